@@ -1,0 +1,36 @@
+"""Names of array kinds with shape and unit, and the checks that every public entrance shares."""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Float, Int
+from numpy.typing import ArrayLike
+
+from stmpl_core.errors import InvalidInput
+
+Points = Float[np.ndarray, "n 3"]  # positions or vectors, one row each [m] or [-]
+PerVertex = Float[np.ndarray, " v"]  # one scalar a vertex
+VertexVectors = Float[np.ndarray, "v 3"]  # one vector a vertex
+Faces = Int[np.ndarray, "f 3"]  # vertex numbers, counter-clockwise seen from outside
+Transform = Float[np.ndarray, "4 4"]  # rigid, column convention: x_a = T_a_from_b @ x_b
+Wrench = Float[np.ndarray, " 6"]  # force [N] then torque [N m]
+
+
+def finite(name: str, value: ArrayLike, shape: tuple[int | None, ...]) -> np.ndarray:
+    """Returns `value` as a contiguous float64 array of `shape` (None: any length).
+
+    Raises:
+        InvalidInput: wrong shape, not numeric, or any NaN or infinity.
+    """
+    try:
+        array = np.ascontiguousarray(value, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise InvalidInput(f"{name} is not an array of numbers: {error}") from error
+    if array.ndim != len(shape) or any(n is not None and n != m for n, m in zip(shape, array.shape, strict=True)):
+        wanted = "(" + ", ".join("any" if n is None else str(n) for n in shape) + ")"
+        raise InvalidInput(f"{name} has shape {array.shape}; expected {wanted}.")
+    bad = ~np.isfinite(array)
+    if bad.any():
+        where = tuple(int(i) for i in np.argwhere(bad)[0])
+        raise InvalidInput(f"{name} holds {int(bad.sum())} values that are not finite, the first at index {where}.")
+    return array

@@ -1,0 +1,53 @@
+"""Contact: a tool's mesh, its pose and the wrench it exerts, as one frozen record."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from stmpl_core.arrays import Faces, Points, Transform, Wrench, finite
+from stmpl_core.errors import InvalidInput
+from stmpl_core.layer import check_faces
+
+
+@dataclass(frozen=True, eq=False)
+class ToolMesh:
+    """A triangle mesh in the tool's own frame: vertices (N, 3) [m], faces (M, 3)."""
+
+    vertices: Points
+    faces: Faces
+
+    @classmethod
+    def of(cls, vertices: ArrayLike, faces: ArrayLike) -> ToolMesh:
+        """Checks and keeps a mesh. Raises MeshError or InvalidInput."""
+        points = finite("tool vertices", vertices, (None, 3))
+        return cls(points, check_faces(faces, len(points)))
+
+
+@dataclass(frozen=True, eq=False)
+class Contact:
+    """One tool at one instant.
+
+    Args:
+        name: of the tool; answers and log lines use it.
+        mesh: in the tool's frame.
+        pose_body_from_tool: rigid transform, (4, 4), taking tool coordinates to the layer's frame.
+        wrench: force [N] and torque about the tool's origin [N m] that the tool exerts *on the body*,
+            in the layer's axes, (6,); None when there is no force sensor.
+    """
+
+    name: str
+    mesh: ToolMesh
+    pose_body_from_tool: Transform
+    wrench: Wrench | None = None
+
+    def __post_init__(self) -> None:
+        pose = finite(f"pose of {self.name}", self.pose_body_from_tool, (4, 4))
+        rotation = pose[:3, :3]
+        if np.abs(rotation @ rotation.T - np.eye(3)).max() > 1e-4 or np.linalg.det(rotation) < 0:
+            raise InvalidInput(f"pose of {self.name} is not rigid: its rotation part is\n{rotation}.")
+        object.__setattr__(self, "pose_body_from_tool", pose)
+        if self.wrench is not None:
+            object.__setattr__(self, "wrench", finite(f"wrench of {self.name}", self.wrench, (6,)))

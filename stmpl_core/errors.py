@@ -1,0 +1,25 @@
+"""The error family: everything that stmpl refuses derives from StmplError, and says what, measured, allowed, what to try."""
+
+
+class StmplError(Exception):
+    """Root of every error that stmpl raises on purpose."""
+
+
+class InvalidInput(StmplError, ValueError):
+    """A value that cannot be worked with: wrong shape, not finite, outside what physics allows."""
+
+
+class MeshError(InvalidInput):
+    """A surface that is empty, inverted, non-manifold, or folds when it is extruded."""
+
+
+class FrameError(InvalidInput):
+    """A pose or message in a frame that is not known."""
+
+
+class NotPrepared(StmplError, RuntimeError):
+    """A method was asked to solve before it was given a layer."""
+
+
+class BagError(StmplError):
+    """A recording that cannot be read, is truncated, or lacks what is needed to repeat it."""

@@ -1,0 +1,197 @@
+"""SoftLayer: a skin mesh, the thickness of the soft layer under it, and the Tissue that it is made of."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from stmpl_core.arrays import Faces, PerVertex, Points, VertexVectors, finite
+from stmpl_core.errors import InvalidInput, MeshError
+
+MAX_EXTENT = 4.0  # m; a limb or a body is smaller, a mesh in millimetres is not
+
+
+@dataclass(frozen=True)
+class Tissue:
+    """Compressible Neo-Hookean material, psi = mu/2 (I_C - 3) - mu ln J + lambda/2 (ln J)^2.
+
+    Bonet & Wood, "Nonlinear Continuum Mechanics for Finite Element Analysis", 2nd ed., eq. 6.28.
+
+    Args:
+        youngs_modulus: E [Pa], > 0.
+        poisson_ratio: nu [-], in [0, 0.5).
+        density: rho [kg/m3], > 0; quasi-static answers do not depend on it.
+    """
+
+    youngs_modulus: float = 1e3
+    poisson_ratio: float = 0.4
+    density: float = 1e3
+
+    def __post_init__(self) -> None:
+        if not (np.isfinite(self.youngs_modulus) and self.youngs_modulus > 0):
+            raise InvalidInput(f"youngs_modulus is {self.youngs_modulus} Pa; it must be finite and above 0.")
+        if not 0 <= self.poisson_ratio < 0.5:
+            raise InvalidInput(f"poisson_ratio is {self.poisson_ratio}; allowed is 0 <= nu < 0.5 (try 0.499).")
+        if not (np.isfinite(self.density) and self.density > 0):
+            raise InvalidInput(f"density is {self.density} kg/m3; it must be finite and above 0.")
+
+    @property
+    def shear_modulus(self) -> float:
+        """mu = E / (2 (1 + nu)) [Pa]."""
+        return self.youngs_modulus / (2 * (1 + self.poisson_ratio))
+
+    @property
+    def lame_lambda(self) -> float:
+        """lambda = E nu / ((1 + nu)(1 - 2 nu)) [Pa]."""
+        nu = self.poisson_ratio
+        return self.youngs_modulus * nu / ((1 + nu) * (1 - 2 * nu))
+
+    @property
+    def confined_modulus(self) -> float:
+        """M = lambda + 2 mu [Pa], the stiffness of a column that cannot bulge."""
+        return self.lame_lambda + 2 * self.shear_modulus
+
+
+class SoftLayer:
+    """Skin over a rigid core, with a soft layer of given thickness between them.
+
+    Args:
+        vertices: skin at rest, shape (V, 3) [m].
+        faces: shape (F, 3), counter-clockwise seen from outside.
+        thickness: of the layer, measured inwards along the vertex normal, (V,) or one number [m].
+        tissue: material of the layer.
+        chart: UV chart of the skin, if it has one (see stmpl_core.chart).
+
+    Raises:
+        MeshError: empty, non-manifold, inside-out or degenerate surface, or one that looks like millimetres.
+        InvalidInput: not finite, wrong shapes, thickness not above 0.
+    """
+
+    def __init__(
+        self,
+        vertices: ArrayLike,
+        faces: ArrayLike,
+        thickness: ArrayLike,
+        *,
+        tissue: Tissue | None = None,
+        chart: Any = None,
+    ) -> None:
+        self.vertices: Points = finite("vertices", vertices, (None, 3))
+        self.faces: Faces = check_faces(faces, len(self.vertices))
+        spread = np.broadcast_to(finite("thickness", np.atleast_1d(thickness), (None,)), len(self.vertices)) \
+            if np.size(thickness) == 1 else finite("thickness", thickness, (len(self.vertices),))
+        self.thickness: PerVertex = np.array(spread)
+        if (self.thickness <= 0).any():
+            worst = int(self.thickness.argmin())
+            raise InvalidInput(f"thickness is {self.thickness[worst]:g} m at vertex {worst}; it must be above 0.")
+        self.tissue = tissue or Tissue()
+        self.chart = chart
+        _check_surface(self)
+
+    def with_(self, **changes: Any) -> SoftLayer:
+        """A copy with `vertices`, `thickness`, `tissue` (or its fields) or `chart` changed."""
+        material = {k: changes.pop(k) for k in ("youngs_modulus", "poisson_ratio", "density") if k in changes}
+        given = {"vertices": self.vertices, "faces": self.faces, "thickness": self.thickness,
+                 "tissue": self.tissue, "chart": self.chart} | changes
+        given["tissue"] = replace(given["tissue"], **material)
+        return SoftLayer(given.pop("vertices"), given.pop("faces"), given.pop("thickness"), **given)
+
+    @cached_property
+    def face_area_vectors(self) -> Points:
+        """Area times outward normal of each face, shape (F, 3) [m2]."""
+        a, b, c = (self.vertices[self.faces[:, k]] for k in range(3))
+        return 0.5 * np.cross(b - a, c - a)
+
+    @cached_property
+    def vertex_area_vectors(self) -> VertexVectors:
+        """A third of the area vectors of the faces around each vertex, shape (V, 3) [m2].
+
+        A pressure p_v at the vertices, interpolated linearly, presses with sum_v p_v A_v in total.
+        """
+        vectors = np.zeros_like(self.vertices)
+        for corner in range(3):
+            np.add.at(vectors, self.faces[:, corner], self.face_area_vectors / 3)
+        return vectors
+
+    @cached_property
+    def vertex_areas(self) -> PerVertex:
+        """A third of the areas of the faces around each vertex, shape (V,) [m2]."""
+        areas = np.linalg.norm(self.face_area_vectors, axis=1) / 3
+        return np.bincount(self.faces.ravel(), weights=np.repeat(areas, 3), minlength=len(self.vertices))
+
+    @cached_property
+    def normals(self) -> VertexVectors:
+        """Outward unit normals at the vertices, area-weighted, shape (V, 3) [-]."""
+        length = np.linalg.norm(self.vertex_area_vectors, axis=1, keepdims=True)
+        return self.vertex_area_vectors / np.where(length > 0, length, 1.0)
+
+    @cached_property
+    def inner_vertices(self) -> Points:
+        """Where the layer is bonded to the rigid core: vertices - thickness * normals, shape (V, 3) [m]."""
+        return self.vertices - self.thickness[:, None] * self.normals
+
+    @cached_property
+    def edges(self) -> np.ndarray:
+        """Undirected edges, each once with its lower vertex first, shape (E, 2)."""
+        directed = np.sort(self.faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
+        return np.unique(directed, axis=0)
+
+    @cached_property
+    def edge_length(self) -> float:
+        """Median edge length [m]."""
+        return float(np.median(np.linalg.norm(np.diff(self.vertices[self.edges], axis=1)[:, 0], axis=1)))
+
+    @cached_property
+    def border(self) -> np.ndarray:
+        """Numbers of the vertices on an open edge of the surface, sorted."""
+        directed = np.sort(self.faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
+        pairs, count = np.unique(directed, axis=0, return_counts=True)
+        return np.unique(pairs[count == 1])
+
+    def __repr__(self) -> str:
+        t = self.thickness * 1e3
+        return (f"SoftLayer({len(self.vertices)} vertices, {len(self.faces)} faces, edges {self.edge_length * 1e3:.1f} mm, "
+                f"thickness {t.min():.1f}..{t.max():.1f} mm, E {self.tissue.youngs_modulus:g} Pa, nu {self.tissue.poisson_ratio:g})")
+
+
+def check_faces(faces: ArrayLike, n_vertices: int) -> Faces:
+    """Returns `faces` as (F, 3) int32 after checking that they name existing, distinct vertices.
+
+    Raises:
+        MeshError: empty, wrong shape, or a vertex number that does not exist or is repeated in a face.
+    """
+    array = np.asarray(faces)
+    if array.ndim != 2 or array.shape[1] != 3 or not len(array) or not np.issubdtype(array.dtype, np.integer):
+        raise MeshError(f"faces must be integers of shape (F, 3) with F > 0; got {array.dtype} {array.shape}.")
+    if array.min() < 0 or array.max() >= n_vertices:
+        raise MeshError(f"faces name vertices {array.min()}..{array.max()}; the mesh has 0..{n_vertices - 1}.")
+    repeated = (array[:, 0] == array[:, 1]) | (array[:, 1] == array[:, 2]) | (array[:, 2] == array[:, 0])
+    if repeated.any():
+        raise MeshError(f"{int(repeated.sum())} faces use a vertex twice, the first is face {int(repeated.argmax())}.")
+    return np.ascontiguousarray(array, dtype=np.int32)
+
+
+def _check_surface(layer: SoftLayer) -> None:
+    extent = float(np.ptp(layer.vertices, axis=0).max())
+    if extent > MAX_EXTENT:
+        raise MeshError(f"the skin is {extent:.1f} m wide; at most {MAX_EXTENT} m is accepted. "
+                        "Is it in millimetres? Scale it by 1e-3.")
+    area = np.linalg.norm(layer.face_area_vectors, axis=1)
+    if (area <= 1e-9 * area.max()).any():
+        raise MeshError(f"{int((area <= 1e-9 * area.max()).sum())} faces have no area, the first is face "
+                        f"{int(area.argmin())}. Clean or remesh the skin (stmpl_core.remesh).")
+    directed = layer.faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2).astype(np.int64)
+    key = directed[:, 0] * len(layer.vertices) + directed[:, 1]
+    if len(np.unique(key)) != len(key):
+        values, count = np.unique(key, return_counts=True)
+        a, b = divmod(int(values[count > 1][0]), len(layer.vertices))
+        raise MeshError(f"edge {a}->{b} is used by several faces in the same direction: the surface is non-manifold "
+                        "or its faces are not oriented alike. Repair it, for instance with trimesh.repair.fix_normals.")
+    if not len(layer.border):
+        volume = float(np.einsum("ij,ij->", layer.vertices[layer.faces[:, 0]], layer.face_area_vectors)) / 3
+        if volume < 0:
+            raise MeshError(f"the closed skin is inside out (volume {volume:.3g} m3). Reverse its faces: faces[:, ::-1].")

@@ -1,0 +1,65 @@
+"""Load: what presses on the skin, as a pressure or as a force per vertex."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from stmpl_core.arrays import PerVertex, VertexVectors, finite
+from stmpl_core.errors import InvalidInput
+from stmpl_core.layer import SoftLayer
+
+
+@dataclass(frozen=True, eq=False)
+class Load:
+    """One scalar a vertex, pressing inwards where positive. Make it with `Load.pressure` or `Load.nodal`."""
+
+    kind: Literal["pressure", "nodal"]
+    values: PerVertex
+
+    @classmethod
+    def pressure(cls, p: ArrayLike) -> Load:
+        """Pressure at each vertex, (V,) [Pa], along the *deformed* normal (a follower load)."""
+        return cls("pressure", finite("pressure", p, (None,)))
+
+    @classmethod
+    def nodal(cls, f: ArrayLike) -> Load:
+        """Force at each vertex, (V,) [N], along the *rest* normal (a dead load: the paper's rule)."""
+        return cls("nodal", finite("nodal force", f, (None,)))
+
+    @classmethod
+    def zero(cls, layer: SoftLayer) -> Load:
+        """No load on any vertex of `layer`."""
+        return cls("pressure", np.zeros(len(layer.vertices)))
+
+    def check(self, layer: SoftLayer) -> Load:
+        """Returns itself if it fits `layer`; raises InvalidInput otherwise."""
+        if len(self.values) != len(layer.vertices):
+            raise InvalidInput(f"the load has {len(self.values)} values; the layer has {len(layer.vertices)} vertices.")
+        return self
+
+    @property
+    def loaded(self) -> np.ndarray:
+        """Numbers of the vertices that carry load."""
+        return np.flatnonzero(self.values)
+
+    def pressure_on(self, layer: SoftLayer) -> PerVertex:
+        """The equivalent pressure at rest, (V,) [Pa]: nodal forces are divided by the vertex areas."""
+        return self.values if self.kind == "pressure" else self.values / layer.vertex_areas
+
+    def forces_on(self, layer: SoftLayer) -> VertexVectors:
+        """The forces on the skin at rest, (V, 3) [N]; their sum is what the load presses with."""
+        if self.kind == "pressure":
+            return -self.values[:, None] * layer.vertex_area_vectors
+        return -self.values[:, None] * layer.normals
+
+    def peak_ratio(self, layer: SoftLayer) -> float:
+        """Largest |p| / E [-], the one number that decides how nonlinear the answer is."""
+        return float(np.abs(self.pressure_on(layer)).max(initial=0.0)) / layer.tissue.youngs_modulus
+
+    def scaled(self, factor: float) -> Load:
+        """The same load times `factor`."""
+        return Load(self.kind, self.values * factor)

@@ -1,0 +1,1 @@
+"""One file a method; all follow the protocol in base."""

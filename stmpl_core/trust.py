@@ -1,0 +1,67 @@
+"""Trust: what may be believed of an answer; and Displacement, the answer that carries it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from stmpl_core.arrays import PerVertex, VertexVectors
+
+
+@dataclass(frozen=True)
+class Trust:
+    """What may be believed of an answer.
+
+    Args:
+        converged: the method reached its own tolerance (closed forms always do).
+        in_range: the scene lies inside the range that the method was validated on.
+        error_bound: largest Euclidean error to expect at any vertex [m], or None where none is known.
+        why: one sentence for a person; empty when there is nothing to say.
+        figures: what the method measured of itself, by name with its unit in the name ("min_j", "truncation_m").
+    """
+
+    converged: bool = True
+    in_range: bool = True
+    error_bound: float | None = None
+    why: str = ""
+    figures: Mapping[str, float] = field(default_factory=dict)
+
+    @property
+    def ok(self) -> bool:
+        """Converged and inside the validated range."""
+        return self.converged and self.in_range
+
+    def also(self, why: str, *, in_range: bool | None = None, converged: bool | None = None) -> Trust:
+        """The same trust with one more reason, and flags lowered (never raised) as given."""
+        return replace(
+            self,
+            why="; ".join(filter(None, (self.why, why))),
+            in_range=self.in_range and in_range is not False,
+            converged=self.converged and converged is not False,
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Displacement:
+    """The answer of a method.
+
+    Args:
+        displacement: of each vertex, (V, 3) [m], in the layer's frame.
+        trust: what may be believed of it.
+        method: name of the method that answered.
+        pressure: the pressure that was solved for, (V,) [Pa], if the method or the simulator knows it.
+        statuses: what was found of each contact, by its name ("touching", "wrench without touch", ...).
+    """
+
+    displacement: VertexVectors
+    trust: Trust
+    method: str
+    pressure: PerVertex | None = None
+    statuses: Mapping[str, str] = field(default_factory=dict)
+
+    @property
+    def magnitude(self) -> PerVertex:
+        """Length of the displacement of each vertex, (V,) [m]."""
+        return np.linalg.norm(self.displacement, axis=1)
