@@ -1,0 +1,39 @@
+# `make` alone says what there is. Everything lives in .venv; nothing else on the machine is touched.
+SHELL := /bin/bash
+.DEFAULT_GOAL := help
+.PHONY: help setup demo test check clean
+
+VENV := .venv
+BIN := $(VENV)/bin
+READY := $(VENV)/.ready
+BUILT_FROM := setup.py pyproject.toml msg_defs/pyproject.toml msg_defs/CMakeLists.txt $(wildcard msg_defs/msg/*.msg)
+
+help:  ## Say what each target does
+	@echo "stmpl: real-time soft-tissue contact for robots"
+	@grep -hE '^[a-z]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z]+):.*## (.*)/  make \1\t\2/' | expand -t 16
+
+setup: $(READY)  ## Make .venv with Python 3.12, ROS 2 and everything else (once; needs a C++ compiler)
+
+demo: $(READY)  ## Run the main job: simulated contact over ROS 2, recorded, compared with FEM, with a report
+	$(BIN)/stmpl demo
+
+test: $(READY)  ## Pass the tests
+	$(BIN)/python -m pytest
+
+check: $(READY)  ## Lint, types and the one-way import rule
+	$(BIN)/ruff check .
+	$(BIN)/pyright
+	$(BIN)/lint-imports
+
+clean:  ## Remove .venv, caches and build folders; runs/ stays
+	rm -rf $(VENV) build install log *.egg-info .pytest_cache .ruff_cache .import_linter_cache .numba_cache
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +
+
+# On a ROS machine its own rclpy is used; elsewhere ROS 2 comes as wheels, which exist for Python 3.12 only.
+$(READY): $(BUILT_FROM)
+	@command -v c++ >/dev/null || { echo "stmpl needs a C++ compiler to build its ROS messages; on Ubuntu: sudo apt install g++"; exit 1; }
+	@python=$$(.ci/find_python) || exit 1; \
+	[ -x $(BIN)/python ] || $$python -m venv $${ROS_DISTRO:+--system-site-packages} $(VENV)
+	$(BIN)/python -m pip install --quiet uv
+	$(BIN)/uv pip install --python $(BIN)/python --editable ".[dev]"
+	@touch $@

@@ -1,0 +1,58 @@
+"""One distribution, `stmpl`: to pip a Python package, to colcon the ROS package stmpl_ros."""
+
+import os
+from pathlib import Path
+
+from setuptools import setup
+
+HERE = Path(__file__).resolve().parent
+ON_ROS_MACHINE = bool(os.environ.get("ROS_DISTRO"))  # its own rclpy and colcon-built messages are used there
+
+REQUIRED = [
+    "anny>=0.6",
+    "jaxtyping>=0.3",
+    "libigl>=2.6",
+    "matplotlib>=3.9",
+    "mcap>=1.2",
+    "mmgpy>=0.17",
+    "numba>=0.60",
+    "numpy>=2.0",
+    "pydantic>=2.8",
+    "python-fcl>=0.7.0.8",
+    "pyyaml>=6.0",
+    "rich>=13.7",
+    "rosbags>=0.10",
+    "scikit-fem>=11",
+    "scipy>=1.13",
+    "smplx>=0.1.28",
+    "torch>=2.4",
+    "trimesh>=4.4",
+    "tyro>=0.9",
+]
+ROS_WHEELS = [  # versions that resolve together: ROS 2 Jazzy as wheels for CPython 3.12
+    "ros-rclpy[fastrtps]==7.1.6",
+    "ros-common-interfaces==5.3.6",
+    "ros-rmw-fastrtps-cpp==8.4.3",
+    f"stmpl-msgs @ {(HERE / 'msg_defs').as_uri()}",
+]
+DEV = ["felupe>=9", "hypothesis>=6.100", "import-linter>=2.0", "pyright>=1.1.380", "pytest>=8", "ruff>=0.6"]
+
+setup(
+    # colcon and ros2 run know the package by the name in package.xml
+    name="stmpl_ros" if ON_ROS_MACHINE else "stmpl",
+    version="0.1.0",
+    description="Real-time soft-tissue contact for robots: a contact comes in, the deformed skin goes out.",
+    license="Apache-2.0",
+    python_requires=">=3.12,<3.13",
+    packages=["stmpl_core", "stmpl_core.methods", "fem_tools", "bags", "stmpl_ros"],
+    package_data={"stmpl_core": ["weights/*"]},
+    data_files=[
+        ("share/ament_index/resource_index/packages", ["resource/stmpl_ros"]),
+        ("share/stmpl_ros", ["package.xml"]),
+    ]
+    if ON_ROS_MACHINE
+    else [],
+    install_requires=REQUIRED + ([] if ON_ROS_MACHINE else ROS_WHEELS),
+    extras_require={"dev": DEV},
+    entry_points={"console_scripts": ["stmpl = stmpl_ros.cli:main"]},
+)

@@ -1,0 +1,1 @@
+"""The ROS side: node, simulated devices, recorder and the stmpl command."""
