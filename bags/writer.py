@@ -1,0 +1,238 @@
+"""BagWriter: MCAP that rosbag2 accepts, on disk in whole chunks about once a second."""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Mapping
+from contextlib import suppress
+from dataclasses import dataclass
+from io import BytesIO
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+from mcap.writer import CompressionType, Writer
+from ruamel.yaml import YAML, YAMLError
+
+from bags.schema import find_schema
+from stmpl_core.errors import BagError
+
+log = logging.getLogger(__name__)
+
+ROS_DISTRO = "jazzy"
+METADATA_VERSION = 9  # of rosbag2's metadata.yaml in Jazzy
+CHUNK_BYTES = 8 << 20  # a chunk is closed when it grows over this, or when chunk_seconds have passed
+
+
+def qos_yaml(*, depth: int = 10, reliable: bool = True, transient_local: bool = False) -> str:
+    """One QoS profile as rosbag2 keeps it in `offered_qos_profiles`; everything else at its default."""
+    forever = {"sec": 9223372036, "nsec": 854775807}
+    return _yaml([{
+        "history": "keep_last",
+        "depth": depth,
+        "reliability": "reliable" if reliable else "best_effort",
+        "durability": "transient_local" if transient_local else "volatile",
+        "deadline": forever,
+        "lifespan": forever,
+        "liveliness": "automatic",
+        "liveliness_lease_duration": forever,
+        "avoid_ros_namespace_conventions": False,
+    }])  # fmt: skip
+
+
+@dataclass
+class _Topic:
+    name: str
+    type_name: str
+    type_hash: str
+    qos: str
+    messages: int = 0
+
+
+class BagWriter:
+    """Writes one recording; use it as a context manager, or call `close`.
+
+    What has been flushed survives a SIGKILL; `bags.recover` brings it back. Call `flush` when no message comes for
+    a while, because time is looked at only when one is written. Not thread-safe: one thread writes.
+
+    Args:
+        path: a folder, which gets run.mcap, or the path of the .mcap file; metadata.yaml goes beside it.
+        chunk_seconds: wall-clock time after which a chunk is closed and handed to the operating system.
+
+    Raises:
+        BagError: the file exists, or cannot be written.
+    """
+
+    def __init__(self, path: Path | str, *, chunk_seconds: float = 1.0) -> None:
+        path = Path(path)
+        self.path = path if path.suffix == ".mcap" else path / "run.mcap"
+        self._chunk_seconds = chunk_seconds
+        self._topics: dict[int, _Topic] = {}
+        self._schemas: dict[str, int] = {}
+        self._times: tuple[int, int] | None = None
+        self._messages = self._safe_messages = self._safe_bytes = 0
+        self._error: BagError | None = None
+        self._closed = False
+        try:
+            self.path.parent.mkdir(parents=True, exist_ok=True)
+            self._file = open(self.path, "xb", buffering=1 << 20)
+        except FileExistsError as error:
+            raise BagError(f"{self.path} exists already. Record into another folder, or remove it.") from error
+        except OSError as error:
+            raise BagError(f"{self.path} cannot be written: {error.strerror}.") from error
+        self._writer = Writer(self._file, chunk_size=CHUNK_BYTES, compression=CompressionType.NONE)
+        self._guard(lambda: self._writer.start(profile="ros2"))
+        self._flushed_at = time.monotonic()
+
+    def add_channel(self, topic: str, type_name: str, qos_yaml: str = "") -> int:
+        """Announces `topic` of message type `pkg/msg/T`, and returns the number to write its messages with.
+
+        Raises:
+            BagError: the message type is not installed, or writing failed.
+        """
+        schema = find_schema(type_name)
+        return self._add_channel(_Topic(topic, schema.name, schema.type_hash, qos_yaml), schema.text)
+
+    def copy_channel(self, topic: str, type_name: str, schema_text: str, metadata: Mapping[str, str]) -> int:
+        """Announces a topic with the schema and channel metadata of another bag, installed here or not."""
+        type_hash, qos = metadata.get("topic_type_hash", ""), metadata.get("offered_qos_profiles", "")
+        return self._add_channel(_Topic(topic, type_name, type_hash, qos), schema_text)
+
+    def _add_channel(self, topic: _Topic, schema_text: str) -> int:
+        name, data = topic.type_name, schema_text.encode()
+        if name not in self._schemas:
+            self._schemas[name] = self._guard(lambda: self._writer.register_schema(name, "ros2msg", data))
+        metadata = {"offered_qos_profiles": topic.qos, "topic_type_hash": topic.type_hash}
+        schema_id = self._schemas[name]
+        channel_id = self._guard(lambda: self._writer.register_channel(topic.name, "cdr", schema_id, metadata))
+        self._topics[channel_id] = topic
+        return channel_id
+
+    def write(self, channel_id: int, cdr_bytes: bytes, log_time_ns: int, publish_time_ns: int) -> None:
+        """Adds one serialised message, with the times at which it was received and published [ns].
+
+        Raises:
+            BagError: unknown channel, or the disk refused; the message says what is safe.
+        """
+        topic = self._topics.get(channel_id)
+        if topic is None:
+            raise BagError(f"no channel {channel_id}; known are {sorted(self._topics)}. Call add_channel first.")
+        times = (log_time_ns, publish_time_ns)
+        self._guard(lambda: self._writer.add_message(channel_id, times[0], cdr_bytes, times[1], topic.messages))
+        topic.messages += 1
+        self._messages += 1
+        first, last = self._times or (log_time_ns, log_time_ns)
+        self._times = (min(first, log_time_ns), max(last, log_time_ns))
+        if time.monotonic() - self._flushed_at >= self._chunk_seconds:
+            self.flush()
+
+    def add_metadata(self, name: str, values: Mapping[str, str]) -> None:
+        """Adds a named table of strings, and flushes. Raises BagError."""
+        self._guard(lambda: self._writer.add_metadata(name, dict(values)))
+        self.flush()
+
+    def attach(self, name: str, media_type: str, data: bytes) -> None:
+        """Adds a file to the bag, and flushes. Raises BagError."""
+        now = time.time_ns()
+        self._guard(lambda: self._writer.add_attachment(now, now, name, media_type, data))
+        self.flush()
+
+    def flush(self) -> None:
+        """Closes the chunk in progress and hands it to the operating system: it survives a SIGKILL from here on."""
+        self._guard(self._writer.flush)
+        self._safe_messages, self._safe_bytes = self._messages, self._file.tell()
+        self._flushed_at = time.monotonic()
+
+    def close(self) -> None:
+        """Finishes the file and writes metadata.yaml. Does nothing when closed already. Raises BagError."""
+        if self._closed:
+            return
+        try:
+            self._guard(self._finish)
+        finally:
+            self._closed = True
+            self._drop_file()
+
+    def _finish(self) -> None:
+        metadata = _yaml({"rosbag2_bagfile_information": self._information()})
+        self._writer.add_metadata("rosbag2", {"ROS_DISTRO": ROS_DISTRO, "serialized_metadata": metadata})
+        self._writer.finish()
+        self._file.flush()
+        (self.path.parent / "metadata.yaml").write_text(metadata)
+
+    def _information(self) -> dict[str, Any]:
+        first, last = self._times or (0, 0)
+        span = {
+            "duration": {"nanoseconds": last - first},
+            "starting_time": {"nanoseconds_since_epoch": first},
+            "message_count": self._messages,
+        }
+        topics = [{"topic_metadata": _topic_metadata(t), "message_count": t.messages} for t in self._topics.values()]
+        return {
+            "version": METADATA_VERSION,
+            "storage_identifier": "mcap",
+            **span,
+            "topics_with_message_count": topics,
+            "compression_format": "",
+            "compression_mode": "",
+            "relative_file_paths": [self.path.name],
+            "files": [{"path": self.path.name, **span}],
+            "custom_data": None,
+            "ros_distro": ROS_DISTRO,
+        }
+
+    def _guard(self, act: Any) -> Any:
+        """Runs `act`; after the first error of the disk every call fails with the same sentence."""
+        if self._error:
+            raise self._error
+        if self._closed:
+            raise BagError(f"{self.path} is closed; nothing more can be written to it.")
+        try:
+            return act()
+        except OSError as error:
+            self._error = BagError(
+                f"writing {self.path} failed: {error.strerror}. Safe on disk are the first {self._safe_messages} of "
+                f"{self._messages} messages ({self._safe_bytes / 1e6:.1f} MB, whole chunks). Make room, then bring "
+                f"them back with: stmpl recover {self.path}"
+            )
+            log.error("%s", self._error)
+            raise self._error from error
+
+    def _drop_file(self) -> None:
+        """Closes the file; what a failed disk did not take is thrown away."""
+        with suppress(OSError):
+            self._file.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind: type | None, error: BaseException | None, trace: TracebackType | None) -> None:
+        if self._error and error:
+            self._closed = True
+            self._drop_file()
+        else:
+            self.close()
+
+
+def _topic_metadata(topic: _Topic) -> dict[str, Any]:
+    try:
+        qos = YAML(typ="safe").load(topic.qos) or []
+    except YAMLError:
+        qos = []
+    return {
+        "name": topic.name,
+        "type": topic.type_name,
+        "serialization_format": "cdr",
+        "offered_qos_profiles": qos,
+        "type_description_hash": topic.type_hash,
+    }
+
+
+def _yaml(value: Any) -> str:
+    stream = BytesIO()
+    writer = YAML(typ="safe")
+    writer.default_flow_style = False
+    writer.representer.ignore_aliases = lambda *_: True  # yaml-cpp readers are happier without anchors
+    writer.dump(value, stream)
+    return stream.getvalue().decode()
