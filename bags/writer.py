@@ -155,11 +155,11 @@ class BagWriter:
             self._drop_file()
 
     def _finish(self) -> None:
-        metadata = _yaml({"rosbag2_bagfile_information": self._information()})
-        self._writer.add_metadata("rosbag2", {"ROS_DISTRO": ROS_DISTRO, "serialized_metadata": metadata})
+        information = self._information()
+        self._writer.add_metadata("rosbag2", {"ROS_DISTRO": ROS_DISTRO, "serialized_metadata": _yaml(information)})
         self._writer.finish()
         self._file.flush()
-        (self.path.parent / "metadata.yaml").write_text(metadata)
+        (self.path.parent / "metadata.yaml").write_text(_yaml({"rosbag2_bagfile_information": information}))
 
     def _information(self) -> dict[str, Any]:
         first, last = self._times or (0, 0)

@@ -1,0 +1,96 @@
+"""Provenance: what a recording carries so that it can be repeated: layer, body, method, configuration, versions."""
+
+from __future__ import annotations
+
+import json
+import platform
+import zipfile
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from importlib.metadata import PackageNotFoundError, version
+from io import BytesIO
+from typing import Any
+
+import numpy as np
+
+from bags.writer import BagWriter
+from stmpl_core.errors import BagError
+from stmpl_core.layer import SoftLayer, Tissue
+
+LAYER = "layer.npz"
+RECORD = "stmpl"
+_PACKAGES = ("stmpl", "numpy", "scipy", "numba", "torch", "anny", "mcap", "rosbags")
+
+
+@dataclass(frozen=True)
+class Provenance:
+    """What made a recording.
+
+    Args:
+        method: name of the method that answered.
+        body: one line on the body and its part.
+        config: everything that was configured, as JSON can hold it.
+        versions: of Python and of the packages that decide the numbers.
+    """
+
+    method: str = ""
+    body: str = ""
+    config: Mapping[str, Any] = field(default_factory=dict)
+    versions: Mapping[str, str] = field(default_factory=dict)
+
+
+def versions() -> dict[str, str]:
+    """Versions of Python and of those packages that decide the numbers and are installed."""
+    found = {"python": platform.python_version(), "machine": platform.machine()}
+    for name in _PACKAGES:
+        try:
+            found[name] = version(name)
+        except PackageNotFoundError:
+            continue
+    return found
+
+
+def write_provenance(
+    writer: BagWriter, layer: SoftLayer | None, *, method: str, body: str = "", config: Mapping[str, Any] | None = None
+) -> None:
+    """Puts into a bag all that is needed to repeat the run, best before its first message.
+
+    A recorder that does not hold the layer gives None; SkinTopology then says it, rounded to float32. Raises BagError.
+    """
+    values = {"method": method, "body": body, "config": json.dumps(config or {}), "versions": json.dumps(versions())}
+    writer.add_metadata(RECORD, values)
+    if layer is not None:
+        writer.attach(LAYER, "application/x-npz", layer_to_bytes(layer))
+
+
+def provenance_from(values: Mapping[str, str]) -> Provenance:
+    """Reads back the metadata record that `write_provenance` wrote. Raises BagError."""
+    try:
+        config, made_by = json.loads(values.get("config", "{}")), json.loads(values.get("versions", "{}"))
+    except json.JSONDecodeError as error:
+        raise BagError(f"the bag's '{RECORD}' record is broken: {error}.") from error
+    return Provenance(values.get("method", ""), values.get("body", ""), config, made_by)
+
+
+def layer_to_bytes(layer: SoftLayer) -> bytes:
+    """A layer as .npz: vertices, faces, thickness, tissue, and the UV chart's arrays if it has one; exact."""
+    tissue = layer.tissue
+    arrays = {
+        "vertices": layer.vertices,
+        "faces": layer.faces,
+        "thickness": layer.thickness,
+        "tissue": np.array([tissue.youngs_modulus, tissue.poisson_ratio, tissue.density]),
+    }
+    stream = BytesIO()
+    np.savez_compressed(stream, allow_pickle=False, **arrays)
+    return stream.getvalue()
+
+
+def layer_from_bytes(data: bytes) -> SoftLayer:
+    """The layer that `layer_to_bytes` wrote, bit for bit. Raises BagError if the bytes are no such file."""
+    try:
+        with np.load(BytesIO(data), allow_pickle=False) as arrays:
+            tissue = Tissue(*(float(x) for x in arrays["tissue"]))
+            return SoftLayer(arrays["vertices"], arrays["faces"], arrays["thickness"], tissue=tissue)
+    except (OSError, ValueError, KeyError, TypeError, zipfile.BadZipFile) as error:
+        raise BagError(f"the attached {LAYER} cannot be read: {error}.") from error

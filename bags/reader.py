@@ -1,0 +1,228 @@
+"""Bag: reads a recording from its start with bounded memory, finished or not, and gives back core types."""
+
+from __future__ import annotations
+
+import logging
+from bisect import bisect_right
+from collections.abc import Callable, Iterator
+from functools import cached_property
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from mcap.records import Attachment, Channel, Message, Metadata, Schema
+from rosbags.typesys.store import Typestore
+
+from bags.messages import Frame, contact_from, frame_from, layer_from, stamp_ns, tool_mesh_from
+from bags.provenance import LAYER, RECORD, Provenance, layer_from_bytes, provenance_from
+from bags.records import Damage, End, bag_file, summary, walk
+from bags.schema import typestore_of
+from stmpl_core.contact import Contact, ToolMesh
+from stmpl_core.errors import BagError
+from stmpl_core.layer import SoftLayer
+
+log = logging.getLogger(__name__)
+
+DISPLACEMENT, TOPOLOGY, MESH = "skin/displacement", "skin/topology", "contact_mesh"
+
+
+class Recorded(NamedTuple):
+    """One message of a bag: topic, decoded message, and when it was received and published [ns]."""
+
+    topic: str
+    message: Any
+    log_time_ns: int
+    publish_time_ns: int
+
+
+class Topic(NamedTuple):
+    """One topic of a bag, with the number of its messages and the span of their log times [ns]."""
+
+    name: str
+    type_name: str
+    messages: int
+    first_ns: int
+    last_ns: int
+
+
+class Bag:
+    """A recording, given by its folder or its .mcap file.
+
+    A file whose writer was killed is read as far as it is sound; `damage` says what is not, and the log too.
+
+    Raises:
+        BagError: no such file, or no MCAP file.
+    """
+
+    def __init__(self, path: Path | str) -> None:
+        self.file = bag_file(path)
+        self.finished = False
+        self.damage: list[Damage] = []
+        self.topics: dict[str, Topic] = {}
+        self.attachments: dict[str, bytes] = {}
+        self.metadata: dict[str, dict[str, str]] = {}
+        self._schemas, self._channels = summary(self.file)
+        self._survey()
+
+    def messages(self, wanted: Callable[[str], bool] | None = None) -> Iterator[Recorded]:
+        """Yields the decoded messages in the order of the file, of those topics that `wanted` accepts.
+
+        Raises:
+            BagError: a schema is missing or cannot be parsed.
+        """
+        for record in walk(self.file):
+            if isinstance(record, Message) and (channel := self._channels.get(record.channel_id)):
+                if wanted is None or wanted(channel.topic):
+                    decoded = self._decode(channel, record.data)
+                    yield Recorded(channel.topic, decoded, record.log_time, record.publish_time)
+
+    def find_topic(self, ending: str) -> str:
+        """The one topic whose name ends with `ending`, whatever its namespace. Raises BagError."""
+        found = [t for t in self.topics if _ends(t, ending)]
+        if len(found) != 1:
+            have = ", ".join(sorted(self.topics)) or "none"
+            raise BagError(f"{self.file} has {len(found)} topics {ending}; one is needed. Topics: {have}.")
+        return found[0]
+
+    def frames(self) -> Iterator[Frame]:
+        """Yields the recorded answers in the order of the file. Raises BagError if there is no such topic."""
+        topic = self.find_topic(DISPLACEMENT)
+        for recorded in self.messages(lambda name: name == topic):
+            yield frame_from(recorded.message, recorded.log_time_ns)
+
+    @cached_property
+    def provenance(self) -> Provenance:
+        """What made the run; empty if the bag does not say."""
+        return provenance_from(self.metadata.get(RECORD, {}))
+
+    @cached_property
+    def layer(self) -> SoftLayer:
+        """The layer of the run: the attached one, exact, else the one that SkinTopology describes.
+
+        Raises:
+            BagError: the bag has neither.
+        """
+        if LAYER in self.attachments:
+            return layer_from_bytes(self.attachments[LAYER])
+        return layer_from(self._topology)
+
+    @cached_property
+    def body_frame(self) -> str:
+        """Frame id of the body, from SkinTopology. Raises BagError."""
+        return self._topology.header.frame_id
+
+    @cached_property
+    def layer_id(self) -> str:
+        """Name of the layer, from SkinTopology. Raises BagError."""
+        return self._topology.layer_id
+
+    @cached_property
+    def tool_meshes(self) -> dict[str, ToolMesh]:
+        """Surface of each tool by its name, in its own frame."""
+        topics = [t for t in self.topics if _ends(t, MESH)]
+        found = self.messages(lambda name: name in topics)
+        return {r.message.header.frame_id: tool_mesh_from(r.message) for r in found}
+
+    @cached_property
+    def _topology(self) -> Any:
+        topic = self.find_topic(TOPOLOGY)
+        for recorded in self.messages(lambda name: name == topic):
+            return recorded.message
+        raise BagError(f"{self.file} holds no message on {topic}, so the skin is not known.")
+
+    @cached_property
+    def _store(self) -> Typestore:
+        return typestore_of([(s.name, s.data.decode()) for s in self._schemas.values()])
+
+    def _decode(self, channel: Channel, data: bytes) -> Any:
+        schema = self._schemas.get(channel.schema_id)
+        if schema is None:
+            raise BagError(f"the schema of {channel.topic} is lost, so it cannot be decoded.")
+        return self._store.deserialize_cdr(data, schema.name)
+
+    def _survey(self) -> None:
+        spans: dict[int, list[int]] = {}
+        for record in walk(self.file):
+            match record:
+                case Message():
+                    span = spans.setdefault(record.channel_id, [0, record.log_time, record.log_time])
+                    span[0] += 1
+                    span[1], span[2] = min(span[1], record.log_time), max(span[2], record.log_time)
+                case Schema():
+                    self._schemas[record.id] = record
+                case Channel():
+                    self._channels[record.id] = record
+                case Attachment():
+                    self.attachments[record.name] = record.data
+                case Metadata():
+                    self.metadata[record.name] = record.metadata
+                case Damage():
+                    self.damage.append(record)
+                case End():
+                    self.finished = True
+        for number, channel in self._channels.items():
+            schema = self._schemas.get(channel.schema_id)
+            self.topics[channel.topic] = Topic(channel.topic, schema.name if schema else "?",
+                                               *spans.get(number, (0, 0, 0)))  # fmt: skip
+        self._warn()
+
+    def _warn(self) -> None:
+        for damage in self.damage:
+            log.warning("%s: %s at byte %d (%d bytes skipped)", self.file, damage.what, damage.offset, damage.length)
+        if not self.finished:
+            log.warning("%s was not finished by its writer; at most its last chunk is missing", self.file)
+
+
+class ContactLog:
+    """Poses and wrenches of every tool by stamp: the contacts as they stood at any answered stamp.
+
+    Memory grows with the number of poses (a few hundred bytes each), not with their meshes or answers.
+    """
+
+    def __init__(self, bag: Bag) -> None:
+        self.received: dict[str, dict[int, int]] = {}  # tool -> stamp -> log time of its pose
+        self._bag = bag
+        self._poses: dict[str, dict[int, Any]] = {}
+        self._wrenches: dict[str, dict[int, Any]] = {}
+        for recorded in bag.messages(lambda name: tool_topic(name) is not None):
+            tool, kind = tool_topic(recorded.topic) or ("", "")
+            stamp = stamp_ns(recorded.message)
+            kept = self._poses if kind == "pose" else self._wrenches
+            kept.setdefault(tool, {})[stamp] = recorded.message
+            if kind == "pose":
+                self.received.setdefault(tool, {})[stamp] = recorded.log_time_ns
+        self._stamps = {tool: sorted(poses) for tool, poses in self._poses.items()}
+
+    @property
+    def poses(self) -> int:
+        """Number of recorded poses, of all tools."""
+        return sum(map(len, self._poses.values()))
+
+    def at(self, frame: Frame) -> list[Contact]:
+        """The contacts that `frame` answers: of each of its tools the newest pose not after its stamp.
+
+        Raises:
+            BagError: the pose or the mesh of one of its tools is not in the bag.
+        """
+        return [self._contact(tool, frame.stamp_ns) for tool in frame.tools]
+
+    def _contact(self, tool: str, stamp: int) -> Contact:
+        number = bisect_right(self._stamps.get(tool, []), stamp)
+        mesh = self._bag.tool_meshes.get(tool)
+        if not number or mesh is None:
+            what = "mesh" if number else "pose up to that stamp"
+            raise BagError(f"the frame at {stamp / 1e9:.3f} s answers tool {tool}, but the bag has no {what} of it.")
+        newest = self._stamps[tool][number - 1]
+        wrench = self._wrenches.get(tool, {}).get(newest)
+        return contact_from(tool, mesh, self._poses[tool][newest], wrench, body_frame=self._bag.body_frame)
+
+
+def tool_topic(topic: str) -> tuple[str, str] | None:
+    """(tool, "pose" or "wrench") if the topic is of a tool: .../tools/NAME/pose."""
+    parts = topic.split("/")
+    if len(parts) >= 3 and parts[-3] == "tools" and parts[-1] in ("pose", "wrench"):
+        return parts[-2], parts[-1]
+    return None
+
+
+def _ends(topic: str, ending: str) -> bool:
+    return topic == ending or topic.endswith("/" + ending)

@@ -1,0 +1,101 @@
+"""Recover: brings every sound chunk of a killed, truncated or damaged recording into a new, valid bag."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from mcap.records import Attachment, Channel, Message, Metadata, Schema
+
+from bags.records import Damage, End, bag_file, summary, walk
+from bags.writer import BagWriter
+from stmpl_core.errors import BagError
+
+
+@dataclass(frozen=True)
+class Recovery:
+    """What came back, and what did not.
+
+    Args:
+        source, target: the damaged file and the new one.
+        messages: brought back.
+        seconds: of log time between the first and the last of them [s].
+        orphans: sound messages given up because their channel's description is lost.
+        damage: stretches of the source that were skipped.
+        finished: the writer had finished the source; False: it was killed, at most its last chunk is missing.
+    """
+
+    source: Path
+    target: Path
+    messages: int
+    seconds: float
+    orphans: int
+    damage: tuple[Damage, ...]
+    finished: bool
+
+    @property
+    def complete(self) -> bool:
+        """Nothing is missing."""
+        return self.finished and not self.damage and not self.orphans
+
+    def __str__(self) -> str:
+        missing = [f"{d.what} at byte {d.offset} ({d.length} bytes)" for d in self.damage]
+        if self.orphans:
+            missing.append(f"{self.orphans} messages whose channel is not described any more")
+        if not self.finished:
+            missing.append("what the writer had not flushed when it was stopped (at most its last chunk)")
+        back = f"{self.messages} messages over {self.seconds:.2f} s are back in {self.target}"
+        return f"{back}; nothing is missing." if not missing else f"{back}. Missing: {'; '.join(missing)}."
+
+
+def recover(source: Path | str, target: Path | str | None = None) -> Recovery:
+    """Copies all that is sound in `source` into a new bag; the source is left as it is.
+
+    Args:
+        source: a folder or .mcap file.
+        target: folder or .mcap file to make; by default a folder beside the source's, named `...-recovered`.
+
+    Raises:
+        BagError: the source is no MCAP file or holds nothing sound, or the target exists or cannot be written.
+    """
+    source = bag_file(source)
+    target = Path(target) if target else source.parent.with_name(f"{source.parent.resolve().name}-recovered")
+    schemas, channels = summary(source)
+    damage, orphans, messages, finished, times = [], 0, 0, False, [0, 0]
+    copied: dict[int, int] = {}
+    with BagWriter(target) as writer:
+        for record in walk(source):
+            match record:
+                case Schema():
+                    schemas[record.id] = record
+                case Channel():
+                    channels[record.id] = record
+                    _copy_channel(writer, record, schemas, copied)
+                case Message():
+                    channel = channels.get(record.channel_id)
+                    if channel is None or not _copy_channel(writer, channel, schemas, copied):
+                        orphans += 1
+                        continue
+                    writer.write(copied[record.channel_id], record.data, record.log_time, record.publish_time)
+                    times = [min(times[0] or record.log_time, record.log_time), max(times[1], record.log_time)]
+                    messages += 1
+                case Attachment():
+                    writer.attach(record.name, record.media_type, record.data)
+                case Metadata() if record.name != "rosbag2":  # the writer makes its own
+                    writer.add_metadata(record.name, record.metadata)
+                case Damage():
+                    damage.append(record)
+                case End():
+                    finished = True
+    if not messages and damage:
+        raise BagError(f"{source} holds no sound message: {damage[0].what} at byte {damage[0].offset}.")
+    seconds = (times[1] - times[0]) / 1e9
+    return Recovery(source, writer.path, messages, seconds, orphans, tuple(damage), finished)
+
+
+def _copy_channel(writer: BagWriter, channel: Channel, schemas: dict[int, Schema], copied: dict[int, int]) -> bool:
+    """Announces the channel in the new bag once; False if its schema is lost."""
+    schema = schemas.get(channel.schema_id)
+    if channel.id not in copied and schema is not None:
+        copied[channel.id] = writer.copy_channel(channel.topic, schema.name, schema.data.decode(), channel.metadata)
+    return channel.id in copied
