@@ -1,0 +1,83 @@
+"""Simulator: contacts in, deformed skin out; the node, a replay and a test all call its `step`."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from weakref import WeakKeyDictionary
+
+import numpy as np
+
+from stmpl_core.contact import Contact, ToolMesh
+from stmpl_core.errors import InvalidInput
+from stmpl_core.layer import SoftLayer
+from stmpl_core.load import Load
+from stmpl_core.methods.base import Method
+from stmpl_core.sdf import MARGIN, SignedDistance
+from stmpl_core.touch import MAX_RATIO, Touch, Toucher
+from stmpl_core.trust import Displacement, Trust
+
+
+class Simulator:
+    """One layer, one method, any number of tools. The same contacts give the same answer, bit for bit.
+
+    Args:
+        layer: the soft layer at rest.
+        method: how to solve; it is prepared here.
+    """
+
+    def __init__(self, layer: SoftLayer, method: Method) -> None:
+        self.layer = layer
+        self.method = method.prepare(layer)
+        self._toucher = Toucher(layer)
+        self._fields: WeakKeyDictionary[ToolMesh, SignedDistance] = WeakKeyDictionary()
+
+    def prepare_tool(self, mesh: ToolMesh) -> SignedDistance:
+        """The distance field of `mesh`, built on the first call (up to a second), kept as long as the mesh is.
+
+        Raises:
+            MeshError: a mesh that cannot be a tool (see SignedDistance.of).
+        """
+        if mesh not in self._fields:
+            self._fields[mesh] = SignedDistance.of(mesh, margin=max(MARGIN, 2 * self._toucher.hole))
+        return self._fields[mesh]
+
+    def step(self, contacts: Sequence[Contact]) -> Displacement:
+        """The skin's displacement under `contacts`, with what was found of each.
+
+        Raises:
+            InvalidInput: two contacts of one name.
+            MeshError: a tool's mesh that cannot be used.
+        """
+        names = [contact.name for contact in contacts]
+        if len(set(names)) < len(names):
+            raise InvalidInput(f"contacts must have names of their own; got {', '.join(names)}.")
+
+        # Touch: each tool's mesh, pose and wrench become a pressure on the skin.
+        touches = [self._toucher.touch(contact, self.prepare_tool(contact.mesh)) for contact in contacts]
+
+        # Sum: pressures of several tools add.
+        pressure = sum((touch.load.values for touch in touches), np.zeros(len(self.layer.vertices)))
+        load = Load.pressure(pressure)
+
+        # Solve: the method moves the skin; where nothing presses, nothing moves.
+        if load.values.any():
+            answer = self.method.solve(load)
+        else:
+            answer = Displacement(np.zeros_like(self.layer.vertices), Trust(), self.method.name)
+
+        # Say what may be believed: what the method says, and what was found of each contact.
+        trust = _joined(answer.trust, dict(zip(names, touches, strict=True)))
+        if len(touches) > 1 and load.peak_ratio(self.layer) > MAX_RATIO:
+            trust = trust.also(f"together the tools press with p/E = {load.peak_ratio(self.layer):.2g}", in_range=False)
+        statuses = {name: touch.status for name, touch in zip(names, touches, strict=True)}
+        return Displacement(answer.displacement, trust, answer.method, load.values, statuses)
+
+
+def _joined(trust: Trust, touches: dict[str, Touch]) -> Trust:
+    """The method's trust, lowered by that of the contacts; their figures carry their names."""
+    figures = dict(trust.figures)
+    for name, touch in touches.items():
+        figures |= {f"{name}.{figure}": value for figure, value in touch.trust.figures.items()}
+        if touch.trust.why:
+            trust = trust.also(touch.trust.why, in_range=touch.trust.in_range, converged=touch.trust.converged)
+    return Trust(trust.converged, trust.in_range, trust.error_bound, trust.why, figures)
