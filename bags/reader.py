@@ -23,6 +23,7 @@ from stmpl_core.layer import SoftLayer
 log = logging.getLogger(__name__)
 
 DISPLACEMENT, TOPOLOGY, MESH = "skin/displacement", "skin/topology", "contact_mesh"
+WRENCH_AGE = 200_000_000  # ns; an older wrench does not belong to a pose any more
 
 
 class Recorded(NamedTuple):
@@ -179,26 +180,23 @@ class ContactLog:
     """
 
     def __init__(self, bag: Bag) -> None:
-        self.received: dict[str, dict[int, int]] = {}  # tool -> stamp -> log time of its pose
+        self.received: dict[int, int] = {}  # stamp -> when the last contact message of that stamp was received [ns]
+        self.pose_stamps: set[int] = set()
         self._bag = bag
         self._poses: dict[str, dict[int, Any]] = {}
         self._wrenches: dict[str, dict[int, Any]] = {}
         for recorded in bag.messages(lambda name: tool_topic(name) is not None):
             tool, kind = tool_topic(recorded.topic) or ("", "")
             stamp = stamp_ns(recorded.message)
-            kept = self._poses if kind == "pose" else self._wrenches
-            kept.setdefault(tool, {})[stamp] = recorded.message
+            (self._poses if kind == "pose" else self._wrenches).setdefault(tool, {})[stamp] = recorded.message
+            self.received[stamp] = max(self.received.get(stamp, 0), recorded.log_time_ns)
             if kind == "pose":
-                self.received.setdefault(tool, {})[stamp] = recorded.log_time_ns
-        self._stamps = {tool: sorted(poses) for tool, poses in self._poses.items()}
-
-    @property
-    def poses(self) -> int:
-        """Number of recorded poses, of all tools."""
-        return sum(map(len, self._poses.values()))
+                self.pose_stamps.add(stamp)
+        self._pose_order = {tool: sorted(kept) for tool, kept in self._poses.items()}
+        self._wrench_order = {tool: sorted(kept) for tool, kept in self._wrenches.items()}
 
     def at(self, frame: Frame) -> list[Contact]:
-        """The contacts that `frame` answers: of each of its tools the newest pose not after its stamp.
+        """The contacts that `frame` answers: of each of its tools the newest pose and wrench not after its stamp.
 
         Raises:
             BagError: the pose or the mesh of one of its tools is not in the bag.
@@ -206,14 +204,19 @@ class ContactLog:
         return [self._contact(tool, frame.stamp_ns) for tool in frame.tools]
 
     def _contact(self, tool: str, stamp: int) -> Contact:
-        number = bisect_right(self._stamps.get(tool, []), stamp)
+        newest = _newest(self._pose_order.get(tool, []), stamp)
         mesh = self._bag.tool_meshes.get(tool)
-        if not number or mesh is None:
-            what = "mesh" if number else "pose up to that stamp"
+        if newest is None or mesh is None:
+            what = "pose up to that stamp" if newest is None else "mesh"
             raise BagError(f"the frame at {stamp / 1e9:.3f} s answers tool {tool}, but the bag has no {what} of it.")
-        newest = self._stamps[tool][number - 1]
-        wrench = self._wrenches.get(tool, {}).get(newest)
+        pushed = _newest(self._wrench_order.get(tool, []), stamp)
+        wrench = None if pushed is None or stamp - pushed > WRENCH_AGE else self._wrenches[tool][pushed]
         return contact_from(tool, mesh, self._poses[tool][newest], wrench, body_frame=self._bag.body_frame)
+
+
+def _newest(stamps: list[int], stamp: int) -> int | None:
+    number = bisect_right(stamps, stamp)
+    return stamps[number - 1] if number else None
 
 
 def tool_topic(topic: str) -> tuple[str, str] | None:

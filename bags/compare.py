@@ -1,0 +1,236 @@
+"""Compare: a sample of a run's frames against a reference solver, another method, or another bag."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from bags.messages import Frame
+from bags.survey import PRESSING, Moment, Survey, survey
+from stmpl_core.contact import Contact
+from stmpl_core.errors import BagError, StmplError
+from stmpl_core.layer import SoftLayer
+from stmpl_core.load import Load
+from stmpl_core.methods.base import Method
+from stmpl_core.metrics import Score, score
+from stmpl_core.trust import Displacement
+
+log = logging.getLogger(__name__)
+
+Answer = Callable[[Frame], Displacement]  # how one side of a comparison answers a frame
+
+
+@dataclass(frozen=True, eq=False)
+class FramePair:
+    """One frame, answered by both sides under the same pressure.
+
+    Args:
+        frame: as recorded.
+        time: since the first answer [s].
+        load: that presses on the skin in all [N].
+        contacts: the tools as they stood.
+        ours: the answer that is judged.
+        reference: the answer that it is judged by.
+        score: of ours against the reference.
+    """
+
+    frame: Frame
+    time: float
+    load: float
+    contacts: tuple[Contact, ...]
+    ours: Displacement
+    reference: Displacement
+    score: Score
+
+    @property
+    def judged(self) -> bool:
+        """The reference converged, so that it may judge."""
+        return self.reference.trust.converged
+
+
+@dataclass(frozen=True, eq=False)
+class Comparison:
+    """A run against a reference.
+
+    Args:
+        run: the run, looked over once: timeline, rate, latency, losses.
+        method, reference: names of the two sides.
+        layer: that both answer for.
+        pairs: the sampled frames, in the order of time.
+        failed: sampled frames that the reference could not solve, with its reason, by sequence number.
+        tolerance: allowed mean error under the contact, in the worst frame [m]; None: no verdict is asked for.
+    """
+
+    run: Survey
+    method: str
+    reference: str
+    layer: SoftLayer
+    pairs: tuple[FramePair, ...]
+    failed: dict[int, str]
+    tolerance: float | None
+
+    @property
+    def judged(self) -> tuple[FramePair, ...]:
+        """The pairs whose reference converged."""
+        return tuple(pair for pair in self.pairs if pair.judged)
+
+    @property
+    def heaviest(self) -> FramePair:
+        """The pair under the largest load. Raises BagError if there is none."""
+        if not self.pairs:
+            raise BagError(f"{self.reference} solved none of {len(self.failed)} sampled frames.")
+        return max(self.judged or self.pairs, key=lambda pair: pair.load)
+
+    @property
+    def most_tools(self) -> FramePair | None:
+        """The heaviest pair with two tools or more on the skin, or None."""
+        several = [pair for pair in self.pairs if sum(s in PRESSING for s in pair.frame.statuses.values()) > 1]
+        return max(several, key=lambda pair: pair.load, default=None)
+
+    @property
+    def worst_under_contact(self) -> float:
+        """Largest mean error under the contact of any judged frame [m]; NaN if no frame could be judged."""
+        return max((pair.score.contact for pair in self.judged), default=float("nan"))
+
+    @property
+    def passed(self) -> bool:
+        """Every sampled frame was judged, and none is over the tolerance (if one was given)."""
+        if self.failed or len(self.judged) < len(self.pairs) or not self.pairs:
+            return False
+        return self.tolerance is None or self.worst_under_contact <= self.tolerance
+
+    @property
+    def verdict(self) -> str:
+        """One sentence: what was compared, measured and allowed."""
+        skipped = len(self.failed) + len(self.pairs) - len(self.judged)
+        sentence = (f"{self.method} against {self.reference} on {len(self.judged)} frames: at most "
+                    f"{self.worst_under_contact * 1e3:.3f} mm on average under the contact")
+        if self.tolerance is not None:
+            sentence += f", allowed {self.tolerance * 1e3:.3f} mm: {'passed' if self.passed else 'failed'}"
+        return sentence + (f"; {skipped} frames could not be judged." if skipped else ".")
+
+
+def compare_run(
+    path: Path | str,
+    reference: Method,
+    *,
+    frames: int = 12,
+    method: Method | None = None,
+    tolerance: float | None = None,
+    on_frame: Callable[[int, int], None] | None = None,
+) -> Comparison:
+    """Solves a sample of a run's frames by `reference`, each under the very pressure that the run's answer had.
+
+    The sample holds the frame under the largest load, the heaviest one with two tools on the skin, and others evenly
+    over the loaded part of the run.
+
+    Args:
+        path: the recording.
+        reference: judges; it is prepared here.
+        frames: how many to sample, >= 1.
+        method: judged under the same pressures; None judges the recorded answers.
+        tolerance: allowed mean error under the contact in the worst frame [m].
+        on_frame: called with (done, total) before each frame, for a progress bar.
+
+    Raises:
+        BagError: the run holds no answers, no loaded frame, or no pressures.
+    """
+    run = survey(path)
+    layer = run.bag.layer
+    judge, judged = _solver(reference, layer), _recorded if method is None else _solver(method, layer)
+    names = (run.method if method is None else method.name, reference.name)
+    return _compare(run, sample(run.moments, frames), names, judged, judge, tolerance, on_frame)
+
+
+def compare_bags(
+    path: Path | str, reference: Path | str, *, frames: int = 12, tolerance: float | None = None
+) -> Comparison:
+    """Compares the answers of one bag with those that another gives at the same stamps.
+
+    Raises:
+        BagError: different skins, or no stamp in common.
+    """
+    run, other = survey(path), survey(reference)
+    if len(run.bag.layer.vertices) != len(other.bag.layer.vertices):
+        raise BagError(f"{run.bag.file} moves {len(run.bag.layer.vertices)} vertices, {other.bag.file} "
+                       f"{len(other.bag.layer.vertices)}; answers can be compared on one skin only.")
+    stamps = {moment.stamp_ns for moment in other.moments}
+    common = [moment for moment in run.moments if moment.stamp_ns in stamps]
+    if not common:
+        raise BagError(f"{run.bag.file} and {other.bag.file} answer no common stamp. Compare a run with its replay.")
+    picks = sample(common, frames)
+    wanted = {moment.stamp_ns for moment in common if moment.sequence in picks}
+    answers = {frame.stamp_ns: _recorded(frame) for frame in other.bag.frames() if frame.stamp_ns in wanted}
+    names = (run.method, f"{other.method} of {other.bag.file.parent.name}")
+    return _compare(run, picks, names, _recorded, lambda frame: answers[frame.stamp_ns], tolerance, None)
+
+
+def sample(moments: list[Moment] | tuple[Moment, ...], frames: int) -> list[int]:
+    """Sequence numbers of a sample of the loaded moments, in order.
+
+    Always there are the largest load and, if any, the largest load under two or more tools.
+
+    Raises:
+        BagError: nothing was pressed in the whole run.
+    """
+    loaded = [moment for moment in moments if moment.load > 0]
+    if not loaded:
+        raise BagError(f"nothing pressed on the skin in any of {len(moments)} answers, so there is nothing to compare.")
+    chosen = {max(loaded, key=lambda moment: moment.load).sequence}
+    several = [moment for moment in loaded if moment.pressing > 1]
+    if several:
+        chosen.add(max(several, key=lambda moment: moment.load).sequence)
+    rest = [moment.sequence for moment in loaded if moment.sequence not in chosen]
+    more = min(max(frames - len(chosen), 0), len(rest))
+    chosen |= {rest[int((k + 0.5) * len(rest) / more)] for k in range(more)}
+    return [moment.sequence for moment in loaded if moment.sequence in chosen]
+
+
+def _compare(
+    run: Survey,
+    picks: list[int],
+    names: tuple[str, str],
+    ours: Answer,
+    reference: Answer,
+    tolerance: float | None,
+    on_frame: Callable[[int, int], None] | None,
+) -> Comparison:
+    pairs: list[FramePair] = []
+    failed: dict[int, str] = {}
+    moments = {moment.sequence: moment for moment in run.moments}
+    wanted = set(picks)
+    for frame in run.bag.frames():
+        if frame.sequence not in wanted:
+            continue
+        if on_frame:
+            on_frame(len(pairs) + len(failed), len(picks))
+        try:
+            pairs.append(_pair(run, moments[frame.sequence], frame, ours(frame), reference(frame)))
+        except StmplError as error:
+            log.warning("frame %d cannot be compared: %s", frame.sequence, error)
+            failed[frame.sequence] = str(error)
+    return Comparison(run, *names, run.bag.layer, tuple(pairs), failed, tolerance)
+
+
+def _pair(run: Survey, moment: Moment, frame: Frame, ours: Displacement, reference: Displacement) -> FramePair:
+    layer = run.bag.layer
+    figures = score(ours.displacement, reference.displacement, layer, _load(frame))
+    return FramePair(frame, moment.time, moment.load, tuple(run.contacts.at(frame)), ours, reference, figures)
+
+
+def _solver(method: Method, layer: SoftLayer) -> Answer:
+    ready = method.prepare(layer)
+    return lambda frame: ready.solve(_load(frame))
+
+
+def _load(frame: Frame) -> Load:
+    if frame.pressure is None:
+        raise BagError(f"answer {frame.sequence} does not say the pressure that it was solved for. "
+                       "Replay the run first, and compare the replay.")
+    return Load.pressure(frame.pressure)
+
+
+def _recorded(frame: Frame) -> Displacement:
+    return Displacement(frame.displacement, frame.trust, frame.method, frame.pressure, frame.statuses)
