@@ -1,0 +1,184 @@
+"""The `stmpl` command: one function a verb; what a verb needs is imported when it is used."""
+
+from __future__ import annotations
+
+import json
+import logging
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import tyro
+
+from stmpl_core.errors import StmplError
+from stmpl_ros.parameters import DemoConfig, NodeConfig, ProbeConfig, RecordConfig
+
+if TYPE_CHECKING:
+    from stmpl_core.methods.base import Method
+
+Flat = tyro.conf.arg(name="")  # a configuration whose fields are flags of the verb itself
+BagPath = Annotated[Path, tyro.conf.Positional]  # a run's folder, or its .mcap file
+MethodName = Literal["fem", "winkler", "naive"]
+
+_ros_arguments: list[str] = []
+
+
+def demo(config: Annotated[DemoConfig, Flat] = DemoConfig()) -> int:
+    """Node, simulated devices and recorder on this machine; then the run against FEM, with a report.
+
+    Example: stmpl demo --frames 6 --node.method winkler
+    """
+    from stmpl_ros.demo import run
+
+    return run(config)
+
+
+def node(config: Annotated[NodeConfig, Flat] = NodeConfig()) -> int:
+    """Answers contacts with the displacement of the skin. ROS arguments may follow.
+
+    Example: stmpl node --part left_arm --edge-length 0.004 --ros-args -r __ns:=/left
+    """
+    from stmpl_ros.node import run
+
+    return run(config, _ros_arguments)
+
+
+def probe(config: Annotated[ProbeConfig, Flat] = ProbeConfig()) -> int:
+    """Simulated devices: mesh, pose and wrench along a script, on the skin of a running node.
+
+    Example: stmpl probe --scripts press --rate 500
+    """
+    from stmpl_ros.probe import run
+
+    return run(config, _ros_arguments)
+
+
+def record(config: Annotated[RecordConfig, Flat]) -> int:
+    """Records the topics of a run as MCAP until Ctrl-C.
+
+    Example: stmpl record --path runs/mine
+    """
+    from stmpl_ros.recorder import run
+
+    return run(config, _ros_arguments)
+
+
+def replay(path: BagPath, method: MethodName = "winkler", every: int = 1, as_json: Annotated[bool, tyro.conf.arg(name="json")] = False) -> int:
+    """Answers the recorded contacts again, offline, and says whether the answers are the recorded ones.
+
+    Example: stmpl replay runs/latest --every 10
+
+    Args:
+        path: a run's folder, or its .mcap file.
+        method: that answers.
+        every: take each n-th frame only.
+        as_json: print figures for machines.
+    """
+    from bags.replay import replay_run
+
+    with _waiting(f"replaying {path}", as_json):
+        summary = replay_run(path, _method(method), every=every)
+    _print_figures(vars(summary) if as_json else str(summary))
+    return 0
+
+
+def compare(path: BagPath, reference: MethodName = "fem", frames: int = 12, as_json: Annotated[bool, tyro.conf.arg(name="json")] = False) -> int:
+    """Compares a recorded run with a reference method on a sample of its frames.
+
+    Example: stmpl compare runs/latest --frames 6
+
+    Args:
+        path: a run's folder, or its .mcap file.
+        reference: that judges.
+        frames: of the run that the reference solves.
+        as_json: print figures for machines.
+    """
+    from stmpl_ros.tables import compare_with_progress, comparison_table, figures_of
+
+    comparison = compare_with_progress(path, _method(reference), frames, quiet=as_json)
+    _print_figures(figures_of(comparison) if as_json else comparison_table(comparison))
+    return 0 if comparison.passed else 1
+
+
+def info(path: BagPath, as_json: Annotated[bool, tyro.conf.arg(name="json")] = False) -> int:
+    """Says what a recording holds, finished or not.
+
+    Example: stmpl info runs/latest
+
+    Args:
+        path: a run's folder, or its .mcap file.
+        as_json: print figures for machines.
+    """
+    from bags.reader import Bag
+    from stmpl_ros.tables import bag_figures, bag_table
+
+    bag = Bag(path)
+    _print_figures(bag_figures(bag) if as_json else bag_table(bag))
+    return 0
+
+
+def recover(path: BagPath, target: Path | None = None) -> int:
+    """Brings back what is sound in a recording that was not finished.
+
+    Example: stmpl recover runs/broken/run.mcap --target runs/mended
+
+    Args:
+        path: a run's folder, or its .mcap file.
+        target: where the sound part goes.
+    """
+    from bags.recover import recover as bring_back
+
+    recovery = bring_back(path, target)
+    _print_figures(str(recovery))
+    return 0
+
+
+VERBS = {f.__name__: f for f in (demo, node, probe, record, replay, compare, info, recover)}
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Runs a verb; exits with its code, or with 1 and one sentence if it refuses."""
+    given = list(sys.argv[1:] if arguments is None else arguments)
+    if "--ros-args" in given:
+        at = given.index("--ros-args")
+        _ros_arguments[:], given = given[at:], given[:at]
+    logging.basicConfig(level=logging.INFO, format="%(levelname)s %(name)s: %(message)s")
+    try:
+        code = tyro.extras.subcommand_cli_from_dict(VERBS, prog="stmpl", description=__doc__, args=given)
+    except StmplError as error:
+        from rich.console import Console
+
+        Console(stderr=True).print(f"[red]stmpl:[/red] {error}", highlight=False)
+        code = 1
+    except KeyboardInterrupt:
+        code = 130
+    sys.exit(code)
+
+
+def _method(name: MethodName) -> Method:
+    if name == "fem":
+        from fem_tools import PatchFem
+
+        return PatchFem()
+    from stmpl_core.methods import Naive, Winkler
+
+    return {"winkler": Winkler, "naive": Naive}[name]()
+
+
+def _waiting(what: str, quiet: bool):
+    from rich.console import Console
+
+    return Console(stderr=True, quiet=quiet).status(what)
+
+
+def _print_figures(shown: object) -> None:
+    from rich.console import Console
+
+    if isinstance(shown, dict):
+        sys.stdout.write(json.dumps(shown, indent=2, default=str) + "\n")
+    else:
+        Console().print(shown)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,156 @@
+"""The main job on one machine: node, simulated devices and recorder as processes, then the run against FEM."""
+
+from __future__ import annotations
+
+import json
+import logging
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from datetime import datetime
+from pathlib import Path
+
+from rich.console import Console
+
+from bags.compare import Comparison
+from bags.provenance import versions
+from stmpl_core.errors import StmplError
+from stmpl_ros.parameters import DemoConfig, ProbeConfig
+from stmpl_ros.tables import compare_with_progress, comparison_table
+
+log = logging.getLogger(__name__)
+
+LONGEST = 600.0  # s until the devices must be done: a first start compiles kernels
+TO_STOP = 20.0  # s that a process gets to end after SIGINT
+LOOK = 0.1  # s
+LEAST_RATE = 100.0  # Hz at which contacts must have come
+LEAST_KEPT = 0.9  # of the contacts must have been answered
+
+
+class DemoError(StmplError):
+    """A part of the demo did not start, did not end, or left something out."""
+
+
+def run(config: DemoConfig) -> int:
+    """Runs all of it; 0 only if everything is there and sane. Raises DemoError with what is not."""
+    console = Console()
+    folder = config.runs / datetime.now().strftime("%Y-%m-%d_%H-%M-%S")
+    folder.mkdir(parents=True)
+    made_by = config.model_dump(mode="json") | {"versions": versions()}
+    (folder / "config.json").write_text(json.dumps(made_by, indent=2) + "\n")
+    console.print(f"run folder: {folder}")
+    play(config, folder, console)
+    _point_latest_at(folder)
+
+    from bags.report import write_report
+    from fem_tools import PatchFem
+
+    comparison = compare_with_progress(folder, PatchFem(), config.frames)
+    report = write_report(comparison, folder / "report.html")
+    console.print(comparison_table(comparison))
+    console.print(f"report: {report.resolve()}")
+    missing = list(complaints(folder, comparison))
+    for complaint in missing:
+        console.print(f"[red]not as it should be:[/red] {complaint}")
+    return int(bool(missing))
+
+
+def play(config: DemoConfig, folder: Path, console: Console) -> None:
+    """Starts the three processes, waits until the devices are done, and stops the others. Raises DemoError."""
+    environment = os.environ | {
+        "ROS_DOMAIN_ID": str(1 + os.getpid() % 100),  # a bus of its own, on this machine only
+        "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
+        "PYTHONUNBUFFERED": "1",
+    }
+    with (
+        _process("record", ["--path", str(folder), "--run", str(folder / "config.json")], folder, environment) as recorder,
+        _process("node", config.node.ros_arguments(), folder, environment) as node,
+        _process("probe", _probe_flags(config.probe), folder, environment) as probe,
+    ):
+        with console.status("starting") as status:
+            _wait(probe, {"node": node, "record": recorder}, folder, status)
+        # the node says that the skin is at rest again once nothing has come for a while
+        time.sleep(config.node.rest_after + 0.5)
+        _stop(recorder, "record", folder)
+        _stop(node, "node", folder)
+
+
+def complaints(folder: Path, comparison: Comparison) -> Iterator[str]:
+    """What of a run is missing or not sane, one sentence each."""
+    for name in ("run.mcap", "metadata.yaml", "report.html", "config.json"):
+        path = folder / name
+        if not path.is_file() or not path.stat().st_size:
+            yield f"{path} is missing or empty"
+    timing = comparison.run.timing
+    first = min(moment.sequence for moment in comparison.run.moments)
+    if first or timing.lost:
+        yield f"{first + timing.lost} answers are not in the recording"
+    if not timing.instant_rate >= 0.95 * LEAST_RATE:
+        yield f"contacts came at {timing.instant_rate:.0f} Hz; at least {LEAST_RATE:g} Hz was asked for"
+    if timing.kept < LEAST_KEPT:
+        yield f"{100 * timing.kept:.0f} % of the contacts were answered; at least {100 * LEAST_KEPT:g} % should be"
+    if not comparison.passed:
+        yield comparison.verdict
+    if max(moment.peak for moment in comparison.run.moments) <= 0:
+        yield "nothing moved"
+
+
+def _probe_flags(config: ProbeConfig) -> list[str]:
+    return [
+        "--scripts", *config.scripts,
+        "--rate", str(config.rate),
+        "--listeners", str(config.listeners),
+        "--patience", str(config.patience),
+    ]  # fmt: skip
+
+
+@contextmanager
+def _process(verb: str, arguments: list[str], folder: Path, environment: dict[str, str]) -> Iterator[subprocess.Popen]:
+    """A verb as a process that logs into the run's folder; killed if it is still there at the end."""
+    command = [sys.executable, "-m", "stmpl_ros.cli", verb, *arguments]
+    with open(folder / f"{verb}.log", "wb") as out:
+        process = subprocess.Popen(command, env=environment, stdout=out, stderr=subprocess.STDOUT)
+    try:
+        yield process
+    finally:
+        if process.poll() is None:
+            process.kill()
+        process.wait()
+
+
+def _wait(probe: subprocess.Popen, others: dict[str, subprocess.Popen], folder: Path, status) -> None:
+    deadline = time.monotonic() + LONGEST
+    while probe.poll() is None:
+        for name, process in others.items():
+            if process.poll() is not None:
+                raise DemoError(f"{name} ended early with code {process.returncode}:\n{_tail(folder, name)}")
+        if time.monotonic() > deadline:
+            raise DemoError(f"the devices were not done after {LONGEST:g} s:\n{_tail(folder, 'probe')}")
+        status.update(_tail(folder, "probe", lines=1) or _tail(folder, "node", lines=1) or "starting")
+        time.sleep(LOOK)
+    if probe.returncode:
+        raise DemoError(f"probe ended with code {probe.returncode}:\n{_tail(folder, 'probe')}")
+
+
+def _stop(process: subprocess.Popen, name: str, folder: Path) -> None:
+    process.send_signal(signal.SIGINT)
+    try:
+        code = process.wait(TO_STOP)
+    except subprocess.TimeoutExpired as error:
+        raise DemoError(f"{name} did not end within {TO_STOP:g} s of SIGINT:\n{_tail(folder, name)}") from error
+    if code:
+        raise DemoError(f"{name} ended with code {code}:\n{_tail(folder, name)}")
+
+
+def _tail(folder: Path, name: str, lines: int = 15) -> str:
+    return "\n".join((folder / f"{name}.log").read_text(errors="replace").splitlines()[-lines:])
+
+
+def _point_latest_at(folder: Path) -> None:
+    latest = folder.parent / "latest"
+    latest.unlink(missing_ok=True)
+    latest.symlink_to(folder.name)

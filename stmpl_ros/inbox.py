@@ -1,0 +1,115 @@
+"""Inbox: the newest mesh, pose and wrench of every tool, and when an instant is complete."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+from bags.messages import wrench_from
+from stmpl_core.arrays import Transform
+from stmpl_core.contact import Contact, ToolMesh
+
+PATIENCE = 3  # poses that may pass a missing partner before the newest of each is taken as it is
+
+
+@dataclass
+class Stream:
+    """One topic's newest value, its stamp [ns] and when it came (on the receiver's clock) [ns]."""
+
+    value: Any = None
+    stamp: int = 0
+    came: int = 0
+
+    def live(self, now: int, rest_after: int) -> bool:
+        """Whether something came within the last `rest_after` nanoseconds."""
+        return self.value is not None and now - self.came <= rest_after
+
+
+@dataclass
+class Tool:
+    """What is known of one tool."""
+
+    mesh: ToolMesh
+    pose: Stream = field(default_factory=Stream)
+    wrench: Stream = field(default_factory=Stream)
+
+
+@dataclass(frozen=True)
+class Instant:
+    """Contacts to answer together, the stamp of the newest pose among them, and how far their stamps lie apart [ns]."""
+
+    contacts: list[Contact]
+    stamp: int
+    skew: int
+
+
+class Inbox:
+    """Keeps the newest of everything and hands out instants.
+
+    An instant is complete when the newest pose and wrench of every live tool carry one stamp. Devices whose clocks
+    never agree would then never be answered: after `PATIENCE` poses without a complete instant every pose is answered
+    with the newest of the rest, until an instant is complete again.
+
+    Args:
+        body_frame: frame that poses are in.
+        rest_after: a stream that is silent for longer than this is no longer live [ns].
+    """
+
+    def __init__(self, body_frame: str, rest_after: int) -> None:
+        self.body_frame = body_frame
+        self.rest_after = rest_after
+        self.tools: dict[str, Tool] = {}
+        self.out_of_order = 0
+        self.waiting: set[str] = set()  # tools whose newest pose was not handed out yet
+        self.missed = 0
+
+    def put_mesh(self, name: str, mesh: ToolMesh) -> None:
+        """Keeps the mesh of a tool, new or changed."""
+        if name in self.tools:
+            self.tools[name].mesh = mesh
+        else:
+            self.tools[name] = Tool(mesh)
+
+    def put_pose(self, name: str, pose: Transform, stamp: int, now: int) -> bool:
+        """Keeps a pose; False if it was dropped as repeated or out of order."""
+        if not self._put(self.tools[name].pose, pose, stamp, now):
+            return False
+        self.missed += name in self.waiting
+        self.waiting.add(name)
+        return True
+
+    def put_wrench(self, name: str, wrench: Any, stamp: int, now: int) -> bool:
+        """Keeps a WrenchStamped; False if it was dropped as repeated or out of order."""
+        return self._put(self.tools[name].wrench, wrench, stamp, now)
+
+    def _put(self, stream: Stream, value: Any, stamp: int, now: int) -> bool:
+        if stream.live(now, self.rest_after) and stamp <= stream.stamp:
+            self.out_of_order += 1
+            return False
+        stream.value, stream.stamp, stream.came = value, stamp, now
+        return True
+
+    def live(self, now: int) -> dict[str, Tool]:
+        """The tools whose pose came lately."""
+        return {name: tool for name, tool in self.tools.items() if tool.pose.live(now, self.rest_after)}
+
+    def take(self, now: int) -> Instant | None:
+        """What is to be answered now, each instant once; None while there is nothing new or something is to come."""
+        live = self.live(now)
+        if not self.waiting & live.keys():
+            return None
+        poses = [tool.pose.stamp for tool in live.values()]
+        stamps = poses + [tool.wrench.stamp for tool in live.values() if tool.wrench.live(now, self.rest_after)]
+        skew = max(stamps) - min(stamps)
+        if skew and self.missed < PATIENCE:
+            return None
+        self.missed = self.missed if skew else 0
+        self.waiting.clear()
+        return Instant([self._contact(name, tool, now) for name, tool in live.items()], max(poses), skew)
+
+    def _contact(self, name: str, tool: Tool, now: int) -> Contact:
+        pose = tool.pose.value
+        if not tool.wrench.live(now, self.rest_after):
+            return Contact(name, tool.mesh, pose)
+        wrench = wrench_from(tool.wrench.value, body_frame=self.body_frame, tool=name, pose_body_from_tool=pose)
+        return Contact(name, tool.mesh, pose, wrench)

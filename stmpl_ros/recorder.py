@@ -1,0 +1,141 @@
+"""Recorder: writes the topics of a run, as they come over the wire, into an MCAP file."""
+
+from __future__ import annotations
+
+import importlib
+import json
+import logging
+import queue
+import re
+import threading
+import time
+from typing import Any
+
+import rclpy
+from rclpy.event_handler import SubscriptionEventCallbacks
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+
+from bags.provenance import write_provenance
+from bags.writer import BagWriter, qos_yaml
+from stmpl_core.errors import BagError
+from stmpl_ros.parameters import RecordConfig
+from stmpl_ros.spinning import ros, spin
+
+log = logging.getLogger(__name__)
+
+WANTED = re.compile(r"(contact_mesh|skin/topology|skin/displacement|tools/\w+/(pose|wrench))$|^/diagnostics$")
+LOOK = 0.1  # s between two looks for new topics
+DEPTH = 1000  # messages that may wait while the disk is busy
+DRAIN = 0.5  # s in which what is still on its way is taken, after being asked to stop
+
+
+class RecorderNode(Node):
+    """Subscribes to every topic of a run as soon as it is announced, and hands the bytes to a thread that writes.
+
+    Topics count when they lie in this node's namespace. Nothing is decoded.
+    """
+
+    def __init__(self, writer: BagWriter, stop: threading.Event) -> None:
+        super().__init__("recorder")
+        self.writer, self._stop = writer, stop
+        self.received = self.lost = 0
+        self.error: BagError | None = None
+        self._channels: dict[str, int] = {}
+        self._queue: queue.SimpleQueue[tuple[str, str, str, bytes, int, int] | None] = queue.SimpleQueue()
+        self._thread = threading.Thread(target=self._write, name="writer")
+        self._thread.start()
+        self._subscribed: set[str] = set()
+        self.create_timer(LOOK, self._look)
+
+    def _look(self) -> None:
+        own = self.get_namespace().rstrip("/") + "/"
+        for topic, types in self.get_topic_names_and_types():
+            inside = topic.startswith(own) or topic == "/diagnostics"
+            if inside and topic not in self._subscribed and WANTED.search(topic) and self.count_publishers(topic):
+                self._subscribed.add(topic)
+                self._subscribe(topic, types[0])
+
+    def _subscribe(self, topic: str, type_name: str) -> None:
+        package, _, name = type_name.split("/")
+        offered = [info.qos_profile for info in self.get_publishers_info_by_topic(topic)]
+        reliable = all(qos.reliability == ReliabilityPolicy.RELIABLE for qos in offered)
+        kept = all(qos.durability == DurabilityPolicy.TRANSIENT_LOCAL for qos in offered)
+        profile = QoSProfile(
+            depth=DEPTH,
+            reliability=ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT,
+            durability=DurabilityPolicy.TRANSIENT_LOCAL if kept else DurabilityPolicy.VOLATILE,
+        )
+        qos = qos_yaml(depth=max((o.depth for o in offered), default=10) or 10, reliable=reliable, transient_local=kept)
+
+        def keep(data: bytes, info: dict[str, Any]) -> None:
+            self.received += 1
+            self._queue.put((topic, type_name, qos, data, time.time_ns(), info["source_timestamp"]))
+
+        self.create_subscription(
+            getattr(importlib.import_module(f"{package}.msg"), name),
+            topic,
+            keep,
+            profile,
+            raw=True,
+            event_callbacks=SubscriptionEventCallbacks(message_lost=self._on_lost),
+        )
+        self.get_logger().info(f"recording {topic} ({type_name})")
+
+    def _on_lost(self, status: Any) -> None:
+        self.lost += status.total_count_change
+        self.get_logger().error(f"{status.total_count_change} messages were lost on the way", throttle_duration_sec=1.0)
+
+    def _write(self) -> None:
+        try:
+            while (item := self._next()) is not None:
+                topic, type_name, qos, data, received, sent = item
+                if topic not in self._channels:
+                    self._channels[topic] = self.writer.add_channel(topic, type_name, qos)
+                self.writer.write(self._channels[topic], data, received, sent)
+        except BagError as error:
+            self.error = error
+            self._stop.set()
+
+    def _next(self) -> tuple[str, str, str, bytes, int, int] | None:
+        while True:
+            try:
+                return self._queue.get(timeout=1.0)
+            except queue.Empty:
+                self.writer.flush()
+
+    def finish(self) -> None:
+        """Waits until all that was received is written."""
+        self._queue.put(None)
+        self._thread.join()
+
+
+def run(config: RecordConfig, arguments: list[str] | None = None) -> int:
+    """Records until SIGINT or SIGTERM; the exit code says whether everything is on disk."""
+    made_by = json.loads(config.run.read_text()) if config.run else {}
+    with ros(arguments) as stop, BagWriter(config.path) as writer:
+        write_provenance(
+            writer,
+            None,
+            method=made_by.get("node", {}).get("method", ""),
+            body=made_by.get("node", {}).get("part", ""),
+            config=made_by,
+        )
+        node = RecorderNode(writer, stop)
+        executor = SingleThreadedExecutor()
+        executor.add_node(node)
+        try:
+            spin(executor, stop)
+            until = time.monotonic() + DRAIN
+            while time.monotonic() < until and rclpy.ok():
+                executor.spin_once(timeout_sec=0.05)
+        finally:
+            executor.shutdown()
+            node.finish()
+            node.destroy_node()
+        if node.error:
+            raise node.error
+        writer.add_metadata("recorder", {"received": str(node.received), "lost": str(node.lost)})
+    log.info("%d messages recorded, %d lost", node.received, node.lost)
+    return 0

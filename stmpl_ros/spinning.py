@@ -1,0 +1,42 @@
+"""Starting and stopping a ROS process: SIGINT and SIGTERM end it cleanly, from any of its threads."""
+
+from __future__ import annotations
+
+import signal
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from types import FrameType
+
+import rclpy
+from rclpy.executors import Executor, ExternalShutdownException
+from rclpy.signals import SignalHandlerOptions
+
+LOOK = 0.1  # s; how often a spinning process looks whether it is to stop
+
+
+@contextmanager
+def ros(arguments: list[str] | None = None) -> Iterator[threading.Event]:
+    """ROS while inside; yields an event that SIGINT and SIGTERM set. rclpy's own handlers stay out of the way."""
+    stop = threading.Event()
+
+    def ask(_signal: int, _frame: FrameType | None) -> None:
+        stop.set()
+
+    before = {number: signal.signal(number, ask) for number in (signal.SIGINT, signal.SIGTERM)}
+    rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO)
+    try:
+        yield stop
+    finally:
+        rclpy.try_shutdown()
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def spin(executor: Executor, stop: threading.Event) -> None:
+    """Runs callbacks until `stop` is set or ROS shuts down."""
+    try:
+        while not stop.is_set() and rclpy.ok():
+            executor.spin_once(timeout_sec=LOOK)
+    except ExternalShutdownException:
+        pass
