@@ -90,6 +90,12 @@ class Bag:
         for recorded in self.messages(lambda name: name == topic):
             yield frame_from(recorded.message, recorded.log_time_ns)
 
+    def check_layer(self, frame: Frame) -> None:
+        """Raises BagError if `frame` answers for another layer than the bag's."""
+        if frame.layer_id != self.layer_id:
+            raise BagError(f"answer {frame.sequence} is for layer {frame.layer_id}, the bag holds {self.layer_id}. "
+                           "A run whose layer was changed cannot be read as one; record one layer a bag.")
+
     @cached_property
     def provenance(self) -> Provenance:
         """What made the run; empty if the bag does not say."""

@@ -11,7 +11,6 @@ import numpy as np
 from bags.messages import Frame
 from bags.provenance import versions
 from bags.reader import Bag, ContactLog
-from stmpl_core.errors import BagError
 from stmpl_core.methods.base import Method
 from stmpl_core.simulator import Simulator
 from stmpl_core.trust import Displacement
@@ -75,9 +74,7 @@ def replay(path: Path | str, method: Method, *, every: int = 1) -> Iterator[Repl
     simulator = Simulator(bag.layer, method)
     for number, frame in enumerate(bag.frames()):
         if number % every == 0:
-            if frame.layer_id != bag.layer_id:
-                raise BagError(f"frame {frame.sequence} answers for layer {frame.layer_id}, the bag holds "
-                               f"{bag.layer_id}. A run whose layer was changed cannot be replayed as one.")
+            bag.check_layer(frame)
             yield Replayed(frame, simulator.step(contacts.at(frame)))
 
 

@@ -96,6 +96,7 @@ def survey(path: Path | str) -> Survey:
     moments: list[Moment] = []
     first, method = 0, ""
     for frame in bag.frames():
+        bag.check_layer(frame)
         first, method = first or frame.stamp_ns, method or frame.method
         moments.append(_moment(frame, (frame.stamp_ns - first) * NANO, area, _latency(frame, contacts)))
     if not moments:

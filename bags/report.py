@@ -1,0 +1,317 @@
+"""Report: one self-contained HTML page on a compared run: figures, pictures, timeline, latency, trust, origin."""
+
+from __future__ import annotations
+
+import html
+import json
+from base64 import b64encode
+from collections.abc import Sequence
+from io import BytesIO
+from pathlib import Path
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from bags.compare import Comparison, FramePair
+from bags.pictures import (
+    DIFFERENCE,
+    MM,
+    SKIN,
+    Spot,
+    draw_cut,
+    draw_skin,
+    draw_tool,
+    limb_axis,
+    scale,
+    spot_of,
+    view_along,
+)
+from bags.replay import ReplaySummary
+from stmpl_core.errors import BagError
+from stmpl_core.metrics import mean_and_deviation
+from stmpl_core.trust import Trust
+
+INK, OURS, TRUTH, WARN = "#2b2b2b", "#c1440e", "#1f4e79", "#f6c667"
+ROOM = 2.6  # half width of a close-up, in radii of the contact
+CLOSEST = 0.02  # m; no close-up is narrower on each side
+
+STYLE = """
+body { font: 15px/1.45 system-ui, sans-serif; color: #2b2b2b; max-width: 1120px; margin: 2em auto; padding: 0 1em; }
+h1 { font-size: 1.5em; } h2 { font-size: 1.15em; margin-top: 2em; }
+table { border-collapse: collapse; margin: .6em 0; } td, th { padding: .22em .8em; text-align: right; }
+th { border-bottom: 1px solid #999; font-weight: 600; } td:first-child, th:first-child { text-align: left; }
+tr:nth-child(even) td { background: #f6f4f1; } img { max-width: 100%; }
+pre { background: #f6f4f1; padding: 1em; overflow: auto; }
+.verdict { padding: .6em 1em; border-left: 5px solid; } .good { border-color: #3a7d44; } .bad { border-color: #b3261e; }
+.note { color: #666; font-size: .92em; }
+"""
+
+
+def headline(comparison: Comparison) -> list[tuple[str, str]]:
+    """The rows of the headline table: what is measured, and its value with unit."""
+    timing = comparison.run.timing
+    rows = [
+        ("method", comparison.method),
+        ("reference", comparison.reference),
+        ("contact instants", f"{timing.instants} at {timing.instant_rate:.1f} Hz"),
+        ("answers", f"{timing.answers} at {timing.answer_rate:.1f} Hz"),
+        ("rate kept", f"{100 * timing.kept:.2f} % ({timing.skipped} instants overtaken by newer ones)"),
+        ("answers lost", f"{timing.lost}"),
+        ("latency, median", f"{1e3 * timing.latency(50):.2f} ms"),
+        ("latency, 99 %", f"{1e3 * timing.latency(99):.2f} ms"),
+        ("frames compared", f"{len(comparison.judged)} of {len(comparison.pairs) + len(comparison.failed)} sampled"),
+    ]
+    if not comparison.judged:
+        return rows
+    mean, deviation = mean_and_deviation([pair.score for pair in comparison.judged])
+    pairs = zip(mean.row().items(), deviation.row().values(), strict=True)
+    return rows + [_figure_row(name, value, spread) for (name, value), spread in pairs]
+
+
+def write_report(comparison: Comparison, path: Path | str, *, replay: ReplaySummary | None = None) -> Path:
+    """Writes the page; nothing in it refers to another file.
+
+    Args:
+        comparison: with at least one frame that the reference solved.
+        path: of the .html file to write.
+        replay: how a replay of the same run went, if there was one.
+
+    Raises:
+        BagError: nothing to show, or the file cannot be written.
+    """
+    path = Path(path)
+    parts = [_opening(comparison, replay), _pressed(comparison), _timeline_part(comparison), _frames_part(comparison)]
+    page = "\n".join([*parts, _origin(comparison)])
+    try:
+        path.write_text(f"<!doctype html><html lang=en><meta charset=utf-8><title>stmpl: {_h(comparison.method)}"
+                        f"</title><style>{STYLE}</style><body>{page}</body></html>\n")  # fmt: skip
+    except OSError as error:
+        raise BagError(f"the report {path} cannot be written: {error.strerror}.") from error
+    return path
+
+
+def pressed_figures(comparison: Comparison, pair: FramePair) -> list[Figure]:
+    """Close-ups of one frame (ours, reference, difference), then the whole limb beside a cut through the contact."""
+    layer, pressure = comparison.layer, pair.frame.pressure
+    if pressure is None or not (pressure > 0).any():
+        raise BagError(f"frame {pair.frame.sequence} carries no load, so there is nothing to show.")
+    spot = spot_of(layer, pressure)
+    return [_close_ups(comparison, pair, spot), _overview(comparison, pair, spot)]
+
+
+def timeline_figure(comparison: Comparison) -> Figure:
+    """Force, depth and error over time, with stretches that are not to be trusted shaded."""
+    moments, judged = comparison.run.moments, comparison.judged
+    time = np.array([moment.time for moment in moments])
+    figure = Figure(figsize=(10.5, 6.2), layout="constrained")
+    force, depth, error = figure.subplots(3, 1, sharex=True)
+    force.plot(time, [moment.load for moment in moments], color=INK, lw=1.2)
+    force.set_ylabel("load on the skin [N]")
+    depth.plot(time, [MM * moment.peak for moment in moments], color=OURS, lw=1.2, label=comparison.method)
+    at = [pair.time for pair in judged]
+    depth.plot(at, [MM * pair.score.peak for pair in judged], "o", color=TRUTH, ms=5, label=comparison.reference)
+    depth.set_ylabel("largest displacement [mm]")
+    error.plot(at, [MM * pair.score.contact for pair in judged], "o-", color=OURS, label="mean under the contact")
+    error.plot(at, [MM * pair.score.mee for pair in judged], "s-", color=INK, label="mean where the skin moves (MEE)")
+    error.plot(at, [MM * abs(pair.score.peak_error) for pair in judged], "^-", color=TRUTH, label="at the peak")
+    error.set(ylabel="error [mm]", xlabel="time since the first answer [s]")
+    for axes in (depth, error):
+        axes.legend(frameon=False, fontsize=9)
+    for axes in (force, depth, error):
+        _shade(axes, time, ~np.array([moment.in_range for moment in moments]), WARN)
+        _shade(axes, time, ~np.array([moment.converged for moment in moments]), "#d9534f")
+        axes.set_ylim(bottom=0)
+        axes.spines[["top", "right"]].set_visible(False)
+    return figure
+
+
+def latency_figure(comparison: Comparison) -> Figure:
+    """Histogram of the latency from the last contact message to the answer."""
+    timing = comparison.run.timing
+    known = 1e3 * timing.latencies[np.isfinite(timing.latencies)]
+    figure = Figure(figsize=(10.5, 2.8), layout="constrained")
+    axes = figure.subplots()
+    top = 1.3 * max(1e3 * timing.latency(99), 1e-3) if len(known) else 1.0
+    axes.hist(np.minimum(known, top), bins=60, range=(0, top), color=TRUTH)
+    for percent, style in ((50, "-"), (99, "--")):
+        value = 1e3 * timing.latency(percent)
+        axes.axvline(value, color=OURS, ls=style, label=f"{'median' if percent == 50 else '99 %'}: {value:.2f} ms")
+    axes.set(xlabel="latency, contact message to displacement message [ms]", ylabel="answers")
+    axes.legend(frameon=False)
+    axes.spines[["top", "right"]].set_visible(False)
+    return figure
+
+
+def _close_ups(comparison: Comparison, pair: FramePair, spot: Spot) -> Figure:
+    layer, ours, truth = comparison.layer, pair.ours.displacement, pair.reference.displacement
+    view = view_along(spot.normal, limb_axis(layer), spot.centre, tilt=-50)
+    half = max(ROOM * spot.radius, CLOSEST)
+    lengths = [MM * np.linalg.norm(u, axis=1) for u in (ours, truth)]
+    off = MM * np.linalg.norm(ours - truth, axis=1)
+    moved, apart = scale(lengths, SKIN), scale([off], DIFFERENCE)
+    figure = Figure(figsize=(10.5, 4.0), layout="constrained")
+    left, middle, right = figure.subplots(1, 3)
+    panels = (
+        (left, comparison.method, ours, lengths[0], moved),
+        (middle, comparison.reference, truth, lengths[1], moved),
+        (right, "difference", ours, off, apart),
+    )
+    for axes, title, displacement, values, colours in panels:
+        draw_skin(axes, view, layer, displacement, values, colours, half_width=half)
+        axes.set_title(f"{title}\nup to {values.max():.2f} mm", fontsize=10, color=INK)
+    _ruler(left, half)
+    figure.colorbar(moved, ax=[left, middle], label="displacement [mm]", shrink=0.8, pad=0.01)
+    figure.colorbar(apart, ax=right, label="difference [mm]", shrink=0.8, pad=0.01)
+    return figure
+
+
+def _overview(comparison: Comparison, pair: FramePair, spot: Spot) -> Figure:
+    layer = comparison.layer
+    axis = limb_axis(layer)
+    centre = (layer.vertices.max(axis=0) + layer.vertices.min(axis=0)) / 2
+    length = MM * np.linalg.norm(pair.ours.displacement, axis=1)
+    colours = scale([length], SKIN)
+    figure = Figure(figsize=(10.5, 4.0), layout="constrained")
+    whole, cut = figure.subplots(1, 2, width_ratios=(1.5, 1))
+    side = np.cross(axis, spot.normal)
+    towards = side / np.linalg.norm(side) + 0.55 * spot.normal
+    view = view_along(towards / np.linalg.norm(towards), axis, centre)
+    behind = [view.project(contact.pose_body_from_tool[None, :3, 3])[0, 2] < 0 for contact in pair.contacts]
+    for contact in (c for c, hidden in zip(pair.contacts, behind, strict=True) if hidden):
+        draw_tool(whole, view, contact)
+    draw_skin(whole, view, layer, pair.ours.displacement, length, colours)
+    for contact in (c for c, hidden in zip(pair.contacts, behind, strict=True) if not hidden):
+        draw_tool(whole, view, contact)
+    whole.set_title(f"{comparison.method} and the tools, {pair.load:.2f} N", fontsize=10, color=INK)
+    figure.colorbar(colours, ax=whole, label="displacement [mm]", shrink=0.8, pad=0.01, location="left")
+    _cut(cut, comparison, pair, spot, axis)
+    return figure
+
+
+def _cut(axes: Axes, comparison: Comparison, pair: FramePair, spot: Spot, limb: np.ndarray) -> None:
+    """Across the limb where several tools press, along it where one does."""
+    layer, across = comparison.layer, len(pair.contacts) > 1
+    out = limb if across else np.cross(spot.normal, limb)
+    out = out - (out @ spot.normal) * spot.normal
+    out /= np.linalg.norm(out)
+    view = view_along(out, np.cross(spot.normal, out), spot.centre)
+    for contact in pair.contacts:
+        pose = contact.pose_body_from_tool
+        points = contact.mesh.vertices @ pose[:3, :3].T + pose[:3, 3]
+        draw_cut(axes, points, contact.mesh.faces, view, color="#9aa3ad", lw=1.2)
+    draw_cut(axes, layer.vertices, layer.faces, view, color="#b8b0a8", lw=1.0, ls=":")
+    draw_cut(axes, layer.inner_vertices, layer.faces, view, color="#b8b0a8", lw=1.0)
+    for side, colour in ((pair.reference, TRUTH), (pair.ours, OURS)):
+        draw_cut(axes, layer.vertices + side.displacement, layer.faces, view, color=colour, lw=1.6)
+    names = (("tool", "#9aa3ad"), ("skin at rest (dotted), core", "#b8b0a8"), (comparison.reference, TRUTH),
+             (comparison.method, OURS))  # fmt: skip
+    for name, colour in names:
+        axes.plot([], [], color=colour, label=name)
+    half = MM * max(ROOM * spot.radius, CLOSEST)
+    if across:
+        axes.autoscale_view()
+    else:
+        axes.set(xlim=(-half, half), ylim=(-0.8 * half, 0.5 * half))
+    axes.set_aspect("equal")
+    axes.set(xlabel="mm", ylabel="mm")
+    axes.set_title(f"cut {'across' if across else 'along'} the limb through the contact", fontsize=10, color=INK)
+    axes.legend(frameon=False, fontsize=8, loc="lower center", ncols=2, bbox_to_anchor=(0.5, -0.42))
+    axes.spines[["top", "right"]].set_visible(False)
+
+
+def _ruler(axes: Axes, half: float) -> None:
+    axes.plot([-0.9 * half * MM, -0.9 * half * MM + 10], [-0.93 * half * MM] * 2, color=INK, lw=2)
+    axes.text(-0.9 * half * MM, -0.9 * half * MM, "10 mm", fontsize=8, color=INK, va="bottom")
+
+
+def _shade(axes: Axes, time: np.ndarray, flagged: np.ndarray, colour: str) -> None:
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], flagged, [False]]).astype(int)))
+    for start, stop in edges.reshape(-1, 2):
+        axes.axvspan(float(time[start]), float(time[min(stop, len(time) - 1)]), color=colour, alpha=0.3, lw=0)
+
+
+def _opening(comparison: Comparison, replay: ReplaySummary | None) -> str:
+    kind = "good" if comparison.passed else "bad"
+    lines = [f"<h1>{_h(comparison.method)} against {_h(comparison.reference)}</h1>",
+             f"<p class='verdict {kind}'>{_h(comparison.verdict)}</p>"]  # fmt: skip
+    if replay is not None:
+        lines.append(f"<p>{_h(str(replay))}</p>")
+    if comparison.run.bag.damage or not comparison.run.bag.finished:
+        lines.append("<p class='verdict bad'>The recording is damaged or was not finished; what is sound was read.</p>")
+    lines.append(_table(("measured", "value"), headline(comparison)))
+    lines.append("<p class=note>Errors are means and standard deviations over the compared frames. MAE, MEE and the "
+                 "shares count vertices that the reference moves by more than 0.001 mm, as the STMPL paper does; most "
+                 "of them hardly move, so look at the errors under the contact and at the peak.</p>")  # fmt: skip
+    return "\n".join(lines)
+
+
+def _pressed(comparison: Comparison) -> str:
+    lines = ["<h2>The pressed limb</h2>"]
+    shown = [("Under the largest load", comparison.heaviest)]
+    if comparison.most_tools is not None and comparison.most_tools is not comparison.heaviest:
+        shown.append(("With several tools", comparison.most_tools))
+    for title, pair in shown:
+        tools = "; ".join(f"{tool}: {status}" for tool, status in pair.frame.statuses.items())
+        lines.append(f"<h3>{title}, {pair.time:.2f} s, {pair.load:.2f} N</h3><p class=note>{_h(tools)}. "
+                     "Drawn to scale, not exaggerated; both sides answer the same pressure.</p>")  # fmt: skip
+        lines += [_image(figure) for figure in pressed_figures(comparison, pair)]
+    return "\n".join(lines)
+
+
+def _timeline_part(comparison: Comparison) -> str:
+    moments = comparison.run.moments
+    outside = sum(not moment.in_range for moment in moments)
+    stopped = sum(not moment.converged for moment in moments)
+    return (f"<h2>Over time</h2>{_image(timeline_figure(comparison))}<p class=note>Yellow: outside the range that the "
+            f"method was validated on ({outside} of {len(moments)} answers); red: not converged ({stopped}).</p>"
+            f"<h2>Latency</h2>{_image(latency_figure(comparison))}")  # fmt: skip
+
+
+def _frames_part(comparison: Comparison) -> str:
+    head = ("time s", "load N", "peak reference mm", "at peak mm", "at peak %", "under contact mm", "MEE mm",
+            "answer", "reference")  # fmt: skip
+    rows = [(f"{p.time:.2f}", f"{p.load:.3f}", f"{MM * p.score.peak:.3f}", f"{MM * p.score.peak_error:+.3f}",
+             f"{100 * p.score.peak_share:+.1f}", f"{MM * p.score.contact:.3f}", f"{MM * p.score.mee:.3f}",
+             _trust(p.frame.trust), _trust(p.reference.trust)) for p in comparison.pairs]  # fmt: skip
+    failed = "".join(f"<li>answer {n}: {_h(why)}</li>" for n, why in comparison.failed.items())
+    return f"<h2>The compared frames</h2>{_table(head, rows)}{f'<p>Not solved:</p><ul>{failed}</ul>' if failed else ''}"
+
+
+def _origin(comparison: Comparison) -> str:
+    bag = comparison.run.bag
+    topics = [(t.name, t.type_name, str(t.messages)) for t in bag.topics.values()]
+    made = {"body": bag.provenance.body, "layer": repr(comparison.layer), "method": bag.provenance.method,
+            "config": bag.provenance.config, "versions": bag.provenance.versions}  # fmt: skip
+    recorded = _table(("topic", "type", "messages"), topics)
+    return (f"<h2>What was recorded</h2><p class=note>{_h(bag.file.name)}</p>{recorded}"
+            f"<h2>What made it</h2><pre>{_h(json.dumps(made, indent=2, default=str))}</pre>")  # fmt: skip
+
+
+def _trust(trust: Trust) -> str:
+    flags = {"not converged": trust.converged, "out of range": trust.in_range}
+    words = [word for word, good in flags.items() if not good]
+    bound = "" if trust.error_bound is None else f" ±{MM * trust.error_bound:.2f} mm"
+    return (", ".join(words) or "ok") + bound
+
+
+def _figure_row(name: str, value: float, spread: float) -> tuple[str, str]:
+    label, unit = name.rsplit(" ", 1)
+    digits = 1 if unit == "%" else 4
+    return (label, f"{value:.{digits}f} ± {spread:.{digits}f} {unit}")
+
+
+def _table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    top = "".join(f"<th>{_h(cell)}</th>" for cell in head)
+    body = "".join("<tr>" + "".join(f"<td>{_h(cell)}</td>" for cell in row) + "</tr>" for row in rows)
+    return f"<table><tr>{top}</tr>{body}</table>"
+
+
+def _image(figure: Figure) -> str:
+    stream = BytesIO()
+    figure.savefig(stream, format="png", dpi=130)
+    return f"<img src='data:image/png;base64,{b64encode(stream.getvalue()).decode()}' alt=''>"
+
+
+def _h(text: str) -> str:
+    return html.escape(str(text))

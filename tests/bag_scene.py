@@ -1,0 +1,145 @@
+"""A recorded run made without ROS: a tube of soft tissue, a ball and a finger, and real messages in CDR."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from bags.messages import contact_from, layer_id, tool_mesh_from
+from bags.provenance import write_provenance
+from bags.schema import find_schema, typestore_of
+from bags.writer import BagWriter, qos_yaml
+from stmpl_core import SoftLayer, Tissue
+from stmpl_core.methods.base import Method
+from stmpl_core.simulator import Simulator
+from stmpl_core.trust import Displacement
+
+TYPES = {
+    "mesh": "stmpl_msgs/msg/ContactMesh",
+    "pose": "geometry_msgs/msg/PoseStamped",
+    "wrench": "geometry_msgs/msg/WrenchStamped",
+    "topology": "stmpl_msgs/msg/SkinTopology",
+    "displacement": "stmpl_msgs/msg/SkinDisplacement",
+}
+STORE = typestore_of([(s.name, s.text) for s in map(find_schema, TYPES.values())])
+START = 1_700_000_000_000_000_000  # ns
+
+
+def message(kind: str, **values: Any) -> Any:
+    """A message of one of TYPES, or of any other type by its full name."""
+    return STORE.types[TYPES.get(kind, kind)](**values)
+
+
+def header(frame: str, stamp: int) -> Any:
+    """std_msgs/Header at `stamp` [ns]."""
+    time = message("builtin_interfaces/msg/Time", sec=stamp // 10**9, nanosec=stamp % 10**9)
+    return message("std_msgs/msg/Header", stamp=time, frame_id=frame)
+
+
+def cdr(made: Any) -> bytes:
+    """The message as it goes over the wire."""
+    return bytes(STORE.serialize_cdr(made, made.__msgtype__))
+
+
+def tube(edge: float = 6e-3, length: float = 0.16, radius: float = 0.04) -> SoftLayer:
+    """A slightly tapered tube, open at both ends, with a layer of 7.5 mm and E = 10 kPa."""
+    around, along = round(2 * np.pi * radius / edge), round(length / edge)
+    i, j = np.meshgrid(np.arange(around), np.arange(along + 1))
+    angle, z = (i + 0.5 * (j % 2)) * 2 * np.pi / around, j * length / along
+    r = radius * (1 - 0.15 * z / length)
+    vertices = np.stack([r * np.cos(angle), r * np.sin(angle), z], axis=-1).reshape(-1, 3)
+    faces = []
+    for row in range(along):
+        for k in range(around):
+            a, b = row * around + k, row * around + (k + 1) % around
+            c, d = a + around, b + around
+            faces += [[a, b, c], [b, d, c]] if row % 2 == 0 else [[a, d, c], [a, b, d]]
+    return SoftLayer(vertices.astype(np.float32), np.array(faces), np.float32(7.5e-3), tissue=Tissue(1e4, 0.4))
+
+
+def ball(radius: float = 12e-3) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices (N, 3) float32 and triangles of a ball."""
+    import trimesh
+
+    mesh = trimesh.creation.icosphere(subdivisions=3, radius=radius)
+    return mesh.vertices.astype(np.float32), mesh.faces.astype(np.uint32)
+
+
+def pose(angle: float, z: float, gap: float, stamp: int, radius: float = 12e-3) -> Any:
+    """A ball at `angle` around the tube, at height z, `gap` above its skin."""
+    r = 0.04 * (1 - 0.15 * z / 0.16) + radius + gap
+    point = message("geometry_msgs/msg/Point", x=r * np.cos(angle), y=r * np.sin(angle), z=z)
+    turn = message("geometry_msgs/msg/Quaternion", x=0.0, y=0.0, z=np.sin(angle / 2), w=np.cos(angle / 2))
+    return message("pose", header=header("body", stamp), pose=message("geometry_msgs/msg/Pose", position=point, orientation=turn))
+
+
+def wrench(tool: str, newtons: float, stamp: int) -> Any:
+    """A push of `newtons` along the tool's own -x, which points at the tube's axis."""
+    force = message("geometry_msgs/msg/Vector3", x=-newtons, y=0.0, z=0.0)
+    torque = message("geometry_msgs/msg/Vector3", x=0.0, y=0.0, z=0.0)
+    return message("wrench", header=header(tool, stamp), wrench=message("geometry_msgs/msg/Wrench", force=force, torque=torque))
+
+
+def topology(layer: SoftLayer) -> Any:
+    """The layer as SkinTopology."""
+    return message("topology", header=header("body", START), layer_id=layer_id(layer),
+                   vertices=layer.vertices.astype(np.float32).ravel(), triangles=layer.faces.astype(np.uint32).ravel(),
+                   thickness=layer.thickness.astype(np.float32), youngs_modulus=layer.tissue.youngs_modulus,
+                   poisson_ratio=layer.tissue.poisson_ratio, density=layer.tissue.density)  # fmt: skip
+
+
+def displacement(answer: Displacement, layer: SoftLayer, stamp: int, sequence: int) -> Any:
+    """An answer as SkinDisplacement."""
+    trust = answer.trust
+    pressure = np.zeros(0) if answer.pressure is None else answer.pressure
+    return message("displacement", header=header("body", stamp), layer_id=layer_id(layer), sequence=sequence,
+                   displacement=answer.displacement.astype(np.float32).ravel(), pressure=pressure.astype(np.float32),
+                   method=answer.method, converged=trust.converged, in_range=trust.in_range,
+                   error_bound=float("nan") if trust.error_bound is None else trust.error_bound, why=trust.why,
+                   tools=list(answer.statuses), statuses=list(answer.statuses.values()),
+                   solve_seconds=0.001)  # fmt: skip
+
+
+def write_run(folder: Path, method: Method, *, layer: SoftLayer | None = None, frames: int = 40, rate: float = 100.0,
+              lose: tuple[int, ...] = (), skip: tuple[int, ...] = (), delay: float = 0.002) -> Path:  # fmt: skip
+    """Records a ball that presses and slides, joined in the last third by a second one; returns the folder.
+
+    Frames in `lose` are answered but not recorded, those in `skip` are not answered at all.
+    """
+    layer = layer or tube()
+    simulator, (vertices, triangles) = Simulator(layer, method), ball()
+    tools = {"ball": 0.3, "finger": 0.3 + 2.2}
+    with BagWriter(folder) as bag:
+        write_provenance(bag, None, method=method.name, body="tube", config={"rate": rate, "frames": frames})
+        kept = qos_yaml(transient_local=True)
+        channels = {kind: bag.add_channel(f"/stmpl/{name}", TYPES[kind], kept if kind in ("topology", "mesh") else qos_yaml())
+                    for kind, name in (("topology", "skin/topology"), ("mesh", "contact_mesh"),
+                                       ("displacement", "skin/displacement"))}  # fmt: skip
+        bag.write(channels["topology"], cdr(topology(layer)), START, START)
+        meshes = {}
+        for tool in tools:
+            sent = message("mesh", header=header(tool, START), vertices=vertices.ravel(), triangles=triangles.ravel())
+            bag.write(channels["mesh"], cdr(sent), START, START)
+            meshes[tool] = tool_mesh_from(sent)
+            for kind in ("pose", "wrench"):
+                channels[tool, kind] = bag.add_channel(f"/stmpl/tools/{tool}/{kind}", TYPES[kind], qos_yaml())
+        sequence = 0
+        for k in range(frames):
+            stamp = START + round((k + 1) * 1e9 / rate)
+            contacts, push = [], 0.4 * np.sin(np.pi * min(3 * k / frames, 1.0) / 2)
+            for tool, angle in list(tools.items())[: 1 if k < 2 * frames // 3 else 2]:
+                newtons = push if tool == "ball" else 0.3 * (3 * k / frames - 2)
+                sent = pose(angle, 0.06 + 0.03 * k / frames, -0.5e-3 if newtons else 5e-3, stamp), wrench(tool, newtons, stamp)
+                for kind, made in zip(("pose", "wrench"), sent, strict=True):
+                    bag.write(channels[tool, kind], cdr(made), stamp + 100_000, stamp)
+                contacts.append(contact_from(tool, meshes[tool], *sent, body_frame="body"))
+            if k in skip:
+                continue
+            answer = simulator.step(contacts)
+            if k not in lose:
+                received = stamp + 100_000 + round(delay * 1e9)
+                bag.write(channels["displacement"], cdr(displacement(answer, layer, stamp, sequence)), received, received)
+            sequence += 1
+    return folder
