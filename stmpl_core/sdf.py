@@ -24,7 +24,7 @@ MARGIN = 5e-3  # m of grid around the tool
 FINEST = 1e-4  # m; no finer grid pays
 COARSE = 3  # the grid far from the surface is this many times coarser
 BAND = 3  # within this many cells of the surface the distances are exact
-BAND_NODES = 50_000  # about what the default spacing spends on the band: half a second for 5,000 triangles
+BAND_NODES = 40_000  # about what the default spacing spends on the band: half a second for 5,000 triangles
 MAX_NODES = 3_000_000  # 24 MB
 
 
@@ -35,7 +35,7 @@ class SignedDistance:
     Nodes within three cells of the surface hold exact distances, signed by the fast winding number (Barill et al.
     2018), so that open or slightly broken meshes have an inside too; the others are interpolated from a grid three
     times coarser. Smooth faces are met to about spacing^2 / radius / 100, edges and corners are rounded by about
-    a tenth of the spacing; `surface_error` is what was measured on this mesh. Outside the grid the answer is
+    a sixth of the spacing; `surface_error` is what was measured on this mesh. Outside the grid the answer is
     sqrt(|x - c|^2 + d(c)^2), c the nearest point of the grid: continuous, and never more than the true distance,
     because the tool lies inside the (convex) grid.
 
@@ -81,12 +81,13 @@ class SignedDistance:
             raise InvalidInput(f"spacing is {spacing} m; it must be finite and above 0.")
         coarse = np.ceil((extent + 2 * margin) / (COARSE * spacing)).astype(int) + 2  # nodes each way
         shape = COARSE * (coarse - 1) + 1
-        if np.prod(shape.astype(float)) > MAX_NODES:
-            raise InvalidInput(f"a grid of {spacing * 1e3:.3g} mm has {np.prod(shape.astype(float)):.3g} nodes; at most "
-                               f"{MAX_NODES:,} fit. Try a larger spacing, or None.")
+        nodes = float(np.prod(shape.astype(float)))
+        if nodes > MAX_NODES:
+            raise InvalidInput(f"a grid of {spacing * 1e3:.3g} mm has {nodes:.3g} nodes; at most {MAX_NODES:.3g} fit. "
+                               "Try a larger spacing, or None.")
         origin = low + extent / 2 - spacing * (shape - 1) / 2
         values = _node_distances(vertices, faces, origin, spacing, shape)
-        coefficients = ndimage.spline_filter(values, order=3, mode="mirror")
+        coefficients = np.asarray(ndimage.spline_filter(values, order=3, mode="mirror"))
         probes = np.concatenate([used, vertices[faces].mean(axis=1)])
         error = float(np.abs(_distances(coefficients, origin, spacing, probes)).max())
         return cls(coefficients, origin, spacing, watertight, flipped, error, (low, low + extent))
@@ -124,11 +125,11 @@ def _checked(mesh: ToolMesh) -> tuple[Points, np.ndarray, bool, bool]:
                         "Is its mesh in millimetres? Scale it by 1e-3.")
     if extent < MIN_EXTENT:
         raise MeshError(f"the tool is {extent:.2g} m wide; at least {MIN_EXTENT:g} m is needed. Is its mesh in metres?")
+    watertight = _is_closed(vertices, faces)
     area = _face_areas(vertices, faces)
     faces = faces[area > 1e-12 * area.max()].astype(np.int64)
     if not len(faces) or area.max() < 1e-12:
         raise MeshError(f"the tool's largest face has {area.max():.2g} m2: there is no surface to touch with.")
-    watertight = _is_closed(vertices, faces)
     corners = vertices[faces] - vertices[faces].mean(axis=(0, 1))
     volume = float(np.einsum("ij,ij->", corners[:, 0], np.cross(corners[:, 1], corners[:, 2]))) / 6
     flipped = watertight and volume < 0
@@ -158,11 +159,11 @@ def _node_distances(vertices: Points, faces: np.ndarray, origin: np.ndarray, h: 
     """Distances at all nodes (I, J, K) [m]: exact in the band around the surface, from the coarse grid elsewhere."""
     def exact(index: np.ndarray) -> np.ndarray:
         kind = igl.SignedDistanceType.SIGNED_DISTANCE_TYPE_FAST_WINDING_NUMBER
-        return igl.signed_distance(origin + h * index, vertices, faces, kind)[0]
+        return np.asarray(igl.signed_distance(origin + h * index, vertices, faces, kind)[0])
 
     index = np.stack(np.meshgrid(*(np.arange(0, n, COARSE) for n in shape), indexing="ij"), axis=-1)
     coarse = exact(index.reshape(-1, 3).astype(float)).reshape(index.shape[:3])
-    values = ndimage.zoom(coarse, shape / np.array(coarse.shape), order=3, mode="mirror")
+    values = np.asarray(ndimage.zoom(coarse, tuple(shape / np.array(coarse.shape)), order=3, mode="mirror"))
     band = np.argwhere(np.abs(values) < BAND * h)
     values[tuple(band.T)] = exact(band.astype(float))
     return values
@@ -175,15 +176,14 @@ def _cubic(f):
     return g * g * g / 6, (4 - 6 * f * f + 3 * f * f * f) / 6, (4 - 6 * g * g + 3 * g * g * g) / 6, f * f * f / 6
 
 
-@numba.njit(cache=True, inline="always")
-def _cubic_slope(f):
+@numba.njit(cache=True)
+def _weights(f, out):
+    """Weights (3, 4) of the four B-splines at fraction f of a cell, and of their first and second derivatives."""
     g = 1.0 - f
-    return -g * g / 2, (3 * f * f - 4 * f) / 2, (4 * g - 3 * g * g) / 2, f * f / 2
-
-
-@numba.njit(cache=True, inline="always")
-def _cubic_bend(f):
-    return 1.0 - f, 3 * f - 2, 1 - 3 * f, f
+    out[0, 0], out[0, 1] = g * g * g / 6, (4 - 6 * f * f + 3 * f * f * f) / 6
+    out[0, 2], out[0, 3] = (4 - 6 * g * g + 3 * g * g * g) / 6, f * f * f / 6
+    out[1, 0], out[1, 1], out[1, 2], out[1, 3] = -g * g / 2, (3 * f * f - 4 * f) / 2, (4 * g - 3 * g * g) / 2, f * f / 2
+    out[2, 0], out[2, 1], out[2, 2], out[2, 3] = g, 3 * f - 2, 3 * g - 2, f
 
 
 @numba.njit(cache=True, inline="always")
@@ -225,52 +225,66 @@ def _distances(coefficients, origin, spacing, points):
 def _jets(coefficients, origin, spacing, points):
     """Distance, gradient and Hessian at each point; outside the grid those of sqrt(|x - c|^2 + d(c)^2)."""
     value, gradient, hessian = np.empty(len(points)), np.empty((len(points), 3)), np.empty((len(points), 3, 3))
-    first, fraction, away, free = np.empty(3, np.int64), np.empty(3), np.empty(3), np.empty(3)
+    first, weights, away, free = np.empty(3, np.int64), np.empty((3, 3, 4)), np.empty(3), np.empty(3)
     for n in range(len(points)):
+        g, h = gradient[n], hessian[n]
+        outside = 0.0
         for axis in range(3):
             u = (points[n, axis] - origin[axis]) / spacing
-            first[axis], inside, fraction[axis] = _cell(u, coefficients.shape[axis])
+            first[axis], inside, fraction = _cell(u, coefficients.shape[axis])
+            _weights(fraction, weights[axis])
             away[axis] = spacing * (u - inside)
             free[axis] = 1.0 if abs(away[axis]) < 1e-12 else 0.0
-        d, g, h = _spline_jet(coefficients, spacing, first, fraction)
-        if free.sum() < 3:
-            root = np.sqrt((away * away).sum() + d * d)
-            slope = (away + d * free * g) / root
-            for p in range(3):
-                for q in range(3):
-                    own = free[p] * free[q] * (g[p] * g[q] + d * h[p, q]) + (1 - free[p] if p == q else 0.0)
-                    hessian[n, p, q] = (own - slope[p] * slope[q]) / root
-            value[n], gradient[n] = root, slope
-        else:
-            value[n], gradient[n], hessian[n] = d, g, h
+            outside += away[axis] * away[axis]
+        value[n] = _spline_jet(coefficients, spacing, first, weights, g, h)
+        if outside > 1e-24:
+            value[n] = _outside_jet(value[n], outside, away, free, g, h)
     return value, gradient, hessian
 
 
 @numba.njit(cache=True)
-def _spline_jet(coefficients, spacing, first, fraction):
-    """The spline's value, gradient and Hessian in the cell that starts at node `first`."""
-    a, b, c = _cubic(fraction[0]), _cubic(fraction[1]), _cubic(fraction[2])
-    a1, b1, c1 = _cubic_slope(fraction[0]), _cubic_slope(fraction[1]), _cubic_slope(fraction[2])
-    a2, b2, c2 = _cubic_bend(fraction[0]), _cubic_bend(fraction[1]), _cubic_bend(fraction[2])
-    d, g, h = 0.0, np.zeros(3), np.zeros((3, 3))
+def _outside_jet(d, outside, away, free, g, h):
+    """Turns the jet at the nearest point of the grid into that of r = sqrt(|x - c|^2 + d(c)^2); returns r."""
+    root = np.sqrt(outside + d * d)
+    for p in range(3):
+        for q in range(3):
+            h[p, q] = free[p] * free[q] * (g[p] * g[q] + d * h[p, q])
+        h[p, p] += 1.0 - free[p]
+    for p in range(3):
+        g[p] = (away[p] + d * free[p] * g[p]) / root
+    for p in range(3):
+        for q in range(3):
+            h[p, q] = (h[p, q] - g[p] * g[q]) / root
+    return root
+
+
+@numba.njit(cache=True)
+def _spline_jet(coefficients, spacing, first, w, g, h):
+    """Writes the spline's gradient and Hessian in the cell that starts at node `first`; returns its value."""
+    d = gx = gy = gz = hxx = hyy = hzz = hxy = hxz = hyz = 0.0
     for p in range(4):
         for q in range(4):
-            line = coefficients[first[0] + p, first[1] + q]
             s = s1 = s2 = 0.0
             for r in range(4):
-                value = line[first[2] + r]
-                s += c[r] * value
-                s1 += c1[r] * value
-                s2 += c2[r] * value
-            d += a[p] * b[q] * s
-            g[0] += a1[p] * b[q] * s
-            g[1] += a[p] * b1[q] * s
-            g[2] += a[p] * b[q] * s1
-            h[0, 0] += a2[p] * b[q] * s
-            h[1, 1] += a[p] * b2[q] * s
-            h[2, 2] += a[p] * b[q] * s2
-            h[0, 1] += a1[p] * b1[q] * s
-            h[0, 2] += a1[p] * b[q] * s1
-            h[1, 2] += a[p] * b1[q] * s1
-    h[1, 0], h[2, 0], h[2, 1] = h[0, 1], h[0, 2], h[1, 2]
-    return d, g / spacing, h / spacing**2
+                value = coefficients[first[0] + p, first[1] + q, first[2] + r]
+                s += w[2, 0, r] * value
+                s1 += w[2, 1, r] * value
+                s2 += w[2, 2, r] * value
+            a, a1, b, b1 = w[0, 0, p], w[0, 1, p], w[1, 0, q], w[1, 1, q]
+            d += a * b * s
+            gx += a1 * b * s
+            gy += a * b1 * s
+            gz += a * b * s1
+            hxx += w[0, 2, p] * b * s
+            hyy += a * w[1, 2, q] * s
+            hzz += a * b * s2
+            hxy += a1 * b1 * s
+            hxz += a1 * b * s1
+            hyz += a * b1 * s1
+    g[0], g[1], g[2] = gx / spacing, gy / spacing, gz / spacing
+    square = spacing * spacing
+    h[0, 0], h[1, 1], h[2, 2] = hxx / square, hyy / square, hzz / square
+    h[0, 1] = h[1, 0] = hxy / square
+    h[0, 2] = h[2, 0] = hxz / square
+    h[1, 2] = h[2, 1] = hyz / square
+    return d

@@ -31,6 +31,7 @@ HOLE = 0.6  # of an edge: a tool that comes this near to a vertex cannot slip be
 STEEPEST = 2.0  # slope of the skin at a tool's edge: depth grows this much per unit of depth into the tool
 DEEPEST = 0.9  # of the thickness; columns are not pressed further
 NEARLY = 1e-6  # m; nearer than this is touching
+FACING = 0.1  # cosine between push and inward normal from which the skin faces a tool that looks for it
 ONE_SIDED = 0.1  # a contact whose pressures cancel to less than this share has no direction
 SIDEWAYS = 0.3  # of the normal force: more tangential force than this is worth a word
 ROUGH = 5e-4  # m: a tool whose distance field is off by more than this is worth a word
@@ -44,8 +45,8 @@ class Touch:
     Args:
         load: a follower pressure.
         status: one of the constants of this module.
-        trust: figures are depth_m (of the pose's deepest point; negative when apart, missing when far), moved_m (along the push),
-            normal_n (carried), tangential_n and torque_nm (asked for, not carried).
+        trust: figures are depth_m (of the pose's deepest point; negative when apart, missing when far), moved_m
+            (along the push), normal_n (carried), tangential_n and torque_nm (asked for, not carried).
     """
 
     load: Load
@@ -139,19 +140,25 @@ class Toucher:
 
     def _move_to_touch(self, field: SignedDistance, pose: Transform, near: np.ndarray, clearance: np.ndarray,
                        force: np.ndarray) -> tuple[float | None, Transform]:
-        """Moves a tool that is apart along `force` until its distance to the facing skin is 0, by sphere tracing."""
+        """Moves a tool that is apart along `force` until its distance to the facing skin is 0, by sphere tracing.
+
+        A tool that passes between vertices stays where it is nearest. None: it comes no nearer than a hole of the mesh.
+        """
         if clearance.min(initial=np.inf) <= 0:
             return 0.0, pose
         push = force / np.linalg.norm(force)
-        facing = near[self._inward[near] @ push > 0]
+        facing = near[self._inward[near] @ push > FACING]
         moved, shifted = 0.0, pose.copy()
+        best, nearest, there = None, self.hole, pose
         while moved <= self.reach:
             shifted[:3, 3] = pose[:3, 3] + moved * push
             gap = float(self._clearance(field, shifted, facing).min(initial=np.inf))
+            if gap < nearest:
+                best, nearest, there = moved, gap, shifted.copy()
             if gap < NEARLY:
-                return moved, shifted
+                break
             moved += gap
-        return None, pose
+        return best, there
 
     def _by_wrench(self, contact: Contact, field: SignedDistance, pose: Transform, near: np.ndarray,
                    clearance: np.ndarray, depth: float, moved: float) -> Touch:
@@ -302,12 +309,12 @@ def _depths(coefficients, origin, spacing, pose, points, inward, thickness, vert
 
 @numba.njit(cache=True)
 def _crossing(coefficients, origin, spacing, pose, point, down, grown, low, d_low, high, d_high):
-    """Depth between low (outside) and high (inside) at which the grown tool begins, by the Illinois rule, to 0.1 um."""
+    """Depth between low (outside) and high (inside) at which the grown tool begins, by the Illinois rule, to 0.1 nm."""
     side = 0
-    for _ in range(30):
+    for _ in range(40):
         middle = (low * d_high - high * d_low) / (d_high - d_low)
         d = _column_distance(coefficients, origin, spacing, pose, point, down, middle) - grown
-        if abs(d) < 1e-7:
+        if abs(d) < 1e-10:
             return middle
         if d > 0:
             low, d_low = middle, d

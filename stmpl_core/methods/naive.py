@@ -55,8 +55,9 @@ class Naive:
             product += (drive * finite("true displacement", truth, layer.vertices.shape)).sum(axis=0)
             square += (drive**2).sum(axis=0)
             ratio = max(ratio, load.peak_ratio(layer))
-        if not square.all():
-            axes = ", ".join(axis for axis, s in zip("xyz", square, strict=True) if s == 0)
+        unseen = square <= 1e-20 * square.max()
+        if unseen.any():
+            axes = ", ".join(axis for axis, none in zip("xyz", unseen, strict=True) if none)
             raise InvalidInput(f"no sample presses along {axes}: its alpha cannot be learnt. Give samples that do.")
         return cls(product / square, fitted_ratio=ratio)
 

@@ -25,9 +25,9 @@ class Winkler:
 
         mu (l - 1/l) + lambda ln(l) / l = -p,    u = -(1 - l) t n
 
-    the Cauchy stress of Tissue (Bonet & Wood) with F = diag(1, 1, l); the column's area does not change, so a follower pressure
-    and a nominal one are the same. Exact under a contact much wider than the layer is thick; it moves nothing
-    outside the load, and lets nothing bulge.
+    the Cauchy stress of Tissue (Bonet & Wood) with F = diag(1, 1, l); the column's area does not change, so a
+    follower pressure and a nominal one are the same. Exact under a contact much wider than the layer is thick; it
+    moves nothing outside the load, and lets nothing bulge.
     """
 
     name = "winkler"
@@ -67,10 +67,10 @@ def column_pressure(stretch: ArrayLike, tissue: Tissue) -> np.ndarray:
     Raises:
         InvalidInput: a stretch that is not finite or not above 0.
     """
-    l = finite("stretch", stretch, (None,))
-    if (l <= 0).any():
-        raise InvalidInput(f"stretch is {l.min():g}; a column cannot be pressed to nothing. Allowed is above 0.")
-    return -(tissue.shear_modulus * (l - 1 / l) + tissue.lame_lambda * np.log(l) / l)
+    values = finite("stretch", stretch, (None,))
+    if (values <= 0).any():
+        raise InvalidInput(f"stretch is {values.min():g}; a column cannot be pressed to nothing. Allowed is above 0.")
+    return -(tissue.shear_modulus * (values - 1 / values) + tissue.lame_lambda * np.log(values) / values)
 
 
 @numba.njit(cache=True)
@@ -127,5 +127,6 @@ def _trust(layer: SoftLayer, pressure: PerVertex, loaded: np.ndarray) -> Trust:
     if (pressure[loaded] < 0).any():
         trust = trust.also("the load pulls, columns are compared with FEM under pressure only", in_range=False)
     if width < least:
-        trust = trust.also(f"the load is {width:.1f} thicknesses wide, columns hold from {least:.1f} on", in_range=False)
+        why = f"the load is {width:.1f} thicknesses wide, columns hold from {least:.1f} on"
+        trust = trust.also(why, in_range=False)
     return trust
