@@ -11,19 +11,22 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 
 from stmpl_core.errors import StmplError
-from stmpl_ros.parameters import DemoConfig, NodeConfig, ProbeConfig, RecordConfig
+from stmpl_ros.parameters import METHODS, DemoConfig, NodeConfig, ProbeConfig, RecordConfig
 
 if TYPE_CHECKING:
     from stmpl_core.methods.base import Method
 
+Json = Annotated[bool, tyro.conf.arg(name="json")]
 Flat = tyro.conf.arg(name="")  # a configuration whose fields are flags of the verb itself
 BagPath = Annotated[Path, tyro.conf.Positional]  # a run's folder, or its .mcap file
 MethodName = Literal["fem", "winkler", "naive"]
 
+DEMO, NODE, PROBE = DemoConfig(), NodeConfig(), ProbeConfig()
+
 _ros_arguments: list[str] = []
 
 
-def demo(config: Annotated[DemoConfig, Flat] = DemoConfig()) -> int:
+def demo(config: Annotated[DemoConfig, Flat] = DEMO) -> int:
     """Node, simulated devices and recorder on this machine; then the run against FEM, with a report.
 
     Example: stmpl demo --frames 6 --node.method winkler
@@ -33,7 +36,7 @@ def demo(config: Annotated[DemoConfig, Flat] = DemoConfig()) -> int:
     return run(config)
 
 
-def node(config: Annotated[NodeConfig, Flat] = NodeConfig()) -> int:
+def node(config: Annotated[NodeConfig, Flat] = NODE) -> int:
     """Answers contacts with the displacement of the skin. ROS arguments may follow.
 
     Example: stmpl node --part left_arm --edge-length 0.004 --ros-args -r __ns:=/left
@@ -43,7 +46,7 @@ def node(config: Annotated[NodeConfig, Flat] = NodeConfig()) -> int:
     return run(config, _ros_arguments)
 
 
-def probe(config: Annotated[ProbeConfig, Flat] = ProbeConfig()) -> int:
+def probe(config: Annotated[ProbeConfig, Flat] = PROBE) -> int:
     """Simulated devices: mesh, pose and wrench along a script, on the skin of a running node.
 
     Example: stmpl probe --scripts press --rate 500
@@ -63,7 +66,7 @@ def record(config: Annotated[RecordConfig, Flat]) -> int:
     return run(config, _ros_arguments)
 
 
-def replay(path: BagPath, method: MethodName = "winkler", every: int = 1, as_json: Annotated[bool, tyro.conf.arg(name="json")] = False) -> int:
+def replay(path: BagPath, method: MethodName = "winkler", every: int = 1, as_json: Json = False) -> int:
     """Answers the recorded contacts again, offline, and says whether the answers are the recorded ones.
 
     Example: stmpl replay runs/latest --every 10
@@ -82,7 +85,7 @@ def replay(path: BagPath, method: MethodName = "winkler", every: int = 1, as_jso
     return 0
 
 
-def compare(path: BagPath, reference: MethodName = "fem", frames: int = 12, as_json: Annotated[bool, tyro.conf.arg(name="json")] = False) -> int:
+def compare(path: BagPath, reference: MethodName = "fem", frames: int = 12, as_json: Json = False) -> int:
     """Compares a recorded run with a reference method on a sample of its frames.
 
     Example: stmpl compare runs/latest --frames 6
@@ -100,7 +103,7 @@ def compare(path: BagPath, reference: MethodName = "fem", frames: int = 12, as_j
     return 0 if comparison.passed else 1
 
 
-def info(path: BagPath, as_json: Annotated[bool, tyro.conf.arg(name="json")] = False) -> int:
+def info(path: BagPath, as_json: Json = False) -> int:
     """Says what a recording holds, finished or not.
 
     Example: stmpl info runs/latest
@@ -160,9 +163,7 @@ def _method(name: MethodName) -> Method:
         from fem_tools import PatchFem
 
         return PatchFem()
-    from stmpl_core.methods import Naive, Winkler
-
-    return {"winkler": Winkler, "naive": Naive}[name]()
+    return METHODS[name]()
 
 
 def _waiting(what: str, quiet: bool):

@@ -18,8 +18,11 @@ from rich.console import Console
 
 from bags.compare import Comparison
 from bags.provenance import versions
+from bags.replay import ReplaySummary, replay_run
+from bags.report import write_report
+from fem_tools import PatchFem
 from stmpl_core.errors import StmplError
-from stmpl_ros.parameters import DemoConfig, ProbeConfig
+from stmpl_ros.parameters import METHODS, DemoConfig, ProbeConfig
 from stmpl_ros.tables import compare_with_progress, comparison_table
 
 log = logging.getLogger(__name__)
@@ -29,6 +32,8 @@ TO_STOP = 20.0  # s that a process gets to end after SIGINT
 LOOK = 0.1  # s
 LEAST_RATE = 100.0  # Hz at which contacts must have come
 LEAST_KEPT = 0.9  # of the contacts must have been answered
+LEAST_IDENTICAL = 0.95  # of the answers must come out of a replay as recorded; those given out of step cannot
+REPLAY_EVERY = 10  # answers
 
 
 class DemoError(StmplError):
@@ -46,17 +51,21 @@ def run(config: DemoConfig) -> int:
     play(config, folder, console)
     _point_latest_at(folder)
 
-    from bags.report import write_report
-    from fem_tools import PatchFem
-
+    replay = _replay(folder, config.node.method, console)
     comparison = compare_with_progress(folder, PatchFem(), config.frames)
-    report = write_report(comparison, folder / "report.html")
+    report = write_report(comparison, folder / "report.html", replay=replay)
     console.print(comparison_table(comparison))
-    console.print(f"report: {report.resolve()}")
-    missing = list(complaints(folder, comparison))
+    console.print(str(replay))
+    console.print(f"report: {report.resolve()}", soft_wrap=True)
+    missing = list(complaints(folder, comparison, replay))
     for complaint in missing:
         console.print(f"[red]not as it should be:[/red] {complaint}")
     return int(bool(missing))
+
+
+def _replay(folder: Path, method: str, console: Console) -> ReplaySummary:
+    with console.status("replaying the run"):
+        return replay_run(folder, METHODS[method](), every=REPLAY_EVERY)
 
 
 def play(config: DemoConfig, folder: Path, console: Console) -> None:
@@ -66,8 +75,9 @@ def play(config: DemoConfig, folder: Path, console: Console) -> None:
         "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
         "PYTHONUNBUFFERED": "1",
     }
+    record = ["--path", str(folder), "--run", str(folder / "config.json")]
     with (
-        _process("record", ["--path", str(folder), "--run", str(folder / "config.json")], folder, environment) as recorder,
+        _process("record", record, folder, environment) as recorder,
         _process("node", config.node.ros_arguments(), folder, environment) as node,
         _process("probe", _probe_flags(config.probe), folder, environment) as probe,
     ):
@@ -79,7 +89,7 @@ def play(config: DemoConfig, folder: Path, console: Console) -> None:
         _stop(node, "node", folder)
 
 
-def complaints(folder: Path, comparison: Comparison) -> Iterator[str]:
+def complaints(folder: Path, comparison: Comparison, replay: ReplaySummary) -> Iterator[str]:
     """What of a run is missing or not sane, one sentence each."""
     for name in ("run.mcap", "metadata.yaml", "report.html", "config.json"):
         path = folder / name
@@ -93,6 +103,8 @@ def complaints(folder: Path, comparison: Comparison) -> Iterator[str]:
         yield f"contacts came at {timing.instant_rate:.0f} Hz; at least {LEAST_RATE:g} Hz was asked for"
     if timing.kept < LEAST_KEPT:
         yield f"{100 * timing.kept:.0f} % of the contacts were answered; at least {100 * LEAST_KEPT:g} % should be"
+    if replay.identical < LEAST_IDENTICAL * replay.frames:
+        yield str(replay)
     if not comparison.passed:
         yield comparison.verdict
     if max(moment.peak for moment in comparison.run.moments) <= 0:

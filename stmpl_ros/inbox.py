@@ -9,7 +9,7 @@ from bags.messages import wrench_from
 from stmpl_core.arrays import Transform
 from stmpl_core.contact import Contact, ToolMesh
 
-PATIENCE = 3  # poses that may pass a missing partner before the newest of each is taken as it is
+PATIENCE = 3  # poses of a tool that may pass a missing partner before the newest of each is taken as it is
 
 
 @dataclass
@@ -47,8 +47,8 @@ class Inbox:
     """Keeps the newest of everything and hands out instants.
 
     An instant is complete when the newest pose and wrench of every live tool carry one stamp. Devices whose clocks
-    never agree would then never be answered: after `PATIENCE` poses without a complete instant every pose is answered
-    with the newest of the rest, until an instant is complete again.
+    never agree would then never be answered: after `PATIENCE` poses a tool without a complete instant, every pose is
+    answered with the newest of the rest, until an instant is complete again.
 
     Args:
         body_frame: frame that poses are in.
@@ -101,7 +101,7 @@ class Inbox:
         poses = [tool.pose.stamp for tool in live.values()]
         stamps = poses + [tool.wrench.stamp for tool in live.values() if tool.wrench.live(now, self.rest_after)]
         skew = max(stamps) - min(stamps)
-        if skew and self.missed < PATIENCE:
+        if skew and self.missed < PATIENCE * len(live):
             return None
         self.missed = self.missed if skew else 0
         self.waiting.clear()

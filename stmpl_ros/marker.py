@@ -37,7 +37,7 @@ class SkinMarker:
         message.pose.orientation.w = message.scale.x = message.scale.y = message.scale.z = message.color.a = 1.0
         count, found = len(self._corners), (1.2345678901234e-5, 1.2345e-5)  # values to find the two blocks by
         message.points = [Point(x=found[0])] + [Point()] * (count - 1)
-        message.colors = [ColorRGBA(r=found[1])] + [ColorRGBA()] * (count - 1)
+        message.colors = [ColorRGBA(r=found[1], a=1.0)] + [ColorRGBA(a=1.0)] * (count - 1)
         self._bytes = bytearray(serialize_message(message))
         points_at = self._bytes.index(struct.pack("<d", found[0]))
         colors_at = self._bytes.index(struct.pack("<f", found[1]), points_at + 24 * count)
@@ -48,7 +48,7 @@ class SkinMarker:
         """The serialised marker of the skin moved by `displacement` (V, 3) [m]."""
         struct.pack_into("<iI", self._bytes, STAMP_AT, *divmod(stamp_ns, NANO))
         share = np.clip(np.linalg.norm(displacement, axis=1) / self._scale, 0, 1)
-        colors = np.stack([np.interp(share, (0, 0.5, 1), STOPS[:, k]) for k in range(3)] + [np.ones_like(share)], axis=1)
+        colors = np.stack([np.interp(share, (0, 0.5, 1), STOPS[:, k]) for k in range(3)], axis=1)
         self._points[:] = (self._rest + displacement)[self._corners]
-        self._colors[:] = colors[self._corners]
+        self._colors[:, :3] = colors[self._corners]
         return bytes(self._bytes)

@@ -5,23 +5,22 @@ from __future__ import annotations
 import gc
 import time
 from collections import deque
+from functools import partial
 from typing import Any
 
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from geometry_msgs.msg import PoseStamped, WrenchStamped
-from rclpy.executors import SingleThreadedExecutor
+from rclpy.experimental import EventsExecutor
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
+from stmpl_core.body import Body
 from stmpl_msgs.msg import ContactMesh, SkinDeformed, SkinDisplacement, SkinTopology
 from visualization_msgs.msg import Marker
 
 from bags.messages import layer_id, stamp_ns
-from stmpl_core.body import Body
 from stmpl_core.contact import Contact, ToolMesh
 from stmpl_core.errors import StmplError
 from stmpl_core.layer import SoftLayer, Tissue
-from stmpl_core.methods.naive import Naive
-from stmpl_core.methods.winkler import Winkler
 from stmpl_core.simulator import Simulator
 from stmpl_core.trust import Displacement
 from stmpl_ros.conversions import (
@@ -35,11 +34,10 @@ from stmpl_ros.conversions import (
 )
 from stmpl_ros.inbox import Inbox, Instant
 from stmpl_ros.marker import SkinMarker
-from stmpl_ros.parameters import NodeConfig
+from stmpl_ros.parameters import METHODS, NodeConfig
 from stmpl_ros.spinning import ros, spin
 from stmpl_ros.topics import KEPT, NEWEST, STREAM
 
-METHODS = {"winkler": Winkler, "naive": Naive}
 SAY_EVERY = 1.0  # s between two lines of the same warning
 
 
@@ -141,8 +139,8 @@ class SkinNode(LifecycleNode):
             self._refuse(f"mesh of '{name}' refused: {error}")
 
     def _listen_to(self, name: str) -> None:
-        self.create_subscription(PoseStamped, f"tools/{name}/pose", lambda m: self._on_pose(name, m), NEWEST)
-        self.create_subscription(WrenchStamped, f"tools/{name}/wrench", lambda m: self._on_wrench(name, m), NEWEST)
+        self.create_subscription(PoseStamped, f"tools/{name}/pose", partial(self._on_pose, name), NEWEST)
+        self.create_subscription(WrenchStamped, f"tools/{name}/wrench", partial(self._on_wrench, name), NEWEST)
         mesh = self.inbox.tools[name].mesh
         self.get_logger().info(f"tool '{name}': {len(mesh.vertices)} vertices, {len(mesh.faces)} faces")
 
@@ -174,8 +172,8 @@ class SkinNode(LifecycleNode):
             return True
         self.stale += 1
         self.get_logger().warning(
-            f"a message stamped {age:+.2f} s before now was dropped; allowed is {self.config.max_age} s. Are the clocks "
-            "in step, or is this a replay? max_age:=0 accepts any age.",
+            f"a message stamped {age:+.2f} s before now was dropped; allowed is {self.config.max_age} s. Are the "
+            "clocks in step, or is this a replay? max_age:=0 accepts any age.",
             throttle_duration_sec=SAY_EVERY,
         )
         return False
@@ -272,7 +270,7 @@ def run(config: NodeConfig, arguments: list[str] | None = None) -> int:
     """Runs the node until SIGINT or SIGTERM; the exit code says whether it could be configured."""
     with ros(arguments) as stop:
         node = SkinNode(config)
-        executor = SingleThreadedExecutor()
+        executor = EventsExecutor()
         executor.add_node(node)
         try:
             if node.config.autostart and (

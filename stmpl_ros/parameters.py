@@ -1,12 +1,17 @@
-"""What a person may set on the node, the simulated devices, the recorder and the demo: one field list for all uses."""
+"""What a person may set on node, devices, recorder and demo: one field list for command line and ROS parameters."""
 
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
+
+from stmpl_core.methods import Method, Naive, Winkler
+
+METHODS: dict[str, Callable[[], Method]] = {"winkler": Winkler, "naive": Naive}
 
 
 class NodeConfig(BaseModel):
@@ -14,18 +19,18 @@ class NodeConfig(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    part: str = Field("left_arm", description="part of the body that answers")
-    edge_length: float = Field(3e-3, gt=0, description="of the skin's mesh [m]")
-    thickness: float = Field(7.5e-3, gt=0, description="of the soft layer [m]")
-    youngs_modulus: float = Field(1e3, gt=0, description="E of the tissue [Pa]")
-    poisson_ratio: float = Field(0.4, ge=0, lt=0.5, description="nu of the tissue [-]")
-    density: float = Field(1e3, gt=0, description="of the tissue [kg/m3]")
-    method: Literal["winkler", "naive"] = Field("winkler", description="that solves for the displacement")
-    frame: str = Field("body", min_length=1, description="frame_id of the body; poses come in it, answers go out in it")
-    rest_after: float = Field(0.25, gt=0, description="a tool that is silent for longer is no longer in contact [s]")
-    max_age: float = Field(1.0, ge=0, description="older messages are dropped; 0 accepts any age [s]")
-    marker_rate: float = Field(15.0, gt=0, description="of skin/marker while somebody looks [Hz]")
-    autostart: bool = Field(True, description="configure and activate without being asked")
+    part: str = Field(default="left_arm", description="part of the body that answers")
+    edge_length: float = Field(default=3e-3, gt=0, description="of the skin's mesh [m]")
+    thickness: float = Field(default=7.5e-3, gt=0, description="of the soft layer [m]")
+    youngs_modulus: float = Field(default=1e3, gt=0, description="E of the tissue [Pa]")
+    poisson_ratio: float = Field(default=0.4, ge=0, lt=0.5, description="nu of the tissue [-]")
+    density: float = Field(default=1e3, gt=0, description="of the tissue [kg/m3]")
+    method: Literal["winkler", "naive"] = Field(default="winkler", description="that solves for the displacement")
+    frame: str = Field(default="body", min_length=1, description="frame_id of the body; poses come in it, answers go out in it")
+    rest_after: float = Field(default=0.25, gt=0, description="a tool that is silent for longer is no longer in contact [s]")
+    max_age: float = Field(default=1.0, ge=0, description="older messages are dropped; 0 accepts any age [s]")
+    marker_rate: float = Field(default=15.0, gt=0, description="of skin/marker while somebody looks [Hz]")
+    autostart: bool = Field(default=True, description="configure and activate without being asked")
 
     def declare_on(self, node: Any) -> NodeConfig:
         """Declares every field as a parameter of `node`, and returns the settings with what ROS overrides.
@@ -52,10 +57,10 @@ class ProbeConfig(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    scripts: tuple[str, ...] = Field(("press", "squeeze"), description="played one after the other")
-    rate: float = Field(200.0, ge=1, le=2000, description="of poses and wrenches [Hz]")
-    listeners: int = Field(1, ge=1, description="subscribers to wait for before moving; 2 with a recorder")
-    patience: float = Field(60.0, gt=0, description="give up when nobody listens for longer [s]")
+    scripts: tuple[Literal["press", "squeeze"], ...] = Field(default=("press", "squeeze"), description="played one after the other")
+    rate: float = Field(default=200.0, ge=1, le=2000, description="of poses and wrenches [Hz]")
+    listeners: int = Field(default=1, ge=1, description="subscribers to wait for before moving; 2 with a recorder")
+    patience: float = Field(default=60.0, gt=0, description="give up when nobody listens for longer [s]")
 
 
 class RecordConfig(BaseModel):
@@ -64,7 +69,7 @@ class RecordConfig(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     path: Path = Field(description="folder that gets run.mcap and metadata.yaml")
-    run: Path | None = Field(None, description="JSON file that says what made the run; kept in the recording")
+    run: Path | None = Field(default=None, description="JSON file that says what made the run; kept in the recording")
 
 
 class DemoConfig(BaseModel):
@@ -74,5 +79,5 @@ class DemoConfig(BaseModel):
 
     node: NodeConfig = NodeConfig()
     probe: ProbeConfig = ProbeConfig(listeners=2, patience=180.0)
-    frames: int = Field(12, ge=1, description="of the run that FEM solves again")
-    runs: Path = Field(Path("runs"), description="folder that gets one folder a run")
+    frames: int = Field(default=12, ge=1, description="of the run that FEM solves again")
+    runs: Path = Field(default=Path("runs"), description="folder that gets one folder a run")

@@ -5,10 +5,12 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import rclpy
 from geometry_msgs.msg import PoseStamped, WrenchStamped
 from rclpy.node import Node
+from rclpy.publisher import Publisher
 from stmpl_msgs.msg import ContactMesh, SkinTopology
 
 from bags.messages import layer_from
@@ -20,6 +22,14 @@ from stmpl_ros.spinning import ros
 from stmpl_ros.topics import KEPT, STREAM
 
 LOOK = 0.05  # s between two looks while waiting
+
+
+class Played(NamedTuple):
+    """One device and the topics that it publishes on."""
+
+    motion: Motion
+    pose: Publisher
+    wrench: Publisher
 
 
 class ProbeNode(Node):
@@ -44,33 +54,35 @@ class ProbeNode(Node):
             rclpy.spin_once(self, timeout_sec=LOOK)
         return layer_from(self.topology)
 
-    def play(self, script: Script, layer: SoftLayer, stop: threading.Event) -> int:
-        """Plays a script on the skin once everybody listens; returns how many instants were sent."""
-        assert self.topology
-        frame = self.topology.header.frame_id
-        motions = [Motion(device, layer) for device in script.devices]
-        topics = []
-        for motion in motions:
+    def announce(self, script: Script, layer: SoftLayer, stop: threading.Event) -> list[Played] | None:
+        """Publishes the meshes of a script's devices; None unless everybody listens to all of them in time."""
+        devices = []
+        for motion in (Motion(device, layer) for device in script.devices):
             name = motion.device.name
             pose = self.create_publisher(PoseStamped, f"tools/{name}/pose", STREAM)
             wrench = self.create_publisher(WrenchStamped, f"tools/{name}/wrench", STREAM)
-            topics.append((wrench, pose))
             self.mesh.publish(mesh_message(name, motion.mesh, self.get_clock().now().nanoseconds))
-        if not self._wait_for_listeners([p for pair in topics for p in pair], stop):
-            return 0
+            devices.append(Played(motion, pose, wrench))
+        publishers = [publisher for device in devices for publisher in (device.pose, device.wrench)]
+        return devices if self._wait_for_listeners(publishers, stop) else None
+
+    def play(self, script: Script, devices: Sequence[Played], stop: threading.Event) -> bool:
+        """Plays a script; True if all of it was sent."""
+        assert self.topology
+        frame = self.topology.header.frame_id
         self.get_logger().info(f"script '{script.name}': {script.seconds:g} s at {self.config.rate:g} Hz")
         period, count = 1 / self.config.rate, round(script.seconds * self.config.rate)
         started = time.perf_counter()
         for k in range(count):
-            moments = [motion.at(k * period) for motion in motions]
+            moments = [device.motion.at(k * period) for device in devices]
             time.sleep(max(0.0, started + k * period - time.perf_counter()))
             if stop.is_set():
-                return k
+                return False
             stamp = self.get_clock().now().nanoseconds
-            for (wrench_topic, pose_topic), (pose, wrench) in zip(topics, moments, strict=True):
-                wrench_topic.publish(wrench_message(wrench, frame, stamp))
-                pose_topic.publish(pose_message(pose, frame, stamp))
-        return count
+            for device, (pose, wrench) in zip(devices, moments, strict=True):
+                device.wrench.publish(wrench_message(wrench, frame, stamp))
+                device.pose.publish(pose_message(pose, frame, stamp))
+        return True
 
     def _wait_for_listeners(self, publishers: Sequence, stop: threading.Event) -> bool:
         deadline = time.monotonic() + self.config.patience
@@ -80,8 +92,8 @@ class ProbeNode(Node):
             if time.monotonic() > deadline:
                 counts = {p.topic_name: p.get_subscription_count() for p in publishers}
                 self.get_logger().error(
-                    f"nobody listens after {self.config.patience:g} s: {counts}; expected {self.config.listeners} each. "
-                    "Is the node running on this ROS_DOMAIN_ID?"
+                    f"nobody listens after {self.config.patience:g} s: {counts}; expected {self.config.listeners} "
+                    "each. Is the node running on this ROS_DOMAIN_ID?"
                 )
                 return False
             rclpy.spin_once(self, timeout_sec=LOOK)
@@ -95,8 +107,11 @@ def run(config: ProbeConfig, arguments: list[str] | None = None) -> int:
         try:
             layer = node.wait_for_skin(stop)
             if layer is None:
-                node.get_logger().error(f"no skin/topology within {config.patience:g} s. Is the node running and active?")
+                node.get_logger().error(f"no skin/topology within {config.patience:g} s. Is the node active?")
                 return 1
-            return int(any(node.play(SCRIPTS[name], layer, stop) == 0 for name in config.scripts))
+            scripts = [SCRIPTS[name] for name in config.scripts]
+            ready = [node.announce(script, layer, stop) for script in scripts]
+            turns = zip(scripts, ready, strict=True)
+            return 0 if all(devices and node.play(script, devices, stop) for script, devices in turns) else 1
         finally:
             node.destroy_node()

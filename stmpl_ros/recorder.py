@@ -9,13 +9,13 @@ import queue
 import re
 import threading
 import time
-from typing import Any
+from typing import Any, cast
 
-import rclpy
 from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.utilities import ok
 
 from bags.provenance import write_provenance
 from bags.writer import BagWriter, qos_yaml
@@ -69,14 +69,14 @@ class RecorderNode(Node):
         )
         qos = qos_yaml(depth=max((o.depth for o in offered), default=10) or 10, reliable=reliable, transient_local=kept)
 
-        def keep(data: bytes, info: dict[str, Any]) -> None:
+        def keep(data: Any, info: Any) -> None:
             self.received += 1
             self._queue.put((topic, type_name, qos, data, time.time_ns(), info["source_timestamp"]))
 
         self.create_subscription(
             getattr(importlib.import_module(f"{package}.msg"), name),
             topic,
-            keep,
+            cast(Any, keep),  # with two arguments rclpy also gives the time at which the message was sent
             profile,
             raw=True,
             event_callbacks=SubscriptionEventCallbacks(message_lost=self._on_lost),
@@ -128,7 +128,7 @@ def run(config: RecordConfig, arguments: list[str] | None = None) -> int:
         try:
             spin(executor, stop)
             until = time.monotonic() + DRAIN
-            while time.monotonic() < until and rclpy.ok():
+            while time.monotonic() < until and ok():
                 executor.spin_once(timeout_sec=0.05)
         finally:
             executor.shutdown()

@@ -12,6 +12,7 @@ from stmpl_core.errors import InvalidInput
 from stmpl_core.layer import SoftLayer
 
 SOFTER = 0.6  # a layer that may bulge at the rim presses back this much less than columns (FEM of spheres)
+STATIONS = 101  # points of a path
 SMOOTHING = 2.0  # footprint radii over which the skin's normal is averaged along a path
 
 
@@ -123,7 +124,8 @@ class SkinPath:
     def __init__(self, layer: SoftLayer, around: float, footprint: float) -> None:
         centre, axis, side = _limb_axes(layer)
         heights = (layer.vertices - centre) @ axis
-        stations = np.linspace(*np.quantile(heights, (0.02, 0.98)), 201)
+        low, high = np.quantile(heights, (0.02, 0.98))
+        stations = np.linspace(low, high, STATIONS)
         turn = np.radians(around)
         outwards = np.cos(turn) * side + np.sin(turn) * np.cross(axis, side)
         points = np.array([_surface_point(layer, centre, axis, outwards, h) for h in stations])
@@ -180,8 +182,10 @@ def _limb_axes(layer: SoftLayer) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return centre, axis, side / np.linalg.norm(side)
 
 
-def _surface_point(layer: SoftLayer, centre: np.ndarray, axis: np.ndarray, outwards: np.ndarray, height: float) -> np.ndarray:
-    """Where a ray from the limb's own middle at `height`, going `outwards`, last leaves the skin (Moller & Trumbore)."""
+def _surface_point(
+    layer: SoftLayer, centre: np.ndarray, axis: np.ndarray, outwards: np.ndarray, height: float
+) -> np.ndarray:
+    """Where a ray `outwards` from the limb's middle at `height` last leaves the skin (Moller & Trumbore 1997)."""
     heights = (layer.vertices - centre) @ axis
     ring = np.abs(heights - height) < max(0.01, 2 * layer.edge_length)
     middle = np.average(layer.vertices[ring], axis=0, weights=layer.vertex_areas[ring])

@@ -11,6 +11,7 @@ from types import FrameType
 import rclpy
 from rclpy.executors import Executor, ExternalShutdownException
 from rclpy.signals import SignalHandlerOptions
+from rclpy.utilities import ok, try_shutdown
 
 LOOK = 0.1  # s; how often a spinning process looks whether it is to stop
 
@@ -28,7 +29,7 @@ def ros(arguments: list[str] | None = None) -> Iterator[threading.Event]:
     try:
         yield stop
     finally:
-        rclpy.try_shutdown()
+        try_shutdown()
         for number, handler in before.items():
             signal.signal(number, handler)
 
@@ -36,7 +37,7 @@ def ros(arguments: list[str] | None = None) -> Iterator[threading.Event]:
 def spin(executor: Executor, stop: threading.Event) -> None:
     """Runs callbacks until `stop` is set or ROS shuts down."""
     try:
-        while not stop.is_set() and rclpy.ok():
+        while not stop.is_set() and ok():
             executor.spin_once(timeout_sec=LOOK)
     except ExternalShutdownException:
         pass

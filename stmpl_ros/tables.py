@@ -5,14 +5,15 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
 from bags.compare import Comparison, compare_run
 from bags.reader import Bag
+from bags.report import headline
 from stmpl_core.methods.base import Method
+from stmpl_core.metrics import mean_and_deviation
 
 
 def compare_with_progress(path: Path, reference: Method, frames: int, *, quiet: bool = False) -> Comparison:
@@ -20,54 +21,43 @@ def compare_with_progress(path: Path, reference: Method, frames: int, *, quiet: 
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     with Progress(*columns, console=Console(stderr=True), disable=quiet, transient=True) as progress:
         task = progress.add_task(f"frames solved by {reference.name}", total=frames)
-        return compare_run(
-            path, reference, frames=frames, on_frame=lambda done, total: progress.update(task, completed=done, total=total)
-        )
 
+        def show(done: int, total: int) -> None:
+            progress.update(task, completed=done, total=total)
 
-def timing_figures(comparison: Comparison) -> dict[str, float]:
-    """Rates [Hz], latencies [ms] and losses of the run, by their heading."""
-    timing = comparison.run.timing
-    return {
-        "contact messages Hz": timing.instant_rate,
-        "answers Hz": timing.answer_rate,
-        "contacts answered %": 100 * timing.kept,
-        "latency median ms": 1e3 * timing.latency(50),
-        "latency p99 ms": 1e3 * timing.latency(99),
-        "answers lost": timing.lost,
-    }
-
-
-def error_figures(comparison: Comparison) -> dict[str, float]:
-    """The scores, averaged over the judged frames, by their heading."""
-    rows = [pair.score.row() for pair in comparison.judged]
-    return {name: float(np.nanmean([row[name] for row in rows])) for name in rows[0]} if rows else {}
+        return compare_run(path, reference, frames=frames, on_frame=show)
 
 
 def figures_of(comparison: Comparison) -> dict[str, Any]:
-    """All figures of a comparison, for machines."""
-    return {
+    """All figures of a comparison, for machines: lengths in metres, times in seconds."""
+    timing = comparison.run.timing
+    figures = {
         "method": comparison.method,
         "reference": comparison.reference,
+        "passed": comparison.passed,
+        "answers": timing.answers,
+        "instants": timing.instants,
+        "skipped": timing.skipped,
+        "lost": timing.lost,
+        "instant_rate": timing.instant_rate,
+        "answer_rate": timing.answer_rate,
+        "latency_median": timing.latency(50),
+        "latency_p99": timing.latency(99),
         "frames": len(comparison.judged),
         "failed": comparison.failed,
-        **timing_figures(comparison),
-        **error_figures(comparison),
-        "passed": comparison.passed,
     }
+    if comparison.judged:
+        figures["score"] = vars(mean_and_deviation([pair.score for pair in comparison.judged])[0])
+    return figures
 
 
 def comparison_table(comparison: Comparison) -> Table:
     """All figures of a comparison, for people."""
-    table = Table(title=f"{comparison.method} against {comparison.reference}", title_justify="left", caption_justify="left")
-    table.add_column("over the run")
-    table.add_column("", justify="right")
-    for name, value in timing_figures(comparison).items():
-        table.add_row(name, f"{value:.4g}")
-    table.add_section()
-    table.add_row(f"[bold]error, mean over {len(comparison.judged)} frames", "")
-    for name, value in error_figures(comparison).items():
-        table.add_row(name, f"{value:.3f}" if "mm" in name.split()[-1:] else f"{value:.1f}")
+    table = Table(show_header=False, title="the run", title_justify="left", caption_justify="left")
+    table.add_column()
+    table.add_column(justify="right")
+    for name, value in headline(comparison):
+        table.add_row(name, value)
     table.caption = comparison.verdict
     return table
 
