@@ -1,0 +1,278 @@
+"""WedgeMesh: a patch of skin extruded inwards into wedges, with columns of nodes, quadrature and rest gradients.
+
+A *column* is a skin node with all nodes under it. Columns have 2 L + 1 levels (quadratic through the thickness, L wedges
+deep), level 0 on the skin, the last one bonded to the core. In plane the elements are linear ("P1xP2", columns at the
+vertices) or quadratic ("P2xP2", columns at the vertices and at the middles of the edges). Geometry is straight-sided.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cache
+from typing import Literal
+
+import numpy as np
+from skfem.element import ElementLineP2, ElementTriP1, ElementTriP2
+from skfem.quadrature import get_quadrature_line, get_quadrature_tri
+
+from stmpl_core.arrays import Points
+from stmpl_core.errors import MeshError
+
+ElementName = Literal["P1xP2", "P2xP2"]
+GRADING = 1.6  # of several wedges through the thickness; halves the error of two equal ones under a sharp-edged load
+ELEMENTS: tuple[ElementName, ...] = ("P1xP2", "P2xP2")
+
+
+@dataclass(frozen=True)
+class Reference:
+    """Shape functions of one wedge at its quadrature points; node numbers run level-fastest within a column."""
+
+    n_columns: int  # columns a triangle
+    shape_gradient: np.ndarray  # (Q, 3 n_columns, 3) with respect to (xi, eta, zeta)
+    geometry_value: np.ndarray  # (Q, 3) linear triangle functions
+    geometry_gradient: np.ndarray  # (3, 2)
+    zeta: np.ndarray  # (Q,) depth within the wedge, 0 outside, 1 inside
+    weight: np.ndarray  # (Q,)
+
+
+@cache
+def reference_wedge(element: ElementName) -> Reference:
+    """Tensor product of scikit-fem's triangle and line elements.
+
+    Two Gauss points a wedge through the thickness: one fewer than full integration, a third cheaper, and half the error
+    under a contact's edge, where three points are too stiff in shear.
+    """
+    plane, degree = (ElementTriP1(), 2) if element == "P1xP2" else (ElementTriP2(), 4)
+    xy, w_plane = get_quadrature_tri(degree)
+    z, w_depth = get_quadrature_line(3)
+    n, m, q_plane, q_depth = (3 if element == "P1xP2" else 6), 3, xy.shape[1], z.shape[1]
+    tri = [plane.lbasis(xy, i) for i in range(n)]
+    line = _line_basis(z)
+    gradient = np.zeros((q_plane, q_depth, n, m, 3))
+    for a, (value, slope) in enumerate(tri):
+        for level, (depth, depth_slope) in enumerate(line):
+            value_, slope_ = np.broadcast_to(value, q_plane), np.broadcast_to(slope, (2, q_plane))
+            gradient[:, :, a, level, 0] = np.outer(slope_[0], depth)
+            gradient[:, :, a, level, 1] = np.outer(slope_[1], depth)
+            gradient[:, :, a, level, 2] = np.outer(value_, depth_slope)
+    linear = np.stack([1 - xy[0] - xy[1], xy[0], xy[1]], axis=1)
+    return Reference(
+        n_columns=n,
+        shape_gradient=gradient.reshape(q_plane * q_depth, n * m, 3),
+        geometry_value=np.repeat(linear, q_depth, axis=0),
+        geometry_gradient=np.array([[-1.0, -1.0], [1.0, 0.0], [0.0, 1.0]]),
+        zeta=np.tile(z[0], q_plane),
+        weight=np.outer(w_plane, w_depth).ravel(),
+    )
+
+
+def _line_basis(z: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Quadratic line functions ordered outside, middle, inside (scikit-fem orders ends first)."""
+    element = ElementLineP2()
+    values = [element.lbasis(z, i) for i in (0, 2, 1)]
+    return [(np.asarray(phi), np.asarray(dphi)[0]) for phi, dphi in values]
+
+
+@dataclass(frozen=True)
+class SkinReference:
+    """In-plane shape functions on the skin, exact for a linear pressure on a deformed face."""
+
+    value: np.ndarray  # (Q, n)
+    slope: np.ndarray  # (Q, n, 2)
+    linear: np.ndarray  # (Q, 3)
+    weight: np.ndarray  # (Q,)
+
+
+@cache
+def reference_skin(element: ElementName) -> SkinReference:
+    """Quadrature of degree 2 (linear in plane) or 5 (quadratic) for the follower load."""
+    plane, degree, n = (ElementTriP1(), 2, 3) if element == "P1xP2" else (ElementTriP2(), 5, 6)
+    xy, weight = get_quadrature_tri(degree)
+    basis = [plane.lbasis(xy, i) for i in range(n)]
+    return SkinReference(
+        value=np.stack([np.broadcast_to(phi, len(weight)) for phi, _ in basis], axis=1),
+        slope=np.stack([np.broadcast_to(dphi, (2, len(weight))).T for _, dphi in basis], axis=1),
+        linear=np.stack([1 - xy[0] - xy[1], xy[0], xy[1]], axis=1),
+        weight=weight,
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class WedgeMesh:
+    """A meshed patch, ready for the kernels. Made by `WedgeMesh.of`.
+
+    Attributes:
+        element: "P1xP2" or "P2xP2".
+        layers: wedges through the thickness.
+        outer, inner: end points of the columns at the triangle corners, (N, 3) [m].
+        triangles: corners of each triangle, (T, 3), numbers of `outer`.
+        columns: columns of each triangle, (T, n).
+        edges: the edges whose middles carry the columns N, N + 1, ... (quadratic only), (E, 2).
+        n_columns: all columns.
+        gradients: of the shape functions at rest, (T L, Q, 3 n, 3) [1/m].
+        volumes: quadrature weight times det, (T L, Q) [m3].
+        indptr, indices: block rows of the tangent, one block a pair of columns that share a triangle.
+        blocks: number of the block of each pair of columns of a triangle, (T, n, n).
+    """
+
+    element: ElementName
+    layers: int
+    outer: Points
+    inner: Points
+    triangles: np.ndarray
+    columns: np.ndarray
+    edges: np.ndarray
+    n_columns: int
+    gradients: np.ndarray
+    volumes: np.ndarray
+    indptr: np.ndarray
+    indices: np.ndarray
+    blocks: np.ndarray
+
+    @classmethod
+    def of(
+        cls, outer: Points, inner: Points, triangles: np.ndarray, element: ElementName = "P1xP2", layers: int = 1
+    ) -> WedgeMesh:
+        """Meshes the space between two copies of a triangulation.
+
+        Raises:
+            MeshError: a wedge is folded at rest (its map has a determinant that is not positive).
+        """
+        columns, edges, n_columns = _columns(triangles, len(outer), element)
+        gradients, volumes = _rest_gradients(outer, inner, triangles, reference_wedge(element), layers)
+        if (volumes <= 0).any():
+            bad = np.unique(triangles[np.flatnonzero((volumes <= 0).any(axis=1)) // layers])
+            raise MeshError(f"the layer folds on itself below {len(bad)} vertices of the patch: {_some(bad)}.")
+        indptr, indices, blocks = _block_pattern(columns, n_columns)
+        return cls(
+            element,
+            layers,
+            outer,
+            inner,
+            triangles,
+            columns,
+            edges,
+            n_columns,
+            gradients,
+            volumes,
+            indptr,
+            indices,
+            blocks,
+        )
+
+    @property
+    def levels(self) -> int:
+        """Levels of nodes in a column, the bonded one included."""
+        return 2 * self.layers + 1
+
+    def column_ends(self) -> tuple[Points, Points]:
+        """Outer and inner end of every column, each (n_columns, 3) [m]."""
+        if not len(self.edges):
+            return self.outer, self.inner
+        return (
+            np.vstack([self.outer, self.outer[self.edges].mean(axis=1)]),
+            np.vstack([self.inner, self.inner[self.edges].mean(axis=1)]),
+        )
+
+    def rest_positions(self) -> np.ndarray:
+        """Rest position of every node, (n_columns, levels, 3) [m]."""
+        outer, inner = self.column_ends()
+        depth = level_depths(self.layers)[None, :, None]
+        return outer[:, None] * (1 - depth) + inner[:, None] * depth
+
+    def on_columns(self, corner_values: np.ndarray) -> np.ndarray:
+        """Extends values at the triangle corners, (N, ...), linearly to all columns."""
+        if not len(self.edges):
+            return corner_values
+        return np.concatenate([corner_values, corner_values[self.edges].mean(axis=1)])
+
+    def border_columns(self) -> np.ndarray:
+        """Mask of the columns on the patch's border, (n_columns,)."""
+        pairs = np.sort(self.triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
+        unique, count = np.unique(pairs, axis=0, return_counts=True)
+        mask = np.zeros(self.n_columns, dtype=bool)
+        mask[unique[count == 1].ravel()] = True
+        if len(self.edges):
+            mask[len(self.outer) :] = count == 1  # unique edges are in the order of self.edges
+        return mask
+
+
+def level_depths(layers: int) -> np.ndarray:
+    """Depth of each level of nodes, 0 at the skin, 1 at the core; the wedges grow with depth as shear fades."""
+    ends = np.linspace(0, 1, layers + 1) ** GRADING
+    return np.sort(np.concatenate([ends, (ends[1:] + ends[:-1]) / 2]))
+
+
+def fold_determinants(outer: Points, inner: Points, triangles: np.ndarray) -> np.ndarray:
+    """Smallest determinant of each prism's map over its corners, over the prism's mean, (T,) [-].
+
+    A prism is sound where this is above 0; a right prism on a flat skin has 1.
+    """
+    out, into = outer[triangles], inner[triangles]
+    dets = []
+    for depth in (0.0, 0.5, 1.0):
+        face = out * (1 - depth) + into * depth
+        normal = np.cross(face[:, 1] - face[:, 0], face[:, 2] - face[:, 0])
+        dets += [np.einsum("ij,ij->i", normal, out[:, corner] - into[:, corner]) for corner in range(3)]
+    determinants = np.stack(dets, axis=1)
+    return determinants.min(axis=1) / np.abs(determinants).mean(axis=1)
+
+
+def subdivide(triangles: np.ndarray, n_vertices: int) -> tuple[np.ndarray, np.ndarray]:
+    """Splits each triangle in four. Returns the new triangles and the edges whose middles are the new vertices."""
+    columns, edges, _ = _columns(triangles, n_vertices, "P2xP2")
+    a, b, c, ab, bc, ca = columns.T
+    parts = [(a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca)]
+    return np.vstack([np.stack(part, axis=1) for part in parts]), edges
+
+
+def _columns(triangles: np.ndarray, n: int, element: ElementName) -> tuple[np.ndarray, np.ndarray, int]:
+    if element == "P1xP2":
+        return np.ascontiguousarray(triangles, dtype=np.int64), np.zeros((0, 2), dtype=np.int64), n
+    pairs = np.sort(triangles[:, [[0, 1], [1, 2], [0, 2]]].reshape(-1, 2), axis=1)
+    edges, number = np.unique(pairs, axis=0, return_inverse=True)
+    columns = np.hstack([triangles, n + number.reshape(-1, 3)])
+    return np.ascontiguousarray(columns, dtype=np.int64), edges.astype(np.int64), n + len(edges)
+
+
+def _rest_gradients(
+    outer: Points, inner: Points, triangles: np.ndarray, ref: Reference, layers: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Shape gradients [1/m] and integration weights [m3] at rest for every wedge and quadrature point."""
+    out, into = outer[triangles], inner[triangles]  # (T, 3, 3)
+    gradients, volumes = [], []
+    for layer in range(layers):
+        top, _, bottom = (out + (into - out) * level_depths(layers)[2 * layer + k] for k in range(3))
+        corner = (
+            top[:, None] * (1 - ref.zeta)[:, None, None] + bottom[:, None] * ref.zeta[:, None, None]
+        )  # (T, Q, 3, 3)
+        plane = np.einsum("tqai,ap->tqip", corner, ref.geometry_gradient)
+        depth = np.einsum("tai,qa->tqi", bottom - top, ref.geometry_value)
+        jacobian = np.concatenate([plane, depth[..., None]], axis=-1)  # dX_i / d(xi, eta, zeta)
+        # (xi, eta) run counter-clockwise seen from outside and zeta inwards: a left-handed frame, so minus det
+        volumes.append(-np.linalg.det(jacobian) * ref.weight)
+        gradients.append(
+            np.einsum(
+                "qap,tqpi->tqai",
+                ref.shape_gradient,
+                np.linalg.pinv(jacobian) if (volumes[-1] == 0).any() else np.linalg.inv(jacobian),
+            )
+        )
+    shape = (len(triangles) * layers, len(ref.weight))
+    return (
+        np.ascontiguousarray(np.stack(gradients, axis=1).reshape(*shape, -1, 3)),
+        np.ascontiguousarray(np.stack(volumes, axis=1).reshape(shape)),
+    )
+
+
+def _block_pattern(columns: np.ndarray, n: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Compressed block rows of the column graph, and the block number of each pair of a triangle's columns."""
+    width = columns.shape[1]
+    rows, cols = np.repeat(columns, width, axis=1).ravel(), np.tile(columns, (1, width)).ravel()
+    keys, number = np.unique(rows * n + cols, return_inverse=True)
+    indptr = np.searchsorted(keys // n, np.arange(n + 1))
+    return indptr.astype(np.int64), (keys % n).astype(np.int64), number.reshape(-1, width, width).astype(np.int64)
+
+
+def _some(numbers: np.ndarray, most: int = 8) -> str:
+    return ", ".join(map(str, numbers[:most])) + (", ..." if len(numbers) > most else "")
