@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from stmpl_core.arrays import finite
 from stmpl_core.errors import InvalidInput
@@ -133,5 +133,5 @@ def _leak(answer: np.ndarray, layer: SoftLayer, loaded: np.ndarray) -> float:
     moved = np.linalg.norm(answer, axis=1)
     if not len(loaded):
         return float(moved.max())
-    away, _ = cKDTree(layer.vertices[loaded]).query(layer.vertices)
+    away, _ = KDTree(layer.vertices[loaded]).query(layer.vertices)
     return float(moved[away > FAR * layer.thickness[loaded].max()].max(initial=0.0))

@@ -30,6 +30,7 @@ REACH = 3e-3  # m that a pressing tool may be moved to meet the skin: what calib
 HOLE = 0.6  # of an edge: a tool that comes this near to a vertex cannot slip between vertices (equilateral: 0.577)
 STEEPEST = 2.0  # slope of the skin at a tool's edge: depth grows this much per unit of depth into the tool
 DEEPEST = 0.9  # of the thickness; columns are not pressed further
+SLACK = 0.25  # of a hole: a curved tool that touches between vertices is this far from them, and was not moved
 NEARLY = 1e-6  # m; nearer than this is touching
 FACING = 0.1  # cosine between push and inward normal from which the skin faces a tool that looks for it
 ONE_SIDED = 0.1  # a contact whose pressures cancel to less than this share has no direction
@@ -174,7 +175,7 @@ class Toucher:
         if normal <= 0:
             return self._nothing(contact, PULLING, depth)
         load = Load.pressure(shape * (normal / size))
-        status = MOVED if moved > self.hole else TOUCHING
+        status = MOVED if moved > SLACK * self.hole else TOUCHING
         return Touch(load, status, self._trust(contact, field, load, depth, moved))
 
     def _by_pose(self, contact: Contact, field: SignedDistance, near: np.ndarray, clearance: np.ndarray,
@@ -210,7 +211,7 @@ class Toucher:
         if ratio > MAX_RATIO:
             trust = trust.also(f"{name} presses with p/E = {ratio:.2g}; pressure loads were solved by FEM up to "
                                f"{MAX_RATIO:g}", in_range=False)
-        if moved > self.hole:
+        if moved > SLACK * self.hole:
             trust = trust.also(f"{name} was moved {moved * 1e3:.1f} mm along its force to touch: check its calibration")
         if depth > self._thickest:
             trust = trust.also(f"{name} reaches {depth * 1e3:.1f} mm deep, past the layer: check its pose or the "
