@@ -18,7 +18,8 @@ SKIN = LinearSegmentedColormap.from_list("skin", ["#f2e4da", "#f7b267", "#e4572e
 DIFFERENCE = LinearSegmentedColormap.from_list("difference", ["#ecebe8", "#9ecae1", "#3182bd", "#08306b", "#030f24"])
 LIGHT = np.array([-0.75, 0.35, 0.55])  # in screen axes: from the upper left, towards the viewer
 AMBIENT = 0.2  # share of the light that comes from everywhere
-SMOOTH = 15_000  # triangles that a skin is split into at least, so that shades look smooth
+SMOOTH = 8_000  # triangles that a skin is split into at least, so that shades look smooth
+FLAT = 0.75  # height of a close-up over its width; it looks at the skin at a slant
 MM = 1e3  # millimetres in a metre
 TOOL = to_rgb("#6b7683")
 
@@ -80,7 +81,7 @@ def draw_skin(
 
     Args:
         displacement: (V, 3) [m], drawn as it is, not exaggerated.
-        half_width: of the square to show [m]; None shows all.
+        half_width: of the window to show, which is FLAT times as high [m]; None shows all.
     """
     deformed = layer.vertices + displacement
     faces = layer.faces
@@ -94,7 +95,7 @@ def draw_skin(
     _draw(axes, view, corners, normals.mean(axis=1), colours.to_rgba(shades.mean(axis=1))[:, :3])
     if half_width is not None:
         _draw_edges(axes, view, coarse)
-        axes.set(xlim=(-half_width * MM, half_width * MM), ylim=(-half_width * MM, half_width * MM))
+        axes.set(xlim=(-half_width * MM, half_width * MM), ylim=(-FLAT * half_width * MM, FLAT * half_width * MM))
     axes.set_aspect("equal")
     axes.axis("off")
 
@@ -135,7 +136,7 @@ def _draw(
     facing = _turn(screen) > 0
     order = np.argsort(screen[facing, :, 2].mean(axis=1))
     light = AMBIENT + (1 - AMBIENT) * np.clip(turned[facing] @ (LIGHT / np.linalg.norm(LIGHT)), 0, 1)
-    shaded = np.clip(colour[facing] * (0.15 + 0.95 * light[:, None]), 0, 1)[order]
+    shaded = np.clip(colour[facing] * (0.35 + 0.75 * light[:, None]), 0, 1)[order]
     edges = shaded if alpha == 1 else "none"
     outlines = list(screen[facing][order][:, :, :2])
     axes.add_collection(PolyCollection(outlines, facecolors=shaded, edgecolors=edges, linewidths=0.3, alpha=alpha))

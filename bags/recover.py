@@ -88,6 +88,8 @@ def recover(source: Path | str, target: Path | str | None = None) -> Recovery:
                 case End():
                     finished = True
     if not messages and damage:
+        for made in (writer.path, writer.path.with_name("metadata.yaml")):
+            made.unlink()
         raise BagError(f"{source} holds no sound message: {damage[0].what} at byte {damage[0].offset}.")
     seconds = (times[1] - times[0]) / 1e9
     return Recovery(source, writer.path, messages, seconds, orphans, tuple(damage), finished)

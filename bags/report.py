@@ -16,6 +16,7 @@ from matplotlib.figure import Figure
 from bags.compare import Comparison, FramePair
 from bags.pictures import (
     DIFFERENCE,
+    FLAT,
     MM,
     SKIN,
     Spot,
@@ -145,12 +146,12 @@ def latency_figure(comparison: Comparison) -> Figure:
 
 def _close_ups(comparison: Comparison, pair: FramePair, spot: Spot) -> Figure:
     layer, ours, truth = comparison.layer, pair.ours.displacement, pair.reference.displacement
-    view = view_along(spot.normal, limb_axis(layer), spot.centre, tilt=-50)
+    view = view_along(spot.normal, limb_axis(layer), spot.centre, tilt=-42)
     half = max(ROOM * spot.radius, CLOSEST)
     lengths = [MM * np.linalg.norm(u, axis=1) for u in (ours, truth)]
     off = MM * np.linalg.norm(ours - truth, axis=1)
     moved, apart = scale(lengths, SKIN), scale([off], DIFFERENCE)
-    figure = Figure(figsize=(10.5, 4.0), layout="constrained")
+    figure = Figure(figsize=(10.5, 3.2), layout="constrained")
     left, middle, right = figure.subplots(1, 3)
     panels = (
         (left, comparison.method, ours, lengths[0], moved),
@@ -161,8 +162,8 @@ def _close_ups(comparison: Comparison, pair: FramePair, spot: Spot) -> Figure:
         draw_skin(axes, view, layer, displacement, values, colours, half_width=half)
         axes.set_title(f"{title}\nup to {values.max():.2f} mm", fontsize=10, color=INK)
     _ruler(left, half)
-    figure.colorbar(moved, ax=[left, middle], label="displacement [mm]", shrink=0.8, pad=0.01)
-    figure.colorbar(apart, ax=right, label="difference [mm]", shrink=0.8, pad=0.01)
+    figure.colorbar(moved, ax=[left, middle], label="displacement [mm]", pad=0.01)
+    figure.colorbar(apart, ax=right, label="difference [mm]", pad=0.01)
     return figure
 
 
@@ -221,8 +222,9 @@ def _cut(axes: Axes, comparison: Comparison, pair: FramePair, spot: Spot, limb: 
 
 
 def _ruler(axes: Axes, half: float) -> None:
-    axes.plot([-0.9 * half * MM, -0.9 * half * MM + 10], [-0.93 * half * MM] * 2, color=INK, lw=2)
-    axes.text(-0.9 * half * MM, -0.9 * half * MM, "10 mm", fontsize=8, color=INK, va="bottom")
+    left, low = -0.92 * half * MM, -0.92 * FLAT * half * MM
+    axes.plot([left, left + 10], [low, low], color=INK, lw=2)
+    axes.text(left, low + 0.02 * half * MM, "10 mm", fontsize=8, color=INK, va="bottom")
 
 
 def _shade(axes: Axes, time: np.ndarray, flagged: np.ndarray, colour: str) -> None:

@@ -52,7 +52,7 @@ class Timing:
     Args:
         answers: recorded displacement messages.
         instants: distinct stamps of contact messages, from the first answered one to the last.
-        skipped: of these, how many have no answer because a newer one came first (latest wins).
+        skipped: of these, how many were never answered because a newer one came first (latest wins).
         lost: answers that were sent but are not in the bag: gaps in their sequence numbers.
         answer_rate, instant_rate: per second [1/s].
         latencies: of every answer [s], NaN where unknown.
@@ -130,13 +130,14 @@ def _timing(moments: list[Moment], contacts: ContactLog) -> Timing:
     first, last = min(stamps), max(stamps)
     instants = {stamp for stamp in contacts.pose_stamps if first <= stamp <= last}
     jumps = np.diff([moment.sequence for moment in moments])
+    lost = int((jumps[jumps > 0] - 1).sum())  # a step back is a node that was started again
     seconds = (last - first) * NANO
     rate = 1 / seconds if seconds > 0 else float("nan")
     return Timing(
         answers=len(moments),
         instants=len(instants),
-        skipped=len(instants - set(stamps)),
-        lost=int((jumps[jumps > 0] - 1).sum()),  # a step back is a node that was started again
+        skipped=max(len(instants - set(stamps)) - lost, 0),  # a lost answer did answer its instant
+        lost=lost,
         answer_rate=(len(moments) - 1) * rate,
         instant_rate=(len(instants) - 1) * rate,
         latencies=np.array([moment.latency for moment in moments]),

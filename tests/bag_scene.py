@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import trimesh
 
 from bags.messages import contact_from, layer_id, tool_mesh_from
 from bags.provenance import write_provenance
@@ -24,6 +25,7 @@ TYPES = {
     "displacement": "stmpl_msgs/msg/SkinDisplacement",
 }
 STORE = typestore_of([(s.name, s.text) for s in map(find_schema, TYPES.values())])
+ANGLES = {"ball": 0.3, "finger": 0.3 + 2.2}  # rad around the tube
 START = 1_700_000_000_000_000_000  # ns
 
 
@@ -61,9 +63,7 @@ def tube(edge: float = 6e-3, length: float = 0.16, radius: float = 0.04) -> Soft
 
 def ball(radius: float = 12e-3) -> tuple[np.ndarray, np.ndarray]:
     """Vertices (N, 3) float32 and triangles of a ball."""
-    import trimesh
-
-    mesh = trimesh.creation.icosphere(subdivisions=3, radius=radius)
+    mesh = trimesh.creation.icosphere(subdivisions=2, radius=radius)
     return mesh.vertices.astype(np.float32), mesh.faces.astype(np.uint32)
 
 
@@ -72,14 +72,16 @@ def pose(angle: float, z: float, gap: float, stamp: int, radius: float = 12e-3) 
     r = 0.04 * (1 - 0.15 * z / 0.16) + radius + gap
     point = message("geometry_msgs/msg/Point", x=r * np.cos(angle), y=r * np.sin(angle), z=z)
     turn = message("geometry_msgs/msg/Quaternion", x=0.0, y=0.0, z=np.sin(angle / 2), w=np.cos(angle / 2))
-    return message("pose", header=header("body", stamp), pose=message("geometry_msgs/msg/Pose", position=point, orientation=turn))
+    placed = message("geometry_msgs/msg/Pose", position=point, orientation=turn)
+    return message("pose", header=header("body", stamp), pose=placed)
 
 
 def wrench(tool: str, newtons: float, stamp: int) -> Any:
     """A push of `newtons` along the tool's own -x, which points at the tube's axis."""
     force = message("geometry_msgs/msg/Vector3", x=-newtons, y=0.0, z=0.0)
     torque = message("geometry_msgs/msg/Vector3", x=0.0, y=0.0, z=0.0)
-    return message("wrench", header=header(tool, stamp), wrench=message("geometry_msgs/msg/Wrench", force=force, torque=torque))
+    push = message("geometry_msgs/msg/Wrench", force=force, torque=torque)
+    return message("wrench", header=header(tool, stamp), wrench=push)
 
 
 def topology(layer: SoftLayer) -> Any:
@@ -110,36 +112,41 @@ def write_run(folder: Path, method: Method, *, layer: SoftLayer | None = None, f
     """
     layer = layer or tube()
     simulator, (vertices, triangles) = Simulator(layer, method), ball()
-    tools = {"ball": 0.3, "finger": 0.3 + 2.2}
     with BagWriter(folder) as bag:
         write_provenance(bag, None, method=method.name, body="tube", config={"rate": rate, "frames": frames})
-        kept = qos_yaml(transient_local=True)
-        channels = {kind: bag.add_channel(f"/stmpl/{name}", TYPES[kind], kept if kind in ("topology", "mesh") else qos_yaml())
-                    for kind, name in (("topology", "skin/topology"), ("mesh", "contact_mesh"),
-                                       ("displacement", "skin/displacement"))}  # fmt: skip
-        bag.write(channels["topology"], cdr(topology(layer)), START, START)
+        kept, stream = qos_yaml(transient_local=True), qos_yaml()
+        skin = bag.add_channel("/stmpl/skin/topology", TYPES["topology"], kept)
+        surface = bag.add_channel("/stmpl/contact_mesh", TYPES["mesh"], kept)
+        answers = bag.add_channel("/stmpl/skin/displacement", TYPES["displacement"], stream)
+        tools = {(tool, kind): bag.add_channel(f"/stmpl/tools/{tool}/{kind}", TYPES[kind], stream)
+                 for tool in ANGLES for kind in ("pose", "wrench")}  # fmt: skip
+        bag.write(skin, cdr(topology(layer)), START, START)
         meshes = {}
-        for tool in tools:
+        for tool in ANGLES:
             sent = message("mesh", header=header(tool, START), vertices=vertices.ravel(), triangles=triangles.ravel())
-            bag.write(channels["mesh"], cdr(sent), START, START)
+            bag.write(surface, cdr(sent), START, START)
             meshes[tool] = tool_mesh_from(sent)
-            for kind in ("pose", "wrench"):
-                channels[tool, kind] = bag.add_channel(f"/stmpl/tools/{tool}/{kind}", TYPES[kind], qos_yaml())
         sequence = 0
         for k in range(frames):
             stamp = START + round((k + 1) * 1e9 / rate)
-            contacts, push = [], 0.4 * np.sin(np.pi * min(3 * k / frames, 1.0) / 2)
-            for tool, angle in list(tools.items())[: 1 if k < 2 * frames // 3 else 2]:
-                newtons = push if tool == "ball" else 0.3 * (3 * k / frames - 2)
-                sent = pose(angle, 0.06 + 0.03 * k / frames, -0.5e-3 if newtons else 5e-3, stamp), wrench(tool, newtons, stamp)
-                for kind, made in zip(("pose", "wrench"), sent, strict=True):
-                    bag.write(channels[tool, kind], cdr(made), stamp + 100_000, stamp)
-                contacts.append(contact_from(tool, meshes[tool], *sent, body_frame="body"))
+            contacts = []
+            for tool, newtons in script(k / frames).items():
+                height, gap = 0.06 + 0.03 * k / frames, -0.5e-3 if newtons else 5e-3
+                instant = pose(ANGLES[tool], height, gap, stamp), wrench(tool, newtons, stamp)
+                for kind, made in zip(("pose", "wrench"), instant, strict=True):
+                    bag.write(tools[tool, kind], cdr(made), stamp + 100_000, stamp)
+                contacts.append(contact_from(tool, meshes[tool], *instant, body_frame="body"))
             if k in skip:
                 continue
             answer = simulator.step(contacts)
             if k not in lose:
                 received = stamp + 100_000 + round(delay * 1e9)
-                bag.write(channels["displacement"], cdr(displacement(answer, layer, stamp, sequence)), received, received)
+                bag.write(answers, cdr(displacement(answer, layer, stamp, sequence)), received, received)
             sequence += 1
     return folder
+
+
+def script(share: float) -> dict[str, float]:
+    """What each tool presses with [N] after a share of the run: one ball presses, in the last third a second joins."""
+    pushes = {"ball": 0.4 * float(np.sin(np.pi / 2 * min(3 * share, 1.0)))}
+    return pushes if share < 2 / 3 else pushes | {"finger": 0.3 * (3 * share - 2)}
