@@ -10,7 +10,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from bag_scene import START, STORE, cdr, header, message, tube
 from mcap.reader import make_reader
 from rosbags.rosbag2 import Reader
 
@@ -21,6 +20,7 @@ from bags.recover import recover
 from bags.schema import find_schema, typestore_of
 from bags.writer import BagWriter, qos_yaml
 from stmpl_core.errors import BagError, FrameError, InvalidInput
+from tests.bag_scene import START, STORE, cdr, header, message, tube
 
 HEADER = "std_msgs/msg/Header"
 KNOWN = ("stmpl_msgs/msg/ContactMesh", "stmpl_msgs/msg/SkinDisplacement", "stmpl_msgs/msg/SkinTopology",
@@ -233,7 +233,7 @@ def test_provenance_comes_back(tmp_path):
 
 
 def test_a_topology_message_says_a_float32_layer_exactly():
-    from bag_scene import topology
+    from tests.bag_scene import topology
 
     layer = tube(edge=12e-3)
     back = layer_from(STORE.deserialize_cdr(cdr(topology(layer)), "stmpl_msgs/msg/SkinTopology"))

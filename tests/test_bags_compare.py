@@ -7,7 +7,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from bag_scene import tube, write_run
 
 from bags.compare import compare_bags, compare_run, sample
 from bags.reader import Bag
@@ -17,6 +16,7 @@ from bags.survey import survey
 from stmpl_core.errors import BagError
 from stmpl_core.methods import Winkler
 from stmpl_core.trust import Displacement, Trust
+from tests.bag_scene import tube, write_run
 
 LOST, SKIPPED, DELAY = (5, 6, 20), (10, 11), 0.003
 
