@@ -5,7 +5,6 @@ from itertools import pairwise
 import numpy as np
 import pytest
 import trimesh
-from scenes import LENGTH, RADIUS, at, ball, capsule, limb, plate, press, punch, tool, turn
 
 from stmpl_core import Contact, Load, SoftLayer
 from stmpl_core.errors import InvalidInput, MeshError
@@ -22,6 +21,7 @@ from stmpl_core.touch import (
     WRAPPED,
     Toucher,
 )
+from tests.touch_scenes import LENGTH, RADIUS, at, ball, capsule, limb, plate, press, punch, tool, turn
 
 LIMB, PLATE, BALL, PUNCH = limb(), plate(), ball(), punch()
 MIDDLE = LENGTH / 2

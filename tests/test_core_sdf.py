@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 import trimesh
-from scenes import ball, capsule, tool
 
 from stmpl_core import ToolMesh
 from stmpl_core.errors import InvalidInput, MeshError
 from stmpl_core.sdf import SignedDistance
+from tests.touch_scenes import ball, capsule, tool
 
 POINTS = np.random.default_rng(1).uniform(-0.02, 0.02, (20_000, 3))
 
