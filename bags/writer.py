@@ -71,7 +71,8 @@ class BagWriter:
         self._topics: dict[int, _Topic] = {}
         self._schemas: dict[str, int] = {}
         self._times: tuple[int, int] | None = None
-        self._messages = self._safe_messages = self._safe_bytes = 0
+        self.safe_messages = 0  # how many survive a SIGKILL
+        self._messages = self._safe_bytes = 0
         self._error: BagError | None = None
         self._closed = False
         try:
@@ -141,7 +142,7 @@ class BagWriter:
     def flush(self) -> None:
         """Closes the chunk in progress and hands it to the operating system: it survives a SIGKILL from here on."""
         self._guard(self._writer.flush)
-        self._safe_messages, self._safe_bytes = self._messages, self._file.tell()
+        self.safe_messages, self._safe_bytes = self._messages, self._file.tell()
         self._flushed_at = time.monotonic()
 
     def close(self) -> None:
@@ -192,7 +193,7 @@ class BagWriter:
             return act()
         except OSError as error:
             self._error = BagError(
-                f"writing {self.path} failed: {error.strerror}. Safe on disk are the first {self._safe_messages} of "
+                f"writing {self.path} failed: {error.strerror}. Safe on disk are the first {self.safe_messages} of "
                 f"{self._messages} messages ({self._safe_bytes / 1e6:.1f} MB, whole chunks). Make room, then bring "
                 f"them back with: stmpl recover {self.path}"
             )

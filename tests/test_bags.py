@@ -98,7 +98,7 @@ while True:
     text = str(k).encode() + b"\\0"
     bag.write(channel, b"\\0\\1\\0\\0" + struct.pack("<iII", 0, 0, len(text)) + text, k, k)
     k += 1
-    print(bag._safe_messages, flush=True)
+    print(bag.safe_messages, flush=True)
 """
 
 
