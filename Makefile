@@ -35,5 +35,5 @@ $(READY): $(BUILT_FROM)
 	@python=$$(.ci/find_python) || exit 1; \
 	[ -x $(BIN)/python ] || $$python -m venv $${ROS_DISTRO:+--system-site-packages} $(VENV)
 	$(BIN)/python -m pip install --quiet uv
-	$(BIN)/uv pip install --python $(BIN)/python --editable ".[dev]"
+	$(BIN)/uv pip install --compile-bytecode --python $(BIN)/python --editable ".[dev]"
 	@touch $@

@@ -5,15 +5,15 @@ from __future__ import annotations
 import gc
 import time
 from collections import deque
+from collections.abc import Callable
 from functools import partial
 from typing import Any
 
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from geometry_msgs.msg import PoseStamped, WrenchStamped
-from rclpy.experimental import EventsExecutor
+from rclpy.experimental.events_executor import EventsExecutor
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
-from stmpl_core.body import Body
 from stmpl_msgs.msg import ContactMesh, SkinDeformed, SkinDisplacement, SkinTopology
 from visualization_msgs.msg import Marker
 
@@ -43,10 +43,15 @@ SAY_EVERY = 1.0  # s between two lines of the same warning
 
 def layer_of(config: NodeConfig) -> SoftLayer:
     """The soft layer that the settings ask for. Raises InvalidInput."""
+    from stmpl_core.body import Body  # takes seconds to import, and who brings a layer does not need it
+
     tissue = Tissue(config.youngs_modulus, config.poisson_ratio, config.density)
-    part = Body.anny().part(config.part, edge_length=config.edge_length, thickness=config.thickness, tissue=tissue)
-    # as float32, which is how it is published: whoever reads the topic or a recording has the very same layer
-    return part.with_(vertices=part.vertices.astype(np.float32), thickness=part.thickness.astype(np.float32))
+    return Body.anny().part(config.part, edge_length=config.edge_length, thickness=config.thickness, tissue=tissue)
+
+
+def published(layer: SoftLayer) -> SoftLayer:
+    """The layer rounded to float32, as messages carry it: whoever reads them has the very same layer."""
+    return layer.with_(vertices=layer.vertices.astype(np.float32), thickness=layer.thickness.astype(np.float32))
 
 
 def warm_up(simulator: Simulator) -> None:
@@ -66,11 +71,16 @@ class SkinNode(LifecycleNode):
 
     What comes in while an answer is being computed waits as the newest; older ones are never answered. A message that
     cannot be used is refused with a log line, and changes nothing.
+
+    Args:
+        config: settings, which ROS parameters override.
+        build: makes the layer from the settings; give your own to answer for another skin.
     """
 
-    def __init__(self, config: NodeConfig | None = None) -> None:
+    def __init__(self, config: NodeConfig, build: Callable[[NodeConfig], SoftLayer] = layer_of) -> None:
         super().__init__("stmpl")
-        self.config = (config or NodeConfig()).declare_on(self)
+        self.config = config.declare_on(self)
+        self._build = build
         self.inbox = Inbox(self.config.frame, int(self.config.rest_after * NANO))
         self.active = self.at_rest = False
         self.sequence = self.refused = self.stale = 0
@@ -84,7 +94,7 @@ class SkinNode(LifecycleNode):
         """Builds the layer, warms the method up, and opens all topics."""
         started = time.monotonic()
         try:
-            self.layer = layer_of(self.config)
+            self.layer = published(self._build(self.config))
             self.simulator = Simulator(self.layer, METHODS[self.config.method]())
             warm_up(self.simulator)
         except StmplError as error:
@@ -266,10 +276,14 @@ class SkinNode(LifecycleNode):
         return self.get_clock().now().nanoseconds
 
 
-def run(config: NodeConfig, arguments: list[str] | None = None) -> int:
+def run(
+    config: NodeConfig,
+    arguments: list[str] | None = None,
+    build: Callable[[NodeConfig], SoftLayer] = layer_of,
+) -> int:
     """Runs the node until SIGINT or SIGTERM; the exit code says whether it could be configured."""
     with ros(arguments) as stop:
-        node = SkinNode(config)
+        node = SkinNode(config, build)
         executor = EventsExecutor()
         executor.add_node(node)
         try:

@@ -26,8 +26,8 @@ class NodeConfig(BaseModel):
     poisson_ratio: float = Field(default=0.4, ge=0, lt=0.5, description="nu of the tissue [-]")
     density: float = Field(default=1e3, gt=0, description="of the tissue [kg/m3]")
     method: Literal["winkler", "naive"] = Field(default="winkler", description="that solves for the displacement")
-    frame: str = Field(default="body", min_length=1, description="frame_id of the body; poses come in it, answers go out in it")
-    rest_after: float = Field(default=0.25, gt=0, description="a tool that is silent for longer is no longer in contact [s]")
+    frame: str = Field(default="body", min_length=1, description="frame_id of the body, in poses and answers")
+    rest_after: float = Field(default=0.25, gt=0, description="a tool silent for longer is no longer in contact [s]")
     max_age: float = Field(default=1.0, ge=0, description="older messages are dropped; 0 accepts any age [s]")
     marker_rate: float = Field(default=15.0, gt=0, description="of skin/marker while somebody looks [Hz]")
     autostart: bool = Field(default=True, description="configure and activate without being asked")
@@ -57,7 +57,9 @@ class ProbeConfig(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    scripts: tuple[Literal["press", "squeeze"], ...] = Field(default=("press", "squeeze"), description="played one after the other")
+    scripts: tuple[Literal["press", "squeeze"], ...] = Field(
+        default=("press", "squeeze"), description="played one after the other"
+    )
     rate: float = Field(default=200.0, ge=1, le=2000, description="of poses and wrenches [Hz]")
     listeners: int = Field(default=1, ge=1, description="subscribers to wait for before moving; 2 with a recorder")
     patience: float = Field(default=60.0, gt=0, description="give up when nobody listens for longer [s]")
@@ -68,7 +70,7 @@ class RecordConfig(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    path: Path = Field(description="folder that gets run.mcap and metadata.yaml")
+    path: Path = Field(description="folder for run.mcap and metadata.yaml")
     run: Path | None = Field(default=None, description="JSON file that says what made the run; kept in the recording")
 
 

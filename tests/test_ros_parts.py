@@ -1,0 +1,247 @@
+"""Laws of what the ROS side is made of: conversions, instants, scripts, the marker's bytes. No process is started."""
+
+import numpy as np
+import pytest
+from geometry_msgs.msg import PoseStamped
+from hypothesis import given
+from hypothesis import strategies as st
+from rclpy.serialization import deserialize_message
+from scipy.spatial.transform import Rotation
+from visualization_msgs.msg import Marker
+
+from bags.messages import layer_from, layer_id, pose_from, tool_mesh_from, wrench_from
+from stmpl_core import ToolMesh
+from stmpl_core.errors import FrameError, InvalidInput, MeshError
+from stmpl_ros.conversions import (
+    checked_mesh,
+    checked_pose,
+    checked_wrench,
+    floats,
+    mesh_message,
+    pose_message,
+    quaternion_from,
+    topology_message,
+    wrench_message,
+)
+from stmpl_ros.inbox import PATIENCE, Inbox
+from stmpl_ros.marker import SkinMarker
+from stmpl_ros.node import published
+from stmpl_ros.parameters import NodeConfig
+from stmpl_ros.scripts import PRESS, SCRIPTS, Device, Keyframe, Motion
+from tests.touch_scenes import ball, limb
+
+MS = 1_000_000
+unit = st.floats(-1, 1).filter(lambda x: abs(x) > 1e-3)
+
+
+@given(st.tuples(unit, unit, unit, unit))
+def test_rotation_to_quaternion_and_back_is_the_same_rotation(q):
+    rotation = Rotation.from_quat(q).as_matrix()
+    pose = np.eye(4)
+    pose[:3, :3] = rotation
+    np.testing.assert_allclose(pose_from(pose_message(pose, "body", 0).pose), pose, atol=1e-12)
+    np.testing.assert_allclose(Rotation.from_quat(quaternion_from(rotation)).as_matrix(), rotation, atol=1e-12)
+
+
+def test_wrench_in_tool_axes_is_the_same_wrench_in_body_axes():
+    pose = np.eye(4)
+    pose[:3, :3] = Rotation.from_euler("xyz", (0.3, -0.7, 1.1)).as_matrix()
+    in_body = np.arange(1.0, 7.0)
+    in_tool = np.concatenate([pose[:3, :3].T @ in_body[:3], pose[:3, :3].T @ in_body[3:]])
+    frames = {"body": in_body, "probe": in_tool}
+    for frame, values in frames.items():
+        message = checked_wrench(wrench_message(values, frame, 0), "probe", "body")
+        read = wrench_from(message, body_frame="body", tool="probe", pose_body_from_tool=pose)
+        np.testing.assert_allclose(read, in_body, atol=1e-12)
+
+
+def test_a_layer_keeps_its_id_and_every_bit_through_a_message():
+    layer = published(limb(6e-3))
+    message = topology_message(layer, "body", 5)
+    back = layer_from(message)
+    assert back.vertices.tobytes() == layer.vertices.tobytes()
+    assert layer_id(back) == layer_id(layer) == message.layer_id
+    assert layer_id(layer.with_(youngs_modulus=2e3)) != message.layer_id
+
+
+def test_a_tool_keeps_its_mesh_through_a_message():
+    mesh = ball()
+    back = tool_mesh_from(mesh_message("probe", mesh, 0))
+    np.testing.assert_allclose(back.vertices, mesh.vertices, atol=1e-9)
+    np.testing.assert_array_equal(back.faces, mesh.faces)
+
+
+def test_flat_arrays_hold_float32_in_the_order_of_the_rows():
+    rows = np.arange(12.0).reshape(4, 3)
+    assert floats(rows).typecode == "f"
+    np.testing.assert_array_equal(np.frombuffer(floats(rows), np.float32), rows.ravel())
+
+
+def _moved(x: float, **quaternion: float) -> PoseStamped:
+    message = pose_message(np.eye(4), "body", 0)
+    message.pose.position.x = x
+    for axis, value in quaternion.items():
+        setattr(message.pose.orientation, axis, value)
+    return message
+
+
+@pytest.mark.parametrize(
+    ("message", "error", "says"),
+    [
+        (pose_message(np.eye(4), "map", 0), FrameError, "frame 'map'; expected 'body'"),
+        (_moved(float("nan")), InvalidInput, "not finite"),
+        (_moved(float("inf")), InvalidInput, "not finite"),
+        (_moved(120.0), InvalidInput, "120.0 m .* millimetres"),
+        (_moved(0.1, w=0.0), InvalidInput, "length 0"),
+        (_moved(0.1, w=float("nan")), InvalidInput, "nan"),
+    ],
+)
+def test_a_pose_that_cannot_be_meant_is_refused_and_told_why(message, error, says):
+    with pytest.raises(error, match=says):
+        checked_pose(message, "probe", "body")
+
+
+def test_a_wrench_that_cannot_be_meant_is_refused_and_told_why():
+    with pytest.raises(FrameError, match="'map'; known are 'body' and 'probe'"):
+        checked_wrench(wrench_message(np.zeros(6), "map", 0), "probe", "body")
+    with pytest.raises(InvalidInput, match="not finite"):
+        checked_wrench(wrench_message(np.full(6, np.nan), "body", 0), "probe", "body")
+
+
+def test_a_mesh_that_cannot_be_meant_is_refused_and_told_why():
+    good = ball()
+    with pytest.raises(MeshError, match="millimetres"):
+        checked_mesh(mesh_message("probe", ToolMesh.of(good.vertices * 1e3, good.faces), 0))
+    with pytest.raises(FrameError, match="frame_id"):
+        checked_mesh(mesh_message("", good, 0))
+    empty = mesh_message("probe", good, 0)
+    empty.triangles = []
+    with pytest.raises(MeshError, match="F > 0"):
+        checked_mesh(empty)
+    torn = mesh_message("probe", good, 0)
+    torn.vertices = torn.vertices[:-1]
+    with pytest.raises(InvalidInput, match="three"):
+        checked_mesh(torn)
+
+
+def _inbox(*tools: str) -> Inbox:
+    inbox = Inbox("body", 250 * MS)
+    for name in tools:
+        inbox.put_mesh(name, ball())
+    return inbox
+
+
+def _push(force: float, stamp: int):
+    return wrench_message(np.array([force, 0, 0, 0, 0, 0]), "body", stamp)
+
+
+@pytest.mark.parametrize("order", ["pose first", "wrench first"])
+def test_pose_and_wrench_of_one_stamp_are_answered_together_in_either_order(order):
+    inbox = _inbox("probe")
+    inbox.put_pose("probe", np.eye(4), 1 * MS, 0)
+    inbox.put_wrench("probe", _push(1, 1 * MS), 1 * MS, 0)
+    assert inbox.take(0) is not None
+    puts = [
+        lambda: inbox.put_pose("probe", np.eye(4), 2 * MS, 5),
+        lambda: inbox.put_wrench("probe", _push(2, 2 * MS), 2 * MS, 5),
+    ]
+    for put in puts if order == "pose first" else puts[::-1]:
+        assert inbox.take(5) is None
+        put()
+    instant = inbox.take(5)
+    assert instant is not None and instant.stamp == 2 * MS and instant.skew == 0
+    assert instant.contacts[0].wrench is not None and instant.contacts[0].wrench[0] == 2
+
+
+def test_each_instant_is_answered_once():
+    inbox = _inbox("probe")
+    inbox.put_pose("probe", np.eye(4), 1 * MS, 0)
+    assert inbox.take(0) is not None
+    assert inbox.take(0) is None
+
+
+def test_messages_out_of_order_or_repeated_are_dropped_and_counted():
+    inbox = _inbox("probe")
+    assert inbox.put_pose("probe", np.eye(4), 5 * MS, 0)
+    assert not inbox.put_pose("probe", np.eye(4), 5 * MS, 1)
+    assert not inbox.put_pose("probe", np.eye(4), 4 * MS, 2)
+    assert inbox.out_of_order == 2
+    assert inbox.put_pose("probe", np.eye(4), 4 * MS, 300 * MS), "a device that was silent may start its clock again"
+
+
+def test_a_silent_tool_is_no_longer_in_contact():
+    inbox = _inbox("probe", "thumb")
+    inbox.put_pose("probe", np.eye(4), 1 * MS, 0)
+    inbox.put_pose("thumb", np.eye(4), 400 * MS, 400 * MS)
+    instant = inbox.take(400 * MS)
+    assert instant is not None and [contact.name for contact in instant.contacts] == ["thumb"]
+    assert inbox.take(900 * MS) is None and not inbox.live(900 * MS)
+
+
+def test_two_tools_in_step_are_answered_once_an_instant():
+    inbox, answered = _inbox("finger", "thumb"), []
+    for stamp in range(1, 6):
+        for name in ("finger", "thumb"):
+            inbox.put_pose(name, np.eye(4), stamp * MS, stamp * MS)
+            instant = inbox.take(stamp * MS)
+            answered += [(instant.stamp, len(instant.contacts), instant.skew)] if instant else []
+    # the first instant comes before the second tool is known to be there
+    assert answered[1:] == [(stamp * MS, 2, 0) for stamp in range(1, 6)]
+
+
+def test_devices_whose_clocks_never_agree_are_answered_after_some_patience_and_flagged():
+    inbox, skews = _inbox("probe"), []
+    for k in range(1, 20):
+        inbox.put_wrench("probe", _push(1, 0), 10 * k * MS - 3 * MS, 10 * k * MS)
+        inbox.put_pose("probe", np.eye(4), 10 * k * MS, 10 * k * MS)
+        instant = inbox.take(10 * k * MS)
+        skews += [instant.skew] if instant else []
+    assert len(skews) == 19 - PATIENCE
+    assert set(skews) == {3 * MS}
+
+
+def test_marker_bytes_are_the_marker_that_they_replace():
+    layer = limb(8e-3)
+    move = np.random.default_rng(0).normal(0, 1e-3, layer.vertices.shape)
+    message = deserialize_message(SkinMarker(layer, "body", scale=1e-3).frame(move, 12 * 10**9 + 34), Marker)
+    assert (message.header.stamp.sec, message.header.stamp.nanosec, message.header.frame_id) == (12, 34, "body")
+    points = np.array([(p.x, p.y, p.z) for p in message.points])
+    np.testing.assert_array_equal(points, (layer.vertices + move)[layer.faces.ravel()])
+    assert len(message.colors) == len(points)
+    colors = np.array([(c.r, c.g, c.b, c.a) for c in message.colors])
+    assert colors.min() >= 0 and colors.max() <= 1 and (colors[:, 3] == 1).all()
+
+
+def test_a_device_moves_without_jumps_and_meets_its_keyframes():
+    for device in (device for script in SCRIPTS.values() for device in script.devices):
+        for key in device.keyframes:
+            assert device.at(key.time) == pytest.approx((key.depth, key.along))
+        depths = np.array([device.at(t)[0] for t in np.arange(0, device.keyframes[-1].time, 1e-3)])
+        assert np.abs(np.diff(depths)).max() < 1e-4  # m in a millisecond
+
+
+def test_a_device_follows_the_skin_and_pushes_along_its_normal():
+    layer = limb()
+    motion = Motion(PRESS.devices[0], layer)
+    for time in np.linspace(0, PRESS.seconds, 17):
+        pose, wrench = motion.at(time)
+        depth, _ = PRESS.devices[0].at(time)
+        assert np.hypot(*pose[:2, 3]) == pytest.approx(0.04 - depth, abs=3e-4)  # the limb is round, 40 mm
+        assert np.linalg.det(pose[:3, :3]) == pytest.approx(1)
+        force = wrench[:3]
+        if depth <= 0:
+            assert not wrench.any()
+        else:
+            np.testing.assert_allclose(force / np.linalg.norm(force), -pose[:3, 2], atol=1e-12)
+    assert [motion.at(0.731)[0].tobytes()] == [Motion(PRESS.devices[0], layer).at(0.731)[0].tobytes()]
+
+
+def test_keyframes_out_of_order_are_refused():
+    with pytest.raises(InvalidInput, match="rising"):
+        Device("probe", 0.01, 0.0, (Keyframe(1.0, 0.0, 0.5), Keyframe(0.5, 0.0, 0.5)))
+
+
+def test_settings_travel_as_ros_arguments():
+    arguments = NodeConfig(edge_length=4e-3, part="left_leg").ros_arguments()
+    assert arguments[0] == "--ros-args"
+    assert "edge_length:=0.004" in arguments and 'part:="left_leg"' in arguments and "autostart:=true" in arguments
