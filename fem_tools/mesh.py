@@ -1,8 +1,9 @@
 """WedgeMesh: a patch of skin extruded inwards into wedges, with columns of nodes, quadrature and rest gradients.
 
-A *column* is a skin node with all nodes under it. Columns have 2 L + 1 levels (quadratic through the thickness, L wedges
-deep), level 0 on the skin, the last one bonded to the core. In plane the elements are linear ("P1xP2", columns at the
-vertices) or quadratic ("P2xP2", columns at the vertices and at the middles of the edges). Geometry is straight-sided.
+A *column* is a skin node with all nodes under it. Columns have 2 L + 1 levels (quadratic through the thickness,
+L wedges deep), level 0 on the skin, the last one bonded to the core. In plane the elements are linear ("P1xP2",
+columns at the vertices) or quadratic ("P2xP2", columns at the vertices and at the middles of the edges). Geometry is
+straight-sided.
 """
 
 from __future__ import annotations

@@ -53,7 +53,7 @@ def _inverse(F, inv):
 
 @njit(cache=True, fastmath=FAST)
 def internal_forces(u, columns, layers, gradients, volumes, mu, lam, forces):
-    """Adds the internal forces [N] to `forces` (C, levels, 3) and returns the smallest det F; stops where it is not > 0.
+    """Adds the internal forces [N] to `forces` (C, levels, 3) and returns the smallest det F; stops where it is <= 0.
 
     u: (C, levels, 3) [m]; gradients (T L, Q, 3 n, 3) [1/m]; volumes (T L, Q) [m3].
     """

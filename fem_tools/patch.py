@@ -1,4 +1,4 @@
-"""PatchFem: the converged finite-element answer on the patch of skin around a load, and what it knows of its own error."""
+"""PatchFem: the converged finite-element answer on the patch of skin around a load, with its own error estimates."""
 
 from __future__ import annotations
 
