@@ -1,0 +1,312 @@
+"""Body: the skin of a parametric human, Anny or the SMPL family, and its parts as soft layers."""
+
+from __future__ import annotations
+
+import gzip
+import hashlib
+import json
+import logging
+import os
+import re
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from functools import cache
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import igl
+import numpy as np
+from numpy.typing import ArrayLike
+
+from stmpl_core.arrays import Faces, Points, finite
+from stmpl_core.chart import UvChart
+from stmpl_core.errors import InvalidInput
+from stmpl_core.layer import SoftLayer, Tissue, check_faces
+from stmpl_core.remesh import Remeshed, remesh
+
+log = logging.getLogger(__name__)
+
+PARTS = {  # the bones of a part: Anny's names, then the SMPL family's
+    "left_arm": r"(upper|lower)arm\d*\.L|left_(shoulder|elbow)",
+    "left_upper_arm": r"upperarm\d*\.L|left_shoulder",
+    "left_forearm": r"lowerarm\d*\.L|left_elbow",
+    "left_leg": r"(upper|lower)leg\d*\.L|left_(hip|knee)",
+    "left_thigh": r"upperleg\d*\.L|left_hip",
+    "left_calf": r"lowerleg\d*\.L|left_knee",
+    "right_arm": r"(upper|lower)arm\d*\.R|right_(shoulder|elbow)",
+    "right_upper_arm": r"upperarm\d*\.R|right_shoulder",
+    "right_forearm": r"lowerarm\d*\.R|right_elbow",
+    "right_leg": r"(upper|lower)leg\d*\.R|right_(hip|knee)",
+    "right_thigh": r"upperleg\d*\.R|right_hip",
+    "right_calf": r"lowerleg\d*\.R|right_knee",
+    "torso": r"root|spine\d+|pelvis\.[LR]|clavicle\.[LR]|breast\.[LR]|pelvis|spine\d|(left|right)_collar",
+}
+RINGS = 3  # of faces kept around a part while it is subdivided, so that its border is no border of the surface
+ANNY_TO_BODY = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])  # Anny looks along -y with its left towards +x
+SMPL_TO_BODY = np.array([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]])  # SMPL looks along +z with its left towards +x
+CACHE_VERSION = 1
+
+
+@dataclass(frozen=True, eq=False)
+class Body:
+    """The skin of a whole body at rest in one pose.
+
+    Frame (REP-103): x forward out of the chest, y to the body's left, z up; origin at the model's own, near the
+    pelvis. Metres.
+
+    Args:
+        name: of the model.
+        vertices: shape (V, 3) [m].
+        faces: shape (F, 3), counter-clockwise seen from outside.
+        uv: per corner, (F, 3, 2) in [0, 1], v up; None if the model has none.
+        weights: of the bones at each vertex, (V, B) [-], rows sum to 1.
+        bones: names of the bones, B of them.
+    """
+
+    name: str
+    vertices: Points
+    faces: Faces
+    uv: np.ndarray | None
+    weights: np.ndarray
+    bones: tuple[str, ...]
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "vertices", finite("vertices", self.vertices, (None, 3)))
+        object.__setattr__(self, "faces", check_faces(self.faces, len(self.vertices)))
+        if self.uv is not None:
+            object.__setattr__(self, "uv", finite("uv", self.uv, (len(self.faces), 3, 2)))
+        shape = (len(self.vertices), len(self.bones))
+        object.__setattr__(self, "weights", finite("weights", self.weights, shape))
+
+    @classmethod
+    def anny(cls, *, pose: Mapping[str, ArrayLike] | None = None, **phenotype: float) -> Body:
+        """Anny (NAVER, Apache-2.0), whose data come with its package.
+
+        The first body ever takes some 20 s: Anny reads its shapes from 1,136 text files and keeps them in its own
+        cache (0.8 GB; ANNY_CACHE_DIR moves it). Each body is then kept as one file of 2 MB in the cache folder of
+        stmpl (STMPL_CACHE_DIR moves it), and costs milliseconds from then on.
+
+        Args:
+            pose: a rotation vector [rad] for each bone that turns, (3,), from the rest pose, in the body's axes.
+            phenotype: gender, age, muscle, weight, height, proportions, each in [0, 1]; 0.5 unless given.
+
+        Raises:
+            InvalidInput: an unknown bone or phenotype (the error lists them), or a value that is out of range.
+        """
+        turns = {bone: finite(f"pose of {bone}", turn, (3,)) for bone, turn in (pose or {}).items()}
+        for name, value in phenotype.items():
+            if not (np.isscalar(value) and 0 <= value <= 1):
+                raise InvalidInput(f"{name} is {value}; allowed is a number from 0 to 1 (0.5 is the average).")
+        return _kept(cls, {"pose": {k: v.tolist() for k, v in turns.items()}, "phenotype": phenotype},
+                     lambda: cls._anny(turns, phenotype))
+
+    @classmethod
+    def _anny(cls, turns: Mapping[str, np.ndarray], phenotype: Mapping[str, float]) -> Body:
+        import roma
+        import torch
+
+        model = _anny_model()
+        _known("bone", turns, model.bone_labels)
+        _known("phenotype", phenotype, model.phenotype_labels)
+        transforms = {}
+        for bone, turn in turns.items():
+            matrix = torch.eye(4, dtype=torch.float64)[None].repeat(1, 1, 1)
+            matrix[0, :3, :3] = roma.rotvec_to_rotmat(torch.tensor(ANNY_TO_BODY.T @ turn))
+            transforms[bone] = matrix
+        with torch.no_grad():
+            posed = model(pose_parameters=transforms or None, phenotype_kwargs=dict(phenotype) or None)
+        weights = np.zeros((len(model.template_vertices), len(model.bone_labels)))
+        rows = np.arange(len(weights))[:, None]
+        np.add.at(weights, (rows, model.vertex_bone_indices.numpy()), model.vertex_bone_weights.numpy())
+        uv = model.texture_coordinates.numpy()[model.face_texture_coordinate_indices.numpy()]
+        vertices = posed["vertices"][0].numpy() @ ANNY_TO_BODY.T
+        return cls("anny", vertices, model.faces.numpy(), uv, weights, tuple(model.bone_labels))
+
+    @classmethod
+    def smpl(
+        cls,
+        path: str | Path,
+        *,
+        model_type: str = "smpl",
+        gender: str = "neutral",
+        betas: ArrayLike | None = None,
+        pose: ArrayLike | None = None,
+        uv: str | Path | None = None,
+    ) -> Body:
+        """A body of the SMPL family from the user's own model file: its licence lets nobody ship it.
+
+        Load no file that you do not trust: a .pkl can run code.
+
+        Args:
+            path: the model file, or the folder that holds `model_type`/ as smplx wants it.
+            model_type: "smpl", "smplh" or "smplx".
+            gender: "neutral", "female" or "male".
+            betas: shape coefficients, up to as many as the file has.
+            pose: body pose, rotation vectors [rad] in SMPL's own axes and order, (joints, 3) or flat.
+            uv: an .obj file of the same topology with texture coordinates (SMPL's come separately).
+
+        Raises:
+            InvalidInput: no such file, or one that smplx cannot read; shapes that do not fit.
+        """
+        import smplx
+        import torch
+
+        if not Path(path).exists():
+            raise InvalidInput(f"there is no SMPL model at {path}. Get it from smpl.is.tue.mpg.de or "
+                               "smpl-x.is.tue.mpg.de, and give the path of the file.")
+        classes = {"smpl": smplx.SMPL, "smplh": smplx.SMPLH, "smplx": smplx.SMPLX}
+        if model_type not in classes:
+            raise InvalidInput(f"model_type is {model_type!r}; available: {', '.join(classes)}.")
+        where = Path(path) / model_type if (Path(path) / model_type).is_dir() else Path(path)
+        shape = {} if betas is None else {"betas": torch.tensor(np.atleast_2d(betas), dtype=torch.float32),
+                                          "num_betas": np.size(betas)}
+        try:
+            model = classes[model_type](str(where), gender=gender, ext=where.suffix.lstrip(".") or "npz",
+                                        use_pca=False, **shape)
+        except Exception as error:
+            raise InvalidInput(f"smplx cannot read {where} as {model_type}: {type(error).__name__}: {error}") from error
+        turned = {} if pose is None else {"body_pose": torch.tensor(np.reshape(pose, (1, -1)), dtype=torch.float32)}
+        with torch.no_grad():
+            vertices = model(**turned).vertices[0].numpy().astype(float) @ SMPL_TO_BODY.T
+        faces = np.asarray(model.faces, dtype=np.int64)
+        weights = model.lbs_weights.detach().numpy()
+        bones = smplx.joint_names.JOINT_NAMES if model_type == "smplx" else smplx.joint_names.SMPLH_JOINT_NAMES
+        if model_type == "smpl":
+            bones = [*bones[:22], "left_hand", "right_hand"]
+        return cls(model_type, vertices, faces, _smpl_uv(model, uv, faces), weights, tuple(bones[: weights.shape[1]]))
+
+    def part(
+        self, name: str, *, edge_length: float = 3e-3, thickness: ArrayLike = 7.5e-3, tissue: Tissue | None = None
+    ) -> SoftLayer:
+        """A part of the body as a soft layer, evenly remeshed, with the body's UV chart attached.
+
+        Args:
+            name: see `Body.parts`, or the name of one bone.
+            edge_length: of the skin's mesh [m].
+            thickness: of the layer, one number or one a vertex of the new mesh [m].
+            tissue: material; Tissue() unless given.
+
+        Raises:
+            InvalidInput: unknown part; the error lists what exists.
+            MeshError: see `stmpl_core.remesh`.
+        """
+        return self.patch(name, edge_length).layer(self, thickness=thickness, tissue=tissue)
+
+    @property
+    def parts(self) -> tuple[str, ...]:
+        """Names of the parts that this body has the bones for."""
+        return tuple(part for part, pattern in PARTS.items() if any(re.fullmatch(pattern, b) for b in self.bones))
+
+    def level(self, part: str) -> np.ndarray:
+        """The bone weight of a part, less one half: positive at the vertices that belong to it, (V,) [-]."""
+        pattern = PARTS.get(part, re.escape(part))
+        columns = [k for k, bone in enumerate(self.bones) if re.fullmatch(pattern, bone)]
+        if not columns:
+            raise InvalidInput(f"unknown part {part!r}. Available: {', '.join(self.parts)}; "
+                               f"or one bone of: {', '.join(self.bones)}.")
+        return self.weights[:, columns].sum(axis=1) - 0.5
+
+    def patch(self, part: str, edge_length: float = 3e-3) -> Patch:
+        """The mesh of a part, cut where its bones weigh one half, which other poses of the same model can take."""
+        level = self.level(part)
+        if not (level > 0).any():
+            raise InvalidInput(f"no vertex of the body belongs to {part!r} by more than half. "
+                               f"Available: {', '.join(self.parts)}.")
+        near = level > 0
+        keep = near[self.faces].any(axis=1)
+        for _ in range(RINGS):
+            near[self.faces[keep]] = True
+            keep = near[self.faces].any(axis=1)
+        source = np.unique(self.faces[keep])
+        renumber = np.empty(len(self.vertices), int)
+        renumber[source] = np.arange(len(source))
+        mesh = remesh(self.vertices[source], renumber[self.faces[keep]], edge_length,
+                      uv=None if self.uv is None else self.uv[keep], inside=level[source])
+        return Patch(part, mesh, source)
+
+
+@dataclass(frozen=True, eq=False)
+class Patch:
+    """An even mesh of a body part, drawn from the vertices `source` of the whole body."""
+
+    part: str
+    mesh: Remeshed
+    source: np.ndarray
+
+    def layer(self, body: Body, *, thickness: ArrayLike = 7.5e-3, tissue: Tissue | None = None) -> SoftLayer:
+        """The part as a soft layer, on `body` in its pose: the mesh's connectivity and chart stay what they are."""
+        if self.source.max() >= len(body.vertices):
+            raise InvalidInput(f"this patch was drawn from a body with at least {self.source.max() + 1} vertices; "
+                               f"{body.name} has {len(body.vertices)}.")
+        vertices = self.mesh.transfer @ body.vertices[self.source]
+        chart = None if self.mesh.uv is None else UvChart(vertices, self.mesh.faces, self.mesh.uv)
+        return SoftLayer(vertices, self.mesh.faces, thickness, tissue=tissue, chart=chart)
+
+
+def _known(kind: str, given: Mapping[str, Any], available: list[str]) -> None:
+    unknown = sorted(set(given) - set(available))
+    if unknown:
+        raise InvalidInput(f"unknown {kind}: {', '.join(unknown)}. Available: {', '.join(available)}.")
+
+
+def _smpl_uv(model: Any, uv: str | Path | None, faces: Faces) -> np.ndarray | None:
+    """UVs per corner, from an .obj file."""
+    if uv is None:
+        return None
+    _, texture, _, obj_faces, texture_faces, _ = igl.readOBJ(str(uv))
+    if obj_faces.shape != faces.shape or not len(texture_faces):
+        raise InvalidInput(f"{uv} has {len(obj_faces)} faces and {len(texture_faces)} with UVs; "
+                           f"the body has {len(faces)}.")
+    return texture[texture_faces][..., :2]
+
+
+@cache
+def _anny_model() -> Any:
+    import anny
+
+    with _fast_targets():
+        return anny.Anny(phenotype_blendshapes="original", skinning_method="lbs")
+
+
+@contextmanager
+def _fast_targets() -> Iterator[None]:
+    """While Anny builds its model, reads its gzipped shape files with one NumPy call each.
+
+    Anny 0.6 makes one tensor a line, 7 million of them: 150 s on two cores, against 10 s.
+    """
+    import torch
+    from anny.models import full_model
+
+    def load(filename: str, vertices_count: int, world_transformation: Any, dtype: Any) -> Any:
+        shape = torch.zeros((vertices_count, 3), dtype=dtype)
+        with gzip.open(filename, "rt") as file:
+            table = np.array(file.read().split(), dtype=np.float64).reshape(-1, 4)
+        shape[table[:, 0].astype(np.int64)] = torch.as_tensor(table[:, 1:], dtype=dtype)
+        return world_transformation.apply(shape)
+
+    original = full_model.load_blend_shape
+    full_model.load_blend_shape = load
+    try:
+        yield
+    finally:
+        full_model.load_blend_shape = original
+
+
+def _kept(cls: type[Body], arguments: Mapping[str, Any], build: Any) -> Body:
+    """A body from the disk if it was built before: importing torch and Anny alone takes ten seconds."""
+    text = json.dumps([CACHE_VERSION, version("anny"), arguments], sort_keys=True)
+    folder = Path(os.environ.get("STMPL_CACHE_DIR") or
+                  Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "stmpl")
+    path = folder / f"anny-{hashlib.sha256(text.encode()).hexdigest()[:16]}.npz"
+    with suppress(OSError, ValueError, KeyError, EOFError), np.load(path) as kept:
+        return cls("anny", kept["vertices"], kept["faces"], kept["uv"], kept["weights"], tuple(kept["bones"].tolist()))
+    body = build()
+    with suppress(OSError):
+        folder.mkdir(parents=True, exist_ok=True)
+        beside = path.with_suffix(f".{os.getpid()}.npz")
+        np.savez_compressed(beside, vertices=body.vertices, faces=body.faces, uv=body.uv, weights=body.weights,
+                            bones=np.array(body.bones))
+        beside.replace(path)
+    return body
