@@ -21,6 +21,7 @@ log = logging.getLogger(__name__)
 MAX_LEVELS = 4  # of subdivision: 256 faces for one
 SEAM, OUTSIDE = 7, 2  # MMG's references: ours for seam edges, its own for triangles beyond a level set
 SNAP = 0.35  # share of an edge within which a cut passes through the vertex itself: no sliver beside it
+SCRAP = 0.03  # share of a part below which a UV island is the edge of a neighbour's
 RELAXATION = 5  # passes; more than 5 changed no figure of quality by over 2 %
 
 
@@ -80,7 +81,8 @@ def remesh(
         faces: shape (F, 3).
         edge_length: [m].
         uv: of each corner, (F, 3, 2).
-        inside: a level at each vertex, (V,); the skin is cut along its zero line and kept where it is positive.
+        inside: a level at each vertex, (V,); the skin is cut along its zero line and kept where it is positive, without
+            scraps of UV islands that it only brushes.
         smooth: False keeps the flat faces, for a mesh whose creases are meant.
 
     Raises:
@@ -176,10 +178,12 @@ def _halved(seam: np.ndarray, faces: Faces, finer: Faces) -> np.ndarray:
 
 
 def _rows_of(table: np.ndarray, pairs: np.ndarray) -> np.ndarray:
-    """Row numbers of undirected `pairs` in a sorted edge `table`."""
+    """Row numbers of those undirected `pairs` that a sorted edge `table` holds."""
     width = int(table.max()) + 1
-    wanted = np.sort(pairs, axis=1).astype(np.int64) @ [width, 1]
-    return np.searchsorted(table.astype(np.int64) @ [width, 1], wanted)
+    wanted = np.sort(pairs[(pairs < width).all(axis=1)], axis=1).astype(np.int64) @ [width, 1]
+    keys = table.astype(np.int64) @ [width, 1]
+    rows = np.minimum(np.searchsorted(keys, wanted), len(keys) - 1)
+    return rows[keys[rows] == wanted]
 
 
 def _interpolating(matrix: sp.csr_matrix) -> sp.csr_matrix:
@@ -193,7 +197,7 @@ def _interpolating(matrix: sp.csr_matrix) -> sp.csr_matrix:
 
 
 def _cut(dense: _Dense, seam: np.ndarray, level: PerVertex) -> tuple[tuple[Points, Faces], np.ndarray]:
-    """The part of the surface where `level` > 0, its largest piece, and the seam edges on it."""
+    """The part of the surface where `level` > 0, and the seam edges on it."""
     if not (level > 0).any():
         raise MeshError("nothing of the skin lies inside: the level is nowhere above 0.")
     if (level > 0).all():
@@ -209,20 +213,45 @@ def _cut(dense: _Dense, seam: np.ndarray, level: PerVertex) -> tuple[tuple[Point
         dense.vertices, dense.faces, seam, level=-level, nomove=1, noswap=1, noinsert=1
     )
     faces = faces[reference != OUTSIDE]
-    faces = faces[_largest_piece(faces, len(vertices))]
+    faces = faces[_without_scraps(vertices, faces, seam)]
     (vertices, faces), renumber = _compact(vertices, faces)
     seam = renumber[seam]
-    return (vertices, faces), seam[(seam >= 0).all(axis=1)]
+    seam = seam[(seam >= 0).all(axis=1)]
+    return (vertices, faces), seam[~_is_border(faces, seam)]
 
 
-def _largest_piece(faces: Faces, n_vertices: int) -> np.ndarray:
-    ones = np.ones(len(faces) * 2)
-    graph = sp.coo_matrix((ones, (faces[:, [0, 1]].ravel(), faces[:, [1, 2]].ravel())), (n_vertices, n_vertices))
-    _, label = connected_components(graph, directed=False)
-    pieces = np.bincount(label[faces[:, 0]])
-    if (pieces > 0).sum() > 1:
-        log.info("kept the largest of %d pieces: %d of %d faces", (pieces > 0).sum(), pieces.max(), len(faces))
-    return label[faces[:, 0]] == pieces.argmax()
+def _without_scraps(vertices: Points, faces: Faces, seam: np.ndarray) -> np.ndarray:
+    """Which faces to keep: not the scraps of neighbouring UV islands, and of what is left the largest piece."""
+    corners = vertices[faces]
+    area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    island = _pieces(faces, seam)
+    share = np.bincount(island, area) / area.sum()
+    keep = share[island] > SCRAP
+    piece = np.full(len(faces), -1)
+    piece[keep] = _pieces(faces[keep], np.empty((0, 2), int))
+    largest = np.bincount(piece[keep], area[keep]).argmax()
+    if (piece != largest).any():
+        log.info("left out %.1f %% of the part: scraps beyond a UV seam, or separate pieces",
+                 100 * area[piece != largest].sum() / area.sum())
+    return piece == largest
+
+
+def _pieces(faces: Faces, seam: np.ndarray) -> np.ndarray:
+    """Numbers the pieces of the surface that hang together by edges not in `seam`, (F,)."""
+    edges, number = edge_table(faces)
+    wall = np.zeros(len(edges), bool)
+    wall[_rows_of(edges, seam)] = True
+    order = np.argsort(number.ravel(), kind="stable")
+    along, face = number.ravel()[order], order // 3
+    same = (along[1:] == along[:-1]) & ~wall[along[1:]]
+    graph = sp.coo_matrix((np.ones(same.sum()), (face[:-1][same], face[1:][same])), (len(faces), len(faces)))
+    return connected_components(graph, directed=False)[1]
+
+
+def _is_border(faces: Faces, pairs: np.ndarray) -> np.ndarray:
+    """Which of the edges `pairs` of the surface have one face only."""
+    edges, number = edge_table(faces)
+    return np.bincount(number.ravel())[_rows_of(edges, pairs)] == 1
 
 
 def _compact(vertices: Points, faces: Faces) -> tuple[tuple[Points, Faces], np.ndarray]:
@@ -340,12 +369,12 @@ def _barycentric(points: Points, triangles: np.ndarray) -> Points:
 def _corner_uv(
     x: Points, faces: Faces, seam: np.ndarray, dense: _Dense, uv: np.ndarray, traced: tuple[np.ndarray, Points]
 ) -> np.ndarray:
-    """UVs of the corners, (F, 3, 2): on a seam each corner looks on its own face's side, then a fan agrees."""
+    """UVs of the corners, (F, 3, 2): on a seam each corner looks on its own face's side, then each fan agrees."""
     dense_uv = np.einsum("fkp,fpd->fkd", dense.corners, uv[dense.parent])
     result = np.einsum("vk,vkd->vd", traced[1], dense_uv[traced[0]])[faces]
-    on_seam = np.zeros(len(x), bool)
-    on_seam[seam] = True
-    face, corner = np.nonzero(on_seam[faces])
+    unsure = np.zeros(len(x), bool)  # borders too: a part may end at a seam
+    unsure[seam], unsure[_border_edges(faces)] = True, True
+    face, corner = np.nonzero(unsure[faces])
     at = x[faces[face, corner]]
     aside, _ = _closest(at + 0.2 * (x[faces[face]].mean(axis=1) - at), dense)
     there = _barycentric(at, dense.vertices[dense.faces[aside]])
