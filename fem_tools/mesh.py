@@ -187,6 +187,12 @@ class WedgeMesh:
             return corner_values
         return np.concatenate([corner_values, corner_values[self.edges].mean(axis=1)])
 
+    def to_corners(self, column_forces: np.ndarray) -> np.ndarray:
+        """Hands forces on all columns to the triangle corners, keeping their sum: (n_columns, ...) to (N, ...)."""
+        corners = column_forces[: len(self.outer)].copy()
+        np.add.at(corners, self.edges.ravel(), np.repeat(column_forces[len(self.outer) :] / 2, 2, axis=0))
+        return corners
+
     def border_columns(self) -> np.ndarray:
         """Mask of the columns on the patch's border, (n_columns,)."""
         pairs = np.sort(self.triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
@@ -219,12 +225,33 @@ def fold_determinants(outer: Points, inner: Points, triangles: np.ndarray) -> np
     return determinants.min(axis=1) / np.abs(determinants).mean(axis=1)
 
 
-def subdivide(triangles: np.ndarray, n_vertices: int) -> tuple[np.ndarray, np.ndarray]:
-    """Splits each triangle in four. Returns the new triangles and the edges whose middles are the new vertices."""
+def split(triangles: np.ndarray, n_vertices: int, marked: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Splits the marked triangles in four, their neighbours as conformity asks (red-green; Bank et al. 1983).
+
+    Args:
+        triangles: (T, 3).
+        n_vertices: how many vertices they name; the new ones are numbered from here.
+        marked: mask of the triangles to split, (T,).
+
+    Returns:
+        The new triangles, and the edges whose middles are the new vertices, (N, 2).
+    """
     columns, edges, _ = _columns(triangles, n_vertices, "P2xP2")
-    a, b, c, ab, bc, ca = columns.T
-    parts = [(a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca)]
-    return np.vstack([np.stack(part, axis=1) for part in parts]), edges
+    sides = columns[:, 3:] - n_vertices  # edges ab, bc, ca
+    cut = np.zeros(len(edges), dtype=bool)
+    cut[sides[marked]] = True
+    while (partly := cut[sides].sum(axis=1) == 2).any():
+        cut[sides[partly]] = True
+    number = np.where(cut, n_vertices + np.cumsum(cut) - 1, -1)
+    (a, b, c), (ab, bc, ca) = triangles.T, number[sides].T
+    count = cut[sides].sum(axis=1)
+    red, out = count == 3, [triangles[count == 0]]
+    for corners in ((a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca)):
+        out.append(np.stack(corners, axis=1)[red])
+    for p, q, r, pq in ((a, b, c, ab), (b, c, a, bc), (c, a, b, ca)):
+        green = (count == 1) & (pq >= 0)
+        out += [np.stack((p, pq, r), axis=1)[green], np.stack((pq, q, r), axis=1)[green]]
+    return np.vstack(out), edges[cut]
 
 
 def _columns(triangles: np.ndarray, n: int, element: ElementName) -> tuple[np.ndarray, np.ndarray, int]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
@@ -18,7 +18,16 @@ log = logging.getLogger(__name__)
 
 
 class SkinLoad(Protocol):
-    """Something that presses on the skin; `factor` in [0, 1] is the share of it that acts (load continuation)."""
+    """Something that presses on the skin; `factor` in [0, 1] is the share of it that acts (load continuation).
+
+    `conservative`: its forces are minus the gradient of `potential`, which then steers the line search.
+    """
+
+    conservative: bool
+
+    def potential(self, skin: np.ndarray, factor: float) -> float:
+        """Its potential energy [J]; only asked where `conservative`."""
+        ...
 
     def add_forces(self, skin: np.ndarray, factor: float, forces: np.ndarray) -> None:
         """Adds its forces on the skin columns, (C, 3) [N], at the deformed positions `skin` (C, 3) [m]."""
@@ -85,6 +94,17 @@ class System:
     def zeros(self) -> np.ndarray:
         """No displacement, (C, levels, 3)."""
         return np.zeros((self.mesh.n_columns, self.mesh.levels, 3))
+
+    @property
+    def conservative(self) -> bool:
+        """Whether all loads are: then the tangent is symmetric and an equilibrium is a minimum of the energy."""
+        return all(load.conservative for load in self.loads)
+
+    def energy(self, u: np.ndarray, factor: float) -> float:
+        """Stored energy plus the loads' potential [J]; infinite where an element is folded."""
+        m, skin = self.mesh, self.rest[:, 0] + u[:, 0]
+        stored = nh.strain_energy(u, m.columns, m.layers, m.gradients, m.volumes, self.mu, self.lam)
+        return stored + sum(load.potential(skin, factor) for load in self.loads)
 
     def internal(self, u: np.ndarray) -> tuple[np.ndarray, float]:
         """Internal forces (C, levels, 3) [N] and the smallest det F."""
@@ -285,30 +305,34 @@ def solve(
     Never raises for a scene that cannot be solved: the result says how far it came.
     """
     settings = settings or NewtonSettings()
-    start = u if u is not None else guess(1.0) if guess else system.zeros()
-    first = _newton(system, start, 1.0, settings)
-    if first.converged:
-        return first
-    iterations, linear = first.iterations, first.linear_iterations
-    reached, best, step, halvings = 0.0, system.zeros(), 0.5, 0
-    last = NewtonResult(best, False, np.inf, 1.0, 0, 0, 0.0)
-    while reached < 1.0 and halvings <= settings.max_halvings:
-        target = min(1.0, reached + step)
-        from_rest = reached == 0.0
-        begin = guess(target) if guess and from_rest else best if from_rest else best * (target / reached)
-        tried = _newton(system, begin, target, settings)
-        iterations, linear = iterations + tried.iterations, linear + tried.linear_iterations
-        if not tried.converged and not from_rest:
-            tried = _newton(system, best, target, settings)
+    tried = newton(system, u if u is not None else guess(1.0) if guess else system.zeros(), 1.0, settings)
+    if tried.converged:
+        return tried
+    iterations, linear = tried.iterations, tried.linear_iterations
+    best = NewtonResult(system.zeros(), True, 0.0, 1.0, 0, 0, 0.0)
+    step, halvings = 0.5, 0
+    while best.load_factor < 1.0 and halvings <= settings.max_halvings:
+        target = min(1.0, best.load_factor + step)
+        for start in _starts(best, target, guess):
+            tried = newton(system, start, target, settings)
             iterations, linear = iterations + tried.iterations, linear + tried.linear_iterations
-        if tried.converged:
-            reached, best, last = target, tried.u, tried
+            if tried.converged:
+                best = tried
+                break
         else:
             step, halvings = step / 2, halvings + 1
-    return NewtonResult(best, reached >= 1.0, last.residual, last.min_j, iterations, linear, reached)
+    return replace(best, converged=best.load_factor >= 1.0, iterations=iterations, linear_iterations=linear)
 
 
-def _newton(system: System, u: np.ndarray, factor: float, settings: NewtonSettings) -> NewtonResult:
+def _starts(best: NewtonResult, target: float, guess: Callable[[float], np.ndarray] | None) -> list[np.ndarray]:
+    """Where to start a load step: stretched from the last one, or as it is; from the guess at first."""
+    if best.load_factor == 0.0:
+        return [guess(target)] if guess else [best.u]
+    return [best.u * (target / best.load_factor), best.u]
+
+
+def newton(system: System, u: np.ndarray, factor: float, settings: NewtonSettings) -> NewtonResult:
+    """Newton from `u` at one share of the loads; energy descent where they are conservative."""
     m = system.mesh
     linear, history = 0, []
     r, min_j = system.residual(u, factor)
@@ -320,26 +344,54 @@ def _newton(system: System, u: np.ndarray, factor: float, settings: NewtonSettin
     for iteration in range(settings.max_iterations + 1):
         data = system.tangent(u, factor)
         inverse = system.preconditioner(data)
-        scale = _norm(inverse, _load_vector(system, u, factor))
-        relative = _norm(inverse, r) / scale if scale > 0 else 0.0
+        relative = _relative(system, inverse, r, u, factor)
         if relative < best[0]:
             best = (relative, u, min_j)
         if relative <= settings.tolerance:
             return NewtonResult(u, True, relative, min_j, iteration, linear, factor)
         history.append(relative)
-        stalled = len(history) > 5 and history[-1] > 0.3 * history[-6]
+        stalled = len(history) > 5 and history[-1] > 0.3 * history[-6] and not system.conservative
         if iteration == settings.max_iterations or not np.isfinite(relative) or stalled:
             break
         forcing = float(np.clip(0.5 * relative**0.5, 0.5 * settings.tolerance / relative, 0.1))
-        du, n, reached = bicgstab(m.indptr, m.indices, data, inverse, -r, forcing, settings.linear_iterations)
+        if system.conservative:
+            du, n, _, _ = conjugate_gradients(
+                m.indptr, m.indices, data, inverse, -r, forcing, settings.linear_iterations
+            )
+            stepped = _descend(system, u, du, r, factor, settings)
+        else:
+            du, n, _ = bicgstab(m.indptr, m.indices, data, inverse, -r, forcing, settings.linear_iterations)
+            stepped = _line_search(system, u, du, r, inverse, factor, settings)
         linear += n
-        if reached > 0.9:
-            break
-        stepped = _line_search(system, u, du, r, inverse, factor, settings)
         if stepped is None:
             break
         u, r, min_j = stepped
     return NewtonResult(best[1], False, best[0], best[2], iteration, linear, factor)
+
+
+def _relative(system: System, inverse: np.ndarray, r: np.ndarray, u: np.ndarray, factor: float) -> float:
+    """The residual over the load, or over the internal forces where they are larger [-]."""
+    size = _norm(inverse, r)
+    scale = max(
+        _norm(inverse, _load_vector(system, u, factor)),
+        _norm(inverse, system.internal(u)[0][:, : system.free].reshape(len(u), -1)),
+    )
+    return size / scale if scale > 0 else 0.0
+
+
+def _descend(system: System, u, du, r, factor: float, settings: NewtonSettings):
+    """Armijo's rule on the energy, with det F kept positive (Nocedal & Wright, sec. 3.1)."""
+    full = np.zeros_like(u)
+    full[:, : system.free] = du.reshape(len(u), system.free, 3)
+    slope, start, alpha = float(np.vdot(r, du)), system.energy(u, factor), 1.0
+    for _ in range(12):
+        trial = u + alpha * full
+        if system.energy(trial, factor) <= start + 1e-4 * alpha * slope + 1e-12 * abs(start):
+            trial_r, trial_j = system.residual(trial, factor)
+            if trial_j > settings.min_j:
+                return trial, trial_r, trial_j
+        alpha *= 0.5
+    return None
 
 
 def _line_search(system: System, u, du, r, inverse, factor: float, settings: NewtonSettings):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal, Self
 
 import numpy as np
@@ -11,7 +11,7 @@ from scipy.sparse.csgraph import dijkstra
 from scipy.spatial import cKDTree
 
 from fem_tools import neo_hookean as nh
-from fem_tools.mesh import ElementName, WedgeMesh, fold_determinants, level_depths, reference_skin, subdivide
+from fem_tools.mesh import ElementName, WedgeMesh, fold_determinants, level_depths, reference_skin, split
 from fem_tools.newton import NewtonResult, NewtonSettings, System, is_positive_definite, solve
 from stmpl_core.errors import InvalidInput, MeshError
 from stmpl_core.layer import SoftLayer
@@ -22,15 +22,22 @@ from stmpl_core.trust import Displacement, Trust
 
 MIN_FOLD = 0.05  # smallest determinant of a wedge at rest, over its mean, that is meshed [-]
 QUADRATIC_ABOVE = 0.45  # Poisson's ratio above which linear in plane locks (8 % of the peak at 0.47, 70 % at 0.499)
+REFINED_WITHIN = 1.5  # thicknesses of the load; beyond, the layer's own mesh is fine enough
 VALIDATED_RATIO = {"pressure": 2.0, "nodal": 0.4}  # p / E
 
 
 class FollowerPressure:
     """A pressure at the triangle corners, (N,) [Pa], along the deformed normal."""
 
+    conservative = False
+
     def __init__(self, mesh: WedgeMesh, pressure: np.ndarray) -> None:
         self.mesh, self.corners = mesh, pressure[mesh.triangles]
         self.reference = reference_skin(mesh.element)
+
+    def potential(self, skin: np.ndarray, factor: float) -> float:
+        """A follower pressure with an edge has none."""
+        return float("nan")
 
     def add_forces(self, skin: np.ndarray, factor: float, forces: np.ndarray) -> None:
         """See SkinLoad."""
@@ -47,6 +54,8 @@ class FollowerPressure:
 class DeadForces:
     """Forces on the skin columns that keep their direction, (C, 3) [N]."""
 
+    conservative = True
+
     def __init__(self, forces: np.ndarray) -> None:
         self.forces = forces
 
@@ -56,6 +65,10 @@ class DeadForces:
 
     def add_tangent(self, skin: np.ndarray, factor: float, data: np.ndarray, *, symmetric: bool) -> None:
         """Dead forces have no stiffness."""
+
+    def potential(self, skin: np.ndarray, factor: float) -> float:
+        """See SkinLoad."""
+        return -factor * float(np.vdot(self.forces, skin))
 
     @classmethod
     def at_vertices(cls, mesh: WedgeMesh, forces: np.ndarray) -> DeadForces:
@@ -85,6 +98,13 @@ class Patch:
     distance: np.ndarray  # of each vertex of the patch from the load, along the skin [m]
     splits: tuple[np.ndarray, ...] = ()  # edges whose middles were added by each refinement
 
+    def gather(self, values: np.ndarray) -> np.ndarray:
+        """Forces at the corners of the refined triangles, handed to the layer's vertices; their sum is kept."""
+        for edges in reversed(self.splits):
+            values, middles = values[: -len(edges)].copy(), values[-len(edges) :]
+            np.add.at(values, edges.ravel(), np.repeat(middles / 2, 2, axis=0))
+        return values
+
     def interpolate(self, values: np.ndarray) -> np.ndarray:
         """Values at the layer's vertices, linearly on the corners of the patch's refined triangles."""
         values = values[self.vertices]
@@ -99,7 +119,7 @@ class PatchFem:
     Args:
         element: "P1xP2", "P2xP2", or None: quadratic in plane where nu > 0.45, linear elsewhere.
         layers: wedges through the thickness.
-        refine: how often each skin triangle is split in four before meshing.
+        refine: how often the skin triangles near the load are split in four before meshing.
         reach: how far the patch extends beyond the load, in largest thicknesses; its rim is held.
         border: what holds the rim: "clamped" (no motion) or "mirror" (no motion across it: a plane of symmetry).
         settings: where Newton stops.
@@ -152,20 +172,22 @@ class PatchFem:
         return self.element or ("P2xP2" if layer.tissue.poisson_ratio > QUADRATIC_ABOVE else "P1xP2")
 
     def patch_around(self, vertices: np.ndarray) -> Patch:
-        """Meshes everything within `reach` thicknesses of the given vertices of the layer."""
+        """Meshes everything within `reach` thicknesses of the given vertices of the layer, finest near them."""
         layer = prepared(self._layer, self)
-        limit = self.reach * float(layer.thickness[vertices].max())
-        distance = dijkstra(self._graph, directed=False, indices=vertices, min_only=True, limit=1.1 * limit)
+        thickness = float(layer.thickness[vertices].max())
+        distance = dijkstra(
+            self._graph, directed=False, indices=vertices, min_only=True, limit=1.1 * self.reach * thickness
+        )
         inside = np.isfinite(distance)
         faces = layer.faces[inside[layer.faces].all(axis=1)].astype(np.int64)
         chosen, flat = np.unique(faces, return_inverse=True)
         outer, inner, triangles = layer.vertices[chosen], layer.inner_vertices[chosen], flat.reshape(-1, 3)
-        splits = []
+        away, splits = distance[chosen], []
         for _ in range(self.refine):
-            triangles, edges = subdivide(triangles, len(outer))
+            near = away[triangles].min(axis=1) <= REFINED_WITHIN * thickness
+            triangles, edges = split(triangles, len(outer), near)
+            outer, inner, away = (np.concatenate([x, x[edges].mean(axis=1)]) for x in (outer, inner, away))
             splits.append(edges)
-            outer = np.vstack([outer, outer[edges].mean(axis=1)])
-            inner = np.vstack([inner, inner[edges].mean(axis=1)])
         mesh = WedgeMesh.of(outer, inner, triangles, self.element_for(layer), self.layers)
         return Patch(chosen, mesh, mesh.border_columns(), distance[chosen], tuple(splits))
 
@@ -208,7 +230,7 @@ class PatchFem:
         discretisation, truncation = discretisation_error(system, result.u), truncation_error(patch, result.u, layer)
         ratio, limit = load.peak_ratio(layer), VALIDATED_RATIO[load.kind]
         trust = Trust(
-            error_bound=discretisation + truncation if result.converged and stable else None,
+            error_bound=discretisation + truncation,
             figures={
                 "min_j": result.min_j,
                 "positive_definite": float(stable),
@@ -243,7 +265,7 @@ class PatchFem:
             trust = trust.also(
                 f"the load is {nearest:.1f} thicknesses from the layer's open border, which is held", in_range=False
             )
-        return trust
+        return trust if trust.ok else replace(trust, error_bound=None)
 
 
 def confined_guess(system: System, pressure: np.ndarray) -> np.ndarray:

@@ -1,0 +1,511 @@
+"""IndenterFem: rigid tools pressed into the soft layer, step by step, by finite elements with node-to-surface contact.
+
+The tools are smooth signed-distance fields phi. A skin column c of area A_c that sinks into one (phi < 0) is pushed
+back by A_c p_c grad phi, p_c = max(0, lambda_c - epsilon phi), where lambda_c is updated to p_c until the tool is
+entered by less than a stated depth: the augmented Lagrangian method (Wriggers, "Computational Contact Mechanics",
+2nd ed., ch. 5.3).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import Literal, Self
+
+import numpy as np
+
+from fem_tools.mesh import WedgeMesh
+from fem_tools.newton import NewtonResult, System, is_positive_definite, newton
+from fem_tools.patch import Patch, PatchFem, discretisation_error, truncation_error
+from stmpl_core.arrays import PerVertex, Points, Transform, VertexVectors, Wrench, finite
+from stmpl_core.errors import InvalidInput
+from stmpl_core.layer import SoftLayer
+from stmpl_core.load import Load
+from stmpl_core.methods.base import prepared
+from stmpl_core.sdf import SignedDistance
+from stmpl_core.trust import Trust
+
+NORMAL_PENALTY = 100.0  # confined moduli over the thickness
+TANGENT_PENALTY = 10.0  # likewise: how far a sticking point creeps
+LONGEST_STEP = 0.04  # thicknesses a step
+MAX_ENTERED = 20e-6  # m; the augmented Lagrangian goes on until nodes are less deep in a tool
+MAX_UPDATES = 4
+MIN_J = 0.1  # below it an answer is not believed
+
+Friction = Literal["stick", "none"] | float
+
+
+@dataclass(frozen=True, eq=False)
+class Tool:
+    """A rigid tool and the way it goes.
+
+    Args:
+        field: its signed distance.
+        pose_body_from_tool: where it stands at travel 0, rigid, (4, 4).
+        direction: unit vector of its travel in the layer's frame, (3,).
+    """
+
+    field: SignedDistance
+    pose_body_from_tool: Transform
+    direction: np.ndarray
+
+    def __post_init__(self) -> None:
+        direction = finite("direction", self.direction, (3,))
+        if not (length := float(np.linalg.norm(direction))) > 0:
+            raise InvalidInput("the direction of a tool's travel has no length.")
+        object.__setattr__(self, "direction", direction / length)
+        object.__setattr__(self, "pose_body_from_tool", finite("pose", self.pose_body_from_tool, (4, 4)))
+
+    def at(self, travel: float) -> Tool:
+        """The same tool, moved on by `travel` [m]."""
+        pose = self.pose_body_from_tool.copy()
+        pose[:3, 3] += travel * self.direction
+        return replace(self, pose_body_from_tool=pose)
+
+    def to_tool(self, points: Points) -> Points:
+        """Points of the layer's frame in the tool's, (N, 3) [m]."""
+        return (points - self.pose_body_from_tool[:3, 3]) @ self.pose_body_from_tool[:3, :3]
+
+    def distance(self, points: Points) -> np.ndarray:
+        """Signed distance of points of the layer's frame, (N,) [m]."""
+        return self.field.distance(self.to_tool(points))
+
+    def jet(self, points: Points) -> tuple[np.ndarray, Points, np.ndarray]:
+        """Signed distance (N,) [m], gradient (N, 3) and Hessian (N, 3, 3) [1/m] in the layer's frame."""
+        turn = self.pose_body_from_tool[:3, :3]
+        phi, gradient, hessian = self.field.distance_gradient_hessian(self.to_tool(points))
+        return phi, gradient @ turn.T, turn @ hessian @ turn.T
+
+    def travel_to_touch(self, points: Points, *, furthest: float = 0.2) -> float | None:
+        """How far the tool goes until it first touches one of `points` [m] (negative: it must come back), or None.
+
+        Sphere tracing: the smallest distance can always be travelled safely (Hart 1996).
+        """
+        travel = 0.0
+        for _ in range(300):
+            gap = float(self.at(travel).distance(points).min())
+            if abs(gap) < 1e-7:
+                return travel
+            travel += gap
+            if abs(travel) > furthest:
+                return None
+        return travel if abs(gap) < 1e-5 else None
+
+
+class ToolLoad:
+    """A tool against the skin columns near it, at a fixed pose: a conservative SkinLoad.
+
+    Args:
+        tool: at this step's pose.
+        area: of all columns, (C,) [m2].
+        near: numbers of the columns that may touch.
+        stiffness: normal and tangential penalty [Pa/m].
+        multiplier: lambda of the columns in `near` [Pa].
+        anchor: where each near column sticks, in the tool's frame, (n, 3); NaN where it does not.
+        limit: largest tangential traction [Pa], (n,); infinite for sticking.
+    """
+
+    conservative = True
+
+    def __init__(
+        self,
+        tool: Tool,
+        area: np.ndarray,
+        near: np.ndarray,
+        stiffness: tuple[float, float],
+        multiplier: np.ndarray,
+        anchor: Points,
+        limit: np.ndarray,
+    ) -> None:
+        self.tool, self.near, self.area = tool, near, area[near]
+        self.normal, self.tangent = stiffness
+        self.multiplier, self.limit = multiplier, limit
+        self.held = np.isfinite(anchor).all(axis=1)
+        pose = tool.pose_body_from_tool
+        self.anchor = np.where(self.held[:, None], anchor, 0.0) @ pose[:3, :3].T + pose[:3, 3]
+        self.curved = True
+        self._project: np.ndarray | None = None
+
+    def pressure(self, skin: np.ndarray) -> np.ndarray:
+        """Contact pressure of the near columns, (n,) [Pa]."""
+        return np.maximum(0.0, self.multiplier - self.normal * self.tool.distance(skin[self.near]))
+
+    def _plane(self, skin: np.ndarray) -> np.ndarray:
+        """Projectors on the tool's tangent planes at the anchors, kept for the whole step, (n, 3, 3)."""
+        if self._project is None:
+            n = self.tool.jet(self.anchor)[1]
+            n /= np.maximum(np.linalg.norm(n, axis=1, keepdims=True), 1e-12)
+            self._project = (np.eye(3) - n[:, :, None] * n[:, None, :]) * self.held[:, None, None]
+        return self._project
+
+    def _slip(self, skin: np.ndarray) -> tuple[Points, np.ndarray]:
+        """Tangential offset from the anchors (n, 3) [m], and its secant stiffness [Pa/m] under the friction limit."""
+        offset = np.einsum("nij,nj->ni", self._plane(skin), skin[self.near] - self.anchor)
+        length = np.linalg.norm(offset, axis=1)
+        return offset, np.minimum(self.tangent, self.limit / np.maximum(length, 1e-12))
+
+    def potential(self, skin: np.ndarray, factor: float) -> float:
+        """int p^2 / (2 epsilon) plus the work of the tangential tractions [J]."""
+        offset, secant = self._slip(skin)
+        length = np.linalg.norm(offset, axis=1)
+        capped = secant < self.tangent
+        limit = np.where(capped, self.limit, 0.0)  # Huber's function: quadratic, then linear
+        capped_energy = limit * length - 0.5 * limit**2 / max(self.tangent, 1e-300)
+        tangential = np.where(capped, capped_energy, 0.5 * self.tangent * length**2)
+        return float(np.sum(self.area * (self.pressure(skin) ** 2 / (2 * self.normal) + tangential)))
+
+    def nodal_forces(self, skin: np.ndarray) -> Points:
+        """Forces of the tool on the near columns, (n, 3) [N]."""
+        phi, gradient, _ = self.tool.jet(skin[self.near])
+        p = np.maximum(0.0, self.multiplier - self.normal * phi)
+        offset, secant = self._slip(skin)
+        return self.area[:, None] * (p[:, None] * gradient - secant[:, None] * offset)
+
+    def add_forces(self, skin: np.ndarray, factor: float, forces: np.ndarray) -> None:
+        """See SkinLoad."""
+        forces[self.near] += self.nodal_forces(skin)
+
+    def add_tangent(self, skin: np.ndarray, factor: float, data: np.ndarray, *, symmetric: bool) -> None:
+        """See SkinLoad; the tool's curvature softens, and is left out where Newton asks for a convex model."""
+        phi, gradient, hessian = self.tool.jet(skin[self.near])
+        p = np.maximum(0.0, self.multiplier - self.normal * phi)
+        stiff = np.where((p > 0)[:, None, None], self.normal * gradient[:, :, None] * gradient[:, None, :], 0.0)
+        if self.curved:
+            stiff -= p[:, None, None] * hessian
+        _, secant = self._slip(skin)
+        stiff += secant[:, None, None] * self._plane(skin)
+        data[self.diagonal[self.near], :3, :3] += self.area[:, None, None] * stiff
+
+    diagonal: np.ndarray  # block number of each column's own block; set by the solver
+
+
+@dataclass(frozen=True, eq=False)
+class Indentation:
+    """One step of a press.
+
+    Args:
+        displacement: of the layer's vertices, (V, 3) [m].
+        pressure: contact force over rest area at the layer's vertices, (V,) [Pa].
+        traction: contact force vectors over rest area, (V, 3) [Pa].
+        wrenches: force [N] and torque about the tool's origin [N m] of each tool *on the body*, in the layer's axes.
+        depth: how far the tools went beyond first touch [m].
+        tools: where the tools stand.
+        trust: what may be believed of it; `figures` hold the entered depth at nodes and faces, min det F, stability.
+    """
+
+    displacement: VertexVectors
+    pressure: PerVertex
+    traction: VertexVectors
+    wrenches: tuple[Wrench, ...]
+    depth: float
+    tools: tuple[Tool, ...]
+    trust: Trust
+
+    @property
+    def force(self) -> float:
+        """Sum over the tools of the force along each tool's travel [N]."""
+        return float(sum(w[:3] @ t.direction for w, t in zip(self.wrenches, self.tools, strict=True)))
+
+
+@dataclass
+class _State:
+    """What a press carries from step to step."""
+
+    u: np.ndarray
+    previous: np.ndarray | None
+    travel: float
+    multipliers: list[np.ndarray]  # per tool, for all columns
+    anchors: list[np.ndarray]  # per tool, for all columns, in the tool's frame; NaN: free
+
+
+class IndenterFem:
+    """Presses rigid tools into a soft layer.
+
+    Args:
+        fem: how the patch is meshed and solved; None: one refinement near the contact.
+        friction: "stick" (a touching point stays where it touched, until it is let go), "none", or Coulomb's
+            coefficient with the limit taken from the last update of the pressure.
+    """
+
+    def __init__(self, fem: PatchFem | None = None, *, friction: Friction = "stick") -> None:
+        if not (friction in ("stick", "none") or (isinstance(friction, int | float) and 0 <= friction < 10)):
+            raise InvalidInput(f'friction is {friction!r}; allowed are "stick", "none" or a coefficient in [0, 10).')
+        self.fem = fem or PatchFem(refine=1)
+        self.friction: Friction = friction
+        self._layer: SoftLayer | None = None
+
+    def prepare(self, layer: SoftLayer) -> Self:
+        """See PatchFem.prepare."""
+        self.fem.prepare(layer)
+        self._layer = layer
+        return self
+
+    def path(self, tools: Sequence[Tool], depths: Sequence[float]) -> Iterator[Indentation]:
+        """Presses all tools together, and gives an answer at each depth beyond first touch.
+
+        Args:
+            tools: anywhere along their ways; each is first brought to where it just touches.
+            depths: increasing, > 0 [m].
+
+        Yields:
+            One Indentation a depth. After a step that fails the last believed one is flagged, and the path ends.
+
+        Raises:
+            InvalidInput: no tools, depths that do not increase, a tool that never meets the skin, or one whose way
+                ends in the core.
+        """
+        press = _Press(self, prepared(self._layer, self), tools, finite("depths", depths, (None,)))
+        for depth in depths:
+            answer = press.to(float(depth))
+            yield answer
+            if not answer.trust.converged:
+                return
+
+    def press(self, tools: Sequence[Tool], depth: float) -> Indentation:
+        """The answer at one depth [m]. See `path`."""
+        return list(self.path(tools, [depth]))[-1]
+
+    def press_with(self, tools: Sequence[Tool], force: float, *, deepest: float | None = None) -> Indentation:
+        """The answer where the tools' forces along their ways sum to `force` [N], within 0.1 %.
+
+        Args:
+            tools: see `path`.
+            force: > 0 [N].
+            deepest: where to give up [m]; None: 0.9 of the smallest thickness under the tools' first touch.
+
+        Raises:
+            InvalidInput: as `path`, or a force that is not above 0.
+        """
+        layer = prepared(self._layer, self)
+        if not (np.isfinite(force) and force > 0):
+            raise InvalidInput(f"the force is {force} N; it must be finite and above 0.")
+        limit = deepest or 0.9 * float(layer.thickness.min())
+        press = _Press(self, layer, tools, np.array([limit]))
+        low, low_force, depth, answer = 0.0, 0.0, LONGEST_STEP * press.thickness, None
+        for _ in range(60):
+            depth = min(depth, limit)
+            tried = press.to(depth)
+            if not tried.trust.converged:
+                return tried
+            answer = tried
+            if abs(tried.force - force) <= 1e-3 * force:
+                return tried
+            if tried.force < force and depth >= limit:
+                return replace(
+                    tried,
+                    trust=tried.trust.also(
+                        f"{tried.force:.3g} N at the deepest allowed {limit * 1e3:.2f} mm; {force:.3g} N was asked",
+                        in_range=False,
+                    ),
+                )
+            slope = max((tried.force - low_force) / (depth - low), 1e-9) if depth != low else 1e-9
+            step = (force - tried.force) / slope
+            low, low_force = depth, tried.force
+            depth = max(depth + float(np.clip(step, -0.04 * press.thickness, 0.04 * press.thickness)), 1e-6)
+        assert answer is not None
+        return replace(
+            answer, trust=answer.trust.also(f"force {answer.force:.4g} N, not {force:.4g} N", converged=False)
+        )
+
+
+class _Press:
+    """One press under way: the patch, the state and the walk from depth to depth."""
+
+    def __init__(self, solver: IndenterFem, layer: SoftLayer, tools: Sequence[Tool], depths: np.ndarray) -> None:
+        if not len(tools):
+            raise InvalidInput("there is no tool to press with.")
+        if not len(depths) or depths[0] <= 0 or (np.diff(depths) <= 0).any():
+            raise InvalidInput(f"depths must be above 0 and increase; got {depths}.")
+        self.solver, self.layer, self.fem = solver, layer, solver.fem
+        samples = np.vstack([layer.vertices, layer.vertices[layer.faces].mean(axis=1)])
+        self.tools = [self._touching(k, tool, samples) for k, tool in enumerate(tools)]
+        deepest = float(depths[-1])
+        reached = [tool.at(deepest).distance(layer.vertices) for tool in self.tools]
+        footprint = np.flatnonzero(np.min(reached, axis=0) <= max(0.0, float(np.min(reached))))
+        self.patch: Patch = self.fem.patch_around(footprint)
+        self.mesh: WedgeMesh = self.patch.mesh
+        self.thickness = float(layer.thickness[footprint].min())
+        self.system: System = self.fem.system(self.patch, Load.zero(layer))
+        self.area = column_areas(self.mesh)
+        modulus = layer.tissue.confined_modulus / self.thickness
+        tangential = 0.0 if solver.friction == "none" else TANGENT_PENALTY * modulus
+        self.stiffness = (NORMAL_PENALTY * modulus, tangential)
+        n = self.mesh.n_columns
+        self.diagonal = diagonal_of(self.mesh)
+        self.state = _State(
+            self.system.zeros(), None, 0.0, [np.zeros(n) for _ in tools], [np.full((n, 3), np.nan) for _ in tools]
+        )
+        self.last: Indentation | None = None
+
+    def _touching(self, number: int, tool: Tool, points: Points) -> Tool:
+        travel = tool.travel_to_touch(points)
+        if travel is None:
+            raise InvalidInput(f"tool {number} never meets the skin along its way {tool.direction}.")
+        return tool.at(travel)
+
+    def to(self, depth: float) -> Indentation:
+        """Walks to `depth` in short steps, halving them where Newton fails."""
+        step = LONGEST_STEP * self.thickness
+        while abs(depth - self.state.travel) > 1e-12:
+            move = float(np.clip(depth - self.state.travel, -step, step))
+            result, loads = self._step(self.state.travel + move)
+            if result.converged:
+                self._accept(result, loads, self.state.travel + move)
+            elif step > LONGEST_STEP * self.thickness / 8:
+                step /= 2
+            else:
+                return self._failed(result, loads, self.state.travel + move)
+        self.last = self._answer(self.last_result, self.last_loads)
+        return self.last
+
+    def _loads(self, travel: float) -> list[ToolLoad]:
+        skin, loads = self.system.rest[:, 0] + self.state.u[:, 0], []
+        for k, start in enumerate(self.tools):
+            tool = start.at(travel)
+            near = np.flatnonzero((tool.distance(skin) < 0.5 * self.thickness) & ~self.patch.fixed)
+            multiplier = self.state.multipliers[k][near]
+            limit = self._friction_limit(multiplier)
+            load = ToolLoad(tool, self.area, near, self.stiffness, multiplier, self.state.anchors[k][near], limit)
+            load.diagonal = self.diagonal
+            loads.append(load)
+        return loads
+
+    def _friction_limit(self, multiplier: np.ndarray) -> np.ndarray:
+        friction = self.solver.friction
+        return np.full(len(multiplier), np.inf) if isinstance(friction, str) else friction * multiplier
+
+    def _step(self, travel: float) -> tuple[NewtonResult, list[ToolLoad]]:
+        state, loads = self.state, self._loads(travel)
+        self.system.loads = [*loads]
+        guess = state.u if state.previous is None else 2 * state.u - state.previous
+        if not self.system.internal(guess)[1] > 0.5 * MIN_J:
+            guess = state.u
+        settings = replace(self.fem.settings, tolerance=1e-4, max_iterations=40)
+        result = newton(self.system, guess, 1.0, settings)
+        for _ in range(MAX_UPDATES):
+            if not result.converged:
+                for load in loads:
+                    load.curved = False
+                result = newton(self.system, result.u, 1.0, settings)
+                if not result.converged:
+                    break
+            skin = self.system.rest[:, 0] + result.u[:, 0]
+            entered = 0.0
+            for load in loads:
+                phi = load.tool.distance(skin[load.near])
+                load.multiplier = np.maximum(0.0, load.multiplier - load.normal * phi)
+                load.limit = self._friction_limit(load.multiplier)
+                entered = max(entered, float(-phi.min(initial=0.0)))
+            if entered < MAX_ENTERED:
+                break
+            result = newton(self.system, result.u, 1.0, settings)
+        return result, loads
+
+    def _accept(self, result: NewtonResult, loads: list[ToolLoad], travel: float) -> None:
+        state = self.state
+        state.previous = None if abs(travel) < 1e-15 else state.u
+        state.u, state.travel = result.u, travel
+        skin = self.system.rest[:, 0] + result.u[:, 0]
+        for k, load in enumerate(loads):
+            state.multipliers[k] = np.zeros(self.mesh.n_columns)
+            state.multipliers[k][load.near] = load.multiplier
+            touching, anchors = load.multiplier > 0, np.full((self.mesh.n_columns, 3), np.nan)
+            offset, secant = load._slip(skin)
+            # a held point that slipped is anchored where its traction is the limit; a new one where it is
+            at = skin[load.near] - offset * (secant / load.tangent)[:, None] if load.tangent > 0 else skin[load.near]
+            anchors[load.near[touching]] = load.tool.to_tool(at[touching])
+            if load.tangent > 0:
+                state.anchors[k] = anchors
+        self.last_result, self.last_loads = result, loads
+
+    def _answer(self, result: NewtonResult, loads: list[ToolLoad]) -> Indentation:
+        layer, patch = self.layer, self.patch
+        displacement, traction = np.zeros_like(layer.vertices), np.zeros_like(layer.vertices)
+        n = len(patch.vertices)
+        displacement[patch.vertices] = result.u[:n, 0]
+        skin, forces, wrenches = self.system.rest[:, 0] + result.u[:, 0], np.zeros((self.mesh.n_columns, 3)), []
+        for load in loads:
+            nodal = load.nodal_forces(skin)
+            forces[load.near] += nodal
+            arm = skin[load.near] - load.tool.pose_body_from_tool[:3, 3]
+            wrenches.append(np.concatenate([nodal.sum(axis=0), np.cross(arm, nodal).sum(axis=0)]))
+        corner = self.mesh.to_corners(forces)
+        traction[patch.vertices] = patch.gather(corner) / layer.vertex_areas[patch.vertices, None]
+        pressure = np.maximum(0.0, -np.einsum("vi,vi->v", traction, layer.normals))
+        return Indentation(
+            displacement,
+            pressure,
+            traction,
+            tuple(wrenches),
+            self.state.travel,
+            tuple(load.tool for load in loads),
+            self._trust(result, loads, skin, pressure),
+        )
+
+    def _trust(self, result: NewtonResult, loads: list[ToolLoad], skin: np.ndarray, pressure: np.ndarray) -> Trust:
+        faces = skin[self.mesh.triangles].mean(axis=1)
+        nodes_in = max(float(-load.tool.distance(skin[load.near]).min(initial=0.0)) for load in loads)
+        faces_in = max(float(-load.tool.distance(faces).min(initial=0.0)) for load in loads)
+        stable = not self.fem.check_stability or is_positive_definite(self.system, result.u)
+        discretisation = discretisation_error(self.system, result.u)
+        truncation = truncation_error(self.patch, result.u, self.layer)
+        area = float(self.layer.vertex_areas[pressure > 0].sum())
+        mean = float((pressure * self.layer.vertex_areas).sum()) / area if area > 0 else 0.0
+        trust = Trust(
+            converged=result.converged,
+            error_bound=discretisation + truncation + faces_in,
+            figures={
+                "min_j": result.min_j,
+                "positive_definite": float(stable),
+                "residual": result.residual,
+                "nodes_entered_m": nodes_in,
+                "faces_entered_m": faces_in,
+                "discretisation_m": discretisation,
+                "truncation_m": truncation,
+                "mean_pressure_over_modulus": mean / self.layer.tissue.youngs_modulus,
+                "contact_area_m2": area,
+                "columns": self.mesh.n_columns,
+            },
+        )
+        if faces_in > 0.01 * self.thickness:
+            trust = trust.also(
+                f"faces enter the tool by {faces_in * 1e3:.3f} mm, more than 1 % of the thickness: "
+                "refine the patch (PatchFem(refine=...))",
+                in_range=False,
+            )
+        if result.min_j < MIN_J:
+            trust = trust.also(f"an element is crushed to {result.min_j:.2f} of its volume", in_range=False)
+        if not stable:
+            trust = trust.also("the tangent is not positive definite: the equilibrium is unstable", in_range=False)
+        if self.last is not None and self.last.depth < self.state.travel:
+            now = sum(float(load.nodal_forces(skin).sum(axis=0) @ load.tool.direction) for load in loads)
+            if now < self.last.force:
+                trust = trust.also(f"the force fell from {self.last.force:.3g} to {now:.3g} N", in_range=False)
+        return trust if trust.ok else replace(trust, error_bound=None)
+
+    def _failed(self, result: NewtonResult, loads: list[ToolLoad], travel: float) -> Indentation:
+        why = (
+            f"Newton stopped at {travel * 1e3:.2f} mm (residual {result.residual:.1e}): "
+            f"the answer is that of {self.state.travel * 1e3:.2f} mm"
+        )
+        if self.state.travel == 0.0:
+            self.last_result, self.last_loads = replace(result, u=self.system.zeros(), min_j=1.0), self._loads(0.0)
+        self.system.loads = [*self.last_loads]
+        answer = self._answer(self.last_result, self.last_loads)
+        return replace(answer, trust=replace(answer.trust.also(why, converged=False, in_range=False), error_bound=None))
+
+
+def column_areas(mesh: WedgeMesh) -> np.ndarray:
+    """Skin area of each column at rest, (C,) [m2]: a third of each triangle, or 1/12 and 1/4 where quadratic."""
+    a, b, c = (mesh.outer[mesh.triangles[:, k]] for k in range(3))
+    area = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)
+    share = np.full(3, 1 / 3) if not len(mesh.edges) else np.repeat([1 / 12, 1 / 4], 3)
+    out = np.zeros(mesh.n_columns)
+    np.add.at(out, mesh.columns, area[:, None] * share)
+    return out
+
+
+def diagonal_of(mesh: WedgeMesh) -> np.ndarray:
+    """Number of the block of each column with itself, (C,)."""
+    rows = np.repeat(np.arange(mesh.n_columns), np.diff(mesh.indptr))
+    return np.flatnonzero(rows == mesh.indices)
