@@ -7,7 +7,6 @@ from functools import cached_property
 
 import numba
 import numpy as np
-import scipy.sparse as sp
 from numpy.typing import ArrayLike
 from scipy.ndimage import distance_transform_edt
 
@@ -79,21 +78,31 @@ class UvChart:
 
     def to_vertices(self, image: ArrayLike) -> np.ndarray:
         """An image (H, W, k) sampled bilinearly at the vertices, (V, k); a seam's vertices average their places."""
-        return self._average @ (self._sampler @ self._flat(image))
+        flat = self._flat(image)
+        result = np.zeros((len(self.vertices), flat.shape[1]), flat.dtype)
+        _sample(result, flat, self.place_vertex, *self._taps, self._share.astype(flat.dtype, copy=False))
+        return result
 
     def seam_gap(self, image: ArrayLike) -> PerVertex:
         """How far the places of each seam vertex disagree in `image`, in its unit, (len(seam_vertices),)."""
-        places = self._sampler @ self._flat(image)
-        low = np.full((len(self.vertices), places.shape[1]), np.inf)
+        flat = self._flat(image)
+        texels, weights = (table[self._seam_places] for table in self._taps)
+        places = np.einsum("pt,ptk->pk", weights, flat[texels])
+        owner = np.searchsorted(self.seam_vertices, self.place_vertex[self._seam_places])
+        low = np.full((len(self.seam_vertices), flat.shape[1]), np.inf)
         high = -low
-        np.minimum.at(low, self.place_vertex, places)
-        np.maximum.at(high, self.place_vertex, places)
-        return np.linalg.norm((high - low)[self.seam_vertices], axis=1)
+        np.minimum.at(low, owner, places)
+        np.maximum.at(high, owner, places)
+        return np.linalg.norm(high - low, axis=1)
 
     @cached_property
     def seam_vertices(self) -> np.ndarray:
         """Numbers of the vertices with more than one place in the image, sorted."""
         return np.flatnonzero(np.bincount(self.place_vertex) > 1)
+
+    @cached_property
+    def _seam_places(self) -> np.ndarray:
+        return np.flatnonzero(np.bincount(self.place_vertex)[self.place_vertex] > 1)
 
     @cached_property
     def mask(self) -> np.ndarray:
@@ -125,23 +134,22 @@ class UvChart:
         array = np.asarray(image)
         if array.shape[:2] != self.shape:
             raise InvalidInput(f"the image has shape {array.shape}; expected ({self.shape[0]}, {self.shape[1]}, k).")
-        return array.reshape(self.shape[0] * self.shape[1], -1)
+        if array.dtype not in (np.float32, np.float64):
+            array = array.astype(np.float64)
+        return np.ascontiguousarray(array).reshape(self.shape[0] * self.shape[1], -1)
 
     def _pixels(self, uv: np.ndarray) -> np.ndarray:
         """(column, row) of UVs, in texels; integers are texel centres."""
         return (uv - self.origin) * np.array([1, -1]) / self.texel - 0.5
 
     def _places(self) -> None:
-        """Numbers the distinct places (vertex, uv) and makes the operators that sample an image there."""
+        """Numbers the distinct places (vertex, uv) and finds the texels that an image is sampled from there."""
         key = np.column_stack([self.faces.ravel(), self.uv.reshape(-1, 2)])
         _, first, corner_place = np.unique(np.round(key, 9), axis=0, return_index=True, return_inverse=True)
         self.place_vertex = self.faces.ravel()[first]
         self.corner_place = corner_place.reshape(-1, 3)
-        count = np.bincount(self.place_vertex, minlength=len(self.vertices))
-        rows = np.arange(len(first))
-        self._average = sp.csr_matrix((1 / count[self.place_vertex], (self.place_vertex, rows)),
-                                      (len(self.vertices), len(rows)))
-        self._sampler = _bilinear(self._pixels(self.uv.reshape(-1, 2)[first]), self.shape)
+        self._share = (1 / np.bincount(self.place_vertex, minlength=len(self.vertices)))[self.place_vertex]
+        self._taps = _bilinear(self._pixels(self.uv.reshape(-1, 2)[first]), self.shape)
 
     @cached_property
     def _cover(self) -> np.ndarray:
@@ -196,16 +204,15 @@ def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
 
 
-def _bilinear(pixels: np.ndarray, shape: tuple[int, int]) -> sp.csr_matrix:
-    """Samples an image at (column, row) positions."""
+def _bilinear(pixels: np.ndarray, shape: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
+    """The four texels around (column, row) positions and their weights, each (P, 4)."""
     height, width = shape
     x, y = np.clip(pixels[:, 0], 0, width - 1), np.clip(pixels[:, 1], 0, height - 1)
     left, top = np.minimum(x.astype(int), width - 2), np.minimum(y.astype(int), height - 2)
     a, b = x - left, y - top
-    columns = (top * width + left)[:, None] + np.array([0, 1, width, width + 1])
+    texels = (top * width + left)[:, None] + np.array([0, 1, width, width + 1])
     weights = np.column_stack([(1 - a) * (1 - b), a * (1 - b), (1 - a) * b, a * b])
-    rows = np.repeat(np.arange(len(pixels)), 4)
-    return sp.csr_matrix((weights.ravel(), (rows, columns.ravel())), (len(pixels), height * width))
+    return texels.astype(np.int32), weights.astype(np.float32)
 
 
 @numba.njit(cache=True)
@@ -239,3 +246,15 @@ def _gather(image: np.ndarray, index: np.ndarray, corners: np.ndarray, weights: 
         wa, wb, wc = weights[n, 0], weights[n, 1], weights[n, 2]
         for k in range(table.shape[1]):
             image[index[n], k] = wa * table[a, k] + wb * table[b, k] + wc * table[c, k]
+
+
+@numba.njit(cache=True)
+def _sample(
+    result: np.ndarray, flat: np.ndarray, owner: np.ndarray, texels: np.ndarray, weights: np.ndarray, share: np.ndarray
+) -> None:
+    """result[owner] += share * sum over taps of weights * flat[texels]."""
+    for p in range(len(owner)):
+        for t in range(4):
+            w = share[p] * weights[p, t]
+            for k in range(flat.shape[1]):
+                result[owner[p], k] += w * flat[texels[p, t], k]
