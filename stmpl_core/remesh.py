@@ -3,6 +3,10 @@
 from __future__ import annotations
 
 import logging
+import signal
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 
 import igl
@@ -282,16 +286,28 @@ def _mmg_raw(
         mesh.set_edges(np.ascontiguousarray(seam, dtype=np.int32), np.full(len(seam), SEAM, np.int64))
     quiet = {"verbose": -1, "angle": 0, "hgrad": -1.0, "hausd": 1e-3} | options
     try:
-        if level is None:
-            mesh.remesh(**quiet)
-        else:
-            mesh.remesh_levelset(np.ascontiguousarray(level[:, None]), **quiet)
+        with _signals_kept():
+            if level is None:
+                mesh.remesh(**quiet)
+            else:
+                mesh.remesh_levelset(np.ascontiguousarray(level[:, None]), **quiet)
     except RuntimeError as error:
         raise MeshError(f"MMG could not remesh this surface ({len(vertices)} vertices): {error}. "
                         "Look for folds and self-intersections, or ask for another edge length.") from error
     triangles, reference = mesh.get_triangles_with_refs()
     edges, edge_reference = mesh.get_edges_with_refs() if len(seam) else (np.empty((0, 2), int), np.empty(0, int))
     return mesh.get_vertices(), triangles.astype(np.int64), edges[edge_reference == SEAM].astype(np.int64), reference
+
+
+@contextmanager
+def _signals_kept() -> Iterator[None]:
+    """MMG sets SIGINT and SIGTERM back to the system's default; this gives Python's handlers back their place."""
+    try:
+        yield
+    finally:
+        if threading.current_thread() is threading.main_thread():
+            for number in (signal.SIGINT, signal.SIGTERM):
+                signal.signal(number, signal.getsignal(number) or signal.SIG_DFL)
 
 
 def _relaxed(

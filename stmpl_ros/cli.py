@@ -151,7 +151,7 @@ def main(arguments: list[str] | None = None) -> None:
     except StmplError as error:
         from rich.console import Console
 
-        Console(stderr=True).print(f"[red]stmpl:[/red] {error}", highlight=False)
+        Console(stderr=True).print(f"stmpl: {error}", markup=False, highlight=False, soft_wrap=True, style="red")
         code = 1
     except KeyboardInterrupt:
         code = 130

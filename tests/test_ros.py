@@ -115,6 +115,18 @@ def device():
     assert code == 0, said
 
 
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_the_node_on_the_arm_ends_cleanly_when_asked_to(device, number):
+    process = start("-m", "stmpl_ros.cli", "node", "--edge-length", "0.008", "--ros-args", "-r", "__ns:=/arm")
+    try:
+        heard = []
+        device.node.create_subscription(SkinTopology, "/arm/skin/topology", heard.append, KEPT)
+        device.wait(lambda: heard, "/arm/skin/topology")
+    finally:
+        code, said = end(process, number)
+    assert code == 0, said
+
+
 def rows(answer: SkinDisplacement) -> np.ndarray:
     return np.frombuffer(answer.displacement, np.float32).reshape(-1, 3)
 
