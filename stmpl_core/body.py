@@ -23,6 +23,7 @@ from numpy.typing import ArrayLike
 from stmpl_core.arrays import Faces, Points, finite
 from stmpl_core.chart import UvChart
 from stmpl_core.errors import InvalidInput
+from stmpl_core.extrusion import foldfree_thickness
 from stmpl_core.layer import SoftLayer, Tissue, check_faces
 from stmpl_core.remesh import Remeshed, remesh
 
@@ -185,7 +186,8 @@ class Body:
         Args:
             name: see `Body.parts`, or the name of one bone.
             edge_length: of the skin's mesh [m].
-            thickness: of the layer, one number or one a vertex of the new mesh [m].
+            thickness: of the layer, one number or one a vertex of the new mesh [m]; thinned, with a warning, where the
+                skin curves more tightly than that.
             tissue: material; Tissue() unless given.
 
         Raises:
@@ -236,13 +238,17 @@ class Patch:
     source: np.ndarray
 
     def layer(self, body: Body, *, thickness: ArrayLike = 7.5e-3, tissue: Tissue | None = None) -> SoftLayer:
-        """The part as a soft layer, on `body` in its pose: the mesh's connectivity and chart stay what they are."""
+        """The part as a soft layer, on `body` in its pose: the mesh's connectivity and UVs stay what they are.
+
+        Where the skin curves more tightly than `thickness`, the layer is thinned, and a warning says where.
+        """
         if self.source.max() >= len(body.vertices):
             raise InvalidInput(f"this patch was drawn from a body with at least {self.source.max() + 1} vertices; "
                                f"{body.name} has {len(body.vertices)}.")
         vertices = self.mesh.transfer @ body.vertices[self.source]
         chart = None if self.mesh.uv is None else UvChart(vertices, self.mesh.faces, self.mesh.uv)
-        return SoftLayer(vertices, self.mesh.faces, thickness, tissue=tissue, chart=chart)
+        layer = SoftLayer(vertices, self.mesh.faces, thickness, tissue=tissue, chart=chart)
+        return layer.with_(thickness=foldfree_thickness(layer))
 
 
 def _known(kind: str, given: Mapping[str, Any], available: list[str]) -> None:

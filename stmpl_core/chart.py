@@ -13,6 +13,7 @@ from scipy.ndimage import distance_transform_edt
 from stmpl_core.arrays import PerVertex, finite
 from stmpl_core.errors import InvalidInput, MeshError
 from stmpl_core.layer import check_faces
+from stmpl_core.remesh import doubled_area
 
 log = logging.getLogger(__name__)
 
@@ -114,7 +115,7 @@ class UvChart:
         """Area of skin that one texel covers, on each face, (F,) [m2]."""
         p = self.vertices[self.faces]
         area = np.linalg.norm(np.cross(p[:, 1] - p[:, 0], p[:, 2] - p[:, 0]), axis=1)
-        return area / np.abs(_doubled_area(self.uv)) * self.texel**2
+        return area / np.abs(doubled_area(self.uv)) * self.texel**2
 
     @property
     def mm_per_texel(self) -> tuple[float, float, float]:
@@ -180,8 +181,8 @@ def _frame(
     uv: np.ndarray, resolution: int, bounds: tuple[float, float, float, float] | None
 ) -> tuple[float, np.ndarray, tuple[int, int]]:
     """Width of a texel in UV, the top left corner of the image in UV, and its (H, W)."""
-    if (np.abs(_doubled_area(uv)) <= 1e-14).any():
-        raise MeshError(f"{int((np.abs(_doubled_area(uv)) <= 1e-14).sum())} faces have no area in UV.")
+    if (np.abs(doubled_area(uv)) <= 1e-14).any():
+        raise MeshError(f"{int((np.abs(doubled_area(uv)) <= 1e-14).sum())} faces have no area in UV.")
     low, high = uv.min(axis=(0, 1)), uv.max(axis=(0, 1))
     if bounds is not None:
         if (low < bounds[:2]).any() or (high > bounds[2:]).any():
@@ -194,10 +195,6 @@ def _frame(
     texels[size.argmax()] = resolution
     middle = (low + high) / 2
     return texel, middle + texels * texel / 2 * np.array([-1, 1]), (int(texels[1]), int(texels[0]))
-
-
-def _doubled_area(uv: np.ndarray) -> np.ndarray:
-    return _cross(uv[:, 1] - uv[:, 0], uv[:, 2] - uv[:, 0])
 
 
 def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:

@@ -398,7 +398,24 @@ def _corner_uv(
     fan = corner_fans(faces, seam)
     count = np.bincount(fan.ravel())
     mean = np.column_stack([np.bincount(fan.ravel(), result[..., k].ravel()) / count for k in range(2)])
-    return mean[fan]
+    return _unturned(mean[fan], x[faces], dense, dense_uv)
+
+
+def _unturned(uv: np.ndarray, corners: np.ndarray, dense: _Dense, dense_uv: np.ndarray) -> np.ndarray:
+    """Faces that the averaging turned over or crushed, as a sliver in a seam's corner may be, look up UVs alone."""
+    below, _ = _closest(corners.mean(axis=1), dense)
+    there = [_barycentric(corners[:, k], dense.vertices[dense.faces[below]]) for k in range(3)]
+    alone = np.stack([np.einsum("fk,fkd->fd", weights, dense_uv[below]) for weights in there], axis=1)
+    wrong = ~(doubled_area(uv) / doubled_area(alone) > 0.1)
+    if wrong.any():
+        log.debug("%d faces look up their UVs alone", int(wrong.sum()))
+    return np.where(wrong[:, None, None], alone, uv)
+
+
+def doubled_area(uv: np.ndarray) -> np.ndarray:
+    """Twice the signed area of triangles (F, 3, 2), positive counter-clockwise."""
+    a, b = uv[:, 1] - uv[:, 0], uv[:, 2] - uv[:, 0]
+    return a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
 
 
 def corner_fans(faces: Faces, seam: np.ndarray) -> np.ndarray:
