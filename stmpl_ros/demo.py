@@ -31,7 +31,7 @@ LONGEST = 600.0  # s until the devices must be done: a first start compiles kern
 TO_STOP = 20.0  # s that a process gets to end after SIGINT
 LOOK = 0.1  # s
 LEAST_RATE = 100.0  # Hz at which contacts must have come
-LEAST_KEPT = 0.9  # of the contacts must have been answered
+LEAST_KEPT = 0.5  # of the contacts must have been answered: the newest wins, so a busy machine answers fewer
 LEAST_IDENTICAL = 0.95  # of the answers must come out of a replay as recorded; those given out of step cannot
 REPLAY_EVERY = 10  # answers
 

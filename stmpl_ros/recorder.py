@@ -9,10 +9,10 @@ import queue
 import re
 import threading
 import time
-from typing import Any, cast
+from typing import Any
 
 from rclpy.event_handler import SubscriptionEventCallbacks
-from rclpy.executors import SingleThreadedExecutor
+from rclpy.experimental.events_executor import EventsExecutor
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.utilities import ok
@@ -30,6 +30,8 @@ LOOK = 0.1  # s between two looks for new topics
 DEPTH = 1000  # messages that may wait while the disk is busy
 DRAIN = 0.5  # s in which what is still on its way is taken, after being asked to stop
 
+Item = tuple[str, str, str, bytes, int]  # topic, type, quality of service, serialised message, when it came [ns]
+
 
 class RecorderNode(Node):
     """Subscribes to every topic of a run as soon as it is announced, and hands the bytes to a thread that writes.
@@ -43,7 +45,7 @@ class RecorderNode(Node):
         self.received = self.lost = 0
         self.error: BagError | None = None
         self._channels: dict[str, int] = {}
-        self._queue: queue.SimpleQueue[tuple[str, str, str, bytes, int, int] | None] = queue.SimpleQueue()
+        self._queue: queue.SimpleQueue[Item | None] = queue.SimpleQueue()
         self._thread = threading.Thread(target=self._write, name="writer")
         self._thread.start()
         self._subscribed: set[str] = set()
@@ -69,14 +71,14 @@ class RecorderNode(Node):
         )
         qos = qos_yaml(depth=max((o.depth for o in offered), default=10) or 10, reliable=reliable, transient_local=kept)
 
-        def keep(data: Any, info: Any) -> None:
+        def keep(data: Any) -> None:
             self.received += 1
-            self._queue.put((topic, type_name, qos, data, time.time_ns(), info["source_timestamp"]))
+            self._queue.put((topic, type_name, qos, data, time.time_ns()))
 
         self.create_subscription(
             getattr(importlib.import_module(f"{package}.msg"), name),
             topic,
-            cast(Any, keep),  # with two arguments rclpy also gives the time at which the message was sent
+            keep,
             profile,
             raw=True,
             event_callbacks=SubscriptionEventCallbacks(message_lost=self._on_lost),
@@ -90,15 +92,15 @@ class RecorderNode(Node):
     def _write(self) -> None:
         try:
             while (item := self._next()) is not None:
-                topic, type_name, qos, data, received, sent = item
+                topic, type_name, qos, data, received = item
                 if topic not in self._channels:
                     self._channels[topic] = self.writer.add_channel(topic, type_name, qos)
-                self.writer.write(self._channels[topic], data, received, sent)
+                self.writer.write(self._channels[topic], data, received, received)
         except BagError as error:
             self.error = error
             self._stop.set()
 
-    def _next(self) -> tuple[str, str, str, bytes, int, int] | None:
+    def _next(self) -> Item | None:
         while True:
             try:
                 return self._queue.get(timeout=1.0)
@@ -123,7 +125,7 @@ def run(config: RecordConfig, arguments: list[str] | None = None) -> int:
             config=made_by,
         )
         node = RecorderNode(writer, stop)
-        executor = SingleThreadedExecutor()
+        executor = EventsExecutor()
         executor.add_node(node)
         try:
             spin(executor, stop)
