@@ -27,7 +27,8 @@ log = logging.getLogger(__name__)
 
 WANTED = re.compile(r"(contact_mesh|skin/topology|skin/displacement|tools/\w+/(pose|wrench))$|^/diagnostics$")
 LOOK = 0.1  # s between two looks for new topics
-DEPTH = 1000  # messages that may wait while the disk is busy
+DEPTH = 1000  # messages of a topic that the middleware keeps while this process is busy
+WAITING = 4000  # messages that may wait for the disk; what comes then is counted as lost
 DRAIN = 0.5  # s in which what is still on its way is taken, after being asked to stop
 
 Item = tuple[str, str, str, bytes, int]  # topic, type, quality of service, serialised message, when it came [ns]
@@ -72,6 +73,8 @@ class RecorderNode(Node):
         qos = qos_yaml(depth=max((o.depth for o in offered), default=10) or 10, reliable=reliable, transient_local=kept)
 
         def keep(data: Any) -> None:
+            if self._queue.qsize() > WAITING:
+                return self._count_lost(1, f"the disk is {WAITING} messages behind")
             self.received += 1
             self._queue.put((topic, type_name, qos, data, time.time_ns()))
 
@@ -86,8 +89,11 @@ class RecorderNode(Node):
         self.get_logger().info(f"recording {topic} ({type_name})")
 
     def _on_lost(self, status: Any) -> None:
-        self.lost += status.total_count_change
-        self.get_logger().error(f"{status.total_count_change} messages were lost on the way", throttle_duration_sec=1.0)
+        self._count_lost(status.total_count_change, "lost on the way")
+
+    def _count_lost(self, count: int, why: str) -> None:
+        self.lost += count
+        self.get_logger().error(f"{self.lost} messages lost so far; the last: {why}", throttle_duration_sec=1.0)
 
     def _write(self) -> None:
         try:
