@@ -29,8 +29,11 @@ NORMAL_PENALTY = 100.0  # confined moduli over the thickness
 TANGENT_PENALTY = 10.0  # likewise: how far a sticking point creeps
 LONGEST_STEP = 0.04  # thicknesses a step
 MAX_ENTERED = 20e-6  # m; the augmented Lagrangian goes on until nodes are less deep in a tool
+MAX_FACES_ENTERED = 0.01  # thicknesses
 MAX_UPDATES = 4
 MIN_J = 0.1  # below it an answer is not believed
+
+_ON_FACE = np.array([(i, j, 8 - i - j) for i in range(9) for j in range(9 - i)]) / 8  # barycentric, (45, 3)
 
 Friction = Literal["stick", "none"] | float
 
@@ -138,7 +141,7 @@ class ToolLoad:
             self._project = (np.eye(3) - n[:, :, None] * n[:, None, :]) * self.held[:, None, None]
         return self._project
 
-    def _slip(self, skin: np.ndarray) -> tuple[Points, np.ndarray]:
+    def slip(self, skin: np.ndarray) -> tuple[Points, np.ndarray]:
         """Tangential offset from the anchors (n, 3) [m], and its secant stiffness [Pa/m] under the friction limit."""
         offset = np.einsum("nij,nj->ni", self._plane(skin), skin[self.near] - self.anchor)
         length = np.linalg.norm(offset, axis=1)
@@ -146,7 +149,7 @@ class ToolLoad:
 
     def potential(self, skin: np.ndarray, factor: float) -> float:
         """int p^2 / (2 epsilon) plus the work of the tangential tractions [J]."""
-        offset, secant = self._slip(skin)
+        offset, secant = self.slip(skin)
         length = np.linalg.norm(offset, axis=1)
         capped = secant < self.tangent
         limit = np.where(capped, self.limit, 0.0)  # Huber's function: quadratic, then linear
@@ -158,7 +161,7 @@ class ToolLoad:
         """Forces of the tool on the near columns, (n, 3) [N]."""
         phi, gradient, _ = self.tool.jet(skin[self.near])
         p = np.maximum(0.0, self.multiplier - self.normal * phi)
-        offset, secant = self._slip(skin)
+        offset, secant = self.slip(skin)
         return self.area[:, None] * (p[:, None] * gradient - secant[:, None] * offset)
 
     def add_forces(self, skin: np.ndarray, factor: float, forces: np.ndarray) -> None:
@@ -172,7 +175,7 @@ class ToolLoad:
         stiff = np.where((p > 0)[:, None, None], self.normal * gradient[:, :, None] * gradient[:, None, :], 0.0)
         if self.curved:
             stiff -= p[:, None, None] * hessian
-        _, secant = self._slip(skin)
+        _, secant = self.slip(skin)
         stiff += secant[:, None, None] * self._plane(skin)
         data[self.diagonal[self.near], :3, :3] += self.area[:, None, None] * stiff
 
@@ -207,7 +210,7 @@ class Indentation:
         return float(sum(w[:3] @ t.direction for w, t in zip(self.wrenches, self.tools, strict=True)))
 
 
-@dataclass
+@dataclass(frozen=True, eq=False)
 class _State:
     """What a press carries from step to step."""
 
@@ -216,13 +219,15 @@ class _State:
     travel: float
     multipliers: list[np.ndarray]  # per tool, for all columns
     anchors: list[np.ndarray]  # per tool, for all columns, in the tool's frame; NaN: free
+    result: NewtonResult
+    loads: list[ToolLoad]
 
 
 class IndenterFem:
     """Presses rigid tools into a soft layer.
 
     Args:
-        fem: how the patch is meshed and solved; None: one refinement near the contact.
+        fem: how the patch is meshed and solved; None: up to three refinements where the tool's curvature asks.
         friction: "stick" (a touching point stays where it touched, until it is let go), "none", or Coulomb's
             coefficient with the limit taken from the last update of the pressure.
     """
@@ -230,7 +235,7 @@ class IndenterFem:
     def __init__(self, fem: PatchFem | None = None, *, friction: Friction = "stick") -> None:
         if not (friction in ("stick", "none") or (isinstance(friction, int | float) and 0 <= friction < 10)):
             raise InvalidInput(f'friction is {friction!r}; allowed are "stick", "none" or a coefficient in [0, 10).')
-        self.fem = fem or PatchFem(refine=1)
+        self.fem = fem or PatchFem(refine=3)
         self.friction: Friction = friction
         self._layer: SoftLayer | None = None
 
@@ -281,31 +286,27 @@ class IndenterFem:
             raise InvalidInput(f"the force is {force} N; it must be finite and above 0.")
         limit = deepest or 0.9 * float(layer.thickness.min())
         press = _Press(self, layer, tools, np.array([limit]))
-        low, low_force, depth, answer = 0.0, 0.0, LONGEST_STEP * press.thickness, None
-        for _ in range(60):
-            depth = min(depth, limit)
-            tried = press.to(depth)
-            if not tried.trust.converged:
-                return tried
-            answer = tried
-            if abs(tried.force - force) <= 1e-3 * force:
-                return tried
-            if tried.force < force and depth >= limit:
-                return replace(
-                    tried,
-                    trust=tried.trust.also(
-                        f"{tried.force:.3g} N at the deepest allowed {limit * 1e3:.2f} mm; {force:.3g} N was asked",
-                        in_range=False,
-                    ),
-                )
-            slope = max((tried.force - low_force) / (depth - low), 1e-9) if depth != low else 1e-9
-            step = (force - tried.force) / slope
-            low, low_force = depth, tried.force
-            depth = max(depth + float(np.clip(step, -0.04 * press.thickness, 0.04 * press.thickness)), 1e-6)
-        assert answer is not None
-        return replace(
-            answer, trust=answer.trust.also(f"force {answer.force:.4g} N, not {force:.4g} N", converged=False)
-        )
+        below, above = (0.0, 0.0, press.state), None  # depth, force, state
+        while above is None:
+            depth = min(below[0] + LONGEST_STEP * press.thickness, limit)
+            if not press.walk(depth):
+                return press.answer()
+            if press.force() >= force:
+                above = (depth, press.force())
+            elif depth >= limit:
+                answer = press.answer()
+                why = f"{answer.force:.3g} N at the deepest allowed {limit * 1e3:.2f} mm; {force:.3g} N was asked"
+                return replace(answer, trust=answer.trust.also(why, in_range=False))
+            else:
+                below = (depth, press.force(), press.state)
+        for _ in range(20):  # regula falsi, always from the state below, so that the path stays the same
+            depth = below[0] + (force - below[1]) / (above[1] - below[1]) * (above[0] - below[0])
+            press.state = below[2]
+            if not press.walk(depth) or abs(press.force() - force) <= 1e-3 * force:
+                break
+            above = (depth, press.force()) if press.force() > force else above
+            below = below if press.force() > force else (depth, press.force(), press.state)
+        return press.answer()
 
 
 class _Press:
@@ -317,14 +318,21 @@ class _Press:
         if not len(depths) or depths[0] <= 0 or (np.diff(depths) <= 0).any():
             raise InvalidInput(f"depths must be above 0 and increase; got {depths}.")
         self.solver, self.layer, self.fem = solver, layer, solver.fem
-        samples = np.vstack([layer.vertices, layer.vertices[layer.faces].mean(axis=1)])
-        self.tools = [self._touching(k, tool, samples) for k, tool in enumerate(tools)]
+        self.tools = [self._touching(k, tool) for k, tool in enumerate(tools)]
         deepest = float(depths[-1])
         reached = [tool.at(deepest).distance(layer.vertices) for tool in self.tools]
         footprint = np.flatnonzero(np.min(reached, axis=0) <= max(0.0, float(np.min(reached))))
-        self.patch: Patch = self.fem.patch_around(footprint)
+        thickness = float(layer.thickness[footprint].min())
+        shallow, deep = float(depths[0]), [float(depths[-1]) * share for share in (0.3, 0.6, 1.0)]
+
+        def edge_length(points: np.ndarray) -> np.ndarray:
+            wanted = [edge_for_curvature(tool.at(d), points, thickness) for tool in self.tools for d in deep]
+            wanted += [edge_for_first_contact(tool.at(shallow), points, shallow) for tool in self.tools]
+            return np.min(wanted, axis=0)
+
+        self.patch: Patch = self.fem.patch_around(footprint, edge_length)
         self.mesh: WedgeMesh = self.patch.mesh
-        self.thickness = float(layer.thickness[footprint].min())
+        self.thickness = thickness
         self.system: System = self.fem.system(self.patch, Load.zero(layer))
         self.area = column_areas(self.mesh)
         modulus = layer.tissue.confined_modulus / self.thickness
@@ -332,31 +340,60 @@ class _Press:
         self.stiffness = (NORMAL_PENALTY * modulus, tangential)
         n = self.mesh.n_columns
         self.diagonal = diagonal_of(self.mesh)
+        u, multipliers = self.system.zeros(), [np.zeros(n) for _ in tools]
         self.state = _State(
-            self.system.zeros(), None, 0.0, [np.zeros(n) for _ in tools], [np.full((n, 3), np.nan) for _ in tools]
+            u,
+            None,
+            0.0,
+            multipliers,
+            [np.full((n, 3), np.nan) for _ in tools],
+            NewtonResult(u, True, 0.0, 1.0, 0, 0, 1.0),
+            [],
         )
+        self.state = replace(self.state, loads=self._loads(0.0))
         self.last: Indentation | None = None
+        self.stopped = ""
 
-    def _touching(self, number: int, tool: Tool, points: Points) -> Tool:
-        travel = tool.travel_to_touch(points)
+    def _touching(self, number: int, tool: Tool) -> Tool:
+        """The tool where it first touches the faces: found with the vertices, then with points on the faces near."""
+        layer = self.layer
+        travel = tool.travel_to_touch(layer.vertices)
+        if travel is not None:
+            close = tool.at(travel).distance(layer.vertices) < 1.2 * layer.edge_length
+            corners = layer.vertices[layer.faces[close[layer.faces].any(axis=1)]]
+            travel = tool.travel_to_touch(np.einsum("pk,fkx->fpx", _ON_FACE, corners).reshape(-1, 3))
         if travel is None:
             raise InvalidInput(f"tool {number} never meets the skin along its way {tool.direction}.")
         return tool.at(travel)
 
     def to(self, depth: float) -> Indentation:
-        """Walks to `depth` in short steps, halving them where Newton fails."""
-        step = LONGEST_STEP * self.thickness
+        """Walks to `depth` and says what is there."""
+        self.walk(depth)
+        self.last = self.answer()
+        return self.last
+
+    def walk(self, depth: float) -> bool:
+        """Moves the state to `depth` in short steps, halved where Newton fails; False if it stops on the way."""
+        step, self.stopped = LONGEST_STEP * self.thickness, ""
         while abs(depth - self.state.travel) > 1e-12:
-            move = float(np.clip(depth - self.state.travel, -step, step))
-            result, loads = self._step(self.state.travel + move)
+            travel = self.state.travel + float(np.clip(depth - self.state.travel, -step, step))
+            result, loads = self._step(travel)
             if result.converged:
-                self._accept(result, loads, self.state.travel + move)
+                self.state = self._next(result, loads, travel)
             elif step > LONGEST_STEP * self.thickness / 8:
                 step /= 2
             else:
-                return self._failed(result, loads, self.state.travel + move)
-        self.last = self._answer(self.last_result, self.last_loads)
-        return self.last
+                self.stopped = (
+                    f"Newton stopped at {travel * 1e3:.2f} mm (residual {result.residual:.1e}): "
+                    f"the answer is that of {self.state.travel * 1e3:.2f} mm"
+                )
+                return False
+        return True
+
+    def force(self) -> float:
+        """Sum over the tools of the force along each one's travel [N], at the present state."""
+        skin = self.system.rest[:, 0] + self.state.u[:, 0]
+        return sum(float(x.nodal_forces(skin).sum(axis=0) @ x.tool.direction) for x in self.state.loads)
 
     def _loads(self, travel: float) -> list[ToolLoad]:
         skin, loads = self.system.rest[:, 0] + self.state.u[:, 0], []
@@ -376,50 +413,48 @@ class _Press:
 
     def _step(self, travel: float) -> tuple[NewtonResult, list[ToolLoad]]:
         state, loads = self.state, self._loads(travel)
-        self.system.loads = [*loads]
+        self.system.loads = loads
         guess = state.u if state.previous is None else 2 * state.u - state.previous
         if not self.system.internal(guess)[1] > 0.5 * MIN_J:
             guess = state.u
         settings = replace(self.fem.settings, tolerance=1e-4, max_iterations=40)
         result = newton(self.system, guess, 1.0, settings)
-        for _ in range(MAX_UPDATES):
+        for update in range(MAX_UPDATES + 1):
             if not result.converged:
                 for load in loads:
                     load.curved = False
                 result = newton(self.system, result.u, 1.0, settings)
-                if not result.converged:
-                    break
             skin = self.system.rest[:, 0] + result.u[:, 0]
-            entered = 0.0
-            for load in loads:
-                phi = load.tool.distance(skin[load.near])
-                load.multiplier = np.maximum(0.0, load.multiplier - load.normal * phi)
-                load.limit = self._friction_limit(load.multiplier)
-                entered = max(entered, float(-phi.min(initial=0.0)))
-            if entered < MAX_ENTERED:
+            entered = max(float(-load.tool.distance(skin[load.near]).min(initial=0.0)) for load in loads)
+            if not result.converged or entered < MAX_ENTERED or update == MAX_UPDATES:
                 break
+            for load in loads:
+                load.multiplier = load.pressure(skin)
+                load.limit = self._friction_limit(load.multiplier)
             result = newton(self.system, result.u, 1.0, settings)
         return result, loads
 
-    def _accept(self, result: NewtonResult, loads: list[ToolLoad], travel: float) -> None:
-        state = self.state
-        state.previous = None if abs(travel) < 1e-15 else state.u
-        state.u, state.travel = result.u, travel
-        skin = self.system.rest[:, 0] + result.u[:, 0]
-        for k, load in enumerate(loads):
-            state.multipliers[k] = np.zeros(self.mesh.n_columns)
-            state.multipliers[k][load.near] = load.multiplier
-            touching, anchors = load.multiplier > 0, np.full((self.mesh.n_columns, 3), np.nan)
-            offset, secant = load._slip(skin)
-            # a held point that slipped is anchored where its traction is the limit; a new one where it is
-            at = skin[load.near] - offset * (secant / load.tangent)[:, None] if load.tangent > 0 else skin[load.near]
-            anchors[load.near[touching]] = load.tool.to_tool(at[touching])
+    def _next(self, result: NewtonResult, loads: list[ToolLoad], travel: float) -> _State:
+        """The state after a step: multipliers kept, touching points anchored, anchors dragged where they slip."""
+        n, skin = self.mesh.n_columns, self.system.rest[:, 0] + result.u[:, 0]
+        multipliers, anchors = [], []
+        for load in loads:
+            multiplier, anchor = np.zeros(n), np.full((n, 3), np.nan)
+            multiplier[load.near] = load.pressure(skin)
             if load.tangent > 0:
-                state.anchors[k] = anchors
-        self.last_result, self.last_loads = result, loads
+                touching = multiplier[load.near] > 0
+                offset, secant = load.slip(skin)
+                at = skin[load.near] - offset * (secant / load.tangent)[:, None]
+                anchor[load.near[touching]] = load.tool.to_tool(at[touching])
+            multipliers.append(multiplier)
+            anchors.append(anchor)
+        previous = self.state.u if self.state.travel != 0.0 else None
+        return _State(result.u, previous, travel, multipliers, anchors, result, loads)
 
-    def _answer(self, result: NewtonResult, loads: list[ToolLoad]) -> Indentation:
-        layer, patch = self.layer, self.patch
+    def answer(self) -> Indentation:
+        """What is known at the present state."""
+        layer, patch, result, loads = self.layer, self.patch, self.state.result, self.state.loads
+        self.system.loads = loads
         displacement, traction = np.zeros_like(layer.vertices), np.zeros_like(layer.vertices)
         n = len(patch.vertices)
         displacement[patch.vertices] = result.u[:n, 0]
@@ -467,7 +502,7 @@ class _Press:
                 "columns": self.mesh.n_columns,
             },
         )
-        if faces_in > 0.01 * self.thickness:
+        if faces_in > MAX_FACES_ENTERED * self.thickness:
             trust = trust.also(
                 f"faces enter the tool by {faces_in * 1e3:.3f} mm, more than 1 % of the thickness: "
                 "refine the patch (PatchFem(refine=...))",
@@ -478,21 +513,44 @@ class _Press:
         if not stable:
             trust = trust.also("the tangent is not positive definite: the equilibrium is unstable", in_range=False)
         if self.last is not None and self.last.depth < self.state.travel:
-            now = sum(float(load.nodal_forces(skin).sum(axis=0) @ load.tool.direction) for load in loads)
-            if now < self.last.force:
-                trust = trust.also(f"the force fell from {self.last.force:.3g} to {now:.3g} N", in_range=False)
+            if self.force() < self.last.force:
+                trust = trust.also(f"the force fell from {self.last.force:.3g} to {self.force():.3g} N", in_range=False)
+        if self.stopped:
+            trust = trust.also(self.stopped, converged=False, in_range=False)
         return trust if trust.ok else replace(trust, error_bound=None)
 
-    def _failed(self, result: NewtonResult, loads: list[ToolLoad], travel: float) -> Indentation:
-        why = (
-            f"Newton stopped at {travel * 1e3:.2f} mm (residual {result.residual:.1e}): "
-            f"the answer is that of {self.state.travel * 1e3:.2f} mm"
-        )
-        if self.state.travel == 0.0:
-            self.last_result, self.last_loads = replace(result, u=self.system.zeros(), min_j=1.0), self._loads(0.0)
-        self.system.loads = [*self.last_loads]
-        answer = self._answer(self.last_result, self.last_loads)
-        return replace(answer, trust=replace(answer.trust.also(why, converged=False, in_range=False), error_bound=None))
+
+def edge_for_curvature(tool: Tool, points: np.ndarray, thickness: float) -> np.ndarray:
+    """The longest edge of a triangle whose middle may sink into the tool by no more than allowed, (T,) [m].
+
+    Where the corners of a triangle with edges h lie on a surface of curvature k, its middle is k h^2 / 6 inside.
+
+    Args:
+        tool: at the pose to be followed.
+        points: of each triangle, (T, k, 3) [m].
+        thickness: of the layer [m].
+    """
+    curvature = _curvature_touched(tool, points)
+    return np.sqrt(6 * 0.6 * MAX_FACES_ENTERED * thickness / np.maximum(curvature, 1e-9))
+
+
+def edge_for_first_contact(tool: Tool, points: np.ndarray, depth: float) -> np.ndarray:
+    """A third of the contact's radius sqrt(depth / k) where a tool of curvature k has sunk in by `depth`, (T,) [m]."""
+    return np.sqrt(depth / np.maximum(_curvature_touched(tool, points), 1e-9)) / 3
+
+
+def _curvature_touched(tool: Tool, points: np.ndarray) -> np.ndarray:
+    """Largest curvature of the tool where each triangle meets it, (T,) [1/m]; 0 where it does not."""
+    flat = points.reshape(-1, 3)
+    phi, gradient, _ = tool.jet(flat)
+    size = np.linalg.norm(points[:, 0] - points[:, -1], axis=1)
+    touching = (phi.reshape(points.shape[:2]) < 0.3 * size[:, None]).any(axis=1)
+    curvature = np.zeros(len(points))
+    if touching.any():
+        at = (flat - phi[:, None] * gradient).reshape(points.shape)[touching]
+        hessian = tool.jet(at.reshape(-1, 3))[2]
+        curvature[touching] = np.linalg.norm(hessian, ord=2, axis=(1, 2)).reshape(at.shape[:2]).max(axis=1)
+    return curvature
 
 
 def column_areas(mesh: WedgeMesh) -> np.ndarray:

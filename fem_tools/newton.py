@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Protocol
 
@@ -82,9 +82,15 @@ class System:
     """
 
     def __init__(
-        self, mesh: WedgeMesh, tissue: Tissue, loads: list[SkinLoad], fixed: np.ndarray, keep: np.ndarray | None = None
+        self,
+        mesh: WedgeMesh,
+        tissue: Tissue,
+        loads: Sequence[SkinLoad],
+        fixed: np.ndarray,
+        keep: np.ndarray | None = None,
     ) -> None:
-        self.mesh, self.tissue, self.loads = mesh, tissue, loads
+        self.mesh, self.tissue = mesh, tissue
+        self.loads: Sequence[SkinLoad] = loads
         self.mu, self.lam = tissue.shear_modulus, tissue.lame_lambda
         self.rest = mesh.rest_positions()
         self.fixed = fixed

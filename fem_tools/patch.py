@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Literal, Self
 
 import numpy as np
 from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import dijkstra
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from fem_tools import neo_hookean as nh
 from fem_tools.mesh import ElementName, WedgeMesh, fold_determinants, level_depths, reference_skin, split
@@ -24,6 +25,9 @@ MIN_FOLD = 0.05  # smallest determinant of a wedge at rest, over its mean, that 
 QUADRATIC_ABOVE = 0.45  # Poisson's ratio above which linear in plane locks (8 % of the peak at 0.47, 70 % at 0.499)
 REFINED_WITHIN = 1.5  # thicknesses of the load; beyond, the layer's own mesh is fine enough
 VALIDATED_RATIO = {"pressure": 2.0, "nodal": 0.4}  # p / E
+
+
+EdgeLength = Callable[[np.ndarray], np.ndarray]  # points of each triangle (T, k, 3) [m] -> longest edge wanted (T,) [m]
 
 
 class FollowerPressure:
@@ -142,7 +146,8 @@ class PatchFem:
                 f"PatchFem(layers={layers}, refine={refine}, reach={reach}): "
                 "layers >= 1, refine >= 0 and reach > 0 are allowed."
             )
-        self.element, self.layers, self.refine, self.reach, self.border = element, layers, refine, reach, border
+        self.element: ElementName | None = element
+        self.layers, self.refine, self.reach, self.border = layers, refine, reach, border
         self.settings = settings or NewtonSettings()
         self.check_stability = check_stability
         self.name = "patch_fem"
@@ -169,10 +174,15 @@ class PatchFem:
 
     def element_for(self, layer: SoftLayer) -> ElementName:
         """The element that this layer's Poisson's ratio asks for, unless one was chosen."""
-        return self.element or ("P2xP2" if layer.tissue.poisson_ratio > QUADRATIC_ABOVE else "P1xP2")
+        if self.element is not None:
+            return self.element
+        return "P2xP2" if layer.tissue.poisson_ratio > QUADRATIC_ABOVE else "P1xP2"
 
-    def patch_around(self, vertices: np.ndarray) -> Patch:
-        """Meshes everything within `reach` thicknesses of the given vertices of the layer, finest near them."""
+    def patch_around(self, vertices: np.ndarray, edge_length: EdgeLength | None = None) -> Patch:
+        """Meshes everything within `reach` thicknesses of the given vertices of the layer.
+
+        Triangles are split in four up to `refine` times: near the vertices, or where `edge_length` asks for it.
+        """
         layer = prepared(self._layer, self)
         thickness = float(layer.thickness[vertices].max())
         distance = dijkstra(
@@ -184,8 +194,15 @@ class PatchFem:
         outer, inner, triangles = layer.vertices[chosen], layer.inner_vertices[chosen], flat.reshape(-1, 3)
         away, splits = distance[chosen], []
         for _ in range(self.refine):
-            near = away[triangles].min(axis=1) <= REFINED_WITHIN * thickness
-            triangles, edges = split(triangles, len(outer), near)
+            if edge_length is None:
+                marked = away[triangles].min(axis=1) <= REFINED_WITHIN * thickness
+            else:
+                corners = outer[triangles]
+                longest = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
+                marked = longest > edge_length(np.concatenate([corners, corners.mean(axis=1, keepdims=True)], axis=1))
+            triangles, edges = split(triangles, len(outer), marked)
+            if not len(edges):
+                break
             outer, inner, away = (np.concatenate([x, x[edges].mean(axis=1)]) for x in (outer, inner, away))
             splits.append(edges)
         mesh = WedgeMesh.of(outer, inner, triangles, self.element_for(layer), self.layers)
@@ -289,7 +306,7 @@ def truncation_error(patch: Patch, u: np.ndarray, layer: SoftLayer) -> float:
     if not len(cut):
         return 0.0
     points = layer.vertices[patch.vertices]
-    gap = cKDTree(layer.vertices[cut]).query(points)[0]
+    gap = KDTree(layer.vertices[cut]).query(points)[0]
     near = gap < 1.25 * layer.thickness.max()
     return float(np.linalg.norm(u[:n, 0][near], axis=1).max(initial=0.0))
 
