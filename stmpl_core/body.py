@@ -85,9 +85,9 @@ class Body:
     def anny(cls, *, pose: Mapping[str, ArrayLike] | None = None, **phenotype: float) -> Body:
         """Anny (NAVER, Apache-2.0), whose data come with its package.
 
-        The first body ever takes some 20 s: Anny reads its shapes from 1,136 text files and keeps them in its own
-        cache (0.8 GB; ANNY_CACHE_DIR moves it). Each body is then kept as one file of 2 MB in the cache folder of
-        stmpl (STMPL_CACHE_DIR moves it), and costs milliseconds from then on.
+        The first body ever takes some 40 s on two cores: Anny reads its shapes from 1,136 text files, and keeps them in
+        its own cache (0.8 GB; ANNY_CACHE_DIR moves it). Each body is then kept as one file of 1 MB in the cache folder
+        of stmpl (STMPL_CACHE_DIR moves it), and costs milliseconds from then on.
 
         Args:
             pose: a rotation vector [rad] for each bone that turns, (3,), from the rest pose, in the body's axes.
@@ -153,6 +153,7 @@ class Body:
         """
         import smplx
         import torch
+        from smplx.joint_names import JOINT_NAMES, SMPLH_JOINT_NAMES
 
         if not Path(path).exists():
             raise InvalidInput(f"there is no SMPL model at {path}. Get it from smpl.is.tue.mpg.de or "
@@ -173,10 +174,10 @@ class Body:
             vertices = model(**turned).vertices[0].numpy().astype(float) @ SMPL_TO_BODY.T
         faces = np.asarray(model.faces, dtype=np.int64)
         weights = model.lbs_weights.detach().numpy()
-        bones = smplx.joint_names.JOINT_NAMES if model_type == "smplx" else smplx.joint_names.SMPLH_JOINT_NAMES
+        bones = JOINT_NAMES if model_type == "smplx" else SMPLH_JOINT_NAMES
         if model_type == "smpl":
             bones = [*bones[:22], "left_hand", "right_hand"]
-        return cls(model_type, vertices, faces, _smpl_uv(model, uv, faces), weights, tuple(bones[: weights.shape[1]]))
+        return cls(model_type, vertices, faces, _smpl_uv(uv, faces), weights, tuple(bones[: weights.shape[1]]))
 
     def part(
         self, name: str, *, edge_length: float = 3e-3, thickness: ArrayLike = 7.5e-3, tissue: Tissue | None = None
@@ -257,11 +258,11 @@ def _known(kind: str, given: Mapping[str, Any], available: list[str]) -> None:
         raise InvalidInput(f"unknown {kind}: {', '.join(unknown)}. Available: {', '.join(available)}.")
 
 
-def _smpl_uv(model: Any, uv: str | Path | None, faces: Faces) -> np.ndarray | None:
+def _smpl_uv(uv: str | Path | None, faces: Faces) -> np.ndarray | None:
     """UVs per corner, from an .obj file."""
     if uv is None:
         return None
-    _, texture, _, obj_faces, texture_faces, _ = igl.readOBJ(str(uv))
+    _, texture, _, obj_faces, texture_faces, _ = (np.asarray(table) for table in igl.readOBJ(str(uv)))
     if obj_faces.shape != faces.shape or not len(texture_faces):
         raise InvalidInput(f"{uv} has {len(obj_faces)} faces and {len(texture_faces)} with UVs; "
                            f"the body has {len(faces)}.")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from functools import cached_property
+from typing import cast
 
 import numba
 import numpy as np
@@ -165,7 +166,7 @@ class UvChart:
     @cached_property
     def _raster(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """For each texel that carries a value: its number, the vertices of its face, and their weights."""
-        distance, nearest = distance_transform_edt(self._cover < 0, return_indices=True)
+        distance, nearest = cast(tuple, distance_transform_edt(self._cover < 0, return_indices=True))
         row, column = np.nonzero(distance <= PADDING)
         face = self._cover[tuple(nearest[:, row, column])]
         corners = self._pixels(self.uv[face])

@@ -8,8 +8,9 @@ import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from typing import Any
 
-import igl
+import igl as libigl
 import mmgpy
 import numpy as np
 import scipy.sparse as sp
@@ -21,6 +22,7 @@ from stmpl_core.errors import InvalidInput, MeshError
 from stmpl_core.layer import check_faces
 
 log = logging.getLogger(__name__)
+igl: Any = libigl  # its stubs call every array an ArrayLike
 
 MAX_LEVELS = 4  # of subdivision: 256 faces for one
 SEAM, OUTSIDE = 7, 2  # MMG's references: ours for seam edges, its own for triangles beyond a level set
@@ -149,14 +151,14 @@ def _subdivided(
     edges, _ = edge_table(faces)
     longest = float(np.percentile(np.linalg.norm(points[edges[:, 0]] - points[edges[:, 1]], axis=1), 50))
     levels = int(np.clip(np.ceil(np.log2(longest / (1.5 * edge_length))), 0, MAX_LEVELS))
-    matrix = sp.identity(len(points), format="csr")
+    matrix = sp.csr_matrix(sp.identity(len(points)))
     parent, corners = np.arange(len(faces)), np.broadcast_to(np.eye(3), (len(faces), 3, 3))
     for _ in range(levels):
         step, finer = (igl.loop_matrix if smooth else igl.upsample_matrix)(faces.astype(np.int64))
         halves = _first_order(faces, finer)
         corners = np.einsum("fkc,fcp->fkp", halves, np.repeat(corners, 4, axis=0))
         seam = _halved(seam, faces, finer)
-        parent, faces, matrix = np.repeat(parent, 4), finer, (step @ matrix).tocsr()
+        parent, faces, matrix = np.repeat(parent, 4), finer, sp.csr_matrix(step @ matrix)
     if smooth and levels:
         matrix = _interpolating(matrix)
     return _Dense(np.ascontiguousarray(matrix @ points), faces, matrix, parent, np.ascontiguousarray(corners)), seam
@@ -190,14 +192,14 @@ def _rows_of(table: np.ndarray, pairs: np.ndarray) -> np.ndarray:
     return rows[keys[rows] == wanted]
 
 
-def _interpolating(matrix: sp.csr_matrix) -> sp.csr_matrix:
+def _interpolating(matrix: Any) -> sp.csr_matrix:
     """S with its control points corrected twice, c <- c + (v - S c), as one matrix."""
     n = matrix.shape[1]
-    identity = sp.identity(n, format="csr")
+    identity = sp.csr_matrix(sp.identity(n))
     controls = identity
     for _ in range(2):
         controls = controls + identity - matrix[:n] @ controls
-    return (matrix @ controls).tocsr()
+    return sp.csr_matrix(matrix @ controls)
 
 
 def _cut(dense: _Dense, seam: np.ndarray, level: PerVertex) -> tuple[tuple[Points, Faces], np.ndarray]:
@@ -221,7 +223,7 @@ def _cut(dense: _Dense, seam: np.ndarray, level: PerVertex) -> tuple[tuple[Point
     (vertices, faces), renumber = _compact(vertices, faces)
     seam = renumber[seam]
     seam = seam[(seam >= 0).all(axis=1)]
-    return (vertices, faces), seam[~_is_border(faces, seam)]
+    return (vertices, faces), _within(faces, seam)
 
 
 def _without_scraps(vertices: Points, faces: Faces, seam: np.ndarray) -> np.ndarray:
@@ -252,10 +254,11 @@ def _pieces(faces: Faces, seam: np.ndarray) -> np.ndarray:
     return connected_components(graph, directed=False)[1]
 
 
-def _is_border(faces: Faces, pairs: np.ndarray) -> np.ndarray:
-    """Which of the edges `pairs` of the surface have one face only."""
+def _within(faces: Faces, pairs: np.ndarray) -> np.ndarray:
+    """Those of the undirected `pairs` that are edges between two faces."""
     edges, number = edge_table(faces)
-    return np.bincount(number.ravel())[_rows_of(edges, pairs)] == 1
+    inner = edges[np.bincount(number.ravel()) == 2]
+    return inner[_rows_of(inner, pairs)] if len(inner) else np.empty((0, 2), int)
 
 
 def _compact(vertices: Points, faces: Faces) -> tuple[tuple[Points, Faces], np.ndarray]:
@@ -272,7 +275,7 @@ def _mmg(vertices: Points, faces: Faces, seam: np.ndarray, *, hsiz: float) -> tu
 
 
 def _mmg_raw(
-    vertices: Points, faces: Faces, seam: np.ndarray, *, level: PerVertex | None = None, **options: float
+    vertices: Points, faces: Faces, seam: np.ndarray, *, level: PerVertex | None = None, **options: Any
 ) -> tuple[Points, Faces, np.ndarray, np.ndarray]:
     """One run of MMG: vertices, faces, seam edges and the faces' references.
 
@@ -320,7 +323,7 @@ def _relaxed(
     on_border, on_seam = np.zeros((2, len(x)), bool)
     on_border[edges_border], on_seam[seam] = True, True
     fixed = (on_border & on_seam) | ((ways > 0) & (ways != 2))
-    along = sp.coo_matrix((np.ones(len(curves)), curves.T), (len(x), len(x))).tocsr()
+    along = sp.csr_matrix((np.ones(len(curves)), curves.T), (len(x), len(x)))
     along = along + along.T
     groups = [(~(on_border | on_seam), dense.vertices, dense.faces), (on_border & ~fixed, cut, border),
               (on_seam & ~fixed, dense.vertices, dense_seam)]
@@ -341,8 +344,8 @@ def _towards_centroids(x: Points, faces: Faces) -> Points:
     corners = x[faces]
     area_vector = 0.5 * np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     area = np.linalg.norm(area_vector, axis=1)
-    ring = sp.coo_matrix((np.ones(faces.size), (faces.ravel(), np.repeat(np.arange(len(faces)), 3))),
-                         (len(x), len(faces))).tocsr()
+    ring = sp.csr_matrix((np.ones(faces.size), (faces.ravel(), np.repeat(np.arange(len(faces)), 3))),
+                         (len(x), len(faces)))
     step = (ring @ (corners.mean(axis=1) * area[:, None])) / (ring @ area)[:, None] - x
     normal = ring @ area_vector
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)
@@ -356,7 +359,7 @@ def _traced(
     face, barycentric = _closest(x, dense)
     rows = np.repeat(np.arange(len(x)), 3)
     onto = sp.csr_matrix((barycentric.ravel(), (rows, dense.faces[face].ravel())), (len(x), len(dense.vertices)))
-    transfer = (onto @ dense.matrix).tocsr()
+    transfer = sp.csr_matrix(onto @ dense.matrix)
     vertices = np.ascontiguousarray(transfer @ source[0])
     distance = np.sqrt(igl.point_mesh_squared_distance(vertices, source[0], source[1].astype(np.int64))[0])
     corner_uv = None if uv is None else _corner_uv(vertices, faces, seam, dense, uv, (face, barycentric))
