@@ -1,4 +1,4 @@
-"""The error family: everything that stmpl refuses derives from StmplError, and says what, measured, allowed, what to try."""
+"""The error family: whatever stmpl refuses derives from StmplError, and says what, measured, allowed, what to try."""
 
 
 class StmplError(Exception):

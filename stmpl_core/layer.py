@@ -154,8 +154,9 @@ class SoftLayer:
 
     def __repr__(self) -> str:
         t = self.thickness * 1e3
-        return (f"SoftLayer({len(self.vertices)} vertices, {len(self.faces)} faces, edges {self.edge_length * 1e3:.1f} mm, "
-                f"thickness {t.min():.1f}..{t.max():.1f} mm, E {self.tissue.youngs_modulus:g} Pa, nu {self.tissue.poisson_ratio:g})")
+        return (f"SoftLayer({len(self.vertices)} vertices, {len(self.faces)} faces, "
+                f"edges {self.edge_length * 1e3:.1f} mm, thickness {t.min():.1f}..{t.max():.1f} mm, "
+                f"E {self.tissue.youngs_modulus:g} Pa, nu {self.tissue.poisson_ratio:g})")
 
 
 def check_faces(faces: ArrayLike, n_vertices: int) -> Faces:
@@ -194,4 +195,5 @@ def _check_surface(layer: SoftLayer) -> None:
     if not len(layer.border):
         volume = float(np.einsum("ij,ij->", layer.vertices[layer.faces[:, 0]], layer.face_area_vectors)) / 3
         if volume < 0:
-            raise MeshError(f"the closed skin is inside out (volume {volume:.3g} m3). Reverse its faces: faces[:, ::-1].")
+            raise MeshError(f"the closed skin is inside out (volume {volume:.3g} m3). "
+                            "Reverse its faces: faces[:, ::-1].")
