@@ -82,7 +82,7 @@ class BagWriter:
             raise BagError(f"{self.path} exists already. Record into another folder, or remove it.") from error
         except OSError as error:
             raise BagError(f"{self.path} cannot be written: {error.strerror}.") from error
-        self._writer = Writer(self._file, chunk_size=CHUNK_BYTES, compression=CompressionType.NONE)
+        self._writer = Writer(self._file, chunk_size=CHUNK_BYTES, compression=CompressionType.ZSTD)
         self._guard(lambda: self._writer.start(profile="ros2"))
         self._flushed_at = time.monotonic()
 
