@@ -164,14 +164,15 @@ class Body:
         where = Path(path) / model_type if (Path(path) / model_type).is_dir() else Path(path)
         shape = {} if betas is None else {"betas": torch.tensor(np.atleast_2d(betas), dtype=torch.float32),
                                           "num_betas": np.size(betas)}
+        turned = {} if pose is None else {"body_pose": torch.tensor(np.reshape(pose, (1, -1)), dtype=torch.float32)}
         try:
             model = classes[model_type](str(where), gender=gender, ext=where.suffix.lstrip(".") or "npz",
                                         use_pca=False, **shape)
-        except Exception as error:
-            raise InvalidInput(f"smplx cannot read {where} as {model_type}: {type(error).__name__}: {error}") from error
-        turned = {} if pose is None else {"body_pose": torch.tensor(np.reshape(pose, (1, -1)), dtype=torch.float32)}
-        with torch.no_grad():
-            vertices = model(**turned).vertices[0].numpy().astype(float) @ SMPL_TO_BODY.T
+            with torch.no_grad():
+                vertices = model(**turned).vertices[0].numpy().astype(float) @ SMPL_TO_BODY.T
+        except Exception as error:  # smplx checks little, and what it meets comes as any kind of error
+            raise InvalidInput(f"smplx cannot make a {model_type} body of {where}: {type(error).__name__}: {error}. "
+                               "Check model_type, and how many betas and pose angles the model has.") from error
         faces = np.asarray(model.faces, dtype=np.int64)
         weights = model.lbs_weights.detach().numpy()
         bones = JOINT_NAMES if model_type == "smplx" else SMPLH_JOINT_NAMES
