@@ -13,9 +13,11 @@ from functools import cache
 from typing import Literal
 
 import numpy as np
+from numba import njit
 from skfem.element import ElementLineP2, ElementTriP1, ElementTriP2
 from skfem.quadrature import get_quadrature_line, get_quadrature_tri
 
+from fem_tools.neo_hookean import invert
 from stmpl_core.arrays import Points
 from stmpl_core.errors import MeshError
 
@@ -266,31 +268,40 @@ def _columns(triangles: np.ndarray, n: int, element: ElementName) -> tuple[np.nd
 def _rest_gradients(
     outer: Points, inner: Points, triangles: np.ndarray, ref: Reference, layers: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Shape gradients [1/m] and integration weights [m3] at rest for every wedge and quadrature point."""
-    out, into = outer[triangles], inner[triangles]  # (T, 3, 3)
-    gradients, volumes = [], []
-    for layer in range(layers):
-        top, _, bottom = (out + (into - out) * level_depths(layers)[2 * layer + k] for k in range(3))
-        corner = (
-            top[:, None] * (1 - ref.zeta)[:, None, None] + bottom[:, None] * ref.zeta[:, None, None]
-        )  # (T, Q, 3, 3)
-        plane = np.einsum("tqai,ap->tqip", corner, ref.geometry_gradient)
-        depth = np.einsum("tai,qa->tqi", bottom - top, ref.geometry_value)
-        jacobian = np.concatenate([plane, depth[..., None]], axis=-1)  # dX_i / d(xi, eta, zeta)
-        # (xi, eta) run counter-clockwise seen from outside and zeta inwards: a left-handed frame, so minus det
-        volumes.append(-np.linalg.det(jacobian) * ref.weight)
-        gradients.append(
-            np.einsum(
-                "qap,tqpi->tqai",
-                ref.shape_gradient,
-                np.linalg.pinv(jacobian) if (volumes[-1] == 0).any() else np.linalg.inv(jacobian),
-            )
-        )
+    """Shape gradients (T L, Q, 3 n, 3) [1/m] and integration weights (T L, Q) [m3] at rest; weight 0 if singular."""
     shape = (len(triangles) * layers, len(ref.weight))
-    return (
-        np.ascontiguousarray(np.stack(gradients, axis=1).reshape(*shape, -1, 3)),
-        np.ascontiguousarray(np.stack(volumes, axis=1).reshape(shape)),
-    )
+    gradients, volumes = np.empty((*shape, ref.shape_gradient.shape[1], 3)), np.empty(shape)
+    ends = level_depths(layers)[::2]
+    _fill_rest(outer, inner, triangles, ends, ref.shape_gradient, ref.geometry_value, ref.geometry_gradient, ref.zeta,
+               ref.weight, gradients, volumes)  # fmt: skip
+    return gradients, volumes
+
+
+@njit(cache=True)
+def _fill_rest(outer, inner, triangles, ends, slopes, value, plane, zeta, weight, gradients, volumes):
+    layers, jacobian, inverse = len(ends) - 1, np.empty((3, 3)), np.empty((3, 3))
+    for t in range(len(triangles)):
+        for layer in range(layers):
+            e, near, far = t * layers + layer, ends[layer], ends[layer + 1]
+            for q in range(len(weight)):
+                depth = near + (far - near) * zeta[q]
+                for i in range(3):  # dX_i / d(xi, eta, zeta)
+                    jacobian[i] = 0.0
+                    for a in range(3):
+                        c = triangles[t, a]
+                        along = inner[c, i] - outer[c, i]
+                        x = outer[c, i] + depth * along
+                        jacobian[i, 0] += x * plane[a, 0]
+                        jacobian[i, 1] += x * plane[a, 1]
+                        jacobian[i, 2] += (far - near) * along * value[q, a]
+                # (xi, eta) run counter-clockwise seen from outside and zeta inwards: left-handed, so minus det
+                volumes[e, q] = -invert(jacobian, inverse) * weight[q]
+                for n in range(slopes.shape[1]):
+                    for i in range(3):
+                        s = 0.0
+                        for k in range(3):
+                            s += slopes[q, n, k] * inverse[k, i]
+                        gradients[e, q, n, i] = s
 
 
 def _block_pattern(columns: np.ndarray, n: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -34,8 +34,8 @@ def _deformation(u, gradients, F):
 
 
 @njit(cache=True, fastmath=FAST)
-def _inverse(F, inv):
-    """Writes F^-1 and returns det F."""
+def invert(F, inv):
+    """Writes the inverse of a 3 x 3 matrix and returns its determinant; zeros where that is 0."""
     c00 = F[1, 1] * F[2, 2] - F[1, 2] * F[2, 1]
     c01 = F[1, 2] * F[2, 0] - F[1, 0] * F[2, 2]
     c02 = F[1, 0] * F[2, 1] - F[1, 1] * F[2, 0]
@@ -67,7 +67,7 @@ def internal_forces(u, columns, layers, gradients, volumes, mu, lam, forces):
                 local[a, i] = u[columns[t, a // 3], level + a % 3, i]
         for q in range(n_points):
             _deformation(local, gradients[e, q], F)
-            J = _inverse(F, inv)
+            J = invert(F, inv)
             smallest = min(smallest, J)
             if not J > 0.0:
                 return J
@@ -98,7 +98,7 @@ def strain_energy(u, columns, layers, gradients, volumes, mu, lam):
                 local[a, i] = u[columns[t, a // 3], level + a % 3, i]
         for q in range(gradients.shape[1]):
             _deformation(local, gradients[e, q], F)
-            J = _inverse(F, inv)
+            J = invert(F, inv)
             if not J > 0.0:
                 return np.inf
             trace = 0.0
@@ -124,7 +124,7 @@ def tangent(u, columns, blocks, layers, gradients, volumes, mu, lam, data):
         for q in range(gradients.shape[1]):
             G = gradients[e, q]
             _deformation(local, G, F)
-            J = _inverse(F, inv)
+            J = invert(F, inv)
             w = volumes[e, q]
             w_mu, w_lam = w * mu, w * lam
             w_cross = w * (mu - lam * log(J)) if J > 0.0 else w_mu

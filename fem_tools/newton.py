@@ -377,12 +377,9 @@ def newton(system: System, u: np.ndarray, factor: float, settings: NewtonSetting
 
 def _relative(system: System, inverse: np.ndarray, r: np.ndarray, u: np.ndarray, factor: float) -> float:
     """The residual over the load, or over the internal forces where they are larger [-]."""
-    size = _norm(inverse, r)
-    scale = max(
-        _norm(inverse, _load_vector(system, u, factor)),
-        _norm(inverse, system.internal(u)[0][:, : system.free].reshape(len(u), -1)),
-    )
-    return size / scale if scale > 0 else 0.0
+    load = _load_vector(system, u, factor)
+    scale = max(_norm(inverse, load), _norm(inverse, r + load))
+    return _norm(inverse, r) / scale if scale > 0 else 0.0
 
 
 def _descend(system: System, u, du, r, factor: float, settings: NewtonSettings):

@@ -52,7 +52,7 @@ def run(config: DemoConfig) -> int:
     _point_latest_at(folder)
 
     replay = _replay(folder, config.node.method, console)
-    comparison = compare_with_progress(folder, PatchFem(), config.frames)
+    comparison = compare_with_progress(folder, PatchFem(layers=2, refine=1), config.frames)
     report = write_report(comparison, folder / "report.html", replay=replay)
     console.print(comparison_table(comparison))
     console.print(str(replay))
