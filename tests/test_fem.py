@@ -144,7 +144,7 @@ class ElementWedgeP1P2(ElementH1):
     """Linear in plane, quadratic through the thickness; all functions inside the element, for element matrices."""
 
     interior_dofs, maxdeg, refdom = 9, 4, RefWedge
-    dofnames = [f"u{k}" for k in range(9)]
+    dofnames = [f"u{k}" for k in range(9)]  # noqa: RUF012 (scikit-fem asks for a list)
     doflocs = np.zeros((9, 3))
 
     def lbasis(self, X, i):
@@ -193,7 +193,7 @@ def bump(points: np.ndarray, peak: float, radius: float) -> np.ndarray:
 
 
 def pressed_by_felupe(half: float, depth: float, tissue: Tissue, peak: float, radius: float, n: int = 9):
-    """A slab of n x n x 2 tri-quadratic hexahedra, held below and at its sides. Returns skin points and displacement."""
+    """A slab of n x n x 2 tri-quadratic hexahedra, held below and at its sides: skin points and displacements."""
     import felupe as fem
 
     mesh = fem.Cube(a=(-half, -half, -depth), b=(half, half, 0.0), n=(n + 1, n + 1, 3))

@@ -149,7 +149,7 @@ def test_a_finer_mesh_is_coarsened_without_being_smoothed() -> None:
 @pytest.mark.parametrize("edge_length", [3.0, np.nan, 0.0, -1e-3, 1e-6])
 def test_an_edge_length_out_of_proportion_is_refused(edge_length: float) -> None:
     vertices, faces, _ = tube()
-    with pytest.raises(InvalidInput, match="edge_length is .* allowed is"):
+    with pytest.raises(InvalidInput, match=r"edge_length is .* allowed is"):
         remesh(vertices, faces, edge_length)
 
 
