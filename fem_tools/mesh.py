@@ -31,6 +31,7 @@ class Reference:
     """Shape functions of one wedge at its quadrature points; node numbers run level-fastest within a column."""
 
     n_columns: int  # columns a triangle
+    shape_value: np.ndarray  # (Q, 3 n_columns)
     shape_gradient: np.ndarray  # (Q, 3 n_columns, 3) with respect to (xi, eta, zeta)
     geometry_value: np.ndarray  # (Q, 3) linear triangle functions
     geometry_gradient: np.ndarray  # (3, 2)
@@ -39,28 +40,30 @@ class Reference:
 
 
 @cache
-def reference_wedge(element: ElementName) -> Reference:
-    """Tensor product of scikit-fem's triangle and line elements.
+def reference_wedge(element: ElementName, extra: int = 0) -> Reference:
+    """Tensor product of scikit-fem's triangle and line elements, with quadrature of `extra` degrees more than needed.
 
     Two Gauss points a wedge through the thickness: one fewer than full integration, a third cheaper, and half the error
     under a contact's edge, where three points are too stiff in shear.
     """
     plane, degree = (ElementTriP1(), 2) if element == "P1xP2" else (ElementTriP2(), 4)
-    xy, w_plane = get_quadrature_tri(degree)
-    z, w_depth = get_quadrature_line(3)
+    xy, w_plane = get_quadrature_tri(degree + extra)
+    z, w_depth = get_quadrature_line(3 + extra)
     n, m, q_plane, q_depth = (3 if element == "P1xP2" else 6), 3, xy.shape[1], z.shape[1]
     tri = [plane.lbasis(xy, i) for i in range(n)]
     line = _line_basis(z)
-    gradient = np.zeros((q_plane, q_depth, n, m, 3))
+    values, gradient = np.zeros((q_plane, q_depth, n, m)), np.zeros((q_plane, q_depth, n, m, 3))
     for a, (value, slope) in enumerate(tri):
         for level, (depth, depth_slope) in enumerate(line):
             value_, slope_ = np.broadcast_to(value, q_plane), np.broadcast_to(slope, (2, q_plane))
+            values[:, :, a, level] = np.outer(value_, depth)
             gradient[:, :, a, level, 0] = np.outer(slope_[0], depth)
             gradient[:, :, a, level, 1] = np.outer(slope_[1], depth)
             gradient[:, :, a, level, 2] = np.outer(value_, depth_slope)
     linear = np.stack([1 - xy[0] - xy[1], xy[0], xy[1]], axis=1)
     return Reference(
         n_columns=n,
+        shape_value=values.reshape(q_plane * q_depth, n * m),
         shape_gradient=gradient.reshape(q_plane * q_depth, n * m, 3),
         geometry_value=np.repeat(linear, q_depth, axis=0),
         geometry_gradient=np.array([[-1.0, -1.0], [1.0, 0.0], [0.0, 1.0]]),
@@ -142,7 +145,7 @@ class WedgeMesh:
             MeshError: a wedge is folded at rest (its map has a determinant that is not positive).
         """
         columns, edges, n_columns = _columns(triangles, len(outer), element)
-        gradients, volumes = _rest_gradients(outer, inner, triangles, reference_wedge(element), layers)
+        gradients, volumes = rest_gradients(outer, inner, triangles, reference_wedge(element), layers)
         if (volumes <= 0).any():
             bad = np.unique(triangles[np.flatnonzero((volumes <= 0).any(axis=1)) // layers])
             raise MeshError(f"the layer folds on itself below {len(bad)} vertices of the patch: {_some(bad)}.")
@@ -265,7 +268,7 @@ def _columns(triangles: np.ndarray, n: int, element: ElementName) -> tuple[np.nd
     return np.ascontiguousarray(columns, dtype=np.int64), edges.astype(np.int64), n + len(edges)
 
 
-def _rest_gradients(
+def rest_gradients(
     outer: Points, inner: Points, triangles: np.ndarray, ref: Reference, layers: int
 ) -> tuple[np.ndarray, np.ndarray]:
     """Shape gradients (T L, Q, 3 n, 3) [1/m] and integration weights (T L, Q) [m3] at rest; weight 0 if singular."""
