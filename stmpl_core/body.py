@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import fcntl
 import gzip
 import hashlib
 import json
@@ -9,7 +10,7 @@ import logging
 import os
 import re
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from functools import cache
 from importlib.metadata import version
@@ -310,7 +311,8 @@ def _kept(cls: type[Body], arguments: Mapping[str, Any], build: Any) -> Body:
     path = folder / f"anny-{hashlib.sha256(text.encode()).hexdigest()[:16]}.npz"
     with suppress(OSError, ValueError, KeyError, EOFError), np.load(path) as kept:
         return cls("anny", kept["vertices"], kept["faces"], kept["uv"], kept["weights"], tuple(kept["bones"].tolist()))
-    body = build()
+    with _one_builder(folder):
+        body = build()
     with suppress(OSError):
         folder.mkdir(parents=True, exist_ok=True)
         beside = path.with_suffix(f".{os.getpid()}.npz")
@@ -318,3 +320,13 @@ def _kept(cls: type[Body], arguments: Mapping[str, Any], build: Any) -> Body:
                             bones=np.array(body.bones))
         beside.replace(path)
     return body
+
+
+@contextmanager
+def _one_builder(folder: Path) -> Iterator[None]:
+    """Lets one process at a time build: Anny's first build writes files that a second one must not read half."""
+    with ExitStack() as stack:
+        with suppress(OSError):
+            folder.mkdir(parents=True, exist_ok=True)
+            fcntl.flock(stack.enter_context(open(folder / "build.lock", "w")), fcntl.LOCK_EX)
+        yield

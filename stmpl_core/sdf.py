@@ -23,6 +23,7 @@ MIN_EXTENT = 2e-4  # m
 MARGIN = 5e-3  # m of grid around the tool
 FINEST = 1e-4  # m; no finer grid pays
 COARSE = 3  # the grid far from the surface is this many times coarser
+ROUNDING_WIDTH = 0.57  # width of the smoothing over the radius that it gives a right-angled edge, measured
 BAND = 3  # within this many cells of the surface the distances are exact
 BAND_NODES = 40_000  # about what the default spacing spends on the band: half a second for 5,000 triangles
 MAX_NODES = 3_000_000  # 24 MB
@@ -58,13 +59,18 @@ class SignedDistance:
     tool_bounds: tuple[np.ndarray, np.ndarray]
 
     @classmethod
-    def of(cls, mesh: ToolMesh, *, spacing: float | None = None, margin: float = MARGIN) -> Self:
+    def of(
+        cls, mesh: ToolMesh, *, spacing: float | None = None, margin: float = MARGIN, rounding: float = 0.0
+    ) -> Self:
         """Builds the field of `mesh`; a closed mesh that is inside out is turned, and `flipped` says so.
 
         Args:
             mesh: in the tool's frame.
             spacing: of the grid [m]; None: as fine as half a second of work allows (0.4 mm for a 20 mm ball).
             margin: of grid around the tool [m].
+            rounding: radius to which right-angled edges and corners are rounded [m], by smoothing the field; flat
+                faces stay, a ball of radius R shrinks by about rounding^2 / (3 R). No skin mesh can follow a sharp
+                edge: pressing by finite elements wants about 1 mm.
 
         Raises:
             MeshError: no area, or an extent that no tool in metres has.
@@ -87,6 +93,8 @@ class SignedDistance:
                                "Try a larger spacing, or None.")
         origin = low + extent / 2 - spacing * (shape - 1) / 2
         values = _node_distances(vertices, faces, origin, spacing, shape)
+        if rounding > 0:
+            values = ndimage.gaussian_filter(values, ROUNDING_WIDTH * rounding / spacing, mode="nearest")
         coefficients = np.asarray(ndimage.spline_filter(values, order=3, mode="mirror"))
         probes = np.concatenate([used, vertices[faces].mean(axis=1)])
         error = float(np.abs(_distances(coefficients, origin, spacing, probes)).max())
