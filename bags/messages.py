@@ -31,6 +31,7 @@ class Frame:
         method: that answered.
         trust: what may be believed of it.
         statuses: what was found of each tool, by its name.
+        inputs: stamps of the pose and the wrench of each tool that it answers [ns]; 0: no wrench.
         solve_seconds: time that the node spent on it [s].
     """
 
@@ -43,6 +44,7 @@ class Frame:
     method: str
     trust: Trust
     statuses: dict[str, str]
+    inputs: dict[str, tuple[int, int]]
     solve_seconds: float
 
     @property
@@ -58,7 +60,11 @@ class Frame:
 
 def stamp_ns(message: Any) -> int:
     """The header's stamp [ns]."""
-    return message.header.stamp.sec * 1_000_000_000 + message.header.stamp.nanosec
+    return _ns(message.header.stamp)
+
+
+def _ns(time: Any) -> int:
+    return time.sec * 1_000_000_000 + time.nanosec
 
 
 def layer_id(layer: SoftLayer) -> str:
@@ -157,6 +163,8 @@ def frame_from(message: Any, log_time_ns: int) -> Frame:
         method=message.method,
         trust=trust,
         statuses=dict(zip(message.tools, message.statuses, strict=True)),
+        inputs={tool: (_ns(pose), _ns(wrench)) for tool, pose, wrench in zip(
+            message.tools, message.pose_stamps, message.wrench_stamps, strict=True)},
         solve_seconds=float(message.solve_seconds),
     )
 

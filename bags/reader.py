@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-from bisect import bisect_right
 from collections.abc import Callable, Iterator
 from functools import cached_property
 from pathlib import Path
@@ -23,7 +22,6 @@ from stmpl_core.layer import SoftLayer
 log = logging.getLogger(__name__)
 
 DISPLACEMENT, TOPOLOGY, MESH = "skin/displacement", "skin/topology", "contact_mesh"
-WRENCH_AGE = 200_000_000  # ns; an older wrench does not belong to a pose any more
 
 
 class Recorded(NamedTuple):
@@ -198,31 +196,23 @@ class ContactLog:
             self.received[stamp] = max(self.received.get(stamp, 0), recorded.log_time_ns)
             if kind == "pose":
                 self.pose_stamps.add(stamp)
-        self._pose_order = {tool: sorted(kept) for tool, kept in self._poses.items()}
-        self._wrench_order = {tool: sorted(kept) for tool, kept in self._wrenches.items()}
 
     def at(self, frame: Frame) -> list[Contact]:
-        """The contacts that `frame` answers: of each of its tools the newest pose and wrench not after its stamp.
+        """The contacts that `frame` answers: of each of its tools the pose and the wrench that it names.
 
         Raises:
-            BagError: the pose or the mesh of one of its tools is not in the bag.
+            BagError: a pose, a wrench or a mesh that it answers is not in the bag.
         """
-        return [self._contact(tool, frame.stamp_ns) for tool in frame.tools]
+        return [self._contact(tool, *stamps) for tool, stamps in frame.inputs.items()]
 
-    def _contact(self, tool: str, stamp: int) -> Contact:
-        newest = _newest(self._pose_order.get(tool, []), stamp)
-        mesh = self._bag.tool_meshes.get(tool)
-        if newest is None or mesh is None:
-            what = "pose up to that stamp" if newest is None else "mesh"
-            raise BagError(f"the frame at {stamp / 1e9:.3f} s answers tool {tool}, but the bag has no {what} of it.")
-        pushed = _newest(self._wrench_order.get(tool, []), stamp)
-        wrench = None if pushed is None or stamp - pushed > WRENCH_AGE else self._wrenches[tool][pushed]
-        return contact_from(tool, mesh, self._poses[tool][newest], wrench, body_frame=self._bag.body_frame)
-
-
-def _newest(stamps: list[int], stamp: int) -> int | None:
-    number = bisect_right(stamps, stamp)
-    return stamps[number - 1] if number else None
+    def _contact(self, tool: str, posed: int, pushed: int) -> Contact:
+        mesh, pose = self._bag.tool_meshes.get(tool), self._poses.get(tool, {}).get(posed)
+        wrench = self._wrenches.get(tool, {}).get(pushed)
+        lacks = ["mesh"] * (mesh is None) + ["pose"] * (pose is None) + ["wrench"] * (pushed != 0 and wrench is None)
+        if mesh is None or lacks:
+            raise BagError(f"an answer to tool {tool} at {posed / 1e9:.3f} s cannot be repeated: "
+                           f"the bag has no {' and no '.join(lacks)} for it.")
+        return contact_from(tool, mesh, pose, wrench, body_frame=self._bag.body_frame)
 
 
 def tool_topic(topic: str) -> tuple[str, str] | None:

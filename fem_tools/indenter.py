@@ -27,7 +27,6 @@ from stmpl_core.trust import Trust
 
 NORMAL_PENALTY = 100.0  # confined moduli over the thickness
 TANGENT_PENALTY = 10.0  # likewise: how far a sticking point creeps
-LONGEST_STEP = 0.04  # thicknesses a step
 MAX_ENTERED = 20e-6  # m; the augmented Lagrangian goes on until nodes are less deep in a tool
 MAX_FACES_ENTERED = 0.01  # thicknesses
 MAX_UPDATES = 4
@@ -230,13 +229,17 @@ class IndenterFem:
         fem: how the patch is meshed and solved; None: up to three refinements where the tool's curvature asks.
         friction: "stick" (a touching point stays where it touched, until it is let go), "none", or Coulomb's
             coefficient with the limit taken from the last update of the pressure.
+        step: longest step of the tools [thicknesses]; what touches first within a step sticks from its end on.
     """
 
-    def __init__(self, fem: PatchFem | None = None, *, friction: Friction = "stick") -> None:
+    def __init__(self, fem: PatchFem | None = None, *, friction: Friction = "stick", step: float = 0.04) -> None:
         if not (friction in ("stick", "none") or (isinstance(friction, int | float) and 0 <= friction < 10)):
             raise InvalidInput(f'friction is {friction!r}; allowed are "stick", "none" or a coefficient in [0, 10).')
         self.fem = fem or PatchFem(refine=3)
+        if not 0 < step <= 0.5:
+            raise InvalidInput(f"step is {step} thicknesses; allowed is 0 < step <= 0.5.")
         self.friction: Friction = friction
+        self.step = step
         self._layer: SoftLayer | None = None
 
     def prepare(self, layer: SoftLayer) -> Self:
@@ -288,7 +291,7 @@ class IndenterFem:
         press = _Press(self, layer, tools, np.array([limit]))
         below, above = (0.0, 0.0, press.state), None  # depth, force, state
         while above is None:
-            depth = min(below[0] + LONGEST_STEP * press.thickness, limit)
+            depth = min(below[0] + self.step * press.thickness, limit)
             if not press.walk(depth):
                 return press.answer()
             if press.force() >= force:
@@ -374,13 +377,13 @@ class _Press:
 
     def walk(self, depth: float) -> bool:
         """Moves the state to `depth` in short steps, halved where Newton fails; False if it stops on the way."""
-        step, self.stopped = LONGEST_STEP * self.thickness, ""
+        step, self.stopped = self.solver.step * self.thickness, ""
         while abs(depth - self.state.travel) > 1e-12:
             travel = self.state.travel + float(np.clip(depth - self.state.travel, -step, step))
             result, loads = self._step(travel)
             if result.converged:
                 self.state = self._next(result, loads, travel)
-            elif step > LONGEST_STEP * self.thickness / 8:
+            elif step > self.solver.step * self.thickness / 8:
                 step /= 2
             else:
                 self.stopped = (

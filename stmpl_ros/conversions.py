@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from array import array
+from collections.abc import Mapping
 
 import numpy as np
+from builtin_interfaces.msg import Time
 from geometry_msgs.msg import PoseStamped, WrenchStamped
 from numpy.typing import ArrayLike
 from std_msgs.msg import Header
@@ -140,10 +142,18 @@ def topology_message(layer: SoftLayer, body_frame: str, stamp_ns: int) -> SkinTo
 
 
 def displacement_message(
-    answer: Displacement, *, layer_id: str, body_frame: str, stamp_ns: int, sequence: int, solve_seconds: float
+    answer: Displacement,
+    *,
+    layer_id: str,
+    body_frame: str,
+    stamp_ns: int,
+    sequence: int,
+    solve_seconds: float,
+    inputs: Mapping[str, tuple[int, int]],
 ) -> SkinDisplacement:
-    """An answer as a message, with its trust."""
+    """An answer as a message, with its trust and the stamps of what it answers [ns] (pose, wrench or 0)."""
     trust = answer.trust
+    stamps = [inputs[tool] for tool in answer.statuses]
     return SkinDisplacement(
         header=header(body_frame, stamp_ns),
         layer_id=layer_id,
@@ -157,6 +167,8 @@ def displacement_message(
         why=trust.why,
         tools=list(answer.statuses),
         statuses=list(answer.statuses.values()),
+        pose_stamps=[Time(sec=pose // NANO, nanosec=pose % NANO) for pose, _ in stamps],
+        wrench_stamps=[Time(sec=wrench // NANO, nanosec=wrench % NANO) for _, wrench in stamps],
         solve_seconds=solve_seconds,
     )
 

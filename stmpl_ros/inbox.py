@@ -36,11 +36,19 @@ class Tool:
 
 @dataclass(frozen=True)
 class Instant:
-    """Contacts to answer together, the stamp of the newest pose among them, and how far their stamps lie apart [ns]."""
+    """Contacts to answer together.
+
+    Args:
+        contacts: one a live tool.
+        stamp: of the newest pose among them [ns].
+        skew: how far their stamps lie apart [ns].
+        inputs: stamps of each tool's pose and wrench [ns]; 0: no wrench.
+    """
 
     contacts: list[Contact]
     stamp: int
     skew: int
+    inputs: dict[str, tuple[int, int]]
 
 
 class Inbox:
@@ -105,7 +113,11 @@ class Inbox:
             return None
         self.missed = self.missed if skew else 0
         self.waiting.clear()
-        return Instant([self._contact(name, tool, now) for name, tool in live.items()], max(poses), skew)
+        inputs = {
+            name: (tool.pose.stamp, tool.wrench.stamp if tool.wrench.live(now, self.rest_after) else 0)
+            for name, tool in live.items()
+        }
+        return Instant([self._contact(name, tool, now) for name, tool in live.items()], max(poses), skew, inputs)
 
     def _contact(self, name: str, tool: Tool, now: int) -> Contact:
         pose = tool.pose.value

@@ -208,17 +208,19 @@ class SkinNode(LifecycleNode):
             return self._refuse(f"no answer: {error}")
         seconds = time.perf_counter() - started
         why = f"stamps of tools and wrenches lie up to {instant.skew / 1e6:.1f} ms apart" if instant.skew else ""
-        self._publish(answer, instant.stamp, seconds, why)
+        self._publish(answer, instant.stamp, seconds, why, instant.inputs)
         self.at_rest = False
 
     def _rest_if_silent(self) -> None:
         if not self.active or self.at_rest or not self.sequence or self.inbox.live(time.monotonic_ns()):
             return
         why = f"no pose for {self.config.rest_after} s: back at rest"
-        self._publish(self.simulator.step([]), self._now(), 0.0, why)
+        self._publish(self.simulator.step([]), self._now(), 0.0, why, {})
         self.at_rest = True
 
-    def _publish(self, answer: Displacement, stamp: int, seconds: float, why: str) -> None:
+    def _publish(
+        self, answer: Displacement, stamp: int, seconds: float, why: str, inputs: dict[str, tuple[int, int]]
+    ) -> None:
         message = displacement_message(
             answer,
             layer_id=self.layer_id,
@@ -226,6 +228,7 @@ class SkinNode(LifecycleNode):
             stamp_ns=stamp,
             sequence=self.sequence,
             solve_seconds=seconds,
+            inputs=inputs,
         )
         message.why = "; ".join(filter(None, (message.why, why)))
         self.displacement.publish(message)

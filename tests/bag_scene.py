@@ -101,6 +101,8 @@ def displacement(answer: Displacement, layer: SoftLayer, stamp: int, sequence: i
                    method=answer.method, converged=trust.converged, in_range=trust.in_range,
                    error_bound=float("nan") if trust.error_bound is None else trust.error_bound, why=trust.why,
                    tools=list(answer.statuses), statuses=list(answer.statuses.values()),
+                   pose_stamps=[header("", stamp).stamp] * len(answer.statuses),
+                   wrench_stamps=[header("", stamp).stamp] * len(answer.statuses),
                    solve_seconds=0.001)  # fmt: skip
 
 
