@@ -237,7 +237,7 @@ class PatchFem:
             system = self.system(patch, load)
             pressure = load.pressure_on(layer)
             corners = patch.interpolate(pressure)
-            guess = functools.partial(_guess_at, system, corners)
+            guess = functools.partial(self.guess, system, corners)
             start = None if not before else _ahead(before, float(np.abs(pressure).max()))
             result = solve(system, start, settings=self.settings, guess=guess)
             if result.converged:
@@ -245,6 +245,10 @@ class PatchFem:
             answer = np.zeros_like(layer.vertices)
             answer[patch.vertices] = result.u[: len(patch.vertices), 0]
             yield Displacement(answer, self._trust(load, patch, system, result), self.name, pressure)
+
+    def guess(self, system: System, pressure: np.ndarray, factor: float) -> np.ndarray:
+        """Where Newton starts under a share of a pressure at the triangle corners, (N,) [Pa]: every column confined."""
+        return confined_guess(system, factor * pressure)
 
     def system(self, patch: Patch, load: Load) -> System:
         """The equations of a patch under a load."""
@@ -303,10 +307,6 @@ class PatchFem:
                 f"the load is {nearest:.1f} thicknesses from the layer's open border, which is held", in_range=False
             )
         return trust if trust.ok else replace(trust, error_bound=None)
-
-
-def _guess_at(system: System, pressure: np.ndarray, factor: float) -> np.ndarray:
-    return confined_guess(system, factor * pressure)
 
 
 def _ahead(before: list[tuple[float, np.ndarray]], pressure: float) -> np.ndarray:
