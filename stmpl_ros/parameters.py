@@ -80,6 +80,6 @@ class DemoConfig(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     node: NodeConfig = NodeConfig()
-    probe: ProbeConfig = ProbeConfig(listeners=2, patience=180.0)
+    probe: ProbeConfig = ProbeConfig(rate=125.0, listeners=2, patience=180.0)
     frames: int = Field(default=12, ge=1, description="of the run that FEM solves again")
     runs: Path = Field(default=Path("runs"), description="folder that gets one folder a run")
