@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
@@ -66,7 +66,7 @@ class Hand:
         local = (np.vstack([vertices, extra]) - frame[:3, 3]) @ frame[:3, :3]
         return cls(local, closed, weights, (joints - frame[:3, 3]) @ frame[:3, :3], axes @ frame[:3, :3])
 
-    def closed_by(self, angles: Mapping[int, float] | Sequence[float]) -> Points:
+    def closed_by(self, angles: Sequence[float] | np.ndarray) -> Points:
         """The vertices with the fifteen joints turned by `angles` [rad], by linear blend skinning, (V, 3) [m]."""
         transforms = np.tile(np.eye(4), (16, 1, 1))
         for j in range(15):

@@ -1,0 +1,240 @@
+"""What is drawn: bodies, the contacts on them, the loads of each, and which split a contact belongs to."""
+
+from __future__ import annotations
+
+import hashlib
+import string
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+import trimesh
+from pydantic import BaseModel, ConfigDict, Field
+
+from fem_tools.hand import Hand
+from fem_tools.scenes import EDGE, Scene, Site, UnusableContact, ellipse, letter
+from stmpl_core.body import Body
+from stmpl_core.contact import ToolMesh
+from stmpl_core.layer import SoftLayer
+
+Kind = Literal["pressure", "nodal", "indenter"]
+SetName = Literal["disc", "ellipse", "seam", "indenter", "hand", "band", "letter"]
+Split = Literal["train", "val", "test", "ood"]
+
+IN_DISTRIBUTION: tuple[SetName, ...] = ("disc", "ellipse", "seam", "indenter")
+OUT_OF_DISTRIBUTION: tuple[SetName, ...] = ("hand", "band", "letter")
+SHARES = (0.8, 0.9)  # of the contacts of a set on a body: training up to the first, validation up to the second
+ATTEMPTS = 60  # at a contact before it is given up
+RADII = (5e-3, 20e-3)  # m, of discs and of the larger semi-axis of ellipses
+ASPECTS = (1.3, 3.0)  # of ellipses
+WIDTHS = (10e-3, 40e-3)  # m, of straps
+HEIGHTS = (25e-3, 45e-3)  # m, of letters
+DEPTHS = (3e-3, 5e-3)  # m, that a grasping hand sinks in
+BALLS = (8e-3, 20e-3)  # m, radii of rounded indenters
+
+
+class BodyPlan(BaseModel):
+    """One body: a phenotype and the thickness of its soft layer."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    name: str
+    weight: float = Field(ge=0, le=1)
+    thickness: float | tuple[float, float]  # m; two: varies smoothly between them
+    paper_rule: bool = True  # the same contacts once more as the paper loads them
+    out_of_distribution: bool = True
+
+
+PAPER_BODIES = tuple(  # thick bodies have thick layers, as in the paper
+    BodyPlan(name=f"weight_{int(100 * w)}", weight=w, thickness=t)
+    for w, t in ((0.0, 5e-3), (0.25, 6.25e-3), (0.5, 7.5e-3), (0.75, 8.75e-3), (1.0, 10e-3))
+)
+VARYING_BODIES = tuple(
+    BodyPlan(name=f"varying_{int(100 * w)}", weight=w, thickness=(2.5e-3, 12.5e-3), paper_rule=False,
+             out_of_distribution=False)
+    for w in (0.25, 0.75)
+)  # fmt: skip
+
+
+class Plan(BaseModel):
+    """Everything that decides what is generated: the same plan gives the same data.
+
+    Args:
+        discs, ellipses, seams, indenters: contacts a body.
+        hands, bands, letters: contacts in all, shared among the bodies.
+        loads: of each contact.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    preset: str
+    bodies: tuple[BodyPlan, ...] = PAPER_BODIES + VARYING_BODIES
+    part: str = "left_arm"
+    edge_length: float = 4e-3  # m
+    reach: float = 6.0  # thicknesses
+    discs: int = 1884
+    ellipses: int = 216
+    seams: int = 555
+    indenters: int = 0
+    hands: int = 395
+    bands: int = 40
+    letters: int = 273
+    loads: int = Field(10, ge=1)
+    highest_pressure: float = Field(2.0, gt=0)  # p / E, of follower pressures
+    highest_nodal: float = Field(0.4, gt=0)  # p / E at the worst vertex, of the paper's rule
+    deepest: float = Field(0.7, gt=0, lt=1)  # thicknesses, of indenters
+    seed: int = 0
+
+    def count(self, name: SetName) -> int:
+        """Contacts of a set: a body where it is in distribution, in all where not."""
+        return int(getattr(self, f"{name}s"))
+
+
+PRESETS = {
+    "tiny": Plan(preset="tiny", bodies=PAPER_BODIES[2:3], edge_length=6e-3, reach=4.0, discs=5, ellipses=2, seams=2,
+                 indenters=1, hands=1, bands=1, letters=1, loads=3),
+    "default": Plan(preset="default", discs=369, ellipses=42, seams=109, indenters=12),
+    "paper": Plan(preset="paper", indenters=40),
+}  # fmt: skip
+
+
+@dataclass(frozen=True, order=True)
+class ContactId:
+    """Names one contact: which body, which set, which number of it."""
+
+    body: str
+    set: SetName
+    number: int
+
+    def __str__(self) -> str:
+        return f"{self.body}/{self.set}-{self.number:04d}"
+
+    def rng(self, seed: int) -> np.random.Generator:
+        """The contact's own random numbers, whoever draws them and when."""
+        digest = hashlib.sha256(f"{seed} {self}".encode()).digest()
+        return np.random.default_rng(np.frombuffer(digest, dtype=np.uint32))
+
+
+def contacts(plan: Plan) -> Iterator[ContactId]:
+    """All contacts of a plan, body by body."""
+    takers = [body.name for body in plan.bodies if body.out_of_distribution]
+    for body in plan.bodies:
+        for name in IN_DISTRIBUTION:
+            yield from (ContactId(body.name, name, k) for k in range(plan.count(name)))
+        if body.name in takers:
+            for name in OUT_OF_DISTRIBUTION:
+                first = takers.index(body.name)
+                yield from (ContactId(body.name, name, k) for k in range(first, plan.count(name), len(takers)))
+
+
+def split_of(plan: Plan, contact: ContactId) -> Split:
+    """By contact, never by sample: all loads of a contact, under either rule, belong to one split."""
+    if contact.set in OUT_OF_DISTRIBUTION:
+        return "ood"
+    count = plan.count(contact.set)
+    order = ContactId(contact.body, contact.set, -1).rng(plan.seed).permutation(count)
+    place = (int(order[contact.number]) + 0.5) / count
+    return "train" if place < SHARES[0] else "val" if place < SHARES[1] else "test"
+
+
+def kinds_of(plan: Plan, contact: ContactId) -> tuple[Kind, ...]:
+    """How the contact presses: contacts by pressure press once more as the paper's do."""
+    if contact.set == "indenter":
+        return ("indenter",)
+    paper_rule = next(body.paper_rule for body in plan.bodies if body.name == contact.body)
+    return ("pressure", "nodal") if paper_rule else ("pressure",)
+
+
+def layers(plan: Plan) -> dict[str, SoftLayer]:
+    """The soft layer of each body, by its name; all have the same vertices and faces, so they share one chart."""
+    patch = Body.anny(weight=0.5).patch(plan.part, plan.edge_length)
+    out = {}
+    for body in plan.bodies:
+        skin = Body.anny(weight=body.weight)
+        thickness = body.thickness
+        if isinstance(thickness, tuple):
+            rng = ContactId(body.name, "disc", -2).rng(plan.seed)
+            thickness = varying(patch.layer(skin, thickness=thickness[0]).vertices, thickness, rng)
+        out[body.name] = patch.layer(skin, thickness=thickness)
+    return out
+
+
+def varying(points: np.ndarray, bounds: tuple[float, float], rng: np.random.Generator) -> np.ndarray:
+    """A smooth thickness that takes all values between the bounds: a few waves of 10 cm and longer, (V,) [m]."""
+    waves = rng.normal(size=(6, 3))
+    waves *= (2 * np.pi / rng.uniform(0.1, 0.3, size=6) / np.linalg.norm(waves, axis=1))[:, None]
+    field = np.cos(points @ waves.T + rng.uniform(0, 2 * np.pi, size=6)).sum(axis=1)
+    return bounds[0] + (bounds[1] - bounds[0]) * (field - field.min()) / np.ptp(field)
+
+
+def ratios(plan: Plan, kind: Kind, rng: np.random.Generator) -> np.ndarray:
+    """The loads of one contact, increasing, one in each equal part of the range: p / E, or depth over thickness."""
+    highest = {"pressure": plan.highest_pressure, "nodal": plan.highest_nodal, "indenter": plan.deepest}[kind]
+    return (np.arange(plan.loads) + rng.uniform(0.05, 1.0, plan.loads)) / plan.loads * highest
+
+
+def draw(contact: ContactId, site: Site, hand: Hand | None, rng: np.random.Generator) -> tuple[Scene, dict[str, Any]]:
+    """Sets a tool down on the skin, drawing again where it cannot stand, and says what was drawn.
+
+    Raises:
+        UnusableContact: nothing fitted in ATTEMPTS.
+    """
+    for _ in range(ATTEMPTS):
+        try:
+            scene, drawn = _draw_once(contact, site, hand, rng)
+            return scene, drawn
+        except UnusableContact as error:
+            last = error
+    raise UnusableContact(f"nothing fitted in {ATTEMPTS} attempts, the last because {last}")
+
+
+def _draw_once(
+    contact: ContactId, site: Site, hand: Hand | None, rng: np.random.Generator
+) -> tuple[Scene, dict[str, Any]]:
+    layer, turn = site.layer, float(rng.uniform(0, 2 * np.pi))
+    area = layer.vertex_areas
+    vertex = int(rng.choice(len(area), p=area / area.sum()))
+    drawn: dict[str, Any] = {"vertex": vertex, "turn": turn}
+    if contact.set in ("disc", "ellipse", "seam"):
+        if contact.set == "seam":
+            drawn["vertex"] = vertex = int(rng.choice(layer.chart.seam_vertices))
+        radius, aspect = float(rng.uniform(*RADII)), float(rng.uniform(*ASPECTS)) if contact.set == "ellipse" else 1.0
+        drawn |= {"a": radius, "b": max(radius / aspect, 3e-3)}
+        return site.press_flat(vertex, ellipse(drawn["a"], drawn["b"]), turn), drawn
+    if contact.set == "letter":
+        drawn |= {"letter": string.ascii_uppercase[contact.number % 26], "height": float(rng.uniform(*HEIGHTS))}
+        return site.press_flat(vertex, letter(drawn["letter"], drawn["height"]), turn), drawn
+    if contact.set == "band":
+        drawn |= {"width": float(rng.uniform(*WIDTHS)), "tilt": float(rng.normal(0.0, 0.15))}
+        return site.strap(vertex, drawn["width"], drawn["tilt"]), drawn
+    if contact.set == "hand":
+        assert hand is not None
+        side = float(rng.choice([0.0, np.pi]))
+        loose = np.clip(rng.normal(0.0, 0.25, 5), 0, 0.9)
+        drawn |= {"turn": side + float(rng.normal(0.0, 0.35)), "depth": float(rng.uniform(*DEPTHS)),
+                  "loose": loose.round(4).tolist()}  # fmt: skip
+        return site.grasp(vertex, hand, drawn["turn"], drawn["depth"], np.array(drawn["loose"])), drawn
+    drawn |= {"tool": str(rng.choice(["sphere", "capsule", "cylinder"])), "radius": float(rng.uniform(*BALLS))}
+    mesh = rounded_tool(drawn["tool"], drawn["radius"])
+    pose = site.standing(vertex, drawn["radius"], turn)
+    pose[:3, 3] += (BALLS[1] + EDGE) * pose[:3, 2]
+    if (gap := float(site.border_distance[vertex])) < 6 * layer.thickness[vertex] + drawn["radius"]:
+        raise UnusableContact(f"it stands {gap * 1e3:.0f} mm from the open border")
+    return Scene(mesh, pose, np.zeros(len(area))), drawn
+
+
+def rounded_tool(name: str, radius: float) -> ToolMesh:
+    """A sphere, a capsule lying down, or an upright cylinder with a filleted rim, of a radius [m], about its middle."""
+    r = 1e3 * radius  # trimesh drops triangles that are small in metres
+    if name == "sphere":
+        mesh = trimesh.creation.icosphere(4, r)
+    elif name == "capsule":
+        mesh = trimesh.creation.capsule(2 * r, 0.6 * r, count=[48, 48])
+        mesh.apply_translation([0, 0, -r])
+        mesh.apply_transform(trimesh.transformations.rotation_matrix(np.pi / 2, [0, 1, 0]))
+    else:
+        fillet, bend = 0.3 * r, np.linspace(0, np.pi / 2, 9)
+        rim = np.column_stack([r - fillet + fillet * np.sin(bend), -r + fillet - fillet * np.cos(bend)])
+        mesh = trimesh.creation.revolve(np.vstack([[0, -r], rim, [r, r], [0, r]]), sections=64)
+    return ToolMesh.of(1e-3 * np.asarray(mesh.vertices), np.asarray(mesh.faces))
