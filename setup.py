@@ -36,7 +36,15 @@ ROS_WHEELS = [  # versions that resolve together: ROS 2 Jazzy as wheels for CPyt
     "ros-rmw-fastrtps-cpp==8.4.3",
     f"stmpl-msgs @ {(HERE / 'msg_defs').as_uri()}",
 ]
-DEV = ["felupe>=9", "hypothesis>=6.100", "import-linter>=2.0", "pyright>=1.1.380", "pytest>=8", "ruff>=0.6"]
+DEV = [
+    "felupe>=9",
+    "hypothesis>=6.100",
+    "import-linter>=2.0",
+    "pyright>=1.1.380",
+    "pytest>=8",
+    "ruff>=0.6",
+    "threadpoolctl>=3.5",
+]
 
 setup(
     # colcon and ros2 run know the package by the name in package.xml
