@@ -279,7 +279,7 @@ class IndenterFem:
         Args:
             tools: see `path`.
             force: > 0 [N].
-            deepest: where to give up [m]; None: 0.9 of the smallest thickness under the tools' first touch.
+            deepest: where to give up [m]; None: 0.9 of the layer's smallest thickness.
 
         Raises:
             InvalidInput: as `path`, or a force that is not above 0.
@@ -325,6 +325,13 @@ class _Press:
         deepest = float(depths[-1])
         reached = [tool.at(deepest).distance(layer.vertices) for tool in self.tools]
         footprint = np.flatnonzero(np.min(reached, axis=0) <= max(0.0, float(np.min(reached))))
+        for number, tool in enumerate(self.tools):
+            clear = float(tool.at(deepest).distance(layer.inner_vertices[footprint]).min())
+            if clear <= 0:
+                raise InvalidInput(
+                    f"tool {number} would be {-clear * 1e3:.2f} mm inside the core at {deepest * 1e3:.2f} mm; the layer is "
+                    f"{layer.thickness[footprint].min() * 1e3:.2f} mm thick there. Press less deep."
+                )
         thickness = float(layer.thickness[footprint].min())
         shallow, deep = float(depths[0]), [float(depths[-1]) * share for share in (0.3, 0.6, 1.0)]
 

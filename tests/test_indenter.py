@@ -169,6 +169,8 @@ def test_bad_input_is_refused_with_its_reason(ball, layer):
     solver = IndenterFem().prepare(layer)
     with pytest.raises(InvalidInput, match="never meets"):
         solver.press([Tool(ball, pose(0.08, 0, 0.08), np.array([1.0, 0, 0]))], 1e-3)
+    with pytest.raises(InvalidInput, match="inside the core"):
+        solver.press([side_tool(ball)], 1.2 * THICKNESS)
     with pytest.raises(InvalidInput, match="increase"):
         list(solver.path([side_tool(ball)], [2e-3, 1e-3]))
     with pytest.raises(InvalidInput, match="no tool"):
