@@ -27,6 +27,7 @@ CHUNK = 32_768  # rows of a ragged array that are read at once
 KINDS: tuple[Kind, ...] = ("pressure", "nodal", "indenter")
 SPLITS: tuple[Split, ...] = ("train", "val", "test", "ood")
 FIGURES = ("ratio", "force_n", "peak_m", "discretisation_m", "truncation_m", "min_j")
+RAGGED = ("loaded", "values", "moved", "steps")  # of a Record
 
 _CODEC = BloscCodec(cname="zstd", clevel=5, shuffle="bitshuffle")
 
@@ -64,7 +65,9 @@ class Record:
     figures: tuple[float, ...]
 
     @classmethod
-    def of(cls, layer: SoftLayer, kind: Kind, load: Load, displacement: VertexVectors, figures: Mapping[str, float]) -> Self:
+    def of(
+        cls, layer: SoftLayer, kind: Kind, load: Load, displacement: VertexVectors, figures: Mapping[str, float]
+    ) -> Self:
         """Packs an answer of FEM."""
         length = np.linalg.norm(displacement, axis=1)
         loaded, moved = load.loaded.astype(np.int32), np.flatnonzero(length > MOVES).astype(np.int32)
@@ -93,10 +96,15 @@ def write_layer(root: zarr.Group, name: str, layer: SoftLayer) -> None:
 
 def read_layer(group: zarr.Group) -> SoftLayer:
     """Reads what `write_layer` wrote."""
-    part = {key: np.asarray(array[...]) for key, array in group["layer"].arrays()}  # type: ignore[union-attr]
+    layer: Any = group["layer"]
+    part = {key: np.asarray(array[...]) for key, array in layer.arrays()}
     chart = UvChart(part["vertices"], part["faces"], part["uv"]) if "uv" in part else None
     tissue = Tissue(**group.attrs["tissue"])  # type: ignore[arg-type]
     return SoftLayer(part["vertices"], part["faces"], part["thickness"], tissue=tissue, chart=chart)
+
+
+def _rows(group: zarr.Group, name: str) -> Any:
+    return group[f"samples/{name}"]
 
 
 class Writer:
@@ -149,7 +157,7 @@ class Writer:
                 continue
             rows = np.concatenate(waiting)
             now = total if least == 1 else total - total % CHUNK
-            self.group[f"samples/{name}"].append(rows[:now])  # type: ignore[union-attr]
+            _rows(self.group, name).append(rows[:now])
             self._waiting[name] = [rows[now:]]
 
 
@@ -160,9 +168,9 @@ class _BodyStore:
         self.group = group
         self.contacts: list[dict[str, Any]] = group.attrs["contacts"]  # type: ignore[assignment]
         names = ("contact", "kind", "split", *FIGURES, "loaded_ends", "moved_ends")
-        self.table = {name: np.asarray(group[f"samples/{name}"][...]) for name in names}  # type: ignore[index]
+        self.table = {name: np.asarray(_rows(group, name)[...]) for name in names}
         self.sets = np.array([self.contacts[c]["set"] for c in self.table["contact"]])
-        self.rows = {name: group[f"samples/{name}"] for name in ("loaded", "values", "moved", "steps")}
+        self.rows = {name: _rows(group, name) for name in RAGGED}
 
     @cached_property
     def layer(self) -> SoftLayer:

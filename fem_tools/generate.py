@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 import zarr
 
-from fem_tools.dataset import FORMAT, Record, Writer, write_layer
+from fem_tools.dataset import FORMAT, RAGGED, Record, Writer, write_layer
 from fem_tools.hand import Hand
 from fem_tools.indenter import IndenterFem, Tool
 from fem_tools.patch import PatchFem
@@ -98,7 +98,7 @@ def solve_contact(job: Job) -> bytes:
     records: list[Record] = []
     drops: list[Drop] = []
     drawn, seconds = {}, {}
-    loads = {kind: ratios(plan, kind, rng) for kind in kinds_of(plan, contact)}
+    loads: dict[Kind, np.ndarray] = {kind: ratios(plan, kind, rng) for kind in kinds_of(plan, contact)}
     try:
         started = time.process_time()
         scene, drawn = draw(contact, bench.site, job.hand, rng)
@@ -148,7 +148,7 @@ def solve_indentations(bench: Bench, scene: Scene, wanted: np.ndarray) -> Iterat
     under = np.linalg.norm(np.cross(layer.vertices - pose[:3, 3], pose[:3, 2]), axis=1)
     facing = layer.normals @ pose[:3, 2] > 0
     thickness = float(layer.thickness[np.where(facing, under, np.inf).argmin()])
-    answers = bench.indenter.path([tool], wanted * thickness)
+    answers = bench.indenter.path([tool], (wanted * thickness).tolist())
     for ratio, answer in zip(wanted, answers, strict=False):
         figures = dict(answer.trust.figures) | {"ratio": float(ratio)}
         load = Load.pressure(answer.pressure)
@@ -276,7 +276,8 @@ def _executor(workers: int | None, scheduler: str | None) -> Iterator[tuple[Exec
         except ImportError as error:
             raise InvalidInput("--scheduler needs Dask. Try: pip install 'stmpl[cluster]'.") from error
         with Client(scheduler, timeout="20s") as client, client.get_executor(pure=False) as executor:
-            yield executor, max(1, len(client.nthreads()))
+            nthreads: Any = client.nthreads()
+            yield executor, max(1, len(nthreads))
         return
     many = workers if workers is not None else len(os.sched_getaffinity(0))
     if many < 1:
@@ -296,8 +297,8 @@ def _skin(layer: SoftLayer) -> tuple[dict[str, Any], str]:
     uv = layer.chart.uv if isinstance(layer.chart, UvChart) else None
     skin = {"vertices": layer.vertices, "faces": layer.faces, "thickness": layer.thickness, "uv": uv,
             "tissue": layer.tissue}  # fmt: skip
-    digest = hashlib.sha256(b"".join(np.ascontiguousarray(skin[k]).tobytes() for k in ("vertices", "faces", "thickness")))
-    return skin, digest.hexdigest()
+    content = b"".join(np.ascontiguousarray(skin[k]).tobytes() for k in ("vertices", "faces", "thickness"))
+    return skin, hashlib.sha256(content).hexdigest()
 
 
 def _part_path(out: Path, contact: ContactId) -> Path:
@@ -312,7 +313,7 @@ def _part_bytes(about: dict[str, Any], records: list[Record], drops: list[Drop],
         "seconds": seconds,
     }
     arrays = {f"{name}_{k}": getattr(r, name) for k, r in enumerate(records)
-              for name in ("loaded", "values", "moved", "steps")}  # fmt: skip
+              for name in RAGGED}  # fmt: skip
     buffer = io.BytesIO()
     np.savez_compressed(buffer, header=np.array(json.dumps(header)), **arrays)
     return buffer.getvalue()
@@ -322,7 +323,7 @@ def _part_read(content: bytes) -> tuple[dict[str, Any], list[Record], list[Drop]
     with np.load(io.BytesIO(content)) as part:
         header = json.loads(str(part["header"]))
         records = [
-            Record(kind, *(part[f"{name}_{k}"] for name in ("loaded", "values", "moved", "steps")), tuple(figures))
+            Record(kind, *(part[f"{name}_{k}"] for name in RAGGED), figures=tuple(figures))
             for k, (kind, *figures) in enumerate(header["records"])
         ]
     return header["about"], records, [Drop(**d) for d in header["drops"]], header["seconds"]
@@ -343,7 +344,7 @@ def _pack(plan: Plan, out: Path, made: Mapping[str, SoftLayer], tally: _Tally) -
     spent: dict[str, list[float]] = defaultdict(list)
     for name, layer in made.items():
         write_layer(root, name, layer)
-        writer = Writer(root[name])  # type: ignore[arg-type]
+        writer = Writer(root.require_group(name))
         for contact in (c for c in contacts(plan) if c.body == name):
             about, records, dropped, seconds = _part_read(_part_path(out, contact).read_bytes())
             if records:

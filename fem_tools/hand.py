@@ -21,6 +21,8 @@ from stmpl_core.layer import SoftLayer
 FINGERS = range(1, 6)  # the thumb first
 STEP = np.radians(6.0)  # by which a closing joint turns
 FURTHEST = np.radians((80.0, 100.0, 70.0))  # of the three joints of a finger
+OPEN = np.radians((-45.0, -20.0, -20.0, -20.0, -20.0))  # the first joint of each finger, before it closes
+SETTLING = 8  # times that the palm is moved by its distance to the skin
 FURTHEST_THUMB = np.radians((35.0, 50.0, 60.0))
 
 
@@ -81,31 +83,36 @@ class Hand:
         """Numbers of the vertices that move with each finger bone itself."""
         return [np.flatnonzero(self.weights[:, j + 1] > 0.5) for j in range(15)]
 
-    def grip(self, layer: SoftLayer, pose_body_from_hand: Transform, depth: float, loose: Sequence[float]) -> ToolMesh:
-        """The hand with its fingers closed on the skin, joint after joint, until each bone is `depth` inside [m].
+    def grip(
+        self, layer: SoftLayer, pose_body_from_hand: Transform, depth: float, loose: Sequence[float]
+    ) -> tuple[ToolMesh, Transform]:
+        """The hand and its pose, once the palm has settled on the skin and the fingers have closed, joint after joint.
 
         Args:
             layer: what is held.
-            pose_body_from_hand: where the hand is, (4, 4).
-            depth: how far fingers sink below the skin at rest [m].
+            pose_body_from_hand: where the hand comes from; it moves along its z, (4, 4).
+            depth: how far palm and finger bones sink below the skin at rest [m].
             loose: the share of its way that each finger stays short of closing, (5,) [-].
         """
-        tree, angles = KDTree(layer.vertices), np.zeros(15)
-        turn, origin = pose_body_from_hand[:3, :3], pose_body_from_hand[:3, 3]
+        tree, angles, pose = KDTree(layer.vertices), np.zeros(15), pose_body_from_hand.copy()
+        angles[::3] = OPEN
 
-        def deepest(vertices: np.ndarray) -> float:
-            points = self.closed_by(angles)[vertices] @ turn.T + origin
+        def entered(vertices: np.ndarray) -> float:
+            points = self.closed_by(angles)[vertices] @ pose[:3, :3].T + pose[:3, 3]
             nearest = tree.query(points)[1]
             return float(-np.einsum("ij,ij->i", points - layer.vertices[nearest], layer.normals[nearest]).min())
 
+        palm = np.flatnonzero(self.weights[:, 0] > 0.95)
+        for _ in range(SETTLING):
+            pose[:3, 3] += (depth - entered(palm)) * pose[:3, 2]
         for finger in range(5):
             furthest = (FURTHEST_THUMB if finger == 0 else FURTHEST) * (1 - loose[finger])
             for bone in range(3):
                 j = 3 * finger + bone
                 watched = np.concatenate(self.beyond[j : 3 * finger + 3])
-                while angles[j] + STEP <= furthest[bone] and deepest(watched) < depth:
+                while angles[j] + STEP <= furthest[bone] and entered(watched) < depth:
                     angles[j] += STEP
-        return ToolMesh.of(self.closed_by(angles), self.faces)
+        return ToolMesh.of(self.closed_by(angles), self.faces), pose
 
 
 def _between(vertices: Points, weights: np.ndarray, bone: int, parent: int) -> np.ndarray:

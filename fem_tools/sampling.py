@@ -80,10 +80,10 @@ class Plan(BaseModel):
     hands: int = 395
     bands: int = 40
     letters: int = 273
-    loads: int = Field(10, ge=1)
-    highest_pressure: float = Field(2.0, gt=0)  # p / E, of follower pressures
-    highest_nodal: float = Field(0.4, gt=0)  # p / E at the worst vertex, of the paper's rule
-    deepest: float = Field(0.7, gt=0, lt=1)  # thicknesses, of indenters
+    loads: int = Field(default=10, ge=1)
+    highest_pressure: float = Field(default=2.0, gt=0)  # p / E, of follower pressures
+    highest_nodal: float = Field(default=0.4, gt=0)  # p / E at the worst vertex, of the paper's rule
+    deepest: float = Field(default=0.7, gt=0, lt=1)  # thicknesses, of indenters
     seed: int = 0
 
     def count(self, name: SetName) -> int:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import igl
 import numpy as np
@@ -26,6 +27,9 @@ BACK = 10e-3  # m of tool above the skin
 STRAP = 4e-3  # m, of a strap's cloth
 CLEAR = 2.5  # thicknesses that a footprint keeps from the layer's open border
 FEWEST = 7  # vertices that a footprint must cover
+
+
+Outline = shapely.Polygon | shapely.MultiPolygon
 
 
 class UnusableContact(StmplError):
@@ -100,7 +104,7 @@ class Site:
             raise UnusableContact(f"it comes within {gap / thick:.1f} thicknesses of the open border")
         return Scene(mesh, pose, footprint)
 
-    def press_flat(self, vertex: int, outline: shapely.Geometry, turn: float) -> Scene:
+    def press_flat(self, vertex: int, outline: Outline, turn: float) -> Scene:
         """A flat-faced punch of `outline` (in metres about its origin), sunk until all of its face meets the skin.
 
         Raises:
@@ -158,12 +162,7 @@ class Site:
         across = np.cross(axis, normal)
         x = np.cos(turn) * across + np.sin(turn) * axis
         pose = frame(layer.vertices[vertex], -normal, x, 0.0)
-        open_hand = ToolMesh.of(hand.vertices, hand.faces)
-        for _ in range(6):  # the palm settles on the skin
-            near = self.within(open_hand, pose)
-            entered = -float(signed_distance(open_hand, pose, layer.vertices[near]).min(initial=0.02))
-            pose[:3, 3] += (entered - depth) * normal
-        mesh = hand.grip(layer, pose, depth, loose.tolist())
+        mesh, pose = hand.grip(layer, pose, depth, loose.tolist())
         return self.scene(mesh, pose, self.within(mesh, pose), EDGE / 4, EDGE / 2)
 
     def within(self, mesh: ToolMesh, pose: Transform, margin: float = 0.03) -> np.ndarray:
@@ -206,16 +205,16 @@ def ellipse(a: float, b: float) -> shapely.Polygon:
     return shapely.Polygon(swell * np.column_stack([a * np.cos(angle), b * np.sin(angle)]))
 
 
-def letter(character: str, height: float) -> shapely.Geometry:
+def letter(character: str, height: float) -> Outline:
     """Outline of a bold block letter of this height [m], about the middle of its box.
 
     Raises:
         InvalidInput: a character that the font draws nothing for.
     """
     path = TextPath((0, 0), character, size=100, prop=FontProperties(family="DejaVu Sans", weight="bold"))
-    outline = shapely.Polygon()
+    outline: Any = shapely.Polygon()
     for loop in path.to_polygons():
-        outline = outline.symmetric_difference(shapely.Polygon(loop).buffer(0))
+        outline = outline.symmetric_difference(shapely.Polygon(np.asarray(loop)).buffer(0))
     if outline.is_empty:
         raise InvalidInput(f"the font draws nothing for {character!r}. Use capital letters.")
     x0, y0, x1, y1 = outline.bounds
@@ -223,9 +222,9 @@ def letter(character: str, height: float) -> shapely.Geometry:
     return shapely.affinity.scale(outline, height / (y1 - y0), height / (y1 - y0), origin=(0, 0))
 
 
-def extruded(outline: shapely.Geometry, low: float, high: float) -> ToolMesh:
+def extruded(outline: Any, low: float, high: float) -> ToolMesh:
     """The prism over `outline` from z = low to z = high [m]. In millimetres on the way: trimesh drops small faces."""
     parts = [p for p in shapely.get_parts(outline) if isinstance(p, shapely.Polygon)]
     scaled = [shapely.affinity.scale(p, 1e3, 1e3, origin=(0, 0)) for p in parts]
-    prism = trimesh.util.concatenate([trimesh.creation.extrude_polygon(p, 1e3 * (high - low)) for p in scaled])
+    prism: Any = trimesh.util.concatenate([trimesh.creation.extrude_polygon(p, 1e3 * (high - low)) for p in scaled])
     return ToolMesh.of(1e-3 * np.asarray(prism.vertices) + [0, 0, low], np.asarray(prism.faces))
