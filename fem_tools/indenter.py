@@ -328,10 +328,10 @@ class _Press:
         for number, tool in enumerate(self.tools):
             clear = float(tool.at(deepest).distance(layer.inner_vertices[footprint]).min())
             if clear <= 0:
+                thin = float(layer.thickness[footprint].min())
                 raise InvalidInput(
-                    f"tool {number} would be {-clear * 1e3:.2f} mm inside the core at {deepest * 1e3:.2f} mm; the layer is "
-                    f"{layer.thickness[footprint].min() * 1e3:.2f} mm thick there. Press less deep."
-                )
+                    f"tool {number} would be {-clear * 1e3:.2f} mm inside the core at {deepest * 1e3:.2f} mm; "
+                    f"the layer is {thin * 1e3:.2f} mm thick there. Press less deep.")  # fmt: skip
         thickness = float(layer.thickness[footprint].min())
         shallow, deep = float(depths[0]), [float(depths[-1]) * share for share in (0.3, 0.6, 1.0)]
 
