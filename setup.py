@@ -12,6 +12,7 @@ REQUIRED = [
     "anny>=0.6",
     "jaxtyping>=0.3",
     "libigl>=2.6",
+    "mapbox-earcut>=1.0",
     "matplotlib>=3.9",
     "mcap>=1.2",
     "mmgpy>=0.17",
@@ -25,10 +26,12 @@ REQUIRED = [
     "ruamel.yaml>=0.18",
     "scikit-fem>=11",
     "scipy>=1.13",
+    "shapely>=2.0",
     "smplx>=0.1.28",
     "torch>=2.4",
     "trimesh>=4.4",
     "tyro>=0.9",
+    "zarr>=3.0",
 ]
 ROS_WHEELS = [  # versions that resolve together: ROS 2 Jazzy as wheels for CPython 3.12
     "ros-rclpy[fastrtps]==7.1.6",
@@ -36,6 +39,7 @@ ROS_WHEELS = [  # versions that resolve together: ROS 2 Jazzy as wheels for CPyt
     "ros-rmw-fastrtps-cpp==8.4.3",
     f"stmpl-msgs @ {(HERE / 'msg_defs').as_uri()}",
 ]
+CLUSTER = ["distributed>=2024.8"]
 DEV = [
     "felupe>=9",
     "hypothesis>=6.100",
@@ -62,6 +66,6 @@ setup(
     if ON_ROS_MACHINE
     else [],
     install_requires=REQUIRED + ([] if ON_ROS_MACHINE else ROS_WHEELS),
-    extras_require={"dev": DEV},
+    extras_require={"dev": DEV + CLUSTER, "cluster": CLUSTER},
     entry_points={"console_scripts": ["stmpl = stmpl_ros.cli:main"]},
 )

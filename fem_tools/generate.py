@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 import zarr
 
-from fem_tools.dataset import FORMAT, RAGGED, Record, Writer, write_layer
+from fem_tools.dataset import FIGURES, FORMAT, RAGGED, Record, Writer, write_layer
 from fem_tools.hand import Hand
 from fem_tools.indenter import IndenterFem, Tool
 from fem_tools.patch import PatchFem
@@ -42,7 +42,8 @@ log = logging.getLogger(__name__)
 
 ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
 VERSIONS = ("stmpl", "numpy", "scipy", "numba", "anny", "libigl", "mmgpy", "trimesh", "shapely", "zarr")
-INDENTER_REFINE = 2  # splits where a tool's curvature asks: from 4 mm down to 1 mm
+INDENTER_REFINE = 3  # splits where a tool's curvature asks: from 4 mm down to 0.5 mm
+WORST_TRUNCATION = 0.05  # of the peak: motion that is left one thickness inside the patch's rim
 
 OnProgress = Callable[[int, int, int, int], None]  # contacts done, contacts in all, samples kept, samples dropped
 
@@ -112,10 +113,10 @@ def solve_contact(job: Job) -> bytes:
             for record, trust in SOLVERS[kind](bench, scene, wanted):
                 ratio = float(wanted[reached])
                 reached += 1
-                if trust.ok:
-                    records.append(record)
+                if why := _reason_to_drop(record, trust):
+                    drops.append(Drop(str(contact), kind, ratio, why))
                 else:
-                    drops.append(Drop(str(contact), kind, ratio, trust.why))
+                    records.append(record)
             why = "the press ended before this depth"
         except Exception as error:  # one contact that goes wrong must not end an hour's run; the manifest says which
             log.warning("%s under %s: %s: %s", contact, kind, type(error).__name__, error)
@@ -124,6 +125,16 @@ def solve_contact(job: Job) -> bytes:
         seconds[kind] = time.process_time() - started
     about = {"set": contact.set, "number": contact.number, "split": split_of(plan, contact), "drawn": drawn}
     return _part_bytes(about, records, drops, seconds)
+
+
+def _reason_to_drop(record: Record, trust: Trust) -> str:
+    """Why a sample is not kept; empty if it is."""
+    figures = dict(zip(FIGURES, record.figures, strict=True))
+    if not trust.ok:
+        return trust.why
+    if (cut := figures["truncation_m"]) > WORST_TRUNCATION * figures["peak_m"]:
+        return f"the patch cuts off {cut / figures['peak_m']:.1%} of the peak; {WORST_TRUNCATION:.0%} are allowed"
+    return ""
 
 
 def solve_pressures(bench: Bench, scene: Scene, wanted: np.ndarray) -> Iterator[tuple[Record, Trust]]:

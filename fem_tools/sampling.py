@@ -6,6 +6,7 @@ import hashlib
 import string
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cache
 from typing import Any, Literal
 
 import numpy as np
@@ -92,7 +93,7 @@ class Plan(BaseModel):
 
 
 PRESETS = {
-    "tiny": Plan(preset="tiny", bodies=PAPER_BODIES[2:3], edge_length=6e-3, reach=4.0, discs=5, ellipses=2, seams=2,
+    "tiny": Plan(preset="tiny", bodies=PAPER_BODIES[2:3], edge_length=6e-3, discs=5, ellipses=2, seams=2,
                  indenters=1, hands=1, bands=1, letters=1, loads=3),
     "default": Plan(preset="default", discs=369, ellipses=42, seams=109, indenters=12),
     "paper": Plan(preset="paper", indenters=40),
@@ -133,9 +134,13 @@ def split_of(plan: Plan, contact: ContactId) -> Split:
     if contact.set in OUT_OF_DISTRIBUTION:
         return "ood"
     count = plan.count(contact.set)
-    order = ContactId(contact.body, contact.set, -1).rng(plan.seed).permutation(count)
-    place = (int(order[contact.number]) + 0.5) / count
+    place = (_shuffled(plan.seed, contact.body, contact.set, count)[contact.number] + 0.5) / count
     return "train" if place < SHARES[0] else "val" if place < SHARES[1] else "test"
+
+
+@cache
+def _shuffled(seed: int, body: str, name: SetName, count: int) -> list[int]:
+    return ContactId(body, name, -1).rng(seed).permutation(count).tolist()
 
 
 def kinds_of(plan: Plan, contact: ContactId) -> tuple[Kind, ...]:

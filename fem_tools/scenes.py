@@ -209,14 +209,14 @@ def letter(character: str, height: float) -> Outline:
     """Outline of a bold block letter of this height [m], about the middle of its box.
 
     Raises:
-        InvalidInput: a character that the font draws nothing for.
+        InvalidInput: no letter and no digit.
     """
+    if not character.isalnum():
+        raise InvalidInput(f"the font draws nothing of use for {character!r}. Use capital letters.")
     path = TextPath((0, 0), character, size=100, prop=FontProperties(family="DejaVu Sans", weight="bold"))
     outline: Any = shapely.Polygon()
     for loop in path.to_polygons():
         outline = outline.symmetric_difference(shapely.Polygon(np.asarray(loop)).buffer(0))
-    if outline.is_empty:
-        raise InvalidInput(f"the font draws nothing for {character!r}. Use capital letters.")
     x0, y0, x1, y1 = outline.bounds
     outline = shapely.affinity.translate(outline, -(x0 + x1) / 2, -(y0 + y1) / 2)
     return shapely.affinity.scale(outline, height / (y1 - y0), height / (y1 - y0), origin=(0, 0))

@@ -137,7 +137,36 @@ def recover(path: BagPath, target: Path | None = None) -> int:
     return 0
 
 
-VERBS = {f.__name__: f for f in (demo, node, probe, record, replay, compare, info, recover)}
+def generate(
+    preset: Literal["tiny", "default", "paper"] = "default",
+    out: Path | None = None,
+    workers: int | None = None,
+    scheduler: str | None = None,
+    as_json: Json = False,
+) -> int:
+    """Makes the data set that networks learn from, or goes on with one that was stopped.
+
+    Example: stmpl generate --preset tiny --out data/tiny
+
+    Args:
+        preset: tiny (seconds), default (under an hour on two cores), paper (hours).
+        out: folder of the data; data/<preset> unless given.
+        workers: local processes; one a core unless given.
+        scheduler: address of a Dask scheduler that does the work instead.
+        as_json: print the manifest for machines.
+    """
+    from fem_tools.generate import generate as make
+    from fem_tools.sampling import PRESETS
+    from stmpl_ros.tables import contacts_bar, data_table
+
+    with contacts_bar(preset, quiet=as_json) as show:
+        folder = out or Path("data") / preset
+        manifest = make(PRESETS[preset], folder, workers=workers, scheduler=scheduler, on_progress=show)
+    _print_figures(manifest if as_json else data_table(manifest, folder))
+    return 0
+
+
+VERBS = {f.__name__: f for f in (demo, node, probe, record, replay, compare, info, recover, generate)}
 
 
 def main(arguments: list[str] | None = None) -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -59,6 +61,32 @@ def comparison_table(comparison: Comparison) -> Table:
     for name, value in headline(comparison):
         table.add_row(name, value)
     table.caption = comparison.verdict
+    return table
+
+
+@contextmanager
+def contacts_bar(preset: str, *, quiet: bool = False) -> Iterator[Callable[[int, int, int, int], None]]:
+    """A progress bar on stderr for fem_tools.generate: contacts done, samples kept and dropped, time left."""
+    counts = TextColumn("{task.fields[kept]:,} samples, {task.fields[dropped]:,} dropped")
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), counts, TimeRemainingColumn())
+    with Progress(*columns, console=Console(stderr=True), disable=quiet) as progress:
+        task = progress.add_task(f"contacts of {preset}", total=None, kept=0, dropped=0)
+
+        def show(done: int, total: int, kept: int, dropped: int) -> None:
+            progress.update(task, completed=done, total=total, kept=kept, dropped=dropped)
+
+        yield show
+
+
+def data_table(manifest: dict[str, Any], folder: Path) -> Table:
+    """What a data set holds, for people."""
+    table = Table(title=str(folder), title_justify="left", caption_justify="left")
+    for heading in ("split", "load", "contacts"):
+        table.add_column(heading)
+    table.add_column("samples", justify="right")
+    for name, count in manifest["counts"].items():
+        table.add_row(*name.split("/"), f"{count:,}")
+    table.caption = f"{manifest['samples']:,} samples, {len(manifest['dropped']):,} dropped: see manifest.json"
     return table
 
 
