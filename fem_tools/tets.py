@@ -94,6 +94,12 @@ class TetMesh:
         """All nodes, by the name under which loads ask for the skin's."""
         return self.points
 
+    def boundary_faces(self) -> np.ndarray:
+        """Faces of one tetrahedron only, each with its nodes in ascending order, (N, 3)."""
+        all_faces = self.tets[:, [[0, 1, 2], [0, 1, 3], [0, 2, 3], [1, 2, 3]]].reshape(-1, 3)
+        faces, count = np.unique(np.sort(all_faces, axis=1), axis=0, return_counts=True)
+        return faces[count == 1]
+
     def column_ends(self) -> tuple[Points, Points]:
         """All nodes, twice: a column of one level ends where it starts."""
         return self.points, self.points
@@ -245,21 +251,18 @@ class TetFem(PatchFem):
         else:
             traction = load.forces_on(layer) / layer.vertex_areas[:, None]
             pressing = DeadForces.of_traction(mesh, patch.interpolate(traction))
-        return TetSystem(mesh, layer.tissue, [pressing], self._held(patch, mesh))
+        return TetSystem(mesh, layer.tissue, [pressing], self.held(patch, mesh))
 
     def guess(self, system: System, pressure: np.ndarray, factor: float) -> np.ndarray:
         """From rest: the nodes that TetGen adds stand in no column."""
         return system.zeros()
 
-    def _held(self, patch: Patch, mesh: TetMesh) -> np.ndarray:
-        """The nodes on the rim: those that belong to a face of the rim."""
-        directed = mesh.tets[:, [[0, 1, 2], [0, 1, 3], [0, 2, 3], [1, 2, 3]]].reshape(-1, 3)
-        faces, count = np.unique(np.sort(directed, axis=1), axis=0, return_counts=True)
-        faces = faces[count == 1]
+    def held(self, patch: Patch, mesh: TetMesh) -> np.ndarray:
+        """Mask of the nodes on the patch's rim, those of its faces that are neither skin nor core, (N,)."""
+        faces = mesh.boundary_faces()
         skin = np.zeros(mesh.n_columns, dtype=bool)
         skin[np.unique(mesh.triangles)] = True
-        rim = faces[~skin[faces].all(axis=1) & ~mesh.core[faces].all(axis=1)]
         held = np.zeros(mesh.n_columns, dtype=bool)
-        held[rim.ravel()] = True
+        held[faces[~skin[faces].all(axis=1) & ~mesh.core[faces].all(axis=1)]] = True
         held[: len(patch.fixed)] |= patch.fixed
         return held
