@@ -29,6 +29,8 @@ NORMAL_PENALTY = 100.0  # confined moduli over the thickness
 TANGENT_PENALTY = 10.0  # likewise: how far a sticking point creeps
 MAX_ENTERED = 20e-6  # m; the augmented Lagrangian goes on until nodes are less deep in a tool
 MAX_FACES_ENTERED = 0.01  # thicknesses
+SPREAD = 0.15  # thicknesses that skin is pushed aside before it is touched
+SHARE_FOR_STRETCH = 0.4  # of that, planned for at rest: edges grow by up to 1.7 where the skin wraps around a fillet
 MAX_UPDATES = 4
 MIN_J = 0.1  # below it an answer is not believed
 
@@ -60,9 +62,18 @@ class Tool:
 
     def at(self, travel: float) -> Tool:
         """The same tool, moved on by `travel` [m]."""
+        return self.shifted(travel * self.direction)
+
+    def shifted(self, by: np.ndarray) -> Tool:
+        """The same tool, moved by a vector of the layer's frame, (3,) [m]."""
         pose = self.pose_body_from_tool.copy()
-        pose[:3, 3] += travel * self.direction
+        pose[:3, 3] += by
         return replace(self, pose_body_from_tool=pose)
+
+    def sideways(self, size: float) -> Points:
+        """No shift, and four of `size` [m] across the travel, (5, 3)."""
+        across = np.linalg.svd(self.direction[None])[2][1:]
+        return size * np.concatenate([np.zeros((1, 3)), across, -across])
 
     def to_tool(self, points: Points) -> Points:
         """Points of the layer's frame in the tool's, (N, 3) [m]."""
@@ -333,10 +344,15 @@ class _Press:
                     f"tool {number} would be {-clear * 1e3:.2f} mm inside the core at {deepest * 1e3:.2f} mm; "
                     f"the layer is {thin * 1e3:.2f} mm thick there. Press less deep.")  # fmt: skip
         thickness = float(layer.thickness[footprint].min())
-        shallow, deep = float(depths[0]), [float(depths[-1]) * share for share in (0.3, 0.6, 1.0)]
+        shallow, deep = float(depths[0]), [float(depths[-1]) * share for share in np.linspace(0.15, 1, 6)]
 
         def edge_length(points: np.ndarray) -> np.ndarray:
-            wanted = [edge_for_curvature(tool.at(d), points, thickness) for tool in self.tools for d in deep]
+            wanted = [
+                edge_for_curvature(tool.at(depth).shifted(aside), points, thickness)
+                for tool in self.tools
+                for depth in deep
+                for aside in tool.sideways(SPREAD * thickness)
+            ]
             wanted += [edge_for_first_contact(tool.at(shallow), points, shallow) for tool in self.tools]
             return np.min(wanted, axis=0)
 
@@ -541,7 +557,7 @@ def edge_for_curvature(tool: Tool, points: np.ndarray, thickness: float) -> np.n
         thickness: of the layer [m].
     """
     curvature = _curvature_touched(tool, points)
-    return np.sqrt(6 * 0.6 * MAX_FACES_ENTERED * thickness / np.maximum(curvature, 1e-9))
+    return np.sqrt(6 * SHARE_FOR_STRETCH * MAX_FACES_ENTERED * thickness / np.maximum(curvature, 1e-9))
 
 
 def edge_for_first_contact(tool: Tool, points: np.ndarray, depth: float) -> np.ndarray:
