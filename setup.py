@@ -40,10 +40,12 @@ ROS_WHEELS = [  # versions that resolve together: ROS 2 Jazzy as wheels for CPyt
     f"stmpl-msgs @ {(HERE / 'msg_defs').as_uri()}",
 ]
 CLUSTER = ["distributed>=2024.8"]
+PAPER = ["tetgen>=0.6"]  # TetGen itself is under the AGPL: nobody gets it who does not ask for it
 DEV = [
     "felupe>=9",
     "hypothesis>=6.100",
     "import-linter>=2.0",
+    "meshio>=5.3",
     "pyright>=1.1.380",
     "pytest>=8",
     "ruff>=0.6",
@@ -66,6 +68,6 @@ setup(
     if ON_ROS_MACHINE
     else [],
     install_requires=REQUIRED + ([] if ON_ROS_MACHINE else ROS_WHEELS),
-    extras_require={"dev": DEV + CLUSTER, "cluster": CLUSTER},
+    extras_require={"dev": DEV + CLUSTER, "cluster": CLUSTER, "paper": PAPER},
     entry_points={"console_scripts": ["stmpl = stmpl_ros.cli:main"]},
 )

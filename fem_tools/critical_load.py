@@ -17,6 +17,7 @@ from fem_tools.mesh import WedgeMesh
 from fem_tools.newton import NewtonSettings, System, is_positive_definite, newton
 from fem_tools.patch import DeadForces, FollowerPressure, PatchFem, mirror_projectors
 from fem_tools.tets import TetSystem, split_wedges
+from stmpl_core.errors import InvalidInput
 from stmpl_core.layer import SoftLayer, Tissue
 from stmpl_core.methods.winkler import column_stretch
 from stmpl_core.sdf import SignedDistance
@@ -28,8 +29,12 @@ LONGEST_STEP, SHORTEST_STEP = 0.25, 0.015  # p / E
 LARGEST_JUMP = 0.3  # thicknesses; an answer further away than this from the last one lies on another branch
 DEPTHS = np.arange(1, 9) / 10  # of a tool, in thicknesses
 
+ELEMENTS = ("P1 tets", "P1xP2", "P2xP2")
+
 LoadName = Literal["follower", "dead", "indenter"]
 SceneName = Literal["plate", "disc", "ball"]
+SCENES: tuple[SceneName, ...] = ("plate", "disc", "ball")
+EDGES = (5e-3, 2.6e-3)  # m
 
 
 @dataclass(frozen=True)
@@ -55,7 +60,7 @@ class CriticalLoad:
 
 
 def least_stiffness(
-    ratio: float, wavelength: float, poisson_ratio: float, load: LoadName, *, degree: int = 20
+    ratio: float, wavelength: float, poisson_ratio: float, load: LoadName, *, degree: int = 16
 ) -> float:
     """Smallest eigenvalue of the second variation of a uniformly pressed bonded layer; below 0 it is unstable.
 
@@ -96,40 +101,58 @@ def closed_form(
     wavelength: float, poisson_ratio: float = 0.4, load: LoadName = "dead", *, up_to: float = 40.0
 ) -> float:
     """The first p / E at which a wave of this length (over the thickness) grows; infinite if none up to `up_to`."""
-    ratios = np.geomspace(0.05, up_to, 40)
+    ratios = np.geomspace(0.2, up_to, 20)
     values = [least_stiffness(r, wavelength, poisson_ratio, load) for r in ratios]
     below = np.flatnonzero(np.array(values) < 0)
     if not len(below):
         return np.inf
     last = int(below[0])
-    return float(brentq(lambda r: least_stiffness(r, wavelength, poisson_ratio, load), *ratios[last - 1 : last + 1]))
+    low, high = ratios[last - 1 : last + 1]
+    root: Any = brentq(lambda r: least_stiffness(r, wavelength, poisson_ratio, load), low, high, xtol=1e-4)
+    return float(root)
 
 
 def critical_loads(
     *,
-    edges: Sequence[float] = (5e-3, 2.6e-3),
-    elements: Sequence[str] = ("P1 tets", "P1xP2", "P2xP2"),
+    edges: Sequence[float] = EDGES,
+    elements: Sequence[str] = ELEMENTS,
+    scenes: Sequence[SceneName] = SCENES,
     largest: float = 3.0,
-    tools: bool = True,
 ) -> Iterator[CriticalLoad]:
     """Presses a flat layer (t = 7.5 mm, nu = 0.4) by each load with each element and mesh width, until it fails.
 
     Args:
         edges: of the skin's triangles [m].
         elements: of "P1 tets", "P1xP2", "P2xP2".
+        scenes: of "plate", "disc", "ball"; the ball is pressed in with wedges only.
         largest: p / E at which a press ends that nothing stopped.
-        tools: also press a rigid ball in, with the wedges.
 
     Yields:
         One row a press, as they are done.
+
+    Raises:
+        InvalidInput: an element that there is not.
     """
-    for edge in edges:
-        for element in elements:
-            for scene in ("plate", "disc"):
-                for load in ("dead", "follower"):
-                    yield _pressed(scene, load, element, edge, largest)
-            if tools and element != "P1 tets":
-                yield _ball(element, edge)
+    for scene, load, element, edge in presses(edges, elements, scenes):
+        yield _ball(element, edge) if scene == "ball" else _pressed(scene, load, element, edge, largest)
+
+
+def presses(
+    edges: Sequence[float] = EDGES, elements: Sequence[str] = ELEMENTS, scenes: Sequence[SceneName] = SCENES
+) -> list[tuple[SceneName, LoadName, str, float]]:
+    """What `critical_loads` does in turn: scene, load, element and edge [m] of each press."""
+    if unknown := set(elements) - set(ELEMENTS):
+        raise InvalidInput(f"unknown elements: {', '.join(unknown)}. Available: {', '.join(ELEMENTS)}.")
+    loads: dict[SceneName, tuple[LoadName, ...]] = {scene: ("dead", "follower") for scene in ("plate", "disc")}
+    loads["ball"] = ("indenter",)
+    return [
+        (scene, load, element, edge)
+        for edge in edges
+        for element in elements
+        for scene in scenes
+        for load in loads[scene]
+        if (scene, element) != ("ball", "P1 tets")
+    ]
 
 
 def _pressed(scene: SceneName, load: LoadName, element: str, edge: float, largest: float) -> CriticalLoad:
@@ -201,7 +224,7 @@ def _ball(element: Any, edge: float) -> CriticalLoad:
     layer = SoftLayer(vertices, faces, THICKNESS)
     solver = IndenterFem(PatchFem(element=element, reach=3, refine=1)).prepare(layer)
     ratio = 0.0
-    for answer in solver.path([Tool(field, pose, np.array([0.0, 0, -1]))], DEPTHS * THICKNESS):
+    for answer in solver.path([Tool(field, pose, np.array([0.0, 0, -1]))], (DEPTHS * THICKNESS).tolist()):
         if not answer.trust.converged:
             return CriticalLoad("indenter", "ball", element, edge, ratio, "no solution")
         ratio = float(answer.pressure.max()) / layer.tissue.youngs_modulus
@@ -238,12 +261,12 @@ def draw(rows: Sequence[CriticalLoad], path: str | Path, *, poisson_ratio: float
 
 
 def _draw_closed_form(axes: Any, poisson_ratio: float) -> float:
-    wavelengths = np.geomspace(0.3, 6, 25)
+    wavelengths = np.geomspace(0.4, 6, 16)
     dead = np.array([closed_form(w, poisson_ratio) for w in wavelengths])
     axes.plot(wavelengths, dead, color="tab:red")
     axes.axhline(dead.min(), color="tab:red", lw=0.8, ls="--")
-    axes.text(0.32, dead.min() * 0.93, f"{dead.min():.2f} E", color="tab:red", va="top")
-    axes.text(0.32, 4.0, "follower pressure:\nno instability up to 40 E", color="tab:blue")
+    axes.text(0.42, dead.min() * 0.93, f"{dead.min():.2f} E", color="tab:red", va="top")
+    axes.text(0.42, 4.0, "follower pressure:\nno instability up to 40 E", color="tab:blue")
     axes.set(xscale="log", yscale="log", ylim=(0.3, 8), xlabel="wavelength / thickness", ylabel="critical p / E")
     axes.set_title("closed form: a bonded layer, dead load", fontsize=10)
     axes.minorticks_off()
@@ -275,5 +298,4 @@ def _draw_rows(axes: Any, rows: Sequence[CriticalLoad], least: float) -> None:
 
 
 def _order(row: CriticalLoad) -> tuple[int, int, float]:
-    scenes, elements = ("plate", "disc", "ball"), ("P1 tets", "P1xP2", "P2xP2")
-    return scenes.index(row.scene), elements.index(row.element), -row.edge
+    return SCENES.index(row.scene), ELEMENTS.index(row.element), -row.edge

@@ -166,7 +166,33 @@ def generate(
     return 0
 
 
-VERBS = {f.__name__: f for f in (demo, node, probe, record, replay, compare, info, recover, generate)}
+def stability(critical_load: bool = False, out: Path = Path("runs/critical_load.png"), as_json: Json = False) -> int:
+    """Where the finite elements lose stability: follower, dead and indenter loads, beside the closed form.
+
+    Example: stmpl stability --critical-load --out critical_load.png
+
+    Args:
+        critical_load: press a flat layer by each load with each element and mesh width until it fails (minutes).
+        out: the picture, a PNG.
+        as_json: print the table for machines.
+    """
+    from fem_tools.critical_load import closed_form, draw
+    from stmpl_ros.tables import critical_load_table, critical_loads_with_progress
+
+    if not critical_load:
+        least = min(closed_form(wavelength) for wavelength in (0.5, 1.0, 2.0))
+        said = f"Under dead loads a bonded layer is unstable from p = {least:.2f} E on; under a follower pressure,"
+        said += " up to 40 E, never. --critical-load shows what each element makes of it."
+        _print_figures({"dead_load_p_over_e": least, "follower_load_p_over_e": None} if as_json else said)
+        return 0
+    rows = critical_loads_with_progress(quiet=as_json)
+    picture = draw(rows, out)
+    figures = {"picture": str(picture), "rows": [vars(row) for row in rows]}
+    _print_figures(figures if as_json else critical_load_table(rows, picture))
+    return 0
+
+
+VERBS = {f.__name__: f for f in (demo, node, probe, record, replay, compare, info, recover, generate, stability)}
 
 
 def main(arguments: list[str] | None = None) -> None:

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
@@ -16,6 +16,9 @@ from bags.reader import Bag
 from bags.report import headline
 from stmpl_core.methods.base import Method
 from stmpl_core.metrics import mean_and_deviation
+
+if TYPE_CHECKING:
+    from fem_tools.critical_load import CriticalLoad
 
 
 def compare_with_progress(path: Path, reference: Method, frames: int, *, quiet: bool = False) -> Comparison:
@@ -87,6 +90,29 @@ def data_table(manifest: dict[str, Any], folder: Path) -> Table:
     for name, count in manifest["counts"].items():
         table.add_row(*name.split("/"), f"{count:,}")
     table.caption = f"{manifest['samples']:,} samples, {len(manifest['dropped']):,} dropped: see manifest.json"
+    return table
+
+
+def critical_loads_with_progress(*, quiet: bool = False) -> list[CriticalLoad]:
+    """fem_tools.critical_load.critical_loads under a progress bar on stderr."""
+    from fem_tools.critical_load import critical_loads, presses
+
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=Console(stderr=True), disable=quiet, transient=True) as progress:
+        return list(progress.track(critical_loads(), total=len(presses()), description="presses of a flat layer"))
+
+
+def critical_load_table(rows: Sequence[CriticalLoad], picture: Path) -> Table:
+    """The loads at which elements lose stability, for people."""
+    table = Table(title="Where the finite elements lose stability", title_justify="left", caption_justify="left")
+    for heading in ("load", "scene", "element"):
+        table.add_column(heading)
+    for heading in ("edge [mm]", "p / E"):
+        table.add_column(heading, justify="right")
+    table.add_column("ended")
+    for row in rows:
+        table.add_row(row.load, row.scene, row.element, f"{row.edge * 1e3:.1f}", f"{row.ratio:.2f}", row.ended)
+    table.caption = f"drawn in {picture}"
     return table
 
 

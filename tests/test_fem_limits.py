@@ -1,0 +1,215 @@
+"""Limits of the finite-element truth: incompressibility, stability, its own error bound, and the paper's own path."""
+
+import json
+
+import numpy as np
+import pytest
+
+from fem_tools import PatchFem
+from fem_tools.critical_load import closed_form, critical_loads, draw, least_stiffness
+from fem_tools.patch import FollowerPressure
+from fem_tools.polyfem import HELD, export
+from fem_tools.tets import TetFem, TetMesh, TetSystem, split_wedges
+from stmpl_core.errors import InvalidInput, MeshError
+from stmpl_core.layer import SoftLayer, Tissue
+from stmpl_core.load import Load
+from tests.scenes import limb, plate, smooth_disc
+
+THICKNESS = 7.5e-3
+
+
+def bump(points: np.ndarray, peak: float, radius: float) -> np.ndarray:
+    """A pressure that falls from `peak` on the z axis to 0 at `radius` as cos^2, (n,) [Pa]."""
+    r = np.minimum(np.linalg.norm(points[:, :2], axis=1) / radius, 1)
+    return peak * np.cos(0.5 * np.pi * r) ** 2
+
+
+def peak_of_the_mixed_method(half: float, tissue: Tissue, peak: float, radius: float, n: int = 4) -> float:
+    """Largest displacement [m] by felupe's u-p-J hexahedra (Simo, Taylor & Pister 1985), a quarter of the slab."""
+    import felupe as fem
+
+    mesh = fem.Cube(a=(0, 0, -THICKNESS), b=(half, half, 0), n=(n + 1, n + 1, 3))
+    mesh = mesh.add_midpoints_edges().add_midpoints_faces().add_midpoints_volumes()
+    field = fem.FieldsMixed(fem.RegionTriQuadraticHexahedron(mesh), n=3)
+    points = mesh.points
+    on_skin = points[:, 2] > -1e-9
+    skin = fem.RegionTriQuadraticHexahedronBoundary(mesh, only_surface=True, mask=on_skin)
+    skin_field = fem.FieldContainer([fem.Field(skin, dim=3)])
+    at = np.moveaxis(fem.Field(skin, dim=3, values=points).interpolate(), 0, -1)
+    pressure = bump(at.reshape(-1, 3), peak, radius).reshape(at.shape[:2])
+    bounds = {
+        "held": fem.Boundary(field[0], mask=(points[:, 2] < 1e-9 - THICKNESS) | (points[:, :2].max(1) > half - 1e-9)),
+        "x": fem.Boundary(field[0], mask=points[:, 0] < 1e-9, skip=(0, 1, 1)),
+        "y": fem.Boundary(field[0], mask=points[:, 1] < 1e-9, skip=(1, 0, 1)),
+    }
+    dof0, dof1 = fem.dof.partition(field, bounds)
+    material = fem.ThreeFieldVariation(fem.NeoHookeCompressible(tissue.shear_modulus, tissue.lame_lambda))
+    pressing = fem.SolidBodyPressure(skin_field, pressure=pressure)
+    fem.newtonraphson(items=[fem.SolidBody(material, field), pressing], x0=field, dof0=dof0, dof1=dof1, verbose=0)
+    return float(np.linalg.norm(field[0].values[on_skin], axis=1).max())
+
+
+def test_nearly_incompressible_tissue_is_within_3_percent_of_a_mixed_method():
+    """nu = 0.499: two wedges deep against u-p-J, and the default, one deep, against those; linear in plane locks."""
+    half, radius, tissue = 0.0225, 0.015, Tissue(poisson_ratio=0.499)
+    vertices, faces = plate(19, half / 9)
+    vertices[:, :2] -= half
+    layer, load = SoftLayer(vertices, faces, THICKNESS, tissue=tissue), Load.pressure(bump(vertices, 400.0, radius))
+    default, deep, linear = (
+        PatchFem(**options, reach=9, check_stability=False).prepare(layer).solve(load)
+        for options in ({}, {"layers": 2}, {"element": "P1xP2"})
+    )
+    assert default.trust.converged and deep.trust.converged
+    assert deep.magnitude.max() == pytest.approx(peak_of_the_mixed_method(half, tissue, 400.0, radius), rel=0.03)
+    assert default.magnitude.max() == pytest.approx(deep.magnitude.max(), rel=0.03)
+    assert linear.magnitude.max() < 0.67 * deep.magnitude.max()
+
+
+@pytest.mark.parametrize(("ratio", "edge", "reach"), [(0.2, 5e-3, 3.0), (0.8, 4e-3, 4.0), (1.2, 6e-3, 6.0)])
+def test_the_stated_bound_covers_the_error(ratio, edge, reach):
+    vertices, faces = limb(4e-3)
+    layer = SoftLayer(vertices, faces, THICKNESS)
+    load = Load.pressure(1e3 * ratio * smooth_disc(vertices, vertices[len(vertices) // 2], 0.008, edge))
+    answer = PatchFem(reach=reach).prepare(layer).solve(load)
+    finer = PatchFem(element="P2xP2", layers=2, reach=reach, check_stability=False).prepare(layer).solve(load)
+    wider = PatchFem(reach=8, check_stability=False).prepare(layer).solve(load)
+    off = (answer.displacement - finer.displacement) + (answer.displacement - wider.displacement)
+    error = float(np.linalg.norm(off, axis=1).max())
+    assert answer.trust.ok and answer.trust.error_bound is not None
+    assert error < answer.trust.error_bound < 5 * error
+
+
+def test_dead_loads_lose_stability_at_065_e_at_waves_up_to_one_thickness():
+    least = min(closed_form(wave) for wave in (0.4, 0.7, 1.0))
+    assert least == pytest.approx(0.651, abs=0.003)
+    assert closed_form(2.0) > 1.2 * least
+
+
+@pytest.mark.parametrize("nu", [0.3, 0.4, 0.45])
+def test_a_follower_pressure_loses_no_stability(nu):
+    assert all(least_stiffness(p, wave, nu, "follower") > 0 for p in (0.5, 2.0, 10.0, 40.0) for wave in (0.4, 1.0, 4.0))
+
+
+def test_coarse_linear_tets_hide_the_instability_that_quadratic_wedges_show(tmp_path):
+    rows = list(critical_loads(edges=(5e-3,), elements=("P2xP2", "P1 tets"), scenes=("plate",), largest=1.0))
+    found = {(row.element, row.load): row for row in rows}
+    assert found["P2xP2", "dead"].ended == "unstable" and 0.64 < found["P2xP2", "dead"].ratio < 0.78
+    assert found["P1 tets", "dead"].ended == "held"
+    assert found["P2xP2", "follower"].ended == "held"
+    assert draw(rows, tmp_path / "critical.png").read_bytes().startswith(b"\x89PNG")
+
+
+def wavy_tets(layers: int = 2) -> TetMesh:
+    vertices, faces = plate(6, 3e-3)
+    vertices[:, 2] = 1e-3 * np.sin(100 * vertices[:, 0]) * np.cos(80 * vertices[:, 1])
+    layer = SoftLayer(vertices, faces, THICKNESS)
+    return split_wedges(layer.vertices, layer.inner_vertices, layer.faces.astype(np.int64), layers)
+
+
+def test_split_wedges_conform_and_fill_the_layer():
+    mesh, flat = wavy_tets(), SoftLayer(*plate(5, 3e-3), THICKNESS)
+    assert len(mesh.boundary_faces()) == 2 * len(mesh.triangles) + 2 * 2 * 20  # skin, core, and 20 rim quads a layer
+    filled = split_wedges(flat.vertices, flat.inner_vertices, flat.faces.astype(np.int64), 3)
+    assert filled.volumes.sum() == pytest.approx(0.012**2 * THICKNESS)
+
+
+def test_tets_pass_the_patch_test_and_their_tangent_is_the_derivative():
+    mesh, tissue = wavy_tets(), Tissue()
+    none = np.zeros(mesh.n_columns, dtype=bool)
+    pressure = np.full(36, 300.0)
+    system = TetSystem(mesh, tissue, [FollowerPressure(mesh, pressure)], none)  # pyright: ignore
+    F = np.array([[1.05, 0.1, 0.02], [0.0, 0.95, 0.05], [-0.03, 0.02, 0.9]])
+    u = system.rest @ (F - np.eye(3)).T
+    forces, smallest = system.internal(u)
+    inside = np.ones(mesh.n_columns, dtype=bool)
+    inside[np.unique(mesh.boundary_faces())] = False
+    assert smallest == pytest.approx(np.linalg.det(F)) and inside.any()
+    assert np.abs(forces[inside]).max() < 1e-12 * np.abs(forces).max()
+    rng, eps = np.random.default_rng(0), 1e-7
+    u = u + rng.normal(scale=3e-5, size=u.shape)
+    direction = rng.normal(size=u.shape)
+    product = np.zeros((mesh.n_columns, 3))
+    data = system.tangent(u, 1.0)
+    for c in range(mesh.n_columns):
+        for k in range(mesh.indptr[c], mesh.indptr[c + 1]):
+            product[c] += data[k] @ direction[mesh.indices[k], 0]
+    difference = (system.residual(u + eps * direction, 1.0)[0] - system.residual(u - eps * direction, 1.0)[0]) / (
+        2 * eps
+    )
+    np.testing.assert_allclose(product, difference, atol=3e-6 * np.abs(difference).max())
+
+
+def paper_scene(h: float) -> tuple[SoftLayer, Load]:
+    """The paper's rule: the same force along the rest normal at every vertex of a contact."""
+    vertices, faces = limb(h, radius=0.03, length=0.08)
+    layer = SoftLayer(vertices, faces, THICKNESS)
+    touched = np.linalg.norm(vertices - vertices[len(vertices) // 2], axis=1) < 0.01
+    return layer, Load.nodal(np.where(touched, 0.04 / touched.sum(), 0.0))
+
+
+def test_linear_tets_come_to_the_wedges_as_they_are_refined():
+    errors = []
+    for h in (5e-3, 2.5e-3):
+        vertices, faces = limb(h, radius=0.03, length=0.08)
+        layer = SoftLayer(vertices, faces, THICKNESS)
+        load = Load.pressure(300 * smooth_disc(vertices, vertices[len(vertices) // 2], 0.01, 6e-3))
+        truth = PatchFem(element="P2xP2", reach=3, check_stability=False).prepare(layer).solve(load)
+        tets = TetFem(layers=round(THICKNESS / h), reach=3, check_stability=False).prepare(layer).solve(load)
+        assert tets.trust.converged
+        errors.append(np.linalg.norm(tets.displacement - truth.displacement, axis=1).max() / truth.magnitude.max())
+    assert errors[1] < 0.75 * errors[0]
+
+
+def test_tetgen_and_split_wedges_agree_on_the_papers_rule():
+    pytest.importorskip("tetgen", reason="TetGen is an optional extra")
+    layer, load = paper_scene(3e-3)
+    split, tetgen = (TetFem(mesher=m, layers=3, reach=3).prepare(layer).solve(load) for m in ("split", "tetgen"))
+    assert split.trust.ok and tetgen.trust.ok, (split.trust.why, tetgen.trust.why)
+    assert tetgen.magnitude.max() == pytest.approx(split.magnitude.max(), rel=0.2)
+
+
+@pytest.mark.parametrize("kind", ["pressure", "nodal"])
+def test_the_polyfem_scene_reads_back_as_the_scene_that_we_solve(tmp_path, kind):
+    """The fields are those of PolyFEM's json-specs/input-spec.json; the mesh is read by meshio."""
+    meshio = pytest.importorskip("meshio")
+    layer, load = paper_scene(5e-3)
+    load = load if kind == "nodal" else Load.pressure(load.pressure_on(layer))
+    fem = TetFem(layers=2, reach=2)
+    path = export(tmp_path, layer, load, fem)
+    scene = json.loads(path.read_text())
+    read = meshio.read(tmp_path / scene["geometry"][0]["mesh"])
+    patch = fem.patch_around(load.loaded)
+    tets = fem.tets(patch)
+    np.testing.assert_array_equal(read.points, tets.points)
+    np.testing.assert_array_equal(read.cells_dict["tetra"], tets.tets)
+    assert scene["materials"] == {"type": "NeoHookean", "E": 1000.0, "nu": 0.4, "rho": 1000.0}
+    conditions = scene["boundary_conditions"]
+    assert conditions["dirichlet_boundary"] == [{"id": HELD, "value": [0, 0, 0]}]
+    rows = np.loadtxt(tmp_path / scene["geometry"][0]["surface_selection"], dtype=int)
+    boundary = {tuple(face) for face in tets.boundary_faces()}
+    assert all(tuple(sorted(face)) in boundary for face in rows[:, 1:])
+    held = np.unique(rows[rows[:, 0] == HELD, 1:])
+    np.testing.assert_array_equal(held, np.flatnonzero(fem.held(patch, tets) | tets.core))
+    values = {
+        c["id"]: c["value"] for c in conditions["pressure_boundary" if kind == "pressure" else "neumann_boundary"]
+    }
+    faces = rows[rows[:, 0] > HELD]
+    edges = read.points[faces[:, 2:]] - read.points[faces[:, 1:2]]
+    area = 0.5 * np.cross(edges[:, 0], edges[:, 1])
+    value = np.array([values[tag] for tag in faces[:, 0]])
+    size = np.linalg.norm(area, axis=1)
+    total = -(value[:, None] * area).sum(axis=0) if kind == "pressure" else (value * size[:, None]).sum(axis=0)
+    np.testing.assert_allclose(total, load.forces_on(layer).sum(axis=0), rtol=1e-9, atol=1e-12)
+
+
+def test_bad_input_is_refused_with_its_reason(tmp_path):
+    layer, _ = paper_scene(5e-3)
+    with pytest.raises(InvalidInput, match="mesher"):
+        TetFem(mesher="gmsh")  # pyright: ignore
+    with pytest.raises(InvalidInput, match="no load"):
+        export(tmp_path, layer, Load.zero(layer))
+    with pytest.raises(InvalidInput, match="elements"):
+        next(critical_loads(elements=("P3",)))
+    flat = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0.0]])
+    with pytest.raises(MeshError, match="no volume"):
+        TetMesh.of(flat, np.array([[0, 1, 2, 3]]), np.array([[0, 1, 2]]), np.zeros(4, dtype=bool))
