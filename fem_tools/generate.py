@@ -16,6 +16,7 @@ from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import FIRST_COMPLETED, Executor, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
+from copy import copy
 from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -28,7 +29,7 @@ from fem_tools.dataset import FIGURES, FORMAT, RAGGED, Record, Writer, write_lay
 from fem_tools.hand import Hand
 from fem_tools.indenter import IndenterFem, Tool
 from fem_tools.patch import PatchFem
-from fem_tools.sampling import ContactId, Kind, Plan, contacts, draw, kinds_of, layers, ratios, split_of
+from fem_tools.sampling import BodyPlan, ContactId, Kind, Plan, contacts, draw, kinds_of, layers, ratios, split_of
 from fem_tools.scenes import Scene, Site, UnusableContact
 from stmpl_core.body import Body
 from stmpl_core.chart import UvChart
@@ -36,7 +37,7 @@ from stmpl_core.errors import InvalidInput, StmplError
 from stmpl_core.layer import SoftLayer
 from stmpl_core.load import Load
 from stmpl_core.sdf import SignedDistance
-from stmpl_core.trust import Trust
+from stmpl_core.trust import Displacement, Trust
 
 log = logging.getLogger(__name__)
 
@@ -75,16 +76,18 @@ class Bench:
 
     site: Site
     fem: PatchFem
+    paper_fem: PatchFem
     indenter: IndenterFem
 
     @classmethod
-    def of(cls, plan: Plan, skin: Mapping[str, Any]) -> Bench:
+    def of(cls, plan: Plan, body: BodyPlan, skin: Mapping[str, Any]) -> Bench:
         """Builds the layer again from its arrays. Raises MeshError if it folds."""
         chart = None if skin["uv"] is None else UvChart(skin["vertices"], skin["faces"], skin["uv"])
         layer = SoftLayer(skin["vertices"], skin["faces"], skin["thickness"], tissue=skin["tissue"], chart=chart)
-        pressing = PatchFem(reach=plan.reach).prepare(layer)
-        indenting = IndenterFem(PatchFem(reach=plan.reach, refine=INDENTER_REFINE)).prepare(layer)
-        return cls(Site(layer), pressing, indenting)
+        pressing = PatchFem(reach=body.reach, refine=plan.refine).prepare(layer)
+        paper_fem = PatchFem(reach=body.reach).prepare(layer)
+        indenting = IndenterFem(PatchFem(reach=body.reach, refine=INDENTER_REFINE)).prepare(layer)
+        return cls(Site(layer), pressing, paper_fem, indenting)
 
 
 _benches: dict[str, Bench] = {}
@@ -93,13 +96,15 @@ _benches: dict[str, Bench] = {}
 def solve_contact(job: Job) -> bytes:
     """Draws and solves one contact under all its kinds of load: its part of the data set, as a file's bytes."""
     if job.digest not in _benches:
-        _benches[job.digest] = Bench.of(job.plan, job.skin)
+        _benches[job.digest] = Bench.of(job.plan, job.plan.body(job.contact.body), job.skin)
     bench, plan, contact = _benches[job.digest], job.plan, job.contact
     rng = contact.rng(plan.seed)
     records: list[Record] = []
     drops: list[Drop] = []
     drawn, seconds = {}, {}
-    loads: dict[Kind, np.ndarray] = {kind: ratios(plan, kind, rng) for kind in kinds_of(plan, contact)}
+    loads: dict[Kind, np.ndarray] = {
+        kind: ratios(plan, kind, plan.loads_of(contact.set), rng) for kind in kinds_of(plan, contact)
+    }
     try:
         started = time.process_time()
         scene, drawn = draw(contact, bench.site, job.hand, rng)
@@ -141,7 +146,7 @@ def solve_pressures(bench: Bench, scene: Scene, wanted: np.ndarray) -> Iterator[
     """The footprint under follower pressures of these p / E."""
     layer = bench.site.layer
     loads = [Load.pressure(r * layer.tissue.youngs_modulus * scene.footprint) for r in wanted]
-    yield from _pressed(bench, "pressure", loads, wanted)
+    yield from _pressed(bench.fem, layer, "pressure", loads, wanted)
 
 
 def solve_nodals(bench: Bench, scene: Scene, wanted: np.ndarray) -> Iterator[tuple[Record, Trust]]:
@@ -149,7 +154,7 @@ def solve_nodals(bench: Bench, scene: Scene, wanted: np.ndarray) -> Iterator[tup
     layer = bench.site.layer
     force = layer.tissue.youngs_modulus * float(layer.vertex_areas[scene.covered].min())
     loads = [Load.nodal(np.where(scene.covered, r * force, 0.0)) for r in wanted]
-    yield from _pressed(bench, "nodal", loads, wanted)
+    yield from _pressed(bench.paper_fem, layer, "nodal", loads, wanted)
 
 
 def solve_indentations(bench: Bench, scene: Scene, wanted: np.ndarray) -> Iterator[tuple[Record, Trust]]:
@@ -166,11 +171,25 @@ def solve_indentations(bench: Bench, scene: Scene, wanted: np.ndarray) -> Iterat
         yield Record.of(layer, "indenter", load, answer.displacement, figures), answer.trust
 
 
-def _pressed(bench: Bench, kind: Kind, loads: list[Load], wanted: np.ndarray) -> Iterator[tuple[Record, Trust]]:
-    layer = bench.site.layer
-    for load, ratio, answer in zip(loads, wanted, bench.fem.solve_many(loads), strict=True):
+def _pressed(
+    fem: PatchFem, layer: SoftLayer, kind: Kind, loads: list[Load], wanted: np.ndarray
+) -> Iterator[tuple[Record, Trust]]:
+    for load, ratio, answer in zip(loads, wanted, _answers(fem, loads), strict=True):
         figures = dict(answer.trust.figures) | {"ratio": float(ratio)}
         yield Record.of(layer, kind, load, answer.displacement, figures), answer.trust
+
+
+def _answers(fem: PatchFem, loads: list[Load]) -> list[Displacement]:
+    """Answers to loads that grow. The largest is tested for stability, and each if that fails: a fifth of the time."""
+    fem = copy(fem)
+    answers, solving = [], fem.solve_many(loads)
+    for k in range(len(loads)):
+        fem.check_stability = k == len(loads) - 1
+        answers.append(next(solving))
+    if answers[-1].trust.ok:
+        return answers
+    fem.check_stability = True
+    return list(fem.solve_many(loads))
 
 
 SOLVERS: dict[Kind, Callable[[Bench, Scene, np.ndarray], Iterator[tuple[Record, Trust]]]] = {

@@ -36,13 +36,14 @@ BALLS = (8e-3, 20e-3)  # m, radii of rounded indenters
 
 
 class BodyPlan(BaseModel):
-    """One body: a phenotype and the thickness of its soft layer."""
+    """One body: a phenotype, the thickness of its soft layer, and how far patches reach beyond a load."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     name: str
     weight: float = Field(ge=0, le=1)
     thickness: float | tuple[float, float]  # m; two: varies smoothly between them
+    reach: float = Field(default=6.0, gt=0)  # largest thicknesses under the load
     paper_rule: bool = True  # the same contacts once more as the paper loads them
     out_of_distribution: bool = True
 
@@ -52,8 +53,8 @@ PAPER_BODIES = tuple(  # thick bodies have thick layers, as in the paper
     for w, t in ((0.0, 5e-3), (0.25, 6.25e-3), (0.5, 7.5e-3), (0.75, 8.75e-3), (1.0, 10e-3))
 )
 VARYING_BODIES = tuple(
-    BodyPlan(name=f"varying_{int(100 * w)}", weight=w, thickness=(2.5e-3, 12.5e-3), paper_rule=False,
-             out_of_distribution=False)
+    BodyPlan(name=f"varying_{int(100 * w)}", weight=w, thickness=(2.5e-3, 12.5e-3), reach=9.0,
+             paper_rule=False, out_of_distribution=False)
     for w in (0.25, 0.75)
 )  # fmt: skip
 
@@ -64,7 +65,7 @@ class Plan(BaseModel):
     Args:
         discs, ellipses, seams, indenters: contacts a body.
         hands, bands, letters: contacts in all, shared among the bodies.
-        loads: of each contact.
+        loads, loads_out_of_distribution: of each contact.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -73,7 +74,7 @@ class Plan(BaseModel):
     bodies: tuple[BodyPlan, ...] = PAPER_BODIES + VARYING_BODIES
     part: str = "left_arm"
     edge_length: float = 4e-3  # m
-    reach: float = 6.0  # thicknesses
+    refine: int = Field(default=1, ge=0)  # splits of the skin near a pressure; the paper's rule has no splits
     discs: int = 1884
     ellipses: int = 216
     seams: int = 555
@@ -82,10 +83,19 @@ class Plan(BaseModel):
     bands: int = 40
     letters: int = 273
     loads: int = Field(default=10, ge=1)
-    highest_pressure: float = Field(default=2.0, gt=0)  # p / E, of follower pressures
+    loads_out_of_distribution: int = Field(default=5, ge=1)
+    highest_pressure: float = Field(default=1.5, gt=0)  # p / E, of follower pressures
     highest_nodal: float = Field(default=0.4, gt=0)  # p / E at the worst vertex, of the paper's rule
     deepest: float = Field(default=0.7, gt=0, lt=1)  # thicknesses, of indenters
     seed: int = 0
+
+    def body(self, name: str) -> BodyPlan:
+        """The body of that name."""
+        return next(body for body in self.bodies if body.name == name)
+
+    def loads_of(self, name: SetName) -> int:
+        """Loads of each contact of a set."""
+        return self.loads_out_of_distribution if name in OUT_OF_DISTRIBUTION else self.loads
 
     def count(self, name: SetName) -> int:
         """Contacts of a set: a body where it is in distribution, in all where not."""
@@ -94,8 +104,8 @@ class Plan(BaseModel):
 
 PRESETS = {
     "tiny": Plan(preset="tiny", bodies=PAPER_BODIES[2:3], edge_length=6e-3, discs=5, ellipses=2, seams=2,
-                 indenters=1, hands=1, bands=1, letters=1, loads=3),
-    "default": Plan(preset="default", discs=369, ellipses=42, seams=109, indenters=12),
+                 indenters=1, hands=1, bands=1, letters=1, loads=3, loads_out_of_distribution=2),
+    "default": Plan(preset="default", discs=369, ellipses=42, seams=109, indenters=8),
     "paper": Plan(preset="paper", indenters=40),
 }  # fmt: skip
 
@@ -147,8 +157,7 @@ def kinds_of(plan: Plan, contact: ContactId) -> tuple[Kind, ...]:
     """How the contact presses: contacts by pressure press once more as the paper's do."""
     if contact.set == "indenter":
         return ("indenter",)
-    paper_rule = next(body.paper_rule for body in plan.bodies if body.name == contact.body)
-    return ("pressure", "nodal") if paper_rule else ("pressure",)
+    return ("pressure", "nodal") if plan.body(contact.body).paper_rule else ("pressure",)
 
 
 def layers(plan: Plan) -> dict[str, SoftLayer]:
@@ -173,10 +182,10 @@ def varying(points: np.ndarray, bounds: tuple[float, float], rng: np.random.Gene
     return bounds[0] + (bounds[1] - bounds[0]) * (field - field.min()) / np.ptp(field)
 
 
-def ratios(plan: Plan, kind: Kind, rng: np.random.Generator) -> np.ndarray:
-    """The loads of one contact, increasing, one in each equal part of the range: p / E, or depth over thickness."""
+def ratios(plan: Plan, kind: Kind, count: int, rng: np.random.Generator) -> np.ndarray:
+    """`count` loads of one contact, increasing, one in each equal part of the range: p / E, or depth over thickness."""
     highest = {"pressure": plan.highest_pressure, "nodal": plan.highest_nodal, "indenter": plan.deepest}[kind]
-    return (np.arange(plan.loads) + rng.uniform(0.05, 1.0, plan.loads)) / plan.loads * highest
+    return (np.arange(count) + rng.uniform(0.05, 1.0, count)) / count * highest
 
 
 def draw(contact: ContactId, site: Site, hand: Hand | None, rng: np.random.Generator) -> tuple[Scene, dict[str, Any]]:

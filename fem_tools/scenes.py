@@ -25,7 +25,7 @@ FACING = 0.2  # cosine between a tool's axis and the skin's normal from which sk
 DEEPEST_FACE = 15e-3  # m that a flat face may have to sink before all of it meets the skin
 BACK = 10e-3  # m of tool above the skin
 STRAP = 4e-3  # m, of a strap's cloth
-CLEAR = 2.5  # thicknesses that a footprint keeps from the layer's open border
+CLEAR = 2.5  # largest thicknesses that a footprint keeps from the layer's open border
 FEWEST = 7  # vertices that a footprint must cover
 
 
@@ -99,7 +99,7 @@ class Site:
         loaded = np.flatnonzero(footprint)
         if (footprint >= 0.5).sum() < FEWEST:
             raise UnusableContact(f"it covers {int((footprint >= 0.5).sum())} vertices, fewer than {FEWEST}")
-        thick = float(self.layer.thickness[loaded].max())
+        thick = float(self.layer.thickness.max())
         if (gap := float(self.border_distance[loaded].min())) < CLEAR * thick:
             raise UnusableContact(f"it comes within {gap / thick:.1f} thicknesses of the open border")
         return Scene(mesh, pose, footprint)

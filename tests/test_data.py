@@ -138,8 +138,8 @@ def test_the_presets_are_as_large_as_they_say() -> None:
 
 
 def test_loads_increase_and_stay_in_their_range() -> None:
-    for kind, highest in (("pressure", 2.0), ("nodal", 0.4), ("indenter", 0.7)):
-        drawn = ratios(PRESETS["paper"], kind, np.random.default_rng(3))
+    for kind, highest in (("pressure", 1.5), ("nodal", 0.4), ("indenter", 0.7)):
+        drawn = ratios(PRESETS["paper"], kind, 10, np.random.default_rng(3))
         assert len(drawn) == 10 and drawn[0] > 0 and drawn[-1] <= highest
         assert all(a < b for a, b in pairwise(drawn))
 
@@ -163,11 +163,12 @@ def test_varying_thickness_spans_its_bounds_smoothly(limb: SoftLayer) -> None:
 def test_every_sample_is_an_answer_of_fem_to_its_load(made: Path) -> None:
     data = Dataset.open(made)
     layer = next(iter(data.layers.values()))
-    fem = PatchFem(reach=TINY.reach).prepare(layer)
+    body = TINY.bodies[0]
     for kind, sets in (("pressure", ["disc"]), ("nodal", ["ellipse"]), ("pressure", ["hand"])):
         subset = data.split("ood" if sets == ["hand"] else "train", kind=kind, sets=sets)
         sample = subset[len(subset) - 1]
-        answer = fem.solve(sample.load)
+        refine = TINY.refine if kind == "pressure" else 0
+        answer = PatchFem(reach=body.reach, refine=refine).prepare(layer).solve(sample.load)
         tolerance = MOVES + QUANTUM + 1e-3 * sample.info["peak_m"]
         assert np.abs(answer.displacement - sample.displacement).max() < tolerance
         assert np.linalg.norm(sample.displacement, axis=1).max() == pytest.approx(sample.info["peak_m"], rel=1e-4)
@@ -175,7 +176,7 @@ def test_every_sample_is_an_answer_of_fem_to_its_load(made: Path) -> None:
 
 def test_samples_and_drops_account_for_every_load(made: Path) -> None:
     data = Dataset.open(made)
-    asked = sum(TINY.loads * len(kinds_of(TINY, c)) for c in contacts(TINY))
+    asked = sum(TINY.loads_of(c.set) * len(kinds_of(TINY, c)) for c in contacts(TINY))
     assert len(data) + len(data.manifest["dropped"]) == asked
     assert all(drop["why"] for drop in data.manifest["dropped"])
     assert sum(len(data.split(s)) for s in ("train", "val", "test", "ood")) == len(data) > 0.8 * asked
@@ -243,7 +244,8 @@ def test_another_plan_does_not_overwrite(made: Path) -> None:
 def test_a_dask_cluster_makes_the_same_data(made: Path, tmp_path: Path) -> None:
     distributed = pytest.importorskip("distributed")
     plan = DISCS.model_copy(update={"discs": 2})
-    with distributed.LocalCluster(n_workers=1, threads_per_worker=1, dashboard_address=None, processes=True) as cluster:
+    settings = {"n_workers": 1, "threads_per_worker": 1, "dashboard_address": None, "processes": False}
+    with distributed.LocalCluster(**settings, protocol="tcp") as cluster:
         manifest = generate(plan, tmp_path / "dask", scheduler=cluster.scheduler_address)
     assert manifest["workers"].startswith("dask") and manifest["samples"] == 2 * 2 * plan.loads
     assert_same(Dataset.open(tmp_path / "dask"), Dataset.open(made))
