@@ -24,6 +24,7 @@ from stmpl_core.trust import Displacement, Trust
 
 MIN_FOLD = 0.05  # smallest determinant of a wedge at rest, over its mean, that is meshed [-]
 QUADRATIC_ABOVE = 0.42  # Poisson's ratio above which linear in plane locks: its largest error passes 3 % of the peak
+TWO_DEEP_ABOVE = 0.49  # Poisson's ratio above which one wedge leaves 2 % of the peak, two leave 0.2 %
 REFINED_WITHIN = 1.5  # thicknesses of the load; beyond, the layer's own mesh is fine enough
 # The stated bound: shares of the estimates and of the peak, fitted on discs of radius 5-18 mm with edges of 3-6 mm on
 # arms, p / E 0.1-1.5, reach 3-7, one wedge of P1xP2 against two or three of P2xP2 at half the width: it covers the
@@ -128,7 +129,7 @@ class PatchFem:
 
     Args:
         element: "P1xP2", "P2xP2", or None: quadratic in plane where nu > 0.42, linear elsewhere.
-        layers: wedges through the thickness.
+        layers: wedges through the thickness; None: two where nu > 0.49, one elsewhere.
         refine: how often the skin triangles near the load are split in four before meshing.
         reach: how far the patch extends beyond the load, in largest thicknesses; its rim is held.
         border: what holds the rim: "clamped" (no motion) or "mirror" (no motion across it: a plane of symmetry).
@@ -140,14 +141,14 @@ class PatchFem:
         self,
         *,
         element: ElementName | None = None,
-        layers: int = 1,
+        layers: int | None = None,
         refine: int = 0,
         reach: float = 6.0,
         border: Literal["clamped", "mirror"] = "clamped",
         settings: NewtonSettings | None = None,
         check_stability: bool = True,
     ) -> None:
-        if layers < 1 or refine < 0 or not reach > 0:
+        if (layers is not None and layers < 1) or refine < 0 or not reach > 0:
             raise InvalidInput(
                 f"PatchFem(layers={layers}, refine={refine}, reach={reach}): "
                 "layers >= 1, refine >= 0 and reach > 0 are allowed."
@@ -184,6 +185,10 @@ class PatchFem:
             return self.element
         return "P2xP2" if layer.tissue.poisson_ratio > QUADRATIC_ABOVE else "P1xP2"
 
+    def layers_for(self, layer: SoftLayer) -> int:
+        """Wedges through the thickness that this layer's Poisson's ratio asks for, unless a number was chosen."""
+        return self.layers or (2 if layer.tissue.poisson_ratio > TWO_DEEP_ABOVE else 1)
+
     def patch_around(self, vertices: np.ndarray, edge_length: EdgeLength | None = None) -> Patch:
         """Meshes everything within `reach` thicknesses of the given vertices of the layer.
 
@@ -211,7 +216,7 @@ class PatchFem:
                 break
             outer, inner, away = (np.concatenate([x, x[edges].mean(axis=1)]) for x in (outer, inner, away))
             splits.append(edges)
-        mesh = WedgeMesh.of(outer, inner, triangles, self.element_for(layer), self.layers)
+        mesh = WedgeMesh.of(outer, inner, triangles, self.element_for(layer), self.layers_for(layer))
         return Patch(chosen, mesh, mesh.border_columns(), distance[chosen], tuple(splits))
 
     def solve(self, load: Load) -> Displacement:

@@ -238,7 +238,7 @@ class TetFem(PatchFem):
         mesh = patch.mesh
         if self.mesher == "tetgen":
             return tetgen_mesh(mesh.outer, mesh.inner, mesh.triangles)
-        return split_wedges(mesh.outer, mesh.inner, mesh.triangles, self.layers)
+        return split_wedges(mesh.outer, mesh.inner, mesh.triangles, mesh.layers)
 
     def system(self, patch: Patch, load: Load) -> TetSystem:
         """The equations of a patch under a load."""
