@@ -105,7 +105,7 @@ class Plan(BaseModel):
 PRESETS = {
     "tiny": Plan(preset="tiny", bodies=PAPER_BODIES[2:3], edge_length=6e-3, discs=5, ellipses=2, seams=2,
                  indenters=1, hands=1, bands=1, letters=1, loads=3, loads_out_of_distribution=2),
-    "default": Plan(preset="default", discs=369, ellipses=42, seams=109, indenters=8),
+    "default": Plan(preset="default", discs=264, ellipses=30, seams=78, indenters=4),
     "paper": Plan(preset="paper", indenters=40),
 }  # fmt: skip
 
