@@ -27,6 +27,7 @@ from stmpl_core.layer import SoftLayer
 from stmpl_core.load import Load
 
 PICTURE = Path(__file__).parents[1] / "docs" / "pictures" / "ground_truth_cost.png"
+COST_TICKS = (0.03, 0.1, 0.3, 1.0)  # s
 SITES, RATIOS, RADIUS, EDGE = 2, (0.2, 0.8), 0.012, 0.004  # p / E [-], [m]
 
 
@@ -130,8 +131,11 @@ def scaling_picture(body: Body, path: Path) -> None:
             cost.append(timed(lambda m=method, x=press: m.solve(x), 2)[0])
         right.loglog(np.array(widths) * 1e3, cost, "o-", color=colour, label=f"{layers} wedge{'s' * (layers > 1)} deep")
     right.set(xlabel="edge length [mm]", title="reach 6")
-    for axes in (left, right):
-        axes.grid(True, which="both", alpha=0.3)
+    for axes, ticks in ((left, (3, 4, 6, 8, 12)), (right, (2, 3, 4, 6))):
+        axes.set_xticks(ticks, [str(tick) for tick in ticks])
+        axes.set_yticks(COST_TICKS, [f"{tick:g}" for tick in COST_TICKS])
+        axes.minorticks_off()
+        axes.grid(True, alpha=0.3)
         axes.legend()
     path.parent.mkdir(parents=True, exist_ok=True)
     plt.savefig(path, dpi=110)
