@@ -392,7 +392,7 @@ def _pack(plan: Plan, out: Path, made: Mapping[str, SoftLayer], tally: _Tally) -
         "versions": {name: _version(name) for name in VERSIONS} | {"python": platform.python_version()},
         "samples": sum(counts.values()),
         "counts": dict(sorted(counts.items())),
-        "wall_seconds_of_last_session": round(tally.seconds, 1),
+        "wall_seconds_of_last_run": round(tally.seconds, 1),
         "workers": tally.workers,
         "cpu_seconds_per_contact": {name: round(float(np.mean(v)), 4) for name, v in sorted(spent.items())},
         "dropped": [vars(d) for d in drops],

@@ -168,6 +168,16 @@ def tangent(u, columns, blocks, layers, gradients, volumes, mu, lam, data):
 
 
 @njit(cache=True, fastmath=FAST)
+def _face_tangents(x, columns, slope, s, r):
+    """Writes x_xi and x_eta of a deformed face."""
+    for i in range(3):
+        s[i] = r[i] = 0.0
+        for a in range(len(columns)):
+            s[i] += slope[a, 0] * x[columns[a], i]
+            r[i] += slope[a, 1] * x[columns[a], i]
+
+
+@njit(cache=True, fastmath=FAST)
 def follower_forces(x, columns, pressure, value, slope, linear, weight, forces):
     """Adds the forces of a follower pressure to `forces` (C, 3): -int p N_a (x_xi x x_eta) dxi deta [N].
 
@@ -180,11 +190,7 @@ def follower_forces(x, columns, pressure, value, slope, linear, weight, forces):
             continue
         for q in range(weight.shape[0]):
             p = pressure[t, 0] * linear[q, 0] + pressure[t, 1] * linear[q, 1] + pressure[t, 2] * linear[q, 2]
-            for i in range(3):
-                s[i] = r[i] = 0.0
-                for a in range(n):
-                    s[i] += slope[q, a, 0] * x[columns[t, a], i]
-                    r[i] += slope[q, a, 1] * x[columns[t, a], i]
+            _face_tangents(x, columns[t], slope[q], s, r)
             w = p * weight[q]
             n0, n1, n2 = s[1] * r[2] - s[2] * r[1], s[2] * r[0] - s[0] * r[2], s[0] * r[1] - s[1] * r[0]
             for a in range(n):
@@ -209,11 +215,7 @@ def follower_tangent(x, columns, blocks, pressure, value, slope, linear, weight,
         half[:] = 0.0
         for q in range(weight.shape[0]):
             p = pressure[t, 0] * linear[q, 0] + pressure[t, 1] * linear[q, 1] + pressure[t, 2] * linear[q, 2]
-            for i in range(3):
-                s[i] = r[i] = 0.0
-                for a in range(n):
-                    s[i] += slope[q, a, 0] * x[columns[t, a], i]
-                    r[i] += slope[q, a, 1] * x[columns[t, a], i]
+            _face_tangents(x, columns[t], slope[q], s, r)
             w = p * weight[q]
             for a in range(n):
                 for b in range(n):
