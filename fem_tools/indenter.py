@@ -136,7 +136,6 @@ class ToolLoad:
         self.held = np.isfinite(anchor).all(axis=1)
         pose = tool.pose_body_from_tool
         self.anchor = np.where(self.held[:, None], anchor, 0.0) @ pose[:3, :3].T + pose[:3, 3]
-        self.curved = True
         self._project: np.ndarray | None = None
 
     def pressure(self, skin: np.ndarray) -> np.ndarray:
@@ -178,12 +177,14 @@ class ToolLoad:
         """See SkinLoad."""
         forces[self.near] += self.nodal_forces(skin)
 
-    def add_tangent(self, skin: np.ndarray, factor: float, data: np.ndarray, *, symmetric: bool) -> None:
-        """See SkinLoad; the tool's curvature softens, and is left out where Newton asks for a convex model."""
+    def add_tangent(
+        self, skin: np.ndarray, factor: float, data: np.ndarray, *, symmetric: bool, convex: bool = False
+    ) -> None:
+        """See SkinLoad; the tool's curvature softens, and is left out where Newton asks for a convex one."""
         phi, gradient, hessian = self.tool.jet(skin[self.near])
         p = np.maximum(0.0, self.multiplier - self.normal * phi)
         stiff = np.where((p > 0)[:, None, None], self.normal * gradient[:, :, None] * gradient[:, None, :], 0.0)
-        if self.curved:
+        if not convex:
             stiff -= p[:, None, None] * hessian
         _, secant = self.slip(skin)
         stiff += secant[:, None, None] * self._plane(skin)
@@ -446,10 +447,6 @@ class _Press:
         settings = replace(self.fem.settings, tolerance=1e-4, max_iterations=40)
         result = newton(self.system, guess, 1.0, settings)
         for update in range(MAX_UPDATES + 1):
-            if not result.converged:
-                for load in loads:
-                    load.curved = False
-                result = newton(self.system, result.u, 1.0, settings)
             skin = self.system.rest[:, 0] + result.u[:, 0]
             entered = max(float(-load.tool.distance(skin[load.near]).min(initial=0.0)) for load in loads)
             if not result.converged or entered < MAX_ENTERED or update == MAX_UPDATES:

@@ -110,8 +110,12 @@ def strain_energy(u, columns, layers, gradients, volumes, mu, lam):
 
 
 @njit(cache=True, fastmath=FAST)
-def tangent(u, columns, blocks, layers, gradients, volumes, mu, lam, data):
-    """Adds the tangent [N/m] to `data` (n_blocks, 3 m, 3 m), m = 2 L free levels; the bonded level is left out."""
+def tangent(u, columns, blocks, layers, gradients, volumes, mu, lam, convex, data):
+    """Adds the tangent [N/m] to `data` (n_blocks, 3 m, 3 m), m = 2 L free levels; the bonded level is left out.
+
+    With l = dF F^-1 the second variation is mu |dF|^2 + (mu - lambda ln J) l : l^T + lambda (tr l)^2. Only
+    l : l^T = |sym l|^2 - |skw l|^2 can be negative; `convex` = 1 leaves the skew part out, 0 keeps the true tangent.
+    """
     n_nodes, free = gradients.shape[2], 2 * layers
     local, F, inv = np.empty((n_nodes, 3)), np.empty((3, 3)), np.empty((3, 3))
     g, K = np.empty((n_nodes, 3)), np.empty((n_nodes, n_nodes, 9))
@@ -128,6 +132,8 @@ def tangent(u, columns, blocks, layers, gradients, volumes, mu, lam, data):
             w = volumes[e, q]
             w_mu, w_lam = w * mu, w * lam
             w_cross = w * (mu - lam * log(J)) if J > 0.0 else w_mu
+            w_skew = 0.5 * convex * max(w_cross, 0.0)
+            w_cross -= w_skew
             for a in range(n_nodes):
                 for i in range(3):
                     g[a, i] = inv[0, i] * G[a, 0] + inv[1, i] * G[a, 1] + inv[2, i] * G[a, 2]
@@ -138,6 +144,7 @@ def tangent(u, columns, blocks, layers, gradients, volumes, mu, lam, data):
                 for b in range(a, n_nodes):
                     b0, b1, b2 = g[b, 0], g[b, 1], g[b, 2]
                     d = A0 * G[b, 0] + A1 * G[b, 1] + A2 * G[b, 2]
+                    d += w_skew * (g[a, 0] * b0 + g[a, 1] * b1 + g[a, 2] * b2)
                     k = K[a, b]
                     k[0] += d + (c0 + l0) * b0
                     k[1] += c1 * b0 + l0 * b1

@@ -33,8 +33,13 @@ class SkinLoad(Protocol):
         """Adds its forces on the skin columns, (C, 3) [N], at the deformed positions `skin` (C, 3) [m]."""
         ...
 
-    def add_tangent(self, skin: np.ndarray, factor: float, data: np.ndarray, *, symmetric: bool) -> None:
-        """Adds its stiffness, -d forces / d skin (or its symmetric part), to the skin level of the tangent's blocks."""
+    def add_tangent(
+        self, skin: np.ndarray, factor: float, data: np.ndarray, *, symmetric: bool, convex: bool = False
+    ) -> None:
+        """Adds its stiffness, -d forces / d skin, to the skin level of the tangent's blocks.
+
+        `symmetric`: only the symmetric part; `convex`: without what may be negative.
+        """
         ...
 
 
@@ -132,14 +137,14 @@ class System:
         forces[:, 0] -= self.external(u, factor)
         return forces[:, : self.free].reshape(len(u), -1), smallest
 
-    def tangent(self, u: np.ndarray, factor: float, *, symmetric: bool = False) -> np.ndarray:
-        """Blocks of the tangent (or of its symmetric part), (n_blocks, 3 m, 3 m) [N/m]."""
+    def tangent(self, u: np.ndarray, factor: float, *, symmetric: bool = False, convex: bool = False) -> np.ndarray:
+        """Blocks of the tangent (or of its symmetric, or of a positive part), (n_blocks, 3 m, 3 m) [N/m]."""
         m, width = self.mesh, 3 * self.free
         data = np.zeros((len(m.indices), width, width))
-        nh.tangent(u, m.columns, m.blocks, m.layers, m.gradients, m.volumes, self.mu, self.lam, data)
+        nh.tangent(u, m.columns, m.blocks, m.layers, m.gradients, m.volumes, self.mu, self.lam, float(convex), data)
         skin = self.rest[:, 0] + u[:, 0]
         for load in self.loads:
-            load.add_tangent(skin, factor, data, symmetric=symmetric)
+            load.add_tangent(skin, factor, data, symmetric=symmetric, convex=convex)
         return data
 
     def preconditioner(self, data: np.ndarray) -> np.ndarray:
@@ -361,9 +366,16 @@ def newton(system: System, u: np.ndarray, factor: float, settings: NewtonSetting
             break
         forcing = float(np.clip(0.5 * relative**0.5, 0.5 * settings.tolerance / relative, 0.1))
         if system.conservative:
-            du, n, _, _ = conjugate_gradients(
+            du, n, _, negative = conjugate_gradients(
                 m.indptr, m.indices, data, inverse, -r, forcing, settings.linear_iterations
             )
+            if negative:  # no minimum in sight along this tangent: descend on a convex one
+                linear += n
+                data = system.tangent(u, factor, convex=True)
+                inverse = system.preconditioner(data)
+                du, n, _, _ = conjugate_gradients(
+                    m.indptr, m.indices, data, inverse, -r, forcing, settings.linear_iterations
+                )
             stepped = _descend(system, u, du, r, factor, settings)
         else:
             du, n, _ = bicgstab(m.indptr, m.indices, data, inverse, -r, forcing, settings.linear_iterations)

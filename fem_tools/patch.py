@@ -55,7 +55,9 @@ class FollowerPressure:
         r = self.reference
         nh.follower_forces(skin, self.mesh.columns, factor * self.corners, r.value, r.slope, r.linear, r.weight, forces)
 
-    def add_tangent(self, skin: np.ndarray, factor: float, data: np.ndarray, *, symmetric: bool) -> None:
+    def add_tangent(
+        self, skin: np.ndarray, factor: float, data: np.ndarray, *, symmetric: bool, convex: bool = False
+    ) -> None:
         """See SkinLoad."""
         r, m = self.reference, self.mesh
         pressure = factor * self.corners
@@ -74,7 +76,9 @@ class DeadForces:
         """See SkinLoad."""
         forces += factor * self.forces
 
-    def add_tangent(self, skin: np.ndarray, factor: float, data: np.ndarray, *, symmetric: bool) -> None:
+    def add_tangent(
+        self, skin: np.ndarray, factor: float, data: np.ndarray, *, symmetric: bool, convex: bool = False
+    ) -> None:
         """Dead forces have no stiffness."""
 
     def potential(self, skin: np.ndarray, factor: float) -> float:

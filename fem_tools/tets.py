@@ -196,19 +196,21 @@ class TetSystem(System):
         forces = np.einsum("m,mij,maj->mai", self.mesh.volumes, P, self.mesh.gradients)
         return (self.mesh.to_nodes @ forces.reshape(-1, 3))[:, None], float(J.min())
 
-    def tangent(self, u: np.ndarray, factor: float, *, symmetric: bool = False) -> np.ndarray:
-        """Blocks of the tangent, (n_blocks, 3, 3) [N/m]; see neo_hookean for the equation."""
+    def tangent(self, u: np.ndarray, factor: float, *, symmetric: bool = False, convex: bool = False) -> np.ndarray:
+        """Blocks of the tangent, (n_blocks, 3, 3) [N/m]; see neo_hookean for the equation, and for `convex`."""
         mesh, (F, J) = self.mesh, self._deformation(u)
         g = np.einsum("mji,maj->mai", np.linalg.inv(F), mesh.gradients)
         cross = (self.mu - self.lam * np.log(np.maximum(J, 1e-300)))[:, None, None, None, None]
         outer = g[:, :, None, :, None] * g[:, None, :, None, :]  # (M, a, b, i, j) = g_a,i g_b,j
-        stiff = cross * outer.swapaxes(3, 4) + self.lam * outer
+        skew = 0.5 * convex * np.maximum(cross, 0.0)
+        stiff = (cross - skew) * outer.swapaxes(3, 4) + self.lam * outer
+        stiff += skew * np.einsum("mak,mbk->mab", g, g)[..., None, None] * np.eye(3)
         stiff += self.mu * np.einsum("mak,mbk->mab", mesh.gradients, mesh.gradients)[..., None, None] * np.eye(3)
         stiff *= mesh.volumes[:, None, None, None, None]
         data = (mesh.to_blocks @ stiff.reshape(-1, 9)).reshape(-1, 3, 3)
         skin = self.rest[:, 0] + u[:, 0]
         for load in self.loads:
-            load.add_tangent(skin, factor, data, symmetric=symmetric)
+            load.add_tangent(skin, factor, data, symmetric=symmetric, convex=convex)
         return data
 
 
