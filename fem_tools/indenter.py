@@ -178,14 +178,13 @@ class ToolLoad:
         forces[self.near] += self.nodal_forces(skin)
 
     def add_tangent(
-        self, skin: np.ndarray, factor: float, data: np.ndarray, *, symmetric: bool, convex: bool = False
+        self, skin: np.ndarray, factor: float, data: np.ndarray, *, symmetric: bool, convex: float = 0.0
     ) -> None:
         """See SkinLoad; the tool's curvature softens, and is left out where Newton asks for a convex one."""
         phi, gradient, hessian = self.tool.jet(skin[self.near])
         p = np.maximum(0.0, self.multiplier - self.normal * phi)
         stiff = np.where((p > 0)[:, None, None], self.normal * gradient[:, :, None] * gradient[:, None, :], 0.0)
-        if not convex:
-            stiff -= p[:, None, None] * hessian
+        stiff -= (1 - convex) * p[:, None, None] * hessian
         _, secant = self.slip(skin)
         stiff += secant[:, None, None] * self._plane(skin)
         data[self.diagonal[self.near], :3, :3] += self.area[:, None, None] * stiff

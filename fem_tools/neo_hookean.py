@@ -114,7 +114,8 @@ def tangent(u, columns, blocks, layers, gradients, volumes, mu, lam, convex, dat
     """Adds the tangent [N/m] to `data` (n_blocks, 3 m, 3 m), m = 2 L free levels; the bonded level is left out.
 
     With l = dF F^-1 the second variation is mu |dF|^2 + (mu - lambda ln J) l : l^T + lambda (tr l)^2. Only
-    l : l^T = |sym l|^2 - |skw l|^2 can be negative; `convex` = 1 leaves the skew part out, 0 keeps the true tangent.
+    l : l^T = |sym l|^2 - |skw l|^2 can be negative; `convex` is the share of the skew part
+    that is left out: 1 is safely positive, 0 the true tangent.
     """
     n_nodes, free = gradients.shape[2], 2 * layers
     local, F, inv = np.empty((n_nodes, 3)), np.empty((3, 3)), np.empty((3, 3))

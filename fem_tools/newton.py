@@ -16,6 +16,8 @@ from stmpl_core.layer import Tissue
 
 log = logging.getLogger(__name__)
 
+CONVEX = (0.1, 0.3, 1.0)  # shares of the skew part that are left out of an indefinite tangent, tried in turn
+
 
 class SkinLoad(Protocol):
     """Something that presses on the skin; `factor` in [0, 1] is the share of it that acts (load continuation).
@@ -34,11 +36,11 @@ class SkinLoad(Protocol):
         ...
 
     def add_tangent(
-        self, skin: np.ndarray, factor: float, data: np.ndarray, *, symmetric: bool, convex: bool = False
+        self, skin: np.ndarray, factor: float, data: np.ndarray, *, symmetric: bool, convex: float = 0.0
     ) -> None:
         """Adds its stiffness, -d forces / d skin, to the skin level of the tangent's blocks.
 
-        `symmetric`: only the symmetric part; `convex`: without what may be negative.
+        `symmetric`: only the symmetric part; `convex`: the share, 0 to 1, of what may be negative that is left out.
         """
         ...
 
@@ -137,11 +139,11 @@ class System:
         forces[:, 0] -= self.external(u, factor)
         return forces[:, : self.free].reshape(len(u), -1), smallest
 
-    def tangent(self, u: np.ndarray, factor: float, *, symmetric: bool = False, convex: bool = False) -> np.ndarray:
+    def tangent(self, u: np.ndarray, factor: float, *, symmetric: bool = False, convex: float = 0.0) -> np.ndarray:
         """Blocks of the tangent (or of its symmetric, or of a positive part), (n_blocks, 3 m, 3 m) [N/m]."""
         m, width = self.mesh, 3 * self.free
         data = np.zeros((len(m.indices), width, width))
-        nh.tangent(u, m.columns, m.blocks, m.layers, m.gradients, m.volumes, self.mu, self.lam, float(convex), data)
+        nh.tangent(u, m.columns, m.blocks, m.layers, m.gradients, m.volumes, self.mu, self.lam, convex, data)
         skin = self.rest[:, 0] + u[:, 0]
         for load in self.loads:
             load.add_tangent(skin, factor, data, symmetric=symmetric, convex=convex)
@@ -369,11 +371,13 @@ def newton(system: System, u: np.ndarray, factor: float, settings: NewtonSetting
             du, n, _, negative = conjugate_gradients(
                 m.indptr, m.indices, data, inverse, -r, forcing, settings.linear_iterations
             )
-            if negative:  # no minimum in sight along this tangent: descend on a convex one
+            for convex in CONVEX:  # no minimum in sight along this tangent: as little of a convex one as it takes
+                if not negative:
+                    break
                 linear += n
-                data = system.tangent(u, factor, convex=True)
+                data = system.tangent(u, factor, convex=convex)
                 inverse = system.preconditioner(data)
-                du, n, _, _ = conjugate_gradients(
+                du, n, _, negative = conjugate_gradients(
                     m.indptr, m.indices, data, inverse, -r, forcing, settings.linear_iterations
                 )
             stepped = _descend(system, u, du, r, factor, settings)

@@ -56,7 +56,7 @@ class FollowerPressure:
         nh.follower_forces(skin, self.mesh.columns, factor * self.corners, r.value, r.slope, r.linear, r.weight, forces)
 
     def add_tangent(
-        self, skin: np.ndarray, factor: float, data: np.ndarray, *, symmetric: bool, convex: bool = False
+        self, skin: np.ndarray, factor: float, data: np.ndarray, *, symmetric: bool, convex: float = 0.0
     ) -> None:
         """See SkinLoad."""
         r, m = self.reference, self.mesh
@@ -77,7 +77,7 @@ class DeadForces:
         forces += factor * self.forces
 
     def add_tangent(
-        self, skin: np.ndarray, factor: float, data: np.ndarray, *, symmetric: bool, convex: bool = False
+        self, skin: np.ndarray, factor: float, data: np.ndarray, *, symmetric: bool, convex: float = 0.0
     ) -> None:
         """Dead forces have no stiffness."""
 

@@ -196,7 +196,7 @@ class TetSystem(System):
         forces = np.einsum("m,mij,maj->mai", self.mesh.volumes, P, self.mesh.gradients)
         return (self.mesh.to_nodes @ forces.reshape(-1, 3))[:, None], float(J.min())
 
-    def tangent(self, u: np.ndarray, factor: float, *, symmetric: bool = False, convex: bool = False) -> np.ndarray:
+    def tangent(self, u: np.ndarray, factor: float, *, symmetric: bool = False, convex: float = 0.0) -> np.ndarray:
         """Blocks of the tangent, (n_blocks, 3, 3) [N/m]; see neo_hookean for the equation, and for `convex`."""
         mesh, (F, J) = self.mesh, self._deformation(u)
         g = np.einsum("mji,maj->mai", np.linalg.inv(F), mesh.gradients)
