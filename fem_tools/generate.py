@@ -123,6 +123,8 @@ def solve_contact(job: Job) -> bytes:
                 else:
                     records.append(record)
             why = "the press ended before this depth"
+        except SystemError:  # Ctrl-C inside a compiled kernel: the run is ending, and this contact is not done
+            raise
         except Exception as error:  # one contact that goes wrong must not end an hour's run; the manifest says which
             log.warning("%s under %s: %s: %s", contact, kind, type(error).__name__, error)
             why = f"{type(error).__name__}: {error}"

@@ -287,7 +287,10 @@ def bicgstab(indptr, indices, data, inverse, b, tolerance, max_iterations):
                 p[c, i] = r[c, i] + beta * (p[c, i] - omega * v[c, i])
         multiply(indptr, indices, data, p, work)
         _precondition(inverse, work, v)
-        alpha = rho / _dot(shadow, v)
+        along = _dot(shadow, v)
+        if along == 0.0:  # breakdown
+            return x, n, (_dot(r, r) / norm0) ** 0.5
+        alpha = rho / along
         for c in range(b.shape[0]):
             for i in range(b.shape[1]):
                 r[c, i] -= alpha * v[c, i]
