@@ -112,6 +112,7 @@ class ToolLoad:
         tool: at this step's pose.
         area: of all columns, (C,) [m2].
         near: numbers of the columns that may touch.
+        diagonal: number of each column's own block in the tangent, (C,).
         stiffness: normal and tangential penalty [Pa/m].
         multiplier: lambda of the columns in `near` [Pa].
         anchor: where each near column sticks, in the tool's frame, (n, 3); NaN where it does not.
@@ -125,12 +126,13 @@ class ToolLoad:
         tool: Tool,
         area: np.ndarray,
         near: np.ndarray,
+        diagonal: np.ndarray,
         stiffness: tuple[float, float],
         multiplier: np.ndarray,
         anchor: Points,
         limit: np.ndarray,
     ) -> None:
-        self.tool, self.near, self.area = tool, near, area[near]
+        self.tool, self.near, self.area, self.diagonal = tool, near, area[near], diagonal[near]
         self.normal, self.tangent = stiffness
         self.multiplier, self.limit = multiplier, limit
         self.held = np.isfinite(anchor).all(axis=1)
@@ -142,7 +144,7 @@ class ToolLoad:
         """Contact pressure of the near columns, (n,) [Pa]."""
         return np.maximum(0.0, self.multiplier - self.normal * self.tool.distance(skin[self.near]))
 
-    def _plane(self, skin: np.ndarray) -> np.ndarray:
+    def _plane(self) -> np.ndarray:
         """Projectors on the tool's tangent planes at the anchors, kept for the whole step, (n, 3, 3)."""
         if self._project is None:
             n = self.tool.jet(self.anchor)[1]
@@ -152,7 +154,7 @@ class ToolLoad:
 
     def slip(self, skin: np.ndarray) -> tuple[Points, np.ndarray]:
         """Tangential offset from the anchors (n, 3) [m], and its secant stiffness [Pa/m] under the friction limit."""
-        offset = np.einsum("nij,nj->ni", self._plane(skin), skin[self.near] - self.anchor)
+        offset = np.einsum("nij,nj->ni", self._plane(), skin[self.near] - self.anchor)
         length = np.linalg.norm(offset, axis=1)
         return offset, np.minimum(self.tangent, self.limit / np.maximum(length, 1e-12))
 
@@ -186,10 +188,8 @@ class ToolLoad:
         stiff = np.where((p > 0)[:, None, None], self.normal * gradient[:, :, None] * gradient[:, None, :], 0.0)
         stiff -= (1 - convex) * p[:, None, None] * hessian
         _, secant = self.slip(skin)
-        stiff += secant[:, None, None] * self._plane(skin)
-        data[self.diagonal[self.near], :3, :3] += self.area[:, None, None] * stiff
-
-    diagonal: np.ndarray  # block number of each column's own block; set by the solver
+        stiff += secant[:, None, None] * self._plane()
+        data[self.diagonal, :3, :3] += self.area[:, None, None] * stiff
 
 
 @dataclass(frozen=True, eq=False)
@@ -320,6 +320,8 @@ class IndenterFem:
                 break
             above = (depth, press.force()) if press.force() > force else above
             below = below if press.force() > force else (depth, press.force(), press.state)
+        else:
+            press.stopped = f"the force is {press.force():.4g} N after 20 trials; {force:.4g} N was asked"
         return press.answer()
 
 
@@ -365,7 +367,6 @@ class _Press:
         tangential = 0.0 if solver.friction == "none" else TANGENT_PENALTY * modulus
         self.stiffness = (NORMAL_PENALTY * modulus, tangential)
         n = self.mesh.n_columns
-        self.diagonal = diagonal_of(self.mesh)
         u, multipliers = self.system.zeros(), [np.zeros(n) for _ in tools]
         self.state = _State(
             u,
@@ -428,8 +429,16 @@ class _Press:
             near = np.flatnonzero((tool.distance(skin) < 0.5 * self.thickness) & ~self.patch.fixed)
             multiplier = self.state.multipliers[k][near]
             limit = self._friction_limit(multiplier)
-            load = ToolLoad(tool, self.area, near, self.stiffness, multiplier, self.state.anchors[k][near], limit)
-            load.diagonal = self.diagonal
+            load = ToolLoad(
+                tool,
+                self.area,
+                near,
+                self.system.diagonal,
+                self.stiffness,
+                multiplier,
+                self.state.anchors[k][near],
+                limit,
+            )
             loads.append(load)
         return loads
 
@@ -583,9 +592,3 @@ def column_areas(mesh: WedgeMesh) -> np.ndarray:
     out = np.zeros(mesh.n_columns)
     np.add.at(out, mesh.columns, area[:, None] * share)
     return out
-
-
-def diagonal_of(mesh: WedgeMesh) -> np.ndarray:
-    """Number of the block of each column with itself, (C,)."""
-    rows = np.repeat(np.arange(mesh.n_columns), np.diff(mesh.indptr))
-    return np.flatnonzero(rows == mesh.indices)

@@ -215,21 +215,6 @@ def level_depths(layers: int) -> np.ndarray:
     return np.sort(np.concatenate([ends, (ends[1:] + ends[:-1]) / 2]))
 
 
-def fold_determinants(outer: Points, inner: Points, triangles: np.ndarray) -> np.ndarray:
-    """Smallest determinant of each prism's map over its corners, over the prism's mean, (T,) [-].
-
-    A prism is sound where this is above 0; a right prism on a flat skin has 1.
-    """
-    out, into = outer[triangles], inner[triangles]
-    dets = []
-    for depth in (0.0, 0.5, 1.0):
-        face = out * (1 - depth) + into * depth
-        normal = np.cross(face[:, 1] - face[:, 0], face[:, 2] - face[:, 0])
-        dets += [np.einsum("ij,ij->i", normal, out[:, corner] - into[:, corner]) for corner in range(3)]
-    determinants = np.stack(dets, axis=1)
-    return determinants.min(axis=1) / np.abs(determinants).mean(axis=1)
-
-
 def split(triangles: np.ndarray, n_vertices: int, marked: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Splits the marked triangles in four, their neighbours as conformity asks (red-green; Bank et al. 1983).
 

@@ -103,6 +103,7 @@ class System:
         self.fixed = fixed
         self.keep = keep
         self.free = mesh.levels - 1
+        self.diagonal = diagonal_blocks(mesh.indptr, mesh.indices)  # block of each column with itself
 
     def zeros(self) -> np.ndarray:
         """No displacement, (C, levels, 3)."""
@@ -151,8 +152,7 @@ class System:
 
     def preconditioner(self, data: np.ndarray) -> np.ndarray:
         """Inverse of each column's own block, (C, 3 m, 3 m); zero where constrained, which is what constrains CG."""
-        m = self.mesh
-        diagonal = data[_diagonal_blocks(m.indptr, m.indices)]
+        diagonal = data[self.diagonal]
         if self.keep is None:
             inverse = _inverse_spd(diagonal)
         else:
@@ -176,7 +176,7 @@ def _inverse_spd(blocks: np.ndarray) -> np.ndarray:
 
 
 @njit(cache=True)
-def _diagonal_blocks(indptr, indices):
+def diagonal_blocks(indptr, indices):
     out = np.empty(len(indptr) - 1, dtype=np.int64)
     for c in range(len(out)):
         for k in range(indptr[c], indptr[c + 1]):
@@ -455,5 +455,5 @@ def is_positive_definite(system: System, u: np.ndarray, factor: float = 1.0, *, 
     m, data = system.mesh, system.tangent(u, factor, symmetric=True)
     inverse = system.preconditioner(data)
     b = np.random.default_rng(seed).standard_normal((m.n_columns, 3 * system.free))
-    b *= np.sqrt(np.abs(np.einsum("cii->ci", data[_diagonal_blocks(m.indptr, m.indices)])))
+    b *= np.sqrt(np.abs(np.einsum("cii->ci", data[system.diagonal])))
     return not conjugate_gradients(m.indptr, m.indices, data, inverse, b, 1e-6, 1000)[3]

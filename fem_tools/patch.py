@@ -13,9 +13,10 @@ from scipy.sparse.csgraph import dijkstra
 from scipy.spatial import KDTree
 
 from fem_tools import neo_hookean as nh
-from fem_tools.mesh import ElementName, WedgeMesh, fold_determinants, level_depths, reference_skin, split
+from fem_tools.mesh import ElementName, WedgeMesh, level_depths, reference_skin, split
 from fem_tools.newton import NewtonResult, NewtonSettings, System, is_positive_definite, solve
 from stmpl_core.errors import InvalidInput, MeshError
+from stmpl_core.extrusion import fold_ratios
 from stmpl_core.layer import SoftLayer
 from stmpl_core.load import Load
 from stmpl_core.methods.base import prepared
@@ -170,7 +171,7 @@ class PatchFem:
         Raises:
             MeshError: it folds on itself when it is extruded; the message names the vertices.
         """
-        folded = fold_determinants(layer.vertices, layer.inner_vertices, layer.faces) < MIN_FOLD
+        folded = fold_ratios(layer.vertices, layer.inner_vertices, layer.faces) < MIN_FOLD
         if folded.any():
             bad = np.unique(layer.faces[folded])
             raise MeshError(

@@ -8,7 +8,7 @@ from typing import Any, Literal
 import numpy as np
 from scipy.sparse import csr_matrix
 
-from fem_tools.newton import System
+from fem_tools.newton import System, diagonal_blocks
 from fem_tools.patch import DeadForces, FollowerPressure, Patch, PatchFem
 from stmpl_core.arrays import Points
 from stmpl_core.errors import InvalidInput, MeshError
@@ -167,6 +167,7 @@ class TetSystem(System):
         self.tissue, self.loads, self.fixed, self.keep = tissue, loads, fixed | mesh.core, keep
         self.mu, self.lam = tissue.shear_modulus, tissue.lame_lambda
         self.rest, self.free = mesh.points[:, None], 1
+        self.diagonal = diagonal_blocks(mesh.indptr, mesh.indices)
 
     def zeros(self) -> np.ndarray:
         """No displacement, (N, 1, 3)."""
