@@ -25,7 +25,7 @@ QUANTUM = 1e-8  # m; displacements are stored as whole numbers of it
 MOVES = 1e-7  # m; vertices that move less are not stored (the paper's metric counts from 1e-6 m)
 CHUNK = 32_768  # rows of a ragged array that are read at once
 KINDS: tuple[Kind, ...] = ("pressure", "nodal", "indenter")
-SPLITS: tuple[Split, ...] = ("train", "val", "test", "ood")
+SPLITS: tuple[Split, ...] = ("train", "val", "test", "ood", "held_out")
 FIGURES = ("ratio", "force_n", "peak_m", "discretisation_m", "truncation_m", "min_j")
 RAGGED = ("loaded", "values", "moved", "steps")  # of a Record
 

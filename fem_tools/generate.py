@@ -162,6 +162,7 @@ def solve_nodals(bench: Bench, scene: Scene, wanted: np.ndarray) -> Iterator[tup
 def solve_indentations(bench: Bench, scene: Scene, wanted: np.ndarray) -> Iterator[tuple[Record, Trust]]:
     """The tool pressed in along its axis to these depths over thickness, sticking."""
     layer, pose = bench.site.layer, scene.pose_body_from_tool
+    assert scene.mesh is not None
     tool = Tool(SignedDistance.of(scene.mesh), pose, -pose[:3, 2])
     under = np.linalg.norm(np.cross(layer.vertices - pose[:3, 3], pose[:3, 2]), axis=1)
     facing = layer.normals @ pose[:3, 2] > 0

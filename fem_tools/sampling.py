@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import math
 import string
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -17,13 +18,13 @@ from fem_tools.hand import Hand
 from fem_tools.scenes import EDGE, Scene, Site, UnusableContact, ellipse, letter
 from stmpl_core.body import Body
 from stmpl_core.contact import ToolMesh
-from stmpl_core.layer import SoftLayer
+from stmpl_core.layer import SoftLayer, Tissue
 
 Kind = Literal["pressure", "nodal", "indenter"]
-SetName = Literal["disc", "ellipse", "seam", "indenter", "hand", "band", "letter"]
-Split = Literal["train", "val", "test", "ood"]
+SetName = Literal["disc", "ellipse", "seam", "field", "indenter", "hand", "band", "letter"]
+Split = Literal["train", "val", "test", "ood", "held_out"]
 
-IN_DISTRIBUTION: tuple[SetName, ...] = ("disc", "ellipse", "seam", "indenter")
+IN_DISTRIBUTION: tuple[SetName, ...] = ("disc", "ellipse", "seam", "field", "indenter")
 OUT_OF_DISTRIBUTION: tuple[SetName, ...] = ("hand", "band", "letter")
 SHARES = (0.8, 0.9)  # of the contacts of a set on a body: training up to the first, validation up to the second
 ATTEMPTS = 60  # at a contact before it is given up
@@ -32,20 +33,26 @@ ASPECTS = (1.3, 3.0)  # of ellipses
 WIDTHS = (10e-3, 40e-3)  # m, of straps
 HEIGHTS = (25e-3, 45e-3)  # m, of letters
 DEPTHS = (3e-3, 5e-3)  # m, that a grasping hand sinks in
+REGIONS = (10e-3, 45e-3)  # m, radii of uneven pressures
+WAVES = (15e-3, 60e-3)  # m, their wavelengths
 BALLS = (8e-3, 20e-3)  # m, radii of rounded indenters
 
 
 class BodyPlan(BaseModel):
-    """One body: a phenotype, the thickness of its soft layer, and how far patches reach beyond a load."""
+    """One body: a phenotype, its soft layer, how far patches reach beyond a load, and what is drawn on it."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     name: str
     weight: float = Field(ge=0, le=1)
     thickness: float | tuple[float, float]  # m; two: varies smoothly between them
+    poisson_ratio: float = Field(default=0.4, ge=0, lt=0.5)
+    part: str | None = None  # of the body; None: the plan's
     reach: float = Field(default=6.0, gt=0)  # largest thicknesses under the load
+    share: float = Field(default=1.0, gt=0, le=1)  # of the plan's contacts
     paper_rule: bool = True  # the same contacts once more as the paper loads them
     out_of_distribution: bool = True
+    held_out: bool = False  # nothing is ever learnt from it
 
 
 PAPER_BODIES = tuple(  # thick bodies have thick layers, as in the paper
@@ -53,9 +60,17 @@ PAPER_BODIES = tuple(  # thick bodies have thick layers, as in the paper
     for w, t in ((0.0, 5e-3), (0.25, 6.25e-3), (0.5, 7.5e-3), (0.75, 8.75e-3), (1.0, 10e-3))
 )
 VARYING_BODIES = tuple(
-    BodyPlan(name=f"varying_{int(100 * w)}", weight=w, thickness=(2.5e-3, 12.5e-3), reach=9.0,
+    BodyPlan(name=name, weight=w, thickness=(2.5e-3, 12.5e-3), poisson_ratio=nu, reach=9.0, share=share,
              paper_rule=False, out_of_distribution=False)
-    for w in (0.25, 0.75)
+    for name, w, nu, share in (("varying_25", 0.25, 0.4, 1.0), ("varying_75", 0.75, 0.4, 1.0),
+                               ("nu_30", 0.5, 0.3, 1.0), ("nu_35", 0.9, 0.35, 1.0),
+                               ("nu_45", 0.1, 0.45, 0.2), ("nu_49", 0.6, 0.49, 0.2))  # quadratic: ten times dearer
+)  # fmt: skip
+OTHER_LIMBS = tuple(
+    BodyPlan(name=name, weight=w, thickness=t, poisson_ratio=nu, part=part, reach=9.0, share=0.1,
+             paper_rule=False, out_of_distribution=False, held_out=True)
+    for name, w, t, nu, part in (("calf", 0.4, 8e-3, 0.4, "left_calf"),
+                                 ("thigh", 0.7, (2.5e-3, 12.5e-3), 0.37, "right_thigh"))
 )  # fmt: skip
 
 
@@ -63,7 +78,7 @@ class Plan(BaseModel):
     """Everything that decides what is generated: the same plan gives the same data.
 
     Args:
-        discs, ellipses, seams, indenters: contacts a body.
+        discs, ellipses, seams, fields, indenters: contacts a body.
         hands, bands, letters: contacts in all, shared among the bodies.
         loads, loads_out_of_distribution: of each contact.
     """
@@ -71,13 +86,14 @@ class Plan(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     preset: str
-    bodies: tuple[BodyPlan, ...] = PAPER_BODIES + VARYING_BODIES
+    bodies: tuple[BodyPlan, ...] = PAPER_BODIES + VARYING_BODIES + OTHER_LIMBS
     part: str = "left_arm"
     edge_length: float = 4e-3  # m
     refine: int = Field(default=1, ge=0)  # splits of the skin near a pressure; the paper's rule has no splits
     discs: int = 1884
     ellipses: int = 216
     seams: int = 555
+    fields: int = 0  # uneven pressures without a tool
     indenters: int = 0
     hands: int = 395
     bands: int = 40
@@ -97,16 +113,17 @@ class Plan(BaseModel):
         """Loads of each contact of a set."""
         return self.loads_out_of_distribution if name in OUT_OF_DISTRIBUTION else self.loads
 
-    def count(self, name: SetName) -> int:
-        """Contacts of a set: a body where it is in distribution, in all where not."""
-        return int(getattr(self, f"{name}s"))
+    def count(self, name: SetName, body: str = "") -> int:
+        """Contacts of a set: on that body where it is in distribution, in all where not."""
+        whole = int(getattr(self, f"{name}s"))
+        return whole if name in OUT_OF_DISTRIBUTION else math.ceil(whole * self.body(body).share)
 
 
 PRESETS = {
     "tiny": Plan(preset="tiny", bodies=PAPER_BODIES[2:3], edge_length=6e-3, discs=5, ellipses=2, seams=2,
-                 indenters=1, hands=1, bands=1, letters=1, loads=3, loads_out_of_distribution=2),
-    "default": Plan(preset="default", discs=264, ellipses=30, seams=78, indenters=4),
-    "paper": Plan(preset="paper", indenters=40),
+                 fields=1, indenters=1, hands=1, bands=1, letters=1, loads=3, loads_out_of_distribution=2),
+    "default": Plan(preset="default", discs=190, ellipses=24, seams=56, fields=40, indenters=10),
+    "paper": Plan(preset="paper", bodies=PAPER_BODIES + VARYING_BODIES[:2], indenters=40),
 }  # fmt: skip
 
 
@@ -132,7 +149,7 @@ def contacts(plan: Plan) -> Iterator[ContactId]:
     takers = [body.name for body in plan.bodies if body.out_of_distribution]
     for body in plan.bodies:
         for name in IN_DISTRIBUTION:
-            yield from (ContactId(body.name, name, k) for k in range(plan.count(name)))
+            yield from (ContactId(body.name, name, k) for k in range(plan.count(name, body.name)))
         if body.name in takers:
             for name in OUT_OF_DISTRIBUTION:
                 first = takers.index(body.name)
@@ -143,7 +160,9 @@ def split_of(plan: Plan, contact: ContactId) -> Split:
     """By contact, never by sample: all loads of a contact, under either rule, belong to one split."""
     if contact.set in OUT_OF_DISTRIBUTION:
         return "ood"
-    count = plan.count(contact.set)
+    if plan.body(contact.body).held_out:
+        return "held_out"
+    count = plan.count(contact.set, contact.body)
     place = (_shuffled(plan.seed, contact.body, contact.set, count)[contact.number] + 0.5) / count
     return "train" if place < SHARES[0] else "val" if place < SHARES[1] else "test"
 
@@ -154,23 +173,25 @@ def _shuffled(seed: int, body: str, name: SetName, count: int) -> list[int]:
 
 
 def kinds_of(plan: Plan, contact: ContactId) -> tuple[Kind, ...]:
-    """How the contact presses: contacts by pressure press once more as the paper's do."""
+    """How the contact presses: contacts by tools press once more as the paper's do."""
     if contact.set == "indenter":
         return ("indenter",)
-    return ("pressure", "nodal") if plan.body(contact.body).paper_rule else ("pressure",)
+    paper = plan.body(contact.body).paper_rule and contact.set != "field"
+    return ("pressure", "nodal") if paper else ("pressure",)
 
 
 def layers(plan: Plan) -> dict[str, SoftLayer]:
-    """The soft layer of each body, by its name; all have the same vertices and faces, so they share one chart."""
-    patch = Body.anny(weight=0.5).patch(plan.part, plan.edge_length)
+    """The soft layer of each body, by its name; those of one part have the same vertices and faces: one chart."""
+    patches = {part: Body.anny(weight=0.5).patch(part, plan.edge_length)
+               for part in dict.fromkeys(body.part or plan.part for body in plan.bodies)}  # fmt: skip
     out = {}
     for body in plan.bodies:
-        skin = Body.anny(weight=body.weight)
-        thickness = body.thickness
+        patch, skin = patches[body.part or plan.part], Body.anny(weight=body.weight)
+        tissue, thickness = Tissue(poisson_ratio=body.poisson_ratio), body.thickness
         if isinstance(thickness, tuple):
             rng = ContactId(body.name, "disc", -2).rng(plan.seed)
             thickness = varying(patch.layer(skin, thickness=thickness[0]).vertices, thickness, rng)
-        out[body.name] = patch.layer(skin, thickness=thickness)
+        out[body.name] = patch.layer(skin, thickness=thickness, tissue=tissue)
     return out
 
 
@@ -216,6 +237,9 @@ def _draw_once(
         radius, aspect = float(rng.uniform(*RADII)), float(rng.uniform(*ASPECTS)) if contact.set == "ellipse" else 1.0
         drawn |= {"a": radius, "b": max(radius / aspect, 3e-3)}
         return site.press_flat(vertex, ellipse(drawn["a"], drawn["b"]), turn), drawn
+    if contact.set == "field":
+        drawn |= {"radius": float(rng.uniform(*REGIONS)), "wavelength": float(rng.uniform(*WAVES))}
+        return site.uneven(vertex, drawn["radius"], drawn["wavelength"], rng), drawn
     if contact.set == "letter":
         drawn |= {"letter": string.ascii_uppercase[contact.number % 26], "height": float(rng.uniform(*HEIGHTS))}
         return site.press_flat(vertex, letter(drawn["letter"], drawn["height"]), turn), drawn

@@ -41,12 +41,12 @@ class Scene:
     """A tool on the skin.
 
     Args:
-        mesh: of the tool, in its own frame.
+        mesh: of the tool, in its own frame; None where a pressure was drawn without one.
         pose_body_from_tool: (4, 4).
         footprint: how much of the tool's pressure each vertex gets, (V,), 0 to 1.
     """
 
-    mesh: ToolMesh
+    mesh: ToolMesh | None
     pose_body_from_tool: Transform
     footprint: PerVertex
 
@@ -96,13 +96,35 @@ class Site:
         distance = signed_distance(mesh, pose, self.layer.vertices[near])
         footprint = np.zeros(len(self.layer.vertices))
         footprint[near] = smoothstep(0.5 - (distance + inside) / ramp)
-        loaded = np.flatnonzero(footprint)
+        return self._usable(Scene(mesh, pose, footprint))
+
+    def uneven(self, vertex: int, radius: float, wavelength: float, rng: np.random.Generator) -> Scene:
+        """Pressure without a tool: random waves of about this length [m], where they are positive, within `radius` [m].
+
+        The highest pressure has weight 1. Real contacts press unevenly, and in shapes that no list of tools has.
+
+        Raises:
+            UnusableContact: as `scene`.
+        """
+        near = self.near(vertex, radius)
+        points = self.layer.vertices[near] - self.layer.vertices[vertex]
+        waves = rng.normal(size=(12, 3)) * (2 * np.pi / wavelength / 3**0.5)
+        field = np.cos(points @ waves.T + rng.uniform(0, 2 * np.pi, 12)).sum(axis=1) / 6**0.5 + rng.uniform(-0.5, 1.0)
+        field = np.maximum(field, 0.0) * smoothstep((radius - np.linalg.norm(points, axis=1)) / (2 * EDGE))
+        if field.max(initial=0.0) <= 0:
+            raise UnusableContact("nothing presses there")
+        footprint = np.zeros(len(self.layer.vertices))
+        footprint[near] = field / field.max()
+        return self._usable(Scene(None, self.standing(vertex, radius, 0.0), footprint))
+
+    def _usable(self, scene: Scene) -> Scene:
+        footprint, loaded = scene.footprint, np.flatnonzero(scene.footprint)
         if (footprint >= 0.5).sum() < FEWEST:
             raise UnusableContact(f"it covers {int((footprint >= 0.5).sum())} vertices, fewer than {FEWEST}")
         thick = float(self.layer.thickness.max())
         if (gap := float(self.border_distance[loaded].min())) < CLEAR * thick:
             raise UnusableContact(f"it comes within {gap / thick:.1f} thicknesses of the open border")
-        return Scene(mesh, pose, footprint)
+        return scene
 
     def press_flat(self, vertex: int, outline: Outline, turn: float) -> Scene:
         """A flat-faced punch of `outline` (in metres about its origin), sunk until all of its face meets the skin.
