@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import partial
 
 import torch
 from torch import Tensor, nn
@@ -10,9 +11,13 @@ from torch.nn import functional
 
 from stmpl_core.errors import InvalidInput
 
-KERNEL = {"kernel_size": 4, "stride": 2, "padding": 1}  # halves an image, or doubles it
 WIDEST = 8  # times the width of the first level
 DROPS_FROM = 5  # levels above this one, but for the deepest, drop half of their channels' values in training
+
+
+# What halves an image, and what doubles it.
+HALVE = partial(nn.Conv2d, kernel_size=4, stride=2, padding=1)
+DOUBLE = partial(nn.ConvTranspose2d, kernel_size=4, stride=2, padding=1)
 
 
 class Pix2PixUNet(nn.Module):
@@ -38,11 +43,9 @@ class Pix2PixUNet(nn.Module):
             raise InvalidInput(f"size is {size} and width {width}; allowed are powers of two from 32 on (512 in the "
                                "paper), and a width from 1 on (64 in the paper).")  # fmt: skip
         channels = [2] + [width * min(2**k, WIDEST) for k in range(levels)]
-        self.down = nn.ModuleList(nn.Conv2d(channels[k], channels[k + 1], bias=False, **KERNEL) for k in range(levels))
+        self.down = nn.ModuleList(HALVE(channels[k], channels[k + 1], bias=False) for k in range(levels))
         self.up = nn.ModuleList(
-            nn.ConvTranspose2d(
-                channels[k + 1] * (1 if k == levels - 1 else 2), channels[k] if k else 3, bias=k == 0, **KERNEL
-            )
+            DOUBLE(channels[k + 1] * (1 if k == levels - 1 else 2), channels[k] if k else 3, bias=k == 0)
             for k in range(levels)
         )
         self.drops = [dropout if DROPS_FROM <= k + 1 < levels else 0.0 for k in range(levels)]
