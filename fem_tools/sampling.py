@@ -64,7 +64,7 @@ VARYING_BODIES = tuple(
              paper_rule=False, out_of_distribution=False)
     for name, w, nu, share in (("varying_25", 0.25, 0.4, 1.0), ("varying_75", 0.75, 0.4, 1.0),
                                ("nu_30", 0.5, 0.3, 1.0), ("nu_35", 0.9, 0.35, 1.0),
-                               ("nu_45", 0.1, 0.45, 0.2), ("nu_49", 0.6, 0.49, 0.2))  # quadratic: ten times dearer
+                               ("nu_45", 0.1, 0.45, 0.1), ("nu_49", 0.6, 0.49, 0.1))  # quadratic: ten times dearer
 )  # fmt: skip
 OTHER_LIMBS = tuple(
     BodyPlan(name=name, weight=w, thickness=t, poisson_ratio=nu, part=part, reach=9.0, share=0.1,
@@ -122,7 +122,7 @@ class Plan(BaseModel):
 PRESETS = {
     "tiny": Plan(preset="tiny", bodies=PAPER_BODIES[2:3], edge_length=6e-3, discs=5, ellipses=2, seams=2,
                  fields=1, indenters=1, hands=1, bands=1, letters=1, loads=3, loads_out_of_distribution=2),
-    "default": Plan(preset="default", discs=190, ellipses=24, seams=56, fields=40, indenters=10),
+    "default": Plan(preset="default", discs=150, ellipses=24, seams=44, fields=40, indenters=5),
     "paper": Plan(preset="paper", bodies=PAPER_BODIES + VARYING_BODIES[:2], indenters=40),
 }  # fmt: skip
 

@@ -15,12 +15,14 @@ from stmpl_core.errors import StmplError
 from stmpl_ros.parameters import METHODS, DemoConfig, NodeConfig, ProbeConfig, RecordConfig
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from stmpl_core.methods.base import Method
 
 Json = Annotated[bool, tyro.conf.arg(name="json")]
 Flat = tyro.conf.arg(name="")  # a configuration whose fields are flags of the verb itself
 BagPath = Annotated[Path, tyro.conf.Positional]  # a run's folder, or its .mcap file
-MethodName = Literal["fem", "winkler", "naive"]
+MethodName = Literal["fem", "moment_net", "unet", "linear", "winkler", "naive"]
 
 DEMO, NODE, PROBE = DemoConfig(), NodeConfig(), ProbeConfig()
 
@@ -166,6 +168,78 @@ def generate(
     return 0
 
 
+def train(
+    preset: Literal["default", "paper", "paper-reduced", "paper-3-bodies", "paper-reduced-3-bodies"] = "default",
+    data: Path = Path("data/default"),
+    out: Path | None = None,
+    steps: int | None = None,
+    seed: int = 0,
+    as_json: Json = False,
+) -> int:
+    """Trains a network on a data set, or goes on where a run into the same folder was stopped.
+
+    Example: stmpl train --preset default --data data/default
+    Several GPUs: torchrun --nproc-per-node 4 -m stmpl_ros.cli train --preset paper --data data/paper
+
+    Args:
+        preset: default is ours (under an hour on two cores), paper the paper's UNet (a GPU), paper-reduced the same
+            code at a size for one core; 3-bodies: its second set-up.
+        data: folder of the data set; make it with stmpl generate.
+        out: folder of the weights; runs/train/<preset> unless given.
+        steps: of the optimiser; epochs for the paper's presets.
+        seed: of weights and order.
+        as_json: print the card for machines.
+    """
+    from fem_tools.train import train as learn
+    from stmpl_ros.tables import steps_bar
+
+    folder = out or Path("runs/train") / preset
+    with steps_bar(f"train {preset}", quiet=as_json) as show:
+        card = learn(preset, data, folder, steps=steps, seed=seed, on_progress=show)
+    _print_figures(card if as_json else f"weights and their card are in {folder}")
+    return 0
+
+
+def tables(
+    data: Path = Path("data/default"),
+    limit: int | None = 400,
+    unet: Path | None = None,
+    unet_3_bodies: Path | None = None,
+    moment_net: Path | None = None,
+    out: Path | None = None,
+    as_json: Json = False,
+) -> int:
+    """The paper's tables 1 to 3 on a data set: its printed figures, every method, and columns that its metric lacks.
+
+    Example: stmpl tables --data data/default --limit 200
+
+    Args:
+        data: folder of the data set; make it with stmpl generate.
+        limit: samples a table.
+        unet: weights of the paper's network; those that come with the package unless given.
+        unet_3_bodies: weights of its second set-up, for Table 3.
+        moment_net: weights of ours; those that come with the package unless given.
+        out: a file for the tables in Markdown; their figures go beside it as JSON.
+        as_json: print the figures for machines.
+    """
+    from fem_tools.evaluate import THREE_BODY_ROW, evaluate
+    from stmpl_core.methods import Linear, MomentNet, UNet
+    from stmpl_ros.tables import steps_bar
+
+    methods: dict[str, Callable[[], Method]] = {"linear": Linear, "unet": lambda: UNet(unet)}
+    if unet_3_bodies is not None:
+        methods[THREE_BODY_ROW] = lambda: UNet(unet_3_bodies)
+    methods["moment_net"] = lambda: MomentNet(moment_net)
+    with steps_bar("tables", quiet=as_json) as show:
+        made = evaluate(data, methods, limit=limit, on_progress=lambda done, total: show(done, total, "samples"))
+    if out is not None:
+        out.parent.mkdir(parents=True, exist_ok=True)
+        out.write_text(made.markdown() + "\n")
+        out.with_suffix(".json").write_text(made.as_json() + "\n")
+    sys.stdout.write((made.as_json() if as_json else made.text()) + "\n")
+    return 0
+
+
 def stability(critical_load: bool = False, out: Path = Path("runs/critical_load.png"), as_json: Json = False) -> int:
     """Where the finite elements lose stability: follower, dead and indenter loads, beside the closed form.
 
@@ -192,7 +266,8 @@ def stability(critical_load: bool = False, out: Path = Path("runs/critical_load.
     return 0
 
 
-VERBS = {f.__name__: f for f in (demo, node, probe, record, replay, compare, info, recover, generate, stability)}
+VERBS = {f.__name__: f for f in (demo, node, probe, record, replay, compare, info, recover, generate, train, tables,
+                                 stability)}  # fmt: skip
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -219,11 +294,12 @@ def main(arguments: list[str] | None = None) -> None:
 
 
 def _method(name: MethodName) -> Method:
-    if name == "fem":
-        from fem_tools import PatchFem
+    from fem_tools import PatchFem
+    from stmpl_core.methods import MomentNet
 
+    if name == "fem":
         return PatchFem()
-    return METHODS[name]()
+    return MomentNet(fallback=PatchFem()) if name == "moment_net" else METHODS[name]()
 
 
 def _waiting(what: str, quiet: bool):

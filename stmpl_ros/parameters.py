@@ -9,9 +9,11 @@ from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from stmpl_core.methods import Method, Naive, Winkler
+from stmpl_core.methods import Linear, Method, MomentNet, Naive, UNet, Winkler
 
-METHODS: dict[str, Callable[[], Method]] = {"winkler": Winkler, "naive": Naive}
+METHODS: dict[str, Callable[[], Method]] = {
+    "moment_net": MomentNet, "unet": UNet, "linear": Linear, "winkler": Winkler, "naive": Naive
+}  # fmt: skip
 
 
 class NodeConfig(BaseModel):
@@ -25,7 +27,9 @@ class NodeConfig(BaseModel):
     youngs_modulus: float = Field(default=1e3, gt=0, description="E of the tissue [Pa]")
     poisson_ratio: float = Field(default=0.4, ge=0, lt=0.5, description="nu of the tissue [-]")
     density: float = Field(default=1e3, gt=0, description="of the tissue [kg/m3]")
-    method: Literal["winkler", "naive"] = Field(default="winkler", description="that solves for the displacement")
+    method: Literal["moment_net", "unet", "linear", "winkler", "naive"] = Field(
+        default="moment_net", description="that solves for the displacement"
+    )
     frame: str = Field(default="body", min_length=1, description="frame_id of the body, in poses and answers")
     rest_after: float = Field(default=0.25, gt=0, description="a tool silent for longer is no longer in contact [s]")
     max_age: float = Field(default=1.0, ge=0, description="older messages are dropped; 0 accepts any age [s]")

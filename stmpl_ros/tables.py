@@ -81,6 +81,20 @@ def contacts_bar(preset: str, *, quiet: bool = False) -> Iterator[Callable[[int,
         yield show
 
 
+@contextmanager
+def steps_bar(what: str, *, quiet: bool = False) -> Iterator[Callable[[int, int, str], None]]:
+    """A progress bar on stderr: steps done, in all, what to say of it, time left."""
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TextColumn("{task.fields[said]}"),
+               TimeRemainingColumn())  # fmt: skip
+    with Progress(*columns, console=Console(stderr=True), disable=quiet) as progress:
+        task = progress.add_task(what, total=None, said="")
+
+        def show(done: int, total: int, said: str) -> None:
+            progress.update(task, completed=done, total=total, said=said)
+
+        yield show
+
+
 def data_table(manifest: dict[str, Any], folder: Path) -> Table:
     """What a data set holds, for people."""
     table = Table(title=str(folder), title_justify="left", caption_justify="left")

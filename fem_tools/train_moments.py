@@ -1,0 +1,342 @@
+"""train_moments: MomentNet on a data set: points drawn from samples, a small network, a bound from held-out ones."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from pydantic import BaseModel, ConfigDict, Field
+from torch import Tensor, nn
+
+from fem_tools.dataset import Dataset
+from fem_tools.provenance import commit, data_card, machine, versions
+from fem_tools.sampling import Kind
+from stmpl_core.layer import SoftLayer
+from stmpl_core.load import Load
+from stmpl_core.methods.moment_net import (
+    AMPLITUDE,
+    DIRECTIONS,
+    INPUTS,
+    MIXED_TENSORS,
+    MIXED_VECTORS,
+    OUTPUTS,
+    MomentNet,
+    Weights,
+    source_fields,
+)
+from stmpl_core.moments import SCALARS, TENSORS, VECTORS, WIDTH, Surroundings
+
+VERSIONS = ("stmpl", "torch", "numpy", "numba", "safetensors")
+ROW = 2 * WIDTH + 9  # of a point: what it feels of both fields, curvature, slope, both fields here, nu, dead or not
+TYPICAL = 1e-3  # of the peak: errors below count as squares in the loss
+COVERED = 0.95  # share of held-out answers whose largest error the stated bound must reach
+
+OnProgress = Callable[[int, int, str], None]  # done, in all, what to say of it
+
+
+class MomentTraining(BaseModel):
+    """What decides what is learnt.
+
+    Args:
+        hidden: width of each of the three hidden layers.
+        kinds: of load; rigid tools that stick also pull along the skin, which a pressure does not tell.
+        points: vertices drawn of each sample, most from where it moves.
+        steps, batch, learning_rate: of Adam, the rate rising to this and falling in one cycle.
+        seed: of weights, points and order.
+        checkpoint_minutes: between two checkpoints.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    hidden: int = Field(default=64, ge=4)
+    kinds: tuple[Kind, ...] = ("pressure", "nodal")
+    points: int = Field(default=128, ge=8)
+    steps: int = Field(default=60_000, ge=10)
+    batch: int = Field(default=2048, ge=8)
+    learning_rate: float = Field(default=4e-3, gt=0)
+    seed: int = 0
+    checkpoint_minutes: float = Field(default=5.0, ge=0)
+
+
+@dataclass(frozen=True, eq=False)
+class Points:
+    """Vertices of samples: what each feels, and how it moves.
+
+    Args:
+        rows: (N, ROW) float32.
+        motion: displacement over the local thickness in the vertex's frame, (N, 3) float32.
+        weight: local thickness over the sample's largest displacement, (N,) float32.
+    """
+
+    rows: np.ndarray
+    motion: np.ndarray
+    weight: np.ndarray
+
+
+def draw_points(data: Dataset, settings: MomentTraining, on_progress: OnProgress) -> Points:
+    """Points of the training split, as many of each sample as the settings say."""
+    rng = np.random.default_rng(settings.seed)
+    subsets = [data.split("train", kind=kind) for kind in settings.kinds]
+    total, done = sum(map(len, subsets)), 0
+    rows = np.empty((total * settings.points, ROW), np.float32)
+    motion, weight = np.empty((len(rows), 3), np.float32), np.empty(len(rows), np.float32)
+    end, near, layer = 0, None, None
+    for subset in subsets:
+        for sample in subset:
+            if near is None or sample.layer is not layer:
+                layer, near = sample.layer, Surroundings(sample.layer)
+            row, moved, scale = _points(near, layer, sample.load, sample.displacement, settings.points, rng)
+            here = slice(end, end := end + len(row))
+            rows[here], motion[here], weight[here] = row, moved, scale
+            done += 1
+            if done % 50 == 0 or done == total:
+                on_progress(done, total, "drawing points")
+    return Points(rows[:end], motion[:end], weight[:end])
+
+
+def _points(near: Surroundings, layer: SoftLayer, load: Load, displacement: np.ndarray, count: int,
+            rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:  # fmt: skip
+    sources = source_fields(load.pressure_on(layer), layer)
+    felt = near.felt(sources)
+    v, length = felt.vertices, np.linalg.norm(displacement, axis=1)
+    peak = float(length.max())
+    likely = np.where(length[v] > 1e-6, 1.0, 0.02) + 3 * (length[v] > 0.1 * peak) + 2 * (sources[v, 0] > 0)
+    chosen = rng.choice(len(v), min(count, len(v)), replace=False, p=likely / likely.sum())
+    v = v[chosen]
+    constants = np.broadcast_to([layer.tissue.poisson_ratio, load.kind == "nodal"], (len(v), 2))
+    rows = [felt.figures[chosen].reshape(len(v), -1), near.curvature[v], near.slope[v], sources[v], constants]
+    local = np.einsum("nij,nj->ni", near.frames[v], displacement[v]) / layer.thickness[v, None]
+    return np.concatenate(rows, axis=1), local, layer.thickness[v] / peak
+
+
+class Model(nn.Module):
+    """The network of stmpl_core.methods.moment_net, in torch: the same inputs, in the same order, with gradients."""
+
+    def __init__(self, hidden: int) -> None:
+        super().__init__()
+        self.mix_vectors = nn.Parameter(torch.randn(MIXED_VECTORS, DIRECTIONS) / DIRECTIONS**0.5)
+        self.mix_tensors = nn.Parameter(torch.randn(MIXED_TENSORS, 2 * TENSORS) / (2 * TENSORS) ** 0.5)
+        self.layers = nn.ModuleList(
+            nn.Linear(a, b) for a, b in ((INPUTS, hidden), (hidden, hidden), (hidden, hidden), (hidden, OUTPUTS))
+        )
+        nn.init.zeros_(self.layers[-1].weight)  # type: ignore[arg-type]
+        nn.init.zeros_(self.layers[-1].bias)  # type: ignore[arg-type]
+        for name, value in (("low", -1.0), ("high", 1.0), ("mean", 0.0), ("scale", 1.0)):
+            self.register_buffer(name, torch.full((INPUTS,), value))
+
+    def normalise(self, rows: Tensor) -> None:
+        """Takes the inputs' ranges and spreads from points (N, ROW)."""
+        with torch.no_grad():
+            inputs, *_ = self._inputs(rows)
+            low, high = inputs.amin(dim=0), inputs.amax(dim=0)
+            self.low, self.high = low - 0.02 * (high - low), high + 0.02 * (high - low)
+            self.mean, self.scale = inputs.mean(dim=0), 1 / (inputs.std(dim=0) + 1e-6)
+
+    def _inputs(self, rows: Tensor) -> tuple[Tensor, ...]:
+        fields = rows[:, : 2 * WIDTH].view(-1, 2, WIDTH)
+        xx, xy, yy, *_ = curvature = rows[:, 2 * WIDTH : 2 * WIDTH + 3].T
+        slope = rows[:, 2 * WIDTH + 3 : 2 * WIDTH + 5]
+        here, constants = rows[:, -4:-2], rows[:, -2:]
+        del curvature
+        a, b = 3 + SCALARS, 3 + SCALARS + 2 * VECTORS
+        scalars = fields[:, :, 3:a]
+        g = scalars[:, 1].abs().sum(dim=1, keepdim=True).clamp_min(1e-9)
+        vectors = fields[:, :, a:b].unflatten(2, (2, VECTORS)).transpose(2, 3).flatten(1, 2)
+        vectors = torch.cat([vectors, fields[:, :, :2]], dim=1) / g[:, :, None]
+        tensors = fields[:, :, b : b + 2 * TENSORS].unflatten(2, (2, TENSORS)).transpose(2, 3).flatten(1, 2)
+        tensors = tensors / g[:, :, None]
+        v = torch.einsum("nci,dc->ndi", vectors, self.mix_vectors)
+        t = torch.einsum("nci,dc->ndi", tensors, self.mix_tensors)
+        iv, it = torch.triu_indices(MIXED_VECTORS, MIXED_VECTORS), torch.triu_indices(MIXED_TENSORS, MIXED_TENSORS)
+        products = torch.einsum("nai,nbi->nab", v, v)[:, iv[0], iv[1]]
+        tensor_products = torch.einsum("nai,nbi->nab", t, t)[:, it[0], it[1]]
+        bent = torch.stack([(xx - yy) / 2, xy], dim=1)
+        turned, curved = _act(t, v[:, :MIXED_TENSORS]), _act(bent[:, None], v)
+        inputs = [
+            scalars.flatten(1) / g, fields[:, :, 2] / g, here / g, torch.log(here.abs() + 0.02),
+            torch.log(g + 1e-4), g, torch.sqrt(g), scalars[:, 0] - scalars[:, 1], products, tensor_products,
+            (turned * v[:, :MIXED_TENSORS]).sum(-1), torch.einsum("ni,nci->nc", bent, t),
+            (curved * v).sum(-1), torch.einsum("ni,nci->nc", slope, v),
+            ((xx + yy) / 2)[:, None], (bent**2).sum(1, keepdim=True), constants,
+            1 / (1.02 - 2 * constants[:, :1]), (slope**2).sum(1, keepdim=True),
+        ]  # fmt: skip
+        return torch.cat(inputs, dim=1), g, vectors, turned, curved, slope, fields[:, 1, :3]
+
+    def forward(self, rows: Tensor) -> tuple[Tensor, Tensor]:
+        """Motion over thickness in the vertex's frame (N, 3), and log of the error to expect of it over g (N,)."""
+        inputs, g, vectors, turned, curved, slope, prior = self._inputs(rows)
+        h = (torch.minimum(torch.maximum(inputs, self.low), self.high) - self.mean) * self.scale
+        for layer in self.layers[:-1]:  # type: ignore[index]
+            h = layer(h)
+            h = h * (0.5 + 0.5 * h / (1 + h.abs()))
+        last: Any = self.layers[-1]
+        out = last(h)
+        coefficients = out[:, 1:-2, None]
+        directions = torch.cat([vectors, turned, curved], dim=1)
+        along = (coefficients * directions).sum(dim=1) + out[:, -2:-1] * slope
+        a = AMPLITUDE * g / (1 + g)
+        log_error = last.weight[-1] @ h.detach().T + last.bias[-1] + torch.log(a[:, 0].detach())
+        return prior + a * torch.cat([along, out[:, :1]], dim=1), log_error
+
+    def weights(self, card: dict[str, Any]) -> Weights:
+        """What the method loads."""
+        arrays = {name: getattr(self, name).detach().numpy().copy()
+                  for name in ("mix_vectors", "mix_tensors", "low", "high", "mean", "scale")}  # fmt: skip
+        for k, layer in enumerate(self.layers, start=1):
+            arrays[f"w{k}"] = np.ascontiguousarray(layer.weight.detach().numpy().T)  # type: ignore[union-attr]
+            arrays[f"b{k}"] = layer.bias.detach().numpy().copy()  # type: ignore[union-attr]
+        return Weights(arrays, card)
+
+
+def _act(tensors: Tensor, vectors: Tensor) -> Tensor:
+    """Traceless tensors (..., 2) as (cos 2a, sin 2a) times vectors (..., 2)."""
+    x, y = vectors[..., 0], vectors[..., 1]
+    return torch.stack([tensors[..., 0] * x + tensors[..., 1] * y, tensors[..., 1] * x - tensors[..., 0] * y], dim=-1)
+
+
+def fit(points: Points, settings: MomentTraining, out: Path, on_progress: OnProgress) -> Model:
+    """Trains on points; a checkpoint in `out` lets a run that was stopped go on, to the same weights."""
+    torch.manual_seed(settings.seed)
+    model = Model(settings.hidden)
+    rows, motion, weight = (torch.from_numpy(a) for a in (points.rows, points.motion, points.weight))
+    some = torch.randperm(len(rows))[:200_000]
+    model.normalise(rows[some])
+    optimiser = torch.optim.AdamW(model.parameters(), lr=settings.learning_rate, weight_decay=1e-5)
+    schedule = torch.optim.lr_scheduler.OneCycleLR(
+        optimiser, settings.learning_rate, total_steps=settings.steps, pct_start=0.1
+    )
+    checkpoint, first, mean = out / "moment_net.checkpoint", 0, 0.0
+    if checkpoint.is_file():
+        kept = torch.load(checkpoint, weights_only=True)
+        if kept["settings"] == settings.model_dump_json() and kept["points"] == len(rows):
+            model.load_state_dict(kept["model"])
+            optimiser.load_state_dict(kept["optimiser"])
+            schedule.load_state_dict(kept["schedule"])
+            first, mean = kept["step"], kept["mean"]
+    saved = time.monotonic()
+    for step in range(first, settings.steps):
+        draw = torch.Generator().manual_seed((settings.seed << 32) + step)
+        k = torch.randint(len(rows), (settings.batch,), generator=draw)
+        moved, log_error = model(rows[k])
+        error = (moved - motion[k]).norm(dim=1)
+        loss = torch.sqrt((error * weight[k]) ** 2 + TYPICAL**2).mean()
+        missed = torch.log(error.detach() + 1e-6) - log_error
+        optimiser.zero_grad()
+        (loss + 0.01 * torch.maximum(0.9 * missed, -0.1 * missed).mean()).backward()
+        nn.utils.clip_grad_norm_(model.parameters(), 0.1)
+        optimiser.step()
+        schedule.step()
+        mean = loss.item() if step == 0 else 0.99 * mean + 0.01 * loss.item()
+        if (step + 1) % 100 == 0 or step + 1 == settings.steps:
+            on_progress(step + 1, settings.steps, f"error {mean:.2%} of the peak")
+        if time.monotonic() - saved > 60 * settings.checkpoint_minutes:
+            state = {"settings": settings.model_dump_json(), "points": len(rows), "step": step + 1, "mean": mean,
+                     "model": model.state_dict(), "optimiser": optimiser.state_dict(),
+                     "schedule": schedule.state_dict()}  # fmt: skip
+            torch.save(state, checkpoint.with_suffix(".tmp"))
+            checkpoint.with_suffix(".tmp").replace(checkpoint)
+            saved = time.monotonic()
+    return model
+
+
+def train_moments(
+    data: str | Path, out: str | Path, settings: MomentTraining | None = None, *, on_progress: OnProgress | None = None
+) -> dict[str, Any]:
+    """Trains a MomentNet on a data set, and writes out/moment_net.safetensors with its card moment_net.json.
+
+    Args:
+        data: folder of a finished data set (stmpl generate).
+        out: folder; what it holds of the same run is used again.
+        settings: what is learnt and how; None: the defaults.
+        on_progress: called often.
+
+    Returns:
+        The card.
+
+    Raises:
+        InvalidInput: no finished data set.
+    """
+    settings, said = settings or MomentTraining(), on_progress or (lambda *_: None)
+    source, out = Dataset.open(data), Path(out)
+    out.mkdir(parents=True, exist_ok=True)
+    started = time.monotonic()
+    points = draw_points(source, settings, said)
+    model = fit(points, settings, out, said)
+    card: dict[str, Any] = {
+        "format": 1,
+        "data": data_card(data, source.manifest),
+        "settings": settings.model_dump(mode="json"),
+        "parameters": sum(p.numel() for p in model.parameters()),
+        "points": len(points.rows),
+        "ranges": _ranges(source, settings),
+        "bound": {"factor": 1.0, "share": 0.0},
+        "commit": commit(),
+        "versions": versions(VERSIONS),
+        "machine": f"{machine()}; {torch.get_num_threads()} threads",
+        "minutes": round((time.monotonic() - started) / 60, 1),
+    }
+    weights = model.weights(card)
+    card["bound"] = calibrate(source, weights, settings.kinds, said)
+    weights.save(out / "moment_net.safetensors")
+    (out / "moment_net.checkpoint").unlink(missing_ok=True)
+    return card
+
+
+def _ranges(data: Dataset, settings: MomentTraining) -> dict[str, list[float]]:
+    """What was trained on, smallest and largest."""
+    trained = {name: layer for name, layer in data.layers.items() if len(data.split("train", bodies=[name]))}
+    t = np.concatenate([layer.thickness for layer in trained.values()])
+    nu = [layer.tissue.poisson_ratio for layer in trained.values()]
+    edges = [layer.edge_length / layer.thickness for layer in trained.values()]
+    out = {
+        "poisson_ratio": [min(nu), max(nu)],
+        "thickness_mm": [1e3 * float(t.min()), 1e3 * float(t.max())],
+        "edge_over_thickness": [float(min(e.min() for e in edges)), float(max(e.max() for e in edges))],
+    }
+    for kind in ("pressure", "nodal"):
+        subset = data.split("train", kind=kind)
+        highest = 0.0
+        for k in range(0, len(subset), max(1, len(subset) // 400)):
+            sample = subset[k]
+            highest = max(highest, sample.load.peak_ratio(sample.layer))
+        out[f"p_over_e_{kind}"] = [0.0, round(highest, 4) if kind in settings.kinds else 0.0]
+    return out
+
+
+def calibrate(data: Dataset, weights: Weights, kinds: Sequence[Kind], on_progress: OnProgress,
+              limit: int = 800) -> dict[str, float]:  # fmt: skip
+    """The factor on the network's own expectation that covers the largest error of COVERED of the validation answers.
+
+    Answers that the method itself flags are left out. Returns factor, share, how many answers, and the median of bound
+    over error.
+    """
+    subsets = [data.split("val", kind=kind) for kind in kinds]
+    method, layer, ratios = MomentNet(weights), None, []
+    total = sum(map(len, subsets))
+    for subset in subsets:
+        for k in range(0, len(subset), max(1, total // limit)):
+            sample = subset[k]
+            if sample.layer is not layer:
+                layer = sample.layer
+                method.prepare(layer)
+            answer = method.solve(sample.load)
+            if answer.trust.in_range:
+                worst = float(np.linalg.norm(answer.displacement - sample.displacement, axis=1).max())
+                ratios.append(worst / max(answer.trust.figures["expected_error_m"], 1e-9))
+        on_progress(len(ratios), max(1, min(total, limit)), "calibrating the bound")
+    if not ratios:
+        return {"factor": float("inf"), "share": 0.0, "answers": 0, "median_bound_over_error": float("nan")}
+    factor = float(np.quantile(ratios, COVERED))
+    return {"factor": factor, "share": 0.0, "answers": len(ratios),
+            "median_bound_over_error": float(np.median(factor / np.array(ratios)))}  # fmt: skip
+
+
+def use_threads() -> None:
+    """Lets torch use the processors that this process may run on."""
+    torch.set_num_threads(len(os.sched_getaffinity(0)))

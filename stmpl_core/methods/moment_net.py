@@ -1,0 +1,351 @@
+"""MomentNet: the learned simulator: what presses around a vertex, through a small network, to how that vertex moves."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any, Self
+
+import numba
+import numpy as np
+
+from stmpl_core.errors import InvalidInput
+from stmpl_core.layer import SoftLayer
+from stmpl_core.load import Load
+from stmpl_core.methods.base import Method, prepared
+from stmpl_core.methods.winkler import column_stretch
+from stmpl_core.moments import FAST, SCALARS, TENSORS, VECTORS, Surroundings
+from stmpl_core.trust import Displacement, Trust
+
+SHIPPED = Path(__file__).parent.parent / "weights" / "moment_net.safetensors"
+
+MIXED_VECTORS, MIXED_TENSORS = 6, 4  # combinations of a vertex's vectors and tensors whose products are inputs
+DIRECTIONS = 2 * VECTORS + 2  # vectors that an answer is made of: moments of both fields, and both linear responses
+_VV, _TT = MIXED_VECTORS * (MIXED_VECTORS + 1) // 2, MIXED_TENSORS * (MIXED_TENSORS + 1) // 2
+INPUTS = 2 * SCALARS + 9 + SCALARS + _VV + _TT + 2 * MIXED_TENSORS + 2 * MIXED_VECTORS + 6
+OUTPUTS = 1 + DIRECTIONS + MIXED_TENSORS + MIXED_VECTORS + 2  # normal, tangential coefficients, slope, error
+AMPLITUDE = 0.3  # of a thickness: what the network may add to the linear response where much presses
+SURROUNDED = 1e-7  # of moments, below which nothing is added
+OUTSIDE_SHARE = 0.02  # of the vertices that move, which may have inputs outside the training data
+
+ARRAYS = ("mix_vectors", "mix_tensors", "low", "high", "mean", "scale", "w1", "b1", "w2", "b2", "w3", "b3", "w4", "b4")
+
+
+@dataclass(frozen=True, eq=False)
+class Weights:
+    """A trained network.
+
+    Args:
+        arrays: float32, by the names in ARRAYS; w of shape (inputs, outputs).
+        card: what made it and what it is good for (see fem_tools.train_moments).
+    """
+
+    arrays: Mapping[str, np.ndarray]
+    card: Mapping[str, Any]
+
+    @classmethod
+    def load(cls, path: str | Path) -> Self:
+        """Reads a .safetensors file and the .json card beside it; no code in them is run.
+
+        Raises:
+            InvalidInput: a file is missing, or holds another network.
+        """
+        from safetensors.numpy import load_file
+
+        path = Path(path)
+        card = path.with_suffix(".json")
+        for one in (path, card):
+            if not one.is_file():
+                raise InvalidInput(f"there is no {one}. Train a network with stmpl train, or give no path.")
+        arrays = load_file(path)
+        shapes = {name: a.shape for name, a in arrays.items()}
+        if set(shapes) != set(ARRAYS) or shapes["w1"][0] != INPUTS or shapes["w4"][1] != OUTPUTS:
+            raise InvalidInput(f"{path} holds no MomentNet of this version.")
+        return cls({name: np.ascontiguousarray(a, dtype=np.float32) for name, a in arrays.items()},
+                   json.loads(card.read_text()))  # fmt: skip
+
+    def save(self, path: str | Path) -> None:
+        """Writes both files."""
+        from safetensors.numpy import save_file
+
+        path = Path(path)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        save_file({name: np.ascontiguousarray(self.arrays[name]) for name in ARRAYS}, path)
+        path.with_suffix(".json").write_text(json.dumps(self.card, indent=1) + "\n")
+
+
+@cache
+def shipped() -> Weights:
+    """The network that comes with the package."""
+    return Weights.load(SHIPPED)
+
+
+class MomentNet:
+    """Linear response, corrected at every vertex by a network that sees the moments of the load around it.
+
+    By dimensional analysis u / t = f(p / E around the vertex in units of t, nu, t times the curvature): so one network
+    serves every stiffness exactly, and any thickness, pose and limb. The inputs are invariants of moments up to second
+    order (as atomic descriptors are: Bartok et al., Phys. Rev. B 87, 184115, 2013), the outputs multiply the normal
+    and the moments' own directions: turning the scene turns the answer. There is no chart, and so no seam. Where
+    nothing presses within stmpl_core.moments.NEAR thicknesses nothing is added to the linear response, which ends at
+    REACH: no load gives exactly no motion.
+
+    Args:
+        weights: a .safetensors file made by `stmpl train`; None: those that come with the package.
+        fallback: a method that answers loads outside the range that the network was trained on; None: the network's
+            answer is given, and flagged.
+
+    Raises:
+        InvalidInput: no such weights.
+    """
+
+    name = "moment_net"
+
+    def __init__(self, weights: str | Path | Weights | None = None, *, fallback: Method | None = None) -> None:
+        self.weights = weights if isinstance(weights, Weights) else Weights.load(weights) if weights else shipped()
+        self.fallback = fallback
+        self._layer: SoftLayer | None = None
+        self._near: Surroundings | None = None
+
+    def prepare(self, layer: SoftLayer) -> Self:
+        """Finds each vertex's neighbours (about half a second for a limb)."""
+        self._near = near = Surroundings(layer)
+        self._shape = np.concatenate([near.curvature, near.slope], axis=1).astype(np.float32)
+        self._frames = near.frames.astype(np.float32) * layer.thickness[:, None, None].astype(np.float32)
+        self._layer = layer
+        if self.fallback is not None:
+            self.fallback.prepare(layer)
+        return self
+
+    def solve(self, load: Load) -> Displacement:
+        """The displacement under `load`.
+
+        Raises:
+            NotPrepared: before `prepare`.
+            InvalidInput: the load does not fit the layer.
+        """
+        layer = prepared(self._layer, self)
+        assert self._near is not None
+        pressure = load.check(layer).pressure_on(layer)
+        sources = source_fields(pressure, layer)
+        felt = self._near.felt(sources)
+        vertices, figures = felt.vertices, felt.figures
+        here, shape = sources[vertices], self._shape[vertices]
+        a, constants = self.weights.arrays, np.array([layer.tissue.poisson_ratio, load.kind == "nodal"], np.float32)
+
+        # What is around each vertex becomes numbers that do not turn with the scene.
+        inputs = np.empty((len(vertices), INPUTS), dtype=np.float32)
+        outside = np.zeros(len(vertices), dtype=np.bool_)
+        _inputs(figures, shape, here, constants, a["mix_vectors"], a["mix_tensors"], a["low"], a["high"], a["mean"],
+                a["scale"], inputs, outside)  # fmt: skip
+
+        # Three hidden layers.
+        hidden = inputs
+        for k in "123":
+            hidden = hidden @ a["w" + k]
+            _activate(hidden, a["b" + k])
+        outputs = hidden @ a["w4"] + a["b4"]
+
+        # Each vertex moves along its normal and along the directions of what is around it.
+        moved, error = np.empty((len(vertices), 3)), np.empty(len(vertices), dtype=np.float32)
+        _move(figures, shape, outputs, a["mix_vectors"], a["mix_tensors"], self._frames[vertices], moved, error)
+        displacement = np.zeros_like(layer.vertices)
+        displacement[vertices] = moved
+        peak_error = float((error * layer.thickness[vertices]).max(initial=0.0))
+        trust = self._trust(load, pressure, vertices, moved, outside, peak_error)
+        if not trust.in_range and self.fallback is not None:
+            answer = self.fallback.solve(load)
+            because = answer.trust.also(f"answered by {answer.method}: {trust.why}")
+            return Displacement(answer.displacement, because, answer.method, answer.pressure)
+        return Displacement(displacement, trust, self.name, pressure)
+
+    def _trust(self, load: Load, pressure: np.ndarray, vertices: np.ndarray, moved: np.ndarray, outside: np.ndarray,
+               error: float) -> Trust:  # fmt: skip
+        layer, card = prepared(self._layer, self), self.weights.card
+        loaded = np.flatnonzero(pressure)
+        if not len(loaded):
+            return Trust(error_bound=0.0)
+        length = np.linalg.norm(moved, axis=1)
+        moving = length > 0.02 * length.max()
+        share = float(outside[moving].mean()) if moving.any() else 0.0
+        ratio = float(pressure[loaded].max()) / layer.tissue.youngs_modulus
+        t, nu = layer.thickness[vertices[moving]], layer.tissue.poisson_ratio
+        trust = Trust(figures={"peak_ratio": ratio, "outside_share": share, "expected_error_m": error})
+        ranges = card["ranges"]
+        for what, low, high, unit in (
+            (f"p_over_e_{load.kind}", min(ratio, 0.0), ratio, ""),
+            ("poisson_ratio", nu, nu, ""),
+            ("thickness_mm", 1e3 * float(t.min()), 1e3 * float(t.max()), " mm"),
+            ("edge_over_thickness", layer.edge_length / float(t.max()), layer.edge_length / float(t.min()), ""),
+        ):
+            least, most = ranges[what]
+            if low < least - 1e-3 * abs(least) or high > most + 1e-3 * abs(most):
+                worst = high if high > most else low
+                trust = trust.also(f"{what} is {worst:.3g}{unit}, trained is {least:.3g} to {most:.3g}", in_range=False)
+        if pressure.min() < 0:
+            trust = trust.also("the load pulls, the network was trained under pressure only", in_range=False)
+        if share > OUTSIDE_SHARE:
+            why = f"{share:.0%} of the vertices that move see what no training load had"
+            trust = trust.also(why, in_range=False)
+        bound = float(card["bound"]["factor"]) * error + float(card["bound"]["share"]) * float(length.max())
+        return Trust(trust.converged, trust.in_range, bound if trust.in_range else None, trust.why, trust.figures)
+
+
+def source_fields(pressure: np.ndarray, layer: SoftLayer) -> np.ndarray:
+    """The two fields that a vertex feels: p / E, and the strain of a confined column times M / E, (V, 2) [-]."""
+    tissue = layer.tissue
+    sources = np.zeros((len(pressure), 2), dtype=np.float32)
+    loaded = np.flatnonzero(pressure)
+    sources[loaded, 0] = pressure[loaded] / tissue.youngs_modulus
+    strain = 1 - column_stretch(pressure[loaded], tissue)
+    sources[loaded, 1] = strain * (tissue.confined_modulus / tissue.youngs_modulus)
+    return sources
+
+
+@numba.njit(inline="always", fastmath=FAST)
+def _amplitude(figures):
+    """How much presses around a vertex: the sum of its scalar moments of the second field."""
+    g = np.float32(0)
+    for m in range(SCALARS):
+        g += abs(figures[1, 3 + m])
+    return g
+
+
+@numba.njit(inline="always", fastmath=FAST)
+def _directions(figures, g, vectors, tensors):
+    """The vectors (DIRECTIONS, 2) and tensors (2 TENSORS, 2) around a vertex, over the amplitude."""
+    one = np.float32(1) / g
+    for s in range(2):
+        for m in range(VECTORS):
+            vectors[s * VECTORS + m, 0] = figures[s, 3 + SCALARS + m] * one
+            vectors[s * VECTORS + m, 1] = figures[s, 3 + SCALARS + VECTORS + m] * one
+        vectors[2 * VECTORS + s, 0] = figures[s, 0] * one
+        vectors[2 * VECTORS + s, 1] = figures[s, 1] * one
+        for m in range(TENSORS):
+            tensors[s * TENSORS + m, 0] = figures[s, 3 + SCALARS + 2 * VECTORS + m] * one
+            tensors[s * TENSORS + m, 1] = figures[s, 3 + SCALARS + 2 * VECTORS + TENSORS + m] * one
+
+
+@numba.njit(inline="always", fastmath=FAST)
+def _mix(weights, vectors, out):
+    """out = weights (rows, n) times vectors (n, 2)."""
+    for a in range(weights.shape[0]):
+        x = y = np.float32(0)
+        for m in range(weights.shape[1]):
+            x += weights[a, m] * vectors[m, 0]
+            y += weights[a, m] * vectors[m, 1]
+        out[a, 0], out[a, 1] = x, y
+
+
+@numba.njit(cache=True, parallel=True, fastmath=FAST)
+def _inputs(figures, shape, here, constants, mix_vectors, mix_tensors, low, high, mean, scale, out, outside):
+    """The network's inputs, (N, INPUTS): kept inside the training data's, then centred and scaled."""
+    half, one = np.float32(0.5), np.float32(1)
+    for n in numba.prange(len(figures)):
+        g = _amplitude(figures[n])
+        if g < SURROUNDED:
+            out[n] = 0
+            continue
+        vectors, tensors = np.empty((DIRECTIONS, 2), np.float32), np.empty((2 * TENSORS, 2), np.float32)
+        v, t = np.empty((MIXED_VECTORS, 2), np.float32), np.empty((MIXED_TENSORS, 2), np.float32)
+        _directions(figures[n], g, vectors, tensors)
+        _mix(mix_vectors, vectors, v)
+        _mix(mix_tensors, tensors, t)
+        row, k, per = out[n], 0, one / g
+        for s in range(2):
+            for m in range(SCALARS):
+                row[k] = figures[n, s, 3 + m] * per
+                k += 1
+        for s in range(2):
+            row[k] = figures[n, s, 2] * per
+            row[k + 2] = here[n, s] * per
+            row[k + 4] = np.log(abs(here[n, s]) + np.float32(0.02))
+            k += 1
+        k += 4
+        row[k], row[k + 1], row[k + 2] = np.log(g + np.float32(1e-4)), g, np.sqrt(g)
+        k += 3
+        for m in range(SCALARS):
+            row[k] = figures[n, 0, 3 + m] - figures[n, 1, 3 + m]
+            k += 1
+        for a in range(MIXED_VECTORS):
+            for b in range(a, MIXED_VECTORS):
+                row[k] = v[a, 0] * v[b, 0] + v[a, 1] * v[b, 1]
+                k += 1
+        for a in range(MIXED_TENSORS):
+            for b in range(a, MIXED_TENSORS):
+                row[k] = t[a, 0] * t[b, 0] + t[a, 1] * t[b, 1]
+                k += 1
+        turn, bend = half * (shape[n, 0] - shape[n, 2]), shape[n, 1]
+        for a in range(MIXED_TENSORS):
+            x, y = v[a, 0], v[a, 1]
+            row[k] = t[a, 0] * (x * x - y * y) + np.float32(2) * t[a, 1] * x * y
+            row[k + MIXED_TENSORS] = turn * t[a, 0] + bend * t[a, 1]
+            k += 1
+        k += MIXED_TENSORS
+        for a in range(MIXED_VECTORS):
+            x, y = v[a, 0], v[a, 1]
+            row[k] = turn * (x * x - y * y) + np.float32(2) * bend * x * y
+            row[k + MIXED_VECTORS] = shape[n, 3] * x + shape[n, 4] * y
+            k += 1
+        k += MIXED_VECTORS
+        row[k], row[k + 1] = half * (shape[n, 0] + shape[n, 2]), turn * turn + bend * bend
+        row[k + 2], row[k + 3] = constants[0], constants[1]
+        row[k + 4] = one / (np.float32(1.02) - np.float32(2) * constants[0])
+        row[k + 5] = shape[n, 3] * shape[n, 3] + shape[n, 4] * shape[n, 4]
+        for m in range(INPUTS):
+            kept = min(max(row[m], low[m]), high[m])
+            if kept != row[m]:
+                outside[n] = True
+            row[m] = (kept - mean[m]) * scale[m]
+
+
+@numba.njit(cache=True, parallel=True, fastmath=FAST)
+def _activate(hidden, bias):
+    """x / 2 (1 + x / (1 + |x|)) of hidden + bias, in place: smooth as SiLU, without its exponential."""
+    half, one = np.float32(0.5), np.float32(1)
+    for n in numba.prange(len(hidden)):
+        for m in range(len(bias)):
+            x = hidden[n, m] + bias[m]
+            hidden[n, m] = x * (half + half * x / (one + abs(x)))
+
+
+@numba.njit(cache=True, parallel=True, fastmath=FAST)
+def _move(figures, shape, outputs, mix_vectors, mix_tensors, frames, moved, error):
+    """Linear response to the columns' strain plus what the network adds, turned into the layer's frame, (N, 3) [m]."""
+    for n in numba.prange(len(figures)):
+        u, v, w = figures[n, 1, 0], figures[n, 1, 1], figures[n, 1, 2]
+        g = _amplitude(figures[n])
+        error[n] = 0
+        if g >= SURROUNDED:
+            vectors, tensors = np.empty((DIRECTIONS, 2), np.float32), np.empty((2 * TENSORS, 2), np.float32)
+            mixed, t = np.empty((MIXED_VECTORS, 2), np.float32), np.empty((MIXED_TENSORS, 2), np.float32)
+            _directions(figures[n], g, vectors, tensors)
+            _mix(mix_vectors, vectors, mixed)
+            _mix(mix_tensors, tensors, t)
+            x = y = np.float32(0)
+            row, k = outputs[n], 1
+            for m in range(DIRECTIONS):
+                x += row[k] * vectors[m, 0]
+                y += row[k] * vectors[m, 1]
+                k += 1
+            for m in range(MIXED_TENSORS):
+                x += row[k] * (t[m, 0] * mixed[m, 0] + t[m, 1] * mixed[m, 1])
+                y += row[k] * (t[m, 1] * mixed[m, 0] - t[m, 0] * mixed[m, 1])
+                k += 1
+            turn, bend = np.float32(0.5) * (shape[n, 0] - shape[n, 2]), shape[n, 1]
+            for m in range(MIXED_VECTORS):
+                x += row[k] * (turn * mixed[m, 0] + bend * mixed[m, 1])
+                y += row[k] * (bend * mixed[m, 0] - turn * mixed[m, 1])
+                k += 1
+            x += row[k] * shape[n, 3]
+            y += row[k] * shape[n, 4]
+            a = np.float32(AMPLITUDE) * g / (np.float32(1) + g)
+            u += a * x
+            v += a * y
+            w += a * row[0]
+            error[n] = a * np.exp(min(row[k + 1], np.float32(2)))
+        for m in range(3):
+            moved[n, m] = u * frames[n, 0, m] + v * frames[n, 1, m] + w * frames[n, 2, m]
