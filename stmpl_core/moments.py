@@ -19,7 +19,7 @@ RINGS = np.array([0.0, 0.35, 0.7, 1.1, 1.6, 2.2, 2.9, 3.6])  # radii of the mome
 WIDTHS = np.array([0.3, 0.3, 0.35, 0.45, 0.55, 0.65, 0.7, 0.6])  # of the rings
 SCALARS, VECTORS, TENSORS = 8, 6, 4  # rings of each order; vectors and tensors leave out the innermost
 WIDTH = 32  # figures of one source field at one vertex, the last of them unused
-SPREAD = 0.38  # standard deviation of a linear hat function over the root of its vertex area, on equilateral triangles
+SPREAD = 0.408  # of the Gaussian with the mean 1 / r of a linear hat: its deviation over the root of the vertex area
 
 
 class Felt(NamedTuple):
@@ -113,11 +113,12 @@ def response_table(poisson_ratio: float) -> np.ndarray:
         D = (3 - 4 nu) cosh 2K + 2 K^2 + 5 - 12 nu + 8 nu^2
 
     (plane strain by an Airy function, as in Johnson, "Contact Mechanics", 1985, chapter 5), and a force spreads as
-    Hankel transforms of order 0 and 1 of these.
+    Hankel transforms of order 0 and 1 of these. What the cut at REACH takes of the whole sinking is given back near
+    the force, so that a wide pressure sinks the layer by exactly p t / M.
     """
     nu, mu = poisson_ratio, 1 / (2 * (1 + poisson_ratio))
     radius = np.arange(int(REACH * STEPS) + 2) / STEPS
-    table = np.empty((len(SPREADS), len(radius), 2), dtype=np.float32)
+    table = np.empty((len(SPREADS), len(radius), 2))
     k = np.linspace(0, 6 / SPREADS[0], 4001)[1:]
     e = np.exp(-2 * k)  # the transforms are divided by exp(2 K) / 2, so that nothing overflows
     scale = mu * k * ((3 - 4 * nu) * (1 + e * e) + 2 * e * (2 * k * k + 5 - 12 * nu + 8 * nu * nu))
@@ -126,8 +127,12 @@ def response_table(poisson_ratio: float) -> np.ndarray:
     phase = np.outer(k, radius)
     weight = np.exp(-0.5 * (k * SPREADS[:, None]) ** 2) * k * (k[1] - k[0]) / (2 * np.pi)
     table[:, :, 0], table[:, :, 1] = (weight * sink) @ j0(phase), (weight * along) @ j1(phase)
-    fade = np.clip((REACH - radius) / 1.0, 0, 1)
-    return table * (fade * fade * (3 - 2 * fade)).astype(np.float32)[:, None]
+    fade = np.clip(REACH - radius, 0, 1)
+    table *= (fade * fade * (3 - 2 * fade))[:, None]
+    ring = 2 * np.pi * radius / STEPS
+    lost = (1 + nu) * (1 - 2 * nu) / (1 - nu) - table[:, :, 0] @ ring
+    table[:, :, 0] += lost[:, None] * fade * np.exp(-radius) / ((fade * np.exp(-radius)) @ ring)
+    return table.astype(np.float32)
 
 
 def ring_table() -> np.ndarray:

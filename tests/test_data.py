@@ -25,7 +25,8 @@ from stmpl_core.errors import InvalidInput
 from tests import scenes
 
 TINY = PRESETS["tiny"]
-DISCS = TINY.model_copy(update=dict.fromkeys(["ellipses", "seams", "indenters", "hands", "bands", "letters"], 0))
+OTHERS = ("ellipses", "seams", "fields", "indenters", "hands", "bands", "letters")
+DISCS = TINY.model_copy(update=dict.fromkeys(OTHERS, 0))
 
 
 @pytest.fixture(scope="module")

@@ -53,6 +53,7 @@ class Weights:
         Raises:
             InvalidInput: a file is missing, or holds another network.
         """
+        from safetensors import SafetensorError
         from safetensors.numpy import load_file
 
         path = Path(path)
@@ -60,7 +61,10 @@ class Weights:
         for one in (path, card):
             if not one.is_file():
                 raise InvalidInput(f"there is no {one}. Train a network with stmpl train, or give no path.")
-        arrays = load_file(path)
+        try:
+            arrays = load_file(path)
+        except SafetensorError as error:
+            raise InvalidInput(f"{path} holds no weights: {error}.") from error
         shapes = {name: a.shape for name, a in arrays.items()}
         if set(shapes) != set(ARRAYS) or shapes["w1"][0] != INPUTS or shapes["w4"][1] != OUTPUTS:
             raise InvalidInput(f"{path} holds no MomentNet of this version.")

@@ -1,0 +1,157 @@
+"""How long an answer takes, end to end (a load in, every vertex's displacement out): our network, its parts, others.
+
+python -m benchmarks.inference [--weights FILE] [--seconds 3]
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import time
+from collections.abc import Callable
+
+import numpy as np
+
+from fem_tools import PatchFem
+from fem_tools.provenance import machine
+from fem_tools.scenes import Site, UnusableContact, ellipse
+from stmpl_core import Load
+from stmpl_core.body import Body
+from stmpl_core.layer import SoftLayer
+from stmpl_core.methods import Linear, Method, MomentNet, UNet, Winkler
+from stmpl_core.methods import moment_net as parts
+from stmpl_core.methods.pix2pix import Pix2PixUNet
+
+
+def footprints(layer: SoftLayer) -> dict[str, np.ndarray]:
+    """A fingertip, a palm and a band on the arm."""
+    site, out = Site(layer), {}
+    order = np.random.default_rng(0).permutation(len(layer.vertices))
+    makers = {
+        "fingertip, 8 mm": lambda v: site.press_flat(v, ellipse(0.008, 0.008), 0.0),
+        "disc, 20 mm": lambda v: site.press_flat(v, ellipse(0.02, 0.02), 0.0),
+        "band, 25 mm": lambda v: site.strap(v, 0.025, 0.0),
+    }
+    for name, make in makers.items():
+        for vertex in order:
+            try:
+                out[name] = make(int(vertex)).footprint
+                break
+            except UnusableContact:
+                continue
+    return out
+
+
+def timed(call: Callable[[], object], seconds: float) -> tuple[float, float]:
+    """Median and 99th percentile [ms] over about this many seconds, after a first call."""
+    call()
+    spent: list[float] = []
+    end = time.perf_counter() + seconds
+    while time.perf_counter() < end or len(spent) < 5:
+        start = time.perf_counter()
+        call()
+        spent.append(1e3 * (time.perf_counter() - start))
+    return float(np.median(spent)), float(np.quantile(spent, 0.99))
+
+
+def network_alone(net: MomentNet, count: int) -> dict[str, Callable[[], object]]:
+    """The three hidden layers on `count` vertices, by several engines."""
+    import torch
+    from torch import nn
+
+    a = net.weights.arrays
+    x = np.random.default_rng(0).normal(size=(count, parts.INPUTS)).astype(np.float32)
+
+    def numpy_engine() -> np.ndarray:
+        h = x
+        for k in "123":
+            h = h @ a["w" + k]
+            parts._activate(h, a["b" + k])
+        return h @ a["w4"] + a["b4"]
+
+    class Torch(nn.Module):
+        def __init__(self) -> None:
+            super().__init__()
+            for name in ("w1", "b1", "w2", "b2", "w3", "b3", "w4", "b4"):
+                self.register_buffer(name, torch.from_numpy(a[name]))
+
+        def forward(self, h: torch.Tensor) -> torch.Tensor:
+            for k in "123":
+                h = torch.addmm(getattr(self, "b" + k), h, getattr(self, "w" + k))
+                h = h * (0.5 + 0.5 * h / (1 + h.abs()))
+            return torch.addmm(self.b4, h, self.w4)
+
+    eager, tensor = Torch().eval(), torch.from_numpy(x)
+    engines: dict[str, Callable[[], object]] = {"numpy and numba": numpy_engine}
+
+    def in_torch(model: Callable) -> Callable[[], object]:
+        def call() -> object:
+            with torch.inference_mode():
+                return model(tensor)
+
+        return call
+
+    engines["torch"] = in_torch(eager)
+    engines["torch.compile"] = in_torch(torch.compile(eager))
+    try:
+        import onnxruntime
+
+        path = "/tmp/moment_net.onnx" if os.path.isdir("/tmp") else "moment_net.onnx"
+        torch.onnx.export(eager, (tensor,), path, input_names=["x"], dynamo=False)
+        session = onnxruntime.InferenceSession(path, providers=["CPUExecutionProvider"])
+        engines["ONNX Runtime"] = lambda: session.run(None, {"x": x})
+    except ImportError as error:
+        print(f"ONNX Runtime is left out: {error}")
+    return engines
+
+
+def main() -> None:
+    """Prints the tables."""
+    given = argparse.ArgumentParser(description=__doc__)
+    given.add_argument("--weights", default=None, help="of MomentNet; those that come with the package unless given")
+    given.add_argument("--seconds", type=float, default=3.0, help="of each measurement")
+    options = given.parse_args()
+    import torch
+
+    layer = Body.anny().part("left_arm", edge_length=3e-3, thickness=7.5e-3)
+    print(f"{layer}\n{machine()}; load {os.getloadavg()[0]:.1f} before the run\n")
+    net = MomentNet(options.weights)
+    methods: dict[str, Method] = {"winkler": Winkler(), "linear": Linear(), "moment_net": net, "unet, reduced": UNet(),
+                                  "patch FEM": PatchFem()}  # fmt: skip
+    for method in methods.values():
+        method.prepare(layer)
+    print(f"{'end to end':24} {'vertices':>9} {'feel it':>8} " + "".join(f"{n:>22}" for n in methods) + "   ms, p99")
+    for name, footprint in footprints(layer).items():
+        load = Load.pressure(0.5 * layer.tissue.youngs_modulus * footprint)
+        assert net._near is not None
+        felt = net._near.felt(parts.source_fields(load.values, layer))
+        cells = []
+        for method in methods.values():
+            median, p99 = timed(lambda m=method, x=load: m.solve(x), options.seconds)
+            cells.append(f"{median:12.2f} ({p99:7.2f})")
+        print(f"{name:24} {np.count_nonzero(footprint):9} {len(felt.vertices):8} " + "".join(f"{c:>22}" for c in cells))
+        sources = parts.source_fields(load.values, layer)
+        median, _ = timed(lambda s=sources: net._near.felt(s), options.seconds / 3)  # type: ignore[union-attr]
+        print(f"    of that, feeling the load: {median:.2f} ms")
+    print("\nthe network alone, 1,000 vertices")
+    base = 0.0
+    for name, call in network_alone(net, 1000).items():
+        median, p99 = timed(call, options.seconds)
+        base = base or median
+        print(f"    {name:20} {median:8.3f} ms, p99 {p99:8.3f}, {median / base:6.2f} times the first")
+    paper = Pix2PixUNet(512, 64).eval()
+    maps = torch.zeros(1, 2, 512, 512)
+
+    def whole() -> object:
+        with torch.inference_mode():
+            return paper(maps)
+
+    load = Load.pressure(0.5 * layer.tissue.youngs_modulus * footprints(layer)["disc, 20 mm"])
+    ours, _ = timed(lambda: net.solve(load), options.seconds)
+    median, p99 = timed(whole, options.seconds)
+    print(f"\nthe paper's UNet, 512 x 512, the network alone: {median:.0f} ms, p99 {p99:.0f}; "
+          f"{median / ours:.0f} times ours end to end")  # fmt: skip
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,200 @@
+"""Laws of the learned simulator: what is exact by construction, what it was trained to, and what it says of itself."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from fem_tools import PatchFem
+from fem_tools.dataset import Dataset
+from fem_tools.generate import generate
+from fem_tools.sampling import PRESETS
+from fem_tools.train_moments import Model, MomentTraining, draw_points, fit, train_moments
+from stmpl_core import Load, SoftLayer, Tissue
+from stmpl_core.errors import InvalidInput, NotPrepared
+from stmpl_core.methods import Linear, MomentNet
+from stmpl_core.methods.moment_net import source_fields
+from stmpl_core.metrics import score
+from stmpl_core.moments import REACH, Surroundings
+from tests import scenes
+from tests.touch_scenes import turn
+
+T = 7e-3
+SETTINGS = MomentTraining(hidden=8, steps=60, points=32, checkpoint_minutes=0)
+
+
+def limb(nu: float = 0.4, thickness: float = T, scale: float = 1.0) -> SoftLayer:
+    """A cylinder: no body, so a shape that nothing was learnt from."""
+    vertices, faces = scenes.limb(3.5e-3)
+    return SoftLayer(scale * vertices, faces, scale * thickness, tissue=Tissue(poisson_ratio=nu))
+
+
+def pad(layer: SoftLayer, ratio: float, radius: float = 0.013, scale: float = 1.0) -> Load:
+    weight = scenes.smooth_disc(layer.vertices, scale * np.array([0.04, 0, 0.08]), scale * radius, scale * 6e-3)
+    return Load.pressure(ratio * layer.tissue.youngs_modulus * weight)
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("data") / "few"
+    plan = PRESETS["tiny"].model_copy(update={"discs": 10, "indenters": 0, "hands": 0, "bands": 0, "letters": 0})
+    generate(plan, out, workers=2)
+    return out
+
+
+@pytest.fixture(scope="module")
+def net() -> MomentNet:
+    return MomentNet().prepare(limb())
+
+
+def test_no_load_moves_nothing(net: MomentNet) -> None:
+    answer = net.solve(Load.zero(limb()))
+    assert not answer.displacement.any() and answer.trust.ok and answer.trust.error_bound == 0.0
+
+
+def test_turning_the_scene_turns_the_answer(net: MomentNet) -> None:
+    layer = limb()
+    rotation = turn((1, 2, 3), 1.1)[:3, :3]
+    turned = layer.with_(vertices=layer.vertices @ rotation.T + [0.3, -0.1, 0.2])
+    straight = net.solve(pad(layer, 0.8)).displacement
+    np.testing.assert_allclose(
+        MomentNet().prepare(turned).solve(pad(layer, 0.8)).displacement, straight @ rotation.T, atol=2e-6
+    )
+
+
+def test_stiffness_enters_as_pressure_over_modulus_alone(net: MomentNet) -> None:
+    layer = limb().with_(youngs_modulus=37e3)
+    stiff = MomentNet().prepare(layer).solve(pad(layer, 0.8)).displacement
+    np.testing.assert_allclose(stiff, net.solve(pad(limb(), 0.8)).displacement, atol=1e-9)
+
+
+def test_a_scene_of_half_the_size_moves_half_as_far(net: MomentNet) -> None:
+    small = limb(scale=0.6)
+    answer = MomentNet().prepare(small).solve(pad(small, 0.8, scale=0.6))
+    np.testing.assert_allclose(answer.displacement, 0.6 * net.solve(pad(limb(), 0.8)).displacement, atol=2e-6)
+
+
+def test_beyond_its_reach_nothing_moves(net: MomentNet) -> None:
+    layer, load = limb(), pad(limb(), 0.8)
+    moved = net.solve(load).magnitude > 0
+    away = np.linalg.norm(layer.vertices[:, None] - layer.vertices[load.loaded][None], axis=2).min(axis=1)
+    assert moved.any() and not moved[away > REACH * T].any()
+
+
+def test_more_pressure_is_more_depth(net: MomentNet) -> None:
+    peaks = [net.solve(pad(limb(), r)).magnitude.max() for r in np.linspace(0.02, 1.5, 60)]
+    assert (np.diff(peaks) > 0).all()
+
+
+@pytest.mark.parametrize(("nu", "ratio", "thickness"), [(0.4, 0.2, 7e-3), (0.4, 1.0, 7e-3), (0.32, 0.6, 5e-3)])
+def test_on_a_shape_it_never_saw_it_is_near_fem_and_nearer_than_the_linear_response(
+    nu: float, ratio: float, thickness: float
+) -> None:
+    layer = limb(nu, thickness)
+    load = pad(layer, ratio)
+    truth = PatchFem(refine=1).prepare(layer).solve(load)
+    answer = MomentNet().prepare(layer).solve(load)
+    ours = score(answer.displacement, truth.displacement, layer, load)
+    linear = score(Linear().prepare(layer).solve(load).displacement, truth.displacement, layer, load)
+    assert answer.trust.ok, answer.trust.why
+    assert ours.mee_share < 0.01 and ours.much < 0.03 * ours.peak and abs(ours.peak_share) < 0.03
+    assert ours.mee < linear.mee and ours.much < linear.much
+
+
+def test_the_bound_says_how_far_off_it_is(net: MomentNet) -> None:
+    layer, inside, loose = limb(), [], []
+    fem = PatchFem(refine=1).prepare(layer)
+    for ratio, radius in ((0.1, 0.009), (0.3, 0.016), (0.6, 0.012), (0.9, 0.02), (1.3, 0.01)):
+        load = pad(layer, ratio, radius)
+        answer = net.solve(load)
+        worst = np.linalg.norm(answer.displacement - fem.solve(load).displacement, axis=1).max()
+        assert answer.trust.error_bound is not None
+        inside.append(worst <= answer.trust.error_bound)
+        loose.append(answer.trust.error_bound / worst)
+    assert sum(inside) >= 4 and np.median(loose) < 5
+
+
+@pytest.mark.parametrize(
+    ("layer", "ratio", "word"),
+    [(limb(), 4.0, "p_over_e"), (limb(0.2), 0.3, "poisson"), (limb(thickness=1e-3), 0.3, "thickness"),
+     (limb(), -0.3, "pulls")],
+)  # fmt: skip
+def test_out_of_range_is_flagged_and_without_a_bound(layer: SoftLayer, ratio: float, word: str) -> None:
+    trust = MomentNet().prepare(layer).solve(pad(layer, ratio)).trust
+    assert not trust.in_range and word in trust.why and trust.error_bound is None
+
+
+def test_out_of_range_goes_to_the_next_method_which_says_so() -> None:
+    layer = limb(0.2)
+    load = pad(layer, 0.1)
+    answer = MomentNet(fallback=PatchFem()).prepare(layer).solve(load)
+    assert answer.method == PatchFem().name and "poisson" in answer.trust.why and answer.trust.converged
+    np.testing.assert_allclose(answer.displacement, PatchFem().prepare(layer).solve(load).displacement)
+
+
+def test_misuse_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(NotPrepared):
+        MomentNet().solve(Load.zero(limb()))
+    with pytest.raises(InvalidInput):
+        MomentNet().prepare(limb()).solve(Load.pressure(np.zeros(3)))
+    with pytest.raises(InvalidInput, match="no "):
+        MomentNet(tmp_path / "none.safetensors")
+    (tmp_path / "bad.json").write_text("{}")
+    (tmp_path / "bad.safetensors").write_bytes(b"not weights")
+    with pytest.raises(InvalidInput):
+        MomentNet(tmp_path / "bad.safetensors")
+
+
+def test_the_method_computes_what_was_trained() -> None:
+    """The same network in torch and in the compiled kernels, with random weights."""
+    torch.manual_seed(1)
+    model = Model(16)
+    torch.nn.init.normal_(model.layers[-1].weight, std=0.1)  # type: ignore[arg-type]
+    layer = limb()
+    load = pad(layer, 0.7)
+    near, sources = Surroundings(layer), source_fields(load.values, layer)
+    felt = near.felt(sources)
+    v = felt.vertices
+    constants = np.tile([layer.tissue.poisson_ratio, 0.0], (len(v), 1))
+    rows = [felt.figures.reshape(len(v), -1), near.curvature[v], near.slope[v], sources[v], constants]
+    points = torch.tensor(np.concatenate(rows, axis=1), dtype=torch.float32)
+    model.normalise(points)
+    with torch.no_grad():
+        local = model(points)[0].numpy()
+    answer = MomentNet(model.weights(MomentNet().weights.card)).prepare(layer).solve(load)
+    want = np.einsum("nj,nji->ni", local * T, near.frames[v])
+    np.testing.assert_allclose(answer.displacement[v], want, atol=2e-3 * np.abs(want).max())
+
+
+def test_training_learns_and_goes_on_where_it_stopped(data: Path, tmp_path: Path) -> None:
+    points = draw_points(Dataset.open(data), SETTINGS, lambda *_: None)
+    for name in ("whole", "cut"):
+        (tmp_path / name).mkdir()
+    whole = fit(points, SETTINGS, tmp_path / "whole", lambda *_: None)
+    original = torch.save
+    saves = 0
+
+    def save_and_stop(state: dict, path: Path) -> None:
+        nonlocal saves
+        original(state, path)
+        saves += 1
+        if saves == SETTINGS.steps // 2:
+            raise KeyboardInterrupt
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(torch, "save", save_and_stop)
+        with pytest.raises(KeyboardInterrupt):
+            fit(points, SETTINGS, tmp_path / "cut", lambda *_: None)
+    resumed = fit(points, SETTINGS, tmp_path / "cut", lambda *_: None)
+    for name, value in whole.state_dict().items():
+        torch.testing.assert_close(resumed.state_dict()[name], value, msg=name)
+
+
+def test_a_trained_network_comes_with_a_card_that_says_what_made_it(data: Path, tmp_path: Path) -> None:
+    card = train_moments(data, tmp_path, SETTINGS)
+    method = MomentNet(tmp_path / "moment_net.safetensors")
+    assert method.weights.card == card and card["data"]["preset"] == "tiny" and card["settings"]["seed"] == 0
+    assert {"commit", "machine", "versions", "ranges", "bound", "parameters"} <= set(card)
+    sample = Dataset.open(data).split("test", kind="pressure")[0]
+    assert method.prepare(sample.layer).solve(sample.load).displacement.any()
