@@ -1,7 +1,7 @@
 # `make` alone says what there is. Everything lives in .venv; nothing else on the machine is touched.
 SHELL := /bin/bash
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test check clean
+.PHONY: help setup demo test check weights clean
 
 VENV := .venv
 BIN := $(VENV)/bin
@@ -24,6 +24,11 @@ check: $(READY)  ## Lint, types and the one-way import rule
 	$(BIN)/ruff check .
 	$(BIN)/pyright
 	$(BIN)/lint-imports
+
+weights: $(READY)  ## Make the networks that ship, from nothing: data, training (about two hours on two cores; goes on if stopped)
+	$(BIN)/stmpl generate --preset default --out data/default
+	$(BIN)/stmpl train --preset default --data data/default --out stmpl_core/weights
+	$(BIN)/stmpl train --preset paper-reduced --data data/default --out stmpl_core/weights
 
 clean:  ## Remove .venv, caches and build folders; runs/ stays
 	rm -rf $(VENV) build install log *.egg-info .pytest_cache .ruff_cache .import_linter_cache .numba_cache

@@ -24,6 +24,7 @@ REQUIRED = [
     "roma>=1.5",
     "rosbags>=0.10",
     "ruamel.yaml>=0.18",
+    "safetensors>=0.4",
     "scikit-fem>=11",
     "scipy>=1.13",
     "shapely>=2.0",

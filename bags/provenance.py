@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import platform
 import zipfile
@@ -9,15 +10,19 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from importlib.metadata import PackageNotFoundError, version
 from io import BytesIO
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+import stmpl_core
 from bags.writer import BagWriter
+from stmpl_core.chart import UvChart
 from stmpl_core.errors import BagError
 from stmpl_core.layer import SoftLayer, Tissue
 
 LAYER = "layer.npz"
+WEIGHTS = Path(stmpl_core.__file__).parent / "weights"
 RECORD = "stmpl"
 _PACKAGES = ("stmpl", "numpy", "scipy", "numba", "torch", "anny", "mcap", "rosbags")
 
@@ -30,7 +35,7 @@ class Provenance:
         method: name of the method that answered.
         body: one line on the body and its part.
         config: everything that was configured, as JSON can hold it.
-        versions: of Python and of the packages that decide the numbers.
+        versions: of Python, and of the packages and weights that decide the numbers.
     """
 
     method: str = ""
@@ -40,13 +45,15 @@ class Provenance:
 
 
 def versions() -> dict[str, str]:
-    """Versions of Python and of those packages that decide the numbers and are installed."""
+    """Versions of Python, of the packages that decide the numbers, and of the networks' weights (their SHA-256)."""
     found = {"python": platform.python_version(), "machine": platform.machine()}
     for name in _PACKAGES:
         try:
             found[name] = version(name)
         except PackageNotFoundError:
             continue
+    for weights in sorted(WEIGHTS.glob("*.safetensors")):
+        found[f"weights/{weights.stem}"] = hashlib.sha256(weights.read_bytes()).hexdigest()[:16]
     return found
 
 
@@ -81,6 +88,8 @@ def layer_to_bytes(layer: SoftLayer) -> bytes:
         "thickness": layer.thickness,
         "tissue": np.array([tissue.youngs_modulus, tissue.poisson_ratio, tissue.density]),
     }
+    if isinstance(layer.chart, UvChart):
+        arrays["uv"] = layer.chart.uv
     stream = BytesIO()
     np.savez_compressed(stream, allow_pickle=False, **arrays)
     return stream.getvalue()
@@ -91,6 +100,8 @@ def layer_from_bytes(data: bytes) -> SoftLayer:
     try:
         with np.load(BytesIO(data), allow_pickle=False) as arrays:
             tissue = Tissue(*(float(x) for x in arrays["tissue"]))
-            return SoftLayer(arrays["vertices"], arrays["faces"], arrays["thickness"], tissue=tissue)
+            skin = arrays["vertices"], arrays["faces"]
+            chart = UvChart(*skin, arrays["uv"]) if "uv" in arrays else None
+            return SoftLayer(*skin, arrays["thickness"], tissue=tissue, chart=chart)
     except (OSError, ValueError, KeyError, TypeError, zipfile.BadZipFile) as error:
         raise BagError(f"the attached {LAYER} cannot be read: {error}.") from error

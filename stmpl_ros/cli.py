@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
-from stmpl_core.errors import StmplError
+from stmpl_core.errors import InvalidInput, StmplError
 from stmpl_ros.parameters import METHODS, DemoConfig, NodeConfig, ProbeConfig, RecordConfig
 
 if TYPE_CHECKING:
@@ -69,21 +69,25 @@ def record(config: Annotated[RecordConfig, Flat]) -> int:
     return run(config, _ros_arguments)
 
 
-def replay(path: BagPath, method: MethodName = "winkler", every: int = 1, as_json: Json = False) -> int:
+def replay(path: BagPath, method: MethodName | None = None, every: int = 1, as_json: Json = False) -> int:
     """Answers the recorded contacts again, offline, and says whether the answers are the recorded ones.
 
     Example: stmpl replay runs/latest --every 10
 
     Args:
         path: a run's folder, or its .mcap file.
-        method: that answers.
+        method: that answers; the one that was recorded unless given.
         every: take each n-th frame only.
         as_json: print figures for machines.
     """
+    from bags.reader import Bag
     from bags.replay import replay_run
 
+    recorded = Bag(path).provenance.method
+    if method is None and recorded not in METHODS:
+        raise InvalidInput(f"{path} was recorded with {recorded or 'no named method'}. Name one with --method.")
     with _waiting(f"replaying {path}", as_json):
-        summary = replay_run(path, _method(method), every=every)
+        summary = replay_run(path, METHODS[recorded]() if method is None else _method(method), every=every)
     _print_figures(vars(summary) if as_json else str(summary))
     return 0
 
