@@ -42,7 +42,7 @@ class UNetTraining(BaseModel):
         size, width, dropout: of Pix2PixUNet.
         batch: samples a step, over all processes.
         learning_rate: of Adam.
-        total_variation: weight of the mean absolute difference of neighbouring texels, beside the mean square.
+        total_variation: weight of the mean absolute difference of neighbouring texels [mm], beside the mean square.
         epochs: how often every sample is seen.
         seed: of weights, order and dropout.
         bodies: all, or the three of the paper's second set-up.
@@ -222,15 +222,19 @@ class _Learner:
             if self.group.rank == 0 and (time.monotonic() - saved) / 60 >= self.settings.checkpoint_minutes:
                 self._save(checkpoint, origin, step, sums, curve)
                 saved = time.monotonic()
-            last = f", loss {curve[-1]['train']:.3g}, held out {curve[-1]['val']:.3g}" if curve else ""
+            last = f", loss {curve[-1]['train']:.3g} mm2, held out {curve[-1]['val']:.3g} mm2" if curve else ""
             tell(step, steps, f"epoch {epoch + 1}/{self.settings.epochs}{last}")
         if self.group.rank == 0:
             self._save(checkpoint, origin, step, sums, curve)
         return curve
 
     def loss(self, answer: Tensor, target: Tensor) -> Tensor:
-        """Mean square over the texels on the chart; with a weight, plus the total variation over them."""
+        """Mean square over the texels on the chart [mm2]; with a weight, plus the total variation over them [mm].
+
+        In mm2, because the squares of images in which 30 mm are 1 have gradients as small as Adam's epsilon.
+        """
         mask = self.images.mask
+        answer, target = 1e3 * MOTION * answer, 1e3 * MOTION * target
         error = (((answer - target) * mask) ** 2).sum() / (len(answer) * 3 * mask.sum())
         if not self.settings.total_variation:
             return error
