@@ -26,7 +26,8 @@ from stmpl_core.sdf import SignedDistance
 from stmpl_core.trust import Trust
 
 NORMAL_PENALTY = 100.0  # confined moduli over the thickness
-TANGENT_PENALTY = 10.0  # likewise: how far a sticking point creeps
+STICK_PENALTY = 100.0  # likewise: what sticking points still creep costs 0.3 % of the force (at 10: 2 %, and a snap)
+FRICTION_PENALTY = 10.0  # likewise under Coulomb's limit, which Newton does not pass where this is stiffer
 MAX_ENTERED = 20e-6  # m; the augmented Lagrangian goes on until nodes are less deep in a tool
 MAX_FACES_ENTERED = 0.01  # thicknesses
 SPREAD = 0.15  # thicknesses that skin is pushed aside before it is touched
@@ -140,9 +141,14 @@ class ToolLoad:
         self.anchor = np.where(self.held[:, None], anchor, 0.0) @ pose[:3, :3].T + pose[:3, 3]
         self._project: np.ndarray | None = None
 
+    def pressed(self, phi: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Energy [J/m2], pressure [Pa] and stiffness [Pa/m] of the near columns at signed distances `phi`, (n,) [m]."""
+        pressure = np.maximum(0.0, self.multiplier - self.normal * phi)
+        return pressure**2 / (2 * self.normal), pressure, np.where(pressure > 0, self.normal, 0.0)
+
     def pressure(self, skin: np.ndarray) -> np.ndarray:
         """Contact pressure of the near columns, (n,) [Pa]."""
-        return np.maximum(0.0, self.multiplier - self.normal * self.tool.distance(skin[self.near]))
+        return self.pressed(self.tool.distance(skin[self.near]))[1]
 
     def _plane(self) -> np.ndarray:
         """Projectors on the tool's tangent planes at the anchors, kept for the whole step, (n, 3, 3)."""
@@ -159,19 +165,19 @@ class ToolLoad:
         return offset, np.minimum(self.tangent, self.limit / np.maximum(length, 1e-12))
 
     def potential(self, skin: np.ndarray, factor: float) -> float:
-        """int p^2 / (2 epsilon) plus the work of the tangential tractions [J]."""
+        """Energy of the normal pressure plus the work of the tangential tractions [J]."""
         offset, secant = self.slip(skin)
         length = np.linalg.norm(offset, axis=1)
         capped = secant < self.tangent
         limit = np.where(capped, self.limit, 0.0)  # Huber's function: quadratic, then linear
         capped_energy = limit * length - 0.5 * limit**2 / max(self.tangent, 1e-300)
         tangential = np.where(capped, capped_energy, 0.5 * self.tangent * length**2)
-        return float(np.sum(self.area * (self.pressure(skin) ** 2 / (2 * self.normal) + tangential)))
+        return float(np.sum(self.area * (self.pressed(self.tool.distance(skin[self.near]))[0] + tangential)))
 
     def nodal_forces(self, skin: np.ndarray) -> Points:
         """Forces of the tool on the near columns, (n, 3) [N]."""
         phi, gradient, _ = self.tool.jet(skin[self.near])
-        p = np.maximum(0.0, self.multiplier - self.normal * phi)
+        p = self.pressed(phi)[1]
         offset, secant = self.slip(skin)
         return self.area[:, None] * (p[:, None] * gradient - secant[:, None] * offset)
 
@@ -184,8 +190,8 @@ class ToolLoad:
     ) -> None:
         """See SkinLoad; the tool's curvature softens, and is left out where Newton asks for a convex one."""
         phi, gradient, hessian = self.tool.jet(skin[self.near])
-        p = np.maximum(0.0, self.multiplier - self.normal * phi)
-        stiff = np.where((p > 0)[:, None, None], self.normal * gradient[:, :, None] * gradient[:, None, :], 0.0)
+        _, p, slope = self.pressed(phi)
+        stiff = slope[:, None, None] * gradient[:, :, None] * gradient[:, None, :]
         stiff -= (1 - convex) * p[:, None, None] * hessian
         _, secant = self.slip(skin)
         stiff += secant[:, None, None] * self._plane()
@@ -259,7 +265,7 @@ class IndenterFem:
         self._layer = layer
         return self
 
-    def path(self, tools: Sequence[Tool], depths: Sequence[float]) -> Iterator[Indentation]:
+    def path(self, tools: Sequence[Tool], depths: Sequence[float] | np.ndarray) -> Iterator[Indentation]:
         """Presses all tools together, and gives an answer at each depth beyond first touch.
 
         Args:
@@ -364,7 +370,7 @@ class _Press:
         self.system: System = self.fem.system(self.patch, Load.zero(layer))
         self.area = column_areas(self.mesh)
         modulus = layer.tissue.confined_modulus / self.thickness
-        tangential = 0.0 if solver.friction == "none" else TANGENT_PENALTY * modulus
+        tangential = {"stick": STICK_PENALTY, "none": 0.0}.get(str(solver.friction), FRICTION_PENALTY) * modulus
         self.stiffness = (NORMAL_PENALTY * modulus, tangential)
         n = self.mesh.n_columns
         u, multipliers = self.system.zeros(), [np.zeros(n) for _ in tools]
@@ -505,18 +511,19 @@ class _Press:
             tuple(wrenches),
             self.state.travel,
             tuple(load.tool for load in loads),
-            self._trust(result, loads, skin, pressure),
+            self._trust(result, loads, skin),
         )
 
-    def _trust(self, result: NewtonResult, loads: list[ToolLoad], skin: np.ndarray, pressure: np.ndarray) -> Trust:
+    def _trust(self, result: NewtonResult, loads: list[ToolLoad], skin: np.ndarray) -> Trust:
         faces = skin[self.mesh.triangles].mean(axis=1)
         nodes_in = max(float(-load.tool.distance(skin[load.near]).min(initial=0.0)) for load in loads)
         faces_in = max(float(-load.tool.distance(faces).min(initial=0.0)) for load in loads)
         stable = not self.fem.check_stability or is_positive_definite(self.system, result.u)
         discretisation = discretisation_error(self.system, result.u)
         truncation = truncation_error(self.patch, result.u, self.layer)
-        area = float(self.layer.vertex_areas[pressure > 0].sum())
-        mean = float((pressure * self.layer.vertex_areas).sum()) / area if area > 0 else 0.0
+        touched = [(load.area, load.pressure(skin)) for load in loads]
+        area = sum(float(share[p > 0].sum()) for share, p in touched)
+        mean = sum(float(share @ p) for share, p in touched) / area if area > 0 else 0.0
         trust = Trust(
             converged=result.converged,
             error_bound=discretisation + truncation + faces_in,
