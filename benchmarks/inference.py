@@ -6,10 +6,12 @@ python -m benchmarks.inference [--weights FILE] [--seconds 3]
 from __future__ import annotations
 
 import argparse
+import io
 import os
 import time
 from collections.abc import Callable
 
+import numba
 import numpy as np
 
 from fem_tools import PatchFem
@@ -54,6 +56,16 @@ def timed(call: Callable[[], object], seconds: float) -> tuple[float, float]:
     return float(np.median(spent)), float(np.quantile(spent, 0.99))
 
 
+def on_threads(threads: int, call: Callable[[], object]) -> Callable[[], object]:
+    """The same call on so many of numba's threads."""
+
+    def limited() -> object:
+        numba.set_num_threads(threads)
+        return call()
+
+    return limited
+
+
 def network_alone(net: MomentNet, count: int) -> dict[str, Callable[[], object]]:
     """The three hidden layers on `count` vertices, by several engines."""
     import torch
@@ -62,12 +74,8 @@ def network_alone(net: MomentNet, count: int) -> dict[str, Callable[[], object]]
     a = net.weights.arrays
     x = np.random.default_rng(0).normal(size=(count, parts.INPUTS)).astype(np.float32)
 
-    def numpy_engine() -> np.ndarray:
-        h = x
-        for k in "123":
-            h = h @ a["w" + k]
-            parts._activate(h, a["b" + k])
-        return h @ a["w4"] + a["b4"]
+    out = np.empty((count, parts.OUTPUTS), np.float32)
+    layers = [a[name + k] for k in "1234" for name in ("w", "b")]
 
     class Torch(nn.Module):
         def __init__(self) -> None:
@@ -82,24 +90,31 @@ def network_alone(net: MomentNet, count: int) -> dict[str, Callable[[], object]]
             return torch.addmm(self.b4, h, self.w4)
 
     eager, tensor = Torch().eval(), torch.from_numpy(x)
-    engines: dict[str, Callable[[], object]] = {"numpy and numba": numpy_engine}
+    engines: dict[str, Callable[[], object]] = {}
+    for threads in (1, 2):
+        engines[f"numba and BLAS, {threads}"] = on_threads(threads, lambda: parts.think(x, *layers, out))
 
-    def in_torch(model: Callable) -> Callable[[], object]:
+    def in_torch(model: Callable, threads: int) -> Callable[[], object]:
         def call() -> object:
+            torch.set_num_threads(threads)
             with torch.inference_mode():
                 return model(tensor)
 
         return call
 
-    engines["torch"] = in_torch(eager)
-    engines["torch.compile"] = in_torch(torch.compile(eager))
+    for threads in (1, 2):
+        engines[f"torch, {threads}"] = in_torch(eager, threads)
+    engines["torch.compile, 1"] = in_torch(torch.compile(eager), 1)
     try:
         import onnxruntime
 
-        path = "/tmp/moment_net.onnx" if os.path.isdir("/tmp") else "moment_net.onnx"
-        torch.onnx.export(eager, (tensor,), path, input_names=["x"], dynamo=False)
-        session = onnxruntime.InferenceSession(path, providers=["CPUExecutionProvider"])
-        engines["ONNX Runtime"] = lambda: session.run(None, {"x": x})
+        stream = io.BytesIO()
+        torch.onnx.export(eager, (tensor,), stream, input_names=["x"], dynamo=False)
+        for threads in (1, 2):
+            options = onnxruntime.SessionOptions()
+            options.intra_op_num_threads = threads
+            session = onnxruntime.InferenceSession(stream.getvalue(), options, providers=["CPUExecutionProvider"])
+            engines[f"ONNX Runtime, {threads}"] = lambda s=session: s.run(None, {"x": x})
     except ImportError as error:
         print(f"ONNX Runtime is left out: {error}")
     return engines
@@ -116,7 +131,8 @@ def main() -> None:
     layer = Body.anny().part("left_arm", edge_length=3e-3, thickness=7.5e-3)
     print(f"{layer}\n{machine()}; load {os.getloadavg()[0]:.1f} before the run\n")
     net = MomentNet(options.weights)
-    methods: dict[str, Method] = {"winkler": Winkler(), "linear": Linear(), "moment_net": net, "unet, reduced": UNet(),
+    methods: dict[str, Method] = {"winkler": Winkler(), "linear": Linear(), "moment_net": net, "moment_net, 2 threads": MomentNet(options.weights, threads=2),
+                                  "unet, reduced": UNet(),
                                   "patch FEM": PatchFem()}  # fmt: skip
     for method in methods.values():
         method.prepare(layer)
@@ -133,7 +149,7 @@ def main() -> None:
         sources = parts.source_fields(load.values, layer)
         median, _ = timed(lambda s=sources: net._near.felt(s), options.seconds / 3)  # type: ignore[union-attr]
         print(f"    of that, feeling the load: {median:.2f} ms")
-    print("\nthe network alone, 1,000 vertices")
+    print("\nthe network alone, 1,000 vertices; engine, threads")
     base = 0.0
     for name, call in network_alone(net, 1000).items():
         median, p99 = timed(call, options.seconds)

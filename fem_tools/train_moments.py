@@ -26,6 +26,7 @@ from stmpl_core.methods.moment_net import (
     MIXED_TENSORS,
     MIXED_VECTORS,
     OUTPUTS,
+    SURROUNDED,
     MomentNet,
     Weights,
     source_fields,
@@ -104,13 +105,15 @@ def _points(near: Surroundings, layer: SoftLayer, load: Load, displacement: np.n
             rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:  # fmt: skip
     sources = source_fields(load.pressure_on(layer), layer)
     felt = near.felt(sources)
-    v, length = felt.vertices, np.linalg.norm(displacement, axis=1)
+    surrounded = np.flatnonzero(np.abs(felt.scalars[:, 1]).sum(axis=1) > SURROUNDED)  # nothing is learnt elsewhere
+    v, length = felt.vertices[surrounded], np.linalg.norm(displacement, axis=1)
     peak = float(length.max())
     likely = np.where(length[v] > 1e-6, 1.0, 0.02) + 3 * (length[v] > 0.1 * peak) + 2 * (sources[v, 0] > 0)
     chosen = rng.choice(len(v), min(count, len(v)), replace=False, p=likely / likely.sum())
     v = v[chosen]
+    figures = felt.figures[surrounded[chosen]].reshape(len(v), -1)
     constants = np.broadcast_to([layer.tissue.poisson_ratio, load.kind == "nodal"], (len(v), 2))
-    rows = [felt.figures[chosen].reshape(len(v), -1), near.curvature[v], near.slope[v], sources[v], constants]
+    rows = [figures, near.curvature[v], near.slope[v], sources[v], constants]
     local = np.einsum("nij,nj->ni", near.frames[v], displacement[v]) / layer.thickness[v, None]
     return np.concatenate(rows, axis=1), local, layer.thickness[v] / peak
 
@@ -205,7 +208,7 @@ def fit(points: Points, settings: MomentTraining, out: Path, on_progress: OnProg
     torch.manual_seed(settings.seed)
     model = Model(settings.hidden)
     rows, motion, weight = (torch.from_numpy(a) for a in (points.rows, points.motion, points.weight))
-    some = torch.randperm(len(rows))[:200_000]
+    some = torch.randperm(len(rows))[:1_000_000]
     model.normalise(rows[some])
     optimiser = torch.optim.AdamW(model.parameters(), lr=settings.learning_rate, weight_decay=1e-5)
     schedule = torch.optim.lr_scheduler.OneCycleLR(

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import NamedTuple
 
 import numba
@@ -10,11 +12,10 @@ from scipy.special import j0, j1
 
 from stmpl_core.layer import SoftLayer
 
-REACH = 6.0  # thicknesses to which a vertex feels a load; the linear response there is below 0.05 % of its peak
+REACH = 8.0  # thicknesses to which a vertex feels a load; the linear response there is below 0.01 % of its peak
 NEAR = 4.0  # thicknesses to which moments are taken
 STEPS = 48  # table rows a thickness
 SPREADS = np.geomspace(0.04, 1.6, 14)  # widths of a load of one vertex that the linear response is tabled for, over t
-LEVELS_PER_LOG = 1 / np.log(SPREADS[1] / SPREADS[0])
 RINGS = np.array([0.0, 0.35, 0.7, 1.1, 1.6, 2.2, 2.9, 3.6])  # radii of the moments' rings, over t
 WIDTHS = np.array([0.3, 0.3, 0.35, 0.45, 0.55, 0.65, 0.7, 0.6])  # of the rings
 SCALARS, VECTORS, TENSORS = 8, 6, 4  # rings of each order; vectors and tensors leave out the innermost
@@ -74,33 +75,33 @@ class Surroundings:
         points = np.ascontiguousarray(layer.vertices)
         self.start, self.index = _neighbours(points, layer.normals, layer.thickness, REACH)
         self._frames = self.frames.astype(np.float32)
-        level = np.log(SPREAD * layer.vertex_areas**0.5 / SPREADS[0]), 0.5 * np.log(layer.thickness)
-        rows = [*(points - points.mean(axis=0)).T, layer.thickness**-0.5, layer.vertex_areas, level[0], level[1]]
-        self._sites = np.stack([*rows, np.zeros(len(points))], axis=1).astype(np.float32)
+        root, spread = layer.thickness**-0.5, np.log(SPREAD * layer.vertex_areas**0.5 / SPREADS[0])
+        half_log = 0.5 * np.log(layer.thickness)
+        rows = [*(points - points.mean(axis=0)).T, root, layer.vertex_areas, half_log, spread - half_log, *layer.normals.T]
+        self._sites = np.ascontiguousarray(rows, dtype=np.float32)
         shape = _shape(self.start, self.index, points, self.frames, layer.thickness)
         self.curvature, self.slope = shape[:, :3], shape[:, 3:]
-        self._response = response_table(layer.tissue.poisson_ratio)
-        self._rings = ring_table()
+        self._response = np.ascontiguousarray(np.moveaxis(response_table(layer.tissue.poisson_ratio), 2, 0))
+        with packed():
+            self._felt(np.zeros((1, len(points))), moments=True)
 
     def felt(self, sources: np.ndarray) -> Felt:
         """What the vertices feel of source fields (V, S) [-], in units of Young's modulus."""
-        values = np.ascontiguousarray(sources, dtype=np.float32)
-        loaded = np.flatnonzero(values.any(axis=1)).astype(np.int32)
-        vertices, slots = _reached(self.start, self.index, loaded, len(values))
-        figures = np.zeros((len(vertices), values.shape[1], WIDTH), dtype=np.float32)
-        _feel(vertices, self.start, self.index, slots, values[loaded], self._sites[loaded], self._sites, self._frames,
-              self._response, self._rings, figures)  # fmt: skip
-        return Felt(vertices, figures)
+        return Felt(*self._felt(np.asarray(sources).T, moments=True))
 
     def linear(self, source: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """The linear response alone to one field (V,) [-]: the vertices that feel it (N,), and (N, 3) as in Felt."""
-        values = np.ascontiguousarray(source, dtype=np.float32)
-        loaded = np.flatnonzero(values).astype(np.int32)
-        vertices, slots = _reached(self.start, self.index, loaded, len(values))
-        out = np.empty((len(vertices), 3), dtype=np.float32)
-        _respond(vertices, self.start, self.index, slots, values[loaded], self._sites[loaded], self._sites,
-                 self._frames, self._response, out)  # fmt: skip
-        return vertices, out
+        vertices, figures = self._felt(source[None], moments=False)
+        return vertices, figures[:, 0, :3]
+
+    def _felt(self, fields: np.ndarray, moments: bool) -> tuple[np.ndarray, np.ndarray]:
+        loaded = np.flatnonzero(fields.any(axis=0))
+        vertices = _reached(self.start, self.index, loaded, fields.shape[1])
+        figures = np.zeros((len(vertices), len(fields), WIDTH), dtype=np.float32)
+        values = np.ascontiguousarray(fields[:, loaded], dtype=np.float32)
+        _feel(vertices, values, np.ascontiguousarray(self._sites[:, loaded]), self._sites, self._frames,
+              self._response[0], self._response[1], moments, figures)  # fmt: skip
+        return vertices, figures
 
 
 def response_table(poisson_ratio: float) -> np.ndarray:
@@ -127,7 +128,7 @@ def response_table(poisson_ratio: float) -> np.ndarray:
     phase = np.outer(k, radius)
     weight = np.exp(-0.5 * (k * SPREADS[:, None]) ** 2) * k * (k[1] - k[0]) / (2 * np.pi)
     table[:, :, 0], table[:, :, 1] = (weight * sink) @ j0(phase), (weight * along) @ j1(phase)
-    fade = np.clip(REACH - radius, 0, 1)
+    fade = np.clip((REACH - radius) / 1.5, 0, 1)
     table *= (fade * fade * (3 - 2 * fade))[:, None]
     ring = 2 * np.pi * radius / STEPS
     lost = (1 + nu) * (1 - 2 * nu) / (1 - nu) - table[:, :, 0] @ ring
@@ -237,114 +238,133 @@ def _shape(start, index, points, frames, thickness):
 
 @numba.njit(cache=True)
 def _reached(start, index, loaded, count):
-    """Vertices with a loaded neighbour, in order; and of each vertex its place among the loaded, or -1."""
+    """Vertices with a loaded neighbour, in order."""
     mark = np.zeros(count, dtype=np.bool_)
-    slots = np.full(count, -1, dtype=np.int32)
-    for k in range(len(loaded)):
-        slots[loaded[k]] = k
-        for p in range(start[loaded[k]], start[loaded[k] + 1]):
+    for j in loaded:
+        for p in range(start[j], start[j + 1]):
             mark[index[p]] = True
-    return np.flatnonzero(mark).astype(np.int32), slots
+    return np.flatnonzero(mark).astype(np.int32)
 
 
 FAST = {"contract", "reassoc", "nsz", "arcp"}
-
-
-@numba.njit(inline="always", fastmath=FAST)
-def _pair(site, frame, source):
-    """Distance and direction of a source in a vertex's tangents, over their thickness; its area; how to scale it."""
-    inverse = site[3] * source[3]
-    dx, dy, dz = source[0] - site[0], source[1] - site[1], source[2] - site[2]
-    x = (frame[0, 0] * dx + frame[0, 1] * dy + frame[0, 2] * dz) * inverse
-    y = (frame[1, 0] * dx + frame[1, 1] * dy + frame[1, 2] * dz) * inverse
-    z = (frame[2, 0] * dx + frame[2, 1] * dy + frame[2, 2] * dz) * inverse
-    flat = x * x + y * y
-    r = np.sqrt(flat + z * z)
-    flat = np.float32(1) / np.sqrt(flat) if flat > np.float32(0) else np.float32(0)
-    cell = source[4] * inverse * inverse
-    return r, x * flat, y * flat, cell, cell * site[3] / source[3]
-
-
-@numba.njit(inline="always", fastmath=FAST)
-def _respond_at(response, r, site, source):
-    """Sinking and motion away under a unit force at r thicknesses, from the table."""
-    one = np.float32(1)
-    f = r * np.float32(STEPS)
-    k = int(f)
-    f -= np.float32(k)
-    h = (source[5] - source[6] - site[6]) * np.float32(LEVELS_PER_LOG)
-    h = min(max(h, np.float32(0)), np.float32(len(SPREADS) - 1.001))
-    g = int(h)
-    h -= np.float32(g)
-    a0, a1, b0, b1 = (one - h) * (one - f), (one - h) * f, h * (one - f), h * f
-    sink = a0 * response[g, k, 0] + a1 * response[g, k + 1, 0]
-    sink += b0 * response[g + 1, k, 0] + b1 * response[g + 1, k + 1, 0]
-    away = a0 * response[g, k, 1] + a1 * response[g, k + 1, 1]
-    away += b0 * response[g + 1, k, 1] + b1 * response[g + 1, k + 1, 1]
-    return sink, away
+CHUNK = 64  # vertices that one thread takes at a time
+_RINGS = np.zeros((int(NEAR * STEPS) + 2, 24), dtype=np.float32)  # a constant: the compiler knows that nothing writes it
+_RINGS[:, :SCALARS] = ring_table()[:, :SCALARS]
+_RINGS[:, 8 : 8 + VECTORS] = ring_table()[:, SCALARS : SCALARS + VECTORS]
+_RINGS[:, 16 : 16 + TENSORS] = ring_table()[:, SCALARS + VECTORS :]
 
 
 @numba.njit(cache=True, parallel=True, fastmath=FAST)
-def _respond(vertices, start, index, slots, values, sources, sites, frames, response, out):
-    """See Surroundings.linear; values and sources are those of the loaded vertices, `out` is (N, 3)."""
-    for n in numba.prange(len(vertices)):
-        i = vertices[n]
-        site, frame = sites[i], frames[i]
-        u = v = w = np.float32(0)
-        for p in range(start[i], start[i + 1]):
-            slot = slots[index[p]]
-            if slot < 0:
-                continue
-            r, c, d, _, scale = _pair(site, frame, sources[slot])
-            if r < REACH:
-                sink, away = _respond_at(response, r, site, sources[slot])
-                scale *= values[slot]
-                u -= scale * away * c
-                v -= scale * away * d
-                w -= scale * sink
-        out[n, 0], out[n, 1], out[n, 2] = u, v, w
+def _feel(vertices, values, sources, sites, frames, sink, away, moments, out):
+    """See Surroundings.felt; values (S, K) and sources (10, K) are those of the loaded vertices, `out` (N, S, WIDTH).
 
-
-@numba.njit(cache=True, parallel=True, fastmath=FAST)
-def _feel(vertices, start, index, slots, values, sources, sites, frames, response, rings, out):
-    """See Surroundings.felt; values and sources are those of the loaded vertices, `out` is (N, S, WIDTH)."""
-    fields = values.shape[1]
-    for n in numba.prange(len(vertices)):
-        i = vertices[n]
-        acc = np.zeros((fields, WIDTH), dtype=np.float32)
-        row = np.zeros(WIDTH, dtype=np.float32)
-        frame, site = frames[i], sites[i]
-        for p in range(start[i], start[i + 1]):
-            slot = slots[index[p]]
-            if slot < 0:
-                continue
-            r, c, d, cell, scale = _pair(site, frame, sources[slot])
-            if r >= REACH:
-                continue
-            sink, away = _respond_at(response, r, site, sources[slot])
-            row[0], row[1], row[2] = -away * c * scale, -away * d * scale, -sink * scale
-            if r >= NEAR:
-                for s in range(fields):
-                    for m in range(3):
-                        acc[s, m] += values[slot, s] * row[m]
-                continue
-            f = r * np.float32(STEPS)
-            k = int(f)
-            f -= np.float32(k)
-            f1, f0 = f * cell, (np.float32(1) - f) * cell
-            for m in range(SCALARS):
-                row[3 + m] = f0 * rings[k, m] + f1 * rings[k + 1, m]
-            for m in range(VECTORS):
-                w = f0 * rings[k, SCALARS + m] + f1 * rings[k + 1, SCALARS + m]
-                row[3 + SCALARS + m] = w * c
-                row[3 + SCALARS + VECTORS + m] = w * d
-            c2, d2 = c * c - d * d, (c + c) * d
-            for m in range(TENSORS):
-                w = f0 * rings[k, SCALARS + VECTORS + m] + f1 * rings[k + 1, SCALARS + VECTORS + m]
-                row[3 + SCALARS + 2 * VECTORS + m] = w * c2
-                row[3 + SCALARS + 2 * VECTORS + TENSORS + m] = w * d2
+    Rows of sites and sources: x, y, z, t^-1/2, area, log(t) / 2, the same of the spread, normal. Loops over the
+    sources have no branches, so that they run in vector registers.
+    """
+    fields, many = values.shape
+    for chunk in numba.prange((len(vertices) + CHUNK - 1) // CHUNK):
+        felt = np.empty((9, many), dtype=np.float32)
+        kept = np.empty(many + 1, dtype=np.int32)
+        sums = np.empty((fields, 5, 8), dtype=np.float32)
+        for n in range(CHUNK * chunk, min(CHUNK * (chunk + 1), len(vertices))):
+            count = _gather(vertices[n], sources, sites, frames, sink, away, felt, kept)
             for s in range(fields):
-                v = values[slot, s]
-                for m in range(WIDTH):
-                    acc[s, m] += v * row[m]
-        out[n] = acc
+                u = v = w = np.float32(0)
+                for q in range(count):
+                    value = values[s, kept[q]]
+                    u -= value * felt[5, q]
+                    v -= value * felt[6, q]
+                    w -= value * felt[7, q]
+                out[n, s, 0], out[n, s, 1], out[n, s, 2] = u, v, w
+            if moments:
+                _take_moments(count, values, felt, kept, sums, out[n])
+
+
+@numba.njit(inline="always", fastmath=FAST)
+def _gather(i, sources, sites, frames, sink, away, felt, kept):
+    """The sources that vertex i feels: how many; in `felt` distance, direction, area, ..., response of each."""
+    one, many, steps = np.float32(1), sources.shape[1], np.float32(STEPS)
+    far, top, wide = np.float32(REACH * REACH), np.float32(len(SPREADS) - 1.001), sink.shape[1]
+    per_log = np.float32(1 / np.log(SPREADS[1] / SPREADS[0]))
+    px, py, pz, root, log_t = sites[0, i], sites[1, i], sites[2, i], sites[3, i], sites[5, i]
+    a0, a1, a2 = frames[i, 0, 0], frames[i, 0, 1], frames[i, 0, 2]
+    b0, b1, b2 = frames[i, 1, 0], frames[i, 1, 1], frames[i, 1, 2]
+    c0, c1, c2 = frames[i, 2, 0], frames[i, 2, 1], frames[i, 2, 2]
+    for q in range(many):
+        dx, dy, dz, inverse = sources[0, q] - px, sources[1, q] - py, sources[2, q] - pz, root * sources[3, q]
+        facing = c0 * sources[7, q] + c1 * sources[8, q] + c2 * sources[9, q]
+        square = (dx * dx + dy * dy + dz * dz) * inverse * inverse
+        felt[8, q] = square if facing > 0 else np.float32(2) * far
+    count = 0
+    for q in range(many):
+        kept[count] = q
+        count += felt[8, q] < far
+    for p in range(count):
+        q = kept[p]
+        dx, dy, dz, inverse = sources[0, q] - px, sources[1, q] - py, sources[2, q] - pz, root * sources[3, q]
+        x, y = (a0 * dx + a1 * dy + a2 * dz) * inverse, (b0 * dx + b1 * dy + b2 * dz) * inverse
+        flat = one / np.sqrt(x * x + y * y + np.float32(1e-12))
+        c, d = x * flat, y * flat
+        f = np.sqrt(felt[8, q]) * steps
+        k = int(f)
+        h = min(max((sources[6, q] - log_t) * per_log, np.float32(0)), top)
+        g = int(h)
+        rest, h = f - np.float32(k), h - np.float32(g)
+        w2, w3 = h * (one - rest), h * rest
+        w0, w1 = one - rest - w2, rest - w3
+        cell = sources[4, q] * inverse * inverse
+        scale = cell * root / sources[3, q]
+        along = scale * (w0 * away[g, k] + w1 * away[g, k + 1] + w2 * away[g + 1, k] + w3 * away[g + 1, k + 1])
+        felt[0, p], felt[1, p], felt[2, p], felt[3, p], felt[4, p] = f, c, d, cell, rest
+        felt[5, p], felt[6, p] = along * c, along * d
+        felt[7, p] = scale * (w0 * sink[g, k] + w1 * sink[g, k + 1] + w2 * sink[g + 1, k] + w3 * sink[g + 1, k + 1])
+    return count
+
+
+@numba.njit(inline="always", fastmath=FAST)
+def _take_moments(count, values, felt, kept, sums, out):
+    """Sums over the near sources of rings times 1, cos a, sin a, cos 2a, sin 2a; loops of eight fill one register."""
+    end = np.float32(NEAR * STEPS)
+    sums[:] = 0
+    for p in range(count):
+        if felt[0, p] >= end:
+            continue
+        k, f1, c, d = int(felt[0, p]), felt[4, p], felt[1, p], felt[2, p]
+        c2, d2 = c * c - d * d, (c + c) * d
+        for s in range(len(out)):
+            v = values[s, kept[p]] * felt[3, p]
+            a, b = v * (np.float32(1) - f1), v * f1
+            for m in range(8):
+                sums[s, 0, m] += a * _RINGS[k, m] + b * _RINGS[k + 1, m]
+            x, y = a * c, b * c
+            for m in range(8):
+                sums[s, 1, m] += x * _RINGS[k, 8 + m] + y * _RINGS[k + 1, 8 + m]
+            x, y = a * d, b * d
+            for m in range(8):
+                sums[s, 2, m] += x * _RINGS[k, 8 + m] + y * _RINGS[k + 1, 8 + m]
+            x, y = a * c2, b * c2
+            for m in range(8):
+                sums[s, 3, m] += x * _RINGS[k, 16 + m] + y * _RINGS[k + 1, 16 + m]
+            x, y = a * d2, b * d2
+            for m in range(8):
+                sums[s, 4, m] += x * _RINGS[k, 16 + m] + y * _RINGS[k + 1, 16 + m]
+    for s in range(len(out)):
+        for m in range(SCALARS):
+            out[s, 3 + m] = sums[s, 0, m]
+        for m in range(VECTORS):
+            out[s, 3 + SCALARS + m] = sums[s, 1, m]
+            out[s, 3 + SCALARS + VECTORS + m] = sums[s, 2, m]
+        for m in range(TENSORS):
+            out[s, 3 + SCALARS + 2 * VECTORS + m] = sums[s, 3, m]
+            out[s, 3 + SCALARS + 2 * VECTORS + TENSORS + m] = sums[s, 4, m]
+
+
+@contextmanager
+def packed() -> Iterator[None]:
+    """While a kernel compiles: lets LLVM pack short loops into vector registers, which numba leaves off."""
+    before = numba.config.SLP_VECTORIZE  # type: ignore[attr-defined]
+    numba.config.SLP_VECTORIZE = 1  # type: ignore[attr-defined]
+    try:
+        yield
+    finally:
+        numba.config.SLP_VECTORIZE = before  # type: ignore[attr-defined]
