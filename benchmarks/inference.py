@@ -131,9 +131,11 @@ def main() -> None:
     layer = Body.anny().part("left_arm", edge_length=3e-3, thickness=7.5e-3)
     print(f"{layer}\n{machine()}; load {os.getloadavg()[0]:.1f} before the run\n")
     net = MomentNet(options.weights)
-    methods: dict[str, Method] = {"winkler": Winkler(), "linear": Linear(), "moment_net": net, "moment_net, 2 threads": MomentNet(options.weights, threads=2),
-                                  "unet, reduced": UNet(),
-                                  "patch FEM": PatchFem()}  # fmt: skip
+    methods: dict[str, Method] = {
+        "winkler": Winkler(), "linear": Linear(), "moment_net": net,
+        "moment_net, 2 threads": MomentNet(options.weights, threads=2),
+        "unet, reduced": UNet(), "patch FEM": PatchFem(),
+    }  # fmt: skip
     for method in methods.values():
         method.prepare(layer)
     print(f"{'end to end':24} {'vertices':>9} {'feel it':>8} " + "".join(f"{n:>22}" for n in methods) + "   ms, p99")

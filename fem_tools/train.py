@@ -35,7 +35,9 @@ def train(
     if preset == "default":
         from fem_tools.train_moments import MomentTraining, train_moments
 
-        moments = MomentTraining(seed=seed, **({} if steps is None else {"steps": steps}))
+        moments = MomentTraining(seed=seed)
+        if steps is not None:
+            moments = moments.model_copy(update={"steps": steps})
         return train_moments(data, out, moments, on_progress=on_progress)
     from fem_tools.train_unet import UNetTraining, train_unet
 

@@ -55,10 +55,10 @@ class MomentTraining(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    hidden: int = Field(default=64, ge=4)
+    hidden: int = Field(default=96, ge=4)
     kinds: tuple[Kind, ...] = ("pressure", "nodal")
     points: int = Field(default=128, ge=8)
-    steps: int = Field(default=60_000, ge=10)
+    steps: int = Field(default=40_000, ge=10)
     batch: int = Field(default=2048, ge=8)
     learning_rate: float = Field(default=4e-3, gt=0)
     seed: int = 0
@@ -87,12 +87,12 @@ def draw_points(data: Dataset, settings: MomentTraining, on_progress: OnProgress
     total, done = sum(map(len, subsets)), 0
     rows = np.empty((total * settings.points, ROW), np.float32)
     motion, weight = np.empty((len(rows), 3), np.float32), np.empty(len(rows), np.float32)
-    end, near, layer = 0, None, None
+    end, near = 0, None
     for subset in subsets:
         for sample in subset:
-            if near is None or sample.layer is not layer:
-                layer, near = sample.layer, Surroundings(sample.layer)
-            row, moved, scale = _points(near, layer, sample.load, sample.displacement, settings.points, rng)
+            if near is None or sample.layer is not near.layer:
+                near = Surroundings(sample.layer)
+            row, moved, scale = _points(near, sample.layer, sample.load, sample.displacement, settings.points, rng)
             here = slice(end, end := end + len(row))
             rows[here], motion[here], weight[here] = row, moved, scale
             done += 1

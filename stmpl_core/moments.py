@@ -77,7 +77,8 @@ class Surroundings:
         self._frames = self.frames.astype(np.float32)
         root, spread = layer.thickness**-0.5, np.log(SPREAD * layer.vertex_areas**0.5 / SPREADS[0])
         half_log = 0.5 * np.log(layer.thickness)
-        rows = [*(points - points.mean(axis=0)).T, root, layer.vertex_areas, half_log, spread - half_log, *layer.normals.T]
+        rows = [*(points - points.mean(axis=0)).T, root, layer.vertex_areas, half_log, spread - half_log]
+        rows += [*layer.normals.T]
         self._sites = np.ascontiguousarray(rows, dtype=np.float32)
         shape = _shape(self.start, self.index, points, self.frames, layer.thickness)
         self.curvature, self.slope = shape[:, :3], shape[:, 3:]
@@ -248,7 +249,7 @@ def _reached(start, index, loaded, count):
 
 FAST = {"contract", "reassoc", "nsz", "arcp"}
 CHUNK = 64  # vertices that one thread takes at a time
-_RINGS = np.zeros((int(NEAR * STEPS) + 2, 24), dtype=np.float32)  # a constant: the compiler knows that nothing writes it
+_RINGS = np.zeros((int(NEAR * STEPS) + 2, 24), dtype=np.float32)  # a constant to the compiler: nothing writes it
 _RINGS[:, :SCALARS] = ring_table()[:, :SCALARS]
 _RINGS[:, 8 : 8 + VECTORS] = ring_table()[:, SCALARS : SCALARS + VECTORS]
 _RINGS[:, 16 : 16 + TENSORS] = ring_table()[:, SCALARS + VECTORS :]
@@ -284,7 +285,7 @@ def _feel(vertices, values, sources, sites, frames, sink, away, moments, out):
 def _gather(i, sources, sites, frames, sink, away, felt, kept):
     """The sources that vertex i feels: how many; in `felt` distance, direction, area, ..., response of each."""
     one, many, steps = np.float32(1), sources.shape[1], np.float32(STEPS)
-    far, top, wide = np.float32(REACH * REACH), np.float32(len(SPREADS) - 1.001), sink.shape[1]
+    far, top = np.float32(REACH * REACH), np.float32(len(SPREADS) - 1.001)
     per_log = np.float32(1 / np.log(SPREADS[1] / SPREADS[0]))
     px, py, pz, root, log_t = sites[0, i], sites[1, i], sites[2, i], sites[3, i], sites[5, i]
     a0, a1, a2 = frames[i, 0, 0], frames[i, 0, 1], frames[i, 0, 2]
