@@ -208,7 +208,7 @@ class MomentNet:
         if share > OUTSIDE_SHARE:
             why = f"{share:.0%} of the vertices that move see what no training load had"
             trust = trust.also(why, in_range=False)
-        bound = float(card["bound"]["factor"]) * error + float(card["bound"]["share"]) * float(length.max())
+        bound = float(card["bound"]["factor"]) * error
         return Trust(trust.converged, trust.in_range, bound if trust.in_range else None, trust.why, trust.figures)
 
 
