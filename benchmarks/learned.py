@@ -83,7 +83,7 @@ def by_edge(net: MomentNet, ratio: float = 0.6) -> dict[str, list[dict]]:
         site, order = Site(layer), np.linalg.norm(layer.vertices - anchor, axis=1).argsort()
         for name, outline in outlines.items():
             shares = []
-            for vertex in order[::40][:12]:
+            for vertex in order[::60][:6]:
                 try:
                     footprint = site.press_flat(int(vertex), outline, 0.3).footprint
                 except UnusableContact:

@@ -74,10 +74,16 @@ class Simulator:
 
 
 def _joined(trust: Trust, touches: dict[str, Touch]) -> Trust:
-    """The method's trust, lowered by that of the contacts; their figures carry their names."""
+    """The method's trust, lowered by that of the contacts; their figures carry their names.
+
+    The method's error bound is for the pressure that it was given. How far that is from what the tools press with is
+    not known, so it becomes a figure, and the answer states no bound.
+    """
     figures = dict(trust.figures)
+    if touches and trust.error_bound is not None:
+        figures["bound_given_pressure_m"] = trust.error_bound
     for name, touch in touches.items():
         figures |= {f"{name}.{figure}": value for figure, value in touch.trust.figures.items()}
         if touch.trust.why:
             trust = trust.also(touch.trust.why, in_range=touch.trust.in_range, converged=touch.trust.converged)
-    return Trust(trust.converged, trust.in_range, trust.error_bound, trust.why, figures)
+    return Trust(trust.converged, trust.in_range, None if touches else trust.error_bound, trust.why, figures)
