@@ -154,22 +154,26 @@ class MomentNet:
         sources = source_fields(pressure, layer)
         felt = near.felt(sources)
         vertices, figures = felt.vertices, felt.figures
-        here, shape = sources[vertices], self._shape[vertices]
+        shape = self._shape[vertices]
         a, constants = self.weights.arrays, np.array([layer.tissue.poisson_ratio, load.kind == "nodal"], np.float32)
 
-        # What is around each vertex becomes numbers that do not turn with the scene.
-        inputs = np.empty((len(vertices), INPUTS), dtype=np.float32)
-        outside = np.zeros(len(vertices), dtype=np.bool_)
-        _inputs(figures, shape, here, constants, a["mix_vectors"], a["mix_tensors"], a["low"], a["high"], a["mean"],
-                a["scale"], inputs, outside)  # fmt: skip
+        # What is around each vertex becomes numbers that do not turn with the scene; far vertices need none.
+        near_ones = np.flatnonzero(np.abs(felt.scalars[:, 1]).sum(axis=1) > SURROUNDED)
+        place = np.full(len(vertices), -1)
+        place[near_ones] = np.arange(len(near_ones))
+        inputs = np.empty((len(near_ones), INPUTS), dtype=np.float32)
+        outside, strange = np.zeros(len(vertices), dtype=np.bool_), np.zeros(len(near_ones), dtype=np.bool_)
+        _inputs(figures[near_ones], shape[near_ones], sources[vertices[near_ones]], constants, a["mix_vectors"],
+                a["mix_tensors"], a["low"], a["high"], a["mean"], a["scale"], inputs, strange)  # fmt: skip
+        outside[near_ones] = strange
 
         # Three hidden layers.
-        outputs = np.empty((len(vertices), OUTPUTS), dtype=np.float32)
+        outputs = np.empty((len(near_ones), OUTPUTS), dtype=np.float32)
         think(inputs, a["w1"], a["b1"], a["w2"], a["b2"], a["w3"], a["b3"], a["w4"], a["b4"], outputs)
 
         # Each vertex moves along its normal and along the directions of what is around it.
         moved, error = np.empty((len(vertices), 3)), np.empty(len(vertices), dtype=np.float32)
-        _move(figures, shape, outputs, a["mix_vectors"], a["mix_tensors"], self._frames[vertices], moved, error)
+        _move(figures, shape, place, outputs, a["mix_vectors"], a["mix_tensors"], self._frames[vertices], moved, error)
         displacement = np.zeros_like(layer.vertices)
         displacement[vertices] = moved
         peak_error = float((error * layer.thickness[vertices]).max(initial=0.0))
@@ -264,9 +268,6 @@ def _inputs(figures, shape, here, constants, mix_vectors, mix_tensors, low, high
     half, one = np.float32(0.5), np.float32(1)
     for n in range(len(figures)):
         g = _amplitude(figures[n])
-        if g < SURROUNDED:
-            out[n] = 0
-            continue
         vectors, tensors = np.empty((DIRECTIONS, 2), np.float32), np.empty((2 * TENSORS, 2), np.float32)
         v, t = np.empty((MIXED_VECTORS, 2), np.float32), np.empty((MIXED_TENSORS, 2), np.float32)
         _directions(figures[n], g, vectors, tensors)
@@ -348,20 +349,20 @@ def _activate(hidden, bias):
 
 
 @numba.njit(cache=True, fastmath=FAST)
-def _move(figures, shape, outputs, mix_vectors, mix_tensors, frames, moved, error):
+def _move(figures, shape, place, outputs, mix_vectors, mix_tensors, frames, moved, error):
     """Linear response to the columns' strain plus what the network adds, turned into the layer's frame, (N, 3) [m]."""
     for n in range(len(figures)):
         u, v, w = figures[n, 1, 0], figures[n, 1, 1], figures[n, 1, 2]
         g = _amplitude(figures[n])
         error[n] = 0
-        if g >= SURROUNDED:
+        if place[n] >= 0:
             vectors, tensors = np.empty((DIRECTIONS, 2), np.float32), np.empty((2 * TENSORS, 2), np.float32)
             mixed, t = np.empty((MIXED_VECTORS, 2), np.float32), np.empty((MIXED_TENSORS, 2), np.float32)
             _directions(figures[n], g, vectors, tensors)
             _mix(mix_vectors, vectors, mixed)
             _mix(mix_tensors, tensors, t)
             x = y = np.float32(0)
-            row, k = outputs[n], 1
+            row, k = outputs[place[n]], 1
             for m in range(DIRECTIONS):
                 x += row[k] * vectors[m, 0]
                 y += row[k] * vectors[m, 1]
