@@ -9,6 +9,7 @@ from fem_tools.patch import PatchFem
 from stmpl_core.contact import ToolMesh
 from stmpl_core.errors import InvalidInput
 from stmpl_core.layer import SoftLayer, Tissue
+from stmpl_core.methods.winkler import column_pressure
 from stmpl_core.sdf import SignedDistance
 from tests.scenes import limb, plate
 
@@ -60,6 +61,22 @@ def test_the_skin_is_nowhere_inside_the_tool(pressed):
     for answer in pressed:
         inside = -answer.tools[0].distance(answer.displacement + SoftLayer(*limb(4e-3), THICKNESS).vertices)
         assert inside.max() < 25e-6
+
+
+def test_a_point_that_sticks_stays_where_it_touched(pressed, layer):
+    early, late = pressed[2:4]
+    stuck = early.pressure > 0.2 * early.pressure.max()
+    before, after = (a.tools[0].to_tool((layer.vertices + a.displacement)[stuck]) for a in (early, late))
+    assert stuck.sum() > 5
+    assert np.linalg.norm(after - before, axis=1).max() < 0.01 * THICKNESS
+
+
+def test_deep_in_the_layer_a_ball_carries_less_than_confined_columns_would(pressed, layer):
+    """A ball presses the columns below it to all depths alike."""
+    for answer in pressed[2:]:
+        stretch = 1 - answer.depth / THICKNESS * np.linspace(0, 1, 201)
+        columns = column_pressure(stretch, layer.tissue).mean() / layer.tissue.youngs_modulus
+        assert 0.4 * columns < answer.trust.figures["mean_pressure_over_modulus"] < columns
 
 
 def test_the_tractions_sum_to_the_wrench(pressed, layer):

@@ -1,10 +1,11 @@
-"""The tools that robots press with, to 70 % of a real arm: sound, growing, no face in the tool by over 1 %."""
+"""How deep tools go: to 70 % of a real arm, to a mean pressure of 5 E, and what keeps skin out of them."""
 
 import numpy as np
 import pytest
 import trimesh
 
-from fem_tools.indenter import IndenterFem, Tool
+from benchmarks.indenters import BarrierLoad, FinerFem, Scene, ball, errors, flat
+from fem_tools.indenter import IndenterFem, Tool, ToolLoad
 from fem_tools.patch import PatchFem
 from stmpl_core.body import Body
 from stmpl_core.sdf import SignedDistance
@@ -59,3 +60,42 @@ def test_a_tool_goes_down_to_70_percent_of_the_arm(arm, name):
         assert answer.trust.ok, answer.trust.why
         assert answer.trust.figures["faces_entered_m"] <= 0.01 * THICKNESS
     assert answers[1].force > 2 * answers[0].force > 0
+
+
+def test_a_flat_tool_carries_a_mean_pressure_of_5_times_the_modulus():
+    scene = Scene("flat", lambda: flat(12, 5), edge=3.5e-3, rim=2.5)
+    layer, tool = scene.built()
+    solver = scene.solver(step=0.08).prepare(layer)
+    answers = list(solver.path([tool], np.array([0.5, 0.7, 0.87]) * scene.thickness))
+    assert len(answers) == 3
+    for answer in answers:
+        assert answer.trust.ok, answer.trust.why
+        assert answer.trust.figures["min_j"] > 0.1
+        assert answer.trust.figures["faces_entered_m"] <= 0.01 * scene.thickness
+    assert answers[0].force < answers[1].force < answers[2].force
+    assert answers[2].trust.figures["mean_pressure_over_modulus"] > 5
+
+
+def test_the_stated_bound_covers_what_a_finer_mesh_changes():
+    scene = Scene("ball", lambda: ball(6), thickness=4e-3)
+    ours, finer = PatchFem(refine=3, reach=3), FinerFem(refine=4, layers=2, reach=4, check_stability=False)
+    for error, bound, peak, _ in errors(
+        scene, IndenterFem(ours, step=0.1), IndenterFem(finer, step=0.1), np.array([0.3, 0.5])
+    ):
+        assert 0.002 * peak < error < bound < 5 * error
+
+
+@pytest.mark.parametrize("barrier", [False, True])
+def test_contact_pressure_is_minus_the_slope_of_its_energy_and_stiffness_that_of_the_pressure(barrier):
+    field = SignedDistance.of(tool_mesh(trimesh.creation.icosphere(subdivisions=2, radius=5.0)))
+    n, nothing = 9, np.zeros((9, 3))
+    load = ToolLoad(
+        Tool(field, np.eye(4), np.array([0, 0, 1.0])), np.ones(n), np.arange(n), np.arange(n), (1e6, 0.0),
+        np.full(n, 5.0), nothing * np.nan, np.full(n, np.inf),
+    )  # fmt: skip
+    load = BarrierLoad(load, 50e-6) if barrier else load
+    gap, by = np.linspace(3e-6, 60e-6, n) if barrier else np.linspace(-20e-6, 22e-6, n), 1e-9
+    below, here, above = (load.pressed(gap + shift) for shift in (-by, 0.0, by))
+    np.testing.assert_allclose(here[1], (below[0] - above[0]) / (2 * by), rtol=1e-5, atol=1e-6)
+    np.testing.assert_allclose(here[2], (below[1] - above[1]) / (2 * by), rtol=1e-5, atol=1e-3)
+    assert here[1][0] > 0 and here[1][-1] == 0
