@@ -112,8 +112,8 @@ class Scene:
         return SoftLayer(vertices, faces, self.thickness, tissue=tissue), Tool(field, pose, np.array([0, 0, -1.0]))
 
     def solver(self, *, step: float = 0.04) -> IndenterFem:
-        """Two wedges deep, edges down to an eighth of the layer's where the tool is curved."""
-        return IndenterFem(PatchFem(refine=3, reach=3, layers=2), step=step)
+        """Linear wedges, two deep, edges down to an eighth of the layer's where the tool is curved."""
+        return IndenterFem(PatchFem(element="P1xP2", layers=2, refine=3, reach=3), step=step)
 
 
 SCENES = (
@@ -126,7 +126,6 @@ SCENES = (
     Scene("flat 12 on a limb", lambda: flat(12, 3), limb=True),
     Scene("fingertip 8", lambda: fingertip(8, 14)),
     Scene("fingertip 8, thin", lambda: fingertip(8, 14), thickness=2.5e-3, edge=2e-3),
-    Scene("letter T 35", lambda: block_letter("T", 35), rounding=1.5e-3, edge=3e-3),
     Scene("letter T 35, thin", lambda: block_letter("T", 35), rounding=2e-3, thickness=2.5e-3, edge=2e-3),
 )
 
