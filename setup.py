@@ -32,6 +32,7 @@ REQUIRED = [
     "torch>=2.4",
     "trimesh>=4.4",
     "tyro>=0.9",
+    "viser>=1.1",
     "zarr>=3.0",
 ]
 ROS_WHEELS = [  # versions that resolve together: ROS 2 Jazzy as wheels for CPython 3.12
@@ -47,6 +48,7 @@ DEV = [
     "hypothesis>=6.100",
     "import-linter>=2.0",
     "meshio>=5.3",
+    "playwright>=1.45",  # drives the Chromium that is installed; it downloads none by itself
     "pyright>=1.1.380",
     "pytest>=8",
     "ruff>=0.6",
@@ -60,8 +62,8 @@ setup(
     description="Real-time soft-tissue contact for robots: a contact comes in, the deformed skin goes out.",
     license="Apache-2.0",
     python_requires=">=3.12,<3.13",
-    packages=["stmpl_core", "stmpl_core.methods", "fem_tools", "bags", "stmpl_ros"],
-    package_data={"stmpl_core": ["weights/*"]},
+    packages=["stmpl_core", "stmpl_core.methods", "fem_tools", "bags", "stmpl_ros", "stmpl_ros.view"],
+    package_data={"stmpl_core": ["weights/*"], "stmpl_ros": ["foxglove/*.json"]},
     data_files=[
         ("share/ament_index/resource_index/packages", ["resource/stmpl_ros"]),
         ("share/stmpl_ros", ["package.xml"]),

@@ -13,6 +13,7 @@ import tyro
 
 from stmpl_core.errors import InvalidInput, StmplError
 from stmpl_ros.parameters import METHODS, DemoConfig, NodeConfig, ProbeConfig, RecordConfig
+from stmpl_ros.view.config import ViewConfig
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -24,7 +25,7 @@ Flat = tyro.conf.arg(name="")  # a configuration whose fields are flags of the v
 BagPath = Annotated[Path, tyro.conf.Positional]  # a run's folder, or its .mcap file
 MethodName = Literal["fem", "moment_net", "unet", "linear", "winkler", "naive"]
 
-DEMO, NODE, PROBE = DemoConfig(), NodeConfig(), ProbeConfig()
+DEMO, NODE, PROBE, VIEW = DemoConfig(), NodeConfig(), ProbeConfig(), ViewConfig()
 
 _ros_arguments: list[str] = []
 
@@ -144,7 +145,7 @@ def recover(path: BagPath, target: Path | None = None) -> int:
 
 
 def generate(
-    preset: Literal["tiny", "default", "paper"] = "default",
+    preset: Literal["tiny", "default", "paper", "contacts"] = "default",
     out: Path | None = None,
     workers: int | None = None,
     scheduler: str | None = None,
@@ -173,7 +174,9 @@ def generate(
 
 
 def train(
-    preset: Literal["default", "paper", "paper-reduced", "paper-3-bodies", "paper-reduced-3-bodies"] = "default",
+    preset: Literal[
+        "default", "contacts", "paper", "paper-reduced", "paper-3-bodies", "paper-reduced-3-bodies"
+    ] = "default",
     data: Path = Path("data/default"),
     out: Path | None = None,
     steps: int | None = None,
@@ -186,8 +189,8 @@ def train(
     Several GPUs: torchrun --nproc-per-node 4 -m stmpl_ros.cli train --preset paper --data data/paper
 
     Args:
-        preset: default is ours (under an hour on two cores), paper the paper's UNet (a GPU), paper-reduced the same
-            code at a size for one core; 3-bodies: its second set-up.
+        preset: default and contacts are ours (under an hour on two cores), paper the paper's UNet (a GPU),
+            paper-reduced the same code at a size for one core; 3-bodies: its second set-up.
         data: folder of the data set; make it with stmpl generate.
         out: folder of the weights; runs/train/<preset> unless given.
         steps: of the optimiser; epochs for the paper's presets.
@@ -244,6 +247,22 @@ def tables(
     return 0
 
 
+def view(path: Annotated[Path | None, tyro.conf.Positional] = None, live: bool = False,
+         config: Annotated[ViewConfig, Flat] = VIEW) -> int:  # fmt: skip
+    """A page in the browser with the deforming skin: of a recording, of the running node, or under a tool to drag.
+
+    Example: stmpl view runs/latest
+    Live from the node: stmpl view --live. Without any robot: stmpl view --tool ball
+
+    Args:
+        path: a run's folder, or its .mcap file.
+        live: show what the running node answers.
+    """
+    from stmpl_ros.view.serve import run
+
+    return run(config, path, live, _ros_arguments)
+
+
 def stability(critical_load: bool = False, out: Path = Path("runs/critical_load.png"), as_json: Json = False) -> int:
     """Where the finite elements lose stability: follower, dead and indenter loads, beside the closed form.
 
@@ -270,8 +289,8 @@ def stability(critical_load: bool = False, out: Path = Path("runs/critical_load.
     return 0
 
 
-VERBS = {f.__name__: f for f in (demo, node, probe, record, replay, compare, info, recover, generate, train, tables,
-                                 stability)}  # fmt: skip
+VERBS = {f.__name__: f for f in (demo, node, probe, view, record, replay, compare, info, recover, generate, train,
+                                 tables, stability)}  # fmt: skip
 
 
 def main(arguments: list[str] | None = None) -> None:

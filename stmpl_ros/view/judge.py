@@ -1,0 +1,65 @@
+"""Judge: solves one instant again by finite elements, in a thread of its own."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from fem_tools import PatchFem
+from stmpl_core.errors import InvalidInput
+from stmpl_core.layer import SoftLayer
+from stmpl_core.load import Load
+from stmpl_core.trust import Displacement
+from stmpl_ros.view.latest import LatestWins
+from stmpl_ros.view.page import Page
+from stmpl_ros.view.snapshot import Snapshot
+
+
+class Judge:
+    """The button `FEM of this instant`, and what it does.
+
+    Args:
+        page: that gets the button, and shows the instant with its error when it is solved.
+        keep: called with the judged snapshot, so that whoever made it can show it again.
+    """
+
+    def __init__(self, page: Page, keep: Callable[[Snapshot, Snapshot], None]) -> None:
+        self._page, self._keep = page, keep
+        self._fem: tuple[SoftLayer, PatchFem] | None = None
+        self._working = LatestWins(self._judge, page.say, "judge")
+        button = page.server.gui.add_button("FEM of this instant", hint="Solves this pressure by finite elements")
+        button.on_click(lambda _: self.judge())
+
+    def judge(self) -> None:
+        """Solves what the page shows."""
+        if self._page.snapshot is None:
+            self._page.say("There is no instant to solve yet.")
+        else:
+            self._page.say("FEM is solving this instant ...")
+            self._working.put(self._page.snapshot)
+
+    def wait(self, timeout: float) -> bool:
+        """Waits until it is solved; False if that takes longer than `timeout` [s]."""
+        return self._working.wait(timeout)
+
+    def close(self) -> None:
+        """Ends its thread."""
+        self._working.close()
+
+    def _judge(self, snapshot: Snapshot) -> None:
+        judged = snapshot.judged_by(self._solve(snapshot.answer))
+        self._keep(snapshot, judged)
+        self._page.say("")
+        if self._page.snapshot is snapshot:
+            self._page.show(judged)
+            self._page.field = "error against FEM"
+
+    def _solve(self, answer: Displacement) -> Displacement:
+        layer = self._page.layer
+        if layer is None or answer.pressure is None:
+            raise InvalidInput("this answer does not say the pressure that it was solved for: FEM cannot solve it.")
+        if self._fem is None or self._fem[0] is not layer:
+            self._fem = layer, PatchFem().prepare(layer)
+        solved = self._fem[1].solve(Load.pressure(answer.pressure))
+        if not solved.trust.converged:
+            raise InvalidInput(f"FEM did not converge on this instant, so it cannot judge it. {solved.trust.why}")
+        return solved

@@ -1,0 +1,154 @@
+"""Recording: instants of a bag, evenly over it, and the slider that goes through them."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from bags.compare import Comparison
+from bags.messages import Frame
+from bags.pictures import spot_of
+from bags.reader import ContactLog
+from bags.survey import Survey, survey
+from stmpl_core.contact import Contact
+from stmpl_core.errors import BagError
+from stmpl_core.layer import SoftLayer
+from stmpl_core.trust import Displacement
+from stmpl_ros.view.judge import Judge
+from stmpl_ros.view.page import Page
+from stmpl_ros.view.snapshot import Gauge, Reading, Snapshot
+
+TICK = 0.05  # s between two steps of the play button
+SPEEDS = {"1/8": 0.125, "1/4": 0.25, "1/2": 0.5, "1": 1.0, "2": 2.0, "4": 4.0}
+
+
+@dataclass(frozen=True, eq=False)
+class Recording:
+    """Some instants of a run, in the order of time, and the layer that they are of."""
+
+    name: str
+    layer: SoftLayer
+    snapshots: tuple[Snapshot, ...]
+
+    @classmethod
+    def of(cls, path: Path | str, frames: int, *, compared: Comparison | None = None,
+           on_frame: Callable[[int, int], None] | None = None) -> Recording:
+        """Reads `frames` instants evenly over a bag, and those that a comparison solved.
+
+        Raises:
+            BagError: no recording, no answers in it, or no skin.
+        """
+        run = survey(path)
+        wanted = set(np.linspace(0, len(run.moments) - 1, min(frames, len(run.moments))).round().astype(int).tolist())
+        judged = {} if compared is None else {pair.frame.log_time_ns: pair.reference for pair in compared.judged}
+        gauge, snapshots = Gauge(run.bag.layer), []
+        for number, frame in enumerate(run.bag.frames()):
+            if number in wanted or frame.log_time_ns in judged:
+                snapshot = _snapshot(run, number, frame, gauge)
+                snapshots.append(replace(snapshot, reference=judged.get(frame.log_time_ns)))
+            if on_frame:
+                on_frame(number, len(run.moments))
+        snapshots.sort(key=lambda snapshot: snapshot.time)
+        return cls(str(run.bag.file), run.bag.layer, tuple(snapshots))
+
+    @property
+    def seconds(self) -> float:
+        """How long it lasts [s]."""
+        return self.snapshots[-1].time
+
+    def nearest(self, time: float) -> int:
+        """Number of the instant that is nearest to `time` [s]."""
+        return int(np.abs([snapshot.time - time for snapshot in self.snapshots]).argmin())
+
+
+class RecordingPlayer:
+    """A recording on a page: time slider, play button, speed.
+
+    Args:
+        page: that shows it.
+        recording: what it shows.
+    """
+
+    def __init__(self, page: Page, recording: Recording) -> None:
+        self.page, self.recording = page, recording
+        self.snapshots = list(recording.snapshots)
+        gui = page.server.gui
+        page.show_layer(recording.layer)
+        end = max(recording.seconds, 1e-3)
+        with page.controls:
+            self._slider = gui.add_slider(
+                "Time [s]", 0.0, round(end, 3), 1e-3, 0.0, marks=_marks(self.snapshots), hint="Dots: solved by FEM"
+            )
+            self._play = gui.add_button("Play")
+            self._speed = gui.add_dropdown("Speed", tuple(SPEEDS), initial_value="1")
+            self.judge = Judge(page, self._keep)
+        page.controls.label, page.controls.visible = "Recording", True
+        self._slider.on_update(lambda _: self.show(self._slider.value))
+        self._play.on_click(lambda _: self.toggle())
+        self._playing, self._closed = threading.Event(), threading.Event()
+        self._thread = threading.Thread(target=self._run, name="playing", daemon=True)
+        self._thread.start()
+        heaviest = max(self.snapshots, key=lambda snapshot: snapshot.force)
+        if heaviest.answer.pressure is not None and heaviest.answer.pressure.any():
+            spot = spot_of(recording.layer, heaviest.answer.pressure)
+            page.look_at(spot.centre, spot.normal)
+        self._slider.value = min(round(heaviest.time, 3), round(end, 3))
+        self.show(heaviest.time)
+
+    def show(self, time: float) -> None:
+        """Shows the instant nearest to `time` [s]."""
+        snapshot = self.snapshots[self.recording.nearest(time)]
+        self.page.show_tools(snapshot.contacts)
+        self.page.show(snapshot)
+        self.page.plot([(s.time, s.force, s.depth, s.peak) for s in self.snapshots], now=snapshot.time)
+
+    def toggle(self) -> None:
+        """Plays, or stops playing."""
+        if self._playing.is_set():
+            self._playing.clear()
+        else:
+            self._playing.set()
+        self._play.label = "Stop" if self._playing.is_set() else "Play"
+
+    def close(self) -> None:
+        """Ends its threads."""
+        self._closed.set()
+        self._playing.set()
+        self._thread.join()
+        self.judge.close()
+
+    def _keep(self, before: Snapshot, judged: Snapshot) -> None:
+        self.snapshots[self.snapshots.index(before)] = judged
+
+    def _run(self) -> None:
+        while self._playing.wait() and not self._closed.is_set():
+            started = time.monotonic()
+            self._closed.wait(TICK)
+            passed = (time.monotonic() - started) * SPEEDS[self._speed.value]
+            later = self._slider.value + passed
+            self._slider.value = round(later if later < self.recording.seconds else 0.0, 3)
+
+
+def _marks(snapshots: Sequence[Snapshot]) -> tuple[float, ...] | None:
+    return tuple(round(snapshot.time, 3) for snapshot in snapshots if snapshot.reference is not None) or None
+
+
+def _snapshot(run: Survey, number: int, frame: Frame, gauge: Gauge) -> Snapshot:
+    moment = run.moments[number]
+    answer = Displacement(frame.displacement, frame.trust, frame.method, frame.pressure, frame.statuses)
+    contacts = _contacts(run.contacts, frame)
+    readings = gauge.read(contacts) if contacts is not None else {n: Reading(s) for n, s in frame.statuses.items()}
+    return Snapshot(moment.time, answer, tuple(contacts or ()), readings, moment.solve_seconds, moment.latency)
+
+
+def _contacts(log: ContactLog, frame: Frame) -> list[Contact] | None:
+    """The contacts of an answer; None if the bag lacks one of them."""
+    try:
+        return log.at(frame)
+    except BagError:
+        return None

@@ -1,0 +1,87 @@
+"""Serves the viewer: a recording, the running node, or a tool to drag."""
+
+from __future__ import annotations
+
+import signal
+import threading
+from pathlib import Path
+
+from rich.console import Console
+
+from fem_tools import PatchFem
+from stmpl_core.errors import InvalidInput
+from stmpl_ros.parameters import METHODS
+from stmpl_ros.tables import compare_with_progress
+from stmpl_ros.view.config import ViewConfig
+from stmpl_ros.view.page import Page
+
+
+def run(config: ViewConfig, path: Path | None, live: bool, arguments: list[str] | None = None) -> int:
+    """Serves until SIGINT or SIGTERM.
+
+    Raises:
+        InvalidInput: a recording and the live node at once, or no such tool.
+        BagError: the recording cannot be shown.
+    """
+    if path is not None and live:
+        raise InvalidInput(f"either a recording ({path}) or --live is shown, not both. Leave one out.")
+    if live:
+        return _serve_live(config, arguments)
+    return _serve_recording(config, path) if path is not None else _serve_hands_on(config)
+
+
+def _serve_recording(config: ViewConfig, path: Path) -> int:
+    from stmpl_ros.view.recording import Recording, RecordingPlayer
+
+    compared = compare_with_progress(path, PatchFem(), config.fem) if config.fem else None
+    with Console(stderr=True).status(f"reading {path}"):
+        recording = Recording.of(path, config.frames, compared=compared)
+    page = Page(config.host, config.port, str(path))
+    return _until_stopped(page, RecordingPlayer(page, recording))
+
+
+def _serve_hands_on(config: ViewConfig) -> int:
+    from stmpl_ros.node import layer_of, published
+    from stmpl_ros.view.hands_on import HandsOn
+    from stmpl_ros.view.tools import tool_named
+
+    tool_named(config.tool)  # a wrong one is refused before the body is made
+    with Console(stderr=True).status("making the body"):
+        layer = published(layer_of(config.node))
+    page = Page(config.host, config.port, f"{config.node.part.replace('_', ' ')}, {config.node.method}")
+    return _until_stopped(page, HandsOn(page, layer, METHODS[config.node.method](), config.tool))
+
+
+def _serve_live(config: ViewConfig, arguments: list[str] | None) -> int:
+    from rclpy.experimental.events_executor import EventsExecutor
+
+    from stmpl_ros.spinning import ros, spin
+    from stmpl_ros.view.live import LiveNode
+
+    with ros(arguments) as stop:
+        page = Page(config.host, config.port, "the running node")
+        node, executor = LiveNode(page, config.patience), EventsExecutor()
+        executor.add_node(node)
+        _say_where(page)
+        try:
+            spin(executor, stop)
+        finally:
+            executor.shutdown()
+            node.close()
+            page.close()
+    return 0
+
+
+def _until_stopped(page: Page, shown) -> int:
+    stop = threading.Event()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: stop.set())
+    _say_where(page)
+    stop.wait()
+    shown.close()
+    page.close()
+    return 0
+
+
+def _say_where(page: Page) -> None:
+    Console().print(f"open {page.url} in a browser; Ctrl-C ends it", soft_wrap=True)
