@@ -18,13 +18,14 @@ from stmpl_core.arrays import VertexVectors
 from stmpl_core.chart import UvChart
 from stmpl_core.errors import InvalidInput
 from stmpl_core.layer import SoftLayer, Tissue
-from stmpl_core.load import Load
+from stmpl_core.load import Load, LoadKind
 
 FORMAT = 1
 QUANTUM = 1e-8  # m; displacements are stored as whole numbers of it
 MOVES = 1e-7  # m; vertices that move less are not stored (the paper's metric counts from 1e-6 m)
 CHUNK = 32_768  # rows of a ragged array that are read at once
 KINDS: tuple[Kind, ...] = ("pressure", "nodal", "indenter")
+LOADS: dict[Kind, LoadKind] = {"pressure": "pressure", "nodal": "nodal", "indenter": "contact"}
 SPLITS: tuple[Split, ...] = ("train", "val", "test", "ood", "held_out")
 FIGURES = ("ratio", "force_n", "peak_m", "discretisation_m", "truncation_m", "min_j")
 RAGGED = ("loaded", "values", "moved", "steps")  # of a Record
@@ -187,7 +188,7 @@ class _BodyStore:
         values, displacement = np.zeros(len(layer.vertices)), np.zeros_like(layer.vertices)
         values[self.rows["loaded"][a:b]] = self.rows["values"][a:b] * layer.tissue.youngs_modulus
         displacement[self.rows["moved"][c:d]] = self.rows["steps"][c:d] * QUANTUM
-        return Sample(layer, Load("nodal" if info["kind"] == "nodal" else "pressure", values), displacement, info)
+        return Sample(layer, Load(LOADS[info["kind"]], values), displacement, info)
 
 
 class Subset:

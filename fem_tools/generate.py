@@ -27,7 +27,7 @@ import zarr
 
 from fem_tools.dataset import FIGURES, FORMAT, RAGGED, Record, Writer, write_layer
 from fem_tools.hand import Hand
-from fem_tools.indenter import IndenterFem, Tool
+from fem_tools.indenter import INDENTER_LAYERS, IndenterFem, Tool
 from fem_tools.patch import PatchFem
 from fem_tools.sampling import BodyPlan, ContactId, Kind, Plan, contacts, draw, kinds_of, layers, ratios, split_of
 from fem_tools.scenes import Scene, Site, UnusableContact
@@ -86,7 +86,8 @@ class Bench:
         layer = SoftLayer(skin["vertices"], skin["faces"], skin["thickness"], tissue=skin["tissue"], chart=chart)
         pressing = PatchFem(reach=body.reach, refine=plan.refine).prepare(layer)
         paper_fem = PatchFem(reach=body.reach).prepare(layer)
-        indenting = IndenterFem(PatchFem(reach=body.reach, refine=INDENTER_REFINE)).prepare(layer)
+        pressed = PatchFem(reach=body.reach, refine=INDENTER_REFINE, layers=INDENTER_LAYERS)
+        indenting = IndenterFem(pressed, step=plan.indenter_step).prepare(layer)
         return cls(Site(layer), pressing, paper_fem, indenting)
 
 
@@ -163,11 +164,8 @@ def solve_indentations(bench: Bench, scene: Scene, wanted: np.ndarray) -> Iterat
     """The tool pressed in along its axis to these depths over thickness, sticking."""
     layer, pose = bench.site.layer, scene.pose_body_from_tool
     assert scene.mesh is not None
-    tool = Tool(SignedDistance.of(scene.mesh), pose, -pose[:3, 2])
-    under = np.linalg.norm(np.cross(layer.vertices - pose[:3, 3], pose[:3, 2]), axis=1)
-    facing = layer.normals @ pose[:3, 2] > 0
-    thickness = float(layer.thickness[np.where(facing, under, np.inf).argmin()])
-    answers = bench.indenter.path([tool], (wanted * thickness).tolist())
+    tool = Tool(SignedDistance.of(scene.mesh, rounding=scene.rounding), pose, -pose[:3, 2])
+    answers = bench.indenter.path([tool], (wanted * bench.site.thickness_under(pose)).tolist())
     for ratio, answer in zip(wanted, answers, strict=False):
         figures = dict(answer.trust.figures) | {"ratio": float(ratio)}
         load = Load.pressure(answer.pressure)

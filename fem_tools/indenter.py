@@ -34,6 +34,7 @@ SPREAD = 0.15  # thicknesses that skin is pushed aside before it is touched
 SHARE_FOR_STRETCH = 0.4  # of that, planned for at rest: edges grow by up to 1.7 where the skin wraps around a fillet
 MAX_UPDATES = 4
 MIN_J = 0.1  # below it an answer is not believed
+INDENTER_LAYERS = 2  # wedges through the thickness: one is 5 % off in force and 10 % in pressure, two 0.7 % in both
 # The stated bound: shares of the estimates and of the peak, fitted on 30 answers of one wedge deep against two deep on
 # half the edges; the peak's share was 0.011 until 12 held-out answers asked for more (docs/ground_truth.md).
 DISCRETISATION_SHARE, TRUNCATION_SHARE, PEAK_SHARE = 1.3, 0.35, 0.015
@@ -92,6 +93,15 @@ class Tool:
         turn = self.pose_body_from_tool[:3, :3]
         phi, gradient, hessian = self.field.distance_gradient_hessian(self.to_tool(points))
         return phi, gradient @ turn.T, turn @ hessian @ turn.T
+
+    def touching(self, layer: SoftLayer) -> Tool | None:
+        """The tool where it first touches the faces, or None: found with the vertices, then on the faces near."""
+        travel = self.travel_to_touch(layer.vertices)
+        if travel is not None:
+            close = self.at(travel).distance(layer.vertices) < 1.2 * layer.edge_length
+            corners = layer.vertices[layer.faces[close[layer.faces].any(axis=1)]]
+            travel = self.travel_to_touch(np.einsum("pk,fkx->fpx", _ON_FACE, corners).reshape(-1, 3))
+        return None if travel is None else self.at(travel)
 
     def travel_to_touch(self, points: Points, *, furthest: float = 0.2) -> float | None:
         """How far the tool goes until it first touches one of `points` [m] (negative: it must come back), or None.
@@ -246,7 +256,8 @@ class IndenterFem:
     """Presses rigid tools into a soft layer.
 
     Args:
-        fem: how the patch is meshed and solved; None: up to three refinements where the tool's curvature asks.
+        fem: how the patch is meshed and solved; None: two wedges deep, up to three refinements where the tool's
+            curvature asks.
         friction: "stick" (a touching point stays where it touched, until it is let go), "none", or Coulomb's
             coefficient with the limit taken from the last update of the pressure.
         step: longest step of the tools [thicknesses]; what touches first within a step sticks from its end on.
@@ -255,7 +266,7 @@ class IndenterFem:
     def __init__(self, fem: PatchFem | None = None, *, friction: Friction = "stick", step: float = 0.04) -> None:
         if not (friction in ("stick", "none") or (isinstance(friction, int | float) and 0 <= friction < 10)):
             raise InvalidInput(f'friction is {friction!r}; allowed are "stick", "none" or a coefficient in [0, 10).')
-        self.fem = fem or PatchFem(refine=3)
+        self.fem = fem or PatchFem(refine=3, layers=INDENTER_LAYERS)
         if not 0 < step <= 0.5:
             raise InvalidInput(f"step is {step} thicknesses; allowed is 0 < step <= 0.5.")
         self.friction: Friction = friction
@@ -343,7 +354,11 @@ class _Press:
         if not len(depths) or depths[0] <= 0 or (np.diff(depths) <= 0).any():
             raise InvalidInput(f"depths must be above 0 and increase; got {depths}.")
         self.solver, self.layer, self.fem = solver, layer, solver.fem
-        self.tools = [self._touching(k, tool) for k, tool in enumerate(tools)]
+        self.tools: list[Tool] = []
+        for number, tool in enumerate(tools):
+            if (touching := tool.touching(layer)) is None:
+                raise InvalidInput(f"tool {number} never meets the skin along its way {tool.direction}.")
+            self.tools.append(touching)
         deepest = float(depths[-1])
         reached = [tool.at(deepest).distance(layer.vertices) for tool in self.tools]
         footprint = np.flatnonzero(np.min(reached, axis=0) <= max(0.0, float(np.min(reached))))
@@ -389,18 +404,6 @@ class _Press:
         self.state = replace(self.state, loads=self._loads(0.0))
         self.last: Indentation | None = None
         self.stopped = ""
-
-    def _touching(self, number: int, tool: Tool) -> Tool:
-        """The tool where it first touches the faces: found with the vertices, then with points on the faces near."""
-        layer = self.layer
-        travel = tool.travel_to_touch(layer.vertices)
-        if travel is not None:
-            close = tool.at(travel).distance(layer.vertices) < 1.2 * layer.edge_length
-            corners = layer.vertices[layer.faces[close[layer.faces].any(axis=1)]]
-            travel = tool.travel_to_touch(np.einsum("pk,fkx->fpx", _ON_FACE, corners).reshape(-1, 3))
-        if travel is None:
-            raise InvalidInput(f"tool {number} never meets the skin along its way {tool.direction}.")
-        return tool.at(travel)
 
     def to(self, depth: float) -> Indentation:
         """Walks to `depth` and says what is there."""

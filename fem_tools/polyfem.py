@@ -50,13 +50,14 @@ def export(folder: str | Path, layer: SoftLayer, load: Load, fem: TetFem | None 
     tags = [(HELD, face) for face in held_faces(mesh, held)]
     tags += [(HELD + 1 + k, mesh.triangles[face]) for k, face in enumerate(loaded)]
     (where / FACES).write_text("".join(f"{tag} {a} {b} {c}\n" for tag, (a, b, c) in tags))
-    if load.kind == "pressure":
+    kind = "nodal" if load.kind == "nodal" else "pressure"
+    if kind == "pressure":
         values = [float(p) for p in corner[loaded].mean(axis=1)]
     else:
         traction = patch.interpolate(load.forces_on(layer) / layer.vertex_areas[:, None])
         values = traction[mesh.triangles[loaded]].mean(axis=1).tolist()
     scene = where / SCENE
-    scene.write_text(json.dumps(problem(layer, load.kind, values), indent=2) + "\n")
+    scene.write_text(json.dumps(problem(layer, kind, values), indent=2) + "\n")
     return scene
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import math
 import string
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import cache
 from typing import Any, Literal
@@ -13,18 +13,19 @@ from typing import Any, Literal
 import numpy as np
 import trimesh
 from pydantic import BaseModel, ConfigDict, Field
+from scipy.spatial.transform import Rotation
 
 from fem_tools.hand import Hand
-from fem_tools.scenes import EDGE, Scene, Site, UnusableContact, ellipse, letter
+from fem_tools.scenes import EDGE, Scene, Site, UnusableContact, ellipse, extruded, letter
 from stmpl_core.body import Body
 from stmpl_core.contact import ToolMesh
 from stmpl_core.layer import SoftLayer, Tissue
 
 Kind = Literal["pressure", "nodal", "indenter"]
-SetName = Literal["disc", "ellipse", "seam", "field", "indenter", "hand", "band", "letter"]
+SetName = Literal["disc", "ellipse", "seam", "field", "indenter", "tool", "hand", "band", "letter"]
 Split = Literal["train", "val", "test", "ood", "held_out"]
 
-IN_DISTRIBUTION: tuple[SetName, ...] = ("disc", "ellipse", "seam", "field", "indenter")
+IN_DISTRIBUTION: tuple[SetName, ...] = ("disc", "ellipse", "seam", "field", "indenter", "tool")
 OUT_OF_DISTRIBUTION: tuple[SetName, ...] = ("hand", "band", "letter")
 SHARES = (0.8, 0.9)  # of the contacts of a set on a body: training up to the first, validation up to the second
 ATTEMPTS = 60  # at a contact before it is given up
@@ -36,6 +37,10 @@ DEPTHS = (3e-3, 5e-3)  # m, that a grasping hand sinks in
 REGIONS = (10e-3, 45e-3)  # m, radii of uneven pressures
 WAVES = (15e-3, 60e-3)  # m, their wavelengths
 BALLS = (8e-3, 20e-3)  # m, radii of rounded indenters
+TOOLS = ("sphere", "ellipsoid", "capsule", "cylinder", "box", "hull", "letter")  # of the set "tool"
+SIZES = (4e-3, 25e-3)  # m, half their width
+FILLETS = (1.5e-3, 4e-3)  # m, of their edges
+TILT = 0.25  # rad, of a tool's axis and of its way
 
 
 class BodyPlan(BaseModel):
@@ -48,6 +53,7 @@ class BodyPlan(BaseModel):
     thickness: float | tuple[float, float]  # m; two: varies smoothly between them
     poisson_ratio: float = Field(default=0.4, ge=0, lt=0.5)
     part: str | None = None  # of the body; None: the plan's
+    edge_length: float | None = None  # m, of the skin; None: the plan's
     reach: float = Field(default=6.0, gt=0)  # largest thicknesses under the load
     share: float = Field(default=1.0, gt=0, le=1)  # of the plan's contacts
     paper_rule: bool = True  # the same contacts once more as the paper loads them
@@ -73,12 +79,29 @@ OTHER_LIMBS = tuple(
                                  ("thigh", 0.7, (2.5e-3, 12.5e-3), 0.37, "right_thigh"))
 )  # fmt: skip
 
+CONTACT_BODIES = tuple(
+    BodyPlan(name=name, weight=w, thickness=t, poisson_ratio=nu, part=part, edge_length=edge, share=share,
+             reach=6.0 if isinstance(t, tuple) else 4.5, paper_rule=False, out_of_distribution=False,
+             held_out=part is not None)
+    for name, w, t, nu, edge, share, part in (
+        ("even_5", 0.0, 5e-3, 0.4, 3e-3, 1.0, None),
+        ("even_75", 0.5, 7.5e-3, 0.4, 4e-3, 1.0, None),
+        ("even_10", 1.0, 10e-3, 0.4, 4e-3, 1.0, None),
+        ("varying_25", 0.25, (2.5e-3, 12.5e-3), 0.4, 3e-3, 1.0, None),
+        ("nu_30", 0.5, (2.5e-3, 12.5e-3), 0.3, 4e-3, 1.0, None),
+        ("nu_35", 0.75, (2.5e-3, 12.5e-3), 0.35, 3e-3, 1.0, None),
+        ("nu_45", 0.1, (4e-3, 12.5e-3), 0.45, 4e-3, 0.15, None),
+        ("calf", 0.4, 8e-3, 0.4, 4e-3, 0.2, "left_calf"),
+        ("thigh", 0.7, (2.5e-3, 12.5e-3), 0.37, 3e-3, 0.2, "right_thigh"),
+    )
+)  # fmt: skip
+
 
 class Plan(BaseModel):
     """Everything that decides what is generated: the same plan gives the same data.
 
     Args:
-        discs, ellipses, seams, fields, indenters: contacts a body.
+        discs, ellipses, seams, fields, indenters, tools: contacts a body.
         hands, bands, letters: contacts in all, shared among the bodies.
         loads, loads_out_of_distribution: of each contact.
     """
@@ -95,6 +118,7 @@ class Plan(BaseModel):
     seams: int = 555
     fields: int = 0  # uneven pressures without a tool
     indenters: int = 0
+    tools: int = 0  # rigid tools of all shapes, pressed in at a slant
     hands: int = 395
     bands: int = 40
     letters: int = 273
@@ -103,6 +127,7 @@ class Plan(BaseModel):
     highest_pressure: float = Field(default=1.5, gt=0)  # p / E, of follower pressures
     highest_nodal: float = Field(default=0.4, gt=0)  # p / E at the worst vertex, of the paper's rule
     deepest: float = Field(default=0.7, gt=0, lt=1)  # thicknesses, of indenters
+    indenter_step: float = Field(default=0.04, gt=0)  # thicknesses, of indenters
     seed: int = 0
 
     def body(self, name: str) -> BodyPlan:
@@ -124,6 +149,8 @@ PRESETS = {
                  fields=1, indenters=1, hands=1, bands=1, letters=1, loads=3, loads_out_of_distribution=2),
     "default": Plan(preset="default", discs=150, ellipses=24, seams=44, fields=40, indenters=5),
     "paper": Plan(preset="paper", bodies=PAPER_BODIES + VARYING_BODIES[:2], indenters=40),
+    "contacts": Plan(preset="contacts", bodies=CONTACT_BODIES, discs=0, ellipses=0, seams=0, hands=0, bands=0,
+                     letters=0, tools=40, loads=7, deepest=0.65, indenter_step=0.08),
 }  # fmt: skip
 
 
@@ -174,19 +201,19 @@ def _shuffled(seed: int, body: str, name: SetName, count: int) -> list[int]:
 
 def kinds_of(plan: Plan, contact: ContactId) -> tuple[Kind, ...]:
     """How the contact presses: contacts by tools press once more as the paper's do."""
-    if contact.set == "indenter":
+    if contact.set in ("indenter", "tool"):
         return ("indenter",)
     paper = plan.body(contact.body).paper_rule and contact.set != "field"
     return ("pressure", "nodal") if paper else ("pressure",)
 
 
 def layers(plan: Plan) -> dict[str, SoftLayer]:
-    """The soft layer of each body, by its name; those of one part have the same vertices and faces: one chart."""
-    patches = {part: Body.anny(weight=0.5).patch(part, plan.edge_length)
-               for part in dict.fromkeys(body.part or plan.part for body in plan.bodies)}  # fmt: skip
+    """The soft layer of each body, by its name; those of one part and edge length share a chart."""
+    kinds = {body.name: (body.part or plan.part, body.edge_length or plan.edge_length) for body in plan.bodies}
+    patches = {kind: Body.anny(weight=0.5).patch(*kind) for kind in dict.fromkeys(kinds.values())}
     out = {}
     for body in plan.bodies:
-        patch, skin = patches[body.part or plan.part], Body.anny(weight=body.weight)
+        patch, skin = patches[kinds[body.name]], Body.anny(weight=body.weight)
         tissue, thickness = Tissue(poisson_ratio=body.poisson_ratio), body.thickness
         if isinstance(thickness, tuple):
             rng = ContactId(body.name, "disc", -2).rng(plan.seed)
@@ -253,6 +280,8 @@ def _draw_once(
         drawn |= {"turn": side + float(rng.normal(0.0, 0.35)), "depth": float(rng.uniform(*DEPTHS)),
                   "loose": loose.round(4).tolist()}  # fmt: skip
         return site.grasp(vertex, hand, drawn["turn"], drawn["depth"], np.array(drawn["loose"])), drawn
+    if contact.set == "tool":
+        return _draw_tool(vertex, turn, site, rng, drawn)
     drawn |= {"tool": str(rng.choice(["sphere", "capsule", "cylinder"])), "radius": float(rng.uniform(*BALLS))}
     mesh = rounded_tool(drawn["tool"], drawn["radius"])
     pose = site.standing(vertex, drawn["radius"], turn)
@@ -260,6 +289,82 @@ def _draw_once(
     if (gap := float(site.border_distance[vertex])) < 6 * layer.thickness[vertex] + drawn["radius"]:
         raise UnusableContact(f"it stands {gap * 1e3:.0f} mm from the open border")
     return Scene(mesh, pose, np.zeros(len(area))), drawn
+
+
+def _draw_tool(
+    vertex: int, turn: float, site: Site, rng: np.random.Generator, drawn: dict[str, Any]
+) -> tuple[Scene, dict[str, Any]]:
+    size = float(np.exp(rng.uniform(math.log(SIZES[0]), math.log(SIZES[1]))))
+    drawn |= {"tool": str(rng.choice(TOOLS)), "size": size, "shape": rng.uniform(0, 1, 8).round(4).tolist(),
+              "tilt": rng.uniform(-TILT, TILT, 2).round(4).tolist(),
+              "slant": rng.uniform(-TILT, TILT, 2).round(4).tolist()}  # fmt: skip
+    scene = tool_scene(site, drawn)
+    assert scene.mesh is not None
+    radius = float(np.linalg.norm(scene.mesh.vertices, axis=1).max())
+    if (gap := float(site.border_distance[vertex])) < 5 * site.layer.thickness[vertex] + min(radius, 2 * SIZES[1]):
+        raise UnusableContact(f"it stands {gap * 1e3:.0f} mm from the open border")
+    return scene, drawn
+
+
+def tool_scene(site: Site, drawn: Mapping[str, Any]) -> Scene:
+    """The tool of the set "tool" that these figures describe, above its vertex; it goes against its z axis."""
+    mesh, rounding = any_tool(drawn)
+    pose = site.standing(drawn["vertex"], drawn["size"], drawn["turn"])
+    lean = np.eye(4)
+    lean[:3, :3] = Rotation.from_euler("xy", drawn["slant"]).as_matrix()
+    pose = pose @ lean
+    pose[:3, 3] += (float(np.linalg.norm(mesh.vertices, axis=1).max()) + EDGE) * pose[:3, 2]
+    return Scene(mesh, pose, np.zeros(len(site.layer.vertices)), rounding)
+
+
+def any_tool(drawn: Mapping[str, Any]) -> tuple[ToolMesh, float]:
+    """The tool of the set "tool" that these figures describe, z up and tilted, about its middle; and its rounding [m].
+
+    Args:
+        drawn: tool, one of TOOLS; size, half its width [m]; shape, eight numbers in [0, 1]; tilt about x and y [rad].
+    """
+    r, shape = 1e3 * float(drawn["size"]), np.asarray(drawn["shape"])  # mm: trimesh drops small triangles
+    fillet = 1e3 * (FILLETS[0] + (FILLETS[1] - FILLETS[0]) * float(shape[0]))
+    name, rounding = drawn["tool"], 0.0
+    if name in ("sphere", "ellipsoid"):
+        mesh = trimesh.creation.icosphere(4, r)
+        if name == "ellipsoid":
+            mesh.apply_scale([1.0, 0.4 + 0.6 * shape[1], 0.3 + 1.2 * shape[2]])
+    elif name == "capsule":
+        long = r * (0.5 + 3.5 * shape[1])
+        mesh = trimesh.creation.capsule(long, 0.6 * r, count=[48, 48])
+        mesh.apply_translation([0, 0, -long / 2])
+        mesh.apply_transform(trimesh.transformations.rotation_matrix(np.pi / 2, [0, 1, 0]))
+    elif name == "cylinder":
+        mesh = _hull(_circle(r), fillet, 24.0)
+    elif name == "box":
+        x, y = r, r * (0.3 + 0.7 * shape[1])
+        mesh = _hull(np.array([[x, y], [x, -y], [-x, -y], [-x, y]]), fillet, 24.0)
+    elif name == "hull":  # of balls at random places: smooth, convex, like nothing else
+        rng = np.random.default_rng((1e4 * shape).astype(np.int64))
+        radii, centres = r * rng.uniform(0.2, 0.6, 5), r * rng.uniform(-0.7, 0.7, (5, 3))
+        ball = trimesh.creation.icosphere(3, 1.0).vertices
+        mesh = trimesh.convex.convex_hull((radii[:, None, None] * ball + centres[:, None]).reshape(-1, 3))
+    else:
+        made = extruded(letter(string.ascii_uppercase[int(25.99 * shape[1])], 2e-3 * max(r, 10.0)), -10e-3, 10e-3)
+        mesh, rounding = trimesh.Trimesh(1e3 * made.vertices, made.faces, process=False), min(1e-3 * fillet, 2.5e-3)
+    tilt = Rotation.from_euler("xy", drawn["tilt"]).as_matrix()
+    return ToolMesh.of(1e-3 * np.asarray(mesh.vertices) @ tilt.T, np.asarray(mesh.faces)), rounding
+
+
+def _circle(radius: float) -> np.ndarray:
+    angle = np.linspace(0, 2 * np.pi, 72, endpoint=False)
+    return radius * np.column_stack([np.cos(angle), np.sin(angle)])
+
+
+def _hull(outline: np.ndarray, fillet: float, height: float) -> trimesh.Trimesh:
+    """A convex prism over an outline (N, 2) with all edges rounded: the hull of balls at its corners."""
+    reach = np.linalg.norm(outline, axis=1)
+    inner = outline * (1 - np.minimum(fillet / reach, 0.9))[:, None]
+    ball = trimesh.creation.icosphere(3, min(fillet, 0.9 * float(reach.min()))).vertices
+    low, high = -height / 2 + fillet, height / 2 - fillet
+    centres = np.concatenate([np.column_stack([inner, np.full(len(inner), z)]) for z in (low, high)])
+    return trimesh.convex.convex_hull((centres[:, None] + ball).reshape(-1, 3))
 
 
 def rounded_tool(name: str, radius: float) -> ToolMesh:

@@ -44,11 +44,13 @@ class Scene:
         mesh: of the tool, in its own frame; None where a pressure was drawn without one.
         pose_body_from_tool: (4, 4).
         footprint: how much of the tool's pressure each vertex gets, (V,), 0 to 1.
+        rounding: of the tool's edges where it is pressed in as a rigid one [m].
     """
 
     mesh: ToolMesh | None
     pose_body_from_tool: Transform
     footprint: PerVertex
+    rounding: float = 0.0
 
     @property
     def covered(self) -> np.ndarray:
@@ -79,6 +81,12 @@ class Site:
         """Pose of a tool that stands on a vertex: z along the mean normal within `radius`, x turned by `turn` [rad]."""
         normal = self.layer.vertex_area_vectors[self.near(vertex, radius)].sum(axis=0)
         return frame(self.layer.vertices[vertex], normal, self.axis(vertex), turn)
+
+    def thickness_under(self, pose: Transform) -> float:
+        """Of the layer, at the vertex nearest to the z axis of `pose` on the side that it comes from [m]."""
+        layer = self.layer
+        away = np.linalg.norm(np.cross(layer.vertices - pose[:3, 3], pose[:3, 2]), axis=1)
+        return float(layer.thickness[np.where(layer.normals @ pose[:3, 2] > 0, away, np.inf).argmin()])
 
     def axis(self, vertex: int, radius: float = 0.05) -> np.ndarray:
         """The limb's axis there: what the skin's normals within `radius` [m] have least of, (3,) [-]."""

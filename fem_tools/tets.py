@@ -247,7 +247,7 @@ class TetFem(PatchFem):
         """The equations of a patch under a load."""
         layer = prepared(self._layer, self)
         mesh: Any = self.tets(patch)
-        if load.kind == "pressure":
+        if load.kind != "nodal":
             pressing = FollowerPressure(mesh, patch.interpolate(load.values))
         elif self.refine == 0:
             pressing = DeadForces.at_vertices(mesh, load.forces_on(layer)[patch.vertices])

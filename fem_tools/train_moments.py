@@ -13,7 +13,7 @@ import torch
 from pydantic import BaseModel, ConfigDict, Field
 from torch import Tensor, nn
 
-from fem_tools.dataset import Dataset
+from fem_tools.dataset import LOADS, Dataset
 from fem_tools.provenance import commit, data_card, machine, versions
 from fem_tools.sampling import Kind
 from stmpl_core.layer import SoftLayer
@@ -46,7 +46,7 @@ class MomentTraining(BaseModel):
 
     Args:
         hidden: width of each of the three hidden layers.
-        kinds: of load; rigid tools that stick also pull along the skin, which a pressure does not tell.
+        kinds: of load; rigid tools that stick also pull along the skin, so they have a network of their own.
         points: vertices drawn of each sample, most from where it moves.
         steps, batch, learning_rate: of Adam, the rate rising to this and falling in one cycle.
         seed: of weights, points and order.
@@ -121,12 +121,12 @@ def _points(near: Surroundings, layer: SoftLayer, load: Load, displacement: np.n
 class Model(nn.Module):
     """The network of stmpl_core.methods.moment_net, in torch: the same inputs, in the same order, with gradients."""
 
-    def __init__(self, hidden: int) -> None:
+    def __init__(self, hidden: int, outputs: int = OUTPUTS) -> None:
         super().__init__()
         self.mix_vectors = nn.Parameter(torch.randn(MIXED_VECTORS, DIRECTIONS) / DIRECTIONS**0.5)
         self.mix_tensors = nn.Parameter(torch.randn(MIXED_TENSORS, 2 * TENSORS) / (2 * TENSORS) ** 0.5)
         self.layers = nn.ModuleList(
-            nn.Linear(a, b) for a, b in ((INPUTS, hidden), (hidden, hidden), (hidden, hidden), (hidden, OUTPUTS))
+            nn.Linear(a, b) for a, b in ((INPUTS, hidden), (hidden, hidden), (hidden, hidden), (hidden, outputs))
         )
         nn.init.zeros_(self.layers[-1].weight)  # type: ignore[arg-type]
         nn.init.zeros_(self.layers[-1].bias)  # type: ignore[arg-type]
@@ -174,18 +174,25 @@ class Model(nn.Module):
     def forward(self, rows: Tensor) -> tuple[Tensor, Tensor]:
         """Motion over thickness in the vertex's frame (N, 3), and log of the error to expect of it over g (N,)."""
         inputs, g, vectors, turned, curved, slope, prior = self._inputs(rows)
+        out, doubt = self._think(inputs)
+        coefficients = out[:, 1:-2, None]
+        directions = torch.cat([vectors, turned, curved], dim=1)
+        along = (coefficients * directions).sum(dim=1) + out[:, -2:-1] * slope
+        a = AMPLITUDE * g / (1 + g)
+        log_error = doubt + torch.log(a[:, 0].detach())
+        return prior + a * torch.cat([along, out[:, :1]], dim=1), log_error
+
+    def outputs(self, rows: Tensor) -> tuple[Tensor, Tensor]:
+        """The last layer alone, (N, outputs), and its last column once more, learnt without bending the others."""
+        return self._think(self._inputs(rows)[0])
+
+    def _think(self, inputs: Tensor) -> tuple[Tensor, Tensor]:
         h = (torch.minimum(torch.maximum(inputs, self.low), self.high) - self.mean) * self.scale
         for layer in self.layers[:-1]:  # type: ignore[index]
             h = layer(h)
             h = h * (0.5 + 0.5 * h / (1 + h.abs()))
         last: Any = self.layers[-1]
-        out = last(h)
-        coefficients = out[:, 1:-2, None]
-        directions = torch.cat([vectors, turned, curved], dim=1)
-        along = (coefficients * directions).sum(dim=1) + out[:, -2:-1] * slope
-        a = AMPLITUDE * g / (1 + g)
-        log_error = last.weight[-1] @ h.detach().T + last.bias[-1] + torch.log(a[:, 0].detach())
-        return prior + a * torch.cat([along, out[:, :1]], dim=1), log_error
+        return last(h), last.weight[-1] @ h.detach().T + last.bias[-1]
 
     def weights(self, card: dict[str, Any]) -> Weights:
         """What the method loads."""
@@ -249,14 +256,20 @@ def fit(points: Points, settings: MomentTraining, out: Path, on_progress: OnProg
 
 
 def train_moments(
-    data: str | Path, out: str | Path, settings: MomentTraining | None = None, *, on_progress: OnProgress | None = None
+    data: str | Path,
+    out: str | Path,
+    settings: MomentTraining | None = None,
+    *,
+    name: str = "moment_net",
+    on_progress: OnProgress | None = None,
 ) -> dict[str, Any]:
-    """Trains a MomentNet on a data set, and writes out/moment_net.safetensors with its card moment_net.json.
+    """Trains a MomentNet on a data set, and writes out/`name`.safetensors with its card `name`.json.
 
     Args:
         data: folder of a finished data set (stmpl generate).
         out: folder; what it holds of the same run is used again.
         settings: what is learnt and how; None: the defaults.
+        name: of the files.
         on_progress: called often.
 
     Returns:
@@ -286,7 +299,7 @@ def train_moments(
     }
     weights = model.weights(card)
     card["bound"] = calibrate(source, weights, settings.kinds, said)
-    weights.save(out / "moment_net.safetensors")
+    weights.save(out / f"{name}.safetensors")
     (out / "moment_net.checkpoint").unlink(missing_ok=True)
     return card
 
@@ -302,13 +315,13 @@ def _ranges(data: Dataset, settings: MomentTraining) -> dict[str, list[float]]:
         "thickness_mm": [1e3 * float(t.min()), 1e3 * float(t.max())],
         "edge_over_thickness": [float(min(e.min() for e in edges)), float(max(e.max() for e in edges))],
     }
-    for kind in ("pressure", "nodal"):
+    for kind, load in LOADS.items():
         subset = data.split("train", kind=kind)
         highest = 0.0
         for k in range(0, len(subset), max(1, len(subset) // 400)):
             sample = subset[k]
             highest = max(highest, sample.load.peak_ratio(sample.layer))
-        out[f"p_over_e_{kind}"] = [0.0, round(highest, 4) if kind in settings.kinds else 0.0]
+        out[f"p_over_e_{load}"] = [0.0, round(highest, 4) if kind in settings.kinds else 0.0]
     return out
 
 

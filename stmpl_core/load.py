@@ -12,18 +12,29 @@ from stmpl_core.arrays import PerVertex, VertexVectors, finite
 from stmpl_core.errors import InvalidInput
 from stmpl_core.layer import SoftLayer
 
+LoadKind = Literal["pressure", "contact", "nodal"]
+
 
 @dataclass(frozen=True, eq=False)
 class Load:
-    """One scalar a vertex, pressing inwards where positive. Make it with `Load.pressure` or `Load.nodal`."""
+    """One scalar a vertex, pressing inwards where positive. Make it with `pressure`, `contact` or `nodal`."""
 
-    kind: Literal["pressure", "nodal"]
+    kind: LoadKind
     values: PerVertex
 
     @classmethod
     def pressure(cls, p: ArrayLike) -> Load:
         """Pressure at each vertex, (V,) [Pa], along the *deformed* normal (a follower load)."""
         return cls("pressure", finite("pressure", p, (None,)))
+
+    @classmethod
+    def contact(cls, p: ArrayLike) -> Load:
+        """What rigid tools that the skin sticks to press with at each vertex, (V,) [Pa].
+
+        A pressure, but one that comes with a pull along the skin: it keeps what is touched from spreading under the
+        tool. Methods that do not know of it take it for a follower pressure.
+        """
+        return cls("contact", finite("pressure", p, (None,)))
 
     @classmethod
     def nodal(cls, f: ArrayLike) -> Load:
@@ -48,13 +59,13 @@ class Load:
 
     def pressure_on(self, layer: SoftLayer) -> PerVertex:
         """The equivalent pressure at rest, (V,) [Pa]: nodal forces are divided by the vertex areas."""
-        return self.values if self.kind == "pressure" else self.values / layer.vertex_areas
+        return self.values / layer.vertex_areas if self.kind == "nodal" else self.values
 
     def forces_on(self, layer: SoftLayer) -> VertexVectors:
         """The forces on the skin at rest, (V, 3) [N]; their sum is what the load presses with."""
-        if self.kind == "pressure":
-            return -self.values[:, None] * layer.vertex_area_vectors
-        return -self.values[:, None] * layer.normals
+        if self.kind == "nodal":
+            return -self.values[:, None] * layer.normals
+        return -self.values[:, None] * layer.vertex_area_vectors
 
     def peak_ratio(self, layer: SoftLayer) -> float:
         """Largest |p| / E [-], the one number that decides how nonlinear the answer is."""

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import NamedTuple
+from typing import NamedTuple, Self
+from weakref import WeakKeyDictionary
 
 import numba
 import numpy as np
@@ -57,6 +58,9 @@ class Felt(NamedTuple):
         return self.figures[:, :, first : first + 2 * TENSORS].reshape(*self.figures.shape[:2], 2, TENSORS)
 
 
+_made: WeakKeyDictionary[SoftLayer, Surroundings] = WeakKeyDictionary()
+
+
 class Surroundings:
     """A layer's vertices with their frames and their neighbours: made once, then asked for every load.
 
@@ -85,15 +89,43 @@ class Surroundings:
         self._response = np.ascontiguousarray(np.moveaxis(response_table(layer.tissue.poisson_ratio), 2, 0))
         with packed():
             self._felt(np.zeros((1, len(points))), moments=True)
+            self.felt_among(np.zeros(1, np.int64), np.zeros((1, 2)))
 
     def felt(self, sources: np.ndarray) -> Felt:
         """What the vertices feel of source fields (V, S) [-], in units of Young's modulus."""
         return Felt(*self._felt(np.asarray(sources).T, moments=True))
 
+    def felt_among(self, vertices: np.ndarray, sources: np.ndarray) -> Felt:
+        """What vertices (N,) feel of sources at themselves alone, (N, S) [-]: on one thread, for small contacts."""
+        figures = np.zeros((len(vertices), sources.shape[1], WIDTH), dtype=np.float32)
+        values = np.ascontiguousarray(sources.T, dtype=np.float32)
+        _feel_few(vertices, values, np.ascontiguousarray(self._sites[:, vertices]), self._sites, self._frames,
+                  self._response[0], self._response[1], True, figures)  # fmt: skip
+        return Felt(vertices, figures)
+
     def linear(self, source: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """The linear response alone to one field (V,) [-]: the vertices that feel it (N,), and (N, 3) as in Felt."""
         vertices, figures = self._felt(source[None], moments=False)
         return vertices, figures[:, 0, :3]
+
+    @classmethod
+    def of(cls, layer: SoftLayer) -> Self:
+        """The surroundings of a layer, made on the first call and kept as long as the layer is."""
+        if layer not in _made:
+            _made[layer] = cls(layer)
+        return _made[layer]  # type: ignore[return-value]
+
+    def sinking(self, vertices: np.ndarray) -> np.ndarray:
+        """How far vertex i sinks under a unit source at vertex j of those given, in thicknesses, (N, N) [-]."""
+        out = np.zeros((len(vertices), len(vertices)), dtype=np.float32)
+        sources = np.ascontiguousarray(self._sites[:, vertices])
+        _sink_between(vertices, sources, self._sites, self._frames, self._response[0], self._response[1], out)
+        return out
+
+    def spread(self, sources: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Vectors at vertices (V, 3) spread over the skin as sinking spreads: the vertices reached (N,), and (N, 3)."""
+        vertices, figures = self._felt(sources.T, moments=False)
+        return vertices, -figures[:, :, 2]
 
     def _felt(self, fields: np.ndarray, moments: bool) -> tuple[np.ndarray, np.ndarray]:
         loaded = np.flatnonzero(fields.any(axis=0))
@@ -255,7 +287,6 @@ _RINGS[:, 8 : 8 + VECTORS] = ring_table()[:, SCALARS : SCALARS + VECTORS]
 _RINGS[:, 16 : 16 + TENSORS] = ring_table()[:, SCALARS + VECTORS :]
 
 
-@numba.njit(cache=True, parallel=True, fastmath=FAST)
 def _feel(vertices, values, sources, sites, frames, sink, away, moments, out):
     """See Surroundings.felt; values (S, K) and sources (10, K) are those of the loaded vertices, `out` (N, S, WIDTH).
 
@@ -279,6 +310,21 @@ def _feel(vertices, values, sources, sites, frames, sink, away, moments, out):
                 out[n, s, 0], out[n, s, 1], out[n, s, 2] = u, v, w
             if moments:
                 _take_moments(count, values, felt, kept, sums, out[n])
+
+
+_feel_few = numba.njit(cache=True, fastmath=FAST)(_feel)
+_feel = numba.njit(cache=True, parallel=True, fastmath=FAST)(_feel)
+
+
+@numba.njit(cache=True, fastmath=FAST)
+def _sink_between(vertices, sources, sites, frames, sink, away, out):
+    """See Surroundings.sinking."""
+    many = len(vertices)
+    felt, kept = np.empty((9, many), dtype=np.float32), np.empty(many + 1, dtype=np.int32)
+    for n in range(many):
+        count = _gather(vertices[n], sources, sites, frames, sink, away, felt, kept)
+        for q in range(count):
+            out[n, kept[q]] = felt[7, q]
 
 
 @numba.njit(inline="always", fastmath=FAST)

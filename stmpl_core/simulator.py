@@ -7,14 +7,17 @@ from weakref import WeakKeyDictionary
 
 import numpy as np
 
+from stmpl_core.conform import Conformed, conform
 from stmpl_core.contact import Contact, ToolMesh
 from stmpl_core.errors import InvalidInput
 from stmpl_core.layer import SoftLayer
 from stmpl_core.load import Load
 from stmpl_core.methods.base import Method
 from stmpl_core.sdf import MARGIN, SignedDistance
-from stmpl_core.touch import MAX_RATIO, Touch, Toucher
+from stmpl_core.touch import Touch, Toucher
 from stmpl_core.trust import Displacement, Trust
+
+ENTERED = 0.02  # of the thickness: skin further inside a tool than this is said
 
 
 class Simulator:
@@ -53,33 +56,38 @@ class Simulator:
             raise InvalidInput(f"contacts must have names of their own; got {', '.join(names)}.")
 
         # Touch: each tool's mesh, pose and wrench become a pressure on the skin.
-        touches = [self._toucher.touch(contact, self.prepare_tool(contact.mesh)) for contact in contacts]
+        fields = [self.prepare_tool(contact.mesh) for contact in contacts]
+        touches = self._toucher.touch_all(contacts, fields)
 
         # Sum: pressures of several tools add.
         pressure = sum((touch.load.values for touch in touches), np.zeros(len(self.layer.vertices)))
-        load = Load.pressure(pressure)
+        load = Load.contact(pressure)
 
-        # Solve: the method moves the skin; where nothing presses, nothing moves.
+        # Solve: the method moves the skin, and what is touched lies on its tool; where nothing presses, nothing moves.
         if load.values.any():
             answer = self.method.solve(load)
+            fitted = conform(self._toucher.net.near, answer.displacement, touches, fields)
         else:
             answer = Displacement(np.zeros_like(self.layer.vertices), Trust(), self.method.name)
+            fitted = Conformed(answer.displacement, 0.0, 0.0)
 
         # Say what may be believed: what the method says, and what was found of each contact.
-        trust = _joined(answer.trust, dict(zip(names, touches, strict=True)))
-        if len(touches) > 1 and load.peak_ratio(self.layer) > MAX_RATIO:
-            trust = trust.also(f"together the tools press with p/E = {load.peak_ratio(self.layer):.2g}", in_range=False)
+        trust = _joined(answer.trust, dict(zip(names, touches, strict=True)), fitted)
+        if fitted.entered > ENTERED * float(self.layer.thickness.min()):
+            trust = trust.also(f"skin is {fitted.entered * 1e3:.2f} mm inside a tool", in_range=False)
         statuses = {name: touch.status for name, touch in zip(names, touches, strict=True)}
-        return Displacement(answer.displacement, trust, answer.method, load.values, statuses)
+        return Displacement(fitted.displacement, trust, answer.method, load.values, statuses)
 
 
-def _joined(trust: Trust, touches: dict[str, Touch]) -> Trust:
+def _joined(trust: Trust, touches: dict[str, Touch], fitted: Conformed) -> Trust:
     """The method's trust, lowered by that of the contacts; their figures carry their names.
 
     The method's error bound is for the pressure that it was given. How far that is from what the tools press with is
     not known, so it becomes a figure, and the answer states no bound.
     """
     figures = dict(trust.figures)
+    if touches:
+        figures |= {"conformed_m": fitted.corrected, "entered_m": fitted.entered}
     if touches and trust.error_bound is not None:
         figures["bound_given_pressure_m"] = trust.error_bound
     for name, touch in touches.items():

@@ -1,42 +1,44 @@
-"""Toucher: turns a Contact (mesh, pose, wrench) into a Load on the skin, and says what it found."""
+"""Toucher: turns Contacts (mesh, pose, wrench) into Loads on the skin, and says what it found."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
-import fcl
-import numba
 import numpy as np
 
-from stmpl_core.arrays import PerVertex, Transform
+from stmpl_core.arrays import Transform, Wrench
+from stmpl_core.columns import Clearance, Columns, Squeeze
 from stmpl_core.contact import Contact
+from stmpl_core.contact_net import ContactNet
 from stmpl_core.layer import SoftLayer
 from stmpl_core.load import Load
-from stmpl_core.methods.winkler import column_pressure
-from stmpl_core.sdf import SignedDistance, distance_at
+from stmpl_core.sdf import SignedDistance
 from stmpl_core.trust import Trust
 
-TOUCHING = "touching"  # the wrench is shared over the skin that the tool covers
+TOUCHING = "touching"  # the wrench is carried by the skin under the tool
 MOVED = "moved to touch"  # as above, after the tool was moved along its push to meet the skin
-BY_POSE = "pressed by pose"  # no wrench given: the pressure follows from how deep the pose is
+BY_POSE = "pressed by pose"  # no wrench given: the force follows from how deep the pose is
 APART = "apart"  # no wrench to carry, and no touch
 NO_FORCE = "no force"  # the pose touches, the wrench is exactly zero
 PULLING = "pulling"  # the wrench draws the tool off the skin; nothing sticks, so nothing is loaded
 NO_TOUCH = "wrench without touch"  # a force, but no skin within reach along it
 WRAPPED = "wrapped around"  # the tool closes around the limb: a wrench does not say how hard it squeezes
+IN_CORE = "inside the core"  # the pose reaches through the soft layer into what is rigid; the layer is pressed flat
 
-REACH = 3e-3  # m that a pressing tool may be moved to meet the skin: what calibration may be off by
+REACH = 3e-3  # m that a pressing tool may be off: what calibration may leave
 HOLE = 0.6  # of an edge: a tool that comes this near to a vertex cannot slip between vertices (equilateral: 0.577)
-STEEPEST = 2.0  # slope of the skin at a tool's edge: depth grows this much per unit of depth into the tool
-DEEPEST = 0.9  # of the thickness; columns are not pressed further
 SLACK = 0.25  # of a hole: a curved tool that touches between vertices is this far from them, and was not moved
 NEARLY = 1e-6  # m; nearer than this is touching
 FACING = 0.1  # cosine between push and inward normal from which the skin faces a tool that looks for it
 ONE_SIDED = 0.1  # a contact whose pressures cancel to less than this share has no direction
 SIDEWAYS = 0.3  # of the normal force: more tangential force than this is worth a word
 ROUGH = 5e-4  # m: a tool whose distance field is off by more than this is worth a word
-MAX_RATIO = 2.0  # p / E up to which smooth follower pressures were solved on every site tried
+STRANGE = 0.1  # of the force: carried by vertices that see what no training contact had
+DEEP = 0.85  # of the thickness: a wrench presses no deeper
+SAME_FORCE = 5e-3  # of the force: how near the depth is sought; what is left is scaled away
+TRIALS = 12  # of the depth
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,283 +48,277 @@ class Touch:
     Args:
         load: a follower pressure.
         status: one of the constants of this module.
-        trust: figures are depth_m (of the pose's deepest point; negative when apart, missing when far), moved_m
-            (along the push), normal_n (carried), tangential_n and torque_nm (asked for, not carried).
+        trust: figures are depth_m (of the deepest column, at the pose that is answered for; negative when apart,
+            missing when far), moved_m (from the stated pose, along the push), normal_n (carried), force_error_n (to
+            expect of what the pose presses with), tangential_n and torque_nm (asked for, not carried).
+        wrench: force [N] and torque about the tool's origin [N m] that the tool exerts on the body, (6,).
+        pose_body_from_tool: that is answered for, (4, 4).
+        squeeze: of the columns there.
+        way: unit vector of the force that moved the tool, (3,), or None where the pose alone was given.
     """
 
     load: Load
     status: str
     trust: Trust
+    wrench: Wrench
+    pose_body_from_tool: Transform
+    squeeze: Squeeze
+    way: np.ndarray | None = None
 
 
-class Covered(NamedTuple):
-    """Vertices under a tool, and how deep it reaches into their columns."""
+class _Placed(NamedTuple):
+    """A tool where it presses, before its neighbours are known."""
 
-    vertices: np.ndarray  # (N,)
-    clearance: np.ndarray  # (N,) [m], least signed distance along the column
-    depth: np.ndarray  # (N,) [m], from the skin at rest to the tool, along the inward normal
+    contact: Contact
+    field: SignedDistance
+    status: str
+    pose: Transform
+    depth: float  # of the stated pose [m]
+    moved: float  # [m]
+    squeeze: Squeeze
+    force: float | None  # to be carried along the mean normal [N]; None: what the pose presses with
+    why: str = ""
 
 
 class Toucher:
-    """Finds the skin that a tool covers, and shares its force over it.
+    """Finds the skin that tools cover, and what presses them back.
 
-    A tool covers a vertex when the column under it, skin to core, enters the tool, counted from the core: so a tool
-    thinner than the layer may be pressed under the skin's rest position, and the far side of the limb stays free.
-    The wrench is shared as the columns would share it: by area and by the pressure of Winkler's law at their
-    depth, scaled to the wrench's component along the mean contact normal. A tool that is less deep than a hole of
-    the skin's mesh is grown to be so, and at sharp edges the depth falls off at a slope of 2: the load changes
-    continuously while the tool slides, and no vertex pops in or out.
+    A tool covers a column when the column, skin to core, enters it, counted from the core: so a tool thinner than the
+    layer may be pressed under the skin's rest position, and the far side of the limb stays free. How far the columns
+    are squeezed is sampled between the vertices (Columns), so the load changes continuously while the tool slides; what
+    holds them so is Winkler's pressure, corrected by a network trained on finite elements (ContactNet).
+
+    Without a wrench the pose decides. With one, its component along the mean contact normal is carried: the tool is
+    moved along the force until it presses as hard as the wrench says; the stated pose is a first guess.
 
     Args:
         layer: the skin.
-        reach: how far a pressing tool that does not touch is moved along its push [m].
+        reach: how far a pressing tool may be from where its force says that it is [m].
     """
 
     def __init__(self, layer: SoftLayer, *, reach: float = REACH) -> None:
         self.layer, self.reach = layer, reach
         self.hole = HOLE * layer.edge_length
+        self.columns, self.net = Columns(layer), ContactNet(layer)
+        self._modulus = layer.tissue.youngs_modulus
         self._thickest = float(layer.thickness.max())
-        self._points, self._inward = layer.vertices, np.ascontiguousarray(-layer.normals)
-        model = fcl.BVHModel()
-        model.beginModel(len(layer.vertices), len(layer.faces))
-        model.addSubModel(layer.vertices, layer.faces)
-        model.endModel()
-        self._skin = fcl.CollisionObject(model)
+        self._inward = self.columns.inward
 
     def touch(self, contact: Contact, field: SignedDistance) -> Touch:
-        """The load of `contact`, whose tool has the distance field `field`."""
+        """The load of one contact alone, whose tool has the distance field `field`."""
+        return self.touch_all([contact], [field])[0]
+
+    def touch_all(self, contacts: Sequence[Contact], fields: Sequence[SignedDistance]) -> list[Touch]:
+        """The loads of several contacts at once: tools side by side feel each other through the skin."""
+        placed = [self._place(contact, field) for contact, field in zip(contacts, fields, strict=True)]
+        pressing = [one for one in placed if len(one.squeeze.vertices)]
+        if len(pressing) == 1:
+            together = pressing[0].squeeze
+        elif pressing:
+            together = _joined([one.squeeze for one in pressing], len(self.layer.vertices))
+        else:
+            return [self._answer(one, np.empty(0), np.empty(0), 0.0) for one in placed]
+        held = self.net.hold(together.vertices, together.pressure, together.strain)
+        share, out = held.pressure / together.pressure, []
+        for one in placed:
+            at = np.searchsorted(together.vertices, one.squeeze.vertices)
+            pressure = one.squeeze.pressure * share[at] * self._modulus
+            doubt = one.squeeze.pressure * held.doubt[at] / together.pressure[at] * self._modulus
+            strange = float(pressure[held.outside[at]].sum() / max(pressure.sum(), 1e-300))
+            out.append(self._answer(one, pressure, doubt, strange))
+        return out
+
+    def _place(self, contact: Contact, field: SignedDistance) -> _Placed:
+        """Where the tool presses, or why it does not."""
         pose = contact.pose_body_from_tool
-        near = self._near(field, pose)
-        clearance = self._clearance(field, pose, near)
-        depth = -float(clearance.min(initial=np.inf))
-        if contact.wrench is None:
-            return self._by_pose(contact, field, near, clearance, depth)
-        force = contact.wrench[:3]
+        clearance = self._clearance(field, pose, self.reach if contact.wrench is not None else 0.0)
+        depth = -float(clearance.least.min(initial=np.inf))
+
+        def nothing(status: str) -> _Placed:
+            return _Placed(contact, field, status, pose, depth, 0.0, _NO_SQUEEZE, 0.0)
+
+        force = contact.wrench[:3] if contact.wrench is not None else None
+        if force is None:
+            if not len((squeeze := self.columns.squeeze(field, pose, clearance)).vertices):
+                return nothing(APART)
+            return _Placed(contact, field, self._status_by_pose(squeeze), pose, depth, 0.0, squeeze, None)
         if not force.any():
-            return self._nothing(contact, APART if depth <= 0 else NO_FORCE, depth)
-        moved, pose = self._move_to_touch(field, pose, near, clearance, force)
-        if moved is None:
-            return self._nothing(contact, NO_TOUCH, depth)
-        if moved > 0:
-            near = self._near(field, pose)
-            clearance = self._clearance(field, pose, near)
-        return self._by_wrench(contact, field, pose, near, clearance, depth, moved)
+            return nothing(APART if depth <= 0 else NO_FORCE)
+        gap = self._gap(field, pose, clearance, force)
+        if gap is None:
+            return nothing(NO_TOUCH)
+        return self._pressed(contact, field, depth, gap, force) or nothing(PULLING)
 
-    def _near(self, field: SignedDistance, pose: Transform) -> np.ndarray:
-        """Broad phase: numbers of the vertices whose columns may meet the tool's box; empty if FCL finds no overlap."""
-        reach = self._thickest + self.hole + self.reach
-        low, high = field.tool_bounds
-        box = fcl.Box(*(high - low + 2 * reach))
-        centre = pose[:3, :3] @ ((low + high) / 2) + pose[:3, 3]
-        if not fcl.collide(self._skin, fcl.CollisionObject(box, fcl.Transform(pose[:3, :3], centre))):
-            return np.empty(0, np.int64)
-        return _inside_box(self._points, pose, low - reach, high + reach)
+    def _status_by_pose(self, squeeze: Squeeze) -> str:
+        return IN_CORE if (squeeze.depth >= self.layer.thickness[squeeze.vertices]).any() else BY_POSE
 
-    def _clearance(self, field: SignedDistance, pose: Transform, near: np.ndarray) -> np.ndarray:
-        """Least signed distance along the column of each vertex in `near` [m]; inf where the tool cannot reach."""
-        return _clearances(field.coefficients, field.origin, field.spacing, pose, self._points, self._inward,
-                           self.layer.thickness, near, self.hole)
+    def _clearance(self, field: SignedDistance, pose: Transform, reach: float = 0.0) -> Clearance:
+        near = self.columns.near(field, pose, self._thickest + self.hole + reach)
+        return self.columns.clearance(field, pose, near, self.hole + reach)
 
-    def _cover(self, field: SignedDistance, pose: Transform, near: np.ndarray, clearance: np.ndarray,
-               grown: float) -> Covered:
-        """The vertices that the tool, grown by `grown` [m], covers."""
-        some = clearance < grown
-        vertices, clearance = near[some], clearance[some]
-        depth = _depths(field.coefficients, field.origin, field.spacing, pose, self._points, self._inward,
-                        self.layer.thickness, vertices, grown)
-        return Covered(vertices, clearance, np.minimum(depth, STEEPEST * (grown - clearance)))
+    def _gap(self, field: SignedDistance, pose: Transform, clearance: Clearance, force: np.ndarray) -> float | None:
+        """How far a tool that is apart must go along `force` to be 0 from the skin that faces it, by sphere tracing.
 
-    def _column_pressure(self, covered: Covered) -> PerVertex:
-        """Winkler's pressure at those depths, (V,) [Pa]."""
-        pressure = np.zeros(len(self.layer.vertices))
-        share = np.clip(covered.depth / self.layer.thickness[covered.vertices], 0, DEEPEST)
-        pressure[covered.vertices] = column_pressure(1 - share, self.layer.tissue)
-        return np.maximum(pressure, 0.0)
-
-    def _move_to_touch(self, field: SignedDistance, pose: Transform, near: np.ndarray, clearance: np.ndarray,
-                       force: np.ndarray) -> tuple[float | None, Transform]:
-        """Moves a tool that is apart along `force` until its distance to the facing skin is 0, by sphere tracing.
-
-        A tool that passes between vertices stays where it is nearest. None: it comes no nearer than a hole of the mesh.
+        0 where it touches. A tool that passes between vertices stops where it is nearest. None: it comes no nearer
+        than a hole of the mesh within `reach` [m].
         """
-        if clearance.min(initial=np.inf) <= 0:
-            return 0.0, pose
+        if clearance.least.min(initial=np.inf) <= 0:
+            return 0.0
         push = force / np.linalg.norm(force)
-        facing = near[self._inward[near] @ push > FACING]
-        moved, shifted = 0.0, pose.copy()
-        best, nearest, there = None, self.hole, pose
+        facing = clearance.vertices[self._inward[clearance.vertices] @ push > FACING]
+        moved, best, nearest = 0.0, None, self.hole
         while moved <= self.reach:
-            shifted[:3, 3] = pose[:3, 3] + moved * push
-            gap = float(self._clearance(field, shifted, facing).min(initial=np.inf))
+            there = self.columns.clearance(field, _shifted(pose, moved * push), facing, self.reach + self.hole)
+            gap = float(there.least.min(initial=np.inf))
             if gap < nearest:
-                best, nearest, there = moved, gap, shifted.copy()
+                best, nearest = moved, gap
             if gap < NEARLY:
                 break
             moved += gap
-        return best, there
+        return best
 
-    def _by_wrench(self, contact: Contact, field: SignedDistance, pose: Transform, near: np.ndarray,
-                   clearance: np.ndarray, depth: float, moved: float) -> Touch:
-        assert contact.wrench is not None
-        covered = self._cover(field, pose, near, clearance, max(0.0, self.hole + float(clearance.min())))
-        shape = self._column_pressure(covered)
-        vector = -(shape @ self.layer.vertex_area_vectors)
-        size = float(np.linalg.norm(vector))
-        if size <= ONE_SIDED * float(shape @ self.layer.vertex_areas):
-            return self._nothing(contact, WRAPPED, depth)
-        force = contact.wrench[:3]
-        normal = float(force @ vector) / size
-        if normal <= 0:
-            return self._nothing(contact, PULLING, depth)
-        load = Load.pressure(shape * (normal / size))
-        status = MOVED if moved > SLACK * self.hole else TOUCHING
-        return Touch(load, status, self._trust(contact, field, load, depth, moved))
+    def _pressed(self, contact: Contact, field: SignedDistance, depth: float, gap: float,
+                 force: np.ndarray) -> _Placed | None:  # fmt: skip
+        """The tool moved along `force` until it presses with its component along the contact normal.
 
-    def _by_pose(self, contact: Contact, field: SignedDistance, near: np.ndarray, clearance: np.ndarray,
-                 depth: float) -> Touch:
-        if depth <= 0:
-            return self._nothing(contact, APART, depth)
-        covered = self._cover(field, contact.pose_body_from_tool, near, clearance, 0.0)
-        load = Load.pressure(self._column_pressure(covered))
-        trust = self._trust(contact, field, load, depth, 0.0).also(
-            f"{contact.name} has no wrench: its force is that of columns, which press up to twice too hard")
-        return Touch(load, BY_POSE, trust)
+        The force grows about as a power of the depth: each trial takes the next from the last two, inside a bracket.
+        None: the force points away from the skin.
+        """
+        layer, push, start = self.layer, force / np.linalg.norm(force), contact.pose_body_from_tool
+        low, high, moved, last, best = -np.inf, np.inf, gap, None, None
+        touch_at: float | None = gap if gap > 0 else None
+        why = ""
+        for _ in range(TRIALS):
+            pose = _shifted(start, moved * push)
+            squeeze = self.columns.squeeze(field, pose, self._clearance(field, pose))
+            v = squeeze.vertices
+            steep = self._inward[v] @ push
+            if not len(v) or not (steep > FACING).any():
+                if best is None and touch_at is None and gap == 0.0 and len(v):
+                    return None
+                low = max(low, moved)
+                moved += 0.05 * self._thickest if not np.isfinite(high) else 0.5 * (high - moved)
+                continue
+            if touch_at is None:
+                touch_at = moved - float((squeeze.depth / np.maximum(steep, FACING)).max())
+            pressure = self.net.hold(v, squeeze.pressure, squeeze.strain).pressure * self._modulus
+            vector = -(pressure @ layer.vertex_area_vectors[v])
+            size = float(np.linalg.norm(vector))
+            if size <= ONE_SIDED * float(pressure @ layer.vertex_areas[v]):
+                return _Placed(contact, field, WRAPPED, start, depth, 0.0, _NO_SQUEEZE, 0.0)
+            normal = float(force @ vector) / size
+            if normal <= 0:
+                return None
+            status = MOVED if gap > SLACK * self.hole else TOUCHING
+            best = _Placed(contact, field, status, pose, depth, moved, squeeze, normal, why)
+            if abs(size / normal - 1) < SAME_FORCE:
+                break
+            deepest = float((squeeze.depth / layer.thickness[v]).max())
+            if size < normal:
+                if deepest > DEEP - 0.01:
+                    why = (f"{contact.name} asks for {normal:.2g} N along the skin's normal; pressed to "
+                           f"{deepest:.0%} of the layer it has {size:.2g} N")
+                    best = best._replace(why=why)
+                    break
+                low = moved
+            else:
+                high = moved
+            below = max(moved - touch_at, 1e-6)
+            power = 1.5 if last is None else np.log(size / last[1]) / np.log(below / last[0])
+            power = float(np.clip(power if np.isfinite(power) else 1.5, 0.8, 4.0))
+            last = (below, size)
+            most = below * DEEP / max(deepest, 1e-3) if size < normal else np.inf
+            following = touch_at + min(below * float(np.clip((normal / size) ** (1 / power), 0.2, 4.0)), most)
+            moved = following if low < following < high else 0.5 * (low + high)
+        return best
 
-    def _nothing(self, contact: Contact, status: str, depth: float) -> Touch:
-        """No load, and why."""
-        trust = Trust(figures=_figures(contact, np.zeros(3), np.zeros(3), depth, 0.0))
+    def _answer(self, one: _Placed, pressure: np.ndarray, doubt: np.ndarray, strange: float) -> Touch:
+        """The load of a placed tool, scaled to its wrench, with what may be believed of it."""
+        layer, v = self.layer, one.squeeze.vertices
+        if one.force is not None and len(v):
+            vector = pressure @ layer.vertex_area_vectors[v]
+            scale = one.force / max(float(np.linalg.norm(vector)), 1e-300)
+            pressure, doubt = scale * pressure, scale * doubt
+        values = np.zeros(len(layer.vertices))
+        values[v] = pressure
+        forces = -pressure[:, None] * layer.vertex_area_vectors[v]
+        arms = layer.vertices[v] - one.pose[:3, 3]
+        turning = arms.T @ forces  # its antisymmetric part is the torque
+        torque = (turning[1, 2] - turning[2, 1], turning[2, 0] - turning[0, 2], turning[0, 1] - turning[1, 0])
+        wrench = np.array([*forces.sum(axis=0), *torque])
+        trust = self._trust(one, wrench, pressure, doubt, strange)
+        force = one.contact.wrench[:3] if one.contact.wrench is not None else np.zeros(3)
+        way = force / np.linalg.norm(force) if force.any() else None
+        return Touch(Load.pressure(values), one.status, trust, wrench, one.pose, one.squeeze, way)
+
+    def _trust(self, one: _Placed, wrench: Wrench, pressure: np.ndarray, doubt: np.ndarray, strange: float) -> Trust:
+        contact, name, layer, card = one.contact, one.contact.name, self.layer, self.net.weights.card
+        squeezed = one.squeeze.depth
+        depth = float(squeezed.max()) if len(squeezed) and squeezed.any() else one.depth
+        error = float(card["bound"]["factor"]) * float(doubt @ layer.vertex_areas[one.squeeze.vertices])
+        trust = Trust(figures=_figures(contact, wrench, depth, one.moved, error))
         why = {
-            NO_TOUCH: f"{contact.name} presses, but no skin is within {self.reach * 1e3:g} mm along its force",
-            PULLING: f"{contact.name} pulls: nothing is taken to stick, so nothing is loaded",
-            WRAPPED: f"{contact.name} closes around the limb: its wrench does not say how hard it squeezes; "
+            NO_TOUCH: f"{name} presses, but no skin is within {self.reach * 1e3:g} mm along its force",
+            PULLING: f"{name} pulls: nothing is taken to stick, so nothing is loaded",
+            WRAPPED: f"{name} closes around the limb: its wrench does not say how hard it squeezes; "
                      "give each finger as a contact, or leave the wrench out",
-        }
-        if status in why:
-            trust = trust.also(why[status], in_range=False if status != PULLING else None)
-        return Touch(Load.zero(self.layer), status, trust)
-
-    def _trust(self, contact: Contact, field: SignedDistance, load: Load, depth: float, moved: float) -> Trust:
-        some = load.loaded
-        forces = -load.values[some, None] * self.layer.vertex_area_vectors[some]
-        arms = self.layer.vertices[some] - contact.pose_body_from_tool[:3, 3]
-        figures = _figures(contact, forces.sum(axis=0), np.cross(arms, forces).sum(axis=0), depth, moved)
-        trust, name = Trust(figures=figures), contact.name
-        ratio = load.peak_ratio(self.layer)
-        if ratio > MAX_RATIO:
-            trust = trust.also(f"{name} presses with p/E = {ratio:.2g}; pressure loads were solved by FEM up to "
-                               f"{MAX_RATIO:g}", in_range=False)
-        if moved > SLACK * self.hole:
-            trust = trust.also(f"{name} was moved {moved * 1e3:.1f} mm along its force to touch: check its calibration")
-        if depth > self._thickest:
-            trust = trust.also(f"{name} reaches {depth * 1e3:.1f} mm deep, past the layer: check its pose or the "
-                               "thickness", in_range=False)
-        if figures["tangential_n"] > SIDEWAYS * figures["normal_n"]:
-            trust = trust.also(f"{name} also drags with {figures['tangential_n']:.2g} N, which is not carried")
-        if field.surface_error > ROUGH:
-            trust = trust.also(f"the distance field of {name} is off by up to {field.surface_error * 1e3:.1f} mm")
-        if not field.watertight:
+            IN_CORE: f"{name} reaches {depth * 1e3:.1f} mm deep, into the rigid core: check its pose or the thickness",
+        }  # fmt: skip
+        if one.status in why:
+            trust = trust.also(why[one.status], in_range=False if one.status != PULLING else None)
+        if one.why:
+            trust = trust.also(one.why, in_range=False)
+        if not len(pressure):
+            return trust
+        ratio, highest = float(pressure.max()) / self._modulus, card["ranges"]["p_over_e"][1]
+        if ratio > highest:
+            trust = trust.also(f"{name} presses with p/E = {ratio:.2g}; contacts were learnt up to {highest:.2g}",
+                               in_range=False)  # fmt: skip
+        deepest = float((squeezed / layer.thickness[one.squeeze.vertices]).max())
+        if deepest > card["ranges"]["depth_over_thickness"][1] and one.status != IN_CORE:
+            trust = trust.also(f"{name} presses to {deepest:.0%} of the thickness, learnt is "
+                               f"{card['ranges']['depth_over_thickness'][1]:.0%}", in_range=False)  # fmt: skip
+        nu, (low, high) = layer.tissue.poisson_ratio, card["ranges"]["poisson_ratio"]
+        if not low - 1e-3 <= nu <= high + 1e-3:
+            trust = trust.also(f"contacts were learnt at Poisson's ratios from {low:g} to {high:g}, not {nu:g}",
+                               in_range=False)  # fmt: skip
+        if strange > STRANGE:
+            trust = trust.also(f"{strange:.0%} of the force of {name} is where no training contact was like it",
+                               in_range=False)  # fmt: skip
+        if abs(one.moved) > self.reach:
+            trust = trust.also(f"{name} was moved {one.moved * 1e3:+.1f} mm along its force: check its calibration")
+        if trust.figures["tangential_n"] > SIDEWAYS * trust.figures["normal_n"]:
+            trust = trust.also(f"{name} also drags with {trust.figures['tangential_n']:.2g} N, which is not carried")
+        if one.field.surface_error > ROUGH:
+            error_mm = one.field.surface_error * 1e3
+            trust = trust.also(f"the distance field of {name} is off by up to {error_mm:.1f} mm")
+        if not one.field.watertight:
             trust = trust.also(f"the mesh of {name} has holes")
         return trust
 
 
-def _figures(contact: Contact, force: np.ndarray, torque: np.ndarray, depth: float, moved: float) -> dict[str, float]:
-    asked = np.zeros(6) if contact.wrench is None else contact.wrench
-    missing = np.zeros(6) if contact.wrench is None else asked - np.concatenate([force, torque])
-    figures = {"moved_m": moved, "normal_n": float(np.linalg.norm(force)),
+_NO_SQUEEZE = Squeeze(np.empty(0, np.int64), np.empty(0), np.empty(0), np.empty(0))
+
+
+def _shifted(pose: Transform, by: np.ndarray) -> Transform:
+    out = pose.copy()
+    out[:3, 3] += by
+    return out
+
+
+def _joined(squeezes: Sequence[Squeeze], count: int) -> Squeeze:
+    """Several tools' squeezes as one: two tools share a vertex only where each has a part of its triangles."""
+    pressure, strain, depth = np.zeros(count), np.zeros(count), np.zeros(count)
+    for one in squeezes:
+        pressure[one.vertices] += one.pressure
+        strain[one.vertices] += one.strain
+        depth[one.vertices] = np.maximum(depth[one.vertices], one.depth)
+    v = np.flatnonzero(pressure)
+    return Squeeze(v, pressure[v], strain[v], depth[v])
+
+
+def _figures(contact: Contact, wrench: Wrench, depth: float, moved: float, error: float) -> dict[str, float]:
+    missing = np.zeros(6) if contact.wrench is None else contact.wrench - wrench
+    figures = {"moved_m": moved, "normal_n": float(np.linalg.norm(wrench[:3])), "force_error_n": error,
                "tangential_n": float(np.linalg.norm(missing[:3])), "torque_nm": float(np.linalg.norm(missing[3:]))}
     return {"depth_m": depth} | figures if np.isfinite(depth) else figures
-
-
-@numba.njit(cache=True, inline="always")
-def _to_tool(pose, x, y, z):
-    """Coordinates in the tool's frame of a point of the body's."""
-    a, b, c = x - pose[0, 3], y - pose[1, 3], z - pose[2, 3]
-    return (pose[0, 0] * a + pose[1, 0] * b + pose[2, 0] * c, pose[0, 1] * a + pose[1, 1] * b + pose[2, 1] * c,
-            pose[0, 2] * a + pose[1, 2] * b + pose[2, 2] * c)
-
-
-@numba.njit(cache=True)
-def _inside_box(points, pose, low, high):
-    """Numbers of the points that lie in a box of the tool's frame."""
-    found, n = np.empty(len(points), np.int64), 0
-    for v in range(len(points)):
-        x, y, z = _to_tool(pose, points[v, 0], points[v, 1], points[v, 2])
-        if low[0] <= x <= high[0] and low[1] <= y <= high[1] and low[2] <= z <= high[2]:
-            found[n] = v
-            n += 1
-    return found[:n].copy()
-
-
-@numba.njit(cache=True)
-def _column_distance(coefficients, origin, spacing, pose, point, inward, s):
-    """Signed distance to the tool at depth s under a vertex [m]."""
-    x, y, z = _to_tool(pose, point[0] + s * inward[0], point[1] + s * inward[1], point[2] + s * inward[2])
-    return distance_at(coefficients, origin, spacing, x, y, z)
-
-
-@numba.njit(cache=True)
-def _clearances(coefficients, origin, spacing, pose, points, inward, thickness, near, hole):
-    """Least signed distance along each column [m], by sphere tracing from the skin to the core.
-
-    A column whose core end lies inside the tool counts only if the tool comes from outside: where the distance still
-    rises along the inward normal there.
-    """
-    out = np.full(len(near), np.inf)
-    for n in range(len(near)):
-        v = near[n]
-        t, point, down = thickness[v], points[v], inward[v]
-        d = _column_distance(coefficients, origin, spacing, pose, point, down, 0.0)
-        if d > t + hole:
-            out[n] = d - t  # the rest of the column cannot be nearer
-            continue
-        least, s = d, 0.0
-        while s < t:
-            s = min(s + max(abs(d), t / 16), t)
-            d = _column_distance(coefficients, origin, spacing, pose, point, down, s)
-            least = min(least, d)
-        if d <= 0 and _column_distance(coefficients, origin, spacing, pose, point, down, t + 1e-5) < d:
-            least = np.inf
-        out[n] = least
-    return out
-
-
-@numba.njit(cache=True)
-def _depths(coefficients, origin, spacing, pose, points, inward, thickness, vertices, grown):
-    """How deep under each vertex the tool, grown by `grown`, is first met on the way up from the core [m]."""
-    out = np.zeros(len(vertices))
-    for n in range(len(vertices)):
-        v = vertices[n]
-        point, down = points[v], inward[v]
-        low = thickness[v]
-        d_low = _column_distance(coefficients, origin, spacing, pose, point, down, low) - grown
-        if d_low <= 0:
-            out[n] = low
-            continue
-        while low > 0:
-            high = max(low - max(d_low, thickness[v] / 32), 0.0)
-            d_high = _column_distance(coefficients, origin, spacing, pose, point, down, high) - grown
-            if d_high <= 0:
-                out[n] = _crossing(coefficients, origin, spacing, pose, point, down, grown, low, d_low, high, d_high)
-                break
-            low, d_low = high, d_high
-    return out
-
-
-@numba.njit(cache=True)
-def _crossing(coefficients, origin, spacing, pose, point, down, grown, low, d_low, high, d_high):
-    """Depth between low (outside) and high (inside) at which the grown tool begins, by the Illinois rule, to 0.1 nm."""
-    side = 0
-    for _ in range(40):
-        middle = (low * d_high - high * d_low) / (d_high - d_low)
-        d = _column_distance(coefficients, origin, spacing, pose, point, down, middle) - grown
-        if abs(d) < 1e-10:
-            return middle
-        if d > 0:
-            low, d_low = middle, d
-            d_high = d_high / 2 if side == 1 else d_high
-            side = 1
-        else:
-            high, d_high = middle, d
-            d_low = d_low / 2 if side == -1 else d_low
-            side = -1
-    return 0.5 * (low + high)

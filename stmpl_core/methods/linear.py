@@ -31,7 +31,7 @@ class Linear:
 
     def prepare(self, layer: SoftLayer) -> Self:
         """Finds each vertex's neighbours (about half a second for a limb)."""
-        self._surroundings = Surroundings(layer)
+        self._surroundings = Surroundings.of(layer)
         self._layer = layer
         return self
 

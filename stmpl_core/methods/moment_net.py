@@ -21,6 +21,7 @@ from stmpl_core.moments import FAST, SCALARS, TENSORS, VECTORS, Surroundings
 from stmpl_core.trust import Displacement, Trust
 
 SHIPPED = Path(__file__).parent.parent / "weights" / "moment_net.safetensors"
+SHIPPED_CONTACT = SHIPPED.with_name("moment_net_contact.safetensors")
 
 MIXED_VECTORS, MIXED_TENSORS = 6, 4  # combinations of a vertex's vectors and tensors whose products are inputs
 DIRECTIONS = 2 * VECTORS + 2  # vectors that an answer is made of: moments of both fields, and both linear responses
@@ -49,7 +50,7 @@ class Weights:
     card: Mapping[str, Any]
 
     @classmethod
-    def load(cls, path: str | Path) -> Self:
+    def load(cls, path: str | Path, *, outputs: int = OUTPUTS) -> Self:
         """Reads a .safetensors file and the .json card beside it; no code in them is run.
 
         Raises:
@@ -68,8 +69,8 @@ class Weights:
         except SafetensorError as error:
             raise InvalidInput(f"{path} holds no weights: {error}.") from error
         shapes = {name: a.shape for name, a in arrays.items()}
-        if set(shapes) != set(ARRAYS) or shapes["w1"][0] != INPUTS or shapes["w4"][1] != OUTPUTS:
-            raise InvalidInput(f"{path} holds no MomentNet of this version.")
+        if set(shapes) != set(ARRAYS) or shapes["w1"][0] != INPUTS or shapes["w4"][1] != outputs:
+            raise InvalidInput(f"{path} holds no network of this kind and version.")
         return cls({name: np.ascontiguousarray(a, dtype=np.float32) for name, a in arrays.items()},
                    json.loads(card.read_text()))  # fmt: skip
 
@@ -84,9 +85,9 @@ class Weights:
 
 
 @cache
-def shipped() -> Weights:
-    """The network that comes with the package."""
-    return Weights.load(SHIPPED)
+def shipped(path: Path = SHIPPED) -> Weights:
+    """A network that comes with the package."""
+    return Weights.load(path)
 
 
 class MomentNet:
@@ -101,6 +102,7 @@ class MomentNet:
 
     Args:
         weights: a .safetensors file made by `stmpl train`; None: those that come with the package.
+        contact: likewise, for what rigid tools press with (Load.contact).
         fallback: a method that answers loads outside the range that the network was trained on; None: the network's
             answer is given, and flagged.
         threads: of the kernels. Two are nearly twice as fast where two cores are idle, and stall for milliseconds
@@ -113,19 +115,24 @@ class MomentNet:
     name = "moment_net"
 
     def __init__(
-        self, weights: str | Path | Weights | None = None, *, fallback: Method | None = None, threads: int = 1
+        self,
+        weights: str | Path | Weights | None = None,
+        *,
+        contact: str | Path | Weights | None = None,
+        fallback: Method | None = None,
+        threads: int = 1,
     ) -> None:
         if threads < 1:
             raise InvalidInput(f"threads is {threads}; at least 1 is needed.")
         self.threads = min(threads, numba.config.NUMBA_NUM_THREADS)  # type: ignore[attr-defined]
-        self.weights = weights if isinstance(weights, Weights) else Weights.load(weights) if weights else shipped()
+        self.weights, self.contact = _weights(weights, SHIPPED), _weights(contact, SHIPPED_CONTACT)
         self.fallback = fallback
         self._layer: SoftLayer | None = None
         self._near: Surroundings | None = None
 
     def prepare(self, layer: SoftLayer) -> Self:
         """Finds each vertex's neighbours (about half a second for a limb)."""
-        self._near = near = Surroundings(layer)
+        self._near = near = Surroundings.of(layer)
         self._shape = np.concatenate([near.curvature, near.slope], axis=1).astype(np.float32)
         self._frames = near.frames.astype(np.float32) * layer.thickness[:, None, None].astype(np.float32)
         self._layer = layer
@@ -155,7 +162,8 @@ class MomentNet:
         felt = near.felt(sources)
         vertices, figures = felt.vertices, felt.figures
         shape = self._shape[vertices]
-        a, constants = self.weights.arrays, np.array([layer.tissue.poisson_ratio, load.kind == "nodal"], np.float32)
+        weights = self.contact if load.kind == "contact" else self.weights
+        a, constants = weights.arrays, np.array([layer.tissue.poisson_ratio, load.kind == "nodal"], np.float32)
 
         # What is around each vertex becomes numbers that do not turn with the scene; far vertices need none.
         near_ones = np.flatnonzero(np.abs(felt.scalars[:, 1]).sum(axis=1) > SURROUNDED)
@@ -163,7 +171,7 @@ class MomentNet:
         place[near_ones] = np.arange(len(near_ones))
         inputs = np.empty((len(near_ones), INPUTS), dtype=np.float32)
         outside, strange = np.zeros(len(vertices), dtype=np.bool_), np.zeros(len(near_ones), dtype=np.bool_)
-        _inputs(figures[near_ones], shape[near_ones], sources[vertices[near_ones]], constants, a["mix_vectors"],
+        invariants(figures[near_ones], shape[near_ones], sources[vertices[near_ones]], constants, a["mix_vectors"],
                 a["mix_tensors"], a["low"], a["high"], a["mean"], a["scale"], inputs, strange)  # fmt: skip
         outside[near_ones] = strange
 
@@ -177,16 +185,16 @@ class MomentNet:
         displacement = np.zeros_like(layer.vertices)
         displacement[vertices] = moved
         peak_error = float((error * layer.thickness[vertices]).max(initial=0.0))
-        trust = self._trust(load, pressure, vertices, moved, outside, peak_error)
+        trust = self._trust(weights.card, load, pressure, vertices, moved, outside, peak_error)
         if not trust.in_range and self.fallback is not None:
             answer = self.fallback.solve(load)
             because = answer.trust.also(f"answered by {answer.method}: {trust.why}")
             return Displacement(answer.displacement, because, answer.method, answer.pressure)
         return Displacement(displacement, trust, self.name, pressure)
 
-    def _trust(self, load: Load, pressure: np.ndarray, vertices: np.ndarray, moved: np.ndarray, outside: np.ndarray,
-               error: float) -> Trust:  # fmt: skip
-        layer, card = prepared(self._layer, self), self.weights.card
+    def _trust(self, card: Mapping[str, Any], load: Load, pressure: np.ndarray, vertices: np.ndarray,
+               moved: np.ndarray, outside: np.ndarray, error: float) -> Trust:  # fmt: skip
+        layer = prepared(self._layer, self)
         loaded = np.flatnonzero(pressure)
         if not len(loaded):
             return Trust(error_bound=0.0)
@@ -214,6 +222,10 @@ class MomentNet:
             trust = trust.also(why, in_range=False)
         bound = float(card["bound"]["factor"]) * error
         return Trust(trust.converged, trust.in_range, bound if trust.in_range else None, trust.why, trust.figures)
+
+
+def _weights(given: str | Path | Weights | None, default: Path) -> Weights:
+    return given if isinstance(given, Weights) else Weights.load(given) if given else shipped(default)
 
 
 def source_fields(pressure: np.ndarray, layer: SoftLayer) -> np.ndarray:
@@ -263,7 +275,7 @@ def _mix(weights, vectors, out):
 
 
 @numba.njit(cache=True, fastmath=FAST)
-def _inputs(figures, shape, here, constants, mix_vectors, mix_tensors, low, high, mean, scale, out, outside):
+def invariants(figures, shape, here, constants, mix_vectors, mix_tensors, low, high, mean, scale, out, outside):
     """The network's inputs, (N, INPUTS): kept inside the training data's, then centred and scaled."""
     half, one = np.float32(0.5), np.float32(1)
     for n in range(len(figures)):
@@ -321,7 +333,6 @@ def _inputs(figures, shape, here, constants, mix_vectors, mix_tensors, low, high
             row[m] = (kept - mean[m]) * scale[m]
 
 
-@numba.njit(cache=True, parallel=True, fastmath=FAST)
 def think(inputs, w1, b1, w2, b2, w3, b3, w4, b4, outputs):
     """The layers, a few vertices at a time: they stay in the cache, and BLAS starts no threads for so little."""
     for block in numba.prange((len(inputs) + BLOCK - 1) // BLOCK):
@@ -336,6 +347,10 @@ def think(inputs, w1, b1, w2, b2, w3, b3, w4, b4, outputs):
         for n in range(len(out)):
             for m in range(len(b4)):
                 outputs[start + n, m] = out[n, m] + b4[m]
+
+
+think_few = numba.njit(cache=True, fastmath=FAST)(think)  # on the caller's thread
+think = numba.njit(cache=True, parallel=True, fastmath=FAST)(think)
 
 
 @numba.njit(cache=True, fastmath=FAST)

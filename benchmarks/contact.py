@@ -1,0 +1,316 @@
+"""Contact against rigid tools solved by finite elements: force, pressure, area and motion; and what a step costs.
+
+    .venv/bin/python -m benchmarks.contact      # prints tables, writes docs/contact.json and docs/pictures/contact.png
+
+The tools are pressed straight into the 3 mm arm. None was trained on: their sizes, places and this skin are new.
+"""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import matplotlib.pyplot as plt
+import numpy as np
+import trimesh
+from rich.console import Console
+from rich.progress import track
+from rich.table import Table
+
+from fem_tools.indenter import Indentation, IndenterFem, Tool
+from fem_tools.scenes import Site
+from stmpl_core.body import Body
+from stmpl_core.contact import Contact, ToolMesh
+from stmpl_core.layer import SoftLayer, Tissue
+from stmpl_core.methods import MomentNet
+from stmpl_core.sdf import SignedDistance
+from stmpl_core.simulator import Simulator
+from stmpl_core.touch import Toucher
+
+DOCS = Path(__file__).parents[1] / "docs"
+DEPTHS = (0.06, 0.15, 0.3, 0.45, 0.6)  # thicknesses
+THICKNESS = 7e-3  # m
+OFF = 1.5e-3  # m that the stated pose is off where the wrench is given
+SLOWEST = 300  # steps that are timed
+
+
+@dataclass(frozen=True)
+class Press:
+    """Tools above a place on the arm.
+
+    Args:
+        name: as tables say it.
+        meshes: of the tools, in their own frames, z up.
+        shifts: of each across the limb [m].
+        rounding: of edges, in FEM [m].
+        place: share of the way along the arm's vertices, sorted by their distance from the border.
+    """
+
+    name: str
+    meshes: tuple[ToolMesh, ...]
+    shifts: tuple[float, ...] = (0.0,)
+    rounding: float = 0.0
+    place: float = 0.0
+
+    def tools(self, layer: SoftLayer) -> list[Tool]:
+        """At first touch each."""
+        site, tools = Site(layer), []
+        order = np.argsort(-site.border_distance)
+        vertex = int(order[int(self.place * len(order))])
+        pose = site.standing(vertex, 10e-3, 0.4)
+        for mesh, shift in zip(self.meshes, self.shifts, strict=True):
+            at = pose.copy()
+            at[:3, 3] += shift * pose[:3, 0] + 40e-3 * pose[:3, 2]
+            tool = Tool(SignedDistance.of(mesh, rounding=self.rounding), at, -pose[:3, 2]).touching(layer)
+            assert tool is not None
+            tools.append(tool)
+        return tools
+
+
+@dataclass(frozen=True)
+class Row:
+    """One press at one depth, ours against FEM; errors as shares.
+
+    Args:
+        name: of the press.
+        depth: of the tools beyond first touch, over the thickness.
+        mean_pressure: over E, of FEM.
+        force: of FEM [N].
+        force_error: of the force along the way, by pose; signed.
+        winkler_error: likewise, of columns.
+        pressure_error: L2, over the L2 norm of FEM's.
+        area_error: of the area of the vertices with over 2 % of the highest pressure; signed.
+        mee: mean Euclidean error over vertices that FEM moves by more than 1e-6 m, over the peak.
+        moving: likewise over those that move more than 10 % of the peak.
+        contact: likewise over those with pressure.
+        peak: signed error of the largest displacement.
+        entered: of the deepest vertex inside a tool, over the thickness.
+        by_wrench: error of the depth found from the force, the pose being off, over the thickness; signed.
+        within: whether the force is within the error that the answer states.
+    """
+
+    name: str
+    depth: float
+    mean_pressure: float
+    force: float
+    force_error: float
+    winkler_error: float
+    pressure_error: float
+    area_error: float
+    mee: float
+    moving: float
+    contact: float
+    peak: float
+    entered: float
+    by_wrench: float
+    within: bool
+
+
+def ball(radius: float) -> ToolMesh:
+    """A ball of this radius [mm]."""
+    return _metres(trimesh.creation.icosphere(4, radius))
+
+
+def fingertip(radius: float, length: float) -> ToolMesh:
+    """A capsule lying along x [mm]."""
+    mesh = trimesh.creation.capsule(length, radius, count=[48, 48])
+    mesh.apply_translation([0, 0, -length / 2])
+    mesh.apply_transform(trimesh.transformations.rotation_matrix(np.pi / 2, [0, 1, 0]))
+    return _metres(mesh)
+
+
+def punch(radius: float, fillet: float) -> ToolMesh:
+    """A flat cylinder with a rounded rim [mm]."""
+    angle = np.linspace(0, np.pi / 2, 12)
+    rim = np.stack([radius - fillet + fillet * np.sin(angle), fillet - fillet * np.cos(angle)], axis=1)
+    outline = np.vstack([[[0, 0]], rim, [[radius, fillet + 12], [0, fillet + 12]]])
+    return _metres(trimesh.creation.revolve(outline, sections=96))
+
+
+def roller(radius: float, length: float) -> ToolMesh:
+    """A cylinder lying along x with rounded ends [mm]."""
+    return fingertip(radius, length)
+
+
+def _metres(mesh: trimesh.Trimesh) -> ToolMesh:
+    return ToolMesh.of(1e-3 * np.asarray(mesh.vertices), np.asarray(mesh.faces))
+
+
+def presses() -> list[Press]:
+    """The scenes of the table."""
+    from fem_tools.scenes import extruded, letter
+
+    return [
+        Press("sphere, r 9 mm", (ball(9),)),
+        Press("sphere, r 17 mm", (ball(17),), place=0.03),
+        Press("cylinder lying, r 11 mm", (roller(11, 26),), place=0.06),
+        Press("flat punch, r 9 mm", (punch(9, 1.5),), place=0.02),
+        Press("fingertip, r 7 mm", (fingertip(7, 10),), place=0.05),
+        Press("letter H, 26 mm", (extruded(letter("H", 26e-3), 0.0, 12e-3),), rounding=1.5e-3, place=0.01),
+        Press("two fingertips", (fingertip(6.5, 8), fingertip(6.5, 8)), shifts=(-11e-3, 11e-3), place=0.04),
+    ]
+
+
+def arm(edge: float = 3e-3) -> SoftLayer:
+    """The arm that is pressed: no body of the training data."""
+    body = Body.anny(weight=0.4)
+    return body.patch("left_arm", edge).layer(body, thickness=THICKNESS, tissue=Tissue(poisson_ratio=0.4))
+
+
+def contacts(press: Press, tools: Sequence[Tool], forces: Sequence[float] | None = None) -> list[Contact]:
+    """The same tools as Contacts, by pose or with these forces along their ways [N]."""
+    out = []
+    for k, (mesh, tool) in enumerate(zip(press.meshes, tools, strict=True)):
+        wrench = None if forces is None else np.concatenate([forces[k] * tool.direction, np.zeros(3)])
+        out.append(Contact(f"tool {k}", mesh, tool.pose_body_from_tool, wrench))
+    return out
+
+
+def row(press: Press, simulator: Simulator, toucher: Toucher, truth: Indentation) -> Row:
+    """Ours against one answer of FEM."""
+    layer, thick = simulator.layer, float(simulator.layer.thickness.mean())
+    fields = [tool.field for tool in truth.tools]
+    touches = toucher.touch_all(contacts(press, truth.tools), fields)
+    ours = np.sum([touch.load.values for touch in touches], axis=0)
+    area, way = layer.vertex_areas, truth.tools[0].direction
+    force = float(sum(touch.wrench[:3] @ tool.direction for touch, tool in zip(touches, truth.tools, strict=True)))
+    columns = sum(float(t.squeeze.pressure @ (-layer.vertex_area_vectors[t.squeeze.vertices] @ way)) for t in touches)
+    answer = simulator.step(contacts(press, truth.tools))
+    error = np.linalg.norm(answer.displacement - truth.displacement, axis=1)
+    length = np.linalg.norm(truth.displacement, axis=1)
+    peak = float(length.max())
+    stated = sum(touch.trust.figures["force_error_n"] for touch in touches)
+    forces = [float(w[:3] @ tool.direction) for w, tool in zip(truth.wrenches, truth.tools, strict=True)]
+    back = [tool.shifted(-OFF * tool.direction) for tool in truth.tools]
+    found = [toucher.touch(c, f).trust.figures["moved_m"] - OFF
+             for c, f in zip(contacts(press, back, forces), fields, strict=True)]  # fmt: skip
+    return Row(
+        name=press.name,
+        depth=truth.depth / thick,
+        mean_pressure=truth.trust.figures["mean_pressure_over_modulus"],
+        force=truth.force,
+        force_error=force / truth.force - 1,
+        winkler_error=columns * layer.tissue.youngs_modulus / truth.force - 1,
+        pressure_error=float(np.sqrt(area @ (ours - truth.pressure) ** 2 / (area @ truth.pressure**2))),
+        area_error=_area(ours, area) / _area(truth.pressure, area) - 1,
+        mee=float(error[length > 1e-6].mean()) / peak,
+        moving=float(error[length > 0.1 * peak].mean()) / peak,
+        contact=float(error[truth.pressure > 0.02 * truth.pressure.max()].mean()) / peak,
+        peak=float(answer.magnitude.max()) / peak - 1,
+        entered=answer.trust.figures["entered_m"] / thick,
+        by_wrench=float(np.abs(found).max()) / thick,
+        within=abs(force - truth.force) <= stated,
+    )
+
+
+def _area(pressure: np.ndarray, area: np.ndarray) -> float:
+    return float(area[pressure > 0.02 * pressure.max()].sum())
+
+
+def timings(simulator: Simulator, toucher: Toucher, press: Press, depth: float) -> dict[str, list[float]]:
+    """Seconds of a contact step by pose and by wrench, and of a whole step, while the tool slides."""
+    tools = [tool.at(depth) for tool in press.tools(simulator.layer)]
+    across = tools[0].sideways(1.0)[1]
+    out: dict[str, list[float]] = {"pose": [], "wrench": [], "whole": []}
+    fields = [tool.field for tool in tools]
+    force = [float(t.wrench[:3] @ tools[0].direction) for t in toucher.touch_all(contacts(press, tools), fields)]
+
+    def timed(name: str, call: Callable[[], object]) -> None:
+        start = time.perf_counter()
+        call()
+        out[name].append(time.perf_counter() - start)
+
+    for k in range(SLOWEST):
+        moved = [tool.shifted(2e-3 * np.sin(0.07 * k) * across) for tool in tools]
+        by_pose, by_wrench = contacts(press, moved), contacts(press, moved, force)
+        timed("pose", lambda: toucher.touch_all(by_pose, fields))  # noqa: B023
+        timed("wrench", lambda: toucher.touch_all(by_wrench, fields))  # noqa: B023
+        if k % 5 == 0:
+            timed("whole", lambda: simulator.step(by_pose))  # noqa: B023
+    return out
+
+
+def main() -> None:
+    console, layer = Console(width=150), arm()
+    simulator, toucher = Simulator(layer, MomentNet()), Toucher(layer)
+    fem = IndenterFem().prepare(layer)
+    rows: list[Row] = []
+    every = presses()
+    for press in track(every, "pressing by finite elements", console=console):
+        tools = press.tools(layer)
+        for truth in fem.path(tools, np.array(DEPTHS) * THICKNESS):
+            rows.append(row(press, simulator, toucher, truth))
+    times = {press.name: timings(simulator, toucher, press, 0.4 * THICKNESS) for press in every}
+    console.print(_table(rows))
+    console.print(_time_table(times))
+    kept = {"rows": [asdict(r) for r in rows],
+            "ms": {n: {k: _percentiles(v) for k, v in t.items()} for n, t in times.items()}}  # fmt: skip
+    (DOCS / "contact.json").write_text(json.dumps(kept, indent=1) + "\n")
+    draw(rows, DOCS / "pictures" / "contact.png")
+
+
+def _percentiles(seconds: Sequence[float]) -> list[float]:
+    return [round(1e3 * float(np.percentile(seconds, q)), 3) for q in (50, 99)]
+
+
+def _table(rows: Sequence[Row]) -> Table:
+    table = Table(title="Ours against FEM; errors in %", caption="by pose, but for the last column: by wrench, "
+                  f"the pose being {OFF * 1e3:g} mm off")  # fmt: skip
+    for name in ("tool", "depth/t", "mean p/E", "force N", "force", "Winkler", "pressure L2", "area", "MEE", "moving",
+                 "contact", "peak", "inside/t", "depth by wrench"):  # fmt: skip
+        table.add_column(name, justify="left" if name == "tool" else "right")
+    last = ""
+    for r in rows:
+        table.add_row(r.name if r.name != last else "", f"{r.depth:.2f}", f"{r.mean_pressure:.2f}", f"{r.force:.3f}",
+                      f"{100 * r.force_error:+.1f}{'' if r.within else ' !'}", f"{100 * r.winkler_error:+.0f}",
+                      f"{100 * r.pressure_error:.1f}", f"{100 * r.area_error:+.1f}", f"{100 * r.mee:.2f}",
+                      f"{100 * r.moving:.1f}", f"{100 * r.contact:.1f}", f"{100 * r.peak:+.1f}",
+                      f"{100 * r.entered:.2f}", f"{100 * r.by_wrench:.1f}")  # fmt: skip
+        last = r.name
+    mean = [np.mean([abs(getattr(r, k)) for r in rows]) for k in ("force_error", "winkler_error", "pressure_error",
+            "area_error", "mee", "moving", "contact", "peak", "entered", "by_wrench")]  # fmt: skip
+    table.add_section()
+    table.add_row("mean of sizes", "", "", "", *(f"{100 * m:.2f}" for m in mean))
+    return table
+
+
+def _time_table(times: dict[str, dict[str, list[float]]]) -> Table:
+    table = Table(title="One step in ms, median / 99 %, one thread")
+    for name in ("tool", "contact by pose", "contact by wrench", "whole step by pose"):
+        table.add_column(name, justify="left" if name == "tool" else "right")
+    for name, t in times.items():
+        cells = ["{:.2f} / {:.2f}".format(*_percentiles(t[k])) for k in t]
+        table.add_row(name, *cells)
+    return table
+
+
+def draw(rows: Sequence[Row], path: Path) -> None:
+    """Force error and pressure error over the mean pressure, a line a tool."""
+    figure, axes = plt.subplots(1, 3, figsize=(13, 4), constrained_layout=True)
+    names = list(dict.fromkeys(r.name for r in rows))
+    for name in names:
+        mine = [r for r in rows if r.name == name]
+        x = [r.mean_pressure for r in mine]
+        axes[0].plot(x, [100 * r.force_error for r in mine], "o-", label=name)
+        axes[1].plot(x, [100 * r.pressure_error for r in mine], "o-")
+        axes[2].plot(x, [100 * r.contact for r in mine], "o-")
+    axes[0].plot([], [], "x:", color="grey", label="Winkler")
+    for name in names:
+        mine = [r for r in rows if r.name == name]
+        x = [r.mean_pressure for r in mine]
+        axes[0].plot(x, [100 * r.winkler_error for r in mine], "x:", color="grey", lw=0.8)
+    for axis, title in zip(axes, ("force, signed error [%]", "pressure, L2 error [%]",
+                                  "displacement under the contact,\nmean error [% of the peak]"), strict=True):  # fmt: skip
+        axis.set(xscale="log", xlabel="mean pressure / E", title=title)
+        axis.grid(alpha=0.3)
+    axes[0].axhspan(-5, 5, color="tab:green", alpha=0.15)
+    axes[1].axhline(10, color="tab:green", alpha=0.5)
+    axes[0].legend(fontsize=7)
+    figure.savefig(path, dpi=110)
+
+
+if __name__ == "__main__":
+    main()

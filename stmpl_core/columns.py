@@ -1,0 +1,295 @@
+"""Columns: how far a tool squeezes the columns of skin under it, sampled between the vertices, gathered at them."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import fcl
+import numba
+import numpy as np
+
+from stmpl_core.arrays import Points, Transform
+from stmpl_core.layer import SoftLayer
+from stmpl_core.sdf import SignedDistance, distance_at
+
+HOLE = 0.6  # of an edge: a tool that comes no nearer to a vertex touches none of its triangles (equilateral: 0.577)
+DEEPEST = 0.9  # of the thickness; columns are not squeezed further
+ROUND = 4e-4  # m over which the squeeze rises beside a tool's wall: no sample pops in while the tool slides
+CLOSE = 2e-5  # m to the tool from which the secant rule finishes what sphere tracing began
+EXACT = 3e-7  # m to which a depth is found
+
+
+class Squeeze(NamedTuple):
+    """What a tool at its pose would do to columns that knew nothing of each other.
+
+    Args:
+        vertices: numbers of the vertices that carry any of it, (N,).
+        pressure: Winkler's pressure over E, averaged with each vertex's hat function, (N,) [-].
+        strain: of the columns, times confined modulus over E, averaged likewise, (N,) [-].
+        depth: under the vertex itself, from the skin at rest to the tool, 0 where it is not covered, (N,) [m].
+    """
+
+    vertices: np.ndarray
+    pressure: np.ndarray
+    strain: np.ndarray
+    depth: np.ndarray
+
+
+class Clearance(NamedTuple):
+    """How near a tool comes to columns.
+
+    Args:
+        vertices: their numbers, (N,).
+        least: signed distance along each column (N,) [m]; inf where the tool comes through the core.
+        skin: signed distance at its skin, (N,) [m].
+    """
+
+    vertices: np.ndarray
+    least: np.ndarray
+    skin: np.ndarray
+
+
+class Columns:
+    """The columns of a layer, skin to core, with their triangles around them.
+
+    Args:
+        layer: the soft layer at rest.
+    """
+
+    def __init__(self, layer: SoftLayer) -> None:
+        self.layer = layer
+        self.points, self.inward = layer.vertices, np.ascontiguousarray(-layer.normals)
+        self.faces = np.ascontiguousarray(layer.faces, dtype=np.int64)
+        corners = self.faces.ravel()
+        self._around = np.argsort(corners, kind="stable") // 3  # faces around each vertex
+        self._start = np.searchsorted(np.sort(corners), np.arange(len(self.points) + 1))
+        a, b, c = (self.points[self.faces[:, k]] for k in range(3))
+        self._face_areas = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)
+        self._slot = np.full(len(self.points), -1)
+        tissue = layer.tissue
+        self._moduli = np.array([tissue.shear_modulus, tissue.lame_lambda]) / tissue.youngs_modulus
+        model = fcl.BVHModel()
+        model.beginModel(len(self.points), len(self.faces))
+        model.addSubModel(self.points, self.faces)
+        model.endModel()
+        self._skin = fcl.CollisionObject(model)
+
+    def near(self, field: SignedDistance, pose: Transform, reach: float) -> np.ndarray:
+        """Broad phase: numbers of the vertices in the tool's box, `reach` [m] larger; empty if FCL finds no overlap."""
+        low, high = field.tool_bounds
+        box = fcl.Box(*(high - low + 2 * reach))
+        centre = pose[:3, :3] @ ((low + high) / 2) + pose[:3, 3]
+        if not fcl.collide(self._skin, fcl.CollisionObject(box, fcl.Transform(pose[:3, :3], centre))):
+            return np.empty(0, np.int64)
+        return _inside_box(self.points, pose, low - reach, high + reach)
+
+    def squeezed(self, field: SignedDistance, pose: Transform) -> Squeeze:
+        """How the tool squeezes the columns at its pose."""
+        near = self.near(field, pose, float(self.layer.thickness.max()) + self.layer.edge_length)
+        return self.squeeze(field, pose, self.clearance(field, pose, near, self.layer.edge_length))
+
+    def clearance(self, field: SignedDistance, pose: Transform, near: np.ndarray, far: float) -> Clearance:
+        """How near the tool comes to columns; those further than `far` [m] are only known to be so."""
+        least, skin = _clearances(field.coefficients, field.origin, field.spacing, pose, self.points, self.inward,
+                                  self.layer.thickness, near, far)  # fmt: skip
+        return Clearance(near, least, skin)
+
+    def squeeze(self, field: SignedDistance, pose: Transform, clearance: Clearance) -> Squeeze:
+        """How the tool squeezes the columns that it comes near to."""
+        near, least, above = clearance
+        covered = near[least < HOLE * self.layer.edge_length]  # no point of a triangle is further from all corners
+        if not len(covered):
+            return Squeeze(np.empty(0, np.int64), np.empty(0), np.empty(0), np.empty(0))
+        buried = bool(((least < 0) & (above > 0)).any())
+        grid = field.coefficients, field.origin, field.spacing, pose
+        skin = self.points, self.inward, self.layer.thickness, self.faces, self._start, self._around, self._face_areas
+        vertices, sums, depth = _squeeze(*grid, *skin, covered, buried, self._slot, self._moduli)
+        sums /= self.layer.vertex_areas[vertices, None]
+        return Squeeze(vertices, sums[:, 0], sums[:, 1], depth)
+
+
+def depth_along(field: SignedDistance, pose: Transform, points: Points, way: Points, guess: np.ndarray) -> np.ndarray:
+    """How far points (N, 3) inside a tool must go along unit vectors (N, 3) to leave it, (N,) [m], from a guess > 0."""
+    grid = field.coefficients, field.origin, field.spacing, pose
+    return _depths_along(*grid, points, np.ascontiguousarray(way), guess)
+
+
+def _samples(split: int) -> np.ndarray:
+    """Barycentric coordinates of the middles of the split^2 parts of a triangle, (split^2, 3)."""
+    out = []
+    for i in range(split):
+        for j in range(split - i):
+            out.append((i + 1 / 3, j + 1 / 3))
+            if i + j < split - 1:
+                out.append((i + 2 / 3, j + 2 / 3))
+    ab = np.array(out) / split
+    return np.column_stack([ab, 1 - ab.sum(axis=1)])
+
+
+_MANY, _FEW = _samples(3), _samples(2)
+
+
+@numba.njit(cache=True, inline="always")
+def _to_tool(pose, x, y, z):
+    """Coordinates in the tool's frame of a point of the body's."""
+    a, b, c = x - pose[0, 3], y - pose[1, 3], z - pose[2, 3]
+    return (pose[0, 0] * a + pose[1, 0] * b + pose[2, 0] * c, pose[0, 1] * a + pose[1, 1] * b + pose[2, 1] * c,
+            pose[0, 2] * a + pose[1, 2] * b + pose[2, 2] * c)  # fmt: skip
+
+
+@numba.njit(cache=True)
+def _inside_box(points, pose, low, high):
+    """Numbers of the points that lie in a box of the tool's frame."""
+    found, n = np.empty(len(points), np.int64), 0
+    for v in range(len(points)):
+        x, y, z = _to_tool(pose, points[v, 0], points[v, 1], points[v, 2])
+        if low[0] <= x <= high[0] and low[1] <= y <= high[1] and low[2] <= z <= high[2]:
+            found[n] = v
+            n += 1
+    return found[:n].copy()
+
+
+@numba.njit(cache=True)
+def _at(coefficients, origin, spacing, pose, point, inward, s):
+    """Signed distance to the tool at depth s under a point of the skin [m]."""
+    x, y, z = _to_tool(pose, point[0] + s * inward[0], point[1] + s * inward[1], point[2] + s * inward[2])
+    return distance_at(coefficients, origin, spacing, x, y, z)
+
+
+@numba.njit(cache=True)
+def _clearances(coefficients, origin, spacing, pose, points, inward, thickness, near, far):
+    """Least signed distance along each column [m], by sphere tracing from the skin to the core; and that at the skin.
+
+    A column whose core end lies inside the tool counts only if the tool comes from outside: where the distance still
+    rises along the inward normal there.
+    """
+    out, skin = np.full(len(near), np.inf), np.empty(len(near))
+    for n in range(len(near)):
+        v = near[n]
+        t, point, down = thickness[v], points[v], inward[v]
+        skin[n] = d = _at(coefficients, origin, spacing, pose, point, down, 0.0)
+        if d > t + far:
+            out[n] = d - t  # the rest of the column cannot be nearer
+            continue
+        least, s = d, 0.0
+        while s < t:
+            s = min(s + max(abs(d), t / 16), t)
+            d = _at(coefficients, origin, spacing, pose, point, down, s)
+            least = min(least, d)
+        if d <= 0 and _at(coefficients, origin, spacing, pose, point, down, t + 1e-5) < d:
+            least = np.inf
+        out[n] = least
+    return out, skin
+
+
+@numba.njit(cache=True)
+def _meet(coefficients, origin, spacing, pose, point, inward, t, guess):
+    """How deep under a point of the skin the tool ends [m]; 0 if it is not met.
+
+    Seen from the core, by sphere tracing, or nearest to a guess above 0; then the secant rule.
+    """
+    s = t if guess <= 0 else guess
+    d = _at(coefficients, origin, spacing, pose, point, inward, s)
+    if guess <= 0 and d <= 0:
+        return t
+    last_s, last_d = s + 1.0, d + 1.0
+    for _ in range(40):
+        if guess <= 0 and s - d > 0 and d > CLOSE:
+            last_s, last_d = s, d
+            s -= d
+        else:
+            slope = (d - last_d) / (s - last_s)
+            following = s - d / slope if slope > 0.2 else s - d
+            last_s, last_d = s, d
+            s = following
+        if s <= 0:
+            return 0.0
+        if abs(s - last_s) < EXACT:
+            return min(s, t)
+        d = _at(coefficients, origin, spacing, pose, point, inward, s)
+    return min(s, t)
+
+
+@numba.njit(cache=True)
+def _depths_along(coefficients, origin, spacing, pose, points, way, guess):
+    out = np.empty(len(points))
+    for n in range(len(points)):
+        out[n] = _meet(coefficients, origin, spacing, pose, points[n], way[n], 4 * guess[n], guess[n])
+    return out
+
+
+@numba.njit(cache=True)
+def _squeeze(coefficients, origin, spacing, pose, points, inward, thickness, faces, start, around, face_areas, covered,
+             buried, slot, moduli):  # fmt: skip
+    """See Columns.squeeze: the vertices in order, pressure and strain times their areas (N, 2), depth under them (N,).
+
+    A triangle with all corners covered is sampled at few places, from a good guess; one at the border at many, where
+    beside a wall of the tool the depth falls to 0 over ROUND. Unless the tool is buried, columns whose skin is outside
+    it are free.
+    """
+    mu, lam = moduli[0], moduli[1]
+    room = 0
+    for v in covered:
+        room += start[v + 1] - start[v]
+    found, vertices, many, count = np.empty(room, np.int64), np.empty(3 * room, np.int64), 0, 0
+    for v in covered:
+        for p in range(start[v], start[v + 1]):
+            f = around[p]
+            for k in range(3):
+                w = faces[f, k]
+                if slot[w] < 0:
+                    slot[w] = count
+                    vertices[count] = w
+                    count += 1
+            found[many] = f
+            many += 1
+    found = np.unique(found[:many])
+    vertices = np.sort(vertices[:count])
+    depth, sums = np.empty(count), np.zeros((count, 2))
+    for n in range(count):
+        v = vertices[n]
+        slot[v] = n
+        guess = 0.0 if buried else -_at(coefficients, origin, spacing, pose, points[v], inward[v], 0.0)
+        depth[n] = 0.0 if guess < 0 else _meet(
+            coefficients, origin, spacing, pose, points[v], inward[v], thickness[v], guess)  # fmt: skip
+    point, down = np.empty(3), np.empty(3)
+    for f in found:
+        i, j, k = faces[f]
+        di, dj, dk = depth[slot[i]], depth[slot[j]], depth[slot[k]]
+        border = min(di, dj, dk) <= 0 or max(di, dj, dk) > 3 * min(di, dj, dk)
+        samples = _MANY if border else _FEW
+        weight = face_areas[f] / len(samples)
+        for q in range(len(samples)):
+            a, b, c = samples[q]
+            length = 0.0
+            for x in range(3):
+                point[x] = a * points[i, x] + b * points[j, x] + c * points[k, x]
+                down[x] = a * inward[i, x] + b * inward[j, x] + c * inward[k, x]
+                length += down[x] * down[x]
+            length = 1 / np.sqrt(length)
+            for x in range(3):
+                down[x] *= length
+            t = a * thickness[i] + b * thickness[j] + c * thickness[k]
+            guess = a * di + b * dj + c * dk
+            if border:
+                guess = 0.0 if buried else -_at(coefficients, origin, spacing, pose, point, down, 0.0)
+                if guess < 0:
+                    continue
+            deep = _meet(coefficients, origin, spacing, pose, point, down, t, guess)
+            if border and deep > 0:
+                inside = -_at(coefficients, origin, spacing, pose, point, down, deep - ROUND)
+                deep *= min(max(2 * inside / ROUND, 0.0), 1.0)
+            if deep <= 0:
+                continue
+            strain = min(deep / t, DEEPEST)
+            stretch = 1 - strain
+            pressure = -(mu * (stretch - 1 / stretch) + lam * np.log(stretch) / stretch)
+            strain *= lam + 2 * mu
+            for corner, share in ((i, a), (j, b), (k, c)):
+                n = slot[corner]
+                sums[n, 0] += weight * share * pressure
+                sums[n, 1] += weight * share * strain
+    for v in vertices:
+        slot[v] = -1
+    carry = np.flatnonzero(sums[:, 0] > 0)
+    return vertices[carry], sums[carry], depth[carry]

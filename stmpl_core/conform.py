@@ -1,0 +1,123 @@
+"""conform: moves an answer so that skin that is touched lies on its tool, and none lies inside."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from stmpl_core.arrays import Points, VertexVectors
+from stmpl_core.columns import depth_along
+from stmpl_core.layer import SoftLayer
+from stmpl_core.moments import Surroundings
+from stmpl_core.sdf import SignedDistance
+from stmpl_core.touch import Touch
+
+PRESSED = 0.05  # of a tool's highest pressure, from which a covered vertex lies on the tool; elsewhere it may be apart
+AHEAD = 0.3  # cosine between the tool's way and the inward normal from which skin comes along
+ALONG = 0.7  # share of the pressures that point one way, and cosine of that to a force, for one way of all skin
+PASSES = 3
+SMOOTH = 0.05  # of the sinking of a vertex under its own source, added to keep neighbours from fighting
+
+
+class Conformed(NamedTuple):
+    """An answer that fits its tools.
+
+    Args:
+        displacement: (V, 3) [m].
+        corrected: how far the furthest vertex under a tool was moved [m].
+        entered: how deep the deepest vertex under a tool still is in it [m].
+    """
+
+    displacement: VertexVectors
+    corrected: float
+    entered: float
+
+
+class _Tool(NamedTuple):
+    field: SignedDistance
+    pose: np.ndarray
+    vertices: np.ndarray
+    gone: Points  # how far the vertices that lie on the tool have come with it, (N, 3) [m]; NaN: may be apart
+
+    def jet(self, points: Points) -> tuple[np.ndarray, Points]:
+        """Signed distance [m] and its gradient at points of the layer's frame."""
+        turn = self.pose[:3, :3]
+        phi, gradient = self.field.distance_gradient((points - self.pose[:3, 3]) @ turn)
+        return phi, gradient @ turn.T
+
+
+def conform(near: Surroundings, displacement: VertexVectors, touches: Sequence[Touch],
+            fields: Sequence[SignedDistance]) -> Conformed:  # fmt: skip
+    """Moves the skin under tools onto them, and the skin around it along, as far as a bonded layer would.
+
+    What presses is known as pressures, what they do is a method's answer; but under a rigid tool the motion is known
+    better than any method can say it: the skin has come along with the tool that it sticks to, and does not enter it.
+    Under each tool the answer is moved onto the tool along the tool's way: the force where there is one, else the mean
+    contact normal, and each vertex's own where the tool closes around the limb. The correction is spread by the linear
+    response of the layer (interpolation with its Green's function as kernel).
+
+    Args:
+        near: of the layer.
+        displacement: a method's answer, (V, 3) [m].
+        touches: of all contacts.
+        fields: of their tools.
+    """
+    layer = near.layer
+    pressing = [(touch, field) for touch, field in zip(touches, fields, strict=True) if touch.load.values.any()]
+    tools = [_tool(touch, field, layer) for touch, field in pressing]
+    if not tools:
+        return Conformed(displacement, 0.0, 0.0)
+    all_of = np.unique(np.concatenate([tool.vertices for tool in tools]))
+    place = [np.searchsorted(all_of, tool.vertices) for tool in tools]
+    sinking = near.sinking(all_of).astype(float)
+    own = SMOOTH * float(np.diag(sinking).mean())
+    moved, sources = displacement[all_of], np.zeros((len(all_of), 3))
+    for _ in range(PASSES):
+        wanted = np.zeros((len(all_of), 3))
+        for tool, at in zip(tools, place, strict=True):
+            some = _wanted(tool, layer.vertices[tool.vertices], moved[at])
+            wanted[at] = np.where(some.any(axis=1, keepdims=True), some, wanted[at])
+        act = np.flatnonzero(wanted.any(axis=1))
+        if not len(act):
+            break
+        step = np.linalg.solve(sinking[np.ix_(act, act)] + own * np.eye(len(act)), wanted[act])
+        sources[act] += step
+        moved += sinking[:, act] @ step
+    out = displacement.copy()
+    spread = np.zeros_like(displacement)
+    spread[all_of] = sources
+    reached, by = near.spread(spread)
+    out[reached] += by
+    entered = 0.0
+    for tool in tools:  # what is left inside goes straight out
+        phi, gradient = tool.jet(layer.vertices[tool.vertices] + out[tool.vertices])
+        out[tool.vertices] -= np.minimum(phi, 0.0)[:, None] * gradient
+        phi, _ = tool.jet(layer.vertices[tool.vertices] + out[tool.vertices])
+        entered = max(entered, -float(phi.min(initial=0.0)))
+    corrected = float(np.linalg.norm(out[all_of] - displacement[all_of], axis=1).max())
+    return Conformed(out, corrected, entered)
+
+
+def _tool(touch: Touch, field: SignedDistance, layer: SoftLayer) -> _Tool:
+    v = touch.squeeze.vertices
+    pressure, size = touch.load.values[v], float(np.linalg.norm(touch.wrench[:3]))
+    way = -layer.normals[v]
+    if size > ALONG * float(pressure @ layer.vertex_areas[v]):
+        one = touch.wrench[:3] / size
+        way = np.broadcast_to(touch.way if touch.way is not None and touch.way @ one > ALONG else one, way.shape)
+    depth, cosine = touch.squeeze.depth, -np.einsum("ni,ni->n", layer.normals[v], way)
+    lies_on = np.flatnonzero((depth > 0) & (pressure > PRESSED * pressure.max()) & (cosine > AHEAD))
+    gone = np.full((len(v), 3), np.nan)
+    points, guess = layer.vertices[v[lies_on]], depth[lies_on] / cosine[lies_on]
+    far = depth_along(field, touch.pose_body_from_tool, points, way[lies_on], guess)
+    gone[lies_on] = far[:, None] * way[lies_on]
+    return _Tool(field, touch.pose_body_from_tool, v, gone)
+
+
+def _wanted(tool: _Tool, rest: Points, moved: Points) -> Points:
+    """How the vertices under a tool should still move, (N, 3) [m]; 0 where they may stay."""
+    phi, gradient = tool.jet(rest + moved)
+    lies_on = np.isfinite(tool.gone[:, :1])
+    return np.where(lies_on, tool.gone - moved, np.where(phi[:, None] < 0, -phi[:, None] * gradient, 0.0))

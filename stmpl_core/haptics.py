@@ -1,0 +1,466 @@
+"""Haptics: a linear model of a contact that holds between two answers, and the 1 kHz loop that renders it.
+
+A node answers some 100 times a second; a hand feels what changes a thousand times a second. So each answer carries a
+LocalContact (reaction, stiffness, how far it holds), and a DeviceLoop beside the device renders it in between.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, fields, replace
+from typing import NamedTuple
+
+import numba
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.spatial.transform import Rotation
+
+from stmpl_core.arrays import Transform, Wrench, finite
+from stmpl_core.contact import Contact
+from stmpl_core.errors import InvalidInput
+from stmpl_core.sdf import SignedDistance
+from stmpl_core.touch import Touch, Toucher
+from stmpl_core.trust import Trust
+
+STEP = 1e-4  # m of the central differences: well above the skin's finest kinks, well below a contact's depth
+AGREEMENT = 0.1  # of the wrench: what the linear model may be off by inside its neighbourhood
+SMALLEST = 0.01  # N; smaller reactions are judged as if they were this large: 10 % of it is below what a hand feels
+WIDEST = 2e-3  # m; no neighbourhood is looked for beyond
+SHRINK = 0.9  # of the radius at which the rim should agree
+FADE = 0.1  # of the reaction: below it drag and torque fade with the normal force, to end with it
+LONGEST_DELAY = 256  # device samples that a force may be under way
+PAYBACK = 4e-3  # s in which the controller takes back what was given out
+SOFTEST = 1e-2  # m: a reaction is taken to grow from nothing within this much, when its energy is told
+
+
+class Rendered(NamedTuple):
+    """What a local model says at a pose, and whether that pose lies where it was found to hold."""
+
+    wrench: Wrench
+    inside: bool
+
+
+@dataclass(frozen=True, eq=False)
+class LocalContact:
+    """The reaction of one contact around a pose, to first order.
+
+    Args:
+        pose_body_from_tool: where it was found, (4, 4).
+        wrench: force [N] and torque about the tool's origin [N m] that the tool exerts on the body, layer axes, (6,).
+        stiffness: d wrench / d twist, (6, 6) [N/m, N/rad; N m/m, N m/rad]; the twist is (translation of the tool's
+            origin, rotation vector) in layer axes.
+        valid_m: translations up to this keep the model within 10 % of the reaction, as seen at their rim [m].
+        valid_rad: the same of rotations [rad].
+        status: of the touch at the pose.
+        trust: of the touch at the pose; figures with evaluations, how many touches the model took.
+    """
+
+    pose_body_from_tool: Transform
+    wrench: Wrench
+    stiffness: np.ndarray
+    valid_m: float
+    valid_rad: float
+    status: str
+    trust: Trust
+
+    @property
+    def normal(self) -> np.ndarray:
+        """Direction in which the tool presses, (3,) [-]; zeros when it does not."""
+        size = np.linalg.norm(self.wrench[:3])
+        return self.wrench[:3] / size if size > 0 else np.zeros(3)
+
+    def wrench_at(self, pose_body_from_tool: ArrayLike) -> Rendered:
+        """Wrench (6,) at another pose, extrapolated and never pulling: no force against `normal`.
+
+        As the normal force falls below a tenth of `wrench`, drag and torque fade with it, so that all end together.
+
+        Raises:
+            InvalidInput: a pose that is not finite.
+        """
+        pose = finite("pose", pose_body_from_tool, (4, 4))
+        twist = _twist(self.pose_body_from_tool, pose)
+        wrench = self.wrench + self.stiffness @ twist
+        normal, size = self.normal, float(np.linalg.norm(self.wrench[:3]))
+        pressing = float(normal @ wrench[:3])
+        if pressing <= 0:
+            wrench = np.zeros(6)
+        else:
+            fade = min(1.0, pressing / (FADE * size))
+            wrench[:3] = pressing * normal + fade * (wrench[:3] - pressing * normal)
+            wrench[3:] *= fade
+        move, turn = float(np.linalg.norm(twist[:3])), float(np.linalg.norm(twist[3:]))
+        return Rendered(wrench, move <= self.valid_m and turn <= self.valid_rad)
+
+
+def local_contact(toucher: Toucher, contact: Contact, field: SignedDistance, *, step: float = STEP,
+                  rotations: bool = True) -> LocalContact:
+    """The local model at the contact's pose; its wrench, if it has one, is left aside.
+
+    The stiffness is found by central differences along the normal, two tangents, and about them. What these say of the
+    curvature proposes how far the model may hold; then the reaction is found at that rim, six ways, and the rim drawn
+    in until all agree. 25 touches when the first rim agrees, 13 without rotations.
+
+    Args:
+        toucher: of the layer.
+        contact: mesh and pose.
+        field: distances of the contact's mesh.
+        step: of the differences [m]; rotations move the tool's farthest corner by as much.
+        rotations: whether to find how the wrench follows rotations; a device that feels forces only needs none. The
+            stiffness to rotations is 0 without, and valid_rad.
+
+    Raises:
+        InvalidInput: a step that is not above 0.
+    """
+    if not (math.isfinite(step) and step > 0):
+        raise InvalidInput(f"step is {step} m; it must be finite and above 0. Try {STEP:g}.")
+    probe = _Probe(toucher, contact, field)
+    touch, wrench = probe.touch(np.zeros(6))
+    frame = _frame(wrench[:3])
+    lever = float(np.linalg.norm(np.maximum(*np.abs(field.tool_bounds))))
+    allowed = AGREEMENT * max(float(np.linalg.norm(wrench[:3])), SMALLEST)
+    stiffness, valid = np.zeros((6, 6)), [0.0, 0.0]
+    for block, arm in enumerate((1.0, lever)[: 1 + rotations]):  # translations, then rotations
+        axes = np.zeros((3, 6))
+        axes[:, 3 * block : 3 * block + 3] = frame.T
+        radius, least = WIDEST / arm, step / arm
+        if wrench.any():
+            columns, bend = probe.differences(wrench, axes, step / arm, lever)
+            stiffness[:, 3 * block : 3 * block + 3] = columns @ frame.T
+            radius = min(radius, math.sqrt(2 * allowed / bend) if bend > 0 else radius)
+        while radius > least:
+            off = probe.disagreement(wrench, stiffness, axes, radius, lever)
+            if off <= allowed:
+                break
+            radius *= max(SHRINK * math.sqrt(allowed / off), 0.25)  # what is left out grows like the square
+        valid[block] = radius
+    trust = replace(touch.trust, figures={**touch.trust.figures, "evaluations": float(probe.count)})
+    return LocalContact(contact.pose_body_from_tool, wrench, stiffness, valid[0], valid[1], touch.status, trust)
+
+
+class _Probe:
+    """The contact's reaction at poses around its own."""
+
+    def __init__(self, toucher: Toucher, contact: Contact, field: SignedDistance) -> None:
+        self.toucher, self.contact, self.field, self.count = toucher, contact, field, 0
+
+    def touch(self, twist: np.ndarray) -> tuple[Touch, Wrench]:
+        """The touch, by pose alone, after a twist (6,), and the wrench that the tool then exerts."""
+        self.count += 1
+        pose = _moved(self.contact.pose_body_from_tool, twist)
+        touch = self.toucher.touch(replace(self.contact, pose_body_from_tool=pose, wrench=None), self.field)
+        return touch, wrench_of(touch, self.toucher, pose)
+
+    def differences(self, middle: Wrench, axes: np.ndarray, step: float, lever: float) -> tuple[np.ndarray, float]:
+        """Derivative of the wrench along each axis, (6, 3), and its largest second derivative, judged as a force."""
+        columns, bend = np.empty((6, 3)), 0.0
+        for k, axis in enumerate(axes):
+            ahead, behind = (self.touch(sign * step * axis)[1] for sign in (1, -1))
+            columns[:, k] = (ahead - behind) / (2 * step)
+            bend = max(bend, _as_force(ahead - 2 * middle + behind, lever) / step**2)
+        return columns, bend
+
+    def disagreement(self, wrench: Wrench, stiffness: np.ndarray, axes: np.ndarray, radius: float,
+                     lever: float) -> float:
+        """Largest difference between model and reaction at a rim, judged as a force [N]."""
+        twists = [sign * radius * axis for axis in axes for sign in (1, -1)]
+        return max(_as_force(self.touch(t)[1] - wrench - stiffness @ t, lever) for t in twists)
+
+
+def wrench_of(touch: Touch, toucher: Toucher, pose_body_from_tool: Transform) -> Wrench:
+    """Force [N] and torque about the tool's origin [N m] that the tool exerts on the body, layer axes, (6,)."""
+    some = touch.load.loaded
+    forces = -touch.load.values[some, None] * toucher.layer.vertex_area_vectors[some]
+    arms = toucher.layer.vertices[some] - pose_body_from_tool[:3, 3]
+    return np.concatenate([forces.sum(axis=0), np.cross(arms, forces).sum(axis=0)])
+
+
+@dataclass(frozen=True)
+class LoopSettings:
+    """How a DeviceLoop renders.
+
+    Args:
+        coupling_stiffness: of the spring between device and proxy, Kc [N/m]; the stiffest that a hand can feel.
+        coupling_damping: of the damper beside it, Bc [N s/m].
+        controller: whether the passivity controller may act; the observer always watches.
+        most_damping: that the controller may add [N s/m]; keep it below device mass times rate / 2.
+        velocity_noise: speeds up to this are noise to the controller [m/s]; damping noise makes energy.
+        force_limit: largest force sent to the device [N].
+        stale_after: age of the newest local model [s] from which its reaction decays.
+        decay: time constant of that decay [s].
+        blend: time over which a new local model replaces the last [s]; about one period of the node.
+        delay_steps: device samples between a command and its force, if known; the observer counts with it.
+    """
+
+    coupling_stiffness: float = 1000.0
+    coupling_damping: float = 1.0
+    controller: bool = True
+    most_damping: float = 20.0
+    velocity_noise: float = 2e-3
+    force_limit: float = 5.0
+    stale_after: float = 0.1
+    decay: float = 0.05
+    blend: float = 8e-3
+    delay_steps: int = 0
+
+    def __post_init__(self) -> None:
+        for name in (f.name for f in fields(self) if f.name not in ("controller", "delay_steps")):
+            value, least = getattr(self, name), name in ("coupling_damping", "most_damping", "velocity_noise", "blend")
+            if not (math.isfinite(value) and (value > 0 or (least and value == 0))):
+                raise InvalidInput(f"{name} is {value}; it must be finite and {'at least' if least else 'above'} 0.")
+        if not 0 <= self.delay_steps < LONGEST_DELAY:
+            raise InvalidInput(f"delay_steps is {self.delay_steps}; allowed is 0..{LONGEST_DELAY - 1}.")
+
+
+class DeviceLoop:
+    """Renders the newest local model to a hand-held device that feels forces.
+
+    Virtual coupling (Colgate, Stanley & Brown 1995; Adams & Hannaford 1999): the device at x pulls, through a spring Kc
+    and a damper Bc, a proxy p without mass that rests on the local model,
+
+        Kc (x - p) + Bc (v - dp/dt) = F(p),    F(p) = F0 + K (p - p0), never pulling,
+
+    solved for p in closed form (backward Euler); the device feels -F. K is the symmetric part of the model's
+    translational stiffness. Rotations of the tool are taken as they were in the newest model: its wrench and
+    stiffness hold the tool's attitude of then, and no torque is rendered.
+
+    Passivity observer (Hannaford & Ryu 2002, "Time-domain passivity control of haptic interfaces"), on the
+    held force times the way measured since (exact for a held force: Stramigioli et al. 2005), less what coupling and
+    contact store (a reference as in Ryu et al. 2005):
+
+        W = -sum f(k-1) . (x(k) - x(k-1)) - V(k),    V = Kc |x - p|^2 / 2 + Fn^2 / (2 kn).
+
+    W < 0: the loop gives out what nobody put in. The controller then damps with -W / (v^2 T), up to `most_damping`,
+    what the velocity has beyond `velocity_noise`; T is 4 ms, not one sample as in the paper, whose forces jump. A
+    surplus W above V / 2 is forgotten, so that what was spent earlier does not pay for oscillating later; half of V is
+    what a contact that stiffens like depth^3 stores beyond Fn^2 / (2 kn).
+
+    `step` takes constant time, allocates nothing that grows, and takes no lock; `update` may be called from another
+    thread, and is one assignment to it.
+    """
+
+    def __init__(self, settings: LoopSettings | None = None) -> None:
+        self.settings = settings or LoopSettings()
+        self.refused = 0
+        s = self.settings
+        self._constants = np.array([s.coupling_stiffness, s.coupling_damping, float(s.controller), s.most_damping,
+                                    s.velocity_noise, s.force_limit, s.stale_after, s.decay, float(s.delay_steps)])
+        self._newest: np.ndarray | None = None
+        self._taken: np.ndarray | None = None
+        self._state = _State(np.zeros(MODEL), np.zeros(MODEL), np.zeros(3), np.zeros(3), np.zeros(3), np.zeros(3),
+                             np.zeros(3), np.zeros((LONGEST_DELAY, 3)), np.zeros(SCALARS))
+        self._state.scalars[AGE] = math.inf
+        _step(self._state, self._constants, 1e-3)  # compiles
+        self._state.scalars[STARTED] = 0.0
+
+    def update(self, model: LocalContact) -> None:
+        """Hands the newest local model over; the next `step` begins to blend to it."""
+        self._newest = _packed(model, self.settings.coupling_stiffness)
+
+    def step(self, position: ArrayLike, velocity: ArrayLike, dt: float) -> np.ndarray:
+        """The force for the device.
+
+        Args:
+            position: of the tool's origin as the device holds it, layer axes, (3,) [m].
+            velocity: its velocity, (3,) [m/s].
+            dt: time since the last step [s].
+
+        Returns:
+            Force on the device, (3,) [N]; the same array at every call. Zero, and one more in `refused`, when the
+            input is not finite or dt not above 0.
+        """
+        state, newest = self._state, self._newest
+        if newest is not None and newest is not self._taken:
+            self._taken = newest
+            state.target[:] = newest
+            state.scalars[LEFT], state.scalars[AGE] = self.settings.blend, 0.0
+        state.position[:], state.velocity[:] = position, velocity
+        if not _step(state, self._constants, dt):
+            self.refused += 1
+        return state.force
+
+    @property
+    def balance(self) -> float:
+        """W, what the observer holds [J]; below 0 the loop has given out energy that was not put in."""
+        return float(self._state.scalars[BALANCE])
+
+    @property
+    def taken_in(self) -> float:
+        """Energy that the device put into the loop since it was made, as measured [J]."""
+        return float(self._state.scalars[TAKEN_IN])
+
+    @property
+    def worst_balance(self) -> float:
+        """Lowest W yet [J]."""
+        return float(self._state.scalars[WORST])
+
+    @property
+    def added_damping(self) -> float:
+        """What the controller adds now [N s/m]."""
+        return float(self._state.scalars[ADDED])
+
+    @property
+    def age(self) -> float:
+        """Time since the newest local model was taken over [s]; infinite before the first."""
+        return float(self._state.scalars[AGE])
+
+    @property
+    def proxy(self) -> np.ndarray:
+        """Where the tool's origin rests, (3,) [m]: the pose to ask the next local model for."""
+        return self._state.proxy.copy()
+
+    @property
+    def outside(self) -> bool:
+        """Whether the proxy has left the neighbourhood in which the newest local model holds."""
+        return bool(np.linalg.norm(self._state.proxy - self._state.target[PLACE]) > self._state.target[VALID])
+
+
+# A local model as the kernel reads it: force at the origin of layer axes, stiffness, normal, size, normal stiffness,
+# place, valid_m. The scalars of the loop follow.
+BIAS, STIFFNESS, NORMAL, SIZE, ALONG = slice(0, 3), slice(3, 12), slice(12, 15), 15, 16
+BLENDED, PLACE, VALID, MODEL = slice(0, 17), slice(17, 20), 20, 21
+AGE, LEFT, STARTED, BALANCE, TAKEN_IN, STORED, WORST, ADDED, TICK, SCALARS = range(10)
+
+
+class _State(NamedTuple):
+    live: np.ndarray  # (MODEL,), what is rendered now
+    target: np.ndarray  # (MODEL,), the newest
+    position: np.ndarray  # (3,) [m]
+    velocity: np.ndarray  # (3,) [m/s]
+    last: np.ndarray  # (3,) [m], position one step ago
+    proxy: np.ndarray  # (3,) [m]
+    force: np.ndarray  # (3,) [N]
+    sent: np.ndarray  # (LONGEST_DELAY, 3) [N], a ring
+    scalars: np.ndarray
+
+
+def _packed(model: LocalContact, coupling: float) -> np.ndarray:
+    """The model for the kernel; stiffness that falls is kept to half of the coupling's: one place for the proxy."""
+    values, vectors = np.linalg.eigh(0.5 * (model.stiffness[:3, :3] + model.stiffness[:3, :3].T))
+    stiffness = (vectors * np.maximum(values, -0.5 * coupling)) @ vectors.T
+    place, force, normal = model.pose_body_from_tool[:3, 3], model.wrench[:3], model.normal
+    size = float(np.linalg.norm(force))
+    along = max(float(normal @ stiffness @ normal), size / SOFTEST)
+    return np.concatenate([force - stiffness @ place, stiffness.ravel(), normal, [size, along], place, [model.valid_m]])
+
+
+@numba.njit(cache=True)
+def _step(state, constants, dt):
+    """One step; False when the input cannot be used."""
+    kc, bc, controlled, most, noise, limit, stale_after, decay, delay = constants
+    x, v, last, p, force, s = state.position, state.velocity, state.last, state.proxy, state.force, state.scalars
+    good = dt > 0 and np.isfinite(dt)
+    for i in range(3):
+        good = good and np.isfinite(x[i]) and np.isfinite(v[i])
+    if not good:
+        force[:] = 0.0
+        state.sent[int(s[TICK]) % len(state.sent)] = 0.0
+        s[TICK] += 1.0
+        return False
+    if s[STARTED] == 0.0:
+        last[:], p[:], s[STARTED] = x, x, 1.0
+        s[BALANCE], s[TAKEN_IN], s[STORED], s[WORST], s[ADDED], s[TICK] = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+        state.sent[:] = 0.0
+
+    # Observe: what the force that acted since the last step took in.
+    tick = int(s[TICK])
+    acted = state.sent[(tick - 1 - int(delay)) % len(state.sent)]
+    work = 0.0
+    for i in range(3):
+        work -= acted[i] * (x[i] - last[i])
+        last[i] = x[i]
+    s[TAKEN_IN] += work
+
+    # Model: blend to the newest; fade when it is stale.
+    model, part = state.live, 1.0 if s[LEFT] <= dt else dt / s[LEFT]
+    for i in range(17):
+        model[i] += part * (state.target[i] - model[i])
+    s[LEFT] = max(s[LEFT] - dt, 0.0)
+    s[AGE] += dt
+    fade = 1.0 if s[AGE] <= stale_after else np.exp(-(s[AGE] - stale_after) / decay)
+
+    # Proxy: balance of coupling and model, then with the model's force kept from pulling.
+    c, pressing = kc + bc / dt, 0.0
+    right = kc * x + bc * (v + p / dt)
+    k = fade * model[3:12].reshape(3, 3)
+    bias, normal = fade * model[0:3], model[12:15]
+    rest = _solved(k, c, right - bias)
+    f = bias + k @ rest
+    for i in range(3):
+        pressing += f[i] * normal[i]
+    size = fade * model[15]
+    kept = min(1.0, pressing / (FADE * size)) if size > 0 else 0.0
+    for i in range(3):
+        f[i] = pressing * normal[i] + kept * (f[i] - pressing * normal[i]) if pressing > 0 else 0.0
+        p[i] = (right[i] - f[i]) / c
+
+    # Balance: what was taken in, less what is stored; a surplus beyond half of that is forgotten.
+    stored = 0.0
+    for i in range(3):
+        stored += 0.5 * kc * (x[i] - p[i]) ** 2
+    along = fade * model[16]
+    if pressing > 0 and along > 0:
+        stored += pressing * pressing / (2 * along)
+    s[BALANCE] = min(s[BALANCE] + work - (stored - s[STORED]), 0.5 * stored)
+    s[STORED] = stored
+    s[WORST] = min(s[WORST], s[BALANCE])
+
+    # Control: damp while the balance is negative; limit the force.
+    speed = np.sqrt(v[0] * v[0] + v[1] * v[1] + v[2] * v[2])
+    s[ADDED] = 0.0
+    if controlled > 0 and s[BALANCE] < 0 and speed > noise:
+        s[ADDED] = min(most, -s[BALANCE] / (speed * speed * max(dt, PAYBACK))) * (1.0 - noise / speed)
+    length = 0.0
+    for i in range(3):
+        force[i] = -f[i] - s[ADDED] * v[i]
+        length += force[i] * force[i]
+    length = np.sqrt(length)
+    if length > limit:
+        for i in range(3):
+            force[i] *= limit / length
+    state.sent[tick % len(state.sent)] = force
+    s[TICK] = tick + 1.0
+    return True
+
+
+@numba.njit(cache=True)
+def _solved(k, c, right):
+    """(k + c I)^-1 right for a symmetric k (3, 3), by Cramer's rule."""
+    a, b, d = k[0, 0] + c, k[1, 1] + c, k[2, 2] + c
+    e, f, g = k[0, 1], k[0, 2], k[1, 2]
+    p, q, r = b * d - g * g, f * g - e * d, e * g - f * b
+    det = a * p + e * q + f * r
+    out = np.empty(3)
+    out[0] = (p * right[0] + q * right[1] + r * right[2]) / det
+    out[1] = (q * right[0] + (a * d - f * f) * right[1] + (e * f - a * g) * right[2]) / det
+    out[2] = (r * right[0] + (e * f - a * g) * right[1] + (a * b - e * e) * right[2]) / det
+    return out
+
+
+def _moved(pose: Transform, twist: np.ndarray) -> Transform:
+    """The pose after a twist of the tool about its own origin, in layer axes."""
+    moved = pose.copy()
+    moved[:3, 3] += twist[:3]
+    if twist[3:].any():
+        moved[:3, :3] = Rotation.from_rotvec(twist[3:]).as_matrix() @ pose[:3, :3]
+    return moved
+
+
+def _twist(start: Transform, end: Transform) -> np.ndarray:
+    """The twist (6,) that takes one pose to the other."""
+    turn = Rotation.from_matrix(end[:3, :3] @ start[:3, :3].T).as_rotvec()
+    return np.concatenate([end[:3, 3] - start[:3, 3], turn])
+
+
+def _frame(force: np.ndarray) -> np.ndarray:
+    """Orthonormal axes as columns, (3, 3), the first along `force`."""
+    if not force.any():
+        return np.eye(3)
+    first = force / np.linalg.norm(force)
+    second = np.cross(first, np.eye(3)[np.abs(first).argmin()])
+    second /= np.linalg.norm(second)
+    return np.stack([first, second, np.cross(first, second)], axis=1)
+
+
+def _as_force(wrench: np.ndarray, lever: float) -> float:
+    """The larger of a wrench's force and of its torque over the tool's reach [N]."""
+    return max(float(np.linalg.norm(wrench[:3])), float(np.linalg.norm(wrench[3:])) / lever)
