@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Protocol, Self
 
 from bags.messages import Frame
 from bags.survey import PRESSING, Moment, Survey, survey
+from stmpl_core.arrays import PerVertex
 from stmpl_core.contact import Contact
 from stmpl_core.errors import BagError, StmplError
 from stmpl_core.layer import SoftLayer
@@ -22,9 +24,23 @@ log = logging.getLogger(__name__)
 Answer = Callable[[Frame], Displacement]  # how one side of a comparison answers a frame
 
 
+class Presser(Protocol):
+    """Judges an answer by its tools: presses them in once more (fem_tools.RigidFem)."""
+
+    name: str
+
+    def prepare(self, layer: SoftLayer) -> Self:
+        """Keeps the layer."""
+        ...
+
+    def press(self, contacts: Sequence[Contact], pressure: PerVertex, figures: Mapping[str, float]) -> Displacement:
+        """The motion under these contacts."""
+        ...
+
+
 @dataclass(frozen=True, eq=False)
 class FramePair:
-    """One frame, answered by both sides under the same pressure.
+    """One frame, answered by both sides: under the same pressure, or with the same tools where they press.
 
     Args:
         frame: as recorded.
@@ -114,14 +130,17 @@ class Comparison:
 
 def compare_run(
     path: Path | str,
-    reference: Method,
+    reference: Method | Presser,
     *,
     frames: int = 12,
     method: Method | None = None,
     tolerance: float | None = None,
     on_frame: Callable[[int, int], None] | None = None,
 ) -> Comparison:
-    """Solves a sample of a run's frames by `reference`, each under the very pressure that the run's answer had.
+    """Solves a sample of a run's frames by `reference`.
+
+    A Method gets the very pressure that the run's answer had, and judges what was made of it: give a method too, since
+    recorded answers also lie on their tools. A Presser gets the tools, and judges recorded answers whole.
 
     The sample holds the frame under the largest load, the heaviest one with two tools on the skin, and others evenly
     over the loaded part of the run.
@@ -139,7 +158,8 @@ def compare_run(
     """
     run = survey(path)
     layer = run.bag.layer
-    judge, judged = _solver(reference, layer), _recorded if method is None else _solver(method, layer)
+    judge = _presser(reference, run) if hasattr(reference, "press") else _solver(reference, layer)  # type: ignore[arg-type]
+    judged = _recorded if method is None else _solver(method, layer)
     names = (run.method if method is None else method.name, reference.name)
     return _compare(run, sample(run.moments, frames), names, judged, judge, tolerance, on_frame)
 
@@ -225,11 +245,21 @@ def _solver(method: Method, layer: SoftLayer) -> Answer:
     return lambda frame: ready.solve(_load(frame))
 
 
+def _presser(reference: Presser, run: Survey) -> Answer:
+    ready = reference.prepare(run.bag.layer)
+
+    def answer(frame: Frame) -> Displacement:
+        pressing = [c for c in run.contacts.at(frame) if frame.statuses[c.name] in PRESSING]
+        return ready.press(pressing, _load(frame).values, frame.trust.figures)
+
+    return answer
+
+
 def _load(frame: Frame) -> Load:
     if frame.pressure is None:
         raise BagError(f"answer {frame.sequence} does not say the pressure that it was solved for. "
                        "Replay the run first, and compare the replay.")
-    return Load.pressure(frame.pressure)
+    return Load.contact(frame.pressure)
 
 
 def _recorded(frame: Frame) -> Displacement:

@@ -11,9 +11,9 @@ from bags.messages import Frame
 from bags.reader import Bag, ContactLog
 from stmpl_core.arrays import PerVertex
 from stmpl_core.errors import BagError
-from stmpl_core.touch import BY_POSE, MOVED, TOUCHING
+from stmpl_core.touch import BY_POSE, IN_CORE, MOVED, TOUCHING
 
-PRESSING = frozenset((TOUCHING, MOVED, BY_POSE))  # statuses of a tool that loads the skin
+PRESSING = frozenset((TOUCHING, MOVED, BY_POSE, IN_CORE))  # statuses of a tool that loads the skin
 NANO = 1e-9  # seconds in a nanosecond
 
 

@@ -148,7 +148,7 @@ class _Probe:
         self.count += 1
         pose = _moved(self.contact.pose_body_from_tool, twist)
         touch = self.toucher.touch(replace(self.contact, pose_body_from_tool=pose, wrench=None), self.field)
-        return touch, wrench_of(touch, self.toucher, pose)
+        return touch, touch.wrench
 
     def differences(self, middle: Wrench, axes: np.ndarray, step: float, lever: float) -> tuple[np.ndarray, float]:
         """Derivative of the wrench along each axis, (6, 3), and its largest second derivative, judged as a force."""
@@ -164,14 +164,6 @@ class _Probe:
         """Largest difference between model and reaction at a rim, judged as a force [N]."""
         twists = [sign * radius * axis for axis in axes for sign in (1, -1)]
         return max(_as_force(self.touch(t)[1] - wrench - stiffness @ t, lever) for t in twists)
-
-
-def wrench_of(touch: Touch, toucher: Toucher, pose_body_from_tool: Transform) -> Wrench:
-    """Force [N] and torque about the tool's origin [N m] that the tool exerts on the body, layer axes, (6,)."""
-    some = touch.load.loaded
-    forces = -touch.load.values[some, None] * toucher.layer.vertex_area_vectors[some]
-    arms = toucher.layer.vertices[some] - pose_body_from_tool[:3, 3]
-    return np.concatenate([forces.sum(axis=0), np.cross(arms, forces).sum(axis=0)])
 
 
 @dataclass(frozen=True)

@@ -123,8 +123,17 @@ class Surroundings:
         return out
 
     def spread(self, sources: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Vectors at vertices (V, 3) spread over the skin as sinking spreads: the vertices reached (N,), and (N, 3)."""
-        vertices, figures = self._felt(sources.T, moments=False)
+        """Vectors at vertices (V, 3) spread as sinking spreads, to NEAR: the vertices reached (N,), and (N, 3)."""
+        loaded = np.flatnonzero(sources.any(axis=1))
+        vertices = _reached(self.start, self.index, loaded, len(sources))
+        points = self.layer.vertices
+        low, high = points[loaded].min(axis=0, initial=np.inf), points[loaded].max(axis=0, initial=-np.inf)
+        away = np.maximum(np.maximum(low - points[vertices], points[vertices] - high), 0.0)
+        vertices = vertices[(away**2).sum(axis=1) < (NEAR * self.layer.thickness[vertices]) ** 2]
+        figures = np.zeros((len(vertices), 3, WIDTH), dtype=np.float32)
+        values = np.ascontiguousarray(sources[loaded].T, dtype=np.float32)
+        _feel_few(vertices, values, np.ascontiguousarray(self._sites[:, loaded]), self._sites, self._frames,
+                  self._response[0], self._response[1], False, figures)  # fmt: skip
         return vertices, -figures[:, :, 2]
 
     def _felt(self, fields: np.ndarray, moments: bool) -> tuple[np.ndarray, np.ndarray]:

@@ -131,7 +131,7 @@ class Toucher:
     def _place(self, contact: Contact, field: SignedDistance) -> _Placed:
         """Where the tool presses, or why it does not."""
         pose = contact.pose_body_from_tool
-        clearance = self._clearance(field, pose, self.reach if contact.wrench is not None else 0.0)
+        clearance = self._clearance(field, pose, 0.0 if contact.wrench is None else self.reach + self._thickest)
         depth = -float(clearance.least.min(initial=np.inf))
 
         def nothing(status: str) -> _Placed:
@@ -147,7 +147,7 @@ class Toucher:
         gap = self._gap(field, pose, clearance, force)
         if gap is None:
             return nothing(NO_TOUCH)
-        return self._pressed(contact, field, depth, gap, force) or nothing(PULLING)
+        return self._pressed(contact, field, clearance.vertices, depth, gap, force) or nothing(PULLING)
 
     def _status_by_pose(self, squeeze: Squeeze) -> str:
         return IN_CORE if (squeeze.depth >= self.layer.thickness[squeeze.vertices]).any() else BY_POSE
@@ -177,7 +177,7 @@ class Toucher:
             moved += gap
         return best
 
-    def _pressed(self, contact: Contact, field: SignedDistance, depth: float, gap: float,
+    def _pressed(self, contact: Contact, field: SignedDistance, near: np.ndarray, depth: float, gap: float,
                  force: np.ndarray) -> _Placed | None:  # fmt: skip
         """The tool moved along `force` until it presses with its component along the contact normal.
 
@@ -190,7 +190,7 @@ class Toucher:
         why = ""
         for _ in range(TRIALS):
             pose = _shifted(start, moved * push)
-            squeeze = self.columns.squeeze(field, pose, self._clearance(field, pose))
+            squeeze = self.columns.squeeze(field, pose, self.columns.clearance(field, pose, near, self.hole))
             v = squeeze.vertices
             steep = self._inward[v] @ push
             if not len(v) or not (steep > FACING).any():
@@ -224,8 +224,9 @@ class Toucher:
             else:
                 high = moved
             below = max(moved - touch_at, 1e-6)
-            power = 1.5 if last is None else np.log(size / last[1]) / np.log(below / last[0])
-            power = float(np.clip(power if np.isfinite(power) else 1.5, 0.8, 4.0))
+            power = 1.5
+            if last is not None and abs(below / last[0] - 1) > 1e-6:
+                power = float(np.clip(np.log(size / last[1]) / np.log(below / last[0]), 0.8, 4.0))
             last = (below, size)
             most = below * DEEP / max(deepest, 1e-3) if size < normal else np.inf
             following = touch_at + min(below * float(np.clip((normal / size) ** (1 / power), 0.2, 4.0)), most)

@@ -93,20 +93,31 @@ def replay(path: BagPath, method: MethodName | None = None, every: int = 1, as_j
     return 0
 
 
-def compare(path: BagPath, reference: MethodName = "fem", frames: int = 12, as_json: Json = False) -> int:
-    """Compares a recorded run with a reference method on a sample of its frames.
+def compare(
+    path: BagPath, reference: Literal["rigid", MethodName] = "rigid", frames: int = 12, as_json: Json = False
+) -> int:
+    """Compares a recorded run with a reference on a sample of its frames.
 
     Example: stmpl compare runs/latest --frames 6
 
     Args:
         path: a run's folder, or its .mcap file.
-        reference: that judges.
+        reference: that judges. rigid: the recorded answers, by the same tools pressed in by finite elements; any
+            other: the run's method, under the recorded pressures.
         frames: of the run that the reference solves.
         as_json: print figures for machines.
     """
+    from bags.reader import Bag
+    from fem_tools import RigidFem
     from stmpl_ros.tables import compare_with_progress, comparison_table, figures_of
 
-    comparison = compare_with_progress(path, _method(reference), frames, quiet=as_json)
+    if reference == "rigid":
+        comparison = compare_with_progress(path, RigidFem(), frames, quiet=as_json)
+    else:
+        if (recorded := Bag(path).provenance.method) not in METHODS:
+            raise InvalidInput(f"{path} was recorded with {recorded or 'no named method'}: compare it with rigid.")
+        method = METHODS[recorded]()
+        comparison = compare_with_progress(path, _method(reference), frames, method=method, quiet=as_json)
     _print_figures(figures_of(comparison) if as_json else comparison_table(comparison))
     return 0 if comparison.passed else 1
 

@@ -20,7 +20,7 @@ from bags.compare import Comparison
 from bags.provenance import versions
 from bags.replay import ReplaySummary, replay_run
 from bags.report import write_report
-from fem_tools import PatchFem
+from fem_tools import RigidFem
 from stmpl_core.errors import StmplError
 from stmpl_ros.parameters import METHODS, DemoConfig, ProbeConfig
 from stmpl_ros.tables import compare_with_progress, comparison_table
@@ -51,7 +51,7 @@ def run(config: DemoConfig) -> int:
     _point_latest_at(folder)
 
     replay = _replay(folder, config.node.method, console)
-    comparison = compare_with_progress(folder, PatchFem(layers=2, refine=1), config.frames)
+    comparison = compare_with_progress(folder, RigidFem(), config.frames)
     report = write_report(comparison, folder / "report.html", replay=replay)
     console.print(comparison_table(comparison))
     console.print(str(replay))

@@ -11,7 +11,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
-from bags.compare import Comparison, compare_run
+from bags.compare import Comparison, Presser, compare_run
 from bags.reader import Bag
 from bags.report import headline
 from stmpl_core.methods.base import Method
@@ -21,7 +21,9 @@ if TYPE_CHECKING:
     from fem_tools.critical_load import CriticalLoad
 
 
-def compare_with_progress(path: Path, reference: Method, frames: int, *, quiet: bool = False) -> Comparison:
+def compare_with_progress(
+    path: Path, reference: Method | Presser, frames: int, *, method: Method | None = None, quiet: bool = False
+) -> Comparison:
     """bags.compare.compare_run under a progress bar on stderr. Raises BagError."""
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     with Progress(*columns, console=Console(stderr=True), disable=quiet, transient=True) as progress:
@@ -30,7 +32,7 @@ def compare_with_progress(path: Path, reference: Method, frames: int, *, quiet: 
         def show(done: int, total: int) -> None:
             progress.update(task, completed=done, total=total)
 
-        return compare_run(path, reference, frames=frames, on_frame=show)
+        return compare_run(path, reference, frames=frames, method=method, on_frame=show)
 
 
 def figures_of(comparison: Comparison) -> dict[str, Any]:
