@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from fem_tools import PatchFem
+from bags.survey import PRESSING
+from fem_tools import RigidFem
 from stmpl_core.errors import InvalidInput
 from stmpl_core.layer import SoftLayer
-from stmpl_core.load import Load
 from stmpl_core.trust import Displacement
 from stmpl_ros.view.latest import LatestWins
 from stmpl_ros.view.page import Page
@@ -24,9 +24,9 @@ class Judge:
 
     def __init__(self, page: Page, keep: Callable[[Snapshot, Snapshot], None]) -> None:
         self._page, self._keep = page, keep
-        self._fem: tuple[SoftLayer, PatchFem] | None = None
+        self._fem: tuple[SoftLayer, RigidFem] | None = None
         self._working = LatestWins(self._judge, page.say, "judge")
-        button = page.server.gui.add_button("FEM of this instant", hint="Solves this pressure by finite elements")
+        button = page.server.gui.add_button("FEM of this instant", hint="Presses these tools by finite elements")
         button.on_click(lambda _: self.judge())
 
     def judge(self) -> None:
@@ -46,20 +46,21 @@ class Judge:
         self._working.close()
 
     def _judge(self, snapshot: Snapshot) -> None:
-        judged = snapshot.judged_by(self._solve(snapshot.answer))
+        judged = snapshot.judged_by(self._solve(snapshot))
         self._keep(snapshot, judged)
         self._page.say("")
         if self._page.snapshot is snapshot:
             self._page.show(judged)
             self._page.field = "error against FEM"
 
-    def _solve(self, answer: Displacement) -> Displacement:
-        layer = self._page.layer
+    def _solve(self, snapshot: Snapshot) -> Displacement:
+        layer, answer = self._page.layer, snapshot.answer
         if layer is None or answer.pressure is None:
             raise InvalidInput("this answer does not say the pressure that it was solved for: FEM cannot solve it.")
         if self._fem is None or self._fem[0] is not layer:
-            self._fem = layer, PatchFem().prepare(layer)
-        solved = self._fem[1].solve(Load.pressure(answer.pressure))
+            self._fem = layer, RigidFem().prepare(layer)
+        pressing = [contact for contact in snapshot.contacts if answer.statuses.get(contact.name) in PRESSING]
+        solved = self._fem[1].press(pressing, answer.pressure, answer.trust.figures)
         if not solved.trust.converged:
             raise InvalidInput(f"FEM did not converge on this instant, so it cannot judge it. {solved.trust.why}")
         return solved

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from rich.console import Console
 
-from fem_tools import PatchFem
+from fem_tools import RigidFem
 from stmpl_core.errors import InvalidInput
 from stmpl_ros.parameters import METHODS
 from stmpl_ros.tables import compare_with_progress
@@ -33,7 +33,7 @@ def run(config: ViewConfig, path: Path | None, live: bool, arguments: list[str] 
 def _serve_recording(config: ViewConfig, path: Path) -> int:
     from stmpl_ros.view.recording import Recording, RecordingPlayer
 
-    compared = compare_with_progress(path, PatchFem(), config.fem) if config.fem else None
+    compared = compare_with_progress(path, RigidFem(), config.fem) if config.fem else None
     with Console(stderr=True).status(f"reading {path}"):
         recording = Recording.of(path, config.frames, compared=compared)
     page = Page(config.host, config.port, str(path))

@@ -37,7 +37,7 @@ class Snapshot:
         readings: of each tool, by its name.
         solve_seconds: that the answer took [s].
         latency: from the contact to the answer [s]; NaN where it is not known.
-        reference: the same pressure solved by finite elements, or None.
+        reference: the same tools pressed by finite elements, or None.
     """
 
     time: float
