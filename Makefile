@@ -25,9 +25,11 @@ check: $(READY)  ## Lint, types and the one-way import rule
 	$(BIN)/pyright
 	$(BIN)/lint-imports
 
-weights: $(READY)  ## Make the networks that ship, from nothing: data, training (about two hours on two cores; goes on if stopped)
+weights: $(READY)  ## Make the networks that ship, from nothing: data, training (about three hours on two cores; goes on if stopped)
 	$(BIN)/stmpl generate --preset default --out data/default
 	$(BIN)/stmpl train --preset default --data data/default --out stmpl_core/weights
+	$(BIN)/stmpl generate --preset contacts --out data/contacts
+	$(BIN)/stmpl train --preset contacts --data data/contacts --out stmpl_core/weights
 	$(BIN)/stmpl train --preset paper-reduced --data data/default --out stmpl_core/weights
 
 clean:  ## Remove .venv, caches and build folders; runs/ stays

@@ -87,7 +87,7 @@ class Row:
         moving: likewise over those that move more than 10 % of the peak.
         contact: likewise over those with pressure.
         peak: signed error of the largest displacement.
-        entered: of the deepest vertex inside a tool, over the thickness.
+        entered: of the deepest vertex of the whole skin inside a tool, over the thickness.
         by_wrench: error of the depth found from the force, the pose being off, over the thickness; signed.
         within: whether the force is within the error that the answer states.
     """
@@ -180,7 +180,7 @@ def row(press: Press, simulator: Simulator, toucher: Toucher, truth: Indentation
     columns = sum(float(t.squeeze.pressure @ (-layer.vertex_area_vectors[t.squeeze.vertices] @ way)) for t in touches)
     answer = simulator.step(contacts(press, truth.tools))
     error = np.linalg.norm(answer.displacement - truth.displacement, axis=1)
-    length = np.linalg.norm(truth.displacement, axis=1)
+    length, skin = np.linalg.norm(truth.displacement, axis=1), layer.vertices + answer.displacement
     peak = float(length.max())
     stated = sum(touch.trust.figures["force_error_n"] for touch in touches)
     forces = [float(w[:3] @ tool.direction) for w, tool in zip(truth.wrenches, truth.tools, strict=True)]
@@ -200,7 +200,7 @@ def row(press: Press, simulator: Simulator, toucher: Toucher, truth: Indentation
         moving=float(error[length > 0.1 * peak].mean()) / peak,
         contact=float(error[truth.pressure > 0.02 * truth.pressure.max()].mean()) / peak,
         peak=float(answer.magnitude.max()) / peak - 1,
-        entered=answer.trust.figures["entered_m"] / thick,
+        entered=max(0.0, *(-float(t.distance(skin).min()) for t in truth.tools)) / thick,
         by_wrench=float(np.abs(found).max()) / thick,
         within=abs(force - truth.force) <= stated,
     )

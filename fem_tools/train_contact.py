@@ -45,11 +45,11 @@ class ContactTraining(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    hidden: int = Field(default=48, ge=4)
-    steps: int = Field(default=12_000, ge=10)
+    hidden: int = Field(default=32, ge=4)
+    steps: int = Field(default=3_000, ge=10)
     batch: int = Field(default=48, ge=4)
     learning_rate: float = Field(default=3e-3, gt=0)
-    weight_decay: float = Field(default=1e-3, ge=0)
+    weight_decay: float = Field(default=1e-2, ge=0)
     seed: int = 0
 
 
