@@ -33,6 +33,7 @@ class Frame:
         statuses: what was found of each tool, by its name.
         inputs: stamps of the pose and the wrench of each tool that it answers [ns]; 0: no wrench.
         solve_seconds: time that the node spent on it [s].
+        fade: share of its contacts' answer that it is; below 1 where the input had stopped.
     """
 
     stamp_ns: int
@@ -46,6 +47,7 @@ class Frame:
     statuses: dict[str, str]
     inputs: dict[str, tuple[int, int]]
     solve_seconds: float
+    fade: float = 1.0
 
     @property
     def tools(self) -> tuple[str, ...]:
@@ -166,6 +168,7 @@ def frame_from(message: Any, log_time_ns: int) -> Frame:
         inputs={tool: (_ns(pose), _ns(wrench)) for tool, pose, wrench in zip(
             message.tools, message.pose_stamps, message.wrench_stamps, strict=True)},
         solve_seconds=float(message.solve_seconds),
+        fade=float(getattr(message, "fade", 1.0)),  # older recordings have none
     )
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -75,7 +75,10 @@ def replay(path: Path | str, method: Method, *, every: int = 1) -> Iterator[Repl
     for number, frame in enumerate(bag.frames()):
         if number % every == 0:
             bag.check_layer(frame)
-            yield Replayed(frame, simulator.step(contacts.at(frame)))
+            answer = simulator.step(contacts.at(frame))
+            if frame.fade < 1:  # the input had stopped: a share of the last answer was sent
+                answer = replace(answer, displacement=frame.fade * answer.displacement)
+            yield Replayed(frame, answer)
 
 
 def replay_run(path: Path | str, method: Method, *, every: int = 1) -> ReplaySummary:

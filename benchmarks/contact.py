@@ -302,8 +302,8 @@ def draw(rows: Sequence[Row], path: Path) -> None:
         mine = [r for r in rows if r.name == name]
         x = [r.mean_pressure for r in mine]
         axes[0].plot(x, [100 * r.winkler_error for r in mine], "x:", color="grey", lw=0.8)
-    for axis, title in zip(axes, ("force, signed error [%]", "pressure, L2 error [%]",
-                                  "displacement under the contact,\nmean error [% of the peak]"), strict=True):  # fmt: skip
+    titles = ("force, signed error [%]", "pressure, L2 error [%]", "motion under the contact, mean error [% of the peak]")
+    for axis, title in zip(axes, titles, strict=True):
         axis.set(xscale="log", xlabel="mean pressure / E", title=title)
         axis.grid(alpha=0.3)
     axes[0].axhspan(-5, 5, color="tab:green", alpha=0.15)

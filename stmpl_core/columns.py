@@ -27,12 +27,17 @@ class Squeeze(NamedTuple):
         pressure: Winkler's pressure over E, averaged with each vertex's hat function, (N,) [-].
         strain: of the columns, times confined modulus over E, averaged likewise, (N,) [-].
         depth: under the vertex itself, from the skin at rest to the tool, 0 where it is not covered, (N,) [m].
+        rests: from 0, where the vertex is not covered, to 1, ROUND inside the tool's walls and its skin, (N,) [-].
     """
 
     vertices: np.ndarray
     pressure: np.ndarray
     strain: np.ndarray
     depth: np.ndarray
+    rests: np.ndarray
+
+
+NO_SQUEEZE = Squeeze(np.empty(0, np.int64), np.empty(0), np.empty(0), np.empty(0), np.empty(0))
 
 
 class Clearance(NamedTuple):
@@ -99,13 +104,13 @@ class Columns:
         near, least, above = clearance
         covered = near[least < HOLE * self.layer.edge_length]  # no point of a triangle is further from all corners
         if not len(covered):
-            return Squeeze(np.empty(0, np.int64), np.empty(0), np.empty(0), np.empty(0))
-        buried = bool(((least < 0) & (above > 0)).any())
+            return NO_SQUEEZE
+        buried = min(max(float(np.minimum(-least, above).max()) / ROUND, 0.0), 1.0)
         grid = field.coefficients, field.origin, field.spacing, pose
         skin = self.points, self.inward, self.layer.thickness, self.faces, self._start, self._around, self._face_areas
-        vertices, sums, depth = _squeeze(*grid, *skin, covered, buried, self._slot, self._moduli)
+        vertices, sums, depth, rests = _squeeze(*grid, *skin, covered, buried, self._slot, self._moduli)
         sums /= self.layer.vertex_areas[vertices, None]
-        return Squeeze(vertices, sums[:, 0], sums[:, 1], depth)
+        return Squeeze(vertices, sums[:, 0], sums[:, 1], depth, rests)
 
 
 def depth_along(field: SignedDistance, pose: Transform, points: Points, way: Points, guess: np.ndarray) -> np.ndarray:
@@ -114,7 +119,7 @@ def depth_along(field: SignedDistance, pose: Transform, points: Points, way: Poi
     return _depths_along(*grid, points, np.ascontiguousarray(way), guess)
 
 
-def _samples(split: int) -> np.ndarray:
+def _middles(split: int) -> np.ndarray:
     """Barycentric coordinates of the middles of the split^2 parts of a triangle, (split^2, 3)."""
     out = []
     for i in range(split):
@@ -126,7 +131,7 @@ def _samples(split: int) -> np.ndarray:
     return np.column_stack([ab, 1 - ab.sum(axis=1)])
 
 
-_MANY, _FEW = _samples(3), _samples(2)
+_SAMPLES = _middles(3)
 
 
 @numba.njit(cache=True, inline="always")
@@ -186,15 +191,27 @@ def _clearances(coefficients, origin, spacing, pose, points, inward, thickness, 
 def _meet(coefficients, origin, spacing, pose, point, inward, t, guess):
     """How deep under a point of the skin the tool ends [m]; 0 if it is not met.
 
-    Seen from the core, by sphere tracing, or nearest to a guess above 0; then the secant rule.
+    From a guess above ROUND by the secant rule. Where that goes astray, as along a wall of the tool, or without such a
+    guess: from the core by sphere tracing, then the secant rule.
     """
-    s = t if guess <= 0 else guess
-    d = _at(coefficients, origin, spacing, pose, point, inward, s)
-    if guess <= 0 and d <= 0:
+    if guess > ROUND:
+        s, d = guess, _at(coefficients, origin, spacing, pose, point, inward, guess)
+        last_s, last_d = s + 1.0, d + 1.0
+        for _ in range(6):
+            slope = (d - last_d) / (s - last_s)
+            if slope < 0.3:
+                break
+            last_s, last_d = s, d
+            s -= d / slope
+            if abs(s - last_s) < EXACT and s > 0:
+                return min(s, t)
+            d = _at(coefficients, origin, spacing, pose, point, inward, s)
+    s, d = t, _at(coefficients, origin, spacing, pose, point, inward, t)
+    if d <= 0:
         return t
     last_s, last_d = s + 1.0, d + 1.0
     for _ in range(40):
-        if guess <= 0 and s - d > 0 and d > CLOSE:
+        if s - d > 0 and d > CLOSE:
             last_s, last_d = s, d
             s -= d
         else:
@@ -221,10 +238,10 @@ def _depths_along(coefficients, origin, spacing, pose, points, way, guess):
 @numba.njit(cache=True)
 def _squeeze(coefficients, origin, spacing, pose, points, inward, thickness, faces, start, around, face_areas, covered,
              buried, slot, moduli):  # fmt: skip
-    """See Columns.squeeze: the vertices in order, pressure and strain times their areas (N, 2), depth under them (N,).
+    """See Columns.squeeze: vertices in order, pressure and strain times their areas (N, 2), depth (N,), rests (N,).
 
-    A triangle with all corners covered is sampled at few places, from a good guess; one at the border at many, where
-    beside a wall of the tool the depth falls to 0 over ROUND. Unless the tool is buried, columns whose skin is outside
+    A triangle with all corners covered has a good guess of every depth; at the border the depth falls to 0 over ROUND
+    beside a wall of the tool. Unless the tool is buried, columns whose skin is outside
     it are free.
     """
     mu, lam = moduli[0], moduli[1]
@@ -245,22 +262,26 @@ def _squeeze(coefficients, origin, spacing, pose, points, inward, thickness, fac
             many += 1
     found = np.unique(found[:many])
     vertices = np.sort(vertices[:count])
-    depth, sums = np.empty(count), np.zeros((count, 2))
+    depth, rests, sums = np.empty(count), np.zeros(count), np.zeros((count, 2))
     for n in range(count):
         v = vertices[n]
         slot[v] = n
-        guess = 0.0 if buried else -_at(coefficients, origin, spacing, pose, points[v], inward[v], 0.0)
-        depth[n] = 0.0 if guess < 0 else _meet(
+        guess = -_at(coefficients, origin, spacing, pose, points[v], inward[v], 0.0)
+        share = 1.0 if guess >= 0 else max(buried, 1 + guess / ROUND)
+        guess = 0.0 if buried > 0 else guess
+        depth[n] = 0.0 if share <= 0 else share * _meet(
             coefficients, origin, spacing, pose, points[v], inward[v], thickness[v], guess)  # fmt: skip
+        if depth[n] > 0:
+            inside = -_at(coefficients, origin, spacing, pose, points[v], inward[v], depth[n] - ROUND)
+            rests[n] = min(max(2 * inside / ROUND, 0.0), 1.0) * min(depth[n] / ROUND, 1.0)
     point, down = np.empty(3), np.empty(3)
     for f in found:
         i, j, k = faces[f]
         di, dj, dk = depth[slot[i]], depth[slot[j]], depth[slot[k]]
-        border = min(di, dj, dk) <= 0 or max(di, dj, dk) > 3 * min(di, dj, dk)
-        samples = _MANY if border else _FEW
-        weight = face_areas[f] / len(samples)
-        for q in range(len(samples)):
-            a, b, c = samples[q]
+        border = min(rests[slot[i]], rests[slot[j]], rests[slot[k]]) < 1 or max(di, dj, dk) > 3 * min(di, dj, dk)
+        weight = face_areas[f] / len(_SAMPLES)
+        for q in range(len(_SAMPLES)):
+            a, b, c = _SAMPLES[q]
             length = 0.0
             for x in range(3):
                 point[x] = a * points[i, x] + b * points[j, x] + c * points[k, x]
@@ -270,26 +291,29 @@ def _squeeze(coefficients, origin, spacing, pose, points, inward, thickness, fac
             for x in range(3):
                 down[x] *= length
             t = a * thickness[i] + b * thickness[j] + c * thickness[k]
-            guess = a * di + b * dj + c * dk
-            if border:
-                guess = 0.0 if buried else -_at(coefficients, origin, spacing, pose, point, down, 0.0)
-                if guess < 0:
+            guess, share = a * di + b * dj + c * dk, 1.0
+            if border or buried > 0:
+                guess = -_at(coefficients, origin, spacing, pose, point, down, 0.0)
+                share = 1.0 if guess >= 0 else max(buried, 1 + guess / ROUND)
+                if share <= 0:
                     continue
+                guess = 0.0 if buried > 0 else guess
             deep = _meet(coefficients, origin, spacing, pose, point, down, t, guess)
             if border and deep > 0:
                 inside = -_at(coefficients, origin, spacing, pose, point, down, deep - ROUND)
                 deep *= min(max(2 * inside / ROUND, 0.0), 1.0)
+            deep *= share
             if deep <= 0:
                 continue
             strain = min(deep / t, DEEPEST)
             stretch = 1 - strain
             pressure = -(mu * (stretch - 1 / stretch) + lam * np.log(stretch) / stretch)
             strain *= lam + 2 * mu
-            for corner, share in ((i, a), (j, b), (k, c)):
+            for corner, part in ((i, a), (j, b), (k, c)):
                 n = slot[corner]
-                sums[n, 0] += weight * share * pressure
-                sums[n, 1] += weight * share * strain
+                sums[n, 0] += weight * part * pressure
+                sums[n, 1] += weight * part * strain
     for v in vertices:
         slot[v] = -1
     carry = np.flatnonzero(sums[:, 0] > 0)
-    return vertices[carry], sums[carry], depth[carry]
+    return vertices[carry], sums[carry], depth[carry], rests[carry]

@@ -14,7 +14,8 @@ from stmpl_core.moments import Surroundings
 from stmpl_core.sdf import SignedDistance
 from stmpl_core.touch import Touch
 
-PRESSED = 0.05  # of a tool's highest pressure, from which a covered vertex lies on the tool; elsewhere it may be apart
+PRESSED = 0.05  # of a tool's highest pressure, from which a covered vertex lies on the tool; with less it may be apart
+TAKEN = 1e-4  # m inside a tool from which skin is moved out with its neighbours, not by itself
 AHEAD = 0.3  # cosine between the tool's way and the inward normal from which skin comes along
 ALONG = 0.7  # share of the pressures that point one way, and cosine of that to a force, for one way of all skin
 PASSES = 3
@@ -39,7 +40,8 @@ class _Tool(NamedTuple):
     field: SignedDistance
     pose: np.ndarray
     vertices: np.ndarray
-    gone: Points  # how far the vertices that lie on the tool have come with it, (N, 3) [m]; NaN: may be apart
+    gone: Points  # how far the vertices have come with the tool if they lie on it, (N, 3) [m]
+    lies: np.ndarray  # from 0, may be apart, to 1, lies on the tool, (N,)
 
     def jet(self, points: Points) -> tuple[np.ndarray, Points]:
         """Signed distance [m] and its gradient at points of the layer's frame."""
@@ -75,14 +77,15 @@ def conform(near: Surroundings, displacement: VertexVectors, touches: Sequence[T
     own = SMOOTH * float(np.diag(sinking).mean())
     moved, sources = displacement[all_of], np.zeros((len(all_of), 3))
     for _ in range(PASSES):
-        wanted = np.zeros((len(all_of), 3))
+        wanted, weight = np.zeros((len(all_of), 3)), np.zeros(len(all_of))
         for tool, at in zip(tools, place, strict=True):
-            some = _wanted(tool, layer.vertices[tool.vertices], moved[at])
-            wanted[at] = np.where(some.any(axis=1, keepdims=True), some, wanted[at])
-        act = np.flatnonzero(wanted.any(axis=1))
+            some, firm = _wanted(tool, layer.vertices[tool.vertices], moved[at])
+            more = firm > weight[at]
+            wanted[at[more]], weight[at[more]] = some[more], firm[more]
+        act = np.flatnonzero(weight > 1e-3)  # a weight that falls to 0 lets go of its vertex continuously
         if not len(act):
             break
-        step = np.linalg.solve(sinking[np.ix_(act, act)] + own * np.eye(len(act)), wanted[act])
+        step = np.linalg.solve(sinking[np.ix_(act, act)] + np.diag(own / weight[act] ** 2), wanted[act])
         sources[act] += step
         moved += sinking[:, act] @ step
     out = displacement.copy()
@@ -108,16 +111,19 @@ def _tool(touch: Touch, field: SignedDistance, layer: SoftLayer) -> _Tool:
         one = touch.wrench[:3] / size
         way = np.broadcast_to(touch.way if touch.way is not None and touch.way @ one > ALONG else one, way.shape)
     depth, cosine = touch.squeeze.depth, -np.einsum("ni,ni->n", layer.normals[v], way)
-    lies_on = np.flatnonzero((depth > 0) & (pressure > PRESSED * pressure.max()) & (cosine > AHEAD))
-    gone = np.full((len(v), 3), np.nan)
-    points, guess = layer.vertices[v[lies_on]], depth[lies_on] / cosine[lies_on]
-    far = depth_along(field, touch.pose_body_from_tool, points, way[lies_on], guess)
-    gone[lies_on] = far[:, None] * way[lies_on]
-    return _Tool(field, touch.pose_body_from_tool, v, gone)
+    lies = touch.squeeze.rests * np.clip(pressure / (PRESSED * pressure.max()) - 0.5, 0, 1)
+    lies *= np.clip((cosine - AHEAD) / 0.1, 0, 1)
+    some, gone = np.flatnonzero(lies), np.zeros((len(v), 3))
+    points, guess = layer.vertices[v[some]], depth[some] / cosine[some]
+    far = depth_along(field, touch.pose_body_from_tool, points, way[some], guess)
+    sure = np.clip(2 * lies[some] - 1, 0, 1)  # beside a wall it is not clear where the way ends
+    gone[some] = (sure * far + (1 - sure) * guess)[:, None] * way[some]
+    return _Tool(field, touch.pose_body_from_tool, v, gone, lies)
 
 
-def _wanted(tool: _Tool, rest: Points, moved: Points) -> Points:
-    """How the vertices under a tool should still move, (N, 3) [m]; 0 where they may stay."""
+def _wanted(tool: _Tool, rest: Points, moved: Points) -> tuple[Points, np.ndarray]:
+    """How the vertices under a tool should still move, (N, 3) [m], and how firmly, (N,): 0, need not, to 1."""
     phi, gradient = tool.jet(rest + moved)
-    lies_on = np.isfinite(tool.gone[:, :1])
-    return np.where(lies_on, tool.gone - moved, np.where(phi[:, None] < 0, -phi[:, None] * gradient, 0.0))
+    out, lies = -np.minimum(phi, 0.0)[:, None] * gradient, tool.lies[:, None]
+    wanted = lies * (tool.gone - moved) + (1 - lies) * out
+    return wanted, np.maximum(tool.lies, np.clip(-phi / TAKEN, 0, 1))

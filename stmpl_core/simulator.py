@@ -26,12 +26,15 @@ class Simulator:
     Args:
         layer: the soft layer at rest.
         method: how to solve; it is prepared here.
+
+    Attributes:
+        toucher: finds what the tools do to the skin.
     """
 
     def __init__(self, layer: SoftLayer, method: Method) -> None:
         self.layer = layer
         self.method = method.prepare(layer)
-        self._toucher = Toucher(layer)
+        self.toucher = Toucher(layer)
         self._fields: WeakKeyDictionary[ToolMesh, SignedDistance] = WeakKeyDictionary()
 
     def prepare_tool(self, mesh: ToolMesh) -> SignedDistance:
@@ -41,8 +44,12 @@ class Simulator:
             MeshError: a mesh that cannot be a tool (see SignedDistance.of).
         """
         if mesh not in self._fields:
-            self._fields[mesh] = SignedDistance.of(mesh, margin=max(MARGIN, 2 * self._toucher.hole))
+            self._fields[mesh] = SignedDistance.of(mesh, margin=max(MARGIN, 2 * self.toucher.hole))
         return self._fields[mesh]
+
+    def keep_field(self, mesh: ToolMesh, field: SignedDistance) -> None:
+        """Takes a distance field of `mesh` that was built elsewhere, as `prepare_tool` would have built it."""
+        self._fields[mesh] = field
 
     def step(self, contacts: Sequence[Contact]) -> Displacement:
         """The skin's displacement under `contacts`, with what was found of each.
@@ -57,7 +64,7 @@ class Simulator:
 
         # Touch: each tool's mesh, pose and wrench become a pressure on the skin.
         fields = [self.prepare_tool(contact.mesh) for contact in contacts]
-        touches = self._toucher.touch_all(contacts, fields)
+        touches = self.toucher.touch_all(contacts, fields)
 
         # Sum: pressures of several tools add.
         pressure = sum((touch.load.values for touch in touches), np.zeros(len(self.layer.vertices)))
@@ -66,7 +73,7 @@ class Simulator:
         # Solve: the method moves the skin, and what is touched lies on its tool; where nothing presses, nothing moves.
         if load.values.any():
             answer = self.method.solve(load)
-            fitted = conform(self._toucher.net.near, answer.displacement, touches, fields)
+            fitted = conform(self.toucher.net.near, answer.displacement, touches, fields)
         else:
             answer = Displacement(np.zeros_like(self.layer.vertices), Trust(), self.method.name)
             fitted = Conformed(answer.displacement, 0.0, 0.0)

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from stmpl_core.arrays import Transform, Wrench
-from stmpl_core.columns import Clearance, Columns, Squeeze
+from stmpl_core.columns import NO_SQUEEZE, Clearance, Columns, Squeeze
 from stmpl_core.contact import Contact
 from stmpl_core.contact_net import ContactNet
 from stmpl_core.layer import SoftLayer
@@ -135,7 +135,7 @@ class Toucher:
         depth = -float(clearance.least.min(initial=np.inf))
 
         def nothing(status: str) -> _Placed:
-            return _Placed(contact, field, status, pose, depth, 0.0, _NO_SQUEEZE, 0.0)
+            return _Placed(contact, field, status, pose, depth, 0.0, NO_SQUEEZE, 0.0)
 
         force = contact.wrench[:3] if contact.wrench is not None else None
         if force is None:
@@ -205,7 +205,7 @@ class Toucher:
             vector = -(pressure @ layer.vertex_area_vectors[v])
             size = float(np.linalg.norm(vector))
             if size <= ONE_SIDED * float(pressure @ layer.vertex_areas[v]):
-                return _Placed(contact, field, WRAPPED, start, depth, 0.0, _NO_SQUEEZE, 0.0)
+                return _Placed(contact, field, WRAPPED, start, depth, 0.0, NO_SQUEEZE, 0.0)
             normal = float(force @ vector) / size
             if normal <= 0:
                 return None
@@ -230,7 +230,11 @@ class Toucher:
             last = (below, size)
             most = below * DEEP / max(deepest, 1e-3) if size < normal else np.inf
             following = touch_at + min(below * float(np.clip((normal / size) ** (1 / power), 0.2, 4.0)), most)
-            moved = following if low < following < high else 0.5 * (low + high)
+            if not low < following < high:  # halve the bracket, or go to where its open end must be
+                least = 0.05 * self._thickest
+                inside = np.isfinite(high - low)
+                following = 0.5 * (low + high) if inside else min(high - least, max(low + least, following))
+            moved = following
         return best
 
     def _answer(self, one: _Placed, pressure: np.ndarray, doubt: np.ndarray, strange: float) -> Touch:
@@ -295,10 +299,9 @@ class Toucher:
             trust = trust.also(f"the distance field of {name} is off by up to {error_mm:.1f} mm")
         if not one.field.watertight:
             trust = trust.also(f"the mesh of {name} has holes")
+        if one.field.flipped:
+            trust = trust.also(f"the mesh of {name} was inside out and was turned")
         return trust
-
-
-_NO_SQUEEZE = Squeeze(np.empty(0, np.int64), np.empty(0), np.empty(0), np.empty(0))
 
 
 def _shifted(pose: Transform, by: np.ndarray) -> Transform:
@@ -309,13 +312,14 @@ def _shifted(pose: Transform, by: np.ndarray) -> Transform:
 
 def _joined(squeezes: Sequence[Squeeze], count: int) -> Squeeze:
     """Several tools' squeezes as one: two tools share a vertex only where each has a part of its triangles."""
-    pressure, strain, depth = np.zeros(count), np.zeros(count), np.zeros(count)
+    pressure, strain, depth, rests = np.zeros((4, count))
     for one in squeezes:
         pressure[one.vertices] += one.pressure
         strain[one.vertices] += one.strain
         depth[one.vertices] = np.maximum(depth[one.vertices], one.depth)
+        rests[one.vertices] = np.maximum(rests[one.vertices], one.rests)
     v = np.flatnonzero(pressure)
-    return Squeeze(v, pressure[v], strain[v], depth[v])
+    return Squeeze(v, pressure[v], strain[v], depth[v], rests[v])
 
 
 def _figures(contact: Contact, wrench: Wrench, depth: float, moved: float, error: float) -> dict[str, float]:

@@ -7,19 +7,23 @@ from collections.abc import Mapping
 
 import numpy as np
 from builtin_interfaces.msg import Time
-from geometry_msgs.msg import PoseStamped, WrenchStamped
+from geometry_msgs.msg import Pose, PoseStamped, WrenchStamped
+from geometry_msgs.msg import Wrench as WrenchMessage
 from numpy.typing import ArrayLike
 from std_msgs.msg import Header
 from stmpl_msgs.msg import ContactMesh, SkinDeformed, SkinDisplacement, SkinTopology
+from stmpl_msgs.msg import LocalContact as LocalContactMessage
 
 from bags.messages import layer_id, pose_from, tool_mesh_from, wrench_from
 from stmpl_core.arrays import Transform, Wrench, finite
 from stmpl_core.contact import ToolMesh
 from stmpl_core.errors import FrameError, InvalidInput, MeshError
+from stmpl_core.haptics import LocalContact
 from stmpl_core.layer import MAX_EXTENT, SoftLayer
-from stmpl_core.trust import Displacement
+from stmpl_core.trust import Displacement, Trust
 
 NANO = 1_000_000_000  # nanoseconds in a second
+STALE = "stale"  # status of a tool whose input has stopped: the answer is a share of its last one
 
 
 def floats(values: ArrayLike) -> array:
@@ -107,8 +111,12 @@ def checked_mesh(message: ContactMesh) -> ToolMesh:
 
 def pose_message(pose: Transform, body_frame: str, stamp_ns: int) -> PoseStamped:
     """pose_body_from_tool as a message."""
-    message = PoseStamped(header=header(body_frame, stamp_ns))
-    p, q = message.pose.position, message.pose.orientation
+    return PoseStamped(header=header(body_frame, stamp_ns), pose=_pose(pose))
+
+
+def _pose(pose: Transform) -> Pose:
+    message = Pose()
+    p, q = message.position, message.orientation
     p.x, p.y, p.z = map(float, pose[:3, 3])
     q.x, q.y, q.z, q.w = quaternion_from(pose[:3, :3])
     return message
@@ -116,8 +124,12 @@ def pose_message(pose: Transform, body_frame: str, stamp_ns: int) -> PoseStamped
 
 def wrench_message(wrench: Wrench, frame: str, stamp_ns: int) -> WrenchStamped:
     """Force [N] and torque about the tool's origin [N m] that the tool exerts on the body, as a message."""
-    message = WrenchStamped(header=header(frame, stamp_ns))
-    f, t = message.wrench.force, message.wrench.torque
+    return WrenchStamped(header=header(frame, stamp_ns), wrench=_wrench(wrench))
+
+
+def _wrench(wrench: Wrench) -> WrenchMessage:
+    message = WrenchMessage()
+    f, t = message.force, message.torque
     f.x, f.y, f.z, t.x, t.y, t.z = map(float, wrench)
     return message
 
@@ -150,8 +162,12 @@ def displacement_message(
     sequence: int,
     solve_seconds: float,
     inputs: Mapping[str, tuple[int, int]],
+    fade: float = 1.0,
 ) -> SkinDisplacement:
-    """An answer as a message, with its trust and the stamps of what it answers [ns] (pose, wrench or 0)."""
+    """An answer as a message, with its trust and the stamps of what it answers [ns] (pose, wrench or 0).
+
+    `fade` says which share of its contacts' answer it is (see `faded`).
+    """
     trust = answer.trust
     stamps = [inputs[tool] for tool in answer.statuses]
     return SkinDisplacement(
@@ -169,7 +185,51 @@ def displacement_message(
         statuses=list(answer.statuses.values()),
         pose_stamps=[Time(sec=pose // NANO, nanosec=pose % NANO) for pose, _ in stamps],
         wrench_stamps=[Time(sec=wrench // NANO, nanosec=wrench % NANO) for _, wrench in stamps],
+        fade=fade,
         solve_seconds=solve_seconds,
+    )
+
+
+def faded(answer: Displacement, fade: float, why: str) -> Displacement:
+    """The share `fade` of an answer whose input has stopped: no pressure, since none was solved for; `STALE`."""
+    trust = Trust(answer.trust.converged, answer.trust.in_range, None, answer.trust.why, answer.trust.figures)
+    return Displacement(
+        fade * answer.displacement,
+        trust.also(why, in_range=False),
+        answer.method,
+        None,
+        dict.fromkeys(answer.statuses, STALE),
+    )
+
+
+def local_contact_message(
+    tool: str, model: LocalContact, status: str, body_frame: str, stamp_ns: int
+) -> LocalContactMessage:
+    """A local model as a message; `status` is what the answer says of the tool."""
+    return LocalContactMessage(
+        header=header(body_frame, stamp_ns),
+        name=tool,
+        pose=_pose(model.pose_body_from_tool),
+        wrench=_wrench(model.wrench),
+        stiffness=np.ascontiguousarray(model.stiffness, dtype=np.float64).ravel(),
+        valid_m=float(model.valid_m),
+        valid_rad=float(model.valid_rad),
+        status=status,
+        in_range=bool(model.trust.in_range),
+    )
+
+
+def local_contact_from(message: LocalContactMessage) -> LocalContact:
+    """The local model that a message carries, for a DeviceLoop. Raises InvalidInput if it is not finite."""
+    f, t = message.wrench.force, message.wrench.torque
+    return LocalContact(
+        finite("pose", pose_from(message.pose), (4, 4)),
+        finite("wrench", [f.x, f.y, f.z, t.x, t.y, t.z], (6,)),
+        finite("stiffness", np.asarray(message.stiffness).reshape(6, 6), (6, 6)),
+        float(message.valid_m),
+        float(message.valid_rad),
+        message.status,
+        Trust(in_range=bool(message.in_range)),
     )
 
 

@@ -83,7 +83,7 @@ def play(config: DemoConfig, folder: Path, console: Console) -> None:
         with console.status("starting") as status:
             _wait(probe, {"node": node, "record": recorder}, folder, status)
         # the node says that the skin is at rest again once nothing has come for a while
-        time.sleep(config.node.rest_after + 0.5)
+        time.sleep(config.node.rest_after + config.node.fade + 0.5)
         _stop(recorder, "record", folder)
         _stop(node, "node", folder)
 

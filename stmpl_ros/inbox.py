@@ -9,6 +9,7 @@ from bags.messages import wrench_from
 from stmpl_core.arrays import Transform
 from stmpl_core.contact import Contact, ToolMesh
 
+RECENT = 1_000_000_000  # ns for which a tool that fell silent is spoken of
 PATIENCE = 3  # poses of a tool that may pass a missing partner before the newest of each is taken as it is
 
 
@@ -30,6 +31,7 @@ class Tool:
     """What is known of one tool."""
 
     mesh: ToolMesh
+    number: int = 0  # of the mesh
     pose: Stream = field(default_factory=Stream)
     wrench: Stream = field(default_factory=Stream)
 
@@ -43,12 +45,14 @@ class Instant:
         stamp: of the newest pose among them [ns].
         skew: how far their stamps lie apart [ns].
         inputs: stamps of each tool's pose and wrench [ns]; 0: no wrench.
+        lost: streams that fell silent: a pose within the last second, a wrench while its tool still moves.
     """
 
     contacts: list[Contact]
     stamp: int
     skew: int
     inputs: dict[str, tuple[int, int]]
+    lost: tuple[str, ...] = ()
 
 
 class Inbox:
@@ -71,12 +75,12 @@ class Inbox:
         self.waiting: set[str] = set()  # tools whose newest pose was not handed out yet
         self.missed = 0
 
-    def put_mesh(self, name: str, mesh: ToolMesh) -> None:
-        """Keeps the mesh of a tool, new or changed."""
+    def put_mesh(self, name: str, mesh: ToolMesh, number: int = 0) -> None:
+        """Keeps the mesh of a tool, new or changed, under a number of the caller's."""
         if name in self.tools:
-            self.tools[name].mesh = mesh
+            self.tools[name].mesh, self.tools[name].number = mesh, number
         else:
-            self.tools[name] = Tool(mesh)
+            self.tools[name] = Tool(mesh, number)
 
     def put_pose(self, name: str, pose: Transform, stamp: int, now: int) -> bool:
         """Keeps a pose; False if it was dropped as repeated or out of order."""
@@ -101,6 +105,16 @@ class Inbox:
         """The tools whose pose came lately."""
         return {name: tool for name, tool in self.tools.items() if tool.pose.live(now, self.rest_after)}
 
+    def silence(self, now: int) -> int:
+        """Time since the newest pose of any tool came [ns]."""
+        return now - max((tool.pose.came for tool in self.tools.values()), default=now)
+
+    def _lost(self, live: dict[str, Tool], now: int) -> tuple[str, ...]:
+        silent = {name: tool for name, tool in self.tools.items() if tool.pose.value is not None and name not in live}
+        poses = [f"pose of {name}" for name, tool in silent.items() if now - tool.pose.came <= self.rest_after + RECENT]
+        dumb = {name: tool.wrench for name, tool in live.items() if tool.wrench.value is not None}
+        return *poses, *(f"wrench of {name}" for name, s in dumb.items() if not s.live(now, self.rest_after))
+
     def take(self, now: int) -> Instant | None:
         """What is to be answered now, each instant once; None while there is nothing new or something is to come."""
         live = self.live(now)
@@ -117,7 +131,8 @@ class Inbox:
             name: (tool.pose.stamp, tool.wrench.stamp if tool.wrench.live(now, self.rest_after) else 0)
             for name, tool in live.items()
         }
-        return Instant([self._contact(name, tool, now) for name, tool in live.items()], max(poses), skew, inputs)
+        contacts = [self._contact(name, tool, now) for name, tool in live.items()]
+        return Instant(contacts, max(poses), skew, inputs, self._lost(live, now))
 
     def _contact(self, name: str, tool: Tool, now: int) -> Contact:
         pose = tool.pose.value

@@ -32,8 +32,12 @@ class NodeConfig(BaseModel):
     )
     frame: str = Field(default="body", min_length=1, description="frame_id of the body, in poses and answers")
     rest_after: float = Field(default=0.25, gt=0, description="a tool silent for longer is no longer in contact [s]")
+    fade: float = Field(default=1.0, ge=0, description="in which the last answer goes to rest when all are silent [s]")
     max_age: float = Field(default=1.0, ge=0, description="older messages are dropped; 0 accepts any age [s]")
     marker_rate: float = Field(default=15.0, gt=0, description="of skin/marker while somebody looks [Hz]")
+    local_rotations: bool = Field(
+        default=True, description="local contacts say how the wrench follows rotations too, at twice the cost"
+    )
     autostart: bool = Field(default=True, description="configure and activate without being asked")
 
     def declare_on(self, node: Any) -> NodeConfig:

@@ -6,19 +6,25 @@ import numpy as np
 import pytest
 import trimesh
 
-from stmpl_core import Contact, Load, SoftLayer
+from fem_tools.indenter import IndenterFem, Tool
+from fem_tools.patch import PatchFem
+from stmpl_core import Contact, Load, SoftLayer, Tissue, ToolMesh
+from stmpl_core.body import Body
 from stmpl_core.errors import InvalidInput, MeshError
-from stmpl_core.methods import Naive, Winkler
+from stmpl_core.methods import Linear, Naive, Winkler
+from stmpl_core.sdf import SignedDistance
 from stmpl_core.simulator import Simulator
 from stmpl_core.touch import (
     APART,
     BY_POSE,
+    IN_CORE,
     MOVED,
     NO_FORCE,
     NO_TOUCH,
     PULLING,
     TOUCHING,
     WRAPPED,
+    Touch,
     Toucher,
 )
 from tests.touch_scenes import LENGTH, RADIUS, at, ball, capsule, limb, plate, press, punch, tool, turn
@@ -39,6 +45,23 @@ def sim() -> Simulator:
 @pytest.fixture(scope="module")
 def flat() -> Simulator:
     return Simulator(PLATE, Winkler())
+
+
+@pytest.fixture(scope="module")
+def toucher() -> Toucher:
+    return Toucher(LIMB)
+
+
+@pytest.fixture(scope="module")
+def flat_toucher() -> Toucher:
+    return Toucher(PLATE)
+
+
+FIELDS = {mesh: SignedDistance.of(mesh, margin=5e-3) for mesh in (BALL, PUNCH)}
+
+
+def touched(toucher: Toucher, mesh: ToolMesh, pose: np.ndarray, force: tuple[float, float, float] | None) -> Touch:
+    return toucher.touch(press(mesh, pose, force), FIELDS[mesh])
 
 
 def total(layer: SoftLayer, pressure: np.ndarray | None) -> np.ndarray:
@@ -71,9 +94,76 @@ def test_load_sums_to_the_normal_component_of_the_wrench(
     assert np.hypot(figures["probe.normal_n"], figures["probe.tangential_n"]) == pytest.approx(np.linalg.norm(force))
 
 
-def test_load_is_linear_in_the_wrench(sim: Simulator) -> None:
-    one, three = (sim.step([press(BALL, on_limb(), (-f, 0, 0))]).pressure for f in (0.1, 0.3))
-    np.testing.assert_allclose(three, 3 * np.asarray(one), rtol=1e-13)
+def test_more_force_presses_deeper_and_on_more_skin(toucher: Toucher) -> None:
+    touches = [touched(toucher, BALL, on_limb(), (-f, 0, 0)) for f in (0.02, 0.06, 0.2, 0.6)]
+    for less, more in pairwise(touches):
+        assert more.trust.figures["depth_m"] > less.trust.figures["depth_m"]
+        assert len(more.load.loaded) > len(less.load.loaded)
+
+
+@pytest.mark.parametrize("mesh, half", [(BALL, 0.012), (PUNCH, 0.015)])
+@pytest.mark.parametrize("force", [(0, 0, -0.15), (0.03, 0.01, -0.15)])
+def test_the_pose_that_a_wrench_finds_presses_by_pose_with_the_same_force(
+    flat_toucher: Toucher, mesh: ToolMesh, half: float, force: tuple[float, float, float]
+) -> None:
+    found = touched(flat_toucher, mesh, at(0.0007, 0.0004, half - 1e-3), force)
+    back = touched(flat_toucher, mesh, found.pose_body_from_tool, None)
+    assert found.status == TOUCHING and back.status == BY_POSE
+    np.testing.assert_allclose(back.wrench[:3], found.wrench[:3], rtol=6e-3, atol=1e-4)
+    moved = found.pose_body_from_tool[:3, 3] - at(0.0007, 0.0004, half - 1e-3)[:3, 3]
+    push = np.array(force) / np.linalg.norm(force)
+    np.testing.assert_allclose(moved, found.trust.figures["moved_m"] * push, atol=1e-12)
+
+
+@pytest.mark.parametrize("mesh, half", [(BALL, 0.012), (PUNCH, 0.015)])
+def test_what_a_wrench_finds_does_not_depend_on_how_far_off_the_stated_pose_is(
+    toucher: Toucher, mesh: ToolMesh, half: float
+) -> None:
+    turned = turn((0, 1, 0), np.pi / 2)
+    shifts = (-2e-3, -0.7e-3, 0.0, 1e-3, 2e-3)
+    poses = [at(RADIUS + half - 1e-3 - s, 0.001, MIDDLE) @ turned for s in shifts]
+    touches = [touched(toucher, mesh, pose, (-0.2, 0, 0)) for pose in poses]
+    depths = [touch.trust.figures["depth_m"] for touch in touches]
+    np.testing.assert_allclose(depths, depths[2], rtol=0.01)
+    ends = [touch.trust.figures["moved_m"] + s for touch, s in zip(touches, shifts, strict=True)]
+    np.testing.assert_allclose(ends, ends[2], atol=0.01 * depths[2])
+
+
+def test_force_by_pose_is_what_the_pressure_sums_to_and_torque_is_about_the_tools_origin(toucher: Toucher) -> None:
+    pose = on_limb()
+    touch = touched(toucher, BALL, pose, None)
+    forces = touch.load.forces_on(LIMB)
+    np.testing.assert_allclose(touch.wrench[:3], forces.sum(axis=0), atol=1e-12)
+    torque = np.cross(LIMB.vertices - pose[:3, 3], forces).sum(axis=0)
+    np.testing.assert_allclose(touch.wrench[3:], torque, atol=1e-12)
+    assert touch.wrench[0] < 0 and np.linalg.norm(touch.wrench[3:]) < 1e-4 * np.linalg.norm(forces)
+
+
+def test_force_by_pose_grows_with_depth(flat_toucher: Toucher) -> None:
+    depths = np.arange(1e-4, 5e-3, 1e-4)
+    forces = np.array([-touched(flat_toucher, BALL, at(4e-4, 7e-4, 0.012 - d), None).wrench[2] for d in depths])
+    assert (forces > 0).all() and forces[-1] > 10 * forces[4]
+    assert np.diff(forces).min() > -2e-3 * forces[-1]
+
+
+def test_stiffer_tissue_presses_as_many_times_harder_and_moves_alike() -> None:
+    soft, stiff = (SoftLayer(PLATE.vertices, PLATE.faces, PLATE.thickness, tissue=Tissue(youngs_modulus=e))
+                   for e in (1e3, 7e3))  # fmt: skip
+    pose = at(0.0003, 0.0008, 0.010)
+    one, seven = (Simulator(layer, Linear()).step([press(BALL, pose, None)]) for layer in (soft, stiff))
+    np.testing.assert_allclose(seven.pressure, 7 * np.asarray(one.pressure), rtol=1e-9)
+    np.testing.assert_allclose(seven.displacement, one.displacement, atol=1e-9)
+    touches = [touched(Toucher(layer), BALL, pose, (0, 0, -f)) for layer, f in ((soft, 0.1), (stiff, 0.7))]
+    assert touches[1].trust.figures["depth_m"] == pytest.approx(touches[0].trust.figures["depth_m"], rel=1e-6)
+
+
+def test_a_scene_twice_as_large_presses_four_times_as_hard(flat_toucher: Toucher) -> None:
+    large = Toucher(SoftLayer(2 * PLATE.vertices, PLATE.faces, 2 * PLATE.thickness))
+    field = SignedDistance.of(ToolMesh(2 * BALL.vertices, BALL.faces), margin=1e-2)
+    for depth in (1e-3, 3e-3):
+        small = touched(flat_toucher, BALL, at(0.0004, 0, 0.012 - depth), None)
+        whole = large.touch(press(BALL, at(0.0008, 0, 2 * (0.012 - depth)), None), field)
+        assert whole.wrench[2] == pytest.approx(4 * small.wrench[2], rel=0.01)
 
 
 def test_torque_is_balanced_by_a_centred_press_and_reported_otherwise(flat: Simulator) -> None:
@@ -104,7 +194,7 @@ def test_turning_and_moving_the_scene_turns_the_answer(turned_pair: tuple, force
     before = still.step([press(BALL, pose, force)])
     after = turned.step([press(BALL, SCENE @ pose, None if force is None else tuple(rotation @ force))])
     assert before.magnitude.max() > 5e-4
-    np.testing.assert_allclose(after.displacement, before.displacement @ rotation.T, atol=1e-9)
+    np.testing.assert_allclose(after.displacement, before.displacement @ rotation.T, atol=5e-6)
 
 
 def test_replay_is_bit_identical() -> None:
@@ -114,39 +204,59 @@ def test_replay_is_bit_identical() -> None:
     assert first.tobytes() == second.tobytes()
 
 
-@pytest.mark.parametrize("mesh, height", [(BALL, 0.0105), (PUNCH, 0.0135)])
-@pytest.mark.parametrize("force", [(0, 0, -0.1), None])
-def test_load_changes_continuously_while_the_tool_slides(
-    flat: Simulator, mesh: object, height: float, force: tuple | None
-) -> None:
-    """Sliding across edges, faces and vertices no pressure jumps: a quarter of the slide, a quarter of it."""
-
-    def worst_change(step: float) -> float:
-        slide = np.arange(0, 4e-3, step)
-        pressures = [flat.step([press(mesh, at(s, 0.37 * s, height), force)]).pressure for s in slide]  # type: ignore
-        return max(np.abs(np.subtract(b, a)).sum() / np.sum(a) for a, b in pairwise(pressures))
-
-    coarse, fine = worst_change(1e-4), worst_change(2.5e-5)
-    assert coarse < 0.1
-    assert fine < 0.4 * coarse
+def worst_change(toucher: Toucher, mesh: ToolMesh, poses: list[np.ndarray], force: tuple | None) -> float:
+    """Largest change from one pose to the next, over the whole load."""
+    loads = [touched(toucher, mesh, pose, force).load.values for pose in poses]
+    largest = max(float(load.sum()) for load in loads)
+    return max(float(np.abs(after - before).sum()) / largest for before, after in pairwise(loads))
 
 
 @pytest.mark.parametrize("mesh, half", [(BALL, 0.012), (PUNCH, 0.015)])
-def test_load_changes_continuously_while_the_tool_comes_down(flat: Simulator, mesh: object, half: float) -> None:
-    depths = np.arange(-2.9e-3, 4e-3, 5e-5)
-    pressures = [flat.step([press(mesh, at(0.0004, 0.0002, half - d), (0, 0, -0.1))]).pressure  # type: ignore[arg-type]
-                 for d in depths]
-    change = [np.abs(np.subtract(b, a)).sum() / np.sum(a) for a, b in pairwise(pressures)]
-    assert max(change) < 0.1
+@pytest.mark.parametrize("force", [(0, 0, -0.1), None])
+def test_load_changes_continuously_while_the_tool_slides(
+    flat_toucher: Toucher, mesh: ToolMesh, half: float, force: tuple | None
+) -> None:
+    """Across edges, faces and vertices no pressure jumps: a quarter of the slide, about a quarter of the change."""
+    coarse, fine = (worst_change(flat_toucher, mesh, [at(s, 0.37 * s, half - 1.5e-3) for s in np.arange(0, 3e-3, step)],
+                                 force) for step in (1e-4, 2.5e-5))  # fmt: skip
+    assert coarse < 0.1
+    assert fine < 0.45 * coarse
 
 
-def test_a_ball_covers_the_cap_that_geometry_says(flat: Simulator) -> None:
-    depth, radius = 3e-3, 0.012
-    pressure = flat.step([press(BALL, at(0, 0, radius - depth), None)]).pressure
-    r = np.linalg.norm(PLATE.vertices[:, :2], axis=1)
-    cap = np.sqrt(radius**2 - (radius - depth) ** 2)
-    loaded = np.asarray(pressure) > 0
-    assert loaded[r < cap - 2e-4].all() and not loaded[r > cap + 2e-4].any()
+@pytest.mark.parametrize("mesh, half", [(BALL, 0.012), (PUNCH, 0.015)])
+def test_load_changes_continuously_while_the_tool_comes_down(
+    flat_toucher: Toucher, mesh: ToolMesh, half: float
+) -> None:
+    """By pose from above the skin; by wrench the stated depth does not matter at all."""
+
+    def down(step: float) -> list[np.ndarray]:
+        return [at(4e-4, 2e-4, half - d) for d in np.arange(-3e-4, 2e-3, step)]
+
+    coarse, fine = (worst_change(flat_toucher, mesh, down(step), None) for step in (1e-4, 2.5e-5))
+    assert fine < 0.4 * coarse
+    assert worst_change(flat_toucher, mesh, down(2.5e-4), (0, 0, -0.1)) < 0.03
+
+
+@pytest.mark.parametrize("force", [True, False])
+def test_the_seam_of_a_chart_is_not_felt(force: bool) -> None:
+    """A ball slides over a seam of the arm: what presses is on both sides of it, and changes as little as elsewhere."""
+    arm = Body.anny().part("left_arm", edge_length=4e-3, thickness=7.5e-3)
+    assert arm.chart is not None
+    seam, toucher = arm.chart.seam_vertices, Toucher(arm)
+    away = np.linalg.norm(arm.vertices[seam][:, None] - arm.vertices[arm.border][None], axis=2).min(axis=1)
+    vertex = int(seam[away.argmax()])
+    others = seam[np.linalg.norm(arm.vertices[seam] - arm.vertices[vertex], axis=1) < 0.012]
+    along = np.linalg.svd(arm.vertices[others] - arm.vertices[others].mean(axis=0))[2][0]
+    normal = arm.normals[vertex]
+    across = np.cross(normal, along) / np.linalg.norm(np.cross(normal, along))
+    start = arm.vertices[vertex] + (0.012 - 1.5e-3) * normal
+    push = tuple(-0.1 * normal) if force else None
+
+    def slide(step: float, first: float = -1.5e-3) -> list[np.ndarray]:
+        return [at(*(start + s * across)) for s in np.arange(first, first + 3e-3, step)]
+
+    coarse, fine = (worst_change(toucher, BALL, slide(step), push) for step in (2e-4, 5e-5))
+    assert coarse < 0.15 and fine < 0.45 * coarse
 
 
 def test_pose_alone_presses_columns_to_the_tool(flat: Simulator) -> None:
@@ -160,14 +270,18 @@ def test_pose_alone_presses_columns_to_the_tool(flat: Simulator) -> None:
 
 def test_a_thin_plate_under_the_rest_position_of_the_skin_still_presses(flat: Simulator) -> None:
     slab = tool(trimesh.creation.box((0.03, 0.03, 0.004)))
-    answer = flat.step([press(slab, at(0, 0, -0.0035), (0, 0, -0.3))])  # from 1.5 to 5.5 mm below the skin
-    assert answer.statuses["probe"] == TOUCHING
-    assert total(PLATE, answer.pressure)[2] == pytest.approx(-0.3)
+    for force in ((0, 0, -0.3), None):
+        answer = flat.step([press(slab, at(0, 0, -0.0035), force)])  # from 1.5 to 5.5 mm below the skin
+        assert answer.statuses["probe"] == (TOUCHING if force else BY_POSE)
+        assert total(PLATE, answer.pressure)[2] < -0.1
+        if force:
+            assert total(PLATE, answer.pressure)[2] == pytest.approx(-0.3)
 
 
 def test_the_far_side_of_the_limb_stays_free(sim: Simulator) -> None:
     answer = sim.step([press(BALL, on_limb(depth=6e-3), (-0.3, 0, 0))])
-    assert not answer.displacement[LIMB.vertices[:, 0] < 0.02].any()
+    assert not np.asarray(answer.pressure)[LIMB.vertices[:, 0] < 0.02].any()
+    assert answer.magnitude[LIMB.vertices[:, 0] < 0].max() < 1e-6
 
 
 def test_a_tool_finer_than_the_mesh_does_not_slip_between_vertices(flat: Simulator) -> None:
@@ -175,15 +289,28 @@ def test_a_tool_finer_than_the_mesh_does_not_slip_between_vertices(flat: Simulat
     for spot in PLATE.vertices[PLATE.faces[1200:1210]].mean(axis=1):
         answer = flat.step([press(needle, at(spot[0], spot[1], 0.0056), (0, 0, -0.001))])
         assert total(PLATE, answer.pressure)[2] == pytest.approx(-0.001)
+        assert np.isfinite(answer.displacement).all()
+
+
+def test_seventy_thousand_triangles_with_a_hole_press_as_a_plain_ball_does(flat_toucher: Toucher) -> None:
+    fine = trimesh.creation.icosphere(6, 12.0)  # mm
+    holed = ToolMesh.of(1e-3 * fine.vertices, fine.faces[fine.triangles_center[:, 2] < 10.0])
+    assert len(holed.faces) > 70_000
+    touch = flat_toucher.touch(press(holed, at(0, 0, 0.0095), None), SignedDistance.of(holed, margin=5e-3))
+    plain = SignedDistance.of(ball(subdivisions=4), margin=5e-3)
+    expected = flat_toucher.touch(press(BALL, at(0, 0, 0.0095), None), plain).wrench[2]
+    assert touch.wrench[2] == pytest.approx(expected, rel=0.02)
+    assert "holes" in touch.trust.why
 
 
 def test_a_pose_that_is_off_is_moved_along_the_push(sim: Simulator) -> None:
     answer = sim.step([press(BALL, on_limb(-2.5e-3), (-0.2, 0, 0))])
     assert answer.statuses["probe"] == MOVED
-    assert answer.trust.figures["probe.moved_m"] == pytest.approx(2.5e-3, abs=2.5e-4)  # the nearest vertex is met
+    figures = answer.trust.figures
+    assert figures["probe.moved_m"] - figures["probe.depth_m"] == pytest.approx(2.5e-3, abs=2.5e-4)  # nearest vertex
     assert total(LIMB, answer.pressure)[0] == pytest.approx(-0.2, rel=1e-3)
     at_touch = sim.step([press(BALL, on_limb(-1e-6), (-0.2, 0, 0))])
-    np.testing.assert_allclose(answer.displacement, at_touch.displacement, atol=1e-5)
+    np.testing.assert_allclose(answer.displacement, at_touch.displacement, atol=0.01 * figures["probe.depth_m"])
 
 
 def test_a_wrench_without_touch_loads_nothing_and_is_out_of_range(sim: Simulator) -> None:
@@ -208,18 +335,75 @@ def test_a_closed_band_has_no_direction(sim: Simulator) -> None:
     np.testing.assert_allclose(squeezed.magnitude[ring], 0.002, atol=1.5e-4)
 
 
-def test_two_fingers_add(sim: Simulator) -> None:
+def test_two_fingers_far_apart_add(sim: Simulator) -> None:
     left = press(BALL, on_limb(), (-0.3, 0, 0), "left")
     right = press(BALL, at(-RADIUS - 0.010, 0, MIDDLE), (0.3, 0, 0), "right")
     both = sim.step([left, right])
-    np.testing.assert_array_equal(both.pressure, np.add(sim.step([left]).pressure, sim.step([right]).pressure))
+    alone = np.add(sim.step([left]).pressure, sim.step([right]).pressure)
+    np.testing.assert_allclose(both.pressure, alone, rtol=1e-6)
     assert set(both.statuses) == {"left", "right"}
     assert "right.normal_n" in both.trust.figures
 
 
+def test_fingers_side_by_side_feel_each_other_and_each_carries_its_own(toucher: Toucher) -> None:
+    small = ball(0.006)
+    field = SignedDistance.of(small, margin=5e-3)
+    poses = [at(RADIUS + 0.006 - 2e-3, 0, MIDDLE + s) for s in (-0.008, 0.008)]
+    by_pose = [press(small, pose, None, name) for pose, name in zip(poses, "ab", strict=True)]
+    together = toucher.touch_all(by_pose, [field, field])
+    for one, contact in zip(together, by_pose, strict=True):
+        alone = toucher.touch(contact, field)
+        assert one.status == BY_POSE and (one.load.values >= 0).all()
+        assert 0.6 < one.wrench[0] / alone.wrench[0] < 1.5
+        assert not np.array_equal(one.load.values, alone.load.values)
+    forces = (0.02, 0.05)
+    with_wrench = [press(small, pose, (-f, 0, 0), name) for pose, f, name in zip(poses, forces, "ab", strict=True)]
+    for one, f in zip(toucher.touch_all(with_wrench, [field, field]), forces, strict=True):
+        normal = one.wrench[:3] / np.linalg.norm(one.wrench[:3])
+        assert np.linalg.norm(one.wrench[:3]) == pytest.approx(-f * normal[0], rel=1e-9)
+
+
+def test_what_is_touched_together_does_not_depend_on_the_order(toucher: Toucher) -> None:
+    contacts = [press(BALL, on_limb(), None, "a"), press(BALL, at(RADIUS + 0.01, 0, MIDDLE + 0.018), (-0.1, 0, 0), "b"),
+                press(BALL, at(1, 1, 1), None, "c")]  # fmt: skip
+    fields = [FIELDS[BALL]] * 3
+    here, there = toucher.touch_all(contacts, fields), toucher.touch_all(contacts[::-1], fields)[::-1]
+    assert [one.status for one in here] == [one.status for one in there] == [BY_POSE, TOUCHING, APART]
+    for one, other in zip(here, there, strict=True):
+        np.testing.assert_allclose(one.load.values, other.load.values, rtol=1e-12)
+
+
+def test_a_tool_in_the_core_is_said_and_still_answered(sim: Simulator) -> None:
+    answer = sim.step([press(BALL, on_limb(depth=9e-3), None)])
+    assert answer.statuses["probe"] == IN_CORE
+    assert not answer.trust.in_range and "rigid core" in answer.trust.why
+    assert total(LIMB, answer.pressure)[0] < 0 and np.isfinite(answer.displacement).all()
+    assert answer.magnitude.max() < 0.012
+    by_wrench = sim.step([press(BALL, on_limb(depth=9e-3), (-0.1, 0, 0))])  # the pose is a first guess only
+    assert by_wrench.statuses["probe"] == TOUCHING and by_wrench.trust.figures["probe.moved_m"] < 0
+    assert by_wrench.trust.figures["probe.depth_m"] < 6e-3
+
+
+def test_a_ball_presses_about_as_hard_as_finite_elements_say() -> None:
+    """By pose, on a limb that nothing was learnt from; columns alone press much too hard."""
+    layer = limb(4e-3)
+    field, depths, toucher = SignedDistance.of(ball(subdivisions=4)), np.array([2e-3, 4e-3]), Toucher(layer)
+    tool_above = Tool(field, at(RADIUS + 0.02, 0, MIDDLE), np.array([-1.0, 0, 0]))
+    solver = IndenterFem(PatchFem(refine=1, layers=1, reach=4), step=0.1).prepare(layer)
+    for depth, answer in zip(depths, solver.path([tool_above], depths), strict=True):
+        touch = toucher.touch(press(BALL, answer.tools[0].pose_body_from_tool, None), field)
+        v = touch.squeeze.vertices
+        columns = layer.tissue.youngs_modulus * float(
+            np.linalg.norm(touch.squeeze.pressure @ layer.vertex_area_vectors[v]))  # fmt: skip
+        force = float(np.linalg.norm(touch.wrench[:3]))
+        assert touch.trust.figures["depth_m"] == pytest.approx(depth, abs=2e-4)
+        assert force == pytest.approx(answer.force, rel=0.15)
+        assert abs(force - answer.force) < abs(columns - answer.force)
+
+
 def test_pressure_beyond_what_was_validated_is_flagged_and_not_clipped(sim: Simulator) -> None:
     answer = sim.step([press(BALL, on_limb(), (-5, 0, 0))])
-    assert not answer.trust.in_range and "p/E" in answer.trust.why
+    assert not answer.trust.in_range and "p/E" in answer.trust.why and "asks for" in answer.trust.why
     assert total(LIMB, answer.pressure)[0] == pytest.approx(-5, rel=1e-3)
 
 

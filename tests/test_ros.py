@@ -16,22 +16,29 @@ os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseStamped, WrenchStamped
-from stmpl_msgs.msg import ContactMesh, SkinDeformed, SkinDisplacement, SkinTopology
+from rcl_interfaces.msg import Log
+from stmpl_msgs.msg import ContactMesh, LocalContact, SkinDeformed, SkinDisplacement, SkinTopology
 from visualization_msgs.msg import Marker
 
-from bags.messages import layer_from, layer_id, stamp_ns
+from bags.messages import layer_from, layer_id, stamp_ns, tool_mesh_from
 from bags.reader import Bag
-from stmpl_ros.conversions import mesh_message, pose_message, wrench_message
+from bags.replay import replay_run
+from stmpl_core import Contact, ToolMesh
+from stmpl_core.haptics import DeviceLoop, local_contact
+from stmpl_core.methods import MomentNet
+from stmpl_core.sdf import MARGIN, SignedDistance
+from stmpl_core.touch import BY_POSE, IN_CORE, NO_FORCE, NO_TOUCH, PULLING, TOUCHING, Toucher
+from stmpl_ros.conversions import STALE, local_contact_from, mesh_message, pose_message, wrench_message
 from stmpl_ros.topics import KEPT, STREAM
 from tests.touch_scenes import LENGTH, RADIUS, at, ball
 
-PATIENCE = 60.0  # s to wait for anything; only a failing test waits so long
+PATIENCE = 120.0  # s to wait for anything; only a failing test waits so long
 NODE = """
 import sys
 from stmpl_ros.node import run
 from stmpl_ros.parameters import NodeConfig
 from tests.touch_scenes import limb
-sys.exit(run(NodeConfig(rest_after=0.4), build=lambda config: limb(4e-3)))
+sys.exit(run(NodeConfig(rest_after=0.4, fade=0.6), build=lambda config: limb(4e-3)))
 """
 TOUCH = RADIUS + 0.012 - 1e-3  # m from the limb's axis: a ball of 12 mm, 1 mm deep
 
@@ -53,7 +60,7 @@ def end(process: subprocess.Popen, number: int) -> tuple[int, str]:
 class Device:
     """A tool on the bus, and all that comes back."""
 
-    def __init__(self, name: str = "probe") -> None:
+    def __init__(self, name: str = "probe", mesh: ToolMesh | None = None) -> None:
         self.name, self.got = name, defaultdict(list)
         self.node = rclpy.create_node(f"device_{name}")
         self.mesh = self.node.create_publisher(ContactMesh, "contact_mesh", KEPT)
@@ -61,7 +68,8 @@ class Device:
         self.wrench = self.node.create_publisher(WrenchStamped, f"tools/{name}/wrench", STREAM)
         self.listen(SkinTopology, "skin/topology", KEPT)
         self.listen(SkinDisplacement, "skin/displacement", STREAM)
-        self.mesh.publish(mesh_message(name, ball(), self.now()))
+        self.listen(Log, "/rosout", KEPT)
+        self.mesh.publish(mesh_message(name, mesh or ball(), self.now()))
 
     def listen(self, kind, topic, profile):
         return self.node.create_subscription(kind, topic, self.got[topic].append, profile)
@@ -88,6 +96,14 @@ class Device:
         self.wrench.publish(wrench_message(push, wrench_frame, stamp))
         self.pose.publish(pose_message(at(distance, 0, LENGTH / 2), pose_frame, stamp))
         return stamp
+
+    def said(self, text: str) -> list[str]:
+        """Log lines of the node that hold `text`."""
+        return [line.msg for line in self.got["/rosout"] if text in line.msg]
+
+    def still(self) -> None:
+        """Waits until the skin is at rest and nothing is sent any more."""
+        self.wait(lambda: not (said := self.got["skin/displacement"]) or not said[-1].tools, "rest")
 
     def answers(self, stamp: int) -> list[SkinDisplacement]:
         return [answer for answer in self.got["skin/displacement"] if stamp_ns(answer) == stamp]
@@ -201,14 +217,168 @@ def test_an_older_stamp_than_the_last_gets_no_answer(device):
     assert not device.answers(old)
 
 
-def test_when_the_input_stops_the_skin_goes_to_rest_and_says_why(device):
-    device.ask(TOUCH, 0.03)
+def test_when_the_input_stops_the_last_answer_fades_to_rest_says_why_and_comes_back(device):
+    last = device.ask(TOUCH, 0.03)
     before = len(device.got["skin/displacement"])
-    device.wait(lambda: len(device.got["skin/displacement"]) > before, "the answer at rest")
-    rest = device.got["skin/displacement"][-1]
-    assert not rows(rest).any() and "back at rest" in rest.why and not rest.tools
+    device.wait(lambda: not device.got["skin/displacement"][-1].tools, "the answer at rest")
+    *fading, rest = device.got["skin/displacement"][before:]
+    assert not rows(rest).any() and "back at rest" in rest.why and rest.fade == 1
+    shares = np.array([answer.fade for answer in fading])
+    assert len(shares) > 3 and (np.diff(shares) < 0).all() and 0 < shares[-1] < 0.3 < 0.7 < shares[0] <= 1
+    for answer in fading:
+        assert list(answer.tools) == ["probe"] and list(answer.statuses) == [STALE] and not answer.in_range
+        assert "no pose for 0.4 s" in answer.why and answer.pose_stamps == last.pose_stamps
+        np.testing.assert_allclose(rows(answer), answer.fade * rows(last), rtol=1e-6, atol=1e-12)
+    assert len(device.said("fades to rest within 0.6 s")) >= 1
     device.spin(0.6)
-    assert len(device.got["skin/displacement"]) == before + 1, "rest is said once"
+    assert device.got["skin/displacement"][-1] is rest, "rest is said once"
+    np.testing.assert_array_equal(rows(device.ask(TOUCH, 0.03)), rows(last))
+
+
+def test_while_only_unusable_input_comes_the_fading_answers_tell_of_it(device):
+    device.ask(TOUCH, 0.03)
+    before, lines, sent = len(device.got["skin/displacement"]), len(device.said("refused: pose of probe holds")), []
+
+    def told():
+        sent.append(device.send(float("nan"), 0.02))
+        return [a for a in device.got["skin/displacement"][before:] if STALE in a.statuses and "finite" in a.why]
+
+    device.wait(told, "a stale answer that tells of the refusals")
+    device.wait(lambda: len(device.said("refused: pose of probe holds")) > lines, "the log line")
+    assert len(device.said("refused: pose of probe holds")) - lines < len(sent) / 2, "one line of a kind in a second"
+    assert list(device.ask(TOUCH, 0.02).statuses) == [TOUCHING]
+
+
+@pytest.mark.parametrize(
+    ("distance", "force", "status", "says"),
+    [
+        (TOUCH, -0.02, PULLING, "nothing sticks"),
+        (TOUCH + 0.02, 0.02, NO_TOUCH, "no skin is within reach"),
+        (TOUCH, 0.0, NO_FORCE, "wrench is zero"),
+    ],
+)
+def test_what_is_wrong_with_a_contact_is_its_status_and_one_line(device, distance, force, status, says):
+    before = len(device.said(says))
+    for _ in range(5):
+        assert list(device.ask(distance, force).statuses) == [status]
+    device.wait(lambda: len(device.said(says)) > before, "the log line")
+    assert len(device.said(says)) <= before + 2, "five answers within a second or two are one or two lines"
+
+
+@pytest.fixture
+def another(device):
+    """Makes more tools, without a force sensor: `another(name, mesh)`."""
+    made = []
+
+    def make(name: str, mesh: ToolMesh) -> Device:
+        device.still()
+        made.append(Device(name, mesh))
+        return made[-1]
+
+    yield make
+    for one in made:
+        one.still()
+        one.node.destroy_node()
+
+
+def posed(tool: Device, distance: float) -> SkinDisplacement:
+    """The answer to a pose without a wrench."""
+    tool.wait(lambda: tool.pose.get_subscription_count(), "the node")
+    stamp = tool.now()
+    tool.pose.publish(pose_message(at(distance, 0, LENGTH / 2), "body", stamp))
+    return tool.wait(lambda: tool.answers(stamp), f"the answer to {stamp}")[0]
+
+
+def test_a_tool_that_starts_inside_the_core_is_told_of(device, another):
+    tool = another("finger", ball())
+    answer = posed(tool, TOUCH - 8e-3)
+    assert list(answer.statuses) == [IN_CORE] and not answer.in_range
+    assert "finger starts 7.5 mm inside the skin" in answer.why
+    device.wait(lambda: device.said("finger starts 7.5") and device.said(f"finger: {IN_CORE}"), "the log lines")
+
+
+def test_a_mesh_that_is_inside_out_is_turned_and_told_of(device, another):
+    good = ball()
+    right = posed(another("right", good), TOUCH)
+    wrong = posed(another("wrong", ToolMesh.of(good.vertices, good.faces[:, ::-1])), TOUCH)
+    assert list(right.statuses) == list(wrong.statuses) == [BY_POSE] and rows(right).any()
+    np.testing.assert_array_equal(rows(wrong), rows(right))
+    device.wait(lambda: device.said("'wrong' came inside out"), "the log line")
+
+
+def test_a_mesh_with_a_hole_is_told_of(device, another):
+    whole = ball()
+    answer = posed(another("open", ToolMesh.of(whole.vertices, whole.faces[:-4])), TOUCH)
+    assert "holes" in answer.why
+    device.wait(lambda: device.said("'open' has holes"), "the log line")
+
+
+@pytest.mark.parametrize(
+    ("name", "scale", "says"),
+    [("mm", 1e3, "millimetres"), ("no tool!", 1.0, "Invalid topic name"), ("dust", 1e-3, "metres")]
+)
+def test_a_mesh_that_cannot_be_used_is_refused_and_the_node_stays_up(device, name, scale, says):
+    device.spin(1.1)  # one line of a kind in a second
+    good = ball()
+    device.mesh.publish(mesh_message(name, ToolMesh.of(good.vertices * scale, good.faces), device.now()))
+    device.wait(lambda: [line for line in device.said(f"'{name}' refused") if says in line], "the refusal")
+    assert list(device.ask(TOUCH, 0.02).statuses) == [TOUCHING]
+
+
+def test_while_the_mesh_of_a_tool_is_being_prepared_others_are_answered(device, another):
+    import trimesh
+
+    sphere = trimesh.creation.icosphere(6, 0.03)  # 82,000 triangles
+    big, before = another("big", ToolMesh.of(sphere.vertices, sphere.faces)), len(device.got["skin/displacement"])
+
+    def ready():
+        device.send(TOUCH, 0.02)
+        device.spin(0.02)
+        return big.pose.get_subscription_count()
+
+    device.wait(ready, "the node to listen to the new tool")
+    meanwhile = device.got["skin/displacement"][before:]
+    assert sum(list(answer.statuses) == [TOUCHING] for answer in meanwhile) >= 10
+
+
+def test_a_local_contact_says_what_the_answer_says_and_how_it_changes(device):
+    heard: list[LocalContact] = []
+    ear = device.node.create_subscription(LocalContact, "tools/probe/local_contact", heard.append, STREAM)
+
+    def models():
+        stamp = device.send(TOUCH, 0.03)
+        device.spin(0.02)
+        asked.append(stamp)
+        return [model for model in heard if stamp_ns(model) in asked and device.answers(stamp_ns(model))]
+
+    asked: list[int] = []
+    message = device.wait(models, "a local contact")[-1]
+    device.node.destroy_subscription(ear)
+    answer = device.answers(stamp_ns(message))[0]
+    layer = layer_from(device.got["skin/topology"][0])
+    model = local_contact_from(message)
+    assert (message.name, message.status, message.header.frame_id) == ("probe", TOUCHING, "body")
+    force = -(np.frombuffer(answer.pressure, np.float32) @ layer.vertex_area_vectors)
+    np.testing.assert_allclose(model.wrench[:3], force, atol=0.01 * np.linalg.norm(force))
+
+    # the node's is the model that anybody finds there
+    mesh, toucher = ball_as_sent(), Toucher(layer)
+    field = SignedDistance.of(mesh, margin=max(MARGIN, 2 * toucher.hole))
+    own = local_contact(toucher, Contact("probe", mesh, model.pose_body_from_tool), field)
+    np.testing.assert_allclose(model.wrench, own.wrench, atol=1e-6 * np.linalg.norm(own.wrench[:3]))
+    np.testing.assert_allclose(model.stiffness, own.stiffness, atol=1e-4 * np.abs(own.stiffness).max())
+    assert model.valid_m == pytest.approx(own.valid_m, rel=0.05) and model.valid_rad > 0
+    assert model.normal @ model.stiffness[:3, :3] @ model.normal > 0
+
+    # a device renders it
+    loop, place = DeviceLoop(), model.pose_body_from_tool[:3, 3]
+    loop.update(model)
+    felt = [loop.step(place + 2e-4 * model.normal, np.zeros(3), 1e-3).copy() for _ in range(60)][-1]
+    assert felt @ model.normal < -0.5 * np.linalg.norm(model.wrench[:3])
+
+
+def ball_as_sent() -> ToolMesh:
+    return tool_mesh_from(mesh_message("probe", ball(), 0))
 
 
 def test_deformed_skin_is_rest_plus_displacement_and_sent_only_to_listeners(device):
@@ -238,11 +408,17 @@ def test_every_message_of_a_run_is_recorded(device, tmp_path):
         device.wait(lambda: device.node.count_subscribers("skin/displacement") == 2, "the recorder")
         device.spin(0.5)
         stamps = [stamp_ns(device.ask(TOUCH, 0.001 * k)) for k in range(50)]
+        device.wait(lambda: not device.got["skin/displacement"][-1].tools, "the answer at rest")
+        device.spin(0.5)
     finally:
         code, said = end(recorder, signal.SIGINT)
     assert code == 0, said
     bag = Bag(tmp_path / "run")
     assert bag.finished and not bag.damage
     assert bag.topics["/tools/probe/pose"].messages == bag.topics["/tools/probe/wrench"].messages == 50
-    assert [frame.stamp_ns for frame in bag.frames() if frame.tools] == stamps
+    fresh = [frame for frame in bag.frames() if frame.tools and STALE not in frame.statuses.values()]
+    assert [frame.stamp_ns for frame in fresh] == stamps
+    replayed = replay_run(tmp_path / "run", MomentNet())
+    assert replayed.frames > len(fresh) + 3, "while the last answer faded, answers went on"
+    assert replayed.identical == replayed.frames, str(replayed)
     assert bag.layer_id == device.got["skin/topology"][0].layer_id

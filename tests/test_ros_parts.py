@@ -5,18 +5,25 @@ import pytest
 from geometry_msgs.msg import PoseStamped
 from hypothesis import given
 from hypothesis import strategies as st
-from rclpy.serialization import deserialize_message
+from rclpy.serialization import deserialize_message, serialize_message
 from scipy.spatial.transform import Rotation
+from stmpl_msgs.msg import LocalContact as LocalContactMessage
 from visualization_msgs.msg import Marker
 
 from bags.messages import layer_from, layer_id, pose_from, tool_mesh_from, wrench_from
 from stmpl_core import ToolMesh
 from stmpl_core.errors import FrameError, InvalidInput, MeshError
+from stmpl_core.haptics import LocalContact
+from stmpl_core.trust import Displacement, Trust
 from stmpl_ros.conversions import (
+    STALE,
     checked_mesh,
     checked_pose,
     checked_wrench,
+    faded,
     floats,
+    local_contact_from,
+    local_contact_message,
     mesh_message,
     pose_message,
     quaternion_from,
@@ -28,6 +35,7 @@ from stmpl_ros.marker import SkinMarker
 from stmpl_ros.node import published
 from stmpl_ros.parameters import NodeConfig
 from stmpl_ros.scripts import PRESS, SCRIPTS, Device, Keyframe, Motion
+from stmpl_ros.throttle import Throttle
 from tests.touch_scenes import ball, limb
 
 MS = 1_000_000
@@ -176,6 +184,54 @@ def test_a_silent_tool_is_no_longer_in_contact():
     instant = inbox.take(400 * MS)
     assert instant is not None and [contact.name for contact in instant.contacts] == ["thumb"]
     assert inbox.take(900 * MS) is None and not inbox.live(900 * MS)
+
+
+def test_streams_that_fall_silent_are_named():
+    inbox = _inbox("probe", "thumb")
+    inbox.put_wrench("probe", _push(1, 1 * MS), 1 * MS, 0)
+    for name in ("probe", "thumb"):
+        inbox.put_pose(name, np.eye(4), 1 * MS, 0)
+    both = inbox.take(0)
+    assert both is not None and both.lost == () and inbox.silence(100 * MS) == 100 * MS
+    inbox.put_pose("probe", np.eye(4), 400 * MS, 400 * MS)
+    alone = inbox.take(400 * MS)
+    assert alone is not None and alone.lost == ("pose of thumb", "wrench of probe")
+    assert alone.contacts[0].wrench is None
+    inbox.put_pose("probe", np.eye(4), 1600 * MS, 1600 * MS)
+    later = inbox.take(1600 * MS)
+    assert later is not None and later.lost == ("wrench of probe",), "a tool put away is not spoken of for ever"
+
+
+def test_one_line_of_a_kind_comes_through_and_tells_how_many_did_not():
+    throttle = Throttle(1.0)
+    assert throttle.line("nan", "not finite", 0.0) == "not finite"
+    assert throttle.line("frame", "wrong frame", 0.1) == "wrong frame", "another kind is not held back"
+    assert [throttle.line("nan", "not finite", t) for t in (0.2, 0.9)] == [None, None]
+    assert throttle.line("nan", "not finite", 1.0) == "not finite (2 more like it before)"
+    assert throttle.line("nan", "not finite", 2.5) == "not finite"
+
+
+def test_a_share_of_an_answer_is_smaller_stale_and_not_to_be_trusted():
+    answer = Displacement(np.full((3, 3), 2e-3), Trust(error_bound=1e-4, why="fine"), "any", np.ones(3), {"probe": "x"})
+    share = faded(answer, 0.25, "no pose")
+    np.testing.assert_array_equal(share.displacement, 5e-4)
+    assert share.pressure is None, "nothing was solved for"
+    assert dict(share.statuses) == {"probe": STALE} and not share.trust.in_range and share.trust.error_bound is None
+    assert share.trust.why == "fine; no pose"
+
+
+def test_a_local_contact_keeps_every_bit_through_a_message():
+    rng, pose = np.random.default_rng(3), np.eye(4)
+    pose[:3, :3], pose[:3, 3] = Rotation.from_euler("xyz", (0.3, -0.7, 1.1)).as_matrix(), (0.1, 0.2, 0.3)
+    model = LocalContact(pose, rng.normal(size=6), rng.normal(size=(6, 6)), 4e-4, 0.02, "found", Trust(in_range=False))
+    message = local_contact_message("probe", model, "touching", "body", 5 * MS)
+    sent = deserialize_message(serialize_message(message), LocalContactMessage)
+    assert (sent.name, sent.header.frame_id, sent.header.stamp.nanosec) == ("probe", "body", 5 * MS)
+    back = local_contact_from(sent)
+    np.testing.assert_array_equal(back.wrench, model.wrench)
+    np.testing.assert_array_equal(back.stiffness, model.stiffness)
+    np.testing.assert_allclose(back.pose_body_from_tool, pose, atol=1e-12)
+    assert (back.valid_m, back.valid_rad, back.status, back.trust.in_range) == (4e-4, 0.02, "touching", False)
 
 
 def test_two_tools_in_step_are_answered_once_an_instant():

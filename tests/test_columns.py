@@ -1,0 +1,207 @@
+"""Laws of squeezed columns: geometry and Winkler's law under a tool, and no jump while it slides."""
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+import trimesh
+
+from stmpl_core import SoftLayer, Tissue, ToolMesh
+from stmpl_core.columns import DEEPEST, Columns, Squeeze
+from stmpl_core.methods.winkler import column_pressure
+from stmpl_core.sdf import SignedDistance
+from tests.touch_scenes import LENGTH, RADIUS, at, ball, capsule, limb, plate, punch, tool, turn
+
+LIMB, PLATE = limb(), plate()
+MARGIN = 5e-3  # m
+
+
+def field_of(mesh: ToolMesh) -> SignedDistance:
+    return SignedDistance.of(mesh, margin=MARGIN)
+
+
+BALL, PUNCH = field_of(ball(subdivisions=4)), field_of(punch())
+SLAB = field_of(tool(trimesh.creation.box((0.03, 0.03, 0.004))))
+
+
+@pytest.fixture(scope="module")
+def flat() -> Columns:
+    return Columns(PLATE)
+
+
+@pytest.fixture(scope="module")
+def round_limb() -> Columns:
+    return Columns(LIMB)
+
+
+def force(columns: Columns, squeeze: Squeeze) -> np.ndarray:
+    """Of Winkler's pressure over E, [m2]."""
+    return -(squeeze.pressure @ columns.layer.vertex_area_vectors[squeeze.vertices])
+
+
+def test_a_tool_that_is_apart_squeezes_nothing(flat: Columns, round_limb: Columns) -> None:
+    for columns, pose in ((flat, at(0, 0, 0.012)), (flat, at(0, 0, 0.015)), (round_limb, at(1, 1, 1))):
+        assert not len(columns.squeezed(BALL, pose).vertices)
+    assert not len(round_limb.near(BALL, at(1, 1, 1), 0.02))
+
+
+@pytest.mark.parametrize("nu", [0.3, 0.4, 0.45])
+@pytest.mark.parametrize("share", [0.05, 0.3, 0.7, 0.97])
+def test_under_a_flat_tool_every_column_has_its_depth_and_the_law_of_columns(nu: float, share: float) -> None:
+    columns = Columns(SoftLayer(PLATE.vertices, PLATE.faces, PLATE.thickness, tissue=Tissue(poisson_ratio=nu)))
+    depth, tissue = share * PLATE.thickness[0], columns.layer.tissue
+    squeeze = columns.squeezed(SLAB, at(0, 0, 0.002 - depth))
+    inside = (np.abs(PLATE.vertices[squeeze.vertices, :2]) < 0.011).all(axis=1)
+    assert inside.sum() > 40
+    strain = min(share, DEEPEST)
+    modulus = (tissue.lame_lambda + 2 * tissue.shear_modulus) / tissue.youngs_modulus
+    expected = column_pressure(np.array([1 - strain]), tissue)[0] / tissue.youngs_modulus
+    np.testing.assert_allclose(squeeze.depth[inside], depth, rtol=1e-3, atol=1e-6)  # the field is off by 0.5 um
+    np.testing.assert_allclose(squeeze.strain[inside], modulus * strain, rtol=5e-3)
+    np.testing.assert_allclose(squeeze.pressure[inside], expected, rtol=5e-3)
+
+
+@pytest.mark.parametrize("depth", [1e-3, 3e-3])
+def test_a_ball_presses_as_the_integral_over_its_cap(flat: Columns, depth: float) -> None:
+    """Winkler's pressure integrated over a true ball's cap, in closed quadrature."""
+    radius, tissue = 0.012, PLATE.tissue
+    r = (np.arange(4000) + 0.5) / 4000 * np.sqrt(radius**2 - (radius - depth) ** 2)
+    deep = np.sqrt(radius**2 - r**2) - (radius - depth)
+    pressure = column_pressure(1 - deep / PLATE.thickness[0], tissue) / tissue.youngs_modulus
+    expected = float((2 * np.pi * r * pressure).sum() * (r[1] - r[0]))
+    for x, y in ((0.0, 0.0), (0.0011, 0.0004), (0.0015, 0.0015)):
+        squeeze = flat.squeezed(BALL, at(x, y, radius - depth))
+        assert -force(flat, squeeze)[2] == pytest.approx(expected, rel=0.03)
+
+
+def test_a_ball_covers_the_cap_that_geometry_says(flat: Columns) -> None:
+    """What is squeezed between vertices is carried by the corners of its triangle, not further."""
+    depth, radius = 3e-3, 0.012
+    squeeze = flat.squeezed(BALL, at(0, 0, radius - depth))
+    r, cap = np.linalg.norm(PLATE.vertices[:, :2], axis=1), np.sqrt(radius**2 - (radius - depth) ** 2)
+    carries = np.isin(np.arange(len(r)), squeeze.vertices)
+    longest = float(np.linalg.norm(np.diff(PLATE.vertices[PLATE.edges], axis=1), axis=2).max())
+    assert carries[r < cap].all() and not carries[r > cap + longest].any()
+    here = r[squeeze.vertices]
+    covered = here < cap - 2e-4
+    np.testing.assert_allclose(squeeze.depth[covered], np.sqrt(radius**2 - here[covered] ** 2) - radius + depth,
+                               atol=1e-4)  # fmt: skip
+    assert not squeeze.depth[here > cap + 2e-4].any()
+
+
+def test_no_column_is_deeper_than_the_layer(flat: Columns) -> None:
+    squeeze = flat.squeezed(BALL, at(0, 0, 0))  # 4.5 mm into the core
+    assert squeeze.depth.max() == pytest.approx(PLATE.thickness[0])
+    highest = column_pressure(np.array([1 - DEEPEST]), PLATE.tissue)[0] / PLATE.tissue.youngs_modulus
+    assert 0.9 * highest < squeeze.pressure.max() <= highest * (1 + 1e-9)
+
+
+def test_a_thin_plate_below_the_skin_squeezes_as_one_on_it(flat: Columns) -> None:
+    thick = field_of(tool(trimesh.creation.box((0.03, 0.03, 0.02))))
+    below = flat.squeezed(SLAB, at(0, 0, 0.002 - 5e-3))  # its top is 1 mm under the skin at rest
+    whole = flat.squeezed(thick, at(0, 0, 0.010 - 5e-3))
+    inside = (np.abs(PLATE.vertices[whole.vertices, :2]) < 0.011).all(axis=1)
+    np.testing.assert_allclose(below.pressure[np.isin(below.vertices, whole.vertices[inside])], whole.pressure[inside],
+                               rtol=1e-3)  # fmt: skip
+    assert force(flat, below)[2] == pytest.approx(force(flat, whole)[2], rel=0.1)
+
+
+def test_the_far_side_of_the_limb_is_free(round_limb: Columns) -> None:
+    long = field_of(capsule(0.06, 0.008))
+    lying = at(RADIUS + 0.008 - 0.006, 0, LENGTH / 2) @ turn((0, 1, 0), np.pi / 2)
+    through = at(RADIUS + 0.008 - 0.006 + 0.03, 0, LENGTH / 2) @ turn((0, 1, 0), np.pi / 2)
+    for pose in (lying, through):
+        squeeze = round_limb.squeezed(long, pose)
+        assert len(squeeze.vertices) and (LIMB.vertices[squeeze.vertices, 0] > 0).all()
+
+
+def test_a_needle_is_felt_wherever_it_comes_down(flat: Columns) -> None:
+    """Finer than the mesh, and than the samples of a triangle: a fifth of the layer deep it is felt everywhere."""
+    needle = SignedDistance.of(capsule(0.012, 0.0008, 16), margin=2e-3)
+    x, y = np.meshgrid(np.linspace(0, 3e-3, 6), np.linspace(0, 3e-3, 6))
+    for spot in np.column_stack([x.ravel(), y.ravel()]):
+        squeeze = flat.squeezed(needle, at(*spot, 0.0068 - 1.5e-3))
+        assert force(flat, squeeze)[2] < 0
+
+
+def test_turning_and_moving_the_scene_leaves_the_squeeze(round_limb: Columns) -> None:
+    scene = turn((0.3, -0.5, 0.8), 1.1, (0.4, -0.2, 0.9))
+    turned = Columns(LIMB.with_(vertices=LIMB.vertices @ scene[:3, :3].T + scene[:3, 3]))
+    pose = at(RADIUS + 0.009, 0.001, LENGTH / 2)
+    here, there = round_limb.squeezed(BALL, pose), turned.squeezed(BALL, scene @ pose)
+    np.testing.assert_array_equal(here.vertices, there.vertices)
+    for one, other in zip(here[1:], there[1:], strict=True):
+        np.testing.assert_allclose(other, one, rtol=1e-3, atol=1e-6)
+
+
+def test_a_scene_twice_as_large_is_squeezed_alike(flat: Columns) -> None:
+    large = Columns(SoftLayer(2 * PLATE.vertices, PLATE.faces, 2 * PLATE.thickness))
+    mesh = ball()
+    here = flat.squeezed(field_of(mesh), at(0.0004, 0, 0.009))
+    there = large.squeezed(SignedDistance.of(ToolMesh(2 * mesh.vertices, mesh.faces), margin=2 * MARGIN),
+                           at(0.0008, 0, 0.018))  # fmt: skip
+    assert -force(large, there)[2] == pytest.approx(-4 * force(flat, here)[2], rel=5e-3)
+
+
+def test_the_same_question_has_the_same_answer_whatever_was_asked_between(flat: Columns) -> None:
+    first = flat.squeezed(BALL, at(0, 0, 0.010))
+    flat.squeezed(SLAB, at(0.01, 0, -0.002))
+    for one, other in zip(first, flat.squeezed(BALL, at(0, 0, 0.010)), strict=True):
+        assert one.tobytes() == other.tobytes()
+
+
+def worst_change(columns: Columns, field: SignedDistance, half: float, tilt: float, step: float) -> float:
+    """Largest change of the pressure in one step of a slide over edges, triangles and vertices, over all of it."""
+    before, largest = None, 0.0
+    for s in np.arange(0, 3e-3, step):
+        squeeze = columns.squeezed(field, at(s, 0.37 * s, half - 1.5e-3) @ turn((0, 1, 0), tilt))
+        now = np.zeros(len(PLATE.vertices))
+        now[squeeze.vertices] = squeeze.pressure
+        if before is not None:
+            largest = max(largest, float(np.abs(now - before).sum() / now.sum()))
+        before = now
+    return largest
+
+
+@pytest.mark.parametrize("field, half, tilt", [(BALL, 0.012, 0.0), (PUNCH, 0.015, 0.0), (PUNCH, 0.015, 0.2),
+                                               (SLAB, 0.002, 0.0)])  # fmt: skip
+def test_the_squeeze_has_no_jump_while_the_tool_slides(
+    flat: Columns, field: SignedDistance, half: float, tilt: float
+) -> None:
+    """A quarter of the step, about a quarter of the change."""
+    coarse, fine = (worst_change(flat, field, half, tilt, step) for step in (1e-4, 2.5e-5))
+    assert coarse < 0.05
+    assert fine < 0.45 * coarse
+
+
+def test_a_thin_plate_goes_under_the_skin_without_a_great_jump(flat: Columns) -> None:
+    """One that slants is half on the skin and half under it, and which columns it covers changes as it slides."""
+    assert worst_change(flat, SLAB, 0.002, 0.2, 2.5e-5) < 0.1
+
+
+@pytest.mark.parametrize("field, half", [(BALL, 0.012), (PUNCH, 0.015)])
+def test_the_squeeze_has_no_jump_while_the_tool_comes_down(flat: Columns, field: SignedDistance, half: float) -> None:
+    def worst(step: float) -> float:
+        forces = [-force(flat, flat.squeezed(field, at(4e-4, 2e-4, half - d)))[2] for d in np.arange(-2e-4, 3e-3, step)]
+        return float(np.abs(np.diff(forces)).max() / max(forces))
+
+    coarse, fine = worst(1e-4), worst(2.5e-5)
+    assert coarse < 0.1
+    assert fine < 0.4 * coarse
+
+
+def test_force_grows_with_depth(flat: Columns) -> None:
+    forces = [-force(flat, flat.squeezed(BALL, at(7e-4, 3e-4, 0.012 - d)))[2] for d in np.arange(2e-4, 7e-3, 1e-4)]
+    assert all(b > a > 0 for a, b in pairwise(forces))
+
+
+def test_clearance_is_the_least_distance_along_the_column(round_limb: Columns) -> None:
+    pose = at(RADIUS + 0.0135, 0.001, LENGTH / 2)
+    near, far = round_limb.near(BALL, pose, 0.01), 0.005
+    clearance = round_limb.clearance(BALL, pose, near, far)
+    facing = LIMB.vertices[near, 0] > 0.5 * RADIUS
+    exact = BALL.distance(LIMB.vertices[near] - pose[:3, 3])
+    np.testing.assert_allclose(clearance[2], exact, atol=1e-9)
+    known = np.minimum(clearance.least, far)  # outside, the skin is nearest
+    np.testing.assert_allclose(known[facing], np.minimum(exact, far)[facing], atol=1e-9)
+    assert (clearance.least <= clearance[2] + 1e-12).all()

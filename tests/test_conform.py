@@ -1,0 +1,144 @@
+"""Laws of conform: skin that is touched lies on its tool, none is inside, and the rest comes along as a layer would."""
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+from stmpl_core import Contact, ToolMesh
+from stmpl_core.conform import conform
+from stmpl_core.methods import Linear, MomentNet, Winkler
+from stmpl_core.methods.base import Method
+from stmpl_core.moments import Surroundings
+from stmpl_core.sdf import SignedDistance
+from stmpl_core.simulator import ENTERED, Simulator
+from stmpl_core.touch import Toucher
+from tests.touch_scenes import LENGTH, RADIUS, at, ball, capsule, limb, press, punch, turn
+
+LIMB = limb(4e-3)
+THICKNESS = float(LIMB.thickness[0])
+BALL, PUNCH, TIP = ball(), punch(), capsule(0.02, 0.008)
+FIELDS = {mesh: SignedDistance.of(mesh, margin=5e-3) for mesh in (BALL, PUNCH, TIP)}
+MIDDLE, LYING = LENGTH / 2, turn((0, 1, 0), np.pi / 2)
+SCENES = {
+    "ball": [press(BALL, at(RADIUS + 0.009, 0.001, MIDDLE), None)],
+    "ball by force": [press(BALL, at(RADIUS + 0.011, 0.001, MIDDLE), (-0.2, 0.03, 0.02))],
+    "deep ball": [press(BALL, at(RADIUS + 0.0075, 0.001, MIDDLE), None)],
+    "punch": [press(PUNCH, at(RADIUS + 0.013, 0, MIDDLE) @ LYING, None)],
+    "tilted punch": [press(PUNCH, at(RADIUS + 0.014, 0, MIDDLE) @ turn((0, 1, 0), np.pi / 2 + 0.15), None)],
+    "fingertip along the limb": [press(TIP, at(RADIUS + 0.006, 0, MIDDLE), (-0.3, 0, 0))],
+    "two fingers": [press(BALL, at(RADIUS + 0.01, 0, MIDDLE - 0.012), None, "one"),
+                    press(BALL, at(RADIUS + 0.0095, 0, MIDDLE + 0.014), (-0.1, 0, 0), "two")],
+}  # fmt: skip
+
+
+@pytest.fixture(scope="module", params=[Winkler, Linear, MomentNet])
+def sim(request: pytest.FixtureRequest) -> Simulator:
+    method: Method = request.param()
+    return Simulator(LIMB, method)
+
+
+@pytest.fixture(scope="module")
+def toucher() -> Toucher:
+    return Toucher(LIMB)
+
+
+@pytest.fixture(scope="module")
+def near() -> Surroundings:
+    return Surroundings.of(LIMB)
+
+
+def seen_by(mesh: ToolMesh, pose: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """Signed distance of points to a placed tool [m]."""
+    return FIELDS[mesh].distance((points - pose[:3, 3]) @ pose[:3, :3])
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_no_vertex_is_inside_a_tool_whatever_the_method(sim: Simulator, toucher: Toucher, name: str) -> None:
+    contacts = SCENES[name]
+    answer = sim.step(contacts)
+    moved = LIMB.vertices + answer.displacement
+    for contact, touch in zip(contacts, toucher.touch_all(contacts, [FIELDS[c.mesh] for c in contacts]), strict=True):
+        away = seen_by(contact.mesh, touch.pose_body_from_tool, moved)
+        assert away.min() > -ENTERED * THICKNESS, f"{-1e3 * away.min():.2f} mm inside {contact.name}"
+        v = touch.squeeze.vertices
+        bears = v[(touch.squeeze.depth > 0) & (touch.load.values[v] > 0.3 * touch.load.values.max())]
+        assert len(bears) > 5
+        np.testing.assert_allclose(away[bears], 0, atol=ENTERED * THICKNESS)
+    figures = answer.trust.figures
+    assert figures["entered_m"] <= ENTERED * THICKNESS and "inside a tool" not in answer.trust.why
+    assert np.isfinite(answer.displacement).all() and answer.magnitude.max() < 2 * THICKNESS
+
+
+def test_vertices_under_a_flat_punch_lie_on_it(sim: Simulator) -> None:
+    pose = SCENES["punch"][0].pose_body_from_tool
+    moved = LIMB.vertices + sim.step(SCENES["punch"]).displacement
+    in_tool = (moved - pose[:3, 3]) @ pose[:3, :3]
+    under = (np.linalg.norm(in_tool[:, :2], axis=1) < 0.006) & (moved[:, 0] > 0)
+    assert under.sum() >= 6
+    np.testing.assert_allclose(np.abs(in_tool[under, 2]), 0.015, atol=1e-5)
+
+
+def test_skin_under_a_ball_by_pose_has_come_along_with_it(sim: Simulator) -> None:
+    """The skin sticks: the vertex under the middle of the ball goes straight in, by the ball's depth."""
+    vertex = int(np.linalg.norm(LIMB.vertices - [RADIUS, 0, MIDDLE], axis=1).argmin())
+    middle = LIMB.vertices[vertex] + (0.012 - 2e-3) * LIMB.normals[vertex]
+    answer = sim.step([press(BALL, at(*middle), None)])
+    np.testing.assert_allclose(answer.displacement[vertex], -2e-3 * LIMB.normals[vertex], atol=1e-4)
+
+
+def test_without_a_load_nothing_is_moved(near: Surroundings, toucher: Toucher) -> None:
+    apart = press(BALL, at(RADIUS + 0.02, 0, MIDDLE), None)
+    some = np.random.default_rng(0).normal(scale=1e-3, size=LIMB.vertices.shape)
+    fitted = conform(near, some, [toucher.touch(apart, FIELDS[BALL])], [FIELDS[BALL]])
+    assert fitted.displacement.tobytes() == some.tobytes()
+    assert fitted.corrected == fitted.entered == 0
+
+
+def _fitted(near: Surroundings, toucher: Toucher, contact: Contact, answer: np.ndarray) -> tuple[np.ndarray, float]:
+    field = FIELDS[contact.mesh]
+    fitted = conform(near, answer, [toucher.touch(contact, field)], [field])
+    return fitted.displacement, fitted.corrected
+
+
+@pytest.mark.parametrize("name", ["ball", "ball by force", "punch"])
+def test_an_answer_that_fits_is_left_as_it_is(near: Surroundings, toucher: Toucher, name: str) -> None:
+    contact = SCENES[name][0]
+    still = np.zeros_like(LIMB.vertices)
+    once, first = _fitted(near, toucher, contact, still)
+    twice, second = _fitted(near, toucher, contact, once)
+    assert not still.any()
+    assert first > 1e-3 and second < 0.05 * first
+    assert np.abs(twice - once).max() < 0.05 * first
+
+
+def test_the_correction_ends_with_the_layers_response_and_turns_with_the_scene(toucher: Toucher) -> None:
+    contact, scene = SCENES["ball"][0], turn((0.3, -0.5, 0.8), 1.1, (0.4, -0.2, 0.9))
+    here, _ = _fitted(Surroundings.of(LIMB), toucher, contact, np.zeros_like(LIMB.vertices))
+    away = np.linalg.norm(LIMB.vertices - [RADIUS, 0, MIDDLE], axis=1)
+    assert np.linalg.norm(here[away > 8 * THICKNESS], axis=1).max() < 2e-5
+    turned = LIMB.with_(vertices=LIMB.vertices @ scene[:3, :3].T + scene[:3, 3])
+    other = press(BALL, scene @ contact.pose_body_from_tool, None)
+    there, _ = _fitted(Surroundings.of(turned), Toucher(turned), other, np.zeros_like(LIMB.vertices))
+    np.testing.assert_allclose(there, here @ scene[:3, :3].T, atol=5e-6)
+
+
+@pytest.mark.parametrize(
+    "mesh, pose", [(BALL, at(RADIUS + 0.0095, 0, MIDDLE)), (PUNCH, SCENES["punch"][0].pose_body_from_tool)]
+)
+def test_skin_moves_continuously_while_a_tool_slides(sim: Simulator, mesh: ToolMesh, pose: np.ndarray) -> None:
+    """No vertex jumps where it comes under the tool: a quarter of the slide, about a quarter of the motion."""
+
+    def furthest(step: float) -> float:
+        slides = [at(0, 0, s) @ pose for s in np.arange(0, 1.5e-3, step)]
+        moved = [sim.step([press(mesh, one, None)]).displacement for one in slides]
+        return max(float(np.linalg.norm(b - a, axis=1).max()) for a, b in pairwise(moved))
+
+    coarse, fine = furthest(2.5e-5), furthest(6.25e-6)
+    assert fine < 0.4 * coarse
+
+
+def test_the_same_step_gives_the_same_answer(sim: Simulator) -> None:
+    first = sim.step(SCENES["two fingers"]).displacement
+    sim.step(SCENES["punch"])
+    assert sim.step(SCENES["two fingers"]).displacement.tobytes() == first.tobytes()

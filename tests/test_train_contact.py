@@ -1,0 +1,140 @@
+"""Laws of what ContactNet learns from: tools of every kind, put back where finite elements had them, and a training."""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+
+from fem_tools.dataset import Dataset
+from fem_tools.generate import generate
+from fem_tools.sampling import CONTACT_BODIES, FILLETS, PRESETS, SIZES, TILT, TOOLS, any_tool, contacts, draw, split_of
+from fem_tools.scenes import Site
+from fem_tools.train_contact import ContactTraining, pressed, score, train_contact
+from stmpl_core import SoftLayer
+from stmpl_core.contact_net import OUTPUTS, ContactNet
+from stmpl_core.errors import InvalidInput
+from stmpl_core.methods.moment_net import Weights
+from stmpl_core.sdf import SignedDistance
+from tests import scenes
+
+BODY = CONTACT_BODIES[1].model_copy(update={"edge_length": 6e-3, "reach": 3.0})
+PLAN = PRESETS["contacts"].model_copy(
+    update={"preset": "few", "bodies": (BODY,), "tools": 3, "loads": 2, "deepest": 0.4, "indenter_step": 0.2, "seed": 1}
+)
+SETTINGS = ContactTraining(hidden=8, steps=60, batch=4)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def one_thread() -> Iterator[None]:
+    """So small a network is not shared among threads, which would wait for one another."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("contacts") / "few"
+    generate(PLAN, out, workers=1)
+    return out
+
+
+def drawn(kind: str, size: float, seed: int) -> dict:
+    rng = np.random.default_rng(seed)
+    return {"tool": kind, "size": size, "shape": rng.uniform(0, 1, 8), "tilt": rng.uniform(-TILT, TILT, 2)}
+
+
+@pytest.mark.parametrize("kind", TOOLS)
+@pytest.mark.parametrize("size", [SIZES[0], 0.01, SIZES[1]])
+def test_every_kind_of_tool_is_a_closed_mesh_of_about_the_size_asked(kind: str, size: float) -> None:
+    for seed in range(3):
+        mesh, rounding = any_tool(drawn(kind, size, seed))
+        shape = trimesh.Trimesh(1e3 * mesh.vertices, mesh.faces)  # mm; merges equal vertices
+        assert shape.is_watertight and shape.is_winding_consistent and shape.volume > 0
+        half = max(1e3 * size, 10.0) if kind == "letter" else 1e3 * size
+        reach = np.linalg.norm(shape.vertices, axis=1).max()
+        assert 0.4 * half < reach < max(4.6 * half, half + 15.0)  # a capsule is up to 4.5 times as long
+        assert (rounding > 0) == (kind == "letter") and rounding <= FILLETS[1]
+
+
+def test_a_smooth_tools_field_is_its_surface() -> None:
+    for kind in ("sphere", "box", "hull"):
+        mesh, rounding = any_tool(drawn(kind, 0.012, 1))
+        field = SignedDistance.of(mesh, rounding=rounding)
+        assert field.watertight and np.abs(field.distance(mesh.vertices)).max() < 2e-4
+
+
+def test_a_drawn_tool_stands_above_the_skin_and_looks_at_it() -> None:
+    layer = SoftLayer(*scenes.limb(4e-3, length=0.3), 6e-3)
+    site, kinds = Site(layer), set()
+    for contact in [c for c in contacts(PRESETS["contacts"]) if c.body == "even_75"][:12]:
+        scene, figures = draw(contact, site, None, contact.rng(0))
+        assert scene.mesh is not None
+        pose = scene.pose_body_from_tool
+        points = scene.mesh.vertices @ pose[:3, :3].T + pose[:3, 3]
+        away = (points - layer.vertices[figures["vertex"]]) @ layer.normals[figures["vertex"]]
+        assert away.min() > 0
+        assert -pose[:3, 2] @ layer.normals[figures["vertex"]] < -0.7
+        kinds.add(figures["tool"])
+        again, _ = draw(contact, site, None, contact.rng(0))
+        assert again.mesh is not None and again.mesh.vertices.tobytes() == scene.mesh.vertices.tobytes()
+    assert len(kinds) > 3
+
+
+def test_the_preset_learns_from_some_limbs_and_holds_others_out() -> None:
+    plan = PRESETS["contacts"]
+    every = list(contacts(plan))
+    assert {c.set for c in every} == {"tool"}
+    out = {c.body for c in every if split_of(plan, c) == "held_out"}
+    assert out == {"calf", "thigh"}
+    assert sum(split_of(plan, c) == "train" for c in every) > 0.7 * sum(c.body not in out for c in every)
+
+
+def test_a_tool_is_put_back_where_finite_elements_had_it(data: Path) -> None:
+    """What presses in their answer lies on the tool, and it is squeezed there."""
+    source = Dataset.open(data)
+    seen = 0
+    for one in pressed(source.split("train", kind="indenter")):
+        layer, sample = one.sample.layer, one.sample
+        moved = layer.vertices + sample.displacement
+        away = one.field.distance((moved - one.pose[:3, 3]) @ one.pose[:3, :3])
+        own = np.zeros(len(away))  # depth of each vertex's own column: at the rim only a part of its triangles bears
+        own[one.squeeze.vertices] = one.squeeze.depth
+        bears = (sample.load.values > 0.3 * sample.load.values.max()) & (own > 0.5 * own.max())
+        assert bears.any()
+        assert np.abs(away[bears]).max() < 1e-4
+        assert away.min() > -1e-4
+        assert one.missed < 0.05 and np.isin(np.flatnonzero(bears), one.squeeze.vertices).all()
+        force = float(layer.vertex_areas @ sample.load.values) / layer.tissue.youngs_modulus
+        columns = float(layer.vertex_areas[one.squeeze.vertices] @ one.squeeze.pressure)
+        assert 0.2 < columns / force < 5
+        seen += 1
+    assert seen >= 2
+
+
+def test_a_short_training_learns_and_its_weights_load_and_hold(data: Path, tmp_path: Path) -> None:
+    card = train_contact(data, tmp_path, SETTINGS)
+    weights = Weights.load(tmp_path / "contact_net.safetensors", outputs=OUTPUTS)
+    assert weights.card["settings"]["steps"] == SETTINGS.steps == card["settings"]["steps"]
+    assert card["contacts"] >= 2 and card["rows"] > card["contacts"]
+    assert card["ranges"]["depth_over_thickness"][1] < 0.4 and card["bound"]["factor"] > 0
+    subset = Dataset.open(data).split("train", kind="indenter")
+    after = score(subset, weights)
+    assert len(after.force) == len(subset)
+    assert np.abs(after.force).mean() < np.abs(after.winkler).mean()
+    one = next(iter(pressed(subset)))
+    held = ContactNet(one.sample.layer, weights).hold(one.squeeze.vertices, one.squeeze.pressure, one.squeeze.strain)
+    assert (held.pressure > 0).all() and np.isfinite(held.doubt).all()
+    again = train_contact(data, tmp_path / "again", SETTINGS)
+    assert again["bound"] == card["bound"]
+
+
+def test_data_without_tools_is_refused_with_a_reason(tmp_path: Path) -> None:
+    plan = PLAN.model_copy(update={"tools": 0, "discs": 1, "loads": 1})
+    generate(plan, tmp_path / "discs", workers=1)
+    with pytest.raises(InvalidInput, match="no rigid tools"):
+        train_contact(tmp_path / "discs", tmp_path, SETTINGS)
