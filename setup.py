@@ -62,7 +62,8 @@ setup(
     description="Real-time soft-tissue contact for robots: a contact comes in, the deformed skin goes out.",
     license="Apache-2.0",
     python_requires=">=3.12,<3.13",
-    packages=["stmpl_core", "stmpl_core.methods", "fem_tools", "bags", "stmpl_ros", "stmpl_ros.view"],
+    packages=["stmpl_core", "stmpl_core.methods", "fem_tools", "fem_tools.stability", "bags", "stmpl_ros",
+              "stmpl_ros.view"],
     package_data={"stmpl_core": ["weights/*"], "stmpl_ros": ["foxglove/*.json"]},
     data_files=[
         ("share/ament_index/resource_index/packages", ["resource/stmpl_ros"]),

@@ -33,6 +33,14 @@ class Recorded(NamedTuple):
     publish_time_ns: int
 
 
+class Raw(NamedTuple):
+    """One message of a bag as it came over the wire, and when it was received [ns]."""
+
+    topic: str
+    data: bytes
+    log_time_ns: int
+
+
 class Topic(NamedTuple):
     """One topic of a bag, with the number of its messages and the span of their log times [ns]."""
 
@@ -59,7 +67,10 @@ class Bag:
         self.topics: dict[str, Topic] = {}
         self.attachments: dict[str, bytes] = {}
         self.metadata: dict[str, dict[str, str]] = {}
-        self._schemas, self._channels = summary(self.file)
+        index = summary(self.file)
+        self.expected = index.messages  # that the writer counted, or None
+        self._schemas, self._channels = dict(index.schemas), dict(index.channels)
+        self._stores: dict[int, Typestore] = {}
         self._survey()
 
     def messages(self, wanted: Callable[[str], bool] | None = None) -> Iterator[Recorded]:
@@ -73,6 +84,18 @@ class Bag:
                 if wanted is None or wanted(channel.topic):
                     decoded = self._decode(channel, record.data)
                     yield Recorded(channel.topic, decoded, record.log_time, record.publish_time)
+
+    def raw(self, wanted: Callable[[str], bool]) -> Iterator[Raw]:
+        """Yields the messages of the topics that `wanted` accepts in the order of the file, undecoded."""
+        for record in walk(self.file):
+            if isinstance(record, Message) and (channel := self._channels.get(record.channel_id)):
+                if wanted(channel.topic):
+                    yield Raw(channel.topic, record.data, record.log_time)
+
+    def described(self, topic: str) -> tuple[str, str]:
+        """Type hash and offered QoS profiles (YAML) of a topic; empty where the bag does not say. Raises KeyError."""
+        told = {channel.topic: channel.metadata for channel in self._channels.values()}[topic]
+        return told.get("topic_type_hash", ""), told.get("offered_qos_profiles", "")
 
     def find_topic(self, ending: str) -> str:
         """The one topic whose name ends with `ending`, whatever its namespace. Raises BagError."""
@@ -134,15 +157,19 @@ class Bag:
             return recorded.message
         raise BagError(f"{self.file} holds no message on {topic}, so the skin is not known.")
 
-    @cached_property
-    def _store(self) -> Typestore:
-        return typestore_of([(s.name, s.data.decode()) for s in self._schemas.values()])
-
     def _decode(self, channel: Channel, data: bytes) -> Any:
         schema = self._schemas.get(channel.schema_id)
         if schema is None:
             raise BagError(f"the schema of {channel.topic} is lost, so it cannot be decoded.")
-        return self._store.deserialize_cdr(data, schema.name)
+        encodings = (channel.message_encoding, schema.encoding)
+        if encodings != ("cdr", "ros2msg"):
+            raise BagError(f"{channel.topic} is encoded as {' with '.join(encodings)}; only cdr with ros2msg is read.")
+        if schema.id not in self._stores:
+            self._stores[schema.id] = typestore_of([(schema.name, schema.data.decode(errors="replace"))])
+        try:
+            return self._stores[schema.id].deserialize_cdr(data, schema.name)
+        except Exception as error:
+            raise BagError(f"a message on {channel.topic} is no {schema.name}: {error}.") from error
 
     def _survey(self) -> None:
         spans: dict[int, list[int]] = {}
@@ -172,7 +199,7 @@ class Bag:
 
     def _warn(self) -> None:
         for damage in self.damage:
-            log.warning("%s: %s at byte %d (%d bytes skipped)", self.file, damage.what, damage.offset, damage.length)
+            log.warning("%s: %s", self.file, damage)
         if not self.finished:
             log.warning("%s was not finished by its writer; at most its last chunk is missing", self.file)
 

@@ -21,6 +21,7 @@ class Recovery:
         messages: brought back.
         seconds: of log time between the first and the last of them [s].
         orphans: sound messages given up because their channel's description is lost.
+        expected: messages that the source's writer counted, or None.
         damage: stretches of the source that were skipped.
         finished: the writer had finished the source; False: it was killed, at most its last chunk is missing.
     """
@@ -30,6 +31,7 @@ class Recovery:
     messages: int
     seconds: float
     orphans: int
+    expected: int | None
     damage: tuple[Damage, ...]
     finished: bool
 
@@ -39,12 +41,13 @@ class Recovery:
         return self.finished and not self.damage and not self.orphans
 
     def __str__(self) -> str:
-        missing = [f"{d.what} at byte {d.offset} ({d.length} bytes)" for d in self.damage]
+        missing = [str(damage) for damage in self.damage]
         if self.orphans:
             missing.append(f"{self.orphans} messages whose channel is not described any more")
         if not self.finished:
             missing.append("what the writer had not flushed when it was stopped (at most its last chunk)")
-        back = f"{self.messages} messages over {self.seconds:.2f} s are back in {self.target}"
+        of = "" if self.expected in (None, self.messages) else f" of {self.expected}"
+        back = f"{self.messages}{of} messages over {self.seconds:.2f} s are back in {self.target}"
         return f"{back}; nothing is missing." if not missing else f"{back}. Missing: {'; '.join(missing)}."
 
 
@@ -60,7 +63,8 @@ def recover(source: Path | str, target: Path | str | None = None) -> Recovery:
     """
     source = bag_file(source)
     target = Path(target) if target else source.parent.with_name(f"{source.parent.resolve().name}-recovered")
-    schemas, channels = summary(source)
+    index = summary(source)
+    schemas, channels = dict(index.schemas), dict(index.channels)
     damage, orphans, messages, finished, times = [], 0, 0, False, [0, 0]
     copied: dict[int, int] = {}
     with BagWriter(target) as writer:
@@ -90,14 +94,14 @@ def recover(source: Path | str, target: Path | str | None = None) -> Recovery:
     if not messages and damage:
         for made in (writer.path, writer.path.with_name("metadata.yaml")):
             made.unlink()
-        raise BagError(f"{source} holds no sound message: {damage[0].what} at byte {damage[0].offset}.")
+        raise BagError(f"{source} holds no sound message: {damage[0]}.")
     seconds = (times[1] - times[0]) / 1e9
-    return Recovery(source, writer.path, messages, seconds, orphans, tuple(damage), finished)
+    return Recovery(source, writer.path, messages, seconds, orphans, index.messages, tuple(damage), finished)
 
 
 def _copy_channel(writer: BagWriter, channel: Channel, schemas: dict[int, Schema], copied: dict[int, int]) -> bool:
     """Announces the channel in the new bag once; False if its schema is lost."""
     schema = schemas.get(channel.schema_id)
-    if channel.id not in copied and schema is not None:
-        copied[channel.id] = writer.copy_channel(channel.topic, schema.name, schema.data.decode(), channel.metadata)
+    if channel.id not in copied and (schema is not None or not channel.schema_id):
+        copied[channel.id] = writer.copy_channel(channel, schema)
     return channel.id in copied

@@ -12,6 +12,8 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
+from mcap import records
+from mcap.records import Channel
 from mcap.writer import CompressionType, Writer
 from ruamel.yaml import YAML, YAMLError
 
@@ -41,12 +43,34 @@ def qos_yaml(*, depth: int = 10, reliable: bool = True, transient_local: bool = 
     }])  # fmt: skip
 
 
+@dataclass(frozen=True)
+class Offered:
+    """What matters of a QoS profile."""
+
+    depth: int = 10
+    reliable: bool = True
+    transient_local: bool = False
+
+
+def offered(yaml: str) -> Offered:
+    """The first profile of a topic's `offered_qos_profiles`, ours or rosbag2's; the default if it cannot be read."""
+    try:
+        told = YAML(typ="safe").load(yaml)[0]
+        depth = int(told["depth"])
+    except (YAMLError, TypeError, KeyError, IndexError, ValueError):
+        return Offered()
+    # rosbag2 before Jazzy wrote the numbers of rmw's enumerations
+    return Offered(depth or 10, told.get("reliability") not in ("best_effort", 2),
+                   told.get("durability") in ("transient_local", 1))  # fmt: skip
+
+
 @dataclass
 class _Topic:
     name: str
     type_name: str
     type_hash: str
     qos: str
+    encoding: str = "cdr"
     messages: int = 0
 
 
@@ -69,7 +93,7 @@ class BagWriter:
         self.path = path if path.suffix == ".mcap" else path / "run.mcap"
         self._chunk_seconds = chunk_seconds
         self._topics: dict[int, _Topic] = {}
-        self._schemas: dict[str, int] = {}
+        self._schemas: dict[tuple[str, str, bytes], int] = {}
         self._times: tuple[int, int] | None = None
         self.safe_messages = 0  # how many survive a SIGKILL
         self._messages = self._safe_bytes = 0
@@ -82,7 +106,8 @@ class BagWriter:
             raise BagError(f"{self.path} exists already. Record into another folder, or remove it.") from error
         except OSError as error:
             raise BagError(f"{self.path} cannot be written: {error.strerror}.") from error
-        self._writer = Writer(self._file, chunk_size=CHUNK_BYTES, compression=CompressionType.ZSTD)
+        self._writer = Writer(self._file, chunk_size=CHUNK_BYTES, compression=CompressionType.ZSTD,
+                              enable_data_crcs=True)  # fmt: skip
         self._guard(lambda: self._writer.start(profile="ros2"))
         self._flushed_at = time.monotonic()
 
@@ -93,20 +118,23 @@ class BagWriter:
             BagError: the message type is not installed, or writing failed.
         """
         schema = find_schema(type_name)
-        return self._add_channel(_Topic(topic, schema.name, schema.type_hash, qos_yaml), schema.text)
+        metadata = {"offered_qos_profiles": qos_yaml, "topic_type_hash": schema.type_hash}
+        announced = _Topic(topic, schema.name, schema.type_hash, qos_yaml)
+        return self._add_channel(announced, "ros2msg", schema.text.encode(), metadata)
 
-    def copy_channel(self, topic: str, type_name: str, schema_text: str, metadata: Mapping[str, str]) -> int:
-        """Announces a topic with the schema and channel metadata of another bag, installed here or not."""
-        type_hash, qos = metadata.get("topic_type_hash", ""), metadata.get("offered_qos_profiles", "")
-        return self._add_channel(_Topic(topic, type_name, type_hash, qos), schema_text)
+    def copy_channel(self, channel: Channel, schema: records.Schema | None) -> int:
+        """Announces a channel of another bag as it is described there, its type installed here or not."""
+        told = channel.metadata
+        topic = _Topic(channel.topic, schema.name if schema else "", told.get("topic_type_hash", ""),
+                       told.get("offered_qos_profiles", ""), channel.message_encoding)  # fmt: skip
+        return self._add_channel(topic, schema.encoding if schema else "", schema.data if schema else b"", told)
 
-    def _add_channel(self, topic: _Topic, schema_text: str) -> int:
-        name, data = topic.type_name, schema_text.encode()
-        if name not in self._schemas:
-            self._schemas[name] = self._guard(lambda: self._writer.register_schema(name, "ros2msg", data))
-        metadata = {"offered_qos_profiles": topic.qos, "topic_type_hash": topic.type_hash}
-        schema_id = self._schemas[name]
-        channel_id = self._guard(lambda: self._writer.register_channel(topic.name, "cdr", schema_id, metadata))
+    def _add_channel(self, topic: _Topic, encoding: str, text: bytes, metadata: Mapping[str, str]) -> int:
+        key = topic.type_name, encoding, text
+        if topic.type_name and key not in self._schemas:
+            self._schemas[key] = self._guard(lambda: self._writer.register_schema(*key))
+        described = topic.name, topic.encoding, self._schemas.get(key, 0), dict(metadata)
+        channel_id = self._guard(lambda: self._writer.register_channel(*described))
         self._topics[channel_id] = topic
         return channel_id
 
@@ -224,7 +252,7 @@ def _topic_metadata(topic: _Topic) -> dict[str, Any]:
     return {
         "name": topic.name,
         "type": topic.type_name,
-        "serialization_format": "cdr",
+        "serialization_format": topic.encoding,
         "offered_qos_profiles": qos,
         "type_description_hash": topic.type_hash,
     }

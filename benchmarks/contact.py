@@ -302,7 +302,7 @@ def draw(rows: Sequence[Row], path: Path) -> None:
         mine = [r for r in rows if r.name == name]
         x = [r.mean_pressure for r in mine]
         axes[0].plot(x, [100 * r.winkler_error for r in mine], "x:", color="grey", lw=0.8)
-    titles = ("force, signed error [%]", "pressure, L2 error [%]", "motion under the contact, mean error [% of the peak]")
+    titles = ("force, signed error [%]", "pressure, L2 error [%]", "motion under the contact [% of the peak]")
     for axis, title in zip(axes, titles, strict=True):
         axis.set(xscale="log", xlabel="mean pressure / E", title=title)
         axis.grid(alpha=0.3)

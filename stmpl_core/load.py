@@ -47,9 +47,10 @@ class Load:
         return cls("pressure", np.zeros(len(layer.vertices)))
 
     def check(self, layer: SoftLayer) -> Load:
-        """Returns itself if it fits `layer`; raises InvalidInput otherwise."""
+        """Returns itself if it is finite and fits `layer`; raises InvalidInput otherwise."""
         if len(self.values) != len(layer.vertices):
             raise InvalidInput(f"the load has {len(self.values)} values; the layer has {len(layer.vertices)} vertices.")
+        finite("load", self.values, (None,))  # once more: the array may have been written to since
         return self
 
     @property

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import logging
 import os
@@ -25,6 +26,7 @@ Flat = tyro.conf.arg(name="")  # a configuration whose fields are flags of the v
 BagPath = Annotated[Path, tyro.conf.Positional]  # a run's folder, or its .mcap file
 MethodName = Literal["fem", "moment_net", "unet", "linear", "winkler", "naive"]
 
+STABILITY_METHODS = ("moment_net", "linear", "winkler", "naive", "zero")  # of fem_tools.stability.METHODS, fast ones
 DEMO, NODE, PROBE, VIEW = DemoConfig(), NodeConfig(), ProbeConfig(), ViewConfig()
 
 _ros_arguments: list[str] = []
@@ -60,70 +62,102 @@ def probe(config: Annotated[ProbeConfig, Flat] = PROBE) -> int:
     return run(config, _ros_arguments)
 
 
-def record(config: Annotated[RecordConfig, Flat]) -> int:
-    """Records the topics of a run as MCAP until Ctrl-C.
+def record(config: Annotated[RecordConfig, Flat], topics: tuple[str, ...] = ()) -> int:
+    """Records topics as they come over the wire, as MCAP, until Ctrl-C.
 
     Example: stmpl record --path runs/mine
+    Any topics: stmpl record --path runs/mine --topics '/left/.*' /tf /tf_static
+
+    Args:
+        config: where to.
+        topics: regular expressions of whole topic names; what a replay needs unless given.
     """
     from stmpl_ros.recorder import run
 
-    return run(config, _ros_arguments)
+    return run(config, _ros_arguments, topics)
 
 
-def replay(path: BagPath, method: MethodName | None = None, every: int = 1, as_json: Json = False) -> int:
-    """Answers the recorded contacts again, offline, and says whether the answers are the recorded ones.
+def replay(
+    path: BagPath,
+    method: MethodName | None = None,
+    every: int = 1,
+    publish: bool = False,
+    speed: float = 1.0,
+    topics: tuple[str, ...] = (),
+    as_json: Json = False,
+) -> int:
+    """Answers the recorded contacts again, offline; exits with 1 if the recorded method gives other answers now.
 
     Example: stmpl replay runs/latest --every 10
+    To a running node (max_age:=0): stmpl replay runs/latest --publish --topics /contact_mesh '/tools/.*' --speed 0.5
 
     Args:
         path: a run's folder, or its .mcap file.
         method: that answers; the one that was recorded unless given.
         every: take each n-th frame only.
+        publish: publish the recorded messages on their topics instead, with the timing of the recording.
+        speed: of publishing; 1 as recorded, 0 as fast as possible.
+        topics: to publish, regular expressions of whole names; all unless given.
         as_json: print figures for machines.
     """
-    from bags.reader import Bag
     from bags.replay import replay_run
 
-    recorded = Bag(path).provenance.method
-    if method is None and recorded not in METHODS:
-        raise InvalidInput(f"{path} was recorded with {recorded or 'no named method'}. Name one with --method.")
+    if publish:
+        from stmpl_ros.player import run
+
+        return run(path, speed, topics, _ros_arguments)
+    if every < 1:
+        raise InvalidInput(f"--every {every} takes no frame; 1 takes each.")
+    answering = _method(method) if method else METHODS[_recorded_method(path)]()
     with _waiting(f"replaying {path}", as_json):
-        summary = replay_run(path, METHODS[recorded]() if method is None else _method(method), every=every)
+        summary = replay_run(path, answering, every=every)
     _print_figures(vars(summary) if as_json else str(summary))
-    return 0
+    return 0 if method or summary.identical == summary.frames else 1
 
 
 def compare(
-    path: BagPath, reference: Literal["rigid", MethodName] = "rigid", frames: int = 12, as_json: Json = False
+    path: BagPath,
+    reference: Literal["rigid", MethodName] = "rigid",
+    other: Annotated[Path | None, tyro.conf.arg(name="with")] = None,
+    tolerance_mm: float | None = None,
+    frames: int = 12,
+    as_json: Json = False,
 ) -> int:
-    """Compares a recorded run with a reference on a sample of its frames.
+    """Compares a recorded run on a sample of its frames; exits with 1 past a tolerance or if a frame is not judged.
 
-    Example: stmpl compare runs/latest --frames 6
+    Example: stmpl compare runs/latest --frames 6 --tolerance-mm 0.3
+    Against another recording of the same contacts: stmpl compare runs/latest --with runs/before --tolerance-mm 0
 
     Args:
         path: a run's folder, or its .mcap file.
         reference: that judges. rigid: the recorded answers, by the same tools pressed in by finite elements; any
             other: the run's method, under the recorded pressures.
+        other: another bag that judges instead, at the stamps that both answer.
+        tolerance_mm: allowed mean error under the contact, in the worst frame [mm].
         frames: of the run that the reference solves.
         as_json: print figures for machines.
     """
-    from bags.reader import Bag
+    from bags.compare import compare_bags
     from fem_tools import RigidFem
     from stmpl_ros.tables import compare_with_progress, comparison_table, figures_of
 
-    if reference == "rigid":
+    if tolerance_mm is not None and not tolerance_mm >= 0:
+        raise InvalidInput(f"--tolerance-mm {tolerance_mm} allows nothing; give 0 or more.")
+    if other is not None:
+        comparison = compare_bags(path, other, frames=frames)
+    elif reference == "rigid":
         comparison = compare_with_progress(path, RigidFem(), frames, quiet=as_json)
     else:
-        if (recorded := Bag(path).provenance.method) not in METHODS:
-            raise InvalidInput(f"{path} was recorded with {recorded or 'no named method'}: compare it with rigid.")
-        method = METHODS[recorded]()
+        method = METHODS[_recorded_method(path)]()
         comparison = compare_with_progress(path, _method(reference), frames, method=method, quiet=as_json)
+    if tolerance_mm is not None:
+        comparison = dataclasses.replace(comparison, tolerance=tolerance_mm * 1e-3)
     _print_figures(figures_of(comparison) if as_json else comparison_table(comparison))
     return 0 if comparison.passed else 1
 
 
 def info(path: BagPath, as_json: Json = False) -> int:
-    """Says what a recording holds, finished or not.
+    """Says what a recording holds; exits with 1 if it was not finished or is damaged.
 
     Example: stmpl info runs/latest
 
@@ -136,7 +170,14 @@ def info(path: BagPath, as_json: Json = False) -> int:
 
     bag = Bag(path)
     _print_figures(bag_figures(bag) if as_json else bag_table(bag))
-    return 0
+    sound = sum(topic.messages for topic in bag.topics.values())
+    if not as_json and bag.expected not in (None, sound):
+        _print_figures(f"{sound} of {bag.expected} messages are sound")
+    if not as_json and bag.provenance.versions:
+        made_by = ", ".join(f"{name} {version}" for name, version in bag.provenance.versions.items())
+        _print_figures(f"method: {bag.provenance.method or 'not named'}; body: {bag.provenance.body or 'not named'}; "
+                       f"made by {made_by}")
+    return 0 if bag.finished and not bag.damage else 1
 
 
 def recover(path: BagPath, target: Path | None = None) -> int:
@@ -274,25 +315,56 @@ def view(path: Annotated[Path | None, tyro.conf.Positional] = None, live: bool =
     return run(config, path, live, _ros_arguments)
 
 
-def stability(critical_load: bool = False, out: Path = Path("runs/critical_load.png"), as_json: Json = False) -> int:
-    """Where the finite elements lose stability: follower, dead and indenter loads, beside the closed form.
+def stability(
+    methods: tuple[str, ...] = STABILITY_METHODS,
+    preset: Literal["default", "quick"] = "default",
+    out: Path | None = None,
+    again: Path | None = None,
+    critical_load: bool = False,
+    as_json: Json = False,
+) -> int:
+    """Where methods fail: pressure, mesh, seam, noise and more, swept until a law breaks; a table and a picture.
 
-    Example: stmpl stability --critical-load --out critical_load.png
+    Example: stmpl stability --methods moment_net winkler
+    Your own: stmpl stability --methods my_module:MyMethod
+    One failure again: stmpl stability --again runs/stability/failures/pressure_5_E.moment_net.json
+    The finite elements' own limits: stmpl stability --critical-load --out critical_load.png
 
     Args:
-        critical_load: press a flat layer by each load with each element and mesh width until it fails (minutes).
-        out: the picture, a PNG.
-        as_json: print the table for machines.
+        methods: names (zero, naive, winkler, linear, moment_net, unet, fem_3_steps, fem), or module:attribute.
+        preset: default (minutes a method, on the arm), quick (seconds, on a round limb).
+        out: folder of report, picture and failures, runs/stability unless given; the picture with --critical-load.
+        again: a saved failure to run again with the same method.
+        critical_load: press a flat layer by follower, dead and indenter loads with each element and mesh width until
+            it fails, beside the closed form (minutes).
+        as_json: print the figures for machines.
     """
-    from fem_tools.critical_load import closed_form, draw
+    if critical_load:
+        return _critical_load(out or Path("runs/critical_load.png"), as_json)
+    from fem_tools.stability import PRESETS, maker
+    from fem_tools.stability import again as run_again
+    from fem_tools.stability import stability as sweep
+    from fem_tools.stability.picture import draw
+    from stmpl_ros.tables import stability_table, steps_bar
+
+    if again is not None:
+        row = run_again(again, maker)
+        said = "\n".join(f"{b.law}: {b.measured} ({'flagged' if b.flagged else 'not flagged'})" for b in row.broken)
+        told = f"{row.method} at {row.axis} {row.level}: {row.outcome}\n{said}".strip()
+        _print_figures(dataclasses.asdict(row) if as_json else told)
+        return 1 if row.broken else 0
+    folder = out or Path("runs/stability")
+    with steps_bar("stability", quiet=as_json) as show:
+        report = sweep({name: maker(name) for name in methods}, PRESETS[preset], folder, on_progress=show)
+    picture = draw(report, folder / "stability.png")
+    _print_figures(report.as_dict() if as_json else stability_table(report, picture))
+    return 0
+
+
+def _critical_load(out: Path, as_json: bool) -> int:
+    from fem_tools.critical_load import draw
     from stmpl_ros.tables import critical_load_table, critical_loads_with_progress
 
-    if not critical_load:
-        least = min(closed_form(wavelength) for wavelength in (0.5, 1.0, 2.0))
-        said = f"Under dead loads a bonded layer is unstable from p = {least:.2f} E on; under a follower pressure,"
-        said += " up to 40 E, never. --critical-load shows what each element makes of it."
-        _print_figures({"dead_load_p_over_e": least, "follower_load_p_over_e": None} if as_json else said)
-        return 0
     rows = critical_loads_with_progress(quiet=as_json)
     picture = draw(rows, out)
     figures = {"picture": str(picture), "rows": [vars(row) for row in rows]}
@@ -325,6 +397,18 @@ def main(arguments: list[str] | None = None) -> None:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         code = 0
     sys.exit(code)
+
+
+def _recorded_method(path: Path) -> str:
+    """The method that a run was recorded with, by its provenance, else by its first answer. Raises InvalidInput."""
+    from bags.reader import Bag
+
+    bag = Bag(path)
+    recorded = bag.provenance.method or next((frame.method for frame in bag.frames()), "no named method")
+    if recorded not in METHODS:
+        raise InvalidInput(f"{path} was recorded with {recorded}; known are {', '.join(METHODS)}. "
+                           "Name one with replay --method, or compare with rigid.")
+    return recorded
 
 
 def _method(name: MethodName) -> Method:

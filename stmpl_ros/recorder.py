@@ -9,6 +9,7 @@ import queue
 import re
 import threading
 import time
+from collections.abc import Sequence
 from typing import Any
 
 from rclpy.event_handler import SubscriptionEventCallbacks
@@ -18,8 +19,9 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.utilities import ok
 
 from bags.provenance import write_provenance
+from bags.schema import find_schema
 from bags.writer import BagWriter, qos_yaml
-from stmpl_core.errors import BagError
+from stmpl_core.errors import BagError, InvalidInput
 from stmpl_ros.parameters import RecordConfig
 from stmpl_ros.spinning import ros, spin
 
@@ -37,12 +39,17 @@ Item = tuple[str, str, str, bytes, int]  # topic, type, quality of service, seri
 class RecorderNode(Node):
     """Subscribes to every topic of a run as soon as it is announced, and hands the bytes to a thread that writes.
 
-    Topics count when they lie in this node's namespace. Nothing is decoded.
+    Nothing is decoded. A topic whose type is not installed is named in the log and left out.
+
+    Args:
+        writer: takes what comes.
+        stop: is set when the disk refuses.
+        wanted: whole topic names to record; None: the run's own topics that lie in this node's namespace.
     """
 
-    def __init__(self, writer: BagWriter, stop: threading.Event) -> None:
+    def __init__(self, writer: BagWriter, stop: threading.Event, wanted: re.Pattern[str] | None = None) -> None:
         super().__init__("recorder")
-        self.writer, self._stop = writer, stop
+        self.writer, self._stop, self._wanted = writer, stop, wanted
         self.received = self.lost = 0
         self.error: BagError | None = None
         self._channels: dict[str, int] = {}
@@ -53,15 +60,22 @@ class RecorderNode(Node):
         self.create_timer(LOOK, self._look)
 
     def _look(self) -> None:
-        own = self.get_namespace().rstrip("/") + "/"
         for topic, types in self.get_topic_names_and_types():
-            inside = topic.startswith(own) or topic == "/diagnostics"
-            if inside and topic not in self._subscribed and WANTED.search(topic) and self.count_publishers(topic):
+            if topic not in self._subscribed and self._is_wanted(topic) and self.count_publishers(topic):
                 self._subscribed.add(topic)
-                self._subscribe(topic, types[0])
+                try:
+                    self._subscribe(topic, types[0])
+                except BagError as error:
+                    self.get_logger().error(f"{topic} is not recorded: {error}")
+
+    def _is_wanted(self, topic: str) -> bool:
+        if self._wanted:
+            return bool(self._wanted.fullmatch(topic))
+        own = self.get_namespace().rstrip("/") + "/"
+        return bool(WANTED.search(topic)) and (topic.startswith(own) or topic == "/diagnostics")
 
     def _subscribe(self, topic: str, type_name: str) -> None:
-        package, _, name = type_name.split("/")
+        find_schema(type_name)  # raises BagError here, not in the thread that writes
         offered = [info.qos_profile for info in self.get_publishers_info_by_topic(topic)]
         reliable = all(qos.reliability == ReliabilityPolicy.RELIABLE for qos in offered)
         kept = all(qos.durability == DurabilityPolicy.TRANSIENT_LOCAL for qos in offered)
@@ -79,7 +93,7 @@ class RecorderNode(Node):
             self._queue.put((topic, type_name, qos, data, time.time_ns()))
 
         self.create_subscription(
-            getattr(importlib.import_module(f"{package}.msg"), name),
+            message_class(type_name),
             topic,
             keep,
             profile,
@@ -119,8 +133,36 @@ class RecorderNode(Node):
         self._thread.join()
 
 
-def run(config: RecordConfig, arguments: list[str] | None = None) -> int:
-    """Records until SIGINT or SIGTERM; the exit code says whether everything is on disk."""
+def message_class(type_name: str) -> type:
+    """The Python class of `pkg/msg/Type`. Raises BagError if it is not installed."""
+    package, kind, name = type_name.split("/")
+    try:
+        return getattr(importlib.import_module(f"{package}.{kind}"), name)
+    except (ImportError, AttributeError) as error:
+        raise BagError(f"message type {type_name} is not installed; install or source {package}.") from error
+
+
+def pattern(topics: Sequence[str]) -> re.Pattern[str]:
+    """One expression that matches what any of `topics` matches. Raises InvalidInput."""
+    try:
+        return re.compile("|".join(f"(?:{topic})" for topic in topics))
+    except re.error as error:
+        raise InvalidInput(f"topics {' '.join(topics)} are no regular expressions: {error}.") from error
+
+
+def run(config: RecordConfig, arguments: list[str] | None = None, topics: Sequence[str] = ()) -> int:
+    """Records until SIGINT or SIGTERM; the exit code says whether everything is on disk.
+
+    Args:
+        config: where to.
+        arguments: of ROS.
+        topics: regular expressions of whole topic names to record instead of the run's own topics.
+
+    Raises:
+        BagError: the file exists, or the disk refused; the message says what is safe.
+        InvalidInput: an expression that cannot be read.
+    """
+    wanted = pattern(topics) if topics else None
     made_by = json.loads(config.run.read_text()) if config.run else {}
     with ros(arguments) as stop, BagWriter(config.path) as writer:
         write_provenance(
@@ -130,7 +172,7 @@ def run(config: RecordConfig, arguments: list[str] | None = None) -> int:
             body=made_by.get("node", {}).get("part", ""),
             config=made_by,
         )
-        node = RecorderNode(writer, stop)
+        node = RecorderNode(writer, stop, wanted)
         executor = EventsExecutor()
         executor.add_node(node)
         try:

@@ -19,6 +19,7 @@ from stmpl_core.metrics import mean_and_deviation
 
 if TYPE_CHECKING:
     from fem_tools.critical_load import CriticalLoad
+    from fem_tools.stability import Report
 
 
 def compare_with_progress(
@@ -129,6 +130,28 @@ def critical_load_table(rows: Sequence[CriticalLoad], picture: Path) -> Table:
     for row in rows:
         table.add_row(row.load, row.scene, row.element, f"{row.edge * 1e3:.1f}", f"{row.ratio:.2f}", row.ended)
     table.caption = f"drawn in {picture}"
+    return table
+
+
+def stability_table(report: Report, picture: Path) -> Table:
+    """How far each method held along each axis, and its first failure, for people."""
+    colours = {"flagged": "yellow", "silent": "red", "crashed": "magenta", "": "green"}
+    table = Table(title="Held up to the first failure", title_justify="left", caption_justify="left", show_lines=True)
+    table.add_column("axis")
+    for method in report.methods:
+        table.add_column(method)
+    for axis in report.axes:
+        cells = []
+        for method in report.methods:
+            one = report.summary(method, axis)
+            failed = f"{one['failed_at']}: {one['law']}, {one['outcome']}"
+            lines = filter(None, (one["held"], failed if one["failed_at"] else ""))
+            cells.append(f"[{colours[one['outcome']]}]" + "\n".join(lines))
+        table.add_row(axis, *cells)
+    counts = [report.counts(method) for method in report.methods]
+    for outcome in ("flagged", "silent", "crashed"):
+        table.add_row(f"all trials: {outcome}", *(str(count[outcome]) for count in counts))
+    table.caption = f"drawn in {picture}; each failure runs again with stmpl stability --again FILE"
     return table
 
 

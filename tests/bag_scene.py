@@ -103,7 +103,7 @@ def displacement(answer: Displacement, layer: SoftLayer, stamp: int, sequence: i
                    tools=list(answer.statuses), statuses=list(answer.statuses.values()),
                    pose_stamps=[header("", stamp).stamp] * len(answer.statuses),
                    wrench_stamps=[header("", stamp).stamp] * len(answer.statuses),
-                   solve_seconds=0.001)  # fmt: skip
+                   fade=1.0, solve_seconds=0.001)  # fmt: skip
 
 
 def write_run(folder: Path, method: Method, *, layer: SoftLayer | None = None, frames: int = 40, rate: float = 100.0,

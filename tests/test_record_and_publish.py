@@ -1,0 +1,156 @@
+"""Recorder and player as processes over the real middleware: any topics, byte for byte; killed, and on a full disk."""
+
+import itertools
+import os
+import resource
+import signal
+import subprocess
+import sys
+import time
+from random import Random
+
+import pytest
+
+os.environ["ROS_DOMAIN_ID"] = str(1 + os.getpid() % 100)
+os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
+
+import rclpy
+from rclpy.qos import QoSProfile
+from std_msgs.msg import Header, String
+
+from bags.reader import Bag
+from bags.recover import recover
+from stmpl_ros.topics import STREAM
+
+PATIENCE = 60.0  # s to wait for anything; only a failing test waits so long
+SOME = 40
+
+
+def start(*arguments: str, **options) -> subprocess.Popen:
+    command = [sys.executable, "-m", "stmpl_ros.cli", *arguments]
+    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, **options)
+
+
+def end(process: subprocess.Popen, number: int | None = None) -> tuple[int, str]:
+    """Exit code of a process and what it said, after a signal if one is given."""
+    if number is not None:
+        process.send_signal(number)
+    try:
+        said, _ = process.communicate(timeout=PATIENCE)
+    finally:
+        process.kill()
+    return process.returncode, said
+
+
+class Talker:
+    """Publishes on two topics that are none of ours."""
+
+    def __init__(self) -> None:
+        self.node = rclpy.create_node("talker")
+        self.words = self.node.create_publisher(String, "any/words", STREAM)
+        self.heads = self.node.create_publisher(Header, "other/heads", STREAM)
+
+    def wait(self, done, what: str) -> None:
+        until = time.monotonic() + PATIENCE
+        while not done():
+            assert time.monotonic() < until, f"waited {PATIENCE} s for {what}"
+            rclpy.spin_once(self.node, timeout_sec=0.02)
+
+    def say(self, number: int) -> None:
+        self.words.publish(String(data=f"word {number}"))
+        self.heads.publish(Header(frame_id=f"head {number}"))
+        rclpy.spin_once(self.node, timeout_sec=0.005)
+
+    def wait_for_recorder(self, *publishers) -> None:
+        self.wait(lambda: all(p.get_subscription_count() == 1 for p in publishers), "the recorder")
+
+
+@pytest.fixture(scope="module")
+def talker():
+    rclpy.init()
+    made = Talker()
+    yield made
+    made.node.destroy_node()
+    rclpy.shutdown()
+
+
+@pytest.fixture(scope="module")
+def run(talker, tmp_path_factory):
+    """A recording of both topics, and of nothing else."""
+    folder = tmp_path_factory.mktemp("record") / "run"
+    recorder = start("record", "--path", str(folder), "--topics", "/any/.*", "/other/heads", "/nothing")
+    try:
+        talker.wait_for_recorder(talker.words, talker.heads)
+        for number in range(SOME):
+            talker.say(number)
+    finally:
+        code, said = end(recorder, signal.SIGINT)
+    assert code == 0, said
+    return folder
+
+
+def test_any_topics_are_recorded_as_they_came(run):
+    bag = Bag(run)
+    assert bag.finished and set(bag.topics) == {"/any/words", "/other/heads"}
+    words = [one.message.data for one in bag.messages() if one.topic == "/any/words"]
+    heads = [one.message.frame_id for one in bag.messages() if one.topic == "/other/heads"]
+    assert words == [f"word {k}" for k in range(SOME)] and heads == [f"head {k}" for k in range(SOME)]
+
+
+@pytest.mark.parametrize("speed", ["0", "1"])
+def test_a_recording_is_published_byte_for_byte_in_order(talker, run, speed):
+    got: list[bytes] = []
+    ear = talker.node.create_subscription(String, "any/words", got.append, QoSProfile(depth=10 * SOME), raw=True)
+    player = start("replay", str(run), "--publish", "--speed", speed, "--topics", "/any/words")
+    try:
+        talker.wait(lambda: len(got) == SOME, "all messages")
+    finally:
+        code, said = end(player)
+        talker.node.destroy_subscription(ear)
+    assert code == 0, said
+    assert f"{SOME} messages published on 1 topics" in said
+    assert [bytes(one) for one in got] == [raw.data for raw in Bag(run).raw(lambda topic: topic == "/any/words")]
+
+
+def test_what_cannot_be_published_is_refused(run):
+    code, said = end(start("replay", str(run), "--publish", "--topics", "/nothing"))
+    assert code == 1 and "nothing to publish on" in said and "Traceback" not in said
+    code, said = end(start("replay", str(run), "--publish", "--topics", "("))
+    assert code == 1 and "no regular expressions" in said and "Traceback" not in said
+
+
+def test_a_killed_recorder_loses_what_it_had_not_flushed_only(talker, tmp_path):
+    recorder = start("record", "--path", str(tmp_path / "run"), "--topics", "/any/words")
+    file, sizes = tmp_path / "run" / "run.mcap", set()
+    try:
+        talker.wait_for_recorder(talker.words)
+        for number in itertools.count():
+            talker.say(number)
+            sizes.add(file.stat().st_size)
+            if len(sizes) > 4:  # several chunks have been handed to the operating system
+                break
+            assert number < 60_000, "the recorder flushes nothing"
+    finally:
+        code, said = end(recorder, signal.SIGKILL)
+    assert code == -signal.SIGKILL, said
+    recovery = recover(tmp_path / "run", tmp_path / "back")
+    words = [one.message.data for one in Bag(tmp_path / "back").messages()]
+    assert words == [f"word {k}" for k in range(len(words))] and words
+    assert not recovery.finished and "had not flushed" in str(recovery) and not recovery.damage
+
+
+def test_a_recorder_on_a_full_disk_stops_and_says_what_is_safe(talker, tmp_path):
+    def small() -> None:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (40_000, 40_000))
+
+    recorder = start("record", "--path", str(tmp_path / "run"), "--topics", "/any/words", preexec_fn=small)
+    talker.wait_for_recorder(talker.words)
+    generator = Random(0)
+    until = time.monotonic() + PATIENCE
+    while recorder.poll() is None and time.monotonic() < until:
+        talker.words.publish(String(data=generator.randbytes(100).hex()))
+        rclpy.spin_once(talker.node, timeout_sec=0.01)
+    code, said = end(recorder)
+    assert code == 1 and "Safe on disk are the first" in said and "stmpl recover" in said and "Traceback" not in said
+    safe = int(said.split("the first ")[1].split()[0])
+    assert recover(tmp_path / "run", tmp_path / "back").messages >= safe
