@@ -128,9 +128,13 @@ class SkinPath:
         stations = np.linspace(low, high, STATIONS)
         turn = np.radians(around)
         outwards = np.cos(turn) * side + np.sin(turn) * np.cross(axis, side)
-        points = np.array([_surface_point(layer, centre, axis, outwards, h) for h in stations])
+        places = [_surface_point(layer, centre, axis, outwards, h) for h in stations]
+        found = {i: place for i, place in enumerate(places) if place is not None}
+        if len(found) < STATIONS / 2:  # near its ends a limb's rim may leave some stations without skin
+            raise InvalidInput(f"skin was found at {len(found)} of {STATIONS} heights along the layer; is it a limb?")
+        points = np.array(list(found.values()))
         normals = np.array([_mean_normal(layer, point, outwards, footprint) for point in points])
-        self._along = np.linspace(0, 1, len(stations))
+        self._along = np.array(list(found)) / (STATIONS - 1)
         kernel = np.hanning(13) / np.hanning(13).sum()
         self._points = _smoothed(points, kernel)
         self._normals = _smoothed(normals, kernel)
@@ -184,10 +188,12 @@ def _limb_axes(layer: SoftLayer) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 def _surface_point(
     layer: SoftLayer, centre: np.ndarray, axis: np.ndarray, outwards: np.ndarray, height: float
-) -> np.ndarray:
+) -> np.ndarray | None:
     """Where a ray `outwards` from the limb's middle at `height` last leaves the skin (Moller & Trumbore 1997)."""
     heights = (layer.vertices - centre) @ axis
     ring = np.abs(heights - height) < max(0.01, 2 * layer.edge_length)
+    if not ring.any():
+        return None
     middle = np.average(layer.vertices[ring], axis=0, weights=layer.vertex_areas[ring])
     a, b, c = (layer.vertices[layer.faces[:, k]] for k in range(3))
     cross = np.cross(outwards, c - a)
@@ -199,7 +205,7 @@ def _surface_point(
     t = np.einsum("ij,ij->i", c - a, other) / det
     hit = (u >= -1e-9) & (v >= -1e-9) & (u + v <= 1 + 1e-9) & (t > 0) & np.isfinite(det)
     if not hit.any():
-        raise InvalidInput(f"no skin at height {height * 1e3:.0f} mm along the limb; is the layer a limb?")
+        return None
     return middle + t[hit].max() * outwards
 
 
