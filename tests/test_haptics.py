@@ -90,7 +90,7 @@ def test_the_model_holds_where_it_says(
         truth = toucher.touch(Contact("block", contact.mesh, pose), field).wrench
         rendered = tilted.wrench_at(pose)
         assert rendered.inside
-        assert off(truth, rendered.wrench, lever) < 0.13
+        assert off(truth, rendered.wrench, lever) < 0.15
         beyond = tilted.wrench_at(turned(contact.pose_body_from_tool, 1.1 * twist))
         assert not beyond.inside
 

@@ -1,0 +1,134 @@
+"""FewSteps: finite elements cut off after some Newton steps, started from a cheaper method's answer or the last one."""
+
+from __future__ import annotations
+
+from typing import Self
+
+import numpy as np
+
+from fem_tools.mesh import level_depths
+from fem_tools.newton import NewtonSettings, System, newton
+from fem_tools.patch import Patch, PatchFem
+from stmpl_core.errors import InvalidInput
+from stmpl_core.layer import SoftLayer
+from stmpl_core.load import Load
+from stmpl_core.methods import Method, MomentNet
+from stmpl_core.methods.base import prepared
+from stmpl_core.trust import Displacement, Trust
+
+FORCING = 0.01  # of the linear solver: a step that is solved loosely is worse than the network that it starts from
+SETTLED = 3  # passes that let the inside of each column follow its skin before the first step
+DAMPING = 0.7  # of these
+CLOSE = 0.1  # residual over load below which the answer counts as converged: it is then within 3 % where it moves
+KEPT = 1.0  # thicknesses that a load may move before the patch is meshed anew
+
+
+class FewSteps:
+    """A few full Newton steps of PatchFem on the layer's own mesh: one, from the network, leaves a third of its error.
+
+    The patch is kept while the load stays within a thickness of where it was meshed for.
+
+    Args:
+        steps: of Newton.
+        start: the method whose answer is started from; None: start from the answer before, at first from rest.
+        reach: of the patch, in thicknesses.
+
+    Raises:
+        InvalidInput: fewer than one step.
+    """
+
+    def __init__(self, steps: int = 1, start: Method | None = None, *, reach: float = 5.0) -> None:
+        if steps < 1:
+            raise InvalidInput(f"steps is {steps}; at least 1 is needed.")
+        self.steps, self.start = steps, start
+        self.fem = PatchFem(reach=reach, check_stability=False)
+        self.settings = NewtonSettings(max_iterations=steps, forcing=FORCING)
+        self.name = f"fem, {steps} step{'s' * (steps > 1)} from {start.name if start else 'the last answer'}"
+        self._layer: SoftLayer | None = None
+        self._patch: Patch | None = None
+        self._last: np.ndarray | None = None
+
+    @classmethod
+    def from_network(cls, steps: int = 1) -> Self:
+        """Started from MomentNet."""
+        return cls(steps, MomentNet())
+
+    def prepare(self, layer: SoftLayer) -> Self:
+        """Prepares the finite elements and the method that is started from."""
+        self.fem.prepare(layer)
+        if self.start is not None:
+            self.start.prepare(layer)
+        self._layer, self._patch, self._last = layer, None, None
+        return self
+
+    def solve(self, load: Load) -> Displacement:
+        """The displacement under `load`; not converged while the residual is above CLOSE.
+
+        Raises:
+            NotPrepared: before `prepare`.
+            InvalidInput: the load does not fit the layer.
+        """
+        layer = prepared(self._layer, self)
+        pressure = load.check(layer).pressure_on(layer)
+        if not len(load.loaded):
+            self._last = None
+            return Displacement(np.zeros_like(layer.vertices), Trust(error_bound=0.0, why="no load"), self.name, pressure)
+        patch = self._patch_for(load.loaded)
+        system = self.fem.system(patch, load)
+        u = self._start(load, patch, system)
+        result = newton(system, u, 1.0, self.settings)
+        self._last = result.u
+        answer = np.zeros_like(layer.vertices)
+        answer[patch.vertices] = result.u[: len(patch.vertices), 0]
+        ratio, limit = load.peak_ratio(layer), 2.0 if load.kind != "nodal" else 0.4
+        trust = Trust(figures={"residual": result.residual, "min_j": result.min_j, "peak_ratio": ratio})
+        if result.residual > CLOSE:
+            why = f"after {result.iterations} Newton steps {result.residual:.0%} of the load is not in balance"
+            trust = trust.also(why, converged=False)
+        if ratio > limit:
+            trust = trust.also(f"p/E is {ratio:.2g}; validated up to {limit:g} for {load.kind} loads", in_range=False)
+        if (load.values < 0).any():
+            trust = trust.also("the load pulls; only pressing was validated", in_range=False)
+        return Displacement(answer, trust, self.name, pressure)
+
+    def _patch_for(self, loaded: np.ndarray) -> Patch:
+        layer, patch = prepared(self._layer, self), self._patch
+        if patch is not None:
+            place = np.searchsorted(patch.vertices, loaded)
+            place[place == len(patch.vertices)] = 0
+            near = patch.distance[place] <= KEPT * layer.thickness[loaded].max()
+            if (patch.vertices[place] == loaded).all() and near.all():
+                return patch
+        self._patch, self._last = self.fem.patch_around(loaded), None
+        return self._patch
+
+    def _start(self, load: Load, patch: Patch, system: System) -> np.ndarray:
+        """Where Newton starts, (C, levels, 3) [m]."""
+        if self.start is None:
+            if self._last is not None:
+                return self._last
+            return self.fem.guess(system, patch.interpolate(load.pressure_on(prepared(self._layer, self))), 1.0)
+        mesh = patch.mesh
+        skin = self.start.solve(load).displacement[patch.vertices]
+        depth = level_depths(mesh.layers)[None, :, None]
+        u = mesh.on_columns(skin)[:, None] * (1 - depth)
+        u[system.fixed] = 0.0
+        return settled(system, u)
+
+
+def settled(system: System, u: np.ndarray) -> np.ndarray:
+    """The same skin, the levels below it in balance: block Jacobi on each column's own stiffness, damped."""
+    u = u.copy()
+    inner = None
+    for _ in range(SETTLED):
+        residual, least = system.residual(u, 1.0)
+        if not least > 0:  # folded: Newton will start from rest
+            return u
+        if inner is None:
+            blocks = system.tangent(u, 1.0)[system.diagonal][:, 3:, 3:]
+            inner = np.linalg.inv(blocks)
+        change = -DAMPING * np.einsum("cij,cj->ci", inner, residual[:, 3:]).reshape(len(u), -1, 3)
+        change[system.fixed] = 0.0
+        u[:, 1 : 1 + change.shape[1]] += change
+    return u
+

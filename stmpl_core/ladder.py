@@ -1,0 +1,300 @@
+"""Ladder: for each load the cheapest method that is expected to be accurate enough in the time that there is."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field, fields, replace
+from pathlib import Path
+from typing import Any, Self
+
+import numpy as np
+
+from stmpl_core.errors import InvalidInput
+from stmpl_core.layer import SoftLayer
+from stmpl_core.load import Load
+from stmpl_core.methods.base import Method, prepared
+from stmpl_core.methods.winkler import column_stretch
+from stmpl_core.trust import Displacement, Trust
+
+SHIPPED = Path(__file__).parent / "weights" / "ladder.json"
+REACH = 6.0  # thicknesses around a load within which the skin moves
+PACE = 0.2  # weight of the newest solve in what is known of how busy the machine is
+SLACK = 1.1  # beyond the measured range of a figure of the scene that is not yet called outside
+
+
+@dataclass(frozen=True)
+class SceneFigures:
+    """What decides how far off and how slow a method will be.
+
+    Args:
+        strain: of a confined column under the highest pressure [-].
+        radius: of the disc with the load's participation area (int p)^2 / int p^2, over the thickness under it [-].
+        nu: Poisson's ratio [-].
+        width: of the mesh's edges over that thickness [-].
+        slope: of the thickness along the skin, largest under the load [-].
+        ratio: highest p / E [-].
+        pressed: vertices that carry load.
+        moved: vertices within REACH thicknesses of the load, were it a disc on a plane.
+    """
+
+    strain: float
+    radius: float
+    nu: float
+    width: float
+    slope: float
+    ratio: float
+    pressed: float
+    moved: float
+
+    def for_error(self) -> np.ndarray:
+        """Terms of the logarithm of the error, (9,)."""
+        s, r, w = np.log(self.strain), np.log(self.radius), np.log(self.width)
+        return np.array([1.0, s, s * s, r, r * r, s * r, w, self.nu, self.slope])
+
+    def for_time(self) -> np.ndarray:
+        """Terms of the time of a solve, each growing with the work of some method, (4,)."""
+        return np.array([1.0, self.moved, self.moved * self.ratio, self.pressed * self.moved])
+
+
+RANGED = ("strain", "radius", "nu", "width", "slope")  # figures that must lie in the range that was measured
+
+
+class SceneReader:
+    """Reads SceneFigures off loads on one layer, in some tens of microseconds."""
+
+    def __init__(self, layer: SoftLayer) -> None:
+        self.layer = layer
+        a, b = layer.edges.T
+        length = np.linalg.norm(layer.vertices[a] - layer.vertices[b], axis=1)
+        rise = np.abs(layer.thickness[a] - layer.thickness[b]) / length
+        self._slope = np.zeros(len(layer.vertices))
+        np.maximum.at(self._slope, a, rise)
+        np.maximum.at(self._slope, b, rise)
+
+    def figures(self, load: Load) -> SceneFigures | None:
+        """Of a load that fits the layer; None if nothing presses."""
+        layer, loaded = self.layer, load.loaded
+        if not len(loaded):
+            return None
+        area, value = layer.vertex_areas[loaded], np.abs(load.values[loaded])
+        pressure = value / area if load.kind == "nodal" else value
+        force, highest = float(area @ pressure), float(pressure.max())
+        t = float((area * pressure) @ layer.thickness[loaded]) / force
+        participating = force**2 / float(area @ pressure**2)
+        radius = (participating / np.pi) ** 0.5
+        strain = float(1 - column_stretch(np.array([highest]), layer.tissue)[0])
+        patch = np.pi * ((float(area.sum()) / np.pi) ** 0.5 + REACH * t) ** 2
+        return SceneFigures(
+            strain=strain, radius=radius / t, nu=layer.tissue.poisson_ratio, width=layer.edge_length / t,
+            slope=float(self._slope[loaded].max()), ratio=highest / layer.tissue.youngs_modulus,
+            pressed=float(len(loaded)), moved=min(patch * len(area) / float(area.sum()), float(len(layer.vertices))),
+        )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Known:
+    """What was measured of one method.
+
+    Args:
+        error: coefficients of SceneFigures.for_error for log(error / (thickness strain)), by kind of load.
+        factor: on that error, so that 95 % of answers are within it, by kind of load.
+        seconds: coefficients of SceneFigures.for_time [s].
+        slow: how many times longer than that one solve in twenty takes.
+    """
+
+    error: Mapping[str, Sequence[float]]
+    factor: Mapping[str, float]
+    seconds: Sequence[float]
+    slow: float
+
+
+@dataclass(frozen=True)
+class Measured:
+    """The measured chart that a Ladder chooses by.
+
+    Args:
+        methods: by the name of the method, in the order in which they were measured.
+        ranges: lowest and highest of each figure in RANGED, by kind of load.
+        about: machine, commit, how it was made.
+    """
+
+    methods: Mapping[str, Known]
+    ranges: Mapping[str, Mapping[str, Sequence[float]]]
+    about: Mapping[str, Any] = field(default_factory=dict)
+
+    @classmethod
+    def load(cls, path: str | Path) -> Self:
+        """Reads what `save` wrote. Raises InvalidInput if there is no such file or it holds something else."""
+        try:
+            found = json.loads(Path(path).read_text())
+            return cls({name: Known(**known) for name, known in found["methods"].items()},
+                       found["ranges"], found["about"])  # fmt: skip
+        except (OSError, ValueError, KeyError, TypeError) as error:
+            raise InvalidInput(f"{path} holds no measured chart: {error}. Make one with stmpl calibrate.") from error
+
+    def save(self, path: str | Path) -> None:
+        """Writes it as JSON."""
+        Path(path).parent.mkdir(parents=True, exist_ok=True)
+        Path(path).write_text(json.dumps(asdict(self), indent=1) + "\n")
+
+    def timed_by(self, other: Measured) -> Measured:
+        """The same errors with the times of another machine, where it has them."""
+        methods = {
+            name: replace(known, seconds=other.methods[name].seconds, slow=other.methods[name].slow)
+            if name in other.methods else known
+            for name, known in self.methods.items()
+        }  # fmt: skip
+        return replace(self, methods=methods, about={**self.about, "times": dict(other.about)})
+
+
+@dataclass(frozen=True)
+class _Expected:
+    rung: int
+    error: float  # m, 95 %
+    seconds: float  # 95 %
+
+
+class Ladder:
+    """A method that hands each load to the cheapest of several that is expected to meet the wish.
+
+    What is expected comes from a measured chart: error and time of each method as functions of the scene (how hard, how
+    wide, how thick, how fine a mesh), and from how busy the machine just was. Where an answer says that it is not to be
+    believed, the next better method is asked, if there is time. Every answer names the method that gave it, says why it
+    was chosen, and carries the bound that 95 % of such answers kept; where nothing meets the wish, the best that fits
+    is given and flagged.
+
+    Args:
+        rungs: methods, not yet prepared; those that the chart does not know are left out.
+        measured: the chart.
+        accuracy: largest error wanted at any vertex [m].
+        deadline: for each solve [s]; None: there is time.
+
+    Raises:
+        InvalidInput: an accuracy or deadline that is not positive, or no rung that the chart knows.
+    """
+
+    name = "ladder"
+
+    def __init__(self, rungs: Sequence[Method], measured: Measured, *, accuracy: float = 1e-4,
+                 deadline: float | None = None) -> None:  # fmt: skip
+        if not accuracy > 0 or (deadline is not None and not deadline > 0):
+            raise InvalidInput(f"Ladder(accuracy={accuracy}, deadline={deadline}): both must be positive, m and s.")
+        self.rungs = [rung for rung in rungs if rung.name in measured.methods]
+        if not self.rungs:
+            raise InvalidInput("none of the methods was measured. stmpl calibrate --errors measures them.")
+        self.measured, self.accuracy, self.deadline = measured, accuracy, deadline
+        known = [measured.methods[rung.name] for rung in self.rungs]
+        self._seconds = np.array([k.seconds for k in known])
+        self._slow = np.array([k.slow for k in known])
+        self._layer: SoftLayer | None = None
+
+    def prepare(self, layer: SoftLayer) -> Self:
+        """Prepares every method; those that refuse the layer are left out.
+
+        Raises:
+            InvalidInput: all of them refuse it.
+        """
+        ready, reasons = [], []
+        for rung in self.rungs:
+            try:
+                ready.append(rung.prepare(layer) is not None)
+            except InvalidInput as error:
+                ready.append(False)
+                reasons.append(f"{rung.name}: {error}")
+        if not any(ready):
+            raise InvalidInput(f"no method takes this layer. {' '.join(reasons)}")
+        self._ready = np.array(ready)
+        self._reader = SceneReader(layer)
+        self._pace = np.ones(len(self.rungs))
+        self._layer = layer
+        return self
+
+    def solve(self, load: Load) -> Displacement:
+        """The displacement under `load` by the method that was chosen; `method` names it, `trust.why` says why.
+
+        Raises:
+            NotPrepared: before `prepare`.
+            InvalidInput: the load does not fit the layer.
+        """
+        layer, started = prepared(self._layer, self), time.perf_counter()
+        scene = self._reader.figures(load.check(layer))
+        if scene is None:
+            return Displacement(np.zeros_like(layer.vertices), Trust(error_bound=0.0), self.name, load.pressure_on(layer))
+        options, outside = self._expected(scene, load.kind)
+        if not options:
+            raise InvalidInput(f"no method was measured under loads of the kind {load.kind!r}.")
+        tried: list[tuple[_Expected, Displacement]] = []
+        while True:
+            left = None if self.deadline is None else self.deadline - (time.perf_counter() - started)
+            choice = self._choose(options, left, first=not tried)
+            if choice is None:
+                break
+            answer = self._ask(choice, load, scene)
+            tried.append((choice, answer))
+            options = [o for o in options if o.error < choice.error]
+            if answer.trust.ok or outside:
+                break
+        choice, answer = next(((c, a) for c, a in tried if a.trust.ok), min(tried, key=lambda pair: pair[0].error))
+        return self._told(choice, answer, scene, outside, len(tried))
+
+    def _expected(self, scene: SceneFigures, kind: str) -> tuple[list[_Expected], str]:
+        """What to expect of each method that was measured under such loads, and how the scene is outside of that."""
+        layer, terms = prepared(self._layer, self), scene.for_error()
+        unit = layer.edge_length / scene.width * scene.strain  # thickness under the load times strain [m]
+        seconds = self._seconds @ scene.for_time() * self._slow * self._pace
+        options = []
+        for k, rung in enumerate(self.rungs):
+            known = self.measured.methods[rung.name]
+            if self._ready[k] and kind in known.error:
+                error = unit * known.factor[kind] * float(np.exp(terms @ np.asarray(known.error[kind])))
+                options.append(_Expected(k, error, float(seconds[k])))
+        ranges = self.measured.ranges.get(kind, {})
+        beyond = [
+            f"{name} is {value:.3g}, measured is {low:.3g} to {high:.3g}"
+            for name, (low, high) in ranges.items()
+            if not low / SLACK <= (value := getattr(scene, name)) <= max(high * SLACK, 1e-9)
+        ]
+        return options, "; ".join(beyond)
+
+    def _choose(self, options: list[_Expected], left: float | None, *, first: bool) -> _Expected | None:
+        """The cheapest that is accurate enough in the time left; else the most accurate in time; else the fastest."""
+        in_time = [o for o in options if left is None or o.seconds <= left]
+        good = [o for o in in_time if o.error <= self.accuracy]
+        if good:
+            return min(good, key=lambda o: o.seconds)
+        if in_time:
+            return min(in_time, key=lambda o: o.error)
+        return min(options, key=lambda o: o.seconds) if first and options else None
+
+    def _ask(self, choice: _Expected, load: Load, scene: SceneFigures) -> Displacement:
+        started = time.perf_counter()
+        answer = self.rungs[choice.rung].solve(load)
+        spent, k = time.perf_counter() - started, choice.rung
+        usual = float(self._seconds[k] @ scene.for_time()) * self._slow[k]
+        self._pace[k] = max(1.0, (1 - PACE) * self._pace[k] + PACE * spent / max(usual, 1e-6))
+        return answer
+
+    def _told(self, choice: _Expected, answer: Displacement, scene: SceneFigures, outside: str, tries: int) -> Displacement:
+        """The answer with the ladder's own bound and reasons."""
+        wish = f"{1e3 * self.accuracy:.2g} mm" + ("" if self.deadline is None else f" in {1e3 * self.deadline:.3g} ms")
+        chosen = (f"chosen for {wish}: {1e3 * choice.error:.2g} mm in {1e3 * choice.seconds:.2g} ms "
+                  "are expected at most")  # fmt: skip
+        own = answer.trust
+        figures = {**own.figures, "expected_error_m": choice.error, "expected_s": choice.seconds, "tries": float(tries)}
+        trust = Trust(own.converged, own.in_range, choice.error, "; ".join(filter(None, (own.why, chosen))), figures)
+        if choice.error > self.accuracy:
+            trust = trust.also("nothing meets the wish, this is the best that fits", in_range=False)
+        if self.deadline is not None and choice.seconds > self.deadline:
+            trust = trust.also("nothing is fast enough, this is the fastest", in_range=False)
+        if outside:
+            trust = trust.also(f"outside what the chart was measured on: {outside}", in_range=False)
+        if outside or not own.ok:
+            trust = replace(trust, error_bound=None)
+        return Displacement(answer.displacement, trust, answer.method, answer.pressure)
+
+
+def figures_table(scenes: Sequence[SceneFigures]) -> dict[str, np.ndarray]:
+    """Columns of many scenes' figures, by name."""
+    return {f.name: np.array([getattr(scene, f.name) for scene in scenes]) for f in fields(SceneFigures)}
