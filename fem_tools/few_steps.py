@@ -72,7 +72,8 @@ class FewSteps:
         pressure = load.check(layer).pressure_on(layer)
         if not len(load.loaded):
             self._last = None
-            return Displacement(np.zeros_like(layer.vertices), Trust(error_bound=0.0, why="no load"), self.name, pressure)
+            zero = np.zeros_like(layer.vertices)
+            return Displacement(zero, Trust(error_bound=0.0, why="no load"), self.name, pressure)
         patch = self._patch_for(load.loaded)
         system = self.fem.system(patch, load)
         u = self._start(load, patch, system)

@@ -9,9 +9,10 @@ from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any, Self
 
+import numba
 import numpy as np
 
-from stmpl_core.errors import InvalidInput
+from stmpl_core.errors import InvalidInput, StmplError
 from stmpl_core.layer import SoftLayer
 from stmpl_core.load import Load
 from stmpl_core.methods.base import Method, prepared
@@ -34,6 +35,8 @@ class SceneFigures:
         nu: Poisson's ratio [-].
         width: of the mesh's edges over that thickness [-].
         slope: of the thickness along the skin, largest under the load [-].
+        outline: total variation of the pressure over the force, times that thickness; 2 t / R for a disc [-].
+        jump: largest difference of pressure across an edge of the mesh, over the highest pressure [-].
         ratio: highest p / E [-].
         pressed: vertices that carry load.
         moved: vertices within REACH thicknesses of the load, were it a disc on a plane.
@@ -44,21 +47,23 @@ class SceneFigures:
     nu: float
     width: float
     slope: float
+    outline: float
+    jump: float
     ratio: float
     pressed: float
     moved: float
 
     def for_error(self) -> np.ndarray:
-        """Terms of the logarithm of the error, (9,)."""
-        s, r, w = np.log(self.strain), np.log(self.radius), np.log(self.width)
-        return np.array([1.0, s, s * s, r, r * r, s * r, w, self.nu, self.slope])
+        """Terms of the logarithm of the error, (11,)."""
+        s, r, w, o = np.log(self.strain), np.log(self.radius), np.log(self.width), np.log(self.outline)
+        return np.array([1.0, s, s * s, r, r * r, s * r, w, o, self.jump, self.nu, self.slope])
 
     def for_time(self) -> np.ndarray:
         """Terms of the time of a solve, each growing with the work of some method, (4,)."""
         return np.array([1.0, self.moved, self.moved * self.ratio, self.pressed * self.moved])
 
 
-RANGED = ("strain", "radius", "nu", "width", "slope")  # figures that must lie in the range that was measured
+RANGED = ("strain", "radius", "nu", "width", "slope", "outline", "jump")  # whose measured range counts
 
 
 class SceneReader:
@@ -66,31 +71,47 @@ class SceneReader:
 
     def __init__(self, layer: SoftLayer) -> None:
         self.layer = layer
-        a, b = layer.edges.T
-        length = np.linalg.norm(layer.vertices[a] - layer.vertices[b], axis=1)
-        rise = np.abs(layer.thickness[a] - layer.thickness[b]) / length
-        self._slope = np.zeros(len(layer.vertices))
-        np.maximum.at(self._slope, a, rise)
-        np.maximum.at(self._slope, b, rise)
+        ends = np.concatenate([layer.edges, layer.edges[:, ::-1]])
+        ends = ends[np.argsort(ends[:, 0], kind="stable")]
+        self._to = np.ascontiguousarray(ends[:, 1])
+        self._length = np.linalg.norm(layer.vertices[ends[:, 0]] - layer.vertices[ends[:, 1]], axis=1)
+        self._first = np.searchsorted(ends[:, 0], np.arange(len(layer.vertices) + 1))
+        squared = 2 / 3**0.5 * layer.vertex_areas  # of the edges of an even mesh [m2]
+        self._across = np.pi / 4 * np.sqrt(squared / 3)  # dual length of each edge, over the mean of |cos| [m]
 
     def figures(self, load: Load) -> SceneFigures | None:
         """Of a load that fits the layer; None if nothing presses."""
         layer, loaded = self.layer, load.loaded
         if not len(loaded):
             return None
-        area, value = layer.vertex_areas[loaded], np.abs(load.values[loaded])
-        pressure = value / area if load.kind == "nodal" else value
-        force, highest = float(area @ pressure), float(pressure.max())
-        t = float((area * pressure) @ layer.thickness[loaded]) / force
-        participating = force**2 / float(area @ pressure**2)
-        radius = (participating / np.pi) ** 0.5
+        area, pressure = layer.vertex_areas[loaded], np.abs(load.pressure_on(layer))
+        here = pressure[loaded]
+        force, highest = float(area @ here), float(here.max())
+        t = float((area * here) @ layer.thickness[loaded]) / force
+        radius = (force**2 / float(area @ here**2) / np.pi) ** 0.5
         strain = float(1 - column_stretch(np.array([highest]), layer.tissue)[0])
         patch = np.pi * ((float(area.sum()) / np.pi) ** 0.5 + REACH * t) ** 2
+        variation, jump, slope = _steps(loaded, pressure, layer.thickness, self._first, self._to, self._length,
+                                        self._across)  # fmt: skip
         return SceneFigures(
-            strain=strain, radius=radius / t, nu=layer.tissue.poisson_ratio, width=layer.edge_length / t,
-            slope=float(self._slope[loaded].max()), ratio=highest / layer.tissue.youngs_modulus,
+            strain=strain, radius=radius / t, nu=layer.tissue.poisson_ratio, width=layer.edge_length / t, slope=slope,
+            outline=max(variation * t / force, 1e-3), jump=jump / highest, ratio=highest / layer.tissue.youngs_modulus,
             pressed=float(len(loaded)), moved=min(patch * len(area) / float(area.sum()), float(len(layer.vertices))),
         )  # fmt: skip
+
+
+@numba.njit(cache=True)
+def _steps(loaded, pressure, thickness, first, to, length, across):
+    """Total variation of the pressure [N/m], its largest step across an edge [Pa], the thickness' largest slope [-]."""
+    variation = jump = slope = 0.0
+    for v in loaded:
+        for k in range(first[v], first[v + 1]):
+            w = to[k]
+            step = abs(pressure[v] - pressure[w])
+            variation += step * across[v] * (0.5 if pressure[w] > 0.0 else 1.0)
+            jump = max(jump, step)
+            slope = max(slope, abs(thickness[v] - thickness[w]) / length[k])
+    return variation, jump, slope
 
 
 @dataclass(frozen=True)
@@ -131,7 +152,7 @@ class Measured:
             found = json.loads(Path(path).read_text())
             return cls({name: Known(**known) for name, known in found["methods"].items()},
                        found["ranges"], found["about"])  # fmt: skip
-        except (OSError, ValueError, KeyError, TypeError) as error:
+        except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
             raise InvalidInput(f"{path} holds no measured chart: {error}. Make one with stmpl calibrate.") from error
 
     def save(self, path: str | Path) -> None:
@@ -200,7 +221,7 @@ class Ladder:
         for rung in self.rungs:
             try:
                 ready.append(rung.prepare(layer) is not None)
-            except InvalidInput as error:
+            except StmplError as error:
                 ready.append(False)
                 reasons.append(f"{rung.name}: {error}")
         if not any(ready):
@@ -221,7 +242,8 @@ class Ladder:
         layer, started = prepared(self._layer, self), time.perf_counter()
         scene = self._reader.figures(load.check(layer))
         if scene is None:
-            return Displacement(np.zeros_like(layer.vertices), Trust(error_bound=0.0), self.name, load.pressure_on(layer))
+            zero = np.zeros_like(layer.vertices)
+            return Displacement(zero, Trust(error_bound=0.0), self.name, load.pressure_on(layer))
         options, outside = self._expected(scene, load.kind)
         if not options:
             raise InvalidInput(f"no method was measured under loads of the kind {load.kind!r}.")
@@ -237,7 +259,7 @@ class Ladder:
             if answer.trust.ok or outside:
                 break
         choice, answer = next(((c, a) for c, a in tried if a.trust.ok), min(tried, key=lambda pair: pair[0].error))
-        return self._told(choice, answer, scene, outside, len(tried))
+        return self._told(choice, answer, outside, len(tried))
 
     def _expected(self, scene: SceneFigures, kind: str) -> tuple[list[_Expected], str]:
         """What to expect of each method that was measured under such loads, and how the scene is outside of that."""
@@ -276,7 +298,7 @@ class Ladder:
         self._pace[k] = max(1.0, (1 - PACE) * self._pace[k] + PACE * spent / max(usual, 1e-6))
         return answer
 
-    def _told(self, choice: _Expected, answer: Displacement, scene: SceneFigures, outside: str, tries: int) -> Displacement:
+    def _told(self, choice: _Expected, answer: Displacement, outside: str, tries: int) -> Displacement:
         """The answer with the ladder's own bound and reasons."""
         wish = f"{1e3 * self.accuracy:.2g} mm" + ("" if self.deadline is None else f" in {1e3 * self.deadline:.3g} ms")
         chosen = (f"chosen for {wish}: {1e3 * choice.error:.2g} mm in {1e3 * choice.seconds:.2g} ms "

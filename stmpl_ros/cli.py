@@ -315,6 +315,82 @@ def view(path: Annotated[Path | None, tyro.conf.Positional] = None, live: bool =
     return run(config, path, live, _ros_arguments)
 
 
+def chart(
+    preset: Literal["default", "quick"] = "default",
+    out: Path = Path("runs/chart"),
+    redraw: bool = False,
+    as_json: Json = False,
+) -> int:
+    """Speed against accuracy: every method, its own knob swept, on the same scenes; a picture, a page to point at.
+
+    Example: stmpl chart --out runs/chart
+    Peers that are installed (pip install .[peers]) are on it as well.
+
+    Args:
+        preset: default (the arm at 3 mm, five scenes, two loads; about twenty minutes), quick (a coarse forearm).
+        out: folder of chart.png, chart.html, break_even.png and chart.json.
+        redraw: draw out/chart.json again instead of measuring.
+        as_json: print all points for machines.
+    """
+    from fem_tools.chart import CURVES, PRESETS, Chart, measure
+    from fem_tools.chart.break_even import break_even, draw_break_even
+    from fem_tools.chart.page import write_page
+    from fem_tools.chart.picture import draw
+    from stmpl_ros.tables import chart_table, steps_bar
+
+    out.mkdir(parents=True, exist_ok=True)
+    if redraw:
+        measured = Chart.load(out / "chart.json")
+    else:
+        with steps_bar("chart", quiet=as_json) as show:
+            measured = measure(PRESETS[preset], CURVES, on_progress=show)
+        measured.save(out / "chart.json")
+    draw(measured, out / "chart.png")
+    write_page(measured, out / "chart.html")
+    rows = break_even(measured)
+    draw_break_even(rows, out / "break_even.png")
+    _print_figures(dataclasses.asdict(measured) if as_json else chart_table(measured, rows, out))
+    return 0
+
+
+def calibrate(
+    errors: bool = False,
+    out: Path | None = None,
+    contacts: Path | None = None,
+    trials: Path = Path("runs/calibrate"),
+    as_json: Json = False,
+) -> int:
+    """Measures what the ladder chooses by: each method's time on this machine; with --errors also how far off it is.
+
+    Example: stmpl calibrate
+    All anew (half an hour): stmpl calibrate --errors --out stmpl_core/weights/ladder.json --contacts data/contacts
+
+    Args:
+        errors: measure errors against finite elements as well, and print how often the stated bounds hold.
+        out: file of the measured chart; the user's cache for times, runs/calibrate/ladder.json for errors.
+        contacts: a data set of the preset contacts, for what rigid tools press with (with --errors).
+        trials: folder of the single trials (with --errors), which are not measured twice.
+        as_json: print the figures for machines.
+    """
+    from fem_tools import calibrate as measuring
+    from stmpl_ros.tables import coverage_table, steps_bar, times_table
+
+    with steps_bar("calibrate", quiet=as_json) as show:
+        if not errors:
+            found = measuring.times(on_progress=show)
+        else:
+            made = measuring.gather(trials, contacts=contacts, on_progress=show)
+            found = measuring.fit(made)
+    if errors:
+        found.save(out or trials / "ladder.json")
+        rows = measuring.coverage(made, found)
+        _print_figures({"rows": [vars(row) for row in rows]} if as_json else coverage_table(rows))
+        return 0
+    found.save(out or measuring.times_file())
+    _print_figures(dataclasses.asdict(found) if as_json else times_table(found, out or measuring.times_file()))
+    return 0
+
+
 def stability(
     methods: tuple[str, ...] = STABILITY_METHODS,
     preset: Literal["default", "quick"] = "default",
@@ -331,7 +407,8 @@ def stability(
     The finite elements' own limits: stmpl stability --critical-load --out critical_load.png
 
     Args:
-        methods: names (zero, naive, winkler, linear, moment_net, unet, fem_3_steps, fem), or module:attribute.
+        methods: names (zero, naive, winkler, linear, moment_net, unet, fem_1_step, fem, ladder), or
+            module:attribute.
         preset: default (minutes a method, on the arm), quick (seconds, on a round limb).
         out: folder of report, picture and failures, runs/stability unless given; the picture with --critical-load.
         again: a saved failure to run again with the same method.
@@ -373,7 +450,7 @@ def _critical_load(out: Path, as_json: bool) -> int:
 
 
 VERBS = {f.__name__: f for f in (demo, node, probe, view, record, replay, compare, info, recover, generate, train,
-                                 tables, stability)}  # fmt: skip
+                                 tables, chart, calibrate, stability)}  # fmt: skip
 
 
 def main(arguments: list[str] | None = None) -> None:

@@ -18,8 +18,12 @@ from stmpl_core.methods.base import Method
 from stmpl_core.metrics import mean_and_deviation
 
 if TYPE_CHECKING:
+    from fem_tools.calibrate import Coverage
+    from fem_tools.chart import Chart
+    from fem_tools.chart.break_even import BreakEven
     from fem_tools.critical_load import CriticalLoad
     from fem_tools.stability import Report
+    from stmpl_core.ladder import Measured
 
 
 def compare_with_progress(
@@ -152,6 +156,51 @@ def stability_table(report: Report, picture: Path) -> Table:
     for outcome in ("flagged", "silent", "crashed"):
         table.add_row(f"all trials: {outcome}", *(str(count[outcome]) for count in counts))
     table.caption = f"drawn in {picture}; each failure runs again with stmpl stability --again FILE"
+    return table
+
+
+def chart_table(chart: Chart, rows: list[BreakEven], out: Path) -> Table:
+    """The Pareto front of every panel, and when the network has paid for itself, for people."""
+    table = Table(title="Speed against accuracy: what nothing else beats", title_justify="left", show_lines=True,
+                  caption_justify="left")  # fmt: skip
+    for heading in ("scene", "p / E", "fastest first; error where it moves, of the peak", "network is ahead after"):
+        table.add_column(heading)
+    solves = {(row.scene, row.ratio): row.solves for row in rows}
+    for scene in chart.about["scenes"]:
+        for ratio in chart.about["ratios"]:
+            front = [f"{1e3 * p.seconds:8.3g} ms {100 * p.error:6.2f} %  {p.curve}: {p.knob}"
+                     for p in chart.front(scene, ratio)]  # fmt: skip
+            after = solves.get((scene, ratio), float("nan"))
+            table.add_row(scene, f"{ratio:g}", "\n".join(front), f"{after:,.0f} solves" if after == after else "-")
+    failed = sum(p.failed for p in chart.points)
+    left_out = ", ".join(chart.about["missing"]) or "nothing"
+    table.caption = (f"{len(chart.points)} points, {failed} failed; {left_out} left out; drawn in {out}: chart.png, "
+                     "chart.html (to point at), break_even.png; all figures in chart.json")  # fmt: skip
+    return table
+
+
+def coverage_table(rows: list[Coverage]) -> Table:
+    """How often the stated bounds hold on loads that were not fitted, for people."""
+    table = Table(title="Bounds on what was not fitted", title_justify="left")
+    for heading in ("method", "load", "on"):
+        table.add_column(heading)
+    for heading in ("answers", "within the bound", "bound / error", "largest error / peak", "ms"):
+        table.add_column(heading, justify="right")
+    for r in rows:
+        table.add_row(r.method, r.kind, r.use, str(r.answers), f"{r.covered:.0%}", f"{r.tight:.1f}",
+                      f"{100 * r.error:.1f} %", f"{1e3 * r.seconds:.2f}")  # fmt: skip
+    return table
+
+
+def times_table(measured: Measured, file: Path) -> Table:
+    """What a disc of a thickness' radius costs on this machine, for people."""
+    table = Table(title="Time of a solve on this machine", title_justify="left", caption=f"kept in {file}")
+    for heading in ("method", "small contact, 3 mm [ms]", "large contact, 3 mm [ms]", "1 in 20 is slower than"):
+        table.add_column(heading, justify="left" if heading == "method" else "right")
+    for name, known in measured.methods.items():
+        small, large = (1e3 * sum(c * x for c, x in zip(known.seconds, (1, m, 0.5 * m, p * m), strict=True))
+                        for p, m in ((40, 1900), (800, 4000)))  # fmt: skip
+        table.add_row(name, f"{small:.2f}", f"{large:.2f}", f"x {known.slow:.2f}")
     return table
 
 

@@ -223,7 +223,7 @@ def test_methods_are_found_by_name_and_by_module_and_attribute():
                        ("tests.test_stability:QUICK", "no prepare and no solve")):  # fmt: skip
         with pytest.raises(InvalidInput, match=said):
             maker(name)
-    assert set(METHODS) >= {"naive", "winkler", "linear", "moment_net", "unet", "fem", "fem_3_steps"}
+    assert set(METHODS) >= {"naive", "winkler", "linear", "moment_net", "unet", "fem", "fem_1_step", "ladder"}
 
 
 def test_det_f_is_the_stretch_of_columns_that_are_pressed_evenly():

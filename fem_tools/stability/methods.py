@@ -9,7 +9,8 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any, cast
 
-from fem_tools.newton import NewtonSettings
+from fem_tools.calibrate import ladder
+from fem_tools.few_steps import FewSteps
 from fem_tools.patch import PatchFem
 from stmpl_core.errors import InvalidInput
 from stmpl_core.methods import Linear, Method, MomentNet, Naive, UNet, Winkler
@@ -18,15 +19,13 @@ from stmpl_core.methods.zero import Zero
 Make = Callable[[], Method]  # a fresh method, not yet prepared
 
 
-def coarse_fem() -> PatchFem:
-    """PatchFem on a patch of 4 thicknesses, linear in plane, to 3 % in at most three Newton steps a load step."""
-    settings = NewtonSettings(tolerance=0.03, max_iterations=3, max_halvings=1)
-    return PatchFem(element="P1xP2", layers=1, reach=4, settings=settings, check_stability=False)
+def _ladder() -> Method:
+    return ladder(accuracy=2e-4)
 
 
 METHODS: dict[str, Make] = {
     "zero": Zero, "naive": Naive, "winkler": Winkler, "linear": Linear, "moment_net": MomentNet, "unet": UNet,
-    "fem_3_steps": coarse_fem, "fem": PatchFem,
+    "fem_1_step": FewSteps.from_network, "fem": PatchFem, "ladder": _ladder,
 }  # fmt: skip
 
 

@@ -15,43 +15,39 @@ from stmpl_core.load import Load
 from stmpl_core.methods.base import Method, prepared
 from stmpl_core.trust import Displacement
 
-COARSER = 1.2  # times the layer's own mesh width from which a coarser one is worth its interpolation
+LEAST = 1.2  # times the layer's own mesh width
 
 
 class Coarse:
-    """Solves on a mesh of width `edge_length`: what costs as the fourth power of the width costs a sixteenth at twice it.
+    """Solves on a mesh `coarsening` times as wide; the work of most methods falls as the fourth power of that.
 
     Forces are handed over so that their sum is kept, displacements are interpolated linearly; that flattens the peak by
     about h^2 / 8 of its curvature, which no bound of the method inside knows of: none is stated.
 
     Args:
         method: that answers; not yet prepared.
-        edge_length: of the coarser mesh [m].
+        coarsening: edge length of the coarser mesh over that of the layer's own.
 
     Raises:
-        InvalidInput: a length that is not positive.
+        InvalidInput: less than LEAST.
     """
 
-    def __init__(self, method: Method, edge_length: float) -> None:
-        if not edge_length > 0:
-            raise InvalidInput(f"edge_length is {edge_length}; a positive length in metres is needed.")
-        self.method, self.edge_length = method, edge_length
-        self.name = f"{method.name} at {1e3 * edge_length:g} mm"
+    def __init__(self, method: Method, coarsening: float) -> None:
+        if not coarsening >= LEAST:
+            raise InvalidInput(f"coarsening is {coarsening}; from {LEAST} on it saves more than it costs.")
+        self.method, self.coarsening = method, coarsening
+        self.name = f"{method.name}, {coarsening:g} x coarser"
         self._layer: SoftLayer | None = None
 
     def prepare(self, layer: SoftLayer) -> Self:
         """Meshes the skin anew (seconds) and prepares the method on it.
 
         Raises:
-            InvalidInput: the layer's own mesh is hardly finer.
-            MeshError: the skin cannot be meshed so coarsely.
+            InvalidInput, MeshError: the skin cannot be meshed so coarsely.
         """
         from stmpl_core.remesh import remesh
 
-        if layer.edge_length * COARSER > self.edge_length:
-            raise InvalidInput(f"the layer's edges are {1e3 * layer.edge_length:.1f} mm: a mesh of "
-                               f"{1e3 * self.edge_length:.1f} mm saves nothing. Use the method itself.")  # fmt: skip
-        mesh = remesh(layer.vertices, layer.faces, self.edge_length)
+        mesh = remesh(layer.vertices, layer.faces, self.coarsening * layer.edge_length)
         self.coarse = SoftLayer(mesh.vertices, mesh.faces, mesh.transfer @ layer.thickness, tissue=layer.tissue)
         self.method.prepare(self.coarse)
         self._carry = interpolation(self.coarse, layer)
@@ -80,7 +76,8 @@ class Coarse:
 def interpolation(coarse: SoftLayer, fine: SoftLayer) -> sp.csr_matrix:
     """Linear interpolation from the vertices of one mesh of a skin to those of another, (V_fine, V_coarse)."""
     library: Any = igl
-    _, face, nearest = library.point_mesh_squared_distance(fine.vertices, coarse.vertices, coarse.faces.astype(np.int64))
+    faces = coarse.faces.astype(np.int64)
+    _, face, nearest = library.point_mesh_squared_distance(fine.vertices, coarse.vertices, faces)
     corners = coarse.faces[face]
     a, b, c = (np.ascontiguousarray(coarse.vertices[corners[:, k]]) for k in range(3))
     weights = np.clip(library.barycentric_coordinates(np.ascontiguousarray(nearest), a, b, c), 0.0, 1.0)

@@ -1,0 +1,289 @@
+"""Ladder: takes the cheapest method that is good and fast enough, says so, and is honest where none is."""
+
+import json
+import time
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from fem_tools import PatchFem
+from fem_tools.calibrate import Trial, coverage, default_rungs, fit, ladder, times_file
+from fem_tools.few_steps import FewSteps
+from stmpl_core.errors import InvalidInput, NotPrepared
+from stmpl_core.ladder import SHIPPED, Known, Ladder, Measured, SceneFigures, SceneReader
+from stmpl_core.layer import SoftLayer, Tissue
+from stmpl_core.load import Load
+from stmpl_core.methods import Linear, MomentNet, Winkler
+from stmpl_core.methods.coarse import Coarse
+from stmpl_core.trust import Displacement, Trust
+from tests.scenes import limb
+
+WIDE = {"strain": [1e-4, 1.0], "radius": [0.01, 100.0], "nu": [0.0, 0.5], "width": [0.01, 10.0], "slope": [0.0, 1.0],
+        "outline": [0.001, 100.0], "jump": [0.0, 1.0]}
+
+
+@pytest.fixture(scope="module")
+def layer():
+    return SoftLayer(*limb(5e-3), thickness=7.5e-3)
+
+
+def disc(layer, ratio=0.5, radius=0.014):
+    """A smooth disc in the middle of the limb."""
+    middle = layer.vertices[np.linalg.norm(layer.vertices - layer.vertices.mean(axis=0), axis=1).argmin()]
+    away = np.linalg.norm(layer.vertices - middle, axis=1) / radius
+    return Load.pressure(ratio * layer.tissue.youngs_modulus * np.clip(2 - 2 * away, 0, 1))
+
+
+class Rung:
+    """Answers after a while, with what it is told to say of itself."""
+
+    def __init__(self, name: str, *, seconds: float = 0.0, ok: bool = True) -> None:
+        self.name, self.seconds, self.ok, self.asked = name, seconds, ok, 0
+
+    def prepare(self, layer):
+        self.layer = layer
+        return self
+
+    def solve(self, load: Load) -> Displacement:
+        self.asked += 1
+        time.sleep(self.seconds)
+        return Displacement(np.ones_like(self.layer.vertices), Trust(in_range=self.ok), self.name)
+
+
+def known(share: float, seconds: float) -> Known:
+    """Off by this share of the columns' motion, after so many seconds."""
+    return Known({"pressure": [float(np.log(share)), *[0.0] * 10]}, {"pressure": 1.0}, [seconds, 0.0, 0.0, 0.0], 1.0)
+
+
+def three(layer, accuracy, deadline=None, *, ok=(True, True, True), seconds=(1e-4, 1e-3, 1e-2), took=(0.0, 0.0, 0.0)):
+    rungs = [Rung(name, ok=good, seconds=s) for name, good, s in zip("abc", ok, took, strict=True)]
+    shares = {"a": 0.3, "b": 0.03, "c": 0.003}
+    chart = Measured({n: known(shares[n], s) for n, s in zip("abc", seconds, strict=True)}, {"pressure": WIDE})
+    return Ladder(rungs, chart, accuracy=accuracy, deadline=deadline).prepare(layer), rungs
+
+
+def unit(layer, load):
+    scene = SceneReader(layer).figures(load)
+    assert scene is not None
+    return layer.edge_length / scene.width * scene.strain
+
+
+@pytest.mark.parametrize(("share", "named"), [(0.5, "a"), (0.05, "b"), (0.005, "c")])
+def test_the_cheapest_that_is_accurate_enough_answers_and_is_named_with_its_bound(layer, share, named):
+    load = disc(layer)
+    method, _ = three(layer, share * unit(layer, load))
+    answer = method.solve(load)
+    assert answer.method == named and answer.trust.ok
+    assert answer.trust.error_bound is not None and answer.trust.error_bound <= method.accuracy
+    assert answer.trust.why.startswith("chosen for")
+
+
+def test_a_deadline_takes_the_most_accurate_that_is_fast_enough_and_flags_what_misses_the_wish(layer):
+    load = disc(layer)
+    method, _ = three(layer, 0.005 * unit(layer, load), deadline=5e-3)
+    answer = method.solve(load)
+    assert answer.method == "b" and not answer.trust.in_range
+    assert "nothing meets the wish" in answer.trust.why
+
+
+def test_where_nothing_is_fast_enough_the_fastest_answers_and_is_flagged(layer):
+    load = disc(layer)
+    method, _ = three(layer, 1.0, deadline=1e-5)
+    answer = method.solve(load)
+    assert answer.method == "a" and not answer.trust.in_range and "fast enough" in answer.trust.why
+
+
+def test_an_answer_that_is_not_to_be_believed_is_handed_to_the_next_better_method(layer):
+    load = disc(layer)
+    method, rungs = three(layer, 0.5 * unit(layer, load), ok=(False, True, True))
+    answer = method.solve(load)
+    assert answer.method != "a" and answer.trust.ok and rungs[0].asked == 1
+    assert answer.trust.figures["tries"] == 2
+
+
+def test_where_no_method_believes_itself_the_best_guess_comes_flagged_and_without_a_bound(layer):
+    method, rungs = three(layer, 0.1, ok=(False, False, False))
+    answer = method.solve(disc(layer))
+    assert answer.method == "c" and not answer.trust.in_range and answer.trust.error_bound is None
+    assert all(rung.asked == 1 for rung in rungs)
+
+
+def test_no_time_is_left_for_a_second_try(layer):
+    method, rungs = three(layer, 0.1, deadline=5e-3, ok=(False, True, True), took=(6e-3, 0.0, 0.0))
+    answer = method.solve(disc(layer))
+    assert answer.method == "a" and not answer.trust.in_range and rungs[1].asked == 0
+
+
+def test_a_busy_machine_is_noticed(layer):
+    load = disc(layer)
+    method, _ = three(layer, 0.05 * unit(layer, load), deadline=2e-2, seconds=(1e-4, 1e-3, 1.0), took=(0.0, 0.1, 0.0))
+    named = [method.solve(load).method for _ in range(4)]
+    assert named[0] == "b" and named[-1] == "a"
+
+
+def test_outside_of_what_was_measured_there_is_no_bound(layer):
+    rungs = [Rung("a")]
+    chart = Measured({"a": known(0.1, 1e-3)}, {"pressure": {**WIDE, "strain": [1e-4, 0.01]}})
+    answer = Ladder(rungs, chart, accuracy=1.0).prepare(layer).solve(disc(layer, 1.0))
+    assert not answer.trust.in_range and answer.trust.error_bound is None and "strain" in answer.trust.why
+
+
+def test_no_load_moves_nothing(layer):
+    answer = three(layer, 1e-4)[0].solve(Load.zero(layer))
+    assert not answer.displacement.any() and answer.trust.ok and answer.trust.error_bound == 0
+
+
+@pytest.mark.parametrize("wish", [{"accuracy": 0.0}, {"accuracy": float("nan")}, {"deadline": -1.0}])
+def test_wishes_that_are_none_are_refused(wish):
+    with pytest.raises(InvalidInput, match="positive"):
+        Ladder([Rung("a")], Measured({"a": known(1, 1)}, {}), **wish)
+
+
+def test_methods_that_were_not_measured_and_kinds_of_load_that_were_not_are_refused(layer):
+    with pytest.raises(InvalidInput, match="none of the methods"):
+        Ladder([Rung("new")], Measured({"a": known(1, 1)}, {}))
+    method, _ = three(layer, 1e-4)
+    with pytest.raises(InvalidInput, match="'nodal'"):
+        method.solve(Load.nodal(np.ones(len(layer.vertices))))
+    with pytest.raises(NotPrepared):
+        Ladder([Rung("a")], Measured({"a": known(1, 1)}, {})).solve(disc(layer))
+
+
+def test_a_method_that_refuses_the_layer_is_left_out(layer):
+    class Refuses(Rung):
+        def prepare(self, layer):
+            raise InvalidInput("not this one")
+
+    chart = Measured({n: known(0.1, 1e-3) for n in "ab"}, {"pressure": WIDE})
+    assert Ladder([Refuses("a"), Rung("b")], chart).prepare(layer).solve(disc(layer)).method == "b"
+    with pytest.raises(InvalidInput, match="not this one"):
+        Ladder([Refuses("a")], chart).prepare(layer)
+
+
+def test_a_chart_is_kept_and_takes_over_the_times_of_another_machine(tmp_path):
+    chart = Measured({"a": known(0.1, 1e-3)}, {"pressure": WIDE}, {"machine": "one"})
+    chart.save(tmp_path / "chart.json")
+    assert Measured.load(tmp_path / "chart.json") == chart
+    other = Measured({"a": known(0.9, 5e-3), "z": known(1, 1)}, {}, {"machine": "two"})
+    mixed = chart.timed_by(other)
+    assert mixed.methods["a"].seconds == other.methods["a"].seconds
+    assert mixed.methods["a"].error == chart.methods["a"].error
+    assert set(mixed.methods) == {"a"} and mixed.about["times"]["machine"] == "two"
+    (tmp_path / "broken.json").write_text('{"methods": 3}')
+    for file in ("broken.json", "none.json"):
+        with pytest.raises(InvalidInput, match="stmpl calibrate"):
+            Measured.load(tmp_path / file)
+
+
+def test_figures_of_a_disc_are_what_they_are_called(layer):
+    scene = SceneReader(layer).figures(disc(layer, 0.3, radius=0.02))
+    assert scene is not None
+    assert scene.ratio == pytest.approx(0.3) and scene.nu == 0.4 and scene.slope < 1e-12
+    assert 0.012 < scene.radius * 7.5e-3 < 0.02, "between half and all of the smooth disc's rim"
+    assert scene.outline == pytest.approx(2 * 7.5e-3 / (scene.radius * 7.5e-3), rel=0.25) and 0.2 < scene.jump < 0.6
+    assert scene.width == pytest.approx(layer.edge_length / 7.5e-3, rel=1e-6) and scene.moved > scene.pressed
+
+
+# What it climbs
+
+
+def test_one_newton_step_leaves_a_part_of_the_networks_error_and_three_next_to_nothing(layer):
+    load = disc(layer, 0.6)
+    truth = PatchFem(reach=5, check_stability=False).prepare(layer).solve(load)
+
+    def off(method):
+        answer = method.prepare(layer).solve(load)
+        return float(np.linalg.norm(answer.displacement - truth.displacement, axis=1).max()), answer
+
+    network, one, three = off(MomentNet())[0], off(FewSteps.from_network(1))[0], off(FewSteps.from_network(3))
+    assert one < 0.6 * network and three[0] < 0.02 * network and three[1].trust.converged
+    blind, answer = off(FewSteps(1))
+    assert blind > three[0] and answer.trust.figures["residual"] > three[1].trust.figures["residual"]
+
+
+def test_steps_from_the_last_answer_arrive_while_the_load_stays(layer):
+    method, load = FewSteps(1).prepare(layer), disc(layer, 0.6)
+    residuals = [method.solve(load).trust.figures["residual"] for _ in range(4)]
+    assert residuals[3] < 1e-3 * residuals[0]
+    zero = method.solve(Load.zero(layer))
+    assert not zero.displacement.any() and method.solve(load).trust.figures["residual"] > residuals[1]
+
+
+def test_too_few_steps_are_told_of(layer):
+    answer = FewSteps(1, Winkler()).prepare(layer).solve(disc(layer, 1.9))
+    assert not answer.trust.converged and "balance" in answer.trust.why
+    with pytest.raises(InvalidInput, match="at least 1"):
+        FewSteps(0)
+
+
+def test_a_coarse_mesh_gets_the_same_force_and_answers_nearly_as_well(layer):
+    load, asked = disc(layer, 0.1, radius=0.025), []
+
+    class Spy(Linear):
+        def solve(self, load):
+            asked.append(load)
+            return super().solve(load)
+
+    coarse = Coarse(Spy(), 1.5).prepare(layer)
+    answer, fine = coarse.solve(load), Linear().prepare(layer).solve(load)
+    assert asked[0].values @ coarse.coarse.vertex_areas == pytest.approx(load.values @ layer.vertex_areas, rel=0.01)
+    off = np.linalg.norm(answer.displacement - fine.displacement, axis=1)
+    assert 0 < off.max() < 0.2 * fine.magnitude.max() and answer.trust.error_bound is None
+    assert not coarse.solve(Load.zero(layer)).displacement.any()
+    with pytest.raises(InvalidInput, match="coarsening"):
+        Coarse(Linear(), 1.0)
+
+
+# What it was measured with
+
+
+def made_up(spread: float, seed: int = 0) -> list[Trial]:
+    rng, out = np.random.default_rng(seed), []
+    for k in range(600):
+        scene = SceneFigures(
+            float(np.exp(rng.uniform(-4, -0.5))), float(np.exp(rng.uniform(-1, 1.5))), 0.4,
+            float(rng.uniform(0.3, 0.9)), 0.0, 1.0, 0.3, 0.5, float(rng.integers(20, 800)),
+            float(rng.integers(900, 4000)),
+        )  # fmt: skip
+        error = 0.2 * scene.strain**0.7 * scene.radius**-0.5 * float(np.exp(spread * rng.normal()))
+        seconds = (1e-3 + 2e-9 * scene.pressed * scene.moved) * float(np.exp(0.05 * rng.normal()))
+        use = "fit" if k % 2 else "test"
+        out.append(Trial(f"body {k % 5}", use, "disc", "pressure", "m", scene, 1e-3, 1e-3 * error, 2e-3, 0.0, seconds,
+                         True, float("nan")))  # fmt: skip
+    return out
+
+
+def test_the_fit_finds_the_law_and_its_bounds_hold_as_often_as_they_say():
+    trials = made_up(0.3)
+    chart = fit(trials)
+    (row,) = coverage(trials, chart)
+    assert 0.9 < row.covered < 0.99 and row.tight < 2.2
+    scene = trials[0].scene
+    seconds = float(scene.for_time() @ np.array(chart.methods["m"].seconds))
+    assert seconds == pytest.approx(1e-3 + 2e-9 * scene.pressed * scene.moved, rel=0.1)
+    assert 1.0 < chart.methods["m"].slow < 1.3
+    exact = fit(made_up(0.0))
+    assert exact.methods["m"].factor["pressure"] == pytest.approx(1.0, abs=0.1)
+
+
+def test_the_shipped_chart_knows_every_default_method_and_its_bounds_hold(layer, tmp_path, monkeypatch):
+    monkeypatch.setenv("STMPL_CACHE_DIR", str(tmp_path))
+    chart = Measured.load(SHIPPED)
+    assert {rung.name for rung in default_rungs()} == set(chart.methods)
+    other = layer.with_(tissue=Tissue(5e3, 0.35))
+    for one in (layer, other):
+        load = disc(one, 0.4, radius=0.02)
+        truth = PatchFem(refine=1, layers=2, check_stability=False).prepare(one).solve(load)
+        named = []
+        for accuracy in (1e-2, 2e-4, 1e-5):
+            answer = ladder(accuracy=accuracy).prepare(one).solve(load)
+            off = float(np.linalg.norm(answer.displacement - truth.displacement, axis=1).max())
+            assert answer.trust.figures["expected_error_m"] >= off
+            named.append(answer.method)
+        assert named[0] == "winkler" and len(set(named)) == 3
+    slow = {n: replace(k, seconds=[9.0, 0.0, 0.0, 0.0]) for n, k in chart.methods.items() if n != "winkler"}
+    Measured({**slow, "winkler": chart.methods["winkler"]}, chart.ranges).save(times_file())
+    answer = ladder(accuracy=1e-6, deadline=0.1).prepare(layer).solve(disc(layer))
+    assert answer.method == "winkler", "this machine's times count"
+    assert json.loads(times_file().read_text())["methods"]
