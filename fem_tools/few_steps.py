@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Self
 
 import numpy as np
 
 from fem_tools.mesh import level_depths
 from fem_tools.newton import NewtonSettings, System, newton
-from fem_tools.patch import Patch, PatchFem
+from fem_tools.patch import Patch, PatchFem, discretisation_error, error_bound, truncation_error
 from stmpl_core.errors import InvalidInput
 from stmpl_core.layer import SoftLayer
 from stmpl_core.load import Load
@@ -64,6 +65,8 @@ class FewSteps:
     def solve(self, load: Load) -> Displacement:
         """The displacement under `load`; not converged while the residual is above CLOSE.
 
+        The bound is PatchFem's, and as much of the peak as is not in balance.
+
         Raises:
             NotPrepared: before `prepare`.
             InvalidInput: the load does not fit the layer.
@@ -82,7 +85,11 @@ class FewSteps:
         answer = np.zeros_like(layer.vertices)
         answer[patch.vertices] = result.u[: len(patch.vertices), 0]
         ratio, limit = load.peak_ratio(layer), 2.0 if load.kind != "nodal" else 0.4
-        trust = Trust(figures={"residual": result.residual, "min_j": result.min_j, "peak_ratio": ratio})
+        discretisation, truncation = discretisation_error(system, result.u), truncation_error(patch, result.u, layer)
+        bound = error_bound(discretisation, truncation, result.u, patch.mesh.layers, ratio)
+        bound += result.residual * float(np.linalg.norm(result.u[:, 0], axis=1).max())
+        figures = {"residual": result.residual, "min_j": result.min_j, "peak_ratio": ratio}
+        trust = Trust(error_bound=bound if load.kind != "contact" else None, figures=figures)
         if result.residual > CLOSE:
             why = f"after {result.iterations} Newton steps {result.residual:.0%} of the load is not in balance"
             trust = trust.also(why, converged=False)
@@ -90,7 +97,7 @@ class FewSteps:
             trust = trust.also(f"p/E is {ratio:.2g}; validated up to {limit:g} for {load.kind} loads", in_range=False)
         if (load.values < 0).any():
             trust = trust.also("the load pulls; only pressing was validated", in_range=False)
-        return Displacement(answer, trust, self.name, pressure)
+        return Displacement(answer, trust if trust.ok else replace(trust, error_bound=None), self.name, pressure)
 
     def _patch_for(self, loaded: np.ndarray) -> Patch:
         layer, patch = prepared(self._layer, self), self._patch

@@ -316,6 +316,7 @@ class PatchFem:
         if (load.values < 0).any():
             trust = trust.also("the load pulls; only pressing was validated", in_range=False)
         if load.kind == "contact":
+            trust = replace(trust, error_bound=None)
             trust = trust.also("how rigid tools pull along the skin is left out (fem_tools.IndenterFem has it)")
         rim = patch.distance[np.isin(patch.vertices, layer.border)]
         nearest = float(rim.min(initial=np.inf)) / float(layer.thickness.max())

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field, fields, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, Self
 
@@ -21,6 +21,7 @@ from stmpl_core.trust import Displacement, Trust
 
 SHIPPED = Path(__file__).parent / "weights" / "ladder.json"
 REACH = 6.0  # thicknesses around a load within which the skin moves
+LINEAR = 0.01  # strain below which the response is linear, and the error a share of it that no longer changes
 PACE = 0.2  # weight of the newest solve in what is known of how busy the machine is
 SLACK = 1.1  # beyond the measured range of a figure of the scene that is not yet called outside
 
@@ -31,9 +32,8 @@ class SceneFigures:
 
     Args:
         strain: of a confined column under the highest pressure [-].
-        radius: of the disc with the load's participation area (int p)^2 / int p^2, over the thickness under it [-].
         nu: Poisson's ratio [-].
-        width: of the mesh's edges over that thickness [-].
+        width: of the mesh's edges over the thickness under the load [-].
         slope: of the thickness along the skin, largest under the load [-].
         outline: total variation of the pressure over the force, times that thickness; 2 t / R for a disc [-].
         jump: largest difference of pressure across an edge of the mesh, over the highest pressure [-].
@@ -43,7 +43,6 @@ class SceneFigures:
     """
 
     strain: float
-    radius: float
     nu: float
     width: float
     slope: float
@@ -54,16 +53,21 @@ class SceneFigures:
     moved: float
 
     def for_error(self) -> np.ndarray:
-        """Terms of the logarithm of the error, (11,)."""
-        s, r, w, o = np.log(self.strain), np.log(self.radius), np.log(self.width), np.log(self.outline)
-        return np.array([1.0, s, s * s, r, r * r, s * r, w, o, self.jump, self.nu, self.slope])
+        """Terms of the logarithm of the error, (10,).
+
+        How wide the parts of a contact are counts, which its outline says, not how wide they are together: a hand errs
+        as five fingers do.
+        """
+        s, w, o = np.log(max(self.strain, LINEAR)), np.log(self.width), np.log(self.outline)
+        return np.array([1.0, s, s * s, o, o * o, s * o, w, self.jump, self.nu, self.slope])
 
     def for_time(self) -> np.ndarray:
         """Terms of the time of a solve, each growing with the work of some method, (4,)."""
         return np.array([1.0, self.moved, self.moved * self.ratio, self.pressed * self.moved])
 
 
-RANGED = ("strain", "radius", "nu", "width", "slope", "outline", "jump")  # whose measured range counts
+RANGED = ("strain", "nu", "width", "slope", "outline", "jump")  # whose measured range counts
+EASY = ("strain", "slope", "jump")  # of these, whose small values are no extrapolation
 
 
 class SceneReader:
@@ -88,13 +92,12 @@ class SceneReader:
         here = pressure[loaded]
         force, highest = float(area @ here), float(here.max())
         t = float((area * here) @ layer.thickness[loaded]) / force
-        radius = (force**2 / float(area @ here**2) / np.pi) ** 0.5
         strain = float(1 - column_stretch(np.array([highest]), layer.tissue)[0])
         patch = np.pi * ((float(area.sum()) / np.pi) ** 0.5 + REACH * t) ** 2
         variation, jump, slope = _steps(loaded, pressure, layer.thickness, self._first, self._to, self._length,
                                         self._across)  # fmt: skip
         return SceneFigures(
-            strain=strain, radius=radius / t, nu=layer.tissue.poisson_ratio, width=layer.edge_length / t, slope=slope,
+            strain=strain, nu=layer.tissue.poisson_ratio, width=layer.edge_length / t, slope=slope,
             outline=max(variation * t / force, 1e-3), jump=jump / highest, ratio=highest / layer.tissue.youngs_modulus,
             pressed=float(len(loaded)), moved=min(patch * len(area) / float(area.sum()), float(len(layer.vertices))),
         )  # fmt: skip
@@ -121,6 +124,8 @@ class Known:
     Args:
         error: coefficients of SceneFigures.for_error for log(error / (thickness strain)), by kind of load.
         factor: on that error, so that 95 % of answers are within it, by kind of load.
+        after, after_factor: likewise with one more term, the logarithm of the bound that the method itself states (over
+            thickness times strain): what to expect once it has answered. Empty if it states none.
         seconds: coefficients of SceneFigures.for_time [s].
         slow: how many times longer than that one solve in twenty takes.
     """
@@ -129,6 +134,16 @@ class Known:
     factor: Mapping[str, float]
     seconds: Sequence[float]
     slow: float
+    after: Mapping[str, Sequence[float]] = field(default_factory=dict)
+    after_factor: Mapping[str, float] = field(default_factory=dict)
+
+    def bound(self, scene: SceneFigures, kind: str, unit: float, stated: float | None = None) -> float:
+        """What 95 % of answers are within [m]; `stated`: the method's own bound, once it has answered [m]."""
+        terms = scene.for_error()
+        if kind in self.after and stated is not None and stated > 0:
+            terms = np.append(terms, np.log(stated / unit))
+            return unit * self.after_factor[kind] * float(np.exp(terms @ np.asarray(self.after[kind])))
+        return unit * self.factor[kind] * float(np.exp(terms @ np.asarray(self.error[kind])))
 
 
 @dataclass(frozen=True)
@@ -160,6 +175,14 @@ class Measured:
         Path(path).parent.mkdir(parents=True, exist_ok=True)
         Path(path).write_text(json.dumps(asdict(self), indent=1) + "\n")
 
+    def outside(self, scene: SceneFigures, kind: str) -> str:
+        """How a scene lies outside of what was measured, in words; empty if it does not."""
+        return "; ".join(
+            f"{name} is {value:.3g}, measured is {low:.3g} to {high:.3g}"
+            for name, (low, high) in self.ranges.get(kind, {}).items()
+            if not (0 if name in EASY else low / SLACK) <= (value := getattr(scene, name)) <= max(high * SLACK, 1e-9)
+        )
+
     def timed_by(self, other: Measured) -> Measured:
         """The same errors with the times of another machine, where it has them."""
         methods = {
@@ -182,9 +205,9 @@ class Ladder:
 
     What is expected comes from a measured chart: error and time of each method as functions of the scene (how hard, how
     wide, how thick, how fine a mesh), and from how busy the machine just was. Where an answer says that it is not to be
-    believed, the next better method is asked, if there is time. Every answer names the method that gave it, says why it
-    was chosen, and carries the bound that 95 % of such answers kept; where nothing meets the wish, the best that fits
-    is given and flagged.
+    believed, or is not as good as wished, the next better method is asked, if there is time. Every answer names the
+    method that gave it, says why it was chosen, and carries a bound that 95 % of such answers kept, by the chart and
+    by what the method states of itself. Where nothing meets the wish, the best that fits is given and flagged.
 
     Args:
         rungs: methods, not yet prepared; those that the chart does not know are left out.
@@ -254,31 +277,32 @@ class Ladder:
             if choice is None:
                 break
             answer = self._ask(choice, load, scene)
+            known = self.measured.methods[self.rungs[choice.rung].name]
+            choice = replace(choice, error=known.bound(scene, load.kind, self._unit(scene), answer.trust.error_bound))
             tried.append((choice, answer))
             options = [o for o in options if o.error < choice.error]
-            if answer.trust.ok or outside:
+            if outside or (answer.trust.ok and choice.error <= self.accuracy):
                 break
-        choice, answer = next(((c, a) for c, a in tried if a.trust.ok), min(tried, key=lambda pair: pair[0].error))
+        sound = [pair for pair in tried if pair[1].trust.ok] or tried
+        choice, answer = min(sound, key=lambda pair: pair[0].error)
         return self._told(choice, answer, outside, len(tried))
 
     def _expected(self, scene: SceneFigures, kind: str) -> tuple[list[_Expected], str]:
         """What to expect of each method that was measured under such loads, and how the scene is outside of that."""
-        layer, terms = prepared(self._layer, self), scene.for_error()
-        unit = layer.edge_length / scene.width * scene.strain  # thickness under the load times strain [m]
-        seconds = self._seconds @ scene.for_time() * self._slow * self._pace
+        unit = self._unit(scene)
+        seconds = self._seconds @ scene.for_time() * self._slow
+        if self.deadline is not None:  # without one, the same loads get the same answers on every run
+            seconds = seconds * self._pace
         options = []
         for k, rung in enumerate(self.rungs):
             known = self.measured.methods[rung.name]
             if self._ready[k] and kind in known.error:
-                error = unit * known.factor[kind] * float(np.exp(terms @ np.asarray(known.error[kind])))
-                options.append(_Expected(k, error, float(seconds[k])))
-        ranges = self.measured.ranges.get(kind, {})
-        beyond = [
-            f"{name} is {value:.3g}, measured is {low:.3g} to {high:.3g}"
-            for name, (low, high) in ranges.items()
-            if not low / SLACK <= (value := getattr(scene, name)) <= max(high * SLACK, 1e-9)
-        ]
-        return options, "; ".join(beyond)
+                options.append(_Expected(k, known.bound(scene, kind, unit), float(seconds[k])))
+        return options, self.measured.outside(scene, kind)
+
+    def _unit(self, scene: SceneFigures) -> float:
+        """Thickness under the load times the strain of its columns [m]."""
+        return prepared(self._layer, self).edge_length / scene.width * scene.strain
 
     def _choose(self, options: list[_Expected], left: float | None, *, first: bool) -> _Expected | None:
         """The cheapest that is accurate enough in the time left; else the most accurate in time; else the fastest."""
@@ -301,10 +325,9 @@ class Ladder:
     def _told(self, choice: _Expected, answer: Displacement, outside: str, tries: int) -> Displacement:
         """The answer with the ladder's own bound and reasons."""
         wish = f"{1e3 * self.accuracy:.2g} mm" + ("" if self.deadline is None else f" in {1e3 * self.deadline:.3g} ms")
-        chosen = (f"chosen for {wish}: {1e3 * choice.error:.2g} mm in {1e3 * choice.seconds:.2g} ms "
-                  "are expected at most")  # fmt: skip
+        chosen = f"chosen for {wish}: at most {1e3 * choice.error:.2g} mm in {1e3 * choice.seconds:.2g} ms expected"
         own = answer.trust
-        figures = {**own.figures, "expected_error_m": choice.error, "expected_s": choice.seconds, "tries": float(tries)}
+        figures = {**own.figures, "expected_s": choice.seconds, "tries": float(tries)}
         trust = Trust(own.converged, own.in_range, choice.error, "; ".join(filter(None, (own.why, chosen))), figures)
         if choice.error > self.accuracy:
             trust = trust.also("nothing meets the wish, this is the best that fits", in_range=False)
@@ -315,8 +338,3 @@ class Ladder:
         if outside or not own.ok:
             trust = replace(trust, error_bound=None)
         return Displacement(answer.displacement, trust, answer.method, answer.pressure)
-
-
-def figures_table(scenes: Sequence[SceneFigures]) -> dict[str, np.ndarray]:
-    """Columns of many scenes' figures, by name."""
-    return {f.name: np.array([getattr(scene, f.name) for scene in scenes]) for f in fields(SceneFigures)}
