@@ -3,7 +3,7 @@
 import os
 from pathlib import Path
 
-from setuptools import setup
+from setuptools import find_packages, setup
 
 HERE = Path(__file__).resolve().parent
 ON_ROS_MACHINE = bool(os.environ.get("ROS_DISTRO"))  # its own rclpy and colcon-built messages are used there
@@ -43,6 +43,11 @@ ROS_WHEELS = [  # versions that resolve together: ROS 2 Jazzy as wheels for CPyt
 ]
 CLUSTER = ["distributed>=2024.8"]
 PAPER = ["tetgen>=0.6"]  # TetGen itself is under the AGPL: nobody gets it who does not ask for it
+PEERS = [  # simulators to compare with, pinned as docs/peers.md measured them; FElupe is under the GPL
+    "felupe==11.3.0",
+    "mujoco==4.0.0",
+    "newton==1.8.0",
+]
 DEV = [
     "felupe>=9",
     "hypothesis>=6.100",
@@ -62,16 +67,17 @@ setup(
     description="Real-time soft-tissue contact for robots: a contact comes in, the deformed skin goes out.",
     license="Apache-2.0",
     python_requires=">=3.12,<3.13",
-    packages=["stmpl_core", "stmpl_core.methods", "fem_tools", "fem_tools.stability", "bags", "stmpl_ros",
-              "stmpl_ros.view"],
+    packages=find_packages(include=["stmpl_core*", "fem_tools*", "bags", "stmpl_ros*"]),
     package_data={"stmpl_core": ["weights/*"], "stmpl_ros": ["foxglove/*.json"]},
     data_files=[
         ("share/ament_index/resource_index/packages", ["resource/stmpl_ros"]),
         ("share/stmpl_ros", ["package.xml"]),
+        ("share/stmpl_ros/launch", ["launch/node.launch.py", "launch/demo.launch.py"]),
+        ("share/stmpl_ros/config", ["config/stmpl.yaml", "config/limits.yaml", "config/frames.yaml"]),
     ]
     if ON_ROS_MACHINE
     else [],
     install_requires=REQUIRED + ([] if ON_ROS_MACHINE else ROS_WHEELS),
-    extras_require={"dev": DEV + CLUSTER, "cluster": CLUSTER, "paper": PAPER},
+    extras_require={"dev": DEV + CLUSTER, "cluster": CLUSTER, "paper": PAPER, "peers": PEERS},
     entry_points={"console_scripts": ["stmpl = stmpl_ros.cli:main"]},
 )

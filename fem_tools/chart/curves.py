@@ -5,9 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from importlib.util import find_spec
+from typing import Any
 
+from fem_tools.calibrate import ladder
 from fem_tools.few_steps import FewSteps
 from fem_tools.patch import PatchFem
+from fem_tools.peers import peer
 from stmpl_core.methods import Linear, Method, MomentNet, Naive, UNet, Winkler
 from stmpl_core.methods.coarse import Coarse
 from stmpl_core.methods.zero import Zero
@@ -50,6 +53,14 @@ def _fem(reach: float, refine: int = 0, layers: int = 1) -> Make:
     return lambda: PatchFem(reach=reach, refine=refine, layers=layers, check_stability=False)
 
 
+def _ladder(accuracy: float) -> Make:
+    return lambda: ladder(accuracy=accuracy)
+
+
+def _peer(name: str, **knobs: Any) -> Make:
+    return lambda: peer(name)(**knobs)
+
+
 CURVES: tuple[Curve, ...] = (
     Curve("zero", "-", (("-", Zero),)),
     Curve("Naive", "-", (("-", Naive),)),
@@ -66,4 +77,15 @@ CURVES: tuple[Curve, ...] = (
     Curve("PatchFem, patch", "reach of the patch in thicknesses",
           tuple((f"{reach:g}", _fem(reach)) for reach in (1.5, 2, 3, 4, 6, 8)), fast=False),
     Curve("whole-arm FEM", "-", (("-", _fem(200)),), fast=False),
+    Curve("Ladder", "wished accuracy", tuple((f"{1e3 * a:g} mm", _ladder(a)) for a in (2e-3, 5e-4, 2e-4, 1e-4)),
+          fast=False),
+    Curve("MuJoCo flex, its defaults", "-", (("StVK, 4 ms", _peer("mujoco_flex")),), fast=False, extra="mujoco"),
+    Curve("MuJoCo flex, neo-Hookean", "mesh", tuple(
+        (f"{layers} layers, refine {refine}",
+         _peer("mujoco_flex", material="snh", timestep=0.1, damping=0.0, layers=layers, refine=refine))
+        for layers, refine in ((1, 0), (2, 0), (3, 1))), fast=False, extra="mujoco"),
+    Curve("Newton VBD", "mesh", tuple((f"{n} layers", _peer("newton_vbd", layers=n)) for n in (1, 2)), fast=False,
+          extra="newton"),
+    Curve("FElupe, hex8", "mesh", tuple((f"{n} layers", _peer("felupe", layers=n)) for n in (1, 2)), fast=False,
+          extra="felupe"),
 )  # fmt: skip

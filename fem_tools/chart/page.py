@@ -9,7 +9,7 @@ from pathlib import Path
 from matplotlib.colors import to_hex
 
 from fem_tools.chart.measure import Chart, Point
-from fem_tools.chart.picture import GUIDES, caption, limits, style_of
+from fem_tools.chart.picture import GUIDES, caption, limits, on_chart, style_of
 
 WIDTH, HEIGHT, LEFT, BOTTOM, TOP = 360, 270, 42, 30, 24  # px of a panel and its margins
 LOOK = """body{font:13px system-ui,sans-serif;margin:1.5em;color:#222}svg{background:#fff}p{color:#555;max-width:70em}
@@ -76,12 +76,12 @@ def _panel(chart: Chart, scene: str, ratio: float, colours: dict[str, str],
         out.append(f'<polyline points="{_points(path)}" fill=none stroke="#ddd" stroke-width=6 />')
     for k, (name, colour) in enumerate(colours.items()):
         mine = [p for p in chart.points if (p.curve, p.scene, p.ratio) == (name, scene, ratio)]
-        shown = [p for p in mine if not p.failed]
+        shown = [p for p in mine if on_chart(p)]
         line = _points([(x(1e3 * p.seconds), y(100 * p.error)) for p in shown])
         out.append(f'<g class=c{k}><polyline points="{line}" fill=none stroke="{colour}" stroke-opacity=.6 />')
         for p in mine:
             place = x(slowest / 1.3 if math.isnan(p.seconds) else 1e3 * p.seconds)
-            if p.failed:
+            if not on_chart(p):
                 out.append(f'<text x={place:.1f} y={TOP + 8} style="fill:{colour};font-weight:700" '
                            f'data-tip="{_tip(p)}">x</text>')  # fmt: skip
             else:

@@ -11,12 +11,13 @@ from matplotlib.figure import Figure
 
 from fem_tools.chart.measure import Chart, Point
 
+WORST = 150.0  # % of the peak; what is farther off has failed
 GUIDES = (1.0, 2.0, 10.0, 33.0)  # ms: haptic loop, 500 Hz, 100 Hz, video
 STYLE = {  # colour and marker of the curves that are known; others get the next free colour
     "zero": ("0.6", "_"), "Naive": ("tab:brown", "s"), "Winkler": ("tab:olive", "D"), "Linear": ("tab:cyan", "v"),
     "MomentNet": ("tab:red", "o"), "the paper's UNet, reduced": ("tab:purple", "P"),
     "FEM, few steps": ("tab:orange", "^"), "PatchFem, mesh": ("tab:blue", "o"),
-    "PatchFem, patch": ("tab:green", "<"), "whole-arm FEM": ("navy", "h"),
+    "PatchFem, patch": ("tab:green", "<"), "whole-arm FEM": ("navy", "h"), "Ladder": ("k", "*"),
 }  # fmt: skip
 SPARE = ("tab:pink", "darkgoldenrod", "teal", "indigo", "crimson", "slategray", "olivedrab", "maroon")
 
@@ -27,11 +28,16 @@ def style_of(chart: Chart) -> dict[str, tuple[str, str]]:
     return {name: STYLE[name] if name in STYLE else (next(spare), "X") for name in names}
 
 
+def on_chart(point: Point) -> bool:
+    """Whether there is an answer, and one nearer to the truth than WORST."""
+    return not point.failed and 100 * point.error < WORST
+
+
 def limits(chart: Chart) -> tuple[float, float, float, float]:
     """Of both axes: fastest and slowest [ms], least and largest error [%]."""
     good = [p for p in chart.points if not math.isnan(p.seconds) and p.error > 0]
     x, y = [1e3 * p.seconds for p in good], [100 * p.error for p in good]
-    return min(x, default=0.1) / 1.6, max(x, default=100) * 1.6, max(min(y, default=0.1) / 1.5, 0.05), 150.0
+    return min(x, default=0.1) / 1.6, max(x, default=100) * 1.6, max(min(y, default=0.1) / 1.5, 0.05), WORST
 
 
 def draw(chart: Chart, path: Path) -> Path:
@@ -62,7 +68,8 @@ def caption(chart: Chart) -> str:
     made = ", ".join(f"{k} {v}" for k, v in about["versions"].items())
     left_out = f" Not installed: {', '.join(about['missing'])}." if about["missing"] else ""
     return (f"{about['layer']}; {about['machine']}; {made}. Reference: {about['reference']}. Hollow: flagged as out of "
-            f"range; cross at the edge: no answer, or not converged; grey: the Pareto front.{left_out}")  # fmt: skip
+            "range; cross at the edge: no answer, not converged, or farther off than the chart; grey: the Pareto "
+            f"front.{left_out}")  # fmt: skip
 
 
 def _panel(axes: Axes, chart: Chart, scene: str, ratio: float, styles: dict[str, tuple[str, str]],
@@ -78,13 +85,13 @@ def _panel(axes: Axes, chart: Chart, scene: str, ratio: float, styles: dict[str,
         axes.step([x[0], *x, slowest], [largest, *y, y[-1]], where="post", color="0.82", lw=5, zorder=0)
     for name, (colour, marker) in styles.items():
         mine = [p for p in chart.points if (p.curve, p.scene, p.ratio) == (name, scene, ratio)]
-        shown = [p for p in mine if not p.failed]
+        shown = [p for p in mine if on_chart(p)]
         axes.plot([1e3 * p.seconds for p in shown], [100 * p.error for p in shown], color=colour, lw=1, alpha=0.7)
         for flagged in (False, True):
             these = [p for p in shown if p.in_range is not flagged]
             axes.plot([1e3 * p.seconds for p in these], [100 * p.error for p in these], marker, color=colour, ms=4.5,
                       mfc="white" if flagged else colour, ls="none")  # fmt: skip
-        failed = [p for p in mine if p.failed]
+        failed = [p for p in mine if not on_chart(p)]
         axes.plot([_place(p, slowest) for p in failed], [largest / 1.15] * len(failed), "x", color=colour, ms=6)
         axes.plot([], [], marker=marker, color=colour, ms=5, lw=1, label=name)
     axes.grid(True, which="major", alpha=0.25)
