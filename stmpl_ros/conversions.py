@@ -73,7 +73,7 @@ def checked_pose(message: PoseStamped, tool: str, body_frame: str) -> Transform:
     if message.header.frame_id != body_frame:
         raise FrameError(
             f"the pose of {tool} is in frame '{message.header.frame_id}'; expected '{body_frame}'. "
-            "Transform it before sending, or set the node's parameter `frame`."
+            "Transform it before sending, list the frame in the file of the parameter `frames`, or set `frame`."
         )
     pose = finite(f"pose of {tool}", pose_from(message.pose), (4, 4))
     far = float(np.abs(pose[:3, 3]).max())

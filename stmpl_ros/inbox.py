@@ -82,6 +82,13 @@ class Inbox:
         else:
             self.tools[name] = Tool(mesh, number)
 
+    def forget(self) -> None:
+        """Forgets every pose and wrench; the meshes stay."""
+        for tool in self.tools.values():
+            tool.pose, tool.wrench = Stream(), Stream()
+        self.waiting.clear()
+        self.missed = 0
+
     def put_pose(self, name: str, pose: Transform, stamp: int, now: int) -> bool:
         """Keeps a pose; False if it was dropped as repeated or out of order."""
         if not self._put(self.tools[name].pose, pose, stamp, now):

@@ -5,9 +5,10 @@ from __future__ import annotations
 import json
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, field_validator
+from pydantic.config import JsonDict
 
 from stmpl_core.methods import Linear, Method, MomentNet, Naive, UNet, Winkler
 
@@ -16,48 +17,113 @@ METHODS: dict[str, Callable[[], Method]] = {
 }  # fmt: skip
 
 
+PHENOTYPE = ("gender", "age", "muscle", "weight", "height", "proportions")
+ANY_TIME: JsonDict = {"when": "any time"}  # a running node takes it over at once
+CONFIGURING: JsonDict = {"when": "configuring"}  # counts when the node is configured, or by ~/set_body
+
+
 class NodeConfig(BaseModel):
-    """The node's settings."""
+    """The node's settings. What is neither ANY_TIME nor CONFIGURING counts from the start to the end."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    part: str = Field(default="left_arm", description="part of the body that answers")
-    edge_length: float = Field(default=3e-3, gt=0, description="of the skin's mesh [m]")
-    thickness: float = Field(default=7.5e-3, gt=0, description="of the soft layer [m]")
-    youngs_modulus: float = Field(default=1e3, gt=0, description="E of the tissue [Pa]")
-    poisson_ratio: float = Field(default=0.4, ge=0, lt=0.5, description="nu of the tissue [-]")
-    density: float = Field(default=1e3, gt=0, description="of the tissue [kg/m3]")
+    part: str = Field(
+        default="left_arm", min_length=1, description="part of the body that answers", json_schema_extra=CONFIGURING
+    )
+    phenotype: str = Field(
+        default="", description="of the body, each from 0 to 1: 'weight=0.7 muscle=0.3'; 0.5 where nothing is said",
+        json_schema_extra=CONFIGURING,
+    )  # fmt: skip
+    edge_length: float = Field(
+        default=3e-3, gt=0, le=0.05, description="of the skin's mesh [m]", json_schema_extra=CONFIGURING
+    )
+    thickness: float = Field(
+        default=7.5e-3, gt=0, le=0.1, description="of the soft layer [m]", json_schema_extra=CONFIGURING
+    )
+    youngs_modulus: float = Field(
+        default=1e3, gt=0, le=1e9, description="E of the tissue [Pa]", json_schema_extra=CONFIGURING
+    )
+    poisson_ratio: float = Field(
+        default=0.4, ge=0, lt=0.5, description="nu of the tissue [-]", json_schema_extra=CONFIGURING
+    )
+    density: float = Field(
+        default=1e3, gt=0, le=1e5, description="of the tissue [kg/m3]", json_schema_extra=CONFIGURING
+    )
     method: Literal["moment_net", "unet", "linear", "winkler", "naive"] = Field(
-        default="moment_net", description="that solves for the displacement"
+        default="moment_net", description="that solves for the displacement", json_schema_extra=CONFIGURING
     )
+    limits: str = Field(
+        default="", description="YAML file of pressure and force limits, advisory; empty: none",
+        json_schema_extra=CONFIGURING,
+    )  # fmt: skip
     frame: str = Field(default="body", min_length=1, description="frame_id of the body, in poses and answers")
-    rest_after: float = Field(default=0.25, gt=0, description="a tool silent for longer is no longer in contact [s]")
-    fade: float = Field(default=1.0, ge=0, description="in which the last answer goes to rest when all are silent [s]")
-    max_age: float = Field(default=1.0, ge=0, description="older messages are dropped; 0 accepts any age [s]")
-    marker_rate: float = Field(default=15.0, gt=0, description="of skin/marker while somebody looks [Hz]")
-    local_rotations: bool = Field(
-        default=True, description="local contacts say how the wrench follows rotations too, at twice the cost"
+    frames: str = Field(
+        default="", description="YAML file of other frames that poses may come in, fixed in the body's; empty: none"
     )
+    deadline: float = Field(
+        default=0.0, ge=0, le=3600, description="that devices must offer for their poses; 0 asks for none [s]"
+    )
+    shape_tools: str = Field(
+        default="", description="tools that announce their surface as shape_msgs/Mesh, parted by blanks"
+    )
+    rest_after: float = Field(
+        default=0.25, gt=0, le=3600, description="a tool silent for longer is no longer in contact [s]",
+        json_schema_extra=ANY_TIME,
+    )  # fmt: skip
+    fade: float = Field(
+        default=1.0, ge=0, le=3600, description="in which the last answer goes to rest when all are silent [s]",
+        json_schema_extra=ANY_TIME,
+    )  # fmt: skip
+    max_age: float = Field(
+        default=1.0, ge=0, le=1e9, description="older messages are dropped; 0 accepts any age [s]",
+        json_schema_extra=ANY_TIME,
+    )  # fmt: skip
+    marker_rate: float = Field(
+        default=15.0, gt=0, le=1000, description="of skin/marker and skin/points while somebody looks [Hz]",
+        json_schema_extra=ANY_TIME,
+    )  # fmt: skip
+    local_rotations: bool = Field(
+        default=True, description="local contacts say how the wrench follows rotations too, at twice the cost",
+        json_schema_extra=ANY_TIME,
+    )  # fmt: skip
     autostart: bool = Field(default=True, description="configure and activate without being asked")
 
-    def declare_on(self, node: Any) -> NodeConfig:
-        """Declares every field as a parameter of `node`, and returns the settings with what ROS overrides.
+    @field_validator("phenotype")
+    @classmethod
+    def _phenotype(cls, text: str) -> str:
+        _shares(text)
+        return text
 
-        Raises:
-            pydantic.ValidationError: a parameter lies outside what its field allows.
-        """
-        from rcl_interfaces.msg import ParameterDescriptor
+    @property
+    def phenotype_values(self) -> dict[str, float]:
+        """The phenotype by name."""
+        return _shares(self.phenotype)
 
-        values = {}
-        for name, field in type(self).model_fields.items():
-            described = ParameterDescriptor(description=field.description or "", read_only=True)
-            values[name] = node.declare_parameter(name, getattr(self, name), described).value
-        return NodeConfig(**values)
+    @classmethod
+    def names(cls, when: JsonDict) -> set[str]:
+        """The fields that count ANY_TIME or CONFIGURING."""
+        return {name for name, field in cls.model_fields.items() if field.json_schema_extra == when}
 
     def ros_arguments(self) -> list[str]:
         """The settings as arguments of a ROS process: --ros-args -p name:=value ..."""
         values = self.model_dump(mode="json").items()
         return ["--ros-args"] + [part for name, value in values for part in ("-p", f"{name}:={json.dumps(value)}")]
+
+
+def _shares(text: str) -> dict[str, float]:
+    """name=value, parted by blanks. Raises ValueError."""
+    shares = {}
+    for pair in text.split():
+        name, _, value = pair.partition("=")
+        try:
+            shares[name] = float(value)
+        except ValueError:
+            raise ValueError(f"'{pair}' is no name=number, as in 'weight=0.7 muscle=0.3'") from None
+        if name not in PHENOTYPE:
+            raise ValueError(f"'{name}' is no phenotype; known are {', '.join(PHENOTYPE)}")
+        if not 0 <= shares[name] <= 1:
+            raise ValueError(f"{pair} is not from 0 to 1 (0.5 is the average)")
+    return shares
 
 
 class ProbeConfig(BaseModel):

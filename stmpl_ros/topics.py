@@ -1,7 +1,30 @@
-"""How topics are delivered: what is kept for late listeners, what streams, and where only the newest counts."""
+"""How topics are delivered; docs/node.md says which topic takes which, and why."""
 
-from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from typing import Any, cast
+
+from rclpy.duration import Duration
+from rclpy.lifecycle import LifecycleNode
+from rclpy.lifecycle.publisher import LifecyclePublisher
+from rclpy.qos import DurabilityPolicy, LivelinessPolicy, QoSProfile, ReliabilityPolicy
+
+LEASE = 1.0  # s: a node that is silent for longer on the bus is told to be gone, to listeners who ask for that
 
 KEPT = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)  # meshes: late listeners get them too
 STREAM = QoSProfile(depth=10)
+ANSWERS = QoSProfile(
+    depth=10, liveliness=LivelinessPolicy.AUTOMATIC, liveliness_lease_duration=Duration(seconds=LEASE)
+)  # a stream whose sender is told to be gone
 NEWEST = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)  # what came while busy is overwritten
+SHOWN = QoSProfile(depth=1)  # pictures: the newest is enough
+
+
+def newest_within(deadline: float) -> QoSProfile:
+    """NEWEST, from senders only who offer at least this deadline [s]; 0: from any."""
+    if not deadline:
+        return NEWEST
+    return QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT, deadline=Duration(seconds=deadline))
+
+
+def managed(node: LifecycleNode, kind: Any, topic: str, profile: QoSProfile) -> LifecyclePublisher:
+    """A publisher that is silent while the node is not active (rclpy's own annotation says less)."""
+    return cast(LifecyclePublisher, node.create_lifecycle_publisher(kind, topic, profile))

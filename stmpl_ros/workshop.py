@@ -62,11 +62,17 @@ _simulator: Simulator
 _meshes: dict[str, dict[int, ToolMesh]] = {}
 
 
-def _start(layer: SoftLayer) -> None:
-    global _simulator
+def stand_beside() -> None:
+    """What a process beside the node does first: it ends with the node, and yields to it."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C goes to the node, which ends this process
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)
     threading.Thread(target=_end_with_the_node, daemon=True).start()
     os.nice(YIELDS)
+
+
+def _start(layer: SoftLayer) -> None:
+    global _simulator
+    stand_beside()
     _simulator = Simulator(layer, Zero())
 
 

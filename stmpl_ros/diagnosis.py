@@ -1,0 +1,88 @@
+"""Diagnosis: what the node tells of itself once a second on /diagnostics."""
+
+from __future__ import annotations
+
+import time
+from collections import Counter, deque
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+
+from stmpl_ros.limits import ADVISORY, Limits
+
+RECENT = 1000  # answers that the times are of
+
+
+@dataclass
+class Tally:
+    """What is counted between two reports, and since the start.
+
+    Attributes:
+        refused, stale: messages that could not be used, and that were too old.
+        last_refusal: why the last one was refused.
+        answers: given since the start.
+        methods: answers since the last report, by method.
+        solve_times: of recent answers [s].
+        latencies: of recent answers, from the stamp of the pose to the answer's publication [s].
+    """
+
+    refused: int = 0
+    stale: int = 0
+    last_refusal: str = ""
+    answers: int = 0
+    methods: Counter[str] = field(default_factory=Counter)
+    solve_times: deque[float] = field(default_factory=lambda: deque(maxlen=RECENT))
+    latencies: deque[float] = field(default_factory=lambda: deque(maxlen=RECENT))
+    _reported: tuple[int, float] = field(default_factory=lambda: (0, time.monotonic()))
+
+    def values(self) -> dict[str, str]:
+        """The figures of a report; the next one counts from here."""
+        answers, since = self._reported
+        self._reported = self.answers, time.monotonic()
+        shares = {method: count / self.methods.total() for method, count in self.methods.items()}
+        self.methods.clear()
+        return {
+            "answers": str(self.answers),
+            "rate [Hz]": f"{(self.answers - answers) / max(self._reported[1] - since, 1e-9):.1f}",
+            **_percentiles("solve", self.solve_times),
+            **_percentiles("latency", self.latencies),
+            "methods": ", ".join(f"{method} {share:.0%}" for method, share in shares.items()),
+            "dropped, stale": str(self.stale),
+            "refused": str(self.refused),
+            "last refusal": self.last_refusal,
+        }
+
+
+def _percentiles(what: str, seconds: deque[float]) -> dict[str, str]:
+    milliseconds = 1e3 * np.array(seconds or [0.0])
+    median, worst = np.percentile(milliseconds, [50, 99])
+    return {f"{what} median [ms]": f"{median:.3f}", f"{what} p99 [ms]": f"{worst:.3f}"}
+
+
+def skin_status(node: str, values: Mapping[str, str], bad: bool, fading: bool) -> DiagnosticStatus:
+    """How answering goes."""
+    message = "some messages were refused, dropped or lost" if bad else "answering"
+    message = "input has stopped: the last answer fades, or is at rest" if fading else message
+    return _status(f"{node}: skin", bad or fading, message, values)
+
+
+def limits_status(node: str, limits: Limits) -> DiagnosticStatus:
+    """How much of the limits was used since the last report."""
+    warn, values = limits.take()
+    message = f"at least {limits.warn_at:.0%} of a limit is used" if warn else "within the limits"
+    return _status(f"{node}: limits", warn, f"{message} ({ADVISORY})", values)
+
+
+def _status(name: str, warn: bool, message: str, values: Mapping[str, str]) -> DiagnosticStatus:
+    level = DiagnosticStatus.WARN if warn else DiagnosticStatus.OK
+    told = [KeyValue(key=key, value=str(value)) for key, value in values.items()]
+    return DiagnosticStatus(level=level, name=name, message=message, hardware_id="stmpl", values=told)
+
+
+def diagnostics(statuses: list[DiagnosticStatus], now) -> DiagnosticArray:
+    """The statuses as one message, stamped `now` (builtin_interfaces/Time)."""
+    message = DiagnosticArray(status=statuses)
+    message.header.stamp = now
+    return message

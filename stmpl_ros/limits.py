@@ -1,0 +1,85 @@
+"""Limits: how much of a body region's pressure and force limits the contacts use. Advisory, not a safety function."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from ruamel.yaml import YAML, YAMLError
+
+from stmpl_core.errors import InvalidInput
+from stmpl_core.trust import Displacement
+
+ADVISORY = "advisory, not a safety function"
+
+
+class Limit(BaseModel):
+    """What one region bears, and who says so."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    pressure_kpa: float = Field(gt=0, description="largest pressure [kPa]")
+    force_n: float = Field(gt=0, description="largest force of one contact [N]")
+    source: str = Field(min_length=1, description="where the figures are from")
+
+
+class LimitsFile(BaseModel):
+    """A limits file."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    warn_at: float = Field(default=0.8, gt=0, le=1, description="share of a limit from which on it is a warning")
+    regions: dict[str, Limit]
+
+
+class Limits:
+    """The largest shares since they were last asked for.
+
+    Args:
+        region: the body part that answers.
+        limit: that holds there.
+        warn_at: share from which on it is a warning.
+    """
+
+    def __init__(self, region: str, limit: Limit, warn_at: float) -> None:
+        self.region, self.limit, self.warn_at = region, limit, warn_at
+        self.pressure_share = self.force_share = 0.0
+
+    @classmethod
+    def read(cls, path: str, region: str) -> Limits | None:
+        """The limits of a region by a YAML file; None if `path` is empty. Raises InvalidInput."""
+        if not path:
+            return None
+        try:
+            file = LimitsFile.model_validate(YAML(typ="safe").load(Path(path).read_text()))
+        except (OSError, UnicodeDecodeError, YAMLError) as error:
+            raise InvalidInput(f"limits file {path}: {error}") from error
+        except ValidationError as error:
+            said = "; ".join(f"{'.'.join(map(str, e['loc'])) or 'file'}: {e['msg']}" for e in error.errors())
+            raise InvalidInput(f"limits file {path}: {said}. See config/limits.yaml.") from error
+        if region not in file.regions:
+            raise InvalidInput(f"limits file {path} has no region '{region}'; it has {', '.join(file.regions)}.")
+        return cls(region, file.regions[region], file.warn_at)
+
+    def put(self, answer: Displacement) -> None:
+        """Takes an answer. Force is what each contact presses with, by itself."""
+        if answer.pressure is not None:
+            peak = 1e-3 * float(np.max(answer.pressure, initial=0.0))
+            self.pressure_share = max(self.pressure_share, peak / self.limit.pressure_kpa)
+        force = max((answer.trust.figures.get(f"{tool}.normal_n", 0.0) for tool in answer.statuses), default=0.0)
+        self.force_share = max(self.force_share, force / self.limit.force_n)
+
+    def take(self) -> tuple[bool, dict[str, str]]:
+        """Whether to warn, and what to tell, of the time since the last call."""
+        told = {
+            "region": self.region,
+            "share of the pressure limit [%]": f"{100 * self.pressure_share:.3g}",
+            "share of the force limit [%]": f"{100 * self.force_share:.3g}",
+            "pressure limit [kPa]": f"{self.limit.pressure_kpa:g}",
+            "force limit [N]": f"{self.limit.force_n:g}",
+            "source": self.limit.source,
+        }
+        warn = max(self.pressure_share, self.force_share) >= self.warn_at
+        self.pressure_share = self.force_share = 0.0
+        return warn, told

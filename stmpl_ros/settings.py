@@ -1,0 +1,118 @@
+"""Settings: a NodeConfig as the parameters of a node, declared with what its fields say and checked whenever set."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Sequence
+from typing import Any, get_args
+
+from pydantic import ValidationError
+from pydantic.fields import FieldInfo
+from rcl_interfaces.msg import FloatingPointRange, ParameterDescriptor, SetParametersResult
+from rclpy.exceptions import InvalidParameterTypeException, InvalidParameterValueException
+from rclpy.lifecycle import LifecycleNode
+from rclpy.parameter import Parameter
+
+from stmpl_core.errors import InvalidInput
+from stmpl_ros.parameters import ANY_TIME, CONFIGURING, NodeConfig
+
+WHEN = {
+    "any time": "A running node takes it over at once.",
+    "configuring": "Counts when the node is configured.",
+    "starting": "Counts from the start.",
+}
+
+
+class Settings:
+    """The settings as they are now.
+
+    Args:
+        node: that declares them.
+        config: its values, which ROS overrides.
+        on_change: called with the new settings once a running node took some over.
+
+    Attributes:
+        config: the settings.
+        locked: whether the node is configured, so that what counts then cannot be set now.
+
+    Raises:
+        InvalidInput: ROS overrides a parameter with what its field does not allow.
+    """
+
+    def __init__(self, node: LifecycleNode, config: NodeConfig, on_change: Callable[[NodeConfig], None]) -> None:
+        self._node, self._on_change = node, on_change
+        self.locked = False
+        values = {}
+        for name, field in NodeConfig.model_fields.items():
+            try:
+                declared = node.declare_parameter(name, getattr(config, name), described(field))
+            except (InvalidParameterValueException, InvalidParameterTypeException) as error:
+                raise InvalidInput(f"parameter {name}: {error}") from error
+            values[name] = declared.value
+        self.config = checked(values)
+        node.add_on_set_parameters_callback(self._check)
+        node.add_post_set_parameters_callback(self._take)
+
+    def with_(self, **changes: Any) -> NodeConfig:
+        """The settings with `changes`. Raises InvalidInput."""
+        return checked(self.config.model_dump() | changes)
+
+    def take(self, config: NodeConfig) -> None:
+        """Sets the parameters to what a running node answers with by now."""
+        locked, self.locked = self.locked, False
+        try:
+            changed = {k: v for k, v in config.model_dump().items() if getattr(self.config, k) != v}
+            self._node.set_parameters([Parameter(name, value=value) for name, value in changed.items()])
+        finally:
+            self.locked = locked
+
+    def _check(self, parameters: Sequence[Parameter]) -> SetParametersResult:
+        changes = self._ours(parameters)
+        try:
+            self.with_(**changes)
+        except InvalidInput as error:
+            return SetParametersResult(successful=False, reason=str(error))
+        late = sorted(changes.keys() & NodeConfig.names(CONFIGURING))
+        if late and self.locked:
+            reason = f"{', '.join(late)} count when the node is configured: call ~/set_body, or clean up first."
+            return SetParametersResult(successful=False, reason=reason)
+        return SetParametersResult(successful=True)
+
+    def _take(self, parameters: Sequence[Parameter]) -> None:
+        changes = self._ours(parameters)
+        if changes:
+            self.config = self.with_(**changes)
+            if changes.keys() & NodeConfig.names(ANY_TIME):
+                self._on_change(self.config)
+
+    def _ours(self, parameters: Sequence[Parameter]) -> dict[str, Any]:
+        return {one.name: one.value for one in parameters if one.name in NodeConfig.model_fields}
+
+
+def checked(values: dict[str, Any]) -> NodeConfig:
+    """The settings of these values. Raises InvalidInput, which says what is wrong with each."""
+    try:
+        return NodeConfig(**values)
+    except ValidationError as error:
+        said = [f"{'.'.join(map(str, e['loc']))} is {e['input']!r}: {e['msg']}" for e in error.errors()]
+        raise InvalidInput("; ".join(said)) from error
+
+
+def described(field: FieldInfo) -> ParameterDescriptor:
+    """What `ros2 param describe` says of a field: unit, range, what else holds, and when it counts."""
+    extra = field.json_schema_extra
+    when = str(extra["when"]) if isinstance(extra, dict) else "starting"
+    bounds = {name: getattr(m, name) for m in field.metadata for name in ("gt", "ge", "lt", "le") if hasattr(m, name)}
+    constraints = [f"{said} {bounds[name]:g}" for name, said in (("gt", "above"), ("lt", "below")) if name in bounds]
+    if field.annotation not in (str, float, bool):
+        constraints = ["one of: " + ", ".join(get_args(field.annotation))]
+    span = FloatingPointRange(
+        from_value=float(bounds.get("ge", bounds.get("gt", -sys.float_info.max))),
+        to_value=float(bounds.get("le", bounds.get("lt", sys.float_info.max))),
+    )
+    return ParameterDescriptor(
+        description=f"{field.description}. {WHEN[when]}",
+        additional_constraints="; ".join(constraints),
+        floating_point_range=[span] if field.annotation is float else [],
+        read_only=when == "starting",
+    )

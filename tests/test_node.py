@@ -1,0 +1,584 @@
+"""Laws of the node as a robot team meets it: parameters, services, other frames, outputs, lifecycle, QoS, launch."""
+
+import ast
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections import defaultdict
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+os.environ["ROS_DOMAIN_ID"] = os.environ.setdefault("STMPL_TEST_BUS", str(1 + os.getpid() % 100))  # its children's too
+os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
+
+import rclpy
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from geometry_msgs.msg import Point, PoseStamped, WrenchStamped
+from lifecycle_msgs.msg import Transition
+from lifecycle_msgs.srv import ChangeState
+from rcl_interfaces.msg import Log
+from rcl_interfaces.msg import Parameter as ParameterMessage
+from rcl_interfaces.srv import DescribeParameters, GetParameters, SetParameters
+from rclpy.duration import Duration
+from rclpy.event_handler import SubscriptionEventCallbacks
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.parameter import Parameter, parameter_value_to_python
+from rclpy.qos import LivelinessPolicy, QoSProfile
+from ruamel.yaml import YAML
+from scipy.spatial.transform import Rotation
+from sensor_msgs.msg import PointCloud2
+from shape_msgs.msg import Mesh, MeshTriangle
+from std_srvs.srv import Trigger
+from stmpl_msgs.msg import ContactMesh, SkinDisplacement, SkinTopology
+from stmpl_msgs.srv import SetBody
+
+from bags.messages import layer_from, layer_id, stamp_ns
+from stmpl_core.errors import InvalidInput
+from stmpl_core.touch import BY_POSE, TOUCHING
+from stmpl_core.trust import Displacement, Trust
+from stmpl_ros.cloud import FIELDS, SkinCloud
+from stmpl_ros.conversions import STALE, mesh_message, pose_message, wrench_message
+from stmpl_ros.frames import Frames, read_frames
+from stmpl_ros.limits import Limits
+from stmpl_ros.node import SkinNode
+from stmpl_ros.parameters import NodeConfig
+from stmpl_ros.settings import checked
+from stmpl_ros.topics import KEPT, LEASE, STREAM
+from tests.touch_scenes import LENGTH, RADIUS, at, ball, limb
+
+ROOT = Path(__file__).parents[1]
+PATIENCE = 60.0  # s to wait for anything; only a failing test waits so long
+TOUCH = RADIUS + 0.012 - 1e-3  # m from the limb's axis: a ball of 12 mm, 1 mm deep
+NODE = """
+import sys
+from stmpl_ros.node import run
+from stmpl_ros.parameters import NodeConfig
+from tests.test_node import skin
+sys.exit(run(NodeConfig(rest_after=0.4, fade=0.6), sys.argv[1:], build=skin))
+"""
+
+
+def skin(config: NodeConfig):
+    """A limb of the settings' thickness and stiffness; `thickness` 0.05 m is more than it bears."""
+    if config.thickness > 0.04:
+        raise InvalidInput("thicker than the limb")
+    return limb(4e-3, config.thickness).with_(youngs_modulus=config.youngs_modulus)
+
+
+@contextmanager
+def running(command: list[str], number: int = signal.SIGTERM):
+    """A process that ends cleanly when asked to."""
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, cwd=ROOT)
+    try:
+        yield process
+        process.send_signal(number)
+        said, _ = process.communicate(timeout=PATIENCE)
+        assert process.returncode == (0 if number != signal.SIGKILL else -signal.SIGKILL), said
+    finally:
+        if process.poll() is None:
+            process.kill()
+            print(process.communicate()[0])
+
+
+class Bus:
+    """A robot's side: a tool that it moves, what it hears, and what it asks."""
+
+    def __init__(self, space: str = "") -> None:
+        self.space, self.got = space, defaultdict(list)
+        self.node = rclpy.create_node("robot", namespace=space or "/")
+        self.mesh = self.node.create_publisher(ContactMesh, "contact_mesh", KEPT)
+        self.listen(SkinTopology, "skin/topology", KEPT)
+        self.listen(SkinDisplacement, "skin/displacement", STREAM)
+        self.listen(Log, "/rosout", KEPT)
+
+    def listen(self, kind, topic, profile, **more):
+        return self.node.create_subscription(kind, topic, self.got[topic].append, profile, **more)
+
+    def now(self) -> int:
+        return self.node.get_clock().now().nanoseconds
+
+    def spin(self, seconds: float) -> None:
+        until = time.monotonic() + seconds
+        while time.monotonic() < until:
+            rclpy.spin_once(self.node, timeout_sec=0.02)
+
+    def wait(self, done, what: str):
+        until = time.monotonic() + PATIENCE
+        while not (found := done()):
+            assert time.monotonic() < until, f"waited {PATIENCE} s for {what}"
+            rclpy.spin_once(self.node, timeout_sec=0.02)
+        return found
+
+    def call(self, kind, name: str, **fields):
+        """The answer of a service of the node."""
+        client = self.node.create_client(kind, f"stmpl/{name}")
+        self.wait(client.service_is_ready, name)
+        future = client.call_async(kind.Request(**fields))
+        self.wait(future.done, f"an answer of {name}")
+        self.node.destroy_client(client)
+        return future.result()
+
+    def set(self, **values) -> list:
+        parameters = [Parameter(name, value=value).to_parameter_msg() for name, value in values.items()]
+        return self.call(SetParameters, "set_parameters", parameters=parameters).results
+
+    def get(self, *names: str) -> list:
+        return [parameter_value_to_python(v) for v in self.call(GetParameters, "get_parameters", names=names).values]
+
+    def still(self) -> None:
+        """Waits until the skin is at rest, so that no other tool is waited for."""
+        self.wait(lambda: not (said := self.got["skin/displacement"]) or not said[-1].tools, "rest")
+
+    def tool(self, name: str) -> "Hand":
+        return Hand(self, name)
+
+    def said(self, text: str) -> list[str]:
+        return [line.msg for line in self.got["/rosout"] if text in line.msg]
+
+
+class Hand:
+    """A tool on the bus."""
+
+    def __init__(self, bus: Bus, name: str, announce: bool = True) -> None:
+        self.bus, self.name = bus, name
+        self.pose = bus.node.create_publisher(PoseStamped, f"tools/{name}/pose", STREAM)
+        self.wrench = bus.node.create_publisher(WrenchStamped, f"tools/{name}/wrench", STREAM)
+        if announce:
+            bus.mesh.publish(mesh_message(name, ball(), bus.now()))
+
+    def ready(self) -> "Hand":
+        self.bus.wait(lambda: self.pose.get_subscription_count() and self.wrench.get_subscription_count(), "the node")
+        return self
+
+    def send(self, pose: np.ndarray, wrench: np.ndarray | None = None, frame: str = "body") -> int:
+        stamp = self.bus.now()
+        if wrench is not None:
+            self.wrench.publish(wrench_message(wrench, frame, stamp))
+        self.pose.publish(pose_message(pose, frame, stamp))
+        return stamp
+
+    def press(self, depth: float = 1e-3) -> int:
+        return self.send(at(RADIUS + 0.012 - depth, 0, LENGTH / 2))
+
+    def ask(self, *pose_and_wrench, frame: str = "body") -> SkinDisplacement:
+        """Sends one instant and waits for its answer."""
+        stamp = self.send(*pose_and_wrench, frame=frame)
+        found = lambda: [a for a in self.bus.got["skin/displacement"] if stamp_ns(a) == stamp]  # noqa: E731
+        return self.bus.wait(found, f"the answer to {stamp}")[0]
+
+
+HERE = at(TOUCH, 0, LENGTH / 2)
+PUSH = np.array([-0.03, 0, 0, 0, 0, 0])
+
+
+def rows(answer: SkinDisplacement) -> np.ndarray:
+    return np.frombuffer(answer.displacement, np.float32).reshape(-1, 3)
+
+
+@pytest.fixture(scope="module")
+def bus(tmp_path_factory):
+    """A node on a limb in a namespace, with limits, frames, and a tool that announces itself as shape_msgs/Mesh."""
+    folder = tmp_path_factory.mktemp("node")
+    (folder / "limits.yaml").write_text("regions:\n  left_arm: {pressure_kpa: 0.05, force_n: 100, source: this test}\n")
+    (folder / "frames.yaml").write_text("table: {position: [0, 0, 0.1], orientation: [0, 0, 1, 0]}\n")
+    files = [f"{name}:={folder}/{name}.yaml" for name in ("limits", "frames")]
+    given = [part for one in (*files, "shape_tools:=shaped") for part in ("-p", one)]
+    rclpy.init()
+    made = Bus("/robot")
+    try:
+        with running([sys.executable, "-c", NODE, "--ros-args", "-r", "__ns:=/robot", *given]):
+            made.wait(lambda: made.got["skin/topology"], "skin/topology")
+            yield made
+    finally:
+        made.node.destroy_node()
+        rclpy.shutdown()
+
+
+@pytest.fixture(scope="module")
+def hand(bus):
+    return bus.tool("probe").ready()
+
+
+# Parameters
+
+
+def test_the_yaml_holds_every_parameter_with_its_default():
+    read = YAML(typ="safe").load((ROOT / "config/stmpl.yaml").read_text())["/**"]["ros__parameters"]
+    assert read == NodeConfig().model_dump(mode="json")
+    assert {name: type(value) for name, value in read.items()} == {n: type(v) for n, v in NodeConfig()}
+
+
+def test_a_parameter_says_its_unit_its_range_and_when_it_counts(bus):
+    asked = ["edge_length", "max_age", "frame", "method"]
+    edge, age, frame, method = bus.call(DescribeParameters, "describe_parameters", names=asked).descriptors
+    assert "[m]" in edge.description and "configured" in edge.description and edge.additional_constraints == "above 0"
+    assert (edge.floating_point_range[0].from_value, edge.floating_point_range[0].to_value) == (0, 0.05)
+    assert "at once" in age.description and not age.read_only
+    assert frame.read_only and "moment_net" in method.additional_constraints
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        ({"rest_after": 0.0}, "rest_after"),
+        ({"marker_rate": -1.0}, "range"),
+        ({"max_age": "old"}, "type"),
+        ({"frame": "world"}, "read-only"),
+        ({"youngs_modulus": 2e3}, "set_body"),
+    ],
+)
+def test_a_parameter_that_cannot_be_taken_is_refused_and_told_why(bus, change, says):
+    (result,) = bus.set(**change)
+    assert not result.successful and says in result.reason
+
+
+def test_a_running_node_honours_what_may_be_set_at_any_time(bus, hand):
+    hand.ask(HERE, PUSH)
+    old = bus.now() - 5 * 10**9
+    assert bus.set(max_age=0.0, fade=0.0)[0].successful
+    hand.ask(HERE, PUSH)
+    bus.still()
+    assert not [a for a in bus.got["skin/displacement"][-2:] if STALE in a.statuses], "fade 0 rests at once"
+    hand.pose.publish(pose_message(HERE, "body", old))
+    bus.wait(lambda: [a for a in bus.got["skin/displacement"] if stamp_ns(a) == old], "the answer to an old stamp")
+    assert bus.set(max_age=1.0, fade=0.6)[0].successful
+    assert bus.get("max_age", "fade") == [1.0, 0.6]
+
+
+def test_settings_that_cannot_be_are_refused_with_what_is_wrong():
+    with pytest.raises(InvalidInput, match=r"edge_length is 3.0: .*0.05"):
+        checked({"edge_length": 3.0})
+    with pytest.raises(InvalidInput, match="'wheight' is no phenotype; known are gender"):
+        checked({"phenotype": "wheight=0.3"})
+    assert checked({"phenotype": "weight=0.7 muscle=0.3"}).phenotype_values == {"weight": 0.7, "muscle": 0.3}
+
+
+# Services
+
+
+def test_reset_brings_the_skin_to_rest_and_forgets_the_last_wrench(bus, hand):
+    hand.ask(HERE, PUSH)
+    before = len(bus.got["skin/displacement"])
+    answer = bus.call(Trigger, "reset")
+    assert answer.success and "at rest" in answer.message
+    rest = bus.wait(lambda: bus.got["skin/displacement"][before:], "the skin at rest")[0]
+    assert not rows(rest).any() and not rest.tools and "reset" in rest.why
+    again = hand.ask(HERE)
+    assert list(again.statuses) == [BY_POSE], "the wrench from before the reset is forgotten"
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [({"thickness": -1.0}, "thickness"), ({"poisson_ratio": 0.6}, "poisson_ratio"), ({"phenotype": "x=1"}, "known are"),
+     ({"edge_length": float("nan")}, "edge_length"), ({"part": "right_arm"}, "region")],
+)  # fmt: skip
+def test_a_body_that_cannot_be_is_refused_and_the_node_goes_on(bus, hand, change, says):
+    answer = bus.call(SetBody, "set_body", **change)
+    assert not answer.success and says in answer.message
+    assert list(hand.ask(HERE, PUSH).statuses) == [TOUCHING]
+
+
+def test_another_body_takes_over_while_the_node_goes_on_answering(bus, hand):
+    hand.ask(HERE, PUSH)
+    layers, before = len(bus.got["skin/topology"]), len(bus.got["skin/displacement"])
+    answer = bus.call(SetBody, "set_body", youngs_modulus=2e3, thickness=6e-3)
+    assert answer.success, answer.message
+    refused = bus.call(SetBody, "set_body", youngs_modulus=3e3)
+    assert not refused.success and "being made" in refused.message
+
+    def taken_over():
+        hand.press()
+        bus.spin(0.02)
+        return bus.got["skin/topology"][layers:]
+
+    topology = bus.wait(taken_over, "the other skin")[0]
+    layer = layer_from(topology)
+    assert layer.tissue.youngs_modulus == 2e3 and layer.thickness.max() == pytest.approx(6e-3)
+    assert topology.layer_id == layer_id(layer) != bus.got["skin/topology"][0].layer_id
+    meanwhile = [a for a in bus.got["skin/displacement"][before:] if a.layer_id != topology.layer_id]
+    assert len(meanwhile) > 10, "the old skin answered until the new one took over"
+    assert not [a for a in meanwhile if not a.tools], "nothing went to rest meanwhile"
+    assert hand.ask(HERE, PUSH).layer_id == topology.layer_id
+    assert bus.get("youngs_modulus", "thickness") == [2e3, 6e-3]
+
+
+def test_a_body_that_cannot_be_made_is_told_and_the_one_from_before_goes_on(bus, hand):
+    before = hand.ask(HERE, PUSH).layer_id
+    lines = len(bus.said("no other skin"))
+    assert bus.call(SetBody, "set_body", thickness=0.05).success, "only making it shows that it cannot be"
+    bus.wait(lambda: len(bus.said("no other skin")) > lines, "the log line")
+    assert "thicker than the limb" in bus.said("no other skin")[-1]
+    assert hand.ask(HERE, PUSH).layer_id == before
+    assert bus.get("thickness") != [0.05]
+
+
+# Input
+
+
+def test_poses_and_wrenches_in_a_listed_frame_count_as_in_the_bodys(bus, hand):
+    place = np.eye(4)
+    place[:3, :3], place[2, 3] = Rotation.from_euler("z", np.pi).as_matrix(), 0.1
+    own = hand.ask(HERE, PUSH)
+    turn = place[:3, :3].T
+    in_table = np.concatenate([turn @ PUSH[:3], turn @ PUSH[3:]])
+    answer = hand.ask(np.linalg.inv(place) @ HERE, in_table, frame="table")
+    assert answer.header.frame_id == "body" and list(answer.statuses) == [TOUCHING]
+    np.testing.assert_allclose(rows(answer), rows(own), atol=1e-7)
+
+
+@pytest.mark.parametrize("text", ["[1, 2]", "t: {position: [1, 2]}", "t: {orientation: [0, 0, 0, 2]}", "t: {pos: 1}",
+                                  "t: 3", "{", "t: {position: [1, 2, .nan]}"])  # fmt: skip
+def test_a_file_of_frames_that_cannot_be_read_is_refused(tmp_path, text):
+    (tmp_path / "frames.yaml").write_text(text)
+    with pytest.raises(InvalidInput, match=r"frames\.yaml"):
+        read_frames(str(tmp_path / "frames.yaml"))
+
+
+def test_the_example_of_frames_is_read_and_unknown_frames_stay_unknown():
+    frames = Frames("body", read_frames(str(ROOT / "config/frames.yaml")))
+    assert frames.of("table") is not None and frames.of("nowhere") is None
+    message = pose_message(np.eye(4), "nowhere", 0)
+    assert frames.pose(message) is message
+
+
+def test_a_tool_may_announce_itself_as_a_shape(bus, hand):
+    shape, mesh = Mesh(), ball()
+    shape.vertices = [Point(x=x, y=y, z=z) for x, y, z in mesh.vertices.tolist()]
+    shape.triangles = [MeshTriangle(vertex_indices=np.array(face, np.uint32)) for face in mesh.faces]
+    bus.still()
+    publisher = bus.node.create_publisher(Mesh, "tools/shaped/mesh", KEPT)
+    publisher.publish(shape)
+    shaped = Hand(bus, "shaped", announce=False).ready().ask(HERE)
+    bus.still()
+    assert list(shaped.tools) == ["shaped"]
+    np.testing.assert_array_equal(rows(shaped), rows(hand.ask(HERE)))
+
+
+def test_a_device_that_leaves_is_told_of(bus, hand):
+    bus.still()
+    tool = bus.tool("guest").ready()
+    tool.ask(HERE)
+    bus.node.destroy_publisher(tool.pose)
+    bus.node.destroy_publisher(tool.wrench)
+    bus.wait(lambda: bus.said("tools/guest/pose: the sender is gone"), "the log line")
+    bus.still()
+
+
+# Output
+
+
+def test_the_contact_wrench_is_what_the_pressure_of_the_answer_sums_to(bus, hand):
+    ear = bus.listen(WrenchStamped, "tools/probe/contact_wrench", STREAM)
+    heard = bus.got["tools/probe/contact_wrench"]
+
+    def both():
+        stamp = hand.send(HERE)
+        bus.spin(0.05)
+        answers = [a for a in bus.got["skin/displacement"] if stamp_ns(a) == stamp]
+        wrenches = [w for w in heard if stamp_ns(w) == stamp]
+        return (answers[0], wrenches[0]) if answers and wrenches else None
+
+    answer, wrench = bus.wait(both, "a contact wrench")
+    layer = layer_from(bus.got["skin/topology"][-1])
+    force = -(np.frombuffer(answer.pressure, np.float32) @ layer.vertex_area_vectors)
+    f = wrench.wrench.force
+    assert wrench.header.frame_id == "body" and f.x < 0, "the tool pushes the skin inwards"
+    np.testing.assert_allclose([f.x, f.y, f.z], force, atol=0.02 * np.linalg.norm(force))
+    bus.wait(lambda: heard[-1].wrench.force.x == 0, "nothing presses any more")
+    bus.node.destroy_subscription(ear)
+
+
+def test_a_cloud_holds_the_moved_skin_its_displacement_and_its_pressure():
+    layer, rng = limb(8e-3), np.random.default_rng(1)
+    move, pressure = rng.normal(0, 1e-3, layer.vertices.shape), rng.uniform(0, 900, len(layer.vertices))
+    answer = Displacement(move, Trust(), "any", pressure)
+    cloud = SkinCloud(layer, "body").frame(answer, 5)
+    values = np.frombuffer(cloud.data, np.float32).reshape(cloud.width, -1)
+    assert [f.name for f in cloud.fields] == list(FIELDS) and cloud.row_step == len(cloud.data) == 20 * cloud.width
+    np.testing.assert_allclose(values[:, :3], layer.vertices + move, atol=1e-7)
+    np.testing.assert_allclose(values[:, 3], 1e3 * answer.magnitude, rtol=1e-5)
+    np.testing.assert_allclose(values[:, 4], 1e-3 * pressure, rtol=1e-5)
+
+
+def test_the_cloud_comes_while_somebody_looks(bus, hand):
+    ear = bus.listen(PointCloud2, "skin/points", 1)
+
+    def heard():
+        hand.press()
+        bus.spin(0.05)
+        return bus.got["skin/points"]
+
+    cloud = bus.wait(heard, "skin/points")[-1]
+    assert cloud.header.frame_id == "body" and cloud.width == len(layer_from(bus.got["skin/topology"][-1]).vertices)
+    bus.node.destroy_subscription(ear)
+
+
+def test_the_diagnostics_tell_how_much_of_a_limit_is_used(bus, hand):
+    ear = bus.listen(DiagnosticArray, "/diagnostics", STREAM)
+
+    def told():
+        hand.send(HERE, PUSH)
+        bus.spin(0.02)
+        found = [s for m in bus.got["/diagnostics"] for s in m.status if s.name == "/robot/stmpl: limits"]
+        return [s for s in found if s.level == DiagnosticStatus.WARN]
+
+    status = bus.wait(told, "a warning")[-1]
+    values = {v.key: v.value for v in status.values}
+    assert "not a safety function" in status.message and values["source"] == "this test"
+    assert float(values["share of the pressure limit [%]"]) > 80
+    assert float(values["share of the force limit [%]"]) == pytest.approx(0.03, rel=0.2)
+    bus.node.destroy_subscription(ear)
+
+
+def test_every_limit_that_ships_names_its_source_and_covers_every_part():
+    from stmpl_core.body import PARTS
+
+    path = str(ROOT / "config/limits.yaml")
+    for part in PARTS:
+        limits = Limits.read(path, part)
+        assert limits and limits.limit.source
+    strict = {side: Limits.read(path, side).limit for side in ("left_arm", "left_upper_arm", "left_forearm")}
+    for figure in ("pressure_kpa", "force_n"):
+        parts = [getattr(strict[part], figure) for part in ("left_upper_arm", "left_forearm")]
+        assert getattr(strict["left_arm"], figure) == min(parts)
+
+
+def test_limits_that_cannot_be_read_are_refused(tmp_path):
+    path = tmp_path / "limits.yaml"
+    path.write_text("regions: {left_arm: {pressure_kpa: -1, force_n: 3, source: x}}")
+    with pytest.raises(InvalidInput, match=r"left_arm.pressure_kpa"):
+        Limits.read(str(path), "left_arm")
+    with pytest.raises(InvalidInput, match="no region 'head'; it has"):
+        Limits.read(str(ROOT / "config/limits.yaml"), "head")
+    assert Limits.read("", "left_arm") is None
+
+
+# Lifecycle and QoS
+
+
+def test_a_node_may_be_cleaned_up_set_up_anew_and_answers_on_what_was_set(bus, hand):
+    hand.ask(HERE, PUSH)
+
+    def go(transition: int) -> None:
+        assert bus.call(ChangeState, "change_state", transition=Transition(id=transition)).success
+
+    go(Transition.TRANSITION_DEACTIVATE)
+    assert not bus.call(Trigger, "reset").success
+    go(Transition.TRANSITION_CLEANUP)
+    assert bus.set(youngs_modulus=1500.0)[0].successful
+    layers = len(bus.got["skin/topology"])
+    go(Transition.TRANSITION_CONFIGURE)
+    go(Transition.TRANSITION_ACTIVATE)
+    topology = bus.wait(lambda: bus.got["skin/topology"][layers:], "the topology")[-1]
+    assert topology.youngs_modulus == 1500
+    hand.ready()  # its mesh was kept for late listeners
+    before = len(bus.got["skin/displacement"])
+    answer = hand.ask(HERE, PUSH)
+    assert answer.layer_id == topology.layer_id and len(bus.got["skin/displacement"]) == before + 1, "answered once"
+
+
+def test_the_node_runs_beside_another_in_any_executor():
+    """In this process: SkinNode is an ordinary node to whoever composes."""
+    context = rclpy.Context()
+    context.init(domain_id=int(os.environ["ROS_DOMAIN_ID"]) + 100)
+    executor = SingleThreadedExecutor(context=context)
+    node = SkinNode(NodeConfig(), skin, context=context)
+    other = rclpy.create_node("other", context=context)
+    heard: list[SkinDisplacement] = []
+    other.create_subscription(SkinDisplacement, "skin/displacement", heard.append, STREAM)
+    mesh = other.create_publisher(ContactMesh, "contact_mesh", KEPT)
+    pose = other.create_publisher(PoseStamped, "tools/finger/pose", STREAM)
+    try:
+        executor.add_node(node)
+        executor.add_node(other)
+        node.trigger_configure()
+        node.trigger_activate()
+        mesh.publish(mesh_message("finger", ball(), 0))
+        until = time.monotonic() + PATIENCE
+        while not heard and time.monotonic() < until:
+            pose.publish(pose_message(HERE, "body", other.get_clock().now().nanoseconds))
+            executor.spin_once(timeout_sec=0.02)
+        assert heard and rows(heard[-1]).any()
+    finally:
+        executor.shutdown()
+        node.destroy_node()
+        other.destroy_node()
+        context.try_shutdown()
+
+
+def test_a_remapped_topic_is_heard_and_a_killed_node_is_told_by_its_liveliness(bus):
+    gone: list[int] = []
+    ask = QoSProfile(depth=10, liveliness=LivelinessPolicy.AUTOMATIC,
+                     liveliness_lease_duration=Duration(seconds=2 * LEASE))  # fmt: skip
+    told = SubscriptionEventCallbacks(liveliness=lambda event: gone.append(event.alive_count))
+    remaps = ["-r", "__ns:=/other", "-r", "skin/topology:=/arm_skin", "--params-file", "config/stmpl.yaml",
+              "-p", "edge_length:=0.01"]  # fmt: skip
+    ear = bus.listen(SkinTopology, "/arm_skin", KEPT)
+    listening = bus.listen(SkinDisplacement, "/other/skin/displacement", ask, event_callbacks=told)
+    with running([sys.executable, "-c", NODE, "--ros-args", *remaps], signal.SIGKILL):
+        bus.wait(lambda: bus.got["/arm_skin"], "the topology under its other name")
+        bus.wait(lambda: gone and gone[-1] == 1, "a live node")
+    bus.wait(lambda: gone[-1] == 0, "the event that it is gone")
+    for subscription in (ear, listening):
+        bus.node.destroy_subscription(subscription)
+
+
+@pytest.mark.parametrize("given", ["edge_length:=3.0", "edge_length:=fine", "limits:=/nowhere.yaml"])
+def test_a_node_with_settings_that_cannot_be_ends_with_one_line(given):
+    done = subprocess.run([sys.executable, "-c", NODE, "--ros-args", "-p", given], capture_output=True, text=True,
+                          cwd=ROOT, timeout=PATIENCE)  # fmt: skip
+    assert done.returncode == 1
+    said = done.stdout + done.stderr
+    assert given.split(":=")[0] in said and "Traceback" not in said
+
+
+def test_the_bus_knows_no_parameter_that_is_not_declared(bus):
+    result = bus.call(SetParameters, "set_parameters", parameters=[ParameterMessage(name="no_such")]).results
+    assert not result[0].successful
+
+
+# What is asked of devices, and launch files
+
+
+def test_a_device_that_offers_no_deadline_is_told_why_it_is_not_heard_and_one_that_misses_its_own_is_told_of(bus):
+    """A node of its own, which asks for poses at least every 0.2 s."""
+    strict = Bus("/strict")
+    offering = QoSProfile(depth=10, deadline=Duration(seconds=0.1))
+    try:
+        with running([sys.executable, "-c", NODE, "--ros-args", "-r", "__ns:=/strict", "-p", "deadline:=0.2"]):
+            strict.wait(lambda: strict.got["skin/topology"], "skin/topology")
+            hand = strict.tool("probe")
+            strict.wait(lambda: strict.said("tools/probe/pose: a sender is not heard"), "the log line")
+            assert "DEADLINE" in strict.said("a sender is not heard")[-1]
+            strict.node.destroy_publisher(hand.pose)
+            hand.pose = strict.node.create_publisher(PoseStamped, "tools/probe/pose", offering)
+            hand.ready().ask(HERE)
+            strict.wait(lambda: strict.said("tools/probe/pose: the sender missed its deadline"), "the log line")
+    finally:
+        strict.node.destroy_node()
+
+
+@pytest.mark.parametrize("path", sorted((ROOT / "launch").glob("*.py")), ids=lambda path: path.name)
+def test_a_launch_file_imports_only_launch_and_names_verbs_and_flags_that_exist(path):
+    """It is read, not run: `launch` is found on ROS machines only."""
+    tree = ast.parse(path.read_text())
+    imported = {str(node.module).split(".")[0] for node in ast.walk(tree) if isinstance(node, ast.ImportFrom)}
+    assert imported <= {"launch", "launch_ros"}
+    assert not [node for node in ast.walk(tree) if isinstance(node, ast.Import)]
+    said = [node.value for node in ast.walk(tree) if isinstance(node, ast.Constant) and isinstance(node.value, str)]
+    verb = next(word for word in said if word in ("node", "probe"))
+    flags = {word for word in said if word.startswith("--")} - {"--ros-args", "--log-level"}
+    told = subprocess.run([sys.executable, "-m", "stmpl_ros.cli", verb, "--help"], capture_output=True, text=True)
+    assert told.returncode == 0 and all(flag in told.stdout for flag in flags)
+
+
+def test_everything_that_colcon_installs_is_there():
+    text = (ROOT / "setup.py").read_text()
+    for folder in ("launch", "config"):
+        for path in (ROOT / folder).iterdir():
+            assert f'"{folder}/{path.name}"' in text
