@@ -21,6 +21,7 @@ FORCING = 0.01  # of the linear solver: a step that is solved loosely is worse t
 SETTLED = 3  # passes that let the inside of each column follow its skin before the first step
 DAMPING = 0.7  # of these
 CLOSE = 0.1  # residual over load below which the answer counts as converged: it is then within 3 % where it moves
+LOST = 0.5  # residual over load from which what was started from is the better answer
 KEPT = 1.0  # thicknesses that a load may move before the patch is meshed anew
 
 
@@ -79,11 +80,14 @@ class FewSteps:
             return Displacement(zero, Trust(error_bound=0.0, why="no load"), self.name, pressure)
         patch = self._patch_for(load.loaded)
         system = self.fem.system(patch, load)
-        u = self._start(load, patch, system)
+        before = self.start.solve(load) if self.start else None
+        u = self._start(load, patch, system, before)
         result = newton(system, u, 1.0, self.settings)
         self._last = result.u
         answer = np.zeros_like(layer.vertices)
         answer[patch.vertices] = result.u[: len(patch.vertices), 0]
+        if before is not None and not result.residual < LOST:
+            answer = before.displacement
         ratio, limit = load.peak_ratio(layer), 2.0 if load.kind != "nodal" else 0.4
         discretisation, truncation = discretisation_error(system, result.u), truncation_error(patch, result.u, layer)
         bound = error_bound(discretisation, truncation, result.u, patch.mesh.layers, ratio)
@@ -110,14 +114,14 @@ class FewSteps:
         self._patch, self._last = self.fem.patch_around(loaded), None
         return self._patch
 
-    def _start(self, load: Load, patch: Patch, system: System) -> np.ndarray:
+    def _start(self, load: Load, patch: Patch, system: System, before: Displacement | None) -> np.ndarray:
         """Where Newton starts, (C, levels, 3) [m]."""
-        if self.start is None:
+        if before is None:
             if self._last is not None:
                 return self._last
             return self.fem.guess(system, patch.interpolate(load.pressure_on(prepared(self._layer, self))), 1.0)
         mesh = patch.mesh
-        skin = self.start.solve(load).displacement[patch.vertices]
+        skin = before.displacement[patch.vertices]
         depth = level_depths(mesh.layers)[None, :, None]
         u = mesh.on_columns(skin)[:, None] * (1 - depth)
         u[system.fixed] = 0.0

@@ -278,9 +278,9 @@ class Ladder:
                 break
             answer = self._ask(choice, load, scene)
             known = self.measured.methods[self.rungs[choice.rung].name]
+            options = [o for o in options if o.error < choice.error]
             choice = replace(choice, error=known.bound(scene, load.kind, self._unit(scene), answer.trust.error_bound))
             tried.append((choice, answer))
-            options = [o for o in options if o.error < choice.error]
             if outside or (answer.trust.ok and choice.error <= self.accuracy):
                 break
         sound = [pair for pair in tried if pair[1].trust.ok] or tried
