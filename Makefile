@@ -6,7 +6,7 @@ SHELL := /bin/bash
 VENV := .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
-BUILT_FROM := setup.py pyproject.toml msg_defs/pyproject.toml msg_defs/CMakeLists.txt $(wildcard msg_defs/msg/*.msg)
+BUILT_FROM := setup.py pyproject.toml msg_defs/pyproject.toml msg_defs/CMakeLists.txt $(wildcard msg_defs/msg/*.msg msg_defs/srv/*.srv)
 
 help:  ## Say what each target does
 	@echo "stmpl: real-time soft-tissue contact for robots"
