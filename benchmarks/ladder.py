@@ -70,8 +70,9 @@ def main() -> None:
                 bound[name][k] = answer.trust.error_bound or np.nan
                 if name in taken:
                     taken[name].append(answer.method)
-    table = Table(title=f"{options.path}: {len(loads)} frames; wish: {options.accuracy_mm:g} mm at any vertex"
-                        f", {options.deadline_ms:g} ms\n{layer}\n{machine()}, one thread", title_justify="left")  # fmt: skip
+    wished = f"{options.accuracy_mm:g} mm at any vertex, {options.deadline_ms:g} ms"
+    table = Table(title=f"{options.path}: {len(loads)} frames; wish: {wished}\n{layer}\n{machine()}, one thread",
+                  title_justify="left")  # fmt: skip
     for heading in ("method", "ms, median", "ms, p99", "largest error mm, median", "worst", "within the wish",
                     "error within its bound"):  # fmt: skip
         table.add_column(heading, justify="left" if heading == "method" else "right")

@@ -1,10 +1,11 @@
 """The node: ros2 launch stmpl_ros node.launch.py [namespace:=/robot] [params:=my.yaml] [autostart:=false]"""
 
-from launch import LaunchDescription
 from launch.actions import DeclareLaunchArgument
 from launch.substitutions import LaunchConfiguration, PathJoinSubstitution
 from launch_ros.actions import LifecycleNode
 from launch_ros.substitutions import FindPackageShare
+
+from launch import LaunchDescription
 
 ARGUMENTS = {
     "namespace": ("", "of node and topics"),

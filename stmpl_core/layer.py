@@ -92,6 +92,10 @@ class SoftLayer:
         self.chart = chart
         _check_surface(self)
 
+    def __getstate__(self) -> dict[str, Any]:
+        """For pickling: without what others keep on it."""
+        return {name: value for name, value in vars(self).items() if not name.startswith("_")}
+
     def with_(self, **changes: Any) -> SoftLayer:
         """A copy with `vertices`, `thickness`, `tissue` (or its fields) or `chart` changed."""
         material = {k: changes.pop(k) for k in ("youngs_modulus", "poisson_ratio", "density") if k in changes}

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import NamedTuple, Self
-from weakref import WeakKeyDictionary
 
 import numba
 import numpy as np
@@ -58,7 +57,7 @@ class Felt(NamedTuple):
         return self.figures[:, :, first : first + 2 * TENSORS].reshape(*self.figures.shape[:2], 2, TENSORS)
 
 
-_made: WeakKeyDictionary[SoftLayer, Surroundings] = WeakKeyDictionary()
+KEPT = "_surroundings"  # attribute of a layer that has them: they live and die with it
 
 
 class Surroundings:
@@ -111,9 +110,14 @@ class Surroundings:
     @classmethod
     def of(cls, layer: SoftLayer) -> Self:
         """The surroundings of a layer, made on the first call and kept as long as the layer is."""
-        if layer not in _made:
-            _made[layer] = cls(layer)
-        return _made[layer]  # type: ignore[return-value]
+        if KEPT not in vars(layer):
+            vars(layer)[KEPT] = cls(layer)
+        return vars(layer)[KEPT]
+
+    @staticmethod
+    def keep(near: Surroundings) -> None:
+        """Has `of` give these for their layer, from now on, if it has made none yet."""
+        vars(near.layer).setdefault(KEPT, near)
 
     def sinking(self, vertices: np.ndarray) -> np.ndarray:
         """How far vertex i sinks under a unit source at vertex j of those given, in thicknesses, (N, N) [-]."""

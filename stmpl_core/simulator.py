@@ -25,15 +25,16 @@ class Simulator:
 
     Args:
         layer: the soft layer at rest.
-        method: how to solve; it is prepared here.
+        method: how to solve; it is prepared here, unless
+        prepared: it was prepared for this very layer before.
 
     Attributes:
         toucher: finds what the tools do to the skin.
     """
 
-    def __init__(self, layer: SoftLayer, method: Method) -> None:
+    def __init__(self, layer: SoftLayer, method: Method, *, prepared: bool = False) -> None:
         self.layer = layer
-        self.method = method.prepare(layer)
+        self.method = method if prepared else method.prepare(layer)
         self.toucher = Toucher(layer)
         self._fields: WeakKeyDictionary[ToolMesh, SignedDistance] = WeakKeyDictionary()
 
@@ -83,7 +84,8 @@ class Simulator:
         if fitted.entered > ENTERED * float(self.layer.thickness.min()):
             trust = trust.also(f"skin is {fitted.entered * 1e3:.2f} mm inside a tool", in_range=False)
         statuses = {name: touch.status for name, touch in zip(names, touches, strict=True)}
-        return Displacement(fitted.displacement, trust, answer.method, load.values, statuses)
+        wrenches = {name: touch.wrench for name, touch in zip(names, touches, strict=True)}
+        return Displacement(fitted.displacement, trust, answer.method, load.values, statuses, wrenches)
 
 
 def _joined(trust: Trust, touches: dict[str, Touch], fitted: Conformed) -> Trust:

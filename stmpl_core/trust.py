@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from stmpl_core.arrays import PerVertex, VertexVectors
+from stmpl_core.arrays import PerVertex, VertexVectors, Wrench
 
 
 @dataclass(frozen=True)
@@ -53,6 +53,7 @@ class Displacement:
         method: name of the method that answered.
         pressure: the pressure that was solved for, (V,) [Pa], if the method or the simulator knows it.
         statuses: what was found of each contact, by its name ("touching", "wrench without touch", ...).
+        wrenches: what each tool exerts on the body, about its origin, in the layer's axes, (6,) [N, N m], by its name.
     """
 
     displacement: VertexVectors
@@ -60,6 +61,7 @@ class Displacement:
     method: str
     pressure: PerVertex | None = None
     statuses: Mapping[str, str] = field(default_factory=dict)
+    wrenches: Mapping[str, Wrench] = field(default_factory=dict)
 
     @property
     def magnitude(self) -> PerVertex:

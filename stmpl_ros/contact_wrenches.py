@@ -10,28 +10,8 @@ from rclpy.node import Node
 from rclpy.publisher import Publisher
 
 from stmpl_core.arrays import Wrench
-from stmpl_core.contact import Contact
-from stmpl_core.sdf import SignedDistance
-from stmpl_core.touch import Touch, Toucher
 from stmpl_ros.conversions import wrench_message
 from stmpl_ros.topics import STREAM
-
-
-class KeptTouches(Toucher):
-    """A Toucher that keeps what it found last.
-
-    Args:
-        toucher: whose columns and networks it takes over.
-    """
-
-    def __init__(self, toucher: Toucher) -> None:
-        self.__dict__.update(vars(toucher))
-        self.last: list[Touch] = []
-
-    def touch_all(self, contacts: Sequence[Contact], fields: Sequence[SignedDistance]) -> list[Touch]:
-        """See Toucher."""
-        self.last = super().touch_all(contacts, fields)
-        return self.last
 
 
 class ContactWrenches:

@@ -29,7 +29,6 @@ from stmpl_core.sdf import SignedDistance
 from stmpl_core.trust import Displacement
 from stmpl_ros.adapters import contact_mesh_of
 from stmpl_ros.background import Background
-from stmpl_ros.contact_wrenches import KeptTouches
 from stmpl_ros.conversions import NANO, checked_mesh, faded
 from stmpl_ros.diagnosis import Tally, diagnostics, limits_status, skin_status
 from stmpl_ros.events import Events
@@ -153,7 +152,6 @@ class SkinNode(LifecycleNode):
     def _answer_on(self, skin: Skin, background: Background) -> None:
         """From here on the answers are of this skin."""
         self.skin, self.simulator = skin, skin.simulator()
-        self.simulator.toucher = self.touches = KeptTouches(self.simulator.toucher)
         before, self.background = self.background, background
         if before:
             before.close()
@@ -350,9 +348,8 @@ class SkinNode(LifecycleNode):
         seconds = time.perf_counter() - started
         why = remarks(instant, answer, self.seen, self.config.rest_after, self.gate.say)
         self._send(answer, instant.stamp, instant.inputs, seconds=seconds, why=why)
-        wrenches = {tool: touch.wrench for tool, touch in zip(answer.statuses, self.touches.last, strict=True)}
         meshes = {name: self.inbox.tools[name].number for name in answer.statuses}
-        self.outputs.send_contacts(instant, answer, wrenches, meshes, self.config.local_rotations)
+        self.outputs.send_contacts(instant, answer, answer.wrenches, meshes, self.config.local_rotations)
         self.tally.solve_times.append(seconds)
         self.tally.latencies.append((self._now() - instant.stamp) / NANO)
         if self.limits:

@@ -13,11 +13,10 @@ from multiprocessing import get_context
 import numpy as np
 
 from bags.messages import layer_id
-from stmpl_core import moments
 from stmpl_core.contact import Contact, ToolMesh
 from stmpl_core.layer import SoftLayer, Tissue
-from stmpl_core.methods import Zero
 from stmpl_core.methods.base import Method
+from stmpl_core.moments import Surroundings
 from stmpl_core.simulator import Simulator
 from stmpl_ros.parameters import METHODS, NodeConfig
 from stmpl_ros.workshop import stand_beside
@@ -59,13 +58,13 @@ class Skin:
 
     layer: SoftLayer
     method: Method
-    near: moments.Surroundings
+    near: Surroundings
 
     @classmethod
     def of(cls, config: NodeConfig, build: Build = layer_of) -> Skin:
         """The skin that the settings ask for (seconds). Raises InvalidInput or MeshError."""
         layer = published(build(config))
-        return cls(layer, METHODS[config.method]().prepare(layer), moments.Surroundings.of(layer))
+        return cls(layer, METHODS[config.method]().prepare(layer), Surroundings.of(layer))
 
     @cached_property
     def layer_id(self) -> str:
@@ -74,10 +73,8 @@ class Skin:
 
     def simulator(self) -> Simulator:
         """Answers on it; what took long to prepare is not prepared again."""
-        moments._made.setdefault(self.layer, self.near)
-        simulator = Simulator(self.layer, Zero())
-        simulator.method = self.method
-        return simulator
+        Surroundings.keep(self.near)
+        return Simulator(self.layer, self.method, prepared=True)
 
 
 def warm_up(simulator: Simulator) -> None:

@@ -1,5 +1,9 @@
 """Laws of the linear response and of what a vertex feels: closed forms, superposition, and FEM at small loads."""
 
+import gc
+import pickle
+import weakref
+
 import numpy as np
 import pytest
 
@@ -119,3 +123,15 @@ def test_out_of_range_is_said_and_misuse_refused() -> None:
         method.solve(Load.pressure(np.zeros(3)))
     assert method.solve(disc(layer, [0.04, 0, 0.08], 0.05)).trust.ok
     assert not method.solve(disc(layer, [0.04, 0, 0.08], 0.5)).trust.in_range
+
+
+def test_what_was_made_of_a_layer_goes_with_it() -> None:
+    layer = arm(8e-3)
+    near = Surroundings.of(layer)
+    assert Surroundings.of(layer) is near
+    again = pickle.loads(pickle.dumps(near))
+    assert Surroundings.of(again.layer) is not near and np.array_equal(again.layer.vertices, layer.vertices)
+    gone = weakref.ref(layer)
+    del layer, near
+    gc.collect()
+    assert gone() is None
