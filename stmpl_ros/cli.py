@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 Json = Annotated[bool, tyro.conf.arg(name="json")]
 Flat = tyro.conf.arg(name="")  # a configuration whose fields are flags of the verb itself
 BagPath = Annotated[Path, tyro.conf.Positional]  # a run's folder, or its .mcap file
-MethodName = Literal["fem", "moment_net", "unet", "linear", "winkler", "naive"]
+MethodName = Literal["fem", "moment_net", "unet", "linear", "winkler", "naive", "ladder"]
 
 STABILITY_METHODS = ("moment_net", "linear", "winkler", "naive", "zero")  # of fem_tools.stability.METHODS, fast ones
 DEMO, NODE, PROBE, VIEW = DemoConfig(), NodeConfig(), ProbeConfig(), ViewConfig()

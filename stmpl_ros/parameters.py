@@ -12,8 +12,18 @@ from pydantic.config import JsonDict
 
 from stmpl_core.methods import Linear, Method, MomentNet, Naive, UNet, Winkler
 
+ACCURACY = 2e-4  # m
+
+
+def ladder(accuracy: float = ACCURACY, solve_time: float = 0.0) -> Method:
+    """The cheapest method that is accurate enough [m] in this time [s]; 0: there is time (fem_tools.calibrate)."""
+    from fem_tools.calibrate import ladder as by_measured_chart  # takes a second to import
+
+    return by_measured_chart(accuracy=accuracy, deadline=solve_time or None)
+
+
 METHODS: dict[str, Callable[[], Method]] = {
-    "moment_net": MomentNet, "unet": UNet, "linear": Linear, "winkler": Winkler, "naive": Naive
+    "moment_net": MomentNet, "unet": UNet, "linear": Linear, "winkler": Winkler, "naive": Naive, "ladder": ladder
 }  # fmt: skip
 
 
@@ -49,9 +59,17 @@ class NodeConfig(BaseModel):
     density: float = Field(
         default=1e3, gt=0, le=1e5, description="of the tissue [kg/m3]", json_schema_extra=CONFIGURING
     )
-    method: Literal["moment_net", "unet", "linear", "winkler", "naive"] = Field(
+    method: Literal["moment_net", "unet", "linear", "winkler", "naive", "ladder"] = Field(
         default="moment_net", description="that solves for the displacement", json_schema_extra=CONFIGURING
     )
+    accuracy: float = Field(
+        default=ACCURACY, gt=0, le=1, description="that the ladder is asked for, at any vertex [m]",
+        json_schema_extra=CONFIGURING,
+    )  # fmt: skip
+    solve_time: float = Field(
+        default=0.0, ge=0, le=3600, description="that the ladder may take for a solve; 0: as long as it needs [s]",
+        json_schema_extra=CONFIGURING,
+    )  # fmt: skip
     limits: str = Field(
         default="", description="YAML file of pressure and force limits, advisory; empty: none",
         json_schema_extra=CONFIGURING,
@@ -93,6 +111,10 @@ class NodeConfig(BaseModel):
     def _phenotype(cls, text: str) -> str:
         _shares(text)
         return text
+
+    def new_method(self) -> Method:
+        """The method, not yet prepared."""
+        return ladder(self.accuracy, self.solve_time) if self.method == "ladder" else METHODS[self.method]()
 
     @property
     def phenotype_values(self) -> dict[str, float]:

@@ -18,7 +18,7 @@ from stmpl_core.layer import SoftLayer, Tissue
 from stmpl_core.methods.base import Method
 from stmpl_core.moments import Surroundings
 from stmpl_core.simulator import Simulator
-from stmpl_ros.parameters import METHODS, NodeConfig
+from stmpl_ros.parameters import NodeConfig
 from stmpl_ros.workshop import stand_beside
 
 Build = Callable[[NodeConfig], SoftLayer]
@@ -64,7 +64,7 @@ class Skin:
     def of(cls, config: NodeConfig, build: Build = layer_of) -> Skin:
         """The skin that the settings ask for (seconds). Raises InvalidInput or MeshError."""
         layer = published(build(config))
-        return cls(layer, METHODS[config.method]().prepare(layer), Surroundings.of(layer))
+        return cls(layer, config.new_method().prepare(layer), Surroundings.of(layer))
 
     @cached_property
     def layer_id(self) -> str:

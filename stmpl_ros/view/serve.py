@@ -10,7 +10,6 @@ from rich.console import Console
 
 from fem_tools import RigidFem
 from stmpl_core.errors import InvalidInput
-from stmpl_ros.parameters import METHODS
 from stmpl_ros.tables import compare_with_progress
 from stmpl_ros.view.config import ViewConfig
 from stmpl_ros.view.page import Page
@@ -49,7 +48,7 @@ def _serve_hands_on(config: ViewConfig) -> int:
     with Console(stderr=True).status("making the body"):
         layer = published(layer_of(config.node))
     page = Page(config.host, config.port, f"{config.node.part.replace('_', ' ')}, {config.node.method}")
-    return _until_stopped(page, HandsOn(page, layer, METHODS[config.node.method](), config.tool))
+    return _until_stopped(page, HandsOn(page, layer, config.node.new_method(), config.tool))
 
 
 def _serve_live(config: ViewConfig, arguments: list[str] | None) -> int:
