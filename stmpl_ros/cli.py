@@ -6,6 +6,7 @@ import dataclasses
 import json
 import logging
 import os
+import shutil
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -323,6 +324,8 @@ def chart(
 ) -> int:
     """Speed against accuracy: every method, its own knob swept, on the same scenes; a picture, a page to point at.
 
+    A run that was stopped goes on where it was.
+
     Example: stmpl chart --out runs/chart
     Peers that are installed (pip install .[peers]) are on it as well.
 
@@ -343,8 +346,9 @@ def chart(
         measured = Chart.load(out / "chart.json")
     else:
         with steps_bar("chart", quiet=as_json) as show:
-            measured = measure(PRESETS[preset], CURVES, on_progress=show)
+            measured = measure(PRESETS[preset], CURVES, parts=out / "parts", on_progress=show)
         measured.save(out / "chart.json")
+        shutil.rmtree(out / "parts")
     draw(measured, out / "chart.png")
     write_page(measured, out / "chart.html")
     rows = break_even(measured)

@@ -45,7 +45,8 @@ class Events:
             self._say(f"deadline of {topic}", f"{topic}: the sender missed its deadline")
 
     def _on_matched(self, topic: str, event: Any) -> None:
-        before = self._senders.get(topic, 0)
+        # A sender that was there before the subscription may have matched before anybody listened for it.
+        before = self._senders.get(topic, event.total_count - event.current_count)
         self._senders[topic] = event.current_count
         if before and not event.current_count:
             self._say(f"senders of {topic}", f"{topic}: the sender is gone")

@@ -51,6 +51,19 @@ def chart() -> Chart:
     return measure(SMALL, curves, reference=PatchFem())
 
 
+def test_a_run_that_was_stopped_goes_on(tmp_path):
+    def stop(done, total, what):
+        if what.startswith("Linear"):
+            raise KeyboardInterrupt
+
+    curves = tuple(Curve(name, "-", (("-", make),)) for name, make in (("Winkler", Winkler), ("Linear", Linear)))
+    with pytest.raises(KeyboardInterrupt):
+        measure(SMALL, curves, reference=PatchFem(), parts=tmp_path, on_progress=stop)
+    seen = []
+    whole = measure(SMALL, curves, parts=tmp_path, reference=PatchFem(), on_progress=lambda *a: seen.append(a[2]))
+    assert len(whole.points) == 4 and not [what for what in seen if what.startswith("Winkler")]
+
+
 def test_every_step_is_measured_on_every_scene_and_what_is_not_installed_is_named(chart):
     assert len(chart.points) == 4 * 2 and chart.about["missing"] == ["a peer (no no_such_package)"]
     for point in chart.points:

@@ -485,9 +485,9 @@ def test_the_live_page_shows_the_answers_of_a_running_node():
             wait(lambda: page.layer is not None, "the skin")
             wait(lambda: device.pose.get_subscription_count() >= 2, "node and page to listen to the tool")
             wait(lambda: device.send(ros.TOUCH, 0.03) and page.snapshot, "an answer")
-            wait(lambda: device.send(ros.TOUCH, 0.03) and shown_on(page).force > 0, "an answer that presses")
+            wait(lambda: device.send(ros.TOUCH, 0.03) and shown_on(page).force == pytest.approx(0.03, rel=0.02),
+                 "an answer to pose and wrench")  # fmt: skip
             shown = shown_on(page)
-            assert shown.force == pytest.approx(0.03, rel=0.02)
             assert 0.5e-3 < shown.depth < 3e-3, "as deep as its wrench presses"
             assert shown.contacts[0].mesh.vertices.shape == ros.ball().vertices.shape
             assert shown.answer.statuses == {"probe": "touching"} and shown.solve_seconds > 0

@@ -83,7 +83,7 @@ CURVES: tuple[Curve, ...] = (
     Curve("MuJoCo flex, neo-Hookean", "mesh", tuple(
         (f"{layers} layers, refine {refine}",
          _peer("mujoco_flex", material="snh", timestep=0.1, damping=0.0, layers=layers, refine=refine))
-        for layers, refine in ((1, 0), (2, 0), (3, 1))), fast=False, extra="mujoco"),
+        for layers, refine in ((1, 0), (2, 0), (4, 0))), fast=False, extra="mujoco"),
     Curve("Newton VBD", "mesh", tuple((f"{n} layers", _peer("newton_vbd", layers=n)) for n in (1, 2)), fast=False,
           extra="newton"),
     Curve("FElupe, hex8", "mesh", tuple((f"{n} layers", _peer("felupe", layers=n)) for n in (1, 2)), fast=False,

@@ -154,13 +154,14 @@ def contact(name: str, layer: SoftLayer, seed: int = 0) -> Scene:
 
 
 def measure(preset: Preset, curves: Sequence[Curve] = CURVES, *, reference: PatchFem | None = None,
-            on_progress: OnProgress | None = None) -> Chart:  # fmt: skip
+            parts: Path | None = None, on_progress: OnProgress | None = None) -> Chart:  # fmt: skip
     """Runs everything on one thread.
 
     Args:
         preset: scenes and layer.
         curves: methods; those whose packages are not installed are left out, and named in `about`.
         reference: that judges; quadratic wedges at half the mesh width, two deep, unless given.
+        parts: folder for what is done; a run that was stopped goes on from there. Empty it when a method has changed.
         on_progress: called after each point.
     """
     from threadpoolctl import threadpool_limits
@@ -179,9 +180,15 @@ def measure(preset: Preset, curves: Sequence[Curve] = CURVES, *, reference: Patc
             said(k, total, f"reference of {name}")
             footprint = contact(name, layer).footprint * layer.tissue.youngs_modulus
             loads = [Load.pressure(ratio * footprint) for ratio in preset.ratios]
-            truths[name] = list(zip(preset.ratios, loads, judge.solve_many(loads), strict=True))
+            truths[name] = list(zip(preset.ratios, loads, _truths(judge, loads, parts, name), strict=True))
         done = len(preset.scenes)
         for curve in curves:
+            file = parts / f"{curve.name}.json" if parts else None
+            if file and file.is_file():
+                points += Chart.load(file).points
+                done += len(curve.steps) * len(truths)
+                continue
+            first = len(points)
             for knob, make in curve.steps:
                 method: Method | StmplError
                 try:
@@ -198,9 +205,11 @@ def measure(preset: Preset, curves: Sequence[Curve] = CURVES, *, reference: Patc
                         elif slow > PATIENCE:
                             points.append(Point(*what, why=f"left out: a cheaper step took {slow:.0f} s"))
                         else:
-                            points.append(_point(what, method, load, truth.displacement, layer, preset, curve.fast))
+                            points.append(_point(what, method, load, truth, layer, preset, curve.fast))
                     done += 1
                     said(done, total, f"{curve.name}, {knob}: {name}")
+            if file:
+                Chart(tuple(points[first:])).save(file)
     about = {
         "machine": f"{machine()}, one thread", "versions": versions(VERSIONS), "commit": commit(),
         "layer": repr(layer), "scenes": list(preset.scenes), "ratios": list(preset.ratios), "missing": missing,
@@ -209,13 +218,24 @@ def measure(preset: Preset, curves: Sequence[Curve] = CURVES, *, reference: Patc
     return Chart(tuple(points), about)
 
 
+def _truths(judge: PatchFem, loads: Sequence[Load], parts: Path | None, name: str) -> list[np.ndarray]:
+    file = parts / f"{name}.npy" if parts else None
+    if file and file.is_file():
+        return list(np.load(file))
+    found = [answer.displacement for answer in judge.solve_many(loads)]
+    if file:
+        file.parent.mkdir(parents=True, exist_ok=True)
+        np.save(file, np.array(found))
+    return found
+
+
 def _point(what: tuple[str, str, str, float], method: Method, load: Load, truth: np.ndarray, layer: SoftLayer,
            preset: Preset, fast: bool) -> Point:  # fmt: skip
     started = time.perf_counter()
     try:
         answer = method.solve(load)
-    except StmplError as error:
-        return Point(*what, why=str(error))
+    except Exception as error:  # a peer raises what it likes
+        return Point(*what, why=f"{error}" if isinstance(error, StmplError) else f"{type(error).__name__}: {error}")
     first, spent = time.perf_counter() - started, []
     while not spent or (sum(spent) < preset.seconds and len(spent) < 400) or (len(spent) < 3 and not fast):
         if first > LONG:
