@@ -24,6 +24,7 @@ from fem_tools.provenance import machine
 from stmpl_core.load import Load
 from stmpl_core.methods import Method
 
+FLOOR = 3e-3  # mm, below which no error is drawn
 PICTURE = Path("docs/pictures/ladder.png")
 
 
@@ -107,18 +108,18 @@ def draw(times: np.ndarray, spent: dict[str, np.ndarray], off: dict[str, np.ndar
                       ms=10 if name in taken else 6, lw=0.8, label=name)  # fmt: skip
     left.axhline(options.accuracy_mm, color="0.6", ls=":")
     left.axvline(options.deadline_ms, color="0.6", ls=":")
-    left.set(xscale="log", yscale="log", xlabel="time of a solve [ms], median and 5-99 %",
+    left.set(xscale="log", yscale="log", ylim=(FLOOR, None), xlabel="time of a solve [ms], median and 5-99 %",
              ylabel="largest error at any vertex [mm], median and 5-95 %")  # fmt: skip
-    left.legend(fontsize=7)
+    left.legend(fontsize=7, loc="lower left")
     name = "ladder, no deadline"
     for method in dict.fromkeys(taken[name]):
         here = np.array([m == method for m in taken[name]])
         right.plot(times[here], 1e3 * off[name][here], "o", ms=4, color=colours.get(method, "k"), label=method)
     right.plot(times, 1e3 * bound[name], color="0.4", lw=0.8, label="stated bound")
     right.axhline(options.accuracy_mm, color="0.6", ls=":", label="wish")
-    right.set(yscale="log", xlabel="time in the run [s]", title="the ladder without a deadline: who answered",
+    right.set(yscale="log", ylim=(FLOOR, None), xlabel="time in the run [s]", title="the ladder without a deadline: who answered",
               ylabel="largest error at any vertex [mm]")  # fmt: skip
-    right.legend(fontsize=7)
+    right.legend(fontsize=7, loc="lower center")
     options.out.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(options.out, dpi=110)
 

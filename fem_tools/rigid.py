@@ -26,8 +26,9 @@ LEAST = 1e-5  # m: shallower contacts move nothing
 class RigidFem:
     """Judges whole answers to contacts: geometry, force and motion, not only what a given pressure does.
 
-    Each tool goes in along its force, or along the mean normal of its pressure, and sticks. Tools are pressed one by
-    one and their motions added: right where they are some thicknesses apart.
+    A tool with a wrench goes in along its force until it carries it; one without goes as deep as its pose says, along
+    the mean normal of its pressure. Tools stick. They are pressed one by one and their motions added: right where they
+    are some thicknesses apart.
     """
 
     name = "rigid_fem"
@@ -58,9 +59,12 @@ class RigidFem:
         displacement, trust, total = np.zeros_like(layer.vertices), Trust(), np.zeros_like(pressure)
         for contact in contacts:
             tool, depth = self._tool(contact, pressure, figures.get(f"{contact.name}.moved_m", 0.0))
-            if depth < LEAST:
+            if contact.wrench is not None and contact.wrench[:3].any():
+                answer = self._fem.press_with([tool], float(np.linalg.norm(contact.wrench[:3])))
+            elif depth < LEAST:
                 continue
-            answer = self._fem.press([tool], depth)
+            else:
+                answer = self._fem.press([tool], depth)
             displacement += answer.displacement
             total += answer.pressure
             found = {f"{contact.name}.normal_n": float(answer.wrenches[0][:3] @ tool.direction)}

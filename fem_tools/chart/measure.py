@@ -27,8 +27,8 @@ from stmpl_core.metrics import score
 OnProgress = Callable[[int, int, str], None]
 SCENES = ("disc", "letter", "band", "grasp", "disc on the seam")
 OFF_SEAM = 6.0  # thicknesses that the other scenes keep from the seam, where the limb is wide enough
-LONG = 8.0  # s of a first solve from which it is not repeated
-PATIENCE = 20.0  # s of a solve from which dearer steps of its curve are left out on that scene
+LONG = 4.0  # s of a first solve from which it is not repeated
+PATIENCE = 5.0  # s of a solve from which dearer steps of its curve are left out on that scene
 VERSIONS = ("stmpl", "numpy", "numba", "scipy", "torch", "mujoco", "felupe", "warp-lang", "newton")
 
 

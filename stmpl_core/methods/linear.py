@@ -55,7 +55,7 @@ class Linear:
 def _trust(layer: SoftLayer, load: Load) -> Trust:
     ratio, nu = load.peak_ratio(layer), layer.tissue.poisson_ratio
     trust = Trust(figures={"peak_ratio": ratio})
-    if ratio > MAX_RATIO:
+    if ratio > MAX_RATIO * (1 + 1e-9):
         trust = trust.also(f"p/E is {ratio:.2g}, the linear response holds to {MAX_RATIO:g}", in_range=False)
     if not NU[0] <= nu <= NU[1]:
         trust = trust.also(f"nu is {nu:g}, validated is {NU[0]:g} to {NU[1]:g}", in_range=False)
