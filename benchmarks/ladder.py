@@ -117,8 +117,8 @@ def draw(times: np.ndarray, spent: dict[str, np.ndarray], off: dict[str, np.ndar
         right.plot(times[here], 1e3 * off[name][here], "o", ms=4, color=colours.get(method, "k"), label=method)
     right.plot(times, 1e3 * bound[name], color="0.4", lw=0.8, label="stated bound")
     right.axhline(options.accuracy_mm, color="0.6", ls=":", label="wish")
-    right.set(yscale="log", ylim=(FLOOR, None), xlabel="time in the run [s]", title="the ladder without a deadline: who answered",
-              ylabel="largest error at any vertex [mm]")  # fmt: skip
+    right.set(yscale="log", ylim=(FLOOR, None), xlabel="time in the run [s]", ylabel="largest error at any vertex [mm]",
+              title="the ladder without a deadline: who answered")  # fmt: skip
     right.legend(fontsize=7, loc="lower center")
     options.out.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(options.out, dpi=110)
