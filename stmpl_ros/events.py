@@ -46,7 +46,7 @@ class Events:
 
     def _on_matched(self, topic: str, event: Any) -> None:
         # A sender that was there before the subscription may have matched before anybody listened for it.
-        before = self._senders.get(topic, event.total_count - event.current_count)
+        before = self._senders[topic] if topic in self._senders else event.total_count - event.current_count
         self._senders[topic] = event.current_count
         if before and not event.current_count:
             self._say(f"senders of {topic}", f"{topic}: the sender is gone")
