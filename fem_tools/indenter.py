@@ -304,13 +304,15 @@ class IndenterFem:
         """The answer at one depth [m]. See `path`."""
         return list(self.path(tools, [depth]))[-1]
 
-    def press_with(self, tools: Sequence[Tool], force: float, *, deepest: float | None = None) -> Indentation:
-        """The answer where the tools' forces along their ways sum to `force` [N], within 0.1 %.
+    def press_with(self, tools: Sequence[Tool], force: float, *, deepest: float | None = None,
+                   tolerance: float = 1e-3) -> Indentation:  # fmt: skip
+        """The answer where the tools' forces along their ways sum to `force` [N].
 
         Args:
             tools: see `path`.
             force: > 0 [N].
             deepest: where to give up [m]; None: 0.9 of the layer's smallest thickness.
+            tolerance: of the force [-].
 
         Raises:
             InvalidInput: as `path`, or a force that is not above 0.
@@ -336,7 +338,7 @@ class IndenterFem:
         for _ in range(20):  # regula falsi, always from the state below, so that the path stays the same
             depth = below[0] + (force - below[1]) / (above[1] - below[1]) * (above[0] - below[0])
             press.state = below[2]
-            if not press.walk(depth) or abs(press.force() - force) <= 1e-3 * force:
+            if not press.walk(depth) or abs(press.force() - force) <= tolerance * force:
                 break
             above = (depth, press.force()) if press.force() > force else above
             below = below if press.force() > force else (depth, press.force(), press.state)

@@ -21,6 +21,8 @@ REFINE, STEP = 2, 0.08  # a third of IndenterFem's own cost; 0.5 % in pressure
 ROUNDED = 1e-3  # m, of edges: no skin mesh follows a sharp one
 NEAR = 3.0  # edges around a tool within which pressure is its own
 LEAST = 1e-5  # m: shallower contacts move nothing
+TOUCH = 5e-5  # m, squared times E: nor do such forces
+FORCE = 1e-2  # of the force, to which a tool with a wrench is pressed
 
 
 class RigidFem:
@@ -59,12 +61,10 @@ class RigidFem:
         displacement, trust, total = np.zeros_like(layer.vertices), Trust(), np.zeros_like(pressure)
         for contact in contacts:
             tool, depth = self._tool(contact, pressure, figures.get(f"{contact.name}.moved_m", 0.0))
-            if contact.wrench is not None and contact.wrench[:3].any():
-                answer = self._fem.press_with([tool], float(np.linalg.norm(contact.wrench[:3])))
-            elif depth < LEAST:
+            force = 0.0 if contact.wrench is None else float(np.linalg.norm(contact.wrench[:3]))
+            if (force < layer.tissue.youngs_modulus * TOUCH**2) if force else (depth < LEAST):
                 continue
-            else:
-                answer = self._fem.press([tool], depth)
+            answer = self._fem.press_with([tool], force, tolerance=FORCE) if force else self._fem.press([tool], depth)
             displacement += answer.displacement
             total += answer.pressure
             found = {f"{contact.name}.normal_n": float(answer.wrenches[0][:3] @ tool.direction)}
