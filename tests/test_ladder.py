@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 from fem_tools import PatchFem
-from fem_tools.calibrate import MARGIN, Trial, coverage, default_rungs, fit, ladder, times_file
+from fem_tools.calibrate import MARGIN, Trial, coverage, default_rungs, fit, gather, ladder, measured, times_file
 from fem_tools.few_steps import FewSteps
+from fem_tools.sampling import BodyPlan
 from stmpl_core.errors import InvalidInput, NotPrepared
 from stmpl_core.ladder import SHIPPED, Known, Ladder, Measured, SceneFigures, SceneReader
 from stmpl_core.layer import SoftLayer, Tissue
@@ -286,6 +287,18 @@ def test_the_fit_finds_the_law_and_its_bounds_hold_as_often_as_they_say():
     assert 1.0 < chart.methods["m"].slow < 1.3
     exact = fit(made_up(0.0))
     assert exact.methods["m"].factor["pressure"] == pytest.approx(MARGIN, abs=0.1)
+
+
+def test_the_shipped_bounds_hold_on_a_limb_and_shapes_that_were_not_fitted_and_are_not_loose(tmp_path, monkeypatch):
+    monkeypatch.setenv("STMPL_CACHE_DIR", str(tmp_path))
+    limb = BodyPlan(name="unseen", weight=0.6, thickness=6.5e-3, edge_length=4.5e-3, part="right_forearm")
+    trials = gather(tmp_path / "trials", bodies=[limb], scenes={"fit": 0, "test": 3, "shapes": 3}, seed=7)
+    rows = coverage(trials, measured())
+    answers = sum(row.answers for row in rows)
+    assert answers > 100 and {row.use for row in rows} == {"test", "shapes"}
+    assert sum(row.covered * row.answers for row in rows) / answers > 0.95
+    assert np.median(np.repeat([row.tight for row in rows], [row.answers for row in rows])) < 3
+    assert gather(tmp_path / "trials", bodies=[limb], seed=7) == trials, "what was measured is not measured again"
 
 
 def test_the_shipped_chart_knows_every_default_method_and_its_bounds_hold(layer, tmp_path, monkeypatch):
