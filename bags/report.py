@@ -256,7 +256,7 @@ def _pressed(comparison: Comparison) -> str:
     for title, pair in shown:
         tools = "; ".join(f"{tool}: {status}" for tool, status in pair.frame.statuses.items())
         lines.append(f"<h3>{title}, {pair.time:.2f} s, {pair.load:.2f} N</h3><p class=note>{_h(tools)}. "
-                     "Drawn to scale, not exaggerated; both sides answer the same pressure.</p>")  # fmt: skip
+                     "Drawn to scale, not exaggerated; both sides answer the same contact.</p>")  # fmt: skip
         lines += [_image(figure) for figure in pressed_figures(comparison, pair)]
     return "\n".join(lines)
 
