@@ -190,7 +190,7 @@ def _prepared(rungs: Sequence[Method], layer: SoftLayer) -> list[Method]:
 
 def _tried(ready: Sequence[Method], reader: SceneReader, load: Load, true: np.ndarray,
            where: tuple[str, Any, str]) -> Iterator[Trial]:  # fmt: skip
-    layer, scene = reader.layer, reader.figures(load)
+    scene = reader.figures(load)
     if scene is None:
         return
     moved = np.linalg.norm(true, axis=1)
@@ -204,7 +204,7 @@ def _tried(ready: Sequence[Method], reader: SceneReader, load: Load, true: np.nd
             if spent[-1] > 0.05:
                 break
         error = np.linalg.norm(answer.displacement - true, axis=1)
-        yield Trial(*where, load.kind, method.name, scene, layer.edge_length / scene.width * scene.strain,
+        yield Trial(*where, load.kind, method.name, scene, reader.unit(scene),
                     float(error.max()), float(moved.max()), float(error[much].mean()), float(np.median(spent)),
                     answer.trust.ok, answer.trust.error_bound or float("nan"))  # fmt: skip
 

@@ -9,7 +9,14 @@ import numpy as np
 
 from fem_tools.mesh import level_depths
 from fem_tools.newton import NewtonSettings, System, newton
-from fem_tools.patch import Patch, PatchFem, discretisation_error, error_bound, truncation_error
+from fem_tools.patch import (
+    Patch,
+    PatchFem,
+    discretisation_error,
+    error_bound,
+    truncation_error,
+    validated,
+)
 from stmpl_core.errors import InvalidInput
 from stmpl_core.layer import SoftLayer
 from stmpl_core.load import Load
@@ -88,7 +95,7 @@ class FewSteps:
         answer[patch.vertices] = result.u[: len(patch.vertices), 0]
         if before is not None and not result.residual < LOST:
             answer = before.displacement
-        ratio, limit = load.peak_ratio(layer), 2.0 if load.kind != "nodal" else 0.4
+        ratio = load.peak_ratio(layer)
         discretisation, truncation = discretisation_error(system, result.u), truncation_error(patch, result.u, layer)
         bound = error_bound(discretisation, truncation, result.u, patch.mesh.layers, ratio)
         bound += result.residual * float(np.linalg.norm(result.u[:, 0], axis=1).max())
@@ -97,10 +104,7 @@ class FewSteps:
         if result.residual > CLOSE:
             why = f"after {result.iterations} Newton steps {result.residual:.0%} of the load is not in balance"
             trust = trust.also(why, converged=False)
-        if ratio > limit:
-            trust = trust.also(f"p/E is {ratio:.2g}; validated up to {limit:g} for {load.kind} loads", in_range=False)
-        if (load.values < 0).any():
-            trust = trust.also("the load pulls; only pressing was validated", in_range=False)
+        trust = validated(trust, load, ratio)
         return Displacement(answer, trust if trust.ok else replace(trust, error_bound=None), self.name, pressure)
 
     def _patch_for(self, loaded: np.ndarray) -> Patch:

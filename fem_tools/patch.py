@@ -284,7 +284,7 @@ class PatchFem:
         layer = prepared(self._layer, self)
         stable = not self.check_stability or is_positive_definite(system, result.u, result.load_factor)
         discretisation, truncation = discretisation_error(system, result.u), truncation_error(patch, result.u, layer)
-        ratio, limit = load.peak_ratio(layer), VALIDATED_RATIO[load.kind]
+        ratio = load.peak_ratio(layer)
         trust = Trust(
             error_bound=error_bound(discretisation, truncation, result.u, patch.mesh.layers, ratio),
             figures={
@@ -311,10 +311,7 @@ class PatchFem:
             trust = trust.also(
                 "the final tangent is not positive definite: this equilibrium is unstable", in_range=False
             )
-        if ratio > limit:
-            trust = trust.also(f"p/E is {ratio:.2g}; validated up to {limit:g} for {load.kind} loads", in_range=False)
-        if (load.values < 0).any():
-            trust = trust.also("the load pulls; only pressing was validated", in_range=False)
+        trust = validated(trust, load, ratio)
         if load.kind == "contact":
             trust = replace(trust, error_bound=None)
             trust = trust.also("how rigid tools pull along the skin is left out (fem_tools.IndenterFem has it)")
@@ -325,6 +322,16 @@ class PatchFem:
                 f"the load is {nearest:.1f} thicknesses from the layer's open border, which is held", in_range=False
             )
         return trust if trust.ok else replace(trust, error_bound=None)
+
+
+def validated(trust: Trust, load: Load, ratio: float) -> Trust:
+    """The same trust, lowered where nobody validated such a load; `ratio`: its highest p / E [-]."""
+    limit = VALIDATED_RATIO[load.kind]
+    if ratio > limit:
+        trust = trust.also(f"p/E is {ratio:.2g}; validated up to {limit:g} for {load.kind} loads", in_range=False)
+    if (load.values < 0).any():
+        trust = trust.also("the load pulls; only pressing was validated", in_range=False)
+    return trust
 
 
 def _ahead(before: list[tuple[float, np.ndarray]], pressure: float) -> np.ndarray:

@@ -83,6 +83,10 @@ class SceneReader:
         squared = 2 / 3**0.5 * layer.vertex_areas  # of the edges of an even mesh [m2]
         self._across = np.pi / 4 * np.sqrt(squared / 3)  # dual length of each edge, over the mean of |cos| [m]
 
+    def unit(self, scene: SceneFigures) -> float:
+        """Thickness under the load times the strain of its columns [m]: errors are measured in it."""
+        return self.layer.edge_length / scene.width * scene.strain
+
     def figures(self, load: Load) -> SceneFigures | None:
         """Of a load that fits the layer; None if nothing presses."""
         layer, loaded = self.layer, load.loaded
@@ -279,7 +283,7 @@ class Ladder:
             answer = self._ask(choice, load, scene)
             known = self.measured.methods[self.rungs[choice.rung].name]
             options = [o for o in options if o.error < choice.error]
-            choice = replace(choice, error=known.bound(scene, load.kind, self._unit(scene), answer.trust.error_bound))
+            choice = replace(choice, error=known.bound(scene, load.kind, self._reader.unit(scene), answer.trust.error_bound))
             tried.append((choice, answer))
             if outside or (answer.trust.ok and choice.error <= self.accuracy):
                 break
@@ -289,7 +293,7 @@ class Ladder:
 
     def _expected(self, scene: SceneFigures, kind: str) -> tuple[list[_Expected], str]:
         """What to expect of each method that was measured under such loads, and how the scene is outside of that."""
-        unit = self._unit(scene)
+        unit = self._reader.unit(scene)
         seconds = self._seconds @ scene.for_time() * self._slow
         if self.deadline is not None:  # without one, the same loads get the same answers on every run
             seconds = seconds * self._pace
@@ -299,10 +303,6 @@ class Ladder:
             if self._ready[k] and kind in known.error:
                 options.append(_Expected(k, known.bound(scene, kind, unit), float(seconds[k])))
         return options, self.measured.outside(scene, kind)
-
-    def _unit(self, scene: SceneFigures) -> float:
-        """Thickness under the load times the strain of its columns [m]."""
-        return prepared(self._layer, self).edge_length / scene.width * scene.strain
 
     def _choose(self, options: list[_Expected], left: float | None, *, first: bool) -> _Expected | None:
         """The cheapest that is accurate enough in the time left; else the most accurate in time; else the fastest."""

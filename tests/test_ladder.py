@@ -65,9 +65,10 @@ def three(layer, accuracy, deadline=None, *, ok=(True, True, True), seconds=(1e-
 
 
 def unit(layer, load):
-    scene = SceneReader(layer).figures(load)
+    reader = SceneReader(layer)
+    scene = reader.figures(load)
     assert scene is not None
-    return layer.edge_length / scene.width * scene.strain
+    return reader.unit(scene)
 
 
 @pytest.mark.parametrize(("share", "named"), [(0.5, "a"), (0.05, "b"), (0.005, "c")])
