@@ -283,7 +283,8 @@ class Ladder:
             answer = self._ask(choice, load, scene)
             known = self.measured.methods[self.rungs[choice.rung].name]
             options = [o for o in options if o.error < choice.error]
-            choice = replace(choice, error=known.bound(scene, load.kind, self._reader.unit(scene), answer.trust.error_bound))
+            bound = known.bound(scene, load.kind, self._reader.unit(scene), answer.trust.error_bound)
+            choice = replace(choice, error=bound)
             tried.append((choice, answer))
             if outside or (answer.trust.ok and choice.error <= self.accuracy):
                 break
