@@ -9,14 +9,15 @@ import numba
 import numpy as np
 
 from stmpl_core.arrays import Points, Transform
-from stmpl_core.layer import SoftLayer
+from stmpl_core.layer import SoftLayer, Tissue
 from stmpl_core.sdf import SignedDistance, distance_at
 
 HOLE = 0.6  # of an edge: a tool that comes no nearer to a vertex touches none of its triangles (equilateral: 0.577)
 DEEPEST = 0.9  # of the thickness; columns are not squeezed further
 ROUND = 4e-4  # m over which the squeeze rises beside a tool's wall: no sample pops in while the tool slides
+EVEN = 1.5  # times the shallowest corner of a triangle that its deepest may be for three samples to do
 CLOSE = 2e-5  # m to the tool from which the secant rule finishes what sphere tracing began
-EXACT = 3e-7  # m to which a depth is found
+EXACT = 3e-6  # m that the secant rule's last step may have; the depth is then known far better
 
 
 class Squeeze(NamedTuple):
@@ -119,6 +120,23 @@ def depth_along(field: SignedDistance, pose: Transform, points: Points, way: Poi
     return _depths_along(*grid, points, np.ascontiguousarray(way), guess)
 
 
+def deeper(tissue: Tissue, thickness: np.ndarray, weight: np.ndarray, depth: np.ndarray, gain: np.ndarray,
+           times: float, most: float) -> float:  # fmt: skip
+    """How much deeper columns must be squeezed to press `times` as hard together, each by itself, [m].
+
+    Args:
+        tissue: of the layer.
+        thickness: of the columns, (N,) [m].
+        weight: of their pressures in the sum, (N,).
+        depth: to which they are squeezed now; below 0: how far the tool still is, (N,) [m].
+        gain: depth that each gains over what is returned, (N,) [-].
+        times: > 0.
+        most: the largest answer [m]; the least is its negative.
+    """
+    moduli = np.array([tissue.shear_modulus, tissue.lame_lambda]) / tissue.youngs_modulus
+    return _deeper(moduli, thickness, weight, depth, gain, times, most)
+
+
 def _middles(split: int) -> np.ndarray:
     """Barycentric coordinates of the middles of the split^2 parts of a triangle, (split^2, 3)."""
     out = []
@@ -132,6 +150,7 @@ def _middles(split: int) -> np.ndarray:
 
 
 _SAMPLES = _middles(3)
+_SMOOTH = np.array([[4, 1, 1], [1, 4, 1], [1, 1, 4]]) / 6  # of degree 2, for triangles that are squeezed evenly
 
 
 @numba.njit(cache=True, inline="always")
@@ -228,6 +247,38 @@ def _meet(coefficients, origin, spacing, pose, point, inward, t, guess):
 
 
 @numba.njit(cache=True)
+def _deeper(moduli, thickness, weight, depth, gain, times, most):
+    """See `deeper`; by bisection, until a hundredth of a percent of the range is left."""
+    wanted = times * _together(moduli, thickness, weight, depth, gain, 0.0)
+    low, high = (0.0, most) if times > 1 else (-most, 0.0)
+    for _ in range(14):
+        middle = 0.5 * (low + high)
+        if _together(moduli, thickness, weight, depth, gain, middle) < wanted:
+            low = middle
+        else:
+            high = middle
+    return 0.5 * (low + high)
+
+
+@numba.njit(cache=True)
+def _together(moduli, thickness, weight, depth, gain, by):
+    """Weighted sum of the pressures of columns that are squeezed `by` more."""
+    total = 0.0
+    for n in range(len(depth)):
+        strain = min((depth[n] + by * gain[n]) / thickness[n], DEEPEST)
+        if strain > 0:
+            total += weight[n] * _column_pressure(moduli, strain)
+    return total
+
+
+@numba.njit(cache=True, inline="always")
+def _column_pressure(moduli, strain):
+    """Of a confined Neo-Hookean column, over E [-]."""
+    stretch = 1 - strain
+    return -(moduli[0] * (stretch - 1 / stretch) + moduli[1] * np.log(stretch) / stretch)
+
+
+@numba.njit(cache=True)
 def _depths_along(coefficients, origin, spacing, pose, points, way, guess):
     out = np.empty(len(points))
     for n in range(len(points)):
@@ -279,9 +330,10 @@ def _squeeze(coefficients, origin, spacing, pose, points, inward, thickness, fac
         i, j, k = faces[f]
         di, dj, dk = depth[slot[i]], depth[slot[j]], depth[slot[k]]
         border = min(rests[slot[i]], rests[slot[j]], rests[slot[k]]) < 1 or max(di, dj, dk) > 3 * min(di, dj, dk)
-        weight = face_areas[f] / len(_SAMPLES)
-        for q in range(len(_SAMPLES)):
-            a, b, c = _SAMPLES[q]
+        samples = _SAMPLES if border or buried > 0 or max(di, dj, dk) > EVEN * min(di, dj, dk) else _SMOOTH
+        weight = face_areas[f] / len(samples)
+        for q in range(len(samples)):
+            a, b, c = samples[q]
             length = 0.0
             for x in range(3):
                 point[x] = a * points[i, x] + b * points[j, x] + c * points[k, x]
@@ -306,8 +358,7 @@ def _squeeze(coefficients, origin, spacing, pose, points, inward, thickness, fac
             if deep <= 0:
                 continue
             strain = min(deep / t, DEEPEST)
-            stretch = 1 - strain
-            pressure = -(mu * (stretch - 1 / stretch) + lam * np.log(stretch) / stretch)
+            pressure = _column_pressure(moduli, strain)
             strain *= lam + 2 * mu
             for corner, part in ((i, a), (j, b), (k, c)):
                 n = slot[corner]

@@ -9,9 +9,9 @@ from typing import NamedTuple
 import numpy as np
 
 from stmpl_core.arrays import Transform, Wrench
-from stmpl_core.columns import NO_SQUEEZE, Clearance, Columns, Squeeze
+from stmpl_core.columns import NO_SQUEEZE, Clearance, Columns, Squeeze, deeper
 from stmpl_core.contact import Contact
-from stmpl_core.contact_net import ContactNet
+from stmpl_core.contact_net import ContactNet, Held
 from stmpl_core.layer import SoftLayer
 from stmpl_core.load import Load
 from stmpl_core.sdf import SignedDistance
@@ -37,8 +37,10 @@ SIDEWAYS = 0.3  # of the normal force: more tangential force than this is worth 
 ROUGH = 5e-4  # m: a tool whose distance field is off by more than this is worth a word
 STRANGE = 0.1  # of the force: carried by vertices that see what no training contact had
 DEEP = 0.85  # of the thickness: a wrench presses no deeper
-SAME_FORCE = 5e-3  # of the force: how near the depth is sought; what is left is scaled away
+SAME_FORCE = 0.02  # of the force: how near the depth is tried; the rest of the way is reckoned
 TRIALS = 12  # of the depth
+BEND = -0.25  # power of Winkler's force with which the skin's share of it falls, until a trial says more
+BENT = 1.4  # factor by which that share is taken to change at most from trial to trial
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,6 +80,7 @@ class _Placed(NamedTuple):
     squeeze: Squeeze
     force: float | None  # to be carried along the mean normal [N]; None: what the pose presses with
     why: str = ""
+    held: Held | None = None  # what holds the skin against this tool alone, where it is known
 
 
 class Toucher:
@@ -101,6 +104,7 @@ class Toucher:
         self.hole = HOLE * layer.edge_length
         self.columns, self.net = Columns(layer), ContactNet(layer)
         self._modulus = layer.tissue.youngs_modulus
+        self._confined = layer.tissue.confined_modulus / self._modulus
         self._thickest = float(layer.thickness.max())
         self._inward = self.columns.inward
 
@@ -118,7 +122,8 @@ class Toucher:
             together = _joined([one.squeeze for one in pressing], len(self.layer.vertices))
         else:
             return [self._answer(one, np.empty(0), np.empty(0), 0.0) for one in placed]
-        held = self.net.hold(together.vertices, together.pressure, together.strain)
+        held = pressing[0].held if len(pressing) == 1 else None
+        held = held or self.net.hold(together.vertices, together.pressure, together.strain)
         share, out = held.pressure / together.pressure, []
         for one in placed:
             at = np.searchsorted(together.vertices, one.squeeze.vertices)
@@ -147,7 +152,7 @@ class Toucher:
         gap = self._gap(field, pose, clearance, force)
         if gap is None:
             return nothing(NO_TOUCH)
-        return self._pressed(contact, field, clearance.vertices, depth, gap, force) or nothing(PULLING)
+        return self._pressed(contact, field, clearance, depth, gap, force) or nothing(PULLING)
 
     def _status_by_pose(self, squeeze: Squeeze) -> str:
         return IN_CORE if (squeeze.depth >= self.layer.thickness[squeeze.vertices]).any() else BY_POSE
@@ -177,31 +182,33 @@ class Toucher:
             moved += gap
         return best
 
-    def _pressed(self, contact: Contact, field: SignedDistance, near: np.ndarray, depth: float, gap: float,
+    def _pressed(self, contact: Contact, field: SignedDistance, stated: Clearance, depth: float, gap: float,
                  force: np.ndarray) -> _Placed | None:  # fmt: skip
         """The tool moved along `force` until it presses with its component along the contact normal.
 
-        The force grows about as a power of the depth: each trial takes the next from the last two, inside a bracket.
+        Each trial takes the next from Winkler's columns, each of which keeps its share of the pressure; how far that was
+        wrong bends the one after. All inside a bracket.
         None: the force points away from the skin.
         """
         layer, push, start = self.layer, force / np.linalg.norm(force), contact.pose_body_from_tool
-        low, high, moved, last, best = -np.inf, np.inf, gap, None, None
-        touch_at: float | None = gap if gap > 0 else None
-        why = ""
+        low, high, moved, best = -np.inf, np.inf, gap, None
+        last: tuple[float, float] | None = None  # force of the trial before, and what it promised for this one
+        bend = BEND
         for _ in range(TRIALS):
-            pose = _shifted(start, moved * push)
-            squeeze = self.columns.squeeze(field, pose, self.columns.clearance(field, pose, near, self.hole))
+            pose, clearance = _shifted(start, moved * push), stated
+            if moved:
+                near = stated.vertices[~(stated.least > abs(moved) + 2 * self.hole) | np.isinf(stated.least)]
+                clearance = self.columns.clearance(field, pose, near, self.hole)
+            squeeze = self.columns.squeeze(field, pose, clearance)
             v = squeeze.vertices
-            steep = self._inward[v] @ push
-            if not len(v) or not (steep > FACING).any():
-                if best is None and touch_at is None and gap == 0.0 and len(v):
+            if not (self._inward[v] @ push > FACING).any():
+                if best is None and gap == 0.0 and len(v):
                     return None
                 low = max(low, moved)
                 moved += 0.05 * self._thickest if not np.isfinite(high) else 0.5 * (high - moved)
                 continue
-            if touch_at is None:
-                touch_at = moved - float((squeeze.depth / np.maximum(steep, FACING)).max())
-            pressure = self.net.hold(v, squeeze.pressure, squeeze.strain).pressure * self._modulus
+            held = self.net.hold(v, squeeze.pressure, squeeze.strain)
+            pressure = held.pressure * self._modulus
             vector = -(pressure @ layer.vertex_area_vectors[v])
             size = float(np.linalg.norm(vector))
             if size <= ONE_SIDED * float(pressure @ layer.vertex_areas[v]):
@@ -210,32 +217,42 @@ class Toucher:
             if normal <= 0:
                 return None
             status = MOVED if gap > SLACK * self.hole else TOUCHING
-            best = _Placed(contact, field, status, pose, depth, moved, squeeze, normal, why)
-            if abs(size / normal - 1) < SAME_FORCE:
-                break
+            best = _Placed(contact, field, status, pose, depth, moved, squeeze, normal, held=held)
+            if last is not None:
+                bend = float(np.clip(np.log(size / last[1]) / np.log(last[1] / last[0]), -0.8, 2.0))
+            times = normal / size
+            times *= float(np.clip(times ** (-bend / (1 + bend)), 1 / BENT, BENT))
+            further = self._deeper(squeeze, clearance, push, times)
+            if abs(size / normal - 1) < SAME_FORCE:  # the rest is small enough to go without another look
+                under = np.where(squeeze.depth > 0, squeeze.depth + further * (self._inward[v] @ push), 0.0)
+                return best._replace(pose=_shifted(pose, further * push), moved=moved + further,
+                                     squeeze=squeeze._replace(depth=np.maximum(under, 0.0)))  # fmt: skip
             deepest = float((squeeze.depth / layer.thickness[v]).max())
-            if size < normal:
-                if deepest > DEEP - 0.01:
-                    why = (f"{contact.name} asks for {normal:.2g} N along the skin's normal; pressed to "
-                           f"{deepest:.0%} of the layer it has {size:.2g} N")
-                    best = best._replace(why=why)
-                    break
-                low = moved
-            else:
-                high = moved
-            below = max(moved - touch_at, 1e-6)
-            power = 1.5
-            if last is not None and abs(below / last[0] - 1) > 1e-6:
-                power = float(np.clip(np.log(size / last[1]) / np.log(below / last[0]), 0.8, 4.0))
-            last = (below, size)
-            most = below * DEEP / max(deepest, 1e-3) if size < normal else np.inf
-            following = touch_at + min(below * float(np.clip((normal / size) ** (1 / power), 0.2, 4.0)), most)
+            if size < normal and deepest > DEEP - 0.01:
+                why = (f"{contact.name} asks for {normal:.2g} N along the skin's normal; pressed to "
+                       f"{deepest:.0%} of the layer it has {size:.2g} N")
+                return best._replace(why=why)
+            low, high = (moved, high) if size < normal else (low, moved)
+            last = size, size * times
+            following = moved + further
             if not low < following < high:  # halve the bracket, or go to where its open end must be
                 least = 0.05 * self._thickest
                 inside = np.isfinite(high - low)
                 following = 0.5 * (low + high) if inside else min(high - least, max(low + least, following))
             moved = following
         return best
+
+    def _deeper(self, squeeze: Squeeze, clearance: Clearance, push: np.ndarray, times: float) -> float:
+        """How much further a tool must go to press `times` as hard, if all columns keep their share of Winkler's [m]."""
+        near = clearance.vertices
+        gain, thickness, depth = self._inward[near] @ push, self.layer.thickness[near], -clearance.least
+        carry = np.searchsorted(near, squeeze.vertices)
+        depth[carry] = np.where(squeeze.depth > 0, squeeze.depth, squeeze.strain / self._confined * thickness[carry])
+        some = (gain > FACING) & np.isfinite(depth)
+        gain, thickness, depth, near = gain[some], thickness[some], depth[some], near[some]
+        room = (DEEP * thickness - depth) / gain if times > 1 else np.maximum(depth, 0.0) / gain
+        most = float(room.min() if times > 1 else room.max())
+        return deeper(self.layer.tissue, thickness, gain * self.layer.vertex_areas[near], depth, gain, times, most)
 
     def _answer(self, one: _Placed, pressure: np.ndarray, doubt: np.ndarray, strange: float) -> Touch:
         """The load of a placed tool, scaled to its wrench, with what may be believed of it."""

@@ -1,0 +1,220 @@
+"""Stiffness: the Young's modulus of a skin from presses on it whose pose and force are both known."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from scipy.optimize import minimize_scalar
+
+from stmpl_core.contact import Contact
+from stmpl_core.errors import InvalidInput
+from stmpl_core.sdf import SignedDistance
+from stmpl_core.touch import SIDEWAYS, Touch, Toucher
+from stmpl_core.trust import Trust
+
+FEWEST = 6  # presses that may be believed
+LIGHT = 0.05  # of the hardest presses' force: those that are lighter count by their absolute error
+OUTLIER = 2.0  # standard deviations from which a press counts less (Huber)
+ROUNDS = 8  # of weighting
+STEPS = 13  # of the offset, before the best is refined
+FOUND = 5e-6  # m: how near the offset is sought
+ALIKE = 2e-3  # relative error of the forces up to which the smaller of two offsets is taken
+WORST_FIT = 0.15  # relative error of the forces that is left: more is no skin of one stiffness
+WORST_ERROR = 0.25  # of the modulus
+AT_THE_END = 1e-4  # m from the ends of the search: the offset that is sought may lie outside
+
+
+class Press(NamedTuple):
+    """A tool at one instant, with its wrench, and its distance field."""
+
+    contact: Contact
+    field: SignedDistance
+
+
+@dataclass(frozen=True)
+class Stiffness:
+    """What presses say of the skin.
+
+    Args:
+        youngs_modulus: E [Pa]; nan where `trust` says that none could be found.
+        relative_error: standard error of E over E, scatter and the contact law's own error together [-].
+        offset: by which the poses stand too far back along their push (negative: too far in) [m].
+        residual: relative error of the forces that is left, root mean square [-].
+        presses: that were fitted.
+        depths: of the lightest and of the deepest of them, with the offset [m].
+        trust: whether E may be used, and why not.
+    """
+
+    youngs_modulus: float
+    relative_error: float
+    offset: float
+    residual: float
+    presses: int
+    depths: tuple[float, float]
+    trust: Trust
+
+    def __str__(self) -> str:
+        low, high = (1e3 * depth for depth in self.depths)
+        return (f"E = {self.youngs_modulus:.4g} Pa +- {self.relative_error:.0%} from {self.presses} presses of "
+                f"{low:.1f} to {high:.1f} mm, poses off by {self.offset * 1e3:+.2f} mm, "
+                f"forces off by {self.residual:.1%}")  # fmt: skip
+
+
+class _Fit(NamedTuple):
+    modulus: float
+    errors: np.ndarray  # of the forces, over what a press is weighed with, (N,) [-]
+    weights: np.ndarray  # Huber's, (N,)
+    cost: float
+
+
+def fit_stiffness(toucher: Toucher, presses: Sequence[Press]) -> Stiffness:
+    """The modulus E with which the contact law explains the measured forces.
+
+    By dimensional analysis the force at a pose is E g, where g does not depend on E. For a given offset s of the poses
+    along their push, E is then the weighted least-squares solution of E g_i(s) = f_i, f_i the measured force along the
+    modelled one, weighed by relative error and, against outliers, by Huber's weights (Huber 1981, "Robust
+    Statistics"). s itself, which hand-eye calibration leaves, is sought within the toucher's reach. Depth and offset
+    are told apart only by presses of different depth: what they leave open is in `relative_error`, where the contact
+    law's own error counts once for all presses, since it is alike in all of them.
+
+    Args:
+        toucher: of the skin, of whatever stiffness.
+        presses: that pressed one at a time, with their wrenches.
+
+    Raises:
+        InvalidInput: a press without a wrench.
+    """
+    for press in presses:
+        if press.contact.wrench is None:
+            raise InvalidInput(f"a press of {press.contact.name} has no wrench; stiffness needs the force.")
+    pressing = [one for one in presses if one.contact.wrench is not None and one.contact.wrench[:3].any()]
+    if len(pressing) < FEWEST:
+        return _nothing(f"{len(pressing)} of {len(presses)} instants pressed with a force; {FEWEST} are needed. "
+                        "Press, at several depths, and ask again")  # fmt: skip
+    fit = _Presses(toucher, pressing)
+    offset = fit.best_offset()
+    touches = fit.touches(offset)
+    sound = [fit.sound(press, touch) for press, touch in zip(pressing, touches, strict=True)]
+    if sum(sound) < FEWEST:
+        return _nothing(f"{sum(sound)} of {len(pressing)} presses are inside what the contact law was validated on; "
+                        f"{FEWEST} are needed{_most_common(touches, sound)}")  # fmt: skip
+    if not all(sound):
+        fit = _Presses(toucher, [press for press, kept in zip(pressing, sound, strict=True) if kept])
+        offset = fit.best_offset()
+        touches = fit.touches(offset)
+    return fit.told(offset, touches)
+
+
+class _Presses:
+    """Presses and the law's forces at their poses, shifted along their push."""
+
+    def __init__(self, toucher: Toucher, presses: list[Press]) -> None:
+        self._toucher, self._presses = toucher, presses
+        self._forces = np.array([one.contact.wrench[:3] for one in presses if one.contact.wrench is not None])
+        sizes = np.linalg.norm(self._forces, axis=1)
+        self._pushes = self._forces / sizes[:, None]
+        self._weigh_by = np.maximum(sizes, LIGHT * np.quantile(sizes, 0.9))  # N
+
+    def touches(self, offset: float) -> list[Touch]:
+        """What the law says of each press, by its shifted pose alone."""
+        return [self._touch(press, offset * push) for press, push in zip(self._presses, self._pushes, strict=True)]
+
+    def _touch(self, press: Press, shift: np.ndarray) -> Touch:
+        pose = press.contact.pose_body_from_tool.copy()
+        pose[:3, 3] += shift
+        return self._toucher.touch(Contact(press.contact.name, press.contact.mesh, pose), press.field)
+
+    def best_offset(self) -> float:
+        """Along the push [m]."""
+        reach = self._toucher.reach
+        tried = np.linspace(-reach, reach, STEPS)
+        costs = [self._cost(offset) for offset in tried]
+        best = int(np.argmin(costs))
+        around = tried[max(best - 1, 0)], tried[min(best + 1, STEPS - 1)]
+        found = minimize_scalar(self._cost, bounds=around, method="bounded", options={"xatol": FOUND})
+        return float(found.x) if found.fun <= costs[best] else float(tried[best])
+
+    def _cost(self, offset: float) -> float:
+        return self._fit(*self._law(offset)).cost + (ALIKE * offset / self._toucher.reach) ** 2
+
+    def _law(self, offset: float) -> tuple[np.ndarray, np.ndarray]:
+        """The law's force over E of each press [m2], and the measured force along it [N], (N,)."""
+        modelled = np.array([touch.wrench[:3] for touch in self.touches(offset)])
+        sizes = np.linalg.norm(modelled, axis=1)
+        ways = np.where(sizes[:, None] > 0, modelled / np.maximum(sizes, 1e-300)[:, None], self._pushes)
+        modulus = self._toucher.layer.tissue.youngs_modulus
+        return sizes / modulus, (self._forces * ways).sum(axis=1)
+
+    def _fit(self, law: np.ndarray, measured: np.ndarray) -> _Fit:
+        """E for given forces over E, by iteratively reweighted least squares."""
+        g, f, weights = law / self._weigh_by, measured / self._weigh_by, np.ones(len(law))
+        modulus, errors = 0.0, f
+        for _ in range(ROUNDS):
+            modulus = float((weights * g * f).sum() / max((weights * g * g).sum(), 1e-300))
+            errors = f - modulus * g
+            most = OUTLIER * max(1.4826 * float(np.median(np.abs(errors))), 1e-6)
+            weights = np.minimum(1.0, most / np.maximum(np.abs(errors), 1e-300))
+        return _Fit(modulus, errors, weights, float((weights * errors**2).sum() / weights.sum()))
+
+    def sound(self, press: Press, touch: Touch) -> bool:
+        """Whether a press may count: validated, or apart, and not dragging; what drags says little of the normal."""
+        size = float(np.linalg.norm(touch.wrench[:3]))
+        if not size:
+            return True
+        assert press.contact.wrench is not None
+        normal = touch.wrench[:3] / size * (press.contact.wrench[:3] @ touch.wrench[:3]) / size
+        dragging = float(np.linalg.norm(press.contact.wrench[:3] - normal))
+        return touch.trust.in_range and dragging <= SIDEWAYS * float(np.linalg.norm(normal))
+
+    def told(self, offset: float, touches: list[Touch]) -> Stiffness:
+        """The answer, with what may be believed of it."""
+        law, measured = self._law(offset)
+        fit = self._fit(law, measured)
+        if not fit.modulus > 0:
+            return _nothing("no force points into the skin where the poses touch it: is it what the tool exerts on "
+                            "the body, and are the poses right?")  # fmt: skip
+        depths = [touch.trust.figures["depth_m"] for touch in touches if touch.trust.figures["normal_n"] > 0]
+        residual = float(np.sqrt(fit.cost))
+        error = self._error(offset, fit, residual)
+        trust, reach = Trust(), self._toucher.reach
+        if residual > WORST_FIT:
+            trust = trust.also(f"one stiffness leaves the forces off by {residual:.0%}, at most {WORST_FIT:.0%} is "
+                               "accepted: check frames, wrench and thickness", converged=False)  # fmt: skip
+        if abs(offset) > reach - AT_THE_END:
+            trust = trust.also(f"the poses are off by {reach * 1e3:g} mm along their push or more: calibrate them",
+                               converged=False)  # fmt: skip
+        if not error <= WORST_ERROR:
+            span = f"{1e3 * min(depths):.1f} to {1e3 * max(depths):.1f} mm"
+            trust = trust.also(f"presses of {span} do not tell the stiffness from an offset of the poses: it is known "
+                               f"to {error:.0%}, {WORST_ERROR:.0%} is needed. Press from a light touch to a third of "
+                               "the thickness", converged=False)  # fmt: skip
+        return Stiffness(fit.modulus, error, offset, residual, len(law), (min(depths), max(depths)), trust)
+
+    def _error(self, offset: float, fit: _Fit, residual: float) -> float:
+        """Standard error of log E with the offset unknown: (J^T J)^-1 of both, J in the weighed forces."""
+        step = 5e-5  # m
+        reach = self._toucher.reach
+        low, high = max(offset - step, -reach), min(offset + step, reach)
+        slope = fit.modulus * (self._law(high)[0] - self._law(low)[0]) / (high - low) / self._weigh_by  # 1/m
+        size = fit.modulus * self._law(offset)[0] / self._weigh_by
+        weigh = np.sqrt(fit.weights)
+        j = np.column_stack([weigh * size, weigh * slope * self._toucher.reach])
+        normal = j.T @ j / len(j)
+        if np.linalg.cond(normal) > 1e12:
+            return float("inf")
+        spread = float(np.sqrt(np.linalg.inv(normal)[0, 0]))
+        own = float(self._toucher.net.weights.card["bound"]["force_mean"])
+        return spread * float(np.hypot(own, residual / np.sqrt(len(j))))
+
+
+def _nothing(why: str) -> Stiffness:
+    nan = float("nan")
+    return Stiffness(nan, nan, nan, nan, 0, (nan, nan), Trust(converged=False, why=why))
+
+
+def _most_common(touches: list[Touch], sound: list[bool]) -> str:
+    whys = [touch.trust.why for touch, kept in zip(touches, sound, strict=True) if not kept and touch.trust.why]
+    return f", most often because {max(set(whys), key=whys.count)}" if whys else "; the rest drags"
