@@ -15,7 +15,6 @@ from stmpl_core.sdf import SignedDistance, distance_at
 HOLE = 0.6  # of an edge: a tool that comes no nearer to a vertex touches none of its triangles (equilateral: 0.577)
 DEEPEST = 0.9  # of the thickness; columns are not squeezed further
 ROUND = 4e-4  # m over which the squeeze rises beside a tool's wall: no sample pops in while the tool slides
-EVEN = 1.5  # times the shallowest corner of a triangle that its deepest may be for three samples to do
 CLOSE = 2e-5  # m to the tool from which the secant rule finishes what sphere tracing began
 EXACT = 3e-6  # m that the secant rule's last step may have; the depth is then known far better
 
@@ -150,7 +149,6 @@ def _middles(split: int) -> np.ndarray:
 
 
 _SAMPLES = _middles(3)
-_SMOOTH = np.array([[4, 1, 1], [1, 4, 1], [1, 1, 4]]) / 6  # of degree 2, for triangles that are squeezed evenly
 
 
 @numba.njit(cache=True, inline="always")
@@ -330,10 +328,9 @@ def _squeeze(coefficients, origin, spacing, pose, points, inward, thickness, fac
         i, j, k = faces[f]
         di, dj, dk = depth[slot[i]], depth[slot[j]], depth[slot[k]]
         border = min(rests[slot[i]], rests[slot[j]], rests[slot[k]]) < 1 or max(di, dj, dk) > 3 * min(di, dj, dk)
-        samples = _SAMPLES if border or buried > 0 or max(di, dj, dk) > EVEN * min(di, dj, dk) else _SMOOTH
-        weight = face_areas[f] / len(samples)
-        for q in range(len(samples)):
-            a, b, c = samples[q]
+        weight = face_areas[f] / len(_SAMPLES)
+        for q in range(len(_SAMPLES)):
+            a, b, c = _SAMPLES[q]
             length = 0.0
             for x in range(3):
                 point[x] = a * points[i, x] + b * points[j, x] + c * points[k, x]

@@ -186,8 +186,8 @@ class Toucher:
                  force: np.ndarray) -> _Placed | None:  # fmt: skip
         """The tool moved along `force` until it presses with its component along the contact normal.
 
-        Each trial takes the next from Winkler's columns, each of which keeps its share of the pressure; how far that was
-        wrong bends the one after. All inside a bracket.
+        Each trial takes the next from Winkler's columns, each of which keeps its share of the pressure; how far that
+        was wrong bends the one after. All inside a bracket.
         None: the force points away from the skin.
         """
         layer, push, start = self.layer, force / np.linalg.norm(force), contact.pose_body_from_tool
@@ -243,7 +243,7 @@ class Toucher:
         return best
 
     def _deeper(self, squeeze: Squeeze, clearance: Clearance, push: np.ndarray, times: float) -> float:
-        """How much further a tool must go to press `times` as hard, if all columns keep their share of Winkler's [m]."""
+        """How much further a tool must go to press `times` as hard, if columns keep their share of Winkler's [m]."""
         near = clearance.vertices
         gain, thickness, depth = self._inward[near] @ push, self.layer.thickness[near], -clearance.least
         carry = np.searchsorted(near, squeeze.vertices)
