@@ -11,6 +11,7 @@ import numpy as np
 from scipy.special import j0, j1
 
 from stmpl_core.layer import SoftLayer
+from stmpl_core.thinning import Asked, Thinning
 
 REACH = 8.0  # thicknesses to which a vertex feels a load; the linear response there is below 0.01 % of its peak
 NEAR = 4.0  # thicknesses to which moments are taken
@@ -76,23 +77,27 @@ class Surroundings:
         self.layer = layer
         self.frames = _frames(layer.normals)
         points = np.ascontiguousarray(layer.vertices)
-        self.start, self.index = _neighbours(points, layer.normals, layer.thickness, REACH)
+        self._thinning = Thinning(layer, self.frames, REACH)
         self._frames = self.frames.astype(np.float32)
         root, spread = layer.thickness**-0.5, np.log(SPREAD * layer.vertex_areas**0.5 / SPREADS[0])
         half_log = 0.5 * np.log(layer.thickness)
         rows = [*(points - points.mean(axis=0)).T, root, layer.vertex_areas, half_log, spread - half_log]
         rows += [*layer.normals.T]
         self._sites = np.ascontiguousarray(rows, dtype=np.float32)
-        shape = _shape(self.start, self.index, points, self.frames, layer.thickness)
+        shape = _shape(self._thinning.start, self._thinning.index, points, self.frames, layer.thickness)
         self.curvature, self.slope = shape[:, :3], shape[:, 3:]
         self._response = np.ascontiguousarray(np.moveaxis(response_table(layer.tissue.poisson_ratio), 2, 0))
         with packed():
-            self._felt(np.zeros((1, len(points))), moments=True)
+            self._felt(np.zeros((1, len(points))), None, moments=True)
             self.felt_among(np.zeros(1, np.int64), np.zeros((1, 2)))
 
-    def felt(self, sources: np.ndarray) -> Felt:
-        """What the vertices feel of source fields (V, S) [-], in units of Young's modulus."""
-        return Felt(*self._felt(np.asarray(sources).T, moments=True))
+    def asked(self, loaded: np.ndarray) -> Asked:
+        """Which vertices to ask what they feel of sources at vertices `loaded` (L,), for all to be known."""
+        return self._thinning.asked(loaded)
+
+    def felt(self, sources: np.ndarray, vertices: np.ndarray | None = None) -> Felt:
+        """What vertices (N,), or all that feel anything, feel of source fields (V, S) [-], over Young's modulus."""
+        return Felt(*self._felt(np.asarray(sources).T, vertices, moments=True))
 
     def felt_among(self, vertices: np.ndarray, sources: np.ndarray) -> Felt:
         """What vertices (N,) feel of sources at themselves alone, (N, S) [-]: on one thread, for small contacts."""
@@ -102,10 +107,14 @@ class Surroundings:
                   self._response[0], self._response[1], True, figures)  # fmt: skip
         return Felt(vertices, figures)
 
-    def linear(self, source: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """The linear response alone to one field (V,) [-]: the vertices that feel it (N,), and (N, 3) as in Felt."""
-        vertices, figures = self._felt(source[None], moments=False)
-        return vertices, figures[:, 0, :3]
+    def linear(self, source: np.ndarray) -> np.ndarray:
+        """The linear response alone to one field (V,) [-], (V, 3) [m]."""
+        asked = self.asked(np.flatnonzero(source))
+        _, figures = self._felt(source[None], asked.vertices, moments=False)
+        local = figures[:, 0, :3] * self.layer.thickness[asked.vertices, None]
+        out = np.zeros_like(self.layer.vertices)
+        asked.fill(np.einsum("nj,nji->ni", local, self.frames[asked.vertices]), out)
+        return out
 
     @classmethod
     def of(cls, layer: SoftLayer) -> Self:
@@ -126,23 +135,17 @@ class Surroundings:
         _sink_between(vertices, sources, self._sites, self._frames, self._response[0], self._response[1], out)
         return out
 
-    def spread(self, sources: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Vectors at vertices (V, 3) spread as sinking spreads, to NEAR: the vertices reached (N,), and (N, 3)."""
-        loaded = np.flatnonzero(sources.any(axis=1))
-        vertices = _reached(self.start, self.index, loaded, len(sources))
-        points = self.layer.vertices
-        low, high = points[loaded].min(axis=0, initial=np.inf), points[loaded].max(axis=0, initial=-np.inf)
-        away = np.maximum(np.maximum(low - points[vertices], points[vertices] - high), 0.0)
-        vertices = vertices[(away**2).sum(axis=1) < (NEAR * self.layer.thickness[vertices]) ** 2]
-        figures = np.zeros((len(vertices), 3, WIDTH), dtype=np.float32)
-        values = np.ascontiguousarray(sources[loaded].T, dtype=np.float32)
-        _feel_few(vertices, values, np.ascontiguousarray(self._sites[:, loaded]), self._sites, self._frames,
-                  self._response[0], self._response[1], False, figures)  # fmt: skip
-        return vertices, -figures[:, :, 2]
+    def spread(self, sources: np.ndarray) -> np.ndarray:
+        """Vectors at vertices, (V, 3), spread as sinking spreads, (V, 3)."""
+        asked = self.asked(np.flatnonzero(sources.any(axis=1)))
+        _, figures = self._felt(sources.T, asked.vertices, moments=False)
+        out = np.zeros_like(sources)
+        asked.fill(-figures[:, :, 2].astype(float), out)
+        return out
 
-    def _felt(self, fields: np.ndarray, moments: bool) -> tuple[np.ndarray, np.ndarray]:
+    def _felt(self, fields: np.ndarray, vertices: np.ndarray | None, moments: bool) -> tuple[np.ndarray, np.ndarray]:
         loaded = np.flatnonzero(fields.any(axis=0))
-        vertices = _reached(self.start, self.index, loaded, fields.shape[1])
+        vertices = self._thinning.reached(loaded) if vertices is None else vertices
         figures = np.zeros((len(vertices), len(fields), WIDTH), dtype=np.float32)
         values = np.ascontiguousarray(fields[:, loaded], dtype=np.float32)
         _feel(vertices, values, np.ascontiguousarray(self._sites[:, loaded]), self._sites, self._frames,
@@ -202,60 +205,14 @@ def _frames(normals: np.ndarray) -> np.ndarray:
     return np.stack([first, np.cross(normals, first), normals], axis=1)
 
 
-def _neighbours(points: np.ndarray, normals: np.ndarray, thickness: np.ndarray, reach: float) -> tuple:
-    """Pairs within `reach` thicknesses (the geometric mean of both) with normals less than 90 degrees apart.
-
-    Returns:
-        start (V + 1,), index: the neighbours of vertex v, itself among them, are index[start[v] : start[v + 1]].
-    """
-    cell = reach * float(thickness.max())
-    low = points.min(axis=0)
-    place = ((points - low) / cell).astype(np.int64)
-    shape = place.max(axis=0) + 1
-    key = (place[:, 0] * shape[1] + place[:, 1]) * shape[2] + place[:, 2]
-    order = np.argsort(key, kind="stable")
-    first = np.searchsorted(key[order], np.arange(shape.prod() + 1))
-    count = np.zeros(len(points) + 1, dtype=np.int64)
-    empty = np.empty(0, dtype=np.int32)
-    _pairs(points, normals, thickness, reach, place, shape, order, first, count, empty)
-    start = np.cumsum(count)
-    index = np.empty(start[-1], dtype=np.int32)
-    _pairs(points, normals, thickness, reach, place, shape, order, first, start, index)
-    return start, index
-
-
-@numba.njit(cache=True, parallel=True)
-def _pairs(points, normals, thickness, reach, place, shape, order, first, start, index):
-    """Counts the neighbours of vertex i into start[i + 1], or where `index` has room writes them from start[i] on."""
-    for i in numba.prange(len(points)):
-        n = 0
-        for a in range(max(place[i, 0] - 1, 0), min(place[i, 0] + 2, shape[0])):
-            for b in range(max(place[i, 1] - 1, 0), min(place[i, 1] + 2, shape[1])):
-                for c in range(max(place[i, 2] - 1, 0), min(place[i, 2] + 2, shape[2])):
-                    k = (a * shape[1] + b) * shape[2] + c
-                    for m in range(first[k], first[k + 1]):
-                        j = order[m]
-                        away = 0.0
-                        facing = 0.0
-                        for x in range(3):
-                            away += (points[i, x] - points[j, x]) ** 2
-                            facing += normals[i, x] * normals[j, x]
-                        if facing > 0 and away < reach * reach * thickness[i] * thickness[j]:
-                            if len(index):
-                                index[start[i] + n] = j
-                            n += 1
-        if not len(index):
-            start[i + 1] = n
-
-
 @numba.njit(cache=True, parallel=True)
 def _shape(start, index, points, frames, thickness):
     """Least-squares curvature (from the normals) and slope of the thickness, over a Gaussian of one thickness."""
-    out = np.zeros((len(points), 5))
+    out, zones = np.zeros((len(points), 5)), (len(start) - 1) // len(points)
     for i in numba.prange(len(points)):
         xx = xy = yy = 1e-12
         s = np.zeros(6)
-        for p in range(start[i], start[i + 1]):
+        for p in range(start[zones * i], start[zones * (i + 1)]):
             j = index[p]
             d = (points[j] - points[i]) / thickness[i]
             r2 = (d * d).sum()
@@ -280,16 +237,6 @@ def _shape(start, index, points, frames, thickness):
         out[i, 0], out[i, 1], out[i, 2] = a, 0.5 * (b + c), e
         out[i, 3], out[i, 4] = (yy * s[4] - xy * s[5]) / det, (xx * s[5] - xy * s[4]) / det
     return out
-
-
-@numba.njit(cache=True)
-def _reached(start, index, loaded, count):
-    """Vertices with a loaded neighbour, in order."""
-    mark = np.zeros(count, dtype=np.bool_)
-    for j in loaded:
-        for p in range(start[j], start[j + 1]):
-            mark[index[p]] = True
-    return np.flatnonzero(mark).astype(np.int32)
 
 
 FAST = {"contract", "reassoc", "nsz", "arcp"}

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from typing import Self
 
-import numpy as np
-
 from stmpl_core.layer import SoftLayer
 from stmpl_core.load import Load
 from stmpl_core.methods.base import prepared
@@ -45,10 +43,7 @@ class Linear:
         layer = prepared(self._layer, self)
         assert self._surroundings is not None
         pressure = load.check(layer).pressure_on(layer)
-        vertices, local = self._surroundings.linear(pressure / layer.tissue.youngs_modulus)
-        displacement = np.zeros_like(layer.vertices)
-        frames, thickness = self._surroundings.frames[vertices], layer.thickness[vertices]
-        displacement[vertices] = np.einsum("nj,nji->ni", local * thickness[:, None], frames)
+        displacement = self._surroundings.linear(pressure / layer.tissue.youngs_modulus)
         return Displacement(displacement, _trust(layer, load), self.name, pressure)
 
 

@@ -18,6 +18,7 @@ from stmpl_core.load import Load
 from stmpl_core.methods.base import Method, prepared
 from stmpl_core.methods.winkler import column_stretch
 from stmpl_core.moments import FAST, SCALARS, TENSORS, VECTORS, Surroundings
+from stmpl_core.thinning import Asked
 from stmpl_core.trust import Displacement, Trust
 
 SHIPPED = Path(__file__).parent.parent / "weights" / "moment_net.safetensors"
@@ -162,7 +163,8 @@ class MomentNet:
 
     def _solve(self, layer: SoftLayer, near: Surroundings, load: Load, pressure: np.ndarray) -> Displacement:
         sources = source_fields(pressure, layer)
-        felt = near.felt(sources)
+        asked = near.asked(np.flatnonzero(pressure))
+        felt = near.felt(sources, asked.vertices)
         vertices, figures = felt.vertices, felt.figures
         shape = self._shape[vertices]
         weights = self.contact if load.kind == "contact" else self.weights
@@ -186,16 +188,16 @@ class MomentNet:
         moved, error = np.empty((len(vertices), 3)), np.empty(len(vertices), dtype=np.float32)
         _move(figures, shape, place, outputs, a["mix_vectors"], a["mix_tensors"], self._frames[vertices], moved, error)
         displacement = np.zeros_like(layer.vertices)
-        displacement[vertices] = moved
+        asked.fill(moved, displacement)
         peak_error = float((error * layer.thickness[vertices]).max(initial=0.0))
-        trust = self._trust(weights.card, load, pressure, vertices, moved, outside, peak_error)
+        trust = self._trust(weights.card, load, pressure, asked, moved, outside, peak_error)
         if not trust.in_range and self.fallback is not None:
             answer = self.fallback.solve(load)
             because = answer.trust.also(f"answered by {answer.method}: {trust.why}")
             return Displacement(answer.displacement, because, answer.method, answer.pressure)
         return Displacement(displacement, trust, self.name, pressure)
 
-    def _trust(self, card: Mapping[str, Any], load: Load, pressure: np.ndarray, vertices: np.ndarray,
+    def _trust(self, card: Mapping[str, Any], load: Load, pressure: np.ndarray, asked: Asked,
                moved: np.ndarray, outside: np.ndarray, error: float) -> Trust:  # fmt: skip
         layer = prepared(self._layer, self)
         loaded = np.flatnonzero(pressure)
@@ -203,10 +205,10 @@ class MomentNet:
             return Trust(error_bound=0.0)
         length = np.linalg.norm(moved, axis=1)
         moving = length > 0.02 * length.max()
-        share = float(outside[moving].mean()) if moving.any() else 0.0
+        share = float(np.average(outside[moving], weights=asked.stand_for[moving])) if moving.any() else 0.0
         ratio = float(pressure[loaded].max()) / layer.tissue.youngs_modulus
-        t, nu = layer.thickness[vertices[moving]], layer.tissue.poisson_ratio
-        fine, coarse = _tenths(self._width[vertices[moving]])
+        t, nu = layer.thickness[asked.vertices[moving]], layer.tissue.poisson_ratio
+        fine, coarse = _tenths(self._width[asked.vertices[moving]])
         trust = Trust(figures={"peak_ratio": ratio, "outside_share": share, "expected_error_m": error})
         ranges = card["ranges"]
         for what, low, high, unit in (

@@ -1,0 +1,253 @@
+"""Thinning: far from a load its answer is smooth: fewer vertices are asked there, those between are filled in."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numba
+import numpy as np
+
+from stmpl_core.layer import SoftLayer
+
+ZONES = (2.0, 4.5)  # thicknesses from the load at which the first and the second thinning begin
+SPACINGS = (0.7, 1.5)  # thicknesses between the vertices that are asked there, at least
+CORNERS = 12  # asked vertices that one between is filled in from
+LARGEST = 2.5  # sum of the weights' sizes, from which a vertex is rather asked itself: it would be extrapolated
+
+
+class Asked(NamedTuple):
+    """The vertices that feel a load.
+
+    Args:
+        vertices: numbers of those that are asked, (N,).
+        between: numbers of those that are filled in, (M,).
+        corners: places in `vertices` of those that each is filled in from, (M, CORNERS).
+        weights: of these, (M, CORNERS) [-].
+    """
+
+    vertices: np.ndarray
+    between: np.ndarray
+    corners: np.ndarray
+    weights: np.ndarray
+
+    def fill(self, values: np.ndarray, out: np.ndarray) -> None:
+        """Writes vectors at the asked vertices (N, 3) and what follows for those between to `out` (V, 3)."""
+        out[self.vertices] = values
+        _fill(np.ascontiguousarray(values), self.between, self.corners, self.weights, out)
+
+    @property
+    def stand_for(self) -> np.ndarray:
+        """How many vertices each asked one stands for, (N,)."""
+        return 1 + np.bincount(self.corners.ravel(), self.weights.ravel(), len(self.vertices))
+
+
+class Thinning:
+    """Vertices in reach of each other by how far they are apart, and which of them stand for those around them.
+
+    Args:
+        layer: the soft layer at rest.
+        frames: two tangents and the normal of each vertex, (V, 3, 3).
+        reach: thicknesses to which a load is felt.
+    """
+
+    def __init__(self, layer: SoftLayer, frames: np.ndarray, reach: float) -> None:
+        points, normals, thickness = np.ascontiguousarray(layer.vertices), layer.normals, layer.thickness
+        self.start, self.index = neighbours(points, normals, thickness, np.array([*ZONES, reach]))
+        count = len(points)
+        self._stands = np.zeros((len(ZONES) + 1, count), dtype=np.bool_)
+        self._corners = np.zeros((len(ZONES) + 1, count, CORNERS), dtype=np.int32)
+        self._weights = np.zeros((len(ZONES) + 1, count, CORNERS), dtype=np.float32)
+        self._stands[0] = True
+        for zone, spacing in enumerate(SPACINGS, start=1):
+            stands = _thinned(self.start, self.index, self._stands[zone - 1], points, thickness, spacing)
+            corners = _nearest(self.start, self.index, stands, points)
+            some = np.flatnonzero(~stands & (corners[:, -1] >= 0))
+            weights = _interpolation(points, frames, thickness, some, corners[some])
+            good = np.abs(weights).sum(axis=1) < LARGEST
+            some = some[good]
+            self._stands[zone] = True
+            self._stands[zone, some] = False
+            self._corners[zone, some], self._weights[zone, some] = corners[some], weights[good]
+
+    def reached(self, loaded: np.ndarray) -> np.ndarray:
+        """All vertices with a loaded one in reach, in order."""
+        return np.flatnonzero(_zones(self.start, self.index, loaded, len(self._stands[0]))).astype(np.int32)
+
+    def asked(self, loaded: np.ndarray) -> Asked:
+        """Which of them are asked under a load on these vertices (L,), and how the others are filled in."""
+        zones = _zones(self.start, self.index, loaded, len(self._stands[0]))
+        return Asked(*_asked(zones, self._stands, self._corners, self._weights))
+
+
+def neighbours(points: np.ndarray, normals: np.ndarray, thickness: np.ndarray, reaches: np.ndarray) -> tuple:
+    """Pairs within each of `reaches`, rising, thicknesses (their geometric mean), normals less than 90 degrees apart.
+
+    Returns:
+        start (Z V + 1,), index: the neighbours of vertex v, itself among them, that lie between reach z - 1 and reach
+        z of Z are index[start[Z v + z] : start[Z v + z + 1]].
+    """
+    cell = reaches[-1] * float(thickness.max())
+    low = points.min(axis=0)
+    place = ((points - low) / cell).astype(np.int64)
+    shape = place.max(axis=0) + 1
+    key = (place[:, 0] * shape[1] + place[:, 1]) * shape[2] + place[:, 2]
+    order = np.argsort(key, kind="stable")
+    first = np.searchsorted(key[order], np.arange(shape.prod() + 1))
+    start = np.zeros(len(reaches) * len(points) + 1, dtype=np.int64)
+    _pairs(points, normals, thickness, reaches, place, shape, order, first, start, np.empty(0, dtype=np.int32))
+    start = np.cumsum(start)
+    index = np.empty(start[-1], dtype=np.int32)
+    _pairs(points, normals, thickness, reaches, place, shape, order, first, start, index)
+    return start, index
+
+
+@numba.njit(cache=True, parallel=True)
+def _pairs(points, normals, thickness, reaches, place, shape, order, first, start, index):
+    """Counts the neighbours of vertex i in zone z into start[Z i + z + 1], or where `index` has room writes them."""
+    zones = len(reaches)
+    for i in numba.prange(len(points)):
+        n = np.zeros(zones, np.int64)
+        for a in range(max(place[i, 0] - 1, 0), min(place[i, 0] + 2, shape[0])):
+            for b in range(max(place[i, 1] - 1, 0), min(place[i, 1] + 2, shape[1])):
+                for c in range(max(place[i, 2] - 1, 0), min(place[i, 2] + 2, shape[2])):
+                    k = (a * shape[1] + b) * shape[2] + c
+                    for m in range(first[k], first[k + 1]):
+                        j = order[m]
+                        away = 0.0
+                        facing = 0.0
+                        for x in range(3):
+                            away += (points[i, x] - points[j, x]) ** 2
+                            facing += normals[i, x] * normals[j, x]
+                        away /= thickness[i] * thickness[j]
+                        if facing > 0 and away < reaches[-1] ** 2:
+                            z = 0
+                            while away >= reaches[z] ** 2:
+                                z += 1
+                            if len(index):
+                                index[start[zones * i + z] + n[z]] = j
+                            n[z] += 1
+        if not len(index):
+            for z in range(zones):
+                start[zones * i + z + 1] = n[z]
+
+
+@numba.njit(cache=True)
+def _thinned(start, index, among, points, thickness, spacing):
+    """Marks vertices of `among` no two of which are nearer than `spacing`, as many as come in order."""
+    count = len(points)
+    zones = (len(start) - 1) // count
+    kept, free = np.zeros(count, np.bool_), among.copy()
+    for v in range(count):
+        if not free[v]:
+            continue
+        kept[v] = True
+        for p in range(start[zones * v], start[zones * v + 1]):
+            away = 0.0
+            for x in range(3):
+                away += (points[v, x] - points[index[p], x]) ** 2
+            if away < (spacing * thickness[v]) ** 2:
+                free[index[p]] = False
+    return kept
+
+
+@numba.njit(cache=True)
+def _nearest(start, index, stands, points):
+    """The nearest CORNERS vertices in reach that stand for others, (V, CORNERS); -1 where there are fewer."""
+    count = len(points)
+    zones = (len(start) - 1) // count
+    out, far = np.full((count, CORNERS), -1, np.int32), np.empty(CORNERS)
+    for v in range(count):
+        n = 0
+        for p in range(start[zones * v], start[zones * (v + 1)]):
+            j = index[p]
+            if not stands[j]:
+                continue
+            away = 0.0
+            for x in range(3):
+                away += (points[v, x] - points[j, x]) ** 2
+            if n == CORNERS and away >= far[-1]:
+                continue
+            k = min(n, CORNERS - 1)
+            while k > 0 and far[k - 1] > away:
+                far[k], out[v, k] = far[k - 1], out[v, k - 1]
+                k -= 1
+            far[k], out[v, k] = away, j
+            n = min(n + 1, CORNERS)
+    return out
+
+
+def _interpolation(points: np.ndarray, frames: np.ndarray, thickness: np.ndarray, some: np.ndarray,
+                   corners: np.ndarray) -> np.ndarray:  # fmt: skip
+    """Weights of the corners (M, CORNERS) for vertices `some` (M,), in their tangent planes.
+
+    Cubic splines through scattered points, exact for what is linear: Fornberg & Flyer, "A Primer on Radial Basis
+    Functions with Applications to the Geosciences", 2015, chapter 5.
+    """
+    away = (points[corners] - points[some][:, None]) / thickness[some][:, None, None]
+    flat = np.einsum("nkx,nax->nka", away, frames[some][:, :2])
+    size = CORNERS + 3
+    left, right = np.zeros((len(some), size, size)), np.zeros((len(some), size))
+    left[:, :CORNERS, :CORNERS] = np.linalg.norm(flat[:, :, None] - flat[:, None], axis=-1) ** 3
+    left[:, :CORNERS, CORNERS], left[:, CORNERS, :CORNERS] = 1.0, 1.0
+    left[:, :CORNERS, CORNERS + 1 :], left[:, CORNERS + 1 :, :CORNERS] = flat, np.swapaxes(flat, 1, 2)
+    left += 1e-9 * np.eye(size)
+    right[:, :CORNERS], right[:, CORNERS] = np.linalg.norm(flat, axis=-1) ** 3, 1.0
+    return np.linalg.solve(left, right[..., None])[:, :CORNERS, 0].astype(np.float32)
+
+
+@numba.njit(cache=True)
+def _zones(start, index, loaded, count):
+    """0 where no loaded vertex is in reach, else 1 for the outermost zone up to Z for the innermost, (count,)."""
+    mark = np.zeros(count, np.uint8)
+    zones = (len(start) - 1) // count
+    for z in range(zones - 1, -1, -1):
+        for j in loaded:
+            for p in range(start[zones * j + z], start[zones * j + z + 1]):
+                mark[index[p]] = zones - z
+    return mark
+
+
+@numba.njit(cache=True)
+def _asked(marks, stands, corners, weights):
+    """See Asked."""
+    last = len(stands)
+    place = np.zeros(len(marks), np.int32)
+    between = np.empty(len(marks), np.int32)
+    many = 0
+    for v in range(len(marks)):
+        if marks[v] == 0:
+            continue
+        z = last - marks[v]
+        if stands[z, v]:
+            place[v] = 1
+        else:
+            between[many] = v
+            many += 1
+            for k in range(CORNERS):
+                place[corners[z, v, k]] = 1
+    count = 0
+    for n in range(many):  # asked after all
+        if place[between[n]] == 0:
+            between[count] = between[n]
+            count += 1
+    between = between[:count].copy()
+    vertices = np.flatnonzero(place).astype(np.int32)
+    for n in range(len(vertices)):
+        place[vertices[n]] = n
+    at, by = np.empty((count, CORNERS), np.int32), np.empty((count, CORNERS), np.float32)
+    for n in range(count):
+        v = between[n]
+        z = last - marks[v]
+        for k in range(CORNERS):
+            at[n, k], by[n, k] = place[corners[z, v, k]], weights[z, v, k]
+    return vertices, between, at, by
+
+
+@numba.njit(cache=True)
+def _fill(values, between, corners, weights, out):
+    for n in range(len(between)):
+        for x in range(3):
+            out[between[n], x] = 0.0
+        for k in range(CORNERS):
+            for x in range(3):
+                out[between[n], x] += weights[n, k] * values[corners[n, k], x]

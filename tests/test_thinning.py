@@ -1,0 +1,96 @@
+"""Laws of thinning: who is asked, what is filled in, and that answers are those of asking everybody."""
+
+import numpy as np
+import pytest
+
+from stmpl_core import Load, SoftLayer
+from stmpl_core.methods import Linear, MomentNet
+from stmpl_core.moments import REACH, Surroundings
+from stmpl_core.thinning import SPACINGS, ZONES, Asked, Thinning
+from tests import scenes
+
+T = 7e-3
+
+
+def arm(h: float = 3e-3, t: float = T) -> SoftLayer:
+    return SoftLayer(*scenes.limb(h), t)
+
+
+def pressed(layer: SoftLayer, radius: float = 8e-3) -> Load:
+    weight = scenes.smooth_disc(layer.vertices, np.array([0.04, 0, 0.08]), radius, 3e-3)
+    return Load.pressure(0.5 * layer.tissue.youngs_modulus * weight)
+
+
+def everybody(thinning: Thinning, loaded: np.ndarray) -> Asked:
+    none = np.empty(0, np.int32)
+    return Asked(thinning.reached(loaded), none, none.reshape(0, 1), np.empty((0, 1), np.float32))
+
+
+@pytest.fixture(scope="module")
+def layer() -> SoftLayer:
+    return arm()
+
+
+@pytest.fixture(scope="module")
+def asked(layer: SoftLayer) -> Asked:
+    return Surroundings.of(layer).asked(np.flatnonzero(pressed(layer).values))
+
+
+def test_every_vertex_in_reach_is_asked_or_filled_in_once(layer: SoftLayer, asked: Asked) -> None:
+    loaded = np.flatnonzero(pressed(layer).values)
+    reached = Thinning(layer, Surroundings.of(layer).frames, REACH).reached(loaded)
+    assert not np.intersect1d(asked.vertices, asked.between).size
+    assert np.isin(reached, np.union1d(asked.vertices, asked.between)).all()
+    assert np.isin(asked.between, reached).all()
+    apart = np.linalg.norm(layer.vertices[reached][:, None] - layer.vertices[loaded], axis=2).min(axis=1)
+    assert apart.max() < REACH * T + 1e-9
+
+
+def test_near_the_load_all_are_asked_and_far_from_it_few(layer: SoftLayer, asked: Asked) -> None:
+    loaded = layer.vertices[np.flatnonzero(pressed(layer).values)]
+    apart = np.linalg.norm(layer.vertices[asked.between][:, None] - loaded, axis=2).min(axis=1)
+    assert apart.min() >= ZONES[0] * T
+    assert len(asked.vertices) < 0.4 * (len(asked.vertices) + len(asked.between))
+
+
+def test_on_a_skin_as_coarse_as_the_thinning_all_are_asked_in_the_middle() -> None:
+    coarse = arm(8e-3)
+    asked = Surroundings.of(coarse).asked(np.flatnonzero(pressed(coarse, 12e-3).values))
+    loaded = coarse.vertices[np.flatnonzero(pressed(coarse, 12e-3).values)]
+    assert SPACINGS[0] * T < 5e-3
+    apart = np.linalg.norm(coarse.vertices[asked.between][:, None] - loaded, axis=2).min(axis=1)
+    assert apart.min() >= ZONES[1] * T
+
+
+def test_what_is_linear_in_space_is_filled_in_as_it_is(layer: SoftLayer, asked: Asked) -> None:
+    """Exact in the tangent plane; out of it by as much as the skin curves away between the corners."""
+    np.testing.assert_allclose(asked.weights.sum(axis=1), 1, atol=1e-4)
+    out = np.full_like(layer.vertices, np.nan)
+    asked.fill(layer.vertices[asked.vertices], out)
+    normals = layer.normals[asked.between]
+    off = out[asked.between] - layer.vertices[asked.between]
+    across = np.abs(np.einsum("ni,ni->n", off, normals))
+    along = np.linalg.norm(off - np.einsum("ni,ni->n", off, normals)[:, None] * normals, axis=1)
+    assert along.max() < 1e-6 and across.max() < 0.02 * T
+    assert np.isnan(out).any(axis=1).sum() == len(out) - len(asked.vertices) - len(asked.between)
+
+
+def test_each_stands_for_as_many_as_there_are(asked: Asked) -> None:
+    assert asked.stand_for.sum() == pytest.approx(len(asked.vertices) + len(asked.between), rel=1e-5)
+
+
+@pytest.mark.parametrize("t", [3e-3, 7e-3, 12e-3])
+@pytest.mark.parametrize("method", [Linear, MomentNet])
+def test_answers_are_those_of_asking_everybody(method: type, t: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    layer = arm(t=t)
+    solver, load = method().prepare(layer), pressed(layer)
+    thinned = solver.solve(load).displacement
+    monkeypatch.setattr(Thinning, "asked", everybody)
+    whole = solver.solve(load).displacement
+    error, peak = np.linalg.norm(thinned - whole, axis=1), np.linalg.norm(whole, axis=1).max()
+    assert 0 < error.max() < 0.01 * peak and error.mean() < 5e-4 * peak
+
+
+def test_no_load_asks_nobody(layer: SoftLayer) -> None:
+    asked = Surroundings.of(layer).asked(np.empty(0, np.int64))
+    assert not len(asked.vertices) and not len(asked.between)
