@@ -88,9 +88,8 @@ def conform(near: Surroundings, displacement: VertexVectors, touches: Sequence[T
         step = np.linalg.solve(sinking[np.ix_(act, act)] + np.diag(own / weight[act] ** 2), wanted[act])
         sources[act] += step
         moved += sinking[:, act] @ step
-    spread = np.zeros_like(displacement)
-    spread[all_of] = sources
-    out = displacement + near.spread(spread)
+    out = near.spread(all_of, sources)
+    out += displacement
     entered = 0.0
     for tool in tools:  # what is left inside goes straight out
         phi, gradient = tool.jet(layer.vertices[tool.vertices] + out[tool.vertices])

@@ -88,16 +88,18 @@ class Surroundings:
         self.curvature, self.slope = shape[:, :3], shape[:, 3:]
         self._response = np.ascontiguousarray(np.moveaxis(response_table(layer.tissue.poisson_ratio), 2, 0))
         with packed():
-            self._felt(np.zeros((1, len(points))), None, moments=True)
+            self._felt(np.zeros((1, 1)), np.zeros(1, np.int64), np.zeros(1, np.int32), moments=True)
             self.felt_among(np.zeros(1, np.int64), np.zeros((1, 2)))
 
     def asked(self, loaded: np.ndarray) -> Asked:
         """Which vertices to ask what they feel of sources at vertices `loaded` (L,), for all to be known."""
         return self._thinning.asked(loaded)
 
-    def felt(self, sources: np.ndarray, vertices: np.ndarray | None = None) -> Felt:
-        """What vertices (N,), or all that feel anything, feel of source fields (V, S) [-], over Young's modulus."""
-        return Felt(*self._felt(np.asarray(sources).T, vertices, moments=True))
+    def felt(self, sources: np.ndarray, asked: Asked | None = None) -> Felt:
+        """What the vertices that are asked, or all, feel of source fields (V, S) [-], in units of Young's modulus."""
+        loaded = np.flatnonzero(sources.any(axis=1)) if asked is None else asked.loaded
+        vertices = self._thinning.reached(loaded) if asked is None else asked.vertices
+        return Felt(vertices, self._felt(sources[loaded], loaded, vertices, moments=True))
 
     def felt_among(self, vertices: np.ndarray, sources: np.ndarray) -> Felt:
         """What vertices (N,) feel of sources at themselves alone, (N, S) [-]: on one thread, for small contacts."""
@@ -110,7 +112,7 @@ class Surroundings:
     def linear(self, source: np.ndarray) -> np.ndarray:
         """The linear response alone to one field (V,) [-], (V, 3) [m]."""
         asked = self.asked(np.flatnonzero(source))
-        _, figures = self._felt(source[None], asked.vertices, moments=False)
+        figures = self._felt(source[asked.loaded, None], asked.loaded, asked.vertices, moments=False)
         local = figures[:, 0, :3] * self.layer.thickness[asked.vertices, None]
         out = np.zeros_like(self.layer.vertices)
         asked.fill(np.einsum("nj,nji->ni", local, self.frames[asked.vertices]), out)
@@ -132,25 +134,24 @@ class Surroundings:
         """How far vertex i sinks under a unit source at vertex j of those given, in thicknesses, (N, N) [-]."""
         out = np.zeros((len(vertices), len(vertices)), dtype=np.float32)
         sources = np.ascontiguousarray(self._sites[:, vertices])
-        _sink_between(vertices, sources, self._sites, self._frames, self._response[0], self._response[1], out)
+        _sink_between(vertices, sources, self._sites, self._frames, self._response[0], out)
         return out
 
-    def spread(self, sources: np.ndarray) -> np.ndarray:
-        """Vectors at vertices, (V, 3), spread as sinking spreads, (V, 3)."""
-        asked = self.asked(np.flatnonzero(sources.any(axis=1)))
-        _, figures = self._felt(sources.T, asked.vertices, moments=False)
-        out = np.zeros_like(sources)
-        asked.fill(-figures[:, :, 2].astype(float), out)
+    def spread(self, vertices: np.ndarray, sources: np.ndarray) -> np.ndarray:
+        """Vectors (N, 3) at vertices (N,) spread as sinking spreads, (V, 3)."""
+        asked = self.asked(vertices)
+        by, out = np.empty((len(asked.vertices), 3)), np.zeros_like(self.layer.vertices)
+        _spread(asked.vertices, sources.astype(np.float32), np.ascontiguousarray(self._sites[:, vertices]), self._sites,
+                self._frames, self._response[0], by)  # fmt: skip
+        asked.fill(by, out)
         return out
 
-    def _felt(self, fields: np.ndarray, vertices: np.ndarray | None, moments: bool) -> tuple[np.ndarray, np.ndarray]:
-        loaded = np.flatnonzero(fields.any(axis=0))
-        vertices = self._thinning.reached(loaded) if vertices is None else vertices
-        figures = np.zeros((len(vertices), len(fields), WIDTH), dtype=np.float32)
-        values = np.ascontiguousarray(fields[:, loaded], dtype=np.float32)
+    def _felt(self, sources: np.ndarray, loaded: np.ndarray, vertices: np.ndarray, moments: bool) -> np.ndarray:
+        figures = np.zeros((len(vertices), sources.shape[1], WIDTH), dtype=np.float32)
+        values = np.ascontiguousarray(sources.T, dtype=np.float32)
         _feel(vertices, values, np.ascontiguousarray(self._sites[:, loaded]), self._sites, self._frames,
               self._response[0], self._response[1], moments, figures)  # fmt: skip
-        return vertices, figures
+        return figures
 
 
 def response_table(poisson_ratio: float) -> np.ndarray:
@@ -276,15 +277,49 @@ _feel_few = numba.njit(cache=True, fastmath=FAST)(_feel)
 _feel = numba.njit(cache=True, parallel=True, fastmath=FAST)(_feel)
 
 
+@numba.njit(inline="always", fastmath=FAST)
+def _sink(i, sources, sites, frames, sink, felt):
+    """How far vertex i sinks under a unit of each source, in thicknesses, to `felt` (N,); 0 out of reach."""
+    one, steps, far = np.float32(1), np.float32(STEPS), np.float32(REACH * REACH)
+    top, per_log = np.float32(len(SPREADS) - 1.001), np.float32(1 / np.log(SPREADS[1] / SPREADS[0]))
+    px, py, pz, root, log_t = sites[0, i], sites[1, i], sites[2, i], sites[3, i], sites[5, i]
+    c0, c1, c2 = frames[i, 2, 0], frames[i, 2, 1], frames[i, 2, 2]
+    for q in range(sources.shape[1]):
+        dx, dy, dz, inverse = sources[0, q] - px, sources[1, q] - py, sources[2, q] - pz, root * sources[3, q]
+        facing = c0 * sources[7, q] + c1 * sources[8, q] + c2 * sources[9, q]
+        square = (dx * dx + dy * dy + dz * dz) * inverse * inverse
+        felt[q] = np.sqrt(square) * steps if facing > 0 and square < far else np.float32(-1)
+    for q in range(sources.shape[1]):
+        if felt[q] < 0:
+            felt[q] = 0
+            continue
+        k, h = int(felt[q]), min(max((sources[6, q] - log_t) * per_log, np.float32(0)), top)
+        g = int(h)
+        rest, h = felt[q] - np.float32(k), h - np.float32(g)
+        low = (one - rest) * sink[g, k] + rest * sink[g, k + 1]
+        high = (one - rest) * sink[g + 1, k] + rest * sink[g + 1, k + 1]
+        felt[q] = sources[4, q] * root * root * root * sources[3, q] * ((one - h) * low + h * high)
+
+
 @numba.njit(cache=True, fastmath=FAST)
-def _sink_between(vertices, sources, sites, frames, sink, away, out):
+def _sink_between(vertices, sources, sites, frames, sink, out):
     """See Surroundings.sinking."""
-    many = len(vertices)
-    felt, kept = np.empty((9, many), dtype=np.float32), np.empty(many + 1, dtype=np.int32)
-    for n in range(many):
-        count = _gather(vertices[n], sources, sites, frames, sink, away, felt, kept)
-        for q in range(count):
-            out[n, kept[q]] = felt[7, q]
+    for n in range(len(vertices)):
+        _sink(vertices[n], sources, sites, frames, sink, out[n])
+
+
+@numba.njit(cache=True, fastmath=FAST)
+def _spread(vertices, values, sources, sites, frames, sink, out):
+    """See Surroundings.spread; values (N, 3), out (M, 3)."""
+    felt = np.empty(sources.shape[1], np.float32)
+    for n in range(len(vertices)):
+        _sink(vertices[n], sources, sites, frames, sink, felt)
+        u = v = w = np.float32(0)
+        for q in range(len(felt)):
+            u += values[q, 0] * felt[q]
+            v += values[q, 1] * felt[q]
+            w += values[q, 2] * felt[q]
+        out[n, 0], out[n, 1], out[n, 2] = u, v, w
 
 
 @numba.njit(inline="always", fastmath=FAST)

@@ -19,12 +19,14 @@ class Asked(NamedTuple):
     """The vertices that feel a load.
 
     Args:
-        vertices: numbers of those that are asked, (N,).
-        between: numbers of those that are filled in, (M,).
+        loaded: numbers of the loaded vertices, (L,).
+        vertices: of those that are asked, (N,).
+        between: of those that are filled in, (M,).
         corners: places in `vertices` of those that each is filled in from, (M, CORNERS).
         weights: of these, (M, CORNERS) [-].
     """
 
+    loaded: np.ndarray
     vertices: np.ndarray
     between: np.ndarray
     corners: np.ndarray
@@ -76,7 +78,7 @@ class Thinning:
     def asked(self, loaded: np.ndarray) -> Asked:
         """Which of them are asked under a load on these vertices (L,), and how the others are filled in."""
         zones = _zones(self.start, self.index, loaded, len(self._stands[0]))
-        return Asked(*_asked(zones, self._stands, self._corners, self._weights))
+        return Asked(loaded, *_asked(zones, self._stands, self._corners, self._weights))
 
 
 def neighbours(points: np.ndarray, normals: np.ndarray, thickness: np.ndarray, reaches: np.ndarray) -> tuple:
@@ -209,7 +211,7 @@ def _zones(start, index, loaded, count):
 
 @numba.njit(cache=True)
 def _asked(marks, stands, corners, weights):
-    """See Asked."""
+    """All of Asked but for the loaded vertices."""
     last = len(stands)
     place = np.zeros(len(marks), np.int32)
     between = np.empty(len(marks), np.int32)

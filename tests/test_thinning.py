@@ -23,7 +23,7 @@ def pressed(layer: SoftLayer, radius: float = 8e-3) -> Load:
 
 def everybody(thinning: Thinning, loaded: np.ndarray) -> Asked:
     none = np.empty(0, np.int32)
-    return Asked(thinning.reached(loaded), none, none.reshape(0, 1), np.empty((0, 1), np.float32))
+    return Asked(loaded, thinning.reached(loaded), none, none.reshape(0, 1), np.empty((0, 1), np.float32))
 
 
 @pytest.fixture(scope="module")

@@ -164,7 +164,7 @@ class MomentNet:
     def _solve(self, layer: SoftLayer, near: Surroundings, load: Load, pressure: np.ndarray) -> Displacement:
         sources = source_fields(pressure, layer)
         asked = near.asked(np.flatnonzero(pressure))
-        felt = near.felt(sources, asked.vertices)
+        felt = near.felt(sources, asked)
         vertices, figures = felt.vertices, felt.figures
         shape = self._shape[vertices]
         weights = self.contact if load.kind == "contact" else self.weights
