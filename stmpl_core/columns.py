@@ -95,8 +95,7 @@ class Columns:
 
     def clearance(self, field: SignedDistance, pose: Transform, near: np.ndarray, far: float) -> Clearance:
         """How near the tool comes to columns; those further than `far` [m] are only known to be so."""
-        least, skin = _clearances(field.coefficients, field.origin, field.spacing, pose, self.points, self.inward,
-                                  self.layer.thickness, near, far)  # fmt: skip
+        least, skin = _clearances(_grid(field), pose, self.points, self.inward, self.layer.thickness, near, far)
         return Clearance(near, least, skin)
 
     def squeeze(self, field: SignedDistance, pose: Transform, clearance: Clearance) -> Squeeze:
@@ -106,17 +105,19 @@ class Columns:
         if not len(covered):
             return NO_SQUEEZE
         buried = min(max(float(np.minimum(-least, above).max()) / ROUND, 0.0), 1.0)
-        grid = field.coefficients, field.origin, field.spacing, pose
         skin = self.points, self.inward, self.layer.thickness, self.faces, self._start, self._around, self._face_areas
-        vertices, sums, depth, rests = _squeeze(*grid, *skin, covered, buried, self._slot, self._moduli)
+        vertices, sums, depth, rests = _squeeze(_grid(field), pose, *skin, covered, buried, self._slot, self._moduli)
         sums /= self.layer.vertex_areas[vertices, None]
         return Squeeze(vertices, sums[:, 0], sums[:, 1], depth, rests)
 
 
 def depth_along(field: SignedDistance, pose: Transform, points: Points, way: Points, guess: np.ndarray) -> np.ndarray:
     """How far points (N, 3) inside a tool must go along unit vectors (N, 3) to leave it, (N,) [m], from a guess > 0."""
-    grid = field.coefficients, field.origin, field.spacing, pose
-    return _depths_along(*grid, points, np.ascontiguousarray(way), guess)
+    return _depths_along(_grid(field), pose, points, np.ascontiguousarray(way), guess)
+
+
+def _grid(field: SignedDistance) -> tuple[np.ndarray, np.ndarray, float]:
+    return field.coefficients, field.origin, field.spacing
 
 
 def deeper(tissue: Tissue, thickness: np.ndarray, weight: np.ndarray, depth: np.ndarray, gain: np.ndarray,
@@ -171,15 +172,23 @@ def _inside_box(points, pose, low, high):
     return found[:n].copy()
 
 
-@numba.njit(cache=True)
-def _at(coefficients, origin, spacing, pose, point, inward, s):
-    """Signed distance to the tool at depth s under a point of the skin [m]."""
-    x, y, z = _to_tool(pose, point[0] + s * inward[0], point[1] + s * inward[1], point[2] + s * inward[2])
-    return distance_at(coefficients, origin, spacing, x, y, z)
+@numba.njit(cache=True, inline="always")
+def _ray(pose, points, ways, n):
+    """Point n and its unit vector in the tool's frame, as six numbers: a view of an array would cost as much again."""
+    x, y, z = _to_tool(pose, points[n, 0], points[n, 1], points[n, 2])
+    a, b, c = ways[n, 0], ways[n, 1], ways[n, 2]
+    return (x, y, z, pose[0, 0] * a + pose[1, 0] * b + pose[2, 0] * c, pose[0, 1] * a + pose[1, 1] * b + pose[2, 1] * c,
+            pose[0, 2] * a + pose[1, 2] * b + pose[2, 2] * c)  # fmt: skip
+
+
+@numba.njit(cache=True, inline="always")
+def _at(grid, ray, s):
+    """Signed distance to the tool at depth s along a ray [m]."""
+    return distance_at(grid[0], grid[1], grid[2], ray[0] + s * ray[3], ray[1] + s * ray[4], ray[2] + s * ray[5])
 
 
 @numba.njit(cache=True)
-def _clearances(coefficients, origin, spacing, pose, points, inward, thickness, near, far):
+def _clearances(grid, pose, points, inward, thickness, near, far):
     """Least signed distance along each column [m], by sphere tracing from the skin to the core; and that at the skin.
 
     A column whose core end lies inside the tool counts only if the tool comes from outside: where the distance still
@@ -188,31 +197,31 @@ def _clearances(coefficients, origin, spacing, pose, points, inward, thickness, 
     out, skin = np.full(len(near), np.inf), np.empty(len(near))
     for n in range(len(near)):
         v = near[n]
-        t, point, down = thickness[v], points[v], inward[v]
-        skin[n] = d = _at(coefficients, origin, spacing, pose, point, down, 0.0)
+        t, ray = thickness[v], _ray(pose, points, inward, v)
+        skin[n] = d = _at(grid, ray, 0.0)
         if d > t + far:
             out[n] = d - t  # the rest of the column cannot be nearer
             continue
         least, s = d, 0.0
         while s < t:
             s = min(s + max(abs(d), t / 16), t)
-            d = _at(coefficients, origin, spacing, pose, point, down, s)
+            d = _at(grid, ray, s)
             least = min(least, d)
-        if d <= 0 and _at(coefficients, origin, spacing, pose, point, down, t + 1e-5) < d:
+        if d <= 0 and _at(grid, ray, t + 1e-5) < d:
             least = np.inf
         out[n] = least
     return out, skin
 
 
 @numba.njit(cache=True)
-def _meet(coefficients, origin, spacing, pose, point, inward, t, guess):
-    """How deep under a point of the skin the tool ends [m]; 0 if it is not met.
+def _meet(grid, ray, t, guess):
+    """How deep along a ray, from the skin inwards, the tool ends [m]; 0 if it is not met.
 
     From a guess above ROUND by the secant rule. Where that goes astray, as along a wall of the tool, or without such a
     guess: from the core by sphere tracing, then the secant rule.
     """
     if guess > ROUND:
-        s, d = guess, _at(coefficients, origin, spacing, pose, point, inward, guess)
+        s, d = guess, _at(grid, ray, guess)
         last_s, last_d = s + 1.0, d + 1.0
         for _ in range(6):
             slope = (d - last_d) / (s - last_s)
@@ -222,8 +231,8 @@ def _meet(coefficients, origin, spacing, pose, point, inward, t, guess):
             s -= d / slope
             if abs(s - last_s) < EXACT and s > 0:
                 return min(s, t)
-            d = _at(coefficients, origin, spacing, pose, point, inward, s)
-    s, d = t, _at(coefficients, origin, spacing, pose, point, inward, t)
+            d = _at(grid, ray, s)
+    s, d = t, _at(grid, ray, t)
     if d <= 0:
         return t
     last_s, last_d = s + 1.0, d + 1.0
@@ -240,7 +249,7 @@ def _meet(coefficients, origin, spacing, pose, point, inward, t, guess):
             return 0.0
         if abs(s - last_s) < EXACT:
             return min(s, t)
-        d = _at(coefficients, origin, spacing, pose, point, inward, s)
+        d = _at(grid, ray, s)
     return min(s, t)
 
 
@@ -277,16 +286,15 @@ def _column_pressure(moduli, strain):
 
 
 @numba.njit(cache=True)
-def _depths_along(coefficients, origin, spacing, pose, points, way, guess):
+def _depths_along(grid, pose, points, way, guess):
     out = np.empty(len(points))
     for n in range(len(points)):
-        out[n] = _meet(coefficients, origin, spacing, pose, points[n], way[n], 4 * guess[n], guess[n])
+        out[n] = _meet(grid, _ray(pose, points, way, n), 4 * guess[n], guess[n])
     return out
 
 
 @numba.njit(cache=True)
-def _squeeze(coefficients, origin, spacing, pose, points, inward, thickness, faces, start, around, face_areas, covered,
-             buried, slot, moduli):  # fmt: skip
+def _squeeze(grid, pose, points, inward, thickness, faces, start, around, face_areas, covered, buried, slot, moduli):
     """See Columns.squeeze: vertices in order, pressure and strain times their areas (N, 2), depth (N,), rests (N,).
 
     A triangle with all corners covered has a good guess of every depth; at the border the depth falls to 0 over ROUND
@@ -315,41 +323,42 @@ def _squeeze(coefficients, origin, spacing, pose, points, inward, thickness, fac
     for n in range(count):
         v = vertices[n]
         slot[v] = n
-        guess = -_at(coefficients, origin, spacing, pose, points[v], inward[v], 0.0)
+        ray = _ray(pose, points, inward, v)
+        guess = -_at(grid, ray, 0.0)
         share = 1.0 if guess >= 0 else max(buried, 1 + guess / ROUND)
         guess = 0.0 if buried > 0 else guess
-        depth[n] = 0.0 if share <= 0 else share * _meet(
-            coefficients, origin, spacing, pose, points[v], inward[v], thickness[v], guess)  # fmt: skip
+        depth[n] = 0.0 if share <= 0 else share * _meet(grid, ray, thickness[v], guess)
         if depth[n] > 0:
-            inside = -_at(coefficients, origin, spacing, pose, points[v], inward[v], depth[n] - ROUND)
+            inside = -_at(grid, ray, depth[n] - ROUND)
             rests[n] = min(max(2 * inside / ROUND, 0.0), 1.0) * min(depth[n] / ROUND, 1.0)
-    point, down = np.empty(3), np.empty(3)
+    point, down = np.empty((1, 3)), np.empty((1, 3))
     for f in found:
-        i, j, k = faces[f]
+        i, j, k = faces[f, 0], faces[f, 1], faces[f, 2]
         di, dj, dk = depth[slot[i]], depth[slot[j]], depth[slot[k]]
         border = min(rests[slot[i]], rests[slot[j]], rests[slot[k]]) < 1 or max(di, dj, dk) > 3 * min(di, dj, dk)
         weight = face_areas[f] / len(_SAMPLES)
         for q in range(len(_SAMPLES)):
-            a, b, c = _SAMPLES[q]
+            a, b, c = _SAMPLES[q, 0], _SAMPLES[q, 1], _SAMPLES[q, 2]
             length = 0.0
             for x in range(3):
-                point[x] = a * points[i, x] + b * points[j, x] + c * points[k, x]
-                down[x] = a * inward[i, x] + b * inward[j, x] + c * inward[k, x]
-                length += down[x] * down[x]
+                point[0, x] = a * points[i, x] + b * points[j, x] + c * points[k, x]
+                down[0, x] = a * inward[i, x] + b * inward[j, x] + c * inward[k, x]
+                length += down[0, x] * down[0, x]
             length = 1 / np.sqrt(length)
             for x in range(3):
-                down[x] *= length
+                down[0, x] *= length
+            ray = _ray(pose, point, down, 0)
             t = a * thickness[i] + b * thickness[j] + c * thickness[k]
             guess, share = a * di + b * dj + c * dk, 1.0
             if border or buried > 0:
-                guess = -_at(coefficients, origin, spacing, pose, point, down, 0.0)
+                guess = -_at(grid, ray, 0.0)
                 share = 1.0 if guess >= 0 else max(buried, 1 + guess / ROUND)
                 if share <= 0:
                     continue
                 guess = 0.0 if buried > 0 else guess
-            deep = _meet(coefficients, origin, spacing, pose, point, down, t, guess)
+            deep = _meet(grid, ray, t, guess)
             if border and deep > 0:
-                inside = -_at(coefficients, origin, spacing, pose, point, down, deep - ROUND)
+                inside = -_at(grid, ray, deep - ROUND)
                 deep *= min(max(2 * inside / ROUND, 0.0), 1.0)
             deep *= share
             if deep <= 0:

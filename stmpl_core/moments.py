@@ -141,8 +141,9 @@ class Surroundings:
         """Vectors (N, 3) at vertices (N,) spread as sinking spreads, (V, 3)."""
         asked = self.asked(vertices)
         by, out = np.empty((len(asked.vertices), 3)), np.zeros_like(self.layer.vertices)
-        _spread(asked.vertices, sources.astype(np.float32), np.ascontiguousarray(self._sites[:, vertices]), self._sites,
-                self._frames, self._response[0], by)  # fmt: skip
+        values = np.ascontiguousarray(sources.T, dtype=np.float32)
+        _spread(asked.vertices, values, np.ascontiguousarray(self._sites[:, vertices]), self._sites, self._frames,
+                self._response[0], by)  # fmt: skip
         asked.fill(by, out)
         return out
 
@@ -206,7 +207,7 @@ def _frames(normals: np.ndarray) -> np.ndarray:
     return np.stack([first, np.cross(normals, first), normals], axis=1)
 
 
-@numba.njit(cache=True, parallel=True)
+@numba.njit(cache=True, parallel=True, error_model="numpy")
 def _shape(start, index, points, frames, thickness):
     """Least-squares curvature (from the normals) and slope of the thickness, over a Gaussian of one thickness."""
     out, zones = np.zeros((len(points), 5)), (len(start) - 1) // len(points)
@@ -256,125 +257,75 @@ def _feel(vertices, values, sources, sites, frames, sink, away, moments, out):
     """
     fields, many = values.shape
     for chunk in numba.prange((len(vertices) + CHUNK - 1) // CHUNK):
-        felt = np.empty((9, many), dtype=np.float32)
-        kept = np.empty(many + 1, dtype=np.int32)
+        felt, cell = np.empty((8, many), dtype=np.float32), np.empty(many, dtype=np.int32)
         sums = np.empty((fields, 5, 8), dtype=np.float32)
         for n in range(CHUNK * chunk, min(CHUNK * (chunk + 1), len(vertices))):
-            count = _gather(vertices[n], sources, sites, frames, sink, away, felt, kept)
+            _gather(vertices[n], sources, sites, frames, sink, away, felt, cell)
             for s in range(fields):
                 u = v = w = np.float32(0)
-                for q in range(count):
-                    value = values[s, kept[q]]
+                for q in range(many):
+                    value = values[s, q]
                     u -= value * felt[5, q]
                     v -= value * felt[6, q]
                     w -= value * felt[7, q]
                 out[n, s, 0], out[n, s, 1], out[n, s, 2] = u, v, w
             if moments:
-                _take_moments(count, values, felt, kept, sums, out[n])
+                _take_moments(values, felt, sums, out[n])
 
 
-_feel_few = numba.njit(cache=True, fastmath=FAST)(_feel)
-_feel = numba.njit(cache=True, parallel=True, fastmath=FAST)(_feel)
+_feel_few = numba.njit(cache=True, fastmath=FAST, error_model="numpy")(_feel)
+_feel = numba.njit(cache=True, parallel=True, fastmath=FAST, error_model="numpy")(_feel)
 
 
-@numba.njit(inline="always", fastmath=FAST)
-def _sink(i, sources, sites, frames, sink, felt):
-    """How far vertex i sinks under a unit of each source, in thicknesses, to `felt` (N,); 0 out of reach."""
-    one, steps, far = np.float32(1), np.float32(STEPS), np.float32(REACH * REACH)
-    top, per_log = np.float32(len(SPREADS) - 1.001), np.float32(1 / np.log(SPREADS[1] / SPREADS[0]))
-    px, py, pz, root, log_t = sites[0, i], sites[1, i], sites[2, i], sites[3, i], sites[5, i]
-    c0, c1, c2 = frames[i, 2, 0], frames[i, 2, 1], frames[i, 2, 2]
-    for q in range(sources.shape[1]):
-        dx, dy, dz, inverse = sources[0, q] - px, sources[1, q] - py, sources[2, q] - pz, root * sources[3, q]
-        facing = c0 * sources[7, q] + c1 * sources[8, q] + c2 * sources[9, q]
-        square = (dx * dx + dy * dy + dz * dz) * inverse * inverse
-        felt[q] = np.sqrt(square) * steps if facing > 0 and square < far else np.float32(-1)
-    for q in range(sources.shape[1]):
-        if felt[q] < 0:
-            felt[q] = 0
-            continue
-        k, h = int(felt[q]), min(max((sources[6, q] - log_t) * per_log, np.float32(0)), top)
-        g = int(h)
-        rest, h = felt[q] - np.float32(k), h - np.float32(g)
-        low = (one - rest) * sink[g, k] + rest * sink[g, k + 1]
-        high = (one - rest) * sink[g + 1, k] + rest * sink[g + 1, k + 1]
-        felt[q] = sources[4, q] * root * root * root * sources[3, q] * ((one - h) * low + h * high)
+@numba.njit(inline="always", fastmath=FAST, error_model="numpy")
+def _gather(i, sources, sites, frames, sink, away, felt, cell):
+    """What vertex i feels of each source, to `felt`: distance in table rows, its direction, area, ..., response.
 
-
-@numba.njit(cache=True, fastmath=FAST)
-def _sink_between(vertices, sources, sites, frames, sink, out):
-    """See Surroundings.sinking."""
-    for n in range(len(vertices)):
-        _sink(vertices[n], sources, sites, frames, sink, out[n])
-
-
-@numba.njit(cache=True, fastmath=FAST)
-def _spread(vertices, values, sources, sites, frames, sink, out):
-    """See Surroundings.spread; values (N, 3), out (M, 3)."""
-    felt = np.empty(sources.shape[1], np.float32)
-    for n in range(len(vertices)):
-        _sink(vertices[n], sources, sites, frames, sink, felt)
-        u = v = w = np.float32(0)
-        for q in range(len(felt)):
-            u += values[q, 0] * felt[q]
-            v += values[q, 1] * felt[q]
-            w += values[q, 2] * felt[q]
-        out[n, 0], out[n, 1], out[n, 2] = u, v, w
-
-
-@numba.njit(inline="always", fastmath=FAST)
-def _gather(i, sources, sites, frames, sink, away, felt, kept):
-    """The sources that vertex i feels: how many; in `felt` distance, direction, area, ..., response of each."""
-    one, many, steps = np.float32(1), sources.shape[1], np.float32(STEPS)
-    far, top = np.float32(REACH * REACH), np.float32(len(SPREADS) - 1.001)
-    per_log = np.float32(1 / np.log(SPREADS[1] / SPREADS[0]))
-    px, py, pz, root, log_t = sites[0, i], sites[1, i], sites[2, i], sites[3, i], sites[5, i]
+    The area, over the local thickness squared, and the response are 0 of sources that are out of reach.
+    """
+    one, far = np.float32(1), np.float32(REACH * REACH)
+    root, log_t, per_log = sites[3, i], sites[5, i], np.float32(1 / np.log(SPREADS[1] / SPREADS[0]))
+    top, width = np.float32(len(SPREADS) - 1.001), np.int32(sink.shape[1])
+    px, py, pz = sites[0, i], sites[1, i], sites[2, i]
     a0, a1, a2 = frames[i, 0, 0], frames[i, 0, 1], frames[i, 0, 2]
     b0, b1, b2 = frames[i, 1, 0], frames[i, 1, 1], frames[i, 1, 2]
     c0, c1, c2 = frames[i, 2, 0], frames[i, 2, 1], frames[i, 2, 2]
-    for q in range(many):
+    for q in range(sources.shape[1]):
         dx, dy, dz, inverse = sources[0, q] - px, sources[1, q] - py, sources[2, q] - pz, root * sources[3, q]
         facing = c0 * sources[7, q] + c1 * sources[8, q] + c2 * sources[9, q]
         square = (dx * dx + dy * dy + dz * dz) * inverse * inverse
-        felt[8, q] = square if facing > 0 else np.float32(2) * far
-    count = 0
-    for q in range(many):
-        kept[count] = q
-        count += felt[8, q] < far
-    for p in range(count):
-        q = kept[p]
-        dx, dy, dz, inverse = sources[0, q] - px, sources[1, q] - py, sources[2, q] - pz, root * sources[3, q]
         x, y = (a0 * dx + a1 * dy + a2 * dz) * inverse, (b0 * dx + b1 * dy + b2 * dz) * inverse
         flat = one / np.sqrt(x * x + y * y + np.float32(1e-12))
-        c, d = x * flat, y * flat
-        f = np.sqrt(felt[8, q]) * steps
-        k = int(f)
+        area = sources[4, q] * inverse * inverse
+        area = area if facing > 0 and square < far else np.float32(0)
+        f = np.sqrt(min(square, far)) * np.float32(STEPS)
         h = min(max((sources[6, q] - log_t) * per_log, np.float32(0)), top)
-        g = int(h)
-        rest, h = f - np.float32(k), h - np.float32(g)
+        k, g = np.int32(f), np.int32(h)
+        felt[0, q], felt[1, q], felt[2, q], felt[3, q] = f, x * flat, y * flat, area
+        felt[4, q], felt[5, q], felt[6, q] = f - np.float32(k), h - np.float32(g), area * root / sources[3, q]
+        cell[q] = g * width + k
+    down, along = sink.ravel(), away.ravel()
+    for q in range(sources.shape[1]):
+        k, rest, h, scale = cell[q], felt[4, q], felt[5, q], felt[6, q]
         w2, w3 = h * (one - rest), h * rest
         w0, w1 = one - rest - w2, rest - w3
-        cell = sources[4, q] * inverse * inverse
-        scale = cell * root / sources[3, q]
-        along = scale * (w0 * away[g, k] + w1 * away[g, k + 1] + w2 * away[g + 1, k] + w3 * away[g + 1, k + 1])
-        felt[0, p], felt[1, p], felt[2, p], felt[3, p], felt[4, p] = f, c, d, cell, rest
-        felt[5, p], felt[6, p] = along * c, along * d
-        felt[7, p] = scale * (w0 * sink[g, k] + w1 * sink[g, k + 1] + w2 * sink[g + 1, k] + w3 * sink[g + 1, k + 1])
-    return count
+        s = w0 * down[k] + w1 * down[k + 1] + w2 * down[k + width] + w3 * down[k + width + 1]
+        t = w0 * along[k] + w1 * along[k + 1] + w2 * along[k + width] + w3 * along[k + width + 1]
+        felt[5, q], felt[6, q], felt[7, q] = scale * t * felt[1, q], scale * t * felt[2, q], scale * s
 
 
-@numba.njit(inline="always", fastmath=FAST)
-def _take_moments(count, values, felt, kept, sums, out):
+@numba.njit(inline="always", fastmath=FAST, error_model="numpy")
+def _take_moments(values, felt, sums, out):
     """Sums over the near sources of rings times 1, cos a, sin a, cos 2a, sin 2a; loops of eight fill one register."""
     end = np.float32(NEAR * STEPS)
     sums[:] = 0
-    for p in range(count):
-        if felt[0, p] >= end:
+    for q in range(values.shape[1]):
+        if felt[0, q] >= end or felt[3, q] == 0:
             continue
-        k, f1, c, d = int(felt[0, p]), felt[4, p], felt[1, p], felt[2, p]
+        k, f1, c, d = int(felt[0, q]), felt[4, q], felt[1, q], felt[2, q]
         c2, d2 = c * c - d * d, (c + c) * d
         for s in range(len(out)):
-            v = values[s, kept[p]] * felt[3, p]
+            v = values[s, q] * felt[3, q]
             a, b = v * (np.float32(1) - f1), v * f1
             for m in range(8):
                 sums[s, 0, m] += a * _RINGS[k, m] + b * _RINGS[k + 1, m]
@@ -399,6 +350,56 @@ def _take_moments(count, values, felt, kept, sums, out):
         for m in range(TENSORS):
             out[s, 3 + SCALARS + 2 * VECTORS + m] = sums[s, 3, m]
             out[s, 3 + SCALARS + 2 * VECTORS + TENSORS + m] = sums[s, 4, m]
+
+
+@numba.njit(inline="always", fastmath=FAST, error_model="numpy")
+def _sinks(i, sources, sites, frames, sink, felt, cell):
+    """How far vertex i sinks under a unit of each source, in thicknesses, to felt[0]; as _gather, and nothing else."""
+    one, far = np.float32(1), np.float32(REACH * REACH)
+    root, log_t, per_log = sites[3, i], sites[5, i], np.float32(1 / np.log(SPREADS[1] / SPREADS[0]))
+    top, width = np.float32(len(SPREADS) - 1.001), np.int32(sink.shape[1])
+    px, py, pz = sites[0, i], sites[1, i], sites[2, i]
+    c0, c1, c2 = frames[i, 2, 0], frames[i, 2, 1], frames[i, 2, 2]
+    for q in range(sources.shape[1]):
+        dx, dy, dz, inverse = sources[0, q] - px, sources[1, q] - py, sources[2, q] - pz, root * sources[3, q]
+        facing = c0 * sources[7, q] + c1 * sources[8, q] + c2 * sources[9, q]
+        square = (dx * dx + dy * dy + dz * dz) * inverse * inverse
+        scale = sources[4, q] * inverse * root * root
+        f = np.sqrt(min(square, far)) * np.float32(STEPS)
+        h = min(max((sources[6, q] - log_t) * per_log, np.float32(0)), top)
+        k, g = np.int32(f), np.int32(h)
+        felt[0, q] = scale if facing > 0 and square < far else np.float32(0)
+        felt[1, q], felt[2, q], cell[q] = f - np.float32(k), h - np.float32(g), g * width + k
+    down = sink.ravel()
+    for q in range(sources.shape[1]):
+        k, rest, h = cell[q], felt[1, q], felt[2, q]
+        low = (one - rest) * down[k] + rest * down[k + 1]
+        high = (one - rest) * down[k + width] + rest * down[k + width + 1]
+        felt[0, q] *= (one - h) * low + h * high
+
+
+@numba.njit(cache=True, fastmath=FAST, error_model="numpy")
+def _sink_between(vertices, sources, sites, frames, sink, out):
+    """See Surroundings.sinking."""
+    felt, cell = np.empty((3, len(vertices)), np.float32), np.empty(len(vertices), np.int32)
+    for n in range(len(vertices)):
+        _sinks(vertices[n], sources, sites, frames, sink, felt, cell)
+        out[n] = felt[0]
+
+
+@numba.njit(cache=True, fastmath=FAST, error_model="numpy")
+def _spread(vertices, values, sources, sites, frames, sink, out):
+    """See Surroundings.spread; values (3, N), out (M, 3)."""
+    many = values.shape[1]
+    felt, cell = np.empty((3, many), np.float32), np.empty(many, np.int32)
+    for n in range(len(vertices)):
+        _sinks(vertices[n], sources, sites, frames, sink, felt, cell)
+        u = v = w = np.float32(0)
+        for q in range(many):
+            u += values[0, q] * felt[0, q]
+            v += values[1, q] * felt[0, q]
+            w += values[2, q] * felt[0, q]
+        out[n, 0], out[n, 1], out[n, 2] = u, v, w
 
 
 @contextmanager

@@ -202,7 +202,7 @@ def _cell(u, n):
     return first - 1, inside, inside - first
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, fastmath={"contract", "reassoc", "nsz", "arcp"})
 def distance_at(coefficients, origin, spacing, x, y, z):
     """Signed distance at one point [m]; for use inside other kernels."""
     i, u, f = _cell((x - origin[0]) / spacing, coefficients.shape[0])
@@ -213,8 +213,8 @@ def distance_at(coefficients, origin, spacing, x, y, z):
     for p in range(4):
         row = 0.0
         for q in range(4):
-            line = coefficients[i + p, j + q]
-            row += b[q] * (c0 * line[k] + c1 * line[k + 1] + c2 * line[k + 2] + c3 * line[k + 3])
+            low = c0 * coefficients[i + p, j + q, k] + c1 * coefficients[i + p, j + q, k + 1]
+            row += b[q] * (low + c2 * coefficients[i + p, j + q, k + 2] + c3 * coefficients[i + p, j + q, k + 3])
         total += a[p] * row
     dx, dy, dz = x - origin[0] - spacing * u, y - origin[1] - spacing * v, z - origin[2] - spacing * w
     away = dx * dx + dy * dy + dz * dz

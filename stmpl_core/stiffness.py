@@ -64,10 +64,9 @@ class Stiffness:
 
 
 class _Fit(NamedTuple):
-    modulus: float
-    errors: np.ndarray  # of the forces, over what a press is weighed with, (N,) [-]
+    modulus: float  # [Pa]
     weights: np.ndarray  # Huber's, (N,)
-    cost: float
+    cost: float  # mean weighted square of the relative errors
 
 
 def fit_stiffness(toucher: Toucher, presses: Sequence[Press]) -> Stiffness:
@@ -157,7 +156,7 @@ class _Presses:
             errors = f - modulus * g
             most = OUTLIER * max(1.4826 * float(np.median(np.abs(errors))), 1e-6)
             weights = np.minimum(1.0, most / np.maximum(np.abs(errors), 1e-300))
-        return _Fit(modulus, errors, weights, float((weights * errors**2).sum() / weights.sum()))
+        return _Fit(modulus, weights, float((weights * errors**2).sum() / weights.sum()))
 
     def sound(self, press: Press, touch: Touch) -> bool:
         """Whether a press may count: validated, or apart, and not dragging; what drags says little of the normal."""

@@ -103,7 +103,7 @@ def neighbours(points: np.ndarray, normals: np.ndarray, thickness: np.ndarray, r
     return start, index
 
 
-@numba.njit(cache=True, parallel=True)
+@numba.njit(cache=True, parallel=True, error_model="numpy")
 def _pairs(points, normals, thickness, reaches, place, shape, order, first, start, index):
     """Counts the neighbours of vertex i in zone z into start[Z i + z + 1], or where `index` has room writes them."""
     zones = len(reaches)
@@ -133,7 +133,7 @@ def _pairs(points, normals, thickness, reaches, place, shape, order, first, star
                 start[zones * i + z + 1] = n[z]
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, error_model="numpy")
 def _thinned(start, index, among, points, thickness, spacing):
     """Marks vertices of `among` no two of which are nearer than `spacing`, as many as come in order."""
     count = len(points)
@@ -152,7 +152,7 @@ def _thinned(start, index, among, points, thickness, spacing):
     return kept
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, error_model="numpy")
 def _nearest(start, index, stands, points):
     """The nearest CORNERS vertices in reach that stand for others, (V, CORNERS); -1 where there are fewer."""
     count = len(points)
@@ -197,7 +197,7 @@ def _interpolation(points: np.ndarray, frames: np.ndarray, thickness: np.ndarray
     return np.linalg.solve(left, right[..., None])[:, :CORNERS, 0].astype(np.float32)
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, error_model="numpy")
 def _zones(start, index, loaded, count):
     """0 where no loaded vertex is in reach, else 1 for the outermost zone up to Z for the innermost, (count,)."""
     mark = np.zeros(count, np.uint8)
@@ -209,7 +209,7 @@ def _zones(start, index, loaded, count):
     return mark
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, error_model="numpy")
 def _asked(marks, stands, corners, weights):
     """All of Asked but for the loaded vertices."""
     last = len(stands)
@@ -245,7 +245,7 @@ def _asked(marks, stands, corners, weights):
     return vertices, between, at, by
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, error_model="numpy")
 def _fill(values, between, corners, weights, out):
     for n in range(len(between)):
         for x in range(3):

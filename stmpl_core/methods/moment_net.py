@@ -163,7 +163,7 @@ class MomentNet:
 
     def _solve(self, layer: SoftLayer, near: Surroundings, load: Load, pressure: np.ndarray) -> Displacement:
         sources = source_fields(pressure, layer)
-        asked = near.asked(np.flatnonzero(pressure))
+        asked = near.asked(load.loaded)
         felt = near.felt(sources, asked)
         vertices, figures = felt.vertices, felt.figures
         shape = self._shape[vertices]
@@ -200,7 +200,7 @@ class MomentNet:
     def _trust(self, card: Mapping[str, Any], load: Load, pressure: np.ndarray, asked: Asked,
                moved: np.ndarray, outside: np.ndarray, error: float) -> Trust:  # fmt: skip
         layer = prepared(self._layer, self)
-        loaded = np.flatnonzero(pressure)
+        loaded = asked.loaded
         if not len(loaded):
             return Trust(error_bound=0.0)
         length = np.linalg.norm(moved, axis=1)
@@ -253,7 +253,7 @@ def source_fields(pressure: np.ndarray, layer: SoftLayer) -> np.ndarray:
     return sources
 
 
-@numba.njit(inline="always", fastmath=FAST)
+@numba.njit(inline="always", fastmath=FAST, error_model="numpy")
 def _amplitude(figures):
     """How much presses around a vertex: the sum of its scalar moments of the second field."""
     g = np.float32(0)
@@ -262,7 +262,7 @@ def _amplitude(figures):
     return g
 
 
-@numba.njit(inline="always", fastmath=FAST)
+@numba.njit(inline="always", fastmath=FAST, error_model="numpy")
 def _directions(figures, g, vectors, tensors):
     """The vectors (DIRECTIONS, 2) and tensors (2 TENSORS, 2) around a vertex, over the amplitude."""
     one = np.float32(1) / g
@@ -277,7 +277,7 @@ def _directions(figures, g, vectors, tensors):
             tensors[s * TENSORS + m, 1] = figures[s, 3 + SCALARS + 2 * VECTORS + TENSORS + m] * one
 
 
-@numba.njit(inline="always", fastmath=FAST)
+@numba.njit(inline="always", fastmath=FAST, error_model="numpy")
 def _mix(weights, vectors, out):
     """out = weights (rows, n) times vectors (n, 2)."""
     for a in range(weights.shape[0]):
@@ -288,7 +288,7 @@ def _mix(weights, vectors, out):
         out[a, 0], out[a, 1] = x, y
 
 
-@numba.njit(cache=True, fastmath=FAST)
+@numba.njit(cache=True, fastmath=FAST, error_model="numpy")
 def invariants(figures, shape, here, constants, mix_vectors, mix_tensors, low, high, mean, scale, out, outside):
     """The network's inputs, (N, INPUTS): kept inside the training data's, then centred and scaled."""
     half, one = np.float32(0.5), np.float32(1)
@@ -363,11 +363,11 @@ def think(inputs, w1, b1, w2, b2, w3, b3, w4, b4, outputs):
                 outputs[start + n, m] = out[n, m] + b4[m]
 
 
-think_few = numba.njit(cache=True, fastmath=FAST)(think)  # on the caller's thread
-think = numba.njit(cache=True, parallel=True, fastmath=FAST)(think)
+think_few = numba.njit(cache=True, fastmath=FAST, error_model="numpy")(think)  # on the caller's thread
+think = numba.njit(cache=True, parallel=True, fastmath=FAST, error_model="numpy")(think)
 
 
-@numba.njit(cache=True, fastmath=FAST)
+@numba.njit(cache=True, fastmath=FAST, error_model="numpy")
 def _activate(hidden, bias):
     """x / 2 (1 + x / (1 + |x|)) of hidden + bias, in place: smooth as SiLU, without its exponential."""
     half, one = np.float32(0.5), np.float32(1)
@@ -377,7 +377,7 @@ def _activate(hidden, bias):
             hidden[n, m] = x * (half + half * x / (one + abs(x)))
 
 
-@numba.njit(cache=True, fastmath=FAST)
+@numba.njit(cache=True, fastmath=FAST, error_model="numpy")
 def _move(figures, shape, place, outputs, mix_vectors, mix_tensors, frames, moved, error):
     """Linear response to the columns' strain plus what the network adds, turned into the layer's frame, (N, 3) [m]."""
     for n in range(len(figures)):
