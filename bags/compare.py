@@ -44,6 +44,7 @@ class FramePair:
 
     Args:
         frame: as recorded.
+        layer: that both sides answer for.
         time: since the first answer [s].
         load: that presses on the skin in all [N].
         contacts: the tools as they stood.
@@ -53,6 +54,7 @@ class FramePair:
     """
 
     frame: Frame
+    layer: SoftLayer
     time: float
     load: float
     contacts: tuple[Contact, ...]
@@ -73,7 +75,6 @@ class Comparison:
     Args:
         run: the run, looked over once: timeline, rate, latency, losses.
         method, reference: names of the two sides.
-        layer: that both answer for.
         pairs: the sampled frames, in the order of time.
         failed: sampled frames that the reference could not solve, with its reason, by sequence number.
         tolerance: allowed mean error under the contact, in the worst frame [m]; None: no verdict is asked for.
@@ -82,7 +83,6 @@ class Comparison:
     run: Survey
     method: str
     reference: str
-    layer: SoftLayer
     pairs: tuple[FramePair, ...]
     failed: dict[int, str]
     tolerance: float | None
@@ -157,9 +157,8 @@ def compare_run(
         BagError: the run holds no answers, no loaded frame, or no pressures.
     """
     run = survey(path)
-    layer = run.bag.layer
-    judge = _presser(reference, run) if hasattr(reference, "press") else _solver(reference, layer)  # type: ignore[arg-type]
-    judged = _recorded if method is None else _solver(method, layer)
+    judge = _presser(reference, run) if hasattr(reference, "press") else _solver(reference, run)  # type: ignore[arg-type]
+    judged = _recorded if method is None else _solver(method, run)
     names = (run.method if method is None else method.name, reference.name)
     return _compare(run, sample(run.moments, frames), names, judged, judge, tolerance, on_frame)
 
@@ -173,9 +172,6 @@ def compare_bags(
         BagError: different skins, or no stamp in common.
     """
     run, other = survey(path), survey(reference)
-    if len(run.bag.layer.vertices) != len(other.bag.layer.vertices):
-        raise BagError(f"{run.bag.file} moves {len(run.bag.layer.vertices)} vertices, {other.bag.file} "
-                       f"{len(other.bag.layer.vertices)}; answers can be compared on one skin only.")
     stamps = {moment.stamp_ns for moment in other.moments}
     common = [moment for moment in run.moments if moment.stamp_ns in stamps]
     if not common:
@@ -183,6 +179,11 @@ def compare_bags(
     picks = sample(common, frames)
     wanted = {moment.stamp_ns for moment in common if moment.sequence in picks}
     answers = {frame.stamp_ns: _recorded(frame) for frame in other.bag.frames() if frame.stamp_ns in wanted}
+    for frame in (frame for frame in run.bag.frames() if frame.sequence in picks):
+        moved = len(answers[frame.stamp_ns].displacement)
+        if moved != len(frame.displacement):
+            raise BagError(f"{run.bag.file} moves {len(frame.displacement)} vertices, {other.bag.file} {moved}; "
+                           "answers can be compared on one skin only.")  # fmt: skip
     names = (run.method, f"{other.method} of {other.bag.file.parent.name}")
     return _compare(run, picks, names, _recorded, lambda frame: answers[frame.stamp_ns], tolerance, None)
 
@@ -231,28 +232,42 @@ def _compare(
         except StmplError as error:
             log.warning("frame %d cannot be compared: %s", frame.sequence, error)
             failed[frame.sequence] = str(error)
-    return Comparison(run, *names, run.bag.layer, tuple(pairs), failed, tolerance)
+    return Comparison(run, *names, tuple(pairs), failed, tolerance)
 
 
 def _pair(run: Survey, moment: Moment, frame: Frame, ours: Displacement, reference: Displacement) -> FramePair:
-    layer = run.bag.layer
+    layer = run.bag.layer_of(frame)
     figures = score(ours.displacement, reference.displacement, layer, _load(frame))
-    return FramePair(frame, moment.time, moment.load, tuple(run.contacts.at(frame)), ours, reference, figures)
+    return FramePair(frame, layer, moment.time, moment.load, tuple(run.contacts.at(frame)), ours, reference, figures)
 
 
-def _solver(method: Method, layer: SoftLayer) -> Answer:
-    ready = method.prepare(layer)
-    return lambda frame: ready.solve(_load(frame))
+def _solver(method: Method, run: Survey) -> Answer:
+    ready = _prepared(method, run)
+    return lambda frame: ready(frame).solve(_load(frame))
 
 
 def _presser(reference: Presser, run: Survey) -> Answer:
-    ready = reference.prepare(run.bag.layer)
+    ready = _prepared(reference, run)
 
     def answer(frame: Frame) -> Displacement:
         pressing = [c for c in run.contacts.at(frame) if frame.statuses[c.name] in PRESSING]
-        return ready.press(pressing, _load(frame).values, frame.trust.figures)
+        return ready(frame).press(pressing, _load(frame).values, frame.trust.figures)
 
     return answer
+
+
+def _prepared[Side: (Method, Presser)](side: Side, run: Survey) -> Callable[[Frame], Side]:
+    """`side`, prepared for the layer of a frame, and again only where the layer changes."""
+    layer: SoftLayer | None = None
+
+    def ready(frame: Frame) -> Side:
+        nonlocal side, layer
+        if layer is not run.bag.layer_of(frame):
+            layer = run.bag.layer_of(frame)
+            side = side.prepare(layer)
+        return side
+
+    return ready
 
 
 def _load(frame: Frame) -> Load:

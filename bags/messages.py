@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Mapping
 from dataclasses import dataclass
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -14,6 +16,9 @@ from stmpl_core.errors import FrameError, InvalidInput
 from stmpl_core.layer import SoftLayer, Tissue
 from stmpl_core.trust import Trust
 
+FixedFrames = Mapping[str, Transform]  # pose_body_from_frame of each frame that does not move, (4, 4)
+
+NO_FRAMES: FixedFrames = MappingProxyType({})
 QUATERNION_TOLERANCE = 1e-2  # a unit quaternion that went through float32 or text is off by far less
 
 
@@ -117,36 +122,44 @@ def pose_from(pose: Any) -> Transform:
     return transform
 
 
-def wrench_from(message: Any, *, body_frame: str, tool: str, pose_body_from_tool: Transform) -> Wrench:
+def wrench_from(
+    message: Any, *, body_frame: str, tool: str, pose_body_from_tool: Transform, frames: FixedFrames = NO_FRAMES
+) -> Wrench:
     """geometry_msgs/WrenchStamped in the body's axes: force [N], torque about the tool's origin [N m], shape (6,).
 
     Raises:
-        FrameError: the wrench is given neither in the body's frame nor in the tool's own.
+        FrameError: the wrench is given neither in the body's frame, nor in the tool's own, nor in one of `frames`.
     """
     f, t = message.wrench.force, message.wrench.torque
     wrench = np.array([f.x, f.y, f.z, t.x, t.y, t.z], dtype=np.float64)
     if message.header.frame_id == body_frame:
         return wrench
-    if message.header.frame_id != tool:
-        raise FrameError(f"the wrench of {tool} is in frame '{message.header.frame_id}'; known are '{body_frame}' "
-                         f"and '{tool}'.")
-    rotation = pose_body_from_tool[:3, :3]
+    placed = {**frames, tool: pose_body_from_tool}
+    if message.header.frame_id not in placed:
+        known = "' and '".join([body_frame, *placed])
+        raise FrameError(f"the wrench of {tool} is in frame '{message.header.frame_id}'; known are '{known}'.")
+    rotation = placed[message.header.frame_id][:3, :3]
     return np.concatenate([rotation @ wrench[:3], rotation @ wrench[3:]])
 
 
-def contact_from(tool: str, mesh: ToolMesh, pose: Any, wrench: Any | None, *, body_frame: str) -> Contact:
+def contact_from(
+    tool: str, mesh: ToolMesh, pose: Any, wrench: Any | None, *, body_frame: str, frames: FixedFrames = NO_FRAMES
+) -> Contact:
     """One tool at one instant, from its PoseStamped and, where there is a force sensor, its WrenchStamped.
 
     Raises:
         FrameError: pose or wrench in a frame that is not known.
         InvalidInput: not finite, or not a rigid pose.
     """
-    if pose.header.frame_id != body_frame:
-        raise FrameError(f"the pose of {tool} is in frame '{pose.header.frame_id}'; it must be in '{body_frame}'.")
-    transform = pose_from(pose.pose)
+    frame, transform = pose.header.frame_id, pose_from(pose.pose)
+    if frame != body_frame:
+        if frame not in frames:
+            known = "' and '".join([body_frame, *frames])
+            raise FrameError(f"the pose of {tool} is in frame '{frame}'; known are '{known}'.")
+        transform = frames[frame] @ transform
     if wrench is None:
         return Contact(tool, mesh, transform)
-    values = wrench_from(wrench, body_frame=body_frame, tool=tool, pose_body_from_tool=transform)
+    values = wrench_from(wrench, body_frame=body_frame, tool=tool, pose_body_from_tool=transform, frames=frames)
     return Contact(tool, mesh, transform, values)
 
 

@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 
 import stmpl_core
+from bags.messages import NO_FRAMES, FixedFrames
 from bags.writer import BagWriter
 from stmpl_core.chart import UvChart
 from stmpl_core.errors import BagError
@@ -36,12 +37,14 @@ class Provenance:
         body: one line on the body and its part.
         config: everything that was configured, as JSON can hold it.
         versions: of Python, and of the packages and weights that decide the numbers.
+        frames: other frames that poses and wrenches are in, fixed in the body's.
     """
 
     method: str = ""
     body: str = ""
     config: Mapping[str, Any] = field(default_factory=dict)
     versions: Mapping[str, str] = field(default_factory=dict)
+    frames: FixedFrames = NO_FRAMES
 
 
 def versions() -> dict[str, str]:
@@ -58,13 +61,15 @@ def versions() -> dict[str, str]:
 
 
 def write_provenance(
-    writer: BagWriter, layer: SoftLayer | None, *, method: str, body: str = "", config: Mapping[str, Any] | None = None
-) -> None:
+    writer: BagWriter, layer: SoftLayer | None, *, method: str, body: str = "",
+    config: Mapping[str, Any] | None = None, frames: FixedFrames = NO_FRAMES,
+) -> None:  # fmt: skip
     """Puts into a bag all that is needed to repeat the run, best before its first message.
 
     A recorder that does not hold the layer gives None; SkinTopology then says it, rounded to float32. Raises BagError.
     """
-    values = {"method": method, "body": body, "config": json.dumps(config or {}), "versions": json.dumps(versions())}
+    values = {"method": method, "body": body, "config": json.dumps(config or {}), "versions": json.dumps(versions()),
+              "frames": json.dumps({name: pose.tolist() for name, pose in frames.items()})}  # fmt: skip
     writer.add_metadata(RECORD, values)
     if layer is not None:
         writer.attach(LAYER, "application/x-npz", layer_to_bytes(layer))
@@ -74,9 +79,11 @@ def provenance_from(values: Mapping[str, str]) -> Provenance:
     """Reads back the metadata record that `write_provenance` wrote. Raises BagError."""
     try:
         config, made_by = json.loads(values.get("config", "{}")), json.loads(values.get("versions", "{}"))
-    except json.JSONDecodeError as error:
+        frames = {name: np.array(pose, dtype=np.float64).reshape(4, 4) for name, pose in
+                  json.loads(values.get("frames", "{}")).items()}  # fmt: skip
+    except (ValueError, AttributeError) as error:
         raise BagError(f"the bag's '{RECORD}' record is broken: {error}.") from error
-    return Provenance(values.get("method", ""), values.get("body", ""), config, made_by)
+    return Provenance(values.get("method", ""), values.get("body", ""), config, made_by, frames)
 
 
 def layer_to_bytes(layer: SoftLayer) -> bytes:

@@ -11,12 +11,12 @@ from typing import Any, NamedTuple
 from mcap.records import Attachment, Channel, Message, Metadata, Schema
 from rosbags.typesys.store import Typestore
 
-from bags.messages import Frame, contact_from, frame_from, layer_from, stamp_ns, tool_mesh_from
+from bags.messages import Frame, contact_from, frame_from, layer_from, layer_id, stamp_ns, tool_mesh_from
 from bags.provenance import LAYER, RECORD, Provenance, layer_from_bytes, provenance_from
 from bags.records import Damage, End, bag_file, summary, walk
 from bags.schema import typestore_of
 from stmpl_core.contact import Contact, ToolMesh
-from stmpl_core.errors import BagError
+from stmpl_core.errors import BagError, FrameError
 from stmpl_core.layer import SoftLayer
 
 log = logging.getLogger(__name__)
@@ -111,11 +111,12 @@ class Bag:
         for recorded in self.messages(lambda name: name == topic):
             yield frame_from(recorded.message, recorded.log_time_ns)
 
-    def check_layer(self, frame: Frame) -> None:
-        """Raises BagError if `frame` answers for another layer than the bag's."""
-        if frame.layer_id != self.layer_id:
-            raise BagError(f"answer {frame.sequence} is for layer {frame.layer_id}, the bag holds {self.layer_id}. "
-                           "A run whose layer was changed cannot be read as one; record one layer a bag.")
+    def layer_of(self, frame: Frame) -> SoftLayer:
+        """The layer that `frame` answers for. Raises BagError if the bag does not hold it."""
+        if frame.layer_id not in self.layers:
+            raise BagError(f"answer {frame.sequence} is for layer {frame.layer_id}, the bag holds "
+                           f"{', '.join(self.layers)}. Was skin/topology recorded?")  # fmt: skip
+        return self.layers[frame.layer_id]
 
     @cached_property
     def provenance(self) -> Provenance:
@@ -123,25 +124,45 @@ class Bag:
         return provenance_from(self.metadata.get(RECORD, {}))
 
     @cached_property
-    def layer(self) -> SoftLayer:
-        """The layer of the run: the attached one, exact, else the one that SkinTopology describes.
+    def layers(self) -> dict[str, SoftLayer]:
+        """The layers of the run by their names: an attached one, exact, then those that SkinTopology describes.
+
+        There is more than one if the run spans `~/set_body` or `~/calibrate`.
 
         Raises:
-            BagError: the bag has neither.
+            BagError: the bag has none.
         """
+        found = {}
         if LAYER in self.attachments:
-            return layer_from_bytes(self.attachments[LAYER])
-        return layer_from(self._topology)
+            layer = layer_from_bytes(self.attachments[LAYER])
+            found[layer_id(layer)] = layer
+            if not any(_ends(topic, TOPOLOGY) for topic in self.topics):
+                return found
+        for topology in self._topologies:
+            if topology.layer_id not in found:
+                found[topology.layer_id] = layer_from(topology)
+        return found
+
+    @property
+    def has_layers(self) -> bool:
+        """Whether the bag says what skin it is of."""
+        told = [topic for topic in self.topics.values() if _ends(topic.name, TOPOLOGY) and topic.messages]
+        return LAYER in self.attachments or len(told) == 1
+
+    @property
+    def layer(self) -> SoftLayer:
+        """The first layer of the run. Raises BagError."""
+        return next(iter(self.layers.values()))
 
     @cached_property
     def body_frame(self) -> str:
         """Frame id of the body, from SkinTopology. Raises BagError."""
-        return self._topology.header.frame_id
+        return self._topologies[0].header.frame_id
 
-    @cached_property
+    @property
     def layer_id(self) -> str:
-        """Name of the layer, from SkinTopology. Raises BagError."""
-        return self._topology.layer_id
+        """Name of the first layer. Raises BagError."""
+        return next(iter(self.layers))
 
     @cached_property
     def tool_meshes(self) -> dict[str, ToolMesh]:
@@ -151,11 +172,12 @@ class Bag:
         return {r.message.header.frame_id: tool_mesh_from(r.message) for r in found}
 
     @cached_property
-    def _topology(self) -> Any:
+    def _topologies(self) -> list[Any]:
         topic = self.find_topic(TOPOLOGY)
-        for recorded in self.messages(lambda name: name == topic):
-            return recorded.message
-        raise BagError(f"{self.file} holds no message on {topic}, so the skin is not known.")
+        found = [recorded.message for recorded in self.messages(lambda name: name == topic)]
+        if not found:
+            raise BagError(f"{self.file} holds no message on {topic}, so the skin is not known.")
+        return found
 
     def _decode(self, channel: Channel, data: bytes) -> Any:
         schema = self._schemas.get(channel.schema_id)
@@ -239,7 +261,12 @@ class ContactLog:
         if mesh is None or lacks:
             raise BagError(f"an answer to tool {tool} at {posed / 1e9:.3f} s cannot be repeated: "
                            f"the bag has no {' and no '.join(lacks)} for it.")
-        return contact_from(tool, mesh, pose, wrench, body_frame=self._bag.body_frame)
+        frames = self._bag.provenance.frames
+        try:
+            return contact_from(tool, mesh, pose, wrench, body_frame=self._bag.body_frame, frames=frames)
+        except FrameError as error:
+            raise BagError(f"{error} The recording carries the frames of stmpl record --frames, and none that "
+                           "move (/tf).") from error  # fmt: skip
 
 
 def tool_topic(topic: str) -> tuple[str, str] | None:

@@ -66,15 +66,19 @@ class ReplaySummary:
 def replay(path: Path | str, method: Method, *, every: int = 1) -> Iterator[Replayed]:
     """Yields each recorded answer (or every n-th) with the one that its recorded contacts give now, in the run's order.
 
+    Each is answered on the layer that it was answered on.
+
     Raises:
         BagError: the bag lacks answers, the layer, or a tool's mesh or pose.
     """
     bag = Bag(path)
     contacts = ContactLog(bag)
-    simulator = Simulator(bag.layer, method)
+    simulator: Simulator | None = None
     for number, frame in enumerate(bag.frames()):
         if number % every == 0:
-            bag.check_layer(frame)
+            layer = bag.layer_of(frame)
+            if simulator is None or simulator.layer is not layer:
+                simulator = Simulator(layer, method)
             answer = simulator.step(contacts.at(frame))
             if frame.fade < 1:  # the input had stopped: a share of the last answer was sent
                 answer = replace(answer, displacement=frame.fade * answer.displacement)

@@ -94,7 +94,7 @@ def write_report(comparison: Comparison, path: Path | str, *, replay: ReplaySumm
 
 def pressed_figures(comparison: Comparison, pair: FramePair) -> list[Figure]:
     """Close-ups of one frame (ours, reference, difference), then the whole limb beside a cut through the contact."""
-    layer, pressure = comparison.layer, pair.frame.pressure
+    layer, pressure = pair.layer, pair.frame.pressure
     if pressure is None or not (pressure > 0).any():
         raise BagError(f"frame {pair.frame.sequence} carries no load, so there is nothing to show.")
     spot = spot_of(layer, pressure)
@@ -145,7 +145,7 @@ def latency_figure(comparison: Comparison) -> Figure:
 
 
 def _close_ups(comparison: Comparison, pair: FramePair, spot: Spot) -> Figure:
-    layer, ours, truth = comparison.layer, pair.ours.displacement, pair.reference.displacement
+    layer, ours, truth = pair.layer, pair.ours.displacement, pair.reference.displacement
     view = view_along(spot.normal, limb_axis(layer), spot.centre, tilt=-42)
     half = max(ROOM * spot.radius, CLOSEST)
     lengths = [MM * np.linalg.norm(u, axis=1) for u in (ours, truth)]
@@ -168,7 +168,7 @@ def _close_ups(comparison: Comparison, pair: FramePair, spot: Spot) -> Figure:
 
 
 def _overview(comparison: Comparison, pair: FramePair, spot: Spot) -> Figure:
-    layer = comparison.layer
+    layer = pair.layer
     axis = limb_axis(layer)
     centre = (layer.vertices.max(axis=0) + layer.vertices.min(axis=0)) / 2
     length = MM * np.linalg.norm(pair.ours.displacement, axis=1)
@@ -192,7 +192,7 @@ def _overview(comparison: Comparison, pair: FramePair, spot: Spot) -> Figure:
 
 def _cut(axes: Axes, comparison: Comparison, pair: FramePair, spot: Spot, limb: np.ndarray) -> None:
     """Across the limb where several tools press, along it where one does."""
-    layer, across = comparison.layer, len(pair.contacts) > 1
+    layer, across = pair.layer, len(pair.contacts) > 1
     out = limb if across else np.cross(spot.normal, limb)
     out = out - (out @ spot.normal) * spot.normal
     out /= np.linalg.norm(out)
@@ -283,8 +283,9 @@ def _frames_part(comparison: Comparison) -> str:
 def _origin(comparison: Comparison) -> str:
     bag = comparison.run.bag
     topics = [(t.name, t.type_name, str(t.messages)) for t in bag.topics.values()]
-    made = {"body": bag.provenance.body, "layer": repr(comparison.layer), "method": bag.provenance.method,
-            "config": bag.provenance.config, "versions": bag.provenance.versions}  # fmt: skip
+    told, layers = bag.provenance, [repr(layer) for layer in bag.layers.values()]
+    made = {"body": told.body, "layers": layers, "method": told.method, "config": told.config,
+            "versions": told.versions}  # fmt: skip
     recorded = _table(("topic", "type", "messages"), topics)
     return (f"<h2>What was recorded</h2><p class=note>{_h(bag.file.name)}</p>{recorded}"
             f"<h2>What made it</h2><pre>{_h(json.dumps(made, indent=2, default=str))}</pre>")  # fmt: skip

@@ -92,11 +92,10 @@ def survey(path: Path | str) -> Survey:
     """Looks over a run. Raises BagError if it holds no answers or no skin."""
     bag = Bag(path)
     contacts = ContactLog(bag)
-    area = bag.layer.vertex_areas
     moments: list[Moment] = []
     first, method = 0, ""
     for frame in bag.frames():
-        bag.check_layer(frame)
+        area = bag.layer_of(frame).vertex_areas
         first, method = first or frame.stamp_ns, method or frame.method
         moments.append(_moment(frame, (frame.stamp_ns - first) * NANO, area, _latency(frame, contacts)))
     if not moments:

@@ -16,6 +16,7 @@ from stmpl_core.thinning import Asked, Thinning
 REACH = 8.0  # thicknesses to which a vertex feels a load; the linear response there is below 0.01 % of its peak
 NEAR = 4.0  # thicknesses to which moments are taken
 STEPS = 48  # table rows a thickness
+FINER = 2  # times as many rows has the rings' table, of which the nearest is taken
 SPREADS = np.geomspace(0.04, 1.6, 14)  # widths of a load of one vertex that the linear response is tabled for, over t
 RINGS = np.array([0.0, 0.35, 0.7, 1.1, 1.6, 2.2, 2.9, 3.6])  # radii of the moments' rings, over t
 WIDTHS = np.array([0.3, 0.3, 0.35, 0.45, 0.55, 0.65, 0.7, 0.6])  # of the rings
@@ -189,11 +190,11 @@ def response_table(poisson_ratio: float) -> np.ndarray:
 
 def ring_table() -> np.ndarray:
     """Weights of the rings of all orders over the radius, (radius, SCALARS + VECTORS + TENSORS)."""
-    radius = np.arange(int(NEAR * STEPS) + 2) / STEPS
+    radius = np.arange(int(NEAR * STEPS * FINER) + 2) / (STEPS * FINER)
     rings = np.exp(-0.5 * ((radius[:, None] - RINGS) / WIDTHS) ** 2)
     fade = np.clip((NEAR - radius) / 0.8, 0, 1)
     rings *= (fade * fade * (3 - 2 * fade))[:, None]
-    rings /= (2 * np.pi * radius[:, None] * rings).sum(axis=0) / STEPS
+    rings /= (2 * np.pi * radius[:, None] * rings).sum(axis=0) / (STEPS * FINER)
     start = np.minimum(radius / 0.35, 1.0)[:, None]  # directions are not defined at the middle
     return np.concatenate([rings, start * rings[:, 1 : 1 + VECTORS], start**2 * rings[:, 1 : 1 + TENSORS]],
                           axis=1).astype(np.float32)  # fmt: skip
@@ -243,7 +244,7 @@ def _shape(start, index, points, frames, thickness):
 
 FAST = {"contract", "reassoc", "nsz", "arcp"}
 CHUNK = 64  # vertices that one thread takes at a time
-_RINGS = np.zeros((int(NEAR * STEPS) + 2, 24), dtype=np.float32)  # a constant to the compiler: nothing writes it
+_RINGS = np.zeros((int(NEAR * STEPS * FINER) + 2, 24), dtype=np.float32)  # a constant to the compiler: nobody writes it
 _RINGS[:, :SCALARS] = ring_table()[:, :SCALARS]
 _RINGS[:, 8 : 8 + VECTORS] = ring_table()[:, SCALARS : SCALARS + VECTORS]
 _RINGS[:, 16 : 16 + TENSORS] = ring_table()[:, SCALARS + VECTORS :]
@@ -322,25 +323,22 @@ def _take_moments(values, felt, sums, out):
     for q in range(values.shape[1]):
         if felt[0, q] >= end or felt[3, q] == 0:
             continue
-        k, f1, c, d = int(felt[0, q]), felt[4, q], felt[1, q], felt[2, q]
+        k, c, d = int(felt[0, q] * np.float32(FINER) + np.float32(0.5)), felt[1, q], felt[2, q]
         c2, d2 = c * c - d * d, (c + c) * d
         for s in range(len(out)):
             v = values[s, q] * felt[3, q]
-            a, b = v * (np.float32(1) - f1), v * f1
             for m in range(8):
-                sums[s, 0, m] += a * _RINGS[k, m] + b * _RINGS[k + 1, m]
-            x, y = a * c, b * c
+                sums[s, 0, m] += v * _RINGS[k, m]
+            x, y = v * c, v * d
             for m in range(8):
-                sums[s, 1, m] += x * _RINGS[k, 8 + m] + y * _RINGS[k + 1, 8 + m]
-            x, y = a * d, b * d
+                sums[s, 1, m] += x * _RINGS[k, 8 + m]
             for m in range(8):
-                sums[s, 2, m] += x * _RINGS[k, 8 + m] + y * _RINGS[k + 1, 8 + m]
-            x, y = a * c2, b * c2
+                sums[s, 2, m] += y * _RINGS[k, 8 + m]
+            x, y = v * c2, v * d2
             for m in range(8):
-                sums[s, 3, m] += x * _RINGS[k, 16 + m] + y * _RINGS[k + 1, 16 + m]
-            x, y = a * d2, b * d2
+                sums[s, 3, m] += x * _RINGS[k, 16 + m]
             for m in range(8):
-                sums[s, 4, m] += x * _RINGS[k, 16 + m] + y * _RINGS[k + 1, 16 + m]
+                sums[s, 4, m] += y * _RINGS[k, 16 + m]
     for s in range(len(out)):
         for m in range(SCALARS):
             out[s, 3 + m] = sums[s, 0, m]

@@ -9,7 +9,8 @@ from rclpy.node import Node
 
 from stmpl_core.contact import ToolMesh
 from stmpl_core.layer import SoftLayer
-from stmpl_ros.workshop import Placed, Workshop
+from stmpl_core.stiffness import Stiffness
+from stmpl_ros.workshop import Placed, Pressed, Workshop
 
 Then = Callable[[Future], None]
 
@@ -48,6 +49,12 @@ class Background:
         """Has the local model of each contact found, for `do`."""
         self._then(self._workshop.models(placed, rotations), do)
 
+    def stiffness(self, presses: Sequence[Pressed]) -> Future[Stiffness]:
+        """How stiff the skin is by these presses: for a thread that waits."""
+        fitted = self._workshop.stiffness(presses)
+        self._then(fitted, self._renew_if_broken)
+        return fitted
+
     def renew(self, error: BaseException) -> None:
         """Replaces the process, if `error` says that it died."""
         if isinstance(error, BrokenExecutor) and not self._closed:
@@ -55,6 +62,10 @@ class Background:
             self._workshop = Workshop(self._layer)
             for tool, (number, mesh) in self._meshes.items():
                 self._workshop.field(tool, number, mesh)
+
+    def _renew_if_broken(self, future: Future) -> None:
+        if error := future.exception():
+            self.renew(error)
 
     def close(self) -> None:
         """Ends the process; nothing comes back any more."""

@@ -170,7 +170,10 @@ def info(path: BagPath, as_json: Json = False) -> int:
     from stmpl_ros.tables import bag_figures, bag_table
 
     bag = Bag(path)
-    _print_figures(bag_figures(bag) if as_json else bag_table(bag))
+    skins = {name: repr(layer) for name, layer in bag.layers.items()} if bag.has_layers else {}
+    _print_figures(bag_figures(bag) | {"skins": skins} if as_json else bag_table(bag))
+    for name, layer in skins.items() if not as_json else ():
+        _print_figures(f"skin {name}: {layer}")
     sound = sum(topic.messages for topic in bag.topics.values())
     if not as_json and bag.expected not in (None, sound):
         _print_figures(f"{sound} of {bag.expected} messages are sound")

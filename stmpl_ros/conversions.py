@@ -63,19 +63,23 @@ def quaternion_from(rotation: np.ndarray) -> tuple[float, float, float, float]:
     return x, y, z, w
 
 
-def checked_pose(message: PoseStamped, tool: str, body_frame: str) -> Transform:
+def checked_pose(
+    message: PoseStamped, tool: str, body_frame: str, pose_body_from_frame: Transform | None = None
+) -> Transform:
     """pose_body_from_tool, (4, 4).
 
     Raises:
-        FrameError: the pose is in another frame than the body's.
+        FrameError: the pose is in another frame than the body's, and not said where that is.
         InvalidInput: not finite, no rotation, or so far off that it must be in millimetres.
     """
-    if message.header.frame_id != body_frame:
+    known = message.header.frame_id == body_frame
+    if not known and pose_body_from_frame is None:
         raise FrameError(
             f"the pose of {tool} is in frame '{message.header.frame_id}'; expected '{body_frame}'. "
             "Transform it before sending, list the frame in the file of the parameter `frames`, or set `frame`."
         )
-    pose = finite(f"pose of {tool}", pose_from(message.pose), (4, 4))
+    pose = pose_from(message.pose) if known else pose_body_from_frame @ pose_from(message.pose)
+    finite(f"pose of {tool}", pose, (4, 4))
     far = float(np.abs(pose[:3, 3]).max())
     if far > MAX_EXTENT:
         raise InvalidInput(

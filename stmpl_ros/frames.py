@@ -13,16 +13,16 @@ from rclpy.node import Node
 from rclpy.time import Time
 from ruamel.yaml import YAML, YAMLError
 
-from bags.messages import pose_from, stamp_ns
+from bags.messages import pose_from, stamp_ns, wrench_from
 from stmpl_core.arrays import Transform
 from stmpl_core.errors import InvalidInput, StmplError
-from stmpl_ros.conversions import pose_message, wrench_message
+from stmpl_ros.conversions import wrench_message
 
 SHAPE = "name: {position: [x, y, z], orientation: [x, y, z, w]}, in metres, both optional"
 
 
 class Frames:
-    """Brings poses and wrenches into the body's frame. What is in an unknown frame comes back as it is.
+    """Brings poses and wrenches into the body's frame.
 
     Args:
         body: frame_id of the body.
@@ -52,21 +52,13 @@ class Frames:
         )  # fmt: skip
         return pose_from(message)
 
-    def pose(self, message: PoseStamped) -> PoseStamped:
-        """A tool's pose in the body's frame. Raises InvalidInput for a broken quaternion."""
-        pose_body_from_frame = None if message.header.frame_id == self.body else self.of(message.header.frame_id)
-        if pose_body_from_frame is None:
-            return message
-        return pose_message(pose_body_from_frame @ pose_from(message.pose), self.body, stamp_ns(message))
-
     def wrench(self, message: WrenchStamped, tool: str) -> WrenchStamped:
-        """A tool's wrench in the body's axes, still about the tool's origin; `body` and the tool's own stay."""
+        """A tool's wrench, about its origin, in the body's axes; what is in the tool's or unknown ones stays."""
         frame = message.header.frame_id
         pose_body_from_frame = None if frame in (self.body, tool) else self.of(frame)
         if pose_body_from_frame is None:
             return message
-        f, t, turn = message.wrench.force, message.wrench.torque, pose_body_from_frame[:3, :3]
-        values = np.concatenate([turn @ [f.x, f.y, f.z], turn @ [t.x, t.y, t.z]])
+        values = wrench_from(message, body_frame=self.body, tool=frame, pose_body_from_tool=pose_body_from_frame)
         return wrench_message(values, self.body, stamp_ns(message))
 
 

@@ -42,7 +42,8 @@ class Gate:
     def pose(self, message: PoseStamped, tool: str) -> Transform | None:
         """pose_body_from_tool, (4, 4)."""
         try:
-            pose = checked_pose(self._frames.pose(message), tool, self._config().frame)
+            pose_body_from_frame = self._frames.of(message.header.frame_id)
+            pose = checked_pose(message, tool, self._config().frame, pose_body_from_frame)
         except StmplError as error:
             return self.refuse(f"pose of {tool}, {type(error).__name__}", str(error))
         return pose if self._fresh(message) else None

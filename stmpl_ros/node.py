@@ -27,8 +27,9 @@ from stmpl_core.contact import ToolMesh
 from stmpl_core.errors import InvalidInput, StmplError
 from stmpl_core.sdf import SignedDistance
 from stmpl_core.trust import Displacement
-from stmpl_ros.adapters import contact_mesh_of
+from stmpl_ros.adapters import GazeboContacts, contact_mesh_of
 from stmpl_ros.background import Background
+from stmpl_ros.calibration import Calibration
 from stmpl_ros.conversions import NANO, checked_mesh, faded
 from stmpl_ros.diagnosis import Tally, diagnostics, limits_status, skin_status
 from stmpl_ros.events import Events
@@ -41,7 +42,7 @@ from stmpl_ros.parameters import NodeConfig
 from stmpl_ros.remarks import remarks
 from stmpl_ros.reskin import Made, Reskin
 from stmpl_ros.settings import Settings
-from stmpl_ros.skin import Build, Skin, check, layer_of, published, warm_up
+from stmpl_ros.skin import Build, Skin, check, layer_of, maker_of, published, warm_up
 from stmpl_ros.spinning import ros, spin
 from stmpl_ros.topics import KEPT, NEWEST, STREAM, managed, newest_within
 
@@ -64,7 +65,7 @@ class SkinNode(LifecycleNode):
         node_options: of rclpy's LifecycleNode: namespace, context, parameter_overrides, ...
 
     Raises:
-        InvalidInput: a parameter lies outside what its field allows, or the file of frames cannot be read.
+        InvalidInput: a parameter cannot be, the file of frames cannot be read, or a package that is needed is missing.
     """
 
     def __init__(self, config: NodeConfig, build: Build = layer_of, **node_options: Any) -> None:
@@ -72,6 +73,7 @@ class SkinNode(LifecycleNode):
         self.settings = Settings(self, config, self._on_settings)
         self._build = build
         frames = Frames(self.config.frame, read_frames(self.config.frames), self)
+        self.gazebo = GazeboContacts(self.config, frames) if self.config.gz_contacts else None
         self.tally = Tally()
         self.gate = Gate(self, lambda: self.config, frames, self.tally)
         self.events = Events(self.gate.say)
@@ -79,6 +81,7 @@ class SkinNode(LifecycleNode):
         self.sequence = self.meshes = 0
         self.background: Background | None = None
         self.reskin: Reskin | None = None
+        self.calibration = Calibration(self, lambda: self.background, lambda e: self.set_body(youngs_modulus=e))
         self._start_empty()
         self._offer("reset", self.reset)
         self.create_service(SetBody, "~/set_body", self._on_set_body)
@@ -96,6 +99,7 @@ class SkinNode(LifecycleNode):
         self.last: tuple[Displacement, Stamps] | None = None  # answered; None: at rest
         self.fading = False
         self.seen: set[str] = set()  # tools of the last answer
+        self.calibration.forget()
 
     # Lifecycle
 
@@ -147,6 +151,7 @@ class SkinNode(LifecycleNode):
     def destroy_node(self) -> None:
         """Ends the processes beside this one too."""
         self._end()
+        self.calibration.close()
         super().destroy_node()
 
     def _answer_on(self, skin: Skin, background: Background) -> None:
@@ -176,6 +181,8 @@ class SkinNode(LifecycleNode):
         self._listen(ContactMesh, "contact_mesh", self._on_mesh, KEPT)
         for tool in self.config.shape_tools.split():
             self._listen(Mesh, f"tools/{tool}/mesh", partial(self._on_shape, tool), KEPT)
+        if self.gazebo:
+            self._listen(self.gazebo.kind, "gz_contacts", partial(self._on_gazebo, self.gazebo), NEWEST)
         self.clocks = [self.create_timer(1 / FADE_RATE, self._fade_if_silent), self.create_timer(1.0, self._diagnose)]
 
     def _close_topics(self) -> None:
@@ -209,10 +216,11 @@ class SkinNode(LifecycleNode):
         self.create_service(Trigger, f"~/{name}", serve)
 
     def reset(self) -> str:
-        """Forgets what the tools did last, and sends the skin at rest. Raises InvalidInput unless active."""
+        """Forgets what the tools did, and sends the skin at rest. Raises InvalidInput unless active."""
         if not self.active:
             raise InvalidInput("the node is not active, so there is nothing to reset.")
         self.inbox.forget()
+        self.calibration.forget()
         self._rest("reset")
         self.fading = False
         return f"at rest; {len(self.inbox.tools)} tools are known"
@@ -227,7 +235,7 @@ class SkinNode(LifecycleNode):
         return response
 
     def set_body(self, **changes: Any) -> str:
-        """Has another skin made beside this process, which then takes over. Raises InvalidInput.
+        """Has another skin, or this one of another stiffness, take over once it is made. Raises InvalidInput.
 
         Args:
             changes: fields of NodeConfig.
@@ -240,7 +248,8 @@ class SkinNode(LifecycleNode):
             return "counts when the node is configured"
         if self.reskin:
             raise InvalidInput("another skin is being made; wait for skin/topology.")
-        self.reskin = Reskin(self, config, self._build, lambda: self.announced, self._on_skin, self._on_no_skin)
+        maker = maker_of(self.skin, config, set(changes), self._build)
+        self.reskin = Reskin(self, config, maker, lambda: self.announced, self._on_skin, self._on_no_skin)
         return "being made; skin/topology comes when it takes over"
 
     def _on_skin(self, made: Made) -> None:
@@ -327,6 +336,13 @@ class SkinNode(LifecycleNode):
             self.gate.order("wrench", name, self.inbox.put_wrench(name, wrench, stamp_ns(message), time.monotonic_ns()))
             self._answer_if_complete()
 
+    def _on_gazebo(self, gazebo: GazeboContacts, message: Any) -> None:
+        try:
+            for name, wrench in gazebo.wrenches(message, self.skin.layer, self.inbox.tools):
+                self._on_wrench(name, wrench)
+        except StmplError as error:
+            self.gate.refuse("gz_contacts", str(error))
+
     def _hears(self, name: str) -> bool:
         return self.active and name in self.inbox.tools
 
@@ -349,6 +365,7 @@ class SkinNode(LifecycleNode):
         why = remarks(instant, answer, self.seen, self.config.rest_after, self.gate.say)
         self._send(answer, instant.stamp, instant.inputs, seconds=seconds, why=why)
         meshes = {name: self.inbox.tools[name].number for name in answer.statuses}
+        self.calibration.put(instant, answer, meshes)
         self.outputs.send_contacts(instant, answer, answer.wrenches, meshes, self.config.local_rotations)
         self.tally.solve_times.append(seconds)
         self.tally.latencies.append((self._now() - instant.stamp) / NANO)
@@ -404,6 +421,7 @@ class SkinNode(LifecycleNode):
             "lost on the way": str(self.events.lost),
             "layer_id": self.skin.layer_id,
             "another skin": "being made" if self.reskin else "",
+            "presses kept": str(len(self.calibration.presses)),
         }
         bad = bool(self.tally.refused or self.tally.stale or self.inbox.out_of_order or self.events.missed_deadlines)
         name = self.get_fully_qualified_name()

@@ -17,7 +17,7 @@ from stmpl_ros.local_contacts import LocalContacts
 from stmpl_ros.parameters import NodeConfig
 from stmpl_ros.show import Show
 from stmpl_ros.skin import Skin
-from stmpl_ros.topics import ANSWERS, KEPT, STREAM, managed
+from stmpl_ros.topics import ANSWERS, NOW, STREAM, managed
 
 Stamps = dict[str, tuple[int, int]]  # of each tool's pose and wrench [ns]
 
@@ -38,7 +38,7 @@ class Outputs:
         say: Callable[[str, str], None],
     ) -> None:  # fmt: skip
         self._node, self._frame, self._skin = node, config.frame, skin
-        self._topology = managed(node, SkinTopology, "skin/topology", KEPT)
+        self._topology = managed(node, SkinTopology, "skin/topology", NOW)
         self._displacement = managed(node, SkinDisplacement, "skin/displacement", ANSWERS)
         self._deformed = managed(node, SkinDeformed, "skin/deformed", STREAM)
         self.show = Show(node, skin.layer, config.frame, config.marker_rate)

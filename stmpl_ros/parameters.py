@@ -84,6 +84,12 @@ class NodeConfig(BaseModel):
     shape_tools: str = Field(
         default="", description="tools that announce their surface as shape_msgs/Mesh, parted by blanks"
     )
+    gz_contacts: str = Field(
+        default="", description="tools that Gazebo's contacts push: 'finger=robot::tip::collision', parted by blanks"
+    )
+    gz_body: str = Field(
+        default="", description="model, link or collision in Gazebo that is the body; empty: whatever the tools touch"
+    )
     rest_after: float = Field(
         default=0.25, gt=0, le=3600, description="a tool silent for longer is no longer in contact [s]",
         json_schema_extra=ANY_TIME,
@@ -112,6 +118,17 @@ class NodeConfig(BaseModel):
         _shares(text)
         return text
 
+    @field_validator("gz_contacts")
+    @classmethod
+    def _collisions(cls, text: str) -> str:
+        _named(text)
+        return text
+
+    @property
+    def gz_collisions(self) -> dict[str, str]:
+        """The collision of each tool that takes its wrench from Gazebo."""
+        return _named(self.gz_contacts)
+
     def new_method(self) -> Method:
         """The method, not yet prepared."""
         return ladder(self.accuracy, self.solve_time) if self.method == "ladder" else METHODS[self.method]()
@@ -130,6 +147,15 @@ class NodeConfig(BaseModel):
         """The settings as arguments of a ROS process: --ros-args -p name:=value ..."""
         values = self.model_dump(mode="json").items()
         return ["--ros-args"] + [part for name, value in values for part in ("-p", f"{name}:={json.dumps(value)}")]
+
+
+def _named(text: str) -> dict[str, str]:
+    """tool=collision, parted by blanks. Raises ValueError."""
+    pairs = [pair.partition("=") for pair in text.split()]
+    for tool, _, collision in pairs:
+        if not tool or not collision:
+            raise ValueError(f"'{text}' is no tool=collision, as in 'finger=robot::tip::collision'")
+    return {tool: collision for tool, _, collision in pairs}
 
 
 def _shares(text: str) -> dict[str, float]:
@@ -168,6 +194,7 @@ class RecordConfig(BaseModel):
 
     path: Path = Field(description="folder for run.mcap and metadata.yaml")
     run: Path | None = Field(default=None, description="JSON file that says what made the run; kept in the recording")
+    frames: Path | None = Field(default=None, description="the node's file of frames; the one that `run` names")
 
 
 class DemoConfig(BaseModel):

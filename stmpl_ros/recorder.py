@@ -22,12 +22,14 @@ from bags.provenance import write_provenance
 from bags.schema import find_schema
 from bags.writer import BagWriter, qos_yaml
 from stmpl_core.errors import BagError, InvalidInput
+from stmpl_ros.frames import read_frames
 from stmpl_ros.parameters import RecordConfig
 from stmpl_ros.spinning import ros, spin
 
 log = logging.getLogger(__name__)
 
 WANTED = re.compile(r"(contact_mesh|skin/topology|skin/displacement|tools/\w+/(pose|wrench))$|^/diagnostics$")
+IF_HEARD = re.compile(r"tools/\w+/local_contact$")  # recorded once a device listens: to listen costs the node work
 LOOK = 0.1  # s between two looks for new topics
 DEPTH = 1000  # messages of a topic that the middleware keeps while this process is busy
 WAITING = 4000  # messages that may wait for the disk; what comes then is counted as lost
@@ -61,7 +63,7 @@ class RecorderNode(Node):
 
     def _look(self) -> None:
         for topic, types in self.get_topic_names_and_types():
-            if topic not in self._subscribed and self._is_wanted(topic) and self.count_publishers(topic):
+            if topic not in self._subscribed and self.count_publishers(topic) and self._is_wanted(topic):
                 self._subscribed.add(topic)
                 try:
                     self._subscribe(topic, types[0])
@@ -72,7 +74,8 @@ class RecorderNode(Node):
         if self._wanted:
             return bool(self._wanted.fullmatch(topic))
         own = self.get_namespace().rstrip("/") + "/"
-        return bool(WANTED.search(topic)) and (topic.startswith(own) or topic == "/diagnostics")
+        run = WANTED.search(topic) or (IF_HEARD.search(topic) and self.count_subscribers(topic))
+        return bool(run) and (topic.startswith(own) or topic == "/diagnostics")
 
     def _subscribe(self, topic: str, type_name: str) -> None:
         find_schema(type_name)  # raises BagError here, not in the thread that writes
@@ -160,10 +163,11 @@ def run(config: RecordConfig, arguments: list[str] | None = None, topics: Sequen
 
     Raises:
         BagError: the file exists, or the disk refused; the message says what is safe.
-        InvalidInput: an expression that cannot be read.
+        InvalidInput: an expression or a file of frames that cannot be read.
     """
     wanted = pattern(topics) if topics else None
     made_by = json.loads(config.run.read_text()) if config.run else {}
+    frames = read_frames(str(config.frames or made_by.get("node", {}).get("frames", "")))
     with ros(arguments) as stop, BagWriter(config.path) as writer:
         write_provenance(
             writer,
@@ -171,6 +175,7 @@ def run(config: RecordConfig, arguments: list[str] | None = None, topics: Sequen
             method=made_by.get("node", {}).get("method", ""),
             body=made_by.get("node", {}).get("part", ""),
             config=made_by,
+            frames=frames,
         )
         node = RecorderNode(writer, stop, wanted)
         executor = EventsExecutor()

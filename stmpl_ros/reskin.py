@@ -14,7 +14,7 @@ from stmpl_core.errors import StmplError
 from stmpl_core.sdf import SignedDistance
 from stmpl_ros.background import Background, then
 from stmpl_ros.parameters import NodeConfig
-from stmpl_ros.skin import Build, Skin, SkinMaker
+from stmpl_ros.skin import AtHand, Skin, SkinMaker
 
 Meshes = Mapping[str, tuple[int, ToolMesh]]  # number and mesh of each tool
 
@@ -41,20 +41,20 @@ class Reskin:
     Args:
         node: whose executor gets it.
         config: that it is made by.
-        build: makes the layer.
+        maker: of the skin, which this ends.
         meshes: asked for the tools of then, once the skin is there.
         do: is called with it.
         failed: is called with why it could not be made.
     """
 
     def __init__(
-        self, node: Node, config: NodeConfig, build: Build, meshes: Callable[[], Meshes],
+        self, node: Node, config: NodeConfig, maker: SkinMaker | AtHand, meshes: Callable[[], Meshes],
         do: Callable[[Made], None], failed: Callable[[BaseException], None],
     ) -> None:  # fmt: skip
         self._node, self._config, self._meshes, self._do, self._failed = node, config, meshes, do, failed
         self._made: Made | None = None
         self._closed = False
-        self._maker = SkinMaker(config, build)
+        self._maker = maker
         then(node, self._maker.skin, self._on_skin)
 
     def close(self) -> None:

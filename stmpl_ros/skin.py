@@ -6,6 +6,7 @@ import os
 import signal
 from collections.abc import Callable
 from concurrent.futures import Future, ProcessPoolExecutor
+from copy import copy
 from dataclasses import dataclass
 from functools import cached_property
 from multiprocessing import get_context
@@ -22,6 +23,8 @@ from stmpl_ros.parameters import NodeConfig
 from stmpl_ros.workshop import stand_beside
 
 Build = Callable[[NodeConfig], SoftLayer]
+STIFFNESS = {"youngs_modulus", "density"}  # settings that change neither geometry nor what is felt around a vertex
+QUICK = {"moment_net", "winkler", "naive"}  # methods that such a change costs no preparation
 
 
 def layer_of(config: NodeConfig) -> SoftLayer:
@@ -66,6 +69,14 @@ class Skin:
         layer = published(build(config))
         return cls(layer, config.new_method().prepare(layer), Surroundings.of(layer))
 
+    def stiffened(self, config: NodeConfig) -> Skin:
+        """The same skin with the stiffness and density of these settings, in a tenth of a second."""
+        layer = self.layer.with_(youngs_modulus=config.youngs_modulus, density=config.density)
+        near = copy(self.near)
+        near.layer = layer
+        Surroundings.keep(near)
+        return Skin(layer, config.new_method().prepare(layer), near)
+
     @cached_property
     def layer_id(self) -> str:
         """Names the layer in messages."""
@@ -106,3 +117,21 @@ class SkinMaker:
         if self._pid.done() and not self.skin.done():
             os.kill(self._pid.result(), signal.SIGTERM)
         self._pool.shutdown(wait=False, cancel_futures=True)
+
+
+class AtHand:
+    """A skin that is there already, where a SkinMaker is asked for."""
+
+    def __init__(self, skin: Skin) -> None:
+        self.skin: Future[Skin] = Future()
+        self.skin.set_result(skin)
+
+    def close(self) -> None:
+        """There is nothing to end."""
+
+
+def maker_of(skin: Skin, config: NodeConfig, changed: set[str], build: Build) -> SkinMaker | AtHand:
+    """Makes the skin of these settings from the one that answers, of which `changed` are changed."""
+    if changed and changed <= STIFFNESS and config.method in QUICK:
+        return AtHand(skin.stiffened(config))
+    return SkinMaker(config, build)

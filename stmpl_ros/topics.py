@@ -10,6 +10,7 @@ from rclpy.qos import DurabilityPolicy, LivelinessPolicy, QoSProfile, Reliabilit
 LEASE = 1.0  # s: a node that is silent for longer on the bus is told to be gone, to listeners who ask for that
 
 KEPT = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)  # meshes: late listeners get them too
+NOW = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)  # the skin: late listeners get the one that is
 STREAM = QoSProfile(depth=10)
 ANSWERS = QoSProfile(
     depth=10, liveliness=LivelinessPolicy.AUTOMATIC, liveliness_lease_duration=Duration(seconds=LEASE)

@@ -13,14 +13,15 @@ import pytest
 from mcap.reader import make_reader
 from rosbags.rosbag2 import Reader
 
-from bags.messages import layer_from, layer_id, pose_from, wrench_from
+from bags.messages import contact_from, layer_from, layer_id, pose_from, wrench_from
 from bags.provenance import layer_from_bytes, layer_to_bytes, write_provenance
 from bags.reader import Bag
 from bags.recover import recover
 from bags.schema import find_schema, typestore_of
 from bags.writer import BagWriter, qos_yaml
+from stmpl_core.contact import ToolMesh
 from stmpl_core.errors import BagError, FrameError, InvalidInput
-from tests.bag_scene import START, STORE, cdr, header, message, tube
+from tests.bag_scene import START, STORE, ball, cdr, header, message, pose, tube, wrench
 
 HEADER = "std_msgs/msg/Header"
 KNOWN = ("stmpl_msgs/msg/ContactMesh", "stmpl_msgs/msg/SkinDisplacement", "stmpl_msgs/msg/SkinTopology",
@@ -240,6 +241,25 @@ def test_provenance_comes_back(tmp_path):
     assert bag.provenance.method == "winkler" and bag.provenance.config == {"edge_length": 0.012}
     assert "numpy" in bag.provenance.versions
     assert bag.layer.vertices.tobytes() == layer.vertices.tobytes()
+
+
+def test_poses_and_wrenches_in_a_frame_that_the_recording_carries_count_as_in_the_bodys(tmp_path):
+    turn, moved = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]), np.array([0.1, -0.2, 0.3])
+    place = np.eye(4)
+    place[:3, :3], place[:3, 3] = turn, moved / 3
+    with BagWriter(tmp_path) as bag:
+        write_provenance(bag, None, method="winkler", frames={"table": place})
+    frames = Bag(tmp_path).provenance.frames
+    assert frames["table"].tobytes() == place.tobytes()
+    mesh, sent, push = ToolMesh.of(*ball()), pose(0.3, 0.06, 0.0, START), wrench("ball", 0.2, START)
+    sent.header.frame_id = push.header.frame_id = "table"
+    contact = contact_from("ball", mesh, sent, push, body_frame="body", frames=frames)
+    assert np.array_equal(contact.pose_body_from_tool, place @ pose_from(sent.pose))
+    assert contact.wrench is not None
+    np.testing.assert_allclose(contact.wrench[:3], turn @ [-0.2, 0, 0], atol=1e-16)
+    for wrong in ({}, {"chair": place}):
+        with pytest.raises(FrameError, match="in frame 'table'; known are 'body"):
+            contact_from("ball", mesh, sent, push, body_frame="body", frames=wrong)
 
 
 def test_a_topology_message_says_a_float32_layer_exactly():

@@ -9,13 +9,17 @@ import numpy as np
 import pytest
 
 from bags.compare import compare_bags, compare_run, sample
+from bags.messages import layer_id
+from bags.provenance import write_provenance
 from bags.reader import Bag
 from bags.replay import replay_run
 from bags.report import headline, write_report
 from bags.survey import survey
+from bags.writer import BagWriter
 from stmpl_core.errors import BagError
 from stmpl_core.methods import Winkler
 from stmpl_core.trust import Displacement, Trust
+from stmpl_ros.view.recording import Recording
 from tests.bag_scene import tube, write_run
 
 LOST, SKIPPED, DELAY = (5, 6, 20), (10, 11), 0.003
@@ -105,6 +109,52 @@ def test_bags_of_different_skins_are_not_compared(run, tmp_path):
     other = write_run(tmp_path / "other", Winkler(), layer=tube(edge=9e-3), frames=3)
     with pytest.raises(BagError, match="one skin only"):
         compare_bags(run, other)
+
+
+@pytest.fixture(scope="module")
+def two_skins(tmp_path_factory):
+    """A run whose skin was changed on the way, as by ~/set_body: another stiffness, then another mesh as well."""
+    folder = tmp_path_factory.mktemp("skins")
+    skins = (tube(), tube().with_(youngs_modulus=2e4), tube(edge=9e-3))
+    parts = [write_run(folder / f"part{k}", Winkler(), layer=skin, frames=8) for k, skin in enumerate(skins)]
+    return joined(parts, folder / "run"), skins
+
+
+def joined(parts, folder):
+    """Several runs as one, one after the other."""
+    with BagWriter(folder) as writer:
+        write_provenance(writer, None, method="winkler")
+        for part, path in enumerate(parts):
+            bag, channels = Bag(path), {}
+            for raw in bag.raw(lambda topic: True):
+                if raw.topic not in channels:
+                    channels[raw.topic] = writer.add_channel(raw.topic, bag.topics[raw.topic].type_name)
+                writer.write(channels[raw.topic], raw.data, raw.log_time_ns + part, raw.log_time_ns)
+    return folder
+
+
+def test_a_run_whose_skin_was_changed_is_replayed_each_answer_on_its_own(two_skins):
+    run, skins = two_skins
+    bag = Bag(run)
+    assert list(bag.layers) == [layer_id(skin) for skin in skins] and bag.layer_id == layer_id(skins[0])
+    replayed = replay_run(run, Winkler())
+    assert replayed.frames == replayed.identical == 24
+    loads = [moment.load for moment in survey(run).moments]
+    assert loads[:8] == pytest.approx(loads[8:16], rel=0.02), "the same wrenches on either skin"
+
+
+def test_a_run_whose_skin_was_changed_is_compared_and_shown_each_answer_on_its_own(two_skins, tmp_path):
+    run, skins = two_skins
+    comparison = compare_run(run, Winkler(), method=Winkler(), frames=100, tolerance=0.0)
+    assert comparison.passed and len(comparison.pairs) == 21, "each run begins at rest"
+    assert {layer_id(pair.layer) for pair in comparison.pairs} == {layer_id(skin) for skin in skins}
+    assert all(len(pair.ours.displacement) == len(pair.layer.vertices) for pair in comparison.pairs)
+    page = write_report(comparison, tmp_path / "report.html").read_text()
+    assert all(repr(skin) in html.unescape(page) for skin in skins)
+    recording = Recording.of(run, frames=24)
+    assert {layer_id(layer) for layer in recording.layers} == {layer_id(skin) for skin in skins}
+    for snapshot, layer in zip(recording.snapshots, recording.layers, strict=True):
+        assert len(snapshot.answer.displacement) == len(layer.vertices)
 
 
 def test_the_report_shows_what_was_measured_and_needs_no_other_file(run, tmp_path):

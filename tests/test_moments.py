@@ -12,7 +12,7 @@ from stmpl_core import Load, SoftLayer
 from stmpl_core.errors import InvalidInput, NotPrepared
 from stmpl_core.methods import Linear
 from stmpl_core.metrics import score
-from stmpl_core.moments import NEAR, REACH, SPREADS, STEPS, Surroundings, response_table, ring_table
+from stmpl_core.moments import FINER, NEAR, REACH, SPREADS, STEPS, Surroundings, response_table, ring_table
 from tests import scenes
 from tests.touch_scenes import plate, turn
 
@@ -50,9 +50,10 @@ def test_a_force_on_a_thick_layer_sinks_it_as_boussinesq_says() -> None:
 
 
 def test_rings_weigh_one_over_the_plane_and_end_where_they_should() -> None:
-    radius = np.arange(int(NEAR * STEPS) + 2) / STEPS
+    step = 1 / (STEPS * FINER)
+    radius = np.arange(int(NEAR / step) + 2) * step
     rings = ring_table()
-    np.testing.assert_allclose((2 * np.pi * radius[:, None] * rings[:, :8]).sum(axis=0) / STEPS, 1.0, atol=1e-4)
+    np.testing.assert_allclose((2 * np.pi * radius[:, None] * rings[:, :8]).sum(axis=0) * step, 1.0, atol=1e-4)
     assert not rings[radius >= NEAR].any()
 
 

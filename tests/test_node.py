@@ -1,6 +1,7 @@
 """Laws of the node as a robot team meets it: parameters, services, other frames, outputs, lifecycle, QoS, launch."""
 
 import ast
+import importlib.util
 import os
 import signal
 import subprocess
@@ -9,6 +10,7 @@ import time
 from collections import defaultdict
 from contextlib import contextmanager
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -17,8 +19,10 @@ os.environ["ROS_DOMAIN_ID"] = os.environ.setdefault("STMPL_TEST_BUS", str(1 + os
 os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
 
 import rclpy
+from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
-from geometry_msgs.msg import Point, PoseStamped, WrenchStamped
+from geometry_msgs.msg import Point, PoseStamped, Vector3, WrenchStamped
+from geometry_msgs.msg import Wrench as WrenchMessage
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState
 from rcl_interfaces.msg import Log
@@ -30,24 +34,30 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.parameter import Parameter, parameter_value_to_python
 from rclpy.qos import LivelinessPolicy, QoSProfile
 from ruamel.yaml import YAML
-from scipy.spatial.transform import Rotation
 from sensor_msgs.msg import PointCloud2
 from shape_msgs.msg import Mesh, MeshTriangle
 from std_srvs.srv import Trigger
-from stmpl_msgs.msg import ContactMesh, SkinDisplacement, SkinTopology
-from stmpl_msgs.srv import SetBody
+from stmpl_msgs.msg import ContactMesh, LocalContact, SkinDisplacement, SkinTopology
+from stmpl_msgs.srv import Calibrate, SetBody
 
 from bags.messages import layer_from, layer_id, stamp_ns
-from stmpl_core.errors import InvalidInput
-from stmpl_core.touch import BY_POSE, TOUCHING
+from bags.reader import Bag
+from bags.replay import replay_run
+from stmpl_core.contact import Contact
+from stmpl_core.errors import FrameError, InvalidInput
+from stmpl_core.methods import MomentNet
+from stmpl_core.sdf import SignedDistance
+from stmpl_core.touch import BY_POSE, MOVED, TOUCHING, Toucher
 from stmpl_core.trust import Displacement, Trust
+from stmpl_ros.adapters import GazeboContacts, gazebo_wrench
 from stmpl_ros.cloud import FIELDS, SkinCloud
-from stmpl_ros.conversions import STALE, mesh_message, pose_message, wrench_message
+from stmpl_ros.conversions import STALE, checked_pose, mesh_message, pose_message, wrench_message
 from stmpl_ros.frames import Frames, read_frames
 from stmpl_ros.limits import Limits
 from stmpl_ros.node import SkinNode
 from stmpl_ros.parameters import NodeConfig
 from stmpl_ros.settings import checked
+from stmpl_ros.skin import Skin, published
 from stmpl_ros.topics import KEPT, LEASE, STREAM
 from tests.touch_scenes import LENGTH, RADIUS, at, ball, limb
 
@@ -89,7 +99,7 @@ class Bus:
     """A robot's side: a tool that it moves, what it hears, and what it asks."""
 
     def __init__(self, space: str = "") -> None:
-        self.space, self.got = space, defaultdict(list)
+        self.space, self.got, self.folder = space, defaultdict(list), Path()
         self.node = rclpy.create_node("robot", namespace=space or "/")
         self.mesh = self.node.create_publisher(ContactMesh, "contact_mesh", KEPT)
         self.listen(SkinTopology, "skin/topology", KEPT)
@@ -174,6 +184,11 @@ class Hand:
 
 HERE = at(TOUCH, 0, LENGTH / 2)
 PUSH = np.array([-0.03, 0, 0, 0, 0, 0])
+TABLE = np.array([[-1.0, 0, 0, 0], [0, -1, 0, 0], [0, 0, 1, 0.1], [0, 0, 0, 1]])  # pose_body_from_table
+
+
+def stamp_of(stamp_ns: int) -> Time:
+    return Time(sec=stamp_ns // 10**9, nanosec=stamp_ns % 10**9)
 
 
 def rows(answer: SkinDisplacement) -> np.ndarray:
@@ -190,6 +205,7 @@ def bus(tmp_path_factory):
     given = [part for one in (*files, "shape_tools:=shaped") for part in ("-p", one)]
     rclpy.init()
     made = Bus("/robot")
+    made.folder = folder
     try:
         with running([sys.executable, "-c", NODE, "--ros-args", "-r", "__ns:=/robot", *given]):
             made.wait(lambda: made.got["skin/topology"], "skin/topology")
@@ -307,6 +323,50 @@ def test_another_body_takes_over_while_the_node_goes_on_answering(bus, hand):
     assert bus.get("youngs_modulus", "thickness") == [2e3, 6e-3]
 
 
+def test_another_stiffness_alone_is_at_hand_at_once_and_answers_as_one_that_was_made():
+    config = NodeConfig(thickness=7e-3)
+    given = Skin.of(config, skin)
+    harder = config.model_copy(update={"youngs_modulus": 3e3})
+    quick, made = given.stiffened(harder), Skin.of(harder, skin)
+    assert quick.layer_id == made.layer_id != given.layer_id
+    contact = Contact("probe", ball(), HERE, PUSH)
+    assert quick.simulator().step([contact]).displacement.tobytes() == (
+        made.simulator().step([contact]).displacement.tobytes()
+    )
+
+
+def test_calibrate_finds_the_stiffness_and_the_offset_that_the_robots_presses_had(bus):
+    hidden, back, mesh = 4.2e3, 0.8e-3, ball()
+    layer = skin(NodeConfig(**dict(zip(asked := ("thickness",), bus.get(*asked), strict=True)), youngs_modulus=hidden))
+    toucher, field = Toucher(published(layer)), SignedDistance.of(mesh)
+    hand = bus.tool("finger").ready()
+    bus.still()
+    bus.call(Trigger, "reset")
+    few = bus.call(Calibrate, "calibrate")
+    assert not few.success and "0 of 0 instants pressed" in few.message and few.presses == 0
+    for depth in np.linspace(0.4e-3, 3e-3, 24):
+        pose = at(RADIUS + 0.012 - depth, 0, LENGTH / 2)
+        wrench = toucher.touch(Contact("finger", mesh, pose), field).wrench
+        assert list(hand.ask(at(back, 0, 0) @ pose, wrench).statuses) in ([TOUCHING], [MOVED])
+    nobody = bus.call(Calibrate, "calibrate", tool="nobody")
+    assert not nobody.success and "0 of 0" in nobody.message
+    before, layers = len(bus.got["skin/displacement"]), len(bus.got["skin/topology"])
+
+    def press_on() -> None:
+        hand.send(at(back, 0, 0) @ HERE, PUSH)
+
+    timer = bus.node.create_timer(0.05, press_on)
+    found = bus.call(Calibrate, "calibrate", tool="finger", apply=True)
+    assert found.success, found.message
+    assert found.youngs_modulus == pytest.approx(hidden, rel=0.05) and found.relative_error < 0.25
+    assert found.offset == pytest.approx(back, abs=1e-4) and found.residual < 0.05 and found.presses > 15
+    topology = bus.wait(lambda: bus.got["skin/topology"][layers:], "the skin of that stiffness")[0]
+    assert topology.youngs_modulus == pytest.approx(found.youngs_modulus) == bus.get("youngs_modulus")[0]
+    bus.node.destroy_timer(timer)
+    assert len(bus.got["skin/displacement"]) > before + 5, "answers went on meanwhile"
+    bus.still()
+
+
 def test_a_body_that_cannot_be_made_is_told_and_the_one_from_before_goes_on(bus, hand):
     before = hand.ask(HERE, PUSH).layer_id
     lines = len(bus.said("no other skin"))
@@ -321,14 +381,40 @@ def test_a_body_that_cannot_be_made_is_told_and_the_one_from_before_goes_on(bus,
 
 
 def test_poses_and_wrenches_in_a_listed_frame_count_as_in_the_bodys(bus, hand):
-    place = np.eye(4)
-    place[:3, :3], place[2, 3] = Rotation.from_euler("z", np.pi).as_matrix(), 0.1
     own = hand.ask(HERE, PUSH)
-    turn = place[:3, :3].T
+    turn = TABLE[:3, :3].T
     in_table = np.concatenate([turn @ PUSH[:3], turn @ PUSH[3:]])
-    answer = hand.ask(np.linalg.inv(place) @ HERE, in_table, frame="table")
+    answer = hand.ask(np.linalg.inv(TABLE) @ HERE, in_table, frame="table")
     assert answer.header.frame_id == "body" and list(answer.statuses) == [TOUCHING]
     np.testing.assert_allclose(rows(answer), rows(own), atol=1e-7)
+
+
+def test_a_recording_of_another_frame_and_of_two_skins_is_replayed_bit_for_bit(bus, tmp_path):
+    hand, stmpl, table = bus.tool("recorded").ready(), Path(sys.executable).with_name("stmpl"), np.linalg.inv(TABLE)
+    bus.still()
+    command = [str(stmpl), "record", "--path", str(tmp_path / "run"), "--frames", str(bus.folder / "frames.yaml")]
+    with running([*command, "--ros-args", "-r", "__ns:=/robot"], signal.SIGINT):
+        for topic in ("skin/displacement", "skin/topology", "tools/recorded/wrench", "tools/recorded/pose"):
+            bus.wait(lambda topic=topic: bus.node.count_subscribers(f"/robot/{topic}") > 1, f"recording {topic}")
+        for depth in (0.5e-3, 1e-3, 2e-3):
+            hand.ask(table @ at(RADIUS + 0.012 - depth, 0, LENGTH / 2), np.array([0.03, 0, 0, 0, 0, 0]), frame="table")
+        layers = len(bus.got["skin/topology"])
+        assert bus.call(SetBody, "set_body", youngs_modulus=1.7e3).success
+        bus.wait(lambda: bus.got["skin/topology"][layers:], "the other skin")
+        heard = "/robot/tools/recorded/local_contact"
+        assert not bus.node.count_subscribers(heard), "to listen costs the node work"
+        bus.listen(LocalContact, "tools/recorded/local_contact", STREAM)
+        bus.wait(lambda: bus.node.count_subscribers(heard) == 2, "recording what a device hears")
+        hand.ask(table @ HERE, np.array([0.05, 0, 0, 0, 0, 0]), frame="table")
+        bus.wait(lambda: bus.got["tools/recorded/local_contact"], "a local contact")
+        bus.still()
+        bus.spin(0.3)
+    bag = Bag(tmp_path / "run")
+    before, after = (layer.tissue.youngs_modulus for layer in bag.layers.values())
+    assert before != after == 1.7e3
+    assert bag.topics[heard].messages >= 1
+    summary = replay_run(tmp_path / "run", MomentNet())
+    assert summary.identical == summary.frames >= 4, str(summary)
 
 
 @pytest.mark.parametrize("text", ["[1, 2]", "t: {position: [1, 2]}", "t: {orientation: [0, 0, 0, 2]}", "t: {pos: 1}",
@@ -342,8 +428,8 @@ def test_a_file_of_frames_that_cannot_be_read_is_refused(tmp_path, text):
 def test_the_example_of_frames_is_read_and_unknown_frames_stay_unknown():
     frames = Frames("body", read_frames(str(ROOT / "config/frames.yaml")))
     assert frames.of("table") is not None and frames.of("nowhere") is None
-    message = pose_message(np.eye(4), "nowhere", 0)
-    assert frames.pose(message) is message
+    with pytest.raises(FrameError, match="in frame 'nowhere'"):
+        checked_pose(pose_message(np.eye(4), "nowhere", 0), "probe", "body", frames.of("nowhere"))
 
 
 def test_a_tool_may_announce_itself_as_a_shape(bus, hand):
@@ -357,6 +443,75 @@ def test_a_tool_may_announce_itself_as_a_shape(bus, hand):
     bus.still()
     assert list(shaped.tools) == ["shaped"]
     np.testing.assert_array_equal(rows(shaped), rows(hand.ask(HERE)))
+
+
+def xyz(vector) -> SimpleNamespace:
+    return SimpleNamespace(**dict(zip("xyz", vector, strict=True)))
+
+
+def gazebo_contact(first: str, second: str, points, forces_on_engines_first) -> SimpleNamespace:
+    """ros_gz_interfaces/Contact as gz-sim fills it, as plain values."""
+    wrenches = [SimpleNamespace(body_1_wrench=SimpleNamespace(force=xyz(f))) for f in forces_on_engines_first]
+    return SimpleNamespace(collision1=SimpleNamespace(name=first), collision2=SimpleNamespace(name=second),
+                           positions=[xyz(point) for point in points], wrenches=wrenches)  # fmt: skip
+
+
+@pytest.mark.parametrize("order", [1, -1])
+@pytest.mark.parametrize("sides", [("robot::tip::collision", "person::arm"), ("person::arm", "robot::tip::collision")])
+def test_gazebos_contacts_sum_to_what_the_tool_exerts_on_the_body_in_any_order(order, sides):
+    layer, origin = limb(4e-3), np.array([RADIUS + 0.012, 0, LENGTH / 2])
+    points = np.array([[RADIUS, 0.002, LENGTH / 2], [RADIUS, -0.001, LENGTH / 2 + 0.003]])
+    forces = np.array([[-0.2, 0.01, 0], [-0.3, 0, 0.05]])  # on the body, in its axes
+    world_from_body = np.linalg.inv(TABLE)
+    there, turned = points @ world_from_body[:3, :3].T + world_from_body[:3, 3], forces @ world_from_body[:3, :3].T
+    contacts = [gazebo_contact(sides[0], sides[1], there, order * turned),
+                gazebo_contact("robot::tip::collision", "table::top::c", points, forces),
+                gazebo_contact("robot::elbow::collision", "person::arm", points, forces)]  # fmt: skip
+    wrench = gazebo_wrench(contacts, "tip::collision", "person", TABLE, layer, origin)
+    assert wrench is not None
+    np.testing.assert_allclose(wrench[:3], forces.sum(axis=0), atol=1e-12)
+    np.testing.assert_allclose(wrench[3:], np.cross(points - origin, forces).sum(axis=0), atol=1e-12)
+    assert gazebo_wrench(contacts, "robot::thumb", "person", TABLE, layer, origin) is None
+    silent = gazebo_contact(sides[0], sides[1], there, [])
+    with pytest.raises(InvalidInput, match="0 forces for 2 points"):
+        gazebo_wrench([silent], "robot", "person", TABLE, layer, origin)
+
+
+def test_gazebos_contacts_answer_as_the_wrench_that_they_sum_to(bus, tmp_path):
+    gz, std = pytest.importorskip("ros_gz_interfaces.msg"), pytest.importorskip("std_msgs.msg")
+    (tmp_path / "frames.yaml").write_text("world: {position: [0, 0, 0.1], orientation: [0, 0, 1, 0]}\n")
+    given = ["gz_contacts:=finger=robot::tip", "gz_body:=person", f"frames:={tmp_path}/frames.yaml"]
+    command = [sys.executable, "-c", NODE, "--ros-args", "-r", "__ns:=/gazebo"]
+    robot = Bus("/gazebo")
+    with running([*command, *(part for one in given for part in ("-p", one))]):
+        robot.wait(lambda: robot.got["skin/topology"], "skin/topology")
+        hand = robot.tool("finger").ready()
+        by_wrench = hand.ask(HERE, PUSH)
+        robot.still()
+        publisher = robot.node.create_publisher(gz.Contacts, "gz_contacts", STREAM)
+        robot.wait(publisher.get_subscription_count, "the node")
+        hand.press()  # Gazebo's forces are about the origin of a tool whose pose is known
+        stamp, world_from_body = robot.now(), np.linalg.inv(TABLE)
+        point = Vector3(**dict(zip("xyz", (world_from_body @ [RADIUS, 0, LENGTH / 2, 1])[:3], strict=True)))
+        pushed, pushing = (Vector3(x=sign * PUSH[0]) for sign in (-1, 1))  # the world is turned by half a turn
+        forces = gz.JointWrench(body_1_wrench=WrenchMessage(force=pushed), body_2_wrench=WrenchMessage(force=pushing))
+        sides = (gz.Entity(name="person::arm::c", type=gz.Entity.COLLISION), gz.Entity(name="robot::tip::c"))
+        contact = gz.Contact(collision1=sides[0], collision2=sides[1], positions=[point], wrenches=[forces])
+        publisher.publish(gz.Contacts(header=std.Header(stamp=stamp_of(stamp)), contacts=[contact]))
+        hand.pose.publish(pose_message(HERE, "body", stamp))
+        found = robot.wait(lambda: [a for a in robot.got["skin/displacement"] if stamp_ns(a) == stamp], "the answer")
+        assert list(found[0].statuses) == [TOUCHING] and rows(found[0]).tobytes() == rows(by_wrench).tobytes()
+    robot.node.destroy_node()
+
+
+def test_gazebos_contacts_are_refused_where_their_package_is_not_installed():
+    if importlib.util.find_spec("ros_gz_interfaces"):
+        pytest.skip("it is installed")
+    config = NodeConfig(gz_contacts="finger=robot::tip::collision")
+    with pytest.raises(InvalidInput, match="needs the package ros_gz_interfaces"):
+        GazeboContacts(config, Frames("body", {}))
+    with pytest.raises(InvalidInput, match="is no tool=collision"):
+        checked({"gz_contacts": "finger"})
 
 
 def test_a_device_that_leaves_is_told_of(bus, hand):

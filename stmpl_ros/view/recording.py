@@ -29,10 +29,10 @@ SPEEDS = {"1/8": 0.125, "1/4": 0.25, "1/2": 0.5, "1": 1.0, "2": 2.0, "4": 4.0}
 
 @dataclass(frozen=True, eq=False)
 class Recording:
-    """Some instants of a run, in the order of time, and the layer that they are of."""
+    """Some instants of a run, in the order of time, and the layer that each is of."""
 
     name: str
-    layer: SoftLayer
+    layers: tuple[SoftLayer, ...]
     snapshots: tuple[Snapshot, ...]
 
     @classmethod
@@ -46,15 +46,25 @@ class Recording:
         run = survey(path)
         wanted = set(np.linspace(0, len(run.moments) - 1, min(frames, len(run.moments))).round().astype(int).tolist())
         judged = {} if compared is None else {pair.frame.log_time_ns: pair.reference for pair in compared.judged}
-        gauge, snapshots = Gauge(run.bag.layer), []
+        gauge: Gauge | None = None
+        shown: list[tuple[Snapshot, SoftLayer]] = []
         for number, frame in enumerate(run.bag.frames()):
             if number in wanted or frame.log_time_ns in judged:
+                layer = run.bag.layer_of(frame)
+                if gauge is None or shown[-1][1] is not layer:
+                    gauge = Gauge(layer)
                 snapshot = _snapshot(run, number, frame, gauge)
-                snapshots.append(replace(snapshot, reference=judged.get(frame.log_time_ns)))
+                shown.append((replace(snapshot, reference=judged.get(frame.log_time_ns)), layer))
             if on_frame:
                 on_frame(number, len(run.moments))
-        snapshots.sort(key=lambda snapshot: snapshot.time)
-        return cls(str(run.bag.file), run.bag.layer, tuple(snapshots))
+        shown.sort(key=lambda one: one[0].time)
+        snapshots, layers = zip(*shown, strict=True)
+        return cls(str(run.bag.file), layers, snapshots)
+
+    @property
+    def layer(self) -> SoftLayer:
+        """Of the first instant."""
+        return self.layers[0]
 
     @property
     def seconds(self) -> float:
@@ -95,14 +105,17 @@ class RecordingPlayer:
         self._thread.start()
         heaviest = max(self.snapshots, key=lambda snapshot: snapshot.force)
         if heaviest.answer.pressure is not None and heaviest.answer.pressure.any():
-            spot = spot_of(recording.layer, heaviest.answer.pressure)
+            spot = spot_of(recording.layers[self.snapshots.index(heaviest)], heaviest.answer.pressure)
             page.look_at(spot.centre, spot.normal)
         self._slider.value = min(round(heaviest.time, 3), round(end, 3))
         self.show(heaviest.time)
 
     def show(self, time: float) -> None:
         """Shows the instant nearest to `time` [s]."""
-        snapshot = self.snapshots[self.recording.nearest(time)]
+        number = self.recording.nearest(time)
+        snapshot, layer = self.snapshots[number], self.recording.layers[number]
+        if layer is not self.page.layer:
+            self.page.show_layer(layer)
         self.page.show_tools(snapshot.contacts)
         self.page.show(snapshot)
         self.page.plot([(s.time, s.force, s.depth, s.peak) for s in self.snapshots], now=snapshot.time)

@@ -1,0 +1,68 @@
+"""WaitingService: a service whose callback may wait, on a thread of its own, while the node's executor goes on."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from concurrent.futures import Future
+from contextlib import suppress
+from threading import Thread
+from typing import Any
+
+from rclpy.executors import ExternalShutdownException, ShutdownException, SingleThreadedExecutor
+from rclpy.node import Node
+
+from stmpl_core.errors import InvalidInput
+
+SOON = 10.0  # s in which the node's executor comes to what is handed to it
+
+
+class WaitingService:
+    """`~/NAME` of a node.
+
+    A service callback has to return its response, and the EventsExecutor of rclpy 7.1.6 takes no coroutines
+    (ros2/rclpy#1473). So this one is called on a thread, by a hidden node that nothing else waits for; what touches the
+    node it hands back with `by_executor`.
+
+    Args:
+        node: whose service it is.
+        kind: its type.
+        name: without the tilde.
+        serve: as rclpy calls it, with request and response.
+    """
+
+    def __init__(self, node: Node, kind: Any, name: str, serve: Callable[[Any, Any], Any]) -> None:
+        self._hidden = Node(
+            f"_{node.get_name()}_{name}", namespace=node.get_namespace(), context=node.context,
+            use_global_arguments=False, enable_rosout=False, start_parameter_services=False,
+        )  # fmt: skip
+        self._hidden.create_service(kind, f"{node.get_fully_qualified_name()}/{name}", serve)
+        self._executor = SingleThreadedExecutor(context=node.context)
+        self._executor.add_node(self._hidden)
+        self._thread = Thread(target=self._spin, name=name, daemon=True)
+        self._thread.start()
+
+    def close(self) -> None:
+        """Ends the service; end what it may wait for first."""
+        self._executor.shutdown(timeout_sec=0)
+        self._thread.join(SOON)
+        self._hidden.destroy_node()
+
+    def _spin(self) -> None:
+        with suppress(ExternalShutdownException, ShutdownException):
+            self._executor.spin()
+
+
+def by_executor[T](node: Node, do: Callable[..., T], *arguments: Any) -> T:
+    """What `do` returns or raises, called by the node's executor. Raises InvalidInput if nobody spins the node."""
+    done: Future[T] = Future()
+
+    def act() -> None:
+        try:
+            done.set_result(do(*arguments))
+        except BaseException as error:
+            done.set_exception(error)
+
+    if node.executor is None:
+        raise InvalidInput("nobody spins the node.")
+    node.executor.create_task(act)
+    return done.result(SOON)
