@@ -86,7 +86,7 @@ class Columns:
         centre = pose[:3, :3] @ ((low + high) / 2) + pose[:3, 3]
         if not fcl.collide(self._skin, fcl.CollisionObject(box, fcl.Transform(pose[:3, :3], centre))):
             return np.empty(0, np.int64)
-        return _inside_box(self.points, pose, low - reach, high + reach)
+        return _inside_box(self.points, pose, low - reach, high + reach, centre)
 
     def squeezed(self, field: SignedDistance, pose: Transform) -> Squeeze:
         """How the tool squeezes the columns at its pose."""
@@ -161,14 +161,18 @@ def _to_tool(pose, x, y, z):
 
 
 @numba.njit(cache=True)
-def _inside_box(points, pose, low, high):
-    """Numbers of the points that lie in a box of the tool's frame."""
-    found, n = np.empty(len(points), np.int64), 0
+def _inside_box(points, pose, low, high, centre):
+    """Numbers of the points that lie in a box of the tool's frame, whose centre is given in the body's."""
+    found, n, radius = np.empty(len(points), np.int64), 0, 0.0
+    for x in range(3):
+        radius += 0.25 * (high[x] - low[x]) ** 2
     for v in range(len(points)):
-        x, y, z = _to_tool(pose, points[v, 0], points[v, 1], points[v, 2])
-        if low[0] <= x <= high[0] and low[1] <= y <= high[1] and low[2] <= z <= high[2]:
-            found[n] = v
-            n += 1
+        a, b, c = points[v, 0] - centre[0], points[v, 1] - centre[1], points[v, 2] - centre[2]
+        if a * a + b * b + c * c <= radius:
+            x, y, z = _to_tool(pose, points[v, 0], points[v, 1], points[v, 2])
+            if low[0] <= x <= high[0] and low[1] <= y <= high[1] and low[2] <= z <= high[2]:
+                found[n] = v
+                n += 1
     return found[:n].copy()
 
 

@@ -56,6 +56,7 @@ class Thinning:
         points, normals, thickness = np.ascontiguousarray(layer.vertices), layer.normals, layer.thickness
         self.start, self.index = neighbours(points, normals, thickness, np.array([*ZONES, reach]))
         count = len(points)
+        self._last: Asked | None = None
         self._stands = np.zeros((len(ZONES) + 1, count), dtype=np.bool_)
         self._corners = np.zeros((len(ZONES) + 1, count, CORNERS), dtype=np.int32)
         self._weights = np.zeros((len(ZONES) + 1, count, CORNERS), dtype=np.float32)
@@ -77,8 +78,11 @@ class Thinning:
 
     def asked(self, loaded: np.ndarray) -> Asked:
         """Which of them are asked under a load on these vertices (L,), and how the others are filled in."""
-        zones = _zones(self.start, self.index, loaded, len(self._stands[0]))
-        return Asked(loaded, *_asked(zones, self._stands, self._corners, self._weights))
+        last = self._last
+        if last is None or len(last.loaded) != len(loaded) or (last.loaded != loaded).any():
+            zones = _zones(self.start, self.index, loaded, len(self._stands[0]))
+            self._last = last = Asked(loaded, *_asked(zones, self._stands, self._corners, self._weights))
+        return last
 
 
 def neighbours(points: np.ndarray, normals: np.ndarray, thickness: np.ndarray, reaches: np.ndarray) -> tuple:
