@@ -140,7 +140,7 @@ class Surroundings:
 
     def spread(self, vertices: np.ndarray, sources: np.ndarray) -> np.ndarray:
         """Vectors (N, 3) at vertices (N,) spread as sinking spreads, (V, 3)."""
-        asked = self.asked(vertices)
+        asked = self._thinning.asked_again(vertices)
         by, out = np.empty((len(asked.vertices), 3)), np.zeros_like(self.layer.vertices)
         values = np.ascontiguousarray(sources.T, dtype=np.float32)
         _spread(asked.vertices, values, np.ascontiguousarray(self._sites[:, vertices]), self._sites, self._frames,

@@ -78,11 +78,14 @@ class Thinning:
 
     def asked(self, loaded: np.ndarray) -> Asked:
         """Which of them are asked under a load on these vertices (L,), and how the others are filled in."""
+        zones = _zones(self.start, self.index, loaded, len(self._stands[0]))
+        self._last = Asked(loaded, *_asked(zones, self._stands, self._corners, self._weights))
+        return self._last
+
+    def asked_again(self, loaded: np.ndarray) -> Asked:
+        """As `asked`, which is not done again if these were the last."""
         last = self._last
-        if last is None or len(last.loaded) != len(loaded) or (last.loaded != loaded).any():
-            zones = _zones(self.start, self.index, loaded, len(self._stands[0]))
-            self._last = last = Asked(loaded, *_asked(zones, self._stands, self._corners, self._weights))
-        return last
+        return last if last is not None and np.array_equal(last.loaded, loaded) else self.asked(loaded)
 
 
 def neighbours(points: np.ndarray, normals: np.ndarray, thickness: np.ndarray, reaches: np.ndarray) -> tuple:
