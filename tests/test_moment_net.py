@@ -135,6 +135,35 @@ def test_out_of_range_is_flagged_and_without_a_bound(layer: SoftLayer, ratio: fl
     assert not trust.in_range and word in trust.why and trust.error_bound is None
 
 
+def odd_loads(layer: SoftLayer) -> dict[str, tuple[Load, bool]]:
+    """Loads that no tool presses with, and whether they are within what the network may answer for."""
+    rng, centre = np.random.default_rng(0), np.array([0.04, 0, 0.08])
+    away = np.linalg.norm(layer.vertices - centre, axis=1)
+    modulus, around, nothing = layer.tissue.youngs_modulus, away < 0.02, np.zeros(len(layer.vertices))
+    needle, few, checkers, small, ring = (nothing.copy() for _ in range(5))
+    needle[away.argmin()] = 1.0
+    few[rng.choice(np.flatnonzero(layer.vertices[:, 2] % 0.14 > 0.03), 40, replace=False)] = 0.5
+    checkers[around] = 0.6 * (rng.random(around.sum()) < 0.5)
+    small[away < 6e-3] = 1.4
+    ring[(away > 0.012) & (away < 0.018)] = 0.6
+    odd = {"needle": (needle, False), "scattered": (few, False), "checkers": (checkers, True), "small": (small, True),
+           "ring": (ring, True)}  # fmt: skip
+    return {name: (Load.pressure(modulus * values), fine) for name, (values, fine) in odd.items()}
+
+
+@pytest.mark.parametrize("name", ["needle", "scattered", "checkers", "small", "ring"])
+def test_loads_unlike_any_tool_are_flagged_or_within_the_bound(net: MomentNet, name: str) -> None:
+    layer = limb()
+    load, fine = odd_loads(layer)[name]
+    answer = net.solve(load)
+    assert answer.trust.in_range == fine, answer.trust.why
+    if fine:
+        truth = PatchFem(refine=1).prepare(layer).solve(load)
+        assert truth.trust.converged and answer.trust.error_bound is not None
+        worst = np.linalg.norm(answer.displacement - truth.displacement, axis=1).max()
+        assert worst < answer.trust.error_bound < 0.8 * np.linalg.norm(truth.displacement, axis=1).max()
+
+
 def test_out_of_range_goes_to_the_next_method_which_says_so() -> None:
     layer = limb(0.2)
     load = pad(layer, 0.1)

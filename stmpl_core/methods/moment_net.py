@@ -33,7 +33,7 @@ AMPLITUDE = 0.3  # of a thickness: what the network may add to the linear respon
 SURROUNDED = 1e-7  # of moments, below which nothing is added
 EDGE_OVER_ROOT_AREA = 1.075  # of a vertex whose six triangles are equilateral: sqrt(2 / sqrt(3))
 EVEN = 1.2  # a tenth of the vertices of an even mesh is so much narrower, and a tenth so much wider, than the median
-OUTSIDE_SHARE = 0.02  # of the vertices that move, which may have inputs outside the training data
+OUTSIDE_SHARE = 0.3  # of the vertices that move, which may have inputs outside the training data (docs/networks.md)
 
 BLOCK = 32  # vertices a matrix product; OpenBLAS takes one thread for up to 2^18 multiplications
 
