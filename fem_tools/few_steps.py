@@ -12,6 +12,7 @@ from fem_tools.newton import NewtonSettings, System, newton
 from fem_tools.patch import (
     Patch,
     PatchFem,
+    away_from_border,
     discretisation_error,
     error_bound,
     truncation_error,
@@ -104,7 +105,7 @@ class FewSteps:
         if result.residual > CLOSE:
             why = f"after {result.iterations} Newton steps {result.residual:.0%} of the load is not in balance"
             trust = trust.also(why, converged=False)
-        trust = validated(trust, load, ratio)
+        trust = away_from_border(validated(trust, load, ratio), patch, layer)
         return Displacement(answer, trust if trust.ok else replace(trust, error_bound=None), self.name, pressure)
 
     def _patch_for(self, loaded: np.ndarray) -> Patch:

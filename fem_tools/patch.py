@@ -33,6 +33,7 @@ REFINED_WITHIN = 1.5  # thicknesses of the load; beyond, the layer's own mesh is
 DISCRETISATION_SHARE, TRUNCATION_SHARE = 0.5, 0.6
 PEAK_SHARE = 0.025  # one wedge through the thickness leaves this share; as much again at p = E, as its square
 VALIDATED_RATIO = {"pressure": 2.0, "contact": 2.0, "nodal": 0.4}  # p / E
+NEAR_BORDER = 2.0  # thicknesses from the open border, nearer to which it is felt
 
 
 EdgeLength = Callable[[np.ndarray], np.ndarray]  # points of each triangle (T, k, 3) [m] -> longest edge wanted (T,) [m]
@@ -315,12 +316,8 @@ class PatchFem:
         if load.kind == "contact":
             trust = replace(trust, error_bound=None)
             trust = trust.also("how rigid tools pull along the skin is left out (fem_tools.IndenterFem has it)")
-        rim = patch.distance[np.isin(patch.vertices, layer.border)]
-        nearest = float(rim.min(initial=np.inf)) / float(layer.thickness.max())
-        if nearest < 2 and self.border == "clamped":
-            trust = trust.also(
-                f"the load is {nearest:.1f} thicknesses from the layer's open border, which is held", in_range=False
-            )
+        if self.border == "clamped":
+            trust = away_from_border(trust, patch, layer)
         return trust if trust.ok else replace(trust, error_bound=None)
 
 
@@ -332,6 +329,16 @@ def validated(trust: Trust, load: Load, ratio: float) -> Trust:
     if (load.values < 0).any():
         trust = trust.also("the load pulls; only pressing was validated", in_range=False)
     return trust
+
+
+def away_from_border(trust: Trust, patch: Patch, layer: SoftLayer) -> Trust:
+    """The same trust, lowered where the load is close to the layer's open border."""
+    rim = patch.distance[np.isin(patch.vertices, layer.border)]
+    nearest = float(rim.min(initial=np.inf)) / float(layer.thickness.max())
+    if nearest >= NEAR_BORDER:
+        return trust
+    why = f"the load is {nearest:.1f} thicknesses from the layer's open border, which is held"
+    return trust.also(why, in_range=False)
 
 
 def _ahead(before: list[tuple[float, np.ndarray]], pressure: float) -> np.ndarray:

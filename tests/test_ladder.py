@@ -239,6 +239,14 @@ def test_too_few_steps_are_told_of(layer):
         FewSteps(0)
 
 
+def test_a_load_at_the_open_border_is_told_of_by_few_steps_as_by_many(layer):
+    at = layer.vertices[layer.border[0]]
+    near = Load.pressure(300 * (np.linalg.norm(layer.vertices - at, axis=1) < 0.014))
+    for method in (FewSteps(3, Winkler()), PatchFem()):
+        trust = method.prepare(layer).solve(near).trust
+        assert not trust.in_range and "border" in trust.why and trust.error_bound is None
+
+
 def test_a_coarse_mesh_gets_the_same_force_and_answers_nearly_as_well(layer):
     load, asked = disc(layer, 0.1, radius=0.025), []
 
