@@ -205,11 +205,12 @@ class MomentNet:
             return Trust(error_bound=0.0)
         length = np.linalg.norm(moved, axis=1)
         moving = length > 0.02 * length.max()
-        share = float(np.average(outside[moving], weights=asked.stand_for[moving])) if moving.any() else 0.0
+        strange = moving & outside
+        share = asked.stand_for[strange].sum() / asked.stand_for[moving].sum() if strange.any() else 0.0
         ratio = float(pressure[loaded].max()) / layer.tissue.youngs_modulus
         t, nu = layer.thickness[asked.vertices[moving]], layer.tissue.poisson_ratio
         fine, coarse = _tenths(self._width[asked.vertices[moving]])
-        trust = Trust(figures={"peak_ratio": ratio, "outside_share": share, "expected_error_m": error})
+        trust = Trust(figures={"peak_ratio": ratio, "outside_share": float(share), "expected_error_m": error})
         ranges = card["ranges"]
         for what, low, high, unit in (
             (f"p_over_e_{load.kind}", min(ratio, 0.0), ratio, ""),
@@ -246,7 +247,7 @@ def source_fields(pressure: np.ndarray, layer: SoftLayer) -> np.ndarray:
     """The two fields that a vertex feels: p / E, and the strain of a confined column times M / E, (V, 2) [-]."""
     tissue = layer.tissue
     sources = np.zeros((len(pressure), 2), dtype=np.float32)
-    loaded = np.flatnonzero(pressure)
+    loaded = np.flatnonzero(pressure != 0)
     sources[loaded, 0] = pressure[loaded] / tissue.youngs_modulus
     strain = 1 - column_stretch(pressure[loaded], tissue)
     sources[loaded, 1] = strain * (tissue.confined_modulus / tissue.youngs_modulus)
