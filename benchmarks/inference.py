@@ -1,6 +1,7 @@
 """How long an answer takes, end to end (a load in, every vertex's displacement out): our network, its parts, others.
 
 python -m benchmarks.inference [--weights FILE] [--seconds 3]
+python -m benchmarks.inference --picture docs/pictures/thinning.png
 """
 
 from __future__ import annotations
@@ -10,7 +11,12 @@ import io
 import os
 import time
 from collections.abc import Callable
+from pathlib import Path
 
+import matplotlib
+
+matplotlib.use("Agg")
+import matplotlib.pyplot as plt
 import numba
 import numpy as np
 
@@ -120,17 +126,42 @@ def network_alone(net: MomentNet, count: int) -> dict[str, Callable[[], object]]
     return engines
 
 
+def draw(net: MomentNet, layer: SoftLayer, loads: dict[str, Load], out: Path) -> None:
+    """Who is pressed, who is asked and who is filled in, seen from above the contact."""
+    assert net._near is not None
+    figure, axes = plt.subplots(1, len(loads), figsize=(6 * len(loads), 5.6), layout="constrained")
+    for axis, (name, load) in zip(axes, loads.items(), strict=True):
+        asked = net._near.asked(load.loaded)
+        peak = int(np.argmax(net.solve(load).magnitude))
+        frame, here = net._near.frames[peak], layer.vertices[peak]
+        facing = layer.normals @ frame[2] > 0.1
+        kinds = {"filled in": (asked.between, 3, "0.75"), "asked": (asked.vertices, 9, "tab:blue"),
+                 "pressed": (load.loaded, 9, "tab:red")}  # fmt: skip
+        for kind, (vertices, size, colour) in kinds.items():
+            x, y, _ = 1e3 * frame @ (layer.vertices[vertices[facing[vertices]]] - here).T
+            axis.scatter(x, y, size, colour, lw=0, label=f"{kind}: {len(vertices):,}")
+        axis.set(title=name, xlabel="mm", aspect="equal", xlim=(-75, 75), ylim=(-75, 75))
+        axis.legend(loc="upper right", fontsize=9, markerscale=2)
+    figure.savefig(out, dpi=90)
+
+
 def main() -> None:
     """Prints the tables."""
     given = argparse.ArgumentParser(description=__doc__)
     given.add_argument("--weights", default=None, help="of MomentNet; those that come with the package unless given")
     given.add_argument("--seconds", type=float, default=3.0, help="of each measurement")
+    given.add_argument("--picture", type=Path, help="only draw which vertices are asked, to this file")
     options = given.parse_args()
     import torch
 
     layer = Body.anny().part("left_arm", edge_length=3e-3, thickness=7.5e-3)
     print(f"{layer}\n{machine()}; load {os.getloadavg()[0]:.1f} before the run\n")
     net = MomentNet(options.weights)
+    loads = {name: Load.pressure(0.5 * layer.tissue.youngs_modulus * footprint)
+             for name, footprint in footprints(layer).items()}  # fmt: skip
+    if options.picture:
+        draw(net.prepare(layer), layer, dict(list(loads.items())[:2]), options.picture)
+        return
     methods: dict[str, Method] = {
         "winkler": Winkler(), "linear": Linear(), "moment_net": net,
         "moment_net, 2 threads": MomentNet(options.weights, threads=2),
@@ -138,18 +169,19 @@ def main() -> None:
     }  # fmt: skip
     for method in methods.values():
         method.prepare(layer)
-    print(f"{'end to end':24} {'vertices':>9} {'feel it':>8} " + "".join(f"{n:>22}" for n in methods) + "   ms, p99")
-    for name, footprint in footprints(layer).items():
-        load = Load.pressure(0.5 * layer.tissue.youngs_modulus * footprint)
+    head = f"{'end to end':24} {'pressed':>8} {'feel it':>8} {'asked':>8} "
+    print(head + "".join(f"{name:>22}" for name in methods) + "   ms, p99")
+    for name, load in loads.items():
         assert net._near is not None
-        felt = net._near.felt(parts.source_fields(load.values, layer))
+        asked = net._near.asked(load.loaded)
         cells = []
         for method in methods.values():
             median, p99 = timed(lambda m=method, x=load: m.solve(x), options.seconds)
             cells.append(f"{median:12.2f} ({p99:7.2f})")
-        print(f"{name:24} {np.count_nonzero(footprint):9} {len(felt.vertices):8} " + "".join(f"{c:>22}" for c in cells))
+        feel = len(asked.vertices) + len(asked.between)
+        print(f"{name:24} {len(load.loaded):8} {feel:8} {len(asked.vertices):8} " + "".join(f"{c:>22}" for c in cells))
         sources = parts.source_fields(load.values, layer)
-        median, _ = timed(lambda s=sources: net._near.felt(s), options.seconds / 3)  # type: ignore[union-attr]
+        median, _ = timed(lambda s=sources, a=asked: net._near.felt(s, a), options.seconds / 3)  # type: ignore[union-attr]
         print(f"    of that, feeling the load: {median:.2f} ms")
     print("\nthe network alone, 1,000 vertices; engine, threads")
     base = 0.0
@@ -164,8 +196,7 @@ def main() -> None:
         with torch.inference_mode():
             return paper(maps)
 
-    load = Load.pressure(0.5 * layer.tissue.youngs_modulus * footprints(layer)["disc, 20 mm"])
-    ours, _ = timed(lambda: net.solve(load), options.seconds)
+    ours, _ = timed(lambda: net.solve(loads["disc, 20 mm"]), options.seconds)
     median, p99 = timed(whole, options.seconds)
     print(f"\nthe paper's UNet, 512 x 512, the network alone: {median:.0f} ms, p99 {p99:.0f}; "
           f"{median / ours:.0f} times ours end to end")  # fmt: skip
