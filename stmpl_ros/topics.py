@@ -13,8 +13,8 @@ KEPT = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)  # mesh
 NOW = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)  # the skin: late listeners get the one that is
 STREAM = QoSProfile(depth=10)
 ANSWERS = QoSProfile(
-    depth=10, liveliness=LivelinessPolicy.AUTOMATIC, liveliness_lease_duration=Duration(seconds=LEASE)
-)  # a stream whose sender is told to be gone
+    depth=100, liveliness=LivelinessPolicy.AUTOMATIC, liveliness_lease_duration=Duration(seconds=LEASE)
+)  # a stream whose sender is told to be gone; a recorder may be held up for a second and lose nothing
 NEWEST = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)  # what came while busy is overwritten
 SHOWN = QoSProfile(depth=1)  # pictures: the newest is enough
 
