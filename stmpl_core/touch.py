@@ -244,8 +244,9 @@ class Toucher:
 
     def _deeper(self, squeeze: Squeeze, clearance: Clearance, push: np.ndarray, times: float) -> float:
         """How much further a tool must go to press `times` as hard, if columns keep their share of Winkler's [m]."""
-        near = clearance.vertices
-        gain, thickness, depth = self._inward[near] @ push, self.layer.thickness[near], -clearance.least
+        near = np.union1d(clearance.vertices, squeeze.vertices)  # a long triangle reaches beyond what was looked at
+        gain, thickness, depth = self._inward[near] @ push, self.layer.thickness[near], np.full(len(near), -np.inf)
+        depth[np.searchsorted(near, clearance.vertices)] = -clearance.least
         carry = np.searchsorted(near, squeeze.vertices)
         depth[carry] = np.where(squeeze.depth > 0, squeeze.depth, squeeze.strain / self._confined * thickness[carry])
         some = (gain > FACING) & np.isfinite(depth)

@@ -5,6 +5,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 import trimesh
+from scipy.spatial import Delaunay
 
 from fem_tools.indenter import IndenterFem, Tool
 from fem_tools.patch import PatchFem
@@ -318,6 +319,38 @@ def test_a_wrench_without_touch_loads_nothing_and_is_out_of_range(sim: Simulator
         answer = sim.step([press(BALL, pose, force)])
         assert answer.statuses["probe"] == NO_TOUCH
         assert not answer.displacement.any() and not answer.trust.in_range and "within 3 mm" in answer.trust.why
+
+
+def scattered(seed: int) -> SoftLayer:
+    """A bumpy patch of triangles of very unlike sizes, coarse as well as dense."""
+    rng = np.random.default_rng(seed)
+    grid = np.stack(np.meshgrid(*2 * [np.linspace(-0.07, 0.07, 8)]), axis=-1).reshape(-1, 2)
+    points = np.concatenate([rng.uniform(-0.06, 0.06, (150, 2)), rng.normal(0, 0.012, (200, 2)), grid])
+    points = np.unique(np.round(points, 4), axis=0)
+    triangles = Delaunay(points).simplices
+    a, b, c = (points[triangles[:, k]] for k in range(3))
+    area = 0.5 * ((b - a)[:, 0] * (c - a)[:, 1] - (b - a)[:, 1] * (c - a)[:, 0])
+    triangles = np.where(area[:, None] < 0, triangles[:, ::-1], triangles)[np.abs(area) > 1e-8]
+    heights = 2 * points[:, 0] ** 2 + rng.normal(0, 2e-4, len(points))
+    used, faces = np.unique(triangles, return_inverse=True)
+    return SoftLayer(np.column_stack([points, heights])[used], faces.reshape(triangles.shape), 6e-3)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_tool_on_triangles_of_unlike_sizes_carries_its_wrench(seed: int) -> None:
+    rng, sim, carried = np.random.default_rng(seed), Simulator(scattered(seed), Winkler()), 0
+    for mesh, half in ((BALL, 0.012), (PUNCH, 0.015), (ball(0.025), 0.025), (capsule(0.015, 4e-3), 0.0115)):
+        for _ in range(12):
+            pose = at(*rng.uniform(-0.04, 0.04, 2), half + rng.uniform(-3e-3, 3e-3))
+            force = rng.normal(0, 0.02, 3) - [0, 0, 10 ** rng.uniform(-3, 0)]
+            answer = sim.step([press(mesh, pose, tuple(force))])
+            assert np.isfinite(answer.displacement).all()
+            if answer.statuses["probe"] in (TOUCHING, MOVED):
+                normal = total(sim.layer, answer.pressure)
+                size = np.linalg.norm(normal)
+                assert size == pytest.approx(float(force @ normal) / size, rel=1e-6)
+                carried += 1
+    assert carried > 30
 
 
 def test_pulling_loads_nothing(sim: Simulator) -> None:
