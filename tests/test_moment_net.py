@@ -135,6 +135,19 @@ def test_out_of_range_is_flagged_and_without_a_bound(layer: SoftLayer, ratio: fl
     assert not trust.in_range and word in trust.why and trust.error_bound is None
 
 
+@pytest.mark.parametrize(("name", "fine"), [("even", True), ("slope", True), ("steep", False), ("step", False),
+                                           ("rough", False)])  # fmt: skip
+def test_a_thickness_that_changes_faster_than_was_learnt_is_flagged(name: str, fine: bool) -> None:
+    even = limb()
+    along = even.vertices[:, 2] - 0.08
+    rough = np.random.default_rng(0).uniform(5e-3, 10e-3, len(along))
+    thickness = {"even": 0 * along + T, "slope": T + 0.05 * along, "steep": np.clip(T + 0.4 * along, 2.5e-3, 0.0124),
+                 "step": T + 3e-3 * np.tanh(along / 2e-3), "rough": rough}[name]  # fmt: skip
+    layer = SoftLayer(even.vertices, even.faces, thickness)
+    trust = MomentNet().prepare(layer).solve(pad(layer, 0.3)).trust
+    assert trust.in_range == fine and ("thickness changes" in trust.why) != fine
+
+
 def odd_loads(layer: SoftLayer) -> dict[str, tuple[Load, bool]]:
     """Loads that no tool presses with, and whether they are within what the network may answer for."""
     rng, centre = np.random.default_rng(0), np.array([0.04, 0, 0.08])

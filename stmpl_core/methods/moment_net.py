@@ -35,6 +35,9 @@ EDGE_OVER_ROOT_AREA = 1.075  # of a vertex whose six triangles are equilateral: 
 EVEN = 1.2  # a tenth of the vertices of an even mesh is so much narrower, and a tenth so much wider, than the median
 OUTSIDE_SHARE = 0.3  # of the vertices that move, which may have inputs outside the training data (docs/networks.md)
 
+STEEP = 0.25  # slope of the thickness from triangle to triangle; trained is up to 0.2
+STEEP_SHARE = 0.02  # of the vertices that move, which may be so steep
+
 BLOCK = 32  # vertices a matrix product; OpenBLAS takes one thread for up to 2^18 multiplications
 
 ARRAYS = ("mix_vectors", "mix_tensors", "low", "high", "mean", "scale", "w1", "b1", "w2", "b2", "w3", "b3", "w4", "b4")
@@ -139,6 +142,7 @@ class MomentNet:
         self._shape = np.concatenate([near.curvature, near.slope], axis=1).astype(np.float32)
         self._frames = near.frames.astype(np.float32) * layer.thickness[:, None, None].astype(np.float32)
         self._width = EDGE_OVER_ROOT_AREA * np.sqrt(layer.vertex_areas) / layer.thickness
+        self._steep = _slope_of_thickness(layer) > STEEP
         self._layer = layer
         if self.fallback is not None:
             self.fallback.prepare(layer)
@@ -205,12 +209,11 @@ class MomentNet:
             return Trust(error_bound=0.0)
         length = np.linalg.norm(moved, axis=1)
         moving = length > 0.02 * length.max()
-        strange = moving & outside
-        share = asked.stand_for[strange].sum() / asked.stand_for[moving].sum() if strange.any() else 0.0
+        share = _share(outside, moving, asked)
         ratio = float(pressure[loaded].max()) / layer.tissue.youngs_modulus
         t, nu = layer.thickness[asked.vertices[moving]], layer.tissue.poisson_ratio
         fine, coarse = _tenths(self._width[asked.vertices[moving]])
-        trust = Trust(figures={"peak_ratio": ratio, "outside_share": float(share), "expected_error_m": error})
+        trust = Trust(figures={"peak_ratio": ratio, "outside_share": share, "expected_error_m": error})
         ranges = card["ranges"]
         for what, low, high, unit in (
             (f"p_over_e_{load.kind}", min(ratio, 0.0), ratio, ""),
@@ -227,12 +230,36 @@ class MomentNet:
         if share > OUTSIDE_SHARE:
             why = f"{share:.0%} of the vertices that move see what no training load had"
             trust = trust.also(why, in_range=False)
+        if (steep := _share(self._steep[asked.vertices], moving, asked)) > STEEP_SHARE:
+            why = f"the thickness changes by more than {STEEP:g} mm a mm at {steep:.0%} of the vertices that move"
+            trust = trust.also(why, in_range=False)
         bound = float(card["bound"]["factor"]) * error
         return Trust(trust.converged, trust.in_range, bound if trust.in_range else None, trust.why, trust.figures)
 
 
 def _weights(given: str | Path | Weights | None, default: Path) -> Weights:
     return given if isinstance(given, Weights) else Weights.load(given) if given else shipped(default)
+
+
+def _share(some: np.ndarray, moving: np.ndarray, asked: Asked) -> float:
+    """Of the vertices that move, each asked one counting for those that it stands for."""
+    both = some & moving
+    return float(asked.stand_for[both].sum() / asked.stand_for[moving].sum()) if both.any() else 0.0
+
+
+def _slope_of_thickness(layer: SoftLayer) -> np.ndarray:
+    """Root mean square over the triangles around each vertex of the thickness's gradient along them, (V,) [-]."""
+    a, b, c = (layer.vertices[layer.faces[:, k]] for k in range(3))
+    s, t, u = (layer.thickness[layer.faces[:, k], None] for k in range(3))
+    normals = layer.face_area_vectors / np.linalg.norm(layer.face_area_vectors, axis=1, keepdims=True)
+    double = 2 * np.linalg.norm(layer.face_area_vectors, axis=1)
+    turned = s * np.cross(normals, c - b) + t * np.cross(normals, a - c) + u * np.cross(normals, b - a)
+    square = ((turned / double[:, None]) ** 2).sum(axis=1) * double
+    sums, weights = np.zeros(len(layer.vertices)), np.zeros(len(layer.vertices))
+    for corner in range(3):
+        np.add.at(sums, layer.faces[:, corner], square)
+        np.add.at(weights, layer.faces[:, corner], double)
+    return np.sqrt(sums / np.maximum(weights, 1e-300))
 
 
 def _tenths(values: np.ndarray) -> tuple[float, float]:
