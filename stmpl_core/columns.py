@@ -9,7 +9,7 @@ import numba
 import numpy as np
 
 from stmpl_core.arrays import Points, Transform
-from stmpl_core.layer import SoftLayer, Tissue
+from stmpl_core.layer import SoftLayer
 from stmpl_core.sdf import SignedDistance, distance_at
 
 HOLE = 0.6  # of an edge: a tool that comes no nearer to a vertex touches none of its triangles (equilateral: 0.577)
@@ -110,6 +110,20 @@ class Columns:
         sums /= self.layer.vertex_areas[vertices, None]
         return Squeeze(vertices, sums[:, 0], sums[:, 1], depth, rests)
 
+    def deeper(self, columns: np.ndarray, weight: np.ndarray, depth: np.ndarray, gain: np.ndarray, times: float,
+               most: float) -> float:  # fmt: skip
+        """How much deeper columns must be squeezed to press `times` as hard together, each by itself, [m].
+
+        Args:
+            columns: their numbers, (N,).
+            weight: of their pressures in the sum, (N,).
+            depth: to which they are squeezed now; below 0: how far the tool still is, (N,) [m].
+            gain: depth that each gains over what is returned, (N,) [-].
+            times: > 0.
+            most: the largest answer [m]; the least is its negative.
+        """
+        return _deeper(self._moduli, self.layer.thickness[columns], weight, depth, gain, times, most)
+
 
 def depth_along(field: SignedDistance, pose: Transform, points: Points, way: Points, guess: np.ndarray) -> np.ndarray:
     """How far points (N, 3) inside a tool must go along unit vectors (N, 3) to leave it, (N,) [m], from a guess > 0."""
@@ -118,23 +132,6 @@ def depth_along(field: SignedDistance, pose: Transform, points: Points, way: Poi
 
 def _grid(field: SignedDistance) -> tuple[np.ndarray, np.ndarray, float]:
     return field.coefficients, field.origin, field.spacing
-
-
-def deeper(tissue: Tissue, thickness: np.ndarray, weight: np.ndarray, depth: np.ndarray, gain: np.ndarray,
-           times: float, most: float) -> float:  # fmt: skip
-    """How much deeper columns must be squeezed to press `times` as hard together, each by itself, [m].
-
-    Args:
-        tissue: of the layer.
-        thickness: of the columns, (N,) [m].
-        weight: of their pressures in the sum, (N,).
-        depth: to which they are squeezed now; below 0: how far the tool still is, (N,) [m].
-        gain: depth that each gains over what is returned, (N,) [-].
-        times: > 0.
-        most: the largest answer [m]; the least is its negative.
-    """
-    moduli = np.array([tissue.shear_modulus, tissue.lame_lambda]) / tissue.youngs_modulus
-    return _deeper(moduli, thickness, weight, depth, gain, times, most)
 
 
 def _middles(split: int) -> np.ndarray:
@@ -259,7 +256,7 @@ def _meet(grid, ray, t, guess):
 
 @numba.njit(cache=True)
 def _deeper(moduli, thickness, weight, depth, gain, times, most):
-    """See `deeper`; by bisection, until a hundredth of a percent of the range is left."""
+    """See Columns.deeper; by bisection, until a hundredth of a percent of the range is left."""
     wanted = times * _together(moduli, thickness, weight, depth, gain, 0.0)
     low, high = (0.0, most) if times > 1 else (-most, 0.0)
     for _ in range(14):

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from stmpl_core.arrays import Transform, Wrench
-from stmpl_core.columns import NO_SQUEEZE, Clearance, Columns, Squeeze, deeper
+from stmpl_core.columns import NO_SQUEEZE, Clearance, Columns, Squeeze
 from stmpl_core.contact import Contact
 from stmpl_core.contact_net import ContactNet, Held
 from stmpl_core.layer import SoftLayer
@@ -253,7 +253,7 @@ class Toucher:
         gain, thickness, depth, near = gain[some], thickness[some], depth[some], near[some]
         room = (DEEP * thickness - depth) / gain if times > 1 else np.maximum(depth, 0.0) / gain
         most = float(room.min() if times > 1 else room.max())
-        return deeper(self.layer.tissue, thickness, gain * self.layer.vertex_areas[near], depth, gain, times, most)
+        return self.columns.deeper(near, gain * self.layer.vertex_areas[near], depth, gain, times, most)
 
     def _answer(self, one: _Placed, pressure: np.ndarray, doubt: np.ndarray, strange: float) -> Touch:
         """The load of a placed tool, scaled to its wrench, with what may be believed of it."""

@@ -61,7 +61,7 @@ class GazeboContacts:
             InvalidInput: see `gazebo_wrench`.
         """
         frame = message.header.frame_id or WORLD
-        pose_body_from_world = np.eye(4) if frame == self._frames.body else self._frames.of(frame)
+        pose_body_from_world = self._frames.of(frame)
         if pose_body_from_world is None:
             raise FrameError(f"contacts are in frame '{frame}'; list it in the file of the parameter `frames`.")
         for tool, collision in self._collisions.items():

@@ -18,6 +18,7 @@ from stmpl_core.arrays import Transform
 from stmpl_core.errors import InvalidInput, StmplError
 from stmpl_ros.conversions import wrench_message
 
+ITSELF = np.eye(4)  # where the body's frame stands
 SHAPE = "name: {position: [x, y, z], orientation: [x, y, z, w]}, in metres, both optional"
 
 
@@ -40,6 +41,8 @@ class Frames:
 
     def of(self, frame: str) -> Transform | None:
         """pose_body_from_frame, (4, 4), or None if nobody knows it."""
+        if frame == self.body:
+            return ITSELF
         if frame in self.table:
             return self.table[frame]
         if self._buffer is None or not frame or not self._buffer.can_transform(self.body, frame, Time()):

@@ -244,15 +244,18 @@ def _weights(given: str | Path | Weights | None, default: Path) -> Weights:
 def _share(some: np.ndarray, moving: np.ndarray, asked: Asked) -> float:
     """Of the vertices that move, each asked one counting for those that it stands for."""
     both = some & moving
-    return float(asked.stand_for[both].sum() / asked.stand_for[moving].sum()) if both.any() else 0.0
+    if not both.any():
+        return 0.0
+    counts = asked.stand_for
+    return float(counts[both].sum() / counts[moving].sum())
 
 
 def _slope_of_thickness(layer: SoftLayer) -> np.ndarray:
     """Root mean square over the triangles around each vertex of the thickness's gradient along them, (V,) [-]."""
     a, b, c = (layer.vertices[layer.faces[:, k]] for k in range(3))
     s, t, u = (layer.thickness[layer.faces[:, k], None] for k in range(3))
-    normals = layer.face_area_vectors / np.linalg.norm(layer.face_area_vectors, axis=1, keepdims=True)
-    double = 2 * np.linalg.norm(layer.face_area_vectors, axis=1)
+    areas = np.linalg.norm(layer.face_area_vectors, axis=1)
+    normals, double = layer.face_area_vectors / areas[:, None], 2 * areas
     turned = s * np.cross(normals, c - b) + t * np.cross(normals, a - c) + u * np.cross(normals, b - a)
     square = ((turned / double[:, None]) ** 2).sum(axis=1) * double
     sums, weights = np.zeros(len(layer.vertices)), np.zeros(len(layer.vertices))
