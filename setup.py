@@ -67,7 +67,7 @@ setup(
     description="Real-time soft-tissue contact for robots: a contact comes in, the deformed skin goes out.",
     license="Apache-2.0",
     python_requires=">=3.12,<3.13",
-    packages=find_packages(include=["stmpl_core*", "fem_tools*", "bags", "stmpl_ros*"]),
+    packages=find_packages(include=["stmpl_core*", "fem_tools*", "bags", "stmpl_ros*", "studies*"]),
     package_data={"stmpl_core": ["weights/*"], "stmpl_ros": ["foxglove/*.json"]},
     data_files=[
         ("share/ament_index/resource_index/packages", ["resource/stmpl_ros"]),

@@ -19,10 +19,11 @@ from rich.table import Table
 from threadpoolctl import threadpool_limits
 
 from bags.reader import Bag
-from fem_tools.calibrate import default_rungs, ladder, truth
+from fem_tools.ladder import default_rungs, ladder
 from fem_tools.provenance import machine
 from stmpl_core.load import Load
 from stmpl_core.methods import Method
+from studies.calibrate import truth
 
 FLOOR = 3e-3  # mm, below which no error is drawn
 PICTURE = Path("docs/pictures/ladder.png")

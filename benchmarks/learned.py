@@ -20,12 +20,12 @@ from fem_tools import PatchFem
 from fem_tools.dataset import Dataset
 from fem_tools.provenance import data_card, machine
 from fem_tools.scenes import Site, UnusableContact, ellipse, letter
-from fem_tools.train_moments import MomentTraining, draw_points, fit
 from stmpl_core import Load
 from stmpl_core.body import Body
 from stmpl_core.methods import Linear, Method, MomentNet
 from stmpl_core.methods.moment_net import shipped
 from stmpl_core.metrics import Score, mean_and_deviation, score
+from studies.train_moments import MomentTraining, draw_points, fit
 
 HIDDEN = (4, 8, 16, 32, 64, 128)
 EDGES = (2.5e-3, 3e-3, 4e-3, 5e-3, 6e-3)  # m, of the skin's mesh

@@ -38,7 +38,7 @@ class ContactNet:
     gives way sideways) and by more at the rim (its neighbours come along). By dimensional analysis the ratio of both
     is a function of the squeeze around it in units of the thickness, of nu and of the skin's curvature: so one network
     serves every stiffness, thickness, pose and limb. It was trained on tools that stick, pressed in along a line
-    (fem_tools.train_contact). The inputs are those of MomentNet. No squeeze gives no pressure, and the pressure is
+    (studies.train_contact). The inputs are those of MomentNet. No squeeze gives no pressure, and the pressure is
     never below 0.
 
     Args:

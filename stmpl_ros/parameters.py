@@ -16,8 +16,8 @@ ACCURACY = 2e-4  # m
 
 
 def ladder(accuracy: float = ACCURACY, solve_time: float = 0.0) -> Method:
-    """The cheapest method that is accurate enough [m] in this time [s]; 0: there is time (fem_tools.calibrate)."""
-    from fem_tools.calibrate import ladder as by_measured_chart  # takes a second to import
+    """The cheapest method that is accurate enough [m] in this time [s]; 0: there is time (studies.calibrate)."""
+    from fem_tools.ladder import ladder as by_measured_chart  # takes a second to import
 
     return by_measured_chart(accuracy=accuracy, deadline=solve_time or None)
 

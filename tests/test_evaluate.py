@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 
 from fem_tools.dataset import Dataset
-from fem_tools.evaluate import THREE_BODY_ROW, Row, Tables, evaluate, spread
 from stmpl_core import Load, SoftLayer
 from stmpl_core.errors import InvalidInput
 from stmpl_core.methods import Naive, Winkler
 from stmpl_core.methods.zero import Zero
 from stmpl_core.metrics import mean_and_deviation, score
+from studies.evaluate import THREE_BODY_ROW, Row, Tables, evaluate, spread
 from tests.learning_data import small_data
 
 

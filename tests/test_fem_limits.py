@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 
 from fem_tools import PatchFem
-from fem_tools.critical_load import closed_form, critical_loads, draw, least_stiffness
 from fem_tools.patch import FollowerPressure
-from fem_tools.polyfem import HELD, export
-from fem_tools.tets import TetFem, TetMesh, TetSystem, split_wedges
 from stmpl_core.errors import InvalidInput, MeshError
 from stmpl_core.layer import SoftLayer, Tissue
 from stmpl_core.load import Load
+from studies.critical_load import closed_form, critical_loads, draw, least_stiffness
+from studies.polyfem import HELD, export
+from studies.tets import TetFem, TetMesh, TetSystem, split_wedges
 from tests.scenes import limb, plate, smooth_disc
 
 THICKNESS = 7.5e-3

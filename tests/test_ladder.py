@@ -8,16 +8,17 @@ import numpy as np
 import pytest
 
 from fem_tools import PatchFem
-from fem_tools.calibrate import MARGIN, Trial, coverage, default_rungs, fit, gather, ladder, measured, times_file
 from fem_tools.few_steps import FewSteps
+from fem_tools.ladder import default_rungs, ladder, measured, times_file
 from fem_tools.sampling import BodyPlan
 from stmpl_core.errors import InvalidInput, NotPrepared
-from stmpl_core.ladder import SHIPPED, Known, Ladder, Measured, SceneFigures, SceneReader
 from stmpl_core.layer import SoftLayer, Tissue
 from stmpl_core.load import Load
 from stmpl_core.methods import Linear, MomentNet, Winkler
 from stmpl_core.methods.coarse import Coarse
+from stmpl_core.methods.ladder import SHIPPED, Known, Ladder, Measured, SceneFigures, SceneReader
 from stmpl_core.trust import Displacement, Trust
+from studies.calibrate import MARGIN, Trial, coverage, fit, gather
 from tests.scenes import limb
 
 WIDE = {"strain": [1e-4, 1.0], "nu": [0.0, 0.5], "width": [0.01, 10.0], "slope": [0.0, 1.0],

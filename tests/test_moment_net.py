@@ -11,13 +11,13 @@ from fem_tools import PatchFem
 from fem_tools.dataset import Dataset
 from fem_tools.generate import generate
 from fem_tools.sampling import PRESETS
-from fem_tools.train_moments import Model, MomentTraining, draw_points, fit, train_moments
 from stmpl_core import Load, SoftLayer, Tissue
 from stmpl_core.errors import InvalidInput, NotPrepared
 from stmpl_core.methods import Linear, MomentNet
 from stmpl_core.methods.moment_net import source_fields
 from stmpl_core.metrics import score
 from stmpl_core.moments import REACH, Surroundings
+from studies.train_moments import Model, MomentTraining, draw_points, fit, train_moments
 from tests import scenes
 from tests.touch_scenes import turn
 

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from fem_tools import PatchFem
-from fem_tools.peers import PEERS, installed, peer
-from fem_tools.tets import TetFem
 from stmpl_core import Load, SoftLayer
 from stmpl_core.errors import InvalidInput, NotPrepared
+from studies.peers import PEERS, installed, peer
+from studies.tets import TetFem
 from tests.scenes import plate, smooth_disc
 
 THICKNESS, RADIUS, EDGE = 7.5e-3, 8e-3, 4e-3  # m

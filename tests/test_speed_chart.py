@@ -9,15 +9,15 @@ import pytest
 from PIL import Image
 
 from fem_tools import PatchFem
-from fem_tools.chart import CURVES, Chart, Curve, Point, measure
-from fem_tools.chart.break_even import break_even, core_hours, draw_break_even
-from fem_tools.chart.measure import Preset, contact
-from fem_tools.chart.page import write_page
-from fem_tools.chart.picture import draw
 from stmpl_core.body import Body
 from stmpl_core.errors import InvalidInput
 from stmpl_core.methods import Linear, Winkler
 from stmpl_core.trust import Displacement, Trust
+from studies.chart import CURVES, Chart, Curve, Point, measure
+from studies.chart.break_even import break_even, core_hours, draw_break_even
+from studies.chart.measure import Preset, contact
+from studies.chart.page import write_page
+from studies.chart.picture import draw
 
 SMALL = Preset(edge_length=8e-3, part="left_forearm", ratios=(0.3,), scenes=("disc", "disc on the seam"), seconds=0.02)
 

@@ -8,12 +8,6 @@ import numpy as np
 import pytest
 
 from fem_tools import PatchFem
-from fem_tools.stability import AXES, LAWS, METHODS, PRESETS, Report, again, maker, stability
-from fem_tools.stability.laws import MEANING, least_det_f
-from fem_tools.stability.meshes import inserted, limb
-from fem_tools.stability.picture import draw
-from fem_tools.stability.sweeps import AXIS_LEVELS
-from fem_tools.stability.trial import Mesh
 from stmpl_core import Displacement, Load, SoftLayer
 from stmpl_core.chart import UvChart
 from stmpl_core.errors import InvalidInput
@@ -21,6 +15,12 @@ from stmpl_core.methods import Winkler
 from stmpl_core.methods.zero import Zero
 from stmpl_core.trust import Trust
 from stmpl_ros.tables import stability_table
+from studies.stability import AXES, LAWS, METHODS, PRESETS, Report, again, maker, stability
+from studies.stability.laws import MEANING, least_det_f
+from studies.stability.meshes import inserted, limb
+from studies.stability.picture import draw
+from studies.stability.sweeps import AXIS_LEVELS
+from studies.stability.trial import Mesh
 
 QUICK = PRESETS["quick"]
 MEMORY = 0.005  # of an answer, by which each one before it adds

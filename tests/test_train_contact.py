@@ -12,12 +12,12 @@ from fem_tools.dataset import Dataset
 from fem_tools.generate import generate
 from fem_tools.sampling import CONTACT_BODIES, FILLETS, PRESETS, SIZES, TILT, TOOLS, any_tool, contacts, draw, split_of
 from fem_tools.scenes import Site
-from fem_tools.train_contact import ContactTraining, pressed, score, train_contact
 from stmpl_core import SoftLayer
 from stmpl_core.contact_net import OUTPUTS, ContactNet
 from stmpl_core.errors import InvalidInput
 from stmpl_core.methods.moment_net import Weights
 from stmpl_core.sdf import SignedDistance
+from studies.train_contact import ContactTraining, pressed, score, train_contact
 from tests import scenes
 
 BODY = CONTACT_BODIES[1].model_copy(update={"edge_length": 6e-3, "reach": 3.0})

@@ -12,12 +12,12 @@ import torch
 from safetensors.torch import save_file
 
 from fem_tools.dataset import Dataset
-from fem_tools.train_unet import Images, Samples, UNetTraining, train_unet
 from stmpl_core import Load, SoftLayer
 from stmpl_core.body import Body
 from stmpl_core.errors import InvalidInput, NotPrepared
 from stmpl_core.methods.pix2pix import Pix2PixUNet
 from stmpl_core.methods.unet import MOTION, UNet, UNetCard, seen_in, square_chart
+from studies.train_unet import Images, Samples, UNetTraining, train_unet
 from tests.learning_data import small_data
 
 QUICK = UNetTraining(size=32, width=2, batch=4, learning_rate=1e-3, epochs=3, highest_force=5e-3, checkpoint_minutes=0)
@@ -205,7 +205,7 @@ def test_two_processes_learn_what_one_learns(data: Path, tmp_path: Path) -> None
     settings = QUICK.model_copy(update={"dropout": 0.0, "epochs": 2})
     train_unet(data, tmp_path / "one", settings)
     program = tmp_path / "train.py"
-    program.write_text("from fem_tools.train_unet import UNetTraining, train_unet\n"
+    program.write_text("from studies.train_unet import UNetTraining, train_unet\n"
                        f"settings = UNetTraining.model_validate_json({settings.model_dump_json()!r})\n"
                        f"train_unet({str(data)!r}, {str(tmp_path / 'two')!r}, settings)\n")  # fmt: skip
     command = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc_per_node=2", str(program)]

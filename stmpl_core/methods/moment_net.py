@@ -49,7 +49,7 @@ class Weights:
 
     Args:
         arrays: float32, by the names in ARRAYS; w of shape (inputs, outputs).
-        card: what made it and what it is good for (see fem_tools.train_moments).
+        card: what made it and what it is good for (see studies.train_moments).
     """
 
     arrays: Mapping[str, np.ndarray]

@@ -1,6 +1,0 @@
-"""chart: speed against accuracy, every method with its own knob, on the same scenes in one run."""
-
-from fem_tools.chart.curves import CURVES, Curve
-from fem_tools.chart.measure import PRESETS, Chart, Point, measure
-
-__all__ = ["CURVES", "PRESETS", "Chart", "Curve", "Point", "measure"]

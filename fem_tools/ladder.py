@@ -1,0 +1,44 @@
+"""ladder: a Ladder of the core's methods and of finite elements, by the chart that ships with the package."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from pathlib import Path
+
+from fem_tools.few_steps import FewSteps
+from fem_tools.patch import PatchFem
+from stmpl_core.methods.base import Method
+from stmpl_core.methods.coarse import Coarse
+from stmpl_core.methods.ladder import SHIPPED, Ladder, Measured
+from stmpl_core.methods.linear import Linear
+from stmpl_core.methods.moment_net import MomentNet
+from stmpl_core.methods.winkler import Winkler
+
+
+def default_rungs() -> list[Method]:
+    """Methods that a Ladder climbs by default, cheapest first."""
+    return [Winkler(), Linear(), Coarse(MomentNet(), 1.5), MomentNet(), FewSteps.from_network(1),
+            PatchFem(reach=4, check_stability=False)]  # fmt: skip
+
+
+def ladder(*, accuracy: float = 1e-4, deadline: float | None = None, rungs: Sequence[Method] | None = None) -> Ladder:
+    """A Ladder of the default methods by the shipped chart, with this machine's own times if it was calibrated.
+
+    Args:
+        accuracy: largest error wanted at any vertex [m].
+        deadline: time for each solve [s]; None: no limit.
+        rungs: methods to choose from.
+    """
+    return Ladder(default_rungs() if rungs is None else rungs, measured(), accuracy=accuracy, deadline=deadline)
+
+
+def times_file() -> Path:
+    """File in which `stmpl calibrate` keeps this machine's times."""
+    return Path(os.environ.get("STMPL_CACHE_DIR", Path.home() / ".cache" / "stmpl")) / "ladder_times.json"
+
+
+def measured() -> Measured:
+    """The shipped chart, with this machine's times where they were measured. Raises InvalidInput: a broken file."""
+    chart = Measured.load(SHIPPED)
+    return chart.timed_by(Measured.load(times_file())) if times_file().is_file() else chart

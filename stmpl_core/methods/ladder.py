@@ -1,0 +1,341 @@
+"""Ladder: for each load the cheapest method that is expected to be accurate enough in the time that there is."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import Any, Self
+
+import numba
+import numpy as np
+
+from stmpl_core.errors import InvalidInput, StmplError
+from stmpl_core.layer import SoftLayer
+from stmpl_core.load import Load
+from stmpl_core.methods.base import Method, prepared
+from stmpl_core.methods.winkler import column_stretch
+from stmpl_core.trust import Displacement, Trust
+
+SHIPPED = Path(__file__).parent.parent / "weights" / "ladder.json"
+REACH = 6.0  # thicknesses around a load within which the skin moves
+LINEAR = 0.01  # strain below which the response is linear, and the error a share of it that no longer changes
+PACE = 0.2  # weight of the newest solve in what is known of how busy the machine is
+SLACK = 1.1  # beyond the measured range of a figure of the scene that is not yet called outside
+
+
+@dataclass(frozen=True)
+class SceneFigures:
+    """What decides how far off and how slow a method will be.
+
+    Args:
+        strain: of a confined column under the highest pressure [-].
+        nu: Poisson's ratio [-].
+        width: of the mesh's edges over the thickness under the load [-].
+        slope: of the thickness along the skin, largest under the load [-].
+        outline: total variation of the pressure over the force, times that thickness; 2 t / R for a disc [-].
+        jump: largest difference of pressure across an edge of the mesh, over the highest pressure [-].
+        ratio: highest p / E [-].
+        pressed: vertices that carry load.
+        moved: vertices within REACH thicknesses of the load, were it a disc on a plane.
+    """
+
+    strain: float
+    nu: float
+    width: float
+    slope: float
+    outline: float
+    jump: float
+    ratio: float
+    pressed: float
+    moved: float
+
+    def for_error(self) -> np.ndarray:
+        """Terms of the logarithm of the error, (10,).
+
+        How wide the parts of a contact are counts, which its outline says, not how wide they are together: a hand errs
+        as five fingers do.
+        """
+        s, w, o = np.log(max(self.strain, LINEAR)), np.log(self.width), np.log(self.outline)
+        return np.array([1.0, s, s * s, o, o * o, s * o, w, self.jump, self.nu, self.slope])
+
+    def for_time(self) -> np.ndarray:
+        """Terms of the time of a solve, each growing with the work of some method, (4,)."""
+        return np.array([1.0, self.moved, self.moved * self.ratio, self.pressed * self.moved])
+
+
+RANGED = ("strain", "nu", "width", "slope", "outline", "jump")  # whose measured range counts
+EASY = ("strain", "slope", "jump")  # of these, whose small values are no extrapolation
+
+
+class SceneReader:
+    """Reads SceneFigures off loads on one layer, in some tens of microseconds."""
+
+    def __init__(self, layer: SoftLayer) -> None:
+        self.layer = layer
+        ends = np.concatenate([layer.edges, layer.edges[:, ::-1]])
+        ends = ends[np.argsort(ends[:, 0], kind="stable")]
+        self._to = np.ascontiguousarray(ends[:, 1])
+        self._length = np.linalg.norm(layer.vertices[ends[:, 0]] - layer.vertices[ends[:, 1]], axis=1)
+        self._first = np.searchsorted(ends[:, 0], np.arange(len(layer.vertices) + 1))
+        squared = 2 / 3**0.5 * layer.vertex_areas  # of the edges of an even mesh [m2]
+        self._across = np.pi / 4 * np.sqrt(squared / 3)  # dual length of each edge, over the mean of |cos| [m]
+
+    def unit(self, scene: SceneFigures) -> float:
+        """Thickness under the load times the strain of its columns [m]: errors are measured in it."""
+        return self.layer.edge_length / scene.width * scene.strain
+
+    def figures(self, load: Load) -> SceneFigures | None:
+        """Of a load that fits the layer; None if nothing presses."""
+        layer, loaded = self.layer, load.loaded
+        if not len(loaded):
+            return None
+        area, pressure = layer.vertex_areas[loaded], np.abs(load.pressure_on(layer))
+        here = pressure[loaded]
+        force, highest = float(area @ here), float(here.max())
+        t = float((area * here) @ layer.thickness[loaded]) / force
+        strain = float(1 - column_stretch(np.array([highest]), layer.tissue)[0])
+        patch = np.pi * ((float(area.sum()) / np.pi) ** 0.5 + REACH * t) ** 2
+        variation, jump, slope = _steps(loaded, pressure, layer.thickness, self._first, self._to, self._length,
+                                        self._across)  # fmt: skip
+        return SceneFigures(
+            strain=strain, nu=layer.tissue.poisson_ratio, width=layer.edge_length / t, slope=slope,
+            outline=max(variation * t / force, 1e-3), jump=jump / highest, ratio=highest / layer.tissue.youngs_modulus,
+            pressed=float(len(loaded)), moved=min(patch * len(area) / float(area.sum()), float(len(layer.vertices))),
+        )  # fmt: skip
+
+
+@numba.njit(cache=True)
+def _steps(loaded, pressure, thickness, first, to, length, across):
+    """Total variation of the pressure [N/m], its largest step across an edge [Pa], the thickness' largest slope [-]."""
+    variation = jump = slope = 0.0
+    for v in loaded:
+        for k in range(first[v], first[v + 1]):
+            w = to[k]
+            step = abs(pressure[v] - pressure[w])
+            variation += step * across[v] * (0.5 if pressure[w] > 0.0 else 1.0)
+            jump = max(jump, step)
+            slope = max(slope, abs(thickness[v] - thickness[w]) / length[k])
+    return variation, jump, slope
+
+
+@dataclass(frozen=True)
+class Known:
+    """What was measured of one method.
+
+    Args:
+        error: coefficients of SceneFigures.for_error for log(error / (thickness strain)), by kind of load.
+        factor: on that error, so that 95 % of answers are within it, by kind of load.
+        after, after_factor: likewise with one more term, the logarithm of the bound that the method itself states (over
+            thickness times strain): what to expect once it has answered. Empty if it states none.
+        seconds: coefficients of SceneFigures.for_time [s].
+        slow: how many times longer than that one solve in twenty takes.
+    """
+
+    error: Mapping[str, Sequence[float]]
+    factor: Mapping[str, float]
+    seconds: Sequence[float]
+    slow: float
+    after: Mapping[str, Sequence[float]] = field(default_factory=dict)
+    after_factor: Mapping[str, float] = field(default_factory=dict)
+
+    def bound(self, scene: SceneFigures, kind: str, unit: float, stated: float | None = None) -> float:
+        """What 95 % of answers are within [m]; `stated`: the method's own bound, once it has answered [m]."""
+        terms = scene.for_error()
+        if kind in self.after and stated is not None and stated > 0:
+            terms = np.append(terms, np.log(stated / unit))
+            return unit * self.after_factor[kind] * float(np.exp(terms @ np.asarray(self.after[kind])))
+        return unit * self.factor[kind] * float(np.exp(terms @ np.asarray(self.error[kind])))
+
+
+@dataclass(frozen=True)
+class Measured:
+    """The measured chart that a Ladder chooses by.
+
+    Args:
+        methods: by the name of the method, in the order in which they were measured.
+        ranges: lowest and highest of each figure in RANGED, by kind of load.
+        about: machine, commit, how it was made.
+    """
+
+    methods: Mapping[str, Known]
+    ranges: Mapping[str, Mapping[str, Sequence[float]]]
+    about: Mapping[str, Any] = field(default_factory=dict)
+
+    @classmethod
+    def load(cls, path: str | Path) -> Self:
+        """Reads what `save` wrote. Raises InvalidInput if there is no such file or it holds something else."""
+        try:
+            found = json.loads(Path(path).read_text())
+            return cls({name: Known(**known) for name, known in found["methods"].items()},
+                       found["ranges"], found["about"])  # fmt: skip
+        except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+            raise InvalidInput(f"{path} holds no measured chart: {error}. Make one with stmpl calibrate.") from error
+
+    def save(self, path: str | Path) -> None:
+        """Writes it as JSON."""
+        Path(path).parent.mkdir(parents=True, exist_ok=True)
+        Path(path).write_text(json.dumps(asdict(self), indent=1) + "\n")
+
+    def outside(self, scene: SceneFigures, kind: str) -> str:
+        """How a scene lies outside of what was measured, in words; empty if it does not."""
+        return "; ".join(
+            f"{name} is {value:.3g}, measured is {low:.3g} to {high:.3g}"
+            for name, (low, high) in self.ranges.get(kind, {}).items()
+            if not (0 if name in EASY else low / SLACK) <= (value := getattr(scene, name)) <= max(high * SLACK, 1e-9)
+        )
+
+    def timed_by(self, other: Measured) -> Measured:
+        """The same errors with the times of another machine, where it has them."""
+        methods = {
+            name: replace(known, seconds=other.methods[name].seconds, slow=other.methods[name].slow)
+            if name in other.methods else known
+            for name, known in self.methods.items()
+        }  # fmt: skip
+        return replace(self, methods=methods, about={**self.about, "times": dict(other.about)})
+
+
+@dataclass(frozen=True)
+class _Expected:
+    rung: int
+    error: float  # m, 95 %
+    seconds: float  # 95 %
+
+
+class Ladder:
+    """A method that hands each load to the cheapest of several that is expected to meet the wish.
+
+    What is expected comes from a measured chart: error and time of each method as functions of the scene (how hard, how
+    wide, how thick, how fine a mesh), and from how busy the machine just was. Where an answer says that it is not to be
+    believed, or is not as good as wished, the next better method is asked, if there is time. Every answer names the
+    method that gave it, says why it was chosen, and carries a bound that 95 % of such answers kept, by the chart and
+    by what the method states of itself. Where nothing meets the wish, the best that fits is given and flagged.
+
+    Args:
+        rungs: methods, not yet prepared; those that the chart does not know are left out.
+        measured: the chart.
+        accuracy: largest error wanted at any vertex [m].
+        deadline: for each solve [s]; None: there is time.
+
+    Raises:
+        InvalidInput: an accuracy or deadline that is not positive, or no rung that the chart knows.
+    """
+
+    name = "ladder"
+
+    def __init__(self, rungs: Sequence[Method], measured: Measured, *, accuracy: float = 1e-4,
+                 deadline: float | None = None) -> None:  # fmt: skip
+        if not accuracy > 0 or (deadline is not None and not deadline > 0):
+            raise InvalidInput(f"Ladder(accuracy={accuracy}, deadline={deadline}): both must be positive, m and s.")
+        self.rungs = [rung for rung in rungs if rung.name in measured.methods]
+        if not self.rungs:
+            raise InvalidInput("none of the methods was measured. stmpl calibrate --errors measures them.")
+        self.measured, self.accuracy, self.deadline = measured, accuracy, deadline
+        known = [measured.methods[rung.name] for rung in self.rungs]
+        self._seconds = np.array([k.seconds for k in known])
+        self._slow = np.array([k.slow for k in known])
+        self._layer: SoftLayer | None = None
+
+    def prepare(self, layer: SoftLayer) -> Self:
+        """Prepares every method; those that refuse the layer are left out.
+
+        Raises:
+            InvalidInput: all of them refuse it.
+        """
+        ready, reasons = [], []
+        for rung in self.rungs:
+            try:
+                ready.append(rung.prepare(layer) is not None)
+            except StmplError as error:
+                ready.append(False)
+                reasons.append(f"{rung.name}: {error}")
+        if not any(ready):
+            raise InvalidInput(f"no method takes this layer. {' '.join(reasons)}")
+        self._ready = np.array(ready)
+        self._reader = SceneReader(layer)
+        self._pace = np.ones(len(self.rungs))
+        self._layer = layer
+        return self
+
+    def solve(self, load: Load) -> Displacement:
+        """The displacement under `load` by the method that was chosen; `method` names it, `trust.why` says why.
+
+        Raises:
+            NotPrepared: before `prepare`.
+            InvalidInput: the load does not fit the layer.
+        """
+        layer, started = prepared(self._layer, self), time.perf_counter()
+        scene = self._reader.figures(load.check(layer))
+        if scene is None:
+            zero = np.zeros_like(layer.vertices)
+            return Displacement(zero, Trust(error_bound=0.0), self.name, load.pressure_on(layer))
+        options, outside = self._expected(scene, load.kind)
+        if not options:
+            raise InvalidInput(f"no method was measured under loads of the kind {load.kind!r}.")
+        tried: list[tuple[_Expected, Displacement]] = []
+        while True:
+            left = None if self.deadline is None else self.deadline - (time.perf_counter() - started)
+            choice = self._choose(options, left, first=not tried)
+            if choice is None:
+                break
+            answer = self._ask(choice, load, scene)
+            known = self.measured.methods[self.rungs[choice.rung].name]
+            options = [o for o in options if o.error < choice.error]
+            bound = known.bound(scene, load.kind, self._reader.unit(scene), answer.trust.error_bound)
+            choice = replace(choice, error=bound)
+            tried.append((choice, answer))
+            if outside or (answer.trust.ok and choice.error <= self.accuracy):
+                break
+        sound = [pair for pair in tried if pair[1].trust.ok] or tried
+        choice, answer = min(sound, key=lambda pair: pair[0].error)
+        return self._told(choice, answer, outside, len(tried))
+
+    def _expected(self, scene: SceneFigures, kind: str) -> tuple[list[_Expected], str]:
+        """What to expect of each method that was measured under such loads, and how the scene is outside of that."""
+        unit = self._reader.unit(scene)
+        seconds = self._seconds @ scene.for_time() * self._slow
+        if self.deadline is not None:  # without one, the same loads get the same answers on every run
+            seconds = seconds * self._pace
+        options = []
+        for k, rung in enumerate(self.rungs):
+            known = self.measured.methods[rung.name]
+            if self._ready[k] and kind in known.error:
+                options.append(_Expected(k, known.bound(scene, kind, unit), float(seconds[k])))
+        return options, self.measured.outside(scene, kind)
+
+    def _choose(self, options: list[_Expected], left: float | None, *, first: bool) -> _Expected | None:
+        """The cheapest that is accurate enough in the time left; else the most accurate in time; else the fastest."""
+        in_time = [o for o in options if left is None or o.seconds <= left]
+        good = [o for o in in_time if o.error <= self.accuracy]
+        if good:
+            return min(good, key=lambda o: o.seconds)
+        if in_time:
+            return min(in_time, key=lambda o: o.error)
+        return min(options, key=lambda o: o.seconds) if first and options else None
+
+    def _ask(self, choice: _Expected, load: Load, scene: SceneFigures) -> Displacement:
+        started = time.perf_counter()
+        answer = self.rungs[choice.rung].solve(load)
+        spent, k = time.perf_counter() - started, choice.rung
+        usual = float(self._seconds[k] @ scene.for_time()) * self._slow[k]
+        self._pace[k] = max(1.0, (1 - PACE) * self._pace[k] + PACE * spent / max(usual, 1e-6))
+        return answer
+
+    def _told(self, choice: _Expected, answer: Displacement, outside: str, tries: int) -> Displacement:
+        """The answer with the ladder's own bound and reasons."""
+        wish = f"{1e3 * self.accuracy:.2g} mm" + ("" if self.deadline is None else f" in {1e3 * self.deadline:.3g} ms")
+        chosen = f"chosen for {wish}: at most {1e3 * choice.error:.2g} mm in {1e3 * choice.seconds:.2g} ms expected"
+        own = answer.trust
+        figures = {**own.figures, "expected_s": choice.seconds, "tries": float(tries)}
+        trust = Trust(own.converged, own.in_range, choice.error, "; ".join(filter(None, (own.why, chosen))), figures)
+        if choice.error > self.accuracy:
+            trust = trust.also("nothing meets the wish, this is the best that fits", in_range=False)
+        if self.deadline is not None and choice.seconds > self.deadline:
+            trust = trust.also("nothing is fast enough, this is the fastest", in_range=False)
+        if outside:
+            trust = trust.also(f"outside what the chart was measured on: {outside}", in_range=False)
+        if outside or not own.ok:
+            trust = replace(trust, error_bound=None)
+        return Displacement(answer.displacement, trust, answer.method, answer.pressure)

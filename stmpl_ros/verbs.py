@@ -1,0 +1,266 @@
+"""The verbs of a robot's day: one function each, which the command line calls; what a verb needs is imported in it."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import tyro
+
+from stmpl_core.console import print_figures
+from stmpl_core.errors import InvalidInput
+from stmpl_ros.parameters import METHODS, DemoConfig, NodeConfig, ProbeConfig, RecordConfig
+from stmpl_ros.view.config import ViewConfig
+
+if TYPE_CHECKING:
+    from stmpl_core.methods.base import Method
+
+Json = Annotated[bool, tyro.conf.arg(name="json")]
+Flat = tyro.conf.arg(name="")  # a configuration whose fields are flags of the verb itself
+BagPath = Annotated[Path, tyro.conf.Positional]  # a run's folder, or its .mcap file
+MethodName = Literal["fem", "moment_net", "unet", "linear", "winkler", "naive", "ladder"]
+
+DEMO, NODE, PROBE, VIEW = DemoConfig(), NodeConfig(), ProbeConfig(), ViewConfig()
+
+ros_arguments: list[str] = []  # arguments of ROS, from --ros-args on
+
+
+def demo(config: Annotated[DemoConfig, Flat] = DEMO) -> int:
+    """Node, simulated devices and recorder on this machine; then the run against FEM, with a report.
+
+    Example: stmpl demo --frames 6 --node.method winkler
+    """
+    from stmpl_ros.demo import run
+
+    return run(config)
+
+
+def node(config: Annotated[NodeConfig, Flat] = NODE) -> int:
+    """Answers contacts with the displacement of the skin. ROS arguments may follow.
+
+    Example: stmpl node --part left_arm --edge-length 0.004 --ros-args -r __ns:=/left
+    """
+    from stmpl_ros.node import run
+
+    return run(config, ros_arguments)
+
+
+def probe(config: Annotated[ProbeConfig, Flat] = PROBE) -> int:
+    """Simulated devices: mesh, pose and wrench along a script, on the skin of a running node.
+
+    Example: stmpl probe --scripts press --rate 500
+    """
+    from stmpl_ros.probe import run
+
+    return run(config, ros_arguments)
+
+
+def view(path: Annotated[Path | None, tyro.conf.Positional] = None, live: bool = False,
+         config: Annotated[ViewConfig, Flat] = VIEW) -> int:  # fmt: skip
+    """A page in the browser with the deforming skin: of a recording, of the running node, or under a tool to drag.
+
+    Example: stmpl view runs/latest
+    Live from the node: stmpl view --live. Without any robot: stmpl view --tool ball
+
+    Args:
+        path: a run's folder, or its .mcap file.
+        live: show what the running node answers.
+    """
+    from stmpl_ros.view.serve import run
+
+    return run(config, path, live, ros_arguments)
+
+
+def record(config: Annotated[RecordConfig, Flat], topics: tuple[str, ...] = ()) -> int:
+    """Records topics as they come over the wire, as MCAP, until Ctrl-C.
+
+    Example: stmpl record --path runs/mine
+    Any topics: stmpl record --path runs/mine --topics '/left/.*' /tf /tf_static
+
+    Args:
+        config: where to.
+        topics: regular expressions of whole topic names; what a replay needs unless given.
+    """
+    from stmpl_ros.recorder import run
+
+    return run(config, ros_arguments, topics)
+
+
+def replay(
+    path: BagPath,
+    method: MethodName | None = None,
+    every: int = 1,
+    publish: bool = False,
+    speed: float = 1.0,
+    topics: tuple[str, ...] = (),
+    as_json: Json = False,
+) -> int:
+    """Answers the recorded contacts again, offline; exits with 1 if the recorded method gives other answers now.
+
+    Example: stmpl replay runs/latest --every 10
+    To a running node (max_age:=0): stmpl replay runs/latest --publish --topics /contact_mesh '/tools/.*' --speed 0.5
+
+    Args:
+        path: a run's folder, or its .mcap file.
+        method: that answers; the one that was recorded unless given.
+        every: take each n-th frame only.
+        publish: publish the recorded messages on their topics instead, with the timing of the recording.
+        speed: of publishing; 1 as recorded, 0 as fast as possible.
+        topics: to publish, regular expressions of whole names; all unless given.
+        as_json: print figures for machines.
+    """
+    from bags.replay import replay_run
+
+    if publish:
+        from stmpl_ros.player import run
+
+        return run(path, speed, topics, ros_arguments)
+    if every < 1:
+        raise InvalidInput(f"--every {every} takes no frame; 1 takes each.")
+    answering = _method(method) if method else METHODS[_recorded_method(path)]()
+    with _waiting(f"replaying {path}", as_json):
+        summary = replay_run(path, answering, every=every)
+    print_figures(vars(summary) if as_json else str(summary))
+    return 0 if method or summary.identical == summary.frames else 1
+
+
+def compare(
+    path: BagPath,
+    reference: Literal["rigid", MethodName] = "rigid",
+    other: Annotated[Path | None, tyro.conf.arg(name="with")] = None,
+    tolerance_mm: float | None = None,
+    frames: int = 12,
+    as_json: Json = False,
+) -> int:
+    """Compares a recorded run on a sample of its frames; exits with 1 past a tolerance or if a frame is not judged.
+
+    Example: stmpl compare runs/latest --frames 6 --tolerance-mm 0.3
+    Against another recording of the same contacts: stmpl compare runs/latest --with runs/before --tolerance-mm 0
+
+    Args:
+        path: a run's folder, or its .mcap file.
+        reference: that judges. rigid: the recorded answers, by the same tools pressed in by finite elements; any
+            other: the run's method, under the recorded pressures.
+        other: another bag that judges instead, at the stamps that both answer.
+        tolerance_mm: allowed mean error under the contact, in the worst frame [mm].
+        frames: of the run that the reference solves.
+        as_json: print figures for machines.
+    """
+    from bags.compare import compare_bags
+    from fem_tools import RigidFem
+    from stmpl_ros.tables import compare_with_progress, comparison_table, figures_of
+
+    if tolerance_mm is not None and not tolerance_mm >= 0:
+        raise InvalidInput(f"--tolerance-mm {tolerance_mm} allows nothing; give 0 or more.")
+    if other is not None:
+        comparison = compare_bags(path, other, frames=frames)
+    elif reference == "rigid":
+        comparison = compare_with_progress(path, RigidFem(), frames, quiet=as_json)
+    else:
+        method = METHODS[_recorded_method(path)]()
+        comparison = compare_with_progress(path, _method(reference), frames, method=method, quiet=as_json)
+    if tolerance_mm is not None:
+        comparison = dataclasses.replace(comparison, tolerance=tolerance_mm * 1e-3)
+    print_figures(figures_of(comparison) if as_json else comparison_table(comparison))
+    return 0 if comparison.passed else 1
+
+
+def info(path: BagPath, as_json: Json = False) -> int:
+    """Says what a recording holds; exits with 1 if it was not finished or is damaged.
+
+    Example: stmpl info runs/latest
+
+    Args:
+        path: a run's folder, or its .mcap file.
+        as_json: print figures for machines.
+    """
+    from bags.reader import Bag
+    from stmpl_ros.tables import bag_figures, bag_table
+
+    bag = Bag(path)
+    skins = {name: repr(layer) for name, layer in bag.layers.items()} if bag.has_layers else {}
+    print_figures(bag_figures(bag) | {"skins": skins} if as_json else bag_table(bag))
+    for name, layer in skins.items() if not as_json else ():
+        print_figures(f"skin {name}: {layer}")
+    sound = sum(topic.messages for topic in bag.topics.values())
+    if not as_json and bag.expected not in (None, sound):
+        print_figures(f"{sound} of {bag.expected} messages are sound")
+    if not as_json and bag.provenance.versions:
+        made_by = ", ".join(f"{name} {version}" for name, version in bag.provenance.versions.items())
+        print_figures(f"method: {bag.provenance.method or 'not named'}; body: {bag.provenance.body or 'not named'}; "
+                       f"made by {made_by}")
+    return 0 if bag.finished and not bag.damage else 1
+
+
+def recover(path: BagPath, target: Path | None = None) -> int:
+    """Brings back what is sound in a recording that was not finished.
+
+    Example: stmpl recover runs/broken/run.mcap --target runs/mended
+
+    Args:
+        path: a run's folder, or its .mcap file.
+        target: where the sound part goes.
+    """
+    from bags.recover import recover as bring_back
+
+    recovery = bring_back(path, target)
+    print_figures(str(recovery))
+    return 0
+
+
+def generate(
+    preset: Literal["tiny", "default", "paper", "contacts"] = "default",
+    out: Path | None = None,
+    workers: int | None = None,
+    scheduler: str | None = None,
+    as_json: Json = False,
+) -> int:
+    """Makes the data set that networks learn from, or goes on with one that was stopped.
+
+    Example: stmpl generate --preset tiny --out data/tiny
+
+    Args:
+        preset: tiny (seconds), default (under an hour on two cores), paper (hours).
+        out: folder of the data; data/<preset> unless given.
+        workers: local processes; one a core unless given.
+        scheduler: address of a Dask scheduler that does the work instead.
+        as_json: print the manifest for machines.
+    """
+    from fem_tools.generate import generate as make
+    from fem_tools.sampling import PRESETS
+    from stmpl_core.console import contacts_bar
+    from stmpl_ros.tables import data_table
+
+    with contacts_bar(preset, quiet=as_json) as show:
+        folder = out or Path("data") / preset
+        manifest = make(PRESETS[preset], folder, workers=workers, scheduler=scheduler, on_progress=show)
+    print_figures(manifest if as_json else data_table(manifest, folder))
+    return 0
+
+
+def _recorded_method(path: Path) -> str:
+    """The method that a run was recorded with, by its provenance, else by its first answer. Raises InvalidInput."""
+    from bags.reader import Bag
+
+    bag = Bag(path)
+    recorded = bag.provenance.method or next((frame.method for frame in bag.frames()), "no named method")
+    if recorded not in METHODS:
+        raise InvalidInput(f"{path} was recorded with {recorded}; known are {', '.join(METHODS)}. "
+                           "Name one with replay --method, or compare with rigid.")
+    return recorded
+
+
+def _method(name: MethodName) -> Method:
+    from fem_tools import PatchFem
+    from stmpl_core.methods import MomentNet
+
+    if name == "fem":
+        return PatchFem()
+    return MomentNet(fallback=PatchFem()) if name == "moment_net" else METHODS[name]()
+
+
+def _waiting(what: str, quiet: bool):
+    from rich.console import Console
+
+    return Console(stderr=True, quiet=quiet).status(what)

@@ -1,0 +1,109 @@
+"""What the verbs of studies show: tables for people."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.table import Table
+
+if TYPE_CHECKING:
+    from stmpl_core.methods.ladder import Measured
+    from studies.calibrate import Coverage
+    from studies.chart import Chart
+    from studies.chart.break_even import BreakEven
+    from studies.critical_load import CriticalLoad
+    from studies.stability import Report
+
+
+def critical_loads_with_progress(*, quiet: bool = False) -> list[CriticalLoad]:
+    """studies.critical_load.critical_loads under a progress bar on stderr."""
+    from studies.critical_load import critical_loads, presses
+
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=Console(stderr=True), disable=quiet, transient=True) as progress:
+        return list(progress.track(critical_loads(), total=len(presses()), description="presses of a flat layer"))
+
+
+def critical_load_table(rows: Sequence[CriticalLoad], picture: Path) -> Table:
+    """The loads at which elements lose stability, for people."""
+    table = Table(title="Where the finite elements lose stability", title_justify="left", caption_justify="left")
+    for heading in ("load", "scene", "element"):
+        table.add_column(heading)
+    for heading in ("edge [mm]", "p / E"):
+        table.add_column(heading, justify="right")
+    table.add_column("ended")
+    for row in rows:
+        table.add_row(row.load, row.scene, row.element, f"{row.edge * 1e3:.1f}", f"{row.ratio:.2f}", row.ended)
+    table.caption = f"drawn in {picture}"
+    return table
+
+
+def stability_table(report: Report, picture: Path) -> Table:
+    """How far each method held along each axis, and its first failure, for people."""
+    colours = {"flagged": "yellow", "silent": "red", "crashed": "magenta", "": "green"}
+    table = Table(title="Held up to the first failure", title_justify="left", caption_justify="left", show_lines=True)
+    table.add_column("axis")
+    for method in report.methods:
+        table.add_column(method)
+    for axis in report.axes:
+        cells = []
+        for method in report.methods:
+            one = report.summary(method, axis)
+            failed = f"{one['failed_at']}: {one['law']}, {one['outcome']}"
+            lines = filter(None, (one["held"], failed if one["failed_at"] else ""))
+            cells.append(f"[{colours[one['outcome']]}]" + "\n".join(lines))
+        table.add_row(axis, *cells)
+    counts = [report.counts(method) for method in report.methods]
+    for outcome in ("flagged", "silent", "crashed"):
+        table.add_row(f"all trials: {outcome}", *(str(count[outcome]) for count in counts))
+    table.caption = f"drawn in {picture}; each failure runs again with stmpl stability --again FILE"
+    return table
+
+
+def chart_table(chart: Chart, rows: list[BreakEven], out: Path) -> Table:
+    """The Pareto front of every panel, and when the network has paid for itself, for people."""
+    table = Table(title="Speed against accuracy: what nothing else beats", title_justify="left", show_lines=True,
+                  caption_justify="left")  # fmt: skip
+    for heading in ("scene", "p / E", "fastest first; error where it moves, of the peak", "network is ahead after"):
+        table.add_column(heading)
+    solves = {(row.scene, row.ratio): row.solves for row in rows}
+    for scene in chart.about["scenes"]:
+        for ratio in chart.about["ratios"]:
+            front = [f"{1e3 * p.seconds:8.3g} ms {100 * p.error:6.2f} %  {p.curve}: {p.knob}"
+                     for p in chart.front(scene, ratio)]  # fmt: skip
+            after = solves.get((scene, ratio), float("nan"))
+            table.add_row(scene, f"{ratio:g}", "\n".join(front), f"{after:,.0f} solves" if after == after else "-")
+    failed = sum(p.failed for p in chart.points)
+    left_out = ", ".join(chart.about["missing"]) or "nothing"
+    table.caption = (f"{len(chart.points)} points, {failed} failed; {left_out} left out; drawn in {out}: chart.png, "
+                     "chart.html (to point at), break_even.png; all figures in chart.json")  # fmt: skip
+    return table
+
+
+def coverage_table(rows: list[Coverage]) -> Table:
+    """How often the stated bounds hold on loads that were not fitted, for people."""
+    table = Table(title="Bounds on what was not fitted", title_justify="left")
+    for heading in ("method", "load", "on"):
+        table.add_column(heading)
+    for heading in ("answers", "within the bound", "bound / error", "largest error / peak", "ms"):
+        table.add_column(heading, justify="right")
+    for r in rows:
+        table.add_row(r.method, r.kind, r.use, str(r.answers), f"{r.covered:.0%}", f"{r.tight:.1f}",
+                      f"{100 * r.error:.1f} %", f"{1e3 * r.seconds:.2f}")  # fmt: skip
+    return table
+
+
+def times_table(measured: Measured, file: Path) -> Table:
+    """What a disc of a thickness' radius costs on this machine, for people."""
+    table = Table(title="Time of a solve on this machine", title_justify="left", caption=f"kept in {file}")
+    for heading in ("method", "small contact, 3 mm [ms]", "large contact, 3 mm [ms]", "1 in 20 is slower than"):
+        table.add_column(heading, justify="left" if heading == "method" else "right")
+    for name, known in measured.methods.items():
+        small, large = (1e3 * sum(c * x for c, x in zip(known.seconds, (1, m, 0.5 * m, p * m), strict=True))
+                        for p, m in ((40, 1900), (800, 4000)))  # fmt: skip
+        table.add_row(name, f"{small:.2f}", f"{large:.2f}", f"x {known.slow:.2f}")
+    return table

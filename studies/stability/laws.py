@@ -1,0 +1,202 @@
+"""The laws that any answer must hold, whatever method gave it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from scipy.spatial import KDTree
+
+from fem_tools.mesh import reference_wedge, rest_gradients
+from fem_tools.patch import MIN_FOLD
+from stmpl_core.extrusion import fold_ratios
+from stmpl_core.layer import SoftLayer
+from stmpl_core.metrics import FAR
+from stmpl_core.trust import Displacement
+from studies.stability.trial import Scene, Trial
+
+LEAK = 0.005  # of the peak, that may move beyond FAR thicknesses: finite elements leave 0.001 (DESIGN: locality)
+SAME = 1e-3  # of the peak, by which answers that must be equal may differ: an iterative solver's own tolerance
+MESH = 0.1  # of the peak, by which the same load on the same skin may differ on another mesh of it
+ADDED = 0.02  # of the peak, by which two contacts FAR apart may differ from their sum
+GAIN = 2.0  # largest relative change of the answer over that of the load; a layer that stiffens stays below 1
+NOTHING = 1e-12  # m, below which answers are the same
+
+
+@dataclass(frozen=True)
+class Broken:
+    """A law that an answer broke; `flagged`: the method itself says not to trust that answer."""
+
+    law: str
+    measured: str
+    flagged: bool
+    why: str = ""  # what the method said of the answer
+
+
+@dataclass(frozen=True, eq=False)
+class Answers:
+    """What a method answered to a trial: to its scene, to its twin, and a fresh method's answer to the last load."""
+
+    scene: list[Displacement]
+    twin: list[Displacement]
+    fresh: Displacement | None = None
+
+
+Law = Callable[[Trial, Answers], Broken | None]
+
+
+def finite(trial: Trial, answers: Answers) -> Broken | None:
+    """Every displacement is a number."""
+    for answer in answers.scene + answers.twin:
+        bad = ~np.isfinite(answer.displacement).all(axis=1)
+        if bad.any():
+            return _broken("finite", f"{int(bad.sum())} vertices not finite", answer)
+    return None
+
+
+def zero(trial: Trial, answers: Answers) -> Broken | None:
+    """No load moves nothing, exactly."""
+    for _, pressure, answer in _all(trial, answers):
+        if not pressure.any() and (most := float(answer.magnitude.max())) > 0:
+            return _broken("zero", f"{most * 1e3:.2g} mm without a load", answer)
+    return None
+
+
+def monotone(trial: Trial, answers: Answers) -> Broken | None:
+    """A load that grows everywhere presses deeper: the peak grows strictly."""
+    pressed = [(p, a) for p, a in zip(trial.scene.pressures, answers.scene, strict=True) if p.any()]
+    for (_, before), (_, after) in pairwise(pressed):
+        less, more = float(before.magnitude.max()), float(after.magnitude.max())
+        if not more > less:
+            return _broken("monotone", f"peak {less * 1e3:.3g} -> {more * 1e3:.3g} mm as the load grew", before, after)
+    return None
+
+
+def unfolded(trial: Trial, answers: Answers) -> Broken | None:
+    """J = det F > 0 in the layer under the skin (see `least_det_f`)."""
+    for scene, _, answer in _all(trial, answers):
+        if (least := least_det_f(scene.mesh.layer, answer.displacement)) <= 0:
+            return _broken("unfolded", f"least det F {least:.2g}", answer)
+    return None
+
+
+def leak(trial: Trial, answers: Answers) -> Broken | None:
+    """Nothing moves beyond FAR thicknesses from the load."""
+    for scene, pressure, answer in _all(trial, answers):
+        layer, loaded = scene.mesh.layer, np.flatnonzero(pressure)
+        if not len(loaded):
+            continue
+        away, _ = KDTree(layer.vertices[loaded]).query(layer.vertices)
+        moved = answer.magnitude
+        most, peak = float(moved[away > FAR * layer.thickness.max()].max(initial=0.0)), float(moved.max())
+        if most > LEAK * peak + NOTHING:
+            return _broken("leak", f"{most * 1e3:.2g} mm beyond {FAR:g} thicknesses, peak {peak * 1e3:.2g}", answer)
+    return None
+
+
+def _alike(name: str, tolerance: float) -> Law:
+    def law(trial: Trial, answers: Answers) -> Broken | None:
+        twin = trial.twin
+        if twin is None or not answers.twin:
+            return None
+        for one, other in zip(answers.scene, answers.twin, strict=True):
+            expected = twin.scale * one.displacement[twin.pairs[:, 0]] @ twin.turn.T
+            off = float(np.linalg.norm(other.displacement[twin.pairs[:, 1]] - expected, axis=1).max())
+            peak = float(np.linalg.norm(expected, axis=1).max())
+            if not off <= tolerance * peak + NOTHING:
+                return _broken(name, f"off by {_of_peak(off, peak)}", one, other)
+        return None
+
+    law.__doc__ = f"The twin's answer is the answer, turned and scaled, within {tolerance:g} of the peak."
+    return law
+
+
+def returns(trial: Trial, answers: Answers) -> Broken | None:
+    """The last answer is what a fresh method gives to the last load: what came before is forgotten."""
+    last, fresh = answers.scene[-1], answers.fresh
+    assert fresh is not None
+    off, peak = float(np.linalg.norm(last.displacement - fresh.displacement, axis=1).max()), _peak(fresh)
+    if off <= SAME * peak + NOTHING:
+        return None
+    return _broken("returns", f"{_of_peak(off, peak)} off a fresh answer", last)
+
+
+def additive(trial: Trial, answers: Answers) -> Broken | None:
+    """Two contacts so far apart that neither feels the other give the sum of their answers: loads A, B, A + B."""
+    a, b, both = answers.scene
+    off = float(np.linalg.norm(both.displacement - a.displacement - b.displacement, axis=1).max())
+    if off <= ADDED * _peak(both) + NOTHING:
+        return None
+    return _broken("additive", f"{_of_peak(off, _peak(both))} off the sum", a, b, both)
+
+
+def gain(trial: Trial, answers: Answers) -> Broken | None:
+    """Noise on the load is not amplified: |du|/|u| <= GAIN |dp|/|p|, in the root of mean squares."""
+    (clean, *noisy), (first, *others) = trial.scene.pressures, answers.scene
+    whole = float(np.linalg.norm(first.displacement))
+    if not whole > 0:
+        return None
+    for pressure, answer in zip(noisy, others, strict=True):
+        change = float(np.linalg.norm(answer.displacement - first.displacement)) / whole
+        factor = change / float(np.linalg.norm(pressure - clean) / np.linalg.norm(clean))
+        if not factor <= GAIN:
+            return _broken("gain", f"noise amplified {factor:.1f} times", first, answer)
+    return None
+
+
+LAWS: Mapping[str, Law] = {
+    "finite": finite, "zero": zero, "monotone": monotone, "unfolded": unfolded, "leak": leak,
+    "seam": _alike("seam", SAME), "objective": _alike("objective", SAME), "similar": _alike("similar", SAME),
+    "mesh": _alike("mesh", MESH), "returns": returns, "additive": additive, "gain": gain,
+}  # fmt: skip
+"""Laws of answers, by name. Two more are judged where a method is asked: "answers" (a load that is sound is answered),
+and "refuses" (a load that is not finite is refused, or its answer flagged)."""
+
+MEANING = {
+    "answers": "answers a sound input", "refuses": "refuses what is not finite", "finite": "finite",
+    "zero": "zero in, zero out", "monotone": "peak grows with the load", "unfolded": "J > 0",
+    "leak": "nothing beyond 8 thicknesses", "seam": "equal on both sides of the seam", "objective": "objective",
+    "similar": "the same at any scale", "mesh": "the same on another mesh", "returns": "forgets what came before",
+    "additive": "far contacts add up", "gain": "noise is not amplified",
+}  # fmt: skip
+
+
+def least_det_f(layer: SoftLayer, displacement: np.ndarray) -> float:
+    """Smallest det F of the layer when its columns stay straight between the moved skin and the core, which is fixed.
+
+    Each face and its inward copy bound a wedge, at rest and moved; det F is the ratio of the two wedges' Jacobians at
+    the quadrature points of P1xP2 elements. Wedges that PatchFem would refuse as folded at rest do not count.
+    """
+    moved = displacement.any(axis=1)
+    faces = layer.faces[moved[layer.faces].any(axis=1)].astype(np.int64)
+    if not len(faces):
+        return 1.0
+    reference, inner = reference_wedge("P1xP2"), layer.inner_vertices
+    rest = rest_gradients(layer.vertices, inner, faces, reference, 1)[1]
+    now = rest_gradients(layer.vertices + displacement, inner, faces, reference, 1)[1]
+    sound = (rest > 0).all(axis=1) & (fold_ratios(layer.vertices, inner, faces) >= MIN_FOLD)
+    return float((now[sound] / rest[sound]).min(initial=1.0))
+
+
+def _all(trial: Trial, answers: Answers) -> Iterator[tuple[Scene, np.ndarray, Displacement]]:
+    pairs = [(trial.scene, answers.scene)]
+    if trial.twin is not None and answers.twin:
+        pairs.append((trial.twin.scene, answers.twin))
+    for scene, given in pairs:
+        for pressure, answer in zip(scene.pressures, given, strict=True):
+            yield scene, pressure, answer
+
+
+def _broken(law: str, measured: str, *answers: Displacement) -> Broken:
+    flagged = [answer for answer in answers if not answer.trust.ok]
+    return Broken(law, measured, bool(flagged), flagged[0].trust.why if flagged else "")
+
+
+def _peak(answer: Displacement) -> float:
+    return float(answer.magnitude.max())
+
+
+def _of_peak(off: float, peak: float) -> str:
+    return f"{off * 1e3:.2g} mm" + (f" ({100 * off / peak:.2g} % of the peak)" if peak > 0 else "")

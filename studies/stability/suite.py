@@ -1,0 +1,229 @@
+"""The suite: asks each method each trial, judges the answers by the laws, and sums up where each method fails."""
+
+from __future__ import annotations
+
+import json
+import logging
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from fem_tools.provenance import commit, machine, versions
+from stmpl_core.errors import InvalidInput, StmplError
+from stmpl_core.layer import SoftLayer
+from stmpl_core.methods.base import Method
+from stmpl_core.trust import Displacement
+from studies.stability import failures
+from studies.stability.laws import LAWS, Answers, Broken
+from studies.stability.methods import Make
+from studies.stability.sweeps import Preset, Stage, trials
+from studies.stability.trial import Scene, Trial
+
+log = logging.getLogger(__name__)
+
+Outcome = Literal["held", "unfinished", "flagged", "silent", "crashed"]
+WORST: tuple[Outcome, ...] = ("held", "unfinished", "flagged", "silent", "crashed")
+PATIENCE = 15.0  # s of processor time, for the repetitions of one trial
+VERSIONS = ("stmpl", "numpy", "scipy", "numba", "torch")
+OnProgress = Callable[[int, int, str], None]  # trials done, in all, and which is next
+
+
+@dataclass(frozen=True)
+class Row:
+    """One trial of one method.
+
+    Args:
+        outcome: held; flagged: a law broke and the method said not to trust the answer, or refused a sound input;
+            silent: a law broke and the method said nothing; crashed: an error that is none of ours; unfinished: too
+            slow for all repetitions, what there was held.
+        broken: the laws that broke, and how.
+        file: the failure that can be run again.
+    """
+
+    method: str
+    axis: str
+    level: str
+    outcome: Outcome
+    broken: tuple[Broken, ...] = ()
+    note: str = ""
+    file: str = ""
+
+
+@dataclass(frozen=True)
+class Report:
+    """All rows of a run, in the order of the sweep, and what made them."""
+
+    rows: tuple[Row, ...]
+    about: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def methods(self) -> list[str]:
+        """Names, in the order they were given."""
+        return list(dict.fromkeys(row.method for row in self.rows))
+
+    @property
+    def axes(self) -> list[str]:
+        """Names, in the order of the sweep."""
+        return list(dict.fromkeys(row.axis for row in self.rows))
+
+    def cell(self, method: str, axis: str) -> list[Row]:
+        """A method's trials along an axis, from easy to hard."""
+        return [row for row in self.rows if (row.method, row.axis) == (method, axis)]
+
+    def counts(self, method: str) -> dict[str, int]:
+        """How many trials of a method ended how."""
+        mine = [row.outcome for row in self.rows if row.method == method]
+        return {outcome: mine.count(outcome) for outcome in WORST}
+
+    def summary(self, method: str, axis: str) -> dict[str, str]:
+        """The range of an axis that a method held up to its first failure, and that failure; empty where none."""
+        cell = self.cell(method, axis)
+        first = next((k for k, row in enumerate(cell) if row.broken), len(cell))
+        held = [row.level for row in cell[:first]]
+        summary = {"held": f"{held[0]} ... {held[-1]}" if len(held) > 1 else "".join(held), "failed_at": "", "law": "",
+                   "outcome": ""}  # fmt: skip
+        if first < len(cell):
+            row = cell[first]
+            summary |= {"failed_at": row.level, "law": ", ".join(b.law for b in row.broken), "outcome": row.outcome}
+        return summary
+
+    def as_dict(self) -> dict[str, Any]:
+        """For JSON: counts, summary of each method and axis, every trial."""
+        return {
+            "about": dict(self.about),
+            "counts": {method: self.counts(method) for method in self.methods},
+            "summary": {m: {axis: self.summary(m, axis) for axis in self.axes} for m in self.methods},
+            "rows": [asdict(row) for row in self.rows],
+        }
+
+
+def stability(methods: Mapping[str, Make], preset: Preset, out: Path | None = None, *, patience: float = PATIENCE,
+              on_progress: OnProgress | None = None) -> Report:  # fmt: skip
+    """Runs a preset on every method.
+
+    Args:
+        methods: what makes a fresh method, by its name (studies.stability.methods.maker).
+        preset: what is swept.
+        out: folder for report.json and failures/; nothing is written unless given.
+        patience: for the repetitions of one trial [s of processor time].
+        on_progress: called before each trial of each method.
+
+    Raises:
+        InvalidInput: a preset with an axis that does not exist, or whose skin cannot be made.
+    """
+    stage, rows = Stage.of(preset), []
+    total, done = len(methods) * sum(map(len, preset.levels.values())), 0
+    for trial in trials(stage, preset):
+        for name, make in methods.items():
+            if on_progress is not None:
+                on_progress(done, total, f"{trial.axis} {trial.level}, {name}")
+            row = judge(name, make, trial, patience=patience)
+            if out is not None and row.broken:
+                found = asdict(row)
+                row = Row(**{**vars(row), "file": str(failures.save(out / "failures", trial, name, found))})
+            rows.append(row)
+            done += 1
+    about = {"commit": commit(), "machine": machine(), "versions": versions(VERSIONS), "seed": preset.seed,
+             "skin": repr(stage.mesh.layer), "body": preset.body}  # fmt: skip
+    report = Report(tuple(rows), about)
+    if out is not None:
+        out.mkdir(parents=True, exist_ok=True)
+        (out / "report.json").write_text(json.dumps(report.as_dict(), indent=1) + "\n")
+    return report
+
+
+def again(path: str | Path, make: Callable[[str], Make], *, patience: float = PATIENCE) -> Row:
+    """Runs a saved failure again with the method that `make` finds under the name it was saved with.
+
+    Raises:
+        InvalidInput: no such failure, or no such method.
+    """
+    trial, name = failures.load(path)
+    return judge(name, make(name), trial, patience=patience)
+
+
+def judge(name: str, make: Make, trial: Trial, *, patience: float = PATIENCE) -> Row:
+    """Asks fresh methods for a trial's answers, and judges them by its laws."""
+    try:
+        if "refuses" in trial.laws:
+            return _refused(name, make().prepare(trial.scene.mesh.layer), trial)
+        answers, done = _answers(make, trial, patience)
+    except (StmplError, ValueError) as error:
+        broken = Broken("answers", "refused", True, str(error))
+        return Row(name, trial.axis, trial.level, "flagged", (broken,))
+    except Exception as error:
+        log.debug("%s crashed at %s %s", name, trial.axis, trial.level, exc_info=True)
+        broken = Broken("answers", f"crashed: {error!r}", False)
+        return Row(name, trial.axis, trial.level, "crashed", (broken,))
+    broken = []
+    for law in trial.laws:
+        if (found := LAWS[law](trial, answers)) is not None:
+            broken.append(found)
+            if law == "finite":  # the other laws have nothing to measure
+                break
+    outcome: Outcome = "held" if done == trial.rounds else "unfinished"
+    if broken:
+        outcome = "flagged" if all(one.flagged for one in broken) else "silent"
+    note = "" if done == trial.rounds else f"{done:,} of {trial.rounds:,} rounds in {patience:g} s of processor time"
+    return Row(name, trial.axis, trial.level, outcome, tuple(broken), note)
+
+
+def _refused(name: str, method: Method, trial: Trial) -> Row:
+    """Whether loads that are not finite are refused with an error that says so, or answered and flagged."""
+    broken: list[Broken] = []
+    outcome: Outcome = "held"
+    for load in trial.scene.loads():
+        try:
+            answer = method.solve(load)
+        except (StmplError, ValueError):
+            continue
+        except Exception as error:
+            broken.append(Broken("refuses", f"crashed: {error!r}", False))
+            outcome = "crashed"
+            continue
+        bad = int((~np.isfinite(answer.displacement)).any(axis=1).sum())
+        if not answer.trust.ok:
+            if bad:
+                broken.append(Broken("refuses", f"answered, {bad} vertices not finite", True, answer.trust.why))
+                outcome = _worse(outcome, "flagged")
+            continue
+        broken.append(Broken("refuses", f"answered without a word, {bad} vertices not finite", False))
+        outcome = _worse(outcome, "silent")
+    return Row(name, trial.axis, trial.level, outcome, tuple(broken))
+
+
+def _worse(one: Outcome, other: Outcome) -> Outcome:
+    return one if WORST.index(one) > WORST.index(other) else other
+
+
+def _answers(make: Make, trial: Trial, patience: float) -> tuple[Answers, int]:
+    """The answers to the last round, and how many rounds there were."""
+    scene, done = [], 0
+    method, loads = make().prepare(trial.scene.mesh.layer), trial.scene.loads()
+    until = time.process_time() + patience
+    while done < trial.rounds and (done == 0 or time.process_time() < until):
+        scene = [method.solve(load) for load in loads]
+        done += 1
+    fresh = make().prepare(trial.scene.mesh.layer).solve(loads[-1]) if "returns" in trial.laws else None
+    return Answers(scene, _twin(make, trial), fresh), done
+
+
+def _twin(make: Make, trial: Trial) -> list[Displacement]:
+    if trial.twin is None:
+        return []
+    try:
+        layer = trial.twin.scene.mesh.layer
+    except InvalidInput:
+        if trial.twin.may_refuse:
+            return []
+        raise
+    return _solved(make, layer, trial.twin.scene)
+
+
+def _solved(make: Make, layer: SoftLayer, scene: Scene) -> list[Displacement]:
+    method: Method = make().prepare(layer)
+    return [method.solve(load) for load in scene.loads()]

@@ -1,0 +1,60 @@
+"""train: one entry to all that is learnt: MomentNet ("default"), ContactNet ("contacts"), the paper's UNet."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, Literal
+
+TrainPreset = Literal["default", "contacts", "paper", "paper-reduced", "paper-3-bodies", "paper-reduced-3-bodies"]
+OnProgress = Callable[[int, int, str], None]  # done, in all, what to say of it
+
+
+def train(
+    preset: TrainPreset, data: Path, out: Path, *, steps: int | None = None, seed: int = 0,
+    on_progress: OnProgress | None = None,
+) -> dict[str, Any]:  # fmt: skip
+    """Trains on a data set, or goes on where an earlier run into the same folder was stopped.
+
+    Args:
+        preset: "default": MomentNet. "contacts": what rigid tools press with (ContactNet) and what that does
+            (MomentNet once more), on data of the preset of that name. "paper": the paper's UNet at 512 x 512 (for a
+            GPU, or several under torchrun);
+            "paper-reduced": the same code at a size that one CPU core trains in under an hour; "-3-bodies": without the
+            second and fourth body, as in the paper's second set-up.
+        data: folder of a finished data set.
+        out: folder for weights, card and checkpoint.
+        steps: of the optimiser for ours, epochs for the paper's; None: the preset's.
+        seed: of weights and order.
+        on_progress: called often.
+
+    Returns:
+        The card that was written beside the weights.
+
+    Raises:
+        InvalidInput: no finished data set.
+    """
+    if preset == "default":
+        from studies.train_moments import MomentTraining, train_moments
+
+        moments = MomentTraining(seed=seed)
+        if steps is not None:
+            moments = moments.model_copy(update={"steps": steps})
+        return train_moments(data, out, moments, on_progress=on_progress)
+    if preset == "contacts":
+        from studies.train_contact import ContactTraining, train_contact
+        from studies.train_moments import MomentTraining, train_moments
+
+        contacts, moments = ContactTraining(seed=seed), MomentTraining(seed=seed, kinds=("indenter",), steps=20_000)
+        if steps is not None:
+            contacts = contacts.model_copy(update={"steps": steps})
+            moments = moments.model_copy(update={"steps": steps})
+        train_moments(data, out, moments, name="moment_net_contact", on_progress=on_progress)
+        return train_contact(data, out, contacts, on_progress=on_progress)
+    from studies.train_unet import UNetTraining, train_unet
+
+    changes: dict[str, Any] = {"seed": seed, "bodies": "three_bodies" if preset.endswith("3-bodies") else "all"}
+    if steps is not None:
+        changes["epochs"] = steps
+    settings = UNetTraining.reduced(**changes) if "reduced" in preset else UNetTraining(**changes)
+    return train_unet(data, out, settings, on_progress=on_progress)

@@ -1,0 +1,232 @@
+"""The verbs of studies: one function each, which the command line calls; what a verb needs is imported in it."""
+
+from __future__ import annotations
+
+import dataclasses
+import shutil
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import tyro
+
+from stmpl_core.console import print_figures, steps_bar
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from stmpl_core.methods.base import Method
+
+Json = Annotated[bool, tyro.conf.arg(name="json")]
+
+STABILITY_METHODS = ("moment_net", "linear", "winkler", "naive", "zero")  # of studies.stability.METHODS, fast ones
+
+
+def train(
+    preset: Literal[
+        "default", "contacts", "paper", "paper-reduced", "paper-3-bodies", "paper-reduced-3-bodies"
+    ] = "default",
+    data: Path = Path("data/default"),
+    out: Path | None = None,
+    steps: int | None = None,
+    seed: int = 0,
+    as_json: Json = False,
+) -> int:
+    """Trains a network on a data set, or goes on where a run into the same folder was stopped.
+
+    Example: stmpl train --preset default --data data/default
+    Several GPUs: torchrun --nproc-per-node 4 -m stmpl_ros.cli train --preset paper --data data/paper
+
+    Args:
+        preset: default and contacts are ours (under an hour on two cores), paper the paper's UNet (a GPU),
+            paper-reduced the same code at a size for one core; 3-bodies: its second set-up.
+        data: folder of the data set; make it with stmpl generate.
+        out: folder of the weights; runs/train/<preset> unless given.
+        steps: of the optimiser; epochs for the paper's presets.
+        seed: of weights and order.
+        as_json: print the card for machines.
+    """
+    from studies.train import train as learn
+
+    folder = out or Path("runs/train") / preset
+    with steps_bar(f"train {preset}", quiet=as_json) as show:
+        card = learn(preset, data, folder, steps=steps, seed=seed, on_progress=show)
+    print_figures(card if as_json else f"weights and their card are in {folder}")
+    return 0
+
+
+def tables(
+    data: Path = Path("data/default"),
+    limit: int | None = 400,
+    unet: Path | None = None,
+    unet_3_bodies: Path | None = None,
+    moment_net: Path | None = None,
+    out: Path | None = None,
+    as_json: Json = False,
+) -> int:
+    """The paper's tables 1 to 3 on a data set: its printed figures, every method, and columns that its metric lacks.
+
+    Example: stmpl tables --data data/default --limit 200
+
+    Args:
+        data: folder of the data set; make it with stmpl generate.
+        limit: samples a table.
+        unet: weights of the paper's network; those that come with the package unless given.
+        unet_3_bodies: weights of its second set-up, for Table 3.
+        moment_net: weights of ours; those that come with the package unless given.
+        out: a file for the tables in Markdown; their figures go beside it as JSON.
+        as_json: print the figures for machines.
+    """
+    from stmpl_core.methods import Linear, MomentNet, UNet
+    from studies.evaluate import THREE_BODY_ROW, evaluate
+
+    methods: dict[str, Callable[[], Method]] = {"linear": Linear, "unet": lambda: UNet(unet)}
+    if unet_3_bodies is not None:
+        methods[THREE_BODY_ROW] = lambda: UNet(unet_3_bodies)
+    methods["moment_net"] = lambda: MomentNet(moment_net)
+    with steps_bar("tables", quiet=as_json) as show:
+        made = evaluate(data, methods, limit=limit, on_progress=lambda done, total: show(done, total, "samples"))
+    if out is not None:
+        out.parent.mkdir(parents=True, exist_ok=True)
+        out.write_text(made.markdown() + "\n")
+        out.with_suffix(".json").write_text(made.as_json() + "\n")
+    sys.stdout.write((made.as_json() if as_json else made.text()) + "\n")
+    return 0
+
+
+def chart(
+    preset: Literal["default", "quick"] = "default",
+    out: Path = Path("runs/chart"),
+    redraw: bool = False,
+    as_json: Json = False,
+) -> int:
+    """Speed against accuracy: every method, its own knob swept, on the same scenes; a picture, a page to point at.
+
+    A run that was stopped goes on where it was.
+
+    Example: stmpl chart --out runs/chart
+    Peers that are installed (pip install .[peers]) are on it as well.
+
+    Args:
+        preset: default (the arm at 3 mm, five scenes, two loads; about twenty minutes), quick (a coarse forearm).
+        out: folder of chart.png, chart.html, break_even.png and chart.json.
+        redraw: draw out/chart.json again instead of measuring.
+        as_json: print all points for machines.
+    """
+    from studies.chart import CURVES, PRESETS, Chart, measure
+    from studies.chart.break_even import break_even, draw_break_even
+    from studies.chart.page import write_page
+    from studies.chart.picture import draw
+    from studies.show import chart_table
+
+    out.mkdir(parents=True, exist_ok=True)
+    if redraw:
+        measured = Chart.load(out / "chart.json")
+    else:
+        with steps_bar("chart", quiet=as_json) as show:
+            measured = measure(PRESETS[preset], CURVES, parts=out / "parts", on_progress=show)
+        measured.save(out / "chart.json")
+        shutil.rmtree(out / "parts")
+    draw(measured, out / "chart.png")
+    write_page(measured, out / "chart.html")
+    rows = break_even(measured)
+    draw_break_even(rows, out / "break_even.png")
+    print_figures(dataclasses.asdict(measured) if as_json else chart_table(measured, rows, out))
+    return 0
+
+
+def calibrate(
+    errors: bool = False,
+    out: Path | None = None,
+    contacts: Path | None = None,
+    trials: Path = Path("runs/calibrate"),
+    as_json: Json = False,
+) -> int:
+    """Measures what the ladder chooses by: each method's time on this machine; with --errors also how far off it is.
+
+    Example: stmpl calibrate
+    All anew (half an hour): stmpl calibrate --errors --out stmpl_core/weights/ladder.json --contacts data/contacts
+
+    Args:
+        errors: measure errors against finite elements as well, and print how often the stated bounds hold.
+        out: file of the measured chart; the user's cache for times, runs/calibrate/ladder.json for errors.
+        contacts: a data set of the preset contacts, for what rigid tools press with (with --errors).
+        trials: folder of the single trials (with --errors), which are not measured twice.
+        as_json: print the figures for machines.
+    """
+    from fem_tools.ladder import times_file
+    from studies import calibrate as measuring
+    from studies.show import coverage_table, times_table
+
+    with steps_bar("calibrate", quiet=as_json) as show:
+        if not errors:
+            found = measuring.times(on_progress=show)
+        else:
+            made = measuring.gather(trials, contacts=contacts, on_progress=show)
+            found = measuring.fit(made)
+    if errors:
+        found.save(out or trials / "ladder.json")
+        rows = measuring.coverage(made, found)
+        print_figures({"rows": [vars(row) for row in rows]} if as_json else coverage_table(rows))
+        return 0
+    found.save(out or times_file())
+    print_figures(dataclasses.asdict(found) if as_json else times_table(found, out or times_file()))
+    return 0
+
+
+def stability(
+    methods: tuple[str, ...] = STABILITY_METHODS,
+    preset: Literal["default", "quick"] = "default",
+    out: Path | None = None,
+    again: Path | None = None,
+    critical_load: bool = False,
+    as_json: Json = False,
+) -> int:
+    """Where methods fail: pressure, mesh, seam, noise and more, swept until a law breaks; a table and a picture.
+
+    Example: stmpl stability --methods moment_net winkler
+    Your own: stmpl stability --methods my_module:MyMethod
+    One failure again: stmpl stability --again runs/stability/failures/pressure_5_E.moment_net.json
+    The finite elements' own limits: stmpl stability --critical-load --out critical_load.png
+
+    Args:
+        methods: names (zero, naive, winkler, linear, moment_net, unet, fem_1_step, fem, ladder), or
+            module:attribute.
+        preset: default (minutes a method, on the arm), quick (seconds, on a round limb).
+        out: folder of report, picture and failures, runs/stability unless given; the picture with --critical-load.
+        again: a saved failure to run again with the same method.
+        critical_load: press a flat layer by follower, dead and indenter loads with each element and mesh width until
+            it fails, beside the closed form (minutes).
+        as_json: print the figures for machines.
+    """
+    if critical_load:
+        return _critical_load(out or Path("runs/critical_load.png"), as_json)
+    from studies.show import stability_table
+    from studies.stability import PRESETS, maker
+    from studies.stability import again as run_again
+    from studies.stability import stability as sweep
+    from studies.stability.picture import draw
+
+    if again is not None:
+        row = run_again(again, maker)
+        said = "\n".join(f"{b.law}: {b.measured} ({'flagged' if b.flagged else 'not flagged'})" for b in row.broken)
+        told = f"{row.method} at {row.axis} {row.level}: {row.outcome}\n{said}".strip()
+        print_figures(dataclasses.asdict(row) if as_json else told)
+        return 1 if row.broken else 0
+    folder = out or Path("runs/stability")
+    with steps_bar("stability", quiet=as_json) as show:
+        report = sweep({name: maker(name) for name in methods}, PRESETS[preset], folder, on_progress=show)
+    picture = draw(report, folder / "stability.png")
+    print_figures(report.as_dict() if as_json else stability_table(report, picture))
+    return 0
+
+
+def _critical_load(out: Path, as_json: bool) -> int:
+    from studies.critical_load import draw
+    from studies.show import critical_load_table, critical_loads_with_progress
+
+    rows = critical_loads_with_progress(quiet=as_json)
+    picture = draw(rows, out)
+    figures = {"picture": str(picture), "rows": [vars(row) for row in rows]}
+    print_figures(figures if as_json else critical_load_table(rows, picture))
+    return 0
