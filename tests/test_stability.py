@@ -14,7 +14,7 @@ from stmpl_core.errors import InvalidInput
 from stmpl_core.methods import Winkler
 from stmpl_core.methods.zero import Zero
 from stmpl_core.trust import Trust
-from stmpl_ros.tables import stability_table
+from studies.show import stability_table
 from studies.stability import AXES, LAWS, METHODS, PRESETS, Report, again, maker, stability
 from studies.stability.laws import MEANING, least_det_f
 from studies.stability.meshes import inserted, limb
