@@ -3,25 +3,25 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol, Self
 
-from bags.messages import Frame
-from bags.survey import PRESSING, Moment, Survey, survey
-from stmpl_core.arrays import PerVertex
+from bags.frame import Frame
+from bags.survey import Moment, Survey, survey
 from stmpl_core.contact import Contact
 from stmpl_core.errors import BagError, StmplError
 from stmpl_core.layer import SoftLayer
 from stmpl_core.load import Load
 from stmpl_core.methods.base import Method
 from stmpl_core.metrics import Score, score
+from stmpl_core.touch import Answer
 from stmpl_core.trust import Displacement
 
 log = logging.getLogger(__name__)
 
-Answer = Callable[[Frame], Displacement]  # how one side of a comparison answers a frame
+Side = Callable[[Frame], Displacement]  # how one side of a comparison answers a frame
 
 
 class Presser(Protocol):
@@ -33,8 +33,8 @@ class Presser(Protocol):
         """Keeps the layer."""
         ...
 
-    def press(self, contacts: Sequence[Contact], pressure: PerVertex, figures: Mapping[str, float]) -> Displacement:
-        """The motion under these contacts."""
+    def press(self, contacts: Sequence[Contact], answer: Answer) -> Displacement:
+        """The motion under these contacts, which `answer` answers."""
         ...
 
 
@@ -102,7 +102,7 @@ class Comparison:
     @property
     def most_tools(self) -> FramePair | None:
         """The heaviest pair with two tools or more on the skin, or None."""
-        several = [pair for pair in self.pairs if sum(s in PRESSING for s in pair.frame.statuses.values()) > 1]
+        several = [pair for pair in self.pairs if sum(touch.presses for touch in pair.frame.touches.values()) > 1]
         return max(several, key=lambda pair: pair.load, default=None)
 
     @property
@@ -158,7 +158,7 @@ def compare_run(
     """
     run = survey(path)
     judge = _presser(reference, run) if hasattr(reference, "press") else _solver(reference, run)  # type: ignore[arg-type]
-    judged = _recorded if method is None else _solver(method, run)
+    judged = (lambda frame: frame) if method is None else _solver(method, run)
     names = (run.method if method is None else method.name, reference.name)
     return _compare(run, sample(run.moments, frames), names, judged, judge, tolerance, on_frame)
 
@@ -178,14 +178,14 @@ def compare_bags(
         raise BagError(f"{run.bag.file} and {other.bag.file} answer no common stamp. Compare a run with its replay.")
     picks = sample(common, frames)
     wanted = {moment.stamp_ns for moment in common if moment.sequence in picks}
-    answers = {frame.stamp_ns: _recorded(frame) for frame in other.bag.frames() if frame.stamp_ns in wanted}
+    answers = {frame.stamp_ns: frame for frame in other.bag.frames() if frame.stamp_ns in wanted}
     for frame in (frame for frame in run.bag.frames() if frame.sequence in picks):
         moved = len(answers[frame.stamp_ns].displacement)
         if moved != len(frame.displacement):
             raise BagError(f"{run.bag.file} moves {len(frame.displacement)} vertices, {other.bag.file} {moved}; "
                            "answers can be compared on one skin only.")  # fmt: skip
     names = (run.method, f"{other.method} of {other.bag.file.parent.name}")
-    return _compare(run, picks, names, _recorded, lambda frame: answers[frame.stamp_ns], tolerance, None)
+    return _compare(run, picks, names, lambda frame: frame, lambda frame: answers[frame.stamp_ns], tolerance, None)
 
 
 def sample(moments: list[Moment] | tuple[Moment, ...], frames: int) -> list[int]:
@@ -213,8 +213,8 @@ def _compare(
     run: Survey,
     picks: list[int],
     names: tuple[str, str],
-    ours: Answer,
-    reference: Answer,
+    ours: Side,
+    reference: Side,
     tolerance: float | None,
     on_frame: Callable[[int, int], None] | None,
 ) -> Comparison:
@@ -241,26 +241,26 @@ def _pair(run: Survey, moment: Moment, frame: Frame, ours: Displacement, referen
     return FramePair(frame, layer, moment.time, moment.load, tuple(run.contacts.at(frame)), ours, reference, figures)
 
 
-def _solver(method: Method, run: Survey) -> Answer:
+def _solver(method: Method, run: Survey) -> Side:
     ready = _prepared(method, run)
     return lambda frame: ready(frame).solve(_load(frame))
 
 
-def _presser(reference: Presser, run: Survey) -> Answer:
+def _presser(reference: Presser, run: Survey) -> Side:
     ready = _prepared(reference, run)
 
     def answer(frame: Frame) -> Displacement:
-        pressing = [c for c in run.contacts.at(frame) if frame.statuses[c.name] in PRESSING]
-        return ready(frame).press(pressing, _load(frame).values, frame.trust.figures)
+        _load(frame)
+        return ready(frame).press([c for c in run.contacts.at(frame) if frame.touches[c.name].presses], frame)
 
     return answer
 
 
-def _prepared[Side: (Method, Presser)](side: Side, run: Survey) -> Callable[[Frame], Side]:
+def _prepared[Judge: (Method, Presser)](side: Judge, run: Survey) -> Callable[[Frame], Judge]:
     """`side`, prepared for the layer of a frame, and again only where the layer changes."""
     layer: SoftLayer | None = None
 
-    def ready(frame: Frame) -> Side:
+    def ready(frame: Frame) -> Judge:
         nonlocal side, layer
         if layer is not run.bag.layer_of(frame):
             layer = run.bag.layer_of(frame)
@@ -276,6 +276,3 @@ def _load(frame: Frame) -> Load:
                        "Replay the run first, and compare the replay.")
     return Load.contact(frame.pressure)
 
-
-def _recorded(frame: Frame) -> Displacement:
-    return Displacement(frame.displacement, frame.trust, frame.method, frame.pressure, frame.statuses)

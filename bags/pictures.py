@@ -103,8 +103,8 @@ def draw_skin(
 def draw_tool(axes: Axes, view: View, contact: Contact) -> None:
     """Draws the outline of a tool, see-through."""
     pose = contact.pose_body_from_tool
-    points = contact.mesh.vertices @ pose[:3, :3].T + pose[:3, 3]
-    corners = points[contact.mesh.faces]
+    points = contact.tool.vertices @ pose[:3, :3].T + pose[:3, 3]
+    corners = points[contact.tool.faces]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     _draw(axes, view, corners, normals, np.broadcast_to(TOOL, (len(corners), 3)), alpha=0.35)
 

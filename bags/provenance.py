@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 import stmpl_core
-from bags.messages import NO_FRAMES, FixedFrames
+from bags.wire import NO_FRAMES, FixedFrames
 from bags.writer import BagWriter
 from stmpl_core.chart import UvChart
 from stmpl_core.errors import BagError

@@ -11,13 +11,15 @@ from typing import Any, NamedTuple
 from mcap.records import Attachment, Channel, Message, Metadata, Schema
 from rosbags.typesys.store import Typestore
 
-from bags.messages import Frame, contact_from, frame_from, layer_from, layer_id, stamp_ns, tool_mesh_from
+from bags.frame import Frame
 from bags.provenance import LAYER, RECORD, Provenance, layer_from_bytes, provenance_from
 from bags.records import Damage, End, bag_file, summary, walk
 from bags.schema import typestore_of
-from stmpl_core.contact import Contact, ToolMesh
+from bags.wire import contact_from, frame_from, layer_from, stamp_ns, tool_from
+from stmpl_core.contact import Contact
 from stmpl_core.errors import BagError, FrameError
-from stmpl_core.layer import SoftLayer
+from stmpl_core.layer import SoftLayer, layer_id
+from stmpl_core.tool import Tool
 
 log = logging.getLogger(__name__)
 
@@ -165,11 +167,11 @@ class Bag:
         return next(iter(self.layers))
 
     @cached_property
-    def tool_meshes(self) -> dict[str, ToolMesh]:
-        """Surface of each tool by its name, in its own frame."""
+    def tools(self) -> dict[str, Tool]:
+        """The tools by their names."""
         topics = [t for t in self.topics if _ends(t, MESH)]
         found = self.messages(lambda name: name in topics)
-        return {r.message.header.frame_id: tool_mesh_from(r.message) for r in found}
+        return {tool.name: tool for tool in (tool_from(r.message) for r in found if len(r.message.triangles))}
 
     @cached_property
     def _topologies(self) -> list[Any]:
@@ -255,15 +257,15 @@ class ContactLog:
         return [self._contact(tool, *stamps) for tool, stamps in frame.inputs.items()]
 
     def _contact(self, tool: str, posed: int, pushed: int) -> Contact:
-        mesh, pose = self._bag.tool_meshes.get(tool), self._poses.get(tool, {}).get(posed)
+        known, pose = self._bag.tools.get(tool), self._poses.get(tool, {}).get(posed)
         wrench = self._wrenches.get(tool, {}).get(pushed)
-        lacks = ["mesh"] * (mesh is None) + ["pose"] * (pose is None) + ["wrench"] * (pushed != 0 and wrench is None)
-        if mesh is None or lacks:
+        lacks = ["mesh"] * (known is None) + ["pose"] * (pose is None) + ["wrench"] * (pushed != 0 and wrench is None)
+        if known is None or lacks:
             raise BagError(f"an answer to tool {tool} at {posed / 1e9:.3f} s cannot be repeated: "
                            f"the bag has no {' and no '.join(lacks)} for it.")
         frames = self._bag.provenance.frames
         try:
-            return contact_from(tool, mesh, pose, wrench, body_frame=self._bag.body_frame, frames=frames)
+            return contact_from(known, pose, wrench, body_frame=self._bag.body_frame, frames=frames)
         except FrameError as error:
             raise BagError(f"{error} The recording carries the frames of stmpl record --frames, and none that "
                            "move (/tf).") from error  # fmt: skip

@@ -8,12 +8,12 @@ from pathlib import Path
 
 import numpy as np
 
-from bags.messages import Frame
+from bags.frame import Frame
 from bags.provenance import versions
 from bags.reader import Bag, ContactLog
 from stmpl_core.methods.base import Method
 from stmpl_core.simulator import Simulator
-from stmpl_core.trust import Displacement
+from stmpl_core.touch import Answer
 
 
 @dataclass(frozen=True, eq=False)
@@ -21,7 +21,7 @@ class Replayed:
     """A recorded answer and the one that the same contacts give now."""
 
     frame: Frame
-    answer: Displacement
+    answer: Answer
 
     @property
     def identical(self) -> bool:

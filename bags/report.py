@@ -199,8 +199,8 @@ def _cut(axes: Axes, comparison: Comparison, pair: FramePair, spot: Spot, limb: 
     view = view_along(out, np.cross(spot.normal, out), spot.centre)
     for contact in pair.contacts:
         pose = contact.pose_body_from_tool
-        points = contact.mesh.vertices @ pose[:3, :3].T + pose[:3, 3]
-        draw_cut(axes, points, contact.mesh.faces, view, color="#9aa3ad", lw=1.2)
+        points = contact.tool.vertices @ pose[:3, :3].T + pose[:3, 3]
+        draw_cut(axes, points, contact.tool.faces, view, color="#9aa3ad", lw=1.2)
     draw_cut(axes, layer.vertices, layer.faces, view, color="#b8b0a8", lw=1.0, ls=":")
     draw_cut(axes, layer.inner_vertices, layer.faces, view, color="#b8b0a8", lw=1.0)
     for side, colour in ((pair.reference, TRUTH), (pair.ours, OURS)):
@@ -254,7 +254,7 @@ def _pressed(comparison: Comparison) -> str:
     if comparison.most_tools is not None and comparison.most_tools is not comparison.heaviest:
         shown.append(("With several tools", comparison.most_tools))
     for title, pair in shown:
-        tools = "; ".join(f"{tool}: {status}" for tool, status in pair.frame.statuses.items())
+        tools = "; ".join(f"{name}: {touch.status}" for name, touch in pair.frame.touches.items())
         lines.append(f"<h3>{title}, {pair.time:.2f} s, {pair.load:.2f} N</h3><p class=note>{_h(tools)}. "
                      "Drawn to scale, not exaggerated; both sides answer the same contact.</p>")  # fmt: skip
         lines += [_image(figure) for figure in pressed_figures(comparison, pair)]

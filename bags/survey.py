@@ -7,13 +7,11 @@ from pathlib import Path
 
 import numpy as np
 
-from bags.messages import Frame
+from bags.frame import Frame
 from bags.reader import Bag, ContactLog
 from stmpl_core.arrays import PerVertex
 from stmpl_core.errors import BagError
-from stmpl_core.touch import BY_POSE, IN_CORE, MOVED, TOUCHING
 
-PRESSING = frozenset((TOUCHING, MOVED, BY_POSE, IN_CORE))  # statuses of a tool that loads the skin
 NANO = 1e-9  # seconds in a nanosecond
 
 
@@ -111,7 +109,7 @@ def _moment(frame: Frame, time: float, area: PerVertex, latency: float) -> Momen
         time=time,
         load=load,
         peak=frame.peak,
-        pressing=sum(status in PRESSING for status in frame.statuses.values()),
+        pressing=sum(touch.presses for touch in frame.touches.values()),
         converged=frame.trust.converged,
         in_range=frame.trust.in_range,
         solve_seconds=frame.solve_seconds,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Self
 
 import numpy as np
@@ -10,11 +10,12 @@ import numpy as np
 from fem_tools.indenter import INDENTER_LAYERS, IndenterFem, Tool
 from fem_tools.patch import PatchFem
 from stmpl_core.arrays import PerVertex
-from stmpl_core.contact import Contact, ToolMesh
+from stmpl_core.contact import Contact
 from stmpl_core.errors import InvalidInput
 from stmpl_core.layer import SoftLayer
 from stmpl_core.methods.base import prepared
 from stmpl_core.sdf import SignedDistance
+from stmpl_core.touch import Answer
 from stmpl_core.trust import Displacement, Trust
 
 REFINE, STEP = 2, 0.08  # a third of IndenterFem's own cost; 0.5 % in pressure
@@ -38,7 +39,7 @@ class RigidFem:
     def __init__(self) -> None:
         self._layer: SoftLayer | None = None
         self._fem = IndenterFem(PatchFem(refine=REFINE, layers=INDENTER_LAYERS, check_stability=False), step=STEP)
-        self._fields: dict[int, tuple[ToolMesh, SignedDistance]] = {}
+        self._fields: dict[str, SignedDistance] = {}  # by the digest of a tool
 
     def prepare(self, layer: SoftLayer) -> Self:
         """Keeps the layer."""
@@ -46,29 +47,32 @@ class RigidFem:
         self._fem.prepare(layer)
         return self
 
-    def press(self, contacts: Sequence[Contact], pressure: PerVertex, figures: Mapping[str, float]) -> Displacement:
+    def press(self, contacts: Sequence[Contact], answer: Answer) -> Displacement:
         """The motion under these contacts.
 
         Args:
-            contacts: that press on the skin, at their stated poses.
-            pressure: that the answer has, (V,) [Pa]: says from where a tool without a wrench comes.
-            figures: of the answer's trust: NAME.moved_m is how far the answer moved a tool along its force.
+            contacts: tools that press on the skin, at their stated poses.
+            answer: answer to judge. Its pressure says from where a tool without a wrench comes, its touches how far it
+                moved a tool along its force.
 
         Raises:
-            InvalidInput: a tool that FEM cannot press.
+            InvalidInput: a tool that FEM cannot press, or an answer that does not say its pressure.
         """
+        if answer.pressure is None:
+            raise InvalidInput("this answer does not say the pressure that it was solved for: FEM cannot judge it.")
+        pressure = np.asarray(answer.pressure, dtype=np.float64)
         layer = prepared(self._layer, self)
         displacement, trust, total = np.zeros_like(layer.vertices), Trust(), np.zeros_like(pressure)
         for contact in contacts:
-            tool, depth = self._tool(contact, pressure, figures.get(f"{contact.name}.moved_m", 0.0))
+            tool, depth = self._tool(contact, pressure, _moved(contact, answer))
             force = 0.0 if contact.wrench is None else float(np.linalg.norm(contact.wrench[:3]))
             if (force < layer.tissue.youngs_modulus * TOUCH**2) if force else (depth < LEAST):
                 continue
-            answer = self._fem.press_with([tool], force, tolerance=FORCE) if force else self._fem.press([tool], depth)
-            displacement += answer.displacement
-            total += answer.pressure
-            found = {f"{contact.name}.normal_n": float(answer.wrenches[0][:3] @ tool.direction)}
-            theirs = answer.trust
+            solved = self._fem.press_with([tool], force, tolerance=FORCE) if force else self._fem.press([tool], depth)
+            displacement += solved.displacement
+            total += solved.pressure
+            found = {f"{contact.name}.normal_n": float(solved.wrenches[0][:3] @ tool.direction)}
+            theirs = solved.trust
             trust = Trust(trust.converged and theirs.converged, trust.in_range and theirs.in_range, None,
                           "; ".join(filter(None, (trust.why, theirs.why))), dict(trust.figures) | found)  # fmt: skip
         return Displacement(displacement, trust, self.name, total)
@@ -76,9 +80,9 @@ class RigidFem:
     def _tool(self, contact: Contact, pressure: PerVertex, moved: float) -> tuple[Tool, float]:
         """The tool where it first touches, and how far it goes from there [m]."""
         layer = prepared(self._layer, self)
-        if id(contact.mesh) not in self._fields:
-            self._fields[id(contact.mesh)] = contact.mesh, SignedDistance.of(contact.mesh, rounding=ROUNDED)
-        field = self._fields[id(contact.mesh)][1]
+        if contact.tool.digest not in self._fields:
+            self._fields[contact.tool.digest] = SignedDistance.of(contact.tool, rounding=ROUNDED)
+        field = self._fields[contact.tool.digest]
         pose = contact.pose_body_from_tool
         force = contact.wrench[:3] if contact.wrench is not None else np.zeros(3)
         if force.any():
@@ -93,3 +97,12 @@ class RigidFem:
             raise InvalidInput(f"{contact.name} never meets the skin along its way.")
         depth = float((there.pose_body_from_tool - touching.pose_body_from_tool)[:3, 3] @ tool.direction)
         return touching, depth
+
+
+def _moved(contact: Contact, answer: Answer) -> float:
+    """How far the answer moved a tool along its force [m]; 0 where a recording does not tell."""
+    if contact.wrench is None or contact.name not in answer.touches or not contact.wrench[:3].any():
+        return 0.0
+    way = answer.touches[contact.name].pose_body_from_tool[:3, 3] - contact.pose_body_from_tool[:3, 3]
+    moved = float(way @ contact.wrench[:3]) / float(np.linalg.norm(contact.wrench[:3]))
+    return moved if np.isfinite(moved) else 0.0

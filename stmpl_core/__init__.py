@@ -1,8 +1,32 @@
-"""The core: bodies, layers, charts, contacts and the methods that solve them. Knows no ROS and no FEM."""
+"""The core: layers, tools, contacts, and the methods that solve them. Knows no ROS and no FEM."""
 
-from stmpl_core.contact import Contact, ToolMesh
-from stmpl_core.layer import SoftLayer, Tissue
-from stmpl_core.load import Load
-from stmpl_core.trust import Displacement, Trust
+from __future__ import annotations
 
-__all__ = ["Contact", "Displacement", "Load", "SoftLayer", "Tissue", "ToolMesh", "Trust"]
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from stmpl_core.contact import Contact
+    from stmpl_core.layer import SoftLayer, Tissue
+    from stmpl_core.load import Load
+    from stmpl_core.simulator import Simulator
+    from stmpl_core.skin import Skin
+    from stmpl_core.state import State
+    from stmpl_core.tool import Tool
+    from stmpl_core.tools import Tools
+    from stmpl_core.touch import Answer, Touch
+    from stmpl_core.trust import Displacement, Trust
+
+__all__ = ["Answer", "Contact", "Displacement", "Load", "Simulator", "Skin", "SoftLayer", "State", "Tissue", "Tool",
+           "Tools", "Touch", "Trust"]  # fmt: skip
+
+_HOME = {"Answer": "touch", "Contact": "contact", "Displacement": "trust", "Load": "load", "Simulator": "simulator",
+         "Skin": "skin", "SoftLayer": "layer", "State": "state", "Tissue": "layer", "Tool": "tool", "Tools": "tools",
+         "Touch": "touch", "Trust": "trust"}  # fmt: skip
+
+
+def __getattr__(name: str) -> Any:
+    """Imports the module of a public name when it is asked for: a verb pays for what it uses."""
+    if name not in _HOME:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(import_module(f"{__name__}.{_HOME[name]}"), name)

@@ -12,7 +12,7 @@ from stmpl_core.columns import depth_along
 from stmpl_core.layer import SoftLayer
 from stmpl_core.moments import Surroundings
 from stmpl_core.sdf import SignedDistance
-from stmpl_core.touch import Touch
+from stmpl_core.touch import Pressed, Touch
 
 PRESSED = 0.05  # of a tool's highest pressure, from which a covered vertex lies on the tool; with less it may be apart
 TAKEN = 1e-4  # m inside a tool from which skin is moved out with its neighbours, not by itself
@@ -50,8 +50,7 @@ class _Tool(NamedTuple):
         return phi, gradient @ turn.T
 
 
-def conform(near: Surroundings, displacement: VertexVectors, touches: Sequence[Touch],
-            fields: Sequence[SignedDistance]) -> Conformed:  # fmt: skip
+def conform(layer: SoftLayer, near: Surroundings, displacement: VertexVectors, touches: Sequence[Touch]) -> Conformed:
     """Moves the skin under tools onto them, and the skin around it along, as far as a bonded layer would.
 
     What presses is known as pressures, what they do is a method's answer; but under a rigid tool the motion is known
@@ -61,14 +60,12 @@ def conform(near: Surroundings, displacement: VertexVectors, touches: Sequence[T
     response of the layer (interpolation with its Green's function as kernel).
 
     Args:
-        near: of the layer.
+        layer: soft layer at rest.
+        near: neighbours of its vertices.
         displacement: a method's answer, (V, 3) [m].
-        touches: of all contacts.
-        fields: of their tools.
+        touches: what all contacts do.
     """
-    layer = near.layer
-    pressing = [(touch, field) for touch, field in zip(touches, fields, strict=True) if touch.load.values.any()]
-    tools = [_tool(touch, field, layer) for touch, field in pressing]
+    tools = [_tool(touch, touch.pressed, layer) for touch in touches if touch.pressed is not None]
     if not tools:
         return Conformed(displacement, 0.0, 0.0)
     all_of = np.unique(np.concatenate([tool.vertices for tool in tools]))
@@ -100,15 +97,17 @@ def conform(near: Surroundings, displacement: VertexVectors, touches: Sequence[T
     return Conformed(out, corrected, entered)
 
 
-def _tool(touch: Touch, field: SignedDistance, layer: SoftLayer) -> _Tool:
-    v = touch.squeeze.vertices
-    pressure, size = touch.load.values[v], float(np.linalg.norm(touch.wrench[:3]))
+def _tool(touch: Touch, pressed: Pressed, layer: SoftLayer) -> _Tool:
+    assert touch.pressure is not None
+    field, squeeze, forced = pressed
+    v = squeeze.vertices
+    pressure, size = touch.pressure[v], touch.force
     way = -layer.normals[v]
     if size > ALONG * float(pressure @ layer.vertex_areas[v]):
         one = touch.wrench[:3] / size
-        way = np.broadcast_to(touch.way if touch.way is not None and touch.way @ one > ALONG else one, way.shape)
-    depth, cosine = touch.squeeze.depth, -np.einsum("ni,ni->n", layer.normals[v], way)
-    lies = touch.squeeze.rests * np.clip(pressure / (PRESSED * pressure.max()) - 0.5, 0, 1)
+        way = np.broadcast_to(forced if forced is not None and forced @ one > ALONG else one, way.shape)
+    depth, cosine = squeeze.depth, -np.einsum("ni,ni->n", layer.normals[v], way)
+    lies = squeeze.rests * np.clip(pressure / (PRESSED * pressure.max()) - 0.5, 0, 1)
     lies *= np.clip((cosine - AHEAD) / 0.1, 0, 1)
     some, gone = np.flatnonzero(lies), np.zeros((len(v), 3))
     points, guess = layer.vertices[v[some]], depth[some] / cosine[some]

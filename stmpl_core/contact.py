@@ -1,29 +1,14 @@
-"""Contact: a tool's mesh, its pose and the wrench it exerts, as one frozen record."""
+"""Contact: a tool at one instant: where it is, and what it presses with, as one frozen record."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike
 
-from stmpl_core.arrays import Faces, Points, Transform, Wrench, finite
+from stmpl_core.arrays import Transform, Wrench, finite
 from stmpl_core.errors import InvalidInput
-from stmpl_core.layer import check_faces
-
-
-@dataclass(frozen=True, eq=False)
-class ToolMesh:
-    """A triangle mesh in the tool's own frame: vertices (N, 3) [m], faces (M, 3)."""
-
-    vertices: Points
-    faces: Faces
-
-    @classmethod
-    def of(cls, vertices: ArrayLike, faces: ArrayLike) -> ToolMesh:
-        """Checks and keeps a mesh. Raises MeshError or InvalidInput."""
-        points = finite("tool vertices", vertices, (None, 3))
-        return cls(points, check_faces(faces, len(points)))
+from stmpl_core.tool import Tool
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,17 +16,20 @@ class Contact:
     """One tool at one instant.
 
     Args:
-        name: of the tool; answers and log lines use it.
-        mesh: in the tool's frame.
+        tool: the tool.
         pose_body_from_tool: rigid transform, (4, 4), taking tool coordinates to the layer's frame.
         wrench: force [N] and torque about the tool's origin [N m] that the tool exerts *on the body*,
             in the layer's axes, (6,); None when there is no force sensor.
+        time: instant [s], on any clock that all contacts share.
+
+    Raises:
+        InvalidInput: not finite, or a pose that is not rigid.
     """
 
-    name: str
-    mesh: ToolMesh
+    tool: Tool
     pose_body_from_tool: Transform
     wrench: Wrench | None = None
+    time: float = 0.0
 
     def __post_init__(self) -> None:
         pose = finite(f"pose of {self.name}", self.pose_body_from_tool, (4, 4))
@@ -51,3 +39,8 @@ class Contact:
         object.__setattr__(self, "pose_body_from_tool", pose)
         if self.wrench is not None:
             object.__setattr__(self, "wrench", finite(f"wrench of {self.name}", self.wrench, (6,)))
+
+    @property
+    def name(self) -> str:
+        """Name of the tool."""
+        return self.tool.name

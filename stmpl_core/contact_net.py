@@ -42,13 +42,13 @@ class ContactNet:
     never below 0.
 
     Args:
-        layer: the soft layer at rest.
+        layer: soft layer at rest.
+        near: neighbours of its vertices.
         weights: a trained network; None: the one that comes with the package.
     """
 
-    def __init__(self, layer: SoftLayer, weights: Weights | None = None) -> None:
-        self.layer = layer
-        self.near = Surroundings.of(layer)
+    def __init__(self, layer: SoftLayer, near: Surroundings, weights: Weights | None = None) -> None:
+        self.near = near
         self.weights = weights or shipped()
         self._shape = np.concatenate([self.near.curvature, self.near.slope], axis=1).astype(np.float32)
         self._constants = np.array([layer.tissue.poisson_ratio, 0.0], np.float32)

@@ -1,169 +1,21 @@
-"""Haptics: a linear model of a contact that holds between two answers, and the 1 kHz loop that renders it.
-
-A node answers some 100 times a second; a hand feels what changes a thousand times a second. So each answer carries a
-LocalContact (reaction, stiffness, how far it holds), and a DeviceLoop beside the device renders it in between.
-"""
+"""DeviceLoop: renders a LocalContact to a hand-held device a thousand times a second, and keeps the loop passive."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 from typing import NamedTuple
 
 import numba
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.spatial.transform import Rotation
 
-from stmpl_core.arrays import Transform, Wrench, finite
-from stmpl_core.contact import Contact
 from stmpl_core.errors import InvalidInput
-from stmpl_core.sdf import SignedDistance
-from stmpl_core.touch import Touch, Toucher
-from stmpl_core.trust import Trust
+from stmpl_core.local_contact import FADE, LocalContact
 
-STEP = 1e-4  # m of the central differences: well above the skin's finest kinks, well below a contact's depth
-AGREEMENT = 0.1  # of the wrench: what the linear model may be off by inside its neighbourhood
-SMALLEST = 0.01  # N; smaller reactions are judged as if they were this large: 10 % of it is below what a hand feels
-WIDEST = 2e-3  # m; no neighbourhood is looked for beyond
-SHRINK = 0.9  # of the radius at which the rim should agree
-FADE = 0.1  # of the reaction: below it drag and torque fade with the normal force, to end with it
 LONGEST_DELAY = 256  # device samples that a force may be under way
 PAYBACK = 4e-3  # s in which the controller takes back what was given out
 SOFTEST = 1e-2  # m: a reaction is taken to grow from nothing within this much, when its energy is told
-
-
-class Rendered(NamedTuple):
-    """What a local model says at a pose, and whether that pose lies where it was found to hold."""
-
-    wrench: Wrench
-    inside: bool
-
-
-@dataclass(frozen=True, eq=False)
-class LocalContact:
-    """The reaction of one contact around a pose, to first order.
-
-    Args:
-        pose_body_from_tool: where it was found, (4, 4).
-        wrench: force [N] and torque about the tool's origin [N m] that the tool exerts on the body, layer axes, (6,).
-        stiffness: d wrench / d twist, (6, 6) [N/m, N/rad; N m/m, N m/rad]; the twist is (translation of the tool's
-            origin, rotation vector) in layer axes.
-        valid_m: translations up to this keep the model within 10 % of the reaction, as seen at their rim [m].
-        valid_rad: the same of rotations [rad].
-        status: of the touch at the pose.
-        trust: of the touch at the pose; figures with evaluations, how many touches the model took.
-    """
-
-    pose_body_from_tool: Transform
-    wrench: Wrench
-    stiffness: np.ndarray
-    valid_m: float
-    valid_rad: float
-    status: str
-    trust: Trust
-
-    @property
-    def normal(self) -> np.ndarray:
-        """Direction in which the tool presses, (3,) [-]; zeros when it does not."""
-        size = np.linalg.norm(self.wrench[:3])
-        return self.wrench[:3] / size if size > 0 else np.zeros(3)
-
-    def wrench_at(self, pose_body_from_tool: ArrayLike) -> Rendered:
-        """Wrench (6,) at another pose, extrapolated and never pulling: no force against `normal`.
-
-        As the normal force falls below a tenth of `wrench`, drag and torque fade with it, so that all end together.
-
-        Raises:
-            InvalidInput: a pose that is not finite.
-        """
-        pose = finite("pose", pose_body_from_tool, (4, 4))
-        twist = _twist(self.pose_body_from_tool, pose)
-        wrench = self.wrench + self.stiffness @ twist
-        normal, size = self.normal, float(np.linalg.norm(self.wrench[:3]))
-        pressing = float(normal @ wrench[:3])
-        if pressing <= 0:
-            wrench = np.zeros(6)
-        else:
-            fade = min(1.0, pressing / (FADE * size))
-            wrench[:3] = pressing * normal + fade * (wrench[:3] - pressing * normal)
-            wrench[3:] *= fade
-        move, turn = float(np.linalg.norm(twist[:3])), float(np.linalg.norm(twist[3:]))
-        return Rendered(wrench, move <= self.valid_m and turn <= self.valid_rad)
-
-
-def local_contact(toucher: Toucher, contact: Contact, field: SignedDistance, *, step: float = STEP,
-                  rotations: bool = True) -> LocalContact:
-    """The local model at the contact's pose; its wrench, if it has one, is left aside.
-
-    The stiffness is found by central differences along the normal, two tangents, and about them. What these say of the
-    curvature proposes how far the model may hold; then the reaction is found at that rim, six ways, and the rim drawn
-    in until all agree. 25 touches when the first rim agrees, 13 without rotations.
-
-    Args:
-        toucher: of the layer.
-        contact: mesh and pose.
-        field: distances of the contact's mesh.
-        step: of the differences [m]; rotations move the tool's farthest corner by as much.
-        rotations: whether to find how the wrench follows rotations; a device that feels forces only needs none. The
-            stiffness to rotations is 0 without, and valid_rad.
-
-    Raises:
-        InvalidInput: a step that is not above 0.
-    """
-    if not (math.isfinite(step) and step > 0):
-        raise InvalidInput(f"step is {step} m; it must be finite and above 0. Try {STEP:g}.")
-    probe = _Probe(toucher, contact, field)
-    touch, wrench = probe.touch(np.zeros(6))
-    frame = _frame(wrench[:3])
-    lever = float(np.linalg.norm(np.maximum(*np.abs(field.tool_bounds))))
-    allowed = AGREEMENT * max(float(np.linalg.norm(wrench[:3])), SMALLEST)
-    stiffness, valid = np.zeros((6, 6)), [0.0, 0.0]
-    for block, arm in enumerate((1.0, lever)[: 1 + rotations]):  # translations, then rotations
-        axes = np.zeros((3, 6))
-        axes[:, 3 * block : 3 * block + 3] = frame.T
-        radius, least = WIDEST / arm, step / arm
-        if wrench.any():
-            columns, bend = probe.differences(wrench, axes, step / arm, lever)
-            stiffness[:, 3 * block : 3 * block + 3] = columns @ frame.T
-            radius = min(radius, math.sqrt(2 * allowed / bend) if bend > 0 else radius)
-        while radius > least:
-            off = probe.disagreement(wrench, stiffness, axes, radius, lever)
-            if off <= allowed:
-                break
-            radius *= max(SHRINK * math.sqrt(allowed / off), 0.25)  # what is left out grows like the square
-        valid[block] = radius
-    trust = replace(touch.trust, figures={**touch.trust.figures, "evaluations": float(probe.count)})
-    return LocalContact(contact.pose_body_from_tool, wrench, stiffness, valid[0], valid[1], touch.status, trust)
-
-
-class _Probe:
-    """The contact's reaction at poses around its own."""
-
-    def __init__(self, toucher: Toucher, contact: Contact, field: SignedDistance) -> None:
-        self.toucher, self.contact, self.field, self.count = toucher, contact, field, 0
-
-    def touch(self, twist: np.ndarray) -> tuple[Touch, Wrench]:
-        """The touch, by pose alone, after a twist (6,), and the wrench that the tool then exerts."""
-        self.count += 1
-        pose = _moved(self.contact.pose_body_from_tool, twist)
-        touch = self.toucher.touch(replace(self.contact, pose_body_from_tool=pose, wrench=None), self.field)
-        return touch, touch.wrench
-
-    def differences(self, middle: Wrench, axes: np.ndarray, step: float, lever: float) -> tuple[np.ndarray, float]:
-        """Derivative of the wrench along each axis, (6, 3), and its largest second derivative, judged as a force."""
-        columns, bend = np.empty((6, 3)), 0.0
-        for k, axis in enumerate(axes):
-            ahead, behind = (self.touch(sign * step * axis)[1] for sign in (1, -1))
-            columns[:, k] = (ahead - behind) / (2 * step)
-            bend = max(bend, _as_force(ahead - 2 * middle + behind, lever) / step**2)
-        return columns, bend
-
-    def disagreement(self, wrench: Wrench, stiffness: np.ndarray, axes: np.ndarray, radius: float,
-                     lever: float) -> float:
-        """Largest difference between model and reaction at a rim, judged as a force [N]."""
-        twists = [sign * radius * axis for axis in axes for sign in (1, -1)]
-        return max(_as_force(self.touch(t)[1] - wrench - stiffness @ t, lever) for t in twists)
 
 
 @dataclass(frozen=True)
@@ -426,33 +278,3 @@ def _solved(k, c, right):
     out[1] = (q * right[0] + (a * d - f * f) * right[1] + (e * f - a * g) * right[2]) / det
     out[2] = (r * right[0] + (e * f - a * g) * right[1] + (a * b - e * e) * right[2]) / det
     return out
-
-
-def _moved(pose: Transform, twist: np.ndarray) -> Transform:
-    """The pose after a twist of the tool about its own origin, in layer axes."""
-    moved = pose.copy()
-    moved[:3, 3] += twist[:3]
-    if twist[3:].any():
-        moved[:3, :3] = Rotation.from_rotvec(twist[3:]).as_matrix() @ pose[:3, :3]
-    return moved
-
-
-def _twist(start: Transform, end: Transform) -> np.ndarray:
-    """The twist (6,) that takes one pose to the other."""
-    turn = Rotation.from_matrix(end[:3, :3] @ start[:3, :3].T).as_rotvec()
-    return np.concatenate([end[:3, 3] - start[:3, 3], turn])
-
-
-def _frame(force: np.ndarray) -> np.ndarray:
-    """Orthonormal axes as columns, (3, 3), the first along `force`."""
-    if not force.any():
-        return np.eye(3)
-    first = force / np.linalg.norm(force)
-    second = np.cross(first, np.eye(3)[np.abs(first).argmin()])
-    second /= np.linalg.norm(second)
-    return np.stack([first, second, np.cross(first, second)], axis=1)
-
-
-def _as_force(wrench: np.ndarray, lever: float) -> float:
-    """The larger of a wrench's force and of its torque over the tool's reach [N]."""
-    return max(float(np.linalg.norm(wrench[:3])), float(np.linalg.norm(wrench[3:])) / lever)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -92,10 +93,6 @@ class SoftLayer:
         self.chart = chart
         _check_surface(self)
 
-    def __getstate__(self) -> dict[str, Any]:
-        """For pickling: without what others keep on it."""
-        return {name: value for name, value in vars(self).items() if not name.startswith("_")}
-
     def with_(self, **changes: Any) -> SoftLayer:
         """A copy with `vertices`, `thickness`, `tissue` (or its fields) or `chart` changed."""
         material = {k: changes.pop(k) for k in ("youngs_modulus", "poisson_ratio", "density") if k in changes}
@@ -161,6 +158,19 @@ class SoftLayer:
         return (f"SoftLayer({len(self.vertices)} vertices, {len(self.faces)} faces, "
                 f"edges {self.edge_length * 1e3:.1f} mm, thickness {t.min():.1f}..{t.max():.1f} mm, "
                 f"E {self.tissue.youngs_modulus:g} Pa, nu {self.tissue.poisson_ratio:g})")
+
+
+def layer_id(layer: SoftLayer) -> str:
+    """Sixteen hex digits that name a layer: SHA-256 of its vertices, faces, thickness and tissue, all as published.
+
+    Vertices and thickness count as float32, so a layer that went through SkinTopology keeps its name.
+    """
+    tissue = layer.tissue
+    material = np.array([tissue.youngs_modulus, tissue.poisson_ratio, tissue.density])
+    digest = hashlib.sha256()
+    for values, kind in ((layer.vertices, "<f4"), (layer.faces, "<u4"), (layer.thickness, "<f4"), (material, "<f8")):
+        digest.update(np.ascontiguousarray(values, dtype=kind).tobytes())
+    return digest.hexdigest()[:16]
 
 
 def check_faces(faces: ArrayLike, n_vertices: int) -> Faces:

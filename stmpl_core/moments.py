@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import NamedTuple, Self
+from typing import NamedTuple
+from weakref import WeakKeyDictionary
 
 import numba
 import numpy as np
@@ -59,7 +60,7 @@ class Felt(NamedTuple):
         return self.figures[:, :, first : first + 2 * TENSORS].reshape(*self.figures.shape[:2], 2, TENSORS)
 
 
-KEPT = "_surroundings"  # attribute of a layer that has them: they live and die with it
+_KEPT: WeakKeyDictionary[SoftLayer, Surroundings] = WeakKeyDictionary()  # die with their layers, which they do not hold
 
 
 class Surroundings:
@@ -75,8 +76,7 @@ class Surroundings:
     """
 
     def __init__(self, layer: SoftLayer) -> None:
-        self.layer = layer
-        self.frames = _frames(layer.normals)
+        self.frames, self._thickness = _frames(layer.normals), layer.thickness
         points = np.ascontiguousarray(layer.vertices)
         self._thinning = Thinning(layer, self.frames, REACH)
         self._frames = self.frames.astype(np.float32)
@@ -114,22 +114,21 @@ class Surroundings:
         """The linear response alone to one field (V,) [-], (V, 3) [m]."""
         asked = self.asked(np.flatnonzero(source))
         figures = self._felt(source[asked.loaded, None], asked.loaded, asked.vertices, moments=False)
-        local = figures[:, 0, :3] * self.layer.thickness[asked.vertices, None]
-        out = np.zeros_like(self.layer.vertices)
+        local = figures[:, 0, :3] * self._thickness[asked.vertices, None]
+        out = np.zeros((len(self.frames), 3))
         asked.fill(np.einsum("nj,nji->ni", local, self.frames[asked.vertices]), out)
         return out
 
     @classmethod
-    def of(cls, layer: SoftLayer) -> Self:
+    def of(cls, layer: SoftLayer) -> Surroundings:
         """The surroundings of a layer, made on the first call and kept as long as the layer is."""
-        if KEPT not in vars(layer):
-            vars(layer)[KEPT] = cls(layer)
-        return vars(layer)[KEPT]
+        if layer not in _KEPT:
+            _KEPT[layer] = cls(layer)
+        return _KEPT[layer]
 
-    @staticmethod
-    def keep(near: Surroundings) -> None:
-        """Has `of` give these for their layer, from now on, if it has made none yet."""
-        vars(near.layer).setdefault(KEPT, near)
+    def keep(self, layer: SoftLayer) -> None:
+        """Has `of` give these for a layer from now on, which has the shape and the Poisson's ratio of their own."""
+        _KEPT[layer] = self
 
     def sinking(self, vertices: np.ndarray) -> np.ndarray:
         """How far vertex i sinks under a unit source at vertex j of those given, in thicknesses, (N, N) [-]."""
@@ -141,7 +140,7 @@ class Surroundings:
     def spread(self, vertices: np.ndarray, sources: np.ndarray) -> np.ndarray:
         """Vectors (N, 3) at vertices (N,) spread as sinking spreads, (V, 3)."""
         asked = self._thinning.asked_again(vertices)
-        by, out = np.empty((len(asked.vertices), 3)), np.zeros_like(self.layer.vertices)
+        by, out = np.empty((len(asked.vertices), 3)), np.zeros((len(self.frames), 3))
         values = np.ascontiguousarray(sources.T, dtype=np.float32)
         _spread(asked.vertices, values, np.ascontiguousarray(self._sites[:, vertices]), self._sites, self._frames,
                 self._response[0], by)  # fmt: skip

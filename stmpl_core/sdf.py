@@ -13,8 +13,8 @@ from numpy.typing import ArrayLike
 from scipy import ndimage
 
 from stmpl_core.arrays import Points, finite
-from stmpl_core.contact import ToolMesh
 from stmpl_core.errors import InvalidInput, MeshError
+from stmpl_core.tool import Tool
 
 log = logging.getLogger(__name__)
 
@@ -60,7 +60,7 @@ class SignedDistance:
 
     @classmethod
     def of(
-        cls, mesh: ToolMesh, *, spacing: float | None = None, margin: float = MARGIN, rounding: float = 0.0
+        cls, mesh: Tool, *, spacing: float | None = None, margin: float = MARGIN, rounding: float = 0.0
     ) -> Self:
         """Builds the field of `mesh`; a closed mesh that is inside out is turned, and `flipped` says so.
 
@@ -120,7 +120,7 @@ class SignedDistance:
         return _jets(self.coefficients, self.origin, self.spacing, finite("points", points, (None, 3)))
 
 
-def _checked(mesh: ToolMesh) -> tuple[Points, np.ndarray, bool, bool]:
+def _checked(mesh: Tool) -> tuple[Points, np.ndarray, bool, bool]:
     """Vertices, faces with area, whether they are closed, whether they were turned."""
     vertices = finite("tool vertices", mesh.vertices, (None, 3))
     faces = np.asarray(mesh.faces)

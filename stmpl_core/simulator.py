@@ -1,95 +1,113 @@
-"""Simulator: contacts in, deformed skin out; the node, a replay and a test all call its `step`."""
+"""Simulator: contacts in; the reaction, then the deformed skin out. Node, robot simulator, replay and test call it."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from weakref import WeakKeyDictionary
+from typing import overload
 
 import numpy as np
 
 from stmpl_core.conform import Conformed, conform
-from stmpl_core.contact import Contact, ToolMesh
+from stmpl_core.contact import Contact
 from stmpl_core.errors import InvalidInput
 from stmpl_core.layer import SoftLayer
 from stmpl_core.load import Load
 from stmpl_core.methods.base import Method
-from stmpl_core.sdf import MARGIN, SignedDistance
-from stmpl_core.touch import Touch, Toucher
+from stmpl_core.skin import Skin
+from stmpl_core.state import State
+from stmpl_core.tools import Tools
+from stmpl_core.touch import Answer, Touch
+from stmpl_core.toucher import Toucher
 from stmpl_core.trust import Displacement, Trust
 
 ENTERED = 0.02  # of the thickness: skin further inside a tool than this is said
 
 
 class Simulator:
-    """One layer, one method, any number of tools. The same contacts give the same answer, bit for bit.
+    """One skin, one method, any number of tools. The same contacts give the same answer, bit for bit on one machine.
 
     Args:
-        layer: the soft layer at rest.
-        method: how to solve; it is prepared here, unless
-        prepared: it was prepared for this very layer before.
+        layer: soft layer at rest, or a Skin, which is prepared already.
+        method: method that solves for the motion, prepared here; None: that of the Skin.
+        tools: tools with their distance fields; None: an empty store, to which contacts add theirs.
 
     Attributes:
-        toucher: finds what the tools do to the skin.
+        toucher: finds what tools do to the skin.
+
+    Raises:
+        InvalidInput: a layer without a method.
     """
 
-    def __init__(self, layer: SoftLayer, method: Method, *, prepared: bool = False) -> None:
-        self.layer = layer
-        self.method = method if prepared else method.prepare(layer)
-        self.toucher = Toucher(layer)
-        self._fields: WeakKeyDictionary[ToolMesh, SignedDistance] = WeakKeyDictionary()
+    def __init__(self, layer: SoftLayer | Skin, method: Method | None = None, tools: Tools | None = None) -> None:
+        if isinstance(layer, Skin):
+            self.skin = layer
+        elif method is None:
+            raise InvalidInput("a simulator needs a method. Try Simulator(layer, MomentNet()).")
+        else:
+            self.skin = Skin.of(layer, method)
+        self.layer, self.method = self.skin.layer, self.skin.method
+        self.toucher = Toucher(self.layer, self.skin.near, tools)
 
-    def prepare_tool(self, mesh: ToolMesh) -> SignedDistance:
-        """The distance field of `mesh`, built on the first call (up to a second), kept as long as the mesh is.
+    @property
+    def tools(self) -> Tools:
+        """Tools that may touch this skin."""
+        return self.toucher.tools
+
+    @overload
+    def touch(self, contacts: Sequence[Contact]) -> list[Touch]: ...
+
+    @overload
+    def touch(self, contacts: Sequence[Contact], state: State, dt: float) -> tuple[list[Touch], State]: ...
+
+    def touch(
+        self, contacts: Sequence[Contact], state: State | None = None, dt: float = 0.0
+    ) -> list[Touch] | tuple[list[Touch], State]:
+        """The reaction: what each contact does, fast; the skin's motion is found by `answer`.
+
+        Args:
+            contacts: tools at one instant, each once.
+            state: memory of the steps before; None: no memory, and none is returned.
+            dt: time since that state [s].
 
         Raises:
-            MeshError: a mesh that cannot be a tool (see SignedDistance.of).
-        """
-        if mesh not in self._fields:
-            self._fields[mesh] = SignedDistance.of(mesh, margin=max(MARGIN, 2 * self.toucher.hole))
-        return self._fields[mesh]
-
-    def keep_field(self, mesh: ToolMesh, field: SignedDistance) -> None:
-        """Takes a distance field of `mesh` that was built elsewhere, as `prepare_tool` would have built it."""
-        self._fields[mesh] = field
-
-    def step(self, contacts: Sequence[Contact]) -> Displacement:
-        """The skin's displacement under `contacts`, with what was found of each.
-
-        Raises:
-            InvalidInput: two contacts of one name.
-            MeshError: a tool's mesh that cannot be used.
+            InvalidInput: two contacts of one name, or a dt below 0.
+            MeshError: a tool's surface that cannot be used.
         """
         names = [contact.name for contact in contacts]
         if len(set(names)) < len(names):
             raise InvalidInput(f"contacts must have names of their own; got {', '.join(names)}.")
+        if not dt >= 0:
+            raise InvalidInput(f"dt is {dt} s; time goes forward, allowed is 0 or more.")
+        touches = self.toucher.touch_all(contacts)
+        return touches if state is None else (touches, state)
 
-        # Touch: each tool's mesh, pose and wrench become a pressure on the skin.
-        fields = [self.prepare_tool(contact.mesh) for contact in contacts]
-        touches = self.toucher.touch_all(contacts, fields)
-
+    def answer(self, touches: Sequence[Touch]) -> Answer:
+        """The field: the skin's motion under touches of this simulator."""
         # Sum: pressures of several tools add.
-        pressure = sum((touch.load.values for touch in touches), np.zeros(len(self.layer.vertices)))
-        load = Load.contact(pressure)
+        zero = np.zeros(len(self.layer.vertices))
+        load = Load.contact(sum((touch.pressure for touch in touches if touch.pressure is not None), zero))
 
         # Solve: the method moves the skin, and what is touched lies on its tool; where nothing presses, nothing moves.
         if load.values.any():
-            answer = self.method.solve(load)
-            fitted = conform(self.toucher.net.near, answer.displacement, touches, fields)
+            solved = self.method.solve(load)
+            fitted = conform(self.layer, self.skin.near, solved.displacement, touches)
         else:
-            answer = Displacement(np.zeros_like(self.layer.vertices), Trust(), self.method.name)
-            fitted = Conformed(answer.displacement, 0.0, 0.0)
+            solved = Displacement(np.zeros_like(self.layer.vertices), Trust(), self.method.name)
+            fitted = Conformed(solved.displacement, 0.0, 0.0)
 
         # Say what may be believed: what the method says, and what was found of each contact.
-        trust = _joined(answer.trust, dict(zip(names, touches, strict=True)), fitted)
+        trust = _joined(solved.trust, touches, fitted)
         if fitted.entered > ENTERED * float(self.layer.thickness.min()):
             trust = trust.also(f"skin is {fitted.entered * 1e3:.2f} mm inside a tool", in_range=False)
-        statuses = {name: touch.status for name, touch in zip(names, touches, strict=True)}
-        wrenches = {name: touch.wrench for name, touch in zip(names, touches, strict=True)}
-        return Displacement(fitted.displacement, trust, answer.method, load.values, statuses, wrenches)
+        return Answer(fitted.displacement, trust, solved.method, load.values, {touch.name: touch for touch in touches})
+
+    def step(self, contacts: Sequence[Contact]) -> Answer:
+        """`touch`, then `answer`. Raises what `touch` raises."""
+        return self.answer(self.touch(contacts))
 
 
-def _joined(trust: Trust, touches: dict[str, Touch], fitted: Conformed) -> Trust:
-    """The method's trust, lowered by that of the contacts; their figures carry their names.
+def _joined(trust: Trust, touches: Sequence[Touch], fitted: Conformed) -> Trust:
+    """The method's trust, lowered by that of the contacts.
 
     The method's error bound is for the pressure that it was given. How far that is from what the tools press with is
     not known, so it becomes a figure, and the answer states no bound.
@@ -99,8 +117,7 @@ def _joined(trust: Trust, touches: dict[str, Touch], fitted: Conformed) -> Trust
         figures |= {"conformed_m": fitted.corrected, "entered_m": fitted.entered}
     if touches and trust.error_bound is not None:
         figures["bound_given_pressure_m"] = trust.error_bound
-    for name, touch in touches.items():
-        figures |= {f"{name}.{figure}": value for figure, value in touch.trust.figures.items()}
+    for touch in touches:
         if touch.trust.why:
             trust = trust.also(touch.trust.why, in_range=touch.trust.in_range, converged=touch.trust.converged)
     return Trust(trust.converged, trust.in_range, None if touches else trust.error_bound, trust.why, figures)

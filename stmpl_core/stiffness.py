@@ -11,8 +11,8 @@ from scipy.optimize import minimize_scalar
 
 from stmpl_core.contact import Contact
 from stmpl_core.errors import InvalidInput
-from stmpl_core.sdf import SignedDistance
-from stmpl_core.touch import SIDEWAYS, Touch, Toucher
+from stmpl_core.touch import Touch
+from stmpl_core.toucher import SIDEWAYS, Toucher
 from stmpl_core.trust import Trust
 
 FEWEST = 6  # presses that may be believed
@@ -25,13 +25,6 @@ ALIKE = 2e-3  # relative error of the forces up to which the smaller of two offs
 WORST_FIT = 0.15  # relative error of the forces that is left: more is no skin of one stiffness
 WORST_ERROR = 0.25  # of the modulus
 AT_THE_END = 1e-4  # m from the ends of the search: the offset that is sought may lie outside
-
-
-class Press(NamedTuple):
-    """A tool at one instant, with its wrench, and its distance field."""
-
-    contact: Contact
-    field: SignedDistance
 
 
 @dataclass(frozen=True)
@@ -69,7 +62,7 @@ class _Fit(NamedTuple):
     cost: float  # mean weighted square of the relative errors
 
 
-def fit_stiffness(toucher: Toucher, presses: Sequence[Press]) -> Stiffness:
+def fit_stiffness(toucher: Toucher, presses: Sequence[Contact]) -> Stiffness:
     """The modulus E with which the contact law explains the measured forces.
 
     By dimensional analysis the force at a pose is E g, where g does not depend on E. For a given offset s of the poses
@@ -80,16 +73,16 @@ def fit_stiffness(toucher: Toucher, presses: Sequence[Press]) -> Stiffness:
     law's own error counts once for all presses, since it is alike in all of them.
 
     Args:
-        toucher: of the skin, of whatever stiffness.
-        presses: that pressed one at a time, with their wrenches.
+        toucher: contact law on the skin, of whatever stiffness.
+        presses: contacts with their wrenches, of tools that pressed one at a time.
 
     Raises:
         InvalidInput: a press without a wrench.
     """
     for press in presses:
-        if press.contact.wrench is None:
-            raise InvalidInput(f"a press of {press.contact.name} has no wrench; stiffness needs the force.")
-    pressing = [one for one in presses if one.contact.wrench is not None and one.contact.wrench[:3].any()]
+        if press.wrench is None:
+            raise InvalidInput(f"a press of {press.name} has no wrench; stiffness needs the force.")
+    pressing = [one for one in presses if one.wrench is not None and one.wrench[:3].any()]
     if len(pressing) < FEWEST:
         return _nothing(f"{len(pressing)} of {len(presses)} instants pressed with a force; {FEWEST} are needed. "
                         "Press, at several depths, and ask again")  # fmt: skip
@@ -110,9 +103,9 @@ def fit_stiffness(toucher: Toucher, presses: Sequence[Press]) -> Stiffness:
 class _Presses:
     """Presses and the law's forces at their poses, shifted along their push."""
 
-    def __init__(self, toucher: Toucher, presses: list[Press]) -> None:
+    def __init__(self, toucher: Toucher, presses: list[Contact]) -> None:
         self._toucher, self._presses = toucher, presses
-        self._forces = np.array([one.contact.wrench[:3] for one in presses if one.contact.wrench is not None])
+        self._forces = np.array([one.wrench[:3] for one in presses if one.wrench is not None])
         sizes = np.linalg.norm(self._forces, axis=1)
         self._pushes = self._forces / sizes[:, None]
         self._weigh_by = np.maximum(sizes, LIGHT * np.quantile(sizes, 0.9))  # N
@@ -121,10 +114,10 @@ class _Presses:
         """What the law says of each press, by its shifted pose alone."""
         return [self._touch(press, offset * push) for press, push in zip(self._presses, self._pushes, strict=True)]
 
-    def _touch(self, press: Press, shift: np.ndarray) -> Touch:
-        pose = press.contact.pose_body_from_tool.copy()
+    def _touch(self, press: Contact, shift: np.ndarray) -> Touch:
+        pose = press.pose_body_from_tool.copy()
         pose[:3, 3] += shift
-        return self._toucher.touch(Contact(press.contact.name, press.contact.mesh, pose), press.field)
+        return self._toucher.touch(Contact(press.tool, pose))
 
     def best_offset(self) -> float:
         """Along the push [m]."""
@@ -158,14 +151,14 @@ class _Presses:
             weights = np.minimum(1.0, most / np.maximum(np.abs(errors), 1e-300))
         return _Fit(modulus, weights, float((weights * errors**2).sum() / weights.sum()))
 
-    def sound(self, press: Press, touch: Touch) -> bool:
+    def sound(self, press: Contact, touch: Touch) -> bool:
         """Whether a press may count: validated, or apart, and not dragging; what drags says little of the normal."""
         size = float(np.linalg.norm(touch.wrench[:3]))
         if not size:
             return True
-        assert press.contact.wrench is not None
-        normal = touch.wrench[:3] / size * (press.contact.wrench[:3] @ touch.wrench[:3]) / size
-        dragging = float(np.linalg.norm(press.contact.wrench[:3] - normal))
+        assert press.wrench is not None
+        normal = touch.wrench[:3] / size * (press.wrench[:3] @ touch.wrench[:3]) / size
+        dragging = float(np.linalg.norm(press.wrench[:3] - normal))
         return touch.trust.in_range and dragging <= SIDEWAYS * float(np.linalg.norm(normal))
 
     def told(self, offset: float, touches: list[Touch]) -> Stiffness:
@@ -175,7 +168,7 @@ class _Presses:
         if not fit.modulus > 0:
             return _nothing("no force points into the skin where the poses touch it: is it what the tool exerts on "
                             "the body, and are the poses right?")  # fmt: skip
-        depths = [touch.trust.figures["depth_m"] for touch in touches if touch.trust.figures["normal_n"] > 0]
+        depths = [touch.depth for touch in touches if touch.force > 0]
         residual = float(np.sqrt(fit.cost))
         error = self._error(offset, fit, residual)
         trust, reach = Trust(), self._toucher.reach

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from stmpl_core.arrays import PerVertex, VertexVectors, Wrench
+from stmpl_core.arrays import PerVertex, VertexVectors
 
 
 @dataclass(frozen=True)
@@ -45,23 +45,19 @@ class Trust:
 
 @dataclass(frozen=True, eq=False)
 class Displacement:
-    """The answer of a method.
+    """What a method gives for a load.
 
     Args:
-        displacement: of each vertex, (V, 3) [m], in the layer's frame.
+        displacement: motion of each vertex, (V, 3) [m], in the layer's frame.
         trust: what may be believed of it.
         method: name of the method that answered.
-        pressure: the pressure that was solved for, (V,) [Pa], if the method or the simulator knows it.
-        statuses: what was found of each contact, by its name ("touching", "wrench without touch", ...).
-        wrenches: what each tool exerts on the body, about its origin, in the layer's axes, (6,) [N, N m], by its name.
+        pressure: pressure that was solved for, (V,) [Pa], if the method knows it.
     """
 
     displacement: VertexVectors
     trust: Trust
     method: str
     pressure: PerVertex | None = None
-    statuses: Mapping[str, str] = field(default_factory=dict)
-    wrenches: Mapping[str, Wrench] = field(default_factory=dict)
 
     @property
     def magnitude(self) -> PerVertex:

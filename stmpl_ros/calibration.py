@@ -3,21 +3,20 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from concurrent.futures import CancelledError, Future
 
 import numpy as np
 from rclpy.node import Node
 from stmpl_msgs.srv import Calibrate
 
+from stmpl_core.contact import Contact
 from stmpl_core.errors import InvalidInput
 from stmpl_core.stiffness import Stiffness
-from stmpl_core.touch import MOVED, TOUCHING
-from stmpl_core.trust import Displacement
-from stmpl_ros.background import Background
+from stmpl_core.touch import MOVED, TOUCHING, Answer
 from stmpl_ros.inbox import Instant
 from stmpl_ros.waiting import WaitingService, by_executor
-from stmpl_ros.workshop import Placed, Pressed
+from stmpl_ros.workshop import Workshop
 
 KEPT = 400  # presses
 APART = 1e-4  # m that a tool moves from one press that is kept to the next
@@ -32,15 +31,13 @@ class Calibration:
 
     Args:
         node: whose service it is.
-        background: the node's, asked for when there is something to fit; None while it is not configured.
+        workshop: gives the node's workshop, or None while the node is not configured.
         apply: has the node answer with this Young's modulus [Pa] from then on; may raise a StmplError.
     """
 
-    def __init__(
-        self, node: Node, background: Callable[[], Background | None], apply: Callable[[float], str]
-    ) -> None:
-        self._node, self._background, self._apply = node, background, apply
-        self.presses: deque[Pressed] = deque(maxlen=KEPT)
+    def __init__(self, node: Node, workshop: Callable[[], Workshop | None], apply: Callable[[float], str]) -> None:
+        self._node, self._workshop, self._apply = node, workshop, apply
+        self.presses: deque[Contact] = deque(maxlen=KEPT)
         self._service = WaitingService(node, Calibrate, "calibrate", self._serve)
 
     def close(self) -> None:
@@ -51,18 +48,17 @@ class Calibration:
         """Starts anew."""
         self.presses.clear()
 
-    def put(self, instant: Instant, answer: Displacement, meshes: Mapping[str, int]) -> None:
-        """Keeps an instant if one tool alone pressed with a wrench, and has moved; `meshes`: each tool's number."""
-        pressing = [contact for contact in instant.contacts if answer.statuses[contact.name] in CARRYING]
-        if len(pressing) != 1 or sum(wrench.any() for wrench in answer.wrenches.values()) > 1:
+    def put(self, instant: Instant, answer: Answer) -> None:
+        """Keeps an instant if one tool alone pressed with a wrench, and has moved."""
+        pressing = [contact for contact in instant.contacts if answer.touches[contact.name].status in CARRYING]
+        if len(pressing) != 1 or sum(touch.wrench.any() for touch in answer.touches.values()) > 1:
             return
         (contact,) = pressing
-        assert contact.wrench is not None
-        placed = Placed(contact.name, meshes[contact.name], contact.pose_body_from_tool)
-        last = self.presses[-1].placed if self.presses else None
-        moved = np.inf if last is None or last[:2] != placed[:2] else np.abs((placed.pose - last.pose)[:3, 3]).max()
+        last, moved = self.presses[-1] if self.presses else None, np.inf
+        if last is not None and last.tool is contact.tool:
+            moved = np.abs((contact.pose_body_from_tool - last.pose_body_from_tool)[:3, 3]).max()
         if moved >= APART:
-            self.presses.append(Pressed(placed, contact.wrench))
+            self.presses.append(contact)
 
     def _serve(self, request: Calibrate.Request, response: Calibrate.Response) -> Calibrate.Response:
         """On a thread of its own, which waits."""
@@ -78,11 +74,11 @@ class Calibration:
         return response
 
     def _fit(self, tool: str) -> Future[Stiffness]:
-        if (background := self._background()) is None:
+        if (workshop := self._workshop()) is None:
             raise InvalidInput("the node is not configured, so it has no skin to calibrate.")
-        newest = {one.placed.tool: one.placed.mesh for one in self.presses}  # a tool that changed is another one
-        chosen = [one for one in self.presses if one.placed.mesh == newest[one.placed.tool]]
-        return background.stiffness([one for one in chosen if tool in ("", one.placed.tool)])
+        newest = {press.name: press.tool for press in self.presses}  # a tool that changed is another one
+        chosen = [press for press in self.presses if press.tool is newest[press.name]]
+        return workshop.stiffness([press for press in chosen if tool in ("", press.name)])
 
 
 def response_of(found: Stiffness) -> Calibrate.Response:

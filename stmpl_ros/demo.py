@@ -22,7 +22,8 @@ from bags.replay import ReplaySummary, replay_run
 from bags.report import write_report
 from fem_tools import RigidFem
 from stmpl_core.errors import StmplError
-from stmpl_ros.parameters import METHODS, DemoConfig, ProbeConfig
+from stmpl_core.methods import method as method_named
+from stmpl_ros.parameters import DemoConfig, ProbeConfig
 from stmpl_ros.tables import compare_with_progress, comparison_table
 
 log = logging.getLogger(__name__)
@@ -64,7 +65,7 @@ def run(config: DemoConfig) -> int:
 
 def _replay(folder: Path, method: str, console: Console) -> ReplaySummary:
     with console.status("replaying the run"):
-        return replay_run(folder, METHODS[method](), every=REPLAY_EVERY)
+        return replay_run(folder, method_named(method), every=REPLAY_EVERY)
 
 
 def play(config: DemoConfig, folder: Path, console: Console) -> None:

@@ -2,36 +2,32 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from importlib.util import find_spec
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
-from geometry_msgs.msg import PoseStamped, WrenchStamped
-from rclpy.node import Node
-from rclpy.time import Time
 from ruamel.yaml import YAML, YAMLError
 
-from bags.messages import pose_from, stamp_ns, wrench_from
+from bags.wire import pose_from
 from stmpl_core.arrays import Transform
 from stmpl_core.errors import InvalidInput, StmplError
-from stmpl_ros.conversions import wrench_message
 
-ITSELF = np.eye(4)  # where the body's frame stands
 SHAPE = "name: {position: [x, y, z], orientation: [x, y, z, w]}, in metres, both optional"
 
 
-class Frames:
-    """Brings poses and wrenches into the body's frame.
+class Frames(Mapping[str, Transform]):
+    """pose_body_from_frame, (4, 4), by the name of the frame.
 
     Args:
         body: frame_id of the body.
-        table: pose_body_from_frame of each frame that does not move, (4, 4).
-        node: that listens to /tf for all others, if tf2_ros is installed.
+        table: frames that do not move.
+        node: node that listens to /tf for all others, if tf2_ros is installed.
     """
 
-    def __init__(self, body: str, table: Mapping[str, Transform], node: Node | None = None) -> None:
+    def __init__(self, body: str, table: Mapping[str, Transform], node: Any = None) -> None:
         self.body, self.table, self._buffer = body, dict(table), None
         if node is not None and find_spec("tf2_ros"):
             from tf2_ros import Buffer, TransformListener  # pyright: ignore[reportMissingImports]
@@ -39,30 +35,23 @@ class Frames:
             self._buffer = Buffer()
             self._listener = TransformListener(self._buffer, node)
 
-    def of(self, frame: str) -> Transform | None:
-        """pose_body_from_frame, (4, 4), or None if nobody knows it."""
+    def __getitem__(self, frame: str) -> Transform:
         if frame == self.body:
-            return ITSELF
-        if frame in self.table:
+            return np.eye(4)
+        if frame in self.table or self._buffer is None:
             return self.table[frame]
-        if self._buffer is None or not frame or not self._buffer.can_transform(self.body, frame, Time()):
-            return None
-        moved: Any = self._buffer.lookup_transform(self.body, frame, Time()).transform
-        message = PoseStamped().pose
-        message.orientation = moved.rotation
-        message.position.x, message.position.y, message.position.z = (
-            moved.translation.x, moved.translation.y, moved.translation.z
-        )  # fmt: skip
-        return pose_from(message)
+        from rclpy.time import Time
 
-    def wrench(self, message: WrenchStamped, tool: str) -> WrenchStamped:
-        """A tool's wrench, about its origin, in the body's axes; what is in the tool's or unknown ones stays."""
-        frame = message.header.frame_id
-        pose_body_from_frame = None if frame in (self.body, tool) else self.of(frame)
-        if pose_body_from_frame is None:
-            return message
-        values = wrench_from(message, body_frame=self.body, tool=frame, pose_body_from_tool=pose_body_from_frame)
-        return wrench_message(values, self.body, stamp_ns(message))
+        if not frame or not self._buffer.can_transform(self.body, frame, Time()):
+            raise KeyError(frame)
+        moved: Any = self._buffer.lookup_transform(self.body, frame, Time()).transform
+        return pose_from(SimpleNamespace(position=moved.translation, orientation=moved.rotation))
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.table)
+
+    def __len__(self) -> int:
+        return len(self.table)
 
 
 def read_frames(path: str) -> dict[str, Transform]:
@@ -82,14 +71,13 @@ def _placed(path: str, name: str, given: Any) -> Transform:
     try:
         if not isinstance(given, dict) or given.keys() - {"position", "orientation"}:
             raise ValueError(f"it is {given!r}")
-        message = PoseStamped().pose
-        p, q = message.position, message.orientation
-        p.x, p.y, p.z = (float(value) for value in given.get("position", (0, 0, 0)))
-        q.x, q.y, q.z, q.w = (float(value) for value in given.get("orientation", (0, 0, 0, 1)))
-        pose = pose_from(message)
+        position = dict(zip("xyz", (float(v) for v in given.get("position", (0, 0, 0))), strict=True))
+        orientation = dict(zip("xyzw", (float(v) for v in given.get("orientation", (0, 0, 0, 1))), strict=True))
+        pose = pose_from(
+            SimpleNamespace(position=SimpleNamespace(**position), orientation=SimpleNamespace(**orientation))
+        )
         if not np.isfinite(pose).all():
             raise ValueError("it is not finite")
         return pose
-    except (ValueError, TypeError, AssertionError, StmplError) as error:
+    except (ValueError, TypeError, StmplError) as error:
         raise InvalidInput(f"frame '{name}' of {path}: {error}. Expected {SHAPE}.") from error
-

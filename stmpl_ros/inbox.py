@@ -1,13 +1,15 @@
-"""Inbox: the newest mesh, pose and wrench of every tool, and when an instant is complete."""
+"""Inbox: the newest pose and wrench of every tool, and when an instant is complete."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
 from typing import Any
 
-from bags.messages import wrench_from
+from bags import wire
+from bags.frame import Stamps
 from stmpl_core.arrays import Transform
-from stmpl_core.contact import Contact, ToolMesh
+from stmpl_core.contact import Contact
+from stmpl_core.tools import Tools
 
 RECENT = 1_000_000_000  # ns for which a tool that fell silent is spoken of
 PATIENCE = 3  # poses of a tool that may pass a missing partner before the newest of each is taken as it is
@@ -27,11 +29,9 @@ class Stream:
 
 
 @dataclass
-class Tool:
-    """What is known of one tool."""
+class Input:
+    """Streams of one tool: poses in the body's frame (4, 4), and WrenchStamped messages."""
 
-    mesh: ToolMesh
-    number: int = 0  # of the mesh
     pose: Stream = field(default_factory=Stream)
     wrench: Stream = field(default_factory=Stream)
 
@@ -41,9 +41,9 @@ class Instant:
     """Contacts to answer together.
 
     Args:
-        contacts: one a live tool.
-        stamp: of the newest pose among them [ns].
-        skew: how far their stamps lie apart [ns].
+        contacts: one contact a live tool.
+        stamp: stamp of the newest pose among them [ns].
+        skew: time between their stamps [ns].
         inputs: stamps of each tool's pose and wrench [ns]; 0: no wrench.
         lost: streams that fell silent: a pose within the last second, a wrench while its tool still moves.
     """
@@ -51,7 +51,7 @@ class Instant:
     contacts: list[Contact]
     stamp: int
     skew: int
-    inputs: dict[str, tuple[int, int]]
+    inputs: Stamps
     lost: tuple[str, ...] = ()
 
 
@@ -63,35 +63,35 @@ class Inbox:
     answered with the newest of the rest, until an instant is complete again.
 
     Args:
+        tools: tools in use; others are not listened to.
         body_frame: frame that poses are in.
-        rest_after: a stream that is silent for longer than this is no longer live [ns].
+        frames: pose_body_from_frame of other frames that wrenches may be in.
+        rest_after: silence after which a stream is no longer live [ns].
     """
 
-    def __init__(self, body_frame: str, rest_after: int) -> None:
-        self.body_frame = body_frame
-        self.rest_after = rest_after
-        self.tools: dict[str, Tool] = {}
+    def __init__(
+        self, tools: Tools, body_frame: str, rest_after: int, frames: wire.FixedFrames = wire.NO_FRAMES
+    ) -> None:
+        self.tools, self.body_frame, self.frames, self.rest_after = tools, body_frame, frames, rest_after
+        self.inputs: dict[str, Input] = {}
         self.out_of_order = 0
         self.waiting: set[str] = set()  # tools whose newest pose was not handed out yet
         self.missed = 0
 
-    def put_mesh(self, name: str, mesh: ToolMesh, number: int = 0) -> None:
-        """Keeps the mesh of a tool, new or changed, under a number of the caller's."""
-        if name in self.tools:
-            self.tools[name].mesh, self.tools[name].number = mesh, number
-        else:
-            self.tools[name] = Tool(mesh, number)
-
-    def forget(self) -> None:
-        """Forgets every pose and wrench; the meshes stay."""
-        for tool in self.tools.values():
-            tool.pose, tool.wrench = Stream(), Stream()
-        self.waiting.clear()
+    def forget(self, name: str | None = None) -> None:
+        """Forgets every pose and wrench, or those of one tool."""
+        for one in [name] if name else list(self.inputs):
+            self.inputs.pop(one, None)
+            self.waiting.discard(one)
         self.missed = 0
+
+    def pose_of(self, name: str) -> Transform | None:
+        """The newest pose of a tool, if there is one."""
+        return self.inputs[name].pose.value if name in self.inputs else None
 
     def put_pose(self, name: str, pose: Transform, stamp: int, now: int) -> bool:
         """Keeps a pose; False if it was dropped as repeated or out of order."""
-        if not self._put(self.tools[name].pose, pose, stamp, now):
+        if not self._put(self.inputs.setdefault(name, Input()).pose, pose, stamp, now):
             return False
         self.missed += name in self.waiting
         self.waiting.add(name)
@@ -99,7 +99,7 @@ class Inbox:
 
     def put_wrench(self, name: str, wrench: Any, stamp: int, now: int) -> bool:
         """Keeps a WrenchStamped; False if it was dropped as repeated or out of order."""
-        return self._put(self.tools[name].wrench, wrench, stamp, now)
+        return self._put(self.inputs.setdefault(name, Input()).wrench, wrench, stamp, now)
 
     def _put(self, stream: Stream, value: Any, stamp: int, now: int) -> bool:
         if stream.live(now, self.rest_after) and stamp <= stream.stamp:
@@ -108,18 +108,19 @@ class Inbox:
         stream.value, stream.stamp, stream.came = value, stamp, now
         return True
 
-    def live(self, now: int) -> dict[str, Tool]:
-        """The tools whose pose came lately."""
-        return {name: tool for name, tool in self.tools.items() if tool.pose.live(now, self.rest_after)}
+    def live(self, now: int) -> dict[str, Input]:
+        """The inputs of the tools whose pose came lately."""
+        return {name: one for name, one in self.inputs.items()
+                if name in self.tools and one.pose.live(now, self.rest_after)}  # fmt: skip
 
     def silence(self, now: int) -> int:
         """Time since the newest pose of any tool came [ns]."""
-        return now - max((tool.pose.came for tool in self.tools.values()), default=now)
+        return now - max((one.pose.came for one in self.inputs.values()), default=now)
 
-    def _lost(self, live: dict[str, Tool], now: int) -> tuple[str, ...]:
-        silent = {name: tool for name, tool in self.tools.items() if tool.pose.value is not None and name not in live}
-        poses = [f"pose of {name}" for name, tool in silent.items() if now - tool.pose.came <= self.rest_after + RECENT]
-        dumb = {name: tool.wrench for name, tool in live.items() if tool.wrench.value is not None}
+    def _lost(self, live: dict[str, Input], now: int) -> tuple[str, ...]:
+        silent = {name: one for name, one in self.inputs.items() if one.pose.value is not None and name not in live}
+        poses = [f"pose of {name}" for name, one in silent.items() if now - one.pose.came <= self.rest_after + RECENT]
+        dumb = {name: one.wrench for name, one in live.items() if one.wrench.value is not None}
         return *poses, *(f"wrench of {name}" for name, s in dumb.items() if not s.live(now, self.rest_after))
 
     def take(self, now: int) -> Instant | None:
@@ -127,23 +128,24 @@ class Inbox:
         live = self.live(now)
         if not self.waiting & live.keys():
             return None
-        poses = [tool.pose.stamp for tool in live.values()]
-        stamps = poses + [tool.wrench.stamp for tool in live.values() if tool.wrench.live(now, self.rest_after)]
+        poses = [one.pose.stamp for one in live.values()]
+        stamps = poses + [one.wrench.stamp for one in live.values() if one.wrench.live(now, self.rest_after)]
         skew = max(stamps) - min(stamps)
         if skew and self.missed < PATIENCE * len(live):
             return None
         self.missed = self.missed if skew else 0
         self.waiting.clear()
         inputs = {
-            name: (tool.pose.stamp, tool.wrench.stamp if tool.wrench.live(now, self.rest_after) else 0)
-            for name, tool in live.items()
+            name: (one.pose.stamp, one.wrench.stamp if one.wrench.live(now, self.rest_after) else 0)
+            for name, one in live.items()
         }
-        contacts = [self._contact(name, tool, now) for name, tool in live.items()]
+        contacts = [self._contact(name, one, now) for name, one in live.items()]
         return Instant(contacts, max(poses), skew, inputs, self._lost(live, now))
 
-    def _contact(self, name: str, tool: Tool, now: int) -> Contact:
-        pose = tool.pose.value
-        if not tool.wrench.live(now, self.rest_after):
-            return Contact(name, tool.mesh, pose)
-        wrench = wrench_from(tool.wrench.value, body_frame=self.body_frame, tool=name, pose_body_from_tool=pose)
-        return Contact(name, tool.mesh, pose, wrench)
+    def _contact(self, name: str, one: Input, now: int) -> Contact:
+        tool, pose, time = self.tools[name], one.pose.value, one.pose.stamp / wire.NANO
+        if not one.wrench.live(now, self.rest_after):
+            return Contact(tool, pose, time=time)
+        wrench = wire.wrench_from(one.wrench.value, body_frame=self.body_frame, tool=name, pose_body_from_tool=pose,
+                                  frames=self.frames)  # fmt: skip
+        return Contact(tool, pose, wrench, time)

@@ -9,7 +9,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from ruamel.yaml import YAML, YAMLError
 
 from stmpl_core.errors import InvalidInput
-from stmpl_core.trust import Displacement
+from stmpl_core.touch import Answer
 
 ADVISORY = "advisory, not a safety function"
 
@@ -62,12 +62,12 @@ class Limits:
             raise InvalidInput(f"limits file {path} has no region '{region}'; it has {', '.join(file.regions)}.")
         return cls(region, file.regions[region], file.warn_at)
 
-    def put(self, answer: Displacement) -> None:
+    def put(self, answer: Answer) -> None:
         """Takes an answer. Force is what each contact presses with, by itself."""
         if answer.pressure is not None:
             peak = 1e-3 * float(np.max(answer.pressure, initial=0.0))
             self.pressure_share = max(self.pressure_share, peak / self.limit.pressure_kpa)
-        force = max((answer.trust.figures.get(f"{tool}.normal_n", 0.0) for tool in answer.statuses), default=0.0)
+        force = max((touch.force for touch in answer.touches.values()), default=0.0)
         self.force_share = max(self.force_share, force / self.limit.force_n)
 
     def take(self) -> tuple[bool, dict[str, str]]:

@@ -3,30 +3,15 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
 from pathlib import Path
 from typing import Literal
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator
 from pydantic.config import JsonDict
 
-from stmpl_core.methods import Linear, Method, MomentNet, Naive, UNet, Winkler
+from stmpl_core.methods import Method, method
 
 ACCURACY = 2e-4  # m
-
-
-def ladder(accuracy: float = ACCURACY, solve_time: float = 0.0) -> Method:
-    """The cheapest method that is accurate enough [m] in this time [s]; 0: there is time (studies.calibrate)."""
-    from fem_tools.ladder import ladder as by_measured_chart  # takes a second to import
-
-    return by_measured_chart(accuracy=accuracy, deadline=solve_time or None)
-
-
-METHODS: dict[str, Callable[[], Method]] = {
-    "moment_net": MomentNet, "unet": UNet, "linear": Linear, "winkler": Winkler, "naive": Naive, "ladder": ladder
-}  # fmt: skip
-
-
 PHENOTYPE = ("gender", "age", "muscle", "weight", "height", "proportions")
 ANY_TIME: JsonDict = {"when": "any time"}  # a running node takes it over at once
 CONFIGURING: JsonDict = {"when": "configuring"}  # counts when the node is configured, or by ~/set_body
@@ -131,7 +116,9 @@ class NodeConfig(BaseModel):
 
     def new_method(self) -> Method:
         """The method, not yet prepared."""
-        return ladder(self.accuracy, self.solve_time) if self.method == "ladder" else METHODS[self.method]()
+        if self.method == "ladder":
+            return method("ladder", accuracy=self.accuracy, deadline=self.solve_time or None)
+        return method(self.method)
 
     @property
     def phenotype_values(self) -> dict[str, float]:

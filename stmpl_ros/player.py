@@ -15,9 +15,10 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
 from bags.reader import Bag, Raw
 from bags.schema import find_schema
+from bags.wire import message_class
 from bags.writer import Offered, offered
 from stmpl_core.errors import BagError, InvalidInput
-from stmpl_ros.recorder import message_class, pattern
+from stmpl_ros.recorder import pattern
 from stmpl_ros.spinning import ros
 
 log = logging.getLogger(__name__)

@@ -13,9 +13,8 @@ from rclpy.node import Node
 from rclpy.publisher import Publisher
 from stmpl_msgs.msg import ContactMesh, SkinTopology
 
-from bags.messages import layer_from
+from bags.wire import layer_from, pose_message, tool_message, wrench_message
 from stmpl_core.layer import SoftLayer
-from stmpl_ros.conversions import mesh_message, pose_message, wrench_message
 from stmpl_ros.parameters import ProbeConfig
 from stmpl_ros.scripts import SCRIPTS, Motion, Script
 from stmpl_ros.spinning import ros
@@ -61,7 +60,7 @@ class ProbeNode(Node):
             name = motion.device.name
             pose = self.create_publisher(PoseStamped, f"tools/{name}/pose", STREAM)
             wrench = self.create_publisher(WrenchStamped, f"tools/{name}/wrench", STREAM)
-            self.mesh.publish(mesh_message(name, motion.mesh, self.get_clock().now().nanoseconds))
+            self.mesh.publish(tool_message(motion.tool, self.get_clock().now().nanoseconds))
             devices.append(Played(motion, pose, wrench))
         publishers = [publisher for device in devices for publisher in (device.pose, device.wrench)]
         return devices if self._wait_for_listeners(publishers, stop) else None

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 import json
 import logging
 import queue
@@ -20,6 +19,7 @@ from rclpy.utilities import ok
 
 from bags.provenance import write_provenance
 from bags.schema import find_schema
+from bags.wire import message_class
 from bags.writer import BagWriter, qos_yaml
 from stmpl_core.errors import BagError, InvalidInput
 from stmpl_ros.frames import read_frames
@@ -134,15 +134,6 @@ class RecorderNode(Node):
         """Waits until all that was received is written."""
         self._queue.put(None)
         self._thread.join()
-
-
-def message_class(type_name: str) -> type:
-    """The Python class of `pkg/msg/Type`. Raises BagError if it is not installed."""
-    package, kind, name = type_name.split("/")
-    try:
-        return getattr(importlib.import_module(f"{package}.{kind}"), name)
-    except (ImportError, AttributeError) as error:
-        raise BagError(f"message type {type_name} is not installed; install or source {package}.") from error
 
 
 def pattern(topics: Sequence[str]) -> re.Pattern[str]:

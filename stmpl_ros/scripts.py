@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from stmpl_core.arrays import Transform, Wrench
-from stmpl_core.contact import ToolMesh
 from stmpl_core.errors import InvalidInput
 from stmpl_core.layer import SoftLayer
+from stmpl_core.tool import Tool
 
 SOFTER = 0.6  # a layer that may bulge at the rim presses back this much less than columns (FEM of spheres)
 STATIONS = 101  # points of a path
@@ -103,13 +103,13 @@ SQUEEZE = Script("squeeze", 6.0, (_squeeze("finger", 0.0), _squeeze("thumb", 180
 SCRIPTS = {script.name: script for script in (PRESS, SQUEEZE)}
 
 
-def capsule(radius: float, length: float = 0.06, sections: int = 32) -> ToolMesh:
+def capsule(radius: float, length: float = 0.06, sections: int = 32, *, name: str = "capsule") -> Tool:
     """A closed capsule of `radius` [m] whose round tip touches the origin; z points from the body into the tool."""
     import trimesh
 
     mesh = trimesh.creation.capsule(height=length, radius=radius, count=[sections, sections])
     vertices = mesh.vertices - [0, 0, mesh.vertices[:, 2].min()]
-    return ToolMesh.of(vertices, mesh.faces)
+    return Tool(name, vertices, mesh.faces)
 
 
 class SkinPath:
@@ -147,11 +147,11 @@ class SkinPath:
 
 
 class Motion:
-    """One device on one layer: its mesh, and at every time its pose and wrench."""
+    """One device on one layer: its tool, and at every time its pose and wrench."""
 
     def __init__(self, device: Device, layer: SoftLayer) -> None:
         self.device, self.layer = device, layer
-        self.mesh = capsule(device.radius)
+        self.tool = capsule(device.radius, name=device.name)
         self._path = SkinPath(layer, device.around, SMOOTHING * footprint(device.radius, 2e-3))
         self._thickness = float(np.median(layer.thickness))
 

@@ -34,6 +34,25 @@ def ros(arguments: list[str] | None = None) -> Iterator[threading.Event]:
             signal.signal(number, handler)
 
 
+@contextmanager
+def interruptible(stop: threading.Event) -> Iterator[None]:
+    """While inside, SIGINT and SIGTERM raise KeyboardInterrupt, so that what takes long ends."""
+
+    def interrupt(_signal: int, _frame: FrameType | None) -> None:
+        stop.set()
+        raise KeyboardInterrupt
+
+    before = {number: signal.signal(number, interrupt) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield
+    except KeyboardInterrupt:
+        if not stop.is_set():
+            raise
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
 def spin(executor: Executor, stop: threading.Event) -> None:
     """Runs callbacks until `stop` is set or ROS shuts down."""
     try:

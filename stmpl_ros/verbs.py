@@ -10,7 +10,9 @@ import tyro
 
 from stmpl_core.console import print_figures
 from stmpl_core.errors import InvalidInput
-from stmpl_ros.parameters import METHODS, DemoConfig, NodeConfig, ProbeConfig, RecordConfig
+from stmpl_core.methods import METHODS
+from stmpl_core.methods import method as method_named
+from stmpl_ros.parameters import DemoConfig, NodeConfig, ProbeConfig, RecordConfig
 from stmpl_ros.view.config import ViewConfig
 
 if TYPE_CHECKING:
@@ -118,7 +120,7 @@ def replay(
         return run(path, speed, topics, ros_arguments)
     if every < 1:
         raise InvalidInput(f"--every {every} takes no frame; 1 takes each.")
-    answering = _method(method) if method else METHODS[_recorded_method(path)]()
+    answering = _method(method) if method else method_named(_recorded_method(path))
     with _waiting(f"replaying {path}", as_json):
         summary = replay_run(path, answering, every=every)
     print_figures(vars(summary) if as_json else str(summary))
@@ -158,7 +160,7 @@ def compare(
     elif reference == "rigid":
         comparison = compare_with_progress(path, RigidFem(), frames, quiet=as_json)
     else:
-        method = METHODS[_recorded_method(path)]()
+        method = method_named(_recorded_method(path))
         comparison = compare_with_progress(path, _method(reference), frames, method=method, quiet=as_json)
     if tolerance_mm is not None:
         comparison = dataclasses.replace(comparison, tolerance=tolerance_mm * 1e-3)
@@ -252,12 +254,8 @@ def _recorded_method(path: Path) -> str:
 
 
 def _method(name: MethodName) -> Method:
-    from fem_tools import PatchFem
-    from stmpl_core.methods import MomentNet
-
-    if name == "fem":
-        return PatchFem()
-    return MomentNet(fallback=PatchFem()) if name == "moment_net" else METHODS[name]()
+    """A method that judges: where the network is out of its range, finite elements answer."""
+    return method_named(name, fallback=method_named("fem")) if name == "moment_net" else method_named(name)
 
 
 def _waiting(what: str, quiet: bool):

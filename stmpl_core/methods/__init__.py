@@ -1,11 +1,59 @@
-"""One file a method; all follow the protocol in base."""
+"""One file a method; all follow the protocol in base. A method's file is imported when the method is asked for."""
 
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+from stmpl_core.errors import InvalidInput
 from stmpl_core.methods.base import Method
-from stmpl_core.methods.linear import Linear
-from stmpl_core.methods.moment_net import MomentNet
-from stmpl_core.methods.naive import Naive
-from stmpl_core.methods.unet import UNet
-from stmpl_core.methods.winkler import Winkler
-from stmpl_core.methods.zero import Zero
 
-__all__ = ["Linear", "Method", "MomentNet", "Naive", "UNet", "Winkler", "Zero"]
+if TYPE_CHECKING:
+    from stmpl_core.methods.coarse import Coarse
+    from stmpl_core.methods.ladder import Ladder
+    from stmpl_core.methods.linear import Linear
+    from stmpl_core.methods.moment_net import MomentNet
+    from stmpl_core.methods.naive import Naive
+    from stmpl_core.methods.unet import UNet
+    from stmpl_core.methods.winkler import Winkler
+    from stmpl_core.methods.zero import Zero
+
+__all__ = ["METHODS", "Coarse", "Ladder", "Linear", "Method", "MomentNet", "Naive", "UNet", "Winkler", "Zero", "method"]
+
+METHODS = {  # name: where what makes it is
+    "moment_net": "stmpl_core.methods.moment_net:MomentNet",
+    "unet": "stmpl_core.methods.unet:UNet",
+    "linear": "stmpl_core.methods.linear:Linear",
+    "winkler": "stmpl_core.methods.winkler:Winkler",
+    "naive": "stmpl_core.methods.naive:Naive",
+    "zero": "stmpl_core.methods.zero:Zero",
+    "ladder": "fem_tools.ladder:ladder",
+    "fem": "fem_tools.patch:PatchFem",
+}
+_CLASSES = {"Coarse": "coarse", "Ladder": "ladder", "Linear": "linear", "MomentNet": "moment_net", "Naive": "naive",
+            "UNet": "unet", "Winkler": "winkler", "Zero": "zero"}  # fmt: skip
+
+
+def method(name: str, **settings: Any) -> Method:
+    """A method by its name, not yet prepared.
+
+    Args:
+        name: name in METHODS, or "module:attribute" of what makes a method of your own.
+        settings: arguments of what makes it.
+
+    Raises:
+        InvalidInput: no such method; the error lists those that exist.
+    """
+    module, _, attribute = METHODS.get(name, name).partition(":")
+    try:
+        make = getattr(import_module(module), attribute)
+    except (ImportError, AttributeError, ValueError) as error:
+        raise InvalidInput(f"there is no method {name!r} ({error}). Available: {', '.join(METHODS)}, or "
+                           "module:attribute of your own.") from error
+    return make(**settings)
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _CLASSES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(import_module(f"{__name__}.{_CLASSES[name]}"), name)

@@ -12,11 +12,12 @@ import viser
 from viser import transforms
 
 from stmpl_core.arrays import Transform
-from stmpl_core.contact import Contact, ToolMesh
+from stmpl_core.contact import Contact
 from stmpl_core.errors import InvalidInput, StmplError
 from stmpl_core.layer import SoftLayer
 from stmpl_core.methods.base import Method
 from stmpl_core.simulator import Simulator
+from stmpl_core.tool import Tool
 from stmpl_ros.view.judge import Judge
 from stmpl_ros.view.latest import LatestWins
 from stmpl_ros.view.page import Page, wxyz_of
@@ -28,14 +29,13 @@ GIZMO = 0.03  # m
 GRIP = 5e-3  # m beyond the end of the tool: there the hand does not cover the contact
 OFF = "off"
 NUDGES = {"-1": -1e-3, "-0.1": -1e-4, "+0.1": 1e-4, "+1": 1e-3}  # mm on the button, m into the skin
-TOOL = "tool"  # its name in contacts
 
 
 @dataclass(frozen=True, eq=False)
 class Asked:
     """A tool at a pose, and when it was asked for [s]."""
 
-    mesh: ToolMesh
+    tool: Tool
     pose: Transform
     at: float
 
@@ -55,7 +55,7 @@ class HandsOn:
 
     def __init__(self, page: Page, layer: SoftLayer, method: Method, tool: str) -> None:
         self.page, self.layer, self._method = page, layer, method
-        self.mesh = tool_named(tool)
+        self.tool = tool_named(tool)
         self._simulator: Simulator | None = None
         self._track: deque[tuple[float, float, float, float]] = deque(maxlen=KEPT)
         self._started = time.monotonic()
@@ -78,7 +78,7 @@ class HandsOn:
             self._push = gui.add_button_group("Push [mm]", (OFF, *NUDGES))
             self.judge = Judge(self.page, lambda before, judged: None)
         self.page.controls.label, self.page.controls.visible = "Your hand on the tool", True
-        self._meshes = {_label(tool): self.mesh}
+        self._known = {_label(tool): self.tool}
         self._tool.on_update(lambda _: self.pick(self._tool.value))
         self._upload.on_upload(lambda _: self.take(self._upload.value.name, self._upload.value.content))
         self._push.on_click(lambda event: self._nudge(event.target.value))
@@ -105,16 +105,16 @@ class HandsOn:
 
     def lift(self) -> None:
         """Holds the tool off the skin, where it was at first."""
-        self.move_to(place_on(self.layer, self.mesh))
+        self.move_to(place_on(self.layer, self.tool.vertices))
 
     def pick(self, name: str) -> None:
         """Takes another tool, and holds it off the skin; says why if there is none."""
         try:
-            if name not in self._meshes:
-                self._meshes[name] = tool_named(name)
+            if name not in self._known:
+                self._known[name] = tool_named(name)
         except StmplError as error:
             return self.page.say(str(error))
-        self.mesh = self._meshes[name]
+        self.tool = self._known[name]
         self._hold()
         self.page.say("")
         self.lift()
@@ -122,10 +122,10 @@ class HandsOn:
     def take(self, name: str, content: bytes) -> None:
         """Takes the tool in a mesh file; says why if it is none."""
         try:
-            self._meshes[name] = tool_from_bytes(name, content)
+            self._known[name] = tool_from_bytes(name, content)
         except StmplError as error:
             return self.page.say(str(error))
-        self._tool.options = (*TOOLS, *(known for known in self._meshes if known not in TOOLS))
+        self._tool.options = (*TOOLS, *(known for known in self._known if known not in TOOLS))
         self._tool.value = name
         self.pick(name)
 
@@ -137,8 +137,8 @@ class HandsOn:
 
     def _hold(self) -> None:
         """Fixes the tool's surface to the gizmo, which sits at the end that looks away from the skin."""
-        self._grip = float(self.mesh.vertices[:, 2].max()) + GRIP
-        surface = self.page.add_tool("/hand/surface", self.mesh)  # replaces what has that name
+        self._grip = float(self.tool.vertices[:, 2].max()) + GRIP
+        surface = self.page.add_tool("/hand/surface", self.tool)  # replaces what has that name
         surface.position = np.array([0.0, 0.0, -self._grip])
 
     def wait(self, timeout: float) -> bool:
@@ -154,7 +154,7 @@ class HandsOn:
         self._ask()
 
     def _ask(self) -> None:
-        self._answering.put(Asked(self.mesh, self.pose, time.perf_counter()))
+        self._answering.put(Asked(self.tool, self.pose, time.perf_counter()))
 
     def _answer(self, asked: Asked) -> None:
         if self._simulator is None:
@@ -162,8 +162,8 @@ class HandsOn:
             self.page.say("")
         started = time.perf_counter()
         try:
-            contact = Contact(TOOL, asked.mesh, asked.pose)
-            self._simulator.prepare_tool(asked.mesh)
+            contact = Contact(asked.tool, asked.pose)
+            self._simulator.tools.field(asked.tool)
             started = time.perf_counter()
             answer = self._simulator.step([contact])
         except InvalidInput as error:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from bags.survey import PRESSING
 from fem_tools import RigidFem
 from stmpl_core.errors import InvalidInput
 from stmpl_core.layer import SoftLayer
@@ -55,12 +54,13 @@ class Judge:
 
     def _solve(self, snapshot: Snapshot) -> Displacement:
         layer, answer = self._page.layer, snapshot.answer
-        if layer is None or answer.pressure is None:
-            raise InvalidInput("this answer does not say the pressure that it was solved for: FEM cannot solve it.")
+        if layer is None:
+            raise InvalidInput("there is no skin yet.")
         if self._fem is None or self._fem[0] is not layer:
             self._fem = layer, RigidFem().prepare(layer)
-        pressing = [contact for contact in snapshot.contacts if answer.statuses.get(contact.name) in PRESSING]
-        solved = self._fem[1].press(pressing, answer.pressure, answer.trust.figures)
+        touches = answer.touches
+        pressing = [one for one in snapshot.contacts if one.name in touches and touches[one.name].presses]
+        solved = self._fem[1].press(pressing, answer)
         if not solved.trust.converged:
             raise InvalidInput(f"FEM did not converge on this instant, so it cannot judge it. {solved.trust.why}")
         return solved

@@ -10,15 +10,15 @@ from geometry_msgs.msg import PoseStamped, WrenchStamped
 from rclpy.node import Node
 from stmpl_msgs.msg import ContactMesh, SkinDisplacement, SkinTopology
 
-from bags.messages import contact_from, frame_from, layer_from, stamp_ns, tool_mesh_from
-from stmpl_core.contact import Contact, ToolMesh
+from bags.wire import contact_from, frame_from, layer_from, stamp_ns, tool_from
+from stmpl_core.contact import Contact
 from stmpl_core.errors import StmplError
-from stmpl_core.trust import Displacement
+from stmpl_core.tool import Tool
 from stmpl_ros.topics import KEPT, NEWEST
 from stmpl_ros.view.judge import Judge
 from stmpl_ros.view.latest import LatestWins
 from stmpl_ros.view.page import Page
-from stmpl_ros.view.snapshot import Gauge, Reading, Snapshot
+from stmpl_ros.view.snapshot import Snapshot, readings_of
 
 REMEMBERED = 256  # poses and wrenches of a tool that an answer may still name
 TRACK = 3000  # answers that the plots go back
@@ -38,8 +38,7 @@ class LiveNode(Node):
         super().__init__("view")
         self.page, self.patience = page, patience
         self._layer_id, self._frame = "", ""
-        self._gauge: Gauge | None = None
-        self._meshes: dict[str, ToolMesh] = {}
+        self._tools: dict[str, Tool] = {}
         self._heard: dict[tuple[str, str], deque[tuple[int, PoseStamped | WrenchStamped]]] = {}
         self._track: deque[tuple[float, float, float, float]] = deque(maxlen=TRACK)
         self._first, self._read = 0, 0.0
@@ -65,7 +64,6 @@ class LiveNode(Node):
     def _on_topology(self, message: SkinTopology) -> None:
         try:
             layer = layer_from(message)
-            self._gauge = Gauge(layer)
         except StmplError as error:
             return self.page.say(f"The node's skin cannot be shown: {error}")
         self.page.show_layer(layer)
@@ -75,15 +73,18 @@ class LiveNode(Node):
 
     def _on_mesh(self, message: ContactMesh) -> None:
         name = message.header.frame_id
+        if not len(message.triangles):
+            self._tools.pop(name, None)
+            return
         try:
-            mesh = tool_mesh_from(message)
+            tool = tool_from(message)
         except StmplError as error:
             return self.page.say(f"The mesh of {name} cannot be shown: {error}")
-        if name not in self._meshes:
+        if (name, "pose") not in self._heard:
             for kind, of in (("pose", PoseStamped), ("wrench", WrenchStamped)):
                 heard = self._heard[name, kind] = deque(maxlen=REMEMBERED)
                 self.create_subscription(of, f"tools/{name}/{kind}", partial(self._on_input, heard), NEWEST)
-        self._meshes[name] = mesh
+        self._tools[name] = tool
 
     @staticmethod
     def _on_input(heard: deque, message: PoseStamped | WrenchStamped) -> None:
@@ -99,12 +100,8 @@ class LiveNode(Node):
         message, received = item
         frame = frame_from(message, received)
         contacts = [c for tool, stamps in frame.inputs.items() if (c := self._contact(tool, *stamps)) is not None]
-        readings = {name: Reading(status) for name, status in frame.statuses.items()}
-        if self._gauge is not None and contacts:
-            readings |= self._gauge.read(contacts)
         self._first = self._first or frame.stamp_ns
-        answer = Displacement(frame.displacement, frame.trust, frame.method, frame.pressure, frame.statuses)
-        snapshot = Snapshot((frame.stamp_ns - self._first) * NANO, answer, tuple(contacts), readings,
+        snapshot = Snapshot((frame.stamp_ns - self._first) * NANO, frame, tuple(contacts), readings_of(frame),
                             frame.solve_seconds, (received - frame.stamp_ns) * NANO)  # fmt: skip
         self._track.append((snapshot.time, snapshot.force, snapshot.depth, snapshot.peak))
         self.page.say("")
@@ -116,9 +113,9 @@ class LiveNode(Node):
         """A tool as the answer names it; None while its mesh or pose has not been heard."""
         pose = _newest(self._heard.get((tool, "pose")), posed)
         wrench = _newest(self._heard.get((tool, "wrench")), pushed) if pushed else None
-        if pose is None or tool not in self._meshes:
+        if pose is None or tool not in self._tools:
             return None
-        return contact_from(tool, self._meshes[tool], pose, wrench, body_frame=self._frame)
+        return contact_from(self._tools[tool], pose, wrench, body_frame=self._frame)
 
     def _complain(self) -> None:
         silent = time.monotonic() - self._came

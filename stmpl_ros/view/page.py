@@ -10,10 +10,11 @@ import numpy as np
 import viser
 from viser import uplot
 
+from bags.wire import quaternion_from
 from stmpl_core.arrays import Transform
-from stmpl_core.contact import Contact, ToolMesh
+from stmpl_core.contact import Contact
 from stmpl_core.layer import SoftLayer
-from stmpl_ros.conversions import quaternion_from
+from stmpl_core.tool import Tool
 from stmpl_ros.view.fields import FIELDS
 from stmpl_ros.view.latest import LatestWins
 from stmpl_ros.view.skin import Skin
@@ -44,7 +45,7 @@ class Page:
         self.snapshot: Snapshot | None = None
         self._skin: Skin | None = None
         self._tops: dict[str, float] = {}
-        self._tools: dict[str, tuple[ToolMesh, viser.MeshHandle]] = {}
+        self._tools: dict[str, tuple[Tool, viser.MeshHandle]] = {}
         self._lay_out(title)
         self._drawing = LatestWins(self._draw, self.say, "drawing")
         self._plotting = LatestWins(self._plot, self.say, "plotting")
@@ -113,7 +114,7 @@ class Page:
             self._skin.remove()
         self.layer, self.snapshot, self._tops = layer, None, {}
         self._skin = Skin(self.server, layer)
-        pose = place_on(layer, ToolMesh(np.zeros((1, 3)), np.zeros((0, 3), int)), gap=0.0)
+        pose = place_on(layer, np.zeros((1, 3)), gap=0.0)
         self.look_at(pose[:3, 3], pose[:3, 2])
 
     def look_at(self, point: np.ndarray, normal: np.ndarray) -> None:
@@ -144,15 +145,15 @@ class Page:
             self._tools.pop(name)[1].remove()
         for contact in contacts:
             known = self._tools.get(contact.name)
-            if known is None or known[0] is not contact.mesh:
-                self._tools[contact.name] = contact.mesh, self.add_tool(f"/tools/{contact.name}", contact.mesh)
+            if known is None or known[0] is not contact.tool:
+                self._tools[contact.name] = contact.tool, self.add_tool(f"/tools/{contact.name}", contact.tool)
             handle = self._tools[contact.name][1]
             handle.wxyz, handle.position = wxyz_of(contact.pose_body_from_tool), contact.pose_body_from_tool[:3, 3]
 
-    def add_tool(self, name: str, mesh: ToolMesh) -> viser.MeshHandle:
+    def add_tool(self, name: str, tool: Tool) -> viser.MeshHandle:
         """Adds the see-through surface of a tool to the scene."""
         return self.server.scene.add_mesh_simple(
-            name, mesh.vertices, mesh.faces, color=STEEL, opacity=0.3, side="double", cast_shadow=False,
+            name, tool.vertices, tool.faces, color=STEEL, opacity=0.3, side="double", cast_shadow=False,
             receive_shadow=False, flat_shading=True,
         )  # fmt: skip
 

@@ -11,17 +11,16 @@ from pathlib import Path
 import numpy as np
 
 from bags.compare import Comparison
-from bags.messages import Frame
+from bags.frame import Frame
 from bags.pictures import spot_of
 from bags.reader import ContactLog
 from bags.survey import Survey, survey
 from stmpl_core.contact import Contact
 from stmpl_core.errors import BagError
 from stmpl_core.layer import SoftLayer
-from stmpl_core.trust import Displacement
 from stmpl_ros.view.judge import Judge
 from stmpl_ros.view.page import Page
-from stmpl_ros.view.snapshot import Gauge, Reading, Snapshot
+from stmpl_ros.view.snapshot import Gauge, Snapshot, readings_of
 
 TICK = 0.05  # s between two steps of the play button
 SPEEDS = {"1/8": 0.125, "1/4": 0.25, "1/2": 0.5, "1": 1.0, "2": 2.0, "4": 4.0}
@@ -153,10 +152,10 @@ def _marks(snapshots: Sequence[Snapshot]) -> tuple[float, ...] | None:
 
 def _snapshot(run: Survey, number: int, frame: Frame, gauge: Gauge) -> Snapshot:
     moment = run.moments[number]
-    answer = Displacement(frame.displacement, frame.trust, frame.method, frame.pressure, frame.statuses)
     contacts = _contacts(run.contacts, frame)
-    readings = gauge.read(contacts) if contacts is not None else {n: Reading(s) for n, s in frame.statuses.items()}
-    return Snapshot(moment.time, answer, tuple(contacts or ()), readings, moment.solve_seconds, moment.latency)
+    told = all(np.isfinite(touch.wrench).all() for touch in frame.touches.values())  # older recordings do not
+    readings = readings_of(frame) if told or contacts is None else gauge.read(contacts)
+    return Snapshot(moment.time, frame, tuple(contacts or ()), readings, moment.solve_seconds, moment.latency)
 
 
 def _contacts(log: ContactLog, frame: Frame) -> list[Contact] | None:

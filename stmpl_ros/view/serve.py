@@ -40,7 +40,8 @@ def _serve_recording(config: ViewConfig, path: Path) -> int:
 
 
 def _serve_hands_on(config: ViewConfig) -> int:
-    from stmpl_ros.node import layer_of, published
+    from stmpl_core.skin import published
+    from stmpl_ros.making import layer_of
     from stmpl_ros.view.hands_on import HandsOn
     from stmpl_ros.view.tools import tool_named
 

@@ -11,6 +11,7 @@ from stmpl_core.contact import Contact
 from stmpl_core.layer import SoftLayer
 from stmpl_core.methods import Naive
 from stmpl_core.simulator import Simulator
+from stmpl_core.touch import Answer
 from stmpl_core.trust import Displacement
 
 MM, MS = 1e3, 1e3  # millimetres in a metre, milliseconds in a second
@@ -41,7 +42,7 @@ class Snapshot:
     """
 
     time: float
-    answer: Displacement
+    answer: Answer
     contacts: tuple[Contact, ...] = ()
     readings: Mapping[str, Reading] = field(default_factory=dict)
     solve_seconds: float = NAN
@@ -108,13 +109,9 @@ class Gauge:
 
     def read(self, contacts: Sequence[Contact]) -> dict[str, Reading]:
         """The reading of each contact by its name. Raises InvalidInput or MeshError."""
-        return readings_of(self._simulator.step(contacts))
+        return readings_of(self._simulator.answer(self._simulator.touch(contacts)))
 
 
-def readings_of(answer: Displacement) -> dict[str, Reading]:
-    """The reading of each tool that a simulator's answer names."""
-    figures = answer.trust.figures
-    return {
-        name: Reading(status, figures.get(f"{name}.depth_m", NAN), figures[f"{name}.normal_n"])
-        for name, status in answer.statuses.items()
-    }
+def readings_of(answer: Answer) -> dict[str, Reading]:
+    """The reading of each tool that an answer names."""
+    return {name: Reading(touch.status, touch.depth, touch.force) for name, touch in answer.touches.items()}

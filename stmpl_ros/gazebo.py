@@ -1,43 +1,31 @@
-"""Adapters: messages of other packages as those that the node understands."""
+"""GazeboContacts: the wrenches of tools from ros_gz_interfaces/Contacts."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
-from geometry_msgs.msg import WrenchStamped
-from shape_msgs.msg import Mesh
-from stmpl_msgs.msg import ContactMesh
 
-from bags.messages import stamp_ns
+from bags.wire import stamp_ns, wrench_message
 from stmpl_core.arrays import Points, Transform, Wrench
 from stmpl_core.errors import FrameError, InvalidInput
 from stmpl_core.layer import SoftLayer
-from stmpl_ros.conversions import floats, header, integers, wrench_message
 from stmpl_ros.frames import Frames
-from stmpl_ros.inbox import Tool
+from stmpl_ros.inbox import Inbox
 from stmpl_ros.parameters import NodeConfig
 
 WORLD = "world"  # frame of contacts that name none: gz-sim states them in the simulated world's
-
-
-def contact_mesh_of(message: Mesh, tool: str, stamp_ns: int) -> ContactMesh:
-    """The surface of a tool from a shape_msgs/Mesh, in metres and in the tool's own frame."""
-    vertices = np.array([(p.x, p.y, p.z) for p in message.vertices]).reshape(-1, 3)
-    triangles = np.array([list(t.vertex_indices) for t in message.triangles]).reshape(-1, 3)
-    return ContactMesh(header=header(tool, stamp_ns), vertices=floats(vertices), triangles=integers(triangles))
-
 
 class GazeboContacts:
     """The wrenches that tools exert on the body, from ros_gz_interfaces/Contacts.
 
     Args:
-        config: says which collision is which tool's, and what the body's are called.
-        frames: where the simulated world stands.
+        config: settings, which say which collision is which tool's, and what the body's are called.
+        frames: frames, the simulated world's among them.
 
     Attributes:
-        kind: the message's class.
+        kind: class of the message.
 
     Raises:
         InvalidInput: ros_gz_interfaces is not installed.
@@ -51,22 +39,19 @@ class GazeboContacts:
         self.kind: Any = Contacts
         self._collisions, self._body, self._frames = config.gz_collisions, config.gz_body, frames
 
-    def wrenches(
-        self, message: Any, layer: SoftLayer, tools: Mapping[str, Tool]
-    ) -> Iterator[tuple[str, WrenchStamped]]:
-        """Each tool that touches the body and whose pose is known, with what it exerts about its origin.
+    def wrenches(self, message: Any, layer: SoftLayer, inbox: Inbox) -> Iterator[tuple[str, Any]]:
+        """Each tool that touches the body and whose pose is known, with the WrenchStamped that it exerts.
 
         Raises:
             FrameError: nobody knows where the simulated world stands.
             InvalidInput: see `gazebo_wrench`.
         """
         frame = message.header.frame_id or WORLD
-        pose_body_from_world = self._frames.of(frame)
-        if pose_body_from_world is None:
+        if frame not in self._frames:
             raise FrameError(f"contacts are in frame '{frame}'; list it in the file of the parameter `frames`.")
         for tool, collision in self._collisions.items():
-            if tool in tools and tools[tool].pose.value is not None:
-                at = pose_body_from_world, layer, tools[tool].pose.value[:3, 3]
+            if (pose := inbox.pose_of(tool)) is not None:
+                at = self._frames[frame], layer, pose[:3, 3]
                 wrench = gazebo_wrench(message.contacts, collision, self._body, *at)
                 if wrench is not None:
                     yield tool, wrench_message(wrench, self._frames.body, stamp_ns(message))

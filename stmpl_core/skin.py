@@ -1,0 +1,53 @@
+"""Skin: a layer with what was prepared for it: a method, and the neighbours of its vertices."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from stmpl_core.layer import SoftLayer, layer_id
+from stmpl_core.methods.base import Method
+from stmpl_core.moments import Surroundings
+
+
+@dataclass(frozen=True, eq=False)
+class Skin:
+    """What answers. It can be pickled, so that a process beside may make it.
+
+    Args:
+        layer: soft layer at rest.
+        method: method, prepared for it.
+        near: neighbours of its vertices, which method and contact share.
+    """
+
+    layer: SoftLayer
+    method: Method
+    near: Surroundings
+
+    @classmethod
+    def of(cls, layer: SoftLayer, method: Method) -> Skin:
+        """Prepares a layer (seconds). Raises InvalidInput or MeshError."""
+        return cls(layer, method.prepare(layer), Surroundings.of(layer))
+
+    def stiffened(self, method: Method, *, youngs_modulus: float, density: float) -> Skin:
+        """The same skin of another stiffness [Pa] and density [kg/m3], in a tenth of a second.
+
+        Args:
+            method: method, not yet prepared.
+        """
+        tissue = replace(self.layer.tissue, youngs_modulus=youngs_modulus, density=density)
+        layer = self.layer.with_(tissue=tissue)
+        self.near.keep(layer)
+        return Skin(layer, method.prepare(layer), self.near)
+
+    @cached_property
+    def layer_id(self) -> str:
+        """Name of the layer in messages."""
+        return layer_id(self.layer)
+
+
+def published(layer: SoftLayer) -> SoftLayer:
+    """The layer rounded to float32, as messages carry it: whoever reads them has the very same layer."""
+    return layer.with_(vertices=layer.vertices.astype(np.float32), thickness=layer.thickness.astype(np.float32))

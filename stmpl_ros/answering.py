@@ -1,0 +1,147 @@
+"""Answering: from an instant to its answer; what is said of it; and rest, when all tools are silent."""
+
+from __future__ import annotations
+
+import time
+
+import numpy as np
+from rclpy.lifecycle import LifecycleNode
+
+from bags.frame import Stamps
+from bags.wire import NANO
+from stmpl_core.simulator import Simulator
+from stmpl_core.touch import IN_CORE, NO_FORCE, NO_TOUCH, PULLING, WRAPPED, Answer
+from stmpl_ros.calibration import Calibration
+from stmpl_ros.diagnosis import Tally
+from stmpl_ros.hearing import Hearing
+from stmpl_ros.inbox import Instant
+from stmpl_ros.limits import Limits
+from stmpl_ros.sending import Sending
+from stmpl_ros.settings import Settings
+
+UNSEEN = 2e-3  # m: a tool that is deeper in its first answer was not seen coming
+WORTH_A_LINE = {
+    NO_FORCE: "it touches, but its wrench is zero",
+    PULLING: "nothing sticks, so nothing is loaded",
+    NO_TOUCH: "it presses, but no skin is within reach along its force",
+    WRAPPED: "its wrench does not say how hard it squeezes",
+    IN_CORE: "its pose reaches into the rigid core",
+}  # log lines of statuses that a person should look at
+
+
+class Answering:
+    """Answers instants, and fades the last answer to rest when nothing comes any more.
+
+    Args:
+        node: node whose clock and logger are used.
+        settings: settings as they are now.
+        hearing: what comes in.
+        tally: counts.
+        calibration: keeps presses.
+
+    Attributes:
+        simulator: simulator of the skin that answers.
+        sending: what goes out.
+        limits: limits that answers are held against, or None.
+        fading: whether the last answer fades.
+    """
+
+    simulator: Simulator
+    sending: Sending
+
+    def __init__(
+        self, node: LifecycleNode, settings: Settings, hearing: Hearing, tally: Tally, calibration: Calibration
+    ) -> None:
+        self._node, self._settings, self._hearing, self._tally = node, settings, hearing, tally
+        self._calibration = calibration
+        self.limits: Limits | None = None
+        self.start_empty()
+
+    def start_empty(self) -> None:
+        """Forgets what was answered."""
+        self.last: tuple[Answer, Stamps] | None = None  # None: at rest
+        self.fading = False
+        self._seen: set[str] = set()  # tools of the last answer
+
+    def answer(self, instant: Instant) -> None:
+        """Answers an instant. Whatever goes wrong is told and counted, and the next one is answered."""
+        gate, config = self._hearing.gate, self._settings.config
+        started = time.perf_counter()
+        try:
+            answer = self.simulator.step(instant.contacts)
+        except Exception as error:  # the one place where an answer may fail
+            tools = ", ".join(contact.name for contact in instant.contacts)
+            return gate.refuse("answer", f"no answer to {tools}: {_told(error)}")
+        if not np.isfinite(answer.displacement).all():
+            statuses = {name: touch.status for name, touch in answer.touches.items()}
+            return gate.refuse("answer", f"no answer: it would not be finite under {statuses}.")
+        seconds = time.perf_counter() - started
+        why = self._remarks(instant, answer)
+        self._send(answer, instant.stamp, instant.inputs, solve_seconds=seconds, why=why)
+        self.sending.contacts(instant, answer, config.local_rotations)
+        self._calibration.put(instant, answer)
+        self._tally.solve_times.append(seconds)
+        self._tally.latencies.append((self._now() - instant.stamp) / NANO)
+        if self.limits:
+            self.limits.put(answer)
+        if self.fading:
+            self._node.get_logger().info("input is back")
+        self.last, self.fading, gate.refused_since = (answer, instant.inputs), False, ""
+        self._seen = set(answer.touches)
+
+    def fade_if_silent(self) -> None:
+        """Sends a share of the last answer, once no tool was heard for a while, and in the end rest."""
+        now, config, gate = time.monotonic_ns(), self._settings.config, self._hearing.gate
+        if self.last is None or self._hearing.inbox.live(now):
+            return
+        answer, inputs = self.last
+        silent, limit = self._hearing.inbox.silence(now) / NANO, config.rest_after
+        left = 1 - (silent - limit) / config.fade if config.fade else 0.0
+        why = f"no pose for {limit} s"
+        if gate.refused_since:
+            why = f"{why} that could be used (refused: {gate.refused_since})"
+        self._seen = set()
+        self.sending.models.forget()
+        if left <= 0 or not answer.displacement.any():
+            return self.rest(f"{why}: back at rest")
+        if not self.fading:
+            self.fading = True
+            self.sending.rest(list(answer.touches), self._now())
+            gate.say("fading", f"{why}: the last answer fades to rest within {config.fade} s")
+        share = float(np.float32(left))  # as the message carries it
+        faded = answer.faded(share, f"{why}: the last answer, faded to {left:.0%}")
+        self._send(faded, self._now(), inputs, fade=share)
+
+    def rest(self, why: str) -> None:
+        """Sends the skin at rest."""
+        tools = list(self.last[0].touches) if self.last else []
+        self._send(self.simulator.step([]), self._now(), {}, why=why)
+        self.sending.rest(tools, self._now())
+        self.start_empty()
+
+    def _send(self, answer: Answer, stamp: int, inputs: Stamps, **said: float | str) -> None:
+        self.sending.answer(answer, stamp, inputs, **said)
+        self._tally.answers = self.sending.sequence
+        self._tally.methods[answer.method] += 1
+
+    def _remarks(self, instant: Instant, answer: Answer) -> str:
+        """What the node has to say of an answer beside what the core says; lines for what a person should look at."""
+        say, rest_after = self._hearing.gate.say, self._settings.config.rest_after
+        said = [f"stamps of tools and wrenches lie up to {instant.skew / 1e6:.1f} ms apart"] if instant.skew else []
+        for stream in instant.lost:
+            said.append(f"no {stream} for {rest_after} s: answered without it")
+            say(f"lost {stream}", said[-1])
+        for name, touch in answer.touches.items():
+            if name not in self._seen and touch.depth > UNSEEN:
+                said.append(f"{name} starts {1e3 * touch.depth:.1f} mm inside the skin")
+                say(f"start of {name}", said[-1])
+            if touch.status in WORTH_A_LINE:
+                say(f"{name} {touch.status}", f"{name}: {touch.status}; {WORTH_A_LINE[touch.status]}")
+        return "; ".join(said)
+
+    def _now(self) -> int:
+        return self._node.get_clock().now().nanoseconds
+
+
+def _told(error: Exception) -> str:
+    return str(error) or type(error).__name__

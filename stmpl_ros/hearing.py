@@ -1,0 +1,199 @@
+"""Hearing: what comes in: tools, poses and wrenches; checked here, kept as the newest, handed on as instants."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+from geometry_msgs.msg import PoseStamped, WrenchStamped
+from rclpy.exceptions import NameValidationException
+from rclpy.node import Node
+from shape_msgs.msg import Mesh
+from stmpl_msgs.msg import ContactMesh
+
+from bags import wire
+from stmpl_core.errors import StmplError
+from stmpl_core.layer import SoftLayer
+from stmpl_core.sdf import SignedDistance
+from stmpl_core.tool import Tool
+from stmpl_core.tools import Tools
+from stmpl_ros.diagnosis import Tally
+from stmpl_ros.events import Events
+from stmpl_ros.frames import Frames, read_frames
+from stmpl_ros.gate import Gate
+from stmpl_ros.gazebo import GazeboContacts
+from stmpl_ros.inbox import Inbox, Instant
+from stmpl_ros.parameters import NodeConfig
+from stmpl_ros.topics import KEPT, NEWEST, newest_within
+
+
+class Hearing:
+    """Tools announce their surface on `contact_mesh`; from then on `tools/NAME/pose` and `tools/NAME/wrench` are heard.
+
+    A message that cannot be used is refused with a line, and changes nothing. A surface counts once its distance field
+    is built. A surface without triangles takes its tool away.
+
+    Args:
+        node: node that subscribes.
+        config: settings as they are now.
+        tools: tools in use.
+        tally: counts.
+
+    Attributes:
+        on_tool: called with a tool whose field is to be built.
+        on_removed: called with the name of a tool that was taken away.
+        on_instant: called with every complete instant.
+    """
+
+    def __init__(self, node: Node, config: Callable[[], NodeConfig], tools: Tools, tally: Tally) -> None:
+        self._node, self._config = node, config
+        self.gate = Gate(node, tally)
+        self.events = Events(self.gate.say)
+        self.frames = Frames(config().frame, read_frames(config().frames), node)
+        self.gazebo = GazeboContacts(config(), self.frames) if config().gz_contacts else None
+        self.inbox = Inbox(tools, config().frame, int(config().rest_after * wire.NANO), self.frames)
+        self.active = False
+        self.layer: SoftLayer | None = None
+        self.on_tool: Callable[[Tool], None] = lambda tool: None
+        self.on_removed: Callable[[str], None] = lambda name: None
+        self.on_instant: Callable[[Instant], None] = lambda instant: None
+        self._topics: list[Any] = []
+        self._listened: dict[str, list[Any]] = {}  # subscriptions of each tool
+        self._strangers: set[str] = set()
+
+    @property
+    def tools(self) -> Tools:
+        """Tools in use."""
+        return self.inbox.tools
+
+    def open(self) -> None:
+        """Listens for tools."""
+        self._topics.append(self._listen(ContactMesh, "contact_mesh", self._on_mesh, KEPT))
+        for name in self._config().shape_tools.split():
+            self._topics.append(self._listen(Mesh, f"tools/{name}/mesh", partial(self._on_shape, name), KEPT))
+        if self.gazebo:
+            self._topics.append(self._listen(self.gazebo.kind, "gz_contacts", self._on_gazebo, NEWEST))
+
+    def close(self) -> None:
+        """Closes all topics, and forgets all tools."""
+        for name in list(self._listened):
+            self._stop_listening(name)
+        for tool in self.tools:
+            self.tools.remove(tool.name)
+        for subscription in self._topics:
+            self._node.destroy_subscription(subscription)
+        self._topics.clear()
+        self.inbox.forget()
+
+    def take(self, tool: Tool, field: SignedDistance) -> bool:
+        """Takes a tool into use, its distance field being there; False if it is not wanted any more."""
+        if not self.tools.expected(tool):
+            return False
+        try:
+            if tool.name not in self._listened:
+                self._listen_to(tool.name)
+        except NameValidationException as error:
+            self.refuse(tool, error)
+            return False
+        self.tools.add(tool, field)
+        if field.flipped:
+            self.gate.say("inside out", f"the mesh of '{tool.name}' came inside out and was turned")
+        if not field.watertight:
+            self.gate.say("holes", f"the mesh of '{tool.name}' has holes; what is inside it near them is a guess")
+        return True
+
+    def refuse(self, tool: Tool, error: BaseException) -> None:
+        """Gives an announced tool up; the one of its name from before, if there is one, stays."""
+        self.tools.withdraw(tool)
+        self.gate.refuse("mesh", f"mesh of '{tool.name}' refused: {error}")
+
+    def look_for_strangers(self) -> None:
+        """Tells once of each tool whose poses are sent and whose surface never was."""
+        for topic, _ in self._node.get_topic_names_and_types():
+            parts = topic.removeprefix(self._node.get_namespace().rstrip("/") + "/").split("/")
+            if len(parts) == 3 and parts[0] == "tools" and parts[2] == "pose":
+                name = parts[1]
+                known = name in self.tools or any(tool.name == name for tool in self.tools.waiting())
+                if not known and name not in self._strangers and self._node.count_publishers(topic):
+                    self._strangers.add(name)
+                    self.gate.say(f"stranger {name}", f"{topic}: poses come, but '{name}' never announced its surface "
+                                  "on contact_mesh; they are not heard")  # fmt: skip
+
+    def _listen(self, kind: Any, topic: str, callback: Callable, profile: Any) -> Any:
+        return self.events.subscribe(self._node, kind, topic, callback, profile)
+
+    def _listen_to(self, name: str) -> None:
+        """Raises NameValidationException for a name that cannot be part of a topic."""
+        poses = newest_within(self._config().deadline)
+        self._listened[name] = [
+            self._listen(PoseStamped, f"tools/{name}/pose", partial(self._on_pose, name), poses),
+            self._listen(WrenchStamped, f"tools/{name}/wrench", partial(self._on_wrench, name), NEWEST),
+        ]
+
+    def _stop_listening(self, name: str) -> None:
+        for subscription in self._listened.pop(name, []):
+            self._node.destroy_subscription(subscription)
+        self.inbox.forget(name)
+
+    def _on_shape(self, name: str, message: Mesh) -> None:
+        self._announce(name, len(message.triangles), lambda: wire.tool_from_shape(message, name))
+
+    def _on_mesh(self, message: ContactMesh) -> None:
+        self._announce(message.header.frame_id, len(message.triangles), lambda: wire.tool_from(message))
+
+    def _announce(self, name: str, triangles: int, read: Callable[[], Tool]) -> None:
+        if not triangles and name in self._listened:
+            self._stop_listening(name)
+            self.tools.remove(name)
+            self._node.get_logger().info(f"tool '{name}' is taken away")
+            return self.on_removed(name)
+        try:
+            tool = read()
+        except StmplError as error:
+            return self.gate.refuse("mesh", f"mesh of '{name}' refused: {error}")
+        self.tools.announce(tool)
+        self.on_tool(tool)
+
+    def _on_pose(self, name: str, message: PoseStamped) -> None:
+        if not self._hears(name):
+            return
+        try:
+            pose = wire.pose_of_tool(message, name, self._config().frame, self.frames)
+        except StmplError as error:
+            return self.gate.refuse(f"pose of {name}, {type(error).__name__}", str(error))
+        if self.gate.fresh(message, self._config().max_age):
+            kept = self.inbox.put_pose(name, pose, wire.stamp_ns(message), time.monotonic_ns())
+            self._go_on("pose", name, kept)
+
+    def _on_wrench(self, name: str, message: WrenchStamped) -> None:
+        if not self._hears(name):
+            return
+        try:
+            wire.wrench_from(message, body_frame=self._config().frame, tool=name, frames=self.frames,
+                             pose_body_from_tool=self.frames[self._config().frame])  # fmt: skip
+        except StmplError as error:
+            return self.gate.refuse(f"wrench of {name}, {type(error).__name__}", str(error))
+        if self.gate.fresh(message, self._config().max_age):
+            kept = self.inbox.put_wrench(name, message, wire.stamp_ns(message), time.monotonic_ns())
+            self._go_on("wrench", name, kept)
+
+    def _on_gazebo(self, message: Any) -> None:
+        assert self.gazebo and self.layer
+        try:
+            for name, wrench in self.gazebo.wrenches(message, self.layer, self.inbox):
+                self._on_wrench(name, wrench)
+        except StmplError as error:
+            self.gate.refuse("gz_contacts", str(error))
+
+    def _hears(self, name: str) -> bool:
+        return self.active and name in self.tools
+
+    def _go_on(self, kind: str, tool: str, kept: bool) -> None:
+        if not kept:
+            self.gate.say(f"order of {kind} of {tool}", f"a {kind} of {tool} was dropped: its stamp is not after the "
+                          "last one's. Do two devices send under one name, or was a clock set back?")  # fmt: skip
+        instant = self.inbox.take(time.monotonic_ns())
+        if instant is not None:
+            self.on_instant(instant)

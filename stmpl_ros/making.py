@@ -1,0 +1,65 @@
+"""Making: a skin from the settings, and what to do before its first answer."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from stmpl_core.contact import Contact
+from stmpl_core.layer import SoftLayer, Tissue
+from stmpl_core.simulator import Simulator
+from stmpl_core.skin import Skin, published
+from stmpl_core.tool import Tool
+from stmpl_ros.parameters import NodeConfig
+
+Build = Callable[[NodeConfig], SoftLayer]
+STIFFNESS = {"youngs_modulus", "density"}  # settings that change neither geometry nor what is felt around a vertex
+QUICK = {"moment_net", "winkler", "naive"}  # methods that such a change costs no preparation
+
+
+def layer_of(config: NodeConfig) -> SoftLayer:
+    """The soft layer that the settings ask for. Raises InvalidInput."""
+    from stmpl_core.body import Body  # takes seconds to import, and who brings a layer does not need it
+
+    tissue = Tissue(config.youngs_modulus, config.poisson_ratio, config.density)
+    body = Body.anny(pose=None, **config.phenotype_values)
+    return body.part(config.part, edge_length=config.edge_length, thickness=config.thickness, tissue=tissue)
+
+
+def check(config: NodeConfig, build: Build) -> None:
+    """Raises InvalidInput, at once, for a part that `layer_of` does not know; other builds are not asked."""
+    if build is layer_of:
+        from stmpl_core.body import Body
+
+        Body.anny().level(config.part)
+
+
+def at_once(config: NodeConfig, build: Build) -> bool:
+    """Whether the skin is made within a second or two."""
+    return build is not layer_of
+
+
+def skin_of(config: NodeConfig, build: Build = layer_of) -> Skin:
+    """The skin that the settings ask for. Raises InvalidInput or MeshError."""
+    return Skin.of(published(build(config)), config.new_method())
+
+
+def restiffened(skin: Skin, config: NodeConfig, changed: set[str]) -> Skin | None:
+    """The same skin of another stiffness, where nothing else changes and that is quick; else None."""
+    if not changed or not changed <= STIFFNESS or config.method not in QUICK:
+        return None
+    return skin.stiffened(config.new_method(), youngs_modulus=config.youngs_modulus, density=config.density)
+
+
+def warm_up(simulator: Simulator) -> None:
+    """Solves one contact of each kind, so that nothing is left to compile when the first real one comes."""
+    corners = 0.01 * np.array([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1]])
+    faces = np.array([[0, 2, 4], [2, 1, 4], [1, 3, 4], [3, 0, 4], [2, 0, 5], [1, 2, 5], [3, 1, 5], [0, 3, 5]])
+    tool, layer, pose = Tool("warm up", corners, faces), simulator.layer, np.eye(4)
+    vertex = int(np.linalg.norm(layer.vertices - layer.vertices.mean(axis=0), axis=1).argmin())
+    push = np.concatenate([-0.01 * layer.normals[vertex], np.zeros(3)])
+    for away, wrench in ((0.009, push), (0.012, push), (0.009, None), (0.05, push)):
+        pose[:3, 3] = layer.vertices[vertex] + away * layer.normals[vertex]
+        simulator.step([Contact(tool, pose, wrench)])
+    simulator.tools.remove(tool.name)

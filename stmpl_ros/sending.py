@@ -1,0 +1,182 @@
+"""Sending: all topics that the node publishes answers on, opened and closed together."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from concurrent.futures import BrokenExecutor, Future
+from dataclasses import replace
+from functools import partial
+from typing import Any
+
+import numpy as np
+from geometry_msgs.msg import WrenchStamped
+from rclpy.lifecycle import LifecycleNode
+from rclpy.publisher import Publisher
+from stmpl_msgs.msg import LocalContact, SkinDeformed, SkinDisplacement, SkinTopology
+
+from bags import wire
+from bags.frame import Stamps
+from stmpl_core.contact import Contact
+from stmpl_core.errors import StmplError
+from stmpl_core.skin import Skin
+from stmpl_core.touch import APART, PRESSING, Answer
+from stmpl_ros.gate import Gate
+from stmpl_ros.inbox import Instant
+from stmpl_ros.parameters import NodeConfig
+from stmpl_ros.show import Show
+from stmpl_ros.topics import ANSWERS, NOW, STREAM, managed
+from stmpl_ros.workshop import Workshop
+
+MODELLED = PRESSING | {APART}  # statuses of which a local model says what the answer says
+
+
+class Sending:
+    """The skin at rest, answers, and what is made of them for those who listen.
+
+    Args:
+        node: node that publishes.
+        config: settings: frame and rates.
+        skin: skin that answers are of.
+        workshop: process that finds local contacts.
+        gate: is told what went wrong.
+    """
+
+    def __init__(self, node: LifecycleNode, config: NodeConfig, skin: Skin, workshop: Workshop, gate: Gate) -> None:
+        self._node, self._frame, self._skin = node, config.frame, skin
+        self._topology = managed(node, SkinTopology, "skin/topology", NOW)
+        self._displacement = managed(node, SkinDisplacement, "skin/displacement", ANSWERS)
+        self._deformed = managed(node, SkinDeformed, "skin/deformed", STREAM)
+        self._wrenches: dict[str, Publisher] = {}
+        self.show = Show(node, skin.layer, config.frame, config.marker_rate)
+        self.models = Models(node, config.frame, workshop, gate)
+        self._sequence = 0
+
+    @property
+    def sequence(self) -> int:
+        """Number of the next answer."""
+        return self._sequence
+
+    def close(self) -> None:
+        """Closes all topics."""
+        for publisher in (self._topology, self._displacement, self._deformed):
+            self._node.destroy_lifecycle_publisher(publisher)
+        for name in list(self._wrenches):
+            self.close_tool(name)
+        self.show.close()
+
+    def open_tool(self, name: str) -> None:
+        """Opens the topics of a tool."""
+        if name not in self._wrenches:
+            self._wrenches[name] = self._node.create_publisher(WrenchStamped, f"tools/{name}/contact_wrench", STREAM)
+            self.models.open(name)
+
+    def close_tool(self, name: str) -> None:
+        """Closes the topics of a tool."""
+        if name in self._wrenches:
+            self._node.destroy_publisher(self._wrenches.pop(name))
+            self.models.close(name)
+
+    def move_to(self, skin: Skin, workshop: Workshop) -> None:
+        """Sends answers of another skin from here on."""
+        self._skin = skin
+        self.models.move_to(workshop)
+        self.show.move_to(skin.layer)
+
+    def topology(self, stamp: int) -> None:
+        """Sends the skin at rest."""
+        self._topology.publish(wire.topology_message(self._skin.layer, self._frame, stamp))
+
+    def answer(self, answer: Answer, stamp: int, inputs: Stamps, **said: Any) -> None:
+        """Sends an answer, with what the node has to say of it (see wire.displacement_message)."""
+        message = wire.displacement_message(
+            answer, layer_id=self._skin.layer_id, body_frame=self._frame, stamp_ns=stamp, sequence=self._sequence,
+            inputs=inputs, **said,
+        )  # fmt: skip
+        self._sequence += 1
+        self._displacement.publish(message)
+        self.show.put(answer, stamp)
+        if self._deformed.get_subscription_count():
+            self._deformed.publish(wire.deformed_message(message, self._skin.layer.vertices))
+
+    def contacts(self, instant: Instant, answer: Answer, rotations: bool) -> None:
+        """Sends what the tools exert, and, once it is found, how that changes; with rotations too, if asked."""
+        for name, touch in answer.touches.items():
+            self._send_wrench(name, touch.wrench, instant.stamp)
+        self.models.put(instant, answer, rotations)
+
+    def rest(self, tools: Sequence[str], stamp: int) -> None:
+        """Tells that these tools exert nothing any more."""
+        for name in tools:
+            self._send_wrench(name, np.zeros(6), stamp)
+        self.models.forget()
+
+    def _send_wrench(self, name: str, wrench: np.ndarray, stamp: int) -> None:
+        publisher = self._wrenches.get(name)
+        if publisher and publisher.get_subscription_count():
+            publisher.publish(wire.wrench_message(wrench, self._frame, stamp))
+
+
+class Models:
+    """`tools/NAME/local_contact`: the newest answer's contacts to first order, while somebody listens.
+
+    Answers do not wait for it. One answer at a time, the newest first.
+    """
+
+    def __init__(self, node: LifecycleNode, frame: str, workshop: Workshop, gate: Gate) -> None:
+        self._node, self._frame, self._workshop, self._gate = node, frame, workshop, gate
+        self._publishers: dict[str, Publisher] = {}
+        self._next: tuple[Instant, Answer, bool] | None = None
+        self._busy = False
+
+    def open(self, name: str) -> None:
+        """Opens the topic of a tool."""
+        self._publishers[name] = self._node.create_publisher(LocalContact, f"tools/{name}/local_contact", STREAM)
+
+    def close(self, name: str) -> None:
+        """Closes it."""
+        self._node.destroy_publisher(self._publishers.pop(name))
+
+    def move_to(self, workshop: Workshop) -> None:
+        """Goes on with another skin's workshop; what the old one was asked is dropped."""
+        self._workshop, self._next, self._busy = workshop, None, False
+
+    def put(self, instant: Instant, answer: Answer, rotations: bool) -> None:
+        """Takes the newest answer."""
+        self._next = instant, answer, rotations
+        self._tell()
+
+    def forget(self) -> None:
+        """Does not tell of what waits any more."""
+        self._next = None
+
+    def _tell(self) -> None:
+        if self._busy or self._next is None:
+            return
+        (instant, answer, rotations), self._next = self._next, None
+        asked = [_answered(contact, answer) for contact in instant.contacts
+                 if answer.touches[contact.name].status in MODELLED and self._heard(contact.name)]  # fmt: skip
+        if asked:
+            self._busy = True
+            self._workshop.models(asked, rotations, partial(self._on_models, instant.stamp, asked, answer))
+
+    def _heard(self, tool: str) -> bool:
+        return tool in self._publishers and self._publishers[tool].get_subscription_count() > 0
+
+    def _on_models(self, stamp: int, asked: list[Contact], answer: Answer, future: Future) -> None:
+        self._busy = False
+        try:
+            for name, model in zip((contact.name for contact in asked), future.result(), strict=True):
+                if name in self._publishers:
+                    status = answer.touches[name].status
+                    self._publishers[name].publish(
+                        wire.local_contact_message(name, model, status, self._frame, stamp)
+                    )
+        except (StmplError, BrokenExecutor) as error:
+            self._workshop.renew(error)
+            self._gate.say("model", f"no local contact: {error}")
+        self._tell()
+
+
+def _answered(contact: Contact, answer: Answer) -> Contact:
+    """The contact where the answer has its tool, by its pose alone."""
+    return replace(contact, pose_body_from_tool=answer.touches[contact.name].pose_body_from_tool, wrench=None)
