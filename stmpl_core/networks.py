@@ -163,13 +163,10 @@ class Network:
 
 _FOLDER = Path(__file__).parent / "weights"
 NETWORKS = {
-    name: Network(kind, _FOLDER / f"{name}.safetensors")
-    for name, kind in (
-        ("moment_net", "motion"),  # pressures and nodal forces
-        ("moment_net_contact", "motion"),  # what rigid tools press with
-        ("contact_net", "pressure"),
-        ("unet", "image"),
-    )
+    "moment_net": Network("motion", _FOLDER / "moment_net.safetensors"),  # pressures and nodal forces
+    "moment_net_contact": Network("motion", _FOLDER / "moment_net_contact.safetensors"),  # what rigid tools press with
+    "contact_net": Network("pressure", _FOLDER / "contact_net.safetensors"),
+    "unet": Network("image", _FOLDER / "unet.safetensors"),
 }
 
 

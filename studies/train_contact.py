@@ -14,7 +14,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from torch import Tensor
 
 from fem_tools.dataset import Dataset, Sample, Subset
-from fem_tools.indenter import Tool
+from fem_tools.press import Press
 from fem_tools.provenance import commit, data_card, machine, versions
 from fem_tools.sampling import tool_scene
 from fem_tools.scenes import Site
@@ -88,7 +88,7 @@ def pressed(subset: Subset) -> Iterator[Pressed]:
             assert scene.mesh is not None
             way = -scene.pose_body_from_tool[:3, 2]
             field = SignedDistance.of(scene.mesh, rounding=scene.rounding)
-            tool = Tool(field, scene.pose_body_from_tool, way).touching(sample.layer)
+            tool = Press(field, scene.pose_body_from_tool, way).touching(sample.layer)
             assert tool is not None
             last = (sample.info["body"], sample.info["number"]), tool, site.thickness_under(scene.pose_body_from_tool)
         _, tool, thickness = last
