@@ -15,12 +15,13 @@ from pathlib import Path
 
 import matplotlib.pyplot as plt
 import numpy as np
-import trimesh
 from rich.console import Console
 from rich.progress import track
 from rich.table import Table
 
-from fem_tools.indenter import Indentation, IndenterFem, Tool
+from benchmarks.tools import ball, block_letter, fingertip, flat
+from fem_tools.indenter import Indentation, IndenterFem
+from fem_tools.press import Press
 from fem_tools.scenes import Site
 from stmpl_core.body import Body
 from stmpl_core.contact import Contact, ToolMesh
@@ -38,14 +39,14 @@ SLOWEST = 300  # steps that are timed
 
 
 @dataclass(frozen=True)
-class Press:
+class Scene:
     """Tools above a place on the arm.
 
     Args:
-        name: as tables say it.
-        meshes: of the tools, in their own frames, z up.
-        shifts: of each across the limb [m].
-        rounding: of edges, in FEM [m].
+        name: name in the tables.
+        meshes: shapes of the tools, in their own frames, z up.
+        shifts: place of each tool across the limb [m].
+        rounding: radius of the edges, in FEM [m].
         place: share of the way along the arm's vertices, sorted by their distance from the border.
     """
 
@@ -55,7 +56,7 @@ class Press:
     rounding: float = 0.0
     place: float = 0.0
 
-    def tools(self, layer: SoftLayer) -> list[Tool]:
+    def tools(self, layer: SoftLayer) -> list[Press]:
         """At first touch each."""
         site, tools = Site(layer), []
         order = np.argsort(-site.border_distance)
@@ -64,7 +65,7 @@ class Press:
         for mesh, shift in zip(self.meshes, self.shifts, strict=True):
             at = pose.copy()
             at[:3, 3] += shift * pose[:3, 0] + 40e-3 * pose[:3, 2]
-            tool = Tool(SignedDistance.of(mesh, rounding=self.rounding), at, -pose[:3, 2]).touching(layer)
+            tool = Press(SignedDistance.of(mesh, rounding=self.rounding), at, -pose[:3, 2]).touching(layer)
             assert tool is not None
             tools.append(tool)
         return tools
@@ -75,19 +76,19 @@ class Row:
     """One press at one depth, ours against FEM; errors as shares.
 
     Args:
-        name: of the press.
-        depth: of the tools beyond first touch, over the thickness.
-        mean_pressure: over E, of FEM.
-        force: of FEM [N].
-        force_error: of the force along the way, by pose; signed.
-        winkler_error: likewise, of columns.
-        pressure_error: L2, over the L2 norm of FEM's.
-        area_error: of the area of the vertices with over 2 % of the highest pressure; signed.
+        name: name of the scene.
+        depth: depth of the tools beyond first touch, over the thickness.
+        mean_pressure: FEM's mean pressure over E.
+        force: FEM's force [N].
+        force_error: signed error of the force along the way, by pose.
+        winkler_error: signed error of the force of columns alone.
+        pressure_error: L2 error of the pressure, over the L2 norm of FEM's.
+        area_error: signed error of the area of the vertices with over 2 % of the highest pressure.
         mee: mean Euclidean error over vertices that FEM moves by more than 1e-6 m, over the peak.
-        moving: likewise over those that move more than 10 % of the peak.
-        contact: likewise over those with pressure.
+        moving: mean error over vertices that move more than 10 % of the peak.
+        contact: mean error over vertices with pressure.
         peak: signed error of the largest displacement.
-        entered: of the deepest vertex of the whole skin inside a tool, over the thickness.
+        entered: depth of the deepest vertex of the whole skin inside a tool, over the thickness.
         by_wrench: error of the depth found from the force, the pose being off, over the thickness; signed.
         within: whether the force is within the error that the answer states.
     """
@@ -109,48 +110,16 @@ class Row:
     within: bool
 
 
-def ball(radius: float) -> ToolMesh:
-    """A ball of this radius [mm]."""
-    return _metres(trimesh.creation.icosphere(4, radius))
-
-
-def fingertip(radius: float, length: float) -> ToolMesh:
-    """A capsule lying along x [mm]."""
-    mesh = trimesh.creation.capsule(length, radius, count=[48, 48])
-    mesh.apply_translation([0, 0, -length / 2])
-    mesh.apply_transform(trimesh.transformations.rotation_matrix(np.pi / 2, [0, 1, 0]))
-    return _metres(mesh)
-
-
-def punch(radius: float, fillet: float) -> ToolMesh:
-    """A flat cylinder with a rounded rim [mm]."""
-    angle = np.linspace(0, np.pi / 2, 12)
-    rim = np.stack([radius - fillet + fillet * np.sin(angle), fillet - fillet * np.cos(angle)], axis=1)
-    outline = np.vstack([[[0, 0]], rim, [[radius, fillet + 12], [0, fillet + 12]]])
-    return _metres(trimesh.creation.revolve(outline, sections=96))
-
-
-def roller(radius: float, length: float) -> ToolMesh:
-    """A cylinder lying along x with rounded ends [mm]."""
-    return fingertip(radius, length)
-
-
-def _metres(mesh: trimesh.Trimesh) -> ToolMesh:
-    return ToolMesh.of(1e-3 * np.asarray(mesh.vertices), np.asarray(mesh.faces))
-
-
-def presses() -> list[Press]:
+def scenes() -> list[Scene]:
     """The scenes of the table."""
-    from fem_tools.scenes import extruded, letter
-
     return [
-        Press("sphere, r 9 mm", (ball(9),)),
-        Press("sphere, r 17 mm", (ball(17),), place=0.03),
-        Press("cylinder lying, r 11 mm", (roller(11, 26),), place=0.06),
-        Press("flat punch, r 9 mm", (punch(9, 1.5),), place=0.02),
-        Press("fingertip, r 7 mm", (fingertip(7, 10),), place=0.05),
-        Press("letter H, 26 mm", (extruded(letter("H", 26e-3), 0.0, 12e-3),), rounding=1.5e-3, place=0.01),
-        Press("two fingertips", (fingertip(6.5, 8), fingertip(6.5, 8)), shifts=(-11e-3, 11e-3), place=0.04),
+        Scene("sphere, r 9 mm", (ball(9),)),
+        Scene("sphere, r 17 mm", (ball(17),), place=0.03),
+        Scene("cylinder lying, r 11 mm", (fingertip(11, 26),), place=0.06),
+        Scene("flat punch, r 9 mm", (flat(9, 1.5),), place=0.02),
+        Scene("fingertip, r 7 mm", (fingertip(7, 10),), place=0.05),
+        Scene("letter H, 26 mm", (block_letter("H", 26),), rounding=1.5e-3, place=0.01),
+        Scene("two fingertips", (fingertip(6.5, 8), fingertip(6.5, 8)), shifts=(-11e-3, 11e-3), place=0.04),
     ]
 
 
@@ -160,25 +129,25 @@ def arm(edge: float = 3e-3) -> SoftLayer:
     return body.patch("left_arm", edge).layer(body, thickness=THICKNESS, tissue=Tissue(poisson_ratio=0.4))
 
 
-def contacts(press: Press, tools: Sequence[Tool], forces: Sequence[float] | None = None) -> list[Contact]:
+def contacts(scene: Scene, tools: Sequence[Press], forces: Sequence[float] | None = None) -> list[Contact]:
     """The same tools as Contacts, by pose or with these forces along their ways [N]."""
     out = []
-    for k, (mesh, tool) in enumerate(zip(press.meshes, tools, strict=True)):
+    for k, (mesh, tool) in enumerate(zip(scene.meshes, tools, strict=True)):
         wrench = None if forces is None else np.concatenate([forces[k] * tool.direction, np.zeros(3)])
         out.append(Contact(f"tool {k}", mesh, tool.pose_body_from_tool, wrench))
     return out
 
 
-def row(press: Press, simulator: Simulator, toucher: Toucher, truth: Indentation) -> Row:
+def row(scene: Scene, simulator: Simulator, toucher: Toucher, truth: Indentation) -> Row:
     """Ours against one answer of FEM."""
     layer, thick = simulator.layer, float(simulator.layer.thickness.mean())
     fields = [tool.field for tool in truth.tools]
-    touches = toucher.touch_all(contacts(press, truth.tools), fields)
+    touches = toucher.touch_all(contacts(scene, truth.tools), fields)
     ours = np.sum([touch.load.values for touch in touches], axis=0)
     area, way = layer.vertex_areas, truth.tools[0].direction
     force = float(sum(touch.wrench[:3] @ tool.direction for touch, tool in zip(touches, truth.tools, strict=True)))
     columns = sum(float(t.squeeze.pressure @ (-layer.vertex_area_vectors[t.squeeze.vertices] @ way)) for t in touches)
-    answer = simulator.step(contacts(press, truth.tools))
+    answer = simulator.step(contacts(scene, truth.tools))
     error = np.linalg.norm(answer.displacement - truth.displacement, axis=1)
     length, skin = np.linalg.norm(truth.displacement, axis=1), layer.vertices + answer.displacement
     peak = float(length.max())
@@ -186,9 +155,9 @@ def row(press: Press, simulator: Simulator, toucher: Toucher, truth: Indentation
     forces = [float(w[:3] @ tool.direction) for w, tool in zip(truth.wrenches, truth.tools, strict=True)]
     back = [tool.shifted(-OFF * tool.direction) for tool in truth.tools]
     found = [toucher.touch(c, f).trust.figures["moved_m"] - OFF
-             for c, f in zip(contacts(press, back, forces), fields, strict=True)]  # fmt: skip
+             for c, f in zip(contacts(scene, back, forces), fields, strict=True)]  # fmt: skip
     return Row(
-        name=press.name,
+        name=scene.name,
         depth=truth.depth / thick,
         mean_pressure=truth.trust.figures["mean_pressure_over_modulus"],
         force=truth.force,
@@ -210,13 +179,13 @@ def _area(pressure: np.ndarray, area: np.ndarray) -> float:
     return float(area[pressure > 0.02 * pressure.max()].sum())
 
 
-def timings(simulator: Simulator, toucher: Toucher, press: Press, depth: float) -> dict[str, list[float]]:
+def timings(simulator: Simulator, toucher: Toucher, scene: Scene, depth: float) -> dict[str, list[float]]:
     """Seconds of a contact step by pose and by wrench, and of a whole step, while the tool slides."""
-    tools = [tool.at(depth) for tool in press.tools(simulator.layer)]
+    tools = [tool.at(depth) for tool in scene.tools(simulator.layer)]
     across = tools[0].sideways(1.0)[1]
     out: dict[str, list[float]] = {"pose": [], "wrench": [], "whole": []}
     fields = [tool.field for tool in tools]
-    force = [float(t.wrench[:3] @ tools[0].direction) for t in toucher.touch_all(contacts(press, tools), fields)]
+    force = [float(t.wrench[:3] @ tools[0].direction) for t in toucher.touch_all(contacts(scene, tools), fields)]
 
     def timed(name: str, call: Callable[[], object]) -> None:
         start = time.perf_counter()
@@ -225,7 +194,7 @@ def timings(simulator: Simulator, toucher: Toucher, press: Press, depth: float) 
 
     for k in range(SLOWEST):
         moved = [tool.shifted(2e-3 * np.sin(0.07 * k) * across) for tool in tools]
-        by_pose, by_wrench = contacts(press, moved), contacts(press, moved, force)
+        by_pose, by_wrench = contacts(scene, moved), contacts(scene, moved, force)
         timed("pose", lambda: toucher.touch_all(by_pose, fields))  # noqa: B023
         timed("wrench", lambda: toucher.touch_all(by_wrench, fields))  # noqa: B023
         if k % 5 == 0:
@@ -238,12 +207,12 @@ def main() -> None:
     simulator, toucher = Simulator(layer, MomentNet()), Toucher(layer)
     fem = IndenterFem().prepare(layer)
     rows: list[Row] = []
-    every = presses()
-    for press in track(every, "pressing by finite elements", console=console):
-        tools = press.tools(layer)
+    every = scenes()
+    for scene in track(every, "pressing by finite elements", console=console):
+        tools = scene.tools(layer)
         for truth in fem.path(tools, np.array(DEPTHS) * THICKNESS):
-            rows.append(row(press, simulator, toucher, truth))
-    times = {press.name: timings(simulator, toucher, press, 0.4 * THICKNESS) for press in every}
+            rows.append(row(scene, simulator, toucher, truth))
+    times = {scene.name: timings(simulator, toucher, scene, 0.4 * THICKNESS) for scene in every}
     console.print(_table(rows))
     console.print(_time_table(times))
     kept = {"rows": [asdict(r) for r in rows],

@@ -1,4 +1,4 @@
-"""What a finite-element answer costs: seconds against error, scikit-fem with a direct solver beside it, and scaling.
+"""What a finite-element answer costs: seconds against error, and scaling.
 
     .venv/bin/python -m benchmarks.ground_truth        # prints tables, writes docs/pictures/ground_truth_cost.png
 
@@ -19,9 +19,7 @@ from rich.progress import track
 from rich.table import Table
 from threadpoolctl import threadpool_limits
 
-from benchmarks.naive_fem import solve_with_scikit_fem
 from fem_tools import PatchFem
-from fem_tools.mesh import ELEMENTS
 from stmpl_core.body import Body
 from stmpl_core.layer import SoftLayer
 from stmpl_core.load import Load
@@ -81,35 +79,6 @@ def accuracy_table(layer: SoftLayer) -> Table:
     return table
 
 
-def ratio_table(body: Body) -> Table:
-    """PatchFem beside scikit-fem's own assembly with a direct solver, on the same small patch of 4.5 mm edges."""
-    layer = body.part("left_arm", edge_length=4.5e-3)
-    load = disc_load(layer, sites(layer, 1)[0], 0.5)
-    patch = PatchFem(reach=2.5).prepare(layer).patch_around(load.loaded)
-    start = time.process_time()
-    other, unknowns = solve_with_scikit_fem(layer, patch, load)
-    slow = time.process_time() - start
-    finest = PatchFem(element="P2xP2", layers=3, refine=1, reach=2.5, check_stability=False).prepare(layer)
-    truth = finest.solve(load).displacement[patch.vertices]
-    peak = np.linalg.norm(truth, axis=1).max()
-
-    def errors(answer: np.ndarray) -> tuple[str, str]:
-        error = np.linalg.norm(answer - truth, axis=1)[np.linalg.norm(truth, axis=1) > 1e-6] / peak
-        return f"{100 * error.mean():.2f}", f"{100 * error.max():.2f}"
-
-    table = Table(title=f"the same press on the same patch of {len(patch.vertices)} vertices")
-    for column in ("solver", "unknowns", "s", "times faster", "MEE / peak %", "worst / peak %"):
-        table.add_column(column, justify="right")
-    table.add_row("scikit-fem, P2 tetrahedra, SuperLU", str(unknowns), f"{slow:.2f}", "1", *errors(other))
-    for element in ELEMENTS:
-        ours = PatchFem(element=element, reach=2.5, check_stability=False).prepare(layer)
-        quick, answer = timed(lambda m=ours: m.solve(load).displacement)
-        columns = ours.patch_around(load.loaded).mesh.n_columns
-        table.add_row(f"PatchFem, {element} wedges", str(6 * columns), f"{quick:.3f}", f"{slow / quick:.0f}",
-                      *errors(answer[patch.vertices]))  # fmt: skip
-    return table
-
-
 def scaling_picture(body: Body, path: Path) -> None:
     """Cost against patch size and against mesh width, log-log."""
     _, (left, right) = plt.subplots(1, 2, figsize=(10, 4), constrained_layout=True)
@@ -149,7 +118,6 @@ def main() -> None:
     layer = body.part("left_arm", edge_length=3e-3)
     console.print(f"{platform.processor() or platform.machine()}, one thread")
     console.print(accuracy_table(layer))
-    console.print(ratio_table(body))
     scaling_picture(body, PICTURE)
     console.print(f"picture: {PICTURE}")
 

@@ -7,24 +7,21 @@ Only the ratios of lengths and of p to E matter, so a thin layer stands for a la
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import matplotlib.pyplot as plt
 import numpy as np
-import trimesh
 from rich.console import Console
 from rich.progress import track
 from rich.table import Table
 from threadpoolctl import threadpool_limits
 
-from fem_tools.indenter import Indentation, IndenterFem, Tool, ToolLoad, _Press
-from fem_tools.mesh import level_depths
-from fem_tools.newton import NewtonResult, newton
+from benchmarks.tools import ball, block_letter, fingertip, flat
+from fem_tools.indenter import Indentation, IndenterFem
 from fem_tools.patch import QUADRATIC_ABOVE, EdgeLength, Patch, PatchFem
-from fem_tools.scenes import extruded, letter
+from fem_tools.press import Press
 from stmpl_core.contact import ToolMesh
 from stmpl_core.layer import SoftLayer, Tissue
 from stmpl_core.methods.base import prepared
@@ -36,41 +33,6 @@ PICTURE = Path(__file__).parents[1] / "docs" / "pictures" / "indenters.png"
 REQUIRED = 5.0  # mean pressure over E
 COLOURS = {"ball": "tab:blue", "flat": "tab:orange", "fingertip": "tab:green", "letter": "tab:red"}
 STYLES = ("-", "--", ":")  # as it is, nu 0.45, thin
-BARRIER_REACH = 0.005  # thicknesses
-HALFWAY = 1 / (1 + 2 * np.log(2))  # makes the barrier's force at half its reach that of the penalty
-
-
-def ball(radius: float) -> ToolMesh:
-    """A ball of a radius [mm] that stands on z = 0."""
-    mesh = trimesh.creation.icosphere(subdivisions=4, radius=radius)
-    mesh.apply_translation([0, 0, radius])
-    return _in_metres(mesh)
-
-
-def flat(radius: float, fillet: float) -> ToolMesh:
-    """A flat-ended cylinder with a filleted rim [mm] that stands on z = 0."""
-    angle = np.linspace(0, np.pi / 2, 12)
-    rim = np.stack([radius - fillet + fillet * np.sin(angle), fillet - fillet * np.cos(angle)], axis=1)
-    outline = np.vstack([[[0, 0]], rim, [[radius, fillet + 12], [0, fillet + 12]]])
-    return _in_metres(trimesh.creation.revolve(outline, sections=96))
-
-
-def fingertip(radius: float, length: float) -> ToolMesh:
-    """A capsule on its side [mm] that lies on z = 0."""
-    mesh = trimesh.creation.capsule(height=length, radius=radius, count=[48, 48])
-    mesh.apply_translation([0, 0, -length / 2])
-    mesh.apply_transform(trimesh.transformations.rotation_matrix(np.pi / 2, [0, 1, 0]))
-    mesh.apply_translation([0, 0, radius])
-    return _in_metres(mesh)
-
-
-def block_letter(character: str, height: float) -> ToolMesh:
-    """A block letter of a height [mm], 12 mm thick, that stands on z = 0."""
-    return extruded(letter(character, 1e-3 * height), 0.0, 12e-3)
-
-
-def _in_metres(mesh: trimesh.Trimesh) -> ToolMesh:
-    return ToolMesh.of(1e-3 * np.asarray(mesh.vertices), np.asarray(mesh.faces))
 
 
 @dataclass(frozen=True)
@@ -78,14 +40,14 @@ class Scene:
     """A tool above a flat layer, or above a limb.
 
     Args:
-        name: as tables say it.
-        mesh: makes the tool.
-        thickness: of the layer [m].
+        name: name in the tables.
+        mesh: function that makes the tool.
+        thickness: thickness of the layer [m].
         nu: Poisson's ratio [-].
-        rounding: of the tool's edges [m].
-        edge: of the layer's triangles before refinement [m].
-        rim: of the plate beyond the tool [thicknesses].
-        limb: a cylinder of 40 mm radius in place of the plate.
+        rounding: radius of the tool's edges [m].
+        edge: edge length of the layer's triangles before refinement [m].
+        rim: width of the plate beyond the tool [thicknesses].
+        limb: whether a cylinder of 40 mm radius stands in place of the plate.
     """
 
     name: str
@@ -97,19 +59,20 @@ class Scene:
     rim: float = 3.5
     limb: bool = False
 
-    def built(self, aside: float = 0.0) -> tuple[SoftLayer, Tool]:
+    def built(self, aside: float = 0.0) -> tuple[SoftLayer, Press]:
         """The layer, and the tool above it, `aside` [m] of its middle."""
         mesh, tissue, pose = self.mesh(), Tissue(poisson_ratio=self.nu), np.eye(4)
         field = SignedDistance.of(mesh, rounding=self.rounding)
         if self.limb:
             pose[:3, :3] = [[0, 0, 1], [0, 1, 0], [-1, 0, 0]]
             pose[:3, 3] = 0.045, aside, 0.08
-            return SoftLayer(*limb(self.edge), self.thickness, tissue=tissue), Tool(field, pose, np.array([-1.0, 0, 0]))
+            layer = SoftLayer(*limb(self.edge), self.thickness, tissue=tissue)
+            return layer, Press(field, pose, np.array([-1.0, 0, 0]))
         half = float(np.abs(mesh.vertices[:, :2]).max()) + self.rim * self.thickness
         vertices, faces = plate(2 * round(half / self.edge) + 1, self.edge)
         vertices[:, :2] -= vertices[:, :2].mean(axis=0)
         pose[:3, 3] = aside, 0.0, 5e-3
-        return SoftLayer(vertices, faces, self.thickness, tissue=tissue), Tool(field, pose, np.array([0, 0, -1.0]))
+        return SoftLayer(vertices, faces, self.thickness, tissue=tissue), Press(field, pose, np.array([0, 0, -1.0]))
 
     def solver(self, *, step: float = 0.04) -> IndenterFem:
         """Linear wedges, two deep, edges down to an eighth of the layer's where the tool is curved."""
@@ -157,46 +120,6 @@ def press(scene: Scene, depths: np.ndarray, *, step: float = 0.04, aside: float 
         if not answer.trust.ok:
             break
     return answers
-
-
-class BarrierLoad(ToolLoad):
-    """A tool kept off by the barrier -k (g - h)^2 ln(g / h) on gaps g < h (Li et al., "Incremental Potential
-    Contact", TOG 39, 2020, eq. 6), weighted by area. No node can enter; there is nothing to update."""
-
-    def __init__(self, load: ToolLoad, reach: float) -> None:
-        self.__dict__.update(load.__dict__)
-        self.reach = reach
-        self.scale = load.normal * HALFWAY  # at half the reach it presses as hard as the penalty does when in by that
-
-    def pressed(self, phi: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """See ToolLoad."""
-        h, g = self.reach, np.clip(phi, 1e-12, self.reach)
-        log, away = np.log(g / h), g - h
-        energy = np.where(phi > 0, -(away**2) * log, np.inf)
-        slope, bend = 2 * away * log + away**2 / g, -2 * log - 4 * away / g + (away / g) ** 2
-        return self.scale * energy, self.scale * slope, self.scale * bend
-
-
-class BarrierPress(_Press):
-    """The same press with a barrier in place of the augmented Lagrangian: it must start with all gaps open."""
-
-    def _loads(self, travel: float) -> list[ToolLoad]:
-        return [BarrierLoad(load, BARRIER_REACH * self.thickness) for load in super()._loads(travel)]
-
-    def _step(self, travel: float) -> tuple[NewtonResult, list[ToolLoad]]:
-        before, loads, rest = self._loads(self.state.travel), self._loads(travel), self.system.rest
-        u, skin = self.state.u.copy(), rest[:, 0] + self.state.u[:, 0]
-        reach = BARRIER_REACH * self.thickness
-        gaps = [np.clip(old.tool.distance(skin), 1e-3 * reach, reach) for old in before]
-        share = 1 - level_depths(self.mesh.layers)[None, :, None]
-        for _ in range(5):  # every column keeps the gap it had, or the barrier's reach
-            for load, gap in zip(loads, gaps, strict=True):
-                phi, gradient, _ = load.tool.jet(rest[:, 0] + u[:, 0])
-                push = np.where(self.patch.fixed, 0.0, np.maximum(gap - phi, 0.0))
-                u += (push[:, None] * gradient)[:, None] * share
-        self.system.loads = loads
-        settings = replace(self.fem.settings, tolerance=1e-4, max_iterations=40)
-        return newton(self.system, u, 1.0, settings), loads
 
 
 class FinerFem(PatchFem):
@@ -341,26 +264,6 @@ def starts_table(ways: list[Way]) -> Table:
     return table
 
 
-def barrier_table(scenes: tuple[Scene, ...]) -> Table:
-    """The augmented Lagrangian and the barrier, to 70 % of the thickness."""
-    table = Table(title="contact by the augmented Lagrangian and by a log barrier, to 70 % of t")
-    for column in ("tool", "rule", "force", "nodes in, % of t", "faces in, % of t", "s"):
-        table.add_column(column, justify="right")
-    for scene in scenes:
-        layer, tool = scene.built()
-        solver, first = scene.solver().prepare(layer), 0.0
-        for rule, kind in (("augmented Lagrangian", _Press), ("barrier", BarrierPress)):
-            way = kind(solver, layer, [tool], np.array([0.7 * scene.thickness]))
-            start = time.process_time()
-            done = way.walk(0.7 * scene.thickness)
-            spent, answer = time.process_time() - start, way.answer()
-            first = first or answer.force
-            entered = [answer.trust.figures[f"{what}_entered_m"] / scene.thickness for what in ("nodes", "faces")]
-            table.add_row(scene.name, rule, f"{answer.force / first:.3f}" if done else f"stopped: {way.stopped}",
-                          *(f"{100 * x:.2f}" for x in entered), f"{spent:.1f}")  # fmt: skip
-    return table
-
-
 def picture(ways: list[Way], path: Path) -> None:
     """Force against depth for each tool, and the mean pressure beside what the issue asks."""
     figure, (left, right) = plt.subplots(1, 2, figsize=(11, 4.6), constrained_layout=True)
@@ -397,7 +300,6 @@ def main() -> None:
             console.print(f"{way.scene.name}, {100 * way.depth[-1]:.1f} %: {way.why}")
     picture(ways, PICTURE)
     console.print(starts_table(ways))
-    console.print(barrier_table((SCENES[0], SCENES[3], SCENES[9])))
     console.print(bound_table(FITTED, "the stated bound where it was fitted"))
     console.print(bound_table(HELD_OUT, "the stated bound on cases held out"))
     console.print(f"picture: {PICTURE}")

@@ -7,7 +7,6 @@ python -m benchmarks.inference --picture docs/pictures/thinning.png
 from __future__ import annotations
 
 import argparse
-import io
 import os
 import time
 from collections.abc import Callable
@@ -17,7 +16,6 @@ import matplotlib
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
-import numba
 import numpy as np
 
 from fem_tools import PatchFem
@@ -62,70 +60,6 @@ def timed(call: Callable[[], object], seconds: float) -> tuple[float, float]:
     return float(np.median(spent)), float(np.quantile(spent, 0.99))
 
 
-def on_threads(threads: int, call: Callable[[], object]) -> Callable[[], object]:
-    """The same call on so many of numba's threads."""
-
-    def limited() -> object:
-        numba.set_num_threads(threads)
-        return call()
-
-    return limited
-
-
-def network_alone(net: MomentNet, count: int) -> dict[str, Callable[[], object]]:
-    """The three hidden layers on `count` vertices, by several engines."""
-    import torch
-    from torch import nn
-
-    a = net.weights.arrays
-    x = np.random.default_rng(0).normal(size=(count, parts.INPUTS)).astype(np.float32)
-
-    out = np.empty((count, parts.OUTPUTS), np.float32)
-    layers = [a[name + k] for k in "1234" for name in ("w", "b")]
-
-    class Torch(nn.Module):
-        def __init__(self) -> None:
-            super().__init__()
-            for name in ("w1", "b1", "w2", "b2", "w3", "b3", "w4", "b4"):
-                self.register_buffer(name, torch.from_numpy(a[name]))
-
-        def forward(self, h: torch.Tensor) -> torch.Tensor:
-            for k in "123":
-                h = torch.addmm(getattr(self, "b" + k), h, getattr(self, "w" + k))
-                h = h * (0.5 + 0.5 * h / (1 + h.abs()))
-            return torch.addmm(self.b4, h, self.w4)
-
-    eager, tensor = Torch().eval(), torch.from_numpy(x)
-    engines: dict[str, Callable[[], object]] = {}
-    for threads in (1, 2):
-        engines[f"numba and BLAS, {threads}"] = on_threads(threads, lambda: parts.think(x, *layers, out))
-
-    def in_torch(model: Callable, threads: int) -> Callable[[], object]:
-        def call() -> object:
-            torch.set_num_threads(threads)
-            with torch.inference_mode():
-                return model(tensor)
-
-        return call
-
-    for threads in (1, 2):
-        engines[f"torch, {threads}"] = in_torch(eager, threads)
-    engines["torch.compile, 1"] = in_torch(torch.compile(eager), 1)
-    try:
-        import onnxruntime
-
-        stream = io.BytesIO()
-        torch.onnx.export(eager, (tensor,), stream, input_names=["x"], dynamo=False)
-        for threads in (1, 2):
-            options = onnxruntime.SessionOptions()
-            options.intra_op_num_threads = threads
-            session = onnxruntime.InferenceSession(stream.getvalue(), options, providers=["CPUExecutionProvider"])
-            engines[f"ONNX Runtime, {threads}"] = lambda s=session: s.run(None, {"x": x})
-    except ImportError as error:
-        print(f"ONNX Runtime is left out: {error}")
-    return engines
-
-
 def draw(net: MomentNet, layer: SoftLayer, loads: dict[str, Load], out: Path) -> None:
     """Who is pressed, who is asked and who is filled in, seen from above the contact."""
     assert net._near is not None
@@ -148,9 +82,9 @@ def draw(net: MomentNet, layer: SoftLayer, loads: dict[str, Load], out: Path) ->
 def main() -> None:
     """Prints the tables."""
     given = argparse.ArgumentParser(description=__doc__)
-    given.add_argument("--weights", default=None, help="of MomentNet; those that come with the package unless given")
-    given.add_argument("--seconds", type=float, default=3.0, help="of each measurement")
-    given.add_argument("--picture", type=Path, help="only draw which vertices are asked, to this file")
+    given.add_argument("--weights", default=None, help="weights of MomentNet; those that ship unless given")
+    given.add_argument("--seconds", type=float, default=3.0, help="time of each measurement [s]")
+    given.add_argument("--picture", type=Path, help="file for a drawing of the asked vertices; measures nothing then")
     options = given.parse_args()
     import torch
 
@@ -183,12 +117,6 @@ def main() -> None:
         sources = parts.source_fields(load.values, layer)
         median, _ = timed(lambda s=sources, a=asked: net._near.felt(s, a), options.seconds / 3)  # type: ignore[union-attr]
         print(f"    of that, feeling the load: {median:.2f} ms")
-    print("\nthe network alone, 1,000 vertices; engine, threads")
-    base = 0.0
-    for name, call in network_alone(net, 1000).items():
-        median, p99 = timed(call, options.seconds)
-        base = base or median
-        print(f"    {name:20} {median:8.3f} ms, p99 {p99:8.3f}, {median / base:6.2f} times the first")
     paper = Pix2PixUNet(512, 64).eval()
     maps = torch.zeros(1, 2, 512, 512)
 

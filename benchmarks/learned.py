@@ -23,8 +23,8 @@ from fem_tools.scenes import Site, UnusableContact, ellipse, letter
 from stmpl_core import Load
 from stmpl_core.body import Body
 from stmpl_core.methods import Linear, Method, MomentNet
-from stmpl_core.methods.moment_net import shipped
 from stmpl_core.metrics import Score, mean_and_deviation, score
+from stmpl_core.networks import shipped
 from studies.train_moments import MomentTraining, draw_points, fit
 
 HIDDEN = (4, 8, 16, 32, 64, 128)
@@ -49,7 +49,7 @@ def by_weights(data: Path, steps: int, count: int, work: Path) -> dict[str, list
     """Networks of several widths, trained alike, on each split; the linear response as width 0."""
     source = Dataset.open(data)
     points = draw_points(source, MomentTraining(points=64), lambda *_: None)
-    card = shipped().card
+    card = shipped("moment_net").card
     rows: dict[str, list[dict]] = {split: [] for split in SPLITS}
     for hidden in (0, *HIDDEN):
         start = time.perf_counter()

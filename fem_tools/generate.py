@@ -27,8 +27,9 @@ import zarr
 
 from fem_tools.dataset import FIGURES, FORMAT, RAGGED, Record, Writer, write_layer
 from fem_tools.hand import Hand
-from fem_tools.indenter import INDENTER_LAYERS, IndenterFem, Tool
+from fem_tools.indenter import INDENTER_LAYERS, IndenterFem
 from fem_tools.patch import PatchFem
+from fem_tools.press import Press
 from fem_tools.sampling import BodyPlan, ContactId, Kind, Plan, contacts, draw, kinds_of, layers, ratios, split_of
 from fem_tools.scenes import Scene, Site, UnusableContact
 from stmpl_core.body import Body
@@ -164,7 +165,7 @@ def solve_indentations(bench: Bench, scene: Scene, wanted: np.ndarray) -> Iterat
     """The tool pressed in along its axis to these depths over thickness, sticking."""
     layer, pose = bench.site.layer, scene.pose_body_from_tool
     assert scene.mesh is not None
-    tool = Tool(SignedDistance.of(scene.mesh, rounding=scene.rounding), pose, -pose[:3, 2])
+    tool = Press(SignedDistance.of(scene.mesh, rounding=scene.rounding), pose, -pose[:3, 2])
     answers = bench.indenter.path([tool], (wanted * bench.site.thickness_under(pose)).tolist())
     for ratio, answer in zip(wanted, answers, strict=False):
         figures = dict(answer.trust.figures) | {"ratio": float(ratio)}

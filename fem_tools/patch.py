@@ -10,11 +10,12 @@ from typing import Literal, Self
 import numpy as np
 from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import dijkstra
-from scipy.spatial import KDTree
 
-from fem_tools import neo_hookean as nh
-from fem_tools.mesh import ElementName, WedgeMesh, level_depths, reference_skin, split
-from fem_tools.newton import NewtonResult, NewtonSettings, System, is_positive_definite, solve
+from fem_tools.estimates import discretisation_error, error_bound, truncation_error
+from fem_tools.mesh import ElementName, WedgeMesh, level_depths, split
+from fem_tools.newton import NewtonResult, NewtonSettings, is_positive_definite, solve
+from fem_tools.skin_loads import DeadForces, FollowerPressure
+from fem_tools.system import System
 from stmpl_core.errors import InvalidInput, MeshError
 from stmpl_core.extrusion import fold_ratios
 from stmpl_core.layer import SoftLayer
@@ -27,82 +28,10 @@ MIN_FOLD = 0.05  # smallest determinant of a wedge at rest, over its mean, that 
 QUADRATIC_ABOVE = 0.42  # Poisson's ratio above which linear in plane locks: its largest error passes 3 % of the peak
 TWO_DEEP_ABOVE = 0.49  # Poisson's ratio above which one wedge leaves 2 % of the peak, two leave 0.2 %
 REFINED_WITHIN = 1.5  # thicknesses of the load; beyond, the layer's own mesh is fine enough
-# The stated bound: shares of the estimates and of the peak, fitted on discs of radius 5-18 mm with edges of 3-6 mm on
-# arms, p / E 0.1-1.5, reach 3-7, one wedge of P1xP2 against two or three of P2xP2 at half the width: it covers the
-# largest error in all 27 cases, and is 2.0 times that error in the middle (docs/ground_truth.md).
-DISCRETISATION_SHARE, TRUNCATION_SHARE = 0.5, 0.6
-PEAK_SHARE = 0.025  # one wedge through the thickness leaves this share; as much again at p = E, as its square
 VALIDATED_RATIO = {"pressure": 2.0, "contact": 2.0, "nodal": 0.4}  # p / E
 NEAR_BORDER = 2.0  # thicknesses from the open border, nearer to which it is felt
 
-
 EdgeLength = Callable[[np.ndarray], np.ndarray]  # points of each triangle (T, k, 3) [m] -> longest edge wanted (T,) [m]
-
-
-class FollowerPressure:
-    """A pressure at the triangle corners, (N,) [Pa], along the deformed normal."""
-
-    conservative = False
-
-    def __init__(self, mesh: WedgeMesh, pressure: np.ndarray) -> None:
-        self.mesh, self.corners = mesh, pressure[mesh.triangles]
-        self.reference = reference_skin(mesh.element)
-
-    def potential(self, skin: np.ndarray, factor: float) -> float:
-        """A follower pressure with an edge has none."""
-        return float("nan")
-
-    def add_forces(self, skin: np.ndarray, factor: float, forces: np.ndarray) -> None:
-        """See SkinLoad."""
-        r = self.reference
-        nh.follower_forces(skin, self.mesh.columns, factor * self.corners, r.value, r.slope, r.linear, r.weight, forces)
-
-    def add_tangent(
-        self, skin: np.ndarray, factor: float, data: np.ndarray, *, symmetric: bool, convex: float = 0.0
-    ) -> None:
-        """See SkinLoad."""
-        r, m = self.reference, self.mesh
-        pressure = factor * self.corners
-        nh.follower_tangent(skin, m.columns, m.blocks, pressure, r.value, r.slope, r.linear, r.weight, symmetric, data)
-
-
-class DeadForces:
-    """Forces on the skin columns that keep their direction, (C, 3) [N]."""
-
-    conservative = True
-
-    def __init__(self, forces: np.ndarray) -> None:
-        self.forces = forces
-
-    def add_forces(self, skin: np.ndarray, factor: float, forces: np.ndarray) -> None:
-        """See SkinLoad."""
-        forces += factor * self.forces
-
-    def add_tangent(
-        self, skin: np.ndarray, factor: float, data: np.ndarray, *, symmetric: bool, convex: float = 0.0
-    ) -> None:
-        """Dead forces have no stiffness."""
-
-    def potential(self, skin: np.ndarray, factor: float) -> float:
-        """See SkinLoad."""
-        return -factor * float(np.vdot(self.forces, skin))
-
-    @classmethod
-    def at_vertices(cls, mesh: WedgeMesh, forces: np.ndarray) -> DeadForces:
-        """Concentrated at the triangle corners, (N, 3) [N]: the paper's rule on its own mesh."""
-        return cls(np.concatenate([forces, np.zeros((mesh.n_columns - len(forces), 3))]))
-
-    @classmethod
-    def of_traction(cls, mesh: WedgeMesh, traction: np.ndarray) -> DeadForces:
-        """Of a traction, linear between the triangle corners, (N, 3) [Pa]: int N_a T dA."""
-        r, skin = reference_skin(mesh.element), mesh.column_ends()[0]
-        a, b, c = (mesh.outer[mesh.triangles[:, k]] for k in range(3))
-        double = np.linalg.norm(np.cross(b - a, c - a), axis=1)
-        mass = np.einsum("q,qa,qk->ak", r.weight, r.value, r.linear)
-        parts = np.einsum("t,ak,tki->tai", double, mass, traction[mesh.triangles])
-        forces = np.zeros_like(skin)
-        np.add.at(forces, mesh.columns, parts)
-        return cls(forces)
 
 
 @dataclass(frozen=True, eq=False)
@@ -355,66 +284,6 @@ def confined_guess(system: System, pressure: np.ndarray) -> np.ndarray:
     u = (1 - stretch)[:, None, None] * (inner - outer)[:, None] * (1 - depth)
     u[system.fixed] = 0.0
     return u if system.keep is None else np.einsum("cij,clj->cli", system.keep, u)
-
-
-def error_bound(discretisation: float, truncation: float, u: np.ndarray, layers: int, ratio: float) -> float:
-    """The largest error to expect at any vertex [m].
-
-    Args:
-        discretisation, truncation: their estimates [m].
-        u: (C, levels, 3) [m].
-        layers: wedges through the thickness.
-        ratio: largest p / E [-].
-    """
-    peak = float(np.linalg.norm(u[:, 0], axis=1).max(initial=0.0))
-    depth = PEAK_SHARE * peak * (1 / layers**2 + ratio**2)
-    return DISCRETISATION_SHARE * discretisation + TRUNCATION_SHARE * truncation + depth
-
-
-def truncation_error(patch: Patch, u: np.ndarray, layer: SoftLayer) -> float:
-    """Estimate of what the held rim of the patch changes [m]: the motion one thickness inside the cut.
-
-    Zero where the patch is the whole layer.
-    """
-    n = len(patch.vertices)
-    own = np.isin(patch.vertices, layer.border)
-    cut = patch.vertices[patch.fixed[:n] & ~own]
-    if not len(cut):
-        return 0.0
-    points = layer.vertices[patch.vertices]
-    gap = KDTree(layer.vertices[cut]).query(points)[0]
-    near = gap < 1.25 * layer.thickness.max()
-    return float(np.linalg.norm(u[:n, 0][near], axis=1).max(initial=0.0))
-
-
-def discretisation_error(system: System, u: np.ndarray) -> float:
-    """Estimate of the largest error of the skin's displacement that the mesh width leaves [m].
-
-    The middle of each edge is where a linear interpolation is worst: by Hermite's cubic through the recovered nodal
-    slopes it is off by |(g_b - g_a) . e| / 8 (Zienkiewicz & Zhu's recovery, IJNME 24, 1987, on the skin).
-    """
-    mesh, skin = system.mesh, system.rest[:, 0]
-    corners, value = mesh.triangles, u[:, 0]
-    a, b, c = (skin[corners[:, k]] for k in range(3))
-    normal = np.cross(b - a, c - a)
-    double = np.linalg.norm(normal, axis=1, keepdims=True)
-    normal = normal / double
-    slopes = (
-        sum(
-            value[corners[:, k]][:, :, None] * np.cross(normal, edge)[:, None, :]
-            for k, edge in enumerate((c - b, a - c, b - a))
-        )
-        / double[:, :, None]
-    )  # (T, 3, 3) du_i / dx_j
-    nodal, area = np.zeros((len(skin), 3, 3)), np.zeros(len(skin))
-    for k in range(3):
-        np.add.at(nodal, corners[:, k], slopes * double[:, :, None])
-        np.add.at(area, corners[:, k], double[:, 0])
-    nodal /= np.maximum(area, 1e-300)[:, None, None]
-    edges = np.unique(np.sort(corners[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1), axis=0)
-    along = skin[edges[:, 1]] - skin[edges[:, 0]]
-    bend = np.einsum("eij,ej->ei", nodal[edges[:, 1]] - nodal[edges[:, 0]], along) / 8
-    return float(np.linalg.norm(bend, axis=1).max(initial=0.0))
 
 
 def mirror_projectors(mesh: WedgeMesh) -> np.ndarray:

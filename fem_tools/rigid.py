@@ -7,8 +7,9 @@ from typing import Self
 
 import numpy as np
 
-from fem_tools.indenter import INDENTER_LAYERS, IndenterFem, Tool
+from fem_tools.indenter import INDENTER_LAYERS, IndenterFem
 from fem_tools.patch import PatchFem
+from fem_tools.press import Press
 from stmpl_core.arrays import PerVertex
 from stmpl_core.contact import Contact
 from stmpl_core.errors import InvalidInput
@@ -77,7 +78,7 @@ class RigidFem:
                           "; ".join(filter(None, (trust.why, theirs.why))), dict(trust.figures) | found)  # fmt: skip
         return Displacement(displacement, trust, self.name, total)
 
-    def _tool(self, contact: Contact, pressure: PerVertex, moved: float) -> tuple[Tool, float]:
+    def _tool(self, contact: Contact, pressure: PerVertex, moved: float) -> tuple[Press, float]:
         """The tool where it first touches, and how far it goes from there [m]."""
         layer = prepared(self._layer, self)
         if contact.tool.digest not in self._fields:
@@ -90,7 +91,7 @@ class RigidFem:
         else:
             away = field.distance((layer.vertices - pose[:3, 3]) @ pose[:3, :3])
             way = -(np.where(away < NEAR * layer.edge_length, pressure, 0.0) @ layer.vertex_area_vectors)
-        tool = Tool(field, pose, way)
+        tool = Press(field, pose, way)
         there = tool.at(moved)
         touching = there.at(-float(layer.thickness.max())).touching(layer)
         if touching is None:

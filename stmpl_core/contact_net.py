@@ -2,18 +2,15 @@
 
 from __future__ import annotations
 
-from functools import cache
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
 from stmpl_core.layer import SoftLayer
-from stmpl_core.methods.moment_net import INPUTS, Weights, invariants, think_few
+from stmpl_core.methods.moment_net import invariants, think_few
 from stmpl_core.moments import Surroundings
+from stmpl_core.networks import INPUTS, PRESSURE, Weights, shipped
 
-SHIPPED = Path(__file__).parent / "weights" / "contact_net.safetensors"
-OUTPUTS = 2  # log of pressure over Winkler's, log of the error to expect of it
 MOST = 2.5  # largest |log| of pressure over Winkler's
 
 
@@ -21,9 +18,9 @@ class Held(NamedTuple):
     """What holds the skin against a tool.
 
     Args:
-        pressure: over E, (N,) [-].
-        doubt: the error to expect of it, likewise, (N,) [-].
-        outside: which vertices see what no training contact had, (N,).
+        pressure: pressure over E, (N,) [-].
+        doubt: error to expect of it, over E, (N,) [-].
+        outside: mask of the vertices that see what no training contact had, (N,).
     """
 
     pressure: np.ndarray
@@ -44,12 +41,12 @@ class ContactNet:
     Args:
         layer: soft layer at rest.
         near: neighbours of its vertices.
-        weights: a trained network; None: the one that comes with the package.
+        weights: trained network; None: the one that comes with the package.
     """
 
     def __init__(self, layer: SoftLayer, near: Surroundings, weights: Weights | None = None) -> None:
         self.near = near
-        self.weights = weights or shipped()
+        self.weights = weights or shipped("contact_net")
         self._shape = np.concatenate([self.near.curvature, self.near.slope], axis=1).astype(np.float32)
         self._constants = np.array([layer.tissue.poisson_ratio, 0.0], np.float32)
 
@@ -57,23 +54,17 @@ class ContactNet:
         """The pressure that holds squeezed columns.
 
         Args:
-            vertices: numbers of those that are squeezed, (N,).
-            pressure: Winkler's there, over E (N,) [-]; see stmpl_core.columns.Squeeze.
-            strain: likewise, (N,) [-].
+            vertices: numbers of the squeezed vertices, (N,).
+            pressure: Winkler's pressure there over E, (N,) [-]; see stmpl_core.columns.Squeeze.
+            strain: strain of a confined column there, times its modulus over E, (N,) [-].
         """
         a = self.weights.arrays
         here = np.column_stack([pressure, strain]).astype(np.float32)
         figures = self.near.felt_among(vertices, here).figures
-        inputs, outside = np.empty((len(vertices), INPUTS), np.float32), np.zeros(len(vertices), np.bool_)
+        inputs, outside = np.empty((len(vertices), INPUTS.size), np.float32), np.zeros(len(vertices), np.bool_)
         invariants(figures, self._shape[vertices], here, self._constants, a["mix_vectors"], a["mix_tensors"], a["low"],
                    a["high"], a["mean"], a["scale"], inputs, outside)  # fmt: skip
-        outputs = np.empty((len(vertices), OUTPUTS), np.float32)
+        outputs = np.empty((len(vertices), PRESSURE.size), np.float32)
         think_few(inputs, a["w1"], a["b1"], a["w2"], a["b2"], a["w3"], a["b3"], a["w4"], a["b4"], outputs)
-        held = pressure * np.exp(np.clip(outputs[:, 0], -MOST, MOST))
-        return Held(held, held * np.exp(np.minimum(outputs[:, 1], 1.0)), outside)
-
-
-@cache
-def shipped() -> Weights:
-    """The network that comes with the package."""
-    return Weights.load(SHIPPED, outputs=OUTPUTS)
+        held = pressure * np.exp(np.clip(outputs[:, PRESSURE.at.log_ratio], -MOST, MOST))
+        return Held(held, held * np.exp(np.minimum(outputs[:, PRESSURE.at.log_error], 1.0)), outside)

@@ -12,10 +12,13 @@ from numpy.polynomial.legendre import Legendre, leggauss
 from scipy.linalg import eigh
 from scipy.optimize import brentq
 
-from fem_tools.indenter import IndenterFem, Tool
+from fem_tools.indenter import IndenterFem
 from fem_tools.mesh import WedgeMesh
-from fem_tools.newton import NewtonSettings, System, is_positive_definite, newton
-from fem_tools.patch import DeadForces, FollowerPressure, PatchFem, mirror_projectors
+from fem_tools.newton import NewtonSettings, is_positive_definite, newton
+from fem_tools.patch import PatchFem, mirror_projectors
+from fem_tools.press import Press
+from fem_tools.skin_loads import DeadForces, FollowerPressure
+from fem_tools.system import System
 from stmpl_core.errors import InvalidInput
 from stmpl_core.layer import SoftLayer, Tissue
 from stmpl_core.methods.winkler import column_stretch
@@ -224,7 +227,7 @@ def _ball(element: Any, edge: float) -> CriticalLoad:
     layer = SoftLayer(vertices, faces, THICKNESS)
     solver = IndenterFem(PatchFem(element=element, reach=3, refine=1)).prepare(layer)
     ratio = 0.0
-    for answer in solver.path([Tool(field, pose, np.array([0.0, 0, -1]))], (DEPTHS * THICKNESS).tolist()):
+    for answer in solver.path([Press(field, pose, np.array([0.0, 0, -1]))], (DEPTHS * THICKNESS).tolist()):
         if not answer.trust.converged:
             return CriticalLoad("indenter", "ball", element, edge, ratio, "no solution")
         ratio = float(answer.pressure.max()) / layer.tissue.youngs_modulus

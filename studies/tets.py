@@ -8,8 +8,9 @@ from typing import Any, Literal
 import numpy as np
 from scipy.sparse import csr_matrix
 
-from fem_tools.newton import System, diagonal_blocks
-from fem_tools.patch import DeadForces, FollowerPressure, Patch, PatchFem
+from fem_tools.patch import Patch, PatchFem
+from fem_tools.skin_loads import DeadForces, FollowerPressure
+from fem_tools.system import System, diagonal_blocks
 from stmpl_core.arrays import Points
 from stmpl_core.errors import InvalidInput, MeshError
 from stmpl_core.layer import Tissue

@@ -14,16 +14,16 @@ from pydantic import BaseModel, ConfigDict, Field
 from torch import Tensor
 
 from fem_tools.dataset import Dataset, Sample, Subset
-from fem_tools.indenter import Tool
+from fem_tools.press import Press
 from fem_tools.provenance import commit, data_card, machine, versions
 from fem_tools.sampling import tool_scene
 from fem_tools.scenes import Site
 from stmpl_core.arrays import Transform
 from stmpl_core.columns import Columns, Squeeze
-from stmpl_core.contact_net import MOST, OUTPUTS, ContactNet
+from stmpl_core.contact_net import MOST, ContactNet
 from stmpl_core.errors import InvalidInput
-from stmpl_core.methods.moment_net import Weights
 from stmpl_core.moments import Surroundings
+from stmpl_core.networks import POINT, PRESSURE, Weights
 from stmpl_core.sdf import SignedDistance
 from studies.train_moments import VERSIONS, Model, OnProgress
 
@@ -88,7 +88,7 @@ def pressed(subset: Subset) -> Iterator[Pressed]:
             assert scene.mesh is not None
             way = -scene.pose_body_from_tool[:3, 2]
             field = SignedDistance.of(scene.mesh, rounding=scene.rounding)
-            tool = Tool(field, scene.pose_body_from_tool, way).touching(sample.layer)
+            tool = Press(field, scene.pose_body_from_tool, way).touching(sample.layer)
             assert tool is not None
             last = (sample.info["body"], sample.info["number"]), tool, site.thickness_under(scene.pose_body_from_tool)
         _, tool, thickness = last
@@ -107,7 +107,7 @@ class Rows:
     """Squeezed vertices of many contacts, one after the other.
 
     Args:
-        rows: inputs of Model, (N, ROW) float32.
+        rows: inputs of Model, laid out as stmpl_core.networks.POINT, (N, POINT.size) float32.
         prior, true: pressure over E, (N,) float32.
         area: of the vertex, over the sum of its contact's, (N,) float32.
         starts: first row of each contact, and the end, (C + 1,).
@@ -133,9 +133,10 @@ def draw_rows(subset: Subset, on_progress: OnProgress) -> Rows:
         sources = np.column_stack([squeeze.pressure, squeeze.strain])
         figures = near.felt_among(v, sources).figures.reshape(n, -1)
         constants = np.broadcast_to([layer.tissue.poisson_ratio, 0.0], (n, 2))
-        rows = np.concatenate([figures, near.curvature[v], near.slope[v], sources, constants], axis=1)
+        rows = POINT.in_order(figures=figures, curvature=near.curvature[v], slope=near.slope[v], here=sources,
+                              constants=constants)  # fmt: skip
         area = layer.vertex_areas[v]
-        parts.append((rows, squeeze.pressure, one.true, area / area.sum()))
+        parts.append((np.concatenate(rows, axis=1), squeeze.pressure, one.true, area / area.sum()))
         starts.append(starts[-1] + n)
         on_progress(k + 1, len(subset), "looking at contacts")
     rows, prior, true, area = (np.concatenate(p).astype(np.float32) for p in zip(*parts, strict=True))
@@ -149,7 +150,7 @@ def loss(model: Model, data: Rows, contacts: np.ndarray) -> tuple[Tensor, Tensor
     owner = torch.from_numpy(np.repeat(np.arange(len(contacts)), [b - a for a, b in ends]))
     rows, prior, true, area = (torch.from_numpy(a[take]) for a in (data.rows, data.prior, data.true, data.area))
     out, doubt = model.outputs(rows)
-    held = prior * torch.exp(torch.clamp(out[:, 0], -MOST, MOST))
+    held = prior * torch.exp(torch.clamp(out[:, PRESSURE.at.log_ratio], -MOST, MOST))
 
     def total(values: Tensor) -> Tensor:
         return torch.zeros(len(contacts)).index_add_(0, owner, values)
@@ -166,7 +167,7 @@ def loss(model: Model, data: Rows, contacts: np.ndarray) -> tuple[Tensor, Tensor
 def fit(data: Rows, settings: ContactTraining, on_progress: OnProgress) -> Model:
     """Trains on contacts drawn at random."""
     torch.manual_seed(settings.seed)
-    model = Model(settings.hidden, OUTPUTS)
+    model = Model(settings.hidden, PRESSURE)
     model.normalise(torch.from_numpy(data.rows))
     optimiser = torch.optim.AdamW(model.parameters(), lr=settings.learning_rate, weight_decay=settings.weight_decay)
     schedule = torch.optim.lr_scheduler.OneCycleLR(

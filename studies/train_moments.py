@@ -18,22 +18,11 @@ from fem_tools.provenance import commit, data_card, machine, versions
 from fem_tools.sampling import Kind
 from stmpl_core.layer import SoftLayer
 from stmpl_core.load import Load
-from stmpl_core.methods.moment_net import (
-    AMPLITUDE,
-    DIRECTIONS,
-    INPUTS,
-    MIXED_TENSORS,
-    MIXED_VECTORS,
-    OUTPUTS,
-    SURROUNDED,
-    MomentNet,
-    Weights,
-    source_fields,
-)
+from stmpl_core.methods.moment_net import AMPLITUDE, SURROUNDED, MomentNet, source_fields
 from stmpl_core.moments import SCALARS, TENSORS, VECTORS, WIDTH, Surroundings
+from stmpl_core.networks import DIRECTIONS, INPUTS, MIXED_TENSORS, MIXED_VECTORS, MOTION, POINT, Layout, Weights
 
 VERSIONS = ("stmpl", "torch", "numpy", "numba", "safetensors")
-ROW = 2 * WIDTH + 9  # of a point: what it feels of both fields, curvature, slope, both fields here, nu, dead or not
 TYPICAL = 1e-3  # of the peak: errors below count as squares in the loss
 COVERED = 0.95  # share of validation answers whose largest error the stated bound must reach
 MARGIN = 1.3  # on that bound, for limbs and shapes unlike the validation data
@@ -70,8 +59,8 @@ class Points:
     """Vertices of samples: what each feels, and how it moves.
 
     Args:
-        rows: (N, ROW) float32.
-        motion: displacement over the local thickness in the vertex's frame, (N, 3) float32.
+        rows: what is known of each, laid out as POINT, (N, POINT.size) float32.
+        motion: displacement over the local thickness in the vertex's frame, (N, 3) float32 [-].
         weight: local thickness over the sample's largest displacement, (N,) float32.
     """
 
@@ -85,7 +74,7 @@ def draw_points(data: Dataset, settings: MomentTraining, on_progress: OnProgress
     rng = np.random.default_rng(settings.seed)
     subsets = [data.split("train", kind=kind) for kind in settings.kinds]
     total, done = sum(map(len, subsets)), 0
-    rows = np.empty((total * settings.points, ROW), np.float32)
+    rows = np.empty((total * settings.points, POINT.size), np.float32)
     motion, weight = np.empty((len(rows), 3), np.float32), np.empty(len(rows), np.float32)
     end, near = 0, None
     for subset in subsets:
@@ -113,28 +102,34 @@ def _points(near: Surroundings, layer: SoftLayer, load: Load, displacement: np.n
     v = v[chosen]
     figures = felt.figures[surrounded[chosen]].reshape(len(v), -1)
     constants = np.broadcast_to([layer.tissue.poisson_ratio, load.kind == "nodal"], (len(v), 2))
-    rows = [figures, near.curvature[v], near.slope[v], sources[v], constants]
+    rows = POINT.in_order(figures=figures, curvature=near.curvature[v], slope=near.slope[v], here=sources[v],
+                          constants=constants)  # fmt: skip
     local = np.einsum("nij,nj->ni", near.frames[v], displacement[v]) / layer.thickness[v, None]
     return np.concatenate(rows, axis=1), local, layer.thickness[v] / peak
 
 
 class Model(nn.Module):
-    """The network of stmpl_core.methods.moment_net, in torch: the same inputs, in the same order, with gradients."""
+    """The network of stmpl_core.methods.moment_net, in torch: the same inputs, with gradients.
 
-    def __init__(self, hidden: int, outputs: int = OUTPUTS) -> None:
+    Args:
+        hidden: width of each hidden layer.
+        says: layout of what the last layer says.
+    """
+
+    def __init__(self, hidden: int, says: Layout = MOTION) -> None:
         super().__init__()
         self.mix_vectors = nn.Parameter(torch.randn(MIXED_VECTORS, DIRECTIONS) / DIRECTIONS**0.5)
         self.mix_tensors = nn.Parameter(torch.randn(MIXED_TENSORS, 2 * TENSORS) / (2 * TENSORS) ** 0.5)
         self.layers = nn.ModuleList(
-            nn.Linear(a, b) for a, b in ((INPUTS, hidden), (hidden, hidden), (hidden, hidden), (hidden, outputs))
+            nn.Linear(a, b) for a, b in ((INPUTS.size, hidden), (hidden, hidden), (hidden, hidden), (hidden, says.size))
         )
         nn.init.zeros_(self.layers[-1].weight)  # type: ignore[arg-type]
         nn.init.zeros_(self.layers[-1].bias)  # type: ignore[arg-type]
         for name, value in (("low", -1.0), ("high", 1.0), ("mean", 0.0), ("scale", 1.0)):
-            self.register_buffer(name, torch.full((INPUTS,), value))
+            self.register_buffer(name, torch.full((INPUTS.size,), value))
 
     def normalise(self, rows: Tensor) -> None:
-        """Takes the inputs' ranges and spreads from points (N, ROW)."""
+        """Takes the inputs' ranges and spreads from points (N, POINT.size)."""
         with torch.no_grad():
             inputs, *_ = self._inputs(rows)
             low, high = inputs.amin(dim=0), inputs.amax(dim=0)
@@ -142,11 +137,10 @@ class Model(nn.Module):
             self.mean, self.scale = inputs.mean(dim=0), 1 / (inputs.std(dim=0) + 1e-6)
 
     def _inputs(self, rows: Tensor) -> tuple[Tensor, ...]:
-        fields = rows[:, : 2 * WIDTH].view(-1, 2, WIDTH)
-        xx, xy, yy, *_ = curvature = rows[:, 2 * WIDTH : 2 * WIDTH + 3].T
-        slope = rows[:, 2 * WIDTH + 3 : 2 * WIDTH + 5]
-        here, constants = rows[:, -4:-2], rows[:, -2:]
-        del curvature
+        known = POINT.split(rows)
+        fields = known["figures"].view(-1, 2, WIDTH)
+        xx, xy, yy = known["curvature"].T
+        slope, here, constants = known["slope"], known["here"], known["constants"]
         a, b = 3 + SCALARS, 3 + SCALARS + 2 * VECTORS
         scalars = fields[:, :, 3:a]
         g = scalars[:, 1].abs().sum(dim=1, keepdim=True).clamp_min(1e-9)
@@ -161,26 +155,40 @@ class Model(nn.Module):
         tensor_products = torch.einsum("nai,nbi->nab", t, t)[:, it[0], it[1]]
         bent = torch.stack([(xx - yy) / 2, xy], dim=1)
         turned, curved = _act(t, v[:, :MIXED_TENSORS]), _act(bent[:, None], v)
-        inputs = [
-            scalars.flatten(1) / g, fields[:, :, 2] / g, here / g, torch.log(here.abs() + 0.02),
-            torch.log(g + 1e-4), g, torch.sqrt(g), scalars[:, 0] - scalars[:, 1], products, tensor_products,
-            (turned * v[:, :MIXED_TENSORS]).sum(-1), torch.einsum("ni,nci->nc", bent, t),
-            (curved * v).sum(-1), torch.einsum("ni,nci->nc", slope, v),
-            ((xx + yy) / 2)[:, None], (bent**2).sum(1, keepdim=True), constants,
-            1 / (1.02 - 2 * constants[:, :1]), (slope**2).sum(1, keepdim=True),
-        ]  # fmt: skip
+        inputs = INPUTS.in_order(
+            scalars=scalars.flatten(1) / g,
+            linear_normal=fields[:, :, 2] / g,
+            here=here / g,
+            log_here=torch.log(here.abs() + 0.02),
+            log_g=torch.log(g + 1e-4),
+            g=g,
+            root_g=torch.sqrt(g),
+            field_difference=scalars[:, 0] - scalars[:, 1],
+            vector_products=products,
+            tensor_products=tensor_products,
+            tensor_along_vector=(turned * v[:, :MIXED_TENSORS]).sum(-1),
+            tensor_along_curvature=torch.einsum("ni,nci->nc", bent, t),
+            curvature_along_vector=(curved * v).sum(-1),
+            slope_along_vector=torch.einsum("ni,nci->nc", slope, v),
+            mean_curvature=((xx + yy) / 2)[:, None],
+            squared_bend=(bent**2).sum(1, keepdim=True),
+            constants=constants,
+            volumetric=1 / (1.02 - 2 * constants[:, :1]),
+            squared_slope=(slope**2).sum(1, keepdim=True),
+        )
         return torch.cat(inputs, dim=1), g, vectors, turned, curved, slope, fields[:, 1, :3]
 
     def forward(self, rows: Tensor) -> tuple[Tensor, Tensor]:
         """Motion over thickness in the vertex's frame (N, 3), and log of the error to expect of it over g (N,)."""
         inputs, g, vectors, turned, curved, slope, prior = self._inputs(rows)
         out, doubt = self._think(inputs)
-        coefficients = out[:, 1:-2, None]
+        say = MOTION.split(out)
+        coefficients = torch.cat([say["directions"], say["turned"], say["curved"]], dim=1)[:, :, None]
         directions = torch.cat([vectors, turned, curved], dim=1)
-        along = (coefficients * directions).sum(dim=1) + out[:, -2:-1] * slope
+        along = (coefficients * directions).sum(dim=1) + say["slope"] * slope
         a = AMPLITUDE * g / (1 + g)
         log_error = doubt + torch.log(a[:, 0].detach())
-        return prior + a * torch.cat([along, out[:, :1]], dim=1), log_error
+        return prior + a * torch.cat([along, say["normal"]], dim=1), log_error
 
     def outputs(self, rows: Tensor) -> tuple[Tensor, Tensor]:
         """The last layer alone, (N, outputs), and its last column once more, learnt without bending the others."""

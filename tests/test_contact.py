@@ -7,8 +7,9 @@ import pytest
 import trimesh
 from scipy.spatial import Delaunay
 
-from fem_tools.indenter import IndenterFem, Tool
+from fem_tools.indenter import IndenterFem
 from fem_tools.patch import PatchFem
+from fem_tools.press import Press
 from stmpl_core import Contact, Load, SoftLayer, Tissue, ToolMesh
 from stmpl_core.body import Body
 from stmpl_core.errors import InvalidInput, MeshError
@@ -421,7 +422,7 @@ def test_a_ball_presses_about_as_hard_as_finite_elements_say() -> None:
     """By pose, on a limb that nothing was learnt from; columns alone press much too hard."""
     layer = limb(4e-3)
     field, depths, toucher = SignedDistance.of(ball(subdivisions=4)), np.array([2e-3, 4e-3]), Toucher(layer)
-    tool_above = Tool(field, at(RADIUS + 0.02, 0, MIDDLE), np.array([-1.0, 0, 0]))
+    tool_above = Press(field, at(RADIUS + 0.02, 0, MIDDLE), np.array([-1.0, 0, 0]))
     solver = IndenterFem(PatchFem(refine=1, layers=1, reach=4), step=0.1).prepare(layer)
     for depth, answer in zip(depths, solver.path([tool_above], depths), strict=True):
         touch = toucher.touch(press(BALL, answer.tools[0].pose_body_from_tool, None), field)

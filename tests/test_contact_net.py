@@ -8,9 +8,9 @@ import pytest
 
 from stmpl_core import SoftLayer, Tissue
 from stmpl_core.columns import Columns, Squeeze
-from stmpl_core.contact_net import MOST, OUTPUTS, SHIPPED, ContactNet, Held, shipped
+from stmpl_core.contact_net import MOST, ContactNet, Held
 from stmpl_core.errors import InvalidInput
-from stmpl_core.methods.moment_net import INPUTS, Weights
+from stmpl_core.networks import INPUTS, NETWORKS, PRESSURE, Weights, shipped
 from stmpl_core.sdf import SignedDistance
 from tests.touch_scenes import LENGTH, RADIUS, at, ball, limb, turn
 
@@ -21,13 +21,13 @@ POSE = at(RADIUS + 0.009, 0.001, LENGTH / 2)
 
 def random_weights(seed: int) -> Weights:
     """A network that was taught nothing: what holds for it holds for any."""
-    rng, known = np.random.default_rng(seed), shipped()
+    rng, known = np.random.default_rng(seed), shipped("contact_net")
     arrays = {name: rng.normal(scale=0.5, size=a.shape).astype(np.float32) if name[0] in "wb" else a
               for name, a in known.arrays.items()}  # fmt: skip
     return Weights(arrays, known.card)
 
 
-WEIGHTS = [shipped(), random_weights(0), random_weights(1)]
+WEIGHTS = [shipped("contact_net"), random_weights(0), random_weights(1)]
 
 
 def held(layer: SoftLayer, weights: Weights, pose: np.ndarray = POSE) -> tuple[Squeeze, Held]:
@@ -96,23 +96,23 @@ def test_what_no_training_contact_had_is_said() -> None:
 
 
 def test_the_weights_that_come_with_the_package_say_what_made_them() -> None:
-    card = shipped().card
+    card = shipped("contact_net").card
     assert {"data", "settings", "ranges", "bound", "commit", "versions"} <= set(card)
     for name in ("poisson_ratio", "thickness_mm", "depth_over_thickness", "p_over_e"):
         low, high = card["ranges"][name]
         assert 0 <= low < high
     assert 0 < card["bound"]["factor"] < np.inf
-    arrays = shipped().arrays
-    assert arrays["w1"].shape[0] == INPUTS and arrays["w4"].shape[1] == OUTPUTS
+    arrays = shipped("contact_net").arrays
+    assert arrays["w1"].shape[0] == INPUTS.size and arrays["w4"].shape[1] == PRESSURE.size
     assert all(np.isfinite(a).all() for a in arrays.values())
 
 
 def test_another_network_is_refused(tmp_path: Path) -> None:
     with pytest.raises(InvalidInput, match="no network of this kind"):
-        Weights.load(SHIPPED)  # a network for contact is no MomentNet
+        Weights.load(NETWORKS["contact_net"].path)  # a network for contact is no MomentNet
     with pytest.raises(InvalidInput, match="there is no"):
-        Weights.load(tmp_path / "none.safetensors", outputs=OUTPUTS)
-    copy = replace(shipped(), card={"format": 1})
+        Weights.load(tmp_path / "none.safetensors", "pressure")
+    copy = replace(shipped("contact_net"), card={"format": 1})
     copy.save(tmp_path / "copy.safetensors")
-    again = Weights.load(tmp_path / "copy.safetensors", outputs=OUTPUTS)
-    assert all((again.arrays[name] == shipped().arrays[name]).all() for name in again.arrays)
+    again = Weights.load(tmp_path / "copy.safetensors", "pressure")
+    assert all((again.arrays[name] == shipped("contact_net").arrays[name]).all() for name in again.arrays)

@@ -8,9 +8,12 @@ from skfem.refdom import RefWedge
 
 from fem_tools import PatchFem
 from fem_tools import neo_hookean as nh
+from fem_tools.krylov import bicgstab, conjugate_gradients, multiply
 from fem_tools.mesh import ELEMENTS, WedgeMesh, reference_wedge
-from fem_tools.newton import System, bicgstab, conjugate_gradients, is_positive_definite, multiply, solve
-from fem_tools.patch import FollowerPressure, mirror_projectors
+from fem_tools.newton import is_positive_definite, solve
+from fem_tools.patch import mirror_projectors
+from fem_tools.skin_loads import FollowerPressure
+from fem_tools.system import System
 from stmpl_core.errors import InvalidInput, MeshError, NotPrepared
 from stmpl_core.layer import SoftLayer, Tissue
 from stmpl_core.load import Load

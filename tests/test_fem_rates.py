@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 
+from fem_tools.krylov import conjugate_gradients
 from fem_tools.mesh import Reference, WedgeMesh, level_depths, reference_wedge, rest_gradients
-from fem_tools.newton import System, conjugate_gradients
+from fem_tools.system import System
 from stmpl_core.layer import SoftLayer, Tissue
 from tests.scenes import plate
 

@@ -3,21 +3,8 @@
 import numpy as np
 import pytest
 
-from benchmarks.haptics import (
-    HARD,
-    QUIET,
-    Device,
-    Felt,
-    Hand,
-    Spot,
-    arm_spot,
-    forces_along,
-    paths,
-    play,
-    settings_for,
-    slide,
-    worst_jump,
-)
+from benchmarks.haptic_device import QUIET, Device, Felt, Hand, Spot, arm_spot, play
+from benchmarks.haptics import HARD, forces_along, paths, settings_for, slide, worst_jump
 from stmpl_core import Contact
 from stmpl_core.errors import InvalidInput
 from stmpl_core.haptics import DeviceLoop, LocalContact, LoopSettings, local_contact

@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 import trimesh
 
-from fem_tools.indenter import IndenterFem, Tool
+from fem_tools.indenter import IndenterFem
 from fem_tools.patch import PatchFem
+from fem_tools.press import Press
 from stmpl_core.contact import ToolMesh
 from stmpl_core.errors import InvalidInput
 from stmpl_core.layer import SoftLayer, Tissue
@@ -43,8 +44,8 @@ def pressed(ball, layer):
     return list(IndenterFem(PatchFem(refine=2, reach=4)).prepare(layer).path([side_tool(ball)], depths))
 
 
-def side_tool(field: SignedDistance, x: float = 0.08) -> Tool:
-    return Tool(field, pose(x, 0, 0.08), np.array([-1.0, 0, 0]))
+def side_tool(field: SignedDistance, x: float = 0.08) -> Press:
+    return Press(field, pose(x, 0, 0.08), np.array([-1.0, 0, 0]))
 
 
 def test_force_grows_with_depth_and_every_answer_is_sound_down_to_70_percent(pressed):
@@ -87,9 +88,9 @@ def test_the_tractions_sum_to_the_wrench(pressed, layer):
 
 def test_the_core_bears_what_the_tool_exerts(ball, layer):
     """Global balance: internal forces at the held nodes are minus the tool's force."""
-    from fem_tools.indenter import _Press
+    from fem_tools.indenter import Walk
 
-    press = _Press(IndenterFem(PatchFem(refine=1, reach=4)).prepare(layer), layer, [side_tool(ball)], np.array([2e-3]))
+    press = Walk(IndenterFem(PatchFem(refine=1, reach=4)).prepare(layer), layer, [side_tool(ball)], np.array([2e-3]))
     press.walk(2e-3)
     reaction = press.system.internal(press.state.u)[0]
     held = reaction[:, -1].sum(axis=0) + reaction[press.patch.fixed, :-1].sum(axis=(0, 1))
@@ -128,7 +129,7 @@ def test_coulomb_lies_between_sliding_and_sticking(ball, layer):
 
 def test_a_grasp_of_a_symmetric_limb_is_in_balance(ball):
     layer = SoftLayer(*limb(3.93e-3), THICKNESS)  # 64 vertices around: the two sides are alike
-    other = Tool(ball, pose(-0.08, 0, 0.08), np.array([1.0, 0, 0]))
+    other = Press(ball, pose(-0.08, 0, 0.08), np.array([1.0, 0, 0]))
     answer = IndenterFem(PatchFem(refine=1, reach=3)).prepare(layer).press([side_tool(ball), other], 2e-3)
     assert answer.trust.converged
     first, second = answer.wrenches
@@ -142,7 +143,7 @@ def test_turning_the_scene_turns_the_answer(ball, layer):
     motion[:3, :3], motion[:3, 3] = turn, (0.1, -0.4, 0.2)
     moved = layer.with_(vertices=layer.vertices @ turn.T + motion[:3, 3])
     tool = side_tool(ball)
-    turned = Tool(ball, motion @ tool.pose_body_from_tool, turn @ tool.direction)
+    turned = Press(ball, motion @ tool.pose_body_from_tool, turn @ tool.direction)
     fem = PatchFem(refine=1, reach=4)
     here, there = IndenterFem(fem).prepare(layer).press([tool], 2e-3), None
     there = IndenterFem(fem).prepare(moved).press([turned], 2e-3)
@@ -176,7 +177,7 @@ def test_a_shallow_ball_is_hertz_with_the_correction_for_a_bonded_layer(ball, nu
     tissue = Tissue(poisson_ratio=nu)
     flat = SoftLayer(vertices, faces, THICKNESS, tissue=tissue)
     solver = IndenterFem(PatchFem(refine=3, reach=4, layers=2), friction="none").prepare(flat)
-    tool = Tool(ball, pose(0, 0, 0.02), np.array([0, 0, -1.0]))
+    tool = Press(ball, pose(0, 0, 0.02), np.array([0, 0, -1.0]))
     for answer in solver.path([tool], [0.15e-3, 0.3e-3]):
         expected = bonded_layer_force(0.012, answer.depth, THICKNESS, tissue)
         assert answer.force == pytest.approx(expected, rel=0.06)
@@ -185,7 +186,7 @@ def test_a_shallow_ball_is_hertz_with_the_correction_for_a_bonded_layer(ball, nu
 def test_bad_input_is_refused_with_its_reason(ball, layer):
     solver = IndenterFem().prepare(layer)
     with pytest.raises(InvalidInput, match="never meets"):
-        solver.press([Tool(ball, pose(0.08, 0, 0.08), np.array([1.0, 0, 0]))], 1e-3)
+        solver.press([Press(ball, pose(0.08, 0, 0.08), np.array([1.0, 0, 0]))], 1e-3)
     with pytest.raises(InvalidInput, match="inside the core"):
         solver.press([side_tool(ball)], 1.2 * THICKNESS)
     with pytest.raises(InvalidInput, match="increase"):

@@ -4,9 +4,12 @@ import numpy as np
 import pytest
 import trimesh
 
-from benchmarks.indenters import BarrierLoad, FinerFem, Scene, ball, errors, flat
-from fem_tools.indenter import IndenterFem, Tool, ToolLoad
+from benchmarks.indenters import FinerFem, Scene, errors
+from benchmarks.tools import ball, flat
+from fem_tools.indenter import IndenterFem
 from fem_tools.patch import PatchFem
+from fem_tools.press import Press
+from fem_tools.tool_contact import PressLoad
 from stmpl_core.body import Body
 from stmpl_core.sdf import SignedDistance
 from tests.test_indenter import tool_mesh
@@ -54,7 +57,7 @@ def test_a_tool_goes_down_to_70_percent_of_the_arm(arm, name):
     pose[:3, 0] *= np.sign(np.linalg.det(pose[:3, :3]))
     pose[:3, 3] = arm.vertices[vertex] + 0.03 * outwards
     solver = IndenterFem(PatchFem(refine=3, reach=3), step=0.1).prepare(arm)
-    answers = list(solver.path([Tool(field, pose, -outwards)], np.array([0.3, 0.7]) * THICKNESS))
+    answers = list(solver.path([Press(field, pose, -outwards)], np.array([0.3, 0.7]) * THICKNESS))
     assert len(answers) == 2
     for answer in answers:
         assert answer.trust.ok, answer.trust.why
@@ -85,16 +88,14 @@ def test_the_stated_bound_covers_what_a_finer_mesh_changes():
         assert 0.002 * peak < error < bound < 5 * error
 
 
-@pytest.mark.parametrize("barrier", [False, True])
-def test_contact_pressure_is_minus_the_slope_of_its_energy_and_stiffness_that_of_the_pressure(barrier):
+def test_contact_pressure_is_minus_the_slope_of_its_energy_and_stiffness_that_of_the_pressure():
     field = SignedDistance.of(tool_mesh(trimesh.creation.icosphere(subdivisions=2, radius=5.0)))
     n, nothing = 9, np.zeros((9, 3))
-    load = ToolLoad(
-        Tool(field, np.eye(4), np.array([0, 0, 1.0])), np.ones(n), np.arange(n), np.arange(n), (1e6, 0.0),
+    load = PressLoad(
+        Press(field, np.eye(4), np.array([0, 0, 1.0])), np.ones(n), np.arange(n), np.arange(n), (1e6, 0.0),
         np.full(n, 5.0), nothing * np.nan, np.full(n, np.inf),
     )  # fmt: skip
-    load = BarrierLoad(load, 50e-6) if barrier else load
-    gap, by = np.linspace(3e-6, 60e-6, n) if barrier else np.linspace(-20e-6, 22e-6, n), 1e-9
+    gap, by = np.linspace(-20e-6, 22e-6, n), 1e-9
     below, here, above = (load.pressed(gap + shift) for shift in (-by, 0.0, by))
     np.testing.assert_allclose(here[1], (below[0] - above[0]) / (2 * by), rtol=1e-5, atol=1e-6)
     np.testing.assert_allclose(here[2], (below[1] - above[1]) / (2 * by), rtol=1e-5, atol=1e-3)

@@ -14,9 +14,10 @@ from fem_tools.sampling import PRESETS
 from stmpl_core import Load, SoftLayer, Tissue
 from stmpl_core.errors import InvalidInput, NotPrepared
 from stmpl_core.methods import Linear, MomentNet
-from stmpl_core.methods.moment_net import source_fields
+from stmpl_core.methods.moment_net import invariants, source_fields
 from stmpl_core.metrics import score
 from stmpl_core.moments import REACH, Surroundings
+from stmpl_core.networks import INPUTS, POINT
 from studies.train_moments import Model, MomentTraining, draw_points, fit, train_moments
 from tests import scenes
 from tests.touch_scenes import turn
@@ -198,6 +199,29 @@ def test_misuse_is_refused(tmp_path: Path) -> None:
         MomentNet(tmp_path / "bad.safetensors")
 
 
+def test_numba_and_torch_see_the_same_inputs() -> None:
+    """Column by column of stmpl_core.networks.INPUTS, for anything that a vertex may feel."""
+    torch.manual_seed(0)
+    model, rng = Model(4), np.random.default_rng(0)
+    parts = {name: rng.normal(size=(200, count)).astype(np.float32) for name, count in POINT.sizes.items()}
+    parts["constants"][:] = 0.4, 1.0
+    inputs, outside = np.empty((200, INPUTS.size), np.float32), np.zeros(200, np.bool_)
+    mixed = model.mix_vectors.detach().numpy(), model.mix_tensors.detach().numpy()
+    ends = [np.full(INPUTS.size, value, np.float32) for value in (-1e9, 1e9, 0.0, 1.0)]
+    shape = np.concatenate([parts["curvature"], parts["slope"]], axis=1)
+    invariants(parts["figures"].reshape(200, 2, -1), shape, parts["here"], parts["constants"][0], *mixed, *ends, inputs,
+               outside)  # fmt: skip
+    with torch.no_grad():
+        want = model._inputs(torch.from_numpy(np.concatenate(POINT.in_order(**parts), axis=1)))[0].numpy()
+    for name, columns in INPUTS.split(inputs).items():
+        np.testing.assert_allclose(columns, INPUTS.split(want)[name], rtol=2e-4, atol=2e-5, err_msg=name)
+
+
+def test_a_row_that_does_not_fit_its_layout_is_refused() -> None:
+    with pytest.raises(InvalidInput, match="layout"):
+        POINT.in_order(figures=np.zeros((3, 2)))
+
+
 def test_the_method_computes_what_was_trained() -> None:
     """The same network in torch and in the compiled kernels, with random weights."""
     torch.manual_seed(1)
@@ -209,7 +233,8 @@ def test_the_method_computes_what_was_trained() -> None:
     felt = near.felt(sources)
     v = felt.vertices
     constants = np.tile([layer.tissue.poisson_ratio, 0.0], (len(v), 1))
-    rows = [felt.figures.reshape(len(v), -1), near.curvature[v], near.slope[v], sources[v], constants]
+    rows = POINT.in_order(figures=felt.figures.reshape(len(v), -1), curvature=near.curvature[v], slope=near.slope[v],
+                          here=sources[v], constants=constants)  # fmt: skip
     points = torch.tensor(np.concatenate(rows, axis=1), dtype=torch.float32)
     model.normalise(points)
     with torch.no_grad():

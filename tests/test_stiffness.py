@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from fem_tools.indenter import IndenterFem, Tool
+from fem_tools.indenter import IndenterFem
 from fem_tools.patch import PatchFem
+from fem_tools.press import Press as IndenterPress
 from stmpl_core import Contact
 from stmpl_core.errors import InvalidInput
 from stmpl_core.sdf import SignedDistance
@@ -29,7 +30,7 @@ def toucher() -> Toucher:
 def pressed() -> list[tuple[np.ndarray, np.ndarray]]:
     """Poses and wrenches of a ball that finite elements press into a limb of the hidden stiffness."""
     solver = IndenterFem(PatchFem(refine=1, layers=1, reach=4), step=0.1).prepare(LAYER.with_(youngs_modulus=HIDDEN))
-    tool = Tool(FIELD, at(RADIUS + 0.02, 0, LENGTH / 2), np.array([-1.0, 0, 0]))
+    tool = IndenterPress(FIELD, at(RADIUS + 0.02, 0, LENGTH / 2), np.array([-1.0, 0, 0]))
     return [(a.tools[0].pose_body_from_tool, np.array(a.wrenches[0])) for a in solver.path([tool], DEPTHS)]
 
 

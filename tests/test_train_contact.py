@@ -13,9 +13,9 @@ from fem_tools.generate import generate
 from fem_tools.sampling import CONTACT_BODIES, FILLETS, PRESETS, SIZES, TILT, TOOLS, any_tool, contacts, draw, split_of
 from fem_tools.scenes import Site
 from stmpl_core import SoftLayer
-from stmpl_core.contact_net import OUTPUTS, ContactNet
+from stmpl_core.contact_net import ContactNet
 from stmpl_core.errors import InvalidInput
-from stmpl_core.methods.moment_net import Weights
+from stmpl_core.networks import Weights
 from stmpl_core.sdf import SignedDistance
 from studies.train_contact import ContactTraining, pressed, score, train_contact
 from tests import scenes
@@ -118,7 +118,7 @@ def test_a_tool_is_put_back_where_finite_elements_had_it(data: Path) -> None:
 
 def test_a_short_training_learns_and_its_weights_load_and_hold(data: Path, tmp_path: Path) -> None:
     card = train_contact(data, tmp_path, SETTINGS)
-    weights = Weights.load(tmp_path / "contact_net.safetensors", outputs=OUTPUTS)
+    weights = Weights.load(tmp_path / "contact_net.safetensors", "pressure")
     assert weights.card["settings"]["steps"] == SETTINGS.steps == card["settings"]["steps"]
     assert card["contacts"] >= 2 and card["rows"] > card["contacts"]
     assert card["ranges"]["depth_over_thickness"][1] < 0.4 and card["bound"]["factor"] > 0

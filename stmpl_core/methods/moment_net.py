@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
-from dataclasses import dataclass
-from functools import cache
 from pathlib import Path
 from typing import Any, Self
 
@@ -18,17 +15,11 @@ from stmpl_core.load import Load
 from stmpl_core.methods.base import Method, prepared
 from stmpl_core.methods.winkler import column_stretch
 from stmpl_core.moments import FAST, SCALARS, TENSORS, VECTORS, Surroundings
+from stmpl_core.networks import DIRECTIONS, INPUTS, MIXED_TENSORS, MIXED_VECTORS, MOTION, Weights, shipped
 from stmpl_core.thinning import Asked
 from stmpl_core.trust import Displacement, Trust
 
-SHIPPED = Path(__file__).parent.parent / "weights" / "moment_net.safetensors"
-SHIPPED_CONTACT = SHIPPED.with_name("moment_net_contact.safetensors")
-
-MIXED_VECTORS, MIXED_TENSORS = 6, 4  # combinations of a vertex's vectors and tensors whose products are inputs
-DIRECTIONS = 2 * VECTORS + 2  # vectors that an answer is made of: moments of both fields, and both linear responses
-_VV, _TT = MIXED_VECTORS * (MIXED_VECTORS + 1) // 2, MIXED_TENSORS * (MIXED_TENSORS + 1) // 2
-INPUTS = 2 * SCALARS + 9 + SCALARS + _VV + _TT + 2 * MIXED_TENSORS + 2 * MIXED_VECTORS + 6
-OUTPUTS = 1 + DIRECTIONS + MIXED_TENSORS + MIXED_VECTORS + 2  # normal, tangential coefficients, slope, error
+IN, OUT = INPUTS.at, MOTION.at  # first columns, constants to numba
 AMPLITUDE = 0.3  # of a thickness: what the network may add to the linear response where much presses
 SURROUNDED = 1e-7  # of moments, below which nothing is added
 EDGE_OVER_ROOT_AREA = 1.075  # of a vertex whose six triangles are equilateral: sqrt(2 / sqrt(3))
@@ -39,61 +30,6 @@ STEEP = 0.25  # slope of the thickness from triangle to triangle; trained is up 
 STEEP_SHARE = 0.02  # of the vertices that move, which may be so steep
 
 BLOCK = 32  # vertices a matrix product; OpenBLAS takes one thread for up to 2^18 multiplications
-
-ARRAYS = ("mix_vectors", "mix_tensors", "low", "high", "mean", "scale", "w1", "b1", "w2", "b2", "w3", "b3", "w4", "b4")
-
-
-@dataclass(frozen=True, eq=False)
-class Weights:
-    """A trained network.
-
-    Args:
-        arrays: float32, by the names in ARRAYS; w of shape (inputs, outputs).
-        card: what made it and what it is good for (see studies.train_moments).
-    """
-
-    arrays: Mapping[str, np.ndarray]
-    card: Mapping[str, Any]
-
-    @classmethod
-    def load(cls, path: str | Path, *, outputs: int = OUTPUTS) -> Self:
-        """Reads a .safetensors file and the .json card beside it; no code in them is run.
-
-        Raises:
-            InvalidInput: a file is missing, or holds another network.
-        """
-        from safetensors import SafetensorError
-        from safetensors.numpy import load_file
-
-        path = Path(path)
-        card = path.with_suffix(".json")
-        for one in (path, card):
-            if not one.is_file():
-                raise InvalidInput(f"there is no {one}. Train a network with stmpl train, or give no path.")
-        try:
-            arrays = load_file(path)
-        except SafetensorError as error:
-            raise InvalidInput(f"{path} holds no weights: {error}.") from error
-        shapes = {name: a.shape for name, a in arrays.items()}
-        if set(shapes) != set(ARRAYS) or shapes["w1"][0] != INPUTS or shapes["w4"][1] != outputs:
-            raise InvalidInput(f"{path} holds no network of this kind and version.")
-        return cls({name: np.ascontiguousarray(a, dtype=np.float32) for name, a in arrays.items()},
-                   json.loads(card.read_text()))  # fmt: skip
-
-    def save(self, path: str | Path) -> None:
-        """Writes both files."""
-        from safetensors.numpy import save_file
-
-        path = Path(path)
-        path.parent.mkdir(parents=True, exist_ok=True)
-        save_file({name: np.ascontiguousarray(self.arrays[name]) for name in ARRAYS}, path)
-        path.with_suffix(".json").write_text(json.dumps(self.card, indent=1) + "\n")
-
-
-@cache
-def shipped(path: Path = SHIPPED) -> Weights:
-    """A network that comes with the package."""
-    return Weights.load(path)
 
 
 class MomentNet:
@@ -131,7 +67,7 @@ class MomentNet:
         if threads < 1:
             raise InvalidInput(f"threads is {threads}; at least 1 is needed.")
         self.threads = min(threads, numba.config.NUMBA_NUM_THREADS)  # type: ignore[attr-defined]
-        self.weights, self.contact = _weights(weights, SHIPPED), _weights(contact, SHIPPED_CONTACT)
+        self.weights, self.contact = _weights(weights, "moment_net"), _weights(contact, "moment_net_contact")
         self.fallback = fallback
         self._layer: SoftLayer | None = None
         self._near: Surroundings | None = None
@@ -178,14 +114,14 @@ class MomentNet:
         near_ones = np.flatnonzero(np.abs(felt.scalars[:, 1]).sum(axis=1) > SURROUNDED)
         place = np.full(len(vertices), -1)
         place[near_ones] = np.arange(len(near_ones))
-        inputs = np.empty((len(near_ones), INPUTS), dtype=np.float32)
+        inputs = np.empty((len(near_ones), INPUTS.size), dtype=np.float32)
         outside, strange = np.zeros(len(vertices), dtype=np.bool_), np.zeros(len(near_ones), dtype=np.bool_)
         invariants(figures[near_ones], shape[near_ones], sources[vertices[near_ones]], constants, a["mix_vectors"],
                 a["mix_tensors"], a["low"], a["high"], a["mean"], a["scale"], inputs, strange)  # fmt: skip
         outside[near_ones] = strange
 
         # Three hidden layers.
-        outputs = np.empty((len(near_ones), OUTPUTS), dtype=np.float32)
+        outputs = np.empty((len(near_ones), MOTION.size), dtype=np.float32)
         think(inputs, a["w1"], a["b1"], a["w2"], a["b2"], a["w3"], a["b3"], a["w4"], a["b4"], outputs)
 
         # Each vertex moves along its normal and along the directions of what is around it.
@@ -237,7 +173,7 @@ class MomentNet:
         return Trust(trust.converged, trust.in_range, bound if trust.in_range else None, trust.why, trust.figures)
 
 
-def _weights(given: str | Path | Weights | None, default: Path) -> Weights:
+def _weights(given: str | Path | Weights | None, default: str) -> Weights:
     return given if isinstance(given, Weights) else Weights.load(given) if given else shipped(default)
 
 
@@ -321,7 +257,7 @@ def _mix(weights, vectors, out):
 
 @numba.njit(cache=True, fastmath=FAST, error_model="numpy")
 def invariants(figures, shape, here, constants, mix_vectors, mix_tensors, low, high, mean, scale, out, outside):
-    """The network's inputs, (N, INPUTS): kept inside the training data's, then centred and scaled."""
+    """The network's inputs, (N, INPUTS.size): kept inside the training data's, then centred and scaled."""
     half, one = np.float32(0.5), np.float32(1)
     for n in range(len(figures)):
         g = _amplitude(figures[n])
@@ -330,26 +266,22 @@ def invariants(figures, shape, here, constants, mix_vectors, mix_tensors, low, h
         _directions(figures[n], g, vectors, tensors)
         _mix(mix_vectors, vectors, v)
         _mix(mix_tensors, tensors, t)
-        row, k, per = out[n], 0, one / g
+        row, per = out[n], one / g
         for s in range(2):
             for m in range(SCALARS):
-                row[k] = figures[n, s, 3 + m] * per
-                k += 1
-        for s in range(2):
-            row[k] = figures[n, s, 2] * per
-            row[k + 2] = here[n, s] * per
-            row[k + 4] = np.log(abs(here[n, s]) + np.float32(0.02))
-            k += 1
-        k += 4
-        row[k], row[k + 1], row[k + 2] = np.log(g + np.float32(1e-4)), g, np.sqrt(g)
-        k += 3
+                row[IN.scalars + s * SCALARS + m] = figures[n, s, 3 + m] * per
+            row[IN.linear_normal + s] = figures[n, s, 2] * per
+            row[IN.here + s] = here[n, s] * per
+            row[IN.log_here + s] = np.log(abs(here[n, s]) + np.float32(0.02))
+        row[IN.log_g], row[IN.g], row[IN.root_g] = np.log(g + np.float32(1e-4)), g, np.sqrt(g)
         for m in range(SCALARS):
-            row[k] = figures[n, 0, 3 + m] - figures[n, 1, 3 + m]
-            k += 1
+            row[IN.field_difference + m] = figures[n, 0, 3 + m] - figures[n, 1, 3 + m]
+        k = IN.vector_products
         for a in range(MIXED_VECTORS):
             for b in range(a, MIXED_VECTORS):
                 row[k] = v[a, 0] * v[b, 0] + v[a, 1] * v[b, 1]
                 k += 1
+        k = IN.tensor_products
         for a in range(MIXED_TENSORS):
             for b in range(a, MIXED_TENSORS):
                 row[k] = t[a, 0] * t[b, 0] + t[a, 1] * t[b, 1]
@@ -357,21 +289,18 @@ def invariants(figures, shape, here, constants, mix_vectors, mix_tensors, low, h
         turn, bend = half * (shape[n, 0] - shape[n, 2]), shape[n, 1]
         for a in range(MIXED_TENSORS):
             x, y = v[a, 0], v[a, 1]
-            row[k] = t[a, 0] * (x * x - y * y) + np.float32(2) * t[a, 1] * x * y
-            row[k + MIXED_TENSORS] = turn * t[a, 0] + bend * t[a, 1]
-            k += 1
-        k += MIXED_TENSORS
+            row[IN.tensor_along_vector + a] = t[a, 0] * (x * x - y * y) + np.float32(2) * t[a, 1] * x * y
+            row[IN.tensor_along_curvature + a] = turn * t[a, 0] + bend * t[a, 1]
         for a in range(MIXED_VECTORS):
             x, y = v[a, 0], v[a, 1]
-            row[k] = turn * (x * x - y * y) + np.float32(2) * bend * x * y
-            row[k + MIXED_VECTORS] = shape[n, 3] * x + shape[n, 4] * y
-            k += 1
-        k += MIXED_VECTORS
-        row[k], row[k + 1] = half * (shape[n, 0] + shape[n, 2]), turn * turn + bend * bend
-        row[k + 2], row[k + 3] = constants[0], constants[1]
-        row[k + 4] = one / (np.float32(1.02) - np.float32(2) * constants[0])
-        row[k + 5] = shape[n, 3] * shape[n, 3] + shape[n, 4] * shape[n, 4]
-        for m in range(INPUTS):
+            row[IN.curvature_along_vector + a] = turn * (x * x - y * y) + np.float32(2) * bend * x * y
+            row[IN.slope_along_vector + a] = shape[n, 3] * x + shape[n, 4] * y
+        row[IN.mean_curvature] = half * (shape[n, 0] + shape[n, 2])
+        row[IN.squared_bend] = turn * turn + bend * bend
+        row[IN.constants], row[IN.constants + 1] = constants[0], constants[1]
+        row[IN.volumetric] = one / (np.float32(1.02) - np.float32(2) * constants[0])
+        row[IN.squared_slope] = shape[n, 3] * shape[n, 3] + shape[n, 4] * shape[n, 4]
+        for m in range(len(mean)):
             kept = min(max(row[m], low[m]), high[m])
             if kept != row[m]:
                 outside[n] = True
@@ -422,26 +351,25 @@ def _move(figures, shape, place, outputs, mix_vectors, mix_tensors, frames, move
             _mix(mix_vectors, vectors, mixed)
             _mix(mix_tensors, tensors, t)
             x = y = np.float32(0)
-            row, k = outputs[place[n]], 1
+            row = outputs[place[n]]
             for m in range(DIRECTIONS):
-                x += row[k] * vectors[m, 0]
-                y += row[k] * vectors[m, 1]
-                k += 1
+                x += row[OUT.directions + m] * vectors[m, 0]
+                y += row[OUT.directions + m] * vectors[m, 1]
             for m in range(MIXED_TENSORS):
-                x += row[k] * (t[m, 0] * mixed[m, 0] + t[m, 1] * mixed[m, 1])
-                y += row[k] * (t[m, 1] * mixed[m, 0] - t[m, 0] * mixed[m, 1])
-                k += 1
+                c = row[OUT.turned + m]
+                x += c * (t[m, 0] * mixed[m, 0] + t[m, 1] * mixed[m, 1])
+                y += c * (t[m, 1] * mixed[m, 0] - t[m, 0] * mixed[m, 1])
             turn, bend = np.float32(0.5) * (shape[n, 0] - shape[n, 2]), shape[n, 1]
             for m in range(MIXED_VECTORS):
-                x += row[k] * (turn * mixed[m, 0] + bend * mixed[m, 1])
-                y += row[k] * (bend * mixed[m, 0] - turn * mixed[m, 1])
-                k += 1
-            x += row[k] * shape[n, 3]
-            y += row[k] * shape[n, 4]
+                c = row[OUT.curved + m]
+                x += c * (turn * mixed[m, 0] + bend * mixed[m, 1])
+                y += c * (bend * mixed[m, 0] - turn * mixed[m, 1])
+            x += row[OUT.slope] * shape[n, 3]
+            y += row[OUT.slope] * shape[n, 4]
             a = np.float32(AMPLITUDE) * g / (np.float32(1) + g)
             u += a * x
             v += a * y
-            w += a * row[0]
-            error[n] = a * np.exp(min(row[k + 1], np.float32(2)))
+            w += a * row[OUT.normal]
+            error[n] = a * np.exp(min(row[OUT.log_error], np.float32(2)))
         for m in range(3):
             moved[n, m] = u * frames[n, 0, m] + v * frames[n, 1, m] + w * frames[n, 2, m]

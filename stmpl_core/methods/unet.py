@@ -14,12 +14,12 @@ from stmpl_core.errors import InvalidInput
 from stmpl_core.layer import SoftLayer
 from stmpl_core.load import Load
 from stmpl_core.methods.base import prepared
+from stmpl_core.networks import NETWORKS
 from stmpl_core.trust import Displacement, Trust
 
 if TYPE_CHECKING:
     from stmpl_core.methods.pix2pix import Pix2PixUNet
 
-WEIGHTS = Path(__file__).parent.parent / "weights"
 THICKNESS = (2.5e-3, 12.5e-3)  # m, drawn as 0 to 1 (STMPL paper)
 MOTION = 30e-3  # m, drawn as 1 (STMPL paper)
 MODULUS = 1e3  # Pa, of the tissue that the forces are meant for (STMPL paper)
@@ -91,7 +91,7 @@ class UNet:
     name = "unet"
 
     def __init__(self, path: str | Path | None = None, *, device: str = "cpu") -> None:
-        self.card, self.network = load_unet(WEIGHTS / "unet.safetensors" if path is None else Path(path), device)
+        self.card, self.network = load_unet(NETWORKS["unet"].path if path is None else Path(path), device)
         self.device = device
         self._layer: SoftLayer | None = None
 

@@ -8,7 +8,8 @@ from typing import Any, Self
 
 import numpy as np
 
-from fem_tools.patch import DeadForces, FollowerPressure, Patch, PatchFem
+from fem_tools.patch import Patch, PatchFem
+from fem_tools.skin_loads import DeadForces, FollowerPressure
 from stmpl_core.arrays import VertexVectors
 from stmpl_core.errors import InvalidInput
 from stmpl_core.layer import SoftLayer, Tissue

@@ -1,0 +1,147 @@
+"""System: the equations of one patch under its loads: energy, residual, tangent, and a preconditioner by columns."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Protocol
+
+import numpy as np
+from numba import njit
+
+from fem_tools import neo_hookean as nh
+from fem_tools.mesh import WedgeMesh
+from stmpl_core.layer import Tissue
+
+
+class SkinLoad(Protocol):
+    """Something that presses on the skin; `factor` in [0, 1] is the share of it that acts (load continuation).
+
+    `conservative`: its forces are minus the gradient of `potential`, which then steers the line search.
+    """
+
+    conservative: bool
+
+    def potential(self, skin: np.ndarray, factor: float) -> float:
+        """Its potential energy [J]; only asked where `conservative`."""
+        ...
+
+    def add_forces(self, skin: np.ndarray, factor: float, forces: np.ndarray) -> None:
+        """Adds its forces on the skin columns, (C, 3) [N], at the deformed positions `skin` (C, 3) [m]."""
+        ...
+
+    def add_tangent(
+        self, skin: np.ndarray, factor: float, data: np.ndarray, *, symmetric: bool, convex: float = 0.0
+    ) -> None:
+        """Adds its stiffness, -d forces / d skin, to the skin level of the tangent's blocks.
+
+        `symmetric`: only the symmetric part; `convex`: the share, 0 to 1, of what may be negative that is left out.
+        """
+        ...
+
+
+class System:
+    """Residual, tangent and constraints of one patch under some loads.
+
+    Args:
+        mesh: wedges.
+        tissue: tissue of all of them.
+        loads: loads on the skin.
+        fixed: mask of the columns that do not move at all, (C,).
+        keep: projectors on the motions that each column may make, (C, 3, 3); None: all, but for the fixed ones.
+    """
+
+    def __init__(
+        self,
+        mesh: WedgeMesh,
+        tissue: Tissue,
+        loads: Sequence[SkinLoad],
+        fixed: np.ndarray,
+        keep: np.ndarray | None = None,
+    ) -> None:
+        self.mesh, self.tissue = mesh, tissue
+        self.loads: Sequence[SkinLoad] = loads
+        self.mu, self.lam = tissue.shear_modulus, tissue.lame_lambda
+        self.rest = mesh.rest_positions()
+        self.fixed = fixed
+        self.keep = keep
+        self.free = mesh.levels - 1
+        self.diagonal = diagonal_blocks(mesh.indptr, mesh.indices)  # block of each column with itself
+
+    def zeros(self) -> np.ndarray:
+        """No displacement, (C, levels, 3)."""
+        return np.zeros((self.mesh.n_columns, self.mesh.levels, 3))
+
+    @property
+    def conservative(self) -> bool:
+        """Whether all loads are: then the tangent is symmetric and an equilibrium is a minimum of the energy."""
+        return all(load.conservative for load in self.loads)
+
+    def energy(self, u: np.ndarray, factor: float) -> float:
+        """Stored energy plus the loads' potential [J]; infinite where an element is folded."""
+        m, skin = self.mesh, self.rest[:, 0] + u[:, 0]
+        stored = nh.strain_energy(u, m.columns, m.layers, m.gradients, m.volumes, self.mu, self.lam)
+        return stored + sum(load.potential(skin, factor) for load in self.loads)
+
+    def internal(self, u: np.ndarray) -> tuple[np.ndarray, float]:
+        """Internal forces (C, levels, 3) [N] and the smallest det F."""
+        m, forces = self.mesh, np.zeros_like(u)
+        smallest = nh.internal_forces(u, m.columns, m.layers, m.gradients, m.volumes, self.mu, self.lam, forces)
+        return forces, smallest
+
+    def external(self, u: np.ndarray, factor: float) -> np.ndarray:
+        """Forces of the loads on the skin, (C, 3) [N]."""
+        skin = self.rest[:, 0] + u[:, 0]
+        forces = np.zeros_like(skin)
+        for load in self.loads:
+            load.add_forces(skin, factor, forces)
+        return forces
+
+    def residual(self, u: np.ndarray, factor: float) -> tuple[np.ndarray, float]:
+        """Internal minus external forces of the free levels, (C, 3 m) [N], and the smallest det F."""
+        forces, smallest = self.internal(u)
+        forces[:, 0] -= self.external(u, factor)
+        return forces[:, : self.free].reshape(len(u), -1), smallest
+
+    def tangent(self, u: np.ndarray, factor: float, *, symmetric: bool = False, convex: float = 0.0) -> np.ndarray:
+        """Blocks of the tangent (or of its symmetric, or of a positive part), (n_blocks, 3 m, 3 m) [N/m]."""
+        m, width = self.mesh, 3 * self.free
+        data = np.zeros((len(m.indices), width, width))
+        nh.tangent(u, m.columns, m.blocks, m.layers, m.gradients, m.volumes, self.mu, self.lam, convex, data)
+        skin = self.rest[:, 0] + u[:, 0]
+        for load in self.loads:
+            load.add_tangent(skin, factor, data, symmetric=symmetric, convex=convex)
+        return data
+
+    def preconditioner(self, data: np.ndarray) -> np.ndarray:
+        """Inverse of each column's own block, (C, 3 m, 3 m); zero where constrained, which is what constrains CG."""
+        diagonal = data[self.diagonal]
+        if self.keep is None:
+            inverse = _inverse_spd(diagonal)
+        else:
+            project = np.einsum("mn,cij->cminj", np.eye(self.free), self.keep).reshape(diagonal.shape)
+            rest = np.eye(diagonal.shape[1]) - project
+            scale = np.trace(diagonal, axis1=1, axis2=2)[:, None, None]
+            inverse = project @ _inverse_spd(project @ diagonal @ project + rest * scale) @ project
+        inverse[self.fixed] = 0.0
+        return inverse
+
+
+def _inverse_spd(blocks: np.ndarray) -> np.ndarray:
+    """Inverse of symmetric blocks; where one is not positive definite its eigenvalues are taken positive."""
+    try:
+        np.linalg.cholesky(blocks)
+        return np.linalg.inv(blocks)
+    except np.linalg.LinAlgError:
+        values, vectors = np.linalg.eigh(blocks)
+        values = np.maximum(np.abs(values), 1e-3 * np.abs(values).max(axis=1, keepdims=True))
+        return np.einsum("cij,cj,ckj->cik", vectors, 1 / values, vectors)
+
+
+@njit(cache=True)
+def diagonal_blocks(indptr, indices):
+    out = np.empty(len(indptr) - 1, dtype=np.int64)
+    for c in range(len(out)):
+        for k in range(indptr[c], indptr[c + 1]):
+            if indices[k] == c:
+                out[c] = k
+    return out
