@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from dataclasses import dataclass
 
 import numpy as np
@@ -9,21 +10,32 @@ from numpy.typing import ArrayLike
 
 from stmpl_core.arrays import Faces, Points, Transform, Wrench, finite
 from stmpl_core.errors import InvalidInput
-from stmpl_core.layer import check_faces
+from stmpl_core.mending import mended
+
+log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, eq=False)
 class ToolMesh:
-    """A triangle mesh in the tool's own frame: vertices (N, 3) [m], faces (M, 3)."""
+    """A triangle mesh in the tool's own frame.
+
+    Args:
+        vertices: positions (N, 3) [m].
+        faces: vertex numbers (M, 3).
+        mendings: sentences that tell what was mended.
+    """
 
     vertices: Points
     faces: Faces
+    mendings: tuple[str, ...] = ()
 
     @classmethod
     def of(cls, vertices: ArrayLike, faces: ArrayLike) -> ToolMesh:
-        """Checks and keeps a mesh. Raises MeshError or InvalidInput."""
-        points = finite("tool vertices", vertices, (None, 3))
-        return cls(points, check_faces(faces, len(points)))
+        """Checks and keeps a mesh, mended where it needs it. Raises MeshError or InvalidInput (see `mended`)."""
+        mesh = mended(vertices, faces)
+        for sentence in mesh.said:
+            log.warning("the tool's mesh was mended: %s", sentence)
+        return cls(mesh.vertices, mesh.faces, mesh.said)
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,8 +43,8 @@ class Contact:
     """One tool at one instant.
 
     Args:
-        name: of the tool; answers and log lines use it.
-        mesh: in the tool's frame.
+        name: name of the tool; answers and log lines use it.
+        mesh: surface in the tool's frame.
         pose_body_from_tool: rigid transform, (4, 4), taking tool coordinates to the layer's frame.
         wrench: force [N] and torque about the tool's origin [N m] that the tool exerts *on the body*,
             in the layer's axes, (6,); None when there is no force sensor.

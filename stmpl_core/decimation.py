@@ -35,7 +35,7 @@ def decimated(vertices: Points, faces: Faces, cell: float) -> tuple[Points, Face
 
     Quadric placement (Lindstrom 2000, "Out-of-core simplification"). A closed surface stays closed: of the faces that
     fall together those of opposite sides cancel, but where all would, one of each side stays, so that a plate thinner
-    than a cell is kept as a sheet; where all faces of a cell shrink to lines (a needle) one stays as it was.
+    than a cell is kept as a sheet; of the faces that shrink to a line of its own (a needle) one stays as it was.
 
     Args:
         vertices: positions (V, 3) [m].
@@ -51,17 +51,10 @@ def decimated(vertices: Points, faces: Faces, cell: float) -> tuple[Points, Face
     a, b, c = drawn.T
     whole = (a != b) & (b != c) & (c != a)
     kept = _uncancelled(drawn[whole])
-    lost = np.ones(len(low), bool)
-    lost[kept] = False
-    lost = np.flatnonzero(lost)
     points = _placed(vertices, faces, cluster, low, cell)
-    if len(lost):
-        one = np.full(len(low), -1)
-        one[drawn.T[::-1]] = np.arange(len(faces))  # any face of each cell
-        sheet = np.unique(one[lost][one[lost] >= 0])
-        own = len(points) + np.arange(3 * len(sheet)).reshape(-1, 3)
-        points = np.concatenate([points, vertices[faces[sheet]].reshape(-1, 3)])
-        kept = np.concatenate([kept, own, own[:, ::-1]])
+    lost = vertices[faces[~whole][_lost(drawn[~whole], kept)]].reshape(-1, 3)
+    own = len(points) + np.arange(len(lost)).reshape(-1, 3)
+    points, kept = np.concatenate([points, lost]), np.concatenate([kept, own, own[:, ::-1]])
     used, numbers = np.unique(kept, return_inverse=True)
     return points[used], numbers.reshape(-1, 3).astype(np.int32)
 
@@ -80,8 +73,20 @@ def _uncancelled(faces: np.ndarray) -> np.ndarray:
     return np.concatenate([np.repeat(up, ups, axis=0), np.repeat(up[:, ::-1], downs, axis=0)])
 
 
+def _lost(shrunk: np.ndarray, kept: np.ndarray) -> np.ndarray:
+    """Numbers of the first faces that shrank to each line or point which is no edge or corner of the kept faces."""
+    ends = np.stack([shrunk.min(axis=1), shrunk.max(axis=1), np.zeros(len(shrunk), int)], axis=1)
+    lines = np.flatnonzero(first_alike(ends) == np.arange(len(ends)))
+    low, high = ends[lines, :2].T
+    n = int(max(shrunk.max(initial=0), kept.max(initial=0))) + 1
+    sides = np.sort(kept[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
+    corners = np.concatenate([kept.ravel(), low[low < high], high[low < high]])
+    there = np.concatenate([sides[:, 0] * n + sides[:, 1], corners * (n + 1)])
+    return lines[~np.isin(low * n + high, there)]
+
+
 def _placed(vertices: Points, faces: Faces, cluster: np.ndarray, low: Points, cell: float) -> Points:
-    """Point of each cluster: nearest to the planes of its faces in the sense of squares, inside its cell, (C, 3) [m]."""
+    """Point of each cluster inside its cell, nearest to the planes of its faces by least squares, (C, 3) [m]."""
     count = np.bincount(cluster)[:, None]
     mean = np.stack([np.bincount(cluster, weights=x) for x in vertices.T], axis=1) / count
     quadric, pull = np.zeros((len(low), 3, 3)), np.zeros((len(low), 3))

@@ -90,9 +90,11 @@ def mended(vertices: ArrayLike, faces: ArrayLike) -> Mended:
       decides, but where the part is a solid (closed, or with small holes) or wound at random its volume does. A closed
       surface that is wound one way is left to the field, which turns it and says so; a cavity stays one.
     - Above 100,000 triangles the surface is clustered in cells of 0.75 of the default spacing of its field. The field
-      stays within MEASURED of the spacing of that of the full surface (ball, box, torus, capsule).
+      stays within 0.1 of the spacing of that of the full surface (ball 0.03, box 0.08, torus 0.08, capsule 0.03; a
+      plate and a needle much thinner than the cells 0.13 and 0.22).
 
-    What needs no mending is returned bit for bit. Takes 4 ms for 5,000 triangles, 3 s for 1.3 million.
+    What needs no mending is returned bit for bit. Takes 2 ms for 5,000 triangles and 1 s
+    for 1.3 million.
 
     Args:
         vertices: positions (V, 3) [m] in the tool's frame.
@@ -161,7 +163,7 @@ def _wound_one_way(points: Points, faces: Faces, place: np.ndarray, said: list[s
     turned ^= (against > 0.5)[part]
     wrong = _inside_out(points, corners, edges, part, turned, np.minimum(against, 1 - against) > MINORITY)
     turned ^= wrong[part]
-    if not turned.any() or turned.all() and edges.closed:
+    if not turned.any() or (turned.all() and edges.closed):
         return faces
     said.append(f"{int(turned.sum()):,} of {_many(len(faces), 'face')} {{were}} turned, to be wound like the others "
                 "and outwards")
@@ -171,13 +173,9 @@ def _wound_one_way(points: Points, faces: Faces, place: np.ndarray, said: list[s
 def _inside_out(points: Points, corners: np.ndarray, edges: _Edges, part: np.ndarray, turned: np.ndarray,
                 doubtful: np.ndarray) -> np.ndarray:  # fmt: skip
     """Which parts enclose a negative volume once their turned faces are turned, though their volume counts, (P,)."""
-    centre = points[corners[:, 0]].mean(axis=0)
-    a, b, c = (points[corners[:, k]] - centre for k in range(3))
-    normal = np.cross(b - a, c - a) * np.where(turned, -0.5, 0.5)[:, None]
-    area = np.bincount(part, weights=np.linalg.norm(normal, axis=1))
-    volume = np.bincount(part, weights=np.einsum("ij,ij->i", a, normal)) / 3
+    area, volume = _measures(points, corners, part, turned, len(doubtful))
     loose = edges.half[np.repeat(edges.count != 2, edges.count)]
-    hole, fill = _holes(points - centre, corners, part, turned, loose, len(area))
+    hole, fill = _holes(points - points[corners[0, 0]], corners, part, turned, loose, len(area))
     volume += fill
     solid = hole <= HOLES * area
     wrong = (volume < -FLAT * area**1.5) & (solid | doubtful)
@@ -229,14 +227,33 @@ def _follow_hosts(points: Points, corners: np.ndarray, part: np.ndarray, solid: 
 
 
 def _reduced(points: Points, faces: Faces, said: list[str]) -> tuple[Points, Faces]:
-    a, b, c = (points[faces[:, k]] for k in range(3))
-    area = 0.5 * float(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum())
-    spacing = field_spacing(area, np.ptp(points, axis=0))
+    area, _ = _measures(points, faces, np.zeros(len(faces), int), np.zeros(len(faces), bool), 1)
+    spacing = field_spacing(float(area[0]), np.ptp(points, axis=0))
     fewer = decimated(points, faces, CELL * spacing)
     if len(fewer[1]) > 0.8 * len(faces):
         return points, faces
-    said.append(f"{len(faces):,} triangles were reduced to {len(fewer[1]):,}: the field resolves {spacing * 1e3:.2g} mm")
+    said.append(f"{len(faces):,} triangles were reduced to {len(fewer[1]):,}: "
+                f"the field resolves {spacing * 1e3:.2g} mm")
     return fewer
+
+
+@numba.njit(cache=True)
+def _measures(points, corners, part, turned, n_parts):
+    """Area [m2] of each part's faces, and the volume [m3] between them and the first corner of all."""
+    area, volume = np.zeros(n_parts), np.zeros(n_parts)
+    origin, a, b, c, n = points[corners[0, 0]], np.empty(3), np.empty(3), np.empty(3), np.empty(3)
+    for face in range(len(corners)):
+        for k in range(3):
+            a[k] = points[corners[face, 0], k] - origin[k]
+            b[k] = points[corners[face, 1], k] - origin[k] - a[k]
+            c[k] = points[corners[face, 2], k] - origin[k] - a[k]
+        for k in range(3):
+            i, j = (k + 1) % 3, (k + 2) % 3
+            n[k] = b[i] * c[j] - b[j] * c[i]
+        height = (a[0] * n[0] + a[1] * n[1] + a[2] * n[2]) / 6
+        area[part[face]] += 0.5 * np.sqrt(n[0] * n[0] + n[1] * n[1] + n[2] * n[2])
+        volume[part[face]] += -height if turned[face] else height
+    return area, volume
 
 
 @numba.njit(cache=True)
