@@ -10,7 +10,6 @@ from numpy.typing import ArrayLike
 
 from stmpl_core.arrays import Faces, Points, Transform, Wrench, finite
 from stmpl_core.errors import InvalidInput
-from stmpl_core.mending import mended
 
 log = logging.getLogger(__name__)
 
@@ -32,6 +31,8 @@ class ToolMesh:
     @classmethod
     def of(cls, vertices: ArrayLike, faces: ArrayLike) -> ToolMesh:
         """Checks and keeps a mesh, mended where it needs it. Raises MeshError or InvalidInput (see `mended`)."""
+        from stmpl_core.mending import mended  # brings numba, which a program without tools does not need
+
         mesh = mended(vertices, faces)
         for sentence in mesh.said:
             log.warning("the tool's mesh was mended: %s", sentence)
