@@ -179,14 +179,24 @@ def check_faces(faces: ArrayLike, n_vertices: int) -> Faces:
     Raises:
         MeshError: empty, wrong shape, or a vertex number that does not exist or is repeated in a face.
     """
+    array = face_numbers(faces, n_vertices)
+    repeated = (array[:, 0] == array[:, 1]) | (array[:, 1] == array[:, 2]) | (array[:, 2] == array[:, 0])
+    if repeated.any():
+        raise MeshError(f"{int(repeated.sum())} faces use a vertex twice, the first is face {int(repeated.argmax())}.")
+    return array
+
+
+def face_numbers(faces: ArrayLike, n_vertices: int) -> Faces:
+    """Returns `faces` as (F, 3) int32 after checking that they name existing vertices.
+
+    Raises:
+        MeshError: empty, wrong shape, or a vertex number that does not exist.
+    """
     array = np.asarray(faces)
     if array.ndim != 2 or array.shape[1] != 3 or not len(array) or not np.issubdtype(array.dtype, np.integer):
         raise MeshError(f"faces must be integers of shape (F, 3) with F > 0; got {array.dtype} {array.shape}.")
     if array.min() < 0 or array.max() >= n_vertices:
         raise MeshError(f"faces name vertices {array.min()}..{array.max()}; the mesh has 0..{n_vertices - 1}.")
-    repeated = (array[:, 0] == array[:, 1]) | (array[:, 1] == array[:, 2]) | (array[:, 2] == array[:, 0])
-    if repeated.any():
-        raise MeshError(f"{int(repeated.sum())} faces use a vertex twice, the first is face {int(repeated.argmax())}.")
     return np.ascontiguousarray(array, dtype=np.int32)
 
 

@@ -13,20 +13,17 @@ from numpy.typing import ArrayLike
 from scipy import ndimage
 
 from stmpl_core.arrays import Points, finite
+from stmpl_core.decimation import BAND, MARGIN, MAX_NODES, field_spacing
 from stmpl_core.errors import InvalidInput, MeshError
+from stmpl_core.mending import closed
 from stmpl_core.tool import Tool
 
 log = logging.getLogger(__name__)
 
 MAX_EXTENT = 2.0  # m; a tool is smaller, a tool in millimetres is not
 MIN_EXTENT = 2e-4  # m
-MARGIN = 5e-3  # m of grid around the tool
-FINEST = 1e-4  # m; no finer grid pays
 COARSE = 3  # the grid far from the surface is this many times coarser
 ROUNDING_WIDTH = 0.57  # width of the smoothing over the radius that it gives a right-angled edge, measured
-BAND = 3  # within this many cells of the surface the distances are exact
-BAND_NODES = 40_000  # about what the default spacing spends on the band: half a second for 5,000 triangles
-MAX_NODES = 3_000_000  # 24 MB
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,12 +38,12 @@ class SignedDistance:
     because the tool lies inside the (convex) grid.
 
     Args:
-        coefficients: of the spline, (I, J, K) [m].
+        coefficients: weights of the spline, (I, J, K) [m].
         origin: position of node (0, 0, 0), (3,) [m].
-        spacing: of the grid [m].
-        watertight: whether the mesh was closed; if not, the sign near its holes is a guess.
-        flipped: whether the mesh came inside out and was turned.
-        surface_error: largest |distance| measured at the vertices and face centres of the mesh, where it is 0 [m].
+        spacing: edge of the grid's cells [m].
+        watertight: truth of the mesh being closed; if it is not, the sign near its holes is a guess.
+        flipped: truth of the mesh having come inside out, and been turned.
+        surface_error: largest |distance| at the vertices and face centres of the mesh, where it should be 0 [m].
         tool_bounds: lowest and highest corner of the mesh, (3,) [m] each.
     """
 
@@ -65,9 +62,10 @@ class SignedDistance:
         """Builds the field of `mesh`; a closed mesh that is inside out is turned, and `flipped` says so.
 
         Args:
-            mesh: in the tool's frame.
-            spacing: of the grid [m]; None: as fine as half a second of work allows (0.4 mm for a 20 mm ball).
-            margin: of grid around the tool [m].
+            mesh: surface in the tool's frame.
+            spacing: edge of the grid's cells [m]; None: as fine as half a second of work allows (0.4 mm for a 20 mm
+                ball).
+            margin: width of the grid around the tool [m].
             rounding: radius to which right-angled edges and corners are rounded [m], by smoothing the field; flat
                 faces stay, a ball of radius R shrinks by about rounding^2 / (3 R). No skin mesh can follow a sharp
                 edge: pressing by finite elements wants about 1 mm.
@@ -81,8 +79,7 @@ class SignedDistance:
         used = vertices[np.unique(faces)]
         low, extent = used.min(axis=0), np.ptp(used, axis=0)
         if spacing is None:
-            spacing = max(FINEST, (2 * BAND * area / BAND_NODES) ** 0.5)
-            spacing = max(spacing, (float(np.prod(extent + 2 * margin + 2 * spacing)) / (0.8 * MAX_NODES)) ** (1 / 3))
+            spacing = field_spacing(area, extent, margin)
         elif not (np.isfinite(spacing) and spacing > 0):
             raise InvalidInput(f"spacing is {spacing} m; it must be finite and above 0.")
         coarse = np.ceil((extent + 2 * margin) / (COARSE * spacing)).astype(int) + 2  # nodes each way
@@ -133,7 +130,7 @@ def _checked(mesh: Tool) -> tuple[Points, np.ndarray, bool, bool]:
                         "Is its mesh in millimetres? Scale it by 1e-3.")
     if extent < MIN_EXTENT:
         raise MeshError(f"the tool is {extent:.2g} m wide; at least {MIN_EXTENT:g} m is needed. Is its mesh in metres?")
-    watertight = _is_closed(vertices, faces)
+    watertight = closed(vertices, faces)
     area = _face_areas(vertices, faces)
     faces = faces[area > 1e-12 * area.max()].astype(np.int64)
     if not len(faces) or area.max() < 1e-12:
@@ -152,15 +149,6 @@ def _checked(mesh: Tool) -> tuple[Points, np.ndarray, bool, bool]:
 def _face_areas(vertices: Points, faces: np.ndarray) -> np.ndarray:
     a, b, c = (vertices[faces[:, k]] for k in range(3))
     return 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)
-
-
-def _is_closed(vertices: Points, faces: np.ndarray) -> bool:
-    """Whether each edge is used as often one way as the other; vertices at the same place count as one (STL files)."""
-    _, merged = np.unique(np.round(vertices, 9), axis=0, return_inverse=True)
-    directed = merged.reshape(-1)[faces][:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2).astype(np.int64)
-    low, high, way = directed.min(axis=1), directed.max(axis=1), np.sign(directed[:, 1] - directed[:, 0])
-    _, edge = np.unique(low * len(vertices) + high, return_inverse=True)
-    return not np.bincount(edge.reshape(-1), weights=way).any()
 
 
 def _node_distances(vertices: Points, faces: np.ndarray, origin: np.ndarray, h: float, shape: np.ndarray) -> np.ndarray:

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import hashlib
-from dataclasses import dataclass
+import logging
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
 
-from stmpl_core.arrays import Faces, Points, finite
-from stmpl_core.layer import check_faces
+from stmpl_core.arrays import Faces, Points
+
+log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, eq=False)
@@ -21,17 +23,26 @@ class Tool:
         vertices: surface in the tool's own frame, (N, 3) [m].
         faces: triangles, (M, 3), counter-clockwise seen from outside.
 
+    Attributes:
+        mendings: sentences that tell what of the surface was mended (see stmpl_core.mending); usually none.
+
     Raises:
-        MeshError, InvalidInput: not finite, empty, or faces that name no vertex.
+        MeshError, InvalidInput: not finite, empty, faces that name no vertex, or a surface that cannot be mended.
     """
 
     name: str
     vertices: Points
     faces: Faces
+    mendings: tuple[str, ...] = field(default=(), init=False)
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "vertices", finite(f"vertices of {self.name}", self.vertices, (None, 3)))
-        object.__setattr__(self, "faces", check_faces(self.faces, len(self.vertices)))
+        from stmpl_core.mending import mended  # brings numba, which a program without tools does not need
+
+        surface = mended(self.vertices, self.faces)
+        for name, value in (("vertices", surface.vertices), ("faces", surface.faces), ("mendings", surface.said)):
+            object.__setattr__(self, name, value)
+        for sentence in surface.said:
+            log.warning("the surface of '%s' was mended: %s", self.name, sentence)
 
     @cached_property
     def digest(self) -> str:

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
-from stmpl_core.errors import InvalidInput
+from stmpl_core.errors import InvalidInput, MeshError, StmplError
 from stmpl_core.sdf import MARGIN, SignedDistance
 from stmpl_core.tool import Tool
 
@@ -65,6 +65,15 @@ class Tools:
             self._fields[tool.digest] = field
         if before is not None:
             self._forget(before.digest)
+
+    def add_all(self, tools: Sequence[Tool]) -> None:
+        """Takes many tools into use, their fields built side by side (see stmpl_core.fields). Raises MeshError."""
+        from stmpl_core.fields import fields_of
+
+        for tool, built in zip(tools, fields_of(tools, margin=self.margin), strict=True):
+            if isinstance(built, StmplError):
+                raise MeshError(f"{tool.name} cannot be a tool: {built}") from built
+            self.add(tool, built)
 
     def remove(self, name: str) -> None:
         """Forgets a tool and what was announced under its name. Raises InvalidInput if there is neither."""

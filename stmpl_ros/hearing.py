@@ -98,6 +98,8 @@ class Hearing:
             self.refuse(tool, error)
             return False
         self.tools.add(tool, field)
+        for sentence in tool.mendings:
+            self.gate.say(f"mended {tool.name} {sentence}", f"the mesh of '{tool.name}' was mended: {sentence}")
         if field.flipped:
             self.gate.say("inside out", f"the mesh of '{tool.name}' came inside out and was turned")
         if not field.watertight:
