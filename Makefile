@@ -18,7 +18,7 @@ demo: $(READY)  ## Run the main job: simulated contact over ROS 2, recorded, com
 	$(BIN)/stmpl demo
 
 test: $(READY)  ## Pass the tests
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder
 
 check: $(READY)  ## Lint, types and the one-way import rule
 	$(BIN)/ruff check .

@@ -4,20 +4,12 @@ import ast
 import importlib.util
 import os
 import signal
-import subprocess
-import sys
 import time
-from collections import defaultdict
-from contextlib import contextmanager
 from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
-
-os.environ["ROS_DOMAIN_ID"] = os.environ.setdefault("STMPL_TEST_BUS", str(1 + os.getpid() % 100))  # its children's too
-os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
-
 import rclpy
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
@@ -25,7 +17,6 @@ from geometry_msgs.msg import Point, PoseStamped, Vector3, WrenchStamped
 from geometry_msgs.msg import Wrench as WrenchMessage
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState
-from rcl_interfaces.msg import Log
 from rcl_interfaces.msg import Parameter as ParameterMessage
 from rcl_interfaces.srv import DescribeParameters, GetParameters, SetParameters
 from rclpy.duration import Duration
@@ -59,10 +50,10 @@ from stmpl_ros.parameters import NodeConfig
 from stmpl_ros.settings import checked
 from stmpl_ros.skin import Skin, published
 from stmpl_ros.topics import KEPT, LEASE, STREAM
+from tests.bus import PATIENCE, ROOT, Robot, end, rows, running, start
+from tests.conftest import BUSES
 from tests.touch_scenes import LENGTH, RADIUS, at, ball, limb
 
-ROOT = Path(__file__).parents[1]
-PATIENCE = 60.0  # s to wait for anything; only a failing test waits so long
 TOUCH = RADIUS + 0.012 - 1e-3  # m from the limb's axis: a ball of 12 mm, 1 mm deep
 NODE = """
 import sys
@@ -80,49 +71,13 @@ def skin(config: NodeConfig):
     return limb(4e-3, config.thickness).with_(youngs_modulus=config.youngs_modulus)
 
 
-@contextmanager
-def running(command: list[str], number: int = signal.SIGTERM):
-    """A process that ends cleanly when asked to."""
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, cwd=ROOT)
-    try:
-        yield process
-        process.send_signal(number)
-        said, _ = process.communicate(timeout=PATIENCE)
-        assert process.returncode == (0 if number != signal.SIGKILL else -signal.SIGKILL), said
-    finally:
-        if process.poll() is None:
-            process.kill()
-            print(process.communicate()[0])
-
-
-class Bus:
+class Bus(Robot):
     """A robot's side: a tool that it moves, what it hears, and what it asks."""
 
     def __init__(self, space: str = "") -> None:
-        self.space, self.got, self.folder = space, defaultdict(list), Path()
-        self.node = rclpy.create_node("robot", namespace=space or "/")
+        super().__init__("robot", space)
+        self.folder = Path()
         self.mesh = self.node.create_publisher(ContactMesh, "contact_mesh", KEPT)
-        self.listen(SkinTopology, "skin/topology", KEPT)
-        self.listen(SkinDisplacement, "skin/displacement", STREAM)
-        self.listen(Log, "/rosout", KEPT)
-
-    def listen(self, kind, topic, profile, **more):
-        return self.node.create_subscription(kind, topic, self.got[topic].append, profile, **more)
-
-    def now(self) -> int:
-        return self.node.get_clock().now().nanoseconds
-
-    def spin(self, seconds: float) -> None:
-        until = time.monotonic() + seconds
-        while time.monotonic() < until:
-            rclpy.spin_once(self.node, timeout_sec=0.02)
-
-    def wait(self, done, what: str):
-        until = time.monotonic() + PATIENCE
-        while not (found := done()):
-            assert time.monotonic() < until, f"waited {PATIENCE} s for {what}"
-            rclpy.spin_once(self.node, timeout_sec=0.02)
-        return found
 
     def call(self, kind, name: str, **fields):
         """The answer of a service of the node."""
@@ -140,15 +95,8 @@ class Bus:
     def get(self, *names: str) -> list:
         return [parameter_value_to_python(v) for v in self.call(GetParameters, "get_parameters", names=names).values]
 
-    def still(self) -> None:
-        """Waits until the skin is at rest, so that no other tool is waited for."""
-        self.wait(lambda: not (said := self.got["skin/displacement"]) or not said[-1].tools, "rest")
-
     def tool(self, name: str) -> "Hand":
         return Hand(self, name)
-
-    def said(self, text: str) -> list[str]:
-        return [line.msg for line in self.got["/rosout"] if text in line.msg]
 
 
 class Hand:
@@ -177,9 +125,7 @@ class Hand:
 
     def ask(self, *pose_and_wrench, frame: str = "body") -> SkinDisplacement:
         """Sends one instant and waits for its answer."""
-        stamp = self.send(*pose_and_wrench, frame=frame)
-        found = lambda: [a for a in self.bus.got["skin/displacement"] if stamp_ns(a) == stamp]  # noqa: E731
-        return self.bus.wait(found, f"the answer to {stamp}")[0]
+        return self.bus.answer(self.send(*pose_and_wrench, frame=frame))
 
 
 HERE = at(TOUCH, 0, LENGTH / 2)
@@ -189,10 +135,6 @@ TABLE = np.array([[-1.0, 0, 0, 0], [0, -1, 0, 0], [0, 0, 1, 0.1], [0, 0, 0, 1]])
 
 def stamp_of(stamp_ns: int) -> Time:
     return Time(sec=stamp_ns // 10**9, nanosec=stamp_ns % 10**9)
-
-
-def rows(answer: SkinDisplacement) -> np.ndarray:
-    return np.frombuffer(answer.displacement, np.float32).reshape(-1, 3)
 
 
 @pytest.fixture(scope="module")
@@ -207,7 +149,7 @@ def bus(tmp_path_factory):
     made = Bus("/robot")
     made.folder = folder
     try:
-        with running([sys.executable, "-c", NODE, "--ros-args", "-r", "__ns:=/robot", *given]):
+        with running("-c", NODE, "--ros-args", "-r", "__ns:=/robot", *given):
             made.wait(lambda: made.got["skin/topology"], "skin/topology")
             yield made
     finally:
@@ -261,7 +203,7 @@ def test_a_running_node_honours_what_may_be_set_at_any_time(bus, hand):
     bus.still()
     assert not [a for a in bus.got["skin/displacement"][-2:] if STALE in a.statuses], "fade 0 rests at once"
     hand.pose.publish(pose_message(HERE, "body", old))
-    bus.wait(lambda: [a for a in bus.got["skin/displacement"] if stamp_ns(a) == old], "the answer to an old stamp")
+    bus.answer(old)
     assert bus.set(max_age=1.0, fade=0.6)[0].successful
     assert bus.get("max_age", "fade") == [1.0, 0.6]
 
@@ -390,10 +332,10 @@ def test_poses_and_wrenches_in_a_listed_frame_count_as_in_the_bodys(bus, hand):
 
 
 def test_a_recording_of_another_frame_and_of_two_skins_is_replayed_bit_for_bit(bus, tmp_path):
-    hand, stmpl, table = bus.tool("recorded").ready(), Path(sys.executable).with_name("stmpl"), np.linalg.inv(TABLE)
+    hand, table = bus.tool("recorded").ready(), np.linalg.inv(TABLE)
     bus.still()
-    command = [str(stmpl), "record", "--path", str(tmp_path / "run"), "--frames", str(bus.folder / "frames.yaml")]
-    with running([*command, "--ros-args", "-r", "__ns:=/robot"], signal.SIGINT):
+    command = ["record", "--path", str(tmp_path / "run"), "--frames", str(bus.folder / "frames.yaml")]
+    with running("-m", "stmpl_ros.cli", *command, "--ros-args", "-r", "__ns:=/robot", number=signal.SIGINT):
         for topic in ("skin/displacement", "skin/topology", "tools/recorded/wrench", "tools/recorded/pose"):
             bus.wait(lambda topic=topic: bus.node.count_subscribers(f"/robot/{topic}") > 1, f"recording {topic}")
         for depth in (0.5e-3, 1e-3, 2e-3):
@@ -481,9 +423,8 @@ def test_gazebos_contacts_answer_as_the_wrench_that_they_sum_to(bus, tmp_path):
     gz, std = pytest.importorskip("ros_gz_interfaces.msg"), pytest.importorskip("std_msgs.msg")
     (tmp_path / "frames.yaml").write_text("world: {position: [0, 0, 0.1], orientation: [0, 0, 1, 0]}\n")
     given = ["gz_contacts:=finger=robot::tip", "gz_body:=person", f"frames:={tmp_path}/frames.yaml"]
-    command = [sys.executable, "-c", NODE, "--ros-args", "-r", "__ns:=/gazebo"]
     robot = Bus("/gazebo")
-    with running([*command, *(part for one in given for part in ("-p", one))]):
+    with running("-c", NODE, "--ros-args", "-r", "__ns:=/gazebo", *(part for one in given for part in ("-p", one))):
         robot.wait(lambda: robot.got["skin/topology"], "skin/topology")
         hand = robot.tool("finger").ready()
         by_wrench = hand.ask(HERE, PUSH)
@@ -499,7 +440,7 @@ def test_gazebos_contacts_answer_as_the_wrench_that_they_sum_to(bus, tmp_path):
         contact = gz.Contact(collision1=sides[0], collision2=sides[1], positions=[point], wrenches=[forces])
         publisher.publish(gz.Contacts(header=std.Header(stamp=stamp_of(stamp)), contacts=[contact]))
         hand.pose.publish(pose_message(HERE, "body", stamp))
-        found = robot.wait(lambda: [a for a in robot.got["skin/displacement"] if stamp_ns(a) == stamp], "the answer")
+        found = robot.wait(lambda: robot.answers(stamp), "the answer")
         assert list(found[0].statuses) == [TOUCHING] and rows(found[0]).tobytes() == rows(by_wrench).tobytes()
     robot.node.destroy_node()
 
@@ -534,7 +475,7 @@ def test_the_contact_wrench_is_what_the_pressure_of_the_answer_sums_to(bus, hand
     def both():
         stamp = hand.send(HERE)
         bus.spin(0.05)
-        answers = [a for a in bus.got["skin/displacement"] if stamp_ns(a) == stamp]
+        answers = bus.answers(stamp)
         wrenches = [w for w in heard if stamp_ns(w) == stamp]
         return (answers[0], wrenches[0]) if answers and wrenches else None
 
@@ -640,7 +581,7 @@ def test_a_node_may_be_cleaned_up_set_up_anew_and_answers_on_what_was_set(bus, h
 def test_the_node_runs_beside_another_in_any_executor():
     """In this process: SkinNode is an ordinary node to whoever composes."""
     context = rclpy.Context()
-    context.init(domain_id=int(os.environ["ROS_DOMAIN_ID"]) + 100)
+    context.init(domain_id=int(os.environ["ROS_DOMAIN_ID"]) + BUSES)
     executor = SingleThreadedExecutor(context=context)
     node = SkinNode(NodeConfig(), skin, context=context)
     other = rclpy.create_node("other", context=context)
@@ -675,7 +616,7 @@ def test_a_remapped_topic_is_heard_and_a_killed_node_is_told_by_its_liveliness(b
               "-p", "edge_length:=0.01"]  # fmt: skip
     ear = bus.listen(SkinTopology, "/arm_skin", KEPT)
     listening = bus.listen(SkinDisplacement, "/other/skin/displacement", ask, event_callbacks=told)
-    with running([sys.executable, "-c", NODE, "--ros-args", *remaps], signal.SIGKILL):
+    with running("-c", NODE, "--ros-args", *remaps, number=signal.SIGKILL):
         bus.wait(lambda: bus.got["/arm_skin"], "the topology under its other name")
         bus.wait(lambda: gone and gone[-1] == 1, "a live node")
     bus.wait(lambda: gone[-1] == 0, "the event that it is gone")
@@ -685,10 +626,8 @@ def test_a_remapped_topic_is_heard_and_a_killed_node_is_told_by_its_liveliness(b
 
 @pytest.mark.parametrize("given", ["edge_length:=3.0", "edge_length:=fine", "limits:=/nowhere.yaml"])
 def test_a_node_with_settings_that_cannot_be_ends_with_one_line(given):
-    done = subprocess.run([sys.executable, "-c", NODE, "--ros-args", "-p", given], capture_output=True, text=True,
-                          cwd=ROOT, timeout=PATIENCE)  # fmt: skip
-    assert done.returncode == 1
-    said = done.stdout + done.stderr
+    code, said = end(start("-c", NODE, "--ros-args", "-p", given))
+    assert code == 1
     assert given.split(":=")[0] in said and "Traceback" not in said
 
 
@@ -705,7 +644,7 @@ def test_a_device_that_offers_no_deadline_is_told_why_it_is_not_heard_and_one_th
     strict = Bus("/strict")
     offering = QoSProfile(depth=10, deadline=Duration(seconds=0.1))
     try:
-        with running([sys.executable, "-c", NODE, "--ros-args", "-r", "__ns:=/strict", "-p", "deadline:=0.2"]):
+        with running("-c", NODE, "--ros-args", "-r", "__ns:=/strict", "-p", "deadline:=0.2"):
             strict.wait(lambda: strict.got["skin/topology"], "skin/topology")
             hand = strict.tool("probe")
             strict.wait(lambda: strict.said("tools/probe/pose: a sender is not heard"), "the log line")
@@ -728,8 +667,8 @@ def test_a_launch_file_imports_only_launch_and_names_verbs_and_flags_that_exist(
     said = [node.value for node in ast.walk(tree) if isinstance(node, ast.Constant) and isinstance(node.value, str)]
     verb = next(word for word in said if word in ("node", "probe"))
     flags = {word for word in said if word.startswith("--")} - {"--ros-args", "--log-level"}
-    told = subprocess.run([sys.executable, "-m", "stmpl_ros.cli", verb, "--help"], capture_output=True, text=True)
-    assert told.returncode == 0 and all(flag in told.stdout for flag in flags)
+    code, told = end(start("-m", "stmpl_ros.cli", verb, "--help"))
+    assert code == 0 and all(flag in told for flag in flags)
 
 
 def test_everything_that_colcon_installs_is_there():

@@ -1,19 +1,12 @@
 """Recorder and player as processes over the real middleware: any topics, byte for byte; killed, and on a full disk."""
 
 import itertools
-import os
 import resource
 import signal
-import subprocess
-import sys
 import time
 from random import Random
 
 import pytest
-
-os.environ["ROS_DOMAIN_ID"] = str(1 + os.getpid() % 100)
-os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
-
 import rclpy
 from rclpy.qos import QoSProfile
 from std_msgs.msg import Header, String
@@ -21,40 +14,19 @@ from std_msgs.msg import Header, String
 from bags.reader import Bag
 from bags.recover import recover
 from stmpl_ros.topics import STREAM
+from tests.bus import PATIENCE, Robot, end, start
 
-PATIENCE = 60.0  # s to wait for anything; only a failing test waits so long
+STMPL = ("-m", "stmpl_ros.cli")
 SOME = 40
 
 
-def start(*arguments: str, **options) -> subprocess.Popen:
-    command = [sys.executable, "-m", "stmpl_ros.cli", *arguments]
-    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, **options)
-
-
-def end(process: subprocess.Popen, number: int | None = None) -> tuple[int, str]:
-    """Exit code of a process and what it said, after a signal if one is given."""
-    if number is not None:
-        process.send_signal(number)
-    try:
-        said, _ = process.communicate(timeout=PATIENCE)
-    finally:
-        process.kill()
-    return process.returncode, said
-
-
-class Talker:
+class Talker(Robot):
     """Publishes on two topics that are none of ours."""
 
     def __init__(self) -> None:
-        self.node = rclpy.create_node("talker")
+        super().__init__("talker")
         self.words = self.node.create_publisher(String, "any/words", STREAM)
         self.heads = self.node.create_publisher(Header, "other/heads", STREAM)
-
-    def wait(self, done, what: str) -> None:
-        until = time.monotonic() + PATIENCE
-        while not done():
-            assert time.monotonic() < until, f"waited {PATIENCE} s for {what}"
-            rclpy.spin_once(self.node, timeout_sec=0.02)
 
     def say(self, number: int) -> None:
         self.words.publish(String(data=f"word {number}"))
@@ -78,7 +50,7 @@ def talker():
 def run(talker, tmp_path_factory):
     """A recording of both topics, and of nothing else."""
     folder = tmp_path_factory.mktemp("record") / "run"
-    recorder = start("record", "--path", str(folder), "--topics", "/any/.*", "/other/heads", "/nothing")
+    recorder = start(*STMPL, "record", "--path", str(folder), "--topics", "/any/.*", "/other/heads", "/nothing")
     try:
         talker.wait_for_recorder(talker.words, talker.heads)
         for number in range(SOME):
@@ -101,7 +73,7 @@ def test_any_topics_are_recorded_as_they_came(run):
 def test_a_recording_is_published_byte_for_byte_in_order(talker, run, speed):
     got: list[bytes] = []
     ear = talker.node.create_subscription(String, "any/words", got.append, QoSProfile(depth=10 * SOME), raw=True)
-    player = start("replay", str(run), "--publish", "--speed", speed, "--topics", "/any/words")
+    player = start(*STMPL, "replay", str(run), "--publish", "--speed", speed, "--topics", "/any/words")
     try:
         talker.wait(lambda: len(got) == SOME, "all messages")
     finally:
@@ -113,14 +85,14 @@ def test_a_recording_is_published_byte_for_byte_in_order(talker, run, speed):
 
 
 def test_what_cannot_be_published_is_refused(run):
-    code, said = end(start("replay", str(run), "--publish", "--topics", "/nothing"))
+    code, said = end(start(*STMPL, "replay", str(run), "--publish", "--topics", "/nothing"))
     assert code == 1 and "nothing to publish on" in said and "Traceback" not in said
-    code, said = end(start("replay", str(run), "--publish", "--topics", "("))
+    code, said = end(start(*STMPL, "replay", str(run), "--publish", "--topics", "("))
     assert code == 1 and "no regular expressions" in said and "Traceback" not in said
 
 
 def test_a_killed_recorder_loses_what_it_had_not_flushed_only(talker, tmp_path):
-    recorder = start("record", "--path", str(tmp_path / "run"), "--topics", "/any/words")
+    recorder = start(*STMPL, "record", "--path", str(tmp_path / "run"), "--topics", "/any/words")
     file, sizes = tmp_path / "run" / "run.mcap", set()
     try:
         talker.wait_for_recorder(talker.words)
@@ -143,7 +115,7 @@ def test_a_recorder_on_a_full_disk_stops_and_says_what_is_safe(talker, tmp_path)
     def small() -> None:
         resource.setrlimit(resource.RLIMIT_FSIZE, (40_000, 40_000))
 
-    recorder = start("record", "--path", str(tmp_path / "run"), "--topics", "/any/words", preexec_fn=small)
+    recorder = start(*STMPL, "record", "--path", str(tmp_path / "run"), "--topics", "/any/words", preexec_fn=small)
     talker.wait_for_recorder(talker.words)
     generator = Random(0)
     until = time.monotonic() + PATIENCE

@@ -1,22 +1,12 @@
 """Laws of the node and the recorder as processes of their own, over the real middleware, on a bus of their own."""
 
-import os
 import signal
-import subprocess
-import sys
-import time
-from collections import defaultdict
 
 import numpy as np
 import pytest
-
-os.environ["ROS_DOMAIN_ID"] = str(1 + os.getpid() % 100)
-os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
-
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseStamped, WrenchStamped
-from rcl_interfaces.msg import Log
 from stmpl_msgs.msg import ContactMesh, LocalContact, SkinDeformed, SkinDisplacement, SkinTopology
 from visualization_msgs.msg import Marker
 
@@ -30,9 +20,9 @@ from stmpl_core.sdf import MARGIN, SignedDistance
 from stmpl_core.touch import BY_POSE, IN_CORE, NO_FORCE, NO_TOUCH, PULLING, TOUCHING, Toucher
 from stmpl_ros.conversions import STALE, local_contact_from, mesh_message, pose_message, wrench_message
 from stmpl_ros.topics import KEPT, STREAM
+from tests.bus import Robot, end, rows, start
 from tests.touch_scenes import LENGTH, RADIUS, at, ball
 
-PATIENCE = 120.0  # s to wait for anything; only a failing test waits so long
 AGAIN = 2_000_000_000  # ns after which an unanswered first pose is sent once more
 NODE = """
 import sys
@@ -44,51 +34,16 @@ sys.exit(run(NodeConfig(rest_after=0.4, fade=0.6), build=lambda config: limb(4e-
 TOUCH = RADIUS + 0.012 - 1e-3  # m from the limb's axis: a ball of 12 mm, 1 mm deep
 
 
-def start(*arguments: str) -> subprocess.Popen:
-    return subprocess.Popen([sys.executable, *arguments], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
-
-
-def end(process: subprocess.Popen, number: int) -> tuple[int, str]:
-    """Ends a process by a signal; its exit code and what it said."""
-    process.send_signal(number)
-    try:
-        said, _ = process.communicate(timeout=PATIENCE)
-    finally:
-        process.kill()
-    return process.returncode, said
-
-
-class Device:
+class Device(Robot):
     """A tool on the bus, and all that comes back."""
 
     def __init__(self, name: str = "probe", mesh: ToolMesh | None = None) -> None:
-        self.name, self.got = name, defaultdict(list)
-        self.node = rclpy.create_node(f"device_{name}")
+        super().__init__(f"device_{name}")
+        self.name = name
         self.mesh = self.node.create_publisher(ContactMesh, "contact_mesh", KEPT)
         self.pose = self.node.create_publisher(PoseStamped, f"tools/{name}/pose", STREAM)
         self.wrench = self.node.create_publisher(WrenchStamped, f"tools/{name}/wrench", STREAM)
-        self.listen(SkinTopology, "skin/topology", KEPT)
-        self.listen(SkinDisplacement, "skin/displacement", STREAM)
-        self.listen(Log, "/rosout", KEPT)
         self.mesh.publish(mesh_message(name, mesh or ball(), self.now()))
-
-    def listen(self, kind, topic, profile):
-        return self.node.create_subscription(kind, topic, self.got[topic].append, profile)
-
-    def now(self) -> int:
-        return self.node.get_clock().now().nanoseconds
-
-    def wait(self, done, what: str):
-        until = time.monotonic() + PATIENCE
-        while not (found := done()):
-            assert time.monotonic() < until, f"waited {PATIENCE} s for {what}"
-            rclpy.spin_once(self.node, timeout_sec=0.02)
-        return found
-
-    def spin(self, seconds: float) -> None:
-        until = time.monotonic() + seconds
-        while time.monotonic() < until:
-            rclpy.spin_once(self.node, timeout_sec=0.02)
 
     def send(self, distance: float, force: float, *, pose_frame="body", wrench_frame="body") -> int:
         """Pose and wrench of one instant, pushing towards the limb's axis; returns their stamp [ns]."""
@@ -98,21 +53,9 @@ class Device:
         self.pose.publish(pose_message(at(distance, 0, LENGTH / 2), pose_frame, stamp))
         return stamp
 
-    def said(self, text: str) -> list[str]:
-        """Log lines of the node that hold `text`."""
-        return [line.msg for line in self.got["/rosout"] if text in line.msg]
-
-    def still(self) -> None:
-        """Waits until the skin is at rest and nothing is sent any more."""
-        self.wait(lambda: not (said := self.got["skin/displacement"]) or not said[-1].tools, "rest")
-
-    def answers(self, stamp: int) -> list[SkinDisplacement]:
-        return [answer for answer in self.got["skin/displacement"] if stamp_ns(answer) == stamp]
-
     def ask(self, distance: float, force: float, **frames) -> SkinDisplacement:
         """Sends one instant and waits for its answer."""
-        stamp = self.send(distance, force, **frames)
-        return self.wait(lambda: self.answers(stamp), f"the answer to {stamp}")[0]
+        return self.answer(self.send(distance, force, **frames))
 
 
 @pytest.fixture(scope="module")
@@ -142,10 +85,6 @@ def test_the_node_on_the_arm_ends_cleanly_when_asked_to(device, number):
     finally:
         code, said = end(process, number)
     assert code == 0, said
-
-
-def rows(answer: SkinDisplacement) -> np.ndarray:
-    return np.frombuffer(answer.displacement, np.float32).reshape(-1, 3)
 
 
 def test_a_contact_is_answered_where_it_is_with_its_stamp_frame_and_layer(device):

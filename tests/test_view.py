@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import json
-import os
 import shutil
+import signal
 import subprocess
 import threading
 import time
@@ -462,11 +462,10 @@ def test_a_browser_pushes_the_tool_and_sees_what_the_simulator_answers(tab, hand
 
 
 def test_the_live_page_shows_the_answers_of_a_running_node():
-    os.environ["ROS_DOMAIN_ID"] = str(1 + os.getpid() % 100)
-    os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
     import rclpy
 
     from stmpl_ros.view.live import LiveNode
+    from tests import bus
     from tests import test_ros as ros
 
     rclpy.init()
@@ -476,16 +475,11 @@ def test_the_live_page_shows_the_answers_of_a_running_node():
         live = LiveNode(page, patience=0.5)
 
         def wait(done, what):
-            end = time.monotonic() + PATIENCE
-            while not (found := done()):
-                assert time.monotonic() < end, f"waited {PATIENCE} s for {what}"
-                rclpy.spin_once(live, timeout_sec=0.01)
-                rclpy.spin_once(device.node, timeout_sec=0.01)
-            return found
+            return bus.wait_for(done, what, live, device.node)
 
         try:
             wait(lambda: "stmpl node" in page.message, "word that no node is there")
-            process = ros.start("-c", ros.NODE)
+            process = bus.start("-c", ros.NODE)
             wait(lambda: page.layer is not None, "the skin")
             wait(lambda: device.pose.get_subscription_count() >= 2, "node and page to listen to the tool")
             wait(lambda: device.send(ros.TOUCH, 0.03) and page.snapshot, "an answer")
@@ -498,7 +492,7 @@ def test_the_live_page_shows_the_answers_of_a_running_node():
         finally:
             live.close()
             if process is not None:
-                code, said = ros.end(process, ros.signal.SIGTERM)
+                code, said = bus.end(process, signal.SIGTERM)
             device.node.destroy_node()
             rclpy.shutdown()
     assert code == 0, said

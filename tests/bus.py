@@ -1,0 +1,109 @@
+"""A robot's end of the ROS bus, and the processes at its other end. conftest.py gives each test process its own bus."""
+
+import signal
+import subprocess
+import sys
+import time
+from collections import defaultdict
+from collections.abc import Callable
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import rclpy
+from rcl_interfaces.msg import Log
+from stmpl_msgs.msg import SkinDisplacement, SkinTopology
+
+from bags.messages import stamp_ns
+from stmpl_ros.topics import KEPT, STREAM
+
+ROOT = Path(__file__).parents[1]
+PATIENCE = 120.0  # s to wait for anything; only a failing test waits so long
+
+
+def wait_for(done: Callable[[], Any], what: str, *nodes: rclpy.node.Node, seconds: float = PATIENCE) -> Any:
+    """What `done` returns once it is true, with the nodes spinning meanwhile."""
+    until = time.monotonic() + seconds
+    while not (found := done()):
+        assert time.monotonic() < until, f"waited {seconds} s for {what}"
+        for node in nodes:
+            rclpy.spin_once(node, timeout_sec=0.02 / len(nodes))
+    return found
+
+
+def start(*arguments: str, **options: Any) -> subprocess.Popen:
+    """A Python process from the repository's root with these arguments."""
+    return subprocess.Popen([sys.executable, *arguments], stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
+                            text=True, cwd=ROOT, **options)  # fmt: skip
+
+
+def end(process: subprocess.Popen, number: int | None = None) -> tuple[int, str]:
+    """Exit code of a process and what it said, after a signal if one is given."""
+    if number is not None:
+        process.send_signal(number)
+    try:
+        said, _ = process.communicate(timeout=PATIENCE)
+    finally:
+        process.kill()
+    return process.returncode, said
+
+
+@contextmanager
+def running(*arguments: str, number: int = signal.SIGTERM):
+    """A Python process that ends cleanly when asked to."""
+    process = start(*arguments)
+    try:
+        yield process
+        code, said = end(process, number)
+        assert code == (0 if number != signal.SIGKILL else -signal.SIGKILL), said
+    finally:
+        if process.poll() is None:
+            process.kill()
+            print(process.communicate()[0])
+
+
+def rows(answer: SkinDisplacement) -> np.ndarray:
+    """The displacement of an answer, (V, 3) [m]."""
+    return np.frombuffer(answer.displacement, np.float32).reshape(-1, 3)
+
+
+class Robot:
+    """A node that hears the skin, and waits."""
+
+    def __init__(self, name: str, space: str = "") -> None:
+        self.space, self.got = space, defaultdict(list)
+        self.node = rclpy.create_node(name, namespace=space or "/")
+        self.listen(SkinTopology, "skin/topology", KEPT)
+        self.listen(SkinDisplacement, "skin/displacement", STREAM)
+        self.listen(Log, "/rosout", KEPT)
+
+    def listen(self, kind: type, topic: str, profile: Any, **more: Any) -> Any:
+        return self.node.create_subscription(kind, topic, self.got[topic].append, profile, **more)
+
+    def now(self) -> int:
+        """The bus's clock [ns]."""
+        return self.node.get_clock().now().nanoseconds
+
+    def wait(self, done: Callable[[], Any], what: str) -> Any:
+        return wait_for(done, what, self.node)
+
+    def spin(self, seconds: float) -> None:
+        until = time.monotonic() + seconds
+        while time.monotonic() < until:
+            rclpy.spin_once(self.node, timeout_sec=0.02)
+
+    def said(self, text: str) -> list[str]:
+        """Log lines of the node that hold `text`."""
+        return [line.msg for line in self.got["/rosout"] if text in line.msg]
+
+    def still(self) -> None:
+        """Waits until the skin is at rest, so that no other tool is waited for."""
+        self.wait(lambda: not (said := self.got["skin/displacement"]) or not said[-1].tools, "rest")
+
+    def answers(self, stamp: int) -> list[SkinDisplacement]:
+        """Answers to the instant `stamp` [ns]."""
+        return [answer for answer in self.got["skin/displacement"] if stamp_ns(answer) == stamp]
+
+    def answer(self, stamp: int) -> SkinDisplacement:
+        return self.wait(lambda: self.answers(stamp), f"the answer to {stamp}")[0]

@@ -1,0 +1,47 @@
+"""What holds for every test: its mark, the worker that runs it, and a ROS bus that no other process is on."""
+
+import os
+import socket
+from pathlib import Path
+
+import pytest
+
+BUSES = 50  # test_node.py uses the domain that lies so much higher as a second bus
+LOCKS = 27_400  # the first of the ports that stand for the buses; below those that systems hand out by themselves
+ROOMS = {  # every other file is of the room "unit"
+    "ros": ["test_node", "test_record_and_publish", "test_ros", "test_ros_parts", "test_view"],
+    "studies": ["test_evaluate", "test_fem_limits", "test_peers", "test_speed_chart", "test_stability",
+                "test_train_contact", "test_unet"],
+}  # fmt: skip
+BUS = pytest.StashKey[socket.socket]()
+ROOM_OF = {file: room for room, files in ROOMS.items() for file in files}
+
+
+def own_bus() -> socket.socket:
+    """Claims a ROS domain, 1 to BUSES, by a port: the system gives it back when this process ends, however it ends."""
+    for k in range(BUSES):
+        domain, claim = 1 + (os.getpid() + k) % BUSES, socket.socket()
+        try:
+            claim.bind(("127.0.0.1", LOCKS + domain))
+        except OSError:
+            claim.close()
+            continue
+        os.environ.update(ROS_DOMAIN_ID=str(domain), ROS_AUTOMATIC_DISCOVERY_RANGE="LOCALHOST")  # children's too
+        return claim
+    raise RuntimeError(f"all {BUSES} ROS domains for tests are in use: end the test runs that hold them")
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Gives this process a bus; and one thread for linear algebra, where a worker has each core."""
+    if "PYTEST_XDIST_WORKER" in os.environ:
+        os.environ.update(OMP_NUM_THREADS="1", OPENBLAS_NUM_THREADS="1")
+    config.stash[BUS] = own_bus()
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Marks each test with its file's room, if it names none itself."""
+    missing = [file for file in ROOM_OF if not Path(__file__).with_name(f"{file}.py").exists()]
+    assert not missing, f"conftest.py names files that are not there: {missing}"
+    for item in items:
+        if not any(item.get_closest_marker(room) for room in ("unit", *ROOMS)):
+            item.add_marker(ROOM_OF.get(item.path.stem, "unit"))
