@@ -23,7 +23,7 @@ PUBLIC = {  # heading: modules, and the names in them that are promised to stay
     "Finite elements": ["fem_tools: PatchFem IndenterFem Press RigidFem"],
     "Stiffness and haptics": [
         "stmpl_core.stiffness: fit_stiffness Stiffness",
-        "stmpl_core.haptics: local_contact LocalContact DeviceLoop LoopSettings",
+        "stmpl_core.local_contact: local_contact LocalContact", "stmpl_core.haptics: DeviceLoop LoopSettings",
     ],
     "Recordings": [
         "bags.reader: Bag", "bags.writer: BagWriter", "bags.replay: replay replay_run",
