@@ -1,6 +1,6 @@
 """Draws docs/pictures/architecture.png: the rooms, what they may import, and three ways through them.
 
-.venv/bin/python -m docs.draw_architecture
+.venv/bin/python docs/draw_architecture.py
 """
 
 from __future__ import annotations

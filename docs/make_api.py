@@ -1,6 +1,6 @@
 """Writes docs/api.md from the docstrings of the public names.
 
-.venv/bin/python -m docs.make_api      # a test fails while the page is out of date
+.venv/bin/python docs/make_api.py      # a test fails while the page is out of date
 """
 
 from __future__ import annotations

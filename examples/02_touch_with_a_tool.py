@@ -24,7 +24,7 @@ def main() -> float:
     # Any closed triangle mesh is a tool, in its own frame, in metres.
     ball = trimesh.creation.icosphere(subdivisions=3, radius=RADIUS)
     tool = Tool("ball", ball.vertices, ball.faces)
-    simulator.tools.add(tool)  # builds its distance field, once
+    simulator.tools.field(tool)  # builds its distance field, once; else the first touch would
 
     # Where the ball is: 2 mm deep over a vertex in the middle of the limb.
     middle = int(np.linalg.norm(layer.vertices - layer.vertices.mean(axis=0), axis=1).argmin())
@@ -33,13 +33,12 @@ def main() -> float:
 
     touches = simulator.touch([Contact(tool, pose)])
     touch = touches[0]
-    force = float(np.linalg.norm(touch.wrench[:3]))
-    print(f"{touch.name}: {touch.status}, {1e3 * touch.depth:.2f} mm deep, presses with {force:.4f} N, "
+    print(f"{touch.name}: {touch.status}, {1e3 * touch.depth:.2f} mm deep, presses with {touch.force:.4f} N, "
           f"give or take {touch.force_bound:.4f} N")
 
     answer = simulator.answer(touches)  # simulator.step(contacts) does both
     print(f"the skin moves by up to {1e3 * answer.magnitude.max():.2f} mm; to be trusted: {answer.trust.ok}")
-    return force
+    return touch.force
 
 
 if __name__ == "__main__":

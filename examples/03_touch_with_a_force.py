@@ -32,14 +32,14 @@ def main() -> float:
 
     answer = simulator.step([Contact(tool, pose, wrench=wrench)])
     touch = answer.touches["ball"]
-    print(f"{touch.status}: moved by {1e3 * touch.moved:.2f} mm, then presses with "
-          f"{np.linalg.norm(touch.wrench[:3]):.4f} N; the skin moves by {1e3 * answer.magnitude.max():.2f} mm")
+    print(f"{touch.status}: moved by {1e3 * touch.moved:.2f} mm, it presses with {touch.force:.4f} N; "
+          f"the skin moves by {1e3 * answer.magnitude.max():.2f} mm")
 
     # The same force where there is no skin within reach: refused in words, and nothing moves.
     pose[:3, 3] += 0.05 * outward
     lost = simulator.step([Contact(tool, pose, wrench=wrench)])
     print(f"{lost.touches['ball'].status}; to be trusted: {lost.trust.ok}; {lost.trust.why}")
-    return float(touch.moved)
+    return touch.moved
 
 
 if __name__ == "__main__":

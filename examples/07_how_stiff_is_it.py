@@ -12,7 +12,7 @@ import trimesh
 from stmpl_core import Contact, Simulator, Tool
 from stmpl_core.body import Body
 from stmpl_core.methods import MomentNet
-from stmpl_core.stiffness import Press, fit_stiffness
+from stmpl_core.stiffness import fit_stiffness
 
 RADIUS = 12e-3  # m
 HIDDEN = 1400.0  # Pa, of the person
@@ -35,7 +35,7 @@ def main() -> float:
         pose[:3, 3] = layer.vertices[middle] + (RADIUS - depth) * outward
         felt = person.touch([Contact(tool, pose)])[0].wrench
         pose[:3, 3] += OFFSET * outward
-        presses.append(Press(Contact(tool, pose, wrench=felt), robot.tools.field(tool)))
+        presses.append(Contact(tool, pose, wrench=felt))
 
     found = fit_stiffness(robot.toucher, presses)
     print(f"hidden: E = {HIDDEN:g} Pa, poses off by {1e3 * OFFSET:+.2f} mm")

@@ -11,7 +11,8 @@ import trimesh
 
 from stmpl_core import Contact, Simulator, Tool
 from stmpl_core.body import Body
-from stmpl_core.haptics import DeviceLoop, LoopSettings, local_contact
+from stmpl_core.haptics import DeviceLoop, LoopSettings
+from stmpl_core.local_contact import local_contact
 from stmpl_core.methods import MomentNet
 
 RADIUS, SPEED, TICK = 12e-3, 0.01, 1e-3  # m, m/s, s
@@ -33,8 +34,7 @@ def main() -> float:
         if millisecond % 10 == 0:  # beside the node, 100 times a second: where the tool rests, not where the device is
             pose = np.eye(4)
             pose[:3, 3] = loop.proxy if millisecond else device
-            field = simulator.tools.field(tool)
-            loop.update(local_contact(simulator.toucher, Contact(tool, pose), field, rotations=False))
+            loop.update(local_contact(simulator.toucher, Contact(tool, pose), rotations=False))
         force = loop.step(device, -SPEED * outward, TICK)  # beside the device, every millisecond
         away -= SPEED * TICK
 
