@@ -26,7 +26,7 @@ PUBLIC = {  # heading: modules, and the names in them that are promised to stay
         "stmpl_core.local_contact: local_contact LocalContact", "stmpl_core.haptics: DeviceLoop LoopSettings",
     ],
     "Recordings": [
-        "bags.reader: Bag", "bags.writer: BagWriter", "bags.replay: replay replay_run",
+        "bags.reader: Bag", "bags.run: Run", "bags.writer: BagWriter", "bags.replay: replay replay_run",
         "bags.compare: compare_run compare_bags Comparison", "bags.recover: recover",
     ],
     "The node in your own process": ["stmpl_ros.node: SkinNode", "stmpl_ros.parameters: NodeConfig"],
