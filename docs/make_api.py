@@ -8,6 +8,7 @@ from __future__ import annotations
 import inspect
 import re
 from collections.abc import Iterator
+from functools import cached_property
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -16,19 +17,13 @@ PAGE = Path(__file__).parent / "api.md"
 PUBLIC = {  # heading: modules, and the names in them that are promised to stay
     "From contact to answer": ["stmpl_core: Tool Contact Simulator Tools State Touch Answer Trust"],
     "Limb and load": ["stmpl_core.body: Body", "stmpl_core: SoftLayer Tissue Load", "stmpl_core.skin: Skin"],
-    "Methods": [
-        "stmpl_core.methods: Method method Naive Winkler Linear MomentNet UNet Ladder", "stmpl_core: Displacement",
-        "fem_tools.ladder: ladder", "stmpl_core.metrics: score Score",
-    ],
+    "Methods": ["stmpl_core.methods: Method method Naive Winkler Linear MomentNet UNet Ladder",
+                "stmpl_core: Displacement", "fem_tools.ladder: ladder", "stmpl_core.metrics: score Score"],
     "Finite elements": ["fem_tools: PatchFem IndenterFem Press RigidFem"],
-    "Stiffness and haptics": [
-        "stmpl_core.stiffness: fit_stiffness Stiffness",
-        "stmpl_core.local_contact: local_contact LocalContact", "stmpl_core.haptics: DeviceLoop LoopSettings",
-    ],
-    "Recordings": [
-        "bags.reader: Bag", "bags.run: Run", "bags.writer: BagWriter", "bags.replay: replay replay_run",
-        "bags.compare: compare_run compare_bags Comparison", "bags.recover: recover",
-    ],
+    "Stiffness and haptics": ["stmpl_core.stiffness: fit_stiffness Stiffness", "stmpl_core.haptics: DeviceLoop",
+                              "stmpl_core.haptics: LoopSettings", "stmpl_core.local_contact: local_contact LocalContact"],
+    "Recordings": ["bags.reader: Bag", "bags.run: Run", "bags.writer: BagWriter", "bags.replay: replay replay_run",
+                   "bags.compare: compare_run compare_bags Comparison", "bags.recover: recover"],
     "The node in your own process": ["stmpl_ros.node: SkinNode", "stmpl_ros.parameters: NodeConfig"],
 }  # fmt: skip
 OPENING = """# Reference of the Python names
@@ -84,7 +79,7 @@ def member(name: str, value: Any) -> str:
     """A bullet for a method or a property: how to call it, and its first paragraph."""
     function = value.__func__ if isinstance(value, classmethod | staticmethod) else value
     if not inspect.isfunction(function):
-        return f"- `.{name}`: {first(value)}" if isinstance(value, property) else ""
+        return f"- `.{name}`: {first(value)}" if isinstance(value, property | cached_property) else ""
     return f"- `.{called(name, function, width=1000)}`: {first(function)}"
 
 
