@@ -1,30 +1,29 @@
-"""The tutorial runs as it is written, and no page links to a file that is not there."""
+"""Pages are what they say: commands succeed, links lead somewhere, the reference is up to date, the README is short."""
 
 import re
+import runpy
 from pathlib import Path
 
+import numpy as np
 import pytest
+import trimesh
 
-from stmpl_ros.cli import main
+from stmpl_core.body import Body
+from stmpl_core.methods import METHODS
+from stmpl_ros.cli import VERBS, main
 
 ROOT = Path(__file__).parent.parent
-PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+PAGES = [*sorted(ROOT.glob("*.md")), *sorted((ROOT / "docs").rglob("*.md"))]
+MOST_WORDS = 700
+PYTHON = re.compile(r"^```python\n(.*?)^```", flags=re.M | re.S)
 
 
-def blocks(page: Path, language: str) -> list[str]:
-    """The page's blocks in this language, in order."""
-    return re.findall(rf"^```{language}\n(.*?)^```", page.read_text(), flags=re.M | re.S)
+def lines_of_the_tutorial() -> list[str]:
+    blocks = re.findall(r"^```sh\n(.*?)^```", (ROOT / "docs" / "tutorial.md").read_text(), flags=re.M | re.S)
+    return [line for block in blocks for line in block.splitlines()]
 
 
-def test_the_tutorials_python_runs() -> None:
-    names: dict = {}
-    for k, block in enumerate(blocks(ROOT / "docs" / "tutorial.md", "python")):
-        exec(compile(block, f"tutorial.md, block {k + 1}", "exec"), names)
-    assert names["answer"].trust.ok and names["loop"]
-
-
-@pytest.mark.parametrize("line", [
-    line for block in blocks(ROOT / "docs" / "tutorial.md", "sh") for line in block.splitlines()])  # fmt: skip
+@pytest.mark.parametrize("line", lines_of_the_tutorial())
 def test_the_tutorials_commands_succeed(line: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(ROOT)
     command, *arguments = line.split()
@@ -34,7 +33,47 @@ def test_the_tutorials_commands_succeed(line: str, monkeypatch: pytest.MonkeyPat
     assert ended.value.code == 0
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
 def test_links_lead_somewhere(page: Path) -> None:
     for target in re.findall(r"\]\((?!http)([^)#]+)", page.read_text()):
         assert (page.parent / target).exists(), f"{page.name} links to {target}"
+
+
+def test_every_page_is_on_the_map() -> None:
+    chart = (ROOT / "docs" / "README.md").read_text()
+    missing = [page.name for page in (ROOT / "docs").glob("*.md") if f"({page.name})" not in chart]
+    assert missing == ["README.md"]
+
+
+def test_the_readme_is_short() -> None:
+    assert len((ROOT / "README.md").read_text().split()) < MOST_WORDS
+
+
+def test_the_readmes_python_runs() -> None:
+    code = PYTHON.findall((ROOT / "README.md").read_text())[0]
+    layer = Body.anny().part("left_forearm")
+    middle = int(np.linalg.norm(layer.vertices - layer.vertices.mean(axis=0), axis=1).argmin())
+    ball, pose = trimesh.creation.icosphere(subdivisions=2, radius=0.012), np.eye(4)
+    pose[:3, 3] = layer.vertices[middle] + 0.010 * layer.normals[middle]  # 2 mm deep
+    names = {"tool_vertices": ball.vertices, "tool_faces": ball.faces, "pose_body_from_tool": pose}
+    exec(compile(code, "README.md", "exec"), names)
+    assert names["touches"][0].force > 0 and names["answer"].magnitude.max() > 1e-3
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
+def test_pages_name_files_and_verbs_that_exist(page: Path) -> None:
+    text = page.read_text()
+    for verb in re.findall(r"(?:`|bin/|^    )stmpl ([a-z]+)", text, flags=re.M):
+        assert verb in VERBS, f"{page.name} names the verb {verb}"
+    for method in re.findall(r"--(?:node\.)?method[ =]([a-z_]+)", text):
+        assert method in METHODS, f"{page.name} names the method {method}"
+    for file in re.findall(r"`((?:stmpl_core|stmpl_ros|fem_tools|bags|studies|msg_defs|examples|docs)/[\w./]+)`", text):
+        assert (ROOT / file).exists(), f"{page.name} names {file}"
+
+
+@pytest.mark.ros  # the node is among the names
+def test_the_reference_is_up_to_date() -> None:
+    made = runpy.run_path(str(ROOT / "docs" / "make_api.py"))
+    gone = [name for heading in made["PUBLIC"] for name in made["names"](heading) if made["find"](*name) is None]
+    assert not gone, f"docs/make_api.py promises what does not exist: {gone}"
+    assert made["PAGE"].read_text() == made["page"](), "run .venv/bin/python docs/make_api.py"
