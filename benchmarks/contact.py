@@ -24,12 +24,14 @@ from fem_tools.indenter import Indentation, IndenterFem
 from fem_tools.press import Press
 from fem_tools.scenes import Site
 from stmpl_core.body import Body
-from stmpl_core.contact import Contact, ToolMesh
+from stmpl_core.contact import Contact
 from stmpl_core.layer import SoftLayer, Tissue
 from stmpl_core.methods import MomentNet
 from stmpl_core.sdf import SignedDistance
 from stmpl_core.simulator import Simulator
-from stmpl_core.touch import Toucher
+from stmpl_core.tool import Tool
+from stmpl_core.touch import Touch
+from stmpl_core.toucher import Toucher
 
 DOCS = Path(__file__).parents[1] / "docs"
 DEPTHS = (0.06, 0.15, 0.3, 0.45, 0.6)  # thicknesses
@@ -51,7 +53,7 @@ class Scene:
     """
 
     name: str
-    meshes: tuple[ToolMesh, ...]
+    meshes: tuple[Tool, ...]
     shifts: tuple[float, ...] = (0.0,)
     rounding: float = 0.0
     place: float = 0.0
@@ -134,28 +136,35 @@ def contacts(scene: Scene, tools: Sequence[Press], forces: Sequence[float] | Non
     out = []
     for k, (mesh, tool) in enumerate(zip(scene.meshes, tools, strict=True)):
         wrench = None if forces is None else np.concatenate([forces[k] * tool.direction, np.zeros(3)])
-        out.append(Contact(f"tool {k}", mesh, tool.pose_body_from_tool, wrench))
+        out.append(Contact(mesh.named(f"tool {k}"), tool.pose_body_from_tool, wrench))
     return out
+
+
+def _touched(toucher: Toucher, found: Sequence[Contact], presses: Sequence[Press]) -> list[Touch]:
+    """Touches of contacts, by the very fields that FEM presses with."""
+    for contact, press in zip(found, presses, strict=True):
+        toucher.tools.add(contact.tool, press.field)
+    return toucher.touch_all(found)
 
 
 def row(scene: Scene, simulator: Simulator, toucher: Toucher, truth: Indentation) -> Row:
     """Ours against one answer of FEM."""
     layer, thick = simulator.layer, float(simulator.layer.thickness.mean())
-    fields = [tool.field for tool in truth.tools]
-    touches = toucher.touch_all(contacts(scene, truth.tools), fields)
-    ours = np.sum([touch.load.values for touch in touches], axis=0)
+    touches = _touched(toucher, contacts(scene, truth.tools), truth.tools)
+    ours = np.sum([touch.pressure for touch in touches if touch.pressure is not None], axis=0)
     area, way = layer.vertex_areas, truth.tools[0].direction
     force = float(sum(touch.wrench[:3] @ tool.direction for touch, tool in zip(touches, truth.tools, strict=True)))
-    columns = sum(float(t.squeeze.pressure @ (-layer.vertex_area_vectors[t.squeeze.vertices] @ way)) for t in touches)
+    squeezes = [touch.pressed.squeeze for touch in touches if touch.pressed]
+    columns = sum(float(one.pressure @ (-layer.vertex_area_vectors[one.vertices] @ way)) for one in squeezes)
     answer = simulator.step(contacts(scene, truth.tools))
     error = np.linalg.norm(answer.displacement - truth.displacement, axis=1)
     length, skin = np.linalg.norm(truth.displacement, axis=1), layer.vertices + answer.displacement
     peak = float(length.max())
-    stated = sum(touch.trust.figures["force_error_n"] for touch in touches)
+    stated = sum(touch.force_bound for touch in touches)
     forces = [float(w[:3] @ tool.direction) for w, tool in zip(truth.wrenches, truth.tools, strict=True)]
     back = [tool.shifted(-OFF * tool.direction) for tool in truth.tools]
-    found = [toucher.touch(c, f).trust.figures["moved_m"] - OFF
-             for c, f in zip(contacts(scene, back, forces), fields, strict=True)]  # fmt: skip
+    found = [_touched(toucher, [contact], [tool])[0].moved - OFF
+             for contact, tool in zip(contacts(scene, back, forces), truth.tools, strict=True)]  # fmt: skip
     return Row(
         name=scene.name,
         depth=truth.depth / thick,
@@ -184,8 +193,7 @@ def timings(simulator: Simulator, toucher: Toucher, scene: Scene, depth: float) 
     tools = [tool.at(depth) for tool in scene.tools(simulator.layer)]
     across = tools[0].sideways(1.0)[1]
     out: dict[str, list[float]] = {"pose": [], "wrench": [], "whole": []}
-    fields = [tool.field for tool in tools]
-    force = [float(t.wrench[:3] @ tools[0].direction) for t in toucher.touch_all(contacts(scene, tools), fields)]
+    force = [float(t.wrench[:3] @ tools[0].direction) for t in _touched(toucher, contacts(scene, tools), tools)]
 
     def timed(name: str, call: Callable[[], object]) -> None:
         start = time.perf_counter()
@@ -195,8 +203,11 @@ def timings(simulator: Simulator, toucher: Toucher, scene: Scene, depth: float) 
     for k in range(SLOWEST):
         moved = [tool.shifted(2e-3 * np.sin(0.07 * k) * across) for tool in tools]
         by_pose, by_wrench = contacts(scene, moved), contacts(scene, moved, force)
-        timed("pose", lambda: toucher.touch_all(by_pose, fields))  # noqa: B023
-        timed("wrench", lambda: toucher.touch_all(by_wrench, fields))  # noqa: B023
+        for contact, tool in zip([*by_pose, *by_wrench], [*tools, *tools], strict=True):
+            toucher.tools.add(contact.tool, tool.field)
+            simulator.tools.add(contact.tool, tool.field)
+        timed("pose", lambda: toucher.touch_all(by_pose))  # noqa: B023
+        timed("wrench", lambda: toucher.touch_all(by_wrench))  # noqa: B023
         if k % 5 == 0:
             timed("whole", lambda: simulator.step(by_pose))  # noqa: B023
     return out

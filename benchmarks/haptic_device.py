@@ -8,11 +8,11 @@ import numba
 import numpy as np
 import trimesh
 
-from stmpl_core import Contact, SoftLayer, ToolMesh
+from stmpl_core import Contact, SoftLayer, Tool
 from stmpl_core.body import Body
-from stmpl_core.haptics import DeviceLoop, LocalContact, LoopSettings, local_contact
-from stmpl_core.sdf import SignedDistance
-from stmpl_core.touch import Toucher
+from stmpl_core.haptics import DeviceLoop, LoopSettings
+from stmpl_core.local_contact import LocalContact, local_contact
+from stmpl_core.toucher import Toucher
 
 FINE = 25e-6  # s, step of the device's own motion
 BALL = 0.012  # m
@@ -83,8 +83,7 @@ class Spot:
     """A ball over one place of a skin: the node's side of the experiment. Everything here is the real contact."""
 
     toucher: Toucher
-    mesh: ToolMesh
-    field: SignedDistance
+    tool: Tool
     place: np.ndarray
     out: np.ndarray
 
@@ -92,8 +91,8 @@ class Spot:
     def of(cls, layer: SoftLayer, vertex: int) -> Spot:
         """Over `vertex`."""
         sphere = trimesh.creation.icosphere(4, BALL)
-        mesh = ToolMesh.of(sphere.vertices, sphere.faces)
-        return cls(Toucher(layer), mesh, SignedDistance.of(mesh), layer.vertices[vertex], layer.normals[vertex])
+        tool = Tool("ball", sphere.vertices, sphere.faces)
+        return cls(Toucher(layer), tool, layer.vertices[vertex], layer.normals[vertex])
 
     def with_modulus(self, youngs_modulus: float) -> Spot:
         """The same on a skin of another stiffness [Pa]."""
@@ -111,11 +110,11 @@ class Spot:
 
     def model(self, origin: np.ndarray) -> LocalContact:
         """The local model there."""
-        return local_contact(self.toucher, Contact("ball", self.mesh, self.pose(origin)), self.field, rotations=False)
+        return local_contact(self.toucher, Contact(self.tool, self.pose(origin)), rotations=False)
 
     def force(self, origin: np.ndarray) -> np.ndarray:
         """The reaction's force on the body there, (3,) [N]."""
-        return self.toucher.touch(Contact("ball", self.mesh, self.pose(origin)), self.field).wrench[:3]
+        return self.toucher.touch(Contact(self.tool, self.pose(origin))).wrench[:3]
 
 
 @dataclass(frozen=True, eq=False)

@@ -19,7 +19,8 @@ import numpy as np
 from benchmarks.haptic_device import Device, Felt, Hand, Spot, arm_spot, play
 from fem_tools.provenance import machine
 from stmpl_core import Contact
-from stmpl_core.haptics import DeviceLoop, LoopSettings, local_contact
+from stmpl_core.haptics import DeviceLoop, LoopSettings
+from stmpl_core.local_contact import local_contact
 
 HARD = 5e5  # Pa: a skin beside which the coupling is soft, 5 kN/m under 1 N
 LEVELS = [round(100 * 2 ** (k / 2)) for k in range(15)]  # N/m, of the coupling: 100 to 12,800
@@ -132,10 +133,10 @@ def slide(spot: Spot, way: tuple[np.ndarray, np.ndarray], *, blend: float, speed
 def cost(spot: Spot) -> None:
     """Prints what a local model and a step of the loop take."""
     print("what it takes                          median      p99   touches")
-    contact = Contact("ball", spot.mesh, spot.pose(spot.centre(-2e-3)))
+    contact = Contact(spot.tool, spot.pose(spot.centre(-2e-3)))
     for name, turns in (("local model", True), ("local model without rotations", False)):
-        model = local_contact(spot.toucher, contact, spot.field, rotations=turns)
-        median, p99 = _timed(lambda t=turns: local_contact(spot.toucher, contact, spot.field, rotations=t), 60)
+        model = local_contact(spot.toucher, contact, rotations=turns)
+        median, p99 = _timed(lambda t=turns: local_contact(spot.toucher, contact, rotations=t), 60)
         print(f"{name:35} {1e3 * median:7.2f}  {1e3 * p99:7.2f} ms {model.trust.figures['evaluations']:6.0f}")
         print(f"    holds within {1e3 * model.valid_m:.2f} mm and {np.degrees(model.valid_rad):.1f} degrees")
     loop, still = DeviceLoop(), np.zeros(3)

@@ -22,11 +22,11 @@ from benchmarks.tools import ball, block_letter, fingertip, flat
 from fem_tools.indenter import Indentation, IndenterFem
 from fem_tools.patch import QUADRATIC_ABOVE, EdgeLength, Patch, PatchFem
 from fem_tools.press import Press
-from stmpl_core.contact import ToolMesh
 from stmpl_core.layer import SoftLayer, Tissue
 from stmpl_core.methods.base import prepared
 from stmpl_core.methods.winkler import column_pressure
 from stmpl_core.sdf import SignedDistance
+from stmpl_core.tool import Tool
 from tests.scenes import limb, plate
 
 PICTURE = Path(__file__).parents[1] / "docs" / "pictures" / "indenters.png"
@@ -51,7 +51,7 @@ class Scene:
     """
 
     name: str
-    mesh: Callable[[], ToolMesh]
+    mesh: Callable[[], Tool]
     thickness: float = 7.5e-3
     nu: float = 0.4
     rounding: float = 0.0

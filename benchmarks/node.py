@@ -30,10 +30,9 @@ from rclpy.signals import SignalHandlerOptions
 from stmpl_msgs.msg import ContactMesh, LocalContact, SkinDisplacement, SkinTopology
 from stmpl_msgs.srv import SetBody
 
-from bags.messages import layer_from, stamp_ns
+from bags.wire import layer_from, pose_message, stamp_ns, tool_message, wrench_message
 from fem_tools.provenance import machine
 from stmpl_core.layer import SoftLayer
-from stmpl_ros.conversions import mesh_message, pose_message, wrench_message
 from stmpl_ros.scripts import PRESS, Motion
 from stmpl_ros.spinning import spin
 from stmpl_ros.topics import KEPT, STREAM
@@ -257,7 +256,7 @@ def main() -> None:
         topology = robot.topologies[0]
         layer, frame = layer_from(topology), topology.header.frame_id
         print(f"{layer}", flush=True)
-        robot.mesh.publish(mesh_message("probe", Motion(PRESS.devices[0], layer).mesh, 0))
+        robot.mesh.publish(tool_message(Motion(PRESS.devices[0], layer).tool, 0))
         wait(lambda: robot.pose.get_subscription_count() and robot.wrench.get_subscription_count(), "the node")
         robot.play(layer, frame, 100.0, 2.0)
         figures: dict = {"machine": machine(), "layer": str(layer)}

@@ -164,8 +164,8 @@ def solve_nodals(bench: Bench, scene: Scene, wanted: np.ndarray) -> Iterator[tup
 def solve_indentations(bench: Bench, scene: Scene, wanted: np.ndarray) -> Iterator[tuple[Record, Trust]]:
     """The tool pressed in along its axis to these depths over thickness, sticking."""
     layer, pose = bench.site.layer, scene.pose_body_from_tool
-    assert scene.mesh is not None
-    tool = Press(SignedDistance.of(scene.mesh, rounding=scene.rounding), pose, -pose[:3, 2])
+    assert scene.tool is not None
+    tool = Press(SignedDistance.of(scene.tool, rounding=scene.rounding), pose, -pose[:3, 2])
     answers = bench.indenter.path([tool], (wanted * bench.site.thickness_under(pose)).tolist())
     for ratio, answer in zip(wanted, answers, strict=False):
         figures = dict(answer.trust.figures) | {"ratio": float(ratio)}

@@ -14,9 +14,9 @@ from scipy.spatial import KDTree
 
 from stmpl_core.arrays import Points, Transform
 from stmpl_core.body import Body
-from stmpl_core.contact import ToolMesh
 from stmpl_core.errors import InvalidInput
 from stmpl_core.layer import SoftLayer
+from stmpl_core.tool import Tool
 
 FINGERS = range(1, 6)  # the thumb first
 STEP = np.radians(6.0)  # by which a closing joint turns
@@ -85,7 +85,7 @@ class Hand:
 
     def grip(
         self, layer: SoftLayer, pose_body_from_hand: Transform, depth: float, loose: Sequence[float]
-    ) -> tuple[ToolMesh, Transform]:
+    ) -> tuple[Tool, Transform]:
         """The hand and its pose, once the palm has settled on the skin and the fingers have closed, joint after joint.
 
         Args:
@@ -112,7 +112,7 @@ class Hand:
                 watched = np.concatenate(self.beyond[j : 3 * finger + 3])
                 while angles[j] + STEP <= furthest[bone] and entered(watched) < depth:
                     angles[j] += STEP
-        return ToolMesh.of(self.closed_by(angles), self.faces), pose
+        return Tool("hand", self.closed_by(angles), self.faces), pose
 
 
 def _between(vertices: Points, weights: np.ndarray, bone: int, parent: int) -> np.ndarray:

@@ -18,8 +18,8 @@ from scipy.spatial.transform import Rotation
 from fem_tools.hand import Hand
 from fem_tools.scenes import EDGE, Scene, Site, UnusableContact, ellipse, extruded, letter
 from stmpl_core.body import Body
-from stmpl_core.contact import ToolMesh
 from stmpl_core.layer import SoftLayer, Tissue
+from stmpl_core.tool import Tool
 
 Kind = Literal["pressure", "nodal", "indenter"]
 SetName = Literal["disc", "ellipse", "seam", "field", "indenter", "tool", "hand", "band", "letter"]
@@ -299,8 +299,8 @@ def _draw_tool(
               "tilt": rng.uniform(-TILT, TILT, 2).round(4).tolist(),
               "slant": rng.uniform(-TILT, TILT, 2).round(4).tolist()}  # fmt: skip
     scene = tool_scene(site, drawn)
-    assert scene.mesh is not None
-    radius = float(np.linalg.norm(scene.mesh.vertices, axis=1).max())
+    assert scene.tool is not None
+    radius = float(np.linalg.norm(scene.tool.vertices, axis=1).max())
     if (gap := float(site.border_distance[vertex])) < 5 * site.layer.thickness[vertex] + min(radius, 2 * SIZES[1]):
         raise UnusableContact(f"it stands {gap * 1e3:.0f} mm from the open border")
     return scene, drawn
@@ -317,7 +317,7 @@ def tool_scene(site: Site, drawn: Mapping[str, Any]) -> Scene:
     return Scene(mesh, pose, np.zeros(len(site.layer.vertices)), rounding)
 
 
-def any_tool(drawn: Mapping[str, Any]) -> tuple[ToolMesh, float]:
+def any_tool(drawn: Mapping[str, Any]) -> tuple[Tool, float]:
     """The tool of the set "tool" that these figures describe, z up and tilted, about its middle; and its rounding [m].
 
     Args:
@@ -349,7 +349,7 @@ def any_tool(drawn: Mapping[str, Any]) -> tuple[ToolMesh, float]:
         made = extruded(letter(string.ascii_uppercase[int(25.99 * shape[1])], 2e-3 * max(r, 10.0)), -10e-3, 10e-3)
         mesh, rounding = trimesh.Trimesh(1e3 * made.vertices, made.faces, process=False), min(1e-3 * fillet, 2.5e-3)
     tilt = Rotation.from_euler("xy", drawn["tilt"]).as_matrix()
-    return ToolMesh.of(1e-3 * np.asarray(mesh.vertices) @ tilt.T, np.asarray(mesh.faces)), rounding
+    return Tool(name, 1e-3 * np.asarray(mesh.vertices) @ tilt.T, np.asarray(mesh.faces)), rounding
 
 
 def _circle(radius: float) -> np.ndarray:
@@ -367,7 +367,7 @@ def _hull(outline: np.ndarray, fillet: float, height: float) -> trimesh.Trimesh:
     return trimesh.convex.convex_hull((centres[:, None] + ball).reshape(-1, 3))
 
 
-def rounded_tool(name: str, radius: float) -> ToolMesh:
+def rounded_tool(name: str, radius: float) -> Tool:
     """A sphere, a capsule lying down, or an upright cylinder with a filleted rim, of a radius [m], about its middle."""
     r = 1e3 * radius  # trimesh drops triangles that are small in metres
     if name == "sphere":
@@ -380,4 +380,4 @@ def rounded_tool(name: str, radius: float) -> ToolMesh:
         fillet, bend = 0.3 * r, np.linspace(0, np.pi / 2, 9)
         rim = np.column_stack([r - fillet + fillet * np.sin(bend), -r + fillet - fillet * np.cos(bend)])
         mesh = trimesh.creation.revolve(np.vstack([[0, -r], rim, [r, r], [0, r]]), sections=64)
-    return ToolMesh.of(1e-3 * np.asarray(mesh.vertices), np.asarray(mesh.faces))
+    return Tool(name, 1e-3 * np.asarray(mesh.vertices), np.asarray(mesh.faces))

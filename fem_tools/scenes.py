@@ -16,9 +16,9 @@ from matplotlib.textpath import TextPath
 
 from fem_tools.hand import Hand
 from stmpl_core.arrays import PerVertex, Points, Transform
-from stmpl_core.contact import ToolMesh
 from stmpl_core.errors import InvalidInput, StmplError
 from stmpl_core.layer import SoftLayer
+from stmpl_core.tool import Tool
 
 EDGE = 4e-3  # m over which a footprint's weight falls from 1 to 0 across the tool's outline
 FACING = 0.2  # cosine between a tool's axis and the skin's normal from which skin counts as facing it
@@ -41,13 +41,13 @@ class Scene:
     """A tool on the skin.
 
     Args:
-        mesh: of the tool, in its own frame; None where a pressure was drawn without one.
+        tool: tool in its own frame; None where a pressure was drawn without one.
         pose_body_from_tool: (4, 4).
         footprint: how much of the tool's pressure each vertex gets, (V,), 0 to 1.
         rounding: of the tool's edges where it is pressed in as a rigid one [m].
     """
 
-    mesh: ToolMesh | None
+    tool: Tool | None
     pose_body_from_tool: Transform
     footprint: PerVertex
     rounding: float = 0.0
@@ -95,7 +95,7 @@ class Site:
         axis = np.linalg.eigh(n.T @ n)[1][:, 0]
         return axis * np.sign(axis[np.abs(axis).argmax()])
 
-    def scene(self, mesh: ToolMesh, pose: Transform, near: np.ndarray, inside: float, ramp: float) -> Scene:
+    def scene(self, mesh: Tool, pose: Transform, near: np.ndarray, inside: float, ramp: float) -> Scene:
         """The scene whose weight rises over `ramp` [m] of signed distance, and is one half where that is -`inside`.
 
         Raises:
@@ -195,7 +195,7 @@ class Site:
         mesh, pose = hand.grip(layer, pose, depth, loose.tolist())
         return self.scene(mesh, pose, self.within(mesh, pose), EDGE / 4, EDGE / 2)
 
-    def within(self, mesh: ToolMesh, pose: Transform, margin: float = 0.03) -> np.ndarray:
+    def within(self, mesh: Tool, pose: Transform, margin: float = 0.03) -> np.ndarray:
         """Numbers of the vertices in the tool's box, `margin` [m] larger."""
         local = (self.layer.vertices - pose[:3, 3]) @ pose[:3, :3]
         low, high = mesh.vertices.min(axis=0) - margin, mesh.vertices.max(axis=0) + margin
@@ -219,7 +219,7 @@ def smoothstep(x: np.ndarray) -> np.ndarray:
     return x * x * (3 - 2 * x)
 
 
-def signed_distance(mesh: ToolMesh, pose: Transform, points: Points) -> np.ndarray:
+def signed_distance(mesh: Tool, pose: Transform, points: Points) -> np.ndarray:
     """Exact distance of points of the layer's frame to a tool, negative inside, (N,) [m]."""
     if not len(points):
         return np.empty(0)
@@ -252,9 +252,9 @@ def letter(character: str, height: float) -> Outline:
     return shapely.affinity.scale(outline, height / (y1 - y0), height / (y1 - y0), origin=(0, 0))
 
 
-def extruded(outline: Any, low: float, high: float) -> ToolMesh:
+def extruded(outline: Any, low: float, high: float) -> Tool:
     """The prism over `outline` from z = low to z = high [m]. In millimetres on the way: trimesh drops small faces."""
     parts = [p for p in shapely.get_parts(outline) if isinstance(p, shapely.Polygon)]
     scaled = [shapely.affinity.scale(p, 1e3, 1e3, origin=(0, 0)) for p in parts]
     prism: Any = trimesh.util.concatenate([trimesh.creation.extrude_polygon(p, 1e3 * (high - low)) for p in scaled])
-    return ToolMesh.of(1e-3 * np.asarray(prism.vertices) + [0, 0, low], np.asarray(prism.faces))
+    return Tool("stamp", 1e-3 * np.asarray(prism.vertices) + [0, 0, low], np.asarray(prism.faces))

@@ -237,9 +237,9 @@ def _ball(element: Any, edge: float) -> CriticalLoad:
 
 
 def _tool_mesh(mesh: Any) -> Any:
-    from stmpl_core.contact import ToolMesh
+    from stmpl_core.tool import Tool
 
-    return ToolMesh.of(mesh.vertices, mesh.faces)
+    return Tool("ball", mesh.vertices, mesh.faces)
 
 
 def draw(rows: Sequence[CriticalLoad], path: str | Path, *, poisson_ratio: float = 0.4) -> Path:

@@ -85,9 +85,9 @@ def pressed(subset: Subset) -> Iterator[Pressed]:
         assert columns is not None and site is not None
         if last is None or last[0] != (sample.info["body"], sample.info["number"]):
             scene = tool_scene(site, sample.info["drawn"])
-            assert scene.mesh is not None
+            assert scene.tool is not None
             way = -scene.pose_body_from_tool[:3, 2]
-            field = SignedDistance.of(scene.mesh, rounding=scene.rounding)
+            field = SignedDistance.of(scene.tool, rounding=scene.rounding)
             tool = Press(field, scene.pose_body_from_tool, way).touching(sample.layer)
             assert tool is not None
             last = (sample.info["body"], sample.info["number"]), tool, site.thickness_under(scene.pose_body_from_tool)
@@ -122,11 +122,11 @@ class Rows:
 
 def draw_rows(subset: Subset, on_progress: OnProgress) -> Rows:
     """What the network sees of every contact of a subset."""
-    near, parts, starts = None, [], [0]
+    near, parts, starts, last = None, [], [0], None
     for k, one in enumerate(pressed(subset)):
         layer, squeeze = one.sample.layer, one.squeeze
-        if near is None or near.layer is not layer:
-            near = Surroundings(layer)
+        if near is None or last is not layer:
+            near, last = Surroundings(layer), layer
         if not len(squeeze.vertices) or not one.true.any():
             continue
         v, n = squeeze.vertices, len(squeeze.vertices)
@@ -274,11 +274,11 @@ class Scores:
 
 def score(subset: Subset, weights: Weights) -> Scores:
     """Scores of a network on the contacts of a subset."""
-    net, rows = None, []
+    net, rows, last = None, [], None
     for one in pressed(subset):
         layer, squeeze = one.sample.layer, one.squeeze
-        if net is None or net.layer is not layer:
-            net = ContactNet(layer, weights)
+        if net is None or last is not layer:
+            net, last = ContactNet(layer, Surroundings.of(layer), weights), layer
         held = net.hold(squeeze.vertices, squeeze.pressure, squeeze.strain)
         area, true = layer.vertex_areas, one.sample.load.values / layer.tissue.youngs_modulus
         ours = np.zeros_like(true)

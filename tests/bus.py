@@ -12,10 +12,10 @@ from typing import Any
 
 import numpy as np
 import rclpy
+from bags.messages import stamp_ns
 from rcl_interfaces.msg import Log
 from stmpl_msgs.msg import SkinDisplacement, SkinTopology
 
-from bags.messages import stamp_ns
 from stmpl_ros.topics import KEPT, STREAM
 
 ROOT = Path(__file__).parents[1]

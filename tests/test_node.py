@@ -11,6 +11,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import rclpy
+from bags.messages import layer_from, layer_id, stamp_ns
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import Point, PoseStamped, Vector3, WrenchStamped
@@ -30,8 +31,11 @@ from shape_msgs.msg import Mesh, MeshTriangle
 from std_srvs.srv import Trigger
 from stmpl_msgs.msg import ContactMesh, LocalContact, SkinDisplacement, SkinTopology
 from stmpl_msgs.srv import Calibrate, SetBody
+from stmpl_ros.adapters import GazeboContacts, gazebo_wrench
+from stmpl_ros.cloud import FIELDS, SkinCloud
+from stmpl_ros.conversions import STALE, checked_pose, mesh_message, pose_message, wrench_message
+from stmpl_ros.skin import Skin, published
 
-from bags.messages import layer_from, layer_id, stamp_ns
 from bags.reader import Bag
 from bags.replay import replay_run
 from stmpl_core.contact import Contact
@@ -40,15 +44,11 @@ from stmpl_core.methods import MomentNet
 from stmpl_core.sdf import SignedDistance
 from stmpl_core.touch import BY_POSE, MOVED, TOUCHING, Toucher
 from stmpl_core.trust import Displacement, Trust
-from stmpl_ros.adapters import GazeboContacts, gazebo_wrench
-from stmpl_ros.cloud import FIELDS, SkinCloud
-from stmpl_ros.conversions import STALE, checked_pose, mesh_message, pose_message, wrench_message
 from stmpl_ros.frames import Frames, read_frames
 from stmpl_ros.limits import Limits
 from stmpl_ros.node import SkinNode
 from stmpl_ros.parameters import NodeConfig
 from stmpl_ros.settings import checked
-from stmpl_ros.skin import Skin, published
 from stmpl_ros.topics import KEPT, LEASE, STREAM
 from tests.bus import PATIENCE, ROOT, Robot, end, rows, running, start
 from tests.conftest import BUSES

@@ -5,12 +5,13 @@ import signal
 import numpy as np
 import pytest
 import rclpy
+from bags.messages import layer_from, layer_id, stamp_ns, tool_mesh_from
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseStamped, WrenchStamped
 from stmpl_msgs.msg import ContactMesh, LocalContact, SkinDeformed, SkinDisplacement, SkinTopology
+from stmpl_ros.conversions import STALE, local_contact_from, mesh_message, pose_message, wrench_message
 from visualization_msgs.msg import Marker
 
-from bags.messages import layer_from, layer_id, stamp_ns, tool_mesh_from
 from bags.reader import Bag
 from bags.replay import replay_run
 from stmpl_core import Contact, ToolMesh
@@ -18,7 +19,6 @@ from stmpl_core.haptics import DeviceLoop, local_contact
 from stmpl_core.methods import MomentNet
 from stmpl_core.sdf import MARGIN, SignedDistance
 from stmpl_core.touch import BY_POSE, IN_CORE, NO_FORCE, NO_TOUCH, PULLING, TOUCHING, Toucher
-from stmpl_ros.conversions import STALE, local_contact_from, mesh_message, pose_message, wrench_message
 from stmpl_ros.topics import KEPT, STREAM
 from tests.bus import Robot, end, rows, start
 from tests.touch_scenes import LENGTH, RADIUS, at, ball
