@@ -132,7 +132,7 @@ def _without_useless(faces: Faces, place: np.ndarray, said: list[str]) -> Faces:
     a, b, c = place[faces].T
     sound = (a != b) & (b != c) & (c != a)
     if not sound.any():
-        raise MeshError(f"none of the tool's {_many(len(faces), 'face')} has an area: there is no surface to touch with.")
+        raise MeshError(f"none of the tool's {_many(len(faces), 'face')} has an area: there is nothing to touch with.")
     if not sound.all():
         said.append(f"{_many(int((~sound).sum()), 'face')} without area {{were}} dropped")
         faces = faces[sound]

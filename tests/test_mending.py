@@ -114,7 +114,7 @@ def test_what_cannot_be_mended_is_refused_in_a_sentence() -> None:
                        np.column_stack([b + turn, (b + 40 + turn) % 80, a + 40])])  # fmt: skip
     with pytest.raises(MeshError, match="one side only"):
         mended(np.vstack(rim), strip)
-    with pytest.raises(MeshError, match="no surface"):
+    with pytest.raises(MeshError, match="nothing to touch"):
         mended(np.eye(3), [[0, 0, 1], [1, 2, 2]])
     with pytest.raises(MeshError, match=r"name vertices 0\.\.9"):
         mended(np.eye(3), [[0, 1, 9]])
