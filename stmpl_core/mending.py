@@ -93,8 +93,7 @@ def mended(vertices: ArrayLike, faces: ArrayLike) -> Mended:
       stays within 0.1 of the spacing of that of the full surface (ball 0.03, box 0.08, torus 0.08, capsule 0.03; a
       plate and a needle much thinner than the cells 0.13 and 0.22).
 
-    What needs no mending is returned bit for bit. Takes 2 ms for 5,000 triangles and 1 s
-    for 1.3 million.
+    What needs no mending is returned bit for bit. Takes 2 ms for 5,000 triangles and 1 s for 1.3 million.
 
     Args:
         vertices: positions (V, 3) [m] in the tool's frame.
@@ -133,7 +132,7 @@ def _without_useless(faces: Faces, place: np.ndarray, said: list[str]) -> Faces:
     a, b, c = place[faces].T
     sound = (a != b) & (b != c) & (c != a)
     if not sound.any():
-        raise MeshError(f"all {len(faces):,} faces of the tool use a place twice: there is no surface to touch with.")
+        raise MeshError(f"none of the tool's {_many(len(faces), 'face')} has an area: there is nothing to touch with.")
     if not sound.all():
         said.append(f"{_many(int((~sound).sum()), 'face')} without area {{were}} dropped")
         faces = faces[sound]
