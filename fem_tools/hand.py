@@ -9,7 +9,6 @@ from functools import cached_property
 from itertools import pairwise
 
 import numpy as np
-import trimesh
 from scipy.spatial import KDTree
 
 from stmpl_core.arrays import Points, Transform
@@ -70,10 +69,12 @@ class Hand:
 
     def closed_by(self, angles: Sequence[float] | np.ndarray) -> Points:
         """The vertices with the fifteen joints turned by `angles` [rad], by linear blend skinning, (V, 3) [m]."""
+        from trimesh.transformations import rotation_matrix
+
         transforms = np.tile(np.eye(4), (16, 1, 1))
         for j in range(15):
             before = transforms[0] if j % 3 == 0 else transforms[j]
-            turn = trimesh.transformations.rotation_matrix(angles[j], self.axes[j], self.joints[j])
+            turn = rotation_matrix(angles[j], self.axes[j], self.joints[j])
             transforms[j + 1] = before @ turn
         moved = np.einsum("bij,vj->vbi", transforms[:, :3, :3], self.vertices) + transforms[:, :3, 3]
         return np.einsum("vb,vbi->vi", self.weights, moved)

@@ -15,7 +15,6 @@ from torch import Tensor
 
 from fem_tools.dataset import Dataset, Sample, Subset
 from fem_tools.press import Press
-from fem_tools.provenance import commit, data_card, machine, versions
 from fem_tools.sampling import tool_scene
 from fem_tools.scenes import Site
 from stmpl_core.arrays import Transform
@@ -25,7 +24,7 @@ from stmpl_core.errors import InvalidInput
 from stmpl_core.moments import Surroundings
 from stmpl_core.networks import POINT, PRESSURE, Weights
 from stmpl_core.sdf import SignedDistance
-from studies.train_moments import VERSIONS, Model, OnProgress
+from studies.train_moments import Model, OnProgress, training_card
 
 COVERED = 0.95  # share of validation contacts whose force the stated bound must reach
 MARGIN = 1.3  # on that bound, for tools and limbs unlike the validation data
@@ -210,20 +209,9 @@ def train_contact(
         raise InvalidInput(f"{data} holds no rigid tools. Make them with stmpl generate --preset contacts.")
     rows = draw_rows(subset, said)
     model = fit(rows, settings, said)
-    card: dict[str, Any] = {
-        "format": 1,
-        "data": data_card(data, source.manifest),
-        "settings": settings.model_dump(mode="json"),
-        "parameters": sum(p.numel() for p in model.parameters()),
-        "contacts": len(rows.starts) - 1,
-        "rows": len(rows.rows),
-        "ranges": _ranges(source, subset),
-        "bound": {"factor": 1.0},
-        "commit": commit(),
-        "versions": versions(VERSIONS),
-        "machine": f"{machine()}; {torch.get_num_threads()} threads",
-        "minutes": round((time.monotonic() - started) / 60, 1),
-    }
+    counts = {"contacts": len(rows.starts) - 1, "rows": len(rows.rows)}
+    card = training_card(data, source, settings, model, _ranges(source, subset), **counts)
+    card["minutes"] = round((time.monotonic() - started) / 60, 1)
     weights = model.weights(card)
     card["bound"] = calibrate(source.split("val", kind="indenter", sets=("tool",)), weights)
     weights.save(out / "contact_net.safetensors")

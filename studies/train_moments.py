@@ -292,24 +292,39 @@ def train_moments(
     started = time.monotonic()
     points = draw_points(source, settings, said)
     model = fit(points, settings, out, said)
-    card: dict[str, Any] = {
-        "format": 1,
-        "data": data_card(data, source.manifest),
-        "settings": settings.model_dump(mode="json"),
-        "parameters": sum(p.numel() for p in model.parameters()),
-        "points": len(points.rows),
-        "ranges": _ranges(source, settings),
-        "bound": {"factor": 1.0},
-        "commit": commit(),
-        "versions": versions(VERSIONS),
-        "machine": f"{machine()}; {torch.get_num_threads()} threads",
-        "minutes": round((time.monotonic() - started) / 60, 1),
-    }
+    card = training_card(data, source, settings, model, _ranges(source, settings), points=len(points.rows))
+    card["minutes"] = round((time.monotonic() - started) / 60, 1)
     weights = model.weights(card)
     card["bound"] = calibrate(source, weights, settings.kinds, said)
     weights.save(out / f"{name}.safetensors")
     (out / "moment_net.checkpoint").unlink(missing_ok=True)
     return card
+
+
+def training_card(data: str | Path, source: Dataset, settings: BaseModel, model: Model, ranges: dict[str, list[float]],
+                  **counts: int) -> dict[str, Any]:  # fmt: skip
+    """What made a network: the card beside its weights, but for its bound and the minutes that it took.
+
+    Args:
+        data: folder of the data set.
+        source: data set.
+        settings: settings of the training.
+        model: trained network.
+        ranges: smallest and largest of what was trained on, by name.
+        counts: numbers of what was trained on, by name.
+    """
+    return {
+        "format": 1,
+        "data": data_card(data, source.manifest),
+        "settings": settings.model_dump(mode="json"),
+        "parameters": sum(p.numel() for p in model.parameters()),
+        **counts,
+        "ranges": ranges,
+        "bound": {"factor": 1.0},
+        "commit": commit(),
+        "versions": versions(VERSIONS),
+        "machine": f"{machine()}; {torch.get_num_threads()} threads",
+    }
 
 
 def _ranges(data: Dataset, settings: MomentTraining) -> dict[str, list[float]]:
