@@ -48,7 +48,7 @@ class Part:
     """What one contact adds to a data set.
 
     Args:
-        about: what names and describes the contact: set, number, split, what was drawn.
+        about: name and description of the contact: set, number, split, what was drawn.
         records: samples that are kept.
         drops: samples that are not.
         seconds: processor time by kind of load [s].

@@ -45,11 +45,11 @@ def generate(
     """Makes the data set of `plan` in the folder `out`, or goes on where an earlier run of it was stopped.
 
     Args:
-        plan: what is generated.
+        plan: plan of what is generated.
         out: folder; each contact that is done is one file in it until all are packed.
         workers: local processes, each on one thread; None: one a core.
         scheduler: address of a Dask scheduler whose workers do the work instead (one thread each, please).
-        on_progress: called after each contact.
+        on_progress: function that is called after each contact.
 
     Returns:
         The manifest.

@@ -121,7 +121,7 @@ class WedgeMesh:
         columns: columns of each triangle, (T, n).
         edges: the edges whose middles carry the columns N, N + 1, ... (quadratic only), (E, 2).
         n_columns: all columns.
-        gradients: of the shape functions at rest, (T L, Q, 3 n, 3) [1/m].
+        gradients: gradients of the shape functions at rest, (T L, Q, 3 n, 3) [1/m].
         volumes: quadrature weight times det, (T L, Q) [m3].
         indptr, indices: block rows of the tangent, one block a pair of columns that share a triangle.
         blocks: number of the block of each pair of columns of a triangle, (T, n, n).
@@ -225,8 +225,8 @@ def split(triangles: np.ndarray, n_vertices: int, marked: np.ndarray) -> tuple[n
     """Splits the marked triangles in four, their neighbours as conformity asks (red-green; Bank et al. 1983).
 
     Args:
-        triangles: (T, 3).
-        n_vertices: how many vertices they name; the new ones are numbered from here.
+        triangles: corners of the triangles, (T, 3).
+        n_vertices: number of vertices before; the new ones are numbered from here.
         marked: mask of the triangles to split, (T,).
 
     Returns:

@@ -51,9 +51,9 @@ class RigidFem:
         """The motion under these contacts.
 
         Args:
-            contacts: that press on the skin, at their stated poses.
-            pressure: that the answer has, (V,) [Pa]: says from where a tool without a wrench comes.
-            figures: of the answer's trust: NAME.moved_m is how far the answer moved a tool along its force.
+            contacts: contacts that press on the skin, at their stated poses.
+            pressure: pressure of the answer, (V,) [Pa]: it says from where a tool without a wrench comes.
+            figures: figures of the answer's trust: NAME.moved_m is how far the answer moved a tool along its force.
 
         Raises:
             InvalidInput: a tool that FEM cannot press.

@@ -98,9 +98,9 @@ class Plan(BaseModel):
     """Everything that decides what is generated: the same plan gives the same data.
 
     Args:
-        discs, ellipses, seams, fields, indenters, tools: contacts a body.
-        hands, bands, letters: contacts in all, shared among the bodies.
-        loads, loads_out_of_distribution: of each contact.
+        discs, ellipses, seams, fields, indenters, tools: numbers of contacts a body, by set.
+        hands, bands, letters: numbers of contacts in all, by set, shared among the bodies.
+        loads, loads_out_of_distribution: numbers of loads of each contact.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")

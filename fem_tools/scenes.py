@@ -38,10 +38,10 @@ class Scene:
     """A tool on the skin.
 
     Args:
-        mesh: of the tool, in its own frame; None where a pressure was drawn without one.
-        pose_body_from_tool: (4, 4).
-        footprint: how much of the tool's pressure each vertex gets, (V,), 0 to 1.
-        rounding: of the tool's edges where it is pressed in as a rigid one [m].
+        mesh: shape of the tool, in its own frame; None where a pressure was drawn without one.
+        pose_body_from_tool: pose of the tool, (4, 4).
+        footprint: share of the tool's pressure that each vertex gets, (V,), 0 to 1.
+        rounding: radius of the tool's edges where it is pressed in as a rigid one [m].
     """
 
     mesh: ToolMesh | None
@@ -177,11 +177,11 @@ class Site:
         """A hand laid across the limb with its palm on `vertex`, its fingers closed until they are `depth` inside [m].
 
         Args:
-            vertex: under the palm.
-            hand: that grasps.
-            turn: of the fingers away from across the limb [rad].
-            depth: that palm and fingers sink below the skin at rest [m].
-            loose: see Hand.grip.
+            vertex: number of the vertex under the palm.
+            hand: hand that grasps.
+            turn: angle of the fingers away from across the limb [rad].
+            depth: depth of palm and fingers below the skin at rest [m].
+            loose: share of its way that each finger stays short of closing, (5,) [-].
 
         Raises:
             UnusableContact: as `scene`.

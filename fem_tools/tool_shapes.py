@@ -20,7 +20,8 @@ def any_tool(drawn: Mapping[str, Any]) -> tuple[ToolMesh, float]:
     """The tool of the set "tool" that these figures describe, z up and tilted, about its middle; and its rounding [m].
 
     Args:
-        drawn: tool, one of TOOLS; size, half its width [m]; shape, eight numbers in [0, 1]; tilt about x and y [rad].
+        drawn: figures by name: tool, one of TOOLS; size, half its width [m]; shape, eight numbers in [0, 1]; tilt
+            about x, y [rad].
     """
     r, shape = 1e3 * float(drawn["size"]), np.asarray(drawn["shape"])  # mm: trimesh drops small triangles
     fillet = 1e3 * (FILLETS[0] + (FILLETS[1] - FILLETS[0]) * float(shape[0]))

@@ -37,9 +37,10 @@ class ContactTraining(BaseModel):
 
     Args:
         hidden: width of each of the three hidden layers.
-        steps, batch, learning_rate: of AdamW, the batch in contacts; the rate rises to this and falls in one cycle.
-        weight_decay: likewise.
-        seed: of weights and order.
+        steps, batch, learning_rate: numbers of AdamW, the batch in contacts; the rate rises to this and falls in one
+            cycle.
+        weight_decay: weight decay of AdamW.
+        seed: seed of weights and order.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -57,10 +58,10 @@ class Pressed:
     """One converged contact: where the tool is, how it squeezes, and the true pressure.
 
     Args:
-        sample: of the data set.
+        sample: sample of the data set.
         field: the tool's.
-        pose: of the tool, (4, 4).
-        squeeze: see Columns.
+        pose: pose of the tool, (4, 4).
+        squeeze: squeeze of the columns under it, see stmpl_core.columns.Squeeze.
         true: pressure over E at the squeezed vertices, (N,) [-].
         missed: share of the true force that acts on vertices that are not squeezed [-].
     """
@@ -108,7 +109,7 @@ class Rows:
     Args:
         rows: inputs of Model, laid out as stmpl_core.networks.POINT, (N, POINT.size) float32.
         prior, true: pressure over E, (N,) float32.
-        area: of the vertex, over the sum of its contact's, (N,) float32.
+        area: area of the vertex over the sum of its contact's, (N,) float32 [-].
         starts: first row of each contact, and the end, (C + 1,).
     """
 
@@ -246,7 +247,7 @@ class Scores:
         force: signed error of the force over the true one.
         doubt: error of the force that the network expects without calibration, over the true force.
         winkler: signed error of the force of columns alone.
-        depth: over the thickness.
+        depth: depth over the thickness.
         mean: true mean pressure over E, weighted by itself.
         tool: its kind.
     """

@@ -35,11 +35,11 @@ class MomentTraining(BaseModel):
 
     Args:
         hidden: width of each of the three hidden layers.
-        kinds: of load; rigid tools that stick also pull along the skin, so they have a network of their own.
+        kinds: kinds of load; rigid tools that stick also pull along the skin, so they have a network of their own.
         points: vertices drawn of each sample, most from where it moves.
-        steps, batch, learning_rate: of Adam, the rate rising to this and falling in one cycle.
-        seed: of weights, points and order.
-        checkpoint_minutes: between two checkpoints.
+        steps, batch, learning_rate: numbers of Adam, the rate rising to this and falling in one cycle.
+        seed: seed of weights, points and order.
+        checkpoint_minutes: time between two checkpoints [min].
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -59,7 +59,7 @@ class Points:
     """Vertices of samples: what each feels, and how it moves.
 
     Args:
-        rows: what is known of each, laid out as POINT, (N, POINT.size) float32.
+        rows: figures of each vertex, laid out as POINT, (N, POINT.size) float32.
         motion: displacement over the local thickness in the vertex's frame, (N, 3) float32 [-].
         weight: local thickness over the sample's largest displacement, (N,) float32.
     """
@@ -276,9 +276,9 @@ def train_moments(
     Args:
         data: folder of a finished data set (stmpl generate).
         out: folder; what it holds of the same run is used again.
-        settings: what is learnt and how; None: the defaults.
-        name: of the files.
-        on_progress: called often.
+        settings: settings of the training; None: the defaults.
+        name: name of the files.
+        on_progress: function that is called often.
 
     Returns:
         The card.

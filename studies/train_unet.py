@@ -39,17 +39,17 @@ class UNetTraining(BaseModel):
     """What decides what is learnt. The defaults are the paper's; how long it trained and its seed are not known.
 
     Args:
-        size, width, dropout: of Pix2PixUNet.
+        size, width, dropout: numbers of Pix2PixUNet.
         batch: samples a step, over all processes.
-        learning_rate: of Adam.
+        learning_rate: learning rate of Adam.
         total_variation: weight of the mean absolute difference of neighbouring texels [mm], beside the mean square.
-        epochs: how often every sample is seen.
-        seed: of weights, order and dropout.
+        epochs: number of times that every sample is seen.
+        seed: seed of weights, order and dropout.
         bodies: all, or the three of the paper's second set-up.
-        kind: of load: the paper's rule, unless another is named.
-        highest_force: at a vertex, drawn as 1 [N]. The paper's 20 N suit its 17 mm mesh and loads that tissue of 1 kPa
-            does not carry.
-        checkpoint_minutes: between two checkpoints.
+        kind: kind of load: the paper's rule, unless another is named.
+        highest_force: force at a vertex that is drawn as 1 [N]. The paper's 20 N suit its 17 mm mesh and loads that
+            tissue of 1 kPa does not carry.
+        checkpoint_minutes: time between two checkpoints [min].
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -96,10 +96,10 @@ def train_unet(
     Under torchrun each batch is shared among the processes, which learn what one process would (dropout aside).
 
     Args:
-        data: a finished data set, see `stmpl generate`.
+        data: folder of a finished data set, see `stmpl generate`.
         out: folder.
-        settings: what is learnt.
-        on_progress: called after each sample that is read and after each step, in the first process.
+        settings: settings of the training.
+        on_progress: function that is called after each sample that is read and each step, in the first process.
 
     Returns:
         The card, as a dictionary.
