@@ -92,7 +92,7 @@ class Row:
         peak: signed error of the largest displacement.
         entered: depth of the deepest vertex of the whole skin inside a tool, over the thickness.
         by_wrench: error of the depth found from the force, the pose being off, over the thickness; signed.
-        within: whether the force is within the error that the answer states.
+        within: truth of the claim that the force is within the error that the answer states.
     """
 
     name: str

@@ -181,7 +181,7 @@ def play(device: Device, hand: Hand, settings: LoopSettings, spot: Spot, *, node
     Args:
         node_rate: rate of local models [Hz], each for the proxy's pose of its instant.
         node_delay: time from that instant to the model's arrival [s].
-        held_force: whether the model comes without its stiffness: what a loop without a local model would render.
+        held_force: models that come without their stiffness: what a loop without a local model would render.
     """
     loop, dt = DeviceLoop(settings), 1 / device.rate
     rng, count = np.random.default_rng(0), round(hand.duration * device.rate)

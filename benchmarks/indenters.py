@@ -47,7 +47,7 @@ class Scene:
         rounding: radius of the tool's edges [m].
         edge: edge length of the layer's triangles before refinement [m].
         rim: width of the plate beyond the tool [thicknesses].
-        limb: whether a cylinder of 40 mm radius stands in place of the plate.
+        limb: cylinder of 40 mm radius in place of the plate.
     """
 
     name: str

@@ -47,12 +47,12 @@ class Figures:
     """What was measured at one rate.
 
     Args:
-        rate: of poses, each with a wrench of the same stamp [Hz].
-        seconds: that it took.
+        rate: rate of poses, each with a wrench of the same stamp [Hz].
+        seconds: time that it took [s].
         instants: sent.
-        answered: of them.
-        p50_ms, p99_ms, worst_ms: from the pose's stamp to the answer's arrival.
-        solve_p50_ms, solve_p99_ms: that the node states for itself.
+        answered: number of them that were answered.
+        p50_ms, p99_ms, worst_ms: times from the pose's stamp to the answer's arrival [ms].
+        solve_p50_ms, solve_p99_ms: times that the node states for itself [ms].
         models: local contacts that came.
     """
 

@@ -50,12 +50,12 @@ class Record:
     """A sample as it is stored; loads are over Young's modulus, so that they serve every stiffness.
 
     Args:
-        kind: of load.
+        kind: kind of load.
         loaded: numbers of the vertices that carry load, (K,) int32.
         values: p / E [-], or nodal force / E [m2], (K,) float32.
         moved: numbers of the vertices that move, (N,) int32.
         steps: their displacement in units of QUANTUM, (N, 3) int32.
-        figures: one number for each of FIGURES.
+        figures: numbers in the order of FIGURES.
     """
 
     kind: Kind

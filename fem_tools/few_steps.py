@@ -39,9 +39,9 @@ class FewSteps:
     The patch is kept while the load stays within a thickness of where it was meshed for.
 
     Args:
-        steps: of Newton.
+        steps: number of Newton steps.
         start: the method whose answer is started from; None: start from the answer before, at first from rest.
-        reach: of the patch, in thicknesses.
+        reach: width of the patch beyond the load [thicknesses].
 
     Raises:
         InvalidInput: fewer than one step.

@@ -9,7 +9,6 @@ from functools import cached_property
 from itertools import pairwise
 
 import numpy as np
-import trimesh
 from scipy.spatial import KDTree
 
 from stmpl_core.arrays import Points, Transform
@@ -31,10 +30,11 @@ class Hand:
     """A hand in its own frame: origin in the middle of the palm, x along the fingers, z out of the palm. Metres.
 
     Args:
-        vertices: at rest, (V, 3) [m].
-        faces: closed at the wrist, (F, 3).
-        weights: of the palm and then the fifteen finger bones, thumb first, knuckle to tip, (V, 16) [-].
-        joints: where each finger bone turns, (15, 3) [m].
+        vertices: vertices at rest, (V, 3) [m].
+        faces: faces, closed at the wrist, (F, 3).
+        weights: skinning weights of the palm and then the fifteen finger bones, thumb first, knuckle to tip, (V, 16)
+            [-].
+        joints: points about which the finger bones turn, (15, 3) [m].
         axes: about which it closes, (15, 3) [-].
     """
 
@@ -70,10 +70,12 @@ class Hand:
 
     def closed_by(self, angles: Sequence[float] | np.ndarray) -> Points:
         """The vertices with the fifteen joints turned by `angles` [rad], by linear blend skinning, (V, 3) [m]."""
+        from trimesh.transformations import rotation_matrix
+
         transforms = np.tile(np.eye(4), (16, 1, 1))
         for j in range(15):
             before = transforms[0] if j % 3 == 0 else transforms[j]
-            turn = trimesh.transformations.rotation_matrix(angles[j], self.axes[j], self.joints[j])
+            turn = rotation_matrix(angles[j], self.axes[j], self.joints[j])
             transforms[j + 1] = before @ turn
         moved = np.einsum("bij,vj->vbi", transforms[:, :3, :3], self.vertices) + transforms[:, :3, 3]
         return np.einsum("vb,vbi->vi", self.weights, moved)
@@ -89,9 +91,9 @@ class Hand:
         """The hand and its pose, once the palm has settled on the skin and the fingers have closed, joint after joint.
 
         Args:
-            layer: what is held.
-            pose_body_from_hand: where the hand comes from; it moves along its z, (4, 4).
-            depth: how far palm and finger bones sink below the skin at rest [m].
+            layer: soft layer that is held.
+            pose_body_from_hand: pose from which the hand comes along its z, (4, 4).
+            depth: depth of palm and finger bones below the skin at rest [m].
             loose: the share of its way that each finger stays short of closing, (5,) [-].
         """
         tree, angles, pose = KDTree(layer.vertices), np.zeros(15), pose_body_from_hand.copy()

@@ -14,8 +14,6 @@ from typing import Literal
 
 import numpy as np
 from numba import njit
-from skfem.element import ElementLineP2, ElementTriP1, ElementTriP2
-from skfem.quadrature import get_quadrature_line, get_quadrature_tri
 
 from fem_tools.neo_hookean import invert
 from stmpl_core.arrays import Points
@@ -46,6 +44,9 @@ def reference_wedge(element: ElementName, extra: int = 0) -> Reference:
     Two Gauss points a wedge through the thickness: one fewer than full integration, a third cheaper, and half the error
     under a contact's edge, where three points are too stiff in shear.
     """
+    from skfem.element import ElementTriP1, ElementTriP2
+    from skfem.quadrature import get_quadrature_line, get_quadrature_tri
+
     plane, degree = (ElementTriP1(), 2) if element == "P1xP2" else (ElementTriP2(), 4)
     xy, w_plane = get_quadrature_tri(degree + extra)
     z, w_depth = get_quadrature_line(3 + extra)
@@ -74,6 +75,8 @@ def reference_wedge(element: ElementName, extra: int = 0) -> Reference:
 
 def _line_basis(z: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
     """Quadratic line functions ordered outside, middle, inside (scikit-fem orders ends first)."""
+    from skfem.element import ElementLineP2
+
     element = ElementLineP2()
     values = [element.lbasis(z, i) for i in (0, 2, 1)]
     return [(np.asarray(phi), np.asarray(dphi)[0]) for phi, dphi in values]
@@ -92,6 +95,9 @@ class SkinReference:
 @cache
 def reference_skin(element: ElementName) -> SkinReference:
     """Quadrature of degree 2 (linear in plane) or 5 (quadratic) for the follower load."""
+    from skfem.element import ElementTriP1, ElementTriP2
+    from skfem.quadrature import get_quadrature_tri
+
     plane, degree, n = (ElementTriP1(), 2, 3) if element == "P1xP2" else (ElementTriP2(), 5, 6)
     xy, weight = get_quadrature_tri(degree)
     basis = [plane.lbasis(xy, i) for i in range(n)]
@@ -115,7 +121,7 @@ class WedgeMesh:
         columns: columns of each triangle, (T, n).
         edges: the edges whose middles carry the columns N, N + 1, ... (quadratic only), (E, 2).
         n_columns: all columns.
-        gradients: of the shape functions at rest, (T L, Q, 3 n, 3) [1/m].
+        gradients: gradients of the shape functions at rest, (T L, Q, 3 n, 3) [1/m].
         volumes: quadrature weight times det, (T L, Q) [m3].
         indptr, indices: block rows of the tangent, one block a pair of columns that share a triangle.
         blocks: number of the block of each pair of columns of a triangle, (T, n, n).
@@ -219,8 +225,8 @@ def split(triangles: np.ndarray, n_vertices: int, marked: np.ndarray) -> tuple[n
     """Splits the marked triangles in four, their neighbours as conformity asks (red-green; Bank et al. 1983).
 
     Args:
-        triangles: (T, 3).
-        n_vertices: how many vertices they name; the new ones are numbered from here.
+        triangles: corners of the triangles, (T, 3).
+        n_vertices: number of vertices before; the new ones are numbered from here.
         marked: mask of the triangles to split, (T,).
 
     Returns:

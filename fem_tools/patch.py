@@ -65,11 +65,11 @@ class PatchFem:
     Args:
         element: "P1xP2", "P2xP2", or None: quadratic in plane where nu > 0.42, linear elsewhere.
         layers: wedges through the thickness; None: two where nu > 0.49, one elsewhere.
-        refine: how often the skin triangles near the load are split in four before meshing.
-        reach: how far the patch extends beyond the load, in largest thicknesses; its rim is held.
-        border: what holds the rim: "clamped" (no motion) or "mirror" (no motion across it: a plane of symmetry).
-        settings: where Newton stops.
-        check_stability: also test the final tangent for positive definiteness (about a fifth of the time).
+        refine: number of times that the skin triangles near the load are split in four before meshing.
+        reach: width of the patch beyond the load [largest thicknesses]; its rim is held.
+        border: condition at the rim: "clamped" (no motion) or "mirror" (no motion across it: a plane of symmetry).
+        settings: settings of Newton's method.
+        check_stability: test of the final tangent for positive definiteness, on or off (about a fifth of the time).
     """
 
     def __init__(

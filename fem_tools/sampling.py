@@ -11,15 +11,13 @@ from functools import cache
 from typing import Any, Literal
 
 import numpy as np
-import trimesh
 from pydantic import BaseModel, ConfigDict, Field
 from scipy.spatial.transform import Rotation
 
 from fem_tools.hand import Hand
-from fem_tools.scenes import EDGE, Scene, Site, UnusableContact, ellipse, extruded, letter
+from fem_tools.scenes import EDGE, Scene, Site, UnusableContact, ellipse, letter
 from stmpl_core.body import Body
 from stmpl_core.layer import SoftLayer, Tissue
-from stmpl_core.tool import Tool
 
 Kind = Literal["pressure", "nodal", "indenter"]
 SetName = Literal["disc", "ellipse", "seam", "field", "indenter", "tool", "hand", "band", "letter"]
@@ -39,7 +37,6 @@ WAVES = (15e-3, 60e-3)  # m, their wavelengths
 BALLS = (8e-3, 20e-3)  # m, radii of rounded indenters
 TOOLS = ("sphere", "ellipsoid", "capsule", "cylinder", "box", "hull", "letter")  # of the set "tool"
 SIZES = (4e-3, 25e-3)  # m, half their width
-FILLETS = (1.5e-3, 4e-3)  # m, of their edges
 TILT = 0.25  # rad, of a tool's axis and of its way
 
 
@@ -101,9 +98,9 @@ class Plan(BaseModel):
     """Everything that decides what is generated: the same plan gives the same data.
 
     Args:
-        discs, ellipses, seams, fields, indenters, tools: contacts a body.
-        hands, bands, letters: contacts in all, shared among the bodies.
-        loads, loads_out_of_distribution: of each contact.
+        discs, ellipses, seams, fields, indenters, tools: numbers of contacts a body, by set.
+        hands, bands, letters: numbers of contacts in all, by set, shared among the bodies.
+        loads, loads_out_of_distribution: numbers of loads of each contact.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -254,6 +251,8 @@ def draw(contact: ContactId, site: Site, hand: Hand | None, rng: np.random.Gener
 def _draw_once(
     contact: ContactId, site: Site, hand: Hand | None, rng: np.random.Generator
 ) -> tuple[Scene, dict[str, Any]]:
+    from fem_tools.tool_shapes import rounded_tool
+
     layer, turn = site.layer, float(rng.uniform(0, 2 * np.pi))
     area = layer.vertex_areas
     vertex = int(rng.choice(len(area), p=area / area.sum()))
@@ -308,6 +307,8 @@ def _draw_tool(
 
 def tool_scene(site: Site, drawn: Mapping[str, Any]) -> Scene:
     """The tool of the set "tool" that these figures describe, above its vertex; it goes against its z axis."""
+    from fem_tools.tool_shapes import any_tool
+
     mesh, rounding = any_tool(drawn)
     pose = site.standing(drawn["vertex"], drawn["size"], drawn["turn"])
     lean = np.eye(4)
@@ -315,69 +316,3 @@ def tool_scene(site: Site, drawn: Mapping[str, Any]) -> Scene:
     pose = pose @ lean
     pose[:3, 3] += (float(np.linalg.norm(mesh.vertices, axis=1).max()) + EDGE) * pose[:3, 2]
     return Scene(mesh, pose, np.zeros(len(site.layer.vertices)), rounding)
-
-
-def any_tool(drawn: Mapping[str, Any]) -> tuple[Tool, float]:
-    """The tool of the set "tool" that these figures describe, z up and tilted, about its middle; and its rounding [m].
-
-    Args:
-        drawn: tool, one of TOOLS; size, half its width [m]; shape, eight numbers in [0, 1]; tilt about x and y [rad].
-    """
-    r, shape = 1e3 * float(drawn["size"]), np.asarray(drawn["shape"])  # mm: trimesh drops small triangles
-    fillet = 1e3 * (FILLETS[0] + (FILLETS[1] - FILLETS[0]) * float(shape[0]))
-    name, rounding = drawn["tool"], 0.0
-    if name in ("sphere", "ellipsoid"):
-        mesh = trimesh.creation.icosphere(4, r)
-        if name == "ellipsoid":
-            mesh.apply_scale([1.0, 0.4 + 0.6 * shape[1], 0.3 + 1.2 * shape[2]])
-    elif name == "capsule":
-        long = r * (0.5 + 3.5 * shape[1])
-        mesh = trimesh.creation.capsule(long, 0.6 * r, count=[48, 48])
-        mesh.apply_translation([0, 0, -long / 2])
-        mesh.apply_transform(trimesh.transformations.rotation_matrix(np.pi / 2, [0, 1, 0]))
-    elif name == "cylinder":
-        mesh = _hull(_circle(r), fillet, 24.0)
-    elif name == "box":
-        x, y = r, r * (0.3 + 0.7 * shape[1])
-        mesh = _hull(np.array([[x, y], [x, -y], [-x, -y], [-x, y]]), fillet, 24.0)
-    elif name == "hull":  # of balls at random places: smooth, convex, like nothing else
-        rng = np.random.default_rng((1e4 * shape).astype(np.int64))
-        radii, centres = r * rng.uniform(0.2, 0.6, 5), r * rng.uniform(-0.7, 0.7, (5, 3))
-        ball = trimesh.creation.icosphere(3, 1.0).vertices
-        mesh = trimesh.convex.convex_hull((radii[:, None, None] * ball + centres[:, None]).reshape(-1, 3))
-    else:
-        made = extruded(letter(string.ascii_uppercase[int(25.99 * shape[1])], 2e-3 * max(r, 10.0)), -10e-3, 10e-3)
-        mesh, rounding = trimesh.Trimesh(1e3 * made.vertices, made.faces, process=False), min(1e-3 * fillet, 2.5e-3)
-    tilt = Rotation.from_euler("xy", drawn["tilt"]).as_matrix()
-    return Tool(name, 1e-3 * np.asarray(mesh.vertices) @ tilt.T, np.asarray(mesh.faces)), rounding
-
-
-def _circle(radius: float) -> np.ndarray:
-    angle = np.linspace(0, 2 * np.pi, 72, endpoint=False)
-    return radius * np.column_stack([np.cos(angle), np.sin(angle)])
-
-
-def _hull(outline: np.ndarray, fillet: float, height: float) -> trimesh.Trimesh:
-    """A convex prism over an outline (N, 2) with all edges rounded: the hull of balls at its corners."""
-    reach = np.linalg.norm(outline, axis=1)
-    inner = outline * (1 - np.minimum(fillet / reach, 0.9))[:, None]
-    ball = trimesh.creation.icosphere(3, min(fillet, 0.9 * float(reach.min()))).vertices
-    low, high = -height / 2 + fillet, height / 2 - fillet
-    centres = np.concatenate([np.column_stack([inner, np.full(len(inner), z)]) for z in (low, high)])
-    return trimesh.convex.convex_hull((centres[:, None] + ball).reshape(-1, 3))
-
-
-def rounded_tool(name: str, radius: float) -> Tool:
-    """A sphere, a capsule lying down, or an upright cylinder with a filleted rim, of a radius [m], about its middle."""
-    r = 1e3 * radius  # trimesh drops triangles that are small in metres
-    if name == "sphere":
-        mesh = trimesh.creation.icosphere(4, r)
-    elif name == "capsule":
-        mesh = trimesh.creation.capsule(2 * r, 0.6 * r, count=[48, 48])
-        mesh.apply_translation([0, 0, -r])
-        mesh.apply_transform(trimesh.transformations.rotation_matrix(np.pi / 2, [0, 1, 0]))
-    else:
-        fillet, bend = 0.3 * r, np.linspace(0, np.pi / 2, 9)
-        rim = np.column_stack([r - fillet + fillet * np.sin(bend), -r + fillet - fillet * np.cos(bend)])
-        mesh = trimesh.creation.revolve(np.vstack([[0, -r], rim, [r, r], [0, r]]), sections=64)
-    return Tool(name, 1e-3 * np.asarray(mesh.vertices), np.asarray(mesh.faces))

@@ -4,21 +4,21 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import igl
 import numpy as np
-import shapely
-import shapely.affinity
-import trimesh
-from matplotlib.font_manager import FontProperties
-from matplotlib.textpath import TextPath
 
-from fem_tools.hand import Hand
 from stmpl_core.arrays import PerVertex, Points, Transform
 from stmpl_core.errors import InvalidInput, StmplError
 from stmpl_core.layer import SoftLayer
 from stmpl_core.tool import Tool
+
+if TYPE_CHECKING:
+    import shapely
+
+    from fem_tools.hand import Hand
+
+    Outline = shapely.Polygon | shapely.MultiPolygon
 
 EDGE = 4e-3  # m over which a footprint's weight falls from 1 to 0 across the tool's outline
 FACING = 0.2  # cosine between a tool's axis and the skin's normal from which skin counts as facing it
@@ -27,9 +27,6 @@ BACK = 10e-3  # m of tool above the skin
 STRAP = 4e-3  # m, of a strap's cloth
 CLEAR = 2.5  # largest thicknesses that a footprint keeps from the layer's open border
 FEWEST = 7  # vertices that a footprint must cover
-
-
-Outline = shapely.Polygon | shapely.MultiPolygon
 
 
 class UnusableContact(StmplError):
@@ -42,9 +39,9 @@ class Scene:
 
     Args:
         tool: tool in its own frame; None where a pressure was drawn without one.
-        pose_body_from_tool: (4, 4).
-        footprint: how much of the tool's pressure each vertex gets, (V,), 0 to 1.
-        rounding: of the tool's edges where it is pressed in as a rigid one [m].
+        pose_body_from_tool: pose of the tool, (4, 4).
+        footprint: share of the tool's pressure that each vertex gets, (V,), 0 to 1.
+        rounding: radius of the tool's edges where it is pressed in as a rigid one [m].
     """
 
     tool: Tool | None
@@ -140,6 +137,8 @@ class Site:
         Raises:
             UnusableContact: the limb curves away too far under the outline, and as `scene`.
         """
+        import shapely
+
         radius = float(np.linalg.norm(shapely.get_coordinates(outline), axis=1).max())
         pose = self.standing(vertex, radius, turn)
         local = (self.layer.vertices - pose[:3, 3]) @ pose[:3, :3]
@@ -160,6 +159,8 @@ class Site:
         Raises:
             UnusableContact: the slice is no limb's, and as `scene`.
         """
+        import shapely
+
         axis, normal = self.axis(vertex), self.layer.normals[vertex]
         along = np.cos(tilt) * axis + np.sin(tilt) * np.cross(axis, normal)
         pose = frame(self.layer.vertices[vertex], along, normal, 0.0)
@@ -176,11 +177,11 @@ class Site:
         """A hand laid across the limb with its palm on `vertex`, its fingers closed until they are `depth` inside [m].
 
         Args:
-            vertex: under the palm.
-            hand: that grasps.
-            turn: of the fingers away from across the limb [rad].
-            depth: that palm and fingers sink below the skin at rest [m].
-            loose: see Hand.grip.
+            vertex: number of the vertex under the palm.
+            hand: hand that grasps.
+            turn: angle of the fingers away from across the limb [rad].
+            depth: depth of palm and fingers below the skin at rest [m].
+            loose: share of its way that each finger stays short of closing, (5,) [-].
 
         Raises:
             UnusableContact: as `scene`.
@@ -221,6 +222,8 @@ def smoothstep(x: np.ndarray) -> np.ndarray:
 
 def signed_distance(mesh: Tool, pose: Transform, points: Points) -> np.ndarray:
     """Exact distance of points of the layer's frame to a tool, negative inside, (N,) [m]."""
+    import igl
+
     if not len(points):
         return np.empty(0)
     local = np.ascontiguousarray((points - pose[:3, 3]) @ pose[:3, :3])
@@ -230,6 +233,8 @@ def signed_distance(mesh: Tool, pose: Transform, points: Points) -> np.ndarray:
 
 def ellipse(a: float, b: float) -> shapely.Polygon:
     """Outline with semi-axes a, b [m] about the origin, of the ellipse's own area."""
+    import shapely
+
     angle = np.linspace(0, 2 * np.pi, 64, endpoint=False)
     swell = (angle[1] / np.sin(angle[1])) ** 0.5
     return shapely.Polygon(swell * np.column_stack([a * np.cos(angle), b * np.sin(angle)]))
@@ -241,6 +246,10 @@ def letter(character: str, height: float) -> Outline:
     Raises:
         InvalidInput: no letter and no digit.
     """
+    import shapely.affinity
+    from matplotlib.font_manager import FontProperties
+    from matplotlib.textpath import TextPath
+
     if not character.isalnum():
         raise InvalidInput(f"the font draws nothing of use for {character!r}. Use capital letters.")
     path = TextPath((0, 0), character, size=100, prop=FontProperties(family="DejaVu Sans", weight="bold"))
@@ -254,6 +263,9 @@ def letter(character: str, height: float) -> Outline:
 
 def extruded(outline: Any, low: float, high: float) -> Tool:
     """The prism over `outline` from z = low to z = high [m]. In millimetres on the way: trimesh drops small faces."""
+    import shapely.affinity
+    import trimesh
+
     parts = [p for p in shapely.get_parts(outline) if isinstance(p, shapely.Polygon)]
     scaled = [shapely.affinity.scale(p, 1e3, 1e3, origin=(0, 0)) for p in parts]
     prism: Any = trimesh.util.concatenate([trimesh.creation.extrude_polygon(p, 1e3 * (high - low)) for p in scaled])

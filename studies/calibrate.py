@@ -67,7 +67,7 @@ class Trial:
     """One method under one load.
 
     Args:
-        body, use, set, kind: where the load comes from.
+        body, use, set, kind: names of where the load comes from.
         method: its name.
         scene: its figures.
         unit: thickness under the load times the strain of its columns [m].
@@ -185,12 +185,12 @@ def gather(folder: Path, rungs: Sequence[Method] | None = None, *, scenes: Mappi
     """All trials, body by body; a body whose trials lie in `folder` already is not run again.
 
     Args:
-        folder: for the trials.
+        folder: folder of the trials.
         rungs: methods, the default ones unless given.
         scenes: contacts of each set on each body, by use.
         bodies: limbs.
         contacts: a data set of the preset "contacts", for what rigid tools press with; None: those are left out.
-        seed: of the scenes.
+        seed: seed of the scenes.
     """
     plan = Plan(preset="calibrate", bodies=tuple(bodies), seed=seed)
     said, counts = on_progress or (lambda *_: None), scenes or SCENES
@@ -332,8 +332,8 @@ class Coverage:
     """How the stated bounds did on loads that were not fitted.
 
     Args:
-        method, use, kind: of which answers.
-        answers: how many the method itself trusts, inside the range that was measured.
+        method, use, kind: names of the answers that are counted.
+        answers: number of answers that the method itself trusts, inside the range that was measured.
         covered: share of them whose error lies within the bound [-].
         tight: median of bound over error [-].
         error: median largest error over the peak [-].

@@ -48,7 +48,7 @@ class CriticalLoad:
         load: "follower", "dead" or "indenter".
         scene: "plate" (pressed everywhere), "disc" (20 mm wide) or "ball" (a rigid sphere, 24 mm wide).
         element: "P1 tets", "P1xP2" or "P2xP2".
-        edge: of the skin's triangles [m].
+        edge: edge length of the skin's triangles [m].
         ratio: p / E where it ended (of a tool: its largest contact pressure).
         ended: "unstable" (negative curvature), "no solution" (Newton stops, while all before is stable), or "held" (it
             is stable up to the last load that was tried).
@@ -74,7 +74,7 @@ def least_stiffness(
 
     Args:
         ratio: p / E [-].
-        wavelength: over the thickness [-].
+        wavelength: wavelength over the thickness [-].
         poisson_ratio: [-].
         load: "follower" or "dead".
         degree: number of polynomials for each of U and W; short waves need more.
@@ -125,9 +125,9 @@ def critical_loads(
     """Presses a flat layer (t = 7.5 mm, nu = 0.4) by each load with each element and mesh width, until it fails.
 
     Args:
-        edges: of the skin's triangles [m].
-        elements: of "P1 tets", "P1xP2", "P2xP2".
-        scenes: of "plate", "disc", "ball"; the ball is pressed in with wedges only.
+        edges: edge lengths of the skin's triangles [m].
+        elements: names out of "P1 tets", "P1xP2", "P2xP2".
+        scenes: names out of "plate", "disc", "ball"; the ball is pressed in with wedges only.
         largest: p / E at which a press ends that nothing stopped.
 
     Yields:
@@ -246,9 +246,9 @@ def draw(rows: Sequence[CriticalLoad], path: str | Path, *, poisson_ratio: float
     """Draws the closed form over the wavelength, and beside it where each element and mesh width ended.
 
     Args:
-        rows: of `critical_loads`.
-        path: of the PNG.
-        poisson_ratio: of the closed form [-].
+        rows: answer of `critical_loads`.
+        path: path of the PNG.
+        poisson_ratio: Poisson's ratio of the closed form [-].
     """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure

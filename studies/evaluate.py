@@ -135,12 +135,12 @@ def evaluate(
     unseen thickness, is of the one named THREE_BODY_ROW, if there is one.
 
     Args:
-        data: a finished data set, see `stmpl generate`.
+        data: folder of a finished data set, see `stmpl generate`.
         methods: further rows: by name, what makes the method.
-        kinds: of load.
-        limit: of samples for each split and kind, spread evenly over it; None: all.
-        seed: of that choice.
-        on_progress: called after each sample.
+        kinds: kinds of load.
+        limit: number of samples for each split and kind, spread evenly over it; None: all.
+        seed: seed of that choice.
+        on_progress: function that is called after each sample.
 
     Raises:
         InvalidInput: no finished data set there, or limit below 1.

@@ -27,10 +27,10 @@ class TetMesh:
     Attributes:
         points: nodes at rest, those of the skin first, (N, 3) [m].
         tets: positively oriented, (M, 4).
-        triangles: of the skin, (T, 3).
+        triangles: triangles of the skin, (T, 3).
         core: mask of the nodes that are bonded, (N,).
-        gradients: of the shape functions at rest, (M, 4, 3) [1/m].
-        volumes: (M,) [m3].
+        gradients: gradients of the shape functions at rest, (M, 4, 3) [1/m].
+        volumes: volumes of the tetrahedra, (M,) [m3].
         indptr, indices: block rows of the tangent, one block a pair of nodes that share a tetrahedron.
         blocks: number of the block of each pair of a skin triangle's nodes, (T, 3, 3).
         to_nodes, to_blocks: sparse sums over the tetrahedra's corners and pairs of corners.
@@ -225,7 +225,7 @@ class TetFem(PatchFem):
     Args:
         mesher: "split" (wedges, three tetrahedra each) or "tetgen" (the optional extra "paper").
         layers: wedges through the thickness before they are split; TetGen chooses its own.
-        others: see PatchFem.
+        others: arguments of PatchFem.
     """
 
     def __init__(self, *, mesher: Mesher = "split", layers: int = 2, **others: Any) -> None:

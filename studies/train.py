@@ -24,9 +24,9 @@ def train(
             second and fourth body, as in the paper's second set-up.
         data: folder of a finished data set.
         out: folder for weights, card and checkpoint.
-        steps: of the optimiser for ours, epochs for the paper's; None: the preset's.
-        seed: of weights and order.
-        on_progress: called often.
+        steps: number of steps of the optimiser for ours, of epochs for the paper's; None: the preset's.
+        seed: seed of weights and order.
+        on_progress: function that is called often.
 
     Returns:
         The card that was written beside the weights.

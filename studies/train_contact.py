@@ -15,7 +15,6 @@ from torch import Tensor
 
 from fem_tools.dataset import Dataset, Sample, Subset
 from fem_tools.press import Press
-from fem_tools.provenance import commit, data_card, machine, versions
 from fem_tools.sampling import tool_scene
 from fem_tools.scenes import Site
 from stmpl_core.arrays import Transform
@@ -25,7 +24,7 @@ from stmpl_core.errors import InvalidInput
 from stmpl_core.moments import Surroundings
 from stmpl_core.networks import POINT, PRESSURE, Weights
 from stmpl_core.sdf import SignedDistance
-from studies.train_moments import VERSIONS, Model, OnProgress
+from studies.train_moments import Model, OnProgress, training_card
 
 COVERED = 0.95  # share of validation contacts whose force the stated bound must reach
 MARGIN = 1.3  # on that bound, for tools and limbs unlike the validation data
@@ -38,9 +37,10 @@ class ContactTraining(BaseModel):
 
     Args:
         hidden: width of each of the three hidden layers.
-        steps, batch, learning_rate: of AdamW, the batch in contacts; the rate rises to this and falls in one cycle.
-        weight_decay: likewise.
-        seed: of weights and order.
+        steps, batch, learning_rate: numbers of AdamW, the batch in contacts; the rate rises to this and falls in one
+            cycle.
+        weight_decay: weight decay of AdamW.
+        seed: seed of weights and order.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -58,10 +58,10 @@ class Pressed:
     """One converged contact: where the tool is, how it squeezes, and the true pressure.
 
     Args:
-        sample: of the data set.
+        sample: sample of the data set.
         field: the tool's.
-        pose: of the tool, (4, 4).
-        squeeze: see Columns.
+        pose: pose of the tool, (4, 4).
+        squeeze: squeeze of the columns under it, see stmpl_core.columns.Squeeze.
         true: pressure over E at the squeezed vertices, (N,) [-].
         missed: share of the true force that acts on vertices that are not squeezed [-].
     """
@@ -109,7 +109,7 @@ class Rows:
     Args:
         rows: inputs of Model, laid out as stmpl_core.networks.POINT, (N, POINT.size) float32.
         prior, true: pressure over E, (N,) float32.
-        area: of the vertex, over the sum of its contact's, (N,) float32.
+        area: area of the vertex over the sum of its contact's, (N,) float32 [-].
         starts: first row of each contact, and the end, (C + 1,).
     """
 
@@ -210,20 +210,9 @@ def train_contact(
         raise InvalidInput(f"{data} holds no rigid tools. Make them with stmpl generate --preset contacts.")
     rows = draw_rows(subset, said)
     model = fit(rows, settings, said)
-    card: dict[str, Any] = {
-        "format": 1,
-        "data": data_card(data, source.manifest),
-        "settings": settings.model_dump(mode="json"),
-        "parameters": sum(p.numel() for p in model.parameters()),
-        "contacts": len(rows.starts) - 1,
-        "rows": len(rows.rows),
-        "ranges": _ranges(source, subset),
-        "bound": {"factor": 1.0},
-        "commit": commit(),
-        "versions": versions(VERSIONS),
-        "machine": f"{machine()}; {torch.get_num_threads()} threads",
-        "minutes": round((time.monotonic() - started) / 60, 1),
-    }
+    counts = {"contacts": len(rows.starts) - 1, "rows": len(rows.rows)}
+    card = training_card(data, source, settings, model, _ranges(source, subset), **counts)
+    card["minutes"] = round((time.monotonic() - started) / 60, 1)
     weights = model.weights(card)
     card["bound"] = calibrate(source.split("val", kind="indenter", sets=("tool",)), weights)
     weights.save(out / "contact_net.safetensors")
@@ -258,7 +247,7 @@ class Scores:
         force: signed error of the force over the true one.
         doubt: error of the force that the network expects without calibration, over the true force.
         winkler: signed error of the force of columns alone.
-        depth: over the thickness.
+        depth: depth over the thickness.
         mean: true mean pressure over E, weighted by itself.
         tool: its kind.
     """

@@ -35,11 +35,11 @@ class MomentTraining(BaseModel):
 
     Args:
         hidden: width of each of the three hidden layers.
-        kinds: of load; rigid tools that stick also pull along the skin, so they have a network of their own.
+        kinds: kinds of load; rigid tools that stick also pull along the skin, so they have a network of their own.
         points: vertices drawn of each sample, most from where it moves.
-        steps, batch, learning_rate: of Adam, the rate rising to this and falling in one cycle.
-        seed: of weights, points and order.
-        checkpoint_minutes: between two checkpoints.
+        steps, batch, learning_rate: numbers of Adam, the rate rising to this and falling in one cycle.
+        seed: seed of weights, points and order.
+        checkpoint_minutes: time between two checkpoints [min].
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -59,7 +59,7 @@ class Points:
     """Vertices of samples: what each feels, and how it moves.
 
     Args:
-        rows: what is known of each, laid out as POINT, (N, POINT.size) float32.
+        rows: figures of each vertex, laid out as POINT, (N, POINT.size) float32.
         motion: displacement over the local thickness in the vertex's frame, (N, 3) float32 [-].
         weight: local thickness over the sample's largest displacement, (N,) float32.
     """
@@ -276,9 +276,9 @@ def train_moments(
     Args:
         data: folder of a finished data set (stmpl generate).
         out: folder; what it holds of the same run is used again.
-        settings: what is learnt and how; None: the defaults.
-        name: of the files.
-        on_progress: called often.
+        settings: settings of the training; None: the defaults.
+        name: name of the files.
+        on_progress: function that is called often.
 
     Returns:
         The card.
@@ -292,24 +292,39 @@ def train_moments(
     started = time.monotonic()
     points = draw_points(source, settings, said)
     model = fit(points, settings, out, said)
-    card: dict[str, Any] = {
-        "format": 1,
-        "data": data_card(data, source.manifest),
-        "settings": settings.model_dump(mode="json"),
-        "parameters": sum(p.numel() for p in model.parameters()),
-        "points": len(points.rows),
-        "ranges": _ranges(source, settings),
-        "bound": {"factor": 1.0},
-        "commit": commit(),
-        "versions": versions(VERSIONS),
-        "machine": f"{machine()}; {torch.get_num_threads()} threads",
-        "minutes": round((time.monotonic() - started) / 60, 1),
-    }
+    card = training_card(data, source, settings, model, _ranges(source, settings), points=len(points.rows))
+    card["minutes"] = round((time.monotonic() - started) / 60, 1)
     weights = model.weights(card)
     card["bound"] = calibrate(source, weights, settings.kinds, said)
     weights.save(out / f"{name}.safetensors")
     (out / "moment_net.checkpoint").unlink(missing_ok=True)
     return card
+
+
+def training_card(data: str | Path, source: Dataset, settings: BaseModel, model: Model, ranges: dict[str, list[float]],
+                  **counts: int) -> dict[str, Any]:  # fmt: skip
+    """What made a network: the card beside its weights, but for its bound and the minutes that it took.
+
+    Args:
+        data: folder of the data set.
+        source: data set.
+        settings: settings of the training.
+        model: trained network.
+        ranges: smallest and largest of what was trained on, by name.
+        counts: numbers of what was trained on, by name.
+    """
+    return {
+        "format": 1,
+        "data": data_card(data, source.manifest),
+        "settings": settings.model_dump(mode="json"),
+        "parameters": sum(p.numel() for p in model.parameters()),
+        **counts,
+        "ranges": ranges,
+        "bound": {"factor": 1.0},
+        "commit": commit(),
+        "versions": versions(VERSIONS),
+        "machine": f"{machine()}; {torch.get_num_threads()} threads",
+    }
 
 
 def _ranges(data: Dataset, settings: MomentTraining) -> dict[str, list[float]]:

@@ -21,12 +21,12 @@ from torch import Tensor, nn
 from fem_tools.dataset import Dataset, Subset
 from fem_tools.provenance import commit, data_card, machine, versions
 from fem_tools.sampling import Kind, Split
-from stmpl_core.chart import UvChart
 from stmpl_core.errors import InvalidInput
 from stmpl_core.layer import SoftLayer
 from stmpl_core.methods.pix2pix import Pix2PixUNet
-from stmpl_core.methods.unet import MODULUS, MOTION, UNet, UNetCard, drawn_thickness, seen_in, square_chart
+from stmpl_core.methods.unet import MOTION, UNet, UNetCard, seen_in, square_chart
 from stmpl_core.metrics import mean_and_deviation, score
+from studies.unet_samples import Images, Samples
 
 THREE_BODIES = ("weight_0", "weight_50", "weight_100")  # beta_2 in {2, 0, -2}
 BOUND = 0.95  # quantile of held-out errors that becomes the error bound
@@ -39,17 +39,17 @@ class UNetTraining(BaseModel):
     """What decides what is learnt. The defaults are the paper's; how long it trained and its seed are not known.
 
     Args:
-        size, width, dropout: of Pix2PixUNet.
+        size, width, dropout: numbers of Pix2PixUNet.
         batch: samples a step, over all processes.
-        learning_rate: of Adam.
+        learning_rate: learning rate of Adam.
         total_variation: weight of the mean absolute difference of neighbouring texels [mm], beside the mean square.
-        epochs: how often every sample is seen.
-        seed: of weights, order and dropout.
+        epochs: number of times that every sample is seen.
+        seed: seed of weights, order and dropout.
         bodies: all, or the three of the paper's second set-up.
-        kind: of load: the paper's rule, unless another is named.
-        highest_force: at a vertex, drawn as 1 [N]. The paper's 20 N suit its 17 mm mesh and loads that tissue of 1 kPa
-            does not carry.
-        checkpoint_minutes: between two checkpoints.
+        kind: kind of load: the paper's rule, unless another is named.
+        highest_force: force at a vertex that is drawn as 1 [N]. The paper's 20 N suit its 17 mm mesh and loads that
+            tissue of 1 kPa does not carry.
+        checkpoint_minutes: time between two checkpoints [min].
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -87,57 +87,6 @@ class Group:
     device: torch.device
 
 
-class Images:
-    """Draws values at vertices as images, a batch at a time, on any device: what UvChart.to_texels does for one."""
-
-    def __init__(self, chart: UvChart, device: torch.device) -> None:
-        index, corners, weights = chart._raster
-        self.index, self.corners = (torch.from_numpy(table).long().to(device) for table in (index, corners))
-        self.weights = torch.from_numpy(weights).to(device)
-        self.mask = torch.from_numpy(chart.mask).to(device)
-        self.shape = chart.shape
-
-    def of(self, values: Tensor) -> Tensor:
-        """Values (B, V, k) as images (B, k, H, W), zero off the chart."""
-        texels = sum(values[:, self.corners[:, c]] * self.weights[:, c, None] for c in range(3))
-        images = values.new_zeros(len(values), self.shape[0] * self.shape[1], values.shape[2])
-        images[:, self.index] = texels  # type: ignore[assignment]
-        return images.unflatten(1, self.shape).permute(0, 3, 1, 2)
-
-
-class Samples:
-    """Training samples in memory: half-precision values at the vertices, a hundredth of the images' size.
-
-    Forces are held in mN (for E = 1 kPa), displacements in mm, where half precision is good to 5e-4 of the value.
-    """
-
-    def __init__(self, subset: Subset, layers: dict[str, SoftLayer], on_read: Callable[[int, int], None]) -> None:
-        vertices = len(next(iter(layers.values())).vertices)
-        self.force = torch.zeros(len(subset), vertices, dtype=torch.float16)
-        self.motion = torch.zeros(len(subset), vertices, 3, dtype=torch.float16)
-        self.body = torch.zeros(len(subset), dtype=torch.long)
-        self.thickness = torch.stack([torch.from_numpy(drawn_thickness(x.thickness)) for x in layers.values()])
-        names, self.peak_ratio = list(layers), 0.0
-        for k, sample in enumerate(subset):
-            force = np.linalg.norm(sample.load.forces_on(sample.layer), axis=1)
-            self.force[k] = torch.from_numpy(1e3 * force * MODULUS / sample.layer.tissue.youngs_modulus)
-            self.motion[k] = torch.from_numpy(1e3 * sample.displacement)
-            self.body[k] = names.index(sample.info["body"])
-            self.peak_ratio = max(self.peak_ratio, sample.load.peak_ratio(sample.layer))
-            on_read(k + 1, len(subset))
-
-    def __len__(self) -> int:
-        return len(self.body)
-
-    def batch(self, rows: Tensor, images: Images, highest_force: float) -> tuple[Tensor, Tensor]:
-        """Inputs (B, 2, H, W) and targets (B, 3, H, W) of some samples, scaled as the network wants them."""
-        device = images.weights.device
-        chosen = self.thickness[self.body[rows]], self.force[rows], self.motion[rows]
-        thickness, force, motion = (values.to(device).float() for values in chosen)
-        inputs = images.of(torch.stack([thickness, force / (1e3 * highest_force)], dim=-1))
-        return inputs, images.of(motion / (1e3 * MOTION))
-
-
 def train_unet(
     data: str | Path, out: str | Path, settings: UNetTraining, *, on_progress: OnProgress | None = None
 ) -> dict[str, Any]:
@@ -147,10 +96,10 @@ def train_unet(
     Under torchrun each batch is shared among the processes, which learn what one process would (dropout aside).
 
     Args:
-        data: a finished data set, see `stmpl generate`.
+        data: folder of a finished data set, see `stmpl generate`.
         out: folder.
-        settings: what is learnt.
-        on_progress: called after each sample that is read and after each step, in the first process.
+        settings: settings of the training.
+        on_progress: function that is called after each sample that is read and each step, in the first process.
 
     Returns:
         The card, as a dictionary.

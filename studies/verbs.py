@@ -42,9 +42,9 @@ def train(
             paper-reduced the same code at a size for one core; 3-bodies: its second set-up.
         data: folder of the data set; make it with stmpl generate.
         out: folder of the weights; runs/train/<preset> unless given.
-        steps: of the optimiser; epochs for the paper's presets.
-        seed: of weights and order.
-        as_json: print the card for machines.
+        steps: number of steps of the optimiser; of epochs for the paper's presets.
+        seed: seed of weights and order.
+        as_json: card on stdout, for machines.
     """
     from studies.train import train as learn
 
@@ -75,7 +75,7 @@ def tables(
         unet_3_bodies: weights of its second set-up, for Table 3.
         moment_net: weights of ours; those that come with the package unless given.
         out: a file for the tables in Markdown; their figures go beside it as JSON.
-        as_json: print the figures for machines.
+        as_json: figures on stdout, for machines.
     """
     from stmpl_core.methods import Linear, MomentNet, UNet
     from studies.evaluate import THREE_BODY_ROW, evaluate
@@ -110,8 +110,8 @@ def chart(
     Args:
         preset: default (the arm at 3 mm, five scenes, two loads; about twenty minutes), quick (a coarse forearm).
         out: folder of chart.png, chart.html, break_even.png and chart.json.
-        redraw: draw out/chart.json again instead of measuring.
-        as_json: print all points for machines.
+        redraw: pictures of out/chart.json again, without measuring.
+        as_json: all points on stdout, for machines.
     """
     from studies.chart import CURVES, PRESETS, Chart, measure
     from studies.chart.break_even import break_even, draw_break_even
@@ -148,11 +148,11 @@ def calibrate(
     All anew (half an hour): stmpl calibrate --errors --out stmpl_core/weights/ladder.json --contacts data/contacts
 
     Args:
-        errors: measure errors against finite elements as well, and print how often the stated bounds hold.
+        errors: errors against finite elements as well, and how often the stated bounds hold.
         out: file of the measured chart; the user's cache for times, runs/calibrate/ladder.json for errors.
         contacts: a data set of the preset contacts, for what rigid tools press with (with --errors).
         trials: folder of the single trials (with --errors), which are not measured twice.
-        as_json: print the figures for machines.
+        as_json: figures on stdout, for machines.
     """
     from fem_tools.ladder import times_file
     from studies import calibrate as measuring
@@ -195,9 +195,9 @@ def stability(
         preset: default (minutes a method, on the arm), quick (seconds, on a round limb).
         out: folder of report, picture and failures, runs/stability unless given; the picture with --critical-load.
         again: a saved failure to run again with the same method.
-        critical_load: press a flat layer by follower, dead and indenter loads with each element and mesh width until
-            it fails, beside the closed form (minutes).
-        as_json: print the figures for machines.
+        critical_load: presses of a flat layer by follower, dead and indenter loads with each element and mesh width
+            until it fails, beside the closed form (minutes).
+        as_json: figures on stdout, for machines.
     """
     if critical_load:
         return _critical_load(out or Path("runs/critical_load.png"), as_json)

@@ -10,8 +10,9 @@ import trimesh
 
 from fem_tools.dataset import Dataset
 from fem_tools.generate import generate
-from fem_tools.sampling import CONTACT_BODIES, FILLETS, PRESETS, SIZES, TILT, TOOLS, any_tool, contacts, draw, split_of
+from fem_tools.sampling import CONTACT_BODIES, PRESETS, SIZES, TILT, TOOLS, contacts, draw, split_of
 from fem_tools.scenes import Site
+from fem_tools.tool_shapes import FILLETS, any_tool
 from stmpl_core import SoftLayer
 from stmpl_core.contact_net import ContactNet
 from stmpl_core.errors import InvalidInput

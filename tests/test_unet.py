@@ -17,7 +17,8 @@ from stmpl_core.body import Body
 from stmpl_core.errors import InvalidInput, NotPrepared
 from stmpl_core.methods.pix2pix import Pix2PixUNet
 from stmpl_core.methods.unet import MOTION, UNet, UNetCard, seen_in, square_chart
-from studies.train_unet import Images, Samples, UNetTraining, train_unet
+from studies.train_unet import UNetTraining, train_unet
+from studies.unet_samples import Images, Samples
 from tests.learning_data import small_data
 
 QUICK = UNetTraining(size=32, width=2, batch=4, learning_rate=1e-3, epochs=3, highest_force=5e-3, checkpoint_minutes=0)

@@ -25,7 +25,7 @@ class Coarse:
     about h^2 / 8 of its curvature, which no bound of the method inside knows of: none is stated.
 
     Args:
-        method: that answers; not yet prepared.
+        method: method that answers; not yet prepared.
         coarsening: edge length of the coarser mesh over that of the layer's own.
 
     Raises:

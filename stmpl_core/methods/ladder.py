@@ -31,10 +31,10 @@ class SceneFigures:
     """What decides how far off and how slow a method will be.
 
     Args:
-        strain: of a confined column under the highest pressure [-].
+        strain: strain of a confined column under the highest pressure [-].
         nu: Poisson's ratio [-].
-        width: of the mesh's edges over the thickness under the load [-].
-        slope: of the thickness along the skin, largest under the load [-].
+        width: length of the mesh's edges over the thickness under the load [-].
+        slope: slope of the thickness along the skin, largest under the load [-].
         outline: total variation of the pressure over the force, times that thickness; 2 t / R for a disc [-].
         jump: largest difference of pressure across an edge of the mesh, over the highest pressure [-].
         ratio: highest p / E [-].
@@ -127,11 +127,11 @@ class Known:
 
     Args:
         error: coefficients of SceneFigures.for_error for log(error / (thickness strain)), by kind of load.
-        factor: on that error, so that 95 % of answers are within it, by kind of load.
-        after, after_factor: likewise with one more term, the logarithm of the bound that the method itself states (over
-            thickness times strain): what to expect once it has answered. Empty if it states none.
+        factor: factor on that error, so that 95 % of answers are within it, by kind of load.
+        after, after_factor: coefficients and factor with one more term, the logarithm of the bound that the method
+            itself states (over thickness times strain): what to expect once it has answered. Empty if it states none.
         seconds: coefficients of SceneFigures.for_time [s].
-        slow: how many times longer than that one solve in twenty takes.
+        slow: factor on that time that one solve in twenty exceeds.
     """
 
     error: Mapping[str, Sequence[float]]
@@ -155,7 +155,7 @@ class Measured:
     """The measured chart that a Ladder chooses by.
 
     Args:
-        methods: by the name of the method, in the order in which they were measured.
+        methods: figures by the name of the method, in the order in which they were measured.
         ranges: lowest and highest of each figure in RANGED, by kind of load.
         about: machine, commit, how it was made.
     """
@@ -217,7 +217,7 @@ class Ladder:
         rungs: methods, not yet prepared; those that the chart does not know are left out.
         measured: the chart.
         accuracy: largest error wanted at any vertex [m].
-        deadline: for each solve [s]; None: there is time.
+        deadline: time for each solve [s]; None: there is time.
 
     Raises:
         InvalidInput: an accuracy or deadline that is not positive, or no rung that the chart knows.

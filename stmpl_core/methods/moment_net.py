@@ -44,11 +44,11 @@ class MomentNet:
 
     Args:
         weights: a .safetensors file made by `stmpl train`; None: those that come with the package.
-        contact: likewise, for what rigid tools press with (Load.contact).
+        contact: weights for what rigid tools press with (Load.contact), given likewise.
         fallback: a method that answers loads outside the range that the network was trained on; None: the network's
             answer is given, and flagged.
-        threads: of the kernels. Two are nearly twice as fast where two cores are idle, and stall for milliseconds
-            where they are not.
+        threads: number of threads of the kernels. Two are nearly twice as fast where two cores are idle, and stall for
+            milliseconds where they are not.
 
     Raises:
         InvalidInput: no such weights, or threads below 1.

@@ -30,9 +30,9 @@ class Pix2PixUNet(nn.Module):
     steps to be better than zero. 512 texels and width 64 make 66,992,515 parameters.
 
     Args:
-        size: of the images, a power of two from 32 on.
+        size: width of the images [texels], a power of two from 32 on.
         width: channels of the first level; they double up to 8 times as many.
-        dropout: in training, on the way up.
+        dropout: share that is dropped in training, on the way up [-].
 
     Raises:
         InvalidInput: a size that is no such power of two, or width below 1.

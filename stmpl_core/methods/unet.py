@@ -32,7 +32,7 @@ class Seen(BaseModel):
     """What a network was trained on: ranges over its samples.
 
     Args:
-        kind: of load, as the data set calls it.
+        kind: kind of load, as the data set calls it.
         peak_ratio: largest p / E [-].
         thickness: [m].
         poisson_ratio: [-].
@@ -54,7 +54,7 @@ class UNetCard(BaseModel):
     """The JSON beside a network's weights: what it needs to run, what it has seen, how far it erred, what made it.
 
     Args:
-        size, width: of Pix2PixUNet.
+        size, width: numbers of Pix2PixUNet.
         highest_force: force at a vertex that is drawn as 1, of skin with E = 1 kPa [N].
         seen: the training data.
         error_ratio: largest error at any vertex over (p / E) t, at the 95 % quantile of held-out contacts [-].
@@ -82,7 +82,7 @@ class UNet:
 
     Args:
         path: a .safetensors file with its .json card beside it; None: the weights that come with stmpl.
-        device: where torch runs, "cpu" or "cuda".
+        device: device of torch, "cpu" or "cuda".
 
     Raises:
         InvalidInput: no weights there, or a card that does not fit them.

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 import trimesh
 
-from fem_tools.sampling import rounded_tool
 from fem_tools.scenes import extruded, frame, letter
+from fem_tools.tool_shapes import rounded_tool
 from stmpl_core.arrays import Points, Transform
 from stmpl_core.errors import InvalidInput
 from stmpl_core.layer import SoftLayer

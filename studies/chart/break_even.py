@@ -22,10 +22,10 @@ class BreakEven:
     """One panel.
 
     Args:
-        scene, ratio: of the panel.
+        scene, ratio: panel, by its scene and its p / E.
         network: the network's point.
         solver: the cheapest finite elements with no larger an error; None if none of the chart reach it.
-        solves: after which the network is ahead; infinite if it never is, NaN without a solver.
+        solves: number of solves after which the network is ahead; infinite if it never is, NaN without a solver.
     """
 
     scene: str

@@ -25,10 +25,10 @@ class Curve:
     """One method.
 
     Args:
-        name: for the legend.
-        knob: what is swept.
+        name: name in the legend.
+        knob: name of what is swept.
         steps: value of the knob, for a person, and what makes the method.
-        fast: whether a solve takes milliseconds, so that many are timed.
+        fast: solves that take milliseconds, so that many are timed; or not.
         extra: a package that it needs beyond ours.
     """
 

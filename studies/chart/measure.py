@@ -37,8 +37,8 @@ class Preset:
     """How much is measured.
 
     Args:
-        edge_length: of the skin [m].
-        part: of the body.
+        edge_length: edge length of the skin [m].
+        part: part of the body.
         ratios: highest p / E of each row of panels.
         scenes: names out of SCENES.
         seconds: spent on timing each fast point.
@@ -62,15 +62,15 @@ class Point:
     """One step of one curve on one scene; errors as shares of the largest true displacement.
 
     Args:
-        curve, knob: which method at which value of its knob.
-        scene, ratio: which load, at which highest p / E.
+        curve, knob: method, and value of its knob.
+        scene, ratio: load, and its highest p / E [-].
         seconds, slow: median and 99th percentile of a solve [s]; the latter NaN for fewer than 100 solves.
         error: mean over the vertices that move more than a tenth of the peak [-].
         contact: mean under the load [-].
-        peak: signed, at the peak [-].
+        peak: signed error at the peak [-].
         far: largest answer beyond 8 thicknesses [-].
         mee: the paper's mean over all that moves [-].
-        largest: at any vertex [-].
+        largest: largest error at any vertex [-].
         converged, in_range: the answer's own flags.
         why: its own words; or why it failed.
         failed: there is no answer, or one that did not converge.
@@ -160,9 +160,9 @@ def measure(preset: Preset, curves: Sequence[Curve] = CURVES, *, reference: Patc
     Args:
         preset: scenes and layer.
         curves: methods; those whose packages are not installed are left out, and named in `about`.
-        reference: that judges; quadratic wedges at half the mesh width, two deep, unless given.
+        reference: method that judges; quadratic wedges at half the mesh width, two deep, unless given.
         parts: folder for what is done; a run that was stopped goes on from there. Empty it when a method has changed.
-        on_progress: called after each point.
+        on_progress: function that is called after each point.
     """
     from threadpoolctl import threadpool_limits
 

@@ -50,10 +50,10 @@ class FelupeHex(PatchPeer):
 
     Args:
         element: "hex8" (FElupe's plain choice), "hex20" or "hex27".
-        layers, refine, reach: see PatchPeer; `layers` hexahedra through the thickness, thinner near the skin.
-        increments: of the load; one that fails is halved.
-        tolerance: of newtonraphson, relative to the forces on held nodes.
-        max_iterations: of newtonraphson in each increment.
+        layers, refine, reach: mesh, see PatchPeer; `layers` hexahedra through the thickness, thinner near the skin.
+        increments: number of increments of the load; one that fails is halved.
+        tolerance: tolerance of newtonraphson, relative to the forces on held nodes [-].
+        max_iterations: most iterations of newtonraphson in each increment.
         solver: "scipy", FElupe's default (SuperLU), or "pypardiso", which its documentation recommends for speed
             (pip install pypardiso; brings Intel's MKL).
     """
@@ -165,8 +165,8 @@ def quadrilaterals(triangles: np.ndarray, n: int, rim: np.ndarray) -> tuple[np.n
     """Cuts each triangle in three at its centroid and the middles of its edges.
 
     Args:
-        triangles: (T, 3).
-        n: how many vertices they name.
+        triangles: corners of the triangles, (T, 3).
+        n: number of vertices that they name.
         rim: mask of the vertices that are held, (n,).
 
     Returns:

@@ -58,7 +58,7 @@ class MujocoFlex(PatchPeer):
 
     Args:
         material: "stvk", MuJoCo's default, or "snh".
-        layers, refine, reach: see PatchPeer; each wedge becomes three tetrahedra.
+        layers, refine, reach: mesh, see PatchPeer; each wedge becomes three tetrahedra.
         timestep: [s]; 1 to 4 ms is what the guide calls typical, longer ones settle in fewer steps.
         damping: Rayleigh's coefficient of the stiffness [s].
         rest: unbalanced force over the load's at which it counts as at rest [-].

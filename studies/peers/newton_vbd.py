@@ -42,9 +42,9 @@ class NewtonVbd(PatchPeer):
     The solver reports no residual; the forces of the same energy are summed here in double precision.
 
     Args:
-        layers, refine, reach: see PatchPeer; each wedge becomes three tetrahedra.
+        layers, refine, reach: mesh, see PatchPeer; each wedge becomes three tetrahedra.
         timestep: [s].
-        iterations: of each step.
+        iterations: number of iterations of each step.
         damping: viscosity over Young's modulus [s]; a fifth of MuJoCo's, because unfinished iterations damp as well.
         rest: unbalanced force over the load's at which it counts as at rest [-].
         max_steps: then it stops, and says that it does not rest.

@@ -24,7 +24,7 @@ class TetPatch:
     """The patch around a load as linear tetrahedra; level k of the nodes is [k N, (k + 1) N), level 0 the skin.
 
     Attributes:
-        patch: where it lies on the layer; its first vertices are the layer's.
+        patch: patch of the layer, whose vertices are its first.
         tets: wedges cut in three.
         held: nodes on the core and on the patch's rim, (N,).
     """
@@ -52,8 +52,8 @@ class SkinForces:
     """What a load presses with on the nodes of the skin.
 
     Attributes:
-        load: on the layer, for what its kind asks.
-        pressure: at the corners of the patch's triangles, (N,) [Pa].
+        load: load on the layer, for what its kind asks.
+        pressure: pressure at the corners of the patch's triangles, (N,) [Pa].
         pressing: the load on the patch, as PatchFem has it.
     """
 
@@ -97,8 +97,8 @@ class PatchPeer(ABC):
 
     Args:
         layers: elements through the thickness.
-        refine: how often the skin triangles near the load are split in four.
-        reach: how far the patch extends beyond the load, in largest thicknesses; its rim is held.
+        refine: number of times that the skin triangles near the load are split in four.
+        reach: width of the patch beyond the load [largest thicknesses]; its rim is held.
     """
 
     name: str = "peer"

@@ -106,11 +106,11 @@ def stability(methods: Mapping[str, Make], preset: Preset, out: Path | None = No
     """Runs a preset on every method.
 
     Args:
-        methods: what makes a fresh method, by its name (studies.stability.methods.maker).
-        preset: what is swept.
+        methods: functions that make a fresh method, by its name (studies.stability.methods.maker).
+        preset: preset of the sweeps.
         out: folder for report.json and failures/; nothing is written unless given.
-        patience: for the repetitions of one trial [s of processor time].
-        on_progress: called before each trial of each method.
+        patience: time for the repetitions of one trial [s of processor time].
+        on_progress: function that is called before each trial of each method.
 
     Raises:
         InvalidInput: a preset with an axis that does not exist, or whose skin cannot be made.

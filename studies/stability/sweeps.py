@@ -29,10 +29,10 @@ class Preset:
     """What is swept, and how finely.
 
     Args:
-        edge_length: of the skin's mesh [m].
-        body: press on the left arm of the Anny body; otherwise on a round limb.
-        levels: of each axis, from easy to hard; an axis without levels is left out.
-        seed: of the noise.
+        edge_length: edge length of the skin's mesh [m].
+        body: limb that is pressed: True, the left arm of the Anny body; False, a round limb.
+        levels: levels of each axis, from easy to hard; an axis without levels is left out.
+        seed: seed of the noise.
     """
 
     edge_length: float = 6e-3
@@ -78,8 +78,8 @@ class Stage:
     """The skin that is pressed, and where.
 
     Args:
-        mesh: of the skin.
-        seed: of the noise.
+        mesh: mesh of the skin.
+        seed: seed of the noise.
     """
 
     mesh: Mesh

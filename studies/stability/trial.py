@@ -19,11 +19,11 @@ class Mesh:
     """What a SoftLayer is made of; `layer` makes it, and raises what SoftLayer raises.
 
     Args:
-        vertices: (V, 3) [m].
-        faces: (F, 3).
-        thickness: (V,) [m].
-        tissue: of the layer.
-        uv: of each corner, (F, 3, 2) [-].
+        vertices: vertices of the skin, (V, 3) [m].
+        faces: faces of the skin, (F, 3).
+        thickness: thickness of the layer, (V,) [m].
+        tissue: tissue of the layer.
+        uv: chart's coordinates of each corner, (F, 3, 2) [-].
     """
 
     vertices: Points
@@ -66,10 +66,10 @@ class Twin:
     """The same scene, seen otherwise: its answer must be `scale turn u` at the vertices that are the same.
 
     Args:
-        scene: with as many loads as the scene that it is compared with.
+        scene: scene with as many loads as the one that it is compared with.
         pairs: number of each common vertex in the first scene and in this one, (N, 2).
         turn: rotation or reflection, (3, 3).
-        scale: of lengths.
+        scale: scale of lengths [-].
         may_refuse: refusing the scene with an error that says why is right as well.
     """
 
@@ -86,11 +86,11 @@ class Trial:
 
     Args:
         axis: its name.
-        level: where on the axis, with its unit, for a person.
+        level: place on the axis, with its unit, for a person.
         laws: names of the laws that must hold (studies.stability.laws).
-        scene: what is asked.
-        twin: what the answer is compared with.
-        rounds: how often the scene's loads are asked for before the answers of the last round are judged.
+        scene: scene that is asked.
+        twin: scene that the answer is compared with.
+        rounds: number of times that the scene's loads are asked for before the answers of the last round are judged.
     """
 
     axis: str
