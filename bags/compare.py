@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Protocol, Self
 
 from bags.messages import Frame
+from bags.provenance import allowance
 from bags.survey import PRESSING, Moment, Survey, survey
 from stmpl_core.arrays import PerVertex
 from stmpl_core.contact import Contact
@@ -43,6 +44,7 @@ class FramePair:
     """One frame, answered by both sides: under the same pressure, or with the same tools where they press.
 
     Args:
+        number: place of the frame in the run, from 0.
         frame: as recorded.
         layer: that both sides answer for.
         time: since the first answer [s].
@@ -53,6 +55,7 @@ class FramePair:
         score: of ours against the reference.
     """
 
+    number: int
     frame: Frame
     layer: SoftLayer
     time: float
@@ -78,6 +81,7 @@ class Comparison:
         pairs: the sampled frames, in the order of time.
         failed: sampled frames that the reference could not solve, with its reason, by sequence number.
         tolerance: allowed mean error under the contact, in the worst frame [m]; None: no verdict is asked for.
+        reason: why this tolerance, where nobody gave one.
     """
 
     run: Survey
@@ -86,6 +90,7 @@ class Comparison:
     pairs: tuple[FramePair, ...]
     failed: dict[int, str]
     tolerance: float | None
+    reason: str = ""
 
     @property
     def judged(self) -> tuple[FramePair, ...]:
@@ -124,12 +129,13 @@ class Comparison:
         sentence = (f"{self.method} against {self.reference} on {len(self.judged)} frames: at most "
                     f"{self.worst_under_contact * 1e3:.3f} mm on average under the contact")
         if self.tolerance is not None:
-            sentence += f", allowed {self.tolerance * 1e3:.3f} mm: {'passed' if self.passed else 'failed'}"
+            why = f" ({self.reason})" if self.reason else ""
+            sentence += f", allowed {self.tolerance * 1e3:.4g} mm{why}: {'passed' if self.passed else 'failed'}"
         return sentence + (f"; {skipped} frames could not be judged." if skipped else ".")
 
 
 def compare_run(
-    path: Path | str,
+    run: Path | str | Survey,
     reference: Method | Presser,
     *,
     frames: int = 12,
@@ -146,7 +152,7 @@ def compare_run(
     over the loaded part of the run.
 
     Args:
-        path: the recording.
+        run: the recording: its folder, its .mcap file, or what a survey of it gave.
         reference: judges; it is prepared here.
         frames: how many to sample, >= 1.
         method: judged under the same pressures; None judges the recorded answers.
@@ -156,7 +162,7 @@ def compare_run(
     Raises:
         BagError: the run holds no answers, no loaded frame, or no pressures.
     """
-    run = survey(path)
+    run = run if isinstance(run, Survey) else survey(run)
     judge = _presser(reference, run) if hasattr(reference, "press") else _solver(reference, run)  # type: ignore[arg-type]
     judged = _recorded if method is None else _solver(method, run)
     names = (run.method if method is None else method.name, reference.name)
@@ -164,32 +170,42 @@ def compare_run(
 
 
 def compare_bags(
-    path: Path | str, reference: Path | str, *, frames: int = 12, tolerance: float | None = None
+    run: Path | str | Survey, other: Path | str | Survey, *, frames: int = 12, tolerance: float | None = None
 ) -> Comparison:
     """Compares the answers of one bag with those that another gives at the same stamps.
+
+    Args:
+        run: the recording that is judged.
+        other: the recording that judges.
+        frames: how many to sample, >= 1.
+        tolerance: allowed mean error under the contact in the worst frame [m]. Unless given, two recordings of one
+            method are held to each other: exactly where one processor made both, else to OTHER_PROCESSOR; two methods
+            are not.
 
     Raises:
         BagError: different skins, or no stamp in common.
     """
-    run, other = survey(path), survey(reference)
-    stamps = {moment.stamp_ns for moment in other.moments}
-    common = [moment for moment in run.moments if moment.stamp_ns in stamps]
+    run, other = (one if isinstance(one, Survey) else survey(one) for one in (run, other))
+    theirs = {moment.stamp_ns: moment.number for moment in other.moments}
+    common = [moment for moment in run.moments if moment.stamp_ns in theirs]
     if not common:
         raise BagError(f"{run.bag.file} and {other.bag.file} answer no common stamp. Compare a run with its replay.")
     picks = sample(common, frames)
-    wanted = {moment.stamp_ns for moment in common if moment.sequence in picks}
-    answers = {frame.stamp_ns: _recorded(frame) for frame in other.bag.frames() if frame.stamp_ns in wanted}
-    for frame in (frame for frame in run.bag.frames() if frame.sequence in picks):
+    numbers = [theirs[moment.stamp_ns] for moment in picks]
+    answers = {frame.stamp_ns: _recorded(frame) for frame in other.bag.frames(sorted(numbers))}
+    for frame in run.bag.frames(moment.number for moment in picks):
         moved = len(answers[frame.stamp_ns].displacement)
         if moved != len(frame.displacement):
             raise BagError(f"{run.bag.file} moves {len(frame.displacement)} vertices, {other.bag.file} {moved}; "
                            "answers can be compared on one skin only.")  # fmt: skip
-    names = (run.method, f"{other.method} of {other.bag.file.parent.name}")
-    return _compare(run, picks, names, _recorded, lambda frame: answers[frame.stamp_ns], tolerance, None)
+    names, reason = (run.method, f"{other.method} of {other.bag.file.parent.name}"), ""
+    if tolerance is None and run.method == other.method:
+        tolerance, reason = allowance(run.bag.provenance.processor, other.bag.provenance.processor)
+    return _compare(run, picks, names, _recorded, lambda frame: answers[frame.stamp_ns], tolerance, None, reason)
 
 
-def sample(moments: list[Moment] | tuple[Moment, ...], frames: int) -> list[int]:
-    """Sequence numbers of a sample of the loaded moments, in order.
+def sample(moments: Sequence[Moment], frames: int) -> list[Moment]:
+    """A sample of the loaded moments, in order.
 
     Always there are the largest load and, if any, the largest load under two or more tools.
 
@@ -199,46 +215,45 @@ def sample(moments: list[Moment] | tuple[Moment, ...], frames: int) -> list[int]
     loaded = [moment for moment in moments if moment.load > 0]
     if not loaded:
         raise BagError(f"nothing pressed on the skin in any of {len(moments)} answers, so there is nothing to compare.")
-    chosen = {max(loaded, key=lambda moment: moment.load).sequence}
+    chosen = {max(loaded, key=lambda moment: moment.load)}
     several = [moment for moment in loaded if moment.pressing > 1]
     if several:
-        chosen.add(max(several, key=lambda moment: moment.load).sequence)
-    rest = [moment.sequence for moment in loaded if moment.sequence not in chosen]
+        chosen.add(max(several, key=lambda moment: moment.load))
+    rest = [moment for moment in loaded if moment not in chosen]
     more = min(max(frames - len(chosen), 0), len(rest))
     chosen |= {rest[int((k + 0.5) * len(rest) / more)] for k in range(more)}
-    return [moment.sequence for moment in loaded if moment.sequence in chosen]
+    return sorted(chosen, key=lambda moment: moment.number)
 
 
 def _compare(
     run: Survey,
-    picks: list[int],
+    picks: list[Moment],
     names: tuple[str, str],
     ours: Answer,
     reference: Answer,
     tolerance: float | None,
     on_frame: Callable[[int, int], None] | None,
+    reason: str = "",
 ) -> Comparison:
     pairs: list[FramePair] = []
     failed: dict[int, str] = {}
-    moments = {moment.sequence: moment for moment in run.moments}
-    wanted = set(picks)
-    for frame in run.bag.frames():
-        if frame.sequence not in wanted:
-            continue
+    frames = run.bag.frames(moment.number for moment in picks)
+    for done, (moment, frame) in enumerate(zip(picks, frames, strict=True)):
         if on_frame:
-            on_frame(len(pairs) + len(failed), len(picks))
+            on_frame(done, len(picks))
         try:
-            pairs.append(_pair(run, moments[frame.sequence], frame, ours(frame), reference(frame)))
+            pairs.append(_pair(run, moment, frame, ours(frame), reference(frame)))
         except StmplError as error:
             log.warning("frame %d cannot be compared: %s", frame.sequence, error)
             failed[frame.sequence] = str(error)
-    return Comparison(run, *names, tuple(pairs), failed, tolerance)
+    return Comparison(run, *names, tuple(pairs), failed, tolerance, reason)
 
 
 def _pair(run: Survey, moment: Moment, frame: Frame, ours: Displacement, reference: Displacement) -> FramePair:
     layer = run.bag.layer_of(frame)
     figures = score(ours.displacement, reference.displacement, layer, _load(frame))
-    return FramePair(frame, layer, moment.time, moment.load, tuple(run.contacts.at(frame)), ours, reference, figures)
+    contacts = tuple(run.bag.contacts(frame))
+    return FramePair(moment.number, frame, layer, moment.time, moment.load, contacts, ours, reference, figures)
 
 
 def _solver(method: Method, run: Survey) -> Answer:
@@ -250,7 +265,7 @@ def _presser(reference: Presser, run: Survey) -> Answer:
     ready = _prepared(reference, run)
 
     def answer(frame: Frame) -> Displacement:
-        pressing = [c for c in run.contacts.at(frame) if frame.statuses[c.name] in PRESSING]
+        pressing = [c for c in run.bag.contacts(frame) if frame.statuses[c.name] in PRESSING]
         return ready(frame).press(pressing, _load(frame).values, frame.trust.figures)
 
     return answer

@@ -18,10 +18,10 @@ import numba
 import numpy as np
 import trimesh
 
-from fem_tools.provenance import machine
 from stmpl_core import Contact, SoftLayer, ToolMesh
 from stmpl_core.body import Body
 from stmpl_core.haptics import DeviceLoop, LocalContact, LoopSettings, local_contact
+from stmpl_core.provenance import machine
 from stmpl_core.sdf import SignedDistance
 from stmpl_core.touch import Toucher
 

@@ -31,8 +31,8 @@ from stmpl_msgs.msg import ContactMesh, LocalContact, SkinDisplacement, SkinTopo
 from stmpl_msgs.srv import SetBody
 
 from bags.messages import layer_from, stamp_ns
-from fem_tools.provenance import machine
 from stmpl_core.layer import SoftLayer
+from stmpl_core.provenance import machine
 from stmpl_ros.conversions import mesh_message, pose_message, wrench_message
 from stmpl_ros.scripts import PRESS, Motion
 from stmpl_ros.spinning import spin

@@ -102,7 +102,7 @@ def complaints(folder: Path, comparison: Comparison, replay: ReplaySummary) -> I
         yield f"contacts came at {timing.instant_rate:.0f} Hz; at least {LEAST_RATE:g} Hz was asked for"
     if timing.kept < LEAST_KEPT:
         yield f"{100 * timing.kept:.0f} % of the contacts were answered; at least {100 * LEAST_KEPT:g} % should be"
-    if replay.identical < replay.frames:
+    if not replay.passed:
         yield str(replay)
     if not comparison.passed:
         yield comparison.verdict

@@ -12,12 +12,13 @@ from rich.table import Table
 from bags.compare import Comparison, Presser, compare_run
 from bags.reader import Bag
 from bags.report import headline
+from bags.survey import Survey
 from stmpl_core.methods.base import Method
 from stmpl_core.metrics import mean_and_deviation
 
 
 def compare_with_progress(
-    path: Path, reference: Method | Presser, frames: int, *, method: Method | None = None, quiet: bool = False
+    run: Path | Survey, reference: Method | Presser, frames: int, *, method: Method | None = None, quiet: bool = False
 ) -> Comparison:
     """bags.compare.compare_run under a progress bar on stderr. Raises BagError."""
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
@@ -27,7 +28,7 @@ def compare_with_progress(
         def show(done: int, total: int) -> None:
             progress.update(task, completed=done, total=total)
 
-        return compare_run(path, reference, frames=frames, method=method, on_frame=show)
+        return compare_run(run, reference, frames=frames, method=method, on_frame=show)
 
 
 def figures_of(comparison: Comparison) -> dict[str, Any]:
@@ -37,6 +38,8 @@ def figures_of(comparison: Comparison) -> dict[str, Any]:
         "method": comparison.method,
         "reference": comparison.reference,
         "passed": comparison.passed,
+        "tolerance": comparison.tolerance,
+        "reason": comparison.reason,
         "answers": timing.answers,
         "instants": timing.instants,
         "skipped": timing.skipped,
@@ -84,6 +87,7 @@ def bag_figures(bag: Bag) -> dict[str, Any]:
         "damage": [vars(damage) for damage in bag.damage],
         "method": bag.provenance.method,
         "versions": dict(bag.provenance.versions),
+        "namespaces": bag.namespaces,
         "topics": {topic.name: topic._asdict() for topic in bag.topics.values()},
     }
 
@@ -99,5 +103,7 @@ def bag_table(bag: Bag) -> Table:
         seconds = (topic.last_ns - topic.first_ns) / 1e9
         rate = f"{(topic.messages - 1) / seconds:.1f}" if seconds > 0 else ""
         table.add_row(topic.name, topic.type_name, f"{topic.messages:,}", f"{seconds:.2f}", rate)
-    table.caption = f"{'finished' if bag.finished else 'not finished by its writer'}, {len(bag.damage)} places damaged"
+    robots = f"{len(bag.namespaces)} robots: {', '.join(bag.namespaces)}; " if len(bag.namespaces) > 1 else ""
+    state = "finished" if bag.finished else "not finished by its writer"
+    table.caption = f"{robots}{state}, {len(bag.damage)} places damaged"
     return table

@@ -13,9 +13,8 @@ import torch
 from pydantic import BaseModel, ConfigDict, Field
 from torch import Tensor
 
-from fem_tools.dataset import Dataset, Sample, Subset
+from fem_tools.dataset import Dataset, Sample, Subset, data_card
 from fem_tools.indenter import Tool
-from fem_tools.provenance import commit, data_card, machine, versions
 from fem_tools.sampling import tool_scene
 from fem_tools.scenes import Site
 from stmpl_core.arrays import Transform
@@ -24,6 +23,7 @@ from stmpl_core.contact_net import MOST, OUTPUTS, ContactNet
 from stmpl_core.errors import InvalidInput
 from stmpl_core.methods.moment_net import Weights
 from stmpl_core.moments import Surroundings
+from stmpl_core.provenance import commit, machine, versions
 from stmpl_core.sdf import SignedDistance
 from studies.train_moments import VERSIONS, Model, OnProgress
 

@@ -13,8 +13,7 @@ import torch
 from pydantic import BaseModel, ConfigDict, Field
 from torch import Tensor, nn
 
-from fem_tools.dataset import LOADS, Dataset
-from fem_tools.provenance import commit, data_card, machine, versions
+from fem_tools.dataset import LOADS, Dataset, data_card
 from fem_tools.sampling import Kind
 from stmpl_core.layer import SoftLayer
 from stmpl_core.load import Load
@@ -31,6 +30,7 @@ from stmpl_core.methods.moment_net import (
     source_fields,
 )
 from stmpl_core.moments import SCALARS, TENSORS, VECTORS, WIDTH, Surroundings
+from stmpl_core.provenance import commit, machine, versions
 
 VERSIONS = ("stmpl", "torch", "numpy", "numba", "safetensors")
 ROW = 2 * WIDTH + 9  # of a point: what it feels of both fields, curvature, slope, both fields here, nu, dead or not
