@@ -17,10 +17,13 @@ from stmpl_core.errors import BagError, StmplError
 from stmpl_core.layer import SoftLayer
 from stmpl_core.load import Load
 from stmpl_core.methods.base import Method
-from stmpl_core.metrics import Score, score
+from stmpl_core.metrics import Score, mean_and_deviation, score
 from stmpl_core.trust import Displacement
 
 log = logging.getLogger(__name__)
+
+PEAKS = {"peak mm": "largest displacement of the reference (peak) mm", "at peak mm": "error at the peak mm",
+         "at peak %": "error at the peak, of the peak's displacement %"}  # fmt: skip
 
 Answer = Callable[[Frame], Displacement]  # how one side of a comparison answers a frame
 
@@ -223,6 +226,35 @@ def sample(moments: Sequence[Moment], frames: int) -> list[Moment]:
     more = min(max(frames - len(chosen), 0), len(rest))
     chosen |= {rest[int((k + 0.5) * len(rest) / more)] for k in range(more)}
     return sorted(chosen, key=lambda moment: moment.number)
+
+
+def headline(comparison: Comparison) -> list[tuple[str, str]]:
+    """What is measured, and its value with unit: the rows of a comparison's table."""
+    timing, moments = comparison.run.timing, comparison.run.moments
+    largest = max((moment.load for moment in moments if moment.load >= 0), default=float("nan"))
+    rows = [
+        ("method", comparison.method),
+        ("reference", comparison.reference),
+        ("contact instants", f"{timing.instants} at {timing.instant_rate:.1f} Hz"),
+        ("answers", f"{timing.answers} at {timing.answer_rate:.1f} Hz"),
+        ("rate kept", f"{100 * timing.kept:.2f} % ({timing.skipped} instants overtaken by newer ones)"),
+        ("answers lost", f"{timing.lost}"),
+        ("latency, median", f"{1e3 * timing.latency(50):.2f} ms"),
+        ("latency, 99 %", f"{1e3 * timing.latency(99):.2f} ms"),
+        ("largest load on the skin", f"{largest:.3f} N"),
+        ("frames compared", f"{len(comparison.judged)} of {len(comparison.pairs) + len(comparison.failed)} sampled"),
+    ]
+    if not comparison.judged:
+        return rows
+    mean, deviation = mean_and_deviation([pair.score for pair in comparison.judged])
+    pairs = zip(mean.row().items(), deviation.row().values(), strict=True)
+    return rows + [_figure_row(PEAKS.get(name, name), value, spread) for (name, value), spread in pairs]
+
+
+def _figure_row(name: str, value: float, spread: float) -> tuple[str, str]:
+    label, unit = name.rsplit(" ", 1)
+    digits = 1 if unit == "%" else 4
+    return (label, f"{value:.{digits}f} ± {spread:.{digits}f} {unit}")
 
 
 def _compare(

@@ -28,7 +28,7 @@ class Moment:
         load: that presses on the skin in all, sum of pressure times area [N]; NaN where the pressure is not known.
         peak: largest displacement [m].
         pressing: number of tools that load the skin.
-        converged, in_range: the answer's own flags.
+        converged, in_range, why: the answer's own flags, and its reason for them.
         solve_seconds: that the node spent on it [s].
         latency: from the last contact message that it answers to itself, by the recorder's clock [s]; NaN: unknown.
     """
@@ -42,6 +42,7 @@ class Moment:
     pressing: int
     converged: bool
     in_range: bool
+    why: str
     solve_seconds: float
     latency: float
 
@@ -139,6 +140,7 @@ def _moment(number: int, frame: Frame, first_ns: int, layer: SoftLayer | None) -
         pressing=sum(status in PRESSING for status in frame.statuses.values()),
         converged=frame.trust.converged,
         in_range=frame.trust.in_range,
+        why=frame.trust.why,
         solve_seconds=frame.solve_seconds,
         latency=float("nan"),
     )

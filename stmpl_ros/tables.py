@@ -3,24 +3,26 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
-from bags.compare import Comparison, Presser, compare_run
-from bags.reader import Bag
-from bags.report import headline
-from bags.survey import Survey
-from stmpl_core.methods.base import Method
-from stmpl_core.metrics import mean_and_deviation
+if TYPE_CHECKING:
+    from bags.compare import Comparison, Presser
+    from bags.reader import Bag
+    from bags.survey import Survey
+    from stmpl_core.methods.base import Method
 
 
 def compare_with_progress(
     run: Path | Survey, reference: Method | Presser, frames: int, *, method: Method | None = None, quiet: bool = False
 ) -> Comparison:
     """bags.compare.compare_run under a progress bar on stderr. Raises BagError."""
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+    from bags.compare import compare_run
+
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     with Progress(*columns, console=Console(stderr=True), disable=quiet, transient=True) as progress:
         task = progress.add_task(f"frames solved by {reference.name}", total=frames)
@@ -33,6 +35,8 @@ def compare_with_progress(
 
 def figures_of(comparison: Comparison) -> dict[str, Any]:
     """All figures of a comparison, for machines: lengths in metres, times in seconds."""
+    from stmpl_core.metrics import mean_and_deviation
+
     timing = comparison.run.timing
     figures = {
         "method": comparison.method,
@@ -58,6 +62,8 @@ def figures_of(comparison: Comparison) -> dict[str, Any]:
 
 def comparison_table(comparison: Comparison) -> Table:
     """All figures of a comparison, for people."""
+    from bags.compare import headline
+
     table = Table(show_header=False, title="the run", title_justify="left", caption_justify="left")
     table.add_column()
     table.add_column(justify="right")

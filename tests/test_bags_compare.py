@@ -8,12 +8,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from bags.compare import compare_bags, compare_run, sample
+from bags.compare import compare_bags, compare_run, headline, sample
 from bags.messages import layer_id
 from bags.provenance import write_provenance
 from bags.reader import Bag
 from bags.replay import replay_run
-from bags.report import headline, write_report
+from bags.report import write_report
 from bags.survey import survey
 from bags.writer import BagWriter
 from stmpl_core.errors import BagError
