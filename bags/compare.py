@@ -129,8 +129,9 @@ class Comparison:
     def verdict(self) -> str:
         """One sentence: what was compared, measured and allowed."""
         skipped = len(self.failed) + len(self.pairs) - len(self.judged)
+        digits = 3 if self.tolerance is None or self.tolerance > 1e-6 else 7
         sentence = (f"{self.method} against {self.reference} on {len(self.judged)} frames: at most "
-                    f"{self.worst_under_contact * 1e3:.3f} mm on average under the contact")
+                    f"{self.worst_under_contact * 1e3:.{digits}f} mm on average under the contact")
         if self.tolerance is not None:
             why = f" ({self.reason})" if self.reason else ""
             sentence += f", allowed {self.tolerance * 1e3:.4g} mm{why}: {'passed' if self.passed else 'failed'}"
@@ -203,7 +204,7 @@ def compare_bags(
                            "answers can be compared on one skin only.")  # fmt: skip
     names, reason = (run.method, f"{other.method} of {other.bag.file.parent.name}"), ""
     if tolerance is None and run.method == other.method:
-        tolerance, reason = allowance(run.bag.provenance.processor, other.bag.provenance.processor)
+        tolerance, reason = allowance(other.bag.provenance.processor, run.bag.provenance.processor)
     return _compare(run, picks, names, _recorded, lambda frame: answers[frame.stamp_ns], tolerance, None, reason)
 
 

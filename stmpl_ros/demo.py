@@ -20,6 +20,7 @@ from bags.compare import Comparison
 from bags.provenance import versions
 from bags.replay import ReplaySummary, replay_run
 from bags.report import write_report
+from bags.writer import FILE
 from fem_tools import RigidFem
 from stmpl_core.errors import StmplError
 from stmpl_ros.parameters import METHODS, DemoConfig, ProbeConfig
@@ -90,7 +91,7 @@ def play(config: DemoConfig, folder: Path, console: Console) -> None:
 
 def complaints(folder: Path, comparison: Comparison, replay: ReplaySummary) -> Iterator[str]:
     """What of a run is missing or not sane, one sentence each."""
-    for name in ("run.mcap", "metadata.yaml", "report.html", "config.json"):
+    for name in (FILE, "metadata.yaml", "report.html", "config.json"):
         path = folder / name
         if not path.is_file() or not path.stat().st_size:
             yield f"{path} is missing or empty"

@@ -83,6 +83,7 @@ def profile(offer: Offered) -> QoSProfile:
         depth=offer.depth if offer.transient_local else max(offer.depth, DEPTH),
         reliability=ReliabilityPolicy.RELIABLE if offer.reliable else ReliabilityPolicy.BEST_EFFORT,
         durability=DurabilityPolicy.TRANSIENT_LOCAL if offer.transient_local else DurabilityPolicy.VOLATILE,
+        liveliness_lease_duration=Duration(seconds=offer.lease),  # 0: never
     )
 
 

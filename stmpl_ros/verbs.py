@@ -211,7 +211,7 @@ def info(path: BagPath, as_json: Json = False) -> int:
 def recover(path: BagPath, target: Path | None = None) -> int:
     """Brings back what is sound in a recording that was not finished.
 
-    Example: stmpl recover runs/broken/run.mcap --target runs/mended
+    Example: stmpl recover runs/broken/run_0.mcap --target runs/mended
 
     Args:
         path: a run's folder, or its .mcap file.

@@ -20,6 +20,7 @@ from std_msgs.msg import Header, String
 
 from bags.reader import Bag
 from bags.recover import recover
+from bags.writer import FILE
 from stmpl_ros.topics import STREAM
 
 PATIENCE = 60.0  # s to wait for anything; only a failing test waits so long
@@ -121,7 +122,7 @@ def test_what_cannot_be_published_is_refused(run):
 
 def test_a_killed_recorder_loses_what_it_had_not_flushed_only(talker, tmp_path):
     recorder = start("record", "--path", str(tmp_path / "run"), "--topics", "/any/words")
-    file, sizes = tmp_path / "run" / "run.mcap", set()
+    file, sizes = tmp_path / "run" / FILE, set()
     try:
         talker.wait_for_recorder(talker.words)
         for number in itertools.count():
