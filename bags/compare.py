@@ -9,17 +9,21 @@ from pathlib import Path
 from typing import Protocol, Self
 
 from bags.frame import Frame
+from bags.provenance import allowance
 from bags.survey import Moment, Survey, survey
 from stmpl_core.contact import Contact
 from stmpl_core.errors import BagError, StmplError
 from stmpl_core.layer import SoftLayer
 from stmpl_core.load import Load
 from stmpl_core.methods.base import Method
-from stmpl_core.metrics import Score, score
+from stmpl_core.metrics import Score, mean_and_deviation, score
 from stmpl_core.touch import Answer
 from stmpl_core.trust import Displacement
 
 log = logging.getLogger(__name__)
+
+PEAKS = {"peak mm": "largest displacement of the reference (peak) mm", "at peak mm": "error at the peak mm",
+         "at peak %": "error at the peak, of the peak's displacement %"}  # fmt: skip
 
 Side = Callable[[Frame], Displacement]  # how one side of a comparison answers a frame
 
@@ -43,6 +47,7 @@ class FramePair:
     """One frame, answered by both sides: under the same pressure, or with the same tools where they press.
 
     Args:
+        number: place of the frame in the run, from 0.
         frame: as recorded.
         layer: that both sides answer for.
         time: since the first answer [s].
@@ -53,6 +58,7 @@ class FramePair:
         score: of ours against the reference.
     """
 
+    number: int
     frame: Frame
     layer: SoftLayer
     time: float
@@ -78,6 +84,7 @@ class Comparison:
         pairs: the sampled frames, in the order of time.
         failed: sampled frames that the reference could not solve, with its reason, by sequence number.
         tolerance: allowed mean error under the contact, in the worst frame [m]; None: no verdict is asked for.
+        reason: why this tolerance, where nobody gave one.
     """
 
     run: Survey
@@ -86,6 +93,7 @@ class Comparison:
     pairs: tuple[FramePair, ...]
     failed: dict[int, str]
     tolerance: float | None
+    reason: str = ""
 
     @property
     def judged(self) -> tuple[FramePair, ...]:
@@ -121,15 +129,17 @@ class Comparison:
     def verdict(self) -> str:
         """One sentence: what was compared, measured and allowed."""
         skipped = len(self.failed) + len(self.pairs) - len(self.judged)
+        digits = 3 if self.tolerance is None or self.tolerance > 1e-6 else 7
         sentence = (f"{self.method} against {self.reference} on {len(self.judged)} frames: at most "
-                    f"{self.worst_under_contact * 1e3:.3f} mm on average under the contact")
+                    f"{self.worst_under_contact * 1e3:.{digits}f} mm on average under the contact")
         if self.tolerance is not None:
-            sentence += f", allowed {self.tolerance * 1e3:.3f} mm: {'passed' if self.passed else 'failed'}"
+            why = f" ({self.reason})" if self.reason else ""
+            sentence += f", allowed {self.tolerance * 1e3:.4g} mm{why}: {'passed' if self.passed else 'failed'}"
         return sentence + (f"; {skipped} frames could not be judged." if skipped else ".")
 
 
 def compare_run(
-    path: Path | str,
+    run: Path | str | Survey,
     reference: Method | Presser,
     *,
     frames: int = 12,
@@ -146,7 +156,7 @@ def compare_run(
     over the loaded part of the run.
 
     Args:
-        path: the recording.
+        run: the recording: its folder, its .mcap file, or what a survey of it gave.
         reference: judges; it is prepared here.
         frames: how many to sample, >= 1.
         method: judged under the same pressures; None judges the recorded answers.
@@ -156,7 +166,7 @@ def compare_run(
     Raises:
         BagError: the run holds no answers, no loaded frame, or no pressures.
     """
-    run = survey(path)
+    run = run if isinstance(run, Survey) else survey(run)
     judge = _presser(reference, run) if hasattr(reference, "press") else _solver(reference, run)  # type: ignore[arg-type]
     judged = (lambda frame: frame) if method is None else _solver(method, run)
     names = (run.method if method is None else method.name, reference.name)
@@ -164,32 +174,43 @@ def compare_run(
 
 
 def compare_bags(
-    path: Path | str, reference: Path | str, *, frames: int = 12, tolerance: float | None = None
+    run: Path | str | Survey, other: Path | str | Survey, *, frames: int = 12, tolerance: float | None = None
 ) -> Comparison:
     """Compares the answers of one bag with those that another gives at the same stamps.
+
+    Args:
+        run: the recording that is judged.
+        other: the recording that judges.
+        frames: how many to sample, >= 1.
+        tolerance: allowed mean error under the contact in the worst frame [m]. Unless given, two recordings of one
+            method are held to each other: exactly where one processor made both, else to OTHER_PROCESSOR; two methods
+            are not.
 
     Raises:
         BagError: different skins, or no stamp in common.
     """
-    run, other = survey(path), survey(reference)
-    stamps = {moment.stamp_ns for moment in other.moments}
-    common = [moment for moment in run.moments if moment.stamp_ns in stamps]
+    run, other = (one if isinstance(one, Survey) else survey(one) for one in (run, other))
+    theirs = {moment.stamp_ns: moment.number for moment in other.moments}
+    common = [moment for moment in run.moments if moment.stamp_ns in theirs]
     if not common:
         raise BagError(f"{run.bag.file} and {other.bag.file} answer no common stamp. Compare a run with its replay.")
     picks = sample(common, frames)
-    wanted = {moment.stamp_ns for moment in common if moment.sequence in picks}
-    answers = {frame.stamp_ns: frame for frame in other.bag.frames() if frame.stamp_ns in wanted}
-    for frame in (frame for frame in run.bag.frames() if frame.sequence in picks):
+    numbers = [theirs[moment.stamp_ns] for moment in picks]
+    answers = {frame.stamp_ns: frame for frame in other.bag.frames(sorted(numbers))}
+    for frame in run.bag.frames(moment.number for moment in picks):
         moved = len(answers[frame.stamp_ns].displacement)
         if moved != len(frame.displacement):
             raise BagError(f"{run.bag.file} moves {len(frame.displacement)} vertices, {other.bag.file} {moved}; "
                            "answers can be compared on one skin only.")  # fmt: skip
-    names = (run.method, f"{other.method} of {other.bag.file.parent.name}")
-    return _compare(run, picks, names, lambda frame: frame, lambda frame: answers[frame.stamp_ns], tolerance, None)
+    names, reason = (run.method, f"{other.method} of {other.bag.file.parent.name}"), ""
+    if tolerance is None and run.method == other.method:
+        tolerance, reason = allowance(other.bag.provenance.processor, run.bag.provenance.processor)
+    return _compare(run, picks, names, lambda frame: frame, lambda frame: answers[frame.stamp_ns], tolerance, None,
+                    reason)  # fmt: skip
 
 
-def sample(moments: list[Moment] | tuple[Moment, ...], frames: int) -> list[int]:
-    """Sequence numbers of a sample of the loaded moments, in order.
+def sample(moments: Sequence[Moment], frames: int) -> list[Moment]:
+    """A sample of the loaded moments, in order.
 
     Always there are the largest load and, if any, the largest load under two or more tools.
 
@@ -199,46 +220,74 @@ def sample(moments: list[Moment] | tuple[Moment, ...], frames: int) -> list[int]
     loaded = [moment for moment in moments if moment.load > 0]
     if not loaded:
         raise BagError(f"nothing pressed on the skin in any of {len(moments)} answers, so there is nothing to compare.")
-    chosen = {max(loaded, key=lambda moment: moment.load).sequence}
+    chosen = {max(loaded, key=lambda moment: moment.load)}
     several = [moment for moment in loaded if moment.pressing > 1]
     if several:
-        chosen.add(max(several, key=lambda moment: moment.load).sequence)
-    rest = [moment.sequence for moment in loaded if moment.sequence not in chosen]
+        chosen.add(max(several, key=lambda moment: moment.load))
+    rest = [moment for moment in loaded if moment not in chosen]
     more = min(max(frames - len(chosen), 0), len(rest))
     chosen |= {rest[int((k + 0.5) * len(rest) / more)] for k in range(more)}
-    return [moment.sequence for moment in loaded if moment.sequence in chosen]
+    return sorted(chosen, key=lambda moment: moment.number)
+
+
+def headline(comparison: Comparison) -> list[tuple[str, str]]:
+    """What is measured, and its value with unit: the rows of a comparison's table."""
+    timing, moments = comparison.run.timing, comparison.run.moments
+    largest = max((moment.load for moment in moments if moment.load >= 0), default=float("nan"))
+    rows = [
+        ("method", comparison.method),
+        ("reference", comparison.reference),
+        ("contact instants", f"{timing.instants} at {timing.instant_rate:.1f} Hz"),
+        ("answers", f"{timing.answers} at {timing.answer_rate:.1f} Hz"),
+        ("rate kept", f"{100 * timing.kept:.2f} % ({timing.skipped} instants overtaken by newer ones)"),
+        ("answers lost", f"{timing.lost}"),
+        ("latency, median", f"{1e3 * timing.latency(50):.2f} ms"),
+        ("latency, 99 %", f"{1e3 * timing.latency(99):.2f} ms"),
+        ("largest load on the skin", f"{largest:.3f} N"),
+        ("frames compared", f"{len(comparison.judged)} of {len(comparison.pairs) + len(comparison.failed)} sampled"),
+    ]
+    if not comparison.judged:
+        return rows
+    mean, deviation = mean_and_deviation([pair.score for pair in comparison.judged])
+    pairs = zip(mean.row().items(), deviation.row().values(), strict=True)
+    return rows + [_figure_row(PEAKS.get(name, name), value, spread) for (name, value), spread in pairs]
+
+
+def _figure_row(name: str, value: float, spread: float) -> tuple[str, str]:
+    label, unit = name.rsplit(" ", 1)
+    digits = 1 if unit == "%" else 4
+    return (label, f"{value:.{digits}f} ± {spread:.{digits}f} {unit}")
 
 
 def _compare(
     run: Survey,
-    picks: list[int],
+    picks: list[Moment],
     names: tuple[str, str],
     ours: Side,
     reference: Side,
     tolerance: float | None,
     on_frame: Callable[[int, int], None] | None,
+    reason: str = "",
 ) -> Comparison:
     pairs: list[FramePair] = []
     failed: dict[int, str] = {}
-    moments = {moment.sequence: moment for moment in run.moments}
-    wanted = set(picks)
-    for frame in run.bag.frames():
-        if frame.sequence not in wanted:
-            continue
+    frames = run.bag.frames(moment.number for moment in picks)
+    for done, (moment, frame) in enumerate(zip(picks, frames, strict=True)):
         if on_frame:
-            on_frame(len(pairs) + len(failed), len(picks))
+            on_frame(done, len(picks))
         try:
-            pairs.append(_pair(run, moments[frame.sequence], frame, ours(frame), reference(frame)))
+            pairs.append(_pair(run, moment, frame, ours(frame), reference(frame)))
         except StmplError as error:
             log.warning("frame %d cannot be compared: %s", frame.sequence, error)
             failed[frame.sequence] = str(error)
-    return Comparison(run, *names, tuple(pairs), failed, tolerance)
+    return Comparison(run, *names, tuple(pairs), failed, tolerance, reason)
 
 
 def _pair(run: Survey, moment: Moment, frame: Frame, ours: Displacement, reference: Displacement) -> FramePair:
     layer = run.bag.layer_of(frame)
     figures = score(ours.displacement, reference.displacement, layer, _load(frame))
-    return FramePair(frame, layer, moment.time, moment.load, tuple(run.contacts.at(frame)), ours, reference, figures)
+    contacts = tuple(run.bag.contacts(frame))
+    return FramePair(moment.number, frame, layer, moment.time, moment.load, contacts, ours, reference, figures)
 
 
 def _solver(method: Method, run: Survey) -> Side:
@@ -251,7 +300,7 @@ def _presser(reference: Presser, run: Survey) -> Side:
 
     def answer(frame: Frame) -> Displacement:
         _load(frame)
-        return ready(frame).press([c for c in run.contacts.at(frame) if frame.touches[c.name].presses], frame)
+        return ready(frame).press([c for c in run.bag.contacts(frame) if frame.touches[c.name].presses], frame)
 
     return answer
 

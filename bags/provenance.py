@@ -2,30 +2,25 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
-import platform
 import zipfile
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from importlib.metadata import PackageNotFoundError, version
 from io import BytesIO
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-import stmpl_core
 from bags.wire import NO_FRAMES, FixedFrames
 from bags.writer import BagWriter
 from stmpl_core.chart import UvChart
 from stmpl_core.errors import BagError
 from stmpl_core.layer import SoftLayer, Tissue
+from stmpl_core.provenance import versions
 
 LAYER = "layer.npz"
-WEIGHTS = Path(stmpl_core.__file__).parent / "weights"
 RECORD = "stmpl"
-_PACKAGES = ("stmpl", "numpy", "scipy", "numba", "torch", "anny", "mcap", "rosbags")
+OTHER_PROCESSOR = 1e-7  # m by which answers may differ between processors, whose sums round in other orders
 
 
 @dataclass(frozen=True)
@@ -36,7 +31,7 @@ class Provenance:
         method: name of the method that answered.
         body: one line on the body and its part.
         config: everything that was configured, as JSON can hold it.
-        versions: of Python, and of the packages and weights that decide the numbers.
+        versions: versions of Python, packages and weights that decide the numbers, and the processor.
         frames: other frames that poses and wrenches are in, fixed in the body's.
     """
 
@@ -46,18 +41,20 @@ class Provenance:
     versions: Mapping[str, str] = field(default_factory=dict)
     frames: FixedFrames = NO_FRAMES
 
+    @property
+    def processor(self) -> str:
+        """The processor that recorded; empty where the recording does not say."""
+        return self.versions.get("processor", "")
 
-def versions() -> dict[str, str]:
-    """Versions of Python, of the packages that decide the numbers, and of the networks' weights (their SHA-256)."""
-    found = {"python": platform.python_version(), "machine": platform.machine()}
-    for name in _PACKAGES:
-        try:
-            found[name] = version(name)
-        except PackageNotFoundError:
-            continue
-    for weights in sorted(WEIGHTS.glob("*.safetensors")):
-        found[f"weights/{weights.stem}"] = hashlib.sha256(weights.read_bytes()).hexdigest()[:16]
-    return found
+
+def allowance(recorded: str, other: str) -> tuple[float, str]:
+    """What two answers to the same contacts may differ by [m], and why, by the processors that made them; "": unknown.
+
+    Exact answers are asked for on one processor only.
+    """
+    if recorded and recorded == other:
+        return 0.0, "the same processor recorded it"
+    return OTHER_PROCESSOR, f"another processor ({recorded or 'not named'}) recorded it"
 
 
 def write_provenance(
@@ -66,7 +63,11 @@ def write_provenance(
 ) -> None:  # fmt: skip
     """Puts into a bag all that is needed to repeat the run, best before its first message.
 
-    A recorder that does not hold the layer gives None; SkinTopology then says it, rounded to float32. Raises BagError.
+    A recorder that does not hold the layer gives None; SkinTopology then says it, rounded to float32. Versions and
+    processor are those of the process that writes: a recorder belongs on the machine whose answers it records.
+
+    Raises:
+        BagError: the disk refused.
     """
     values = {"method": method, "body": body, "config": json.dumps(config or {}), "versions": json.dumps(versions()),
               "frames": json.dumps({name: pose.tolist() for name, pose in frames.items()})}  # fmt: skip

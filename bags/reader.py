@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterator
-from functools import cached_property
+import re
+from collections.abc import Callable, Iterable, Iterator
+from functools import cache, cached_property
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -13,17 +14,17 @@ from rosbags.typesys.store import Typestore
 
 from bags.frame import Frame
 from bags.provenance import LAYER, RECORD, Provenance, layer_from_bytes, provenance_from
-from bags.records import Damage, End, bag_file, summary, walk
+from bags.records import Damage, End, Place, Record, bag_file, read_places, summary, walk, walk_places
 from bags.schema import typestore_of
-from bags.wire import contact_from, frame_from, layer_from, stamp_ns, tool_from
-from stmpl_core.contact import Contact
-from stmpl_core.errors import BagError, FrameError
+from bags.wire import frame_from, layer_from, tool_from
+from stmpl_core.errors import BagError
 from stmpl_core.layer import SoftLayer, layer_id
 from stmpl_core.tool import Tool
 
 log = logging.getLogger(__name__)
 
 DISPLACEMENT, TOPOLOGY, MESH = "skin/displacement", "skin/topology", "contact_mesh"
+_OF_ROBOT = re.compile(r"(?:(.*?)/)?(?:skin/\w+|contact_mesh|tools/[^/]+/\w+)")  # its namespace, then what a run has
 
 
 class Recorded(NamedTuple):
@@ -54,16 +55,22 @@ class Topic(NamedTuple):
 
 
 class Bag:
-    """A recording, given by its folder or its .mcap file.
+    """A recording, given by its folder or its .mcap file, looked over once.
 
+    Of the large messages (skins, tools' surfaces, answers) only the places are kept; they are read when asked for.
     A file whose writer was killed is read as far as it is sound; `damage` says what is not, and the log too.
 
+    Args:
+        path: a folder, or the path of the .mcap file.
+        namespace: namespace of the one robot that is meant, "/left"; "": all topics.
+
     Raises:
-        BagError: no such file, or no MCAP file.
+        BagError: no such file, no MCAP file, or no such namespace in it.
     """
 
-    def __init__(self, path: Path | str) -> None:
+    def __init__(self, path: Path | str, namespace: str = "") -> None:
         self.file = bag_file(path)
+        self.namespace = namespace and "/" + namespace.strip("/")
         self.finished = False
         self.damage: list[Damage] = []
         self.topics: dict[str, Topic] = {}
@@ -73,7 +80,16 @@ class Bag:
         self.expected = index.messages  # that the writer counted, or None
         self._schemas, self._channels = dict(index.schemas), dict(index.channels)
         self._stores: dict[int, Typestore] = {}
-        self._survey()
+        self._places: dict[str, list[Place]] = {}  # of the large messages, by topic
+        self._layers: dict[str, SoftLayer] = {}  # that were read so far
+        self._layers_read: dict[str, int] = {}  # number of messages, by topic
+        self._look_over()
+
+    @property
+    def namespaces(self) -> list[str]:
+        """Namespaces of the robots in the file, whether asked for or not; "/" where a robot has none."""
+        found = (namespace_of(channel.topic) for channel in self._channels.values())
+        return sorted({namespace for namespace in found if namespace is not None})
 
     def messages(self, wanted: Callable[[str], bool] | None = None) -> Iterator[Recorded]:
         """Yields the decoded messages in the order of the file, of those topics that `wanted` accepts.
@@ -81,18 +97,29 @@ class Bag:
         Raises:
             BagError: a schema is missing or cannot be parsed.
         """
-        for record in walk(self.file):
-            if isinstance(record, Message) and (channel := self._channels.get(record.channel_id)):
-                if wanted is None or wanted(channel.topic):
-                    decoded = self._decode(channel, record.data)
-                    yield Recorded(channel.topic, decoded, record.log_time, record.publish_time)
+        for topic, record in self._walk(wanted or (lambda _: True)):
+            yield Recorded(topic, self.decode(record), record.log_time, record.publish_time)
 
     def raw(self, wanted: Callable[[str], bool]) -> Iterator[Raw]:
         """Yields the messages of the topics that `wanted` accepts in the order of the file, undecoded."""
-        for record in walk(self.file):
-            if isinstance(record, Message) and (channel := self._channels.get(record.channel_id)):
-                if wanted(channel.topic):
-                    yield Raw(channel.topic, record.data, record.log_time)
+        for topic, record in self._walk(wanted):
+            yield Raw(topic, record.data, record.log_time)
+
+    def decode(self, record: Message) -> Any:
+        """The message that a record carries. Raises BagError if its schema is lost or does not fit."""
+        channel = self._channels[record.channel_id]
+        schema = self._schemas.get(channel.schema_id)
+        if schema is None:
+            raise BagError(f"the schema of {channel.topic} is lost, so it cannot be decoded.")
+        encodings = (channel.message_encoding, schema.encoding)
+        if encodings != ("cdr", "ros2msg"):
+            raise BagError(f"{channel.topic} is encoded as {' with '.join(encodings)}; only cdr with ros2msg is read.")
+        if schema.id not in self._stores:
+            self._stores[schema.id] = typestore_of([(schema.name, schema.data.decode(errors="replace"))])
+        try:
+            return self._stores[schema.id].deserialize_cdr(record.data, schema.name)
+        except Exception as error:
+            raise BagError(f"a message on {channel.topic} is no {schema.name}: {error}.") from error
 
     def described(self, topic: str) -> tuple[str, str]:
         """Type hash and offered QoS profiles (YAML) of a topic; empty where the bag does not say. Raises KeyError."""
@@ -101,17 +128,31 @@ class Bag:
 
     def find_topic(self, ending: str) -> str:
         """The one topic whose name ends with `ending`, whatever its namespace. Raises BagError."""
-        found = [t for t in self.topics if _ends(t, ending)]
-        if len(found) != 1:
-            have = ", ".join(sorted(self.topics)) or "none"
-            raise BagError(f"{self.file} has {len(found)} topics {ending}; one is needed. Topics: {have}.")
+        names = {channel.topic for channel in self._channels.values() if self._is_meant(channel.topic)}
+        found = [name for name in names if _ends(name, ending)]
+        if len(found) > 1:
+            raise BagError(f"{self.file} holds {len(found)} robots, of the namespaces {', '.join(self.namespaces)}. "
+                           "Name one of them with --namespace.")  # fmt: skip
+        if not found:
+            have = ", ".join(sorted(names)) or "none"
+            raise BagError(f"{self.file} has no topic {ending}; one is needed. Topics: {have}.")
         return found[0]
 
-    def frames(self) -> Iterator[Frame]:
-        """Yields the recorded answers in the order of the file. Raises BagError if there is no such topic."""
-        topic = self.find_topic(DISPLACEMENT)
-        for recorded in self.messages(lambda name: name == topic):
-            yield frame_from(recorded.message, recorded.log_time_ns)
+    @property
+    def answers(self) -> int:
+        """Number of recorded answers. Raises BagError if there is no such topic."""
+        return len(self._places.get(self.find_topic(DISPLACEMENT), ()))
+
+    def frames(self, numbers: Iterable[int] | None = None) -> Iterator[Frame]:
+        """Yields recorded answers by their numbers in the file, from 0; all, in the order of the file, unless given.
+
+        Raises:
+            BagError: there is no topic of answers.
+        """
+        places = self._places.get(self.find_topic(DISPLACEMENT), [])
+        wanted = places if numbers is None else [places[number] for number in numbers]
+        for record in read_places(self.file, wanted):
+            yield frame_from(self.decode(record), record.log_time)
 
     def layer_of(self, frame: Frame) -> SoftLayer:
         """The layer that `frame` answers for. Raises BagError if the bag does not hold it."""
@@ -126,30 +167,38 @@ class Bag:
         return provenance_from(self.metadata.get(RECORD, {}))
 
     @cached_property
+    def method(self) -> str:
+        """Name of the method that answered, by the provenance, else by the first answer; empty if neither says."""
+        return self.provenance.method or next((frame.method for frame in self.frames()), "")
+
+    @cached_property
     def layers(self) -> dict[str, SoftLayer]:
         """The layers of the run by their names: an attached one, exact, then those that SkinTopology describes.
 
         There is more than one if the run spans `~/set_body` or `~/calibrate`.
 
         Raises:
-            BagError: the bag has none.
+            BagError: the bag has none, or those of several robots.
         """
-        found = {}
-        if LAYER in self.attachments:
-            layer = layer_from_bytes(self.attachments[LAYER])
-            found[layer_id(layer)] = layer
-            if not any(_ends(topic, TOPOLOGY) for topic in self.topics):
-                return found
-        for topology in self._topologies:
-            if topology.layer_id not in found:
-                found[topology.layer_id] = layer_from(topology)
+        found = self.known_layers()
+        topic = None if found and not self._told(TOPOLOGY) else self.find_topic(TOPOLOGY)
+        if not found:
+            raise BagError(f"{self.file} holds no message on {topic}, so the skin is not known.")
         return found
 
-    @property
-    def has_layers(self) -> bool:
-        """Whether the bag says what skin it is of."""
-        told = [topic for topic in self.topics.values() if _ends(topic.name, TOPOLOGY) and topic.messages]
-        return LAYER in self.attachments or len(told) == 1
+    def known_layers(self) -> dict[str, SoftLayer]:
+        """The layers of all robots by their names, as far as the file was looked over; none if it holds none."""
+        if LAYER in self.attachments and LAYER not in self._layers_read:
+            layer, self._layers_read[LAYER] = layer_from_bytes(self.attachments[LAYER]), 1
+            self._layers = {layer_id(layer): layer} | {k: v for k, v in self._layers.items() if k != layer_id(layer)}
+        for topic in self._told(TOPOLOGY):
+            places, read = self._places[topic], self._layers_read.get(topic, 0)
+            self._layers_read[topic] = len(places)
+            for record in read_places(self.file, places[read:]):
+                topology = self.decode(record)
+                if topology.layer_id not in self._layers:
+                    self._layers[topology.layer_id] = layer_from(topology)
+        return self._layers
 
     @property
     def layer(self) -> SoftLayer:
@@ -159,7 +208,10 @@ class Bag:
     @cached_property
     def body_frame(self) -> str:
         """Frame id of the body, from SkinTopology. Raises BagError."""
-        return self._topologies[0].header.frame_id
+        topic = self.find_topic(TOPOLOGY)
+        for record in read_places(self.file, self._places.get(topic, [])[:1]):
+            return self.decode(record).header.frame_id
+        raise BagError(f"{self.file} holds no message on {topic}, so the body's frame is not known.")
 
     @property
     def layer_id(self) -> str:
@@ -168,58 +220,79 @@ class Bag:
 
     @cached_property
     def tools(self) -> dict[str, Tool]:
-        """The tools by their names."""
-        topics = [t for t in self.topics if _ends(t, MESH)]
-        found = self.messages(lambda name: name in topics)
-        return {tool.name: tool for tool in (tool_from(r.message) for r in found if len(r.message.triangles))}
+        """The tools by their names; the last surface of one that was changed."""
+        places = sorted(place for topic in self._told(MESH) for place in self._places[topic])
+        told = [message for message in map(self.decode, read_places(self.file, places)) if len(message.triangles)]
+        return {tool: tool_from(message) for tool, message in {one.header.frame_id: one for one in told}.items()}
 
-    @cached_property
-    def _topologies(self) -> list[Any]:
-        topic = self.find_topic(TOPOLOGY)
-        found = [recorded.message for recorded in self.messages(lambda name: name == topic)]
-        if not found:
-            raise BagError(f"{self.file} holds no message on {topic}, so the skin is not known.")
-        return found
+    def see(self, topic: str, record: Message, place: Place) -> None:
+        """Called for each message while the file is looked over; keeps the places of the large ones."""
+        if _ends(topic, DISPLACEMENT) or _ends(topic, TOPOLOGY) or _ends(topic, MESH):
+            self._places.setdefault(topic, []).append(place)
 
-    def _decode(self, channel: Channel, data: bytes) -> Any:
-        schema = self._schemas.get(channel.schema_id)
-        if schema is None:
-            raise BagError(f"the schema of {channel.topic} is lost, so it cannot be decoded.")
-        encodings = (channel.message_encoding, schema.encoding)
-        if encodings != ("cdr", "ros2msg"):
-            raise BagError(f"{channel.topic} is encoded as {' with '.join(encodings)}; only cdr with ros2msg is read.")
-        if schema.id not in self._stores:
-            self._stores[schema.id] = typestore_of([(schema.name, schema.data.decode(errors="replace"))])
-        try:
-            return self._stores[schema.id].deserialize_cdr(data, schema.name)
-        except Exception as error:
-            raise BagError(f"a message on {channel.topic} is no {schema.name}: {error}.") from error
+    def _told(self, ending: str) -> list[str]:
+        """Topics with messages whose names end with `ending`."""
+        return [topic for topic in self._places if _ends(topic, ending)]
 
-    def _survey(self) -> None:
-        spans: dict[int, list[int]] = {}
+    def _is_meant(self, topic: str) -> bool:
+        """The topic is of the robot that is meant, or of none."""
+        if not self.namespace:
+            return True
+        around = [name for name in self.namespaces if name != "/" and topic.startswith(name + "/")]
+        return (namespace_of(topic) or max(around, key=len, default=None)) in (None, self.namespace)
+
+    def _walk(self, wanted: Callable[[str], bool]) -> Iterator[tuple[str, Message]]:
+        topics = {number: channel.topic for number, channel in self._channels.items()
+                  if channel.topic in self.topics and wanted(channel.topic)}  # fmt: skip
         for record in walk(self.file):
-            match record:
-                case Message():
-                    span = spans.setdefault(record.channel_id, [0, record.log_time, record.log_time])
-                    span[0] += 1
-                    span[1], span[2] = min(span[1], record.log_time), max(span[2], record.log_time)
-                case Schema():
-                    self._schemas[record.id] = record
-                case Channel():
-                    self._channels[record.id] = record
-                case Attachment():
-                    self.attachments[record.name] = record.data
-                case Metadata():
-                    self.metadata[record.name] = record.metadata
-                case Damage():
-                    self.damage.append(record)
-                case End():
-                    self.finished = True
+            if isinstance(record, Message) and record.channel_id in topics:
+                yield topics[record.channel_id], record
+
+    def _look_over(self) -> None:
+        spans: dict[int, list[int]] = {}
+        early: list[Place] = []  # messages before the description of their channel, where the first one was lost
+        for place, record in walk_places(self.file):
+            if isinstance(record, Message):
+                span = spans.setdefault(record.channel_id, [0, record.log_time, record.log_time])
+                span[0] += 1
+                span[1], span[2] = min(span[1], record.log_time), max(span[2], record.log_time)
+                if not self._show(record, place):
+                    early.append(place)
+            else:
+                self._take(record)
+        for place, record in zip(early, read_places(self.file, early), strict=True):
+            self._show(record, place)
         for number, channel in self._channels.items():
             schema = self._schemas.get(channel.schema_id)
-            self.topics[channel.topic] = Topic(channel.topic, schema.name if schema else "?",
-                                               *spans.get(number, (0, 0, 0)))  # fmt: skip
+            if self._is_meant(channel.topic):
+                self.topics[channel.topic] = Topic(channel.topic, schema.name if schema else "?",
+                                                   *spans.get(number, (0, 0, 0)))  # fmt: skip
+        if self.namespace and self.namespace not in self.namespaces:
+            raise BagError(f"{self.file} holds no robot of the namespace {self.namespace}; "
+                           f"there: {', '.join(self.namespaces) or 'none'}.")  # fmt: skip
         self._warn()
+
+    def _show(self, record: Message, place: Place) -> bool:
+        """Lets `see` have a message that is meant; False if its topic is not known (yet)."""
+        channel = self._channels.get(record.channel_id)
+        if channel and self._is_meant(channel.topic):
+            self.see(channel.topic, record, place)
+        return channel is not None
+
+    def _take(self, record: Record) -> None:
+        match record:
+            case Schema():
+                self._schemas[record.id] = record
+            case Channel():
+                self._channels[record.id] = record
+            case Attachment():
+                self.attachments[record.name] = record.data
+            case Metadata():
+                self.metadata[record.name] = record.metadata
+            case Damage():
+                self.damage.append(record)
+            case End():
+                self.finished = True
 
     def _warn(self) -> None:
         for damage in self.damage:
@@ -228,55 +301,19 @@ class Bag:
             log.warning("%s was not finished by its writer; at most its last chunk is missing", self.file)
 
 
-class ContactLog:
-    """Poses and wrenches of every tool by stamp: the contacts as they stood at any answered stamp.
-
-    Memory grows with the number of poses (a few hundred bytes each), not with their meshes or answers.
-    """
-
-    def __init__(self, bag: Bag) -> None:
-        self.received: dict[int, int] = {}  # stamp -> when the last contact message of that stamp was received [ns]
-        self.pose_stamps: set[int] = set()
-        self._bag = bag
-        self._poses: dict[str, dict[int, Any]] = {}
-        self._wrenches: dict[str, dict[int, Any]] = {}
-        for recorded in bag.messages(lambda name: tool_topic(name) is not None):
-            tool, kind = tool_topic(recorded.topic) or ("", "")
-            stamp = stamp_ns(recorded.message)
-            (self._poses if kind == "pose" else self._wrenches).setdefault(tool, {})[stamp] = recorded.message
-            self.received[stamp] = max(self.received.get(stamp, 0), recorded.log_time_ns)
-            if kind == "pose":
-                self.pose_stamps.add(stamp)
-
-    def at(self, frame: Frame) -> list[Contact]:
-        """The contacts that `frame` answers: of each of its tools the pose and the wrench that it names.
-
-        Raises:
-            BagError: a pose, a wrench or a mesh that it answers is not in the bag.
-        """
-        return [self._contact(tool, *stamps) for tool, stamps in frame.inputs.items()]
-
-    def _contact(self, tool: str, posed: int, pushed: int) -> Contact:
-        known, pose = self._bag.tools.get(tool), self._poses.get(tool, {}).get(posed)
-        wrench = self._wrenches.get(tool, {}).get(pushed)
-        lacks = ["mesh"] * (known is None) + ["pose"] * (pose is None) + ["wrench"] * (pushed != 0 and wrench is None)
-        if known is None or lacks:
-            raise BagError(f"an answer to tool {tool} at {posed / 1e9:.3f} s cannot be repeated: "
-                           f"the bag has no {' and no '.join(lacks)} for it.")
-        frames = self._bag.provenance.frames
-        try:
-            return contact_from(known, pose, wrench, body_frame=self._bag.body_frame, frames=frames)
-        except FrameError as error:
-            raise BagError(f"{error} The recording carries the frames of stmpl record --frames, and none that "
-                           "move (/tf).") from error  # fmt: skip
-
-
 def tool_topic(topic: str) -> tuple[str, str] | None:
     """(tool, "pose" or "wrench") if the topic is of a tool: .../tools/NAME/pose."""
     parts = topic.split("/")
     if len(parts) >= 3 and parts[-3] == "tools" and parts[-1] in ("pose", "wrench"):
         return parts[-2], parts[-1]
     return None
+
+
+@cache
+def namespace_of(topic: str) -> str | None:
+    """Namespace of the robot that a topic is of, "/" for none; None if the topic is of no robot's run."""
+    found = _OF_ROBOT.fullmatch(topic)
+    return found and (found[1] or "/")
 
 
 def _ends(topic: str, ending: str) -> bool:

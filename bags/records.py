@@ -7,11 +7,12 @@ import re
 import struct
 import zlib
 from bisect import bisect_left
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from io import BytesIO
 from pathlib import Path
+from typing import NamedTuple
 
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
@@ -66,6 +67,13 @@ class End:
 Record = Schema | Channel | Message | Attachment | Metadata | Damage | End
 
 
+class Place(NamedTuple):
+    """Where a record stands: the offset of its chunk in the file (or its own, outside chunks), and its number in it."""
+
+    offset: int
+    number: int
+
+
 @dataclass(frozen=True)
 class Summary:
     """The index that a finished file ends with; empty where its CRC is wrong, and without places where it has none.
@@ -114,8 +122,33 @@ def walk(path: Path | str) -> Iterator[Record]:
     Raises:
         BagError: the file cannot be opened or is no MCAP file.
     """
+    for _, record in walk_places(path):
+        yield record
+
+
+def walk_places(path: Path | str) -> Iterator[tuple[Place, Record]]:
+    """What `walk` yields, each with its place, by which `read_places` finds a message again. Raises BagError."""
     with _mapped(path) as data:
-        yield from _walk(data, _summary(data))
+        for offset, records in _walk(data, _summary(data)):
+            for number, record in enumerate(records):
+                yield Place(offset, number), record
+
+
+def read_places(path: Path | str, places: Iterable[Place]) -> Iterator[Message]:
+    """Yields the messages at `places`; where several in a row stand in one chunk, it is opened once.
+
+    Raises:
+        BagError: the file cannot be opened, or has changed since it was walked.
+    """
+    with _mapped(path) as data:
+        opened, records = -1, []
+        for offset, number in places:
+            if offset != opened:
+                opened, records = offset, _opened(data, offset)
+            if number >= len(records) or not isinstance(message := records[number], Message):
+                raise BagError(f"{path} has changed since it was looked over: no message {number} at byte {offset}. "
+                               "Is it still being recorded?")  # fmt: skip
+            yield message
 
 
 def summary(path: Path | str) -> Summary:
@@ -171,7 +204,8 @@ def _place(record: McapRecord) -> tuple[int, int, int] | None:
     return None
 
 
-def _walk(data: mmap.mmap, index: Summary) -> Iterator[Record]:
+def _walk(data: mmap.mmap, index: Summary) -> Iterator[tuple[int, list[Record]]]:
+    """Yields the offset of each chunk, or of each record outside chunks, and what is in it."""
     at, stop = len(MAGIC), index.data_end or len(data)
     bare = sound = True  # bare: schemas, channels and messages may stand outside chunks
     while at < stop:
@@ -191,16 +225,23 @@ def _walk(data: mmap.mmap, index: Summary) -> Iterator[Record]:
         if records is None:
             sound = False
             resume, what = _resume(data, at, opcode, after, index, stop)
-            yield Damage(at, resume - at, what)
+            yield at, [Damage(at, resume - at, what)]
             at = resume
         else:
             bare = bare and opcode != CHUNK
-            yield from records
+            yield at, records
             at = after
     if index.data_end or at < stop:
-        if sound and (broken := _wrong_crc(data, at)):
-            yield broken
-        yield End()
+        broken = _wrong_crc(data, at) if sound else None
+        yield at, [broken, End()] if broken else [End()]
+
+
+def _opened(data: mmap.mmap, at: int) -> list[Record]:
+    """The records at an offset that `_walk` gave, of a chunk or of one record outside chunks; none if it is broken."""
+    if chunk := _chunk_at(data, at):
+        return chunk[0]
+    opcode, after = _frame(data, at)
+    return _read(data, at, opcode, after, bare=True) or []
 
 
 def _frame(data: mmap.mmap, at: int) -> tuple[int, int]:

@@ -9,9 +9,10 @@ from pathlib import Path
 import numpy as np
 
 from bags.frame import Frame
-from bags.provenance import versions
-from bags.reader import Bag, ContactLog
+from bags.provenance import allowance
+from bags.run import Run
 from stmpl_core.methods.base import Method
+from stmpl_core.provenance import versions
 from stmpl_core.simulator import Simulator
 from stmpl_core.touch import Answer
 
@@ -30,9 +31,10 @@ class Replayed:
 
     @property
     def difference(self) -> float:
-        """Largest Euclidean difference at any vertex [m]."""
+        """Largest Euclidean difference at any vertex [m]; infinite where one of them is no number."""
         off = self.answer.displacement.astype(np.float32) - self.frame.displacement
-        return float(np.linalg.norm(off, axis=1).max(initial=0.0))
+        largest = float(np.linalg.norm(off, axis=1).max(initial=0.0))
+        return largest if np.isfinite(largest) else float("inf")
 
 
 @dataclass(frozen=True)
@@ -40,11 +42,13 @@ class ReplaySummary:
     """How a replay went.
 
     Args:
-        method: that answered now.
-        frames: that were replayed.
-        identical: how many came out bit for bit as recorded.
+        method: name of the method that answered now.
+        frames: number of frames that were replayed.
+        identical: number of them that came out bit for bit as recorded.
         worst: largest difference at any vertex of any frame [m].
-        first_difference: sequence number of the first frame that differs, or None.
+        tolerance: largest difference that is allowed [m]; 0: bit for bit.
+        reason: why this tolerance.
+        first_difference: sequence number of the first frame past the tolerance, or None.
         changed: what is another version now than when the run was recorded, "numpy 2.4 -> 2.5".
     """
 
@@ -52,49 +56,79 @@ class ReplaySummary:
     frames: int
     identical: int
     worst: float
+    tolerance: float
+    reason: str
     first_difference: int | None
     changed: tuple[str, ...]
 
+    @property
+    def passed(self) -> bool:
+        """No frame is past the tolerance."""
+        return self.first_difference is None
+
     def __str__(self) -> str:
+        held = f"held to {f'{self.tolerance * 1e3:.3g} mm' if self.tolerance else 'every bit'}, since {self.reason}"
         if self.identical == self.frames:
-            return f"{self.frames} frames replayed with {self.method}, every one bit for bit as recorded."
+            return f"{self.frames} frames replayed with {self.method}, every one bit for bit as recorded; {held}."
+        off = (f"{self.frames - self.identical} of {self.frames} frames replayed with {self.method} differ, "
+               f"by up to {self.worst * 1e3:.3g} mm; {held}")  # fmt: skip
         note = f" Changed since: {', '.join(self.changed)}." if self.changed else ""
-        return (f"{self.frames - self.identical} of {self.frames} frames replayed with {self.method} differ, the first "
-                f"is number {self.first_difference}, by up to {self.worst * 1e3:.3g} mm.{note}")
+        return f"{off}." if self.passed else f"{off}; number {self.first_difference} is the first past it.{note}"
 
 
-def replay(path: Path | str, method: Method, *, every: int = 1) -> Iterator[Replayed]:
+def replay(run: Path | str | Run, method: Method, *, every: int = 1) -> Iterator[Replayed]:
     """Yields each recorded answer (or every n-th) with the one that its recorded contacts give now, in the run's order.
 
     Each is answered on the layer that it was answered on.
 
+    Args:
+        run: the recording: its folder, its .mcap file, or an opened one.
+        method: that answers.
+        every: take each n-th frame only.
+
     Raises:
         BagError: the bag lacks answers, the layer, or a tool's mesh or pose.
     """
-    bag = Bag(path)
-    contacts = ContactLog(bag)
+    run = run if isinstance(run, Run) else Run(run)
     simulator: Simulator | None = None
-    for number, frame in enumerate(bag.frames()):
-        if number % every == 0:
-            layer = bag.layer_of(frame)
-            if simulator is None or simulator.layer is not layer:
-                simulator = Simulator(layer, method)
-            answer = simulator.step(contacts.at(frame))
-            if frame.fade < 1:  # the input had stopped: a share of the last answer was sent
-                answer = replace(answer, displacement=frame.fade * answer.displacement)
-            yield Replayed(frame, answer)
+    for frame in run.frames(range(0, run.answers, every)):
+        layer = run.layer_of(frame)
+        if simulator is None or simulator.layer is not layer:
+            simulator = Simulator(layer, method)
+        answer = simulator.step(run.contacts(frame))
+        if frame.fade < 1:  # the input had stopped: a share of the last answer was sent
+            answer = replace(answer, displacement=frame.fade * answer.displacement)
+        yield Replayed(frame, answer)
 
 
-def replay_run(path: Path | str, method: Method, *, every: int = 1) -> ReplaySummary:
-    """Replays a run and counts the answers that come out bit for bit as recorded. Raises BagError."""
+def replay_run(
+    run: Path | str | Run, method: Method, *, every: int = 1, tolerance: float | None = None
+) -> ReplaySummary:
+    """Replays a run and counts the answers that come out as recorded.
+
+    Args:
+        run: the recording: its folder, its .mcap file, or an opened one.
+        method: that answers.
+        every: take each n-th frame only.
+        tolerance: largest difference that is allowed [m]; None: exact where this processor recorded the run,
+            provenance.OTHER_PROCESSOR where another did.
+
+    Raises:
+        BagError: the bag lacks answers, the layer, or a tool's mesh or pose.
+    """
+    run = run if isinstance(run, Run) else Run(run)
+    then, now = run.provenance.versions, versions()
+    allowed, reason = allowance(run.provenance.processor, now["processor"])
+    if tolerance is not None:
+        allowed, reason = tolerance, "this tolerance was asked for"
     frames = identical = 0
     worst, first = 0.0, None
-    for replayed in replay(path, method, every=every):
+    for replayed in replay(run, method, every=every):
         frames += 1
         identical += replayed.identical
-        if not replayed.identical:
-            worst = max(worst, replayed.difference)
-            first = replayed.frame.sequence if first is None else first
-    then, now = Bag(path).provenance.versions, versions()
+        difference = 0.0 if replayed.identical else replayed.difference
+        worst = max(worst, difference)
+        if not replayed.identical and not (allowed and difference <= allowed) and first is None:
+            first = replayed.frame.sequence
     changed = tuple(f"{k} {then[k]} -> {now.get(k, 'none')}" for k in then if now.get(k) != then[k])
-    return ReplaySummary(method.name, frames, identical, worst, first, changed)
+    return ReplaySummary(method.name, frames, identical, worst, allowed, reason, first, changed)

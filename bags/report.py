@@ -5,6 +5,7 @@ from __future__ import annotations
 import html
 import json
 from base64 import b64encode
+from collections import Counter
 from collections.abc import Sequence
 from io import BytesIO
 from pathlib import Path
@@ -13,7 +14,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from bags.compare import Comparison, FramePair
+from bags.compare import Comparison, FramePair, headline
 from bags.pictures import (
     DIFFERENCE,
     FLAT,
@@ -30,10 +31,10 @@ from bags.pictures import (
 )
 from bags.replay import ReplaySummary
 from stmpl_core.errors import BagError
-from stmpl_core.metrics import mean_and_deviation
 from stmpl_core.trust import Trust
 
 INK, OURS, TRUTH, WARN = "#2b2b2b", "#c1440e", "#1f4e79", "#f6c667"
+STOPPED = "#d9534f"
 ROOM = 2.6  # half width of a close-up, in radii of the contact
 CLOSEST = 0.02  # m; no close-up is narrower on each side
 
@@ -47,27 +48,6 @@ pre { background: #f6f4f1; padding: 1em; overflow: auto; }
 .verdict { padding: .6em 1em; border-left: 5px solid; } .good { border-color: #3a7d44; } .bad { border-color: #b3261e; }
 .note { color: #666; font-size: .92em; }
 """
-
-
-def headline(comparison: Comparison) -> list[tuple[str, str]]:
-    """The rows of the headline table: what is measured, and its value with unit."""
-    timing = comparison.run.timing
-    rows = [
-        ("method", comparison.method),
-        ("reference", comparison.reference),
-        ("contact instants", f"{timing.instants} at {timing.instant_rate:.1f} Hz"),
-        ("answers", f"{timing.answers} at {timing.answer_rate:.1f} Hz"),
-        ("rate kept", f"{100 * timing.kept:.2f} % ({timing.skipped} instants overtaken by newer ones)"),
-        ("answers lost", f"{timing.lost}"),
-        ("latency, median", f"{1e3 * timing.latency(50):.2f} ms"),
-        ("latency, 99 %", f"{1e3 * timing.latency(99):.2f} ms"),
-        ("frames compared", f"{len(comparison.judged)} of {len(comparison.pairs) + len(comparison.failed)} sampled"),
-    ]
-    if not comparison.judged:
-        return rows
-    mean, deviation = mean_and_deviation([pair.score for pair in comparison.judged])
-    pairs = zip(mean.row().items(), deviation.row().values(), strict=True)
-    return rows + [_figure_row(name, value, spread) for (name, value), spread in pairs]
 
 
 def write_report(comparison: Comparison, path: Path | str, *, replay: ReplaySummary | None = None) -> Path:
@@ -117,12 +97,12 @@ def timeline_figure(comparison: Comparison) -> Figure:
     error.plot(at, [MM * pair.score.mee for pair in judged], "s-", color=INK, label="mean where the skin moves (MEE)")
     error.plot(at, [MM * abs(pair.score.peak_error) for pair in judged], "^-", color=TRUTH, label="at the peak")
     error.set(ylabel="error [mm]", xlabel="time since the first answer [s]")
-    for axes in (depth, error):
-        axes.legend(frameon=False, fontsize=9)
     for axes in (force, depth, error):
-        _shade(axes, time, ~np.array([moment.in_range for moment in moments]), WARN)
-        _shade(axes, time, ~np.array([moment.converged for moment in moments]), "#d9534f")
+        _shade(axes, time, ~np.array([moment.in_range for moment in moments]), WARN, "outside the validated range")
+        _shade(axes, time, ~np.array([moment.converged for moment in moments]), STOPPED, "not converged")
         axes.set_ylim(bottom=0)
+        if axes is not force or axes.get_legend_handles_labels()[0]:
+            axes.legend(frameon=False, fontsize=9)
         axes.spines[["top", "right"]].set_visible(False)
     return figure
 
@@ -227,10 +207,11 @@ def _ruler(axes: Axes, half: float) -> None:
     axes.text(left, low + 0.02 * half * MM, "10 mm", fontsize=8, color=INK, va="bottom")
 
 
-def _shade(axes: Axes, time: np.ndarray, flagged: np.ndarray, colour: str) -> None:
+def _shade(axes: Axes, time: np.ndarray, flagged: np.ndarray, colour: str, label: str) -> None:
     edges = np.flatnonzero(np.diff(np.concatenate([[False], flagged, [False]]).astype(int)))
-    for start, stop in edges.reshape(-1, 2):
-        axes.axvspan(float(time[start]), float(time[min(stop, len(time) - 1)]), color=colour, alpha=0.3, lw=0)
+    for number, (start, stop) in enumerate(edges.reshape(-1, 2)):
+        end = float(time[min(stop, len(time) - 1)])
+        axes.axvspan(float(time[start]), end, color=colour, alpha=0.3, lw=0, label=label if number == 0 else None)
 
 
 def _opening(comparison: Comparison, replay: ReplaySummary | None) -> str:
@@ -265,14 +246,17 @@ def _timeline_part(comparison: Comparison) -> str:
     moments = comparison.run.moments
     outside = sum(not moment.in_range for moment in moments)
     stopped = sum(not moment.converged for moment in moments)
+    reasons = Counter(moment.why for moment in moments if moment.why and not moment.in_range).most_common(1)
+    most = f", most often since {_h(reasons[0][0].rstrip('.'))}" if reasons else ""
     return (f"<h2>Over time</h2>{_image(timeline_figure(comparison))}<p class=note>Yellow: outside the range that the "
-            f"method was validated on ({outside} of {len(moments)} answers); red: not converged ({stopped}).</p>"
+            f"method was validated on, so that its error there is not known ({outside} of {len(moments)} answers"
+            f"{most}); red: not converged ({stopped}).</p>"
             f"<h2>Latency</h2>{_image(latency_figure(comparison))}")  # fmt: skip
 
 
 def _frames_part(comparison: Comparison) -> str:
-    head = ("time s", "load N", "peak reference mm", "at peak mm", "at peak %", "under contact mm", "MEE mm",
-            "answer", "reference")  # fmt: skip
+    head = ("time s", "load N", "peak of reference mm", "error at peak mm", "error at peak, % of it",
+            "error under contact mm", "MEE mm", "answer", "reference")  # fmt: skip
     rows = [(f"{p.time:.2f}", f"{p.load:.3f}", f"{MM * p.score.peak:.3f}", f"{MM * p.score.peak_error:+.3f}",
              f"{100 * p.score.peak_share:+.1f}", f"{MM * p.score.contact:.3f}", f"{MM * p.score.mee:.3f}",
              _trust(p.frame.trust), _trust(p.reference.trust)) for p in comparison.pairs]  # fmt: skip
@@ -296,12 +280,6 @@ def _trust(trust: Trust) -> str:
     words = [word for word, good in flags.items() if not good]
     bound = "" if trust.error_bound is None else f" ±{MM * trust.error_bound:.2f} mm"
     return (", ".join(words) or "ok") + bound
-
-
-def _figure_row(name: str, value: float, spread: float) -> tuple[str, str]:
-    label, unit = name.rsplit(" ", 1)
-    digits = 1 if unit == "%" else 4
-    return (label, f"{value:.{digits}f} ± {spread:.{digits}f} {unit}")
 
 
 def _table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import json
 import os
-import re
 import sys
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 
+from rosbags.interfaces import Nodetype
+from rosbags.interfaces.typing import Typesdict
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
@@ -17,10 +19,6 @@ from stmpl_core.errors import BagError
 
 SEPARATOR = "=" * 80
 _OWN_MESSAGES = Path(__file__).resolve().parent.parent / "msg_defs" / "msg"  # a checkout that is not built yet
-_PRIMITIVES = frozenset(
-    "bool byte char float32 float64 int8 uint8 int16 uint16 int32 uint32 int64 uint64 string wstring".split()
-)
-_FIELD = re.compile(r"^\s*([A-Za-z][\w/]*)(?:<=\d+)?(?:\[[^\]]*\])?\s+[A-Za-z]\w*")
 
 
 @dataclass(frozen=True)
@@ -42,31 +40,57 @@ class Schema:
 def find_schema(type_name: str) -> Schema:
     """The schema of `pkg/msg/Type` (or `pkg/Type`), from the installed .msg files, else from rosbags' Jazzy types.
 
+    The text keeps the files' comments, which say units to who opens the recording elsewhere.
+
     Raises:
         BagError: no such message is installed.
     """
     package, type_ = _split(type_name)
-    texts = _with_dependencies(package, type_)
-    (_, first), *rest = texts.items()
-    text = first + "".join(f"\n{SEPARATOR}\nMSG: {'/'.join(key)}\n{body}" for key, body in rest)
     name = f"{package}/msg/{type_}"
+    texts: dict[str, str] = {}
+    waiting = [name]
+    while waiting:
+        wanted = waiting.pop(0)
+        if wanted not in texts:
+            texts[wanted] = _message_text(*_split(wanted))
+            waiting += _mentioned(_types_in(wanted, texts[wanted]))
+    text = f"\n{SEPARATOR}\n".join(
+        body if one == name else f"MSG: {one.replace('/msg/', '/')}\n{body}" for one, body in texts.items()
+    )
     return Schema(name, text, _installed_hash(package, type_) or typestore_of([(name, text)]).hash_rihs01(name))
 
 
 def typestore_of(schemas: list[tuple[str, str]]) -> Typestore:
-    """A store that decodes the given (name, text) schemas, beside Jazzy's own messages.
+    """A store that decodes the given (name, text) schemas; Jazzy's own messages fill what a text leaves out.
 
     Raises:
         BagError: a schema text cannot be parsed.
     """
-    store = get_typestore(Stores.ROS2_JAZZY)
+    types: Typesdict = {}
     for name, text in schemas:
-        try:
-            types = get_types_from_msg(text, name)
-            store.register({k: v for k, v in types.items() if k not in store.fielddefs})
-        except Exception as error:
-            raise BagError(f"the schema of {name} cannot be read: {error}.") from error
+        types |= _types_in(name, text)
+    store = get_typestore(Stores.EMPTY)  # Jazzy's take half a second to load
+    if not set(_mentioned(types)) <= {*types, *store.fielddefs}:
+        store = get_typestore(Stores.ROS2_JAZZY)
+    store.register({name: fields for name, fields in types.items() if name not in store.fielddefs})
     return store
+
+
+def _types_in(name: str, text: str) -> Typesdict:
+    """The types that a schema text describes. Raises BagError if it cannot be parsed."""
+    try:
+        return get_types_from_msg(text, name)
+    except Exception as error:
+        raise BagError(f"the schema of {name} cannot be read: {error}.") from error
+
+
+def _mentioned(types: Typesdict) -> Iterator[str]:
+    """Names of the message types that the fields of these types are of."""
+    for _, fields in types.values():
+        for _, (kind, inner) in fields:
+            inner = inner[0][1] if kind in (Nodetype.ARRAY, Nodetype.SEQUENCE) else inner
+            if isinstance(inner, str):
+                yield inner
 
 
 def _split(type_name: str) -> tuple[str, str]:
@@ -74,23 +98,6 @@ def _split(type_name: str) -> tuple[str, str]:
     if len(parts) not in (2, 3) or not all(parts):
         raise BagError(f"'{type_name}' is no message type; expected pkg/msg/Type, for instance std_msgs/msg/Header.")
     return parts[0], parts[-1]
-
-
-def _with_dependencies(package: str, type_: str) -> dict[tuple[str, str], str]:
-    texts: dict[tuple[str, str], str] = {}
-    waiting = [(package, type_)]
-    while waiting:
-        name = waiting.pop(0)
-        if name not in texts:
-            texts[name] = _message_text(*name)
-            waiting += _mentioned(texts[name], name[0])
-    return texts
-
-
-def _mentioned(text: str, package: str) -> list[tuple[str, str]]:
-    lines = (line.split("#", 1)[0] for line in text.splitlines())
-    named = [match[1] for line in lines if (match := _FIELD.match(line)) and match[1] not in _PRIMITIVES]
-    return [_split(name) if "/" in name else (package, name) for name in named]
 
 
 def _message_text(package: str, type_: str) -> str:

@@ -1,18 +1,16 @@
-"""Survey: one pass over a run that gives its timeline, rate, latency and losses, without keeping its answers."""
+"""Survey: a run's timeline, rate, latency and losses, from one walk over its file, without keeping its answers."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
 from bags.frame import Frame
-from bags.reader import Bag, ContactLog
-from stmpl_core.arrays import PerVertex
+from bags.run import NANO, Run
 from stmpl_core.errors import BagError
-
-NANO = 1e-9  # seconds in a nanosecond
+from stmpl_core.layer import SoftLayer
 
 
 @dataclass(frozen=True)
@@ -20,17 +18,19 @@ class Moment:
     """One answer of a run, without its arrays.
 
     Args:
-        sequence: number of the answer.
+        number: place of the answer in the run, from 0, by which Bag.frames reads it.
+        sequence: number that the node gave the answer; it starts again where a node was started again.
         stamp_ns: of the newest pose that it answers [ns].
         time: since the first answer's stamp [s].
         load: that presses on the skin in all, sum of pressure times area [N]; NaN where the pressure is not known.
         peak: largest displacement [m].
         pressing: number of tools that load the skin.
-        converged, in_range: the answer's own flags.
+        converged, in_range, why: the answer's own flags, and its reason for them.
         solve_seconds: that the node spent on it [s].
         latency: from the last contact message that it answers to itself, by the recorder's clock [s]; NaN: unknown.
     """
 
+    number: int
     sequence: int
     stamp_ns: int
     time: float
@@ -39,6 +39,7 @@ class Moment:
     pressing: int
     converged: bool
     in_range: bool
+    why: str
     solve_seconds: float
     latency: float
 
@@ -79,53 +80,83 @@ class Timing:
 class Survey:
     """A run, looked over once; `method` answered its first frame."""
 
-    bag: Bag
-    contacts: ContactLog
+    bag: Run
     method: str
     moments: tuple[Moment, ...]
     timing: Timing
 
 
-def survey(path: Path | str) -> Survey:
-    """Looks over a run. Raises BagError if it holds no answers or no skin."""
-    bag = Bag(path)
-    contacts = ContactLog(bag)
-    moments: list[Moment] = []
-    first, method = 0, ""
-    for frame in bag.frames():
-        area = bag.layer_of(frame).vertex_areas
-        first, method = first or frame.stamp_ns, method or frame.method
-        moments.append(_moment(frame, (frame.stamp_ns - first) * NANO, area, _latency(frame, contacts)))
-    if not moments:
-        raise BagError(f"{bag.file} holds no answers. Did the node see the tool's mesh, pose and wrench?")
-    return Survey(bag, contacts, method, tuple(moments), _timing(moments, contacts))
+@dataclass(frozen=True, eq=False)
+class _Note:
+    """What is known of an answer when it is met: not yet its latency, nor its load where its layer comes later."""
+
+    moment: Moment
+    method: str
+    log_time_ns: int
+    layer_id: str
+    layer: SoftLayer | None  # that the load was summed over
 
 
-def _moment(frame: Frame, time: float, area: PerVertex, latency: float) -> Moment:
-    load = float("nan") if frame.pressure is None else float(frame.pressure.astype(np.float64) @ area)
+def survey(path: Path | str, namespace: str = "") -> Survey:
+    """Looks over a run.
+
+    Args:
+        path: a folder, or the path of the .mcap file.
+        namespace: namespace of the one robot that is meant, "/left"; "": there is but one.
+
+    Raises:
+        BagError: no answers, no skin, or several robots and no namespace.
+    """
+    notes: list[_Note] = []
+
+    def note(run: Run, frame: Frame) -> None:
+        first = notes[0].moment.stamp_ns if notes else frame.stamp_ns
+        layer = run.known_layers().get(frame.layer_id)
+        moment = _moment(len(notes), frame, first, layer)
+        notes.append(_Note(moment, frame.method, frame.log_time_ns, frame.layer_id, layer))
+
+    run = Run(path, namespace, on_answer=note)
+    if not run.answers:
+        raise BagError(f"{run.file} holds no answers. Did the node see the tool's mesh, pose and wrench?")
+    late = [k for k, one in enumerate(notes) if one.layer is None or one.layer is not run.layers[one.layer_id]]
+    for number, frame in zip(late, run.frames(late), strict=True):  # their layer, or the exact one, came after them
+        moment = replace(notes[number].moment, load=_load(frame, run.layer_of(frame)))
+        notes[number] = replace(notes[number], moment=moment)
+    moments = [replace(one.moment, latency=_latency(one, run)) for one in notes]
+    return Survey(run, notes[0].method, tuple(moments), _timing(moments, run))
+
+
+def _moment(number: int, frame: Frame, first_ns: int, layer: SoftLayer | None) -> Moment:
     return Moment(
+        number=number,
         sequence=frame.sequence,
         stamp_ns=frame.stamp_ns,
-        time=time,
-        load=load,
+        time=(frame.stamp_ns - first_ns) * NANO,
+        load=float("nan") if layer is None else _load(frame, layer),
         peak=frame.peak,
         pressing=sum(touch.presses for touch in frame.touches.values()),
         converged=frame.trust.converged,
         in_range=frame.trust.in_range,
+        why=frame.trust.why,
         solve_seconds=frame.solve_seconds,
-        latency=latency,
+        latency=float("nan"),
     )
 
 
-def _latency(frame: Frame, contacts: ContactLog) -> float:
-    received = contacts.received.get(frame.stamp_ns)
-    return float("nan") if received is None else (frame.log_time_ns - received) * NANO
+def _load(frame: Frame, layer: SoftLayer) -> float:
+    """What presses on the skin in all [N], summed without BLAS, whose threads cost more than the sum itself."""
+    return float("nan") if frame.pressure is None else float(np.sum(frame.pressure * layer.vertex_areas))
 
 
-def _timing(moments: list[Moment], contacts: ContactLog) -> Timing:
+def _latency(note: _Note, run: Run) -> float:
+    received = run.received.get(note.moment.stamp_ns)
+    return float("nan") if received is None else (note.log_time_ns - received) * NANO
+
+
+def _timing(moments: list[Moment], run: Run) -> Timing:
     stamps = [moment.stamp_ns for moment in moments]
     first, last = min(stamps), max(stamps)
-    instants = {stamp for stamp in contacts.pose_stamps if first <= stamp <= last}
+    instants = {stamp for stamp in run.pose_stamps if first <= stamp <= last}
     jumps = np.diff([moment.sequence for moment in moments])
     lost = int((jumps[jumps > 0] - 1).sum())  # a step back is a node that was started again
     seconds = (last - first) * NANO

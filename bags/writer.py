@@ -23,13 +23,27 @@ from stmpl_core.errors import BagError
 log = logging.getLogger(__name__)
 
 ROS_DISTRO = "jazzy"
+FILE = "run_0.mcap"  # in a recording's folder; ros2 bag reindex takes names that end in a number only
+FOREVER = 2147483647.0  # s; an infinite duration is written as this or more
 METADATA_VERSION = 9  # of rosbag2's metadata.yaml in Jazzy
 CHUNK_BYTES = 8 << 20  # a chunk is closed when it grows over this, or when chunk_seconds have passed
 
 
-def qos_yaml(*, depth: int = 10, reliable: bool = True, transient_local: bool = False) -> str:
-    """One QoS profile as rosbag2 keeps it in `offered_qos_profiles`; everything else at its default."""
+def qos_yaml(
+    *, depth: int = 10, reliable: bool = True, transient_local: bool = False, liveliness: str = "automatic",
+    lease: float = 0.0,
+) -> str:  # fmt: skip
+    """One QoS profile as rosbag2 keeps it in `offered_qos_profiles`; everything else at its default.
+
+    Args:
+        depth: number of messages that are kept for late or slow listeners.
+        reliable: reliable delivery; else best effort.
+        transient_local: durability for listeners who come late.
+        liveliness: policy by which a sender tells that it is there, as rosbag2 writes it.
+        lease: time after which a silent sender is told to be gone [s]; 0: never.
+    """
     forever = {"sec": 9223372036, "nsec": 854775807}
+    whole, part = divmod(round(lease * 1e9), 10**9)
     return _yaml([{
         "history": "keep_last",
         "depth": depth,
@@ -37,31 +51,33 @@ def qos_yaml(*, depth: int = 10, reliable: bool = True, transient_local: bool = 
         "durability": "transient_local" if transient_local else "volatile",
         "deadline": forever,
         "lifespan": forever,
-        "liveliness": "automatic",
-        "liveliness_lease_duration": forever,
+        "liveliness": liveliness,
+        "liveliness_lease_duration": {"sec": whole, "nsec": part} if lease else forever,
         "avoid_ros_namespace_conventions": False,
     }])  # fmt: skip
 
 
 @dataclass(frozen=True)
 class Offered:
-    """What matters of a QoS profile."""
+    """What matters of a QoS profile; the names are those of `qos_yaml`."""
 
     depth: int = 10
     reliable: bool = True
     transient_local: bool = False
+    lease: float = 0.0
 
 
 def offered(yaml: str) -> Offered:
     """The first profile of a topic's `offered_qos_profiles`, ours or rosbag2's; the default if it cannot be read."""
     try:
         told = YAML(typ="safe").load(yaml)[0]
-        depth = int(told["depth"])
-    except (YAMLError, TypeError, KeyError, IndexError, ValueError):
+        depth, lease = int(told["depth"]), told.get("liveliness_lease_duration") or {}
+        seconds = int(lease.get("sec", 0)) + 1e-9 * int(lease.get("nsec", 0))
+    except (YAMLError, TypeError, KeyError, IndexError, ValueError, AttributeError):
         return Offered()
     # rosbag2 before Jazzy wrote the numbers of rmw's enumerations
     return Offered(depth or 10, told.get("reliability") not in ("best_effort", 2),
-                   told.get("durability") in ("transient_local", 1))  # fmt: skip
+                   told.get("durability") in ("transient_local", 1), seconds if seconds < FOREVER else 0.0)  # fmt: skip
 
 
 @dataclass
@@ -81,7 +97,7 @@ class BagWriter:
     a while, because time is looked at only when one is written. Not thread-safe: one thread writes.
 
     Args:
-        path: a folder, which gets run.mcap, or the path of the .mcap file; metadata.yaml goes beside it.
+        path: a folder, which gets FILE, or the path of the .mcap file; metadata.yaml goes beside it.
         chunk_seconds: wall-clock time after which a chunk is closed and handed to the operating system.
 
     Raises:
@@ -90,7 +106,7 @@ class BagWriter:
 
     def __init__(self, path: Path | str, *, chunk_seconds: float = 1.0) -> None:
         path = Path(path)
-        self.path = path if path.suffix == ".mcap" else path / "run.mcap"
+        self.path = path if path.suffix == ".mcap" else path / FILE
         self._chunk_seconds = chunk_seconds
         self._topics: dict[int, _Topic] = {}
         self._schemas: dict[tuple[str, str, bytes], int] = {}

@@ -17,10 +17,10 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.haptic_device import Device, Felt, Hand, Spot, arm_spot, play
-from fem_tools.provenance import machine
 from stmpl_core import Contact
 from stmpl_core.haptics import DeviceLoop, LoopSettings
 from stmpl_core.local_contact import local_contact
+from stmpl_core.provenance import machine
 
 HARD = 5e5  # Pa: a skin beside which the coupling is soft, 5 kN/m under 1 N
 LEVELS = [round(100 * 2 ** (k / 2)) for k in range(15)]  # N/m, of the coupling: 100 to 12,800

@@ -19,7 +19,6 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 from fem_tools import PatchFem
-from fem_tools.provenance import machine
 from fem_tools.scenes import Site, UnusableContact, ellipse
 from stmpl_core import Load
 from stmpl_core.body import Body
@@ -27,6 +26,7 @@ from stmpl_core.layer import SoftLayer
 from stmpl_core.methods import Linear, Method, MomentNet, UNet, Winkler
 from stmpl_core.methods import moment_net as parts
 from stmpl_core.methods.pix2pix import Pix2PixUNet
+from stmpl_core.provenance import machine
 
 
 def footprints(layer: SoftLayer) -> dict[str, np.ndarray]:

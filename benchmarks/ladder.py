@@ -20,9 +20,9 @@ from threadpoolctl import threadpool_limits
 
 from bags.reader import Bag
 from fem_tools.ladder import default_rungs, ladder
-from fem_tools.provenance import machine
 from stmpl_core.load import Load
 from stmpl_core.methods import Method
+from stmpl_core.provenance import machine
 from studies.calibrate import truth
 
 FLOOR = 3e-3  # mm, below which no error is drawn

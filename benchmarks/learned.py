@@ -17,14 +17,14 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 from fem_tools import PatchFem
-from fem_tools.dataset import Dataset
-from fem_tools.provenance import data_card, machine
+from fem_tools.dataset import Dataset, data_card
 from fem_tools.scenes import Site, UnusableContact, ellipse, letter
 from stmpl_core import Load
 from stmpl_core.body import Body
 from stmpl_core.methods import Linear, Method, MomentNet
 from stmpl_core.metrics import Score, mean_and_deviation, score
 from stmpl_core.networks import shipped
+from stmpl_core.provenance import machine
 from studies.train_moments import MomentTraining, draw_points, fit
 
 HIDDEN = (4, 8, 16, 32, 64, 128)

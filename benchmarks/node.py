@@ -31,8 +31,8 @@ from stmpl_msgs.msg import ContactMesh, LocalContact, SkinDisplacement, SkinTopo
 from stmpl_msgs.srv import SetBody
 
 from bags.wire import layer_from, pose_message, stamp_ns, tool_message, wrench_message
-from fem_tools.provenance import machine
 from stmpl_core.layer import SoftLayer
+from stmpl_core.provenance import machine
 from stmpl_ros.scripts import PRESS, Motion
 from stmpl_ros.spinning import spin
 from stmpl_ros.topics import KEPT, STREAM

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -280,6 +281,13 @@ class Dataset:
                 stores.append(store)
                 chosen.append(np.flatnonzero(mask))
         return Subset(stores, chosen)
+
+
+def data_card(path: str | Path, manifest: dict[str, Any]) -> dict[str, Any]:
+    """A data set's preset, seed, size and the SHA-256 of its manifest, for the JSON beside what was learnt from it."""
+    digest = hashlib.sha256((Path(path) / "manifest.json").read_bytes()).hexdigest()
+    plan = manifest["plan"]
+    return {"preset": plan["preset"], "seed": plan["seed"], "samples": manifest["samples"], "manifest_sha256": digest}
 
 
 def _known(what: str, given: Sequence[str], available: Sequence[str]) -> None:

@@ -22,11 +22,11 @@ import zarr
 from fem_tools.contact_job import Drop, Job, Part, Skin, solve_contact
 from fem_tools.dataset import FORMAT, Writer, write_layer
 from fem_tools.hand import Hand
-from fem_tools.provenance import versions
 from fem_tools.sampling import ContactId, Plan, contacts, layers
 from stmpl_core.body import Body
 from stmpl_core.errors import InvalidInput, StmplError
 from stmpl_core.layer import SoftLayer
+from stmpl_core.provenance import versions
 
 ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
 VERSIONS = ("stmpl", "numpy", "scipy", "numba", "anny", "libigl", "mmgpy", "trimesh", "shapely", "zarr")

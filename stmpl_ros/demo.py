@@ -20,6 +20,7 @@ from bags.compare import Comparison
 from bags.provenance import versions
 from bags.replay import ReplaySummary, replay_run
 from bags.report import write_report
+from bags.writer import FILE
 from fem_tools import RigidFem
 from stmpl_core.errors import StmplError
 from stmpl_core.methods import method as method_named
@@ -91,7 +92,7 @@ def play(config: DemoConfig, folder: Path, console: Console) -> None:
 
 def complaints(folder: Path, comparison: Comparison, replay: ReplaySummary) -> Iterator[str]:
     """What of a run is missing or not sane, one sentence each."""
-    for name in ("run.mcap", "metadata.yaml", "report.html", "config.json"):
+    for name in (FILE, "metadata.yaml", "report.html", "config.json"):
         path = folder / name
         if not path.is_file() or not path.stat().st_size:
             yield f"{path} is missing or empty"
@@ -103,7 +104,7 @@ def complaints(folder: Path, comparison: Comparison, replay: ReplaySummary) -> I
         yield f"contacts came at {timing.instant_rate:.0f} Hz; at least {LEAST_RATE:g} Hz was asked for"
     if timing.kept < LEAST_KEPT:
         yield f"{100 * timing.kept:.0f} % of the contacts were answered; at least {100 * LEAST_KEPT:g} % should be"
-    if replay.identical < replay.frames:
+    if not replay.passed:
         yield str(replay)
     if not comparison.passed:
         yield comparison.verdict

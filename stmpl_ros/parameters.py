@@ -179,7 +179,7 @@ class RecordConfig(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    path: Path = Field(description="folder for run.mcap and metadata.yaml")
+    path: Path = Field(description="folder for run_0.mcap and metadata.yaml")
     run: Path | None = Field(default=None, description="JSON file that says what made the run; kept in the recording")
     frames: Path | None = Field(default=None, description="the node's file of frames; the one that `run` names")
 

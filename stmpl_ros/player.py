@@ -84,16 +84,21 @@ def profile(offer: Offered) -> QoSProfile:
         depth=offer.depth if offer.transient_local else max(offer.depth, DEPTH),
         reliability=ReliabilityPolicy.RELIABLE if offer.reliable else ReliabilityPolicy.BEST_EFFORT,
         durability=DurabilityPolicy.TRANSIENT_LOCAL if offer.transient_local else DurabilityPolicy.VOLATILE,
+        liveliness_lease_duration=Duration(seconds=offer.lease),  # 0: never
     )
 
 
-def run(path: Path, speed: float, topics: tuple[str, ...], arguments: list[str] | None = None) -> int:
+def run(
+    path: Path, speed: float, topics: tuple[str, ...], arguments: list[str] | None = None, *, namespace: str = ""
+) -> int:
     """Publishes a recording until its end, SIGINT or SIGTERM; 0 if all of it was sent.
 
     Args:
         path: a run's folder, or its .mcap file.
         speed: 1 as recorded, 2 twice as fast, 0 as fast as possible.
         topics: regular expressions of whole topic names; all topics if there are none.
+        arguments: of ROS.
+        namespace: namespace of the one robot whose topics are published, "/left"; "": all.
 
     Raises:
         BagError: nothing to publish.
@@ -101,7 +106,7 @@ def run(path: Path, speed: float, topics: tuple[str, ...], arguments: list[str] 
     """
     if not 0 <= speed < float("inf"):
         raise InvalidInput(f"a speed of {speed} cannot be played; 1 is as recorded, 0 as fast as possible.")
-    wanted, bag = pattern(topics or (".*",)), Bag(path)
+    wanted, bag = pattern(topics or (".*",)), Bag(path, namespace)
     with ros(arguments) as stop:
         node = PlayerNode(bag, wanted)
         try:

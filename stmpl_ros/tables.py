@@ -3,23 +3,26 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
-from bags.compare import Comparison, Presser, compare_run
-from bags.reader import Bag
-from bags.report import headline
-from stmpl_core.methods.base import Method
-from stmpl_core.metrics import mean_and_deviation
+if TYPE_CHECKING:
+    from bags.compare import Comparison, Presser
+    from bags.reader import Bag
+    from bags.survey import Survey
+    from stmpl_core.methods.base import Method
 
 
 def compare_with_progress(
-    path: Path, reference: Method | Presser, frames: int, *, method: Method | None = None, quiet: bool = False
+    run: Path | Survey, reference: Method | Presser, frames: int, *, method: Method | None = None, quiet: bool = False
 ) -> Comparison:
     """bags.compare.compare_run under a progress bar on stderr. Raises BagError."""
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+    from bags.compare import compare_run
+
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     with Progress(*columns, console=Console(stderr=True), disable=quiet, transient=True) as progress:
         task = progress.add_task(f"frames solved by {reference.name}", total=frames)
@@ -27,16 +30,20 @@ def compare_with_progress(
         def show(done: int, total: int) -> None:
             progress.update(task, completed=done, total=total)
 
-        return compare_run(path, reference, frames=frames, method=method, on_frame=show)
+        return compare_run(run, reference, frames=frames, method=method, on_frame=show)
 
 
 def figures_of(comparison: Comparison) -> dict[str, Any]:
     """All figures of a comparison, for machines: lengths in metres, times in seconds."""
+    from stmpl_core.metrics import mean_and_deviation
+
     timing = comparison.run.timing
     figures = {
         "method": comparison.method,
         "reference": comparison.reference,
         "passed": comparison.passed,
+        "tolerance": comparison.tolerance,
+        "reason": comparison.reason,
         "answers": timing.answers,
         "instants": timing.instants,
         "skipped": timing.skipped,
@@ -55,6 +62,8 @@ def figures_of(comparison: Comparison) -> dict[str, Any]:
 
 def comparison_table(comparison: Comparison) -> Table:
     """All figures of a comparison, for people."""
+    from bags.compare import headline
+
     table = Table(show_header=False, title="the run", title_justify="left", caption_justify="left")
     table.add_column()
     table.add_column(justify="right")
@@ -84,6 +93,7 @@ def bag_figures(bag: Bag) -> dict[str, Any]:
         "damage": [vars(damage) for damage in bag.damage],
         "method": bag.provenance.method,
         "versions": dict(bag.provenance.versions),
+        "namespaces": bag.namespaces,
         "topics": {topic.name: topic._asdict() for topic in bag.topics.values()},
     }
 
@@ -99,5 +109,7 @@ def bag_table(bag: Bag) -> Table:
         seconds = (topic.last_ns - topic.first_ns) / 1e9
         rate = f"{(topic.messages - 1) / seconds:.1f}" if seconds > 0 else ""
         table.add_row(topic.name, topic.type_name, f"{topic.messages:,}", f"{seconds:.2f}", rate)
-    table.caption = f"{'finished' if bag.finished else 'not finished by its writer'}, {len(bag.damage)} places damaged"
+    robots = f"{len(bag.namespaces)} robots: {', '.join(bag.namespaces)}; " if len(bag.namespaces) > 1 else ""
+    state = "finished" if bag.finished else "not finished by its writer"
+    table.caption = f"{robots}{state}, {len(bag.damage)} places damaged"
     return table

@@ -16,6 +16,7 @@ from stmpl_ros.parameters import DemoConfig, NodeConfig, ProbeConfig, RecordConf
 from stmpl_ros.view.config import ViewConfig
 
 if TYPE_CHECKING:
+    from bags.run import Run
     from stmpl_core.methods.base import Method
 
 Json = Annotated[bool, tyro.conf.arg(name="json")]
@@ -93,6 +94,8 @@ def replay(
     path: BagPath,
     method: MethodName | None = None,
     every: int = 1,
+    tolerance_mm: float | None = None,
+    namespace: str = "",
     publish: bool = False,
     speed: float = 1.0,
     topics: tuple[str, ...] = (),
@@ -105,26 +108,33 @@ def replay(
 
     Args:
         path: a run's folder, or its .mcap file.
-        method: that answers; the one that was recorded unless given.
-        every: take each n-th frame only.
+        method: method that answers; the one that was recorded unless given, and another one may differ.
+        every: step from frame to frame; 1 takes each.
+        tolerance_mm: largest difference that is allowed at any vertex [mm]; unless given, 0 where this processor
+            recorded the run, and 1e-4 where another did.
+        namespace: namespace of the robot that is meant, /left, where several were recorded.
         publish: publish the recorded messages on their topics instead, with the timing of the recording.
-        speed: of publishing; 1 as recorded, 0 as fast as possible.
-        topics: to publish, regular expressions of whole names; all unless given.
+        speed: speed of publishing; 1 as recorded, 0 as fast as possible.
+        topics: topics to publish, regular expressions of whole names; all unless given.
         as_json: print figures for machines.
     """
     from bags.replay import replay_run
+    from bags.run import Run
 
     if publish:
-        from stmpl_ros.player import run
+        from stmpl_ros.player import run as play
 
-        return run(path, speed, topics, ros_arguments)
+        return play(path, speed, topics, ros_arguments, namespace=namespace)
     if every < 1:
         raise InvalidInput(f"--every {every} takes no frame; 1 takes each.")
-    answering = _method(method) if method else method_named(_recorded_method(path))
+    tolerance = _tolerance(tolerance_mm)
     with _waiting(f"replaying {path}", as_json):
-        summary = replay_run(path, answering, every=every)
-    print_figures(vars(summary) if as_json else str(summary))
-    return 0 if method or summary.identical == summary.frames else 1
+        run = Run(path, namespace)
+        answering = _method(method) if method else _recorded_method(run)
+        summary = replay_run(run, answering, every=every, tolerance=tolerance)
+    print_figures(vars(summary) | {"passed": summary.passed} if as_json else str(summary))
+    may_differ = method is not None and tolerance is None
+    return 0 if may_differ or summary.passed else 1
 
 
 def compare(
@@ -132,6 +142,7 @@ def compare(
     reference: Literal["rigid", MethodName] = "rigid",
     other: Annotated[Path | None, tyro.conf.arg(name="with")] = None,
     tolerance_mm: float | None = None,
+    namespace: str = "",
     frames: int = 12,
     as_json: Json = False,
 ) -> int:
@@ -142,28 +153,32 @@ def compare(
 
     Args:
         path: a run's folder, or its .mcap file.
-        reference: that judges. rigid: the recorded answers, by the same tools pressed in by finite elements; any
-            other: the run's method, under the recorded pressures.
+        reference: judge. rigid: of the recorded answers, by the same tools pressed in by finite elements; any
+            other: of the run's method, under the recorded pressures.
         other: another bag that judges instead, at the stamps that both answer.
-        tolerance_mm: allowed mean error under the contact, in the worst frame [mm].
-        frames: of the run that the reference solves.
+        tolerance_mm: allowed mean error under the contact, in the worst frame [mm]. Unless given, nothing is held to
+            a tolerance but two recordings of one method: 0 where one processor made both, 1e-4 where two did.
+        namespace: namespace of the robot that is meant, /left, where several were recorded; in both bags.
+        frames: number of frames that the reference solves.
         as_json: print figures for machines.
     """
     from bags.compare import compare_bags
+    from bags.survey import survey
     from fem_tools import RigidFem
     from stmpl_ros.tables import compare_with_progress, comparison_table, figures_of
 
-    if tolerance_mm is not None and not tolerance_mm >= 0:
-        raise InvalidInput(f"--tolerance-mm {tolerance_mm} allows nothing; give 0 or more.")
+    tolerance = _tolerance(tolerance_mm)
+    with _waiting(f"reading {path}", as_json):
+        run = survey(path, namespace)
     if other is not None:
-        comparison = compare_bags(path, other, frames=frames)
+        comparison = compare_bags(run, survey(other, namespace), frames=frames, tolerance=tolerance)
     elif reference == "rigid":
-        comparison = compare_with_progress(path, RigidFem(), frames, quiet=as_json)
+        comparison = compare_with_progress(run, RigidFem(), frames, quiet=as_json)
     else:
-        method = method_named(_recorded_method(path))
-        comparison = compare_with_progress(path, _method(reference), frames, method=method, quiet=as_json)
-    if tolerance_mm is not None:
-        comparison = dataclasses.replace(comparison, tolerance=tolerance_mm * 1e-3)
+        method = _recorded_method(run.bag)
+        comparison = compare_with_progress(run, _method(reference), frames, method=method, quiet=as_json)
+    if tolerance is not None:
+        comparison = dataclasses.replace(comparison, tolerance=tolerance)
     print_figures(figures_of(comparison) if as_json else comparison_table(comparison))
     return 0 if comparison.passed else 1
 
@@ -181,7 +196,7 @@ def info(path: BagPath, as_json: Json = False) -> int:
     from stmpl_ros.tables import bag_figures, bag_table
 
     bag = Bag(path)
-    skins = {name: repr(layer) for name, layer in bag.layers.items()} if bag.has_layers else {}
+    skins = {name: repr(layer) for name, layer in bag.known_layers().items()}
     print_figures(bag_figures(bag) | {"skins": skins} if as_json else bag_table(bag))
     for name, layer in skins.items() if not as_json else ():
         print_figures(f"skin {name}: {layer}")
@@ -198,7 +213,7 @@ def info(path: BagPath, as_json: Json = False) -> int:
 def recover(path: BagPath, target: Path | None = None) -> int:
     """Brings back what is sound in a recording that was not finished.
 
-    Example: stmpl recover runs/broken/run.mcap --target runs/mended
+    Example: stmpl recover runs/broken/run_0.mcap --target runs/mended
 
     Args:
         path: a run's folder, or its .mcap file.
@@ -241,16 +256,22 @@ def generate(
     return 0
 
 
-def _recorded_method(path: Path) -> str:
-    """The method that a run was recorded with, by its provenance, else by its first answer. Raises InvalidInput."""
-    from bags.reader import Bag
+def _recorded_method(run: Run) -> Method:
+    """The method that a run was recorded with. Raises InvalidInput if there is none of that name."""
+    if run.method not in METHODS:
+        raise InvalidInput(f"{run.file} was recorded with {run.method or 'no named method'}; "
+                           f"known are {', '.join(METHODS)}. "
+                           "Name one with replay --method, or compare with rigid.")  # fmt: skip
+    return method_named(run.method)
 
-    bag = Bag(path)
-    recorded = bag.provenance.method or next((frame.method for frame in bag.frames()), "no named method")
-    if recorded not in METHODS:
-        raise InvalidInput(f"{path} was recorded with {recorded}; known are {', '.join(METHODS)}. "
-                           "Name one with replay --method, or compare with rigid.")
-    return recorded
+
+def _tolerance(millimetres: float | None) -> float | None:
+    """A tolerance in metres. Raises InvalidInput if it is below 0."""
+    if millimetres is None:
+        return None
+    if not millimetres >= 0:
+        raise InvalidInput(f"--tolerance-mm {millimetres} allows nothing; give 0 or more.")
+    return millimetres * 1e-3
 
 
 def _method(name: MethodName) -> Method:

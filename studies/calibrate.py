@@ -17,7 +17,6 @@ from fem_tools.dataset import Dataset
 from fem_tools.hand import Hand
 from fem_tools.ladder import default_rungs
 from fem_tools.patch import PatchFem
-from fem_tools.provenance import commit, machine, versions
 from fem_tools.sampling import BodyPlan, ContactId, Plan, SetName, draw, layers
 from fem_tools.scenes import Site, UnusableContact, ellipse
 from stmpl_core.body import Body
@@ -26,6 +25,7 @@ from stmpl_core.layer import SoftLayer
 from stmpl_core.load import Load
 from stmpl_core.methods import Method
 from stmpl_core.methods.ladder import RANGED, SHIPPED, Known, Measured, SceneFigures, SceneReader
+from stmpl_core.provenance import commit, machine, versions
 
 COVERED = 0.95  # share of answers that must lie within the bound, on a body that the fit has not seen
 MARGIN = 1.25  # on that bound, for shapes unlike those of the fit

@@ -13,14 +13,14 @@ from typing import Any
 
 import numpy as np
 
-from fem_tools.dataset import Dataset, Sample, Subset
-from fem_tools.provenance import commit, data_card, machine, versions
+from fem_tools.dataset import Dataset, Sample, Subset, data_card
 from fem_tools.sampling import Kind, Split
 from stmpl_core.errors import InvalidInput, StmplError
 from stmpl_core.layer import SoftLayer
 from stmpl_core.methods import Method, Naive, Winkler
 from stmpl_core.methods.zero import Zero
 from stmpl_core.metrics import LIMITS, Score, mean_and_deviation, score
+from stmpl_core.provenance import commit, machine, versions
 
 THREE_BODIES = ("weight_0", "weight_50", "weight_100")  # of the second set-up: beta_2 in {2, 0, -2}
 THREE_BODY_ROW = "unet, 3 bodies"  # the method of Table 3

@@ -13,14 +13,14 @@ import torch
 from pydantic import BaseModel, ConfigDict, Field
 from torch import Tensor, nn
 
-from fem_tools.dataset import LOADS, Dataset
-from fem_tools.provenance import commit, data_card, machine, versions
+from fem_tools.dataset import LOADS, Dataset, data_card
 from fem_tools.sampling import Kind
 from stmpl_core.layer import SoftLayer
 from stmpl_core.load import Load
 from stmpl_core.methods.moment_net import AMPLITUDE, SURROUNDED, MomentNet, source_fields
 from stmpl_core.moments import SCALARS, TENSORS, VECTORS, WIDTH, Surroundings
 from stmpl_core.networks import DIRECTIONS, INPUTS, MIXED_TENSORS, MIXED_VECTORS, MOTION, POINT, Layout, Weights
+from stmpl_core.provenance import commit, machine, versions
 
 VERSIONS = ("stmpl", "torch", "numpy", "numba", "safetensors")
 TYPICAL = 1e-3  # of the peak: errors below count as squares in the loss

@@ -18,14 +18,14 @@ from pydantic import BaseModel, ConfigDict, Field
 from safetensors.torch import save_file
 from torch import Tensor, nn
 
-from fem_tools.dataset import Dataset, Subset
-from fem_tools.provenance import commit, data_card, machine, versions
+from fem_tools.dataset import Dataset, Subset, data_card
 from fem_tools.sampling import Kind, Split
 from stmpl_core.errors import InvalidInput
 from stmpl_core.layer import SoftLayer
 from stmpl_core.methods.pix2pix import Pix2PixUNet
 from stmpl_core.methods.unet import MOTION, UNet, UNetCard, seen_in, square_chart
 from stmpl_core.metrics import mean_and_deviation, score
+from stmpl_core.provenance import commit, machine, versions
 from studies.unet_samples import Images, Samples
 
 THREE_BODIES = ("weight_0", "weight_50", "weight_100")  # beta_2 in {2, 0, -2}

@@ -6,9 +6,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pytest
 import trimesh
-
 from bags.messages import contact_from, layer_id, tool_mesh_from
+
 from bags.provenance import write_provenance
 from bags.schema import find_schema, typestore_of
 from bags.writer import BagWriter, qos_yaml
@@ -16,6 +17,7 @@ from stmpl_core import SoftLayer, Tissue
 from stmpl_core.methods.base import Method
 from stmpl_core.simulator import Simulator
 from stmpl_core.trust import Displacement
+from stmpl_ros.cli import main
 
 TYPES = {
     "mesh": "stmpl_msgs/msg/ContactMesh",
@@ -107,7 +109,8 @@ def displacement(answer: Displacement, layer: SoftLayer, stamp: int, sequence: i
 
 
 def write_run(folder: Path, method: Method, *, layer: SoftLayer | None = None, frames: int = 40, rate: float = 100.0,
-              lose: tuple[int, ...] = (), skip: tuple[int, ...] = (), delay: float = 0.002) -> Path:  # fmt: skip
+              lose: tuple[int, ...] = (), skip: tuple[int, ...] = (), delay: float = 0.002,
+              namespace: str = "/stmpl") -> Path:  # fmt: skip
     """Records a ball that presses and slides, joined in the last third by a second one; returns the folder.
 
     Frames in `lose` are answered but not recorded, those in `skip` are not answered at all.
@@ -117,10 +120,10 @@ def write_run(folder: Path, method: Method, *, layer: SoftLayer | None = None, f
     with BagWriter(folder) as bag:
         write_provenance(bag, None, method=method.name, body="tube", config={"rate": rate, "frames": frames})
         kept, stream = qos_yaml(transient_local=True), qos_yaml()
-        skin = bag.add_channel("/stmpl/skin/topology", TYPES["topology"], kept)
-        surface = bag.add_channel("/stmpl/contact_mesh", TYPES["mesh"], kept)
-        answers = bag.add_channel("/stmpl/skin/displacement", TYPES["displacement"], stream)
-        tools = {(tool, kind): bag.add_channel(f"/stmpl/tools/{tool}/{kind}", TYPES[kind], stream)
+        skin = bag.add_channel(f"{namespace}/skin/topology", TYPES["topology"], kept)
+        surface = bag.add_channel(f"{namespace}/contact_mesh", TYPES["mesh"], kept)
+        answers = bag.add_channel(f"{namespace}/skin/displacement", TYPES["displacement"], stream)
+        tools = {(tool, kind): bag.add_channel(f"{namespace}/tools/{tool}/{kind}", TYPES[kind], stream)
                  for tool in ANGLES for kind in ("pose", "wrench")}  # fmt: skip
         bag.write(skin, cdr(topology(layer)), START, START)
         meshes = {}
@@ -152,3 +155,11 @@ def script(share: float) -> dict[str, float]:
     """What each tool presses with [N] after a share of the run: one ball presses, in the last third a second joins."""
     pushes = {"ball": 0.4 * float(np.sin(np.pi / 2 * min(3 * share, 1.0)))}
     return pushes if share < 2 / 3 else pushes | {"finger": 0.3 * (3 * share - 2)}
+
+
+def stmpl(capsys, *arguments: object) -> tuple[int, str]:
+    """Exit code of the command, and all that it printed."""
+    with pytest.raises(SystemExit) as ended:
+        main([str(argument) for argument in arguments])
+    shown = capsys.readouterr()
+    return int(ended.value.code or 0), " ".join((shown.out + shown.err).split())

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import resource
 import signal
 import subprocess
@@ -10,15 +11,16 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from bags.messages import contact_from, layer_from, layer_id, pose_from, wrench_from
 from mcap.reader import make_reader
 from rosbags.rosbag2 import Reader
 
-from bags.messages import contact_from, layer_from, layer_id, pose_from, wrench_from
 from bags.provenance import layer_from_bytes, layer_to_bytes, write_provenance
 from bags.reader import Bag
+from bags.records import bag_file
 from bags.recover import recover
 from bags.schema import find_schema, typestore_of
-from bags.writer import BagWriter, qos_yaml
+from bags.writer import FILE, BagWriter, Offered, offered, qos_yaml
 from stmpl_core.contact import ToolMesh
 from stmpl_core.errors import BagError, FrameError, InvalidInput
 from tests.bag_scene import START, STORE, ball, cdr, header, message, pose, tube, wrench
@@ -95,6 +97,21 @@ def test_a_schema_stands_on_its_own_and_has_the_hash_of_its_text(name):
     assert schema.text.count("MSG: ") == schema.text.count("=" * 80)
 
 
+@pytest.mark.parametrize("offer", [Offered(), Offered(3, False, True, 0.25), Offered(depth=7, lease=1.0)], ids=str)
+def test_a_quality_of_service_comes_back(offer):
+    written = qos_yaml(**vars(offer))
+    assert offered(written) == offer
+    assert ("9223372036" in written.split("liveliness_lease_duration")[1]) == (not offer.lease)
+
+
+def test_rosbag2_may_index_a_recording_again_by_its_name(tmp_path):
+    path = write_headers(tmp_path / "run")
+    assert re.fullmatch(r".+_(\d+)\.([a-zA-Z0-9])+", path.name)  # what rosbag2's Reindexer looks for
+    assert bag_file(tmp_path / "run") == path and bag_file(path) == path
+    path.rename(path.with_name("run.mcap"))  # the name in older recordings
+    assert bag_file(tmp_path / "run").name == "run.mcap" and numbers(tmp_path / "run") == list(range(100))
+
+
 def test_an_unknown_type_or_channel_is_refused(tmp_path):
     with BagWriter(tmp_path) as bag:
         with pytest.raises(BagError, match="no_msgs/msg/Nothing is not installed"):
@@ -129,7 +146,7 @@ def test_a_killed_recording_gives_back_every_whole_chunk(tmp_path):
     safe = max([safe, *(int(line) for line in child.stdout.read().split("\n")[:-1])])
     child.wait()
 
-    with pytest.raises(Exception, match=r"(?i)magic|footer|end"), Reader(tmp_path / "run" / "run.mcap") as reader:
+    with pytest.raises(Exception, match=r"(?i)magic|footer|end"), Reader(tmp_path / "run" / FILE) as reader:
         list(reader.messages())  # a reader that seeks cannot open it
     recovery = recover(tmp_path / "run", tmp_path / "back")
     back = numbers(tmp_path / "back")

@@ -3,24 +3,28 @@
 from __future__ import annotations
 
 import html
+import json
 from dataclasses import replace
 
 import numpy as np
 import pytest
-
-from bags.compare import compare_bags, compare_run, sample
 from bags.messages import layer_id
-from bags.provenance import write_provenance
+
+from bags import records
+from bags.compare import compare_bags, compare_run, headline, sample
+from bags.provenance import LAYER, OTHER_PROCESSOR, layer_to_bytes, write_provenance
 from bags.reader import Bag
-from bags.replay import replay_run
-from bags.report import headline, write_report
+from bags.replay import Replayed, replay_run
+from bags.report import write_report
+from bags.run import Run
 from bags.survey import survey
 from bags.writer import BagWriter
 from stmpl_core.errors import BagError
 from stmpl_core.methods import Winkler
+from stmpl_core.provenance import processor
 from stmpl_core.trust import Displacement, Trust
 from stmpl_ros.view.recording import Recording
-from tests.bag_scene import tube, write_run
+from tests.bag_scene import stmpl, tube, write_run
 
 LOST, SKIPPED, DELAY = (5, 6, 20), (10, 11), 0.003
 
@@ -56,6 +60,40 @@ def test_a_replay_repeats_the_run_bit_for_bit(run):
     assert "every one bit for bit" in str(replayed)
 
 
+def test_a_recording_names_the_processor_and_another_one_may_differ_in_the_last_bit(run, monkeypatch):
+    assert Bag(run).provenance.processor == processor() and replay_run(run, Winkler()).tolerance == 0
+    nearly = replay_run(run, Stiffer(1 + 1e-6))
+    assert nearly.identical < nearly.frames and 0 < nearly.worst < OTHER_PROCESSOR and not nearly.passed
+    assert "held to every bit, since the same processor recorded it; number" in str(nearly)
+    assert replay_run(run, Stiffer(1 + 1e-6), tolerance=OTHER_PROCESSOR).passed
+
+    recorded = processor()
+    monkeypatch.setattr("stmpl_core.provenance.processor", lambda: "another make")
+    nearly, off = replay_run(run, Stiffer(1 + 1e-6)), replay_run(run, Stiffer(1.25))
+    assert nearly.passed and nearly.identical < nearly.frames and nearly.tolerance == OTHER_PROCESSOR
+    assert str(nearly).endswith(f"held to 0.0001 mm, since another processor ({recorded}) recorded it.")
+    assert f"number {off.first_difference} is the first past it. Changed since: processor" in str(off)
+    assert not off.passed
+    assert not replay_run(run, Stiffer(1 + 1e-6), tolerance=0.0).passed
+
+
+def test_an_answer_that_is_no_number_passes_no_tolerance(run):
+    frame = next(Bag(run).frames())
+    replayed = Replayed(frame, Displacement(np.full(frame.displacement.shape, np.nan), Trust(), "none"))
+    assert not replayed.identical and replayed.difference == float("inf")
+
+
+def test_two_recordings_of_one_method_are_held_to_what_their_processors_allow(run, tmp_path, monkeypatch):
+    same = compare_bags(run, run)
+    assert same.tolerance == 0 and same.passed and "the same processor recorded it" in same.verdict
+    monkeypatch.setattr("stmpl_core.provenance.processor", lambda: "another make")
+    elsewhere = write_run(tmp_path / "elsewhere", Winkler(), frames=24)
+    assert compare_bags(run, elsewhere).tolerance == OTHER_PROCESSOR and compare_bags(run, elsewhere).passed
+    assert "another processor (another make) recorded it" in compare_bags(run, elsewhere).verdict
+    stiffer = write_run(tmp_path / "stiffer", Stiffer(1.25), frames=24)
+    assert compare_bags(run, stiffer).tolerance is None and compare_bags(run, stiffer).passed
+
+
 def test_a_replay_by_another_method_says_where_it_differs(run):
     replayed = replay_run(run, Stiffer(0.9))
     assert 0 < replayed.identical < replayed.frames  # the first frame is at rest
@@ -83,10 +121,10 @@ def test_the_comparison_measures_the_error_that_was_put_in(run):
 def test_the_sample_holds_the_heaviest_frame_and_both_tools_and_spreads(run):
     moments = survey(run).moments
     for count in (2, 5, 12, 1000):
-        picks = set(sample(moments, count))
+        picks = sample(moments, count)
         assert len(picks) == min(count, sum(moment.load > 0 for moment in moments))
-        assert max(moments, key=lambda moment: moment.load).sequence in picks
-        assert any(moment.pressing > 1 for moment in moments if moment.sequence in picks)
+        assert max(moments, key=lambda moment: moment.load) in picks
+        assert any(moment.pressing > 1 for moment in picks)
     alone = [replace(moment, load=0.0) for moment in moments]
     with pytest.raises(BagError, match="nothing pressed"):
         sample(alone, 5)
@@ -120,16 +158,19 @@ def two_skins(tmp_path_factory):
     return joined(parts, folder / "run"), skins
 
 
-def joined(parts, folder):
-    """Several runs as one, one after the other."""
+def joined(parts, folder, order=None, attached=None):
+    """Several runs as one, one after the other, or in another order of (part, topic, data, log time); a layer last."""
     with BagWriter(folder) as writer:
         write_provenance(writer, None, method="winkler")
-        for part, path in enumerate(parts):
-            bag, channels = Bag(path), {}
-            for raw in bag.raw(lambda topic: True):
-                if raw.topic not in channels:
-                    channels[raw.topic] = writer.add_channel(raw.topic, bag.topics[raw.topic].type_name)
-                writer.write(channels[raw.topic], raw.data, raw.log_time_ns + part, raw.log_time_ns)
+        channels = {}
+        bags = [Bag(path) for path in parts]
+        told = [(part, *raw) for part, bag in enumerate(bags) for raw in bag.raw(lambda topic: True)]
+        for part, topic, data, log_time in sorted(told, key=order) if order else told:
+            if topic not in channels:
+                channels[topic] = writer.add_channel(topic, bags[part].topics[topic].type_name)
+            writer.write(channels[topic], data, log_time + part, log_time)
+        if attached:
+            writer.attach(LAYER, "application/x-npz", layer_to_bytes(attached))
     return folder
 
 
@@ -155,6 +196,91 @@ def test_a_run_whose_skin_was_changed_is_compared_and_shown_each_answer_on_its_o
     assert {layer_id(layer) for layer in recording.layers} == {layer_id(skin) for skin in skins}
     for snapshot, layer in zip(recording.snapshots, recording.layers, strict=True):
         assert len(snapshot.answer.displacement) == len(layer.vertices)
+
+
+def test_loads_and_times_are_those_of_the_answer_where_a_node_was_started_again(two_skins):
+    comparison = compare_run(two_skins[0], Winkler(), frames=100)
+    for pair in comparison.pairs:
+        assert pair.load == pytest.approx(float(pair.frame.pressure @ pair.layer.vertex_areas), rel=1e-6)
+        assert comparison.run.moments[pair.number].stamp_ns == pair.frame.stamp_ns
+
+
+def test_a_file_in_any_order_gives_the_same(run, tmp_path):
+    last = ("displacement", "pose", "wrench", "contact_mesh", "topology")
+    backwards = joined([run], tmp_path / "run", order=lambda told: (last.index(told[1].split("/")[-1]), told[3]))
+    assert next(Bag(backwards).raw(lambda topic: True)).topic == "/stmpl/skin/displacement"
+    ours, theirs = survey(backwards), survey(run)
+    for moment, expected in zip(ours.moments, theirs.moments, strict=True):
+        assert vars(moment) == vars(expected)
+    assert replay_run(backwards, Winkler()).identical == len(ours.moments)
+    assert compare_run(backwards, Winkler(), method=Winkler(), tolerance=0.0).passed
+
+
+def test_an_exact_layer_that_comes_last_counts_for_every_answer(run, tmp_path):
+    layer = Bag(run).layer
+    exact = layer.with_(vertices=layer.vertices * (1 + 1e-9))  # the same to float32
+    assert layer_id(exact) == layer_id(layer)
+    late = survey(joined([run], tmp_path / "late", attached=exact))
+    frames = list(late.bag.frames())
+    assert late.bag.layer.vertices.tobytes() == exact.vertices.tobytes()
+    for moment, frame in zip(late.moments, frames, strict=True):
+        assert moment.load == float(np.sum(frame.pressure * exact.vertex_areas))
+
+
+def test_a_comparison_walks_the_file_once(run, monkeypatch):
+    walks = []
+    walk = records._walk
+    monkeypatch.setattr(records, "_walk", lambda *given: walks.append(1) or walk(*given))
+    compare_run(run, Winkler(), method=Winkler(), frames=4)
+    assert len(walks) == 1
+    replay_run(run, Winkler())
+    assert len(walks) == 2
+
+
+@pytest.fixture(scope="module")
+def two_robots(tmp_path_factory):
+    """Two robots in one recording: skins, tools of the same names, answers; and a topic that is of neither."""
+    folder = tmp_path_factory.mktemp("robots")
+    skins = {"/left": tube(edge=9e-3), "/right/arm": tube(edge=9e-3).with_(youngs_modulus=2e4)}
+    parts = [write_run(folder / name[1:5], Winkler(), layer=skin, frames=8, namespace=name)
+             for name, skin in skins.items()]  # fmt: skip
+    return joined(parts, folder / "run", order=lambda told: told[3]), parts, skins
+
+
+def test_a_recording_of_two_robots_is_read_by_namespace(two_robots):
+    run, parts, skins = two_robots
+    assert Bag(run).namespaces == ["/left", "/right/arm"] and len(Bag(run).topics) == 14
+    for name, part in zip(skins, parts, strict=True):
+        bag = Bag(run, name)
+        assert set(bag.topics) == set(Bag(part).topics) and list(bag.layers) == [layer_id(skins[name])]
+        replayed = replay_run(Run(run, name.strip("/")), Winkler())
+        assert replayed.frames == replayed.identical == 8
+        ours, alone = survey(run, name), survey(part)
+        assert [moment.load for moment in ours.moments] == [moment.load for moment in alone.moments]
+        assert compare_run(ours, Winkler(), method=Winkler(), tolerance=0.0).passed
+        assert Recording.of(ours, frames=4).layer.tissue == skins[name].tissue
+
+
+@pytest.mark.parametrize("read", [survey, Run, lambda run: Bag(run).layers, lambda run: list(Bag(run).frames())])
+def test_which_robot_is_asked_for_where_there_are_two(two_robots, read):
+    with pytest.raises(BagError, match=r"holds 2 robots, of the namespaces /left, /right/arm. Name one .*--namespace"):
+        read(two_robots[0])
+    with pytest.raises(BagError, match="no robot of the namespace /middle; there: /left, /right/arm"):
+        Bag(two_robots[0], "/middle")
+
+
+def test_the_command_takes_a_namespace_and_info_lists_them(two_robots, capsys):
+    run = two_robots[0]
+    code, said = stmpl(capsys, "info", run)
+    assert code == 0 and "2 robots: /left, /right/arm" in said and said.count("skin ") == 2
+    assert json.loads(stmpl(capsys, "info", run, "--json")[1])["namespaces"] == ["/left", "/right/arm"]
+    code, said = stmpl(capsys, "replay", run)
+    assert code == 1 and "--namespace" in said
+    assert stmpl(capsys, "replay", run, "--namespace", "/left")[0] == 0
+    assert stmpl(capsys, "replay", run, "--namespace", "/left", "--method", "linear", "--tolerance-mm", 0)[0] == 1
+    compared = "compare", run, "--reference", "winkler", "--tolerance-mm", 1e-3, "--namespace"
+    assert stmpl(capsys, *compared, "/right/arm")[0] == 0
+    assert stmpl(capsys, *compared, "/middle")[0] == 1
 
 
 def test_the_report_shows_what_was_measured_and_needs_no_other_file(run, tmp_path):

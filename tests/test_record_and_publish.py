@@ -13,6 +13,7 @@ from std_msgs.msg import Header, String
 
 from bags.reader import Bag
 from bags.recover import recover
+from bags.writer import FILE
 from stmpl_ros.topics import STREAM
 from tests.bus import PATIENCE, Robot, end, start
 
@@ -93,7 +94,7 @@ def test_what_cannot_be_published_is_refused(run):
 
 def test_a_killed_recorder_loses_what_it_had_not_flushed_only(talker, tmp_path):
     recorder = start(*STMPL, "record", "--path", str(tmp_path / "run"), "--topics", "/any/words")
-    file, sizes = tmp_path / "run" / "run.mcap", set()
+    file, sizes = tmp_path / "run" / FILE, set()
     try:
         talker.wait_for_recorder(talker.words)
         for number in itertools.count():

@@ -15,6 +15,7 @@ class ViewConfig(BaseModel):
     node: NodeConfig = Field(default=NodeConfig(), description="skin and method under a dragged tool")
     tool: str = Field(default="fingertip", description="ball, fingertip, cylinder, a letter, or a mesh file in m")
     frames: int = Field(default=300, ge=2, description="of a recording that the time slider holds; each costs 0.2 MB")
+    namespace: str = Field(default="", description="namespace of the one robot of a recording to show, /left")
     fem: int = Field(default=0, ge=0, description="frames of a recording that FEM solves before the page opens")
     patience: float = Field(default=10.0, gt=0, description="say so if the live node is silent for longer [s]")
     host: str = Field(default="127.0.0.1", description="address to serve on; 0.0.0.0 lets other machines look")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -13,7 +13,7 @@ import numpy as np
 from bags.compare import Comparison
 from bags.frame import Frame
 from bags.pictures import spot_of
-from bags.reader import ContactLog
+from bags.run import Run
 from bags.survey import Survey, survey
 from stmpl_core.contact import Contact
 from stmpl_core.errors import BagError
@@ -35,27 +35,28 @@ class Recording:
     snapshots: tuple[Snapshot, ...]
 
     @classmethod
-    def of(cls, path: Path | str, frames: int, *, compared: Comparison | None = None,
-           on_frame: Callable[[int, int], None] | None = None) -> Recording:
-        """Reads `frames` instants evenly over a bag, and those that a comparison solved.
+    def of(cls, run: Path | str | Survey, frames: int, *, compared: Comparison | None = None) -> Recording:
+        """Reads `frames` instants evenly over a bag, and those that a comparison of it solved.
+
+        Args:
+            run: the recording: its folder, its .mcap file, or what a survey of it gave.
+            frames: how many.
+            compared: comparison of this recording.
 
         Raises:
             BagError: no recording, no answers in it, or no skin.
         """
-        run = survey(path)
-        wanted = set(np.linspace(0, len(run.moments) - 1, min(frames, len(run.moments))).round().astype(int).tolist())
-        judged = {} if compared is None else {pair.frame.log_time_ns: pair.reference for pair in compared.judged}
+        run = run if isinstance(run, Survey) else survey(run)
+        judged = {} if compared is None else {pair.number: pair.reference for pair in compared.judged}
+        even = np.linspace(0, len(run.moments) - 1, min(frames, len(run.moments))).round().astype(int).tolist()
+        numbers = sorted({*even, *judged})
         gauge: Gauge | None = None
         shown: list[tuple[Snapshot, SoftLayer]] = []
-        for number, frame in enumerate(run.bag.frames()):
-            if number in wanted or frame.log_time_ns in judged:
-                layer = run.bag.layer_of(frame)
-                if gauge is None or shown[-1][1] is not layer:
-                    gauge = Gauge(layer)
-                snapshot = _snapshot(run, number, frame, gauge)
-                shown.append((replace(snapshot, reference=judged.get(frame.log_time_ns)), layer))
-            if on_frame:
-                on_frame(number, len(run.moments))
+        for number, frame in zip(numbers, run.bag.frames(numbers), strict=True):
+            layer = run.bag.layer_of(frame)
+            if gauge is None or shown[-1][1] is not layer:
+                gauge = Gauge(layer)
+            shown.append((replace(_snapshot(run, number, frame, gauge), reference=judged.get(number)), layer))
         shown.sort(key=lambda one: one[0].time)
         snapshots, layers = zip(*shown, strict=True)
         return cls(str(run.bag.file), layers, snapshots)
@@ -152,15 +153,15 @@ def _marks(snapshots: Sequence[Snapshot]) -> tuple[float, ...] | None:
 
 def _snapshot(run: Survey, number: int, frame: Frame, gauge: Gauge) -> Snapshot:
     moment = run.moments[number]
-    contacts = _contacts(run.contacts, frame)
+    contacts = _contacts(run.bag, frame)
     told = all(np.isfinite(touch.wrench).all() for touch in frame.touches.values())  # older recordings do not
     readings = readings_of(frame) if told or contacts is None else gauge.read(contacts)
     return Snapshot(moment.time, frame, tuple(contacts or ()), readings, moment.solve_seconds, moment.latency)
 
 
-def _contacts(log: ContactLog, frame: Frame) -> list[Contact] | None:
+def _contacts(run: Run, frame: Frame) -> list[Contact] | None:
     """The contacts of an answer; None if the bag lacks one of them."""
     try:
-        return log.at(frame)
+        return run.contacts(frame)
     except BagError:
         return None

@@ -30,11 +30,14 @@ def run(config: ViewConfig, path: Path | None, live: bool, arguments: list[str] 
 
 
 def _serve_recording(config: ViewConfig, path: Path) -> int:
+    from bags.survey import survey
     from stmpl_ros.view.recording import Recording, RecordingPlayer
 
-    compared = compare_with_progress(path, RigidFem(), config.fem) if config.fem else None
     with Console(stderr=True).status(f"reading {path}"):
-        recording = Recording.of(path, config.frames, compared=compared)
+        run = survey(path, config.namespace)
+    compared = compare_with_progress(run, RigidFem(), config.fem) if config.fem else None
+    with Console(stderr=True).status(f"reading {path}"):
+        recording = Recording.of(run, config.frames, compared=compared)
     page = Page(config.host, config.port, str(path))
     return _until_stopped(page, RecordingPlayer(page, recording))
 

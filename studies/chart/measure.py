@@ -14,7 +14,6 @@ import numpy as np
 
 from fem_tools.hand import Hand
 from fem_tools.patch import PatchFem
-from fem_tools.provenance import commit, machine, versions
 from fem_tools.scenes import Scene, Site, UnusableContact, ellipse, letter
 from stmpl_core.body import Body
 from stmpl_core.errors import InvalidInput, StmplError
@@ -22,6 +21,7 @@ from stmpl_core.layer import SoftLayer
 from stmpl_core.load import Load
 from stmpl_core.methods import Method
 from stmpl_core.metrics import score
+from stmpl_core.provenance import commit, machine, versions
 from studies.chart.curves import CURVES, Curve
 
 OnProgress = Callable[[int, int, str], None]

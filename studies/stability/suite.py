@@ -12,10 +12,10 @@ from typing import Any, Literal
 
 import numpy as np
 
-from fem_tools.provenance import commit, machine, versions
 from stmpl_core.errors import InvalidInput, StmplError
 from stmpl_core.layer import SoftLayer
 from stmpl_core.methods.base import Method
+from stmpl_core.provenance import commit, machine, versions
 from stmpl_core.trust import Displacement
 from studies.stability import failures
 from studies.stability.laws import LAWS, Answers, Broken

@@ -1,0 +1,86 @@
+"""Run: a recording of contacts and their answers, with the contacts as they stood at any answer."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, Self
+
+from mcap.records import Message
+
+from bags.frame import Frame
+from bags.reader import DISPLACEMENT, Bag, tool_topic
+from bags.records import Place
+from bags.wire import contact_from, frame_from, stamp_ns
+from stmpl_core.contact import Contact
+from stmpl_core.errors import BagError, FrameError
+
+NANO = 1e-9  # seconds in a nanosecond
+
+
+class Run(Bag):
+    """A bag whose poses and wrenches are kept by tool and stamp: a few hundred bytes each, whatever the answers weigh.
+
+    Args:
+        path: a folder, or the path of the .mcap file.
+        namespace: namespace of the one robot that is meant, "/left"; "": there is but one.
+        on_answer: function that gets each answer while the file is looked over, in its order.
+
+    Attributes:
+        received: when the last contact message of a stamp was received [ns], by the stamp.
+        pose_stamps: stamps of all poses.
+
+    Raises:
+        BagError: as for a Bag; or several robots, and no namespace.
+    """
+
+    def __init__(
+        self, path: Path | str, namespace: str = "", *, on_answer: Callable[[Self, Frame], None] | None = None
+    ) -> None:
+        self.received: dict[int, int] = {}
+        self.pose_stamps: set[int] = set()
+        self._sent: dict[tuple[str, str], dict[int, Message]] = {}  # by tool and kind, then stamp
+        self._on_answer, self._answering = on_answer, ""
+        super().__init__(path, namespace)
+
+    def see(self, topic: str, record: Message, place: Place) -> None:
+        """Keeps poses and wrenches, and hands on the answers."""
+        super().see(topic, record, place)
+        if contact := tool_topic(topic):
+            stamp = stamp_ns(self.decode(record))
+            self._sent.setdefault(contact, {})[stamp] = record
+            self.received[stamp] = max(self.received.get(stamp, 0), record.log_time)
+            if contact[1] == "pose":
+                self.pose_stamps.add(stamp)
+        elif topic.endswith(DISPLACEMENT):
+            if topic != self._answering:
+                self._answering = self.find_topic(DISPLACEMENT)
+            if self._on_answer:
+                self._on_answer(self, frame_from(self.decode(record), record.log_time))
+
+    def contacts(self, frame: Frame) -> list[Contact]:
+        """The contacts that `frame` answers: of each of its tools the pose and the wrench that it names.
+
+        Raises:
+            BagError: a pose, a wrench or a mesh that it answers is not in the bag.
+        """
+        return [self._contact(tool, *stamps) for tool, stamps in frame.inputs.items()]
+
+    def _contact(self, tool: str, posed: int, pushed: int) -> Contact:
+        known, pose, wrench = self.tools.get(tool), self._told_at(tool, "pose", posed), None
+        lacks = ["mesh"] * (known is None) + ["pose"] * (pose is None)
+        if pushed and (wrench := self._told_at(tool, "wrench", pushed)) is None:
+            lacks.append("wrench")
+        if known is None or lacks:
+            raise BagError(f"an answer to tool {tool} at {posed * NANO:.3f} s cannot be repeated: "
+                           f"the bag has no {' and no '.join(lacks)} for it.")
+        frames = self.provenance.frames
+        try:
+            return contact_from(known, pose, wrench, body_frame=self.body_frame, frames=frames)
+        except FrameError as error:
+            raise BagError(f"{error} The recording carries the frames of stmpl record --frames, and none that "
+                           "move (/tf).") from error  # fmt: skip
+
+    def _told_at(self, tool: str, kind: str, stamp: int) -> Any | None:
+        record = self._sent.get((tool, kind), {}).get(stamp)
+        return None if record is None else self.decode(record)
