@@ -6,26 +6,28 @@ SHELL := /bin/bash
 VENV := .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
-BUILT_FROM := setup.py pyproject.toml msg_defs/pyproject.toml msg_defs/CMakeLists.txt $(wildcard msg_defs/msg/*.msg msg_defs/srv/*.srv)
+READY_DEV := $(VENV)/.ready-dev
+MESSAGES := msg_defs/pyproject.toml msg_defs/CMakeLists.txt $(wildcard msg_defs/msg/*.msg msg_defs/srv/*.srv)
+INSTALL := $(BIN)/uv pip install --compile-bytecode --python $(BIN)/python $(if $(ROS_DISTRO),,./msg_defs)
 
 help:  ## Say what each target does
 	@echo "stmpl: real-time soft-tissue contact for robots"
 	@grep -hE '^[a-z]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z]+):.*## (.*)/  make \1\t\2/' | expand -t 16
 
-setup: $(READY)  ## Make .venv with Python 3.12, ROS 2 and everything else (once; needs a C++ compiler)
+setup: $(READY)  ## Make .venv with Python 3.12, ROS 2 and what the main job needs (once; needs a C++ compiler)
 
 demo: $(READY)  ## Run the main job: simulated contact over ROS 2, recorded, compared with FEM, with a report
 	$(BIN)/stmpl demo
 
-test: $(READY)  ## Pass the tests
+test: $(READY_DEV)  ## Pass the tests
 	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder
 
-check: $(READY)  ## Lint, types and the one-way import rule
+check: $(READY_DEV)  ## Lint, types and the one-way import rule
 	$(BIN)/ruff check .
 	$(BIN)/pyright
 	$(BIN)/lint-imports
 
-weights: $(READY)  ## Make the networks that ship, from nothing: data, training (about three hours on two cores; goes on if stopped)
+weights: $(READY_DEV)  ## Make the networks that ship, from nothing: data, training (about three hours on two cores; goes on if stopped)
 	$(BIN)/stmpl generate --preset default --out data/default
 	$(BIN)/stmpl train --preset default --data data/default --out stmpl_core/weights
 	$(BIN)/stmpl generate --preset contacts --out data/contacts
@@ -36,11 +38,15 @@ clean:  ## Remove .venv, caches and build folders; runs/ stays
 	rm -rf $(VENV) build install log *.egg-info .pytest_cache .ruff_cache .import_linter_cache .numba_cache
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
 
-# On a ROS machine its own rclpy is used; elsewhere ROS 2 comes as wheels, which exist for Python 3.12 only.
-$(READY): $(BUILT_FROM)
-	@command -v c++ >/dev/null || { echo "stmpl needs a C++ compiler to build its ROS messages; on Ubuntu: sudo apt install g++"; exit 1; }
+# On a ROS machine its own rclpy and colcon-built messages are used; elsewhere both come as wheels, for Python 3.12 only.
+$(READY): setup.py pyproject.toml $(MESSAGES)
+	@[ -n "$$ROS_DISTRO" ] || command -v c++ >/dev/null || { echo "stmpl needs a C++ compiler to build its ROS messages; on Ubuntu: sudo apt install g++"; exit 1; }
 	@python=$$(.ci/find_python) || exit 1; \
 	[ -x $(BIN)/python ] || $$python -m venv $${ROS_DISTRO:+--system-site-packages} $(VENV)
 	$(BIN)/python -m pip install --quiet uv
-	$(BIN)/uv pip install --compile-bytecode --python $(BIN)/python --editable ".[dev]"
+	$(INSTALL) --editable .
+	@touch $@
+
+$(READY_DEV): $(READY)  # tools of the tests, and what all verbs need (gigabytes: torch)
+	$(INSTALL) --editable ".[dev]"
 	@touch $@

@@ -25,6 +25,7 @@ from fem_tools.hand import Hand
 from fem_tools.sampling import ContactId, Plan, contacts, layers
 from stmpl_core.body import Body
 from stmpl_core.errors import InvalidInput, StmplError
+from stmpl_core.extras import needed
 from stmpl_core.layer import SoftLayer
 from stmpl_core.provenance import versions
 
@@ -135,10 +136,9 @@ def _solve_all(plan: Plan, out: Path, made: Mapping[str, SoftLayer], workers: in
 def _executor(workers: int | None, scheduler: str | None) -> Iterator[tuple[Executor, int]]:
     """Something that takes jobs, and how many it works on at a time."""
     if scheduler is not None:
-        try:
-            from distributed import Client
-        except ImportError as error:
-            raise InvalidInput("--scheduler needs Dask. Try: pip install 'stmpl[cluster]'.") from error
+        needed("a scheduler of Dask", "cluster", "distributed")
+        from distributed import Client
+
         with Client(scheduler, timeout="20s") as client, client.get_executor(pure=False) as executor:
             nthreads: Any = client.nthreads()
             yield executor, max(1, len(nthreads))

@@ -2,33 +2,26 @@
 
 from __future__ import annotations
 
-import fcntl
-import gzip
-import hashlib
-import json
-import logging
-import os
 import re
-from collections.abc import Iterator, Mapping
-from contextlib import ExitStack, contextmanager, suppress
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import cache
-from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
-import igl
 import numpy as np
 from numpy.typing import ArrayLike
 
+from stmpl_core import limbs
 from stmpl_core.arrays import Faces, Points, finite
 from stmpl_core.chart import UvChart
 from stmpl_core.errors import InvalidInput
+from stmpl_core.extras import needed
 from stmpl_core.extrusion import foldfree_thickness
 from stmpl_core.layer import SoftLayer, Tissue, check_faces
-from stmpl_core.remesh import Remeshed, remesh
 
-log = logging.getLogger(__name__)
+if TYPE_CHECKING:
+    from stmpl_core.remesh import Remeshed
 
 PARTS = {  # the bones of a part: Anny's names, then the SMPL family's
     "left_arm": r"(upper|lower)arm\d*\.L|left_(shoulder|elbow)",
@@ -46,9 +39,9 @@ PARTS = {  # the bones of a part: Anny's names, then the SMPL family's
     "torso": r"root|spine\d+|pelvis\.[LR]|clavicle\.[LR]|breast\.[LR]|pelvis|spine\d|(left|right)_collar",
 }
 RINGS = 3  # of faces kept around a part while it is subdivided, so that its border is no border of the surface
-ANNY_TO_BODY = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])  # Anny looks along -y with its left towards +x
 SMPL_TO_BODY = np.array([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]])  # SMPL looks along +z with its left towards +x
-CACHE_VERSION = 1
+PHENOTYPE = ("gender", "age", "muscle", "weight", "height", "proportions")
+AVERAGE = 0.5  # of every phenotype
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,45 +79,30 @@ class Body:
     def anny(cls, *, pose: Mapping[str, ArrayLike] | None = None, **phenotype: float) -> Body:
         """Anny (NAVER, Apache-2.0), whose data come with its package.
 
-        The first body ever takes some 40 s on two cores: Anny reads its shapes from 1,136 text files, and keeps them in
-        its own cache (0.8 GB; ANNY_CACHE_DIR moves it). Each body is then kept as one file of 1 MB in the cache folder
-        of stmpl (STMPL_CACHE_DIR moves it), and costs milliseconds from then on.
+        The average body at rest ships with stmpl and takes a tenth of a second. Others need the extra bodies: the first
+        takes some 40 s on two cores, as Anny reads its shapes from 1,136 text files, and keeps them in its own cache
+        (0.8 GB; ANNY_CACHE_DIR moves it). Each is then kept as one file of 1 MB in the cache folder of stmpl
+        (STMPL_CACHE_DIR moves it), and costs milliseconds from then on.
 
         Args:
             pose: a rotation vector [rad] for each bone that turns, (3,), from the rest pose, in the body's axes.
             phenotype: gender, age, muscle, weight, height, proportions, each in [0, 1]; 0.5 unless given.
 
         Raises:
-            InvalidInput: an unknown bone or phenotype (the error lists them), or a value that is out of range.
+            InvalidInput: an unknown bone or phenotype (the error lists them), a value that is out of range, or another
+                body than the average at rest where Anny is not installed.
         """
         turns = {bone: finite(f"pose of {bone}", turn, (3,)) for bone, turn in (pose or {}).items()}
+        _known("bone", turns, _average().bones)
+        _known("phenotype", phenotype, PHENOTYPE)
         for name, value in phenotype.items():
             if not (np.isscalar(value) and 0 <= value <= 1):
                 raise InvalidInput(f"{name} is {value}; allowed is a number from 0 to 1 (0.5 is the average).")
-        return _kept(cls, {"pose": {k: v.tolist() for k, v in turns.items()}, "phenotype": phenotype},
-                     lambda: cls._anny(turns, phenotype))
+        if not turns and all(value == AVERAGE for value in phenotype.values()):
+            return _average()
+        from stmpl_core.anny_model import posed
 
-    @classmethod
-    def _anny(cls, turns: Mapping[str, np.ndarray], phenotype: Mapping[str, float]) -> Body:
-        import roma
-        import torch
-
-        model = _anny_model()
-        _known("bone", turns, model.bone_labels)
-        _known("phenotype", phenotype, model.phenotype_labels)
-        transforms = {}
-        for bone, turn in turns.items():
-            matrix = torch.eye(4, dtype=torch.float64)[None].repeat(1, 1, 1)
-            matrix[0, :3, :3] = roma.rotvec_to_rotmat(torch.tensor(ANNY_TO_BODY.T @ turn))
-            transforms[bone] = matrix
-        with torch.no_grad():
-            posed = model(pose_parameters=transforms or None, phenotype_kwargs=dict(phenotype) or None)
-        weights = np.zeros((len(model.template_vertices), len(model.bone_labels)))
-        rows = np.arange(len(weights))[:, None]
-        np.add.at(weights, (rows, model.vertex_bone_indices.numpy()), model.vertex_bone_weights.numpy())
-        uv = model.texture_coordinates.numpy()[model.face_texture_coordinate_indices.numpy()]
-        vertices = posed["vertices"][0].numpy() @ ANNY_TO_BODY.T
-        return cls("anny", vertices, model.faces.numpy(), uv, weights, tuple(model.bone_labels))
+        return cls("anny", *posed(turns, phenotype))
 
     @classmethod
     def smpl(
@@ -152,6 +130,7 @@ class Body:
         Raises:
             InvalidInput: no such file, or one that smplx cannot read; shapes that do not fit.
         """
+        needed("a body of the SMPL family", "smpl", "smplx", "torch")
         import smplx
         import torch
         from smplx.joint_names import JOINT_NAMES, SMPLH_JOINT_NAMES
@@ -197,6 +176,9 @@ class Body:
             InvalidInput: unknown part; the error lists what exists.
             MeshError: see `stmpl_core.remesh`.
         """
+        shipped = limbs.part(name, edge_length) if self is _average() else None
+        if shipped is not None:
+            return _layer(*shipped, thickness, tissue)
         return self.patch(name, edge_length).layer(self, thickness=thickness, tissue=tissue)
 
     @property
@@ -215,6 +197,8 @@ class Body:
 
     def patch(self, part: str, edge_length: float = 3e-3) -> Patch:
         """The mesh of a part, cut where its bones weigh one half, which other poses of the same model can take."""
+        from stmpl_core.remesh import remesh
+
         level = self.level(part)
         if not (level > 0).any():
             raise InvalidInput(f"no vertex of the body belongs to {part!r} by more than half. "
@@ -249,12 +233,24 @@ class Patch:
             raise InvalidInput(f"this patch was drawn from a body with at least {self.source.max() + 1} vertices; "
                                f"{body.name} has {len(body.vertices)}.")
         vertices = self.mesh.transfer @ body.vertices[self.source]
-        chart = None if self.mesh.uv is None else UvChart(vertices, self.mesh.faces, self.mesh.uv)
-        layer = SoftLayer(vertices, self.mesh.faces, thickness, tissue=tissue, chart=chart)
-        return layer.with_(thickness=foldfree_thickness(layer))
+        return _layer(vertices, self.mesh.faces, self.mesh.uv, thickness, tissue)
 
 
-def _known(kind: str, given: Mapping[str, Any], available: list[str]) -> None:
+@cache
+def _average() -> Body:
+    return Body("anny", *limbs.body())
+
+
+def _layer(
+    vertices: Points, faces: Faces, uv: np.ndarray | None, thickness: ArrayLike, tissue: Tissue | None
+) -> SoftLayer:
+    """The layer under a mesh of the skin, thinned where the skin curves more tightly."""
+    chart = None if uv is None else UvChart(vertices, faces, uv)
+    layer = SoftLayer(vertices, faces, thickness, tissue=tissue, chart=chart)
+    return layer.with_(thickness=foldfree_thickness(layer))
+
+
+def _known(kind: str, given: Iterable[str], available: tuple[str, ...]) -> None:
     unknown = sorted(set(given) - set(available))
     if unknown:
         raise InvalidInput(f"unknown {kind}: {', '.join(unknown)}. Available: {', '.join(available)}.")
@@ -264,69 +260,10 @@ def _smpl_uv(uv: str | Path | None, faces: Faces) -> np.ndarray | None:
     """UVs per corner, from an .obj file."""
     if uv is None:
         return None
+    import igl
+
     _, texture, _, obj_faces, texture_faces, _ = (np.asarray(table) for table in igl.readOBJ(str(uv)))
     if obj_faces.shape != faces.shape or not len(texture_faces):
         raise InvalidInput(f"{uv} has {len(obj_faces)} faces and {len(texture_faces)} with UVs; "
                            f"the body has {len(faces)}.")
     return texture[texture_faces][..., :2]
-
-
-@cache
-def _anny_model() -> Any:
-    import anny
-
-    with _fast_targets():
-        return anny.Anny(phenotype_blendshapes="original", skinning_method="lbs")
-
-
-@contextmanager
-def _fast_targets() -> Iterator[None]:
-    """While Anny builds its model, reads its gzipped shape files with one NumPy call each.
-
-    Anny 0.6 makes one tensor a line, 7 million of them: 150 s on two cores, against 10 s.
-    """
-    import torch
-    from anny.models import full_model
-
-    def load(filename: str, vertices_count: int, world_transformation: Any, dtype: Any) -> Any:
-        shape = torch.zeros((vertices_count, 3), dtype=dtype)
-        with gzip.open(filename, "rt") as file:
-            table = np.array(file.read().split(), dtype=np.float64).reshape(-1, 4)
-        shape[table[:, 0].astype(np.int64)] = torch.as_tensor(table[:, 1:], dtype=dtype)
-        return world_transformation.apply(shape)
-
-    original = full_model.load_blend_shape
-    full_model.load_blend_shape = load
-    try:
-        yield
-    finally:
-        full_model.load_blend_shape = original
-
-
-def _kept(cls: type[Body], arguments: Mapping[str, Any], build: Any) -> Body:
-    """A body from the disk if it was built before: importing torch and Anny alone takes ten seconds."""
-    text = json.dumps([CACHE_VERSION, version("anny"), arguments], sort_keys=True)
-    folder = Path(os.environ.get("STMPL_CACHE_DIR") or
-                  Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "stmpl")
-    path = folder / f"anny-{hashlib.sha256(text.encode()).hexdigest()[:16]}.npz"
-    with suppress(OSError, ValueError, KeyError, EOFError), np.load(path) as kept:
-        return cls("anny", kept["vertices"], kept["faces"], kept["uv"], kept["weights"], tuple(kept["bones"].tolist()))
-    with _one_builder(folder):
-        body = build()
-    with suppress(OSError):
-        folder.mkdir(parents=True, exist_ok=True)
-        beside = path.with_suffix(f".{os.getpid()}.npz")
-        np.savez_compressed(beside, vertices=body.vertices, faces=body.faces, uv=body.uv, weights=body.weights,
-                            bones=np.array(body.bones))
-        beside.replace(path)
-    return body
-
-
-@contextmanager
-def _one_builder(folder: Path) -> Iterator[None]:
-    """Lets one process at a time build: Anny's first build writes files that a second one must not read half."""
-    with ExitStack() as stack:
-        with suppress(OSError):
-            folder.mkdir(parents=True, exist_ok=True)
-            fcntl.flock(stack.enter_context(open(folder / "build.lock", "w")), fcntl.LOCK_EX)
-        yield

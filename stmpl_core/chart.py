@@ -14,7 +14,6 @@ from scipy.ndimage import distance_transform_edt
 from stmpl_core.arrays import PerVertex, finite
 from stmpl_core.errors import InvalidInput, MeshError
 from stmpl_core.layer import check_faces
-from stmpl_core.remesh import doubled_area
 
 log = logging.getLogger(__name__)
 
@@ -176,6 +175,12 @@ class UvChart:
         b, c = _cross(d, d2) / det, _cross(d1, d) / det
         index = (row * self.shape[1] + column).astype(np.int32)
         return index, self.faces[face], np.ascontiguousarray(np.column_stack([1 - b - c, b, c]), dtype=np.float32)
+
+
+def doubled_area(uv: np.ndarray) -> np.ndarray:
+    """Twice the signed area of triangles (F, 3, 2), positive counter-clockwise."""
+    a, b = uv[:, 1] - uv[:, 0], uv[:, 2] - uv[:, 0]
+    return a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
 
 
 def _frame(

@@ -18,6 +18,7 @@ from numpy.typing import ArrayLike
 from scipy.sparse.csgraph import connected_components
 
 from stmpl_core.arrays import Faces, PerVertex, Points, finite
+from stmpl_core.chart import doubled_area
 from stmpl_core.errors import InvalidInput, MeshError
 from stmpl_core.layer import check_faces
 
@@ -413,12 +414,6 @@ def _unturned(uv: np.ndarray, corners: np.ndarray, dense: _Dense, dense_uv: np.n
     if wrong.any():
         log.debug("%d faces look up their UVs alone", int(wrong.sum()))
     return np.where(wrong[:, None, None], alone, uv)
-
-
-def doubled_area(uv: np.ndarray) -> np.ndarray:
-    """Twice the signed area of triangles (F, 3, 2), positive counter-clockwise."""
-    a, b = uv[:, 1] - uv[:, 0], uv[:, 2] - uv[:, 0]
-    return a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
 
 
 def corner_fans(faces: Faces, seam: np.ndarray) -> np.ndarray:

@@ -10,6 +10,7 @@ import tyro
 
 from stmpl_core.console import print_figures
 from stmpl_core.errors import InvalidInput
+from stmpl_core.extras import needed
 from stmpl_core.methods import METHODS
 from stmpl_core.methods import method as method_named
 from stmpl_ros.parameters import DemoConfig, NodeConfig, ProbeConfig, RecordConfig
@@ -70,6 +71,7 @@ def view(path: Annotated[Path | None, tyro.conf.Positional] = None, live: bool =
         path: a run's folder, or its .mcap file.
         live: show what the running node answers.
     """
+    needed("stmpl view", "view", "viser", "shapely")
     from stmpl_ros.view.serve import run
 
     return run(config, path, live, ros_arguments)
@@ -244,6 +246,7 @@ def generate(
         scheduler: address of a Dask scheduler that does the work instead.
         as_json: print the manifest for machines.
     """
+    needed("stmpl generate", "learn", "anny", "torch", "zarr", "shapely")
     from fem_tools.generate import generate as make
     from fem_tools.sampling import PRESETS
     from stmpl_core.console import contacts_bar

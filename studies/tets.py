@@ -13,6 +13,7 @@ from fem_tools.skin_loads import DeadForces, FollowerPressure
 from fem_tools.system import System, diagonal_blocks
 from stmpl_core.arrays import Points
 from stmpl_core.errors import InvalidInput, MeshError
+from stmpl_core.extras import needed
 from stmpl_core.layer import Tissue
 from stmpl_core.load import Load
 from stmpl_core.methods.base import prepared
@@ -133,13 +134,9 @@ def tetgen_mesh(outer: Points, inner: Points, triangles: np.ndarray) -> TetMesh:
         InvalidInput: the package `tetgen` is not there.
         MeshError: TetGen refuses the surface, for instance because it cuts itself.
     """
-    try:
-        import tetgen
-    except ImportError as error:
-        raise InvalidInput(
-            "TetGen is not installed; it is optional because of its licence (AGPL). "
-            'Install it with: pip install "stmpl[paper]", or use mesher="split".'
-        ) from error
+    needed('mesher="tetgen"', "tetgen", "tetgen")  # by its name only: its licence is the AGPL
+    import tetgen
+
     n, points = len(outer), np.vstack([outer, inner])
     directed = triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
     _, first, count = np.unique(np.sort(directed, axis=1), axis=0, return_index=True, return_counts=True)

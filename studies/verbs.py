@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 
 from stmpl_core.console import print_figures, steps_bar
+from stmpl_core.extras import needed
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -46,6 +47,7 @@ def train(
         seed: seed of weights and order.
         as_json: card on stdout, for machines.
     """
+    needed("stmpl train", "learn", "torch", "zarr", "shapely")
     from studies.train import train as learn
 
     folder = out or Path("runs/train") / preset
@@ -77,6 +79,7 @@ def tables(
         out: a file for the tables in Markdown; their figures go beside it as JSON.
         as_json: figures on stdout, for machines.
     """
+    needed("stmpl tables", "studies", "torch", "zarr", "shapely")
     from stmpl_core.methods import Linear, MomentNet, UNet
     from studies.evaluate import THREE_BODY_ROW, evaluate
 
@@ -105,7 +108,7 @@ def chart(
     A run that was stopped goes on where it was.
 
     Example: stmpl chart --out runs/chart
-    Peers that are installed (pip install .[peers]) are on it as well.
+    Peers that are installed (pip install 'stmpl[peers]') are on it as well.
 
     Args:
         preset: default (the arm at 3 mm, five scenes, two loads; about twenty minutes), quick (a coarse forearm).
@@ -113,6 +116,7 @@ def chart(
         redraw: pictures of out/chart.json again, without measuring.
         as_json: all points on stdout, for machines.
     """
+    needed("stmpl chart", "studies", "torch", "threadpoolctl", "shapely")
     from studies.chart import CURVES, PRESETS, Chart, measure
     from studies.chart.break_even import break_even, draw_break_even
     from studies.chart.page import write_page
@@ -154,6 +158,7 @@ def calibrate(
         trials: folder of the single trials (with --errors), which are not measured twice.
         as_json: figures on stdout, for machines.
     """
+    needed("stmpl calibrate", "studies", "anny", "torch", "zarr", "shapely")
     from fem_tools.ladder import times_file
     from studies import calibrate as measuring
     from studies.show import coverage_table, times_table

@@ -2,13 +2,15 @@
 
 import logging
 import pickle
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from stmpl_core import body as body_module
-from stmpl_core.body import Body, Patch
+from stmpl_core import anny_model, limbs
+from stmpl_core.body import PARTS, Body, Patch
 from stmpl_core.errors import InvalidInput
 from stmpl_core.extrusion import fold_ratios, foldfree_thickness
 from stmpl_core.layer import SoftLayer
@@ -104,7 +106,57 @@ def test_the_chart_fits_the_arm_and_both_sides_of_its_seam_agree(arm: SoftLayer)
     assert 0.5 < chart.mm_per_texel[1] < 2 and chart.mm_per_texel[2] < 5
 
 
+@pytest.mark.parametrize("part", ["left_arm", "right_forearm"])
+def test_a_shipped_limb_is_the_one_that_the_remesher_makes(body: Body, part: str) -> None:
+    made = body.patch(part, limbs.EDGE_LENGTH).layer(body, thickness=12.5e-3)
+    shipped = body.part(part, thickness=12.5e-3)
+    if len(made.vertices) == len(shipped.vertices):
+        assert np.array_equal(made.faces, shipped.faces)
+        assert np.allclose(made.vertices, shipped.vertices, rtol=0, atol=1e-9)
+        assert np.allclose(made.thickness, shipped.thickness, rtol=0, atol=1e-9)
+        assert np.allclose(made.chart.uv, shipped.chart.uv, rtol=0, atol=1e-9)
+    else:  # on another processor MMG may split an edge less or more
+        assert len(made.vertices) == pytest.approx(len(shipped.vertices), rel=0.01)
+        assert made.vertex_areas.sum() == pytest.approx(shipped.vertex_areas.sum(), rel=1e-3)
+
+
+def test_the_shipped_body_is_annys_average(body: Body) -> None:
+    pytest.importorskip("anny")
+    vertices, faces, uv, weights, bones = anny_model.build({}, {})
+    assert np.allclose(vertices, body.vertices, rtol=0, atol=1e-9) and np.array_equal(faces, body.faces)
+    assert body.uv is not None and np.array_equal(uv, body.uv)
+    assert np.allclose(weights, body.weights, rtol=0, atol=1e-12) and bones == body.bones
+    assert Body.anny(weight=0.5, age=0.5) is body
+
+
+def test_every_part_ships_and_packing_is_exact(
+    body: Body, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert {path.stem for path in limbs.FOLDER.glob("*.npz")} == {limbs.BODY, *PARTS} == {limbs.BODY, *body.parts}
+    mesh = limbs.part("left_forearm", limbs.EDGE_LENGTH)
+    assert mesh is not None and limbs.part("left_forearm", 4e-3) is None
+    limbs.write_part(tmp_path, "left_forearm", mesh)
+    monkeypatch.setattr(limbs, "FOLDER", tmp_path)
+    again = limbs.part("left_forearm", limbs.EDGE_LENGTH)
+    assert again is not None and all(map(np.array_equal, mesh, again))
+    assert 5700 < len(mesh[0]) < 5900 and (np.unique(mesh[1]) == np.arange(len(mesh[0]))).all()
+
+
+def test_a_shipped_limb_needs_neither_remesher_nor_anny() -> None:
+    code = ("import sys; sys.modules.update(dict.fromkeys(['anny', 'torch', 'mmgpy', 'igl', 'roma']))\n"
+            "from stmpl_core.body import Body; print(len(Body.anny().part('left_arm').vertices))")
+    said = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert int(said.stdout) > 14000
+
+
+def test_without_anny_another_body_is_refused_in_one_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("stmpl_core.extras.find_spec", lambda package: None)
+    with pytest.raises(InvalidInput, match=r"needs anny and roma and torch: pip install 'stmpl\[bodies\]'"):
+        Body.anny(weight=0.7)
+
+
 def test_another_pose_keeps_the_mesh_and_bends_the_arm(patch: Patch, arm: SoftLayer) -> None:
+    pytest.importorskip("anny")
     bent = patch.layer(Body.anny(pose={"lowerarm01.L": [0, -0.6, 0]}))
     assert np.array_equal(bent.faces, arm.faces)
     assert np.allclose(bent.chart.uv, arm.chart.uv)
@@ -115,6 +167,7 @@ def test_another_pose_keeps_the_mesh_and_bends_the_arm(patch: Patch, arm: SoftLa
 
 
 def test_turning_the_arm_turns_the_part_about_the_asked_axis(body: Body) -> None:
+    pytest.importorskip("anny")
     turned = Body.anny(pose={"root": [0, 0, np.pi / 2]})
     quarter = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
     shift = turned.vertices - body.vertices @ quarter.T
@@ -122,15 +175,17 @@ def test_turning_the_arm_turns_the_part_about_the_asked_axis(body: Body) -> None
 
 
 def test_weight_makes_the_arm_thicker(patch: Patch) -> None:
+    pytest.importorskip("anny")
     light, heavy = (patch.layer(Body.anny(weight=w)).vertex_areas.sum() for w in (0.0, 1.0))
     assert heavy > 1.1 * light
 
 
 def test_a_body_read_from_the_disk_is_the_one_that_was_built(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("anny")
     monkeypatch.setenv("STMPL_CACHE_DIR", str(tmp_path))
     built = Body.anny(muscle=0.8)
     assert len(list(tmp_path.glob("*.npz"))) == 1
-    monkeypatch.setattr(body_module, "_anny_model", lambda: pytest.fail("built anew"))
+    monkeypatch.setattr(anny_model, "_model", lambda: pytest.fail("built anew"))
     kept = Body.anny(muscle=0.8)
     for name in ("vertices", "faces", "uv", "weights", "bones"):
         assert np.array_equal(getattr(built, name), getattr(kept, name))
@@ -184,6 +239,7 @@ def smpl_file(folder: Path) -> Path:
 
 
 def test_a_model_file_in_smpls_layout_becomes_a_body_in_our_frame(tmp_path: Path) -> None:
+    pytest.importorskip("smplx", reason="smplx has a licence of its own: pip install stmpl[smpl]")
     path = smpl_file(tmp_path)
     body, larger = Body.smpl(path), Body.smpl(path, betas=[1.0])
     assert body.bones[16] == "left_shoulder" and "left_arm" in body.parts and body.uv is None
@@ -196,6 +252,7 @@ def test_a_model_file_in_smpls_layout_becomes_a_body_in_our_frame(tmp_path: Path
 
 
 def test_a_missing_or_unreadable_smpl_file_is_refused(tmp_path: Path) -> None:
+    pytest.importorskip("smplx", reason="smplx has a licence of its own: pip install stmpl[smpl]")
     with pytest.raises(InvalidInput, match="there is no SMPL model at"):
         Body.smpl(tmp_path / "SMPL_NEUTRAL.pkl")
     (tmp_path / "SMPL_NEUTRAL.pkl").write_bytes(b"not a pickle")

@@ -197,7 +197,7 @@ def bump(points: np.ndarray, peak: float, radius: float) -> np.ndarray:
 
 def pressed_by_felupe(half: float, depth: float, tissue: Tissue, peak: float, radius: float, n: int = 9):
     """A slab of n x n x 2 tri-quadratic hexahedra, held below and at its sides: skin points and displacements."""
-    import felupe as fem
+    fem = pytest.importorskip("felupe", reason="FElupe is under the GPL: pip install stmpl[peers]")
 
     mesh = fem.Cube(a=(-half, -half, -depth), b=(half, half, 0.0), n=(n + 1, n + 1, 3))
     mesh = mesh.add_midpoints_edges().add_midpoints_faces().add_midpoints_volumes()

@@ -23,7 +23,7 @@ def bump(points: np.ndarray, peak: float, radius: float) -> np.ndarray:
 
 def peak_of_the_mixed_method(half: float, tissue: Tissue, peak: float, radius: float, n: int = 4) -> float:
     """Largest displacement [m] by felupe's u-p-J hexahedra (Simo, Taylor & Pister 1985), a quarter of the slab."""
-    import felupe as fem
+    fem = pytest.importorskip("felupe", reason="FElupe is under the GPL: pip install stmpl[peers]")
 
     mesh = fem.Cube(a=(0, 0, -THICKNESS), b=(half, half, 0), n=(n + 1, n + 1, 3))
     mesh = mesh.add_midpoints_edges().add_midpoints_faces().add_midpoints_volumes()

@@ -11,6 +11,7 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 from stmpl_core.arrays import PerVertex
 from stmpl_core.chart import PADDING, UvChart
 from stmpl_core.errors import InvalidInput
+from stmpl_core.extras import needed
 from stmpl_core.layer import SoftLayer
 from stmpl_core.load import Load
 from stmpl_core.methods.base import prepared
@@ -142,6 +143,7 @@ class UNet:
 
 def load_unet(path: Path, device: str = "cpu") -> tuple[UNetCard, Pix2PixUNet]:
     """A network and its card. Raises InvalidInput where there is none, or the two do not fit one another."""
+    needed("the method unet", "learn", "torch")
     from safetensors import SafetensorError
     from safetensors.torch import load_file
 

@@ -17,6 +17,7 @@ from fem_tools.patch import PatchFem
 from fem_tools.scenes import Scene, Site, UnusableContact, ellipse, letter
 from stmpl_core.body import Body
 from stmpl_core.errors import InvalidInput, StmplError
+from stmpl_core.extras import needed
 from stmpl_core.layer import SoftLayer
 from stmpl_core.load import Load
 from stmpl_core.methods import Method
@@ -164,6 +165,7 @@ def measure(preset: Preset, curves: Sequence[Curve] = CURVES, *, reference: Patc
         parts: folder for what is done; a run that was stopped goes on from there. Empty it when a method has changed.
         on_progress: function that is called after each point.
     """
+    needed("the chart", "studies", "threadpoolctl")
     from threadpoolctl import threadpool_limits
 
     said = on_progress or (lambda *_: None)

@@ -5,6 +5,7 @@ from importlib.util import find_spec
 from typing import Any
 
 from stmpl_core.errors import InvalidInput
+from stmpl_core.extras import needed
 
 PEERS = {  # name: (package that it needs, where its class is)
     "felupe": ("felupe", "studies.peers.felupe_hex:FelupeHex"),
@@ -27,7 +28,6 @@ def peer(name: str) -> Any:
     if name not in PEERS:
         raise InvalidInput(f"unknown peer {name!r}. Available: {', '.join(PEERS)}.")
     package, place = PEERS[name]
-    if find_spec(package) is None:
-        raise InvalidInput(f'{name} needs the package {package}, which is not installed: pip install "stmpl[peers]".')
+    needed(name, "peers", package)
     module, attribute = place.split(":")
     return getattr(import_module(module), attribute)
