@@ -20,7 +20,7 @@ QUICK = {"moment_net", "winkler", "naive"}  # methods that such a change costs n
 
 def layer_of(config: NodeConfig) -> SoftLayer:
     """The soft layer that the settings ask for. Raises InvalidInput."""
-    from stmpl_core.body import Body  # takes seconds to import, and who brings a layer does not need it
+    from stmpl_core.body import Body
 
     tissue = Tissue(config.youngs_modulus, config.poisson_ratio, config.density)
     body = Body.anny(pose=None, **config.phenotype_values)
@@ -36,8 +36,12 @@ def check(config: NodeConfig, build: Build) -> None:
 
 
 def at_once(config: NodeConfig, build: Build) -> bool:
-    """Whether the skin is made within a second or two."""
-    return build is not layer_of
+    """Whether the skin is made within a second or two: its mesh ships, or somebody else makes it."""
+    from stmpl_core import limbs
+    from stmpl_core.body import AVERAGE
+
+    average = all(value == AVERAGE for value in config.phenotype_values.values())
+    return build is not layer_of or (average and limbs.ships(config.part, config.edge_length))
 
 
 def skin_of(config: NodeConfig, build: Build = layer_of) -> Skin:

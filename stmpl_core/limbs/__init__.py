@@ -28,8 +28,12 @@ def body() -> tuple[Points, Faces, np.ndarray, np.ndarray, tuple[str, ...]]:
 
 def part(name: str, edge_length: float) -> Mesh | None:
     """The mesh of a part of the average body at rest, if it ships with such edges [m]."""
-    path = FOLDER / f"{name}.npz"
-    return _mesh(_read(path)) if edge_length == EDGE_LENGTH and name != BODY and path.is_file() else None
+    return _mesh(_read(FOLDER / f"{name}.npz")) if ships(name, edge_length) else None
+
+
+def ships(name: str, edge_length: float) -> bool:
+    """Whether the mesh of a part with such edges [m] ships."""
+    return edge_length == EDGE_LENGTH and name != BODY and (FOLDER / f"{name}.npz").is_file()
 
 
 def write_body(folder: Path, mesh: Mesh, weights: np.ndarray, bones: tuple[str, ...]) -> Path:
