@@ -12,7 +12,7 @@ from fem_tools.few_steps import FewSteps
 from fem_tools.ladder import default_rungs, ladder, measured, times_file
 from fem_tools.sampling import BodyPlan
 from stmpl_core.errors import InvalidInput, NotPrepared
-from stmpl_core.layer import SoftLayer, Tissue
+from stmpl_core.layer import Tissue
 from stmpl_core.load import Load
 from stmpl_core.methods import Linear, MomentNet, Winkler
 from stmpl_core.methods.coarse import Coarse
@@ -27,7 +27,7 @@ WIDE = {"strain": [1e-4, 1.0], "nu": [0.0, 0.5], "width": [0.01, 10.0], "slope":
 
 @pytest.fixture(scope="module")
 def layer():
-    return SoftLayer(*limb(5e-3), thickness=7.5e-3)
+    return limb(5e-3)
 
 
 def disc(layer, ratio=0.5, radius=0.014):

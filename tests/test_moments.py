@@ -14,22 +14,21 @@ from stmpl_core.methods import Linear
 from stmpl_core.metrics import score
 from stmpl_core.moments import FINER, NEAR, REACH, SPREADS, STEPS, Surroundings, response_table, ring_table
 from tests import scenes
-from tests.touch_scenes import plate, turn
+from tests.scenes import limb, plate, turn
 
 T = 6e-3
 
 
 def sheet(nu: float = 0.4) -> SoftLayer:
-    return plate(0.144, 3e-3, T).with_(poisson_ratio=nu)
+    return plate(0.144, 3e-3, T, poisson_ratio=nu)
 
 
 def arm(h: float = 3e-3) -> SoftLayer:
-    return SoftLayer(*scenes.limb(h), T)
+    return limb(h, T)
 
 
 def disc(layer: SoftLayer, centre: list[float], ratio: float, radius: float = 0.011) -> Load:
-    weight = scenes.smooth_disc(layer.vertices, np.array(centre), radius, 6e-3)
-    return Load.pressure(ratio * layer.tissue.youngs_modulus * weight)
+    return scenes.disc(layer, ratio, centre, radius)
 
 
 @pytest.mark.parametrize("nu", [0.0, 0.3, 0.4, 0.49])

@@ -1,18 +1,15 @@
 """Laws of what ContactNet learns from: tools of every kind, put back where finite elements had them, and a training."""
 
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 import trimesh
 
 from fem_tools.dataset import Dataset
 from fem_tools.generate import generate
 from fem_tools.sampling import CONTACT_BODIES, FILLETS, PRESETS, SIZES, TILT, TOOLS, any_tool, contacts, draw, split_of
 from fem_tools.scenes import Site
-from stmpl_core import SoftLayer
 from stmpl_core.contact_net import OUTPUTS, ContactNet
 from stmpl_core.errors import InvalidInput
 from stmpl_core.methods.moment_net import Weights
@@ -25,15 +22,7 @@ PLAN = PRESETS["contacts"].model_copy(
     update={"preset": "few", "bodies": (BODY,), "tools": 3, "loads": 2, "deepest": 0.4, "indenter_step": 0.2, "seed": 1}
 )
 SETTINGS = ContactTraining(hidden=8, steps=60, batch=4)
-
-
-@pytest.fixture(scope="module", autouse=True)
-def one_thread() -> Iterator[None]:
-    """So small a network is not shared among threads, which would wait for one another."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
+pytestmark = pytest.mark.usefixtures("one_thread")
 
 
 @pytest.fixture(scope="module")
@@ -69,7 +58,7 @@ def test_a_smooth_tools_field_is_its_surface() -> None:
 
 
 def test_a_drawn_tool_stands_above_the_skin_and_looks_at_it() -> None:
-    layer = SoftLayer(*scenes.limb(4e-3, length=0.3), 6e-3)
+    layer = scenes.limb(4e-3, 6e-3, length=0.3)
     site, kinds = Site(layer), set()
     for contact in [c for c in contacts(PRESETS["contacts"]) if c.body == "even_75"][:12]:
         scene, figures = draw(contact, site, None, contact.rng(0))
