@@ -60,6 +60,7 @@ def test_a_tool_goes_down_to_70_percent_of_the_arm(arm, name):
     assert answers[1].force > 2 * answers[0].force > 0
 
 
+@pytest.mark.slow
 def test_a_flat_tool_carries_a_mean_pressure_of_5_times_the_modulus():
     scene = Scene("flat", lambda: flat(12, 5), edge=3.5e-3, rim=2.5)
     layer, tool = scene.built()

@@ -299,6 +299,7 @@ def test_the_fit_finds_the_law_and_its_bounds_hold_as_often_as_they_say():
     assert exact.methods["m"].factor["pressure"] == pytest.approx(MARGIN, abs=0.1)
 
 
+@pytest.mark.slow
 def test_the_shipped_bounds_hold_on_a_limb_and_shapes_that_were_not_fitted_and_are_not_loose(tmp_path, monkeypatch):
     monkeypatch.setenv("STMPL_CACHE_DIR", str(tmp_path))
     limb = BodyPlan(name="unseen", weight=0.6, thickness=6.5e-3, edge_length=4.5e-3, part="right_forearm")

@@ -1,5 +1,6 @@
 """Laws of the learned simulator: what is exact by construction, what it was trained to, and what it says of itself."""
 
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -25,6 +26,7 @@ SETTINGS = MomentTraining(hidden=8, steps=60, points=32, checkpoint_minutes=0)
 pytestmark = pytest.mark.usefixtures("one_thread")
 
 
+@cache
 def limb(nu: float = 0.4, thickness: float = T, scale: float = 1.0) -> SoftLayer:
     """A cylinder: no body, so a shape that nothing was learnt from."""
     return scenes.enlarged(scenes.limb(3.5e-3, thickness, poisson_ratio=nu), scale)

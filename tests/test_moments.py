@@ -3,6 +3,7 @@
 import gc
 import pickle
 import weakref
+from functools import cache
 
 import numpy as np
 import pytest
@@ -19,10 +20,12 @@ from tests.scenes import limb, plate, turn
 T = 6e-3
 
 
+@cache
 def sheet(nu: float = 0.4) -> SoftLayer:
     return plate(0.144, 3e-3, T, poisson_ratio=nu)
 
 
+@cache
 def arm(h: float = 3e-3) -> SoftLayer:
     return limb(h, T)
 
@@ -126,7 +129,7 @@ def test_out_of_range_is_said_and_misuse_refused() -> None:
 
 
 def test_what_was_made_of_a_layer_goes_with_it() -> None:
-    layer = arm(8e-3)
+    layer = limb(8e-3, T)
     near = Surroundings.of(layer)
     assert Surroundings.of(layer) is near
     again = pickle.loads(pickle.dumps(near))

@@ -75,6 +75,7 @@ def device():
     assert code == 0, said
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_the_node_on_the_arm_ends_cleanly_when_asked_to(device, number):
     process = start("-m", "stmpl_ros.cli", "node", "--edge-length", "0.008", "--ros-args", "-r", "__ns:=/arm")

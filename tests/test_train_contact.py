@@ -105,6 +105,7 @@ def test_a_tool_is_put_back_where_finite_elements_had_it(data: Path) -> None:
     assert seen >= 2
 
 
+@pytest.mark.slow
 def test_a_short_training_learns_and_its_weights_load_and_hold(data: Path, tmp_path: Path) -> None:
     card = train_contact(data, tmp_path, SETTINGS)
     weights = Weights.load(tmp_path / "contact_net.safetensors", outputs=OUTPUTS)
