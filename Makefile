@@ -19,8 +19,9 @@ setup: $(READY)  ## Make .venv with Python 3.12, ROS 2 and what the main job nee
 demo: $(READY)  ## Run the main job: simulated contact over ROS 2, recorded, compared with FEM, with a report
 	$(BIN)/stmpl demo
 
-test: $(READY_DEV)  ## Pass the tests
-	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder
+test: $(READY_DEV)  ## Pass the tests, two at a time; print the slowest, and the files of which they run least
+	COVERAGE_CORE=sysmon $(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder --cov --cov-report=
+	@$(BIN)/coverage report | sed -n '1,12p;$$p'
 
 check: $(READY_DEV)  ## Lint, types and the one-way import rule
 	$(BIN)/ruff check .

@@ -2,6 +2,7 @@
 
 import os
 import socket
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -13,6 +14,8 @@ ROOMS = {  # every other file is of the room "unit"
     "studies": ["test_evaluate", "test_fem_limits", "test_peers", "test_speed_chart", "test_stability",
                 "test_train_contact", "test_unet"],
 }  # fmt: skip
+FIRST = ["test_conform", "test_ladder", "test_train_contact", "test_indenter_shapes", "test_unet", "test_node",
+         "test_ros", "test_view", "test_moments", "test_haptics", "test_record_and_publish"]
 BUS = pytest.StashKey[socket.socket]()
 ROOM_OF = {file: room for room, files in ROOMS.items() for file in files}
 
@@ -39,9 +42,25 @@ def pytest_configure(config: pytest.Config) -> None:
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Marks each test with its file's room, if it names none itself."""
-    missing = [file for file in ROOM_OF if not Path(__file__).with_name(f"{file}.py").exists()]
+    """Marks each test with its file's room, if it names none itself; and puts the longest files first.
+
+    So two workers end together; the first file compiles what nodes need before they are waited for.
+    """
+    missing = [file for file in (*ROOM_OF, *FIRST) if not Path(__file__).with_name(f"{file}.py").exists()]
     assert not missing, f"conftest.py names files that are not there: {missing}"
     for item in items:
         if not any(item.get_closest_marker(room) for room in ("unit", *ROOMS)):
             item.add_marker(ROOM_OF.get(item.path.stem, "unit"))
+    rank = {file: k for k, file in enumerate(FIRST)}
+    items.sort(key=lambda item: rank.get(item.path.stem, len(rank)))
+
+
+@pytest.fixture(scope="module")
+def one_thread() -> Iterator[None]:
+    """So small a network is not shared among threads, which would wait for one another."""
+    import torch
+
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)

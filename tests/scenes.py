@@ -1,36 +1,168 @@
-"""Small skins and loads that several tests press on."""
+"""Skins, tools, contacts and loads that the tests share; what product type they are made of is known here alone."""
+
+from dataclasses import dataclass
 
 import numpy as np
+import trimesh
+
+from stmpl_core import Contact, Load, SoftLayer, Tissue, ToolMesh
+from stmpl_core.touch import Touch
+from stmpl_core.trust import Displacement
+
+RADIUS, LENGTH = 0.04, 0.16  # m, of the limb
+THICKNESS = 7.5e-3  # m
 
 
-def plate(n: int, h: float) -> tuple[np.ndarray, np.ndarray]:
-    """A flat square of n x n vertices, h apart [m], facing +z, with its diagonals turned about."""
-    x = np.arange(n) * h
-    vertices = np.stack([*np.meshgrid(x, x, indexing="ij"), np.zeros((n, n))], axis=-1).reshape(-1, 3)
-    i, j = (k.ravel() for k in np.meshgrid(np.arange(n - 1), np.arange(n - 1), indexing="ij"))
-    a, b, c, d = i * n + j, (i + 1) * n + j, (i + 1) * n + j + 1, i * n + j + 1
-    even = ((i + j) % 2 == 0)[:, None]
-    first = np.where(even, np.stack([a, b, c], axis=1), np.stack([a, b, d], axis=1))
-    second = np.where(even, np.stack([a, c, d], axis=1), np.stack([b, c, d], axis=1))
-    return vertices, np.vstack([first, second])
+# Skins
 
 
-def limb(h: float, radius: float = 0.04, length: float = 0.16) -> tuple[np.ndarray, np.ndarray]:
-    """An open cylinder along +z of nearly equilateral triangles with edges h [m], facing outwards."""
-    around, along = round(2 * np.pi * radius / h), round(length / (h * 0.866))
-    ring, turn = np.meshgrid(np.arange(along + 1), np.arange(around), indexing="ij")
-    angle = 2 * np.pi * (turn + 0.5 * (ring % 2)) / around
-    vertices = np.stack([radius * np.cos(angle), radius * np.sin(angle), ring * length / along], axis=-1).reshape(-1, 3)
-    k, i = (x.ravel() for x in np.meshgrid(np.arange(along), np.arange(around), indexing="ij"))
-    a, b = k * around + i, k * around + (i + 1) % around
-    c, d = a + around, b + around
-    even = (k % 2 == 0)[:, None]
-    first = np.where(even, np.stack([a, b, c], axis=1), np.stack([a, b, d], axis=1))
-    second = np.where(even, np.stack([b, d, c], axis=1), np.stack([a, d, c], axis=1))
-    return vertices, np.vstack([first, second])
+def limb(edge: float = 3e-3, thickness: float = THICKNESS, radius: float = RADIUS, length: float = LENGTH,
+         **tissue: float) -> SoftLayer:  # fmt: skip
+    """An open cylinder along +z of nearly equilateral triangles, facing outwards."""
+    around, rings = round(2 * np.pi * radius / edge), round(length / (edge * 3**0.5 / 2))
+    column, row = np.meshgrid(np.arange(around), np.arange(rings + 1))
+    angle = 2 * np.pi * (column + 0.5 * (row % 2)) / around
+    vertices = np.stack([radius * np.cos(angle), radius * np.sin(angle), row * length / rings], axis=-1).reshape(-1, 3)
+    a, below = np.arange(around), np.arange(rings)[:, None] * around
+    p, q = below + a, below + (a + 1) % around
+    u, w = p + around, q + around
+    even = np.stack([p, q, u, q, w, u], axis=-1).reshape(rings, -1, 3)
+    odd = np.stack([p, q, w, p, w, u], axis=-1).reshape(rings, -1, 3)
+    faces = np.where((np.arange(rings) % 2 == 0)[:, None, None], even, odd).reshape(-1, 3)
+    return SoftLayer(vertices, faces, thickness, tissue=Tissue(**tissue))
+
+
+def plate(size: float = 0.12, edge: float = 3e-3, thickness: float = THICKNESS, *, crossed: bool = False,
+          **tissue: float) -> SoftLayer:  # fmt: skip
+    """A flat square in the plane z = 0, centred at the origin, facing +z; `crossed`: with diagonals turned about."""
+    n = round(size / edge)
+    x, y = np.meshgrid(np.linspace(-size / 2, size / 2, n + 1), np.linspace(-size / 2, size / 2, n + 1))
+    vertices = np.stack([x, y, 0 * x], axis=-1).reshape(-1, 3)
+    row, column = np.divmod(np.arange(n * n), n)
+    p = row * (n + 1) + column
+    a, b, c, d = p, p + 1, p + n + 2, p + n + 1
+    other = (crossed & ((row + column) % 2 == 1))[:, None]
+    first = np.where(other, np.stack([a, b, d], axis=1), np.stack([a, b, c], axis=1))
+    second = np.where(other, np.stack([b, c, d], axis=1), np.stack([a, c, d], axis=1))
+    return SoftLayer(vertices, np.concatenate([first, second]), thickness, tissue=Tissue(**tissue))
+
+
+def wavy_layer(n: int = 6, h: float = 3e-3) -> SoftLayer:
+    """A bumpy patch of n x n vertices, h apart [m]."""
+    flat = plate((n - 1) * h, h, crossed=True)
+    x, y, _ = flat.vertices.T
+    return flat.with_(vertices=np.column_stack([x, y, 1e-3 * np.sin(100 * x) * np.cos(80 * y)]))
+
+
+def placed(layer: SoftLayer, motion: np.ndarray) -> SoftLayer:
+    """The layer where a rigid motion (4, 4) takes it."""
+    return layer.with_(vertices=layer.vertices @ motion[:3, :3].T + motion[:3, 3])
+
+
+def enlarged(layer: SoftLayer, by: float) -> SoftLayer:
+    return layer.with_(vertices=by * layer.vertices, thickness=by * layer.thickness)
+
+
+# Tools
+
+
+def tool(mesh: trimesh.Trimesh, unit: float = 1.0) -> ToolMesh:
+    """A mesh whose coordinates are in `unit` [m]."""
+    return ToolMesh.of(unit * np.asarray(mesh.vertices), mesh.faces)
+
+
+def ball(radius: float = 0.012, subdivisions: int = 3) -> ToolMesh:
+    return tool(trimesh.creation.icosphere(subdivisions, radius))
+
+
+def box(x: float, y: float, z: float) -> ToolMesh:
+    """With these sides [m], centred at its own origin."""
+    return tool(trimesh.creation.box((x, y, z)))
+
+
+def punch(radius: float = 0.01, height: float = 0.03) -> ToolMesh:
+    """A flat, sharp-edged cylinder along z, centred at its own origin."""
+    return tool(trimesh.creation.cylinder(radius, height, sections=48))
+
+
+def band() -> ToolMesh:
+    """A ring along z around the limb, 2 mm deep in it."""
+    return tool(trimesh.creation.annulus(RADIUS - 0.002, RADIUS + 0.01, 0.02, sections=96))
+
+
+def capsule(height: float, radius: float, count: int = 32) -> ToolMesh:
+    """Along z, centred. Made in millimetres: trimesh drops triangles under 1e-8 of whatever unit."""
+    return tool(trimesh.creation.capsule(1e3 * height, 1e3 * radius, count=[count, count]), 1e-3)
+
+
+def scaled(mesh: ToolMesh, by: float) -> ToolMesh:
+    return ToolMesh.of(by * mesh.vertices, mesh.faces)
+
+
+# Poses and contacts
+
+
+def turn(axis: tuple[float, float, float], angle: float, move: tuple[float, float, float] = (0, 0, 0)) -> np.ndarray:
+    """A rigid transform, (4, 4)."""
+    pose = trimesh.transformations.rotation_matrix(angle, axis)
+    pose[:3, 3] = move
+    return pose
+
+
+def at(x: float, y: float, z: float) -> np.ndarray:
+    return turn((0, 0, 1), 0.0, (x, y, z))
+
+
+def contact_of(mesh: ToolMesh, pose: np.ndarray, wrench: np.ndarray | None = None, name: str = "probe") -> Contact:
+    """A tool at a pose (4, 4), with a wrench (6,) on the body or none."""
+    return Contact(name, mesh, pose, wrench)
+
+
+def press(mesh: ToolMesh, pose: np.ndarray, force: tuple[float, float, float] | None, name: str = "probe") -> Contact:
+    """A tool that pushes with a force through its own origin, or none."""
+    return contact_of(mesh, pose, None if force is None else np.array([*force, 0.0, 0.0, 0.0]), name)
+
+
+# Answers
+
+
+@dataclass
+class Touched:
+    """What an answer says of one tool; figures that it does not say are not a number."""
+
+    status: str
+    wrench: np.ndarray  # (6,) on the body [N, N m]
+    depth: float  # m
+    moved: float  # m
+    normal: float  # N, carried
+    tangential: float  # N, asked for and not carried
+    force_bound: float  # N
+
+
+def touch_of(answer: Displacement | Touch, name: str = "probe") -> Touched:
+    """What `answer` says of the tool `name`."""
+    found = {key.removeprefix(f"{name}."): value for key, value in answer.trust.figures.items()}
+    status, wrench = (answer.status, answer.wrench) if isinstance(answer, Touch) \
+        else (answer.statuses[name], answer.wrenches[name])  # fmt: skip
+    keys = ("depth_m", "moved_m", "normal_n", "tangential_n", "force_error_n")
+    return Touched(status, wrench, *(found.get(key, float("nan")) for key in keys))
+
+
+# Loads
 
 
 def smooth_disc(vertices: np.ndarray, centre: np.ndarray, radius: float, edge: float) -> np.ndarray:
     """1 within `radius` of `centre`, falling to 0 over `edge` by a smoothstep centred on the rim, (V,)."""
     x = np.clip((radius - np.linalg.norm(vertices - centre, axis=1)) / edge + 0.5, 0, 1)
     return x * x * (3 - 2 * x)
+
+
+def disc(layer: SoftLayer, ratio: float, centre: tuple | np.ndarray, radius: float, edge: float = 6e-3) -> Load:
+    """A pressure of `ratio` E on a disc around `centre`."""
+    return Load.pressure(ratio * layer.tissue.youngs_modulus * smooth_disc(layer.vertices, centre, radius, edge))
+
+
+def bump(points: np.ndarray, peak: float, radius: float) -> np.ndarray:
+    """A pressure that falls from `peak` on the z axis to 0 at `radius` as cos^2, (n,) [Pa]."""
+    r = np.minimum(np.linalg.norm(points[:, :2], axis=1) / radius, 1)
+    return peak * np.cos(0.5 * np.pi * r) ** 2

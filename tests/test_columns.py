@@ -4,13 +4,12 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-import trimesh
 
-from stmpl_core import SoftLayer, Tissue, ToolMesh
+from stmpl_core import ToolMesh
 from stmpl_core.columns import DEEPEST, Columns, Squeeze
 from stmpl_core.methods.winkler import column_pressure
 from stmpl_core.sdf import SignedDistance
-from tests.touch_scenes import LENGTH, RADIUS, at, ball, capsule, limb, plate, punch, tool, turn
+from tests.scenes import LENGTH, RADIUS, at, ball, box, capsule, enlarged, limb, placed, plate, punch, scaled, turn
 
 LIMB, PLATE = limb(), plate()
 MARGIN = 5e-3  # m
@@ -21,7 +20,7 @@ def field_of(mesh: ToolMesh) -> SignedDistance:
 
 
 BALL, PUNCH = field_of(ball(subdivisions=4)), field_of(punch())
-SLAB = field_of(tool(trimesh.creation.box((0.03, 0.03, 0.004))))
+SLAB = field_of(box(0.03, 0.03, 0.004))
 
 
 @pytest.fixture(scope="module")
@@ -48,7 +47,7 @@ def test_a_tool_that_is_apart_squeezes_nothing(flat: Columns, round_limb: Column
 @pytest.mark.parametrize("nu", [0.3, 0.4, 0.45])
 @pytest.mark.parametrize("share", [0.05, 0.3, 0.7, 0.97])
 def test_under_a_flat_tool_every_column_has_its_depth_and_the_law_of_columns(nu: float, share: float) -> None:
-    columns = Columns(SoftLayer(PLATE.vertices, PLATE.faces, PLATE.thickness, tissue=Tissue(poisson_ratio=nu)))
+    columns = Columns(PLATE.with_(poisson_ratio=nu))
     depth, tissue = share * PLATE.thickness[0], columns.layer.tissue
     squeeze = columns.squeezed(SLAB, at(0, 0, 0.002 - depth))
     inside = (np.abs(PLATE.vertices[squeeze.vertices, :2]) < 0.011).all(axis=1)
@@ -97,7 +96,7 @@ def test_no_column_is_deeper_than_the_layer(flat: Columns) -> None:
 
 
 def test_a_thin_plate_below_the_skin_squeezes_as_one_on_it(flat: Columns) -> None:
-    thick = field_of(tool(trimesh.creation.box((0.03, 0.03, 0.02))))
+    thick = field_of(box(0.03, 0.03, 0.02))
     below = flat.squeezed(SLAB, at(0, 0, 0.002 - 5e-3))  # its top is 1 mm under the skin at rest
     whole = flat.squeezed(thick, at(0, 0, 0.010 - 5e-3))
     inside = (np.abs(PLATE.vertices[whole.vertices, :2]) < 0.011).all(axis=1)
@@ -126,7 +125,7 @@ def test_a_needle_is_felt_wherever_it_comes_down(flat: Columns) -> None:
 
 def test_turning_and_moving_the_scene_leaves_the_squeeze(round_limb: Columns) -> None:
     scene = turn((0.3, -0.5, 0.8), 1.1, (0.4, -0.2, 0.9))
-    turned = Columns(LIMB.with_(vertices=LIMB.vertices @ scene[:3, :3].T + scene[:3, 3]))
+    turned = Columns(placed(LIMB, scene))
     pose = at(RADIUS + 0.009, 0.001, LENGTH / 2)
     here, there = round_limb.squeezed(BALL, pose), turned.squeezed(BALL, scene @ pose)
     np.testing.assert_array_equal(here.vertices, there.vertices)
@@ -135,10 +134,10 @@ def test_turning_and_moving_the_scene_leaves_the_squeeze(round_limb: Columns) ->
 
 
 def test_a_scene_twice_as_large_is_squeezed_alike(flat: Columns) -> None:
-    large = Columns(SoftLayer(2 * PLATE.vertices, PLATE.faces, 2 * PLATE.thickness))
+    large = Columns(enlarged(PLATE, 2))
     mesh = ball()
     here = flat.squeezed(field_of(mesh), at(0.0004, 0, 0.009))
-    there = large.squeezed(SignedDistance.of(ToolMesh(2 * mesh.vertices, mesh.faces), margin=2 * MARGIN),
+    there = large.squeezed(SignedDistance.of(scaled(mesh, 2), margin=2 * MARGIN),
                            at(0.0008, 0, 0.018))  # fmt: skip
     assert -force(large, there)[2] == pytest.approx(-4 * force(flat, here)[2], rel=5e-3)
 

@@ -13,7 +13,7 @@ from stmpl_core.moments import Surroundings
 from stmpl_core.sdf import SignedDistance
 from stmpl_core.simulator import ENTERED, Simulator
 from stmpl_core.touch import Toucher
-from tests.touch_scenes import LENGTH, RADIUS, at, ball, capsule, limb, press, punch, turn
+from tests.scenes import LENGTH, RADIUS, at, ball, capsule, limb, placed, press, punch, turn
 
 LIMB = limb(4e-3)
 THICKNESS = float(LIMB.thickness[0])
@@ -117,7 +117,7 @@ def test_the_correction_ends_with_the_layers_response_and_turns_with_the_scene(t
     here, _ = _fitted(Surroundings.of(LIMB), toucher, contact, np.zeros_like(LIMB.vertices))
     away = np.linalg.norm(LIMB.vertices - [RADIUS, 0, MIDDLE], axis=1)
     assert np.linalg.norm(here[away > 8 * THICKNESS], axis=1).max() < 2e-5
-    turned = LIMB.with_(vertices=LIMB.vertices @ scene[:3, :3].T + scene[:3, 3])
+    turned = placed(LIMB, scene)
     other = press(BALL, scene @ contact.pose_body_from_tool, None)
     there, _ = _fitted(Surroundings.of(turned), Toucher(turned), other, np.zeros_like(LIMB.vertices))
     np.testing.assert_allclose(there, here @ scene[:3, :3].T, atol=5e-6)

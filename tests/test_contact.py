@@ -10,7 +10,7 @@ from scipy.spatial import Delaunay
 from fem_tools.indenter import IndenterFem
 from fem_tools.patch import PatchFem
 from fem_tools.press import Press
-from stmpl_core import Contact, Load, SoftLayer, Tissue, ToolMesh
+from stmpl_core import Load, SoftLayer, Tissue
 from stmpl_core.body import Body
 from stmpl_core.errors import InvalidInput, MeshError
 from stmpl_core.methods import Linear, Naive, Winkler
@@ -29,7 +29,25 @@ from stmpl_core.touch import (
     Touch,
     Toucher,
 )
-from tests.touch_scenes import LENGTH, RADIUS, at, ball, capsule, limb, plate, press, punch, tool, turn
+from tests.scenes import (
+    LENGTH,
+    RADIUS,
+    at,
+    ball,
+    band,
+    box,
+    capsule,
+    contact_of,
+    enlarged,
+    limb,
+    placed,
+    plate,
+    press,
+    punch,
+    scaled,
+    touch_of,
+    turn,
+)
 
 LIMB, PLATE, BALL, PUNCH = limb(), plate(), ball(), punch()
 MIDDLE = LENGTH / 2
@@ -62,7 +80,7 @@ def flat_toucher() -> Toucher:
 FIELDS = {mesh: SignedDistance.of(mesh, margin=5e-3) for mesh in (BALL, PUNCH)}
 
 
-def touched(toucher: Toucher, mesh: ToolMesh, pose: np.ndarray, force: tuple[float, float, float] | None) -> Touch:
+def felt(toucher: Toucher, mesh: ToolMesh, pose: np.ndarray, force: tuple[float, float, float] | None) -> Touch:
     return toucher.touch(press(mesh, pose, force), FIELDS[mesh])
 
 
@@ -79,7 +97,7 @@ def test_no_contact_moves_nothing(sim: Simulator) -> None:
 def test_zero_wrench_moves_nothing_at_any_pose(sim: Simulator, depth: float) -> None:
     answer = sim.step([press(BALL, on_limb(depth), (0, 0, 0))])
     assert not answer.displacement.any()
-    assert answer.statuses["probe"] == (NO_FORCE if depth > 0 else APART)
+    assert touch_of(answer).status == (NO_FORCE if depth > 0 else APART)
 
 
 @pytest.mark.parametrize("force", [(-0.3, 0, 0), (-0.2, 0.1, 0.05), (-2.0, -0.4, 0.3)])
@@ -91,15 +109,15 @@ def test_load_sums_to_the_normal_component_of_the_wrench(
     carried = total(LIMB, answer.pressure)
     normal = carried / np.linalg.norm(carried)
     np.testing.assert_allclose(carried, (np.array(force) @ normal) * normal, rtol=1e-12, atol=1e-14)
-    figures = answer.trust.figures
-    assert figures["probe.normal_n"] == pytest.approx(np.array(force) @ normal, rel=1e-12)
-    assert np.hypot(figures["probe.normal_n"], figures["probe.tangential_n"]) == pytest.approx(np.linalg.norm(force))
+    found = touch_of(answer)
+    assert found.normal == pytest.approx(np.array(force) @ normal, rel=1e-12)
+    assert np.hypot(found.normal, found.tangential) == pytest.approx(np.linalg.norm(force))
 
 
 def test_more_force_presses_deeper_and_on_more_skin(toucher: Toucher) -> None:
-    touches = [touched(toucher, BALL, on_limb(), (-f, 0, 0)) for f in (0.02, 0.06, 0.2, 0.6)]
+    touches = [felt(toucher, BALL, on_limb(), (-f, 0, 0)) for f in (0.02, 0.06, 0.2, 0.6)]
     for less, more in pairwise(touches):
-        assert more.trust.figures["depth_m"] > less.trust.figures["depth_m"]
+        assert touch_of(more).depth > touch_of(less).depth
         assert len(more.load.loaded) > len(less.load.loaded)
 
 
@@ -108,13 +126,13 @@ def test_more_force_presses_deeper_and_on_more_skin(toucher: Toucher) -> None:
 def test_the_pose_that_a_wrench_finds_presses_by_pose_with_the_same_force(
     flat_toucher: Toucher, mesh: ToolMesh, half: float, force: tuple[float, float, float]
 ) -> None:
-    found = touched(flat_toucher, mesh, at(0.0007, 0.0004, half - 1e-3), force)
-    back = touched(flat_toucher, mesh, found.pose_body_from_tool, None)
+    found = felt(flat_toucher, mesh, at(0.0007, 0.0004, half - 1e-3), force)
+    back = felt(flat_toucher, mesh, found.pose_body_from_tool, None)
     assert found.status == TOUCHING and back.status == BY_POSE
     np.testing.assert_allclose(back.wrench[:3], found.wrench[:3], rtol=6e-3, atol=1e-4)
     moved = found.pose_body_from_tool[:3, 3] - at(0.0007, 0.0004, half - 1e-3)[:3, 3]
     push = np.array(force) / np.linalg.norm(force)
-    np.testing.assert_allclose(moved, found.trust.figures["moved_m"] * push, atol=1e-12)
+    np.testing.assert_allclose(moved, touch_of(found).moved * push, atol=1e-12)
 
 
 @pytest.mark.parametrize("mesh, half", [(BALL, 0.012), (PUNCH, 0.015)])
@@ -124,16 +142,16 @@ def test_what_a_wrench_finds_does_not_depend_on_how_far_off_the_stated_pose_is(
     turned = turn((0, 1, 0), np.pi / 2)
     shifts = (-2e-3, -0.7e-3, 0.0, 1e-3, 2e-3)
     poses = [at(RADIUS + half - 1e-3 - s, 0.001, MIDDLE) @ turned for s in shifts]
-    touches = [touched(toucher, mesh, pose, (-0.2, 0, 0)) for pose in poses]
-    depths = [touch.trust.figures["depth_m"] for touch in touches]
+    touches = [felt(toucher, mesh, pose, (-0.2, 0, 0)) for pose in poses]
+    depths = [touch_of(touch).depth for touch in touches]
     np.testing.assert_allclose(depths, depths[2], rtol=0.01)
-    ends = [touch.trust.figures["moved_m"] + s for touch, s in zip(touches, shifts, strict=True)]
+    ends = [touch_of(touch).moved + s for touch, s in zip(touches, shifts, strict=True)]
     np.testing.assert_allclose(ends, ends[2], atol=0.01 * depths[2])
 
 
 def test_force_by_pose_is_what_the_pressure_sums_to_and_torque_is_about_the_tools_origin(toucher: Toucher) -> None:
     pose = on_limb()
-    touch = touched(toucher, BALL, pose, None)
+    touch = felt(toucher, BALL, pose, None)
     forces = touch.load.forces_on(LIMB)
     np.testing.assert_allclose(touch.wrench[:3], forces.sum(axis=0), atol=1e-12)
     torque = np.cross(LIMB.vertices - pose[:3, 3], forces).sum(axis=0)
@@ -143,7 +161,7 @@ def test_force_by_pose_is_what_the_pressure_sums_to_and_torque_is_about_the_tool
 
 def test_force_by_pose_grows_with_depth(flat_toucher: Toucher) -> None:
     depths = np.arange(1e-4, 5e-3, 1e-4)
-    forces = np.array([-touched(flat_toucher, BALL, at(4e-4, 7e-4, 0.012 - d), None).wrench[2] for d in depths])
+    forces = np.array([-felt(flat_toucher, BALL, at(4e-4, 7e-4, 0.012 - d), None).wrench[2] for d in depths])
     assert (forces > 0).all() and forces[-1] > 10 * forces[4]
     assert np.diff(forces).min() > -2e-3 * forces[-1]
 
@@ -155,15 +173,15 @@ def test_stiffer_tissue_presses_as_many_times_harder_and_moves_alike() -> None:
     one, seven = (Simulator(layer, Linear()).step([press(BALL, pose, None)]) for layer in (soft, stiff))
     np.testing.assert_allclose(seven.pressure, 7 * np.asarray(one.pressure), rtol=1e-9)
     np.testing.assert_allclose(seven.displacement, one.displacement, atol=1e-9)
-    touches = [touched(Toucher(layer), BALL, pose, (0, 0, -f)) for layer, f in ((soft, 0.1), (stiff, 0.7))]
-    assert touches[1].trust.figures["depth_m"] == pytest.approx(touches[0].trust.figures["depth_m"], rel=1e-6)
+    touches = [felt(Toucher(layer), BALL, pose, (0, 0, -f)) for layer, f in ((soft, 0.1), (stiff, 0.7))]
+    assert touch_of(touches[1]).depth == pytest.approx(touch_of(touches[0]).depth, rel=1e-6)
 
 
 def test_a_scene_twice_as_large_presses_four_times_as_hard(flat_toucher: Toucher) -> None:
-    large = Toucher(SoftLayer(2 * PLATE.vertices, PLATE.faces, 2 * PLATE.thickness))
-    field = SignedDistance.of(ToolMesh(2 * BALL.vertices, BALL.faces), margin=1e-2)
+    large = Toucher(enlarged(PLATE, 2))
+    field = SignedDistance.of(scaled(BALL, 2), margin=1e-2)
     for depth in (1e-3, 3e-3):
-        small = touched(flat_toucher, BALL, at(0.0004, 0, 0.012 - depth), None)
+        small = felt(flat_toucher, BALL, at(0.0004, 0, 0.012 - depth), None)
         whole = large.touch(press(BALL, at(0.0008, 0, 2 * (0.012 - depth)), None), field)
         assert whole.wrench[2] == pytest.approx(4 * small.wrench[2], rel=0.01)
 
@@ -171,7 +189,7 @@ def test_a_scene_twice_as_large_presses_four_times_as_hard(flat_toucher: Toucher
 def test_torque_is_balanced_by_a_centred_press_and_reported_otherwise(flat: Simulator) -> None:
     centred = flat.step([press(BALL, at(0, 0, 0.010), (0, 0, -0.2))]).trust.figures
     assert centred["probe.torque_nm"] < 1e-5
-    twisted = flat.step([Contact("probe", BALL, at(0, 0, 0.010), np.array([0, 0, -0.2, 0, 0, 0.05]))]).trust.figures
+    twisted = flat.step([contact_of(BALL, at(0, 0, 0.010), np.array([0, 0, -0.2, 0, 0, 0.05]))]).trust.figures
     assert twisted["probe.torque_nm"] == pytest.approx(0.05, rel=1e-3)
 
 
@@ -185,7 +203,7 @@ SCENE = turn((0.3, -0.5, 0.8), 1.1, (0.4, -0.2, 0.9))
 
 @pytest.fixture(scope="module", params=[Winkler, Naive])
 def turned_pair(request: pytest.FixtureRequest) -> tuple[Simulator, Simulator]:
-    layer = LIMB.with_(vertices=LIMB.vertices @ SCENE[:3, :3].T + SCENE[:3, 3])
+    layer = placed(LIMB, SCENE)
     return Simulator(LIMB, request.param()), Simulator(layer, request.param())
 
 
@@ -208,7 +226,7 @@ def test_replay_is_bit_identical() -> None:
 
 def worst_change(toucher: Toucher, mesh: ToolMesh, poses: list[np.ndarray], force: tuple | None) -> float:
     """Largest change from one pose to the next, over the whole load."""
-    loads = [touched(toucher, mesh, pose, force).load.values for pose in poses]
+    loads = [felt(toucher, mesh, pose, force).load.values for pose in poses]
     largest = max(float(load.sum()) for load in loads)
     return max(float(np.abs(after - before).sum()) / largest for before, after in pairwise(loads))
 
@@ -263,7 +281,7 @@ def test_the_seam_of_a_chart_is_not_felt(force: bool) -> None:
 
 def test_pose_alone_presses_columns_to_the_tool(flat: Simulator) -> None:
     answer = flat.step([press(BALL, at(0, 0, 0.009), None)])
-    assert answer.statuses["probe"] == BY_POSE
+    assert touch_of(answer).status == BY_POSE
     r = np.linalg.norm(PLATE.vertices[:, :2], axis=1)
     inner = r < 6e-3
     surface = 0.009 - np.sqrt(0.012**2 - r[inner] ** 2)
@@ -271,10 +289,10 @@ def test_pose_alone_presses_columns_to_the_tool(flat: Simulator) -> None:
 
 
 def test_a_thin_plate_under_the_rest_position_of_the_skin_still_presses(flat: Simulator) -> None:
-    slab = tool(trimesh.creation.box((0.03, 0.03, 0.004)))
+    slab = box(0.03, 0.03, 0.004)
     for force in ((0, 0, -0.3), None):
         answer = flat.step([press(slab, at(0, 0, -0.0035), force)])  # from 1.5 to 5.5 mm below the skin
-        assert answer.statuses["probe"] == (TOUCHING if force else BY_POSE)
+        assert touch_of(answer).status == (TOUCHING if force else BY_POSE)
         assert total(PLATE, answer.pressure)[2] < -0.1
         if force:
             assert total(PLATE, answer.pressure)[2] == pytest.approx(-0.3)
@@ -307,18 +325,18 @@ def test_seventy_thousand_triangles_with_a_hole_press_as_a_plain_ball_does(flat_
 
 def test_a_pose_that_is_off_is_moved_along_the_push(sim: Simulator) -> None:
     answer = sim.step([press(BALL, on_limb(-2.5e-3), (-0.2, 0, 0))])
-    assert answer.statuses["probe"] == MOVED
-    figures = answer.trust.figures
-    assert figures["probe.moved_m"] - figures["probe.depth_m"] == pytest.approx(2.5e-3, abs=2.5e-4)  # nearest vertex
+    assert touch_of(answer).status == MOVED
+    found = touch_of(answer)
+    assert found.moved - found.depth == pytest.approx(2.5e-3, abs=2.5e-4)  # nearest vertex
     assert total(LIMB, answer.pressure)[0] == pytest.approx(-0.2, rel=1e-3)
     at_touch = sim.step([press(BALL, on_limb(-1e-6), (-0.2, 0, 0))])
-    np.testing.assert_allclose(answer.displacement, at_touch.displacement, atol=0.01 * figures["probe.depth_m"])
+    np.testing.assert_allclose(answer.displacement, at_touch.displacement, atol=0.01 * found.depth)
 
 
 def test_a_wrench_without_touch_loads_nothing_and_is_out_of_range(sim: Simulator) -> None:
     for pose, force in ((on_limb(-4e-3), (-1, 0, 0)), (on_limb(-1e-3), (0, 0, -1)), (at(1, 1, 1), (-1, 0, 0))):
         answer = sim.step([press(BALL, pose, force)])
-        assert answer.statuses["probe"] == NO_TOUCH
+        assert touch_of(answer).status == NO_TOUCH
         assert not answer.displacement.any() and not answer.trust.in_range and "within 3 mm" in answer.trust.why
 
 
@@ -346,7 +364,7 @@ def test_a_tool_on_triangles_of_unlike_sizes_carries_its_wrench(seed: int) -> No
             force = rng.normal(0, 0.02, 3) - [0, 0, 10 ** rng.uniform(-3, 0)]
             answer = sim.step([press(mesh, pose, tuple(force))])
             assert np.isfinite(answer.displacement).all()
-            if answer.statuses["probe"] in (TOUCHING, MOVED):
+            if touch_of(answer).status in (TOUCHING, MOVED):
                 normal = total(sim.layer, answer.pressure)
                 size = np.linalg.norm(normal)
                 assert size == pytest.approx(float(force @ normal) / size, rel=1e-6)
@@ -356,17 +374,17 @@ def test_a_tool_on_triangles_of_unlike_sizes_carries_its_wrench(seed: int) -> No
 
 def test_pulling_loads_nothing(sim: Simulator) -> None:
     answer = sim.step([press(BALL, on_limb(), (1, 0, 0))])
-    assert answer.statuses["probe"] == PULLING and not answer.displacement.any()
+    assert touch_of(answer).status == PULLING and not answer.displacement.any()
 
 
 def test_a_closed_band_has_no_direction(sim: Simulator) -> None:
-    band = tool(trimesh.creation.annulus(RADIUS - 0.002, RADIUS + 0.01, 0.02, sections=96))
-    answer = sim.step([press(band, at(0, 0, MIDDLE), (-1, 0, 0))])
-    assert answer.statuses["probe"] == WRAPPED and not answer.displacement.any() and not answer.trust.in_range
-    squeezed = sim.step([press(band, at(0, 0, MIDDLE), None)])
-    assert squeezed.statuses["probe"] == BY_POSE
-    ring = np.abs(LIMB.vertices[:, 2] - MIDDLE) < 0.008
-    np.testing.assert_allclose(squeezed.magnitude[ring], 0.002, atol=1.5e-4)
+    ring = band()
+    answer = sim.step([press(ring, at(0, 0, MIDDLE), (-1, 0, 0))])
+    assert touch_of(answer).status == WRAPPED and not answer.displacement.any() and not answer.trust.in_range
+    squeezed = sim.step([press(ring, at(0, 0, MIDDLE), None)])
+    assert touch_of(squeezed).status == BY_POSE
+    under = np.abs(LIMB.vertices[:, 2] - MIDDLE) < 0.008
+    np.testing.assert_allclose(squeezed.magnitude[under], 0.002, atol=1.5e-4)
 
 
 def test_two_fingers_far_apart_add(sim: Simulator) -> None:
@@ -376,7 +394,7 @@ def test_two_fingers_far_apart_add(sim: Simulator) -> None:
     alone = np.add(sim.step([left]).pressure, sim.step([right]).pressure)
     np.testing.assert_allclose(both.pressure, alone, rtol=1e-6)
     assert set(both.statuses) == {"left", "right"}
-    assert "right.normal_n" in both.trust.figures
+    assert np.isfinite(touch_of(both, "right").normal)
 
 
 def test_fingers_side_by_side_feel_each_other_and_each_carries_its_own(toucher: Toucher) -> None:
@@ -409,13 +427,13 @@ def test_what_is_touched_together_does_not_depend_on_the_order(toucher: Toucher)
 
 def test_a_tool_in_the_core_is_said_and_still_answered(sim: Simulator) -> None:
     answer = sim.step([press(BALL, on_limb(depth=9e-3), None)])
-    assert answer.statuses["probe"] == IN_CORE
+    assert touch_of(answer).status == IN_CORE
     assert not answer.trust.in_range and "rigid core" in answer.trust.why
     assert total(LIMB, answer.pressure)[0] < 0 and np.isfinite(answer.displacement).all()
     assert answer.magnitude.max() < 0.012
     by_wrench = sim.step([press(BALL, on_limb(depth=9e-3), (-0.1, 0, 0))])  # the pose is a first guess only
-    assert by_wrench.statuses["probe"] == TOUCHING and by_wrench.trust.figures["probe.moved_m"] < 0
-    assert by_wrench.trust.figures["probe.depth_m"] < 6e-3
+    assert touch_of(by_wrench).status == TOUCHING and touch_of(by_wrench).moved < 0
+    assert touch_of(by_wrench).depth < 6e-3
 
 
 def test_a_ball_presses_about_as_hard_as_finite_elements_say() -> None:
@@ -430,7 +448,7 @@ def test_a_ball_presses_about_as_hard_as_finite_elements_say() -> None:
         columns = layer.tissue.youngs_modulus * float(
             np.linalg.norm(touch.squeeze.pressure @ layer.vertex_area_vectors[v]))  # fmt: skip
         force = float(np.linalg.norm(touch.wrench[:3]))
-        assert touch.trust.figures["depth_m"] == pytest.approx(depth, abs=2e-4)
+        assert touch_of(touch).depth == pytest.approx(depth, abs=2e-4)
         assert force == pytest.approx(answer.force, rel=0.15)
         assert abs(force - answer.force) < abs(columns - answer.force)
 

@@ -6,13 +6,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from stmpl_core import SoftLayer, Tissue
+from stmpl_core import SoftLayer
 from stmpl_core.columns import Columns, Squeeze
 from stmpl_core.contact_net import MOST, ContactNet, Held
 from stmpl_core.errors import InvalidInput
 from stmpl_core.networks import INPUTS, NETWORKS, PRESSURE, Weights, shipped
 from stmpl_core.sdf import SignedDistance
-from tests.touch_scenes import LENGTH, RADIUS, at, ball, limb, turn
+from tests.scenes import LENGTH, RADIUS, at, ball, enlarged, limb, placed, turn
 
 LIMB = limb(4e-3)
 BALL = SignedDistance.of(ball(), margin=5e-3)
@@ -52,7 +52,7 @@ def test_pressure_is_above_zero_and_within_a_factor_of_that_of_columns(weights: 
 @pytest.mark.parametrize("weights", WEIGHTS)
 def test_turning_and_moving_the_limb_leaves_the_pressure(weights: Weights) -> None:
     scene = turn((0.3, -0.5, 0.8), 1.1, (0.4, -0.2, 0.9))
-    turned = LIMB.with_(vertices=LIMB.vertices @ scene[:3, :3].T + scene[:3, 3])
+    turned = placed(LIMB, scene)
     squeeze = Columns(LIMB).squeezed(BALL, POSE)
     here, there = (ContactNet(layer, weights).hold(squeeze.vertices, squeeze.pressure, squeeze.strain)
                    for layer in (LIMB, turned))  # fmt: skip
@@ -62,8 +62,8 @@ def test_turning_and_moving_the_limb_leaves_the_pressure(weights: Weights) -> No
 @pytest.mark.parametrize("weights", WEIGHTS)
 def test_neither_stiffness_nor_size_changes_pressure_over_stiffness(weights: Weights) -> None:
     squeeze = Columns(LIMB).squeezed(BALL, POSE)
-    stiff = SoftLayer(LIMB.vertices, LIMB.faces, LIMB.thickness, tissue=Tissue(youngs_modulus=3e4))
-    large = SoftLayer(2 * LIMB.vertices, LIMB.faces, 2 * LIMB.thickness)
+    stiff = LIMB.with_(youngs_modulus=3e4)
+    large = enlarged(LIMB, 2)
     answers = [ContactNet(layer, weights).hold(squeeze.vertices, squeeze.pressure, squeeze.strain)
                for layer in (LIMB, stiff, large)]  # fmt: skip
     np.testing.assert_allclose(answers[1].pressure, answers[0].pressure, rtol=1e-6)

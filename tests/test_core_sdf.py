@@ -7,7 +7,7 @@ import trimesh
 from stmpl_core import ToolMesh
 from stmpl_core.errors import InvalidInput, MeshError
 from stmpl_core.sdf import SignedDistance
-from tests.touch_scenes import ball, capsule, tool
+from tests.scenes import ball, box, capsule, scaled, tool
 
 POINTS = np.random.default_rng(1).uniform(-0.02, 0.02, (20_000, 3))
 
@@ -27,7 +27,7 @@ def test_distance_to_a_sphere_is_exact_but_for_its_facets(sphere: SignedDistance
 
 def test_distance_to_a_box_is_exact_but_for_rounded_edges() -> None:
     half = np.array([0.01, 0.0125, 0.006])
-    field = SignedDistance.of(tool(trimesh.creation.box(2 * half)), spacing=5e-4)
+    field = SignedDistance.of(box(*2 * half), spacing=5e-4)
     q = np.abs(POINTS) - half
     exact = np.linalg.norm(np.maximum(q, 0), axis=1) + np.minimum(q.max(axis=1), 0)
     error = np.abs(field.distance(POINTS) - exact)
@@ -51,7 +51,7 @@ def test_field_converges_with_its_spacing() -> None:
     q = np.abs(POINTS) - half
     exact = np.linalg.norm(np.maximum(q, 0), axis=1) + np.minimum(q.max(axis=1), 0)
     near = np.abs(exact) < 1e-3
-    mesh = tool(trimesh.creation.box(2 * half))
+    mesh = box(*2 * half)
     errors = [np.abs(SignedDistance.of(mesh, spacing=h).distance(POINTS[near]) - exact[near]).mean()
               for h in (2e-3, 1e-3, 5e-4)]
     assert np.log2(errors[0] / errors[1]) > 1.5 and np.log2(errors[1] / errors[2]) > 1.5
@@ -114,9 +114,9 @@ def test_unmerged_vertices_are_no_holes() -> None:
 def test_what_cannot_be_a_tool_is_refused_with_a_reason() -> None:
     mesh = ball(subdivisions=1)
     with pytest.raises(MeshError, match=r"24\.0 m wide.*millimetres"):
-        SignedDistance.of(ToolMesh.of(1000 * mesh.vertices, mesh.faces))
+        SignedDistance.of(scaled(mesh, 1000))
     with pytest.raises(MeshError, match="metres"):
-        SignedDistance.of(ToolMesh.of(1e-3 * mesh.vertices, mesh.faces))
+        SignedDistance.of(scaled(mesh, 1e-3))
     with pytest.raises(MeshError, match="no surface"):
         SignedDistance.of(ToolMesh.of(mesh.vertices * [1, 0, 0], mesh.faces))
     with pytest.raises(MeshError, match="F > 0"):

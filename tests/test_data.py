@@ -31,7 +31,7 @@ DISCS = TINY.model_copy(update=dict.fromkeys(OTHERS, 0))
 
 @pytest.fixture(scope="module")
 def limb() -> SoftLayer:
-    return SoftLayer(*scenes.limb(3e-3, length=0.2), 6e-3)
+    return scenes.limb(3e-3, 6e-3, length=0.2)
 
 
 @pytest.fixture(scope="module")
@@ -80,7 +80,7 @@ def test_a_hand_is_closed_and_its_grip_touches_from_opposite_sides() -> None:
     hand = Hand.of(Body.anny(weight=0.5))
     edges = np.sort(hand.faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
     assert (np.unique(edges, axis=0, return_counts=True)[1] == 2).all()
-    limb = SoftLayer(*scenes.limb(5e-3, length=0.3), 6e-3)
+    limb = scenes.limb(5e-3, 6e-3, length=0.3)
     scene = Site(limb).grasp(
         int(np.linalg.norm(limb.vertices - [0.04, 0, 0.15], axis=1).argmin()), hand, 0.0, 4e-3, np.zeros(5)
     )

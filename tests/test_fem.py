@@ -18,16 +18,9 @@ from stmpl_core.errors import InvalidInput, MeshError, NotPrepared
 from stmpl_core.layer import SoftLayer, Tissue
 from stmpl_core.load import Load
 from stmpl_core.methods.winkler import column_pressure
-from tests.scenes import limb, plate, smooth_disc
+from tests.scenes import THICKNESS, bump, disc, limb, plate, wavy_layer
 
-THICKNESS = 7.5e-3
 CASES = [(element, layers) for element in ELEMENTS for layers in (1, 2)]
-
-
-def wavy_layer(n: int = 6, h: float = 3e-3) -> SoftLayer:
-    vertices, faces = plate(n, h)
-    vertices[:, 2] = 1e-3 * np.sin(100 * vertices[:, 0]) * np.cos(80 * vertices[:, 1])
-    return SoftLayer(vertices, faces, THICKNESS)
 
 
 def wavy_system(element, layers, pressure=400.0) -> System:
@@ -107,11 +100,10 @@ def test_patch_test_an_affine_motion_leaves_no_force_inside(element, layers):
 @pytest.mark.parametrize("ratio", [0.1, 0.5, 1.0, 2.0, 5.0])
 def test_confined_slab_is_the_closed_form(element, ratio):
     """From rest, not from the closed-form guess, so that Newton has work to do."""
-    vertices, faces = plate(5, THICKNESS)
-    layer = SoftLayer(vertices, faces, THICKNESS)
+    layer = plate(4 * THICKNESS, THICKNESS, crossed=True)
     mesh = WedgeMesh.of(layer.vertices, layer.inner_vertices, layer.faces, element)
     pressure = ratio * layer.tissue.youngs_modulus
-    load = FollowerPressure(mesh, np.full(len(vertices), pressure))
+    load = FollowerPressure(mesh, np.full(mesh.n_columns, pressure))
     system = System(mesh, layer.tissue, [load], np.zeros(mesh.n_columns, bool), mirror_projectors(mesh))
     result = solve(system, system.zeros())
     assert result.converged and result.iterations > 2
@@ -121,10 +113,9 @@ def test_confined_slab_is_the_closed_form(element, ratio):
 
 
 def test_a_wide_clamped_plate_reaches_the_slab_in_its_middle():
-    vertices, faces = plate(17, THICKNESS)
-    layer = SoftLayer(vertices, faces, THICKNESS)
-    answer = PatchFem().prepare(layer).solve(Load.pressure(np.full(len(vertices), 1e3)))
-    middle = np.linalg.norm(vertices - vertices.mean(axis=0), axis=1).argmin()
+    layer = plate(16 * THICKNESS, THICKNESS, crossed=True)
+    answer = PatchFem().prepare(layer).solve(Load.pressure(np.full(len(layer.vertices), 1e3)))
+    middle = np.linalg.norm(layer.vertices, axis=1).argmin()
     stretch = 1 + answer.displacement[middle, 2] / THICKNESS
     assert column_pressure(stretch, layer.tissue) == pytest.approx(1e3, rel=1e-3)
 
@@ -189,12 +180,6 @@ def scikit_fem_stiffness(layer: SoftLayer, mesh: WedgeMesh) -> np.ndarray:
     return local
 
 
-def bump(points: np.ndarray, peak: float, radius: float) -> np.ndarray:
-    """A pressure that falls from `peak` to 0 at `radius` from the z axis as cos^2, (n,) [Pa]."""
-    r = np.minimum(np.linalg.norm(points[:, :2], axis=1) / radius, 1)
-    return peak * np.cos(0.5 * np.pi * r) ** 2
-
-
 def pressed_by_felupe(half: float, depth: float, tissue: Tissue, peak: float, radius: float, n: int = 9):
     """A slab of n x n x 2 tri-quadratic hexahedra, held below and at its sides: skin points and displacements."""
     fem = pytest.importorskip("felupe", reason="FElupe is under the GPL: pip install stmpl[peers]")
@@ -221,12 +206,10 @@ def test_an_independent_quadratic_code_finds_the_same_press():
     """felupe's tri-quadratic hexahedra and follower pressure, p/E = 0.8, against both of our elements."""
     half, radius, peak = 0.0225, 0.015, 800.0
     points, theirs = pressed_by_felupe(half, THICKNESS, Tissue(), peak, radius)
-    vertices, faces = plate(37, half / 18)  # fine, because our pressure is linear between the vertices
-    vertices[:, :2] -= half
-    nearest = np.linalg.norm(points[:, None] - vertices[None], axis=2).argmin(axis=1)
-    assert np.linalg.norm(points - vertices[nearest], axis=1).max() < 1e-9
-    layer = SoftLayer(vertices, faces, THICKNESS)
-    load = Load.pressure(bump(vertices, peak, radius))
+    layer = plate(2 * half, half / 18, crossed=True)  # fine, because our pressure is linear between the vertices
+    nearest = np.linalg.norm(points[:, None] - layer.vertices[None], axis=2).argmin(axis=1)
+    assert np.linalg.norm(points - layer.vertices[nearest], axis=1).max() < 1e-9
+    load = Load.pressure(bump(layer.vertices, peak, radius))
     for element, layers in (("P1xP2", 2), ("P2xP2", 2)):
         method = PatchFem(element=element, layers=layers, reach=9, check_stability=False)
         ours = method.prepare(layer).solve(load).displacement[nearest]
@@ -236,12 +219,11 @@ def test_an_independent_quadratic_code_finds_the_same_press():
 
 
 def test_turning_the_scene_turns_the_answer():
-    vertices, faces = limb(4e-3)
-    layer = SoftLayer(vertices, faces, THICKNESS)
-    load = Load.pressure(600 * smooth_disc(vertices, vertices[len(vertices) // 2], 0.01, 0.006))
+    layer = limb(4e-3)
+    load = disc(layer, 0.6, layer.vertices[len(layer.vertices) // 2], 0.01)
     turn, shift = np.linalg.qr(np.random.default_rng(3).normal(size=(3, 3)))[0], np.array([0.3, -1.0, 0.5])
     turn *= np.sign(np.linalg.det(turn))
-    moved = layer.with_(vertices=vertices @ turn.T + shift)
+    moved = layer.with_(vertices=layer.vertices @ turn.T + shift)
     here, there = (PatchFem(reach=4).prepare(x).solve(load) for x in (layer, moved))
     assert here.trust.ok and there.trust.ok
     np.testing.assert_allclose(there.displacement, here.displacement @ turn.T, atol=1e-9)
@@ -255,12 +237,11 @@ def test_zero_load_moves_nothing_at_all():
 
 def test_dead_forces_lose_stability_where_follower_pressure_does_not():
     """Linear stability of a pressed layer: 0.65 E for dead loads, none for a follower pressure."""
-    vertices, faces = plate(13, 2.5e-3)
-    layer = SoftLayer(vertices, faces, THICKNESS)
+    layer = plate(12 * 2.5e-3, 2.5e-3, crossed=True)
     for ratio, stable in ((0.5, True), (0.9, False)):
         mesh = WedgeMesh.of(layer.vertices, layer.inner_vertices, layer.faces, "P2xP2")
         keep, none = mirror_projectors(mesh), np.zeros(mesh.n_columns, bool)
-        pressed = System(mesh, layer.tissue, [FollowerPressure(mesh, np.full(len(vertices), 1e3 * ratio))], none, keep)
+        pressed = System(mesh, layer.tissue, [FollowerPressure(mesh, np.full(mesh.n_columns, 1e3 * ratio))], none, keep)
         uniform = solve(pressed).u
         assert is_positive_definite(pressed, uniform)
         assert is_positive_definite(System(mesh, layer.tissue, [], none, keep), uniform) is stable
@@ -284,8 +265,7 @@ def test_the_linear_solvers_agree_with_a_direct_solution():
 @pytest.mark.parametrize("element", ELEMENTS)
 def test_the_convex_tangent_is_positive_where_the_true_one_is_not(element):
     """A layer crushed to 0.4 by dead loads is unstable; leaving out the skew part makes a direction of descent."""
-    vertices, faces = plate(7, 2.5e-3)
-    layer = SoftLayer(vertices, faces, THICKNESS)
+    layer = plate(6 * 2.5e-3, 2.5e-3, crossed=True)
     mesh = WedgeMesh.of(layer.vertices, layer.inner_vertices, layer.faces, element)
     system = System(mesh, layer.tissue, [], np.zeros(mesh.n_columns, bool), mirror_projectors(mesh))
     u = np.zeros_like(system.rest)
@@ -300,9 +280,9 @@ def test_the_convex_tangent_is_positive_where_the_true_one_is_not(element):
 
 
 def test_a_load_past_what_exists_is_flagged_not_believed():
-    vertices, faces = limb(5e-3)
-    layer = SoftLayer(vertices, faces, THICKNESS)
-    load = Load.nodal(3e3 * smooth_disc(vertices, vertices[len(vertices) // 2], 0.012, 0.001) * layer.vertex_areas)
+    layer = limb(5e-3)
+    pressure = disc(layer, 3.0, layer.vertices[len(layer.vertices) // 2], 0.012, 0.001)
+    load = Load.nodal(pressure.values * layer.vertex_areas)
     answer = PatchFem(reach=3).prepare(layer).solve(load)
     assert not answer.trust.ok and answer.trust.error_bound is None and answer.trust.why
     assert np.isfinite(answer.displacement).all()
@@ -316,6 +296,5 @@ def test_bad_input_is_refused_with_its_reason():
         Load.pressure([0.0, np.nan])
     with pytest.raises(InvalidInput, match="3 values"):
         PatchFem().prepare(layer).solve(Load.pressure([1.0, 2.0, 3.0]))
-    vertices, faces = limb(4e-3, radius=0.01)
     with pytest.raises(MeshError, match=r"folds on itself below \d+ vertices"):
-        PatchFem().prepare(SoftLayer(vertices, faces, 0.011))
+        PatchFem().prepare(limb(4e-3, 0.011, radius=0.01))

@@ -10,15 +10,7 @@ from stmpl_core.layer import SoftLayer, Tissue
 from stmpl_core.load import Load
 from studies.critical_load import closed_form, critical_loads, draw, least_stiffness
 from studies.tets import TetFem, TetMesh, TetSystem, split_wedges
-from tests.scenes import limb, plate, smooth_disc
-
-THICKNESS = 7.5e-3
-
-
-def bump(points: np.ndarray, peak: float, radius: float) -> np.ndarray:
-    """A pressure that falls from `peak` on the z axis to 0 at `radius` as cos^2, (n,) [Pa]."""
-    r = np.minimum(np.linalg.norm(points[:, :2], axis=1) / radius, 1)
-    return peak * np.cos(0.5 * np.pi * r) ** 2
+from tests.scenes import THICKNESS, bump, disc, limb, plate, wavy_layer
 
 
 def peak_of_the_mixed_method(half: float, tissue: Tissue, peak: float, radius: float, n: int = 4) -> float:
@@ -49,9 +41,8 @@ def peak_of_the_mixed_method(half: float, tissue: Tissue, peak: float, radius: f
 def test_nearly_incompressible_tissue_is_within_3_percent_of_a_mixed_method():
     """nu = 0.499: two wedges deep against u-p-J, and the default, one deep, against those; linear in plane locks."""
     half, radius, tissue = 0.0225, 0.015, Tissue(poisson_ratio=0.499)
-    vertices, faces = plate(13, half / 6)
-    vertices[:, :2] -= half
-    layer, load = SoftLayer(vertices, faces, THICKNESS, tissue=tissue), Load.pressure(bump(vertices, 400.0, radius))
+    layer = plate(2 * half, half / 6, crossed=True, poisson_ratio=tissue.poisson_ratio)
+    load = Load.pressure(bump(layer.vertices, 400.0, radius))
     default, deep, linear = (
         PatchFem(**options, reach=9, check_stability=False).prepare(layer).solve(load)
         for options in ({}, {"layers": 2}, {"element": "P1xP2"})
@@ -64,9 +55,8 @@ def test_nearly_incompressible_tissue_is_within_3_percent_of_a_mixed_method():
 
 @pytest.mark.parametrize(("ratio", "edge", "reach"), [(0.2, 5e-3, 3.0), (0.8, 4e-3, 4.0), (1.2, 6e-3, 6.0)])
 def test_the_stated_bound_covers_the_error(ratio, edge, reach):
-    vertices, faces = limb(4e-3)
-    layer = SoftLayer(vertices, faces, THICKNESS)
-    load = Load.pressure(1e3 * ratio * smooth_disc(vertices, vertices[len(vertices) // 2], 0.008, edge))
+    layer = limb(4e-3)
+    load = disc(layer, ratio, layer.vertices[len(layer.vertices) // 2], 0.008, edge)
     answer = PatchFem(reach=reach).prepare(layer).solve(load)
     finer = PatchFem(element="P2xP2", layers=2, reach=reach, check_stability=False).prepare(layer).solve(load)
     wider = PatchFem(reach=8, check_stability=False).prepare(layer).solve(load)
@@ -97,14 +87,12 @@ def test_coarse_linear_tets_hide_the_instability_that_quadratic_wedges_show(tmp_
 
 
 def wavy_tets(layers: int = 2) -> TetMesh:
-    vertices, faces = plate(6, 3e-3)
-    vertices[:, 2] = 1e-3 * np.sin(100 * vertices[:, 0]) * np.cos(80 * vertices[:, 1])
-    layer = SoftLayer(vertices, faces, THICKNESS)
+    layer = wavy_layer()
     return split_wedges(layer.vertices, layer.inner_vertices, layer.faces.astype(np.int64), layers)
 
 
 def test_split_wedges_conform_and_fill_the_layer():
-    mesh, flat = wavy_tets(), SoftLayer(*plate(5, 3e-3), THICKNESS)
+    mesh, flat = wavy_tets(), plate(0.012, 3e-3, crossed=True)
     assert len(mesh.boundary_faces()) == 2 * len(mesh.triangles) + 2 * 2 * 20  # skin, core, and 20 rim quads a layer
     filled = split_wedges(flat.vertices, flat.inner_vertices, flat.faces.astype(np.int64), 3)
     assert filled.volumes.sum() == pytest.approx(0.012**2 * THICKNESS)
@@ -138,18 +126,16 @@ def test_tets_pass_the_patch_test_and_their_tangent_is_the_derivative():
 
 def paper_scene(h: float) -> tuple[SoftLayer, Load]:
     """The paper's rule: the same force along the rest normal at every vertex of a contact."""
-    vertices, faces = limb(h, radius=0.03, length=0.08)
-    layer = SoftLayer(vertices, faces, THICKNESS)
-    touched = np.linalg.norm(vertices - vertices[len(vertices) // 2], axis=1) < 0.01
+    layer = limb(h, radius=0.03, length=0.08)
+    touched = np.linalg.norm(layer.vertices - layer.vertices[len(layer.vertices) // 2], axis=1) < 0.01
     return layer, Load.nodal(np.where(touched, 0.04 / touched.sum(), 0.0))
 
 
 def test_linear_tets_come_to_the_wedges_as_they_are_refined():
     errors = []
     for h in (5e-3, 2.5e-3):
-        vertices, faces = limb(h, radius=0.03, length=0.08)
-        layer = SoftLayer(vertices, faces, THICKNESS)
-        load = Load.pressure(300 * smooth_disc(vertices, vertices[len(vertices) // 2], 0.01, 6e-3))
+        layer = limb(h, radius=0.03, length=0.08)
+        load = disc(layer, 0.3, layer.vertices[len(layer.vertices) // 2], 0.01)
         truth = PatchFem(element="P2xP2", reach=3, check_stability=False).prepare(layer).solve(load)
         tets = TetFem(layers=round(THICKNESS / h), reach=3, check_stability=False).prepare(layer).solve(load)
         assert tets.trust.converged

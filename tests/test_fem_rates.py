@@ -31,10 +31,11 @@ def known(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 def sheared_plate(n: int) -> SoftLayer:
     """n x n squares cut in triangles, their inner vertices shifted smoothly, so that no two are alike."""
-    vertices, faces = plate(n + 1, SIDE / n)
+    flat = plate(SIDE, SIDE / n, THICKNESS, crossed=True)
+    vertices = flat.vertices + [SIDE / 2, SIDE / 2, 0]
     x, y = np.pi * vertices[:, 0] / SIDE, np.pi * vertices[:, 1] / SIDE
     vertices[:, :2] += 0.06 * SIDE * np.stack([np.sin(x) * np.sin(2 * y), np.sin(2 * x) * np.sin(y)], axis=1)
-    return SoftLayer(vertices, faces, THICKNESS)
+    return flat.with_(vertices=vertices)
 
 
 class FineQuadrature:

@@ -10,7 +10,7 @@ from stmpl_core.errors import InvalidInput
 from stmpl_core.haptics import DeviceLoop, LocalContact, LoopSettings, local_contact
 from stmpl_core.sdf import SignedDistance
 from stmpl_core.touch import APART, Toucher
-from tests.touch_scenes import at, plate, tool, turn
+from tests.scenes import at, contact_of, placed, plate, tool, turn
 
 DEEP = 2e-3  # m
 STILL = np.zeros(3)
@@ -74,7 +74,7 @@ def test_the_model_holds_where_it_says(
         twist = scale * rng.normal(size=6)
         twist *= 0.99 * (tilted.valid_m if scale[0] else tilted.valid_rad) / np.linalg.norm(twist)
         pose = turned(contact.pose_body_from_tool, twist)
-        truth = toucher.touch(Contact("block", contact.mesh, pose), field).wrench
+        truth = toucher.touch(contact_of(contact.mesh, pose, name="block"), field).wrench
         rendered = tilted.wrench_at(pose)
         assert rendered.inside
         assert off(truth, rendered.wrench, lever) < 0.15
@@ -90,13 +90,13 @@ def test_the_neighbourhood_is_not_far_too_small(
     for axis in np.eye(6)[:3]:
         for sign in (1, -1):
             pose = turned(contact.pose_body_from_tool, 3 * sign * tilted.valid_m * axis)
-            truth = toucher.touch(Contact("block", contact.mesh, pose), field).wrench
+            truth = toucher.touch(contact_of(contact.mesh, pose, name="block"), field).wrench
             worst = max(worst, off(truth, tilted.wrench + 3 * sign * tilted.valid_m * tilted.stiffness @ axis, 0.03))
     assert worst > 0.1
 
 
 def test_turning_a_ball_about_its_centre_changes_nothing(spot: Spot) -> None:
-    contact = Contact("ball", spot.mesh, spot.pose(spot.centre(-DEEP)))
+    contact = contact_of(spot.mesh, spot.pose(spot.centre(-DEEP)), name="ball")
     model = local_contact(spot.toucher, contact, spot.field)
     assert np.linalg.norm(model.stiffness[:3, 3:]) < 0.02 * np.linalg.norm(model.wrench[:3])
     plain = local_contact(spot.toucher, contact, spot.field, rotations=False)
@@ -110,8 +110,8 @@ def test_turning_the_scene_turns_the_model(
     toucher, contact, field = block
     scene = turn((0.3, -0.5, 0.8), 1.1, (0.4, -0.2, 0.9))
     rotation = np.kron(np.eye(2), scene[:3, :3])
-    layer = toucher.layer.with_(vertices=toucher.layer.vertices @ scene[:3, :3].T + scene[:3, 3])
-    after = local_contact(Toucher(layer), Contact("block", contact.mesh, scene @ contact.pose_body_from_tool), field)
+    moved = contact_of(contact.mesh, scene @ contact.pose_body_from_tool, name="block")
+    after = local_contact(Toucher(placed(toucher.layer, scene)), moved, field)
     np.testing.assert_allclose(after.wrench, rotation @ tilted.wrench, atol=1e-6 * np.linalg.norm(tilted.wrench[:3]))
     size = np.abs(tilted.stiffness[:3, :3]).max()
     np.testing.assert_allclose(after.stiffness[:3, :3], (rotation @ tilted.stiffness @ rotation.T)[:3, :3],
@@ -140,7 +140,7 @@ def test_bad_input_is_refused_or_gives_no_force(spot: Spot, model: LocalContact)
     with pytest.raises(InvalidInput, match="pose holds"):
         model.wrench_at(np.full((4, 4), np.nan))
     with pytest.raises(InvalidInput, match="step is 0"):
-        local_contact(spot.toucher, Contact("ball", spot.mesh, spot.pose(spot.place)), spot.field, step=0.0)
+        local_contact(spot.toucher, contact_of(spot.mesh, spot.pose(spot.place), name="ball"), spot.field, step=0.0)
     with pytest.raises(InvalidInput, match="coupling_stiffness is -1"):
         LoopSettings(coupling_stiffness=-1)
     with pytest.raises(InvalidInput, match="delay_steps is 300"):

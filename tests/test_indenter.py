@@ -2,40 +2,26 @@
 
 import numpy as np
 import pytest
-import trimesh
 
 from fem_tools.indenter import IndenterFem
 from fem_tools.patch import PatchFem
 from fem_tools.press import Press
-from stmpl_core.contact import ToolMesh
 from stmpl_core.errors import InvalidInput
 from stmpl_core.layer import SoftLayer, Tissue
 from stmpl_core.methods.winkler import column_pressure
 from stmpl_core.sdf import SignedDistance
-from tests.scenes import limb, plate
-
-THICKNESS = 7.5e-3
-
-
-def tool_mesh(mesh: trimesh.Trimesh) -> ToolMesh:
-    """A mesh made in millimetres, in metres."""
-    return ToolMesh.of(np.asarray(mesh.vertices) / 1e3, mesh.faces)
+from tests import scenes
+from tests.scenes import THICKNESS, at, limb, plate
 
 
 @pytest.fixture(scope="module")
 def ball() -> SignedDistance:
-    return SignedDistance.of(tool_mesh(trimesh.creation.icosphere(subdivisions=4, radius=12.0)))
+    return SignedDistance.of(scenes.ball(subdivisions=4))
 
 
 @pytest.fixture(scope="module")
 def layer() -> SoftLayer:
-    return SoftLayer(*limb(4e-3), THICKNESS)
-
-
-def pose(x: float, y: float, z: float) -> np.ndarray:
-    out = np.eye(4)
-    out[:3, 3] = x, y, z
-    return out
+    return limb(4e-3)
 
 
 @pytest.fixture(scope="module")
@@ -45,7 +31,7 @@ def pressed(ball, layer):
 
 
 def side_tool(field: SignedDistance, x: float = 0.08) -> Press:
-    return Press(field, pose(x, 0, 0.08), np.array([-1.0, 0, 0]))
+    return Press(field, at(x, 0, 0.08), np.array([-1.0, 0, 0]))
 
 
 def test_force_grows_with_depth_and_every_answer_is_sound_down_to_70_percent(pressed):
@@ -60,7 +46,7 @@ def test_force_grows_with_depth_and_every_answer_is_sound_down_to_70_percent(pre
 
 def test_the_skin_is_nowhere_inside_the_tool(pressed):
     for answer in pressed:
-        inside = -answer.tools[0].distance(answer.displacement + SoftLayer(*limb(4e-3), THICKNESS).vertices)
+        inside = -answer.tools[0].distance(answer.displacement + limb(4e-3).vertices)
         assert inside.max() < 25e-6
 
 
@@ -128,8 +114,8 @@ def test_coulomb_lies_between_sliding_and_sticking(ball, layer):
 
 
 def test_a_grasp_of_a_symmetric_limb_is_in_balance(ball):
-    layer = SoftLayer(*limb(3.93e-3), THICKNESS)  # 64 vertices around: the two sides are alike
-    other = Press(ball, pose(-0.08, 0, 0.08), np.array([1.0, 0, 0]))
+    layer = limb(3.93e-3)  # 64 vertices around: the two sides are alike
+    other = Press(ball, at(-0.08, 0, 0.08), np.array([1.0, 0, 0]))
     answer = IndenterFem(PatchFem(refine=1, reach=3)).prepare(layer).press([side_tool(ball), other], 2e-3)
     assert answer.trust.converged
     first, second = answer.wrenches
@@ -172,21 +158,18 @@ def bonded_layer_force(radius: float, depth: float, thickness: float, tissue: Ti
 
 @pytest.mark.parametrize("nu", [0.3, 0.4])
 def test_a_shallow_ball_is_hertz_with_the_correction_for_a_bonded_layer(ball, nu):
-    vertices, faces = plate(19, 2.5e-3)
-    vertices[:, :2] -= vertices[:, :2].mean(axis=0)
-    tissue = Tissue(poisson_ratio=nu)
-    flat = SoftLayer(vertices, faces, THICKNESS, tissue=tissue)
+    flat = plate(18 * 2.5e-3, 2.5e-3, crossed=True, poisson_ratio=nu)
     solver = IndenterFem(PatchFem(refine=3, reach=4, layers=2), friction="none").prepare(flat)
-    tool = Press(ball, pose(0, 0, 0.02), np.array([0, 0, -1.0]))
+    tool = Press(ball, at(0, 0, 0.02), np.array([0, 0, -1.0]))
     for answer in solver.path([tool], [0.15e-3, 0.3e-3]):
-        expected = bonded_layer_force(0.012, answer.depth, THICKNESS, tissue)
+        expected = bonded_layer_force(0.012, answer.depth, THICKNESS, flat.tissue)
         assert answer.force == pytest.approx(expected, rel=0.06)
 
 
 def test_bad_input_is_refused_with_its_reason(ball, layer):
     solver = IndenterFem().prepare(layer)
     with pytest.raises(InvalidInput, match="never meets"):
-        solver.press([Press(ball, pose(0.08, 0, 0.08), np.array([1.0, 0, 0]))], 1e-3)
+        solver.press([Press(ball, at(0.08, 0, 0.08), np.array([1.0, 0, 0]))], 1e-3)
     with pytest.raises(InvalidInput, match="inside the core"):
         solver.press([side_tool(ball)], 1.2 * THICKNESS)
     with pytest.raises(InvalidInput, match="increase"):

@@ -12,9 +12,7 @@ from fem_tools.press import Press
 from fem_tools.tool_contact import PressLoad
 from stmpl_core.body import Body
 from stmpl_core.sdf import SignedDistance
-from tests.test_indenter import tool_mesh
-
-THICKNESS = 7.5e-3
+from tests.scenes import THICKNESS, tool
 
 
 def filleted_punch(radius: float = 12.0, fillet: float = 3.0) -> trimesh.Trimesh:
@@ -46,7 +44,7 @@ def arm():
 @pytest.mark.parametrize("name", TOOLS)
 def test_a_tool_goes_down_to_70_percent_of_the_arm(arm, name):
     make, rounding = TOOLS[name]
-    field = SignedDistance.of(tool_mesh(make()), rounding=rounding)
+    field = SignedDistance.of(tool(make(), 1e-3), rounding=rounding)
     away = np.linalg.norm(arm.vertices[:, None] - arm.vertices[arm.border][None, ::3], axis=2).min(axis=1)
     inside = np.flatnonzero(away > 0.07)
     vertex = inside[len(inside) // 3]
@@ -65,6 +63,7 @@ def test_a_tool_goes_down_to_70_percent_of_the_arm(arm, name):
     assert answers[1].force > 2 * answers[0].force > 0
 
 
+@pytest.mark.slow
 def test_a_flat_tool_carries_a_mean_pressure_of_5_times_the_modulus():
     scene = Scene("flat", lambda: flat(12, 5), edge=3.5e-3, rim=2.5)
     layer, tool = scene.built()
@@ -89,7 +88,7 @@ def test_the_stated_bound_covers_what_a_finer_mesh_changes():
 
 
 def test_contact_pressure_is_minus_the_slope_of_its_energy_and_stiffness_that_of_the_pressure():
-    field = SignedDistance.of(tool_mesh(trimesh.creation.icosphere(subdivisions=2, radius=5.0)))
+    field = SignedDistance.of(tool(trimesh.creation.icosphere(subdivisions=2, radius=5.0), 1e-3))
     n, nothing = 9, np.zeros((9, 3))
     load = PressLoad(
         Press(field, np.eye(4), np.array([0, 0, 1.0])), np.ones(n), np.arange(n), np.arange(n), (1e6, 0.0),

@@ -12,7 +12,7 @@ from fem_tools.few_steps import FewSteps
 from fem_tools.ladder import default_rungs, ladder, measured, times_file
 from fem_tools.sampling import BodyPlan
 from stmpl_core.errors import InvalidInput, NotPrepared
-from stmpl_core.layer import SoftLayer, Tissue
+from stmpl_core.layer import Tissue
 from stmpl_core.load import Load
 from stmpl_core.methods import Linear, MomentNet, Winkler
 from stmpl_core.methods.coarse import Coarse
@@ -27,7 +27,7 @@ WIDE = {"strain": [1e-4, 1.0], "nu": [0.0, 0.5], "width": [0.01, 10.0], "slope":
 
 @pytest.fixture(scope="module")
 def layer():
-    return SoftLayer(*limb(5e-3), thickness=7.5e-3)
+    return limb(5e-3)
 
 
 def disc(layer, ratio=0.5, radius=0.014):
@@ -299,6 +299,7 @@ def test_the_fit_finds_the_law_and_its_bounds_hold_as_often_as_they_say():
     assert exact.methods["m"].factor["pressure"] == pytest.approx(MARGIN, abs=0.1)
 
 
+@pytest.mark.slow
 def test_the_shipped_bounds_hold_on_a_limb_and_shapes_that_were_not_fitted_and_are_not_loose(tmp_path, monkeypatch):
     monkeypatch.setenv("STMPL_CACHE_DIR", str(tmp_path))
     limb = BodyPlan(name="unseen", weight=0.6, thickness=6.5e-3, edge_length=4.5e-3, part="right_forearm")

@@ -9,7 +9,7 @@ from stmpl_core import Load, Tissue
 from stmpl_core.errors import InvalidInput, NotPrepared
 from stmpl_core.methods import Naive, Winkler
 from stmpl_core.methods.winkler import column_pressure, column_stretch, least_width
-from tests.touch_scenes import limb, plate, turn
+from tests.scenes import limb, plate, turn
 
 SKIN = plate(0.06)
 TISSUES = [Tissue(poisson_ratio=nu) for nu in (0.0, 0.3, 0.4, 0.49)]

@@ -6,7 +6,7 @@ import pytest
 from stmpl_core import Load
 from stmpl_core.errors import InvalidInput
 from stmpl_core.metrics import LIMITS, mean_and_deviation, score
-from tests.touch_scenes import plate
+from tests.scenes import plate
 
 SKIN = plate(0.2, edge=4e-3)
 R = np.linalg.norm(SKIN.vertices, axis=1)

@@ -1,6 +1,6 @@
 """Laws of the learned simulator: what is exact by construction, what it was trained to, and what it says of itself."""
 
-from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +11,7 @@ from fem_tools import PatchFem
 from fem_tools.dataset import Dataset
 from fem_tools.generate import generate
 from fem_tools.sampling import PRESETS
-from stmpl_core import Load, SoftLayer, Tissue
+from stmpl_core import Load, SoftLayer
 from stmpl_core.errors import InvalidInput, NotPrepared
 from stmpl_core.methods import Linear, MomentNet
 from stmpl_core.methods.moment_net import invariants, source_fields
@@ -20,30 +20,21 @@ from stmpl_core.moments import REACH, Surroundings
 from stmpl_core.networks import INPUTS, POINT
 from studies.train_moments import Model, MomentTraining, draw_points, fit, train_moments
 from tests import scenes
-from tests.touch_scenes import turn
+from tests.scenes import turn
 
 T = 7e-3
 SETTINGS = MomentTraining(hidden=8, steps=60, points=32, checkpoint_minutes=0)
+pytestmark = pytest.mark.usefixtures("one_thread")
 
 
+@cache
 def limb(nu: float = 0.4, thickness: float = T, scale: float = 1.0) -> SoftLayer:
     """A cylinder: no body, so a shape that nothing was learnt from."""
-    vertices, faces = scenes.limb(3.5e-3)
-    return SoftLayer(scale * vertices, faces, scale * thickness, tissue=Tissue(poisson_ratio=nu))
+    return scenes.enlarged(scenes.limb(3.5e-3, thickness, poisson_ratio=nu), scale)
 
 
 def pad(layer: SoftLayer, ratio: float, radius: float = 0.013, scale: float = 1.0) -> Load:
-    weight = scenes.smooth_disc(layer.vertices, scale * np.array([0.04, 0, 0.08]), scale * radius, scale * 6e-3)
-    return Load.pressure(ratio * layer.tissue.youngs_modulus * weight)
-
-
-@pytest.fixture(scope="module", autouse=True)
-def one_thread() -> Iterator[None]:
-    """So small a network is not shared among threads, which would wait for one another."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
+    return scenes.disc(layer, ratio, scale * np.array([0.04, 0, 0.08]), scale * radius, scale * 6e-3)
 
 
 @pytest.fixture(scope="module")

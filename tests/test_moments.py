@@ -3,6 +3,7 @@
 import gc
 import pickle
 import weakref
+from functools import cache
 
 import numpy as np
 import pytest
@@ -14,22 +15,23 @@ from stmpl_core.methods import Linear
 from stmpl_core.metrics import score
 from stmpl_core.moments import FINER, NEAR, REACH, SPREADS, STEPS, Surroundings, response_table, ring_table
 from tests import scenes
-from tests.touch_scenes import plate, turn
+from tests.scenes import limb, plate, turn
 
 T = 6e-3
 
 
+@cache
 def sheet(nu: float = 0.4) -> SoftLayer:
-    return plate(0.144, 3e-3, T).with_(poisson_ratio=nu)
+    return plate(0.144, 3e-3, T, poisson_ratio=nu)
 
 
+@cache
 def arm(h: float = 3e-3) -> SoftLayer:
-    return SoftLayer(*scenes.limb(h), T)
+    return limb(h, T)
 
 
 def disc(layer: SoftLayer, centre: list[float], ratio: float, radius: float = 0.011) -> Load:
-    weight = scenes.smooth_disc(layer.vertices, np.array(centre), radius, 6e-3)
-    return Load.pressure(ratio * layer.tissue.youngs_modulus * weight)
+    return scenes.disc(layer, ratio, centre, radius)
 
 
 @pytest.mark.parametrize("nu", [0.0, 0.3, 0.4, 0.49])
@@ -127,7 +129,7 @@ def test_out_of_range_is_said_and_misuse_refused() -> None:
 
 
 def test_what_was_made_of_a_layer_goes_with_it() -> None:
-    layer = arm(8e-3)
+    layer = limb(8e-3, T)
     near = Surroundings.of(layer)
     assert Surroundings.of(layer) is near
     again = pickle.loads(pickle.dumps(near))

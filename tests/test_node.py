@@ -38,7 +38,6 @@ from stmpl_ros.skin import Skin, published
 
 from bags.reader import Bag
 from bags.replay import replay_run
-from stmpl_core.contact import Contact
 from stmpl_core.errors import FrameError, InvalidInput
 from stmpl_core.methods import MomentNet
 from stmpl_core.sdf import SignedDistance
@@ -52,7 +51,7 @@ from stmpl_ros.settings import checked
 from stmpl_ros.topics import KEPT, LEASE, STREAM
 from tests.bus import PATIENCE, ROOT, Robot, end, rows, running, start
 from tests.conftest import BUSES
-from tests.touch_scenes import LENGTH, RADIUS, at, ball, limb
+from tests.scenes import LENGTH, RADIUS, at, ball, contact_of, limb
 
 TOUCH = RADIUS + 0.012 - 1e-3  # m from the limb's axis: a ball of 12 mm, 1 mm deep
 NODE = """
@@ -271,7 +270,7 @@ def test_another_stiffness_alone_is_at_hand_at_once_and_answers_as_one_that_was_
     harder = config.model_copy(update={"youngs_modulus": 3e3})
     quick, made = given.stiffened(harder), Skin.of(harder, skin)
     assert quick.layer_id == made.layer_id != given.layer_id
-    contact = Contact("probe", ball(), HERE, PUSH)
+    contact = contact_of(ball(), HERE, PUSH)
     assert quick.simulator().step([contact]).displacement.tobytes() == (
         made.simulator().step([contact]).displacement.tobytes()
     )
@@ -288,7 +287,7 @@ def test_calibrate_finds_the_stiffness_and_the_offset_that_the_robots_presses_ha
     assert not few.success and "0 of 0 instants pressed" in few.message and few.presses == 0
     for depth in np.linspace(0.4e-3, 3e-3, 24):
         pose = at(RADIUS + 0.012 - depth, 0, LENGTH / 2)
-        wrench = toucher.touch(Contact("finger", mesh, pose), field).wrench
+        wrench = toucher.touch(contact_of(mesh, pose, name="finger"), field).wrench
         assert list(hand.ask(at(back, 0, 0) @ pose, wrench).statuses) in ([TOUCHING], [MOVED])
     nobody = bus.call(Calibrate, "calibrate", tool="nobody")
     assert not nobody.success and "0 of 0" in nobody.message

@@ -10,21 +10,20 @@ from stmpl_core import Load, SoftLayer
 from stmpl_core.errors import InvalidInput, NotPrepared
 from studies.peers import PEERS, installed, peer
 from studies.tets import TetFem
-from tests.scenes import plate, smooth_disc
+from tests.scenes import THICKNESS, disc, plate
 
-THICKNESS, RADIUS, EDGE = 7.5e-3, 8e-3, 4e-3  # m
+RADIUS, EDGE = 8e-3, 4e-3  # m
 SMALL, FIRM = 1e-3, 0.3  # p / E
 
 
 @cache
 def slab(across: int = 17) -> SoftLayer:
     """A flat layer, 64 mm wide unless said, with edges of 4 mm."""
-    return SoftLayer(*plate(across, 4e-3), THICKNESS)
+    return plate((across - 1) * 4e-3, 4e-3, crossed=True)
 
 
 def press(layer: SoftLayer, ratio: float) -> Load:
-    centre = layer.vertices.mean(axis=0)
-    return Load.pressure(ratio * layer.tissue.youngs_modulus * smooth_disc(layer.vertices, centre, RADIUS, EDGE))
+    return disc(layer, ratio, (0, 0, 0), RADIUS, EDGE)
 
 
 def off(found: np.ndarray, truth: np.ndarray) -> float:

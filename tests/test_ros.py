@@ -14,21 +14,21 @@ from visualization_msgs.msg import Marker
 
 from bags.reader import Bag
 from bags.replay import replay_run
-from stmpl_core import Contact, ToolMesh
+from stmpl_core import ToolMesh
 from stmpl_core.haptics import DeviceLoop, local_contact
 from stmpl_core.methods import MomentNet
 from stmpl_core.sdf import MARGIN, SignedDistance
 from stmpl_core.touch import BY_POSE, IN_CORE, NO_FORCE, NO_TOUCH, PULLING, TOUCHING, Toucher
 from stmpl_ros.topics import KEPT, STREAM
 from tests.bus import Robot, end, rows, start
-from tests.touch_scenes import LENGTH, RADIUS, at, ball
+from tests.scenes import LENGTH, RADIUS, at, ball, contact_of, scaled
 
 AGAIN = 2_000_000_000  # ns after which an unanswered first pose is sent once more
 NODE = """
 import sys
 from stmpl_ros.node import run
 from stmpl_ros.parameters import NodeConfig
-from tests.touch_scenes import limb
+from tests.scenes import limb
 sys.exit(run(NodeConfig(rest_after=0.4, fade=0.6), build=lambda config: limb(4e-3)))
 """
 TOUCH = RADIUS + 0.012 - 1e-3  # m from the limb's axis: a ball of 12 mm, 1 mm deep
@@ -75,6 +75,7 @@ def device():
     assert code == 0, said
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_the_node_on_the_arm_ends_cleanly_when_asked_to(device, number):
     process = start("-m", "stmpl_ros.cli", "node", "--edge-length", "0.008", "--ros-args", "-r", "__ns:=/arm")
@@ -266,7 +267,7 @@ def test_a_mesh_with_a_hole_is_told_of(device, another):
 def test_a_mesh_that_cannot_be_used_is_refused_and_the_node_stays_up(device, name, scale, says):
     device.spin(1.1)  # one line of a kind in a second
     good = ball()
-    device.mesh.publish(mesh_message(name, ToolMesh.of(good.vertices * scale, good.faces), device.now()))
+    device.mesh.publish(mesh_message(name, scaled(good, scale), device.now()))
     device.wait(lambda: [line for line in device.said(f"'{name}' refused") if says in line], "the refusal")
     assert list(device.ask(TOUCH, 0.02).statuses) == [TOUCHING]
 
@@ -310,7 +311,7 @@ def test_a_local_contact_says_what_the_answer_says_and_how_it_changes(device):
     # the node's is the model that anybody finds there
     mesh, toucher = ball_as_sent(), Toucher(layer)
     field = SignedDistance.of(mesh, margin=max(MARGIN, 2 * toucher.hole))
-    own = local_contact(toucher, Contact("probe", mesh, model.pose_body_from_tool), field)
+    own = local_contact(toucher, contact_of(mesh, model.pose_body_from_tool), field)
     np.testing.assert_allclose(model.wrench, own.wrench, atol=1e-6 * np.linalg.norm(own.wrench[:3]))
     np.testing.assert_allclose(model.stiffness, own.stiffness, atol=1e-4 * np.abs(own.stiffness).max())
     assert model.valid_m == pytest.approx(own.valid_m, rel=0.05) and model.valid_rad > 0

@@ -2,19 +2,13 @@
 
 import numpy as np
 import pytest
+from bags.messages import layer_from, layer_id, pose_from, tool_mesh_from, wrench_from
 from geometry_msgs.msg import PoseStamped
 from hypothesis import given
 from hypothesis import strategies as st
 from rclpy.serialization import deserialize_message, serialize_message
 from scipy.spatial.transform import Rotation
 from stmpl_msgs.msg import LocalContact as LocalContactMessage
-from visualization_msgs.msg import Marker
-
-from bags.messages import layer_from, layer_id, pose_from, tool_mesh_from, wrench_from
-from stmpl_core import ToolMesh
-from stmpl_core.errors import FrameError, InvalidInput, MeshError
-from stmpl_core.haptics import LocalContact
-from stmpl_core.trust import Displacement, Trust
 from stmpl_ros.conversions import (
     STALE,
     checked_mesh,
@@ -30,13 +24,18 @@ from stmpl_ros.conversions import (
     topology_message,
     wrench_message,
 )
-from stmpl_ros.inbox import PATIENCE, Inbox
 from stmpl_ros.marker import SkinMarker
+from stmpl_ros.throttle import Throttle
+from visualization_msgs.msg import Marker
+
+from stmpl_core.errors import FrameError, InvalidInput, MeshError
+from stmpl_core.haptics import LocalContact
+from stmpl_core.trust import Displacement, Trust
+from stmpl_ros.inbox import PATIENCE, Inbox
 from stmpl_ros.node import published
 from stmpl_ros.parameters import NodeConfig
 from stmpl_ros.scripts import PRESS, SCRIPTS, Device, Keyframe, Motion
-from stmpl_ros.throttle import Throttle
-from tests.touch_scenes import ball, limb
+from tests.scenes import ball, limb, scaled
 
 MS = 1_000_000
 unit = st.floats(-1, 1).filter(lambda x: abs(x) > 1e-3)
@@ -119,7 +118,7 @@ def test_a_wrench_that_cannot_be_meant_is_refused_and_told_why():
 def test_a_mesh_that_cannot_be_meant_is_refused_and_told_why():
     good = ball()
     with pytest.raises(MeshError, match="millimetres"):
-        checked_mesh(mesh_message("probe", ToolMesh.of(good.vertices * 1e3, good.faces), 0))
+        checked_mesh(mesh_message("probe", scaled(good, 1e3), 0))
     with pytest.raises(FrameError, match="frame_id"):
         checked_mesh(mesh_message("", good, 0))
     empty = mesh_message("probe", good, 0)

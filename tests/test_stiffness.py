@@ -7,13 +7,12 @@ import pytest
 
 from fem_tools.indenter import IndenterFem
 from fem_tools.patch import PatchFem
-from fem_tools.press import Press as IndenterPress
-from stmpl_core import Contact
+from fem_tools.press import Press
 from stmpl_core.errors import InvalidInput
 from stmpl_core.sdf import SignedDistance
-from stmpl_core.stiffness import Press, fit_stiffness
+from stmpl_core.stiffness import fit_stiffness
 from stmpl_core.touch import Toucher
-from tests.touch_scenes import LENGTH, RADIUS, at, ball, limb, press
+from tests.scenes import LENGTH, RADIUS, at, ball, contact_of, limb, press
 
 HIDDEN = 3.7e3  # Pa
 LAYER, BALL = limb(4e-3), ball(subdivisions=4)
@@ -43,7 +42,7 @@ def presses(pressed, *, back: float = 0.0, noise: float = 0.0, times: int = 1) -
     generator, out = np.random.default_rng(0), []
     for pose, wrench in pressed * times:
         told = at(back, 0, 0) @ pose
-        out.append(Press(Contact("probe", BALL, told, wrench * (1 + noise * generator.normal())), FIELD))
+        out.append(Press(contact_of(BALL, told, wrench * (1 + noise * generator.normal())), FIELD))
     return out
 
 
@@ -82,7 +81,7 @@ def test_too_few_presses_are_refused(toucher, pressed):
     idle = [pushed(pose, (0, 0, 0)) for pose, _ in pressed * 3]
     assert "0 of 18 instants pressed with a force" in fit_stiffness(toucher, idle).trust.why
     with pytest.raises(InvalidInput, match="has no wrench"):
-        fit_stiffness(toucher, [Press(Contact("probe", BALL, at(1, 0, 0)), FIELD)])
+        fit_stiffness(toucher, [Press(contact_of(BALL, at(1, 0, 0)), FIELD)])
 
 
 def test_presses_of_one_depth_do_not_tell_stiffness_from_offset(toucher, pressed):

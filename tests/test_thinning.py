@@ -13,12 +13,11 @@ T = 7e-3
 
 
 def arm(h: float = 3e-3, t: float = T) -> SoftLayer:
-    return SoftLayer(*scenes.limb(h), t)
+    return scenes.limb(h, t)
 
 
 def pressed(layer: SoftLayer, radius: float = 8e-3) -> Load:
-    weight = scenes.smooth_disc(layer.vertices, np.array([0.04, 0, 0.08]), radius, 3e-3)
-    return Load.pressure(0.5 * layer.tissue.youngs_modulus * weight)
+    return scenes.disc(layer, 0.5, (0.04, 0, 0.08), radius, 3e-3)
 
 
 def everybody(thinning: Thinning, loaded: np.ndarray) -> Asked:

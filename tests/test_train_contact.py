@@ -1,11 +1,9 @@
 """Laws of what ContactNet learns from: tools of every kind, put back where finite elements had them, and a training."""
 
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 import trimesh
 
 from fem_tools.dataset import Dataset
@@ -13,7 +11,6 @@ from fem_tools.generate import generate
 from fem_tools.sampling import CONTACT_BODIES, PRESETS, SIZES, TILT, TOOLS, contacts, draw, split_of
 from fem_tools.scenes import Site
 from fem_tools.tool_shapes import FILLETS, any_tool
-from stmpl_core import SoftLayer
 from stmpl_core.contact_net import ContactNet
 from stmpl_core.errors import InvalidInput
 from stmpl_core.networks import Weights
@@ -26,15 +23,7 @@ PLAN = PRESETS["contacts"].model_copy(
     update={"preset": "few", "bodies": (BODY,), "tools": 3, "loads": 2, "deepest": 0.4, "indenter_step": 0.2, "seed": 1}
 )
 SETTINGS = ContactTraining(hidden=8, steps=60, batch=4)
-
-
-@pytest.fixture(scope="module", autouse=True)
-def one_thread() -> Iterator[None]:
-    """So small a network is not shared among threads, which would wait for one another."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
+pytestmark = pytest.mark.usefixtures("one_thread")
 
 
 @pytest.fixture(scope="module")
@@ -70,7 +59,7 @@ def test_a_smooth_tools_field_is_its_surface() -> None:
 
 
 def test_a_drawn_tool_stands_above_the_skin_and_looks_at_it() -> None:
-    layer = SoftLayer(*scenes.limb(4e-3, length=0.3), 6e-3)
+    layer = scenes.limb(4e-3, 6e-3, length=0.3)
     site, kinds = Site(layer), set()
     for contact in [c for c in contacts(PRESETS["contacts"]) if c.body == "even_75"][:12]:
         scene, figures = draw(contact, site, None, contact.rng(0))
@@ -117,6 +106,7 @@ def test_a_tool_is_put_back_where_finite_elements_had_it(data: Path) -> None:
     assert seen >= 2
 
 
+@pytest.mark.slow
 def test_a_short_training_learns_and_its_weights_load_and_hold(data: Path, tmp_path: Path) -> None:
     card = train_contact(data, tmp_path, SETTINGS)
     weights = Weights.load(tmp_path / "contact_net.safetensors", "pressure")

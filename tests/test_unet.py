@@ -202,6 +202,7 @@ def test_a_run_that_was_stopped_goes_on_as_if_it_had_not_been(data: Path, run: P
         train_unet(data, tmp_path, QUICK.model_copy(update={"seed": 1}))
 
 
+@pytest.mark.slow
 def test_two_processes_learn_what_one_learns(data: Path, tmp_path: Path) -> None:
     settings = QUICK.model_copy(update={"dropout": 0.0, "epochs": 2})
     train_unet(data, tmp_path / "one", settings)

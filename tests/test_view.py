@@ -31,7 +31,7 @@ from stmpl_ros.view.skin import glb
 from stmpl_ros.view.snapshot import Gauge, Snapshot
 from stmpl_ros.view.tools import TOOLS, place_on, tool_from_bytes, tool_named
 from tests.bag_scene import tube, write_run
-from tests.touch_scenes import limb
+from tests.scenes import limb
 
 PATIENCE = 120.0  # s to wait for anything; only a failing test waits so long
 LAYOUT = Path(__file__).parents[1] / "stmpl_ros/foxglove/stmpl.json"
