@@ -40,12 +40,12 @@ class ContactNet:
 
     Args:
         layer: soft layer at rest.
-        near: neighbours of its vertices.
         weights: trained network; None: the one that comes with the package.
+        near: neighbours of its vertices; None: found here.
     """
 
-    def __init__(self, layer: SoftLayer, near: Surroundings, weights: Weights | None = None) -> None:
-        self.near = near
+    def __init__(self, layer: SoftLayer, weights: Weights | None = None, near: Surroundings | None = None) -> None:
+        self.near = near or Surroundings.of(layer)
         self.weights = weights or shipped("contact_net")
         self._shape = np.concatenate([self.near.curvature, self.near.slope], axis=1).astype(np.float32)
         self._constants = np.array([layer.tissue.poisson_ratio, 0.0], np.float32)

@@ -86,7 +86,7 @@ class Toucher:
         self.near = near or Surroundings.of(layer)
         self.hole = HOLE * layer.edge_length
         self.tools = Tools(margin_on(layer)) if tools is None else tools
-        self.columns, self.net = Columns(layer), ContactNet(layer, self.near)
+        self.columns, self.net = Columns(layer), ContactNet(layer, near=self.near)
         self._modulus = layer.tissue.youngs_modulus
         self._confined = layer.tissue.confined_modulus / self._modulus
         self._thickest = float(layer.thickness.max())

@@ -267,7 +267,7 @@ def score(subset: Subset, weights: Weights) -> Scores:
     for one in pressed(subset):
         layer, squeeze = one.sample.layer, one.squeeze
         if net is None or last is not layer:
-            net, last = ContactNet(layer, Surroundings.of(layer), weights), layer
+            net, last = ContactNet(layer, weights), layer
         held = net.hold(squeeze.vertices, squeeze.pressure, squeeze.strain)
         area, true = layer.vertex_areas, one.sample.load.values / layer.tissue.youngs_modulus
         ours = np.zeros_like(true)

@@ -5,7 +5,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from stmpl_core import ToolMesh
+from stmpl_core import Tool
 from stmpl_core.columns import DEEPEST, Columns, Squeeze
 from stmpl_core.methods.winkler import column_pressure
 from stmpl_core.sdf import SignedDistance
@@ -15,7 +15,7 @@ LIMB, PLATE = limb(), plate()
 MARGIN = 5e-3  # m
 
 
-def field_of(mesh: ToolMesh) -> SignedDistance:
+def field_of(mesh: Tool) -> SignedDistance:
     return SignedDistance.of(mesh, margin=MARGIN)
 
 

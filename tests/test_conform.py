@@ -5,20 +5,18 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from stmpl_core import Contact, ToolMesh
+from stmpl_core import Contact, Tool
 from stmpl_core.conform import conform
 from stmpl_core.methods import Linear, MomentNet, Winkler
 from stmpl_core.methods.base import Method
 from stmpl_core.moments import Surroundings
-from stmpl_core.sdf import SignedDistance
 from stmpl_core.simulator import ENTERED, Simulator
-from stmpl_core.touch import Toucher
+from stmpl_core.toucher import Toucher
 from tests.scenes import LENGTH, RADIUS, at, ball, capsule, limb, placed, press, punch, turn
 
 LIMB = limb(4e-3)
 THICKNESS = float(LIMB.thickness[0])
 BALL, PUNCH, TIP = ball(), punch(), capsule(0.02, 0.008)
-FIELDS = {mesh: SignedDistance.of(mesh, margin=5e-3) for mesh in (BALL, PUNCH, TIP)}
 MIDDLE, LYING = LENGTH / 2, turn((0, 1, 0), np.pi / 2)
 SCENES = {
     "ball": [press(BALL, at(RADIUS + 0.009, 0.001, MIDDLE), None)],
@@ -48,9 +46,9 @@ def near() -> Surroundings:
     return Surroundings.of(LIMB)
 
 
-def seen_by(mesh: ToolMesh, pose: np.ndarray, points: np.ndarray) -> np.ndarray:
+def seen_by(toucher: Toucher, tool: Tool, pose: np.ndarray, points: np.ndarray) -> np.ndarray:
     """Signed distance of points to a placed tool [m]."""
-    return FIELDS[mesh].distance((points - pose[:3, 3]) @ pose[:3, :3])
+    return toucher.tools.field(tool).distance((points - pose[:3, 3]) @ pose[:3, :3])
 
 
 @pytest.mark.parametrize("name", SCENES)
@@ -58,11 +56,12 @@ def test_no_vertex_is_inside_a_tool_whatever_the_method(sim: Simulator, toucher:
     contacts = SCENES[name]
     answer = sim.step(contacts)
     moved = LIMB.vertices + answer.displacement
-    for contact, touch in zip(contacts, toucher.touch_all(contacts, [FIELDS[c.mesh] for c in contacts]), strict=True):
-        away = seen_by(contact.mesh, touch.pose_body_from_tool, moved)
+    for contact, touch in zip(contacts, toucher.touch_all(contacts), strict=True):
+        away = seen_by(toucher, contact.tool, touch.pose_body_from_tool, moved)
         assert away.min() > -ENTERED * THICKNESS, f"{-1e3 * away.min():.2f} mm inside {contact.name}"
-        v = touch.squeeze.vertices
-        bears = v[(touch.squeeze.depth > 0) & (touch.load.values[v] > 0.3 * touch.load.values.max())]
+        assert touch.pressed and touch.pressure is not None
+        v, depth = touch.pressed.squeeze.vertices, touch.pressed.squeeze.depth
+        bears = v[(depth > 0) & (touch.pressure[v] > 0.3 * touch.pressure.max())]
         assert len(bears) > 5
         np.testing.assert_allclose(away[bears], 0, atol=ENTERED * THICKNESS)
     figures = answer.trust.figures
@@ -90,14 +89,13 @@ def test_skin_under_a_ball_by_pose_has_come_along_with_it(sim: Simulator) -> Non
 def test_without_a_load_nothing_is_moved(near: Surroundings, toucher: Toucher) -> None:
     apart = press(BALL, at(RADIUS + 0.02, 0, MIDDLE), None)
     some = np.random.default_rng(0).normal(scale=1e-3, size=LIMB.vertices.shape)
-    fitted = conform(near, some, [toucher.touch(apart, FIELDS[BALL])], [FIELDS[BALL]])
+    fitted = conform(LIMB, near, some, [toucher.touch(apart)])
     assert fitted.displacement.tobytes() == some.tobytes()
     assert fitted.corrected == fitted.entered == 0
 
 
 def _fitted(near: Surroundings, toucher: Toucher, contact: Contact, answer: np.ndarray) -> tuple[np.ndarray, float]:
-    field = FIELDS[contact.mesh]
-    fitted = conform(near, answer, [toucher.touch(contact, field)], [field])
+    fitted = conform(toucher.layer, near, answer, [toucher.touch(contact)])
     return fitted.displacement, fitted.corrected
 
 
@@ -126,7 +124,7 @@ def test_the_correction_ends_with_the_layers_response_and_turns_with_the_scene(t
 @pytest.mark.parametrize(
     "mesh, pose", [(BALL, at(RADIUS + 0.0095, 0, MIDDLE)), (PUNCH, SCENES["punch"][0].pose_body_from_tool)]
 )
-def test_skin_moves_continuously_while_a_tool_slides(sim: Simulator, mesh: ToolMesh, pose: np.ndarray) -> None:
+def test_skin_moves_continuously_while_a_tool_slides(sim: Simulator, mesh: Tool, pose: np.ndarray) -> None:
     """No vertex jumps where it comes under the tool: a quarter of the slide, about a quarter of the motion."""
 
     def furthest(step: float) -> float:

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from stmpl_core import ToolMesh
+from stmpl_core import Tool
 from stmpl_core.errors import InvalidInput, MeshError
 from stmpl_core.sdf import SignedDistance
 from tests.scenes import ball, box, capsule, scaled, tool
@@ -100,14 +100,14 @@ def test_an_open_shell_still_has_an_inside() -> None:
 
 def test_a_mesh_inside_out_is_turned_and_says_so() -> None:
     mesh = ball()
-    field = SignedDistance.of(ToolMesh.of(mesh.vertices, mesh.faces[:, ::-1]))
+    field = SignedDistance.of(Tool("probe", mesh.vertices, mesh.faces[:, ::-1]))
     assert field.flipped and field.watertight
     assert field.distance([[0, 0, 0]])[0] < 0
 
 
 def test_unmerged_vertices_are_no_holes() -> None:
     mesh = ball(subdivisions=2)
-    soup = ToolMesh.of(mesh.vertices[mesh.faces].reshape(-1, 3), np.arange(3 * len(mesh.faces)).reshape(-1, 3))
+    soup = Tool("probe", mesh.vertices[mesh.faces].reshape(-1, 3), np.arange(3 * len(mesh.faces)).reshape(-1, 3))
     assert SignedDistance.of(soup, spacing=1e-3).watertight
 
 
@@ -118,11 +118,11 @@ def test_what_cannot_be_a_tool_is_refused_with_a_reason() -> None:
     with pytest.raises(MeshError, match="metres"):
         SignedDistance.of(scaled(mesh, 1e-3))
     with pytest.raises(MeshError, match="no surface"):
-        SignedDistance.of(ToolMesh.of(mesh.vertices * [1, 0, 0], mesh.faces))
+        SignedDistance.of(Tool("probe", mesh.vertices * [1, 0, 0], mesh.faces))
     with pytest.raises(MeshError, match="F > 0"):
-        ToolMesh.of(mesh.vertices, np.empty((0, 3), int))
+        Tool("probe", mesh.vertices, np.empty((0, 3), int))
     with pytest.raises(InvalidInput, match="not finite"):
-        ToolMesh.of(np.where(mesh.vertices == mesh.vertices[0, 0], np.nan, mesh.vertices), mesh.faces)
+        Tool("probe", np.where(mesh.vertices == mesh.vertices[0, 0], np.nan, mesh.vertices), mesh.faces)
     with pytest.raises(InvalidInput, match="nodes"):
         SignedDistance.of(mesh, spacing=1e-5)
     with pytest.raises(InvalidInput, match="not finite"):

@@ -7,9 +7,11 @@ from benchmarks.haptic_device import QUIET, Device, Felt, Hand, Spot, arm_spot, 
 from benchmarks.haptics import HARD, forces_along, paths, settings_for, slide, worst_jump
 from stmpl_core import Contact
 from stmpl_core.errors import InvalidInput
-from stmpl_core.haptics import DeviceLoop, LocalContact, LoopSettings, local_contact
+from stmpl_core.haptics import DeviceLoop, LoopSettings
+from stmpl_core.local_contact import LocalContact, local_contact
 from stmpl_core.sdf import SignedDistance
-from stmpl_core.touch import APART, Toucher
+from stmpl_core.touch import APART
+from stmpl_core.toucher import Toucher
 from tests.scenes import at, contact_of, placed, plate, tool, turn
 
 DEEP = 2e-3  # m
@@ -27,18 +29,18 @@ def model(spot: Spot) -> LocalContact:
 
 
 @pytest.fixture(scope="module")
-def block() -> tuple[Toucher, Contact, SignedDistance]:
+def block() -> tuple[Toucher, Contact]:
     """A blunt box on a plate, off its own centre and tilted: every rotation matters."""
     import trimesh
 
-    mesh = tool(trimesh.creation.box((0.03, 0.024, 0.02), transform=at(0.004, 0.002, 0.003)))
-    pose = at(0.001, 0.0007, 0.005) @ turn((0.3, 1, 0.2), 0.04)
-    field = SignedDistance.of(mesh, rounding=2e-3)
-    return Toucher(plate()), Contact("block", mesh, pose), field
+    blunt = tool(trimesh.creation.box((0.03, 0.024, 0.02), transform=at(0.004, 0.002, 0.003)), name="block")
+    pose, toucher = at(0.001, 0.0007, 0.005) @ turn((0.3, 1, 0.2), 0.04), Toucher(plate())
+    toucher.tools.add(blunt, SignedDistance.of(blunt, rounding=2e-3))
+    return toucher, Contact(blunt, pose)
 
 
 @pytest.fixture(scope="module")
-def tilted(block: tuple[Toucher, Contact, SignedDistance]) -> LocalContact:
+def tilted(block: tuple[Toucher, Contact]) -> LocalContact:
     return local_contact(*block)
 
 
@@ -64,17 +66,17 @@ def test_the_model_is_the_reaction_at_its_own_pose(spot: Spot, model: LocalConta
 
 @pytest.mark.parametrize("seed", range(3))
 def test_the_model_holds_where_it_says(
-    block: tuple[Toucher, Contact, SignedDistance], tilted: LocalContact, seed: int
+    block: tuple[Toucher, Contact], tilted: LocalContact, seed: int
 ) -> None:
     """Six directions at the rim were measured; others are found as good, but for what lies between the axes."""
-    toucher, contact, field = block
+    toucher, contact = block
     assert tilted.valid_m > 5e-5 and tilted.valid_rad > 2e-3
     lever, rng = 0.03, np.random.default_rng(seed)
     for scale in (np.array([1, 1, 1, 0, 0, 0]), np.array([0, 0, 0, 1, 1, 1])):
         twist = scale * rng.normal(size=6)
         twist *= 0.99 * (tilted.valid_m if scale[0] else tilted.valid_rad) / np.linalg.norm(twist)
         pose = turned(contact.pose_body_from_tool, twist)
-        truth = toucher.touch(contact_of(contact.mesh, pose, name="block"), field).wrench
+        truth = toucher.touch(contact_of(contact.tool, pose, name="block")).wrench
         rendered = tilted.wrench_at(pose)
         assert rendered.inside
         assert off(truth, rendered.wrench, lever) < 0.15
@@ -83,35 +85,36 @@ def test_the_model_holds_where_it_says(
 
 
 def test_the_neighbourhood_is_not_far_too_small(
-    block: tuple[Toucher, Contact, SignedDistance], tilted: LocalContact
+    block: tuple[Toucher, Contact], tilted: LocalContact
 ) -> None:
-    toucher, contact, field = block
+    toucher, contact = block
     worst = 0.0
     for axis in np.eye(6)[:3]:
         for sign in (1, -1):
             pose = turned(contact.pose_body_from_tool, 3 * sign * tilted.valid_m * axis)
-            truth = toucher.touch(contact_of(contact.mesh, pose, name="block"), field).wrench
+            truth = toucher.touch(contact_of(contact.tool, pose, name="block")).wrench
             worst = max(worst, off(truth, tilted.wrench + 3 * sign * tilted.valid_m * tilted.stiffness @ axis, 0.03))
     assert worst > 0.1
 
 
 def test_turning_a_ball_about_its_centre_changes_nothing(spot: Spot) -> None:
-    contact = contact_of(spot.mesh, spot.pose(spot.centre(-DEEP)), name="ball")
-    model = local_contact(spot.toucher, contact, spot.field)
+    contact = contact_of(spot.tool, spot.pose(spot.centre(-DEEP)), name="ball")
+    model = local_contact(spot.toucher, contact)
     assert np.linalg.norm(model.stiffness[:3, 3:]) < 0.02 * np.linalg.norm(model.wrench[:3])
-    plain = local_contact(spot.toucher, contact, spot.field, rotations=False)
+    plain = local_contact(spot.toucher, contact, rotations=False)
     np.testing.assert_array_equal(plain.stiffness[:, :3], model.stiffness[:, :3])
     assert plain.valid_rad == 0 and plain.trust.figures["evaluations"] < model.trust.figures["evaluations"]
 
 
 def test_turning_the_scene_turns_the_model(
-    block: tuple[Toucher, Contact, SignedDistance], tilted: LocalContact
+    block: tuple[Toucher, Contact], tilted: LocalContact
 ) -> None:
-    toucher, contact, field = block
+    toucher, contact = block
     scene = turn((0.3, -0.5, 0.8), 1.1, (0.4, -0.2, 0.9))
     rotation = np.kron(np.eye(2), scene[:3, :3])
-    moved = contact_of(contact.mesh, scene @ contact.pose_body_from_tool, name="block")
-    after = local_contact(Toucher(placed(toucher.layer, scene)), moved, field)
+    moved, there = Contact(contact.tool, scene @ contact.pose_body_from_tool), Toucher(placed(toucher.layer, scene))
+    there.tools.add(contact.tool, toucher.tools.field(contact.tool))
+    after = local_contact(there, moved)
     np.testing.assert_allclose(after.wrench, rotation @ tilted.wrench, atol=1e-6 * np.linalg.norm(tilted.wrench[:3]))
     size = np.abs(tilted.stiffness[:3, :3]).max()
     np.testing.assert_allclose(after.stiffness[:3, :3], (rotation @ tilted.stiffness @ rotation.T)[:3, :3],
@@ -140,7 +143,7 @@ def test_bad_input_is_refused_or_gives_no_force(spot: Spot, model: LocalContact)
     with pytest.raises(InvalidInput, match="pose holds"):
         model.wrench_at(np.full((4, 4), np.nan))
     with pytest.raises(InvalidInput, match="step is 0"):
-        local_contact(spot.toucher, contact_of(spot.mesh, spot.pose(spot.place), name="ball"), spot.field, step=0.0)
+        local_contact(spot.toucher, contact_of(spot.tool, spot.pose(spot.place), name="ball"), step=0.0)
     with pytest.raises(InvalidInput, match="coupling_stiffness is -1"):
         LoopSettings(coupling_stiffness=-1)
     with pytest.raises(InvalidInput, match="delay_steps is 300"):

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from stmpl_core import ToolMesh
+from stmpl_core import Tool
 from stmpl_core.decimation import field_spacing
 from stmpl_core.errors import InvalidInput, MeshError
 from stmpl_core.fields import fields_of
@@ -81,7 +81,7 @@ def test_faces_of_three_places_in_a_row_stay_because_they_close_seams() -> None:
     tetrahedron = np.array([[0, 0, 0], [0.02, 0, 0], [0, 0.02, 0], [0, 0, 0.02], [0.01, 0, 0]])
     faces = np.array([[0, 2, 1], [0, 4, 3], [4, 1, 3], [1, 2, 3], [0, 3, 2], [0, 1, 4]])  # the last has no area
     mesh = mended(tetrahedron, faces)
-    assert mesh.said == () and SignedDistance.of(ToolMesh(mesh.vertices, mesh.faces), spacing=1e-3).watertight
+    assert mesh.said == () and SignedDistance.of(Tool("probe", mesh.vertices, mesh.faces), spacing=1e-3).watertight
 
 
 def test_a_wall_between_two_boxes_is_no_surface() -> None:
@@ -192,9 +192,9 @@ def test_random_damage_is_mended_or_refused(name: str) -> None:
 
 
 def test_fields_of_many_tools_come_in_order_and_alike_ones_once() -> None:
-    meshes = [ToolMesh.of(SHAPES[name].vertices, SHAPES[name].faces) for name in SHAPES]
-    bad = ToolMesh(1e3 * meshes[0].vertices, meshes[0].faces)
-    again = ToolMesh(meshes[0].vertices.copy(), meshes[0].faces)
+    meshes = [Tool("probe", SHAPES[name].vertices, SHAPES[name].faces) for name in SHAPES]
+    bad = Tool("probe", 1e3 * meshes[0].vertices, meshes[0].faces)
+    again = Tool("probe", meshes[0].vertices.copy(), meshes[0].faces)
     first, *others, refused, last = fields_of([*meshes, bad, again], spacing=2e-3)
     assert first is last and isinstance(refused, MeshError)
     for field, mesh in zip([first, *others], meshes, strict=True):
@@ -205,8 +205,8 @@ def test_fields_of_many_tools_come_in_order_and_alike_ones_once() -> None:
 
 def test_fields_built_in_processes_are_those_built_here(caplog: pytest.LogCaptureFixture) -> None:
     clean = SHAPES["torus"]
-    meshes = [ToolMesh.of((1 + 0.1 * k) * clean.vertices, clean.faces) for k in range(7)]
-    meshes.append(ToolMesh(clean.vertices, clean.faces[3:]))
+    meshes = [Tool("probe", (1 + 0.1 * k) * clean.vertices, clean.faces) for k in range(7)]
+    meshes.append(Tool("probe", clean.vertices, clean.faces[3:]))
     fields = fields_of(meshes, spacing=2e-3, workers=2)
     for field, mesh in zip(fields, meshes, strict=True):
         assert isinstance(field, SignedDistance)

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from fem_tools import PatchFem
-from stmpl_core import Load, SoftLayer
+from stmpl_core import Load, Skin, SoftLayer
 from stmpl_core.errors import InvalidInput, NotPrepared
-from stmpl_core.methods import Linear
+from stmpl_core.methods import Linear, MomentNet
 from stmpl_core.metrics import score
 from stmpl_core.moments import FINER, NEAR, REACH, SPREADS, STEPS, Surroundings, response_table, ring_table
 from tests import scenes
@@ -132,8 +132,10 @@ def test_what_was_made_of_a_layer_goes_with_it() -> None:
     layer = limb(8e-3, T)
     near = Surroundings.of(layer)
     assert Surroundings.of(layer) is near
-    again = pickle.loads(pickle.dumps(near))
-    assert Surroundings.of(again.layer) is not near and np.array_equal(again.layer.vertices, layer.vertices)
+    assert not [name for name, value in vars(layer).items() if value is near], "nothing is planted on a layer"
+    skin = pickle.loads(pickle.dumps(Skin.of(layer, MomentNet())))
+    assert skin.near is not near and np.array_equal(skin.layer.vertices, layer.vertices)
+    assert skin.method.solve(Load.zero(skin.layer)).trust.ok
     gone = weakref.ref(layer)
     del layer, near
     gc.collect()

@@ -17,7 +17,7 @@ import pytest
 import scipy
 
 from bags.replay import replay_run
-from stmpl_core import Contact, SoftLayer, Tissue, ToolMesh
+from stmpl_core import Contact, SoftLayer, Tissue, Tool
 from stmpl_core.methods import Linear, MomentNet
 from stmpl_core.simulator import Simulator
 from tests.scenes import LENGTH, RADIUS, at, ball, band, box, capsule, limb, punch, turn
@@ -97,22 +97,20 @@ def answers(known: Known) -> Iterator[tuple[np.ndarray, np.ndarray, dict[str, To
 
     Each case is answered by itself, in the file's order.
     """
-    tools = {name: ToolMesh.of(*shape) for name, shape in known.tools.items()}
+    tools = {name: Tool(name, *shape) for name, shape in known.tools.items()}
     simulators = []
     for skin, thickness in zip(SKINS, known.thicknesses, strict=True):
         tissue = Tissue(skin["youngs_modulus"], skin["poisson_ratio"])
         layer = SoftLayer(known.vertices, known.faces, thickness, tissue=tissue)
         simulators.append(Simulator(layer, METHODS[skin["method"]]()))
-        for mesh in tools.values():  # each field is built once
-            simulators[-1].keep_field(mesh, simulators[0].prepare_tool(mesh))
+        for tool in tools.values():  # each field is built once
+            simulators[-1].tools.add(tool, simulators[0].tools.field(tool))
     for case in known.cases:
-        answer = simulators[case.skin].step([Contact(name, tools[name], np.array(pose), wrench)
+        answer = simulators[case.skin].step([Contact(tools[name], np.array(pose), wrench)
                                              for name, pose in case.poses.items()
                                              for wrench in [case.wrenches[name]]])  # fmt: skip
-        figures = answer.trust.figures
-        touches = {name: Touched(status, answer.wrenches[name].tolist(), figures.get(f"{name}.depth_m", np.nan),
-                                 figures.get(f"{name}.force_error_n", np.nan))
-                   for name, status in answer.statuses.items()}  # fmt: skip
+        touches = {name: Touched(touch.status, touch.wrench.tolist(), touch.depth, touch.force_bound)
+                   for name, touch in answer.touches.items()}  # fmt: skip
         assert answer.pressure is not None
         yield answer.displacement, answer.pressure, touches
 

@@ -8,10 +8,11 @@ import pytest
 from fem_tools.indenter import IndenterFem
 from fem_tools.patch import PatchFem
 from fem_tools.press import Press
+from stmpl_core import Contact, SoftLayer
 from stmpl_core.errors import InvalidInput
 from stmpl_core.sdf import SignedDistance
 from stmpl_core.stiffness import fit_stiffness
-from stmpl_core.touch import Toucher
+from stmpl_core.toucher import Toucher
 from tests.scenes import LENGTH, RADIUS, at, ball, contact_of, limb, press
 
 HIDDEN = 3.7e3  # Pa
@@ -22,27 +23,34 @@ DEPTHS = np.array([0.5e-3, 1e-3, 1.5e-3, 2e-3, 3e-3, 4e-3])
 
 @pytest.fixture(scope="module")
 def toucher() -> Toucher:
-    return Toucher(LAYER)  # of 1 kPa
+    return toucher_on(LAYER)  # of 1 kPa
+
+
+def toucher_on(layer: SoftLayer) -> Toucher:
+    """With the very field that finite elements press with."""
+    toucher = Toucher(layer)
+    toucher.tools.add(BALL, FIELD)
+    return toucher
 
 
 @pytest.fixture(scope="module")
 def pressed() -> list[tuple[np.ndarray, np.ndarray]]:
     """Poses and wrenches of a ball that finite elements press into a limb of the hidden stiffness."""
     solver = IndenterFem(PatchFem(refine=1, layers=1, reach=4), step=0.1).prepare(LAYER.with_(youngs_modulus=HIDDEN))
-    tool = IndenterPress(FIELD, at(RADIUS + 0.02, 0, LENGTH / 2), np.array([-1.0, 0, 0]))
+    tool = Press(FIELD, at(RADIUS + 0.02, 0, LENGTH / 2), np.array([-1.0, 0, 0]))
     return [(a.tools[0].pose_body_from_tool, np.array(a.wrenches[0])) for a in solver.path([tool], DEPTHS)]
 
 
-def pushed(pose: np.ndarray, force: tuple[float, float, float]) -> Press:
-    return Press(press(BALL, pose, force), FIELD)
+def pushed(pose: np.ndarray, force: tuple[float, float, float]) -> Contact:
+    return press(BALL, pose, force)
 
 
-def presses(pressed, *, back: float = 0.0, noise: float = 0.0, times: int = 1) -> list[Press]:
+def presses(pressed, *, back: float = 0.0, noise: float = 0.0, times: int = 1) -> list[Contact]:
     """The presses as a robot reports them whose poses stand `back` [m] too far off, with noise on its forces."""
     generator, out = np.random.default_rng(0), []
     for pose, wrench in pressed * times:
         told = at(back, 0, 0) @ pose
-        out.append(Press(contact_of(BALL, told, wrench * (1 + noise * generator.normal())), FIELD))
+        out.append(contact_of(BALL, told, wrench * (1 + noise * generator.normal())))
     return out
 
 
@@ -70,7 +78,7 @@ def test_noise_and_a_few_wrong_forces_change_little(toucher, pressed):
 
 def test_the_answer_does_not_depend_on_the_stiffness_that_was_taken_before(toucher, pressed):
     given = presses(pressed, back=1e-3)
-    found, again = fit_stiffness(toucher, given), fit_stiffness(Toucher(LAYER.with_(youngs_modulus=5e4)), given)
+    found, again = fit_stiffness(toucher, given), fit_stiffness(toucher_on(LAYER.with_(youngs_modulus=5e4)), given)
     assert again.youngs_modulus == pytest.approx(found.youngs_modulus, rel=1e-3)
     assert again.relative_error == pytest.approx(found.relative_error, rel=0.01)
 
@@ -81,7 +89,7 @@ def test_too_few_presses_are_refused(toucher, pressed):
     idle = [pushed(pose, (0, 0, 0)) for pose, _ in pressed * 3]
     assert "0 of 18 instants pressed with a force" in fit_stiffness(toucher, idle).trust.why
     with pytest.raises(InvalidInput, match="has no wrench"):
-        fit_stiffness(toucher, [Press(contact_of(BALL, at(1, 0, 0)), FIELD)])
+        fit_stiffness(toucher, [contact_of(BALL, at(1, 0, 0))])
 
 
 def test_presses_of_one_depth_do_not_tell_stiffness_from_offset(toucher, pressed):
