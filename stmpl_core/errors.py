@@ -1,6 +1,15 @@
 """The error family: whatever stmpl refuses derives from StmplError, and says what, measured, allowed, what to try."""
 
 
+def sentence_of(error: Exception) -> str:
+    """What went wrong, in one sentence, without a library's dump of its validation (pydantic's ValidationError)."""
+    if not hasattr(error, "errors"):
+        return str(error)
+    found = [(".".join(map(str, e["loc"])), e["input"], e["msg"]) for e in error.errors()]  # type: ignore[attr-defined]
+    return "; ".join(f"{name or 'the input'} is {value!r}: {said.removeprefix('Value error, ')}"
+                     for name, value, said in found)  # fmt: skip
+
+
 class StmplError(Exception):
     """Root of every error that stmpl raises on purpose."""
 

@@ -14,6 +14,8 @@ from stmpl_core.arrays import Faces, PerVertex, Points, VertexVectors, finite
 from stmpl_core.errors import InvalidInput, MeshError
 
 MAX_EXTENT = 4.0  # m; a limb or a body is smaller, a mesh in millimetres is not
+MAX_THICKNESS = 0.1  # m; soft tissue on bone is thinner, a thickness in millimetres is not
+SOFTEST = 100.0  # Pa; no tissue is softer, a modulus in kilopascals is
 
 
 @dataclass(frozen=True)
@@ -35,6 +37,9 @@ class Tissue:
     def __post_init__(self) -> None:
         if not (np.isfinite(self.youngs_modulus) and self.youngs_modulus > 0):
             raise InvalidInput(f"youngs_modulus is {self.youngs_modulus} Pa; it must be finite and above 0.")
+        if self.youngs_modulus < SOFTEST:
+            raise InvalidInput(f"youngs_modulus is {self.youngs_modulus:g} Pa; at least {SOFTEST:g} Pa is accepted. Is "
+                               "it in kilopascals? Scale it by 1e3.")
         if not 0 <= self.poisson_ratio < 0.5:
             raise InvalidInput(f"poisson_ratio is {self.poisson_ratio}; allowed is 0 <= nu < 0.5 (try 0.499).")
         if not (np.isfinite(self.density) and self.density > 0):
@@ -86,6 +91,9 @@ class SoftLayer:
         spread = np.broadcast_to(finite("thickness", np.atleast_1d(thickness), (None,)), len(self.vertices)) \
             if np.size(thickness) == 1 else finite("thickness", thickness, (len(self.vertices),))
         self.thickness: PerVertex = np.array(spread)
+        if (thickest := float(self.thickness.max(initial=0.0))) > MAX_THICKNESS:
+            raise InvalidInput(f"thickness is {thickest:g} m; at most {MAX_THICKNESS:g} m is accepted. Is it in "
+                               "millimetres? Scale it by 1e-3.")
         if (self.thickness <= 0).any():
             worst = int(self.thickness.argmin())
             raise InvalidInput(f"thickness is {self.thickness[worst]:g} m at vertex {worst}; it must be above 0.")

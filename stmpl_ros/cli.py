@@ -3,8 +3,13 @@
 from __future__ import annotations
 
 import os
+import signal
 import sys
+import threading
+import time
 
+GRACE = 1.5  # s in which a verb must end after Ctrl-C or SIGTERM, whatever it is doing
+PATIENT = {"record": 30.0}  # s for verbs that have something to save
 VERBS = {  # verb: module of its function, what it does
     "demo": ("stmpl_ros.verbs", "node, simulated devices and recorder; then the run against FEM, with a report"),
     "node": ("stmpl_ros.verbs", "answer contacts with the displacement of the skin"),
@@ -26,8 +31,11 @@ VERBS = {  # verb: module of its function, what it does
 
 def main(arguments: list[str] | None = None) -> None:
     """Runs a verb; exits with its code, or with 1 and one sentence if it refuses."""
+    given = list(sys.argv[1:] if arguments is None else arguments)
+    if arguments is None:
+        _end_soon_after_a_signal(PATIENT.get(given[0] if given else "", GRACE))
     try:
-        code = _run(list(sys.argv[1:] if arguments is None else arguments))
+        code = _run(given)
         sys.stdout.flush()
     except KeyboardInterrupt:
         code = 130
@@ -50,7 +58,7 @@ def _run(given: list[str]) -> int:
 
     import tyro
 
-    from stmpl_core.errors import StmplError
+    from stmpl_core.errors import StmplError, sentence_of
 
     logging.basicConfig(level=logging.INFO, format="%(levelname)s %(name)s: %(message)s")
     module = import_module(VERBS[verb][0])
@@ -59,8 +67,28 @@ def _run(given: list[str]) -> int:
         module.ros_arguments[:], rest = rest[at:], rest[:at]
     try:
         return tyro.cli(getattr(module, verb), prog=f"stmpl {verb}", args=rest) or 0
-    except StmplError as error:
-        return _refuse(str(error))
+    except (StmplError, ValueError) as error:
+        if not isinstance(error, StmplError) and type(error).__name__ != "ValidationError":
+            raise
+        return _refuse(sentence_of(error))
+
+
+def _end_soon_after_a_signal(grace: float) -> None:
+    """Ends the process `grace` [s] after SIGINT or SIGTERM came, if it has not ended by itself.
+
+    Python's own handlers run between two steps of the main thread; a compiled call may keep it for longer.
+    """
+    told, tell = os.pipe()
+    os.set_blocking(tell, False)
+    signal.set_wakeup_fd(tell, warn_on_full_buffer=False)
+
+    def watch() -> None:
+        while (number := os.read(told, 1)[0]) not in (signal.SIGINT, signal.SIGTERM):
+            continue
+        time.sleep(grace)
+        os._exit(128 + number)
+
+    threading.Thread(target=watch, name="ending", daemon=True).start()
 
 
 def usage() -> str:

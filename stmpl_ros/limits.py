@@ -8,7 +8,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from ruamel.yaml import YAML, YAMLError
 
-from stmpl_core.errors import InvalidInput
+from stmpl_core.errors import InvalidInput, sentence_of
 from stmpl_core.touch import Answer
 
 ADVISORY = "advisory, not a safety function"
@@ -56,8 +56,7 @@ class Limits:
         except (OSError, UnicodeDecodeError, YAMLError) as error:
             raise InvalidInput(f"limits file {path}: {error}") from error
         except ValidationError as error:
-            said = "; ".join(f"{'.'.join(map(str, e['loc'])) or 'file'}: {e['msg']}" for e in error.errors())
-            raise InvalidInput(f"limits file {path}: {said}. See config/limits.yaml.") from error
+            raise InvalidInput(f"limits file {path}: {sentence_of(error)}. See config/limits.yaml.") from error
         if region not in file.regions:
             raise InvalidInput(f"limits file {path} has no region '{region}'; it has {', '.join(file.regions)}.")
         return cls(region, file.regions[region], file.warn_at)

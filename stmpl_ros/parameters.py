@@ -9,6 +9,7 @@ from typing import Literal
 from pydantic import BaseModel, ConfigDict, Field, field_validator
 from pydantic.config import JsonDict
 
+from stmpl_core.layer import MAX_THICKNESS, SOFTEST
 from stmpl_core.methods import Method, method
 
 ACCURACY = 2e-4  # m
@@ -96,6 +97,20 @@ class NodeConfig(BaseModel):
         json_schema_extra=ANY_TIME,
     )  # fmt: skip
     autostart: bool = Field(default=True, description="configure and activate without being asked")
+
+    @field_validator("thickness", mode="before")
+    @classmethod
+    def _in_metres(cls, value: float) -> float:
+        if isinstance(value, (int, float)) and value > MAX_THICKNESS:
+            raise ValueError(f"at most {MAX_THICKNESS:g} m is accepted. Is it in millimetres? Scale it by 1e-3")
+        return value
+
+    @field_validator("youngs_modulus", mode="before")
+    @classmethod
+    def _in_pascals(cls, value: float) -> float:
+        if isinstance(value, (int, float)) and 0 < value < SOFTEST:
+            raise ValueError(f"at least {SOFTEST:g} Pa is accepted. Is it in kilopascals? Scale it by 1e3")
+        return value
 
     @field_validator("phenotype")
     @classmethod

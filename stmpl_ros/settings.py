@@ -13,7 +13,7 @@ from rclpy.exceptions import InvalidParameterTypeException, InvalidParameterValu
 from rclpy.lifecycle import LifecycleNode
 from rclpy.parameter import Parameter
 
-from stmpl_core.errors import InvalidInput
+from stmpl_core.errors import InvalidInput, sentence_of
 from stmpl_ros.parameters import ANY_TIME, CONFIGURING, NodeConfig
 
 WHEN = {
@@ -94,8 +94,7 @@ def checked(values: dict[str, Any]) -> NodeConfig:
     try:
         return NodeConfig(**values)
     except ValidationError as error:
-        said = [f"{'.'.join(map(str, e['loc']))} is {e['input']!r}: {e['msg']}" for e in error.errors()]
-        raise InvalidInput("; ".join(said)) from error
+        raise InvalidInput(sentence_of(error)) from error
 
 
 def described(field: FieldInfo) -> ParameterDescriptor:
