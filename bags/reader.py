@@ -27,12 +27,11 @@ _OF_ROBOT = re.compile(r"(?:(.*?)/)?(?:skin/\w+|contact_mesh|tools/[^/]+/\w+)") 
 
 
 class Recorded(NamedTuple):
-    """One message of a bag: topic, decoded message, and when it was received and published [ns]."""
+    """One message of a bag: topic, decoded message, and when it was received [ns]."""
 
     topic: str
     message: Any
     log_time_ns: int
-    publish_time_ns: int
 
 
 class Raw(NamedTuple):
@@ -97,7 +96,7 @@ class Bag:
             BagError: a schema is missing or cannot be parsed.
         """
         for topic, record in self._walk(wanted or (lambda _: True)):
-            yield Recorded(topic, self.decode(record), record.log_time, record.publish_time)
+            yield Recorded(topic, self.decode(record), record.log_time)
 
     def raw(self, wanted: Callable[[str], bool]) -> Iterator[Raw]:
         """Yields the messages of the topics that `wanted` accepts in the order of the file, undecoded."""
