@@ -9,7 +9,7 @@ from typing import Any, Self
 from mcap.records import Message
 
 from bags.messages import Frame, contact_from, frame_from, stamp_ns
-from bags.reader import DISPLACEMENT, Bag, tool_topic
+from bags.reader import DISPLACEMENT, Bag, ends, tool_topic
 from bags.records import Place
 from stmpl_core.contact import Contact
 from stmpl_core.errors import BagError, FrameError
@@ -51,7 +51,7 @@ class Run(Bag):
             self.received[stamp] = max(self.received.get(stamp, 0), record.log_time)
             if contact[1] == "pose":
                 self.pose_stamps.add(stamp)
-        elif topic.endswith(DISPLACEMENT):
+        elif ends(topic, DISPLACEMENT):
             if topic != self._answering:
                 self._answering = self.find_topic(DISPLACEMENT)
             if self._on_answer:
