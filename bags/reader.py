@@ -28,12 +28,11 @@ _OF_ROBOT = re.compile(r"(?:(.*?)/)?(?:skin/\w+|contact_mesh|tools/[^/]+/\w+)") 
 
 
 class Recorded(NamedTuple):
-    """One message of a bag: topic, decoded message, and when it was received and published [ns]."""
+    """One message of a bag: topic, decoded message, and when it was received [ns]."""
 
     topic: str
     message: Any
     log_time_ns: int
-    publish_time_ns: int
 
 
 class Raw(NamedTuple):
@@ -98,7 +97,7 @@ class Bag:
             BagError: a schema is missing or cannot be parsed.
         """
         for topic, record in self._walk(wanted or (lambda _: True)):
-            yield Recorded(topic, self.decode(record), record.log_time, record.publish_time)
+            yield Recorded(topic, self.decode(record), record.log_time)
 
     def raw(self, wanted: Callable[[str], bool]) -> Iterator[Raw]:
         """Yields the messages of the topics that `wanted` accepts in the order of the file, undecoded."""
@@ -129,7 +128,7 @@ class Bag:
     def find_topic(self, ending: str) -> str:
         """The one topic whose name ends with `ending`, whatever its namespace. Raises BagError."""
         names = {channel.topic for channel in self._channels.values() if self._is_meant(channel.topic)}
-        found = [name for name in names if _ends(name, ending)]
+        found = [name for name in names if ends(name, ending)]
         if len(found) > 1:
             raise BagError(f"{self.file} holds {len(found)} robots, of the namespaces {', '.join(self.namespaces)}. "
                            "Name one of them with --namespace.")  # fmt: skip
@@ -227,12 +226,12 @@ class Bag:
 
     def see(self, topic: str, record: Message, place: Place) -> None:
         """Called for each message while the file is looked over; keeps the places of the large ones."""
-        if _ends(topic, DISPLACEMENT) or _ends(topic, TOPOLOGY) or _ends(topic, MESH):
+        if ends(topic, DISPLACEMENT) or ends(topic, TOPOLOGY) or ends(topic, MESH):
             self._places.setdefault(topic, []).append(place)
 
     def _told(self, ending: str) -> list[str]:
         """Topics with messages whose names end with `ending`."""
-        return [topic for topic in self._places if _ends(topic, ending)]
+        return [topic for topic in self._places if ends(topic, ending)]
 
     def _is_meant(self, topic: str) -> bool:
         """The topic is of the robot that is meant, or of none."""
@@ -316,5 +315,6 @@ def namespace_of(topic: str) -> str | None:
     return found and (found[1] or "/")
 
 
-def _ends(topic: str, ending: str) -> bool:
+def ends(topic: str, ending: str) -> bool:
+    """The topic is `ending`, in whatever namespace."""
     return topic == ending or topic.endswith("/" + ending)

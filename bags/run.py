@@ -9,7 +9,7 @@ from typing import Any, Self
 from mcap.records import Message
 
 from bags.frame import Frame
-from bags.reader import DISPLACEMENT, Bag, tool_topic
+from bags.reader import DISPLACEMENT, Bag, ends, tool_topic
 from bags.records import Place
 from bags.wire import contact_from, frame_from, stamp_ns
 from stmpl_core.contact import Contact
@@ -52,7 +52,7 @@ class Run(Bag):
             self.received[stamp] = max(self.received.get(stamp, 0), record.log_time)
             if contact[1] == "pose":
                 self.pose_stamps.add(stamp)
-        elif topic.endswith(DISPLACEMENT):
+        elif ends(topic, DISPLACEMENT):
             if topic != self._answering:
                 self._answering = self.find_topic(DISPLACEMENT)
             if self._on_answer:

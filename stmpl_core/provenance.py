@@ -46,7 +46,8 @@ def processor() -> str:
 
     features = binding.get_host_cpu_features()
     width = next((f"{bits} bit" for name, bits in WIDTHS if features.get(name)), "")
-    return ", ".join(filter(None, (_told("vendor_id"), _model(), binding.get_host_cpu_name(), width)))
+    compiled_for = os.environ.get("NUMBA_CPU_NAME") or binding.get_host_cpu_name()
+    return ", ".join(filter(None, (_told("vendor_id"), _model(), compiled_for, width)))
 
 
 def machine() -> str:
