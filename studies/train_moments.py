@@ -76,11 +76,11 @@ def draw_points(data: Dataset, settings: MomentTraining, on_progress: OnProgress
     total, done = sum(map(len, subsets)), 0
     rows = np.empty((total * settings.points, POINT.size), np.float32)
     motion, weight = np.empty((len(rows), 3), np.float32), np.empty(len(rows), np.float32)
-    end, near = 0, None
+    end, near, last = 0, None, None
     for subset in subsets:
         for sample in subset:
-            if near is None or sample.layer is not near.layer:
-                near = Surroundings(sample.layer)
+            if near is None or sample.layer is not last:
+                near, last = Surroundings(sample.layer), sample.layer
             row, moved, scale = _points(near, sample.layer, sample.load, sample.displacement, settings.points, rng)
             here = slice(end, end := end + len(row))
             rows[here], motion[here], weight[here] = row, moved, scale

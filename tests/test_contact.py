@@ -149,7 +149,8 @@ def test_what_a_wrench_finds_does_not_depend_on_how_far_off_the_stated_pose_is(
 def test_force_by_pose_is_what_the_pressure_sums_to_and_torque_is_about_the_tools_origin(toucher: Toucher) -> None:
     pose = on_limb()
     touch = felt(toucher, BALL, pose, None)
-    forces = touch.load.forces_on(LIMB)
+    assert touch.pressure is not None
+    forces = Load.pressure(touch.pressure).forces_on(LIMB)
     np.testing.assert_allclose(touch.wrench[:3], forces.sum(axis=0), atol=1e-12)
     torque = np.cross(LIMB.vertices - pose[:3, 3], forces).sum(axis=0)
     np.testing.assert_allclose(touch.wrench[3:], torque, atol=1e-12)
@@ -171,7 +172,7 @@ def test_stiffer_tissue_presses_as_many_times_harder_and_moves_alike() -> None:
     np.testing.assert_allclose(seven.pressure, 7 * np.asarray(one.pressure), rtol=1e-9)
     np.testing.assert_allclose(seven.displacement, one.displacement, atol=1e-9)
     touches = [felt(Toucher(layer), BALL, pose, (0, 0, -f)) for layer, f in ((soft, 0.1), (stiff, 0.7))]
-    assert touch_of(touches[1]).depth == pytest.approx(touch_of(touches[0]).depth, rel=1e-6)
+    assert touches[1].depth == pytest.approx(touches[0].depth, rel=1e-6)
 
 
 def test_a_scene_twice_as_large_presses_four_times_as_hard(flat_toucher: Toucher) -> None:
