@@ -43,7 +43,8 @@ class Indentation:
         wrenches: force [N] and torque about the tool's origin [N m] of each tool *on the body*, in the layer's axes.
         depth: way of the tools beyond first touch [m].
         tools: tools at the poses where they stand.
-        trust: limits of what may be believed of it; `figures` hold the entered depth at nodes and faces, min det F, stability.
+        trust: limits of what may be believed of it; `figures` hold the entered depth at nodes and faces, min det F,
+            stability.
     """
 
     displacement: VertexVectors

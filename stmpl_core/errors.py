@@ -1,5 +1,7 @@
 """The error family: whatever stmpl refuses derives from StmplError, and says what, measured, allowed, what to try."""
 
+from typing import Any
+
 
 class StmplError(Exception):
     """Root of every error that stmpl raises on purpose."""
@@ -23,3 +25,10 @@ class NotPrepared(StmplError, RuntimeError):
 
 class BagError(StmplError):
     """A recording that cannot be read, is truncated, or lacks what is needed to repeat it."""
+
+
+def misfits(error: Any) -> str:
+    """What a pydantic ValidationError found, in one line: each field, its value and what is allowed."""
+    found = [(".".join(map(str, e["loc"])) or "it", e) for e in error.errors()]
+    return "; ".join(f"{name} is missing" if e["type"] == "missing" else f"{name} is {e['input']!r:.60}: {e['msg']}"
+                     for name, e in found)  # fmt: skip
