@@ -222,10 +222,14 @@ def stability(
 
 
 def _critical_load(out: Path, as_json: bool) -> int:
-    from studies.critical_load import draw
-    from studies.show import critical_load_table, critical_loads_with_progress
+    from studies.critical_load import critical_loads, draw, presses
+    from studies.show import critical_load_table
 
-    rows = critical_loads_with_progress(quiet=as_json)
+    rows, total = [], len(presses())
+    with steps_bar("presses of a flat layer", quiet=as_json) as show:
+        for row in critical_loads():
+            rows.append(row)
+            show(len(rows), total, "")
     picture = draw(rows, out)
     figures = {"picture": str(picture), "rows": [vars(row) for row in rows]}
     print_figures(figures if as_json else critical_load_table(rows, picture))
