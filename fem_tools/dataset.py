@@ -55,7 +55,7 @@ class Record:
         loaded: numbers of the vertices that carry load, (K,) int32.
         values: p / E [-], or nodal force / E [m2], (K,) float32.
         moved: numbers of the vertices that move, (N,) int32.
-        steps: their displacement in units of QUANTUM, (N, 3) int32.
+        steps: displacement of these in units of QUANTUM, (N, 3) int32.
         figures: numbers in the order of FIGURES.
     """
 
@@ -238,7 +238,10 @@ class Dataset:
         path = Path(path)
         if not (path / "manifest.json").is_file():
             raise InvalidInput(f"{path} holds no manifest.json: it is no data set. Make one with stmpl generate.")
-        manifest = json.loads((path / "manifest.json").read_text())
+        try:
+            manifest = json.loads((path / "manifest.json").read_text())
+        except ValueError as error:
+            raise InvalidInput(f"{path}/manifest.json is broken: {error}.") from error
         if manifest.get("format") != FORMAT:
             raise InvalidInput(f"{path} has format {manifest.get('format')}; this version reads {FORMAT}.")
         if not manifest.get("complete"):

@@ -40,7 +40,7 @@ class FewSteps:
 
     Args:
         steps: number of Newton steps.
-        start: the method whose answer is started from; None: start from the answer before, at first from rest.
+        start: method whose answer is started from; None: start from the answer before, at first from rest.
         reach: width of the patch beyond the load [thicknesses].
 
     Raises:

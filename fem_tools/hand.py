@@ -35,7 +35,7 @@ class Hand:
         weights: skinning weights of the palm and then the fifteen finger bones, thumb first, knuckle to tip, (V, 16)
             [-].
         joints: points about which the finger bones turn, (15, 3) [m].
-        axes: about which it closes, (15, 3) [-].
+        axes: axes about which they close, (15, 3) [-].
     """
 
     vertices: Points
@@ -94,7 +94,7 @@ class Hand:
             layer: soft layer that is held.
             pose_body_from_hand: pose from which the hand comes along its z, (4, 4).
             depth: depth of palm and finger bones below the skin at rest [m].
-            loose: the share of its way that each finger stays short of closing, (5,) [-].
+            loose: share of its way that each finger stays short of closing, (5,) [-].
         """
         tree, angles, pose = KDTree(layer.vertices), np.zeros(15), pose_body_from_hand.copy()
         angles[::3] = OPEN

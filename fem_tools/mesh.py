@@ -119,8 +119,8 @@ class WedgeMesh:
         outer, inner: end points of the columns at the triangle corners, (N, 3) [m].
         triangles: corners of each triangle, (T, 3), numbers of `outer`.
         columns: columns of each triangle, (T, n).
-        edges: the edges whose middles carry the columns N, N + 1, ... (quadratic only), (E, 2).
-        n_columns: all columns.
+        edges: edges whose middles carry the columns N, N + 1, ... (quadratic only), (E, 2).
+        n_columns: number of columns.
         gradients: gradients of the shape functions at rest, (T L, Q, 3 n, 3) [1/m].
         volumes: quadrature weight times det, (T L, Q) [m3].
         indptr, indices: block rows of the tangent, one block a pair of columns that share a triangle.

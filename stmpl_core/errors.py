@@ -5,9 +5,10 @@ def sentence_of(error: Exception) -> str:
     """What went wrong, in one sentence, without a library's dump of its validation (pydantic's ValidationError)."""
     if not hasattr(error, "errors"):
         return str(error)
-    found = [(".".join(map(str, e["loc"])), e["input"], e["msg"]) for e in error.errors()]  # type: ignore[attr-defined]
-    return "; ".join(f"{name or 'the input'} is {value!r}: {said.removeprefix('Value error, ')}"
-                     for name, value, said in found)  # fmt: skip
+    found = [(".".join(map(str, e["loc"])) or "the input", e) for e in error.errors()]  # type: ignore[attr-defined]
+    return "; ".join(f"{name} is missing" if e["type"] == "missing" else
+                     f"{name} is {e['input']!r:.60}: {e['msg'].removeprefix('Value error, ')}"
+                     for name, e in found)  # fmt: skip
 
 
 class StmplError(Exception):
@@ -32,3 +33,4 @@ class NotPrepared(StmplError, RuntimeError):
 
 class BagError(StmplError):
     """A recording that cannot be read, is truncated, or lacks what is needed to repeat it."""
+

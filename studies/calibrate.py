@@ -68,15 +68,15 @@ class Trial:
 
     Args:
         body, use, set, kind: names of where the load comes from.
-        method: its name.
-        scene: its figures.
+        method: name of the method.
+        scene: figures of the scene.
         unit: thickness under the load times the strain of its columns [m].
         error: largest, at any vertex [m].
         peak: largest true displacement [m].
         much: mean error where the truth moves more than a tenth of the peak [m].
         seconds: median of some solves.
-        ok: the answer's own trust.
-        bound: its own, [m] or NaN.
+        ok: trust of the answer in itself.
+        bound: bound that the answer states [m], or NaN.
     """
 
     body: str
@@ -189,7 +189,7 @@ def gather(folder: Path, rungs: Sequence[Method] | None = None, *, scenes: Mappi
         rungs: methods, the default ones unless given.
         scenes: contacts of each set on each body, by use.
         bodies: limbs.
-        contacts: a data set of the preset "contacts", for what rigid tools press with; None: those are left out.
+        contacts: data set of the preset "contacts", for what rigid tools press with; None: those are left out.
         seed: seed of the scenes.
     """
     plan = Plan(preset="calibrate", bodies=tuple(bodies), seed=seed)

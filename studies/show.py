@@ -6,8 +6,6 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
 if TYPE_CHECKING:
@@ -17,15 +15,6 @@ if TYPE_CHECKING:
     from studies.chart.break_even import BreakEven
     from studies.critical_load import CriticalLoad
     from studies.stability import Report
-
-
-def critical_loads_with_progress(*, quiet: bool = False) -> list[CriticalLoad]:
-    """studies.critical_load.critical_loads under a progress bar on stderr."""
-    from studies.critical_load import critical_loads, presses
-
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=Console(stderr=True), disable=quiet, transient=True) as progress:
-        return list(progress.track(critical_loads(), total=len(presses()), description="presses of a flat layer"))
 
 
 def critical_load_table(rows: Sequence[CriticalLoad], picture: Path) -> Table:

@@ -6,6 +6,10 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Literal
 
+from pydantic import ValidationError
+
+from stmpl_core.errors import InvalidInput, sentence_of
+
 TrainPreset = Literal["default", "contacts", "paper", "paper-reduced", "paper-3-bodies", "paper-reduced-3-bodies"]
 OnProgress = Callable[[int, int, str], None]  # done, in all, what to say of it
 
@@ -32,29 +36,32 @@ def train(
         The card that was written beside the weights.
 
     Raises:
-        InvalidInput: no finished data set.
+        InvalidInput: no finished data set, or steps that are too few.
     """
+    changes: dict[str, Any] = {"seed": seed}
+    if preset.startswith("paper"):
+        from studies.train_unet import UNetTraining, train_unet
+
+        changes |= {"bodies": "three_bodies" if preset.endswith("3-bodies") else "all"}
+        changes |= {} if steps is None else {"epochs": steps}
+        unet = _settings(UNetTraining.reduced if "reduced" in preset else UNetTraining, changes)
+        return train_unet(data, out, unet, on_progress=on_progress)
+    from studies.train_moments import MomentTraining, train_moments
+
+    changes |= {} if steps is None else {"steps": steps}
     if preset == "default":
-        from studies.train_moments import MomentTraining, train_moments
+        return train_moments(data, out, _settings(MomentTraining, changes), on_progress=on_progress)
+    from studies.train_contact import ContactTraining, train_contact
 
-        moments = MomentTraining(seed=seed)
-        if steps is not None:
-            moments = moments.model_copy(update={"steps": steps})
-        return train_moments(data, out, moments, on_progress=on_progress)
-    if preset == "contacts":
-        from studies.train_contact import ContactTraining, train_contact
-        from studies.train_moments import MomentTraining, train_moments
+    contacts = _settings(ContactTraining, changes)
+    moments = _settings(MomentTraining, {"kinds": ("indenter",), "steps": 20_000} | changes)
+    train_moments(data, out, moments, name="moment_net_contact", on_progress=on_progress)
+    return train_contact(data, out, contacts, on_progress=on_progress)
 
-        contacts, moments = ContactTraining(seed=seed), MomentTraining(seed=seed, kinds=("indenter",), steps=20_000)
-        if steps is not None:
-            contacts = contacts.model_copy(update={"steps": steps})
-            moments = moments.model_copy(update={"steps": steps})
-        train_moments(data, out, moments, name="moment_net_contact", on_progress=on_progress)
-        return train_contact(data, out, contacts, on_progress=on_progress)
-    from studies.train_unet import UNetTraining, train_unet
 
-    changes: dict[str, Any] = {"seed": seed, "bodies": "three_bodies" if preset.endswith("3-bodies") else "all"}
-    if steps is not None:
-        changes["epochs"] = steps
-    settings = UNetTraining.reduced(**changes) if "reduced" in preset else UNetTraining(**changes)
-    return train_unet(data, out, settings, on_progress=on_progress)
+def _settings(make: Callable[..., Any], changes: dict[str, Any]) -> Any:
+    """The settings that `make` builds. Raises InvalidInput where it refuses them."""
+    try:
+        return make(**changes)
+    except ValidationError as error:
+        raise InvalidInput(f"the training cannot be set up so: {sentence_of(error)}.") from error

@@ -59,7 +59,7 @@ class Pressed:
 
     Args:
         sample: sample of the data set.
-        field: the tool's.
+        field: signed distance of the tool.
         pose: pose of the tool, (4, 4).
         squeeze: squeeze of the columns under it, see stmpl_core.columns.Squeeze.
         true: pressure over E at the squeezed vertices, (N,) [-].
@@ -249,7 +249,7 @@ class Scores:
         winkler: signed error of the force of columns alone.
         depth: depth over the thickness.
         mean: true mean pressure over E, weighted by itself.
-        tool: its kind.
+        tool: kind of the tool.
     """
 
     pressure: np.ndarray

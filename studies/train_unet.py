@@ -45,7 +45,7 @@ class UNetTraining(BaseModel):
         total_variation: weight of the mean absolute difference of neighbouring texels [mm], beside the mean square.
         epochs: number of times that every sample is seen.
         seed: seed of weights, order and dropout.
-        bodies: all, or the three of the paper's second set-up.
+        bodies: bodies that are learnt from: all, or the three of the paper's second set-up.
         kind: kind of load: the paper's rule, unless another is named.
         highest_force: force at a vertex that is drawn as 1 [N]. The paper's 20 N suit its 17 mm mesh and loads that
             tissue of 1 kPa does not carry.

@@ -76,7 +76,7 @@ def tables(
         unet: weights of the paper's network; those that come with the package unless given.
         unet_3_bodies: weights of its second set-up, for Table 3.
         moment_net: weights of ours; those that come with the package unless given.
-        out: a file for the tables in Markdown; their figures go beside it as JSON.
+        out: file for the tables in Markdown; their figures go beside it as JSON.
         as_json: figures on stdout, for machines.
     """
     needed("stmpl tables", "studies", "torch", "zarr", "shapely")
@@ -154,7 +154,7 @@ def calibrate(
     Args:
         errors: errors against finite elements as well, and how often the stated bounds hold.
         out: file of the measured chart; the user's cache for times, runs/calibrate/ladder.json for errors.
-        contacts: a data set of the preset contacts, for what rigid tools press with (with --errors).
+        contacts: folder of a data set of the preset contacts, for what rigid tools press with (with --errors).
         trials: folder of the single trials (with --errors), which are not measured twice.
         as_json: figures on stdout, for machines.
     """
@@ -199,7 +199,7 @@ def stability(
             module:attribute.
         preset: default (minutes a method, on the arm), quick (seconds, on a round limb).
         out: folder of report, picture and failures, runs/stability unless given; the picture with --critical-load.
-        again: a saved failure to run again with the same method.
+        again: file of a failure to run again with the same method.
         critical_load: presses of a flat layer by follower, dead and indenter loads with each element and mesh width
             until it fails, beside the closed form (minutes).
         as_json: figures on stdout, for machines.
@@ -227,10 +227,14 @@ def stability(
 
 
 def _critical_load(out: Path, as_json: bool) -> int:
-    from studies.critical_load import draw
-    from studies.show import critical_load_table, critical_loads_with_progress
+    from studies.critical_load import critical_loads, draw, presses
+    from studies.show import critical_load_table
 
-    rows = critical_loads_with_progress(quiet=as_json)
+    rows, total = [], len(presses())
+    with steps_bar("presses of a flat layer", quiet=as_json) as show:
+        for row in critical_loads():
+            rows.append(row)
+            show(len(rows), total, "")
     picture = draw(rows, out)
     figures = {"picture": str(picture), "rows": [vars(row) for row in rows]}
     print_figures(figures if as_json else critical_load_table(rows, picture))

@@ -1,5 +1,8 @@
 """Laws of the finite-element truth: patch test, slab, derivatives, objectivity, and an independent code."""
 
+import subprocess
+import sys
+
 import numpy as np
 import pytest
 from skfem import Basis, BilinearForm, MeshWedge1
@@ -298,3 +301,12 @@ def test_bad_input_is_refused_with_its_reason():
         PatchFem().prepare(layer).solve(Load.pressure([1.0, 2.0, 3.0]))
     with pytest.raises(MeshError, match=r"folds on itself below \d+ vertices"):
         PatchFem().prepare(limb(4e-3, 0.011, radius=0.01))
+
+
+def test_the_solvers_are_imported_without_what_only_draws():
+    """Letters, scenes and meshes need matplotlib, shapely, trimesh and scikit-fem; a press does not."""
+    code = ("import sys; from fem_tools import IndenterFem, PatchFem, Press, RigidFem; import fem_tools.scenes;"
+            "names = 'matplotlib', 'shapely', 'trimesh', 'skfem', 'zarr';"
+            "sys.exit(str([name for name in names if name in sys.modules]))")  # fmt: skip
+    said = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False).stderr
+    assert said.strip() == "[]"

@@ -15,6 +15,7 @@ from stmpl_core.contact_net import ContactNet
 from stmpl_core.errors import InvalidInput
 from stmpl_core.networks import Weights
 from stmpl_core.sdf import SignedDistance
+from studies.train import train
 from studies.train_contact import ContactTraining, pressed, score, train_contact
 from tests import scenes
 
@@ -129,3 +130,9 @@ def test_data_without_tools_is_refused_with_a_reason(tmp_path: Path) -> None:
     generate(plan, tmp_path / "discs", workers=1)
     with pytest.raises(InvalidInput, match="no rigid tools"):
         train_contact(tmp_path / "discs", tmp_path, SETTINGS)
+
+
+def test_settings_that_cannot_be_are_refused_in_a_sentence(tmp_path: Path) -> None:
+    for preset in ("default", "contacts", "paper-reduced"):
+        with pytest.raises(InvalidInput, match=r"is 0: .* greater than or equal to"):
+            train(preset, tmp_path, tmp_path, steps=0)

@@ -215,7 +215,7 @@ class Ladder:
 
     Args:
         rungs: methods, not yet prepared; those that the chart does not know are left out.
-        measured: the chart.
+        measured: chart to choose by.
         accuracy: largest error wanted at any vertex [m].
         deadline: time for each solve [s]; None: there is time.
 

@@ -43,9 +43,9 @@ class MomentNet:
     REACH: no load gives exactly no motion.
 
     Args:
-        weights: a .safetensors file made by `stmpl train`; None: those that come with the package.
+        weights: .safetensors file made by `stmpl train`; None: those that come with the package.
         contact: weights for what rigid tools press with (Load.contact), given likewise.
-        fallback: a method that answers loads outside the range that the network was trained on; None: the network's
+        fallback: method that answers loads outside the range that the network was trained on; None: the network's
             answer is given, and flagged.
         threads: number of threads of the kernels. Two are nearly twice as fast where two cores are idle, and stall for
             milliseconds where they are not.

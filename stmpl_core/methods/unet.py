@@ -10,7 +10,7 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 
 from stmpl_core.arrays import PerVertex
 from stmpl_core.chart import PADDING, UvChart
-from stmpl_core.errors import InvalidInput
+from stmpl_core.errors import InvalidInput, sentence_of
 from stmpl_core.extras import needed
 from stmpl_core.layer import SoftLayer
 from stmpl_core.load import Load
@@ -38,7 +38,7 @@ class Seen(BaseModel):
         thickness: [m].
         poisson_ratio: [-].
         edge_length: median, of the skins [m]; a force per vertex means less pressure where vertices are fewer.
-        uv: the part's place on the body's chart, (u0, v0, u1, v1).
+        uv: place of the part on the body's chart, (u0, v0, u1, v1).
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -57,7 +57,7 @@ class UNetCard(BaseModel):
     Args:
         size, width: numbers of Pix2PixUNet.
         highest_force: force at a vertex that is drawn as 1, of skin with E = 1 kPa [N].
-        seen: the training data.
+        seen: ranges of the training data.
         error_ratio: largest error at any vertex over (p / E) t, at the 95 % quantile of held-out contacts [-].
         about: data, settings, versions, machine and figures, for people.
     """
@@ -82,7 +82,7 @@ class UNet:
     body's chart, most of which one limb leaves empty.
 
     Args:
-        path: a .safetensors file with its .json card beside it; None: the weights that come with stmpl.
+        path: .safetensors file with its .json card beside it; None: the weights that come with stmpl.
         device: device of torch, "cpu" or "cuda".
 
     Raises:
@@ -156,8 +156,11 @@ def load_unet(path: Path, device: str = "cpu") -> tuple[UNetCard, Pix2PixUNet]:
         card = UNetCard.model_validate_json(beside.read_text())
         network = Pix2PixUNet(card.size, card.width)
         network.load_state_dict({name: tensor.float() for name, tensor in load_file(path).items()})
-    except (ValidationError, SafetensorError, RuntimeError) as error:
-        raise InvalidInput(f"{path} and {beside.name} do not make a network: {error}") from error
+    except ValidationError as error:
+        raise InvalidInput(f"{beside} is no card of a network: {sentence_of(error)}.") from error
+    except (SafetensorError, RuntimeError) as error:
+        said = " ".join(str(error).split())[:200]
+        raise InvalidInput(f"{path} and {beside.name} do not make a network: {said}") from error
     return card, network.eval().to(device)
 
 

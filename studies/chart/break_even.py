@@ -23,8 +23,8 @@ class BreakEven:
 
     Args:
         scene, ratio: panel, by its scene and its p / E.
-        network: the network's point.
-        solver: the cheapest finite elements with no larger an error; None if none of the chart reach it.
+        network: point of the network.
+        solver: cheapest finite elements with no larger an error; None if none of the chart reach it.
         solves: number of solves after which the network is ahead; infinite if it never is, NaN without a solver.
     """
 

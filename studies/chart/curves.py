@@ -29,7 +29,7 @@ class Curve:
         knob: name of what is swept.
         steps: value of the knob, for a person, and what makes the method.
         fast: solves that take milliseconds, so that many are timed; or not.
-        extra: a package that it needs beyond ours.
+        extra: package that it needs beyond ours.
     """
 
     name: str

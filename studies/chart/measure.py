@@ -70,10 +70,10 @@ class Point:
         contact: mean under the load [-].
         peak: signed error at the peak [-].
         far: largest answer beyond 8 thicknesses [-].
-        mee: the paper's mean over all that moves [-].
+        mee: mean error, as the paper has it, over all that moves [-].
         largest: largest error at any vertex [-].
-        converged, in_range: the answer's own flags.
-        why: its own words; or why it failed.
+        converged, in_range: flags of the answer itself.
+        why: words of the answer itself, or of the error that ended it.
         failed: there is no answer, or one that did not converge.
     """
 

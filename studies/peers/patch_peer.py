@@ -54,7 +54,7 @@ class SkinForces:
     Attributes:
         load: load on the layer, for what its kind asks.
         pressure: pressure at the corners of the patch's triangles, (N,) [Pa].
-        pressing: the load on the patch, as PatchFem has it.
+        pressing: load on the patch, as PatchFem has it.
     """
 
     load: Load

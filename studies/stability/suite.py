@@ -40,8 +40,8 @@ class Row:
         outcome: held; flagged: a law broke and the method said not to trust the answer, or refused a sound input;
             silent: a law broke and the method said nothing; crashed: an error that is none of ours; unfinished: too
             slow for all repetitions, what there was held.
-        broken: the laws that broke, and how.
-        file: the failure that can be run again.
+        broken: laws that broke, and how.
+        file: failure that can be run again.
     """
 
     method: str

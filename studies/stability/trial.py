@@ -85,7 +85,7 @@ class Trial:
     """One level of one axis.
 
     Args:
-        axis: its name.
+        axis: name of the axis.
         level: place on the axis, with its unit, for a person.
         laws: names of the laws that must hold (studies.stability.laws).
         scene: scene that is asked.
