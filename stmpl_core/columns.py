@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from functools import cached_property
+from typing import Any, NamedTuple
 
-import fcl
 import numba
 import numpy as np
 
@@ -73,19 +73,36 @@ class Columns:
         self._slot = np.full(len(self.points), -1)
         tissue = layer.tissue
         self._moduli = np.array([tissue.shear_modulus, tissue.lame_lambda]) / tissue.youngs_modulus
+
+    @cached_property
+    def _skin(self) -> Any:
+        """The skin as FCL knows it: a tree of boxes."""
+        import fcl
+
         model = fcl.BVHModel()
         model.beginModel(len(self.points), len(self.faces))
         model.addSubModel(self.points, self.faces)
         model.endModel()
-        self._skin = fcl.CollisionObject(model)
+        return fcl.CollisionObject(model)
 
-    def near(self, field: SignedDistance, pose: Transform, reach: float) -> np.ndarray:
-        """Broad phase: numbers of the vertices in the tool's box, `reach` [m] larger; empty if FCL finds no overlap."""
+    def near(self, field: SignedDistance, pose: Transform, reach: float, *, many: bool = False) -> np.ndarray:
+        """Broad phase: numbers of the vertices in the tool's box.
+
+        Args:
+            field: distance field of the tool.
+            pose: pose_body_from_tool, (4, 4).
+            reach: width by which the box is larger than the tool [m].
+            many: choice to ask FCL's tree first. That takes 6 us for a tool that is apart, where looking at each vertex
+                of an arm takes 14, and 60 us for one that touches: it pays where many tools are, most of them apart.
+        """
         low, high = field.tool_bounds
-        box = fcl.Box(*(high - low + 2 * reach))
         centre = pose[:3, :3] @ ((low + high) / 2) + pose[:3, 3]
-        if not fcl.collide(self._skin, fcl.CollisionObject(box, fcl.Transform(pose[:3, :3], centre))):
-            return np.empty(0, np.int64)
+        if many:
+            import fcl
+
+            box = fcl.CollisionObject(fcl.Box(*(high - low + 2 * reach)), fcl.Transform(pose[:3, :3], centre))
+            if not fcl.collide(self._skin, box):
+                return np.empty(0, np.int64)
         return _inside_box(self.points, pose, low - reach, high + reach, centre)
 
     def squeezed(self, field: SignedDistance, pose: Transform) -> Squeeze:

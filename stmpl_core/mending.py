@@ -7,7 +7,6 @@ from dataclasses import dataclass
 import numba
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.sparse import coo_array, csgraph
 
 from stmpl_core.arrays import Faces, Points, finite
 from stmpl_core.decimation import CELL, MANY, decimated, field_spacing
@@ -193,6 +192,8 @@ def _holes(points: Points, corners: np.ndarray, part: np.ndarray, turned: np.nda
     ends = np.where(turned[face, None], ends[:, ::-1], ends)
     knots, knot = np.unique(part[face, None] * len(points) + ends, return_inverse=True)
     knot = knot.reshape(-1, 2)
+    from scipy.sparse import coo_array, csgraph
+
     graph = coo_array((np.ones(len(knot), np.int8), knot.T), (len(knots), len(knots)))
     n_loops, label = csgraph.connected_components(graph, directed=False)
     loop = label[knot[:, 0]]

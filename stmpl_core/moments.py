@@ -216,13 +216,17 @@ def _shape(start, index, points, frames, thickness):
         s = np.zeros(6)
         for p in range(start[zones * i], start[zones * (i + 1)]):
             j = index[p]
-            d = (points[j] - points[i]) / thickness[i]
-            r2 = (d * d).sum()
+            dx, dy, dz = ((points[j, 0] - points[i, 0]) / thickness[i], (points[j, 1] - points[i, 1]) / thickness[i],
+                          (points[j, 2] - points[i, 2]) / thickness[i])  # fmt: skip
+            r2 = dx * dx + dy * dy + dz * dz
             if r2 > 9.0:
                 continue
             w = np.exp(-0.5 * r2)
-            x, y = (frames[i, 0] * d).sum(), (frames[i, 1] * d).sum()
-            u, v = (frames[i, 0] * frames[j, 2]).sum(), (frames[i, 1] * frames[j, 2]).sum()
+            x = frames[i, 0, 0] * dx + frames[i, 0, 1] * dy + frames[i, 0, 2] * dz
+            y = frames[i, 1, 0] * dx + frames[i, 1, 1] * dy + frames[i, 1, 2] * dz
+            n0, n1, n2 = frames[j, 2, 0], frames[j, 2, 1], frames[j, 2, 2]
+            u = frames[i, 0, 0] * n0 + frames[i, 0, 1] * n1 + frames[i, 0, 2] * n2
+            v = frames[i, 1, 0] * n0 + frames[i, 1, 1] * n1 + frames[i, 1, 2] * n2
             h = thickness[j] / thickness[i] - 1
             xx += w * x * x
             xy += w * x * y

@@ -6,11 +6,9 @@ import logging
 from dataclasses import dataclass
 from typing import Self
 
-import igl
 import numba
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy import ndimage
 
 from stmpl_core.arrays import Points, finite
 from stmpl_core.decimation import BAND, MARGIN, MAX_NODES, field_spacing
@@ -88,6 +86,8 @@ class SignedDistance:
         if nodes > MAX_NODES:
             raise InvalidInput(f"a grid of {spacing * 1e3:.3g} mm has {nodes:.3g} nodes; at most {MAX_NODES:.3g} fit. "
                                "Try a larger spacing, or None.")
+        from scipy import ndimage  # who only reads a field need not wait for what builds it
+
         origin = low + extent / 2 - spacing * (shape - 1) / 2
         values = _node_distances(vertices, faces, origin, spacing, shape)
         if rounding > 0:
@@ -153,6 +153,9 @@ def _face_areas(vertices: Points, faces: np.ndarray) -> np.ndarray:
 
 def _node_distances(vertices: Points, faces: np.ndarray, origin: np.ndarray, h: float, shape: np.ndarray) -> np.ndarray:
     """Distances at all nodes (I, J, K) [m]: exact in the band around the surface, from the coarse grid elsewhere."""
+    import igl
+    from scipy import ndimage
+
     def exact(index: np.ndarray) -> np.ndarray:
         kind = igl.SignedDistanceType.SIGNED_DISTANCE_TYPE_FAST_WINDING_NUMBER
         return np.asarray(igl.signed_distance(origin + h * index, vertices, faces, kind)[0])

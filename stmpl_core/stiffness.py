@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from scipy.optimize import minimize_scalar
 
 from stmpl_core.contact import Contact
 from stmpl_core.errors import InvalidInput
@@ -121,6 +120,8 @@ class _Presses:
 
     def best_offset(self) -> float:
         """Along the push [m]."""
+        from scipy.optimize import minimize_scalar
+
         reach = self._toucher.reach
         tried = np.linspace(-reach, reach, STEPS)
         costs = [self._cost(offset) for offset in tried]

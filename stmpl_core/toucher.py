@@ -43,6 +43,7 @@ STRANGE = 0.1  # of the force: carried by vertices that see what no training con
 DEEP = 0.85  # of the thickness: a wrench presses no deeper
 SAME_FORCE = 0.02  # of the force: how near the depth is tried; the rest of the way is reckoned
 TRIALS = 12  # of the depth
+MANY = 8  # tools from which those that are apart are told by a tree of boxes
 BEND = -0.25  # power of Winkler's force with which the skin's share of it falls, until a trial says more
 BENT = 1.4  # factor by which that share is taken to change at most from trial to trial
 
@@ -98,7 +99,8 @@ class Toucher:
 
     def touch_all(self, contacts: Sequence[Contact]) -> list[Touch]:
         """What several contacts do at once: tools side by side feel each other through the skin."""
-        placed = [self._place(contact, self.tools.field(contact.tool)) for contact in contacts]
+        many = len(contacts) >= MANY
+        placed = [self._place(contact, self.tools.field(contact.tool), many) for contact in contacts]
         pressing = [one for one in placed if len(one.squeeze.vertices)]
         if len(pressing) == 1:
             together = pressing[0].squeeze
@@ -117,10 +119,12 @@ class Toucher:
             out.append(self._answer(one, pressure, doubt, strange))
         return out
 
-    def _place(self, contact: Contact, field: SignedDistance) -> _Placed:
+    def _place(self, contact: Contact, field: SignedDistance, many: bool) -> _Placed:
         """Where the tool presses, or why it does not."""
         pose = contact.pose_body_from_tool
-        clearance = self._clearance(field, pose, 0.0 if contact.wrench is None else self.reach + self._thickest)
+        reach = 0.0 if contact.wrench is None else self.reach + self._thickest
+        near = self.columns.near(field, pose, self._thickest + self.hole + reach, many=many)
+        clearance = self.columns.clearance(field, pose, near, self.hole + reach)
         depth = -float(clearance.least.min(initial=np.inf))
 
         def nothing(status: str) -> _Placed:
@@ -140,10 +144,6 @@ class Toucher:
 
     def _status_by_pose(self, squeeze: Squeeze) -> str:
         return IN_CORE if (squeeze.depth >= self.layer.thickness[squeeze.vertices]).any() else BY_POSE
-
-    def _clearance(self, field: SignedDistance, pose: Transform, reach: float = 0.0) -> Clearance:
-        near = self.columns.near(field, pose, self._thickest + self.hole + reach)
-        return self.columns.clearance(field, pose, near, self.hole + reach)
 
     def _gap(self, field: SignedDistance, pose: Transform, clearance: Clearance, force: np.ndarray) -> float | None:
         """How far a tool that is apart must go along `force` to be 0 from the skin that faces it, by sphere tracing.

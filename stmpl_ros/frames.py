@@ -9,7 +9,6 @@ from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
-from ruamel.yaml import YAML, YAMLError
 
 from bags.wire import pose_from
 from stmpl_core.arrays import Transform
@@ -58,6 +57,8 @@ def read_frames(path: str) -> dict[str, Transform]:
     """The table of a YAML file; none if `path` is empty. Raises InvalidInput."""
     if not path:
         return {}
+    from ruamel.yaml import YAML, YAMLError
+
     try:
         read = YAML(typ="safe").load(Path(path).read_text()) or {}
     except (OSError, UnicodeDecodeError, YAMLError) as error:

@@ -6,7 +6,6 @@ from pathlib import Path
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
-from ruamel.yaml import YAML, YAMLError
 
 from stmpl_core.errors import InvalidInput, sentence_of
 from stmpl_core.touch import Answer
@@ -51,6 +50,8 @@ class Limits:
         """The limits of a region by a YAML file; None if `path` is empty. Raises InvalidInput."""
         if not path:
             return None
+        from ruamel.yaml import YAML, YAMLError
+
         try:
             file = LimitsFile.model_validate(YAML(typ="safe").load(Path(path).read_text()))
         except (OSError, UnicodeDecodeError, YAMLError) as error:

@@ -25,6 +25,7 @@ from stmpl_core.tool import Tool
 from stmpl_core.tools import Tools
 from stmpl_core.toucher import margin_on
 from stmpl_ros.answering import Answering
+from stmpl_ros.beside import Beside, Builders
 from stmpl_ros.calibration import Calibration
 from stmpl_ros.diagnosis import Tally, diagnostics, limits_status, skin_status
 from stmpl_ros.hearing import Hearing
@@ -35,7 +36,7 @@ from stmpl_ros.sending import Sending
 from stmpl_ros.settings import Settings
 from stmpl_ros.spinning import LOOK, interruptible, ros, spin
 from stmpl_ros.topics import STREAM, managed
-from stmpl_ros.workshop import Beside, Workshop, then
+from stmpl_ros.workshop import Workshop, then
 
 FADE_RATE = 30.0  # Hz of the answers while the last one fades
 
@@ -93,7 +94,8 @@ class SkinNode(LifecycleNode):
         started = time.monotonic()
         try:
             self.answering.limits = Limits.read(self.config.limits, self.config.part)
-            self._answer_on(self._make_skin())
+            builders = Builders()  # start while the skin is made
+            self._answer_on(self._make_skin(), builders)
             warm_up(self.answering.simulator)
         except StmplError as error:
             self._end()
@@ -159,7 +161,7 @@ class SkinNode(LifecycleNode):
         finally:
             making.close()
 
-    def _answer_on(self, skin: Skin) -> None:
+    def _answer_on(self, skin: Skin, builders: Builders | None = None) -> None:
         """From here on the answers are of this skin."""
         tools, before = self.hearing.tools, self.workshop
         if tools.margin != margin_on(skin.layer):  # fields of another width are built anew
@@ -168,7 +170,7 @@ class SkinNode(LifecycleNode):
             again = tools
         self.skin, self.hearing.layer = skin, skin.layer
         self.answering.simulator = Simulator(skin, tools=again)
-        self.workshop = Workshop(self, skin.layer)
+        self.workshop = Workshop(self, skin.layer, builders)
         if before:
             before.close()
         for tool in [*tools, *tools.waiting()] if again is not tools else again.waiting():

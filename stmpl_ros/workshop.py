@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-import multiprocessing
 import os
 import signal
-import threading
 from collections.abc import Callable, Sequence
 from concurrent.futures import BrokenExecutor, Future, ProcessPoolExecutor
-from typing import Any
 
 import numpy as np
 from rclpy.node import Node
@@ -16,14 +13,12 @@ from rclpy.node import Node
 from stmpl_core.contact import Contact
 from stmpl_core.layer import SoftLayer
 from stmpl_core.local_contact import LocalContact, local_contact
-from stmpl_core.sdf import SignedDistance
 from stmpl_core.stiffness import Stiffness, fit_stiffness
 from stmpl_core.tool import Tool
 from stmpl_core.toucher import Toucher, margin_on
+from stmpl_ros.beside import Builders, pool
 
-YIELDS = 5  # nice value: what answers goes first
 FITTED = 60  # presses, evenly from the lightest to the hardest: a fit takes about 25 touches of each
-BUILDERS = min(os.cpu_count() or 1, 4)  # processes that build distance fields, started as they are needed
 
 Then = Callable[[Future], None]
 
@@ -37,29 +32,27 @@ class Workshop:
     Args:
         node: node whose executor gets what was made.
         layer: layer that contacts are on.
+        builders: processes that build distance fields; None: started here.
     """
 
-    def __init__(self, node: Node, layer: SoftLayer) -> None:
+    def __init__(self, node: Node, layer: SoftLayer, builders: Builders | None = None) -> None:
         self._node, self._layer, self._closed = node, layer, False
         self._fit: Future[Stiffness] | None = None
-        self._start()
-
-    def _start(self) -> None:
-        self._builders = _pool(BUILDERS)
-        self._models = _pool(1, _know, self._layer)
-        self._pid = self._models.submit(os.getpid)  # starts it now
+        self._pid: Future[int] | None = None
+        self._models: ProcessPoolExecutor | None = None  # started when somebody asks
+        self._builders = builders or Builders()
 
     def field(self, tool: Tool, do: Then) -> None:
         """Has the distance field of a tool built, for `do`. The future may raise MeshError."""
-        self._then(self._builders.submit(_field, tool, margin_on(self._layer)), do)
+        self._then(self._builders.field(tool, margin_on(self._layer)), do)
 
     def models(self, contacts: Sequence[Contact], rotations: bool, do: Then) -> None:
         """Has the local model of each contact found, without the others, for `do`."""
-        self._then(self._models.submit(_local_contacts, list(contacts), rotations), do)
+        self._then(self._modeller().submit(_local_contacts, list(contacts), rotations), do)
 
     def stiffness(self, presses: Sequence[Contact]) -> Future[Stiffness]:
         """How stiff the skin is by these presses: for a thread that waits."""
-        self._fit = self._models.submit(_stiffness, list(presses))
+        self._fit = self._modeller().submit(_stiffness, list(presses))
         self._then(self._fit, lambda future: self.renew(future.exception()))
         return self._fit
 
@@ -68,44 +61,30 @@ class Workshop:
         if isinstance(error, BrokenExecutor) and not self._closed:
             self._node.get_logger().error(f"a process that builds distance fields or local models died: {error}")
             self._end()
-            self._start()
+            self._models, self._builders = None, Builders()
 
     def close(self) -> None:
         """Ends the processes; nothing comes back any more."""
         self._closed = True
         self._end()
 
+    def _modeller(self) -> ProcessPoolExecutor:
+        if self._models is None:
+            self._models = pool(1, _know, self._layer)
+            self._pid = self._models.submit(os.getpid)
+        return self._models
+
     def _end(self) -> None:
         """What was not begun is dropped, and a fit, which takes seconds, is broken off."""
-        if self._fit and not self._fit.done() and self._pid.done() and not self._pid.exception():
-            os.kill(self._pid.result(), signal.SIGTERM)
-        for pool in (self._builders, self._models):
-            pool.shutdown(wait=False, cancel_futures=True)
+        pid = self._pid
+        if self._fit and not self._fit.done() and pid and pid.done() and not pid.exception():
+            os.kill(pid.result(), signal.SIGTERM)
+        self._builders.close()
+        if self._models:
+            self._models.shutdown(wait=False, cancel_futures=True)
 
     def _then(self, future: Future, do: Then) -> None:
         then(self._node, future, lambda done: None if self._closed else do(done))
-
-
-class Beside[T]:
-    """One job in a process of its own, so that nobody waits for it, and it can be given up at any moment.
-
-    Args:
-        do: function of a module, called there with `arguments`.
-
-    Attributes:
-        result: raises what `do` raises, or BrokenExecutor if the process died.
-    """
-
-    def __init__(self, do: Callable[..., T], *arguments: Any) -> None:
-        self._pool = _pool(1)
-        self._pid = self._pool.submit(os.getpid)
-        self.result: Future[T] = self._pool.submit(do, *arguments)
-
-    def close(self) -> None:
-        """Ends the process, whether the job is done or not."""
-        if self._pid.done() and not self.result.done():
-            os.kill(self._pid.result(), signal.SIGTERM)
-        self._pool.shutdown(wait=False, cancel_futures=True)
 
 
 def then(node: Node, future: Future, do: Then) -> None:
@@ -119,30 +98,9 @@ def then(node: Node, future: Future, do: Then) -> None:
     future.add_done_callback(done)
 
 
-# In the processes
+# In the process that knows the layer
 
 _toucher: Toucher
-
-
-def _pool(workers: int, start: Callable | None = None, *arguments: Any) -> ProcessPoolExecutor:
-    return ProcessPoolExecutor(workers, multiprocessing.get_context("spawn"), stand_beside, (start, *arguments))
-
-
-def stand_beside(start: Callable | None = None, *arguments: Any) -> None:
-    """What a process beside the node does first: it ends with the node, and yields to it."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C goes to the node, which ends this process
-    signal.signal(signal.SIGTERM, signal.SIG_DFL)
-    threading.Thread(target=_end_with_the_node, daemon=True).start()
-    os.nice(YIELDS)
-    if start:
-        start(*arguments)
-
-
-def _end_with_the_node() -> None:
-    node = multiprocessing.parent_process()
-    assert node
-    node.join()
-    os._exit(0)
 
 
 def _know(layer: SoftLayer) -> None:
@@ -151,10 +109,6 @@ def _know(layer: SoftLayer) -> None:
     global _toucher
     numba.set_num_threads(1)  # what answers goes first
     _toucher = Toucher(layer)
-
-
-def _field(tool: Tool, margin: float) -> SignedDistance:
-    return SignedDistance.of(tool, margin=margin)
 
 
 def _local_contacts(contacts: list[Contact], rotations: bool) -> list[LocalContact]:
