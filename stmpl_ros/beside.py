@@ -1,0 +1,86 @@
+"""Processes beside the node's: they end with it, yield to it, and import no ROS."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import signal
+import threading
+from collections.abc import Callable
+from concurrent.futures import Future, ProcessPoolExecutor
+from typing import Any
+
+from stmpl_core.sdf import SignedDistance
+from stmpl_core.tool import Tool
+
+YIELDS = 5  # nice value: what answers goes first
+BUILDERS = min(os.cpu_count() or 1, 4)  # processes that build distance fields, started as they are needed
+
+
+class Beside[T]:
+    """One job in a process of its own, so that nobody waits for it, and it can be given up at any moment.
+
+    Args:
+        do: function of a module, called there with `arguments`.
+
+    Attributes:
+        result: raises what `do` raises, or BrokenExecutor if the process died.
+    """
+
+    def __init__(self, do: Callable[..., T], *arguments: Any) -> None:
+        self._pool = pool(1)
+        self._pid = self._pool.submit(os.getpid)
+        self.result: Future[T] = self._pool.submit(do, *arguments)
+
+    def close(self) -> None:
+        """Ends the process, whether the job is done or not."""
+        if self._pid.done() and not self.result.done():
+            os.kill(self._pid.result(), signal.SIGTERM)
+        self._pool.shutdown(wait=False, cancel_futures=True)
+
+
+class Builders:
+    """Processes that build distance fields side by side; the first starts at once."""
+
+    def __init__(self) -> None:
+        self._pool = pool(BUILDERS, _ready_to_build)
+        self._pool.submit(os.getpid)
+
+    def field(self, tool: Tool, margin: float) -> Future[SignedDistance]:
+        """The distance field of a tool, `margin` [m] wide. May raise MeshError."""
+        return self._pool.submit(_field, tool, margin)
+
+    def close(self) -> None:
+        """Ends the processes; what was not begun is dropped."""
+        self._pool.shutdown(wait=False, cancel_futures=True)
+
+
+def pool(workers: int, start: Callable | None = None, *arguments: Any) -> ProcessPoolExecutor:
+    """Processes that call `start` with `arguments` first."""
+    return ProcessPoolExecutor(workers, multiprocessing.get_context("spawn"), stand_beside, (start, *arguments))
+
+
+def stand_beside(start: Callable | None = None, *arguments: Any) -> None:
+    """What a process beside the node does first: it ends with the node, and yields to it."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C goes to the node, which ends this process
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)
+    threading.Thread(target=_end_with_the_node, daemon=True).start()
+    os.nice(YIELDS)
+    if start:
+        start(*arguments)
+
+
+def _end_with_the_node() -> None:
+    node = multiprocessing.parent_process()
+    assert node
+    node.join()
+    os._exit(0)
+
+
+def _ready_to_build() -> None:
+    import igl  # noqa: F401
+    from scipy import ndimage  # noqa: F401
+
+
+def _field(tool: Tool, margin: float) -> SignedDistance:
+    return SignedDistance.of(tool, margin=margin)
