@@ -1,13 +1,9 @@
 """Skins, tools, contacts and loads that the tests share; what product type they are made of is known here alone."""
 
-from dataclasses import dataclass
-
 import numpy as np
 import trimesh
 
-from stmpl_core import Contact, Load, SoftLayer, Tissue, ToolMesh
-from stmpl_core.touch import Touch
-from stmpl_core.trust import Displacement
+from stmpl_core import Contact, Load, SoftLayer, Tissue, Tool
 
 RADIUS, LENGTH = 0.04, 0.16  # m, of the limb
 THICKNESS = 7.5e-3  # m
@@ -66,37 +62,37 @@ def enlarged(layer: SoftLayer, by: float) -> SoftLayer:
 # Tools
 
 
-def tool(mesh: trimesh.Trimesh, unit: float = 1.0) -> ToolMesh:
+def tool(mesh: trimesh.Trimesh, unit: float = 1.0, name: str = "probe") -> Tool:
     """A mesh whose coordinates are in `unit` [m]."""
-    return ToolMesh.of(unit * np.asarray(mesh.vertices), mesh.faces)
+    return Tool(name, unit * np.asarray(mesh.vertices), np.asarray(mesh.faces))
 
 
-def ball(radius: float = 0.012, subdivisions: int = 3) -> ToolMesh:
+def ball(radius: float = 0.012, subdivisions: int = 3) -> Tool:
     return tool(trimesh.creation.icosphere(subdivisions, radius))
 
 
-def box(x: float, y: float, z: float) -> ToolMesh:
+def box(x: float, y: float, z: float) -> Tool:
     """With these sides [m], centred at its own origin."""
     return tool(trimesh.creation.box((x, y, z)))
 
 
-def punch(radius: float = 0.01, height: float = 0.03) -> ToolMesh:
+def punch(radius: float = 0.01, height: float = 0.03) -> Tool:
     """A flat, sharp-edged cylinder along z, centred at its own origin."""
     return tool(trimesh.creation.cylinder(radius, height, sections=48))
 
 
-def band() -> ToolMesh:
+def band() -> Tool:
     """A ring along z around the limb, 2 mm deep in it."""
     return tool(trimesh.creation.annulus(RADIUS - 0.002, RADIUS + 0.01, 0.02, sections=96))
 
 
-def capsule(height: float, radius: float, count: int = 32) -> ToolMesh:
+def capsule(height: float, radius: float, count: int = 32) -> Tool:
     """Along z, centred. Made in millimetres: trimesh drops triangles under 1e-8 of whatever unit."""
     return tool(trimesh.creation.capsule(1e3 * height, 1e3 * radius, count=[count, count]), 1e-3)
 
 
-def scaled(mesh: ToolMesh, by: float) -> ToolMesh:
-    return ToolMesh.of(by * mesh.vertices, mesh.faces)
+def scaled(tool: Tool, by: float) -> Tool:
+    return Tool(tool.name, by * tool.vertices, tool.faces)
 
 
 # Poses and contacts
@@ -113,39 +109,14 @@ def at(x: float, y: float, z: float) -> np.ndarray:
     return turn((0, 0, 1), 0.0, (x, y, z))
 
 
-def contact_of(mesh: ToolMesh, pose: np.ndarray, wrench: np.ndarray | None = None, name: str = "probe") -> Contact:
+def contact_of(tool: Tool, pose: np.ndarray, wrench: np.ndarray | None = None, name: str = "probe") -> Contact:
     """A tool at a pose (4, 4), with a wrench (6,) on the body or none."""
-    return Contact(name, mesh, pose, wrench)
+    return Contact(tool if tool.name == name else tool.named(name), pose, wrench)
 
 
-def press(mesh: ToolMesh, pose: np.ndarray, force: tuple[float, float, float] | None, name: str = "probe") -> Contact:
+def press(tool: Tool, pose: np.ndarray, force: tuple[float, float, float] | None, name: str = "probe") -> Contact:
     """A tool that pushes with a force through its own origin, or none."""
-    return contact_of(mesh, pose, None if force is None else np.array([*force, 0.0, 0.0, 0.0]), name)
-
-
-# Answers
-
-
-@dataclass
-class Touched:
-    """What an answer says of one tool; figures that it does not say are not a number."""
-
-    status: str
-    wrench: np.ndarray  # (6,) on the body [N, N m]
-    depth: float  # m
-    moved: float  # m
-    normal: float  # N, carried
-    tangential: float  # N, asked for and not carried
-    force_bound: float  # N
-
-
-def touch_of(answer: Displacement | Touch, name: str = "probe") -> Touched:
-    """What `answer` says of the tool `name`."""
-    found = {key.removeprefix(f"{name}."): value for key, value in answer.trust.figures.items()}
-    status, wrench = (answer.status, answer.wrench) if isinstance(answer, Touch) \
-        else (answer.statuses[name], answer.wrenches[name])  # fmt: skip
-    keys = ("depth_m", "moved_m", "normal_n", "tangential_n", "force_error_n")
-    return Touched(status, wrench, *(found.get(key, float("nan")) for key in keys))
+    return contact_of(tool, pose, None if force is None else np.array([*force, 0.0, 0.0, 0.0]), name)
 
 
 # Loads
