@@ -67,7 +67,7 @@ class SkinNode(LifecycleNode):
         self.hearing = Hearing(self, lambda: self.config, Tools(), self.tally)
         self.answering = Answering(self, self.settings, self.hearing, self.tally, self.calibration)
         self.hearing.on_tool, self.hearing.on_instant = self._on_tool, self.answering.answer
-        self.hearing.on_removed = lambda name: self.sending.close_tool(name)
+        self.hearing.on_removed = self._on_removed
         self._offer("reset", self.reset)
         self.create_service(SetBody, "~/set_body", self._on_set_body)
 
@@ -279,6 +279,10 @@ class SkinNode(LifecycleNode):
             self.hearing.refuse(tool, error)
             if self.workshop:
                 self.workshop.renew(error)
+
+    def _on_removed(self, name: str) -> None:
+        self.answering.without(name)
+        self.sending.close_tool(name)
 
     def _fade(self) -> None:
         if self.active:

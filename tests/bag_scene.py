@@ -110,8 +110,8 @@ def touched(touch: Touch, stamp: int) -> Any:
     """What one tool does, by pose and wrench of one stamp, as stmpl_msgs/Touch."""
     (x, y, z), turn = touch.pose_body_from_tool[:3, 3], quaternion_from(touch.pose_body_from_tool[:3, :3])
     point = message("geometry_msgs/msg/Point", x=x, y=y, z=z)
-    placed = message("geometry_msgs/msg/Pose", position=point,
-                     orientation=message("geometry_msgs/msg/Quaternion", **dict(zip("xyzw", turn, strict=True))))  # fmt: skip
+    turned = message("geometry_msgs/msg/Quaternion", **dict(zip("xyzw", turn, strict=True)))
+    placed = message("geometry_msgs/msg/Pose", position=point, orientation=turned)
     force, torque = (message("geometry_msgs/msg/Vector3", **dict(zip("xyz", values, strict=True)))
                      for values in (touch.wrench[:3], touch.wrench[3:]))  # fmt: skip
     return message("stmpl_msgs/msg/Touch", tool=touch.name, status=touch.status, pose=placed,

@@ -280,6 +280,21 @@ def test_poses_and_wrenches_in_a_frame_that_the_recording_carries_count_as_in_th
             contact_from(tool, sent, push, body_frame="body", frames=wrong)
 
 
+def test_a_surface_that_a_node_refuses_is_left_out_of_a_recording_and_the_one_before_it_stays(tmp_path, caplog):
+    vertices, triangles = ball()
+    sent = [("ball", 1.0, triangles), ("ball", 1e3, triangles), ("other", 1.0, triangles),
+            ("other", 1.0, triangles[:0])]  # fmt: skip
+    with BagWriter(tmp_path) as bag:
+        channel = bag.add_channel("/contact_mesh", "stmpl_msgs/msg/ContactMesh")
+        for k, (name, scale, faces) in enumerate(sent):
+            made = message("mesh", header=header(name, START + k), vertices=scale * vertices.ravel(),
+                           triangles=faces.ravel())  # fmt: skip
+            bag.write(channel, cdr(made), START + k, START + k)
+    tools = Bag(tmp_path).tools
+    assert list(tools) == ["ball", "other"] and np.ptp(tools["ball"].vertices) < 0.03
+    assert "a surface of 'ball' is left out" in caplog.text and "millimetres" in caplog.text
+
+
 def test_a_topology_message_says_a_float32_layer_exactly():
     from tests.bag_scene import topology
 

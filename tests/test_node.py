@@ -11,7 +11,6 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import rclpy
-from bags.messages import layer_from, layer_id, stamp_ns
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import Point, PoseStamped, Vector3, WrenchStamped
@@ -31,25 +30,28 @@ from shape_msgs.msg import Mesh, MeshTriangle
 from std_srvs.srv import Trigger
 from stmpl_msgs.msg import ContactMesh, LocalContact, SkinDisplacement, SkinTopology
 from stmpl_msgs.srv import Calibrate, SetBody
-from stmpl_ros.adapters import GazeboContacts, gazebo_wrench
-from stmpl_ros.cloud import FIELDS, SkinCloud
-from stmpl_ros.conversions import STALE, checked_pose, mesh_message, pose_message, wrench_message
-from stmpl_ros.skin import Skin, published
 
 from bags.reader import Bag
 from bags.replay import replay_run
+from bags.wire import layer_from, pose_message, pose_of_tool, stamp_ns, tool_message, wrench_message
+from stmpl_core import Simulator
 from stmpl_core.errors import FrameError, InvalidInput
+from stmpl_core.layer import layer_id
 from stmpl_core.methods import MomentNet
-from stmpl_core.sdf import SignedDistance
-from stmpl_core.touch import BY_POSE, MOVED, TOUCHING, Toucher
+from stmpl_core.skin import published
+from stmpl_core.touch import BY_POSE, MOVED, STALE, TOUCHING
+from stmpl_core.toucher import Toucher
 from stmpl_core.trust import Displacement, Trust
 from stmpl_ros.frames import Frames, read_frames
+from stmpl_ros.gazebo import GazeboContacts, gazebo_wrench
 from stmpl_ros.limits import Limits
+from stmpl_ros.making import restiffened, skin_of
 from stmpl_ros.node import SkinNode
 from stmpl_ros.parameters import NodeConfig
 from stmpl_ros.settings import checked
+from stmpl_ros.show import FIELDS, SkinCloud
 from stmpl_ros.topics import KEPT, LEASE, STREAM
-from tests.bus import PATIENCE, ROOT, Robot, end, rows, running, start
+from tests.bus import PATIENCE, ROOT, Robot, end, rows, running, start, statuses
 from tests.conftest import BUSES
 from tests.scenes import LENGTH, RADIUS, at, ball, contact_of, limb
 
@@ -106,7 +108,7 @@ class Hand:
         self.pose = bus.node.create_publisher(PoseStamped, f"tools/{name}/pose", STREAM)
         self.wrench = bus.node.create_publisher(WrenchStamped, f"tools/{name}/wrench", STREAM)
         if announce:
-            bus.mesh.publish(mesh_message(name, ball(), bus.now()))
+            bus.mesh.publish(tool_message(ball().named(name), bus.now()))
 
     def ready(self) -> "Hand":
         self.bus.wait(lambda: self.pose.get_subscription_count() and self.wrench.get_subscription_count(), "the node")
@@ -200,7 +202,7 @@ def test_a_running_node_honours_what_may_be_set_at_any_time(bus, hand):
     assert bus.set(max_age=0.0, fade=0.0)[0].successful
     hand.ask(HERE, PUSH)
     bus.still()
-    assert not [a for a in bus.got["skin/displacement"][-2:] if STALE in a.statuses], "fade 0 rests at once"
+    assert not [a for a in bus.got["skin/displacement"][-2:] if STALE in statuses(a).values()], "fade 0 rests at once"
     hand.pose.publish(pose_message(HERE, "body", old))
     bus.answer(old)
     assert bus.set(max_age=1.0, fade=0.6)[0].successful
@@ -224,9 +226,9 @@ def test_reset_brings_the_skin_to_rest_and_forgets_the_last_wrench(bus, hand):
     answer = bus.call(Trigger, "reset")
     assert answer.success and "at rest" in answer.message
     rest = bus.wait(lambda: bus.got["skin/displacement"][before:], "the skin at rest")[0]
-    assert not rows(rest).any() and not rest.tools and "reset" in rest.why
+    assert not rows(rest).any() and not rest.touches and "reset" in rest.why
     again = hand.ask(HERE)
-    assert list(again.statuses) == [BY_POSE], "the wrench from before the reset is forgotten"
+    assert statuses(again) == {"probe": BY_POSE}, "the wrench from before the reset is forgotten"
 
 
 @pytest.mark.parametrize(
@@ -237,7 +239,7 @@ def test_reset_brings_the_skin_to_rest_and_forgets_the_last_wrench(bus, hand):
 def test_a_body_that_cannot_be_is_refused_and_the_node_goes_on(bus, hand, change, says):
     answer = bus.call(SetBody, "set_body", **change)
     assert not answer.success and says in answer.message
-    assert list(hand.ask(HERE, PUSH).statuses) == [TOUCHING]
+    assert statuses(hand.ask(HERE, PUSH)) == {"probe": TOUCHING}
 
 
 def test_another_body_takes_over_while_the_node_goes_on_answering(bus, hand):
@@ -259,27 +261,29 @@ def test_another_body_takes_over_while_the_node_goes_on_answering(bus, hand):
     assert topology.layer_id == layer_id(layer) != bus.got["skin/topology"][0].layer_id
     meanwhile = [a for a in bus.got["skin/displacement"][before:] if a.layer_id != topology.layer_id]
     assert len(meanwhile) > 10, "the old skin answered until the new one took over"
-    assert not [a for a in meanwhile if not a.tools], "nothing went to rest meanwhile"
+    assert not [a for a in meanwhile if not a.touches], "nothing went to rest meanwhile"
     assert hand.ask(HERE, PUSH).layer_id == topology.layer_id
     assert bus.get("youngs_modulus", "thickness") == [2e3, 6e-3]
 
 
 def test_another_stiffness_alone_is_at_hand_at_once_and_answers_as_one_that_was_made():
     config = NodeConfig(thickness=7e-3)
-    given = Skin.of(config, skin)
+    given, contact = skin_of(config, skin), contact_of(ball(), HERE, PUSH)
+    Simulator(given).step([contact])  # what the old one was asked leaves no trace
     harder = config.model_copy(update={"youngs_modulus": 3e3})
-    quick, made = given.stiffened(harder), Skin.of(harder, skin)
-    assert quick.layer_id == made.layer_id != given.layer_id
-    contact = contact_of(ball(), HERE, PUSH)
-    assert quick.simulator().step([contact]).displacement.tobytes() == (
-        made.simulator().step([contact]).displacement.tobytes()
+    quick, made = restiffened(given, harder, {"youngs_modulus"}), skin_of(harder, skin)
+    assert quick is not None and quick.layer_id == made.layer_id != given.layer_id
+    assert Simulator(quick).step([contact]).displacement.tobytes() == (
+        Simulator(made).step([contact]).displacement.tobytes()
     )
+    assert restiffened(given, harder, {"youngs_modulus", "thickness"}) is None
+    assert restiffened(given, harder.model_copy(update={"method": "fem"}), {"youngs_modulus"}) is None
 
 
 def test_calibrate_finds_the_stiffness_and_the_offset_that_the_robots_presses_had(bus):
-    hidden, back, mesh = 4.2e3, 0.8e-3, ball()
+    hidden, back = 4.2e3, 0.8e-3
     layer = skin(NodeConfig(**dict(zip(asked := ("thickness",), bus.get(*asked), strict=True)), youngs_modulus=hidden))
-    toucher, field = Toucher(published(layer)), SignedDistance.of(mesh)
+    toucher, tool = Toucher(published(layer)), ball().named("finger")
     hand = bus.tool("finger").ready()
     bus.still()
     bus.call(Trigger, "reset")
@@ -287,8 +291,8 @@ def test_calibrate_finds_the_stiffness_and_the_offset_that_the_robots_presses_ha
     assert not few.success and "0 of 0 instants pressed" in few.message and few.presses == 0
     for depth in np.linspace(0.4e-3, 3e-3, 24):
         pose = at(RADIUS + 0.012 - depth, 0, LENGTH / 2)
-        wrench = toucher.touch(contact_of(mesh, pose, name="finger"), field).wrench
-        assert list(hand.ask(at(back, 0, 0) @ pose, wrench).statuses) in ([TOUCHING], [MOVED])
+        wrench = toucher.touch(contact_of(tool, pose, name="finger")).wrench
+        assert statuses(hand.ask(at(back, 0, 0) @ pose, wrench))["finger"] in (TOUCHING, MOVED)
     nobody = bus.call(Calibrate, "calibrate", tool="nobody")
     assert not nobody.success and "0 of 0" in nobody.message
     before, layers = len(bus.got["skin/displacement"]), len(bus.got["skin/topology"])
@@ -326,7 +330,7 @@ def test_poses_and_wrenches_in_a_listed_frame_count_as_in_the_bodys(bus, hand):
     turn = TABLE[:3, :3].T
     in_table = np.concatenate([turn @ PUSH[:3], turn @ PUSH[3:]])
     answer = hand.ask(np.linalg.inv(TABLE) @ HERE, in_table, frame="table")
-    assert answer.header.frame_id == "body" and list(answer.statuses) == [TOUCHING]
+    assert answer.header.frame_id == "body" and statuses(answer) == {"probe": TOUCHING}
     np.testing.assert_allclose(rows(answer), rows(own), atol=1e-7)
 
 
@@ -368,9 +372,9 @@ def test_a_file_of_frames_that_cannot_be_read_is_refused(tmp_path, text):
 
 def test_the_example_of_frames_is_read_and_unknown_frames_stay_unknown():
     frames = Frames("body", read_frames(str(ROOT / "config/frames.yaml")))
-    assert frames.of("table") is not None and frames.of("nowhere") is None
+    assert frames["table"].shape == (4, 4) and "nowhere" not in frames
     with pytest.raises(FrameError, match="in frame 'nowhere'"):
-        checked_pose(pose_message(np.eye(4), "nowhere", 0), "probe", "body", frames.of("nowhere"))
+        pose_of_tool(pose_message(np.eye(4), "nowhere", 0), "probe", "body", frames)
 
 
 def test_a_tool_may_announce_itself_as_a_shape(bus, hand):
@@ -382,7 +386,7 @@ def test_a_tool_may_announce_itself_as_a_shape(bus, hand):
     publisher.publish(shape)
     shaped = Hand(bus, "shaped", announce=False).ready().ask(HERE)
     bus.still()
-    assert list(shaped.tools) == ["shaped"]
+    assert list(statuses(shaped)) == ["shaped"]
     np.testing.assert_array_equal(rows(shaped), rows(hand.ask(HERE)))
 
 
@@ -440,7 +444,7 @@ def test_gazebos_contacts_answer_as_the_wrench_that_they_sum_to(bus, tmp_path):
         publisher.publish(gz.Contacts(header=std.Header(stamp=stamp_of(stamp)), contacts=[contact]))
         hand.pose.publish(pose_message(HERE, "body", stamp))
         found = robot.wait(lambda: robot.answers(stamp), "the answer")
-        assert list(found[0].statuses) == [TOUCHING] and rows(found[0]).tobytes() == rows(by_wrench).tobytes()
+        assert statuses(found[0]) == {"finger": TOUCHING} and rows(found[0]).tobytes() == rows(by_wrench).tobytes()
     robot.node.destroy_node()
 
 
@@ -593,7 +597,7 @@ def test_the_node_runs_beside_another_in_any_executor():
         executor.add_node(other)
         node.trigger_configure()
         node.trigger_activate()
-        mesh.publish(mesh_message("finger", ball(), 0))
+        mesh.publish(tool_message(ball().named("finger"), 0))
         until = time.monotonic() + PATIENCE
         while not heard and time.monotonic() < until:
             pose.publish(pose_message(HERE, "body", other.get_clock().now().nanoseconds))

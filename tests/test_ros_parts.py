@@ -271,7 +271,8 @@ def test_an_answer_keeps_what_each_tool_does_through_a_message():
     touches = {"finger": Touch("finger", TOUCHING, turned, rng.normal(size=6), depth=1.2345678901e-3,
                                force_bound=0.0123456789, trust=Trust(in_range=False)),
                "thumb": Touch("thumb", BY_POSE, np.eye(4), rng.normal(size=6))}  # fmt: skip
-    answer = Answer(rng.normal(0, 1e-3, (5, 3)), Trust(True, False, 2e-4, "a word"), "any", rng.uniform(0, 9, 5), touches)
+    displacement, trust = rng.normal(0, 1e-3, (5, 3)), Trust(True, False, 2e-4, "a word")
+    answer = Answer(displacement, trust, "any", rng.uniform(0, 9, 5), touches)
     message = displacement_message(answer, layer_id="id", body_frame="body", stamp_ns=5 * MS, sequence=8,
                                    solve_seconds=0.25, inputs=stamps, fade=0.5, why="another")  # fmt: skip
     sent = deserialize_message(serialize_message(message), SkinDisplacement)
