@@ -61,7 +61,8 @@ class Hearing:
         self.on_instant: Callable[[Instant], None] = lambda instant: None
         self._topics: list[Any] = []
         self._listened: dict[str, list[Any]] = {}  # subscriptions of each tool
-        self._strangers: set[str] = set()
+        self._unknown: dict[str, str] = {}  # topics of poses at the last look, by tool, whose surface is not known
+        self._strangers: set[str] = set()  # tools that were told of, or taken away
 
     @property
     def tools(self) -> Tools:
@@ -111,15 +112,17 @@ class Hearing:
         self.gate.refuse("mesh", f"mesh of '{tool.name}' refused: {error}")
 
     def look_for_strangers(self) -> None:
-        """Tells once of each tool whose poses are sent and whose surface is not known."""
+        """Tells once of each tool whose poses are sent and whose surface is not known, at the second look."""
+        before, self._unknown = self._unknown, {}
         for topic, _ in self._node.get_topic_names_and_types():
             parts = topic.removeprefix(self._node.get_namespace().rstrip("/") + "/").split("/")
-            if len(parts) == 3 and parts[0] == "tools" and parts[2] == "pose":
-                name = parts[1]
-                if not self._knows(name) and name not in self._strangers and self._node.count_publishers(topic):
-                    self._strangers.add(name)
-                    self.gate.say(f"stranger {name}", f"{topic}: poses come, but no surface of '{name}' that can be "
-                                  "used is on contact_mesh; they are not heard")  # fmt: skip
+            if len(parts) == 3 and parts[0] == "tools" and parts[2] == "pose" and self._node.count_publishers(topic):
+                self._unknown |= {} if self._knows(parts[1]) else {parts[1]: topic}
+        for name in self._unknown.keys() & before.keys() - self._strangers:
+            self._strangers.add(name)
+            topic = self._unknown[name]
+            self.gate.say(f"stranger {name}", f"{topic}: poses come, but no surface of '{name}' that can be used is on "
+                          "contact_mesh; they are not heard")  # fmt: skip
 
     def _knows(self, name: str) -> bool:
         """Whether a tool is in use, or its field is being built."""

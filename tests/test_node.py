@@ -3,14 +3,18 @@
 import ast
 import importlib.util
 import os
+import runpy
 import signal
 import time
+from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
+from typing import NamedTuple
 
 import numpy as np
 import pytest
 import rclpy
+import trimesh
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import Point, PoseStamped, Vector3, WrenchStamped
@@ -33,8 +37,8 @@ from stmpl_msgs.srv import Calibrate, SetBody
 
 from bags.reader import Bag
 from bags.replay import replay_run
-from bags.wire import layer_from, pose_message, pose_of_tool, stamp_ns, tool_message, wrench_message
-from stmpl_core import Simulator
+from bags.wire import header, layer_from, pose_message, pose_of_tool, stamp_ns, tool_message, wrench_message
+from stmpl_core import Simulator, Tool
 from stmpl_core.errors import FrameError, InvalidInput
 from stmpl_core.layer import layer_id
 from stmpl_core.methods import MomentNet
@@ -109,6 +113,10 @@ class Hand:
         self.wrench = bus.node.create_publisher(WrenchStamped, f"tools/{name}/wrench", STREAM)
         if announce:
             bus.mesh.publish(tool_message(ball().named(name), bus.now()))
+
+    def take_away(self) -> None:
+        """Announces a surface without triangles."""
+        self.bus.mesh.publish(ContactMesh(header=header(self.name, self.bus.now())))
 
     def ready(self) -> "Hand":
         self.bus.wait(lambda: self.pose.get_subscription_count() and self.wrench.get_subscription_count(), "the node")
@@ -390,6 +398,74 @@ def test_a_tool_may_announce_itself_as_a_shape(bus, hand):
     np.testing.assert_array_equal(rows(shaped), rows(hand.ask(HERE)))
 
 
+def test_a_tool_is_taken_away_and_the_others_go_on(bus):
+    left, right = (bus.tool(name).ready() for name in ("left", "right"))
+    bus.listen(WrenchStamped, "tools/left/contact_wrench", STREAM)
+    wrenches = bus.got["tools/left/contact_wrench"]
+    bus.still()
+    there = at(-TOUCH, 0, LENGTH / 2)
+
+    def both() -> SkinDisplacement | None:
+        """The answer to an instant of both tools, once the left one's wrench is heard too."""
+        stamp = left.send(HERE)
+        right.pose.publish(pose_message(there, "body", stamp))
+        bus.spin(0.05)
+        answers = [answer for answer in bus.answers(stamp) if len(answer.touches) == 2]
+        return answers[0] if answers and wrenches else None
+
+    assert statuses(bus.wait(both, "an answer to both")) == {"left": BY_POSE, "right": BY_POSE}
+    assert wrenches[-1].wrench.force.x < 0
+    left.take_away()
+
+    def gone() -> bool:
+        right.send(there)
+        bus.spin(0.02)
+        return not any(count for count in (left.pose.get_subscription_count(), left.wrench.get_subscription_count(),
+                                           bus.node.count_publishers("tools/left/contact_wrench"),
+                                           bus.node.count_publishers("tools/left/local_contact")))  # fmt: skip
+
+    bus.wait(gone, "the topics of the tool to close")
+    assert wrenches[-1].wrench.force.x == 0, "who listened is told that it exerts nothing any more"
+    bus.wait(lambda: bus.said("'left' is taken away"), "the log line")
+    alone = right.ask(there)
+    assert statuses(alone) == {"right": BY_POSE} and rows(alone).any()
+    right.take_away()
+    rest = bus.wait(lambda: not (last := bus.got["skin/displacement"][-1]).touches and last, "rest")
+    assert not rows(rest).any() and rest.why == "'right' was taken away: back at rest"
+    bus.spin(1.0)
+    assert bus.got["skin/displacement"][-1] is rest, "rest is said once"
+
+    bus.mesh.publish(tool_message(ball().named("left"), bus.now()))  # it may come back
+    assert statuses(left.ready().ask(HERE)) == {"left": BY_POSE}
+    left.take_away()
+    bus.still()
+    bus.spin(2.5)
+    assert not bus.said("no surface of 'left'"), "who takes a tool away may go on sending where it is"
+
+
+def test_a_tool_that_is_taken_away_while_its_field_is_built_is_not_taken_into_use(bus):
+    sphere = trimesh.creation.icosphere(5, 0.03)
+    bus.mesh.publish(tool_message(Tool("early", sphere.vertices, sphere.faces), bus.now()))
+    early = Hand(bus, "early", announce=False)
+    early.take_away()
+    bus.wait(lambda: bus.said("'early' is taken away"), "the log line")
+    bus.tool("later").ready()
+    bus.spin(2.0)
+    assert not early.pose.get_subscription_count() and not bus.said("tool 'early': ")
+
+
+def test_poses_of_a_tool_that_nobody_announced_are_told_of_once(bus):
+    ghost, until = Hand(bus, "ghost", announce=False), time.monotonic() + 5.0
+    bus.wait(lambda: bus.said("no surface of 'ghost'"), "the log line")
+    while time.monotonic() < until:
+        ghost.press()
+        bus.spin(0.05)
+    (line,) = bus.said("no surface of 'ghost'")
+    assert line.startswith("/robot/tools/ghost/pose: poses come") and "they are not heard" in line
+    assert not ghost.pose.get_subscription_count()
+    assert not bus.said("no surface of 'probe'"), "a tool that was announced is none"
+
+
 def xyz(vector) -> SimpleNamespace:
     return SimpleNamespace(**dict(zip("xyz", vector, strict=True)))
 
@@ -581,8 +657,18 @@ def test_a_node_may_be_cleaned_up_set_up_anew_and_answers_on_what_was_set(bus, h
     assert answer.layer_id == topology.layer_id and len(bus.got["skin/displacement"]) == before + 1, "answered once"
 
 
-def test_the_node_runs_beside_another_in_any_executor():
-    """In this process: SkinNode is an ordinary node to whoever composes."""
+class Composed(NamedTuple):
+    """A SkinNode in this process beside another node, which moves a tool and hears answers."""
+
+    node: SkinNode
+    heard: list[SkinDisplacement]
+    press: Callable[[], int]
+    wait: Callable[[Callable[[], object]], None]
+
+
+@pytest.fixture
+def composed():
+    """SkinNode is an ordinary node to whoever composes."""
     context = rclpy.Context()
     context.init(domain_id=int(os.environ["ROS_DOMAIN_ID"]) + BUSES)
     executor = SingleThreadedExecutor(context=context)
@@ -592,22 +678,81 @@ def test_the_node_runs_beside_another_in_any_executor():
     other.create_subscription(SkinDisplacement, "skin/displacement", heard.append, STREAM)
     mesh = other.create_publisher(ContactMesh, "contact_mesh", KEPT)
     pose = other.create_publisher(PoseStamped, "tools/finger/pose", STREAM)
+
+    def press() -> int:
+        stamp = other.get_clock().now().nanoseconds
+        pose.publish(pose_message(HERE, "body", stamp))
+        return stamp
+
+    def wait(done: Callable[[], object]) -> None:
+        until = time.monotonic() + PATIENCE
+        while not done():
+            assert time.monotonic() < until
+            executor.spin_once(timeout_sec=0.02)
+
     try:
         executor.add_node(node)
         executor.add_node(other)
         node.trigger_configure()
         node.trigger_activate()
         mesh.publish(tool_message(ball().named("finger"), 0))
-        until = time.monotonic() + PATIENCE
-        while not heard and time.monotonic() < until:
-            pose.publish(pose_message(HERE, "body", other.get_clock().now().nanoseconds))
-            executor.spin_once(timeout_sec=0.02)
-        assert heard and rows(heard[-1]).any()
+        wait(pose.get_subscription_count)
+        yield Composed(node, heard, press, wait)
     finally:
         executor.shutdown()
         node.destroy_node()
         other.destroy_node()
         context.try_shutdown()
+        context.destroy()
+
+
+def test_the_node_runs_beside_another_in_any_executor(composed):
+    composed.wait(lambda: composed.press() and composed.heard)
+    assert rows(composed.heard[-1]).any()
+
+
+def test_whatever_fails_inside_an_answer_is_told_and_the_next_instant_is_answered(composed, monkeypatch, capfd):
+    simulator, failed = composed.node.answering.simulator, []
+    step = simulator.step
+
+    def fails_once(contacts):
+        if not failed:
+            failed.append(contacts[0])
+            raise RuntimeError("an accident")
+        return step(contacts)
+
+    monkeypatch.setattr(simulator, "step", fails_once)
+    composed.wait(lambda: composed.press() and failed)
+    refused = round(1e9 * failed[0].time)
+    assert composed.node.tally.refused == 1
+    assert composed.node.tally.last_refusal == "no answer to finger: an accident"
+    composed.wait(lambda: composed.press() and composed.heard)
+    assert rows(composed.heard[0]).any() and stamp_ns(composed.heard[0]) > refused
+    assert composed.node.tally.refused == 1
+    assert capfd.readouterr().err.count("refused: no answer to finger: an accident\n") == 1
+
+
+def test_two_nodes_on_one_topic_tell_of_each_other_and_of_one_of_their_name():
+    twins, command = Bus("/twins"), ("-c", NODE, "--ros-args", "-r", "__ns:=/twins")
+
+    def told(twin: str) -> set[str]:
+        where = f"there is another node {twin} on /twins/skin/displacement: listeners get the answers of both"
+        return {line.name for line in twins.got["/rosout"] if line.msg.startswith(where) and "__ns:=" in line.msg}
+
+    namesake = None
+    try:
+        with running(*command):
+            twins.wait(lambda: twins.got["skin/topology"], "skin/topology")
+            twins.spin(2.5)
+            assert not told("that answers") | told("of the same name"), "one alone is no twin"
+            with running(*command, "-r", "__node:=other"):
+                twins.wait(lambda: told("that answers") == {"twins.stmpl", "twins.other"}, "both log lines")
+            namesake = rclpy.create_node("stmpl", namespace="/twins")
+            twins.wait(lambda: "twins.stmpl" in told("of the same name"), "word of the namesake")
+    finally:
+        if namesake:
+            namesake.destroy_node()
+        twins.node.destroy_node()
 
 
 def test_a_remapped_topic_is_heard_and_a_killed_node_is_told_by_its_liveliness(bus):
@@ -674,8 +819,13 @@ def test_a_launch_file_imports_only_launch_and_names_verbs_and_flags_that_exist(
     assert code == 0 and all(flag in told for flag in flags)
 
 
-def test_everything_that_colcon_installs_is_there():
-    text = (ROOT / "setup.py").read_text()
+def test_everything_that_colcon_installs_is_there(monkeypatch):
+    given = {}
+    monkeypatch.setenv("ROS_DISTRO", "jazzy")
+    monkeypatch.setattr("setuptools.setup", lambda **arguments: given.update(arguments))
+    monkeypatch.chdir(ROOT)
+    runpy.run_path("setup.py")
+    installed = {folder: {Path(file).resolve() for file in files} for folder, files in given["data_files"]}
     for folder in ("launch", "config"):
-        for path in (ROOT / folder).iterdir():
-            assert f'"{folder}/{path.name}"' in text
+        assert installed[f"share/stmpl_ros/{folder}"] == {path.resolve() for path in (ROOT / folder).iterdir()}
+    assert all(file.is_file() for files in installed.values() for file in files)
