@@ -17,7 +17,7 @@ from bags.provenance import LAYER, RECORD, Provenance, layer_from_bytes, provena
 from bags.records import Damage, End, Place, Record, bag_file, read_places, summary, walk, walk_places
 from bags.schema import typestore_of
 from bags.wire import frame_from, layer_from, tool_from
-from stmpl_core.errors import BagError
+from stmpl_core.errors import BagError, StmplError
 from stmpl_core.layer import SoftLayer, layer_id
 from stmpl_core.tool import Tool
 
@@ -219,10 +219,18 @@ class Bag:
 
     @cached_property
     def tools(self) -> dict[str, Tool]:
-        """The tools by their names; the last surface of one that was changed."""
+        """The tools by their names; the last surface of one that was changed. What a node refuses is left out."""
         places = sorted(place for topic in self._told(MESH) for place in self._places[topic])
         told = [message for message in map(self.decode, read_places(self.file, places)) if len(message.triangles)]
-        return {tool: tool_from(message) for tool, message in {one.header.frame_id: one for one in told}.items()}
+        found: dict[str, Tool] = {}
+        for message in reversed(told):
+            name = message.header.frame_id
+            if name not in found:
+                try:
+                    found[name] = tool_from(message)
+                except StmplError as error:
+                    log.warning("%s: a surface of '%s' is left out: %s", self.file, name, error)
+        return dict(reversed(found.items()))
 
     def see(self, topic: str, record: Message, place: Place) -> None:
         """Called for each message while the file is looked over; keeps the places of the large ones."""

@@ -117,11 +117,10 @@ def wrench_from(
     frame, wrench = message.header.frame_id, finite(f"wrench of {tool}", _six(message.wrench), (6,))
     if frame == body_frame:
         return wrench
-    placed = {**frames, tool: pose_body_from_tool}
-    if frame not in placed:
-        known = "', '".join([body_frame, *placed])
+    if frame != tool and frame not in frames:  # frames of /tf are found when asked for, and not listed
+        known = "', '".join([body_frame, *frames, tool])
         raise FrameError(f"the wrench of {tool} is in frame '{frame}'; known are '{known}'.")
-    rotation = placed[frame][:3, :3]
+    rotation = (pose_body_from_tool if frame == tool else frames[frame])[:3, :3]
     return np.concatenate([rotation @ wrench[:3], rotation @ wrench[3:]])
 
 

@@ -112,6 +112,12 @@ class Answering:
         faded = answer.faded(share, f"{why}: the last answer, faded to {left:.0%}")
         self._send(faded, self._now(), inputs, fade=share)
 
+    def without(self, name: str) -> None:
+        """Tells that a tool, which was taken away, exerts nothing; rest, if no tool of the last answer is left."""
+        self.sending.rest([name], self._now())
+        if self.last is not None and not any(tool in self._hearing.tools for tool in self.last[0].touches):
+            self.rest(f"'{name}' was taken away: back at rest")
+
     def rest(self, why: str) -> None:
         """Sends the skin at rest."""
         tools = list(self.last[0].touches) if self.last else []

@@ -61,7 +61,8 @@ class Hearing:
         self.on_instant: Callable[[Instant], None] = lambda instant: None
         self._topics: list[Any] = []
         self._listened: dict[str, list[Any]] = {}  # subscriptions of each tool
-        self._strangers: set[str] = set()
+        self._unknown: dict[str, str] = {}  # topics of poses at the last look, by tool, whose surface is not known
+        self._strangers: set[str] = set()  # tools that were told of, or taken away
 
     @property
     def tools(self) -> Tools:
@@ -80,8 +81,7 @@ class Hearing:
         """Closes all topics, and forgets all tools."""
         for name in list(self._listened):
             self._stop_listening(name)
-        for tool in self.tools:
-            self.tools.remove(tool.name)
+        self.inbox.tools = Tools(self.tools.margin)
         for subscription in self._topics:
             self._node.destroy_subscription(subscription)
         self._topics.clear()
@@ -112,16 +112,21 @@ class Hearing:
         self.gate.refuse("mesh", f"mesh of '{tool.name}' refused: {error}")
 
     def look_for_strangers(self) -> None:
-        """Tells once of each tool whose poses are sent and whose surface never was."""
+        """Tells once of each tool whose poses are sent and whose surface is not known, at the second look."""
+        before, self._unknown = self._unknown, {}
         for topic, _ in self._node.get_topic_names_and_types():
             parts = topic.removeprefix(self._node.get_namespace().rstrip("/") + "/").split("/")
-            if len(parts) == 3 and parts[0] == "tools" and parts[2] == "pose":
-                name = parts[1]
-                known = name in self.tools or any(tool.name == name for tool in self.tools.waiting())
-                if not known and name not in self._strangers and self._node.count_publishers(topic):
-                    self._strangers.add(name)
-                    self.gate.say(f"stranger {name}", f"{topic}: poses come, but '{name}' never announced its surface "
-                                  "on contact_mesh; they are not heard")  # fmt: skip
+            if len(parts) == 3 and parts[0] == "tools" and parts[2] == "pose" and self._node.count_publishers(topic):
+                self._unknown |= {} if self._knows(parts[1]) else {parts[1]: topic}
+        for name in self._unknown.keys() & before.keys() - self._strangers:
+            self._strangers.add(name)
+            topic = self._unknown[name]
+            self.gate.say(f"stranger {name}", f"{topic}: poses come, but no surface of '{name}' that can be used is on "
+                          "contact_mesh; they are not heard")  # fmt: skip
+
+    def _knows(self, name: str) -> bool:
+        """Whether a tool is in use, or its field is being built."""
+        return name in self.tools or any(tool.name == name for tool in self.tools.waiting())
 
     def _listen(self, kind: Any, topic: str, callback: Callable, profile: Any) -> Any:
         return self.events.subscribe(self._node, kind, topic, callback, profile)
@@ -146,9 +151,10 @@ class Hearing:
         self._announce(message.header.frame_id, len(message.triangles), lambda: wire.tool_from(message))
 
     def _announce(self, name: str, triangles: int, read: Callable[[], Tool]) -> None:
-        if not triangles and name in self._listened:
+        if not triangles and self._knows(name):
             self._stop_listening(name)
             self.tools.remove(name)
+            self._strangers.add(name)  # who takes a tool away may go on sending where it is
             self._node.get_logger().info(f"tool '{name}' is taken away")
             return self.on_removed(name)
         try:
@@ -196,6 +202,9 @@ class Hearing:
         if not kept:
             self.gate.say(f"order of {kind} of {tool}", f"a {kind} of {tool} was dropped: its stamp is not after the "
                           "last one's. Do two devices send under one name, or was a clock set back?")  # fmt: skip
-        instant = self.inbox.take(time.monotonic_ns())
+        try:
+            instant = self.inbox.take(time.monotonic_ns())
+        except StmplError as error:  # a frame that /tf has forgotten since
+            return self.gate.refuse(f"instant, {type(error).__name__}", str(error))
         if instant is not None:
             self.on_instant(instant)

@@ -64,11 +64,12 @@ class SkinNode(LifecycleNode):
         self.tally = Tally()
         self.workshop: Workshop | None = None
         self._making: Beside[Skin] | None = None
+        self._twin = ""  # what the other node is that was told of
         self.calibration = Calibration(self, lambda: self.workshop, lambda e: self.set_body(youngs_modulus=e))
         self.hearing = Hearing(self, lambda: self.config, Tools(), self.tally)
         self.answering = Answering(self, self.settings, self.hearing, self.tally, self.calibration)
         self.hearing.on_tool, self.hearing.on_instant = self._on_tool, self.answering.answer
-        self.hearing.on_removed = lambda name: self.sending.close_tool(name)
+        self.hearing.on_removed = self._on_removed
         self._offer("reset", self.reset)
         self.create_service(SetBody, "~/set_body", self._on_set_body)
 
@@ -282,6 +283,10 @@ class SkinNode(LifecycleNode):
             if self.workshop:
                 self.workshop.renew(error)
 
+    def _on_removed(self, name: str) -> None:
+        self.answering.without(name)
+        self.sending.close_tool(name)
+
     def _fade(self) -> None:
         if self.active:
             self.answering.fade_if_silent()
@@ -309,15 +314,15 @@ class SkinNode(LifecycleNode):
         self.diagnostics.publish(diagnostics(statuses, self.get_clock().now().to_msg()))
 
     def _look_for_twins(self) -> None:
-        """Tells of other nodes that answer on the same topic, or bear the same name."""
+        """Tells, once as they come, of other nodes that answer on the same topic, or bear the same name."""
         topic, me = "skin/displacement", (self.get_name(), self.get_namespace())
-        others = self.count_publishers(topic) - 1
         named = sum(one == me for one in self.get_node_names_and_namespaces()) - 1
-        if others > 0 or named > 0:
-            twin = "of the same name" if named > 0 else "that answers"
+        before, self._twin = self._twin, "that answers" if self.count_publishers(topic) > 1 else ""
+        self._twin = "of the same name" if named > 0 else self._twin
+        if self._twin not in ("", before):
             where = self.resolve_topic_name(topic)
-            self.hearing.gate.say("twin", f"there is another node {twin} on {where}: listeners get the answers of "
-                                  "both. Give each a namespace: --ros-args -r __ns:=/left")  # fmt: skip
+            self.hearing.gate.say("twin", f"there is another node {self._twin} on {where}: listeners get the answers "
+                                  "of both. Give each a namespace: --ros-args -r __ns:=/left")  # fmt: skip
 
     def _now(self) -> int:
         return self.get_clock().now().nanoseconds

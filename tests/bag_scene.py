@@ -8,15 +8,15 @@ from typing import Any
 import numpy as np
 import pytest
 import trimesh
-from bags.messages import contact_from, layer_id, tool_mesh_from
 
 from bags.provenance import write_provenance
 from bags.schema import find_schema, typestore_of
+from bags.wire import contact_from, quaternion_from, tool_from
 from bags.writer import BagWriter, qos_yaml
-from stmpl_core import SoftLayer, Tissue
+from stmpl_core import Answer, SoftLayer, Tissue, Touch
+from stmpl_core.layer import layer_id
 from stmpl_core.methods.base import Method
 from stmpl_core.simulator import Simulator
-from stmpl_core.trust import Displacement
 from stmpl_ros.cli import main
 
 TYPES = {
@@ -94,7 +94,7 @@ def topology(layer: SoftLayer) -> Any:
                    poisson_ratio=layer.tissue.poisson_ratio, density=layer.tissue.density)  # fmt: skip
 
 
-def displacement(answer: Displacement, layer: SoftLayer, stamp: int, sequence: int) -> Any:
+def displacement(answer: Answer, layer: SoftLayer, stamp: int, sequence: int) -> Any:
     """An answer as SkinDisplacement."""
     trust = answer.trust
     pressure = np.zeros(0) if answer.pressure is None else answer.pressure
@@ -102,10 +102,22 @@ def displacement(answer: Displacement, layer: SoftLayer, stamp: int, sequence: i
                    displacement=answer.displacement.astype(np.float32).ravel(), pressure=pressure.astype(np.float32),
                    method=answer.method, converged=trust.converged, in_range=trust.in_range,
                    error_bound=float("nan") if trust.error_bound is None else trust.error_bound, why=trust.why,
-                   tools=list(answer.statuses), statuses=list(answer.statuses.values()),
-                   pose_stamps=[header("", stamp).stamp] * len(answer.statuses),
-                   wrench_stamps=[header("", stamp).stamp] * len(answer.statuses),
+                   touches=[touched(touch, stamp) for touch in answer.touches.values()],
                    fade=1.0, solve_seconds=0.001)  # fmt: skip
+
+
+def touched(touch: Touch, stamp: int) -> Any:
+    """What one tool does, by pose and wrench of one stamp, as stmpl_msgs/Touch."""
+    (x, y, z), turn = touch.pose_body_from_tool[:3, 3], quaternion_from(touch.pose_body_from_tool[:3, :3])
+    point = message("geometry_msgs/msg/Point", x=x, y=y, z=z)
+    turned = message("geometry_msgs/msg/Quaternion", **dict(zip("xyzw", turn, strict=True)))
+    placed = message("geometry_msgs/msg/Pose", position=point, orientation=turned)
+    force, torque = (message("geometry_msgs/msg/Vector3", **dict(zip("xyz", values, strict=True)))
+                     for values in (touch.wrench[:3], touch.wrench[3:]))  # fmt: skip
+    return message("stmpl_msgs/msg/Touch", tool=touch.name, status=touch.status, pose=placed,
+                   wrench=message("geometry_msgs/msg/Wrench", force=force, torque=torque), depth=touch.depth,
+                   force_bound=touch.force_bound, in_range=touch.trust.in_range,
+                   pose_stamp=header("", stamp).stamp, wrench_stamp=header("", stamp).stamp)  # fmt: skip
 
 
 def write_run(folder: Path, method: Method, *, layer: SoftLayer | None = None, frames: int = 40, rate: float = 100.0,
@@ -126,11 +138,11 @@ def write_run(folder: Path, method: Method, *, layer: SoftLayer | None = None, f
         tools = {(tool, kind): bag.add_channel(f"{namespace}/tools/{tool}/{kind}", TYPES[kind], stream)
                  for tool in ANGLES for kind in ("pose", "wrench")}  # fmt: skip
         bag.write(skin, cdr(topology(layer)), START, START)
-        meshes = {}
+        known = {}
         for tool in ANGLES:
             sent = message("mesh", header=header(tool, START), vertices=vertices.ravel(), triangles=triangles.ravel())
             bag.write(surface, cdr(sent), START, START)
-            meshes[tool] = tool_mesh_from(sent)
+            known[tool] = tool_from(sent)
         sequence = 0
         for k in range(frames):
             stamp = START + round((k + 1) * 1e9 / rate)
@@ -140,7 +152,7 @@ def write_run(folder: Path, method: Method, *, layer: SoftLayer | None = None, f
                 instant = pose(ANGLES[tool], height, gap, stamp), wrench(tool, newtons, stamp)
                 for kind, made in zip(("pose", "wrench"), instant, strict=True):
                     bag.write(tools[tool, kind], cdr(made), stamp + 100_000, stamp)
-                contacts.append(contact_from(tool, meshes[tool], *instant, body_frame="body"))
+                contacts.append(contact_from(known[tool], *instant, body_frame="body"))
             if k in skip:
                 continue
             answer = simulator.step(contacts)

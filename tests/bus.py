@@ -12,10 +12,10 @@ from typing import Any
 
 import numpy as np
 import rclpy
-from bags.messages import stamp_ns
 from rcl_interfaces.msg import Log
 from stmpl_msgs.msg import SkinDisplacement, SkinTopology
 
+from bags.wire import stamp_ns
 from stmpl_ros.topics import KEPT, STREAM
 
 ROOT = Path(__file__).parents[1]
@@ -68,6 +68,11 @@ def rows(answer: SkinDisplacement) -> np.ndarray:
     return np.frombuffer(answer.displacement, np.float32).reshape(-1, 3)
 
 
+def statuses(answer: SkinDisplacement) -> dict[str, str]:
+    """The status of each tool of an answer."""
+    return {touch.tool: touch.status for touch in answer.touches}
+
+
 class Robot:
     """A node that hears the skin, and waits."""
 
@@ -99,7 +104,7 @@ class Robot:
 
     def still(self) -> None:
         """Waits until the skin is at rest, so that no other tool is waited for."""
-        self.wait(lambda: not (said := self.got["skin/displacement"]) or not said[-1].tools, "rest")
+        self.wait(lambda: not (said := self.got["skin/displacement"]) or not said[-1].touches, "rest")
 
     def answers(self, stamp: int) -> list[SkinDisplacement]:
         """Answers to the instant `stamp` [ns]."""

@@ -11,7 +11,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from bags.messages import contact_from, layer_from, layer_id, pose_from, wrench_from
 from mcap.reader import make_reader
 from rosbags.rosbag2 import Reader
 
@@ -20,9 +19,11 @@ from bags.reader import Bag
 from bags.records import bag_file
 from bags.recover import recover
 from bags.schema import find_schema, typestore_of
+from bags.wire import contact_from, layer_from, pose_from, wrench_from
 from bags.writer import FILE, BagWriter, Offered, offered, qos_yaml
-from stmpl_core.contact import ToolMesh
+from stmpl_core import Tool
 from stmpl_core.errors import BagError, FrameError, InvalidInput
+from stmpl_core.layer import layer_id
 from tests.bag_scene import START, STORE, ball, cdr, header, message, pose, tube, wrench
 
 HEADER = "std_msgs/msg/Header"
@@ -268,15 +269,30 @@ def test_poses_and_wrenches_in_a_frame_that_the_recording_carries_count_as_in_th
         write_provenance(bag, None, method="winkler", frames={"table": place})
     frames = Bag(tmp_path).provenance.frames
     assert frames["table"].tobytes() == place.tobytes()
-    mesh, sent, push = ToolMesh.of(*ball()), pose(0.3, 0.06, 0.0, START), wrench("ball", 0.2, START)
+    tool, sent, push = Tool("ball", *ball()), pose(0.3, 0.06, 0.0, START), wrench("ball", 0.2, START)
     sent.header.frame_id = push.header.frame_id = "table"
-    contact = contact_from("ball", mesh, sent, push, body_frame="body", frames=frames)
+    contact = contact_from(tool, sent, push, body_frame="body", frames=frames)
     assert np.array_equal(contact.pose_body_from_tool, place @ pose_from(sent.pose))
     assert contact.wrench is not None
     np.testing.assert_allclose(contact.wrench[:3], turn @ [-0.2, 0, 0], atol=1e-16)
     for wrong in ({}, {"chair": place}):
         with pytest.raises(FrameError, match="in frame 'table'; known are 'body"):
-            contact_from("ball", mesh, sent, push, body_frame="body", frames=wrong)
+            contact_from(tool, sent, push, body_frame="body", frames=wrong)
+
+
+def test_a_surface_that_a_node_refuses_is_left_out_of_a_recording_and_the_one_before_it_stays(tmp_path, caplog):
+    vertices, triangles = ball()
+    sent = [("ball", 1.0, triangles), ("ball", 1e3, triangles), ("other", 1.0, triangles),
+            ("other", 1.0, triangles[:0])]  # fmt: skip
+    with BagWriter(tmp_path) as bag:
+        channel = bag.add_channel("/contact_mesh", "stmpl_msgs/msg/ContactMesh")
+        for k, (name, scale, faces) in enumerate(sent):
+            made = message("mesh", header=header(name, START + k), vertices=scale * vertices.ravel(),
+                           triangles=faces.ravel())  # fmt: skip
+            bag.write(channel, cdr(made), START + k, START + k)
+    tools = Bag(tmp_path).tools
+    assert list(tools) == ["ball", "other"] and np.ptp(tools["ball"].vertices) < 0.03
+    assert "a surface of 'ball' is left out" in caplog.text and "millimetres" in caplog.text
 
 
 def test_a_topology_message_says_a_float32_layer_exactly():

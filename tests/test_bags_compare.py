@@ -8,7 +8,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from bags.messages import layer_id
 
 from bags import records
 from bags.compare import compare_bags, compare_run, headline, sample
@@ -20,8 +19,10 @@ from bags.run import Run
 from bags.survey import survey
 from bags.writer import BagWriter
 from stmpl_core.errors import BagError
+from stmpl_core.layer import layer_id
 from stmpl_core.methods import Winkler
 from stmpl_core.provenance import processor
+from stmpl_core.touch import Answer
 from stmpl_core.trust import Displacement, Trust
 from stmpl_ros.view.recording import Recording
 from tests.bag_scene import stmpl, tube, write_run
@@ -79,7 +80,7 @@ def test_a_recording_names_the_processor_and_another_one_may_differ_in_the_last_
 
 def test_an_answer_that_is_no_number_passes_no_tolerance(run):
     frame = next(Bag(run).frames())
-    replayed = Replayed(frame, Displacement(np.full(frame.displacement.shape, np.nan), Trust(), "none"))
+    replayed = Replayed(frame, Answer(np.full(frame.displacement.shape, np.nan), Trust(), "none"))
     assert not replayed.identical and replayed.difference == float("inf")
 
 

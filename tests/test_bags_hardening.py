@@ -15,6 +15,7 @@ from bags.reader import Bag
 from bags.records import CHUNK, Damage, End, Record, summary, walk
 from bags.recover import recover
 from bags.replay import replay_run
+from bags.run import Run
 from bags.writer import BagWriter
 from stmpl_core.errors import BagError
 from stmpl_core.methods import Linear, MomentNet, Winkler
@@ -237,3 +238,22 @@ def test_the_sample_replays_as_recorded():
     summary = replay_run(SAMPLE, MomentNet(), every=50)
     assert summary.frames > 5
     assert summary.passed, f"{summary} If it was meant to change, docs/bags.md says how to record it again."
+
+
+def test_the_answers_of_a_recording_from_before_touches_are_read_and_say_what_they_knew():
+    """Its messages name tools, statuses and stamps alone: pose, wrench, depth and bound are not a number."""
+    bag = Bag(SAMPLE)
+    schemas = [record for record in walk(bag.file) if isinstance(record, Schema)]
+    (told,) = {schema.data for schema in schemas if schema.name.endswith("SkinDisplacement")}
+    assert b"string[] statuses" in told and b"Touch" not in told, "the sample is of today's form: give an older one"
+    frames, sent = list(bag.frames()), (one.message for one in bag.messages(lambda topic: "displacement" in topic))
+    assert len(frames) == bag.answers > 100 and any(frame.touches for frame in frames)
+    for frame, message in zip(frames, sent, strict=True):
+        assert {name: touch.status for name, touch in frame.touches.items()} == dict(
+            zip(message.tools, message.statuses, strict=True)
+        )
+        for touch in frame.touches.values():
+            assert frame.inputs[touch.name][0] > 0 and touch.pressure is None
+            assert np.isnan([touch.depth, touch.force_bound, *touch.wrench, *touch.pose_body_from_tool.ravel()]).all()
+    pressed = next(frame for frame in frames if any(touch.presses for touch in frame.touches.values()))
+    assert [contact.name for contact in Run(SAMPLE).contacts(pressed)] == list(pressed.touches)

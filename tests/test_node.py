@@ -3,15 +3,18 @@
 import ast
 import importlib.util
 import os
+import runpy
 import signal
 import time
+from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
+from typing import NamedTuple
 
 import numpy as np
 import pytest
 import rclpy
-from bags.messages import layer_from, layer_id, stamp_ns
+import trimesh
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import Point, PoseStamped, Vector3, WrenchStamped
@@ -31,25 +34,28 @@ from shape_msgs.msg import Mesh, MeshTriangle
 from std_srvs.srv import Trigger
 from stmpl_msgs.msg import ContactMesh, LocalContact, SkinDisplacement, SkinTopology
 from stmpl_msgs.srv import Calibrate, SetBody
-from stmpl_ros.adapters import GazeboContacts, gazebo_wrench
-from stmpl_ros.cloud import FIELDS, SkinCloud
-from stmpl_ros.conversions import STALE, checked_pose, mesh_message, pose_message, wrench_message
-from stmpl_ros.skin import Skin, published
 
 from bags.reader import Bag
 from bags.replay import replay_run
+from bags.wire import header, layer_from, pose_message, pose_of_tool, stamp_ns, tool_message, wrench_message
+from stmpl_core import Simulator, Tool
 from stmpl_core.errors import FrameError, InvalidInput
+from stmpl_core.layer import layer_id
 from stmpl_core.methods import MomentNet
-from stmpl_core.sdf import SignedDistance
-from stmpl_core.touch import BY_POSE, MOVED, TOUCHING, Toucher
+from stmpl_core.skin import published
+from stmpl_core.touch import BY_POSE, MOVED, STALE, TOUCHING
+from stmpl_core.toucher import Toucher
 from stmpl_core.trust import Displacement, Trust
 from stmpl_ros.frames import Frames, read_frames
+from stmpl_ros.gazebo import GazeboContacts, gazebo_wrench
 from stmpl_ros.limits import Limits
+from stmpl_ros.making import restiffened, skin_of
 from stmpl_ros.node import SkinNode
 from stmpl_ros.parameters import NodeConfig
 from stmpl_ros.settings import checked
+from stmpl_ros.show import FIELDS, SkinCloud
 from stmpl_ros.topics import KEPT, LEASE, STREAM
-from tests.bus import PATIENCE, ROOT, Robot, end, rows, running, start
+from tests.bus import PATIENCE, ROOT, Robot, end, rows, running, start, statuses
 from tests.conftest import BUSES
 from tests.scenes import LENGTH, RADIUS, at, ball, contact_of, limb
 
@@ -106,7 +112,11 @@ class Hand:
         self.pose = bus.node.create_publisher(PoseStamped, f"tools/{name}/pose", STREAM)
         self.wrench = bus.node.create_publisher(WrenchStamped, f"tools/{name}/wrench", STREAM)
         if announce:
-            bus.mesh.publish(mesh_message(name, ball(), bus.now()))
+            bus.mesh.publish(tool_message(ball().named(name), bus.now()))
+
+    def take_away(self) -> None:
+        """Announces a surface without triangles."""
+        self.bus.mesh.publish(ContactMesh(header=header(self.name, self.bus.now())))
 
     def ready(self) -> "Hand":
         self.bus.wait(lambda: self.pose.get_subscription_count() and self.wrench.get_subscription_count(), "the node")
@@ -200,7 +210,7 @@ def test_a_running_node_honours_what_may_be_set_at_any_time(bus, hand):
     assert bus.set(max_age=0.0, fade=0.0)[0].successful
     hand.ask(HERE, PUSH)
     bus.still()
-    assert not [a for a in bus.got["skin/displacement"][-2:] if STALE in a.statuses], "fade 0 rests at once"
+    assert not [a for a in bus.got["skin/displacement"][-2:] if STALE in statuses(a).values()], "fade 0 rests at once"
     hand.pose.publish(pose_message(HERE, "body", old))
     bus.answer(old)
     assert bus.set(max_age=1.0, fade=0.6)[0].successful
@@ -224,9 +234,9 @@ def test_reset_brings_the_skin_to_rest_and_forgets_the_last_wrench(bus, hand):
     answer = bus.call(Trigger, "reset")
     assert answer.success and "at rest" in answer.message
     rest = bus.wait(lambda: bus.got["skin/displacement"][before:], "the skin at rest")[0]
-    assert not rows(rest).any() and not rest.tools and "reset" in rest.why
+    assert not rows(rest).any() and not rest.touches and "reset" in rest.why
     again = hand.ask(HERE)
-    assert list(again.statuses) == [BY_POSE], "the wrench from before the reset is forgotten"
+    assert statuses(again) == {"probe": BY_POSE}, "the wrench from before the reset is forgotten"
 
 
 @pytest.mark.parametrize(
@@ -237,7 +247,7 @@ def test_reset_brings_the_skin_to_rest_and_forgets_the_last_wrench(bus, hand):
 def test_a_body_that_cannot_be_is_refused_and_the_node_goes_on(bus, hand, change, says):
     answer = bus.call(SetBody, "set_body", **change)
     assert not answer.success and says in answer.message
-    assert list(hand.ask(HERE, PUSH).statuses) == [TOUCHING]
+    assert statuses(hand.ask(HERE, PUSH)) == {"probe": TOUCHING}
 
 
 def test_another_body_takes_over_while_the_node_goes_on_answering(bus, hand):
@@ -259,27 +269,29 @@ def test_another_body_takes_over_while_the_node_goes_on_answering(bus, hand):
     assert topology.layer_id == layer_id(layer) != bus.got["skin/topology"][0].layer_id
     meanwhile = [a for a in bus.got["skin/displacement"][before:] if a.layer_id != topology.layer_id]
     assert len(meanwhile) > 10, "the old skin answered until the new one took over"
-    assert not [a for a in meanwhile if not a.tools], "nothing went to rest meanwhile"
+    assert not [a for a in meanwhile if not a.touches], "nothing went to rest meanwhile"
     assert hand.ask(HERE, PUSH).layer_id == topology.layer_id
     assert bus.get("youngs_modulus", "thickness") == [2e3, 6e-3]
 
 
 def test_another_stiffness_alone_is_at_hand_at_once_and_answers_as_one_that_was_made():
     config = NodeConfig(thickness=7e-3)
-    given = Skin.of(config, skin)
+    given, contact = skin_of(config, skin), contact_of(ball(), HERE, PUSH)
+    Simulator(given).step([contact])  # what the old one was asked leaves no trace
     harder = config.model_copy(update={"youngs_modulus": 3e3})
-    quick, made = given.stiffened(harder), Skin.of(harder, skin)
-    assert quick.layer_id == made.layer_id != given.layer_id
-    contact = contact_of(ball(), HERE, PUSH)
-    assert quick.simulator().step([contact]).displacement.tobytes() == (
-        made.simulator().step([contact]).displacement.tobytes()
+    quick, made = restiffened(given, harder, {"youngs_modulus"}), skin_of(harder, skin)
+    assert quick is not None and quick.layer_id == made.layer_id != given.layer_id
+    assert Simulator(quick).step([contact]).displacement.tobytes() == (
+        Simulator(made).step([contact]).displacement.tobytes()
     )
+    assert restiffened(given, harder, {"youngs_modulus", "thickness"}) is None
+    assert restiffened(given, harder.model_copy(update={"method": "fem"}), {"youngs_modulus"}) is None
 
 
 def test_calibrate_finds_the_stiffness_and_the_offset_that_the_robots_presses_had(bus):
-    hidden, back, mesh = 4.2e3, 0.8e-3, ball()
+    hidden, back = 4.2e3, 0.8e-3
     layer = skin(NodeConfig(**dict(zip(asked := ("thickness",), bus.get(*asked), strict=True)), youngs_modulus=hidden))
-    toucher, field = Toucher(published(layer)), SignedDistance.of(mesh)
+    toucher, tool = Toucher(published(layer)), ball().named("finger")
     hand = bus.tool("finger").ready()
     bus.still()
     bus.call(Trigger, "reset")
@@ -287,8 +299,8 @@ def test_calibrate_finds_the_stiffness_and_the_offset_that_the_robots_presses_ha
     assert not few.success and "0 of 0 instants pressed" in few.message and few.presses == 0
     for depth in np.linspace(0.4e-3, 3e-3, 24):
         pose = at(RADIUS + 0.012 - depth, 0, LENGTH / 2)
-        wrench = toucher.touch(contact_of(mesh, pose, name="finger"), field).wrench
-        assert list(hand.ask(at(back, 0, 0) @ pose, wrench).statuses) in ([TOUCHING], [MOVED])
+        wrench = toucher.touch(contact_of(tool, pose, name="finger")).wrench
+        assert statuses(hand.ask(at(back, 0, 0) @ pose, wrench))["finger"] in (TOUCHING, MOVED)
     nobody = bus.call(Calibrate, "calibrate", tool="nobody")
     assert not nobody.success and "0 of 0" in nobody.message
     before, layers = len(bus.got["skin/displacement"]), len(bus.got["skin/topology"])
@@ -326,7 +338,7 @@ def test_poses_and_wrenches_in_a_listed_frame_count_as_in_the_bodys(bus, hand):
     turn = TABLE[:3, :3].T
     in_table = np.concatenate([turn @ PUSH[:3], turn @ PUSH[3:]])
     answer = hand.ask(np.linalg.inv(TABLE) @ HERE, in_table, frame="table")
-    assert answer.header.frame_id == "body" and list(answer.statuses) == [TOUCHING]
+    assert answer.header.frame_id == "body" and statuses(answer) == {"probe": TOUCHING}
     np.testing.assert_allclose(rows(answer), rows(own), atol=1e-7)
 
 
@@ -368,9 +380,9 @@ def test_a_file_of_frames_that_cannot_be_read_is_refused(tmp_path, text):
 
 def test_the_example_of_frames_is_read_and_unknown_frames_stay_unknown():
     frames = Frames("body", read_frames(str(ROOT / "config/frames.yaml")))
-    assert frames.of("table") is not None and frames.of("nowhere") is None
+    assert frames["table"].shape == (4, 4) and "nowhere" not in frames
     with pytest.raises(FrameError, match="in frame 'nowhere'"):
-        checked_pose(pose_message(np.eye(4), "nowhere", 0), "probe", "body", frames.of("nowhere"))
+        pose_of_tool(pose_message(np.eye(4), "nowhere", 0), "probe", "body", frames)
 
 
 def test_a_tool_may_announce_itself_as_a_shape(bus, hand):
@@ -382,8 +394,76 @@ def test_a_tool_may_announce_itself_as_a_shape(bus, hand):
     publisher.publish(shape)
     shaped = Hand(bus, "shaped", announce=False).ready().ask(HERE)
     bus.still()
-    assert list(shaped.tools) == ["shaped"]
+    assert list(statuses(shaped)) == ["shaped"]
     np.testing.assert_array_equal(rows(shaped), rows(hand.ask(HERE)))
+
+
+def test_a_tool_is_taken_away_and_the_others_go_on(bus):
+    left, right = (bus.tool(name).ready() for name in ("left", "right"))
+    bus.listen(WrenchStamped, "tools/left/contact_wrench", STREAM)
+    wrenches = bus.got["tools/left/contact_wrench"]
+    bus.still()
+    there = at(-TOUCH, 0, LENGTH / 2)
+
+    def both() -> SkinDisplacement | None:
+        """The answer to an instant of both tools, once the left one's wrench is heard too."""
+        stamp = left.send(HERE)
+        right.pose.publish(pose_message(there, "body", stamp))
+        bus.spin(0.05)
+        answers = [answer for answer in bus.answers(stamp) if len(answer.touches) == 2]
+        return answers[0] if answers and wrenches else None
+
+    assert statuses(bus.wait(both, "an answer to both")) == {"left": BY_POSE, "right": BY_POSE}
+    assert wrenches[-1].wrench.force.x < 0
+    left.take_away()
+
+    def gone() -> bool:
+        right.send(there)
+        bus.spin(0.02)
+        return not any(count for count in (left.pose.get_subscription_count(), left.wrench.get_subscription_count(),
+                                           bus.node.count_publishers("tools/left/contact_wrench"),
+                                           bus.node.count_publishers("tools/left/local_contact")))  # fmt: skip
+
+    bus.wait(gone, "the topics of the tool to close")
+    assert wrenches[-1].wrench.force.x == 0, "who listened is told that it exerts nothing any more"
+    bus.wait(lambda: bus.said("'left' is taken away"), "the log line")
+    alone = right.ask(there)
+    assert statuses(alone) == {"right": BY_POSE} and rows(alone).any()
+    right.take_away()
+    rest = bus.wait(lambda: not (last := bus.got["skin/displacement"][-1]).touches and last, "rest")
+    assert not rows(rest).any() and rest.why == "'right' was taken away: back at rest"
+    bus.spin(1.0)
+    assert bus.got["skin/displacement"][-1] is rest, "rest is said once"
+
+    bus.mesh.publish(tool_message(ball().named("left"), bus.now()))  # it may come back
+    assert statuses(left.ready().ask(HERE)) == {"left": BY_POSE}
+    left.take_away()
+    bus.still()
+    bus.spin(2.5)
+    assert not bus.said("no surface of 'left'"), "who takes a tool away may go on sending where it is"
+
+
+def test_a_tool_that_is_taken_away_while_its_field_is_built_is_not_taken_into_use(bus):
+    sphere = trimesh.creation.icosphere(5, 0.03)
+    bus.mesh.publish(tool_message(Tool("early", sphere.vertices, sphere.faces), bus.now()))
+    early = Hand(bus, "early", announce=False)
+    early.take_away()
+    bus.wait(lambda: bus.said("'early' is taken away"), "the log line")
+    bus.tool("later").ready()
+    bus.spin(2.0)
+    assert not early.pose.get_subscription_count() and not bus.said("tool 'early': ")
+
+
+def test_poses_of_a_tool_that_nobody_announced_are_told_of_once(bus):
+    ghost, until = Hand(bus, "ghost", announce=False), time.monotonic() + 5.0
+    bus.wait(lambda: bus.said("no surface of 'ghost'"), "the log line")
+    while time.monotonic() < until:
+        ghost.press()
+        bus.spin(0.05)
+    (line,) = bus.said("no surface of 'ghost'")
+    assert line.startswith("/robot/tools/ghost/pose: poses come") and "they are not heard" in line
+    assert not ghost.pose.get_subscription_count()
+    assert not bus.said("no surface of 'probe'"), "a tool that was announced is none"
 
 
 def xyz(vector) -> SimpleNamespace:
@@ -440,7 +520,7 @@ def test_gazebos_contacts_answer_as_the_wrench_that_they_sum_to(bus, tmp_path):
         publisher.publish(gz.Contacts(header=std.Header(stamp=stamp_of(stamp)), contacts=[contact]))
         hand.pose.publish(pose_message(HERE, "body", stamp))
         found = robot.wait(lambda: robot.answers(stamp), "the answer")
-        assert list(found[0].statuses) == [TOUCHING] and rows(found[0]).tobytes() == rows(by_wrench).tobytes()
+        assert statuses(found[0]) == {"finger": TOUCHING} and rows(found[0]).tobytes() == rows(by_wrench).tobytes()
     robot.node.destroy_node()
 
 
@@ -577,8 +657,18 @@ def test_a_node_may_be_cleaned_up_set_up_anew_and_answers_on_what_was_set(bus, h
     assert answer.layer_id == topology.layer_id and len(bus.got["skin/displacement"]) == before + 1, "answered once"
 
 
-def test_the_node_runs_beside_another_in_any_executor():
-    """In this process: SkinNode is an ordinary node to whoever composes."""
+class Composed(NamedTuple):
+    """A SkinNode in this process beside another node, which moves a tool and hears answers."""
+
+    node: SkinNode
+    heard: list[SkinDisplacement]
+    press: Callable[[], int]
+    wait: Callable[[Callable[[], object]], None]
+
+
+@pytest.fixture
+def composed():
+    """SkinNode is an ordinary node to whoever composes."""
     context = rclpy.Context()
     context.init(domain_id=int(os.environ["ROS_DOMAIN_ID"]) + BUSES)
     executor = SingleThreadedExecutor(context=context)
@@ -588,22 +678,81 @@ def test_the_node_runs_beside_another_in_any_executor():
     other.create_subscription(SkinDisplacement, "skin/displacement", heard.append, STREAM)
     mesh = other.create_publisher(ContactMesh, "contact_mesh", KEPT)
     pose = other.create_publisher(PoseStamped, "tools/finger/pose", STREAM)
+
+    def press() -> int:
+        stamp = other.get_clock().now().nanoseconds
+        pose.publish(pose_message(HERE, "body", stamp))
+        return stamp
+
+    def wait(done: Callable[[], object]) -> None:
+        until = time.monotonic() + PATIENCE
+        while not done():
+            assert time.monotonic() < until
+            executor.spin_once(timeout_sec=0.02)
+
     try:
         executor.add_node(node)
         executor.add_node(other)
         node.trigger_configure()
         node.trigger_activate()
-        mesh.publish(mesh_message("finger", ball(), 0))
-        until = time.monotonic() + PATIENCE
-        while not heard and time.monotonic() < until:
-            pose.publish(pose_message(HERE, "body", other.get_clock().now().nanoseconds))
-            executor.spin_once(timeout_sec=0.02)
-        assert heard and rows(heard[-1]).any()
+        mesh.publish(tool_message(ball().named("finger"), 0))
+        wait(pose.get_subscription_count)
+        yield Composed(node, heard, press, wait)
     finally:
         executor.shutdown()
         node.destroy_node()
         other.destroy_node()
         context.try_shutdown()
+        context.destroy()
+
+
+def test_the_node_runs_beside_another_in_any_executor(composed):
+    composed.wait(lambda: composed.press() and composed.heard)
+    assert rows(composed.heard[-1]).any()
+
+
+def test_whatever_fails_inside_an_answer_is_told_and_the_next_instant_is_answered(composed, monkeypatch, capfd):
+    simulator, failed = composed.node.answering.simulator, []
+    step = simulator.step
+
+    def fails_once(contacts):
+        if not failed:
+            failed.append(contacts[0])
+            raise RuntimeError("an accident")
+        return step(contacts)
+
+    monkeypatch.setattr(simulator, "step", fails_once)
+    composed.wait(lambda: composed.press() and failed)
+    refused = round(1e9 * failed[0].time)
+    assert composed.node.tally.refused == 1
+    assert composed.node.tally.last_refusal == "no answer to finger: an accident"
+    composed.wait(lambda: composed.press() and composed.heard)
+    assert rows(composed.heard[0]).any() and stamp_ns(composed.heard[0]) > refused
+    assert composed.node.tally.refused == 1
+    assert capfd.readouterr().err.count("refused: no answer to finger: an accident\n") == 1
+
+
+def test_two_nodes_on_one_topic_tell_of_each_other_and_of_one_of_their_name():
+    twins, command = Bus("/twins"), ("-c", NODE, "--ros-args", "-r", "__ns:=/twins")
+
+    def told(twin: str) -> set[str]:
+        where = f"there is another node {twin} on /twins/skin/displacement: listeners get the answers of both"
+        return {line.name for line in twins.got["/rosout"] if line.msg.startswith(where) and "__ns:=" in line.msg}
+
+    namesake = None
+    try:
+        with running(*command):
+            twins.wait(lambda: twins.got["skin/topology"], "skin/topology")
+            twins.spin(2.5)
+            assert not told("that answers") | told("of the same name"), "one alone is no twin"
+            with running(*command, "-r", "__node:=other"):
+                twins.wait(lambda: told("that answers") == {"twins.stmpl", "twins.other"}, "both log lines")
+            namesake = rclpy.create_node("stmpl", namespace="/twins")
+            twins.wait(lambda: "twins.stmpl" in told("of the same name"), "word of the namesake")
+    finally:
+        if namesake:
+            namesake.destroy_node()
+        twins.node.destroy_node()
 
 
 def test_a_remapped_topic_is_heard_and_a_killed_node_is_told_by_its_liveliness(bus):
@@ -670,8 +819,13 @@ def test_a_launch_file_imports_only_launch_and_names_verbs_and_flags_that_exist(
     assert code == 0 and all(flag in told for flag in flags)
 
 
-def test_everything_that_colcon_installs_is_there():
-    text = (ROOT / "setup.py").read_text()
+def test_everything_that_colcon_installs_is_there(monkeypatch):
+    given = {}
+    monkeypatch.setenv("ROS_DISTRO", "jazzy")
+    monkeypatch.setattr("setuptools.setup", lambda **arguments: given.update(arguments))
+    monkeypatch.chdir(ROOT)
+    runpy.run_path("setup.py")
+    installed = {folder: {Path(file).resolve() for file in files} for folder, files in given["data_files"]}
     for folder in ("launch", "config"):
-        for path in (ROOT / folder).iterdir():
-            assert f'"{folder}/{path.name}"' in text
+        assert installed[f"share/stmpl_ros/{folder}"] == {path.resolve() for path in (ROOT / folder).iterdir()}
+    assert all(file.is_file() for files in installed.values() for file in files)

@@ -5,22 +5,24 @@ import signal
 import numpy as np
 import pytest
 import rclpy
-from bags.messages import layer_from, layer_id, stamp_ns, tool_mesh_from
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseStamped, WrenchStamped
 from stmpl_msgs.msg import ContactMesh, LocalContact, SkinDeformed, SkinDisplacement, SkinTopology
-from stmpl_ros.conversions import STALE, local_contact_from, mesh_message, pose_message, wrench_message
 from visualization_msgs.msg import Marker
 
+from bags.frame import Frame
 from bags.reader import Bag
 from bags.replay import replay_run
-from stmpl_core import ToolMesh
-from stmpl_core.haptics import DeviceLoop, local_contact
+from bags.wire import layer_from, local_contact_from, pose_message, stamp_ns, tool_from, tool_message, wrench_message
+from stmpl_core import Tool
+from stmpl_core.haptics import DeviceLoop
+from stmpl_core.layer import layer_id
+from stmpl_core.local_contact import local_contact
 from stmpl_core.methods import MomentNet
-from stmpl_core.sdf import MARGIN, SignedDistance
-from stmpl_core.touch import BY_POSE, IN_CORE, NO_FORCE, NO_TOUCH, PULLING, TOUCHING, Toucher
+from stmpl_core.touch import BY_POSE, IN_CORE, NO_FORCE, NO_TOUCH, PULLING, STALE, TOUCHING
+from stmpl_core.toucher import Toucher
 from stmpl_ros.topics import KEPT, STREAM
-from tests.bus import Robot, end, rows, start
+from tests.bus import Robot, end, rows, start, statuses
 from tests.scenes import LENGTH, RADIUS, at, ball, contact_of, scaled
 
 AGAIN = 2_000_000_000  # ns after which an unanswered first pose is sent once more
@@ -37,13 +39,13 @@ TOUCH = RADIUS + 0.012 - 1e-3  # m from the limb's axis: a ball of 12 mm, 1 mm d
 class Device(Robot):
     """A tool on the bus, and all that comes back."""
 
-    def __init__(self, name: str = "probe", mesh: ToolMesh | None = None) -> None:
+    def __init__(self, name: str = "probe", tool: Tool | None = None) -> None:
         super().__init__(f"device_{name}")
         self.name = name
         self.mesh = self.node.create_publisher(ContactMesh, "contact_mesh", KEPT)
         self.pose = self.node.create_publisher(PoseStamped, f"tools/{name}/pose", STREAM)
         self.wrench = self.node.create_publisher(WrenchStamped, f"tools/{name}/wrench", STREAM)
-        self.mesh.publish(mesh_message(name, mesh or ball(), self.now()))
+        self.mesh.publish(tool_message((tool or ball()).named(name), self.now()))
 
     def send(self, distance: float, force: float, *, pose_frame="body", wrench_frame="body") -> int:
         """Pose and wrench of one instant, pushing towards the limb's axis; returns their stamp [ns]."""
@@ -94,7 +96,7 @@ def test_a_contact_is_answered_where_it_is_with_its_stamp_frame_and_layer(device
     layer = layer_from(topology)
     assert answer.header.frame_id == topology.header.frame_id == "body"
     assert answer.layer_id == topology.layer_id == layer_id(layer)
-    assert list(answer.tools) == ["probe"] and list(answer.statuses) == ["touching"]
+    assert statuses(answer) == {"probe": "touching"}
     moved = np.linalg.norm(rows(answer), axis=1)
     deepest = layer.vertices[moved.argmax()]
     assert 1e-4 < moved.max() < 7.5e-3
@@ -112,7 +114,7 @@ def test_the_pressure_of_an_answer_carries_the_force(device):
 def test_zero_wrench_gives_exactly_zero(device):
     answer = device.ask(TOUCH, 0.0)
     assert not rows(answer).any() and not np.frombuffer(answer.pressure, np.float32).any()
-    assert list(answer.statuses) == ["no force"]
+    assert statuses(answer) == {"probe": "no force"}
 
 
 def test_a_wrench_in_the_tools_axes_counts_as_the_same_wrench(device):
@@ -161,14 +163,14 @@ def test_an_older_stamp_than_the_last_gets_no_answer(device):
 def test_when_the_input_stops_the_last_answer_fades_to_rest_says_why_and_comes_back(device):
     last = device.ask(TOUCH, 0.03)
     before = len(device.got["skin/displacement"])
-    device.wait(lambda: not device.got["skin/displacement"][-1].tools, "the answer at rest")
+    device.wait(lambda: not device.got["skin/displacement"][-1].touches, "the answer at rest")
     *fading, rest = device.got["skin/displacement"][before:]
     assert not rows(rest).any() and "back at rest" in rest.why and rest.fade == 1
     shares = np.array([answer.fade for answer in fading])
     assert len(shares) > 3 and (np.diff(shares) < 0).all() and 0 < shares[-1] < 0.3 < 0.7 < shares[0] <= 1
     for answer in fading:
-        assert list(answer.tools) == ["probe"] and list(answer.statuses) == [STALE] and not answer.in_range
-        assert "no pose for 0.4 s" in answer.why and answer.pose_stamps == last.pose_stamps
+        assert statuses(answer) == {"probe": STALE} and not answer.in_range
+        assert "no pose for 0.4 s" in answer.why and answer.touches[0].pose_stamp == last.touches[0].pose_stamp
         np.testing.assert_allclose(rows(answer), answer.fade * rows(last), rtol=1e-6, atol=1e-12)
     assert len(device.said("fades to rest within 0.6 s")) >= 1
     device.spin(0.6)
@@ -182,12 +184,13 @@ def test_while_only_unusable_input_comes_the_fading_answers_tell_of_it(device):
 
     def told():
         sent.append(device.send(float("nan"), 0.02))
-        return [a for a in device.got["skin/displacement"][before:] if STALE in a.statuses and "finite" in a.why]
+        later = device.got["skin/displacement"][before:]
+        return [answer for answer in later if STALE in statuses(answer).values() and "finite" in answer.why]
 
     device.wait(told, "a stale answer that tells of the refusals")
     device.wait(lambda: len(device.said("refused: pose of probe holds")) > lines, "the log line")
     assert len(device.said("refused: pose of probe holds")) - lines < len(sent) / 2, "one line of a kind in a second"
-    assert list(device.ask(TOUCH, 0.02).statuses) == [TOUCHING]
+    assert statuses(device.ask(TOUCH, 0.02)) == {"probe": TOUCHING}
 
 
 @pytest.mark.parametrize(
@@ -201,19 +204,19 @@ def test_while_only_unusable_input_comes_the_fading_answers_tell_of_it(device):
 def test_what_is_wrong_with_a_contact_is_its_status_and_one_line(device, distance, force, status, says):
     before = len(device.said(says))
     for _ in range(5):
-        assert list(device.ask(distance, force).statuses) == [status]
+        assert statuses(device.ask(distance, force)) == {"probe": status}
     device.wait(lambda: len(device.said(says)) > before, "the log line")
     assert len(device.said(says)) <= before + 2, "five answers within a second or two are one or two lines"
 
 
 @pytest.fixture
 def another(device):
-    """Makes more tools, without a force sensor: `another(name, mesh)`."""
+    """Makes more tools, without a force sensor: `another(name, tool)`."""
     made = []
 
-    def make(name: str, mesh: ToolMesh) -> Device:
+    def make(name: str, tool: Tool) -> Device:
         device.still()
-        made.append(Device(name, mesh))
+        made.append(Device(name, tool))
         return made[-1]
 
     yield make
@@ -239,7 +242,7 @@ def posed(tool: Device, distance: float) -> SkinDisplacement:
 def test_a_tool_that_starts_inside_the_core_is_told_of(device, another):
     tool = another("finger", ball())
     answer = posed(tool, TOUCH - 8e-3)
-    assert list(answer.statuses) == [IN_CORE] and not answer.in_range
+    assert statuses(answer) == {"finger": IN_CORE} and not answer.in_range
     assert "finger starts 7.5 mm inside the skin" in answer.why
     device.wait(lambda: device.said("finger starts 7.5") and device.said(f"finger: {IN_CORE}"), "the log lines")
 
@@ -247,15 +250,15 @@ def test_a_tool_that_starts_inside_the_core_is_told_of(device, another):
 def test_a_mesh_that_is_inside_out_is_turned_and_told_of(device, another):
     good = ball()
     right = posed(another("right", good), TOUCH)
-    wrong = posed(another("wrong", ToolMesh.of(good.vertices, good.faces[:, ::-1])), TOUCH)
-    assert list(right.statuses) == list(wrong.statuses) == [BY_POSE] and rows(right).any()
+    wrong = posed(another("wrong", Tool("wrong", good.vertices, good.faces[:, ::-1])), TOUCH)
+    assert (statuses(right), statuses(wrong)) == ({"right": BY_POSE}, {"wrong": BY_POSE}) and rows(right).any()
     np.testing.assert_array_equal(rows(wrong), rows(right))
     device.wait(lambda: device.said("'wrong' came inside out"), "the log line")
 
 
 def test_a_mesh_with_a_hole_is_told_of(device, another):
     whole = ball()
-    answer = posed(another("open", ToolMesh.of(whole.vertices, whole.faces[:-4])), TOUCH)
+    answer = posed(another("open", Tool("open", whole.vertices, whole.faces[:-4])), TOUCH)
     assert "holes" in answer.why
     device.wait(lambda: device.said("'open' has holes"), "the log line")
 
@@ -266,17 +269,16 @@ def test_a_mesh_with_a_hole_is_told_of(device, another):
 )
 def test_a_mesh_that_cannot_be_used_is_refused_and_the_node_stays_up(device, name, scale, says):
     device.spin(1.1)  # one line of a kind in a second
-    good = ball()
-    device.mesh.publish(mesh_message(name, scaled(good, scale), device.now()))
+    device.mesh.publish(tool_message(scaled(ball(), scale).named(name), device.now()))
     device.wait(lambda: [line for line in device.said(f"'{name}' refused") if says in line], "the refusal")
-    assert list(device.ask(TOUCH, 0.02).statuses) == [TOUCHING]
+    assert statuses(device.ask(TOUCH, 0.02)) == {"probe": TOUCHING}
 
 
 def test_while_the_mesh_of_a_tool_is_being_prepared_others_are_answered(device, another):
     import trimesh
 
     sphere = trimesh.creation.icosphere(6, 0.03)  # 82,000 triangles
-    big, before = another("big", ToolMesh.of(sphere.vertices, sphere.faces)), len(device.got["skin/displacement"])
+    big, before = another("big", Tool("big", sphere.vertices, sphere.faces)), len(device.got["skin/displacement"])
 
     def ready():
         device.send(TOUCH, 0.02)
@@ -285,7 +287,7 @@ def test_while_the_mesh_of_a_tool_is_being_prepared_others_are_answered(device, 
 
     device.wait(ready, "the node to listen to the new tool")
     meanwhile = device.got["skin/displacement"][before:]
-    assert sum(list(answer.statuses) == [TOUCHING] for answer in meanwhile) >= 10
+    assert sum(statuses(answer) == {"probe": TOUCHING} for answer in meanwhile) >= 10
 
 
 def test_a_local_contact_says_what_the_answer_says_and_how_it_changes(device):
@@ -309,9 +311,7 @@ def test_a_local_contact_says_what_the_answer_says_and_how_it_changes(device):
     np.testing.assert_allclose(model.wrench[:3], force, atol=0.01 * np.linalg.norm(force))
 
     # the node's is the model that anybody finds there
-    mesh, toucher = ball_as_sent(), Toucher(layer)
-    field = SignedDistance.of(mesh, margin=max(MARGIN, 2 * toucher.hole))
-    own = local_contact(toucher, contact_of(mesh, model.pose_body_from_tool), field)
+    own = local_contact(Toucher(layer), contact_of(ball_as_sent(), model.pose_body_from_tool))
     np.testing.assert_allclose(model.wrench, own.wrench, atol=1e-6 * np.linalg.norm(own.wrench[:3]))
     np.testing.assert_allclose(model.stiffness, own.stiffness, atol=1e-4 * np.abs(own.stiffness).max())
     assert model.valid_m == pytest.approx(own.valid_m, rel=0.05) and model.valid_rad > 0
@@ -324,8 +324,8 @@ def test_a_local_contact_says_what_the_answer_says_and_how_it_changes(device):
     assert felt @ model.normal < -0.5 * np.linalg.norm(model.wrench[:3])
 
 
-def ball_as_sent() -> ToolMesh:
-    return tool_mesh_from(mesh_message("probe", ball(), 0))
+def ball_as_sent() -> Tool:
+    return tool_from(tool_message(ball(), 0))
 
 
 def test_deformed_skin_is_rest_plus_displacement_and_sent_only_to_listeners(device):
@@ -347,6 +347,10 @@ def test_deformed_skin_is_rest_plus_displacement_and_sent_only_to_listeners(devi
         device.node.destroy_subscription(ear)
 
 
+def stale(frame: Frame) -> bool:
+    return any(touch.status == STALE for touch in frame.touches.values())
+
+
 def test_every_message_of_a_run_is_recorded(device, tmp_path):
     recorder = start("-m", "stmpl_ros.cli", "record", "--path", str(tmp_path / "run"))
     try:
@@ -355,7 +359,7 @@ def test_every_message_of_a_run_is_recorded(device, tmp_path):
         device.wait(lambda: device.node.count_subscribers("skin/displacement") == 2, "the recorder")
         device.spin(0.5)
         stamps = [stamp_ns(device.ask(TOUCH, 0.001 * k)) for k in range(50)]
-        device.wait(lambda: not device.got["skin/displacement"][-1].tools, "the answer at rest")
+        device.wait(lambda: not device.got["skin/displacement"][-1].touches, "the answer at rest")
         device.spin(0.5)
     finally:
         code, said = end(recorder, signal.SIGINT)
@@ -363,7 +367,7 @@ def test_every_message_of_a_run_is_recorded(device, tmp_path):
     bag = Bag(tmp_path / "run")
     assert bag.finished and not bag.damage
     assert bag.topics["/tools/probe/pose"].messages == bag.topics["/tools/probe/wrench"].messages == 50
-    fresh = [frame for frame in bag.frames() if frame.tools and STALE not in frame.statuses.values()]
+    fresh = [frame for frame in bag.frames() if frame.touches and not stale(frame)]
     assert [frame.stamp_ns for frame in fresh] == stamps
     replayed = replay_run(tmp_path / "run", MomentNet())
     assert replayed.frames > len(fresh) + 3, "while the last answer faded, answers went on"

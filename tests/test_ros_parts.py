@@ -1,41 +1,50 @@
 """Laws of what the ROS side is made of: conversions, instants, scripts, the marker's bytes. No process is started."""
 
+from collections.abc import Mapping
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
-from bags.messages import layer_from, layer_id, pose_from, tool_mesh_from, wrench_from
 from geometry_msgs.msg import PoseStamped
 from hypothesis import given
 from hypothesis import strategies as st
 from rclpy.serialization import deserialize_message, serialize_message
 from scipy.spatial.transform import Rotation
 from stmpl_msgs.msg import LocalContact as LocalContactMessage
-from stmpl_ros.conversions import (
-    STALE,
-    checked_mesh,
-    checked_pose,
-    checked_wrench,
-    faded,
-    floats,
-    local_contact_from,
-    local_contact_message,
-    mesh_message,
-    pose_message,
-    quaternion_from,
-    topology_message,
-    wrench_message,
-)
-from stmpl_ros.marker import SkinMarker
-from stmpl_ros.throttle import Throttle
+from stmpl_msgs.msg import SkinDisplacement
 from visualization_msgs.msg import Marker
 
+from bags.wire import (
+    displacement_message,
+    floats,
+    frame_from,
+    layer_from,
+    local_contact_from,
+    local_contact_message,
+    pose_from,
+    pose_message,
+    pose_of_tool,
+    quaternion_from,
+    tool_from,
+    tool_message,
+    topology_message,
+    wrench_from,
+    wrench_message,
+)
+from stmpl_core import Answer, Tools, Touch
 from stmpl_core.errors import FrameError, InvalidInput, MeshError
-from stmpl_core.haptics import LocalContact
-from stmpl_core.trust import Displacement, Trust
+from stmpl_core.layer import layer_id
+from stmpl_core.local_contact import LocalContact
+from stmpl_core.skin import published
+from stmpl_core.touch import BY_POSE, STALE, TOUCHING
+from stmpl_core.trust import Trust
+from stmpl_ros.diagnosis import Tally
+from stmpl_ros.gate import SAY_EVERY, Gate
 from stmpl_ros.inbox import PATIENCE, Inbox
-from stmpl_ros.node import published
 from stmpl_ros.parameters import NodeConfig
 from stmpl_ros.scripts import PRESS, SCRIPTS, Device, Keyframe, Motion
-from tests.scenes import ball, limb, scaled
+from stmpl_ros.show import SkinMarker
+from tests.scenes import at, ball, limb, scaled
 
 MS = 1_000_000
 unit = st.floats(-1, 1).filter(lambda x: abs(x) > 1e-3)
@@ -57,7 +66,7 @@ def test_wrench_in_tool_axes_is_the_same_wrench_in_body_axes():
     in_tool = np.concatenate([pose[:3, :3].T @ in_body[:3], pose[:3, :3].T @ in_body[3:]])
     frames = {"body": in_body, "probe": in_tool}
     for frame, values in frames.items():
-        message = checked_wrench(wrench_message(values, frame, 0), "probe", "body")
+        message = wrench_message(values, frame, 0)
         read = wrench_from(message, body_frame="body", tool="probe", pose_body_from_tool=pose)
         np.testing.assert_allclose(read, in_body, atol=1e-12)
 
@@ -72,10 +81,11 @@ def test_a_layer_keeps_its_id_and_every_bit_through_a_message():
 
 
 def test_a_tool_keeps_its_mesh_through_a_message():
-    mesh = ball()
-    back = tool_mesh_from(mesh_message("probe", mesh, 0))
-    np.testing.assert_allclose(back.vertices, mesh.vertices, atol=1e-9)
-    np.testing.assert_array_equal(back.faces, mesh.faces)
+    tool = ball()
+    back = tool_from(tool_message(tool, 0))
+    assert back.name == tool.name == "probe"
+    np.testing.assert_allclose(back.vertices, tool.vertices, atol=1e-9)
+    np.testing.assert_array_equal(back.faces, tool.faces)
 
 
 def test_flat_arrays_hold_float32_in_the_order_of_the_rows():
@@ -95,7 +105,7 @@ def _moved(x: float, **quaternion: float) -> PoseStamped:
 @pytest.mark.parametrize(
     ("message", "error", "says"),
     [
-        (pose_message(np.eye(4), "map", 0), FrameError, "frame 'map'; expected 'body'"),
+        (pose_message(np.eye(4), "map", 0), FrameError, "frame 'map'; known are 'body'"),
         (_moved(float("nan")), InvalidInput, "not finite"),
         (_moved(float("inf")), InvalidInput, "not finite"),
         (_moved(120.0), InvalidInput, "120.0 m .* millimetres"),
@@ -105,37 +115,59 @@ def _moved(x: float, **quaternion: float) -> PoseStamped:
 )
 def test_a_pose_that_cannot_be_meant_is_refused_and_told_why(message, error, says):
     with pytest.raises(error, match=says):
-        checked_pose(message, "probe", "body")
+        pose_of_tool(message, "probe", "body")
 
 
 def test_a_wrench_that_cannot_be_meant_is_refused_and_told_why():
-    with pytest.raises(FrameError, match="'map'; known are 'body' and 'probe'"):
-        checked_wrench(wrench_message(np.zeros(6), "map", 0), "probe", "body")
+    here = {"body_frame": "body", "tool": "probe", "pose_body_from_tool": np.eye(4)}
+    with pytest.raises(FrameError, match="'map'; known are 'body', 'probe'"):
+        wrench_from(wrench_message(np.zeros(6), "map", 0), **here)
     with pytest.raises(InvalidInput, match="not finite"):
-        checked_wrench(wrench_message(np.full(6, np.nan), "body", 0), "probe", "body")
+        wrench_from(wrench_message(np.full(6, np.nan), "body", 0), **here)
+
+
+class Moving(Mapping):
+    """Frames that are found when they are asked for, and not listed: as /tf's are."""
+
+    def __getitem__(self, frame: str) -> np.ndarray:
+        return {"camera": np.diag([-1.0, -1.0, 1.0, 1.0])}[frame]
+
+    def __iter__(self):
+        return iter(())
+
+    def __len__(self) -> int:
+        return 0
+
+
+def test_poses_and_wrenches_in_a_frame_that_only_tf_knows_are_turned_into_the_bodys():
+    pose = pose_of_tool(pose_message(np.eye(4), "camera", 0), "probe", "body", Moving())
+    np.testing.assert_array_equal(pose, np.diag([-1, -1, 1, 1]))
+    wrench = wrench_message(np.arange(1.0, 7.0), "camera", 0)
+    found = wrench_from(wrench, body_frame="body", tool="probe", pose_body_from_tool=np.eye(4), frames=Moving())
+    np.testing.assert_array_equal(found, [-1, -2, 3, -4, -5, 6])
 
 
 def test_a_mesh_that_cannot_be_meant_is_refused_and_told_why():
     good = ball()
     with pytest.raises(MeshError, match="millimetres"):
-        checked_mesh(mesh_message("probe", scaled(good, 1e3), 0))
+        tool_from(tool_message(scaled(good, 1e3), 0))
     with pytest.raises(FrameError, match="frame_id"):
-        checked_mesh(mesh_message("", good, 0))
-    empty = mesh_message("probe", good, 0)
+        tool_from(tool_message(good.named(""), 0))
+    empty = tool_message(good, 0)
     empty.triangles = []
     with pytest.raises(MeshError, match="F > 0"):
-        checked_mesh(empty)
-    torn = mesh_message("probe", good, 0)
+        tool_from(empty)
+    torn = tool_message(good, 0)
     torn.vertices = torn.vertices[:-1]
     with pytest.raises(InvalidInput, match="three"):
-        checked_mesh(torn)
+        tool_from(torn)
 
 
 def _inbox(*tools: str) -> Inbox:
-    inbox = Inbox("body", 250 * MS)
+    known = Tools()
     for name in tools:
-        inbox.put_mesh(name, ball())
-    return inbox
+        known.add(ball().named(name))
+    return Inbox(known, "body", 250 * MS)
 
 
 def _push(force: float, stamp: int):
@@ -201,22 +233,62 @@ def test_streams_that_fall_silent_are_named():
     assert later is not None and later.lost == ("wrench of probe",), "a tool put away is not spoken of for ever"
 
 
-def test_one_line_of_a_kind_comes_through_and_tells_how_many_did_not():
-    throttle = Throttle(1.0)
-    assert throttle.line("nan", "not finite", 0.0) == "not finite"
-    assert throttle.line("frame", "wrong frame", 0.1) == "wrong frame", "another kind is not held back"
-    assert [throttle.line("nan", "not finite", t) for t in (0.2, 0.9)] == [None, None]
-    assert throttle.line("nan", "not finite", 1.0) == "not finite (2 more like it before)"
-    assert throttle.line("nan", "not finite", 2.5) == "not finite"
+def test_one_line_of_a_kind_comes_through_and_tells_how_many_did_not(monkeypatch):
+    said, now = [], [0.0]
+    logger = SimpleNamespace(warning=said.append)
+    gate = Gate(SimpleNamespace(get_logger=lambda: logger), Tally())  # type: ignore[arg-type]
+    monkeypatch.setattr("stmpl_ros.gate.time.monotonic", lambda: now[0])
+
+    def line(kind: str, text: str, time: float) -> str | None:
+        before, now[0] = len(said), time * SAY_EVERY
+        gate.say(kind, text)
+        return said[-1] if len(said) > before else None
+
+    assert line("nan", "not finite", 0.0) == "not finite"
+    assert line("frame", "wrong frame", 0.1) == "wrong frame", "another kind is not held back"
+    assert [line("nan", "not finite", t) for t in (0.2, 0.9)] == [None, None]
+    assert line("nan", "not finite", 1.0) == "not finite (2 more like it before)"
+    assert line("nan", "not finite", 2.5) == "not finite"
 
 
 def test_a_share_of_an_answer_is_smaller_stale_and_not_to_be_trusted():
-    answer = Displacement(np.full((3, 3), 2e-3), Trust(error_bound=1e-4, why="fine"), "any", np.ones(3), {"probe": "x"})
-    share = faded(answer, 0.25, "no pose")
+    touch = Touch("probe", TOUCHING, at(0.1, 0, 0), np.arange(6.0), depth=1e-3, pressure=np.ones(3))
+    answer = Answer(np.full((3, 3), 2e-3), Trust(error_bound=1e-4, why="fine"), "any", np.ones(3), {"probe": touch})
+    share = answer.faded(0.25, "no pose")
     np.testing.assert_array_equal(share.displacement, 5e-4)
     assert share.pressure is None, "nothing was solved for"
-    assert dict(share.statuses) == {"probe": STALE} and not share.trust.in_range and share.trust.error_bound is None
+    assert {name: one.status for name, one in share.touches.items()} == {"probe": STALE}
+    assert not share.touches["probe"].wrench.any() and share.touches["probe"].pressure is None
+    assert not share.trust.in_range and share.trust.error_bound is None
     assert share.trust.why == "fine; no pose"
+
+
+def test_an_answer_keeps_what_each_tool_does_through_a_message():
+    """Figures to the last bit; the pose to what a quaternion rounds."""
+    rng, stamps = np.random.default_rng(4), {"finger": (3 * 10**9 + 7, 10**9 + 1), "thumb": (2 * MS, 0)}
+    turned = at(0.1, -0.2, 0.3)
+    turned[:3, :3] = Rotation.from_euler("xyz", (0.3, -0.7, 1.1)).as_matrix()
+    touches = {"finger": Touch("finger", TOUCHING, turned, rng.normal(size=6), depth=1.2345678901e-3,
+                               force_bound=0.0123456789, trust=Trust(in_range=False)),
+               "thumb": Touch("thumb", BY_POSE, np.eye(4), rng.normal(size=6))}  # fmt: skip
+    displacement, trust = rng.normal(0, 1e-3, (5, 3)), Trust(True, False, 2e-4, "a word")
+    answer = Answer(displacement, trust, "any", rng.uniform(0, 9, 5), touches)
+    message = displacement_message(answer, layer_id="id", body_frame="body", stamp_ns=5 * MS, sequence=8,
+                                   solve_seconds=0.25, inputs=stamps, fade=0.5, why="another")  # fmt: skip
+    sent = deserialize_message(serialize_message(message), SkinDisplacement)
+    back = frame_from(sent, 6 * MS)
+    assert (back.stamp_ns, back.log_time_ns, back.sequence, back.layer_id) == (5 * MS, 6 * MS, 8, "id")
+    assert (back.fade, back.solve_seconds, back.method, back.inputs) == (0.5, 0.25, "any", stamps)
+    assert back.trust == Trust(True, False, float(np.float32(2e-4)), "a word; another")
+    assert back.displacement.tobytes() == answer.displacement.astype(np.float32).tobytes()
+    assert back.pressure.tobytes() == answer.pressure.astype(np.float32).tobytes()
+    assert list(back.touches) == ["finger", "thumb"]
+    for name, touch in touches.items():
+        found = back.touches[name]
+        assert (found.name, found.status, found.trust.in_range) == (name, touch.status, touch.trust.in_range)
+        np.testing.assert_array_equal([found.depth, found.force_bound], [touch.depth, touch.force_bound])
+        assert found.wrench.tobytes() == touch.wrench.tobytes()
+        np.testing.assert_allclose(found.pose_body_from_tool, touch.pose_body_from_tool, atol=1e-12)
 
 
 def test_a_local_contact_keeps_every_bit_through_a_message():
