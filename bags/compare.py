@@ -29,7 +29,7 @@ Side = Callable[[Frame], Displacement]  # how one side of a comparison answers a
 
 
 class Presser(Protocol):
-    """Judges an answer by its tools: presses them in once more (fem_tools.RigidFem)."""
+    """A method that judges an answer by pressing its tools in once more (fem_tools.RigidFem)."""
 
     name: str
 
@@ -38,24 +38,24 @@ class Presser(Protocol):
         ...
 
     def press(self, contacts: Sequence[Contact], answer: Answer) -> Displacement:
-        """The motion under these contacts, which `answer` answers."""
+        """Displacement under these contacts, which `answer` answers."""
         ...
 
 
 @dataclass(frozen=True, eq=False)
 class FramePair:
-    """One frame, answered by both sides: under the same pressure, or with the same tools where they press.
+    """Answers of both sides to one frame: under the same pressure, or with the same tools where they press.
 
     Args:
         number: place of the frame in the run, from 0.
-        frame: as recorded.
-        layer: that both sides answer for.
-        time: since the first answer [s].
-        load: that presses on the skin in all [N].
-        contacts: the tools as they stood.
-        ours: the answer that is judged.
-        reference: the answer that it is judged by.
-        score: of ours against the reference.
+        frame: recorded frame.
+        layer: layer that both sides answer for.
+        time: time since the first answer [s].
+        load: force that presses on the skin in all [N].
+        contacts: tools as they stood.
+        ours: answer that is judged.
+        reference: answer that it is judged by.
+        score: score of ours against the reference.
     """
 
     number: int
@@ -70,21 +70,21 @@ class FramePair:
 
     @property
     def judged(self) -> bool:
-        """The reference converged, so that it may judge."""
+        """Whether the reference converged: only then it judges."""
         return self.reference.trust.converged
 
 
 @dataclass(frozen=True, eq=False)
 class Comparison:
-    """A run against a reference.
+    """Errors of a run against a reference.
 
     Args:
-        run: the run, looked over once: timeline, rate, latency, losses.
+        run: survey of the run: timeline, rate, latency, losses.
         method, reference: names of the two sides.
-        pairs: the sampled frames, in the order of time.
+        pairs: sampled frames, in the order of time.
         failed: sampled frames that the reference could not solve, with its reason, by sequence number.
         tolerance: allowed mean error under the contact, in the worst frame [m]; None: no verdict is asked for.
-        reason: why this tolerance, where nobody gave one.
+        reason: sentence that tells why this tolerance, where nobody gave one.
     """
 
     run: Survey
@@ -120,7 +120,7 @@ class Comparison:
 
     @property
     def passed(self) -> bool:
-        """Every sampled frame was judged, and none is over the tolerance (if one was given)."""
+        """Whether every sampled frame was judged and none is over the tolerance (if one was given)."""
         if self.failed or len(self.judged) < len(self.pairs) or not self.pairs:
             return False
         return self.tolerance is None or self.worst_under_contact <= self.tolerance
@@ -156,12 +156,12 @@ def compare_run(
     over the loaded part of the run.
 
     Args:
-        run: the recording: its folder, its .mcap file, or what a survey of it gave.
-        reference: judges; it is prepared here.
-        frames: how many to sample, >= 1.
-        method: judged under the same pressures; None judges the recorded answers.
+        run: recording: its folder, its .mcap file, or what a survey of it gave.
+        reference: method that judges; it is prepared here.
+        frames: number of frames to sample, >= 1.
+        method: method that is judged under the same pressures; None judges the recorded answers.
         tolerance: allowed mean error under the contact in the worst frame [m].
-        on_frame: called with (done, total) before each frame, for a progress bar.
+        on_frame: callback with (done, total) before each frame, for a progress bar.
 
     Raises:
         BagError: the run holds no answers, no loaded frame, or no pressures.
@@ -176,12 +176,12 @@ def compare_run(
 def compare_bags(
     run: Path | str | Survey, other: Path | str | Survey, *, frames: int = 12, tolerance: float | None = None
 ) -> Comparison:
-    """Compares the answers of one bag with those that another gives at the same stamps.
+    """Compares the answers of two bags at the same stamps.
 
     Args:
-        run: the recording that is judged.
-        other: the recording that judges.
-        frames: how many to sample, >= 1.
+        run: recording that is judged.
+        other: recording that judges.
+        frames: number of frames to sample, >= 1.
         tolerance: allowed mean error under the contact in the worst frame [m]. Unless given, two recordings of one
             method are held to each other: exactly where one processor made both, else to OTHER_PROCESSOR; two methods
             are not.
@@ -231,7 +231,7 @@ def sample(moments: Sequence[Moment], frames: int) -> list[Moment]:
 
 
 def headline(comparison: Comparison) -> list[tuple[str, str]]:
-    """What is measured, and its value with unit: the rows of a comparison's table."""
+    """Rows of a comparison's table: name of a figure, and its value with unit."""
     timing, moments = comparison.run.timing, comparison.run.moments
     largest = max((moment.load for moment in moments if moment.load >= 0), default=float("nan"))
     rows = [

@@ -16,7 +16,7 @@ from stmpl_core.layer import SoftLayer
 
 SKIN = LinearSegmentedColormap.from_list("skin", ["#f2e4da", "#f7b267", "#e4572e", "#8c1c3f", "#2e0a3c"])
 DIFFERENCE = LinearSegmentedColormap.from_list("difference", ["#ecebe8", "#9ecae1", "#3182bd", "#08306b", "#030f24"])
-LIGHT = np.array([-0.75, 0.35, 0.55])  # in screen axes: from the upper left, towards the viewer
+LIGHT = np.array([-0.75, 0.35, 0.55])  # direction of the light in screen axes: from the upper left, towards the viewer
 AMBIENT = 0.2  # share of the light that comes from everywhere
 SMOOTH = 8_000  # triangles that a skin is split into at least, so that shades look smooth
 FLAT = 0.75  # height of a close-up over its width; it looks at the skin at a slant
@@ -80,8 +80,8 @@ def draw_skin(
     """Draws the deformed skin, shaded, coloured by `values` (V,) in the units of `colours`.
 
     Args:
-        displacement: (V, 3) [m], drawn as it is, not exaggerated.
-        half_width: of the window to show, which is FLAT times as high [m]; None shows all.
+        displacement: displacement, (V, 3) [m], drawn as it is, not exaggerated.
+        half_width: half width of the window to show, which is FLAT times as high [m]; None shows all.
     """
     deformed = layer.vertices + displacement
     faces = layer.faces

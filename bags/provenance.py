@@ -20,19 +20,19 @@ from stmpl_core.provenance import versions
 
 LAYER = "layer.npz"
 RECORD = "stmpl"
-OTHER_PROCESSOR = 1e-7  # m by which answers may differ between processors, whose sums round in other orders
+OTHER_PROCESSOR = 1e-7  # difference of answers between processors [m], whose sums round in other orders
 
 
 @dataclass(frozen=True)
 class Provenance:
-    """What made a recording.
+    """Origin of a recording: method, body, settings and versions.
 
     Args:
         method: name of the method that answered.
-        body: one line on the body and its part.
-        config: everything that was configured, as JSON can hold it.
+        body: line on the body and its part.
+        config: settings, as JSON can hold them.
         versions: versions of Python, packages and weights that decide the numbers, and the processor.
-        frames: other frames that poses and wrenches are in, fixed in the body's.
+        frames: poses of the frames that poses and wrenches are in, fixed in the body's.
     """
 
     method: str = ""
@@ -48,7 +48,7 @@ class Provenance:
 
 
 def allowance(recorded: str, other: str) -> tuple[float, str]:
-    """What two answers to the same contacts may differ by [m], and why, by the processors that made them; "": unknown.
+    """Allowed difference of answers to the same contacts [m], and why, by the processors that made them; "": unknown.
 
     Exact answers are asked for on one processor only.
     """
@@ -67,7 +67,7 @@ def write_provenance(
     processor are those of the process that writes: a recorder belongs on the machine whose answers it records.
 
     Raises:
-        BagError: the disk refused.
+        BagError: a disk that refused.
     """
     values = {"method": method, "body": body, "config": json.dumps(config or {}), "versions": json.dumps(versions()),
               "frames": json.dumps({name: pose.tolist() for name, pose in frames.items()})}  # fmt: skip

@@ -24,7 +24,7 @@ from stmpl_core.tool import Tool
 log = logging.getLogger(__name__)
 
 DISPLACEMENT, TOPOLOGY, MESH = "skin/displacement", "skin/topology", "contact_mesh"
-_OF_ROBOT = re.compile(r"(?:(.*?)/)?(?:skin/\w+|contact_mesh|tools/[^/]+/\w+)")  # its namespace, then what a run has
+_OF_ROBOT = re.compile(r"(?:(.*?)/)?(?:skin/\w+|contact_mesh|tools/[^/]+/\w+)")  # topics of a robot's run
 
 
 class Recorded(NamedTuple):
@@ -60,11 +60,11 @@ class Bag:
     A file whose writer was killed is read as far as it is sound; `damage` says what is not, and the log too.
 
     Args:
-        path: a folder, or the path of the .mcap file.
+        path: path of a folder, or of the .mcap file.
         namespace: namespace of the one robot that is meant, "/left"; "": all topics.
 
     Raises:
-        BagError: no such file, no MCAP file, or no such namespace in it.
+        BagError: a file that is missing or no MCAP file, or a namespace that is not in it.
     """
 
     def __init__(self, path: Path | str, namespace: str = "") -> None:
@@ -162,7 +162,7 @@ class Bag:
 
     @cached_property
     def provenance(self) -> Provenance:
-        """What made the run; empty if the bag does not say."""
+        """Origin of the run; empty if the bag does not tell it."""
         return provenance_from(self.metadata.get(RECORD, {}))
 
     @cached_property

@@ -37,7 +37,7 @@ from stmpl_core.errors import BagError
 MAGIC = b"\x89MCAP0\r\n"
 HEADER, FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK, MESSAGE_INDEX = range(1, 8)
 ATTACHMENT, METADATA, DATA_END = 9, 0x0C, 0x0F
-LARGEST = 1 << 32  # bytes; a chunk that claims more when opened is broken
+LARGEST = 1 << 32  # size of an opened chunk [bytes]; one that claims more is broken
 _FRAME = struct.Struct("<BQ")  # opcode, length
 _FOOTER = struct.Struct("<BQQQI")  # opcode, length, start of summary, start of its offsets, CRC
 _MESSAGE = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time
@@ -79,8 +79,8 @@ class Summary:
     """The index that a finished file ends with; empty where its CRC is wrong, and without places where it has none.
 
     Args:
-        schemas, channels: by their numbers.
-        messages: that the writer counted, or None.
+        schemas, channels: descriptions by their numbers.
+        messages: number of messages that the writer counted, or None.
         data_end: offset of the record that ends the data section [bytes], or None.
         places: (offset, opcode, end) of every chunk, attachment and metadata record, in the order of the file.
     """
@@ -101,7 +101,7 @@ def bag_file(path: Path | str) -> Path:
     """The .mcap file of a recording, given itself or its folder.
 
     Raises:
-        BagError: no such file, or a folder that does not hold exactly one.
+        BagError: a file that is missing, or a folder that does not hold exactly one.
     """
     path = Path(path)
     if path.is_file():

@@ -14,16 +14,16 @@ from stmpl_core.errors import BagError
 
 @dataclass(frozen=True)
 class Recovery:
-    """What came back, and what did not.
+    """Result of a recovery: what came back, and what is lost.
 
     Args:
-        source, target: the damaged file and the new one.
-        messages: brought back.
-        seconds: of log time between the first and the last of them [s].
-        orphans: sound messages given up because their channel's description is lost.
-        expected: messages that the source's writer counted, or None.
+        source, target: paths of the damaged file and of the new one.
+        messages: number of messages brought back.
+        seconds: log time between the first and the last of them [s].
+        orphans: number of sound messages given up because their channel's description is lost.
+        expected: number of messages that the source's writer counted, or None.
         damage: stretches of the source that were skipped.
-        finished: the writer had finished the source; False: it was killed, at most its last chunk is missing.
+        finished: flag of a source that was finished; False: its writer was killed, at most its last chunk is missing.
     """
 
     source: Path
@@ -37,7 +37,7 @@ class Recovery:
 
     @property
     def complete(self) -> bool:
-        """Nothing is missing."""
+        """Whether nothing is missing."""
         return self.finished and not self.damage and not self.orphans
 
     def __str__(self) -> str:
@@ -55,7 +55,7 @@ def recover(source: Path | str, target: Path | str | None = None) -> Recovery:
     """Copies all that is sound in `source` into a new bag; the source is left as it is.
 
     Args:
-        source: a folder or .mcap file.
+        source: path of a folder or .mcap file.
         target: folder or .mcap file to make; by default a folder beside the source's, named `...-recovered`.
 
     Raises:

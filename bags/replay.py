@@ -19,14 +19,14 @@ from stmpl_core.touch import Answer
 
 @dataclass(frozen=True, eq=False)
 class Replayed:
-    """A recorded answer and the one that the same contacts give now."""
+    """A recorded answer, and the answer to the same contacts now."""
 
     frame: Frame
     answer: Answer
 
     @property
     def identical(self) -> bool:
-        """The displacement is the recorded one bit for bit, as float32."""
+        """Whether the displacement is the recorded one bit for bit, as float32."""
         return self.answer.displacement.astype(np.float32).tobytes() == self.frame.displacement.tobytes()
 
     @property
@@ -39,7 +39,7 @@ class Replayed:
 
 @dataclass(frozen=True)
 class ReplaySummary:
-    """How a replay went.
+    """Result of a replay.
 
     Args:
         method: name of the method that answered now.
@@ -47,9 +47,9 @@ class ReplaySummary:
         identical: number of them that came out bit for bit as recorded.
         worst: largest difference at any vertex of any frame [m].
         tolerance: largest difference that is allowed [m]; 0: bit for bit.
-        reason: why this tolerance.
+        reason: sentence that tells why this tolerance.
         first_difference: sequence number of the first frame past the tolerance, or None.
-        changed: what is another version now than when the run was recorded, "numpy 2.4 -> 2.5".
+        changed: packages with another version now than when the run was recorded, "numpy 2.4 -> 2.5".
     """
 
     method: str
@@ -63,7 +63,7 @@ class ReplaySummary:
 
     @property
     def passed(self) -> bool:
-        """No frame is past the tolerance."""
+        """Whether no frame is past the tolerance."""
         return self.first_difference is None
 
     def __str__(self) -> str:
@@ -82,9 +82,9 @@ def replay(run: Path | str | Run, method: Method, *, every: int = 1) -> Iterator
     Each is answered on the layer that it was answered on.
 
     Args:
-        run: the recording: its folder, its .mcap file, or an opened one.
-        method: that answers.
-        every: take each n-th frame only.
+        run: recording: its folder, its .mcap file, or an opened one.
+        method: method that answers.
+        every: step from frame to frame; 1 takes each.
 
     Raises:
         BagError: the bag lacks answers, the layer, or a tool's mesh or pose.
@@ -107,9 +107,9 @@ def replay_run(
     """Replays a run and counts the answers that come out as recorded.
 
     Args:
-        run: the recording: its folder, its .mcap file, or an opened one.
-        method: that answers.
-        every: take each n-th frame only.
+        run: recording: its folder, its .mcap file, or an opened one.
+        method: method that answers.
+        every: step from frame to frame; 1 takes each.
         tolerance: largest difference that is allowed [m]; None: exact where this processor recorded the run,
             provenance.OTHER_PROCESSOR where another did.
 

@@ -36,7 +36,7 @@ from stmpl_core.trust import Trust
 INK, OURS, TRUTH, WARN = "#2b2b2b", "#c1440e", "#1f4e79", "#f6c667"
 STOPPED = "#d9534f"
 ROOM = 2.6  # half width of a close-up, in radii of the contact
-CLOSEST = 0.02  # m; no close-up is narrower on each side
+CLOSEST = 0.02  # half width of the narrowest close-up [m]
 
 STYLE = """
 body { font: 15px/1.45 system-ui, sans-serif; color: #2b2b2b; max-width: 1120px; margin: 2em auto; padding: 0 1em; }
@@ -54,9 +54,9 @@ def write_report(comparison: Comparison, path: Path | str, *, replay: ReplaySumm
     """Writes the page; nothing in it refers to another file.
 
     Args:
-        comparison: with at least one frame that the reference solved.
-        path: of the .html file to write.
-        replay: how a replay of the same run went, if there was one.
+        comparison: comparison with at least one frame that the reference solved.
+        path: path of the .html file to write.
+        replay: summary of a replay of the same run, if there was one.
 
     Raises:
         BagError: nothing to show, or the file cannot be written.

@@ -22,16 +22,16 @@ class Run(Bag):
     """A bag whose poses and wrenches are kept by tool and stamp: a few hundred bytes each, whatever the answers weigh.
 
     Args:
-        path: a folder, or the path of the .mcap file.
+        path: path of a folder, or of the .mcap file.
         namespace: namespace of the one robot that is meant, "/left"; "": there is but one.
         on_answer: function that gets each answer while the file is looked over, in its order.
 
     Attributes:
-        received: when the last contact message of a stamp was received [ns], by the stamp.
+        received: time at which the last contact message of a stamp was received [ns], by the stamp.
         pose_stamps: stamps of all poses.
 
     Raises:
-        BagError: as for a Bag; or several robots, and no namespace.
+        BagError: a file that `Bag` refuses, or several robots and no namespace.
     """
 
     def __init__(

@@ -18,16 +18,16 @@ from rosbags.typesys.store import Typestore
 from stmpl_core.errors import BagError
 
 SEPARATOR = "=" * 80
-_OWN_MESSAGES = Path(__file__).resolve().parent.parent / "msg_defs" / "msg"  # a checkout that is not built yet
+_OWN_MESSAGES = Path(__file__).resolve().parent.parent / "msg_defs" / "msg"  # folder in a checkout not yet built
 
 
 @dataclass(frozen=True)
 class Schema:
-    """What a reader needs to decode messages of one type.
+    """Description of a message type, enough to decode its messages.
 
     Args:
-        name: `pkg/msg/Type`.
-        text: its .msg text, then each dependency after a line of 80 `=` and `MSG: pkg/Type` (encoding ros2msg).
+        name: name, `pkg/msg/Type`.
+        text: .msg text, then each dependency after a line of 80 `=` and `MSG: pkg/Type` (encoding ros2msg).
         type_hash: RIHS01 hash, as in `share/<pkg>/msg/<Type>.json` (REP-2016).
     """
 
@@ -43,7 +43,7 @@ def find_schema(type_name: str) -> Schema:
     The text keeps the files' comments, which say units to who opens the recording elsewhere.
 
     Raises:
-        BagError: no such message is installed.
+        BagError: a message type that is not installed.
     """
     package, type_ = _split(type_name)
     name = f"{package}/msg/{type_}"

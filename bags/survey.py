@@ -20,14 +20,14 @@ class Moment:
     Args:
         number: place of the answer in the run, from 0, by which Bag.frames reads it.
         sequence: number that the node gave the answer; it starts again where a node was started again.
-        stamp_ns: of the newest pose that it answers [ns].
-        time: since the first answer's stamp [s].
-        load: that presses on the skin in all, sum of pressure times area [N]; NaN where the pressure is not known.
+        stamp_ns: stamp of the newest pose that it answers [ns].
+        time: time since the first answer's stamp [s].
+        load: force on the skin in all, sum of pressure times area [N]; NaN where the pressure is not known.
         peak: largest displacement [m].
         pressing: number of tools that load the skin.
-        converged, in_range, why: the answer's own flags, and its reason for them.
-        solve_seconds: that the node spent on it [s].
-        latency: from the last contact message that it answers to itself, by the recorder's clock [s]; NaN: unknown.
+        converged, in_range, why: flags of the answer, and its reason for them.
+        solve_seconds: time that the node spent on it [s].
+        latency: time from its last contact message to itself, by the recorder's clock [s]; NaN: unknown.
     """
 
     number: int
@@ -49,12 +49,12 @@ class Timing:
     """Rate, latency and losses of a run.
 
     Args:
-        answers: recorded displacement messages.
-        instants: distinct stamps of contact messages, from the first answered one to the last.
-        skipped: of these, how many were never answered because a newer one came first (latest wins).
-        lost: answers that were sent but are not in the bag: gaps in their sequence numbers.
-        answer_rate, instant_rate: per second [1/s].
-        latencies: of every answer [s], NaN where unknown.
+        answers: number of recorded answers.
+        instants: number of distinct stamps of contact messages, from the first answered one to the last.
+        skipped: number of these that were never answered because a newer one came first (latest wins).
+        lost: number of answers that were sent but are not in the bag: gaps in their sequence numbers.
+        answer_rate, instant_rate: answers and instants a second [1/s].
+        latencies: latency of every answer [s], NaN where unknown.
     """
 
     answers: int
@@ -94,18 +94,18 @@ class _Note:
     method: str
     log_time_ns: int
     layer_id: str
-    layer: SoftLayer | None  # that the load was summed over
+    layer: SoftLayer | None  # layer that the load was summed over
 
 
 def survey(path: Path | str, namespace: str = "") -> Survey:
     """Looks over a run.
 
     Args:
-        path: a folder, or the path of the .mcap file.
+        path: path of a folder, or of the .mcap file.
         namespace: namespace of the one robot that is meant, "/left"; "": there is but one.
 
     Raises:
-        BagError: no answers, no skin, or several robots and no namespace.
+        BagError: a run without answers or skin, or several robots and no namespace.
     """
     notes: list[_Note] = []
 

@@ -1,4 +1,4 @@
-"""wire: every message, decoded and encoded once: what its fields mean as core types, and core types as messages.
+"""Wire: every message, decoded and encoded once: what its fields mean as core types, and core types as messages.
 
 Decoding takes rclpy's messages and those of a recording alike. Encoding imports the ROS classes when it is first asked.
 """
@@ -29,7 +29,7 @@ FixedFrames = Mapping[str, Transform]  # pose_body_from_frame of each frame that
 
 NANO = 1_000_000_000  # nanoseconds in a second
 NO_FRAMES: FixedFrames = MappingProxyType({})
-QUATERNION_TOLERANCE = 1e-2  # a unit quaternion that went through float32 or text is off by far less
+QUATERNION_TOLERANCE = 1e-2  # error of a unit quaternion's length; through float32 or text it is far less
 NOWHERE = np.full((4, 4), np.nan)  # pose that a recording does not tell
 
 
@@ -65,7 +65,7 @@ def pose_from(pose: Any) -> Transform:
     """geometry_msgs/Pose as a rigid transform (4, 4).
 
     Raises:
-        InvalidInput: not finite, or the quaternion is no unit quaternion.
+        InvalidInput: numbers that are not finite, or the quaternion is no unit quaternion.
     """
     p, q = pose.position, pose.orientation
     xyzw = np.array([q.x, q.y, q.z, q.w], dtype=np.float64)
@@ -88,7 +88,7 @@ def pose_of_tool(message: Any, tool: str, body_frame: str, frames: FixedFrames =
 
     Raises:
         FrameError: a frame that is neither the body's nor in `frames`.
-        InvalidInput: not finite, no rotation, or so far off that it must be in millimetres.
+        InvalidInput: numbers that are not finite, no rotation, or so far off that it must be in millimetres.
     """
     frame, pose = message.header.frame_id, pose_from(message.pose)
     if frame != body_frame:
@@ -112,7 +112,7 @@ def wrench_from(
 
     Raises:
         FrameError: a frame that is neither the body's, nor the tool's own, nor in `frames`.
-        InvalidInput: not finite.
+        InvalidInput: numbers that are not finite.
     """
     frame, wrench = message.header.frame_id, finite(f"wrench of {tool}", _six(message.wrench), (6,))
     if frame == body_frame:
@@ -131,7 +131,7 @@ def contact_from(
 
     Raises:
         FrameError: pose or wrench in a frame that is not known.
-        InvalidInput: not finite, or not a rigid pose.
+        InvalidInput: numbers that are not finite, or not a rigid pose.
     """
     at, time = pose_of_tool(pose, tool.name, body_frame, frames), stamp_ns(pose) / NANO
     if wrench is None:
@@ -318,7 +318,7 @@ def displacement_message(
         stamp_ns: stamp of the newest pose that it answers [ns].
         sequence: number of the answer.
         solve_seconds: time spent on it [s].
-        inputs: stamps of what it answers [ns].
+        inputs: stamps of the poses and wrenches that it answers [ns].
         fade: share of its contacts' answer that it is (see Answer.faded).
         why: sentence to add to the trust's own.
     """

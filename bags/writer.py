@@ -23,10 +23,10 @@ from stmpl_core.errors import BagError
 log = logging.getLogger(__name__)
 
 ROS_DISTRO = "jazzy"
-FILE = "run_0.mcap"  # in a recording's folder; ros2 bag reindex takes names that end in a number only
-FOREVER = 2147483647.0  # s; an infinite duration is written as this or more
-METADATA_VERSION = 9  # of rosbag2's metadata.yaml in Jazzy
-CHUNK_BYTES = 8 << 20  # a chunk is closed when it grows over this, or when chunk_seconds have passed
+FILE = "run_0.mcap"  # file in a recording's folder; ros2 bag reindex takes only names that end in a number
+FOREVER = 2147483647.0  # duration that is written for infinity or more [s]
+METADATA_VERSION = 9  # version of rosbag2's metadata.yaml in Jazzy
+CHUNK_BYTES = 8 << 20  # size at which a chunk is closed [bytes], if chunk_seconds have not passed before
 
 
 def qos_yaml(
@@ -59,7 +59,7 @@ def qos_yaml(
 
 @dataclass(frozen=True)
 class Offered:
-    """What matters of a QoS profile; the names are those of `qos_yaml`."""
+    """Part of a QoS profile that matters here; the names are those of `qos_yaml`."""
 
     depth: int = 10
     reliable: bool = True
@@ -97,11 +97,11 @@ class BagWriter:
     a while, because time is looked at only when one is written. Not thread-safe: one thread writes.
 
     Args:
-        path: a folder, which gets FILE, or the path of the .mcap file; metadata.yaml goes beside it.
+        path: path of a folder, which gets FILE, or of the .mcap file; metadata.yaml goes beside it.
         chunk_seconds: wall-clock time after which a chunk is closed and handed to the operating system.
 
     Raises:
-        BagError: the file exists, or cannot be written.
+        BagError: a file that exists, or cannot be written.
     """
 
     def __init__(self, path: Path | str, *, chunk_seconds: float = 1.0) -> None:

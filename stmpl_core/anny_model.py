@@ -19,7 +19,7 @@ import numpy as np
 from stmpl_core.arrays import Faces, Points
 from stmpl_core.extras import needed
 
-ANNY_TO_BODY = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])  # Anny looks along -y with its left towards +x
+ANNY_TO_BODY = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])  # rotation; Anny looks along -y with its left towards +x
 CACHE_VERSION = 1
 
 Skin = tuple[Points, Faces, np.ndarray, np.ndarray, tuple[str, ...]]  # vertices, faces, uv, bone weights, bones

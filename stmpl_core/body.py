@@ -23,7 +23,7 @@ from stmpl_core.layer import SoftLayer, Tissue, check_faces
 if TYPE_CHECKING:
     from stmpl_core.remesh import Remeshed
 
-PARTS = {  # the bones of a part: Anny's names, then the SMPL family's
+PARTS = {  # bones of a part: Anny's names, then the SMPL family's
     "left_arm": r"(upper|lower)arm\d*\.L|left_(shoulder|elbow)",
     "left_upper_arm": r"upperarm\d*\.L|left_shoulder",
     "left_forearm": r"lowerarm\d*\.L|left_elbow",
@@ -38,10 +38,10 @@ PARTS = {  # the bones of a part: Anny's names, then the SMPL family's
     "right_calf": r"lowerleg\d*\.R|right_knee",
     "torso": r"root|spine\d+|pelvis\.[LR]|clavicle\.[LR]|breast\.[LR]|pelvis|spine\d|(left|right)_collar",
 }
-RINGS = 3  # of faces kept around a part while it is subdivided, so that its border is no border of the surface
-SMPL_TO_BODY = np.array([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]])  # SMPL looks along +z with its left towards +x
+RINGS = 3  # rings of faces kept around a part while it is subdivided, so that its border is none of the surface
+SMPL_TO_BODY = np.array([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]])  # rotation; SMPL looks along +z with its left towards +x
 PHENOTYPE = ("gender", "age", "muscle", "weight", "height", "proportions")
-AVERAGE = 0.5  # of every phenotype
+AVERAGE = 0.5  # value of every phenotype unless given
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,11 +52,11 @@ class Body:
     pelvis. Metres.
 
     Args:
-        name: of the model.
-        vertices: shape (V, 3) [m].
-        faces: shape (F, 3), counter-clockwise seen from outside.
-        uv: per corner, (F, 3, 2) in [0, 1], v up; None if the model has none.
-        weights: of the bones at each vertex, (V, B) [-], rows sum to 1.
+        name: name of the model.
+        vertices: positions, (V, 3) [m].
+        faces: vertex numbers, (F, 3), counter-clockwise seen from outside.
+        uv: texture coordinates of each corner, (F, 3, 2) in [0, 1], v up; None if the model has none.
+        weights: weights of the bones at each vertex, (V, B) [-], rows sum to 1.
         bones: names of the bones, B of them.
     """
 
@@ -85,7 +85,7 @@ class Body:
         (STMPL_CACHE_DIR moves it), and costs milliseconds from then on.
 
         Args:
-            pose: a rotation vector [rad] for each bone that turns, (3,), from the rest pose, in the body's axes.
+            pose: rotation vector [rad] for each bone that turns, (3,), from the rest pose, in the body's axes.
             phenotype: gender, age, muscle, weight, height, proportions, each in [0, 1]; 0.5 unless given.
 
         Raises:
@@ -120,15 +120,15 @@ class Body:
         Load no file that you do not trust: a .pkl can run code.
 
         Args:
-            path: the model file, or the folder that holds `model_type`/ as smplx wants it.
+            path: model file, or the folder that holds `model_type`/ as smplx wants it.
             model_type: "smpl", "smplh" or "smplx".
             gender: "neutral", "female" or "male".
             betas: shape coefficients, up to as many as the file has.
             pose: body pose, rotation vectors [rad] in SMPL's own axes and order, (joints, 3) or flat.
-            uv: an .obj file of the same topology with texture coordinates (SMPL's come separately).
+            uv: path of an .obj file of the same topology with texture coordinates (SMPL's come separately).
 
         Raises:
-            InvalidInput: no such file, or one that smplx cannot read; shapes that do not fit.
+            InvalidInput: a file that is missing or that smplx cannot read; shapes that do not fit.
         """
         needed("a body of the SMPL family", "smpl", "smplx", "torch")
         import smplx
@@ -166,15 +166,15 @@ class Body:
         """A part of the body as a soft layer, evenly remeshed, with the body's UV chart attached.
 
         Args:
-            name: see `Body.parts`, or the name of one bone.
-            edge_length: of the skin's mesh [m].
-            thickness: of the layer, one number or one a vertex of the new mesh [m]; thinned, with a warning, where the
-                skin curves more tightly than that.
+            name: name of a part (`Body.parts`), or of one bone.
+            edge_length: length of the mesh's edges [m].
+            thickness: thickness of the layer [m], one number or one a vertex of the new mesh; thinned, with a warning,
+                where the skin curves more tightly than that.
             tissue: material; Tissue() unless given.
 
         Raises:
             InvalidInput: unknown part; the error lists what exists.
-            MeshError: see `stmpl_core.remesh`.
+            MeshError: a surface that `stmpl_core.remesh` refuses.
         """
         shipped = limbs.part(name, edge_length) if self is _average() else None
         if shipped is not None:

@@ -18,7 +18,7 @@ from stmpl_core.layer import check_faces
 log = logging.getLogger(__name__)
 
 PADDING = 3  # texels beyond the island that carry extrapolated values: bilinear sampling at a seam needs one
-MULTIPLE = 16  # image sides are multiples of it, so that a network may halve them four times
+MULTIPLE = 16  # texels of which image sides are multiples, so that a network may halve them four times
 
 
 class UvChart:
@@ -28,11 +28,11 @@ class UvChart:
     One texel is as wide as high in UV. A vertex on a seam has several places in the image.
 
     Args:
-        vertices: shape (V, 3) [m], for the scale in mm.
-        faces: shape (F, 3).
-        uv: per corner, (F, 3, 2) [-].
+        vertices: positions, (V, 3) [m], for the scale in mm.
+        faces: vertex numbers, (F, 3).
+        uv: texture coordinates of each corner, (F, 3, 2) [-].
         resolution: texels along the longer side of the image.
-        bounds: the part of UV space to show, (u0, v0, u1, v1); the island itself unless given.
+        bounds: part of UV space to show, (u0, v0, u1, v1); the island itself unless given.
             (0, 0, 1, 1) is the whole body's image, as in the STMPL paper, most of which one limb leaves empty.
 
     Raises:

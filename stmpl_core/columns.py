@@ -12,22 +12,22 @@ from stmpl_core.arrays import Points, Transform
 from stmpl_core.layer import SoftLayer
 from stmpl_core.sdf import SignedDistance, distance_at
 
-HOLE = 0.6  # of an edge: a tool that comes no nearer to a vertex touches none of its triangles (equilateral: 0.577)
-DEEPEST = 0.9  # of the thickness; columns are not squeezed further
-ROUND = 4e-4  # m over which the squeeze rises beside a tool's wall: no sample pops in while the tool slides
-CLOSE = 2e-5  # m to the tool from which the secant rule finishes what sphere tracing began
-EXACT = 3e-6  # m that the secant rule's last step may have; the depth is then known far better
+HOLE_RADIUS = 0.6  # farthest point of a triangle from its corners, over the edge length (equilateral: 0.577)
+MAX_COLUMN_STRAIN = 0.9  # strain beyond which no column is squeezed
+WALL_BLEND_M = 4e-4  # width over which the squeeze rises beside a tool's wall: no sample pops in while the tool slides
+SECANT_START_M = 2e-5  # distance to the tool at which the secant rule takes over from sphere tracing
+SECANT_TOLERANCE_M = 3e-6  # largest last step of the secant rule; the depth is then known far better
 
 
 class Squeeze(NamedTuple):
-    """What a tool at its pose would do to columns that knew nothing of each other.
+    """Squeeze of columns by a tool at its pose, each column by itself.
 
     Args:
         vertices: numbers of the vertices that carry any of it, (N,).
         pressure: Winkler's pressure over E, averaged with each vertex's hat function, (N,) [-].
-        strain: of the columns, times confined modulus over E, averaged likewise, (N,) [-].
-        depth: under the vertex itself, from the skin at rest to the tool, 0 where it is not covered, (N,) [m].
-        rests: from 0, where the vertex is not covered, to 1, ROUND inside the tool's walls and its skin, (N,) [-].
+        strain: strain of the columns times confined modulus over E, averaged likewise, (N,) [-].
+        depth: depth of the tool under the vertex itself, 0 where it is not covered, (N,) [m].
+        rests: share from 0, not covered, to 1, WALL_BLEND_M inside the tool's walls and its skin, (N,) [-].
     """
 
     vertices: np.ndarray
@@ -41,10 +41,10 @@ NO_SQUEEZE = Squeeze(np.empty(0, np.int64), np.empty(0), np.empty(0), np.empty(0
 
 
 class Clearance(NamedTuple):
-    """How near a tool comes to columns.
+    """Distance of a tool from columns.
 
     Args:
-        vertices: their numbers, (N,).
+        vertices: numbers of the columns' vertices, (N,).
         least: signed distance along each column (N,) [m]; inf where the tool comes through the core.
         skin: signed distance at its skin, (N,) [m].
     """
@@ -58,7 +58,7 @@ class Columns:
     """The columns of a layer, skin to core, with their triangles around them.
 
     Args:
-        layer: the soft layer at rest.
+        layer: soft layer at rest.
     """
 
     def __init__(self, layer: SoftLayer) -> None:
@@ -106,22 +106,22 @@ class Columns:
         return _inside_box(self.points, pose, low - reach, high + reach, centre)
 
     def squeezed(self, field: SignedDistance, pose: Transform) -> Squeeze:
-        """How the tool squeezes the columns at its pose."""
+        """Squeeze of the columns by a tool at its pose."""
         near = self.near(field, pose, float(self.layer.thickness.max()) + self.layer.edge_length)
         return self.squeeze(field, pose, self.clearance(field, pose, near, self.layer.edge_length))
 
     def clearance(self, field: SignedDistance, pose: Transform, near: np.ndarray, far: float) -> Clearance:
-        """How near the tool comes to columns; those further than `far` [m] are only known to be so."""
+        """Distance of the tool from columns; those further than `far` [m] are only known to be so."""
         least, skin = _clearances(_grid(field), pose, self.points, self.inward, self.layer.thickness, near, far)
         return Clearance(near, least, skin)
 
     def squeeze(self, field: SignedDistance, pose: Transform, clearance: Clearance) -> Squeeze:
-        """How the tool squeezes the columns that it comes near to."""
+        """Squeeze of the columns that the tool comes near to."""
         near, least, above = clearance
-        covered = near[least < HOLE * self.layer.edge_length]  # no point of a triangle is further from all corners
+        covered = near[least < HOLE_RADIUS * self.layer.edge_length]
         if not len(covered):
             return NO_SQUEEZE
-        buried = min(max(float(np.minimum(-least, above).max()) / ROUND, 0.0), 1.0)
+        buried = min(max(float(np.minimum(-least, above).max()) / WALL_BLEND_M, 0.0), 1.0)
         skin = self.points, self.inward, self.layer.thickness, self.faces, self._start, self._around, self._face_areas
         vertices, sums, depth, rests = _squeeze(_grid(field), pose, *skin, covered, buried, self._slot, self._moduli)
         sums /= self.layer.vertex_areas[vertices, None]
@@ -129,21 +129,21 @@ class Columns:
 
     def deeper(self, columns: np.ndarray, weight: np.ndarray, depth: np.ndarray, gain: np.ndarray, times: float,
                most: float) -> float:  # fmt: skip
-        """How much deeper columns must be squeezed to press `times` as hard together, each by itself, [m].
+        """Further depth at which columns together press `times` as hard, each by itself [m].
 
         Args:
-            columns: their numbers, (N,).
-            weight: of their pressures in the sum, (N,).
-            depth: to which they are squeezed now; below 0: how far the tool still is, (N,) [m].
+            columns: numbers of the columns' vertices, (N,).
+            weight: weights of their pressures in the sum, (N,).
+            depth: depth of the tool in each now, (N,) [m]; below 0: the tool is that far away.
             gain: depth that each gains over what is returned, (N,) [-].
-            times: > 0.
-            most: the largest answer [m]; the least is its negative.
+            times: factor on the force, > 0.
+            most: largest answer [m]; the least is its negative.
         """
         return _deeper(self._moduli, self.layer.thickness[columns], weight, depth, gain, times, most)
 
 
 def depth_along(field: SignedDistance, pose: Transform, points: Points, way: Points, guess: np.ndarray) -> np.ndarray:
-    """How far points (N, 3) inside a tool must go along unit vectors (N, 3) to leave it, (N,) [m], from a guess > 0."""
+    """Way of points (N, 3) along unit vectors (N, 3) out of a tool, (N,) [m], from a guess > 0."""
     return _depths_along(_grid(field), pose, points, np.ascontiguousarray(way), guess)
 
 
@@ -235,10 +235,10 @@ def _clearances(grid, pose, points, inward, thickness, near, far):
 def _meet(grid, ray, t, guess):
     """How deep along a ray, from the skin inwards, the tool ends [m]; 0 if it is not met.
 
-    From a guess above ROUND by the secant rule. Where that goes astray, as along a wall of the tool, or without such a
-    guess: from the core by sphere tracing, then the secant rule.
+    From a guess above WALL_BLEND_M by the secant rule. Where that goes astray, as along a wall of the tool, or without
+    such a guess: from the core by sphere tracing, then the secant rule.
     """
-    if guess > ROUND:
+    if guess > WALL_BLEND_M:
         s, d = guess, _at(grid, ray, guess)
         last_s, last_d = s + 1.0, d + 1.0
         for _ in range(6):
@@ -247,7 +247,7 @@ def _meet(grid, ray, t, guess):
                 break
             last_s, last_d = s, d
             s -= d / slope
-            if abs(s - last_s) < EXACT and s > 0:
+            if abs(s - last_s) < SECANT_TOLERANCE_M and s > 0:
                 return min(s, t)
             d = _at(grid, ray, s)
     s, d = t, _at(grid, ray, t)
@@ -255,7 +255,7 @@ def _meet(grid, ray, t, guess):
         return t
     last_s, last_d = s + 1.0, d + 1.0
     for _ in range(40):
-        if s - d > 0 and d > CLOSE:
+        if s - d > 0 and d > SECANT_START_M:
             last_s, last_d = s, d
             s -= d
         else:
@@ -265,7 +265,7 @@ def _meet(grid, ray, t, guess):
             s = following
         if s <= 0:
             return 0.0
-        if abs(s - last_s) < EXACT:
+        if abs(s - last_s) < SECANT_TOLERANCE_M:
             return min(s, t)
         d = _at(grid, ray, s)
     return min(s, t)
@@ -290,7 +290,7 @@ def _together(moduli, thickness, weight, depth, gain, by):
     """Weighted sum of the pressures of columns that are squeezed `by` more."""
     total = 0.0
     for n in range(len(depth)):
-        strain = min((depth[n] + by * gain[n]) / thickness[n], DEEPEST)
+        strain = min((depth[n] + by * gain[n]) / thickness[n], MAX_COLUMN_STRAIN)
         if strain > 0:
             total += weight[n] * _column_pressure(moduli, strain)
     return total
@@ -298,7 +298,7 @@ def _together(moduli, thickness, weight, depth, gain, by):
 
 @numba.njit(cache=True, inline="always")
 def _column_pressure(moduli, strain):
-    """Of a confined Neo-Hookean column, over E [-]."""
+    """Pressure of a confined Neo-Hookean column, over E [-]."""
     stretch = 1 - strain
     return -(moduli[0] * (stretch - 1 / stretch) + moduli[1] * np.log(stretch) / stretch)
 
@@ -315,9 +315,8 @@ def _depths_along(grid, pose, points, way, guess):
 def _squeeze(grid, pose, points, inward, thickness, faces, start, around, face_areas, covered, buried, slot, moduli):
     """See Columns.squeeze: vertices in order, pressure and strain times their areas (N, 2), depth (N,), rests (N,).
 
-    A triangle with all corners covered has a good guess of every depth; at the border the depth falls to 0 over ROUND
-    beside a wall of the tool. Unless the tool is buried, columns whose skin is outside
-    it are free.
+    A triangle with all corners covered has a good guess of every depth; at the border the depth falls to 0 over
+    WALL_BLEND_M beside a wall of the tool. Unless the tool is buried, columns whose skin is outside it are free.
     """
     mu, lam = moduli[0], moduli[1]
     room = 0
@@ -343,12 +342,12 @@ def _squeeze(grid, pose, points, inward, thickness, faces, start, around, face_a
         slot[v] = n
         ray = _ray(pose, points, inward, v)
         guess = -_at(grid, ray, 0.0)
-        share = 1.0 if guess >= 0 else max(buried, 1 + guess / ROUND)
+        share = 1.0 if guess >= 0 else max(buried, 1 + guess / WALL_BLEND_M)
         guess = 0.0 if buried > 0 else guess
         depth[n] = 0.0 if share <= 0 else share * _meet(grid, ray, thickness[v], guess)
         if depth[n] > 0:
-            inside = -_at(grid, ray, depth[n] - ROUND)
-            rests[n] = min(max(2 * inside / ROUND, 0.0), 1.0) * min(depth[n] / ROUND, 1.0)
+            inside = -_at(grid, ray, depth[n] - WALL_BLEND_M)
+            rests[n] = min(max(2 * inside / WALL_BLEND_M, 0.0), 1.0) * min(depth[n] / WALL_BLEND_M, 1.0)
     point, down = np.empty((1, 3)), np.empty((1, 3))
     for f in found:
         i, j, k = faces[f, 0], faces[f, 1], faces[f, 2]
@@ -370,18 +369,18 @@ def _squeeze(grid, pose, points, inward, thickness, faces, start, around, face_a
             guess, share = a * di + b * dj + c * dk, 1.0
             if border or buried > 0:
                 guess = -_at(grid, ray, 0.0)
-                share = 1.0 if guess >= 0 else max(buried, 1 + guess / ROUND)
+                share = 1.0 if guess >= 0 else max(buried, 1 + guess / WALL_BLEND_M)
                 if share <= 0:
                     continue
                 guess = 0.0 if buried > 0 else guess
             deep = _meet(grid, ray, t, guess)
             if border and deep > 0:
-                inside = -_at(grid, ray, deep - ROUND)
-                deep *= min(max(2 * inside / ROUND, 0.0), 1.0)
+                inside = -_at(grid, ray, deep - WALL_BLEND_M)
+                deep *= min(max(2 * inside / WALL_BLEND_M, 0.0), 1.0)
             deep *= share
             if deep <= 0:
                 continue
-            strain = min(deep / t, DEEPEST)
+            strain = min(deep / t, MAX_COLUMN_STRAIN)
             pressure = _column_pressure(moduli, strain)
             strain *= lam + 2 * mu
             for corner, part in ((i, a), (j, b), (k, c)):

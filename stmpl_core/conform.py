@@ -1,4 +1,4 @@
-"""conform: moves an answer so that skin that is touched lies on its tool, and none lies inside."""
+"""Conform: moves an answer so that skin that is touched lies on its tool, and none lies inside."""
 
 from __future__ import annotations
 
@@ -14,21 +14,21 @@ from stmpl_core.moments import Surroundings
 from stmpl_core.sdf import SignedDistance
 from stmpl_core.touch import Pressed, Touch
 
-PRESSED = 0.05  # of a tool's highest pressure, from which a covered vertex lies on the tool; with less it may be apart
-TAKEN = 1e-4  # m inside a tool from which skin is moved out with its neighbours, not by itself
-AHEAD = 0.3  # cosine between the tool's way and the inward normal from which skin comes along
-ALONG = 0.7  # share of the pressures that point one way, and cosine of that to a force, for one way of all skin
-PASSES = 3
-SMOOTH = 0.05  # of the sinking of a vertex under its own source, added to keep neighbours from fighting
+MIN_LYING_PRESSURE = 0.05  # pressure over the tool's highest, below which a covered vertex may be apart from the tool
+FIRM_DEPTH_M = 1e-4  # depth inside a tool from which skin is moved out with its neighbours, not by itself
+MIN_FACING_COSINE = 0.3  # cosine between tool's way and inward normal, from which skin comes along
+MIN_ONE_WAY_SHARE = 0.7  # share of the pressure that points one way, and its cosine to a force: all skin then goes so
+PASSES = 3  # corrections of one answer
+SMOOTHING_SHARE = 0.05  # ridge over the sinking of a vertex under its own source: it keeps neighbours from fighting
 
 
 class Conformed(NamedTuple):
     """An answer that fits its tools.
 
     Args:
-        displacement: (V, 3) [m].
-        corrected: how far the furthest vertex under a tool was moved [m].
-        entered: how deep the deepest vertex under a tool still is in it [m].
+        displacement: displacement that fits, (V, 3) [m].
+        corrected: largest correction of a vertex under a tool [m].
+        entered: largest depth of a vertex inside a tool that is left [m].
     """
 
     displacement: VertexVectors
@@ -40,8 +40,8 @@ class _Tool(NamedTuple):
     field: SignedDistance
     pose: np.ndarray
     vertices: np.ndarray
-    gone: Points  # how far the vertices have come with the tool if they lie on it, (N, 3) [m]
-    lies: np.ndarray  # from 0, may be apart, to 1, lies on the tool, (N,)
+    gone: Points  # way of the vertices with the tool if they lie on it, (N, 3) [m]
+    lies: np.ndarray  # share from 0, may be apart, to 1, lies on the tool, (N,)
 
     def jet(self, points: Points) -> tuple[np.ndarray, Points]:
         """Signed distance [m] and its gradient at points of the layer's frame."""
@@ -51,7 +51,7 @@ class _Tool(NamedTuple):
 
 
 def conform(layer: SoftLayer, near: Surroundings, displacement: VertexVectors, touches: Sequence[Touch]) -> Conformed:
-    """Moves the skin under tools onto them, and the skin around it along, as far as a bonded layer would.
+    """Moves the skin under tools onto them, and the skin around them along as a bonded layer would.
 
     What presses is known as pressures, what they do is a method's answer; but under a rigid tool the motion is known
     better than any method can say it: the skin has come along with the tool that it sticks to, and does not enter it.
@@ -63,7 +63,7 @@ def conform(layer: SoftLayer, near: Surroundings, displacement: VertexVectors, t
         layer: soft layer at rest.
         near: neighbours of its vertices.
         displacement: a method's answer, (V, 3) [m].
-        touches: what all contacts do.
+        touches: touches of all contacts.
     """
     tools = [_tool(touch, touch.pressed, layer) for touch in touches if touch.pressed is not None]
     if not tools:
@@ -71,7 +71,7 @@ def conform(layer: SoftLayer, near: Surroundings, displacement: VertexVectors, t
     all_of = np.unique(np.concatenate([tool.vertices for tool in tools]))
     place = [np.searchsorted(all_of, tool.vertices) for tool in tools]
     sinking = near.sinking(all_of).astype(float)
-    own = SMOOTH * float(np.diag(sinking).mean())
+    own = SMOOTHING_SHARE * float(np.diag(sinking).mean())
     moved, sources = displacement[all_of], np.zeros((len(all_of), 3))
     for _ in range(PASSES):
         wanted, weight = np.zeros((len(all_of), 3)), np.zeros(len(all_of))
@@ -103,12 +103,12 @@ def _tool(touch: Touch, pressed: Pressed, layer: SoftLayer) -> _Tool:
     v = squeeze.vertices
     pressure, size = touch.pressure[v], touch.force
     way = -layer.normals[v]
-    if size > ALONG * float(pressure @ layer.vertex_areas[v]):
+    if size > MIN_ONE_WAY_SHARE * float(pressure @ layer.vertex_areas[v]):
         one = touch.wrench[:3] / size
-        way = np.broadcast_to(forced if forced is not None and forced @ one > ALONG else one, way.shape)
+        way = np.broadcast_to(forced if forced is not None and forced @ one > MIN_ONE_WAY_SHARE else one, way.shape)
     depth, cosine = squeeze.depth, -np.einsum("ni,ni->n", layer.normals[v], way)
-    lies = squeeze.rests * np.clip(pressure / (PRESSED * pressure.max()) - 0.5, 0, 1)
-    lies *= np.clip((cosine - AHEAD) / 0.1, 0, 1)
+    lies = squeeze.rests * np.clip(pressure / (MIN_LYING_PRESSURE * pressure.max()) - 0.5, 0, 1)
+    lies *= np.clip((cosine - MIN_FACING_COSINE) / 0.1, 0, 1)
     some, gone = np.flatnonzero(lies), np.zeros((len(v), 3))
     points, guess = layer.vertices[v[some]], depth[some] / cosine[some]
     far = depth_along(field, touch.pose_body_from_tool, points, way[some], guess)
@@ -122,4 +122,4 @@ def _wanted(tool: _Tool, rest: Points, moved: Points) -> tuple[Points, np.ndarra
     phi, gradient = tool.jet(rest + moved)
     out, lies = -np.minimum(phi, 0.0)[:, None] * gradient, tool.lies[:, None]
     wanted = lies * (tool.gone - moved) + (1 - lies) * out
-    return wanted, np.maximum(tool.lies, np.clip(-phi / TAKEN, 0, 1))
+    return wanted, np.maximum(tool.lies, np.clip(-phi / FIRM_DEPTH_M, 0, 1))

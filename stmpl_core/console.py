@@ -1,4 +1,4 @@
-"""console: what commands print: figures for people or machines, and progress bars with the time left."""
+"""Console: what commands print: figures for people or machines, and progress bars with the time left."""
 
 from __future__ import annotations
 

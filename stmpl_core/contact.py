@@ -16,14 +16,14 @@ class Contact:
     """One tool at one instant.
 
     Args:
-        tool: the tool.
+        tool: tool that touches.
         pose_body_from_tool: rigid transform, (4, 4), taking tool coordinates to the layer's frame.
         wrench: force [N] and torque about the tool's origin [N m] that the tool exerts *on the body*,
             in the layer's axes, (6,); None when there is no force sensor.
         time: instant [s], on any clock that all contacts share.
 
     Raises:
-        InvalidInput: not finite, or a pose that is not rigid.
+        InvalidInput: numbers that are not finite, or a pose that is not rigid.
     """
 
     tool: Tool

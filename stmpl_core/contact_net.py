@@ -11,11 +11,11 @@ from stmpl_core.methods.moment_net import invariants, think_few
 from stmpl_core.moments import Surroundings
 from stmpl_core.networks import INPUTS, PRESSURE, Weights, shipped
 
-MOST = 2.5  # largest |log| of pressure over Winkler's
+MAX_LOG_RATIO = 2.5  # largest |log| of pressure over Winkler's [-]
 
 
 class Held(NamedTuple):
-    """What holds the skin against a tool.
+    """Pressure that holds the skin against a tool, and its doubt.
 
     Args:
         pressure: pressure over E, (N,) [-].
@@ -51,7 +51,7 @@ class ContactNet:
         self._constants = np.array([layer.tissue.poisson_ratio, 0.0], np.float32)
 
     def hold(self, vertices: np.ndarray, pressure: np.ndarray, strain: np.ndarray) -> Held:
-        """The pressure that holds squeezed columns.
+        """Pressure that holds squeezed columns.
 
         Args:
             vertices: numbers of the squeezed vertices, (N,).
@@ -66,5 +66,5 @@ class ContactNet:
                    a["high"], a["mean"], a["scale"], inputs, outside)  # fmt: skip
         outputs = np.empty((len(vertices), PRESSURE.size), np.float32)
         think_few(inputs, a["w1"], a["b1"], a["w2"], a["b2"], a["w3"], a["b3"], a["w4"], a["b4"], outputs)
-        held = pressure * np.exp(np.clip(outputs[:, PRESSURE.at.log_ratio], -MOST, MOST))
+        held = pressure * np.exp(np.clip(outputs[:, PRESSURE.at.log_ratio], -MAX_LOG_RATIO, MAX_LOG_RATIO))
         return Held(held, held * np.exp(np.minimum(outputs[:, PRESSURE.at.log_error], 1.0)), outside)

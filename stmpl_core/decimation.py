@@ -8,14 +8,14 @@ import numpy as np
 from stmpl_core.arrays import Faces, Points
 from stmpl_core.rows import first_alike
 
-MARGIN = 5e-3  # m of grid around the tool
-FINEST = 1e-4  # m; no finer grid pays
-BAND = 3  # within this many cells of the surface the distances are exact
-BAND_NODES = 40_000  # about what the default spacing spends on the band: a third of a second for 5,000 triangles
-MAX_NODES = 3_000_000  # 24 MB
-MANY = 100_000  # triangles; a surface of fewer is left as it is
-CELL = 0.75  # edge of a cluster's cell over the field's spacing
-PULL = 1e-3  # weight of a cluster's mean against its planes: it decides along a plane or an edge
+MARGIN = 5e-3  # width of the grid around the tool [m]
+MIN_SPACING_M = 1e-4  # spacing below which no grid pays
+BAND_CELLS = 3  # cells around the surface in which the distances are exact
+BAND_NODES = 40_000  # nodes that the default spacing spends on the band: 1/3 s for 5,000 triangles
+MAX_NODES = 3_000_000  # nodes of a grid: 24 MB
+MAX_KEPT_TRIANGLES = 100_000  # triangles up to which a surface is left as it is
+CELL_OVER_SPACING = 0.75  # edge of a cluster's cell over the field's spacing
+MEAN_WEIGHT = 1e-3  # weight of a cluster's mean against its planes: it decides along a plane or an edge
 
 
 def field_spacing(area: float, extent: np.ndarray, margin: float = MARGIN) -> float:
@@ -26,7 +26,7 @@ def field_spacing(area: float, extent: np.ndarray, margin: float = MARGIN) -> fl
         extent: size of the surface along each axis, (3,) [m].
         margin: width of the grid around the surface [m].
     """
-    spacing = max(FINEST, (2 * BAND * area / BAND_NODES) ** 0.5)
+    spacing = max(MIN_SPACING_M, (2 * BAND_CELLS * area / BAND_NODES) ** 0.5)
     return max(spacing, (float(np.prod(extent + 2 * margin + 2 * spacing)) / (0.8 * MAX_NODES)) ** (1 / 3))
 
 
@@ -91,7 +91,7 @@ def _placed(vertices: Points, faces: Faces, cluster: np.ndarray, low: Points, ce
     mean = np.stack([np.bincount(cluster, weights=x) for x in vertices.T], axis=1) / count
     quadric, pull = np.zeros((len(low), 3, 3)), np.zeros((len(low), 3))
     _gather_planes(vertices, faces, cluster, mean, quadric, pull)
-    stay = PULL * np.trace(quadric, axis1=1, axis2=2) + 1e-30
+    stay = MEAN_WEIGHT * np.trace(quadric, axis1=1, axis2=2) + 1e-30
     move = np.linalg.solve(quadric + stay[:, None, None] * np.eye(3), pull[..., None])[..., 0]
     return np.clip(mean + move, low, low + cell)
 

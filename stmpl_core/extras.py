@@ -8,7 +8,7 @@ from stmpl_core.errors import InvalidInput
 
 
 def needed(what: str, extra: str, *packages: str) -> None:
-    """Goes before the import of optional packages.
+    """Checks that optional packages are installed; call it before their import.
 
     Args:
         what: subject of the sentence, as in "stmpl view".

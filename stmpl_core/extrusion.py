@@ -11,10 +11,10 @@ from stmpl_core.layer import SoftLayer
 
 log = logging.getLogger(__name__)
 
-STEP = 0.95  # a vertex under a folding face loses 5 % of its thickness at a time
-SLOPE = 0.3  # of the thickness along the skin [m/m]: a step in it would fold the layer by itself
-FLOOR = 0.1  # of the asked thickness: what folds there is a fold of the skin, and thinning does not help
-PASSES = 80
+THINNING_FACTOR = 0.95  # factor on the thickness under a folding face, each pass
+MAX_THICKNESS_SLOPE = 0.3  # slope of the thickness along the skin [m/m]; a step would fold the layer by itself
+MIN_THICKNESS_SHARE = 0.1  # thinnest over asked thickness; what folds there is a fold of the skin itself
+PASSES = 80  # passes of thinning at most
 
 
 def fold_ratios(vertices: Points, inner: Points, faces: Faces) -> np.ndarray:
@@ -42,13 +42,13 @@ def foldfree_thickness(layer: SoftLayer, *, least: float = 0.15) -> PerVertex:
     """
     thickness = layer.thickness.copy()
     edges = layer.edges
-    reach = SLOPE * np.linalg.norm(layer.vertices[edges[:, 0]] - layer.vertices[edges[:, 1]], axis=1)
-    hopeless = _ratios(layer, FLOOR * thickness) < least
+    reach = MAX_THICKNESS_SLOPE * np.linalg.norm(layer.vertices[edges[:, 0]] - layer.vertices[edges[:, 1]], axis=1)
+    hopeless = _ratios(layer, MIN_THICKNESS_SHARE * thickness) < least
     for _ in range(PASSES):
         bad = np.unique(layer.faces[(_ratios(layer, thickness) < least) & ~hopeless])
         if not len(bad):
             break
-        thickness[bad] *= STEP
+        thickness[bad] *= THINNING_FACTOR
         _limit_slope(thickness, edges, reach)
     _report(layer, thickness, least)
     return thickness
@@ -59,7 +59,7 @@ def _ratios(layer: SoftLayer, thickness: PerVertex) -> np.ndarray:
 
 
 def _limit_slope(thickness: PerVertex, edges: np.ndarray, reach: np.ndarray) -> None:
-    """Lowers the thickness until no edge is steeper than SLOPE."""
+    """Lowers the thickness until no edge is steeper than MAX_THICKNESS_SLOPE."""
     a, b = edges.T
     while True:
         before = thickness.copy()

@@ -17,7 +17,7 @@ from stmpl_core.tool import Tool
 
 log = logging.getLogger(__name__)
 
-LEAST = 4  # surfaces; a process takes as long to start as three of them to be built
+MIN_FIELDS_PER_WORKER = 4  # surfaces that pay for a process; it takes as long to start as three of them to be built
 Built = tuple[SignedDistance | StmplError, list[logging.LogRecord]]
 
 
@@ -46,7 +46,7 @@ def fields_of(
     contents = [tool.digest for tool in tools]
     distinct = dict(zip(contents, tools, strict=True))
     build = partial(_built, spacing=spacing, margin=margin, rounding=rounding)
-    many = min(workers, len(distinct) // LEAST)
+    many = min(workers, len(distinct) // MIN_FIELDS_PER_WORKER)
     fields: list[SignedDistance | StmplError] = []
     if many > 1:
         try:

@@ -14,20 +14,20 @@ from stmpl_core.errors import InvalidInput
 from stmpl_core.local_contact import FADE, LocalContact
 
 LONGEST_DELAY = 256  # device samples that a force may be under way
-PAYBACK = 4e-3  # s in which the controller takes back what was given out
-SOFTEST = 1e-2  # m: a reaction is taken to grow from nothing within this much, when its energy is told
+PAYBACK_S = 4e-3  # time in which the controller takes back the energy that was given out
+ENERGY_DEPTH_M = 1e-2  # depth over which a reaction is taken to grow from nothing, for its energy
 
 
 @dataclass(frozen=True)
 class LoopSettings:
-    """How a DeviceLoop renders.
+    """Settings of a DeviceLoop.
 
     Args:
-        coupling_stiffness: of the spring between device and proxy, Kc [N/m]; the stiffest that a hand can feel.
-        coupling_damping: of the damper beside it, Bc [N s/m].
-        controller: whether the passivity controller may act; the observer always watches.
-        most_damping: that the controller may add [N s/m]; keep it below device mass times rate / 2.
-        velocity_noise: speeds up to this are noise to the controller [m/s]; damping noise makes energy.
+        coupling_stiffness: stiffness of the spring between device and proxy, Kc [N/m]; the hand feels none stiffer.
+        coupling_damping: damping of the damper beside it, Bc [N s/m].
+        controller: permission for the passivity controller to act; the observer always watches.
+        most_damping: largest damping that the controller may add [N s/m]; keep it below device mass times rate / 2.
+        velocity_noise: speed up to which motion is noise to the controller [m/s]; damping noise makes energy.
         force_limit: largest force sent to the device [N].
         stale_after: age of the newest local model [s] from which its reaction decays.
         decay: time constant of that decay [s].
@@ -101,11 +101,11 @@ class DeviceLoop:
         self._newest = _packed(model, self.settings.coupling_stiffness)
 
     def step(self, position: ArrayLike, velocity: ArrayLike, dt: float) -> np.ndarray:
-        """The force for the device.
+        """Force for the device, once per sample.
 
         Args:
-            position: of the tool's origin as the device holds it, layer axes, (3,) [m].
-            velocity: its velocity, (3,) [m/s].
+            position: position of the tool's origin as the device holds it, layer axes, (3,) [m].
+            velocity: velocity of the tool's origin, (3,) [m/s].
             dt: time since the last step [s].
 
         Returns:
@@ -124,22 +124,22 @@ class DeviceLoop:
 
     @property
     def balance(self) -> float:
-        """W, what the observer holds [J]; below 0 the loop has given out energy that was not put in."""
+        """Energy W of the passivity observer [J]; below 0 the loop has given out energy that was not put in."""
         return float(self._state.scalars[BALANCE])
 
     @property
     def taken_in(self) -> float:
-        """Energy that the device put into the loop since it was made, as measured [J]."""
+        """Energy that the device has put into the loop, as measured [J]."""
         return float(self._state.scalars[TAKEN_IN])
 
     @property
     def worst_balance(self) -> float:
-        """Lowest W yet [J]."""
+        """Lowest energy W so far [J]."""
         return float(self._state.scalars[WORST])
 
     @property
     def added_damping(self) -> float:
-        """What the controller adds now [N s/m]."""
+        """Damping that the controller adds now [N s/m]."""
         return float(self._state.scalars[ADDED])
 
     @property
@@ -149,7 +149,7 @@ class DeviceLoop:
 
     @property
     def proxy(self) -> np.ndarray:
-        """Where the tool's origin rests, (3,) [m]: the pose to ask the next local model for."""
+        """Position where the tool's origin rests, (3,) [m]: the pose to ask the next local model for."""
         return self._state.proxy.copy()
 
     @property
@@ -166,14 +166,14 @@ AGE, LEFT, STARTED, BALANCE, TAKEN_IN, STORED, WORST, ADDED, TICK, SCALARS = ran
 
 
 class _State(NamedTuple):
-    live: np.ndarray  # (MODEL,), what is rendered now
-    target: np.ndarray  # (MODEL,), the newest
-    position: np.ndarray  # (3,) [m]
-    velocity: np.ndarray  # (3,) [m/s]
-    last: np.ndarray  # (3,) [m], position one step ago
-    proxy: np.ndarray  # (3,) [m]
-    force: np.ndarray  # (3,) [N]
-    sent: np.ndarray  # (LONGEST_DELAY, 3) [N], a ring
+    live: np.ndarray  # model that is rendered now, (MODEL,)
+    target: np.ndarray  # newest model, (MODEL,)
+    position: np.ndarray  # position of the tool's origin, (3,) [m]
+    velocity: np.ndarray  # velocity of the tool's origin, (3,) [m/s]
+    last: np.ndarray  # position one step ago, (3,) [m]
+    proxy: np.ndarray  # position of the proxy, (3,) [m]
+    force: np.ndarray  # force on the device, (3,) [N]
+    sent: np.ndarray  # ring of sent forces, (LONGEST_DELAY, 3) [N]
     scalars: np.ndarray
 
 
@@ -183,7 +183,7 @@ def _packed(model: LocalContact, coupling: float) -> np.ndarray:
     stiffness = (vectors * np.maximum(values, -0.5 * coupling)) @ vectors.T
     place, force, normal = model.pose_body_from_tool[:3, 3], model.wrench[:3], model.normal
     size = float(np.linalg.norm(force))
-    along = max(float(normal @ stiffness @ normal), size / SOFTEST)
+    along = max(float(normal @ stiffness @ normal), size / ENERGY_DEPTH_M)
     return np.concatenate([force - stiffness @ place, stiffness.ravel(), normal, [size, along], place, [model.valid_m]])
 
 
@@ -252,7 +252,7 @@ def _step(state, constants, dt):
     speed = np.sqrt(v[0] * v[0] + v[1] * v[1] + v[2] * v[2])
     s[ADDED] = 0.0
     if controlled > 0 and s[BALANCE] < 0 and speed > noise:
-        s[ADDED] = min(most, -s[BALANCE] / (speed * speed * max(dt, PAYBACK))) * (1.0 - noise / speed)
+        s[ADDED] = min(most, -s[BALANCE] / (speed * speed * max(dt, PAYBACK_S))) * (1.0 - noise / speed)
     length = 0.0
     for i in range(3):
         force[i] = -f[i] - s[ADDED] * v[i]

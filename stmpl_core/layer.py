@@ -13,9 +13,9 @@ from numpy.typing import ArrayLike
 from stmpl_core.arrays import Faces, PerVertex, Points, VertexVectors, finite
 from stmpl_core.errors import InvalidInput, MeshError
 
-MAX_EXTENT = 4.0  # m; a limb or a body is smaller, a mesh in millimetres is not
-MAX_THICKNESS = 0.1  # m; soft tissue on bone is thinner, a thickness in millimetres is not
-SOFTEST = 100.0  # Pa; no tissue is softer, a modulus in kilopascals is
+MAX_EXTENT = 4.0  # largest extent of a skin [m]; that of a mesh in millimetres is larger
+MAX_THICKNESS = 0.1  # largest thickness of soft tissue [m]; that of a thickness in millimetres is larger
+SOFTEST = 100.0  # smallest Young's modulus of a tissue [Pa]; that of a modulus in kilopascals is smaller
 
 
 @dataclass(frozen=True)
@@ -66,15 +66,15 @@ class SoftLayer:
     """Skin over a rigid core, with a soft layer of given thickness between them.
 
     Args:
-        vertices: skin at rest, shape (V, 3) [m].
-        faces: shape (F, 3), counter-clockwise seen from outside.
-        thickness: of the layer, measured inwards along the vertex normal, (V,) or one number [m].
+        vertices: positions of the skin at rest, (V, 3) [m].
+        faces: vertex numbers, (F, 3), counter-clockwise seen from outside.
+        thickness: thickness of the layer, measured inwards along the vertex normal, (V,) or one number [m].
         tissue: material of the layer.
         chart: UV chart of the skin, if it has one (see stmpl_core.chart).
 
     Raises:
         MeshError: empty, non-manifold, inside-out or degenerate surface, or one that looks like millimetres.
-        InvalidInput: not finite, wrong shapes, thickness not above 0.
+        InvalidInput: numbers that are not finite, wrong shapes, or a thickness not above 0.
     """
 
     def __init__(
@@ -140,7 +140,7 @@ class SoftLayer:
 
     @cached_property
     def inner_vertices(self) -> Points:
-        """Where the layer is bonded to the rigid core: vertices - thickness * normals, shape (V, 3) [m]."""
+        """Points where the layer is bonded to the rigid core: vertices - thickness * normals, shape (V, 3) [m]."""
         return self.vertices - self.thickness[:, None] * self.normals
 
     @cached_property

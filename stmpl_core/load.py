@@ -17,7 +17,7 @@ LoadKind = Literal["pressure", "contact", "nodal"]
 
 @dataclass(frozen=True, eq=False)
 class Load:
-    """One scalar a vertex, pressing inwards where positive. Make it with `pressure`, `contact` or `nodal`."""
+    """Load on the skin, one number a vertex, inwards where positive. Make it with `pressure`, `contact` or `nodal`."""
 
     kind: LoadKind
     values: PerVertex
@@ -29,7 +29,7 @@ class Load:
 
     @classmethod
     def contact(cls, p: ArrayLike) -> Load:
-        """What rigid tools that the skin sticks to press with at each vertex, (V,) [Pa].
+        """Pressure of rigid tools that the skin sticks to, at each vertex, (V,) [Pa].
 
         A pressure, but one that comes with a pull along the skin: it keeps what is touched from spreading under the
         tool. Methods that do not know of it take it for a follower pressure.
@@ -63,7 +63,7 @@ class Load:
         return self.values / layer.vertex_areas if self.kind == "nodal" else self.values
 
     def forces_on(self, layer: SoftLayer) -> VertexVectors:
-        """The forces on the skin at rest, (V, 3) [N]; their sum is what the load presses with."""
+        """Forces on the skin at rest, (V, 3) [N]; their sum is the force of the load."""
         if self.kind == "nodal":
             return -self.values[:, None] * layer.normals
         return -self.values[:, None] * layer.vertex_area_vectors

@@ -21,16 +21,16 @@ from stmpl_core.touch import Touch
 from stmpl_core.toucher import Toucher
 from stmpl_core.trust import Trust
 
-STEP = 1e-4  # m of the central differences: well above the skin's finest kinks, well below a contact's depth
-AGREEMENT = 0.1  # of the wrench: what the linear model may be off by inside its neighbourhood
-SMALLEST = 0.01  # N; smaller reactions are judged as if they were this large: 10 % of it is below what a hand feels
-WIDEST = 2e-3  # m; no neighbourhood is looked for beyond
-SHRINK = 0.9  # of the radius at which the rim should agree
-FADE = 0.1  # of the reaction: below it drag and torque fade with the normal force, to end with it
+STEP = 1e-4  # width of the central differences [m]: far above the skin's finest kinks, far below a contact's depth
+AGREEMENT = 0.1  # error of the linear model over the wrench, inside its neighbourhood
+SMALLEST = 0.01  # reaction as which smaller ones are judged [N]: a hand does not feel 10 % of it
+WIDEST = 2e-3  # largest neighbourhood that is looked for [m]
+SHRINK = 0.9  # factor on the radius until the model agrees at the rim
+FADE = 0.1  # normal force over the reaction, below which drag and torque fade with it
 
 
 class Rendered(NamedTuple):
-    """What a local model says at a pose, and whether that pose lies where it was found to hold."""
+    """Wrench of a local model at a pose, and whether the model holds there."""
 
     wrench: Wrench
     inside: bool
@@ -41,14 +41,14 @@ class LocalContact:
     """The reaction of one contact around a pose, to first order.
 
     Args:
-        pose_body_from_tool: where it was found, (4, 4).
+        pose_body_from_tool: pose at which it was found, (4, 4).
         wrench: force [N] and torque about the tool's origin [N m] that the tool exerts on the body, layer axes, (6,).
         stiffness: d wrench / d twist, (6, 6) [N/m, N/rad; N m/m, N m/rad]; the twist is (translation of the tool's
             origin, rotation vector) in layer axes.
-        valid_m: translations up to this keep the model within 10 % of the reaction, as seen at their rim [m].
-        valid_rad: the same of rotations [rad].
-        status: of the touch at the pose.
-        trust: of the touch at the pose; figures with evaluations, how many touches the model took.
+        valid_m: translation up to which the model is within 10 % of the reaction, as seen at its rim [m].
+        valid_rad: rotation up to which it is [rad].
+        status: status of the touch at the pose.
+        trust: trust in the touch at the pose; its figures count the model's touches as `evaluations`.
     """
 
     pose_body_from_tool: Transform
@@ -89,7 +89,7 @@ class LocalContact:
 
 
 def local_contact(toucher: Toucher, contact: Contact, *, step: float = STEP, rotations: bool = True) -> LocalContact:
-    """The local model at the contact's pose; its wrench, if it has one, is left aside.
+    """Finds the local model at the contact's pose; a wrench of the contact is not used.
 
     The stiffness is found by central differences along the normal, two tangents, and about them. What these say of the
     curvature proposes how far the model may hold; then the reaction is found at that rim, six ways, and the rim drawn
@@ -99,7 +99,7 @@ def local_contact(toucher: Toucher, contact: Contact, *, step: float = STEP, rot
         toucher: contact law on the layer.
         contact: tool and pose.
         step: width of the differences [m]; rotations move the tool's farthest corner by as much.
-        rotations: choice whether to find how the wrench follows rotations; a device that feels forces only needs none.
+        rotations: derivatives by rotations too; a device that feels forces only needs none.
             Without, the stiffness to rotations and valid_rad are 0.
 
     Raises:

@@ -9,20 +9,20 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from stmpl_core.arrays import Faces, Points, finite
-from stmpl_core.decimation import CELL, MANY, decimated, field_spacing
+from stmpl_core.decimation import CELL_OVER_SPACING, MAX_KEPT_TRIANGLES, decimated, field_spacing
 from stmpl_core.errors import MeshError
 from stmpl_core.layer import face_numbers
 from stmpl_core.rows import first_alike
 
-PER_METRE = 1e9  # places; vertices that agree to a nanometre are one (STL files repeat them)
-HOLES = 0.25  # of a part's area: with smaller holes it is solid, and its volume tells what is outside
+PER_METRE = 1e9  # steps of the grid on which equal vertices are one (STL files repeat them) [1/m]
+HOLES = 0.25  # area of holes over that of a part, up to which it is solid and its volume tells what is outside
 MINORITY = 1 / 3  # share of a part's faces that must be wound against the others to doubt those too
-FLAT = 1e-9  # of area^1.5: a smaller volume tells nothing
+FLAT = 1e-9  # volume over area^1.5, below which it tells nothing
 
 
 @dataclass(frozen=True, eq=False)
 class Mended:
-    """A surface, and what was done to it.
+    """A mended surface, and what was done to it.
 
     Args:
         vertices: positions (V, 3) [m].
@@ -43,7 +43,7 @@ class _Edges:
         half: numbers of the half-edges, 3 face + corner, in that order.
         start: places in `half` where an edge begins, (E,).
         count: number of half-edges of each edge, (E,).
-        up: whether each half-edge runs from its lower vertex to its higher one, by half-edge number.
+        up: mask of the half-edges that run from their lower vertex to their higher one, by half-edge number.
     """
 
     half: np.ndarray
@@ -53,6 +53,7 @@ class _Edges:
 
     @classmethod
     def of(cls, corners: np.ndarray) -> _Edges:
+        """The edges of triangles (F, 3)."""
         a, b = corners.ravel(), corners[:, [1, 2, 0]].ravel()
         key = np.minimum(a, b) * (int(corners.max()) + 1) + np.maximum(a, b)
         half = np.argsort(key)
@@ -62,6 +63,7 @@ class _Edges:
 
     @property
     def odd(self) -> int:
+        """Number of edges with an odd number of faces."""
         return int((self.count % 2).sum())
 
     @property
@@ -99,8 +101,8 @@ def mended(vertices: ArrayLike, faces: ArrayLike) -> Mended:
         faces: vertex numbers (F, 3).
 
     Raises:
-        MeshError: no faces with an area, a vertex number that does not exist, or a surface with one side only.
-        InvalidInput: not finite.
+        MeshError: a surface without area, a vertex number that does not exist, or a surface with one side only.
+        InvalidInput: numbers that are not finite.
     """
     points = finite("tool vertices", vertices, (None, 3))
     triangles = face_numbers(faces, len(points))
@@ -113,7 +115,7 @@ def mended(vertices: ArrayLike, faces: ArrayLike) -> Mended:
     if not used.all():
         points, triangles = points[used], (np.cumsum(used, dtype=np.int32) - 1)[triangles]
         said.append(f"{_many(int((~used).sum()), 'vertex', 'vertices')} that no face uses {{were}} dropped")
-    if len(triangles) > MANY:
+    if len(triangles) > MAX_KEPT_TRIANGLES:
         points, triangles = _reduced(points, triangles, said)
     return Mended(points, triangles, tuple(_sentence(text) for text in said))
 
@@ -229,7 +231,7 @@ def _follow_hosts(points: Points, corners: np.ndarray, part: np.ndarray, solid: 
 def _reduced(points: Points, faces: Faces, said: list[str]) -> tuple[Points, Faces]:
     area, _ = _measures(points, faces, np.zeros(len(faces), int), np.zeros(len(faces), bool), 1)
     spacing = field_spacing(float(area[0]), np.ptp(points, axis=0))
-    fewer = decimated(points, faces, CELL * spacing)
+    fewer = decimated(points, faces, CELL_OVER_SPACING * spacing)
     if len(fewer[1]) > 0.8 * len(faces):
         return points, faces
     said.append(f"{len(faces):,} triangles were reduced to {len(fewer[1]):,}: "

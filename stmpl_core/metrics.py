@@ -15,15 +15,15 @@ from stmpl_core.errors import InvalidInput
 from stmpl_core.layer import SoftLayer
 from stmpl_core.load import Load
 
-MOVING = 1e-6  # m; the paper counts vertices that move more than this in the truth
-MOVING_MUCH = 0.1  # of the largest displacement
-FAR = 8.0  # thicknesses from the load, beyond which the truth moves by less than 0.1 % of the peak
-LIMITS = (1e-4, 1.25e-4, 1.5e-4, 2e-4, 5e-4)  # m, of the paper's tables
+MOVING = 1e-6  # true displacement from which the paper counts a vertex [m]
+MOVING_MUCH = 0.1  # displacement over the largest, from which a vertex moves much
+FAR = 8.0  # distance from the load, over t, beyond which the truth moves by less than 0.1 % of the peak
+LIMITS = (1e-4, 1.25e-4, 1.5e-4, 2e-4, 5e-4)  # errors that the paper's tables count up to [m]
 
 
 @dataclass(frozen=True)
 class Score:
-    """How far a displacement is from the truth; lengths in metres, shares from 0 to 1, nan where nothing counts.
+    """Errors of a displacement against the truth; lengths in metres, shares from 0 to 1, nan where nothing counts.
 
     Args:
         mae_x, mae_y, mae_z: mean absolute error along each axis over the moving vertices [m] (paper).
@@ -36,7 +36,7 @@ class Score:
         peak_error: length of the answer minus length of the truth, where the truth is largest [m]; signed.
         peak_share: peak_error over peak [-].
         leak: largest displacement of the answer beyond FAR thicknesses from the load [m].
-        moving: how many vertices move.
+        moving: number of vertices that move.
     """
 
     mae_x: float
@@ -65,13 +65,13 @@ class Score:
 
 
 def score(answer: ArrayLike, truth: ArrayLike, layer: SoftLayer, load: Load) -> Score:
-    """Compares displacements of one load.
+    """Compares an answer with the truth, under one load.
 
     Args:
         answer: displacement to judge, (V, 3) [m].
         truth: displacement to judge it by, (V, 3) [m].
-        layer: whose vertices they are.
-        load: which vertices are pressed.
+        layer: layer of these vertices.
+        load: load that tells the pressed vertices.
 
     Raises:
         InvalidInput: shapes that do not fit the layer, or values that are not finite.
@@ -98,7 +98,7 @@ def mean_and_deviation(scores: Sequence[Score]) -> tuple[Score, Score]:
     """Mean and standard deviation over samples, figure by figure, as the paper's tables give them; nans do not count.
 
     Raises:
-        InvalidInput: no scores.
+        InvalidInput: an empty list of scores.
     """
     if not scores:
         raise InvalidInput("there are no scores to average.")

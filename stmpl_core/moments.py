@@ -2,36 +2,37 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from typing import NamedTuple
 from weakref import WeakKeyDictionary
 
 import numba
 import numpy as np
-from scipy.special import j0, j1
 
 from stmpl_core.layer import SoftLayer
+from stmpl_core.response import (
+    REACH,
+    SCALARS,
+    SPREAD,
+    SPREADS,
+    TENSORS,
+    VECTORS,
+    WIDTH,
+    feel,
+    feel_few,
+    packed,
+    response_table,
+    sink_between,
+    spread_sinking,
+)
 from stmpl_core.thinning import Asked, Thinning
-
-REACH = 8.0  # thicknesses to which a vertex feels a load; the linear response there is below 0.01 % of its peak
-NEAR = 4.0  # thicknesses to which moments are taken
-STEPS = 48  # table rows a thickness
-FINER = 2  # times as many rows has the rings' table, of which the nearest is taken
-SPREADS = np.geomspace(0.04, 1.6, 14)  # widths of a load of one vertex that the linear response is tabled for, over t
-RINGS = np.array([0.0, 0.35, 0.7, 1.1, 1.6, 2.2, 2.9, 3.6])  # radii of the moments' rings, over t
-WIDTHS = np.array([0.3, 0.3, 0.35, 0.45, 0.55, 0.65, 0.7, 0.6])  # of the rings
-SCALARS, VECTORS, TENSORS = 8, 6, 4  # rings of each order; vectors and tensors leave out the innermost
-WIDTH = 32  # figures of one source field at one vertex, the last of them unused
-SPREAD = 0.408  # of the Gaussian with the mean 1 / r of a linear hat: its deviation over the root of the vertex area
 
 
 class Felt(NamedTuple):
-    """What N vertices feel of S source fields, in lengths of the local thickness and in the vertex's own frame.
+    """Response and moments of S source fields at N vertices, in lengths of the local thickness and each vertex's frame.
 
     Args:
         vertices: numbers of the vertices that feel anything, (N,).
-        figures: (N, S, WIDTH) float32; the properties name its parts, and directions come last in each.
+        figures: sums, (N, S, WIDTH) float32; the properties name its parts, and directions come last in each.
     """
 
     vertices: np.ndarray
@@ -60,14 +61,14 @@ class Felt(NamedTuple):
         return self.figures[:, :, first : first + 2 * TENSORS].reshape(*self.figures.shape[:2], 2, TENSORS)
 
 
-_KEPT: WeakKeyDictionary[SoftLayer, Surroundings] = WeakKeyDictionary()  # die with their layers, which they do not hold
+_KEPT: WeakKeyDictionary[SoftLayer, Surroundings] = WeakKeyDictionary()  # entries die with their layers
 
 
 class Surroundings:
     """A layer's vertices with their frames and their neighbours: made once, then asked for every load.
 
     Args:
-        layer: the soft layer at rest.
+        layer: soft layer at rest.
 
     Attributes:
         frames: tangent, tangent, outward normal of each vertex, (V, 3, 3) [-].
@@ -93,25 +94,25 @@ class Surroundings:
             self.felt_among(np.zeros(1, np.int64), np.zeros((1, 2)))
 
     def asked(self, loaded: np.ndarray) -> Asked:
-        """Which vertices to ask what they feel of sources at vertices `loaded` (L,), for all to be known."""
+        """Vertices that must be asked under sources at vertices `loaded` (L,), for all to be known."""
         return self._thinning.asked(loaded)
 
     def felt(self, sources: np.ndarray, asked: Asked | None = None) -> Felt:
-        """What the vertices that are asked, or all, feel of source fields (V, S) [-], in units of Young's modulus."""
+        """Response and moments, at the vertices that are asked or at all, of source fields (V, S) over E [-]."""
         loaded = np.flatnonzero(sources.any(axis=1)) if asked is None else asked.loaded
         vertices = self._thinning.reached(loaded) if asked is None else asked.vertices
         return Felt(vertices, self._felt(sources[loaded], loaded, vertices, moments=True))
 
     def felt_among(self, vertices: np.ndarray, sources: np.ndarray) -> Felt:
-        """What vertices (N,) feel of sources at themselves alone, (N, S) [-]: on one thread, for small contacts."""
+        """Response and moments at vertices (N,) of sources there alone, (N, S) [-]: on one thread."""
         figures = np.zeros((len(vertices), sources.shape[1], WIDTH), dtype=np.float32)
         values = np.ascontiguousarray(sources.T, dtype=np.float32)
-        _feel_few(vertices, values, np.ascontiguousarray(self._sites[:, vertices]), self._sites, self._frames,
+        feel_few(vertices, values, np.ascontiguousarray(self._sites[:, vertices]), self._sites, self._frames,
                   self._response[0], self._response[1], True, figures)  # fmt: skip
         return Felt(vertices, figures)
 
     def linear(self, source: np.ndarray) -> np.ndarray:
-        """The linear response alone to one field (V,) [-], (V, 3) [m]."""
+        """Linear response alone to one source field (V,) [-], (V, 3) [m]."""
         asked = self.asked(np.flatnonzero(source))
         figures = self._felt(source[asked.loaded, None], asked.loaded, asked.vertices, moments=False)
         local = figures[:, 0, :3] * self._thickness[asked.vertices, None]
@@ -127,14 +128,14 @@ class Surroundings:
         return _KEPT[layer]
 
     def keep(self, layer: SoftLayer) -> None:
-        """Has `of` give these for a layer from now on, which has the shape and the Poisson's ratio of their own."""
+        """Lets `of` give these for another layer of the same shape and Poisson's ratio."""
         _KEPT[layer] = self
 
     def sinking(self, vertices: np.ndarray) -> np.ndarray:
-        """How far vertex i sinks under a unit source at vertex j of those given, in thicknesses, (N, N) [-]."""
+        """Sinking of vertex i under a unit source at vertex j of those given, over t, (N, N) [-]."""
         out = np.zeros((len(vertices), len(vertices)), dtype=np.float32)
         sources = np.ascontiguousarray(self._sites[:, vertices])
-        _sink_between(vertices, sources, self._sites, self._frames, self._response[0], out)
+        sink_between(vertices, sources, self._sites, self._frames, self._response[0], out)
         return out
 
     def spread(self, vertices: np.ndarray, sources: np.ndarray) -> np.ndarray:
@@ -142,61 +143,17 @@ class Surroundings:
         asked = self._thinning.asked_again(vertices)
         by, out = np.empty((len(asked.vertices), 3)), np.zeros((len(self.frames), 3))
         values = np.ascontiguousarray(sources.T, dtype=np.float32)
-        _spread(asked.vertices, values, np.ascontiguousarray(self._sites[:, vertices]), self._sites, self._frames,
-                self._response[0], by)  # fmt: skip
+        spread_sinking(asked.vertices, values, np.ascontiguousarray(self._sites[:, vertices]), self._sites,
+                       self._frames, self._response[0], by)  # fmt: skip
         asked.fill(by, out)
         return out
 
     def _felt(self, sources: np.ndarray, loaded: np.ndarray, vertices: np.ndarray, moments: bool) -> np.ndarray:
         figures = np.zeros((len(vertices), sources.shape[1], WIDTH), dtype=np.float32)
         values = np.ascontiguousarray(sources.T, dtype=np.float32)
-        _feel(vertices, values, np.ascontiguousarray(self._sites[:, loaded]), self._sites, self._frames,
+        feel(vertices, values, np.ascontiguousarray(self._sites[:, loaded]), self._sites, self._frames,
               self._response[0], self._response[1], moments, figures)  # fmt: skip
         return figures
-
-
-def response_table(poisson_ratio: float) -> np.ndarray:
-    """Response of a flat bonded layer to a unit normal force on its surface, E = 1, t = 1, (spread, radius, 2).
-
-    The force is spread as a Gaussian of standard deviation SPREADS. Columns: sinking, and motion away from the force.
-    With K = k t, a pressure cos(k x) sinks the surface by A cos(k x) and moves it along by B sin(k x):
-
-        mu k A = (1 - nu) ((3 - 4 nu) sinh 2K - 2K) / D,    mu k B = (K^2 - (1 - 2 nu)(3 - 4 nu) sinh^2 K) / D
-        D = (3 - 4 nu) cosh 2K + 2 K^2 + 5 - 12 nu + 8 nu^2
-
-    (plane strain by an Airy function, as in Johnson, "Contact Mechanics", 1985, chapter 5), and a force spreads as
-    Hankel transforms of order 0 and 1 of these. What the cut at REACH takes of the whole sinking is given back near
-    the force, so that a wide pressure sinks the layer by exactly p t / M.
-    """
-    nu, mu = poisson_ratio, 1 / (2 * (1 + poisson_ratio))
-    radius = np.arange(int(REACH * STEPS) + 2) / STEPS
-    table = np.empty((len(SPREADS), len(radius), 2))
-    k = np.linspace(0, 6 / SPREADS[0], 4001)[1:]
-    e = np.exp(-2 * k)  # the transforms are divided by exp(2 K) / 2, so that nothing overflows
-    scale = mu * k * ((3 - 4 * nu) * (1 + e * e) + 2 * e * (2 * k * k + 5 - 12 * nu + 8 * nu * nu))
-    sink = (1 - nu) * ((3 - 4 * nu) * (1 - e * e) - 4 * k * e) / scale
-    along = (2 * e * k * k - (1 - 2 * nu) * (3 - 4 * nu) * 0.5 * (1 - e) ** 2) / scale
-    phase = np.outer(k, radius)
-    weight = np.exp(-0.5 * (k * SPREADS[:, None]) ** 2) * k * (k[1] - k[0]) / (2 * np.pi)
-    table[:, :, 0], table[:, :, 1] = (weight * sink) @ j0(phase), (weight * along) @ j1(phase)
-    fade = np.clip((REACH - radius) / 1.5, 0, 1)
-    table *= (fade * fade * (3 - 2 * fade))[:, None]
-    ring = 2 * np.pi * radius / STEPS
-    lost = (1 + nu) * (1 - 2 * nu) / (1 - nu) - table[:, :, 0] @ ring
-    table[:, :, 0] += lost[:, None] * fade * np.exp(-radius) / ((fade * np.exp(-radius)) @ ring)
-    return table.astype(np.float32)
-
-
-def ring_table() -> np.ndarray:
-    """Weights of the rings of all orders over the radius, (radius, SCALARS + VECTORS + TENSORS)."""
-    radius = np.arange(int(NEAR * STEPS * FINER) + 2) / (STEPS * FINER)
-    rings = np.exp(-0.5 * ((radius[:, None] - RINGS) / WIDTHS) ** 2)
-    fade = np.clip((NEAR - radius) / 0.8, 0, 1)
-    rings *= (fade * fade * (3 - 2 * fade))[:, None]
-    rings /= (2 * np.pi * radius[:, None] * rings).sum(axis=0) / (STEPS * FINER)
-    start = np.minimum(radius / 0.35, 1.0)[:, None]  # directions are not defined at the middle
-    return np.concatenate([rings, start * rings[:, 1 : 1 + VECTORS], start**2 * rings[:, 1 : 1 + TENSORS]],
-                          axis=1).astype(np.float32)  # fmt: skip
 
 
 def _frames(normals: np.ndarray) -> np.ndarray:
@@ -243,172 +200,3 @@ def _shape(start, index, points, frames, thickness):
         out[i, 0], out[i, 1], out[i, 2] = a, 0.5 * (b + c), e
         out[i, 3], out[i, 4] = (yy * s[4] - xy * s[5]) / det, (xx * s[5] - xy * s[4]) / det
     return out
-
-
-FAST = {"contract", "reassoc", "nsz", "arcp"}
-CHUNK = 64  # vertices that one thread takes at a time
-_RINGS = np.zeros((int(NEAR * STEPS * FINER) + 2, 24), dtype=np.float32)  # a constant to the compiler: nobody writes it
-_RINGS[:, :SCALARS] = ring_table()[:, :SCALARS]
-_RINGS[:, 8 : 8 + VECTORS] = ring_table()[:, SCALARS : SCALARS + VECTORS]
-_RINGS[:, 16 : 16 + TENSORS] = ring_table()[:, SCALARS + VECTORS :]
-
-
-def _feel(vertices, values, sources, sites, frames, sink, away, moments, out):
-    """See Surroundings.felt; values (S, K) and sources (10, K) are those of the loaded vertices, `out` (N, S, WIDTH).
-
-    Rows of sites and sources: x, y, z, t^-1/2, area, log(t) / 2, the same of the spread, normal. Loops over the
-    sources have no branches, so that they run in vector registers.
-    """
-    fields, many = values.shape
-    for chunk in numba.prange((len(vertices) + CHUNK - 1) // CHUNK):
-        felt, cell = np.empty((8, many), dtype=np.float32), np.empty(many, dtype=np.int32)
-        sums = np.empty((fields, 5, 8), dtype=np.float32)
-        for n in range(CHUNK * chunk, min(CHUNK * (chunk + 1), len(vertices))):
-            _gather(vertices[n], sources, sites, frames, sink, away, felt, cell)
-            for s in range(fields):
-                u = v = w = np.float32(0)
-                for q in range(many):
-                    value = values[s, q]
-                    u -= value * felt[5, q]
-                    v -= value * felt[6, q]
-                    w -= value * felt[7, q]
-                out[n, s, 0], out[n, s, 1], out[n, s, 2] = u, v, w
-            if moments:
-                _take_moments(values, felt, sums, out[n])
-
-
-_feel_few = numba.njit(cache=True, fastmath=FAST, error_model="numpy")(_feel)
-_feel = numba.njit(cache=True, parallel=True, fastmath=FAST, error_model="numpy")(_feel)
-
-
-@numba.njit(inline="always", fastmath=FAST, error_model="numpy")
-def _gather(i, sources, sites, frames, sink, away, felt, cell):
-    """What vertex i feels of each source, to `felt`: distance in table rows, its direction, area, ..., response.
-
-    The area, over the local thickness squared, and the response are 0 of sources that are out of reach.
-    """
-    one, far = np.float32(1), np.float32(REACH * REACH)
-    root, log_t, per_log = sites[3, i], sites[5, i], np.float32(1 / np.log(SPREADS[1] / SPREADS[0]))
-    top, width = np.float32(len(SPREADS) - 1.001), np.int32(sink.shape[1])
-    px, py, pz = sites[0, i], sites[1, i], sites[2, i]
-    a0, a1, a2 = frames[i, 0, 0], frames[i, 0, 1], frames[i, 0, 2]
-    b0, b1, b2 = frames[i, 1, 0], frames[i, 1, 1], frames[i, 1, 2]
-    c0, c1, c2 = frames[i, 2, 0], frames[i, 2, 1], frames[i, 2, 2]
-    for q in range(sources.shape[1]):
-        dx, dy, dz, inverse = sources[0, q] - px, sources[1, q] - py, sources[2, q] - pz, root * sources[3, q]
-        facing = c0 * sources[7, q] + c1 * sources[8, q] + c2 * sources[9, q]
-        square = (dx * dx + dy * dy + dz * dz) * inverse * inverse
-        x, y = (a0 * dx + a1 * dy + a2 * dz) * inverse, (b0 * dx + b1 * dy + b2 * dz) * inverse
-        flat = one / np.sqrt(x * x + y * y + np.float32(1e-12))
-        area = sources[4, q] * inverse * inverse
-        area = area if facing > 0 and square < far else np.float32(0)
-        f = np.sqrt(min(square, far)) * np.float32(STEPS)
-        h = min(max((sources[6, q] - log_t) * per_log, np.float32(0)), top)
-        k, g = np.int32(f), np.int32(h)
-        felt[0, q], felt[1, q], felt[2, q], felt[3, q] = f, x * flat, y * flat, area
-        felt[4, q], felt[5, q], felt[6, q] = f - np.float32(k), h - np.float32(g), area * root / sources[3, q]
-        cell[q] = g * width + k
-    down, along = sink.ravel(), away.ravel()
-    for q in range(sources.shape[1]):
-        k, rest, h, scale = cell[q], felt[4, q], felt[5, q], felt[6, q]
-        w2, w3 = h * (one - rest), h * rest
-        w0, w1 = one - rest - w2, rest - w3
-        s = w0 * down[k] + w1 * down[k + 1] + w2 * down[k + width] + w3 * down[k + width + 1]
-        t = w0 * along[k] + w1 * along[k + 1] + w2 * along[k + width] + w3 * along[k + width + 1]
-        felt[5, q], felt[6, q], felt[7, q] = scale * t * felt[1, q], scale * t * felt[2, q], scale * s
-
-
-@numba.njit(inline="always", fastmath=FAST, error_model="numpy")
-def _take_moments(values, felt, sums, out):
-    """Sums over the near sources of rings times 1, cos a, sin a, cos 2a, sin 2a; loops of eight fill one register."""
-    end = np.float32(NEAR * STEPS)
-    sums[:] = 0
-    for q in range(values.shape[1]):
-        if felt[0, q] >= end or felt[3, q] == 0:
-            continue
-        k, c, d = int(felt[0, q] * np.float32(FINER) + np.float32(0.5)), felt[1, q], felt[2, q]
-        c2, d2 = c * c - d * d, (c + c) * d
-        for s in range(len(out)):
-            v = values[s, q] * felt[3, q]
-            for m in range(8):
-                sums[s, 0, m] += v * _RINGS[k, m]
-            x, y = v * c, v * d
-            for m in range(8):
-                sums[s, 1, m] += x * _RINGS[k, 8 + m]
-            for m in range(8):
-                sums[s, 2, m] += y * _RINGS[k, 8 + m]
-            x, y = v * c2, v * d2
-            for m in range(8):
-                sums[s, 3, m] += x * _RINGS[k, 16 + m]
-            for m in range(8):
-                sums[s, 4, m] += y * _RINGS[k, 16 + m]
-    for s in range(len(out)):
-        for m in range(SCALARS):
-            out[s, 3 + m] = sums[s, 0, m]
-        for m in range(VECTORS):
-            out[s, 3 + SCALARS + m] = sums[s, 1, m]
-            out[s, 3 + SCALARS + VECTORS + m] = sums[s, 2, m]
-        for m in range(TENSORS):
-            out[s, 3 + SCALARS + 2 * VECTORS + m] = sums[s, 3, m]
-            out[s, 3 + SCALARS + 2 * VECTORS + TENSORS + m] = sums[s, 4, m]
-
-
-@numba.njit(inline="always", fastmath=FAST, error_model="numpy")
-def _sinks(i, sources, sites, frames, sink, felt, cell):
-    """How far vertex i sinks under a unit of each source, in thicknesses, to felt[0]; as _gather, and nothing else."""
-    one, far = np.float32(1), np.float32(REACH * REACH)
-    root, log_t, per_log = sites[3, i], sites[5, i], np.float32(1 / np.log(SPREADS[1] / SPREADS[0]))
-    top, width = np.float32(len(SPREADS) - 1.001), np.int32(sink.shape[1])
-    px, py, pz = sites[0, i], sites[1, i], sites[2, i]
-    c0, c1, c2 = frames[i, 2, 0], frames[i, 2, 1], frames[i, 2, 2]
-    for q in range(sources.shape[1]):
-        dx, dy, dz, inverse = sources[0, q] - px, sources[1, q] - py, sources[2, q] - pz, root * sources[3, q]
-        facing = c0 * sources[7, q] + c1 * sources[8, q] + c2 * sources[9, q]
-        square = (dx * dx + dy * dy + dz * dz) * inverse * inverse
-        scale = sources[4, q] * inverse * root * root
-        f = np.sqrt(min(square, far)) * np.float32(STEPS)
-        h = min(max((sources[6, q] - log_t) * per_log, np.float32(0)), top)
-        k, g = np.int32(f), np.int32(h)
-        felt[0, q] = scale if facing > 0 and square < far else np.float32(0)
-        felt[1, q], felt[2, q], cell[q] = f - np.float32(k), h - np.float32(g), g * width + k
-    down = sink.ravel()
-    for q in range(sources.shape[1]):
-        k, rest, h = cell[q], felt[1, q], felt[2, q]
-        low = (one - rest) * down[k] + rest * down[k + 1]
-        high = (one - rest) * down[k + width] + rest * down[k + width + 1]
-        felt[0, q] *= (one - h) * low + h * high
-
-
-@numba.njit(cache=True, fastmath=FAST, error_model="numpy")
-def _sink_between(vertices, sources, sites, frames, sink, out):
-    """See Surroundings.sinking."""
-    felt, cell = np.empty((3, len(vertices)), np.float32), np.empty(len(vertices), np.int32)
-    for n in range(len(vertices)):
-        _sinks(vertices[n], sources, sites, frames, sink, felt, cell)
-        out[n] = felt[0]
-
-
-@numba.njit(cache=True, fastmath=FAST, error_model="numpy")
-def _spread(vertices, values, sources, sites, frames, sink, out):
-    """See Surroundings.spread; values (3, N), out (M, 3)."""
-    many = values.shape[1]
-    felt, cell = np.empty((3, many), np.float32), np.empty(many, np.int32)
-    for n in range(len(vertices)):
-        _sinks(vertices[n], sources, sites, frames, sink, felt, cell)
-        u = v = w = np.float32(0)
-        for q in range(many):
-            u += values[0, q] * felt[0, q]
-            v += values[1, q] * felt[0, q]
-            w += values[2, q] * felt[0, q]
-        out[n, 0], out[n, 1], out[n, 2] = u, v, w
-
-
-@contextmanager
-def packed() -> Iterator[None]:
-    """While a kernel compiles: lets LLVM pack short loops into vector registers, which numba leaves off."""
-    before = numba.config.SLP_VECTORIZE  # type: ignore[attr-defined]
-    numba.config.SLP_VECTORIZE = 1  # type: ignore[attr-defined]
-    try:
-        yield
-    finally:
-        numba.config.SLP_VECTORIZE = before  # type: ignore[attr-defined]

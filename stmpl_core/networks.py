@@ -18,7 +18,7 @@ from typing import Any, Literal, Self
 import numpy as np
 
 from stmpl_core.errors import InvalidInput
-from stmpl_core.moments import SCALARS, VECTORS, WIDTH
+from stmpl_core.response import SCALARS, VECTORS, WIDTH
 
 MIXED_VECTORS, MIXED_TENSORS = 6, 4  # combinations of a vertex's vectors and tensors whose products are inputs
 DIRECTIONS = 2 * VECTORS + 2  # vectors that an answer is made of: moments of both fields, and both linear responses
@@ -98,7 +98,7 @@ MOTION = Layout(
     slope=1,
     log_error=1,
 )
-PRESSURE = Layout(log_ratio=1, log_error=1)  # of pressure over Winkler's
+PRESSURE = Layout(log_ratio=1, log_error=1)  # output: log of pressure over Winkler's
 
 ARRAYS = ("mix_vectors", "mix_tensors", "low", "high", "mean", "scale", "w1", "b1", "w2", "b2", "w3", "b3", "w4", "b4")
 

@@ -15,21 +15,21 @@ import mmgpy
 import numpy as np
 import scipy.sparse as sp
 from numpy.typing import ArrayLike
-from scipy.sparse.csgraph import connected_components
 
 from stmpl_core.arrays import Faces, PerVertex, Points, finite
 from stmpl_core.chart import doubled_area
 from stmpl_core.errors import InvalidInput, MeshError
 from stmpl_core.layer import check_faces
+from stmpl_core.seams import border_edges, corner_fans, edge_table, halved, pieces, seam_edges, within
 
 log = logging.getLogger(__name__)
 igl: Any = libigl  # its stubs call every array an ArrayLike
 
-MAX_LEVELS = 4  # of subdivision: 256 faces for one
+MAX_LEVELS = 4  # levels of subdivision: 256 faces for one
 SEAM, OUTSIDE = 7, 2  # MMG's references: ours for seam edges, its own for triangles beyond a level set
-SNAP = 0.35  # share of an edge within which a cut passes through the vertex itself: no sliver beside it
-SCRAP = 0.03  # share of a part below which a UV island is the edge of a neighbour's
-RELAXATION = 5  # passes; more than 5 changed no figure of quality by over 2 %
+MAX_SNAP_SHARE = 0.35  # share of an edge within which a cut passes through the vertex itself: no sliver beside it
+MIN_ISLAND_SHARE = 0.03  # share of a part below which a UV island is the edge of a neighbour's
+RELAXATION = 5  # passes of relaxation; more changed no figure of quality by over 2 %
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,13 +37,14 @@ class Remeshed:
     """An even mesh of a skin, and where each of its vertices comes from.
 
     Args:
-        vertices: shape (V, 3) [m].
-        faces: shape (F, 3), oriented as the source is.
-        uv: per corner, (F, 3, 2) [-], each face on one side of every seam; None where the source has none.
-        transfer: sparse (V, V_source), rows sum to 1: `vertices == transfer @ source_vertices`.
-        source_face: the face of the source that each vertex lies over, (V,).
-        barycentric: where in that face, (V, 3) [-].
-        distance: of each vertex from the source's flat faces, (V,) [m].
+        vertices: positions, (V, 3) [m].
+        faces: vertex numbers, (F, 3), oriented as the source is.
+        uv: texture coordinates of each corner, (F, 3, 2) [-], each face on one side of a seam; None if the source has
+            none.
+        transfer: sparse matrix, (V, V_source), rows sum to 1: `vertices == transfer @ source_vertices`.
+        source_face: number of the source's face under each vertex, (V,).
+        barycentric: coordinates in that face, (V, 3) [-].
+        distance: distance of each vertex from the source's flat faces, (V,) [m].
     """
 
     vertices: Points
@@ -61,9 +62,9 @@ class _Dense:
 
     vertices: Points
     faces: Faces
-    matrix: sp.csr_matrix  # (N, V_source)
-    parent: np.ndarray  # (faces,)
-    corners: np.ndarray  # (faces, 3, 3) barycentric coordinates of the corners in the parent
+    matrix: sp.csr_matrix  # transfer, (N, V_source)
+    parent: np.ndarray  # source's face of each face, (faces,)
+    corners: np.ndarray  # barycentric coordinates of the corners in the parent, (faces, 3, 3)
 
 
 def remesh(
@@ -84,16 +85,16 @@ def remesh(
     even them out, and each vertex ends on the subdivided surface.
 
     Args:
-        vertices: shape (V, 3) [m].
-        faces: shape (F, 3).
-        edge_length: [m].
-        uv: of each corner, (F, 3, 2).
-        inside: a level at each vertex, (V,); the skin is cut along its zero line and kept where it is positive, without
+        vertices: positions, (V, 3) [m].
+        faces: vertex numbers, (F, 3).
+        edge_length: length that the new edges should have [m].
+        uv: texture coordinates of each corner, (F, 3, 2).
+        inside: level at each vertex, (V,); the skin is cut along its zero line and kept where it is positive, without
             scraps of UV islands that it only brushes.
-        smooth: False keeps the flat faces, for a mesh whose creases are meant.
+        smooth: subdivision to a curved surface; False keeps the flat faces, for a mesh whose creases are meant.
 
     Raises:
-        MeshError: not a manifold surface, nothing inside, or MMG fails.
+        MeshError: a surface that is no manifold, nothing inside, or MMG fails.
         InvalidInput: wrong shapes, not finite, or an edge length out of proportion to the surface.
     """
     points = finite("vertices", vertices, (None, 3))
@@ -106,32 +107,8 @@ def remesh(
     if inside is not None:
         surface, kept_seam = _cut(dense, seam, dense.matrix @ finite("inside", inside, (len(points),)))
     even, even_faces, even_seam = _mmg(*surface, kept_seam, hsiz=edge_length)
-    even = _relaxed(even, even_faces, even_seam, dense, seam, _border_edges(surface[1]), surface[0])
+    even = _relaxed(even, even_faces, even_seam, dense, seam, border_edges(surface[1]), surface[0])
     return _traced(even, even_faces, even_seam, dense, (points, triangles), corner_uv)
-
-
-def edge_table(faces: Faces) -> tuple[np.ndarray, np.ndarray]:
-    """Undirected edges, (E, 2), and for each of the faces' three edges (ab, bc, ca) its number, (F, 3)."""
-    directed = np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
-    edges, number = np.unique(directed, axis=0, return_inverse=True)
-    return edges, number.reshape(-1, 3)
-
-
-def seam_edges(faces: Faces, uv: np.ndarray) -> np.ndarray:
-    """Edges whose two faces disagree about their UVs, shape (S, 2)."""
-    edges, number = edge_table(faces)
-    order = np.argsort(faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
-    ends = np.take_along_axis(uv[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2, 2), order[:, :, None], axis=1)
-    low = np.full((len(edges), 2, 2), np.inf)
-    high = np.full((len(edges), 2, 2), -np.inf)
-    np.minimum.at(low, number.ravel(), ends)
-    np.maximum.at(high, number.ravel(), ends)
-    return edges[(high - low).max(axis=(1, 2)) > 1e-9]
-
-
-def _border_edges(faces: Faces) -> np.ndarray:
-    edges, number = edge_table(faces)
-    return edges[np.bincount(number.ravel(), minlength=len(edges)) == 1]
 
 
 def _check_edge_length(points: Points, faces: Faces, edge_length: float) -> None:
@@ -158,7 +135,7 @@ def _subdivided(
         step, finer = (igl.loop_matrix if smooth else igl.upsample_matrix)(faces.astype(np.int64))
         halves = _first_order(faces, finer)
         corners = np.einsum("fkc,fcp->fkp", halves, np.repeat(corners, 4, axis=0))
-        seam = _halved(seam, faces, finer)
+        seam = halved(seam, faces, finer)
         parent, faces, matrix = np.repeat(parent, 4), finer, sp.csr_matrix(step @ matrix)
     if smooth and levels:
         matrix = _interpolating(matrix)
@@ -173,24 +150,6 @@ def _first_order(faces: Faces, finer: Faces) -> np.ndarray:
         raise MeshError("libigl numbers the children of a face in another order than expected; use libigl 2.6.")
     child = np.array([[a, ab, ca], [b, bc, ab], [ab, bc, ca], [bc, c, ca]])
     return np.tile(child, (len(faces), 1, 1))
-
-
-def _halved(seam: np.ndarray, faces: Faces, finer: Faces) -> np.ndarray:
-    """Seam edges of `faces`, each as its two halves in `finer`, (2S, 2)."""
-    edges, number = edge_table(faces)
-    middle = np.empty(len(edges), int)
-    middle[number] = finer[2::4]  # the inner child joins the middles of ab, bc, ca
-    mids = middle[_rows_of(edges, seam)]
-    return np.concatenate([np.column_stack([seam[:, 0], mids]), np.column_stack([mids, seam[:, 1]])])
-
-
-def _rows_of(table: np.ndarray, pairs: np.ndarray) -> np.ndarray:
-    """Row numbers of those undirected `pairs` that a sorted edge `table` holds."""
-    width = int(table.max()) + 1
-    wanted = np.sort(pairs[(pairs < width).all(axis=1)], axis=1).astype(np.int64) @ [width, 1]
-    keys = table.astype(np.int64) @ [width, 1]
-    rows = np.minimum(np.searchsorted(keys, wanted), len(keys) - 1)
-    return rows[keys[rows] == wanted]
 
 
 def _interpolating(matrix: Any) -> sp.csr_matrix:
@@ -214,8 +173,8 @@ def _cut(dense: _Dense, seam: np.ndarray, level: PerVertex) -> tuple[tuple[Point
     crossing = a * b < 0
     share = a[crossing] / (a[crossing] - b[crossing])
     level = level.copy()
-    level[edges[crossing, 0][share < SNAP]] = 0
-    level[edges[crossing, 1][share > 1 - SNAP]] = 0
+    level[edges[crossing, 0][share < MAX_SNAP_SHARE]] = 0
+    level[edges[crossing, 1][share > 1 - MAX_SNAP_SHARE]] = 0
     vertices, faces, seam, reference = _mmg_raw(
         dense.vertices, dense.faces, seam, level=-level, nomove=1, noswap=1, noinsert=1
     )
@@ -224,42 +183,23 @@ def _cut(dense: _Dense, seam: np.ndarray, level: PerVertex) -> tuple[tuple[Point
     (vertices, faces), renumber = _compact(vertices, faces)
     seam = renumber[seam]
     seam = seam[(seam >= 0).all(axis=1)]
-    return (vertices, faces), _within(faces, seam)
+    return (vertices, faces), within(faces, seam)
 
 
 def _without_scraps(vertices: Points, faces: Faces, seam: np.ndarray) -> np.ndarray:
     """Which faces to keep: not the scraps of neighbouring UV islands, and of what is left the largest piece."""
     corners = vertices[faces]
     area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
-    island = _pieces(faces, seam)
+    island = pieces(faces, seam)
     share = np.bincount(island, area) / area.sum()
-    keep = share[island] > SCRAP
+    keep = share[island] > MIN_ISLAND_SHARE
     piece = np.full(len(faces), -1)
-    piece[keep] = _pieces(faces[keep], np.empty((0, 2), int))
+    piece[keep] = pieces(faces[keep], np.empty((0, 2), int))
     largest = np.bincount(piece[keep], area[keep]).argmax()
     if (piece != largest).any():
         log.info("left out %.1f %% of the part: scraps beyond a UV seam, or separate pieces",
                  100 * area[piece != largest].sum() / area.sum())
     return piece == largest
-
-
-def _pieces(faces: Faces, seam: np.ndarray) -> np.ndarray:
-    """Numbers the pieces of the surface that hang together by edges not in `seam`, (F,)."""
-    edges, number = edge_table(faces)
-    wall = np.zeros(len(edges), bool)
-    wall[_rows_of(edges, seam)] = True
-    order = np.argsort(number.ravel(), kind="stable")
-    along, face = number.ravel()[order], order // 3
-    same = (along[1:] == along[:-1]) & ~wall[along[1:]]
-    graph = sp.coo_matrix((np.ones(same.sum()), (face[:-1][same], face[1:][same])), (len(faces), len(faces)))
-    return connected_components(graph, directed=False)[1]
-
-
-def _within(faces: Faces, pairs: np.ndarray) -> np.ndarray:
-    """Those of the undirected `pairs` that are edges between two faces."""
-    edges, number = edge_table(faces)
-    inner = edges[np.bincount(number.ravel()) == 2]
-    return inner[_rows_of(inner, pairs)] if len(inner) else np.empty((0, 2), int)
 
 
 def _compact(vertices: Points, faces: Faces) -> tuple[tuple[Points, Faces], np.ndarray]:
@@ -318,7 +258,7 @@ def _relaxed(
     x: Points, faces: Faces, seam: np.ndarray, dense: _Dense, dense_seam: np.ndarray, border: np.ndarray, cut: Points
 ) -> Points:
     """Moves vertices towards the centroids of the faces around them, along the surface, the seam or the border."""
-    edges_border = _border_edges(faces)
+    edges_border = border_edges(faces)
     curves = np.concatenate([edges_border, seam])
     ways = np.bincount(curves.ravel(), minlength=len(x))
     on_border, on_seam = np.zeros((2, len(x)), bool)
@@ -393,7 +333,7 @@ def _corner_uv(
     dense_uv = np.einsum("fkp,fpd->fkd", dense.corners, uv[dense.parent])
     result = np.einsum("vk,vkd->vd", traced[1], dense_uv[traced[0]])[faces]
     unsure = np.zeros(len(x), bool)  # borders too: a part may end at a seam
-    unsure[seam], unsure[_border_edges(faces)] = True, True
+    unsure[seam], unsure[border_edges(faces)] = True, True
     face, corner = np.nonzero(unsure[faces])
     at = x[faces[face, corner]]
     aside, _ = _closest(at + 0.2 * (x[faces[face]].mean(axis=1) - at), dense)
@@ -414,21 +354,3 @@ def _unturned(uv: np.ndarray, corners: np.ndarray, dense: _Dense, dense_uv: np.n
     if wrong.any():
         log.debug("%d faces look up their UVs alone", int(wrong.sum()))
     return np.where(wrong[:, None, None], alone, uv)
-
-
-def corner_fans(faces: Faces, seam: np.ndarray) -> np.ndarray:
-    """Numbers the fans of corners around each vertex that no seam edge separates, (F, 3)."""
-    edges, number = edge_table(faces)
-    cut = np.zeros(len(edges), bool)
-    cut[_rows_of(edges, seam)] = True
-    corner = np.arange(faces.size).reshape(-1, 3)
-    table = np.stack([corner, np.roll(corner, -1, axis=1)], axis=-1)  # each edge's two corners: ab, bc, ca
-    turned = faces > np.roll(faces, -1, axis=1)
-    table[turned] = table[turned][:, ::-1]  # lower vertex first
-    order = np.argsort(number.ravel(), kind="stable")
-    sorted_number, sorted_corners = number.ravel()[order], table.reshape(-1, 2)[order]
-    same = (sorted_number[1:] == sorted_number[:-1]) & ~cut[sorted_number[1:]]
-    links = np.concatenate([np.column_stack([sorted_corners[:-1][same][:, k], sorted_corners[1:][same][:, k]])
-                            for k in range(2)])
-    graph = sp.coo_matrix((np.ones(len(links)), links.T), (faces.size, faces.size))
-    return connected_components(graph, directed=False)[1].reshape(-1, 3)

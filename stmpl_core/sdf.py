@@ -11,16 +11,16 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from stmpl_core.arrays import Points, finite
-from stmpl_core.decimation import BAND, MARGIN, MAX_NODES, field_spacing
+from stmpl_core.decimation import BAND_CELLS, MARGIN, MAX_NODES, field_spacing
 from stmpl_core.errors import InvalidInput, MeshError
 from stmpl_core.mending import closed
 from stmpl_core.tool import Tool
 
 log = logging.getLogger(__name__)
 
-MAX_EXTENT = 2.0  # m; a tool is smaller, a tool in millimetres is not
-MIN_EXTENT = 2e-4  # m
-COARSE = 3  # the grid far from the surface is this many times coarser
+MAX_EXTENT = 2.0  # largest extent of a tool [m]; that of a mesh in millimetres is larger
+MIN_EXTENT = 2e-4  # smallest extent of a tool [m]
+COARSE = 3  # factor by which the grid far from the surface is coarser
 ROUNDING_WIDTH = 0.57  # width of the smoothing over the radius that it gives a right-angled edge, measured
 
 
@@ -39,8 +39,8 @@ class SignedDistance:
         coefficients: weights of the spline, (I, J, K) [m].
         origin: position of node (0, 0, 0), (3,) [m].
         spacing: edge of the grid's cells [m].
-        watertight: truth of the mesh being closed; if it is not, the sign near its holes is a guess.
-        flipped: truth of the mesh having come inside out, and been turned.
+        watertight: flag of a closed mesh; if it is not, the sign near its holes is a guess.
+        flipped: flag of a mesh that came inside out, and was turned.
         surface_error: largest |distance| at the vertices and face centres of the mesh, where it should be 0 [m].
         tool_bounds: lowest and highest corner of the mesh, (3,) [m] each.
     """
@@ -57,7 +57,7 @@ class SignedDistance:
     def of(
         cls, mesh: Tool, *, spacing: float | None = None, margin: float = MARGIN, rounding: float = 0.0
     ) -> Self:
-        """Builds the field of `mesh`; a closed mesh that is inside out is turned, and `flipped` says so.
+        """Builds the distance field of `mesh`; a closed mesh that is inside out is turned, and `flipped` says so.
 
         Args:
             mesh: surface in the tool's frame.
@@ -69,8 +69,8 @@ class SignedDistance:
                 edge: pressing by finite elements wants about 1 mm.
 
         Raises:
-            MeshError: no area, or an extent that no tool in metres has.
-            InvalidInput: not finite, or a spacing so fine that the grid would not fit in memory.
+            MeshError: a surface without area, or an extent that no tool in metres has.
+            InvalidInput: numbers that are not finite, or a spacing so fine that the grid would not fit in memory.
         """
         vertices, faces, watertight, flipped = _checked(mesh)
         area = float(_face_areas(vertices, faces).sum())
@@ -163,7 +163,7 @@ def _node_distances(vertices: Points, faces: np.ndarray, origin: np.ndarray, h: 
     index = np.stack(np.meshgrid(*(np.arange(0, n, COARSE) for n in shape), indexing="ij"), axis=-1)
     coarse = exact(index.reshape(-1, 3).astype(float)).reshape(index.shape[:3])
     values = np.asarray(ndimage.zoom(coarse, tuple(shape / np.array(coarse.shape)), order=3, mode="mirror"))
-    band = np.argwhere(np.abs(values) < BAND * h)
+    band = np.argwhere(np.abs(values) < BAND_CELLS * h)
     values[tuple(band.T)] = exact(band.astype(float))
     return values
 

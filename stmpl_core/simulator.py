@@ -20,7 +20,7 @@ from stmpl_core.touch import Answer, Touch
 from stmpl_core.toucher import Toucher
 from stmpl_core.trust import Displacement, Trust
 
-ENTERED = 0.02  # of the thickness: skin further inside a tool than this is said
+MAX_ENTERED_SHARE = 0.02  # depth of skin inside a tool over the thickness, which is not yet said
 
 
 class Simulator:
@@ -32,7 +32,7 @@ class Simulator:
         tools: tools with their distance fields; None: an empty store, to which contacts add theirs.
 
     Attributes:
-        toucher: finds what tools do to the skin.
+        toucher: contact law on this layer.
 
     Raises:
         InvalidInput: a layer without a method.
@@ -62,7 +62,7 @@ class Simulator:
     def touch(
         self, contacts: Sequence[Contact], state: State | None = None, dt: float = 0.0
     ) -> list[Touch] | tuple[list[Touch], State]:
-        """The reaction: what each contact does, fast; the skin's motion is found by `answer`.
+        """Finds the reaction: touch of each contact, fast; `answer` finds the displacement.
 
         Args:
             contacts: tools at one instant, each once.
@@ -82,7 +82,7 @@ class Simulator:
         return touches if state is None else (touches, state)
 
     def answer(self, touches: Sequence[Touch]) -> Answer:
-        """The field: the skin's motion under touches of this simulator."""
+        """Finds the displacement of the skin under touches of this simulator."""
         # Sum: pressures of several tools add.
         zero = np.zeros(len(self.layer.vertices))
         load = Load.contact(sum((touch.pressure for touch in touches if touch.pressure is not None), zero))
@@ -97,7 +97,7 @@ class Simulator:
 
         # Say what may be believed: what the method says, and what was found of each contact.
         trust = _joined(solved.trust, touches, fitted)
-        if fitted.entered > ENTERED * float(self.layer.thickness.min()):
+        if fitted.entered > MAX_ENTERED_SHARE * float(self.layer.thickness.min()):
             trust = trust.also(f"skin is {fitted.entered * 1e3:.2f} mm inside a tool", in_range=False)
         return Answer(fitted.displacement, trust, solved.method, load.values, {touch.name: touch for touch in touches})
 

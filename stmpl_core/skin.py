@@ -14,7 +14,7 @@ from stmpl_core.moments import Surroundings
 
 @dataclass(frozen=True, eq=False)
 class Skin:
-    """What answers. It can be pickled, so that a process beside may make it.
+    """A layer, ready to answer. It can be pickled, so that another process may make it.
 
     Args:
         layer: soft layer at rest.

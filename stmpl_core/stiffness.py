@@ -11,33 +11,33 @@ import numpy as np
 from stmpl_core.contact import Contact
 from stmpl_core.errors import InvalidInput
 from stmpl_core.touch import Touch
-from stmpl_core.toucher import SIDEWAYS, Toucher
+from stmpl_core.toucher import MAX_DRAG_RATIO, Toucher
 from stmpl_core.trust import Trust
 
-FEWEST = 6  # presses that may be believed
-LIGHT = 0.05  # of the hardest presses' force: those that are lighter count by their absolute error
-OUTLIER = 2.0  # standard deviations from which a press counts less (Huber)
-ROUNDS = 8  # of weighting
-STEPS = 13  # of the offset, before the best is refined
-FOUND = 5e-6  # m: how near the offset is sought
-ALIKE = 2e-3  # relative error of the forces up to which the smaller of two offsets is taken
-WORST_FIT = 0.15  # relative error of the forces that is left: more is no skin of one stiffness
-WORST_ERROR = 0.25  # of the modulus
-AT_THE_END = 1e-4  # m from the ends of the search: the offset that is sought may lie outside
+MIN_PRESSES = 6  # presses that a fit needs
+LIGHT_PRESS_SHARE = 0.05  # force over the hardest presses', below which a press counts by its absolute error
+HUBER_DEVIATIONS = 2.0  # standard deviations from which a press counts less (Huber)
+WEIGHTING_ROUNDS = 8  # rounds of weighting
+OFFSET_STEPS = 13  # offsets that are tried before the best is refined
+OFFSET_TOLERANCE_M = 5e-6  # error of the offset at which the search ends
+OFFSET_PENALTY = 2e-3  # relative error of the forces up to which the smaller of two offsets is taken
+MAX_RESIDUAL = 0.15  # relative error of the forces that may be left; with more it is no skin of one stiffness
+MAX_RELATIVE_ERROR = 0.25  # standard error of the modulus over it
+OFFSET_MARGIN_M = 1e-4  # distance from the ends of the search, within which the offset may as well lie outside
 
 
 @dataclass(frozen=True)
 class Stiffness:
-    """What presses say of the skin.
+    """Stiffness of a skin, as its presses tell it.
 
     Args:
         youngs_modulus: E [Pa]; nan where `trust` says that none could be found.
         relative_error: standard error of E over E, scatter and the contact law's own error together [-].
-        offset: by which the poses stand too far back along their push (negative: too far in) [m].
+        offset: distance by which the poses stand too far back along their push [m]; negative: too far in.
         residual: relative error of the forces that is left, root mean square [-].
-        presses: that were fitted.
-        depths: of the lightest and of the deepest of them, with the offset [m].
-        trust: whether E may be used, and why not.
+        presses: number of presses that were fitted.
+        depths: smallest and largest depth among them, with the offset [m].
+        trust: verdict on E: may it be used, and why not.
     """
 
     youngs_modulus: float
@@ -56,13 +56,13 @@ class Stiffness:
 
 
 class _Fit(NamedTuple):
-    modulus: float  # [Pa]
-    weights: np.ndarray  # Huber's, (N,)
+    modulus: float  # Young's modulus [Pa]
+    weights: np.ndarray  # Huber's weights, (N,)
     cost: float  # mean weighted square of the relative errors
 
 
 def fit_stiffness(toucher: Toucher, presses: Sequence[Contact]) -> Stiffness:
-    """The modulus E with which the contact law explains the measured forces.
+    """Finds the modulus E with which the contact law explains the measured forces.
 
     By dimensional analysis the force at a pose is E g, where g does not depend on E. For a given offset s of the poses
     along their push, E is then the weighted least-squares solution of E g_i(s) = f_i, f_i the measured force along the
@@ -82,16 +82,16 @@ def fit_stiffness(toucher: Toucher, presses: Sequence[Contact]) -> Stiffness:
         if press.wrench is None:
             raise InvalidInput(f"a press of {press.name} has no wrench; stiffness needs the force.")
     pressing = [one for one in presses if one.wrench is not None and one.wrench[:3].any()]
-    if len(pressing) < FEWEST:
-        return _nothing(f"{len(pressing)} of {len(presses)} instants pressed with a force; {FEWEST} are needed. "
+    if len(pressing) < MIN_PRESSES:
+        return _nothing(f"{len(pressing)} of {len(presses)} instants pressed with a force; {MIN_PRESSES} are needed. "
                         "Press, at several depths, and ask again")  # fmt: skip
     fit = _Presses(toucher, pressing)
     offset = fit.best_offset()
     touches = fit.touches(offset)
     sound = [fit.sound(press, touch) for press, touch in zip(pressing, touches, strict=True)]
-    if sum(sound) < FEWEST:
+    if sum(sound) < MIN_PRESSES:
         return _nothing(f"{sum(sound)} of {len(pressing)} presses are inside what the contact law was validated on; "
-                        f"{FEWEST} are needed{_most_common(touches, sound)}")  # fmt: skip
+                        f"{MIN_PRESSES} are needed{_most_common(touches, sound)}")  # fmt: skip
     if not all(sound):
         fit = _Presses(toucher, [press for press, kept in zip(pressing, sound, strict=True) if kept])
         offset = fit.best_offset()
@@ -107,10 +107,10 @@ class _Presses:
         self._forces = np.array([one.wrench[:3] for one in presses if one.wrench is not None])
         sizes = np.linalg.norm(self._forces, axis=1)
         self._pushes = self._forces / sizes[:, None]
-        self._weigh_by = np.maximum(sizes, LIGHT * np.quantile(sizes, 0.9))  # N
+        self._weigh_by = np.maximum(sizes, LIGHT_PRESS_SHARE * np.quantile(sizes, 0.9))  # N
 
     def touches(self, offset: float) -> list[Touch]:
-        """What the law says of each press, by its shifted pose alone."""
+        """Touch of each press by the contact law, by its shifted pose alone."""
         return [self._touch(press, offset * push) for press, push in zip(self._presses, self._pushes, strict=True)]
 
     def _touch(self, press: Contact, shift: np.ndarray) -> Touch:
@@ -119,19 +119,19 @@ class _Presses:
         return self._toucher.touch(Contact(press.tool, pose))
 
     def best_offset(self) -> float:
-        """Along the push [m]."""
+        """Offset along the push that explains the forces best [m]."""
         from scipy.optimize import minimize_scalar
 
         reach = self._toucher.reach
-        tried = np.linspace(-reach, reach, STEPS)
+        tried = np.linspace(-reach, reach, OFFSET_STEPS)
         costs = [self._cost(offset) for offset in tried]
         best = int(np.argmin(costs))
-        around = tried[max(best - 1, 0)], tried[min(best + 1, STEPS - 1)]
-        found = minimize_scalar(self._cost, bounds=around, method="bounded", options={"xatol": FOUND})
+        around = tried[max(best - 1, 0)], tried[min(best + 1, OFFSET_STEPS - 1)]
+        found = minimize_scalar(self._cost, bounds=around, method="bounded", options={"xatol": OFFSET_TOLERANCE_M})
         return float(found.x) if found.fun <= costs[best] else float(tried[best])
 
     def _cost(self, offset: float) -> float:
-        return self._fit(*self._law(offset)).cost + (ALIKE * offset / self._toucher.reach) ** 2
+        return self._fit(*self._law(offset)).cost + (OFFSET_PENALTY * offset / self._toucher.reach) ** 2
 
     def _law(self, offset: float) -> tuple[np.ndarray, np.ndarray]:
         """The law's force over E of each press [m2], and the measured force along it [N], (N,)."""
@@ -145,10 +145,10 @@ class _Presses:
         """E for given forces over E, by iteratively reweighted least squares."""
         g, f, weights = law / self._weigh_by, measured / self._weigh_by, np.ones(len(law))
         modulus, errors = 0.0, f
-        for _ in range(ROUNDS):
+        for _ in range(WEIGHTING_ROUNDS):
             modulus = float((weights * g * f).sum() / max((weights * g * g).sum(), 1e-300))
             errors = f - modulus * g
-            most = OUTLIER * max(1.4826 * float(np.median(np.abs(errors))), 1e-6)
+            most = HUBER_DEVIATIONS * max(1.4826 * float(np.median(np.abs(errors))), 1e-6)
             weights = np.minimum(1.0, most / np.maximum(np.abs(errors), 1e-300))
         return _Fit(modulus, weights, float((weights * errors**2).sum() / weights.sum()))
 
@@ -160,10 +160,10 @@ class _Presses:
         assert press.wrench is not None
         normal = touch.wrench[:3] / size * (press.wrench[:3] @ touch.wrench[:3]) / size
         dragging = float(np.linalg.norm(press.wrench[:3] - normal))
-        return touch.trust.in_range and dragging <= SIDEWAYS * float(np.linalg.norm(normal))
+        return touch.trust.in_range and dragging <= MAX_DRAG_RATIO * float(np.linalg.norm(normal))
 
     def told(self, offset: float, touches: list[Touch]) -> Stiffness:
-        """The answer, with what may be believed of it."""
+        """Result of the fit, with its trust."""
         law, measured = self._law(offset)
         fit = self._fit(law, measured)
         if not fit.modulus > 0:
@@ -173,17 +173,17 @@ class _Presses:
         residual = float(np.sqrt(fit.cost))
         error = self._error(offset, fit, residual)
         trust, reach = Trust(), self._toucher.reach
-        if residual > WORST_FIT:
-            trust = trust.also(f"one stiffness leaves the forces off by {residual:.0%}, at most {WORST_FIT:.0%} is "
+        if residual > MAX_RESIDUAL:
+            trust = trust.also(f"one stiffness leaves the forces off by {residual:.0%}, at most {MAX_RESIDUAL:.0%} is "
                                "accepted: check frames, wrench and thickness", converged=False)  # fmt: skip
-        if abs(offset) > reach - AT_THE_END:
+        if abs(offset) > reach - OFFSET_MARGIN_M:
             trust = trust.also(f"the poses are off by {reach * 1e3:g} mm along their push or more: calibrate them",
                                converged=False)  # fmt: skip
-        if not error <= WORST_ERROR:
+        if not error <= MAX_RELATIVE_ERROR:
             span = f"{1e3 * min(depths):.1f} to {1e3 * max(depths):.1f} mm"
             trust = trust.also(f"presses of {span} do not tell the stiffness from an offset of the poses: it is known "
-                               f"to {error:.0%}, {WORST_ERROR:.0%} is needed. Press from a light touch to a third of "
-                               "the thickness", converged=False)  # fmt: skip
+                               f"to {error:.0%}, {MAX_RELATIVE_ERROR:.0%} is needed. Press from a light touch to "
+                               "a third of the thickness", converged=False)  # fmt: skip
         return Stiffness(fit.modulus, error, offset, residual, len(law), (min(depths), max(depths)), trust)
 
     def _error(self, offset: float, fit: _Fit, residual: float) -> float:

@@ -9,9 +9,9 @@ import numpy as np
 
 from stmpl_core.layer import SoftLayer
 
-ZONES = (2.0, 4.5)  # thicknesses from the load at which the first and the second thinning begin
-SPACINGS = (0.7, 1.5)  # thicknesses between the vertices that are asked there, at least
-CORNERS = 12  # asked vertices that one between is filled in from
+ZONES = (2.0, 4.5)  # distances from the load, over t, at which the first and the second thinning begin
+SPACINGS = (0.7, 1.5)  # least distances between the vertices that are asked there, over t
+CORNERS = 12  # number of asked vertices from which one between is filled in
 LARGEST = 2.5  # sum of the weights' sizes, from which a vertex is rather asked itself: it would be extrapolated
 
 
@@ -20,10 +20,10 @@ class Asked(NamedTuple):
 
     Args:
         loaded: numbers of the loaded vertices, (L,).
-        vertices: of those that are asked, (N,).
-        between: of those that are filled in, (M,).
+        vertices: numbers of those that are asked, (N,).
+        between: numbers of those that are filled in, (M,).
         corners: places in `vertices` of those that each is filled in from, (M, CORNERS).
-        weights: of these, (M, CORNERS) [-].
+        weights: weights of these, (M, CORNERS) [-].
     """
 
     loaded: np.ndarray
@@ -39,7 +39,7 @@ class Asked(NamedTuple):
 
     @property
     def stand_for(self) -> np.ndarray:
-        """How many vertices each asked one stands for, (N,)."""
+        """Number of vertices that each asked one stands for, (N,)."""
         return 1 + np.bincount(self.corners.ravel(), self.weights.ravel(), len(self.vertices))
 
 
@@ -47,9 +47,9 @@ class Thinning:
     """Vertices in reach of each other by how far they are apart, and which of them stand for those around them.
 
     Args:
-        layer: the soft layer at rest.
+        layer: soft layer at rest.
         frames: two tangents and the normal of each vertex, (V, 3, 3).
-        reach: thicknesses to which a load is felt.
+        reach: distance to which a load is felt, over t.
     """
 
     def __init__(self, layer: SoftLayer, frames: np.ndarray, reach: float) -> None:
@@ -77,13 +77,13 @@ class Thinning:
         return np.flatnonzero(_zones(self.start, self.index, loaded, len(self._stands[0]))).astype(np.int32)
 
     def asked(self, loaded: np.ndarray) -> Asked:
-        """Which of them are asked under a load on these vertices (L,), and how the others are filled in."""
+        """Vertices that are asked under a load on vertices (L,), and how the others are filled in."""
         zones = _zones(self.start, self.index, loaded, len(self._stands[0]))
         self._last = Asked(loaded, *_asked(zones, self._stands, self._corners, self._weights))
         return self._last
 
     def asked_again(self, loaded: np.ndarray) -> Asked:
-        """As `asked`, which is not done again if these were the last."""
+        """Same as `asked`, but not done again if these were the last."""
         last = self._last
         return last if last is not None and np.array_equal(last.loaded, loaded) else self.asked(loaded)
 

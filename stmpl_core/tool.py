@@ -16,7 +16,7 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, eq=False)
 class Tool:
-    """A tool: its surface does not change, where it is says a Contact.
+    """A rigid tool with a name. Its surface does not change; a Contact tells where it is.
 
     Args:
         name: name in answers, messages and log lines.
@@ -27,7 +27,8 @@ class Tool:
         mendings: sentences that tell what of the surface was mended (see stmpl_core.mending); usually none.
 
     Raises:
-        MeshError, InvalidInput: not finite, empty, faces that name no vertex, or a surface that cannot be mended.
+        MeshError, InvalidInput: a surface that is not finite, is empty, names vertices that do not exist, or
+            cannot be mended.
     """
 
     name: str

@@ -55,7 +55,7 @@ class Tools:
         """Takes a tool into use, in place of another of its name.
 
         Args:
-            tool: the tool.
+            tool: tool to hold.
             field: distance field of its surface, built with this store's margin; None: built when it is first needed.
         """
         self._announced.pop(tool.name, None)

@@ -15,22 +15,22 @@ if TYPE_CHECKING:
     from stmpl_core.columns import Squeeze
     from stmpl_core.sdf import SignedDistance
 
-TOUCHING = "touching"  # the wrench is carried by the skin under the tool
-MOVED = "moved to touch"  # as above, after the tool was moved along its push to meet the skin
-BY_POSE = "pressed by pose"  # no wrench given: the force follows from how deep the pose is
-APART = "apart"  # no wrench to carry, and no touch
-NO_FORCE = "no force"  # the pose touches, the wrench is exactly zero
-PULLING = "pulling"  # the wrench draws the tool off the skin; nothing sticks, so nothing is loaded
-NO_TOUCH = "wrench without touch"  # a force, but no skin within reach along it
-WRAPPED = "wrapped around"  # the tool closes around the limb: a wrench does not say how hard it squeezes
-IN_CORE = "inside the core"  # the pose reaches through the soft layer into what is rigid; the layer is pressed flat
-STALE = "stale"  # the tool's input has stopped: the answer is a share of its last one
+TOUCHING = "touching"  # wrench carried by the skin under the tool
+MOVED = "moved to touch"  # wrench carried so, after the tool was moved along its push to meet the skin
+BY_POSE = "pressed by pose"  # pose without a wrench: the force follows from the depth
+APART = "apart"  # pose off the skin, and no wrench to carry
+NO_FORCE = "no force"  # pose that touches, with a wrench of exactly zero
+PULLING = "pulling"  # wrench that draws the tool off the skin; nothing sticks, so nothing is loaded
+NO_TOUCH = "wrench without touch"  # force without skin within reach along it
+WRAPPED = "wrapped around"  # tool that closes around the limb: a wrench does not say how hard it squeezes
+IN_CORE = "inside the core"  # pose that reaches through the soft layer into what is rigid; the layer is pressed flat
+STALE = "stale"  # input that has stopped: the answer is a share of its last one
 
 PRESSING = frozenset((TOUCHING, MOVED, BY_POSE, IN_CORE))  # statuses of a tool that loads the skin
 
 
 class Pressed(NamedTuple):
-    """What the motion under a tool is found from.
+    """Squeeze and field from which the motion under a tool follows.
 
     Args:
         field: distance field of the tool.
@@ -45,7 +45,7 @@ class Pressed(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Touch:
-    """What one contact does.
+    """Effect of one contact: status, wrench, depth, pressure.
 
     Args:
         name: name of the tool.
@@ -56,9 +56,9 @@ class Touch:
         force_bound: bound on the error of the force that the pose presses with [N]; NaN where it is not known.
         moved: way that the tool went from the stated pose, along its push [m].
         missing: part of the stated wrench that the skin does not carry, (6,) [N, N m].
-        trust: what may be believed of it.
+        trust: verdict on the touch: what may be believed of it.
         pressure: pressure on the skin, (V,) [Pa]; None in recordings, which keep the sum over all tools.
-        pressed: what the motion under the tool is found from; None where nothing presses and in recordings.
+        pressed: squeeze and field from which the motion under the tool follows; None: nothing presses, or a recording.
     """
 
     name: str
@@ -80,7 +80,7 @@ class Touch:
 
     @property
     def drag(self) -> float:
-        """Size of the stated force that is not carried [N]: what goes along the skin."""
+        """Size of the stated force along the skin, which is not carried [N]."""
         return float(np.linalg.norm(self.missing[:3]))
 
     @property
@@ -94,7 +94,7 @@ class Answer(Displacement):
     """The skin under some contacts.
 
     Args:
-        touches: what each contact does, by the name of its tool.
+        touches: touch of each contact, by the name of its tool.
     """
 
     touches: Mapping[str, Touch] = field(default_factory=dict)

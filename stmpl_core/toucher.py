@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from stmpl_core.arrays import Transform
-from stmpl_core.columns import NO_SQUEEZE, Clearance, Columns, Squeeze
+from stmpl_core.columns import HOLE_RADIUS, NO_SQUEEZE, Clearance, Columns, Squeeze
 from stmpl_core.contact import Contact
 from stmpl_core.contact_net import ContactNet, Held
 from stmpl_core.layer import SoftLayer
@@ -31,21 +31,20 @@ from stmpl_core.touch import (
 )
 from stmpl_core.trust import Trust
 
-REACH = 3e-3  # m that a pressing tool may be off: what calibration may leave
-HOLE = 0.6  # of an edge: a tool that comes this near to a vertex cannot slip between vertices (equilateral: 0.577)
-SLACK = 0.25  # of a hole: a curved tool that touches between vertices is this far from them, and was not moved
-NEARLY = 1e-6  # m; nearer than this is touching
-FACING = 0.1  # cosine between push and inward normal from which the skin faces a tool that looks for it
-ONE_SIDED = 0.1  # a contact whose pressures cancel to less than this share has no direction
-SIDEWAYS = 0.3  # of the normal force: more tangential force than this is worth a word
-ROUGH = 5e-4  # m: a tool whose distance field is off by more than this is worth a word
-STRANGE = 0.1  # of the force: carried by vertices that see what no training contact had
-DEEP = 0.85  # of the thickness: a wrench presses no deeper
-SAME_FORCE = 0.02  # of the force: how near the depth is tried; the rest of the way is reckoned
-TRIALS = 12  # of the depth
-MANY = 8  # tools from which those that are apart are told by a tree of boxes
-BEND = -0.25  # power of Winkler's force with which the skin's share of it falls, until a trial says more
-BENT = 1.4  # factor by which that share is taken to change at most from trial to trial
+MAX_TOOL_OFFSET_M = 3e-3  # distance that calibration may leave between a pressing tool and its stated place
+MAX_TOUCHING_GAP = 0.25  # largest gap of a tool that touches between vertices, over a hole's radius
+GAP_TOLERANCE_M = 1e-6  # gap at which the search along the force ends
+MIN_FACING_COSINE = 0.1  # cosine between push and inward normal from which the skin faces a tool that looks for it
+MIN_NET_FORCE_SHARE = 0.1  # force over the sum of its parts' sizes, below which a contact has no direction
+MAX_DRAG_RATIO = 0.3  # tangential over normal force that is not yet worth a word
+MAX_FIELD_ERROR_M = 5e-4  # error of a distance field that is not yet worth a word
+MAX_UNSEEN_FORCE_SHARE = 0.1  # share of the force that vertices unlike all training contacts may carry
+MAX_PRESSED_STRAIN = 0.85  # depth over thickness beyond which no wrench presses a tool
+FORCE_TOLERANCE = 0.02  # relative error of the force at which trials end; the rest of the way is reckoned
+MAX_DEPTH_TRIALS = 12  # trials of the depth for one wrench
+FIRST_SHARE_POWER = -0.25  # power of Winkler's force with which the skin's share of it falls, until a trial says more
+MAX_SHARE_CHANGE = 1.4  # factor by which that share is taken to change at most from trial to trial
+MANY_TOOLS = 8  # number of tools from which those that are apart are told by a tree of boxes
 
 
 class _Placed(NamedTuple):
@@ -55,16 +54,16 @@ class _Placed(NamedTuple):
     field: SignedDistance
     status: str
     pose: Transform
-    depth: float  # of the stated pose [m]
-    moved: float  # [m]
+    depth: float  # depth of the stated pose [m]
+    moved: float  # way along the force [m]
     squeeze: Squeeze
-    force: float | None  # to be carried along the mean normal [N]; None: what the pose presses with
+    force: float | None  # force to carry along the mean normal [N]; None: what the pose presses with
     why: str = ""
-    held: Held | None = None  # what holds the skin against this tool alone, where it is known
+    held: Held | None = None  # pressures of the skin against this tool alone, where they are known
 
 
 class Toucher:
-    """Finds the skin that tools cover, and what presses them back.
+    """Finds the skin that tools cover, and the pressure that carries them: the contact law on one layer.
 
     A tool covers a column when the column, skin to core, enters it, counted from the core: so a tool thinner than the
     layer may be pressed under the skin's rest position, and the far side of the limb stays free. How far the columns
@@ -82,10 +81,10 @@ class Toucher:
     """
 
     def __init__(self, layer: SoftLayer, near: Surroundings | None = None, tools: Tools | None = None, *,
-                 reach: float = REACH) -> None:  # fmt: skip
+                 reach: float = MAX_TOOL_OFFSET_M) -> None:  # fmt: skip
         self.layer, self.reach = layer, reach
         self.near = near or Surroundings.of(layer)
-        self.hole = HOLE * layer.edge_length
+        self.hole = HOLE_RADIUS * layer.edge_length
         self.tools = Tools(margin_on(layer)) if tools is None else tools
         self.columns, self.net = Columns(layer), ContactNet(layer, near=self.near)
         self._modulus = layer.tissue.youngs_modulus
@@ -94,12 +93,12 @@ class Toucher:
         self._inward = self.columns.inward
 
     def touch(self, contact: Contact) -> Touch:
-        """What one contact does alone. Raises MeshError: a surface that cannot be a tool."""
+        """Touch of one contact alone. Raises MeshError: a surface that cannot be a tool."""
         return self.touch_all([contact])[0]
 
     def touch_all(self, contacts: Sequence[Contact]) -> list[Touch]:
-        """What several contacts do at once: tools side by side feel each other through the skin."""
-        many = len(contacts) >= MANY
+        """Touches of several contacts at once: tools side by side feel each other through the skin."""
+        many = len(contacts) >= MANY_TOOLS
         placed = [self._place(contact, self.tools.field(contact.tool), many) for contact in contacts]
         pressing = [one for one in placed if len(one.squeeze.vertices)]
         if len(pressing) == 1:
@@ -154,14 +153,14 @@ class Toucher:
         if clearance.least.min(initial=np.inf) <= 0:
             return 0.0
         push = force / np.linalg.norm(force)
-        facing = clearance.vertices[self._inward[clearance.vertices] @ push > FACING]
+        facing = clearance.vertices[self._inward[clearance.vertices] @ push > MIN_FACING_COSINE]
         moved, best, nearest = 0.0, None, self.hole
         while moved <= self.reach:
             there = self.columns.clearance(field, _shifted(pose, moved * push), facing, self.reach + self.hole)
             gap = float(there.least.min(initial=np.inf))
             if gap < nearest:
                 best, nearest = moved, gap
-            if gap < NEARLY:
+            if gap < GAP_TOLERANCE_M:
                 break
             moved += gap
         return best
@@ -177,15 +176,15 @@ class Toucher:
         layer, push, start = self.layer, force / np.linalg.norm(force), contact.pose_body_from_tool
         low, high, moved, best = -np.inf, np.inf, gap, None
         last: tuple[float, float] | None = None  # force of the trial before, and what it promised for this one
-        bend = BEND
-        for _ in range(TRIALS):
+        bend = FIRST_SHARE_POWER
+        for _ in range(MAX_DEPTH_TRIALS):
             pose, clearance = _shifted(start, moved * push), stated
             if moved:
                 near = stated.vertices[~(stated.least > abs(moved) + 2 * self.hole) | np.isinf(stated.least)]
                 clearance = self.columns.clearance(field, pose, near, self.hole)
             squeeze = self.columns.squeeze(field, pose, clearance)
             v = squeeze.vertices
-            if not (self._inward[v] @ push > FACING).any():
+            if not (self._inward[v] @ push > MIN_FACING_COSINE).any():
                 if best is None and gap == 0.0 and len(v):
                     return None
                 low = max(low, moved)
@@ -195,24 +194,24 @@ class Toucher:
             pressure = held.pressure * self._modulus
             vector = -(pressure @ layer.vertex_area_vectors[v])
             size = float(np.linalg.norm(vector))
-            if size <= ONE_SIDED * float(pressure @ layer.vertex_areas[v]):
+            if size <= MIN_NET_FORCE_SHARE * float(pressure @ layer.vertex_areas[v]):
                 return _Placed(contact, field, WRAPPED, start, depth, 0.0, NO_SQUEEZE, 0.0)
             normal = float(force @ vector) / size
             if normal <= 0:
                 return None
-            status = MOVED if gap > SLACK * self.hole else TOUCHING
+            status = MOVED if gap > MAX_TOUCHING_GAP * self.hole else TOUCHING
             best = _Placed(contact, field, status, pose, depth, moved, squeeze, normal, held=held)
             if last is not None:
                 bend = float(np.clip(np.log(size / last[1]) / np.log(last[1] / last[0]), -0.8, 2.0))
             times = normal / size
-            times *= float(np.clip(times ** (-bend / (1 + bend)), 1 / BENT, BENT))
+            times *= float(np.clip(times ** (-bend / (1 + bend)), 1 / MAX_SHARE_CHANGE, MAX_SHARE_CHANGE))
             further = self._deeper(squeeze, clearance, push, times)
-            if abs(size / normal - 1) < SAME_FORCE:  # the rest is small enough to go without another look
+            if abs(size / normal - 1) < FORCE_TOLERANCE:  # the rest is small enough to go without another look
                 under = np.where(squeeze.depth > 0, squeeze.depth + further * (self._inward[v] @ push), 0.0)
                 return best._replace(pose=_shifted(pose, further * push), moved=moved + further,
                                      squeeze=squeeze._replace(depth=np.maximum(under, 0.0)))  # fmt: skip
             deepest = float((squeeze.depth / layer.thickness[v]).max())
-            if size < normal and deepest > DEEP - 0.01:
+            if size < normal and deepest > MAX_PRESSED_STRAIN - 0.01:
                 why = (f"{contact.name} asks for {normal:.2g} N along the skin's normal; pressed to "
                        f"{deepest:.0%} of the layer it has {size:.2g} N")
                 return best._replace(why=why)
@@ -233,9 +232,9 @@ class Toucher:
         depth[np.searchsorted(near, clearance.vertices)] = -clearance.least
         carry = np.searchsorted(near, squeeze.vertices)
         depth[carry] = np.where(squeeze.depth > 0, squeeze.depth, squeeze.strain / self._confined * thickness[carry])
-        some = (gain > FACING) & np.isfinite(depth)
+        some = (gain > MIN_FACING_COSINE) & np.isfinite(depth)
         gain, thickness, depth, near = gain[some], thickness[some], depth[some], near[some]
-        room = (DEEP * thickness - depth) / gain if times > 1 else np.maximum(depth, 0.0) / gain
+        room = (MAX_PRESSED_STRAIN * thickness - depth) / gain if times > 1 else np.maximum(depth, 0.0) / gain
         most = float(room.min() if times > 1 else room.max())
         return self.columns.deeper(near, gain * self.layer.vertex_areas[near], depth, gain, times, most)
 
@@ -295,14 +294,14 @@ class Toucher:
         if not low - 1e-3 <= nu <= high + 1e-3:
             trust = trust.also(f"contacts were learnt at Poisson's ratios from {low:g} to {high:g}, not {nu:g}",
                                in_range=False)  # fmt: skip
-        if strange > STRANGE:
+        if strange > MAX_UNSEEN_FORCE_SHARE:
             trust = trust.also(f"{strange:.0%} of the force of {name} is where no training contact was like it",
                                in_range=False)  # fmt: skip
         if abs(one.moved) > self.reach:
             trust = trust.also(f"{name} was moved {one.moved * 1e3:+.1f} mm along its force: check its calibration")
-        if touch.drag > SIDEWAYS * touch.force:
+        if touch.drag > MAX_DRAG_RATIO * touch.force:
             trust = trust.also(f"{name} also drags with {touch.drag:.2g} N, which is not carried")
-        if one.field.surface_error > ROUGH:
+        if one.field.surface_error > MAX_FIELD_ERROR_M:
             error_mm = one.field.surface_error * 1e3
             trust = trust.also(f"the distance field of {name} is off by up to {error_mm:.1f} mm")
         if not one.field.watertight:
@@ -314,7 +313,7 @@ class Toucher:
 
 def margin_on(layer: SoftLayer) -> float:
     """Width that a tool's distance field needs around its surface to press on this layer [m]."""
-    return max(MARGIN, 2 * HOLE * layer.edge_length)
+    return max(MARGIN, 2 * HOLE_RADIUS * layer.edge_length)
 
 
 def _shifted(pose: Transform, by: np.ndarray) -> Transform:

@@ -15,11 +15,11 @@ class Trust:
     """What may be believed of an answer.
 
     Args:
-        converged: the method reached its own tolerance (closed forms always do).
-        in_range: the scene lies inside the range that the method was validated on.
+        converged: flag of an answer within the method's own tolerance (closed forms always are).
+        in_range: flag of a scene inside the range that the method was validated on.
         error_bound: largest Euclidean error to expect at any vertex [m], or None where none is known.
-        why: one sentence for a person; empty when there is nothing to say.
-        figures: what the method measured of itself, by name with its unit in the name ("min_j", "truncation_m").
+        why: sentence for a person; empty when there is nothing to say.
+        figures: figures that the method measured, by name with unit ("min_j", "truncation_m").
     """
 
     converged: bool = True
@@ -30,7 +30,7 @@ class Trust:
 
     @property
     def ok(self) -> bool:
-        """Converged and inside the validated range."""
+        """Whether the answer converged and lies inside the validated range."""
         return self.converged and self.in_range
 
     def also(self, why: str, *, in_range: bool | None = None, converged: bool | None = None) -> Trust:
@@ -45,11 +45,11 @@ class Trust:
 
 @dataclass(frozen=True, eq=False)
 class Displacement:
-    """What a method gives for a load.
+    """Displacement that a method finds for a load.
 
     Args:
         displacement: motion of each vertex, (V, 3) [m], in the layer's frame.
-        trust: what may be believed of it.
+        trust: verdict on the answer: what may be believed of it.
         method: name of the method that answered.
         pressure: pressure that was solved for, (V,) [Pa], if the method knows it.
     """

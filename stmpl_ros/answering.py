@@ -19,7 +19,7 @@ from stmpl_ros.limits import Limits
 from stmpl_ros.sending import Sending
 from stmpl_ros.settings import Settings
 
-UNSEEN = 2e-3  # m: a tool that is deeper in its first answer was not seen coming
+MAX_FIRST_DEPTH_M = 2e-3  # depth in a tool's first answer, beyond which it was not seen coming
 WORTH_A_LINE = {
     NO_FORCE: "it touches, but its wrench is zero",
     PULLING: "nothing sticks, so nothing is loaded",
@@ -30,20 +30,20 @@ WORTH_A_LINE = {
 
 
 class Answering:
-    """Answers instants, and fades the last answer to rest when nothing comes any more.
+    """Answers instants, and fades the last answer to rest when no input comes any more.
 
     Args:
         node: node whose clock and logger are used.
         settings: settings as they are now.
-        hearing: what comes in.
-        tally: counts.
-        calibration: keeps presses.
+        hearing: subscriptions and what they heard.
+        tally: counts of answers and refusals.
+        calibration: service that keeps presses.
 
     Attributes:
         simulator: simulator of the skin that answers.
-        sending: what goes out.
+        sending: publishers of the answers.
         limits: limits that answers are held against, or None.
-        fading: whether the last answer fades.
+        fading: flag of an answer that fades to rest.
     """
 
     simulator: Simulator
@@ -138,7 +138,7 @@ class Answering:
             said.append(f"no {stream} for {rest_after} s: answered without it")
             say(f"lost {stream}", said[-1])
         for name, touch in answer.touches.items():
-            if name not in self._seen and touch.depth > UNSEEN:
+            if name not in self._seen and touch.depth > MAX_FIRST_DEPTH_M:
                 said.append(f"{name} starts {1e3 * touch.depth:.1f} mm inside the skin")
                 say(f"start of {name}", said[-1])
             if touch.status in WORTH_A_LINE:

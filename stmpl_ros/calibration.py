@@ -18,8 +18,8 @@ from stmpl_ros.inbox import Instant
 from stmpl_ros.waiting import WaitingService, by_executor
 from stmpl_ros.workshop import Workshop
 
-KEPT = 400  # presses
-APART = 1e-4  # m that a tool moves from one press that is kept to the next
+KEPT = 400  # number of presses that are kept
+APART = 1e-4  # way of a tool between two presses that are kept [m]
 CARRYING = frozenset((TOUCHING, MOVED))  # statuses of a tool whose wrench the skin carries
 
 
@@ -30,9 +30,9 @@ class Calibration:
     the body's frame, so they count on another skin too. The fit is made in the process beside the node.
 
     Args:
-        node: whose service it is.
-        workshop: gives the node's workshop, or None while the node is not configured.
-        apply: has the node answer with this Young's modulus [Pa] from then on; may raise a StmplError.
+        node: node that serves.
+        workshop: function that gives the node's workshop, or None while the node is not configured.
+        apply: function that has the node answer with a Young's modulus [Pa] from then on; may raise a StmplError.
     """
 
     def __init__(self, node: Node, workshop: Callable[[], Workshop | None], apply: Callable[[float], str]) -> None:

@@ -8,9 +8,9 @@ import sys
 import threading
 import time
 
-GRACE = 1.5  # s in which a verb must end after Ctrl-C or SIGTERM, whatever it is doing
-PATIENT = {"record": 30.0}  # s for verbs that have something to save
-VERBS = {  # verb: module of its function, what it does
+GRACE = 1.5  # time in which a verb must end after Ctrl-C or SIGTERM, whatever it is doing [s]
+PATIENT = {"record": 30.0}  # time for verbs that have something to save [s]
+VERBS = {  # module of each verb's function, and what it does
     "demo": ("stmpl_ros.verbs", "node, simulated devices and recorder; then the run against FEM, with a report"),
     "node": ("stmpl_ros.verbs", "answer contacts with the displacement of the skin"),
     "probe": ("stmpl_ros.verbs", "simulated devices along a script, on the skin of a running node"),

@@ -29,12 +29,12 @@ from stmpl_ros.tables import compare_with_progress, comparison_table
 
 log = logging.getLogger(__name__)
 
-LONGEST = 600.0  # s until the devices must be done: a first start compiles kernels
-TO_STOP = 20.0  # s that a process gets to end after SIGINT
-LOOK = 0.1  # s
-LEAST_RATE = 100.0  # Hz at which contacts must have come
-LEAST_KEPT = 0.5  # of the contacts must have been answered: the newest wins, so a busy machine answers fewer
-REPLAY_EVERY = 10  # answers
+LONGEST = 600.0  # time until the devices must be done [s]: a first start compiles kernels
+TO_STOP = 20.0  # time that a process gets to end after SIGINT [s]
+POLL_PERIOD_S = 0.1  # time between two looks at the processes
+LEAST_RATE = 100.0  # rate at which contacts must have come [Hz]
+LEAST_KEPT = 0.5  # share of the contacts that must have been answered: the newest wins, so a busy machine answers fewer
+REPLAY_EVERY = 10  # step between the answers that are replayed
 
 
 class DemoError(StmplError):
@@ -144,7 +144,7 @@ def _wait(probe: subprocess.Popen, others: dict[str, subprocess.Popen], folder: 
         if time.monotonic() > deadline:
             raise DemoError(f"the devices were not done after {LONGEST:g} s:\n{_tail(folder, 'probe')}")
         status.update(_tail(folder, "probe", lines=1) or _tail(folder, "node", lines=1) or "starting")
-        time.sleep(LOOK)
+        time.sleep(POLL_PERIOD_S)
     if probe.returncode:
         raise DemoError(f"probe ended with code {probe.returncode}:\n{_tail(folder, 'probe')}")
 

@@ -12,20 +12,20 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 
 from stmpl_ros.limits import ADVISORY, Limits
 
-RECENT = 1000  # answers that the times are of
+RECENT = 1000  # number of answers whose times are kept
 
 
 @dataclass
 class Tally:
-    """What is counted between two reports, and since the start.
+    """Counts between two reports, and since the start.
 
     Attributes:
-        refused, stale: messages that could not be used, and that were too old.
-        last_refusal: why the last one was refused.
-        answers: given since the start.
-        methods: answers since the last report, by method.
-        solve_times: of recent answers [s].
-        latencies: of recent answers, from the stamp of the pose to the answer's publication [s].
+        refused, stale: numbers of messages that could not be used, and that were too old.
+        last_refusal: reason why the last one was refused.
+        answers: number of answers since the start.
+        methods: number of answers since the last report, by method.
+        solve_times: times spent on recent answers [s].
+        latencies: times from the stamp of the pose to the publication of recent answers [s].
     """
 
     refused: int = 0
@@ -62,14 +62,14 @@ def _percentiles(what: str, seconds: deque[float]) -> dict[str, str]:
 
 
 def skin_status(node: str, values: Mapping[str, str], bad: bool, fading: bool) -> DiagnosticStatus:
-    """How answering goes."""
+    """Status of the answers."""
     message = "some messages were refused, dropped or lost" if bad else "answering"
     message = "input has stopped: the last answer fades, or is at rest" if fading else message
     return _status(f"{node}: skin", bad or fading, message, values)
 
 
 def limits_status(node: str, limits: Limits) -> DiagnosticStatus:
-    """How much of the limits was used since the last report."""
+    """Status of the limits: largest shares since the last report."""
     warn, values = limits.take()
     message = f"at least {limits.warn_at:.0%} of a limit is used" if warn else "within the limits"
     return _status(f"{node}: limits", warn, f"{message} ({ADVISORY})", values)

@@ -13,10 +13,10 @@ from rclpy.subscription import Subscription
 
 
 class Events:
-    """Counts, and says what a person should know.
+    """Counts events of the middleware, and says what a person should know.
 
     Args:
-        say: is told a kind, and a line.
+        say: function that gets a kind, and a line.
     """
 
     def __init__(self, say: Callable[[str, str], None]) -> None:

@@ -11,15 +11,15 @@ from rclpy.node import Node
 from bags.wire import NANO, stamp_ns
 from stmpl_ros.diagnosis import Tally
 
-SAY_EVERY = 1.0  # s between two lines of the same kind
+SAY_EVERY = 1.0  # time between two lines of the same kind [s]
 
 
 class Gate:
-    """What may pass, and what is said of the rest.
+    """Check of each message: what is refused is counted and told.
 
     Args:
         node: node whose clock and logger are used.
-        tally: counts.
+        tally: counts of messages.
 
     Attributes:
         refused_since: reason why something was refused since it was last emptied.

@@ -43,8 +43,8 @@ class GazeboContacts:
         """Each tool that touches the body and whose pose is known, with the WrenchStamped that it exerts.
 
         Raises:
-            FrameError: nobody knows where the simulated world stands.
-            InvalidInput: see `gazebo_wrench`.
+            FrameError: a simulated world that stands nobody knows where.
+            InvalidInput: points without forces.
         """
         frame = message.header.frame_id or WORLD
         if frame not in self._frames:
@@ -60,7 +60,7 @@ class GazeboContacts:
 def gazebo_wrench(
     contacts: Any, collision: str, body: str, pose_body_from_world: Transform, layer: SoftLayer, origin: np.ndarray
 ) -> Wrench | None:
-    """What the tool with this collision exerts on the body, about `origin` (3,) [m]; None if it touches nothing of it.
+    """Wrench of the tool with this collision on the body, about `origin` (3,) [m]; None if it touches nothing of it.
 
     gz-sim (Physics::UpdateCollisions) gives every contact point its position and, as body_1_wrench and body_2_wrench,
     the opposite forces on both bodies, in the world's frame, without torque. Which of them is the first is the physics

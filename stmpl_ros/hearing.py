@@ -39,12 +39,12 @@ class Hearing:
         node: node that subscribes.
         config: settings as they are now.
         tools: tools in use.
-        tally: counts.
+        tally: counts of messages.
 
     Attributes:
-        on_tool: called with a tool whose field is to be built.
-        on_removed: called with the name of a tool that was taken away.
-        on_instant: called with every complete instant.
+        on_tool: callback with a tool whose field is to be built.
+        on_removed: callback with the name of a tool that was taken away.
+        on_instant: callback with every complete instant.
     """
 
     def __init__(self, node: Node, config: Callable[[], NodeConfig], tools: Tools, tally: Tally) -> None:

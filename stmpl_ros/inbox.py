@@ -11,8 +11,8 @@ from stmpl_core.arrays import Transform
 from stmpl_core.contact import Contact
 from stmpl_core.tools import Tools
 
-RECENT = 1_000_000_000  # ns for which a tool that fell silent is spoken of
-PATIENCE = 3  # poses of a tool that may pass a missing partner before the newest of each is taken as it is
+RECENT = 1_000_000_000  # time for which a tool that fell silent is told of [ns]
+PATIENCE = 3  # number of poses of a tool that may pass a missing partner before the newest of each is taken as it is
 
 
 @dataclass
@@ -124,7 +124,7 @@ class Inbox:
         return *poses, *(f"wrench of {name}" for name, s in dumb.items() if not s.live(now, self.rest_after))
 
     def take(self, now: int) -> Instant | None:
-        """What is to be answered now, each instant once; None while there is nothing new or something is to come."""
+        """Instant to answer now, each once; None while there is nothing new or something is to come."""
         live = self.live(now)
         if not self.waiting & live.keys():
             return None

@@ -14,13 +14,13 @@ ADVISORY = "advisory, not a safety function"
 
 
 class Limit(BaseModel):
-    """What one region bears, and who says so."""
+    """Limit of one region of the body, with its source."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     pressure_kpa: float = Field(gt=0, description="largest pressure [kPa]")
     force_n: float = Field(gt=0, description="largest force of one contact [N]")
-    source: str = Field(min_length=1, description="where the figures are from")
+    source: str = Field(min_length=1, description="source of the figures")
 
 
 class LimitsFile(BaseModel):
@@ -33,12 +33,12 @@ class LimitsFile(BaseModel):
 
 
 class Limits:
-    """The largest shares since they were last asked for.
+    """Largest shares of the limits that contacts used since last asked.
 
     Args:
-        region: the body part that answers.
-        limit: that holds there.
-        warn_at: share from which on it is a warning.
+        region: part of the body that answers.
+        limit: limit that holds there.
+        warn_at: share of the limit from which on it is a warning.
     """
 
     def __init__(self, region: str, limit: Limit, warn_at: float) -> None:

@@ -45,7 +45,7 @@ def at_once(config: NodeConfig, build: Build) -> bool:
 
 
 def skin_of(config: NodeConfig, build: Build = layer_of) -> Skin:
-    """The skin that the settings ask for. Raises InvalidInput or MeshError."""
+    """Skin that the settings ask for. Raises InvalidInput or MeshError."""
     return Skin.of(published(build(config)), config.new_method())
 
 

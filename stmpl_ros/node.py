@@ -34,15 +34,15 @@ from stmpl_ros.making import Build, at_once, check, layer_of, restiffened, skin_
 from stmpl_ros.parameters import NodeConfig
 from stmpl_ros.sending import Sending
 from stmpl_ros.settings import Settings
-from stmpl_ros.spinning import LOOK, interruptible, ros, spin
+from stmpl_ros.spinning import POLL_PERIOD_S, interruptible, ros, spin
 from stmpl_ros.topics import STREAM, managed
 from stmpl_ros.workshop import Workshop, then
 
-FADE_RATE = 30.0  # Hz of the answers while the last one fades
+FADE_RATE = 30.0  # rate of the answers while the last one fades [Hz]
 
 
 class SkinNode(LifecycleNode):
-    """What hears (Hearing), what answers (Answering) and what sends (Sending), with a lifecycle, settings, services.
+    """ROS 2 lifecycle node that answers contacts: it hears (Hearing), answers (Answering) and sends (Sending).
 
     What comes in while an answer is being computed waits as the newest; older ones are never answered. When all tools
     are silent the last answer fades to rest. Distance fields, local contacts and other skins are made in processes
@@ -85,7 +85,7 @@ class SkinNode(LifecycleNode):
 
     @property
     def sending(self) -> Sending:
-        """What goes out."""
+        """Publishers of the answers."""
         return self.answering.sending
 
     # Lifecycle
@@ -154,7 +154,7 @@ class SkinNode(LifecycleNode):
         try:
             while True:
                 try:
-                    return making.result.result(LOOK)
+                    return making.result.result(POLL_PERIOD_S)
                 except TimeoutError:
                     continue
                 except BrokenExecutor as error:
@@ -222,7 +222,7 @@ class SkinNode(LifecycleNode):
         return _served(response, lambda: self.set_body(**changes))
 
     def set_body(self, **changes: Any) -> str:
-        """Has another skin, or this one of another stiffness, take over once it is made. Raises InvalidInput.
+        """Changes to another skin, or another stiffness, once it is made. Raises InvalidInput.
 
         Args:
             changes: fields of NodeConfig.

@@ -12,10 +12,10 @@ from pydantic.config import JsonDict
 from stmpl_core.layer import MAX_THICKNESS, SOFTEST
 from stmpl_core.methods import Method, method
 
-ACCURACY = 2e-4  # m
+ACCURACY = 2e-4  # error at any vertex that is asked for [m]
 PHENOTYPE = ("gender", "age", "muscle", "weight", "height", "proportions")
-ANY_TIME: JsonDict = {"when": "any time"}  # a running node takes it over at once
-CONFIGURING: JsonDict = {"when": "configuring"}  # counts when the node is configured, or by ~/set_body
+ANY_TIME: JsonDict = {"when": "any time"}  # fields that a running node takes over at once
+CONFIGURING: JsonDict = {"when": "configuring"}  # fields that count when the node is configured, or by ~/set_body
 
 
 class NodeConfig(BaseModel):
@@ -27,33 +27,34 @@ class NodeConfig(BaseModel):
         default="left_arm", min_length=1, description="part of the body that answers", json_schema_extra=CONFIGURING
     )
     phenotype: str = Field(
-        default="", description="of the body, each from 0 to 1: 'weight=0.7 muscle=0.3'; 0.5 where nothing is said",
+        default="",
+        description="phenotype of the body, each value from 0 to 1: 'weight=0.7 muscle=0.3'; 0.5 unless given",
         json_schema_extra=CONFIGURING,
     )  # fmt: skip
     edge_length: float = Field(
-        default=3e-3, gt=0, le=0.05, description="of the skin's mesh [m]", json_schema_extra=CONFIGURING
+        default=3e-3, gt=0, le=0.05, description="length of the skin mesh's edges [m]", json_schema_extra=CONFIGURING
     )
     thickness: float = Field(
-        default=7.5e-3, gt=0, le=0.1, description="of the soft layer [m]", json_schema_extra=CONFIGURING
+        default=7.5e-3, gt=0, le=0.1, description="thickness of the soft layer [m]", json_schema_extra=CONFIGURING
     )
     youngs_modulus: float = Field(
-        default=1e3, gt=0, le=1e9, description="E of the tissue [Pa]", json_schema_extra=CONFIGURING
+        default=1e3, gt=0, le=1e9, description="Young's modulus of the tissue [Pa]", json_schema_extra=CONFIGURING
     )
     poisson_ratio: float = Field(
-        default=0.4, ge=0, lt=0.5, description="nu of the tissue [-]", json_schema_extra=CONFIGURING
+        default=0.4, ge=0, lt=0.5, description="Poisson's ratio of the tissue [-]", json_schema_extra=CONFIGURING
     )
     density: float = Field(
-        default=1e3, gt=0, le=1e5, description="of the tissue [kg/m3]", json_schema_extra=CONFIGURING
+        default=1e3, gt=0, le=1e5, description="density of the tissue [kg/m3]", json_schema_extra=CONFIGURING
     )
     method: Literal["moment_net", "unet", "linear", "winkler", "naive", "ladder"] = Field(
-        default="moment_net", description="that solves for the displacement", json_schema_extra=CONFIGURING
+        default="moment_net", description="method that solves for the displacement", json_schema_extra=CONFIGURING
     )
     accuracy: float = Field(
-        default=ACCURACY, gt=0, le=1, description="that the ladder is asked for, at any vertex [m]",
+        default=ACCURACY, gt=0, le=1, description="largest error at any vertex that the ladder is asked for [m]",
         json_schema_extra=CONFIGURING,
     )  # fmt: skip
     solve_time: float = Field(
-        default=0.0, ge=0, le=3600, description="that the ladder may take for a solve; 0: as long as it needs [s]",
+        default=0.0, ge=0, le=3600, description="time that the ladder may take for a solve [s]; 0: as long as it needs",
         json_schema_extra=CONFIGURING,
     )  # fmt: skip
     limits: str = Field(
@@ -65,7 +66,7 @@ class NodeConfig(BaseModel):
         default="", description="YAML file of other frames that poses may come in, fixed in the body's; empty: none"
     )
     deadline: float = Field(
-        default=0.0, ge=0, le=3600, description="that devices must offer for their poses; 0 asks for none [s]"
+        default=0.0, ge=0, le=3600, description="longest time between two poses that a device must promise [s]; 0: none"
     )
     shape_tools: str = Field(
         default="", description="tools that announce their surface as shape_msgs/Mesh, parted by blanks"
@@ -77,26 +78,27 @@ class NodeConfig(BaseModel):
         default="", description="model, link or collision in Gazebo that is the body; empty: whatever the tools touch"
     )
     rest_after: float = Field(
-        default=0.25, gt=0, le=3600, description="a tool silent for longer is no longer in contact [s]",
+        default=0.25, gt=0, le=3600, description="silence after which a tool is no longer in contact [s]",
         json_schema_extra=ANY_TIME,
     )  # fmt: skip
     fade: float = Field(
-        default=1.0, ge=0, le=3600, description="in which the last answer goes to rest when all are silent [s]",
+        default=1.0, ge=0, le=3600,
+        description="time in which the last answer fades to rest when all tools are silent [s]",
         json_schema_extra=ANY_TIME,
     )  # fmt: skip
     max_age: float = Field(
-        default=1.0, ge=0, le=1e9, description="older messages are dropped; 0 accepts any age [s]",
+        default=1.0, ge=0, le=1e9, description="age beyond which a message is dropped [s]; 0: never",
         json_schema_extra=ANY_TIME,
     )  # fmt: skip
     marker_rate: float = Field(
-        default=15.0, gt=0, le=1000, description="of skin/marker and skin/points while somebody looks [Hz]",
+        default=15.0, gt=0, le=1000, description="rate of skin/marker and skin/points while somebody listens [Hz]",
         json_schema_extra=ANY_TIME,
     )  # fmt: skip
     local_rotations: bool = Field(
-        default=True, description="local contacts say how the wrench follows rotations too, at twice the cost",
+        default=True, description="derivatives of local contacts by rotations too, at twice the cost",
         json_schema_extra=ANY_TIME,
     )  # fmt: skip
-    autostart: bool = Field(default=True, description="configure and activate without being asked")
+    autostart: bool = Field(default=True, description="start into the active state without being asked")
 
     @field_validator("thickness", mode="before")
     @classmethod
@@ -182,11 +184,13 @@ class ProbeConfig(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     scripts: tuple[Literal["press", "squeeze"], ...] = Field(
-        default=("press", "squeeze"), description="played one after the other"
+        default=("press", "squeeze"), description="scripts to play, one after the other"
     )
-    rate: float = Field(default=200.0, ge=1, le=2000, description="of poses and wrenches [Hz]")
-    listeners: int = Field(default=1, ge=1, description="subscribers to wait for before moving; 2 with a recorder")
-    patience: float = Field(default=60.0, gt=0, description="give up when nobody listens for longer [s]")
+    rate: float = Field(default=200.0, ge=1, le=2000, description="rate of poses and wrenches [Hz]")
+    listeners: int = Field(
+        default=1, ge=1, description="number of subscribers to wait for before moving; 2 with a recorder"
+    )
+    patience: float = Field(default=60.0, gt=0, description="time after which to give up if nobody listens [s]")
 
 
 class RecordConfig(BaseModel):
@@ -196,7 +200,7 @@ class RecordConfig(BaseModel):
 
     path: Path = Field(description="folder for run_0.mcap and metadata.yaml")
     run: Path | None = Field(default=None, description="JSON file that says what made the run; kept in the recording")
-    frames: Path | None = Field(default=None, description="the node's file of frames; the one that `run` names")
+    frames: Path | None = Field(default=None, description="file of frames, as the node's; by default the one of `run`")
 
 
 class DemoConfig(BaseModel):
@@ -206,5 +210,5 @@ class DemoConfig(BaseModel):
 
     node: NodeConfig = NodeConfig()
     probe: ProbeConfig = ProbeConfig(rate=125.0, listeners=2, patience=180.0)
-    frames: int = Field(default=12, ge=1, description="of the run that FEM solves again")
+    frames: int = Field(default=12, ge=1, description="number of frames of the run that FEM solves again")
     runs: Path = Field(default=Path("runs"), description="folder that gets one folder a run")

@@ -23,16 +23,16 @@ from stmpl_ros.spinning import ros
 
 log = logging.getLogger(__name__)
 
-DISCOVERY = 1.0  # s that listeners get to find the topics before the first message
+DISCOVERY_S = 1.0  # time that listeners get to find the topics before the first message
 DEPTH = 1000  # messages of a stream that wait for slow reliable listeners
-LAST = 5.0  # s that reliable listeners get to take the last messages
+LAST_MESSAGES_S = 5.0  # time that reliable listeners get to take the last messages
 
 
 class PlayerNode(Node):
     """One publisher for every topic of a bag that `wanted` accepts, with the quality of service it was recorded with.
 
     Raises:
-        BagError: no topic is left: not wanted, of a type that is not installed, or that has changed since.
+        BagError: a run without any topic left: not wanted, of a type that is not installed, or that has changed since.
     """
 
     def __init__(self, bag: Bag, wanted: re.Pattern[str]) -> None:
@@ -59,7 +59,7 @@ class PlayerNode(Node):
 
     def play(self, bag: Bag, speed: float, stop: threading.Event) -> bool:
         """Publishes everything in the order of the file; False if it was asked to stop before the end."""
-        stop.wait(DISCOVERY)
+        stop.wait(DISCOVERY_S)
         started, first = time.perf_counter(), None
         for raw in bag.raw(self.targets.__contains__):
             first = raw.log_time_ns if first is None else first
@@ -70,7 +70,7 @@ class PlayerNode(Node):
                 return False
             self._send(raw)
         for publisher in self.targets.values():
-            publisher.wait_for_all_acked(Duration(seconds=LAST))
+            publisher.wait_for_all_acked(Duration(seconds=LAST_MESSAGES_S))
         return True
 
     def _send(self, raw: Raw) -> None:
@@ -94,14 +94,14 @@ def run(
     """Publishes a recording until its end, SIGINT or SIGTERM; 0 if all of it was sent.
 
     Args:
-        path: a run's folder, or its .mcap file.
-        speed: 1 as recorded, 2 twice as fast, 0 as fast as possible.
+        path: folder or .mcap file of a run.
+        speed: factor on the recorded pace; 1 as recorded, 2 twice as fast, 0 as fast as possible.
         topics: regular expressions of whole topic names; all topics if there are none.
-        arguments: of ROS.
+        arguments: arguments of ROS.
         namespace: namespace of the one robot whose topics are published, "/left"; "": all.
 
     Raises:
-        BagError: nothing to publish.
+        BagError: a run with nothing to publish.
         InvalidInput: a speed below 0, or an expression that cannot be read.
     """
     if not 0 <= speed < float("inf"):

@@ -20,7 +20,7 @@ from stmpl_ros.scripts import SCRIPTS, Motion, Script
 from stmpl_ros.spinning import ros
 from stmpl_ros.topics import KEPT, STREAM
 
-LOOK = 0.05  # s between two looks while waiting
+POLL_PERIOD_S = 0.05  # time between two looks while waiting
 
 
 class Played(NamedTuple):
@@ -50,7 +50,7 @@ class ProbeNode(Node):
         while not self.topology:
             if stop.is_set() or time.monotonic() > deadline:
                 return None
-            rclpy.spin_once(self, timeout_sec=LOOK)
+            rclpy.spin_once(self, timeout_sec=POLL_PERIOD_S)
         return layer_from(self.topology)
 
     def announce(self, script: Script, layer: SoftLayer, stop: threading.Event) -> list[Played] | None:
@@ -95,7 +95,7 @@ class ProbeNode(Node):
                     "each. Is the node running on this ROS_DOMAIN_ID?"
                 )
                 return False
-            rclpy.spin_once(self, timeout_sec=LOOK)
+            rclpy.spin_once(self, timeout_sec=POLL_PERIOD_S)
         return True
 
 

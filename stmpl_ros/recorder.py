@@ -29,11 +29,11 @@ from stmpl_ros.spinning import ros, spin
 log = logging.getLogger(__name__)
 
 WANTED = re.compile(r"(contact_mesh|skin/topology|skin/displacement|tools/\w+/(pose|wrench))$|^/diagnostics$")
-IF_HEARD = re.compile(r"tools/\w+/local_contact$")  # recorded once a device listens: to listen costs the node work
-LOOK = 0.1  # s between two looks for new topics
+IF_HEARD = re.compile(r"tools/\w+/local_contact$")  # recorded only once a device listens: it costs the node work
+POLL_PERIOD_S = 0.1  # time between two looks for new topics
 DEPTH = 1000  # messages of a topic that the middleware keeps while this process is busy
-WAITING = 4000  # messages that may wait for the disk; what comes then is counted as lost
-DRAIN = 0.5  # s in which what is still on its way is taken, after being asked to stop
+MAX_QUEUED_MESSAGES = 4000  # messages that may wait for the disk; later ones are counted as lost
+DRAIN_S = 0.5  # time in which messages still on their way are taken, after being asked to stop
 
 Item = tuple[str, str, str, bytes, int]  # topic, type, quality of service, serialised message, when it came [ns]
 
@@ -44,9 +44,9 @@ class RecorderNode(Node):
     Nothing is decoded. A topic whose type is not installed is named in the log and left out.
 
     Args:
-        writer: takes what comes.
-        stop: is set when the disk refuses.
-        wanted: whole topic names to record; None: the run's own topics that lie in this node's namespace.
+        writer: writer that takes what comes.
+        stop: event that is set when the disk refuses.
+        wanted: topic names to record, whole; None: the run's own topics that lie in this node's namespace.
     """
 
     def __init__(self, writer: BagWriter, stop: threading.Event, wanted: re.Pattern[str] | None = None) -> None:
@@ -59,7 +59,7 @@ class RecorderNode(Node):
         self._thread = threading.Thread(target=self._write, name="writer")
         self._thread.start()
         self._subscribed: set[str] = set()
-        self.create_timer(LOOK, self._look)
+        self.create_timer(POLL_PERIOD_S, self._look)
 
     def _look(self) -> None:
         for topic, types in self.get_topic_names_and_types():
@@ -90,8 +90,8 @@ class RecorderNode(Node):
         qos = qos_yaml(depth=max((o.depth for o in offered), default=10) or 10, reliable=reliable, transient_local=kept)
 
         def keep(data: Any) -> None:
-            if self._queue.qsize() > WAITING:
-                return self._count_lost(1, f"the disk is {WAITING} messages behind")
+            if self._queue.qsize() > MAX_QUEUED_MESSAGES:
+                return self._count_lost(1, f"the disk is {MAX_QUEUED_MESSAGES} messages behind")
             self.received += 1
             self._queue.put((topic, type_name, qos, data, time.time_ns()))
 
@@ -148,12 +148,12 @@ def run(config: RecordConfig, arguments: list[str] | None = None, topics: Sequen
     """Records until SIGINT or SIGTERM; the exit code says whether everything is on disk.
 
     Args:
-        config: where to.
-        arguments: of ROS.
+        config: folder and files of the recording.
+        arguments: arguments of ROS.
         topics: regular expressions of whole topic names to record instead of the run's own topics.
 
     Raises:
-        BagError: the file exists, or the disk refused; the message says what is safe.
+        BagError: a file that exists, or the disk refused; the message says what is safe.
         InvalidInput: an expression or a file of frames that cannot be read.
     """
     wanted = pattern(topics) if topics else None
@@ -173,7 +173,7 @@ def run(config: RecordConfig, arguments: list[str] | None = None, topics: Sequen
         executor.add_node(node)
         try:
             spin(executor, stop)
-            until = time.monotonic() + DRAIN
+            until = time.monotonic() + DRAIN_S
             while time.monotonic() < until and ok():
                 executor.spin_once(timeout_sec=0.05)
         finally:

@@ -11,7 +11,7 @@ from stmpl_core.errors import InvalidInput
 from stmpl_core.layer import SoftLayer
 from stmpl_core.tool import Tool
 
-SOFTER = 0.6  # a layer that may bulge at the rim presses back this much less than columns (FEM of spheres)
+SOFTER = 0.6  # factor by which a layer that may bulge at the rim presses back less than columns (FEM of spheres)
 STATIONS = 101  # points of a path
 SMOOTHING = 2.0  # footprint radii over which the skin's normal is averaged along a path
 
@@ -21,8 +21,8 @@ class Keyframe:
     """Where a device is at one moment.
 
     Args:
-        time: since the script began [s].
-        depth: of its tip under the skin at rest [m]; negative: off the skin.
+        time: time since the script began [s].
+        depth: depth of its tip under the skin at rest [m]; negative: off the skin.
         along: place on the limb, 0 at one end of its axis, 1 at the other [-].
     """
 
@@ -36,10 +36,10 @@ class Device:
     """A capsule on a stick, pressing with its round end.
 
     Args:
-        name: of the tool.
-        radius: of the round end [m].
+        name: name of the tool.
+        radius: radius of the round end [m].
         around: angle about the limb's axis at which it comes [degrees]; 0 is the side that looks most outwards.
-        keyframes: in order of time, at least two.
+        keyframes: keyframes in order of time, at least two.
     """
 
     name: str
@@ -116,7 +116,7 @@ class SkinPath:
     """Points on the skin and averaged normals, along a limb at one angle about its axis.
 
     Args:
-        layer: the limb.
+        layer: layer of the limb.
         around: angle about the limb's axis [degrees].
         footprint: radius over which normals are averaged [m].
     """

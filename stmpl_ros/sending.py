@@ -27,18 +27,18 @@ from stmpl_ros.show import Show
 from stmpl_ros.topics import ANSWERS, NOW, STREAM, managed
 from stmpl_ros.workshop import Workshop
 
-MODELLED = PRESSING | {APART}  # statuses of which a local model says what the answer says
+MODELLED = PRESSING | {APART}  # statuses for which a local model says what the answer says
 
 
 class Sending:
-    """The skin at rest, answers, and what is made of them for those who listen.
+    """Publishers of the skin at rest and of answers, in every form that somebody listens to.
 
     Args:
         node: node that publishes.
         config: settings: frame and rates.
         skin: skin that answers are of.
         workshop: process that finds local contacts.
-        gate: is told what went wrong.
+        gate: gate that tells what went wrong.
     """
 
     def __init__(self, node: LifecycleNode, config: NodeConfig, skin: Skin, workshop: Workshop, gate: Gate) -> None:
@@ -99,7 +99,7 @@ class Sending:
             self._deformed.publish(wire.deformed_message(message, self._skin.layer.vertices))
 
     def contacts(self, instant: Instant, answer: Answer, rotations: bool) -> None:
-        """Sends what the tools exert, and, once it is found, how that changes; with rotations too, if asked."""
+        """Sends the tools' wrenches, and once found their local contacts; with rotations too, if asked."""
         for name, touch in answer.touches.items():
             self._send_wrench(name, touch.wrench, instant.stamp)
         self.models.put(instant, answer, rotations)
@@ -146,7 +146,7 @@ class Models:
         self._tell()
 
     def forget(self) -> None:
-        """Does not tell of what waits any more."""
+        """Drops models that wait."""
         self._next = None
 
     def _tell(self) -> None:

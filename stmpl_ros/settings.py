@@ -27,16 +27,16 @@ class Settings:
     """The settings as they are now.
 
     Args:
-        node: that declares them.
-        config: its values, which ROS overrides.
-        on_change: called with the new settings once a running node took some over.
+        node: node that declares them.
+        config: values, which ROS overrides.
+        on_change: callback with the new settings once a running node took some over.
 
     Attributes:
-        config: the settings.
-        locked: whether the node is configured, so that what counts then cannot be set now.
+        config: settings as they are now.
+        locked: flag of a configured node, in which what counts then cannot be set.
 
     Raises:
-        InvalidInput: ROS overrides a parameter with what its field does not allow.
+        InvalidInput: a parameter that ROS overrides with what its field does not allow.
     """
 
     def __init__(self, node: LifecycleNode, config: NodeConfig, on_change: Callable[[NodeConfig], None]) -> None:

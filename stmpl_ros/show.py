@@ -19,12 +19,12 @@ from stmpl_core.trust import Displacement
 from stmpl_ros.topics import SHOWN, managed
 
 FIELDS = ("x", "y", "z", "displacement_mm", "pressure_kpa")
-STAMP_AT = 4  # the header's stamp follows the four bytes that say how the message is encoded
-STOPS = np.array([[0.27, 0.0, 0.33], [0.13, 0.57, 0.55], [0.99, 0.91, 0.14]])  # dark: at rest, bright: moved most
+STAMP_AT = 4  # offset of the header's stamp, after the four bytes that say how the message is encoded
+STOPS = np.array([[0.27, 0.0, 0.33], [0.13, 0.57, 0.55], [0.99, 0.91, 0.14]])  # colours from rest to peak
 
 
 class Show:
-    """`skin/marker` and `skin/points`.
+    """Publisher of `skin/marker` and `skin/points`.
 
     Args:
         node: node that publishes.
@@ -79,7 +79,7 @@ class SkinMarker:
     Building the message anew costs 78 ms for 8,000 vertices, patching it 0.4 ms.
 
     Args:
-        layer: whose skin is shown.
+        layer: layer whose skin is shown.
         frame: frame_id of the body.
         scale: displacement that gets the brightest colour [m]; None: a third of the median thickness.
     """
@@ -116,7 +116,7 @@ class SkinCloud:
     The pressure is 0 where the method knows none.
 
     Args:
-        layer: whose skin is shown.
+        layer: layer whose skin is shown.
         frame: frame_id of the body.
     """
 

@@ -13,7 +13,7 @@ from rclpy.executors import Executor, ExternalShutdownException
 from rclpy.signals import SignalHandlerOptions
 from rclpy.utilities import ok, try_shutdown
 
-LOOK = 0.1  # s; how often a spinning process looks whether it is to stop
+POLL_PERIOD_S = 0.1  # time between two looks of a spinning process whether it is to stop
 
 
 @contextmanager
@@ -57,6 +57,6 @@ def spin(executor: Executor, stop: threading.Event) -> None:
     """Runs callbacks until `stop` is set or ROS shuts down."""
     try:
         while not stop.is_set() and ok():
-            executor.spin_once(timeout_sec=LOOK)
+            executor.spin_once(timeout_sec=POLL_PERIOD_S)
     except ExternalShutdownException:
         pass

@@ -7,15 +7,15 @@ from rclpy.lifecycle import LifecycleNode
 from rclpy.lifecycle.publisher import LifecyclePublisher
 from rclpy.qos import DurabilityPolicy, LivelinessPolicy, QoSProfile, ReliabilityPolicy
 
-LEASE = 1.0  # s: a node that is silent for longer on the bus is told to be gone, to listeners who ask for that
+LEASE = 1.0  # silence on the bus after which a node is told to be gone, to listeners who ask for that [s]
 
 KEPT = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)  # meshes: late listeners get them too
-NOW = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)  # the skin: late listeners get the one that is
+NOW = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)  # the skin: late listeners get it
 STREAM = QoSProfile(depth=10)
 ANSWERS = QoSProfile(
     depth=100, liveliness=LivelinessPolicy.AUTOMATIC, liveliness_lease_duration=Duration(seconds=LEASE)
 )  # a stream whose sender is told to be gone; a recorder may be held up for a second and lose nothing
-NEWEST = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)  # what came while busy is overwritten
+NEWEST = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)  # inputs: overwritten while busy
 SHOWN = QoSProfile(depth=1)  # pictures: the newest is enough
 
 

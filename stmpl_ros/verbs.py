@@ -68,8 +68,8 @@ def view(path: Annotated[Path | None, tyro.conf.Positional] = None, live: bool =
     Live from the node: stmpl view --live. Without any robot: stmpl view --tool ball
 
     Args:
-        path: a run's folder, or its .mcap file.
-        live: show what the running node answers.
+        path: folder or .mcap file of a run.
+        live: answers of the running node instead of a recording.
     """
     needed("stmpl view", "view", "viser", "shapely")
     from stmpl_ros.view.serve import run
@@ -84,7 +84,7 @@ def record(config: Annotated[RecordConfig, Flat], topics: tuple[str, ...] = ()) 
     Any topics: stmpl record --path runs/mine --topics '/left/.*' /tf /tf_static
 
     Args:
-        config: where to.
+        config: folder and files of the recording.
         topics: regular expressions of whole topic names; what a replay needs unless given.
     """
     from stmpl_ros.recorder import run
@@ -109,16 +109,16 @@ def replay(
     To a running node (max_age:=0): stmpl replay runs/latest --publish --topics /contact_mesh '/tools/.*' --speed 0.5
 
     Args:
-        path: a run's folder, or its .mcap file.
+        path: folder or .mcap file of a run.
         method: method that answers; the one that was recorded unless given, and another one may differ.
         every: step from frame to frame; 1 takes each.
         tolerance_mm: largest difference that is allowed at any vertex [mm]; unless given, 0 where this processor
             recorded the run, and 1e-4 where another did.
         namespace: namespace of the robot that is meant, /left, where several were recorded.
-        publish: publish the recorded messages on their topics instead, with the timing of the recording.
+        publish: publication of the recorded messages on their topics instead, with the timing of the recording.
         speed: speed of publishing; 1 as recorded, 0 as fast as possible.
         topics: topics to publish, regular expressions of whole names; all unless given.
-        as_json: print figures for machines.
+        as_json: figures as JSON, for machines.
     """
     from bags.replay import replay_run
     from bags.run import Run
@@ -154,15 +154,15 @@ def compare(
     Against another recording of the same contacts: stmpl compare runs/latest --with runs/before --tolerance-mm 0
 
     Args:
-        path: a run's folder, or its .mcap file.
-        reference: judge. rigid: of the recorded answers, by the same tools pressed in by finite elements; any
+        path: folder or .mcap file of a run.
+        reference: judge; rigid: of the recorded answers, by the same tools pressed in by finite elements; any
             other: of the run's method, under the recorded pressures.
         other: another bag that judges instead, at the stamps that both answer.
         tolerance_mm: allowed mean error under the contact, in the worst frame [mm]. Unless given, nothing is held to
             a tolerance but two recordings of one method: 0 where one processor made both, 1e-4 where two did.
         namespace: namespace of the robot that is meant, /left, where several were recorded; in both bags.
         frames: number of frames that the reference solves.
-        as_json: print figures for machines.
+        as_json: figures as JSON, for machines.
     """
     from bags.compare import compare_bags
     from bags.survey import survey
@@ -191,8 +191,8 @@ def info(path: BagPath, as_json: Json = False) -> int:
     Example: stmpl info runs/latest
 
     Args:
-        path: a run's folder, or its .mcap file.
-        as_json: print figures for machines.
+        path: folder or .mcap file of a run.
+        as_json: figures as JSON, for machines.
     """
     from bags.reader import Bag
     from stmpl_ros.tables import bag_figures, bag_table
@@ -218,8 +218,8 @@ def recover(path: BagPath, target: Path | None = None) -> int:
     Example: stmpl recover runs/broken/run_0.mcap --target runs/mended
 
     Args:
-        path: a run's folder, or its .mcap file.
-        target: where the sound part goes.
+        path: folder or .mcap file of a run.
+        target: folder or .mcap file of the sound part.
     """
     from bags.recover import recover as bring_back
 
@@ -240,11 +240,11 @@ def generate(
     Example: stmpl generate --preset tiny --out data/tiny
 
     Args:
-        preset: tiny (seconds), default (under an hour on two cores), paper (hours).
+        preset: size of the data: tiny (seconds), default (under an hour on two cores), paper (hours).
         out: folder of the data; data/<preset> unless given.
         workers: local processes; one a core unless given.
         scheduler: address of a Dask scheduler that does the work instead.
-        as_json: print the manifest for machines.
+        as_json: manifest as JSON, for machines.
     """
     needed("stmpl generate", "learn", "anny", "torch", "zarr", "shapely")
     from fem_tools.generate import generate as make

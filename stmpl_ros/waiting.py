@@ -13,7 +13,7 @@ from rclpy.node import Node
 
 from stmpl_core.errors import InvalidInput
 
-SOON = 10.0  # s in which the node's executor comes to what is handed to it
+HANDOVER_S = 10.0  # time in which the node's executor comes to what is handed to it
 
 
 class WaitingService:
@@ -24,10 +24,10 @@ class WaitingService:
     node it hands back with `by_executor`.
 
     Args:
-        node: whose service it is.
-        kind: its type.
-        name: without the tilde.
-        serve: as rclpy calls it, with request and response.
+        node: node that serves.
+        kind: type of the service.
+        name: name, without the tilde.
+        serve: function as rclpy calls it, with request and response.
     """
 
     def __init__(self, node: Node, kind: Any, name: str, serve: Callable[[Any, Any], Any]) -> None:
@@ -44,7 +44,7 @@ class WaitingService:
     def close(self) -> None:
         """Ends the service; end what it may wait for first."""
         self._executor.shutdown(timeout_sec=0)
-        self._thread.join(SOON)
+        self._thread.join(HANDOVER_S)
         self._hidden.destroy_node()
 
     def _spin(self) -> None:
@@ -65,4 +65,4 @@ def by_executor[T](node: Node, do: Callable[..., T], *arguments: Any) -> T:
     if node.executor is None:
         raise InvalidInput("nobody spins the node.")
     node.executor.create_task(act)
-    return done.result(SOON)
+    return done.result(HANDOVER_S)

@@ -18,7 +18,7 @@ from stmpl_core.tool import Tool
 from stmpl_core.toucher import Toucher, margin_on
 from stmpl_ros.beside import Builders, pool
 
-FITTED = 60  # presses, evenly from the lightest to the hardest: a fit takes about 25 touches of each
+MAX_FITTED_PRESSES = 60  # presses of a fit, from the lightest to the hardest; it takes about 25 touches of each
 
 Then = Callable[[Future], None]
 
@@ -51,7 +51,7 @@ class Workshop:
         self._then(self._modeller().submit(_local_contacts, list(contacts), rotations), do)
 
     def stiffness(self, presses: Sequence[Contact]) -> Future[Stiffness]:
-        """How stiff the skin is by these presses: for a thread that waits."""
+        """Fits the skin's stiffness to these presses: for a thread that waits."""
         self._fit = self._modeller().submit(_stiffness, list(presses))
         self._then(self._fit, lambda future: self.renew(future.exception()))
         return self._fit
@@ -117,5 +117,5 @@ def _local_contacts(contacts: list[Contact], rotations: bool) -> list[LocalConta
 
 def _stiffness(presses: list[Contact]) -> Stiffness:
     presses.sort(key=lambda one: 0.0 if one.wrench is None else float(np.linalg.norm(one.wrench[:3])))
-    chosen = np.unique(np.linspace(0, len(presses) - 1, FITTED).astype(int)) if presses else []
+    chosen = np.unique(np.linspace(0, len(presses) - 1, MAX_FITTED_PRESSES).astype(int)) if presses else []
     return fit_stiffness(_toucher, [presses[k] for k in chosen])

@@ -19,7 +19,7 @@ from fem_tools.sampling import tool_scene
 from fem_tools.scenes import Site
 from stmpl_core.arrays import Transform
 from stmpl_core.columns import Columns, Squeeze
-from stmpl_core.contact_net import MOST, ContactNet
+from stmpl_core.contact_net import MAX_LOG_RATIO, ContactNet
 from stmpl_core.errors import InvalidInput
 from stmpl_core.moments import Surroundings
 from stmpl_core.networks import POINT, PRESSURE, Weights
@@ -150,7 +150,7 @@ def loss(model: Model, data: Rows, contacts: np.ndarray) -> tuple[Tensor, Tensor
     owner = torch.from_numpy(np.repeat(np.arange(len(contacts)), [b - a for a, b in ends]))
     rows, prior, true, area = (torch.from_numpy(a[take]) for a in (data.rows, data.prior, data.true, data.area))
     out, doubt = model.outputs(rows)
-    held = prior * torch.exp(torch.clamp(out[:, PRESSURE.at.log_ratio], -MOST, MOST))
+    held = prior * torch.exp(torch.clamp(out[:, PRESSURE.at.log_ratio], -MAX_LOG_RATIO, MAX_LOG_RATIO))
 
     def total(values: Tensor) -> Tensor:
         return torch.zeros(len(contacts)).index_add_(0, owner, values)

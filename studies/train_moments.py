@@ -18,9 +18,10 @@ from fem_tools.sampling import Kind
 from stmpl_core.layer import SoftLayer
 from stmpl_core.load import Load
 from stmpl_core.methods.moment_net import AMPLITUDE, SURROUNDED, MomentNet, source_fields
-from stmpl_core.moments import SCALARS, TENSORS, VECTORS, WIDTH, Surroundings
+from stmpl_core.moments import Surroundings
 from stmpl_core.networks import DIRECTIONS, INPUTS, MIXED_TENSORS, MIXED_VECTORS, MOTION, POINT, Layout, Weights
 from stmpl_core.provenance import commit, machine, versions
+from stmpl_core.response import SCALARS, TENSORS, VECTORS, WIDTH
 
 VERSIONS = ("stmpl", "torch", "numpy", "numba", "safetensors")
 TYPICAL = 1e-3  # of the peak: errors below count as squares in the loss

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from stmpl_core import Tool
-from stmpl_core.columns import DEEPEST, Columns, Squeeze
+from stmpl_core.columns import MAX_COLUMN_STRAIN, Columns, Squeeze
 from stmpl_core.methods.winkler import column_pressure
 from stmpl_core.sdf import SignedDistance
 from tests.scenes import LENGTH, RADIUS, at, ball, box, capsule, enlarged, limb, placed, plate, punch, scaled, turn
@@ -52,7 +52,7 @@ def test_under_a_flat_tool_every_column_has_its_depth_and_the_law_of_columns(nu:
     squeeze = columns.squeezed(SLAB, at(0, 0, 0.002 - depth))
     inside = (np.abs(PLATE.vertices[squeeze.vertices, :2]) < 0.011).all(axis=1)
     assert inside.sum() > 40
-    strain = min(share, DEEPEST)
+    strain = min(share, MAX_COLUMN_STRAIN)
     modulus = (tissue.lame_lambda + 2 * tissue.shear_modulus) / tissue.youngs_modulus
     expected = column_pressure(np.array([1 - strain]), tissue)[0] / tissue.youngs_modulus
     np.testing.assert_allclose(squeeze.depth[inside], depth, rtol=1e-3, atol=1e-6)  # the field is off by 0.5 um
@@ -91,7 +91,7 @@ def test_a_ball_covers_the_cap_that_geometry_says(flat: Columns) -> None:
 def test_no_column_is_deeper_than_the_layer(flat: Columns) -> None:
     squeeze = flat.squeezed(BALL, at(0, 0, 0))  # 4.5 mm into the core
     assert squeeze.depth.max() == pytest.approx(PLATE.thickness[0])
-    highest = column_pressure(np.array([1 - DEEPEST]), PLATE.tissue)[0] / PLATE.tissue.youngs_modulus
+    highest = column_pressure(np.array([1 - MAX_COLUMN_STRAIN]), PLATE.tissue)[0] / PLATE.tissue.youngs_modulus
     assert 0.9 * highest < squeeze.pressure.max() <= highest * (1 + 1e-9)
 
 

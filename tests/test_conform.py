@@ -10,7 +10,7 @@ from stmpl_core.conform import conform
 from stmpl_core.methods import Linear, MomentNet, Winkler
 from stmpl_core.methods.base import Method
 from stmpl_core.moments import Surroundings
-from stmpl_core.simulator import ENTERED, Simulator
+from stmpl_core.simulator import MAX_ENTERED_SHARE, Simulator
 from stmpl_core.toucher import Toucher
 from tests.scenes import LENGTH, RADIUS, at, ball, capsule, limb, placed, press, punch, turn
 
@@ -58,14 +58,14 @@ def test_no_vertex_is_inside_a_tool_whatever_the_method(sim: Simulator, toucher:
     moved = LIMB.vertices + answer.displacement
     for contact, touch in zip(contacts, toucher.touch_all(contacts), strict=True):
         away = seen_by(toucher, contact.tool, touch.pose_body_from_tool, moved)
-        assert away.min() > -ENTERED * THICKNESS, f"{-1e3 * away.min():.2f} mm inside {contact.name}"
+        assert away.min() > -MAX_ENTERED_SHARE * THICKNESS, f"{-1e3 * away.min():.2f} mm inside {contact.name}"
         assert touch.pressed and touch.pressure is not None
         v, depth = touch.pressed.squeeze.vertices, touch.pressed.squeeze.depth
         bears = v[(depth > 0) & (touch.pressure[v] > 0.3 * touch.pressure.max())]
         assert len(bears) > 5
-        np.testing.assert_allclose(away[bears], 0, atol=ENTERED * THICKNESS)
+        np.testing.assert_allclose(away[bears], 0, atol=MAX_ENTERED_SHARE * THICKNESS)
     figures = answer.trust.figures
-    assert figures["entered_m"] <= ENTERED * THICKNESS and "inside a tool" not in answer.trust.why
+    assert figures["entered_m"] <= MAX_ENTERED_SHARE * THICKNESS and "inside a tool" not in answer.trust.why
     assert np.isfinite(answer.displacement).all() and answer.magnitude.max() < 2 * THICKNESS
 
 

@@ -8,7 +8,7 @@ import pytest
 
 from stmpl_core import SoftLayer
 from stmpl_core.columns import Columns, Squeeze
-from stmpl_core.contact_net import MOST, ContactNet, Held
+from stmpl_core.contact_net import MAX_LOG_RATIO, ContactNet, Held
 from stmpl_core.errors import InvalidInput
 from stmpl_core.networks import INPUTS, NETWORKS, PRESSURE, Weights, shipped
 from stmpl_core.sdf import SignedDistance
@@ -45,7 +45,7 @@ def test_pressure_is_above_zero_and_within_a_factor_of_that_of_columns(weights: 
     squeeze, answer = held(LIMB, weights)
     assert len(squeeze.vertices) > 20
     ratio = answer.pressure / squeeze.pressure
-    assert (np.abs(np.log(ratio)) <= MOST + 1e-6).all()
+    assert (np.abs(np.log(ratio)) <= MAX_LOG_RATIO + 1e-6).all()
     assert (answer.doubt > 0).all() and np.isfinite(answer.doubt).all()
 
 

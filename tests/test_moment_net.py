@@ -16,8 +16,9 @@ from stmpl_core.errors import InvalidInput, NotPrepared
 from stmpl_core.methods import Linear, MomentNet
 from stmpl_core.methods.moment_net import invariants, source_fields
 from stmpl_core.metrics import score
-from stmpl_core.moments import REACH, Surroundings
+from stmpl_core.moments import Surroundings
 from stmpl_core.networks import INPUTS, POINT
+from stmpl_core.response import REACH
 from studies.train_moments import Model, MomentTraining, draw_points, fit, train_moments
 from tests import scenes
 from tests.scenes import turn

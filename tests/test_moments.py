@@ -13,7 +13,8 @@ from stmpl_core import Load, Skin, SoftLayer
 from stmpl_core.errors import InvalidInput, NotPrepared
 from stmpl_core.methods import Linear, MomentNet
 from stmpl_core.metrics import score
-from stmpl_core.moments import FINER, NEAR, REACH, SPREADS, STEPS, Surroundings, response_table, ring_table
+from stmpl_core.moments import Surroundings
+from stmpl_core.response import FINER, NEAR, REACH, SPREADS, STEPS, response_table, ring_table
 from tests import scenes
 from tests.scenes import limb, plate, turn
 

@@ -5,7 +5,8 @@ import pytest
 
 from stmpl_core import Load, SoftLayer
 from stmpl_core.methods import Linear, MomentNet
-from stmpl_core.moments import REACH, Surroundings
+from stmpl_core.moments import Surroundings
+from stmpl_core.response import REACH
 from stmpl_core.thinning import SPACINGS, ZONES, Asked, Thinning
 from tests import scenes
 

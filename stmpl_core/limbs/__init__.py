@@ -11,7 +11,7 @@ import numpy as np
 from stmpl_core.arrays import Faces, Points
 
 FOLDER = Path(__file__).parent
-EDGE_LENGTH = 3e-3  # m, of the meshes of the parts
+EDGE_LENGTH = 3e-3  # length of the edges of the parts' meshes [m]
 BODY = "body"
 
 Mesh = tuple[Points, Faces, np.ndarray]  # vertices (V, 3) [m], faces (F, 3), uv of each corner (F, 3, 2)

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 __all__ = ["METHODS", "Coarse", "Ladder", "Linear", "Method", "MomentNet", "Naive", "UNet", "Winkler", "Zero", "method"]
 
-METHODS = {  # name: where what makes it is
+METHODS = {  # module and class of each method, by its name
     "moment_net": "stmpl_core.methods.moment_net:MomentNet",
     "unet": "stmpl_core.methods.unet:UNet",
     "linear": "stmpl_core.methods.linear:Linear",
@@ -38,11 +38,11 @@ def method(name: str, **settings: Any) -> Method:
     """A method by its name, not yet prepared.
 
     Args:
-        name: name in METHODS, or "module:attribute" of what makes a method of your own.
-        settings: arguments of what makes it.
+        name: name in METHODS, or "module:attribute" of a method of your own.
+        settings: arguments of its class.
 
     Raises:
-        InvalidInput: no such method; the error lists those that exist.
+        InvalidInput: an unknown method; the error lists those that exist.
     """
     module, _, attribute = METHODS.get(name, name).partition(":")
     try:

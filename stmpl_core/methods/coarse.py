@@ -15,7 +15,7 @@ from stmpl_core.load import Load
 from stmpl_core.methods.base import Method, prepared
 from stmpl_core.trust import Displacement
 
-LEAST = 1.2  # times the layer's own mesh width
+MIN_COARSENING = 1.2  # coarsening that saves more than it costs [-]
 
 
 class Coarse:
@@ -29,12 +29,12 @@ class Coarse:
         coarsening: edge length of the coarser mesh over that of the layer's own.
 
     Raises:
-        InvalidInput: less than LEAST.
+        InvalidInput: a coarsening below MIN_COARSENING.
     """
 
     def __init__(self, method: Method, coarsening: float) -> None:
-        if not coarsening >= LEAST:
-            raise InvalidInput(f"coarsening is {coarsening}; from {LEAST} on it saves more than it costs.")
+        if not coarsening >= MIN_COARSENING:
+            raise InvalidInput(f"coarsening is {coarsening}; from {MIN_COARSENING} on it saves more than it costs.")
         self.method, self.coarsening = method, coarsening
         self.name = f"{method.name}, {coarsening:g} x coarser"
         self._layer: SoftLayer | None = None
@@ -62,7 +62,7 @@ class Coarse:
         """The displacement under `load`.
 
         Raises:
-            NotPrepared: before `prepare`.
+            NotPrepared: a call before `prepare`.
             InvalidInput: the load does not fit the layer.
         """
         layer = prepared(self._layer, self)

@@ -20,15 +20,15 @@ from stmpl_core.methods.winkler import column_stretch
 from stmpl_core.trust import Displacement, Trust
 
 SHIPPED = Path(__file__).parent.parent / "weights" / "ladder.json"
-REACH = 6.0  # thicknesses around a load within which the skin moves
+MOVING_RADIUS = 6.0  # distance around a load within which the skin moves, over t
 LINEAR = 0.01  # strain below which the response is linear, and the error a share of it that no longer changes
-PACE = 0.2  # weight of the newest solve in what is known of how busy the machine is
-SLACK = 1.1  # beyond the measured range of a figure of the scene that is not yet called outside
+PACE = 0.2  # weight of the newest solve in the mean slowness of the machine
+RANGE_FACTOR = 1.1  # factor beyond the measured range of a scene's figure that is not yet called outside
 
 
 @dataclass(frozen=True)
 class SceneFigures:
-    """What decides how far off and how slow a method will be.
+    """Figures of a scene that decide error and time of a method.
 
     Args:
         strain: strain of a confined column under the highest pressure [-].
@@ -38,8 +38,8 @@ class SceneFigures:
         outline: total variation of the pressure over the force, times that thickness; 2 t / R for a disc [-].
         jump: largest difference of pressure across an edge of the mesh, over the highest pressure [-].
         ratio: highest p / E [-].
-        pressed: vertices that carry load.
-        moved: vertices within REACH thicknesses of the load, were it a disc on a plane.
+        pressed: number of vertices that carry load.
+        moved: number of vertices within MOVING_RADIUS thicknesses of the load, were it a disc on a plane.
     """
 
     strain: float
@@ -66,8 +66,8 @@ class SceneFigures:
         return np.array([1.0, self.moved, self.moved * self.ratio, self.pressed * self.moved])
 
 
-RANGED = ("strain", "nu", "width", "slope", "outline", "jump")  # whose measured range counts
-EASY = ("strain", "slope", "jump")  # of these, whose small values are no extrapolation
+RANGED = ("strain", "nu", "width", "slope", "outline", "jump")  # figures whose measured range counts
+EASY = ("strain", "slope", "jump")  # figures among these whose small values are no extrapolation
 
 
 class SceneReader:
@@ -88,7 +88,7 @@ class SceneReader:
         return self.layer.edge_length / scene.width * scene.strain
 
     def figures(self, load: Load) -> SceneFigures | None:
-        """Of a load that fits the layer; None if nothing presses."""
+        """Figures of a load that fits the layer; None if nothing presses."""
         layer, loaded = self.layer, load.loaded
         if not len(loaded):
             return None
@@ -97,7 +97,7 @@ class SceneReader:
         force, highest = float(area @ here), float(here.max())
         t = float((area * here) @ layer.thickness[loaded]) / force
         strain = float(1 - column_stretch(np.array([highest]), layer.tissue)[0])
-        patch = np.pi * ((float(area.sum()) / np.pi) ** 0.5 + REACH * t) ** 2
+        patch = np.pi * ((float(area.sum()) / np.pi) ** 0.5 + MOVING_RADIUS * t) ** 2
         variation, jump, slope = _steps(loaded, pressure, layer.thickness, self._first, self._to, self._length,
                                         self._across)  # fmt: skip
         return SceneFigures(
@@ -123,7 +123,7 @@ def _steps(loaded, pressure, thickness, first, to, length, across):
 
 @dataclass(frozen=True)
 class Known:
-    """What was measured of one method.
+    """Measured error and time of one method.
 
     Args:
         error: coefficients of SceneFigures.for_error for log(error / (thickness strain)), by kind of load.
@@ -142,7 +142,7 @@ class Known:
     after_factor: Mapping[str, float] = field(default_factory=dict)
 
     def bound(self, scene: SceneFigures, kind: str, unit: float, stated: float | None = None) -> float:
-        """What 95 % of answers are within [m]; `stated`: the method's own bound, once it has answered [m]."""
+        """Bound on the error of 95 % of answers [m]; `stated`: the method's own bound, once it has answered [m]."""
         terms = scene.for_error()
         if kind in self.after and stated is not None and stated > 0:
             terms = np.append(terms, np.log(stated / unit))
@@ -152,12 +152,12 @@ class Known:
 
 @dataclass(frozen=True)
 class Measured:
-    """The measured chart that a Ladder chooses by.
+    """Measured errors and times of all methods, by which a Ladder chooses.
 
     Args:
         methods: figures by the name of the method, in the order in which they were measured.
         ranges: lowest and highest of each figure in RANGED, by kind of load.
-        about: machine, commit, how it was made.
+        about: machine, commit, and the way in which it was made.
     """
 
     methods: Mapping[str, Known]
@@ -166,7 +166,7 @@ class Measured:
 
     @classmethod
     def load(cls, path: str | Path) -> Self:
-        """Reads what `save` wrote. Raises InvalidInput if there is no such file or it holds something else."""
+        """Reads a file that `save` wrote. Raises InvalidInput if there is no such file or it holds something else."""
         try:
             found = json.loads(Path(path).read_text())
             return cls({name: Known(**known) for name, known in found["methods"].items()},
@@ -180,11 +180,12 @@ class Measured:
         Path(path).write_text(json.dumps(asdict(self), indent=1) + "\n")
 
     def outside(self, scene: SceneFigures, kind: str) -> str:
-        """How a scene lies outside of what was measured, in words; empty if it does not."""
+        """Sentence on how a scene lies outside the measured range; empty if it does not."""
         return "; ".join(
             f"{name} is {value:.3g}, measured is {low:.3g} to {high:.3g}"
             for name, (low, high) in self.ranges.get(kind, {}).items()
-            if not (0 if name in EASY else low / SLACK) <= (value := getattr(scene, name)) <= max(high * SLACK, 1e-9)
+            if not (0 if name in EASY else low / RANGE_FACTOR)
+            <= (value := getattr(scene, name)) <= max(high * RANGE_FACTOR, 1e-9)
         )
 
     def timed_by(self, other: Measured) -> Measured:
@@ -200,12 +201,12 @@ class Measured:
 @dataclass(frozen=True)
 class _Expected:
     rung: int
-    error: float  # m, 95 %
-    seconds: float  # 95 %
+    error: float  # 95 % quantile of the error [m]
+    seconds: float  # 95 % quantile of the time [s]
 
 
 class Ladder:
-    """A method that hands each load to the cheapest of several that is expected to meet the wish.
+    """Hands each load to the cheapest of several methods that is expected to meet the accuracy in time.
 
     What is expected comes from a measured chart: error and time of each method as functions of the scene (how hard, how
     wide, how thick, how fine a mesh), and from how busy the machine just was. Where an answer says that it is not to be
@@ -215,9 +216,9 @@ class Ladder:
 
     Args:
         rungs: methods, not yet prepared; those that the chart does not know are left out.
-        measured: chart to choose by.
+        measured: chart of their times and errors.
         accuracy: largest error wanted at any vertex [m].
-        deadline: time for each solve [s]; None: there is time.
+        deadline: time for each solve [s]; None: as long as it needs.
 
     Raises:
         InvalidInput: an accuracy or deadline that is not positive, or no rung that the chart knows.
@@ -263,7 +264,7 @@ class Ladder:
         """The displacement under `load` by the method that was chosen; `method` names it, `trust.why` says why.
 
         Raises:
-            NotPrepared: before `prepare`.
+            NotPrepared: a call before `prepare`.
             InvalidInput: the load does not fit the layer.
         """
         layer, started = prepared(self._layer, self), time.perf_counter()

@@ -10,12 +10,12 @@ from stmpl_core.methods.base import prepared
 from stmpl_core.moments import Surroundings
 from stmpl_core.trust import Displacement, Trust
 
-MAX_RATIO = 0.1  # p / E up to which it is validated; its peak is then within 4 % (docs/networks.md)
-NU = (0.3, 0.49)  # Poisson's ratios that it is validated on
+MAX_RATIO = 0.1  # p / E up to which the method is validated; its peak is then within 4 % (docs/networks.md)
+NU = (0.3, 0.49)  # Poisson's ratios that the method is validated on
 
 
 class Linear:
-    """Green's function of a flat bonded layer (stmpl_core.moments.response_table), cut off at REACH thicknesses.
+    """Green's function of a flat bonded layer (stmpl_core.response.response_table), cut off at REACH thicknesses.
 
     It is laid into each vertex's tangent plane with the local thickness, so that it needs no solve: only the loaded
     vertices and those near them are touched. The skin's curvature is left out, and so is all that is not linear.
@@ -37,7 +37,7 @@ class Linear:
         """The displacement under `load`; nodal forces act as the equivalent pressure.
 
         Raises:
-            NotPrepared: before `prepare`.
+            NotPrepared: a call before `prepare`.
             InvalidInput: the load does not fit the layer.
         """
         layer = prepared(self._layer, self)

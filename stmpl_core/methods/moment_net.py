@@ -14,22 +14,23 @@ from stmpl_core.layer import SoftLayer
 from stmpl_core.load import Load
 from stmpl_core.methods.base import Method, prepared
 from stmpl_core.methods.winkler import column_stretch
-from stmpl_core.moments import FAST, SCALARS, TENSORS, VECTORS, Surroundings
+from stmpl_core.moments import Surroundings
 from stmpl_core.networks import DIRECTIONS, INPUTS, MIXED_TENSORS, MIXED_VECTORS, MOTION, Weights, shipped
+from stmpl_core.response import FAST, SCALARS, TENSORS, VECTORS
 from stmpl_core.thinning import Asked
 from stmpl_core.trust import Displacement, Trust
 
 IN, OUT = INPUTS.at, MOTION.at  # first columns, constants to numba
-AMPLITUDE = 0.3  # of a thickness: what the network may add to the linear response where much presses
-SURROUNDED = 1e-7  # of moments, below which nothing is added
-EDGE_OVER_ROOT_AREA = 1.075  # of a vertex whose six triangles are equilateral: sqrt(2 / sqrt(3))
-EVEN = 1.2  # a tenth of the vertices of an even mesh is so much narrower, and a tenth so much wider, than the median
-OUTSIDE_SHARE = 0.3  # of the vertices that move, which may have inputs outside the training data (docs/networks.md)
+AMPLITUDE = 0.3  # largest addition of the network to the linear response, over t
+SURROUNDED = 1e-7  # size of the moments below which nothing is added
+EDGE_OVER_ROOT_AREA = 1.075  # ratio at a vertex of six equilateral triangles: sqrt(2 / sqrt(3))
+EVEN = 1.2  # widths of vertices over the median, at the tenth and the ninetieth percentile of an even mesh
+OUTSIDE_SHARE = 0.3  # share of the moving vertices whose inputs may be unlike the training data (docs/networks.md)
 
 STEEP = 0.25  # slope of the thickness from triangle to triangle; trained is up to 0.2
-STEEP_SHARE = 0.02  # of the vertices that move, which may be so steep
+STEEP_SHARE = 0.02  # share of the moving vertices that may be so steep
 
-BLOCK = 32  # vertices a matrix product; OpenBLAS takes one thread for up to 2^18 multiplications
+BLOCK = 32  # vertices in one matrix product; OpenBLAS takes one thread for up to 2^18 multiplications
 
 
 class MomentNet:
@@ -39,11 +40,11 @@ class MomentNet:
     serves every stiffness exactly, and any thickness, pose and limb. The inputs are invariants of moments up to second
     order (as atomic descriptors are: Bartok et al., Phys. Rev. B 87, 184115, 2013), the outputs multiply the normal
     and the moments' own directions: turning the scene turns the answer. There is no chart, and so no seam. Where
-    nothing presses within stmpl_core.moments.NEAR thicknesses nothing is added to the linear response, which ends at
+    nothing presses within stmpl_core.response.NEAR thicknesses nothing is added to the linear response, which ends at
     REACH: no load gives exactly no motion.
 
     Args:
-        weights: .safetensors file made by `stmpl train`; None: those that come with the package.
+        weights: path of a .safetensors file made by `stmpl train`; None: those that come with the package.
         contact: weights for what rigid tools press with (Load.contact), given likewise.
         fallback: method that answers loads outside the range that the network was trained on; None: the network's
             answer is given, and flagged.
@@ -51,7 +52,7 @@ class MomentNet:
             milliseconds where they are not.
 
     Raises:
-        InvalidInput: no such weights, or threads below 1.
+        InvalidInput: weights that are missing, or threads below 1.
     """
 
     name = "moment_net"
@@ -88,7 +89,7 @@ class MomentNet:
         """The displacement under `load`.
 
         Raises:
-            NotPrepared: before `prepare`.
+            NotPrepared: a call before `prepare`.
             InvalidInput: the load does not fit the layer.
         """
         layer = prepared(self._layer, self)

@@ -44,10 +44,10 @@ class Naive:
         alpha_c = sum t F_c delta_c / sum (t F_c)^2: the minimum that the paper's Adam (2e-2, batch 128) walks to.
 
         Args:
-            samples: layer, load and true displacement (V, 3) [m] of each.
+            samples: triples of layer, load and true displacement (V, 3) [m].
 
         Raises:
-            InvalidInput: no samples, an axis along which nothing presses, or shapes that do not fit.
+            InvalidInput: an empty list of samples, an axis along which nothing presses, or shapes that do not fit.
         """
         product, square, ratio = np.zeros(3), np.zeros(3), 0.0
         for layer, load, truth in samples:

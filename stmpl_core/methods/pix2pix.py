@@ -11,8 +11,8 @@ from torch.nn import functional
 
 from stmpl_core.errors import InvalidInput
 
-WIDEST = 8  # times the width of the first level
-SPREAD = 0.02  # of the weights at first
+WIDEST = 8  # largest width over that of the first level
+SPREAD = 0.02  # standard deviation of the weights at first
 DROPS_FROM = 5  # levels above this one, but for the deepest, drop half of their channels' values in training
 
 

@@ -21,23 +21,23 @@ from stmpl_core.trust import Displacement, Trust
 if TYPE_CHECKING:
     from stmpl_core.methods.pix2pix import Pix2PixUNet
 
-THICKNESS = (2.5e-3, 12.5e-3)  # m, drawn as 0 to 1 (STMPL paper)
-MOTION = 30e-3  # m, drawn as 1 (STMPL paper)
-MODULUS = 1e3  # Pa, of the tissue that the forces are meant for (STMPL paper)
-SLACK = 0.02  # by which a scene may lie outside what was seen: samples fall short of what they were drawn from
+THICKNESS = (2.5e-3, 12.5e-3)  # thicknesses that are drawn as 0 and 1 [m] (STMPL paper)
+MOTION = 30e-3  # displacement that is drawn as 1 [m] (STMPL paper)
+MODULUS = 1e3  # Young's modulus that the forces are meant for [Pa] (STMPL paper)
+RANGE_MARGIN = 0.02  # share by which a scene may exceed what was seen: samples fall short of their distribution
 
 Range = tuple[float, float]
 
 
 class Seen(BaseModel):
-    """What a network was trained on: ranges over its samples.
+    """Range of a network's training data.
 
     Args:
         kind: kind of load, as the data set calls it.
         peak_ratio: largest p / E [-].
-        thickness: [m].
-        poisson_ratio: [-].
-        edge_length: median, of the skins [m]; a force per vertex means less pressure where vertices are fewer.
+        thickness: thickness of the layers [m].
+        poisson_ratio: Poisson's ratios of the tissues [-].
+        edge_length: median edge length of the skins [m]; with fewer vertices, a force on each is less pressure.
         uv: place of the part on the body's chart, (u0, v0, u1, v1).
     """
 
@@ -52,12 +52,12 @@ class Seen(BaseModel):
 
 
 class UNetCard(BaseModel):
-    """The JSON beside a network's weights: what it needs to run, what it has seen, how far it erred, what made it.
+    """Record beside a network's weights: its settings, the range of its training data, its errors, its origin.
 
     Args:
         size, width: numbers of Pix2PixUNet.
         highest_force: force at a vertex that is drawn as 1, of skin with E = 1 kPa [N].
-        seen: ranges of the training data.
+        seen: range of the training data.
         error_ratio: largest error at any vertex over (p / E) t, at the 95 % quantile of held-out contacts [-].
         about: data, settings, versions, machine and figures, for people.
     """
@@ -82,11 +82,11 @@ class UNet:
     body's chart, most of which one limb leaves empty.
 
     Args:
-        path: .safetensors file with its .json card beside it; None: the weights that come with stmpl.
+        path: path of a .safetensors file with its .json card beside it; None: the weights that come with stmpl.
         device: device of torch, "cpu" or "cuda".
 
     Raises:
-        InvalidInput: no weights there, or a card that does not fit them.
+        InvalidInput: a path without weights, or a card that does not fit them.
     """
 
     name = "unet"
@@ -129,7 +129,7 @@ class UNet:
         trust = Trust(figures={"peak_ratio": ratio})
         for why in self._scene:
             trust = trust.also(why, in_range=False)
-        if ratio > (1 + SLACK) * seen.peak_ratio:
+        if ratio > (1 + RANGE_MARGIN) * seen.peak_ratio:
             trust = trust.also(f"p/E is {ratio:.2g}, the network has seen up to {seen.peak_ratio:.2g}", in_range=False)
         if (load.values < 0).any():
             trust = trust.also("the load pulls, the network knows no sign of a force", in_range=False)
@@ -206,9 +206,9 @@ def _outside(seen: Seen, layer: SoftLayer) -> list[str]:
     reasons = []
     for text, values, (low, high), unit in checks:
         least, most = _range(values)
-        if least < (1 - SLACK) * low or most > (1 + SLACK) * high:
+        if least < (1 - RANGE_MARGIN) * low or most > (1 + RANGE_MARGIN) * high:
             here = f"{unit * least:.3g}" if least == most else f"{unit * least:.3g}..{unit * most:.3g}"
             reasons.append(f"{text % here}, the network has seen {unit * low:.3g}..{unit * high:.3g}")
-    if np.abs(uv - seen.uv).max() > SLACK * np.ptp(np.reshape(seen.uv, (2, 2)), axis=0).max():
+    if np.abs(uv - seen.uv).max() > RANGE_MARGIN * np.ptp(np.reshape(seen.uv, (2, 2)), axis=0).max():
         reasons.append("the skin lies elsewhere on the body's chart: another part than the network has seen")
     return reasons

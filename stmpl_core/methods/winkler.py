@@ -44,7 +44,7 @@ class Winkler:
         """The displacement under `load`; nodal forces act as the equivalent pressure.
 
         Raises:
-            NotPrepared: before `prepare`.
+            NotPrepared: a call before `prepare`.
             InvalidInput: the load does not fit the layer.
         """
         layer = prepared(self._layer, self)
@@ -105,7 +105,7 @@ def _stretch(pressure, mu, lam):
 
 
 def least_width(poisson_ratio: float) -> float:
-    """How many thicknesses wide a load must be for columns to be within MAX_SPREAD of a linear layer's depth [-].
+    """Width of a load, over t, from which columns are within MAX_SPREAD of a linear layer's depth [-].
 
     A bonded layer of thickness t under p cos(k x) sinks by p t / M (1 + kappa (k t)^2 + ...), with
     kappa = (3 - 4 nu) / (3 (1 - 2 nu)) - 1 / (1 - nu): the expansion of the plane-strain solution (Johnson, "Contact

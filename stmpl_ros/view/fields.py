@@ -14,23 +14,23 @@ from stmpl_core.arrays import PerVertex
 from stmpl_ros.view.snapshot import Snapshot
 
 STOPS = 256  # colours of a scale
-MOVED = 0.02  # of the peak: what moves less is drawn as at rest in the picture of trust
+MOVED = 0.02  # displacement over the peak, below which trust is drawn as at rest
 STATES = ("at rest", "inside the validated range", "outside it", "not converged")
 TRUSTED = ListedColormap(["#f2e4da", "#5aa469", "#e9a03b", "#b3261e"])
 
 
 @dataclass(frozen=True, eq=False)
 class Field:
-    """One way to colour the skin.
+    """A quantity by which the skin can be coloured.
 
     Args:
-        name: on the page.
-        unit: of the numbers on the colour bar.
-        factor: from SI to that unit.
-        least: the scale never ends below this, in that unit.
-        colours: from 0 to the end of the scale.
-        values: of each vertex, (V,) in SI units, or None if the snapshot has none.
-        absent: what to tell a person then.
+        name: name on the page.
+        unit: unit of the numbers on the colour bar.
+        factor: factor from SI to that unit.
+        least: smallest end of the scale, in that unit.
+        colours: colours from 0 to the end of the scale.
+        values: function of a snapshot that gives each vertex's value, (V,) in SI units, or None if it has none.
+        absent: sentence for a person then.
         states: names of the colours, where they stand for states and not for numbers.
     """
 

@@ -24,11 +24,11 @@ from stmpl_ros.view.page import Page, wxyz_of
 from stmpl_ros.view.snapshot import Snapshot, readings_of
 from stmpl_ros.view.tools import TOOLS, place_on, tool_from_bytes, tool_named
 
-KEPT = 2000  # answers that the plots go back
-GIZMO = 0.03  # m
-GRIP = 5e-3  # m beyond the end of the tool: there the hand does not cover the contact
+KEPT = 2000  # number of answers that the plots go back
+GIZMO = 0.03  # size of the handle [m]
+GRIP = 5e-3  # place of the handle beyond the tool's end [m]: there the hand does not cover the contact
 OFF = "off"
-NUDGES = {"-1": -1e-3, "-0.1": -1e-4, "+0.1": 1e-4, "+1": 1e-3}  # mm on the button, m into the skin
+NUDGES = {"-1": -1e-3, "-0.1": -1e-4, "+0.1": 1e-4, "+1": 1e-3}  # steps into the skin [m] by the button's text [mm]
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,13 +44,13 @@ class HandsOn:
     """A tool on a page, a simulator behind it.
 
     Args:
-        page: that shows it.
-        layer: that is pressed.
-        method: that answers.
+        page: page that shows it.
+        layer: layer that is pressed.
+        method: method that answers.
         tool: name of a tool, a letter, or a mesh file.
 
     Raises:
-        InvalidInput: there is no such tool.
+        InvalidInput: a tool that does not exist.
     """
 
     def __init__(self, page: Page, layer: SoftLayer, method: Method, tool: str) -> None:

@@ -17,8 +17,8 @@ class Judge:
     """The button `FEM of this instant`, and what it does.
 
     Args:
-        page: that gets the button, and shows the instant with its error when it is solved.
-        keep: called with the judged snapshot, so that whoever made it can show it again.
+        page: page that gets the button, and shows the instant with its error when it is solved.
+        keep: callback with the judged snapshot, so that whoever made it can show it again.
     """
 
     def __init__(self, page: Page, keep: Callable[[Snapshot, Snapshot], None]) -> None:

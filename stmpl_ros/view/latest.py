@@ -15,9 +15,9 @@ class LatestWins[T]:
     """One thread, at most one item waiting.
 
     Args:
-        work: called with each item, in this thread only.
-        refuse: told what `work` raised, and the thread goes on; what is no StmplError is logged too.
-        name: of the thread.
+        work: function that is called with each item, in this thread only.
+        refuse: function that gets what `work` raised; the thread goes on, and what is no StmplError is logged too.
+        name: name of the thread.
     """
 
     def __init__(self, work: Callable[[T], None], refuse: Callable[[str], None], name: str) -> None:

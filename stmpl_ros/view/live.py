@@ -20,9 +20,9 @@ from stmpl_ros.view.latest import LatestWins
 from stmpl_ros.view.page import Page
 from stmpl_ros.view.snapshot import Snapshot, readings_of
 
-REMEMBERED = 256  # poses and wrenches of a tool that an answer may still name
-TRACK = 3000  # answers that the plots go back
-SHOWN_EVERY = 0.05  # s between two answers that are read; a node may send hundreds a second
+REMEMBERED = 256  # number of poses and wrenches of a tool that an answer may still name
+TRACK = 3000  # number of answers that the plots go back
+SHOWN_EVERY = 0.05  # time between two answers that are read [s]; a node may send hundreds a second
 NANO = 1e-9  # seconds in a nanosecond
 
 
@@ -30,8 +30,8 @@ class LiveNode(Node):
     """Shows on a page what a node answers; poses, wrenches and meshes are heard as the node hears them.
 
     Args:
-        page: that shows it.
-        patience: say so if nothing comes for longer [s].
+        page: page that shows it.
+        patience: silence after which the page says so [s].
     """
 
     def __init__(self, page: Page, patience: float) -> None:

@@ -22,8 +22,8 @@ from stmpl_ros.view.snapshot import MM, Snapshot
 from stmpl_ros.view.tools import place_on
 
 STEEL = (107, 118, 131)
-PLOT_EVERY = 0.2  # s
-SEEN = 0.25  # m between the camera and the skin at first
+PLOT_EVERY = 0.2  # time between two updates of the plots [s]
+CAMERA_DISTANCE_M = 0.25  # distance of the camera from the skin at first
 WIDTH, PLOT = 330, 150  # pixels: width of the panels, height of a plot
 WARNING = "color:#b3261e;font-weight:600"
 SCALES = {"x": uplot.Scale(time=False, auto=True), "y": uplot.Scale(auto=True)}
@@ -35,8 +35,8 @@ class Page:
     """A served page. Every method may be called from any thread; drawing is done in a thread of the page's own.
 
     Args:
-        host, port: to serve on; the next free port is taken.
-        title: what is shown, in a few words.
+        host, port: address and port to serve on; the next free port is taken.
+        title: title of the page, a few words.
     """
 
     def __init__(self, host: str, port: int, title: str) -> None:
@@ -89,13 +89,13 @@ class Page:
 
     @property
     def url(self) -> str:
-        """Where the page is."""
+        """Address of the page."""
         host = self.server.get_host()
         return f"http://{'localhost' if host in ('127.0.0.1', '0.0.0.0') else host}:{self.server.get_port()}"
 
     @property
     def field(self) -> str:
-        """What the skin is coloured by: a name in FIELDS."""
+        """Name in FIELDS by which the skin is coloured."""
         return self._field.value
 
     @field.setter
@@ -105,7 +105,7 @@ class Page:
 
     @property
     def message(self) -> str:
-        """What stands above everything else; empty if nothing does."""
+        """Message above everything else; empty if there is none."""
         return self._message.content
 
     def show_layer(self, layer: SoftLayer) -> None:
@@ -123,8 +123,8 @@ class Page:
         aside = np.cross(up, normal)
         camera = self.server.initial_camera
         camera.fov, camera.near, camera.up = 0.7, 5e-3, up
-        camera.look_at = point + 0.1 * SEEN * normal
-        camera.position = point + SEEN * (0.55 * normal + 0.75 * aside + 0.4 * up)
+        camera.look_at = point + 0.1 * CAMERA_DISTANCE_M * normal
+        camera.position = point + CAMERA_DISTANCE_M * (0.55 * normal + 0.75 * aside + 0.4 * up)
 
     def show(self, snapshot: Snapshot) -> None:
         """Shows a snapshot, unless a newer one comes before there is time to."""

@@ -22,7 +22,7 @@ from stmpl_ros.view.judge import Judge
 from stmpl_ros.view.page import Page
 from stmpl_ros.view.snapshot import Gauge, Snapshot, readings_of
 
-TICK = 0.05  # s between two steps of the play button
+TICK = 0.05  # time between two steps of the play button [s]
 SPEEDS = {"1/8": 0.125, "1/4": 0.25, "1/2": 0.5, "1": 1.0, "2": 2.0, "4": 4.0}
 
 
@@ -39,12 +39,12 @@ class Recording:
         """Reads `frames` instants evenly over a bag, and those that a comparison of it solved.
 
         Args:
-            run: the recording: its folder, its .mcap file, or what a survey of it gave.
-            frames: how many.
+            run: recording: its folder, its .mcap file, or what a survey of it gave.
+            frames: number of frames to show.
             compared: comparison of this recording.
 
         Raises:
-            BagError: no recording, no answers in it, or no skin.
+            BagError: a file that is no recording, or has no answers or no skin.
         """
         run = run if isinstance(run, Survey) else survey(run)
         judged = {} if compared is None else {pair.number: pair.reference for pair in compared.judged}
@@ -63,12 +63,12 @@ class Recording:
 
     @property
     def layer(self) -> SoftLayer:
-        """Of the first instant."""
+        """Layer of the first instant."""
         return self.layers[0]
 
     @property
     def seconds(self) -> float:
-        """How long it lasts [s]."""
+        """Duration [s]."""
         return self.snapshots[-1].time
 
     def nearest(self, time: float) -> int:
@@ -80,8 +80,8 @@ class RecordingPlayer:
     """A recording on a page: time slider, play button, speed.
 
     Args:
-        page: that shows it.
-        recording: what it shows.
+        page: page that shows it.
+        recording: recording that it shows.
     """
 
     def __init__(self, page: Page, recording: Recording) -> None:

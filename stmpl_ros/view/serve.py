@@ -19,7 +19,7 @@ def run(config: ViewConfig, path: Path | None, live: bool, arguments: list[str] 
     """Serves until SIGINT or SIGTERM.
 
     Raises:
-        InvalidInput: a recording and the live node at once, or no such tool.
+        InvalidInput: a recording and the live node at once, or a tool that does not exist.
         BagError: the recording cannot be shown.
     """
     if path is not None and live:

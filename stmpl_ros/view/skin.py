@@ -14,7 +14,7 @@ from trimesh.visual.material import PBRMaterial
 from stmpl_core.arrays import Points
 from stmpl_core.layer import SoftLayer
 
-SETTLE = 0.04  # s that a browser gets to read a mesh before it is shown
+SETTLE = 0.04  # time that a browser gets to read a mesh before it is shown [s]
 MATTE = PBRMaterial(metallicFactor=0.0, roughnessFactor=0.9, doubleSided=True)
 
 
@@ -24,8 +24,8 @@ class Skin:
     viser colours the vertices of a glTF mesh only, and shows nothing while it reads one.
 
     Args:
-        server: whose scene holds the skin.
-        layer: whose skin it is.
+        server: server whose scene holds the skin.
+        layer: layer whose skin it is.
     """
 
     def __init__(self, server: viser.ViserServer, layer: SoftLayer) -> None:

@@ -20,7 +20,7 @@ NAN = float("nan")
 
 @dataclass(frozen=True)
 class Reading:
-    """What one tool does: depth of its deepest point [m] (below 0 off the skin, NaN if far) and its force [N]."""
+    """Status, depth of the deepest point [m] (below 0: off the skin; NaN: far) and force [N] of one tool."""
 
     status: str
     depth: float = NAN
@@ -29,16 +29,16 @@ class Reading:
 
 @dataclass(frozen=True, eq=False)
 class Snapshot:
-    """One instant.
+    """One instant, as the page shows it.
 
     Args:
-        time: since the run began [s].
-        answer: the skin's displacement, its pressure and what may be believed of it.
-        contacts: the tools as they stood.
-        readings: of each tool, by its name.
-        solve_seconds: that the answer took [s].
-        latency: from the contact to the answer [s]; NaN where it is not known.
-        reference: the same tools pressed by finite elements, or None.
+        time: time since the run began [s].
+        answer: displacement and pressure of the skin, with the trust in them.
+        contacts: tools as they stood.
+        readings: reading of each tool, by its name.
+        solve_seconds: time that the answer took [s].
+        latency: time from the contact to the answer [s]; NaN where it is not known.
+        reference: answer of finite elements to the same tools, or None.
     """
 
     time: float
@@ -51,12 +51,12 @@ class Snapshot:
 
     @property
     def force(self) -> float:
-        """What the tools press with together [N]."""
+        """Force of all tools together [N]."""
         return sum(reading.force for reading in self.readings.values())
 
     @property
     def depth(self) -> float:
-        """Of the deepest tool [m]; 0 when none touches."""
+        """Depth of the deepest tool [m]; 0 when none touches."""
         return max((r.depth for r in self.readings.values() if r.depth > 0), default=0.0)
 
     @property

@@ -19,7 +19,7 @@ from stmpl_core.tool import Tool
 from stmpl_ros.scripts import SkinPath, capsule
 
 LETTER_HEIGHT, LETTER_LENGTH = 30e-3, 15e-3  # m
-PLACE = 0.6  # along the limb, 0 to 1
+PLACE = 0.6  # place along the limb, 0 to 1
 TOOLS: dict[str, Callable[[], Tool]] = {
     "ball": lambda: rounded_tool("sphere", 15e-3),
     "fingertip": lambda: capsule(8e-3),
@@ -37,7 +37,7 @@ def tool_named(name: str) -> Tool:
     """The mesh of one of TOOLS, of a single letter, or of a mesh file in metres.
 
     Raises:
-        InvalidInput: there is no such tool and no such file, or it holds no mesh.
+        InvalidInput: a name that is neither a tool nor a file, or a file without a mesh.
     """
     if name in TOOLS:
         return TOOLS[name]()
