@@ -30,6 +30,7 @@ log = logging.getLogger(__name__)
 
 WANTED = re.compile(r"(contact_mesh|skin/topology|skin/displacement|tools/\w+/(pose|wrench))$|^/diagnostics$")
 IF_HEARD = re.compile(r"tools/\w+/local_contact$")  # recorded only once a device listens: it costs the node work
+FOREVER = 1e9  # lease of a sender that never tells that it is there, at least [s]
 POLL_PERIOD_S = 0.1  # time between two looks for new topics
 DEPTH = 1000  # messages of a topic that the middleware keeps while this process is busy
 MAX_QUEUED_MESSAGES = 4000  # messages that may wait for the disk; later ones are counted as lost
@@ -87,7 +88,10 @@ class RecorderNode(Node):
             reliability=ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT,
             durability=DurabilityPolicy.TRANSIENT_LOCAL if kept else DurabilityPolicy.VOLATILE,
         )
-        qos = qos_yaml(depth=max((o.depth for o in offered), default=10) or 10, reliable=reliable, transient_local=kept)
+        leases = [o.liveliness_lease_duration.nanoseconds * 1e-9 for o in offered]
+        lease = max((one for one in leases if one < FOREVER), default=0.0)
+        depth = max((o.depth for o in offered), default=10) or 10
+        qos = qos_yaml(depth=depth, reliable=reliable, transient_local=kept, lease=lease)
 
         def keep(data: Any) -> None:
             if self._queue.qsize() > MAX_QUEUED_MESSAGES:

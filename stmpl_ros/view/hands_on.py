@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections import deque
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -157,9 +157,10 @@ class HandsOn:
         self._answering.put(Asked(self.tool, self.pose, time.perf_counter()))
 
     def _answer(self, asked: Asked) -> None:
-        if self._simulator is None:
+        if self._simulator is None:  # nobody waits for what is prepared once
             self._simulator = Simulator(self.layer, self._method)
             self.page.say("")
+            asked = replace(asked, at=time.perf_counter())
         started = time.perf_counter()
         try:
             contact = Contact(asked.tool, asked.pose)
