@@ -20,10 +20,11 @@ from stmpl_core import Contact
 from stmpl_core.errors import InvalidInput, MeshError
 from stmpl_core.methods import Linear, Winkler
 from stmpl_core.simulator import Simulator
-from stmpl_core.trust import Displacement, Trust
+from stmpl_core.touch import Answer
+from stmpl_core.trust import Trust
 from stmpl_ros.cli import main
 from stmpl_ros.view.fields import FIELDS, STOPS, round_up
-from stmpl_ros.view.hands_on import TOOL, HandsOn
+from stmpl_ros.view.hands_on import HandsOn
 from stmpl_ros.view.latest import LatestWins
 from stmpl_ros.view.page import Page
 from stmpl_ros.view.recording import Recording, RecordingPlayer
@@ -41,7 +42,7 @@ def moved(peak: float, trust: Trust | None = None) -> Snapshot:
     """Three vertices of which the last moves by `peak` [m]."""
     displacement = np.zeros((3, 3))
     displacement[2, 1] = -peak
-    return Snapshot(0.0, Displacement(displacement, trust or Trust(), "none"))
+    return Snapshot(0.0, Answer(displacement, trust or Trust(), "none"))
 
 
 def shown_on(page: Page) -> Snapshot:
@@ -163,11 +164,11 @@ def test_an_error_is_told_and_the_work_goes_on():
 
 @pytest.mark.parametrize("name", [*TOOLS, "k"])
 def test_a_tool_stands_off_the_skin_and_touches_when_it_is_pushed(layer, name):
-    mesh = tool_named(name)
-    pose, gauge = place_on(layer, mesh), Gauge(layer)
-    assert gauge.read([Contact(name, mesh, pose)])[name].force == 0
+    tool = tool_named(name)
+    pose, gauge = place_on(layer, tool.vertices), Gauge(layer)
+    assert gauge.read([Contact(tool, pose)])[tool.name].force == 0
     pose[:3, 3] -= 8e-3 * pose[:3, 2]
-    reading = gauge.read([Contact(name, mesh, pose)])[name]
+    reading = gauge.read([Contact(tool, pose)])[tool.name]
     assert reading.force > 0 and 1e-3 < reading.depth < 5e-3
 
 
@@ -197,9 +198,9 @@ def test_a_pushed_tool_is_answered_as_the_simulator_answers_it(hand, layer):
     hand.push(7e-3)
     assert hand.wait(PATIENCE)
     shown = shown_on(hand.page)
-    expected = Simulator(layer, Winkler()).step([Contact(TOOL, hand.mesh, hand.pose)])
+    expected = Simulator(layer, Winkler()).step([Contact(hand.tool, hand.pose)])
     np.testing.assert_array_equal(shown.answer.displacement, expected.displacement)
-    assert shown.force == pytest.approx(expected.trust.figures["tool.normal_n"]) and shown.force > 0
+    assert shown.force == pytest.approx(expected.touches[hand.tool.name].force) and shown.force > 0
     assert shown.peak > 0 and shown.latency >= shown.solve_seconds > 0
     rows = dict(shown.rows())
     assert rows["reaction force"] == f"{shown.force:.3f} N" and rows["depth"].endswith(" mm")
@@ -219,17 +220,17 @@ def test_pushing_further_presses_harder_and_letting_go_gives_exactly_zero(hand):
 
 
 def test_where_the_hand_holds_the_tool_is_not_where_it_touches(hand):
-    pose = place_on(hand.layer, hand.mesh)
+    pose = place_on(hand.layer, hand.tool.vertices)
     hand.move_to(pose)
     np.testing.assert_allclose(hand.pose, pose, atol=1e-9)
-    assert (hand.gizmo.position - pose[:3, 3]) @ pose[:3, 2] > hand.mesh.vertices[:, 2].max()
+    assert (hand.gizmo.position - pose[:3, 3]) @ pose[:3, 2] > hand.tool.vertices[:, 2].max()
 
 
 def test_another_tool_presses_with_its_own_shape(hand):
     hand.pick("cylinder")
     hand.push(6e-3)
     assert hand.wait(PATIENCE)
-    assert shown_on(hand.page).contacts[0].mesh is hand.mesh and shown_on(hand.page).force > 0
+    assert shown_on(hand.page).contacts[0].tool is hand.tool and shown_on(hand.page).force > 0
 
 
 @pytest.mark.parametrize(("scale", "said"), [(15.0, "millimetres"), (0.0, "nothing to touch with")])
@@ -252,7 +253,7 @@ def test_fem_of_an_instant_presses_the_same_tool_as_deep(hand, layer):
     reference, error = shown_on(hand.page).reference, shown_on(hand.page).error
     assert shown.answer.pressure is not None and reference is not None and error is not None
     fem = RigidFem().prepare(layer)
-    truth = fem.press(shown.contacts, shown.answer.pressure, shown.answer.trust.figures).displacement
+    truth = fem.press(shown.contacts, shown.answer).displacement
     np.testing.assert_array_equal(reference.displacement, truth)
     np.testing.assert_allclose(error, np.linalg.norm(shown.answer.displacement - truth, axis=1), atol=1e-15)
     assert hand.page.field == "error against FEM" and error.max() > 0
@@ -487,8 +488,9 @@ def test_the_live_page_shows_the_answers_of_a_running_node():
                  "an answer to pose and wrench")  # fmt: skip
             shown = shown_on(page)
             assert 0.5e-3 < shown.depth < 3e-3, "as deep as its wrench presses"
-            assert shown.contacts[0].mesh.vertices.shape == ros.ball().vertices.shape
-            assert shown.answer.statuses == {"probe": "touching"} and shown.solve_seconds > 0
+            assert shown.contacts[0].tool.vertices.shape == ros.ball().vertices.shape
+            assert {name: touch.status for name, touch in shown.answer.touches.items()} == {"probe": "touching"}
+            assert shown.solve_seconds > 0
         finally:
             live.close()
             if process is not None:
