@@ -278,7 +278,7 @@ class SkinNode(LifecycleNode):
             if self.hearing.take(tool, future.result()):
                 self.sending.open_tool(tool.name)
                 self.get_logger().info(f"tool '{tool.name}': {len(tool.vertices)} vertices, {len(tool.faces)} faces")
-        except (StmplError, BrokenExecutor) as error:
+        except Exception as error:  # whatever happened in the other process; the node goes on
             self.hearing.refuse(tool, error)
             if self.workshop:
                 self.workshop.renew(error)

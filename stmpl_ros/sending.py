@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from concurrent.futures import BrokenExecutor, Future
+from concurrent.futures import Future
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -17,7 +17,6 @@ from stmpl_msgs.msg import LocalContact, SkinDeformed, SkinDisplacement, SkinTop
 from bags import wire
 from bags.frame import Stamps
 from stmpl_core.contact import Contact
-from stmpl_core.errors import StmplError
 from stmpl_core.skin import Skin
 from stmpl_core.touch import APART, PRESSING, Answer
 from stmpl_ros.gate import Gate
@@ -171,9 +170,9 @@ class Models:
                     self._publishers[name].publish(
                         wire.local_contact_message(name, model, status, self._frame, stamp)
                     )
-        except (StmplError, BrokenExecutor) as error:
+        except Exception as error:  # whatever happened in the other process; the node goes on
             self._workshop.renew(error)
-            self._gate.say("model", f"no local contact: {error}")
+            self._gate.say("model", f"no local contact: {error or type(error).__name__}")
         self._tell()
 
 

@@ -9,7 +9,7 @@ from rclpy.qos import DurabilityPolicy, LivelinessPolicy, QoSProfile, Reliabilit
 
 LEASE = 1.0  # silence on the bus after which a node is told to be gone, to listeners who ask for that [s]
 
-KEPT = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)  # meshes: late listeners get them too
+KEPT = QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL)  # a robot's meshes, for late listeners too
 NOW = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)  # the skin: late listeners get it
 STREAM = QoSProfile(depth=10)
 ANSWERS = QoSProfile(

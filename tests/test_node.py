@@ -7,6 +7,7 @@ import runpy
 import signal
 import time
 from collections.abc import Callable
+from concurrent.futures import Future
 from pathlib import Path
 from types import SimpleNamespace
 from typing import NamedTuple
@@ -770,6 +771,22 @@ def test_a_remapped_topic_is_heard_and_a_killed_node_is_told_by_its_liveliness(b
     bus.wait(lambda: gone[-1] == 0, "the event that it is gone")
     for subscription in (ear, listening):
         bus.node.destroy_subscription(subscription)
+
+
+def test_whatever_fails_beside_the_node_is_told_and_the_tool_from_before_goes_on(composed, capfd):
+    node, failed = composed.node, Future()
+    failed.set_exception(RuntimeError("an accident"))
+    composed.wait(lambda: composed.press() and composed.heard)
+    before, again = node.hearing.tools["finger"], ball().named("finger")
+    node.hearing.tools.announce(again)
+    node._on_field(again, failed)
+    node.sending.models._on_models(0, [contact_of(before, HERE)], composed.heard[0], failed)
+    said = capfd.readouterr().err
+    assert "refused: mesh of 'finger' refused: an accident\n" in said and "no local contact: an accident\n" in said
+    assert node.hearing.tools["finger"] is before and not node.hearing.tools.waiting()
+    count = len(composed.heard)
+    composed.wait(lambda: composed.press() and len(composed.heard) > count)
+    assert rows(composed.heard[-1]).any()
 
 
 @pytest.mark.parametrize("given", ["edge_length:=3.0", "edge_length:=fine", "limits:=/nowhere.yaml"])
