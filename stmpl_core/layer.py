@@ -164,7 +164,7 @@ class SoftLayer:
     def __repr__(self) -> str:
         t = self.thickness * 1e3
         return (f"SoftLayer({len(self.vertices)} vertices, {len(self.faces)} faces, "
-                f"edges {self.edge_length * 1e3:.1f} mm, thickness {t.min():.1f}..{t.max():.1f} mm, "
+                f"thickness {t.min():.1f}..{t.max():.1f} mm, "
                 f"E {self.tissue.youngs_modulus:g} Pa, nu {self.tissue.poisson_ratio:g})")
 
 
