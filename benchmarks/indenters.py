@@ -61,18 +61,18 @@ class Scene:
 
     def built(self, aside: float = 0.0) -> tuple[SoftLayer, Press]:
         """The layer, and the tool above it, `aside` [m] of its middle."""
-        mesh, tissue, pose = self.mesh(), Tissue(poisson_ratio=self.nu), np.eye(4)
+        mesh, pose = self.mesh(), np.eye(4)
         field = SignedDistance.of(mesh, rounding=self.rounding)
         if self.limb:
             pose[:3, :3] = [[0, 0, 1], [0, 1, 0], [-1, 0, 0]]
             pose[:3, 3] = 0.045, aside, 0.08
-            layer = SoftLayer(*limb(self.edge), self.thickness, tissue=tissue)
+            layer = limb(self.edge, self.thickness, poisson_ratio=self.nu)
             return layer, Press(field, pose, np.array([-1.0, 0, 0]))
         half = float(np.abs(mesh.vertices[:, :2]).max()) + self.rim * self.thickness
-        vertices, faces = plate(2 * round(half / self.edge) + 1, self.edge)
-        vertices[:, :2] -= vertices[:, :2].mean(axis=0)
         pose[:3, 3] = aside, 0.0, 5e-3
-        return SoftLayer(vertices, faces, self.thickness, tissue=tissue), Press(field, pose, np.array([0, 0, -1.0]))
+        size = 2 * round(half / self.edge) * self.edge
+        layer = plate(size, self.edge, self.thickness, crossed=True, poisson_ratio=self.nu)
+        return layer, Press(field, pose, np.array([0, 0, -1.0]))
 
     def solver(self, *, step: float = 0.04) -> IndenterFem:
         """Linear wedges, two deep, edges down to an eighth of the layer's where the tool is curved."""

@@ -24,6 +24,7 @@ from stmpl_ros.spinning import ros
 log = logging.getLogger(__name__)
 
 DISCOVERY_S = 1.0  # time that listeners get to find the topics before the first message
+LISTENER_S = 5.0  # wait for the first listener [s]
 DEPTH = 1000  # messages of a stream that wait for slow reliable listeners
 LAST_MESSAGES_S = 5.0  # time that reliable listeners get to take the last messages
 
@@ -59,6 +60,10 @@ class PlayerNode(Node):
 
     def play(self, bag: Bag, speed: float, stop: threading.Event) -> bool:
         """Publishes everything in the order of the file; False if it was asked to stop before the end."""
+        until = time.perf_counter() + LISTENER_S
+        while not any(p.get_subscription_count() for p in self.targets.values()) and time.perf_counter() < until:
+            if stop.wait(0.05):
+                return False
         stop.wait(DISCOVERY_S)
         started, first = time.perf_counter(), None
         for raw in bag.raw(self.targets.__contains__):

@@ -79,9 +79,10 @@ def least_stiffness(
         load: "follower" or "dead".
         degree: number of polynomials for each of U and W; short waves need more.
     """
-    tissue = Tissue(1.0, poisson_ratio)
-    mu, lam, k = tissue.shear_modulus, tissue.lame_lambda, 2 * np.pi / wavelength
-    s = float(column_stretch(np.array([ratio]), tissue)[0])
+    tissue = Tissue(poisson_ratio=poisson_ratio)
+    modulus, k = tissue.youngs_modulus, 2 * np.pi / wavelength
+    mu, lam = tissue.shear_modulus / modulus, tissue.lame_lambda / modulus
+    s = float(column_stretch(np.array([ratio * modulus]), tissue)[0])
     cross = mu - lam * np.log(s)
     x, weight = leggauss(degree + 4)
     z, weight = (x + 1) / 2, weight / 2

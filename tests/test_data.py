@@ -54,7 +54,7 @@ def test_a_footprint_weighs_as_much_as_its_outline_seen_along_the_tool(limb: Sof
 
 def test_covered_skin_lies_inside_the_tool_and_other_skin_outside(limb: SoftLayer) -> None:
     scene = Site(limb).press_flat(middle(limb), letter("S", 0.04), 0.3)
-    away = signed_distance(scene.mesh, scene.pose_body_from_tool, limb.vertices)
+    away = signed_distance(scene.tool, scene.pose_body_from_tool, limb.vertices)
     assert (away[scene.covered] < 1e-9).all()
     facing = limb.normals @ scene.pose_body_from_tool[:3, 2] > 0.3
     assert (away[facing & ~scene.covered] > -1e-9).all()
@@ -86,7 +86,7 @@ def test_a_hand_is_closed_and_its_grip_touches_from_opposite_sides() -> None:
     )
     around = np.arctan2(limb.vertices[scene.covered, 1], limb.vertices[scene.covered, 0])
     assert (np.abs(around) < 0.8).any() and (np.abs(around) > 1.6).any()
-    entered = -signed_distance(scene.mesh, scene.pose_body_from_tool, limb.vertices)
+    entered = -signed_distance(scene.tool, scene.pose_body_from_tool, limb.vertices)
     assert 1e-3 < entered.max() < 0.015
 
 

@@ -64,15 +64,15 @@ def test_a_drawn_tool_stands_above_the_skin_and_looks_at_it() -> None:
     site, kinds = Site(layer), set()
     for contact in [c for c in contacts(PRESETS["contacts"]) if c.body == "even_75"][:12]:
         scene, figures = draw(contact, site, None, contact.rng(0))
-        assert scene.mesh is not None
+        assert scene.tool is not None
         pose = scene.pose_body_from_tool
-        points = scene.mesh.vertices @ pose[:3, :3].T + pose[:3, 3]
+        points = scene.tool.vertices @ pose[:3, :3].T + pose[:3, 3]
         away = (points - layer.vertices[figures["vertex"]]) @ layer.normals[figures["vertex"]]
         assert away.min() > 0
         assert -pose[:3, 2] @ layer.normals[figures["vertex"]] < -0.7
         kinds.add(figures["tool"])
         again, _ = draw(contact, site, None, contact.rng(0))
-        assert again.mesh is not None and again.mesh.vertices.tobytes() == scene.mesh.vertices.tobytes()
+        assert again.tool is not None and again.tool.vertices.tobytes() == scene.tool.vertices.tobytes()
     assert len(kinds) > 3
 
 
