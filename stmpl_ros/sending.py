@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 from geometry_msgs.msg import WrenchStamped
+from rclpy.duration import Duration
 from rclpy.lifecycle import LifecycleNode
 from rclpy.publisher import Publisher
 from stmpl_msgs.msg import LocalContact, SkinDeformed, SkinDisplacement, SkinTopology
@@ -26,6 +27,7 @@ from stmpl_ros.show import Show
 from stmpl_ros.topics import ANSWERS, NOW, STREAM, managed
 from stmpl_ros.workshop import Workshop
 
+LAST_WORD_S = 0.05  # time that listeners get to take a tool's last wrench before its topic closes
 MODELLED = PRESSING | {APART}  # statuses for which a local model says what the answer says
 
 
@@ -72,7 +74,9 @@ class Sending:
     def close_tool(self, name: str) -> None:
         """Closes the topics of a tool."""
         if name in self._wrenches:
-            self._node.destroy_publisher(self._wrenches.pop(name))
+            publisher = self._wrenches.pop(name)
+            publisher.wait_for_all_acked(Duration(seconds=LAST_WORD_S))
+            self._node.destroy_publisher(publisher)
             self.models.close(name)
 
     def move_to(self, skin: Skin, workshop: Workshop) -> None:

@@ -7,14 +7,15 @@ from pathlib import Path
 
 import pytest
 
-BUSES = 50  # test_node.py uses the domain that lies so much higher as a second bus
+BUSES = 50  # test_node_life.py uses the domain that lies so much higher as a second bus
 LOCKS = 27_400  # the first of the ports that stand for the buses; below those that systems hand out by themselves
 ROOMS = {  # every other file is of the room "unit"
-    "ros": ["test_node", "test_record_and_publish", "test_ros", "test_ros_parts", "test_view"],
+    "ros": ["test_node", "test_node_life", "test_node_topics", "test_record_and_publish", "test_ros", "test_ros_parts",
+            "test_view"],
     "studies": ["test_evaluate", "test_fem_limits", "test_peers", "test_speed_chart", "test_stability",
                 "test_train_contact", "test_unet"],
 }  # fmt: skip
-FIRST = ["test_conform", "test_ladder", "test_train_contact", "test_indenter_shapes", "test_unet", "test_node",
+FIRST = ["test_conform", "test_ladder", "test_train_contact", "test_indenter_shapes", "test_unet", "test_node_life",
          "test_ros", "test_view", "test_moments", "test_haptics", "test_record_and_publish"]
 BUS = pytest.StashKey[socket.socket]()
 ROOM_OF = {file: room for room, files in ROOMS.items() for file in files}

@@ -1,0 +1,265 @@
+"""Laws of the node's life: lifecycle, another node beside it, what is asked of devices, launch files."""
+
+import ast
+import os
+import runpy
+import signal
+import time
+from collections.abc import Callable
+from concurrent.futures import Future
+from pathlib import Path
+from typing import NamedTuple
+
+import pytest
+import rclpy
+from geometry_msgs.msg import PoseStamped
+from lifecycle_msgs.msg import Transition
+from lifecycle_msgs.srv import ChangeState
+from rcl_interfaces.msg import Parameter as ParameterMessage
+from rcl_interfaces.srv import SetParameters
+from rclpy.duration import Duration
+from rclpy.event_handler import SubscriptionEventCallbacks
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.qos import LivelinessPolicy, QoSProfile
+from std_srvs.srv import Trigger
+from stmpl_msgs.msg import ContactMesh, SkinDisplacement, SkinTopology
+
+from bags.wire import pose_message, stamp_ns, tool_message
+from stmpl_ros.node import SkinNode
+from stmpl_ros.parameters import NodeConfig
+from stmpl_ros.topics import KEPT, LEASE, STREAM
+from tests.bus import PATIENCE, ROOT, end, rows, running, start
+from tests.conftest import BUSES
+from tests.node_bus import HERE, NODE, PUSH, Bus, a_node, skin
+from tests.scenes import ball, contact_of
+
+
+@pytest.fixture(scope="module")
+def bus(tmp_path_factory):
+    yield from a_node(tmp_path_factory.mktemp("node"))
+
+
+@pytest.fixture(scope="module")
+def hand(bus):
+    return bus.tool("probe").ready()
+
+
+# Lifecycle and QoS
+
+
+def test_a_node_may_be_cleaned_up_set_up_anew_and_answers_on_what_was_set(bus, hand):
+    hand.ask(HERE, PUSH)
+
+    def go(transition: int) -> None:
+        assert bus.call(ChangeState, "change_state", transition=Transition(id=transition)).success
+
+    go(Transition.TRANSITION_DEACTIVATE)
+    assert not bus.call(Trigger, "reset").success
+    go(Transition.TRANSITION_CLEANUP)
+    assert bus.set(youngs_modulus=1500.0)[0].successful
+    layers = len(bus.got["skin/topology"])
+    go(Transition.TRANSITION_CONFIGURE)
+    go(Transition.TRANSITION_ACTIVATE)
+    topology = bus.wait(lambda: bus.got["skin/topology"][layers:], "the topology")[-1]
+    assert topology.youngs_modulus == 1500
+    hand.ready()  # its mesh was kept for late listeners
+    before = len(bus.got["skin/displacement"])
+    answer = hand.ask(HERE, PUSH)
+    assert answer.layer_id == topology.layer_id and len(bus.got["skin/displacement"]) == before + 1, "answered once"
+
+
+class Composed(NamedTuple):
+    """A SkinNode in this process beside another node, which moves a tool and hears answers."""
+
+    node: SkinNode
+    heard: list[SkinDisplacement]
+    press: Callable[[], int]
+    wait: Callable[[Callable[[], object]], None]
+
+
+@pytest.fixture
+def composed():
+    """SkinNode is an ordinary node to whoever composes."""
+    context = rclpy.Context()
+    context.init(domain_id=int(os.environ["ROS_DOMAIN_ID"]) + BUSES)
+    executor = SingleThreadedExecutor(context=context)
+    node = SkinNode(NodeConfig(), skin, context=context)
+    other = rclpy.create_node("other", context=context)
+    heard: list[SkinDisplacement] = []
+    other.create_subscription(SkinDisplacement, "skin/displacement", heard.append, STREAM)
+    mesh = other.create_publisher(ContactMesh, "contact_mesh", KEPT)
+    pose = other.create_publisher(PoseStamped, "tools/finger/pose", STREAM)
+
+    def press() -> int:
+        stamp = other.get_clock().now().nanoseconds
+        pose.publish(pose_message(HERE, "body", stamp))
+        return stamp
+
+    def wait(done: Callable[[], object]) -> None:
+        until = time.monotonic() + PATIENCE
+        while not done():
+            assert time.monotonic() < until
+            executor.spin_once(timeout_sec=0.02)
+
+    try:
+        executor.add_node(node)
+        executor.add_node(other)
+        node.trigger_configure()
+        node.trigger_activate()
+        mesh.publish(tool_message(ball().named("finger"), 0))
+        wait(pose.get_subscription_count)
+        yield Composed(node, heard, press, wait)
+    finally:
+        executor.shutdown()
+        node.destroy_node()
+        other.destroy_node()
+        context.try_shutdown()
+        context.destroy()
+
+
+def test_the_node_runs_beside_another_in_any_executor(composed):
+    composed.wait(lambda: composed.press() and composed.heard)
+    assert rows(composed.heard[-1]).any()
+
+
+def test_whatever_fails_inside_an_answer_is_told_and_the_next_instant_is_answered(composed, monkeypatch, capfd):
+    simulator, failed = composed.node.answering.simulator, []
+    step = simulator.step
+
+    def fails_once(contacts):
+        if not failed:
+            failed.append(contacts[0])
+            raise RuntimeError("an accident")
+        return step(contacts)
+
+    monkeypatch.setattr(simulator, "step", fails_once)
+    composed.wait(lambda: composed.press() and failed)
+    refused = round(1e9 * failed[0].time)
+    assert composed.node.tally.refused == 1
+    assert composed.node.tally.last_refusal == "no answer to finger: an accident"
+    composed.wait(lambda: composed.press() and composed.heard)
+    assert rows(composed.heard[0]).any() and stamp_ns(composed.heard[0]) > refused
+    assert composed.node.tally.refused == 1
+    assert capfd.readouterr().err.count("refused: no answer to finger: an accident\n") == 1
+
+
+def test_two_nodes_on_one_topic_tell_of_each_other_and_of_one_of_their_name():
+    twins, command = Bus("/twins"), ("-c", NODE, "--ros-args", "-r", "__ns:=/twins")
+
+    def told(twin: str) -> set[str]:
+        where = f"there is another node {twin} on /twins/skin/displacement: listeners get the answers of both"
+        return {line.name for line in twins.got["/rosout"] if line.msg.startswith(where) and "__ns:=" in line.msg}
+
+    namesake = None
+    try:
+        with running(*command):
+            twins.wait(lambda: twins.got["skin/topology"], "skin/topology")
+            twins.spin(2.5)
+            assert not told("that answers") | told("of the same name"), "one alone is no twin"
+            with running(*command, "-r", "__node:=other"):
+                twins.wait(lambda: told("that answers") == {"twins.stmpl", "twins.other"}, "both log lines")
+            namesake = rclpy.create_node("stmpl", namespace="/twins")
+            twins.wait(lambda: "twins.stmpl" in told("of the same name"), "word of the namesake")
+    finally:
+        if namesake:
+            namesake.destroy_node()
+        twins.node.destroy_node()
+
+
+def test_a_remapped_topic_is_heard_and_a_killed_node_is_told_by_its_liveliness(bus):
+    gone: list[int] = []
+    ask = QoSProfile(depth=10, liveliness=LivelinessPolicy.AUTOMATIC,
+                     liveliness_lease_duration=Duration(seconds=2 * LEASE))  # fmt: skip
+    told = SubscriptionEventCallbacks(liveliness=lambda event: gone.append(event.alive_count))
+    remaps = ["-r", "__ns:=/other", "-r", "skin/topology:=/arm_skin", "--params-file", "config/stmpl.yaml",
+              "-p", "edge_length:=0.01"]  # fmt: skip
+    ear = bus.listen(SkinTopology, "/arm_skin", KEPT)
+    listening = bus.listen(SkinDisplacement, "/other/skin/displacement", ask, event_callbacks=told)
+    with running("-c", NODE, "--ros-args", *remaps, number=signal.SIGKILL):
+        bus.wait(lambda: bus.got["/arm_skin"], "the topology under its other name")
+        bus.wait(lambda: gone and gone[-1] == 1, "a live node")
+    bus.wait(lambda: gone[-1] == 0, "the event that it is gone")
+    for subscription in (ear, listening):
+        bus.node.destroy_subscription(subscription)
+
+
+def test_whatever_fails_beside_the_node_is_told_and_the_tool_from_before_goes_on(composed, capfd):
+    node, failed = composed.node, Future()
+    failed.set_exception(RuntimeError("an accident"))
+    composed.wait(lambda: composed.press() and composed.heard)
+    before, again = node.hearing.tools["finger"], ball().named("finger")
+    node.hearing.tools.announce(again)
+    node._on_field(again, failed)
+    node.sending.models._on_models(0, [contact_of(before, HERE)], composed.heard[0], failed)
+    said = capfd.readouterr().err
+    assert "refused: mesh of 'finger' refused: an accident\n" in said and "no local contact: an accident\n" in said
+    assert node.hearing.tools["finger"] is before and not node.hearing.tools.waiting()
+    count = len(composed.heard)
+    composed.wait(lambda: composed.press() and len(composed.heard) > count)
+    assert rows(composed.heard[-1]).any()
+
+
+@pytest.mark.parametrize("given", ["edge_length:=3.0", "edge_length:=fine", "limits:=/nowhere.yaml"])
+def test_a_node_with_settings_that_cannot_be_ends_with_one_line(given):
+    code, said = end(start("-c", NODE, "--ros-args", "-p", given))
+    assert code == 1
+    assert given.split(":=")[0] in said and "Traceback" not in said
+
+
+def test_the_bus_knows_no_parameter_that_is_not_declared(bus):
+    result = bus.call(SetParameters, "set_parameters", parameters=[ParameterMessage(name="no_such")]).results
+    assert not result[0].successful
+
+
+# What is asked of devices, and launch files
+
+
+def test_a_device_that_offers_no_deadline_is_told_why_it_is_not_heard_and_one_that_misses_its_own_is_told_of(bus):
+    """A node of its own, which asks for poses at least every 0.2 s."""
+    strict = Bus("/strict")
+    offering = QoSProfile(depth=10, deadline=Duration(seconds=0.1))
+    try:
+        with running("-c", NODE, "--ros-args", "-r", "__ns:=/strict", "-p", "deadline:=0.2"):
+            strict.wait(lambda: strict.got["skin/topology"], "skin/topology")
+            hand = strict.tool("probe")
+            strict.wait(lambda: strict.said("tools/probe/pose: a sender is not heard"), "the log line")
+            assert "DEADLINE" in strict.said("a sender is not heard")[-1]
+            strict.node.destroy_publisher(hand.pose)
+            hand.pose = strict.node.create_publisher(PoseStamped, "tools/probe/pose", offering)
+            hand.ready()
+
+            def answered() -> list[SkinDisplacement]:  # the node may still be about to hear of the sender
+                stamp = hand.send(HERE)
+                strict.spin(0.05)
+                return strict.answers(stamp)
+
+            strict.wait(answered, "an answer")
+            strict.wait(lambda: strict.said("tools/probe/pose: the sender missed its deadline"), "the log line")
+    finally:
+        strict.node.destroy_node()
+
+
+@pytest.mark.parametrize("path", sorted((ROOT / "launch").glob("*.py")), ids=lambda path: path.name)
+def test_a_launch_file_imports_only_launch_and_names_verbs_and_flags_that_exist(path):
+    """It is read, not run: `launch` is found on ROS machines only."""
+    tree = ast.parse(path.read_text())
+    imported = {str(node.module).split(".")[0] for node in ast.walk(tree) if isinstance(node, ast.ImportFrom)}
+    assert imported <= {"launch", "launch_ros"}
+    assert not [node for node in ast.walk(tree) if isinstance(node, ast.Import)]
+    said = [node.value for node in ast.walk(tree) if isinstance(node, ast.Constant) and isinstance(node.value, str)]
+    verb = next(word for word in said if word in ("node", "probe"))
+    flags = {word for word in said if word.startswith("--")} - {"--ros-args", "--log-level"}
+    code, told = end(start("-m", "stmpl_ros.cli", verb, "--help"))
+    assert code == 0 and all(flag in told for flag in flags)
+
+
+def test_everything_that_colcon_installs_is_there(monkeypatch):
+    given = {}
+    monkeypatch.setenv("ROS_DISTRO", "jazzy")
+    monkeypatch.setattr("setuptools.setup", lambda **arguments: given.update(arguments))
+    monkeypatch.chdir(ROOT)
+    runpy.run_path("setup.py")
+    installed = {folder: {Path(file).resolve() for file in files} for folder, files in given["data_files"]}
+    for folder in ("launch", "config"):
+        assert installed[f"share/stmpl_ros/{folder}"] == {path.resolve() for path in (ROOT / folder).iterdir()}
+    assert all(file.is_file() for files in installed.values() for file in files)
