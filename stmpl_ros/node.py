@@ -321,8 +321,8 @@ class SkinNode(LifecycleNode):
         self._twin = "of the same name" if named > 0 else self._twin
         if self._twin not in ("", before):
             where = self.resolve_topic_name(topic)
-            self.hearing.gate.say("twin", f"there is another node {self._twin} on {where}: listeners get the answers "
-                                  "of both. Give each a namespace: --ros-args -r __ns:=/left")  # fmt: skip
+            said = f"there is another node {self._twin} on {where}: listeners get the answers of both. "
+            self.hearing.gate.say(f"twin {self._twin}", said + "Give each a namespace: --ros-args -r __ns:=/left")
 
     def _now(self) -> int:
         return self.get_clock().now().nanoseconds

@@ -79,6 +79,7 @@ class Hand:
 
     def ready(self) -> "Hand":
         self.bus.wait(lambda: self.pose.get_subscription_count() and self.wrench.get_subscription_count(), "the node")
+        self.bus.spin(0.3)  # the node may still be about to hear of the sender
         return self
 
     def send(self, pose: np.ndarray, wrench: np.ndarray | None = None, frame: str = "body") -> int:
