@@ -7,6 +7,7 @@ import signal
 import sys
 import threading
 import time
+from types import FrameType
 
 GRACE = 1.5  # time in which a verb must end after Ctrl-C or SIGTERM, whatever it is doing [s]
 PATIENT = {"record": 30.0}  # time for verbs that have something to save [s]
@@ -37,8 +38,8 @@ def main(arguments: list[str] | None = None) -> None:
     try:
         code = _run(given)
         sys.stdout.flush()
-    except KeyboardInterrupt:
-        code = 130
+    except KeyboardInterrupt as interrupt:
+        code = 128 + next(iter(interrupt.args), signal.SIGINT)
     except BrokenPipeError:  # `stmpl ... | head`
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         code = 0
@@ -74,10 +75,11 @@ def _run(given: list[str]) -> int:
 
 
 def _end_soon_after_a_signal(grace: float) -> None:
-    """Ends the process `grace` [s] after SIGINT or SIGTERM came, if it has not ended by itself.
+    """SIGTERM interrupts as Ctrl-C does; `grace` [s] after either the process ends, if it has not ended by itself.
 
     Python's own handlers run between two steps of the main thread; a compiled call may keep it for longer.
     """
+    signal.signal(signal.SIGTERM, _interrupt)
     told, tell = os.pipe()
     os.set_blocking(tell, False)
     signal.set_wakeup_fd(tell, warn_on_full_buffer=False)
@@ -89,6 +91,10 @@ def _end_soon_after_a_signal(grace: float) -> None:
         os._exit(128 + number)
 
     threading.Thread(target=watch, name="ending", daemon=True).start()
+
+
+def _interrupt(number: int, _frame: FrameType | None) -> None:
+    raise KeyboardInterrupt(number)
 
 
 def usage() -> str:

@@ -123,16 +123,19 @@ def _probe_flags(config: ProbeConfig) -> list[str]:
 
 @contextmanager
 def _process(verb: str, arguments: list[str], folder: Path, environment: dict[str, str]) -> Iterator[subprocess.Popen]:
-    """A verb as a process that logs into the run's folder; killed if it is still there at the end."""
+    """A verb as a process that logs into the run's folder; ended if it is still there at the end."""
     command = [sys.executable, "-m", "stmpl_ros.cli", verb, *arguments]
     with open(folder / f"{verb}.log", "wb") as out:
         process = subprocess.Popen(command, env=environment, stdout=out, stderr=subprocess.STDOUT)
     try:
         yield process
     finally:
-        if process.poll() is None:
+        process.terminate()
+        try:
+            process.wait(0.4)
+        except subprocess.TimeoutExpired:
             process.kill()
-        process.wait()
+            process.wait()
 
 
 def _wait(probe: subprocess.Popen, others: dict[str, subprocess.Popen], folder: Path, status) -> None:
