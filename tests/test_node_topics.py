@@ -65,6 +65,8 @@ def test_a_recording_of_another_frame_and_of_two_skins_is_replayed_bit_for_bit(b
     with running("-m", "stmpl_ros.cli", *command, "--ros-args", "-r", "__ns:=/robot", number=signal.SIGINT):
         for topic in ("skin/displacement", "skin/topology", "tools/recorded/wrench", "tools/recorded/pose"):
             bus.wait(lambda topic=topic: bus.node.count_subscribers(f"/robot/{topic}") > 1, f"recording {topic}")
+        bus.wait(lambda: min(hand.pose.get_subscription_count(), hand.wrench.get_subscription_count()) > 1, "the recorder")
+        bus.spin(0.3)  # the recorder may still be about to hear of the senders
         for depth in (0.5e-3, 1e-3, 2e-3):
             hand.ask(table @ at(RADIUS + 0.012 - depth, 0, LENGTH / 2), np.array([0.03, 0, 0, 0, 0, 0]), frame="table")
         layers = len(bus.got["skin/topology"])
