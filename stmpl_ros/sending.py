@@ -62,7 +62,7 @@ class Sending:
         for publisher in (self._topology, self._displacement, self._deformed):
             self._node.destroy_lifecycle_publisher(publisher)
         for name in list(self._wrenches):
-            self.close_tool(name)
+            self._close_tool(name)
         self.show.close()
 
     def open_tool(self, name: str) -> None:
@@ -72,12 +72,10 @@ class Sending:
             self.models.open(name)
 
     def close_tool(self, name: str) -> None:
-        """Closes the topics of a tool."""
+        """Closes the topics of a tool, once its last wrench is taken."""
         if name in self._wrenches:
-            publisher = self._wrenches.pop(name)
-            publisher.wait_for_all_acked(Duration(seconds=LAST_WORD_S))
-            self._node.destroy_publisher(publisher)
-            self.models.close(name)
+            self._wrenches[name].wait_for_all_acked(Duration(seconds=LAST_WORD_S))
+            self._close_tool(name)
 
     def move_to(self, skin: Skin, workshop: Workshop) -> None:
         """Sends answers of another skin from here on."""
@@ -112,6 +110,10 @@ class Sending:
         for name in tools:
             self._send_wrench(name, np.zeros(6), stamp)
         self.models.forget()
+
+    def _close_tool(self, name: str) -> None:
+        self._node.destroy_publisher(self._wrenches.pop(name))
+        self.models.close(name)
 
     def _send_wrench(self, name: str, wrench: np.ndarray, stamp: int) -> None:
         publisher = self._wrenches.get(name)
