@@ -193,7 +193,7 @@ def _cell(u, n):
     return first - 1, inside, inside - first
 
 
-@numba.njit(cache=True, fastmath={"contract", "reassoc", "nsz", "arcp"})
+@numba.njit(cache=True)
 def distance_at(coefficients, origin, spacing, x, y, z):
     """Signed distance at one point [m]; for use inside other kernels."""
     i, u, f = _cell((x - origin[0]) / spacing, coefficients.shape[0])
