@@ -59,7 +59,7 @@ class Answering:
 
     def start_empty(self) -> None:
         """Forgets what was answered."""
-        self.last: tuple[Answer, Stamps] | None = None  # None: at rest
+        self.last: tuple[Answer, Instant] | None = None  # None: at rest
         self.fading = False
         self._seen: set[str] = set()  # tools of the last answer
 
@@ -86,7 +86,7 @@ class Answering:
             self.limits.put(answer)
         if self.fading:
             self._node.get_logger().info("input is back")
-        self.last, self.fading, gate.refused_since = (answer, instant.inputs), False, ""
+        self.last, self.fading, gate.refused_since = (answer, instant), False, ""
         self._seen = set(answer.touches)
 
     def fade_if_silent(self) -> None:
@@ -94,7 +94,7 @@ class Answering:
         now, config, gate = time.monotonic_ns(), self._settings.config, self._hearing.gate
         if self.last is None or self._hearing.inbox.live(now):
             return
-        answer, inputs = self.last
+        answer, instant = self.last
         silent, limit = self._hearing.inbox.silence(now) / NANO, config.rest_after
         left = 1 - (silent - limit) / config.fade if config.fade else 0.0
         why = f"no pose for {limit} s"
@@ -110,7 +110,18 @@ class Answering:
             gate.say("fading", f"{why}: the last answer fades to rest within {config.fade} s")
         share = float(np.float32(left))  # as the message carries it
         faded = answer.faded(share, f"{why}: the last answer, faded to {left:.0%}")
-        self._send(faded, self._now(), inputs, fade=share)
+        self._send(faded, self._now(), instant.inputs, fade=share)
+
+    def on_other_skin(self) -> None:
+        """Answers the last instant again, on the skin that took over; rest, if its tools are silent or not ready."""
+        if self.last is None:
+            return
+        before, instant = self.last
+        if self._hearing.inbox.live(time.monotonic_ns()) and all(one.name in self.simulator.tools
+                                                                 for one in instant.contacts):  # fmt: skip
+            self.answer(instant)
+        if self.last[0] is before:
+            self.rest("another skin")
 
     def without(self, name: str) -> None:
         """Tells that a tool, which was taken away, exerts nothing; rest, if no tool of the last answer is left."""

@@ -264,8 +264,7 @@ class SkinNode(LifecycleNode):
         self.get_logger().info(f"from here on layer {skin.layer_id}: {skin.layer}")
         if self.active:
             self.sending.topology(self._now())
-            if self.answering.last is not None and not self.hearing.inbox.live(time.monotonic_ns()):
-                self.answering.rest("another skin")
+            self.answering.on_other_skin()
 
     # Tools and clocks
 
