@@ -170,7 +170,7 @@ def _shape(start, index, points, frames, thickness):
     out, zones = np.zeros((len(points), 5)), (len(start) - 1) // len(points)
     for i in numba.prange(len(points)):
         xx = xy = yy = 1e-12
-        s = np.zeros(6)
+        s0 = s1 = s2 = s3 = s4 = s5 = 0.0
         for p in range(start[zones * i], start[zones * (i + 1)]):
             j = index[p]
             dx, dy, dz = ((points[j, 0] - points[i, 0]) / thickness[i], (points[j, 1] - points[i, 1]) / thickness[i],
@@ -188,15 +188,15 @@ def _shape(start, index, points, frames, thickness):
             xx += w * x * x
             xy += w * x * y
             yy += w * y * y
-            s[0] += w * x * u
-            s[1] += w * y * u
-            s[2] += w * x * v
-            s[3] += w * y * v
-            s[4] += w * x * h
-            s[5] += w * y * h
+            s0 += w * x * u
+            s1 += w * y * u
+            s2 += w * x * v
+            s3 += w * y * v
+            s4 += w * x * h
+            s5 += w * y * h
         det = xx * yy - xy * xy + 1e-9
-        a, b = (yy * s[0] - xy * s[1]) / det, (xx * s[1] - xy * s[0]) / det
-        c, e = (yy * s[2] - xy * s[3]) / det, (xx * s[3] - xy * s[2]) / det
+        a, b = (yy * s0 - xy * s1) / det, (xx * s1 - xy * s0) / det
+        c, e = (yy * s2 - xy * s3) / det, (xx * s3 - xy * s2) / det
         out[i, 0], out[i, 1], out[i, 2] = a, 0.5 * (b + c), e
-        out[i, 3], out[i, 4] = (yy * s[4] - xy * s[5]) / det, (xx * s[5] - xy * s[4]) / det
+        out[i, 3], out[i, 4] = (yy * s4 - xy * s5) / det, (xx * s5 - xy * s4) / det
     return out

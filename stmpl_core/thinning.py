@@ -96,48 +96,45 @@ def neighbours(points: np.ndarray, normals: np.ndarray, thickness: np.ndarray, r
         z of Z are index[start[Z v + z] : start[Z v + z + 1]].
     """
     cell = reaches[-1] * float(thickness.max())
-    low = points.min(axis=0)
-    place = ((points - low) / cell).astype(np.int64)
+    place = ((points - points.min(axis=0)) / cell).astype(np.int64)
     shape = place.max(axis=0) + 1
     key = (place[:, 0] * shape[1] + place[:, 1]) * shape[2] + place[:, 2]
     order = np.argsort(key, kind="stable")
     first = np.searchsorted(key[order], np.arange(shape.prod() + 1))
+    rows = np.column_stack([points, normals, thickness])[order]  # those of a cell side by side
     start = np.zeros(len(reaches) * len(points) + 1, dtype=np.int64)
-    _pairs(points, normals, thickness, reaches, place, shape, order, first, start, np.empty(0, dtype=np.int32))
+    _pairs(rows, reaches, place, shape, order, first, start, np.empty(0, dtype=np.int32))
     start = np.cumsum(start)
     index = np.empty(start[-1], dtype=np.int32)
-    _pairs(points, normals, thickness, reaches, place, shape, order, first, start, index)
+    _pairs(rows, reaches, place, shape, order, first, start, index)
     return start, index
 
 
 @numba.njit(cache=True, parallel=True, error_model="numpy")
-def _pairs(points, normals, thickness, reaches, place, shape, order, first, start, index):
+def _pairs(rows, reaches, place, shape, order, first, start, index):
     """Counts the neighbours of vertex i in zone z into start[Z i + z + 1], or where `index` has room writes them."""
-    zones = len(reaches)
-    for i in numba.prange(len(points)):
+    zones, writing = len(reaches), len(index) > 0
+    squares = reaches**2
+    for q in numba.prange(len(rows)):
+        i = order[q]
         n = np.zeros(zones, np.int64)
+        px, py, pz, nx, ny, nz, t = rows[q]
         for a in range(max(place[i, 0] - 1, 0), min(place[i, 0] + 2, shape[0])):
             for b in range(max(place[i, 1] - 1, 0), min(place[i, 1] + 2, shape[1])):
-                for c in range(max(place[i, 2] - 1, 0), min(place[i, 2] + 2, shape[2])):
-                    k = (a * shape[1] + b) * shape[2] + c
-                    for m in range(first[k], first[k + 1]):
-                        j = order[m]
-                        away = 0.0
-                        facing = 0.0
-                        for x in range(3):
-                            away += (points[i, x] - points[j, x]) ** 2
-                            facing += normals[i, x] * normals[j, x]
-                        away /= thickness[i] * thickness[j]
-                        if facing > 0 and away < reaches[-1] ** 2:
-                            z = 0
-                            while away >= reaches[z] ** 2:
-                                z += 1
-                            if len(index):
-                                index[start[zones * i + z] + n[z]] = j
-                            n[z] += 1
-        if not len(index):
-            for z in range(zones):
-                start[zones * i + z + 1] = n[z]
+                k = (a * shape[1] + b) * shape[2]
+                for m in range(first[k + max(place[i, 2] - 1, 0)], first[k + min(place[i, 2] + 2, shape[2])]):
+                    x, y, z = px - rows[m, 0], py - rows[m, 1], pz - rows[m, 2]
+                    away = (x * x + y * y + z * z) / (t * rows[m, 6])
+                    if away < squares[-1] and nx * rows[m, 3] + ny * rows[m, 4] + nz * rows[m, 5] > 0:
+                        zone = 0
+                        while away >= squares[zone]:
+                            zone += 1
+                        if writing:
+                            index[start[zones * i + zone] + n[zone]] = order[m]
+                        n[zone] += 1
+        if not writing:
+            for zone in range(zones):
+                start[zones * i + zone + 1] = n[zone]
 
 
 @numba.njit(cache=True, error_model="numpy")
