@@ -18,7 +18,7 @@ from fem_tools.dataset import FIGURES, RAGGED, Record
 from fem_tools.hand import Hand
 from fem_tools.indenter import INDENTER_LAYERS, IndenterFem
 from fem_tools.patch import PatchFem
-from fem_tools.press import Press
+from fem_tools.press import Press, above_core
 from fem_tools.sampling import BodyPlan, ContactId, Kind, Plan, draw, kinds_of, ratios, split_of
 from fem_tools.scenes import Scene, Site, UnusableContact
 from stmpl_core.chart import UvChart
@@ -30,6 +30,7 @@ from stmpl_core.trust import Displacement, Trust
 log = logging.getLogger(__name__)
 
 INDENTER_REFINE = 3  # splits where a tool's curvature asks: from 4 mm down to 0.5 mm
+CLEAR = 0.03  # distance from the core that is left under a tool, over its depth
 WORST_TRUNCATION = 0.05  # largest motion that is left one thickness inside the patch's rim, over the peak
 
 
@@ -208,11 +209,14 @@ def solve_nodals(bench: Bench, scene: Scene, wanted: np.ndarray) -> Iterator[tup
 
 
 def solve_indentations(bench: Bench, scene: Scene, wanted: np.ndarray) -> Iterator[tuple[Record, Trust]]:
-    """The tool pressed in along its axis to these depths over thickness, sticking."""
+    """The tool pressed in along its axis to these depths over thickness, sticking; not to those that reach the core."""
     layer, pose = bench.site.layer, scene.pose_body_from_tool
     assert scene.tool is not None
     tool = Press(SignedDistance.of(scene.tool, rounding=scene.rounding), pose, -pose[:3, 2])
-    answers = bench.indenter.path([tool], (wanted * bench.site.thickness_under(pose)).tolist())
+    depths, touching = wanted * bench.site.thickness_under(pose), tool.touching(layer)
+    while touching and len(depths) > 1 and above_core(layer, [touching.at(depths[-1])])[1][0] < CLEAR * depths[-1]:
+        depths = depths[:-1]
+    answers = bench.indenter.path([tool], depths.tolist())
     for ratio, answer in zip(wanted, answers, strict=False):
         figures = dict(answer.trust.figures) | {"ratio": float(ratio)}
         load = Load.pressure(answer.pressure)

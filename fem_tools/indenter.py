@@ -12,7 +12,7 @@ from fem_tools.estimates import discretisation_error, truncation_error
 from fem_tools.mesh import WedgeMesh
 from fem_tools.newton import NewtonResult, is_positive_definite, newton
 from fem_tools.patch import Patch, PatchFem
-from fem_tools.press import MAX_FACES_ENTERED, Press, edge_for_curvature, edge_for_first_contact
+from fem_tools.press import MAX_FACES_ENTERED, Press, above_core, edge_for_curvature, edge_for_first_contact
 from fem_tools.system import System
 from fem_tools.tool_contact import Friction, PressLoad, column_areas, friction_limit, penalties
 from stmpl_core.arrays import PerVertex, VertexVectors, Wrench, finite
@@ -193,10 +193,8 @@ class Walk:
                 raise InvalidInput(f"tool {number} never meets the skin along its way {tool.direction}.")
             self.tools.append(touching)
         deepest = float(depths[-1])
-        reached = [tool.at(deepest).distance(layer.vertices) for tool in self.tools]
-        footprint = np.flatnonzero(np.min(reached, axis=0) <= max(0.0, float(np.min(reached))))
-        for number, tool in enumerate(self.tools):
-            clear = float(tool.at(deepest).distance(layer.inner_vertices[footprint]).min())
+        footprint, clearances = above_core(layer, [tool.at(deepest) for tool in self.tools])
+        for number, clear in enumerate(clearances):
             if clear <= 0:
                 thin = float(layer.thickness[footprint].min())
                 raise InvalidInput(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -90,6 +91,13 @@ class Press:
             if abs(travel) > furthest:
                 return None
         return travel if abs(gap) < 1e-5 else None
+
+
+def above_core(layer: SoftLayer, tools: Sequence[Press]) -> tuple[np.ndarray, list[float]]:
+    """Numbers of the vertices that tools cover where they stand, and each tool's distance from the core there [m]."""
+    reached = np.min([tool.distance(layer.vertices) for tool in tools], axis=0)
+    footprint = np.flatnonzero(reached <= max(0.0, float(reached.min())))
+    return footprint, [float(tool.distance(layer.inner_vertices[footprint]).min()) for tool in tools]
 
 
 def edge_for_curvature(press: Press, points: np.ndarray, thickness: float) -> np.ndarray:

@@ -35,9 +35,12 @@ DEPTHS = (3e-3, 5e-3)  # m, that a grasping hand sinks in
 REGIONS = (10e-3, 45e-3)  # m, radii of uneven pressures
 WAVES = (15e-3, 60e-3)  # m, their wavelengths
 BALLS = (8e-3, 20e-3)  # m, radii of rounded indenters
-TOOLS = ("sphere", "ellipsoid", "capsule", "cylinder", "box", "hull", "letter")  # of the set "tool"
+TOOLS = ("sphere", "ellipsoid", "capsule", "cylinder", "box", "hull", "letter", "torus", "edge", "corner", "pin",
+         "plate")  # of the set "tool"  # fmt: skip
 SIZES = (4e-3, 25e-3)  # m, half their width
 TILT = 0.25  # rad, of a tool's axis and of its way
+SLANTED, SLANT = 0.25, 0.8  # share of tools that come at a slant of up to so much [rad]
+SHALLOWEST = 0.01  # thicknesses, of indenters
 
 
 class BodyPlan(BaseModel):
@@ -147,7 +150,7 @@ PRESETS = {
     "default": Plan(preset="default", discs=150, ellipses=24, seams=44, fields=40, indenters=5),
     "paper": Plan(preset="paper", bodies=PAPER_BODIES + VARYING_BODIES[:2], indenters=40),
     "contacts": Plan(preset="contacts", bodies=CONTACT_BODIES, discs=0, ellipses=0, seams=0, hands=0, bands=0,
-                     letters=0, tools=40, loads=7, deepest=0.65, indenter_step=0.08),
+                     letters=0, tools=60, loads=8, deepest=0.9, indenter_step=0.08),
 }  # fmt: skip
 
 
@@ -230,7 +233,10 @@ def varying(points: np.ndarray, bounds: tuple[float, float], rng: np.random.Gene
 def ratios(plan: Plan, kind: Kind, count: int, rng: np.random.Generator) -> np.ndarray:
     """`count` loads of one contact, increasing, one in each equal part of the range: p / E, or depth over thickness."""
     highest = {"pressure": plan.highest_pressure, "nodal": plan.highest_nodal, "indenter": plan.deepest}[kind]
-    return (np.arange(count) + rng.uniform(0.05, 1.0, count)) / count * highest
+    share = (np.arange(count) + rng.uniform(0.05, 1.0, count)) / count
+    if kind == "indenter":  # closer together where the contact begins
+        return np.maximum(highest * share**2, SHALLOWEST * (1 + np.arange(count)))
+    return share * highest
 
 
 def draw(contact: ContactId, site: Site, hand: Hand | None, rng: np.random.Generator) -> tuple[Scene, dict[str, Any]]:
@@ -294,9 +300,10 @@ def _draw_tool(
     vertex: int, turn: float, site: Site, rng: np.random.Generator, drawn: dict[str, Any]
 ) -> tuple[Scene, dict[str, Any]]:
     size = float(np.exp(rng.uniform(math.log(SIZES[0]), math.log(SIZES[1]))))
+    slant = SLANT if rng.uniform() < SLANTED else TILT
     drawn |= {"tool": str(rng.choice(TOOLS)), "size": size, "shape": rng.uniform(0, 1, 8).round(4).tolist(),
               "tilt": rng.uniform(-TILT, TILT, 2).round(4).tolist(),
-              "slant": rng.uniform(-TILT, TILT, 2).round(4).tolist()}  # fmt: skip
+              "slant": rng.uniform(-slant, slant, 2).round(4).tolist()}  # fmt: skip
     scene = tool_scene(site, drawn)
     assert scene.tool is not None
     radius = float(np.linalg.norm(scene.tool.vertices, axis=1).max())

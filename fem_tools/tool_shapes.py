@@ -43,13 +43,35 @@ def any_tool(drawn: Mapping[str, Any]) -> tuple[Tool, float]:
     elif name == "hull":  # of balls at random places: smooth, convex, like nothing else
         rng = np.random.default_rng((1e4 * shape).astype(np.int64))
         radii, centres = r * rng.uniform(0.2, 0.6, 5), r * rng.uniform(-0.7, 0.7, (5, 3))
-        ball = trimesh.creation.icosphere(3, 1.0).vertices
-        mesh = trimesh.convex.convex_hull((radii[:, None, None] * ball + centres[:, None]).reshape(-1, 3))
+        mesh = _balls(centres, radii)
+    elif name == "torus":  # a ring that lies flat, or a tyre that stands
+        mesh = trimesh.creation.torus(r, r * (0.2 + 0.25 * shape[1]), 64, 32)
+        if shape[2] < 0.5:
+            mesh.apply_transform(trimesh.transformations.rotation_matrix(np.pi / 2, [1, 0, 0]))
+    elif name == "pin":
+        thick = 1.2 + 1.8 * float(shape[1])
+        mesh = _balls(np.array([[0, 0, -12.0], [0, 0, 12.0]]), np.array([thick, thick]))
+    elif name in ("edge", "corner"):  # the rounded ridge of a roof, the rounded top of a pyramid, upside down
+        steep, long = np.tan(np.radians(25 + 35 * shape[1])), r * (0.5 + shape[2]) if name == "edge" else 0.0
+        high = 8.0 + r
+        top = [[x * (long + high / steep * (name == "corner")), y * high / steep, high / 2]
+               for x in (-1, 1) for y in (-1, 1)]  # fmt: skip
+        centres = np.array([[-long, 0, -high / 2], [long, 0, -high / 2], *top])
+        mesh = _balls(centres, np.full(6, 0.4 * fillet))
+    elif name == "plate":  # wider than a limb
+        wide = 30.0 + 20.0 * shape[1:3]
+        mesh = _hull(np.array([[1, 1], [1, -1], [-1, -1], [-1, 1]]) * wide, fillet, 12.0)
     else:
         made = extruded(letter(string.ascii_uppercase[int(25.99 * shape[1])], 2e-3 * max(r, 10.0)), -10e-3, 10e-3)
         mesh, rounding = trimesh.Trimesh(1e3 * made.vertices, made.faces, process=False), min(1e-3 * fillet, 2.5e-3)
     tilt = Rotation.from_euler("xy", drawn["tilt"]).as_matrix()
     return Tool(name, 1e-3 * np.asarray(mesh.vertices) @ tilt.T, np.asarray(mesh.faces)), rounding
+
+
+def _balls(centres: np.ndarray, radii: np.ndarray) -> trimesh.Trimesh:
+    """The convex hull of balls about centres (N, 3) of radii (N,)."""
+    ball = trimesh.creation.icosphere(3, 1.0).vertices
+    return trimesh.convex.convex_hull((radii[:, None, None] * ball + centres[:, None]).reshape(-1, 3))
 
 
 def _circle(radius: float) -> np.ndarray:
@@ -61,10 +83,10 @@ def _hull(outline: np.ndarray, fillet: float, height: float) -> trimesh.Trimesh:
     """A convex prism over an outline (N, 2) with all edges rounded: the hull of balls at its corners."""
     reach = np.linalg.norm(outline, axis=1)
     inner = outline * (1 - np.minimum(fillet / reach, 0.9))[:, None]
-    ball = trimesh.creation.icosphere(3, min(fillet, 0.9 * float(reach.min()))).vertices
+    radius = min(fillet, 0.9 * float(reach.min()))
     low, high = -height / 2 + fillet, height / 2 - fillet
     centres = np.concatenate([np.column_stack([inner, np.full(len(inner), z)]) for z in (low, high)])
-    return trimesh.convex.convex_hull((centres[:, None] + ball).reshape(-1, 3))
+    return _balls(centres, np.full(len(centres), radius))
 
 
 def rounded_tool(name: str, radius: float) -> Tool:
