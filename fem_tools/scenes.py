@@ -11,6 +11,7 @@ import numpy as np
 from stmpl_core.arrays import PerVertex, Points, Transform
 from stmpl_core.errors import InvalidInput, StmplError
 from stmpl_core.layer import SoftLayer
+from stmpl_core.soundness import border_distance
 from stmpl_core.tool import Tool
 
 if TYPE_CHECKING:
@@ -64,10 +65,7 @@ class Site:
     @cached_property
     def border_distance(self) -> PerVertex:
         """Of each vertex from the layer's open border, straight, (V,) [m]; infinite if it has none."""
-        points = self.layer.vertices[self.layer.border]
-        if not len(points):
-            return np.full(len(self.layer.vertices), np.inf)
-        return np.linalg.norm(self.layer.vertices[:, None] - points[None], axis=2).min(axis=1)
+        return border_distance(self.layer)
 
     def near(self, vertex: int, radius: float) -> np.ndarray:
         """Numbers of the vertices within `radius` [m] of one, on its side of the limb."""

@@ -59,7 +59,7 @@ def any_tool(drawn: Mapping[str, Any]) -> tuple[Tool, float]:
         centres = np.array([[-long, 0, -high / 2], [long, 0, -high / 2], *top])
         mesh = _balls(centres, np.full(6, 0.4 * fillet))
     elif name == "plate":  # wider than a limb
-        wide = 30.0 + 20.0 * shape[1:3]
+        wide = 15.0 + 10.0 * shape[1:3]
         mesh = _hull(np.array([[1, 1], [1, -1], [-1, -1], [-1, 1]]) * wide, fillet, 12.0)
     else:
         made = extruded(letter(string.ascii_uppercase[int(25.99 * shape[1])], 2e-3 * max(r, 10.0)), -10e-3, 10e-3)

@@ -99,7 +99,7 @@ def conform(layer: SoftLayer, near: Surroundings, displacement: VertexVectors, t
 
 def _tool(touch: Touch, pressed: Pressed, layer: SoftLayer) -> _Tool:
     assert touch.pressure is not None
-    field, squeeze, forced = pressed
+    field, squeeze, forced, _ = pressed
     v = squeeze.vertices
     pressure, size = touch.pressure[v], touch.force
     way = -layer.normals[v]

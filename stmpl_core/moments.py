@@ -18,7 +18,6 @@ from stmpl_core.response import (
     VECTORS,
     WIDTH,
     feel,
-    feel_few,
     packed,
     response_table,
     sink_between,
@@ -74,6 +73,7 @@ class Surroundings:
         frames: tangent, tangent, outward normal of each vertex, (V, 3, 3) [-].
         curvature: thickness times the skin's curvature in the tangents, xx, xy, yy, (V, 3) [-]; convex is positive.
         slope: gradient of the thickness along the tangents, (V, 2) [-].
+        bent: both in the layer's axes, a (3, 3) tensor and a vector, (V, 12) [-].
     """
 
     def __init__(self, layer: SoftLayer) -> None:
@@ -81,17 +81,16 @@ class Surroundings:
         points = np.ascontiguousarray(layer.vertices)
         self._thinning = Thinning(layer, self.frames, REACH)
         self._frames = self.frames.astype(np.float32)
-        root, spread = layer.thickness**-0.5, np.log(SPREAD * layer.vertex_areas**0.5 / SPREADS[0])
-        half_log = 0.5 * np.log(layer.thickness)
-        rows = [*(points - points.mean(axis=0)).T, root, layer.vertex_areas, half_log, spread - half_log]
-        rows += [*layer.normals.T]
-        self._sites = np.ascontiguousarray(rows, dtype=np.float32)
+        self._sites = _sites(points, layer.normals, layer.thickness, layer.vertex_areas)
         shape = _shape(self._thinning.start, self._thinning.index, points, self.frames, layer.thickness)
         self.curvature, self.slope = shape[:, :3], shape[:, 3:]
+        tangents, (xx, xy, yy) = self.frames[:, :2], self.curvature.T
+        own = np.stack([xx, xy, xy, yy], axis=1).reshape(-1, 2, 2)
+        bend, slope = tangents.transpose(0, 2, 1) @ own @ tangents, np.einsum("va,vax->vx", self.slope, tangents)
+        self.bent = np.concatenate([bend.reshape(-1, 9), slope], axis=1)
         self._response = np.ascontiguousarray(np.moveaxis(response_table(layer.tissue.poisson_ratio), 2, 0))
         with packed():
             self._felt(np.zeros((1, 1)), np.zeros(1, np.int64), np.zeros(1, np.int32), moments=True)
-            self.felt_among(np.zeros(1, np.int64), np.zeros((1, 2)))
 
     def asked(self, loaded: np.ndarray) -> Asked:
         """Vertices that must be asked under sources at vertices `loaded` (L,), for all to be known."""
@@ -101,20 +100,12 @@ class Surroundings:
         """Response and moments, at the vertices that are asked or at all, of source fields (V, S) over E [-]."""
         loaded = np.flatnonzero(sources.any(axis=1)) if asked is None else asked.loaded
         vertices = self._thinning.reached(loaded) if asked is None else asked.vertices
-        return Felt(vertices, self._felt(sources[loaded], loaded, vertices, moments=True))
-
-    def felt_among(self, vertices: np.ndarray, sources: np.ndarray) -> Felt:
-        """Response and moments at vertices (N,) of sources there alone, (N, S) [-]: on one thread."""
-        figures = np.zeros((len(vertices), sources.shape[1], WIDTH), dtype=np.float32)
-        values = np.ascontiguousarray(sources.T, dtype=np.float32)
-        feel_few(vertices, values, np.ascontiguousarray(self._sites[:, vertices]), self._sites, self._frames,
-                  self._response[0], self._response[1], True, figures)  # fmt: skip
-        return Felt(vertices, figures)
+        return Felt(vertices, self._by_groups(sources[loaded], loaded, vertices, moments=True))
 
     def linear(self, source: np.ndarray) -> np.ndarray:
         """Linear response alone to one source field (V,) [-], (V, 3) [m]."""
         asked = self.asked(np.flatnonzero(source))
-        figures = self._felt(source[asked.loaded, None], asked.loaded, asked.vertices, moments=False)
+        figures = self._by_groups(source[asked.loaded, None], asked.loaded, asked.vertices, moments=False)
         local = figures[:, 0, :3] * self._thickness[asked.vertices, None]
         out = np.zeros((len(self.frames), 3))
         asked.fill(np.einsum("nj,nji->ni", local, self.frames[asked.vertices]), out)
@@ -136,17 +127,45 @@ class Surroundings:
         out = np.zeros((len(vertices), len(vertices)), dtype=np.float32)
         sources = np.ascontiguousarray(self._sites[:, vertices])
         sink_between(vertices, sources, self._sites, self._frames, self._response[0], out)
-        return out
+        group = self.groups(vertices)
+        return np.where(group[:, None] == group, out, np.float32(0)) if group.any() else out
 
     def spread(self, vertices: np.ndarray, sources: np.ndarray) -> np.ndarray:
         """Vectors (N, 3) at vertices (N,) spread as sinking spreads, (V, 3)."""
-        asked = self._thinning.asked_again(vertices)
-        by, out = np.empty((len(asked.vertices), 3)), np.zeros((len(self.frames), 3))
-        values = np.ascontiguousarray(sources.T, dtype=np.float32)
-        spread_sinking(asked.vertices, values, np.ascontiguousarray(self._sites[:, vertices]), self._sites,
-                       self._frames, self._response[0], by)  # fmt: skip
+        asked, out = self._thinning.asked_again(vertices), np.zeros((len(self.frames), 3))
+        by, group = np.zeros((len(asked.vertices), 3)), self.groups(vertices)
+        for one in range(group.max(initial=0) + 1):
+            of = np.flatnonzero(group == one)
+            there, some = self._reached(vertices[of], asked.vertices, alone=not group.any()), vertices[of]
+            part = np.empty((len(there), 3))
+            values = np.ascontiguousarray(sources[of].T, dtype=np.float32)
+            spread_sinking(asked.vertices[there], values, np.ascontiguousarray(self._sites[:, some]), self._sites,
+                           self._frames, self._response[0], part)  # fmt: skip
+            by[there] += part
         asked.fill(by, out)
         return out
+
+    def groups(self, vertices: np.ndarray) -> np.ndarray:
+        """Numbers of groups of vertices (N,), none of which feels another, (N,): all 0 where the skin has no folds."""
+        return self._thinning.groups(vertices)
+
+    def _reached(self, loaded: np.ndarray, vertices: np.ndarray, alone: bool) -> np.ndarray:
+        """Places in `vertices` of those that feel a load; of all, where there is no other."""
+        if alone:
+            return np.arange(len(vertices))
+        return np.flatnonzero(np.isin(vertices, self._thinning.reached(loaded)))
+
+    def _by_groups(self, sources: np.ndarray, loaded: np.ndarray, vertices: np.ndarray, moments: bool) -> np.ndarray:
+        """As _felt; no vertex feels a load that is near it through the air only."""
+        group = self.groups(loaded)
+        if not group.any():
+            return self._felt(sources, loaded, vertices, moments)
+        figures = np.zeros((len(vertices), sources.shape[1], WIDTH), dtype=np.float32)
+        for one in range(group.max() + 1):
+            of = group == one
+            there = self._reached(loaded[of], vertices, alone=False)
+            figures[there] += self._felt(sources[of], loaded[of], vertices[there], moments)
+        return figures
 
     def _felt(self, sources: np.ndarray, loaded: np.ndarray, vertices: np.ndarray, moments: bool) -> np.ndarray:
         figures = np.zeros((len(vertices), sources.shape[1], WIDTH), dtype=np.float32)
@@ -154,6 +173,14 @@ class Surroundings:
         feel(vertices, values, np.ascontiguousarray(self._sites[:, loaded]), self._sites, self._frames,
               self._response[0], self._response[1], moments, figures)  # fmt: skip
         return figures
+
+
+def _sites(points: np.ndarray, normals: np.ndarray, thickness: np.ndarray, area: np.ndarray) -> np.ndarray:
+    """Points as the kernels take them, see stmpl_core.response.feel, (10, N) float32."""
+    half_log = 0.5 * np.log(thickness)
+    spread = np.log(SPREAD * area**0.5 / SPREADS[0]) - half_log
+    rows = [*(points - points.mean(axis=0)).T, thickness**-0.5, area, half_log, spread, *normals.T]
+    return np.ascontiguousarray(rows, dtype=np.float32)
 
 
 def _frames(normals: np.ndarray) -> np.ndarray:

@@ -18,6 +18,7 @@ from typing import Any, Literal, Self
 import numpy as np
 
 from stmpl_core.errors import InvalidInput
+from stmpl_core.obstacle import RINGS
 from stmpl_core.response import SCALARS, VECTORS, WIDTH
 
 MIXED_VECTORS, MIXED_TENSORS = 6, 4  # combinations of a vertex's vectors and tensors whose products are inputs
@@ -98,20 +99,39 @@ MOTION = Layout(
     slope=1,
     log_error=1,
 )
-PRESSURE = Layout(log_ratio=1, log_error=1)  # output: log of pressure over Winkler's
+PRESSURE = Layout(log_ratio=1, log_error=1)  # output: log of pressure over that of the linear layer
 
-ARRAYS = ("mix_vectors", "mix_tensors", "low", "high", "mean", "scale", "w1", "b1", "w2", "b2", "w3", "b3", "w4", "b4")
+# What the first layer of a ContactNet reads of a contact node; written by stmpl_core.contact_net alone.
+NODE = Layout(
+    log_pressure=1,  # of the linear layer, over E
+    pressure=1,
+    log_strain=1,
+    strain=1,
+    log_moments=2 * RINGS,  # of pressure and strain on rings around the node
+    vector_sizes=2,  # lengths of their first moments, over the second ring's
+    vectors_together=1,  # product of these vectors
+    mean_curvature=1,
+    squared_bend=1,
+    curvature_along_vector=1,
+    slope_along_vector=1,
+    squared_slope=1,
+    poisson_ratio=1,
+    volumetric=1,  # 1 / (1.02 - 2 nu)
+)
 
 Kind = Literal["motion", "pressure", "image"]  # what a network says: a MomentNet, a ContactNet, a UNet
+READS: dict[Kind, Layout] = {"motion": INPUTS, "pressure": NODE}
 SAYS: dict[Kind, Layout] = {"motion": MOTION, "pressure": PRESSURE}
+_LAYERS = ("low", "high", "mean", "scale", "w1", "b1", "w2", "b2", "w3", "b3", "w4", "b4")
+ARRAYS: dict[Kind, tuple[str, ...]] = {"motion": ("mix_vectors", "mix_tensors", *_LAYERS), "pressure": _LAYERS}
 
 
 @dataclass(frozen=True, eq=False)
 class Weights:
-    """A trained network over INPUTS.
+    """A trained network of three hidden layers.
 
     Args:
-        arrays: arrays by the names in ARRAYS, float32; w of shape (inputs, outputs).
+        arrays: arrays by the names in ARRAYS of its kind, float32; w of shape (inputs, outputs).
         card: record of what made it and what it is good for (see studies.train_moments).
     """
 
@@ -138,7 +158,8 @@ class Weights:
         except SafetensorError as error:
             raise InvalidInput(f"{path} holds no weights: {error}.") from error
         shapes = {name: a.shape for name, a in arrays.items()}
-        if set(shapes) != set(ARRAYS) or (shapes["w1"][0], shapes["w4"][1]) != (INPUTS.size, SAYS[kind].size):
+        ends = READS[kind].size, SAYS[kind].size
+        if set(shapes) != set(ARRAYS[kind]) or (shapes["w1"][0], shapes["w4"][1]) != ends:
             raise InvalidInput(f"{path} holds no network of this kind and version.")
         return cls({name: np.ascontiguousarray(a, dtype=np.float32) for name, a in arrays.items()},
                    json.loads(card.read_text()))  # fmt: skip
@@ -149,7 +170,7 @@ class Weights:
 
         path = Path(path)
         path.parent.mkdir(parents=True, exist_ok=True)
-        save_file({name: np.ascontiguousarray(self.arrays[name]) for name in ARRAYS}, path)
+        save_file({name: np.ascontiguousarray(self.arrays[name]) for name in sorted(self.arrays)}, path)
         path.with_suffix(".json").write_text(json.dumps(self.card, indent=1) + "\n")
 
 

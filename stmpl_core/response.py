@@ -97,7 +97,6 @@ def feel(vertices, values, sources, sites, frames, sink, away, moments, out):
                 _take_moments(values, felt, sums, out[n])
 
 
-feel_few = numba.njit(cache=True, fastmath=FAST, error_model="numpy")(feel)
 feel = numba.njit(cache=True, parallel=True, fastmath=FAST, error_model="numpy")(feel)
 
 

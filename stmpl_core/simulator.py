@@ -20,6 +20,7 @@ from stmpl_core.touch import Answer, Touch
 from stmpl_core.toucher import Toucher
 from stmpl_core.trust import Displacement, Trust
 
+MOST_MOVED = 0.95  # motion over the thickness from which it is held back
 MAX_ENTERED_SHARE = 0.02  # depth of skin inside a tool over the thickness, which is not yet said
 
 
@@ -85,11 +86,14 @@ class Simulator:
         """Finds the displacement of the skin under touches of this simulator."""
         # Sum: pressures of several tools add.
         zero = np.zeros(len(self.layer.vertices))
-        load = Load.contact(sum((touch.pressure for touch in touches if touch.pressure is not None), zero))
+        pressing = [(touch.pressure, touch.pressed.factor) for touch in touches
+                    if touch.pressure is not None and touch.pressed is not None]  # fmt: skip
+        pressure = sum((one for one, _ in pressing), zero)
 
         # Solve: the method moves the skin, and what is touched lies on its tool; where nothing presses, nothing moves.
-        if load.values.any():
-            solved = self.method.solve(load)
+        if pressing:
+            moving = sum((one / factor for one, factor in pressing), zero)
+            solved = self.method.solve(Load.contact(moving))
             fitted = conform(self.layer, self.skin.near, solved.displacement, touches)
         else:
             solved = Displacement(np.zeros_like(self.layer.vertices), Trust(), self.method.name)
@@ -99,11 +103,27 @@ class Simulator:
         trust = _joined(solved.trust, touches, fitted)
         if fitted.entered > MAX_ENTERED_SHARE * float(self.layer.thickness.min()):
             trust = trust.also(f"skin is {fitted.entered * 1e3:.2f} mm inside a tool", in_range=False)
-        return Answer(fitted.displacement, trust, solved.method, load.values, {touch.name: touch for touch in touches})
+        displacement, cut = _within(fitted.displacement, self.layer.thickness)
+        if cut:
+            trust = trust.also(f"{cut} vertices would move further than there is skin: held back", in_range=False)
+        return Answer(displacement, trust, solved.method, pressure, {touch.name: touch for touch in touches})
 
     def step(self, contacts: Sequence[Contact]) -> Answer:
         """`touch`, then `answer`. Raises what `touch` raises."""
         return self.answer(self.touch(contacts))
+
+
+def _within(displacement: np.ndarray, thickness: np.ndarray) -> tuple[np.ndarray, int]:
+    """The displacement, no longer than the layer is thick anywhere, and how many vertices were held back."""
+    length = np.linalg.norm(displacement, axis=1)
+    long = np.flatnonzero(length > MOST_MOVED * thickness)
+    if not len(long):
+        return displacement, 0
+    over = (length[long] / thickness[long] - MOST_MOVED) / (1 - MOST_MOVED)
+    held = thickness[long] * (MOST_MOVED + (1 - MOST_MOVED) * np.tanh(over))  # smooth, and never further
+    out = displacement.copy()
+    out[long] *= (held / length[long])[:, None]
+    return out, len(long)
 
 
 def _joined(trust: Trust, touches: Sequence[Touch], fitted: Conformed) -> Trust:

@@ -22,7 +22,7 @@ OFFSET_STEPS = 13  # offsets that are tried before the best is refined
 OFFSET_TOLERANCE_M = 5e-6  # error of the offset at which the search ends
 OFFSET_PENALTY = 2e-3  # relative error of the forces up to which the smaller of two offsets is taken
 MAX_RESIDUAL = 0.15  # relative error of the forces that may be left; with more it is no skin of one stiffness
-MAX_RELATIVE_ERROR = 0.25  # standard error of the modulus over it
+MAX_RELATIVE_ERROR = 0.2  # standard error of the modulus over it
 OFFSET_MARGIN_M = 1e-4  # distance from the ends of the search, within which the offset may as well lie outside
 
 

@@ -12,6 +12,7 @@ from stmpl_core.layer import SoftLayer
 ZONES = (2.0, 4.5)  # distances from the load, over t, at which the first and the second thinning begin
 SPACINGS = (0.7, 1.5)  # least distances between the vertices that are asked there, over t
 CORNERS = 12  # number of asked vertices from which one between is filled in
+CHUNK = 64  # vertices that one thread takes at a time
 LARGEST = 2.5  # sum of the weights' sizes, from which a vertex is rather asked itself: it would be extrapolated
 
 
@@ -50,11 +51,14 @@ class Thinning:
         layer: soft layer at rest.
         frames: two tangents and the normal of each vertex, (V, 3, 3).
         reach: distance to which a load is felt, over t.
+
+    Attributes:
+        folded: flag of a skin that comes near itself through the air, as fingers do.
     """
 
     def __init__(self, layer: SoftLayer, frames: np.ndarray, reach: float) -> None:
         points, normals, thickness = np.ascontiguousarray(layer.vertices), layer.normals, layer.thickness
-        self.start, self.index = neighbours(points, normals, thickness, np.array([*ZONES, reach]))
+        self.start, self.index = neighbours(points, normals, thickness, layer.faces, np.array([*ZONES, reach]))
         count = len(points)
         self._last: Asked | None = None
         self._stands = np.zeros((len(ZONES) + 1, count), dtype=np.bool_)
@@ -72,6 +76,15 @@ class Thinning:
             self._stands[zone, some] = False
             self._corners[zone, some], self._weights[zone, some] = corners[some], weights[good]
 
+        some = np.flatnonzero(self._stands[-1])
+        self.folded = _folded(self.start, self.index, some, points, normals, thickness, ZONES[1])
+
+    def groups(self, vertices: np.ndarray) -> np.ndarray:
+        """Numbers of groups of vertices (N,), none of which feels another, (N,): all 0 where the skin has no folds."""
+        if not self.folded or len(vertices) < 2:
+            return np.zeros(len(vertices), np.int64)
+        return _together(self.start, self.index, vertices, len(self._stands[0]))
+
     def reached(self, loaded: np.ndarray) -> np.ndarray:
         """All vertices with a loaded one in reach, in order."""
         return np.flatnonzero(_zones(self.start, self.index, loaded, len(self._stands[0]))).astype(np.int32)
@@ -88,53 +101,126 @@ class Thinning:
         return last if last is not None and np.array_equal(last.loaded, loaded) else self.asked(loaded)
 
 
-def neighbours(points: np.ndarray, normals: np.ndarray, thickness: np.ndarray, reaches: np.ndarray) -> tuple:
+def neighbours(points: np.ndarray, normals: np.ndarray, thickness: np.ndarray, faces: np.ndarray,
+               reaches: np.ndarray) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
     """Pairs within each of `reaches`, rising, thicknesses (their geometric mean), normals less than 90 degrees apart.
+
+    Only along the skin: a vertex is a neighbour if edges lead to it that never come back nearer, or if it is beside one
+    that is. So what is near through the air, as another finger, is none.
 
     Returns:
         start (Z V + 1,), index: the neighbours of vertex v, itself among them, that lie between reach z - 1 and reach
         z of Z are index[start[Z v + z] : start[Z v + z + 1]].
     """
-    cell = reaches[-1] * float(thickness.max())
-    place = ((points - points.min(axis=0)) / cell).astype(np.int64)
-    shape = place.max(axis=0) + 1
-    key = (place[:, 0] * shape[1] + place[:, 1]) * shape[2] + place[:, 2]
-    order = np.argsort(key, kind="stable")
-    first = np.searchsorted(key[order], np.arange(shape.prod() + 1))
-    rows = np.column_stack([points, normals, thickness])[order]  # those of a cell side by side
+    ends = np.concatenate([faces[:, [k, (k + 1) % 3]] for k in range(3)])
+    ends = np.unique(np.concatenate([ends, ends[:, ::-1]]), axis=0)
+    first = np.searchsorted(ends[:, 0], np.arange(len(points) + 1))
+    beside = np.ascontiguousarray(ends[:, 1], dtype=np.int32)
+    rows = np.column_stack([points, normals, thickness])
     start = np.zeros(len(reaches) * len(points) + 1, dtype=np.int64)
-    _pairs(rows, reaches, place, shape, order, first, start, np.empty(0, dtype=np.int32))
+    _flood(rows, reaches, first, beside, start, np.empty(0, dtype=np.int32))
     start = np.cumsum(start)
     index = np.empty(start[-1], dtype=np.int32)
-    _pairs(rows, reaches, place, shape, order, first, start, index)
+    _flood(rows, reaches, first, beside, start, index)
     return start, index
 
 
 @numba.njit(cache=True, parallel=True, error_model="numpy")
-def _pairs(rows, reaches, place, shape, order, first, start, index):
+def _flood(rows, reaches, first, beside, start, index):
     """Counts the neighbours of vertex i in zone z into start[Z i + z + 1], or where `index` has room writes them."""
-    zones, writing = len(reaches), len(index) > 0
+    count, zones, writing = len(rows), len(reaches), len(index) > 0
     squares = reaches**2
-    for q in numba.prange(len(rows)):
-        i = order[q]
-        n = np.zeros(zones, np.int64)
-        px, py, pz, nx, ny, nz, t = rows[q]
-        for a in range(max(place[i, 0] - 1, 0), min(place[i, 0] + 2, shape[0])):
-            for b in range(max(place[i, 1] - 1, 0), min(place[i, 1] + 2, shape[1])):
-                k = (a * shape[1] + b) * shape[2]
-                for m in range(first[k + max(place[i, 2] - 1, 0)], first[k + min(place[i, 2] + 2, shape[2])]):
-                    x, y, z = px - rows[m, 0], py - rows[m, 1], pz - rows[m, 2]
-                    away = (x * x + y * y + z * z) / (t * rows[m, 6])
-                    if away < squares[-1] and nx * rows[m, 3] + ny * rows[m, 4] + nz * rows[m, 5] > 0:
-                        zone = 0
-                        while away >= squares[zone]:
-                            zone += 1
-                        if writing:
-                            index[start[zones * i + zone] + n[zone]] = order[m]
-                        n[zone] += 1
-        if not writing:
-            for zone in range(zones):
-                start[zones * i + zone + 1] = n[zone]
+    for chunk in numba.prange((count + CHUNK - 1) // CHUNK):
+        seen, away = np.full(count, -1, np.int32), np.empty(count)
+        queue, side, n = np.empty(count, np.int32), np.empty(count, np.int32), np.empty(zones, np.int64)
+        for i in range(CHUNK * chunk, min(CHUNK * (chunk + 1), count)):
+            n[:] = 0
+            many, ends, sides = 0, 1, 0
+            queue[0], seen[i], away[i] = i, 2 * i + 1, 0.0
+            while many < ends:
+                k = queue[many]
+                many += 1
+                for p in range(first[k], first[k + 1]):
+                    j = beside[p]
+                    if seen[j] == 2 * i + 1:
+                        continue
+                    if seen[j] != 2 * i:  # not looked at yet
+                        x, y, z = rows[j, 0] - rows[i, 0], rows[j, 1] - rows[i, 1], rows[j, 2] - rows[i, 2]
+                        facing = rows[i, 3] * rows[j, 3] + rows[i, 4] * rows[j, 4] + rows[i, 5] * rows[j, 5]
+                        away[j] = (x * x + y * y + z * z) if facing > 0 else np.inf
+                        seen[j] = 2 * i
+                        if away[j] < squares[-1] * rows[i, 6] * rows[j, 6]:
+                            side[sides] = j
+                            sides += 1
+                        else:
+                            away[j] = np.inf
+                    if away[j] < np.inf and away[j] >= away[k]:
+                        seen[j] = 2 * i + 1
+                        queue[ends] = j
+                        ends += 1
+            for m in range(sides):  # beside the flood
+                if seen[side[m]] == 2 * i:
+                    queue[ends] = side[m]
+                    ends += 1
+            for m in range(ends):
+                j = queue[m]
+                square, zone = away[j] / (rows[i, 6] * rows[j, 6]), 0
+                while square >= squares[zone]:
+                    zone += 1
+                if writing:
+                    index[start[zones * i + zone] + n[zone]] = j
+                n[zone] += 1
+            if not writing:
+                for zone in range(zones):
+                    start[zones * i + zone + 1] = n[zone]
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _folded(start, index, some, points, normals, thickness, reach):
+    """Whether any two of `some` vertices are near each other through the air, but not along the skin."""
+    count = len(points)
+    zones = (len(start) - 1) // count
+    near = np.full(count, -1)
+    for a in range(len(some)):
+        i = some[a]
+        for p in range(start[zones * i], start[zones * (i + 1)]):
+            near[index[p]] = i
+        for b in range(len(some)):
+            j = some[b]
+            if near[j] == i:
+                continue
+            away = facing = 0.0
+            for x in range(3):
+                away += (points[i, x] - points[j, x]) ** 2
+                facing += normals[i, x] * normals[j, x]
+            if facing > 0 and away < reach**2 * thickness[i] * thickness[j]:
+                return True
+    return False
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _together(start, index, some, count):
+    """Numbers of groups of `some` vertices, within each of which each is a neighbour of another."""
+    zones = (len(start) - 1) // count
+    place, group, queue = np.full(count, -1), np.full(len(some), -1), np.empty(len(some), np.int64)
+    for n in range(len(some)):
+        place[some[n]] = n
+    groups = 0
+    for n in range(len(some)):
+        if group[n] >= 0:
+            continue
+        queue[0], group[n], many, ends = n, groups, 0, 1
+        while many < ends:
+            i = some[queue[many]]
+            many += 1
+            for p in range(start[zones * i], start[zones * (i + 1)]):
+                m = place[index[p]]
+                if m >= 0 and group[m] < 0:
+                    group[m] = groups
+                    queue[ends] = m
+                    ends += 1
+        groups += 1
+    return group
 
 
 @numba.njit(cache=True, error_model="numpy")

@@ -36,11 +36,13 @@ class Pressed(NamedTuple):
         field: distance field of the tool.
         squeeze: columns that the tool squeezes.
         way: unit vector of the force that moved the tool, (3,), or None where the pose alone was given.
+        factor: factor on the pressure of a tool that was drawn back from the core: it stiffens, and moves no skin.
     """
 
     field: SignedDistance
     squeeze: Squeeze
     way: np.ndarray | None
+    factor: float = 1.0
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,9 +11,11 @@ import numpy as np
 from stmpl_core.arrays import Transform
 from stmpl_core.columns import HOLE_RADIUS, NO_SQUEEZE, Clearance, Columns, Squeeze
 from stmpl_core.contact import Contact
-from stmpl_core.contact_net import ContactNet, Held
+from stmpl_core.contact_net import NOTHING, ContactNet, Held
+from stmpl_core.deep import DEEPEST, Deep
 from stmpl_core.layer import SoftLayer
 from stmpl_core.moments import Surroundings
+from stmpl_core.nodes import Nodes
 from stmpl_core.sdf import MARGIN, SignedDistance
 from stmpl_core.tools import Tools
 from stmpl_core.touch import (
@@ -40,10 +42,13 @@ MAX_DRAG_RATIO = 0.3  # tangential over normal force that is not yet worth a wor
 MAX_FIELD_ERROR_M = 5e-4  # error of a distance field that is not yet worth a word
 MAX_UNSEEN_FORCE_SHARE = 0.1  # share of the force that vertices unlike all training contacts may carry
 MAX_PRESSED_STRAIN = 0.85  # depth over thickness beyond which no wrench presses a tool
-FORCE_TOLERANCE = 0.02  # relative error of the force at which trials end; the rest of the way is reckoned
-MAX_DEPTH_TRIALS = 12  # trials of the depth for one wrench
-FIRST_SHARE_POWER = -0.25  # power of Winkler's force with which the skin's share of it falls, until a trial says more
-MAX_SHARE_CHANGE = 1.4  # factor by which that share is taken to change at most from trial to trial
+STIFFENING = 10.0  # growth of the force beyond, relative, a thickness of the way that it was drawn back
+FORCE_TOLERANCE = 0.015  # relative error of the force at which trials end; the rest of the way is reckoned
+FIRST_TOLERANCE = 3e-3  # the same for the first trial, which knows no power yet
+LEAST_STEP = 2e-4  # step of the depth, over the thickness, that is likewise only reckoned
+MAX_DEPTH_TRIALS = 14  # trials of the depth for one wrench
+FIRST_POWER = 1.4  # power of the depth with which the force grows, until a trial says more
+POWERS = (0.7, 6.0)  # range of that power
 MANY_TOOLS = 8  # number of tools from which those that are apart are told by a tree of boxes
 
 
@@ -60,6 +65,7 @@ class _Placed(NamedTuple):
     force: float | None  # force to carry along the mean normal [N]; None: what the pose presses with
     why: str = ""
     held: Held | None = None  # pressures of the skin against this tool alone, where they are known
+    factor: float = 1.0  # on the pressures: what a tool that was drawn back presses more
 
 
 class Toucher:
@@ -88,9 +94,8 @@ class Toucher:
         self.tools = Tools(margin_on(layer)) if tools is None else tools
         self.columns, self.net = Columns(layer), ContactNet(layer, near=self.near)
         self._modulus = layer.tissue.youngs_modulus
-        self._confined = layer.tissue.confined_modulus / self._modulus
         self._thickest = float(layer.thickness.max())
-        self._inward = self.columns.inward
+        self._inward, self.deep = self.columns.inward, Deep(self.columns)
 
     def touch(self, contact: Contact) -> Touch:
         """Touch of one contact alone. Raises MeshError: a surface that cannot be a tool."""
@@ -98,25 +103,19 @@ class Toucher:
 
     def touch_all(self, contacts: Sequence[Contact]) -> list[Touch]:
         """Touches of several contacts at once: tools side by side feel each other through the skin."""
+        if not contacts:
+            return []
         many = len(contacts) >= MANY_TOOLS
         placed = [self._place(contact, self.tools.field(contact.tool), many) for contact in contacts]
-        pressing = [one for one in placed if len(one.squeeze.vertices)]
-        if len(pressing) == 1:
-            together = pressing[0].squeeze
-        elif pressing:
-            together = _joined([one.squeeze for one in pressing], len(self.layer.vertices))
+        pressing = sorted((one for one in placed if len(one.squeeze.nodes.area)), key=lambda one: one.contact.name)
+        if len(pressing) == 1 and (alone := pressing[0].held):
+            held = {pressing[0].contact.name: alone}
         else:
-            return [self._answer(one, np.empty(0), np.empty(0), 0.0) for one in placed]
-        held = pressing[0].held if len(pressing) == 1 else None
-        held = held or self.net.hold(together.vertices, together.pressure, together.strain)
-        share, out = held.pressure / together.pressure, []
-        for one in placed:
-            at = np.searchsorted(together.vertices, one.squeeze.vertices)
-            pressure = one.squeeze.pressure * share[at] * self._modulus
-            doubt = one.squeeze.pressure * held.doubt[at] / together.pressure[at] * self._modulus
-            strange = float(pressure[held.outside[at]].sum() / max(pressure.sum(), 1e-300))
-            out.append(self._answer(one, pressure, doubt, strange))
-        return out
+            together = self.net.hold(Nodes.joined([one.squeeze.nodes for one in pressing]))
+            ends = np.cumsum([len(one.squeeze.nodes.area) for one in pressing])[:-1]
+            parts = zip(*(np.split(values, ends) for values in together), strict=True)
+            held = {one.contact.name: Held(*part) for one, part in zip(pressing, parts, strict=False)}
+        return [self._answer(one, held.get(one.contact.name, NOTHING)) for one in placed]
 
     def _place(self, contact: Contact, field: SignedDistance, many: bool) -> _Placed:
         """Where the tool presses, or why it does not."""
@@ -129,20 +128,32 @@ class Toucher:
         def nothing(status: str) -> _Placed:
             return _Placed(contact, field, status, pose, depth, 0.0, NO_SQUEEZE, 0.0)
 
-        force = contact.wrench[:3] if contact.wrench is not None else None
-        if force is None:
-            if not len((squeeze := self.columns.squeeze(field, pose, clearance)).vertices):
-                return nothing(APART)
-            return _Placed(contact, field, self._status_by_pose(squeeze), pose, depth, 0.0, squeeze, None)
-        if not force.any():
-            return nothing(APART if depth <= 0 else NO_FORCE)
+        force, tool = contact.wrench[:3] if contact.wrench is not None else None, contact.tool.vertices
+        light = force is not None and 0 < depth < 0.5 * float(self.layer.thickness[near].min())
+        squeeze = NO_SQUEEZE if light else self.columns.squeeze(field, pose, clearance)
+        inside = not light and not len(squeeze.nodes.area) and self.deep.inside(field, pose, tool)
+        if force is not None and not force.any():
+            return nothing(NO_FORCE if depth > 0 or inside else APART)
+        if inside or self.deep.strain(squeeze) >= DEEPEST:
+            back, drawn, way = self.deep.drawn_back(field, pose, tool, squeeze)
+            core = inside or bool((squeeze.depth >= self.layer.thickness[squeeze.vertices]).any())
+            if force is None:
+                return _Placed(contact, field, IN_CORE if core else BY_POSE, back, self._depth(drawn) + way, -way,
+                               drawn, None, factor=1 + STIFFENING * way / self._thickest)  # fmt: skip
+            pose, near = back, self.columns.near(field, back, self._thickest + self.hole + reach)
+            clearance = self.columns.clearance(field, pose, near, self.hole + reach)
+        elif force is None:
+            return _Placed(contact, field, BY_POSE, pose, depth, 0.0, squeeze, None) if len(squeeze.nodes.area) \
+                else nothing(APART)
         gap = self._gap(field, pose, clearance, force)
         if gap is None:
             return nothing(NO_TOUCH)
-        return self._pressed(contact, field, clearance, depth, gap, force) or nothing(PULLING)
+        return self._pressed(contact, field, pose, clearance, depth, gap) or nothing(PULLING)
 
-    def _status_by_pose(self, squeeze: Squeeze) -> str:
-        return IN_CORE if (squeeze.depth >= self.layer.thickness[squeeze.vertices]).any() else BY_POSE
+    def _depth(self, squeeze: Squeeze) -> float:
+        """Depth of the deepest column [m]."""
+        nodes = squeeze.nodes
+        return max(float(squeeze.depth.max(initial=0.0)), float((nodes.strain * nodes.thickness).max(initial=0.0)))
 
     def _gap(self, field: SignedDistance, pose: Transform, clearance: Clearance, force: np.ndarray) -> float | None:
         """How far a tool that is apart must go along `force` to be 0 from the skin that faces it, by sphere tracing.
@@ -165,86 +176,83 @@ class Toucher:
             moved += gap
         return best
 
-    def _pressed(self, contact: Contact, field: SignedDistance, stated: Clearance, depth: float, gap: float,
-                 force: np.ndarray) -> _Placed | None:  # fmt: skip
-        """The tool moved along `force` until it presses with its component along the contact normal.
+    def _pressed(self, contact: Contact, field: SignedDistance, start: Transform, stated: Clearance, depth: float,
+                 gap: float) -> _Placed | None:  # fmt: skip
+        """The tool moved along its force until it presses with its component along the contact normal.
 
-        Each trial takes the next from Winkler's columns, each of which keeps its share of the pressure; how far that
-        was wrong bends the one after. All inside a bracket.
-        None: the force points away from the skin.
+        From trial to trial the force grows with a power of the depth, the last two trials say which. All inside a
+        bracket. None: the force points away from the skin.
         """
-        layer, push, start = self.layer, force / np.linalg.norm(force), contact.pose_body_from_tool
+        assert contact.wrench is not None
+        layer, force = self.layer, contact.wrench[:3]
+        push, stated_at = force / np.linalg.norm(force), contact.pose_body_from_tool[:3, 3]
         low, high, moved, best = -np.inf, np.inf, gap, None
-        last: tuple[float, float] | None = None  # force of the trial before, and what it promised for this one
-        bend = FIRST_SHARE_POWER
+        last: tuple[float, float] | None = None  # depth and force of the trial before
+        power, back = FIRST_POWER, 0.1 * self._thickest
         for _ in range(MAX_DEPTH_TRIALS):
             pose, clearance = _shifted(start, moved * push), stated
             if moved:
                 near = stated.vertices[~(stated.least > abs(moved) + 2 * self.hole) | np.isinf(stated.least)]
                 clearance = self.columns.clearance(field, pose, near, self.hole)
             squeeze = self.columns.squeeze(field, pose, clearance)
-            v = squeeze.vertices
-            if not (self._inward[v] @ push > MIN_FACING_COSINE).any():
-                if best is None and gap == 0.0 and len(v):
+            v, strain = squeeze.vertices, self.deep.strain(squeeze)
+            if not (self._inward[v] @ push > MIN_FACING_COSINE).any() or not len(squeeze.nodes.area):
+                if best is None and gap == 0.0 and len(squeeze.nodes.area):
                     return None
                 low = max(low, moved)
                 moved += 0.05 * self._thickest if not np.isfinite(high) else 0.5 * (high - moved)
                 continue
-            held = self.net.hold(v, squeeze.pressure, squeeze.strain)
-            pressure = held.pressure * self._modulus
-            vector = -(pressure @ layer.vertex_area_vectors[v])
+            held = self.net.hold(squeeze.nodes)
+            some, pressure = squeeze.nodes.at_vertices(held.pressure * self._modulus, layer.vertex_areas)
+            vector = -(pressure @ layer.vertex_area_vectors[some])
             size = float(np.linalg.norm(vector))
-            if size <= MIN_NET_FORCE_SHARE * float(pressure @ layer.vertex_areas[v]):
-                return _Placed(contact, field, WRAPPED, start, depth, 0.0, NO_SQUEEZE, 0.0)
+            if size <= MIN_NET_FORCE_SHARE * float(pressure @ layer.vertex_areas[some]):
+                return _Placed(contact, field, WRAPPED, contact.pose_body_from_tool, depth, 0.0, NO_SQUEEZE, 0.0)
             normal = float(force @ vector) / size
             if normal <= 0:
                 return None
+            if strain > MAX_PRESSED_STRAIN + 0.02:  # too deep, whatever it presses with
+                high, back = min(high, moved), 2 * back
+                moved = 0.5 * (low + high) if np.isfinite(low) else moved - back
+                continue
             status = MOVED if gap > MAX_TOUCHING_GAP * self.hole else TOUCHING
-            best = _Placed(contact, field, status, pose, depth, moved, squeeze, normal, held=held)
-            if last is not None:
-                bend = float(np.clip(np.log(size / last[1]) / np.log(last[1] / last[0]), -0.8, 2.0))
-            times = normal / size
-            times *= float(np.clip(times ** (-bend / (1 + bend)), 1 / MAX_SHARE_CHANGE, MAX_SHARE_CHANGE))
-            further = self._deeper(squeeze, clearance, push, times)
-            if abs(size / normal - 1) < FORCE_TOLERANCE:  # the rest is small enough to go without another look
+            way = float((pose[:3, 3] - stated_at) @ push)
+            best = _Placed(contact, field, status, pose, depth, way, squeeze, normal, held=held)
+            deep = self._depth(squeeze)
+            if last is not None and abs(deep / last[0] - 1) > 1e-6:
+                power = float(np.clip(np.log(size / last[1]) / np.log(deep / last[0]), *POWERS))
+            gain = max(normal / float(np.linalg.norm(force)), MIN_FACING_COSINE)
+            further = deep * ((normal / size) ** (1 / power) - 1) / gain
+            tolerance = FORCE_TOLERANCE if last else FIRST_TOLERANCE
+            if abs(size / normal - 1) < tolerance or abs(further) < LEAST_STEP * self._thickest:
                 under = np.where(squeeze.depth > 0, squeeze.depth + further * (self._inward[v] @ push), 0.0)
-                return best._replace(pose=_shifted(pose, further * push), moved=moved + further,
+                return best._replace(pose=_shifted(pose, further * push), moved=way + further,
                                      squeeze=squeeze._replace(depth=np.maximum(under, 0.0)))  # fmt: skip
-            deepest = float((squeeze.depth / layer.thickness[v]).max())
-            if size < normal and deepest > MAX_PRESSED_STRAIN - 0.01:
-                why = (f"{contact.name} asks for {normal:.2g} N along the skin's normal; pressed to "
-                       f"{deepest:.0%} of the layer it has {size:.2g} N")
-                return best._replace(why=why)
-            low, high = (moved, high) if size < normal else (low, moved)
-            last = size, size * times
-            following = moved + further
+            if size < normal and strain > MAX_PRESSED_STRAIN - 0.01:
+                why = (f"{contact.name} carries {size:.2g} of {normal:.2g} N along the skin's normal, "
+                       f"pressed to {strain:.0%} of the layer")  # fmt: skip
+                return best._replace(force=size, why=why)
+            low, high, last = (moved, high, (deep, size)) if size < normal else (low, moved, (deep, size))
+            room = (MAX_PRESSED_STRAIN - strain) * self._thickest / gain
+            following = moved + min(further, max(room, 0.002 * self._thickest))
             if not low < following < high:  # halve the bracket, or go to where its open end must be
                 least = 0.05 * self._thickest
                 inside = np.isfinite(high - low)
                 following = 0.5 * (low + high) if inside else min(high - least, max(low + least, following))
             moved = following
+        if best is not None and best.force is not None:
+            best = best._replace(force=min(size, best.force), why=f"{contact.name} did not settle within 2 %")
         return best
 
-    def _deeper(self, squeeze: Squeeze, clearance: Clearance, push: np.ndarray, times: float) -> float:
-        """How much further a tool must go to press `times` as hard, if columns keep their share of Winkler's [m]."""
-        near = np.union1d(clearance.vertices, squeeze.vertices)  # a long triangle reaches beyond what was looked at
-        gain, thickness, depth = self._inward[near] @ push, self.layer.thickness[near], np.full(len(near), -np.inf)
-        depth[np.searchsorted(near, clearance.vertices)] = -clearance.least
-        carry = np.searchsorted(near, squeeze.vertices)
-        depth[carry] = np.where(squeeze.depth > 0, squeeze.depth, squeeze.strain / self._confined * thickness[carry])
-        some = (gain > MIN_FACING_COSINE) & np.isfinite(depth)
-        gain, thickness, depth, near = gain[some], thickness[some], depth[some], near[some]
-        room = (MAX_PRESSED_STRAIN * thickness - depth) / gain if times > 1 else np.maximum(depth, 0.0) / gain
-        most = float(room.min() if times > 1 else room.max())
-        return self.columns.deeper(near, gain * self.layer.vertex_areas[near], depth, gain, times, most)
-
-    def _answer(self, one: _Placed, pressure: np.ndarray, doubt: np.ndarray, strange: float) -> Touch:
+    def _answer(self, one: _Placed, held: Held) -> Touch:
         """What a placed tool does, scaled to its wrench, with what may be believed of it."""
-        layer, v = self.layer, one.squeeze.vertices
+        layer, nodes = self.layer, one.squeeze.nodes
+        there = held.pressure * (one.factor * self._modulus)
+        v, pressure = nodes.at_vertices(there, layer.vertex_areas)
+        scale = 1.0
         if one.force is not None and len(v):
-            vector = pressure @ layer.vertex_area_vectors[v]
-            scale = one.force / max(float(np.linalg.norm(vector)), 1e-300)
-            pressure, doubt = scale * pressure, scale * doubt
+            scale = one.force / max(float(np.linalg.norm(pressure @ layer.vertex_area_vectors[v])), 1e-300)
+            pressure = scale * pressure
         values = np.zeros(len(layer.vertices))
         values[v] = pressure
         forces = -pressure[:, None] * layer.vertex_area_vectors[v]
@@ -252,18 +260,21 @@ class Toucher:
         turning = arms.T @ forces  # its antisymmetric part is the torque
         torque = (turning[1, 2] - turning[2, 1], turning[2, 0] - turning[0, 2], turning[0, 1] - turning[1, 0])
         wrench = np.array([*forces.sum(axis=0), *torque])
-        stated, squeezed = one.contact.wrench, one.squeeze.depth
-        depth = float(squeezed.max()) if len(squeezed) and squeezed.any() else one.depth
+        stated = one.contact.wrench
+        depth = self._depth(one.squeeze) if len(v) and not one.factor > 1 else one.depth
         way = stated[:3] / np.linalg.norm(stated[:3]) if stated is not None and stated[:3].any() else None
+        doubt = scale * one.factor * self._modulus * float(held.doubt @ nodes.area)
         touch = Touch(
             one.contact.name, one.status, one.pose, wrench,
             depth=depth if np.isfinite(depth) else float("nan"),
-            force_bound=float(self.net.weights.card["bound"]["factor"]) * float(doubt @ layer.vertex_areas[v]),
+            force_bound=float(self.net.weights.card["bound"]["factor"]) * doubt,
             moved=one.moved,
             missing=np.zeros(6) if stated is None else stated - wrench,
             pressure=values,
-            pressed=Pressed(one.field, one.squeeze, way) if values.any() else None,
+            pressed=Pressed(one.field, one.squeeze, way, one.factor) if values.any() else None,
         )  # fmt: skip
+        forces_there = there * nodes.area
+        strange = float(forces_there[held.outside].sum() / max(forces_there.sum(), 1e-300))
         return replace(touch, trust=self._trust(one, touch, pressure, strange))
 
     def _trust(self, one: _Placed, touch: Touch, pressure: np.ndarray, strange: float) -> Trust:
@@ -278,6 +289,8 @@ class Toucher:
         }  # fmt: skip
         if one.status in why:
             trust = trust.also(why[one.status], in_range=False if one.status != PULLING else None)
+        if one.status == NO_FORCE and one.contact.wrench is not None and one.contact.wrench[3:].any():
+            trust = trust.also(f"{name} asks for a torque without a force, which is not carried", in_range=False)
         if one.why:
             trust = trust.also(one.why, in_range=False)
         if not len(pressure):
@@ -286,7 +299,7 @@ class Toucher:
         if ratio > highest:
             trust = trust.also(f"{name} presses with p/E = {ratio:.2g}; contacts were learnt up to {highest:.2g}",
                                in_range=False)  # fmt: skip
-        deepest = float((one.squeeze.depth / layer.thickness[one.squeeze.vertices]).max())
+        deepest = touch.depth / float(one.squeeze.nodes.thickness.mean())
         if deepest > card["ranges"]["depth_over_thickness"][1] and one.status != IN_CORE:
             trust = trust.also(f"{name} presses to {deepest:.0%} of the thickness, learnt is "
                                f"{card['ranges']['depth_over_thickness'][1]:.0%}", in_range=False)  # fmt: skip
@@ -297,10 +310,10 @@ class Toucher:
         if strange > MAX_UNSEEN_FORCE_SHARE:
             trust = trust.also(f"{strange:.0%} of the force of {name} is where no training contact was like it",
                                in_range=False)  # fmt: skip
-        if abs(one.moved) > self.reach:
+        if one.force is not None and abs(one.moved) > self.reach:
             trust = trust.also(f"{name} was moved {one.moved * 1e3:+.1f} mm along its force: check its calibration")
         if touch.drag > MAX_DRAG_RATIO * touch.force:
-            trust = trust.also(f"{name} also drags with {touch.drag:.2g} N, which is not carried")
+            trust = trust.also(f"{name} also drags with {touch.drag:.2g} N, which is not carried", in_range=False)
         if one.field.surface_error > MAX_FIELD_ERROR_M:
             error_mm = one.field.surface_error * 1e3
             trust = trust.also(f"the distance field of {name} is off by up to {error_mm:.1f} mm")
@@ -320,15 +333,3 @@ def _shifted(pose: Transform, by: np.ndarray) -> Transform:
     out = pose.copy()
     out[:3, 3] += by
     return out
-
-
-def _joined(squeezes: Sequence[Squeeze], count: int) -> Squeeze:
-    """Several tools' squeezes as one: two tools share a vertex only where each has a part of its triangles."""
-    pressure, strain, depth, rests = np.zeros((4, count))
-    for one in squeezes:
-        pressure[one.vertices] += one.pressure
-        strain[one.vertices] += one.strain
-        depth[one.vertices] = np.maximum(depth[one.vertices], one.depth)
-        rests[one.vertices] = np.maximum(rests[one.vertices], one.rests)
-    v = np.flatnonzero(pressure)
-    return Squeeze(v, pressure[v], strain[v], depth[v], rests[v])

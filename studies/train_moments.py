@@ -109,33 +109,66 @@ def _points(near: Surroundings, layer: SoftLayer, load: Load, displacement: np.n
     return np.concatenate(rows, axis=1), local, layer.thickness[v] / peak
 
 
-class Model(nn.Module):
+class Layers(nn.Module):
+    """The layers of a network, which keep their inputs within what they were trained on.
+
+    Args:
+        hidden: width of each hidden layer.
+        reads: layout of the inputs.
+        says: layout of what the last layer says.
+    """
+
+    def __init__(self, hidden: int, reads: Layout, says: Layout) -> None:
+        super().__init__()
+        ends = (reads.size, hidden), (hidden, hidden), (hidden, hidden), (hidden, says.size)
+        self.layers = nn.ModuleList(nn.Linear(a, b) for a, b in ends)
+        nn.init.zeros_(self.layers[-1].weight)  # type: ignore[arg-type]
+        nn.init.zeros_(self.layers[-1].bias)  # type: ignore[arg-type]
+        for name, value in (("low", -1.0), ("high", 1.0), ("mean", 0.0), ("scale", 1.0)):
+            self.register_buffer(name, torch.full((reads.size,), value))
+
+    def take_range(self, inputs: Tensor) -> None:
+        """Takes the range and the spread of each input from examples (N, inputs)."""
+        with torch.no_grad():
+            low, high = inputs.amin(dim=0), inputs.amax(dim=0)
+            self.low, self.high = low - 0.02 * (high - low), high + 0.02 * (high - low)
+            self.mean, self.scale = inputs.mean(dim=0), 1 / (inputs.std(dim=0) + 1e-6)
+
+    def think(self, inputs: Tensor) -> tuple[Tensor, Tensor]:
+        """The last layer, (N, outputs), and its last column once more, learnt without bending the others."""
+        h = (torch.minimum(torch.maximum(inputs, self.low), self.high) - self.mean) * self.scale
+        for layer in self.layers[:-1]:  # type: ignore[index]
+            h = layer(h)
+            h = h * (0.5 + 0.5 * h / (1 + h.abs()))
+        last: Any = self.layers[-1]
+        return last(h), last.weight[-1] @ h.detach().T + last.bias[-1]
+
+    def weights(self, card: dict[str, Any]) -> Weights:
+        """What the method loads."""
+        own = [name for name, _ in self.named_parameters() if not name.startswith("layers")]
+        arrays = {name: getattr(self, name).detach().numpy().copy() for name in (*own, "low", "high", "mean", "scale")}
+        for k, layer in enumerate(self.layers, start=1):
+            arrays[f"w{k}"] = np.ascontiguousarray(layer.weight.detach().numpy().T)  # type: ignore[union-attr]
+            arrays[f"b{k}"] = layer.bias.detach().numpy().copy()  # type: ignore[union-attr]
+        return Weights(arrays, card)
+
+
+class Model(Layers):
     """The network of stmpl_core.methods.moment_net, in torch: the same inputs, with gradients.
 
     Args:
         hidden: width of each hidden layer.
-        says: layout of what the last layer says.
     """
 
-    def __init__(self, hidden: int, says: Layout = MOTION) -> None:
-        super().__init__()
+    def __init__(self, hidden: int) -> None:
+        super().__init__(hidden, INPUTS, MOTION)
         self.mix_vectors = nn.Parameter(torch.randn(MIXED_VECTORS, DIRECTIONS) / DIRECTIONS**0.5)
         self.mix_tensors = nn.Parameter(torch.randn(MIXED_TENSORS, 2 * TENSORS) / (2 * TENSORS) ** 0.5)
-        self.layers = nn.ModuleList(
-            nn.Linear(a, b) for a, b in ((INPUTS.size, hidden), (hidden, hidden), (hidden, hidden), (hidden, says.size))
-        )
-        nn.init.zeros_(self.layers[-1].weight)  # type: ignore[arg-type]
-        nn.init.zeros_(self.layers[-1].bias)  # type: ignore[arg-type]
-        for name, value in (("low", -1.0), ("high", 1.0), ("mean", 0.0), ("scale", 1.0)):
-            self.register_buffer(name, torch.full((INPUTS.size,), value))
 
     def normalise(self, rows: Tensor) -> None:
         """Takes the inputs' ranges and spreads from points (N, POINT.size)."""
         with torch.no_grad():
-            inputs, *_ = self._inputs(rows)
-            low, high = inputs.amin(dim=0), inputs.amax(dim=0)
-            self.low, self.high = low - 0.02 * (high - low), high + 0.02 * (high - low)
-            self.mean, self.scale = inputs.mean(dim=0), 1 / (inputs.std(dim=0) + 1e-6)
+            self.take_range(self._inputs(rows)[0])
 
     def _inputs(self, rows: Tensor) -> tuple[Tensor, ...]:
         known = POINT.split(rows)
@@ -182,7 +215,7 @@ class Model(nn.Module):
     def forward(self, rows: Tensor) -> tuple[Tensor, Tensor]:
         """Motion over thickness in the vertex's frame (N, 3), and log of the error to expect of it over g (N,)."""
         inputs, g, vectors, turned, curved, slope, prior = self._inputs(rows)
-        out, doubt = self._think(inputs)
+        out, doubt = self.think(inputs)
         say = MOTION.split(out)
         coefficients = torch.cat([say["directions"], say["turned"], say["curved"]], dim=1)[:, :, None]
         directions = torch.cat([vectors, turned, curved], dim=1)
@@ -190,27 +223,6 @@ class Model(nn.Module):
         a = AMPLITUDE * g / (1 + g)
         log_error = doubt + torch.log(a[:, 0].detach())
         return prior + a * torch.cat([along, say["normal"]], dim=1), log_error
-
-    def outputs(self, rows: Tensor) -> tuple[Tensor, Tensor]:
-        """The last layer alone, (N, outputs), and its last column once more, learnt without bending the others."""
-        return self._think(self._inputs(rows)[0])
-
-    def _think(self, inputs: Tensor) -> tuple[Tensor, Tensor]:
-        h = (torch.minimum(torch.maximum(inputs, self.low), self.high) - self.mean) * self.scale
-        for layer in self.layers[:-1]:  # type: ignore[index]
-            h = layer(h)
-            h = h * (0.5 + 0.5 * h / (1 + h.abs()))
-        last: Any = self.layers[-1]
-        return last(h), last.weight[-1] @ h.detach().T + last.bias[-1]
-
-    def weights(self, card: dict[str, Any]) -> Weights:
-        """What the method loads."""
-        arrays = {name: getattr(self, name).detach().numpy().copy()
-                  for name in ("mix_vectors", "mix_tensors", "low", "high", "mean", "scale")}  # fmt: skip
-        for k, layer in enumerate(self.layers, start=1):
-            arrays[f"w{k}"] = np.ascontiguousarray(layer.weight.detach().numpy().T)  # type: ignore[union-attr]
-            arrays[f"b{k}"] = layer.bias.detach().numpy().copy()  # type: ignore[union-attr]
-        return Weights(arrays, card)
 
 
 def _act(tensors: Tensor, vectors: Tensor) -> Tensor:
@@ -302,7 +314,7 @@ def train_moments(
     return card
 
 
-def training_card(data: str | Path, source: Dataset, settings: BaseModel, model: Model, ranges: dict[str, list[float]],
+def training_card(data: str | Path, source: Dataset, settings: BaseModel, model: Layers, ranges: dict[str, list[float]],
                   **counts: int) -> dict[str, Any]:  # fmt: skip
     """What made a network: the card beside its weights, but for its bound and the minutes that it took.
 

@@ -106,5 +106,5 @@ def test_the_go_library_reads_what_was_recovered(go_reader, tmp_path):
 
 
 def test_the_go_library_reads_the_sample(go_reader):
-    found = agrees(go_reader, SAMPLE / "run.mcap")
+    found = agrees(go_reader, SAMPLE / "run_0.mcap")
     assert {"/skin/topology", "/skin/displacement", "/contact_mesh", "/tools/probe/pose"} <= set(found["topics"])

@@ -22,6 +22,7 @@ from stmpl_core.methods import Linear, MomentNet, Winkler
 from tests.bag_scene import START, cdr, header, stmpl, tube, write_run
 
 SAMPLE = Path(__file__).parent.parent / "bags" / "sample"
+BEFORE = Path(__file__).with_name("recording_before")  # the first 3.4 s of a sample from before stmpl_msgs/Touch
 HEADER = "std_msgs/msg/Header"
 CHUNKS, EACH = 4, 5
 NUMBERS = list(range(CHUNKS * EACH))
@@ -227,7 +228,7 @@ def test_replay_exits_with_1_unless_the_recorded_method_repeats_itself(tmp_path,
 
 def test_the_sample_is_small_whole_and_read_by_rosbags():
     bag = Bag(SAMPLE)
-    assert bag.finished and not bag.damage and bag.file.stat().st_size < 2e6
+    assert bag.finished and not bag.damage and bag.file.stat().st_size < 2.5e6
     assert {"weights/moment_net", "weights/contact_net", "numpy"} <= set(bag.provenance.versions)
     with Reader(SAMPLE) as reader:
         counts = {connection.topic: connection.msgcount for connection in reader.connections}
@@ -242,10 +243,10 @@ def test_the_sample_replays_as_recorded():
 
 def test_the_answers_of_a_recording_from_before_touches_are_read_and_say_what_they_knew():
     """Its messages name tools, statuses and stamps alone: pose, wrench, depth and bound are not a number."""
-    bag = Bag(SAMPLE)
+    bag = Bag(BEFORE)
     schemas = [record for record in walk(bag.file) if isinstance(record, Schema)]
     (told,) = {schema.data for schema in schemas if schema.name.endswith("SkinDisplacement")}
-    assert b"string[] statuses" in told and b"Touch" not in told, "the sample is of today's form: give an older one"
+    assert b"string[] statuses" in told and b"Touch" not in told, "it is of today's form: give an older one"
     frames, sent = list(bag.frames()), (one.message for one in bag.messages(lambda topic: "displacement" in topic))
     assert len(frames) == bag.answers > 100 and any(frame.touches for frame in frames)
     for frame, message in zip(frames, sent, strict=True):
@@ -256,4 +257,4 @@ def test_the_answers_of_a_recording_from_before_touches_are_read_and_say_what_th
             assert frame.inputs[touch.name][0] > 0 and touch.pressure is None
             assert np.isnan([touch.depth, touch.force_bound, *touch.wrench, *touch.pose_body_from_tool.ravel()]).all()
     pressed = next(frame for frame in frames if any(touch.presses for touch in frame.touches.values()))
-    assert [contact.name for contact in Run(SAMPLE).contacts(pressed)] == list(pressed.touches)
+    assert [contact.name for contact in Run(BEFORE).contacts(pressed)] == list(pressed.touches)

@@ -97,7 +97,7 @@ def test_zero_wrench_moves_nothing_at_any_pose(sim: Simulator, depth: float) -> 
     assert touch_of(answer).status == (NO_FORCE if depth > 0 else APART)
 
 
-@pytest.mark.parametrize("force", [(-0.3, 0, 0), (-0.2, 0.1, 0.05), (-2.0, -0.4, 0.3)])
+@pytest.mark.parametrize("force", [(-0.3, 0, 0), (-0.2, 0.1, 0.05), (-0.4, -0.08, 0.06)])
 @pytest.mark.parametrize("mesh, x", [(BALL, RADIUS + 0.010), (PUNCH, RADIUS + 0.008)])
 def test_load_sums_to_the_normal_component_of_the_wrench(
     sim: Simulator, mesh: object, x: float, force: tuple[float, float, float]
@@ -364,9 +364,11 @@ def test_a_tool_on_triangles_of_unlike_sizes_carries_its_wrench(seed: int) -> No
             if touch_of(answer).status in (TOUCHING, MOVED):
                 normal = total(sim.layer, answer.pressure)
                 size = np.linalg.norm(normal)
-                assert size == pytest.approx(float(force @ normal) / size, rel=1e-6)
-                carried += 1
-    assert carried > 30
+                less = "carries" in answer.trust.why or "settle" in answer.trust.why  # than was asked, and says so
+                assert less or size == pytest.approx(float(force @ normal) / size, rel=1e-6)
+                assert size < (1 + 1e-6) * float(force @ normal) / size
+                carried += not less
+    assert carried > 25
 
 
 def test_pulling_loads_nothing(sim: Simulator) -> None:
@@ -381,7 +383,8 @@ def test_a_closed_band_has_no_direction(sim: Simulator) -> None:
     squeezed = sim.step([press(ring, at(0, 0, MIDDLE), None)])
     assert touch_of(squeezed).status == BY_POSE
     under = np.abs(LIMB.vertices[:, 2] - MIDDLE) < 0.008
-    np.testing.assert_allclose(squeezed.magnitude[under], 0.002, atol=1.5e-4)
+    np.testing.assert_allclose(squeezed.magnitude[under], 0.002, atol=3e-4)
+    assert np.median(np.abs(squeezed.magnitude[under] - 0.002)) < 5e-5
 
 
 def test_two_fingers_far_apart_add(sim: Simulator) -> None:
@@ -408,7 +411,7 @@ def test_fingers_side_by_side_feel_each_other_and_each_carries_its_own(toucher: 
     with_wrench = [press(small, pose, (-f, 0, 0), name) for pose, f, name in zip(poses, forces, "ab", strict=True)]
     for one, f in zip(toucher.touch_all(with_wrench), forces, strict=True):
         normal = one.wrench[:3] / np.linalg.norm(one.wrench[:3])
-        assert np.linalg.norm(one.wrench[:3]) == pytest.approx(-f * normal[0], rel=1e-9)
+        assert np.linalg.norm(one.wrench[:3]) == pytest.approx(-f * normal[0], rel=1e-6)
 
 
 def test_what_is_touched_together_does_not_depend_on_the_order(toucher: Toucher) -> None:
@@ -432,7 +435,7 @@ def test_a_tool_in_the_core_is_said_and_still_answered(sim: Simulator) -> None:
 
 
 def test_a_ball_presses_about_as_hard_as_finite_elements_say() -> None:
-    """By pose, on a limb that nothing was learnt from; columns alone press much too hard."""
+    """By pose, on a limb that nothing was learnt from."""
     layer = limb(4e-3)
     field, depths, toucher = SignedDistance.of(ball(subdivisions=4)), np.array([2e-3, 4e-3]), Toucher(layer)
     tool_above = Press(field, at(RADIUS + 0.02, 0, MIDDLE), np.array([-1.0, 0, 0]))
@@ -441,20 +444,20 @@ def test_a_ball_presses_about_as_hard_as_finite_elements_say() -> None:
         contact = press(BALL, answer.tools[0].pose_body_from_tool, None)
         toucher.tools.add(contact.tool, field)
         touch = toucher.touch(contact)
-        assert touch.pressed
-        squeeze = touch.pressed.squeeze
-        columns = layer.tissue.youngs_modulus * float(
-            np.linalg.norm(squeeze.pressure @ layer.vertex_area_vectors[squeeze.vertices]))  # fmt: skip
         force = float(np.linalg.norm(touch.wrench[:3]))
         assert touch.depth == pytest.approx(depth, abs=2e-4)
-        assert force == pytest.approx(answer.force, rel=0.15)
-        assert abs(force - answer.force) < abs(columns - answer.force)
+        assert force == pytest.approx(answer.force, rel=0.08)
 
 
-def test_pressure_beyond_what_was_validated_is_flagged_and_not_clipped(sim: Simulator) -> None:
-    answer = sim.step([press(BALL, on_limb(), (-5, 0, 0))])
-    assert not answer.trust.in_range and "p/E" in answer.trust.why and "asks for" in answer.trust.why
-    assert total(LIMB, answer.pressure)[0] == pytest.approx(-5, rel=1e-3)
+@pytest.mark.parametrize("force", [5, 200, 1e20])
+def test_what_the_skin_cannot_carry_is_said_and_not_scaled(sim: Simulator, force: float) -> None:
+    """A tool is pressed to 85 % of the layer and no further, whatever is asked."""
+    answer = sim.step([press(BALL, on_limb(), (-force, 0, 0))])
+    touch = touch_of(answer)
+    assert not answer.trust.in_range and "carries" in answer.trust.why
+    assert 0.3 < touch.force < 1 and touch.force == pytest.approx(-total(LIMB, answer.pressure)[0], rel=1e-3)
+    assert touch.missing[0] == pytest.approx(touch.force - force, rel=1e-3)
+    assert answer.magnitude.max() < LIMB.thickness.max()
 
 
 def test_bad_input_is_refused_with_a_reason(sim: Simulator) -> None:

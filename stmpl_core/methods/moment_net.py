@@ -17,6 +17,7 @@ from stmpl_core.methods.winkler import column_stretch
 from stmpl_core.moments import Surroundings
 from stmpl_core.networks import DIRECTIONS, INPUTS, MIXED_TENSORS, MIXED_VECTORS, MOTION, Weights, shipped
 from stmpl_core.response import FAST, SCALARS, TENSORS, VECTORS
+from stmpl_core.soundness import border_distance, longest_over_width, slope_of_thickness
 from stmpl_core.thinning import Asked
 from stmpl_core.trust import Displacement, Trust
 
@@ -29,6 +30,11 @@ OUTSIDE_SHARE = 0.3  # share of the moving vertices whose inputs may be unlike t
 
 STEEP = 0.25  # slope of the thickness from triangle to triangle; trained is up to 0.2
 STEEP_SHARE = 0.02  # share of the moving vertices that may be so steep
+
+LONG = 2.2  # length of a triangle over its width; trained is up to about 2
+LONG_SHARE = 0.05  # share of the moving vertices that may be in such
+BORDER = 2.0  # distance of a load from the open border, over t; nearer the worst vertex is 6 to 21 % off
+BORDER_SHARE = 0.05  # share of the load that may be nearer
 
 BLOCK = 32  # vertices in one matrix product; OpenBLAS takes one thread for up to 2^18 multiplications
 
@@ -79,7 +85,9 @@ class MomentNet:
         self._shape = np.concatenate([near.curvature, near.slope], axis=1).astype(np.float32)
         self._frames = near.frames.astype(np.float32) * layer.thickness[:, None, None].astype(np.float32)
         self._width = EDGE_OVER_ROOT_AREA * np.sqrt(layer.vertex_areas) / layer.thickness
-        self._steep = _slope_of_thickness(layer) > STEEP
+        self._steep = slope_of_thickness(layer) > STEEP
+        self._long = longest_over_width(layer) > LONG
+        self._border = border_distance(layer) / layer.thickness
         self._layer = layer
         if self.fallback is not None:
             self.fallback.prepare(layer)
@@ -148,20 +156,19 @@ class MomentNet:
         moving = length > 0.02 * length.max()
         share = _share(outside, moving, asked)
         ratio = float(pressure[loaded].max()) / layer.tissue.youngs_modulus
-        t, nu = layer.thickness[asked.vertices[moving]], layer.tissue.poisson_ratio
+        nu = layer.tissue.poisson_ratio
         fine, coarse = _tenths(self._width[asked.vertices[moving]])
         trust = Trust(figures={"peak_ratio": ratio, "outside_share": share, "expected_error_m": error})
         ranges = card["ranges"]
-        for what, low, high, unit in (
-            (f"p_over_e_{load.kind}", min(ratio, 0.0), ratio, ""),
-            ("poisson_ratio", nu, nu, ""),
-            ("thickness_mm", 1e3 * float(t.min()), 1e3 * float(t.max()), " mm"),
-            ("edge_over_thickness", EVEN * fine, coarse / EVEN, ""),
+        for what, low, high in (
+            (f"p_over_e_{load.kind}", min(ratio, 0.0), ratio),
+            ("poisson_ratio", nu, nu),
+            ("edge_over_thickness", EVEN * fine, coarse / EVEN),
         ):
             least, most = ranges[what]
             if low < least - 1e-3 * abs(least) or high > most + 1e-3 * abs(most):
                 worst = high if high > most else low
-                trust = trust.also(f"{what} is {worst:.3g}{unit}, trained is {least:.3g} to {most:.3g}", in_range=False)
+                trust = trust.also(f"{what} is {worst:.3g}, trained is {least:.3g} to {most:.3g}", in_range=False)
         if pressure.min() < 0:
             trust = trust.also("the load pulls, the network was trained under pressure only", in_range=False)
         if share > OUTSIDE_SHARE:
@@ -169,6 +176,14 @@ class MomentNet:
             trust = trust.also(why, in_range=False)
         if (steep := _share(self._steep[asked.vertices], moving, asked)) > STEEP_SHARE:
             why = f"the thickness changes by more than {STEEP:g} mm a mm at {steep:.0%} of the vertices that move"
+            trust = trust.also(why, in_range=False)
+        if (long := _share(self._long[asked.vertices], moving, asked)) > LONG_SHARE:
+            why = f"triangles are longer than {LONG:g} times their width at {long:.0%} of the vertices that move"
+            trust = trust.also(why, in_range=False)
+        size = pressure[loaded] * layer.vertex_areas[loaded]
+        if float(size[self._border[loaded] < BORDER].sum()) > BORDER_SHARE * float(size.sum()):
+            nearest = float(self._border[loaded].min())
+            why = f"the load comes to {nearest:.1f} thicknesses from the open border; trained is from {BORDER:g} on"
             trust = trust.also(why, in_range=False)
         bound = float(card["bound"]["factor"]) * error
         return Trust(trust.converged, trust.in_range, bound if trust.in_range else None, trust.why, trust.figures)
@@ -185,21 +200,6 @@ def _share(some: np.ndarray, moving: np.ndarray, asked: Asked) -> float:
         return 0.0
     counts = asked.stand_for
     return float(counts[both].sum() / counts[moving].sum())
-
-
-def _slope_of_thickness(layer: SoftLayer) -> np.ndarray:
-    """Root mean square over the triangles around each vertex of the thickness's gradient along them, (V,) [-]."""
-    a, b, c = (layer.vertices[layer.faces[:, k]] for k in range(3))
-    s, t, u = (layer.thickness[layer.faces[:, k], None] for k in range(3))
-    areas = np.linalg.norm(layer.face_area_vectors, axis=1)
-    normals, double = layer.face_area_vectors / areas[:, None], 2 * areas
-    turned = s * np.cross(normals, c - b) + t * np.cross(normals, a - c) + u * np.cross(normals, b - a)
-    square = ((turned / double[:, None]) ** 2).sum(axis=1) * double
-    sums, weights = np.zeros(len(layer.vertices)), np.zeros(len(layer.vertices))
-    for corner in range(3):
-        np.add.at(sums, layer.faces[:, corner], square)
-        np.add.at(weights, layer.faces[:, corner], double)
-    return np.sqrt(sums / np.maximum(weights, 1e-300))
 
 
 def _tenths(values: np.ndarray) -> tuple[float, float]:

@@ -1,0 +1,200 @@
+"""Obstacle: the pressure with which a bonded linear layer holds a rigid tool off, and where: contact finds its area.
+
+At contact nodes the tool asks for depths d. With the layer's linear response G from forces q to depths,
+
+    q >= 0,    G q >= d,    q (G q - d) = 0
+
+(Signorini's problem). Solved by conjugate gradients on the nodes that press: Polonsky & Keer, Wear 231, 206-219, 1999.
+"""
+
+from __future__ import annotations
+
+from functools import cache
+from typing import NamedTuple
+
+import numba
+import numpy as np
+from scipy.special import j0
+
+from stmpl_core.response import FAST
+
+REACH = 8.0  # distance beyond which nodes do not feel each other, over t
+STEPS = 64  # rows of the layer's table a thickness
+NEAR = 4.0  # distance to which rings see, over t
+RING_AT = np.array([0.0, 0.5, 1.1, 1.9])  # radii of the rings, over t
+RING_WIDTH = np.array([0.3, 0.3, 0.4, 0.6])  # their widths, likewise
+RINGS = len(RING_AT)
+OWN = 3.921  # of an even pressure on a lattice of triangles: sum of 1 / r with this / sqrt(area) for the node itself
+TOLERANCE = 3e-6  # largest change of the forces of one iteration, over the largest, at which it ends
+MAX_ITERATIONS = 200
+
+
+class Response(NamedTuple):
+    """What a unit force does to a layer with E = t = 1, and how much of it a ring around a node sees.
+
+    Args:
+        half_space: factor (1 - nu^2) / pi on the response of the half-space.
+        rows: over the distance in thicknesses: what the layer's response is more; weight of each ring; weight of the
+            first moment, over the distance.
+    """
+
+    half_space: float
+    rows: np.ndarray
+
+
+class Linear(NamedTuple):
+    """The linear problem's answer at nodes.
+
+    Args:
+        pressure: pressure over E that holds the skin off, (N,) [-]; 0 where the skin leaves the tool.
+        moments: of pressure and strain on the rings, (N, 2, RINGS) [-].
+        vectors: their first moments, in the body's axes, (N, 2, 3) [-].
+    """
+
+    pressure: np.ndarray
+    moments: np.ndarray
+    vectors: np.ndarray
+
+
+@cache
+def response(poisson_ratio: float) -> Response:
+    """Tables for a flat bonded layer (see stmpl_core.response for its compliance A(k), and the sources).
+
+    The half-space takes the singular part, 2 (1 - nu^2) / k, so that nodes may be as close together as they like; the
+    rest of A falls with exp(-2 k).
+    """
+    nu, mu = poisson_ratio, 1 / (2 * (1 + poisson_ratio))
+    k = np.linspace(0, 14, 2801)[1:]
+    e = np.exp(-2 * k)
+    scale = mu * k * ((3 - 4 * nu) * (1 + e * e) + 2 * e * (2 * k * k + 5 - 12 * nu + 8 * nu * nu))
+    sink = (1 - nu) * ((3 - 4 * nu) * (1 - e * e) - 4 * k * e) / scale
+    radius = np.arange(int(REACH * STEPS) + 2) / STEPS
+    weight = (sink - 2 * (1 - nu * nu) / k) * k * (k[1] - k[0]) / (2 * np.pi)
+    layer = j0(np.outer(radius, k)) @ weight - (1 - nu * nu) * (k[1] - k[0]) / (2 * np.pi)  # the half step at k = 0
+    half_space = (1 - nu * nu) / np.pi
+    fade = np.clip((REACH - radius) / 1.5, 0, 1)
+    whole = half_space / np.maximum(radius, 1.0)
+    layer = np.where(radius > 1, (layer + whole) * fade * fade * (3 - 2 * fade) - whole, layer)
+    rings = np.exp(-0.5 * ((radius[:, None] - RING_AT) / RING_WIDTH) ** 2)
+    fade = np.clip(NEAR - radius, 0, 1)
+    rings *= (fade * fade * (3 - 2 * fade))[:, None]
+    rings /= (2 * np.pi * radius[:, None] * rings).sum(axis=0) / STEPS
+    along = rings[:, 1] * np.minimum(radius / 0.35, 1.0) / np.maximum(radius, 1 / STEPS)
+    return Response(half_space, np.column_stack([layer, rings, along]))
+
+
+def held_off(points: np.ndarray, inward: np.ndarray, thickness: np.ndarray, area: np.ndarray, strain: np.ndarray,
+             most: float, poisson_ratio: float, group: np.ndarray) -> Linear:  # fmt: skip
+    """How nodes are held off as a tool asks, and what each sees around it.
+
+    Args:
+        points, inward: nodes on the skin at rest and unit vectors into it, (N, 3) [m], [-].
+        thickness: thickness of the layer there, (N,) [m].
+        area: area that each stands for, (N,) [m2].
+        strain: depth that the tool asks for, over the thickness, (N,) [-].
+        most: strain up to which is solved [-].
+        poisson_ratio: nu.
+        group: numbers of groups of nodes that do not feel each other, (N,).
+    """
+    mean = float(thickness.mean())
+    table = response(poisson_ratio)
+    matrix, rings = _pairs(points, inward, thickness, area, group, mean, table.half_space, table.rows)
+    pressure = solve(matrix, np.minimum(strain, most) * thickness / mean) * mean**2 / area
+    return Linear(pressure, *_moments(rings, points, thickness, area, pressure, strain))
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _pairs(points, inward, thickness, area, group, mean, half_space, rows):
+    """Depth over `mean` of each node under a force E mean^2 at each, and its weights in rings, (N, N) and (N, N, .).
+
+    All of it is symmetric.
+    """
+    count, width = len(points), rows.shape[1] - 1
+    out, rings = np.zeros((count, count)), np.zeros((count, count, width), np.float32)
+    roots = 1 / np.sqrt(thickness)
+    own = np.sqrt(area) / OWN
+    for i in range(count):
+        for j in range(i + 1):
+            facing = inward[i, 0] * inward[j, 0] + inward[i, 1] * inward[j, 1] + inward[i, 2] * inward[j, 2]
+            x, y, z = (points[i, 0] - points[j, 0], points[i, 1] - points[j, 1], points[i, 2] - points[j, 2])
+            per = roots[i] * roots[j]
+            r = np.sqrt(x * x + y * y + z * z)
+            f = r * per * STEPS
+            if facing <= 0 or f >= REACH * STEPS or group[i] != group[j]:
+                continue
+            k = int(f)
+            f -= k
+            value = half_space / max(r, 0.5 * (own[i] + own[j])) + per * ((1 - f) * rows[k, 0] + f * rows[k + 1, 0])
+            out[i, j] = out[j, i] = mean * value
+            if k < NEAR * STEPS:
+                for m in range(width):
+                    weight = per * per * ((1 - f) * rows[k, m + 1] + f * rows[k + 1, m + 1])
+                    rings[i, j, m] = rings[j, i, m] = weight
+    return out, rings
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _moments(rings, points, thickness, area, pressure, strain):
+    """See Linear."""
+    count, last = len(points), rings.shape[2] - 1
+    moments, vectors = np.zeros((count, 2, last)), np.zeros((count, 2, 3))
+    for i in range(count):
+        for j in range(count):
+            p, s = area[j] * pressure[j], area[j] * strain[j]
+            for m in range(last):
+                moments[i, 0, m] += rings[i, j, m] * p
+                moments[i, 1, m] += rings[i, j, m] * s
+            for x in range(3):
+                along = rings[i, j, last] * (points[j, x] - points[i, x]) / thickness[i]
+                vectors[i, 0, x] += p * along
+                vectors[i, 1, x] += s * along
+    return moments, vectors
+
+
+@numba.njit(cache=True, fastmath=FAST, error_model="numpy")
+def solve(matrix, depth):
+    """Forces (N,) >= 0 with matrix @ forces >= depth, and equal where they are above 0."""
+    count = len(depth)
+    force, gap, way, along = np.zeros(count), np.empty(count), np.zeros(count), np.empty(count)
+    for i in range(count):
+        if depth[i] > 0:
+            force[i] = 0.3 * depth[i] / matrix[i, i]
+    before, restart = 1.0, True
+    for _ in range(MAX_ITERATIONS):
+        square = 0.0
+        for i in range(count):
+            total = -depth[i]
+            for j in range(count):
+                total += matrix[i, j] * force[j]
+            gap[i] = total
+            if force[i] > 0:
+                square += total * total
+        if square == 0:
+            break
+        for i in range(count):
+            way[i] = 0.0 if force[i] <= 0 else gap[i] + (0.0 if restart else square / before * way[i])
+        before = square
+        up = down = 0.0
+        for i in range(count):
+            total = 0.0
+            for j in range(count):
+                total += matrix[i, j] * way[j]
+            along[i] = total
+            up += gap[i] * way[i]
+            down += total * way[i]
+        if down <= 0:
+            break
+        step = up / down
+        restart, change, largest = False, 0.0, 0.0
+        for i in range(count):
+            now = force[i]
+            if now > 0:
+                now = max(now - step * way[i], 0.0)
+            elif gap[i] < 0:
+                now = -gap[i] / matrix[i, i]  # the skin would be inside the tool: it presses after all
+                restart = True
+            change, largest = max(change, abs(now - force[i])), max(largest, now)
+            force[i] = now
+        if change <= TOLERANCE * largest:
+            break
+    return force

@@ -1,0 +1,87 @@
+"""Rays: a column of skin as a ray through a tool's distance field, and the pressure that confines it."""
+
+from __future__ import annotations
+
+import numba
+import numpy as np
+
+from stmpl_core.sdf import distance_at
+
+WALL = 0.05  # width over which depth rises beside a tool's wall, over the thickness: nothing pops in while it slides
+MAX_COLUMN_STRAIN = 0.9  # strain beyond which no column is squeezed
+SECANT_START = 3e-3  # distance to the tool, over the thickness, at which the secant rule takes over from sphere tracing
+SECANT_TOLERANCE = 4e-4  # largest last step of the secant rule, likewise; the depth is then known far better
+
+
+@numba.njit(cache=True, inline="always")
+def to_tool(pose, x, y, z):
+    """Coordinates in the tool's frame of a point of the body's."""
+    a, b, c = x - pose[0, 3], y - pose[1, 3], z - pose[2, 3]
+    return (pose[0, 0] * a + pose[1, 0] * b + pose[2, 0] * c, pose[0, 1] * a + pose[1, 1] * b + pose[2, 1] * c,
+            pose[0, 2] * a + pose[1, 2] * b + pose[2, 2] * c)  # fmt: skip
+
+
+@numba.njit(cache=True, inline="always")
+def ray_from(pose, x, y, z, a, b, c):
+    """A point and a unit vector (a, b, c) in the tool's frame, as six numbers."""
+    x, y, z = to_tool(pose, x, y, z)
+    return (x, y, z, pose[0, 0] * a + pose[1, 0] * b + pose[2, 0] * c, pose[0, 1] * a + pose[1, 1] * b + pose[2, 1] * c,
+            pose[0, 2] * a + pose[1, 2] * b + pose[2, 2] * c)  # fmt: skip
+
+
+@numba.njit(cache=True, inline="always")
+def ray_of(pose, points, ways, n):
+    """Point n and its unit vector in the tool's frame."""
+    return ray_from(pose, points[n, 0], points[n, 1], points[n, 2], ways[n, 0], ways[n, 1], ways[n, 2])
+
+
+@numba.njit(cache=True, inline="always")
+def distance_in_column(grid, ray, s):
+    """Signed distance to the tool at depth s along a ray [m]."""
+    return distance_at(grid[0], grid[1], grid[2], ray[0] + s * ray[3], ray[1] + s * ray[4], ray[2] + s * ray[5])
+
+
+@numba.njit(cache=True)
+def depth_in_column(grid, ray, t, guess):
+    """How deep along a ray, from the skin inwards, the tool ends [m]; 0 if it is not met.
+
+    From a guess above WALL of the thickness by the secant rule. Where that goes astray, as along a wall of the tool, or
+    without such a guess: from the core by sphere tracing, then the secant rule.
+    """
+    if guess > WALL * t:
+        s, d = guess, distance_in_column(grid, ray, guess)
+        last_s, last_d = s + 1.0, d + 1.0
+        for _ in range(6):
+            slope = (d - last_d) / (s - last_s)
+            if slope < 0.3:
+                break
+            last_s, last_d = s, d
+            s -= d / slope
+            if abs(s - last_s) < SECANT_TOLERANCE * t and s > 0:
+                return min(s, t)
+            d = distance_in_column(grid, ray, s)
+    s, d = t, distance_in_column(grid, ray, t)
+    if d <= 0:
+        return t
+    last_s, last_d = s + 1.0, d + 1.0
+    for _ in range(40):
+        if s - d > 0 and d > SECANT_START * t:
+            last_s, last_d = s, d
+            s -= d
+        else:
+            slope = (d - last_d) / (s - last_s)
+            following = s - d / slope if slope > 0.2 else s - d
+            last_s, last_d = s, d
+            s = following
+        if s <= 0:
+            return 0.0
+        if abs(s - last_s) < SECANT_TOLERANCE * t:
+            return min(s, t)
+        d = distance_in_column(grid, ray, s)
+    return min(s, t)
+
+
+def column_pressure(moduli, strain):
+    """Pressure of confined Neo-Hookean columns, over E [-]; moduli: mu and lambda over E."""
+    stretch = 1 - strain
+    return -(moduli[0] * (stretch - 1 / stretch) + moduli[1] * np.log(stretch) / stretch)

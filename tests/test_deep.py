@@ -1,0 +1,85 @@
+"""Laws of tools that go too deep: the core is hard, and motion has a bound."""
+
+import numpy as np
+import pytest
+
+from stmpl_core import Simulator, Tool
+from stmpl_core.methods import MomentNet, Winkler
+from stmpl_core.touch import APART, IN_CORE, NO_FORCE
+from tests.scenes import LENGTH, RADIUS, at, ball, box, capsule, limb, press, punch, touch_of, turn
+
+LIMB = limb(4e-3)
+LYING = turn((0, 1, 0), np.pi / 2)
+TOOLS = {"ball": (ball(), 0.012), "small ball": (ball(0.004), 0.004), "slab": (box(0.004, 0.03, 0.03), 0.002),
+         "capsule": (capsule(0.02, 0.008), 0.008)}  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def sim() -> Simulator:
+    return Simulator(LIMB, MomentNet())
+
+
+def pressed(sim: Simulator, tool: Tool, half: float, depth: float, side: float = 1.0):
+    return sim.step([press(tool, at(side * (RADIUS + half - depth), 0, LENGTH / 2), None)])
+
+
+@pytest.mark.parametrize("name", TOOLS)
+@pytest.mark.parametrize("side", [1.0, -1.0])
+def test_force_rises_with_depth_for_ever(sim: Simulator, name: str, side: float) -> None:
+    """To the limb's axis: through the layer, the core, and where the whole tool is inside."""
+    tool, half = TOOLS[name]
+    depths = np.concatenate([np.linspace(5e-4, 9e-3, 35), np.linspace(0.01, RADIUS - 0.004, 12)])
+    touches = [touch_of(pressed(sim, tool, half, d, side)) for d in depths]
+    forces = np.array([touch.force for touch in touches])
+    assert (np.diff(forces) > 0).all()
+    assert all(touch.status == IN_CORE and not touch.trust.in_range for touch in touches[-12:])
+    assert all(side * touch.wrench[0] < 0 for touch in touches)
+
+
+@pytest.mark.parametrize("name", TOOLS)
+def test_no_vertex_moves_further_than_the_layer_is_thick(sim: Simulator, name: str) -> None:
+    tool, half = TOOLS[name]
+    for depth in (5e-3, 7e-3, 9e-3, 0.02, 0.03):
+        assert pressed(sim, tool, half, depth).magnitude.max() <= LIMB.thickness.max()
+
+
+def test_force_has_no_step_where_the_tool_begins_to_be_drawn_back(sim: Simulator) -> None:
+    tool, half = TOOLS["ball"]
+    forces = [touch_of(pressed(sim, tool, half, d)).force for d in np.arange(6.2e-3, 8.2e-3, 2e-5)]
+    assert np.diff(np.log(forces)).max() < 0.03
+
+
+@pytest.mark.parametrize("force", [1e-3, 0.1, 1.0, 1e6])
+def test_a_wrench_brings_a_tool_out_of_the_core(sim: Simulator, force: float) -> None:
+    """The stated pose is a first guess, however bad."""
+    tool, half = TOOLS["ball"]
+    deep = [touch_of(sim.step([press(tool, at(RADIUS + half - d, 0, LENGTH / 2), (-force, 0, 0))]))
+            for d in (2e-3, 9e-3, 0.024)]  # fmt: skip
+    for one in deep[1:]:
+        assert one.force == pytest.approx(deep[0].force, rel=0.02)
+        assert one.depth == pytest.approx(deep[0].depth, rel=0.05)
+
+
+def test_what_is_beside_or_around_the_limb_is_not_inside(sim: Simulator) -> None:
+    ring = Tool("ring", *_ring(RADIUS + 0.01, 0.004))
+    cases = [press(ring, at(0, 0, LENGTH / 2), None), press(punch(), at(0, 0, LENGTH + 0.03), None),
+             press(ball(), at(RADIUS + 0.013, 0, LENGTH / 2), None)]  # fmt: skip
+    for contact in cases:
+        assert touch_of(sim.step([contact])).status == APART
+    inside = press(ball(), at(0, 0, LENGTH / 2), (0, 0, 0))
+    assert touch_of(sim.step([inside])).status == NO_FORCE
+
+
+def test_a_torque_without_a_force_is_told_of() -> None:
+    from dataclasses import replace
+
+    contact = replace(press(ball(), at(RADIUS + 0.01, 0, LENGTH / 2), (0, 0, 0)), wrench=np.array([0, 0, 0, 0, 0, 0.1]))
+    touch = touch_of(Simulator(LIMB, Winkler()).step([contact]))
+    assert touch.status == NO_FORCE and not touch.trust.in_range and "torque without a force" in touch.trust.why
+
+
+def _ring(radius: float, thick: float) -> tuple[np.ndarray, np.ndarray]:
+    import trimesh
+
+    mesh = trimesh.creation.torus(1e3 * radius, 1e3 * thick, 64, 24)
+    return 1e-3 * np.asarray(mesh.vertices), np.asarray(mesh.faces)

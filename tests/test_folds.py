@@ -1,0 +1,80 @@
+"""Laws of skin that is near itself: what is near through the air is not felt."""
+
+import numpy as np
+import pytest
+
+from stmpl_core import Contact, Load, SoftLayer
+from stmpl_core.methods import Linear, MomentNet
+from stmpl_core.simulator import Simulator
+from stmpl_core.thinning import ZONES, Thinning
+from tests.scenes import at, ball, limb, plate
+
+GAP, LONG, THICKNESS = 1.5e-3, 0.06, 4e-3  # m
+METHODS = [MomentNet, Linear]
+
+
+def fingers() -> SoftLayer:
+    """Two flat fingers side by side, 1.5 mm apart, which meet at their root."""
+    h = 2e-3
+    columns = np.concatenate([-GAP / 2 - h * np.arange(8)[::-1], GAP / 2 + h * np.arange(8)])
+    x, y = np.meshgrid(columns, np.arange(0, LONG + 0.02, h))
+    number = np.arange(x.size).reshape(x.shape)
+    a, b, c, d = number[:-1, :-1], number[:-1, 1:], number[1:, 1:], number[1:, :-1]
+    between = np.broadcast_to(np.arange(x.shape[1] - 1) == 7, a.shape) & (y[:-1, :-1] < LONG)
+    faces = np.concatenate([np.stack(t, axis=-1)[~between] for t in ((a, b, c), (a, c, d))])
+    return SoftLayer(np.column_stack([x.ravel(), y.ravel(), 0 * x.ravel()]), faces, THICKNESS)
+
+
+FINGERS = fingers()
+LEFT = FINGERS.vertices[:, 0] < 0
+SPOT = np.array([-0.004, 0.02, 0.0])  # on the left one, far from the root
+
+
+def around(spot: np.ndarray, radius: float) -> np.ndarray:
+    return np.clip(1 - (np.linalg.norm(FINGERS.vertices - spot, axis=1) / radius) ** 2, 0, 1)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_pressing_one_finger_does_not_move_the_other(method: type) -> None:
+    answer = method().prepare(FINGERS).solve(Load.pressure(400 * around(SPOT, 6e-3) * LEFT))
+    root = FINGERS.vertices[:, 1] > LONG - 8 * THICKNESS
+    assert answer.magnitude[LEFT].max() > 5e-4
+    assert not answer.magnitude[~LEFT & ~root].any()
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_two_fingers_pressed_at_once_move_as_each_alone(method: type) -> None:
+    prepared = method().prepare(FINGERS)
+    left = 400 * around(SPOT, 6e-3) * LEFT
+    right = 300 * around(SPOT * [-1, 1, 1], 6e-3) * ~LEFT
+    both, one, other = (prepared.solve(Load.pressure(p)).displacement for p in (left + right, left, right))
+    np.testing.assert_allclose(both, one + other, atol=5e-7)  # of 2 mm; at the root they do feel each other
+
+
+def test_tools_on_two_fingers_press_as_each_alone() -> None:
+    simulator, tip = Simulator(FINGERS, MomentNet()), ball(0.005)
+    poses = [at(side * 0.006, 0.02, 0.005 - 1e-3) for side in (-1, 1)]
+    contacts = [Contact(tip.named(name), pose) for name, pose in zip("ab", poses, strict=True)]
+    together = simulator.step(contacts)
+    alone = [simulator.step([contact]) for contact in contacts]
+    for name, one in zip("ab", alone, strict=True):
+        np.testing.assert_allclose(together.touches[name].wrench, one.touches[name].wrench, rtol=1e-4, atol=1e-8)
+    np.testing.assert_allclose(together.displacement, alone[0].displacement + alone[1].displacement, atol=2e-6)
+
+
+def test_where_skin_is_near_itself_is_known_and_plain_limbs_are_not_held_up() -> None:
+    frames = np.broadcast_to(np.eye(3), (len(FINGERS.vertices), 3, 3))
+    assert Thinning(FINGERS, frames, 8.0).folded
+    for layer in (limb(4e-3), plate()):
+        assert not Thinning(layer, np.broadcast_to(np.eye(3), (len(layer.vertices), 3, 3)), 8.0).folded
+
+
+def test_all_that_is_in_reach_along_the_skin_is_a_neighbour() -> None:
+    layer = limb(4e-3)
+    thinning = Thinning(layer, np.broadcast_to(np.eye(3), (len(layer.vertices), 3, 3)), 8.0)
+    zones = len(ZONES) + 1
+    for v in range(0, len(layer.vertices), 97):
+        away = np.linalg.norm(layer.vertices - layer.vertices[v], axis=1) / layer.thickness[0]
+        expected = np.flatnonzero((away < 8.0) & (layer.normals @ layer.normals[v] > 0))
+        found = thinning.index[thinning.start[zones * v] : thinning.start[zones * (v + 1)]]
+        np.testing.assert_array_equal(np.sort(found), expected)

@@ -1,0 +1,83 @@
+"""Laws of the linear contact problem: what holds a tool off a bonded layer, and where."""
+
+import numpy as np
+import pytest
+
+from stmpl_core import Tissue
+from stmpl_core.obstacle import Linear, held_off
+
+NU = 0.4
+
+
+def lattice(spacing: float, radius: float) -> np.ndarray:
+    """A lattice of triangles in a disc, (N, 3)."""
+    n = int(radius / spacing) + 2
+    x, y = np.meshgrid(np.arange(-n, n + 1.0), np.arange(-n, n + 1.0))
+    points = spacing * np.column_stack([(x + 0.5 * (y % 2)).ravel(), 0.5 * np.sqrt(3) * y.ravel(), 0 * x.ravel()])
+    return points[np.linalg.norm(points, axis=1) < radius]
+
+
+def solved(points: np.ndarray, spacing: float, strain: np.ndarray, nu: float = NU, group: np.ndarray | None = None,
+           thickness: float = 1.0) -> Linear:  # fmt: skip
+    n = len(points)
+    area = np.full(n, 0.5 * np.sqrt(3) * spacing**2)
+    group = np.zeros(n, np.int64) if group is None else group
+    return held_off(points, np.tile([0.0, 0.0, -1.0], (n, 1)), np.full(n, thickness), area, strain, 1.0, nu, group)
+
+
+@pytest.mark.parametrize("nu", [0.3, 0.4, 0.45])
+def test_a_light_ball_presses_as_hertz_says(nu: float) -> None:
+    """A layer is a half-space to a contact that is small beside it: F = 4/3 E / (1 - nu^2) sqrt(R) d^1.5."""
+    radius, depth = 1.0, 4e-4
+    spacing = np.sqrt(radius * depth) / 6
+    points = lattice(spacing, 1.5 * np.sqrt(radius * depth))
+    strain = depth - (points**2).sum(axis=1) / (2 * radius)
+    force = 0.5 * np.sqrt(3) * spacing**2 * solved(points, spacing, strain, nu).pressure.sum()
+    assert force == pytest.approx(4 / 3 / (1 - nu**2) * np.sqrt(radius) * depth**1.5, rel=0.05)
+
+
+def test_a_wide_flat_tool_presses_in_its_middle_as_a_confined_column() -> None:
+    points = lattice(0.3, 7.0)
+    pressure = solved(points, 0.3, np.full(len(points), 0.01)).pressure
+    middle = np.linalg.norm(points, axis=1) < 3
+    tissue = Tissue(1e3, NU)
+    expected = 0.01 * tissue.confined_modulus / tissue.youngs_modulus
+    np.testing.assert_allclose(pressure[middle], expected, rtol=0.03)
+
+
+def test_pressure_is_never_below_zero_and_the_skin_is_never_inside_the_tool() -> None:
+    """Where it presses the skin lies on the tool: more nodes beyond the contact change nothing."""
+    points = lattice(0.05, 0.8)
+    strain = 0.05 - (points**2).sum(axis=1) / 2
+    found = solved(points, 0.05, strain).pressure
+    presses = found > 0
+    assert (found >= 0).all() and 20 < presses.sum() < (strain > 0).sum()
+    some = solved(points[presses], 0.05, strain[presses]).pressure
+    np.testing.assert_allclose(some, found[presses], rtol=1e-3, atol=1e-4 * found.max())
+
+
+def test_it_is_linear_while_the_contact_stays_and_grows_with_depth() -> None:
+    points = lattice(0.1, 0.8)
+    flat = np.full(len(points), 0.02)
+    one, two = (solved(points, 0.1, k * flat).pressure for k in (1, 2))
+    np.testing.assert_allclose(two, 2 * one, rtol=1e-4)
+    forces = [solved(points, 0.1, d - (points**2).sum(axis=1) / 2).pressure.sum() for d in np.linspace(0.01, 0.3, 12)]
+    assert (np.diff(forces) > 0).all()
+
+
+def test_nodes_of_other_groups_are_not_felt() -> None:
+    left = lattice(0.1, 0.5)
+    both = np.concatenate([left, left + [1.2, 0, 0]])
+    strain, group = np.full(len(both), 0.02), np.repeat([0, 1], len(left))
+    apart, near = solved(both, 0.1, strain, group=group), solved(both, 0.1, strain)
+    alone = solved(left, 0.1, strain[: len(left)]).pressure
+    np.testing.assert_allclose(apart.pressure[: len(left)], alone, rtol=1e-4)
+    assert np.abs(near.pressure[: len(left)] - alone).max() > 0.01 * alone.max()
+
+
+def test_the_same_at_any_scale() -> None:
+    points = lattice(0.1, 0.8)
+    strain = 0.05 - (points**2).sum(axis=1) / 2
+    here, there = solved(points, 0.1, strain), solved(7e-3 * points, 7e-4, strain, thickness=7e-3)
+    np.testing.assert_allclose(there.pressure, here.pressure, rtol=1e-5)
+    np.testing.assert_allclose(there.moments, here.moments, rtol=1e-4)
