@@ -16,6 +16,7 @@ from stmpl_core.deep import DEEPEST, Deep
 from stmpl_core.layer import SoftLayer
 from stmpl_core.moments import Surroundings
 from stmpl_core.nodes import Nodes
+from stmpl_core.obstacle import REACH
 from stmpl_core.sdf import MARGIN, SignedDistance
 from stmpl_core.tools import Tools
 from stmpl_core.touch import (
@@ -108,14 +109,29 @@ class Toucher:
         many = len(contacts) >= MANY_TOOLS
         placed = [self._place(contact, self.tools.field(contact.tool), many) for contact in contacts]
         pressing = sorted((one for one in placed if len(one.squeeze.nodes.area)), key=lambda one: one.contact.name)
-        if len(pressing) == 1 and (alone := pressing[0].held):
-            held = {pressing[0].contact.name: alone}
-        else:
-            together = self.net.hold(Nodes.joined([one.squeeze.nodes for one in pressing]))
-            ends = np.cumsum([len(one.squeeze.nodes.area) for one in pressing])[:-1]
+        held: dict[str, Held] = {}
+        for group in self._near_each_other(pressing):
+            if len(group) == 1 and (alone := group[0].held):
+                held[group[0].contact.name] = alone
+                continue
+            together = self.net.hold(Nodes.joined([one.squeeze.nodes for one in group]))
+            ends = np.cumsum([len(one.squeeze.nodes.area) for one in group])[:-1]
             parts = zip(*(np.split(values, ends) for values in together), strict=True)
-            held = {one.contact.name: Held(*part) for one, part in zip(pressing, parts, strict=False)}
+            held |= {one.contact.name: Held(*part) for one, part in zip(group, parts, strict=True)}
         return [self._answer(one, held.get(one.contact.name, NOTHING)) for one in placed]
+
+    def _near_each_other(self, pressing: Sequence[_Placed]) -> list[list[_Placed]]:
+        """The tools in groups, between which none feels another: what many tools cost grows with the largest."""
+        groups: list[tuple[list[_Placed], list[tuple[np.ndarray, float]]]] = []
+        for one in pressing:
+            points = one.squeeze.nodes.points
+            middle = points.mean(axis=0)
+            ball = middle, float(np.linalg.norm(points - middle, axis=1).max()) + 0.5 * REACH * self._thickest
+            near = [group for group in groups
+                    if any(np.linalg.norm(middle - other) < ball[1] + size for other, size in group[1])]  # fmt: skip
+            groups = [group for group in groups if group not in near]
+            groups.append(([*(o for group in near for o in group[0]), one], [*(b for g in near for b in g[1]), ball]))
+        return [sorted(group, key=lambda one: one.contact.name) for group, _ in groups]
 
     def _place(self, contact: Contact, field: SignedDistance, many: bool) -> _Placed:
         """Where the tool presses, or why it does not."""

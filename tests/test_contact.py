@@ -414,6 +414,19 @@ def test_fingers_side_by_side_feel_each_other_and_each_carries_its_own(toucher: 
         assert np.linalg.norm(one.wrench[:3]) == pytest.approx(-f * normal[0], rel=1e-6)
 
 
+def test_many_tools_are_held_in_groups_that_do_not_feel_each_other() -> None:
+    """Two fingers here and two there, further apart than 8 thicknesses: each pair as if the other were not there."""
+    thin, small = Toucher(limb(4e-3, 3e-3)), ball(0.004)
+    contacts = [press(small, at(RADIUS + 0.003, 0, z), None, f"t{z}") for z in (0.03, 0.042, 0.11, 0.122)]
+    groups = thin._near_each_other(sorted((thin._place(c, thin.tools.field(c.tool), False) for c in contacts),
+                                          key=lambda one: one.contact.name))  # fmt: skip
+    assert sorted(len(group) for group in groups) == [2, 2]
+    together = thin.touch_all(contacts)
+    for one, other in zip(together, [*thin.touch_all(contacts[:2]), *thin.touch_all(contacts[2:])], strict=True):
+        np.testing.assert_array_equal(one.wrench, other.wrench)
+    assert not np.allclose(thin.touch(contacts[0]).wrench, together[0].wrench, rtol=1e-3)
+
+
 def test_what_is_touched_together_does_not_depend_on_the_order(toucher: Toucher) -> None:
     contacts = [press(BALL, on_limb(), None, "a"), press(BALL, at(RADIUS + 0.01, 0, MIDDLE + 0.018), (-0.1, 0, 0), "b"),
                 press(BALL, at(1, 1, 1), None, "c")]  # fmt: skip
