@@ -111,8 +111,8 @@ class Toucher:
         pressing = sorted((one for one in placed if len(one.squeeze.nodes.area)), key=lambda one: one.contact.name)
         held: dict[str, Held] = {}
         for group in self._near_each_other(pressing):
-            if len(group) == 1 and (alone := group[0].held):
-                held[group[0].contact.name] = alone
+            if len(group) == 1:
+                held[group[0].contact.name] = group[0].held or self.net.hold(group[0].squeeze.nodes)
                 continue
             together = self.net.hold(Nodes.joined([one.squeeze.nodes for one in group]))
             ends = np.cumsum([len(one.squeeze.nodes.area) for one in group])[:-1]
