@@ -1,4 +1,4 @@
-"""Columns: how far a tool squeezes the columns of skin under it, sampled between the vertices, gathered at them."""
+"""Columns: which columns of skin a tool squeezes, and how deep it is in them."""
 
 from __future__ import annotations
 
@@ -88,7 +88,7 @@ class Columns:
                 of an arm takes 14, and 60 us for one that touches: it pays where many tools are, most of them apart.
         """
         low, high = field.tool_bounds
-        centre = pose[:3, :3] @ ((low + high) / 2) + pose[:3, 3]
+        centre = middle_of(field, pose)
         if many:
             import fcl
 
@@ -119,9 +119,20 @@ class Columns:
         grid, skin = _grid(field), (self.points, self.inward, self.layer.thickness, self.faces)
         faces = self._start, self._around, self._slot
         found, vertices, depth, rests = _cover(grid, pose, *skin, *faces, covered, buried)
-        low, high = field.tool_bounds
-        centre = pose[:3, :3] @ (0.5 * (low + high)) + pose[:3, 3]
-        return Squeeze(vertices, depth, rests, nodes_under(grid, pose, centre, skin, found, buried))
+        return Squeeze(vertices, depth, rests, nodes_under(grid, pose, middle_of(field, pose), skin, found, buried))
+
+
+def middle_of(field: SignedDistance, pose: Transform) -> np.ndarray:
+    """Middle of a tool's box, in the body's frame, (3,) [m]."""
+    low, high = field.tool_bounds
+    return pose[:3, :3] @ ((low + high) / 2) + pose[:3, 3]
+
+
+def shifted(pose: Transform, by: np.ndarray) -> Transform:
+    """The pose, moved by a vector of the body's frame, (3,) [m]."""
+    out = pose.copy()
+    out[:3, 3] += by
+    return out
 
 
 def depth_along(field: SignedDistance, pose: Transform, points: Points, way: Points, guess: np.ndarray) -> np.ndarray:

@@ -8,7 +8,7 @@ import numpy as np
 from scipy.spatial import KDTree
 
 from stmpl_core.arrays import Transform
-from stmpl_core.columns import Columns, Squeeze
+from stmpl_core.columns import Columns, Squeeze, middle_of, shifted
 from stmpl_core.sdf import SignedDistance
 
 DEEPEST = 0.9  # depth over thickness beyond which a tool is answered for where it is drawn back to that
@@ -41,7 +41,7 @@ class Deep:
 
         The limb goes on where it is cut off: what is nearest to its open border is not inside.
         """
-        centre = pose[:3, :3] @ np.mean(field.tool_bounds, axis=0) + pose[:3, 3]
+        centre = middle_of(field, pose)
         if (centre < self._low).any() or (centre > self._high).any():
             return False
         some = points[:: max(1, len(points) // LOOKED_AT)] @ pose[:3, :3].T + pose[:3, 3]
@@ -62,8 +62,7 @@ class Deep:
         thickness = float(self.layer.thickness.max())
 
         def there(way: float) -> float:
-            at = pose.copy()
-            at[:3, 3] += way * out
+            at = shifted(pose, way * out)
             found = self.columns.squeezed(field, at)
             return self.strain(found) if len(found.nodes.area) else float(self.inside(field, at, points))
 
@@ -71,8 +70,7 @@ class Deep:
         while there(high) > DEEPEST and high < 1e3 * thickness:
             low, high = high, 2 * high
         way = _root(lambda x: there(x) - DEEPEST, low, high, ACCURACY * thickness)
-        at = pose.copy()
-        at[:3, 3] += way * out
+        at = shifted(pose, way * out)
         return at, self.columns.squeezed(field, at), way
 
     def _nearest(self, points: np.ndarray) -> np.ndarray:
@@ -84,8 +82,7 @@ class Deep:
         """The mean normal of the skin over the tool, (3,); None where there is no such direction."""
         v = squeeze.vertices[squeeze.depth > 0]
         if not len(v):
-            centre = pose[:3, :3] @ np.mean(field.tool_bounds, axis=0) + pose[:3, 3]
-            return -self.columns.inward[int(self._nearest(centre[None])[0])]
+            return -self.columns.inward[int(self._nearest(middle_of(field, pose)[None])[0])]
         vectors = self.layer.vertex_area_vectors[v]
         mean = vectors.sum(axis=0)
         size = float(np.linalg.norm(mean))

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from stmpl_core.arrays import Transform
-from stmpl_core.columns import HOLE_RADIUS, NO_SQUEEZE, Clearance, Columns, Squeeze
+from stmpl_core.columns import HOLE_RADIUS, NO_SQUEEZE, Clearance, Columns, Squeeze, shifted
 from stmpl_core.contact import Contact
 from stmpl_core.contact_net import NOTHING, ContactNet, Held
 from stmpl_core.deep import DEEPEST, Deep
@@ -183,7 +183,7 @@ class Toucher:
         facing = clearance.vertices[self._inward[clearance.vertices] @ push > MIN_FACING_COSINE]
         moved, best, nearest = 0.0, None, self.hole
         while moved <= self.reach:
-            there = self.columns.clearance(field, _shifted(pose, moved * push), facing, self.reach + self.hole)
+            there = self.columns.clearance(field, shifted(pose, moved * push), facing, self.reach + self.hole)
             gap = float(there.least.min(initial=np.inf))
             if gap < nearest:
                 best, nearest = moved, gap
@@ -206,7 +206,7 @@ class Toucher:
         last: tuple[float, float] | None = None  # depth and force of the trial before
         power, back = FIRST_POWER, 0.1 * self._thickest
         for _ in range(MAX_DEPTH_TRIALS):
-            pose, clearance = _shifted(start, moved * push), stated
+            pose, clearance = shifted(start, moved * push), stated
             if moved:
                 near = stated.vertices[~(stated.least > abs(moved) + 2 * self.hole) | np.isinf(stated.least)]
                 clearance = self.columns.clearance(field, pose, near, self.hole)
@@ -242,7 +242,7 @@ class Toucher:
             tolerance = FORCE_TOLERANCE if last else FIRST_TOLERANCE
             if abs(size / normal - 1) < tolerance or abs(further) < LEAST_STEP * self._thickest:
                 under = np.where(squeeze.depth > 0, squeeze.depth + further * (self._inward[v] @ push), 0.0)
-                return best._replace(pose=_shifted(pose, further * push), moved=way + further,
+                return best._replace(pose=shifted(pose, further * push), moved=way + further,
                                      squeeze=squeeze._replace(depth=np.maximum(under, 0.0)))  # fmt: skip
             if size < normal and strain > MAX_PRESSED_STRAIN - 0.01:
                 why = (f"{contact.name} carries {size:.2g} of {normal:.2g} N along the skin's normal, "
@@ -343,9 +343,3 @@ class Toucher:
 def margin_on(layer: SoftLayer) -> float:
     """Width that a tool's distance field needs around its surface to press on this layer [m]."""
     return max(MARGIN, 2 * HOLE_RADIUS * layer.edge_length)
-
-
-def _shifted(pose: Transform, by: np.ndarray) -> Transform:
-    out = pose.copy()
-    out[:3, 3] += by
-    return out

@@ -4,6 +4,7 @@ import os
 import socket
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -54,6 +55,20 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
             item.add_marker(ROOM_OF.get(item.path.stem, "unit"))
     rank = {file: k for k, file in enumerate(FIRST)}
     items.sort(key=lambda item: rank.get(item.path.stem, len(rank)))
+
+
+@pytest.fixture(scope="module")
+def bus(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
+    """A robot's side of a node that runs as a process of its own; ROS is loaded by who asks for it."""
+    from tests.node_bus import a_node
+
+    yield from a_node(tmp_path_factory.mktemp("node"))
+
+
+@pytest.fixture(scope="module")
+def hand(bus: Any) -> Any:
+    """A tool on that bus, heard by the node."""
+    return bus.tool("probe").ready()
 
 
 @pytest.fixture(scope="module")

@@ -19,19 +19,8 @@ from stmpl_ros.making import restiffened, skin_of
 from stmpl_ros.parameters import NodeConfig
 from stmpl_ros.settings import checked
 from tests.bus import ROOT, rows, statuses
-from tests.node_bus import HERE, PUSH, a_node, skin
+from tests.node_bus import HERE, PUSH, skin
 from tests.scenes import LENGTH, RADIUS, at, ball, contact_of
-
-
-@pytest.fixture(scope="module")
-def bus(tmp_path_factory):
-    yield from a_node(tmp_path_factory.mktemp("node"))
-
-
-@pytest.fixture(scope="module")
-def hand(bus):
-    return bus.tool("probe").ready()
-
 
 # Parameters
 

@@ -30,19 +30,8 @@ from stmpl_ros.parameters import NodeConfig
 from stmpl_ros.topics import KEPT, LEASE, STREAM
 from tests.bus import PATIENCE, ROOT, end, rows, running, start
 from tests.conftest import BUSES
-from tests.node_bus import HERE, NODE, PUSH, Bus, a_node, skin
+from tests.node_bus import HERE, NODE, PUSH, Bus, skin
 from tests.scenes import ball, contact_of
-
-
-@pytest.fixture(scope="module")
-def bus(tmp_path_factory):
-    yield from a_node(tmp_path_factory.mktemp("node"))
-
-
-@pytest.fixture(scope="module")
-def hand(bus):
-    return bus.tool("probe").ready()
-
 
 # Lifecycle and QoS
 

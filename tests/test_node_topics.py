@@ -32,19 +32,8 @@ from stmpl_ros.settings import checked
 from stmpl_ros.show import FIELDS, SkinCloud
 from stmpl_ros.topics import KEPT, STREAM
 from tests.bus import ROOT, rows, running, statuses
-from tests.node_bus import HERE, NODE, PUSH, TABLE, TOUCH, Bus, Hand, a_node, stamp_of
+from tests.node_bus import HERE, NODE, PUSH, TABLE, TOUCH, Bus, Hand, stamp_of
 from tests.scenes import LENGTH, RADIUS, at, ball, limb
-
-
-@pytest.fixture(scope="module")
-def bus(tmp_path_factory):
-    yield from a_node(tmp_path_factory.mktemp("node"))
-
-
-@pytest.fixture(scope="module")
-def hand(bus):
-    return bus.tool("probe").ready()
-
 
 # Input
 
