@@ -9,8 +9,8 @@ import numpy as np
 
 from stmpl_core.layer import SoftLayer
 
-ZONES = (2.0, 4.5)  # distances from the load, over t, at which the first and the second thinning begin
-SPACINGS = (0.7, 1.5)  # least distances between the vertices that are asked there, over t
+ZONES = (2.5, 5.0)  # distances from the load, over t, at which the first and the second thinning begin
+SPACINGS = (0.6, 1.5)  # least distances between the vertices that are asked there, over t
 CORNERS = 12  # number of asked vertices from which one between is filled in
 CHUNK = 64  # vertices that one thread takes at a time
 LARGEST = 2.5  # sum of the weights' sizes, from which a vertex is rather asked itself: it would be extrapolated

@@ -24,6 +24,9 @@ from stmpl_core.trust import Displacement, Trust
 IN, OUT = INPUTS.at, MOTION.at  # first columns, constants to numba
 AMPLITUDE = 0.3  # largest addition of the network to the linear response, over t
 SURROUNDED = 1e-7  # size of the moments below which nothing is added
+FADE, RING = 1.5, 8.0  # size of the moments over the linear response, about 10 near a load: below, the answer fades
+# into a multiple of the linear response, and up to where that multiple is measured: at 3 to 4 t from a load
+GAINS = (0.5, 4.0)  # range of that multiple
 EDGE_OVER_ROOT_AREA = 1.075  # ratio at a vertex of six equilateral triangles: sqrt(2 / sqrt(3))
 EVEN = 1.2  # widths of vertices over the median, at the tenth and the ninetieth percentile of an even mesh
 OUTSIDE_SHARE = 0.3  # share of the moving vertices whose inputs may be unlike the training data (docs/networks.md)
@@ -46,8 +49,8 @@ class MomentNet:
     serves every stiffness exactly, and any thickness, pose and limb. The inputs are invariants of moments up to second
     order (as atomic descriptors are: Bartok et al., Phys. Rev. B 87, 184115, 2013), the outputs multiply the normal
     and the moments' own directions: turning the scene turns the answer. There is no chart, and so no seam. Where
-    nothing presses within stmpl_core.response.NEAR thicknesses nothing is added to the linear response, which ends at
-    REACH: no load gives exactly no motion.
+    nothing presses within stmpl_core.response.NEAR thicknesses the answer is a multiple of the linear response, the one
+    that the network says at that distance; it ends at REACH: no load gives exactly no motion.
 
     Args:
         weights: path of a .safetensors file made by `stmpl train`; None: those that come with the package.
@@ -135,7 +138,8 @@ class MomentNet:
 
         # Each vertex moves along its normal and along the directions of what is around it.
         moved, error = np.empty((len(vertices), 3)), np.empty(len(vertices), dtype=np.float32)
-        _move(figures, shape, place, outputs, a["mix_vectors"], a["mix_tensors"], self._frames[vertices], moved, error)
+        _move(figures, shape, sources[vertices], place, outputs, a["mix_vectors"], a["mix_tensors"],
+              self._frames[vertices], moved, error)  # fmt: skip
         displacement = np.zeros_like(layer.vertices)
         asked.fill(moved, displacement)
         peak_error = float((error * layer.thickness[vertices]).max(initial=0.0))
@@ -339,38 +343,72 @@ def _activate(hidden, bias):
 
 
 @numba.njit(cache=True, fastmath=FAST, error_model="numpy")
-def _move(figures, shape, place, outputs, mix_vectors, mix_tensors, frames, moved, error):
-    """Linear response to the columns' strain plus what the network adds, turned into the layer's frame, (N, 3) [m]."""
+def _move(figures, shape, here, place, outputs, mix_vectors, mix_tensors, frames, moved, error):
+    """Linear response to the columns' strain plus what the network adds, turned into the layer's frame, (N, 3) [m].
+
+    Where the moments end so does the network, but not what it knows: the linear response is too small far from a load
+    that is not small. So it goes on as the multiple of it that the network says on a ring around the load.
+    """
+    one, told, told_of = np.float32(1), 1e-30, 1e-30
+    local, share = np.empty((len(figures), 3), np.float32), np.empty(len(figures), np.float32)
     for n in range(len(figures)):
         u, v, w = figures[n, 1, 0], figures[n, 1, 1], figures[n, 1, 2]
+        local[n, 0], local[n, 1], local[n, 2] = u, v, w
+        share[n], error[n] = 0, 0
+        if place[n] < 0:
+            continue
         g = _amplitude(figures[n])
-        error[n] = 0
-        if place[n] >= 0:
-            vectors, tensors = np.empty((DIRECTIONS, 2), np.float32), np.empty((2 * TENSORS, 2), np.float32)
-            mixed, t = np.empty((MIXED_VECTORS, 2), np.float32), np.empty((MIXED_TENSORS, 2), np.float32)
-            _directions(figures[n], g, vectors, tensors)
-            _mix(mix_vectors, vectors, mixed)
-            _mix(mix_tensors, tensors, t)
-            x = y = np.float32(0)
-            row = outputs[place[n]]
-            for m in range(DIRECTIONS):
-                x += row[OUT.directions + m] * vectors[m, 0]
-                y += row[OUT.directions + m] * vectors[m, 1]
-            for m in range(MIXED_TENSORS):
-                c = row[OUT.turned + m]
-                x += c * (t[m, 0] * mixed[m, 0] + t[m, 1] * mixed[m, 1])
-                y += c * (t[m, 1] * mixed[m, 0] - t[m, 0] * mixed[m, 1])
-            turn, bend = np.float32(0.5) * (shape[n, 0] - shape[n, 2]), shape[n, 1]
-            for m in range(MIXED_VECTORS):
-                c = row[OUT.curved + m]
-                x += c * (turn * mixed[m, 0] + bend * mixed[m, 1])
-                y += c * (bend * mixed[m, 0] - turn * mixed[m, 1])
-            x += row[OUT.slope] * shape[n, 3]
-            y += row[OUT.slope] * shape[n, 4]
-            a = np.float32(AMPLITUDE) * g / (np.float32(1) + g)
-            u += a * x
-            v += a * y
-            w += a * row[OUT.normal]
-            error[n] = a * np.exp(min(row[OUT.log_error], np.float32(2)))
+        _add(figures[n], g, shape[n], outputs[place[n]], mix_vectors, mix_tensors, local[n])
+        error[n] = np.float32(AMPLITUDE) * g / (one + g) * np.exp(min(outputs[place[n], OUT.log_error], np.float32(2)))
+        square = u * u + v * v + w * w
+        ratio = g / (np.sqrt(square) + np.float32(1e-30))
+        share[n] = _smooth(ratio / np.float32(FADE))
+        if here[n, 0] == 0:
+            weight = share[n] * (one - _smooth(ratio / np.float32(RING)))
+            told += weight * (u * local[n, 0] + v * local[n, 1] + w * local[n, 2])
+            told_of += weight * square
+    gain = np.float32(min(max(told / told_of, GAINS[0]), GAINS[1]))
+    for n in range(len(figures)):
+        s, rest = share[n], (one - share[n]) * gain
         for m in range(3):
-            moved[n, m] = u * frames[n, 0, m] + v * frames[n, 1, m] + w * frames[n, 2, m]
+            moved[n, m] = 0
+        for k in range(3):
+            value = s * local[n, k] + rest * figures[n, 1, k]
+            for m in range(3):
+                moved[n, m] += value * frames[n, k, m]
+
+
+@numba.njit(inline="always", fastmath=FAST, error_model="numpy")
+def _smooth(x):
+    """A step from 0 at 0 to 1 at 1."""
+    x = min(max(x, np.float32(0)), np.float32(1))
+    return x * x * (np.float32(3) - np.float32(2) * x)
+
+
+@numba.njit(inline="always", fastmath=FAST, error_model="numpy")
+def _add(figures, g, shape, row, mix_vectors, mix_tensors, out):
+    """Adds what the network says of a vertex to its linear response (3,) over t, in its own frame."""
+    vectors, tensors = np.empty((DIRECTIONS, 2), np.float32), np.empty((2 * TENSORS, 2), np.float32)
+    mixed, t = np.empty((MIXED_VECTORS, 2), np.float32), np.empty((MIXED_TENSORS, 2), np.float32)
+    _directions(figures, g, vectors, tensors)
+    _mix(mix_vectors, vectors, mixed)
+    _mix(mix_tensors, tensors, t)
+    x = y = np.float32(0)
+    for m in range(DIRECTIONS):
+        x += row[OUT.directions + m] * vectors[m, 0]
+        y += row[OUT.directions + m] * vectors[m, 1]
+    for m in range(MIXED_TENSORS):
+        c = row[OUT.turned + m]
+        x += c * (t[m, 0] * mixed[m, 0] + t[m, 1] * mixed[m, 1])
+        y += c * (t[m, 1] * mixed[m, 0] - t[m, 0] * mixed[m, 1])
+    turn, bend = np.float32(0.5) * (shape[0] - shape[2]), shape[1]
+    for m in range(MIXED_VECTORS):
+        c = row[OUT.curved + m]
+        x += c * (turn * mixed[m, 0] + bend * mixed[m, 1])
+        y += c * (bend * mixed[m, 0] - turn * mixed[m, 1])
+    x += row[OUT.slope] * shape[3]
+    y += row[OUT.slope] * shape[4]
+    a = np.float32(AMPLITUDE) * g / (np.float32(1) + g)
+    out[0] += a * x
+    out[1] += a * y
+    out[2] += a * row[OUT.normal]
