@@ -10,13 +10,13 @@ import numpy as np
 from stmpl_core.layer import SoftLayer
 from stmpl_core.methods.moment_net import think_few
 from stmpl_core.moments import Surroundings
-from stmpl_core.networks import NODE, PRESSURE, Weights, shipped
+from stmpl_core.networks import ARRAYS, NODE, PRESSURE, Weights, shipped
 from stmpl_core.nodes import Nodes
-from stmpl_core.obstacle import RINGS, held_off
+from stmpl_core.obstacle import RINGS, hold_off, response
 from stmpl_core.rays import column_pressure
 
 MAX_LOG_RATIO = 2.5  # largest |log| of pressure over that of the linear layer [-]
-AT = NODE.at  # first columns, constants to numba
+AT, SAY, NODES_SEE = NODE.at, PRESSURE.at, NODE.size  # first columns, constants to numba
 LINEAR_TO = 0.6  # strain to which contact is solved; beyond it the columns' barrier takes over
 HARDENING = 0.75  # power of the columns' pressure with which it does
 FADE, FADE_RING = 0.03, 2  # strain at and around a node at which half of the correction is left: a touch begins linear
@@ -29,14 +29,16 @@ class Held(NamedTuple):
         pressure: pressure over E at the nodes, (N,) [-].
         doubt: error to expect of it, over E, (N,) [-].
         outside: mask of the nodes that see what no training contact had, (N,).
+        power: power of the depth with which the force grows, about [-].
     """
 
     pressure: np.ndarray
     doubt: np.ndarray
     outside: np.ndarray
+    power: float
 
 
-NOTHING = Held(np.empty(0), np.empty(0), np.empty(0, np.bool_))
+NOTHING = Held(np.empty(0), np.empty(0), np.empty(0, np.bool_), 1.0)
 
 
 class Look(NamedTuple):
@@ -46,11 +48,13 @@ class Look(NamedTuple):
         pressure: pressure over E of the linear layer, with the barrier, (N,) [-].
         inputs: what the network reads, (N, NODE.size) float32.
         fade: share of the network's correction, (N,) [-].
+        power: power of the depth with which the linear layer's force grows [-].
     """
 
     pressure: np.ndarray
     inputs: np.ndarray
     fade: np.ndarray
+    power: float
 
 
 class ContactNet:
@@ -76,7 +80,7 @@ class ContactNet:
         tissue = layer.tissue
         self._nu = tissue.poisson_ratio
         self._moduli = np.array([tissue.shear_modulus, tissue.lame_lambda]) / tissue.youngs_modulus
-        self._top = column_pressure(self._moduli, LINEAR_TO)
+        self._table = response(self._nu)
 
     @property
     def weights(self) -> Weights:
@@ -88,30 +92,55 @@ class ContactNet:
     def look(self, nodes: Nodes) -> Look:
         """Solves the linear problem at the nodes, at least one, and gathers what the network reads."""
         group = self.near.groups(nodes.corners[:, 0])
-        linear = held_off(nodes.points, nodes.inward, nodes.thickness, nodes.area, nodes.strain, LINEAR_TO, self._nu,
-                          group)  # fmt: skip
-        deep = np.maximum(nodes.strain, LINEAR_TO)
-        rise = (column_pressure(self._moduli, deep) / self._top) ** HARDENING
-        bent = np.einsum("nc,ncx->nx", nodes.shares, self.near.bent[nodes.corners])
-        inputs = np.empty((len(deep), NODE.size), np.float32)
-        _inputs(*linear, nodes.strain, nodes.inward, bent, self._nu, inputs)
-        around = nodes.strain + linear.moments[:, 1, FADE_RING]
-        return Look(linear.pressure * rise, inputs, around / (around + FADE))
+        return Look(*_look(*nodes, group, self.near.bent, *self._table, self._moduli, self._nu))
 
     def hold(self, nodes: Nodes) -> Held:
         """Pressure at contact nodes."""
-        many = len(nodes.area)
-        if not many:
+        if not len(nodes.area):
             return NOTHING
-        a, look = self.weights.arrays, self.look(nodes)
-        kept = np.clip(look.inputs, a["low"], a["high"])
-        outside = (kept != look.inputs).any(axis=1)
-        outputs = np.empty((many, PRESSURE.size), np.float32)
-        think_few((kept - a["mean"]) * a["scale"], a["w1"], a["b1"], a["w2"], a["b2"], a["w3"], a["b3"], a["w4"],
-                  a["b4"], outputs)  # fmt: skip
-        log_ratio = np.clip(outputs[:, PRESSURE.at.log_ratio].astype(float), -MAX_LOG_RATIO, MAX_LOG_RATIO)
-        held = look.pressure * np.exp(look.fade * log_ratio)
-        return Held(held, held * np.exp(np.minimum(outputs[:, PRESSURE.at.log_error], 1.0)), outside)
+        look = self.look(nodes)
+        corrected = _correct(*look[:3], *(self.weights.arrays[name] for name in ARRAYS["pressure"]))
+        return Held(*corrected, look.power)
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _look(points, inward, thickness, area, strain, corners, shares, group, bent, half_space, rows, moduli, nu):
+    """See Look."""
+    pressure, moments, vectors, power = hold_off(points, inward, thickness, area, strain, LINEAR_TO, group, half_space,
+                                                 rows)  # fmt: skip
+    there, fade, top = np.zeros((len(area), bent.shape[1])), np.empty(len(area)), column_pressure(moduli, LINEAR_TO)
+    for n in range(len(area)):
+        around = strain[n] + moments[n, 1, FADE_RING]
+        fade[n] = around / (around + FADE)
+        for c in range(3):
+            for x in range(bent.shape[1]):
+                there[n, x] += shares[n, c] * bent[corners[n, c], x]
+    inputs = np.empty((len(area), NODES_SEE), np.float32)
+    _inputs(pressure, moments, vectors, strain, inward, there, nu, inputs)
+    for n in range(len(area)):
+        if strain[n] > LINEAR_TO:
+            pressure[n] *= (column_pressure(moduli, strain[n]) / top) ** HARDENING
+    return pressure, inputs, fade, power
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _correct(pressure, inputs, fade, low, high, mean, scale, w1, b1, w2, b2, w3, b3, w4, b4):
+    """See Held."""
+    count = len(pressure)
+    held, doubt, outside = np.empty(count), np.empty(count), np.zeros(count, np.bool_)
+    kept, outputs = np.empty_like(inputs), np.empty((count, len(b4)), np.float32)
+    for n in range(count):
+        for m in range(inputs.shape[1]):
+            value = min(max(inputs[n, m], low[m]), high[m])
+            if value != inputs[n, m]:
+                outside[n] = True
+            kept[n, m] = (value - mean[m]) * scale[m]
+    think_few(kept, w1, b1, w2, b2, w3, b3, w4, b4, outputs)
+    for n in range(count):
+        log_ratio = min(max(float(outputs[n, SAY.log_ratio]), -MAX_LOG_RATIO), MAX_LOG_RATIO)
+        held[n] = pressure[n] * np.exp(fade[n] * log_ratio)
+        doubt[n] = held[n] * np.exp(min(float(outputs[n, SAY.log_error]), 1.0))
+    return held, doubt, outside
 
 
 @numba.njit(cache=True, error_model="numpy")

@@ -47,15 +47,10 @@ class Nodes(NamedTuple):
     shares: np.ndarray
 
     @classmethod
-    def of(cls, rows: np.ndarray) -> Nodes:
-        """From the rows that the kernel writes."""
-        return cls(rows[:, 0:3].copy(), rows[:, 3:6].copy(), rows[:, 6].copy(), rows[:, 7].copy(), rows[:, 8].copy(),
-                   rows[:, 9:12].astype(np.int64), rows[:, 12:15].copy())  # fmt: skip
-
-    @classmethod
     def none(cls) -> Nodes:
         """No nodes."""
-        return cls.of(np.empty((0, 15)))
+        three, one = np.empty((0, 3)), np.empty(0)
+        return cls(three, three, one, one, one, np.empty((0, 3), np.int64), three)
 
     @classmethod
     def joined(cls, parts: list[Nodes]) -> Nodes:
@@ -69,10 +64,22 @@ class Nodes(NamedTuple):
             values: pressures at the nodes, (N,).
             areas: areas of all vertices, (V,) [m2].
         """
-        vertices, place = np.unique(self.corners, return_inverse=True)
-        forces = np.bincount(place.ravel(), ((values * self.area)[:, None] * self.shares).ravel(), len(vertices))
-        some = forces > 0
-        return vertices[some], forces[some] / areas[vertices[some]]
+        return _gathered(self.corners, self.shares, values * self.area, areas)
+
+
+@numba.njit(cache=True)
+def _gathered(corners, shares, forces, areas):
+    """Numbers of the vertices that forces at nodes press on, and pressures there."""
+    some = np.unique(corners)
+    sums, count = np.zeros(len(some)), 0
+    for n in range(len(corners)):
+        for c in range(3):
+            sums[np.searchsorted(some, corners[n, c])] += forces[n] * shares[n, c]
+    for k in range(len(some)):
+        if sums[k] > 0:
+            some[count], sums[count] = some[k], sums[k] / areas[some[k]]
+            count += 1
+    return some[:count].copy(), sums[:count].copy()
 
 
 def nodes_under(grid: tuple, pose: np.ndarray, centre: np.ndarray, skin: tuple, found: np.ndarray,
@@ -87,23 +94,35 @@ def nodes_under(grid: tuple, pose: np.ndarray, centre: np.ndarray, skin: tuple, 
         found: numbers of the triangles that the tool may touch, (F,).
         buried: 1 where the whole tool is under the skin, 0 where it comes out of it, else between.
     """
+    return Nodes(*_nodes(grid, pose, centre, *skin, found, buried))
+
+
+@numba.njit(cache=True)
+def _nodes(grid, pose, centre, points, inward, thickness, faces, found, buried):
+    """See nodes_under. The lattice is laid twice: first to see the covered area as it does, not as the triangles do."""
     split = 1
     while split < 8 and len(found) * split**2 < SAMPLES:
         split += 1
-    points, inward, thickness, faces = skin
     depths, middles, ways, sizes, best, area = _look(
         grid, pose, points, inward, thickness, faces, found, buried, split
     )
-    if area <= 0:
-        return Nodes.none()
-    chart, frames = _charts(pose, found, depths, ways, sizes, best)
-
-    def lay(area: float, only_look: bool) -> tuple[float, np.ndarray]:
-        return _lay(grid, pose, centre, points, inward, thickness, faces, found, buried, depths, middles, chart,
-                    frames, area, only_look)  # fmt: skip
-
-    area, _ = lay(area, True)
-    return Nodes.of(lay(area, False)[1]) if area > 0 else Nodes.none()
+    rows = np.empty((0, 15))
+    if area > 0:
+        chart, frames = _charts(pose, found, depths, ways, sizes, best)
+        for only_look in (True, False):
+            seen, rows = _lay(grid, pose, centre, points, inward, thickness, faces, found, buried, depths, middles,
+                              chart, frames, area, only_look)  # fmt: skip
+            if only_look:
+                area = seen
+                if area <= 0:
+                    break
+    count = len(rows)
+    corners = np.empty((count, 3), np.int64)
+    for n in range(count):
+        for c in range(3):
+            corners[n, c] = int(rows[n, 9 + c])
+    return (rows[:, 0:3].copy(), rows[:, 3:6].copy(), rows[:, 6].copy(), rows[:, 7].copy(), rows[:, 8].copy(), corners,
+            rows[:, 12:15].copy())  # fmt: skip
 
 
 @numba.njit(cache=True)
@@ -260,16 +279,18 @@ def _lay(grid, pose, centre, points, inward, thickness, faces, found, buried, de
         first, second, way = frames[side, 0], frames[side, 1], frames[side, 2]
 
         # How far the lattice must reach.
+        near = np.zeros(len(found), np.bool_)
         reach = np.array([np.inf, np.inf, -np.inf, -np.inf])
         for m in range(len(found)):
+            f, edge = found[m], 0.0
             if chart[m] != side:
                 continue
-            f, edge = found[m], 0.0
             for x in range(3):
                 edge += (points[faces[f, 0], x] - points[faces[f, 1], x]) ** 2
             edge = np.sqrt(edge / depths.shape[1])
             for q in range(depths.shape[1]):
-                if depths[m, q] > -0.5 * edge:
+                if depths[m, q] > -0.6 * edge - WALL * thick:  # a part may reach that far beyond its middle
+                    near[m] = True
                     u = v = 0.0
                     for x in range(3):
                         u += first[x] * (middles[m, q, x] - centre[x])
@@ -292,7 +313,7 @@ def _lay(grid, pose, centre, points, inward, thickness, faces, found, buried, de
         # Which triangle each point of it lies on.
         uv = np.empty((3, 2))
         for m in range(len(found)):
-            if chart[m] != side:
+            if not near[m]:
                 continue
             f = found[m]
             for c in range(3):

@@ -27,6 +27,7 @@ RINGS = len(RING_AT)
 OWN = 3.921  # of an even pressure on a lattice of triangles: sum of 1 / r with this / sqrt(area) for the node itself
 TOLERANCE = 3e-6  # largest change of the forces of one iteration, over the largest, at which it ends
 MAX_ITERATIONS = 200
+POWER_TOLERANCE = 1e-4  # square of the residual over the first, at which the power is known
 
 
 class Response(NamedTuple):
@@ -49,11 +50,13 @@ class Linear(NamedTuple):
         pressure: pressure over E that holds the skin off, (N,) [-]; 0 where the skin leaves the tool.
         moments: of pressure and strain on the rings, (N, 2, RINGS) [-].
         vectors: their first moments, in the body's axes, (N, 2, 3) [-].
+        power: power of the depth with which the force grows as the tool goes on [-].
     """
 
     pressure: np.ndarray
     moments: np.ndarray
     vectors: np.ndarray
+    power: float
 
 
 @cache
@@ -96,21 +99,30 @@ def held_off(points: np.ndarray, inward: np.ndarray, thickness: np.ndarray, area
         poisson_ratio: nu.
         group: numbers of groups of nodes that do not feel each other, (N,).
     """
-    mean = float(thickness.mean())
     table = response(poisson_ratio)
-    matrix, rings = _pairs(points, inward, thickness, area, group, mean, table.half_space, table.rows)
-    pressure = solve(matrix, np.minimum(strain, most) * thickness / mean) * mean**2 / area
-    return Linear(pressure, *_moments(rings, points, thickness, area, pressure, strain))
+    return Linear(*hold_off(points, inward, thickness, area, strain, most, group, table.half_space, table.rows))
+
+
+@numba.njit(cache=True, error_model="numpy")
+def hold_off(points, inward, thickness, area, strain, most, group, half_space, rows):
+    """`held_off` with the tables of a Response."""
+    mean = thickness.mean()
+    matrix, rings = _pairs(points, inward, thickness, area, group, mean, half_space, rows)
+    depth = np.minimum(strain, most) * thickness / mean
+    force = solve(matrix, depth)
+    pressure = force * mean**2 / area
+    moments, vectors = _moments(rings, points, thickness, area, pressure, strain)
+    return pressure, moments, vectors, _power(matrix, force, depth.max())
 
 
 @numba.njit(cache=True, error_model="numpy")
 def _pairs(points, inward, thickness, area, group, mean, half_space, rows):
-    """Depth over `mean` of each node under a force E mean^2 at each, and its weights in rings, (N, N) and (N, N, .).
+    """Depth over `mean` of each node under a force E mean^2 at each, and its weights in rings, (N, N) and (., N, N).
 
     All of it is symmetric.
     """
     count, width = len(points), rows.shape[1] - 1
-    out, rings = np.zeros((count, count)), np.zeros((count, count, width), np.float32)
+    out, rings = np.zeros((count, count)), np.zeros((width, count, count), np.float32)
     roots = 1 / np.sqrt(thickness)
     own = np.sqrt(area) / OWN
     for i in range(count):
@@ -129,25 +141,31 @@ def _pairs(points, inward, thickness, area, group, mean, half_space, rows):
             if k < NEAR * STEPS:
                 for m in range(width):
                     weight = per * per * ((1 - f) * rows[k, m + 1] + f * rows[k + 1, m + 1])
-                    rings[i, j, m] = rings[j, i, m] = weight
+                    rings[m, i, j] = rings[m, j, i] = weight
     return out, rings
 
 
 @numba.njit(cache=True, error_model="numpy")
 def _moments(rings, points, thickness, area, pressure, strain):
     """See Linear."""
-    count, last = len(points), rings.shape[2] - 1
-    moments, vectors = np.zeros((count, 2, last)), np.zeros((count, 2, 3))
-    for i in range(count):
-        for j in range(count):
-            p, s = area[j] * pressure[j], area[j] * strain[j]
-            for m in range(last):
-                moments[i, 0, m] += rings[i, j, m] * p
-                moments[i, 1, m] += rings[i, j, m] * s
+    width, count = rings.shape[:2]
+    sources, scale, centre = np.empty((count, 8), np.float32), thickness.mean(), points[0].copy()
+    for j in range(count):
+        for s in range(2):
+            value = area[j] / scale**2 * (pressure[j] if s == 0 else strain[j])
+            sources[j, 4 * s] = value
             for x in range(3):
-                along = rings[i, j, last] * (points[j, x] - points[i, x]) / thickness[i]
-                vectors[i, 0, x] += p * along
-                vectors[i, 1, x] += s * along
+                sources[j, 4 * s + 1 + x] = value * (points[j, x] - centre[x]) / scale
+    sums = np.dot(rings.reshape(width * count, count), sources).reshape(width, count, 8)
+    moments, vectors = np.empty((count, 2, width - 1)), np.empty((count, 2, 3))
+    for i in range(count):
+        for s in range(2):
+            for m in range(width - 1):
+                moments[i, s, m] = sums[m, i, 4 * s] * scale**2
+            for x in range(3):
+                here = (points[i, x] - centre[x]) / scale
+                around = sums[width - 1, i, 4 * s + 1 + x] - here * sums[width - 1, i, 4 * s]
+                vectors[i, s, x] = around * scale**3 / thickness[i]
     return moments, vectors
 
 
@@ -198,3 +216,30 @@ def solve(matrix, depth):
         if change <= TOLERANCE * largest:
             break
     return force
+
+
+@numba.njit(cache=True, fastmath=FAST, error_model="numpy")
+def _power(matrix, force, depth):
+    """The slope of the whole force over the depth, times depth over force: conjugate gradients on what presses."""
+    count = len(force)
+    found, left = np.zeros(count), (force > 0).astype(np.float64)
+    way, along = left.copy(), np.empty(count)
+    square = start = left.sum()
+    for _ in range(MAX_ITERATIONS):
+        if square <= POWER_TOLERANCE * start:
+            break
+        down = 0.0
+        for i in range(count):
+            along[i] = 0.0
+            if force[i] > 0:
+                for j in range(count):
+                    along[i] += matrix[i, j] * way[j]
+            down += along[i] * way[i]
+        step, before, square = square / down, square, 0.0
+        for i in range(count):
+            found[i] += step * way[i]
+            left[i] -= step * along[i]
+            square += left[i] * left[i]
+        for i in range(count):
+            way[i] = left[i] + square / before * way[i]
+    return depth * found.sum() / max(force.sum(), 1e-300)

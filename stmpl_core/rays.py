@@ -81,6 +81,7 @@ def depth_in_column(grid, ray, t, guess):
     return min(s, t)
 
 
+@numba.njit(cache=True, error_model="numpy")
 def column_pressure(moduli, strain):
     """Pressure of confined Neo-Hookean columns, over E [-]; moduli: mu and lambda over E."""
     stretch = 1 - strain

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
+import numba
 import numpy as np
 
 from stmpl_core.arrays import Transform
@@ -45,12 +46,18 @@ MAX_UNSEEN_FORCE_SHARE = 0.1  # share of the force that vertices unlike all trai
 MAX_PRESSED_STRAIN = 0.85  # depth over thickness beyond which no wrench presses a tool
 STIFFENING = 10.0  # growth of the force beyond, relative, a thickness of the way that it was drawn back
 FORCE_TOLERANCE = 0.015  # relative error of the force at which trials end; the rest of the way is reckoned
-FIRST_TOLERANCE = 3e-3  # the same for the first trial, which knows no power yet
 LEAST_STEP = 2e-4  # step of the depth, over the thickness, that is likewise only reckoned
 MAX_DEPTH_TRIALS = 14  # trials of the depth for one wrench
-FIRST_POWER = 1.4  # power of the depth with which the force grows, until a trial says more
+STIFFER = 1.1  # power of the depth with which the force grows over that of the linear layer, until a trial says more
 POWERS = (0.7, 6.0)  # range of that power
 MANY_TOOLS = 8  # number of tools from which those that are apart are told by a tree of boxes
+WHY = {
+    NO_TOUCH: "{name} presses, but no skin is within {reach:g} mm along its force",
+    PULLING: "{name} pulls: nothing is taken to stick, so nothing is loaded",
+    WRAPPED: "{name} closes around the limb: its wrench does not say how hard it squeezes; "
+             "give each finger as a contact, or leave the wrench out",
+    IN_CORE: "{name} reaches {depth:.1f} mm deep, into the rigid core: check its pose or the thickness",
+}  # fmt: skip
 
 
 class _Placed(NamedTuple):
@@ -116,8 +123,8 @@ class Toucher:
                 continue
             together = self.net.hold(Nodes.joined([one.squeeze.nodes for one in group]))
             ends = np.cumsum([len(one.squeeze.nodes.area) for one in group])[:-1]
-            parts = zip(*(np.split(values, ends) for values in together), strict=True)
-            held |= {one.contact.name: Held(*part) for one, part in zip(group, parts, strict=True)}
+            parts = zip(*(np.split(values, ends) for values in together[:3]), strict=True)
+            held |= {one.contact.name: Held(*part, together.power) for one, part in zip(group, parts, strict=True)}
         return [self._answer(one, held.get(one.contact.name, NOTHING)) for one in placed]
 
     def _near_each_other(self, pressing: Sequence[_Placed]) -> list[list[_Placed]]:
@@ -204,7 +211,7 @@ class Toucher:
         push, stated_at = force / np.linalg.norm(force), contact.pose_body_from_tool[:3, 3]
         low, high, moved, best = -np.inf, np.inf, gap, None
         last: tuple[float, float] | None = None  # depth and force of the trial before
-        power, back = FIRST_POWER, 0.1 * self._thickest
+        back = 0.1 * self._thickest
         for _ in range(MAX_DEPTH_TRIALS):
             pose, clearance = shifted(start, moved * push), stated
             if moved:
@@ -235,12 +242,12 @@ class Toucher:
             way = float((pose[:3, 3] - stated_at) @ push)
             best = _Placed(contact, field, status, pose, depth, way, squeeze, normal, held=held)
             deep = self._depth(squeeze)
+            power = held.power * STIFFER
             if last is not None and abs(deep / last[0] - 1) > 1e-6:
                 power = float(np.clip(np.log(size / last[1]) / np.log(deep / last[0]), *POWERS))
             gain = max(normal / float(np.linalg.norm(force)), MIN_FACING_COSINE)
             further = deep * ((normal / size) ** (1 / power) - 1) / gain
-            tolerance = FORCE_TOLERANCE if last else FIRST_TOLERANCE
-            if abs(size / normal - 1) < tolerance or abs(further) < LEAST_STEP * self._thickest:
+            if abs(size / normal - 1) < FORCE_TOLERANCE or abs(further) < LEAST_STEP * self._thickest:
                 under = np.where(squeeze.depth > 0, squeeze.depth + further * (self._inward[v] @ push), 0.0)
                 return best._replace(pose=shifted(pose, further * push), moved=way + further,
                                      squeeze=squeeze._replace(depth=np.maximum(under, 0.0)))  # fmt: skip
@@ -265,21 +272,19 @@ class Toucher:
         layer, nodes = self.layer, one.squeeze.nodes
         there = held.pressure * (one.factor * self._modulus)
         v, pressure = nodes.at_vertices(there, layer.vertex_areas)
+        wrench = _wrench(pressure, v, layer.vertices, layer.vertex_area_vectors, one.pose[:3, 3])
         scale = 1.0
         if one.force is not None and len(v):
-            scale = one.force / max(float(np.linalg.norm(pressure @ layer.vertex_area_vectors[v])), 1e-300)
-            pressure = scale * pressure
+            scale = one.force / max(float(np.linalg.norm(wrench[:3])), 1e-300)
+            pressure, wrench = scale * pressure, scale * wrench
         values = np.zeros(len(layer.vertices))
         values[v] = pressure
-        forces = -pressure[:, None] * layer.vertex_area_vectors[v]
-        arms = layer.vertices[v] - one.pose[:3, 3]
-        turning = arms.T @ forces  # its antisymmetric part is the torque
-        torque = (turning[1, 2] - turning[2, 1], turning[2, 0] - turning[0, 2], turning[0, 1] - turning[1, 0])
-        wrench = np.array([*forces.sum(axis=0), *torque])
         stated = one.contact.wrench
         depth = self._depth(one.squeeze) if len(v) and not one.factor > 1 else one.depth
         way = stated[:3] / np.linalg.norm(stated[:3]) if stated is not None and stated[:3].any() else None
         doubt = scale * one.factor * self._modulus * float(held.doubt @ nodes.area)
+        forces_there = there * nodes.area
+        strange = float(forces_there[held.outside].sum() / max(forces_there.sum(), 1e-300))
         touch = Touch(
             one.contact.name, one.status, one.pose, wrench,
             depth=depth if np.isfinite(depth) else float("nan"),
@@ -287,24 +292,15 @@ class Toucher:
             moved=one.moved,
             missing=np.zeros(6) if stated is None else stated - wrench,
             pressure=values,
-            pressed=Pressed(one.field, one.squeeze, way, one.factor) if values.any() else None,
+            pressed=Pressed(one.field, one.squeeze, way, one.factor) if len(v) else None,
         )  # fmt: skip
-        forces_there = there * nodes.area
-        strange = float(forces_there[held.outside].sum() / max(forces_there.sum(), 1e-300))
         return replace(touch, trust=self._trust(one, touch, pressure, strange))
 
     def _trust(self, one: _Placed, touch: Touch, pressure: np.ndarray, strange: float) -> Trust:
         name, layer, card, trust = touch.name, self.layer, self.net.weights.card, Trust()
-        why = {
-            NO_TOUCH: f"{name} presses, but no skin is within {self.reach * 1e3:g} mm along its force",
-            PULLING: f"{name} pulls: nothing is taken to stick, so nothing is loaded",
-            WRAPPED: f"{name} closes around the limb: its wrench does not say how hard it squeezes; "
-                     "give each finger as a contact, or leave the wrench out",
-            IN_CORE: f"{name} reaches {touch.depth * 1e3:.1f} mm deep, into the rigid core: "
-                     "check its pose or the thickness",
-        }  # fmt: skip
-        if one.status in why:
-            trust = trust.also(why[one.status], in_range=False if one.status != PULLING else None)
+        if one.status in WHY:
+            why = WHY[one.status].format(name=name, reach=1e3 * self.reach, depth=1e3 * touch.depth)
+            trust = trust.also(why, in_range=False if one.status != PULLING else None)
         if one.status == NO_FORCE and one.contact.wrench is not None and one.contact.wrench[3:].any():
             trust = trust.also(f"{name} asks for a torque without a force, which is not carried", in_range=False)
         if one.why:
@@ -338,6 +334,21 @@ class Toucher:
         if one.field.flipped:
             trust = trust.also(f"the mesh of {name} was inside out and was turned")
         return trust
+
+
+@numba.njit(cache=True)
+def _wrench(pressure, vertices, points, area_vectors, origin):
+    """Force and torque about a point, (6,), of pressures (N,) at vertices (N,)."""
+    out, f, arm = np.zeros(6), np.empty(3), np.empty(3)
+    for n in range(len(vertices)):
+        v = vertices[n]
+        for x in range(3):
+            f[x], arm[x] = -pressure[n] * area_vectors[v, x], points[v, x] - origin[x]
+            out[x] += f[x]
+        out[3] += arm[1] * f[2] - arm[2] * f[1]
+        out[4] += arm[2] * f[0] - arm[0] * f[2]
+        out[5] += arm[0] * f[1] - arm[1] * f[0]
+    return out
 
 
 def margin_on(layer: SoftLayer) -> float:

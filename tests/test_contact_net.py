@@ -37,7 +37,7 @@ def held(layer: SoftLayer, weights: Weights, pose: np.ndarray = POSE) -> tuple[N
 
 
 def test_no_nodes_no_pressure() -> None:
-    assert all(part.shape == (0,) for part in ContactNet(LIMB).hold(Nodes.none()))
+    assert all(part.shape == (0,) for part in ContactNet(LIMB).hold(Nodes.none())[:3])
 
 
 @pytest.mark.parametrize("weights", WEIGHTS)
