@@ -38,7 +38,8 @@ def strange_tools() -> dict[str, Tool]:
         "mushroom": lambda p: _blend([_ball(p, (0, 0, 14), 20), p[:, 2] - 1], -2),
     }  # fmt: skip
     made = {name: _meshed(name, distance) for name, distance in shapes.items()}
-    return {"saddle roller": roller(8, 12, 30), "peanut": peanut(7, 18), "star": star(5, 14, 7), "cup": cup(11, 4)} | made
+    turned = {"saddle roller": roller(8, 12, 30), "peanut": peanut(7, 18), "cup": cup(11, 4)}
+    return turned | {"star": star(5, 14, 7)} | made
 
 
 def _ring(k: int, count: int, radius: float) -> np.ndarray:
@@ -87,6 +88,7 @@ def _meshed(name: str, distance: Distance) -> Tool:
     """The surface of a shape, lowered to z = 0."""
     side = np.arange(-32.17, 32, SPACING)
     grid = np.stack(np.meshgrid(side, side, side, indexing="ij"), axis=-1).reshape(-1, 3, order="F")
-    vertices, faces, _ = igl.marching_cubes(np.maximum(distance(grid), np.abs(grid).max(axis=1) - 30), grid, *(len(side),) * 3, 0.0)
+    inside = np.maximum(distance(grid), np.abs(grid).max(axis=1) - 30)
+    vertices, faces, _ = igl.marching_cubes(inside, grid, *(len(side),) * 3, 0.0)
     vertices = 1e-3 * (vertices - [0, 0, vertices[:, 2].min()])
     return Tool(name, vertices, faces)

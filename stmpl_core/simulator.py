@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import overload
 
 import numpy as np
@@ -21,6 +22,7 @@ from stmpl_core.toucher import Toucher
 from stmpl_core.trust import Displacement, Trust
 
 MOST_MOVED = 0.95  # motion over the thickness from which it is held back
+SHEAR = 3.0  # motion of the skin along a force, over that across it: 1.3 on a half-space, 6 on a wide contact at nu 0.4
 MAX_ENTERED_SHARE = 0.02  # depth of skin inside a tool over the thickness, which is not yet said
 
 
@@ -106,7 +108,25 @@ class Simulator:
         displacement, cut = _within(fitted.displacement, self.layer.thickness)
         if cut:
             trust = trust.also(f"{cut} vertices would move further than there is skin: held back", in_range=False)
+        if trust.in_range:
+            trust = replace(trust, error_bound=self._bound(touches, float(np.linalg.norm(displacement, axis=1).max())))
         return Answer(displacement, trust, solved.method, pressure, {touch.name: touch for touch in touches})
+
+    def _bound(self, touches: Sequence[Touch], peak: float) -> float | None:
+        """Bound on the error of the motion under touches that are in range [m]; None where the method knows none.
+
+        It follows from how far the force may be off, and from the drag that a wrench tells of: the skin would go along
+        with it, by so much as it gives.
+        """
+        pressing = [touch for touch in touches if touch.presses and touch.force > 0]
+        if not pressing:
+            return 0.0
+        known = getattr(self.method, "contact_bound", None)
+        if known is None:
+            return None
+        doubt = max(touch.force_bound / touch.force for touch in pressing)
+        along = max(SHEAR * touch.drag / touch.force * touch.depth for touch in pressing)
+        return peak * known["scale"] * doubt ** known["power"] + along
 
     def step(self, contacts: Sequence[Contact]) -> Answer:
         """`touch`, then `answer`. Raises what `touch` raises."""
@@ -129,8 +149,7 @@ def _within(displacement: np.ndarray, thickness: np.ndarray) -> tuple[np.ndarray
 def _joined(trust: Trust, touches: Sequence[Touch], fitted: Conformed) -> Trust:
     """The method's trust, lowered by that of the contacts.
 
-    The method's error bound is for the pressure that it was given. How far that is from what the tools press with is
-    not known, so it becomes a figure, and the answer states no bound.
+    The method's error bound is for the pressure that it was given, so it becomes a figure.
     """
     figures = dict(trust.figures)
     if touches:

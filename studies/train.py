@@ -51,12 +51,14 @@ def train(
     changes |= {} if steps is None else {"steps": steps}
     if preset == "default":
         return train_moments(data, out, _settings(MomentTraining, changes), on_progress=on_progress)
+    from studies.judge_contact import bound_motion
     from studies.train_contact import ContactTraining, train_contact
 
     contacts = _settings(ContactTraining, changes)
     moments = _settings(MomentTraining, {"kinds": ("indenter",), "steps": 20_000} | changes)
     train_moments(data, out, moments, name="moment_net_contact", on_progress=on_progress)
-    return train_contact(data, out, contacts, on_progress=on_progress)
+    card = train_contact(data, out, contacts, on_progress=on_progress)
+    return card | {"motion": bound_motion(data, out)}
 
 
 def _settings(make: Callable[..., Any], changes: dict[str, Any]) -> Any:

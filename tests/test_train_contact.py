@@ -15,8 +15,10 @@ from stmpl_core.contact_net import ContactNet
 from stmpl_core.errors import InvalidInput
 from stmpl_core.networks import Weights
 from stmpl_core.sdf import SignedDistance
+from studies.judge_contact import fit_bound, score
+from studies.pressed import pressed
 from studies.train import train
-from studies.train_contact import ContactTraining, pressed, score, train_contact
+from studies.train_contact import ContactTraining, train_contact
 from tests import scenes
 
 BODY = CONTACT_BODIES[1].model_copy(update={"edge_length": 6e-3, "reach": 3.0})
@@ -135,3 +137,19 @@ def test_settings_that_cannot_be_are_refused_in_a_sentence(tmp_path: Path) -> No
     for preset in ("default", "contacts", "paper-reduced"):
         with pytest.raises(InvalidInput, match=r"is 0: .* greater than or equal to"):
             train(preset, tmp_path, tmp_path, steps=0)
+
+
+def test_a_bound_holds_for_kinds_that_it_was_not_fitted_to_and_is_not_loose() -> None:
+    rng = np.random.default_rng(4)
+    kinds = rng.integers(12, size=600)
+    own = 0.2 * rng.normal(size=24)  # each kind errs a little more or less than the others
+    doubts = np.exp(rng.uniform(-5, -1, 600))
+
+    def errors(of: np.ndarray) -> np.ndarray:
+        return 0.3 * doubts**0.5 * np.exp(own[of] + 0.3 * rng.normal(size=600))
+
+    known = fit_bound(errors(kinds), doubts, kinds)
+    assert known["power"] == pytest.approx(0.5, abs=0.05) and known["median_bound_over_error"] < 3
+    others = errors(kinds + 12)
+    assert np.mean(others <= known["scale"] * doubts ** known["power"]) > 0.95
+    assert fit_bound(others[:10], doubts[:10], kinds[:10])["scale"] == np.inf  # too few say nothing

@@ -82,6 +82,11 @@ class MomentNet:
         self._layer: SoftLayer | None = None
         self._near: Surroundings | None = None
 
+    @property
+    def contact_bound(self) -> Mapping[str, float] | None:
+        """Figures of a bound on the motion under tools, see studies.judge_contact; None: not known."""
+        return self.contact.card.get("contact_bound")
+
     def prepare(self, layer: SoftLayer) -> Self:
         """Finds each vertex's neighbours (about half a second for a limb)."""
         self._near = near = Surroundings.of(layer)

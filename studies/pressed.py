@@ -1,0 +1,142 @@
+"""pressed: contacts of a data set with their tools built again, and what a ContactNet sees of them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from fem_tools.contact_job import INDENTER_REFINE
+from fem_tools.dataset import Sample
+from fem_tools.press import Press
+from fem_tools.sampling import tool_scene
+from fem_tools.scenes import Site
+from stmpl_core.arrays import Transform
+from stmpl_core.columns import Columns
+from stmpl_core.contact_net import ContactNet
+from stmpl_core.nodes import Nodes
+from stmpl_core.sdf import SignedDistance
+from stmpl_core.tool import Tool
+
+LEAST_CELLS = 20  # area of a contact over the square of the finite elements' edge, from which they know its pressure
+STRAIGHT = 0.36  # largest slant of a tool's way that is learnt from: no pose tells of it [rad]
+
+
+@dataclass(frozen=True, eq=False)
+class Pressed:
+    """One converged contact: where the tool is, the nodes under it, and the true pressure.
+
+    Args:
+        sample: sample of the data set.
+        tool: tool that presses.
+        field: its signed distance.
+        pose: pose of the tool, (4, 4).
+        nodes: contact nodes under it.
+    """
+
+    sample: Sample
+    tool: Tool
+    field: SignedDistance
+    pose: Transform
+    nodes: Nodes
+
+    @property
+    def true(self) -> np.ndarray:
+        """True pressure over E at all vertices, (V,) [-]."""
+        return self.sample.load.values / self.sample.layer.tissue.youngs_modulus
+
+
+def pressed(samples: Iterable[Sample]) -> Iterator[Pressed]:
+    """Contacts of samples, each with its tool built again where it stood."""
+    layer = columns = site = last = None
+    for sample in samples:
+        if sample.info["set"] != "tool":
+            continue
+        if sample.layer is not layer:
+            layer, columns, site = sample.layer, Columns(sample.layer), Site(sample.layer)
+        assert columns is not None and site is not None
+        if last is None or last[0] != (sample.info["body"], sample.info["number"]):
+            scene = tool_scene(site, sample.info["drawn"])
+            assert scene.tool is not None
+            way = -scene.pose_body_from_tool[:3, 2]
+            field = SignedDistance.of(scene.tool, rounding=scene.rounding)
+            tool = Press(field, scene.pose_body_from_tool, way).touching(sample.layer)
+            assert tool is not None
+            last = ((sample.info["body"], sample.info["number"]), tool, scene.tool,
+                    site.thickness_under(scene.pose_body_from_tool))  # fmt: skip
+        _, tool, mesh, thickness = last
+        pose = tool.at(sample.info["ratio"] * thickness).pose_body_from_tool
+        yield Pressed(sample, mesh, tool.field, pose, columns.squeezed(tool.field, pose).nodes)
+
+
+@dataclass(frozen=True, eq=False)
+class Rows:
+    """Nodes of many contacts, one after the other, and the vertices that they press on.
+
+    Args:
+        rows: inputs, laid out as stmpl_core.networks.NODE, (N, NODE.size) float32.
+        prior: pressure over E that the network corrects, (N,) float32.
+        fade: share of the correction, (N,) float32.
+        area: area of the node, over its contact's scale, (N,) float32.
+        corners: rows of `true` of the vertices around the node, (N, 3).
+        shares: barycentric coordinates, (N, 3) float32.
+        starts: first node of each contact, and the end, (C + 1,).
+        true: true pressure over E at the vertices, (M,) float32.
+        vertex_area: area of the vertices, over the contact's scale, (M,) float32.
+        vertex_starts: first vertex of each contact, and the end, (C + 1,).
+    """
+
+    rows: np.ndarray
+    prior: np.ndarray
+    fade: np.ndarray
+    area: np.ndarray
+    corners: np.ndarray
+    shares: np.ndarray
+    starts: np.ndarray
+    true: np.ndarray
+    vertex_area: np.ndarray
+    vertex_starts: np.ndarray
+
+    @property
+    def contacts(self) -> int:
+        """Number of contacts."""
+        return len(self.starts) - 1
+
+    @classmethod
+    def joined(cls, parts: Sequence[Rows]) -> Rows:
+        """Contacts of several, in order."""
+        columns = {name: np.concatenate([getattr(part, name) for part in parts])
+                   for name in ("rows", "prior", "fade", "area", "shares", "true", "vertex_area")}  # fmt: skip
+        counts = [np.concatenate([np.diff(getattr(part, name)) for part in parts]) for name in
+                  ("starts", "vertex_starts")]  # fmt: skip
+        starts, vertex_starts = (np.concatenate([[0], np.cumsum(count)]) for count in counts)
+        before = np.cumsum([0] + [len(part.true) for part in parts])
+        corners = np.concatenate([part.corners + k for part, k in zip(parts, before, strict=False)])
+        return cls(**columns, corners=corners, starts=starts, vertex_starts=vertex_starts)
+
+
+def seen(one: Pressed, net: ContactNet) -> Rows | None:
+    """What the network sees of a contact; None where finite elements were too coarse to know its pressure."""
+    layer, nodes = one.sample.layer, one.nodes
+    if not len(nodes.area):
+        return None
+    look = net.look(nodes)
+    touching = float(nodes.area[look.pressure > 0].sum())
+    if touching < LEAST_CELLS * (layer.edge_length / 2**INDENTER_REFINE) ** 2 or not one.true.any():
+        return None
+    n = len(nodes.area)
+    vertices = np.union1d(nodes.corners, np.flatnonzero(one.true))
+    areas = layer.vertex_areas[vertices]
+    scale = areas.sum()
+    float32 = np.float32
+    return Rows(look.inputs, look.pressure.astype(float32),
+                look.fade.astype(float32), (nodes.area / scale).astype(float32),
+                np.searchsorted(vertices, nodes.corners), nodes.shares.astype(float32), np.array([0, n]),
+                one.true[vertices].astype(float32), (areas / scale).astype(float32),
+                np.array([0, len(vertices)]))  # fmt: skip
+
+
+def slant_of(sample: Sample) -> float:
+    """Angle between a tool's way and the skin's normal [rad]."""
+    return float(np.hypot(*sample.info["drawn"]["slant"]))
