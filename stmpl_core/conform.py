@@ -15,7 +15,7 @@ from stmpl_core.sdf import SignedDistance
 from stmpl_core.touch import Pressed, Touch
 
 MIN_LYING_PRESSURE = 0.05  # pressure over the tool's highest, below which a covered vertex may be apart from the tool
-FIRM_DEPTH_M = 1e-4  # depth inside a tool from which skin is moved out with its neighbours, not by itself
+FIRM_DEPTH = 0.013  # depth in a tool over the thickness, from which skin is moved out with its neighbours, not by itself
 MIN_FACING_COSINE = 0.3  # cosine between tool's way and inward normal, from which skin comes along
 MIN_ONE_WAY_SHARE = 0.7  # share of the pressure that points one way, and its cosine to a force: all skin then goes so
 PASSES = 3  # corrections of one answer
@@ -42,6 +42,7 @@ class _Tool(NamedTuple):
     vertices: np.ndarray
     gone: Points  # way of the vertices with the tool if they lie on it, (N, 3) [m]
     lies: np.ndarray  # share from 0, may be apart, to 1, lies on the tool, (N,)
+    firm: np.ndarray  # FIRM_DEPTH, (N,) [m]
 
     def jet(self, points: Points) -> tuple[np.ndarray, Points]:
         """Signed distance [m] and its gradient at points of the layer's frame."""
@@ -114,7 +115,7 @@ def _tool(touch: Touch, pressed: Pressed, layer: SoftLayer) -> _Tool:
     far = depth_along(field, touch.pose_body_from_tool, points, way[some], guess)
     sure = np.clip(2 * lies[some] - 1, 0, 1)  # beside a wall it is not clear where the way ends
     gone[some] = (sure * far + (1 - sure) * guess)[:, None] * way[some]
-    return _Tool(field, touch.pose_body_from_tool, v, gone, lies)
+    return _Tool(field, touch.pose_body_from_tool, v, gone, lies, FIRM_DEPTH * layer.thickness[v])
 
 
 def _wanted(tool: _Tool, rest: Points, moved: Points) -> tuple[Points, np.ndarray]:
@@ -122,4 +123,4 @@ def _wanted(tool: _Tool, rest: Points, moved: Points) -> tuple[Points, np.ndarra
     phi, gradient = tool.jet(rest + moved)
     out, lies = -np.minimum(phi, 0.0)[:, None] * gradient, tool.lies[:, None]
     wanted = lies * (tool.gone - moved) + (1 - lies) * out
-    return wanted, np.maximum(tool.lies, np.clip(-phi / FIRM_DEPTH_M, 0, 1))
+    return wanted, np.maximum(tool.lies, np.clip(-phi / tool.firm, 0, 1))

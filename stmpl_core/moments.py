@@ -23,6 +23,7 @@ from stmpl_core.response import (
     sink_between,
     spread_sinking,
 )
+from stmpl_core.soundness import Soundness
 from stmpl_core.thinning import Asked, Thinning
 
 
@@ -74,12 +75,14 @@ class Surroundings:
         curvature: thickness times the skin's curvature in the tangents, xx, xy, yy, (V, 3) [-]; convex is positive.
         slope: gradient of the thickness along the tangents, (V, 2) [-].
         bent: both in the layer's axes, a (3, 3) tensor and a vector, (V, 12) [-].
+        sound: where the layer is as the networks know skin.
     """
 
     def __init__(self, layer: SoftLayer) -> None:
         self.frames, self._thickness = _frames(layer.normals), layer.thickness
         points = np.ascontiguousarray(layer.vertices)
         self._thinning = Thinning(layer, self.frames, REACH)
+        self.sound = Soundness(layer)
         self._frames = self.frames.astype(np.float32)
         self._sites = _sites(points, layer.normals, layer.thickness, layer.vertex_areas)
         shape = _shape(self._thinning.start, self._thinning.index, points, self.frames, layer.thickness)

@@ -41,6 +41,7 @@ GAP_TOLERANCE_M = 1e-6  # gap at which the search along the force ends
 MIN_FACING_COSINE = 0.1  # cosine between push and inward normal from which the skin faces a tool that looks for it
 MIN_NET_FORCE_SHARE = 0.1  # force over the sum of its parts' sizes, below which a contact has no direction
 MAX_DRAG_RATIO = 0.3  # tangential over normal force that is not yet worth a word
+MAX_LEVER = 1.0  # torque that is not carried over the force, over the contact's radius, that is not yet worth a word
 MAX_FIELD_ERROR_M = 5e-4  # error of a distance field that is not yet worth a word
 MAX_UNSEEN_FORCE_SHARE = 0.1  # share of the force that vertices unlike all training contacts may carry
 MAX_PRESSED_STRAIN = 0.85  # depth over thickness beyond which no wrench presses a tool
@@ -294,19 +295,22 @@ class Toucher:
             pressure=values,
             pressed=Pressed(one.field, one.squeeze, way, one.factor) if len(v) else None,
         )  # fmt: skip
-        return replace(touch, trust=self._trust(one, touch, pressure, strange))
+        return replace(touch, trust=self._trust(one, touch, v, pressure, strange))
 
-    def _trust(self, one: _Placed, touch: Touch, pressure: np.ndarray, strange: float) -> Trust:
+    def _trust(self, one: _Placed, touch: Touch, vertices: np.ndarray, pressure: np.ndarray, strange: float) -> Trust:
         name, layer, card, trust = touch.name, self.layer, self.net.weights.card, Trust()
         if one.status in WHY:
             why = WHY[one.status].format(name=name, reach=1e3 * self.reach, depth=1e3 * touch.depth)
             trust = trust.also(why, in_range=False if one.status != PULLING else None)
-        if one.status == NO_FORCE and one.contact.wrench is not None and one.contact.wrench[3:].any():
+        stated = one.contact.wrench
+        if stated is not None and stated[3:].any() and not stated[:3].any():
             trust = trust.also(f"{name} asks for a torque without a force, which is not carried", in_range=False)
         if one.why:
             trust = trust.also(one.why, in_range=False)
         if not len(pressure):
             return trust
+        for why in self.near.sound.of_contact(vertices, pressure * layer.vertex_areas[vertices]):
+            trust = trust.also(why, in_range=False)
         ratio, highest = float(pressure.max()) / self._modulus, card["ranges"]["p_over_e"][1]
         if ratio > highest:
             trust = trust.also(f"{name} presses with p/E = {ratio:.2g}; contacts were learnt up to {highest:.2g}",
@@ -324,6 +328,11 @@ class Toucher:
                                in_range=False)  # fmt: skip
         if one.force is not None and abs(one.moved) > self.reach:
             trust = trust.also(f"{name} was moved {one.moved * 1e3:+.1f} mm along its force: check its calibration")
+        area = float(one.squeeze.nodes.area.sum())
+        lever = float(np.linalg.norm(touch.missing[3:])) / max(touch.force, 1e-300)
+        if stated is not None and stated[3:].any() and lever > max(MAX_LEVER * (area / np.pi) ** 0.5, self.reach):
+            trust = trust.also(f"{name} also turns with {1e3 * touch.force * lever:.2g} N mm, which is not carried",
+                               in_range=False)  # fmt: skip
         if touch.drag > MAX_DRAG_RATIO * touch.force:
             trust = trust.also(f"{name} also drags with {touch.drag:.2g} N, which is not carried", in_range=False)
         if one.field.surface_error > MAX_FIELD_ERROR_M:

@@ -34,10 +34,11 @@ class Trust:
         return self.converged and self.in_range
 
     def also(self, why: str, *, in_range: bool | None = None, converged: bool | None = None) -> Trust:
-        """The same trust with one more reason, and flags lowered (never raised) as given."""
+        """The same trust with one more reason, if it is new, and flags lowered (never raised) as given."""
+        told = self.why.split("; ")
         return replace(
             self,
-            why="; ".join(filter(None, (self.why, why))),
+            why="; ".join([*filter(None, told), *(one for one in why.split("; ") if one and one not in told)]),
             in_range=self.in_range and in_range is not False,
             converged=self.converged and converged is not False,
         )

@@ -17,7 +17,6 @@ from stmpl_core.methods.winkler import column_stretch
 from stmpl_core.moments import Surroundings
 from stmpl_core.networks import DIRECTIONS, INPUTS, MIXED_TENSORS, MIXED_VECTORS, MOTION, Weights, shipped
 from stmpl_core.response import FAST, SCALARS, TENSORS, VECTORS
-from stmpl_core.soundness import border_distance, longest_over_width, slope_of_thickness
 from stmpl_core.thinning import Asked
 from stmpl_core.trust import Displacement, Trust
 
@@ -30,14 +29,6 @@ GAINS = (0.5, 4.0)  # range of that multiple
 EDGE_OVER_ROOT_AREA = 1.075  # ratio at a vertex of six equilateral triangles: sqrt(2 / sqrt(3))
 EVEN = 1.2  # widths of vertices over the median, at the tenth and the ninetieth percentile of an even mesh
 OUTSIDE_SHARE = 0.3  # share of the moving vertices whose inputs may be unlike the training data (docs/networks.md)
-
-STEEP = 0.25  # slope of the thickness from triangle to triangle; trained is up to 0.2
-STEEP_SHARE = 0.02  # share of the moving vertices that may be so steep
-
-LONG = 2.2  # length of a triangle over its width; trained is up to about 2
-LONG_SHARE = 0.05  # share of the moving vertices that may be in such
-BORDER = 2.0  # distance of a load from the open border, over t; nearer the worst vertex is 6 to 21 % off
-BORDER_SHARE = 0.05  # share of the load that may be nearer
 
 BLOCK = 32  # vertices in one matrix product; OpenBLAS takes one thread for up to 2^18 multiplications
 
@@ -93,9 +84,6 @@ class MomentNet:
         self._shape = np.concatenate([near.curvature, near.slope], axis=1).astype(np.float32)
         self._frames = near.frames.astype(np.float32) * layer.thickness[:, None, None].astype(np.float32)
         self._width = EDGE_OVER_ROOT_AREA * np.sqrt(layer.vertex_areas) / layer.thickness
-        self._steep = slope_of_thickness(layer) > STEEP
-        self._long = longest_over_width(layer) > LONG
-        self._border = border_distance(layer) / layer.thickness
         self._layer = layer
         if self.fallback is not None:
             self.fallback.prepare(layer)
@@ -163,6 +151,8 @@ class MomentNet:
             return Trust(error_bound=0.0)
         length = np.linalg.norm(moved, axis=1)
         moving = length > 0.02 * length.max()
+        if not moving.any():  # a load so small that numbers cannot tell
+            return Trust(error_bound=0.0)
         share = _share(outside, moving, asked)
         ratio = float(pressure[loaded].max()) / layer.tissue.youngs_modulus
         nu = layer.tissue.poisson_ratio
@@ -183,16 +173,11 @@ class MomentNet:
         if share > OUTSIDE_SHARE:
             why = f"{share:.0%} of the vertices that move see what no training load had"
             trust = trust.also(why, in_range=False)
-        if (steep := _share(self._steep[asked.vertices], moving, asked)) > STEEP_SHARE:
-            why = f"the thickness changes by more than {STEEP:g} mm a mm at {steep:.0%} of the vertices that move"
-            trust = trust.also(why, in_range=False)
-        if (long := _share(self._long[asked.vertices], moving, asked)) > LONG_SHARE:
-            why = f"triangles are longer than {LONG:g} times their width at {long:.0%} of the vertices that move"
-            trust = trust.also(why, in_range=False)
-        size = pressure[loaded] * layer.vertex_areas[loaded]
-        if float(size[self._border[loaded] < BORDER].sum()) > BORDER_SHARE * float(size.sum()):
-            nearest = float(self._border[loaded].min())
-            why = f"the load comes to {nearest:.1f} thicknesses from the open border; trained is from {BORDER:g} on"
+        assert self._near is not None
+        sound = self._near.sound
+        steep, long = (_share(mask[asked.vertices], moving, asked) for mask in (sound.steep, sound.long))
+        for why in (*sound.of_mesh(steep, long, "the vertices that move"),
+                    *sound.of_load(loaded, np.abs(pressure[loaded]) * layer.vertex_areas[loaded])):  # fmt: skip
             trust = trust.also(why, in_range=False)
         bound = float(card["bound"]["factor"]) * error
         return Trust(trust.converged, trust.in_range, bound if trust.in_range else None, trust.why, trust.figures)
