@@ -71,6 +71,7 @@ setup(
     python_requires=">=3.12,<3.13",
     packages=find_packages(include=["stmpl_core*", "fem_tools*", "bags", "stmpl_ros*", "studies*"]),
     package_data={
+        "studies": ["stability/truth.npz"],
         "stmpl_core": ["weights/*", "limbs/*.npz", "limbs/*.md"],
         "stmpl_ros": ["config/*.yaml", "foxglove/*.json"],
     },

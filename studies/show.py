@@ -33,7 +33,7 @@ def critical_load_table(rows: Sequence[CriticalLoad], picture: Path) -> Table:
 
 def stability_table(report: Report, picture: Path) -> Table:
     """How far each method held along each axis, and its first failure, for people."""
-    colours = {"flagged": "yellow", "silent": "red", "crashed": "magenta", "": "green"}
+    colours = {"flagged": "yellow", "needless": "blue", "silent": "red", "crashed": "magenta", "": "green"}
     table = Table(title="Held up to the first failure", title_justify="left", caption_justify="left", show_lines=True)
     table.add_column("axis")
     for method in report.methods:
@@ -47,7 +47,7 @@ def stability_table(report: Report, picture: Path) -> Table:
             cells.append(f"[{colours[one['outcome']]}]" + "\n".join(lines))
         table.add_row(axis, *cells)
     counts = [report.counts(method) for method in report.methods]
-    for outcome in ("flagged", "silent", "crashed"):
+    for outcome in ("flagged", "needless", "silent", "crashed"):
         table.add_row(f"all trials: {outcome}", *(str(count[outcome]) for count in counts))
     table.caption = f"drawn in {picture}; each failure runs again with stmpl stability --again FILE"
     return table

@@ -182,12 +182,13 @@ def calibrate(
 def stability(
     methods: tuple[str, ...] = STABILITY_METHODS,
     preset: Literal["default", "quick"] = "default",
+    only: Literal["all", "pressures", "contacts"] = "all",
     out: Path | None = None,
     again: Path | None = None,
     critical_load: bool = False,
     as_json: Json = False,
 ) -> int:
-    """Where methods fail: pressure, mesh, seam, noise and more, swept until a law breaks; a table and a picture.
+    """Where methods fail: pressures, meshes, tools and more, swept until a law breaks; a table and a picture.
 
     Example: stmpl stability --methods moment_net winkler
     Your own: stmpl stability --methods my_module:MyMethod
@@ -198,6 +199,7 @@ def stability(
         methods: names (zero, naive, winkler, linear, moment_net, unet, fem_1_step, fem, ladder), or
             module:attribute.
         preset: default (minutes a method, on the arm), quick (seconds, on a round limb).
+        only: axes to sweep: all, those of pressures, those of rigid tools.
         out: folder of report, picture and failures, runs/stability unless given; the picture with --critical-load.
         again: file of a failure to run again with the same method.
         critical_load: presses of a flat layer by follower, dead and indenter loads with each element and mesh width
@@ -220,7 +222,7 @@ def stability(
         return 1 if row.broken else 0
     folder = out or Path("runs/stability")
     with steps_bar("stability", quiet=as_json) as show:
-        report = sweep({name: maker(name) for name in methods}, PRESETS[preset], folder, on_progress=show)
+        report = sweep({name: maker(name) for name in methods}, PRESETS[preset].only(only), folder, on_progress=show)
     picture = draw(report, folder / "stability.png")
     print_figures(report.as_dict() if as_json else stability_table(report, picture))
     return 0

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
+from collections.abc import Iterator
 from itertools import pairwise
 
 import numpy as np
@@ -15,7 +14,10 @@ from stmpl_core.extrusion import fold_ratios
 from stmpl_core.layer import SoftLayer
 from stmpl_core.metrics import FAR
 from stmpl_core.trust import Displacement
-from studies.stability.trial import Scene, Trial
+from studies.stability.broken import Answers, Broken, Law, broken
+from studies.stability.contact_laws import CONTACT_LAWS, forces_alike
+from studies.stability.scene import Pressures
+from studies.stability.trial import Trial
 
 LEAK = 0.005  # of the peak, that may move beyond FAR thicknesses: finite elements leave 0.001 (DESIGN: locality)
 SAME = 1e-3  # of the peak, by which answers that must be equal may differ: an iterative solver's own tolerance
@@ -25,34 +27,12 @@ GAIN = 2.0  # largest relative change of the answer over that of the load; a lay
 NOTHING = 1e-12  # m, below which answers are the same
 
 
-@dataclass(frozen=True)
-class Broken:
-    """A law that an answer broke; `flagged`: the method itself says not to trust that answer."""
-
-    law: str
-    measured: str
-    flagged: bool
-    why: str = ""  # what the method said of the answer
-
-
-@dataclass(frozen=True, eq=False)
-class Answers:
-    """What a method answered to a trial: to its scene, to its twin, and a fresh method's answer to the last load."""
-
-    scene: list[Displacement]
-    twin: list[Displacement]
-    fresh: Displacement | None = None
-
-
-Law = Callable[[Trial, Answers], Broken | None]
-
-
 def finite(trial: Trial, answers: Answers) -> Broken | None:
     """Every displacement is a number."""
     for answer in answers.scene + answers.twin:
         bad = ~np.isfinite(answer.displacement).all(axis=1)
         if bad.any():
-            return _broken("finite", f"{int(bad.sum())} vertices not finite", answer)
+            return broken("finite", f"{int(bad.sum())} vertices not finite", answer)
     return None
 
 
@@ -60,17 +40,17 @@ def zero(trial: Trial, answers: Answers) -> Broken | None:
     """No load moves nothing, exactly."""
     for _, pressure, answer in _all(trial, answers):
         if not pressure.any() and (most := float(answer.magnitude.max())) > 0:
-            return _broken("zero", f"{most * 1e3:.2g} mm without a load", answer)
+            return broken("zero", f"{most * 1e3:.2g} mm without a load", answer)
     return None
 
 
 def monotone(trial: Trial, answers: Answers) -> Broken | None:
     """A load that grows everywhere presses deeper: the peak grows strictly."""
-    pressed = [(p, a) for p, a in zip(trial.scene.pressures, answers.scene, strict=True) if p.any()]
+    pressed = [(p, a) for p, a in zip(_pressures(trial), answers.scene, strict=True) if p.any()]
     for (_, before), (_, after) in pairwise(pressed):
         less, more = float(before.magnitude.max()), float(after.magnitude.max())
         if not more > less:
-            return _broken("monotone", f"peak {less * 1e3:.3g} -> {more * 1e3:.3g} mm as the load grew", before, after)
+            return broken("monotone", f"peak {less * 1e3:.3g} -> {more * 1e3:.3g} mm as the load grew", before, after)
     return None
 
 
@@ -78,7 +58,7 @@ def unfolded(trial: Trial, answers: Answers) -> Broken | None:
     """J = det F > 0 in the layer under the skin (see `least_det_f`)."""
     for scene, _, answer in _all(trial, answers):
         if (least := least_det_f(scene.mesh.layer, answer.displacement)) <= 0:
-            return _broken("unfolded", f"least det F {least:.2g}", answer)
+            return broken("unfolded", f"least det F {least:.2g}", answer)
     return None
 
 
@@ -92,7 +72,7 @@ def leak(trial: Trial, answers: Answers) -> Broken | None:
         moved = answer.magnitude
         most, peak = float(moved[away > FAR * layer.thickness.max()].max(initial=0.0)), float(moved.max())
         if most > LEAK * peak + NOTHING:
-            return _broken("leak", f"{most * 1e3:.2g} mm beyond {FAR:g} thicknesses, peak {peak * 1e3:.2g}", answer)
+            return broken("leak", f"{most * 1e3:.2g} mm beyond {FAR:g} thicknesses, peak {peak * 1e3:.2g}", answer)
     return None
 
 
@@ -106,8 +86,8 @@ def _alike(name: str, tolerance: float) -> Law:
             off = float(np.linalg.norm(other.displacement[twin.pairs[:, 1]] - expected, axis=1).max())
             peak = float(np.linalg.norm(expected, axis=1).max())
             if not off <= tolerance * peak + NOTHING:
-                return _broken(name, f"off by {_of_peak(off, peak)}", one, other)
-        return None
+                return broken(name, f"off by {_of_peak(off, peak)}", one, other)
+        return forces_alike(name, tolerance, trial, answers)
 
     law.__doc__ = f"The twin's answer is the answer, turned and scaled, within {tolerance:g} of the peak."
     return law
@@ -120,7 +100,7 @@ def returns(trial: Trial, answers: Answers) -> Broken | None:
     off, peak = float(np.linalg.norm(last.displacement - fresh.displacement, axis=1).max()), _peak(fresh)
     if off <= SAME * peak + NOTHING:
         return None
-    return _broken("returns", f"{_of_peak(off, peak)} off a fresh answer", last)
+    return broken("returns", f"{_of_peak(off, peak)} off a fresh answer", last)
 
 
 def additive(trial: Trial, answers: Answers) -> Broken | None:
@@ -129,12 +109,12 @@ def additive(trial: Trial, answers: Answers) -> Broken | None:
     off = float(np.linalg.norm(both.displacement - a.displacement - b.displacement, axis=1).max())
     if off <= ADDED * _peak(both) + NOTHING:
         return None
-    return _broken("additive", f"{_of_peak(off, _peak(both))} off the sum", a, b, both)
+    return broken("additive", f"{_of_peak(off, _peak(both))} off the sum", a, b, both)
 
 
 def gain(trial: Trial, answers: Answers) -> Broken | None:
     """Noise on the load is not amplified: |du|/|u| <= GAIN |dp|/|p|, in the root of mean squares."""
-    (clean, *noisy), (first, *others) = trial.scene.pressures, answers.scene
+    (clean, *noisy), (first, *others) = _pressures(trial), answers.scene
     whole = float(np.linalg.norm(first.displacement))
     if not whole > 0:
         return None
@@ -142,15 +122,15 @@ def gain(trial: Trial, answers: Answers) -> Broken | None:
         change = float(np.linalg.norm(answer.displacement - first.displacement)) / whole
         factor = change / float(np.linalg.norm(pressure - clean) / np.linalg.norm(clean))
         if not factor <= GAIN:
-            return _broken("gain", f"noise amplified {factor:.1f} times", first, answer)
+            return broken("gain", f"noise amplified {factor:.1f} times", first, answer)
     return None
 
 
-LAWS: Mapping[str, Law] = {
+LAWS: dict[str, Law] = {
     "finite": finite, "zero": zero, "monotone": monotone, "unfolded": unfolded, "leak": leak,
     "seam": _alike("seam", SAME), "objective": _alike("objective", SAME), "similar": _alike("similar", SAME),
     "mesh": _alike("mesh", MESH), "returns": returns, "additive": additive, "gain": gain,
-}  # fmt: skip
+} | CONTACT_LAWS  # fmt: skip
 """Laws of answers, by name. Two more are judged where a method is asked: "answers" (a load that is sound is answered),
 and "refuses" (a load that is not finite is refused, or its answer flagged)."""
 
@@ -160,7 +140,15 @@ MEANING = {
     "leak": "nothing beyond 8 thicknesses", "seam": "equal on both sides of the seam", "objective": "objective",
     "similar": "the same at any scale", "mesh": "the same on another mesh", "returns": "forgets what came before",
     "additive": "far contacts add up", "gain": "noise is not amplified",
+    "bounded": "motion and force have a bound", "rises": "force never falls with depth",
+    "touches": "not apart with skin inside", "presses": "a force where it presses",
+    "carries": "carries the wrench, or says", "still": "nothing moves through air",
+    "steady": "same place by pose and wrench", "smooth": "no jump while sliding", "ripple": "no ripple while sliding",
+    "outside": "no skin inside a tool", "covers": "stated bounds cover the error",
+    "needless": "an ordinary touch is not flagged", "verdict": "one verdict for one scene",
+    "agrees": "stiffness agrees",
 }  # fmt: skip
+VERDICTS = frozenset(("needless", "verdict", "agrees"))  # laws of flags: alone, they do not make an answer wrong
 
 
 def least_det_f(layer: SoftLayer, displacement: np.ndarray) -> float:
@@ -180,18 +168,19 @@ def least_det_f(layer: SoftLayer, displacement: np.ndarray) -> float:
     return float((now[sound] / rest[sound]).min(initial=1.0))
 
 
-def _all(trial: Trial, answers: Answers) -> Iterator[tuple[Scene, np.ndarray, Displacement]]:
+def _all(trial: Trial, answers: Answers) -> Iterator[tuple[Pressures, np.ndarray, Displacement]]:
     pairs = [(trial.scene, answers.scene)]
     if trial.twin is not None and answers.twin:
         pairs.append((trial.twin.scene, answers.twin))
     for scene, given in pairs:
+        assert isinstance(scene, Pressures)
         for pressure, answer in zip(scene.pressures, given, strict=True):
             yield scene, pressure, answer
 
 
-def _broken(law: str, measured: str, *answers: Displacement) -> Broken:
-    flagged = [answer for answer in answers if not answer.trust.ok]
-    return Broken(law, measured, bool(flagged), flagged[0].trust.why if flagged else "")
+def _pressures(trial: Trial) -> np.ndarray:
+    assert isinstance(trial.scene, Pressures)
+    return trial.scene.pressures
 
 
 def _peak(answer: Displacement) -> float:

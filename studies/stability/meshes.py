@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from stmpl_core.layer import Tissue
-from studies.stability.trial import Mesh
+from studies.stability.scene import Mesh
 
 
 def limb(edge_length: float, radius: float, length: float, thickness: float) -> Mesh:
@@ -54,3 +54,54 @@ def inserted(mesh: Mesh, chosen: np.ndarray, share: tuple[float, float, float]) 
         uv=np.concatenate([np.delete(mesh.uv, chosen, axis=0), *thirds_uv]),
         thickness=np.concatenate([mesh.thickness, np.einsum("k,fk->f", weights, mesh.thickness[faces])]),
     )
+
+
+def plate(steps_x: np.ndarray, steps_y: np.ndarray, thickness: float, tissue: Tissue | None = None) -> Mesh:
+    """A flat skin in the plane z = 0, facing +z, with vertices at these places along x and y [m]."""
+    x, y = (part.ravel() for part in np.meshgrid(steps_x, steps_y))
+    number = np.arange(len(x)).reshape(len(steps_y), len(steps_x))
+    a, b, c, d = (part.ravel() for part in (number[:-1, :-1], number[:-1, 1:], number[1:, 1:], number[1:, :-1]))
+    faces = np.concatenate([np.stack([a, b, c], axis=1), np.stack([a, c, d], axis=1)])
+    return flat(np.column_stack([x, y, 0 * x]), faces, thickness, tissue)
+
+
+def flat(points: np.ndarray, faces: np.ndarray, thickness: float, tissue: Tissue | None = None) -> Mesh:
+    """A skin with a chart that is its own shadow on the plane z = 0."""
+    low = points[:, :2].min(axis=0)
+    uv = 0.05 + 0.9 * (points[:, :2] - low) / np.ptp(points[:, :2], axis=0).max()
+    return Mesh(points, faces.astype(np.int32), np.full(len(points), thickness), tissue or Tissue(), uv[faces])
+
+
+def even_plate(size: float, edge_length: float, thickness: float, tissue: Tissue | None = None) -> Mesh:
+    """A square plate around the origin."""
+    steps = np.linspace(-size / 2, size / 2, round(size / edge_length) + 1)
+    return plate(steps, steps, thickness, tissue)
+
+
+def saddle(edge_length: float, size: float, radius: float, thickness: float) -> Mesh:
+    """A square patch that is curved by 1 / radius along x and by as much the other way along y."""
+    mesh = even_plate(size, edge_length, thickness)
+    x, y, _ = mesh.vertices.T
+    return replace(mesh, vertices=np.column_stack([x, y, (y * y - x * x) / (2 * radius)]))
+
+
+def fingers(gap: float, edge_length: float, length: float, thickness: float) -> Mesh:
+    """Two flat fingers along y, this far apart [m], that meet at their root beyond `length`."""
+    side = edge_length * np.arange(9)
+    columns = np.concatenate([-gap / 2 - side[::-1], gap / 2 + side])
+    mesh = plate(columns, np.arange(0, length + 10 * edge_length, edge_length), thickness)
+    x, y, _ = np.moveaxis(mesh.vertices[mesh.faces], -1, 0)
+    between = (x.min(axis=1) < 0) & (x.max(axis=1) > 0) & (y.min(axis=1) < length)
+    return replace(mesh, faces=mesh.faces[~between], uv=mesh.uv[~between])
+
+
+def irregular(mesh: Mesh, share: float, seed: int = 0) -> Mesh:
+    """A round limb along z whose vertices are shifted along its skin by up to this share of an edge; not its border."""
+    rng, edge = np.random.default_rng(seed), mesh.layer.edge_length
+    x, y, z = mesh.vertices.T
+    aside, along = share * edge * rng.uniform(-1, 1, (2, len(x)))
+    free = np.ones(len(x))
+    free[mesh.layer.border] = 0
+    radius = np.hypot(x, y)
+    angle = np.arctan2(y, x) + free * aside / radius
+    return replace(mesh, vertices=np.column_stack([radius * np.cos(angle), radius * np.sin(angle), z + free * along]))

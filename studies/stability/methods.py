@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import copy
 import sys
-from collections.abc import Callable
 from importlib import import_module
 from pathlib import Path
 from typing import Any, cast
@@ -15,8 +14,7 @@ from fem_tools.patch import PatchFem
 from stmpl_core.errors import InvalidInput
 from stmpl_core.methods import Linear, Method, MomentNet, Naive, UNet, Winkler
 from stmpl_core.methods.zero import Zero
-
-Make = Callable[[], Method]  # a fresh method, not yet prepared
+from studies.stability.scene import Make
 
 
 def _ladder() -> Method:

@@ -8,14 +8,18 @@ from typing import Any
 from studies.stability.laws import MEANING
 from studies.stability.suite import Report, Row
 
-COLOURS = {"held": "#8fc98f", "unfinished": "#d5e8d5", "flagged": "#f2c14e", "silent": "#d1495b", "crashed": "#3b1c32"}
+COLOURS = {"held": "#8fc98f", "unfinished": "#d5e8d5", "flagged": "#f2c14e",
+           "needless": "#8fb8de", "silent": "#d1495b", "crashed": "#3b1c32"}
 SAID = {
     "held": "all laws held", "unfinished": "held, too slow for all rounds", "flagged": "law broken, answer flagged",
+    "needless": "flagged without need",
     "silent": "law broken, method silent", "crashed": "crashed",
 }  # fmt: skip
 LETTERS = {
     "answers": "r", "refuses": "n", "finite": "f", "zero": "0", "monotone": "p", "unfolded": "J", "leak": "l",
     "seam": "e", "objective": "o", "similar": "s", "mesh": "m", "returns": "h", "additive": "a", "gain": "g",
+    "bounded": "b", "rises": "d", "touches": "i", "presses": "F", "carries": "w", "still": "t", "steady": "P",
+    "smooth": "k", "ripple": "~", "outside": "q", "covers": "±", "needless": "x", "verdict": "v", "agrees": "E",
 }  # fmt: skip
 
 

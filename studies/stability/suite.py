@@ -6,27 +6,26 @@ import json
 import logging
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 
 from stmpl_core.errors import InvalidInput, StmplError
-from stmpl_core.layer import SoftLayer
 from stmpl_core.methods.base import Method
 from stmpl_core.provenance import commit, machine, versions
 from stmpl_core.trust import Displacement
 from studies.stability import failures
-from studies.stability.laws import LAWS, Answers, Broken
-from studies.stability.methods import Make
+from studies.stability.laws import LAWS, VERDICTS, Answers, Broken
+from studies.stability.scene import Make, Pressures
 from studies.stability.sweeps import Preset, Stage, trials
-from studies.stability.trial import Scene, Trial
+from studies.stability.trial import Trial
 
 log = logging.getLogger(__name__)
 
-Outcome = Literal["held", "unfinished", "flagged", "silent", "crashed"]
-WORST: tuple[Outcome, ...] = ("held", "unfinished", "flagged", "silent", "crashed")
+Outcome = Literal["held", "unfinished", "refused", "flagged", "needless", "silent", "crashed"]
+WORST: tuple[Outcome, ...] = ("held", "unfinished", "flagged", "needless", "silent", "crashed")
 PATIENCE = 15.0  # s of processor time, for the repetitions of one trial
 VERSIONS = ("stmpl", "numpy", "scipy", "numba", "torch")
 OnProgress = Callable[[int, int, str], None]  # trials done, in all, and which is next
@@ -38,8 +37,8 @@ class Row:
 
     Args:
         outcome: held; flagged: a law broke and the method said not to trust the answer, or refused a sound input;
-            silent: a law broke and the method said nothing; crashed: an error that is none of ours; unfinished: too
-            slow for all repetitions, what there was held.
+            needless: sound, but flagged; silent: a law broke and the method said nothing; crashed: an error that is
+            none of ours; unfinished: too slow for all repetitions, what there was held.
         broken: laws that broke, and how.
         file: failure that can be run again.
     """
@@ -150,7 +149,8 @@ def judge(name: str, make: Make, trial: Trial, *, patience: float = PATIENCE) ->
     """Asks fresh methods for a trial's answers, and judges them by its laws."""
     try:
         if "refuses" in trial.laws:
-            return _refused(name, make().prepare(trial.scene.mesh.layer), trial)
+            assert isinstance(trial.scene, Pressures)
+            return _refused(name, make().prepare(trial.scene.mesh.layer), trial, trial.scene)
         answers, done = _answers(make, trial, patience)
     except (StmplError, ValueError) as error:
         broken = Broken("answers", "refused", True, str(error))
@@ -159,24 +159,27 @@ def judge(name: str, make: Make, trial: Trial, *, patience: float = PATIENCE) ->
         log.debug("%s crashed at %s %s", name, trial.axis, trial.level, exc_info=True)
         broken = Broken("answers", f"crashed: {error!r}", False)
         return Row(name, trial.axis, trial.level, "crashed", (broken,))
+    note = "" if done == trial.rounds else f"{done:,} of {trial.rounds:,} rounds in {patience:g} s of processor time"
+    row = judged(name, trial, answers)
+    return replace(row, note=note, outcome="unfinished" if note and row.outcome == "held" else row.outcome)
+
+
+def judged(name: str, trial: Trial, answers: Answers) -> Row:
+    """How answers end by the trial's laws."""
     broken = []
     for law in trial.laws:
         if (found := LAWS[law](trial, answers)) is not None:
             broken.append(found)
             if law == "finite":  # the other laws have nothing to measure
                 break
-    outcome: Outcome = "held" if done == trial.rounds else "unfinished"
-    if broken:
-        outcome = "flagged" if all(one.flagged for one in broken) else "silent"
-    note = "" if done == trial.rounds else f"{done:,} of {trial.rounds:,} rounds in {patience:g} s of processor time"
-    return Row(name, trial.axis, trial.level, outcome, tuple(broken), note)
+    return Row(name, trial.axis, trial.level, _outcome(broken) if broken else "held", tuple(broken))
 
 
-def _refused(name: str, method: Method, trial: Trial) -> Row:
+def _refused(name: str, method: Method, trial: Trial, scene: Pressures) -> Row:
     """Whether loads that are not finite are refused with an error that says so, or answered and flagged."""
     broken: list[Broken] = []
     outcome: Outcome = "held"
-    for load in trial.scene.loads():
+    for load in scene.loads():
         try:
             answer = method.solve(load)
         except (StmplError, ValueError):
@@ -196,6 +199,12 @@ def _refused(name: str, method: Method, trial: Trial) -> Row:
     return Row(name, trial.axis, trial.level, outcome, tuple(broken))
 
 
+def _outcome(broken: list[Broken]) -> Outcome:
+    if any(not one.flagged for one in broken):
+        return "silent"
+    return "needless" if all(one.law in VERDICTS for one in broken) else "flagged"
+
+
 def _worse(one: Outcome, other: Outcome) -> Outcome:
     return one if WORST.index(one) > WORST.index(other) else other
 
@@ -203,12 +212,12 @@ def _worse(one: Outcome, other: Outcome) -> Outcome:
 def _answers(make: Make, trial: Trial, patience: float) -> tuple[Answers, int]:
     """The answers to the last round, and how many rounds there were."""
     scene, done = [], 0
-    method, loads = make().prepare(trial.scene.mesh.layer), trial.scene.loads()
+    ask = trial.scene.prepared(make)
     until = time.process_time() + patience
     while done < trial.rounds and (done == 0 or time.process_time() < until):
-        scene = [method.solve(load) for load in loads]
+        scene = ask()
         done += 1
-    fresh = make().prepare(trial.scene.mesh.layer).solve(loads[-1]) if "returns" in trial.laws else None
+    fresh = trial.scene.last.prepared(make)()[-1] if "returns" in trial.laws else None
     return Answers(scene, _twin(make, trial), fresh), done
 
 
@@ -216,14 +225,9 @@ def _twin(make: Make, trial: Trial) -> list[Displacement]:
     if trial.twin is None:
         return []
     try:
-        layer = trial.twin.scene.mesh.layer
+        assert trial.twin.scene.mesh.layer
     except InvalidInput:
         if trial.twin.may_refuse:
             return []
         raise
-    return _solved(make, layer, trial.twin.scene)
-
-
-def _solved(make: Make, layer: SoftLayer, scene: Scene) -> list[Displacement]:
-    method: Method = make().prepare(layer)
-    return [method.solve(load) for load in scene.loads()]
+    return trial.twin.scene.prepared(make)()

@@ -13,8 +13,10 @@ from scipy.spatial.transform import Rotation
 from stmpl_core.body import Body
 from stmpl_core.extrusion import foldfree_thickness
 from stmpl_core.metrics import FAR
+from studies.stability.contact_axes import CONTACT_AXES, CONTACT_LEVELS, QUICK_CONTACTS
 from studies.stability.meshes import inserted, limb
-from studies.stability.trial import Mesh, Scene, Trial, Twin
+from studies.stability.scene import Mesh, Pressures
+from studies.stability.trial import Trial, Twin
 
 THICKNESS = 7.5e-3  # m
 RADIUS, RAMP = 12e-3, 6e-3  # m, of the contact and of its smooth edge
@@ -33,12 +35,20 @@ class Preset:
         body: limb that is pressed: True, the left arm of the Anny body; False, a round limb.
         levels: levels of each axis, from easy to hard; an axis without levels is left out.
         seed: seed of the noise.
+        tool_edge: edge length of the round limb that tools press [m].
     """
 
     edge_length: float = 6e-3
     body: bool = True
     levels: Mapping[str, Sequence[float]] = field(default_factory=lambda: AXIS_LEVELS)
     seed: int = 0
+    tool_edge: float = 4e-3
+
+    def only(self, which: str) -> Preset:
+        """This preset with the axes of "pressures" or "contacts" alone; "all": itself."""
+        kept = {axis: levels for axis, levels in self.levels.items()
+                if which == "all" or (axis in CONTACT_AXES) == (which == "contacts")}  # fmt: skip
+        return replace(self, levels=kept)
 
 
 HALF_ARM = np.inf  # as a contact's radius
@@ -61,7 +71,7 @@ AXIS_LEVELS: dict[str, Sequence[float]] = {
     "noise": (0.1, 0.5, 1, 2, 5),
     "two contacts": (16, 12, 8),
     "not finite": (0, 1, 2),
-}
+} | CONTACT_LEVELS
 PRESETS = {
     "default": Preset(),
     "quick": Preset(edge_length=7e-3, body=False, levels={
@@ -69,7 +79,7 @@ PRESETS = {
         "contact size": (25, 6), "edge": (6,), "seam": (2, 0), "obtuse": (0.1,), "area jump": (2,),
         "scale": (0.5, 1000), "turn": (90,), "shift": (1,), "stale start": (1,), "jump": (0.5,), "cycles": (100,),
         "noise": (0.1, 0.5), "two contacts": (8,), "not finite": (0, 1),
-    }),
+    } | QUICK_CONTACTS, tool_edge=6e-3),
 }  # fmt: skip
 
 
@@ -80,18 +90,20 @@ class Stage:
     Args:
         mesh: mesh of the skin.
         seed: seed of the noise.
+        tool_edge: edge length of the round limb that tools press [m].
     """
 
     mesh: Mesh
     seed: int = 0
+    tool_edge: float = 4e-3
 
     @classmethod
     def of(cls, preset: Preset) -> Stage:
         """The preset's skin. Raises MeshError."""
         if preset.body:
             arm = Body.anny().part("left_arm", edge_length=preset.edge_length, thickness=THICKNESS)
-            return cls(Mesh.of(arm), preset.seed)
-        return cls(limb(preset.edge_length, 0.04, 0.26, THICKNESS), preset.seed)
+            return cls(Mesh.of(arm), preset.seed, preset.tool_edge)
+        return cls(limb(preset.edge_length, 0.04, 0.26, THICKNESS), preset.seed, preset.tool_edge)
 
     @cached_property
     def border_distance(self) -> np.ndarray:
@@ -142,7 +154,7 @@ def trials(stage: Stage, preset: Preset) -> Iterator[Trial]:
 
 def _pressed(mesh: Mesh, pressure: np.ndarray, level: str, *extra: str) -> Trial:
     """Half of a pressure, all of it, nothing."""
-    return Trial("", level, (*SWEEP, *extra), Scene(mesh, np.stack([0.5 * pressure, pressure, 0 * pressure])))
+    return Trial("", level, (*SWEEP, *extra), Pressures(mesh, np.stack([0.5 * pressure, pressure, 0 * pressure])))
 
 
 def pressure(stage: Stage, level: float) -> Trial:
@@ -201,7 +213,7 @@ def seam(stage: Stage, level: float) -> Trial:
     centre = np.array([0.04 * np.cos(angle), 0.04 * np.sin(angle), middle])
     partner = np.asarray(KDTree(mesh.vertices).query(mesh.vertices @ mirror)[1])
     pairs = np.stack([np.arange(len(partner)), partner], axis=1)
-    scene, other = (Scene(mesh, RATIO * disc(mesh, c)[None]) for c in (centre, mirror @ centre))
+    scene, other = (Pressures(mesh, RATIO * disc(mesh, c)[None]) for c in (centre, mirror @ centre))
     return Trial("", f"{level:g} t", ("finite", "seam"), scene, Twin(other, pairs, mirror))
 
 
@@ -233,7 +245,7 @@ def _remeshed(stage: Stage, mesh: Mesh, level: str) -> Trial:
     """The same load on the same skin, at the vertices that both meshes have."""
     trial = _pressed(mesh, RATIO * disc(mesh, stage.centre), level, "mesh")
     pressed = RATIO * disc(stage.mesh, stage.centre)
-    even = Scene(stage.mesh, np.stack([0.5 * pressed, pressed, 0 * pressed]))
+    even = Pressures(stage.mesh, np.stack([0.5 * pressed, pressed, 0 * pressed]))
     same = np.arange(len(stage.mesh.vertices))
     return replace(trial, twin=Twin(even, np.stack([same, same], axis=1), np.eye(3)))
 
@@ -243,8 +255,8 @@ def scale(stage: Stage, level: float) -> Trial:
     mesh, pressed = stage.mesh, RATIO * disc(stage.mesh, stage.centre)[None]
     other = replace(mesh, vertices=level * mesh.vertices, thickness=level * mesh.thickness)
     same = np.arange(len(mesh.vertices))
-    twin = Twin(Scene(other, pressed), np.stack([same, same], axis=1), np.eye(3), level, may_refuse=level >= 100)
-    return Trial("", f"x {level:g}", ("finite", "similar"), Scene(mesh, pressed), twin)
+    twin = Twin(Pressures(other, pressed), np.stack([same, same], axis=1), np.eye(3), level, may_refuse=level >= 100)
+    return Trial("", f"x {level:g}", ("finite", "similar"), Pressures(mesh, pressed), twin)
 
 
 def turn(stage: Stage, level: float) -> Trial:
@@ -260,9 +272,9 @@ def shift(stage: Stage, level: float) -> Trial:
 
 def _moved(stage: Stage, rotation: np.ndarray, by: np.ndarray, level: str) -> Trial:
     mesh, pressed = stage.mesh, RATIO * disc(stage.mesh, stage.centre)[None]
-    other = Scene(replace(mesh, vertices=mesh.vertices @ rotation.T + by), pressed)
+    other = Pressures(replace(mesh, vertices=mesh.vertices @ rotation.T + by), pressed)
     same = np.arange(len(mesh.vertices))
-    return Trial("", level, ("finite", "objective"), Scene(mesh, pressed),
+    return Trial("", level, ("finite", "objective"), Pressures(mesh, pressed),
                  Twin(other, np.stack([same, same], axis=1), rotation))  # fmt: skip
 
 
@@ -271,20 +283,20 @@ def stale_start(stage: Stage, level: float) -> Trial:
     mesh = stage.mesh
     here, there = disc(mesh, stage.centre), disc(mesh, stage.apart(2))
     loads = np.stack([level * there, level * here, RATIO * here])
-    return Trial("", f"{level:g} E", ("finite", "returns"), Scene(mesh, loads))
+    return Trial("", f"{level:g} E", ("finite", "returns"), Pressures(mesh, loads))
 
 
 def jump(stage: Stage, level: float) -> Trial:
     """Full load at p / E, none, full load."""
     pressed = level * disc(stage.mesh, stage.centre)
-    scene = Scene(stage.mesh, np.stack([pressed, 0 * pressed, pressed]))
+    scene = Pressures(stage.mesh, np.stack([pressed, 0 * pressed, pressed]))
     return Trial("", f"{level:g} E", ("finite", "zero", "returns"), scene)
 
 
 def cycles(stage: Stage, level: float) -> Trial:
     """Pressing and releasing so often."""
     pressed = RATIO * disc(stage.mesh, stage.centre, 8e-3)
-    scene = Scene(stage.mesh, np.stack([0 * pressed, pressed]))
+    scene = Pressures(stage.mesh, np.stack([0 * pressed, pressed]))
     return Trial("", f"{int(level):,}", ("finite", "zero", "returns"), scene, rounds=int(level))
 
 
@@ -292,21 +304,22 @@ def noise(stage: Stage, level: float) -> Trial:
     """Noise of 5 % on the load at each vertex, at p / E."""
     rng, pressed = np.random.default_rng(stage.seed), level * disc(stage.mesh, stage.centre)
     noisy = [pressed * (1 + NOISE * rng.normal(size=len(pressed))) for _ in range(3)]
-    return Trial("", f"{level:g} E", ("finite", "gain"), Scene(stage.mesh, np.stack([pressed, *noisy])))
+    return Trial("", f"{level:g} E", ("finite", "gain"), Pressures(stage.mesh, np.stack([pressed, *noisy])))
 
 
 def two_contacts(stage: Stage, level: float) -> Trial:
     """Two contacts, and the gap between them in thicknesses; at least FAR, where neither feels the other."""
     assert level >= FAR
     here, there = (RATIO * disc(stage.mesh, c) for c in (stage.centre, stage.apart(level)))
-    return Trial("", f"{level:g} t", ("finite", "additive"), Scene(stage.mesh, np.stack([here, there, here + there])))
+    scene = Pressures(stage.mesh, np.stack([here, there, here + there]))
+    return Trial("", f"{level:g} t", ("finite", "additive"), scene)
 
 
 def not_finite(stage: Stage, level: float) -> Trial:
     """NaN, infinity or minus infinity at one pressed vertex."""
     pressed = RATIO * disc(stage.mesh, stage.centre)
     pressed[pressed.argmax()] = (np.nan, np.inf, -np.inf)[int(level)]
-    return Trial("", ("NaN", "inf", "-inf")[int(level)], ("refuses",), Scene(stage.mesh, pressed[None]))
+    return Trial("", ("NaN", "inf", "-inf")[int(level)], ("refuses",), Pressures(stage.mesh, pressed[None]))
 
 
 AXES: dict[str, Callable[[Stage, float], Trial]] = {
@@ -314,5 +327,5 @@ AXES: dict[str, Callable[[Stage, float], Trial]] = {
     "contact size": size, "edge": edge, "seam": seam, "obtuse": obtuse, "area jump": area_jump, "scale": scale,
     "turn": turn, "shift": shift, "stale start": stale_start, "jump": jump, "cycles": cycles, "noise": noise,
     "two contacts": two_contacts, "not finite": not_finite,
-}  # fmt: skip
+} | CONTACT_AXES  # fmt: skip
 

@@ -2,63 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
-from functools import cached_property
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from stmpl_core.arrays import Faces, PerVertex, Points
-from stmpl_core.chart import UvChart
-from stmpl_core.layer import SoftLayer, Tissue
-from stmpl_core.load import Load
-
-
-@dataclass(frozen=True, eq=False)
-class Mesh:
-    """What a SoftLayer is made of; `layer` makes it, and raises what SoftLayer raises.
-
-    Args:
-        vertices: vertices of the skin, (V, 3) [m].
-        faces: faces of the skin, (F, 3).
-        thickness: thickness of the layer, (V,) [m].
-        tissue: tissue of the layer.
-        uv: chart's coordinates of each corner, (F, 3, 2) [-].
-    """
-
-    vertices: Points
-    faces: Faces
-    thickness: PerVertex
-    tissue: Tissue
-    uv: np.ndarray
-
-    @classmethod
-    def of(cls, layer: SoftLayer) -> Mesh:
-        """The mesh of a layer that has a UvChart."""
-        return cls(layer.vertices, layer.faces, layer.thickness, layer.tissue, layer.chart.uv)
-
-    @cached_property
-    def layer(self) -> SoftLayer:
-        """The layer, made on first use."""
-        chart = UvChart(self.vertices, self.faces, self.uv)
-        return SoftLayer(self.vertices, self.faces, self.thickness, tissue=self.tissue, chart=chart)
-
-
-@dataclass(frozen=True, eq=False)
-class Scene:
-    """Pressures, (K, V) [Pa], that one method is asked for one after the other on one mesh."""
-
-    mesh: Mesh
-    pressures: np.ndarray
-
-    def loads(self) -> list[Load]:
-        """The loads. What is not finite is put in after `Load` was made, which would refuse it."""
-        loads = []
-        for pressure in self.pressures:
-            load = Load.pressure(np.where(np.isfinite(pressure), pressure, 0.0))
-            load.values[:] = pressure
-            loads.append(load)
-        return loads
+from studies.stability.contacts import Contacts
+from studies.stability.scene import Pressures, Scene
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,7 +16,7 @@ class Twin:
     """The same scene, seen otherwise: its answer must be `scale turn u` at the vertices that are the same.
 
     Args:
-        scene: scene with as many loads as the one that it is compared with.
+        scene: scene that asks for as much as the one that it is compared with.
         pairs: number of each common vertex in the first scene and in this one, (N, 2).
         turn: rotation or reflection, (3, 3).
         scale: scale of lengths [-].
@@ -102,18 +52,17 @@ class Trial:
 
     def arrays(self) -> dict[str, np.ndarray]:
         """Everything that is an array, by name."""
-        arrays = _arrays("scene", self.scene)
+        arrays = _named("scene", self.scene)
         if self.twin is not None:
-            arrays |= _arrays("twin", self.twin.scene) | {"pairs": self.twin.pairs, "turn": self.twin.turn}
+            arrays |= _named("twin", self.twin.scene) | {"pairs": self.twin.pairs, "turn": self.twin.turn}
         return arrays
 
     def card(self) -> dict[str, Any]:
         """Everything else, for JSON."""
         card: dict[str, Any] = {"axis": self.axis, "level": self.level, "laws": self.laws, "rounds": self.rounds}
-        card["scene"] = asdict(self.scene.mesh.tissue)
+        card |= {"kind": KINDS[type(self.scene)], "scene": self.scene.card()}
         if self.twin is not None:
-            card |= {"twin": asdict(self.twin.scene.mesh.tissue), "scale": self.twin.scale,
-                     "may_refuse": self.twin.may_refuse}  # fmt: skip
+            card |= {"twin": self.twin.scene.card(), "scale": self.twin.scale, "may_refuse": self.twin.may_refuse}
         return card
 
     @classmethod
@@ -127,13 +76,14 @@ class Trial:
         return cls(card["axis"], card["level"], laws, _scene("scene", card, arrays), twin, card["rounds"])
 
 
-def _arrays(name: str, scene: Scene) -> dict[str, np.ndarray]:
-    mesh = scene.mesh
-    parts = {"vertices": mesh.vertices, "faces": mesh.faces, "thickness": mesh.thickness, "uv": mesh.uv,
-             "pressures": scene.pressures}  # fmt: skip
-    return {f"{name}_{key}": value for key, value in parts.items()}
+KINDS: dict[type, str] = {Pressures: "pressures", Contacts: "contacts"}
+
+
+def _named(name: str, scene: Scene) -> dict[str, np.ndarray]:
+    return {f"{name}_{key}": value for key, value in scene.arrays().items()}
 
 
 def _scene(name: str, card: dict[str, Any], arrays: dict[str, np.ndarray]) -> Scene:
-    part = {key: arrays[f"{name}_{key}"] for key in ("vertices", "faces", "thickness", "uv")}
-    return Scene(Mesh(**part, tissue=Tissue(**card[name])), arrays[f"{name}_pressures"])
+    kind = {kind: scene for scene, kind in KINDS.items()}[card["kind"]]
+    part = {key.removeprefix(f"{name}_"): value for key, value in arrays.items() if key.startswith(f"{name}_")}
+    return kind.restored(card[name], part)

@@ -1,0 +1,37 @@
+"""What a trial's laws are judged on, and what they find."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from stmpl_core.trust import Displacement
+from studies.stability.trial import Trial
+
+
+@dataclass(frozen=True)
+class Broken:
+    """A law that an answer broke; `flagged`: the method itself says not to trust that answer."""
+
+    law: str
+    measured: str
+    flagged: bool
+    why: str = ""  # what the method said of the answer
+
+
+@dataclass(frozen=True, eq=False)
+class Answers:
+    """What a method answered to a trial: to its scene, to its twin, and a fresh method's answer to the last load."""
+
+    scene: list[Displacement]
+    twin: list[Displacement]
+    fresh: Displacement | None = None
+
+
+Law = Callable[[Trial, Answers], Broken | None]
+
+
+def broken(law: str, measured: str, *answers: Displacement) -> Broken:
+    """What breaks a law; flagged if one of the answers is."""
+    flagged = [answer for answer in answers if not answer.trust.ok]
+    return Broken(law, measured, bool(flagged), flagged[0].trust.why if flagged else "")
