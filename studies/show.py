@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from studies.chart.break_even import BreakEven
     from studies.critical_load import CriticalLoad
     from studies.stability import Report
+    from studies.stability.fuzz import Fuzzed
 
 
 def critical_load_table(rows: Sequence[CriticalLoad], picture: Path) -> Table:
@@ -50,6 +51,19 @@ def stability_table(report: Report, picture: Path) -> Table:
     for outcome in ("flagged", "needless", "silent", "crashed"):
         table.add_row(f"all trials: {outcome}", *(str(count[outcome]) for count in counts))
     table.caption = f"drawn in {picture}; each failure runs again with stmpl stability --again FILE"
+    return table
+
+
+def fuzz_table(found: Mapping[str, Fuzzed], out: Path) -> Table:
+    """How random contacts ended, for people."""
+    table = Table(title="Random contacts", title_justify="left", caption_justify="left", show_lines=True)
+    for heading in ("method", "contacts", "ended", "laws that broke", "tools were", "ms each"):
+        table.add_column(heading)
+    for name, one in found.items():
+        counts = ["\n".join(f"{n:,} {what}" for what, n in sorted(told.items(), key=lambda item: -item[1]))
+                  for told in (one.outcomes, one.broken, one.statuses)]  # fmt: skip
+        table.add_row(name, f"{one.contacts:,}", *counts, f"{1e3 * one.about['seconds'] / max(one.contacts, 1):.1f}")
+    table.caption = f"failures in {out}/METHOD/failures; each runs again with stmpl stability --again FILE"
     return table
 
 

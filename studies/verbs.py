@@ -185,6 +185,8 @@ def stability(
     only: Literal["all", "pressures", "contacts"] = "all",
     out: Path | None = None,
     again: Path | None = None,
+    fuzz: int = 0,
+    seed: int = 0,
     critical_load: bool = False,
     as_json: Json = False,
 ) -> int:
@@ -192,6 +194,7 @@ def stability(
 
     Example: stmpl stability --methods moment_net winkler
     Your own: stmpl stability --methods my_module:MyMethod
+    Random contacts: stmpl stability --fuzz 10000 --methods moment_net
     One failure again: stmpl stability --again runs/stability/failures/pressure_5_E.moment_net.json
     The finite elements' own limits: stmpl stability --critical-load --out critical_load.png
 
@@ -202,6 +205,8 @@ def stability(
         only: axes to sweep: all, those of pressures, those of rigid tools.
         out: folder of report, picture and failures, runs/stability unless given; the picture with --critical-load.
         again: file of a failure to run again with the same method.
+        fuzz: number of random contacts to ask each method for instead (5 to 50 ms each).
+        seed: seed of the random contacts.
         critical_load: presses of a flat layer by follower, dead and indenter loads with each element and mesh width
             until it fails, beside the closed form (minutes).
         as_json: figures on stdout, for machines.
@@ -220,12 +225,28 @@ def stability(
         told = f"{row.method} at {row.axis} {row.level}: {row.outcome}\n{said}".strip()
         print_figures(dataclasses.asdict(row) if as_json else told)
         return 1 if row.broken else 0
+    if fuzz > 0:
+        return _fuzz(methods, fuzz, seed, out or Path("runs/fuzz"), as_json)
     folder = out or Path("runs/stability")
     with steps_bar("stability", quiet=as_json) as show:
         report = sweep({name: maker(name) for name in methods}, PRESETS[preset].only(only), folder, on_progress=show)
     picture = draw(report, folder / "stability.png")
     print_figures(report.as_dict() if as_json else stability_table(report, picture))
     return 0
+
+
+def _fuzz(methods: tuple[str, ...], count: int, seed: int, out: Path, as_json: bool) -> int:
+    from studies.show import fuzz_table
+    from studies.stability import maker
+    from studies.stability.fuzz import fuzz
+
+    found = {}
+    for name in methods:
+        with steps_bar(f"contacts of {name}", quiet=as_json) as show:
+            found[name] = fuzz(name, maker(name), count, seed, out / name, on_progress=show)
+    told = {name: dataclasses.asdict(one) for name, one in found.items()}
+    print_figures(told if as_json else fuzz_table(found, out))
+    return int(any(one.outcomes.get(bad, 0) for one in found.values() for bad in ("silent", "crashed")))
 
 
 def _critical_load(out: Path, as_json: bool) -> int:

@@ -1,7 +1,9 @@
-"""The stability suite's contacts: each law catches the simulator that is made to break it."""
+"""The stability suite's contacts: each law catches the simulator that is made to break it, and so does the fuzz."""
 
+import json
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,6 +16,7 @@ from stmpl_core.trust import Trust
 from studies.stability import PRESETS, Report, again, stability
 from studies.stability.contact_axes import CONTACT_AXES, CONTACT_LEVELS, QUICK_CONTACTS
 from studies.stability.contact_laws import CONTACT_LAWS
+from studies.stability.fuzz import fuzz, random_mesh
 from studies.stability.picture import draw
 from studies.stability.shapes import ball, box, capsule, punch, ring
 from studies.stability.sweeps import Stage, trials
@@ -235,6 +238,44 @@ def test_tools_of_the_suite_are_closed_and_turned_outwards():
         v, f = tool.vertices, tool.faces
         assert not tool.mendings
         assert np.einsum("ij,ij->", v[f[:, 0]], np.cross(v[f[:, 1]], v[f[:, 2]])) > 0
+
+
+def test_the_fuzz_finds_what_is_wrong_and_nothing_else(tmp_path):
+    count, seen = 60, []
+    sound = fuzz("sound", Winkler, count, 3)
+    wrong = fuzz("wrong", lambda: Brings(too_far), count, 3, tmp_path, on_progress=lambda *said: seen.append(said))
+    assert sound.contacts == wrong.contacts == count == len(seen)
+    assert "silent bounded" not in sound.broken
+    assert wrong.broken["silent bounded"] > 5
+    file = next(f for f in wrong.files if json.loads(Path(f).read_text())["found"]["broken"][0]["law"] == "bounded")
+    assert again(file, lambda name: lambda: Brings(too_far)).outcome == "silent"
+    assert "bounded" not in {b.law for b in again(file, lambda name: Winkler).broken}
+
+
+def test_the_fuzz_tells_a_crash_from_a_refusal():
+    def crashes(answer, contacts, layer):
+        return {}[layer]
+
+    found = fuzz("crashing", lambda: Brings(crashes), 40, 3)
+    assert found.outcomes["crashed"] > 10 and found.outcomes.get("refused", 0) < 40
+
+
+def test_random_skins_span_sizes_and_materials():
+    meshes = [random_mesh(np.random.default_rng(seed)) for seed in range(60)]
+    sizes = np.log10([np.ptp(mesh.vertices, axis=0).max() for mesh in meshes])
+    moduli = np.log10([mesh.tissue.youngs_modulus for mesh in meshes])
+    assert np.ptp(sizes) > 4 and np.ptp(moduli) > 8
+    assert len({len(mesh.vertices) for mesh in meshes}) > 20
+
+
+def test_the_verb_fuzzes(tmp_path, capsys):
+    from stmpl_ros.cli import main
+
+    with pytest.raises(SystemExit) as ended:
+        main(["stability", "--fuzz", "20", "--seed", "3", "--methods", "zero", "--out", str(tmp_path), "--json"])
+    told = json.loads(capsys.readouterr().out)
+    assert told["zero"]["contacts"] == 20
+    assert bool(ended.value.code) == any(told["zero"]["outcomes"].get(bad, 0) for bad in ("silent", "crashed"))
 
 
 def test_the_report_names_contacts(tmp_path):
