@@ -54,6 +54,34 @@ def stability_table(report: Report, picture: Path) -> Table:
     return table
 
 
+def stability_markdown(report: Report) -> str:
+    """How each method's trials ended, and its first failure along each axis, as tables of a page."""
+    outcomes = ("held", "flagged", "needless", "silent", "crashed")
+    counts = [[outcome, *(str(report.counts(m)[outcome]) for m in report.methods)] for outcome in outcomes]
+    cells = []
+    for axis in report.axes:
+        first = report.cell(report.methods[0], axis)
+        levels = first[0].level if len(first) == 1 else f"{first[0].level} to {first[-1].level}"
+        cells.append([axis, levels, *(_ended(report, method, axis) for method in report.methods)])
+    return "\n".join(["", *_rows(["", *report.methods], counts), "",
+                      *_rows(["axis", "levels", *report.methods], cells), ""])  # fmt: skip
+
+
+def _ended(report: Report, method: str, axis: str) -> str:
+    """The worst that a method did along an axis: how, where first, and which law broke."""
+    failed = [row for row in report.cell(method, axis) if row.broken]
+    if not failed:
+        return "held"
+    worst = max((row.outcome for row in failed), key=("flagged", "needless", "silent", "crashed").index)
+    row = next(row for row in failed if row.outcome == worst)
+    law = next((b.law for b in row.broken if not b.flagged), row.broken[0].law)
+    return f"{worst} at {row.level}: {law}"
+
+
+def _rows(heading: Sequence[str], cells: Sequence[Sequence[str]]) -> list[str]:
+    return [f"| {' | '.join(row)} |" for row in (heading, ["---"] * len(heading), *cells)]
+
+
 def fuzz_table(found: Mapping[str, Fuzzed], out: Path) -> Table:
     """How random contacts ended, for people."""
     table = Table(title="Random contacts", title_justify="left", caption_justify="left", show_lines=True)

@@ -203,7 +203,8 @@ def stability(
             module:attribute.
         preset: default (minutes a method, on the arm), quick (seconds, on a round limb).
         only: axes to sweep: all, those of pressures, those of rigid tools.
-        out: folder of report, picture and failures, runs/stability unless given; the picture with --critical-load.
+        out: folder of report, tables, picture and failures, runs/stability unless given; the picture with
+            --critical-load.
         again: file of a failure to run again with the same method.
         fuzz: number of random contacts to ask each method for instead (5 to 50 ms each).
         seed: seed of the random contacts.
@@ -213,7 +214,7 @@ def stability(
     """
     if critical_load:
         return _critical_load(out or Path("runs/critical_load.png"), as_json)
-    from studies.show import stability_table
+    from studies.show import stability_markdown, stability_table
     from studies.stability import PRESETS, maker
     from studies.stability import again as run_again
     from studies.stability import stability as sweep
@@ -231,6 +232,7 @@ def stability(
     with steps_bar("stability", quiet=as_json) as show:
         report = sweep({name: maker(name) for name in methods}, PRESETS[preset].only(only), folder, on_progress=show)
     picture = draw(report, folder / "stability.png")
+    (folder / "stability.md").write_text(stability_markdown(report))
     print_figures(report.as_dict() if as_json else stability_table(report, picture))
     return 0
 

@@ -14,7 +14,7 @@ from stmpl_core.errors import InvalidInput
 from stmpl_core.methods import Winkler
 from stmpl_core.methods.zero import Zero
 from stmpl_core.trust import Trust
-from studies.show import stability_table
+from studies.show import stability_markdown, stability_table
 from studies.stability import AXES, LAWS, METHODS, PRESETS, Report, again, maker, stability
 from studies.stability.contact_laws import CONTACT_LAWS
 from studies.stability.laws import MEANING, least_det_f
@@ -216,6 +216,9 @@ def test_report_table_and_picture_hold_every_method_and_axis(run):
     assert len(kept["rows"]) == len(report.rows)
     assert set(kept["summary"]) == set(kept["counts"]) == set(report.methods)
     assert stability_table(report, out).row_count == len(report.axes) + 4
+    page = stability_markdown(report)
+    assert all(f"| {axis} |" in page for axis in report.axes) and "| crashed |" in page
+    assert "silent at 0.1 E: finite" in page
     assert draw(report, out / "stability.png").read_bytes().startswith(b"\x89PNG")
 
 

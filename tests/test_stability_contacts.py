@@ -278,6 +278,17 @@ def test_the_verb_fuzzes(tmp_path, capsys):
     assert bool(ended.value.code) == any(told["zero"]["outcomes"].get(bad, 0) for bad in ("silent", "crashed"))
 
 
+def test_what_is_flagged_hides_nothing_that_is_not():
+    """Of two answers that break a law the one that is not flagged counts."""
+
+    def spoilt(answer, contacts, layer):
+        light = contacts[0].pose_body_from_tool[0, 3] > 0.0508
+        return (unsure if light else nothing)(stronger(answer, 1 + (layer.thickness[0] < 5e-3)), contacts, layer)
+
+    (row,) = stability({"spoilt": lambda: Brings(spoilt)}, some("scale of contact")).rows
+    assert row.outcome == "silent" and next(one.law for one in row.broken) == "similar"
+
+
 def test_the_report_names_contacts(tmp_path):
     report: Report = stability({"sound": lambda: Brings(nothing)}, some("depth", "first touch"), tmp_path)
     assert report.axes == ["depth", "first touch"]

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import wraps
 
 from stmpl_core.trust import Displacement
 from studies.stability.trial import Trial
@@ -29,9 +30,21 @@ class Answers:
 
 
 Law = Callable[[Trial, Answers], Broken | None]
+Found = Iterator[Broken]
 
 
 def broken(law: str, measured: str, *answers: Displacement) -> Broken:
     """What breaks a law; flagged if one of the answers is."""
     flagged = [answer for answer in answers if not answer.trust.ok]
     return Broken(law, measured, bool(flagged), flagged[0].trust.why if flagged else "")
+
+
+def worst(law: Callable[[Trial, Answers], Found]) -> Law:
+    """A law of what it finds: of all that is broken what is not flagged counts, else the first."""
+
+    @wraps(law)
+    def judged(trial: Trial, answers: Answers) -> Broken | None:
+        found = list(law(trial, answers))
+        return next((one for one in found if not one.flagged), found[0] if found else None)
+
+    return judged

@@ -97,7 +97,7 @@ def slant(stage: Stage, level: float) -> Trial:
 
 def kind(stage: Stage, level: float) -> Trial:
     """Kinds of tool and skin, against finite elements."""
-    names = ("ball", "capsule", "box", "punch", "two balls", "ring on a saddle")
+    names = ("ball", "capsule", "punch", "wide punch", "two balls", "ring on a saddle")
     return _true("kind", level, names[int(level)])
 
 

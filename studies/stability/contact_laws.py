@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from functools import wraps
+from collections.abc import Iterator
 
 import numpy as np
 
@@ -13,7 +12,7 @@ from stmpl_core.stiffness import fit_stiffness
 from stmpl_core.tool import Tool
 from stmpl_core.touch import APART, NO_FORCE, PULLING, Answer
 from stmpl_core.toucher import Toucher, margin_on
-from studies.stability.broken import Answers, Broken, Law, broken
+from studies.stability.broken import Answers, Broken, Found, Law, broken, worst
 from studies.stability.contacts import Contacts, Instant, Placed, answers_of, field_of
 from studies.stability.trial import Trial
 
@@ -30,20 +29,6 @@ TRUTH = 0.015  # of the peak and of the force, by which the finite elements them
 LEARNT = 0.65  # depth over thickness up to which an ordinary touch must not be flagged
 COVERED = 0.05  # depth over thickness of a vertex of the skin inside a tool, from which the tool is not apart
 PRESSURE = 20.0  # pressure over the confined modulus, above which no answer may be trusted
-
-
-Found = Iterator[Broken]
-
-
-def worst(law: Callable[[Trial, Answers], Found]) -> Law:
-    """A law of what it finds: of all that is broken what is not flagged counts, else the first."""
-
-    @wraps(law)
-    def judged(trial: Trial, answers: Answers) -> Broken | None:
-        found = list(law(trial, answers))
-        return next((one for one in found if not one.flagged), found[0] if found else None)
-
-    return judged
 
 
 @worst
@@ -262,20 +247,19 @@ CONTACT_LAWS: dict[str, Law] = {
 """Laws of answers to tools, by name."""
 
 
-def forces_alike(name: str, tolerance: float, trial: Trial, answers: Answers) -> Broken | None:
+def forces_alike(name: str, tolerance: float, trial: Trial, answers: Answers) -> Found:
     """The twin's forces are the forces, turned and scaled with E and area."""
     twin = trial.twin
     assert twin is not None
     stiffer = twin.scene.mesh.tissue.youngs_modulus / trial.scene.mesh.tissue.youngs_modulus
     for one, other in zip(answers.scene, answers.twin, strict=True):
         if not (isinstance(one, Answer) and isinstance(other, Answer)):
-            return None
+            return
         for tool, touch in one.touches.items():
             expected = stiffer * twin.scale**2 * twin.turn @ touch.wrench[:3]
             off, size = _size(other.touches[tool].wrench[:3] - expected), _size(expected)
             if not off <= tolerance * size:
-                return broken(name, f"force off by {100 * off / max(size, 1e-300):.2g} %", one, other)
-    return None
+                yield broken(name, f"force off by {100 * off / max(size, 1e-300):.2g} %", one, other)
 
 
 def _asked(trial: Trial, answers: Answers) -> Iterator[tuple[Instant, Answer]]:

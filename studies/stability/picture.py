@@ -41,7 +41,8 @@ def draw(report: Report, path: str | Path) -> Path:
         counts = report.counts(method)
         plot.text(m * column + widest / 2, -0.75, method, ha="center", va="bottom", fontsize=10, weight="bold")
         plot.text(m * column + widest / 2, len(axes) - 0.1, f"{counts['flagged']} flagged\n"
-                  f"{counts['silent']} silent" + (f"\n{counts['crashed']} crashed" if counts["crashed"] else ""),
+                  f"{counts['silent']} silent"
+                  + "".join(f"\n{counts[o]} {o}" for o in ("needless", "crashed") if counts[o]),
                   ha="center", va="top", fontsize=8)  # fmt: skip
     for a, axis in enumerate(axes):
         cell = report.cell(methods[0], axis)

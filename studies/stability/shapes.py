@@ -26,10 +26,13 @@ def capsule(radius: float, length: float, name: str = "capsule") -> Tool:
 
 
 @cache
-def punch(radius: float, height: float, name: str = "punch") -> Tool:
-    """A cylinder along z with sharp edges."""
-    half = height / 2
-    return revolved(name, np.array([[0, -half], [radius, -half], [radius, half], [0, half]]))
+def punch(radius: float, height: float, name: str = "punch", fillet: float = 0.0) -> Tool:
+    """A cylinder along z, its edges sharp or rounded to a fillet."""
+    half, inner = height / 2, radius - fillet
+    if not fillet:
+        return revolved(name, np.array([[0, -half], [radius, -half], [radius, half], [0, half]]))
+    arcs = [_arc(fillet, side * (half - fillet), start, start + 90, 8) for side, start in ((-1, -90), (1, 0))]
+    return revolved(name, np.concatenate([[[0, -half]], *(arc + [inner, 0] for arc in arcs), [[0, half]]]))
 
 
 @cache
