@@ -130,7 +130,7 @@ class Bench:
 
     @classmethod
     def of(cls, plan: Plan, body: BodyPlan, layer: SoftLayer) -> Bench:
-        """Prepares the solvers. Raises MeshError if the layer folds."""
+        """Prepares the solvers."""
         pressing = PatchFem(reach=body.reach, refine=plan.refine).prepare(layer)
         paper_fem = PatchFem(reach=body.reach).prepare(layer)
         pressed = PatchFem(reach=body.reach, refine=INDENTER_REFINE, layers=INDENTER_LAYERS)

@@ -10,7 +10,7 @@ import numpy as np
 
 from fem_tools.estimates import discretisation_error, truncation_error
 from fem_tools.mesh import WedgeMesh
-from fem_tools.newton import NewtonResult, is_positive_definite, newton
+from fem_tools.newton import MAX_WORK, NewtonResult, is_positive_definite, newton, work_spent
 from fem_tools.patch import Patch, PatchFem
 from fem_tools.press import MAX_FACES_ENTERED, Press, above_core, edge_for_curvature, edge_for_first_contact
 from fem_tools.system import System
@@ -82,20 +82,24 @@ class IndenterFem:
         friction: law of friction: "stick" (a touching point stays where it touched, until it is let go), "none", or
             Coulomb's coefficient with the limit taken from the last update of the pressure.
         step: longest step of the tools [thicknesses]; what touches first within a step sticks from its end on.
+        max_work: multiplications after which a press or a path stops, whatever it has reached (see NewtonSettings).
     """
 
-    def __init__(self, fem: PatchFem | None = None, *, friction: Friction = "stick", step: float = 0.04) -> None:
+    def __init__(self, fem: PatchFem | None = None, *, friction: Friction = "stick", step: float = 0.04,
+                 max_work: float = MAX_WORK) -> None:  # fmt: skip
         if not (friction in ("stick", "none") or (isinstance(friction, int | float) and 0 <= friction < 10)):
             raise InvalidInput(f'friction is {friction!r}; allowed are "stick", "none" or a coefficient in [0, 10).')
         self.fem = fem or PatchFem(refine=3, layers=INDENTER_LAYERS)
         if not 0 < step <= 0.5:
             raise InvalidInput(f"step is {step} thicknesses; allowed is 0 < step <= 0.5.")
         self.friction: Friction = friction
-        self.step = step
+        if not max_work > 0:
+            raise InvalidInput(f"max_work is {max_work}; it must be above 0 multiplications.")
+        self.step, self.max_work = step, max_work
         self._layer: SoftLayer | None = None
 
     def prepare(self, layer: SoftLayer) -> Self:
-        """See PatchFem.prepare."""
+        """See PatchFem.prepare. A tool near a fold of the layer is refused when it is pressed (MeshError)."""
         self.fem.prepare(layer)
         self._layer = layer
         return self
@@ -225,7 +229,7 @@ class Walk:
                             NewtonResult(u, True, 0.0, 1.0, 0, 0, 1.0), [])  # fmt: skip
         self.state = replace(self.state, loads=self._loads(0.0))
         self.last: Indentation | None = None
-        self.stopped = ""
+        self.stopped, self.work = "", 0.0
 
     def to(self, depth: float) -> Indentation:
         """Walks to `depth` and says what is there."""
@@ -234,19 +238,23 @@ class Walk:
         return self.last
 
     def walk(self, depth: float) -> bool:
-        """Moves the state to `depth` in short steps, halved where Newton fails; False if it stops on the way."""
+        """Moves the state to `depth` in short steps, halved where Newton fails; False if it stops on the way.
+
+        It stops where Newton fails in the shortest step, and where the work is spent.
+        """
         step, self.stopped = self.solver.step * self.thickness, ""
         while abs(depth - self.state.travel) > 1e-12:
             travel = self.state.travel + float(np.clip(depth - self.state.travel, -step, step))
             result, loads = self._step(travel)
             if result.converged:
                 self.state = self._next(result, loads, travel)
-            elif step > self.solver.step * self.thickness / 8:
+            elif step > self.solver.step * self.thickness / 8 and self.work < self.solver.max_work:
                 step /= 2
             else:
+                spent = work_spent(self.work, self.solver.max_work)
                 self.stopped = (
                     f"Newton stopped at {travel * 1e3:.2f} mm (residual {result.residual:.1e}): "
-                    f"the answer is that of {self.state.travel * 1e3:.2f} mm"
+                    f"the answer is that of {self.state.travel * 1e3:.2f} mm{'; ' * bool(spent)}{spent}"
                 )
                 return False
         return True
@@ -273,8 +281,7 @@ class Walk:
         guess = state.u if state.previous is None else 2 * state.u - state.previous
         if not self.system.internal(guess)[1] > 0.5 * MIN_J:
             guess = state.u
-        settings = replace(self.fem.settings, tolerance=1e-4, max_iterations=40)
-        result = newton(self.system, guess, 1.0, settings)
+        result = self._newton(guess)
         for update in range(MAX_UPDATES + 1):
             skin = self.system.rest[:, 0] + result.u[:, 0]
             entered = max(float(-load.tool.distance(skin[load.near]).min(initial=0.0)) for load in loads)
@@ -283,8 +290,16 @@ class Walk:
             for load in loads:
                 load.multiplier = load.pressure(skin)
                 load.limit = friction_limit(self.solver.friction, load.multiplier)
-            result = newton(self.system, result.u, 1.0, settings)
+            result = self._newton(result.u)
         return result, loads
+
+    def _newton(self, start: np.ndarray) -> NewtonResult:
+        """Newton from here with the work that is left."""
+        left = max(self.solver.max_work - self.work, 1.0)
+        settings = replace(self.fem.settings, tolerance=1e-4, max_iterations=40, max_work=left)
+        result = newton(self.system, start, 1.0, settings)
+        self.work += result.work
+        return result
 
     def _next(self, result: NewtonResult, loads: list[PressLoad], travel: float) -> _State:
         """The state after a step: multipliers kept, touching points anchored, anchors dragged where they slip."""

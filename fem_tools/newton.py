@@ -9,7 +9,10 @@ import numpy as np
 
 from fem_tools.krylov import bicgstab, conjugate_gradients, dot, precondition
 from fem_tools.system import System
+from stmpl_core.errors import InvalidInput
 
+MAX_WORK = 3e11  # multiplications of one solve or press: some ten minutes of one core
+TANGENT_COST = 30  # products with a tangent that its assembly, its preconditioner and a line search cost together
 CONVEX = (0.1, 0.3, 1.0)  # shares of the skew part that are left out of an indefinite tangent, tried in turn
 
 
@@ -24,6 +27,8 @@ class NewtonSettings:
         min_j: smallest det F that the line search accepts [-].
         linear_iterations: most steps of the linear solver a Newton step.
         forcing: largest residual that the linear solver may leave of a Newton step's [-].
+        max_work: multiplications after which a solve stops, whatever it has reached. It is counted, not timed, so that
+            every machine stops at the same place.
     """
 
     tolerance: float = 1e-5
@@ -32,6 +37,11 @@ class NewtonSettings:
     min_j: float = 0.02
     linear_iterations: int = 300
     forcing: float = 0.1
+    max_work: float = MAX_WORK
+
+    def __post_init__(self) -> None:
+        if not self.max_work > 0:
+            raise InvalidInput(f"max_work is {self.max_work}; it must be above 0 multiplications.")
 
 
 @dataclass(frozen=True)
@@ -45,6 +55,7 @@ class NewtonResult:
     iterations: int
     linear_iterations: int
     load_factor: float  # share of the load that was reached
+    work: float = 0.0  # multiplications that it took, about
 
 
 def solve(
@@ -61,20 +72,29 @@ def solve(
     tried = newton(system, u if u is not None else guess(1.0) if guess else system.zeros(), 1.0, settings)
     if tried.converged:
         return tried
-    iterations, linear = tried.iterations, tried.linear_iterations
+    iterations, linear, work = tried.iterations, tried.linear_iterations, tried.work
     best = NewtonResult(system.zeros(), True, 0.0, 1.0, 0, 0, 0.0)
     step, halvings = 0.5, 0
-    while best.load_factor < 1.0 and halvings <= settings.max_halvings:
+    while best.load_factor < 1.0 and halvings <= settings.max_halvings and work < settings.max_work:
         target = min(1.0, best.load_factor + step)
         for start in _starts(best, target, guess):
-            tried = newton(system, start, target, settings)
+            tried = newton(system, start, target, replace(settings, max_work=max(settings.max_work - work, 1.0)))
             iterations, linear = iterations + tried.iterations, linear + tried.linear_iterations
+            work += tried.work
             if tried.converged:
                 best = tried
                 break
         else:
             step, halvings = step / 2, halvings + 1
-    return replace(best, converged=best.load_factor >= 1.0, iterations=iterations, linear_iterations=linear)
+    return replace(best, converged=best.load_factor >= 1.0, iterations=iterations, linear_iterations=linear, work=work)
+
+
+def work_spent(work: float, limit: float) -> str:
+    """Sentence on a limit of work that was reached [multiplications]; empty if it was not."""
+    if work < limit:
+        return ""
+    return (f"its limit of work is spent, {work:.1e} of {limit:.1e} multiplications. "
+            "Try a coarser mesh, fewer splits, a smaller reach, or a higher max_work")  # fmt: skip
 
 
 def _starts(best: NewtonResult, target: float, guess: Callable[[float], np.ndarray] | None) -> list[np.ndarray]:
@@ -87,50 +107,55 @@ def _starts(best: NewtonResult, target: float, guess: Callable[[float], np.ndarr
 def newton(system: System, u: np.ndarray, factor: float, settings: NewtonSettings) -> NewtonResult:
     """Newton from `u` at one share of the loads; energy descent where they are conservative."""
     m = system.mesh
-    linear, history = 0, []
+    linear, tangents, history = 0, 1, []
     r, min_j = system.residual(u, factor)
     if not min_j > settings.min_j:
         u = system.zeros()
         r, min_j = system.residual(u, factor)
     data = system.tangent(u, factor)
+    product = float(data.size)  # multiplications
     inverse = system.preconditioner(data)
     best = (np.inf, u, min_j)
     for iteration in range(settings.max_iterations + 1):
         relative = _relative(system, inverse, r, u, factor)  # in the last tangent's norm: a new one costs as a step
+        work = product * (linear + TANGENT_COST * tangents)
         if relative < best[0]:
             best = (relative, u, min_j)
         if relative <= settings.tolerance:
-            return NewtonResult(u, True, relative, min_j, iteration, linear, factor)
+            return NewtonResult(u, True, relative, min_j, iteration, linear, factor, work)
         history.append(relative)
         stalled = len(history) > 5 and history[-1] > 0.3 * history[-6] and not system.conservative
-        if iteration == settings.max_iterations or not np.isfinite(relative) or stalled:
+        if iteration == settings.max_iterations or not np.isfinite(relative) or stalled or work >= settings.max_work:
             break
         if iteration:
+            tangents += 1
             data = system.tangent(u, factor)
             inverse = system.preconditioner(data)
+        most = int(min(settings.linear_iterations, max(1.0, (settings.max_work - work) / product)))
         forcing = float(np.clip(0.5 * relative**0.5, 0.5 * settings.tolerance / relative, settings.forcing))
         if system.conservative:
             du, n, _, negative = conjugate_gradients(
-                m.indptr, m.indices, data, inverse, -r, forcing, settings.linear_iterations
+                m.indptr, m.indices, data, inverse, -r, forcing, most
             )
             for convex in CONVEX:  # no minimum in sight along this tangent: as little of a convex one as it takes
                 if not negative:
                     break
-                linear += n
+                linear, tangents = linear + n, tangents + 1
                 data = system.tangent(u, factor, convex=convex)
                 inverse = system.preconditioner(data)
                 du, n, _, negative = conjugate_gradients(
-                    m.indptr, m.indices, data, inverse, -r, forcing, settings.linear_iterations
+                    m.indptr, m.indices, data, inverse, -r, forcing, most
                 )
             stepped = _descend(system, u, du, r, factor, settings)
         else:
-            du, n, _ = bicgstab(m.indptr, m.indices, data, inverse, -r, forcing, settings.linear_iterations)
+            du, n, _ = bicgstab(m.indptr, m.indices, data, inverse, -r, forcing, most)
             stepped = _line_search(system, u, du, r, inverse, factor, settings)
         linear += n
         if stepped is None:
             break
         u, r, min_j = stepped
-    return NewtonResult(best[1], False, best[0], best[2], iteration, linear, factor)
+    work = product * (linear + TANGENT_COST * tangents)
+    return NewtonResult(best[1], False, best[0], best[2], iteration, linear, factor, work)
 
 
 def _relative(system: System, inverse: np.ndarray, r: np.ndarray, u: np.ndarray, factor: float) -> float:

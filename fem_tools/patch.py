@@ -13,7 +13,7 @@ from scipy.sparse.csgraph import dijkstra
 
 from fem_tools.estimates import discretisation_error, error_bound, truncation_error
 from fem_tools.mesh import ElementName, WedgeMesh, level_depths, split
-from fem_tools.newton import NewtonResult, NewtonSettings, is_positive_definite, solve
+from fem_tools.newton import NewtonResult, NewtonSettings, is_positive_definite, solve, work_spent
 from fem_tools.skin_loads import DeadForces, FollowerPressure
 from fem_tools.system import System
 from stmpl_core.errors import InvalidInput, MeshError
@@ -96,18 +96,8 @@ class PatchFem:
         self._layer: SoftLayer | None = None
 
     def prepare(self, layer: SoftLayer) -> Self:
-        """Checks that the layer can be meshed.
-
-        Raises:
-            MeshError: it folds on itself when it is extruded; the message names the vertices.
-        """
-        folded = fold_ratios(layer.vertices, layer.inner_vertices, layer.faces) < MIN_FOLD
-        if folded.any():
-            bad = np.unique(layer.faces[folded])
-            raise MeshError(
-                f"the layer folds on itself below {len(bad)} vertices: {', '.join(map(str, bad[:12]))}"
-                f"{', ...' if len(bad) > 12 else ''}. Thin it there, coarsen the skin, or smooth it."
-            )
+        """Keeps the layer, with its graph of edges and where it folds on itself when it is extruded."""
+        self._folded = fold_ratios(layer.vertices, layer.inner_vertices, layer.faces) < MIN_FOLD
         length = np.linalg.norm(layer.vertices[layer.edges[:, 0]] - layer.vertices[layer.edges[:, 1]], axis=1)
         n = len(layer.vertices)
         self._graph = csr_matrix((length, layer.edges.T), shape=(n, n))
@@ -128,6 +118,9 @@ class PatchFem:
         """Meshes everything within `reach` thicknesses of the given vertices of the layer.
 
         Triangles are split in four up to `refine` times: near the vertices, or where `edge_length` asks for it.
+
+        Raises:
+            MeshError: the layer folds on itself in there; the message names the vertices.
         """
         layer = prepared(self._layer, self)
         thickness = float(layer.thickness[vertices].max())
@@ -135,7 +128,9 @@ class PatchFem:
             self._graph, directed=False, indices=vertices, min_only=True, limit=1.1 * self.reach * thickness
         )
         inside = np.isfinite(distance)
-        faces = layer.faces[inside[layer.faces].all(axis=1)].astype(np.int64)
+        chosen_faces = inside[layer.faces].all(axis=1)
+        self._refuse_folds(layer.faces[chosen_faces & self._folded])
+        faces = layer.faces[chosen_faces].astype(np.int64)
         chosen, flat = np.unique(faces, return_inverse=True)
         outer, inner, triangles = layer.vertices[chosen], layer.inner_vertices[chosen], flat.reshape(-1, 3)
         away, splits = distance[chosen], []
@@ -154,10 +149,23 @@ class PatchFem:
         mesh = WedgeMesh.of(outer, inner, triangles, self.element_for(layer), self.layers_for(layer))
         return Patch(chosen, mesh, mesh.border_columns(), distance[chosen], tuple(splits))
 
+    def _refuse_folds(self, folded: np.ndarray) -> None:
+        """Raises MeshError if there are such faces, (k, 3)."""
+        if len(folded):
+            bad = np.unique(folded)
+            raise MeshError(
+                f"the layer folds on itself below {len(bad)} vertices within {self.reach:g} thicknesses of the load: "
+                f"{', '.join(map(str, bad[:12]))}{', ...' if len(bad) > 12 else ''}. "
+                "Press elsewhere, lower reach, thin the layer there, coarsen the skin, or smooth it."
+            )
+
     def solve(self, load: Load) -> Displacement:
         """The displacement under `load`, with min det F, stability and error estimates in its trust.
 
         Never raises for a load that has no solution: the answer then says converged False, and how far it came.
+
+        Raises:
+            MeshError: the layer folds on itself within `reach` of the load.
         """
         layer = prepared(self._layer, self)
         load.check(layer)
@@ -173,6 +181,7 @@ class PatchFem:
 
         Raises:
             InvalidInput: a load that does not fit the layer, or that presses on other vertices than the first.
+            MeshError: as `solve`.
         """
         layer, before = prepared(self._layer, self), []
         patch = self.patch_around(loads[0].check(layer).loaded)
@@ -224,6 +233,7 @@ class PatchFem:
                 "load_factor": result.load_factor,
                 "newton_iterations": result.iterations,
                 "linear_iterations": result.linear_iterations,
+                "work": result.work,
                 "discretisation_m": discretisation,
                 "truncation_m": truncation,
                 "pressure_over_modulus": ratio,
@@ -237,6 +247,8 @@ class PatchFem:
                 converged=False,
                 in_range=False,
             )
+            if spent := work_spent(result.work, self.settings.max_work):
+                trust = trust.also(spent)
         if not stable:
             trust = trust.also(
                 "the final tangent is not positive definite: this equilibrium is unstable", in_range=False

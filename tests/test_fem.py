@@ -17,7 +17,7 @@ from fem_tools.newton import is_positive_definite, solve
 from fem_tools.patch import mirror_projectors
 from fem_tools.skin_loads import FollowerPressure
 from fem_tools.system import System
-from stmpl_core.errors import InvalidInput, MeshError, NotPrepared
+from stmpl_core.errors import InvalidInput, NotPrepared
 from stmpl_core.layer import SoftLayer, Tissue
 from stmpl_core.load import Load
 from stmpl_core.methods.winkler import column_pressure
@@ -299,8 +299,6 @@ def test_bad_input_is_refused_with_its_reason():
         Load.pressure([0.0, np.nan])
     with pytest.raises(InvalidInput, match="3 values"):
         PatchFem().prepare(layer).solve(Load.pressure([1.0, 2.0, 3.0]))
-    with pytest.raises(MeshError, match=r"folds on itself below \d+ vertices"):
-        PatchFem().prepare(limb(4e-3, 0.011, radius=0.01))
 
 
 def test_the_solvers_are_imported_without_what_only_draws():

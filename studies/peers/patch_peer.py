@@ -112,7 +112,7 @@ class PatchPeer(ABC):
         self._kept: tuple[bytes, Patch, Any] | None = None
 
     def prepare(self, layer: SoftLayer) -> Self:
-        """Checks that the layer can be meshed. Raises MeshError if it folds on itself."""
+        """See PatchFem.prepare."""
         self._mesher.prepare(layer)
         self._layer, self._kept = layer, None
         return self
