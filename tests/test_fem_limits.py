@@ -66,6 +66,39 @@ def test_the_stated_bound_covers_the_error(ratio, edge, reach):
     assert error < answer.trust.error_bound < 5 * error
 
 
+def outlines(points: np.ndarray, radius: float) -> dict[str, np.ndarray]:
+    """Masks of points of a plane, (N, 2) [m], that lie in a shape of this radius [m]."""
+    (x, y), away = points.T, np.linalg.norm(points, axis=1)
+    return {
+        "disc": away < radius,
+        "ring": (away < 1.3 * radius) & (away > 0.7 * radius),
+        "square": np.abs(points).max(axis=1) < radius,
+        "star": away < radius * (1 + 0.5 * np.cos(5 * np.arctan2(y, x))),
+        "T": ((np.abs(y - 1.2 * radius) < 0.4 * radius) & (np.abs(x) < 1.3 * radius))
+        | ((np.abs(x) < 0.4 * radius) & (np.abs(y) < 1.5 * radius)),
+    }
+
+
+@pytest.mark.parametrize(("edge", "thickness", "radius", "ratio"),
+                         [(4e-3, 5e-3, 8e-3, 0.15), (4e-3, 5e-3, 11e-3, 1.2), (3.5e-3, 10e-3, 8e-3, 0.15)])  # fmt: skip
+def test_the_stated_bound_covers_hard_edges(edge, thickness, radius, ratio):
+    layer = limb(edge, thickness)
+    answers = PatchFem(check_stability=False).prepare(layer)
+    truths = PatchFem(refine=2, layers=2, check_stability=False).prepare(layer)
+    middle = layer.vertices[len(layer.vertices) // 2]
+    side = middle * [1, 1, 0] / np.linalg.norm(middle[:2])
+    facing = layer.normals @ side > 0.2
+    plane = (layer.vertices - middle) @ np.column_stack([np.cross([0, 0, 1], side), [0, 0, 1]])
+    over = []
+    for shape in outlines(plane, radius).values():
+        load = Load.pressure(ratio * layer.tissue.youngs_modulus * (shape & facing))
+        answer, truth = answers.solve(load), truths.solve(load)
+        error = float(np.linalg.norm(answer.displacement - truth.displacement, axis=1).max())
+        assert answer.trust.ok and answer.trust.error_bound is not None
+        over.append(answer.trust.error_bound / error)
+    assert min(over) > 1 and np.median(over) < 4, over
+
+
 def test_dead_loads_lose_stability_at_065_e_at_waves_up_to_one_thickness():
     least = min(closed_form(wave) for wave in (0.4, 0.7, 1.0))
     assert least == pytest.approx(0.651, abs=0.003)
