@@ -50,6 +50,13 @@ def wavy_layer(n: int = 6, h: float = 3e-3) -> SoftLayer:
     return flat.with_(vertices=np.column_stack([x, y, 1e-3 * np.sin(100 * x) * np.cos(80 * y)]))
 
 
+def dented() -> SoftLayer:
+    """A limb with a dent at half its height that is tighter than the layer is thick, and so folds there."""
+    layer = limb(4e-3, length=0.24)
+    away = np.linalg.norm(layer.vertices - layer.vertices[len(layer.vertices) // 2], axis=1)
+    return layer.with_(vertices=layer.vertices * np.where(away < 3e-3, 0.8, 1.0)[:, None] ** [1, 1, 0])
+
+
 def placed(layer: SoftLayer, motion: np.ndarray) -> SoftLayer:
     """The layer where a rigid motion (4, 4) takes it."""
     return layer.with_(vertices=layer.vertices @ motion[:3, :3].T + motion[:3, 3])

@@ -8,18 +8,10 @@ from fem_tools.few_steps import FewSteps
 from fem_tools.indenter import Walk
 from fem_tools.newton import MAX_WORK, NewtonSettings
 from stmpl_core.errors import InvalidInput, MeshError
-from stmpl_core.layer import SoftLayer
 from stmpl_core.methods import Winkler
 from stmpl_core.sdf import SignedDistance
 from tests import scenes
-from tests.scenes import at, disc, limb
-
-
-def dented() -> SoftLayer:
-    """A limb with a dent at half its height that is tighter than the layer is thick, and so folds there."""
-    layer = limb(4e-3, length=0.24)
-    away = np.linalg.norm(layer.vertices - layer.vertices[len(layer.vertices) // 2], axis=1)
-    return layer.with_(vertices=layer.vertices * np.where(away < 3e-3, 0.8, 1.0)[:, None] ** [1, 1, 0])
+from tests.scenes import at, dented, disc, limb
 
 
 @pytest.mark.parametrize("method", [PatchFem(), FewSteps(2, Winkler()), IndenterFem(PatchFem())])

@@ -19,7 +19,8 @@ from stmpl_core.methods.coarse import Coarse
 from stmpl_core.methods.ladder import SHIPPED, Known, Ladder, Measured, SceneFigures, SceneReader
 from stmpl_core.trust import Displacement, Trust
 from studies.calibrate import MARGIN, Trial, coverage, fit, gather
-from tests.scenes import limb
+from tests.scenes import dented, limb
+from tests.scenes import disc as scenes_disc
 
 WIDE = {"strain": [1e-4, 1.0], "nu": [0.0, 0.5], "width": [0.01, 10.0], "slope": [0.0, 1.0],
         "outline": [0.001, 100.0], "jump": [0.0, 1.0]}
@@ -55,7 +56,7 @@ class Rung:
 
 def known(share: float, seconds: float) -> Known:
     """Off by this share of the columns' motion, after so many seconds."""
-    return Known({"pressure": [float(np.log(share)), *[0.0] * 9]}, {"pressure": 1.0}, [seconds, 0.0, 0.0, 0.0], 1.0)
+    return Known({"pressure": [float(np.log(share)), *[0.0] * 9]}, {"pressure": 1.0}, [seconds, *[0.0] * 4], 1.0)
 
 
 def three(layer, accuracy, deadline=None, *, ok=(True, True, True), seconds=(1e-4, 1e-3, 1e-2), took=(0.0, 0.0, 0.0)):
@@ -141,11 +142,31 @@ def test_a_busy_machine_is_noticed(layer):
     assert named[0] == "b" and named[-1] == "a"
 
 
-def test_outside_of_what_was_measured_there_is_no_bound(layer):
-    rungs = [Rung("a")]
-    chart = Measured({"a": known(0.1, 1e-3)}, {"pressure": {**WIDE, "strain": [1e-4, 0.01]}})
-    answer = Ladder(rungs, chart, accuracy=1.0).prepare(layer).solve(disc(layer, 1.0))
+def outside(layer, ok=(True, True, True), deadline=None, seconds=(1e-4, 1e-3, 1e-2), took=(0.0, 0.0, 0.0)):
+    """Three rungs whose chart ends at 1 % of strain, and has their errors upside down."""
+    rungs = [Rung(name, ok=good, seconds=s) for name, good, s in zip("abc", ok, took, strict=True)]
+    methods = {n: known(e, s) for n, e, s in zip("abc", (1e-4, 1e-3, 1e-2), seconds, strict=True)}
+    chart = Measured(methods, {"pressure": {**WIDE, "strain": [1e-4, 0.01]}})
+    return Ladder(rungs, chart, accuracy=1.0, deadline=deadline).prepare(layer), rungs
+
+
+def test_outside_of_what_was_measured_the_most_accurate_answers_flagged_and_without_a_bound(layer):
+    method, rungs = outside(layer)
+    answer = method.solve(disc(layer, 1.0))
+    assert answer.method == "c" and [rung.asked for rung in rungs] == [0, 0, 1]
     assert not answer.trust.in_range and answer.trust.error_bound is None and "strain" in answer.trust.why
+    within = outside(layer)[0].solve(disc(layer, 0.003))
+    assert within.method == "a" and within.trust.ok
+
+
+def test_outside_of_what_was_measured_time_and_the_methods_own_ranges_decide(layer):
+    load = disc(layer, 1.0)
+    assert outside(layer, deadline=5e-3)[0].solve(load).method == "b"
+    assert outside(layer, deadline=5e-5)[0].solve(load).method == "a"
+    assert outside(layer, ok=(True, True, False))[0].solve(load).method == "b"
+    assert outside(layer, ok=(False, False, False))[0].solve(load).method == "c"
+    late, rungs = outside(layer, ok=(True, True, False), deadline=3e-2, took=(0.0, 0.0, 4e-2))
+    assert late.solve(load).method == "c" and rungs[1].asked == 0, "no time is left to ask another"
 
 
 def test_no_load_moves_nothing(layer):
@@ -175,9 +196,38 @@ def test_a_method_that_refuses_the_layer_is_left_out(layer):
             raise InvalidInput("not this one")
 
     chart = Measured({n: known(0.1, 1e-3) for n in "ab"}, {"pressure": WIDE})
-    assert Ladder([Refuses("a"), Rung("b")], chart).prepare(layer).solve(disc(layer)).method == "b"
+    method = Ladder([Refuses("a"), Rung("b"), Rung("new")], chart).prepare(layer)
+    answer = method.solve(disc(layer))
+    assert answer.method == "b" and "without new and a" in answer.trust.why
+    assert "not this one" in method.left_out["a"] and "chart" in method.left_out["new"]
+    assert "without" not in Ladder([Rung("b")], chart).prepare(layer).solve(disc(layer)).trust.why
     with pytest.raises(InvalidInput, match="not this one"):
         Ladder([Refuses("a")], chart).prepare(layer)
+
+
+def test_a_method_that_refuses_a_load_is_passed_over_and_said(layer):
+    class Refuses(Rung):
+        def solve(self, load):
+            raise InvalidInput("not that one")
+
+    load = disc(layer)
+    chart = Measured({n: known(share, 1e-3) for n, share in zip("abc", (0.3, 0.03, 0.003), strict=True)},
+                     {"pressure": WIDE})  # fmt: skip
+    rungs = [Rung("a"), Refuses("b"), Rung("c")]
+    answer = Ladder(rungs, chart, accuracy=0.05 * unit(layer, load)).prepare(layer).solve(load)
+    assert answer.method == "c" and "without b" in answer.trust.why and answer.trust.ok
+    with pytest.raises(InvalidInput, match="not that one"):
+        Ladder([Refuses("b")], chart).prepare(layer).solve(load)
+
+
+def test_a_fold_far_away_leaves_the_ladder_its_finite_elements_and_one_near_takes_them():
+    layer = dented()
+    middle = layer.vertices[len(layer.vertices) // 2]
+    far = layer.vertices[np.linalg.norm(layer.vertices - middle - [0, 0, 0.06], axis=1).argmin()]
+    method = ladder(accuracy=1e-6).prepare(layer)
+    away, near = (method.solve(scenes_disc(layer, 0.3, at, 0.01)) for at in (far, middle))
+    assert not method.left_out and "fem" in away.method and "without" not in away.trust.why
+    assert "fem" not in near.method and "without" in near.trust.why and "patch_fem" in near.trust.why
 
 
 def test_a_chart_is_kept_and_takes_over_the_times_of_another_machine(tmp_path):
@@ -189,6 +239,8 @@ def test_a_chart_is_kept_and_takes_over_the_times_of_another_machine(tmp_path):
     assert mixed.methods["a"].seconds == other.methods["a"].seconds
     assert mixed.methods["a"].error == chart.methods["a"].error
     assert set(mixed.methods) == {"a"} and mixed.about["times"]["machine"] == "two"
+    older = Measured({"a": replace(known(0.9, 5e-3), seconds=[5e-3, 0.0])}, {})
+    assert chart.timed_by(older).methods["a"].seconds == chart.methods["a"].seconds, "times in other terms are not used"
     (tmp_path / "broken.json").write_text('{"methods": 3}')
     for file in ("broken.json", "none.json"):
         with pytest.raises(InvalidInput, match="stmpl calibrate"):
@@ -327,7 +379,7 @@ def test_the_shipped_chart_knows_every_default_method_and_its_bounds_hold(layer,
             assert answer.trust.error_bound is not None and answer.trust.error_bound >= off
             named.append(answer.method)
         assert named[0] == "moment_net, 1.5 x coarser" and "fem" in named[-1]
-    slow = {n: replace(k, seconds=[9.0, 0.0, 0.0, 0.0]) for n, k in chart.methods.items() if n != "winkler"}
+    slow = {n: replace(k, seconds=[9.0, 0.0, 0.0, 0.0, 0.0]) for n, k in chart.methods.items() if n != "winkler"}
     Measured({**slow, "winkler": chart.methods["winkler"]}, chart.ranges).save(times_file())
     answer = ladder(accuracy=1e-6, deadline=0.1).prepare(layer).solve(disc(layer))
     assert answer.method == "winkler", "this machine's times count"

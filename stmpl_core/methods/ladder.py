@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import logging
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
@@ -19,10 +20,13 @@ from stmpl_core.methods.base import Method, prepared
 from stmpl_core.methods.winkler import column_stretch
 from stmpl_core.trust import Displacement, Trust
 
+log = logging.getLogger(__name__)
+
 SHIPPED = Path(__file__).parent.parent / "weights" / "ladder.json"
 MOVING_RADIUS = 6.0  # distance around a load within which the skin moves, over t
 LINEAR = 0.01  # strain below which the response is linear, and the error a share of it that no longer changes
 PACE = 0.2  # weight of the newest solve in the mean slowness of the machine
+LOCKS = 0.42  # Poisson's ratio above which finite elements turn to quadratic ones (fem_tools.patch.QUADRATIC_ABOVE)
 RANGE_FACTOR = 1.1  # factor beyond the measured range of a scene's figure that is not yet called outside
 
 
@@ -56,14 +60,16 @@ class SceneFigures:
         """Terms of the logarithm of the error, (10,).
 
         How wide the parts of a contact are counts, which its outline says, not how wide they are together: a hand errs
-        as five fingers do.
+        as five fingers do. 1 - 2 nu is what remains of the compressibility.
         """
         s, w, o = np.log(max(self.strain, LINEAR)), np.log(self.width), np.log(self.outline)
-        return np.array([1.0, s, s * s, o, o * o, s * o, w, self.jump, self.nu, self.slope])
+        return np.array([1.0, s, s * s, o, o * o, s * o, w, self.jump, np.log(1 - 2 * self.nu),
+                         self.slope])  # fmt: skip
 
     def for_time(self) -> np.ndarray:
-        """Terms of the time of a solve, each growing with the work of some method, (4,)."""
-        return np.array([1.0, self.moved, self.moved * self.ratio, self.pressed * self.moved])
+        """Terms of the time of a solve, each growing with the work of some method, (5,)."""
+        quadratic = self.moved if self.nu > LOCKS else 0.0
+        return np.array([1.0, self.moved, self.moved * self.ratio, self.pressed * self.moved, quadratic])
 
 
 RANGED = ("strain", "nu", "width", "slope", "outline", "jump")  # figures whose measured range counts
@@ -181,18 +187,22 @@ class Measured:
 
     def outside(self, scene: SceneFigures, kind: str) -> str:
         """Sentence on how a scene lies outside the measured range; empty if it does not."""
-        return "; ".join(
-            f"{name} is {value:.3g}, measured is {low:.3g} to {high:.3g}"
-            for name, (low, high) in self.ranges.get(kind, {}).items()
-            if not (0 if name in EASY else low / RANGE_FACTOR)
-            <= (value := getattr(scene, name)) <= max(high * RANGE_FACTOR, 1e-9)
-        )
+        out = []
+        for name, (low, high) in self.ranges.get(kind, {}).items():
+            value = getattr(scene, name)
+            least, most = (low, high) if name == "nu" else (low / RANGE_FACTOR, high * RANGE_FACTOR)
+            if not (0 if name in EASY else least - 1e-9) <= value <= most + 1e-9:
+                out.append(f"{name} is {value:.3g}, measured is {low:.3g} to {high:.3g}")
+        return "; ".join(out)
 
     def timed_by(self, other: Measured) -> Measured:
-        """The same errors with the times of another machine, where it has them."""
+        """The same errors with the times of another machine, where it has them in the same terms."""
+        if any(len(known.seconds) != len(other.methods[n].seconds)
+               for n, known in self.methods.items() if n in other.methods):  # fmt: skip
+            log.warning("times that an older version measured are not used. Measure them again: stmpl calibrate.")
         methods = {
             name: replace(known, seconds=other.methods[name].seconds, slow=other.methods[name].slow)
-            if name in other.methods else known
+            if name in other.methods and len(other.methods[name].seconds) == len(known.seconds) else known
             for name, known in self.methods.items()
         }  # fmt: skip
         return replace(self, methods=methods, about={**self.about, "times": dict(other.about)})
@@ -214,8 +224,13 @@ class Ladder:
     method that gave it, says why it was chosen, and carries a bound that 95 % of such answers kept, by the chart and
     by what the method states of itself. Where nothing meets the wish, the best that fits is given and flagged.
 
+    Outside what the chart was measured on its errors mean nothing: the most accurate method that time allows answers,
+    those that say of themselves that they are in range before those that do not. The answer is flagged.
+
+    `left_out` says which methods do not answer on this layer, and why; every answer names them.
+
     Args:
-        rungs: methods, not yet prepared; those that the chart does not know are left out.
+        rungs: methods, not yet prepared, the most accurate last; those that the chart does not know are left out.
         measured: chart of their times and errors.
         accuracy: largest error wanted at any vertex [m].
         deadline: time for each solve [s]; None: as long as it needs.
@@ -234,6 +249,8 @@ class Ladder:
         if not self.rungs:
             raise InvalidInput("none of the methods was measured. stmpl calibrate --errors measures them.")
         self.measured, self.accuracy, self.deadline = measured, accuracy, deadline
+        self._unknown = {rung.name: "the chart does not know it" for rung in rungs if rung not in self.rungs}
+        self.left_out: dict[str, str] = dict(self._unknown)
         known = [measured.methods[rung.name] for rung in self.rungs]
         self._seconds = np.array([k.seconds for k in known])
         self._slow = np.array([k.slow for k in known])
@@ -245,16 +262,17 @@ class Ladder:
         Raises:
             InvalidInput: all of them refuse it.
         """
-        ready, reasons = [], []
-        for rung in self.rungs:
+        self._ready, refused = np.ones(len(self.rungs), dtype=bool), {}
+        for k, rung in enumerate(self.rungs):
             try:
-                ready.append(rung.prepare(layer) is not None)
+                rung.prepare(layer)
             except StmplError as error:
-                ready.append(False)
-                reasons.append(f"{rung.name}: {error}")
-        if not any(ready):
-            raise InvalidInput(f"no method takes this layer. {' '.join(reasons)}")
-        self._ready = np.array(ready)
+                self._ready[k], refused[rung.name] = False, f"it refuses the layer: {error}"
+        self.left_out = self._unknown | refused
+        for name, why in self.left_out.items():
+            log.warning("the ladder does without %s: %s", name, why)
+        if not self._ready.any():
+            raise InvalidInput(f"no method takes this layer. {' '.join(f'{n}: {why}' for n, why in refused.items())}")
         self._reader = SceneReader(layer)
         self._pace = np.ones(len(self.rungs))
         self._layer = layer
@@ -276,22 +294,31 @@ class Ladder:
         if not options:
             raise InvalidInput(f"no method was measured under loads of the kind {load.kind!r}.")
         tried: list[tuple[_Expected, Displacement]] = []
+        refused: dict[str, StmplError] = {}
         while True:
             left = None if self.deadline is None else self.deadline - (time.perf_counter() - started)
-            choice = self._choose(options, left, first=not tried)
+            choice = self._choose(options, left, first=not tried, outside=bool(outside))
             if choice is None:
                 break
-            answer = self._ask(choice, load, scene)
+            options = [o for o in options if o.rung != choice.rung]
             known = self.measured.methods[self.rungs[choice.rung].name]
-            options = [o for o in options if o.error < choice.error]
+            try:
+                answer = self._ask(choice, load, scene)
+            except StmplError as error:
+                refused[self.rungs[choice.rung].name] = error
+                continue
+            if not outside:
+                options = [o for o in options if o.error < choice.error]
             bound = known.bound(scene, load.kind, self._reader.unit(scene), answer.trust.error_bound)
             choice = replace(choice, error=bound)
             tried.append((choice, answer))
-            if outside or (answer.trust.ok and choice.error <= self.accuracy):
+            if answer.trust.ok and (outside or choice.error <= self.accuracy):
                 break
+        if not tried:
+            raise next(iter(refused.values()))
         sound = [pair for pair in tried if pair[1].trust.ok] or tried
-        choice, answer = min(sound, key=lambda pair: pair[0].error)
-        return self._told(choice, answer, outside, len(tried))
+        choice, answer = sound[0] if outside else min(sound, key=lambda pair: pair[0].error)
+        return self._told(choice, answer, outside, len(tried), [*self.left_out, *refused])
 
     def _expected(self, scene: SceneFigures, kind: str) -> tuple[list[_Expected], str]:
         """What to expect of each method that was measured under such loads, and how the scene is outside of that."""
@@ -306,9 +333,14 @@ class Ladder:
                 options.append(_Expected(k, known.bound(scene, kind, unit), float(seconds[k])))
         return options, self.measured.outside(scene, kind)
 
-    def _choose(self, options: list[_Expected], left: float | None, *, first: bool) -> _Expected | None:
-        """The cheapest that is accurate enough in the time left; else the most accurate in time; else the fastest."""
+    def _choose(self, options: list[_Expected], left: float | None, *, first: bool, outside: bool) -> _Expected | None:
+        """The cheapest that is accurate enough in the time left; else the most accurate in time; else the fastest.
+
+        `outside` of the chart the most accurate is the highest rung.
+        """
         in_time = [o for o in options if left is None or o.seconds <= left]
+        if outside and in_time:
+            return max(in_time, key=lambda o: o.rung)
         good = [o for o in in_time if o.error <= self.accuracy]
         if good:
             return min(good, key=lambda o: o.seconds)
@@ -324,14 +356,19 @@ class Ladder:
         self._pace[k] = max(1.0, (1 - PACE) * self._pace[k] + PACE * spent / max(usual, 1e-6))
         return answer
 
-    def _told(self, choice: _Expected, answer: Displacement, outside: str, tries: int) -> Displacement:
-        """The answer with the ladder's own bound and reasons."""
+    def _told(self, choice: _Expected, answer: Displacement, outside: str, tries: int,
+              without: list[str]) -> Displacement:  # fmt: skip
+        """The answer with the ladder's own bound and reasons; `without`: names of the methods that cannot answer."""
         wish = f"{1e3 * self.accuracy:.2g} mm" + ("" if self.deadline is None else f" in {1e3 * self.deadline:.3g} ms")
-        chosen = f"chosen for {wish}: at most {1e3 * choice.error:.2g} mm in {1e3 * choice.seconds:.2g} ms expected"
+        chosen = f"chosen for {wish}: "
+        chosen += "the most accurate in time" if outside else f"at most {1e3 * choice.error:.2g} mm"
+        chosen += f", in {1e3 * choice.seconds:.2g} ms expected"
+        if without:
+            chosen += f", without {' and '.join(without)}, which cannot serve here"
         own = answer.trust
         figures = {**own.figures, "expected_s": choice.seconds, "tries": float(tries)}
         trust = Trust(own.converged, own.in_range, choice.error, "; ".join(filter(None, (own.why, chosen))), figures)
-        if choice.error > self.accuracy:
+        if choice.error > self.accuracy and not outside:
             trust = trust.also("nothing meets the wish, this is the best that fits", in_range=False)
         if self.deadline is not None and choice.seconds > self.deadline:
             trust = trust.also("nothing is fast enough, this is the fastest", in_range=False)
