@@ -38,8 +38,8 @@ def strange_tools() -> dict[str, Tool]:
         "mushroom": lambda p: _blend([_ball(p, (0, 0, 14), 20), p[:, 2] - 1], -2),
     }  # fmt: skip
     made = {name: _meshed(name, distance) for name, distance in shapes.items()}
-    turned = {"saddle roller": roller(8, 12, 30), "peanut": peanut(7, 18), "cup": cup(11, 4)}
-    return turned | {"star": star(5, 14, 7)} | made
+    others = [roller(8, 12, 30), peanut(7, 18), star(5, 14, 7), cup(11, 4)]
+    return dict(zip(("saddle roller", "peanut", "star", "cup"), others, strict=True)) | made
 
 
 def _ring(k: int, count: int, radius: float) -> np.ndarray:

@@ -15,7 +15,7 @@ from stmpl_core.sdf import SignedDistance
 from stmpl_core.touch import Pressed, Touch
 
 MIN_LYING_PRESSURE = 0.05  # pressure over the tool's highest, below which a covered vertex may be apart from the tool
-FIRM_DEPTH = 0.013  # depth in a tool over the thickness, from which skin is moved out with its neighbours, not by itself
+FIRM_DEPTH = 0.013  # depth in a tool over the thickness, from which skin is moved out with its neighbours, not alone
 MIN_FACING_COSINE = 0.3  # cosine between tool's way and inward normal, from which skin comes along
 MIN_ONE_WAY_SHARE = 0.7  # share of the pressure that points one way, and its cosine to a force: all skin then goes so
 PASSES = 3  # corrections of one answer

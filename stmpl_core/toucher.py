@@ -18,7 +18,7 @@ from stmpl_core.layer import SoftLayer
 from stmpl_core.moments import Surroundings
 from stmpl_core.nodes import Nodes
 from stmpl_core.obstacle import REACH
-from stmpl_core.sdf import MARGIN, SignedDistance
+from stmpl_core.sdf import SignedDistance
 from stmpl_core.tools import Tools
 from stmpl_core.touch import (
     APART,
@@ -41,6 +41,8 @@ GAP_TOLERANCE_M = 1e-6  # gap at which the search along the force ends
 MIN_FACING_COSINE = 0.1  # cosine between push and inward normal from which the skin faces a tool that looks for it
 MIN_NET_FORCE_SHARE = 0.1  # force over the sum of its parts' sizes, below which a contact has no direction
 MAX_DRAG_RATIO = 0.3  # tangential over normal force that is not yet worth a word
+MARGIN_SHARE = 2 / 3  # width of the distance fields around tools, over the thickness
+MAX_AROUND = 0.02  # depth of skin in a tool that presses nothing, over the thickness, that is not yet worth a word
 MAX_LEVER = 1.0  # torque that is not carried over the force, over the contact's radius, that is not yet worth a word
 MAX_FIELD_ERROR_M = 5e-4  # error of a distance field that is not yet worth a word
 MAX_UNSEEN_FORCE_SHARE = 0.1  # share of the force that vertices unlike all training contacts may carry
@@ -150,6 +152,11 @@ class Toucher:
         depth = -float(clearance.least.min(initial=np.inf))
 
         def nothing(status: str) -> _Placed:
+            around = -float(clearance.skin.min(initial=np.inf))
+            if status == APART and around > MAX_AROUND * self._thickest:
+                why = f"{1e3 * around:.1f} mm of skin are inside {contact.name}, which no column meets from outside: " \
+                      "check its pose, its scale and which side of its surface is out"  # fmt: skip
+                return _Placed(contact, field, WRAPPED, pose, depth, 0.0, NO_SQUEEZE, 0.0, why=why)
             return _Placed(contact, field, status, pose, depth, 0.0, NO_SQUEEZE, 0.0)
 
         force, tool = contact.wrench[:3] if contact.wrench is not None else None, contact.tool.vertices
@@ -283,13 +290,14 @@ class Toucher:
         stated = one.contact.wrench
         depth = self._depth(one.squeeze) if len(v) and not one.factor > 1 else one.depth
         way = stated[:3] / np.linalg.norm(stated[:3]) if stated is not None and stated[:3].any() else None
-        doubt = scale * one.factor * self._modulus * float(held.doubt @ nodes.area)
+        size, known = float(np.linalg.norm(wrench[:3])), self.net.weights.card["bound"]
+        doubt = scale * one.factor * self._modulus * float(held.doubt @ nodes.area) / size if size > 0 else 0.0
         forces_there = there * nodes.area
         strange = float(forces_there[held.outside].sum() / max(forces_there.sum(), 1e-300))
         touch = Touch(
             one.contact.name, one.status, one.pose, wrench,
             depth=depth if np.isfinite(depth) else float("nan"),
-            force_bound=float(self.net.weights.card["bound"]["factor"]) * doubt,
+            force_bound=size * known["scale"] * doubt ** known["power"] if size > 0 else 0.0,
             moved=one.moved,
             missing=np.zeros(6) if stated is None else stated - wrench,
             pressure=values,
@@ -299,7 +307,7 @@ class Toucher:
 
     def _trust(self, one: _Placed, touch: Touch, vertices: np.ndarray, pressure: np.ndarray, strange: float) -> Trust:
         name, layer, card, trust = touch.name, self.layer, self.net.weights.card, Trust()
-        if one.status in WHY:
+        if one.status in WHY and not one.why:
             why = WHY[one.status].format(name=name, reach=1e3 * self.reach, depth=1e3 * touch.depth)
             trust = trust.also(why, in_range=False if one.status != PULLING else None)
         stated = one.contact.wrench
@@ -362,4 +370,4 @@ def _wrench(pressure, vertices, points, area_vectors, origin):
 
 def margin_on(layer: SoftLayer) -> float:
     """Width that a tool's distance field needs around its surface to press on this layer [m]."""
-    return max(MARGIN, 2 * HOLE_RADIUS * layer.edge_length)
+    return max(MARGIN_SHARE * float(layer.thickness.max()), 2 * HOLE_RADIUS * layer.edge_length)

@@ -18,26 +18,20 @@ from studies.pressed import STRAIGHT, pressed, seen, slant_of
 
 COVERED = 0.95  # share of validation contacts whose force and motion the stated bounds must reach
 MARGIN = 1.3  # on these bounds, for tools and limbs unlike the validation data
-FEWEST = 30  # contacts from which a bound on the motion is known
+FEWEST = 30  # contacts from which a bound is known
+LEAST_ERROR = 2e-3  # relative error of a force below which one is as good as another
 
 
 def calibrate(subset: Subset, weights: Weights) -> dict[str, float]:
-    """The factor on the network's own doubt that covers the error of a contact's force with a margin.
+    """Bound on the error of a contact's force, over the force, from the network's own doubt: see fit_bound.
 
-    Returns the factor, how many contacts, the median of bound over error, and the errors of these contacts.
+    Besides, the errors of these contacts.
     """
     scores = score((sample for sample in subset if slant_of(sample) <= STRAIGHT), weights)
-    if not len(scores.force):
-        return {"factor": float("inf"), "contacts": 0, "median_bound_over_error": float("nan")}
-    ratio = np.abs(scores.force) / np.maximum(scores.doubt, 1e-9)
-    factor = MARGIN * float(np.quantile(ratio, COVERED))
-    return {
-        "factor": factor,
-        "contacts": len(ratio),
-        "median_bound_over_error": float(np.median(factor / ratio)),
-        "force_mean": float(np.abs(scores.force).mean()),
-        "pressure_l2_mean": float(scores.pressure.mean()),
-    }
+    found = fit_bound(np.maximum(np.abs(scores.force), LEAST_ERROR), scores.doubt, scores.tool)
+    if len(scores.force):
+        found |= {"force_mean": float(np.abs(scores.force).mean()), "pressure_l2_mean": float(scores.pressure.mean())}
+    return found
 
 
 def bound_motion(data: str | Path, out: str | Path) -> dict[str, float]:

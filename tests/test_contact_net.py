@@ -93,7 +93,7 @@ def test_the_weights_that_come_with_the_package_say_what_made_them() -> None:
     for name in ("poisson_ratio", "thickness_mm", "depth_over_thickness", "p_over_e"):
         low, high = card["ranges"][name]
         assert 0 <= low < high
-    assert 0 < card["bound"]["factor"] < np.inf
+    assert 0 < card["bound"]["scale"] < np.inf
     arrays = shipped("contact_net").arrays
     assert arrays["w1"].shape[0] == NODE.size and arrays["w4"].shape[1] == PRESSURE.size
     assert all(np.isfinite(a).all() for a in arrays.values())

@@ -114,7 +114,7 @@ def test_a_short_training_learns_and_its_weights_load_and_hold(data: Path, tmp_p
     weights = Weights.load(tmp_path / "contact_net.safetensors", "pressure")
     assert weights.card["settings"]["steps"] == SETTINGS.steps == card["settings"]["steps"]
     assert card["contacts"] >= 2 and card["rows"] > card["contacts"]
-    assert card["ranges"]["depth_over_thickness"][1] < 0.4 and card["bound"]["factor"] > 0
+    assert card["ranges"]["depth_over_thickness"][1] < 0.4 and card["bound"]["scale"] > 0
     subset = Dataset.open(data).split("train", kind="indenter")
     after = score(subset, weights)
     assert 0 < len(after.force) <= len(subset)
