@@ -123,7 +123,10 @@ Kind = Literal["motion", "pressure", "image"]  # what a network says: a MomentNe
 READS: dict[Kind, Layout] = {"motion": INPUTS, "pressure": NODE}
 SAYS: dict[Kind, Layout] = {"motion": MOTION, "pressure": PRESSURE}
 _LAYERS = ("low", "high", "mean", "scale", "w1", "b1", "w2", "b2", "w3", "b3", "w4", "b4")
-ARRAYS: dict[Kind, tuple[str, ...]] = {"motion": ("mix_vectors", "mix_tensors", *_LAYERS), "pressure": _LAYERS}
+ARRAYS: dict[Kind, tuple[str, ...]] = {
+    "motion": ("mix_vectors", "mix_tensors", "least", "most", *_LAYERS),  # least, most: what training inputs reached
+    "pressure": _LAYERS,
+}
 
 
 @dataclass(frozen=True, eq=False)

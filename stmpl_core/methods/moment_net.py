@@ -122,7 +122,8 @@ class MomentNet:
         inputs = np.empty((len(near_ones), INPUTS.size), dtype=np.float32)
         outside, strange = np.zeros(len(vertices), dtype=np.bool_), np.zeros(len(near_ones), dtype=np.bool_)
         invariants(figures[near_ones], shape[near_ones], sources[vertices[near_ones]], constants, a["mix_vectors"],
-                a["mix_tensors"], a["low"], a["high"], a["mean"], a["scale"], inputs, strange)  # fmt: skip
+                a["mix_tensors"], a["least"], a["most"], a["low"], a["high"], a["mean"], a["scale"], inputs,
+                strange)  # fmt: skip
         outside[near_ones] = strange
 
         # Three hidden layers.
@@ -251,8 +252,12 @@ def _mix(weights, vectors, out):
 
 
 @numba.njit(cache=True, fastmath=FAST, error_model="numpy")
-def invariants(figures, shape, here, constants, mix_vectors, mix_tensors, low, high, mean, scale, out, outside):
-    """The network's inputs, (N, INPUTS.size): kept inside the training data's, then centred and scaled."""
+def invariants(figures, shape, here, constants, mix_vectors, mix_tensors, least, most, low, high, mean, scale, out,
+               outside):  # fmt: skip
+    """The network's inputs, (N, INPUTS.size): kept from low to high, then centred and scaled.
+
+    Outside is who has one that no training load had.
+    """
     half, one = np.float32(0.5), np.float32(1)
     for n in range(len(figures)):
         g = _amplitude(figures[n])
@@ -296,10 +301,9 @@ def invariants(figures, shape, here, constants, mix_vectors, mix_tensors, low, h
         row[IN.volumetric] = one / (np.float32(1.02) - np.float32(2) * constants[0])
         row[IN.squared_slope] = shape[n, 3] * shape[n, 3] + shape[n, 4] * shape[n, 4]
         for m in range(len(mean)):
-            kept = min(max(row[m], low[m]), high[m])
-            if kept != row[m]:
+            if not least[m] <= row[m] <= most[m]:
                 outside[n] = True
-            row[m] = (kept - mean[m]) * scale[m]
+            row[m] = (min(max(row[m], low[m]), high[m]) - mean[m]) * scale[m]
 
 
 def think(inputs, w1, b1, w2, b2, w3, b3, w4, b4, outputs):
