@@ -11,9 +11,10 @@ import numpy as np
 from stmpl_core.arrays import Points, Transform
 from stmpl_core.layer import SoftLayer
 from stmpl_core.nodes import Nodes, nodes_under
-from stmpl_core.rays import WALL, depth_in_column, distance_in_column, ray_of, to_tool
+from stmpl_core.rays import WALL, depth_in_column, distance_in_column, inside_most, ray_of, to_tool
 from stmpl_core.sdf import SignedDistance
 
+LEAST_UNDER = 0.05  # how much further inside a tool a column gets below its skin than there, over the width of a wall
 HOLE_RADIUS = 0.6  # farthest point of a triangle from its corners, over the edge length (equilateral: 0.577)
 
 
@@ -114,12 +115,12 @@ class Columns:
         if not len(covered):
             return NO_SQUEEZE
         wall = WALL * float(self.layer.thickness[covered].mean())
-        under = float(np.minimum(-least, above).max()) / wall
-        buried = min(max(1.2 * under - 0.06, 0.0), 1.0)  # a wall along a column is not
+        under = float((-least - np.maximum(-above, 0.0)).max()) / wall
+        sunk = under > LEAST_UNDER
         grid, skin = _grid(field), (self.points, self.inward, self.layer.thickness, self.faces)
         faces = self._start, self._around, self._slot
-        found, vertices, depth, rests = _cover(grid, pose, *skin, *faces, covered, buried)
-        return Squeeze(vertices, depth, rests, nodes_under(grid, pose, middle_of(field, pose), skin, found, buried))
+        found, vertices, depth, rests = _cover(grid, pose, *skin, *faces, covered, sunk)
+        return Squeeze(vertices, depth, rests, nodes_under(grid, pose, middle_of(field, pose), skin, found, sunk))
 
 
 def middle_of(field: SignedDistance, pose: Transform) -> np.ndarray:
@@ -195,11 +196,11 @@ def _depths_along(grid, pose, points, way, guess):
 
 
 @numba.njit(cache=True)
-def _cover(grid, pose, points, inward, thickness, faces, start, around, slot, covered, buried):
+def _cover(grid, pose, points, inward, thickness, faces, start, around, slot, covered, sunk):
     """Triangles around covered vertices, their vertices in order, and of these depth and rests: see Squeeze.
 
-    At the border the depth falls to 0 over WALL beside a wall of the tool. Unless the tool is buried, columns whose
-    skin is outside it are free.
+    At the border the depth falls to 0 over WALL beside a wall of the tool, and where a tool has sunk under skin that it
+    does not reach, within half of that inside it.
     """
     room = 0
     for v in covered:
@@ -224,9 +225,11 @@ def _cover(grid, pose, points, inward, thickness, faces, start, around, slot, co
         slot[v] = -1
         wall, ray = WALL * thickness[v], ray_of(pose, points, inward, v)
         guess = -distance_in_column(grid, ray, 0.0)
-        share = 1.0 if guess >= 0 else min(max(1 + guess / wall, 0.0) + buried, 1.0)
-        guess = 0.0 if buried > 0 else guess
-        depth[n] = 0.0 if share <= 0 else share * depth_in_column(grid, ray, thickness[v], guess)
+        share = min(max(1 + guess / wall, 0.0), 1.0)
+        deep = depth_in_column(grid, ray, thickness[v], guess) if share > 0 or sunk else 0.0
+        if share < 1 and sunk and deep > 0:
+            share = min(max(share, 2 * inside_most(grid, ray, deep) / wall), 1.0)
+        depth[n] = share * deep
         if depth[n] > 0:
             inside = -distance_in_column(grid, ray, depth[n] - wall)
             rests[n] = min(max(2 * inside / wall, 0.0), 1.0) * min(depth[n] / wall, 1.0)

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numba
 import numpy as np
 
-from stmpl_core.rays import MAX_COLUMN_STRAIN, WALL, depth_in_column, distance_in_column, ray_from
+from stmpl_core.rays import MAX_COLUMN_STRAIN, WALL, depth_in_column, distance_in_column, inside_most, ray_from
 
 NODES = 80  # number of nodes under a tool, about
 WIDEST = 0.45  # largest spacing of nodes, over the thickness
@@ -83,7 +83,7 @@ def _gathered(corners, shares, forces, areas):
 
 
 def nodes_under(grid: tuple, pose: np.ndarray, centre: np.ndarray, skin: tuple, found: np.ndarray,
-                buried: float) -> Nodes:  # fmt: skip
+                sunk: bool) -> Nodes:  # fmt: skip
     """Nodes under a tool.
 
     Args:
@@ -92,25 +92,25 @@ def nodes_under(grid: tuple, pose: np.ndarray, centre: np.ndarray, skin: tuple, 
         centre: middle of the tool, in the body's frame, (3,) [m].
         skin: points, inward normals, thickness and faces of the layer.
         found: numbers of the triangles that the tool may touch, (F,).
-        buried: 1 where the whole tool is under the skin, 0 where it comes out of it, else between.
+        sunk: truth of the claim that the tool is under skin which it does not reach.
     """
-    return Nodes(*_nodes(grid, pose, centre, *skin, found, buried))
+    return Nodes(*_nodes(grid, pose, centre, *skin, found, sunk))
 
 
 @numba.njit(cache=True)
-def _nodes(grid, pose, centre, points, inward, thickness, faces, found, buried):
+def _nodes(grid, pose, centre, points, inward, thickness, faces, found, sunk):
     """See nodes_under. The lattice is laid twice: first to see the covered area as it does, not as the triangles do."""
     split = 1
     while split < 8 and len(found) * split**2 < SAMPLES:
         split += 1
     depths, middles, ways, sizes, best, area = _look(
-        grid, pose, points, inward, thickness, faces, found, buried, split
+        grid, pose, points, inward, thickness, faces, found, sunk, split
     )
     rows = np.empty((0, 15))
     if area > 0:
         chart, frames = _charts(pose, found, depths, ways, sizes, best)
         for only_look in (True, False):
-            seen, rows = _lay(grid, pose, centre, points, inward, thickness, faces, found, buried, depths, middles,
+            seen, rows = _lay(grid, pose, centre, points, inward, thickness, faces, found, sunk, depths, middles,
                               chart, frames, area, only_look)  # fmt: skip
             if only_look:
                 area = seen
@@ -141,24 +141,26 @@ def _mixed(points, inward, thickness, faces, f, a, b, c, row):
 
 
 @numba.njit(cache=True)
-def _strain_under(grid, pose, row, buried):
+def _strain_under(grid, pose, row, sunk):
     """How far the tool squeezes the column at row[:7], over its thickness; rising from 0 beside the tool's walls."""
     ray, t = ray_from(pose, row[0], row[1], row[2], row[3], row[4], row[5]), row[6]
     wall = WALL * t
     guess = -distance_in_column(grid, ray, 0.0)
-    share = 1.0 if guess >= 0 else min(max(1 + guess / wall, 0.0) + buried, 1.0)
-    if share <= 0:
+    if guess <= -wall and not sunk:
         return 0.0
-    deep = depth_in_column(grid, ray, t, 0.0 if buried > 0 else guess)
+    deep = depth_in_column(grid, ray, t, guess)
     if deep <= 0:
         return 0.0
+    share = min(max(1 + guess / wall, 0.0), 1.0)
+    if share < 1 and sunk:
+        share = min(max(share, 2 * inside_most(grid, ray, deep) / wall), 1.0)
     inside = -distance_in_column(grid, ray, deep - wall)
     share *= min(max(2 * inside / wall, 0.0), 1.0) if deep > wall else 1.0
     return share * min(deep / t, MAX_COLUMN_STRAIN)
 
 
 @numba.njit(cache=True)
-def _look(grid, pose, points, inward, thickness, faces, found, buried, split):
+def _look(grid, pose, points, inward, thickness, faces, found, sunk, split):
     """How deep the tool is at parts of the triangles.
 
     Returns:
@@ -189,7 +191,7 @@ def _look(grid, pose, points, inward, thickness, faces, found, buried, split):
                         continue
                     a, b = (p + (1 + flip) / 3) / split, (r + (1 + flip) / 3) / split
                     _mixed(points, inward, thickness, faces, f, a, b, 1 - a - b, row)
-                    depths[m, q] = _depth_at(grid, pose, row, buried)
+                    depths[m, q] = _depth_at(grid, pose, row, sunk)
                     for x in range(3):
                         middles[m, q, x] = row[x]
                     if depths[m, q] > deepest:
@@ -205,12 +207,12 @@ def _look(grid, pose, points, inward, thickness, faces, found, buried, split):
 
 
 @numba.njit(cache=True)
-def _depth_at(grid, pose, row, buried):
-    """Depth of the skin at row[:7] in the tool; the more that is buried, how far it squeezes the column [m]."""
+def _depth_at(grid, pose, row, sunk):
+    """Depth of the skin at row[:7] in the tool [m], or where the tool has sunk under it, of its column."""
     ray = ray_from(pose, row[0], row[1], row[2], row[3], row[4], row[5])
     depth = -distance_in_column(grid, ray, 0.0)
-    if buried > 0:
-        depth += buried * max(depth_in_column(grid, ray, row[6], 0.0) - depth, 0.0)
+    if sunk and depth < 0:
+        return max(depth, inside_most(grid, ray, max(depth_in_column(grid, ray, row[6], 0.0), 0.5 * row[6])))
     return depth
 
 
@@ -259,7 +261,7 @@ def _charts(pose, found, depths, ways, sizes, best):
 
 
 @numba.njit(cache=True)
-def _lay(grid, pose, centre, points, inward, thickness, faces, found, buried, depths, middles, chart, frames, area,
+def _lay(grid, pose, centre, points, inward, thickness, faces, found, sunk, depths, middles, chart, frames, area,
          only_look):  # fmt: skip
     """Lays a lattice about the tool's middle on each side, for a covered area [m2].
 
@@ -341,9 +343,9 @@ def _lay(grid, pose, centre, points, inward, thickness, faces, found, buried, de
                     _mixed(points, inward, thickness, faces, f, a, b, c, row)
                     row[7] = cell / max(row[3] * way[0] + row[4] * way[1] + row[5] * way[2], FACING)
                     if only_look:
-                        sum_area += row[7] * min(max(0.5 + _depth_at(grid, pose, row, buried) / blur, 0.0), 1.0)
+                        sum_area += row[7] * min(max(0.5 + _depth_at(grid, pose, row, sunk) / blur, 0.0), 1.0)
                         continue
-                    row[8] = _strain_under(grid, pose, row, buried)
+                    row[8] = _strain_under(grid, pose, row, sunk)
                     if row[8] <= 0:
                         continue
                     row[9], row[10], row[11] = faces[f, 0], faces[f, 1], faces[f, 2]

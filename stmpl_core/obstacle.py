@@ -27,6 +27,7 @@ RINGS = len(RING_AT)
 OWN = 3.921  # of an even pressure on a lattice of triangles: sum of 1 / r with this / sqrt(area) for the node itself
 TOLERANCE = 3e-6  # largest change of the forces of one iteration, over the largest, at which it ends
 MAX_ITERATIONS = 200
+ONE_THREAD = 2**18  # multiplications up to which OpenBLAS takes one thread, and so always sums in the same order
 POWER_TOLERANCE = 1e-4  # square of the residual over the first, at which the power is known
 
 
@@ -156,7 +157,11 @@ def _moments(rings, points, thickness, area, pressure, strain):
             sources[j, 4 * s] = value
             for x in range(3):
                 sources[j, 4 * s + 1 + x] = value * (points[j, x] - centre[x]) / scale
-    sums = np.dot(rings.reshape(width * count, count), sources).reshape(width, count, 8)
+    flat, sums = rings.reshape(width * count, count), np.empty((width * count, 8), np.float32)
+    block = max(1, ONE_THREAD // (8 * count))
+    for start in range(0, width * count, block):
+        sums[start : start + block] = np.dot(flat[start : start + block], sources)
+    sums = sums.reshape(width, count, 8)
     moments, vectors = np.empty((count, 2, width - 1)), np.empty((count, 2, 3))
     for i in range(count):
         for s in range(2):

@@ -8,6 +8,7 @@ import numpy as np
 from stmpl_core.sdf import distance_at
 
 WALL = 0.05  # width over which depth rises beside a tool's wall, over the thickness: nothing pops in while it slides
+PASSED = 6  # places along a column at which it is looked how far it is inside a tool, or passes beside it
 MAX_COLUMN_STRAIN = 0.9  # strain beyond which no column is squeezed
 SECANT_START = 3e-3  # distance to the tool, over the thickness, at which the secant rule takes over from sphere tracing
 SECANT_TOLERANCE = 4e-4  # largest last step of the secant rule, likewise; the depth is then known far better
@@ -79,6 +80,15 @@ def depth_in_column(grid, ray, t, guess):
             return min(s, t)
         d = distance_in_column(grid, ray, s)
     return min(s, t)
+
+
+@numba.njit(cache=True)
+def inside_most(grid, ray, deep):
+    """How far inside the tool a ray gets at most on its way to a depth [m]; below 0: how far it passes beside it."""
+    most = -distance_in_column(grid, ray, 0.0)
+    for k in range(1, PASSED + 1):
+        most = max(most, -distance_in_column(grid, ray, deep * k / (PASSED + 1)))
+    return most
 
 
 @numba.njit(cache=True, error_model="numpy")

@@ -22,6 +22,7 @@ OFFSET_STEPS = 13  # offsets that are tried before the best is refined
 OFFSET_TOLERANCE_M = 5e-6  # error of the offset at which the search ends
 OFFSET_PENALTY = 2e-3  # relative error of the forces up to which the smaller of two offsets is taken
 MAX_RESIDUAL = 0.15  # relative error of the forces that may be left; with more it is no skin of one stiffness
+DEVIATION = 1.25  # standard deviation of an error over the mean of its size, sqrt(pi / 2)
 MAX_RELATIVE_ERROR = 0.2  # standard error of the modulus over it
 OFFSET_MARGIN_M = 1e-4  # distance from the ends of the search, within which the offset may as well lie outside
 
@@ -199,7 +200,7 @@ class _Presses:
         if np.linalg.cond(normal) > 1e12:
             return float("inf")
         spread = float(np.sqrt(np.linalg.inv(normal)[0, 0]))
-        own = float(self._toucher.net.weights.card["bound"]["force_mean"])
+        own = DEVIATION * float(self._toucher.net.weights.card["bound"]["force_mean"])
         return spread * float(np.hypot(own, residual / np.sqrt(len(j))))
 
 
