@@ -94,7 +94,8 @@ def nodes_under(grid: tuple, pose: np.ndarray, centre: np.ndarray, skin: tuple, 
         found: numbers of the triangles that the tool may touch, (F,).
         sunk: truth of the claim that the tool is under skin which it does not reach.
     """
-    return Nodes(*_nodes(grid, pose, centre, *skin, found, sunk))
+    points, inward, thickness, faces = skin
+    return Nodes(*_nodes(grid, pose, centre, points, inward, thickness, faces, found, sunk))
 
 
 @numba.njit(cache=True)

@@ -127,7 +127,8 @@ class Toucher:
             together = self.net.hold(Nodes.joined([one.squeeze.nodes for one in group]))
             ends = np.cumsum([len(one.squeeze.nodes.area) for one in group])[:-1]
             parts = zip(*(np.split(values, ends) for values in together[:3]), strict=True)
-            held |= {one.contact.name: Held(*part, together.power) for one, part in zip(group, parts, strict=True)}
+            for one, (pressure, doubt, outside) in zip(group, parts, strict=True):
+                held[one.contact.name] = Held(pressure, doubt, outside, together.power)
         return [self._answer(one, held.get(one.contact.name, NOTHING)) for one in placed]
 
     def _near_each_other(self, pressing: Sequence[_Placed]) -> list[list[_Placed]]:
