@@ -16,8 +16,6 @@ import numba
 import numpy as np
 from scipy.special import j0
 
-from stmpl_core.response import FAST
-
 REACH = 8.0  # distance beyond which nodes do not feel each other, over t
 STEPS = 64  # rows of the layer's table a thickness
 NEAR = 4.0  # distance to which rings see, over t
@@ -174,7 +172,7 @@ def _moments(rings, points, thickness, area, pressure, strain):
     return moments, vectors
 
 
-@numba.njit(cache=True, fastmath=FAST, error_model="numpy")
+@numba.njit(cache=True, error_model="numpy")
 def solve(matrix, depth):
     """Forces (N,) >= 0 with matrix @ forces >= depth, and equal where they are above 0."""
     count = len(depth)
@@ -185,26 +183,21 @@ def solve(matrix, depth):
     before, restart = 1.0, True
     for _ in range(MAX_ITERATIONS):
         square = 0.0
+        _times(matrix, force, gap)
         for i in range(count):
-            total = -depth[i]
-            for j in range(count):
-                total += matrix[i, j] * force[j]
-            gap[i] = total
+            gap[i] -= depth[i]
             if force[i] > 0:
-                square += total * total
+                square += gap[i] * gap[i]
         if square == 0:
             break
         for i in range(count):
             way[i] = 0.0 if force[i] <= 0 else gap[i] + (0.0 if restart else square / before * way[i])
         before = square
         up = down = 0.0
+        _times(matrix, way, along)
         for i in range(count):
-            total = 0.0
-            for j in range(count):
-                total += matrix[i, j] * way[j]
-            along[i] = total
             up += gap[i] * way[i]
-            down += total * way[i]
+            down += along[i] * way[i]
         if down <= 0:
             break
         step = up / down
@@ -223,7 +216,17 @@ def solve(matrix, depth):
     return force
 
 
-@numba.njit(cache=True, fastmath=FAST, error_model="numpy")
+@numba.njit(cache=True, error_model="numpy")
+def _times(matrix, vector, out):
+    """out = a symmetric matrix (N, N) times a vector, summed in one order whatever the processor's width."""
+    out[:] = 0.0
+    for j in range(len(vector)):
+        if vector[j] != 0.0:
+            for i in range(len(out)):
+                out[i] += matrix[j, i] * vector[j]
+
+
+@numba.njit(cache=True, error_model="numpy")
 def _power(matrix, force, depth):
     """The slope of the whole force over the depth, times depth over force: conjugate gradients on what presses."""
     count = len(force)
@@ -233,12 +236,10 @@ def _power(matrix, force, depth):
     for _ in range(MAX_ITERATIONS):
         if square <= POWER_TOLERANCE * start:
             break
+        _times(matrix, way, along)
         down = 0.0
         for i in range(count):
-            along[i] = 0.0
-            if force[i] > 0:
-                for j in range(count):
-                    along[i] += matrix[i, j] * way[j]
+            along[i] = along[i] if force[i] > 0 else 0.0
             down += along[i] * way[i]
         step, before, square = square / down, square, 0.0
         for i in range(count):

@@ -322,11 +322,11 @@ def think(inputs, w1, b1, w2, b2, w3, b3, w4, b4, outputs):
                 outputs[start + n, m] = out[n, m] + b4[m]
 
 
-think_few = numba.njit(cache=True, fastmath=FAST, error_model="numpy")(think)  # on the caller's thread
+think_few = numba.njit(cache=True, error_model="numpy")(think)  # on the caller's thread
 think = numba.njit(cache=True, parallel=True, fastmath=FAST, error_model="numpy")(think)
 
 
-@numba.njit(cache=True, fastmath=FAST, error_model="numpy")
+@numba.njit(cache=True, error_model="numpy")
 def _activate(hidden, bias):
     """x / 2 (1 + x / (1 + |x|)) of hidden + bias, in place: smooth as SiLU, without its exponential."""
     half, one = np.float32(0.5), np.float32(1)
