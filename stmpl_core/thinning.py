@@ -83,7 +83,8 @@ class Thinning:
         """Numbers of groups of vertices (N,), none of which feels another, (N,): all 0 where the skin has no folds."""
         if not self.folded or len(vertices) < 2:
             return np.zeros(len(vertices), np.int64)
-        return _together(self.start, self.index, vertices, len(self._stands[0]))
+        some, place = np.unique(vertices, return_inverse=True)  # nodes of a contact share vertices
+        return _together(self.start, self.index, some, len(self._stands[0]))[place]
 
     def reached(self, loaded: np.ndarray) -> np.ndarray:
         """All vertices with a loaded one in reach, in order."""
@@ -200,7 +201,7 @@ def _folded(start, index, some, points, normals, thickness, reach):
 
 @numba.njit(cache=True, error_model="numpy")
 def _together(start, index, some, count):
-    """Numbers of groups of `some` vertices, within each of which each is a neighbour of another."""
+    """Numbers of groups of `some` vertices, each once, within each of which each is a neighbour of another."""
     zones = (len(start) - 1) // count
     place, group, queue = np.full(count, -1), np.full(len(some), -1), np.empty(len(some), np.int64)
     for n in range(len(some)):

@@ -78,3 +78,13 @@ def test_all_that_is_in_reach_along_the_skin_is_a_neighbour() -> None:
         expected = np.flatnonzero((away < 8.0) & (layer.normals @ layer.normals[v] > 0))
         found = thinning.index[thinning.start[zones * v] : thinning.start[zones * (v + 1)]]
         np.testing.assert_array_equal(np.sort(found), expected)
+
+
+def test_one_contact_is_one_group_however_many_nodes_share_a_vertex() -> None:
+    """A finger beside another presses as hard as the same finger alone, whose skin has no fold."""
+    alone = FINGERS.vertices[:, 0] < 0
+    number = np.cumsum(alone) - 1
+    single = SoftLayer(FINGERS.vertices[alone], number[FINGERS.faces[alone[FINGERS.faces].all(axis=1)]], THICKNESS)
+    tip, pose = ball(0.005), at(-0.008, 0.03, 0.005 - 1e-3)
+    beside, one = (Simulator(layer, MomentNet()).touch([Contact(tip, pose)])[0].force for layer in (FINGERS, single))
+    assert beside == pytest.approx(one, rel=1e-3)
