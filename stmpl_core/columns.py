@@ -11,7 +11,7 @@ import numpy as np
 from stmpl_core.arrays import Points, Transform
 from stmpl_core.layer import SoftLayer
 from stmpl_core.nodes import Nodes, nodes_under
-from stmpl_core.rays import WALL, depth_in_column, distance_in_column, inside_most, ray_of, to_tool
+from stmpl_core.rays import WALL, depth_and_share, depth_in_column, distance_in_column, ray_of, to_tool
 from stmpl_core.sdf import SignedDistance
 
 LEAST_UNDER = 0.05  # how much further inside a tool a column gets below its skin than there, over the width of a wall
@@ -224,11 +224,7 @@ def _cover(grid, pose, points, inward, thickness, faces, start, around, slot, co
         v = vertices[n]
         slot[v] = -1
         wall, ray = WALL * thickness[v], ray_of(pose, points, inward, v)
-        guess = -distance_in_column(grid, ray, 0.0)
-        share = min(max(1 + guess / wall, 0.0), 1.0)
-        deep = depth_in_column(grid, ray, thickness[v], guess) if share > 0 or sunk else 0.0
-        if share < 1 and sunk and deep > 0:
-            share = min(max(share, 2 * inside_most(grid, ray, deep) / wall), 1.0)
+        deep, share = depth_and_share(grid, ray, thickness[v], sunk)
         depth[n] = share * deep
         if depth[n] > 0:
             inside = -distance_in_column(grid, ray, depth[n] - wall)

@@ -12,7 +12,15 @@ from typing import NamedTuple
 import numba
 import numpy as np
 
-from stmpl_core.rays import MAX_COLUMN_STRAIN, WALL, depth_in_column, distance_in_column, inside_most, ray_from
+from stmpl_core.rays import (
+    MAX_COLUMN_STRAIN,
+    WALL,
+    depth_and_share,
+    depth_in_column,
+    distance_in_column,
+    inside_most,
+    ray_from,
+)
 
 NODES = 80  # number of nodes under a tool, about
 WIDEST = 0.45  # largest spacing of nodes, over the thickness
@@ -146,15 +154,9 @@ def _strain_under(grid, pose, row, sunk):
     """How far the tool squeezes the column at row[:7], over its thickness; rising from 0 beside the tool's walls."""
     ray, t = ray_from(pose, row[0], row[1], row[2], row[3], row[4], row[5]), row[6]
     wall = WALL * t
-    guess = -distance_in_column(grid, ray, 0.0)
-    if guess <= -wall and not sunk:
-        return 0.0
-    deep = depth_in_column(grid, ray, t, guess)
+    deep, share = depth_and_share(grid, ray, t, sunk)
     if deep <= 0:
         return 0.0
-    share = min(max(1 + guess / wall, 0.0), 1.0)
-    if share < 1 and sunk:
-        share = min(max(share, 2 * inside_most(grid, ray, deep) / wall), 1.0)
     inside = -distance_in_column(grid, ray, deep - wall)
     share *= min(max(2 * inside / wall, 0.0), 1.0) if deep > wall else 1.0
     return share * min(deep / t, MAX_COLUMN_STRAIN)

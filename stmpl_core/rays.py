@@ -91,6 +91,22 @@ def inside_most(grid, ray, deep):
     return most
 
 
+@numba.njit(cache=True)
+def depth_and_share(grid, ray, t, sunk):
+    """How deep the tool is in a column [m], and the share of that which counts: rising from 0 over WALL at its skin.
+
+    Where the tool has sunk under skin that it does not reach, a column counts as far as it is inside the tool.
+    """
+    wall, guess = WALL * t, -distance_in_column(grid, ray, 0.0)
+    share = min(max(1 + guess / wall, 0.0), 1.0)
+    if share <= 0 and not sunk:
+        return 0.0, 0.0
+    deep = depth_in_column(grid, ray, t, guess)
+    if share < 1 and sunk and deep > 0:
+        share = min(max(share, 2 * inside_most(grid, ray, deep) / wall), 1.0)
+    return deep, share
+
+
 @numba.njit(cache=True, error_model="numpy")
 def column_pressure(moduli, strain):
     """Pressure of confined Neo-Hookean columns, over E [-]; moduli: mu and lambda over E."""
