@@ -73,6 +73,7 @@ _RINGS[:, 8 : 8 + VECTORS] = ring_table()[:, SCALARS : SCALARS + VECTORS]
 _RINGS[:, 16 : 16 + TENSORS] = ring_table()[:, SCALARS + VECTORS :]
 
 
+@numba.njit(cache=True, parallel=True, fastmath=FAST, error_model="numpy")
 def feel(vertices, values, sources, sites, frames, sink, away, moments, out):
     """See Surroundings.felt; values (S, K) and sources (10, K) are those of the loaded vertices, `out` (N, S, WIDTH).
 
@@ -95,9 +96,6 @@ def feel(vertices, values, sources, sites, frames, sink, away, moments, out):
                 out[n, s, 0], out[n, s, 1], out[n, s, 2] = u, v, w
             if moments:
                 _take_moments(values, felt, sums, out[n])
-
-
-feel = numba.njit(cache=True, parallel=True, fastmath=FAST, error_model="numpy")(feel)
 
 
 @numba.njit(inline="always", fastmath=FAST, error_model="numpy")

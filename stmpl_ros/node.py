@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+import multiprocessing
 import time
 from collections.abc import Callable
 from concurrent.futures import BrokenExecutor, Future, TimeoutError
@@ -357,4 +358,6 @@ def run(config: NodeConfig, arguments: list[str] | None = None, build: Build = l
         finally:
             executor.shutdown()
             node.destroy_node()
+            for beside in multiprocessing.active_children():
+                beside.terminate()  # else Python waits for what they are at
     return 0

@@ -19,6 +19,7 @@ from bags.wire import stamp_ns
 from stmpl_ros.topics import KEPT, STREAM
 
 ROOT = Path(__file__).parents[1]
+AGAIN = 2_000_000_000  # ns after which an instant without an answer is sent once more: inputs are best effort
 PATIENCE = 120.0  # s to wait for anything; only a failing test waits so long
 
 
@@ -78,6 +79,7 @@ class Robot:
 
     def __init__(self, name: str, space: str = "") -> None:
         self.space, self.got = space, defaultdict(list)
+        self.partner: subprocess.Popen | None = None  # process that is waited for; None: nobody looks whether it lives
         self.node = rclpy.create_node(name, namespace=space or "/")
         self.listen(SkinTopology, "skin/topology", KEPT)
         self.listen(SkinDisplacement, "skin/displacement", STREAM)
@@ -91,7 +93,11 @@ class Robot:
         return self.node.get_clock().now().nanoseconds
 
     def wait(self, done: Callable[[], Any], what: str) -> Any:
-        return wait_for(done, what, self.node)
+        return wait_for(lambda: done() or self._alone(), what, self.node)
+
+    def _alone(self) -> None:
+        if self.partner and (code := self.partner.poll()) is not None:
+            raise AssertionError(f"the process ended with {code}: {self.partner.communicate()[0]}")
 
     def spin(self, seconds: float) -> None:
         until = time.monotonic() + seconds
@@ -110,5 +116,13 @@ class Robot:
         """Answers to the instant `stamp` [ns]."""
         return [answer for answer in self.got["skin/displacement"] if stamp_ns(answer) == stamp]
 
-    def answer(self, stamp: int) -> SkinDisplacement:
-        return self.wait(lambda: self.answers(stamp), f"the answer to {stamp}")[0]
+    def answer(self, send: Callable[[], int]) -> SkinDisplacement:
+        """The answer to an instant, which is sent by `send`, that returns its stamp [ns], until one is answered."""
+        stamps: list[int] = []
+
+        def answered() -> list[SkinDisplacement]:
+            if not stamps or self.now() - stamps[-1] > AGAIN:
+                stamps.append(send())
+            return [answer for stamp in stamps for answer in self.answers(stamp)]
+
+        return self.wait(answered, "an answer")[0]

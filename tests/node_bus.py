@@ -94,7 +94,7 @@ class Hand:
 
     def ask(self, *pose_and_wrench, frame: str = "body") -> SkinDisplacement:
         """Sends one instant and waits for its answer."""
-        return self.bus.answer(self.send(*pose_and_wrench, frame=frame))
+        return self.bus.answer(lambda: self.send(*pose_and_wrench, frame=frame))
 
 
 HERE = at(TOUCH, 0, LENGTH / 2)
@@ -116,7 +116,7 @@ def a_node(folder: Path) -> Iterator[Bus]:
     made = Bus("/robot")
     made.folder = folder
     try:
-        with running("-c", NODE, "--ros-args", "-r", "__ns:=/robot", *given):
+        with running("-c", NODE, "--ros-args", "-r", "__ns:=/robot", *given) as made.partner:
             made.wait(lambda: made.got["skin/topology"], "skin/topology")
             yield made
     finally:

@@ -1,12 +1,18 @@
 """Laws of the learned simulator: what is exact by construction, what it was trained to, and what it says of itself."""
 
+import importlib
+import pkgutil
 from functools import cache
 from pathlib import Path
+from types import CodeType
 
 import numpy as np
 import pytest
 import torch
+from numba.core.dispatcher import Dispatcher
 
+import fem_tools
+import stmpl_core
 from fem_tools import PatchFem
 from fem_tools.dataset import Dataset
 from fem_tools.generate import generate
@@ -281,3 +287,15 @@ def test_what_training_saw_is_not_outside_however_it_mixed_its_inputs(data: Path
         outside = ((inputs < model.least) | (inputs > model.most)).any(dim=1)
         clamped = ((inputs < model.low) | (inputs > model.high)).any(dim=1)
     assert not outside.any() and clamped.float().mean() < 0.05
+
+
+def test_no_function_is_compiled_under_a_name_that_another_one_has():
+    """numba keeps compiled code by file, name and line: the parallel twin of a function was loaded in its stead."""
+    kept: dict[CodeType, list[str]] = {}
+    for package in (stmpl_core, fem_tools):
+        for found in pkgutil.walk_packages(package.__path__, package.__name__ + "."):
+            for name, one in vars(importlib.import_module(found.name)).items():
+                if isinstance(one, Dispatcher) and one.__module__ == found.name:
+                    kept.setdefault(one.py_func.__code__, []).append(f"{found.name}.{name}")
+    assert len(kept) > 50
+    assert not [names for names in kept.values() if len(names) > 1]

@@ -63,7 +63,7 @@ def test_a_running_node_honours_what_may_be_set_at_any_time(bus, hand):
     bus.still()
     assert not [a for a in bus.got["skin/displacement"][-2:] if STALE in statuses(a).values()], "fade 0 rests at once"
     hand.pose.publish(pose_message(HERE, "body", old))
-    bus.answer(old)
+    bus.wait(lambda: bus.answers(old), "the answer to an old pose")
     assert bus.set(max_age=1.0, fade=0.6)[0].successful
     assert bus.get("max_age", "fade") == [1.0, 0.6]
 

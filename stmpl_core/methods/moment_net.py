@@ -306,24 +306,33 @@ def invariants(figures, shape, here, constants, mix_vectors, mix_tensors, least,
             row[m] = (min(max(row[m], low[m]), high[m]) - mean[m]) * scale[m]
 
 
+@numba.njit(cache=True, parallel=True, error_model="numpy")
 def think(inputs, w1, b1, w2, b2, w3, b3, w4, b4, outputs):
-    """The layers, a few vertices at a time: they stay in the cache, and BLAS starts no threads for so little."""
+    """The layers, shared among threads."""
     for block in numba.prange((len(inputs) + BLOCK - 1) // BLOCK):
-        start = BLOCK * block
-        h = np.dot(inputs[start : start + BLOCK], w1)
-        _activate(h, b1)
-        h = np.dot(h, w2)
-        _activate(h, b2)
-        h = np.dot(h, w3)
-        _activate(h, b3)
-        out = np.dot(h, w4)
-        for n in range(len(out)):
-            for m in range(len(b4)):
-                outputs[start + n, m] = out[n, m] + b4[m]
+        _think(inputs, BLOCK * block, w1, b1, w2, b2, w3, b3, w4, b4, outputs)
 
 
-think_few = numba.njit(cache=True, error_model="numpy")(think)  # on the caller's thread
-think = numba.njit(cache=True, parallel=True, fastmath=FAST, error_model="numpy")(think)
+@numba.njit(cache=True, error_model="numpy")
+def think_few(inputs, w1, b1, w2, b2, w3, b3, w4, b4, outputs):
+    """The layers, on the caller's thread. Not `think` compiled otherwise: numba would keep both under one name."""
+    for block in range((len(inputs) + BLOCK - 1) // BLOCK):
+        _think(inputs, BLOCK * block, w1, b1, w2, b2, w3, b3, w4, b4, outputs)
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _think(inputs, start, w1, b1, w2, b2, w3, b3, w4, b4, outputs):
+    """The layers for a few vertices: they stay in the cache, and BLAS starts no threads for so little."""
+    h = np.dot(inputs[start : start + BLOCK], w1)
+    _activate(h, b1)
+    h = np.dot(h, w2)
+    _activate(h, b2)
+    h = np.dot(h, w3)
+    _activate(h, b3)
+    out = np.dot(h, w4)
+    for n in range(len(out)):
+        for m in range(len(b4)):
+            outputs[start + n, m] = out[n, m] + b4[m]
 
 
 @numba.njit(cache=True, error_model="numpy")
