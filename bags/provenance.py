@@ -15,8 +15,9 @@ from bags.wire import NO_FRAMES, FixedFrames
 from bags.writer import BagWriter
 from stmpl_core.chart import UvChart
 from stmpl_core.errors import BagError
-from stmpl_core.layer import SoftLayer, Tissue
+from stmpl_core.layer import SoftLayer
 from stmpl_core.provenance import versions
+from stmpl_core.tissue import Tissue
 
 LAYER = "layer.npz"
 RECORD = "stmpl"

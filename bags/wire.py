@@ -19,8 +19,9 @@ from bags.frame import Frame, Stamps
 from stmpl_core.arrays import Transform, Wrench, finite
 from stmpl_core.contact import Contact
 from stmpl_core.errors import BagError, FrameError, InvalidInput, MeshError
-from stmpl_core.layer import MAX_EXTENT, SoftLayer, Tissue, layer_id
+from stmpl_core.layer import MAX_EXTENT, SoftLayer, layer_id
 from stmpl_core.local_contact import LocalContact
+from stmpl_core.tissue import Tissue
 from stmpl_core.tool import Tool
 from stmpl_core.touch import Answer, Touch
 from stmpl_core.trust import Trust

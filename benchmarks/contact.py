@@ -27,11 +27,12 @@ from fem_tools.press import Press
 from fem_tools.scenes import Site
 from stmpl_core.body import Body
 from stmpl_core.contact import Contact
-from stmpl_core.layer import SoftLayer, Tissue
+from stmpl_core.layer import SoftLayer
 from stmpl_core.methods import MomentNet
 from stmpl_core.nodes import Nodes
 from stmpl_core.sdf import SignedDistance
 from stmpl_core.simulator import Simulator
+from stmpl_core.tissue import Tissue
 from stmpl_core.tool import Tool
 from stmpl_core.touch import Touch
 from stmpl_core.toucher import Toucher

@@ -22,10 +22,11 @@ from benchmarks.tools import ball, block_letter, fingertip, flat
 from fem_tools.indenter import Indentation, IndenterFem
 from fem_tools.patch import QUADRATIC_ABOVE, EdgeLength, Patch, PatchFem
 from fem_tools.press import Press
-from stmpl_core.layer import SoftLayer, Tissue
+from stmpl_core.layer import SoftLayer
 from stmpl_core.methods.base import prepared
 from stmpl_core.methods.winkler import column_pressure
 from stmpl_core.sdf import SignedDistance
+from stmpl_core.tissue import Tissue
 from stmpl_core.tool import Tool
 from tests.scenes import limb, plate
 

@@ -22,9 +22,10 @@ from fem_tools.press import Press, above_core
 from fem_tools.sampling import BodyPlan, ContactId, Kind, Plan, draw, kinds_of, ratios, split_of
 from fem_tools.scenes import Scene, Site, UnusableContact
 from stmpl_core.chart import UvChart
-from stmpl_core.layer import SoftLayer, Tissue
+from stmpl_core.layer import SoftLayer
 from stmpl_core.load import Load
 from stmpl_core.sdf import SignedDistance
+from stmpl_core.tissue import Tissue
 from stmpl_core.trust import Displacement, Trust
 
 log = logging.getLogger(__name__)

@@ -18,8 +18,9 @@ from fem_tools.sampling import Kind, SetName, Split
 from stmpl_core.arrays import VertexVectors
 from stmpl_core.chart import UvChart
 from stmpl_core.errors import InvalidInput
-from stmpl_core.layer import SoftLayer, Tissue
+from stmpl_core.layer import SoftLayer
 from stmpl_core.load import Load, LoadKind
+from stmpl_core.tissue import Tissue
 
 FORMAT = 1
 QUANTUM = 1e-8  # m; displacements are stored as whole numbers of it

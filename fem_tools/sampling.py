@@ -17,7 +17,8 @@ from scipy.spatial.transform import Rotation
 from fem_tools.hand import Hand
 from fem_tools.scenes import EDGE, Scene, Site, UnusableContact, ellipse, letter
 from stmpl_core.body import Body
-from stmpl_core.layer import SoftLayer, Tissue
+from stmpl_core.layer import SoftLayer
+from stmpl_core.tissue import Tissue
 
 Kind = Literal["pressure", "nodal", "indenter"]
 SetName = Literal["disc", "ellipse", "seam", "field", "indenter", "tool", "hand", "band", "letter"]

@@ -10,7 +10,7 @@ from numba import njit
 
 from fem_tools import neo_hookean as nh
 from fem_tools.mesh import WedgeMesh
-from stmpl_core.layer import Tissue
+from stmpl_core.tissue import Tissue
 
 
 class SkinLoad(Protocol):

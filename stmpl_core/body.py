@@ -18,7 +18,8 @@ from stmpl_core.chart import UvChart
 from stmpl_core.errors import InvalidInput
 from stmpl_core.extras import needed
 from stmpl_core.extrusion import foldfree_thickness
-from stmpl_core.layer import SoftLayer, Tissue, check_faces
+from stmpl_core.layer import SoftLayer, check_faces
+from stmpl_core.tissue import Tissue
 
 if TYPE_CHECKING:
     from stmpl_core.remesh import Remeshed

@@ -1,9 +1,9 @@
-"""SoftLayer: a skin mesh, the thickness of the soft layer under it, and the Tissue that it is made of."""
+"""SoftLayer: a skin mesh, the thickness of the soft tissue under it, and the Tissue that it is made of."""
 
 from __future__ import annotations
 
 import hashlib
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cached_property
 from typing import Any
 
@@ -12,54 +12,10 @@ from numpy.typing import ArrayLike
 
 from stmpl_core.arrays import Faces, PerVertex, Points, VertexVectors, finite
 from stmpl_core.errors import InvalidInput, MeshError
+from stmpl_core.tissue import Tissue
 
 MAX_EXTENT = 4.0  # largest extent of a skin [m]; that of a mesh in millimetres is larger
 MAX_THICKNESS = 0.1  # largest thickness of soft tissue [m]; that of a thickness in millimetres is larger
-SOFTEST = 100.0  # smallest Young's modulus of a tissue [Pa]; that of a modulus in kilopascals is smaller
-
-
-@dataclass(frozen=True)
-class Tissue:
-    """Compressible Neo-Hookean material, psi = mu/2 (I_C - 3) - mu ln J + lambda/2 (ln J)^2.
-
-    Bonet & Wood, "Nonlinear Continuum Mechanics for Finite Element Analysis", 2nd ed., eq. 6.28.
-
-    Args:
-        youngs_modulus: E [Pa], > 0.
-        poisson_ratio: nu [-], in [0, 0.5).
-        density: rho [kg/m3], > 0; quasi-static answers do not depend on it.
-    """
-
-    youngs_modulus: float = 1e3
-    poisson_ratio: float = 0.4
-    density: float = 1e3
-
-    def __post_init__(self) -> None:
-        if not (np.isfinite(self.youngs_modulus) and self.youngs_modulus > 0):
-            raise InvalidInput(f"youngs_modulus is {self.youngs_modulus} Pa; it must be finite and above 0.")
-        if self.youngs_modulus < SOFTEST:
-            raise InvalidInput(f"youngs_modulus is {self.youngs_modulus:g} Pa; at least {SOFTEST:g} Pa is accepted. Is "
-                               "it in kilopascals? Scale it by 1e3.")
-        if not 0 <= self.poisson_ratio < 0.5:
-            raise InvalidInput(f"poisson_ratio is {self.poisson_ratio}; allowed is 0 <= nu < 0.5 (try 0.499).")
-        if not (np.isfinite(self.density) and self.density > 0):
-            raise InvalidInput(f"density is {self.density} kg/m3; it must be finite and above 0.")
-
-    @property
-    def shear_modulus(self) -> float:
-        """mu = E / (2 (1 + nu)) [Pa]."""
-        return self.youngs_modulus / (2 * (1 + self.poisson_ratio))
-
-    @property
-    def lame_lambda(self) -> float:
-        """lambda = E nu / ((1 + nu)(1 - 2 nu)) [Pa]."""
-        nu = self.poisson_ratio
-        return self.youngs_modulus * nu / ((1 + nu) * (1 - 2 * nu))
-
-    @property
-    def confined_modulus(self) -> float:
-        """M = lambda + 2 mu [Pa], the stiffness of a column that cannot bulge."""
-        return self.lame_lambda + 2 * self.shear_modulus
 
 
 class SoftLayer:
@@ -69,7 +25,7 @@ class SoftLayer:
         vertices: positions of the skin at rest, (V, 3) [m].
         faces: vertex numbers, (F, 3), counter-clockwise seen from outside.
         thickness: thickness of the layer, measured inwards along the vertex normal, (V,) or one number [m].
-        tissue: material of the layer.
+        tissue: what lies between skin and core.
         chart: UV chart of the skin, if it has one (see stmpl_core.chart).
 
     Raises:
@@ -103,7 +59,8 @@ class SoftLayer:
 
     def with_(self, **changes: Any) -> SoftLayer:
         """A copy with `vertices`, `thickness`, `tissue` (or its fields) or `chart` changed."""
-        material = {k: changes.pop(k) for k in ("youngs_modulus", "poisson_ratio", "density") if k in changes}
+        material = {k: changes.pop(k) for k in ("youngs_modulus", "poisson_ratio", "density", "skin", "deeper")
+                    if k in changes}
         given = {"vertices": self.vertices, "faces": self.faces, "thickness": self.thickness,
                  "tissue": self.tissue, "chart": self.chart} | changes
         given["tissue"] = replace(given["tissue"], **material)
@@ -178,6 +135,8 @@ def layer_id(layer: SoftLayer) -> str:
     digest = hashlib.sha256()
     for values, kind in ((layer.vertices, "<f4"), (layer.faces, "<u4"), (layer.thickness, "<f4"), (material, "<f8")):
         digest.update(np.ascontiguousarray(values, dtype=kind).tobytes())
+    if not tissue.single:
+        digest.update(np.array(tissue.stacked, dtype="<f8").tobytes())
     return digest.hexdigest()[:16]
 
 

@@ -25,6 +25,7 @@ from stmpl_core.response import (
 )
 from stmpl_core.soundness import Soundness
 from stmpl_core.thinning import Asked, Thinning
+from stmpl_core.tissue import single
 
 
 class Felt(NamedTuple):
@@ -79,6 +80,7 @@ class Surroundings:
     """
 
     def __init__(self, layer: SoftLayer) -> None:
+        single(layer.tissue, "the linear response")
         self.frames, self._thickness = _frames(layer.normals), layer.thickness
         points = np.ascontiguousarray(layer.vertices)
         self._thinning = Thinning(layer, self.frames, REACH)

@@ -7,9 +7,10 @@ from collections.abc import Callable
 import numpy as np
 
 from stmpl_core.contact import Contact
-from stmpl_core.layer import SoftLayer, Tissue
+from stmpl_core.layer import SoftLayer
 from stmpl_core.simulator import Simulator
 from stmpl_core.skin import Skin, published
+from stmpl_core.tissue import Tissue
 from stmpl_core.tool import Tool
 from stmpl_ros.parameters import NodeConfig
 

@@ -9,8 +9,9 @@ from typing import Literal
 from pydantic import BaseModel, ConfigDict, Field, field_validator
 from pydantic.config import JsonDict
 
-from stmpl_core.layer import MAX_THICKNESS, SOFTEST
+from stmpl_core.layer import MAX_THICKNESS
 from stmpl_core.methods import Method, method
+from stmpl_core.tissue import SOFTEST
 
 ACCURACY = 2e-4  # error at any vertex that is asked for [m]
 PHENOTYPE = ("gender", "age", "muscle", "weight", "height", "proportions")

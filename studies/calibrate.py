@@ -21,11 +21,12 @@ from fem_tools.sampling import ATTEMPTS, BodyPlan, ContactId, Plan, SetName, dra
 from fem_tools.scenes import Scene, Site, UnusableContact, ellipse
 from stmpl_core.body import Body
 from stmpl_core.errors import MeshError, StmplError
-from stmpl_core.layer import SoftLayer, Tissue
+from stmpl_core.layer import SoftLayer
 from stmpl_core.load import Load
 from stmpl_core.methods import Method
 from stmpl_core.methods.ladder import RANGED, SHIPPED, Known, Measured, SceneFigures, SceneReader
 from stmpl_core.provenance import commit, machine, versions
+from stmpl_core.tissue import Tissue
 
 COVERED = 0.95  # share of answers that must lie within the bound, on a body or under a shape that the fit has not seen
 MARGIN = 1.25  # on that bound, for shapes unlike those of the fit

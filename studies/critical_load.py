@@ -20,9 +20,10 @@ from fem_tools.press import Press
 from fem_tools.skin_loads import DeadForces, FollowerPressure
 from fem_tools.system import System
 from stmpl_core.errors import InvalidInput
-from stmpl_core.layer import SoftLayer, Tissue
+from stmpl_core.layer import SoftLayer
 from stmpl_core.methods.winkler import column_stretch
 from stmpl_core.sdf import SignedDistance
+from stmpl_core.tissue import Tissue
 from studies.tets import TetSystem, split_wedges
 
 THICKNESS = 7.5e-3  # m

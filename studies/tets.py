@@ -14,9 +14,9 @@ from fem_tools.system import System, diagonal_blocks
 from stmpl_core.arrays import Points
 from stmpl_core.errors import InvalidInput, MeshError
 from stmpl_core.extras import needed
-from stmpl_core.layer import Tissue
 from stmpl_core.load import Load
 from stmpl_core.methods.base import prepared
+from stmpl_core.tissue import Tissue
 
 Mesher = Literal["split", "tetgen"]
 

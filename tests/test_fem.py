@@ -18,9 +18,10 @@ from fem_tools.patch import mirror_projectors
 from fem_tools.skin_loads import FollowerPressure
 from fem_tools.system import System
 from stmpl_core.errors import InvalidInput, NotPrepared
-from stmpl_core.layer import SoftLayer, Tissue
+from stmpl_core.layer import SoftLayer
 from stmpl_core.load import Load
 from stmpl_core.methods.winkler import column_pressure
+from stmpl_core.tissue import Tissue
 from tests.scenes import THICKNESS, bump, disc, limb, plate, wavy_layer
 
 CASES = [(element, layers) for element in ELEMENTS for layers in (1, 2)]

@@ -6,8 +6,9 @@ import pytest
 from fem_tools import PatchFem
 from fem_tools.skin_loads import FollowerPressure
 from stmpl_core.errors import InvalidInput, MeshError
-from stmpl_core.layer import SoftLayer, Tissue
+from stmpl_core.layer import SoftLayer
 from stmpl_core.load import Load
+from stmpl_core.tissue import Tissue
 from studies.critical_load import closed_form, critical_loads, draw, least_stiffness
 from studies.tets import TetFem, TetMesh, TetSystem, split_wedges
 from tests.scenes import THICKNESS, bump, disc, limb, plate, wavy_layer

@@ -6,7 +6,8 @@ import pytest
 from fem_tools.krylov import conjugate_gradients
 from fem_tools.mesh import Reference, WedgeMesh, level_depths, reference_wedge, rest_gradients
 from fem_tools.system import System
-from stmpl_core.layer import SoftLayer, Tissue
+from stmpl_core.layer import SoftLayer
+from stmpl_core.tissue import Tissue
 from tests.scenes import plate
 
 SIDE, THICKNESS = 0.03, 7.5e-3

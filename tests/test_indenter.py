@@ -7,9 +7,10 @@ from fem_tools.indenter import IndenterFem
 from fem_tools.patch import PatchFem
 from fem_tools.press import Press
 from stmpl_core.errors import InvalidInput
-from stmpl_core.layer import SoftLayer, Tissue
+from stmpl_core.layer import SoftLayer
 from stmpl_core.methods.winkler import column_pressure
 from stmpl_core.sdf import SignedDistance
+from stmpl_core.tissue import Tissue
 from tests import scenes
 from tests.scenes import THICKNESS, at, limb, plate
 

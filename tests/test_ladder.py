@@ -12,11 +12,11 @@ from fem_tools.few_steps import FewSteps
 from fem_tools.ladder import default_rungs, ladder, measured, times_file
 from fem_tools.sampling import BodyPlan
 from stmpl_core.errors import InvalidInput, NotPrepared
-from stmpl_core.layer import Tissue
 from stmpl_core.load import Load
 from stmpl_core.methods import Linear, MomentNet, Winkler
 from stmpl_core.methods.coarse import Coarse
 from stmpl_core.methods.ladder import SHIPPED, Known, Ladder, Measured, SceneFigures, SceneReader
+from stmpl_core.tissue import Tissue
 from stmpl_core.trust import Displacement, Trust
 from studies.calibrate import MARGIN, Trial, coverage, fit, gather
 from tests.scenes import dented, limb

@@ -11,9 +11,10 @@ from numpy.typing import ArrayLike
 
 from stmpl_core.arrays import PerVertex, finite
 from stmpl_core.errors import InvalidInput
-from stmpl_core.layer import SoftLayer, Tissue
+from stmpl_core.layer import SoftLayer
 from stmpl_core.load import Load
 from stmpl_core.methods.base import prepared
+from stmpl_core.tissue import Tissue, single
 from stmpl_core.trust import Displacement, Trust
 
 MAX_SPREAD = 0.1  # share of the depth that neighbours may add before a column is no model of the layer
@@ -36,7 +37,8 @@ class Winkler:
         self._layer: SoftLayer | None = None
 
     def prepare(self, layer: SoftLayer) -> Self:
-        """Keeps the layer; there is nothing to compute."""
+        """Keeps the layer; there is nothing to compute. Raises InvalidInput for a skin or a stack."""
+        single(layer.tissue, "Winkler")
         self._layer = layer
         return self
 

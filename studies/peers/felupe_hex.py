@@ -15,7 +15,7 @@ from scipy.sparse.linalg import MatrixRankWarning, spsolve
 from fem_tools.mesh import level_depths
 from fem_tools.patch import Patch
 from stmpl_core.errors import InvalidInput
-from stmpl_core.layer import Tissue
+from stmpl_core.tissue import Tissue
 from studies.peers.patch_peer import Found, PatchPeer, SkinForces
 
 MM, KPA = 1e-3, 1e3  # its own units, so that forces are in mN: its test of convergence adds 1e-3 to the force

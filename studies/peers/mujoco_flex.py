@@ -14,7 +14,7 @@ import numpy as np
 
 from fem_tools.patch import Patch
 from stmpl_core.errors import InvalidInput
-from stmpl_core.layer import Tissue
+from stmpl_core.tissue import Tissue
 from studies.peers.patch_peer import Found, PatchPeer, SkinForces, TetPatch
 
 log = logging.getLogger(__name__)

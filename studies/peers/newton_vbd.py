@@ -11,7 +11,7 @@ import warp as wp
 
 from fem_tools.patch import Patch
 from stmpl_core.errors import InvalidInput
-from stmpl_core.layer import Tissue
+from stmpl_core.tissue import Tissue
 from studies.peers.patch_peer import Found, PatchPeer, SkinForces, TetPatch
 
 wp.config.log_level = wp.LOG_WARNING  # no banner and no list of kernels on standard output

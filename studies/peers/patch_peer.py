@@ -12,9 +12,10 @@ from fem_tools.patch import Patch, PatchFem
 from fem_tools.skin_loads import DeadForces, FollowerPressure
 from stmpl_core.arrays import VertexVectors
 from stmpl_core.errors import InvalidInput
-from stmpl_core.layer import SoftLayer, Tissue
+from stmpl_core.layer import SoftLayer
 from stmpl_core.load import Load
 from stmpl_core.methods.base import prepared
+from stmpl_core.tissue import Tissue
 from stmpl_core.trust import Displacement, Trust
 from studies.tets import TetMesh, split_wedges
 

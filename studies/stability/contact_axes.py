@@ -11,7 +11,7 @@ import numpy as np
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
-from stmpl_core.layer import Tissue
+from stmpl_core.tissue import Tissue
 from stmpl_core.tool import Tool
 from studies.stability import shapes
 from studies.stability.contact_laws import SLIDE

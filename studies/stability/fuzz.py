@@ -15,9 +15,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from stmpl_core.errors import InvalidInput, StmplError
-from stmpl_core.layer import Tissue
 from stmpl_core.provenance import commit, machine, versions
 from stmpl_core.simulator import Simulator
+from stmpl_core.tissue import Tissue
 from stmpl_core.tool import Tool
 from stmpl_core.trust import Displacement
 from studies.stability import failures, shapes

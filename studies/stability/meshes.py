@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from stmpl_core.layer import Tissue
+from stmpl_core.tissue import Tissue
 from studies.stability.scene import Mesh
 
 

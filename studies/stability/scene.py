@@ -11,9 +11,10 @@ import numpy as np
 
 from stmpl_core.arrays import Faces, PerVertex, Points
 from stmpl_core.chart import UvChart
-from stmpl_core.layer import SoftLayer, Tissue
+from stmpl_core.layer import SoftLayer
 from stmpl_core.load import Load
 from stmpl_core.methods.base import Method
+from stmpl_core.tissue import Tissue
 from stmpl_core.trust import Displacement
 
 Make = Callable[[], Method]  # a fresh method, not yet prepared

@@ -16,7 +16,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from stmpl_core.errors import InvalidInput
-from stmpl_core.layer import Tissue
+from stmpl_core.tissue import Tissue
 from stmpl_core.tool import Tool
 from studies.stability import shapes
 from studies.stability.contacts import Contacts, Placed, Truth

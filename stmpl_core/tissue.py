@@ -1,0 +1,158 @@
+"""Tissue: what lies between skin and bone. One soft material, or a stack under a skin that is a stretched membrane."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+
+from stmpl_core.errors import InvalidInput
+
+THICKEST_SKIN = 5e-3  # largest thickness of a skin [m]; that of a skin in millimetres is larger
+SOFTEST = 100.0  # smallest Young's modulus of a tissue [Pa]; that of a modulus in kilopascals is smaller
+
+
+@dataclass(frozen=True)
+class Membrane:
+    """Skin: a sheet so thin that it only resists stretching, and carries a tension at rest.
+
+    Args:
+        youngs_modulus: E_s [Pa], > 0.
+        thickness: h [m], > 0.
+        tension: T, the same in all directions of the rest state [N/m], >= 0.
+        poisson_ratio: nu_s [-], in [0, 0.5]; 0.5: its thickness gives what its area takes.
+        source: where the numbers come from.
+    """
+
+    youngs_modulus: float
+    thickness: float
+    tension: float = 0.0
+    poisson_ratio: float = 0.45
+    source: str = ""
+
+    def __post_init__(self) -> None:
+        _check_moduli(self.youngs_modulus, min(self.poisson_ratio, 0.499))
+        if not (np.isfinite(self.thickness) and 0 < self.thickness <= THICKEST_SKIN):
+            raise InvalidInput(f"the skin is {self.thickness:g} m thick; above 0 and up to {THICKEST_SKIN:g} m is "
+                               "accepted. Is it in millimetres? Scale it by 1e-3.")
+        if not (np.isfinite(self.tension) and self.tension >= 0):
+            raise InvalidInput(f"the skin's tension is {self.tension:g} N/m; it must be finite and not below 0.")
+
+    @property
+    def stiffness(self) -> float:
+        """E_s h [N/m]."""
+        return self.youngs_modulus * self.thickness
+
+
+@dataclass(frozen=True)
+class Ply:
+    """One material of a stack, from a depth on.
+
+    Args:
+        depth: where it begins below the surface [m], > 0. Where the tissue is thinner than that, it is not there.
+        youngs_modulus: E [Pa], > 0.
+        poisson_ratio: nu [-], in [0, 0.5).
+        name: what it is.
+        source: where the numbers come from.
+    """
+
+    depth: float
+    youngs_modulus: float
+    poisson_ratio: float = 0.45
+    name: str = ""
+    source: str = ""
+
+    def __post_init__(self) -> None:
+        _check_moduli(self.youngs_modulus, self.poisson_ratio)
+        if not (np.isfinite(self.depth) and self.depth > 0):
+            raise InvalidInput(f"a material begins {self.depth:g} m deep; it must be finite and above 0.")
+
+
+@dataclass(frozen=True)
+class Tissue:
+    """What lies between the skin and a rigid core: one soft material, or a stack of them, with or without a skin.
+
+    Every material is compressible Neo-Hookean, psi = mu/2 (I_C - 3) - mu ln J + lambda/2 (ln J)^2 (Bonet & Wood,
+    "Nonlinear Continuum Mechanics for Finite Element Analysis", 2nd ed., eq. 6.28). The first, right under the skin,
+    gives the unit of all moduli; each that lies deeper reaches from its depth to the next one's, the last to the core.
+
+    Args:
+        youngs_modulus: E of the first material [Pa], > 0.
+        poisson_ratio: its nu [-], in [0, 0.5).
+        density: rho [kg/m3], > 0; quasi-static answers do not depend on it.
+        skin: membrane on top; None: the first material reaches to the surface.
+        deeper: materials below the first, from the skin inwards.
+        source: where the first material's numbers come from.
+    """
+
+    youngs_modulus: float = 1e3
+    poisson_ratio: float = 0.4
+    density: float = 1e3
+    skin: Membrane | None = None
+    deeper: tuple[Ply, ...] = ()
+    source: str = ""
+
+    def __post_init__(self) -> None:
+        _check_moduli(self.youngs_modulus, self.poisson_ratio)
+        if not (np.isfinite(self.density) and self.density > 0):
+            raise InvalidInput(f"density is {self.density} kg/m3; it must be finite and above 0.")
+        object.__setattr__(self, "deeper", tuple(self.deeper))
+        depths = [ply.depth for ply in self.deeper]
+        if any(b <= a for a, b in pairwise(depths)):
+            raise InvalidInput(f"the deeper materials begin at {depths} m; each must begin below the one before it.")
+
+    @property
+    def shear_modulus(self) -> float:
+        """mu = E / (2 (1 + nu)) [Pa]."""
+        return self.youngs_modulus / (2 * (1 + self.poisson_ratio))
+
+    @property
+    def lame_lambda(self) -> float:
+        """lambda = E nu / ((1 + nu)(1 - 2 nu)) [Pa]."""
+        nu = self.poisson_ratio
+        return self.youngs_modulus * nu / ((1 + nu) * (1 - 2 * nu))
+
+    @property
+    def confined_modulus(self) -> float:
+        """M = lambda + 2 mu [Pa], the stiffness of a column that cannot bulge."""
+        return self.lame_lambda + 2 * self.shear_modulus
+
+    @property
+    def single(self) -> bool:
+        """Whether it is one material without a skin."""
+        return self.skin is None and not self.deeper
+
+    @property
+    def stacked(self) -> tuple[float, ...]:
+        """The numbers of skin and deeper materials, one after the other: E_s, h, T, nu_s, and depth, E, nu of each."""
+        skin = self.skin
+        sheet = (skin.youngs_modulus, skin.thickness, skin.tension, skin.poisson_ratio) if skin else (0.0,) * 4
+        return sheet + tuple(x for ply in self.deeper for x in (ply.depth, ply.youngs_modulus, ply.poisson_ratio))
+
+    def kappa(self, thickness: float) -> float:
+        """E_s h / (E t) [-]: how stiff the skin is beside the material under it; 0 without a skin."""
+        return self.skin.stiffness / (self.youngs_modulus * thickness) if self.skin else 0.0
+
+    def pull(self, thickness: float) -> float:
+        """T / (E t) [-]: how taut the skin is beside the material under it; 0 without a skin."""
+        return self.skin.tension / (self.youngs_modulus * thickness) if self.skin else 0.0
+
+
+def _check_moduli(youngs_modulus: float, poisson_ratio: float) -> None:
+    if not (np.isfinite(youngs_modulus) and youngs_modulus > 0):
+        raise InvalidInput(f"youngs_modulus is {youngs_modulus} Pa; it must be finite and above 0.")
+    if youngs_modulus < SOFTEST:
+        raise InvalidInput(f"youngs_modulus is {youngs_modulus:g} Pa; at least {SOFTEST:g} Pa is accepted. Is "
+                           "it in kilopascals? Scale it by 1e3.")
+    if not 0 <= poisson_ratio < 0.5:
+        raise InvalidInput(f"poisson_ratio is {poisson_ratio}; allowed is 0 <= nu < 0.5 (try 0.499).")
+
+
+def single(tissue: Tissue, who: str) -> Tissue:
+    """The tissue, for those who know one material only. Raises InvalidInput for a skin or a stack."""
+    if not tissue.single:
+        what = " and ".join(["a skin"] * (tissue.skin is not None) + [f"{len(tissue.deeper)} deeper materials"] *
+                            bool(tissue.deeper))  # fmt: skip
+        raise InvalidInput(f"{who} knows one soft material; this tissue has {what}.")
+    return tissue
