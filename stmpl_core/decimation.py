@@ -9,7 +9,6 @@ from stmpl_core.arrays import Faces, Points
 from stmpl_core.rows import first_alike
 
 MARGIN = 5e-3  # width of the grid around the tool [m]
-MIN_SPACING_M = 1e-4  # spacing below which no grid pays
 BAND_CELLS = 3  # cells around the surface in which the distances are exact
 BAND_NODES = 40_000  # nodes that the default spacing spends on the band: 1/3 s for 5,000 triangles
 MAX_NODES = 3_000_000  # nodes of a grid: 24 MB
@@ -26,7 +25,7 @@ def field_spacing(area: float, extent: np.ndarray, margin: float = MARGIN) -> fl
         extent: size of the surface along each axis, (3,) [m].
         margin: width of the grid around the surface [m].
     """
-    spacing = max(MIN_SPACING_M, (2 * BAND_CELLS * area / BAND_NODES) ** 0.5)
+    spacing = (2 * BAND_CELLS * area / BAND_NODES) ** 0.5
     return max(spacing, (float(np.prod(extent + 2 * margin + 2 * spacing)) / (0.8 * MAX_NODES)) ** (1 / 3))
 
 
