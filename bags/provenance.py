@@ -13,11 +13,10 @@ import numpy as np
 
 from bags.wire import NO_FRAMES, FixedFrames
 from bags.writer import BagWriter
-from stmpl_core.chart import UvChart
 from stmpl_core.errors import BagError
 from stmpl_core.layer import SoftLayer
+from stmpl_core.packed import pack, unpack
 from stmpl_core.provenance import versions
-from stmpl_core.tissue import Tissue
 
 LAYER = "layer.npz"
 RECORD = "stmpl"
@@ -89,18 +88,9 @@ def provenance_from(values: Mapping[str, str]) -> Provenance:
 
 
 def layer_to_bytes(layer: SoftLayer) -> bytes:
-    """A layer as .npz: vertices, faces, thickness, tissue, and the UV chart's arrays if it has one; exact."""
-    tissue = layer.tissue
-    arrays = {
-        "vertices": layer.vertices,
-        "faces": layer.faces,
-        "thickness": layer.thickness,
-        "tissue": np.array([tissue.youngs_modulus, tissue.poisson_ratio, tissue.density]),
-    }
-    if isinstance(layer.chart, UvChart):
-        arrays["uv"] = layer.chart.uv
+    """A layer as .npz of the arrays of stmpl_core.packed; exact."""
     stream = BytesIO()
-    np.savez_compressed(stream, allow_pickle=False, **arrays)
+    np.savez_compressed(stream, allow_pickle=False, **pack(layer))
     return stream.getvalue()
 
 
@@ -108,9 +98,6 @@ def layer_from_bytes(data: bytes) -> SoftLayer:
     """The layer that `layer_to_bytes` wrote, bit for bit. Raises BagError if the bytes are no such file."""
     try:
         with np.load(BytesIO(data), allow_pickle=False) as arrays:
-            tissue = Tissue(*(float(x) for x in arrays["tissue"]))
-            skin = arrays["vertices"], arrays["faces"]
-            chart = UvChart(*skin, arrays["uv"]) if "uv" in arrays else None
-            return SoftLayer(*skin, arrays["thickness"], tissue=tissue, chart=chart)
+            return unpack(arrays)
     except (OSError, ValueError, KeyError, TypeError, zipfile.BadZipFile) as error:
         raise BagError(f"the attached {LAYER} cannot be read: {error}.") from error

@@ -16,7 +16,8 @@ from typing import Any
 PAGE = Path(__file__).parent / "api.md"
 PUBLIC = {  # heading: modules, and the names in them that are promised to stay
     "From contact to answer": ["stmpl_core: Tool Contact Simulator Tools State Touch Answer Trust"],
-    "Limb and load": ["stmpl_core.body: Body", "stmpl_core: SoftLayer Tissue Membrane Ply Load", "stmpl_core.skin: Skin"],
+    "Limb and load": ["stmpl_core.body: Body", "stmpl_core: SoftLayer Tissue Membrane Ply Load",
+                      "stmpl_core.bones: Bone bones_of core_of to_bone", "stmpl_core.skin: Skin"],
     "Methods": ["stmpl_core.methods: Method method Naive Winkler Linear MomentNet UNet Ladder",
                 "stmpl_core: Displacement", "fem_tools.ladder: ladder", "stmpl_core.metrics: score Score"],
     "Finite elements": ["fem_tools: PatchFem IndenterFem Press RigidFem"],

@@ -21,11 +21,10 @@ from fem_tools.patch import PatchFem
 from fem_tools.press import Press, above_core
 from fem_tools.sampling import BodyPlan, ContactId, Kind, Plan, draw, kinds_of, ratios, split_of
 from fem_tools.scenes import Scene, Site, UnusableContact
-from stmpl_core.chart import UvChart
 from stmpl_core.layer import SoftLayer
 from stmpl_core.load import Load
+from stmpl_core.packed import pack, unpack
 from stmpl_core.sdf import SignedDistance
-from stmpl_core.tissue import Tissue
 from stmpl_core.trust import Displacement, Trust
 
 log = logging.getLogger(__name__)
@@ -90,24 +89,19 @@ class Part:
 class Skin:
     """A layer as plain arrays, which travel to workers, and a digest that names it."""
 
-    vertices: np.ndarray
-    faces: np.ndarray
-    thickness: np.ndarray
-    uv: np.ndarray | None
-    tissue: Tissue
+    arrays: dict[str, np.ndarray]
     digest: str
 
     @classmethod
     def of(cls, layer: SoftLayer) -> Skin:
         """The layer's arrays."""
-        arrays = layer.vertices, layer.faces, layer.thickness
-        digest = hashlib.sha256(b"".join(np.ascontiguousarray(a).tobytes() for a in arrays)).hexdigest()
-        return cls(*arrays, layer.chart.uv if isinstance(layer.chart, UvChart) else None, layer.tissue, digest)
+        named = layer.vertices, layer.faces, layer.thickness if layer.core is None else layer.core
+        digest = hashlib.sha256(b"".join(np.ascontiguousarray(a).tobytes() for a in named)).hexdigest()
+        return cls(pack(layer), digest)
 
     def layer(self) -> SoftLayer:
         """The layer again."""
-        chart = None if self.uv is None else UvChart(self.vertices, self.faces, self.uv)
-        return SoftLayer(self.vertices, self.faces, self.thickness, tissue=self.tissue, chart=chart)
+        return unpack(self.arrays)
 
 
 @dataclass(frozen=True, eq=False)

@@ -16,11 +16,10 @@ from zarr.codecs import BloscCodec
 
 from fem_tools.sampling import Kind, SetName, Split
 from stmpl_core.arrays import VertexVectors
-from stmpl_core.chart import UvChart
 from stmpl_core.errors import InvalidInput
 from stmpl_core.layer import SoftLayer
 from stmpl_core.load import Load, LoadKind
-from stmpl_core.tissue import Tissue
+from stmpl_core.packed import pack, unpack
 
 FORMAT = 1
 QUANTUM = 1e-8  # m; displacements are stored as whole numbers of it
@@ -90,10 +89,7 @@ def write_layer(root: zarr.Group, name: str, layer: SoftLayer) -> None:
     """Writes a body's layer, with its UVs if it has a chart, over what is there."""
     group = root.create_group(name, overwrite=True)
     group.attrs["tissue"] = {k: getattr(layer.tissue, k) for k in ("youngs_modulus", "poisson_ratio", "density")}
-    arrays = {"vertices": layer.vertices, "faces": layer.faces, "thickness": layer.thickness}
-    if isinstance(layer.chart, UvChart):
-        arrays["uv"] = layer.chart.uv
-    for key, values in arrays.items():
+    for key, values in pack(layer).items():
         group.create_array(f"layer/{key}", data=np.ascontiguousarray(values), compressors=_CODEC)
 
 
@@ -101,9 +97,7 @@ def read_layer(group: zarr.Group) -> SoftLayer:
     """Reads what `write_layer` wrote."""
     layer: Any = group["layer"]
     part = {key: np.asarray(array[...]) for key, array in layer.arrays()}
-    chart = UvChart(part["vertices"], part["faces"], part["uv"]) if "uv" in part else None
-    tissue = Tissue(**group.attrs["tissue"])  # type: ignore[arg-type]
-    return SoftLayer(part["vertices"], part["faces"], part["thickness"], tissue=tissue, chart=chart)
+    return unpack({"tissue": np.array(list(group.attrs["tissue"].values()))} | part)  # type: ignore[union-attr]
 
 
 def _rows(group: zarr.Group, name: str) -> Any:

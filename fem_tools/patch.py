@@ -22,7 +22,6 @@ from stmpl_core.layer import SoftLayer
 from stmpl_core.load import Load
 from stmpl_core.methods.base import prepared
 from stmpl_core.methods.winkler import column_stretch
-from stmpl_core.tissue import single
 from stmpl_core.trust import Displacement, Trust
 
 MIN_FOLD = 0.05  # smallest determinant of a wedge at rest, over its mean, that is meshed [-]
@@ -98,7 +97,8 @@ class PatchFem:
 
     def prepare(self, layer: SoftLayer) -> Self:
         """Keeps the layer, with its graph of edges and where it folds on itself when it is extruded."""
-        single(layer.tissue, "PatchFem")
+        if not layer.tissue.single:
+            raise InvalidInput("PatchFem knows one soft material; this tissue has a skin or deeper materials.")
         self._folded = fold_ratios(layer.vertices, layer.inner_vertices, layer.faces) < MIN_FOLD
         length = np.linalg.norm(layer.vertices[layer.edges[:, 0]] - layer.vertices[layer.edges[:, 1]], axis=1)
         n = len(layer.vertices)

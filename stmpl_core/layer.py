@@ -15,6 +15,7 @@ from stmpl_core.errors import InvalidInput, MeshError
 from stmpl_core.tissue import Tissue
 
 MAX_EXTENT = 4.0  # largest extent of a skin [m]; that of a mesh in millimetres is larger
+STEEPEST = 0.35  # cosine between the normal and a column to the core, below which the column's length counts
 MAX_THICKNESS = 0.1  # largest thickness of soft tissue [m]; that of a thickness in millimetres is larger
 
 
@@ -24,7 +25,9 @@ class SoftLayer:
     Args:
         vertices: positions of the skin at rest, (V, 3) [m].
         faces: vertex numbers, (F, 3), counter-clockwise seen from outside.
-        thickness: thickness of the layer, measured inwards along the vertex normal, (V,) or one number [m].
+        thickness: thickness of the layer, measured inwards along the vertex normal, (V,) or one number [m]; None with
+            a core, which says it.
+        core: points of the rigid core at which the tissue's columns end, (V, 3) [m]; None: straight below each vertex.
         tissue: what lies between skin and core.
         chart: UV chart of the skin, if it has one (see stmpl_core.chart).
 
@@ -37,13 +40,18 @@ class SoftLayer:
         self,
         vertices: ArrayLike,
         faces: ArrayLike,
-        thickness: ArrayLike,
+        thickness: ArrayLike | None = None,
         *,
+        core: ArrayLike | None = None,
         tissue: Tissue | None = None,
         chart: Any = None,
     ) -> None:
         self.vertices: Points = finite("vertices", vertices, (None, 3))
         self.faces: Faces = check_faces(faces, len(self.vertices))
+        self.core: Points | None = None if core is None else finite("core", core, self.vertices.shape)
+        if (thickness is None) == (core is None):
+            raise InvalidInput("a layer wants a thickness or a core, one of them.")
+        thickness = self._depth_of_core() if thickness is None else thickness
         spread = np.broadcast_to(finite("thickness", np.atleast_1d(thickness), (None,)), len(self.vertices)) \
             if np.size(thickness) == 1 else finite("thickness", thickness, (len(self.vertices),))
         self.thickness: PerVertex = np.array(spread)
@@ -58,13 +66,27 @@ class SoftLayer:
         _check_surface(self)
 
     def with_(self, **changes: Any) -> SoftLayer:
-        """A copy with `vertices`, `thickness`, `tissue` (or its fields) or `chart` changed."""
+        """A copy with `vertices`, `thickness` or `core`, `tissue` (or its fields) or `chart` changed.
+
+        Raises:
+            InvalidInput: vertices without a core, where the layer has one.
+        """
+        if self.core is not None and "vertices" in changes and not {"core", "thickness"} & set(changes):
+            raise InvalidInput("this layer's columns run to a core: changed vertices want a core, too.")
+        depth = {} if {"core", "thickness"} & set(changes) else {"core": self.core} if self.core is not None else \
+            {"thickness": self.thickness}
         material = {k: changes.pop(k) for k in ("youngs_modulus", "poisson_ratio", "density", "skin", "deeper")
                     if k in changes}
-        given = {"vertices": self.vertices, "faces": self.faces, "thickness": self.thickness,
-                 "tissue": self.tissue, "chart": self.chart} | changes
+        given = {"vertices": self.vertices, "faces": self.faces, "tissue": self.tissue, "chart": self.chart}
+        given |= depth | changes
         given["tissue"] = replace(given["tissue"], **material)
-        return SoftLayer(given.pop("vertices"), given.pop("faces"), given.pop("thickness"), **given)
+        return SoftLayer(**given)
+
+    def _depth_of_core(self) -> PerVertex:
+        """Depth of the core below the skin, along its normal, but no less than a third of the column, (V,) [m]."""
+        columns = self.vertices - self.core
+        return np.maximum(np.einsum("ij,ij->i", columns, self.normals),
+                          STEEPEST * np.linalg.norm(columns, axis=1))  # fmt: skip
 
     @cached_property
     def face_area_vectors(self) -> Points:
@@ -97,8 +119,8 @@ class SoftLayer:
 
     @cached_property
     def inner_vertices(self) -> Points:
-        """Points where the layer is bonded to the rigid core: vertices - thickness * normals, shape (V, 3) [m]."""
-        return self.vertices - self.thickness[:, None] * self.normals
+        """Points where the layer is bonded to its core, (V, 3) [m]: the core, or vertices - thickness * normals."""
+        return self.core if self.core is not None else self.vertices - self.thickness[:, None] * self.normals
 
     @cached_property
     def edges(self) -> np.ndarray:
@@ -125,6 +147,21 @@ class SoftLayer:
                 f"E {self.tissue.youngs_modulus:g} Pa, nu {self.tissue.poisson_ratio:g})")
 
 
+def single(layer: SoftLayer, who: str) -> SoftLayer:
+    """The layer, for those who know one material in columns straight below the skin. Raises InvalidInput for others."""
+    tissue, more = layer.tissue, []
+    if tissue.skin:
+        more.append("a skin")
+    if tissue.deeper:
+        more.append(f"{len(tissue.deeper)} deeper material{'s' * (len(tissue.deeper) > 1)}")
+    if layer.core is not None:
+        more.append("columns that run to a core of their own")
+    if more:
+        raise InvalidInput(f"{who} knows one soft material straight below the skin; this layer has "
+                           f"{', '.join(more)}. PatchFem knows these.")
+    return layer
+
+
 def layer_id(layer: SoftLayer) -> str:
     """Sixteen hex digits that name a layer: SHA-256 of its vertices, faces, thickness and tissue, all as published.
 
@@ -135,6 +172,8 @@ def layer_id(layer: SoftLayer) -> str:
     digest = hashlib.sha256()
     for values, kind in ((layer.vertices, "<f4"), (layer.faces, "<u4"), (layer.thickness, "<f4"), (material, "<f8")):
         digest.update(np.ascontiguousarray(values, dtype=kind).tobytes())
+    if layer.core is not None:
+        digest.update(np.ascontiguousarray(layer.core, dtype="<f4").tobytes())
     if not tissue.single:
         digest.update(np.array(tissue.stacked, dtype="<f8").tobytes())
     return digest.hexdigest()[:16]

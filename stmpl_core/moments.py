@@ -8,7 +8,7 @@ from weakref import WeakKeyDictionary
 import numba
 import numpy as np
 
-from stmpl_core.layer import SoftLayer
+from stmpl_core.layer import SoftLayer, single
 from stmpl_core.response import (
     REACH,
     SCALARS,
@@ -25,7 +25,6 @@ from stmpl_core.response import (
 )
 from stmpl_core.soundness import Soundness
 from stmpl_core.thinning import Asked, Thinning
-from stmpl_core.tissue import single
 
 
 class Felt(NamedTuple):
@@ -80,7 +79,7 @@ class Surroundings:
     """
 
     def __init__(self, layer: SoftLayer) -> None:
-        single(layer.tissue, "the linear response")
+        single(layer, "the linear response")
         self.frames, self._thickness = _frames(layer.normals), layer.thickness
         points = np.ascontiguousarray(layer.vertices)
         self._thinning = Thinning(layer, self.frames, REACH)

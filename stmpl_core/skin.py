@@ -50,4 +50,6 @@ class Skin:
 
 def published(layer: SoftLayer) -> SoftLayer:
     """The layer rounded to float32, as messages carry it: whoever reads them has the very same layer."""
-    return layer.with_(vertices=layer.vertices.astype(np.float32), thickness=layer.thickness.astype(np.float32))
+    depth = {"thickness": layer.thickness} if layer.core is None else {"core": layer.core}
+    rounded = {name: values.astype(np.float32) for name, values in ({"vertices": layer.vertices} | depth).items()}
+    return layer.with_(**rounded)

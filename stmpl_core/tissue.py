@@ -147,12 +147,3 @@ def _check_moduli(youngs_modulus: float, poisson_ratio: float) -> None:
                            "it in kilopascals? Scale it by 1e3.")
     if not 0 <= poisson_ratio < 0.5:
         raise InvalidInput(f"poisson_ratio is {poisson_ratio}; allowed is 0 <= nu < 0.5 (try 0.499).")
-
-
-def single(tissue: Tissue, who: str) -> Tissue:
-    """The tissue, for those who know one material only. Raises InvalidInput for a skin or a stack."""
-    if not tissue.single:
-        what = " and ".join(["a skin"] * (tissue.skin is not None) + [f"{len(tissue.deeper)} deeper materials"] *
-                            bool(tissue.deeper))  # fmt: skip
-        raise InvalidInput(f"{who} knows one soft material; this tissue has {what}.")
-    return tissue

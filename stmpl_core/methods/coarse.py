@@ -48,7 +48,9 @@ class Coarse:
         from stmpl_core.remesh import remesh
 
         mesh = remesh(layer.vertices, layer.faces, self.coarsening * layer.edge_length)
-        self.coarse = SoftLayer(mesh.vertices, mesh.faces, mesh.transfer @ layer.thickness, tissue=layer.tissue)
+        depth = {"thickness": mesh.transfer @ layer.thickness} if layer.core is None else \
+            {"core": mesh.transfer @ layer.core}  # fmt: skip
+        self.coarse = SoftLayer(mesh.vertices, mesh.faces, **depth, tissue=layer.tissue)
         self.method.prepare(self.coarse)
         self._carry = interpolation(self.coarse, layer)
         area = layer.vertex_areas

@@ -10,10 +10,9 @@ from numpy.typing import ArrayLike
 
 from stmpl_core.arrays import VertexVectors, finite
 from stmpl_core.errors import InvalidInput
-from stmpl_core.layer import SoftLayer
+from stmpl_core.layer import SoftLayer, single
 from stmpl_core.load import Load
 from stmpl_core.methods.base import prepared
-from stmpl_core.tissue import single
 from stmpl_core.trust import Displacement, Trust
 
 
@@ -64,7 +63,7 @@ class Naive:
 
     def prepare(self, layer: SoftLayer) -> Self:
         """Keeps the layer, and derives alpha from it if none was given. Raises InvalidInput for a skin or a stack."""
-        single(layer.tissue, "Naive")
+        single(layer, "Naive")
         self._layer = layer
         default = 1 / (layer.tissue.confined_modulus * float(layer.vertex_areas.mean()))
         self._alpha = np.full(3, default) if self.alpha is None else self.alpha

@@ -12,11 +12,10 @@ from stmpl_core.arrays import PerVertex
 from stmpl_core.chart import PADDING, UvChart
 from stmpl_core.errors import InvalidInput, sentence_of
 from stmpl_core.extras import needed
-from stmpl_core.layer import SoftLayer
+from stmpl_core.layer import SoftLayer, single
 from stmpl_core.load import Load
 from stmpl_core.methods.base import prepared
 from stmpl_core.networks import NETWORKS
-from stmpl_core.tissue import single
 from stmpl_core.trust import Displacement, Trust
 
 if TYPE_CHECKING:
@@ -99,7 +98,7 @@ class UNet:
 
     def prepare(self, layer: SoftLayer) -> Self:
         """Draws the thickness. Raises InvalidInput if the layer has no UV chart, for a skin or a stack."""
-        single(layer.tissue, "UNet")
+        single(layer, "UNet")
         self._chart = square_chart(layer, self.card.size)
         self._images = np.zeros((2, self.card.size, self.card.size), np.float32)
         self._images[0] = self._chart.to_texels(drawn_thickness(layer.thickness))[..., 0]

@@ -11,10 +11,10 @@ from numpy.typing import ArrayLike
 
 from stmpl_core.arrays import PerVertex, finite
 from stmpl_core.errors import InvalidInput
-from stmpl_core.layer import SoftLayer
+from stmpl_core.layer import SoftLayer, single
 from stmpl_core.load import Load
 from stmpl_core.methods.base import prepared
-from stmpl_core.tissue import Tissue, single
+from stmpl_core.tissue import Tissue
 from stmpl_core.trust import Displacement, Trust
 
 MAX_SPREAD = 0.1  # share of the depth that neighbours may add before a column is no model of the layer
@@ -38,7 +38,7 @@ class Winkler:
 
     def prepare(self, layer: SoftLayer) -> Self:
         """Keeps the layer; there is nothing to compute. Raises InvalidInput for a skin or a stack."""
-        single(layer.tissue, "Winkler")
+        single(layer, "Winkler")
         self._layer = layer
         return self
 

@@ -1,0 +1,126 @@
+"""Bones: the rigid core of a limb as capsules between its joints, and the columns of tissue that run to it.
+
+Where tissue is no longer thin beside the limb's radius, columns along the skin's normals cross and fold; columns that
+run to the bone do not. The bones' radii are guesses of an adult's, the joints are read from the body's own weights.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from stmpl_core.arrays import Faces, Points, VertexVectors
+from stmpl_core.body import Body
+from stmpl_core.errors import InvalidInput
+from stmpl_core.extrusion import fold_ratios
+from stmpl_core.layer import SoftLayer
+
+RADII = {  # radius of a segment's bones as one capsule [m]: humerus, radius and ulna, femur, tibia and fibula
+    "upper_arm": 11e-3, "forearm": 15e-3, "thigh": 14e-3, "calf": 20e-3,
+}  # fmt: skip
+SEGMENTS = {"arm": ("upper_arm", "forearm"), "leg": ("thigh", "calf")}
+FACING = 0.35  # cosine between normal and column, below which a bone is no longer reached through this skin
+AWAY = 0.3  # cost of a bone that the skin does not face, over the missing cosine [m]
+BLEND = 6e-3  # difference of cost over which two bones share a column [m]
+THINNEST = 0.8e-3  # shortest column: skin lies on the bone, and never in it [m]
+LEAST_FOLD = 0.15  # fold ratio of a prism (stmpl_core.extrusion.fold_ratios) from which it is sound
+SHORTER = 0.93  # factor on the columns around a folding face, each pass
+PASSES = 60  # passes of shortening at most
+
+
+@dataclass(frozen=True)
+class Bone:
+    """A bone, or several side by side, as a capsule.
+
+    Args:
+        start, end: middles of its ends, (3,) each [m].
+        radius: its radius [m].
+    """
+
+    start: np.ndarray
+    end: np.ndarray
+    radius: float
+
+    def middles(self, points: Points) -> Points:
+        """The nearest point of its axis to each of the points, (N, 3) [m]."""
+        axis = self.end - self.start
+        share = np.clip((points - self.start) @ axis / (axis @ axis), 0, 1)
+        return self.start + share[:, None] * axis
+
+
+def bones_of(body: Body, part: str) -> list[Bone]:
+    """The bones of an arm, a leg, or a segment of one. Raises InvalidInput for other parts.
+
+    A joint lies in the middle of the ring of skin that the bones on both sides of it move alike.
+    """
+    side, _, name = part.partition("_")
+    segments = SEGMENTS.get(name, (name,))
+    if side not in ("left", "right") or any(segment not in RADII for segment in segments):
+        known = [f"left_{one}, right_{one}" for one in (*SEGMENTS, *RADII)]
+        raise InvalidInput(f"the bones of {part!r} are not known. Known: {', '.join(known)}. "
+                           "Or give SoftLayer a core of your own.")  # fmt: skip
+    return [_bone(body, f"{side}_{segment}", RADII[segment]) for segment in segments]
+
+
+def _bone(body: Body, part: str, radius: float) -> Bone:
+    level = body.level(part)
+    own = body.vertices[level > 0]
+    middle = own.mean(axis=0)
+    axis = np.linalg.svd(own - middle, full_matrices=False)[2][0]
+    along, ring = (body.vertices - middle) @ axis, np.abs(level) < 0.3
+    ends = []
+    for side in (ring & (along < 0), ring & (along > 0)):
+        weight = 0.3 - np.abs(level[side])
+        ends.append(weight @ body.vertices[side] / weight.sum())
+    return Bone(*ends, radius)
+
+
+def core_of(vertices: Points, normals: VertexVectors, faces: Faces, bones: Sequence[Bone],
+            thickness: float | None = None) -> Points:  # fmt: skip
+    """Where the column below each vertex of a skin ends, (V, 3) [m]: on the bones, or sooner.
+
+    A column points to the bone that is near and that the skin faces, or between two. Columns of prisms that would fold
+    are shortened.
+
+    Args:
+        vertices: skin at rest, (V, 3) [m].
+        normals: its outward unit normals, (V, 3).
+        faces: vertex numbers, (F, 3).
+        bones: bones, at least one.
+        thickness: depth below the skin, along its normal, at which the tissue ends above the bone [m]; None: it reaches
+            to the bone.
+    """
+    ways, lengths, costs = [], [], []
+    for bone in bones:
+        away = vertices - bone.middles(vertices)
+        distance = np.maximum(np.linalg.norm(away, axis=1), 1e-9)
+        facing = np.einsum("ij,ij->i", normals, away) / distance
+        ways.append(-away / distance[:, None])
+        lengths.append(np.maximum(distance - bone.radius, THINNEST))
+        costs.append(lengths[-1] / np.maximum(facing, FACING) + AWAY * np.maximum(FACING - facing, 0))
+    cost = np.array(costs)
+    share = np.exp(-(cost - cost.min(axis=0)) / BLEND)
+    share /= share.sum(axis=0)
+    columns = np.einsum("bv,bvi->vi", share, np.array(ways) * np.array(lengths)[..., None])
+    if thickness is not None:
+        deep = -np.einsum("ij,ij->i", columns, normals)
+        columns *= np.minimum(thickness / np.maximum(deep, FACING * thickness), 1)[:, None]
+    return vertices + _unfolded(vertices, columns, faces)
+
+
+def _unfolded(vertices: Points, columns: VertexVectors, faces: Faces) -> VertexVectors:
+    columns = columns.copy()
+    hopeless = fold_ratios(vertices, vertices + 0.1 * columns, faces) < LEAST_FOLD
+    for _ in range(PASSES):
+        bad = np.unique(faces[(fold_ratios(vertices, vertices + columns, faces) < LEAST_FOLD) & ~hopeless])
+        if not len(bad):
+            break
+        columns[bad] *= SHORTER
+    return columns
+
+
+def to_bone(layer: SoftLayer, bones: Sequence[Bone], thickness: float | None = None) -> SoftLayer:
+    """The layer with columns that run to bones (see `core_of`)."""
+    return layer.with_(core=core_of(layer.vertices, layer.normals, layer.faces, bones, thickness))
