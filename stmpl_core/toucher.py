@@ -329,6 +329,10 @@ class Toucher:
         if deepest > card["ranges"]["depth_over_thickness"][1] and one.status != IN_CORE:
             trust = trust.also(f"{name} presses to {deepest:.0%} of the thickness, learnt is "
                                f"{card['ranges']['depth_over_thickness'][1]:.0%}", in_range=False)  # fmt: skip
+        thinnest = float(np.subtract(*one.field.tool_bounds[::-1]).min())
+        if touch.depth > thinnest and one.status != IN_CORE:
+            trust = trust.also(f"{name} is {1e3 * thinnest:.2g} mm thin and {1e3 * touch.depth:.2g} mm deep: skin may "
+                               "close over it", in_range=False)  # fmt: skip
         nu, (low, high) = layer.tissue.poisson_ratio, card["ranges"]["poisson_ratio"]
         if not low - 1e-3 <= nu <= high + 1e-3:
             trust = trust.also(f"contacts were learnt at Poisson's ratios from {low:g} to {high:g}, not {nu:g}",
@@ -340,7 +344,8 @@ class Toucher:
             trust = trust.also(f"{name} was moved {one.moved * 1e3:+.1f} mm along its force: check its calibration")
         area = float(one.squeeze.nodes.area.sum())
         lever = float(np.linalg.norm(touch.missing[3:])) / max(touch.force, 1e-300)
-        if stated is not None and stated[3:].any() and lever > max(MAX_LEVER * (area / np.pi) ** 0.5, self.reach):
+        slack = min(self.reach, float(np.subtract(*one.field.tool_bounds[::-1]).max()))
+        if stated is not None and stated[3:].any() and lever > max(MAX_LEVER * (area / np.pi) ** 0.5, slack):
             trust = trust.also(f"{name} also turns with {1e3 * touch.force * lever:.2g} N mm, which is not carried",
                                in_range=False)  # fmt: skip
         if touch.drag > MAX_DRAG_RATIO * touch.force:
