@@ -18,6 +18,7 @@ PUBLIC = {  # heading: modules, and the names in them that are promised to stay
     "From contact to answer": ["stmpl_core: Tool Contact Simulator Tools State Touch Answer Trust"],
     "Limb and load": ["stmpl_core.body: Body", "stmpl_core: SoftLayer Load", "stmpl_core.skin: Skin"],
     "Tissue": ["stmpl_core: Tissue Membrane Ply",
+               "stmpl_core.regions: region Region Quantity",
                "stmpl_core.stack: compliance Compliance effective Effective Misfit needs Need ball_force"],
     "Methods": ["stmpl_core.methods: Method method Naive Winkler Linear MomentNet UNet Ladder",
                 "stmpl_core: Displacement", "fem_tools.ladder: ladder", "stmpl_core.metrics: score Score"],
