@@ -35,8 +35,9 @@ class Quantity:
 
     def times(self, low: float, value: float, high: float, source: str) -> Quantity:
         """A multiple of it, to two digits: `low` times its low end, and so on."""
-        ends = (value * self.value, low * self.low, high * self.high)
-        return Quantity(*(float(f"{each:.2g}") for each in ends), self.unit, source)
+        ends = low * self.low, value * self.value, high * self.high
+        low, value, high = (float(f"{each:.2g}") for each in ends)
+        return Quantity(value, low, high, self.unit, source)
 
     def assumed(self, source: str) -> Quantity:
         """The same number at a place where none was found."""

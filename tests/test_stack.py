@@ -1,5 +1,7 @@
 """Laws of a bonded stack's linear response, and of the single layer nearest to it."""
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 
@@ -34,6 +36,37 @@ def test_equal_materials_are_one_material(nu):
     whole, cut = compliance(Tissue(1e3, nu), 0.03, K), compliance(alike, 0.03, K)
     np.testing.assert_allclose(cut.sinking, whole.sinking, rtol=1e-11)
     np.testing.assert_allclose(cut.along, whole.along, atol=1e-11 * whole.sinking.max())
+
+
+def through_the_depth(tissue, thickness, k, rows):
+    """A and B [t/E] by linear finite elements through the depth, of motion U(z) sin(k x), W(z) cos(k x)."""
+    cuts = [0.0, *(ply.depth / thickness for ply in tissue.deeper), 1.0]
+    moduli = [tissue.youngs_modulus, *(ply.youngs_modulus for ply in tissue.deeper)]
+    z = np.concatenate([np.linspace(a, b, rows + 1)[:-1] for a, b in pairwise(cuts)] + [[1.0]])
+    stiffness = np.zeros((2 * len(z), 2 * len(z)))
+    for n, h in enumerate(np.diff(z)):
+        mu = moduli[n // rows] / moduli[0] / (2 * 1.45)
+        lam = mu * 2 * 0.45 / 0.1
+        hook = np.array([[lam + 2 * mu, lam, 0], [lam, lam + 2 * mu, 0], [0, 0, mu]])
+        for at in (0.5 - 3**-0.5 / 2, 0.5 + 3**-0.5 / 2):
+            strain = np.array([[k * (1 - at), 0, k * at, 0], [0, -1 / h, 0, 1 / h],
+                               [-1 / h, -k * (1 - at), 1 / h, -k * at]])  # fmt: skip
+            stiffness[2 * n : 2 * n + 4, 2 * n : 2 * n + 4] += h / 2 * strain.T @ hook @ strain
+    if tissue.skin:
+        stiffness[0, 0] += tissue.kappa(thickness) / (1 - tissue.skin.poisson_ratio**2) * k * k
+        stiffness[1, 1] += tissue.pull(thickness) * k * k
+    load = np.zeros(2 * len(z) - 2)
+    load[1] = 1
+    return np.linalg.solve(stiffness[:-2, :-2], load)[1::-1]
+
+
+@pytest.mark.parametrize("skin", [None, SKIN])
+@pytest.mark.parametrize("k", [0.5, 2.0, 8.0])
+def test_finite_elements_through_the_depth_come_to_the_closed_form_with_the_square_of_their_size(k, skin):
+    stack = Tissue(3e3, 0.45, skin=skin, deeper=(Ply(8e-3, 1.5e4, 0.45), Ply(2e-2, 1e3, 0.45)))
+    exact = np.ravel(compliance(stack, 0.04, k))
+    off = [np.abs(through_the_depth(stack, 0.04, k, rows) - exact).max() / exact[0] for rows in (30, 60)]
+    assert off[1] < 5e-3 and off[0] / off[1] == pytest.approx(4, rel=0.1)
 
 
 def test_a_material_below_the_base_is_not_there():
