@@ -16,8 +16,11 @@ from typing import Any
 PAGE = Path(__file__).parent / "api.md"
 PUBLIC = {  # heading: modules, and the names in them that are promised to stay
     "From contact to answer": ["stmpl_core: Tool Contact Simulator Tools State Touch Answer Trust"],
-    "Limb and load": ["stmpl_core.body: Body", "stmpl_core: SoftLayer Tissue Membrane Ply Load",
-                      "stmpl_core.bones: Bone bones_of core_of to_bone", "stmpl_core.skin: Skin"],
+    "Limb and load": ["stmpl_core.body: Body", "stmpl_core: SoftLayer Load", "stmpl_core.skin: Skin",
+                      "stmpl_core.bones: Bone bones_of core_of to_bone"],
+    "Tissue": ["stmpl_core: Tissue Membrane Ply",
+               "stmpl_core.regions: region Region Quantity",
+               "stmpl_core.stack: compliance Compliance effective Effective Misfit needs Need ball_force"],
     "Methods": ["stmpl_core.methods: Method method Naive Winkler Linear MomentNet UNet Ladder",
                 "stmpl_core: Displacement", "fem_tools.ladder: ladder", "stmpl_core.metrics: score Score"],
     "Finite elements": ["fem_tools: PatchFem IndenterFem Press RigidFem"],
@@ -90,8 +93,9 @@ def called(name: str, thing: Any, width: int = 110) -> str:
     if not callable(thing) or getattr(thing, "_is_protocol", False):
         return name
     whole = inspect.signature(thing)
-    shown = [each.replace(annotation=_Written(each.annotation)) if isinstance(each.annotation, str) else each
-             for each in whole.parameters.values() if each.name not in ("self", "cls")]  # fmt: skip
+    shown = [each.replace(annotation=_Written(written)) if isinstance(written, str) else each
+             for each in whole.parameters.values() if each.name not in ("self", "cls")
+             for written in [getattr(each.annotation, "__forward_arg__", each.annotation)]]  # fmt: skip
     back = whole.return_annotation
     back = "" if back in (None, "None", whole.empty) else f" -> {back}"
     listed = re.sub(r"<[^<>]*(?:factory|at 0x\w+)[^<>]*>", "...", str(inspect.Signature(shown)))

@@ -19,7 +19,7 @@ VERBS = {  # module of each verb's function, and what it does
     "record": ("stmpl_ros.verbs", "record topics as MCAP, until Ctrl-C"),
     "replay": ("stmpl_ros.verbs", "answer recorded contacts again, or publish them"),
     "compare": ("stmpl_ros.verbs", "judge a recorded run by finite elements, a method or another recording"),
-    "info": ("stmpl_ros.verbs", "say what a recording holds"),
+    "info": ("stmpl_ros.verbs", "say what a recording holds, or what a part of the body is made of"),
     "recover": ("stmpl_ros.verbs", "bring back what is sound in a recording that was not finished"),
     "generate": ("stmpl_ros.verbs", "make the data that networks learn from"),
     "train": ("studies.verbs", "train a network"),

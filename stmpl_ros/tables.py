@@ -1,4 +1,4 @@
-"""What the command shows of a recording and of a comparison: tables for people, figures for machines."""
+"""What the command shows of recordings, comparisons and parts of a body: tables for people, figures for machines."""
 
 from __future__ import annotations
 
@@ -12,6 +12,10 @@ if TYPE_CHECKING:
     from bags.reader import Bag
     from bags.survey import Survey
     from stmpl_core.methods.base import Method
+    from stmpl_core.regions import Region
+
+BALL_RADIUS, BALL_DEPTH = 0.010, 0.001  # ball and depth at which the stiffness of a part is told [m]
+SHOWN = {"Pa": (1e-3, "kPa"), "m": (1e3, "mm"), "N/m": (1.0, "N/m"), "-": (1.0, "")}  # factor and unit for people
 
 
 def compare_with_progress(
@@ -112,4 +116,69 @@ def bag_table(bag: Bag) -> Table:
     robots = f"{len(bag.namespaces)} robots: {', '.join(bag.namespaces)}; " if len(bag.namespaces) > 1 else ""
     state = "finished" if bag.finished else "not finished by its writer"
     table.caption = f"{robots}{state}, {len(bag.damage)} places damaged"
+    return table
+
+
+def part_figures(name: str) -> dict[str, Any]:
+    """What a part of a body is made of, relaxed and tensed, for machines. Raises InvalidInput."""
+    from dataclasses import asdict
+
+    from stmpl_core.regions import region
+
+    both = [region(name), region(name, "tensed")]
+    return {"part": name, "where": both[0].where} | {
+        one.tone: {
+            "quantities": {key: asdict(quantity) for key, quantity in one.quantities.items()},
+            "thickness": one.thickness,
+            "effective": _effective(one),
+        }
+        for one in both
+    }
+
+
+def _effective(one: Region) -> dict[str, Any]:
+    """The layer that answers most like a part, what it misses, the rung it needs, its stiffness under a ball [N/m]."""
+    from stmpl_core.stack import ball_force, effective, needs
+
+    near = effective(one.tissue, one.thickness)
+    need = needs(one.tissue, one.thickness)
+    force = ball_force(one.tissue, one.thickness, BALL_RADIUS, BALL_DEPTH)
+    return near._asdict() | {
+        "misfit": near.misfit._asdict(),
+        "bare": near.bare._asdict(),
+        "ball_stiffness": force / BALL_DEPTH,
+        "rung": need.rung,
+        "why": need.why,
+    }
+
+
+def part_table(name: str) -> Table:
+    """What a part of a body is made of, relaxed and tensed, for people: typical number, and low to high."""
+    from stmpl_core.regions import region
+
+    relaxed, tensed = region(name), region(name, "tensed")
+    table = Table(title=f"{name}: {relaxed.where}", title_justify="left", caption_justify="left")
+    table.add_column("quantity")
+    table.add_column("unit")
+    table.add_column("relaxed", justify="right")
+    table.add_column("tensed", justify="right")
+    table.add_column("source")
+    for key, one in relaxed.quantities.items():
+        other, (factor, unit) = tensed.quantities[key], SHOWN[one.unit]
+        shown = [f"{q.value * factor:.3g} ({q.low * factor:.3g}-{q.high * factor:.3g})" for q in (one, other)]
+        source = one.source if other == one else f"{one.source}. Tensed: {other.source}"
+        table.add_row(key.replace("_", " "), unit, *shown, source)
+    near = [_effective(relaxed), _effective(tensed)]
+    fit = "fit to the linear response under loads of 2-40 mm radius"
+    rows = [("effective modulus", "kPa", "youngs_modulus", 1e-3, fit),
+            ("effective thickness", "mm", "thickness", 1e3, fit),
+            ("kappa = E_s h / (E t)", "", "kappa", 1.0, "with effective E and t"),
+            ("pull = T / (E t)", "", "pull", 1.0, "with effective E and t"),
+            ("stiffness", "N/mm", "ball_stiffness", 1e-3,
+             f"linear response to a ball of {BALL_RADIUS * 1e3:g} mm, {BALL_DEPTH * 1e3:g} mm deep")]  # fmt: skip
+    table.add_section()
+    for label, unit, key, factor, source in rows:
+        table.add_row(label, unit, *(f"{one[key] * factor:.2g}" for one in near), source)
+    table.caption = "\n".join(f"{tone}: rung {one['rung']}. {one['why']}"
+                              for tone, one in zip(("relaxed", "tensed"), near, strict=True))  # fmt: skip
     return table

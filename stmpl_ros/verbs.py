@@ -185,18 +185,29 @@ def compare(
     return 0 if comparison.passed else 1
 
 
-def info(path: BagPath, as_json: Json = False) -> int:
-    """Says what a recording holds; exits with 1 if it was not finished or is damaged.
+def info(path: Annotated[Path | None, tyro.conf.Positional] = None, part: str | None = None,
+         as_json: Json = False) -> int:  # fmt: skip
+    """Says what a recording holds, and exits with 1 if it is damaged or not finished; or what a body is made of.
 
     Example: stmpl info runs/latest
+    Skin, fat and muscle with their sources: stmpl info --part back
 
     Args:
         path: folder or .mcap file of a run.
+        part: region of the body instead of a run: forearm, upper_arm, shoulder, neck, back, abdomen, thigh or calf.
         as_json: figures as JSON, for machines.
     """
+    if (path is None) == (part is None):
+        raise InvalidInput("Give the path of a recording or --part with a region of the body, one of them.")
+    if part is not None:
+        from stmpl_ros.tables import part_figures, part_table
+
+        print_figures(part_figures(part) if as_json else part_table(part))
+        return 0
     from bags.reader import Bag
     from stmpl_ros.tables import bag_figures, bag_table
 
+    assert path is not None
     bag = Bag(path)
     skins = {name: repr(layer) for name, layer in bag.known_layers().items()}
     print_figures(bag_figures(bag) | {"skins": skins} if as_json else bag_table(bag))
