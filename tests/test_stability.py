@@ -70,6 +70,20 @@ class Choosy(Winkler):
         return self
 
 
+class Switching(Winkler):
+    """Another method from a threshold on, which answers more; both state a share of the peak as their bound."""
+
+    def __init__(self, bound: float) -> None:
+        super().__init__()
+        self.bound = bound
+
+    def solve(self, load: Load) -> Displacement:
+        answer, layer = super().solve(load), self._layer
+        assert layer is not None
+        u, name = with_a_threshold(layer, load, answer.displacement), f"above {load.peak_ratio(layer) > 0.500001}"
+        return replace(answer, displacement=u, method=name, trust=Trust(error_bound=self.bound * np.abs(u).max()))
+
+
 class Crashing(Winkler):
     """Stumbles over high pressures."""
 
@@ -140,7 +154,8 @@ FAULTS = {
 def run(tmp_path_factory) -> tuple[Report, object]:
     """All faulty methods, a sound one, Zero, one that flags its fault and one that crashes, in one quick sweep."""
     out = tmp_path_factory.mktemp("stability")
-    others = {"sound": Winkler, "nothing": Zero, "honest": faulty(too_deep, flags=True), "crashing": Crashing}
+    others = {"sound": Winkler, "nothing": Zero, "honest": faulty(too_deep, flags=True), "crashing": Crashing,
+              "candid": lambda: Switching(0.3), "boastful": lambda: Switching(0.01)}  # fmt: skip
     return stability(FAULTS | others, PRESSURES, out), out
 
 
@@ -163,6 +178,11 @@ def test_columns_hold_every_law_of_the_quick_sweep(run):
     report = run[0]
     assert not broken(report, "sound")
     assert report.counts("sound")["held"] == sum(map(len, PRESSURES.levels.values()))
+
+
+def test_two_methods_of_one_that_chooses_agree_within_the_bounds_that_they_state(run):
+    assert not broken(run[0], "candid")
+    assert broken(run[0], "boastful") == {"gain"}
 
 
 def test_zero_breaks_only_what_it_must_and_says_so(run):
