@@ -11,8 +11,6 @@ STEEP = 0.25  # slope of the thickness from triangle to triangle; trained is up 
 STEEP_SHARE = 0.02  # share of what moves or presses that may be so steep
 LONG = 2.2  # length of a triangle over its width; trained is up to about 2
 LONG_SHARE = 0.05  # share of what moves or presses that may be in such
-COARSE = 1.0  # longest edge of a triangle over t; trained is up to 0.7
-COARSE_SHARE = 0.1  # share of what moves or presses that may be in such
 BORDER = 2.0  # distance of a load from the open border, over t; nearer the worst vertex is 6 to 21 % off
 BORDER_SHARE = 0.05  # share of the load that may be nearer
 
@@ -24,24 +22,22 @@ class Soundness:
         layer: soft layer at rest.
 
     Attributes:
-        wrong: masks of vertices where the thickness is steep, triangles are long, triangles are coarse, (V, 3).
+        steep, long: masks of vertices, (V,).
         border: distance from the open border, over t, (V,).
     """
 
     def __init__(self, layer: SoftLayer) -> None:
-        self.wrong = np.stack([slope_of_thickness(layer) > STEEP, longest_over_width(layer) > LONG,
-                               longest_edge(layer) > COARSE * layer.thickness], axis=1)  # fmt: skip
+        self.steep = slope_of_thickness(layer) > STEEP
+        self.long = longest_over_width(layer) > LONG
         self.border = border_distance(layer) / layer.thickness
 
-    def of_mesh(self, shares: np.ndarray, where: str) -> list[str]:
-        """What is wrong with shares of what is `wrong`, (3,), as sentences."""
-        (steep, long, coarse), out = shares, []
+    def of_mesh(self, steep: float, long: float, where: str) -> list[str]:
+        """What is wrong with shares of steep and long triangles, as sentences."""
+        out = []
         if steep > STEEP_SHARE:
             out.append(f"the thickness changes by more than {STEEP:g} mm a mm at {steep:.0%} of {where}")
         if long > LONG_SHARE:
             out.append(f"triangles are longer than {LONG:g} times their width at {long:.0%} of {where}")
-        if coarse > COARSE_SHARE:
-            out.append(f"triangles are wider than the layer is thick at {coarse:.0%} of {where}")
         return out
 
     def of_load(self, loaded: np.ndarray, force: np.ndarray) -> list[str]:
@@ -55,7 +51,8 @@ class Soundness:
     def of_contact(self, loaded: np.ndarray, force: np.ndarray) -> list[str]:
         """What is wrong with the skin under a tool that presses with forces (L,) on vertices (L,), as sentences."""
         total = max(float(force.sum()), 1e-300)
-        return [*self.of_mesh(force @ self.wrong[loaded] / total, "the force"), *self.of_load(loaded, force)]
+        steep, long = (float(force[mask[loaded]].sum()) / total for mask in (self.steep, self.long))
+        return [*self.of_mesh(steep, long, "the force"), *self.of_load(loaded, force)]
 
 
 def slope_of_thickness(layer: SoftLayer) -> np.ndarray:
@@ -75,24 +72,12 @@ def slope_of_thickness(layer: SoftLayer) -> np.ndarray:
 
 def longest_over_width(layer: SoftLayer) -> np.ndarray:
     """Longest of the triangles around each vertex: its longest edge over the width of an even one of its area, (V,)."""
-    areas = np.linalg.norm(layer.face_area_vectors, axis=1)
-    return _largest_around(layer, _longest(layer) ** 2 * (np.sqrt(3) / 4) / areas)
-
-
-def longest_edge(layer: SoftLayer) -> np.ndarray:
-    """Longest edge of the triangles around each vertex, (V,) [m]."""
-    return _largest_around(layer, _longest(layer))
-
-
-def _longest(layer: SoftLayer) -> np.ndarray:
     corners = layer.vertices[layer.faces]
-    return np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
-
-
-def _largest_around(layer: SoftLayer, values: np.ndarray) -> np.ndarray:
+    longest = ((corners - np.roll(corners, 1, axis=1)) ** 2).sum(axis=2).max(axis=1)
+    areas = np.linalg.norm(layer.face_area_vectors, axis=1)
     out = np.zeros(len(layer.vertices))
     for corner in range(3):
-        np.maximum.at(out, layer.faces[:, corner], values)
+        np.maximum.at(out, layer.faces[:, corner], longest * (np.sqrt(3) / 4) / areas)
     return out
 
 

@@ -43,6 +43,8 @@ MIN_NET_FORCE_SHARE = 0.1  # force over the sum of its parts' sizes, below which
 MAX_DRAG_RATIO = 0.3  # tangential over normal force that is not yet worth a word
 MARGIN_SHARE = 2 / 3  # width of the distance fields around tools, over the thickness
 MAX_AROUND = 0.02  # depth of skin in a tool that presses nothing, over the thickness, that is not yet worth a word
+THIN = 0.5  # least extent of a tool, over the skin's edges, below which it is thin
+SUNK = 0.8  # depth of a thin tool over its least extent, beyond which its force may fall as it goes deeper
 MAX_LEVER = 1.0  # torque that is not carried over the force, over the contact's radius, that is not yet worth a word
 MAX_FIELD_ERROR_M = 5e-4  # error of a distance field that is not yet worth a word
 MAX_UNSEEN_FORCE_SHARE = 0.1  # share of the force that vertices unlike all training contacts may carry
@@ -330,9 +332,9 @@ class Toucher:
             trust = trust.also(f"{name} presses to {deepest:.0%} of the thickness, learnt is "
                                f"{card['ranges']['depth_over_thickness'][1]:.0%}", in_range=False)  # fmt: skip
         thinnest = float(np.subtract(*one.field.tool_bounds[::-1]).min())
-        if touch.depth > thinnest and one.status != IN_CORE:
-            trust = trust.also(f"{name} is {1e3 * thinnest:.2g} mm thin and {1e3 * touch.depth:.2g} mm deep: skin may "
-                               "close over it", in_range=False)  # fmt: skip
+        if thinnest < THIN * layer.edge_length and touch.depth > SUNK * thinnest and one.status != IN_CORE:
+            trust = trust.also(f"{name} is {1e3 * thinnest:.2g} mm thick, thin beside the skin's edges of "
+                               f"{1e3 * layer.edge_length:.2g} mm, and {1e3 * touch.depth:.2g} mm deep", in_range=False)
         nu, (low, high) = layer.tissue.poisson_ratio, card["ranges"]["poisson_ratio"]
         if not low - 1e-3 <= nu <= high + 1e-3:
             trust = trust.also(f"contacts were learnt at Poisson's ratios from {low:g} to {high:g}, not {nu:g}",

@@ -491,3 +491,10 @@ def test_a_tool_is_measured_once(sim: Simulator) -> None:
 def test_reach_is_the_callers(sim: Simulator) -> None:
     contact = press(BALL, on_limb(-4e-3), (-0.2, 0, 0))
     assert Toucher(LIMB, reach=5e-3).touch(contact).status == MOVED
+
+
+@pytest.mark.parametrize("depth, sound", [(0.4e-3, True), (2e-3, False)])
+def test_a_sheet_thinner_than_the_mesh_that_sinks_below_the_skin_is_flagged(sim: Simulator, depth, sound) -> None:
+    touch = touch_of(sim.step([press(box(1e-3, 0.02, 0.02), at(RADIUS + 0.5e-3 - depth, 0, MIDDLE), None)]))
+    assert ("thin beside the skin's edges" not in touch.trust.why) == sound
+    assert sound or not touch.trust.in_range

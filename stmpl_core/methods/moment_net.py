@@ -176,8 +176,8 @@ class MomentNet:
             trust = trust.also(why, in_range=False)
         assert self._near is not None
         sound = self._near.sound
-        wrong = np.array([_share(mask, moving, asked) for mask in sound.wrong[asked.vertices].T])
-        for why in (*sound.of_mesh(wrong, "the vertices that move"),
+        steep, long = (_share(mask[asked.vertices], moving, asked) for mask in (sound.steep, sound.long))
+        for why in (*sound.of_mesh(steep, long, "the vertices that move"),
                     *sound.of_load(loaded, np.abs(pressure[loaded]) * layer.vertex_areas[loaded])):  # fmt: skip
             trust = trust.also(why, in_range=False)
         bound = float(card["bound"]["factor"]) * error
