@@ -16,7 +16,7 @@ from stmpl_core.errors import InvalidInput, MeshError
 from stmpl_core.extras import needed
 from stmpl_core.load import Load
 from stmpl_core.methods.base import prepared
-from stmpl_core.tissue import Tissue
+from stmpl_core.tissue import Tissue, single
 
 Mesher = Literal["split", "tetgen"]
 
@@ -163,7 +163,7 @@ class TetSystem(System):
     def __init__(self, mesh: TetMesh, tissue: Tissue, loads: Any, fixed: np.ndarray, keep: Any = None) -> None:
         self.mesh: Any = mesh
         self.tissue, self.loads, self.fixed, self.keep = tissue, loads, fixed | mesh.core, keep
-        self.mu, self.lam = tissue.shear_modulus, tissue.lame_lambda
+        self.mu, self.lam = single(tissue, "TetFem").shear_modulus, tissue.lame_lambda
         self.rest, self.free = mesh.points[:, None], 1
         self.diagonal = diagonal_blocks(mesh.indptr, mesh.indices)
 
