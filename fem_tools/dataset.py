@@ -20,7 +20,7 @@ from stmpl_core.chart import UvChart
 from stmpl_core.errors import InvalidInput
 from stmpl_core.layer import SoftLayer
 from stmpl_core.load import Load, LoadKind
-from stmpl_core.tissue import Tissue
+from stmpl_core.tissue import Tissue, single
 
 FORMAT = 1
 QUANTUM = 1e-8  # m; displacements are stored as whole numbers of it
@@ -87,7 +87,8 @@ class Record:
 
 
 def write_layer(root: zarr.Group, name: str, layer: SoftLayer) -> None:
-    """Writes a body's layer, with its UVs if it has a chart, over what is there."""
+    """Writes a body's layer, with its UVs if it has a chart, over what is there. Raises InvalidInput for a stack."""
+    single(layer.tissue, "a data set")
     group = root.create_group(name, overwrite=True)
     group.attrs["tissue"] = {k: getattr(layer.tissue, k) for k in ("youngs_modulus", "poisson_ratio", "density")}
     arrays = {"vertices": layer.vertices, "faces": layer.faces, "thickness": layer.thickness}

@@ -10,7 +10,7 @@ from fem_tools.mesh import WedgeMesh, level_depths
 from stmpl_core.methods.winkler import column_stretch
 from stmpl_core.tissue import Tissue
 
-GROWTH = 9.0  # depth at which a wedge below the first material may end over that at which it begins, at one wedge [-]
+GROWTH = 10.0  # depth at which a wedge below the first material may end over that at which it begins, at one wedge [-]
 THINNEST_SHARE = 0.01  # least share of a column that a wedge keeps where its material is not there
 
 

@@ -15,7 +15,7 @@ from stmpl_core.errors import InvalidInput
 from stmpl_core.layer import SoftLayer
 from stmpl_core.load import Load
 from stmpl_core.methods.base import prepared
-from stmpl_core.tissue import Tissue
+from stmpl_core.tissue import Tissue, single
 from stmpl_core.trust import Displacement, Trust
 from studies.tets import TetMesh, split_wedges
 
@@ -113,7 +113,8 @@ class PatchPeer(ABC):
         self._kept: tuple[bytes, Patch, Any] | None = None
 
     def prepare(self, layer: SoftLayer) -> Self:
-        """See PatchFem.prepare."""
+        """See PatchFem.prepare. Raises InvalidInput for a skin or a stack."""
+        single(layer.tissue, type(self).__name__)
         self._mesher.prepare(layer)
         self._layer, self._kept = layer, None
         return self
