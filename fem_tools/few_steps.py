@@ -7,7 +7,6 @@ from typing import Self
 
 import numpy as np
 
-from fem_tools.mesh import level_depths
 from fem_tools.newton import NewtonSettings, System, newton
 from fem_tools.patch import (
     Patch,
@@ -127,7 +126,7 @@ class FewSteps:
             return self.fem.guess(system, patch.interpolate(load.pressure_on(prepared(self._layer, self))), 1.0)
         mesh = patch.mesh
         skin = before.displacement[patch.vertices]
-        depth = level_depths(mesh.layers)[None, :, None]
+        depth = mesh.depths()[:, :, None]
         u = mesh.on_columns(skin)[:, None] * (1 - depth)
         u[system.fixed] = 0.0
         return settled(system, u)

@@ -12,6 +12,7 @@ from fem_tools.estimates import discretisation_error, truncation_error
 from fem_tools.mesh import WedgeMesh
 from fem_tools.newton import MAX_WORK, NewtonResult, is_positive_definite, newton, work_spent
 from fem_tools.patch import Patch, PatchFem
+from fem_tools.plies import confined_modulus
 from fem_tools.press import MAX_FACES_ENTERED, Press, above_core, edge_for_curvature, edge_for_first_contact
 from fem_tools.system import System
 from fem_tools.tool_contact import Friction, PressLoad, column_areas, friction_limit, penalties
@@ -222,7 +223,7 @@ class Walk:
         self.thickness = thickness
         self.system: System = self.fem.system(self.patch, Load.zero(layer))
         self.area = column_areas(self.mesh)
-        self.stiffness = penalties(solver.friction, layer.tissue.confined_modulus / self.thickness)
+        self.stiffness = penalties(solver.friction, confined_modulus(layer.tissue, thickness) / thickness)
         n = self.mesh.n_columns
         u = self.system.zeros()
         self.state = _State(u, None, 0.0, [np.zeros(n) for _ in tools], [np.full((n, 3), np.nan) for _ in tools],

@@ -93,13 +93,13 @@ class SkinReference:
 
 
 @cache
-def reference_skin(element: ElementName) -> SkinReference:
-    """Quadrature of degree 2 (linear in plane) or 5 (quadratic) for the follower load."""
+def reference_skin(element: ElementName, degree: int | None = None) -> SkinReference:
+    """Quadrature of a degree; None: 2 (linear in plane) or 5 (quadratic), for the follower load."""
     from skfem.element import ElementTriP1, ElementTriP2
     from skfem.quadrature import get_quadrature_tri
 
-    plane, degree, n = (ElementTriP1(), 2, 3) if element == "P1xP2" else (ElementTriP2(), 5, 6)
-    xy, weight = get_quadrature_tri(degree)
+    plane, enough, n = (ElementTriP1(), 2, 3) if element == "P1xP2" else (ElementTriP2(), 5, 6)
+    xy, weight = get_quadrature_tri(degree or enough)
     basis = [plane.lbasis(xy, i) for i in range(n)]
     return SkinReference(
         value=np.stack([np.broadcast_to(phi, len(weight)) for phi, _ in basis], axis=1),
@@ -117,6 +117,8 @@ class WedgeMesh:
         element: "P1xP2" or "P2xP2".
         layers: wedges through the thickness.
         outer, inner: end points of the columns at the triangle corners, (N, 3) [m].
+        ends: depths at which the wedges end, as shares of the columns at the corners, (N, L + 1), or of all of them,
+            (1, L + 1) [-].
         triangles: corners of each triangle, (T, 3), numbers of `outer`.
         columns: columns of each triangle, (T, n).
         edges: edges whose middles carry the columns N, N + 1, ... (quadratic only), (E, 2).
@@ -131,6 +133,7 @@ class WedgeMesh:
     layers: int
     outer: Points
     inner: Points
+    ends: np.ndarray
     triangles: np.ndarray
     columns: np.ndarray
     edges: np.ndarray
@@ -143,15 +146,25 @@ class WedgeMesh:
 
     @classmethod
     def of(
-        cls, outer: Points, inner: Points, triangles: np.ndarray, element: ElementName = "P1xP2", layers: int = 1
-    ) -> WedgeMesh:
+        cls, outer: Points, inner: Points, triangles: np.ndarray, element: ElementName = "P1xP2", layers: int = 1,
+        ends: np.ndarray | None = None,
+    ) -> WedgeMesh:  # fmt: skip
         """Meshes the space between two copies of a triangulation.
+
+        Args:
+            outer, inner: end points of the columns, (N, 3) each [m].
+            triangles: corners of the triangles, (T, 3).
+            element: element in plane and through the thickness.
+            layers: wedges through the thickness, if `ends` is None.
+            ends: see WedgeMesh; None: those of `level_depths`, the same in all columns.
 
         Raises:
             MeshError: a wedge is folded at rest (its map has a determinant that is not positive).
         """
         columns, edges, n_columns = _columns(triangles, len(outer), element)
-        gradients, volumes = rest_gradients(outer, inner, triangles, reference_wedge(element), layers)
+        ends = level_depths(layers)[None, ::2] if ends is None else ends
+        layers = ends.shape[1] - 1
+        gradients, volumes = rest_gradients(outer, inner, triangles, reference_wedge(element), layers, ends)
         if (volumes <= 0).any():
             bad = np.unique(triangles[np.flatnonzero((volumes <= 0).any(axis=1)) // layers])
             raise MeshError(f"the layer folds on itself below {len(bad)} vertices of the patch: {_some(bad)}.")
@@ -161,6 +174,7 @@ class WedgeMesh:
             layers,
             outer,
             inner,
+            ends,
             triangles,
             columns,
             edges,
@@ -188,9 +202,16 @@ class WedgeMesh:
 
     def rest_positions(self) -> np.ndarray:
         """Rest position of every node, (n_columns, levels, 3) [m]."""
-        outer, inner = self.column_ends()
-        depth = level_depths(self.layers)[None, :, None]
-        return outer[:, None] * (1 - depth) + inner[:, None] * depth
+        if len(self.ends) == 1:
+            (outer, inner), depth = self.column_ends(), self.depths()[:, :, None]
+            return outer[:, None] * (1 - depth) + inner[:, None] * depth
+        depth = _with_middles(self.ends)[:, :, None]
+        return self.on_columns(self.outer[:, None] * (1 - depth) + self.inner[:, None] * depth)
+
+    def depths(self) -> np.ndarray:
+        """Depth of each level of nodes, 0 at the skin, 1 at the core, (n_columns, levels) or (1, levels) [-]."""
+        depth = _with_middles(self.ends)
+        return depth if len(depth) == 1 else self.on_columns(depth)
 
     def on_columns(self, corner_values: np.ndarray) -> np.ndarray:
         """Extends values at the triangle corners, (N, ...), linearly to all columns."""
@@ -217,8 +238,12 @@ class WedgeMesh:
 
 def level_depths(layers: int) -> np.ndarray:
     """Depth of each level of nodes, 0 at the skin, 1 at the core; the wedges grow with depth as shear fades."""
-    ends = np.linspace(0, 1, layers + 1) ** GRADING
-    return np.sort(np.concatenate([ends, (ends[1:] + ends[:-1]) / 2]))
+    return _with_middles(np.linspace(0, 1, layers + 1)[None] ** GRADING)[0]
+
+
+def _with_middles(ends: np.ndarray) -> np.ndarray:
+    """Depths of all levels, (N, 2 L + 1), of those at which wedges end, (N, L + 1)."""
+    return np.sort(np.concatenate([ends, (ends[:, 1:] + ends[:, :-1]) / 2], axis=1), axis=1)
 
 
 def split(triangles: np.ndarray, n_vertices: int, marked: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -260,12 +285,16 @@ def _columns(triangles: np.ndarray, n: int, element: ElementName) -> tuple[np.nd
 
 
 def rest_gradients(
-    outer: Points, inner: Points, triangles: np.ndarray, ref: Reference, layers: int
+    outer: Points, inner: Points, triangles: np.ndarray, ref: Reference, layers: int, ends: np.ndarray | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Shape gradients (T L, Q, 3 n, 3) [1/m] and integration weights (T L, Q) [m3] at rest; weight 0 if singular."""
+    """Shape gradients (T L, Q, 3 n, 3) [1/m] and integration weights (T L, Q) [m3] at rest; weight 0 if singular.
+
+    `ends`: see WedgeMesh; None: those of `level_depths`.
+    """
     shape = (len(triangles) * layers, len(ref.weight))
     gradients, volumes = np.empty((*shape, ref.shape_gradient.shape[1], 3)), np.empty(shape)
-    ends = level_depths(layers)[::2]
+    ends = level_depths(layers)[None, ::2] if ends is None else ends
+    ends = np.ascontiguousarray(np.broadcast_to(ends, (len(outer), layers + 1)))
     _fill_rest(outer, inner, triangles, ends, ref.shape_gradient, ref.geometry_value, ref.geometry_gradient, ref.zeta,
                ref.weight, gradients, volumes)  # fmt: skip
     return gradients, volumes
@@ -273,16 +302,17 @@ def rest_gradients(
 
 @njit(cache=True)
 def _fill_rest(outer, inner, triangles, ends, slopes, value, plane, zeta, weight, gradients, volumes):
-    layers, jacobian, inverse = len(ends) - 1, np.empty((3, 3)), np.empty((3, 3))
+    layers, jacobian, inverse = ends.shape[1] - 1, np.empty((3, 3)), np.empty((3, 3))
     for t in range(len(triangles)):
         for layer in range(layers):
-            e, near, far = t * layers + layer, ends[layer], ends[layer + 1]
+            e = t * layers + layer
             for q in range(len(weight)):
-                depth = near + (far - near) * zeta[q]
                 for i in range(3):  # dX_i / d(xi, eta, zeta)
                     jacobian[i] = 0.0
                     for a in range(3):
                         c = triangles[t, a]
+                        near, far = ends[c, layer], ends[c, layer + 1]
+                        depth = near + (far - near) * zeta[q]
                         along = inner[c, i] - outer[c, i]
                         x = outer[c, i] + depth * along
                         jacobian[i, 0] += x * plane[a, 0]

@@ -52,16 +52,18 @@ def invert(F, inv):
 
 
 @njit(cache=True, fastmath=FAST)
-def internal_forces(u, columns, layers, gradients, volumes, mu, lam, forces):
+def internal_forces(u, columns, layers, gradients, volumes, mus, lams, forces):
     """Adds the internal forces [N] to `forces` (C, levels, 3) and returns the smallest det F; stops where it is <= 0.
 
-    u: (C, levels, 3) [m]; gradients (T L, Q, 3 n, 3) [1/m]; volumes (T L, Q) [m3].
+    u: (C, levels, 3) [m]; gradients (T L, Q, 3 n, 3) [1/m]; volumes (T L, Q) [m3]; mus and lams of the wedges,
+    (T L,) [Pa].
     """
     n_nodes, n_points = gradients.shape[2], gradients.shape[1]
     local, F, inv, P = np.empty((n_nodes, 3)), np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
     smallest = np.inf
     for e in range(gradients.shape[0]):
         t, level = e // layers, 2 * (e % layers)
+        mu, lam = mus[e], lams[e]
         for a in range(n_nodes):
             for i in range(3):
                 local[a, i] = u[columns[t, a // 3], level + a % 3, i]
@@ -86,13 +88,14 @@ def internal_forces(u, columns, layers, gradients, volumes, mu, lam, forces):
 
 
 @njit(cache=True, fastmath=FAST)
-def strain_energy(u, columns, layers, gradients, volumes, mu, lam):
+def strain_energy(u, columns, layers, gradients, volumes, mus, lams):
     """The stored energy [J] at u; infinite where an element is folded."""
     n_nodes = gradients.shape[2]
     local, F, inv = np.empty((n_nodes, 3)), np.empty((3, 3)), np.empty((3, 3))
     total = 0.0
     for e in range(gradients.shape[0]):
         t, level = e // layers, 2 * (e % layers)
+        mu, lam = mus[e], lams[e]
         for a in range(n_nodes):
             for i in range(3):
                 local[a, i] = u[columns[t, a // 3], level + a % 3, i]
@@ -110,7 +113,7 @@ def strain_energy(u, columns, layers, gradients, volumes, mu, lam):
 
 
 @njit(cache=True, fastmath=FAST)
-def tangent(u, columns, blocks, layers, gradients, volumes, mu, lam, convex, data):
+def tangent(u, columns, blocks, layers, gradients, volumes, mus, lams, convex, data):
     """Adds the tangent [N/m] to `data` (n_blocks, 3 m, 3 m), m = 2 L free levels; the bonded level is left out.
 
     With l = dF F^-1 the second variation is mu |dF|^2 + (mu - lambda ln J) l : l^T + lambda (tr l)^2. Only
@@ -122,6 +125,7 @@ def tangent(u, columns, blocks, layers, gradients, volumes, mu, lam, convex, dat
     g, K = np.empty((n_nodes, 3)), np.empty((n_nodes, n_nodes, 9))
     for e in range(gradients.shape[0]):
         t, level = e // layers, 2 * (e % layers)
+        mu, lam = mus[e], lams[e]
         for a in range(n_nodes):
             for i in range(3):
                 local[a, i] = u[columns[t, a // 3], level + a % 3, i]

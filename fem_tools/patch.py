@@ -12,8 +12,9 @@ from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import dijkstra
 
 from fem_tools.estimates import discretisation_error, error_bound, truncation_error
-from fem_tools.mesh import ElementName, WedgeMesh, level_depths, split
+from fem_tools.mesh import ElementName, WedgeMesh, split
 from fem_tools.newton import NewtonResult, NewtonSettings, is_positive_definite, solve, work_spent
+from fem_tools.plies import confined, largest_poisson_ratio, wedge_ends
 from fem_tools.skin_loads import DeadForces, FollowerPressure
 from fem_tools.system import System
 from stmpl_core.errors import InvalidInput, MeshError
@@ -21,7 +22,6 @@ from stmpl_core.extrusion import fold_ratios
 from stmpl_core.layer import SoftLayer
 from stmpl_core.load import Load
 from stmpl_core.methods.base import prepared
-from stmpl_core.methods.winkler import column_stretch
 from stmpl_core.trust import Displacement, Trust
 
 MIN_FOLD = 0.05  # smallest determinant of a wedge at rest, over its mean, that is meshed [-]
@@ -64,7 +64,8 @@ class PatchFem:
 
     Args:
         element: "P1xP2", "P2xP2", or None: quadratic in plane where nu > 0.42, linear elsewhere.
-        layers: wedges through the thickness; None: two where nu > 0.49, one elsewhere.
+        layers: wedges through the thickness, of a stack through its first material, with as many below as
+            fem_tools.plies.wedge_ends says; None: two where nu > 0.49, in a stack, or under a skin, one elsewhere.
         refine: number of times that the skin triangles near the load are split in four before meshing.
         reach: width of the patch beyond the load [largest thicknesses]; its rim is held.
         border: condition at the rim: "clamped" (no motion) or "mirror" (no motion across it: a plane of symmetry).
@@ -97,8 +98,6 @@ class PatchFem:
 
     def prepare(self, layer: SoftLayer) -> Self:
         """Keeps the layer, with its graph of edges and where it folds on itself when it is extruded."""
-        if not layer.tissue.single:
-            raise InvalidInput("PatchFem knows one soft material; this tissue has a skin or deeper materials.")
         self._folded = fold_ratios(layer.vertices, layer.inner_vertices, layer.faces) < MIN_FOLD
         length = np.linalg.norm(layer.vertices[layer.edges[:, 0]] - layer.vertices[layer.edges[:, 1]], axis=1)
         n = len(layer.vertices)
@@ -110,11 +109,12 @@ class PatchFem:
         """The element that this layer's Poisson's ratio asks for, unless one was chosen."""
         if self.element is not None:
             return self.element
-        return "P2xP2" if layer.tissue.poisson_ratio > QUADRATIC_ABOVE else "P1xP2"
+        return "P2xP2" if largest_poisson_ratio(layer.tissue) > QUADRATIC_ABOVE else "P1xP2"
 
     def layers_for(self, layer: SoftLayer) -> int:
-        """Wedges through the thickness that this layer's Poisson's ratio asks for, unless a number was chosen."""
-        return self.layers or (2 if layer.tissue.poisson_ratio > TWO_DEEP_ABOVE else 1)
+        """Wedges through the first material that this layer's tissue asks for, unless a number was chosen."""
+        deep = largest_poisson_ratio(layer.tissue) > TWO_DEEP_ABOVE or not layer.tissue.single
+        return self.layers or (2 if deep else 1)
 
     def patch_around(self, vertices: np.ndarray, edge_length: EdgeLength | None = None) -> Patch:
         """Meshes everything within `reach` thicknesses of the given vertices of the layer.
@@ -148,7 +148,8 @@ class PatchFem:
                 break
             outer, inner, away = (np.concatenate([x, x[edges].mean(axis=1)]) for x in (outer, inner, away))
             splits.append(edges)
-        mesh = WedgeMesh.of(outer, inner, triangles, self.element_for(layer), self.layers_for(layer))
+        ends = wedge_ends(layer.tissue, np.linalg.norm(inner - outer, axis=1), self.layers_for(layer))
+        mesh = WedgeMesh.of(outer, inner, triangles, self.element_for(layer), ends=ends)
         return Patch(chosen, mesh, mesh.border_columns(), distance[chosen], tuple(splits))
 
     def _refuse_folds(self, folded: np.ndarray) -> None:
@@ -291,11 +292,8 @@ def _ahead(before: list[tuple[float, np.ndarray]], pressure: float) -> np.ndarra
 
 
 def confined_guess(system: System, pressure: np.ndarray) -> np.ndarray:
-    """Each column compressed as if confined by its own pressure (Winkler), linearly through the depth."""
-    stretch = column_stretch(system.mesh.on_columns(pressure), system.tissue)
-    outer, inner = system.mesh.column_ends()
-    depth = level_depths(system.mesh.layers)[None, :, None]
-    u = (1 - stretch)[:, None, None] * (inner - outer)[:, None] * (1 - depth)
+    """Each column compressed as if confined by its own pressure (Winkler), linearly through each material."""
+    u = confined(system.mesh, system.tissue, system.mesh.on_columns(pressure))
     u[system.fixed] = 0.0
     return u if system.keep is None else np.einsum("cij,clj->cli", system.keep, u)
 

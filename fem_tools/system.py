@@ -9,7 +9,9 @@ import numpy as np
 from numba import njit
 
 from fem_tools import neo_hookean as nh
+from fem_tools.membrane import SkinMembrane
 from fem_tools.mesh import WedgeMesh
+from fem_tools.plies import wedge_materials
 from stmpl_core.tissue import Tissue
 
 
@@ -44,7 +46,7 @@ class System:
 
     Args:
         mesh: wedges.
-        tissue: tissue of all of them.
+        tissue: materials of the wedges, and the skin's membrane.
         loads: loads on the skin.
         fixed: mask of the columns that do not move at all, (C,).
         keep: projectors on the motions that each column may make, (C, 3, 3); None: all, but for the fixed ones.
@@ -60,7 +62,8 @@ class System:
     ) -> None:
         self.mesh, self.tissue = mesh, tissue
         self.loads: Sequence[SkinLoad] = loads
-        self.mu, self.lam = tissue.shear_modulus, tissue.lame_lambda
+        self.mu, self.lam = wedge_materials(mesh, tissue)
+        self.membrane = SkinMembrane(mesh, tissue.skin) if tissue.skin else None
         self.rest = mesh.rest_positions()
         self.fixed = fixed
         self.keep = keep
@@ -80,12 +83,17 @@ class System:
         """Stored energy plus the loads' potential [J]; infinite where an element is folded."""
         m, skin = self.mesh, self.rest[:, 0] + u[:, 0]
         stored = nh.strain_energy(u, m.columns, m.layers, m.gradients, m.volumes, self.mu, self.lam)
+        stored += self.membrane.energy(u[:, 0]) if self.membrane else 0.0
         return stored + sum(load.potential(skin, factor) for load in self.loads)
 
     def internal(self, u: np.ndarray) -> tuple[np.ndarray, float]:
-        """Internal forces (C, levels, 3) [N] and the smallest det F."""
+        """Internal forces (C, levels, 3) [N] and the smallest det F, or 0 where a face of a membrane has no area."""
         m, forces = self.mesh, np.zeros_like(u)
         smallest = nh.internal_forces(u, m.columns, m.layers, m.gradients, m.volumes, self.mu, self.lam, forces)
+        if self.membrane:
+            of_skin, grown = self.membrane.forces(u[:, 0])
+            forces[:, 0] += of_skin
+            smallest = smallest if grown > 0 else 0.0
         return forces, smallest
 
     def external(self, u: np.ndarray, factor: float) -> np.ndarray:
@@ -107,6 +115,8 @@ class System:
         m, width = self.mesh, 3 * self.free
         data = np.zeros((len(m.indices), width, width))
         nh.tangent(u, m.columns, m.blocks, m.layers, m.gradients, m.volumes, self.mu, self.lam, convex, data)
+        if self.membrane:
+            self.membrane.add_tangent(u[:, 0], data, convex=convex)
         skin = self.rest[:, 0] + u[:, 0]
         for load in self.loads:
             load.add_tangent(skin, factor, data, symmetric=symmetric, convex=convex)

@@ -147,17 +147,21 @@ class SoftLayer:
                 f"E {self.tissue.youngs_modulus:g} Pa, nu {self.tissue.poisson_ratio:g})")
 
 
-def single(layer: SoftLayer, who: str) -> SoftLayer:
-    """The layer, for those who know one material in columns straight below the skin. Raises InvalidInput for others."""
+def single(layer: SoftLayer, who: str, *, straight: bool = True) -> SoftLayer:
+    """The layer, for those who know one material only, and columns straight below the skin unless `straight` is False.
+
+    Raises:
+        InvalidInput: a layer with a skin, deeper materials or a core.
+    """
     tissue, more = layer.tissue, []
     if tissue.skin:
         more.append("a skin")
     if tissue.deeper:
         more.append(f"{len(tissue.deeper)} deeper material{'s' * (len(tissue.deeper) > 1)}")
-    if layer.core is not None:
+    if straight and layer.core is not None:
         more.append("columns that run to a core of their own")
     if more:
-        raise InvalidInput(f"{who} knows one soft material straight below the skin; this layer has "
+        raise InvalidInput(f"{who} knows one soft material{' straight below the skin' * straight}; this layer has "
                            f"{', '.join(more)}. PatchFem knows these.")
     return layer
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, Literal, Self
 
 import numpy as np
 from scipy.sparse import csr_matrix
@@ -14,6 +14,7 @@ from fem_tools.system import System, diagonal_blocks
 from stmpl_core.arrays import Points
 from stmpl_core.errors import InvalidInput, MeshError
 from stmpl_core.extras import needed
+from stmpl_core.layer import SoftLayer, single
 from stmpl_core.load import Load
 from stmpl_core.methods.base import prepared
 from stmpl_core.tissue import Tissue
@@ -233,6 +234,11 @@ class TetFem(PatchFem):
             raise InvalidInput('border is "mirror"; TetFem holds the rim of its patch, so only "clamped" is allowed.')
         self.mesher: Mesher = mesher
         self.name = "tet_fem"
+
+    def prepare(self, layer: SoftLayer) -> Self:
+        """See PatchFem.prepare. Raises InvalidInput for a skin or a stack."""
+        single(layer, "TetFem", straight=False)
+        return super().prepare(layer)
 
     def tets(self, patch: Patch) -> TetMesh:
         """The tetrahedra of a patch."""

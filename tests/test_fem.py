@@ -75,7 +75,8 @@ def test_stress_in_the_kernel_is_the_derivative_of_the_energy_density():
     F = np.array([[1.1, 0.2, 0.0], [-0.1, 0.9, 0.3], [0.05, 0.0, 0.8]])
     u = mesh.rest_positions() @ (F - np.eye(3)).T
     forces = np.zeros_like(u)
-    smallest = nh.internal_forces(u, mesh.columns, 1, mesh.gradients, mesh.volumes, mu, lam, forces)
+    moduli = np.full(1, mu), np.full(1, lam)
+    smallest = nh.internal_forces(u, mesh.columns, 1, mesh.gradients, mesh.volumes, *moduli, forces)
     assert smallest == pytest.approx(np.linalg.det(F))
     eps, P = 1e-6, np.empty((3, 3))
     for i, j in np.ndindex(3, 3):

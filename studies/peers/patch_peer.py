@@ -12,7 +12,7 @@ from fem_tools.patch import Patch, PatchFem
 from fem_tools.skin_loads import DeadForces, FollowerPressure
 from stmpl_core.arrays import VertexVectors
 from stmpl_core.errors import InvalidInput
-from stmpl_core.layer import SoftLayer
+from stmpl_core.layer import SoftLayer, single
 from stmpl_core.load import Load
 from stmpl_core.methods.base import prepared
 from stmpl_core.tissue import Tissue
@@ -113,7 +113,8 @@ class PatchPeer(ABC):
         self._kept: tuple[bytes, Patch, Any] | None = None
 
     def prepare(self, layer: SoftLayer) -> Self:
-        """See PatchFem.prepare."""
+        """See PatchFem.prepare. Raises InvalidInput for a skin or a stack."""
+        single(layer, type(self).__name__, straight=False)
         self._mesher.prepare(layer)
         self._layer, self._kept = layer, None
         return self
