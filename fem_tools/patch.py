@@ -207,7 +207,7 @@ class PatchFem:
     def guess(self, system: System, pressure: np.ndarray, factor: float) -> np.ndarray:
         """Where Newton starts under a share of a pressure at the triangle corners, (N,) [Pa]: every column confined.
 
-        Under a skin much stiffer than the layer it starts from rest: columns that give way one by one would tear the skin.
+        Under a skin much stiffer than the layer it starts from rest: columns that give way one by one would tear it.
         """
         layer = prepared(self._layer, self)
         if layer.tissue.kappa(float(layer.thickness.max())) > STIFF_SKIN:
