@@ -42,7 +42,7 @@ class SkinMembrane:
         self.balanced = np.zeros((mesh.n_columns, 3))  # f_0 [N]
         self.balanced -= self.forces(np.zeros((mesh.n_columns, 3)))[0]
 
-    def _arguments(self) -> tuple:
+    def _arguments(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, float, float, float]:
         return self.mesh.columns, self.gradients, self.axes, self.areas, self.shear, self.nu, self.tension
 
     def energy(self, u: np.ndarray) -> float:
