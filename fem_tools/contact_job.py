@@ -128,7 +128,8 @@ class Bench:
         """Prepares the solvers."""
         pressing = PatchFem(reach=body.reach, refine=plan.refine).prepare(layer)
         paper_fem = PatchFem(reach=body.reach).prepare(layer)
-        pressed = PatchFem(reach=body.reach, refine=INDENTER_REFINE, layers=INDENTER_LAYERS)
+        element, layers = ("P1xP2", 1) if plan.linear else (None, INDENTER_LAYERS)
+        pressed = PatchFem(element=element, reach=body.reach, refine=INDENTER_REFINE, layers=layers)
         indenting = IndenterFem(pressed, step=plan.indenter_step).prepare(layer)
         return cls(Site(layer), pressing, paper_fem, indenting)
 
@@ -151,7 +152,7 @@ def solve_contact(job: Job) -> bytes:
     }
     try:
         started = time.process_time()
-        scene, drawn = draw(contact, bench.site, job.hand, rng)
+        scene, drawn = draw(plan, contact, bench.site, job.hand, rng)
         seconds["draw"] = time.process_time() - started
     except UnusableContact as error:
         drops = [Drop(str(contact), kind, float(r), str(error)) for kind in loads for r in loads[kind]]

@@ -18,6 +18,7 @@ from typing import Any
 
 import numpy as np
 import zarr
+from pydantic import ValidationError
 
 from fem_tools.contact_job import Drop, Job, Part, Skin, solve_contact
 from fem_tools.dataset import FORMAT, Writer, write_layer
@@ -79,10 +80,18 @@ def _manifest_of(plan: Plan, out: Path) -> dict[str, Any] | None:
             raise InvalidInput(f"{out} is not empty and holds no data set. Choose another folder.")
         return None
     kept = json.loads(path.read_text())
-    if kept.get("format") != FORMAT or kept.get("plan") != plan.model_dump(mode="json"):
+    if kept.get("format") != FORMAT or not _same(kept.get("plan"), plan):
         raise InvalidInput(f"{out} holds data of another plan ({kept.get('plan', {}).get('preset')}). "
                            "Choose another folder, or remove it.")  # fmt: skip
     return kept
+
+
+def _same(kept: Any, plan: Plan) -> bool:
+    """Whether a plan on disk is this one; what it does not say is as it was before it could be said."""
+    try:
+        return Plan.model_validate(kept) == plan
+    except ValidationError:
+        return False
 
 
 @dataclass

@@ -6,7 +6,7 @@ import hashlib
 import math
 import string
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from typing import Any, Literal
 
@@ -17,8 +17,9 @@ from scipy.spatial.transform import Rotation
 from fem_tools.hand import Hand
 from fem_tools.scenes import EDGE, Scene, Site, UnusableContact, ellipse, letter
 from stmpl_core.body import Body
+from stmpl_core.bones import bones_of, to_bone
 from stmpl_core.layer import SoftLayer
-from stmpl_core.tissue import Tissue
+from stmpl_core.tissue import Membrane, Ply, Tissue
 
 Kind = Literal["pressure", "nodal", "indenter"]
 SetName = Literal["disc", "ellipse", "seam", "field", "indenter", "tool", "hand", "band", "letter"]
@@ -42,6 +43,26 @@ SIZES = (4e-3, 25e-3)  # m, half their width
 TILT = 0.25  # rad, of a tool's axis and of its way
 SLANTED, SLANT = 0.25, 0.8  # share of tools that come at a slant of up to so much [rad]
 SHALLOWEST = 0.01  # thicknesses, of indenters
+SKIN = 1.5e-3  # m, thickness of a skin
+
+
+class StackPlan(BaseModel):
+    """Fat on muscle under a skin, in ratios to fat and to the layer's median thickness t."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    kappa: float = Field(ge=0)  # E_s h / (E t); 0: no skin
+    pull: float = Field(default=0.0, ge=0)  # T / (E t)
+    fat: float = Field(default=1.0, gt=0, le=1)  # depth at which muscle begins, over t; 1: no muscle
+    muscle: float = Field(default=1.0, gt=0)  # its modulus over that of fat
+
+    def tissue(self, poisson_ratio: float, thickness: float) -> Tissue:
+        """The tissue, of fat of 1 kPa, for a median thickness [m]."""
+        fat = Tissue(poisson_ratio=poisson_ratio)
+        unit = fat.youngs_modulus * thickness
+        skin = Membrane(self.kappa * unit / SKIN, SKIN, self.pull * unit) if self.kappa else None
+        muscle = Ply(self.fat * thickness, self.muscle * fat.youngs_modulus, poisson_ratio)
+        return replace(fat, skin=skin, deeper=(muscle,) if self.fat < 1 else ())
 
 
 class BodyPlan(BaseModel):
@@ -53,6 +74,8 @@ class BodyPlan(BaseModel):
     weight: float = Field(ge=0, le=1)
     thickness: float | tuple[float, float]  # m; two: varies smoothly between them
     poisson_ratio: float = Field(default=0.4, ge=0, lt=0.5)
+    stack: StackPlan | None = None  # None: one material
+    to_bone: bool = False  # columns run to the bones, or end at the thickness if they are longer
     part: str | None = None  # of the body; None: the plan's
     edge_length: float | None = None  # m, of the skin; None: the plan's
     reach: float = Field(default=6.0, gt=0)  # largest thicknesses under the load
@@ -98,6 +121,31 @@ CONTACT_BODIES = tuple(
 )  # fmt: skip
 
 
+TISSUE_BODIES = tuple(
+    BodyPlan(name=name, weight=w, thickness=t, poisson_ratio=nu, part=part, edge_length=edge, to_bone=True,
+             stack=StackPlan(kappa=kappa, pull=pull, fat=fat, muscle=muscle), reach=6.0 + kappa / 5, paper_rule=False,
+             out_of_distribution=False, share=share, held_out=part[:5] == "right")
+    for name, w, part, t, edge, nu, kappa, pull, fat, muscle, share in (
+        # what a limb has, to the bone and above it
+        ("arm_bone", 0.5, "left_arm", 0.06, 7e-3, 0.45, 2.0, 0.15, 0.3, 5.0, 1.0),
+        ("arm_lean", 0.1, "left_arm", 0.06, 6e-3, 0.45, 6.0, 0.4, 0.15, 8.0, 1.0),
+        ("arm_heavy", 0.9, "left_arm", 0.06, 8e-3, 0.43, 1.0, 0.1, 0.5, 4.0, 1.0),
+        ("arm_20", 0.4, "left_arm", 0.02, 6e-3, 0.4, 3.0, 0.2, 0.6, 3.0, 1.0),
+        ("arm_12", 0.6, "left_arm", 0.012, 4e-3, 0.45, 10.0, 0.6, 0.4, 10.0, 1.0),
+        ("leg_bone", 0.5, "left_leg", 0.08, 12e-3, 0.45, 1.5, 0.1, 0.2, 5.0, 0.6),
+        ("leg_30", 0.7, "left_leg", 0.03, 9e-3, 0.42, 5.0, 0.3, 0.35, 12.0, 1.0),
+        # the ends of the ranges
+        ("bare", 0.3, "left_arm", 0.02, 6e-3, 0.42, 0.0, 0.0, 0.5, 4.0, 1.0),
+        ("drum", 0.5, "left_arm", 0.015, 5e-3, 0.4, 30.0, 1.0, 1.0, 1.0, 1.0),
+        ("sheet", 0.8, "left_arm", 0.025, 7e-3, 0.35, 0.3, 0.02, 1.0, 1.0, 1.0),
+        ("even", 0.2, "left_arm", 0.03, 8e-3, 0.45, 1.0, 0.05, 1.0, 1.0, 1.0),
+        # nothing is learnt from these
+        ("forearm", 0.6, "right_forearm", 0.06, 6e-3, 0.45, 2.5, 0.2, 0.25, 6.0, 0.4),
+        ("thigh", 0.3, "right_thigh", 0.05, 10e-3, 0.45, 3.0, 0.15, 0.2, 5.0, 0.4),
+    )
+)  # fmt: skip
+
+
 class Plan(BaseModel):
     """Everything that decides what is generated: the same plan gives the same data.
 
@@ -129,6 +177,10 @@ class Plan(BaseModel):
     highest_nodal: float = Field(default=0.4, gt=0)  # p / E at the worst vertex, of the paper's rule
     deepest: float = Field(default=0.7, gt=0, lt=1)  # thicknesses, of indenters
     indenter_step: float = Field(default=0.04, gt=0)  # thicknesses, of indenters
+    clear: float = Field(default=5.0, gt=0)  # distance of tools from the open border, thicknesses
+    thinnest: float = Field(default=0.0, ge=0)  # thickness under tools, over the edge length
+    sizes: tuple[float, float] = SIZES  # m, half the width of tools
+    linear: bool = False  # elements linear in plane whatever nu is; they are 1 to 3 % off in force up to 0.45
     seed: int = 0
 
     def body(self, name: str) -> BodyPlan:
@@ -152,6 +204,9 @@ PRESETS = {
     "paper": Plan(preset="paper", bodies=PAPER_BODIES + VARYING_BODIES[:2], indenters=40),
     "contacts": Plan(preset="contacts", bodies=CONTACT_BODIES, discs=0, ellipses=0, seams=0, hands=0, bands=0,
                      letters=0, tools=60, loads=8, deepest=0.9, indenter_step=0.08),
+    "tissue": Plan(preset="tissue", bodies=TISSUE_BODIES, discs=0, ellipses=0, seams=0, hands=0, bands=0, letters=0,
+                   tools=45, loads=7, deepest=0.6, indenter_step=0.12, clear=4.0, thinnest=1.4, sizes=(4e-3, 40e-3),
+                   linear=True),
 }  # fmt: skip
 
 
@@ -215,12 +270,21 @@ def layers(plan: Plan) -> dict[str, SoftLayer]:
     out = {}
     for body in plan.bodies:
         patch, skin = patches[kinds[body.name]], Body.anny(weight=body.weight)
-        tissue, thickness = Tissue(poisson_ratio=body.poisson_ratio), body.thickness
+        thickness = body.thickness
         if isinstance(thickness, tuple):
             rng = ContactId(body.name, "disc", -2).rng(plan.seed)
             thickness = varying(patch.layer(skin, thickness=thickness[0]).vertices, thickness, rng)
-        out[body.name] = patch.layer(skin, thickness=thickness, tissue=tissue)
+        out[body.name] = _stacked(body, skin, patch.part, patch.layer(skin, thickness=SKIN)) if body.to_bone else \
+            patch.layer(skin, thickness=thickness, tissue=Tissue(poisson_ratio=body.poisson_ratio))
     return out
+
+
+def _stacked(body: BodyPlan, skin: Body, part: str, layer: SoftLayer) -> SoftLayer:
+    """The layer with columns to its bones, of the body's stack."""
+    assert isinstance(body.thickness, float)
+    layer = to_bone(layer, bones_of(skin, part), body.thickness)
+    stack = body.stack or StackPlan(kappa=0)
+    return layer.with_(tissue=stack.tissue(body.poisson_ratio, float(np.median(layer.thickness))))
 
 
 def varying(points: np.ndarray, bounds: tuple[float, float], rng: np.random.Generator) -> np.ndarray:
@@ -240,7 +304,9 @@ def ratios(plan: Plan, kind: Kind, count: int, rng: np.random.Generator) -> np.n
     return share * highest
 
 
-def draw(contact: ContactId, site: Site, hand: Hand | None, rng: np.random.Generator) -> tuple[Scene, dict[str, Any]]:
+def draw(
+    plan: Plan, contact: ContactId, site: Site, hand: Hand | None, rng: np.random.Generator
+) -> tuple[Scene, dict[str, Any]]:
     """Sets a tool down on the skin, drawing again where it cannot stand, and says what was drawn.
 
     Raises:
@@ -248,7 +314,7 @@ def draw(contact: ContactId, site: Site, hand: Hand | None, rng: np.random.Gener
     """
     for _ in range(ATTEMPTS):
         try:
-            scene, drawn = _draw_once(contact, site, hand, rng)
+            scene, drawn = _draw_once(plan, contact, site, hand, rng)
             return scene, drawn
         except UnusableContact as error:
             last = error
@@ -256,7 +322,7 @@ def draw(contact: ContactId, site: Site, hand: Hand | None, rng: np.random.Gener
 
 
 def _draw_once(
-    contact: ContactId, site: Site, hand: Hand | None, rng: np.random.Generator
+    plan: Plan, contact: ContactId, site: Site, hand: Hand | None, rng: np.random.Generator
 ) -> tuple[Scene, dict[str, Any]]:
     from fem_tools.tool_shapes import rounded_tool
 
@@ -287,7 +353,7 @@ def _draw_once(
                   "loose": loose.round(4).tolist()}  # fmt: skip
         return site.grasp(vertex, hand, drawn["turn"], drawn["depth"], np.array(drawn["loose"])), drawn
     if contact.set == "tool":
-        return _draw_tool(vertex, turn, site, rng, drawn)
+        return _draw_tool(plan, vertex, turn, site, rng, drawn)
     drawn |= {"tool": str(rng.choice(["sphere", "capsule", "cylinder"])), "radius": float(rng.uniform(*BALLS))}
     mesh = rounded_tool(drawn["tool"], drawn["radius"])
     pose = site.standing(vertex, drawn["radius"], turn)
@@ -298,9 +364,9 @@ def _draw_once(
 
 
 def _draw_tool(
-    vertex: int, turn: float, site: Site, rng: np.random.Generator, drawn: dict[str, Any]
+    plan: Plan, vertex: int, turn: float, site: Site, rng: np.random.Generator, drawn: dict[str, Any]
 ) -> tuple[Scene, dict[str, Any]]:
-    size = float(np.exp(rng.uniform(math.log(SIZES[0]), math.log(SIZES[1]))))
+    size = float(np.exp(rng.uniform(math.log(plan.sizes[0]), math.log(plan.sizes[1]))))
     slant = SLANT if rng.uniform() < SLANTED else TILT
     drawn |= {"tool": str(rng.choice(TOOLS)), "size": size, "shape": rng.uniform(0, 1, 8).round(4).tolist(),
               "tilt": rng.uniform(-TILT, TILT, 2).round(4).tolist(),
@@ -308,7 +374,10 @@ def _draw_tool(
     scene = tool_scene(site, drawn)
     assert scene.tool is not None
     radius = float(np.linalg.norm(scene.tool.vertices, axis=1).max())
-    if (gap := float(site.border_distance[vertex])) < 5 * site.layer.thickness[vertex] + min(radius, 2 * SIZES[1]):
+    clear = plan.clear * site.layer.thickness[vertex] + min(radius, 2 * SIZES[1])
+    if site.layer.thickness[vertex] < plan.thinnest * site.layer.edge_length:
+        raise UnusableContact("the tissue is thinner there than the mesh is fine")
+    if (gap := float(site.border_distance[vertex])) < clear:
         raise UnusableContact(f"it stands {gap * 1e3:.0f} mm from the open border")
     return scene, drawn
 

@@ -104,6 +104,8 @@ def core_of(vertices: Points, normals: VertexVectors, faces: Faces, bones: Seque
     share = np.exp(-(cost - cost.min(axis=0)) / BLEND)
     share /= share.sum(axis=0)
     columns = np.einsum("bv,bvi->vi", share, np.array(ways) * np.array(lengths)[..., None])
+    steep = FACING * np.linalg.norm(columns, axis=1) + np.einsum("ij,ij->i", columns, normals)
+    columns -= np.maximum(steep, 0)[:, None] * normals  # no column leaves the skin sideways, as at an armpit
     if thickness is not None:
         deep = -np.einsum("ij,ij->i", columns, normals)
         columns *= np.minimum(thickness / np.maximum(deep, FACING * thickness), 1)[:, None]

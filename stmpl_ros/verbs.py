@@ -240,7 +240,7 @@ def recover(path: BagPath, target: Path | None = None) -> int:
 
 
 def generate(
-    preset: Literal["tiny", "default", "paper", "contacts"] = "default",
+    preset: Literal["tiny", "default", "paper", "contacts", "tissue"] = "default",
     out: Path | None = None,
     workers: int | None = None,
     scheduler: str | None = None,
@@ -251,7 +251,8 @@ def generate(
     Example: stmpl generate --preset tiny --out data/tiny
 
     Args:
-        preset: size of the data: tiny (seconds), default (under an hour on two cores), paper (hours).
+        preset: size of the data: tiny (seconds), default (under an hour on two cores), paper (hours); contacts
+            (rigid tools), tissue (the same on stacks to the bone): hours.
         out: folder of the data; data/<preset> unless given.
         workers: local processes; one a core unless given.
         scheduler: address of a Dask scheduler that does the work instead.

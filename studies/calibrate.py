@@ -120,7 +120,7 @@ def trials_on(plan: Plan, body: BodyPlan, layer: SoftLayer, rungs: Sequence[Meth
         contact = ContactId(body.name, kind, number)
         rng = contact.rng(plan.seed)
         try:
-            scene = _outlined(site, kind, rng) if kind in OUTLINES else draw(contact, site, hand, rng)[0]
+            scene = _outlined(site, kind, rng) if kind in OUTLINES else draw(plan, contact, site, hand, rng)[0]
         except UnusableContact:
             continue
         edge = str(rng.choice(EDGES))

@@ -29,11 +29,11 @@ def test_tissue_thinner_than_the_way_to_the_bone_ends_above_it():
 
 
 @pytest.mark.parametrize("part", ["left_forearm", "left_calf", "left_thigh", "left_arm"])
-def test_columns_to_bone_fold_on_less_than_half_a_percent_of_a_limb_where_normals_fold_on_a_tenth(part):
+def test_columns_to_bone_fold_nowhere_on_a_limb_where_normals_fold_on_a_twentieth_and_more(part):
     body = Body.anny()
     layer = to_bone(body.part(part), bones_of(body, part))
     straight = layer.vertices - layer.thickness[:, None] * layer.normals
-    assert (fold_ratios(layer.vertices, layer.inner_vertices, layer.faces) < 0.05).mean() < 0.005
+    assert fold_ratios(layer.vertices, layer.inner_vertices, layer.faces).min() > 0.05
     assert (fold_ratios(layer.vertices, straight, layer.faces) < 0.05).mean() > 0.05
     assert 0.005 < np.median(layer.thickness) < 0.07 and layer.thickness.min() > 0
 

@@ -66,7 +66,7 @@ def test_a_drawn_tool_stands_above_the_skin_and_looks_at_it() -> None:
     layer = scenes.limb(4e-3, 6e-3, length=0.3)
     site, kinds = Site(layer), set()
     for contact in [c for c in contacts(PRESETS["contacts"]) if c.body == "even_75"][:12]:
-        scene, figures = draw(contact, site, None, contact.rng(0))
+        scene, figures = draw(PRESETS["contacts"], contact, site, None, contact.rng(0))
         assert scene.tool is not None
         pose = scene.pose_body_from_tool
         points = scene.tool.vertices @ pose[:3, :3].T + pose[:3, 3]
@@ -74,7 +74,7 @@ def test_a_drawn_tool_stands_above_the_skin_and_looks_at_it() -> None:
         assert away.min() > 0
         assert -pose[:3, 2] @ layer.normals[figures["vertex"]] < -0.7
         kinds.add(figures["tool"])
-        again, _ = draw(contact, site, None, contact.rng(0))
+        again, _ = draw(PRESETS["contacts"], contact, site, None, contact.rng(0))
         assert again.tool is not None and again.tool.vertices.tobytes() == scene.tool.vertices.tobytes()
     assert len(kinds) > 3
 
