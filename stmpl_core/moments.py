@@ -8,7 +8,8 @@ from weakref import WeakKeyDictionary
 import numba
 import numpy as np
 
-from stmpl_core.layer import SoftLayer, single
+from stmpl_core.errors import InvalidInput
+from stmpl_core.layer import SoftLayer
 from stmpl_core.response import (
     REACH,
     SCALARS,
@@ -79,7 +80,8 @@ class Surroundings:
     """
 
     def __init__(self, layer: SoftLayer) -> None:
-        single(layer, "the linear response")
+        if not layer.tissue.single and np.ptp(layer.thickness) > 0:
+            raise InvalidInput("the flat response of a stack wants one thickness.")
         self.frames, self._thickness = _frames(layer.normals), layer.thickness
         points = np.ascontiguousarray(layer.vertices)
         self._thinning = Thinning(layer, self.frames, REACH)
@@ -92,7 +94,8 @@ class Surroundings:
         own = np.stack([xx, xy, xy, yy], axis=1).reshape(-1, 2, 2)
         bend, slope = tangents.transpose(0, 2, 1) @ own @ tangents, np.einsum("va,vax->vx", self.slope, tangents)
         self.bent = np.concatenate([bend.reshape(-1, 9), slope], axis=1)
-        self._response = np.ascontiguousarray(np.moveaxis(response_table(layer.tissue.poisson_ratio), 2, 0))
+        table = response_table(layer.tissue, float(layer.thickness[0]))
+        self._response = np.ascontiguousarray(np.moveaxis(table, 2, 0))
         with packed():
             self._felt(np.zeros((1, 1)), np.zeros(1, np.int64), np.zeros(1, np.int32), moments=True)
 
@@ -105,6 +108,11 @@ class Surroundings:
         loaded = np.flatnonzero(sources.any(axis=1)) if asked is None else asked.loaded
         vertices = self._thinning.reached(loaded) if asked is None else asked.vertices
         return Felt(vertices, self._by_groups(sources[loaded], loaded, vertices, moments=True))
+
+    def of_one(self, vertex: int) -> np.ndarray:
+        """Linear response to a unit source at one vertex, (V, 3) [m], computed at every vertex."""
+        figures = self._by_groups(np.ones((1, 1)), np.array([vertex]), np.arange(len(self.frames)), moments=False)
+        return np.einsum("nj,nji->ni", figures[:, 0, :3] * self._thickness[:, None], self.frames)
 
     def linear(self, source: np.ndarray) -> np.ndarray:
         """Linear response alone to one source field (V,) [-], (V, 3) [m]."""

@@ -9,6 +9,8 @@ import numba
 import numpy as np
 from scipy.special import j0, j1
 
+from stmpl_core.tissue import Tissue
+
 REACH = 8.0  # distance to which a vertex feels a load, over t; the linear response there is below 0.01 % of its peak
 NEAR = 4.0  # distance to which moments are taken, over t
 STEPS = 48  # rows of the response table a thickness
@@ -21,8 +23,12 @@ WIDTH = 32  # figures of one source field at one vertex, the last of them unused
 SPREAD = 0.408  # deviation over the root of the vertex area of the Gaussian with the mean 1 / r of a linear hat
 
 
-def response_table(poisson_ratio: float) -> np.ndarray:
+def response_table(tissue: Tissue, thickness: float = 1.0) -> np.ndarray:
     """Response of a flat bonded layer to a unit normal force on its surface, E = 1, t = 1, (spread, radius, 2).
+
+    Args:
+        tissue: what the layer is made of.
+        thickness: its thickness [m]; only a stack's response depends on it.
 
     The force is spread as a Gaussian of standard deviation SPREADS. Columns: sinking, and motion away from the force.
     With K = k t, a pressure cos(k x) sinks the surface by A cos(k x) and moves it along by B sin(k x):
@@ -30,27 +36,41 @@ def response_table(poisson_ratio: float) -> np.ndarray:
         mu k A = (1 - nu) ((3 - 4 nu) sinh 2K - 2K) / D,    mu k B = (K^2 - (1 - 2 nu)(3 - 4 nu) sinh^2 K) / D
         D = (3 - 4 nu) cosh 2K + 2 K^2 + 5 - 12 nu + 8 nu^2
 
-    (plane strain by an Airy function, as in Johnson, "Contact Mechanics", 1985, chapter 5), and a force spreads as
-    Hankel transforms of order 0 and 1 of these. What the cut at REACH takes of the whole sinking is given back near
-    the force, so that a wide pressure sinks the layer by exactly p t / M.
+    (plane strain by an Airy function, as in Johnson, "Contact Mechanics", 1985, chapter 5; of a stack those of
+    stmpl_core.stack), and a force spreads as Hankel transforms of order 0 and 1 of these. What the cut at REACH takes
+    of the whole sinking of one material is given back near the force, so that a wide pressure sinks the layer by
+    exactly p t / M.
     """
-    nu, mu = poisson_ratio, 1 / (2 * (1 + poisson_ratio))
     radius = np.arange(int(REACH * STEPS) + 2) / STEPS
     table = np.empty((len(SPREADS), len(radius), 2))
     k = np.linspace(0, 6 / SPREADS[0], 4001)[1:]
-    e = np.exp(-2 * k)  # the transforms are divided by exp(2 K) / 2, so that nothing overflows
-    scale = mu * k * ((3 - 4 * nu) * (1 + e * e) + 2 * e * (2 * k * k + 5 - 12 * nu + 8 * nu * nu))
-    sink = (1 - nu) * ((3 - 4 * nu) * (1 - e * e) - 4 * k * e) / scale
-    along = (2 * e * k * k - (1 - 2 * nu) * (3 - 4 * nu) * 0.5 * (1 - e) ** 2) / scale
+    sink, along = _of_one(tissue.poisson_ratio, k) if tissue.single else _of_stack(tissue, thickness, k)
     phase = np.outer(k, radius)
     weight = np.exp(-0.5 * (k * SPREADS[:, None]) ** 2) * k * (k[1] - k[0]) / (2 * np.pi)
     table[:, :, 0], table[:, :, 1] = (weight * sink) @ j0(phase), (weight * along) @ j1(phase)
     fade = np.clip((REACH - radius) / 1.5, 0, 1)
     table *= (fade * fade * (3 - 2 * fade))[:, None]
-    ring = 2 * np.pi * radius / STEPS
+    if not tissue.single:
+        return table.astype(np.float32)
+    nu, ring = tissue.poisson_ratio, 2 * np.pi * radius / STEPS
     lost = (1 + nu) * (1 - 2 * nu) / (1 - nu) - table[:, :, 0] @ ring
     table[:, :, 0] += lost[:, None] * fade * np.exp(-radius) / ((fade * np.exp(-radius)) @ ring)
     return table.astype(np.float32)
+
+
+def _of_one(nu: float, k: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """A and B of one material at wave numbers k [1/t], (K,) each [t/E]."""
+    mu = 1 / (2 * (1 + nu))
+    e = np.exp(-2 * k)  # the transforms are divided by exp(2 K) / 2, so that nothing overflows
+    scale = mu * k * ((3 - 4 * nu) * (1 + e * e) + 2 * e * (2 * k * k + 5 - 12 * nu + 8 * nu * nu))
+    sink = (1 - nu) * ((3 - 4 * nu) * (1 - e * e) - 4 * k * e) / scale
+    return sink, (2 * e * k * k - (1 - 2 * nu) * (3 - 4 * nu) * 0.5 * (1 - e) ** 2) / scale
+
+
+def _of_stack(tissue: Tissue, thickness: float, k: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    from stmpl_core.stack import compliance  # its fits load scipy's optimisers
+
+    return compliance(tissue, thickness, k)
 
 
 def ring_table() -> np.ndarray:

@@ -148,9 +148,9 @@ def test_loads_increase_and_stay_in_their_range() -> None:
 
 def test_a_contact_draws_the_same_whoever_draws_it(limb: SoftLayer) -> None:
     contact = next(c for c in contacts(TINY) if c.set == "letter")
-    first, second = (draw(contact, Site(limb), None, contact.rng(0)) for _ in range(2))
+    first, second = (draw(PRESETS["tiny"], contact, Site(limb), None, contact.rng(0)) for _ in range(2))
     assert first[1] == second[1] and (first[0].footprint == second[0].footprint).all()
-    other = draw(contact, Site(limb), None, contact.rng(1))
+    other = draw(PRESETS["tiny"], contact, Site(limb), None, contact.rng(1))
     assert other[1] != first[1]
 
 

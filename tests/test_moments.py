@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from fem_tools import PatchFem
-from stmpl_core import Load, Skin, SoftLayer
+from stmpl_core import Load, Skin, SoftLayer, Tissue
 from stmpl_core.errors import InvalidInput, NotPrepared
 from stmpl_core.methods import Linear, MomentNet
 from stmpl_core.metrics import score
@@ -40,7 +40,7 @@ def test_a_unit_force_sinks_as_much_in_all_as_a_uniform_pressure_sinks_a_confine
     """The integral of the response over the plane is t / M."""
     radius = np.arange(int(REACH * STEPS) + 2) / STEPS
     for level in (4, 9):
-        whole = response_table(nu)[level, :, 0] @ (2 * np.pi * radius) / STEPS
+        whole = response_table(Tissue(poisson_ratio=nu))[level, :, 0] @ (2 * np.pi * radius) / STEPS
         assert whole == pytest.approx((1 + nu) * (1 - 2 * nu) / (1 - nu), rel=1e-4)
 
 
@@ -48,7 +48,7 @@ def test_a_force_on_a_thick_layer_sinks_it_as_boussinesq_says() -> None:
     """Close to a force the rigid floor is not felt: u = (1 - nu^2) / (pi E r)."""
     nu, step = 0.3, 1 / STEPS
     r = np.arange(round(5 * SPREADS[0] / step), round(0.4 / step)) * step
-    floor = response_table(nu)[0, np.round(r / step).astype(int), 0] - (1 - nu**2) / (np.pi * r)
+    floor = response_table(Tissue(poisson_ratio=nu))[0, np.round(r / step).astype(int), 0] - (1 - nu**2) / (np.pi * r)
     assert np.ptp(floor) < 0.01 * (1 - nu**2) / (np.pi * r[0])  # what the floor takes away is nearly constant there
 
 

@@ -29,6 +29,7 @@ METHODS = {  # module and class of each method, by its name
     "zero": "stmpl_core.methods.zero:Zero",
     "ladder": "fem_tools.ladder:ladder",
     "fem": "fem_tools.patch:PatchFem",
+    "limb_linear": "fem_tools.limb:LimbLinear",
 }
 _CLASSES = {"Coarse": "coarse", "Ladder": "ladder", "Linear": "linear", "MomentNet": "moment_net", "Naive": "naive",
             "UNet": "unet", "Winkler": "winkler", "Zero": "zero"}  # fmt: skip

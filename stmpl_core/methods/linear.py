@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Self
 
-from stmpl_core.layer import SoftLayer
+from stmpl_core.layer import SoftLayer, single
 from stmpl_core.load import Load
 from stmpl_core.methods.base import prepared
 from stmpl_core.moments import Surroundings
@@ -28,7 +28,8 @@ class Linear:
         self._surroundings: Surroundings | None = None
 
     def prepare(self, layer: SoftLayer) -> Self:
-        """Finds each vertex's neighbours (about half a second for a limb)."""
+        """Finds each vertex's neighbours (half a second for a limb). Raises InvalidInput for a skin or a stack."""
+        single(layer, "Linear")
         self._surroundings = Surroundings.of(layer)
         self._layer = layer
         return self

@@ -10,7 +10,7 @@ import numba
 import numpy as np
 
 from stmpl_core.errors import InvalidInput
-from stmpl_core.layer import SoftLayer
+from stmpl_core.layer import SoftLayer, single
 from stmpl_core.load import Load
 from stmpl_core.methods.base import Method, prepared
 from stmpl_core.methods.winkler import column_stretch
@@ -79,7 +79,8 @@ class MomentNet:
         return self.contact.card.get("contact_bound")
 
     def prepare(self, layer: SoftLayer) -> Self:
-        """Finds each vertex's neighbours (about half a second for a limb)."""
+        """Finds each vertex's neighbours (half a second for a limb). Raises InvalidInput for a skin or a stack."""
+        single(layer, "MomentNet")
         self._near = near = Surroundings.of(layer)
         self._shape = np.concatenate([near.curvature, near.slope], axis=1).astype(np.float32)
         self._frames = near.frames.astype(np.float32) * layer.thickness[:, None, None].astype(np.float32)
