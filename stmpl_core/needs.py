@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from scipy.optimize import brentq
@@ -108,8 +108,8 @@ class Needs:
         what = "every material as its own layer" if self.rung == 2 and not self["skin"].needed else RUNGS[self.rung]
         if self["skin"].needed and not self["tension"].needed:
             what = what.replace("membrane", "membrane without tension")
-        also = [said for name, said in (("time", "relaxation in time"), ("slip", "slip"), ("mesh", "a finer mesh"))
-                if self[name].needed]  # fmt: skip
+        more: dict[TermName, str] = {"time": "relaxation in time", "slip": "slip", "mesh": "a finer mesh"}
+        also = [said for name, said in more.items() if self[name].needed]
         is_, most = "no single layer is", f"{self.enough.force:.0%} in force and {self.enough.motion:.0%} in motion"
         if self.layer:
             what += f" of {self.layer.youngs_modulus * 1e-3:.2g} kPa and {self.layer.thickness * 1e3:.2g} mm"
@@ -328,9 +328,9 @@ def _mesh(tissue: Tissue, thickness: float, pressed: tuple[Indentation, ...], ed
         return float(np.linalg.norm(np.minimum(0.0685 * (k * length) ** 2, 1) * motion) / np.linalg.norm(motion[0]))
 
     least, most = np.log(narrow.contact_radius) + np.array([-7, 7])
-    longest = np.exp(brentq(lambda log: off(np.exp(log)) - min(enough.motion, 0.9), least, most))
+    longest: Any = brentq(lambda log: off(np.exp(log)) - min(enough.motion, 0.9), least, most)
     wide = f"the narrowest contact is {narrow.contact_radius * 2e3:.2g} mm wide"
-    said = f"Edges up to {longest * 1e3:.2g} mm serve; {wide}"
+    said = f"Edges up to {np.exp(longest) * 1e3:.2g} mm serve; {wide}"
     if edge is None:
         return Term("mesh", None, None, False, f"No edge was given. {said}.")
     over = f", the edges are {edge / narrow.contact_radius:.2g} of its radius"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -237,11 +237,12 @@ def ball(
     usual = np.sqrt(radius * depth) if depth is not None else radius + thickness
     bounds = (1e-2 * usual, 2 * usual) if depth is not None else (1e-5 * usual, 20 * usual)
     try:
-        return at(float(brentq(beyond, *bounds, rtol=1e-6)))
+        a: Any = brentq(beyond, *bounds, rtol=1e-6)  # type: ignore[arg-type]
     except ValueError:
         asked = f"{depth * 1e3:g} mm deep" if depth is not None else f"under {force:g} N"
         raise InvalidInput(f"a ball of {radius * 1e3:g} mm, {asked}, is beyond the linear response of "
                            f"{thickness * 1e3:g} mm. Try less.") from None  # fmt: skip
+    return at(float(a))
 
 
 def ball_force(tissue: Tissue, thickness: float, radius: float, depth: float) -> float:
