@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.optimize import brentq, least_squares
-from scipy.special import j0
+from scipy.special import j0, j1, jv
 
 from stmpl_core.errors import InvalidInput
 from stmpl_core.tissue import Membrane, Tissue
 
 RADII = (2e-3, 4e-3, 9e-3, 19e-3, 40e-3)  # radii of loads that one effective layer shall serve [m]
 THINNEST, THICKEST = 0.02, 4.0  # bounds of the effective layer's thickness, over that of the stack
+WHERE = np.linspace(0, 1, 9)  # places in a contact that lie on the ball, over its radius
 FLIP = np.array([[1.0, -1.0], [-1.0, 1.0]])  # signs of a 2 x 2 stiffness in a mirror
 
 
@@ -43,9 +44,6 @@ class Misfit(NamedTuple):
     motion: float
 
 
-ENOUGH = Misfit(force=0.10, motion=0.10)  # with which a simpler model will do
-
-
 class Effective(NamedTuple):
     """The single layer under the same skin that answers most like a stack, with the first material's nu.
 
@@ -66,16 +64,40 @@ class Effective(NamedTuple):
     bare: Misfit
 
 
-class Need(NamedTuple):
-    """The simplest model that will do.
+class Fit(NamedTuple):
+    """A single layer in place of a stack.
 
     Args:
-        rung: 0: one layer; 1: a skin on one layer; 2: every material as its own layer.
-        why: sentence with the numbers that decide.
+        youngs_modulus: modulus of the layer [Pa].
+        thickness: thickness of the layer [m].
+        misfit: what it misses.
     """
 
-    rung: int
-    why: str
+    youngs_modulus: float
+    thickness: float
+    misfit: Misfit
+
+
+class Ball(NamedTuple):
+    """A ball without friction, pressed in a little: what the linear response says of it.
+
+    Args:
+        radius: radius of the ball [m].
+        depth: depth of its lowest point below the surface at rest [m].
+        force: force that holds it [N].
+        contact_radius: radius a of the contact [m].
+        pressures: p_n in the pressure, the sum of p_n (1 - r^2 / a^2)^n of n = 0, 1/2, 1, (3,) [Pa].
+    """
+
+    radius: float
+    depth: float
+    force: float
+    contact_radius: float
+    pressures: np.ndarray
+
+    def spectrum(self, k: np.ndarray) -> np.ndarray:
+        """Pressure by wave number, int p J0(k r) r dr, (K,) [N], at k [1/m], (K,), > 0."""
+        return self.contact_radius**2 * self.pressures @ _shapes(k * self.contact_radius)
 
 
 def plies(tissue: Tissue, thickness: float) -> list[tuple[float, float, float]]:
@@ -118,11 +140,11 @@ def compliance(tissue: Tissue, thickness: float, k: ArrayLike) -> Compliance:
     if not (np.isfinite(k) & (k > 0)).all():
         raise InvalidInput(f"the smallest wave number is {k.min():g} / t; all must be finite and above 0.")
     unit = thickness / tissue.youngs_modulus
-    return Compliance(*(each / unit for each in _in_si(plies(tissue, thickness), tissue.skin, k / thickness)))
+    return Compliance(*(each / unit for each in response(plies(tissue, thickness), tissue.skin, k / thickness)))
 
 
-def _in_si(stack: list[tuple[float, float, float]], skin: Membrane | None, k: np.ndarray) -> np.ndarray:
-    """A and B of plies under a skin, (2, K) [m/Pa], at wave numbers k [1/m]; see `compliance`."""
+def response(stack: list[tuple[float, float, float]], skin: Membrane | None, k: np.ndarray) -> np.ndarray:
+    """A and B of plies under a skin, (2, K) [m/Pa], at wave numbers k [1/m], (K,); see `compliance`."""
     stiffness, *above = (_between_faces(*ply, k) for ply in reversed(stack))
     stiffness = stiffness[0]
     for face, between in above:
@@ -163,73 +185,79 @@ def effective(tissue: Tissue, thickness: float, radii: Iterable[float] = RADII) 
         InvalidInput: a thickness or a radius that is not above 0.
     """
     stack = plies(tissue, thickness)
-    modulus, t, misfit = _nearest(stack, tissue.skin, tissue.skin, radii)
-    bare = _nearest(stack, tissue.skin, None, radii)[2] if tissue.skin else misfit
+    modulus, t, misfit = nearest(stack, tissue.skin, tissue.skin, radii)
+    bare = nearest(stack, tissue.skin, None, radii).misfit if tissue.skin else misfit
     stiffness, tension = (tissue.skin.stiffness, tissue.skin.tension) if tissue.skin else (0.0, 0.0)
     return Effective(modulus, t, stiffness / (modulus * t), tension / (modulus * t), misfit, bare)
 
 
-def needs(tissue: Tissue, thickness: float, radii: Iterable[float] = RADII, enough: Misfit = ENOUGH) -> Need:
-    """The simplest model that comes near enough to the stack, for loads of these radii.
+def ball(
+    tissue: Tissue, thickness: float, radius: float, *, depth: float | None = None, force: float | None = None
+) -> Ball:
+    """A ball without friction at a small depth, or under a small force, by the linear response.
 
-    What it cannot see asks for rung 2 as well: muscle whose tone changes, fat that is known place by place.
-
-    Args:
-        tissue: materials, and the skin on them.
-        thickness: thickness from the surface to the base [m], > 0.
-        radii: radii of the loads [m], > 0; one of them for one tool.
-        enough: misfit that is allowed.
-
-    Raises:
-        InvalidInput: a thickness or a radius that is not above 0.
-    """
-    near = effective(tissue, thickness, radii)
-    rungs = [all(is_ <= most for is_, most in zip(off, enough, strict=True)) for off in (near.bare, near.misfit)]
-    said = [f"{off.force:.0%} off in force and {off.motion:.0%} in motion" for off in (near.bare, near.misfit, enough)]
-    skin = f", one layer under the skin {said[1]}" if tissue.skin else ""
-    return Need((*rungs, True).index(True), f"The best single layer is {said[0]}{skin}; allowed is {said[2]}.")
-
-
-def ball_force(tissue: Tissue, thickness: float, radius: float, depth: float) -> float:
-    """Force that holds a ball without friction at a small depth, by the linear response [N].
-
-    The pressure is Hertz's, p0 sqrt(1 - r^2 / a^2), with p0 and a such that middle and edge of the contact lie on the
-    paraboloid r^2 / (2 radius): exact on a half-space (Johnson, "Contact Mechanics", 1985, chapter 4), 8 % too stiff
-    where the contact is about twice as wide as the layer is thick.
+    The pressure is a sum of p_n (1 - r^2 / a^2)^n, such that the contact lies on the paraboloid r^2 / (2 radius), by
+    least squares: n = 1/2 is exact on a half-space (Hertz), 1 on columns, 0 under a taut skin alone (Johnson, "Contact
+    Mechanics", 1985, chapters 4 and 5).
 
     Args:
         tissue: materials, and the skin on them.
         thickness: thickness from the surface to the base [m], > 0.
         radius: radius of the ball [m], > 0.
         depth: depth of its lowest point below the surface at rest [m], > 0 and small beside radius and thickness.
+        force: force on it instead [N], > 0.
 
     Raises:
-        InvalidInput: a number that is not above 0, or a depth that the linear response does not reach.
+        InvalidInput: a number that is not above 0, not one of depth and force, or one beyond the linear response.
     """
-    if not (radius > 0 and depth > 0):
-        raise InvalidInput(f"the ball's radius is {radius:g} m, its depth {depth:g} m; both must be above 0.")
+    if (depth is None) == (force is None):
+        raise InvalidInput("give the ball's depth or its force, one of them.")
+    if not (radius > 0 and (depth or force or 0) > 0):
+        asked = f"depth {depth:g} m" if force is None else f"force {force:g} N"
+        raise InvalidInput(f"the ball's radius is {radius:g} m, its {asked}; both must be above 0.")
     stack = plies(tissue, thickness)
-    x = (np.arange(8000) + 0.5) * 0.05  # k a
-    load = (np.sin(x) - x * np.cos(x)) / x**3
+    taut = tissue.skin is not None and tissue.skin.tension > 0
+    x = (np.arange(6000) + 0.5) * 0.05  # k a
+    loads = 0.05 * _shapes(x)[0 if taut else 1 :].T * x[:, None]
+    at_r = j0(np.outer(WHERE, x))
 
-    def at(a: float) -> tuple[float, float]:
-        """Depth [m] and force [N] with a contact of this radius [m]."""
-        sunk = _in_si(stack, tissue.skin, x / a)[0] * load * x
-        middle, edge = 0.05 * sunk.sum(), 0.05 * (sunk @ j0(x))
-        pressure = a * a / (2 * radius) / (middle - edge)
-        return pressure * middle, 2 / 3 * np.pi * a * a * pressure
+    def at(a: float) -> Ball:
+        """The ball with a contact of this radius [m]."""
+        sunk = at_r @ (response(stack, tissue.skin, x / a)[0][:, None] * loads)  # [m/Pa], a row each WHERE
+        scale = np.abs(sunk).max()
+        *found, depth = np.linalg.lstsq(np.column_stack([sunk / scale, -np.ones(len(WHERE))]),
+                                        -0.5 * (a * WHERE) ** 2 / radius, rcond=None)[0]  # fmt: skip
+        pressures = np.array([*(() if taut else (0.0,)), *found]) / scale
+        return Ball(radius, float(depth), float(np.pi * a * a * pressures @ [1, 2 / 3, 1 / 2]), a, pressures)
 
+    def beyond(a: float) -> float:
+        """How far depth [m] or force [N] is from what is asked."""
+        return at(a).depth - depth if depth is not None else at(a).force - (force or 0.0)
+
+    usual = np.sqrt(radius * depth) if depth is not None else radius + thickness
+    bounds = (1e-2 * usual, 2 * usual) if depth is not None else (1e-5 * usual, 20 * usual)
     try:
-        a = brentq(lambda a: at(a)[0] - depth, 1e-3 * np.sqrt(radius * depth), 2 * np.sqrt(radius * depth), rtol=1e-6)
+        a: Any = brentq(beyond, *bounds, rtol=1e-6)  # type: ignore[arg-type]
     except ValueError:
-        raise InvalidInput(f"a ball of {radius * 1e3:g} mm, {depth * 1e3:g} mm deep, is beyond the linear response of "
-                           f"{thickness * 1e3:g} mm. Try a smaller depth.") from None  # fmt: skip
-    return float(at(a)[1])
+        asked = f"{depth * 1e3:g} mm deep" if depth is not None else f"under {force:g} N"
+        raise InvalidInput(f"a ball of {radius * 1e3:g} mm, {asked}, is beyond the linear response of "
+                           f"{thickness * 1e3:g} mm. Try less.") from None  # fmt: skip
+    return at(float(a))
 
 
-def _nearest(stack: list[tuple[float, float, float]], skin: Membrane | None, its_skin: Membrane | None,
-             radii: Iterable[float]) -> tuple[float, float, Misfit]:  # fmt: skip
-    """E [Pa], t [m] and misfit of the single layer under `its_skin` that answers most like plies under `skin`."""
+def ball_force(tissue: Tissue, thickness: float, radius: float, depth: float) -> float:
+    """Force that holds a ball at a small depth [N]; see `ball`."""
+    return ball(tissue, thickness, radius, depth=depth).force
+
+
+def _shapes(x: np.ndarray) -> np.ndarray:
+    """int_0^1 (1 - r^2)^n J0(x r) r dr of n = 0, 1/2, 1, at x > 0, (3, K); Sonine's first integral."""
+    return np.array([j1(x) / x, (np.sin(x) - x * np.cos(x)) / x**3, 2 * jv(2, x) / x**2])
+
+
+def nearest(stack: list[tuple[float, float, float]], skin: Membrane | None, its_skin: Membrane | None,
+            radii: Iterable[float]) -> Fit:  # fmt: skip
+    """The single layer under `its_skin` that answers most like plies under `skin`; see `effective`."""
     each = np.array(list(radii), dtype=float)
     if not (len(each) and (np.isfinite(each) & (each > 0)).all()):
         raise InvalidInput(f"the loads' radii are {each.tolist()} m; all must be finite and above 0.")
@@ -241,13 +269,13 @@ def _nearest(stack: list[tuple[float, float, float]], skin: Membrane | None, its
         depth = weight @ both[0]
         return depth, both[:, None] / depth[:, None] * np.sqrt(weight)
 
-    depth, motion = at_depth(_in_si(stack, skin, k))
+    depth, motion = at_depth(response(stack, skin, k))
     whole = np.linalg.norm(motion[0], axis=1, keepdims=True)
 
     def off(logs: np.ndarray) -> np.ndarray:
         """First the logarithm of the force, then the motion, (radius, 1 + 2 * k)."""
         modulus, t = np.exp(logs)
-        its, its_motion = at_depth(_in_si([(t, modulus, stack[0][2])], its_skin, k))
+        its, its_motion = at_depth(response([(t, modulus, stack[0][2])], its_skin, k))
         return np.hstack([np.log(depth / its)[:, None], *((its_motion - motion) / whole)])
 
     t = sum(h for h, _, _ in stack)
@@ -258,4 +286,4 @@ def _nearest(stack: list[tuple[float, float, float]], skin: Membrane | None, its
     best = min(tries, key=lambda one: one.cost).x
     rest = off(best)
     misfit = Misfit(float(np.abs(np.expm1(rest[:, 0])).max()), float(np.linalg.norm(rest[:, 1:], axis=1).max()))
-    return float(np.exp(best[0])), float(np.exp(best[1])), misfit
+    return Fit(float(np.exp(best[0])), float(np.exp(best[1])), misfit)

@@ -20,6 +20,7 @@ VERBS = {  # module of each verb's function, and what it does
     "replay": ("stmpl_ros.verbs", "answer recorded contacts again, or publish them"),
     "compare": ("stmpl_ros.verbs", "judge a recorded run by finite elements, a method or another recording"),
     "info": ("stmpl_ros.verbs", "say what a recording holds, or what a part of the body is made of"),
+    "needs": ("stmpl_ros.verbs", "which parts of a tissue matter under a tool, and the smallest model"),
     "recover": ("stmpl_ros.verbs", "bring back what is sound in a recording that was not finished"),
     "generate": ("stmpl_ros.verbs", "make the data that networks learn from"),
     "train": ("studies.verbs", "train a network"),

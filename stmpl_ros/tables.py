@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from stmpl_core.regions import Region
 
 BALL_RADIUS, BALL_DEPTH = 0.010, 0.001  # ball and depth at which the stiffness of a part is told [m]
+NEEDS_RADII, NEEDS_FORCES = (5e-3, 40e-3), (1.0, 20.0)  # scene for which the smallest model of a part is told [m], [N]
 SHOWN = {"Pa": (1e-3, "kPa"), "m": (1e3, "mm"), "N/m": (1.0, "N/m"), "-": (1.0, "")}  # factor and unit for people
 
 
@@ -138,17 +139,18 @@ def part_figures(name: str) -> dict[str, Any]:
 
 def _effective(one: Region) -> dict[str, Any]:
     """The layer that answers most like a part, what it misses, the rung it needs, its stiffness under a ball [N/m]."""
-    from stmpl_core.stack import ball_force, effective, needs
+    from stmpl_core.needs import needs
+    from stmpl_core.stack import ball_force, effective
 
     near = effective(one.tissue, one.thickness)
-    need = needs(one.tissue, one.thickness)
+    need = needs(one.tissue, NEEDS_RADII, NEEDS_FORCES, thickness=one.thickness)
     force = ball_force(one.tissue, one.thickness, BALL_RADIUS, BALL_DEPTH)
     return near._asdict() | {
         "misfit": near.misfit._asdict(),
         "bare": near.bare._asdict(),
         "ball_stiffness": force / BALL_DEPTH,
         "rung": need.rung,
-        "why": need.why,
+        "why": need.sentence,
     }
 
 
@@ -179,6 +181,7 @@ def part_table(name: str) -> Table:
     table.add_section()
     for label, unit, key, factor, source in rows:
         table.add_row(label, unit, *(f"{one[key] * factor:.2g}" for one in near), source)
-    table.caption = "\n".join(f"{tone}: rung {one['rung']}. {one['why']}"
+    table.caption = "\n".join(f"{tone}: {one['why']}"
                               for tone, one in zip(("relaxed", "tensed"), near, strict=True))  # fmt: skip
+    table.caption += "\nFor tips of 5 to 40 mm radius and 1 to 20 N; `stmpl needs` says it for yours."
     return table

@@ -14,6 +14,7 @@ from stmpl_core.extras import needed
 from stmpl_core.methods import METHODS
 from stmpl_core.methods import method as method_named
 from stmpl_ros.parameters import DemoConfig, NodeConfig, ProbeConfig, RecordConfig
+from stmpl_ros.scene import SceneConfig
 from stmpl_ros.view.config import ViewConfig
 
 if TYPE_CHECKING:
@@ -25,7 +26,7 @@ Flat = tyro.conf.arg(name="")  # a configuration whose fields are flags of the v
 BagPath = Annotated[Path, tyro.conf.Positional]  # a run's folder, or its .mcap file
 MethodName = Literal["fem", "moment_net", "unet", "linear", "winkler", "naive", "ladder"]
 
-DEMO, NODE, PROBE, VIEW = DemoConfig(), NodeConfig(), ProbeConfig(), ViewConfig()
+DEMO, NODE, PROBE, SCENE, VIEW = DemoConfig(), NodeConfig(), ProbeConfig(), SceneConfig(), ViewConfig()
 
 ros_arguments: list[str] = []  # arguments of ROS, from --ros-args on
 
@@ -221,6 +222,27 @@ def info(path: Annotated[Path | None, tyro.conf.Positional] = None, part: str | 
         print_figures(f"method: {bag.provenance.method or 'not named'}; body: {bag.provenance.body or 'not named'}; "
                        f"made by {made_by}")
     return 0 if bag.finished and not bag.damage else 1
+
+
+def needs(config: Annotated[SceneConfig, Flat] = SCENE, as_json: Json = False) -> int:
+    """Says which of skin, tension, muscle, time, slip and mesh a scene needs, and the smallest model that serves.
+
+    Example: stmpl needs --part back --radius 20 --force 10
+
+    A range of tools, forces and speeds: stmpl needs --part thigh --radius 5 40 --force 1 20 --speed 5 50 --drag 0.3
+
+    A tissue of your own: stmpl needs --thickness 30 --modulus 3 --muscle-depth 8 --muscle-modulus 12 --radius 10
+
+    Args:
+        config: tissue, tools and forces.
+        as_json: figures as JSON, for machines.
+    """
+    from stmpl_ros.needs_table import needs_figures, needs_table
+
+    found = config.needs()
+    title = f"{config.part}, {config.tone}" if config.part else "tissue of your own"
+    print_figures(needs_figures(found) if as_json else needs_table(found, title))
+    return 0
 
 
 def recover(path: BagPath, target: Path | None = None) -> int:

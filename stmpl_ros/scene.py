@@ -1,0 +1,87 @@
+"""What a person may set on the verb `needs`: a tissue and what presses on it, in mm and N."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from stmpl_core.errors import InvalidInput
+from stmpl_core.tissue import FRICTION, Membrane, Ply, Tissue
+
+if TYPE_CHECKING:
+    from stmpl_core.needs import Needs
+
+OWN = ("modulus", "skin_modulus", "skin_thickness", "tension", "muscle_modulus", "muscle_depth")
+
+
+class SceneConfig(BaseModel):
+    """A tissue, and what presses on it, as people say it."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    part: str | None = Field(default=None, description="region of the body: forearm, upper_arm, shoulder, neck, back, "
+                             "abdomen, thigh or calf")  # fmt: skip
+    tone: Literal["relaxed", "tensed"] = Field(default="relaxed", description="state of the region's muscle")
+    radius: tuple[float, ...] = Field(default=(20.0,), description="radius of the tool's tip [mm]; two for a range")
+    force: tuple[float, ...] = Field(default=(5.0,), description="force on the tool [N]; two for a range")
+    speed: tuple[float, ...] = Field(default=(), description="speed of pressing [mm/s]; two for a range; none: time is "
+                                     "not judged")  # fmt: skip
+    drag: float | None = Field(default=None, description="tangential force over normal force; none: slip is not judged")
+    friction: float = Field(default=FRICTION, description="coefficient of friction")
+    edge: float | None = Field(default=None, description="length of the mesh's edges [mm]; none: it is not judged")
+    accuracy: float = Field(default=10.0, description="error that is allowed, in force and in motion [%]")
+    thickness: float | None = Field(default=None, description="thickness from skin to bone [mm], of a tissue of your "
+                                    "own instead of a region")  # fmt: skip
+    modulus: float | None = Field(default=None, description="Young's modulus of its first material [kPa]")
+    nu: float = Field(default=0.45, description="Poisson's ratio of its materials")
+    skin_modulus: float | None = Field(default=None, description="Young's modulus of its skin [kPa]; none: no skin")
+    skin_thickness: float | None = Field(default=None, description="thickness of its skin [mm]")
+    tension: float | None = Field(default=None, description="tension of its skin [N/m]")
+    muscle_modulus: float | None = Field(default=None, description="Young's modulus of its muscle [kPa]; none: no "
+                                         "muscle")  # fmt: skip
+    muscle_depth: float | None = Field(default=None, description="depth at which its muscle begins [mm]")
+
+    def needs(self) -> Needs:
+        """What the scene asks for. Raises InvalidInput."""
+        from stmpl_core.needs import needs
+        from stmpl_core.stack import Misfit
+
+        tissue, thickness = self._tissue()
+        share = self.accuracy * 1e-2
+        return needs(tissue, _si(self.radius), self.force, _si(self.speed), thickness=thickness, drag=self.drag,
+                     friction=self.friction, edge=None if self.edge is None else self.edge * 1e-3,
+                     enough=Misfit(share, share))  # fmt: skip
+
+    def _tissue(self) -> tuple[Tissue, float]:
+        if (self.part is None) == (self.thickness is None):
+            raise InvalidInput("Give --part with a region of the body or --thickness with a tissue of your own, "
+                               "one of them.")  # fmt: skip
+        given = [name for name in OWN if getattr(self, name) is not None]
+        if self.part is not None:
+            if given:
+                raise InvalidInput(f"--part has its own numbers; leave --{given[0].replace('_', '-')} out, or give "
+                                   "--thickness instead of --part.")  # fmt: skip
+            from stmpl_core.regions import region
+
+            part = region(self.part, self.tone)
+            return part.tissue, part.thickness
+        modulus = self._with("modulus", "thickness")
+        skin, deeper = None, ()
+        if {"skin_modulus", "skin_thickness", "tension"} & set(given):
+            skin = Membrane(self._with("skin_modulus", "a skin") * 1e3, self._with("skin_thickness", "a skin") * 1e-3,
+                            self.tension or 0.0)  # fmt: skip
+        if {"muscle_modulus", "muscle_depth"} & set(given):
+            deeper = (Ply(self._with("muscle_depth", "a muscle") * 1e-3,
+                          self._with("muscle_modulus", "a muscle") * 1e3, self.nu, "muscle"),)  # fmt: skip
+        return Tissue(modulus * 1e3, self.nu, skin=skin, deeper=deeper), (self.thickness or 0.0) * 1e-3
+
+    def _with(self, name: str, what: str) -> float:
+        value = getattr(self, name)
+        if value is None:
+            raise InvalidInput(f"{what} wants --{name.replace('_', '-')} as well.")
+        return value
+
+
+def _si(millimetres: tuple[float, ...]) -> list[float]:
+    return [one * 1e-3 for one in millimetres]

@@ -1,0 +1,163 @@
+"""Laws of what a scene asks a model of tissue to have."""
+
+import json
+
+import pytest
+
+from stmpl_core import Membrane, Ply, Tissue
+from stmpl_core.errors import InvalidInput
+from stmpl_core.needs import needs, relaxed
+from stmpl_core.regions import region
+from stmpl_core.stack import Misfit
+from stmpl_ros.cli import main
+from tests.scenes import plate
+
+SKIN = Membrane(2e5, 1.5e-3, 20.0)
+LIMB = Tissue(3e3, 0.45, skin=SKIN, deeper=(Ply(10e-3, 10e3, 0.45),))
+
+
+def asked(tissue, radii=(5e-3, 40e-3), forces=(0.1, 2.0), *speeds, thickness=0.04, **more):
+    return needs(tissue, radii, forces, speeds, thickness=thickness, **more)
+
+
+def stmpl(capsys, *arguments):
+    """Exit code of the command, what it printed, what it refused with."""
+    with pytest.raises(SystemExit) as ended:
+        main([str(each) for each in arguments])
+    said = capsys.readouterr()
+    return ended.value.code, said.out, said.err
+
+
+@pytest.mark.parametrize(
+    "rung, tissue",
+    [
+        (0, Tissue(3e3, 0.45)),
+        (0, Tissue(3e3, 0.45, deeper=(Ply(10e-3, 4e3, 0.45),))),
+        (0, Tissue(3e3, 0.45, skin=Membrane(2e3, 1e-4))),  # a film as soft as what lies under it
+        (1, LIMB),
+        (2, Tissue(3e3, 0.45, skin=SKIN, deeper=(Ply(4e-3, 3e4, 0.45),))),  # little fat on a tense muscle
+        (2, Tissue(1e5, 0.45, deeper=(Ply(2e-3, 3e3, 0.45),))),  # a thick skin as the first material
+    ],
+)
+def test_the_rung_of_model_that_a_stack_needs(rung, tissue):
+    found = asked(tissue)
+    assert found.rung == rung and f"rung {rung}" in found.sentence
+    assert found["muscle"].needed == (rung == 2) and (found.layer is None) == (rung == 2)
+    assert found["skin"].needed == (rung > 0 and tissue.skin is not None)
+
+
+def test_what_is_not_there_is_not_missed():
+    found = asked(Tissue(3e3, 0.45))
+    assert all((found[name].force, found[name].motion) == (0, 0) for name in ("skin", "tension", "muscle"))
+    assert max(found.layer.misfit) < 1e-6 and found.layer.thickness == pytest.approx(0.04, rel=1e-3)
+
+
+def test_without_skin_tension_or_muscle_a_limb_is_softer():
+    found = asked(LIMB)
+    assert found["skin"].force < found["tension"].force < 0 and found["muscle"].force < 0
+    assert min(found[name].motion for name in ("skin", "tension", "muscle")) > 0.1
+
+
+def test_what_vanishes_is_not_missed_in_proportion():
+    off = [asked(Tissue(3e3, 0.45, skin=Membrane(e, 1e-6)))["skin"] for e in (1e5, 1e4)]  # kappa 8e-4, 8e-5
+    assert off[0].motion < 0.01 and off[1].motion == pytest.approx(off[0].motion / 10, rel=0.1)
+
+
+def test_a_force_beyond_the_linear_response_is_said_and_judged_where_it_ends():
+    found = asked(LIMB, (20e-3,), (2.0, 50.0))
+    light, heavy = found.indentations
+    assert not light.beyond and light.judged.force == pytest.approx(2.0, rel=1e-4)
+    assert heavy.beyond and heavy.judged.depth == pytest.approx(10e-3, rel=1e-4) and heavy.judged.force < 50
+
+
+def test_a_press_in_the_time_that_tissue_relaxes_needs_time():
+    quick, usual, slow = (relaxed(seconds) for seconds in (1e-3, 2.0, 1e4))
+    assert max(quick) < 0.01 and slow.motion < 0.01 and slow.force == pytest.approx(1 / 0.55 - 1, rel=0.01)
+    assert 0.15 < usual.force < 0.41 and 0.18 < usual.motion < 0.31  # trials of finite elements with time
+    assert asked(LIMB, (20e-3,), (1.0,), 5e-3)["time"].needed
+    assert not asked(LIMB, (20e-3,), (1.0,), 1.0)["time"].needed
+    assert not asked(LIMB, (20e-3,), (1.0,), 1e-6)["time"].needed
+    assert asked(LIMB)["time"].force is None
+
+
+def test_slip_matters_near_the_friction_and_is_worst_where_it_slides():
+    off = [asked(LIMB, (20e-3,), (1.0,), drag=drag, friction=0.5)["slip"] for drag in (0.0, 0.05, 0.4, 0.5, 2.0)]
+    assert [one.needed for one in off] == [False, False, True, True, True]
+    assert off[0].force == off[0].motion == 0 and off[3].force == pytest.approx(0.5) == off[4].force
+
+
+def test_a_mesh_errs_with_the_square_of_its_edge():
+    off = [asked(LIMB, (20e-3,), (1.0,), edge=edge)["mesh"] for edge in (1e-3, 2e-3, 3e-2)]
+    assert off[1].motion / off[0].motion == pytest.approx(4, rel=0.1)
+    assert [one.needed for one in off] == [False, False, True]
+
+
+def test_a_layer_brings_its_tissue_thickness_and_edges():
+    layer = plate(0.12, 5e-3, 0.04).with_(tissue=LIMB)
+    found, same = needs(layer, [20e-3], [1.0]), asked(LIMB, [20e-3], [1.0], edge=layer.edge_length)
+    assert found.terms == same.terms and found["mesh"].motion > 0
+
+
+def test_less_accuracy_asks_for_less():
+    assert asked(LIMB, enough=Misfit(0.9, 0.9)).rung == 0 and asked(LIMB, enough=Misfit(1e-3, 1e-3)).rung == 2
+
+
+@pytest.mark.parametrize(
+    "change, says",
+    [
+        ({"radii": (20.0,)}, "radii is 20 m"),
+        ({"radii": ()}, "at least one radius"),
+        ({"forces": (-1.0,)}, "forces is -1 N"),
+        ({"friction": 0.0}, "friction is 0"),
+        ({"drag": -1.0}, "drag is -1"),
+        ({"edge": 0.0}, "edge is 0"),
+        ({"thickness": None}, "thickness"),
+        ({"enough": Misfit(0.0, 0.1)}, "force is 0"),
+    ],
+)
+def test_what_cannot_be_is_refused_with_what_is_wrong(change, says):
+    with pytest.raises(InvalidInput, match=says):
+        asked(LIMB, **change)
+
+
+def test_the_verb_says_the_smallest_model_with_units(capsys):
+    code, said, _ = stmpl(capsys, "needs", "--part", "back", "--radius", 20, "--force", 10)
+    assert code == 0
+    for word in ("skin", "tension", "muscle", "time", "slip", "mesh", "mm", "N", "rung 1", "smallest model", "linear"):
+        assert word in said
+
+
+def test_the_verb_gives_machines_the_same_in_si(capsys):
+    code, said, _ = stmpl(capsys, "needs", "--part", "thigh", "--radius", 10, 40, "--force", 1, "--speed", 5, "--json")
+    part, figures = region("thigh"), json.loads(said)
+    found = needs(part.tissue, [0.01, 0.04], [1.0], [5e-3], thickness=part.thickness)
+    assert code == 0 and figures["rung"] == found.rung and figures["smallest"] == found.sentence
+    assert figures["terms"]["skin"]["force"] == pytest.approx(found["skin"].force)
+    assert figures["indentations"][0]["radius"] == 0.01
+
+
+def test_the_verb_takes_a_tissue_of_ones_own(capsys):
+    code, said, _ = stmpl(capsys, "needs", "--thickness", 40, "--modulus", 3, "--radius", 20, "--force", 1)
+    assert code == 0 and "rung 0" in said
+    layers = ("--skin-modulus", 200, "--skin-thickness", 1.5, "--tension", 20, "--muscle-modulus", 10,
+              "--muscle-depth", 10)  # fmt: skip
+    code, said, _ = stmpl(capsys, "needs", "--thickness", 40, "--modulus", 3, *layers, "--radius", 20, "--force", 1)
+    assert code == 0 and "rung 1" in said
+
+
+@pytest.mark.parametrize(
+    "arguments, says",
+    [
+        ((), "one of them"),
+        (("--part", "knee"), "no region 'knee'"),
+        (("--part", "back", "--thickness", 20), "one of them"),
+        (("--part", "back", "--tension", 20), "--tension"),
+        (("--thickness", 20, "--modulus", 3, "--tension", 20), "--skin-modulus"),
+        (("--part", "back", "--radius", 0), "radii is 0 m"),
+        (("--part", "back", "--force", 1e9), "forces is 1e+09 N"),
+        (("--part", "back", "--accuracy", 0), "force is 0"),
+    ],
+)
+def test_the_verb_refuses_in_one_sentence(capsys, arguments, says):
+    code, said, refused = stmpl(capsys, "needs", *arguments)
+    assert code == 1 and not said and says in refused and "Traceback" not in refused
