@@ -75,13 +75,13 @@ def _alone(value: float, unit: str, source: str) -> Quantity:
 FIBRES = ("the skin's modulus is that of suction at small stretch; 1.3 mm beside a probe 4 mm wide stretches the skin "
           "much further, where its fibres bear more (the authors find a neo-Hookean law too poor), and most along one "
           "direction")  # fmt: skip
-TAP = ("a tap of 15 ms on tissue that a preload has already passed through its soft part: inertia, rate and finite "
-       "strain stiffen it; the model is slow and starts at rest")  # fmt: skip
+TAP = ("a tap of 15 ms on a preload: rate and inertia stiffen tissue, and finite depth too (the thigh to 0.13 N/mm at "
+       "half a newton, by finite elements); the closed form is slow and starts at rest")  # fmt: skip
 LIGHT = "a contact of 2 mm under 20 mN feels the skin's tension first; the old have slacker skin than the library's"
 TONE = ("relaxed and tensed differ by the muscle's modulus only, along its fibres by elastography; a fascia that "
         "tightens and a muscle that bulges are left out, and the fat hides what lies below")  # fmt: skip
 SPRING = ("a safety standard's spring, meant for forces near the pain limit and told without tool or depth; the model "
-          "bears 2 to 14 N at a third of its thickness, and neo-Hookean tissue stiffens too little beyond")  # fmt: skip
+          "bears 8 to 13 N at a third of its thickness, and neo-Hookean tissue stiffens too little beyond")  # fmt: skip
 
 _FLYNN = "Flynn, Taberner & Nielsen, Med Eng Phys 33 (2011) 610: largest force over largest way, 20 people"
 _PULLED = Protocol("probe 4 mm wide, taken to be glued, moved up to 1.3 mm; stiffest along the skin", "pulled along",
