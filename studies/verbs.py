@@ -246,7 +246,7 @@ def validate(out: Path = Path("runs/validate"), quick: bool = False, as_json: Js
 
     Args:
         out: folder of report.json, table.md and validate.png.
-        quick: rows of the closed form only (seconds); the others press balls by finite elements (minutes).
+        quick: rows of the closed form only (seconds); the others press balls by finite elements (half a minute).
         as_json: report on stdout, for machines.
     """
     needed("stmpl validate", "studies", "matplotlib")
