@@ -20,7 +20,8 @@ PUBLIC = {  # heading: modules, and the names in them that are promised to stay
                       "stmpl_core.bones: Bone bones_of core_of to_bone"],
     "Tissue": ["stmpl_core: Tissue Membrane Ply",
                "stmpl_core.regions: region Region Quantity",
-               "stmpl_core.stack: compliance Compliance effective Effective Misfit Fit ball Ball ball_force",
+               "stmpl_core.stack: compliance Compliance along Along effective Effective Misfit Fit ball Ball"
+               " ball_force",
                "stmpl_core.needs: needs Needs Term Indentation"],
     "Methods": ["stmpl_core.methods: Method method Naive Winkler Linear MomentNet UNet Ladder",
                 "stmpl_core: Displacement", "fem_tools.ladder: ladder", "stmpl_core.metrics: score Score"],

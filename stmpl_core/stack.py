@@ -31,6 +31,18 @@ class Compliance(NamedTuple):
     along: np.ndarray
 
 
+class Along(NamedTuple):
+    """What a traction cos(k x) along the surface does to it: a motion along the traction, times cos(k x).
+
+    Args:
+        lengthwise: motion where the traction points along x, as the wave does, (K,) [t/E].
+        crosswise: motion where it points across, (K,) [t/E].
+    """
+
+    lengthwise: np.ndarray
+    crosswise: np.ndarray
+
+
 class Misfit(NamedTuple):
     """How far a simpler model is from a stack, the largest over loads.
 
@@ -136,23 +148,61 @@ def compliance(tissue: Tissue, thickness: float, k: ArrayLike) -> Compliance:
     Raises:
         InvalidInput: a thickness or a wave number that is not above 0.
     """
-    k = np.atleast_1d(np.asarray(k, dtype=float))
-    if not (np.isfinite(k) & (k > 0)).all():
-        raise InvalidInput(f"the smallest wave number is {k.min():g} / t; all must be finite and above 0.")
+    k = _wave_numbers(k)
     unit = thickness / tissue.youngs_modulus
     return Compliance(*(each / unit for each in response(plies(tissue, thickness), tissue.skin, k / thickness)))
 
 
+def along(tissue: Tissue, thickness: float, k: ArrayLike) -> Along:
+    """How far the surface of a flat stack moves along under a traction cos(k x) that pulls along it.
+
+    Where the traction points along x, it is what `compliance` inverts; where it points across, each material is
+    sheared as mu k [[coth k h, -1 / sinh k h], [., coth k h]], and the skin adds E_s h k^2 / (2 (1 + nu_s)).
+
+    Args:
+        tissue: materials, and the skin on them.
+        thickness: thickness t from the surface to the base [m], > 0.
+        k: wave numbers, (K,) [1/t], > 0.
+
+    Raises:
+        InvalidInput: a thickness or a wave number that is not above 0.
+    """
+    k = _wave_numbers(k) / thickness
+    stack, skin, unit = plies(tissue, thickness), tissue.skin, thickness / tissue.youngs_modulus
+    stiffness, across = _surface(stack, skin, k), np.full(len(k), np.inf)
+    for h, modulus, nu in reversed(stack):
+        shear, far = modulus / (2 * (1 + nu)) * k, np.exp(-k * h)
+        own, between = shear * (1 + far * far) / -np.expm1(-2 * k * h), 2 * shear * far / -np.expm1(-2 * k * h)
+        across = own - between**2 / (own + across)
+    if skin:
+        across = across + skin.stiffness / (2 * (1 + skin.poisson_ratio)) * k * k
+    xx, xz, zz = stiffness[:, 0, 0], stiffness[:, 0, 1], stiffness[:, 1, 1]
+    return Along(zz / (xx * zz - xz * xz) / unit, 1 / across / unit)
+
+
+def _wave_numbers(k: ArrayLike) -> np.ndarray:
+    k = np.atleast_1d(np.asarray(k, dtype=float))
+    if not (np.isfinite(k) & (k > 0)).all():
+        raise InvalidInput(f"the smallest wave number is {k.min():g} / t; all must be finite and above 0.")
+    return k
+
+
 def response(stack: list[tuple[float, float, float]], skin: Membrane | None, k: np.ndarray) -> np.ndarray:
     """A and B of plies under a skin, (2, K) [m/Pa], at wave numbers k [1/m], (K,); see `compliance`."""
+    (xx, xz), (_, zz) = _surface(stack, skin, k).transpose(1, 2, 0)
+    return np.array([xx, -xz]) / (xx * zz - xz * xz)
+
+
+def _surface(stack: list[tuple[float, float, float]], skin: Membrane | None, k: np.ndarray) -> np.ndarray:
+    """Stiffness of the surface of plies under a skin, (K, 2, 2) [Pa/m], to motions along and inwards."""
     stiffness, *above = (_between_faces(*ply, k) for ply in reversed(stack))
     stiffness = stiffness[0]
     for face, between in above:
         stiffness = face - between @ np.linalg.solve(FLIP * face + stiffness, between.transpose(0, 2, 1))
-    (xx, xz), (_, zz) = stiffness.transpose(1, 2, 0)
     if skin:
-        xx, zz = xx + skin.stiffness / (1 - skin.poisson_ratio**2) * k * k, zz + skin.tension * k * k
-    return np.array([xx, -xz]) / (xx * zz - xz * xz)
+        added = np.array([[skin.stiffness / (1 - skin.poisson_ratio**2), 0.0], [0.0, skin.tension]])
+        stiffness = stiffness + added * (k * k)[:, None, None]
+    return stiffness
 
 
 def _between_faces(h: float, modulus: float, nu: float, k: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -28,6 +28,7 @@ VERBS = {  # module of each verb's function, and what it does
     "chart": ("studies.verbs", "speed against accuracy of every method"),
     "calibrate": ("studies.verbs", "measure what the ladder chooses by"),
     "stability": ("studies.verbs", "where methods fail"),
+    "validate": ("studies.verbs", "the model beside published measurements on people"),
 }
 
 

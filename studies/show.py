@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from studies.critical_load import CriticalLoad
     from studies.stability import Report
     from studies.stability.fuzz import Fuzzed
+    from studies.validate import Judged
 
 
 def critical_load_table(rows: Sequence[CriticalLoad], picture: Path) -> Table:
@@ -137,4 +138,24 @@ def times_table(measured: Measured, file: Path) -> Table:
         small, large = (1e3 * sum(c * x for c, x in zip(known.seconds, (1, m, 0.5 * m, p * m), strict=True))
                         for p, m in ((40, 1900), (800, 4000)))  # fmt: skip
         table.add_row(name, f"{small:.2f}", f"{large:.2f}", f"x {known.slow:.2f}")
+    return table
+
+
+def validation_table(judged: Sequence[Judged], picture: Path) -> Table:
+    """The model beside published measurements, for people."""
+    from studies.validate import said
+
+    table = Table(title="The model beside published measurements", title_justify="left", caption_justify="left")
+    for heading in ("row", "model", "measured"):
+        table.add_column(heading)
+    table.add_column("ratio", justify="right")
+    for heading in ("meets", "matters most"):
+        table.add_column(heading)
+    for one in judged:
+        verdict = "[green]yes" if one.inside else f"[red]no, {one.apart:.2g} apart"
+        table.add_row(one.row.name, said(one.model), said(one.row.measured), f"{one.ratio:.2g}", verdict,
+                      one.most.replace("_", " "))  # fmt: skip
+    met = sum(one.inside for one in judged)
+    where = f"drawn in {picture}, reasons and sources in {picture.parent}/table.md"
+    table.caption = f"{met} of {len(judged)} rows meet; {where}"
     return table

@@ -237,6 +237,29 @@ def stability(
     return 0
 
 
+def validate(out: Path = Path("runs/validate"), quick: bool = False, as_json: Json = False) -> int:
+    """The model beside published measurements on people: value, spread, whether they meet, and why not.
+
+    Rows that do not meet stay in the table. Nothing was fitted on any row.
+
+    Example: stmpl validate --quick
+
+    Args:
+        out: folder of report.json, table.md and validate.png.
+        quick: rows of the closed form only (seconds); the others press balls by finite elements (half a minute).
+        as_json: report on stdout, for machines.
+    """
+    needed("stmpl validate", "studies", "matplotlib")
+    from studies.show import validation_table
+    from studies.validate import as_dict, judge, save
+
+    with steps_bar("validate", quiet=as_json) as show:
+        judged = judge(quick=quick, on_progress=show)
+    picture = save(judged, out)
+    print_figures(as_dict(judged) if as_json else validation_table(judged, picture))
+    return 0
+
+
 def _fuzz(methods: tuple[str, ...], count: int, seed: int, out: Path, as_json: bool) -> int:
     from studies.show import fuzz_table
     from studies.stability import maker
