@@ -70,11 +70,9 @@ def _bone(body: Body, part: str, radius: float) -> Bone:
     middle = own.mean(axis=0)
     axis = np.linalg.svd(own - middle, full_matrices=False)[2][0]
     along, ring = (body.vertices - middle) @ axis, np.abs(level) < 0.3
-    ends = []
-    for side in (ring & (along < 0), ring & (along > 0)):
-        weight = 0.3 - np.abs(level[side])
-        ends.append(weight @ body.vertices[side] / weight.sum())
-    return Bone(*ends, radius)
+    weight = np.where(ring, 0.3 - np.abs(level), 0.0)
+    first, second = (weight * (along < 0), weight * (along > 0))
+    return Bone(first @ body.vertices / first.sum(), second @ body.vertices / second.sum(), radius)
 
 
 def core_of(vertices: Points, normals: VertexVectors, faces: Faces, bones: Sequence[Bone],

@@ -41,7 +41,8 @@ def unpack(arrays: Mapping[str, np.ndarray]) -> SoftLayer:
         skin, deeper = given.pop("skin"), given.pop("deeper")
         tissue = Tissue(**given, skin=Membrane(**skin) if skin else None, deeper=tuple(Ply(**one) for one in deeper))
     else:
-        tissue = Tissue(*(float(x) for x in arrays["tissue"]))
+        modulus, ratio, density = (float(x) for x in arrays["tissue"])
+        tissue = Tissue(modulus, ratio, density)
     depth = {name: arrays[name] for name in ("thickness", "core") if name in arrays}
     chart = UvChart(arrays["vertices"], arrays["faces"], arrays["uv"]) if "uv" in arrays else None
     return SoftLayer(arrays["vertices"], arrays["faces"], **depth, tissue=tissue, chart=chart)

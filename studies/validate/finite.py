@@ -12,6 +12,7 @@ from stmpl_core.errors import StmplError
 from stmpl_core.layer import SoftLayer
 from stmpl_core.sdf import SignedDistance
 from stmpl_core.tissue import Tissue
+from stmpl_core.tool import Tool
 from studies.critical_load import flat_skin
 
 REACH = 2.0  # width of the patch beyond the ball [thicknesses]
@@ -33,7 +34,8 @@ def ball_force(tissue: Tissue, thickness: float, radius: float, depth: float, fe
     """
     vertices, faces = flat_skin((REACH + 0.6) * thickness + radius, max(thickness / 3, radius / 6))
     layer = SoftLayer(vertices, faces, thickness, tissue=tissue)
-    ball, pose = trimesh.creation.icosphere(subdivisions=4, radius=radius), np.eye(4)
+    mesh, pose = trimesh.creation.icosphere(subdivisions=4, radius=radius), np.eye(4)
+    ball = Tool("ball", np.asarray(mesh.vertices), np.asarray(mesh.faces))
     pose[2, 3] = radius + 1e-3
     tool = Press(SignedDistance.of(ball), pose, np.array([0.0, 0.0, -1.0]))
     answer = IndenterFem(fem, step=0.1).prepare(layer).press([tool], depth)
