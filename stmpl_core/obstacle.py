@@ -42,22 +42,6 @@ class Response(NamedTuple):
     rows: np.ndarray
 
 
-class Linear(NamedTuple):
-    """The linear problem's answer at nodes.
-
-    Args:
-        pressure: pressure over E that holds the skin off, (N,) [-]; 0 where the skin leaves the tool.
-        moments: of pressure and strain on the rings, (N, 2, RINGS) [-].
-        vectors: their first moments, in the body's axes, (N, 2, 3) [-].
-        power: power of the depth with which the force grows as the tool goes on [-].
-    """
-
-    pressure: np.ndarray
-    moments: np.ndarray
-    vectors: np.ndarray
-    power: float
-
-
 @cache
 def response(poisson_ratio: float) -> Response:
     """Tables for a flat bonded layer (see stmpl_core.response for its compliance A(k), and the sources).
@@ -85,8 +69,8 @@ def response(poisson_ratio: float) -> Response:
     return Response(half_space, np.column_stack([layer, rings, along]))
 
 
-def held_off(points: np.ndarray, inward: np.ndarray, thickness: np.ndarray, area: np.ndarray, strain: np.ndarray,
-             most: float, poisson_ratio: float, group: np.ndarray) -> Linear:  # fmt: skip
+@numba.njit(cache=True, error_model="numpy")
+def hold_off(points, inward, thickness, area, strain, most, group, half_space, rows):
     """How nodes are held off as a tool asks, and what each sees around it.
 
     Args:
@@ -95,16 +79,15 @@ def held_off(points: np.ndarray, inward: np.ndarray, thickness: np.ndarray, area
         area: area that each stands for, (N,) [m2].
         strain: depth that the tool asks for, over the thickness, (N,) [-].
         most: strain up to which is solved [-].
-        poisson_ratio: nu.
         group: numbers of groups of nodes that do not feel each other, (N,).
+        half_space, rows: tables of a Response.
+
+    Returns:
+        pressure: pressure over E that holds the skin off, (N,) [-]; 0 where the skin leaves the tool.
+        moments: of pressure and strain on the rings, (N, 2, RINGS) [-].
+        vectors: their first moments, in the body's axes, (N, 2, 3) [-].
+        power: power of the depth with which the force grows as the tool goes on [-].
     """
-    table = response(poisson_ratio)
-    return Linear(*hold_off(points, inward, thickness, area, strain, most, group, table.half_space, table.rows))
-
-
-@numba.njit(cache=True, error_model="numpy")
-def hold_off(points, inward, thickness, area, strain, most, group, half_space, rows):
-    """`held_off` with the tables of a Response."""
     mean = thickness.mean()
     matrix, rings = _pairs(points, inward, thickness, area, group, mean, half_space, rows)
     depth = np.minimum(strain, most) * thickness / mean

@@ -1,12 +1,23 @@
 """Laws of the linear contact problem: what holds a tool off a bonded layer, and where."""
 
+from typing import NamedTuple
+
 import numpy as np
 import pytest
 
 from stmpl_core import Tissue
-from stmpl_core.obstacle import Linear, held_off
+from stmpl_core.obstacle import hold_off, response
 
 NU = 0.4
+
+
+class Linear(NamedTuple):
+    """What `hold_off` returns."""
+
+    pressure: np.ndarray
+    moments: np.ndarray
+    vectors: np.ndarray
+    power: float
 
 
 def lattice(spacing: float, radius: float) -> np.ndarray:
@@ -22,7 +33,8 @@ def solved(points: np.ndarray, spacing: float, strain: np.ndarray, nu: float = N
     n = len(points)
     area = np.full(n, 0.5 * np.sqrt(3) * spacing**2)
     group = np.zeros(n, np.int64) if group is None else group
-    return held_off(points, np.tile([0.0, 0.0, -1.0], (n, 1)), np.full(n, thickness), area, strain, 1.0, nu, group)
+    inward, table = np.tile([0.0, 0.0, -1.0], (n, 1)), response(nu)
+    return Linear(*hold_off(points, inward, np.full(n, thickness), area, strain, 1.0, group, *table))
 
 
 @pytest.mark.parametrize("nu", [0.3, 0.4, 0.45])
