@@ -95,7 +95,7 @@ class Skin:
     @classmethod
     def of(cls, layer: SoftLayer) -> Skin:
         """The layer's arrays."""
-        named = layer.vertices, layer.faces, layer.thickness if layer.core is None else layer.core
+        named = layer.vertices, layer.faces, *layer.below.values()
         digest = hashlib.sha256(b"".join(np.ascontiguousarray(a).tobytes() for a in named)).hexdigest()
         return cls(pack(layer), digest)
 

@@ -23,7 +23,7 @@ from fem_tools.system import System
 from stmpl_core.layer import SoftLayer
 from stmpl_core.load import Load
 from stmpl_core.methods.base import prepared
-from stmpl_core.methods.coarse import interpolation
+from stmpl_core.methods.coarse import handed_over, interpolation
 from stmpl_core.moments import Surroundings
 from stmpl_core.trust import Displacement, Trust
 
@@ -60,10 +60,8 @@ class LimbLinear:
         wide, narrow = _compliance(coarse), _flat(coarse, thickness)
         for vertex in range(len(coarse.vertices)):
             wide[:, vertex] -= narrow.of_one(vertex).ravel()
-        gathered = np.asarray(carry.T @ layer.vertex_areas)
-        self._near = _flat(layer, thickness)
-        self._wide, self._carry = wide, carry
-        self._hand = sp.csr_matrix(sp.diags(1 / np.maximum(gathered, 1e-12)) @ carry.T @ sp.diags(layer.vertex_areas))
+        self._near = narrow if coarse is layer else _flat(layer, thickness)
+        self._wide, self._carry, self._hand = wide, carry, handed_over(carry, layer.vertex_areas)
         self._layer, self._thickness, self._edge = layer, thickness, coarse.edge_length
         return self
 

@@ -73,14 +73,18 @@ class SoftLayer:
         """
         if self.core is not None and "vertices" in changes and not {"core", "thickness"} & set(changes):
             raise InvalidInput("this layer's columns run to a core: changed vertices want a core, too.")
-        depth = {} if {"core", "thickness"} & set(changes) else {"core": self.core} if self.core is not None else \
-            {"thickness": self.thickness}
+        below = {} if {"core", "thickness"} & set(changes) else self.below
         material = {k: changes.pop(k) for k in ("youngs_modulus", "poisson_ratio", "density", "skin", "deeper")
                     if k in changes}
         given = {"vertices": self.vertices, "faces": self.faces, "tissue": self.tissue, "chart": self.chart}
-        given |= depth | changes
+        given |= below | changes
         given["tissue"] = replace(given["tissue"], **material)
         return SoftLayer(**given)
+
+    @property
+    def below(self) -> dict[str, np.ndarray]:
+        """The argument that says how deep the layer is: its thickness (V,), or its core (V, 3), by name [m]."""
+        return {"thickness": self.thickness} if self.core is None else {"core": self.core}
 
     def _depth_of_core(self) -> PerVertex:
         """Depth of the core below the skin, along its normal, but no less than a third of the column, (V,) [m]."""

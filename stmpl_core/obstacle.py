@@ -16,6 +16,8 @@ import numba
 import numpy as np
 from scipy.special import j0
 
+from stmpl_core.response import of_one
+
 REACH = 8.0  # distance beyond which nodes do not feel each other, over t
 STEPS = 64  # rows of the layer's table a thickness
 NEAR = 4.0  # distance to which rings see, over t
@@ -49,11 +51,8 @@ def response(poisson_ratio: float) -> Response:
     The half-space takes the singular part, 2 (1 - nu^2) / k, so that nodes may be as close together as they like; the
     rest of A falls with exp(-2 k).
     """
-    nu, mu = poisson_ratio, 1 / (2 * (1 + poisson_ratio))
-    k = np.linspace(0, 14, 2801)[1:]
-    e = np.exp(-2 * k)
-    scale = mu * k * ((3 - 4 * nu) * (1 + e * e) + 2 * e * (2 * k * k + 5 - 12 * nu + 8 * nu * nu))
-    sink = (1 - nu) * ((3 - 4 * nu) * (1 - e * e) - 4 * k * e) / scale
+    nu, k = poisson_ratio, np.linspace(0, 14, 2801)[1:]
+    sink, _ = of_one(nu, k)
     radius = np.arange(int(REACH * STEPS) + 2) / STEPS
     weight = (sink - 2 * (1 - nu * nu) / k) * k * (k[1] - k[0]) / (2 * np.pi)
     layer = j0(np.outer(radius, k)) @ weight - (1 - nu * nu) * (k[1] - k[0]) / (2 * np.pi)  # the half step at k = 0

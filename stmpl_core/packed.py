@@ -19,8 +19,7 @@ def pack(layer: SoftLayer) -> dict[str, np.ndarray]:
     The tissue of one material is its modulus, ratio and density, (3,); what else it has is JSON, as bytes in `stack`.
     """
     tissue = layer.tissue
-    arrays = {"vertices": layer.vertices, "faces": layer.faces}
-    arrays |= {"thickness": layer.thickness} if layer.core is None else {"core": layer.core}
+    arrays = {"vertices": layer.vertices, "faces": layer.faces} | layer.below
     arrays["tissue"] = np.array([tissue.youngs_modulus, tissue.poisson_ratio, tissue.density])
     if isinstance(layer.chart, UvChart):
         arrays["uv"] = layer.chart.uv

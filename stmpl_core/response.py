@@ -44,7 +44,7 @@ def response_table(tissue: Tissue, thickness: float = 1.0) -> np.ndarray:
     radius = np.arange(int(REACH * STEPS) + 2) / STEPS
     table = np.empty((len(SPREADS), len(radius), 2))
     k = np.linspace(0, 6 / SPREADS[0], 4001)[1:]
-    sink, along = _of_one(tissue.poisson_ratio, k) if tissue.single else _of_stack(tissue, thickness, k)
+    sink, along = of_one(tissue.poisson_ratio, k) if tissue.single else _of_stack(tissue, thickness, k)
     phase = np.outer(k, radius)
     weight = np.exp(-0.5 * (k * SPREADS[:, None]) ** 2) * k * (k[1] - k[0]) / (2 * np.pi)
     table[:, :, 0], table[:, :, 1] = (weight * sink) @ j0(phase), (weight * along) @ j1(phase)
@@ -58,8 +58,8 @@ def response_table(tissue: Tissue, thickness: float = 1.0) -> np.ndarray:
     return table.astype(np.float32)
 
 
-def _of_one(nu: float, k: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """A and B of one material at wave numbers k [1/t], (K,) each [t/E]."""
+def of_one(nu: float, k: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """A and B of one material at wave numbers k [1/t], (K,) each [t/E]; see `response_table`."""
     mu = 1 / (2 * (1 + nu))
     e = np.exp(-2 * k)  # the transforms are divided by exp(2 K) / 2, so that nothing overflows
     scale = mu * k * ((3 - 4 * nu) * (1 + e * e) + 2 * e * (2 * k * k + 5 - 12 * nu + 8 * nu * nu))

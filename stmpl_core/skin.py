@@ -50,6 +50,6 @@ class Skin:
 
 def published(layer: SoftLayer) -> SoftLayer:
     """The layer rounded to float32, as messages carry it: whoever reads them has the very same layer."""
-    depth = {"thickness": layer.thickness} if layer.core is None else {"core": layer.core}
-    rounded = {name: values.astype(np.float32) for name, values in ({"vertices": layer.vertices} | depth).items()}
+    exact = {"vertices": layer.vertices} | layer.below
+    rounded = {name: values.astype(np.float32) for name, values in exact.items()}
     return layer.with_(**rounded)

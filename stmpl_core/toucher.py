@@ -331,7 +331,8 @@ class Toucher:
         if deepest > card["ranges"]["depth_over_thickness"][1] and one.status != IN_CORE:
             trust = trust.also(f"{name} presses to {deepest:.0%} of the thickness, learnt is "
                                f"{card['ranges']['depth_over_thickness'][1]:.0%}", in_range=False)  # fmt: skip
-        thinnest = float(np.subtract(*one.field.tool_bounds[::-1]).min())
+        extent = np.subtract(*one.field.tool_bounds[::-1])
+        thinnest = float(extent.min())
         if thinnest < THIN * layer.edge_length and touch.depth > SUNK * thinnest and one.status != IN_CORE:
             trust = trust.also(f"{name} is {1e3 * thinnest:.2g} mm thick, thin beside the skin's edges of "
                                f"{1e3 * layer.edge_length:.2g} mm, and {1e3 * touch.depth:.2g} mm deep", in_range=False)
@@ -346,7 +347,7 @@ class Toucher:
             trust = trust.also(f"{name} was moved {one.moved * 1e3:+.1f} mm along its force: check its calibration")
         area = float(one.squeeze.nodes.area.sum())
         lever = float(np.linalg.norm(touch.missing[3:])) / max(touch.force, 1e-300)
-        slack = min(self.reach, float(np.subtract(*one.field.tool_bounds[::-1]).max()))
+        slack = min(self.reach, float(extent.max()))
         if stated is not None and stated[3:].any() and lever > max(MAX_LEVER * (area / np.pi) ** 0.5, slack):
             trust = trust.also(f"{name} also turns with {1e3 * touch.force * lever:.2g} N mm, which is not carried",
                                in_range=False)  # fmt: skip

@@ -48,15 +48,12 @@ class Coarse:
         from stmpl_core.remesh import remesh
 
         mesh = remesh(layer.vertices, layer.faces, self.coarsening * layer.edge_length)
-        depth = {"thickness": mesh.transfer @ layer.thickness} if layer.core is None else \
-            {"core": mesh.transfer @ layer.core}  # fmt: skip
-        self.coarse = SoftLayer(mesh.vertices, mesh.faces, **depth, tissue=layer.tissue)
+        below = {name: mesh.transfer @ values for name, values in layer.below.items()}
+        self.coarse = SoftLayer(mesh.vertices, mesh.faces, **below, tissue=layer.tissue)
         self.method.prepare(self.coarse)
         self._carry = interpolation(self.coarse, layer)
-        area = layer.vertex_areas
-        gathered = np.asarray(self._carry.T @ area)
         self._forces = self._carry.T.tocsr()
-        self._pressures = sp.csr_matrix(sp.diags(1 / np.maximum(gathered, 1e-12)) @ self._forces @ sp.diags(area))
+        self._pressures = handed_over(self._carry, layer.vertex_areas)
         self._layer = layer
         return self
 
@@ -86,3 +83,14 @@ def interpolation(coarse: SoftLayer, fine: SoftLayer) -> sp.csr_matrix:
     weights /= weights.sum(axis=1, keepdims=True)
     rows = np.repeat(np.arange(len(face)), 3)
     return sp.csr_matrix((weights.ravel(), (rows, corners.ravel())), shape=(len(face), len(coarse.vertices)))
+
+
+def handed_over(carry: sp.csr_matrix, areas: np.ndarray) -> sp.csr_matrix:
+    """What makes pressures on the fine mesh pressures on the coarse one, whose forces have the same sum, (C, V).
+
+    Args:
+        carry: interpolation from the coarse to the fine mesh, (V, C).
+        areas: areas of the fine mesh's vertices, (V,) [m2].
+    """
+    gathered = np.asarray(carry.T @ areas)
+    return sp.csr_matrix(sp.diags(1 / np.maximum(gathered, 1e-12)) @ carry.T.tocsr() @ sp.diags(areas))
