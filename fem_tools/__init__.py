@@ -1,9 +1,8 @@
 """The ground truth: finite elements for a soft layer bonded to a rigid core, and what is learned from them."""
 
 from fem_tools.indenter import IndenterFem
-from fem_tools.limb import LimbLinear
 from fem_tools.patch import PatchFem
 from fem_tools.press import Press
 from fem_tools.rigid import RigidFem
 
-__all__ = ["IndenterFem", "LimbLinear", "PatchFem", "Press", "RigidFem"]
+__all__ = ["IndenterFem", "PatchFem", "Press", "RigidFem"]

@@ -131,7 +131,7 @@ TISSUE_BODIES = tuple(
         ("arm_lean", 0.1, "left_arm", 0.06, 6e-3, 0.45, 6.0, 0.4, 0.15, 8.0, 1.0),
         ("arm_heavy", 0.9, "left_arm", 0.06, 8e-3, 0.43, 1.0, 0.1, 0.5, 4.0, 1.0),
         ("arm_20", 0.4, "left_arm", 0.02, 6e-3, 0.4, 3.0, 0.2, 0.6, 3.0, 1.0),
-        ("arm_12", 0.6, "left_arm", 0.012, 4e-3, 0.45, 10.0, 0.6, 0.4, 10.0, 1.0),
+        ("arm_12", 0.6, "left_arm", 0.012, 4e-3, 0.45, 10.0, 0.6, 1.0, 1.0, 1.0),
         ("leg_bone", 0.5, "left_leg", 0.08, 12e-3, 0.45, 1.5, 0.1, 0.2, 5.0, 0.6),
         ("leg_30", 0.7, "left_leg", 0.03, 9e-3, 0.42, 5.0, 0.3, 0.35, 12.0, 1.0),
         # the ends of the ranges
@@ -205,7 +205,7 @@ PRESETS = {
     "contacts": Plan(preset="contacts", bodies=CONTACT_BODIES, discs=0, ellipses=0, seams=0, hands=0, bands=0,
                      letters=0, tools=60, loads=8, deepest=0.9, indenter_step=0.08),
     "tissue": Plan(preset="tissue", bodies=TISSUE_BODIES, discs=0, ellipses=0, seams=0, hands=0, bands=0, letters=0,
-                   tools=45, loads=7, deepest=0.6, indenter_step=0.12, clear=4.0, thinnest=1.4, sizes=(4e-3, 40e-3),
+                   tools=18, loads=8, deepest=0.85, indenter_step=0.12, clear=4.0, thinnest=1.4, sizes=(4e-3, 40e-3),
                    linear=True),
 }  # fmt: skip
 

@@ -27,6 +27,8 @@ BLEND = 6e-3  # difference of cost over which two bones share a column [m]
 THINNEST = 0.8e-3  # shortest column: skin lies on the bone, and never in it [m]
 LEAST_FOLD = 0.15  # fold ratio of a prism (stmpl_core.extrusion.fold_ratios) from which it is sound
 SHORTER = 0.93  # factor on the columns around a folding face, each pass
+WORST_FOLD = 0.02  # fold ratio below which a column that did not get sound by that also turns to the skin's normal
+TURNED = 0.1  # how far in each pass
 PASSES = 60  # passes of shortening at most
 
 
@@ -107,17 +109,28 @@ def core_of(vertices: Points, normals: VertexVectors, faces: Faces, bones: Seque
     if thickness is not None:
         deep = -np.einsum("ij,ij->i", columns, normals)
         columns *= np.minimum(thickness / np.maximum(deep, FACING * thickness), 1)[:, None]
-    return vertices + _unfolded(vertices, columns, faces)
+    return vertices + unfolded(vertices, normals, columns, faces)
 
 
-def _unfolded(vertices: Points, columns: VertexVectors, faces: Faces) -> VertexVectors:
+def unfolded(vertices: Points, normals: VertexVectors, columns: VertexVectors, faces: Faces) -> VertexVectors:
+    """Columns below a skin, shortened where their prisms are near to folding; where they still fold, also turned.
+
+    Args:
+        vertices: skin at rest, (V, 3) [m].
+        normals: its outward unit normals, (V, 3).
+        columns: vectors from there to the core, (V, 3) [m].
+        faces: vertex numbers, (F, 3).
+    """
     columns = columns.copy()
     hopeless = fold_ratios(vertices, vertices + 0.1 * columns, faces) < LEAST_FOLD
-    for _ in range(PASSES):
-        bad = np.unique(faces[(fold_ratios(vertices, vertices + columns, faces) < LEAST_FOLD) & ~hopeless])
-        if not len(bad):
-            break
-        columns[bad] *= SHORTER
+    for least, turned, spared in ((LEAST_FOLD, 0.0, hopeless), (WORST_FOLD, TURNED, False)):
+        for _ in range(PASSES):
+            bad = np.unique(faces[(fold_ratios(vertices, vertices + columns, faces) < least) & ~np.asarray(spared)])
+            if not len(bad):
+                break
+            length = np.linalg.norm(columns[bad], axis=1, keepdims=True)
+            way = columns[bad] / length - turned * normals[bad]
+            columns[bad] = SHORTER * length * way / np.linalg.norm(way, axis=1, keepdims=True)
     return columns
 
 

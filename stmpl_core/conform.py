@@ -12,12 +12,11 @@ from stmpl_core.columns import depth_along
 from stmpl_core.layer import SoftLayer
 from stmpl_core.moments import Surroundings
 from stmpl_core.sdf import SignedDistance
-from stmpl_core.touch import Pressed, Touch
+from stmpl_core.touch import Pressed, Touch, way_of
 
 MIN_LYING_PRESSURE = 0.05  # pressure over the tool's highest, below which a covered vertex may be apart from the tool
 FIRM_DEPTH = 0.013  # depth in a tool over the thickness, from which skin is moved out with its neighbours, not alone
 MIN_FACING_COSINE = 0.3  # cosine between tool's way and inward normal, from which skin comes along
-MIN_ONE_WAY_SHARE = 0.7  # share of the pressure that points one way, and its cosine to a force: all skin then goes so
 PASSES = 3  # corrections of one answer
 SMOOTHING_SHARE = 0.05  # ridge over the sinking of a vertex under its own source: it keeps neighbours from fighting
 
@@ -100,13 +99,10 @@ def conform(layer: SoftLayer, near: Surroundings, displacement: VertexVectors, t
 
 def _tool(touch: Touch, pressed: Pressed, layer: SoftLayer) -> _Tool:
     assert touch.pressure is not None
-    field, squeeze, forced, _ = pressed
+    field, squeeze, _, _ = pressed
     v = squeeze.vertices
-    pressure, size = touch.pressure[v], touch.force
-    way = -layer.normals[v]
-    if size > MIN_ONE_WAY_SHARE * float(pressure @ layer.vertex_areas[v]):
-        one = touch.wrench[:3] / size
-        way = np.broadcast_to(forced if forced is not None and forced @ one > MIN_ONE_WAY_SHARE else one, way.shape)
+    pressure = touch.pressure[v]
+    way = way_of(touch, pressed, -layer.normals[v], float(pressure @ layer.vertex_areas[v]))
     depth, cosine = squeeze.depth, -np.einsum("ni,ni->n", layer.normals[v], way)
     lies = squeeze.rests * np.clip(pressure / (MIN_LYING_PRESSURE * pressure.max()) - 0.5, 0, 1)
     lies *= np.clip((cosine - MIN_FACING_COSINE) / 0.1, 0, 1)

@@ -7,16 +7,18 @@ from typing import NamedTuple
 import numba
 import numpy as np
 
+from stmpl_core.green import Green
 from stmpl_core.layer import SoftLayer
 from stmpl_core.methods.moment_net import think_few
 from stmpl_core.moments import Surroundings
-from stmpl_core.networks import ARRAYS, NODE, PRESSURE, Weights, shipped
+from stmpl_core.networks import ARRAYS, NODE, PRESSURE, STACK_NODE, Weights, shipped
 from stmpl_core.nodes import Nodes
-from stmpl_core.obstacle import RINGS, hold_off, response
+from stmpl_core.obstacle import RINGS, hold_off, moments_of, pairs, power_of, response, solve
 from stmpl_core.rays import column_pressure
 
 MAX_LOG_RATIO = 2.5  # largest |log| of pressure over that of the linear layer [-]
 AT, SAY, NODES_SEE = NODE.at, PRESSURE.at, NODE.size  # first columns, constants to numba
+ON_STACK, STACKS_SEE = STACK_NODE.at, STACK_NODE.size
 LINEAR_TO = 0.6  # strain to which contact is solved; beyond it the columns' barrier takes over
 HARDENING = 0.75  # power of the columns' pressure with which it does
 FADE, FADE_RING = 0.03, 2  # strain at and around a node at which half of the correction is left: a touch begins linear
@@ -65,6 +67,9 @@ class ContactNet:
     nu and on the skin's curvature; so one network serves every stiffness, thickness, pose and limb. It was trained on
     tools that stick, pressed in along a line (studies.train_contact).
 
+    A stack, and columns that run to bone, have a linear response of their own (stmpl_core.green) and a network of their
+    own, which also reads kappa, T / (E t) and how thick the tissue is there; its units are those of the effective layer.
+
     Beyond LINEAR_TO of the thickness the problem is solved there, and each node's pressure rises as its confined
     column's to the power HARDENING: it never falls as the tool goes deeper.
 
@@ -72,6 +77,10 @@ class ContactNet:
         layer: soft layer at rest.
         weights: trained network; None: the one that comes with the package.
         near: neighbours of its vertices; None: found here.
+
+    Attributes:
+        network: name of the network that belongs to the layer.
+        unit: modulus in which its range of pressures is counted [Pa].
     """
 
     def __init__(self, layer: SoftLayer, weights: Weights | None = None, near: Surroundings | None = None) -> None:
@@ -81,18 +90,27 @@ class ContactNet:
         self._nu = tissue.poisson_ratio
         self._moduli = np.array([tissue.shear_modulus, tissue.lame_lambda]) / tissue.youngs_modulus
         self._table = response(self._nu)
+        self.network, self.unit, self._green = "contact_net", tissue.youngs_modulus, None
+        if layer.stacked:
+            self._green = Green.of(layer)
+            one = self._green.effective
+            self.network, self.unit = "stack_contact_net", one.youngs_modulus
 
     @property
     def weights(self) -> Weights:
         """The trained network; only `hold` needs it."""
         if self._weights is None:
-            self._weights = shipped("contact_net")
+            self._weights = shipped(self.network)
         return self._weights
 
     def look(self, nodes: Nodes) -> Look:
         """Solves the linear problem at the nodes, at least one, and gathers what the network reads."""
         group = self.near.groups(nodes.corners[:, 0])
-        return Look(*_look(*nodes, group, self.near.bent, *self._table, self._moduli, self._nu))
+        if self._green is None:
+            return Look(*_look(*nodes, group, self.near.bent, *self._table, self._moduli, self._nu))
+        matrix = self._green.matrix(nodes, group)
+        return Look(*_look_on_stack(*nodes, group, self.near.bent, *self._table, self._moduli, self._nu, matrix,
+                                    self._green.effective.thickness, self._green.numbers))  # fmt: skip
 
     def hold(self, nodes: Nodes) -> Held:
         """Pressure at contact nodes."""
@@ -108,19 +126,62 @@ def _look(points, inward, thickness, area, strain, corners, shares, group, bent,
     """See Look."""
     pressure, moments, vectors, power = hold_off(points, inward, thickness, area, strain, LINEAR_TO, group, half_space,
                                                  rows)  # fmt: skip
-    there, fade, top = np.zeros((len(area), bent.shape[1])), np.empty(len(area)), column_pressure(moduli, LINEAR_TO)
-    for n in range(len(area)):
-        around = strain[n] + moments[n, 1, FADE_RING]
-        fade[n] = around / (around + FADE)
-        for c in range(3):
-            for x in range(bent.shape[1]):
-                there[n, x] += shares[n, c] * bent[corners[n, c], x]
     inputs = np.empty((len(area), NODES_SEE), np.float32)
-    _inputs(pressure, moments, vectors, strain, inward, there, nu, inputs)
+    _inputs(pressure, moments, vectors, strain, inward, _between(corners, shares, bent), nu, inputs)
+    _harden(pressure, strain, moduli)
+    return pressure, inputs, _faded(strain, moments), power
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _look_on_stack(points, inward, thickness, area, strain, corners, shares, group, bent, half_space, rows, moduli, nu,
+                   matrix, t, numbers):  # fmt: skip
+    """See Look; t: thickness of the effective layer [m]; numbers: those of a Green."""
+    softness = np.exp(numbers[3])
+    even, overlap = np.full(len(area), t), strain * thickness / t
+    rings = pairs(points, inward, even, area, group, t, half_space, rows)[1]
+    depth = np.minimum(strain, LINEAR_TO) * thickness
+    force = solve(matrix, depth)
+    pressure = force / area
+    moments, vectors = moments_of(rings, points, even, area, softness * pressure, overlap)
+    inputs = np.empty((len(area), STACKS_SEE), np.float32)
+    _inputs(softness * pressure, moments, vectors, overlap, inward, _between(corners, shares, bent), nu, inputs)
     for n in range(len(area)):
+        row = inputs[n]
+        row[ON_STACK.log_thickness], row[ON_STACK.column_strain] = np.log(thickness[n] / t), strain[n]
+        row[ON_STACK.log_kappa], row[ON_STACK.log_pull] = numbers[1], numbers[2]
+        row[ON_STACK.log_softness] = numbers[3]
+    _harden(pressure, strain, moduli)
+    return pressure, inputs, _faded(overlap, moments), power_of(matrix, force, depth.max())
+
+
+@numba.njit(cache=True)
+def _between(corners, shares, values):
+    """Values of vertices (V, K), interpolated at nodes, (N, K)."""
+    out = np.zeros((len(corners), values.shape[1]))
+    for n in range(len(corners)):
+        for c in range(3):
+            for x in range(values.shape[1]):
+                out[n, x] += shares[n, c] * values[corners[n, c], x]
+    return out
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _faded(strain, moments):
+    """Share of the network's correction at each node, (N,)."""
+    out = np.empty(len(strain))
+    for n in range(len(strain)):
+        around = strain[n] + moments[n, 1, FADE_RING]
+        out[n] = around / (around + FADE)
+    return out
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _harden(pressure, strain, moduli):
+    """Lets pressures at strains beyond LINEAR_TO rise as those of confined columns."""
+    top = column_pressure(moduli, LINEAR_TO)
+    for n in range(len(pressure)):
         if strain[n] > LINEAR_TO:
             pressure[n] *= (column_pressure(moduli, strain[n]) / top) ** HARDENING
-    return pressure, inputs, fade, power
 
 
 @numba.njit(cache=True, error_model="numpy")

@@ -82,6 +82,11 @@ class SoftLayer:
         return SoftLayer(**given)
 
     @property
+    def stacked(self) -> bool:
+        """Whether it is more than one material straight below the skin: a skin, deeper materials, or a core."""
+        return not self.tissue.single or self.core is not None
+
+    @property
     def below(self) -> dict[str, np.ndarray]:
         """The argument that says how deep the layer is: its thickness (V,), or its core (V, 3), by name [m]."""
         return {"thickness": self.thickness} if self.core is None else {"core": self.core}

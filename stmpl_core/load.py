@@ -21,6 +21,7 @@ class Load:
 
     kind: LoadKind
     values: PerVertex
+    motion: VertexVectors | None = None
 
     @classmethod
     def pressure(cls, p: ArrayLike) -> Load:
@@ -28,13 +29,18 @@ class Load:
         return cls("pressure", finite("pressure", p, (None,)))
 
     @classmethod
-    def contact(cls, p: ArrayLike) -> Load:
+    def contact(cls, p: ArrayLike, motion: VertexVectors | None = None) -> Load:
         """Pressure of rigid tools that the skin sticks to, at each vertex, (V,) [Pa].
 
         A pressure, but one that comes with a pull along the skin: it keeps what is touched from spreading under the
         tool. Methods that do not know of it take it for a follower pressure.
+
+        Args:
+            p: pressure at each vertex, (V,) [Pa].
+            motion: linear response, (V, 3) [m], where it is known better than from the pressure: from where the tools
+                are.
         """
-        return cls("contact", finite("pressure", p, (None,)))
+        return cls("contact", finite("pressure", p, (None,)), motion)
 
     @classmethod
     def nodal(cls, f: ArrayLike) -> Load:
@@ -74,4 +80,4 @@ class Load:
 
     def scaled(self, factor: float) -> Load:
         """The same load times `factor`."""
-        return Load(self.kind, self.values * factor)
+        return Load(self.kind, self.values * factor, None if self.motion is None else self.motion * factor)

@@ -8,7 +8,6 @@ from weakref import WeakKeyDictionary
 import numba
 import numpy as np
 
-from stmpl_core.errors import InvalidInput
 from stmpl_core.layer import SoftLayer
 from stmpl_core.response import (
     REACH,
@@ -69,9 +68,10 @@ class Surroundings:
     """A layer's vertices with their frames and their neighbours: made once, then asked for every load.
 
     Args:
-        layer: soft layer at rest.
+        layer: soft layer at rest. Of a stack, or of columns that run to a core, the median thickness counts.
 
     Attributes:
+        thickness: thickness that distances are counted in, (V,) [m].
         frames: tangent, tangent, outward normal of each vertex, (V, 3, 3) [-].
         curvature: thickness times the skin's curvature in the tangents, xx, xy, yy, (V, 3) [-]; convex is positive.
         slope: gradient of the thickness along the tangents, (V, 2) [-].
@@ -80,9 +80,9 @@ class Surroundings:
     """
 
     def __init__(self, layer: SoftLayer) -> None:
-        if not layer.tissue.single and np.ptp(layer.thickness) > 0:
-            raise InvalidInput("the flat response of a stack wants one thickness.")
-        self.frames, self._thickness = _frames(layer.normals), layer.thickness
+        if layer.stacked:  # to a stack, and to bone, belongs one flat response
+            layer = SoftLayer(layer.vertices, layer.faces, float(np.median(layer.thickness)), tissue=layer.tissue)
+        self.frames, self.thickness = _frames(layer.normals), layer.thickness
         points = np.ascontiguousarray(layer.vertices)
         self._thinning = Thinning(layer, self.frames, REACH)
         self.sound = Soundness(layer)
@@ -112,13 +112,13 @@ class Surroundings:
     def of_one(self, vertex: int) -> np.ndarray:
         """Linear response to a unit source at one vertex, (V, 3) [m], computed at every vertex."""
         figures = self._by_groups(np.ones((1, 1)), np.array([vertex]), np.arange(len(self.frames)), moments=False)
-        return np.einsum("nj,nji->ni", figures[:, 0, :3] * self._thickness[:, None], self.frames)
+        return np.einsum("nj,nji->ni", figures[:, 0, :3] * self.thickness[:, None], self.frames)
 
     def linear(self, source: np.ndarray) -> np.ndarray:
         """Linear response alone to one source field (V,) [-], (V, 3) [m]."""
         asked = self.asked(np.flatnonzero(source))
         figures = self._by_groups(source[asked.loaded, None], asked.loaded, asked.vertices, moments=False)
-        local = figures[:, 0, :3] * self._thickness[asked.vertices, None]
+        local = figures[:, 0, :3] * self.thickness[asked.vertices, None]
         out = np.zeros((len(self.frames), 3))
         asked.fill(np.einsum("nj,nji->ni", local, self.frames[asked.vertices]), out)
         return out
@@ -148,7 +148,7 @@ class Surroundings:
         by, group = np.zeros((len(asked.vertices), 3)), self.groups(vertices)
         for one in range(group.max(initial=0) + 1):
             of = np.flatnonzero(group == one)
-            there, some = self._reached(vertices[of], asked.vertices, alone=not group.any()), vertices[of]
+            there, some = self.reached_among(vertices[of], asked.vertices, alone=not group.any()), vertices[of]
             part = np.empty((len(there), 3))
             values = np.ascontiguousarray(sources[of].T, dtype=np.float32)
             spread_sinking(asked.vertices[there], values, np.ascontiguousarray(self._sites[:, some]), self._sites,
@@ -161,7 +161,7 @@ class Surroundings:
         """Numbers of groups of vertices (N,), none of which feels another, (N,): all 0 where the skin has no folds."""
         return self._thinning.groups(vertices)
 
-    def _reached(self, loaded: np.ndarray, vertices: np.ndarray, alone: bool) -> np.ndarray:
+    def reached_among(self, loaded: np.ndarray, vertices: np.ndarray, alone: bool) -> np.ndarray:
         """Places in `vertices` of those that feel a load; of all, where there is no other."""
         if alone:
             return np.arange(len(vertices))
@@ -175,7 +175,7 @@ class Surroundings:
         figures = np.zeros((len(vertices), sources.shape[1], WIDTH), dtype=np.float32)
         for one in range(group.max() + 1):
             of = group == one
-            there = self._reached(loaded[of], vertices, alone=False)
+            there = self.reached_among(loaded[of], vertices, alone=False)
             figures[there] += self._felt(sources[of], loaded[of], vertices[there], moments)
         return figures
 

@@ -119,14 +119,35 @@ NODE = Layout(
     volumetric=1,  # 1 / (1.02 - 2 nu)
 )
 
-Kind = Literal["motion", "pressure", "image"]  # what a network says: a MomentNet, a ContactNet, a UNet
-READS: dict[Kind, Layout] = {"motion": INPUTS, "pressure": NODE}
-SAYS: dict[Kind, Layout] = {"motion": MOTION, "pressure": PRESSURE}
-_LAYERS = ("low", "high", "mean", "scale", "w1", "b1", "w2", "b2", "w3", "b3", "w4", "b4")
-ARRAYS: dict[Kind, tuple[str, ...]] = {
-    "motion": ("mix_vectors", "mix_tensors", "least", "most", *_LAYERS),  # least, most: what training inputs reached
-    "pressure": _LAYERS,
+# The same on a stack: t is that of the effective layer (stmpl_core.stack), strain the depth over it.
+STACK_NODE = Layout(
+    **NODE.sizes,
+    log_thickness=1,  # of the tissue at the node, over that of the effective layer
+    column_strain=1,  # depth over the tissue's thickness at the node
+    log_kappa=1,  # of the effective layer
+    log_pull=1,
+    log_softness=1,  # modulus of the first material over that of the effective layer
+)
+
+ON_STACK = {
+    "log_thickness": 1,  # of the tissue at the vertex, over the flat stack's
+    "log_effective": 1,  # thickness of the effective layer over the flat stack's
+    "log_kappa": 1,
+    "log_pull": 1,
+    "log_softness": 1,
+    "log_sunk": 1,  # largest linear motion, over the flat stack's thickness
 }
+STACK_POINT, STACK_INPUTS = Layout(**POINT.sizes, **ON_STACK), Layout(**INPUTS.sizes, **ON_STACK)
+
+Kind = Literal["motion", "pressure", "stack_motion", "stack_pressure", "image"]  # what a network says, a MomentNet, a ContactNet, a UNet
+READS: dict[Kind, Layout] = {"motion": INPUTS, "pressure": NODE, "stack_motion": STACK_INPUTS,
+                             "stack_pressure": STACK_NODE}  # fmt: skip
+SAYS: dict[Kind, Layout] = {"motion": MOTION, "pressure": PRESSURE, "stack_motion": MOTION, "stack_pressure": PRESSURE}
+_LAYERS = ("low", "high", "mean", "scale", "w1", "b1", "w2", "b2", "w3", "b3", "w4", "b4")
+_MOTION = ("mix_vectors", "mix_tensors", "least", "most", *_LAYERS)  # least, most: what training inputs reached
+ARRAYS: dict[Kind, tuple[str, ...]] = {
+    "motion": _MOTION, "pressure": _LAYERS, "stack_motion": _MOTION, "stack_pressure": _LAYERS,
+}  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
@@ -190,6 +211,8 @@ NETWORKS = {
     "moment_net": Network("motion", _FOLDER / "moment_net.safetensors"),  # pressures and nodal forces
     "moment_net_contact": Network("motion", _FOLDER / "moment_net_contact.safetensors"),  # what rigid tools press with
     "contact_net": Network("pressure", _FOLDER / "contact_net.safetensors"),
+    "stack_contact_net": Network("stack_pressure", _FOLDER / "stack_contact_net.safetensors"),
+    "stack_moment_net": Network("stack_motion", _FOLDER / "stack_moment_net.safetensors"),
     "unet": Network("image", _FOLDER / "unet.safetensors"),
 }
 

@@ -88,16 +88,16 @@ def hold_off(points, inward, thickness, area, strain, most, group, half_space, r
         power: power of the depth with which the force grows as the tool goes on [-].
     """
     mean = thickness.mean()
-    matrix, rings = _pairs(points, inward, thickness, area, group, mean, half_space, rows)
+    matrix, rings = pairs(points, inward, thickness, area, group, mean, half_space, rows)
     depth = np.minimum(strain, most) * thickness / mean
     force = solve(matrix, depth)
     pressure = force * mean**2 / area
-    moments, vectors = _moments(rings, points, thickness, area, pressure, strain)
-    return pressure, moments, vectors, _power(matrix, force, depth.max())
+    moments, vectors = moments_of(rings, points, thickness, area, pressure, strain)
+    return pressure, moments, vectors, power_of(matrix, force, depth.max())
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _pairs(points, inward, thickness, area, group, mean, half_space, rows):
+def pairs(points, inward, thickness, area, group, mean, half_space, rows):
     """Depth over `mean` of each node under a force E mean^2 at each, and its weights in rings, (N, N) and (., N, N).
 
     All of it is symmetric.
@@ -127,8 +127,8 @@ def _pairs(points, inward, thickness, area, group, mean, half_space, rows):
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _moments(rings, points, thickness, area, pressure, strain):
-    """See Linear."""
+def moments_of(rings, points, thickness, area, pressure, strain):
+    """Moments of pressure and strain on the rings, and their first moments: see hold_off."""
     width, count = rings.shape[:2]
     sources, scale, centre = np.empty((count, 8), np.float32), thickness.mean(), points[0].copy()
     for j in range(count):
@@ -209,7 +209,7 @@ def _times(matrix, vector, out):
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _power(matrix, force, depth):
+def power_of(matrix, force, depth):
     """The slope of the whole force over the depth, times depth over force: conjugate gradients on what presses."""
     count = len(force)
     found, left = np.zeros(count), (force > 0).astype(np.float64)

@@ -11,11 +11,13 @@ import numpy as np
 from stmpl_core.conform import Conformed, conform
 from stmpl_core.contact import Contact
 from stmpl_core.errors import InvalidInput
+from stmpl_core.green import Green
 from stmpl_core.layer import SoftLayer
 from stmpl_core.load import Load
 from stmpl_core.methods.base import Method
 from stmpl_core.skin import Skin
 from stmpl_core.state import State
+from stmpl_core.stick import stuck_motion
 from stmpl_core.tools import Tools
 from stmpl_core.touch import Answer, Touch
 from stmpl_core.toucher import Toucher
@@ -50,6 +52,7 @@ class Simulator:
             self.skin = Skin.of(layer, method)
         self.layer, self.method = self.skin.layer, self.skin.method
         self.toucher = Toucher(self.layer, self.skin.near, tools)
+        self._green = Green.of(self.layer) if self.layer.stacked else None
 
     @property
     def tools(self) -> Tools:
@@ -95,7 +98,8 @@ class Simulator:
         # Solve: the method moves the skin, and what is touched lies on its tool; where nothing presses, nothing moves.
         if pressing:
             moving = sum((one / factor for one, factor in pressing), zero)
-            solved = self.method.solve(Load.contact(moving))
+            motion = None if self._green is None else stuck_motion(self._green, touches)
+            solved = self.method.solve(Load.contact(moving, motion))
             fitted = conform(self.layer, self.skin.near, solved.displacement, touches)
         else:
             solved = Displacement(np.zeros_like(self.layer.vertices), Trust(), self.method.name)
@@ -103,7 +107,7 @@ class Simulator:
 
         # Say what may be believed: what the method says, and what was found of each contact.
         trust = _joined(solved.trust, touches, fitted)
-        if fitted.entered > MAX_ENTERED_SHARE * float(self.layer.thickness.min()):
+        if fitted.entered > MAX_ENTERED_SHARE * float(self.skin.near.thickness.min()):
             trust = trust.also(f"skin is {fitted.entered * 1e3:.2f} mm inside a tool", in_range=False)
         displacement, cut = _within(fitted.displacement, self.layer.thickness)
         if cut:

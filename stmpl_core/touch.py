@@ -26,6 +26,7 @@ WRAPPED = "wrapped around"  # tool that closes around the limb: a wrench does no
 IN_CORE = "inside the core"  # pose that reaches through the soft layer into what is rigid; the layer is pressed flat
 STALE = "stale"  # input that has stopped: the answer is a share of its last one
 
+MIN_ONE_WAY_SHARE = 0.7  # share of the pressure that points one way, and its cosine to a force: all skin then goes so
 PRESSING = frozenset((TOUCHING, MOVED, BY_POSE, IN_CORE))  # statuses of a tool that loads the skin
 
 
@@ -89,6 +90,25 @@ class Touch:
     def presses(self) -> bool:
         """Whether the tool loads the skin."""
         return self.status in PRESSING
+
+
+def way_of(touch: Touch, pressed: Pressed, inward: np.ndarray, total: float) -> np.ndarray:
+    """Ways that skin with these inward normals goes with a tool that it sticks to, unit vectors (N, 3).
+
+    That of the force where there is one, else of the mean contact normal, and each one's own normal where the tool
+    closes around the limb.
+
+    Args:
+        touch: touch of the tool.
+        pressed: what it presses.
+        inward: unit vectors into the skin, (N, 3).
+        total: sum of the sizes of the forces that it presses with [N].
+    """
+    if touch.force <= MIN_ONE_WAY_SHARE * total:
+        return inward
+    one = touch.wrench[:3] / touch.force
+    forced = pressed.way is not None and pressed.way @ one > MIN_ONE_WAY_SHARE
+    return np.tile(pressed.way if forced else one, (len(inward), 1))
 
 
 @dataclass(frozen=True, eq=False)

@@ -14,7 +14,7 @@ from stmpl_core.columns import HOLE_RADIUS, NO_SQUEEZE, Clearance, Columns, Sque
 from stmpl_core.contact import Contact
 from stmpl_core.contact_net import NOTHING, ContactNet, Held
 from stmpl_core.deep import DEEPEST, Deep
-from stmpl_core.layer import SoftLayer, single
+from stmpl_core.layer import SoftLayer
 from stmpl_core.moments import Surroundings
 from stmpl_core.nodes import Nodes
 from stmpl_core.obstacle import REACH
@@ -101,7 +101,7 @@ class Toucher:
 
     def __init__(self, layer: SoftLayer, near: Surroundings | None = None, tools: Tools | None = None, *,
                  reach: float = MAX_TOOL_OFFSET_M) -> None:  # fmt: skip
-        self.layer, self.reach = single(layer, "the contact law"), reach
+        self.layer, self.reach = layer, reach
         self.near = near or Surroundings.of(layer)
         self.hole = HOLE_RADIUS * layer.edge_length
         self.tools = Tools(margin_on(layer)) if tools is None else tools
@@ -323,7 +323,7 @@ class Toucher:
             return trust
         for why in self.near.sound.of_contact(vertices, pressure * layer.vertex_areas[vertices]):
             trust = trust.also(why, in_range=False)
-        ratio, highest = float(pressure.max()) / self._modulus, card["ranges"]["p_over_e"][1]
+        ratio, highest = float(pressure.max()) / self.net.unit, card["ranges"]["p_over_e"][1]
         if ratio > highest:
             trust = trust.also(f"{name} presses with p/E = {ratio:.2g}; contacts were learnt up to {highest:.2g}",
                                in_range=False)  # fmt: skip

@@ -12,7 +12,7 @@ from fem_tools.dataset import Dataset, Sample
 from stmpl_core.contact import Contact
 from stmpl_core.contact_net import ContactNet
 from stmpl_core.methods import MomentNet
-from stmpl_core.networks import Weights
+from stmpl_core.networks import NETWORKS, Weights
 from stmpl_core.simulator import Simulator
 from studies.pressed import STRAIGHT, pressed, seen, slant_of
 
@@ -59,7 +59,7 @@ def score(samples: Iterable[Sample], pressures: Weights, moments: Weights | None
     for one in pressed(sample for sample in samples if slant_of(sample) <= STRAIGHT):
         layer, true, area = one.sample.layer, one.true, one.sample.layer.vertex_areas
         if simulator is None or last is not layer:
-            simulator, last = Simulator(layer, MomentNet(contact=moments)), layer
+            simulator, last = Simulator(layer, MomentNet(contact=moments, stack=moments)), layer
             simulator.toucher.net = ContactNet(layer, pressures, simulator.toucher.near)
         if seen(one, simulator.toucher.net) is None:
             continue
@@ -95,17 +95,23 @@ def bound_force(samples: Iterable[Sample], pressures: Weights) -> dict[str, floa
     return found
 
 
-def bound_motion(data: str | Path, out: str | Path) -> dict[str, float]:
+def bound_motion(data: str | Path, out: str | Path, motion: str = "moment_net_contact",
+                 pressure: str = "contact_net") -> dict[str, float]:  # fmt: skip
     """How far the motion under a tool that came straight is off, from how far its force may be: see fit_bound.
 
-    Written to the card of out/moment_net_contact, and returned. Answers of the validation split that are flagged are
-    left out.
+    Written to the card of out/`motion`, and returned. Answers of the validation split that are flagged are left out.
+
+    Args:
+        data: folder of the data set.
+        out: folder of the weights.
+        motion, pressure: names of both networks.
 
     Raises:
         InvalidInput: no finished data set, or weights that are missing.
     """
-    path = Path(out) / "moment_net_contact.safetensors"
-    moments, pressures = Weights.load(path), Weights.load(Path(out) / "contact_net.safetensors", "pressure")
+    path = Path(out) / f"{motion}.safetensors"
+    moments = Weights.load(path, NETWORKS[motion].kind)
+    pressures = Weights.load(Path(out) / f"{pressure}.safetensors", NETWORKS[pressure].kind)
     scores = score(Dataset.open(data).split("val", kind="indenter", sets=("tool",)), pressures, moments)
     some = scores.trusted
     found = fit_bound(scores.motion[some], scores.stated[some], scores.tool[some], scores.slant[some])

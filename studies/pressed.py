@@ -13,11 +13,13 @@ from fem_tools.press import Press
 from fem_tools.sampling import tool_scene
 from fem_tools.scenes import Site
 from stmpl_core.arrays import Transform
-from stmpl_core.columns import Columns
+from stmpl_core.columns import Columns, Squeeze
 from stmpl_core.contact_net import ContactNet
 from stmpl_core.nodes import Nodes
 from stmpl_core.sdf import SignedDistance
 from stmpl_core.tool import Tool
+from stmpl_core.touch import BY_POSE, Touch
+from stmpl_core.touch import Pressed as Touched
 
 LEAST_CELLS = 20  # area of a contact over the square of the finite elements' edge, from which they know its pressure
 STRAIGHT = 0.36  # largest slant of a tool's way that is learnt from: no pose tells of it [rad]
@@ -32,14 +34,29 @@ class Pressed:
         tool: tool that presses.
         field: its signed distance.
         pose: pose of the tool, (4, 4).
-        nodes: contact nodes under it.
+        way: unit vector along which it came, (3,).
+        squeeze: columns under it.
     """
 
     sample: Sample
     tool: Tool
     field: SignedDistance
     pose: Transform
-    nodes: Nodes
+    way: np.ndarray
+    squeeze: Squeeze
+
+    @property
+    def nodes(self) -> Nodes:
+        """Contact nodes under it."""
+        return self.squeeze.nodes
+
+    @property
+    def touch(self) -> Touch:
+        """What a contact law that knows the true pressure would say, of a force along the tool's way."""
+        layer, pressure = self.sample.layer, self.sample.load.values
+        force = -(pressure @ layer.vertex_area_vectors)
+        return Touch(self.tool.name, BY_POSE, self.pose, np.concatenate([force, np.zeros(3)]), pressure=pressure,
+                     pressed=Touched(self.field, self.squeeze, self.way))  # fmt: skip
 
     @property
     def true(self) -> np.ndarray:
@@ -67,7 +84,7 @@ def pressed(samples: Iterable[Sample]) -> Iterator[Pressed]:
                     site.thickness_under(scene.pose_body_from_tool))  # fmt: skip
         _, tool, mesh, thickness = last
         pose = tool.at(sample.info["ratio"] * thickness).pose_body_from_tool
-        yield Pressed(sample, mesh, tool.field, pose, columns.squeezed(tool.field, pose).nodes)
+        yield Pressed(sample, mesh, tool.field, pose, tool.direction, columns.squeezed(tool.field, pose))
 
 
 @dataclass(frozen=True, eq=False)

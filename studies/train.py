@@ -10,7 +10,9 @@ from pydantic import ValidationError
 
 from stmpl_core.errors import InvalidInput, sentence_of
 
-TrainPreset = Literal["default", "contacts", "paper", "paper-reduced", "paper-3-bodies", "paper-reduced-3-bodies"]
+TrainPreset = Literal[
+    "default", "contacts", "tissue", "paper", "paper-reduced", "paper-3-bodies", "paper-reduced-3-bodies"
+]
 OnProgress = Callable[[int, int, str], None]  # done, in all, what to say of it
 
 
@@ -22,7 +24,7 @@ def train(
 
     Args:
         preset: "default": MomentNet. "contacts": what rigid tools press with (ContactNet) and what that does
-            (MomentNet once more), on data of the preset of that name. "paper": the paper's UNet at 512 x 512 (for a
+            (MomentNet once more), on data of the preset of that name. "tissue": the same on stacks. "paper": the paper's UNet at 512 x 512 (for a
             GPU, or several under torchrun);
             "paper-reduced": the same code at a size that one CPU core trains in under an hour; "-3-bodies": without the
             second and fourth body, as in the paper's second set-up.
@@ -56,9 +58,11 @@ def train(
 
     contacts = _settings(ContactTraining, changes)
     moments = _settings(MomentTraining, {"kinds": ("indenter",), "steps": 20_000} | changes)
-    train_moments(data, out, moments, name="moment_net_contact", on_progress=on_progress)
-    card = train_contact(data, out, contacts, on_progress=on_progress)
-    return card | {"motion": bound_motion(data, out)}
+    motion, pressure = ("stack_moment_net", "stack_contact_net") if preset == "tissue" else \
+        ("moment_net_contact", "contact_net")  # fmt: skip
+    train_moments(data, out, moments, name=motion, on_progress=on_progress)
+    card = train_contact(data, out, contacts, name=pressure, on_progress=on_progress)
+    return card | {"motion": bound_motion(data, out, motion, pressure)}
 
 
 def _settings(make: Callable[..., Any], changes: dict[str, Any]) -> Any:

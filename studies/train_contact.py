@@ -15,7 +15,7 @@ from torch import Tensor
 from fem_tools.dataset import Dataset, Sample, Subset
 from stmpl_core.contact_net import MAX_LOG_RATIO, ContactNet
 from stmpl_core.errors import InvalidInput
-from stmpl_core.networks import NODE, PRESSURE
+from stmpl_core.networks import NODE, PRESSURE, STACK_NODE
 from studies.judge_contact import bound_force
 from studies.pressed import STRAIGHT, Rows, pressed, seen, slant_of
 from studies.train_moments import Layers, OnProgress, training_card
@@ -95,7 +95,7 @@ def loss(model: Layers, data: Rows, contacts: np.ndarray) -> tuple[Tensor, Tenso
 def fit(data: Rows, settings: ContactTraining, on_progress: OnProgress) -> Layers:
     """Trains on contacts drawn at random."""
     torch.manual_seed(settings.seed)
-    model = Layers(settings.hidden, NODE, PRESSURE)
+    model = Layers(settings.hidden, STACK_NODE if data.rows.shape[1] == STACK_NODE.size else NODE, PRESSURE)
     model.take_range(torch.from_numpy(data.rows))
     optimiser = torch.optim.AdamW(model.parameters(), lr=settings.learning_rate, weight_decay=settings.weight_decay)
     schedule = torch.optim.lr_scheduler.OneCycleLR(
@@ -121,9 +121,12 @@ def train_contact(
     out: str | Path,
     settings: ContactTraining | None = None,
     *,
+    name: str = "contact_net",
     on_progress: OnProgress | None = None,
 ) -> dict[str, Any]:
-    """Trains a ContactNet on a data set of the preset "contacts", and writes out/contact_net.safetensors and .json.
+    """Trains a ContactNet on a data set of the preset "contacts" or "tissue", and writes its weights into `out`.
+
+    They are `name`.safetensors, and the card `name`.json beside.
 
     Returns:
         The card.
@@ -143,7 +146,7 @@ def train_contact(
     card["minutes"] = round((time.monotonic() - started) / 60, 1)
     weights = model.weights(card)
     card["bound"] = bound_force(source.split("val", kind="indenter", sets=("tool",)), weights)
-    weights.save(out / "contact_net.safetensors")
+    weights.save(out / f"{name}.safetensors")
     return card
 
 
@@ -152,7 +155,8 @@ def _ranges(data: Dataset, subset: Subset) -> dict[str, list[float]]:
     t = np.concatenate([layer.thickness for layer in trained])
     nu = [layer.tissue.poisson_ratio for layer in trained]
     infos = [subset.info(k) for k in range(len(subset))]
-    highest = max(subset[k].load.peak_ratio(subset[k].layer) for k in range(0, len(subset), max(1, len(subset) // 400)))
+    every = (subset[k] for k in range(0, len(subset), max(1, len(subset) // 400)))
+    highest = max(float(one.load.values.max()) / ContactNet(one.layer).unit for one in every)
     return {
         "poisson_ratio": [min(nu), max(nu)],
         "thickness_mm": [1e3 * float(t.min()), 1e3 * float(t.max())],

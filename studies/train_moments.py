@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,20 +13,44 @@ import torch
 from pydantic import BaseModel, ConfigDict, Field
 from torch import Tensor, nn
 
-from fem_tools.dataset import LOADS, Dataset, data_card
+from fem_tools.dataset import LOADS, Dataset, Sample, data_card
 from fem_tools.sampling import Kind
+from stmpl_core.green import Green
 from stmpl_core.layer import SoftLayer
 from stmpl_core.load import Load
-from stmpl_core.methods.moment_net import AMPLITUDE, SURROUNDED, MomentNet, source_fields
+from stmpl_core.methods.moment_net import (
+    AMPLITUDE,
+    SURROUNDED,
+    MomentNet,
+    of_stack,
+    source_fields,
+    take_linear,
+    unit_of,
+)
 from stmpl_core.moments import Surroundings
-from stmpl_core.networks import DIRECTIONS, INPUTS, MIXED_TENSORS, MIXED_VECTORS, MOTION, POINT, Layout, Weights
+from stmpl_core.networks import (
+    DIRECTIONS,
+    INPUTS,
+    MIXED_TENSORS,
+    MIXED_VECTORS,
+    MOTION,
+    ON_STACK,
+    POINT,
+    STACK_INPUTS,
+    STACK_POINT,
+    Layout,
+    Weights,
+)
 from stmpl_core.provenance import commit, machine, versions
 from stmpl_core.response import SCALARS, TENSORS, VECTORS, WIDTH
+from stmpl_core.stick import stuck_motion
+from studies.pressed import STRAIGHT, pressed, slant_of
 
 VERSIONS = ("stmpl", "torch", "numpy", "numba", "safetensors")
 AGAIN = 500  # steps, in the first half of them, after which the inputs' ranges are taken again: mixing changes them
 TYPICAL = 1e-3  # of the peak: errors below count as squares in the loss
 COVERED = 0.95  # share of validation answers whose largest error the stated bound must reach
+STUCK_FROM = 0.04  # depth over thickness from which finite elements have taken enough steps for skin to stick
 MARGIN = 1.3  # on that bound, for limbs and shapes unlike the validation data
 
 OnProgress = Callable[[int, int, str], None]  # done, in all, what to say of it
@@ -76,13 +100,13 @@ def draw_points(data: Dataset, settings: MomentTraining, on_progress: OnProgress
     rng = np.random.default_rng(settings.seed)
     subsets = [data.split("train", kind=kind) for kind in settings.kinds]
     total, done = sum(map(len, subsets)), 0
-    rows = np.empty((total * settings.points, POINT.size), np.float32)
+    rows = np.empty((total * settings.points, (STACK_POINT if stacked(data) else POINT).size), np.float32)
     motion, weight = np.empty((len(rows), 3), np.float32), np.empty(len(rows), np.float32)
     end, near, last = 0, None, None
     for subset in subsets:
-        for sample in subset:
+        for sample in stuck(subset) if stacked(data) else subset:
             if near is None or sample.layer is not last:
-                near, last = Surroundings(sample.layer), sample.layer
+                near, last = Surroundings.of(sample.layer), sample.layer
             row, moved, scale = _points(near, sample.layer, sample.load, sample.displacement, settings.points, rng)
             here = slice(end, end := end + len(row))
             rows[here], motion[here], weight[here] = row, moved, scale
@@ -92,10 +116,26 @@ def draw_points(data: Dataset, settings: MomentTraining, on_progress: OnProgress
     return Points(rows[:end], motion[:end], weight[:end])
 
 
+def stacked(data: Dataset) -> bool:
+    """Whether a data set is of stacks, or of columns that run to bone."""
+    return all(layer.stacked for layer in data.layers.values())
+
+
+def stuck(samples: Iterable[Sample]) -> Iterator[Sample]:
+    """Contacts of samples that came straight and not just now, with the motion of what sticks to their tools."""
+    for one in pressed(samples):
+        if slant_of(one.sample) <= STRAIGHT and one.sample.info["ratio"] >= STUCK_FROM and len(one.nodes.area):
+            layer, load = one.sample.layer, one.sample.load
+            yield one.sample._replace(load=Load.contact(load.values, stuck_motion(Green.of(layer), [one.touch])))
+
+
 def _points(near: Surroundings, layer: SoftLayer, load: Load, displacement: np.ndarray, count: int,
             rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:  # fmt: skip
-    sources = source_fields(load.pressure_on(layer), layer)
+    unit = unit_of(Green.of(layer)) if layer.stacked else layer.tissue
+    sources = source_fields(load.pressure_on(layer), unit)
     felt = near.felt(sources)
+    if load.motion is not None:
+        take_linear(felt.figures, near, felt.vertices, load.motion)
     surrounded = np.flatnonzero(np.abs(felt.scalars[:, 1]).sum(axis=1) > SURROUNDED)  # nothing is learnt elsewhere
     v, length = felt.vertices[surrounded], np.linalg.norm(displacement, axis=1)
     peak = float(length.max())
@@ -106,8 +146,10 @@ def _points(near: Surroundings, layer: SoftLayer, load: Load, displacement: np.n
     constants = np.broadcast_to([layer.tissue.poisson_ratio, load.kind == "nodal"], (len(v), 2))
     rows = POINT.in_order(figures=figures, curvature=near.curvature[v], slope=near.slope[v], here=sources[v],
                           constants=constants)  # fmt: skip
-    local = np.einsum("nij,nj->ni", near.frames[v], displacement[v]) / layer.thickness[v, None]
-    return np.concatenate(rows, axis=1), local, layer.thickness[v] / peak
+    if load.motion is not None:
+        rows.append(of_stack(Green.of(layer), v, load.motion))
+    local = np.einsum("nij,nj->ni", near.frames[v], displacement[v]) / near.thickness[v, None]
+    return np.concatenate(rows, axis=1), local, near.thickness[v] / peak
 
 
 class Layers(nn.Module):
@@ -164,10 +206,12 @@ class Model(Layers):
 
     Args:
         hidden: width of each hidden layer.
+        reads: INPUTS or STACK_INPUTS.
     """
 
-    def __init__(self, hidden: int) -> None:
-        super().__init__(hidden, INPUTS, MOTION)
+    def __init__(self, hidden: int, reads: Layout = INPUTS) -> None:
+        super().__init__(hidden, reads, MOTION)
+        self.known = STACK_POINT if reads is STACK_INPUTS else POINT
         self.mix_vectors = nn.Parameter(torch.randn(MIXED_VECTORS, DIRECTIONS) / DIRECTIONS**0.5)
         self.mix_tensors = nn.Parameter(torch.randn(MIXED_TENSORS, 2 * TENSORS) / (2 * TENSORS) ** 0.5)
         self.register_buffer("least", self.low.clone())
@@ -186,7 +230,7 @@ class Model(Layers):
             self.low, self.high = self.least, self.most
 
     def _inputs(self, rows: Tensor) -> tuple[Tensor, ...]:
-        known = POINT.split(rows)
+        known = self.known.split(rows)
         fields = known["figures"].view(-1, 2, WIDTH)
         xx, xy, yy = known["curvature"].T
         slope, here, constants = known["slope"], known["here"], known["constants"]
@@ -225,6 +269,7 @@ class Model(Layers):
             volumetric=1 / (1.02 - 2 * constants[:, :1]),
             squared_slope=(slope**2).sum(1, keepdim=True),
         )
+        inputs += [known[name] for name in ON_STACK if name in known]
         return torch.cat(inputs, dim=1), g, vectors, turned, curved, slope, fields[:, 1, :3]
 
     def forward(self, rows: Tensor) -> tuple[Tensor, Tensor]:
@@ -249,7 +294,7 @@ def _act(tensors: Tensor, vectors: Tensor) -> Tensor:
 def fit(points: Points, settings: MomentTraining, out: Path, on_progress: OnProgress) -> Model:
     """Trains on points; a checkpoint in `out` lets a run that was stopped go on, to the same weights."""
     torch.manual_seed(settings.seed)
-    model = Model(settings.hidden)
+    model = Model(settings.hidden, STACK_INPUTS if points.rows.shape[1] == STACK_POINT.size else INPUTS)
     rows, motion, weight = (torch.from_numpy(a) for a in (points.rows, points.motion, points.weight))
     some = torch.randperm(len(rows))[:1_000_000]
     model.normalise(rows[some])
@@ -365,7 +410,7 @@ def _ranges(data: Dataset, settings: MomentTraining) -> dict[str, list[float]]:
     trained = {name: layer for name, layer in data.layers.items() if len(data.split("train", bodies=[name]))}
     t = np.concatenate([layer.thickness for layer in trained.values()])
     nu = [layer.tissue.poisson_ratio for layer in trained.values()]
-    edges = [layer.edge_length / layer.thickness for layer in trained.values()]
+    edges = [layer.edge_length / Surroundings.of(layer).thickness for layer in trained.values()]
     out = {
         "poisson_ratio": [min(nu), max(nu)],
         "thickness_mm": [1e3 * float(t.min()), 1e3 * float(t.max())],
@@ -376,7 +421,10 @@ def _ranges(data: Dataset, settings: MomentTraining) -> dict[str, list[float]]:
         highest = 0.0
         for k in range(0, len(subset), max(1, len(subset) // 400)):
             sample = subset[k]
-            highest = max(highest, sample.load.peak_ratio(sample.layer))
+            layer, ratio = sample.layer, sample.load.peak_ratio(sample.layer)
+            if layer.stacked:
+                ratio *= layer.tissue.youngs_modulus / unit_of(Green.of(layer)).youngs_modulus
+            highest = max(highest, ratio)
         out[f"p_over_e_{load}"] = [0.0, round(highest, 4) if kind in settings.kinds else 0.0]
     return out
 
@@ -389,11 +437,11 @@ def calibrate(data: Dataset, weights: Weights, kinds: Sequence[Kind], on_progres
     over error.
     """
     subsets = [data.split("val", kind=kind) for kind in kinds]
-    method, layer, ratios = MomentNet(weights), None, []
+    method, layer, ratios = MomentNet(weights, contact=weights, stack=weights), None, []
     total = sum(map(len, subsets))
     for subset in subsets:
-        for k in range(0, len(subset), max(1, total // limit)):
-            sample = subset[k]
+        some = (subset[k] for k in range(0, len(subset), max(1, total // limit)))
+        for sample in stuck(some) if stacked(data) else some:
             if sample.layer is not layer:
                 layer = sample.layer
                 method.prepare(layer)

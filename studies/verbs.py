@@ -25,7 +25,7 @@ STABILITY_METHODS = ("moment_net", "linear", "winkler", "naive", "zero")  # of s
 
 def train(
     preset: Literal[
-        "default", "contacts", "paper", "paper-reduced", "paper-3-bodies", "paper-reduced-3-bodies"
+        "default", "contacts", "tissue", "paper", "paper-reduced", "paper-3-bodies", "paper-reduced-3-bodies"
     ] = "default",
     data: Path = Path("data/default"),
     out: Path | None = None,
@@ -39,7 +39,7 @@ def train(
     Several GPUs: torchrun --nproc-per-node 4 -m stmpl_ros.cli train --preset paper --data data/paper
 
     Args:
-        preset: default and contacts are ours (under an hour on two cores), paper the paper's UNet (a GPU),
+        preset: default, contacts and tissue are ours (under an hour on two cores), paper the paper's UNet (a GPU),
             paper-reduced the same code at a size for one core; 3-bodies: its second set-up.
         data: folder of the data set; make it with stmpl generate.
         out: folder of the weights; runs/train/<preset> unless given.

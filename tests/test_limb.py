@@ -3,10 +3,11 @@
 import numpy as np
 import pytest
 
-from fem_tools import LimbLinear, PatchFem
+from fem_tools import PatchFem
 from stmpl_core import Load, Membrane, Ply, SoftLayer, Tissue
 from stmpl_core.bones import Bone, to_bone
-from stmpl_core.errors import InvalidInput, NotPrepared
+from stmpl_core.errors import NotPrepared
+from stmpl_core.methods import LimbLinear
 from stmpl_core.moments import Surroundings
 from tests.scenes import disc, limb
 
@@ -21,7 +22,7 @@ def tissue_on_bone(tissue: Tissue) -> SoftLayer:
 
 @pytest.fixture(scope="module")
 def method() -> LimbLinear:
-    return LimbLinear(vertices=350).prepare(tissue_on_bone(STACK))
+    return LimbLinear().prepare(tissue_on_bone(STACK))
 
 
 def pressed(layer: SoftLayer, side: float, ratio: float) -> Load:
@@ -53,12 +54,10 @@ def test_more_than_a_twentieth_of_the_tissue_is_flagged(method):
 
 def test_tissue_thinner_than_the_coarse_mesh_is_flagged():
     thin = to_bone(limb(7e-3, 5e-3, RADIUS, LENGTH), [Bone(BESIDE.start, BESIDE.end, 0.024)])
-    answer = LimbLinear(vertices=350).prepare(thin).solve(pressed(thin, 1, 0.01))
+    answer = LimbLinear().prepare(thin).solve(pressed(thin, 1, 0.01))
     assert not answer.trust.in_range and "edges of the coarse mesh" in answer.trust.why
 
 
-def test_it_wants_a_layer_and_a_flat_stack_one_thickness():
+def test_it_wants_a_layer():
     with pytest.raises(NotPrepared):
         LimbLinear().solve(Load.pressure(np.zeros(3)))
-    with pytest.raises(InvalidInput, match="one thickness"):
-        Surroundings(tissue_on_bone(STACK))

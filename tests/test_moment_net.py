@@ -207,7 +207,8 @@ def test_numba_and_torch_see_the_same_inputs() -> None:
     mixed = model.mix_vectors.detach().numpy(), model.mix_tensors.detach().numpy()
     ends = [np.full(INPUTS.size, value, np.float32) for value in (-1e9, 1e9, -1e9, 1e9, 0.0, 1.0)]
     shape = np.concatenate([parts["curvature"], parts["slope"]], axis=1)
-    invariants(parts["figures"].reshape(200, 2, -1), shape, parts["here"], parts["constants"][0], *mixed, *ends, inputs,
+    more = np.empty((200, 0), np.float32)
+    invariants(parts["figures"].reshape(200, 2, -1), shape, parts["here"], parts["constants"][0], more, *mixed, *ends, inputs,
                outside)  # fmt: skip
     with torch.no_grad():
         want = model._inputs(torch.from_numpy(np.concatenate(POINT.in_order(**parts), axis=1)))[0].numpy()
@@ -228,7 +229,7 @@ def test_the_method_computes_what_was_trained() -> None:
     torch.nn.init.normal_(model.layers[-1].weight, std=0.1)  # type: ignore[arg-type]
     layer = limb()
     load = pad(layer, 0.7)
-    near, sources = Surroundings(layer), source_fields(load.values, layer)
+    near, sources = Surroundings(layer), source_fields(load.values, layer.tissue)
     felt = near.felt(sources)
     v = felt.vertices
     constants = np.tile([layer.tissue.poisson_ratio, 0.0], (len(v), 1))

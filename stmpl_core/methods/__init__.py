@@ -11,6 +11,7 @@ from stmpl_core.methods.base import Method
 if TYPE_CHECKING:
     from stmpl_core.methods.coarse import Coarse
     from stmpl_core.methods.ladder import Ladder
+    from stmpl_core.methods.limb_linear import LimbLinear
     from stmpl_core.methods.linear import Linear
     from stmpl_core.methods.moment_net import MomentNet
     from stmpl_core.methods.naive import Naive
@@ -18,7 +19,8 @@ if TYPE_CHECKING:
     from stmpl_core.methods.winkler import Winkler
     from stmpl_core.methods.zero import Zero
 
-__all__ = ["METHODS", "Coarse", "Ladder", "Linear", "Method", "MomentNet", "Naive", "UNet", "Winkler", "Zero", "method"]
+__all__ = ["METHODS", "Coarse", "Ladder", "LimbLinear", "Linear", "Method", "MomentNet", "Naive", "UNet", "Winkler",
+           "Zero", "method"]  # fmt: skip
 
 METHODS = {  # module and class of each method, by its name
     "moment_net": "stmpl_core.methods.moment_net:MomentNet",
@@ -29,10 +31,10 @@ METHODS = {  # module and class of each method, by its name
     "zero": "stmpl_core.methods.zero:Zero",
     "ladder": "fem_tools.ladder:ladder",
     "fem": "fem_tools.patch:PatchFem",
-    "limb_linear": "fem_tools.limb:LimbLinear",
+    "limb_linear": "stmpl_core.methods.limb_linear:LimbLinear",
 }
-_CLASSES = {"Coarse": "coarse", "Ladder": "ladder", "Linear": "linear", "MomentNet": "moment_net", "Naive": "naive",
-            "UNet": "unet", "Winkler": "winkler", "Zero": "zero"}  # fmt: skip
+_CLASSES = {"Coarse": "coarse", "Ladder": "ladder", "LimbLinear": "limb_linear", "Linear": "linear",
+            "MomentNet": "moment_net", "Naive": "naive", "UNet": "unet", "Winkler": "winkler", "Zero": "zero"}  # fmt: skip
 
 
 def method(name: str, **settings: Any) -> Method:

@@ -9,6 +9,7 @@ import igl
 import numpy as np
 import scipy.sparse as sp
 
+from stmpl_core.arrays import Points
 from stmpl_core.errors import InvalidInput
 from stmpl_core.layer import SoftLayer
 from stmpl_core.load import Load
@@ -74,15 +75,19 @@ class Coarse:
 
 def interpolation(coarse: SoftLayer, fine: SoftLayer) -> sp.csr_matrix:
     """Linear interpolation from the vertices of one mesh of a skin to those of another, (V_fine, V_coarse)."""
+    corners, weights = nearest_corners(coarse, fine.vertices)
+    rows = np.repeat(np.arange(len(corners)), 3)
+    return sp.csr_matrix((weights.ravel(), (rows, corners.ravel())), shape=(len(corners), len(coarse.vertices)))
+
+
+def nearest_corners(layer: SoftLayer, points: Points) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices around the nearest place of a skin to each of the points (N, 3), and barycentric coordinates, (N, 3)."""
     library: Any = igl
-    faces = coarse.faces.astype(np.int64)
-    _, face, nearest = library.point_mesh_squared_distance(fine.vertices, coarse.vertices, faces)
-    corners = coarse.faces[face]
-    a, b, c = (np.ascontiguousarray(coarse.vertices[corners[:, k]]) for k in range(3))
+    _, face, nearest = library.point_mesh_squared_distance(points, layer.vertices, layer.faces.astype(np.int64))
+    corners = layer.faces[face].astype(np.int64)
+    a, b, c = (np.ascontiguousarray(layer.vertices[corners[:, k]]) for k in range(3))
     weights = np.clip(library.barycentric_coordinates(np.ascontiguousarray(nearest), a, b, c), 0.0, 1.0)
-    weights /= weights.sum(axis=1, keepdims=True)
-    rows = np.repeat(np.arange(len(face)), 3)
-    return sp.csr_matrix((weights.ravel(), (rows, corners.ravel())), shape=(len(face), len(coarse.vertices)))
+    return corners, weights / weights.sum(axis=1, keepdims=True)
 
 
 def handed_over(carry: sp.csr_matrix, areas: np.ndarray) -> sp.csr_matrix:

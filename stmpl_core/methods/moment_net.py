@@ -10,17 +10,20 @@ import numba
 import numpy as np
 
 from stmpl_core.errors import InvalidInput
-from stmpl_core.layer import SoftLayer, single
+from stmpl_core.green import Green
+from stmpl_core.layer import SoftLayer
 from stmpl_core.load import Load
 from stmpl_core.methods.base import Method, prepared
+from stmpl_core.methods.limb_linear import LimbLinear, linear_motion
 from stmpl_core.methods.winkler import column_stretch
 from stmpl_core.moments import Surroundings
-from stmpl_core.networks import DIRECTIONS, INPUTS, MIXED_TENSORS, MIXED_VECTORS, MOTION, Weights, shipped
+from stmpl_core.networks import DIRECTIONS, INPUTS, MIXED_TENSORS, MIXED_VECTORS, MOTION, Kind, Weights, shipped
 from stmpl_core.response import FAST, SCALARS, TENSORS, VECTORS
 from stmpl_core.thinning import Asked
+from stmpl_core.tissue import Tissue
 from stmpl_core.trust import Displacement, Trust
 
-IN, OUT = INPUTS.at, MOTION.at  # first columns, constants to numba
+IN, OUT, INPUTS_END = INPUTS.at, MOTION.at, INPUTS.size  # first columns, constants to numba
 AMPLITUDE = 0.3  # largest addition of the network to the linear response, over t
 SURROUNDED = 1e-7  # size of the moments below which nothing is added
 FADE, RING = 1.5, 8.0  # size of the moments over the linear response, about 10 near a load: below, the answer fades
@@ -46,6 +49,8 @@ class MomentNet:
     Args:
         weights: path of a .safetensors file made by `stmpl train`; None: those that come with the package.
         contact: weights for what rigid tools press with (Load.contact), given likewise.
+        stack: weights for that on a stack, or on columns that run to bone, given likewise. Other loads on these are
+            answered by LimbLinear.
         fallback: method that answers loads outside the range that the network was trained on; None: the network's
             answer is given, and flagged.
         threads: number of threads of the kernels. Two are nearly twice as fast where two cores are idle, and stall for
@@ -62,6 +67,7 @@ class MomentNet:
         weights: str | Path | Weights | None = None,
         *,
         contact: str | Path | Weights | None = None,
+        stack: str | Path | Weights | None = None,
         fallback: Method | None = None,
         threads: int = 1,
     ) -> None:
@@ -69,23 +75,39 @@ class MomentNet:
             raise InvalidInput(f"threads is {threads}; at least 1 is needed.")
         self.threads = min(threads, numba.config.NUMBA_NUM_THREADS)  # type: ignore[attr-defined]
         self.weights, self.contact = _weights(weights, "moment_net"), _weights(contact, "moment_net_contact")
+        self._on_stack = stack
         self.fallback = fallback
+        self._green: Green | None = None
         self._layer: SoftLayer | None = None
         self._near: Surroundings | None = None
 
     @property
     def contact_bound(self) -> Mapping[str, float] | None:
         """Figures of a bound on the motion under tools, see studies.judge_contact; None: not known."""
-        return self.contact.card.get("contact_bound")
+        return (self.contact if self._green is None else self.stack).card.get("contact_bound")
+
+    @property
+    def stack(self) -> Weights:
+        """The network for stacks, read when one is met."""
+        if not isinstance(self._on_stack, Weights):
+            self._on_stack = _weights(self._on_stack, "stack_moment_net", "stack_motion")
+        return self._on_stack
 
     def prepare(self, layer: SoftLayer) -> Self:
-        """Finds each vertex's neighbours (half a second for a limb). Raises InvalidInput for a skin or a stack."""
-        single(layer, "MomentNet")
+        """Finds each vertex's neighbours (half a second for a limb), and a stack's linear response (seconds).
+
+        Raises:
+            InvalidInput, MeshError: a stack's skin that cannot be meshed coarsely.
+        """
         self._near = near = Surroundings.of(layer)
         self._shape = np.concatenate([near.curvature, near.slope], axis=1).astype(np.float32)
-        self._frames = near.frames.astype(np.float32) * layer.thickness[:, None, None].astype(np.float32)
-        self._width = EDGE_OVER_ROOT_AREA * np.sqrt(layer.vertex_areas) / layer.thickness
-        self._layer = layer
+        self._frames = near.frames.astype(np.float32) * near.thickness[:, None, None].astype(np.float32)
+        self._width = EDGE_OVER_ROOT_AREA * np.sqrt(layer.vertex_areas) / near.thickness
+        self._layer, self._green, self._unit = layer, None, layer.tissue
+        if layer.stacked:
+            self._green = Green.of(layer)
+            self._unit = unit_of(self._green)
+            self._linear = LimbLinear().prepare(layer)
         if self.fallback is not None:
             self.fallback.prepare(layer)
         return self
@@ -99,6 +121,8 @@ class MomentNet:
         """
         layer = prepared(self._layer, self)
         assert self._near is not None
+        if self._green is not None and load.kind != "contact":
+            return self._linear.solve(load)
         pressure = load.check(layer).pressure_on(layer)
         before = numba.get_num_threads()
         numba.set_num_threads(self.threads)
@@ -108,21 +132,27 @@ class MomentNet:
             numba.set_num_threads(before)
 
     def _solve(self, layer: SoftLayer, near: Surroundings, load: Load, pressure: np.ndarray) -> Displacement:
-        sources = source_fields(pressure, layer)
+        sources = source_fields(pressure, self._unit)
         asked = near.asked(load.loaded)
         felt = near.felt(sources, asked)
         vertices, figures = felt.vertices, felt.figures
         shape = self._shape[vertices]
         weights = self.contact if load.kind == "contact" else self.weights
+        displacement, more = np.zeros_like(layer.vertices), np.empty((len(vertices), 0), np.float32)
+        if self._green is not None:
+            weights, displacement = self.stack, linear_motion(self._green, load)
+            take_linear(figures, near, vertices, displacement)
+            more = of_stack(self._green, vertices, displacement)
         a, constants = weights.arrays, np.array([layer.tissue.poisson_ratio, load.kind == "nodal"], np.float32)
 
         # What is around each vertex becomes numbers that do not turn with the scene; far vertices need none.
         near_ones = np.flatnonzero(np.abs(felt.scalars[:, 1]).sum(axis=1) > SURROUNDED)
         place = np.full(len(vertices), -1)
         place[near_ones] = np.arange(len(near_ones))
-        inputs = np.empty((len(near_ones), INPUTS.size), dtype=np.float32)
+        inputs = np.empty((len(near_ones), INPUTS.size + more.shape[1]), dtype=np.float32)
         outside, strange = np.zeros(len(vertices), dtype=np.bool_), np.zeros(len(near_ones), dtype=np.bool_)
-        invariants(figures[near_ones], shape[near_ones], sources[vertices[near_ones]], constants, a["mix_vectors"],
+        invariants(figures[near_ones], shape[near_ones], sources[vertices[near_ones]], constants, more[near_ones],
+                a["mix_vectors"],
                 a["mix_tensors"], a["least"], a["most"], a["low"], a["high"], a["mean"], a["scale"], inputs,
                 strange)  # fmt: skip
         outside[near_ones] = strange
@@ -135,9 +165,8 @@ class MomentNet:
         moved, error = np.empty((len(vertices), 3)), np.empty(len(vertices), dtype=np.float32)
         _move(figures, shape, sources[vertices], place, outputs, a["mix_vectors"], a["mix_tensors"],
               self._frames[vertices], moved, error)  # fmt: skip
-        displacement = np.zeros_like(layer.vertices)
         asked.fill(moved, displacement)
-        peak_error = float((error * layer.thickness[vertices]).max(initial=0.0))
+        peak_error = float((error * near.thickness[vertices]).max(initial=0.0))
         trust = self._trust(weights.card, load, pressure, asked, moved, outside, peak_error)
         if not trust.in_range and self.fallback is not None:
             answer = self.fallback.solve(load)
@@ -156,7 +185,7 @@ class MomentNet:
         if not moving.any():  # a load so small that numbers cannot tell
             return Trust(error_bound=0.0)
         share = _share(outside, moving, asked)
-        ratio = float(pressure[loaded].max()) / layer.tissue.youngs_modulus
+        ratio = float(pressure[loaded].max()) / self._unit.youngs_modulus
         nu = layer.tissue.poisson_ratio
         fine, coarse = _tenths(self._width[asked.vertices[moving]])
         trust = Trust(figures={"peak_ratio": ratio, "outside_share": share, "expected_error_m": error})
@@ -185,8 +214,8 @@ class MomentNet:
         return Trust(trust.converged, trust.in_range, bound if trust.in_range else None, trust.why, trust.figures)
 
 
-def _weights(given: str | Path | Weights | None, default: str) -> Weights:
-    return given if isinstance(given, Weights) else Weights.load(given) if given else shipped(default)
+def _weights(given: str | Path | Weights | None, default: str, kind: Kind = "motion") -> Weights:
+    return given if isinstance(given, Weights) else Weights.load(given, kind) if given else shipped(default)
 
 
 def _share(some: np.ndarray, moving: np.ndarray, asked: Asked) -> float:
@@ -206,9 +235,28 @@ def _tenths(values: np.ndarray) -> tuple[float, float]:
     return float(ordered[low]), float(ordered[high])
 
 
-def source_fields(pressure: np.ndarray, layer: SoftLayer) -> np.ndarray:
+def unit_of(green: Green) -> Tissue:
+    """The material of a stack's effective layer."""
+    return Tissue(green.effective.youngs_modulus, green.layer.tissue.poisson_ratio)
+
+
+def take_linear(figures: np.ndarray, near: Surroundings, vertices: np.ndarray, motion: np.ndarray) -> None:
+    """Writes a linear response (V, 3) [m] into the figures (N, 2, WIDTH) of vertices (N,)."""
+    local = np.einsum("nij,nj->ni", near.frames[vertices], motion[vertices]) / near.thickness[vertices, None]
+    figures[:, :, :3] = local[:, None]
+
+
+def of_stack(green: Green, vertices: np.ndarray, motion: np.ndarray) -> np.ndarray:
+    """What the network reads of a stack at vertices (N,), (N, 6) float32; see stmpl_core.networks.ON_STACK."""
+    out = np.empty((len(vertices), 6), np.float32)
+    out[:, 0] = np.log(green.layer.thickness[vertices] / green.thickness)
+    out[:, 1:5] = green.numbers
+    out[:, 5] = np.log(np.linalg.norm(motion, axis=1).max() / green.thickness + 1e-6)
+    return out
+
+
+def source_fields(pressure: np.ndarray, tissue: Tissue) -> np.ndarray:
     """The two fields that a vertex feels: p / E, and the strain of a confined column times M / E, (V, 2) [-]."""
-    tissue = layer.tissue
     sources = np.zeros((len(pressure), 2), dtype=np.float32)
     loaded = np.flatnonzero(pressure != 0)
     sources[loaded, 0] = pressure[loaded] / tissue.youngs_modulus
@@ -253,9 +301,9 @@ def _mix(weights, vectors, out):
 
 
 @numba.njit(cache=True, fastmath=FAST, error_model="numpy")
-def invariants(figures, shape, here, constants, mix_vectors, mix_tensors, least, most, low, high, mean, scale, out,
+def invariants(figures, shape, here, constants, more, mix_vectors, mix_tensors, least, most, low, high, mean, scale, out,
                outside):  # fmt: skip
-    """The network's inputs, (N, INPUTS.size): kept from low to high, then centred and scaled.
+    """The network's inputs, those of INPUTS and then `more` (N, .): kept from low to high, then centred and scaled.
 
     Outside is who has one that no training load had.
     """
@@ -301,6 +349,8 @@ def invariants(figures, shape, here, constants, mix_vectors, mix_tensors, least,
         row[IN.constants], row[IN.constants + 1] = constants[0], constants[1]
         row[IN.volumetric] = one / (np.float32(1.02) - np.float32(2) * constants[0])
         row[IN.squared_slope] = shape[n, 3] * shape[n, 3] + shape[n, 4] * shape[n, 4]
+        for m in range(more.shape[1]):
+            row[INPUTS_END + m] = more[n, m]
         for m in range(len(mean)):
             if not least[m] <= row[m] <= most[m]:
                 outside[n] = True

@@ -1,0 +1,414 @@
+"""Green: what forces on a limb's skin do to it, in a linear response that knows stack, skin and the limb's own shape.
+
+Where tissue is no longer thin beside a limb's radius it flows and sways round the bone, which no flat layer knows; but
+that is smooth. So with G the response of a flat stack of one thickness, K the limb's linear stiffness on a coarse mesh
+of its skin, C the interpolation from there and R the way there (forces keep their sum),
+
+    u = G f + C (K^-1 - G_coarse) R f
+
+the sharp part is the closed form's, the wide part the finite elements' (fem_tools.limb).
+"""
+
+from __future__ import annotations
+
+from functools import cached_property
+from importlib import import_module
+from typing import NamedTuple
+from weakref import WeakKeyDictionary
+
+import numba
+import numpy as np
+from scipy.special import j0, j1
+
+from stmpl_core.layer import SoftLayer
+from stmpl_core.moments import Surroundings
+from stmpl_core.nodes import Nodes
+from stmpl_core.response import SPREAD
+from stmpl_core.stack import Effective, along, compliance, effective
+from stmpl_core.tissue import Tissue
+
+REACH = 8.0  # distance beyond which the flat response is not felt, over t
+ROWS = 64  # rows of the tables over the root of the distance
+SPREADS = np.geomspace(0.004, 1.6, 16)  # widths of a node's force that are tabled, over t
+ROUND = float(np.sqrt(2 / np.pi))  # of a Gaussian that is as wide, 1 / r in its middle is 1 / (ROUND s)
+FAR = 16.0  # distance over the spread, from which a force may be spread wider without a difference (0.2 %)
+POINTS = 4  # of Gauss's rule on each panel of wave numbers
+RIDGE = 1e-6  # of the matrix that sticks, over its largest number: two nodes in one place are no error
+LEAST_KAPPA, LEAST_PULL = 0.05, 0.02  # kappa and pull that are none, in logarithms
+ONE_WAY = 0.3  # least cosine between a tool's way and the skin's inward normal at a node
+
+
+class CoarseResponse(NamedTuple):
+    """The wide part of a limb's response, on a coarse mesh of its skin.
+
+    Args:
+        corners: numbers of the coarse vertices around each vertex of the skin, (V, 3).
+        shares: barycentric coordinates among them, (V, 3) [-].
+        gathered: area that each coarse vertex stands for, (C,) [m2].
+        motion: motion of coarse vertices under a pressure E at one, less that of the flat stack, (C, 3, C) float32 [m].
+        edge_length: of the coarse mesh [m].
+    """
+
+    corners: np.ndarray
+    shares: np.ndarray
+    gathered: np.ndarray
+    motion: np.ndarray
+    edge_length: float
+
+
+_KEPT: WeakKeyDictionary[SoftLayer, Green] = WeakKeyDictionary()  # entries die with their layers
+
+
+class Green:
+    """Linear response of a stacked layer to forces at contact nodes: prepared once, then microseconds a node.
+
+    Args:
+        layer: soft layer at rest.
+        coarse: wide part of its response.
+
+    Attributes:
+        thickness: thickness of the flat stack, the median of the layer's [m].
+        effective: single layer under the same skin that is nearest to the stack.
+        near: neighbours of the layer's vertices, with the flat stack's response.
+    """
+
+    def __init__(self, layer: SoftLayer, coarse: CoarseResponse) -> None:
+        self.layer, self.coarse = layer, coarse
+        self.thickness = float(np.median(layer.thickness))
+        self.near = Surroundings.of(layer)
+        self.tables = tables(layer.tissue, self.thickness)
+
+    @classmethod
+    def of(cls, layer: SoftLayer) -> Green:
+        """The response of a layer, made on the first call (seconds) and kept as long as the layer is.
+
+        Raises:
+            InvalidInput, MeshError: the skin cannot be meshed coarsely.
+        """
+        if layer not in _KEPT:
+            _KEPT[layer] = cls(layer, import_module("fem_tools.limb").coarse_response(layer))
+        return _KEPT[layer]
+
+    def keep(self, layer: SoftLayer) -> None:
+        """Lets `of` give this one for another layer, of the same shape and the same ratios of moduli."""
+        _KEPT[layer] = self
+
+    @cached_property
+    def effective(self) -> Effective:
+        """See the class."""
+        return effective(self.layer.tissue, self.thickness)
+
+    @cached_property
+    def numbers(self) -> np.ndarray:
+        """What networks read of the stack, (4,): logarithms of t over that of the flat stack, kappa, T / (E t), and E.
+
+        Those of the effective layer, the last as the first material's modulus over it.
+        """
+        one = self.effective
+        return np.log([one.thickness / self.thickness, one.kappa + LEAST_KAPPA, one.pull + LEAST_PULL,
+                       self.layer.tissue.youngs_modulus / one.youngs_modulus])  # fmt: skip
+
+    def matrix(self, nodes: Nodes, group: np.ndarray) -> np.ndarray:
+        """Depth at each node under a force E at each along the normals, symmetric, (N, N) [1/m].
+
+        Args:
+            nodes: contact nodes.
+            group: numbers of groups of nodes that do not feel each other, (N,).
+        """
+        return _matrix(nodes.points, nodes.inward, nodes.area, nodes.corners, nodes.shares, group, self.thickness,
+                       self.tables[0], *self.coarse[:4])  # fmt: skip
+
+    def stuck(self, nodes: Nodes, group: np.ndarray, gone: np.ndarray) -> np.ndarray:
+        """Forces over E with which nodes that stick are held where they have gone, (N, 3) [m2].
+
+        Args:
+            nodes: nodes that press.
+            group: numbers of groups of nodes that do not feel each other, (N,).
+            gone: their motion, (N, 3) [m].
+        """
+        blocks = _blocks(nodes.points, nodes.inward, nodes.area, nodes.corners, nodes.shares, group, self.thickness,
+                         self.tables, *self.coarse[:4])  # fmt: skip
+        np.fill_diagonal(blocks, np.diag(blocks) + RIDGE * np.abs(blocks).max())
+        return np.linalg.solve(blocks, gone.ravel()).reshape(-1, 3)
+
+    def motion(self, nodes: Nodes, forces: np.ndarray) -> np.ndarray:
+        """Motion of all vertices under forces over E at nodes (N, 3) [m2], (V, 3) [m]."""
+        layer, out = self.layer, np.zeros_like(self.layer.vertices)
+        loaded = np.unique(nodes.corners)
+        asked = self.near.asked(loaded)
+        by, group = np.zeros((len(asked.vertices), 3)), self.near.groups(nodes.corners[:, 0])
+        spread = SPREAD * np.sqrt(nodes.area) / self.thickness
+        for one in np.unique(group):
+            of = group == one
+            there = self.near.reached_among(np.unique(nodes.corners[of]), asked.vertices, alone=not group.any())
+            _add_motion(by, there, layer.vertices[asked.vertices], -layer.normals[asked.vertices],
+                        nodes.points[of], nodes.inward[of], forces[of], spread[of], self.thickness,
+                        self.tables)  # fmt: skip
+        asked.fill(by, out)
+        source = _handed(nodes.inward, nodes.corners, nodes.shares, forces, *self.coarse[:3])
+        return self._widely(source, out)
+
+    def linear(self, source: np.ndarray) -> np.ndarray:
+        """Motion of all vertices under a pressure over E at each (V,) [-], (V, 3) [m]."""
+        corners, shares, gathered = self.coarse[:3]
+        weight = (shares * (source * self.layer.vertex_areas)[:, None]).ravel()
+        handed = np.bincount(corners.ravel(), weight, len(gathered)) / np.maximum(gathered, 1e-12)
+        return self._widely(handed, self.near.linear(source))
+
+    def _widely(self, source: np.ndarray, out: np.ndarray) -> np.ndarray:
+        """Adds the coarse part of the response to pressures over E at coarse vertices (C,)."""
+        loaded = np.flatnonzero(source)
+        if len(loaded):
+            motion = _times(self.coarse.motion, loaded, source)
+            _add_between(self.coarse.corners, self.coarse.shares, motion, out)
+        return out
+
+
+def tables(tissue: Tissue, thickness: float) -> np.ndarray:
+    """Responses of a flat stack with E = t = 1 to a force spread as a Gaussian, (4, spread, root of the distance).
+
+    In order: motion inwards and outwards from a force inwards; of one along the skin the even part of the motion and
+    the part that goes with the direction. With A, B of stmpl_core.stack.compliance and L, C of `along`,
+
+        int A J0, int B J1, int (L + C) / 2 J0, -int (L - C) J2, each times exp(-(k s)^2 / 2) k dk / (2 pi)
+
+    and times sqrt(r^2 + (ROUND s)^2), which takes out how steep it is.
+    """
+    waves = np.geomspace(1e-5, 10 / SPREADS[0], 3000)
+    sink, away = compliance(tissue, thickness, waves)
+    lengthwise, crosswise = along(tissue, thickness, waves)
+    curves, logs = (sink, away, 0.5 * (lengthwise + crosswise), crosswise - lengthwise), np.log(waves)
+    radii = (np.arange(int(np.sqrt(REACH) * ROWS) + 2) / ROWS) ** 2
+    out = np.empty((4, len(SPREADS), len(radii)))
+    for row, radius in enumerate(radii):
+        for n, spread in enumerate(np.maximum(SPREADS, radius / FAR)):
+            if n and spread > SPREADS[n]:
+                out[:, n, row] = out[:, n - 1, row] if spread == radius / FAR and radius / FAR > SPREADS[n - 1] \
+                    else _transforms(curves, logs, radius, spread)  # fmt: skip
+            else:
+                out[:, n, row] = _transforms(curves, logs, radius, spread)
+    fade = np.clip((REACH - radii) / 1.5, 0, 1)
+    return out * np.sqrt(radii**2 + (ROUND * SPREADS[:, None]) ** 2) * fade * fade * (3 - 2 * fade)
+
+
+def _transforms(curves: tuple, logs: np.ndarray, radius: float, spread: float) -> np.ndarray:
+    """The four transforms at one radius and spread, on panels as fine as the waves there."""
+    edges = _panels(radius, 6 / spread)
+    x, w = np.polynomial.legendre.leggauss(POINTS)
+    middle, half = 0.5 * (edges[1:] + edges[:-1]), 0.5 * np.diff(edges)
+    k, weight = (middle[:, None] + half[:, None] * x).ravel(), (half[:, None] * w).ravel()
+    weight = weight * np.exp(-0.5 * (k * spread) ** 2) * k / (2 * np.pi)
+    f, log = k * radius, np.log(k)
+    first, zeroth = j1(f), j0(f)
+    second = np.where(f > 1e-4, 2 * first / np.maximum(f, 1e-4) - zeroth, f * f / 8)
+    values = (np.interp(log, logs, curve) for curve in curves)
+    return np.array([weight @ (v * j) for v, j in zip(values, (zeroth, first, zeroth, second), strict=True)])
+
+
+def _panels(radius: float, end: float) -> np.ndarray:
+    edges = [1e-4]
+    while edges[-1] < end:
+        edges.append(edges[-1] + min(0.15 * edges[-1] + 0.05, 1.5 / max(radius, 1e-9)))
+    return np.array(edges)
+
+
+@numba.njit(cache=True, error_model="numpy", inline="always")
+def _place(radius, spread):
+    """Place in a table: rows of the root of the distance and of the spread, and what is left, both over t."""
+    f = np.sqrt(min(radius, REACH * 0.9999)) * ROWS
+    h = min(max(np.log(spread / SPREADS[0]) / np.log(SPREADS[1] / SPREADS[0]), 0.0), len(SPREADS) - 1.001)
+    return int(f), f - int(f), int(h), h - int(h)
+
+
+@numba.njit(cache=True, error_model="numpy", inline="always")
+def _at(table, k, f, g, h):
+    """Value of one table at a place."""
+    low = (1 - f) * table[g, k] + f * table[g, k + 1]
+    return (1 - h) * low + h * ((1 - f) * table[g + 1, k] + f * table[g + 1, k + 1])
+
+
+@numba.njit(cache=True)
+def _corners_of(corners, shares, skin_corners, skin_shares):
+    """The coarse vertices around nodes and their weights, (N, 9) each; and those that are met, in order."""
+    count = len(corners)
+    index, weight = np.empty((count, 9), np.int64), np.empty((count, 9))
+    for n in range(count):
+        for a in range(3):
+            for b in range(3):
+                index[n, 3 * a + b] = skin_corners[corners[n, a], b]
+                weight[n, 3 * a + b] = shares[n, a] * skin_shares[corners[n, a], b]
+    return index, weight, np.unique(index)
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _wide(index, weight, some, inward, gathered, motion, out):
+    """Adds the coarse motion of each node under a force E inwards at each, (N, 3, N) [1/m]."""
+    count, row = len(index), np.empty((3, len(some)))
+    for n in range(count):
+        row[:] = 0.0
+        for a in range(9):
+            for x in range(3):
+                for d in range(len(some)):
+                    row[x, d] += weight[n, a] * motion[index[n, a], x, some[d]]
+        for j in range(count):
+            for a in range(9):
+                d, share = np.searchsorted(some, index[j, a]), weight[j, a] / gathered[index[j, a]]
+                for x in range(3):
+                    out[n, x, j] += share * row[x, d]
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _matrix(points, inward, area, corners, shares, group, thickness, table, skin_corners, skin_shares, gathered,
+            motion):  # fmt: skip
+    """See Green.matrix."""
+    count = len(points)
+    index, weight, some = _corners_of(corners, shares, skin_corners, skin_shares)
+    wide, out = np.zeros((count, 3, count)), np.zeros((count, count))
+    _wide(index, weight, some, inward, gathered, motion, wide)
+    for i in range(count):
+        for j in range(i + 1):
+            if group[i] != group[j]:
+                continue
+            both = square = facing = 0.0
+            for x in range(3):
+                both += 0.5 * (wide[i, x, j] * inward[i, x] + wide[j, x, i] * inward[j, x])
+                square += (points[i, x] - points[j, x]) ** 2
+                facing += inward[i, x] * inward[j, x]
+            r = np.sqrt(square) / thickness
+            if facing > 0 and r < REACH:
+                s = SPREAD * np.sqrt(0.5 * (area[i] + area[j])) / thickness
+                k, f, g, h = _place(r, s)
+                both += _at(table, k, f, g, h) / (np.sqrt(r * r + (ROUND * s) ** 2) * thickness)
+            out[i, j] = out[j, i] = both
+    return out
+
+
+@numba.njit(cache=True, error_model="numpy", inline="always")
+def _of_force(points, inward, i, sources, source_inward, j, size, g0, g1, even, along, force, out):
+    """Adds to out (3,) the flat motion of point i under a force (3,) at source j, given the four responses there."""
+    m0, m1, m2 = (inward[i, 0] + source_inward[j, 0], inward[i, 1] + source_inward[j, 1],
+                  inward[i, 2] + source_inward[j, 2])  # fmt: skip
+    root = 1 / np.sqrt(m0 * m0 + m1 * m1 + m2 * m2)
+    m0, m1, m2 = m0 * root, m1 * root, m2 * root
+    d0, d1, d2 = points[i, 0] - sources[j, 0], points[i, 1] - sources[j, 1], points[i, 2] - sources[j, 2]
+    up = d0 * m0 + d1 * m1 + d2 * m2
+    d0, d1, d2 = d0 - up * m0, d1 - up * m1, d2 - up * m2
+    length = np.sqrt(d0 * d0 + d1 * d1 + d2 * d2)
+    root = 1 / length if length > 1e-6 * size else 0.0
+    d0, d1, d2 = d0 * root, d1 * root, d2 * root
+    down = force[0] * source_inward[j, 0] + force[1] * source_inward[j, 1] + force[2] * source_inward[j, 2]
+    over = force[0] * m0 + force[1] * m1 + force[2] * m2
+    t0, t1, t2 = force[0] - over * m0, force[1] - over * m1, force[2] - over * m2
+    radial = t0 * d0 + t1 * d1 + t2 * d2
+    sink, away, rest = g0 * down - g1 * radial, g1 * down + along * radial, even - 0.5 * along
+    out[0] += sink * inward[i, 0] + away * d0 + rest * t0
+    out[1] += sink * inward[i, 1] + away * d1 + rest * t1
+    out[2] += sink * inward[i, 2] + away * d2 + rest * t2
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _blocks(points, inward, area, corners, shares, group, thickness, tables, skin_corners, skin_shares, gathered,
+            motion):  # fmt: skip
+    """Motion of each node under a force E at each, (3 N, 3 N) [1/m]; the coarse part only under what goes inwards."""
+    count = len(points)
+    index, weight, some = _corners_of(corners, shares, skin_corners, skin_shares)
+    wide, out = np.zeros((count, 3, count)), np.zeros((count, 3, count, 3))
+    _wide(index, weight, some, inward, gathered, motion, wide)
+    force, moved = np.zeros(3), np.empty(3)
+    for i in range(count):
+        for j in range(count):
+            if group[i] != group[j]:
+                continue
+            square = facing = 0.0
+            for x in range(3):
+                square += (points[i, x] - points[j, x]) ** 2
+                facing += inward[i, x] * inward[j, x]
+                for y in range(3):
+                    out[i, x, j, y] = wide[i, x, j] * inward[j, y]
+            r = np.sqrt(square) / thickness
+            if facing <= 0 or r >= REACH:
+                continue
+            s = SPREAD * np.sqrt(0.5 * (area[i] + area[j])) / thickness
+            k, f, g, h = _place(r, s)
+            per = 1 / (np.sqrt(r * r + (ROUND * s) ** 2) * thickness)
+            g0, g1, even, along = (per * _at(tables[0], k, f, g, h), per * _at(tables[1], k, f, g, h),
+                                   per * _at(tables[2], k, f, g, h), per * _at(tables[3], k, f, g, h))  # fmt: skip
+            for y in range(3):
+                force[:] = 0.0
+                force[y], moved[:] = 1.0, 0.0
+                _of_force(points, inward, i, points, inward, j, thickness, g0, g1, even, along, force, moved)
+                for x in range(3):
+                    out[i, x, j, y] += moved[x]
+    return out.reshape(3 * count, 3 * count)
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _add_motion(out, there, points, inward, sources, source_inward, forces, spread, thickness, tables):
+    """Adds to rows `there` of out (M, 3) the flat motion of points under forces over E at sources."""
+    rows, row_of = np.empty((len(sources), 4, tables.shape[2])), np.empty(len(sources), np.int64)
+    kinds = 0
+    for j in range(len(sources)):  # nodes of one tool are about as wide: few tables serve all
+        _, _, g, h = _place(0.0, spread[j])
+        at = int(16 * (g + h))
+        row_of[j] = -1
+        for k in range(kinds):
+            if rows[k, 0, -1] == at:
+                row_of[j] = k
+        if row_of[j] < 0:
+            g, h = at // 16, (at % 16 + 0.5) / 16
+            for m in range(4):
+                for c in range(tables.shape[2]):
+                    rows[kinds, m, c] = (1 - h) * tables[m, g, c] + h * tables[m, g + 1, c]
+            rows[kinds, 0, -1] = at
+            row_of[j] = kinds
+            kinds += 1
+    for n in range(len(there)):
+        i = there[n]
+        for j in range(len(sources)):
+            square = facing = 0.0
+            for x in range(3):
+                square += (points[i, x] - sources[j, x]) ** 2
+                facing += inward[i, x] * source_inward[j, x]
+            r = np.sqrt(square) / thickness
+            if facing <= 0 or r >= 0.98 * REACH:
+                continue
+            f = np.sqrt(r) * ROWS
+            k, row = int(f), rows[row_of[j]]
+            f -= k
+            per = 1 / (np.sqrt(r * r + (ROUND * spread[j]) ** 2) * thickness)
+            g0, g1 = per * ((1 - f) * row[0, k] + f * row[0, k + 1]), per * ((1 - f) * row[1, k] + f * row[1, k + 1])
+            even, along = (per * ((1 - f) * row[2, k] + f * row[2, k + 1]),
+                           per * ((1 - f) * row[3, k] + f * row[3, k + 1]))  # fmt: skip
+            _of_force(points, inward, i, sources, source_inward, j, thickness, g0, g1, even, along, forces[j], out[i])
+
+
+@numba.njit(cache=True)
+def _handed(inward, corners, shares, forces, skin_corners, skin_shares, gathered):
+    """Pressures over E at coarse vertices that forces over E at nodes amount to, inwards, (C,)."""
+    index, weight, _ = _corners_of(corners, shares, skin_corners, skin_shares)
+    out = np.zeros(len(gathered))
+    for n in range(len(index)):
+        down = inward[n, 0] * forces[n, 0] + inward[n, 1] * forces[n, 1] + inward[n, 2] * forces[n, 2]
+        for a in range(9):
+            out[index[n, a]] += weight[n, a] * down / gathered[index[n, a]]
+    return out
+
+
+@numba.njit(cache=True)
+def _times(motion, loaded, source):
+    """Motion of coarse vertices under sources at those that are loaded, (C, 3)."""
+    out = np.zeros((len(motion), 3))
+    for c in range(len(motion)):
+        for x in range(3):
+            for k in loaded:
+                out[c, x] += motion[c, x, k] * source[k]
+    return out
+
+
+@numba.njit(cache=True)
+def _add_between(corners, shares, motion, out):
+    """Adds motion of coarse vertices (C, 3), interpolated, to out (V, 3)."""
+    for v in range(len(corners)):
+        for a in range(3):
+            for x in range(3):
+                out[v, x] += shares[v, a] * motion[corners[v, a], x]

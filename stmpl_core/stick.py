@@ -1,0 +1,44 @@
+"""Stick: how the skin of a stacked limb moves when what a tool touches sticks to it, in the linear response."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from stmpl_core.arrays import VertexVectors
+from stmpl_core.columns import depth_along
+from stmpl_core.green import ONE_WAY, Green
+from stmpl_core.nodes import Nodes
+from stmpl_core.obstacle import solve
+from stmpl_core.touch import Pressed, Touch, way_of
+
+FURTHEST = 1.5  # way of a node over its depth along the tool's way: beside a wall it is not clear where that ends
+
+
+def stuck_motion(green: Green, touches: Sequence[Touch]) -> VertexVectors:
+    """Motion of the skin under tools that press, (V, 3) [m].
+
+    The linear problem without friction says which nodes press; those go with their tools, in all directions, and the
+    forces that this takes move the rest of the skin. So the motion follows from the pose, not from the pressure: it
+    depends little on how tissue stiffens.
+    """
+    pressed = [(touch, touch.pressed) for touch in touches if touch.pressed is not None]
+    nodes = Nodes.joined([one.squeeze.nodes for _, one in pressed])
+    group = green.near.groups(nodes.corners[:, 0])
+    gone = np.concatenate([_gone(touch, one, green.layer.vertex_areas) for touch, one in pressed])
+    holds = np.flatnonzero(solve(green.matrix(nodes, group), nodes.strain * nodes.thickness) > 0)
+    if not len(holds):
+        return np.zeros_like(green.layer.vertices)
+    some = Nodes(*(values[holds] for values in nodes))
+    return green.motion(some, green.stuck(some, group[holds], gone[holds]))
+
+
+def _gone(touch: Touch, pressed: Pressed, areas: np.ndarray) -> np.ndarray:
+    """Way of a tool's nodes with it, if they stick, (N, 3) [m]."""
+    nodes = pressed.squeeze.nodes
+    assert touch.pressure is not None
+    way = way_of(touch, pressed, nodes.inward, float(touch.pressure @ areas))
+    depth = nodes.strain * nodes.thickness / np.maximum(np.einsum("ni,ni->n", nodes.inward, way), ONE_WAY)
+    far = depth_along(pressed.field, touch.pose_body_from_tool, nodes.points, way, depth)
+    return np.minimum(far, FURTHEST * depth)[:, None] * way
