@@ -12,10 +12,9 @@ from fem_tools.mesh import WedgeMesh
 from fem_tools.plies import wedge_ends
 from fem_tools.system import System
 from stmpl_core.bones import unfolded
-from stmpl_core.green import CoarseResponse
+from stmpl_core.green import CoarseResponse, add_motion, tables
 from stmpl_core.layer import SoftLayer
 from stmpl_core.methods.coarse import nearest_corners
-from stmpl_core.moments import Surroundings
 
 VERTICES = 900  # vertices of the coarse skin, about: its operator has 3 times their square numbers
 FINEST = 1.1  # edges of the coarse mesh over the layer's own, below which the layer's own is taken
@@ -33,15 +32,18 @@ def coarse_response(layer: SoftLayer, vertices: int = VERTICES) -> CoarseRespons
         InvalidInput, MeshError: the skin cannot be meshed so coarsely.
     """
     coarse = _coarse(layer, vertices)
-    wide = _compliance(coarse)
-    narrow = Surroundings(SoftLayer(coarse.vertices, coarse.faces, float(np.median(layer.thickness)),
-                                    tissue=layer.tissue))  # fmt: skip
-    for vertex in range(len(coarse.vertices)):
-        wide[:, vertex] -= narrow.of_one(vertex).ravel()
+    wide, thickness = _compliance(coarse), float(np.median(layer.thickness))
+    table, every = tables(layer.tissue, thickness), np.arange(len(coarse.vertices))
+    inward, area = -coarse.normals, coarse.vertex_areas
+    for v in every:  # less the flat stack's
+        flat, one = np.zeros_like(coarse.vertices), slice(v, v + 1)
+        add_motion(flat, every, coarse.vertices, inward, coarse.vertices[one], inward[one], area[one],
+                   area[v] * inward[one], thickness, table)  # fmt: skip
+        wide[:, v] -= flat.ravel()
     corners, shares = nearest_corners(coarse, layer.vertices)
-    area = np.bincount(corners.ravel(), (shares * layer.vertex_areas[:, None]).ravel(), len(coarse.vertices))
+    gathered = np.bincount(corners.ravel(), (shares * layer.vertex_areas[:, None]).ravel(), len(coarse.vertices))
     motion = np.ascontiguousarray(wide.reshape(-1, 3, len(coarse.vertices)))
-    return CoarseResponse(corners, shares, np.maximum(area, 1e-12), motion, coarse.edge_length)
+    return CoarseResponse(corners, shares, np.maximum(gathered, 1e-12), motion, coarse.edge_length)
 
 
 def _coarse(layer: SoftLayer, vertices: int) -> SoftLayer:

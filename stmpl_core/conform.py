@@ -43,12 +43,6 @@ class _Tool(NamedTuple):
     lies: np.ndarray  # share from 0, may be apart, to 1, lies on the tool, (N,)
     firm: np.ndarray  # FIRM_DEPTH, (N,) [m]
 
-    def jet(self, points: Points) -> tuple[np.ndarray, Points]:
-        """Signed distance [m] and its gradient at points of the layer's frame."""
-        turn = self.pose[:3, :3]
-        phi, gradient = self.field.distance_gradient((points - self.pose[:3, 3]) @ turn)
-        return phi, gradient @ turn.T
-
 
 def conform(layer: SoftLayer, near: Surroundings, displacement: VertexVectors, touches: Sequence[Touch]) -> Conformed:
     """Moves the skin under tools onto them, and the skin around them along as a bonded layer would.
@@ -87,14 +81,37 @@ def conform(layer: SoftLayer, near: Surroundings, displacement: VertexVectors, t
         moved += sinking[:, act] @ step
     out = near.spread(all_of, sources)
     out += displacement
-    entered = 0.0
-    for tool in tools:  # what is left inside goes straight out
-        phi, gradient = tool.jet(layer.vertices[tool.vertices] + out[tool.vertices])
-        out[tool.vertices] -= np.minimum(phi, 0.0)[:, None] * gradient
-        phi, _ = tool.jet(layer.vertices[tool.vertices] + out[tool.vertices])
-        entered = max(entered, -float(phi.min(initial=0.0)))
+    entered = _push_out(layer, touches, out)
     corrected = float(np.linalg.norm(out[all_of] - displacement[all_of], axis=1).max())
     return Conformed(out, corrected, entered)
+
+
+def kept_out(layer: SoftLayer, displacement: VertexVectors, touches: Sequence[Touch]) -> Conformed:
+    """The answer with the skin that is inside a tool on its surface: where all else lies on the tool already."""
+    out = displacement.copy()
+    entered = _push_out(layer, touches, out)
+    return Conformed(out, float(np.linalg.norm(out - displacement, axis=1).max()), entered)
+
+
+def _push_out(layer: SoftLayer, touches: Sequence[Touch], out: VertexVectors) -> float:
+    """Moves what is left inside tools straight out; the largest depth that is left [m]."""
+    entered = 0.0
+    for touch in touches:
+        if touch.pressed is None:
+            continue
+        field, pose, v = touch.pressed.field, touch.pose_body_from_tool, touch.pressed.squeeze.vertices
+        phi, gradient = _jet(field, pose, layer.vertices[v] + out[v])
+        out[v] -= np.minimum(phi, 0.0)[:, None] * gradient
+        phi, _ = _jet(field, pose, layer.vertices[v] + out[v])
+        entered = max(entered, -float(phi.min(initial=0.0)))
+    return entered
+
+
+def _jet(field: SignedDistance, pose: np.ndarray, points: Points) -> tuple[np.ndarray, Points]:
+    """Signed distance [m] of a tool and its gradient at points of the layer's frame."""
+    turn = pose[:3, :3]
+    phi, gradient = field.distance_gradient((points - pose[:3, 3]) @ turn)
+    return phi, gradient @ turn.T
 
 
 def _tool(touch: Touch, pressed: Pressed, layer: SoftLayer) -> _Tool:
@@ -116,7 +133,7 @@ def _tool(touch: Touch, pressed: Pressed, layer: SoftLayer) -> _Tool:
 
 def _wanted(tool: _Tool, rest: Points, moved: Points) -> tuple[Points, np.ndarray]:
     """How the vertices under a tool should still move, (N, 3) [m], and how firmly, (N,): 0, need not, to 1."""
-    phi, gradient = tool.jet(rest + moved)
+    phi, gradient = _jet(tool.field, tool.pose, rest + moved)
     out, lies = -np.minimum(phi, 0.0)[:, None] * gradient, tool.lies[:, None]
     wanted = lies * (tool.gone - moved) + (1 - lies) * out
     return wanted, np.maximum(tool.lies, np.clip(-phi / tool.firm, 0, 1))

@@ -23,7 +23,7 @@ from scipy.special import j0, j1
 from stmpl_core.layer import SoftLayer
 from stmpl_core.moments import Surroundings
 from stmpl_core.nodes import Nodes
-from stmpl_core.response import SPREAD
+from stmpl_core.response import FAST, SPREAD
 from stmpl_core.stack import Effective, along, compliance, effective
 from stmpl_core.tissue import Tissue
 
@@ -32,6 +32,7 @@ ROWS = 64  # rows of the tables over the root of the distance
 SPREADS = np.geomspace(0.004, 1.6, 16)  # widths of a node's force that are tabled, over t
 ROUND = float(np.sqrt(2 / np.pi))  # of a Gaussian that is as wide, 1 / r in its middle is 1 / (ROUND s)
 FAR = 16.0  # distance over the spread, from which a force may be spread wider without a difference (0.2 %)
+AROUND = 0.5  # cosine between normals below which the flat response fades: what is round the limb is the coarse part's
 POINTS = 4  # of Gauss's rule on each panel of wave numbers
 RIDGE = 1e-6  # of the matrix that sticks, over its largest number: two nodes in one place are no error
 LEAST_KAPPA, LEAST_PULL = 0.05, 0.02  # kappa and pull that are none, in logarithms
@@ -133,35 +134,33 @@ class Green:
 
     def motion(self, nodes: Nodes, forces: np.ndarray) -> np.ndarray:
         """Motion of all vertices under forces over E at nodes (N, 3) [m2], (V, 3) [m]."""
-        layer, out = self.layer, np.zeros_like(self.layer.vertices)
-        loaded = np.unique(nodes.corners)
-        asked = self.near.asked(loaded)
+        layer = self.layer
+        asked = self.near.asked(np.unique(nodes.corners))
         by, group = np.zeros((len(asked.vertices), 3)), self.near.groups(nodes.corners[:, 0])
-        spread = SPREAD * np.sqrt(nodes.area) / self.thickness
         for one in np.unique(group):
             of = group == one
             there = self.near.reached_among(np.unique(nodes.corners[of]), asked.vertices, alone=not group.any())
-            _add_motion(by, there, layer.vertices[asked.vertices], -layer.normals[asked.vertices],
-                        nodes.points[of], nodes.inward[of], forces[of], spread[of], self.thickness,
-                        self.tables)  # fmt: skip
+            add_motion(by, there, layer.vertices[asked.vertices], -layer.normals[asked.vertices], nodes.points[of],
+                       nodes.inward[of], nodes.area[of], forces[of], self.thickness, self.tables)  # fmt: skip
+        out = np.zeros_like(layer.vertices)
         asked.fill(by, out)
         source = _handed(nodes.inward, nodes.corners, nodes.shares, forces, *self.coarse[:3])
-        return self._widely(source, out)
-
-    def linear(self, source: np.ndarray) -> np.ndarray:
-        """Motion of all vertices under a pressure over E at each (V,) [-], (V, 3) [m]."""
-        corners, shares, gathered = self.coarse[:3]
-        weight = (shares * (source * self.layer.vertex_areas)[:, None]).ravel()
-        handed = np.bincount(corners.ravel(), weight, len(gathered)) / np.maximum(gathered, 1e-12)
-        return self._widely(handed, self.near.linear(source))
-
-    def _widely(self, source: np.ndarray, out: np.ndarray) -> np.ndarray:
-        """Adds the coarse part of the response to pressures over E at coarse vertices (C,)."""
         loaded = np.flatnonzero(source)
         if len(loaded):
             motion = _times(self.coarse.motion, loaded, source)
             _add_between(self.coarse.corners, self.coarse.shares, motion, out)
         return out
+
+    def linear(self, source: np.ndarray) -> np.ndarray:
+        """Motion of all vertices under a pressure over E at each (V,) [-], (V, 3) [m]."""
+        layer, loaded = self.layer, np.flatnonzero(source)
+        if not len(loaded):
+            return np.zeros_like(layer.vertices)
+        inward, area = -layer.normals[loaded], layer.vertex_areas[loaded]
+        one = np.eye(3)[[0]].repeat(len(loaded), axis=0)  # a node at each vertex, all of it the first corner's
+        corners = np.tile(loaded[:, None], 3)
+        nodes = Nodes(layer.vertices[loaded], inward, layer.thickness[loaded], area, area, corners, one)
+        return self.motion(nodes, (source[loaded] * area)[:, None] * inward)
 
 
 def tables(tissue: Tissue, thickness: float) -> np.ndarray:
@@ -218,6 +217,13 @@ def _place(radius, spread):
     f = np.sqrt(min(radius, REACH * 0.9999)) * ROWS
     h = min(max(np.log(spread / SPREADS[0]) / np.log(SPREADS[1] / SPREADS[0]), 0.0), len(SPREADS) - 1.001)
     return int(f), f - int(f), int(h), h - int(h)
+
+
+@numba.njit(cache=True, inline="always")
+def _share(facing):
+    """Share of the flat response that two places with this cosine between their normals feel of each other."""
+    x = min(max(facing / AROUND, 0.0), 1.0)
+    return x * x * (3 - 2 * x)
 
 
 @numba.njit(cache=True, error_model="numpy", inline="always")
@@ -278,7 +284,7 @@ def _matrix(points, inward, area, corners, shares, group, thickness, table, skin
             if facing > 0 and r < REACH:
                 s = SPREAD * np.sqrt(0.5 * (area[i] + area[j])) / thickness
                 k, f, g, h = _place(r, s)
-                both += _at(table, k, f, g, h) / (np.sqrt(r * r + (ROUND * s) ** 2) * thickness)
+                both += _share(facing) * _at(table, k, f, g, h) / (np.sqrt(r * r + (ROUND * s) ** 2) * thickness)
             out[i, j] = out[j, i] = both
     return out
 
@@ -330,7 +336,7 @@ def _blocks(points, inward, area, corners, shares, group, thickness, tables, ski
                 continue
             s = SPREAD * np.sqrt(0.5 * (area[i] + area[j])) / thickness
             k, f, g, h = _place(r, s)
-            per = 1 / (np.sqrt(r * r + (ROUND * s) ** 2) * thickness)
+            per = _share(facing) / (np.sqrt(r * r + (ROUND * s) ** 2) * thickness)
             g0, g1, even, along = (per * _at(tables[0], k, f, g, h), per * _at(tables[1], k, f, g, h),
                                    per * _at(tables[2], k, f, g, h), per * _at(tables[3], k, f, g, h))  # fmt: skip
             for y in range(3):
@@ -342,9 +348,21 @@ def _blocks(points, inward, area, corners, shares, group, thickness, tables, ski
     return out.reshape(3 * count, 3 * count)
 
 
-@numba.njit(cache=True, error_model="numpy")
-def _add_motion(out, there, points, inward, sources, source_inward, forces, spread, thickness, tables):
-    """Adds to rows `there` of out (M, 3) the flat motion of points under forces over E at sources."""
+@numba.njit(cache=True, fastmath=FAST, error_model="numpy")
+def add_motion(out, there, points, inward, sources, source_inward, area, forces, thickness, tables):
+    """Adds to rows `there` of out (M, 3) [m] the flat motion of points under forces over E at sources (N, 3) [m2].
+
+    Args:
+        out: motion of the points, (M, 3) [m].
+        there: numbers of the points that feel the sources.
+        points, inward: points and unit vectors into the skin, (M, 3).
+        sources, source_inward: the same of the sources, (N, 3).
+        area: area that each source stands for, (N,) [m2].
+        forces: forces over E, (N, 3) [m2].
+        thickness: thickness of the flat stack [m].
+        tables: see `tables`.
+    """
+    spread = SPREAD * np.sqrt(area) / thickness
     rows, row_of = np.empty((len(sources), 4, tables.shape[2])), np.empty(len(sources), np.int64)
     kinds = 0
     for j in range(len(sources)):  # nodes of one tool are about as wide: few tables serve all
@@ -375,7 +393,7 @@ def _add_motion(out, there, points, inward, sources, source_inward, forces, spre
             f = np.sqrt(r) * ROWS
             k, row = int(f), rows[row_of[j]]
             f -= k
-            per = 1 / (np.sqrt(r * r + (ROUND * spread[j]) ** 2) * thickness)
+            per = _share(facing) / (np.sqrt(r * r + (ROUND * spread[j]) ** 2) * thickness)
             g0, g1 = per * ((1 - f) * row[0, k] + f * row[0, k + 1]), per * ((1 - f) * row[1, k] + f * row[1, k + 1])
             even, along = (per * ((1 - f) * row[2, k] + f * row[2, k + 1]),
                            per * ((1 - f) * row[3, k] + f * row[3, k + 1]))  # fmt: skip

@@ -24,8 +24,25 @@ def pack(layer: SoftLayer) -> dict[str, np.ndarray]:
     if isinstance(layer.chart, UvChart):
         arrays["uv"] = layer.chart.uv
     if not tissue.single or tissue.source:
-        arrays["stack"] = np.frombuffer(json.dumps(asdict(tissue)).encode(), np.uint8)
+        arrays["stack"] = np.frombuffer(stack_to_text(tissue).encode(), np.uint8)
     return arrays
+
+
+def stack_to_text(tissue: Tissue) -> str:
+    """A tissue as JSON."""
+    return json.dumps(asdict(tissue))
+
+
+def stack_from_text(text: str) -> Tissue:
+    """The tissue of such JSON.
+
+    Raises:
+        KeyError, TypeError, ValueError: text of another kind.
+        InvalidInput: numbers that are no tissue's.
+    """
+    given = json.loads(text)
+    skin, deeper = given.pop("skin"), given.pop("deeper")
+    return Tissue(**given, skin=Membrane(**skin) if skin else None, deeper=tuple(Ply(**one) for one in deeper))
 
 
 def unpack(arrays: Mapping[str, np.ndarray]) -> SoftLayer:
@@ -36,9 +53,7 @@ def unpack(arrays: Mapping[str, np.ndarray]) -> SoftLayer:
         InvalidInput, MeshError: arrays that are no layer.
     """
     if "stack" in arrays:
-        given = json.loads(np.asarray(arrays["stack"], np.uint8).tobytes())
-        skin, deeper = given.pop("skin"), given.pop("deeper")
-        tissue = Tissue(**given, skin=Membrane(**skin) if skin else None, deeper=tuple(Ply(**one) for one in deeper))
+        tissue = stack_from_text(np.asarray(arrays["stack"], np.uint8).tobytes().decode())
     else:
         modulus, ratio, density = (float(x) for x in arrays["tissue"])
         tissue = Tissue(modulus, ratio, density)

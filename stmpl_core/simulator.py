@@ -8,7 +8,7 @@ from typing import overload
 
 import numpy as np
 
-from stmpl_core.conform import Conformed, conform
+from stmpl_core.conform import Conformed, conform, kept_out
 from stmpl_core.contact import Contact
 from stmpl_core.errors import InvalidInput
 from stmpl_core.green import Green
@@ -100,7 +100,8 @@ class Simulator:
             moving = sum((one / factor for one, factor in pressing), zero)
             motion = None if self._green is None else stuck_motion(self._green, touches)
             solved = self.method.solve(Load.contact(moving, motion))
-            fitted = conform(self.layer, self.skin.near, solved.displacement, touches)
+            fitted = conform(self.layer, self.skin.near, solved.displacement, touches) if motion is None else \
+                kept_out(self.layer, solved.displacement, touches)
         else:
             solved = Displacement(np.zeros_like(self.layer.vertices), Trust(), self.method.name)
             fitted = Conformed(solved.displacement, 0.0, 0.0)

@@ -13,6 +13,7 @@ ZONES = (2.5, 5.0)  # distances from the load, over t, at which the first and th
 SPACINGS = (0.6, 1.5)  # least distances between the vertices that are asked there, over t
 CORNERS = 12  # number of asked vertices from which one between is filled in
 CHUNK = 64  # vertices that one thread takes at a time
+STACK_ZONES, STACK_SPACINGS = (0.8, 2.5), (0.25, 0.4)  # the same of a stack, which is thicker beside what presses
 LARGEST = 2.5  # sum of the weights' sizes, from which a vertex is rather asked itself: it would be extrapolated
 
 
@@ -51,21 +52,25 @@ class Thinning:
         layer: soft layer at rest.
         frames: two tangents and the normal of each vertex, (V, 3, 3).
         reach: distance to which a load is felt, over t.
+        zones: distances from the load, over t, at which the first and the second thinning begin.
+        spacings: least distances between the vertices that are asked there, over t.
 
     Attributes:
         folded: flag of a skin that comes near itself through the air, as fingers do.
     """
 
-    def __init__(self, layer: SoftLayer, frames: np.ndarray, reach: float) -> None:
+    def __init__(self, layer: SoftLayer, frames: np.ndarray, reach: float, zones: tuple[float, float] = ZONES,
+                 spacings: tuple[float, float] = SPACINGS) -> None:  # fmt: skip
         points, normals, thickness = np.ascontiguousarray(layer.vertices), layer.normals, layer.thickness
-        self.start, self.index = neighbours(points, normals, thickness, layer.faces, np.array([*ZONES, reach]))
+        self.start, self.index = neighbours(points, normals, thickness, layer.faces, np.array([*zones, reach]))
         count = len(points)
         self._last: Asked | None = None
-        self._stands = np.zeros((len(ZONES) + 1, count), dtype=np.bool_)
-        self._corners = np.zeros((len(ZONES) + 1, count, CORNERS), dtype=np.int32)
-        self._weights = np.zeros((len(ZONES) + 1, count, CORNERS), dtype=np.float32)
+        self._grouped: tuple[np.ndarray, np.ndarray] | None = None
+        self._stands = np.zeros((len(zones) + 1, count), dtype=np.bool_)
+        self._corners = np.zeros((len(zones) + 1, count, CORNERS), dtype=np.int32)
+        self._weights = np.zeros((len(zones) + 1, count, CORNERS), dtype=np.float32)
         self._stands[0] = True
-        for zone, spacing in enumerate(SPACINGS, start=1):
+        for zone, spacing in enumerate(spacings, start=1):
             stands = _thinned(self.start, self.index, self._stands[zone - 1], points, thickness, spacing)
             corners = _nearest(self.start, self.index, stands, points)
             some = np.flatnonzero(~stands & (corners[:, -1] >= 0))
@@ -77,14 +82,16 @@ class Thinning:
             self._corners[zone, some], self._weights[zone, some] = corners[some], weights[good]
 
         some = np.flatnonzero(self._stands[-1])
-        self.folded = _folded(self.start, self.index, some, points, normals, thickness, ZONES[1])
+        self.folded = _folded(self.start, self.index, some, points, normals, thickness, zones[1])
 
     def groups(self, vertices: np.ndarray) -> np.ndarray:
         """Numbers of groups of vertices (N,), none of which feels another, (N,): all 0 where the skin has no folds."""
         if not self.folded or len(vertices) < 2:
             return np.zeros(len(vertices), np.int64)
-        some, place = np.unique(vertices, return_inverse=True)  # nodes of a contact share vertices
-        return _together(self.start, self.index, some, len(self._stands[0]))[place]
+        if self._grouped is None or not np.array_equal(self._grouped[0], vertices):
+            some, place = np.unique(vertices, return_inverse=True)  # nodes of a contact share vertices
+            self._grouped = vertices, _together(self.start, self.index, some, len(self._stands[0]))[place]
+        return self._grouped[1]
 
     def reached(self, loaded: np.ndarray) -> np.ndarray:
         """All vertices with a loaded one in reach, in order."""

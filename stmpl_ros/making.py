@@ -7,7 +7,9 @@ from collections.abc import Callable
 import numpy as np
 
 from stmpl_core.contact import Contact
+from stmpl_core.errors import InvalidInput
 from stmpl_core.layer import SoftLayer
+from stmpl_core.living import living, region_of
 from stmpl_core.simulator import Simulator
 from stmpl_core.skin import Skin, published
 from stmpl_core.tissue import Tissue
@@ -16,6 +18,7 @@ from stmpl_ros.parameters import NodeConfig
 
 Build = Callable[[NodeConfig], SoftLayer]
 STIFFNESS = {"youngs_modulus", "density"}  # settings that change neither geometry nor what is felt around a vertex
+ON_STACKS = ("moment_net", "limb_linear", "ladder")  # methods that know skin, fat and muscle
 QUICK = {"moment_net", "winkler", "naive"}  # methods that such a change costs no preparation
 
 
@@ -23,17 +26,24 @@ def layer_of(config: NodeConfig) -> SoftLayer:
     """The soft layer that the settings ask for. Raises InvalidInput."""
     from stmpl_core.body import Body
 
-    tissue = Tissue(config.youngs_modulus, config.poisson_ratio, config.density)
     body = Body.anny(pose=None, **config.phenotype_values)
+    if config.tissue != "paper":
+        return living(body, config.part, config.tissue, edge_length=config.edge_length)
+    tissue = Tissue(config.youngs_modulus, config.poisson_ratio, config.density)
     return body.part(config.part, edge_length=config.edge_length, thickness=config.thickness, tissue=tissue)
 
 
 def check(config: NodeConfig, build: Build) -> None:
-    """Raises InvalidInput, at once, for a part that `layer_of` does not know; other builds are not asked."""
+    """Raises InvalidInput, at once, for what `layer_of` does not know; other builds are not asked."""
     if build is layer_of:
         from stmpl_core.body import Body
 
         Body.anny().level(config.part)
+        if config.tissue != "paper":
+            region_of(config.part)
+            if config.method not in ON_STACKS:
+                raise InvalidInput(f"{config.method} knows one soft material only; of a part as measured answer "
+                                   f"{', '.join(ON_STACKS)}, or set tissue to 'paper'.")  # fmt: skip
 
 
 def at_once(config: NodeConfig, build: Build) -> bool:
@@ -42,7 +52,8 @@ def at_once(config: NodeConfig, build: Build) -> bool:
     from stmpl_core.body import AVERAGE
 
     average = all(value == AVERAGE for value in config.phenotype_values.values())
-    return build is not layer_of or (average and limbs.ships(config.part, config.edge_length))
+    ships = average and config.tissue == "paper" and limbs.ships(config.part, config.edge_length)
+    return build is not layer_of or ships
 
 
 def skin_of(config: NodeConfig, build: Build = layer_of) -> Skin:
@@ -52,7 +63,7 @@ def skin_of(config: NodeConfig, build: Build = layer_of) -> Skin:
 
 def restiffened(skin: Skin, config: NodeConfig, changed: set[str]) -> Skin | None:
     """The same skin of another stiffness, where nothing else changes and that is quick; else None."""
-    if not changed or not changed <= STIFFNESS or config.method not in QUICK:
+    if not changed or not changed <= STIFFNESS or config.method not in QUICK or skin.layer.stacked:
         return None
     return skin.stiffened(config.new_method(), youngs_modulus=config.youngs_modulus, density=config.density)
 

@@ -35,6 +35,12 @@ class NodeConfig(BaseModel):
     edge_length: float = Field(
         default=3e-3, gt=0, le=0.05, description="length of the skin mesh's edges [m]", json_schema_extra=CONFIGURING
     )
+    tissue: Literal["paper", "relaxed", "tensed"] = Field(
+        default="paper",
+        description="what is under the skin: 'paper': one layer of thickness, youngs_modulus and poisson_ratio; "
+        "'relaxed', 'tensed': skin, fat and muscle of the part as measured, to its bones, which leave those three unused",
+        json_schema_extra=CONFIGURING,
+    )  # fmt: skip
     thickness: float = Field(
         default=7.5e-3, gt=0, le=0.1, description="thickness of the soft layer [m]", json_schema_extra=CONFIGURING
     )
@@ -47,7 +53,7 @@ class NodeConfig(BaseModel):
     density: float = Field(
         default=1e3, gt=0, le=1e5, description="density of the tissue [kg/m3]", json_schema_extra=CONFIGURING
     )
-    method: Literal["moment_net", "unet", "linear", "winkler", "naive", "ladder"] = Field(
+    method: Literal["moment_net", "unet", "linear", "winkler", "naive", "limb_linear", "ladder"] = Field(
         default="moment_net", description="method that solves for the displacement", json_schema_extra=CONFIGURING
     )
     accuracy: float = Field(
