@@ -130,7 +130,7 @@ class Bench:
         paper_fem = PatchFem(reach=body.reach).prepare(layer)
         element, layers = ("P1xP2", 1) if plan.linear else (None, INDENTER_LAYERS)
         pressed = PatchFem(element=element, reach=body.reach, refine=INDENTER_REFINE, layers=layers)
-        indenting = IndenterFem(pressed, step=plan.indenter_step).prepare(layer)
+        indenting = IndenterFem(pressed, step=plan.indenter_step, max_work=plan.most_work).prepare(layer)
         return cls(Site(layer), pressing, paper_fem, indenting)
 
 

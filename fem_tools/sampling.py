@@ -15,6 +15,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from scipy.spatial.transform import Rotation
 
 from fem_tools.hand import Hand
+from fem_tools.newton import MAX_WORK
 from fem_tools.scenes import EDGE, Scene, Site, UnusableContact, ellipse, letter
 from stmpl_core.body import Body
 from stmpl_core.bones import bones_of, to_bone
@@ -44,6 +45,7 @@ TILT = 0.25  # rad, of a tool's axis and of its way
 SLANTED, SLANT = 0.25, 0.8  # share of tools that come at a slant of up to so much [rad]
 SHALLOWEST = 0.01  # thicknesses, of indenters
 SKIN = 1.5e-3  # m, thickness of a skin
+DRAWN, DRAWN_SHARE = 20, 0.2  # bodies whose stack is drawn, and their share of the contacts
 
 
 class StackPlan(BaseModel):
@@ -146,6 +148,26 @@ TISSUE_BODIES = tuple(
 )  # fmt: skip
 
 
+def _drawn_bodies(count: int) -> tuple[BodyPlan, ...]:
+    """Arms and legs of many phenotypes and stacks, so that no network learns a few stacks by heart."""
+    rng, out = np.random.default_rng(1), []
+    for n in range(count):
+        leg = n % 4 == 3
+        thickness = float(rng.choice([0.015, 0.025, 0.04, 0.06])) * (1.3 if leg else 1.0)
+        kappa = float(np.exp(rng.uniform(math.log(0.3), math.log(20))))
+        layered = rng.uniform() < 0.75
+        stack = StackPlan(kappa=round(kappa, 2), pull=round(kappa * float(np.exp(rng.uniform(-4, -2.3))), 3),
+                          fat=round(float(rng.uniform(0.12, 0.7)), 2) if layered else 1.0,
+                          muscle=round(float(np.exp(rng.uniform(0.7, 2.6))), 1) if layered else 1.0)  # fmt: skip
+        out.append(BodyPlan(name=f"drawn_{n:02d}", weight=round(float(rng.uniform(0.1, 0.9)), 2),
+                            thickness=round(thickness, 4), poisson_ratio=round(float(rng.uniform(0.38, 0.46)), 2),
+                            stack=stack, to_bone=True, part="left_leg" if leg else "left_arm",
+                            edge_length=0.011 if leg else (0.005 if thickness < 0.02 else 0.007),
+                            reach=6.0 + kappa / 5, share=DRAWN_SHARE, paper_rule=False,
+                            out_of_distribution=False))  # fmt: skip
+    return tuple(out)
+
+
 class Plan(BaseModel):
     """Everything that decides what is generated: the same plan gives the same data.
 
@@ -177,6 +199,7 @@ class Plan(BaseModel):
     highest_nodal: float = Field(default=0.4, gt=0)  # p / E at the worst vertex, of the paper's rule
     deepest: float = Field(default=0.7, gt=0, lt=1)  # thicknesses, of indenters
     indenter_step: float = Field(default=0.04, gt=0)  # thicknesses, of indenters
+    most_work: float = Field(default=MAX_WORK, gt=0)  # multiplications of a press; deeper ones are dropped
     clear: float = Field(default=5.0, gt=0)  # distance of tools from the open border, thicknesses
     thinnest: float = Field(default=0.0, ge=0)  # thickness under tools, over the edge length
     sizes: tuple[float, float] = SIZES  # m, half the width of tools
@@ -204,9 +227,9 @@ PRESETS = {
     "paper": Plan(preset="paper", bodies=PAPER_BODIES + VARYING_BODIES[:2], indenters=40),
     "contacts": Plan(preset="contacts", bodies=CONTACT_BODIES, discs=0, ellipses=0, seams=0, hands=0, bands=0,
                      letters=0, tools=60, loads=8, deepest=0.9, indenter_step=0.08),
-    "tissue": Plan(preset="tissue", bodies=TISSUE_BODIES, discs=0, ellipses=0, seams=0, hands=0, bands=0, letters=0,
+    "tissue": Plan(preset="tissue", bodies=TISSUE_BODIES + _drawn_bodies(DRAWN), discs=0, ellipses=0, seams=0, hands=0, bands=0, letters=0,
                    tools=18, loads=8, deepest=0.85, indenter_step=0.12, clear=4.0, thinnest=1.4, sizes=(4e-3, 40e-3),
-                   linear=True),
+                   linear=True, most_work=4e10),
 }  # fmt: skip
 
 

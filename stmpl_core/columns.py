@@ -13,6 +13,7 @@ from stmpl_core.layer import SoftLayer
 from stmpl_core.nodes import Nodes, nodes_under
 from stmpl_core.rays import WALL, depth_and_share, depth_in_column, distance_in_column, ray_of, to_tool
 from stmpl_core.sdf import SignedDistance
+from stmpl_core.touch import MIN_ONE_WAY_SHARE
 
 LEAST_UNDER = 0.05  # how much further inside a tool a column gets below its skin than there, over the width of a wall
 HOLE_RADIUS = 0.6  # farthest point of a triangle from its corners, over the edge length (equilateral: 0.577)
@@ -120,7 +121,10 @@ class Columns:
         grid, skin = _grid(field), (self.points, self.inward, self.layer.thickness, self.faces)
         faces = self._start, self._around, self._slot
         found, vertices, depth, rests = _cover(grid, pose, *skin, *faces, covered, sunk)
-        return Squeeze(vertices, depth, rests, nodes_under(grid, pose, middle_of(field, pose), skin, found, sunk))
+        nodes = nodes_under(grid, pose, middle_of(field, pose), skin, found, sunk)
+        if self.layer.stacked and len(nodes.area):
+            nodes = nodes._replace(sinking=_sinking(grid, pose, nodes))
+        return Squeeze(vertices, depth, rests, nodes)
 
 
 def middle_of(field: SignedDistance, pose: Transform) -> np.ndarray:
@@ -139,6 +143,21 @@ def shifted(pose: Transform, by: np.ndarray) -> Transform:
 def depth_along(field: SignedDistance, pose: Transform, points: Points, way: Points, guess: np.ndarray) -> np.ndarray:
     """Way of points (N, 3) along unit vectors (N, 3) out of a tool, (N,) [m], from a guess > 0."""
     return _depths_along(_grid(field), pose, points, np.ascontiguousarray(way), guess)
+
+
+def _sinking(grid: tuple, pose: Transform, nodes: Nodes) -> np.ndarray:
+    """Depth by which skin sinks along its normal if it goes with the tool along the mean normal, (N,) [m].
+
+    On a limb that is no wider than its contact, columns along the normals meet the tool at a slant, and too deep.
+    """
+    depth = nodes.strain * nodes.thickness
+    mean = (nodes.area * depth) @ nodes.inward
+    size = float(np.linalg.norm(mean))
+    if size <= MIN_ONE_WAY_SHARE * float(nodes.area @ depth):
+        return depth
+    cosine = nodes.inward @ (mean / size)
+    way = np.tile(mean / size, (len(depth), 1))
+    return np.minimum(_depths_along(grid, pose, nodes.points, way, np.maximum(depth * cosine, 1e-9)) * cosine, depth)
 
 
 def _grid(field: SignedDistance) -> tuple[np.ndarray, np.ndarray, float]:

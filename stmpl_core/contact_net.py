@@ -67,8 +67,8 @@ class ContactNet:
     nu and on the skin's curvature; so one network serves every stiffness, thickness, pose and limb. It was trained on
     tools that stick, pressed in along a line (studies.train_contact).
 
-    A stack, and columns that run to bone, have a linear response of their own (stmpl_core.green) and a network of their
-    own, which also reads kappa, T / (E t) and how thick the tissue is there; its units are those of the effective layer.
+    A stack, and columns that run to bone, have a linear response of their own (stmpl_core.green), and a network of
+    their own that also reads kappa, T / (E t) and how thick the tissue is; its units are those of the effective layer.
 
     Beyond LINEAR_TO of the thickness the problem is solved there, and each node's pressure rises as its confined
     column's to the power HARDENING: it never falls as the tool goes deeper.
@@ -107,10 +107,10 @@ class ContactNet:
         """Solves the linear problem at the nodes, at least one, and gathers what the network reads."""
         group = self.near.groups(nodes.corners[:, 0])
         if self._green is None:
-            return Look(*_look(*nodes, group, self.near.bent, *self._table, self._moduli, self._nu))
+            return Look(*_look(*nodes[:7], group, self.near.bent, *self._table, self._moduli, self._nu))
         matrix = self._green.matrix(nodes, group)
         return Look(*_look_on_stack(*nodes, group, self.near.bent, *self._table, self._moduli, self._nu, matrix,
-                                    self._green.effective.thickness, self._green.numbers))  # fmt: skip
+                                    self._green.effective.thickness, self._green.numbers, *self._green.hardening))  # fmt: skip
 
     def hold(self, nodes: Nodes) -> Held:
         """Pressure at contact nodes."""
@@ -133,13 +133,13 @@ def _look(points, inward, thickness, area, strain, corners, shares, group, bent,
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _look_on_stack(points, inward, thickness, area, strain, corners, shares, group, bent, half_space, rows, moduli, nu,
-                   matrix, t, numbers):  # fmt: skip
-    """See Look; t: thickness of the effective layer [m]; numbers: those of a Green."""
+def _look_on_stack(points, inward, thickness, area, strain, corners, shares, sinking, group, bent, half_space, rows,
+                   moduli, nu, matrix, t, numbers, log_thickness, hardening):  # fmt: skip
+    """See Look; t: thickness of the effective layer [m]; numbers, log_thickness and hardening: those of a Green."""
     softness = np.exp(numbers[3])
-    even, overlap = np.full(len(area), t), strain * thickness / t
+    even, overlap = np.full(len(area), t), sinking / t
     rings = pairs(points, inward, even, area, group, t, half_space, rows)[1]
-    depth = np.minimum(strain, LINEAR_TO) * thickness
+    depth = sinking * np.minimum(LINEAR_TO / strain, 1.0)
     force = solve(matrix, depth)
     pressure = force / area
     moments, vectors = moments_of(rings, points, even, area, softness * pressure, overlap)
@@ -150,8 +150,24 @@ def _look_on_stack(points, inward, thickness, area, strain, corners, shares, gro
         row[ON_STACK.log_thickness], row[ON_STACK.column_strain] = np.log(thickness[n] / t), strain[n]
         row[ON_STACK.log_kappa], row[ON_STACK.log_pull] = numbers[1], numbers[2]
         row[ON_STACK.log_softness] = numbers[3]
-    _harden(pressure, strain, moduli)
+        row[ON_STACK.hardening] = _hardening(log_thickness, hardening, thickness[n], sinking[n] / thickness[n])
+        if strain[n] > LINEAR_TO:
+            top = _hardening(log_thickness, hardening, thickness[n], LINEAR_TO)
+            there = _hardening(log_thickness, hardening, thickness[n], strain[n])
+            pressure[n] *= (strain[n] / LINEAR_TO * np.exp(there - top)) ** HARDENING
     return pressure, inputs, _faded(overlap, moments), power_of(matrix, force, depth.max())
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _hardening(logs, table, thickness, strain):
+    """Value of Green.hardening at a thickness [m] and a strain."""
+    a = (np.log(thickness) - logs[0]) / (logs[1] - logs[0])
+    b = min(strain, 0.999) * table.shape[1]
+    a, b = min(max(a, 0.0), len(logs) - 1.001), min(max(b, 0.0), table.shape[1] - 1.001)
+    i, j = int(a), int(b)
+    a, b = a - i, b - j
+    return (1 - a) * ((1 - b) * table[i, j] + b * table[i, j + 1]) + \
+        a * ((1 - b) * table[i + 1, j] + b * table[i + 1, j + 1])  # fmt: skip
 
 
 @numba.njit(cache=True)

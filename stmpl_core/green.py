@@ -24,7 +24,7 @@ from stmpl_core.layer import SoftLayer
 from stmpl_core.moments import Surroundings
 from stmpl_core.nodes import Nodes
 from stmpl_core.response import FAST, SPREAD
-from stmpl_core.stack import Effective, along, compliance, effective
+from stmpl_core.stack import Effective, along, compliance, effective, hardening
 from stmpl_core.tissue import Tissue
 
 REACH = 8.0  # distance beyond which the flat response is not felt, over t
@@ -33,6 +33,7 @@ SPREADS = np.geomspace(0.004, 1.6, 16)  # widths of a node's force that are tabl
 ROUND = float(np.sqrt(2 / np.pi))  # of a Gaussian that is as wide, 1 / r in its middle is 1 / (ROUND s)
 FAR = 16.0  # distance over the spread, from which a force may be spread wider without a difference (0.2 %)
 AROUND = 0.5  # cosine between normals below which the flat response fades: what is round the limb is the coarse part's
+COLUMNS, STRAINS = 12, 64  # thicknesses and strains of the table of confined columns
 POINTS = 4  # of Gauss's rule on each panel of wave numbers
 RIDGE = 1e-6  # of the matrix that sticks, over its largest number: two nodes in one place are no error
 LEAST_KAPPA, LEAST_PULL = 0.05, 0.02  # kappa and pull that are none, in logarithms
@@ -108,6 +109,13 @@ class Green:
         one = self.effective
         return np.log([one.thickness / self.thickness, one.kappa + LEAST_KAPPA, one.pull + LEAST_PULL,
                        self.layer.tissue.youngs_modulus / one.youngs_modulus])  # fmt: skip
+
+    @cached_property
+    def hardening(self) -> tuple[np.ndarray, np.ndarray]:
+        """Logarithms of thicknesses, (T,), and what stmpl_core.stack.hardening is at STRAINS even strains, (T, STRAINS)."""
+        least, most = np.log(self.layer.thickness.min()), np.log(self.layer.thickness.max())
+        logs, strain = np.linspace(least, most + 1e-6, COLUMNS), np.linspace(0, 1, STRAINS, endpoint=False)
+        return logs, np.array([hardening(self.layer.tissue, t, strain) for t in np.exp(logs)])
 
     def matrix(self, nodes: Nodes, group: np.ndarray) -> np.ndarray:
         """Depth at each node under a force E at each along the normals, symmetric, (N, N) [1/m].

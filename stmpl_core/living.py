@@ -2,10 +2,16 @@
 
 from __future__ import annotations
 
+import json
+from pathlib import Path
+
 from stmpl_core.body import Body
 from stmpl_core.bones import bones_of, to_bone
+from stmpl_core.errors import InvalidInput
 from stmpl_core.layer import SoftLayer
+from stmpl_core.packed import stack_from_text, stack_to_text
 from stmpl_core.regions import REGIONS, Region, Tone, region
+from stmpl_core.tissue import Tissue
 
 WHOLE = {"arm": "forearm", "leg": "thigh", "torso": "back"}  # region whose numbers serve a part of several
 SHEET = 2e-3  # thickness with which a part is meshed before its columns are known [m]
@@ -45,3 +51,23 @@ def living(body: Body, part: str, tone: Tone = "relaxed", *, edge_length: float 
         return body.part(part, edge_length=edge_length, thickness=its.thickness, tissue=its.tissue)
     skin = body.part(part, edge_length=edge_length, thickness=SHEET, tissue=its.tissue)
     return to_bone(skin, bones_of(body, part))
+
+
+def write_tissue(path: str | Path, tissue: Tissue, thickness: float) -> None:
+    """Writes a tissue and its thickness [m] as JSON, for the node's setting `tissue`."""
+    Path(path).write_text(json.dumps({"thickness": thickness, "tissue": json.loads(stack_to_text(tissue))}, indent=1))
+
+
+def read_tissue(path: str | Path) -> tuple[Tissue, float]:
+    """The tissue and its thickness [m] that `write_tissue` wrote.
+
+    Raises:
+        InvalidInput: no such file, or one that holds no tissue.
+    """
+    try:
+        given = json.loads(Path(path).read_text())
+        return stack_from_text(json.dumps(given["tissue"])), float(given["thickness"])
+    except OSError as error:
+        raise InvalidInput(f"there is no tissue in {path}: {error.strerror}. stmpl needs --out writes one.") from error
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
+        raise InvalidInput(f"{path} holds no tissue ({error}). stmpl needs --out writes one.") from error

@@ -124,6 +124,7 @@ STACK_NODE = Layout(
     **NODE.sizes,
     log_thickness=1,  # of the tissue at the node, over that of the effective layer
     column_strain=1,  # depth over the tissue's thickness at the node
+    hardening=1,  # of the confined column there, see stmpl_core.stack.hardening
     log_kappa=1,  # of the effective layer
     log_pull=1,
     log_softness=1,  # modulus of the first material over that of the effective layer
@@ -139,7 +140,8 @@ ON_STACK = {
 }
 STACK_POINT, STACK_INPUTS = Layout(**POINT.sizes, **ON_STACK), Layout(**INPUTS.sizes, **ON_STACK)
 
-Kind = Literal["motion", "pressure", "stack_motion", "stack_pressure", "image"]  # what a network says, a MomentNet, a ContactNet, a UNet
+# What a network says: a MomentNet, a ContactNet, both on stacks, a UNet.
+Kind = Literal["motion", "pressure", "stack_motion", "stack_pressure", "image"]
 READS: dict[Kind, Layout] = {"motion": INPUTS, "pressure": NODE, "stack_motion": STACK_INPUTS,
                              "stack_pressure": STACK_NODE}  # fmt: skip
 SAYS: dict[Kind, Layout] = {"motion": MOTION, "pressure": PRESSURE, "stack_motion": MOTION, "stack_pressure": PRESSURE}

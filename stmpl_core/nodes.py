@@ -44,6 +44,8 @@ class Nodes(NamedTuple):
         strain: depth of the tool in the column over the thickness, (N,) [-].
         corners: numbers of the vertices around it, (N, 3).
         shares: barycentric coordinates among them, (N, 3) [-].
+        sinking: depth by which the skin there sinks along its normal if it goes with the tool, all of it one way, (N,)
+            [m]; empty where only depths in columns are known.
     """
 
     points: np.ndarray
@@ -53,12 +55,13 @@ class Nodes(NamedTuple):
     strain: np.ndarray
     corners: np.ndarray
     shares: np.ndarray
+    sinking: np.ndarray = np.empty(0)
 
     @classmethod
     def none(cls) -> Nodes:
         """No nodes."""
         three, one = np.empty((0, 3)), np.empty(0)
-        return cls(three, three, one, one, one, np.empty((0, 3), np.int64), three)
+        return cls(three, three, one, one, one, np.empty((0, 3), np.int64), three, one)
 
     @classmethod
     def joined(cls, parts: list[Nodes]) -> Nodes:

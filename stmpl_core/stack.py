@@ -11,6 +11,7 @@ from scipy.optimize import brentq, least_squares
 from scipy.special import j0, j1, jv
 
 from stmpl_core.errors import InvalidInput
+from stmpl_core.rays import column_pressure
 from stmpl_core.tissue import Membrane, Tissue
 
 RADII = (2e-3, 4e-3, 9e-3, 19e-3, 40e-3)  # radii of loads that one effective layer shall serve [m]
@@ -215,6 +216,28 @@ def _between_faces(h: float, modulus: float, nu: float, k: np.ndarray) -> tuple[
     bend = scale / ((3 - 4 * nu) * sc + q) * np.array([[twice * cc, less + q], [less + q, twice * ss]])
     between = 0.5 * (stretch - bend) * np.array([1.0, -1.0])[:, None]
     return (0.5 * (stretch + bend)).transpose(2, 0, 1), between.transpose(2, 0, 1)
+
+
+def hardening(tissue: Tissue, thickness: float, strain: ArrayLike) -> np.ndarray:
+    """Logarithm of what a confined column of a stack presses back with, over that of a linear one, (K,) [-].
+
+    Its materials carry the same pressure, each with the strain that this takes.
+
+    Args:
+        tissue: materials.
+        thickness: thickness of the column [m], > 0.
+        strain: depth by which it is pressed together over the thickness, (K,), from 0 to below 1.
+
+    Raises:
+        InvalidInput: a thickness that is not above 0.
+    """
+    pressure, whole = np.geomspace(1e-5, 1e5, 800), np.zeros(800)  # over E
+    each = 1 - np.geomspace(1, 1e-4, 400)
+    for h, modulus, nu in plies(tissue, thickness):
+        moduli = np.array([0.5 / (1 + nu), nu / ((1 + nu) * (1 - 2 * nu))]) * modulus / tissue.youngs_modulus
+        whole += h / thickness * np.interp(pressure, column_pressure(moduli, each), each)
+    logs = np.log(pressure / whole) - np.log(pressure[0] / whole[0])
+    return np.interp(np.asarray(strain, dtype=float), whole, logs)
 
 
 def effective(tissue: Tissue, thickness: float, radii: Iterable[float] = RADII) -> Effective:

@@ -27,7 +27,7 @@ def stuck_motion(green: Green, touches: Sequence[Touch]) -> VertexVectors:
     nodes = Nodes.joined([one.squeeze.nodes for _, one in pressed])
     group = green.near.groups(nodes.corners[:, 0])
     gone = np.concatenate([_gone(touch, one, green.layer.vertex_areas) for touch, one in pressed])
-    holds = np.flatnonzero(solve(green.matrix(nodes, group), nodes.strain * nodes.thickness) > 0)
+    holds = np.flatnonzero(solve(green.matrix(nodes, group), nodes.sinking) > 0)
     if not len(holds):
         return np.zeros_like(green.layer.vertices)
     some = Nodes(*(values[holds] for values in nodes))

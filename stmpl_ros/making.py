@@ -3,18 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import cast, get_args
 
 import numpy as np
 
 from stmpl_core.contact import Contact
 from stmpl_core.errors import InvalidInput
 from stmpl_core.layer import SoftLayer
-from stmpl_core.living import living, region_of
+from stmpl_core.living import living, read_tissue, region_of
+from stmpl_core.regions import Tone
 from stmpl_core.simulator import Simulator
 from stmpl_core.skin import Skin, published
 from stmpl_core.tissue import Tissue
 from stmpl_core.tool import Tool
-from stmpl_ros.parameters import NodeConfig
+from stmpl_ros.parameters import PAPER, NodeConfig
 
 Build = Callable[[NodeConfig], SoftLayer]
 STIFFNESS = {"youngs_modulus", "density"}  # settings that change neither geometry nor what is felt around a vertex
@@ -27,8 +29,11 @@ def layer_of(config: NodeConfig) -> SoftLayer:
     from stmpl_core.body import Body
 
     body = Body.anny(pose=None, **config.phenotype_values)
-    if config.tissue != "paper":
-        return living(body, config.part, config.tissue, edge_length=config.edge_length)
+    if config.tissue in get_args(Tone):
+        return living(body, config.part, cast(Tone, config.tissue), edge_length=config.edge_length)
+    if config.tissue != PAPER:
+        tissue, thickness = read_tissue(config.tissue)
+        return body.part(config.part, edge_length=config.edge_length, thickness=thickness, tissue=tissue)
     tissue = Tissue(config.youngs_modulus, config.poisson_ratio, config.density)
     return body.part(config.part, edge_length=config.edge_length, thickness=config.thickness, tissue=tissue)
 
@@ -39,11 +44,14 @@ def check(config: NodeConfig, build: Build) -> None:
         from stmpl_core.body import Body
 
         Body.anny().level(config.part)
-        if config.tissue != "paper":
+        stacked = config.tissue != PAPER
+        if config.tissue in get_args(Tone):
             region_of(config.part)
-            if config.method not in ON_STACKS:
-                raise InvalidInput(f"{config.method} knows one soft material only; of a part as measured answer "
-                                   f"{', '.join(ON_STACKS)}, or set tissue to 'paper'.")  # fmt: skip
+        elif stacked:
+            stacked = not read_tissue(config.tissue)[0].single
+        if stacked and config.method not in ON_STACKS:
+            raise InvalidInput(f"{config.method} knows one soft material only; of skin, fat and muscle know "
+                               f"{', '.join(ON_STACKS)}. Take one of these, or set tissue to '{PAPER}'.")  # fmt: skip
 
 
 def at_once(config: NodeConfig, build: Build) -> bool:
@@ -52,7 +60,7 @@ def at_once(config: NodeConfig, build: Build) -> bool:
     from stmpl_core.body import AVERAGE
 
     average = all(value == AVERAGE for value in config.phenotype_values.values())
-    ships = average and config.tissue == "paper" and limbs.ships(config.part, config.edge_length)
+    ships = average and config.tissue == PAPER and limbs.ships(config.part, config.edge_length)
     return build is not layer_of or ships
 
 

@@ -13,6 +13,7 @@ from stmpl_core.layer import MAX_THICKNESS
 from stmpl_core.methods import Method, method
 from stmpl_core.tissue import SOFTEST
 
+PAPER = "paper"  # tissue of one layer, by the settings beside it
 ACCURACY = 2e-4  # error at any vertex that is asked for [m]
 PHENOTYPE = ("gender", "age", "muscle", "weight", "height", "proportions")
 ANY_TIME: JsonDict = {"when": "any time"}  # fields that a running node takes over at once
@@ -35,10 +36,10 @@ class NodeConfig(BaseModel):
     edge_length: float = Field(
         default=3e-3, gt=0, le=0.05, description="length of the skin mesh's edges [m]", json_schema_extra=CONFIGURING
     )
-    tissue: Literal["paper", "relaxed", "tensed"] = Field(
-        default="paper",
+    tissue: str = Field(
+        default=PAPER, min_length=1,
         description="what is under the skin: 'paper': one layer of thickness, youngs_modulus and poisson_ratio; "
-        "'relaxed', 'tensed': skin, fat and muscle of the part as measured, to its bones, which leave those three unused",
+        "'relaxed' or 'tensed': skin, fat and muscle of the part as measured, to its bones; or a file of needs --out",
         json_schema_extra=CONFIGURING,
     )  # fmt: skip
     thickness: float = Field(

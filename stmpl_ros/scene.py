@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
@@ -52,6 +53,18 @@ class SceneConfig(BaseModel):
         return needs(tissue, _si(self.radius), self.force, _si(self.speed), thickness=thickness, drag=self.drag,
                      friction=self.friction, edge=None if self.edge is None else self.edge * 1e-3,
                      enough=Misfit(share, share))  # fmt: skip
+
+    def model(self, found: Needs) -> tuple[Tissue, float]:
+        """The tissue of the smallest model that serves, and its thickness [m]."""
+        tissue, thickness = self._tissue()
+        if found.layer is None:
+            return (tissue if found["skin"].needed else replace(tissue, skin=None)), thickness
+        skin = tissue.skin if found.rung else None
+        if skin and not found["tension"].needed:
+            skin = replace(skin, tension=0.0)
+        one = Tissue(found.layer.youngs_modulus, tissue.poisson_ratio, tissue.density, skin=skin,
+                     source="the one layer that serves this scene, of stmpl needs")  # fmt: skip
+        return one, found.layer.thickness
 
     def _tissue(self) -> tuple[Tissue, float]:
         if (self.part is None) == (self.thickness is None):

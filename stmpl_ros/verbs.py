@@ -224,7 +224,7 @@ def info(path: Annotated[Path | None, tyro.conf.Positional] = None, part: str | 
     return 0 if bag.finished and not bag.damage else 1
 
 
-def needs(config: Annotated[SceneConfig, Flat] = SCENE, as_json: Json = False) -> int:
+def needs(config: Annotated[SceneConfig, Flat] = SCENE, out: Path | None = None, as_json: Json = False) -> int:
     """Says which of skin, tension, muscle, time, slip and mesh a scene needs, and the smallest model that serves.
 
     Example: stmpl needs --part back --radius 20 --force 10
@@ -233,13 +233,19 @@ def needs(config: Annotated[SceneConfig, Flat] = SCENE, as_json: Json = False) -
 
     A tissue of your own: stmpl needs --thickness 30 --modulus 3 --muscle-depth 8 --muscle-modulus 12 --radius 10
 
+    Its answer for a node: stmpl needs --part forearm --out arm.json; stmpl node --part left_forearm --tissue arm.json
+
     Args:
         config: tissue, tools and forces.
+        out: file for the tissue of the smallest model that serves.
         as_json: figures as JSON, for machines.
     """
+    from stmpl_core.living import write_tissue
     from stmpl_ros.needs_table import needs_figures, needs_table
 
     found = config.needs()
+    if out:
+        write_tissue(out, *config.model(found))
     title = f"{config.part}, {config.tone}" if config.part else "tissue of your own"
     print_figures(needs_figures(found) if as_json else needs_table(found, title))
     return 0

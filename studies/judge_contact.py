@@ -11,7 +11,7 @@ import numpy as np
 from fem_tools.dataset import Dataset, Sample
 from stmpl_core.contact import Contact
 from stmpl_core.contact_net import ContactNet
-from stmpl_core.methods import MomentNet
+from stmpl_core.methods import MomentNet, Zero
 from stmpl_core.networks import NETWORKS, Weights
 from stmpl_core.simulator import Simulator
 from studies.pressed import STRAIGHT, pressed, seen, slant_of
@@ -47,35 +47,42 @@ class Scores:
     trusted: np.ndarray
 
 
-def score(samples: Iterable[Sample], pressures: Weights, moments: Weights | None = None) -> Scores:
+def score(samples: Iterable[Sample], pressures: Weights, moments: Weights | None = None, *,
+          reaction_only: bool = False) -> Scores:  # fmt: skip
     """Scores on the contacts of samples that came straight, and whose pressure finite elements know.
 
     Args:
         samples: samples of the data.
         pressures: network that says what tools press with.
         moments: network that says what that moves; None: the one that comes with the package.
+        reaction_only: choice to leave the motion out; its errors are NaN then, and touches decide what is trusted.
     """
     simulator, rows, last = None, [], None
     for one in pressed(sample for sample in samples if slant_of(sample) <= STRAIGHT):
         layer, true, area = one.sample.layer, one.true, one.sample.layer.vertex_areas
         if simulator is None or last is not layer:
-            simulator, last = Simulator(layer, MomentNet(contact=moments, stack=moments)), layer
+            method = Zero() if reaction_only else MomentNet(contact=moments, stack=moments)
+            simulator, last = Simulator(layer, method), layer
             simulator.toucher.net = ContactNet(layer, pressures, simulator.toucher.near)
         if seen(one, simulator.toucher.net) is None:
             continue
         simulator.tools.add(one.tool, one.field)
-        answer = simulator.step([Contact(one.tool, one.pose)])
-        touch, force = answer.touches[one.tool.name], float(area @ true)
-        if answer.pressure is None or not touch.force > 0:
+        (touch,) = simulator.touch([Contact(one.tool, one.pose)])
+        if touch.pressure is None or not touch.force > 0:
             continue
-        ours, nodes = answer.pressure / layer.tissue.youngs_modulus, one.nodes
+        motion, trusted = float("nan"), touch.trust.in_range
+        if not reaction_only:
+            answer = simulator.answer([touch])
+            off = np.linalg.norm(answer.displacement - one.sample.displacement, axis=1)
+            motion, trusted = float(off.max() / answer.magnitude.max()), answer.trust.in_range
+        ours, nodes, force = touch.pressure / layer.tissue.youngs_modulus, one.nodes, float(area @ true)
         rows.append((
             float(area @ ours) / force - 1,
             float(np.sqrt(area @ (ours - true) ** 2 / (area @ true**2))),
-            float(np.linalg.norm(answer.displacement - one.sample.displacement, axis=1).max() / answer.magnitude.max()),
+            motion,
             touch.force_bound / touch.force,
             float(nodes.area @ simulator.toucher.net.look(nodes).pressure) / force - 1,
-            one.sample.info["drawn"]["tool"], slant_of(one.sample), touch.trust.in_range, answer.trust.in_range,
+            one.sample.info["drawn"]["tool"], slant_of(one.sample), touch.trust.in_range, trusted,
         ))  # fmt: skip
     columns = list(zip(*rows, strict=True)) or [()] * 9
     return Scores(*(np.array(c) for c in columns[:-2]), *(np.array(c, dtype=bool) for c in columns[-2:]))
@@ -87,7 +94,7 @@ def bound_force(samples: Iterable[Sample], pressures: Weights) -> dict[str, floa
     Touches that are flagged are left out. Besides, the mean errors of the others.
     """
     plain = replace(pressures, card={**pressures.card, "bound": {"scale": 1.0, "power": 1.0}})
-    scores = score(samples, plain)
+    scores = score(samples, plain, reaction_only=True)
     force, held = np.abs(scores.force), scores.held
     found = fit_bound(np.maximum(force, LEAST_ERROR)[held], scores.stated[held], scores.tool[held])
     if held.any():

@@ -24,8 +24,8 @@ def train(
 
     Args:
         preset: "default": MomentNet. "contacts": what rigid tools press with (ContactNet) and what that does
-            (MomentNet once more), on data of the preset of that name. "tissue": the same on stacks. "paper": the paper's UNet at 512 x 512 (for a
-            GPU, or several under torchrun);
+            (MomentNet once more), on data of the preset of that name. "tissue": the same on stacks, to the bone.
+            "paper": the paper's UNet at 512 x 512 (for a GPU, or several under torchrun);
             "paper-reduced": the same code at a size that one CPU core trains in under an hour; "-3-bodies": without the
             second and fourth body, as in the paper's second set-up.
         data: folder of a finished data set.

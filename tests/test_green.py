@@ -28,7 +28,8 @@ def flat(tissue: Tissue = STACK, edge: float = 5e-3) -> Green:
     """A plate that nothing is known of but the flat response."""
     layer = plate(0.2, edge, THICK).with_(tissue=tissue)
     three = np.zeros((len(layer.vertices), 3), np.int64)
-    return Green(layer, CoarseResponse(three, np.ones(three.shape) / 3, np.ones(1), np.zeros((1, 3, 1), np.float32), 1.0))
+    none = CoarseResponse(three, np.ones(three.shape) / 3, np.ones(1), np.zeros((1, 3, 1), np.float32), 1.0)
+    return Green(layer, none)
 
 
 @pytest.fixture(scope="module")
@@ -40,7 +41,7 @@ def under(green: Green, field: SignedDistance, pose: np.ndarray) -> tuple[Nodes,
     """Nodes under a tool, what they feel of each other, and the linear forces over E."""
     nodes = Columns(green.layer).squeezed(field, pose).nodes
     matrix = green.matrix(nodes, np.zeros(len(nodes.area), np.int64))
-    return nodes, matrix, solve(matrix, nodes.strain * nodes.thickness)
+    return nodes, matrix, solve(matrix, nodes.sinking)
 
 
 def test_a_wide_force_sinks_the_stack_as_its_table_says():
@@ -72,7 +73,8 @@ def test_a_ball_pressed_in_a_little_is_held_as_the_closed_form_says(radius):
 
 
 def test_what_one_node_does_to_another_that_does_to_it(green):
-    nodes, matrix, _ = under(green, SignedDistance.of(box(0.02, 0.02, 0.02), margin=5e-3), at(-RADIUS - 8e-3, 0, LENGTH / 2))
+    field = SignedDistance.of(box(0.02, 0.02, 0.02), margin=5e-3)
+    _, matrix, _ = under(green, field, at(-RADIUS - 8e-3, 0, LENGTH / 2))
     np.testing.assert_allclose(matrix, matrix.T, rtol=1e-12)
     assert np.linalg.eigvalsh(matrix)[0] > 0
 

@@ -208,8 +208,8 @@ def test_numba_and_torch_see_the_same_inputs() -> None:
     ends = [np.full(INPUTS.size, value, np.float32) for value in (-1e9, 1e9, -1e9, 1e9, 0.0, 1.0)]
     shape = np.concatenate([parts["curvature"], parts["slope"]], axis=1)
     more = np.empty((200, 0), np.float32)
-    invariants(parts["figures"].reshape(200, 2, -1), shape, parts["here"], parts["constants"][0], more, *mixed, *ends, inputs,
-               outside)  # fmt: skip
+    figures = parts["figures"].reshape(200, 2, -1)
+    invariants(figures, shape, parts["here"], parts["constants"][0], more, *mixed, *ends, inputs, outside)
     with torch.no_grad():
         want = model._inputs(torch.from_numpy(np.concatenate(POINT.in_order(**parts), axis=1)))[0].numpy()
     assert not outside.any()

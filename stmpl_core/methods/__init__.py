@@ -34,7 +34,8 @@ METHODS = {  # module and class of each method, by its name
     "limb_linear": "stmpl_core.methods.limb_linear:LimbLinear",
 }
 _CLASSES = {"Coarse": "coarse", "Ladder": "ladder", "LimbLinear": "limb_linear", "Linear": "linear",
-            "MomentNet": "moment_net", "Naive": "naive", "UNet": "unet", "Winkler": "winkler", "Zero": "zero"}  # fmt: skip
+            "MomentNet": "moment_net", "Naive": "naive", "UNet": "unet", "Winkler": "winkler",
+            "Zero": "zero"}  # fmt: skip
 
 
 def method(name: str, **settings: Any) -> Method:

@@ -301,8 +301,8 @@ def _mix(weights, vectors, out):
 
 
 @numba.njit(cache=True, fastmath=FAST, error_model="numpy")
-def invariants(figures, shape, here, constants, more, mix_vectors, mix_tensors, least, most, low, high, mean, scale, out,
-               outside):  # fmt: skip
+def invariants(figures, shape, here, constants, more, mix_vectors, mix_tensors, least, most, low, high, mean, scale,
+               out, outside):  # fmt: skip
     """The network's inputs, those of INPUTS and then `more` (N, .): kept from low to high, then centred and scaled.
 
     Outside is who has one that no training load had.
