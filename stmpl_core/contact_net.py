@@ -18,7 +18,7 @@ from stmpl_core.rays import column_pressure
 
 MAX_LOG_RATIO = 2.5  # largest |log| of pressure over that of the linear layer [-]
 AT, SAY, NODES_SEE = NODE.at, PRESSURE.at, NODE.size  # first columns, constants to numba
-ON_STACK, STACKS_SEE = STACK_NODE.at, STACK_NODE.size
+ON_STACK, STACKS_SEE, SEEN_ALIKE = STACK_NODE.at, STACK_NODE.size, STACK_NODE.at.log_thickness
 LINEAR_TO = 0.6  # strain to which contact is solved; beyond it the columns' barrier takes over
 HARDENING = 0.75  # power of the columns' pressure with which it does
 FADE, FADE_RING = 0.03, 2  # strain at and around a node at which half of the correction is left: a touch begins linear
@@ -110,7 +110,8 @@ class ContactNet:
             return Look(*_look(*nodes[:7], group, self.near.bent, *self._table, self._moduli, self._nu))
         matrix = self._green.matrix(nodes, group)
         return Look(*_look_on_stack(*nodes, group, self.near.bent, *self._table, self._moduli, self._nu, matrix,
-                                    self._green.effective.thickness, self._green.numbers, *self._green.hardening))  # fmt: skip
+                                    self._green.effective.thickness, self._green.numbers,
+                                    *self._green.hardening))  # fmt: skip
 
     def hold(self, nodes: Nodes) -> Held:
         """Pressure at contact nodes."""
@@ -143,13 +144,13 @@ def _look_on_stack(points, inward, thickness, area, strain, corners, shares, sin
     force = solve(matrix, depth)
     pressure = force / area
     moments, vectors = moments_of(rings, points, even, area, softness * pressure, overlap)
-    inputs = np.empty((len(area), STACKS_SEE), np.float32)
-    _inputs(softness * pressure, moments, vectors, overlap, inward, _between(corners, shares, bent), nu, inputs)
+    alike, inputs = np.empty((len(area), NODES_SEE), np.float32), np.empty((len(area), STACKS_SEE), np.float32)
+    _inputs(softness * pressure, moments, vectors, overlap, inward, _between(corners, shares, bent), nu, alike)
     for n in range(len(area)):
         row = inputs[n]
+        row[:SEEN_ALIKE] = alike[n, :SEEN_ALIKE]
         row[ON_STACK.log_thickness], row[ON_STACK.column_strain] = np.log(thickness[n] / t), strain[n]
         row[ON_STACK.log_kappa], row[ON_STACK.log_pull] = numbers[1], numbers[2]
-        row[ON_STACK.log_softness] = numbers[3]
         row[ON_STACK.hardening] = _hardening(log_thickness, hardening, thickness[n], sinking[n] / thickness[n])
         if strain[n] > LINEAR_TO:
             top = _hardening(log_thickness, hardening, thickness[n], LINEAR_TO)

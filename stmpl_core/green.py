@@ -79,6 +79,7 @@ class Green:
         self.thickness = float(np.median(layer.thickness))
         self.near = Surroundings.of(layer)
         self.tables = tables(layer.tissue, self.thickness)
+        self._last: tuple[np.ndarray, np.ndarray] | None = None
 
     @classmethod
     def of(cls, layer: SoftLayer) -> Green:
@@ -112,7 +113,7 @@ class Green:
 
     @cached_property
     def hardening(self) -> tuple[np.ndarray, np.ndarray]:
-        """Logarithms of thicknesses, (T,), and what stmpl_core.stack.hardening is at STRAINS even strains, (T, STRAINS)."""
+        """Logarithms of thicknesses, (T,), and stmpl_core.stack.hardening at even strains from 0 to below 1, (T, S)."""
         least, most = np.log(self.layer.thickness.min()), np.log(self.layer.thickness.max())
         logs, strain = np.linspace(least, most + 1e-6, COLUMNS), np.linspace(0, 1, STRAINS, endpoint=False)
         return logs, np.array([hardening(self.layer.tissue, t, strain) for t in np.exp(logs)])
@@ -124,8 +125,11 @@ class Green:
             nodes: contact nodes.
             group: numbers of groups of nodes that do not feel each other, (N,).
         """
-        return _matrix(nodes.points, nodes.inward, nodes.area, nodes.corners, nodes.shares, group, self.thickness,
-                       self.tables[0], *self.coarse[:4])  # fmt: skip
+        if self._last is None or not np.array_equal(self._last[0], nodes.points):  # a touch, then its answer
+            made = _matrix(nodes.points, nodes.inward, nodes.area, nodes.corners, nodes.shares, group, self.thickness,
+                           self.tables[0], *self.coarse[:4])  # fmt: skip
+            self._last = nodes.points, made
+        return self._last[1]
 
     def stuck(self, nodes: Nodes, group: np.ndarray, gone: np.ndarray) -> np.ndarray:
         """Forces over E with which nodes that stick are held where they have gone, (N, 3) [m2].
@@ -255,9 +259,12 @@ def _corners_of(corners, shares, skin_corners, skin_shares):
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _wide(index, weight, some, inward, gathered, motion, out):
+def _wide(index, weight, some, gathered, motion, out):
     """Adds the coarse motion of each node under a force E inwards at each, (N, 3, N) [1/m]."""
-    count, row = len(index), np.empty((3, len(some)))
+    count, row, place = len(index), np.empty((3, len(some))), np.empty(index.shape, np.int64)
+    for n in range(count):
+        for a in range(9):
+            place[n, a] = np.searchsorted(some, index[n, a])
     for n in range(count):
         row[:] = 0.0
         for a in range(9):
@@ -266,7 +273,7 @@ def _wide(index, weight, some, inward, gathered, motion, out):
                     row[x, d] += weight[n, a] * motion[index[n, a], x, some[d]]
         for j in range(count):
             for a in range(9):
-                d, share = np.searchsorted(some, index[j, a]), weight[j, a] / gathered[index[j, a]]
+                d, share = place[j, a], weight[j, a] / gathered[index[j, a]]
                 for x in range(3):
                     out[n, x, j] += share * row[x, d]
 
@@ -278,7 +285,7 @@ def _matrix(points, inward, area, corners, shares, group, thickness, table, skin
     count = len(points)
     index, weight, some = _corners_of(corners, shares, skin_corners, skin_shares)
     wide, out = np.zeros((count, 3, count)), np.zeros((count, count))
-    _wide(index, weight, some, inward, gathered, motion, wide)
+    _wide(index, weight, some, gathered, motion, wide)
     for i in range(count):
         for j in range(i + 1):
             if group[i] != group[j]:
@@ -327,7 +334,7 @@ def _blocks(points, inward, area, corners, shares, group, thickness, tables, ski
     count = len(points)
     index, weight, some = _corners_of(corners, shares, skin_corners, skin_shares)
     wide, out = np.zeros((count, 3, count)), np.zeros((count, 3, count, 3))
-    _wide(index, weight, some, inward, gathered, motion, wide)
+    _wide(index, weight, some, gathered, motion, wide)
     force, moved = np.zeros(3), np.empty(3)
     for i in range(count):
         for j in range(count):

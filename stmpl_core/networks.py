@@ -119,15 +119,15 @@ NODE = Layout(
     volumetric=1,  # 1 / (1.02 - 2 nu)
 )
 
-# The same on a stack: t is that of the effective layer (stmpl_core.stack), strain the depth over it.
+# What it reads on a stack, less than of one material: t is that of the effective layer, strain the sinking over it.
+SEEN_ALIKE = ("log_pressure", "pressure", "log_strain", "strain", "log_moments", "vector_sizes", "vectors_together")
 STACK_NODE = Layout(
-    **NODE.sizes,
+    **{name: NODE.sizes[name] for name in SEEN_ALIKE},  # as in NODE, and first in both
     log_thickness=1,  # of the tissue at the node, over that of the effective layer
     column_strain=1,  # depth over the tissue's thickness at the node
     hardening=1,  # of the confined column there, see stmpl_core.stack.hardening
     log_kappa=1,  # of the effective layer
     log_pull=1,
-    log_softness=1,  # modulus of the first material over that of the effective layer
 )
 
 ON_STACK = {

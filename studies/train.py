@@ -13,6 +13,9 @@ from stmpl_core.errors import InvalidInput, sentence_of
 TrainPreset = Literal[
     "default", "contacts", "tissue", "paper", "paper-reduced", "paper-3-bodies", "paper-reduced-3-bodies"
 ]
+TOOLS: dict[str, Any] = {"kinds": ("indenter",), "steps": 20_000}  # settings of a MomentNet for what tools press with
+STACK_CONTACTS = {"hidden": 24, "weight_decay": 0.1, "steps": 1_500}  # stacks are few: more would learn them by heart
+STACK_MOMENTS = {"hidden": 64, "weight_decay": 0.3, "steps": 3_000, "points": 64}
 OnProgress = Callable[[int, int, str], None]  # done, in all, what to say of it
 
 
@@ -56,8 +59,10 @@ def train(
     from studies.judge_contact import bound_motion
     from studies.train_contact import ContactTraining, train_contact
 
-    contacts = _settings(ContactTraining, changes)
-    moments = _settings(MomentTraining, {"kinds": ("indenter",), "steps": 20_000} | changes)
+    contacts, moments = _settings(ContactTraining, changes), _settings(MomentTraining, TOOLS | changes)
+    if preset == "tissue":
+        contacts = _settings(ContactTraining, STACK_CONTACTS | changes)
+        moments = _settings(MomentTraining, TOOLS | STACK_MOMENTS | changes)
     motion, pressure = ("stack_moment_net", "stack_contact_net") if preset == "tissue" else \
         ("moment_net_contact", "contact_net")  # fmt: skip
     train_moments(data, out, moments, name=motion, on_progress=on_progress)

@@ -64,6 +64,7 @@ class MomentTraining(BaseModel):
         kinds: kinds of load; rigid tools that stick also pull along the skin, so they have a network of their own.
         points: vertices drawn of each sample, most from where it moves.
         steps, batch, learning_rate: numbers of Adam, the rate rising to this and falling in one cycle.
+        weight_decay: weight decay of AdamW.
         seed: seed of weights, points and order.
         checkpoint_minutes: time between two checkpoints [min].
     """
@@ -76,6 +77,7 @@ class MomentTraining(BaseModel):
     steps: int = Field(default=40_000, ge=10)
     batch: int = Field(default=2048, ge=8)
     learning_rate: float = Field(default=4e-3, gt=0)
+    weight_decay: float = Field(default=1e-5, ge=0)
     seed: int = 0
     checkpoint_minutes: float = Field(default=5.0, ge=0)
 
@@ -298,7 +300,8 @@ def fit(points: Points, settings: MomentTraining, out: Path, on_progress: OnProg
     rows, motion, weight = (torch.from_numpy(a) for a in (points.rows, points.motion, points.weight))
     some = torch.randperm(len(rows))[:1_000_000]
     model.normalise(rows[some])
-    optimiser = torch.optim.AdamW(model.parameters(), lr=settings.learning_rate, weight_decay=1e-5)
+    optimiser = torch.optim.AdamW(model.parameters(), lr=settings.learning_rate,
+                                  weight_decay=settings.weight_decay)  # fmt: skip
     schedule = torch.optim.lr_scheduler.OneCycleLR(
         optimiser, settings.learning_rate, total_steps=settings.steps, pct_start=0.1
     )

@@ -31,7 +31,8 @@ from bags.wire import (
     wrench_from,
     wrench_message,
 )
-from stmpl_core import Answer, Tools, Touch
+from stmpl_core import Answer, Membrane, Ply, Tissue, Tools, Touch
+from stmpl_core.bones import Bone, to_bone
 from stmpl_core.errors import FrameError, InvalidInput, MeshError
 from stmpl_core.layer import layer_id
 from stmpl_core.local_contact import LocalContact
@@ -78,6 +79,25 @@ def test_a_layer_keeps_its_id_and_every_bit_through_a_message():
     assert back.vertices.tobytes() == layer.vertices.tobytes()
     assert layer_id(back) == layer_id(layer) == message.layer_id
     assert layer_id(layer.with_(youngs_modulus=2e3)) != message.layer_id
+
+
+def test_a_stack_and_its_core_go_through_a_message():
+    tissue = Tissue(3e3, 0.45, skin=Membrane(2e5, 1.5e-3, 20.0), deeper=(Ply(6e-3, 15e3, name="muscle"),))
+    layer = published(to_bone(limb(6e-3), [Bone(np.zeros(3), np.array([0, 0, 0.2]), 0.01)]).with_(tissue=tissue))
+    message = topology_message(layer, "body", 5)
+    back = layer_from(message)
+    assert back.tissue == tissue and back.core.tobytes() == layer.core.tobytes()
+    assert layer_id(back) == layer_id(layer) == message.layer_id
+    message.stack = '{"skin": 3}'
+    with pytest.raises(InvalidInput, match="stack of a SkinTopology"):
+        layer_from(message)
+
+
+def test_a_message_from_before_stacks_is_one_material():
+    message = topology_message(published(limb(6e-3)), "body", 5)
+    old = SimpleNamespace(**{name: getattr(message, name) for name in message.get_fields_and_field_types()
+                             if name not in ("core", "stack")})  # fmt: skip
+    assert layer_id(layer_from(old)) == message.layer_id
 
 
 def test_a_tool_keeps_its_mesh_through_a_message():

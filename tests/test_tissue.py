@@ -5,7 +5,7 @@ import pytest
 from stmpl_core import Membrane, Ply, Tissue
 from stmpl_core.errors import InvalidInput
 from stmpl_core.layer import layer_id
-from stmpl_core.methods import Linear, MomentNet, Naive, Winkler
+from stmpl_core.methods import Linear, Naive, Winkler
 from studies.tets import TetFem
 from tests.scenes import plate
 
@@ -41,7 +41,7 @@ def test_a_skin_and_a_deeper_material_give_a_layer_another_name():
     assert len(names) == 3
 
 
-@pytest.mark.parametrize("method", [Naive, Winkler, Linear, MomentNet, TetFem])
+@pytest.mark.parametrize("method", [Naive, Winkler, Linear, TetFem])
 @pytest.mark.parametrize("more", [{"skin": SKIN}, {"deeper": (MUSCLE,)}])
 def test_who_knows_one_material_refuses_a_stack(method, more):
     with pytest.raises(InvalidInput, match="knows one soft material"):

@@ -1,0 +1,76 @@
+"""Laws of parts of a body as people were measured, and of the tissue that a node is started with."""
+
+import numpy as np
+import pytest
+
+from stmpl_core import SoftLayer, Tissue
+from stmpl_core.body import Body
+from stmpl_core.errors import InvalidInput
+from stmpl_core.extrusion import fold_ratios
+from stmpl_core.living import living, read_tissue, region_of, write_tissue
+from stmpl_core.regions import region
+from stmpl_ros.making import at_once, check, layer_of
+from stmpl_ros.parameters import NodeConfig
+from tests.test_needs import stmpl
+
+COARSE = 8e-3  # m
+
+
+@pytest.mark.parametrize("part", ["left_forearm", "right_thigh"])
+def test_a_part_has_the_tissue_of_its_region_down_to_its_bone(part):
+    layer = living(Body.anny(), part, edge_length=COARSE)
+    assert layer.tissue == region(part.partition("_")[2]).tissue and layer.core is not None
+    assert 0.01 < np.median(layer.thickness) < 0.06
+    assert (fold_ratios(layer.vertices, layer.inner_vertices, layer.faces) > 0).all()
+
+
+def test_tensed_muscle_is_stiffer_and_nothing_else():
+    relaxed, tensed = (living(Body.anny(), "left_forearm", tone, edge_length=COARSE) for tone in ("relaxed", "tensed"))
+    assert tensed.tissue.deeper[0].youngs_modulus > 1.2 * relaxed.tissue.deeper[0].youngs_modulus
+    assert tensed.tissue.skin == relaxed.tissue.skin
+    np.testing.assert_array_equal(tensed.core, relaxed.core)
+
+
+def test_whole_limbs_and_the_torso_take_the_numbers_of_one_region():
+    assert region_of("left_arm").name == "forearm" and region_of("torso").name == "back"
+    with pytest.raises(InvalidInput, match="there is no region"):
+        region_of("left_wing")
+
+
+def test_a_tissue_goes_through_a_file(tmp_path):
+    tissue = region("back").tissue
+    write_tissue(tmp_path / "back.json", tissue, 0.018)
+    assert read_tissue(tmp_path / "back.json") == (tissue, 0.018)
+
+
+@pytest.mark.parametrize("content", ["", "{}", "[1]", '{"tissue": 3, "thickness": 1}', '{"tissue": {"skin": null}}'])
+def test_a_file_that_holds_no_tissue_is_refused_with_how_to_make_one(tmp_path, content):
+    path = tmp_path / "tissue.json"
+    path.write_text(content)
+    with pytest.raises(InvalidInput, match="stmpl needs --out"):
+        read_tissue(path)
+    with pytest.raises(InvalidInput, match="stmpl needs --out"):
+        read_tissue(tmp_path / "none.json")
+
+
+def config(**changes) -> NodeConfig:
+    return NodeConfig(part="left_forearm", edge_length=COARSE, **changes)
+
+
+def test_a_node_starts_with_the_tissue_that_it_is_asked_for(tmp_path, capsys):
+    assert layer_of(config()).tissue == Tissue()
+    assert layer_of(config(tissue="tensed")).tissue == region("forearm", "tensed").tissue
+    path = tmp_path / "arm.json"
+    code, _, _ = stmpl(capsys, "needs", "--part", "forearm", "--radius", 20, "--force", 5, "--out", path)
+    made = layer_of(config(tissue=str(path)))
+    assert code == 0 and isinstance(made, SoftLayer) and made.tissue.skin and not made.tissue.deeper
+    assert made.tissue.youngs_modulus > 2 * region("forearm").tissue.youngs_modulus, "one layer for fat and muscle"
+
+
+def test_a_node_refuses_at_once_what_cannot_be(tmp_path):
+    with pytest.raises(InvalidInput, match="winkler knows one soft material only; of skin.* know moment_net"):
+        check(config(tissue="relaxed", method="winkler"), layer_of)
+    with pytest.raises(InvalidInput, match="stmpl needs --out"):
+        check(config(tissue=str(tmp_path / "none.json")), layer_of)
+    check(config(tissue="relaxed"), layer_of)
+    assert not at_once(NodeConfig(tissue="relaxed"), layer_of) and at_once(NodeConfig(), layer_of)
