@@ -8,7 +8,7 @@ import numpy as np
 import scipy.sparse as sp
 from scipy.sparse.linalg import splu
 
-from fem_tools.mesh import WedgeMesh
+from fem_tools.mesh import ElementName, WedgeMesh, folding, reference_wedge, rest_gradients
 from fem_tools.plies import wedge_ends
 from fem_tools.system import System
 from stmpl_core.bones import unfolded
@@ -18,6 +18,8 @@ from stmpl_core.methods.coarse import nearest_corners
 
 VERTICES = 900  # vertices of the coarse skin, about: its operator has 3 times their square numbers
 FINEST = 1.1  # edges of the coarse mesh over the layer's own, below which the layer's own is taken
+ELEMENT: ElementName = "P1xP2"
+PASSES, SHORTER, TURNED = 40, 0.85, 0.25  # columns of the coarse mesh whose wedges fold: passes, and what each does
 HAT = np.array([[2.0, 1.0, 1.0], [1.0, 2.0, 1.0], [1.0, 1.0, 2.0]]) / 12  # forces of linear pressures on a triangle
 
 
@@ -56,14 +58,39 @@ def _coarse(layer: SoftLayer, vertices: int) -> SoftLayer:
     skin = SoftLayer(mesh.vertices, mesh.faces, mesh.transfer @ layer.thickness, tissue=layer.tissue)
     columns = mesh.transfer @ layer.inner_vertices - skin.vertices
     columns = unfolded(skin.vertices, skin.normals, columns, skin.faces)
-    return skin.with_(core=skin.vertices + columns)
+    bad = _folding(skin, columns)
+    for _ in range(PASSES):  # a stack's wedges may fold where the whole column does not
+        if not len(bad):
+            break
+        length = np.linalg.norm(columns[bad], axis=1, keepdims=True)
+        way = columns[bad] / length - TURNED * skin.normals[bad]
+        columns[bad] = SHORTER * length * way / np.linalg.norm(way, axis=1, keepdims=True)
+        bad = _folding(skin, columns)
+    whole = skin.with_(core=skin.vertices + columns)
+    return whole if not len(bad) else _without(whole, np.isin(skin.faces, bad).all(axis=1))
+
+
+def _without(layer: SoftLayer, faces: np.ndarray) -> SoftLayer:
+    """The layer without some faces, by their mask (F,), and without vertices that are left alone."""
+    kept = layer.faces[~faces]
+    some, places = np.unique(kept, return_inverse=True)
+    return SoftLayer(layer.vertices[some], places.reshape(-1, 3), core=layer.inner_vertices[some], tissue=layer.tissue)
+
+
+def _folding(skin: SoftLayer, columns: np.ndarray) -> np.ndarray:
+    """Numbers of the vertices around wedges that fold."""
+    ends, faces = wedge_ends(skin.tissue, np.linalg.norm(columns, axis=1), 1), skin.faces.astype(np.int64)
+    layers = ends.shape[1] - 1
+    wedge = reference_wedge(ELEMENT)
+    _, volumes = rest_gradients(skin.vertices, skin.vertices + columns, faces, wedge, layers, ends)
+    return folding(faces, volumes, layers)
 
 
 def _compliance(layer: SoftLayer) -> np.ndarray:
     """Motion of every vertex under a pressure E at each, its edges held, (3 V, V) [m]."""
     ends = wedge_ends(layer.tissue, np.linalg.norm(layer.inner_vertices - layer.vertices, axis=1), 1)
     faces = layer.faces.astype(np.int64)
-    mesh = WedgeMesh.of(layer.vertices, layer.inner_vertices, faces, "P1xP2", ends=ends)
+    mesh = WedgeMesh.of(layer.vertices, layer.inner_vertices, faces, ELEMENT, ends=ends)
     system = System(mesh, layer.tissue, [], mesh.border_columns())
     blocks: Any = system.tangent(system.zeros(), 1.0)
     count, width = len(layer.vertices), blocks.shape[1]

@@ -165,8 +165,7 @@ class WedgeMesh:
         ends = level_depths(layers)[None, ::2] if ends is None else ends
         layers = ends.shape[1] - 1
         gradients, volumes = rest_gradients(outer, inner, triangles, reference_wedge(element), layers, ends)
-        if (volumes <= 0).any():
-            bad = np.unique(triangles[np.flatnonzero((volumes <= 0).any(axis=1)) // layers])
+        if len(bad := folding(triangles, volumes, layers)):
             raise MeshError(f"the layer folds on itself below {len(bad)} vertices of the patch: {_some(bad)}.")
         indptr, indices, blocks = _block_pattern(columns, n_columns)
         return cls(
@@ -282,6 +281,11 @@ def _columns(triangles: np.ndarray, n: int, element: ElementName) -> tuple[np.nd
     edges, number = np.unique(pairs, axis=0, return_inverse=True)
     columns = np.hstack([triangles, n + number.reshape(-1, 3)])
     return np.ascontiguousarray(columns, dtype=np.int64), edges.astype(np.int64), n + len(edges)
+
+
+def folding(triangles: np.ndarray, volumes: np.ndarray, layers: int) -> np.ndarray:
+    """Numbers of the vertices around wedges that fold at rest, by their integration weights (T L, Q)."""
+    return np.unique(triangles[np.flatnonzero((volumes <= 0).any(axis=1)) // layers])
 
 
 def rest_gradients(

@@ -22,6 +22,7 @@ ON_STACK, STACKS_SEE, SEEN_ALIKE = STACK_NODE.at, STACK_NODE.size, STACK_NODE.at
 LINEAR_TO = 0.6  # strain to which contact is solved; beyond it the columns' barrier takes over
 HARDENING = 0.75  # power of the columns' pressure with which it does
 FADE, FADE_RING = 0.03, 2  # strain at and around a node at which half of the correction is left: a touch begins linear
+STACK_FADE = 0.1  # the same on a stack, whose linear response alone is good to some percent up to there
 
 
 class Held(NamedTuple):
@@ -130,7 +131,7 @@ def _look(points, inward, thickness, area, strain, corners, shares, group, bent,
     inputs = np.empty((len(area), NODES_SEE), np.float32)
     _inputs(pressure, moments, vectors, strain, inward, _between(corners, shares, bent), nu, inputs)
     _harden(pressure, strain, moduli)
-    return pressure, inputs, _faded(strain, moments), power
+    return pressure, inputs, _faded(strain, moments, FADE), power
 
 
 @numba.njit(cache=True, error_model="numpy")
@@ -156,7 +157,7 @@ def _look_on_stack(points, inward, thickness, area, strain, corners, shares, sin
             top = _hardening(log_thickness, hardening, thickness[n], LINEAR_TO)
             there = _hardening(log_thickness, hardening, thickness[n], strain[n])
             pressure[n] *= (strain[n] / LINEAR_TO * np.exp(there - top)) ** HARDENING
-    return pressure, inputs, _faded(overlap, moments), power_of(matrix, force, depth.max())
+    return pressure, inputs, _faded(overlap, moments, STACK_FADE), power_of(matrix, force, depth.max())
 
 
 @numba.njit(cache=True, error_model="numpy")
@@ -183,12 +184,12 @@ def _between(corners, shares, values):
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _faded(strain, moments):
+def _faded(strain, moments, half):
     """Share of the network's correction at each node, (N,)."""
     out = np.empty(len(strain))
     for n in range(len(strain)):
         around = strain[n] + moments[n, 1, FADE_RING]
-        out[n] = around / (around + FADE)
+        out[n] = around / (around + half)
     return out
 
 

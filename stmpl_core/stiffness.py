@@ -10,6 +10,7 @@ import numpy as np
 
 from stmpl_core.contact import Contact
 from stmpl_core.errors import InvalidInput
+from stmpl_core.layer import single
 from stmpl_core.touch import Touch
 from stmpl_core.toucher import MAX_DRAG_RATIO, Toucher
 from stmpl_core.trust import Trust
@@ -77,8 +78,9 @@ def fit_stiffness(toucher: Toucher, presses: Sequence[Contact]) -> Stiffness:
         presses: contacts with their wrenches, of tools that pressed one at a time.
 
     Raises:
-        InvalidInput: a press without a wrench.
+        InvalidInput: a press without a wrench, or a layer of several materials: one number does not scale them.
     """
+    single(toucher.layer, "the fit of a stiffness", straight=False)
     for press in presses:
         if press.wrench is None:
             raise InvalidInput(f"a press of {press.name} has no wrench; stiffness needs the force.")

@@ -68,7 +68,7 @@ def test_a_node_starts_with_the_tissue_that_it_is_asked_for(tmp_path, capsys):
 
 
 def test_a_node_refuses_at_once_what_cannot_be(tmp_path):
-    with pytest.raises(InvalidInput, match="winkler knows one soft material only; of skin.* know moment_net"):
+    with pytest.raises(InvalidInput, match=r"winkler knows one soft material only; of skin.* know moment_net"):
         check(config(tissue="relaxed", method="winkler"), layer_of)
     with pytest.raises(InvalidInput, match="stmpl needs --out"):
         check(config(tissue=str(tmp_path / "none.json")), layer_of)

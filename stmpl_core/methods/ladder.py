@@ -265,6 +265,8 @@ class Ladder:
         self._ready, refused = np.ones(len(self.rungs), dtype=bool), {}
         for k, rung in enumerate(self.rungs):
             try:
+                if layer.stacked and "moment_net" in rung.name:
+                    raise InvalidInput("its bound was measured on one material, its other network's was not")
                 rung.prepare(layer)
             except StmplError as error:
                 self._ready[k], refused[rung.name] = False, f"it refuses the layer: {error}"
