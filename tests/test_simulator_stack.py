@@ -1,0 +1,122 @@
+"""Laws of touches and answers on a limb of skin, fat and muscle, and what finite elements say of both."""
+
+import numpy as np
+import pytest
+
+from fem_tools import IndenterFem, PatchFem, Press
+from stmpl_core import Load, Membrane, Ply, Simulator, SoftLayer, Tissue
+from stmpl_core.bones import Bone, to_bone
+from stmpl_core.contact_net import ContactNet
+from stmpl_core.errors import InvalidInput
+from stmpl_core.methods import LimbLinear, MomentNet
+from stmpl_core.sdf import SignedDistance
+from stmpl_core.stiffness import fit_stiffness
+from tests.scenes import at, ball, contact_of, limb, placed, punch, turn
+
+RADIUS, LENGTH, BALL = 0.035, 0.3, 0.015
+STACK = Tissue(3e3, 0.45, skin=Membrane(1.3e5, 1.2e-3, 11.0), deeper=(Ply(6e-3, 15e3, 0.45),))
+BESIDE = Bone(np.array([0.006, 0, -1]), np.array([0.006, 0, 1]), 0.012)  # off the limb's axis
+LIMB = to_bone(limb(5e-3, 10e-3, RADIUS, LENGTH), [BESIDE]).with_(tissue=STACK)
+THICK = RADIUS - 0.006  # of the tissue on the side where it is thicker [m]
+HALF = LENGTH / 2
+
+
+@pytest.fixture(scope="module")
+def simulator() -> Simulator:
+    return Simulator(LIMB, MomentNet())
+
+
+def pressed(depth: float, wrench: np.ndarray | None = None):
+    return contact_of(ball(BALL), at(-RADIUS - BALL + depth, 0, HALF), wrench)
+
+
+def push(force: float) -> np.ndarray:
+    return np.array([force, 0, 0, 0, 0, 0])
+
+
+def test_a_ball_presses_and_moves_as_finite_elements_say_and_no_further_than_the_bounds(simulator):
+    field = SignedDistance.of(ball(BALL), margin=0.03)
+    start = Press(field, at(-RADIUS - BALL - 5e-3, 0, HALF), np.array([1.0, 0, 0])).touching(LIMB)
+    assert start is not None
+    depths = [1e-3, 4e-3, 9e-3]
+    fem = IndenterFem(PatchFem(element="P1xP2", reach=10, refine=3, layers=1), step=0.15).prepare(LIMB)
+    for depth, truth in zip(depths, fem.path([start], depths), strict=True):
+        answer = simulator.step([contact_of(ball(BALL), start.at(depth).pose_body_from_tool)])
+        touch, moved = answer.touches["probe"], np.linalg.norm(truth.displacement, axis=1)
+        force = float(np.linalg.norm(truth.pressure @ LIMB.vertex_area_vectors))
+        off = np.linalg.norm(answer.displacement - truth.displacement, axis=1)
+        assert answer.trust.ok, answer.trust.why
+        assert touch.force == pytest.approx(force, rel=0.1) and abs(touch.force - force) < touch.force_bound
+        assert off[moved > 0.1 * moved.max()].mean() < 0.06 * moved.max()
+        assert off.max() < answer.trust.error_bound
+
+
+def test_force_rises_with_depth_into_the_bone(simulator):
+    forces = [simulator.touch([pressed(depth)])[0].force for depth in THICK * np.linspace(0.02, 1.3, 40)]
+    assert (np.diff(forces) > 0).all()
+
+
+def test_the_ball_is_where_the_skin_is(simulator):
+    depth = 8e-3
+    answer = simulator.step([pressed(depth)])
+    deepest = np.linalg.norm(answer.displacement, axis=1).max()
+    assert deepest == pytest.approx(depth, rel=0.05)
+    assert answer.trust.figures["entered_m"] < 1e-4
+
+
+@pytest.mark.parametrize("force", [0.2, 1.0, 3.0])
+def test_a_force_is_carried_where_the_pose_presses_as_hard(simulator, force):
+    (touch,) = simulator.touch([pressed(2e-3, push(force))])
+    assert touch.force == pytest.approx(force, rel=0.02)
+    by_pose = simulator.touch([contact_of(ball(BALL), touch.pose_body_from_tool)])[0]
+    assert by_pose.force == pytest.approx(force, rel=0.03)
+
+
+def test_what_the_tissue_cannot_carry_is_said(simulator):
+    (touch,) = simulator.touch([pressed(5e-3, push(500.0))])
+    assert not touch.trust.in_range and "carries" in touch.trust.why and touch.force < 500
+    assert touch.depth < THICK
+
+
+def test_a_thousand_times_stiffer_presses_a_thousand_times_harder_and_moves_alike(simulator):
+    skin = Membrane(1.3e8, 1.2e-3, 11.0e3)
+    stiff = Simulator(LIMB.with_(tissue=Tissue(3e6, 0.45, skin=skin, deeper=(Ply(6e-3, 15e6, 0.45),))), MomentNet())
+    one, other = simulator.step([pressed(4e-3)]), stiff.step([pressed(4e-3)])
+    assert other.touches["probe"].force == pytest.approx(1e3 * one.touches["probe"].force, rel=1e-3)
+    np.testing.assert_allclose(other.displacement, one.displacement, atol=2e-6)
+
+
+def test_turning_the_scene_turns_the_answer(simulator):
+    scene = turn((0.3, -0.5, 0.8), 1.1, (0.4, -0.2, 0.9))
+    core = LIMB.core @ scene[:3, :3].T + scene[:3, 3]
+    there = Simulator(LIMB.with_(vertices=placed(LIMB.with_(core=None, thickness=1e-2), scene).vertices, core=core),
+                      MomentNet())  # fmt: skip
+    here = simulator.step([pressed(4e-3)])
+    answer = there.step([contact_of(ball(BALL), scene @ pressed(4e-3).pose_body_from_tool)])
+    assert answer.touches["probe"].force == pytest.approx(here.touches["probe"].force, rel=0.01)
+    np.testing.assert_allclose(answer.displacement @ scene[:3, :3], here.displacement, atol=2e-4)
+
+
+def test_no_touch_no_motion_and_two_tools_far_apart_do_not_feel_each_other(simulator):
+    assert not simulator.step([contact_of(ball(BALL), at(-0.2, 0, HALF))]).displacement.any()
+    one = simulator.step([pressed(4e-3)])
+    other = contact_of(punch(8e-3), turn((0, 1, 0), np.pi / 2, (RADIUS + 0.013, 0, HALF + 0.005)), name="other")
+    both = simulator.step([pressed(4e-3), other])
+    assert both.touches["probe"].force == pytest.approx(one.touches["probe"].force, rel=0.1)
+
+
+def test_a_pressure_without_a_tool_is_answered_by_the_linear_response():
+    load = Load.pressure(np.where(np.linalg.norm(LIMB.vertices - [-RADIUS, 0, HALF], axis=1) < 0.012, 20.0, 0.0))
+    answer, linear = MomentNet().prepare(LIMB).solve(load), LimbLinear().prepare(LIMB).solve(load)
+    np.testing.assert_array_equal(answer.displacement, linear.displacement)
+    assert answer.method == "limb_linear"
+
+
+def test_one_number_does_not_fit_a_stack(simulator):
+    with pytest.raises(InvalidInput, match="knows one soft material"):
+        fit_stiffness(simulator.toucher, [pressed(1e-3, push(0.1))])
+
+
+def test_each_kind_of_layer_has_its_own_network():
+    assert ContactNet(LIMB).network == "stack_contact_net"
+    assert ContactNet(SoftLayer(LIMB.vertices, LIMB.faces, 5e-3)).network == "contact_net"
