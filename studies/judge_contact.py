@@ -16,7 +16,8 @@ from stmpl_core.networks import NETWORKS, Weights
 from stmpl_core.simulator import Simulator
 from studies.pressed import STRAIGHT, pressed, seen, slant_of
 
-COVERED = 0.95  # share of contacts with kinds of tools left out, whose force and motion the stated bounds must reach
+COVERED = 0.95  # share of contacts of kinds left out, whose force and motion the stated bounds must reach
+STACK_MARGIN = 1.3  # on the bound of motion on stacks; without, it covers 92 % on known ones and 77 % on two unseen
 FEWEST = 30  # contacts from which a bound is known
 LEAST_ERROR = 2e-3  # relative error of a force below which one is as good as another
 
@@ -31,8 +32,8 @@ class Scores:
         motion: largest error at a vertex over the largest displacement that is answered.
         stated: bound on the force that is stated, over the force.
         linear: signed error of the force without the network.
-        tool: kind of the tool.
-        slant: angle between its way and the skin's normal [rad].
+        kind: kind of the tool; on stacks the body, as each has a stack of its own.
+        slant: angle between its way and the skin's normal that the answer does not know of [rad].
         held, trusted: truth of the claim that the touch, and that the whole answer is not flagged.
     """
 
@@ -41,7 +42,7 @@ class Scores:
     motion: np.ndarray
     stated: np.ndarray
     linear: np.ndarray
-    tool: np.ndarray
+    kind: np.ndarray
     slant: np.ndarray
     held: np.ndarray
     trusted: np.ndarray
@@ -70,11 +71,14 @@ def score(samples: Iterable[Sample], pressures: Weights, moments: Weights | None
         (touch,) = simulator.touch([Contact(one.tool, one.pose)])
         if touch.pressure is None or not touch.force > 0:
             continue
-        motion, trusted = float("nan"), touch.trust.in_range
+        motion, trusted, slant = float("nan"), touch.trust.in_range, slant_of(one.sample)
+        if layer.stacked and touch.pressed is not None:  # told which way it came, as by a wrench
+            touch, slant = replace(touch, pressed=touch.pressed._replace(way=one.way)), 0.0
         if not reaction_only:
             answer = simulator.answer([touch])
             off = np.linalg.norm(answer.displacement - one.sample.displacement, axis=1)
             motion, trusted = float(off.max() / answer.magnitude.max()), answer.trust.in_range
+        kind = one.sample.info["body"] if layer.stacked else one.sample.info["drawn"]["tool"]
         ours, nodes, force = touch.pressure / layer.tissue.youngs_modulus, one.nodes, float(area @ true)
         rows.append((
             float(area @ ours) / force - 1,
@@ -82,7 +86,7 @@ def score(samples: Iterable[Sample], pressures: Weights, moments: Weights | None
             motion,
             touch.force_bound / touch.force,
             float(nodes.area @ simulator.toucher.net.look(nodes).pressure) / force - 1,
-            one.sample.info["drawn"]["tool"], slant_of(one.sample), touch.trust.in_range, trusted,
+            kind, slant, touch.trust.in_range, trusted,
         ))  # fmt: skip
     columns = list(zip(*rows, strict=True)) or [()] * 9
     return Scores(*(np.array(c) for c in columns[:-2]), *(np.array(c, dtype=bool) for c in columns[-2:]))
@@ -96,7 +100,7 @@ def bound_force(samples: Iterable[Sample], pressures: Weights) -> dict[str, floa
     plain = replace(pressures, card={**pressures.card, "bound": {"scale": 1.0, "power": 1.0}})
     scores = score(samples, plain, reaction_only=True)
     force, held = np.abs(scores.force), scores.held
-    found = fit_bound(np.maximum(force, LEAST_ERROR)[held], scores.stated[held], scores.tool[held])
+    found = fit_bound(np.maximum(force, LEAST_ERROR)[held], scores.stated[held], scores.kind[held])
     if held.any():
         found |= {"force_mean": float(force[held].mean()), "pressure_l2_mean": float(scores.pressure[held].mean())}
     return found
@@ -121,7 +125,9 @@ def bound_motion(data: str | Path, out: str | Path, motion: str = "moment_net_co
     pressures = Weights.load(Path(out) / f"{pressure}.safetensors", NETWORKS[pressure].kind)
     scores = score(Dataset.open(data).split("val", kind="indenter", sets=("tool",)), pressures, moments)
     some = scores.trusted
-    found = fit_bound(scores.motion[some], scores.stated[some], scores.tool[some], scores.slant[some])
+    found = fit_bound(scores.motion[some], scores.stated[some], scores.kind[some], scores.slant[some])
+    if NETWORKS[motion].kind == "stack_motion":  # validation is of the stacks that were learnt; others are further off
+        found |= {name: STACK_MARGIN * found[name] for name in ("scale", "median_bound_over_error")}
     replace(moments, card={**moments.card, "contact_bound": found}).save(path)
     return found
 
