@@ -9,6 +9,7 @@ from stmpl_core.body import Body
 from stmpl_core.bones import bones_of, to_bone
 from stmpl_core.errors import InvalidInput
 from stmpl_core.layer import SoftLayer
+from stmpl_core.limbs import EDGE_LENGTH
 from stmpl_core.packed import stack_from_text, stack_to_text
 from stmpl_core.regions import REGIONS, Region, Tone, region
 from stmpl_core.tissue import Tissue
@@ -31,7 +32,7 @@ def region_of(part: str, tone: Tone = "relaxed") -> Region:
     return region(name if name in REGIONS else WHOLE.get(name, name), tone)
 
 
-def living(body: Body, part: str, tone: Tone = "relaxed", *, edge_length: float | None = None) -> SoftLayer:
+def living(body: Body, part: str, tone: Tone = "relaxed", *, edge_length: float = EDGE_LENGTH) -> SoftLayer:
     """A part of a body with the tissue that was measured in its region (stmpl_core.regions).
 
     Arms and legs reach to their bones, so how thick their tissue is follows the body; the torso is as thick as its
@@ -41,7 +42,7 @@ def living(body: Body, part: str, tone: Tone = "relaxed", *, edge_length: float 
         body: body.
         part: its part.
         tone: state of the muscle.
-        edge_length: length of the skin mesh's edges [m]; None: the body's own.
+        edge_length: length of the skin mesh's edges [m].
 
     Raises:
         InvalidInput: a part without a region.

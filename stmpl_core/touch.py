@@ -107,8 +107,9 @@ def way_of(touch: Touch, pressed: Pressed, inward: np.ndarray, total: float) -> 
     if touch.force <= MIN_ONE_WAY_SHARE * total:
         return inward
     one = touch.wrench[:3] / touch.force
-    forced = pressed.way is not None and pressed.way @ one > MIN_ONE_WAY_SHARE
-    return np.tile(pressed.way if forced else one, (len(inward), 1))
+    if pressed.way is not None and pressed.way @ one > MIN_ONE_WAY_SHARE:
+        one = pressed.way
+    return np.tile(one, (len(inward), 1))
 
 
 @dataclass(frozen=True, eq=False)

@@ -69,7 +69,8 @@ def score(samples: Iterable[Sample], pressures: Weights, moments: Weights | None
             continue
         simulator.tools.add(one.tool, one.field)
         (touch,) = simulator.touch([Contact(one.tool, one.pose)])
-        if touch.pressure is None or not touch.force > 0:
+        pressure = touch.pressure
+        if pressure is None or not touch.force > 0:
             continue
         motion, trusted, slant = float("nan"), touch.trust.in_range, slant_of(one.sample)
         if layer.stacked and touch.pressed is not None:  # told which way it came, as by a wrench
@@ -79,7 +80,7 @@ def score(samples: Iterable[Sample], pressures: Weights, moments: Weights | None
             off = np.linalg.norm(answer.displacement - one.sample.displacement, axis=1)
             motion, trusted = float(off.max() / answer.magnitude.max()), answer.trust.in_range
         kind = one.sample.info["body"] if layer.stacked else one.sample.info["drawn"]["tool"]
-        ours, nodes, force = touch.pressure / layer.tissue.youngs_modulus, one.nodes, float(area @ true)
+        ours, nodes, force = pressure / layer.tissue.youngs_modulus, one.nodes, float(area @ true)
         rows.append((
             float(area @ ours) / force - 1,
             float(np.sqrt(area @ (ours - true) ** 2 / (area @ true**2))),
