@@ -58,8 +58,10 @@ def depth_in_column(grid, ray, t, guess):
                 break
             last_s, last_d = s, d
             s -= d / slope
-            if abs(s - last_s) < SECANT_TOLERANCE * t and s > 0:
-                return min(s, t)
+            if abs(s - last_s) < SECANT_TOLERANCE * t:
+                if s > 0:
+                    return min(s, t)
+                break
             d = distance_in_column(grid, ray, s)
     s, d = t, distance_in_column(grid, ray, t)
     if d <= 0:

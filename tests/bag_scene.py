@@ -91,7 +91,8 @@ def topology(layer: SoftLayer) -> Any:
     return message("topology", header=header("body", START), layer_id=layer_id(layer),
                    vertices=layer.vertices.astype(np.float32).ravel(), triangles=layer.faces.astype(np.uint32).ravel(),
                    thickness=layer.thickness.astype(np.float32), youngs_modulus=layer.tissue.youngs_modulus,
-                   poisson_ratio=layer.tissue.poisson_ratio, density=layer.tissue.density)  # fmt: skip
+                   poisson_ratio=layer.tissue.poisson_ratio, density=layer.tissue.density,
+                   core=np.zeros(0, np.float32), stack="")  # fmt: skip
 
 
 def displacement(answer: Answer, layer: SoftLayer, stamp: int, sequence: int) -> Any:

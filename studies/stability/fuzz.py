@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 from stmpl_core.errors import InvalidInput, StmplError
 from stmpl_core.provenance import commit, machine, versions
 from stmpl_core.simulator import Simulator
-from stmpl_core.tissue import Tissue
+from stmpl_core.tissue import Membrane, Ply, Tissue
 from stmpl_core.tool import Tool
 from stmpl_core.trust import Displacement
 from studies.stability import failures, shapes
@@ -31,6 +31,7 @@ from studies.stability.trial import Trial
 log = logging.getLogger(__name__)
 
 ON_ONE_SKIN = 500  # contacts that a skin is pressed by, before the next one is made
+STACKED = 0.25  # share of the skins that are a stack
 TOOLS = 6  # tools that press it
 DEEPER = 0.03  # of the thickness, by which a tool that presses by its pose alone goes on, where its force must not fall
 LONGEST_ERROR = 500  # letters of an error
@@ -175,6 +176,8 @@ def random_mesh(rng: np.random.Generator) -> Mesh:
                        uv=np.where(some[:, None, None], mesh.uv[:, ::-1], mesh.uv))  # fmt: skip
     by = np.array([1.0, 1.0, rng.uniform(1, 4) if kind == "long" else 1.0]) * random_size(rng)
     thickness = by[0] * mesh.thickness * (1 if rng.uniform() < 0.7 else rng.uniform(0.7, 1.3, len(mesh.thickness)))
+    if rng.uniform() < STACKED:
+        tissue = random_stack(rng, tissue, float(np.median(thickness)))
     return replace(mesh, vertices=mesh.vertices * by, thickness=thickness, tissue=tissue)
 
 
@@ -189,6 +192,20 @@ def random_tissue(rng: np.random.Generator) -> Tissue:
     nu = rng.choice([rng.uniform(0.3, 0.45), rng.uniform(0, 0.4999), 0.0, 0.4999], p=[0.6, 0.3, 0.05, 0.05])
     modulus = 10 ** rng.choice([rng.uniform(3, 5), rng.uniform(2, 14)])
     return Tissue(float(modulus), float(nu))
+
+
+def random_stack(rng: np.random.Generator, tissue: Tissue, thickness: float) -> Tissue:
+    """The tissue under a skin, over deeper materials, or both, from laxer and softer than people's to beyond."""
+    unit, more = tissue.youngs_modulus * thickness, {}
+    if rng.uniform() < 0.8:
+        stiffness = unit * 10 ** rng.uniform(-1.5, 2)
+        sheet = min(0.1 * thickness, 4e-3)
+        more["skin"] = Membrane(max(stiffness / sheet, 100.0), sheet, stiffness * 10 ** rng.uniform(-3, -0.5))
+    if rng.uniform() < 0.7:
+        starts = np.sort(rng.uniform(0.05, 0.95, int(rng.integers(1, 4)))) * thickness
+        more["deeper"] = tuple(Ply(float(z), float(max(tissue.youngs_modulus * 10 ** rng.uniform(-1, 1.5), 100.0)),
+                                   tissue.poisson_ratio) for z in starts)  # fmt: skip
+    return replace(tissue, **more)
 
 
 def random_tool(rng: np.random.Generator, mesh: Mesh, name: str) -> Tool:

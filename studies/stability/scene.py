@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
@@ -14,6 +15,7 @@ from stmpl_core.chart import UvChart
 from stmpl_core.layer import SoftLayer
 from stmpl_core.load import Load
 from stmpl_core.methods.base import Method
+from stmpl_core.packed import stack_from_text
 from stmpl_core.tissue import Tissue
 from stmpl_core.trust import Displacement
 
@@ -128,5 +130,5 @@ class Pressures:
 
 def restored_mesh(card: dict[str, Any], arrays: dict[str, np.ndarray]) -> Mesh:
     """The mesh of a scene's card and arrays."""
-    tissue = Tissue(**{key: card[key] for key in ("youngs_modulus", "poisson_ratio", "density")})
+    tissue = stack_from_text(json.dumps({name: card.get(name) or value for name, value in asdict(Tissue()).items()}))
     return Mesh(**{key: arrays[key] for key in ("vertices", "faces", "thickness", "uv")}, tissue=tissue)
