@@ -11,7 +11,6 @@ import numpy as np
 from stmpl_core.conform import Conformed, conform, kept_out
 from stmpl_core.contact import Contact
 from stmpl_core.errors import InvalidInput
-from stmpl_core.green import Green
 from stmpl_core.layer import SoftLayer
 from stmpl_core.load import Load
 from stmpl_core.methods.base import Method
@@ -51,8 +50,10 @@ class Simulator:
         else:
             self.skin = Skin.of(layer, method)
         self.layer, self.method = self.skin.layer, self.skin.method
+        self._green = self.skin.green
+        if self._green is not None:
+            self._green.keep(self.layer)  # a Skin from another process has a layer of its own
         self.toucher = Toucher(self.layer, self.skin.near, tools)
-        self._green = Green.of(self.layer) if self.layer.stacked else None
 
     @property
     def tools(self) -> Tools:

@@ -7,6 +7,7 @@ from functools import cached_property
 
 import numpy as np
 
+from stmpl_core.green import Green
 from stmpl_core.layer import SoftLayer, layer_id
 from stmpl_core.methods.base import Method
 from stmpl_core.moments import Surroundings
@@ -20,16 +21,19 @@ class Skin:
         layer: soft layer at rest.
         method: method, prepared for it.
         near: neighbours of its vertices, which method and contact share.
+        green: linear response of a stack, likewise; None: one material straight below the skin.
     """
 
     layer: SoftLayer
     method: Method
     near: Surroundings
+    green: Green | None = None
 
     @classmethod
     def of(cls, layer: SoftLayer, method: Method) -> Skin:
         """Prepares a layer (seconds). Raises InvalidInput or MeshError."""
-        return cls(layer, method.prepare(layer), Surroundings.of(layer))
+        ready = method.prepare(layer)
+        return cls(layer, ready, Surroundings.of(layer), Green.of(layer) if layer.stacked else None)
 
     def stiffened(self, method: Method, *, youngs_modulus: float, density: float) -> Skin:
         """The same skin of another stiffness [Pa] and density [kg/m3], in a tenth of a second.

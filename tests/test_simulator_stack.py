@@ -1,5 +1,7 @@
 """Laws of touches and answers on a limb of skin, fat and muscle, and what finite elements say of both."""
 
+import pickle
+
 import numpy as np
 import pytest
 
@@ -120,3 +122,12 @@ def test_one_number_does_not_fit_a_stack(simulator):
 def test_each_kind_of_layer_has_its_own_network():
     assert ContactNet(LIMB).network == "stack_contact_net"
     assert ContactNet(SoftLayer(LIMB.vertices, LIMB.faces, 5e-3)).network == "contact_net"
+
+
+def test_a_skin_from_another_process_is_ready_at_once(simulator):
+    skin = pickle.loads(pickle.dumps(simulator.skin))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("fem_tools.limb.coarse_response", None)  # would be called if anything were made again
+        again = Simulator(skin)
+    here, there = simulator.step([pressed(4e-3)]), again.step([pressed(4e-3)])
+    np.testing.assert_array_equal(there.displacement, here.displacement)
