@@ -11,7 +11,7 @@ from scipy.sparse.linalg import splu
 from fem_tools.mesh import ElementName, WedgeMesh, folding, reference_wedge, rest_gradients
 from fem_tools.plies import wedge_ends
 from fem_tools.system import System
-from stmpl_core.bones import unfolded
+from stmpl_core.bones import shortened, unfolded
 from stmpl_core.green import CoarseResponse, add_motion, tables
 from stmpl_core.layer import SoftLayer
 from stmpl_core.methods.coarse import nearest_corners
@@ -62,9 +62,7 @@ def _coarse(layer: SoftLayer, vertices: int) -> SoftLayer:
     for _ in range(PASSES):  # a stack's wedges may fold where the whole column does not
         if not len(bad):
             break
-        length = np.linalg.norm(columns[bad], axis=1, keepdims=True)
-        way = columns[bad] / length - TURNED * skin.normals[bad]
-        columns[bad] = SHORTER * length * way / np.linalg.norm(way, axis=1, keepdims=True)
+        columns[bad] = shortened(columns[bad], skin.normals[bad], SHORTER, TURNED)
         bad = _folding(skin, columns)
     whole = skin.with_(core=skin.vertices + columns)
     return whole if not len(bad) else _without(whole, np.isin(skin.faces, bad).all(axis=1))

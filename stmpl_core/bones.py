@@ -128,10 +128,15 @@ def unfolded(vertices: Points, normals: VertexVectors, columns: VertexVectors, f
             bad = np.unique(faces[(fold_ratios(vertices, vertices + columns, faces) < least) & ~np.asarray(spared)])
             if not len(bad):
                 break
-            length = np.linalg.norm(columns[bad], axis=1, keepdims=True)
-            way = columns[bad] / length - turned * normals[bad]
-            columns[bad] = SHORTER * length * way / np.linalg.norm(way, axis=1, keepdims=True)
+            columns[bad] = shortened(columns[bad], normals[bad], SHORTER, turned)
     return columns
+
+
+def shortened(columns: VertexVectors, normals: VertexVectors, factor: float, turned: float) -> VertexVectors:
+    """Columns (N, 3) [m], shortened by a factor and turned inwards by so much of outward normals (N, 3)."""
+    length = np.linalg.norm(columns, axis=1, keepdims=True)
+    way = columns / length - turned * normals
+    return factor * length * way / np.linalg.norm(way, axis=1, keepdims=True)
 
 
 def to_bone(layer: SoftLayer, bones: Sequence[Bone], thickness: float | None = None) -> SoftLayer:

@@ -147,7 +147,7 @@ class Green:
     def motion(self, nodes: Nodes, forces: np.ndarray) -> np.ndarray:
         """Motion of all vertices under forces over E at nodes (N, 3) [m2], (V, 3) [m]."""
         layer = self.layer
-        asked = self.near.asked(np.unique(nodes.corners))
+        asked = self.near.asked_again(np.unique(nodes.corners))
         by, group = np.zeros((len(asked.vertices), 3)), self.near.groups(nodes.corners[:, 0])
         for one in np.unique(group):
             of = group == one

@@ -104,6 +104,10 @@ class Surroundings:
         """Vertices that must be asked under sources at vertices `loaded` (L,), for all to be known."""
         return self._thinning.asked(loaded)
 
+    def asked_again(self, loaded: np.ndarray) -> Asked:
+        """Same as `asked`, but not looked for again if these were the last."""
+        return self._thinning.asked_again(loaded)
+
     def felt(self, sources: np.ndarray, asked: Asked | None = None) -> Felt:
         """Response and moments, at the vertices that are asked or at all, of source fields (V, S) over E [-]."""
         loaded = np.flatnonzero(sources.any(axis=1)) if asked is None else asked.loaded
@@ -145,7 +149,7 @@ class Surroundings:
 
     def spread(self, vertices: np.ndarray, sources: np.ndarray) -> np.ndarray:
         """Vectors (N, 3) at vertices (N,) spread as sinking spreads, (V, 3)."""
-        asked, out = self._thinning.asked_again(vertices), np.zeros((len(self.frames), 3))
+        asked, out = self.asked_again(vertices), np.zeros((len(self.frames), 3))
         by, group = np.zeros((len(asked.vertices), 3)), self.groups(vertices)
         for one in range(group.max(initial=0) + 1):
             of = np.flatnonzero(group == one)

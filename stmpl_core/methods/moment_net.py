@@ -133,7 +133,7 @@ class MomentNet:
 
     def _solve(self, layer: SoftLayer, near: Surroundings, load: Load, pressure: np.ndarray) -> Displacement:
         sources = source_fields(pressure, self._unit)
-        asked = near.asked(load.loaded)
+        asked = near.asked_again(load.loaded)
         felt = near.felt(sources, asked)
         vertices, figures = felt.vertices, felt.figures
         shape = self._shape[vertices]
