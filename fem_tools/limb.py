@@ -36,11 +36,11 @@ def coarse_response(layer: SoftLayer, vertices: int = VERTICES) -> CoarseRespons
     coarse = _coarse(layer, vertices)
     wide, thickness = _compliance(coarse), float(np.median(layer.thickness))
     table, every = tables(layer.tissue, thickness), np.arange(len(coarse.vertices))
-    inward, area = -coarse.normals, coarse.vertex_areas
+    inward, area, unit = -coarse.normals, coarse.vertex_areas, np.full(len(every), thickness)
     for v in every:  # less the flat stack's
         flat, one = np.zeros_like(coarse.vertices), slice(v, v + 1)
-        add_motion(flat, every, coarse.vertices, inward, coarse.vertices[one], inward[one], area[one],
-                   area[v] * inward[one], thickness, table)  # fmt: skip
+        add_motion(flat, every, coarse.vertices, inward, unit, coarse.vertices[one], inward[one], area[one], unit[one],
+                   area[v] * inward[one], table)  # fmt: skip
         wide[:, v] -= flat.ravel()
     corners, shares = nearest_corners(coarse, layer.vertices)
     gathered = np.bincount(corners.ravel(), (shares * layer.vertex_areas[:, None]).ravel(), len(coarse.vertices))

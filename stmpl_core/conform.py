@@ -90,7 +90,8 @@ def kept_out(layer: SoftLayer, displacement: VertexVectors, touches: Sequence[To
     """The answer with the skin that is inside a tool on its surface: where all else lies on the tool already."""
     out = displacement.copy()
     entered = _push_out(layer, touches, out)
-    return Conformed(out, float(np.linalg.norm(out - displacement, axis=1).max()), entered)
+    under = np.concatenate([touch.pressed.squeeze.vertices for touch in touches if touch.pressed is not None])
+    return Conformed(out, float(np.linalg.norm(out[under] - displacement[under], axis=1).max(initial=0.0)), entered)
 
 
 def _push_out(layer: SoftLayer, touches: Sequence[Touch], out: VertexVectors) -> float:

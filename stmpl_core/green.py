@@ -1,8 +1,9 @@
 """Green: what forces on a limb's skin do to it, in a linear response that knows stack, skin and the limb's own shape.
 
-Where tissue is no longer thin beside a limb's radius it flows and sways round the bone, which no flat layer knows; but
-that is smooth. So with G the response of a flat stack of one thickness, K the limb's linear stiffness on a coarse mesh
-of its skin, C the interpolation from there and R the way there (forces keep their sum),
+One material straight below the skin is a flat layer, as thick at each place as it is there. Where tissue is no longer
+thin beside a limb's radius it flows and sways round the bone, which no flat layer knows; but that is smooth. So with
+G the response of a flat stack of one thickness, K the limb's linear stiffness on a coarse mesh of its skin, C the
+interpolation from there and R the way there (forces keep their sum),
 
     u = G f + C (K^-1 - G_coarse) R f
 
@@ -11,7 +12,7 @@ the sharp part is the closed form's, the wide part the finite elements' (fem_too
 
 from __future__ import annotations
 
-from functools import cached_property
+from functools import cache, cached_property
 from importlib import import_module
 from typing import NamedTuple
 from weakref import WeakKeyDictionary
@@ -58,15 +59,16 @@ class CoarseResponse(NamedTuple):
     edge_length: float
 
 
+NO_COARSE = (np.empty((0, 3), np.int64), np.empty((0, 3)), np.empty(0), np.empty((0, 3, 0), np.float32))
 _KEPT: WeakKeyDictionary[SoftLayer, Green] = WeakKeyDictionary()  # entries die with their layers
 
 
 class Green:
-    """Linear response of a stacked layer to forces at contact nodes: prepared once, then microseconds a node.
+    """Linear response of a layer to forces at contact nodes: prepared once, then microseconds a node.
 
     Args:
         layer: soft layer at rest.
-        coarse: wide part of its response.
+        coarse: wide part of its response; None: that of flat layers, each place as thick as it is.
 
     Attributes:
         thickness: thickness of the flat stack, the median of the layer's [m].
@@ -74,27 +76,37 @@ class Green:
         near: neighbours of the layer's vertices, with the flat stack's response.
     """
 
-    def __init__(self, layer: SoftLayer, coarse: CoarseResponse) -> None:
+    def __init__(self, layer: SoftLayer, coarse: CoarseResponse | None) -> None:
         self.layer, self.coarse = layer, coarse
         self.thickness = float(np.median(layer.thickness))
         self.near = Surroundings.of(layer)
-        self.tables = tables(layer.tissue, self.thickness)
+        self.tables = tables(layer.tissue, self.thickness) if layer.stacked else _of_one(layer.tissue.poisson_ratio)
         self._last: tuple[np.ndarray, np.ndarray] | None = None
 
     @classmethod
     def of(cls, layer: SoftLayer) -> Green:
-        """The response of a layer, made on the first call (seconds) and kept as long as the layer is.
+        """The response of a layer, made on the first call (seconds on a stack) and kept as long as the layer is.
 
         Raises:
             InvalidInput, MeshError: the skin cannot be meshed coarsely.
         """
         if layer not in _KEPT:
-            _KEPT[layer] = cls(layer, import_module("fem_tools.limb").coarse_response(layer))
+            coarse = import_module("fem_tools.limb").coarse_response(layer) if layer.stacked else None
+            _KEPT[layer] = cls(layer, coarse)
         return _KEPT[layer]
 
     def keep(self, layer: SoftLayer) -> None:
         """Lets `of` give this one for another layer, of the same shape and the same ratios of moduli."""
         _KEPT[layer] = self
+
+    @property
+    def _coarse(self) -> tuple[np.ndarray, ...]:
+        """What kernels take of the coarse part; all empty if there is none."""
+        return self.coarse[:4] if self.coarse is not None else NO_COARSE
+
+    def unit_at(self, nodes: Nodes) -> np.ndarray:
+        """Thickness of the flat layer at nodes, (N,) [m]."""
+        return np.full(len(nodes.area), self.thickness) if self.layer.stacked else nodes.thickness
 
     @cached_property
     def effective(self) -> Effective:
@@ -126,8 +138,8 @@ class Green:
             group: numbers of groups of nodes that do not feel each other, (N,).
         """
         if self._last is None or not np.array_equal(self._last[0], nodes.points):  # a touch, then its answer
-            made = _matrix(nodes.points, nodes.inward, nodes.area, nodes.corners, nodes.shares, group, self.thickness,
-                           self.tables[0], *self.coarse[:4])  # fmt: skip
+            made = _matrix(nodes.points, nodes.inward, nodes.area, nodes.corners, nodes.shares, group,
+                           self.unit_at(nodes), self.tables[0], *self._coarse)  # fmt: skip
             self._last = nodes.points, made
         return self._last[1]
 
@@ -139,8 +151,8 @@ class Green:
             group: numbers of groups of nodes that do not feel each other, (N,).
             gone: their motion, (N, 3) [m].
         """
-        blocks = _blocks(nodes.points, nodes.inward, nodes.area, nodes.corners, nodes.shares, group, self.thickness,
-                         self.tables, *self.coarse[:4])  # fmt: skip
+        blocks = _blocks(nodes.points, nodes.inward, nodes.area, nodes.corners, nodes.shares, group,
+                         self.unit_at(nodes), self.tables, *self._coarse)  # fmt: skip
         np.fill_diagonal(blocks, np.diag(blocks) + RIDGE * np.abs(blocks).max())
         return np.linalg.solve(blocks, gone.ravel()).reshape(-1, 3)
 
@@ -152,10 +164,13 @@ class Green:
         for one in np.unique(group):
             of = group == one
             there = self.near.reached_among(np.unique(nodes.corners[of]), asked.vertices, alone=not group.any())
-            add_motion(by, there, layer.vertices[asked.vertices], -layer.normals[asked.vertices], nodes.points[of],
-                       nodes.inward[of], nodes.area[of], forces[of], self.thickness, self.tables)  # fmt: skip
+            add_motion(by, there, layer.vertices[asked.vertices], -layer.normals[asked.vertices],
+                       self.near.thickness[asked.vertices], nodes.points[of], nodes.inward[of], nodes.area[of],
+                       self.unit_at(nodes)[of], forces[of], self.tables)  # fmt: skip
         out = np.zeros_like(layer.vertices)
         asked.fill(by, out)
+        if self.coarse is None:
+            return out
         source = _handed(nodes.inward, nodes.corners, nodes.shares, forces, *self.coarse[:3])
         loaded = np.flatnonzero(source)
         if len(loaded):
@@ -173,6 +188,12 @@ class Green:
         corners = np.tile(loaded[:, None], 3)
         nodes = Nodes(layer.vertices[loaded], inward, layer.thickness[loaded], area, area, corners, one)
         return self.motion(nodes, (source[loaded] * area)[:, None] * inward)
+
+
+@cache
+def _of_one(poisson_ratio: float) -> np.ndarray:
+    """Tables of one material, whose thickness does not matter."""
+    return tables(Tissue(poisson_ratio=poisson_ratio), 1.0)
 
 
 def tables(tissue: Tissue, thickness: float) -> np.ndarray:
@@ -248,7 +269,7 @@ def _at(table, k, f, g, h):
 @numba.njit(cache=True)
 def _corners_of(corners, shares, skin_corners, skin_shares):
     """The coarse vertices around nodes and their weights, (N, 9) each; and those that are met, in order."""
-    count = len(corners)
+    count = len(corners) if len(skin_corners) else 0
     index, weight = np.empty((count, 9), np.int64), np.empty((count, 9))
     for n in range(count):
         for a in range(3):
@@ -261,6 +282,8 @@ def _corners_of(corners, shares, skin_corners, skin_shares):
 @numba.njit(cache=True, error_model="numpy")
 def _wide(index, weight, some, gathered, motion, out):
     """Adds the coarse motion of each node under a force E inwards at each, (N, 3, N) [1/m]."""
+    if not len(gathered):
+        return
     count, row, place = len(index), np.empty((3, len(some))), np.empty(index.shape, np.int64)
     for n in range(count):
         for a in range(9):
@@ -279,7 +302,7 @@ def _wide(index, weight, some, gathered, motion, out):
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _matrix(points, inward, area, corners, shares, group, thickness, table, skin_corners, skin_shares, gathered,
+def _matrix(points, inward, area, corners, shares, group, unit, table, skin_corners, skin_shares, gathered,
             motion):  # fmt: skip
     """See Green.matrix."""
     count = len(points)
@@ -295,11 +318,12 @@ def _matrix(points, inward, area, corners, shares, group, thickness, table, skin
                 both += 0.5 * (wide[i, x, j] * inward[i, x] + wide[j, x, i] * inward[j, x])
                 square += (points[i, x] - points[j, x]) ** 2
                 facing += inward[i, x] * inward[j, x]
-            r = np.sqrt(square) / thickness
+            t = np.sqrt(unit[i] * unit[j])
+            r = np.sqrt(square) / t
             if facing > 0 and r < REACH:
-                s = SPREAD * np.sqrt(0.5 * (area[i] + area[j])) / thickness
+                s = SPREAD * np.sqrt(0.5 * (area[i] + area[j])) / t
                 k, f, g, h = _place(r, s)
-                both += _share(facing) * _at(table, k, f, g, h) / (np.sqrt(r * r + (ROUND * s) ** 2) * thickness)
+                both += _share(facing) * _at(table, k, f, g, h) / (np.sqrt(r * r + (ROUND * s) ** 2) * t)
             out[i, j] = out[j, i] = both
     return out
 
@@ -328,7 +352,7 @@ def _of_force(points, inward, i, sources, source_inward, j, size, g0, g1, even, 
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _blocks(points, inward, area, corners, shares, group, thickness, tables, skin_corners, skin_shares, gathered,
+def _blocks(points, inward, area, corners, shares, group, unit, tables, skin_corners, skin_shares, gathered,
             motion):  # fmt: skip
     """Motion of each node under a force E at each, (3 N, 3 N) [1/m]; the coarse part only under what goes inwards."""
     count = len(points)
@@ -338,46 +362,52 @@ def _blocks(points, inward, area, corners, shares, group, thickness, tables, ski
     force, moved = np.zeros(3), np.empty(3)
     for i in range(count):
         for j in range(count):
+            for x in range(3):
+                for y in range(3):
+                    out[i, x, j, y] = wide[i, x, j] * inward[j, y] if group[i] == group[j] else 0.0
+    for i in range(count):
+        for j in range(i + 1):
             if group[i] != group[j]:
                 continue
             square = facing = 0.0
             for x in range(3):
                 square += (points[i, x] - points[j, x]) ** 2
                 facing += inward[i, x] * inward[j, x]
-                for y in range(3):
-                    out[i, x, j, y] = wide[i, x, j] * inward[j, y]
-            r = np.sqrt(square) / thickness
+            t = np.sqrt(unit[i] * unit[j])
+            r = np.sqrt(square) / t
             if facing <= 0 or r >= REACH:
                 continue
-            s = SPREAD * np.sqrt(0.5 * (area[i] + area[j])) / thickness
+            s = SPREAD * np.sqrt(0.5 * (area[i] + area[j])) / t
             k, f, g, h = _place(r, s)
-            per = _share(facing) / (np.sqrt(r * r + (ROUND * s) ** 2) * thickness)
+            per = _share(facing) / (np.sqrt(r * r + (ROUND * s) ** 2) * t)
             g0, g1, even, along = (per * _at(tables[0], k, f, g, h), per * _at(tables[1], k, f, g, h),
                                    per * _at(tables[2], k, f, g, h), per * _at(tables[3], k, f, g, h))  # fmt: skip
             for y in range(3):
                 force[:] = 0.0
                 force[y], moved[:] = 1.0, 0.0
-                _of_force(points, inward, i, points, inward, j, thickness, g0, g1, even, along, force, moved)
+                _of_force(points, inward, i, points, inward, j, t, g0, g1, even, along, force, moved)
                 for x in range(3):
                     out[i, x, j, y] += moved[x]
+                    if i != j:
+                        out[j, y, i, x] += moved[x]
     return out.reshape(3 * count, 3 * count)
 
 
 @numba.njit(cache=True, fastmath=FAST, error_model="numpy")
-def add_motion(out, there, points, inward, sources, source_inward, area, forces, thickness, tables):
+def add_motion(out, there, points, inward, unit, sources, source_inward, area, source_unit, forces, tables):
     """Adds to rows `there` of out (M, 3) [m] the flat motion of points under forces over E at sources (N, 3) [m2].
 
     Args:
         out: motion of the points, (M, 3) [m].
         there: numbers of the points that feel the sources.
-        points, inward: points and unit vectors into the skin, (M, 3).
+        points, inward, unit: points, unit vectors into the skin, (M, 3), and thickness of the flat layer there, (M,).
         sources, source_inward: the same of the sources, (N, 3).
         area: area that each source stands for, (N,) [m2].
+        source_unit: thickness of the flat layer there, (N,) [m].
         forces: forces over E, (N, 3) [m2].
-        thickness: thickness of the flat stack [m].
         tables: see `tables`.
     """
-    spread = SPREAD * np.sqrt(area) / thickness
+    spread = SPREAD * np.sqrt(area) / source_unit
     rows, row_of = np.empty((len(sources), 4, tables.shape[2])), np.empty(len(sources), np.int64)
     kinds = 0
     for j in range(len(sources)):  # nodes of one tool are about as wide: few tables serve all
@@ -402,17 +432,18 @@ def add_motion(out, there, points, inward, sources, source_inward, area, forces,
             for x in range(3):
                 square += (points[i, x] - sources[j, x]) ** 2
                 facing += inward[i, x] * source_inward[j, x]
-            r = np.sqrt(square) / thickness
+            t = np.sqrt(unit[i] * source_unit[j])
+            r = np.sqrt(square) / t
             if facing <= 0 or r >= 0.98 * REACH:
                 continue
             f = np.sqrt(r) * ROWS
             k, row = int(f), rows[row_of[j]]
             f -= k
-            per = _share(facing) / (np.sqrt(r * r + (ROUND * spread[j]) ** 2) * thickness)
+            per = _share(facing) / (np.sqrt(r * r + (ROUND * spread[j]) ** 2) * t)
             g0, g1 = per * ((1 - f) * row[0, k] + f * row[0, k + 1]), per * ((1 - f) * row[1, k] + f * row[1, k + 1])
             even, along = (per * ((1 - f) * row[2, k] + f * row[2, k + 1]),
                            per * ((1 - f) * row[3, k] + f * row[3, k + 1]))  # fmt: skip
-            _of_force(points, inward, i, sources, source_inward, j, thickness, g0, g1, even, along, forces[j], out[i])
+            _of_force(points, inward, i, sources, source_inward, j, t, g0, g1, even, along, forces[j], out[i])
 
 
 @numba.njit(cache=True)

@@ -111,11 +111,11 @@ class Simulator:
         trust = _joined(solved.trust, touches, fitted)
         if fitted.entered > MAX_ENTERED_SHARE * float(self.skin.near.thickness.min()):
             trust = trust.also(f"skin is {fitted.entered * 1e3:.2f} mm inside a tool", in_range=False)
-        displacement, cut = _within(fitted.displacement, self.layer.thickness)
+        displacement, peak, cut = _within(fitted.displacement, self.layer.thickness)
         if cut:
             trust = trust.also(f"{cut} vertices would move further than there is skin: held back", in_range=False)
         if trust.in_range:
-            trust = replace(trust, error_bound=self._bound(touches, float(np.linalg.norm(displacement, axis=1).max())))
+            trust = replace(trust, error_bound=self._bound(touches, peak))
         return Answer(displacement, trust, solved.method, pressure, {touch.name: touch for touch in touches})
 
     def _bound(self, touches: Sequence[Touch], peak: float) -> float | None:
@@ -139,17 +139,18 @@ class Simulator:
         return self.answer(self.touch(contacts))
 
 
-def _within(displacement: np.ndarray, thickness: np.ndarray) -> tuple[np.ndarray, int]:
-    """The displacement, no longer than the layer is thick anywhere, and how many vertices were held back."""
-    length = np.linalg.norm(displacement, axis=1)
+def _within(displacement: np.ndarray, thickness: np.ndarray) -> tuple[np.ndarray, float, int]:
+    """The displacement, no longer than the layer is thick anywhere, its peak [m], how many were held back."""
+    length = np.sqrt(np.einsum("ni,ni->n", displacement, displacement))
     long = np.flatnonzero(length > MOST_MOVED * thickness)
     if not len(long):
-        return displacement, 0
+        return displacement, float(length.max()), 0
     over = (length[long] / thickness[long] - MOST_MOVED) / (1 - MOST_MOVED)
     held = thickness[long] * (MOST_MOVED + (1 - MOST_MOVED) * np.tanh(over))  # smooth, and never further
     out = displacement.copy()
     out[long] *= (held / length[long])[:, None]
-    return out, len(long)
+    length[long] = held
+    return out, float(length.max()), len(long)
 
 
 def _joined(trust: Trust, touches: Sequence[Touch], fitted: Conformed) -> Trust:

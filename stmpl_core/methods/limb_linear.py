@@ -63,7 +63,7 @@ def _trust(layer: SoftLayer, green: Green, displacement: np.ndarray, pressure: n
     if peak > MAX_SINK * green.thickness:
         trust = trust.also(f"the skin moves by {peak / green.thickness:.0%} of the tissue's thickness, the linear "
                            f"response holds to {MAX_SINK:.0%}", in_range=False)  # fmt: skip
-    loaded, edge = np.flatnonzero(pressure), green.coarse.edge_length
+    loaded, edge = np.flatnonzero(pressure), green.coarse.edge_length if green.coarse is not None else 0.0
     force = np.abs(pressure[loaded]) * layer.vertex_areas[loaded]
     thin = float(force @ (layer.thickness[loaded] < THIN * edge)) / max(float(force.sum()), 1e-300)
     if thin > THIN_SHARE:

@@ -253,7 +253,7 @@ def of_stack(green: Green, vertices: np.ndarray, motion: np.ndarray) -> np.ndarr
     out = np.empty((len(vertices), 6), np.float32)
     out[:, 0] = np.log(green.layer.thickness[vertices] / green.thickness)
     out[:, 1:5] = green.numbers
-    out[:, 5] = np.log(np.linalg.norm(motion, axis=1).max() / green.thickness + 1e-6)
+    out[:, 5] = np.log(np.linalg.norm(motion[vertices], axis=1).max(initial=0.0) / green.thickness + 1e-6)
     return out
 
 
