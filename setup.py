@@ -22,6 +22,7 @@ REQUIRED = [  # what `stmpl demo` uses: node, devices, recorder, replay, finite 
     "safetensors>=0.4",
     "scikit-fem>=11",
     "scipy>=1.13",
+    "threadpoolctl>=3.5",
     "trimesh>=4.4",
     "tyro>=0.9",
 ]
@@ -34,7 +35,7 @@ ROS_WHEELS = [  # versions that resolve together: ROS 2 Jazzy as wheels for CPyt
 DRAWN = ["mapbox-earcut>=1.0", "shapely>=2.0"]  # tools that are extruded from an outline, such as letters
 BODIES = ["anny>=0.6", "roma>=1.5", "torch>=2.4"]
 LEARN = [*BODIES, *DRAWN, "zarr>=3.0"]
-STUDIES = [*LEARN, "threadpoolctl>=3.5"]
+STUDIES = LEARN
 VIEW = [*DRAWN, "viser>=1.1"]
 CLUSTER = ["distributed>=2024.8"]
 TEST_TOOLS = [

@@ -6,10 +6,10 @@ from typing import Any
 
 import numpy as np
 import scipy.sparse as sp
-from scipy.sparse.linalg import splu
 
 from fem_tools.mesh import ElementName, WedgeMesh, folding, reference_wedge, rest_gradients
 from fem_tools.plies import wedge_ends
+from fem_tools.slabs import Slabs, slabs_of
 from fem_tools.system import System
 from stmpl_core.bones import shortened, unfolded
 from stmpl_core.green import CoarseResponse, add_motion, tables
@@ -93,20 +93,17 @@ def _compliance(layer: SoftLayer) -> np.ndarray:
     blocks: Any = system.tangent(system.zeros(), 1.0)
     count, width = len(layer.vertices), blocks.shape[1]
     free = np.repeat(~system.fixed, width)
-    stiffness = sp.bsr_matrix((blocks, mesh.indices, mesh.indptr), shape=(count * width,) * 2).tocsc()[free][:, free]
+    stiffness = sp.bsr_matrix((blocks, mesh.indices, mesh.indptr), shape=(count * width,) * 2).tocsr()[free][:, free]
     forces = -np.einsum("ij,fx->fxij", HAT, layer.face_area_vectors)  # on corner i by a pressure at corner j
     rows = faces[:, None, :, None] * width + np.arange(3)[None, :, None, None]
     columns = np.broadcast_to(faces[:, None, None, :], forces.shape)
     loads = sp.csc_matrix((forces.ravel(), (np.broadcast_to(rows, forces.shape).ravel(), columns.ravel())),
                           shape=(count * width, count))[free]  # fmt: skip
-    factors = splu(sp.csc_matrix(stiffness), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0,
-                   options={"SymmetricMode": True})  # fmt: skip
-    at_skin = np.flatnonzero(np.arange(count * width) % width < 3)
-    place = np.full(count * width, -1)
-    place[free] = np.arange(free.sum())
-    kept = place[at_skin] >= 0
-    out = np.zeros((3 * count, count), np.float32)
-    for first in range(0, count, 64):
-        some = slice(first, min(first + 64, count))
-        out[kept, some] = factors.solve(loads[:, some].toarray())[place[at_skin][kept]] * layer.tissue.youngs_modulus
-    return out
+    column = np.flatnonzero(~system.fixed)  # of each free column, its number
+    touch = sp.csr_matrix((np.ones(len(mesh.indices)), mesh.indices, mesh.indptr), shape=(count, count))
+    slabs = [(width * one[:, None] + np.arange(width)).ravel() for one in slabs_of(touch[column][:, column])]
+    at_skin = (width * np.arange(len(column))[:, None] + np.arange(3)).ravel()
+    moved = Slabs.of(stiffness, slabs).solve(loads, at_skin)
+    out = np.zeros((count, 3, count), np.float32)
+    out[column] = moved.reshape(-1, 3, count) * layer.tissue.youngs_modulus
+    return out.reshape(3 * count, count)

@@ -12,7 +12,7 @@ the sharp part is the closed form's, the wide part the finite elements' (fem_too
 
 from __future__ import annotations
 
-from functools import cache, cached_property
+from functools import cache, cached_property, lru_cache
 from importlib import import_module
 from typing import NamedTuple
 from weakref import WeakKeyDictionary
@@ -35,7 +35,7 @@ ROUND = float(np.sqrt(2 / np.pi))  # of a Gaussian that is as wide, 1 / r in its
 FAR = 16.0  # distance over the spread, from which a force may be spread wider without a difference (0.2 %)
 AROUND = 0.5  # cosine between normals below which the flat response fades: what is round the limb is the coarse part's
 COLUMNS, STRAINS = 12, 64  # thicknesses and strains of the table of confined columns
-POINTS = 4  # of Gauss's rule on each panel of wave numbers
+GAUSS = np.polynomial.legendre.leggauss(4)  # points and weights on each panel of wave numbers
 RIDGE = 1e-6  # of the matrix that sticks, over its largest number: two nodes in one place are no error
 LEAST_KAPPA, LEAST_PULL = 0.05, 0.02  # kappa and pull that are none, in logarithms
 ONE_WAY = 0.3  # least cosine between a tool's way and the skin's inward normal at a node
@@ -196,6 +196,7 @@ def _of_one(poisson_ratio: float) -> np.ndarray:
     return tables(Tissue(poisson_ratio=poisson_ratio), 1.0)
 
 
+@lru_cache(maxsize=4)  # coarse elements and their layer ask for the same
 def tables(tissue: Tissue, thickness: float) -> np.ndarray:
     """Responses of a flat stack with E = t = 1 to a force spread as a Gaussian, (4, spread, root of the distance).
 
@@ -226,7 +227,7 @@ def tables(tissue: Tissue, thickness: float) -> np.ndarray:
 def _transforms(curves: tuple, logs: np.ndarray, radius: float, spread: float) -> np.ndarray:
     """The four transforms at one radius and spread, on panels as fine as the waves there."""
     edges = _panels(radius, 6 / spread)
-    x, w = np.polynomial.legendre.leggauss(POINTS)
+    x, w = GAUSS
     middle, half = 0.5 * (edges[1:] + edges[:-1]), 0.5 * np.diff(edges)
     k, weight = (middle[:, None] + half[:, None] * x).ravel(), (half[:, None] * w).ravel()
     weight = weight * np.exp(-0.5 * (k * spread) ** 2) * k / (2 * np.pi)

@@ -17,6 +17,7 @@ from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackRet
 from rclpy.logging import get_logger
 from std_srvs.srv import Trigger
 from stmpl_msgs.srv import SetBody
+from threadpoolctl import threadpool_limits
 
 from stmpl_core.errors import InvalidInput, StmplError
 from stmpl_core.sdf import SignedDistance
@@ -338,6 +339,7 @@ def _served(response: Any, do: Callable[[], str]) -> Any:
 
 def run(config: NodeConfig, arguments: list[str] | None = None, build: Build = layer_of) -> int:
     """Runs the node until SIGINT or SIGTERM; the exit code says whether it could be configured."""
+    threadpool_limits(1, user_api="blas")  # where a core is busy, OpenBLAS' second thread stalls answers for 0.1 s
     with ros(arguments) as stop:
         try:
             node = SkinNode(config, build)

@@ -105,9 +105,11 @@ _toucher: Toucher
 
 def _know(layer: SoftLayer) -> None:
     import numba
+    from threadpoolctl import threadpool_limits
 
     global _toucher
     numba.set_num_threads(1)  # what answers goes first
+    threadpool_limits(1, user_api="blas")
     _toucher = Toucher(layer)
 
 

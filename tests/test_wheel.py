@@ -44,7 +44,7 @@ def test_base_and_dev_bring_nothing_that_must_be_asked_for_by_name_and_base_no_t
     base = {line.split(">=")[0].split("==")[0].split("[")[0] for line in requirements if "extra ==" not in line}
     dev = {line.split(">=")[0].split("==")[0] for line in requirements if 'extra == "dev"' in line}
     assert dev and not (base | dev) & ASKED_FOR_BY_NAME
-    assert not base & {"torch", "anny", "roma", "zarr", "viser", "distributed", "shapely", "threadpoolctl"}
+    assert not base & {"torch", "anny", "roma", "zarr", "viser", "distributed", "shapely"}
 
 
 def test_settings_limbs_weights_and_layouts_are_inside(wheel: zipfile.ZipFile) -> None:
