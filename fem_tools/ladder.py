@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
 from pathlib import Path
 
 from fem_tools.few_steps import FewSteps
 from fem_tools.patch import PatchFem
+from stmpl_core.cache import folder
 from stmpl_core.methods.base import Method
 from stmpl_core.methods.coarse import Coarse
 from stmpl_core.methods.ladder import SHIPPED, Ladder, Measured
@@ -35,7 +35,7 @@ def ladder(*, accuracy: float = 1e-4, deadline: float | None = None, rungs: Sequ
 
 def times_file() -> Path:
     """File in which `stmpl calibrate` keeps this machine's times."""
-    return Path(os.environ.get("STMPL_CACHE_DIR", Path.home() / ".cache" / "stmpl")) / "ladder_times.json"
+    return folder() / "ladder_times.json"
 
 
 def measured() -> Measured:

@@ -6,13 +6,15 @@ from typing import Any
 
 import numpy as np
 import scipy.sparse as sp
+from threadpoolctl import threadpool_limits
 
 from fem_tools.mesh import ElementName, WedgeMesh, folding, reference_wedge, rest_gradients
 from fem_tools.plies import wedge_ends
 from fem_tools.slabs import Slabs, slabs_of
 from fem_tools.system import System
 from stmpl_core.bones import shortened, unfolded
-from stmpl_core.green import CoarseResponse, add_motion, tables
+from stmpl_core.coarse_response import CoarseResponse
+from stmpl_core.green import add_motion, tables
 from stmpl_core.layer import SoftLayer
 from stmpl_core.methods.coarse import nearest_corners
 
@@ -103,7 +105,8 @@ def _compliance(layer: SoftLayer) -> np.ndarray:
     touch = sp.csr_matrix((np.ones(len(mesh.indices)), mesh.indices, mesh.indptr), shape=(count, count))
     slabs = [(width * one[:, None] + np.arange(width)).ravel() for one in slabs_of(touch[column][:, column])]
     at_skin = (width * np.arange(len(column))[:, None] + np.arange(3)).ravel()
-    moved = Slabs.of(stiffness, slabs).solve(loads, at_skin)
+    with threadpool_limits(1, user_api="blas"):  # where a core is busy, OpenBLAS' two take 0.2 s for one's 5 ms
+        moved = Slabs.of(stiffness, slabs).solve(loads, at_skin)
     out = np.zeros((count, 3, count), np.float32)
     out[column] = moved.reshape(-1, 3, count) * layer.tissue.youngs_modulus
     return out.reshape(3 * count, count)

@@ -7,12 +7,8 @@ from typing import NamedTuple
 import numpy as np
 import scipy.sparse as sp
 from scipy.sparse.csgraph import connected_components, dijkstra
-from threadpoolctl import threadpool_limits
 
 TOGETHER = 128  # loads that are solved for together
-
-# OpenBLAS' threads wait actively: where another process holds a core, two take 0.2 s for what one does in 5 ms.
-one_thread = threadpool_limits.wrap(1, user_api="blas")
 
 
 class Slabs(NamedTuple):
@@ -36,7 +32,6 @@ class Slabs(NamedTuple):
     passed: list[np.ndarray]
 
     @classmethod
-    @one_thread
     def of(cls, stiffness: sp.csr_matrix, slabs: list[np.ndarray]) -> Slabs:
         """Eliminates. Raises LinAlgError: a stiffness that is singular."""
         inverses, passed = [], []
@@ -50,24 +45,23 @@ class Slabs(NamedTuple):
                 lost = -to_next.T @ passed[-1]
         return cls(slabs, inverses, passed)
 
-    @one_thread
     def solve(self, loads: sp.csc_matrix, kept: np.ndarray) -> np.ndarray:
         """Motion of the unknowns `kept` (K,) under each column of loads (N, L), (K, L)."""
-        out = np.empty((len(kept), loads.shape[1]))
-        slab, place = np.empty(loads.shape[0], int), np.full(loads.shape[0], -1)
+        size, many = sum(map(len, self.unknowns)), len(loads.indptr) - 1
+        out, slab, place = np.empty((len(kept), many)), np.empty(size, int), np.full(size, -1)
         for k, here in enumerate(self.unknowns):
             slab[here] = k
         place[kept] = np.arange(len(kept))
-        first = np.full(loads.shape[1], len(self.unknowns) - 1)  # slab at which each load begins: none before is pushed
-        np.minimum.at(first, np.repeat(np.arange(loads.shape[1]), np.diff(loads.indptr)), slab[loads.indices])
-        for some in np.array_split(np.argsort(first, kind="stable"), -(-loads.shape[1] // TOGETHER)):
-            out[:, some] = self._solve(loads[:, some].tocsr(), int(first[some[0]]), place, len(kept))
+        first = np.full(many, len(self.unknowns) - 1)  # slab at which each load begins: none before is pushed
+        np.minimum.at(first, np.repeat(np.arange(many), np.diff(loads.indptr)), slab[loads.indices])
+        for some in np.array_split(np.argsort(first, kind="stable"), -(-many // TOGETHER)):
+            out[:, some] = self._solve(loads[:, some].toarray(), int(first[some[0]]), place, len(kept))
         return out
 
-    def _solve(self, loads: sp.csr_matrix, begin: int, place: np.ndarray, count: int) -> np.ndarray:
-        """The same for loads that begin at slab `begin` or after it, with the places in the answer, -1: not kept."""
+    def _solve(self, loads: np.ndarray, begin: int, place: np.ndarray, count: int) -> np.ndarray:
+        """The same for loads that begin at slab `begin` or after it, with their places in the answer, -1: not kept."""
         out = np.empty((count, loads.shape[1]))
-        carried = [loads[here].toarray() for here in self.unknowns[begin:]]
+        carried = [loads[here] for here in self.unknowns[begin:]]
         for k, way in enumerate(self.passed[begin:]):
             carried[k + 1] += way.T @ carried[k]
         motion = np.zeros((0, loads.shape[1]))

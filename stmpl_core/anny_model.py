@@ -6,7 +6,6 @@ import fcntl
 import gzip
 import hashlib
 import json
-import os
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
 from functools import cache
@@ -17,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from stmpl_core.arrays import Faces, Points
+from stmpl_core.cache import folder, read, write
 from stmpl_core.extras import needed
 
 ANNY_TO_BODY = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])  # rotation; Anny looks along -y with its left towards +x
@@ -38,18 +38,14 @@ def posed(turns: Mapping[str, np.ndarray], phenotype: Mapping[str, float]) -> Sk
     needed("a body other than the average at rest", "bodies", "anny", "roma", "torch")
     arguments = {"pose": {bone: turn.tolist() for bone, turn in turns.items()}, "phenotype": dict(phenotype)}
     text = json.dumps([CACHE_VERSION, version("anny"), arguments], sort_keys=True)
-    folder = Path(os.environ.get("STMPL_CACHE_DIR") or
-                  Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "stmpl")
-    path = folder / f"anny-{hashlib.sha256(text.encode()).hexdigest()[:16]}.npz"
-    with suppress(OSError, ValueError, KeyError, EOFError), np.load(path) as kept:
+    name = f"anny-{hashlib.sha256(text.encode()).hexdigest()[:16]}"
+    kept = read(name)
+    if kept is not None:
         return kept["vertices"], kept["faces"], kept["uv"], kept["weights"], tuple(kept["bones"].tolist())
-    with _one_builder(folder):
+    with _one_builder(folder()):
         vertices, faces, uv, weights, bones = build(turns, phenotype)
-    with suppress(OSError):
-        folder.mkdir(parents=True, exist_ok=True)
-        beside = path.with_suffix(f".{os.getpid()}.npz")
-        np.savez_compressed(beside, vertices=vertices, faces=faces, uv=uv, weights=weights, bones=np.array(bones))
-        beside.replace(path)
+    write(name, {"vertices": vertices, "faces": faces, "uv": uv, "weights": weights, "bones": np.array(bones)},
+          packed=True)  # fmt: skip
     return vertices, faces, uv, weights, bones
 
 

@@ -13,14 +13,13 @@ the sharp part is the closed form's, the wide part the finite elements' (fem_too
 from __future__ import annotations
 
 from functools import cache, cached_property, lru_cache
-from importlib import import_module
-from typing import NamedTuple
 from weakref import WeakKeyDictionary
 
 import numba
 import numpy as np
 from scipy.special import j0, j1
 
+from stmpl_core.coarse_response import CoarseResponse
 from stmpl_core.layer import SoftLayer
 from stmpl_core.moments import Surroundings
 from stmpl_core.nodes import Nodes
@@ -39,24 +38,6 @@ GAUSS = np.polynomial.legendre.leggauss(4)  # points and weights on each panel o
 RIDGE = 1e-6  # of the matrix that sticks, over its largest number: two nodes in one place are no error
 LEAST_KAPPA, LEAST_PULL = 0.05, 0.02  # kappa and pull that are none, in logarithms
 ONE_WAY = 0.3  # least cosine between a tool's way and the skin's inward normal at a node
-
-
-class CoarseResponse(NamedTuple):
-    """The wide part of a limb's response, on a coarse mesh of its skin.
-
-    Args:
-        corners: numbers of the coarse vertices around each vertex of the skin, (V, 3).
-        shares: barycentric coordinates among them, (V, 3) [-].
-        gathered: area that each coarse vertex stands for, (C,) [m2].
-        motion: motion of coarse vertices under a pressure E at one, less that of the flat stack, (C, 3, C) float32 [m].
-        edge_length: of the coarse mesh [m].
-    """
-
-    corners: np.ndarray
-    shares: np.ndarray
-    gathered: np.ndarray
-    motion: np.ndarray
-    edge_length: float
 
 
 NO_COARSE = (np.empty((0, 3), np.int64), np.empty((0, 3)), np.empty(0), np.empty((0, 3, 0), np.float32))
@@ -85,14 +66,13 @@ class Green:
 
     @classmethod
     def of(cls, layer: SoftLayer) -> Green:
-        """The response of a layer, made on the first call (seconds on a stack) and kept as long as the layer is.
+        """The response of a layer, made or read on the first call (seconds on a stack) and kept as long as the layer is.
 
         Raises:
             InvalidInput, MeshError: the skin cannot be meshed coarsely.
         """
         if layer not in _KEPT:
-            coarse = import_module("fem_tools.limb").coarse_response(layer) if layer.stacked else None
-            _KEPT[layer] = cls(layer, coarse)
+            _KEPT[layer] = cls(layer, CoarseResponse.of(layer) if layer.stacked else None)
         return _KEPT[layer]
 
     def keep(self, layer: SoftLayer) -> None:
