@@ -239,7 +239,8 @@ def main() -> None:
     given.add_argument("--change-body", action="store_true", help="time ~/set_body as well")
     given.add_argument("--picture", type=Path, default=Path("docs/pictures/soak.png"), help="of the soak")
     given.add_argument("--out", type=Path, default=None, help="JSON file for the figures")
-    given.add_argument("--node", nargs="*", default=[], help="flags of stmpl node, as in edge-length=0.004")
+    given.add_argument("--node", nargs="*", default=["tissue=paper"],
+                       help="flags of stmpl node, as in tissue=paper edge-length=0.004")
     options = given.parse_args()
     flags = [part for one in options.node for part in ("--" + one.split("=")[0], one.split("=")[1])]
     print(f"{machine()}; load {os.getloadavg()[0]:.1f} before the run", flush=True)

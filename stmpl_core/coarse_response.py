@@ -15,7 +15,6 @@ import numpy as np
 
 from stmpl_core.cache import read, trim, write
 from stmpl_core.layer import SoftLayer
-from stmpl_core.packed import pack
 from stmpl_core.provenance import processor, versions
 
 KIND = "response-"  # beginning of the names of its files
@@ -64,10 +63,12 @@ class CoarseResponse(NamedTuple):
 
 def digest(layer: SoftLayer) -> str:
     """Name of all that decides a layer's response: its numbers, to the last bit, code, packages and processor."""
+    tissue = layer.tissue
+    numbers = np.array([tissue.youngs_modulus, tissue.poisson_ratio, *tissue.stacked])
     found = hashlib.sha256(json.dumps([_code(), versions(DECIDES), processor()]).encode())
-    for name, values in pack(layer).items():
-        if name != "uv":
-            found.update(f"{name} {values.dtype} {values.shape}".encode() + np.ascontiguousarray(values).tobytes())
+    arrays = {"vertices": layer.vertices, "faces": layer.faces, "tissue": numbers} | layer.below
+    for name, values in arrays.items():
+        found.update(f"{name} {values.dtype} {values.shape}".encode() + np.ascontiguousarray(values).tobytes())
     return found.hexdigest()[:32]
 
 

@@ -16,7 +16,7 @@ from stmpl_core.simulator import Simulator
 from stmpl_core.skin import Skin, published
 from stmpl_core.tissue import Tissue
 from stmpl_core.tool import Tool
-from stmpl_ros.parameters import PAPER, NodeConfig
+from stmpl_ros.parameters import ONE_LAYER, PAPER, NodeConfig
 
 Build = Callable[[NodeConfig], SoftLayer]
 STIFFNESS = {"youngs_modulus", "density"}  # settings that change neither geometry nor what is felt around a vertex
@@ -30,23 +30,35 @@ def layer_of(config: NodeConfig) -> SoftLayer:
 
     body = Body.anny(pose=None, **config.phenotype_values)
     if config.tissue in get_args(Tone):
-        return living(body, config.part, cast(Tone, config.tissue), edge_length=config.edge_length)
+        return living(body, config.limb, cast(Tone, config.tissue), edge_length=config.edge_length)
     if config.tissue != PAPER:
         tissue, thickness = read_tissue(config.tissue)
-        return body.part(config.part, edge_length=config.edge_length, thickness=thickness, tissue=tissue)
+        return body.part(config.limb, edge_length=config.edge_length, thickness=thickness, tissue=tissue)
     tissue = Tissue(config.youngs_modulus, config.poisson_ratio, config.density)
-    return body.part(config.part, edge_length=config.edge_length, thickness=config.thickness, tissue=tissue)
+    return body.part(config.limb, edge_length=config.edge_length, thickness=config.thickness, tissue=tissue)
 
 
-def check(config: NodeConfig, build: Build) -> None:
-    """Raises InvalidInput, at once, for what `layer_of` does not know; other builds are not asked."""
+def check(config: NodeConfig, build: Build, changed: set[str] | None = None) -> None:
+    """Raises InvalidInput, at once, for what `layer_of` does not know; other builds are not asked.
+
+    Args:
+        config: settings.
+        build: function that makes the layer.
+        changed: names of the settings that were asked for; None: all that are not as by default.
+    """
     if build is layer_of:
         from stmpl_core.body import Body
 
-        Body.anny().level(config.part)
+        default = NodeConfig()
+        asked = {name for name in ONE_LAYER if getattr(config, name) != getattr(default, name)}
+        if idle := sorted((asked if changed is None else changed & set(ONE_LAYER)) if config.tissue != PAPER else ()):
+            raise InvalidInput(f"{', '.join(idle)} would change nothing: '{config.tissue}' has its own. Leave it out, "
+                               f"or set tissue to '{PAPER}', which is one layer of your numbers.")  # fmt: skip
+
+        Body.anny().level(config.limb)
         stacked = config.tissue != PAPER
         if config.tissue in get_args(Tone):
-            region_of(config.part)
+            region_of(config.limb)
         elif stacked:
             stacked = not read_tissue(config.tissue)[0].single
         if stacked and config.method not in ON_STACKS:
@@ -60,7 +72,7 @@ def at_once(config: NodeConfig, build: Build) -> bool:
     from stmpl_core.body import AVERAGE
 
     average = all(value == AVERAGE for value in config.phenotype_values.values())
-    return build is not layer_of or (average and limbs.ships(config.part, config.edge_length))
+    return build is not layer_of or (average and limbs.ships(config.limb, config.edge_length))
 
 
 def skin_of(config: NodeConfig, build: Build = layer_of) -> Skin:

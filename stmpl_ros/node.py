@@ -96,7 +96,8 @@ class SkinNode(LifecycleNode):
         """Builds the skin, warms the method up, and opens all topics."""
         started = time.monotonic()
         try:
-            self.answering.limits = Limits.read(self.config.limits, self.config.part)
+            check(self.config, self._build)
+            self.answering.limits = Limits.read(self.config.limits, self.config.limb)
             builders = Builders()  # start while the skin is made
             self._answer_on(self._make_skin(), builders)
             warm_up(self.answering.simulator)
@@ -151,7 +152,7 @@ class SkinNode(LifecycleNode):
         """At once where that is quick, else in a process beside this one: Ctrl-C is heard meanwhile."""
         if at_once(self.config, self._build):
             return skin_of(self.config, self._build)
-        self.get_logger().info(f"making {self.config.part}; this may take a minute")
+        self.get_logger().info(f"making {self.config.limb}; this may take a minute")
         making = Beside(skin_of, self.config, self._build)
         try:
             while True:
@@ -230,8 +231,8 @@ class SkinNode(LifecycleNode):
             changes: fields of NodeConfig.
         """
         config = self.settings.with_(**changes)
-        check(config, self._build)
-        Limits.read(config.limits, config.part)
+        check(config, self._build, set(changes))
+        Limits.read(config.limits, config.limb)
         if not self.settings.locked:
             self.settings.take(config)
             return "counts when the node is configured"
@@ -259,7 +260,7 @@ class SkinNode(LifecycleNode):
         self._answer_on(skin)
         assert self.workshop
         self.settings.take(config)
-        self.answering.limits = Limits.read(config.limits, config.part)
+        self.answering.limits = Limits.read(config.limits, config.limb)
         self.sending.move_to(skin, self.workshop)
         gc.collect()
         gc.freeze()

@@ -14,6 +14,8 @@ from stmpl_core.methods import Method, method
 from stmpl_core.tissue import SOFTEST
 
 PAPER = "paper"  # tissue of one layer, by the settings beside it
+ONE_LAYER = ("thickness", "youngs_modulus", "poisson_ratio", "density")  # settings beside it
+FOREARM, PAPER_ARM = "left_forearm", "left_arm"  # parts that answer unless one is asked for
 ACCURACY = 2e-4  # error at any vertex that is asked for [m]
 PHENOTYPE = ("gender", "age", "muscle", "weight", "height", "proportions")
 ANY_TIME: JsonDict = {"when": "any time"}  # fields that a running node takes over at once
@@ -26,8 +28,9 @@ class NodeConfig(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     part: str = Field(
-        default="left_arm", min_length=1, description="part of the body that answers", json_schema_extra=CONFIGURING
-    )
+        default="", json_schema_extra=CONFIGURING,
+        description=f"part of the body that answers; empty: {FOREARM}, and with tissue 'paper' {PAPER_ARM}",
+    )  # fmt: skip
     phenotype: str = Field(
         default="",
         description="phenotype of the body, each value from 0 to 1: 'weight=0.7 muscle=0.3'; 0.5 unless given",
@@ -37,22 +40,23 @@ class NodeConfig(BaseModel):
         default=3e-3, gt=0, le=0.05, description="length of the skin mesh's edges [m]", json_schema_extra=CONFIGURING
     )
     tissue: str = Field(
-        default=PAPER, min_length=1,
-        description="what is under the skin: 'paper': one layer of thickness, youngs_modulus and poisson_ratio; "
-        "'relaxed' or 'tensed': skin, fat and muscle of the part as measured, to its bones; or a file of needs --out",
+        default="relaxed", min_length=1,
+        description="what is under the skin: 'relaxed' or 'tensed': skin, fat and muscle of the part as measured, to "
+        "its bones; 'paper': one layer of thickness, youngs_modulus and poisson_ratio; or a file of needs --out",
         json_schema_extra=CONFIGURING,
     )  # fmt: skip
     thickness: float = Field(
-        default=7.5e-3, gt=0, le=0.1, description="thickness of the soft layer [m]", json_schema_extra=CONFIGURING
+        default=7.5e-3, gt=0, le=0.1, description="thickness of the paper's layer [m]", json_schema_extra=CONFIGURING
     )
     youngs_modulus: float = Field(
-        default=1e3, gt=0, le=1e9, description="Young's modulus of the tissue [Pa]", json_schema_extra=CONFIGURING
-    )
+        default=1e3, gt=0, le=1e9, description="Young's modulus of the paper's layer [Pa]",
+        json_schema_extra=CONFIGURING,
+    )  # fmt: skip
     poisson_ratio: float = Field(
-        default=0.4, ge=0, lt=0.5, description="Poisson's ratio of the tissue [-]", json_schema_extra=CONFIGURING
+        default=0.4, ge=0, lt=0.5, description="Poisson's ratio of the paper's layer [-]", json_schema_extra=CONFIGURING
     )
     density: float = Field(
-        default=1e3, gt=0, le=1e5, description="density of the tissue [kg/m3]", json_schema_extra=CONFIGURING
+        default=1e3, gt=0, le=1e5, description="density of the paper's layer [kg/m3]", json_schema_extra=CONFIGURING
     )
     method: Literal["moment_net", "unet", "linear", "winkler", "naive", "limb_linear", "ladder"] = Field(
         default="moment_net", description="method that solves for the displacement", json_schema_extra=CONFIGURING
@@ -133,6 +137,11 @@ class NodeConfig(BaseModel):
     def _collisions(cls, text: str) -> str:
         _named(text)
         return text
+
+    @property
+    def limb(self) -> str:
+        """The part of the body that answers: the one that is asked for, or else that which the tissue is meant for."""
+        return self.part or (PAPER_ARM if self.tissue == PAPER else FOREARM)
 
     @property
     def gz_collisions(self) -> dict[str, str]:

@@ -16,7 +16,7 @@ from stmpl_msgs.msg import ContactMesh, SkinTopology
 from bags.wire import layer_from, pose_message, tool_message, wrench_message
 from stmpl_core.layer import SoftLayer
 from stmpl_ros.parameters import ProbeConfig
-from stmpl_ros.scripts import SCRIPTS, Motion, Script
+from stmpl_ros.scripts import Motion, Script, scripts_for
 from stmpl_ros.spinning import ros
 from stmpl_ros.topics import KEPT, STREAM
 
@@ -108,7 +108,8 @@ def run(config: ProbeConfig, arguments: list[str] | None = None) -> int:
             if layer is None:
                 node.get_logger().error(f"no skin/topology within {config.patience:g} s. Is the node active?")
                 return 1
-            scripts = [SCRIPTS[name] for name in config.scripts]
+            known = scripts_for(layer)
+            scripts = [known[name] for name in config.scripts]
             ready = [node.announce(script, layer, stop) for script in scripts]
             turns = zip(scripts, ready, strict=True)
             return 0 if all(devices and node.play(script, devices, stop) for script, devices in turns) else 1

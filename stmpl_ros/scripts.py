@@ -2,16 +2,23 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
+from scipy.spatial import KDTree
 
 from stmpl_core.arrays import Transform, Wrench
 from stmpl_core.errors import InvalidInput
 from stmpl_core.layer import SoftLayer
+from stmpl_core.stack import ball_force
 from stmpl_core.tool import Tool
 
 SOFTER = 0.6  # factor by which a layer that may bulge at the rim presses back less than columns (FEM of spheres)
+DEEPER = 4.5  # depth on skin, fat and muscle over that on one layer of 1 kPa
+DEEPEST = 0.65  # depth over the tissue there, below which a device does not go on skin, fat and muscle
+FORCES = 16  # depths between which a device's force on skin, fat and muscle is interpolated
 STATIONS = 101  # points of a path
 SMOOTHING = 2.0  # footprint radii over which the skin's normal is averaged along a path
 
@@ -74,33 +81,36 @@ class Script:
     devices: tuple[Device, ...]
 
 
-def _squeeze(name: str, around: float) -> Device:
-    keys = ((0.0, -0.02), (1.5, 0.0), (2.7, 2.2e-3), (3.4, 2.2e-3), (4.2, 1e-3), (5.0, 2.6e-3), (6.0, -0.02))
-    return Device(name, 12e-3, around, tuple(Keyframe(time, depth, 0.66) for time, depth in keys))
+def _press(deeper: float) -> Script:
+    """One probe presses, slides along, and lets go."""
+    keys = (
+        Keyframe(0.0, -0.03, 0.60),  # approach
+        Keyframe(1.5, 0.0, 0.60),
+        Keyframe(2.8, 2.6e-3 * deeper, 0.60),  # press
+        Keyframe(3.3, 2.6e-3 * deeper, 0.60),
+        Keyframe(6.3, 2.0e-3 * deeper, 0.78),  # slide
+        Keyframe(7.0, 0.0, 0.78),  # release
+        Keyframe(8.0, -0.03, 0.78),
+    )
+    return Script("press", 8.0, (Device("probe", 15e-3, 0.0, keys),))
 
 
-PRESS = Script(
-    "press",
-    8.0,
-    (
-        Device(
-            "probe",
-            15e-3,
-            0.0,
-            (
-                Keyframe(0.0, -0.03, 0.60),  # approach
-                Keyframe(1.5, 0.0, 0.60),
-                Keyframe(2.8, 2.6e-3, 0.60),  # press
-                Keyframe(3.3, 2.6e-3, 0.60),
-                Keyframe(6.3, 2.0e-3, 0.78),  # slide
-                Keyframe(7.0, 0.0, 0.78),  # release
-                Keyframe(8.0, -0.03, 0.78),
-            ),
-        ),
-    ),
-)
-SQUEEZE = Script("squeeze", 6.0, (_squeeze("finger", 0.0), _squeeze("thumb", 180.0)))
-SCRIPTS = {script.name: script for script in (PRESS, SQUEEZE)}
+def _squeeze(deeper: float, along: float) -> Script:
+    """Finger and thumb close on a limb, let up, close again, and let go."""
+    steps = ((0.0, -0.02), (1.5, 0.0), (2.7, 2.2e-3 * deeper), (3.4, 2.2e-3 * deeper), (4.2, 1e-3 * deeper),
+             (5.0, 2.6e-3 * deeper), (6.0, -0.02))  # fmt: skip
+    keys = tuple(Keyframe(time, depth, along) for time, depth in steps)
+    return Script("squeeze", 6.0, (Device("finger", 12e-3, 0.0, keys), Device("thumb", 12e-3, 180.0, keys)))
+
+
+PRESS = _press(1.0)
+ON_ONE_LAYER = {script.name: script for script in (PRESS, _squeeze(1.0, 0.66))}  # to 0.1 N, where E is 1 kPa
+ON_LIMBS = {script.name: script for script in (_press(DEEPER), _squeeze(DEEPER, 0.45))}  # to 5 N on a forearm
+
+
+def scripts_for(layer: SoftLayer) -> dict[str, Script]:
+    """The scripts by name, as deep as suits a layer: one of one material, or skin, fat and muscle."""
+    return ON_LIMBS if layer.stacked else ON_ONE_LAYER
 
 
 def capsule(radius: float, length: float = 0.06, sections: int = 32, *, name: str = "capsule") -> Tool:
@@ -135,15 +145,21 @@ class SkinPath:
         points = np.array(list(found.values()))
         normals = np.array([_mean_normal(layer, point, outwards, footprint) for point in points])
         self._along = np.array(list(found)) / (STATIONS - 1)
+        self._tissue = layer.thickness[KDTree(layer.vertices).query(points)[1]]
         kernel = np.hanning(13) / np.hanning(13).sum()
         self._points = _smoothed(points, kernel)
         self._normals = _smoothed(normals, kernel)
+        self._tissue = _smoothed(self._tissue[:, None].repeat(3, axis=1), kernel)[:, 0]
 
     def at(self, along: float) -> tuple[np.ndarray, np.ndarray]:
         """Point on the skin (3,) [m] and outward unit normal (3,) at `along` in [0, 1]."""
         point = np.array([np.interp(along, self._along, self._points[:, k]) for k in range(3)])
         normal = np.array([np.interp(along, self._along, self._normals[:, k]) for k in range(3)])
         return point, normal / np.linalg.norm(normal)
+
+    def tissue(self, along: float) -> float:
+        """Thickness of the tissue below that point [m]."""
+        return float(np.interp(along, self._along, self._tissue))
 
 
 class Motion:
@@ -153,17 +169,29 @@ class Motion:
         self.device, self.layer = device, layer
         self.tool = capsule(device.radius, name=device.name)
         self._path = SkinPath(layer, device.around, SMOOTHING * footprint(device.radius, 2e-3))
-        self._thickness = float(np.median(layer.thickness))
+        self._force = self._force_on_limb() if layer.stacked else partial(
+            foundation_force, radius=device.radius, thickness=float(np.median(layer.thickness)),
+            confined_modulus=layer.tissue.confined_modulus,
+        )  # fmt: skip
 
     def at(self, time: float) -> tuple[Transform, Wrench]:
         """pose_body_from_tool (4, 4), and the wrench on the body in the body's axes (6,), at `time` [s]."""
         depth, along = self.device.at(time)
+        if self.layer.stacked:
+            depth = min(depth, DEEPEST * self._path.tissue(along))
         point, normal = self._path.at(along)
         pose = np.eye(4)
         pose[:3, :3] = _frame_along(normal)
         pose[:3, 3] = point - depth * normal
-        force = foundation_force(depth, self.device.radius, self._thickness, self.layer.tissue.confined_modulus)
-        return pose, np.concatenate([-force * normal, np.zeros(3)])
+        return pose, np.concatenate([-self._force(depth) * normal, np.zeros(3)])
+
+    def _force_on_limb(self) -> Callable[[float], float]:
+        """Force over depth [N] by the linear response of the flat stack, as thick as where the device presses most."""
+        deepest = max(self.device.keyframes, key=lambda key: key.depth)
+        tissue, thickness = self.layer.tissue, self._path.tissue(deepest.along)
+        depths = np.linspace(0, deepest.depth, FORCES)
+        forces = [0.0, *(ball_force(tissue, thickness, self.device.radius, depth) for depth in depths[1:])]
+        return lambda depth: float(np.interp(depth, depths, forces))
 
 
 def footprint(radius: float, depth: float) -> float:

@@ -34,7 +34,8 @@ ros_arguments: list[str] = []  # arguments of ROS, from --ros-args on
 def demo(config: Annotated[DemoConfig, Flat] = DEMO) -> int:
     """Node, simulated devices and recorder on this machine; then the run against FEM, with a report.
 
-    Example: stmpl demo --frames 6 --node.method winkler
+    Example: stmpl demo --frames 6
+    One sheet on the bone, as in the paper: stmpl demo --node.tissue paper --node.method winkler
     """
     from stmpl_ros.demo import run
 
@@ -45,6 +46,7 @@ def node(config: Annotated[NodeConfig, Flat] = NODE) -> int:
     """Answers contacts with the displacement of the skin. ROS arguments may follow.
 
     Example: stmpl node --part left_arm --edge-length 0.004 --ros-args -r __ns:=/left
+    One sheet on the bone, as in the paper: stmpl node --tissue paper
     """
     from stmpl_ros.node import run
 
@@ -195,20 +197,20 @@ def info(path: Annotated[Path | None, tyro.conf.Positional] = None, part: str | 
 
     Args:
         path: folder or .mcap file of a run.
-        part: region of the body instead of a run: forearm, upper_arm, shoulder, neck, back, abdomen, thigh or calf.
+        part: region of the body instead of a run: forearm (where neither is given), upper_arm, shoulder, neck, back,
+            abdomen, thigh or calf.
         as_json: figures as JSON, for machines.
     """
-    if (path is None) == (part is None):
-        raise InvalidInput("Give the path of a recording or --part with a region of the body, one of them.")
-    if part is not None:
+    if path is None:
         from stmpl_ros.tables import part_figures, part_table
 
-        print_figures(part_figures(part) if as_json else part_table(part))
+        print_figures(part_figures(part or "forearm") if as_json else part_table(part or "forearm"))
         return 0
+    if part is not None:
+        raise InvalidInput("Give the path of a recording or --part with a region of the body, not both.")
     from bags.reader import Bag
     from stmpl_ros.tables import bag_figures, bag_table
 
-    assert path is not None
     bag = Bag(path)
     skins = {name: repr(layer) for name, layer in bag.known_layers().items()}
     print_figures(bag_figures(bag) | {"skins": skins} if as_json else bag_table(bag))

@@ -24,7 +24,7 @@ import sys
 from stmpl_ros.node import run
 from stmpl_ros.parameters import NodeConfig
 from tests.node_bus import skin
-sys.exit(run(NodeConfig(rest_after=0.4, fade=0.6), sys.argv[1:], build=skin))
+sys.exit(run(NodeConfig(tissue="paper", rest_after=0.4, fade=0.6), sys.argv[1:], build=skin))
 """
 
 

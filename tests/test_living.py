@@ -1,5 +1,8 @@
 """Laws of parts of a body as people were measured, and of the tissue that a node is started with."""
 
+import subprocess
+import sys
+
 import numpy as np
 import pytest
 
@@ -58,7 +61,8 @@ def config(**changes) -> NodeConfig:
 
 
 def test_a_node_starts_with_the_tissue_that_it_is_asked_for(tmp_path, capsys):
-    assert layer_of(config()).tissue == Tissue()
+    assert layer_of(config()).tissue == region("forearm").tissue
+    assert layer_of(config(tissue="paper")).tissue == Tissue()
     assert layer_of(config(tissue="tensed")).tissue == region("forearm", "tensed").tissue
     path = tmp_path / "arm.json"
     code, _, _ = stmpl(capsys, "needs", "--part", "forearm", "--radius", 20, "--force", 5, "--out", path)
@@ -72,5 +76,33 @@ def test_a_node_refuses_at_once_what_cannot_be(tmp_path):
         check(config(tissue="relaxed", method="winkler"), layer_of)
     with pytest.raises(InvalidInput, match="stmpl needs --out"):
         check(config(tissue=str(tmp_path / "none.json")), layer_of)
-    check(config(tissue="relaxed"), layer_of)
-    assert not at_once(NodeConfig(tissue="relaxed"), layer_of) and at_once(NodeConfig(), layer_of)
+    with pytest.raises(InvalidInput, match="poisson_ratio, youngs_modulus would change nothing: 'relaxed' has its own"):
+        check(config(youngs_modulus=5e3, poisson_ratio=0.3), layer_of)
+    with pytest.raises(InvalidInput, match="thickness would change nothing"):
+        check(config(), layer_of, {"thickness", "edge_length"})
+    check(config(), layer_of)
+    check(config(tissue="paper", youngs_modulus=5e3), layer_of)
+    check(config(youngs_modulus=5e3), layer_of, {"tissue"})  # left of the paper's layer, which a node had before
+
+
+def test_the_default_limb_is_a_forearm_as_measured_and_the_papers_is_a_preset():
+    default, paper = NodeConfig(edge_length=COARSE), NodeConfig(tissue="paper", edge_length=COARSE)
+    assert default.limb == "left_forearm" and default.tissue == "relaxed" and paper.limb == "left_arm"
+    assert NodeConfig(tissue="paper", part="torso").limb == NodeConfig(part="torso").limb == "torso"
+    assert layer_of(default).stacked and layer_of(default).core is not None
+    layer = layer_of(paper)
+    assert layer.tissue == Tissue() and layer.core is None and layer.thickness.max() == pytest.approx(7.5e-3)
+
+
+def test_only_a_skin_that_ships_is_made_while_a_node_waits():
+    assert at_once(NodeConfig(), layer_of) and at_once(NodeConfig(tissue="paper"), layer_of)
+    assert not at_once(config(), layer_of) and not at_once(NodeConfig(phenotype="weight=0.7"), layer_of)
+
+
+def test_the_default_node_starts_without_torch_or_anny():
+    code = ("import sys; from stmpl_ros.making import skin_of, warm_up; from stmpl_ros.parameters import NodeConfig\n"
+            "from stmpl_core import Simulator\n"
+            "skin = skin_of(NodeConfig()); warm_up(Simulator(skin)); print(skin.layer)\n"
+            "assert not {'anny', 'torch', 'roma', 'viser', 'zarr'} & set(sys.modules)")  # fmt: skip
+    said = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert "E 2500 Pa" in said.stdout

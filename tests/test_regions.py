@@ -63,6 +63,10 @@ def test_info_shows_a_part_with_units_and_sources(capsys):
         assert word in said
 
 
+def test_info_without_a_word_more_is_of_the_default_limb(capsys):
+    assert stmpl(capsys, "info") == stmpl(capsys, "info", "--part", "forearm")
+
+
 def test_info_gives_machines_the_same_in_si(capsys):
     code, said, _ = stmpl(capsys, "info", "--part", "thigh", "--json")
     figures, part = json.loads(said), region("thigh", "tensed")
@@ -73,8 +77,8 @@ def test_info_gives_machines_the_same_in_si(capsys):
 
 @pytest.mark.parametrize(
     "arguments, says",
-    [((), "one of them"), (("runs/latest", "--part", "back"), "one of them"), (("--part", "knee"), "no region 'knee'")],
+    [(("runs/latest", "--part", "back"), "not both"), (("--part", "knee"), "no region 'knee'")],
 )
-def test_info_refuses_both_none_and_parts_that_are_not_listed_in_one_sentence(capsys, arguments, says):
+def test_info_refuses_both_and_parts_that_are_not_listed_in_one_sentence(capsys, arguments, says):
     code, said, refused = stmpl(capsys, "info", *arguments)
     assert code == 1 and not said and says in refused and "Traceback" not in refused

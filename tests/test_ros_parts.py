@@ -9,6 +9,7 @@ from geometry_msgs.msg import PoseStamped
 from hypothesis import given
 from hypothesis import strategies as st
 from rclpy.serialization import deserialize_message, serialize_message
+from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 from stmpl_msgs.msg import LocalContact as LocalContactMessage
 from stmpl_msgs.msg import SkinDisplacement
@@ -32,9 +33,11 @@ from bags.wire import (
     wrench_message,
 )
 from stmpl_core import Answer, Membrane, Ply, Tissue, Tools, Touch
+from stmpl_core.body import Body
 from stmpl_core.bones import Bone, to_bone
 from stmpl_core.errors import FrameError, InvalidInput, MeshError
 from stmpl_core.layer import layer_id
+from stmpl_core.living import living
 from stmpl_core.local_contact import LocalContact
 from stmpl_core.skin import published
 from stmpl_core.touch import BY_POSE, STALE, TOUCHING
@@ -43,7 +46,7 @@ from stmpl_ros.diagnosis import Tally
 from stmpl_ros.gate import SAY_EVERY, Gate
 from stmpl_ros.inbox import PATIENCE, Inbox
 from stmpl_ros.parameters import NodeConfig
-from stmpl_ros.scripts import PRESS, SCRIPTS, Device, Keyframe, Motion
+from stmpl_ros.scripts import DEEPEST, ON_LIMBS, ON_ONE_LAYER, PRESS, Device, Keyframe, Motion, scripts_for
 from stmpl_ros.show import SkinMarker
 from tests.scenes import at, ball, limb, scaled
 
@@ -360,7 +363,7 @@ def test_marker_bytes_are_the_marker_that_they_replace():
 
 
 def test_a_device_moves_without_jumps_and_meets_its_keyframes():
-    for device in (device for script in SCRIPTS.values() for device in script.devices):
+    for device in (d for script in (*ON_ONE_LAYER.values(), *ON_LIMBS.values()) for d in script.devices):
         for key in device.keyframes:
             assert device.at(key.time) == pytest.approx((key.depth, key.along))
         depths = np.array([device.at(t)[0] for t in np.arange(0, device.keyframes[-1].time, 1e-3)])
@@ -381,6 +384,21 @@ def test_a_device_follows_the_skin_and_pushes_along_its_normal():
         else:
             np.testing.assert_allclose(force / np.linalg.norm(force), -pose[:3, 2], atol=1e-12)
     assert [motion.at(0.731)[0].tobytes()] == [Motion(PRESS.devices[0], layer).at(0.731)[0].tobytes()]
+
+
+def test_a_device_presses_a_limb_with_newtons_and_not_onto_its_bone():
+    layer = living(Body.anny(), "left_forearm", edge_length=6e-3)
+    scripts = scripts_for(layer)
+    assert scripts.keys() == scripts_for(limb()).keys() and scripts_for(limb()) is ON_ONE_LAYER
+    skin = KDTree(layer.vertices)
+    for script in scripts.values():
+        for motion in (Motion(device, layer) for device in script.devices):
+            moments = [motion.at(time) for time in np.linspace(0, script.seconds, 200)]
+            force = np.array([np.linalg.norm(wrench[:3]) for _, wrench in moments])
+            assert 3 < force.max() < 8 and force[0] == 0 and force[-1] == 0
+            pose = moments[int(force.argmax())][0]
+            distance, at = skin.query(pose[:3, 3])
+            assert distance < (DEEPEST + 0.1) * layer.thickness[at]
 
 
 def test_keyframes_out_of_order_are_refused():

@@ -44,14 +44,15 @@ def _serve_recording(config: ViewConfig, path: Path) -> int:
 
 def _serve_hands_on(config: ViewConfig) -> int:
     from stmpl_core.skin import published
-    from stmpl_ros.making import layer_of
+    from stmpl_ros.making import check, layer_of
     from stmpl_ros.view.hands_on import HandsOn
     from stmpl_ros.view.tools import tool_named
 
     tool_named(config.tool)  # a wrong one is refused before the body is made
     with Console(stderr=True).status("making the body"):
+        check(config.node, layer_of)
         layer = published(layer_of(config.node))
-    page = Page(config.host, config.port, f"{config.node.part.replace('_', ' ')}, {config.node.method}")
+    page = Page(config.host, config.port, f"{config.node.limb.replace('_', ' ')}, {config.node.method}")
     return _until_stopped(page, HandsOn(page, layer, config.node.new_method(), config.tool))
 
 
