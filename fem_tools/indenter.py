@@ -137,7 +137,8 @@ class IndenterFem:
         Args:
             tools: tools, see `path`.
             force: force that is wanted, > 0 [N].
-            deepest: depth at which to give up [m]; None: 0.9 of the layer's smallest thickness.
+            deepest: depth at which to give up [m]; None: 0.9 of the layer's smallest thickness, or of what lies
+                below the tools where the layer has a core.
             tolerance: relative error of the force that is allowed [-].
 
         Raises:
@@ -146,7 +147,7 @@ class IndenterFem:
         layer = prepared(self._layer, self)
         if not (np.isfinite(force) and force > 0):
             raise InvalidInput(f"the force is {force} N; it must be finite and above 0.")
-        limit = deepest or 0.9 * float(layer.thickness.min())
+        limit = deepest or 0.9 * self._least_below(layer, tools)
         walk = Walk(self, layer, tools, np.array([limit]))
         below, above = (0.0, 0.0, walk.state), None  # depth, force, state
         while above is None:
@@ -171,6 +172,15 @@ class IndenterFem:
         else:
             walk.stopped = f"the force is {walk.force():.4g} N after 20 trials; {force:.4g} N was asked"
         return walk.answer()
+
+
+    @staticmethod
+    def _least_below(layer: SoftLayer, tools: Sequence[Press]) -> float:
+        """Thickness that tools may go through [m]."""
+        if layer.core is None:
+            return float(layer.thickness.min())
+        touching = [there for tool in tools if (there := tool.touching(layer)) is not None]
+        return max(float(np.min(above_core(layer, touching)[1])), 1e-6) if touching else float(layer.thickness.min())
 
 
 class Walk:

@@ -20,6 +20,7 @@ from stmpl_core.touch import Answer
 from stmpl_core.trust import Displacement, Trust
 
 REFINE, STEP = 2, 0.08  # a third of IndenterFem's own cost; 0.5 % in pressure
+REACH, STACK_STEP = 9.0, 0.1  # of a stack: half a minute a tool on a forearm of 3 mm edges
 ROUNDED = 1e-3  # m, of edges: no skin mesh follows a sharp one
 NEAR = 3.0  # edges around a tool within which pressure is its own
 LEAST = 1e-5  # m: shallower contacts move nothing
@@ -39,13 +40,17 @@ class RigidFem:
 
     def __init__(self) -> None:
         self._layer: SoftLayer | None = None
-        self._fem = IndenterFem(PatchFem(refine=REFINE, layers=INDENTER_LAYERS, check_stability=False), step=STEP)
+        self._fem = IndenterFem()
         self._fields: dict[str, SignedDistance] = {}  # by the digest of a tool
 
     def prepare(self, layer: SoftLayer) -> Self:
-        """Keeps the layer."""
+        """Keeps the layer. A stack is thick beside the edges of its mesh, which is taken as it is, and far around."""
         self._layer = layer
-        self._fem.prepare(layer)
+        if layer.stacked:
+            patch, step = PatchFem(element="P1xP2", layers=1, reach=REACH, check_stability=False), STACK_STEP
+        else:
+            patch, step = PatchFem(refine=REFINE, layers=INDENTER_LAYERS, check_stability=False), STEP
+        self._fem = IndenterFem(patch, step=step).prepare(layer)
         return self
 
     def press(self, contacts: Sequence[Contact], answer: Answer) -> Displacement:

@@ -227,5 +227,5 @@ class DemoConfig(BaseModel):
 
     node: NodeConfig = NodeConfig()
     probe: ProbeConfig = ProbeConfig(rate=125.0, listeners=2, patience=180.0)
-    frames: int = Field(default=12, ge=1, description="number of frames of the run that FEM solves again")
+    frames: int = Field(default=6, ge=1, description="number of frames of the run that FEM solves again")
     runs: Path = Field(default=Path("runs"), description="folder that gets one folder a run")

@@ -15,6 +15,7 @@ from fem_tools.plies import THINNEST_SHARE, confined, materials, wedge_ends, wed
 from fem_tools.skin_loads import FollowerPressure
 from fem_tools.system import System
 from stmpl_core import Load, Membrane, Ply, Tissue
+from stmpl_core.bones import Bone, to_bone
 from stmpl_core.methods.winkler import column_pressure
 from stmpl_core.sdf import SignedDistance
 from tests import scenes
@@ -305,3 +306,12 @@ def test_a_ball_reaches_ten_newtons(tissue):
     forces = [answer.force for answer in answers]
     assert all(answer.trust.ok for answer in answers), [answer.trust.why for answer in answers]
     assert np.all(np.diff(forces) > 0) and forces[-1] > 10
+
+
+def test_a_wrench_is_carried_where_the_tissue_is_thick_however_thin_it_is_elsewhere():
+    round_limb = limb(7e-3, 10e-3, 0.035, 0.16).with_(tissue=LIMB)
+    layer = to_bone(round_limb, [Bone(np.array([0.012, 0, -1]), np.array([0.012, 0, 1]), 0.02)])
+    tool = Press(SignedDistance.of(scenes.ball()), at(-0.035 - 0.012, 0, 0.08), np.array([1.0, 0, 0]))
+    fem = IndenterFem(PatchFem(element="P1xP2", reach=9, layers=1, check_stability=False), step=0.2).prepare(layer)
+    answer = fem.press_with([tool], 1.5, tolerance=0.02)
+    assert answer.force == pytest.approx(1.5, rel=0.02) and answer.depth > 0.9 * layer.thickness.min()
