@@ -66,7 +66,7 @@ class Green:
 
     @classmethod
     def of(cls, layer: SoftLayer) -> Green:
-        """The response of a layer, made or read on the first call (seconds on a stack) and kept as long as the layer is.
+        """The response of a layer, made or read on the first call (a stack: seconds), kept as long as the layer is.
 
         Raises:
             InvalidInput, MeshError: the skin cannot be meshed coarsely.
