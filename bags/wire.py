@@ -21,7 +21,7 @@ from stmpl_core.contact import Contact
 from stmpl_core.errors import BagError, FrameError, InvalidInput, MeshError
 from stmpl_core.layer import MAX_EXTENT, SoftLayer, layer_id
 from stmpl_core.local_contact import LocalContact
-from stmpl_core.packed import stack_from_text, stack_to_text
+from stmpl_core.packed import layer_stack_from_text, layer_stack_to_text
 from stmpl_core.tissue import Tissue
 from stmpl_core.tool import Tool
 from stmpl_core.touch import Answer, Touch
@@ -45,16 +45,16 @@ def stamp_ns(message: Any) -> int:
 
 def layer_from(topology: Any) -> SoftLayer:
     """The layer that a SkinTopology message describes. Raises MeshError or InvalidInput."""
-    tissue = Tissue(topology.youngs_modulus, topology.poisson_ratio, topology.density)
+    tissue, scale = Tissue(topology.youngs_modulus, topology.poisson_ratio, topology.density), None
     if stack := getattr(topology, "stack", ""):  # recordings from before stacks have none
         try:
-            tissue = stack_from_text(stack)
+            tissue, scale = layer_stack_from_text(stack)
         except (KeyError, TypeError, ValueError, AttributeError) as error:
             raise InvalidInput(f"the stack of a SkinTopology cannot be read: {error}.") from error
     vertices, triangles = _rows("vertices", topology.vertices), _rows("triangles", topology.triangles)
     core = _rows("core", getattr(topology, "core", ()))
     below = {"core": core} if len(core) else {"thickness": np.asarray(topology.thickness)}
-    return SoftLayer(vertices, triangles.astype(np.int32), **below, tissue=tissue)
+    return SoftLayer(vertices, triangles.astype(np.int32), **below, tissue=tissue, ply_scale=scale)
 
 
 def tool_from(message: Any) -> Tool:
@@ -304,7 +304,7 @@ def topology_message(layer: SoftLayer, body_frame: str, stamp_ns: int) -> Any:
         poisson_ratio=float(layer.tissue.poisson_ratio),
         density=float(layer.tissue.density),
         core=floats([] if layer.core is None else layer.core),
-        stack="" if layer.tissue.single else stack_to_text(layer.tissue),
+        stack="" if layer.tissue.single and layer.ply_scale is None else layer_stack_to_text(layer),
     )
 
 

@@ -57,7 +57,8 @@ def _coarse(layer: SoftLayer, vertices: int) -> SoftLayer:
     from stmpl_core.remesh import remesh
 
     mesh = remesh(layer.vertices, layer.faces, edge)
-    skin = SoftLayer(mesh.vertices, mesh.faces, mesh.transfer @ layer.thickness, tissue=layer.tissue)
+    scale = None if layer.ply_scale is None else mesh.transfer @ layer.ply_scale
+    skin = SoftLayer(mesh.vertices, mesh.faces, mesh.transfer @ layer.thickness, tissue=layer.tissue, ply_scale=scale)
     columns = mesh.transfer @ layer.inner_vertices - skin.vertices
     columns = unfolded(skin.vertices, skin.normals, columns, skin.faces)
     bad = _folding(skin, columns)
@@ -74,12 +75,15 @@ def _without(layer: SoftLayer, faces: np.ndarray) -> SoftLayer:
     """The layer without some faces, by their mask (F,), and without vertices that are left alone."""
     kept = layer.faces[~faces]
     some, places = np.unique(kept, return_inverse=True)
-    return SoftLayer(layer.vertices[some], places.reshape(-1, 3), core=layer.inner_vertices[some], tissue=layer.tissue)
+    scale = None if layer.ply_scale is None else layer.ply_scale[some]
+    return SoftLayer(layer.vertices[some], places.reshape(-1, 3), core=layer.inner_vertices[some], tissue=layer.tissue,
+                     ply_scale=scale)  # fmt: skip
 
 
 def _folding(skin: SoftLayer, columns: np.ndarray) -> np.ndarray:
     """Numbers of the vertices around wedges that fold."""
-    ends, faces = wedge_ends(skin.tissue, np.linalg.norm(columns, axis=1), 1), skin.faces.astype(np.int64)
+    ends = wedge_ends(skin.tissue, np.linalg.norm(columns, axis=1), 1, skin.ply_scale)
+    faces = skin.faces.astype(np.int64)
     layers = ends.shape[1] - 1
     wedge = reference_wedge(ELEMENT)
     _, volumes = rest_gradients(skin.vertices, skin.vertices + columns, faces, wedge, layers, ends)
@@ -88,9 +92,9 @@ def _folding(skin: SoftLayer, columns: np.ndarray) -> np.ndarray:
 
 def _compliance(layer: SoftLayer) -> np.ndarray:
     """Motion of every vertex under a pressure E at each, its edges held, (3 V, V) [m]."""
-    ends = wedge_ends(layer.tissue, np.linalg.norm(layer.inner_vertices - layer.vertices, axis=1), 1)
+    ends = wedge_ends(layer.tissue, np.linalg.norm(layer.inner_vertices - layer.vertices, axis=1), 1, layer.ply_scale)
     faces = layer.faces.astype(np.int64)
-    mesh = WedgeMesh.of(layer.vertices, layer.inner_vertices, faces, ELEMENT, ends=ends)
+    mesh = WedgeMesh.of(layer.vertices, layer.inner_vertices, faces, ELEMENT, ends=ends, ply_scale=layer.ply_scale)
     system = System(mesh, layer.tissue, [], mesh.border_columns())
     blocks: Any = system.tangent(system.zeros(), 1.0)
     count, width = len(layer.vertices), blocks.shape[1]

@@ -127,6 +127,7 @@ class WedgeMesh:
         volumes: quadrature weight times det, (T L, Q) [m3].
         indptr, indices: block rows of the tangent, one block a pair of columns that share a triangle.
         blocks: number of the block of each pair of columns of a triangle, (T, n, n).
+        ply_scale: factor on the depths at which materials begin below each corner, (N,) [-]; None: 1.
     """
 
     element: ElementName
@@ -143,11 +144,12 @@ class WedgeMesh:
     indptr: np.ndarray
     indices: np.ndarray
     blocks: np.ndarray
+    ply_scale: np.ndarray | None = None
 
     @classmethod
     def of(
         cls, outer: Points, inner: Points, triangles: np.ndarray, element: ElementName = "P1xP2", layers: int = 1,
-        ends: np.ndarray | None = None,
+        ends: np.ndarray | None = None, ply_scale: np.ndarray | None = None,
     ) -> WedgeMesh:  # fmt: skip
         """Meshes the space between two copies of a triangulation.
 
@@ -157,6 +159,7 @@ class WedgeMesh:
             element: element in plane and through the thickness.
             layers: wedges through the thickness, if `ends` is None.
             ends: see WedgeMesh; None: those of `level_depths`, the same in all columns.
+            ply_scale: see WedgeMesh.
 
         Raises:
             MeshError: a wedge is folded at rest (its map has a determinant that is not positive).
@@ -183,6 +186,7 @@ class WedgeMesh:
             indptr,
             indices,
             blocks,
+            ply_scale,
         )
 
     @property

@@ -137,6 +137,7 @@ class PatchFem:
         chosen, flat = np.unique(faces, return_inverse=True)
         outer, inner, triangles = layer.vertices[chosen], layer.inner_vertices[chosen], flat.reshape(-1, 3)
         away, splits = distance[chosen], []
+        scale = np.ones(len(chosen)) if layer.ply_scale is None else layer.ply_scale[chosen]
         for _ in range(self.refine):
             if edge_length is None:
                 marked = away[triangles].min(axis=1) <= REFINED_WITHIN * thickness
@@ -147,10 +148,11 @@ class PatchFem:
             triangles, edges = split(triangles, len(outer), marked)
             if not len(edges):
                 break
-            outer, inner, away = (np.concatenate([x, x[edges].mean(axis=1)]) for x in (outer, inner, away))
+            outer, inner, away, scale = (np.concatenate([x, x[edges].mean(axis=1)])
+                                         for x in (outer, inner, away, scale))  # fmt: skip
             splits.append(edges)
-        ends = wedge_ends(layer.tissue, np.linalg.norm(inner - outer, axis=1), self.layers_for(layer))
-        mesh = WedgeMesh.of(outer, inner, triangles, self.element_for(layer), ends=ends)
+        ends = wedge_ends(layer.tissue, np.linalg.norm(inner - outer, axis=1), self.layers_for(layer), scale)
+        mesh = WedgeMesh.of(outer, inner, triangles, self.element_for(layer), ends=ends, ply_scale=scale)
         return Patch(chosen, mesh, mesh.border_columns(), distance[chosen], tuple(splits))
 
     def _refuse_folds(self, folded: np.ndarray) -> None:

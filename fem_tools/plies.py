@@ -33,7 +33,7 @@ def confined_modulus(tissue: Tissue, thickness: float) -> float:
     return 1 / sum(share / one.confined_modulus for share, one in zip(shares, materials(tissue), strict=True))
 
 
-def wedge_ends(tissue: Tissue, length: np.ndarray, layers: int) -> np.ndarray:
+def wedge_ends(tissue: Tissue, length: np.ndarray, layers: int, scale: np.ndarray | None = None) -> np.ndarray:
     """Depths at which the wedges of each column end, as shares of its length, (N, L + 1) or (1, L + 1) [-].
 
     The first material has `layers` wedges, graded as those of a single one. Each below it has as many as let the last
@@ -45,8 +45,10 @@ def wedge_ends(tissue: Tissue, length: np.ndarray, layers: int) -> np.ndarray:
         tissue: stack.
         length: lengths of the columns, (N,) [m].
         layers: wedges of the first material.
+        scale: factor on the depths at which materials begin below each column, (N,) [-]; None: 1.
     """
-    starts = [ply.depth for ply in tissue.deeper if ply.depth < length.max()]
+    factor = np.ones(1) if scale is None else scale
+    starts = [ply.depth for ply in tissue.deeper if (ply.depth * factor < length).any()]
     if not starts:
         return level_depths(layers)[None, ::2]
     lows, highs = starts, [*starts[1:], float(length.max())]
@@ -58,7 +60,7 @@ def wedge_ends(tissue: Tissue, length: np.ndarray, layers: int) -> np.ndarray:
         shares.append((ratio**step - 1) / (ratio - 1))
     below = np.cumsum([len(share) - 1 for share in shares][:0:-1])[::-1]  # wedges from each deeper material on
     most = 1 - THINNEST_SHARE * below
-    bounds = np.minimum(np.array(starts) / length[:, None], most)
+    bounds = np.minimum(np.array(starts) * (factor / length)[:, None], most)
     bounds = np.hstack([np.zeros((len(length), 1)), bounds, np.ones((len(length), 1))])
     ends = [bounds[:, k, None] + (bounds[:, k + 1] - bounds[:, k])[:, None] * share[:-1]
             for k, share in enumerate(shares)]  # fmt: skip
@@ -70,7 +72,8 @@ def wedge_materials(mesh: WedgeMesh, tissue: Tissue) -> tuple[np.ndarray, np.nda
     count = len(mesh.triangles) * mesh.layers
     if not tissue.deeper:
         return np.full(count, tissue.shear_modulus), np.full(count, tissue.lame_lambda)
-    middle = (mesh.ends[:, :-1] + mesh.ends[:, 1:]) / 2 * np.linalg.norm(mesh.inner - mesh.outer, axis=1)[:, None]
+    length = np.linalg.norm(mesh.inner - mesh.outer, axis=1) / (1.0 if mesh.ply_scale is None else mesh.ply_scale)
+    middle = (mesh.ends[:, :-1] + mesh.ends[:, 1:]) / 2 * length[:, None]
     which = np.searchsorted([ply.depth for ply in tissue.deeper], middle[mesh.triangles].mean(axis=1).ravel())
     moduli = np.array([(one.shear_modulus, one.lame_lambda) for one in materials(tissue)])[which]
     return np.ascontiguousarray(moduli[:, 0]), np.ascontiguousarray(moduli[:, 1])
@@ -87,7 +90,8 @@ def confined(mesh: WedgeMesh, tissue: Tissue, pressure: np.ndarray) -> np.ndarra
         stretch = column_stretch(pressure, tissue)
         return (1 - stretch)[:, None, None] * (inner - outer)[:, None] * (1 - depth)
     length = np.linalg.norm(inner - outer, axis=1)
-    bounds = _bounds(tissue, length)
+    scale = None if mesh.ply_scale is None else mesh.on_columns(mesh.ply_scale)
+    bounds = _bounds(tissue, length, scale)
     given = np.zeros(depth.shape[:2])
     for k, one in enumerate(materials(tissue)):
         below = np.maximum(bounds[:, k + 1, None] - np.maximum(bounds[:, k, None], depth[..., 0] * length[:, None]), 0)
@@ -95,7 +99,7 @@ def confined(mesh: WedgeMesh, tissue: Tissue, pressure: np.ndarray) -> np.ndarra
     return given[..., None] * ((inner - outer) / length[:, None])[:, None]
 
 
-def _bounds(tissue: Tissue, length: np.ndarray) -> np.ndarray:
+def _bounds(tissue: Tissue, length: np.ndarray, scale: np.ndarray | None = None) -> np.ndarray:
     """Depths at which the materials of columns of a length (N,) begin, and the last one ends, (N, M + 1) [m]."""
     starts = np.array([0.0, *(ply.depth for ply in tissue.deeper), np.inf])
-    return np.minimum(starts, length[:, None])
+    return np.minimum(starts * (1.0 if scale is None else scale[:, None]), length[:, None])

@@ -41,8 +41,37 @@ PARTS = {  # bones of a part: Anny's names, then the SMPL family's
 }
 RINGS = 3  # rings of faces kept around a part while it is subdivided, so that its border is none of the surface
 SMPL_TO_BODY = np.array([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]])  # rotation; SMPL looks along +z with its left towards +x
+SEXES = {"male": 0.0, "female": 1.0}  # share of a gender that is female [-]
+WATER = 1e3  # density of a body [kg/m3]
 PHENOTYPE = ("gender", "age", "muscle", "weight", "height", "proportions")
 AVERAGE = 0.5  # value of every phenotype unless given
+
+
+@dataclass(frozen=True)
+class Physique:
+    """How heavy a person is, beside the average of the model, and of which sex.
+
+    Args:
+        mass_index: body mass index at rest, of a body as dense as water [kg/m2].
+        average: that of the model's average body [kg/m2].
+        female: share from 0, male, to 1, female [-].
+    """
+
+    mass_index: float
+    average: float
+    female: float
+
+    @property
+    def heavier(self) -> float:
+        """Body mass index above the average's [kg/m2]."""
+        return self.mass_index - self.average
+
+
+def mass_index(vertices: Points, faces: Faces, up: int = 2) -> float:
+    """Body mass index of a closed skin that stands upright along the axis `up`, as dense as water [kg/m2]."""
+    corners = vertices[faces]
+    volume = float(np.einsum("ij,ij->", corners[:, 0], np.cross(corners[:, 1], corners[:, 2]))) / 6
+    return WATER * volume / float(np.ptp(vertices[:, up])) ** 2
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,6 +88,7 @@ class Body:
         uv: texture coordinates of each corner, (F, 3, 2) in [0, 1], v up; None if the model has none.
         weights: weights of the bones at each vertex, (V, B) [-], rows sum to 1.
         bones: names of the bones, B of them.
+        physique: how heavy the person is and of which sex; None: not known, taken as average.
     """
 
     name: str
@@ -67,6 +97,7 @@ class Body:
     uv: np.ndarray | None
     weights: np.ndarray
     bones: tuple[str, ...]
+    physique: Physique | None = None
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "vertices", finite("vertices", self.vertices, (None, 3)))
@@ -87,7 +118,7 @@ class Body:
 
         Args:
             pose: rotation vector [rad] for each bone that turns, (3,), from the rest pose, in the body's axes.
-            phenotype: gender, age, muscle, weight, height, proportions, each in [0, 1]; 0.5 unless given.
+            phenotype: gender (1: female), age, muscle, weight, height, proportions, each in [0, 1]; 0.5 unless given.
 
         Raises:
             InvalidInput: an unknown bone or phenotype (the error lists them), a value that is out of range, or another
@@ -103,7 +134,10 @@ class Body:
             return _average()
         from stmpl_core.anny_model import posed
 
-        return cls("anny", *posed(turns, phenotype))
+        vertices, faces, *_ = at_rest = posed({}, phenotype)
+        average = mass_index(_average().vertices, _average().faces)
+        physique = Physique(mass_index(vertices, faces), average, float(phenotype.get("gender", AVERAGE)))
+        return cls("anny", *(posed(turns, phenotype) if turns else at_rest), physique)
 
     @classmethod
     def smpl(
@@ -150,7 +184,8 @@ class Body:
             model = classes[model_type](str(where), gender=gender, ext=where.suffix.lstrip(".") or "npz",
                                         use_pca=False, **shape)
             with torch.no_grad():
-                vertices = model(**turned).vertices[0].numpy().astype(float) @ SMPL_TO_BODY.T
+                posed, own, mean = (model(**given).vertices[0].numpy().astype(float) @ SMPL_TO_BODY.T for given in
+                                    (turned, {}, {"betas": torch.zeros_like(model.betas)}))  # fmt: skip
         except Exception as error:  # smplx checks little, and what it meets comes as any kind of error
             raise InvalidInput(f"smplx cannot make a {model_type} body of {where}: {type(error).__name__}: {error}. "
                                "Check model_type, and how many betas and pose angles the model has.") from error
@@ -159,7 +194,9 @@ class Body:
         bones = JOINT_NAMES if model_type == "smplx" else SMPLH_JOINT_NAMES
         if model_type == "smpl":
             bones = [*bones[:22], "left_hand", "right_hand"]
-        return cls(model_type, vertices, faces, _smpl_uv(uv, faces), weights, tuple(bones[: weights.shape[1]]))
+        physique = Physique(mass_index(own, faces), mass_index(mean, faces), SEXES.get(gender, AVERAGE))
+        bones = tuple(bones[: weights.shape[1]])
+        return cls(model_type, posed, faces, _smpl_uv(uv, faces), weights, bones, physique)
 
     def part(
         self, name: str, *, edge_length: float = 3e-3, thickness: ArrayLike = 7.5e-3, tissue: Tissue | None = None

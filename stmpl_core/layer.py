@@ -29,11 +29,12 @@ class SoftLayer:
             a core, which says it.
         core: points of the rigid core at which the tissue's columns end, (V, 3) [m]; None: straight below each vertex.
         tissue: what lies between skin and core.
+        ply_scale: factor on the depths at which deeper materials begin below each vertex, (V,) [-], > 0; None: 1.
         chart: UV chart of the skin, if it has one (see stmpl_core.chart).
 
     Raises:
         MeshError: empty, non-manifold, inside-out or degenerate surface, or one that looks like millimetres.
-        InvalidInput: numbers that are not finite, wrong shapes, or a thickness not above 0.
+        InvalidInput: numbers that are not finite, wrong shapes, or a thickness or factor not above 0.
     """
 
     def __init__(
@@ -44,6 +45,7 @@ class SoftLayer:
         *,
         core: ArrayLike | None = None,
         tissue: Tissue | None = None,
+        ply_scale: ArrayLike | None = None,
         chart: Any = None,
     ) -> None:
         self.vertices: Points = finite("vertices", vertices, (None, 3))
@@ -62,18 +64,25 @@ class SoftLayer:
             worst = int(self.thickness.argmin())
             raise InvalidInput(f"thickness is {self.thickness[worst]:g} m at vertex {worst}; it must be above 0.")
         self.tissue = tissue or Tissue()
+        self.ply_scale: PerVertex | None = None
+        if ply_scale is not None:
+            self.ply_scale = finite("ply_scale", ply_scale, (len(self.vertices),))
+            if (self.ply_scale <= 0).any():
+                raise InvalidInput(f"ply_scale is {self.ply_scale.min():g} at its least; it must be above 0.")
         self.chart = chart
         _check_surface(self)
 
     def with_(self, **changes: Any) -> SoftLayer:
-        """A copy with `vertices`, `thickness` or `core`, `tissue` (or its fields) or `chart` changed.
+        """A copy with `vertices`, `thickness` or `core`, `tissue` (or its fields), `ply_scale` or `chart` changed.
 
         Raises:
             InvalidInput: vertices without a core, where the layer has one.
         """
         if self.core is not None and "vertices" in changes and not {"core", "thickness"} & set(changes):
             raise InvalidInput("this layer's columns run to a core: changed vertices want a core, too.")
-        below = {} if {"core", "thickness"} & set(changes) else self.below
+        below = self.below
+        if {"core", "thickness"} & set(changes):
+            below = {"ply_scale": self.ply_scale}
         material = {k: changes.pop(k) for k in ("youngs_modulus", "poisson_ratio", "density", "skin", "deeper")
                     if k in changes}
         given = {"vertices": self.vertices, "faces": self.faces, "tissue": self.tissue, "chart": self.chart}
@@ -88,8 +97,9 @@ class SoftLayer:
 
     @property
     def below(self) -> dict[str, np.ndarray]:
-        """The argument that says how deep the layer is: its thickness (V,), or its core (V, 3), by name [m]."""
-        return {"thickness": self.thickness} if self.core is None else {"core": self.core}
+        """The arguments that say how deep layer and materials are, by name: thickness or core [m], ply_scale if any."""
+        depth = {"thickness": self.thickness} if self.core is None else {"core": self.core}
+        return depth if self.ply_scale is None else depth | {"ply_scale": self.ply_scale}
 
     def _depth_of_core(self) -> PerVertex:
         """Depth of the core below the skin, along its normal, but no less than a third of the column, (V,) [m]."""
@@ -189,6 +199,8 @@ def layer_id(layer: SoftLayer) -> str:
         digest.update(np.ascontiguousarray(layer.core, dtype="<f4").tobytes())
     if not tissue.single:
         digest.update(np.array(tissue.stacked, dtype="<f8").tobytes())
+    if layer.ply_scale is not None:
+        digest.update(np.ascontiguousarray(layer.ply_scale, dtype="<f4").tobytes())
     return digest.hexdigest()[:16]
 
 

@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
+
+import numpy as np
 
 from stmpl_core.body import Body
 from stmpl_core.bones import bones_of, to_bone
 from stmpl_core.errors import InvalidInput
-from stmpl_core.layer import SoftLayer
+from stmpl_core.fat import fat_map, for_person
+from stmpl_core.layer import MAX_THICKNESS, SoftLayer
 from stmpl_core.limbs import EDGE_LENGTH
 from stmpl_core.packed import stack_from_text, stack_to_text
 from stmpl_core.regions import REGIONS, Region, Tone, region
@@ -16,6 +20,7 @@ from stmpl_core.tissue import Tissue
 
 WHOLE = {"arm": "forearm", "leg": "thigh", "torso": "back"}  # region whose numbers serve a part of several
 SHEET = 2e-3  # thickness with which a part is meshed before its columns are known [m]
+DEEPEST = 0.95 * MAX_THICKNESS  # depth at which tissue ends above the bone, as in a heavy person's groin [m]
 
 
 def region_of(part: str, tone: Tone = "relaxed") -> Region:
@@ -36,7 +41,7 @@ def living(body: Body, part: str, tone: Tone = "relaxed", *, edge_length: float 
     """A part of a body with the tissue that was measured in its region (stmpl_core.regions).
 
     Arms and legs reach to their bones, so how thick their tissue is follows the body; the torso is as thick as its
-    region. The fat is as thick everywhere as in the region's middle.
+    region. Fat and skin follow the person's weight and sex, fat also the side of a limb (stmpl_core.fat).
 
     Args:
         body: body.
@@ -47,11 +52,16 @@ def living(body: Body, part: str, tone: Tone = "relaxed", *, edge_length: float 
     Raises:
         InvalidInput: a part without a region.
     """
-    its = region_of(part, tone)
+    its = for_person(region_of(part, tone), body.physique)
     if part == "torso":
         return body.part(part, edge_length=edge_length, thickness=its.thickness, tissue=its.tissue)
     skin = body.part(part, edge_length=edge_length, thickness=SHEET, tissue=its.tissue)
-    return to_bone(skin, bones_of(body, part))
+    fat = fat_map(body, part, skin.vertices)
+    if fat is not None:
+        middle = float(np.median(fat))
+        tissue = replace(its, fat_thickness=replace(its.fat_thickness, value=middle)).tissue
+        skin = skin.with_(tissue=tissue, ply_scale=fat / middle)
+    return to_bone(skin, bones_of(body, part), DEEPEST)
 
 
 def write_tissue(path: str | Path, tissue: Tissue, thickness: float) -> None:

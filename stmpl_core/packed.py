@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping
 from dataclasses import asdict
+from typing import Any
 
 import numpy as np
 
@@ -14,7 +15,7 @@ from stmpl_core.tissue import Membrane, Ply, Tissue
 
 
 def pack(layer: SoftLayer) -> dict[str, np.ndarray]:
-    """Arrays of a layer by name: vertices, faces, thickness or core, tissue, and if it has one the chart's uv.
+    """Arrays of a layer by name: vertices, faces, thickness or core, tissue, and if it has them ply_scale and uv.
 
     The tissue of one material is its modulus, ratio and density, (3,); what else it has is JSON, as bytes in `stack`.
     """
@@ -33,6 +34,21 @@ def stack_to_text(tissue: Tissue) -> str:
     return json.dumps(asdict(tissue))
 
 
+def layer_stack_to_text(layer: SoftLayer) -> str:
+    """Tissue and ply_scale of a layer as JSON; the factors as float32."""
+    given = asdict(layer.tissue)
+    if layer.ply_scale is not None:
+        given["ply_scale"] = [float(f"{x:.9g}") for x in layer.ply_scale.astype(np.float32)]
+    return json.dumps(given)
+
+
+def layer_stack_from_text(text: str) -> tuple[Tissue, np.ndarray | None]:
+    """Tissue and ply_scale, (V,) or None, of such JSON. Raises what `stack_from_text` raises."""
+    given = json.loads(text)
+    scale = given.pop("ply_scale", None)
+    return _stack(given), None if scale is None else np.array(scale, np.float32).astype(float)
+
+
 def stack_from_text(text: str) -> Tissue:
     """The tissue of such JSON.
 
@@ -40,7 +56,10 @@ def stack_from_text(text: str) -> Tissue:
         KeyError, TypeError, ValueError: text of another kind.
         InvalidInput: numbers that are no tissue's.
     """
-    given = json.loads(text)
+    return _stack(json.loads(text))
+
+
+def _stack(given: dict[str, Any]) -> Tissue:
     skin, deeper = given.pop("skin"), given.pop("deeper")
     return Tissue(**given, skin=Membrane(**skin) if skin else None, deeper=tuple(Ply(**one) for one in deeper))
 
@@ -57,6 +76,6 @@ def unpack(arrays: Mapping[str, np.ndarray]) -> SoftLayer:
     else:
         modulus, ratio, density = (float(x) for x in arrays["tissue"])
         tissue = Tissue(modulus, ratio, density)
-    depth = {name: arrays[name] for name in ("thickness", "core") if name in arrays}
+    depth = {name: arrays[name] for name in ("thickness", "core", "ply_scale") if name in arrays}
     chart = UvChart(arrays["vertices"], arrays["faces"], arrays["uv"]) if "uv" in arrays else None
     return SoftLayer(arrays["vertices"], arrays["faces"], **depth, tissue=tissue, chart=chart)

@@ -135,6 +135,8 @@ _LAURENT = "Laurent et al., Vaccine 25 (2007) 6423: 342 adults, ultrasound"
 _MAUGHAN = ("Maughan et al., Clin Sci 66 (1984) 683: shares of fat and bone in 16 forearms, CT; assumed round, radius "
             "40 mm")
 _MECHELLI = "Mechelli, J Cachexia Sarcopenia Muscle Clin Rep 4 (2019): 17 adults, front of the thigh, ultrasound"
+_MULTIS = ("MULTIS, Neumann et al., Sci Data 5 (2018) 180193: {}, 95 adults, ultrasound; geometric mean and deviation, "
+           "at 24 kg/m2")  # fmt: skip
 _ABDUCTION = "Quantitative assessment of normal middle deltoid muscle elasticity, Sci Rep 11 (2021)"
 _SEXES = "spread: difference of the sexes"
 
@@ -182,7 +184,7 @@ REGIONS = {  # where, modulus of the tensed muscle, numbers
                                  "largest; high: assumed, as the forearm's"),
         "fat_thickness": _mm(10.8, 5.7, 15.9, f"{_GIBNEY}; {_SEXES}"),
         "muscle_modulus": _LIMB_E,
-        "muscle_thickness": _mm(30, 20, 40, "assumed, as the front of the thigh's"),
+        "muscle_thickness": _mm(24, 18, 32, _MULTIS.format("back of the upper arm")),
     }),
     "shoulder": ("deltoid, to the humerus", _kpa(115, 75, 160, f"{_ABDUCTION}: 4.9-7.1 m/s, arm held at 90 degrees"), {
         "skin_thickness": _mm(2.0, 1.2, 3.2, f"{_LAURENT}; spread: Van Mulder et al., Vaccine 35 (2017) 1810"),
@@ -220,9 +222,9 @@ REGIONS = {  # where, modulus of the tensed muscle, numbers
         "muscle_thickness": _mm(28, 21, 35, _MECHELLI),
     }),
     "calf": ("back of the leg, to the tibia", _LIMB_E.times(*_TWICE), {
-        "skin_thickness": _mm(1.55, 1.5, 1.9, "assumed, as the thigh's: Laurent et al. (2007)"),
-        "fat_thickness": _SITES,
+        "skin_thickness": _mm(1.35, 1.06, 1.72, _MULTIS.format("back of the lower leg")),
+        "fat_thickness": _mm(7.1, 4.4, 11, _MULTIS.format("back of the lower leg")),
         "muscle_modulus": _LIMB_E,
-        "muscle_thickness": _mm(40, 30, 50, "assumed, as gastrocnemius and soleus together"),
+        "muscle_thickness": _mm(44, 37, 53, _MULTIS.format("back of the lower leg")),
     }),
 }  # fmt: skip

@@ -127,7 +127,7 @@ def part_figures(name: str) -> dict[str, Any]:
     from stmpl_core.regions import region
 
     both = [region(name), region(name, "tensed")]
-    return {"part": name, "where": both[0].where} | {
+    return {"part": name, "where": both[0].where, "fat": _fat(name)} | {
         one.tone: {
             "quantities": {key: asdict(quantity) for key, quantity in one.quantities.items()},
             "thickness": one.thickness,
@@ -135,6 +135,22 @@ def part_figures(name: str) -> dict[str, Any]:
         }
         for one in both
     }
+
+
+def _fat(name: str) -> dict[str, Any]:
+    """How the fat of a part follows the person, and on arms and legs the side of the limb [m]."""
+    from dataclasses import asdict
+
+    from stmpl_core.body import Physique
+    from stmpl_core.fat import MULTIS, SITES, fat_factor
+
+    at = {"ten_kg_per_m2_more": (34, 0.5), "women": (24, 1.0), "men": (24, 0.0)}
+    said: dict[str, Any] = {key: fat_factor(name, Physique(mass_index, 24, female))
+                            for key, (mass_index, female) in at.items()}  # fmt: skip
+    said["source"] = f"{MULTIS}; fitted" if name in SITES else f"assumed, as the limbs' of {MULTIS}"
+    if name in SITES:
+        said |= {"front": asdict(SITES[name][1].front), "back": asdict(SITES[name][1].back)}
+    return said
 
 
 def _effective(one: Region) -> dict[str, Any]:
@@ -178,6 +194,14 @@ def part_table(name: str) -> Table:
             ("pull = T / (E t)", "", "pull", 1.0, "with effective E and t"),
             ("stiffness", "N/mm", "ball_stiffness", 1e-3,
              f"linear response to a ball of {BALL_RADIUS * 1e3:g} mm, {BALL_DEPTH * 1e3:g} mm deep")]  # fmt: skip
+    fat = _fat(name)
+    table.add_section()
+    for side in ("front", "back"):
+        if side in fat:
+            sizes = [f"{fat[side][key] * 1e3:.3g}" for key in ("value", "low", "high")]
+            table.add_row(f"fat, {side}", "mm", *2 * [f"{sizes[0]} ({sizes[1]}-{sizes[2]})"], fat[side]["source"])
+    for label, key in (("10 kg/m2 more", "ten_kg_per_m2_more"), ("women", "women"), ("men", "men")):
+        table.add_row(f"fat, {label}", "times", *2 * [f"{fat[key]:.2f}"], fat["source"])
     table.add_section()
     for label, unit, key, factor, source in rows:
         table.add_row(label, unit, *(f"{one[key] * factor:.2g}" for one in near), source)

@@ -22,7 +22,11 @@ COARSE = 8e-3  # m
 @pytest.mark.parametrize("part", ["left_forearm", "right_thigh"])
 def test_a_part_has_the_tissue_of_its_region_down_to_its_bone(part):
     layer = living(Body.anny(), part, edge_length=COARSE)
-    assert layer.tissue == region(part.partition("_")[2]).tissue and layer.core is not None
+    its = region(part.partition("_")[2])
+    assert layer.tissue.skin == its.tissue.skin and layer.tissue.youngs_modulus == its.fat_modulus.value
+    assert layer.tissue.deeper[0].youngs_modulus == its.muscle_modulus.value and layer.core is not None
+    fat = layer.tissue.deeper[0].depth * layer.ply_scale
+    assert np.abs(fat - its.fat_thickness.value).min() < 0.1 * its.fat_thickness.value
     assert 0.01 < np.median(layer.thickness) < 0.06
     assert (fold_ratios(layer.vertices, layer.inner_vertices, layer.faces) > 0).all()
 
@@ -61,9 +65,11 @@ def config(**changes) -> NodeConfig:
 
 
 def test_a_node_starts_with_the_tissue_that_it_is_asked_for(tmp_path, capsys):
-    assert layer_of(config()).tissue == region("forearm").tissue
     assert layer_of(config(tissue="paper")).tissue == Tissue()
-    assert layer_of(config(tissue="tensed")).tissue == region("forearm", "tensed").tissue
+    for state in ("relaxed", "tensed"):
+        muscle = layer_of(config(tissue=state)).tissue.deeper[0]
+        assert muscle.youngs_modulus == region("forearm", state).muscle_modulus.value
+    assert layer_of(config()).tissue == layer_of(config(tissue="relaxed")).tissue
     path = tmp_path / "arm.json"
     code, _, _ = stmpl(capsys, "needs", "--part", "forearm", "--radius", 20, "--force", 5, "--out", path)
     made = layer_of(config(tissue=str(path)))

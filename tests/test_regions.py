@@ -59,7 +59,7 @@ def test_what_is_not_listed_is_refused_with_what_is(asked, says):
 def test_info_shows_a_part_with_units_and_sources(capsys):
     code, said, _ = stmpl(capsys, "info", "--part", "back")
     assert code == 0
-    for word in ("relaxed", "tensed", "source", "kPa", "Laurent", "effective", "N/mm", "rung"):
+    for word in ("relaxed", "tensed", "source", "kPa", "Laurent", "effective", "N/mm", "rung", "fat, women"):
         assert word in said
 
 
@@ -72,6 +72,7 @@ def test_info_gives_machines_the_same_in_si(capsys):
     figures, part = json.loads(said), region("thigh", "tensed")
     assert code == 0 and figures["tensed"]["thickness"] == part.thickness
     assert figures["tensed"]["quantities"]["muscle_modulus"]["value"] == part.muscle_modulus.value
+    assert figures["fat"]["men"] < 1 < figures["fat"]["women"] and 5e-3 < figures["fat"]["back"]["value"] < 0.02
     assert figures["relaxed"]["effective"]["rung"] in (1, 2) and figures["relaxed"]["effective"]["ball_stiffness"] > 0
 
 
