@@ -1,6 +1,7 @@
 """A ball of 40 mm on four parts of a body as measured, skin, fat and muscle: finite elements, and the fast answer.
 
     .venv/bin/python -m benchmarks.living_limbs     # writes docs/pictures/living_limbs.png; about ten minutes
+    .venv/bin/python -m benchmarks.living_limbs --trunk     # 5 N on back, abdomen, neck and shoulder; prints
 
 Finite elements press the ball in along the skin's normal; the answer gets each pose, and then each force. Both on the
 same mesh; times on a mesh of 3 mm, on one core: set OMP_NUM_THREADS=1.
@@ -29,6 +30,12 @@ PICTURE = Path(__file__).parents[1] / "docs" / "pictures" / "living_limbs.png"
 RADIUS = 0.02  # of the ball [m]
 PARTS = {"forearm": ("left_forearm", 7e-3), "upper arm": ("left_upper_arm", 8e-3), "thigh": ("left_thigh", 11e-3),
          "back": ("torso", 10e-3)}  # part, edges of the mesh that finite elements get [m]  # fmt: skip
+TRUNK = {"back": 6e-3, "left_shoulder": 8e-3, "neck": 8e-3, "abdomen": 14e-3}  # part, edges likewise
+TRUNK_REACH = 3.0  # [thicknesses]: the parts themselves reach little further
+SITES = {  # of the trunk's: place near a vertex, and the way its skin faces
+    "back": ((-0.06, 0.06, 0.33), (-1, 0, 0)), "abdomen": ((0.12, 0.04, 0.17), (1, 0, 0)),
+    "neck": ((-0.03, 0.01, 0.54), (-1, 0, 0)), "left_shoulder": ((0.02, 0.24, 0.42), (0, 0.8, 0.6)),
+}  # fmt: skip
 STRAINS = (0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8)  # depths over the thickness under the ball
 FORCES = (5.0, 20.0, 50.0)  # N
 
@@ -56,6 +63,9 @@ def ball() -> Tool:
 def site(layer: SoftLayer, part: str) -> int:
     """A vertex in the middle of a limb where the tissue is thick; on the back beside the spine, high up."""
     v = layer.vertices
+    if part in SITES:
+        place, way = (np.array(each) for each in SITES[part])
+        return int(np.where(layer.normals @ way > 0.6, np.linalg.norm(v - place, axis=1), 9).argmin())
     if part == "torso":
         wanted = np.array([v[:, 1].mean() + 0.06, v[:, 2].min() + 0.7 * np.ptp(v[:, 2])])
         return int(np.where(layer.normals[:, 0] < -0.6, np.linalg.norm(v[:, 1:] - wanted, axis=1), 9).argmin())
@@ -64,8 +74,8 @@ def site(layer: SoftLayer, part: str) -> int:
     return int(np.where(middle & (layer.thickness < np.median(layer.thickness) + 8e-3), layer.thickness, 0).argmax())
 
 
-def compare(part: str, edge: float) -> list[Compared]:
-    """Finite elements and the answer at STRAINS."""
+def compare(part: str, edge: float, strains: tuple[float, ...] = STRAINS, reach: float = 9) -> list[Compared]:
+    """Finite elements within a reach [thicknesses], and the answer, at some strains."""
     layer = living(Body.anny(), part, edge_length=edge)
     vertex = site(layer, part)
     normal, thickness = layer.normals[vertex], float(layer.thickness[vertex])
@@ -73,10 +83,10 @@ def compare(part: str, edge: float) -> list[Compared]:
     pose[:3, 3] = layer.vertices[vertex] + (RADIUS + 0.01) * normal
     start = Press(SignedDistance.of(ball(), margin=0.04), pose, -normal).touching(layer)
     assert start is not None
-    fem = IndenterFem(PatchFem(element="P1xP2", reach=9, refine=3, layers=1), step=0.1).prepare(layer)
+    fem = IndenterFem(PatchFem(element="P1xP2", reach=reach, refine=3, layers=1), step=0.1).prepare(layer)
     simulator, out = Simulator(layer, MomentNet()), []
-    depths = [strain * thickness for strain in STRAINS]
-    for strain, depth, truth in zip(STRAINS, depths, fem.path([start], depths), strict=True):
+    depths = [strain * thickness for strain in strains]
+    for strain, depth, truth in zip(strains, depths, fem.path([start], depths), strict=True):
         if not truth.trust.ok:
             break
         answer = simulator.step([Contact(ball(), start.at(depth).pose_body_from_tool)])
@@ -86,6 +96,24 @@ def compare(part: str, edge: float) -> list[Compared]:
                             touch.force, touch.force_bound, float(off[moved > 0.1 * moved.max()].mean()),
                             float(off.max()), answer.trust.why))  # fmt: skip
     return out
+
+
+def trunk(part: str, edge: float, force: float = 5.0) -> None:
+    """Prints what a ball does that is pressed with a force, and finite elements at the depth that it comes to."""
+    layer = living(Body.anny(), part, edge_length=edge)
+    vertex, simulator = site(layer, part), Simulator(layer, MomentNet())
+    normal, thickness, pose = layer.normals[vertex], float(layer.thickness[vertex]), np.eye(4)
+    pose[:3, 3] = layer.vertices[vertex] + (RADIUS - 0.2 * thickness) * normal
+    wrench = np.concatenate([-force * normal, np.zeros(3)])
+    touch = simulator.touch([Contact(ball(), pose, wrench)])[0]  # where the force is carried
+    answer = simulator.step([Contact(ball(), touch.pose_body_from_tool, wrench)])
+    touch = answer.touches["ball"]
+    print(f"{part}: {1e3 * thickness:.0f} mm thick, {force:g} N: {1e3 * touch.depth:.1f} mm deep, "
+          f"{answer.trust.why or 'unflagged'}")  # fmt: skip
+    (row,) = compare(part, edge, (touch.depth / thickness,), reach=TRUNK_REACH)
+    print(f"    at that depth finite elements {row.truth:.2f} N, ours {row.force:.2f} +- {row.bound:.2f} N "
+          f"({100 * (row.force / row.truth - 1):+.1f} %); motion off {row.moves:.1f} %, worst {row.worst:.1f} % "
+          f"of the peak {row.why}")  # fmt: skip
 
 
 def times(part: str) -> None:
@@ -139,7 +167,12 @@ def main() -> None:
     options = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     options.add_argument("--times-only", action="store_true", help="no finite elements")
     options.add_argument("--out", type=Path, default=PICTURE, help="picture")
+    options.add_argument("--trunk", nargs="*", choices=TRUNK, help="parts of the trunk instead, at 5 N; all of them")
     given, found = options.parse_args(), {}
+    if given.trunk is not None:
+        for part in given.trunk or TRUNK:
+            trunk(part, TRUNK[part])
+        return
     for name, (part, edge) in PARTS.items():
         print(name)
         if not given.times_only:

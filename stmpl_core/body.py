@@ -20,6 +20,7 @@ from stmpl_core.extras import needed
 from stmpl_core.extrusion import foldfree_thickness
 from stmpl_core.layer import SoftLayer, check_faces
 from stmpl_core.tissue import Tissue
+from stmpl_core.trunk import TRUNK, trunk_level
 
 if TYPE_CHECKING:
     from stmpl_core.remesh import Remeshed
@@ -222,10 +223,21 @@ class Body:
     @property
     def parts(self) -> tuple[str, ...]:
         """Names of the parts that this body has the bones for."""
-        return tuple(part for part, pattern in PARTS.items() if any(re.fullmatch(pattern, b) for b in self.bones))
+        limbs_and_torso = (p for p, pattern in PARTS.items() if any(re.fullmatch(pattern, b) for b in self.bones))
+        return (*limbs_and_torso, *(TRUNK if self._as_anny else ()))
+
+    @property
+    def _as_anny(self) -> bool:
+        """Whether its vertices are Anny's, so that what is known of the average body's is known of them."""
+        return self.name == "anny" and len(self.vertices) == len(_average().vertices)
 
     def level(self, part: str) -> np.ndarray:
-        """The bone weight of a part, less one half: positive at the vertices that belong to it, (V,) [-]."""
+        """The bone weight of a part, less one half: positive at the vertices that belong to it, (V,) [-].
+
+        Of parts of the trunk (stmpl_core.trunk) it is a distance instead; only Anny's bodies have them.
+        """
+        if part in TRUNK and self._as_anny:
+            return trunk_level(_average().vertices, _average().level("torso"), part)
         pattern = PARTS.get(part, re.escape(part))
         columns = [k for k, bone in enumerate(self.bones) if re.fullmatch(pattern, bone)]
         if not columns:

@@ -20,6 +20,12 @@ from stmpl_core.layer import SoftLayer
 RADII = {  # radius of a segment's bones as one capsule [m]: humerus, radius and ulna, femur, tibia and fibula
     "upper_arm": 11e-3, "forearm": 15e-3, "thigh": 14e-3, "calf": 20e-3,
 }  # fmt: skip
+SPINE = {  # radius of the spine as a capsule, assumed: a vertebra of the loins is 34 by 44 mm (Panjabi 1992) [m]; two
+    # groups of bones, through the middles of whose skin it runs
+    "abdomen": (20e-3, (("spine05",), ("spine02",))), "neck": (10e-3, (("neck01", "neck02", "neck03"), ("head",))),
+}  # fmt: skip
+OWN = 0.5  # weight of such bones over its largest, from which skin is their own
+BEYOND = 0.1  # how far the spine goes on beyond these middles [m]
 SEGMENTS = {"arm": ("upper_arm", "forearm"), "leg": ("thigh", "calf")}
 FACING = 0.35  # cosine between normal and column, below which a bone is no longer reached through this skin
 AWAY = 0.3  # cost of a bone that the skin does not face, over the missing cosine [m]
@@ -53,17 +59,33 @@ class Bone:
 
 
 def bones_of(body: Body, part: str) -> list[Bone]:
-    """The bones of an arm, a leg, or a segment of one. Raises InvalidInput for other parts.
+    """The bones of an arm, a leg, a segment of one, of a shoulder, abdomen or neck. Raises InvalidInput for others.
 
-    A joint lies in the middle of the ring of skin that the bones on both sides of it move alike.
+    A joint lies in the middle of the ring of skin that the bones on both sides of it move alike. A shoulder has the
+    upper arm's. The spine runs through the middle of what its bones' skin spans: place and radius are guesses.
     """
+    if part in SPINE:
+        return [_spine(body, *SPINE[part])]
+    part = part.replace("shoulder", "upper_arm")
     side, _, name = part.partition("_")
     segments = SEGMENTS.get(name, (name,))
     if side not in ("left", "right") or any(segment not in RADII for segment in segments):
-        known = [f"left_{one}, right_{one}" for one in (*SEGMENTS, *RADII)]
+        known = [*(f"left_{one}, right_{one}" for one in (*SEGMENTS, *RADII, "shoulder")), *SPINE]
         raise InvalidInput(f"the bones of {part!r} are not known. Known: {', '.join(known)}. "
                            "Or give SoftLayer a core of your own.")  # fmt: skip
     return [_bone(body, f"{side}_{segment}", RADII[segment]) for segment in segments]
+
+
+def _spine(body: Body, radius: float, groups: Sequence[Sequence[str]]) -> Bone:
+    if missing := {bone for group in groups for bone in group} - set(body.bones):
+        raise InvalidInput(f"the spine of this body is not known: it has no {', '.join(sorted(missing))}.")
+    ends = []
+    for group in groups:
+        weight = body.weights[:, [body.bones.index(bone) for bone in group]].sum(axis=1)
+        own = body.vertices[weight > OWN * weight.max()]
+        ends.append((own.min(axis=0) + own.max(axis=0)) / 2)
+    way = BEYOND * (ends[1] - ends[0]) / np.linalg.norm(ends[1] - ends[0])
+    return Bone(ends[0] - way, ends[1] + way, radius)
 
 
 def _bone(body: Body, part: str, radius: float) -> Bone:

@@ -17,8 +17,10 @@ from stmpl_core.limbs import EDGE_LENGTH
 from stmpl_core.packed import stack_from_text, stack_to_text
 from stmpl_core.regions import REGIONS, Region, Tone, region
 from stmpl_core.tissue import Tissue
+from stmpl_core.trunk import TRUNK
 
 WHOLE = {"arm": "forearm", "leg": "thigh", "torso": "back"}  # region whose numbers serve a part of several
+STRAIGHT = ("torso", "back")  # parts whose bones are not known: their tissue lies straight below the skin
 SHEET = 2e-3  # thickness with which a part is meshed before its columns are known [m]
 DEEPEST = 0.95 * MAX_THICKNESS  # depth at which tissue ends above the bone, as in a heavy person's groin [m]
 
@@ -40,8 +42,9 @@ def region_of(part: str, tone: Tone = "relaxed") -> Region:
 def living(body: Body, part: str, tone: Tone = "relaxed", *, edge_length: float = EDGE_LENGTH) -> SoftLayer:
     """A part of a body with the tissue that was measured in its region (stmpl_core.regions).
 
-    Arms and legs reach to their bones, so how thick their tissue is follows the body; the torso is as thick as its
-    region. Fat and skin follow the person's weight and sex, fat also the side of a limb (stmpl_core.fat).
+    Arms and legs reach to their bones, so how thick their tissue is follows the body. Torso and back are as thick as
+    their region; abdomen, neck and shoulders no thicker than theirs, in columns to spine or humerus. Fat and skin
+    follow the person's weight and sex, fat also the side of a limb (stmpl_core.fat).
 
     Args:
         body: body.
@@ -53,7 +56,7 @@ def living(body: Body, part: str, tone: Tone = "relaxed", *, edge_length: float 
         InvalidInput: a part without a region.
     """
     its = for_person(region_of(part, tone), body.physique)
-    if part == "torso":
+    if part in STRAIGHT:
         return body.part(part, edge_length=edge_length, thickness=its.thickness, tissue=its.tissue)
     skin = body.part(part, edge_length=edge_length, thickness=SHEET, tissue=its.tissue)
     fat = fat_map(body, part, skin.vertices)
@@ -61,7 +64,8 @@ def living(body: Body, part: str, tone: Tone = "relaxed", *, edge_length: float 
         middle = float(np.median(fat))
         tissue = replace(its, fat_thickness=replace(its.fat_thickness, value=middle)).tissue
         skin = skin.with_(tissue=tissue, ply_scale=fat / middle)
-    return to_bone(skin, bones_of(body, part), DEEPEST)
+    deepest = min(its.thickness, DEEPEST) if part in TRUNK else DEEPEST
+    return to_bone(skin, bones_of(body, part), deepest)
 
 
 def write_tissue(path: str | Path, tissue: Tissue, thickness: float) -> None:

@@ -2,16 +2,20 @@
 
 import subprocess
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from stmpl_core import SoftLayer, Tissue
 from stmpl_core.body import Body
+from stmpl_core.bones import bones_of
 from stmpl_core.errors import InvalidInput
 from stmpl_core.extrusion import fold_ratios
 from stmpl_core.living import living, read_tissue, region_of, write_tissue
 from stmpl_core.regions import region
+from stmpl_core.soundness import border_distance
+from stmpl_core.trunk import TRUNK
 from stmpl_ros.making import at_once, check, layer_of
 from stmpl_ros.parameters import NodeConfig
 from tests.test_needs import stmpl
@@ -112,3 +116,31 @@ def test_the_default_node_starts_without_torch_or_anny():
             "assert not {'anny', 'torch', 'roma', 'viser', 'zarr'} & set(sys.modules)")  # fmt: skip
     said = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert "E 2500 Pa" in said.stdout
+
+
+@pytest.mark.parametrize(("part", "edge", "site"), [
+    ("back", 1e-2, (-0.06, 0.06, 0.33)), ("abdomen", 2e-2, (0.12, 0.04, 0.17)), ("neck", 1e-2, (-0.03, 0.01, 0.54)),
+    ("left_shoulder", 1e-2, (0.02, 0.24, 0.42)), ("right_shoulder", 1e-2, (0.02, -0.24, 0.42)),
+])  # fmt: skip
+def test_a_part_of_the_trunk_has_the_tissue_of_its_region_and_its_border_far_from_where_it_is_pressed(part, edge, site):
+    layer, its = living(Body.anny(), part, edge_length=edge), region_of(part)
+    assert layer.tissue == its.tissue and part.endswith(its.name)
+    place = int(np.linalg.norm(layer.vertices - np.array(site), axis=1).argmin())
+    assert np.linalg.norm(layer.vertices[place] - site) < 0.03
+    assert 0.7 * its.thickness < layer.thickness[place] < 1.05 * its.thickness
+    assert border_distance(layer)[place] > 2 * layer.thickness[place]
+    ratios = fold_ratios(layer.vertices, layer.inner_vertices, layer.faces)
+    assert (ratios < 0).mean() < 5e-3 and layer.chart is not None
+
+
+def test_the_trunks_parts_are_annys_and_follow_a_body():
+    body = Body.anny()
+    assert set(TRUNK) < set(body.parts)
+    other = replace(body, name="smpl", uv=None)
+    assert not set(TRUNK) & set(other.parts)
+    with pytest.raises(InvalidInput, match=r"unknown part 'abdomen'. Available: left_arm"):
+        other.part("abdomen")
+    (spine,) = bones_of(body, "abdomen")
+    assert abs(spine.start[1]) < 5e-3 and spine.end[2] - spine.start[2] > 0.4
+    left, right = (bones_of(body, f"{side}_shoulder")[0] for side in ("left", "right"))
+    np.testing.assert_allclose(left.start * [1, -1, 1], right.start, atol=5e-3)
