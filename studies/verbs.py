@@ -237,7 +237,9 @@ def stability(
     return 0
 
 
-def validate(out: Path = Path("runs/validate"), quick: bool = False, as_json: Json = False) -> int:
+def validate(
+    out: Path = Path("runs/validate"), quick: bool = False, multis: Path | None = None, as_json: Json = False
+) -> int:
     """The model beside published measurements on people: value, spread, whether they meet, and why not.
 
     Rows that do not meet stay in the table. Nothing was fitted on any row.
@@ -247,14 +249,17 @@ def validate(out: Path = Path("runs/validate"), quick: bool = False, as_json: Js
     Args:
         out: folder of report.json, table.md and validate.png.
         quick: rows of the closed form only (seconds); the others press balls by finite elements (half a minute).
+        multis: folder or file of the public MULTIS data (see studies/validate/multis.py), whose rows are added.
         as_json: report on stdout, for machines.
     """
     needed("stmpl validate", "studies", "matplotlib")
     from studies.show import validation_table
-    from studies.validate import as_dict, judge, save
+    from studies.validate import ROWS, as_dict, judge, save
+    from studies.validate.multis import read, rows
 
+    asked = (*ROWS, *(rows(read(multis)) if multis else ()))
     with steps_bar("validate", quiet=as_json) as show:
-        judged = judge(quick=quick, on_progress=show)
+        judged = judge(asked, quick=quick, on_progress=show)
     picture = save(judged, out)
     print_figures(as_dict(judged) if as_json else validation_table(judged, picture))
     return 0

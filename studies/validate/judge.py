@@ -107,8 +107,8 @@ def judge_row(row: Row, inputs: Inputs | None = None) -> Judged:
 
 
 def inputs_of(row: Row) -> Inputs:
-    """Every number of the region and of the protocol, by name."""
-    inputs = region(row.region).quantities | {"radius": row.protocol.radius}
+    """Every number of the region, or of the people themselves, and of the protocol, by name."""
+    inputs = region(row.region).quantities | dict(row.own) | {"radius": row.protocol.radius}
     return inputs | ({"depth": row.protocol.depth} if row.protocol.depth else {})
 
 

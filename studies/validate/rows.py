@@ -6,14 +6,15 @@ the row says so. A part of a protocol that was not found is marked "assumed" and
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from typing import Literal
 
 from stmpl_core.regions import Quantity, region
 from studies.validate.closed import Way
 
 Asked = Literal["stiffness", "force", "reduced modulus", "layer modulus", "tensed over relaxed", "tensed less relaxed"]
-Read = Literal["abstract", "quotation", "public page"]
+Read = Literal["abstract", "quotation", "public page", "data"]
 
 
 @dataclass(frozen=True)
@@ -46,8 +47,9 @@ class Row:
         protocol: protocol of the measurement.
         asked: number that was measured.
         measured: value, low and high over people; all three the same where no spread was read.
-        read: what was read: the source's own abstract, another's quotation of it, or a public page.
+        read: what was read: the source's own abstract, another's quotation of it, a public page, or the data.
         outside: likely reason if model and measurement do not meet.
+        own: numbers of the region that were measured on the same people, by name; the others are the library's.
     """
 
     name: str
@@ -58,6 +60,7 @@ class Row:
     measured: Quantity
     read: Read
     outside: str
+    own: Mapping[str, Quantity] = field(default_factory=dict)
 
 
 def _m(value: float, low: float, high: float, source: str) -> Quantity:
