@@ -13,8 +13,9 @@ LOCKS = 27_400  # the first of the ports that stand for the buses; below those t
 ROOMS = {  # every other file is of the room "unit"
     "ros": ["test_node", "test_node_life", "test_node_topics", "test_record_and_publish", "test_ros", "test_ros_parts",
             "test_view"],
-    "studies": ["test_evaluate", "test_fem_limits", "test_multis", "test_peers", "test_speed_chart",
-                "test_stability", "test_stability_contacts", "test_train_contact", "test_unet", "test_validate"],
+    "studies": ["test_axisymmetric", "test_evaluate", "test_fem_limits", "test_multis", "test_peers",
+                "test_speed_chart", "test_stability", "test_stability_contacts", "test_train_contact", "test_unet",
+                "test_validate"],
 }  # fmt: skip
 FIRST = ["test_conform", "test_ladder", "test_train_contact", "test_indenter_shapes", "test_unet", "test_node_life",
          "test_ros", "test_view", "test_moments", "test_haptics", "test_record_and_publish"]

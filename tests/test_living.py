@@ -29,6 +29,7 @@ def test_a_part_has_the_tissue_of_its_region_down_to_its_bone(part):
     its = region(part.partition("_")[2])
     assert layer.tissue.skin == its.tissue.skin and layer.tissue.youngs_modulus == its.fat_modulus.value
     assert layer.tissue.deeper[0].youngs_modulus == its.muscle_modulus.value and layer.core is not None
+    assert layer.ply_scale is not None
     fat = layer.tissue.deeper[0].depth * layer.ply_scale
     assert np.abs(fat - its.fat_thickness.value).min() < 0.1 * its.fat_thickness.value
     assert 0.01 < np.median(layer.thickness) < 0.06
