@@ -36,6 +36,7 @@ DRAWN = ["mapbox-earcut>=1.0", "shapely>=2.0"]  # tools that are extruded from a
 BODIES = ["anny>=0.6", "roma>=1.5", "torch>=2.4"]
 LEARN = [*BODIES, *DRAWN, "zarr>=3.0"]
 STUDIES = LEARN
+SIM = ["gymnasium>=1.0", "mujoco==4.0.0"]
 VIEW = [*DRAWN, "viser>=1.1"]
 CLUSTER = ["distributed>=2024.8"]
 TEST_TOOLS = [
@@ -54,9 +55,9 @@ EXTRAS = {  # by what people do
     "learn": LEARN,  # make data, train; the method unet
     "studies": STUDIES,  # the paper's tables, chart, stability, calibration of the ladder
     "view": VIEW,  # the page in the browser
-    "sim": ["gymnasium>=1.0", "mujoco==4.0.0"],  # robots in simulators
+    "sim": SIM,  # robots in simulators
     "cluster": CLUSTER,  # data made on many machines
-    "dev": [*TEST_TOOLS, *STUDIES, *VIEW, *CLUSTER],
+    "dev": [*TEST_TOOLS, *STUDIES, *VIEW, *SIM, *CLUSTER],
     # only by name: their licences ask more than ours
     "smpl": ["smplx>=0.1.28", "torch>=2.4"],  # not for commerce
     "tetgen": ["tetgen>=0.6"],  # AGPL
@@ -70,11 +71,12 @@ setup(
     description="Real-time soft-tissue contact for robots: a contact comes in, the deformed skin goes out.",
     license="Apache-2.0",
     python_requires=">=3.12,<3.13",
-    packages=find_packages(include=["stmpl_core*", "fem_tools*", "bags", "stmpl_ros*", "studies*"]),
+    packages=find_packages(include=["stmpl_core*", "fem_tools*", "bags", "stmpl_sim*", "stmpl_ros*", "studies*"]),
     package_data={
         "studies": ["stability/truth.npz"],
         "stmpl_core": ["weights/*", "limbs/*.npz", "limbs/*.md"],
         "stmpl_ros": ["config/*.yaml", "foxglove/*.json"],
+        "stmpl_sim": ["models/*.xml"],
     },
     data_files=[
         ("share/ament_index/resource_index/packages", ["resource/stmpl_ros"]),

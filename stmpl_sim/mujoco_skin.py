@@ -1,0 +1,291 @@
+"""SoftBody: a soft skin on a body of a MuJoCo model, which the model's tools feel, and which feels them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+from weakref import WeakKeyDictionary
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from stmpl_core.arrays import Transform, Wrench
+from stmpl_core.errors import InvalidInput
+from stmpl_core.layer import SoftLayer
+from stmpl_core.methods.base import Method
+from stmpl_core.simulator import Simulator
+from stmpl_core.skin import Skin
+from stmpl_core.tool import Tool
+from stmpl_core.touch import Answer, Touch
+from stmpl_sim.engine import mujoco
+from stmpl_sim.protocol import Memory, Poses, Reaction, SoftContact
+
+MOST_NAMES = 30  # names of a model that an error lists
+
+
+class _Source(NamedTuple):
+    """Where a tool comes from: body that it moves with, and geom whose frame it has (None: the body's)."""
+
+    body: int
+    geom: int | None
+
+
+class SoftBody:
+    """A soft skin on a body of a MuJoCo model.
+
+        skin = SoftBody(model, layer, body="forearm", tools=["ball"])
+        mujoco.mj_step1(model, data)
+        touches = skin.apply(data)                    # wrenches on tools and limb
+        data.ctrl[:] = controller(data, skin.reaction.tools["ball"])
+        mujoco.mj_step2(model, data)
+        skin.answer().displacement                    # the field, only when wanted
+
+    The wrenches go into `data.xfrc_applied`, the limb's opposite to the tools', so whatever carries the limb is
+    moved: a free joint, springs, joints; an animated (mocap) or fixed body takes them without moving. Each call takes
+    the wrenches of the call before out again and leaves what others added there; rows that somebody set to zero are
+    not touched twice. Works with as many skins as there are limbs.
+
+    Args:
+        model: MuJoCo model.
+        layer: soft layer at rest, or a Skin, or a Simulator that is ready.
+        body: name of the body that carries the skin.
+        tools: names of geoms or bodies that may touch: sphere, capsule, ellipsoid, cylinder, box or mesh. A geom's tool
+            has the geom's frame; a body's has the body's, and the union of its colliding geoms (all, if none collides).
+        method: method that finds the displacement; MomentNet() unless given.
+        pose_body_from_layer: pose of the layer's axes in the body's frame, (4, 4); the same frame unless given.
+        damping: see SoftContact [s/m].
+        implicit: see SoftContact; MuJoCo gives the mobility.
+
+    Attributes:
+        contact: the SoftContact.
+        reaction: last reaction, with the wrenches in world axes; None before the first `apply`.
+        memory: memory of the steps; may be set.
+
+    Raises:
+        InvalidInput: names that the model does not have, kinds of geoms that cannot be tools, a tool that is part of
+            the limb, or one that also collides with it rigidly.
+        MeshError: a surface that cannot be a tool.
+    """
+
+    def __init__(
+        self,
+        model: Any,
+        layer: SoftLayer | Skin | Simulator,
+        *,
+        body: str,
+        tools: Sequence[str],
+        method: Method | None = None,
+        pose_body_from_layer: ArrayLike | None = None,
+        damping: float = 0.0,
+        implicit: bool = False,
+    ) -> None:
+        self.model = model
+        self.body = _body(model, body)
+        if isinstance(tools, str):
+            raise InvalidInput(f"tools is the text '{tools}'; give a list of names: ['{tools}'].")
+        self._sources = {name: _source(model, name) for name in tools}
+        for name, source in self._sources.items():
+            if model.body_weldid[source.body] == model.body_weldid[self.body] and source.body != 0:
+                raise InvalidInput(f"'{name}' is part of '{body}', or rigidly joined to it: it cannot touch its skin.")
+            _check_no_rigid_contact(model, self.body, source)
+        made = [_tool(model, name, self._sources[name]) for name in tools]
+        self.contact = SoftContact(layer, made, method, pose_body_from_layer=pose_body_from_layer, damping=damping,
+                                   implicit=implicit)  # fmt: skip
+        self.memory = Memory()
+        self.reaction: Reaction | None = None
+        self._time: float | None = None
+        self._jacobians = np.zeros((2, 3, model.nv)) if implicit else None
+
+    @property
+    def simulator(self) -> Simulator:
+        """Simulator of the skin."""
+        return self.contact.simulator
+
+    def apply(self, data: Any) -> Mapping[str, Touch]:
+        """Finds what touches at the positions of `data`, and exerts the wrenches during the coming step.
+
+        Between mj_step1 and mj_step2, or right before mj_step. Positions are made up to date with qpos first. A time
+        that went back (mj_resetData) starts afresh.
+
+        Returns:
+            Touch of each tool, by name, in layer axes.
+
+        Raises:
+            InvalidInput: positions that are not finite.
+        """
+        mujoco.mj_kinematics(self.model, data)
+        if self._time is not None and data.time < self._time:
+            self.memory = Memory()
+        dt = 0.0 if self._time is None else max(0.0, data.time - self._time)
+        mobility = None if self._jacobians is None else lambda name, at, along: self._mobility(data, name, at, along)
+        self.reaction = self.contact.step(self.poses(data), self.memory, dt, mobility)
+        self.memory, self._time = self.reaction.memory, float(data.time)
+        self._push(data, self.reaction)
+        return self.reaction.touches
+
+    def poses(self, data: Any) -> Poses:
+        """Places of body and tools in `data`."""
+        tools = {name: _pose(data.xpos[s.body], data.xmat[s.body]) if s.geom is None
+                 else _pose(data.geom_xpos[s.geom], data.geom_xmat[s.geom])
+                 for name, s in self._sources.items()}  # fmt: skip
+        return Poses(_pose(data.xpos[self.body], data.xmat[self.body]), tools)
+
+    def answer(self) -> Answer:
+        """The displacement of the skin at the last `apply`, layer axes. Raises InvalidInput before the first one."""
+        if self.reaction is None:
+            raise InvalidInput("there is no answer before the first apply(data).")
+        return self.contact.answer(self.reaction)
+
+    def skin_points(self, data: Any, answer: Answer | None = None) -> np.ndarray:
+        """Vertices of the skin in the world, (V, 3) [m], deformed by an answer if one is given."""
+        pose = _pose(data.xpos[self.body], data.xmat[self.body]) @ self.contact.pose_body_from_layer
+        rest = self.simulator.layer.vertices
+        return (rest if answer is None else rest + answer.displacement) @ pose[:3, :3].T + pose[:3, 3]
+
+    def reset(self, data: Any) -> None:
+        """Takes the wrenches out of `data`, and forgets."""
+        ledger = _ledger(data)
+        ledger.replace(data, self, {})
+        self.memory, self.reaction, self._time = Memory(), None, None
+
+    def _push(self, data: Any, reaction: Reaction) -> None:
+        rows: dict[int, Wrench] = {}
+        for name, source in self._sources.items():
+            at = data.xpos[source.body] if source.geom is None else data.geom_xpos[source.geom]
+            _add(rows, source.body, reaction.tools[name], at - data.xipos[source.body])
+        _add(rows, self.body, reaction.body, data.xpos[self.body] - data.xipos[self.body])
+        _ledger(data).replace(data, self, rows)
+
+    def _mobility(self, data: Any, name: str, at: np.ndarray, along: np.ndarray) -> float:
+        """Acceleration of the tool against the body along `along` for 1 N between them there [1/kg]."""
+        assert self._jacobians is not None
+        tool, body = self._jacobians
+        mujoco.mj_jac(self.model, data, tool, None, at, self._sources[name].body)
+        mujoco.mj_jac(self.model, data, body, None, at, self.body)
+        row = (along @ (tool - body))[None]
+        out = np.zeros_like(row)
+        mujoco.mj_solveM(self.model, data, out, row)
+        return float(out[0] @ row[0])
+
+
+class _Ledger:
+    """What all skins put into one MjData's xfrc_applied, so that each takes out what it put in, and no more."""
+
+    def __init__(self) -> None:
+        self._of: WeakKeyDictionary[SoftBody, dict[int, Wrench]] = WeakKeyDictionary()
+
+    def replace(self, data: Any, owner: SoftBody, rows: dict[int, Wrench]) -> None:
+        """Puts these wrenches, by body, in place of the owner's last ones."""
+        applied, last = data.xfrc_applied, self._of.get(owner, {})
+        for body in set(last) | set(rows):
+            if not applied[body].any():  # somebody cleared the row, with all that skins had put there
+                for theirs in self._of.values():
+                    theirs.pop(body, None)
+            others = sum((theirs[body] for one, theirs in self._of.items() if one is not owner and body in theirs),
+                         np.zeros(6))  # fmt: skip
+            strange = applied[body] - others - last.get(body, 0.0)
+            strange[np.abs(strange) < 1e-9] = 0.0  # rounding must not pile up over a million steps
+            applied[body] = strange + others + rows.get(body, 0.0)
+        self._of[owner] = dict(rows)
+
+
+_LEDGERS: WeakKeyDictionary[Any, _Ledger] = WeakKeyDictionary()
+
+
+def _ledger(data: Any) -> _Ledger:
+    return _LEDGERS.setdefault(data, _Ledger())
+
+
+def exclude(spec: Any, body: str, tools: Sequence[str]) -> None:
+    """Adds to a MjSpec that these geoms' or bodies' bodies do not collide rigidly with `body`: their skin does that.
+
+    Raises:
+        InvalidInput: names that the spec does not have.
+    """
+    known = {b.name for b in spec.bodies}
+    for name in (body, *tools):
+        geom = spec.geom(name)
+        owner = geom.parent.name if geom is not None else name
+        if owner not in known:
+            raise InvalidInput(f"there is no geom or body '{name}'. Bodies: {_some(known)}.")
+        if name != body:
+            spec.add_exclude(bodyname1=body, bodyname2=owner)
+
+
+def _add(rows: dict[int, Wrench], body: int, wrench: Wrench, lever: np.ndarray) -> None:
+    """Adds a wrench about a point that is `lever` from the body's centre of mass, where MuJoCo applies it."""
+    about = wrench.copy()
+    about[3:] += np.cross(lever, wrench[:3])
+    rows[body] = rows.get(body, 0.0) + about
+
+
+def _pose(position: np.ndarray, turn: np.ndarray) -> Transform:
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = turn.reshape(3, 3), position
+    return pose
+
+
+def _some(names: Any) -> str:
+    listed = sorted(name for name in names if name)
+    more = len(listed) - MOST_NAMES
+    return ", ".join(listed[:MOST_NAMES]) + (f" and {more} more" if more > 0 else "") or "none with a name"
+
+
+def _names(model: Any, kind: str) -> list[str]:
+    count = {"body": model.nbody, "geom": model.ngeom}[kind]
+    return [getattr(model, kind)(k).name for k in range(count)]
+
+
+def _body(model: Any, name: str) -> int:
+    names = _names(model, "body")
+    if name not in names:
+        raise InvalidInput(f"the model has no body '{name}'. Bodies: {_some(names)}.")
+    return names.index(name)
+
+
+def _source(model: Any, name: str) -> _Source:
+    geoms, bodies = _names(model, "geom"), _names(model, "body")
+    if name in geoms:
+        geom = geoms.index(name)
+        return _Source(int(model.geom_bodyid[geom]), geom)
+    if name in bodies:
+        return _Source(bodies.index(name), None)
+    raise InvalidInput(f"the model has no geom or body '{name}' to be a tool. Geoms: {_some(geoms)}. "
+                       f"Bodies: {_some(bodies)}.")  # fmt: skip
+
+
+def _geoms_of(model: Any, source: _Source) -> list[int]:
+    if source.geom is not None:
+        return [source.geom]
+    own = [geom for geom in range(model.ngeom) if model.geom_bodyid[geom] == source.body]
+    hard = [geom for geom in own if model.geom_contype[geom] or model.geom_conaffinity[geom]]
+    return hard or own
+
+
+def _tool(model: Any, name: str, source: _Source) -> Tool:
+    from stmpl_sim.shapes import body_surface, geom_surface
+
+    geoms = _geoms_of(model, source)
+    if not geoms:
+        raise InvalidInput(f"body '{name}' has no geom that could touch.")
+    return Tool(name, *(body_surface(model, geoms) if source.geom is None else geom_surface(model, source.geom)))
+
+
+def _check_no_rigid_contact(model: Any, body: int, source: _Source) -> None:
+    """Raises InvalidInput where MuJoCo would make rigid contacts between the tool's geoms and the limb's."""
+    signatures = {int(s) for s in model.exclude_signature}
+    for tool in _geoms_of(model, source):
+        for limb in range(model.ngeom):
+            if model.geom_bodyid[limb] != body:
+                continue
+            first, second = sorted((source.body, body))
+            meet = (model.geom_contype[tool] & model.geom_conaffinity[limb]
+                    or model.geom_contype[limb] & model.geom_conaffinity[tool])  # fmt: skip
+            paired = any({int(model.pair_geom1[p]), int(model.pair_geom2[p])} == {tool, limb}
+                         for p in range(model.npair))  # fmt: skip
+            if paired or (meet and (first << 16) + second not in signatures):
+                a, b = model.body(body).name, model.body(source.body).name
+                raise InvalidInput(
+                    f"geom '{model.geom(tool).name or tool}' of '{b}' also collides rigidly with geom "
+                    f"'{model.geom(limb).name or limb}' of '{a}'. Let only the skin touch: add <exclude body1=\"{a}\" "
+                    f'body2="{b}"/> to <contact>, or call stmpl_sim.exclude(spec, "{a}", ["{b}"]) before compiling.')

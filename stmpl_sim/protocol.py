@@ -1,0 +1,273 @@
+"""Protocol: poses in, wrenches out, one step at a time: what any rigid-body simulator needs to feel soft skin."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.spatial import KDTree
+
+from stmpl_core.arrays import Transform, Wrench, finite
+from stmpl_core.contact import Contact
+from stmpl_core.errors import InvalidInput
+from stmpl_core.layer import SoftLayer
+from stmpl_core.methods import MomentNet
+from stmpl_core.methods.base import Method
+from stmpl_core.simulator import Simulator
+from stmpl_core.skin import Skin
+from stmpl_core.state import State
+from stmpl_core.tool import Tool
+from stmpl_core.touch import APART, Answer, Touch
+
+DEEPER_M = 5e-5  # step of the one-sided difference that finds the contact's stiffness [m]
+FAR_HOLES = 3.0  # distance of a tool from the skin, over a hole of the mesh, from which the contact law is not asked
+
+
+@dataclass(frozen=True, eq=False)
+class Poses:
+    """Places of one instant, as a simulator knows them.
+
+    Args:
+        body: pose_world_from_body of the body that carries the skin, (4, 4).
+        tools: pose_world_from_tool by the tool's name, (4, 4) each.
+    """
+
+    body: Transform
+    tools: Mapping[str, Transform]
+
+
+@dataclass(frozen=True, eq=False)
+class Memory:
+    """Memory of a soft contact: a value that goes into a step and comes out of it.
+
+    Args:
+        tissue: memory of the tissue.
+        at: pose_body_from_tool of the step before, by the tool's name, layer axes.
+        speed: speed at which each tool that pressed went into the skin [m/s], and the force that it pressed with [N].
+    """
+
+    tissue: State = field(default_factory=State)
+    at: Mapping[str, Transform] = field(default_factory=dict)
+    speed: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, eq=False)
+class Reaction:
+    """Wrenches of one step, for the simulator to exert: force [N], torque [N m], world axes, (6,).
+
+    Args:
+        tools: wrench on each tool about its own origin, by name. What a sensor behind the tool would feel.
+        body: wrench on the body about its origin: the opposite of all of them.
+        touches: touch of each contact, by the name of its tool, in layer axes: the elastic answer.
+        memory: memory for the next step.
+    """
+
+    tools: Mapping[str, Wrench]
+    body: Wrench
+    touches: Mapping[str, Touch]
+    memory: Memory
+
+
+class World(Protocol):
+    """A rigid-body simulator, as a soft contact sees it."""
+
+    def poses(self) -> Poses:
+        """Places of now."""
+        ...
+
+    def push(self, reaction: Reaction) -> None:
+        """Exerts the wrenches of a reaction during the coming step, in place of those of the last one."""
+        ...
+
+
+class SoftContact:
+    """Soft skin on one body, and the tools that may touch it. It keeps no time: poses and memory in, wrenches out.
+
+    The wrench follows from the poses of the same instant, so a simulator that integrates semi-implicitly (velocity
+    first, then position with the new velocity) couples to it like to a spring of its own: stable while the step is
+    shorter than 2 sqrt(m / k) for the effective mass m of what touches and the contact's stiffness k. `damping` and
+    `implicit` are for what is lighter than that.
+
+    Args:
+        layer: soft layer at rest, or a Skin, or a Simulator that is ready.
+        tools: tools that may touch.
+        method: method that finds the displacement; MomentNet() unless given. Not used with a Skin or Simulator.
+        pose_body_from_layer: pose of the layer's axes in the body's frame, (4, 4); the same frame unless given.
+        damping: damping of the contact [s/m], as of Hunt and Crossley (1975): the elastic force F becomes
+            F (1 + damping v) at the speed v into the skin, and never pulls. Not measured on tissue; 0: elastic.
+        implicit: choice to take the force at the end of the step, to first order (backward Euler, linearised):
+            F* = (F + h k (v + h a)) / (1 + h^2 k A), with the step h, the stiffness k along the force by one more
+            touch 0.05 mm deeper, the speed v into the skin, its acceleration a without the contact, and the
+            mobility A [1/kg] of the tool against the body. Needs `mobility` at each step. Each tool by itself.
+
+    Raises:
+        InvalidInput: tools of one name, no tools, a damping below 0, or a pose that is not rigid.
+        MeshError: a surface that cannot be a tool.
+    """
+
+    def __init__(
+        self,
+        layer: SoftLayer | Skin | Simulator,
+        tools: Sequence[Tool],
+        method: Method | None = None,
+        *,
+        pose_body_from_layer: ArrayLike | None = None,
+        damping: float = 0.0,
+        implicit: bool = False,
+    ) -> None:
+        names = [tool.name for tool in tools]
+        if not names or len(set(names)) < len(names):
+            raise InvalidInput(f"a skin wants tools with names of their own; got {', '.join(names) or 'none'}.")
+        if not (math.isfinite(damping) and damping >= 0):
+            raise InvalidInput(f"damping is {damping} s/m; it must be finite and at least 0.")
+        if isinstance(layer, Simulator):
+            self.simulator = layer
+        else:
+            self.simulator = Simulator(layer, None if isinstance(layer, Skin) else method or MomentNet())
+        self.tools = {tool.name: tool for tool in tools}
+        self.damping, self.implicit = damping, implicit
+        self.pose_body_from_layer = _rigid("pose_body_from_layer", np.eye(4) if pose_body_from_layer is None
+                                           else pose_body_from_layer)  # fmt: skip
+        skin = self.simulator.layer
+        self._far = FAR_HOLES * self.simulator.toucher.hole
+        self._tree = KDTree(skin.vertices)
+        self._balls = {}
+        for tool in tools:
+            low, high = self.simulator.tools.field(tool).tool_bounds
+            middle = 0.5 * (low + high)
+            self._balls[tool.name] = middle, float(np.linalg.norm(tool.vertices - middle, axis=1).max())
+
+    def step(
+        self,
+        poses: Poses,
+        memory: Memory | None = None,
+        dt: float = 0.0,
+        mobility: Callable[[str, np.ndarray, np.ndarray], float] | None = None,
+    ) -> Reaction:
+        """Finds the wrenches at one instant.
+
+        Args:
+            poses: places of now.
+            memory: memory of the step before; None: a fresh start.
+            dt: time since that step [s].
+            mobility: with `implicit`, acceleration [m/s2] of the tool of this name against the body, along a unit
+                vector (3,) at a point (3,) [m], world axes, when 1 N pushes them apart there: n^T J M^-1 J^T n.
+
+        Raises:
+            InvalidInput: poses that are missing, not finite or not rigid, a dt below 0, or no mobility where one
+                is needed.
+        """
+        if self.implicit and mobility is None:
+            raise InvalidInput("an implicit contact needs the mobility of its tools. Try implicit=False.")
+        memory = memory or Memory()
+        body = _rigid("the body", poses.body)
+        world_from_layer = body @ self.pose_body_from_layer
+        layer_from_world = _inverse(world_from_layer)
+        missing = [name for name in self.tools if name not in poses.tools]
+        if missing:
+            raise InvalidInput(f"there is no pose of {', '.join(missing)}; given: {', '.join(poses.tools) or 'none'}.")
+        at = {name: layer_from_world @ _rigid(name, poses.tools[name]) for name in self.tools}
+
+        # Touch: those that are near; the others are apart, which costs nothing.
+        near = [Contact(self.tools[name], pose) for name, pose in at.items() if not self._is_far(name, pose)]
+        found, tissue = self.simulator.touch(near, memory.tissue, dt)
+        touches = {touch.name: touch for touch in found}
+        touches = {name: touches.get(name) or Touch(name, APART, pose, np.zeros(6)) for name, pose in at.items()}
+
+        # Wrenches: from layer to world axes, about the origin of the stated pose; the body feels the opposite.
+        turn = world_from_layer[:3, :3]
+        wrenches, on_body, speed = {}, np.zeros(6), {}
+        for name, touch in touches.items():
+            if not touch.wrench.any():
+                wrenches[name] = np.zeros(6)
+                continue
+            factor, speed[name] = self._factor(touch, at[name], memory, dt, world_from_layer, mobility)
+            force, torque = factor * touch.wrench[:3], factor * touch.wrench[3:]
+            torque = torque + np.cross(touch.pose_body_from_tool[:3, 3] - at[name][:3, 3], force)
+            force, torque = turn @ force, turn @ torque
+            wrenches[name] = -np.concatenate([force, torque])
+            lever = poses.tools[name][:3, 3] - body[:3, 3]
+            on_body += np.concatenate([force, torque + np.cross(lever, force)])
+        return Reaction(wrenches, on_body, touches, Memory(tissue, at, speed))
+
+    def answer(self, reaction: Reaction) -> Answer:
+        """The displacement of the skin under a reaction of this contact, layer axes."""
+        return self.simulator.answer(list(reaction.touches.values()))
+
+    def _is_far(self, name: str, pose: Transform) -> bool:
+        """Whether a tool is outside of the skin and farther from it than the contact law looks."""
+        middle, radius = self._balls[name]
+        centre = pose[:3, :3] @ middle + pose[:3, 3]
+        gap, nearest = self._tree.query(centre)
+        if gap < radius + self._far:
+            return False
+        layer = self.simulator.layer
+        return bool((centre - layer.vertices[nearest]) @ layer.normals[nearest] > 0.5 * gap)
+
+    def _factor(
+        self,
+        touch: Touch,
+        pose: Transform,
+        memory: Memory,
+        dt: float,
+        world_from_layer: Transform,
+        mobility: Callable[[str, np.ndarray, np.ndarray], float] | None,
+    ) -> tuple[float, tuple[float, float]]:
+        """Factor on the elastic wrench; and for the memory, speed into the skin [m/s] and force [N]."""
+        if not self.damping and not self.implicit:
+            return 1.0, (0.0, 0.0)
+        force = touch.force
+        normal, centre = touch.wrench[:3] / force, _centre_of_pressure(touch)
+        before = memory.at.get(touch.name)
+        v = 0.0
+        if before is not None and dt > 0:  # of the tool's point that is at the centre of pressure now
+            then = before @ np.linalg.solve(pose, np.append(centre, 1.0))
+            v = float((centre - then[:3]) @ normal) / dt
+        c = self.damping * force
+        if not self.implicit or dt <= 0:
+            return max(0.0, 1 + self.damping * v), (v, force)
+        assert mobility is not None
+        deeper = pose.copy()
+        deeper[:3, 3] += DEEPER_M * normal
+        harder = self.simulator.touch([Contact(self.tools[touch.name], deeper)])[0]
+        k = max(0.0, (float(harder.wrench[:3] @ normal) - force) / DEEPER_M)
+        turn = world_from_layer[:3, :3]
+        a = mobility(touch.name, turn @ centre + world_from_layer[:3, 3], turn @ normal)
+        # What accelerated it in the last step, less what the contact itself did of that.
+        last = memory.speed.get(touch.name)
+        free = (v - last[0]) / dt + a * last[1] if last else 0.0
+        stiff = k * dt + c
+        taken = max(0.0, (force + stiff * (v + dt * free)) / (1 + stiff * dt * a))
+        return taken / force, (v, taken)
+
+
+def exchange(contact: SoftContact, world: World, memory: Memory | None = None, dt: float = 0.0) -> Reaction:
+    """One step with a world: reads its poses, exerts the wrenches, and returns them. Raises InvalidInput."""
+    reaction = contact.step(world.poses(), memory, dt, getattr(world, "mobility", None))
+    world.push(reaction)
+    return reaction
+
+
+def _centre_of_pressure(touch: Touch) -> np.ndarray:
+    """Point of the wrench's axis that is nearest to the tool's origin, layer axes, (3,) [m]."""
+    force = touch.wrench[:3]
+    return touch.pose_body_from_tool[:3, 3] + np.cross(force, touch.wrench[3:]) / (force @ force)
+
+
+def _rigid(name: str, pose: ArrayLike) -> Transform:
+    """The pose, if it is finite; Contact checks that it is rigid."""
+    try:
+        return finite(f"the pose of {name}", pose, (4, 4))
+    except InvalidInput as error:
+        raise InvalidInput(f"{error} Has the simulation diverged? Try a shorter timestep.") from error
+
+
+def _inverse(pose: Transform) -> Transform:
+    out = np.eye(4)
+    out[:3, :3] = pose[:3, :3].T
+    out[:3, 3] = -out[:3, :3] @ pose[:3, 3]
+    return out

@@ -1,0 +1,99 @@
+"""Shapes: surfaces of MuJoCo's geoms as triangles, for tools and for pictures."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from stmpl_core.arrays import Faces, Points, Transform
+from stmpl_core.errors import InvalidInput
+from stmpl_sim.engine import mujoco
+
+BALL_SPLITS = 4  # times that the icosahedron of a ball is split: 2,562 corners, radius met to 0.05 %
+ROUND = 64  # corners around a cylinder or a capsule
+OFF_NODES = 0.37  # cells by which the nodes of a union's grid are off its faces: on them marching cubes leaves gaps
+KINDS = "sphere, capsule, ellipsoid, cylinder, box and mesh"
+
+
+class Surface(NamedTuple):
+    """Triangles: vertices (N, 3) [m], and faces (M, 3), counter-clockwise seen from outside."""
+
+    vertices: Points
+    faces: Faces
+
+
+def geom_surface(model: Any, geom: int) -> Surface:
+    """Surface of a geom in its own frame, (data.geom_xpos, data.geom_xmat) in the world.
+
+    Raises:
+        InvalidInput: a plane, a height field or a signed distance field, which no tool can be.
+    """
+    import trimesh
+
+    kind, size = int(model.geom_type[geom]), np.array(model.geom_size[geom])
+    kinds = mujoco.mjtGeom
+    if kind == kinds.mjGEOM_SPHERE:
+        mesh = trimesh.creation.icosphere(BALL_SPLITS, size[0])
+    elif kind == kinds.mjGEOM_ELLIPSOID:
+        mesh = trimesh.creation.icosphere(BALL_SPLITS, 1.0)
+        mesh.apply_scale(size)
+    elif kind == kinds.mjGEOM_CAPSULE:
+        arc = np.linspace(-np.pi / 2, np.pi / 2, ROUND // 2 + 2)
+        shift = np.where(arc < 0, -size[1], size[1])
+        outline = np.stack([size[0] * np.cos(arc), size[0] * np.sin(arc) + shift], axis=1)
+        outline[[0, -1], 0] = 0.0
+        mesh = trimesh.creation.revolve(outline, sections=ROUND)
+    elif kind == kinds.mjGEOM_CYLINDER:
+        mesh = trimesh.creation.cylinder(radius=size[0], height=2 * size[1], sections=ROUND)
+    elif kind == kinds.mjGEOM_BOX:
+        mesh = trimesh.creation.box(extents=2 * size)
+    elif kind == kinds.mjGEOM_MESH:
+        return _mesh_surface(model, int(model.geom_dataid[geom]))
+    else:
+        name = kinds(kind).name.removeprefix("mjGEOM_").lower()
+        raise InvalidInput(f"geom '{model.geom(geom).name or geom}' is a {name}; a tool can be a {KINDS}.")
+    return Surface(np.asarray(mesh.vertices), np.asarray(mesh.faces, dtype=np.int32))
+
+
+def _mesh_surface(model: Any, mesh: int) -> Surface:
+    first, count = model.mesh_vertadr[mesh], model.mesh_vertnum[mesh]
+    at, faces = model.mesh_faceadr[mesh], model.mesh_facenum[mesh]
+    return Surface(model.mesh_vert[first : first + count].astype(float), model.mesh_face[at : at + faces].copy())
+
+
+def body_surface(model: Any, geoms: list[int]) -> Surface:
+    """Surface of several geoms of one body together, in the body's frame: of their union, without inner walls."""
+    parts = []
+    for geom in geoms:
+        surface, pose = geom_surface(model, geom), geom_in_body(model, geom)
+        parts.append(Surface(surface.vertices @ pose[:3, :3].T + pose[:3, 3], surface.faces))
+    return parts[0] if len(parts) == 1 else _union(parts)
+
+
+def geom_in_body(model: Any, geom: int) -> Transform:
+    """pose_body_from_geom, (4, 4)."""
+    turn, pose = np.empty(9), np.eye(4)
+    mujoco.mju_quat2Mat(turn, model.geom_quat[geom])
+    pose[:3, :3], pose[:3, 3] = turn.reshape(3, 3), model.geom_pos[geom]
+    return pose
+
+
+def _union(parts: list[Surface], cells: int = 72) -> Surface:
+    """Zero of the least of the parts' distances, by marching cubes: corners are rounded by about a cell."""
+    import igl
+
+    points = np.concatenate([part.vertices for part in parts])
+    low, high = points.min(axis=0), points.max(axis=0)
+    spacing = float((high - low).max()) / cells
+    axes = [np.arange(a - (2 + OFF_NODES) * spacing, b + 3 * spacing, spacing) for a, b in zip(low, high, strict=True)]
+    grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
+    nodes = np.ascontiguousarray(grid.transpose(2, 1, 0, 3).reshape(-1, 3))  # x runs fastest, as igl counts
+    least = np.full(len(nodes), np.inf)
+    for part in parts:
+        distance = igl.signed_distance(nodes, part.vertices, part.faces.astype(np.int64),
+                                       sign_type=igl.SIGNED_DISTANCE_TYPE_FAST_WINDING_NUMBER)[0]  # fmt: skip
+        least = np.minimum(least, distance)
+    shape = grid.shape[:3]
+    vertices, faces = igl.marching_cubes(least, nodes, *shape, 0.0)[:2]
+    return Surface(np.asarray(vertices), np.asarray(faces, dtype=np.int32))

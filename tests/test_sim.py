@@ -1,0 +1,376 @@
+"""stmpl_sim: soft skin in a rigid-body simulator: what it exerts is what the contact law says, on both, once."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from stmpl_core import Contact, Simulator, SoftLayer, Touch
+from stmpl_core.errors import InvalidInput
+from stmpl_core.methods import Winkler
+from stmpl_core.touch import APART
+from stmpl_sim import Memory, Poses, Reaction, SoftBody, SoftContact, exchange
+from stmpl_sim.energy import EnergyBook
+from tests.scenes import ball, limb, plate
+
+mujoco = pytest.importorskip("mujoco", reason="pip install 'stmpl[sim]'")
+
+RADIUS, MASS, GRAVITY = 0.012, 0.3, 9.81  # m, kg, m/s2
+CORE = '<geom name="core" type="box" size=".05 .05 .001" pos="0 0 -.009" mass="1"/>'
+SHAPES = {  # attributes of a geom: its volume [m3]
+    'type="sphere" size=".012"': 4 / 3 * np.pi * 0.012**3,
+    'type="capsule" size=".008 .01"': np.pi * 0.008**2 * 0.02 + 4 / 3 * np.pi * 0.008**3,
+    'type="cylinder" size=".01 .015"': np.pi * 0.01**2 * 0.03,
+    'type="box" size=".01 .012 .014"': 8 * 0.01 * 0.012 * 0.014,
+    'type="ellipsoid" size=".01 .012 .014"': 4 / 3 * np.pi * 0.01 * 0.012 * 0.014,
+}
+
+
+@pytest.fixture(scope="module")
+def slab() -> SoftLayer:
+    return plate(0.09, youngs_modulus=20e3)
+
+
+@pytest.fixture(scope="module")
+def simulator(slab: SoftLayer) -> Simulator:
+    return Simulator(slab, Winkler())
+
+
+def model(tool: str = '<geom name="ball" type="sphere" size=".012" mass=".3"/>', slab: str = CORE, joint: str = "",
+          exclude: bool = True, timestep: float = 1e-3, at: str = "0 0 .0115") -> Any:  # fmt: skip
+    """A slab of soft tissue with something free over it."""
+    kept = '<contact><exclude body1="slab" body2="bob"/></contact>' if exclude else ""
+    return mujoco.MjModel.from_xml_string(
+        f'<mujoco><option timestep="{timestep}" gravity="0 0 -{GRAVITY}"/><worldbody><body name="slab">{joint}{slab}'
+        f'</body><body name="bob" pos="{at}"><freejoint/>{tool}</body></worldbody>{kept}</mujoco>')  # fmt: skip
+
+
+def pose(x: float = 0.0, y: float = 0.0, z: float = 0.0, turn: Rotation | None = None) -> np.ndarray:
+    out = np.eye(4)
+    out[:3, 3] = x, y, z
+    if turn is not None:
+        out[:3, :3] = turn.as_matrix()
+    return out
+
+
+def step(m: Any, d: Any, *skins: SoftBody) -> None:
+    mujoco.mj_step1(m, d)
+    for skin in skins:
+        skin.apply(d)
+    mujoco.mj_step2(m, d)
+
+
+# The step: poses in, wrenches out
+
+
+def test_the_wrench_is_that_of_the_contact_law_and_the_body_feels_the_opposite(simulator: Simulator) -> None:
+    tool = ball(RADIUS)
+    contact = SoftContact(simulator, [tool])
+    at = pose(0.01, -0.005, RADIUS - 0.002)
+    reaction = contact.step(Poses(np.eye(4), {"probe": at}))
+    touch = simulator.touch([Contact(tool, at)])[0]
+    np.testing.assert_allclose(reaction.tools["probe"], -touch.wrench, atol=1e-15)
+    about_origin = -reaction.tools["probe"]
+    about_origin[3:] += np.cross(at[:3, 3], about_origin[:3])
+    np.testing.assert_allclose(reaction.body, about_origin, atol=1e-12)
+
+
+def test_turning_the_scene_turns_the_wrenches(simulator: Simulator) -> None:
+    tool, turn = ball(RADIUS), pose(0.3, -1.0, 0.7, Rotation.from_rotvec([0.4, -1.1, 2.0]))
+    at = pose(0.01, 0.0, RADIUS - 0.002)
+    straight = SoftContact(simulator, [tool]).step(Poses(np.eye(4), {"probe": at}))
+    turned = SoftContact(simulator, [tool]).step(Poses(turn, {"probe": turn @ at}))
+    for before, after in ((straight.tools["probe"], turned.tools["probe"]), (straight.body, turned.body)):
+        np.testing.assert_allclose(after[:3], turn[:3, :3] @ before[:3], atol=1e-9)
+        np.testing.assert_allclose(after[3:], turn[:3, :3] @ before[3:], atol=1e-9)
+
+
+def test_a_layer_with_axes_of_its_own_feels_the_same(simulator: Simulator) -> None:
+    tool, shift = ball(RADIUS), pose(0.2, 0.1, 0.0, Rotation.from_rotvec([0, 0, 1.0]))
+    at = pose(0.01, 0.0, RADIUS - 0.002)
+    there = SoftContact(simulator, [tool], pose_body_from_layer=shift).step(Poses(np.eye(4), {"probe": shift @ at}))
+    here = SoftContact(simulator, [tool]).step(Poses(np.eye(4), {"probe": at}))
+    np.testing.assert_allclose(there.tools["probe"][:3], shift[:3, :3] @ here.tools["probe"][:3], atol=1e-9)
+
+
+def test_a_tool_that_is_not_asked_about_would_have_been_apart() -> None:
+    simulator = Simulator(limb(5e-3), Winkler())
+    tool, random = ball(0.008), np.random.default_rng(1)
+    contact, far = SoftContact(simulator, [tool]), 0
+    for _ in range(150):
+        at = pose(*random.uniform([-0.07, -0.07, 0.0], [0.07, 0.07, 0.16]))
+        touch, law = contact.step(Poses(np.eye(4), {"probe": at})).touches["probe"], None
+        law = simulator.touch([Contact(tool, at)])[0]
+        assert touch.status == law.status
+        np.testing.assert_array_equal(touch.wrench, law.wrench)
+        far += contact._is_far("probe", at)
+    assert 30 < far < 140  # both happened
+
+
+def test_poses_that_cannot_be_used_are_one_sentence(simulator: Simulator) -> None:
+    contact = SoftContact(simulator, [ball(RADIUS)])
+    with pytest.raises(InvalidInput, match=r"no pose of probe; given: finger"):
+        contact.step(Poses(np.eye(4), {"finger": np.eye(4)}))
+    with pytest.raises(InvalidInput, match=r"pose of probe holds 1 values that are not finite.*shorter timestep"):
+        contact.step(Poses(np.eye(4), {"probe": pose(np.nan)}))
+    with pytest.raises(InvalidInput, match=r"names of their own; got probe, probe"):
+        SoftContact(simulator, [ball(RADIUS), ball(RADIUS)])
+    with pytest.raises(InvalidInput, match=r"damping is -1"):
+        SoftContact(simulator, [ball(RADIUS)], damping=-1.0)
+    with pytest.raises(InvalidInput, match=r"needs the mobility"):
+        SoftContact(simulator, [ball(RADIUS)], implicit=True).step(Poses(np.eye(4), {"probe": pose(z=0.011)}))
+
+
+def test_a_step_has_no_memory_but_what_it_is_given(simulator: Simulator) -> None:
+    contact = SoftContact(simulator, [ball(RADIUS)], damping=10.0)
+    first = Poses(np.eye(4), {"probe": pose(z=RADIUS - 1e-3)})
+    second = Poses(np.eye(4), {"probe": pose(z=RADIUS - 1.1e-3)})
+    memory = contact.step(first, Memory(), 1e-3).memory
+    one, two = (contact.step(second, memory, 1e-3).tools["probe"] for _ in range(2))
+    np.testing.assert_array_equal(one, two)
+    elastic = contact.step(second, Memory(), 1e-3).tools["probe"]
+    np.testing.assert_allclose(one, (1 + 10.0 * 0.1) * elastic, rtol=1e-6)  # 0.1 m/s into the skin
+    away = contact.step(first, contact.step(second, memory, 1e-4).memory, 1e-4).tools["probe"]
+    assert not away.any()  # 1 m/s out: damped to nothing, never pulling
+
+
+class MassOnASpring:
+    """A ball on a spring over a slab, integrated by hand: the smallest world there is."""
+
+    def __init__(self, stiffness: float = 200.0, rest: float = RADIUS - 0.01) -> None:
+        self.height, self.speed, self.push_ = RADIUS + 1e-3, 0.0, 0.0
+        self.stiffness, self.rest = stiffness, rest
+
+    def poses(self) -> Poses:
+        return Poses(np.eye(4), {"probe": pose(z=self.height)})
+
+    def push(self, reaction: Reaction) -> None:
+        self.push_ = float(reaction.tools["probe"][2])
+
+    def step(self, dt: float) -> None:
+        self.speed += dt * (self.push_ + self.stiffness * (self.rest - self.height) - 4.0 * self.speed) / MASS
+        self.height += dt * self.speed
+
+
+def test_a_world_of_numpy_comes_to_rest_where_spring_and_skin_agree(simulator: Simulator) -> None:
+    world, contact, memory = MassOnASpring(), SoftContact(simulator, [ball(RADIUS)]), Memory()
+    for _ in range(1500):
+        memory = exchange(contact, world, memory, 1e-3).memory
+        world.step(1e-3)
+    law = simulator.touch([Contact(ball(RADIUS), pose(z=world.height))])[0]
+    assert law.force == pytest.approx(world.stiffness * (world.height - world.rest), rel=1e-4)
+    assert law.force > 0.2
+
+
+# MuJoCo
+
+
+def test_a_ball_lies_where_the_skin_carries_its_weight_and_the_slab_carries_both(simulator: Simulator) -> None:
+    m = model(joint='<joint name="up" type="slide" axis="0 0 1" stiffness="3000" damping="60"/>')
+    d = mujoco.MjData(m)
+    skin = SoftBody(m, simulator, body="slab", tools=["ball"], damping=20.0)
+    for _ in range(2500):
+        step(m, d, skin)
+    touch = skin.apply(d)["ball"]
+    assert touch.force == pytest.approx(MASS * GRAVITY, rel=2e-3)
+    assert 3000 * -d.joint("up").qpos[0] == pytest.approx((MASS + 1.0) * GRAVITY, rel=2e-3)
+    assert skin.answer().magnitude.max() == pytest.approx(touch.depth, rel=0.2)
+    world = skin.skin_points(d, skin.answer())
+    assert world[:, 2].min() < d.body("slab").xpos[2] - 0.5 * touch.depth
+
+
+def test_momentum_is_kept_between_two_free_bodies(simulator: Simulator) -> None:
+    m = model(slab='<geom name="core" size=".03" mass="1"/>', joint="<freejoint/>", at="0.004 -.003 .0115")
+    m.opt.gravity[:] = 0
+    d = mujoco.MjData(m)
+    d.qvel[6:9] = 0, 0, -0.2  # the ball flies at the slab
+    skin = SoftBody(m, simulator, body="slab", tools=["ball"])
+    mujoco.mj_forward(m, d)
+    mass = m.body_mass[[1, 2]]
+
+    def momenta() -> tuple[np.ndarray, np.ndarray]:
+        mujoco.mj_forward(m, d)
+        mujoco.mj_subtreeVel(m, d)
+        linear = mass @ d.subtree_linvel[[1, 2]]
+        spins = d.subtree_angmom[[1, 2]].sum(axis=0)
+        return linear, spins + np.cross(d.xipos[[1, 2]], mass[:, None] * d.subtree_linvel[[1, 2]]).sum(axis=0)
+
+    before = momenta()
+    for _ in range(80):
+        step(m, d, skin)
+    after = momenta()
+    assert np.linalg.norm(d.qvel[:3]) > 0.02  # it was hit
+    np.testing.assert_allclose(after[0], before[0], atol=1e-12)
+    np.testing.assert_allclose(after[1], before[1], atol=1e-5)  # the integrator turns bodies to first order
+
+
+def test_an_elastic_bounce_gives_back_what_it_took(simulator: Simulator) -> None:
+    m = model(at="0 0 .0121")
+    m.opt.gravity[:] = 0
+    for damping, least, most in ((0.0, 0.99, 1.01), (10.0, 0.0, 0.6)):
+        d = mujoco.MjData(m)
+        d.qvel[2] = -0.2
+        skin, book = SoftBody(m, simulator, body="slab", tools=["ball"], damping=damping), EnergyBook()
+        for _ in range(120):
+            step(m, d, skin)
+            assert skin.reaction is not None
+            book.add(skin.memory.at["ball"], skin.reaction.tools["ball"])
+        kept = (d.qvel[2] / 0.2) ** 2
+        assert least < kept < most
+        assert book.held == pytest.approx(0.5 * MASS * 0.2**2 * (1 - kept), abs=1e-6)  # the books are exact
+        assert book.most == pytest.approx(0.5 * MASS * 0.2**2, rel=0.02)
+
+
+def test_wrenches_of_others_stay_and_ours_do_not_pile_up(simulator: Simulator) -> None:
+    m = model()
+    d = mujoco.MjData(m)
+    skin, other = (SoftBody(m, simulator, body="slab", tools=["ball"]) for _ in range(2))
+    skin.apply(d)
+    alone = d.xfrc_applied.copy()
+    assert alone.any()
+    d.xfrc_applied[2, 0] += 3.0
+    for _ in range(5):
+        skin.apply(d)
+    np.testing.assert_allclose(d.xfrc_applied[2] - alone[2], [3, 0, 0, 0, 0, 0], atol=1e-12)
+    other.apply(d)
+    skin.apply(d)
+    np.testing.assert_allclose(d.xfrc_applied[1], 2 * alone[1], atol=1e-12)
+    d.xfrc_applied[:] = 0  # as many programs do at each step
+    skin.apply(d)
+    np.testing.assert_allclose(d.xfrc_applied, alone, atol=1e-12)
+    other.apply(d)
+    other.reset(d)
+    skin.reset(d)
+    assert not d.xfrc_applied.any()
+
+
+def test_reset_begins_the_same_run_again(simulator: Simulator) -> None:
+    m = model()
+    d = mujoco.MjData(m)
+    skin = SoftBody(m, simulator, body="slab", tools=["ball"], damping=20.0)
+    ends = []
+    for _ in range(2):
+        mujoco.mj_resetData(m, d)
+        for _ in range(60):
+            step(m, d, skin)
+        ends.append(d.qpos.copy())
+    np.testing.assert_array_equal(*ends)
+
+
+def test_an_implicit_contact_is_stable_where_an_explicit_one_is_not_and_rests_at_the_same_force() -> None:
+    """A tool of 6 g on a contact of some 1.5 kN/m: 2 sqrt(m / k) is 4 ms."""
+    stiff = Simulator(plate(0.06, youngs_modulus=60e3), Winkler())
+    still = {}
+    for implicit in (False, True):
+        m = model('<geom name="ball" type="sphere" size=".012" mass=".006"/>', timestep=5e-3, at="0 0 .0108")
+        d = mujoco.MjData(m)
+        skin = SoftBody(m, stiff, body="slab", tools=["ball"], implicit=implicit, damping=0.1)
+        d.xfrc_applied[2, 2] = -1.0
+        forces = []
+        for _ in range(300):
+            step(m, d, skin)
+            assert skin.reaction is not None
+            forces.append(skin.reaction.tools["ball"][2])
+        still[implicit] = np.ptp(forces[-50:]), np.mean(forces[-50:])
+    right = 1 + 0.006 * GRAVITY
+    assert still[True][0] < 5e-3 and still[True][1] == pytest.approx(right, rel=1e-3)
+    assert still[False][0] > 0.5 or still[False][1] != pytest.approx(right, rel=0.1)  # it rattles, or was thrown off
+
+
+@pytest.mark.parametrize("attributes", SHAPES)
+def test_the_surface_of_a_geom_has_its_volume(attributes: str) -> None:
+    import trimesh
+
+    from stmpl_sim.shapes import geom_surface
+
+    m = model(f'<geom name="ball" {attributes} mass="1"/>')
+    mesh = trimesh.Trimesh(*geom_surface(m, m.geom("ball").id))
+    assert mesh.is_watertight
+    assert mesh.volume == pytest.approx(SHAPES[attributes], rel=0.006)
+    np.testing.assert_allclose(mesh.center_mass, 0, atol=1e-9)
+
+
+def test_a_mesh_and_a_body_of_several_geoms_are_tools(slab: SoftLayer) -> None:
+    import trimesh
+
+    from stmpl_sim.shapes import body_surface
+
+    corners = " ".join(f"{x} {y} {z}" for x in (0, 0.02) for y in (0, 0.03) for z in (0, 0.04))
+    m = mujoco.MjModel.from_xml_string(
+        f'<mujoco><asset><mesh name="brick" vertex="{corners}"/></asset><worldbody><body name="slab">{CORE}</body>'
+        '<body name="hammer" pos="0 0 .05"><freejoint/><geom type="mesh" mesh="brick" pos="0 0 -.02" mass=".1"/>'
+        '<geom type="sphere" size=".012" pos="0 0 -.02" mass=".1"/></body></worldbody>'
+        '<contact><exclude body1="slab" body2="hammer"/></contact></mujoco>')  # fmt: skip
+    union = trimesh.Trimesh(*body_surface(m, [1, 2]))
+    sphere, brick = 4 / 3 * np.pi * 0.012**3, 0.02 * 0.03 * 0.04
+    assert union.is_watertight
+    assert union.volume == pytest.approx(brick + 7 / 8 * sphere, rel=0.03)  # an eighth of the ball is in the brick
+    skin = SoftBody(m, slab, body="slab", tools=["hammer"], method=Winkler())
+    d = mujoco.MjData(m)
+    d.qpos[2] = 0.031
+    assert skin.apply(d)["hammer"].depth == pytest.approx(1e-3, abs=2e-4)
+
+
+def test_several_tools_feel_each_other_and_each_gets_its_own(simulator: Simulator) -> None:
+    two = ('<geom name="left" type="sphere" size=".008" pos="-.01 0 0" mass=".1"/>'
+           '<geom name="right" type="sphere" size=".008" pos=".01 0 0" mass=".1"/>')  # fmt: skip
+    m = model(two, at="0 0 .007")
+    d = mujoco.MjData(m)
+    skin = SoftBody(m, simulator, body="slab", tools=["left", "right"])
+    touches: Mapping[str, Touch] = skin.apply(d)
+    assert touches["left"].force == pytest.approx(touches["right"].force, rel=0.03) and touches["left"].force > 0
+    assert d.xfrc_applied[2, 2] == pytest.approx(touches["left"].force + touches["right"].force, rel=0.01)
+
+
+def test_what_cannot_be_is_one_clear_sentence(simulator: Simulator) -> None:
+    m = model()
+
+    def make(**changes: Any) -> SoftBody:
+        return SoftBody(changes.pop("model", m), simulator, **{"body": "slab", "tools": ["ball"]} | changes)
+
+    with pytest.raises(InvalidInput, match=r"no body 'arm'. Bodies: bob, slab, world"):
+        make(body="arm")
+    with pytest.raises(InvalidInput, match=r"no geom or body 'probe' to be a tool. Geoms: ball, core"):
+        make(tools=["probe"])
+    with pytest.raises(InvalidInput, match=r"names of their own; got ball, ball"):
+        make(tools=["ball", "ball"])
+    with pytest.raises(InvalidInput, match=r"tools is the text 'ball'"):
+        make(tools="ball")
+    with pytest.raises(InvalidInput, match=r"'core' is part of 'slab'"):
+        make(tools=["core"])
+    with pytest.raises(InvalidInput, match=r"is a plane; a tool can be a sphere"):
+        make(model=mujoco.MjModel.from_xml_string(
+            '<mujoco><worldbody><geom name="ball" type="plane" size="1 1 1"/><body name="slab"><geom size="1" '
+            'contype="0" conaffinity="0"/></body></worldbody></mujoco>'))  # fmt: skip
+    with pytest.raises(InvalidInput, match=r"also collides rigidly.*<exclude body1=\"slab\" body2=\"bob\"/>"):
+        make(model=model(exclude=False))
+    with pytest.raises(InvalidInput, match=r"before the first apply"):
+        make().answer()
+
+
+def test_exclude_does_what_the_sentence_says(simulator: Simulator) -> None:
+    from stmpl_sim import exclude
+
+    spec = mujoco.MjSpec.from_string(
+        f'<mujoco><worldbody><body name="slab">{CORE}</body><body name="bob"><freejoint/><geom name="ball" '
+        'size=".01"/></body></worldbody></mujoco>')  # fmt: skip
+    exclude(spec, "slab", ["ball"])
+    SoftBody(spec.compile(), simulator, body="slab", tools=["ball"])
+    with pytest.raises(InvalidInput, match="no geom or body 'gone'"):
+        exclude(spec, "slab", ["gone"])
+
+
+def test_data_that_is_not_finite_is_one_sentence(simulator: Simulator) -> None:
+    m = model()
+    d = mujoco.MjData(m)
+    d.qpos[0] = np.nan
+    with pytest.raises(InvalidInput, match=r"pose of ball holds .* not finite"):
+        SoftBody(m, simulator, body="slab", tools=["ball"]).apply(d)
+
+
+def test_far_tools_are_apart(simulator: Simulator) -> None:
+    m = model(at="0 0 1")
+    touch = SoftBody(m, simulator, body="slab", tools=["ball"]).apply(mujoco.MjData(m))["ball"]
+    assert touch.status == APART and np.isnan(touch.depth) and not touch.wrench.any()
