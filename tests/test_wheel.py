@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).resolve().parent.parent
-ROOMS = ("stmpl_core", "fem_tools", "bags", "stmpl_ros", "studies")
+ROOMS = ("stmpl_core", "fem_tools", "bags", "stmpl_sim", "stmpl_ros", "studies")
 ASKED_FOR_BY_NAME = {"smplx", "tetgen", "felupe"}  # not for commerce, AGPL, GPL
 
 
@@ -44,13 +44,13 @@ def test_base_and_dev_bring_nothing_that_must_be_asked_for_by_name_and_base_no_t
     base = {line.split(">=")[0].split("==")[0].split("[")[0] for line in requirements if "extra ==" not in line}
     dev = {line.split(">=")[0].split("==")[0] for line in requirements if 'extra == "dev"' in line}
     assert dev and not (base | dev) & ASKED_FOR_BY_NAME
-    assert not base & {"torch", "anny", "roma", "zarr", "viser", "distributed", "shapely"}
+    assert not base & {"torch", "anny", "roma", "zarr", "viser", "distributed", "shapely", "mujoco", "gymnasium"}
 
 
 def test_settings_limbs_weights_and_layouts_are_inside(wheel: zipfile.ZipFile) -> None:
     held = set(wheel.namelist())
     for folder, pattern in (("stmpl_ros/config", "*.yaml"), ("stmpl_core/limbs", "*.npz"), ("stmpl_core/weights", "*"),
-                            ("stmpl_ros/foxglove", "*.json")):  # fmt: skip
+                            ("stmpl_ros/foxglove", "*.json"), ("stmpl_sim/models", "*.xml")):  # fmt: skip
         wanted = {f"{folder}/{path.name}" for path in (ROOT / folder).glob(pattern) if path.is_file()}
         assert wanted and wanted <= held
     assert (ROOT / "config").resolve() == ROOT / "stmpl_ros/config"

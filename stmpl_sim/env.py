@@ -1,0 +1,216 @@
+"""MassageEnv: a gymnasium environment: keep a force on skin that breathes while circling on it. And what solves it."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from stmpl_core.errors import InvalidInput
+from stmpl_core.extras import needed
+from stmpl_core.layer import SoftLayer
+from stmpl_sim.controller import Goal
+from stmpl_sim.massage import Course, Massage
+from stmpl_sim.scene import BALL, build
+from stmpl_sim.site import Site
+
+needed("MassageEnv", "sim", "gymnasium")
+import gymnasium  # noqa: E402
+
+FORCE, SPEED = 10.0, 0.05  # asked of the massage [N], [m/s]
+BREATH_M, BREATH_HZ = 4e-3, 0.25  # amplitude and rate at which the body rises and falls
+CONTROL_S = 0.02  # time between two actions [s]
+PUSH_LIMIT, SHIFT_LIMIT = 20.0, 5e-3  # what the largest action adds: force [N], places beside the course [m]
+MOST = 100.0  # largest size of an observation
+HARD = 40.0  # force at which an episode ends, as too hard [N]
+FORCE_SCALE, OFF_SCALE = 2.0, 5e-3  # errors at which a reward falls to 1 / e [N], [m]
+
+
+class MassageEnv(gymnasium.Env[np.ndarray, np.ndarray]):
+    """A robot massages a breathing body: 10 N along a circle at 50 mm/s.
+
+    Action, (3,) in -1..1: push into the skin, 0..20 N over the range, and places beside the course along the skin,
+    up to 5 mm. The push acts in the open: what the arm feels is not fed back for you. Underneath, the arm follows the
+    course over the body's mean place and keeps upright to the skin.
+    Observation, (8,): force felt [10 N], its rate [100 N/s], where the ball is beside the course [5 mm] (2), height
+    over the mean skin [10 mm] and its rate [50 mm/s], sine and cosine of the course's angle; each within -100..100.
+    Reward, 0..1 a step: exp(-(force error / 2 N)^2) exp(-(off course / 5 mm)^2).
+    An episode ends after its laps; it ends at once, with -10, at 40 N.
+
+    Args:
+        layer: skin; the left forearm as measured unless given. Any part does: living(Body.anny(), "torso").
+        circle: radius of the course [m].
+        laps: laps of an episode.
+        timestep: timestep of physics [s].
+        render_mode: rgb_array, or none.
+    """
+
+    metadata = {"render_modes": ["rgb_array"], "render_fps": round(1 / CONTROL_S)}  # noqa: RUF012
+
+    def __init__(
+        self,
+        layer: SoftLayer | None = None,
+        *,
+        circle: float = 0.012,
+        laps: float = 2.0,
+        timestep: float = 2e-3,
+        render_mode: str | None = None,
+    ) -> None:
+        if render_mode not in (None, *self.metadata["render_modes"]):
+            raise InvalidInput(f"render_mode is {render_mode}; allowed is rgb_array or none.")
+        self.render_mode = render_mode
+        if layer is None:
+            from stmpl_core.body import Body
+            from stmpl_core.living import living
+
+            layer = living(Body.anny(), "left_forearm")
+        site = Site.thickest(layer)
+        self._scene = build(layer, site, mount="animated", timestep=timestep)
+        self.course = Course(site.circle(circle), (FORCE,), SPEED, laps)
+        self.massage = Massage(self._scene, self.course)
+        self._rest = self.massage.data.mocap_pos[0].copy()
+        self._steps = max(1, round(CONTROL_S / timestep))
+        self._camera: Any = None
+        self.action_space = gymnasium.spaces.Box(-1.0, 1.0, (3,), np.float32)
+        self.observation_space = gymnasium.spaces.Box(-MOST, MOST, (8,), np.float32)
+        self._phase, self._time, self._begun = 0.0, 0.0, False
+        self._press = self.course.phases[2].start
+        self._start: tuple[np.ndarray, np.ndarray] | None = None
+        self._last = np.zeros(2)
+        self._goal = self.course.goal(0.0, self._mean(), self._scene.radius)
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict]:
+        """A new episode: the ball presses with 10 N, and the body begins to breathe somewhere in a breath."""
+        super().reset(seed=seed)
+        self._phase = float(self.np_random.uniform(0, 2 * np.pi))
+        if self._start is None:
+            self._start = self._pressed()
+        run = self.massage
+        run.reset()
+        run.data.mocap_pos[0] = self._rest
+        run.data.qpos[:], run.data.qvel[:] = self._start
+        self._time, self._begun = self._press, True
+        run.skin.apply(run.data)
+        self._goal = self.course.goal(self._time, self._mean(), self._scene.radius)
+        self._last = self._felt()
+        return self._observed(), {}
+
+    def _pressed(self) -> tuple[np.ndarray, np.ndarray]:
+        """Configuration and velocity after reaching and pressing, before it breathes."""
+        self.massage.reset()
+        self._time, self._begun = 0.0, False
+        while self._time < self._press:
+            self._advance(FORCE if self._time > self.course.phases[1].start else None, np.zeros(2))
+        return self.massage.data.qpos.copy(), self.massage.data.qvel.copy()
+
+    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+        """One action, held for 20 ms."""
+        action = np.clip(np.asarray(action, dtype=float), -1, 1)
+        self._last = self._felt()
+        for _ in range(self._steps):
+            self._advance(PUSH_LIMIT * 0.5 * (1 + float(action[0])), SHIFT_LIMIT * action[1:])
+        force, off = self._felt()[0], float(np.linalg.norm(self._beside()))
+        reward = float(np.exp(-(((force - FORCE) / FORCE_SCALE) ** 2) - (off / OFF_SCALE) ** 2))
+        hard = force > HARD
+        done = self._time >= self.course.phases[-1].start
+        info = {"force_N": force, "off_course_m": off, "in_range": self._in_range()}
+        return self._observed(), -10.0 if hard else reward, bool(hard), bool(done), info
+
+    def render(self) -> np.ndarray | None:  # type: ignore[override]
+        """A frame, (480, 640, 3) uint8."""
+        if self.render_mode is None:
+            return None
+        if self._camera is None:
+            from stmpl_sim.film import Camera
+
+            layer = self._scene.layer
+            self._camera = Camera(self._scene.model, layer, 0.5 * float(layer.thickness.max()))
+        skin, data = self.massage.skin, self.massage.data
+        answer = skin.answer()
+        self._camera.take(data, skin.skin_points(data, answer), self.massage.limb_pose(), answer.magnitude)
+        return self._camera.frames.pop()
+
+    def close(self) -> None:
+        """Gives the renderer back."""
+        if self._camera is not None:
+            self._camera.close()
+            self._camera = None
+
+    def _advance(self, push: float | None, shift: np.ndarray) -> None:
+        """One step of physics, with a push in the open [N]; None holds the ball over the skin."""
+        run = self.massage
+        breath = np.sin(self._phase + 2 * np.pi * BREATH_HZ * self._time)
+        depth = BREATH_M * self._begun * min(1.0, self._time - self._press)  # m, deeper over the first second
+        run.data.mocap_pos[0] = self._rest + [0, 0, depth * breath]
+        mean = self._mean()
+
+        def goal(_limb: np.ndarray) -> Goal:
+            aim = self.course.goal(self._time, mean, self._scene.radius)
+            across = np.cross(self._axes()[1], aim.normal)
+            beside = shift[0] * across + shift[1] * self._axes()[1]
+            return Goal(aim.point + beside, aim.velocity, aim.acceleration, aim.normal, aim.spin, aim.swing, push,
+                        aim.height, closed=False)  # fmt: skip
+
+        self._goal, _ = run.step(goal)
+        self._time += float(self._scene.model.opt.timestep)
+
+    def _axes(self) -> np.ndarray:
+        """Axes of the site in the world: across and along the limb."""
+        site = self.course.circle.site
+        turn = self.massage.limb_pose()[:3, :3]
+        return np.stack([turn @ np.cross(site.along, site.normal), turn @ site.along])
+
+    def _felt(self) -> np.ndarray:
+        """Force [N] and height over the mean skin [m]."""
+        reaction = self.massage.skin.reaction
+        assert reaction is not None
+        n = self._goal.normal
+        height = (self.massage.data.geom(BALL).xpos - self._goal.point) @ n - self._scene.radius
+        return np.array([reaction.tools[BALL][:3] @ n, height])
+
+    def _beside(self) -> np.ndarray:
+        """Place of the ball beside the course, along the skin, (2,) [m]."""
+        off = self.massage.data.geom(BALL).xpos - self.course.goal(self._time, self._mean(), self._scene.radius).point
+        return self._axes() @ (off - (off @ self._goal.normal) * self._goal.normal)
+
+    def _mean(self) -> np.ndarray:
+        pose = self.massage.limb_pose()
+        pose[:3, 3] = self._rest
+        return pose
+
+    def _in_range(self) -> bool:
+        reaction = self.massage.skin.reaction
+        return reaction is not None and reaction.touches[BALL].trust.in_range is not False
+
+    def _observed(self) -> np.ndarray:
+        force, height = self._felt()
+        rate = (self._felt() - self._last) / CONTROL_S
+        angle = self.course.angle(self._time)[0]
+        values = [force / FORCE, rate[0] / 100, *(self._beside() / SHIFT_LIMIT), height / 0.01, rate[1] / 0.05,
+                  np.sin(angle), np.cos(angle)]  # fmt: skip
+        return np.clip(values, -MOST, MOST).astype(np.float32)
+
+
+class Scripted:
+    """What solves MassageEnv: proportional and integral control of the force, and of the place beside the course.
+
+    Args:
+        proportional: gain on the force's error [-].
+        integral: gain on its integral [1/s].
+    """
+
+    def __init__(self, proportional: float = 0.5, integral: float = 6.0) -> None:
+        self.proportional, self.integral, self.sum = proportional, integral, 0.0
+
+    def act(self, observation: np.ndarray) -> np.ndarray:
+        """The action after an observation."""
+        error = FORCE * (1 - float(observation[0]))
+        self.sum = float(np.clip(self.sum + self.integral * error * CONTROL_S, -FORCE, FORCE))
+        push = FORCE + self.proportional * error + self.sum
+        return np.clip([2 * push / PUSH_LIMIT - 1, *(-observation[2:4])], -1, 1).astype(np.float32)
+
+
+def register() -> None:
+    """Makes gymnasium.make("stmpl/Massage-v0") known."""
+    gymnasium.register("stmpl/Massage-v0", entry_point="stmpl_sim.env:MassageEnv")
+

@@ -1,0 +1,285 @@
+"""Massage: approach, press, circle, let go: a course, the loop in which a robot follows it, and what it kept."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from stmpl_core.errors import InvalidInput
+from stmpl_sim.controller import ForceImpedance, Gains, Goal
+from stmpl_sim.energy import EnergyBook
+from stmpl_sim.engine import mujoco
+from stmpl_sim.mujoco_skin import SoftBody
+from stmpl_sim.scene import BALL, LIMB, Scene
+from stmpl_sim.site import Circle
+
+REACH_S, APPROACH_S, HOLD_S, RELEASE_S = 0.6, 1.4, 1.0, 1.0  # durations of phases
+SETTLE_S = 0.5  # time into a phase from which it is judged
+RAMP_S = 0.4  # time in which the speed along a circle is reached
+FIRST = 0.3  # share of the force with which the tool comes to the skin
+START_M = 0.01  # height over the skin at which the tool begins and ends [m]
+
+
+@dataclass(frozen=True)
+class Phase:
+    """Part of a course.
+
+    Args:
+        name: name: reach, approach, press, circle, release.
+        start: time at which it starts [s].
+        duration: duration [s].
+        force: force into the skin [N].
+    """
+
+    name: str
+    start: float
+    duration: float
+    force: float
+
+
+@dataclass(frozen=True, eq=False)
+class Course:
+    """Approach, then press and circle with each force, then let go.
+
+    Args:
+        circle: circle along the skin.
+        forces: forces, one after the other [N].
+        speed: speed along the circle [m/s]; 0: no circles.
+        laps: laps around it with each force.
+    """
+
+    circle: Circle
+    forces: tuple[float, ...] = (5.0, 10.0)
+    speed: float = 0.05
+    laps: float = 2.0
+    phases: tuple[Phase, ...] = field(init=False)
+
+    def __post_init__(self) -> None:
+        if not self.forces or min(self.forces) <= 0:
+            raise InvalidInput(f"forces are {self.forces}; at least one above 0 N is needed.")
+        if self.speed < 0 or self.laps < 0:
+            raise InvalidInput(f"speed is {self.speed} m/s and laps {self.laps}; neither may be below 0.")
+        lap = 2 * np.pi * self.circle.radius * self.laps / self.speed + RAMP_S if self.speed and self.laps else 0.0
+        found = [Phase("reach", 0.0, REACH_S, 0.0), Phase("approach", REACH_S, APPROACH_S, self.forces[0])]
+        for force in self.forces:
+            for name, duration in (("press", HOLD_S), ("circle", lap)):
+                if duration:
+                    found.append(Phase(name, found[-1].start + found[-1].duration, duration, force))
+        found.append(Phase("release", found[-1].start + found[-1].duration, RELEASE_S, 0.0))
+        object.__setattr__(self, "phases", tuple(found))
+
+    @property
+    def duration(self) -> float:
+        """Duration of all [s]."""
+        return self.phases[-1].start + self.phases[-1].duration
+
+    def phase(self, at: float) -> Phase:
+        """The phase of a time [s]."""
+        return next((p for p in reversed(self.phases) if at >= p.start), self.phases[0])
+
+    def goal(self, at: float, pose_world_from_layer: np.ndarray, radius: float) -> Goal:
+        """What the tool is to do at a time [s], where the limb is now.
+
+        Args:
+            at: time since the start [s].
+            pose_world_from_layer: pose of the limb, (4, 4).
+            radius: radius of the ball [m].
+        """
+        phase = self.phase(at)
+        angle, rate, more = self.angle(at)
+        place = self.circle.at(angle)
+        point, normal, force, height = place.point, place.normal, phase.force, radius
+        if phase.name == "reach":  # from over the site to over the circle's start
+            share = _smooth((at - phase.start) / phase.duration)
+            point = self.circle.site.point + share * (point - self.circle.site.point)
+            normal = self.circle.site.normal + share * (normal - self.circle.site.normal)
+            normal, force, height = normal / np.linalg.norm(normal), None, radius + START_M
+        elif phase.name == "approach":
+            force *= FIRST + (1 - FIRST) * _smooth((at - phase.start) / (0.7 * phase.duration))
+        elif phase.name == "release":
+            height, force = radius + START_M * _smooth((at - phase.start) / (0.7 * RELEASE_S)), None
+        turn = pose_world_from_layer[:3, :3]
+        return Goal(
+            point=turn @ point + pose_world_from_layer[:3, 3],
+            velocity=turn @ (place.slope * rate),
+            acceleration=turn @ (place.bend * rate**2 + place.slope * more),
+            normal=turn @ normal,
+            spin=turn @ np.cross(normal, place.tilt * rate),
+            swing=turn @ np.cross(normal, place.curl * rate**2 + place.tilt * more),
+            force=force,
+            height=height,
+        )
+
+    def angle(self, at: float) -> tuple[float, float, float]:
+        """Angle along the circle, its rate [rad/s] and its acceleration: laps begin and end at rest."""
+        angle, rate, more, top = 0.0, 0.0, 0.0, self.speed / self.circle.radius
+        for phase in self.phases:
+            if phase.name != "circle" or at <= phase.start:
+                continue
+            t, whole = min(at - phase.start, phase.duration), phase.duration
+            up, down = min(t, RAMP_S), max(0.0, t - (whole - RAMP_S))
+            angle += top * (0.5 * up**2 / RAMP_S + max(0.0, t - RAMP_S) - 0.5 * down**2 / RAMP_S)
+            if at < phase.start + whole:
+                rate = top * min(1.0, t / RAMP_S, (whole - t) / RAMP_S)
+                more = top / RAMP_S * ((t < RAMP_S) - float(t > whole - RAMP_S))
+        return angle, rate, more
+
+
+def _smooth(share: float) -> float:
+    """From 0 to 1, at rest at both."""
+    share = min(max(share, 0.0), 1.0)
+    return share * share * (3 - 2 * share)
+
+
+@dataclass(frozen=True, eq=False)
+class Log:
+    """What a run did, a row a step.
+
+    Args:
+        time: time [s], (N,).
+        force: force of the tool into the skin along the outward normal of the course [N], (N,).
+        asked: force that was asked for [N], NaN without one, (N,).
+        depth: depth of the tool, NaN apart [m], (N,).
+        wrench: wrench on the tool, world axes, (N, 6) [N, N m].
+        tool: pose of the tool in the world, (N, 4, 4).
+        limb: pose of the limb in the world, (N, 4, 4).
+        qpos: configuration, (N, nq).
+        energy: energy that the skin holds of what the tool gave it [J], (N,).
+        off: distance of the tool from its course, along the skin [m], (N,).
+        trusted: whether the touch was in the range that was validated, (N,).
+        touch_s: time that contact took in each step on this machine [s], (N,).
+        step_s: time that the whole step took [s], (N,).
+        cpu_s: processor time of the whole step [s], (N,): what a core of its own would have taken.
+        phases: phases.
+    """
+
+    time: np.ndarray
+    force: np.ndarray
+    asked: np.ndarray
+    depth: np.ndarray
+    wrench: np.ndarray
+    tool: np.ndarray
+    limb: np.ndarray
+    qpos: np.ndarray
+    energy: np.ndarray
+    off: np.ndarray
+    trusted: np.ndarray
+    touch_s: np.ndarray
+    step_s: np.ndarray
+    cpu_s: np.ndarray
+    phases: tuple[Phase, ...]
+
+    @property
+    def real_time_factor(self) -> float:
+        """Simulated time over the time that it took on this machine, as busy as it was."""
+        return float((self.time[-1] + self.time[1]) / self.step_s.sum())
+
+    @property
+    def own_core_factor(self) -> float:
+        """Simulated time over the processor time that it took: the real-time factor on a core of its own."""
+        return float((self.time[-1] + self.time[1]) / self.cpu_s.sum())
+
+    def during(self, phase: Phase) -> np.ndarray:
+        """Which rows are judged of a phase, (N,): those from SETTLE_S after its start on."""
+        late = min(SETTLE_S, 0.5 * phase.duration)
+        return (self.time >= phase.start + late) & (self.time < phase.start + phase.duration)
+
+    def save(self, path: Path) -> Path:
+        """Writes all rows as .npz."""
+        rows = {name: value for name, value in vars(self).items() if name != "phases"}
+        phases = np.array([(p.name, p.start, p.duration, p.force) for p in self.phases],
+                          dtype=[("name", "U16"), ("start", float), ("duration", float), ("force", float)])  # fmt: skip
+        np.savez_compressed(path, **rows, phases=phases)
+        return path
+
+
+class Massage:
+    """A robot that follows a course on a skin.
+
+    Args:
+        scene: scene.
+        course: course.
+        gains: gains of the controller.
+        method: method that finds the displacement, or a Skin or Simulator of the scene's layer that is ready.
+        damping: see SoftContact.
+        implicit: see SoftContact.
+    """
+
+    def __init__(self, scene: Scene, course: Course, *, gains: Gains | None = None, skin: Any = None,
+                 damping: float = 0.0, implicit: bool = False) -> None:  # fmt: skip
+        self.scene, self.course = scene, course
+        self.skin = SoftBody(scene.model, skin or scene.layer, body=LIMB, tools=[BALL], damping=damping,
+                             implicit=implicit)  # fmt: skip
+        self.data = mujoco.MjData(scene.model)
+        self.controller = ForceImpedance(scene.model, scene.joints, BALL, scene.qpos, gains)
+        self.reset()
+
+    def reset(self) -> None:
+        """Back to the start."""
+        self.skin.reset(self.data)
+        mujoco.mj_resetData(self.scene.model, self.data)
+        self.data.qpos[:] = self.scene.qpos
+        self.controller.reset()
+        mujoco.mj_forward(self.scene.model, self.data)
+
+    def step(self, goal: Callable[[np.ndarray], Goal]) -> tuple[Goal, float]:
+        """One step: contact, controller, physics.
+
+        Args:
+            goal: what to do, by the pose of the limb.
+
+        Returns:
+            The goal, and the time that contact took [s].
+        """
+        model, data = self.scene.model, self.data
+        mujoco.mj_step1(model, data)
+        begun = time.perf_counter()
+        self.skin.apply(data)
+        took = time.perf_counter() - begun
+        assert self.skin.reaction is not None
+        aim = goal(self.limb_pose())
+        self.controller.command(data, aim, self.skin.reaction.tools[BALL], model.opt.timestep)
+        mujoco.mj_step2(model, data)
+        return aim, took
+
+    def limb_pose(self) -> np.ndarray:
+        """Pose of the limb in the world, (4, 4)."""
+        return self.skin.poses(self.data).body
+
+    def run(self, seen: Sequence[Callable[[Massage, float], None]] = ()) -> Log:
+        """Follows the course from the start.
+
+        Args:
+            seen: functions that are called after each step with this and the time [s]; their time is not counted.
+        """
+        self.reset()
+        radius, dt = self.scene.radius, float(self.scene.model.opt.timestep)
+        rows: list[tuple[Any, ...]] = []
+        book = EnergyBook()
+        for k in range(round(self.course.duration / dt)):
+            at, begun, busy = k * dt, time.perf_counter(), time.process_time()
+            aim, took = self.step(lambda limb, at=at: self.course.goal(at, limb, radius))
+            spent, busy = time.perf_counter() - begun, time.process_time() - busy
+            reaction = self.skin.reaction
+            assert reaction is not None
+            touch, wrench = reaction.touches[BALL], reaction.tools[BALL]
+            poses = reaction.memory.at[BALL], self.skin.contact
+            energy = book.add(poses[0], _in_layer(wrench, self.limb_pose()))
+            off = self.data.geom(BALL).xpos - aim.point
+            along = off - (off @ aim.normal) * aim.normal
+            rows.append((at, wrench[:3] @ aim.normal, np.nan if aim.force is None else aim.force,
+                         touch.depth if touch.presses else np.nan, wrench, self.skin.poses(self.data).tools[BALL],
+                         self.limb_pose(), self.data.qpos.copy(), energy, np.linalg.norm(along),
+                         touch.trust.in_range is not False, took, spent, busy))  # fmt: skip
+            for see in seen:
+                see(self, at)
+        return Log(*(np.array(column) for column in zip(*rows, strict=True)), phases=self.course.phases)
+
+
+def _in_layer(wrench: np.ndarray, limb: np.ndarray) -> np.ndarray:
+    return np.concatenate([wrench[:3] @ limb[:3, :3], wrench[3:] @ limb[:3, :3]])

@@ -1,0 +1,276 @@
+"""Scene: a robot with a tool, and a limb in front of it, as one MuJoCo model."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from stmpl_core.arrays import Transform
+from stmpl_core.errors import InvalidInput
+from stmpl_core.layer import SoftLayer
+from stmpl_sim.engine import mujoco
+from stmpl_sim.mujoco_skin import exclude
+from stmpl_sim.site import Site
+
+ARM = Path(__file__).parent / "models" / "arm7.xml"
+LIMB, HEAD, BALL, EYE = "limb", "head", "ball", "eye"  # names of bodies, geom and camera that a scene adds
+SKIN_MESH, SKIN_GEOM, SKIN_MATERIAL = "skin", "skin", "skin"
+DENSITY = 1050.0  # of a limb [kg/m3]
+HEAD_LENGTH, HEAD_MASS = 0.09, 0.3  # of the massage head, flange to the ball's middle [m], [kg]
+SPRING, TWIST = (1500.0, 20.0), (30.0, 0.4)  # of a limb on springs: N/m and N s/m; N m/rad and N m s/rad
+FROM = np.array([0.34, -0.55, 0.42])  # place of the camera, from the site [m]
+COLOURS = 256  # texels of the skin's colour scale
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """A compiled scene.
+
+    Args:
+        model: MuJoCo model.
+        layer: skin of the limb; its axes are those of the body LIMB.
+        site: place on the skin where the robot is to work.
+        joints: numbers of the robot's joints from its base to the tool.
+        qpos: start, with the tool above the site, (nq,).
+        radius: radius of the ball [m].
+    """
+
+    model: Any
+    layer: SoftLayer
+    site: Site
+    joints: tuple[int, ...]
+    qpos: np.ndarray
+    radius: float
+
+
+def build(
+    layer: SoftLayer,
+    site: Site,
+    *,
+    robot: str | Path | None = None,
+    end: str | None = None,
+    at: tuple[float, float, float] = (0.5, 0.0, 0.25),
+    mount: Literal["fixed", "springs", "animated"] = "fixed",
+    radius: float = 0.02,
+    timestep: float = 1e-3,
+    above: float = 0.01,
+) -> Scene:
+    """Puts a robot with a massage head before a limb, the head over the site.
+
+    The robot's joints from base to tool are driven by torques: actuators of its own on these joints are replaced.
+
+    Args:
+        layer: skin of the limb.
+        site: place on it that is turned up, and put at `at`.
+        robot: MJCF or URDF file; the arm that ships unless given.
+        end: name of the robot's body or site that carries the head, its z axis towards the skin; the last body of
+            the longest chain unless given.
+        at: place of the site in the robot's world [m].
+        mount: what holds the limb: nothing moves it, six springs do, or it is animated (a mocap body).
+        radius: radius of the ball at the head [m].
+        timestep: timestep [s].
+        above: height of the ball over the skin at the start [m].
+
+    Raises:
+        InvalidInput: a file that MuJoCo does not read, an end that is not there, or a site out of reach.
+    """
+    spec = _robot_spec(ARM if robot is None else Path(robot))
+    holder = _end(spec, end)
+    chain = _chain(holder if hasattr(holder, "add_body") else holder.parent)
+    _add_head(holder, radius)
+    _drive(spec, chain)
+    _add_limb(spec, layer, site, np.array(at), mount)
+    _add_stage(spec, np.array(at))
+    exclude(spec, LIMB, [BALL])
+    spec.option.timestep = timestep
+    spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    try:
+        model = spec.compile()
+    except ValueError as error:
+        raise InvalidInput(f"MuJoCo cannot compile the scene: {' '.join(str(error).split())}") from error
+    joints = tuple(model.joint(joint.name).id for joint in chain)
+    qpos = _reach(model, joints, site, np.array(at), radius + above)
+    return Scene(model, layer, site, joints, qpos, radius)
+
+
+def world_from_limb(site: Site, at: np.ndarray) -> Transform:
+    """Pose of a limb whose site lies at `at`, turned up, its length across the robot's view."""
+    pose = np.eye(4)
+    up, along = site.normal, site.along
+    frame = np.stack([np.cross(along, up), along, up], axis=1)  # the site's axes in the layer: x, y, z of the world
+    pose[:3, :3] = frame.T
+    pose[:3, 3] = at - frame.T @ site.point
+    return pose
+
+
+def _robot_spec(path: Path) -> Any:
+    if not path.is_file():
+        raise InvalidInput(f"there is no robot file {path}.")
+    try:
+        spec = mujoco.MjSpec.from_file(str(path))
+    except (ValueError, OSError) as error:
+        raise InvalidInput(f"MuJoCo cannot read {path}: {' '.join(str(error).split())}") from error
+    spec.compiler.discardvisual = spec.compiler.fusestatic = False  # as URDF has them, head and skin would be lost
+    return spec
+
+
+def _end(spec: Any, name: str | None) -> Any:
+    """The body or site that carries the head."""
+    if name is not None:
+        found = spec.body(name) or spec.site(name)
+        if found is None:
+            bodies, sites = (", ".join(one.name for one in many if one.name) for many in (spec.bodies, spec.sites))
+            raise InvalidInput(f"the robot has no body or site '{name}'. Bodies: {bodies}. Sites: {sites or 'none'}.")
+        return found
+    return max(spec.bodies[1:], key=lambda body: (len(_chain(body)), _depth(body)))
+
+
+def _depth(body: Any) -> int:
+    depth = 0
+    while body.parent is not None:
+        body, depth = body.parent, depth + 1
+    return depth
+
+
+def _chain(body: Any) -> list[Any]:
+    """Joints from the base to a body: hinges and slides."""
+    joints: list[Any] = []
+    while body is not None and body.name != "world":
+        joints = [*body.joints, *joints]
+        body = body.parent
+    return joints
+
+
+def _drive(spec: Any, chain: list[Any]) -> None:
+    """A torque motor on each joint of the chain, in place of the robot's own actuators there."""
+    if not chain:
+        raise InvalidInput("no joint moves the robot's end. Give the body behind the last joint with --end.")
+    for k, joint in enumerate(chain):
+        joint.name = joint.name or f"joint_{k + 1}"
+        if joint.type not in (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE):
+            raise InvalidInput(f"joint '{joint.name}' is no hinge and no slide; the controller drives only these.")
+    names = {joint.name for joint in chain}
+    for actuator in list(spec.actuators):
+        if actuator.target in names:
+            spec.delete(actuator)
+    for joint in chain:
+        motor = spec.add_actuator(name=f"torque_{joint.name}", target=joint.name)
+        motor.trntype = mujoco.mjtTrn.mjTRN_JOINT
+        motor.set_to_motor()
+
+
+def _add_head(holder: Any, radius: float) -> None:
+    site = not hasattr(holder, "add_body")
+    parent = holder.parent if site else holder
+    head = parent.add_body(name=HEAD, **({"pos": holder.pos, "quat": holder.quat} if site else {}))
+    head.add_geom(name="stem", type=mujoco.mjtGeom.mjGEOM_CAPSULE, fromto=[0, 0, 0.005, 0, 0, HEAD_LENGTH],
+                  size=[0.35 * radius, 0, 0], contype=0, conaffinity=0, mass=0.4 * HEAD_MASS,
+                  rgba=[0.35, 0.38, 0.42, 1])  # fmt: skip
+    head.add_geom(name=BALL, type=mujoco.mjtGeom.mjGEOM_SPHERE, pos=[0, 0, HEAD_LENGTH], size=[radius, 0, 0],
+                  contype=0, conaffinity=0, mass=0.6 * HEAD_MASS, rgba=[0.16, 0.38, 0.54, 1])  # fmt: skip
+
+
+def _add_limb(spec: Any, layer: SoftLayer, site: Site, at: np.ndarray, mount: str) -> None:
+    from scipy.spatial.transform import Rotation
+
+    pose = world_from_limb(site, at)
+    limb = spec.worldbody.add_body(name=LIMB, pos=pose[:3, 3],
+                                   quat=Rotation.from_matrix(pose[:3, :3]).as_quat(scalar_first=True))  # fmt: skip
+    v = layer.vertices
+    middle, extent = v.mean(axis=0), np.ptp(v, axis=0)
+    radius = 0.5 * float(np.median(extent))
+    mass = DENSITY * np.pi * radius**2 * float(extent.max())
+    limb.explicitinertial, limb.mass, limb.ipos = True, mass, middle
+    limb.inertia = mass * (np.dot(extent, extent) - extent**2) / 12
+    if mount == "animated":
+        limb.mocap = True
+    elif mount == "springs":
+        for kind, name, (stiffness, damping) in ((mujoco.mjtJoint.mjJNT_SLIDE, "slide", SPRING),
+                                                 (mujoco.mjtJoint.mjJNT_HINGE, "turn", TWIST)):  # fmt: skip
+            for axis, letter in zip(np.eye(3), "xyz", strict=True):
+                joint = limb.add_joint(name=f"limb_{name}_{letter}", type=kind, axis=axis, pos=middle)
+                joint.stiffness, joint.damping = np.resize(stiffness, 3), np.resize(damping, 3)
+                joint.springref = joint.armature = joint.frictionloss = 0.0  # the robot's defaults are not the limb's
+                joint.limited = mujoco.mjtLimited.mjLIMITED_FALSE
+    elif mount != "fixed":
+        raise InvalidInput(f"a limb cannot be mounted '{mount}'. Allowed: fixed, springs, animated.")
+    limb.gravcomp = 1.0  # it rests on something that is not drawn
+    mesh = spec.add_mesh(name=SKIN_MESH)
+    mesh.uservert, mesh.userface = v.astype(np.float32).ravel(), layer.faces.astype(np.int32).ravel()
+    mesh.usertexcoord = np.tile([0.5 / COLOURS, 0.5], len(v)).astype(np.float32)
+    mesh.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL
+    _add_colours(spec)
+    limb.add_geom(name=SKIN_GEOM, type=mujoco.mjtGeom.mjGEOM_MESH, meshname=SKIN_MESH, material=SKIN_MATERIAL,
+                  contype=0, conaffinity=0, mass=0.0)  # fmt: skip
+
+
+def _add_colours(spec: Any) -> None:
+    """A texture whose columns are the colours of no to most displacement."""
+    from stmpl_sim.film import colours
+
+    texture = spec.add_texture(name=SKIN_MATERIAL, type=mujoco.mjtTexture.mjTEXTURE_2D, width=COLOURS, height=2,
+                               nchannel=3)  # fmt: skip
+    row = (255 * colours(np.linspace(0, 1, COLOURS))).astype(np.uint8)
+    texture.data = np.concatenate([row, row]).tobytes()
+    material = spec.add_material(name=SKIN_MATERIAL, specular=0.1, shininess=0.2, reflectance=0.0)
+    material.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = SKIN_MATERIAL
+
+
+def _add_stage(spec: Any, at: np.ndarray) -> None:
+    spec.visual.headlight.ambient = [0.35, 0.35, 0.35]
+    spec.visual.headlight.diffuse = [0.45, 0.45, 0.45]
+    spec.visual.global_.offwidth, spec.visual.global_.offheight = 1280, 960
+    spec.add_texture(name="sky", type=mujoco.mjtTexture.mjTEXTURE_SKYBOX, builtin=mujoco.mjtBuiltin.mjBUILTIN_FLAT,
+                     width=8, height=48, rgb1=[0.97, 0.97, 0.98], rgb2=[0.97, 0.97, 0.98])  # fmt: skip
+    world = spec.worldbody
+    world.add_light(pos=at + [-0.2, -0.4, 1.5], dir=[0.13, 0.26, -1.0], diffuse=[0.45, 0.45, 0.45])
+    world.add_geom(name="floor", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[2, 2, 0.05], contype=0, conaffinity=0,
+                   rgba=[0.93, 0.93, 0.92, 1])  # fmt: skip
+    world.add_camera(name=EYE, pos=at + FROM, xyaxes=[*_looking(-FROM)], fovy=33)
+
+
+def _looking(way: np.ndarray) -> np.ndarray:
+    """The camera's right and up axes, (6,), when it looks along a way (3,)."""
+    back = -way / np.linalg.norm(way)
+    right = np.cross([0, 0, 1], back)
+    right /= np.linalg.norm(right)
+    return np.concatenate([right, np.cross(back, right)])
+
+
+def _reach(model: Any, joints: tuple[int, ...], site: Site, at: np.ndarray, height: float) -> np.ndarray:
+    """Configuration with the ball `height` over the site, head down; damped least squares from several starts."""
+    data, random = mujoco.MjData(model), np.random.default_rng(0)
+    dofs, places = model.jnt_dofadr[list(joints)], model.jnt_qposadr[list(joints)]
+    low, high = model.jnt_range[list(joints)].T
+    free = ~model.jnt_limited[list(joints)].astype(bool)
+    low, high = np.where(free, -np.pi, low), np.where(free, np.pi, high)
+    first = model.key_qpos[0][: model.nq] if model.nkey else None
+    ball, target = model.geom(BALL).id, at + [0, 0, height]
+    jacobian = np.zeros((6, model.nv))
+    for trial in range(40):
+        mujoco.mj_resetData(model, data)
+        if trial == 0 and first is not None:
+            data.qpos[places] = first[places]
+        else:
+            data.qpos[places] = 0.5 * (low + high) + (0 if trial < 2 else 0.3 * (high - low)) * random.uniform(
+                -1, 1, len(places))  # fmt: skip
+        for _ in range(200):
+            mujoco.mj_kinematics(model, data)
+            mujoco.mj_comPos(model, data)
+            axis = data.geom_xmat[ball].reshape(3, 3)[:, 2]
+            error = np.concatenate([target - data.geom_xpos[ball], np.cross(axis, [0, 0, -1.0])])
+            if axis[2] > 0:
+                error[3:] += axis[[1, 2, 0]]  # upside down: turn somewhere
+            if np.abs(error).max() < 1e-6:
+                if (data.qpos[places] >= low).all() and (data.qpos[places] <= high).all():
+                    return data.qpos.copy()
+                break
+            mujoco.mj_jacGeom(model, data, jacobian[:3], jacobian[3:], ball)
+            part = jacobian[:, dofs]
+            step = part.T @ np.linalg.solve(part @ part.T + 1e-4 * np.eye(6), error)
+            data.qpos[places] = np.clip(data.qpos[places] + np.clip(step, -0.2, 0.2), low, high)
+    raise InvalidInput(f"the robot's head does not reach the limb at {np.round(at, 3).tolist()} m, pointing down. "
+                       "Put the limb elsewhere (--at X Y Z), or name another end (--end).")  # fmt: skip

@@ -1,0 +1,146 @@
+"""Site: a place on a skin where a robot works, and a circle around it along the skin."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+
+from stmpl_core.errors import InvalidInput
+from stmpl_core.layer import SoftLayer
+
+SMOOTH_M = 12e-3  # width over which normals are averaged [m]: what a tool of that size feels as one surface
+MIDDLE = 0.2  # half width of the middle part of a limb, over its length
+HARMONICS = 6  # of a circle's course along the skin: what is finer is the mesh
+SAMPLES = 240  # points of a circle that are laid on the skin
+
+
+@dataclass(frozen=True, eq=False)
+class Site:
+    """A place on the skin.
+
+    Args:
+        layer: skin.
+        vertex: number of the vertex in its middle.
+    """
+
+    layer: SoftLayer
+    vertex: int
+
+    @classmethod
+    def thickest(cls, layer: SoftLayer) -> Site:
+        """The vertex in the middle part of the limb whose tissue is thickest, averaged over its surroundings."""
+        v = layer.vertices
+        along = (v - v.mean(axis=0)) @ _long_axis(layer)
+        some = np.flatnonzero(np.abs(along) < MIDDLE * np.ptp(along))
+        away = np.linalg.norm(v[some, None] - v[None, some], axis=2) < 2 * SMOOTH_M
+        thick = away @ layer.thickness[some] / away.sum(axis=1)
+        return cls(layer, int(some[(thick / thick.max() - np.abs(along[some]) / np.ptp(along)).argmax()]))
+
+    @cached_property
+    def point(self) -> np.ndarray:
+        """Position, layer axes, (3,) [m]."""
+        return self.layer.vertices[self.vertex]
+
+    @cached_property
+    def normal(self) -> np.ndarray:
+        """Outward unit normal, averaged around, (3,) [-]."""
+        return self.normal_at(self.point)
+
+    @cached_property
+    def along(self) -> np.ndarray:
+        """Unit vector along the limb, square to the normal, (3,) [-]."""
+        axis = _long_axis(self.layer)
+        axis = axis - (axis @ self.normal) * self.normal
+        return axis / np.linalg.norm(axis)
+
+    def normal_at(self, point: np.ndarray) -> np.ndarray:
+        """Outward unit normal around a point on the skin, averaged by area and nearness, (3,) [-]."""
+        away = np.linalg.norm(self.layer.vertices - point, axis=1)
+        sum_ = np.exp(-0.5 * (away / SMOOTH_M) ** 2) @ self.layer.vertex_area_vectors
+        return sum_ / np.linalg.norm(sum_)
+
+    def on_skin(self, across: float, along: float) -> np.ndarray:
+        """Point of the skin over a place in the site's tangent plane [m], (3,). Raises InvalidInput: no skin there."""
+        axes = np.cross(self.along, self.normal), self.along
+        start = self.point + across * axes[0] + along * axes[1] + 0.05 * self.normal
+        corners = self.layer.vertices[self.layer.faces]
+        hits = _hits(corners, start, -self.normal)
+        if not len(hits):
+            raise InvalidInput(f"there is no skin {1e3 * np.hypot(across, along):.0f} mm beside the site. "
+                               "Take a smaller circle, or another site.")  # fmt: skip
+        return start - float(hits.min()) * self.normal
+
+    def circle(self, radius: float) -> Circle:
+        """A circle around the site, laid on the skin. Raises InvalidInput: it leaves the skin."""
+        angle = 2 * np.pi * np.arange(SAMPLES) / SAMPLES
+        points = np.array([self.on_skin(radius * np.cos(a), radius * np.sin(a)) for a in angle])
+        normals = np.array([self.normal_at(p) for p in points])
+        both = np.fft.rfft(np.concatenate([points, normals], axis=1), axis=0) / SAMPLES
+        return Circle(self, radius, both[: HARMONICS + 1])
+
+
+class Place(NamedTuple):
+    """A place on a circle, layer axes, (3,) each.
+
+    Args:
+        point: point [m].
+        slope: its derivative by the angle [m/rad].
+        bend: its second derivative [m/rad2].
+        normal: outward unit normal [-].
+        tilt: its derivative by the angle [1/rad].
+        curl: its second derivative [1/rad2].
+    """
+
+    point: np.ndarray
+    slope: np.ndarray
+    bend: np.ndarray
+    normal: np.ndarray
+    tilt: np.ndarray
+    curl: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class Circle:
+    """A closed course along the skin, smooth.
+
+    Args:
+        site: place around which it goes.
+        radius: radius in the tangent plane [m].
+        harmonics: Fourier coefficients of points and normals over the angle, (HARMONICS + 1, 6).
+    """
+
+    site: Site
+    radius: float
+    harmonics: np.ndarray
+
+    def at(self, angle: float) -> Place:
+        """What lies at an angle [rad]."""
+        k = np.arange(len(self.harmonics))
+        turn = np.exp(1j * k * angle) * np.where(k == 0, 1.0, 2.0)
+        values, rates, bends = ((turn * (1j * k) ** order @ self.harmonics).real for order in range(3))
+        size = np.linalg.norm(values[3:])
+        normal = values[3:] / size
+        shrink = rates[3:] @ normal / size
+        tilt = rates[3:] / size - shrink * normal
+        curl = bends[3:] / size - 2 * shrink * tilt
+        return Place(values[:3], rates[:3], bends[:3], normal, tilt, curl - (curl @ normal) * normal)
+
+
+def _long_axis(layer: SoftLayer) -> np.ndarray:
+    return np.linalg.svd(layer.vertices - layer.vertices.mean(axis=0), full_matrices=False)[2][0]
+
+
+def _hits(corners: np.ndarray, start: np.ndarray, way: np.ndarray) -> np.ndarray:
+    """Distances along a ray at which it meets triangles (F, 3, 3), (N,) [m] (Moeller and Trumbore 1997)."""
+    a, e1, e2 = corners[:, 0], corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+    p = np.cross(way, e2)
+    det = np.einsum("ij,ij->i", e1, p)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        s = start - a
+        u = np.einsum("ij,ij->i", s, p) / det
+        q = np.cross(s, e1)
+        v, t = (q @ way) / det, np.einsum("ij,ij->i", q, e2) / det
+        return t[(np.abs(det) > 1e-18) & (u >= 0) & (v >= 0) & (u + v <= 1) & (t > 0)]

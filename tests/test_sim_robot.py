@@ -1,0 +1,123 @@
+"""A robot in MuJoCo: it keeps its force on skin, on a course along it; scene, film and environment around it."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from stmpl_core import Simulator, SoftLayer
+from stmpl_core.errors import InvalidInput
+from stmpl_core.methods import Winkler
+
+pytest.importorskip("mujoco", reason="pip install 'stmpl[sim]'")
+
+
+@pytest.fixture(scope="module")
+def forearm() -> SoftLayer:
+    from stmpl_core import Tissue
+    from stmpl_core.body import Body
+
+    return Body.anny().part("left_forearm", tissue=Tissue(youngs_modulus=20e3))
+
+
+def test_the_arm_presses_circles_and_lets_go(forearm: SoftLayer, tmp_path: Path) -> None:
+    from stmpl_sim.massage import Course, Massage
+    from stmpl_sim.scene import build
+    from stmpl_sim.site import Site
+
+    site = Site.thickest(forearm)
+    course = Course(site.circle(0.012), (5.0,), laps=0.5)
+    massage = Massage(build(forearm, site, timestep=2e-3), course, skin=Simulator(forearm, Winkler()))
+    log = massage.run()
+    for phase in course.phases:
+        if phase.name in ("press", "circle"):
+            force = log.force[log.during(phase)]
+            assert force.mean() == pytest.approx(5.0, abs=0.1) and np.abs(force - 5.0).max() < 0.5
+            assert log.off[log.during(phase)].max() < 5e-4
+    assert not log.wrench[-1].any()
+    assert abs(log.energy[-1]) < 0.1 * log.energy.max()
+    kept = np.load(log.save(tmp_path / "log.npz"))
+    np.testing.assert_array_equal(kept["force"], log.force)
+
+
+def test_a_course_is_smooth_and_its_rates_are_its_derivatives(forearm: SoftLayer) -> None:
+    from stmpl_sim.massage import Course
+    from stmpl_sim.site import Site
+
+    circle = Site.thickest(forearm).circle(0.012)
+    step, place = 1e-5, circle.at(0.7)
+    ahead, behind = circle.at(0.7 + step), circle.at(0.7 - step)
+    for value, rate in (("point", "slope"), ("slope", "bend"), ("normal", "tilt")):
+        found = (getattr(ahead, value) - getattr(behind, value)) / (2 * step)
+        np.testing.assert_allclose(getattr(place, rate), found, atol=1e-6)
+    away = np.linalg.norm(forearm.vertices - place.point, axis=1).min()
+    assert away < forearm.edge_length
+    course = Course(circle, (5.0,), laps=1.0)
+    times = np.linspace(0, course.duration, 4001)
+    angles = np.array([course.angle(t) for t in times])
+    np.testing.assert_allclose(np.gradient(angles[:, 0], times)[1:-1], angles[1:-1, 1], atol=0.02)
+    assert angles[-1, 0] == pytest.approx(2 * np.pi) and angles[:, 1].max() == pytest.approx(0.05 / 0.012)
+
+
+def test_a_robot_of_ones_own_is_driven_and_what_it_lacks_is_said(forearm: SoftLayer, tmp_path: Path) -> None:
+    """A gantry of three slides as URDF, with no actuator."""
+    from stmpl_sim.massage import Course, Massage
+    from stmpl_sim.scene import build
+    from stmpl_sim.site import Site
+
+    site, parts = Site.thickest(forearm), []
+    for k, axis in enumerate(("1 0 0", "0 1 0", "0 0 1")):
+        parts.append(f'<joint name="j{k}" type="prismatic"><parent link="l{k}"/><child link="l{k + 1}"/>'
+                     f'<axis xyz="{axis}"/><origin xyz="0 0 {0.5 * (k == 2)}" rpy="{3.14159265 * (k == 2)} 0 0"/>'
+                     '<limit lower="-1" upper="1" effort="200" velocity="1"/></joint>')  # fmt: skip
+    inertia = '<inertia ixx=".01" iyy=".01" izz=".01" ixy="0" ixz="0" iyz="0"/>'
+    links = "".join(f'<link name="l{k}"><inertial><mass value="1"/>{inertia}</inertial></link>' for k in range(4))
+    path = tmp_path / "gantry.urdf"
+    path.write_text(f'<robot name="gantry">{links}{"".join(parts)}</robot>')
+    scene = build(forearm, site, robot=path, at=(0.3, 0.1, 0.1), timestep=2e-3)
+    log = Massage(scene, Course(site.circle(0.005), (5.0,), laps=0), skin=Simulator(forearm, Winkler())).run()
+    assert log.force[log.during(log.phases[2])].mean() == pytest.approx(5, abs=0.2)
+    with pytest.raises(InvalidInput, match=r"no body or site 'gripper'\. Bodies: .*l3"):
+        build(forearm, site, robot=path, end="gripper")
+    with pytest.raises(InvalidInput, match="does not reach the limb"):
+        build(forearm, site, robot=path, at=(3.0, 0, 0))
+    with pytest.raises(InvalidInput, match="no robot file"):
+        build(forearm, site, robot=tmp_path / "nothing.xml")
+    path.write_text("<robot><link>")
+    with pytest.raises(InvalidInput, match="MuJoCo cannot read"):
+        build(forearm, site, robot=path)
+
+
+def test_frames_drawn_in_software_show_the_nearer_of_two_triangles() -> None:
+    from stmpl_sim.film import HEIGHT, WIDTH, draw
+
+    square = np.array([[-1.0, -1, 0], [1, -1, 0], [0, 1, 0]])
+    corners = np.stack([square, 0.3 * square + [0, 0, 0.5]])
+    picture = draw(corners, np.array([[1.0, 0, 0], [0, 1, 0]]), np.tile([0.0, 0, 1], (2, 1)), np.array([0.0, 0, 3]),
+                   np.eye(3), 60.0)  # fmt: skip
+    middle, rim = picture[HEIGHT // 2, WIDTH // 2], picture[HEIGHT // 2 + 60, WIDTH // 2]
+    assert middle[1] > 100 and middle[0] == 0
+    assert rim[0] > 100 and rim[1] == 0
+
+
+def test_the_environment_passes_gymnasiums_own_check_and_its_script_solves_it(forearm: SoftLayer) -> None:
+    pytest.importorskip("gymnasium", reason="pip install 'stmpl[sim]'")
+    from gymnasium.utils.env_checker import check_env
+
+    from stmpl_sim.env import MassageEnv, Scripted
+
+    env, policy = MassageEnv(forearm, laps=0.3), Scripted()
+    check_env(env, skip_render_check=True)
+    observation, _ = env.reset(seed=3)
+    rewards, done, failed = [], False, False
+    while not (done or failed):
+        observation, reward, failed, done, _ = env.step(policy.act(observation))
+        rewards.append(reward)
+    assert done and np.mean(rewards[20:]) > 0.6
+    still = []
+    observation, _ = env.reset(seed=3)
+    for _ in rewards:
+        still.append(env.step(np.array([-1.0, 0, 0]))[1])
+    assert np.mean(still[20:]) < 0.3  # who does nothing is not paid
+    with pytest.raises(InvalidInput, match="render_mode"):
+        MassageEnv(forearm, render_mode="human")
