@@ -9,6 +9,7 @@ import numpy as np
 from stmpl_core.errors import InvalidInput
 from stmpl_core.extras import needed
 from stmpl_core.layer import SoftLayer
+from stmpl_core.simulator import Simulator
 from stmpl_sim.controller import Goal
 from stmpl_sim.massage import Course, Massage
 from stmpl_sim.scene import BALL, build
@@ -38,7 +39,8 @@ class MassageEnv(gymnasium.Env[np.ndarray, np.ndarray]):
     An episode ends after its laps; it ends at once, with -10, at 40 N.
 
     Args:
-        layer: skin; the left forearm as measured unless given. Any part does: living(Body.anny(), "torso").
+        layer: skin, or a Simulator that is ready; the left forearm as measured unless given. Any part does:
+            living(Body.anny(), "torso").
         circle: radius of the course [m].
         laps: laps of an episode.
         timestep: timestep of physics [s].
@@ -49,7 +51,7 @@ class MassageEnv(gymnasium.Env[np.ndarray, np.ndarray]):
 
     def __init__(
         self,
-        layer: SoftLayer | None = None,
+        layer: SoftLayer | Simulator | None = None,
         *,
         circle: float = 0.012,
         laps: float = 2.0,
@@ -64,10 +66,11 @@ class MassageEnv(gymnasium.Env[np.ndarray, np.ndarray]):
             from stmpl_core.living import living
 
             layer = living(Body.anny(), "left_forearm")
+        ready, layer = (layer, layer.layer) if isinstance(layer, Simulator) else (None, layer)
         site = Site.thickest(layer)
         self._scene = build(layer, site, mount="animated", timestep=timestep)
         self.course = Course(site.circle(circle), (FORCE,), SPEED, laps)
-        self.massage = Massage(self._scene, self.course)
+        self.massage = Massage(self._scene, self.course, skin=ready)
         self._rest = self.massage.data.mocap_pos[0].copy()
         self._steps = max(1, round(CONTROL_S / timestep))
         self._camera: Any = None

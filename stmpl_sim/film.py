@@ -14,6 +14,7 @@ import numpy as np
 from stmpl_core.errors import InvalidInput
 
 log = logging.getLogger(__name__)
+logging.getLogger("OpenGL.acceleratesupport").setLevel(logging.WARNING)  # says on every import what it lacks
 
 SKIN = np.array([[242, 228, 218], [247, 178, 103], [228, 87, 46], [140, 28, 63], [46, 10, 60]]) / 255
 WIDTH, HEIGHT = 640, 480  # of a frame [pixels]
@@ -49,6 +50,7 @@ class Camera:
     def __init__(self, model: Any, layer: Any, most: float, backend: str | None = None) -> None:
         self.model, self.layer, self.most = model, layer, most
         self.frames: list[np.ndarray] = []
+        self._surfaces: dict[int, Any] = {}
         self.backend, self._renderer = _renderer(model, backend)
         if self._renderer is not None:
             from stmpl_sim.scene import SKIN_MESH
@@ -103,7 +105,9 @@ class Camera:
             kind = self.model.geom_type[geom]
             if self.model.geom(geom).name == SKIN_GEOM or kind == mujoco.mjtGeom.mjGEOM_PLANE:
                 continue
-            surface = geom_surface(self.model, geom)
+            if geom not in self._surfaces:
+                self._surfaces[geom] = geom_surface(self.model, geom)
+            surface = self._surfaces[geom]
             at, turn = data.geom_xpos[geom], data.geom_xmat[geom].reshape(3, 3)
             there = (surface.vertices @ turn.T + at)[surface.faces]
             corners.append(there)

@@ -205,7 +205,7 @@ class Massage:
         scene: scene.
         course: course.
         gains: gains of the controller.
-        method: method that finds the displacement, or a Skin or Simulator of the scene's layer that is ready.
+        skin: Skin or Simulator of the scene's layer that is ready; made with MomentNet() unless given.
         damping: see SoftContact.
         implicit: see SoftContact.
     """

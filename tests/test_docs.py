@@ -3,6 +3,7 @@
 import re
 import runpy
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -60,6 +61,20 @@ def test_the_readmes_python_runs() -> None:
     assert names["touches"][0].force > 0 and names["answer"].magnitude.max() > 1e-3
 
 
+def test_the_simulators_pages_python_runs() -> None:
+    """All of it, one block after the other, as somebody reads it."""
+    pytest.importorskip("mujoco", reason="pip install 'stmpl[sim]'")
+    pytest.importorskip("gymnasium", reason="pip install 'stmpl[sim]'")
+    names: dict[str, Any] = {}
+    for code in PYTHON.findall((ROOT / "docs" / "simulators.md").read_text()):
+        exec(compile(code, "simulators.md", "exec"), names)
+    assert names["touches"]["ball"].force == pytest.approx(3, rel=0.05)
+    assert names["log"].force[names["circling"]].mean() == pytest.approx(5, abs=0.3)
+    world = names["world"]
+    assert world.force == pytest.approx(world.stiffness * (world.height - world.rest), rel=0.02)
+    assert names["info"]["force_N"] == pytest.approx(10, abs=1.5)
+
+
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
 def test_pages_name_files_and_verbs_that_exist(page: Path) -> None:
     text = page.read_text()
@@ -73,6 +88,8 @@ def test_pages_name_files_and_verbs_that_exist(page: Path) -> None:
 
 @pytest.mark.ros  # the node is among the names
 def test_the_reference_is_up_to_date() -> None:
+    pytest.importorskip("gymnasium", reason="pip install 'stmpl[sim]'")
+    pytest.importorskip("mujoco", reason="pip install 'stmpl[sim]'")
     made = runpy.run_path(str(ROOT / "docs" / "make_api.py"))
     gone = [name for heading in made["PUBLIC"] for name in made["names"](heading) if made["find"](*name) is None]
     assert not gone, f"docs/make_api.py promises what does not exist: {gone}"

@@ -1,5 +1,6 @@
 """A robot in MuJoCo: it keeps its force on skin, on a course along it; scene, film and environment around it."""
 
+import json
 from pathlib import Path
 
 import numpy as np
@@ -121,3 +122,21 @@ def test_the_environment_passes_gymnasiums_own_check_and_its_script_solves_it(fo
     assert np.mean(still[20:]) < 0.3  # who does nothing is not paid
     with pytest.raises(InvalidInput, match="render_mode"):
         MassageEnv(forearm, render_mode="human")
+
+
+def test_the_verb_prints_figures_and_leaves_log_and_film(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    from stmpl_ros.cli import main
+
+    flags = "sim --tissue single --force 5 --laps 0 --rate 250 --film software --json --out".split()
+    with pytest.raises(SystemExit) as ended:
+        main([*flags, str(tmp_path)])
+    assert ended.value.code == 0
+    figures = json.loads(capsys.readouterr().out)
+    assert figures["phases"][0]["mean_N"] == pytest.approx(5.0, abs=0.05) and figures["frames_by"] == "software"
+    assert len(np.load(tmp_path / "log.npz")["force"]) == 1000
+    assert Path(figures["film"]).stat().st_size > 10_000
+    for wrong, why in ((["--rate", "5"], "allowed is 50 to 20000"), (["--force", "-1"], "above 0 N"),
+                       (["--robot", "nothing.urdf"], "no robot file")):  # fmt: skip
+        with pytest.raises(SystemExit) as ended:
+            main([*flags, str(tmp_path), *wrong])
+        assert ended.value.code == 1 and why in capsys.readouterr().err

@@ -1,0 +1,181 @@
+"""The verb `sim`: a robot massages a limb in a simulator, on this machine alone."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import tyro
+
+from stmpl_core.console import print_figures
+from stmpl_core.errors import InvalidInput
+from stmpl_core.extras import needed
+
+if TYPE_CHECKING:
+    from stmpl_core.layer import SoftLayer
+    from stmpl_sim.massage import Log, Massage
+
+FILM_RATE = 20.0  # frames a second
+PAPER_MODULUS = 20e3  # Young's modulus of the limb of one material [Pa]
+ros_arguments: list[str] = []  # arguments of ROS, from --ros-args on; this verb has no use for them
+
+
+def sim(
+    out: Path = Path("runs/sim"),
+    part: str = "left_forearm",
+    tissue: Literal["relaxed", "tensed", "single"] = "relaxed",
+    force: tuple[float, ...] = (5.0, 10.0),
+    speed: float = 50.0,
+    circle: float = 12.0,
+    laps: float = 2.0,
+    radius: float = 20.0,
+    mount: Literal["fixed", "springs"] = "fixed",
+    robot: Path | None = None,
+    end: str | None = None,
+    at: tuple[float, float, float] = (0.5, 0.0, 0.25),
+    rate: float = 1000.0,
+    damping: float = 0.0,
+    film: Literal["auto", "egl", "osmesa", "software", "none"] = "auto",
+    as_json: Annotated[bool, tyro.conf.arg(name="json")] = False,
+) -> int:
+    """A robot presses on a limb, circles on it and lets go, in MuJoCo, without ROS: force kept, energy, speed, a film.
+
+    Example: stmpl sim --force 5 --laps 1 --tissue single
+    With your own robot: stmpl sim --robot arm.urdf --end tool0 --at 0.6 0 0.3
+
+    Args:
+        out: folder for log.npz and film.webp.
+        part: part of the average body: left_forearm, right_thigh, torso.
+        tissue: tissue of it; relaxed, tensed: skin, fat and muscle as measured in its region, with the muscle so;
+            single: one material of 20 kPa, 7.5 mm thick.
+        force: forces to press with, one after the other [N].
+        speed: speed along the circles [mm/s].
+        circle: radius of the circles [mm].
+        laps: laps with each force.
+        radius: radius of the ball that presses [mm].
+        mount: what holds the limb: nothing moves it, or springs do.
+        robot: MJCF or URDF file; the 7-axis arm that ships unless given. Its actuators become torque motors.
+        end: body or site of the robot that carries the ball, z axis towards the skin; the last body unless given.
+        at: place of the limb in the robot's world [m].
+        rate: rate of physics, with contact at every step [Hz].
+        damping: damping of the contact [s/m], not measured on tissue; 0: elastic.
+        film: what makes the film's frames: auto takes the first that works here; none makes no film.
+        as_json: figures as JSON, for machines.
+    """
+    needed("stmpl sim", "sim", "mujoco")
+    if not 50 <= rate <= 20_000:
+        raise InvalidInput(f"--rate is {rate:g} Hz; allowed is 50 to 20000.")
+    from stmpl_sim.massage import Course, Massage
+    from stmpl_sim.scene import build
+    from stmpl_sim.site import Site
+
+    layer = limb(part, tissue)
+    site = Site.thickest(layer)
+    scene = build(layer, site, robot=robot, end=end, at=at, mount=mount, radius=1e-3 * radius, timestep=1 / rate)
+    course = Course(site.circle(1e-3 * circle), tuple(force), 1e-3 * speed, laps)
+    massage = Massage(scene, course, damping=damping)
+    out.mkdir(parents=True, exist_ok=True)
+    camera = None
+    if film != "none":
+        from stmpl_sim.film import Camera
+
+        most = 0.5 * float(layer.thickness[site.vertex])
+        camera = Camera(scene.model, layer, most, None if film == "auto" else film)
+    log = _run(massage, camera, quiet=as_json)
+    log.save(out / "log.npz")
+    figures = figures_of(log) | {"log": str(out / "log.npz")}
+    if camera is not None:
+        from stmpl_sim.film import save
+
+        figures |= {"film": str(save(camera.frames, out / "film.webp", FILM_RATE)), "frames_by": camera.backend}
+        camera.close()
+    print_figures(figures if as_json else table(figures))
+    return 0
+
+
+def limb(part: str, tissue: str) -> SoftLayer:
+    """A part of the average body. Raises InvalidInput: no such part."""
+    from stmpl_core.body import Body
+    from stmpl_core.living import living
+    from stmpl_core.tissue import Tissue
+
+    if tissue == "single":
+        return Body.anny().part(part, tissue=Tissue(youngs_modulus=PAPER_MODULUS))
+    return living(Body.anny(), part, "tensed" if tissue == "tensed" else "relaxed")
+
+
+def _run(massage: Massage, camera: Any, *, quiet: bool) -> Log:
+    """Runs the course under a progress bar; the camera takes its frames."""
+    from stmpl_core.console import steps_bar
+
+    dt = float(massage.scene.model.opt.timestep)
+    steps, every = round(massage.course.duration / dt), max(1, round(1 / (FILM_RATE * dt)))
+    with steps_bar("steps", quiet=quiet) as show:
+
+        def see(run: Massage, at: float) -> None:
+            k = round(at / dt)
+            if k % 50 == 0:
+                show(k, steps, run.course.phase(at).name)
+            if camera is not None and k % every == 0:
+                answer = run.skin.answer()
+                camera.take(run.data, run.skin.skin_points(run.data, answer), run.limb_pose(), answer.magnitude)
+
+        return massage.run([see])
+
+
+def figures_of(log: Log) -> dict[str, Any]:
+    """What a run kept, SI units."""
+    import numpy as np
+
+    phases = []
+    for phase in log.phases:
+        rows = log.during(phase)
+        if phase.name not in ("press", "circle"):
+            continue
+        force, depth = log.force[rows], log.depth[rows]
+        phases.append({
+            "name": phase.name, "asked_N": phase.force, "mean_N": float(force.mean()),
+            "deviation_N": float(force.std()), "worst_N": float(np.abs(force - phase.force).max()),
+            "depth_m": float(np.nanmean(depth)) if np.isfinite(depth).any() else float("nan"),
+            "off_course_m": float(log.off[rows].max()), "in_range": float(log.trusted[rows].mean()),
+        })  # fmt: skip
+    most = float(log.energy.max())
+    return {
+        "phases": phases,
+        "highest_force_N": float(log.force.max()),
+        "stored_J": most,
+        "given_out_J": -float(log.energy[-1]),
+        "given_out_of_stored": -float(log.energy[-1]) / most if most > 0 else 0.0,
+        "limb_moved_m": float(np.linalg.norm(log.limb[:, :3, 3] - log.limb[0, :3, 3], axis=1).max()),
+        "rate_Hz": 1 / float(log.time[1] - log.time[0]),
+        "real_time_factor": log.real_time_factor,
+        "real_time_factor_of_processor_time": log.own_core_factor,
+        "touch_s": float(np.median(log.touch_s)),
+        "step_s": float(np.median(log.step_s)),
+    }
+
+
+def table(figures: dict[str, Any]) -> Any:
+    """The figures for people."""
+    from rich.console import Group
+    from rich.table import Table
+
+    shown = Table(title="force kept", title_justify="left")
+    for heading in ("phase", "asked [N]", "kept [N]", "worst [N]", "depth [mm]", "off course [mm]", "in range [%]"):
+        shown.add_column(heading, justify="left" if heading == "phase" else "right", no_wrap=heading == "kept [N]")
+    for p in figures["phases"]:
+        shown.add_row(p["name"], f"{p['asked_N']:.1f}", f"{p['mean_N']:.2f} ± {p['deviation_N']:.2f}",
+                      f"{p['worst_N']:.2f}", f"{1e3 * p['depth_m']:.1f}", f"{1e3 * p['off_course_m']:.2f}",
+                      f"{100 * p['in_range']:.0f}")  # fmt: skip
+    lines = [
+        f"highest force {figures['highest_force_N']:.1f} N; limb moved {1e3 * figures['limb_moved_m']:.1f} mm",
+        f"energy: stored {1e3 * figures['stored_J']:.2f} mJ at most, given out beyond what was put in "
+        f"{1e3 * figures['given_out_J']:+.3f} mJ ({100 * figures['given_out_of_stored']:+.1f} %)",
+        f"{figures['rate_Hz']:.0f} Hz, contact at every step: {figures['real_time_factor']:.2f} of real time here, "
+        f"{figures['real_time_factor_of_processor_time']:.2f} by processor time "
+        f"(contact {1e3 * figures['touch_s']:.2f} of {1e3 * figures['step_s']:.2f} ms, median)",
+        f"log: {figures['log']}",
+    ]
+    if "film" in figures:
+        lines.append(f"film: {figures['film']}, frames by {figures['frames_by']}")
+    return Group(shown, *lines)
