@@ -12,18 +12,18 @@ if TYPE_CHECKING:
     from stmpl_core.simulator import Simulator
     from stmpl_core.skin import Skin
     from stmpl_core.state import State
-    from stmpl_core.tissue import Membrane, Ply, Tissue
+    from stmpl_core.tissue import Membrane, Ply, Prony, Tissue
     from stmpl_core.tool import Tool
     from stmpl_core.tools import Tools
     from stmpl_core.touch import Answer, Touch
     from stmpl_core.trust import Displacement, Trust
 
-__all__ = ["Answer", "Contact", "Displacement", "Load", "Membrane", "Ply", "Simulator", "Skin", "SoftLayer", "State",
-           "Tissue", "Tool", "Tools", "Touch", "Trust"]  # fmt: skip
+__all__ = ["Answer", "Contact", "Displacement", "Load", "Membrane", "Ply", "Prony", "Simulator", "Skin", "SoftLayer",
+           "State", "Tissue", "Tool", "Tools", "Touch", "Trust"]  # fmt: skip
 
 _HOME = {"Answer": "touch", "Contact": "contact", "Displacement": "trust", "Load": "load", "Membrane": "tissue",
-         "Ply": "tissue", "Simulator": "simulator", "Skin": "skin", "SoftLayer": "layer", "State": "state",
-         "Tissue": "tissue", "Tool": "tool", "Tools": "tools",
+         "Ply": "tissue", "Prony": "tissue", "Simulator": "simulator", "Skin": "skin", "SoftLayer": "layer",
+         "State": "state", "Tissue": "tissue", "Tool": "tool", "Tools": "tools",
          "Touch": "touch", "Trust": "trust"}  # fmt: skip
 
 

@@ -117,7 +117,7 @@ def _jet(field: SignedDistance, pose: np.ndarray, points: Points) -> tuple[np.nd
 
 def _tool(touch: Touch, pressed: Pressed, layer: SoftLayer) -> _Tool:
     assert touch.pressure is not None
-    field, squeeze, _, _ = pressed
+    field, squeeze = pressed.field, pressed.squeeze
     v = squeeze.vertices
     pressure = touch.pressure[v]
     way = way_of(touch, pressed, -layer.normals[v], float(pressure @ layer.vertex_areas[v]))

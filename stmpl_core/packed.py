@@ -11,7 +11,7 @@ import numpy as np
 
 from stmpl_core.chart import UvChart
 from stmpl_core.layer import SoftLayer
-from stmpl_core.tissue import Membrane, Ply, Tissue
+from stmpl_core.tissue import Membrane, Ply, Prony, Tissue
 
 
 def pack(layer: SoftLayer) -> dict[str, np.ndarray]:
@@ -24,14 +24,23 @@ def pack(layer: SoftLayer) -> dict[str, np.ndarray]:
     arrays["tissue"] = np.array([tissue.youngs_modulus, tissue.poisson_ratio, tissue.density])
     if isinstance(layer.chart, UvChart):
         arrays["uv"] = layer.chart.uv
-    if not tissue.single or tissue.source:
+    if not tissue.single or tissue.source or tissue.relaxation:
         arrays["stack"] = np.frombuffer(stack_to_text(tissue).encode(), np.uint8)
     return arrays
 
 
 def stack_to_text(tissue: Tissue) -> str:
-    """A tissue as JSON."""
-    return json.dumps(asdict(tissue))
+    """A tissue as JSON. A series that is not there is not written: elastic tissues read as they always did."""
+    return json.dumps(_plain(asdict(tissue)))
+
+
+def _plain(values: dict[str, Any]) -> dict[str, Any]:
+    """Fields of a tissue, or of one of its materials, without the series of those that are elastic."""
+    out = {name: value for name, value in values.items() if name != "relaxation" or value is not None}
+    for name in ("skin", "deeper"):
+        if out.get(name):
+            out[name] = _plain(out[name]) if name == "skin" else [_plain(one) for one in out[name]]
+    return out
 
 
 def layer_stack_to_text(layer: SoftLayer) -> str:
@@ -61,7 +70,14 @@ def stack_from_text(text: str) -> Tissue:
 
 def _stack(given: dict[str, Any]) -> Tissue:
     skin, deeper = given.pop("skin"), given.pop("deeper")
-    return Tissue(**given, skin=Membrane(**skin) if skin else None, deeper=tuple(Ply(**one) for one in deeper))
+    membrane = Membrane(**_with_series(skin)) if skin else None
+    return Tissue(**_with_series(given), skin=membrane, deeper=tuple(Ply(**_with_series(one)) for one in deeper))
+
+
+def _with_series(values: dict[str, Any]) -> dict[str, Any]:
+    """Fields of a material, its series made of those that it was written as."""
+    series = values.get("relaxation")
+    return values | {"relaxation": Prony(**series)} if series else values
 
 
 def unpack(arrays: Mapping[str, np.ndarray]) -> SoftLayer:

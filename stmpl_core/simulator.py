@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import cached_property
 from typing import overload
 
 import numpy as np
 
 from stmpl_core.conform import Conformed, conform, kept_out
 from stmpl_core.contact import Contact
+from stmpl_core.dragged import Flat, dragged_motion
 from stmpl_core.errors import InvalidInput
+from stmpl_core.friction import Friction
+from stmpl_core.history import History
 from stmpl_core.layer import SoftLayer
 from stmpl_core.load import Load
 from stmpl_core.methods.base import Method
@@ -34,15 +38,19 @@ class Simulator:
         layer: soft layer at rest, or a Skin, which is prepared already.
         method: method that solves for the motion, prepared here; None: that of the Skin.
         tools: tools with their distance fields; None: an empty store, to which contacts add theirs.
+        friction: coefficient of friction, or the name of a pair in stmpl_core.friction, of all tools or by tool's name;
+            it is felt where touches have a state. None: none.
 
     Attributes:
         toucher: contact law on this layer.
+        history: what time, friction and the balance of energy make of it.
 
     Raises:
-        InvalidInput: a layer without a method.
+        InvalidInput: a layer without a method, or friction that is none.
     """
 
-    def __init__(self, layer: SoftLayer | Skin, method: Method | None = None, tools: Tools | None = None) -> None:
+    def __init__(self, layer: SoftLayer | Skin, method: Method | None = None, tools: Tools | None = None, *,
+                 friction: Friction | Mapping[str, Friction] = None) -> None:  # fmt: skip
         if isinstance(layer, Skin):
             self.skin = layer
         elif method is None:
@@ -54,6 +62,11 @@ class Simulator:
         if self._green is not None:
             self._green.keep(self.layer)  # a Skin from another process has a layer of its own
         self.toucher = Toucher(self.layer, self.skin.near, tools)
+        self.history = History(self.toucher, friction)
+
+    @cached_property
+    def _flat(self) -> Flat:
+        return Flat.of(self.layer, self.skin.near)
 
     @property
     def tools(self) -> Tools:
@@ -73,7 +86,8 @@ class Simulator:
 
         Args:
             contacts: tools at one instant, each once.
-            state: memory of the steps before; None: no memory, and none is returned.
+            state: memory of the steps before, empty at the beginning; None: elastic skin without friction, as if
+                nothing had been before, and no state is returned.
             dt: time since that state [s].
 
         Raises:
@@ -85,24 +99,25 @@ class Simulator:
             raise InvalidInput(f"contacts must have names of their own; got {', '.join(names)}.")
         if not dt >= 0:
             raise InvalidInput(f"dt is {dt} s; time goes forward, allowed is 0 or more.")
-        touches = self.toucher.touch_all(contacts)
-        return touches if state is None else (touches, state)
+        return self.toucher.touch_all(contacts) if state is None else self.history.step(contacts, state, dt)
 
     def answer(self, touches: Sequence[Touch]) -> Answer:
         """Finds the displacement of the skin under touches of this simulator."""
         # Sum: pressures of several tools add.
         zero = np.zeros(len(self.layer.vertices))
-        pressing = [(touch.pressure, touch.pressed.factor) for touch in touches
+        pressure = sum((touch.pressure for touch in touches if touch.pressure is not None), zero)
+        moves = self.history.elastic(touches)
+        pressing = [(touch.pressure, touch.pressed.factor) for touch in moves
                     if touch.pressure is not None and touch.pressed is not None]  # fmt: skip
-        pressure = sum((one for one, _ in pressing), zero)
 
         # Solve: the method moves the skin, and what is touched lies on its tool; where nothing presses, nothing moves.
         if pressing:
             moving = sum((one / factor for one, factor in pressing), zero)
-            motion = None if self._green is None else stuck_motion(self._green, touches)
+            motion = None if self._green is None else stuck_motion(self._green, moves)
             solved = self.method.solve(Load.contact(moving, motion))
-            fitted = conform(self.layer, self.skin.near, solved.displacement, touches) if motion is None else \
-                kept_out(self.layer, solved.displacement, touches)
+            fitted = conform(self.layer, self.skin.near, solved.displacement, moves) if motion is None else \
+                kept_out(self.layer, solved.displacement, moves)
+            fitted = self._dragged(fitted, touches)
         else:
             solved = Displacement(np.zeros_like(self.layer.vertices), Trust(), self.method.name)
             fitted = Conformed(solved.displacement, 0.0, 0.0)
@@ -117,6 +132,15 @@ class Simulator:
         if trust.in_range:
             trust = replace(trust, error_bound=self._bound(touches, peak))
         return Answer(displacement, trust, solved.method, pressure, {touch.name: touch for touch in touches})
+
+    def _dragged(self, fitted: Conformed, touches: Sequence[Touch]) -> Conformed:
+        """The answer with the skin that is dragged along."""
+        for touch in touches:
+            if touch.slip is not None:
+                more = dragged_motion(self._green or self._flat, touch)
+                if more is not None:
+                    fitted = fitted._replace(displacement=fitted.displacement + more)
+        return fitted
 
     def _bound(self, touches: Sequence[Touch], peak: float) -> float | None:
         """Bound on the error of the motion under touches that are in range [m]; None where the method knows none.

@@ -2,9 +2,127 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import numpy as np
+
+from stmpl_core.errors import InvalidInput
+from stmpl_core.slip import SPRINGS
+
+VERSION = 1  # of packed states; older ones are not read
 
 
-@dataclass(frozen=True)
+class Memory(NamedTuple):
+    """What skin and tool remember of each other after a step. P: number of times of relaxation.
+
+    Args:
+        pose: pose of the tool, (4, 4).
+        wrench: wrench that it exerted, (6,) [N, N m].
+        scalars: see Scalars, in that order.
+        relaxed: elastic force that has relaxed in each time, (P,) [N].
+        contact: middle of the last contact on the skin at rest [m], its inward normal, and a tangent that goes with
+            it, (3, 3).
+        imprint: pose of the tool when it pressed last, (4, 4).
+        stiffness: stiffness of the patch to the ways of `springs`, (3,) [N/m]; 0: no friction yet.
+        springs: forces of the springs of friction without relaxation, (SPRINGS, 3) [N].
+        springs_relaxed: what of them has relaxed, (P, SPRINGS, 3) [N].
+    """
+
+    pose: np.ndarray
+    wrench: np.ndarray
+    scalars: Scalars
+    relaxed: np.ndarray
+    contact: np.ndarray
+    imprint: np.ndarray
+    stiffness: np.ndarray
+    springs: np.ndarray
+    springs_relaxed: np.ndarray
+
+
+class Scalars(NamedTuple):
+    """The numbers of a Memory.
+
+    Args:
+        pressing: 1 where the tool pressed, 0 where it did not, -1 where nobody told of it.
+        elastic: force of elastic skin [N]; of skin that is free, that of the depth to which it has come back.
+        largest: largest of it so far [N].
+        net: size of the force over the sum of its parts' sizes [-].
+        radius: radius of the last contact [m].
+        depth: depth of the last contact [m].
+        imprint_force: elastic force there [N].
+        power: power of the depth with which the force grows there [-].
+        share: share of the contact that slid [-].
+        work: work that was put into the contact and not given back [J].
+        passive: factor on the wrench that kept it above 0 [-].
+    """
+
+    pressing: float = 0.0
+    elastic: float = 0.0
+    largest: float = 0.0
+    net: float = 1.0
+    radius: float = 0.0
+    depth: float = 0.0
+    imprint_force: float = 0.0
+    power: float = 1.5
+    share: float = 1.0
+    work: float = 0.0
+    passive: float = 1.0
+
+
+def fresh(pose: np.ndarray, terms: int) -> Memory:
+    """Memory of a tool at a pose (4, 4) that has not touched, for skin with so many times of relaxation."""
+    return Memory(pose, np.zeros(6), Scalars(), np.zeros(terms), np.eye(3), pose, np.zeros(3), np.zeros((SPRINGS, 3)),
+                  np.zeros((terms, SPRINGS, 3)))  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
 class State:
-    """Memory of the tissue: goes into a step and comes out of it. Empty: this tissue has none."""
+    """Memory of the tissue: goes into a step and comes out of it. Empty: nothing was touched yet.
+
+    It can be pickled; `pack` and `unpack` are for files. Two states are the same where their `pack` is.
+
+    Args:
+        tools: memory of each tool that touches or has touched, by name.
+    """
+
+    tools: Mapping[str, Memory] = field(default_factory=dict)
+
+    def pack(self) -> bytes:
+        """The state as bytes, exact: a line of JSON, then float64 numbers, the least byte first."""
+        names = sorted(self.tools)
+        terms = max((len(self.tools[name].relaxed) for name in names), default=0)
+        head = json.dumps({"version": VERSION, "terms": terms, "tools": names}) + "\n"
+        numbers = [np.ravel(one) for name in names for one in self.tools[name]]
+        return head.encode() + np.concatenate([*numbers, np.empty(0)]).astype("<f8").tobytes()
+
+    @classmethod
+    def unpack(cls, packed: bytes) -> State:
+        """The state of such bytes.
+
+        Raises:
+            InvalidInput: bytes of another kind.
+        """
+        head, _, rest = bytes(packed).partition(b"\n")
+        try:
+            told = json.loads(head)
+            names, terms, version = list(told["tools"]), int(told["terms"]), told["version"]
+            numbers = np.frombuffer(rest, "<f8").astype(float)
+        except (ValueError, KeyError, TypeError) as error:
+            raise InvalidInput(f"{len(packed)} bytes are no state: {error}.") from error
+        shapes = [one.shape for one in map(np.asarray, fresh(np.eye(4), terms))]
+        size = sum(int(np.prod(shape)) for shape in shapes)
+        if version != VERSION or len(numbers) != size * len(names):
+            raise InvalidInput(f"a state of version {version} with {len(numbers)} numbers cannot be read; expected are "
+                               f"version {VERSION} and {size * len(names)} numbers of {len(names)} tools.")  # fmt: skip
+        return cls({name: _memory(part, shapes) for name, part in
+                    zip(names, numbers.reshape(len(names), size), strict=True)})  # fmt: skip
+
+
+def _memory(numbers: np.ndarray, shapes: list[tuple[int, ...]]) -> Memory:
+    ends = np.cumsum([int(np.prod(shape)) for shape in shapes])[:-1]
+    parts = [part.reshape(shape) for part, shape in zip(np.split(numbers, ends), shapes, strict=True)]
+    pose, wrench, scalars, *rest = parts
+    return Memory._make([pose, wrench, Scalars(*map(float, scalars)), *rest])

@@ -15,6 +15,48 @@ FRICTION = 0.52  # static, on skin: median of 450 measurements (Veijgen et al., 
 
 
 @dataclass(frozen=True)
+class Prony:
+    """How stress fades under a strain that is held: a share 1 - sum g_i (1 - exp(-t / tau_i)) of it is left.
+
+    Moduli are those of a strain too quick for it to fade; the relaxed ones are 1 - sum g_i of them.
+
+    Args:
+        shares: g_i of the terms [-], each above 0, their sum below 1.
+        times: tau_i of the terms [s], > 0.
+        source: where the numbers come from.
+    """
+
+    shares: tuple[float, ...]
+    times: tuple[float, ...]
+    source: str = ""
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "shares", tuple(float(x) for x in self.shares))
+        object.__setattr__(self, "times", tuple(float(x) for x in self.times))
+        if len(self.shares) != len(self.times) or not self.shares:
+            raise InvalidInput(
+                f"a Prony series has {len(self.shares)} shares and {len(self.times)} times; it needs as "
+                "many of each, and one at least."
+            )
+        if not all(x > 0 for x in self.shares) or not sum(self.shares) < 1:
+            raise InvalidInput(
+                f"the shares of a Prony series are {self.shares}; each must be above 0, and their sum below 1."
+            )
+        if not all(np.isfinite(x) and x > 0 for x in self.times):
+            raise InvalidInput(f"the times of a Prony series are {self.times} s; each must be finite and above 0.")
+
+    @property
+    def relaxed(self) -> float:
+        """Share of a stress that is left at last, 1 - sum g_i [-]."""
+        return 1.0 - sum(self.shares)
+
+    def left(self, after: float | np.ndarray) -> np.ndarray:
+        """Share of a stress that is left after times that a strain was held [-], in the shape of `after` [s]."""
+        fading = np.exp(-np.asarray(after, dtype=np.float64)[..., None] / np.array(self.times))
+        return self.relaxed + fading @ np.array(self.shares)
+
+
+@dataclass(frozen=True)
 class Membrane:
     """Skin: a sheet so thin that it only resists stretching, and carries a tension at rest.
 
@@ -24,6 +66,7 @@ class Membrane:
         tension: T, the same in all directions of the rest state [N/m], >= 0.
         poisson_ratio: nu_s [-], in [0, 0.5]; 0.5: its thickness gives what its area takes.
         source: where the numbers come from.
+        relaxation: how its stress fades, but for the tension at rest; None: it is elastic.
     """
 
     youngs_modulus: float
@@ -31,12 +74,15 @@ class Membrane:
     tension: float = 0.0
     poisson_ratio: float = 0.45
     source: str = ""
+    relaxation: Prony | None = None
 
     def __post_init__(self) -> None:
         _check_moduli(self.youngs_modulus, min(self.poisson_ratio, 0.499))
         if not (np.isfinite(self.thickness) and 0 < self.thickness <= THICKEST_SKIN):
-            raise InvalidInput(f"the skin is {self.thickness:g} m thick; above 0 and up to {THICKEST_SKIN:g} m is "
-                               "accepted. Is it in millimetres? Scale it by 1e-3.")
+            raise InvalidInput(
+                f"the skin is {self.thickness:g} m thick; above 0 and up to {THICKEST_SKIN:g} m is "
+                "accepted. Is it in millimetres? Scale it by 1e-3."
+            )
         if not (np.isfinite(self.tension) and self.tension >= 0):
             raise InvalidInput(f"the skin's tension is {self.tension:g} N/m; it must be finite and not below 0.")
 
@@ -56,6 +102,7 @@ class Ply:
         poisson_ratio: nu [-], in [0, 0.5).
         name: what it is.
         source: where the numbers come from.
+        relaxation: how its stress fades; None: it is elastic.
     """
 
     depth: float
@@ -63,6 +110,7 @@ class Ply:
     poisson_ratio: float = 0.45
     name: str = ""
     source: str = ""
+    relaxation: Prony | None = None
 
     def __post_init__(self) -> None:
         _check_moduli(self.youngs_modulus, self.poisson_ratio)
@@ -85,6 +133,7 @@ class Tissue:
         skin: membrane on top; None: the first material reaches to the surface.
         deeper: materials below the first, from the skin inwards.
         source: where the first material's numbers come from.
+        relaxation: how the first material's stress fades; None: it is elastic.
     """
 
     youngs_modulus: float = 1e3
@@ -93,6 +142,7 @@ class Tissue:
     skin: Membrane | None = None
     deeper: tuple[Ply, ...] = ()
     source: str = ""
+    relaxation: Prony | None = None
 
     def __post_init__(self) -> None:
         _check_moduli(self.youngs_modulus, self.poisson_ratio)
@@ -125,6 +175,11 @@ class Tissue:
         return self.skin is None and not self.deeper
 
     @property
+    def relaxes(self) -> bool:
+        """Whether the stress of any of its materials fades."""
+        return any(one is not None and one.relaxation is not None for one in (self, self.skin, *self.deeper))
+
+    @property
     def stacked(self) -> tuple[float, ...]:
         """The numbers of skin and deeper materials, one after the other: E_s, h, T, nu_s, and depth, E, nu of each."""
         skin = self.skin
@@ -144,7 +199,9 @@ def _check_moduli(youngs_modulus: float, poisson_ratio: float) -> None:
     if not (np.isfinite(youngs_modulus) and youngs_modulus > 0):
         raise InvalidInput(f"youngs_modulus is {youngs_modulus} Pa; it must be finite and above 0.")
     if youngs_modulus < SOFTEST:
-        raise InvalidInput(f"youngs_modulus is {youngs_modulus:g} Pa; at least {SOFTEST:g} Pa is accepted. Is "
-                           "it in kilopascals? Scale it by 1e3.")
+        raise InvalidInput(
+            f"youngs_modulus is {youngs_modulus:g} Pa; at least {SOFTEST:g} Pa is accepted. Is "
+            "it in kilopascals? Scale it by 1e3."
+        )
     if not 0 <= poisson_ratio < 0.5:
         raise InvalidInput(f"poisson_ratio is {poisson_ratio}; allowed is 0 <= nu < 0.5 (try 0.499).")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Literal, NamedTuple
 
 import numpy as np
 
@@ -37,13 +37,43 @@ class Pressed(NamedTuple):
         field: distance field of the tool.
         squeeze: columns that the tool squeezes.
         way: unit vector of the force that moved the tool, (3,), or None where the pose alone was given.
-        factor: factor on the pressure of a tool that was drawn back from the core: it stiffens, and moves no skin.
+        factor: factor on the pressure that moves no skin: of a tool that was drawn back from the core, and of time.
+        forces: forces along the normals at the squeeze's nodes, (N,) [N]; None: not told.
+        power: power of the depth with which the force grows, about [-].
     """
 
     field: SignedDistance
     squeeze: Squeeze
     way: np.ndarray | None
     factor: float = 1.0
+    forces: np.ndarray | None = None
+    power: float = 1.5
+
+
+SlipKind = Literal["stick", "creep", "slide"]
+
+
+class Slip(NamedTuple):
+    """Friction of a contact: what it carries, and how far the skin goes along.
+
+    Args:
+        wrench: part of the touch's wrench that is friction, (6,) [N, N m].
+        share: share of the normal force under which the skin slides [-]: 0 all sticks, 1 all slides.
+        offset: way by which the skin under the tool is dragged along it, (3,) [m].
+        turn: turn by which it is, about the inward normal of the contact [rad].
+        middle: middle of the contact on the skin at rest, (3,) [m].
+    """
+
+    wrench: Wrench
+    share: float
+    offset: np.ndarray
+    turn: float
+    middle: np.ndarray
+
+    @property
+    def kind(self) -> SlipKind:
+        """Whether the contact sticks, creeps (slides at its rim), or slides as a whole."""
+        return "slide" if self.share > 1 - 1e-9 else "creep" if self.share > 0 else "stick"
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,6 +92,10 @@ class Touch:
         trust: verdict on the touch: what may be believed of it.
         pressure: pressure on the skin, (V,) [Pa]; None in recordings, which keep the sum over all tools.
         pressed: squeeze and field from which the motion under the tool follows; None: nothing presses, or a recording.
+        slip: friction of the contact; None: none is told (no state, no friction, nothing presses, or a recording).
+        imprint: pose of the tool at which it would press elastic skin to where the skin is that has not come back yet,
+            (4, 4); None: the skin is where the tool is.
+        passive: factor on the wrench that keeps the contact from giving more energy than was put in [-].
     """
 
     name: str
@@ -75,11 +109,19 @@ class Touch:
     trust: Trust = field(default_factory=Trust)
     pressure: PerVertex | None = None
     pressed: Pressed | None = None
+    slip: Slip | None = None
+    imprint: Transform | None = None
+    passive: float = 1.0
+
+    @property
+    def push(self) -> np.ndarray:
+        """Force that the tool presses with, friction left out, (3,) [N]."""
+        return self.wrench[:3] if self.slip is None else self.wrench[:3] - self.slip.wrench[:3]
 
     @property
     def force(self) -> float:
-        """Size of the force that the tool presses with [N]."""
-        return float(np.linalg.norm(self.wrench[:3]))
+        """Size of the force that the tool presses with, friction left out [N]."""
+        return float(np.linalg.norm(self.push))
 
     @property
     def drag(self) -> float:
@@ -106,7 +148,7 @@ def way_of(touch: Touch, pressed: Pressed, inward: np.ndarray, total: float) -> 
     """
     if touch.force <= MIN_ONE_WAY_SHARE * total:
         return inward
-    one = touch.wrench[:3] / touch.force
+    one = touch.push / touch.force
     if pressed.way is not None and pressed.way @ one > MIN_ONE_WAY_SHARE:
         one = pressed.way
     return np.tile(one, (len(inward), 1))
@@ -125,6 +167,7 @@ class Answer(Displacement):
     def faded(self, share: float, why: str) -> Answer:
         """A share of this answer, whose input has stopped: every tool is STALE and exerts nothing."""
         trust = replace(self.trust, error_bound=None).also(why, in_range=False)
-        touches = {name: replace(touch, status=STALE, wrench=np.zeros(6), pressure=None, pressed=None)
+        touches = {name: replace(touch, status=STALE, wrench=np.zeros(6), pressure=None, pressed=None, slip=None,
+                                 imprint=None)
                    for name, touch in self.touches.items()}  # fmt: skip
         return Answer(share * self.displacement, trust, self.method, None, touches)

@@ -114,8 +114,13 @@ class Toucher:
         """Touch of one contact alone. Raises MeshError: a surface that cannot be a tool."""
         return self.touch_all([contact])[0]
 
-    def touch_all(self, contacts: Sequence[Contact]) -> list[Touch]:
-        """Touches of several contacts at once: tools side by side feel each other through the skin."""
+    def touch_all(self, contacts: Sequence[Contact], *, alone: bool = True) -> list[Touch]:
+        """Touches of several contacts at once: tools side by side feel each other through the skin.
+
+        Args:
+            contacts: tools at one instant.
+            alone: whether each touch is the last word, and tells of what of its wrench is not carried (`unmet`).
+        """
         if not contacts:
             return []
         many = len(contacts) >= MANY_TOOLS
@@ -131,7 +136,7 @@ class Toucher:
             parts = zip(*(np.split(values, ends) for values in together[:3]), strict=True)
             for one, (pressure, doubt, outside) in zip(group, parts, strict=True):
                 held[one.contact.name] = Held(pressure, doubt, outside, together.power)
-        return [self._answer(one, held.get(one.contact.name, NOTHING)) for one in placed]
+        return [self._answer(one, held.get(one.contact.name, NOTHING), alone) for one in placed]
 
     def _near_each_other(self, pressing: Sequence[_Placed]) -> list[list[_Placed]]:
         """The tools in groups, between which none feels another: what many tools cost grows with the largest."""
@@ -278,7 +283,7 @@ class Toucher:
             best = best._replace(force=min(size, best.force), why=f"{contact.name} did not settle within 2 %")
         return best
 
-    def _answer(self, one: _Placed, held: Held) -> Touch:
+    def _answer(self, one: _Placed, held: Held, alone: bool) -> Touch:
         """What a placed tool does, scaled to its wrench, with what may be believed of it."""
         layer, nodes = self.layer, one.squeeze.nodes
         there = held.pressure * (one.factor * self._modulus)
@@ -305,11 +310,13 @@ class Toucher:
             moved=one.moved,
             missing=np.zeros(6) if stated is None else stated - wrench,
             pressure=values,
-            pressed=Pressed(one.field, one.squeeze, way, one.factor) if len(v) else None,
+            pressed=Pressed(one.field, one.squeeze, way, one.factor, scale * forces_there, held.power * STIFFER)
+            if len(v) else None,
         )  # fmt: skip
-        return replace(touch, trust=self._trust(one, touch, v, pressure, strange))
+        return replace(touch, trust=self._trust(one, touch, v, pressure, strange, alone))
 
-    def _trust(self, one: _Placed, touch: Touch, vertices: np.ndarray, pressure: np.ndarray, strange: float) -> Trust:
+    def _trust(self, one: _Placed, touch: Touch, vertices: np.ndarray, pressure: np.ndarray, strange: float,
+               alone: bool) -> Trust:  # fmt: skip
         name, layer, card, trust = touch.name, self.layer, self.net.weights.card, Trust()
         if one.status in WHY and not one.why:
             why = WHY[one.status].format(name=name, reach=1e3 * self.reach, depth=1e3 * touch.depth)
@@ -345,14 +352,8 @@ class Toucher:
                                in_range=False)  # fmt: skip
         if one.force is not None and abs(one.moved) > self.reach:
             trust = trust.also(f"{name} was moved {one.moved * 1e3:+.1f} mm along its force: check its calibration")
-        area = float(one.squeeze.nodes.area.sum())
-        lever = float(np.linalg.norm(touch.missing[3:])) / max(touch.force, 1e-300)
-        slack = min(self.reach, float(extent.max()))
-        if stated is not None and stated[3:].any() and lever > max(MAX_LEVER * (area / np.pi) ** 0.5, slack):
-            trust = trust.also(f"{name} also turns with {1e3 * touch.force * lever:.2g} N mm, which is not carried",
-                               in_range=False)  # fmt: skip
-        if touch.drag > MAX_DRAG_RATIO * touch.force:
-            trust = trust.also(f"{name} also drags with {touch.drag:.2g} N, which is not carried", in_range=False)
+        if alone:
+            trust = self.unmet(trust, touch, stated)
         if one.field.surface_error > MAX_FIELD_ERROR_M:
             error_mm = one.field.surface_error * 1e3
             trust = trust.also(f"the distance field of {name} is off by up to {error_mm:.1f} mm")
@@ -360,6 +361,21 @@ class Toucher:
             trust = trust.also(f"the mesh of {name} has holes")
         if one.field.flipped:
             trust = trust.also(f"the mesh of {name} was inside out and was turned")
+        return trust
+
+    def unmet(self, trust: Trust, touch: Touch, stated: np.ndarray | None) -> Trust:
+        """The trust in a touch, lowered where much of the stated wrench (6,) is not carried."""
+        if touch.pressed is None:
+            return trust
+        name, field = touch.name, touch.pressed.field
+        area = float(touch.pressed.squeeze.nodes.area.sum())
+        lever = float(np.linalg.norm(touch.missing[3:])) / max(touch.force, 1e-300)
+        slack = min(self.reach, float(np.subtract(*field.tool_bounds[::-1]).max()))
+        if stated is not None and stated[3:].any() and lever > max(MAX_LEVER * (area / np.pi) ** 0.5, slack):
+            trust = trust.also(f"{name} also turns with {1e3 * touch.force * lever:.2g} N mm, which is not carried",
+                               in_range=False)  # fmt: skip
+        if touch.drag > MAX_DRAG_RATIO * touch.force:
+            trust = trust.also(f"{name} also drags with {touch.drag:.2g} N, which is not carried", in_range=False)
         return trust
 
 

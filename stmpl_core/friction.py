@@ -1,0 +1,68 @@
+"""Friction: coefficients between skin and tools, from the literature, by pair of surfaces."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from stmpl_core.errors import InvalidInput
+from stmpl_core.tissue import FRICTION
+
+MOST = 5.0  # largest coefficient of friction that is accepted [-]; skin that is moist sticks with 1 to 3
+
+Surface = Literal["typical", "dry", "moist", "oiled", "glove"]
+
+
+@dataclass(frozen=True)
+class Pair:
+    """Two surfaces that rub.
+
+    Args:
+        friction: coefficient mu [-].
+        range: spread of what was measured [-].
+        source: where the numbers come from; "assumed" where nobody is quoted.
+    """
+
+    friction: float
+    range: tuple[float, float]
+    source: str
+
+
+_VEIJGEN = "Veijgen et al., Tribol Lett 49 (2013) 251: 450 measurements, median static 0.52, dynamic 0.36"
+_DERLER = "Derler & Gerhardt, Tribol Lett 45 (2012) 1: review; dry about 0.5, moist above 1, falling with pressure"
+PAIRS: dict[Surface, Pair] = {
+    "typical": Pair(FRICTION, (0.36, 0.52), _VEIJGEN),
+    "dry": Pair(0.5, (0.2, 0.7), _DERLER),
+    "moist": Pair(1.2, (0.7, 2.0), _DERLER),
+    "oiled": Pair(0.1, (0.05, 0.2), "assumed: a lubricated contact; no measurement is quoted for oil on skin"),
+    "glove": Pair(0.6, (0.3, 1.0), "assumed: rubber on dry skin, a little above dry skin; measure yours"),
+}
+
+Friction = float | str | None
+
+
+def coefficient(friction: Friction) -> float:
+    """Coefficient of friction mu of a number, of the name of a pair, or of None, which is 0.
+
+    Raises:
+        InvalidInput: a name that is not known, or a number that is not from 0 to MOST.
+    """
+    if friction is None:
+        return 0.0
+    if isinstance(friction, str):
+        if friction not in PAIRS:
+            raise InvalidInput(f"there is no friction '{friction}'. Available: {', '.join(PAIRS)}, or a number.")
+        return PAIRS[friction].friction
+    if not (np.isfinite(friction) and 0 <= friction <= MOST):
+        raise InvalidInput(f"friction is {friction:g}; a coefficient from 0 to {MOST:g} is accepted.")
+    return float(friction)
+
+
+def coefficients(friction: Friction | Mapping[str, Friction]) -> tuple[float, dict[str, float]]:
+    """The coefficient of all tools, and those by tool's name that differ. Raises what `coefficient` raises."""
+    if isinstance(friction, Mapping):
+        return 0.0, {name: coefficient(one) for name, one in friction.items()}
+    return coefficient(friction), {}

@@ -1,0 +1,479 @@
+"""History: what time, friction and the balance of energy make of elastic touches, step by step.
+
+A step asks the contact law for elastic touches without friction, by poses as they are and by wrenches as large as an
+elastic skin would have to carry now. Then, tool by tool, the force relaxes (`stmpl_core.relaxation`), friction follows
+the tool's way (`stmpl_core.slip`), and a contact that would give more energy than was put in is weakened.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from functools import cached_property
+from typing import NamedTuple
+
+import numba
+import numpy as np
+
+from stmpl_core.arrays import Transform
+from stmpl_core.columns import shifted
+from stmpl_core.contact import Contact
+from stmpl_core.dragged import MIN_OFFSET
+from stmpl_core.friction import Friction, coefficients
+from stmpl_core.relaxation import series_of, weights
+from stmpl_core.sideways import Sideways
+from stmpl_core.slip import drag
+from stmpl_core.state import Memory, Scalars, State, fresh
+from stmpl_core.touch import APART, MIN_ONE_WAY_SHARE, Pressed, Slip, Touch
+from stmpl_core.toucher import Toucher
+
+PLOUGHED = 0.33, 0.2, 0.67  # see _dragged: growth of stiffness, and of the cap without and over mu
+ROUGH = 0.12  # error of the relaxed force, over what has relaxed: 5.4 of 45 % in trials where only the shear relaxes
+HELD_OFF = 0.01  # relative error of the elastic force by wrench, from which it is asked for again
+FORGOTTEN = 1e-3  # elastic force of skin that comes back, over its largest, below which it is forgotten
+GIVEN_BACK = 0.7  # share of what an elastic contact gives back that must be covered by what was put in
+KEPT = 1.5  # work beyond what elastic skin could hold that is forgotten: what was lost before pays for nothing now
+EDGE_SHARE = 0.3  # pressure over its mean from which skin counts as touched in full
+NOTHING = np.zeros(3)
+
+
+class _Asked(NamedTuple):
+    """What a step knows of a tool before the contact law is asked.
+
+    Args:
+        contact: what the law is asked.
+        stated: what was stated.
+        before: memory of the step before.
+        known: whether that memory is of this tool's way until now.
+        twist: its way, (6,) [m, rad].
+        kept: what has relaxed, less what follows from this step's force (see relaxation.weights), (P,) [N].
+        gain: what follows, over that force, (P,) [-].
+    """
+
+    contact: Contact
+    stated: Contact
+    before: Memory
+    known: bool
+    twist: np.ndarray
+    kept: np.ndarray
+    gain: np.ndarray
+
+
+class _Law(NamedTuple):
+    """What a tool does before the balance of energy.
+
+    Args:
+        touch: touch with the forces of relaxed skin and friction.
+        memory: what is remembered, less work.
+        stored: energy that the contact could give back [J].
+        whole: energy that it could hold [J].
+    """
+
+    touch: Touch
+    memory: Memory
+    stored: float
+    whole: float
+
+
+class History:
+    """Touches with a memory, on one layer.
+
+    Args:
+        toucher: contact law of elastic skin.
+        friction: coefficient of friction, or name of a pair in stmpl_core.friction: of all tools, or by tool's name.
+
+    Attributes:
+        series: relaxation of the layer's force.
+
+    Raises:
+        InvalidInput: friction that is none.
+    """
+
+    def __init__(self, toucher: Toucher, friction: Friction | Mapping[str, Friction] = None) -> None:
+        self.toucher, layer = toucher, toucher.layer
+        self._friction = coefficients(friction)
+        self.series = series_of(layer.tissue, float(np.median(layer.thickness)))
+
+    @cached_property
+    def sideways(self) -> Sideways:
+        """Stiffness of the layer to what sticks to it."""
+        return Sideways(self.toucher.layer)
+
+    def friction(self, name: str) -> float:
+        """Coefficient of friction of a tool [-]."""
+        every, some = self._friction
+        return some.get(name, every)
+
+    def step(self, contacts: Sequence[Contact], state: State, dt: float) -> tuple[list[Touch], State]:
+        """Touches of contacts with names of their own, dt [s] after a state; and the state then."""
+        asked = [self._asked(contact, state.tools.get(contact.name), dt) for contact in contacts]
+        touches = self.toucher.touch_all([one.contact for one in asked], alone=False)
+        for k, (one, touch) in enumerate(zip(asked, touches, strict=True)):
+            if (again := self._again(one, touch)) is not None:
+                asked[k] = again
+                touches[k] = self.toucher.touch_all([again.contact], alone=False)[0] if len(contacts) == 1 else touch
+        laws = [self._law(one, touch, dt) for one, touch in zip(asked, touches, strict=True)]
+        out, memories = _balanced(asked, laws)
+        for name, memory in state.tools.items():
+            if name not in memories:
+                left = self._left(memory, dt)
+                if left.scalars.elastic > FORGOTTEN * left.scalars.largest:
+                    memories[name] = left
+        return out, State(memories)
+
+    def _relaxed(self, before: Memory, dt: float, gone: float) -> tuple[np.ndarray, np.ndarray]:
+        kept, gain = np.empty(len(self.series.times)), np.empty(len(self.series.times))
+        weights(self.series.times, dt, gone, before.scalars.elastic, before.relaxed, kept, gain)
+        return kept, gain
+
+    def _asked(self, contact: Contact, before: Memory | None, dt: float) -> _Asked:
+        """What the contact law is asked for a contact."""
+        pose = contact.pose_body_from_tool
+        memory = before or fresh(pose, len(self.series.times))
+        known = before is not None and memory.scalars.pressing >= 0
+        twist, gone = np.zeros(6), 0.0
+        if known:
+            twist = _twist(memory.pose, pose)
+        if memory.scalars.radius > 0:
+            held = memory.scalars.pressing > 0
+            start = memory.pose if held else memory.imprint
+            over = _along(_twist(start, pose), memory.contact, start)
+            gone = (memory.scalars.share if held else 1.0) * over / memory.scalars.radius
+        kept, gain = self._relaxed(memory, dt, gone)
+        asked = contact
+        if contact.wrench is not None and len(kept):
+            force = contact.wrench[:3]
+            normal = memory.contact[1] if memory.scalars.radius > 0 else force / max(np.linalg.norm(force), 1e-300)
+            wanted = float(force @ normal) / memory.scalars.net
+            owed, now = float(self.series.shares @ kept), 1 - float(self.series.shares @ gain)
+            if wanted > 0:
+                asked = replace(contact, wrench=contact.wrench * ((wanted + owed) / (wanted * now)))
+        return _Asked(asked, contact, memory, known, twist, kept, gain)
+
+    def _whole(self, touch: Touch) -> float:
+        """Sum of the sizes of the forces that a touch presses with [N]."""
+        return 0.0 if touch.pressure is None else float(touch.pressure @ self.toucher.layer.vertex_areas)
+
+    def _needed(self, one: _Asked, touch: Touch) -> tuple[float, float]:
+        """Elastic force that a stated wrench takes, as a sum of sizes, and the one that the touch has [N]."""
+        assert one.stated.wrench is not None
+        whole = self._whole(touch)
+        wanted = float(one.stated.wrench[:3] @ touch.push) / touch.force * whole / touch.force
+        owed, now = float(self.series.shares @ one.kept), 1 - float(self.series.shares @ one.gain)
+        return (wanted + owed) / now, whole
+
+    def _again(self, one: _Asked, touch: Touch) -> _Asked | None:
+        """The same with a wrench that fits where the contact's normal turned out to be; None where it does."""
+        if one.contact is one.stated or not (touch.presses and touch.force > 0) or one.contact.wrench is None:
+            return None
+        needed, has = self._needed(one, touch)
+        carried = float(one.contact.wrench[:3] @ touch.push) / touch.force
+        if touch.force < (1 - 1e-6) * carried or not needed > 0 or abs(needed / has - 1) < HELD_OFF:
+            return None
+        return one._replace(contact=replace(one.contact, wrench=one.contact.wrench * (needed / has)))
+
+    def _law(self, one: _Asked, touch: Touch, dt: float) -> _Law:
+        """What a tool does, from what elastic skin does."""
+        shares, before = self.series.shares, one.before.scalars
+        owed, now = float(shares @ one.kept), 1 - float(shares @ one.gain)
+        presses = touch.presses and touch.pressed is not None and touch.force > 0
+        elastic = self._whole(touch) if presses else 0.0
+        force = now * elastic - owed
+        if presses and one.contact is not one.stated:
+            needed, _ = self._needed(one, touch)
+            if abs(needed / elastic - 1) < 2 * HELD_OFF:
+                elastic, force = needed, now * needed - owed
+        if not (presses and force > 0):
+            return self._free(one, touch, max(owed / now, 0.0))
+        push, pressed, size = touch.push, touch.pressed, touch.force
+        assert pressed is not None and pressed.forces is not None
+        normal, net = push / size, min(size / elastic, 1.0)
+        nodes = pressed.squeeze.nodes
+        depth = nodes.sinking if len(nodes.sinking) else nodes.strain * nodes.thickness
+        middle, radius, lever, thickness, whole = _patch(
+            nodes.points, nodes.area, nodes.thickness, depth, pressed.forces, normal)  # fmt: skip
+        contact = np.stack([middle, normal, _carried(one.before.contact, normal, before.pressing > 0)])
+        scalars = Scalars(1.0, elastic, max(elastic, before.largest), net, radius, touch.depth, elastic, pressed.power,
+                          work=before.work)  # fmt: skip
+        relaxed = one.kept + one.gain * elastic
+        memory = Memory(one.stated.pose_body_from_tool, touch.wrench, scalars, relaxed, contact,
+                        touch.pose_body_from_tool, np.zeros(3), one.before.springs,
+                        one.before.springs_relaxed)  # fmt: skip
+        done = _scaled(touch, force / elastic, ROUGH * float(shares @ relaxed))
+        whole *= 0.5 + 0.5 / pressed.factor  # what draws a tool back from the core is steep: it stores less
+        stored = whole * _left_over(float(shares @ relaxed) / elastic, pressed.power)
+        if self.friction(touch.name) > 0 and net > MIN_ONE_WAY_SHARE:
+            done, memory, bent = self._dragged(one, done, memory, force, lever, thickness, dt)
+            stored, whole = stored + bent, whole + 2 * bent
+        return _Law(self._said(one, done), memory._replace(wrench=done.wrench), stored, whole)
+
+    def _free(self, one: _Asked, touch: Touch, elastic: float) -> _Law:
+        """Skin that the tool does not hold comes back by itself."""
+        before = one.before.scalars
+        if touch.presses and touch.pressed is not None:
+            touch = replace(touch, status=APART, wrench=np.zeros(6), force_bound=0.0, pressure=None, pressed=None)
+        scalars = before._replace(pressing=0.0, elastic=elastic, share=1.0, passive=1.0)
+        memory = _let_go(one.before._replace(pose=one.stated.pose_body_from_tool, wrench=touch.wrench, scalars=scalars,
+                                             relaxed=one.kept + one.gain * elastic))  # fmt: skip
+        if elastic > FORGOTTEN * before.largest:
+            touch = replace(touch, imprint=_imprint(memory))
+        depth = before.depth * (elastic / before.imprint_force) ** (1 / before.power) if elastic > 0 else 0.0
+        return _Law(self._said(one, touch), memory, 0.0, elastic * depth / (before.power + 1))
+
+    def _left(self, memory: Memory, dt: float) -> Memory:
+        """The memory of a tool that is not told of any more: the skin comes back."""
+        kept, gain = self._relaxed(memory, dt, 0.0)
+        elastic = max(float(self.series.shares @ kept) / (1 - float(self.series.shares @ gain)), 0.0)
+        scalars = memory.scalars._replace(pressing=-1.0, elastic=elastic, share=1.0, work=0.0, passive=1.0)
+        return _let_go(memory._replace(scalars=scalars, relaxed=kept + gain * elastic, wrench=np.zeros(6)))
+
+    def _dragged(self, one: _Asked, touch: Touch, memory: Memory, force: float, lever: float, thickness: float,
+                 dt: float) -> tuple[Touch, Memory, float]:  # fmt: skip
+        """The touch with friction, its memory, and the energy that the bent skin stores [J].
+
+        Skin that is dragged rises before the tool and leans on it (ploughing): with r = (depth / a) N / (k_t a) the
+        patch is stiffer by 1 + 0.33 r, the cap higher by 1 + (0.2 + 0.67 mu) r, fitted on slides of a ball by finite
+        elements at mu 0.3 and 0.6.
+        """
+        before, now, radius = one.before, memory.scalars, memory.scalars.radius
+        patch, origin = self.sideways.at(radius, thickness), touch.pose_body_from_tool[:3, 3]
+        rises = now.depth / radius * force / (patch.along * radius)
+        mu = self.friction(touch.name)
+        cap = (1 + (PLOUGHED[1] + PLOUGHED[2] * mu) * rises) * mu * force
+        stiffness = (1 + PLOUGHED[0] * rises) * np.array([patch.along, patch.along, patch.turn / (lever * lever)])
+        stated, wanted = one.stated.wrench, NOTHING
+        if stated is not None:
+            wanted = _in_plane(stated - touch.wrench, memory.contact, origin, lever)
+        way, rolled = _way(one.twist, one.known, before.contact, before.scalars.pressing > 0, memory.contact, origin,
+                           now.depth, radius, lever)  # fmt: skip
+        springs, relaxed, carried, share, stored = drag(
+            before.springs, before.springs_relaxed, *self.series, dt, rolled, stiffness, before.stiffness, cap, way,
+            wanted, stated is not None)  # fmt: skip
+        wrench, offset, turn = _in_space(carried, springs, stiffness, memory.contact, origin, lever)
+        slip = Slip(wrench, share, offset, turn, memory.contact[0])
+        memory = memory._replace(scalars=now._replace(share=share), stiffness=stiffness, springs=springs,
+                                 springs_relaxed=relaxed)  # fmt: skip
+        return replace(touch, wrench=touch.wrench + wrench, slip=slip), memory, stored
+
+    def _said(self, one: _Asked, touch: Touch) -> Touch:
+        """The touch with what of the stated wrench is missing, and what that says of it."""
+        stated = one.stated.wrench
+        if stated is None:
+            return touch
+        touch = replace(touch, missing=stated - touch.wrench)
+        return replace(touch, trust=self.toucher.unmet(touch.trust, touch, stated))
+
+    def elastic(self, touches: Sequence[Touch]) -> list[Touch]:
+        """The touches of elastic skin without friction that move the skin as these do, but for what is dragged along.
+
+        Skin that a tool does not hold is where an imprint says; skin that is dragged along was pressed by a tool that
+        stands where the skin came from.
+        """
+        out, asked = [], []
+        for touch in touches:
+            pose = touch.imprint
+            if pose is None and touch.slip is not None and np.linalg.norm(touch.slip.offset) > MIN_OFFSET:
+                pose = shifted(touch.pose_body_from_tool, -touch.slip.offset)
+            if pose is None or touch.name not in self.toucher.tools:
+                out.append(touch)
+            else:
+                asked.append(Contact(self.toucher.tools[touch.name], pose))
+        return [*out, *self.toucher.touch_all(asked)]
+
+
+def _scaled(touch: Touch, by: float, doubt: float) -> Touch:
+    """The touch with other pressures on skin that is moved as before; doubt: error of the force that comes in [N]."""
+    if by == 1.0 and not doubt:
+        return touch
+    assert touch.pressure is not None and touch.pressed is not None
+    forces = touch.pressed.forces
+    pressed: Pressed = touch.pressed._replace(factor=touch.pressed.factor * by,
+                                              forces=None if forces is None else forces * by)  # fmt: skip
+    return replace(touch, wrench=touch.wrench * by, pressure=touch.pressure * by, pressed=pressed,
+                   force_bound=touch.force_bound * by + doubt)  # fmt: skip
+
+
+def _left_over(relaxed: float, power: float) -> float:
+    """What skin gives back when it is let go at once, over the energy of elastic skin, of which a share has relaxed.
+
+    The integral of depth^power - relaxed from where that is 0 to 1, times power + 1.
+    """
+    free = min(relaxed, 1.0) ** (1 / power)
+    return max(1 - free ** (power + 1) - (power + 1) * relaxed * (1 - free), 1e-12)
+
+
+def _let_go(memory: Memory) -> Memory:
+    """The memory without springs of friction."""
+    return memory._replace(stiffness=np.zeros(3), springs=np.zeros_like(memory.springs),
+                           springs_relaxed=np.zeros_like(memory.springs_relaxed))  # fmt: skip
+
+
+def _imprint(memory: Memory) -> Transform:
+    """Pose at which the tool that pressed last would hold the skin where it has come back to."""
+    one = memory.scalars
+    depth = one.depth * (one.elastic / one.imprint_force) ** (1 / one.power)
+    return shifted(memory.imprint, (depth - one.depth) * memory.contact[1])
+
+
+def _balanced(asked: Sequence[_Asked], laws: Sequence[_Law]) -> tuple[list[Touch], dict[str, Memory]]:
+    """The touches, weakened where a contact would give more than was put in, and the memories with their balance.
+
+    Work put in is the trapezoid of the wrench over the tool's way. Tools that feel each other pass energy on, so one is
+    weakened only where all together lack it.
+    """
+    works = []
+    for one, law in zip(asked, laws, strict=True):
+        new = not one.known or one.stated.wrench is not None
+        work = one.before.scalars.work + 0.5 * float((one.before.wrench + law.memory.wrench) @ one.twist)
+        work = max(work, law.stored) if new else work
+        works.append(work)
+    all_stored = sum(law.stored for law in laws)
+    together = sum(works) / (GIVEN_BACK * all_stored) if all_stored > 0 else 1.0
+    touches, memories = [], {}
+    for one, law, work in zip(asked, laws, works, strict=True):
+        touch, memory, passive = law.touch, law.memory, 1.0
+        if law.stored > 0:
+            passive = min(1.0, max(work / (GIVEN_BACK * law.stored), together if len(laws) > 1 else 0.0, 0.0))
+            if passive < 1:
+                at_rest = one.before.scalars.work + 0.5 * float(one.before.wrench @ one.twist)
+                given = 0.5 * float(memory.wrench @ one.twist)
+                if len(laws) == 1 and at_rest + passive * given < 0 and given < 0:
+                    passive = max(-at_rest / given, 0.0)
+                work = at_rest + passive * given
+                touch = _weakened(touch, passive)
+                memory = memory._replace(wrench=touch.wrench)
+        work = min(work if law.stored > 0 else max(work, 0.0), KEPT * law.whole)
+        memories[touch.name] = memory._replace(scalars=memory.scalars._replace(work=work, passive=passive))
+        touches.append(touch)
+    return touches, memories
+
+
+def _weakened(touch: Touch, by: float) -> Touch:
+    if touch.slip is not None:
+        touch = replace(touch, slip=touch.slip._replace(wrench=touch.slip.wrench * by))
+    return replace(_scaled(touch, by, 0.0), passive=by)
+
+
+@numba.njit(cache=True, error_model="numpy", inline="always")
+def _dot(a, b):
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+@numba.njit(cache=True, error_model="numpy", inline="always")
+def _cross(a, b):
+    return np.array([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]])
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _patch(points, area, thickness, depth, forces, normal):
+    """What a contact is as a whole: its middle (3,) [m]; the radius of a circle as large [m]; the mean distance of its
+    forces from the middle [m]; its mean thickness [m]; and the energy of its forces if they grew as linear ones do,
+    half the sum of each times its depth (Clapeyron) [J].
+    """
+    middle, total, squares, thick, energy = np.zeros(3), 0.0, 0.0, 0.0, 0.0
+    for n in range(len(area)):
+        energy += 0.5 * forces[n] * depth[n]
+        total += forces[n]
+        squares += forces[n] * forces[n] / area[n]
+        thick += forces[n] * thickness[n]
+        for x in range(3):
+            middle[x] += forces[n] * points[n, x]
+    middle /= total
+    full, size, lever = EDGE_SHARE * squares / total, 0.0, 0.0
+    for n in range(len(area)):
+        size += min(area[n], forces[n] / full)
+        square = up = 0.0
+        for x in range(3):
+            d = points[n, x] - middle[x]
+            square += d * d
+            up += d * normal[x]
+        lever += forces[n] * np.sqrt(max(square - up * up, 0.0))
+    radius = np.sqrt(size / np.pi)
+    return middle, radius, max(lever / total, 0.1 * radius), thick / total, energy
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _twist(start, end):
+    """Way of a tool's origin and its turn as a vector, between poses (4, 4), (6,) [m, rad]."""
+    out = np.empty(6)
+    for x in range(3):
+        out[x] = end[x, 3] - start[x, 3]
+    cosine, turn = -1.0, np.zeros((3, 3))
+    for a in range(3):
+        for b in range(3):
+            for c in range(3):
+                turn[a, b] += end[a, c] * start[b, c]
+        cosine += turn[a, a]
+    out[3], out[4], out[5] = turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]
+    sine = np.sqrt(out[3] ** 2 + out[4] ** 2 + out[5] ** 2)
+    scale = np.arctan2(sine, cosine) / sine if sine > 1e-9 else 0.5
+    for x in range(3, 6):
+        out[x] *= scale
+    return out
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _way(twist, known, before, held, contact, origin, depth, radius, lever):
+    """Way of a tool along the skin and lever times its turn (3,) [m], and how far its contact rolled on, over a.
+
+    A tool that meets the skin within a step goes along it from there on.
+    """
+    way, rolled = np.zeros(3), 0.0
+    if not known:
+        return way, rolled
+    middle, normal, first = contact
+    second = _cross(normal, first)
+    go = twist[:3] + _cross(twist[3:], middle - origin)
+    if not held:
+        go *= min(1.0, depth / max(abs(_dot(go, normal)), 1e-12))
+    way[0], way[1], way[2] = _dot(go, first), _dot(go, second), lever * _dot(twist[3:], normal)
+    if held:
+        on = middle - before[0] - go
+        rolled = np.sqrt(_dot(on, first) ** 2 + _dot(on, second) ** 2) / radius
+    return way, rolled
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _in_plane(wrench, contact, origin, lever):
+    """Forces of friction (3,) [N] of a wrench (6,); see stmpl_core.slip."""
+    middle, normal, first = contact
+    turn = _dot(wrench[3:] - _cross(middle - origin, wrench[:3]), normal)
+    return np.array([_dot(wrench, first), _dot(wrench, _cross(normal, first)), turn / lever])
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _in_space(forces, springs, stiffness, contact, origin, lever):
+    """Wrench (6,) of forces of friction, way of the skin under the tool (3,) [m], and its turn."""
+    middle, normal, first = contact
+    second, wrench = _cross(normal, first), np.empty(6)
+    along = forces[0] * first + forces[1] * second
+    wrench[:3], wrench[3:] = along, _cross(middle - origin, along) + forces[2] * lever * normal
+    x, y, turn = springs[:, 0].sum() / stiffness[0], springs[:, 1].sum() / stiffness[1], springs[:, 2].sum()
+    return wrench, x * first + y * second, turn / (stiffness[2] * lever)
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _along(twist, contact, pose):
+    """Way along the skin of the place of a tool that was in the middle of its contact [m]; contact: see Memory."""
+    w, d, go = twist[3:], contact[0] - pose[:3, 3], twist[:3].copy()
+    go[0] += w[1] * d[2] - w[2] * d[1]
+    go[1] += w[2] * d[0] - w[0] * d[2]
+    go[2] += w[0] * d[1] - w[1] * d[0]
+    deep = _dot(go, contact[1])
+    return np.sqrt(max(_dot(go, go) - deep * deep, 0.0))
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _carried(contact, normal, held):
+    """The tangent (3,) of a contact after its normal turned, turned by the least; a new one where it was not held."""
+    old, tangent = contact[1], contact[2].copy()
+    if held:
+        over = 1 + _dot(old, normal)
+        up = _dot(tangent, normal)
+        if over > 1e-6:
+            tangent -= up / over * (old + normal)
+    else:
+        tangent[:] = 0.0
+        tangent[np.argmin(np.abs(normal))] = 1.0
+    tangent -= _dot(tangent, normal) * normal
+    return tangent / np.sqrt(_dot(tangent, tangent))

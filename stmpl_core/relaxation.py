@@ -1,0 +1,107 @@
+"""Relaxation: what time makes of a force, as one convolution over the path, with skin that is replaced as tools slide.
+
+An elastic force F_e(t), relaxing as its moduli do, E(t) = E (1 - sum g_i (1 - exp(-t / tau_i))), is
+
+    F = F_e - sum g_i D_i,    dD_i/dt = (F_e - D_i) / tau_i - D_i / a |ds/dt|
+
+with D_i the part that has relaxed. Without the last term this is the convolution int G(t - s) dF_e(s) of quasi-linear
+viscoelasticity (Fung, "Biomechanics", 1993, chapter 7), one number in place of a field. The last term is fresh skin: a
+contact of radius a that goes ds over the skin leaves what has relaxed behind. Against a ball on relaxing columns that
+starts to slide, each with a history of its own, it is within 6 % of the force at any speed, 4.5 % in steady slide.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numba
+import numpy as np
+
+from stmpl_core.stack import plies, response
+from stmpl_core.tissue import Prony, Tissue
+
+MIX_RADIUS = 9e-3  # radius of the load for which the materials of a stack share a force [m]
+LOG_STEP = 0.05  # change of a modulus by which its share is found, logarithm
+
+
+class Series(NamedTuple):
+    """Relaxation of the force on a layer.
+
+    Args:
+        shares: share of the force that relaxes in each time, (P,) [-].
+        times: those times, (P,) [s].
+    """
+
+    shares: np.ndarray
+    times: np.ndarray
+
+
+def series_of(tissue: Tissue, thickness: float) -> Series:
+    """Relaxation of a force on a flat stack: each material's own times its share d ln F / d ln E in the force.
+
+    The shares are those of the linear response under a Gaussian load of MIX_RADIUS (`stmpl_core.stack.effective`); they
+    sum to one less that of the skin's tension, which does not relax.
+
+    Args:
+        tissue: materials, and the skin on them.
+        thickness: thickness from the surface to the base [m], > 0.
+    """
+    there = [ply for ply in tissue.deeper if ply.depth < thickness]
+    each: list[Prony | None] = [tissue.relaxation, *(ply.relaxation for ply in there)]
+    if tissue.skin:
+        each.append(tissue.skin.relaxation)
+    if not any(each):
+        return Series(np.empty(0), np.empty(0))
+    found: dict[float, float] = {}
+    for prony, share in zip(each, _shares(tissue, thickness), strict=True):
+        for g, tau in zip(prony.shares, prony.times, strict=True) if prony else ():
+            found[tau] = found.get(tau, 0.0) + share * g
+    times = sorted(found)
+    return Series(np.array([found[tau] for tau in times]), np.array(times))
+
+
+def _shares(tissue: Tissue, thickness: float) -> list[float]:
+    """d ln F / d ln E of each material of a stack, from the skin inwards, and last of the skin if there is one."""
+    stack = plies(tissue, thickness)
+    if tissue.single:
+        return [1.0]
+    k = np.geomspace(0.02, 8, 200) / MIX_RADIUS
+    weight = np.exp(-0.25 * (k * MIX_RADIUS) ** 2) * k * k
+
+    def log_force(number: int, by: float) -> float:
+        changed = [(h, modulus * np.exp(by * (n == number)), nu) for n, (h, modulus, nu) in enumerate(stack)]
+        skin = tissue.skin
+        if skin and number == len(stack):
+            skin = type(skin)(skin.youngs_modulus * float(np.exp(by)), skin.thickness, skin.tension, skin.poisson_ratio)
+        return -float(np.log(weight @ response(changed, skin, k)[0]))
+
+    many = len(stack) + (tissue.skin is not None)
+    return [(log_force(n, LOG_STEP) - log_force(n, -LOG_STEP)) / (2 * LOG_STEP) for n in range(many)]
+
+
+@numba.njit(cache=True, error_model="numpy")
+def weights(times, dt, gone, before, relaxed, kept, gain):
+    """What has relaxed after a step is kept + gain F, with F the elastic force at its end, straight in between.
+
+    The equation of the module, solved exactly. A step without time lets nothing relax.
+
+    Args:
+        times: times of the series, (P,) [s].
+        dt: time of the step [s].
+        gone: way of the contact over the skin in the step, over its radius [-].
+        before: elastic force at the beginning of the step.
+        relaxed: what had relaxed there, (P,).
+        kept, gain: what is found, (P,) each.
+    """
+    for i in range(len(times)):
+        part = dt / times[i]
+        x = part + gone
+        if not x > 0:
+            kept[i], gain[i] = relaxed[i], 0.0
+            continue
+        left = np.exp(-x)
+        mean = -np.expm1(-x) / x if x > 1e-4 else 1 - x / 2 + x * x / 6
+        first = 1 - mean if x > 1e-4 else x / 2 - x * x / 6
+        last = mean - left if x > 1e-4 else x / 2 - x * x / 3
+        kept[i] = left * relaxed[i] + part / x * before * last
+        gain[i] = part / x * first

@@ -1,0 +1,96 @@
+"""Sideways: how stiff skin is to a patch that sticks to a tool and is moved along it, or turned about its normal."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from scipy.special import gamma, j0, j1, jv
+
+from stmpl_core.layer import SoftLayer
+from stmpl_core.stack import along
+from stmpl_core.tissue import Tissue
+
+WAVES = np.concatenate([np.geomspace(1e-4, 0.05, 60)[:-1], np.arange(0.05, 120, 0.08)])  # k a
+WEIGHTS = np.gradient(WAVES)
+WHERE = np.linspace(0.05, 0.95, 10)  # places in the patch that move with the tool, over its radius
+POWERS = (-0.5, 0.5, 1.5)  # powers of 1 - r^2 / a^2 in the traction: the first alone is exact on a half-space
+RADII = np.geomspace(0.02, 8.0, 18)  # radii of the patch that are tabled, over the thickness
+THICKNESSES = 5  # thicknesses of a stack that are tabled
+
+
+class Patch(NamedTuple):
+    """Stiffness of a round patch of skin that sticks to a tool.
+
+    Args:
+        along: tangential force over the way of the tool k_t [N/m].
+        turn: torque about the normal over the turn of the tool [N m/rad].
+    """
+
+    along: float
+    turn: float
+
+
+def patch(tissue: Tissue, thickness: float, radius: float) -> Patch:
+    """Stiffness of a round patch in the linear response of a flat stack, free of traction around it.
+
+    The traction is a sum of (1 - r^2/a^2)^n, n = -1/2, 1/2, 3/2, times r where the patch turns, such that it moves as
+    one by least squares. With L, C of `stmpl_core.stack.along` a patch moved along feels (L + C) / 2, averaged over
+    directions, one that turns C alone. On a half-space this is k_t = 8 G a / (2 - nu) and 16/3 G a^3 (Johnson, "Contact
+    Mechanics", 1985, chapters 3 and 7; Mindlin, J. Appl. Mech. 16, 259, 1949).
+
+    Args:
+        tissue: materials, and the skin on them.
+        thickness: thickness from the surface to the base [m], > 0.
+        radius: radius a of the patch [m], > 0.
+    """
+    k = WAVES * thickness / radius
+    both = along(tissue, thickness, k)
+    unit = thickness / (tissue.youngs_modulus * radius)  # of motion under a traction of one, over the radius
+    near = 0.5 * (both.lengthwise + both.crosswise)
+    moved = j0(np.outer(WHERE, WAVES)) * (near * WAVES * WEIGHTS)
+    sunk = moved @ _spectra(0).T * unit * radius
+    found = np.linalg.lstsq(sunk, np.full(len(WHERE), 1.0), rcond=None)[0]
+    force = 2 * np.pi * radius**2 * found @ [0.5 / (n + 1) for n in POWERS]
+    turned = j1(np.outer(WHERE, WAVES)) * (both.crosswise * WAVES * WEIGHTS) @ _spectra(1).T * unit * radius
+    found = np.linalg.lstsq(turned, WHERE * radius, rcond=None)[0]
+    torque = 2 * np.pi * radius**3 * found @ [0.5 / ((n + 1) * (n + 2)) for n in POWERS]
+    return Patch(float(force), float(torque))
+
+
+def _spectra(order: int) -> np.ndarray:
+    """int_0^1 r^order (1 - r^2)^n J_order(x r) r dr of POWERS, (3, K); Sonine's first integral."""
+    return np.array([2**n * gamma(n + 1) * jv(order + n + 1, WAVES) / WAVES ** (n + 1) for n in POWERS])
+
+
+class Sideways:
+    """Stiffness of patches of a layer, tabled on the first call (a tenth of a second).
+
+    Args:
+        layer: soft layer at rest.
+    """
+
+    def __init__(self, layer: SoftLayer) -> None:
+        tissue, (least, most) = layer.tissue, (float(layer.thickness.min()), float(layer.thickness.max()))
+        many = 1 if tissue.single or most < 1.02 * least else THICKNESSES
+        middle = [float(np.median(layer.thickness))]
+        self._log_thickness = np.log(np.geomspace(least, most, many) if many > 1 else middle)
+        self._logs = np.log(RADII)
+        rows = [[patch(tissue, t, t * r) for r in RADII] for t in np.exp(self._log_thickness)]
+        radius = np.exp(self._log_thickness)[:, None] * RADII
+        self._table = np.log(np.array(rows) / (tissue.youngs_modulus * np.stack([radius, radius**3], axis=-1)))
+        self._modulus = tissue.youngs_modulus
+
+    def at(self, radius: float, thickness: float) -> Patch:
+        """Stiffness of a patch of a radius [m] where the layer is this thick [m]."""
+        log, radii = np.log(radius / thickness), self._logs
+        f = min(max((log - radii[0]) / (radii[1] - radii[0]), 0.0), len(radii) - 1.001)
+        i, low = int(f), self._table[0]
+        if len(self._table) > 1:
+            logs = self._log_thickness
+            g = min(max((np.log(thickness) - logs[0]) / (logs[1] - logs[0]), 0.0), len(logs) - 1.001)
+            j = int(g)
+            low = (1 - g + j) * self._table[j] + (g - j) * self._table[j + 1]
+        value = (1 - f + i) * low[i] + (f - i) * low[i + 1]
+        force, turn = float(np.exp(value[0])), float(np.exp(value[1]))
+        return Patch(force * self._modulus * radius, turn * self._modulus * radius**3)

@@ -1,0 +1,167 @@
+"""Slip: skin that sticks to a tool, creeps and slides: partial slip as a set of springs, each with a slider.
+
+With k the stiffness of the patch that sticks (`stmpl_core.sideways`), s the way of the tool along it and cap = mu N the
+force at which it slides, a contact that was not dragged before answers (Cattaneo 1938, Mindlin 1949; Johnson, "Contact
+Mechanics", 1985, chapter 7)
+
+    F = cap (1 - (1 - k s / (1.5 cap))^1.5)    up to s = 1.5 cap / k
+
+Springs in parallel, each of which slides at its share of the cap, answer so on first loading, and by Masing's rule on
+every reversal (Iwan, J. Appl. Mech. 33, 893, 1966). Whatever the path, they give no energy. Forces are vectors
+(F_x, F_y, M / rho) in the tangent plane, with M the torque about the contact's normal and rho its lever, the mean
+distance of the pressure from the middle; so translation and spin share one limit. Springs relax as the force does.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numba
+import numpy as np
+
+from stmpl_core.relaxation import weights
+
+SPRINGS = 8
+_LEFT = (1 - np.arange(SPRINGS + 1) / SPRINGS) ** (4 / 3)  # 1 - x / 1.5 where springs begin to slide; finer at the end
+_YIELD, _FORCE = 1.5 * (1 - _LEFT), 1 - _LEFT**1.5  # k s / cap and F / cap there
+_SLOPE = np.append(np.diff(_FORCE) / np.diff(_YIELD), 0.0)
+STIFFNESS = _SLOPE[:-1] - _SLOPE[1:]  # of each spring, over k, (SPRINGS,)
+LIMIT = STIFFNESS * _YIELD[1:]  # force at which each slides, over the cap, (SPRINGS,)
+TRIALS, TOLERANCE = 30, 1e-9  # of the way for a force; over the cap
+MOST_CARRIED = 0.9999  # share of the cap that sticks: a force at the cap has no way
+
+
+class Drag(NamedTuple):
+    """What a step makes of the springs.
+
+    Args:
+        springs: their forces without relaxation, (SPRINGS, 3) [N].
+        relaxed: what of them has relaxed, (P, SPRINGS, 3) [N].
+        force: sum of their forces, (3,) [N].
+        share: share of the normal force whose skin slides [-]: 0 sticks, 1 slides.
+        stored: energy that the springs would give back at once [J].
+    """
+
+    springs: np.ndarray
+    relaxed: np.ndarray
+    force: np.ndarray
+    share: float
+    stored: float
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _go(way, stiffness, cap, start, left, over, springs, force, slides):
+    """Springs after a way (3,): their forces without relaxation (S, 3), the sum (3,), and which slide (S,)."""
+    force[:] = 0.0
+    for j in range(len(springs)):
+        square = 0.0
+        for x in range(3):
+            springs[j, x] = start[j, x] + STIFFNESS[j] * stiffness[x] * way[x]
+            one = over * springs[j, x] - left[j, x]
+            square += one * one
+        most, size = LIMIT[j] * cap, np.sqrt(square)
+        slides[j] = size >= most
+        scale = most / size if size > most else 1.0
+        for x in range(3):
+            one = (over * springs[j, x] - left[j, x]) * scale
+            if scale < 1.0:
+                springs[j, x] = (one + left[j, x]) / over
+            force[x] += one
+
+
+@numba.njit(cache=True, error_model="numpy")
+def drag(springs, relaxed, shares, times, dt, rolled, stiffness, before, cap, way, wanted, by_force):
+    """One step of the springs; see Drag.
+
+    Where the patch grew stiffer the springs keep their forces, where it grew softer these fall in proportion, and where
+    the cap fell they are cut to it: none of that gives energy.
+
+    Args:
+        springs, relaxed: see Drag, before the step.
+        shares, times: series of the relaxation, (P,) each.
+        dt: time of the step [s].
+        rolled: way that the contact rolled on, over its radius [-]: rolling leaves strained skin behind.
+        stiffness: of the patch to (way, way, rho times turn), (3,) [N/m].
+        before: the same one step before, (3,).
+        cap: force at which all slides [N].
+        way: way of the tool along the skin and rho times its turn, (3,) [m]; not read by force.
+        wanted: forces to carry, (3,) [N]; read by force: the nearest that the cap allows is carried.
+        by_force: whether forces are given.
+    """
+    many, terms = len(springs), len(times)
+    start, left = np.empty((many, 3)), np.zeros((many, 3))
+    found, kept_all = np.empty((many, 3)), np.empty((terms, many, 3))
+    old, kept, gain = np.empty(terms), np.empty(terms), np.zeros(terms)
+    over, stays = 1.0, np.exp(-rolled)
+    for x in range(3):
+        soft = min(stiffness[x] / before[x], 1.0) * stays if before[x] > 0 else stays
+        for j in range(many):
+            start[j, x] = soft * springs[j, x]
+            for i in range(terms):
+                old[i] = soft * relaxed[i, j, x]
+            weights(times, dt, 0.0, start[j, x], old, kept, gain)
+            for i in range(terms):
+                kept_all[i, j, x] = kept[i]
+                left[j, x] += shares[i] * kept[i]
+    for i in range(terms):
+        over -= shares[i] * gain[i]
+    force, slides, go = np.zeros(3), np.zeros(many, np.bool_), way.copy()
+    if by_force:
+        go[:] = 0.0
+        size = np.sqrt(wanted[0] ** 2 + wanted[1] ** 2 + wanted[2] ** 2)
+        if size > MOST_CARRIED * cap:  # all slide along the force
+            for j in range(many):
+                for x in range(3):
+                    one = LIMIT[j] * cap * wanted[x] / size if size > 0 else 0.0
+                    found[j, x] = (one + left[j, x]) / over
+                    force[x] += one
+                slides[j] = True
+        else:
+            _find(wanted, stiffness, cap, start, left, over, found, force, slides, go)
+    else:
+        _go(go, stiffness, cap, start, left, over, found, force, slides)
+    share = stored = 0.0
+    for j in range(many):
+        share += LIMIT[j] if slides[j] else 0.0
+        for x in range(3):
+            stored += 0.5 * (over * found[j, x] - left[j, x]) ** 2 / (STIFFNESS[j] * stiffness[x])
+            for i in range(terms):
+                kept_all[i, j, x] += gain[i] * found[j, x]
+    return found, kept_all, force, min(share, 1.0), stored
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _find(wanted, stiffness, cap, start, left, over, springs, force, slides, go):
+    """The way (3,) for a force within the cap, to `go`: Newton on a convex problem, with the springs' own tangent."""
+    step, tangent = np.empty(3), np.empty((3, 3))
+    last, back = np.inf, 1.0
+    for _ in range(TRIALS):
+        _go(go, stiffness, cap, start, left, over, springs, force, slides)
+        off = 0.0
+        for x in range(3):
+            off += (wanted[x] - force[x]) ** 2
+        if np.sqrt(off) < TOLERANCE * cap:
+            return
+        if off > last:  # a step too far: half of the way back
+            back *= 0.5
+            for x in range(3):
+                go[x] -= back * step[x]
+            if back > 1e-6:
+                continue
+            return
+        last, back = off, 1.0
+        tangent[:] = 0.0
+        for j in range(len(springs)):
+            most = LIMIT[j] * cap
+            for x in range(3):
+                for y in range(3):
+                    along = 0.0
+                    if slides[j] and most > 0:
+                        a, b = over * springs[j, x] - left[j, x], over * springs[j, y] - left[j, y]
+                        along = a * b / (most * most)
+                    tangent[x, y] += over * STIFFNESS[j] * stiffness[y] * ((1.0 if x == y else 0.0) - along)
+        for x in range(3):
+            tangent[x, x] += 1e-9 * stiffness[x]
+        step[:] = np.linalg.solve(tangent, wanted - force)
+        for x in range(3):
+            go[x] += step[x]

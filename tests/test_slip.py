@@ -1,0 +1,250 @@
+"""Laws of friction: skin that sticks to a tool, creeps and slides, and a contact that gives no energy."""
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from stmpl_core import Contact, Prony, Simulator, State, Tissue, Tool, Touch
+from stmpl_core.errors import InvalidInput
+from stmpl_core.friction import PAIRS, coefficient
+from stmpl_core.methods import Winkler
+from stmpl_core.sideways import Sideways, patch
+from stmpl_core.slip import LIMIT, SPRINGS, drag
+from tests.scenes import at, ball, plate, punch, turn
+
+RADIUS, DEPTH, MU = 8e-3, 3e-3, 0.5
+BALL = ball(RADIUS)
+SERIES = Prony((0.225, 0.225), (0.5, 5.0))
+NO_TIME = np.empty(0)
+
+
+@pytest.fixture(scope="module")
+def sim() -> Simulator:
+    return Simulator(plate(0.09, youngs_modulus=2e4), Winkler(), friction=MU)
+
+
+@pytest.fixture(scope="module")
+def smooth(sim: Simulator) -> Simulator:
+    return Simulator(sim.layer, Winkler(), sim.tools)
+
+
+@pytest.fixture(scope="module")
+def living(sim: Simulator) -> Simulator:
+    tissue = Tissue(2e4, 0.4, relaxation=SERIES)
+    return Simulator(sim.layer.with_(tissue=tissue), Winkler(), sim.tools, friction=MU)
+
+
+def led(sim: Simulator, poses: list[np.ndarray], state: State | None = None, dt: float = 0.0,
+        tool: Tool = BALL) -> tuple[list[Touch], State]:  # fmt: skip
+    state, touches = state or State(), []
+    for pose in poses:
+        (touch,), state = sim.touch([Contact(tool, pose)], state, dt)
+        touches.append(touch)
+    return touches, state
+
+
+def down(depth: float = DEPTH) -> list[np.ndarray]:
+    return [at(0, 0, RADIUS - z) for z in np.linspace(-1e-4, depth, 12)]
+
+
+def along(ways: np.ndarray, depth: float = DEPTH) -> list[np.ndarray]:
+    return [at(x, 0, RADIUS - depth) for x in ways]
+
+
+# The springs
+
+
+def sum_of(ways: np.ndarray, cap: float = 1.0) -> np.ndarray:
+    """Forces of springs of stiffness 1 along ways, one step each."""
+    springs, relaxed, one = np.zeros((SPRINGS, 3)), np.zeros((0, SPRINGS, 3)), np.array([1.0, 1.0, 2.5])
+    out = []
+    for way in np.diff(ways, axis=0):
+        springs, relaxed, force, _, _ = drag(springs, relaxed, NO_TIME, NO_TIME, 0.0, 0.0, one, one, cap, way,
+                                             np.zeros(3), False)  # fmt: skip
+        out.append(force)
+    return np.array(out)
+
+
+def test_first_loading_is_cattaneo_and_mindlin() -> None:
+    s = np.linspace(0, 2, 201)
+    found = sum_of(np.stack([s, 0 * s, 0 * s], axis=1))[:, 0]
+    np.testing.assert_allclose(found, 1 - np.maximum(1 - s[1:] / 1.5, 0) ** 1.5, atol=3e-3)
+    assert LIMIT.sum() == pytest.approx(1.0, abs=1e-12)
+
+
+def test_a_reversal_is_the_first_loading_twice_as_large() -> None:
+    up, back = np.linspace(0, 1.0, 51), np.linspace(1.0, 0.0, 51)
+    first, after = np.split(sum_of(np.stack([np.append(up, back[1:]), np.zeros(101), np.zeros(101)], axis=1))[:, 0], 2)
+    half = sum_of(np.stack([np.linspace(0, 0.5, 51), np.zeros(51), np.zeros(51)], axis=1))[:, 0]
+    np.testing.assert_allclose(first[-1] - after, 2 * half, atol=1e-12)
+
+
+def test_springs_take_energy_on_any_path_and_share_one_limit() -> None:
+    rng = np.random.default_rng(0)
+    for _ in range(20):
+        ways = np.cumsum(rng.normal(size=(200, 3)) * 0.1, axis=0)
+        ways -= np.linspace(0, 1, 200)[:, None] * (ways[-1] - ways[0])
+        force = sum_of(ways)
+        work = 0.5 * np.sum((force[1:] + force[:-1]) * np.diff(ways, axis=0)[1:])
+        assert work > 0 and np.linalg.norm(force, axis=1).max() < 1 + 1e-9
+
+
+# The patch
+
+
+def test_a_small_patch_is_that_of_a_half_space() -> None:
+    tissue, a = Tissue(2e4, 0.45), 1e-4
+    found = patch(tissue, 0.05, a)
+    assert found.along == pytest.approx(8 * tissue.shear_modulus * a / (2 - 0.45), rel=0.01)
+    assert found.turn == pytest.approx(16 / 3 * tissue.shear_modulus * a**3, rel=0.01)
+
+
+def test_a_wide_patch_is_sheared_as_a_slab() -> None:
+    tissue, a, t = Tissue(2e4, 0.45), 0.1, 1e-2
+    assert patch(tissue, t, a).along == pytest.approx(tissue.shear_modulus * np.pi * a * a / t, rel=0.2)
+
+
+def test_the_table_is_the_closed_form() -> None:
+    layer = plate(0.03)
+    for a in (1e-3, 3.3e-3, 1.2e-2):
+        np.testing.assert_allclose(Sideways(layer).at(a, 7.5e-3), patch(layer.tissue, 7.5e-3, a), rtol=0.01)
+
+
+# Contacts
+
+
+def test_friction_needs_a_state_and_changes_no_straight_press(sim: Simulator, smooth: Simulator) -> None:
+    plain = smooth.touch([Contact(BALL, down()[-1])])[0]
+    assert sim.touch([Contact(BALL, down()[-1])])[0].wrench.tobytes() == plain.wrench.tobytes()
+    touch = led(sim, down())[0][-1]
+    np.testing.assert_allclose(touch.wrench, plain.wrench, atol=0.01 * plain.force)
+    assert touch.slip is not None and touch.slip.kind == "stick" and plain.slip is None
+
+
+def test_a_slide_sticks_creeps_and_slides(sim: Simulator) -> None:
+    touches, _ = led(sim, down() + along(np.arange(1, 41) * 1.5e-4))
+    kinds = [touch.slip.kind for touch in touches if touch.slip]
+    assert list(dict.fromkeys(kinds)) == ["stick", "creep", "slide"]
+    drags = np.array([touch.wrench[0] for touch in touches[12:]])
+    last = touches[-1]
+    assert (np.diff(drags) > -0.01 * drags.max()).all() and last.slip is not None
+    assert MU * last.force < drags[-1] < 1.6 * MU * last.force  # ploughing adds some tenths
+    turned = np.cross(last.slip.middle - last.pose_body_from_tool[:3, 3], last.slip.wrench[:3])
+    np.testing.assert_allclose(last.slip.wrench[3:], turned, atol=1e-3 * np.abs(turned).max())
+
+
+def test_friction_turns_with_the_way(sim: Simulator) -> None:
+    for angle in (0.7, 2.0, -1.3):
+        c, s = np.cos(angle), np.sin(angle)
+        last = led(sim, down() + [at(c * x, s * x, RADIUS - DEPTH) for x in np.arange(1, 31) * 2e-4])[0][-1]
+        assert last.slip is not None
+        np.testing.assert_allclose(last.slip.wrench[:2] / np.linalg.norm(last.slip.wrench[:2]), [c, s], atol=0.02)
+
+
+def test_a_reversed_slide_has_the_same_drag_the_other_way(sim: Simulator) -> None:
+    touches, _ = led(sim, down() + along(np.append(np.arange(1, 31), np.arange(29, -1, -1)) * 2e-4))
+    there, back = touches[41].wrench[0], touches[-1].wrench[0]
+    assert back == pytest.approx(-there, rel=0.03)
+
+
+def test_a_spin_is_resisted_up_to_its_limit(sim: Simulator) -> None:
+    poses = [turn((0, 0, 1), angle, (0, 0, RADIUS - DEPTH)) for angle in np.linspace(0, 1.2, 40)]
+    touches, _ = led(sim, down() + poses)
+    torques = np.array([touch.wrench[5] for touch in touches[12:]])
+    assert (np.diff(torques) > -1e-9).all() and touches[-1].slip is not None and touches[-1].slip.kind == "slide"
+    assert 0.4 < torques[-1] / (MU * touches[-1].force * 4e-3) < 1.2  # 0.59 mu N a of Hertz's pressure, and ploughing
+
+
+def test_a_turned_scene_answers_turned(sim: Simulator) -> None:
+    motion = turn((1, 2, 3), 0.8, (0.1, 0.2, -0.3))
+    other = Simulator(sim.layer.with_(vertices=sim.layer.vertices @ motion[:3, :3].T + motion[:3, 3]), Winkler(),
+                      friction=MU)  # fmt: skip
+    poses = down() + along(np.arange(1, 16) * 2e-4)
+    one, two = led(sim, poses)[0][-1], led(other, [motion @ pose for pose in poses])[0][-1]
+    np.testing.assert_allclose(two.wrench[:3], motion[:3, :3] @ one.wrench[:3], atol=1e-5)
+
+
+def test_halving_the_steps_changes_the_drag_by_less_than_one_percent(living: Simulator) -> None:
+    x = np.append(np.linspace(0, 4e-3, 21), np.linspace(4e-3, 1e-3, 16)[1:])
+    fine = np.interp(np.arange(2 * len(x) - 1) / 2, np.arange(len(x)), x)
+    coarse = led(living, along(x), led(living, down(), dt=0.01)[1], 0.02)[0]
+    finer = led(living, along(fine), led(living, down(), dt=0.01)[1], 0.01)[0][::2]
+    off = max(np.abs(a.wrench[:3] - b.wrench[:3]).max() for a, b in zip(coarse[1:], finer[1:], strict=True))
+    assert off < 0.01 * coarse[-1].force
+
+
+def test_a_wrench_within_the_cap_is_carried(living: Simulator) -> None:
+    state, force = State(), np.array([0.2, -0.1, -0.8])
+    for dt in (0.0, 0.01, 0.3, 2.0):
+        pose = at(0, 0, RADIUS - 2.5e-3)
+        plain = living.touch([Contact(BALL, pose, np.append(force, [0, 0, 0]))])[0]
+        torque = np.cross([0.0, 0.0, -RADIUS], force)  # through the contact, about the ball's middle
+        (touch,), state = living.touch([Contact(BALL, pose, np.append(force, torque))], state, dt)
+        assert plain.drag > 0.2 and touch.slip is not None and touch.slip.kind != "slide"
+        np.testing.assert_allclose(touch.wrench[:3], force, atol=1e-6)
+        assert "drag" not in touch.trust.why
+
+
+def test_a_wrench_beyond_the_cap_slides_and_says_what_is_missing(sim: Simulator) -> None:
+    stated = np.array([0.9, 0, -0.8, 0, 0, 0.0])
+    (touch,), _ = sim.touch([Contact(BALL, at(0, 0, RADIUS - 2.5e-3), stated)], State(), 0.01)
+    assert touch.slip is not None and touch.slip.kind == "slide"
+    np.testing.assert_allclose(touch.wrench + touch.missing, stated, atol=1e-9)
+    assert 0.1 < touch.drag < 0.6 and touch.force == pytest.approx(0.8, rel=0.02)
+
+
+def test_skin_under_a_tool_is_dragged_along(sim: Simulator) -> None:
+    touches, _ = led(sim, down() + along(np.arange(1, 11) * 1e-4))
+    straight, dragged = sim.answer(touches[11:12]), sim.answer(touches[-1:])
+    under = np.linalg.norm(sim.layer.vertices[:, :2], axis=1) < 2e-3
+    assert np.abs(straight.displacement[under, 0]).max() < 3e-4
+    assert dragged.displacement[under, 0].mean() == pytest.approx(1e-3, rel=0.25)
+    assert dragged.displacement[:, 2].min() == pytest.approx(straight.displacement[:, 2].min(), rel=0.1)
+
+
+def test_friction_is_by_tool_and_by_name(sim: Simulator) -> None:
+    some = Simulator(sim.layer, Winkler(), sim.tools, friction={"probe": "oiled"})
+    assert some.history.friction("probe") == PAIRS["oiled"].friction and some.history.friction("other") == 0
+    assert coefficient(None) == 0 and coefficient("dry") == PAIRS["dry"].friction
+    for wrong in ("wet", -0.1, 9.0, float("nan")):
+        with pytest.raises(InvalidInput):
+            coefficient(wrong)
+
+
+# Energy
+
+
+def closed_path(rng: np.random.Generator, deepest: float) -> np.ndarray:
+    """Ways along x and y, depth [m] and tilts [rad] of a path from the air back to the same place, (N, 5)."""
+    most = np.array([0.01, 0.01, deepest, 0.25, 0.25])
+    keys = rng.uniform([-1, -1, -0.3, -1, -1], 1, (4, 5)) * most
+    keys = np.vstack([np.zeros(5), keys, np.zeros(5)])
+    keys[[0, -1], 2] = -2e-4
+    steps = [keys[0]]
+    for a, b in pairwise(keys):
+        many = int(np.ceil(max(np.linalg.norm((b - a)[:3]) / 2e-4, np.linalg.norm((b - a)[3:]) / 0.02)))
+        steps += [a + (b - a) * k / many for k in range(1, many + 1)]
+    return np.array(steps)
+
+
+@pytest.mark.parametrize("kind", ["sim", "smooth", "living"])
+@pytest.mark.parametrize("tool, height, deepest", [(BALL, RADIUS, 3.5e-3), (punch(8e-3, 0.02), 0.01, 3e-3)])
+def test_no_closed_path_gives_energy(
+    request: pytest.FixtureRequest, kind: str, tool: Tool, height: float, deepest: float
+) -> None:
+    sim, rng = request.getfixturevalue(kind), np.random.default_rng(3)
+    for _ in range(3):
+        state, before, wrench, net, put, dt = State(), None, np.zeros(6), 0.0, 0.0, 10 ** rng.uniform(-4, -1)
+        for x, y, z, tilt_x, tilt_y in closed_path(rng, deepest):
+            pose = np.eye(4)
+            pose[:3, :3] = Rotation.from_rotvec([tilt_x, tilt_y, 0]).as_matrix()
+            pose[:3, 3] = x, y, height - z
+            (touch,), state = sim.touch([Contact(tool, pose)], state, dt)
+            if before is not None:
+                spun = Rotation.from_matrix(pose[:3, :3] @ before[:3, :3].T).as_rotvec()
+                work = 0.5 * float((wrench + touch.wrench) @ np.concatenate([pose[:3, 3] - before[:3, 3], spun]))
+                net, put = net + work, put + max(work, 0.0)
+            before, wrench = pose, touch.wrench
+        assert net > -0.005 * put

@@ -1,0 +1,191 @@
+"""Laws of time: tissue that relaxes, answered step by step from a state that is a value."""
+
+import pickle
+
+import numpy as np
+import pytest
+
+from stmpl_core import Contact, Membrane, Ply, Prony, Simulator, SoftLayer, State, Tissue, Touch
+from stmpl_core.errors import InvalidInput
+from stmpl_core.methods import Winkler
+from stmpl_core.relaxation import series_of
+from stmpl_core.touch import APART, BY_POSE
+from tests.scenes import at, ball, plate
+
+SERIES = Prony((0.225, 0.225), (0.5, 5.0))
+RADIUS, DEPTH = 8e-3, 3e-3
+BALL = ball(RADIUS)
+MIDDLE = (3e-4, 2e-4)  # off the mesh's vertices
+
+
+def relaxing(series: Prony | None = SERIES) -> SoftLayer:
+    return plate(0.09).with_(tissue=Tissue(2e4, 0.4, relaxation=series))
+
+
+@pytest.fixture(scope="module")
+def sim() -> Simulator:
+    return Simulator(relaxing(), Winkler())
+
+
+@pytest.fixture(scope="module")
+def elastic(sim: Simulator) -> Simulator:
+    return Simulator(relaxing(None), Winkler(), sim.tools)
+
+
+def pressed(depth: float, wrench: tuple[float, ...] | None = None, x: float = 0.0) -> Contact:
+    pose = at(MIDDLE[0] + x, MIDDLE[1], RADIUS - depth)
+    return Contact(BALL, pose, None if wrench is None else np.array([*wrench, 0.0, 0.0, 0.0]))
+
+
+def played(sim: Simulator, times: np.ndarray, depths: np.ndarray) -> tuple[list[Touch], State]:
+    """Touches at depths [m], one at each time [s]."""
+    state, touches, before = State(), [], times[0]
+    for time, depth in zip(times, depths, strict=True):
+        (touch,), state = sim.touch([pressed(depth)], state, time - before)
+        touches.append(touch)
+        before = time
+    return touches, state
+
+
+def forces(sim: Simulator, times: np.ndarray, depths: np.ndarray) -> np.ndarray:
+    return np.array([touch.force for touch in played(sim, times, depths)[0]])
+
+
+def test_elastic_tissue_answers_bit_for_bit_as_without_a_state(elastic: Simulator) -> None:
+    depths = np.array([-1e-3, 0.5e-3, 2e-3, 4e-3, 3e-3, 1e-3, -1e-3])
+    for touch, depth in zip(played(elastic, 0.1 * np.arange(7), depths)[0], depths, strict=True):
+        (plain,) = elastic.touch([pressed(depth)])
+        assert touch.wrench.tobytes() == plain.wrench.tobytes() and touch.status == plain.status
+        assert (touch.pressure is None) == (plain.pressure is None)
+        if touch.pressure is not None and plain.pressure is not None:
+            assert touch.pressure.tobytes() == plain.pressure.tobytes()
+        assert sim_motion(elastic, touch).tobytes() == sim_motion(elastic, plain).tobytes()
+
+
+def sim_motion(sim: Simulator, touch: Touch) -> np.ndarray:
+    return sim.answer([touch]).displacement
+
+
+def test_a_quick_press_is_elastic_and_a_slow_one_relaxed(sim: Simulator, elastic: Simulator) -> None:
+    depths = np.linspace(-1e-4, DEPTH, 20)
+    stiff = forces(elastic, np.zeros(20), depths)
+    np.testing.assert_allclose(forces(sim, np.zeros(20), depths), stiff, rtol=1e-12)
+    np.testing.assert_allclose(forces(sim, 1e4 * np.arange(20.0), depths)[2:], SERIES.relaxed * stiff[2:], rtol=1e-3)
+
+
+def test_a_held_press_relaxes_as_the_series_says(sim: Simulator, elastic: Simulator) -> None:
+    times = np.concatenate([np.zeros(10), np.geomspace(0.01, 60, 30)])
+    depths = np.concatenate([np.linspace(-1e-4, DEPTH, 10), np.full(30, DEPTH)])
+    hold = elastic.touch([pressed(DEPTH)])[0].force * SERIES.left(times[10:])
+    np.testing.assert_allclose(forces(sim, times, depths)[10:], hold, rtol=1e-9)
+
+
+def test_the_force_is_the_convolution_until_the_skin_is_free(sim: Simulator, elastic: Simulator) -> None:
+    """1 Hz massage with lift-off, against the integral over the elastic force on a fine grid of time."""
+    times = np.linspace(0, 3, 601)
+    depths = 0.5 * DEPTH * (1 - 1.4 * np.cos(2 * np.pi * times))
+    found = forces(sim, times, depths)
+    plain = forces(elastic, times, depths)
+    history, free, straight = np.zeros(2), 0.0, []
+    gone = np.exp(-0.005 / np.array(SERIES.times))
+    for one in plain:  # forward Euler in the elastic force of skin that is free or held
+        owed = float(np.array(SERIES.shares) @ (gone * history + (1 - gone) * free))
+        free = max(one, owed)
+        history = gone * history + (1 - gone) * free
+        straight.append(max(one - float(np.array(SERIES.shares) @ history), 0.0))
+    assert np.abs(found - straight).max() < 0.02 * plain.max()
+    assert (found == 0).mean() > (plain == 0).mean() + 0.05  # skin lags: the tool leaves it early
+
+
+def test_halving_the_steps_changes_the_force_by_less_than_one_percent(sim: Simulator) -> None:
+    rng = np.random.default_rng(0)
+    times = np.cumsum(rng.uniform(0.005, 0.04, 60))
+    knots = np.array([-0.1, 1, 0.3, 0.9, -0.2, 0.7, 0.7])
+    depths = np.interp(times, np.linspace(times[0], times[-1], 7), DEPTH * knots)
+    fine = np.interp(np.arange(119) / 2, np.arange(60), times)
+    coarse, finer = forces(sim, times, depths), forces(sim, fine, np.interp(fine, times, depths))[::2]
+    assert np.abs(coarse - finer).max() < 0.01 * coarse.max()
+
+
+def test_a_step_without_time_or_motion_changes_nothing(sim: Simulator) -> None:
+    touches, state = played(sim, np.array([0.0, 0.1, 0.3]), np.array([-1e-4, 2e-3, 2e-3]))
+    (again,), same = sim.touch([pressed(2e-3)], state, 0.0)
+    np.testing.assert_allclose(again.wrench, touches[-1].wrench, rtol=1e-12)
+    np.testing.assert_allclose(same.tools["probe"].relaxed, state.tools["probe"].relaxed, rtol=1e-12)
+
+
+def test_a_held_force_creeps_to_the_depth_of_relaxed_tissue(sim: Simulator) -> None:
+    push, state, depths = (0.0, 0.0, -0.5), State(), []
+    for dt in [0.0, *[0.05] * 4, 0.5, 2.0, 10.0, 100.0]:
+        (touch,), state = sim.touch([pressed(2e-3, push)], state, dt)
+        assert touch.wrench[2] == pytest.approx(-0.5, rel=1e-9) and np.abs(touch.missing[:3]).max() < 1e-9
+        depths.append(touch.depth)
+    assert (np.diff(depths) > -1e-6).all()
+    relaxed = sim.touch([pressed(2e-3, (0.0, 0.0, -0.5 / SERIES.relaxed))])[0]
+    assert depths[-1] == pytest.approx(relaxed.depth, rel=0.02)
+    assert depths[0] == pytest.approx(sim.touch([pressed(2e-3, push)])[0].depth, rel=1e-6)
+
+
+def test_skin_comes_back_by_itself_after_a_quick_lift(sim: Simulator) -> None:
+    touches, state = played(sim, np.array([0, 0.1, 5.0, 5.0, 5.2, 6.0, 15.0]),
+                            np.array([-1e-4, DEPTH, DEPTH, -1e-3, -1e-3, -1e-3, -1e-3]))  # fmt: skip
+    sunk = [sim.answer([touch]).magnitude.max() for touch in touches[3:]]
+    assert all(touch.status == APART and touch.force == 0 for touch in touches[3:])
+    assert DEPTH > sunk[0] > sunk[1] > sunk[2] > sunk[3] > 0
+    _, state = sim.touch([], state, 1.0)
+    assert list(state.tools) == ["probe"]
+    assert not sim.touch([], state, 1e3)[1].tools
+
+
+def test_a_second_press_is_softer_until_the_skin_has_come_back(sim: Simulator) -> None:
+    for wait, less in ((0.05, True), (200.0, False)):
+        times = np.array([0, 0, 3, 3, 3 + wait, 3 + wait])
+        found = forces(sim, times, np.array([-1e-4, DEPTH, DEPTH, -1e-3, -1e-3, DEPTH]))
+        assert (found[-1] < 0.9 * found[1]) == less
+
+
+def test_fresh_skin_is_met_where_a_tool_slides_to(sim: Simulator) -> None:
+    _, state = played(sim, np.array([0, 0, 30.0]), np.array([-1e-4, DEPTH, DEPTH]))
+    fresh = sim.touch([pressed(DEPTH, x=0.03)], State(), 0.0)[0][0].force
+    stays = sim.touch([pressed(DEPTH)], state, 0.1)[0][0].force
+    found = []
+    for k in range(60):
+        (touch,), state = sim.touch([pressed(DEPTH, x=5e-4 * (k + 1))], state, 1e-3)
+        found.append(touch.force)
+    assert stays < 0.6 * fresh and found[-1] > 0.98 * fresh and (np.diff(found) > -0.02 * fresh).all()
+
+
+def test_a_replay_from_any_frame_is_bit_for_bit(sim: Simulator) -> None:
+    times, depths = np.linspace(0, 2, 21), DEPTH * np.sin(np.linspace(-0.1, 6, 21))
+    all_of, last = played(sim, times, depths)
+    _, middle = played(sim, times[:9], depths[:9])
+    for kept in (State.unpack(middle.pack()), pickle.loads(pickle.dumps(middle))):
+        state = kept
+        for k in range(9, 21):
+            (touch,), state = sim.touch([pressed(depths[k])], state, times[k] - times[k - 1])
+            assert touch.wrench.tobytes() == all_of[k].wrench.tobytes()
+        assert state.pack() == last.pack()
+
+
+def test_bytes_of_another_kind_are_no_state() -> None:
+    assert not State.unpack(State().pack()).tools
+    for wrong in (b"", b"{}\n", b'{"version": 1, "terms": 0, "tools": ["a"]}\n1234', b'{"version": 9}\n'):
+        with pytest.raises(InvalidInput):
+            State.unpack(wrong)
+
+
+def test_a_tool_that_was_not_told_of_for_a_while_presses_again(sim: Simulator) -> None:
+    touches, state = played(sim, np.array([0, 0.1, 0.2]), np.array([-1e-4, 2e-3, 2e-3]))
+    _, state = sim.touch([], state, 0.05)
+    (touch,), _ = sim.touch([pressed(2e-3)], state, 0.05)
+    assert touch.status == BY_POSE and touch.force == pytest.approx(touches[-1].force, rel=0.1)
+
+
+def test_materials_share_a_stacks_relaxation() -> None:
+    stack = Tissue(3e3, 0.45, skin=Membrane(2e5, 1.5e-3, 15.0), deeper=(Ply(1e-2, 1.5e4),))
+    assert not len(series_of(stack, 0.04).times)
+    fat = series_of(Tissue(3e3, 0.45, skin=stack.skin, deeper=stack.deeper, relaxation=SERIES), 0.04)
+    muscle = series_of(Tissue(3e3, 0.45, skin=stack.skin, deeper=(Ply(1e-2, 1.5e4, relaxation=SERIES),)), 0.04)
+    assert fat.times.tolist() == muscle.times.tolist() == list(SERIES.times)
+    assert 0 < muscle.shares.sum() < fat.shares.sum() and fat.shares.sum() + muscle.shares.sum() < 0.45
+    np.testing.assert_allclose(series_of(Tissue(3e3, 0.45, relaxation=SERIES), 0.04).shares, SERIES.shares)
