@@ -94,3 +94,9 @@ def test_the_reference_is_up_to_date() -> None:
     gone = [name for heading in made["PUBLIC"] for name in made["names"](heading) if made["find"](*name) is None]
     assert not gone, f"docs/make_api.py promises what does not exist: {gone}"
     assert made["PAGE"].read_text() == made["page"](), "run .venv/bin/python docs/make_api.py"
+
+
+def test_the_python_of_time_and_slip_runs() -> None:
+    code, names = PYTHON.findall((ROOT / "docs" / "time_and_slip.md").read_text())[0], {}
+    exec(compile(code, "time_and_slip.md", "exec"), names)
+    assert names["touch"].slip.kind == "slide" and names["kept"]

@@ -32,8 +32,6 @@ class Stroke:
 
     def __init__(self, name: str) -> None:
         with np.load(FILE) as file:
-            if f"{name}.pose" not in file:
-                pytest.skip(f"{name} has not been cut")
             self.pose, self.time, self.wrench = (file[f"{name}.{what}"] for what in ("pose", "time", "wrench"))
             about = json.loads(str(file[f"{name}.about"]))
         self.radius, law = about["radius"], about["friction"]
@@ -68,11 +66,11 @@ def drags(stroke: Stroke) -> tuple[np.ndarray, np.ndarray]:
     return stroke.wrench[:, :2], np.array([touch.wrench[:2] for touch in stroke.played()])
 
 
-@pytest.mark.parametrize("name, allowed", [("slab-ball8-mu0.3", 0.08), ("slab-ball8-mu0.6", 0.08),
-                                           ("slab-ball8-mu1.0", 0.12), ("slab-ball8-back-mu0.6", 0.12)])  # fmt: skip
-def test_drag_is_that_of_finite_elements(name: str, allowed: float) -> None:
+@pytest.mark.parametrize("name", ["slab-ball8-mu0.3", "slab-ball8-mu0.6", "slab-ball8-mu1.0"])
+def test_drag_is_that_of_finite_elements(name: str) -> None:
+    """Two figures of ploughing were fitted at 0.3 and 0.6; at 1.0 the file holds the first 5 mm."""
     truth, found = drags(Stroke(name))
-    assert np.abs(found - truth).max() < allowed * np.abs(truth).max()
+    assert np.abs(found - truth).max() < 0.08 * np.abs(truth).max()
 
 
 @pytest.mark.parametrize("name", ["slab-ball8-mu0.3", "slab-ball8-mu0.6"])
@@ -85,21 +83,15 @@ def test_sliding_begins_where_finite_elements_say(name: str) -> None:
         rising = np.maximum.accumulate(force[:, 0]) / np.median(force[-10:, 0])
         return float(np.interp(0.9, rising, way))
 
-    assert onset(found) == pytest.approx(onset(truth), rel=0.15)
+    assert onset(found) == pytest.approx(onset(truth), rel=0.1)
 
 
-def test_a_spin_is_resisted_as_finite_elements_say() -> None:
-    stroke = Stroke("slab-ball8-spin-mu0.6")
-    truth, found = stroke.wrench[:, 5], np.array([touch.wrench[5] for touch in stroke.played()])
-    assert np.abs(found - truth).max() < 0.2 * np.abs(truth).max()
-
-
-@pytest.mark.parametrize("name", ["slab-ramp-hold", "slab-massage", "slab-press-lift-press"])
+@pytest.mark.parametrize("name", ["slab-ramp-hold", "slab-massage"])
 def test_force_relaxes_as_that_of_finite_elements(name: str) -> None:
     """The elastic law is 2.6 % off here by itself."""
     stroke = Stroke(name)
     truth, found = stroke.wrench[:, 2], np.array([touch.wrench[2] for touch in stroke.played()])
-    assert np.abs(found - truth).max() < 0.06 * np.abs(truth).max()
+    assert np.abs(found - truth).max() < 0.04 * np.abs(truth).max()
 
 
 def main(folder: Path) -> None:
