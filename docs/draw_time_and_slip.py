@@ -36,7 +36,7 @@ def main() -> None:
             one.plot(way, np.abs(stroke.wrench[:, k]), ".", color=colour, ms=4)
     one.set(xlabel="way of the tool / mm", ylabel="force / N", ylim=(0, None),
             title="8 mm ball, 4 mm deep, slid")  # fmt: skip
-    one.legend(fontsize=7, title="lines: ours; dots: finite elements", title_fontsize=7)
+    one.legend(fontsize=6, ncol=3, loc="lower right", title="lines: ours; dots: finite elements", title_fontsize=6)
     for axis, name in zip(axes[1:], timed, strict=True):
         stroke = Stroke(name)
         axis.plot(stroke.time, [-touch.wrench[2] for touch in stroke.played(8)], "-", color="tab:blue", label="ours")

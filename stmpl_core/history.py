@@ -108,10 +108,10 @@ class History:
         """Touches of contacts with names of their own, dt [s] after a state; and the state then."""
         asked = [self._asked(contact, state.tools.get(contact.name), dt) for contact in contacts]
         touches = self.toucher.touch_all([one.contact for one in asked], alone=False)
-        for k, (one, touch) in enumerate(zip(asked, touches, strict=True)):
-            if (again := self._again(one, touch)) is not None:
-                asked[k] = again
-                touches[k] = self.toucher.touch_all([again.contact], alone=False)[0] if len(contacts) == 1 else touch
+        again = [self._again(one, touch) for one, touch in zip(asked, touches, strict=True)]
+        if any(again):
+            asked = [new or one for one, new in zip(asked, again, strict=True)]
+            touches = self.toucher.touch_all([one.contact for one in asked], alone=False)
         laws = [self._law(one, touch, dt) for one, touch in zip(asked, touches, strict=True)]
         out, memories = _balanced(asked, laws)
         for name, memory in state.tools.items():

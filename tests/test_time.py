@@ -181,6 +181,17 @@ def test_a_tool_that_was_not_told_of_for_a_while_presses_again(sim: Simulator) -
     assert touch.status == BY_POSE and touch.force == pytest.approx(touches[-1].force, rel=0.1)
 
 
+def test_two_tools_by_wrench_keep_a_state_each(sim: Simulator) -> None:
+    state, other, push = State(), BALL.named("other"), np.array([0, 0, -0.4, 0, 0, 0.0])
+    for dt in (0.0, 0.1, 1.0, 10.0):
+        pair = [Contact(BALL, at(-0.012, 0, RADIUS - 2e-3), push), Contact(other, at(0.012, 0, RADIUS - 2e-3), push)]
+        touches, state = sim.touch(pair, state, dt)
+        assert [touch.name for touch in touches] == ["probe", "other"] and set(state.tools) == {"probe", "other"}
+        assert all(touch.wrench[2] == pytest.approx(-0.4, rel=0.02) for touch in touches)
+    one, two = (state.tools[name].scalars.elastic for name in ("probe", "other"))
+    assert one == pytest.approx(two, rel=0.05) and one > 0.6
+
+
 def test_materials_share_a_stacks_relaxation() -> None:
     stack = Tissue(3e3, 0.45, skin=Membrane(2e5, 1.5e-3, 15.0), deeper=(Ply(1e-2, 1.5e4),))
     assert not len(series_of(stack, 0.04).times)
