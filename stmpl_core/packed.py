@@ -45,7 +45,7 @@ def _plain(values: dict[str, Any]) -> dict[str, Any]:
 
 def layer_stack_to_text(layer: SoftLayer) -> str:
     """Tissue and ply_scale of a layer as JSON; the factors as float32."""
-    given = asdict(layer.tissue)
+    given = _plain(asdict(layer.tissue))
     if layer.ply_scale is not None:
         given["ply_scale"] = [float(f"{x:.9g}") for x in layer.ply_scale.astype(np.float32)]
     return json.dumps(given)

@@ -4,16 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from functools import cached_property
 from typing import overload
 
 import numpy as np
 
 from stmpl_core.conform import Conformed, conform, kept_out
 from stmpl_core.contact import Contact
-from stmpl_core.dragged import Flat, dragged_motion
+from stmpl_core.dragged import dragged_motion
 from stmpl_core.errors import InvalidInput
 from stmpl_core.friction import Friction
+from stmpl_core.green import Green
 from stmpl_core.history import History
 from stmpl_core.layer import SoftLayer
 from stmpl_core.load import Load
@@ -63,10 +63,6 @@ class Simulator:
             self._green.keep(self.layer)  # a Skin from another process has a layer of its own
         self.toucher = Toucher(self.layer, self.skin.near, tools)
         self.history = History(self.toucher, friction)
-
-    @cached_property
-    def _flat(self) -> Flat:
-        return Flat.of(self.layer, self.skin.near)
 
     @property
     def tools(self) -> Tools:
@@ -137,7 +133,7 @@ class Simulator:
         """The answer with the skin that is dragged along."""
         for touch in touches:
             if touch.slip is not None:
-                more = dragged_motion(self._green or self._flat, touch)
+                more = dragged_motion(Green.of(self.layer), touch)
                 if more is not None:
                     fitted = fitted._replace(displacement=fitted.displacement + more)
         return fitted
