@@ -37,13 +37,13 @@ class SkinMembrane:
     def __init__(self, mesh: WedgeMesh, skin: Membrane) -> None:
         self.mesh, self.nu = mesh, skin.poisson_ratio
         self.shear = skin.stiffness / (2 * (1 + skin.poisson_ratio))  # mu h [N/m]
-        self.tension = skin.tension
+        self.tension, self.scale = skin.tension, 1.0  # share of mu that acts (see fem_tools.relaxation)
         self.gradients, self.axes, self.areas = _rest(mesh)
         self.balanced = np.zeros((mesh.n_columns, 3))  # f_0 [N]
         self.balanced -= self.forces(np.zeros((mesh.n_columns, 3)))[0]
 
     def _arguments(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, float, float, float]:
-        return self.mesh.columns, self.gradients, self.axes, self.areas, self.shear, self.nu, self.tension
+        return self.mesh.columns, self.gradients, self.axes, self.areas, self.scale * self.shear, self.nu, self.tension
 
     def energy(self, u: np.ndarray) -> float:
         """Energy at a displacement of the skin columns (C, 3) [m], in J; infinite where a face has no area."""
@@ -54,6 +54,13 @@ class SkinMembrane:
         out = self.balanced.copy()
         smallest = membrane_forces(u, *self._arguments(), out)
         return out, smallest
+
+    def elastic_stress(self, u: np.ndarray) -> np.ndarray:
+        """h mu (I - c C^-1) in the body's axes, (T, Q, 6) as xx, yy, zz, yz, zx, xy [N/m]; at (C, 3) [m]."""
+        flat = np.empty((*self.areas.shape, 2, 2))
+        membrane_stress(u, self.mesh.columns, self.gradients, self.axes, self.shear, self.nu, flat)
+        full = np.einsum("tai,tqab,tbj->tqij", self.axes, flat, self.axes)
+        return full[..., (0, 1, 2, 1, 2, 0), (0, 1, 2, 2, 0, 1)]
 
     def add_tangent(self, u: np.ndarray, data: np.ndarray, *, convex: float = 0.0) -> None:
         """Adds the second derivative of the energy to the skin level of the tangent's blocks [N/m].
@@ -158,6 +165,19 @@ def membrane_forces(u, columns, gradients, axes, areas, shear, nu, tension, forc
                 for i in range(3):
                     forces[columns[t, a], i] += F[i, 0] * x + F[i, 1] * y
     return smallest
+
+
+@njit(cache=True, fastmath=FAST)
+def membrane_stress(u, columns, gradients, axes, shear, nu, out):
+    """Writes shear (I - c C^-1), the stress without the tension, along the face's axes, (T, Q, 2, 2) [N/m]."""
+    local, F, inverse = np.empty((gradients.shape[2], 3)), np.empty((3, 2)), np.empty(3)
+    for t in range(gradients.shape[0]):
+        _gather(u, columns[t], local)
+        for k in range(gradients.shape[1]):
+            _, log_j = _surface(local, gradients[t, k], axes[t], F, inverse)
+            c = shear * exp(_thinning(log_j, nu))
+            out[t, k, 0, 0], out[t, k, 1, 1] = shear - c * inverse[0], shear - c * inverse[2]
+            out[t, k, 0, 1] = out[t, k, 1, 0] = -c * inverse[1]
 
 
 @njit(cache=True, fastmath=FAST)

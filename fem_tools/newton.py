@@ -56,6 +56,7 @@ class NewtonResult:
     linear_iterations: int
     load_factor: float  # share of the load that was reached
     work: float = 0.0  # multiplications that it took, about
+    scale: float = 0.0  # what the residual was measured by [sqrt(J)]
 
 
 def solve(
@@ -117,12 +118,12 @@ def newton(system: System, u: np.ndarray, factor: float, settings: NewtonSetting
     inverse = system.preconditioner(data)
     best = (np.inf, u, min_j)
     for iteration in range(settings.max_iterations + 1):
-        relative = _relative(system, inverse, r, u, factor)  # in the last tangent's norm: a new one costs as a step
+        relative, scale = _relative(system, inverse, r, u, factor)  # in the last tangent's norm: a new one costs a step
         work = product * (linear + TANGENT_COST * tangents)
         if relative < best[0]:
             best = (relative, u, min_j)
         if relative <= settings.tolerance:
-            return NewtonResult(u, True, relative, min_j, iteration, linear, factor, work)
+            return NewtonResult(u, True, relative, min_j, iteration, linear, factor, work, scale)
         history.append(relative)
         stalled = len(history) > 5 and history[-1] > 0.3 * history[-6] and not system.conservative
         if iteration == settings.max_iterations or not np.isfinite(relative) or stalled or work >= settings.max_work:
@@ -158,11 +159,11 @@ def newton(system: System, u: np.ndarray, factor: float, settings: NewtonSetting
     return NewtonResult(best[1], False, best[0], best[2], iteration, linear, factor, work)
 
 
-def _relative(system: System, inverse: np.ndarray, r: np.ndarray, u: np.ndarray, factor: float) -> float:
-    """The residual over the load, or over the internal forces where they are larger [-]."""
+def _relative(system: System, inverse: np.ndarray, r: np.ndarray, u: np.ndarray, factor: float) -> tuple[float, float]:
+    """The residual over the load, or over the internal forces where they are larger [-]; and that scale [sqrt(J)]."""
     load = _load_vector(system, u, factor)
-    scale = max(_norm(inverse, load), _norm(inverse, r + load))
-    return _norm(inverse, r) / scale if scale > 0 else 0.0
+    scale = max(_norm(inverse, load), _norm(inverse, r + load), system.least)
+    return (_norm(inverse, r) / scale if scale > 0 else 0.0), scale
 
 
 def _descend(system: System, u, du, r, factor: float, settings: NewtonSettings):

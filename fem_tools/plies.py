@@ -67,15 +67,21 @@ def wedge_ends(tissue: Tissue, length: np.ndarray, layers: int, scale: np.ndarra
     return np.hstack([*ends, np.ones((len(length), 1))])
 
 
+def wedge_plies(mesh: WedgeMesh, tissue: Tissue) -> np.ndarray:
+    """Number of the material at the depth of each wedge's middle, (T L,)."""
+    if not tissue.deeper:
+        return np.zeros(len(mesh.triangles) * mesh.layers, dtype=np.int64)
+    length = np.linalg.norm(mesh.inner - mesh.outer, axis=1) / (1.0 if mesh.ply_scale is None else mesh.ply_scale)
+    middle = (mesh.ends[:, :-1] + mesh.ends[:, 1:]) / 2 * length[:, None]
+    return np.searchsorted([ply.depth for ply in tissue.deeper], middle[mesh.triangles].mean(axis=1).ravel())
+
+
 def wedge_materials(mesh: WedgeMesh, tissue: Tissue) -> tuple[np.ndarray, np.ndarray]:
     """mu and lambda of each wedge, (T L,) each [Pa]: those of the material at the depth of its middle."""
     count = len(mesh.triangles) * mesh.layers
     if not tissue.deeper:
         return np.full(count, tissue.shear_modulus), np.full(count, tissue.lame_lambda)
-    length = np.linalg.norm(mesh.inner - mesh.outer, axis=1) / (1.0 if mesh.ply_scale is None else mesh.ply_scale)
-    middle = (mesh.ends[:, :-1] + mesh.ends[:, 1:]) / 2 * length[:, None]
-    which = np.searchsorted([ply.depth for ply in tissue.deeper], middle[mesh.triangles].mean(axis=1).ravel())
-    moduli = np.array([(one.shear_modulus, one.lame_lambda) for one in materials(tissue)])[which]
+    moduli = np.array([(one.shear_modulus, one.lame_lambda) for one in materials(tissue)])[wedge_plies(mesh, tissue)]
     return np.ascontiguousarray(moduli[:, 0]), np.ascontiguousarray(moduli[:, 1])
 
 

@@ -12,6 +12,7 @@ from fem_tools import neo_hookean as nh
 from fem_tools.membrane import SkinMembrane
 from fem_tools.mesh import WedgeMesh
 from fem_tools.plies import wedge_materials
+from fem_tools.relaxation import Fading, Relaxing
 from stmpl_core.tissue import Tissue
 
 
@@ -64,6 +65,8 @@ class System:
         self.loads: Sequence[SkinLoad] = loads
         self.mu, self.lam = wedge_materials(mesh, tissue)
         self.membrane = SkinMembrane(mesh, tissue.skin) if tissue.skin else None
+        self.relaxing: Relaxing | None = None
+        self.least = 0.0  # least load that a residual is measured by [sqrt(J)]: skin that is let go bears none
         self.rest = mesh.rest_positions()
         self.fixed = fixed
         self.keep = keep
@@ -74,22 +77,34 @@ class System:
         """No displacement, (C, levels, 3)."""
         return np.zeros((self.mesh.n_columns, self.mesh.levels, 3))
 
+    def relax(self, fading: Fading = "stress") -> Relaxing:
+        """Lets stress fade with time as the tissue's series say; see fem_tools.relaxation."""
+        self.relaxing = Relaxing(self.mesh, self.tissue, (self.mu, self.lam), self.membrane, fading)
+        return self.relaxing
+
     @property
     def conservative(self) -> bool:
         """Whether all loads are: then the tangent is symmetric and an equilibrium is a minimum of the energy."""
         return all(load.conservative for load in self.loads)
 
+    def _moduli(self) -> tuple[np.ndarray, np.ndarray]:
+        """mu and lambda of the wedges as they act now, (T L,) each [Pa]."""
+        return (self.relaxing.body.mu, self.relaxing.body.lam) if self.relaxing else (self.mu, self.lam)
+
     def energy(self, u: np.ndarray, factor: float) -> float:
         """Stored energy plus the loads' potential [J]; infinite where an element is folded."""
         m, skin = self.mesh, self.rest[:, 0] + u[:, 0]
-        stored = nh.strain_energy(u, m.columns, m.layers, m.gradients, m.volumes, self.mu, self.lam)
+        stored = nh.strain_energy(u, m.columns, m.layers, m.gradients, m.volumes, *self._moduli())
         stored += self.membrane.energy(u[:, 0]) if self.membrane else 0.0
+        stored += self.relaxing.energy(u) if self.relaxing else 0.0
         return stored + sum(load.potential(skin, factor) for load in self.loads)
 
     def internal(self, u: np.ndarray) -> tuple[np.ndarray, float]:
         """Internal forces (C, levels, 3) [N] and the smallest det F, or 0 where a face of a membrane has no area."""
         m, forces = self.mesh, np.zeros_like(u)
-        smallest = nh.internal_forces(u, m.columns, m.layers, m.gradients, m.volumes, self.mu, self.lam, forces)
+        smallest = nh.internal_forces(u, m.columns, m.layers, m.gradients, m.volumes, *self._moduli(), forces)
+        if self.relaxing:
+            self.relaxing.add_forces(u, forces)
         if self.membrane:
             of_skin, grown = self.membrane.forces(u[:, 0])
             forces[:, 0] += of_skin
@@ -114,7 +129,9 @@ class System:
         """Blocks of the tangent (or of its symmetric, or of a positive part), (n_blocks, 3 m, 3 m) [N/m]."""
         m, width = self.mesh, 3 * self.free
         data = np.zeros((len(m.indices), width, width))
-        nh.tangent(u, m.columns, m.blocks, m.layers, m.gradients, m.volumes, self.mu, self.lam, convex, data)
+        nh.tangent(u, m.columns, m.blocks, m.layers, m.gradients, m.volumes, *self._moduli(), convex, data)
+        if self.relaxing:
+            self.relaxing.add_tangent(data, convex)
         if self.membrane:
             self.membrane.add_tangent(u[:, 0], data, convex=convex)
         skin = self.rest[:, 0] + u[:, 0]
