@@ -4,5 +4,6 @@ from fem_tools.indenter import IndenterFem
 from fem_tools.patch import PatchFem
 from fem_tools.press import Press
 from fem_tools.rigid import RigidFem
+from fem_tools.stroke import Stroke
 
-__all__ = ["IndenterFem", "PatchFem", "Press", "RigidFem"]
+__all__ = ["IndenterFem", "PatchFem", "Press", "RigidFem", "Stroke"]

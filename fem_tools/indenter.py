@@ -24,14 +24,15 @@ INDENTER_LAYERS = 2  # wedges through the thickness: one is 5 % off in force and
 
 
 class IndenterFem:
-    """Presses rigid tools into a soft layer.
+    """Presses rigid tools into a soft layer, or leads them over it.
 
     Args:
         fem: solver that meshes the patch; None: two wedges deep, up to three refinements where the tool's
             curvature asks.
         friction: law of friction: "stick" (a touching point stays where it touched, until it is let go), "none", or
-            Coulomb's coefficient with the limit taken from the last update of the pressure.
-        step: longest step of the tools [thicknesses]; what touches first within a step sticks from its end on.
+            Coulomb's coefficient (fem_tools.tool_contact).
+        step: longest step of the tools [thicknesses]; what touches first within a step sticks from its end on, under
+            Coulomb's law from its middle.
         fading: stress that a material with a Prony series loses in time: "stress", all of it, or "shear", that of mu.
         max_work: multiplications after which a press or a path stops, whatever it has reached (see NewtonSettings).
     """

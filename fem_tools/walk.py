@@ -31,6 +31,7 @@ MAX_ENTERED = 20e-6  # m; the augmented Lagrangian goes on until nodes are less 
 MAX_UPDATES = 4
 MAX_FRICTION_UPDATES = 12  # updates under Coulomb's law, whose limit follows the pressure
 LEAST_LOAD = 0.01  # share of a path's largest load by which residuals are measured where there is less [-]
+MAX_UNSETTLED = 0.05  # share of the limit by which friction may differ from that of the pressure [-]
 STRAIGHT = 0.9  # cosine between two steps of a tool, above which the skin is taken to go on as it did [-]
 TIGHT = 1e-4  # residual over load of a solve [-]
 LOOSE = 3e-3  # residual over load of a solve whose friction has still to settle [-]
@@ -322,6 +323,12 @@ class Walk:
                 "refine the patch (PatchFem(refine=...))",
                 in_range=False,
             )
+        unsettled = trust.figures["friction_unsettled"]
+        if unsettled > MAX_UNSETTLED:
+            why = f"friction is {unsettled:.0%} from that of the pressure: shorten the steps, or refine the patch"
+            trust = trust.also(why, in_range=False)
+        if isinstance(self.way, StrokeWay):  # nobody fitted one
+            trust = replace(trust, error_bound=None)
         if result.min_j < MIN_J:
             trust = trust.also(f"an element is crushed to {result.min_j:.2f} of its volume", in_range=False)
         if not stable:

@@ -14,6 +14,7 @@ from stmpl_core.errors import InvalidInput
 from stmpl_core.layer import SoftLayer
 
 SPREAD = 0.15  # way that skin is pushed aside before it is touched [thicknesses]
+SPREAD_OVER_DEPTH = 0.5  # the same over the depth, at most [-]
 DRAGGED = 2.0  # way that skin is dragged along before it slips, over mu and the depth; 1.4 by Mindlin's law at nu 0.45
 STRETCHED = 1.5  # by how much friction stretches what trails behind, over mu squared: faces grow by as much [-]
 SAMPLES = 48  # places of a stroke at which it says how fine the mesh shall be, at most
@@ -201,7 +202,7 @@ class StrokeWay:
                 way = (press.pose_body_from_tool - before.pose_body_from_tool)[:3, 3]
                 way -= (way @ press.direction) * press.direction
                 length = float(np.linalg.norm(way))
-                shifts = list(press.sideways(SPREAD * self.thickness))
+                shifts = list(press.sideways(min(SPREAD * self.thickness, SPREAD_OVER_DEPTH * self.deepest)))
                 if length > 0:
                     shifts += [-share * self._drag * way / length for share in (0.5, 1.0)]
                 for aside in shifts:

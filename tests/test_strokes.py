@@ -87,6 +87,30 @@ def test_a_ball_pushed_a_little_sticks_and_pushed_back_has_given_no_energy(ball)
     assert np.linalg.norm(forces[-1]) < 1e-4 * np.linalg.norm(forces[2])
 
 
+@pytest.mark.slow
+def test_a_ball_pushed_lightly_sideways_creeps_as_cattaneo_and_mindlin_say():
+    """F = mu N (1 - (1 - k s / (1.5 mu N))^1.5), k = 8 G a / (2 - nu) (Johnson, "Contact Mechanics", sec. 7.2-7.3).
+
+    A layer 28 times as thick as the contact is wide; a is Hertz's of the force. Wedges end at the depths of materials,
+    so equal ones make the mesh fine where the stress is.
+    """
+    nu, mu, radius, depth, modulus = 0.45, 0.5, 8e-3, 0.25e-3, 1e3
+    plies = tuple(Ply(z, modulus, nu) for z in (0.8e-3, 2.5e-3, 7e-3))
+    thick = plate(0.072, 6e-3, 0.04, crossed=True).with_(tissue=Tissue(modulus, nu, deeper=plies))
+    field = SignedDistance.of(scenes.ball(radius, 5), spacing=0.3e-3)
+    fem = PatchFem(element="P1xP2", layers=1, refine=5, reach=0.8, check_stability=False)
+    slid = [0.06e-3, 0.12e-3, 0.2e-3]
+    way = np.array([at(x, 0, radius - depth * (z > 0)) for x, z in [(0, 0), (0, 1), *((x, 1) for x in slid)]])
+    answers = list(IndenterFem(fem, friction=mu, step=0.01).prepare(thick).follow([Stroke(field, way)]))
+    for x, answer in zip(slid, answers[2:], strict=True):
+        along, normal = answer.wrenches[0][0], -answer.wrenches[0][2]
+        wide = (0.75 * normal * radius * (1 - nu**2) / modulus) ** (1 / 3)
+        stiff = 8 * modulus / (2 * (1 + nu)) * wide / (2 - nu)
+        expected = mu * normal * (1 - max(0.0, 1 - stiff * x / (1.5 * mu * normal)) ** 1.5)
+        assert along == pytest.approx(expected, abs=0.03 * mu * normal)
+    assert answers[1].force == pytest.approx(4 / 3 * modulus / (1 - nu**2) * radius**0.5 * depth**1.5, rel=0.1)
+
+
 def test_a_ball_that_spins_bears_the_torque_of_full_slip(ball):
     """The integral of mu p r over the contact, less than mu times force times its radius."""
     mu = 0.3
