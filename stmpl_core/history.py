@@ -12,13 +12,13 @@ from dataclasses import replace
 from functools import cached_property
 from typing import NamedTuple
 
-import numba
 import numpy as np
 
 from stmpl_core.arrays import Transform
 from stmpl_core.columns import shifted
 from stmpl_core.contact import Contact
 from stmpl_core.dragged import MIN_OFFSET
+from stmpl_core.footing import carried_tangent, in_plane, in_space, patch_of, twist_between, way_along, way_of_tool
 from stmpl_core.friction import Friction, coefficients
 from stmpl_core.relaxation import series_of, weights
 from stmpl_core.sideways import Sideways
@@ -33,7 +33,6 @@ HELD_OFF = 0.01  # relative error of the elastic force by wrench, from which it 
 FORGOTTEN = 1e-3  # elastic force of skin that comes back, over its largest, below which it is forgotten
 GIVEN_BACK = 0.7  # share of what an elastic contact gives back that must be covered by what was put in
 KEPT = 1.5  # work beyond what elastic skin could hold that is forgotten: what was lost before pays for nothing now
-EDGE_SHARE = 0.3  # pressure over its mean from which skin counts as touched in full
 NOTHING = np.zeros(3)
 
 
@@ -133,11 +132,11 @@ class History:
         known = before is not None and memory.scalars.pressing >= 0
         twist, gone = np.zeros(6), 0.0
         if known:
-            twist = _twist(memory.pose, pose)
+            twist = twist_between(memory.pose, pose)
         if memory.scalars.radius > 0:
             held = memory.scalars.pressing > 0
             start = memory.pose if held else memory.imprint
-            over = _along(_twist(start, pose), memory.contact, start)
+            over = way_along(twist_between(start, pose), memory.contact, start)
             gone = (memory.scalars.share if held else 1.0) * over / memory.scalars.radius
         kept, gain = self._relaxed(memory, dt, gone)
         asked = contact
@@ -190,9 +189,9 @@ class History:
         normal, net = push / size, min(size / elastic, 1.0)
         nodes = pressed.squeeze.nodes
         depth = nodes.sinking if len(nodes.sinking) else nodes.strain * nodes.thickness
-        middle, radius, lever, thickness, whole = _patch(
+        middle, radius, lever, thickness, whole = patch_of(
             nodes.points, nodes.area, nodes.thickness, depth, pressed.forces, normal)  # fmt: skip
-        contact = np.stack([middle, normal, _carried(one.before.contact, normal, before.pressing > 0)])
+        contact = np.stack([middle, normal, carried_tangent(one.before.contact, normal, before.pressing > 0)])
         scalars = Scalars(1.0, elastic, max(elastic, before.largest), net, radius, touch.depth, elastic, pressed.power,
                           work=before.work)  # fmt: skip
         relaxed = one.kept + one.gain * elastic
@@ -243,13 +242,13 @@ class History:
         stiffness = (1 + PLOUGHED[0] * rises) * np.array([patch.along, patch.along, patch.turn / (lever * lever)])
         stated, wanted = one.stated.wrench, NOTHING
         if stated is not None:
-            wanted = _in_plane(stated - touch.wrench, memory.contact, origin, lever)
-        way, rolled = _way(one.twist, one.known, before.contact, before.scalars.pressing > 0, memory.contact, origin,
-                           now.depth, radius, lever)  # fmt: skip
+            wanted = in_plane(stated - touch.wrench, memory.contact, origin, lever)
+        way, rolled = way_of_tool(one.twist, one.known, before.contact, before.scalars.pressing > 0, memory.contact,
+                                  origin, now.depth, radius, lever)  # fmt: skip
         springs, relaxed, carried, share, stored = drag(
             before.springs, before.springs_relaxed, *self.series, dt, rolled, stiffness, before.stiffness, cap, way,
             wanted, stated is not None)  # fmt: skip
-        wrench, offset, turn = _in_space(carried, springs, stiffness, memory.contact, origin, lever)
+        wrench, offset, turn = in_space(carried, springs, stiffness, memory.contact, origin, lever)
         slip = Slip(wrench, share, offset, turn, memory.contact[0])
         memory = memory._replace(scalars=now._replace(share=share), stiffness=stiffness, springs=springs,
                                  springs_relaxed=relaxed)  # fmt: skip
@@ -352,128 +351,3 @@ def _weakened(touch: Touch, by: float) -> Touch:
     if touch.slip is not None:
         touch = replace(touch, slip=touch.slip._replace(wrench=touch.slip.wrench * by))
     return replace(_scaled(touch, by, 0.0), passive=by)
-
-
-@numba.njit(cache=True, error_model="numpy", inline="always")
-def _dot(a, b):
-    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
-
-
-@numba.njit(cache=True, error_model="numpy", inline="always")
-def _cross(a, b):
-    return np.array([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]])
-
-
-@numba.njit(cache=True, error_model="numpy")
-def _patch(points, area, thickness, depth, forces, normal):
-    """What a contact is as a whole: its middle (3,) [m]; the radius of a circle as large [m]; the mean distance of its
-    forces from the middle [m]; its mean thickness [m]; and the energy of its forces if they grew as linear ones do,
-    half the sum of each times its depth (Clapeyron) [J].
-    """
-    middle, total, squares, thick, energy = np.zeros(3), 0.0, 0.0, 0.0, 0.0
-    for n in range(len(area)):
-        energy += 0.5 * forces[n] * depth[n]
-        total += forces[n]
-        squares += forces[n] * forces[n] / area[n]
-        thick += forces[n] * thickness[n]
-        for x in range(3):
-            middle[x] += forces[n] * points[n, x]
-    middle /= total
-    full, size, lever = EDGE_SHARE * squares / total, 0.0, 0.0
-    for n in range(len(area)):
-        size += min(area[n], forces[n] / full)
-        square = up = 0.0
-        for x in range(3):
-            d = points[n, x] - middle[x]
-            square += d * d
-            up += d * normal[x]
-        lever += forces[n] * np.sqrt(max(square - up * up, 0.0))
-    radius = np.sqrt(size / np.pi)
-    return middle, radius, max(lever / total, 0.1 * radius), thick / total, energy
-
-
-@numba.njit(cache=True, error_model="numpy")
-def _twist(start, end):
-    """Way of a tool's origin and its turn as a vector, between poses (4, 4), (6,) [m, rad]."""
-    out = np.empty(6)
-    for x in range(3):
-        out[x] = end[x, 3] - start[x, 3]
-    cosine, turn = -1.0, np.zeros((3, 3))
-    for a in range(3):
-        for b in range(3):
-            for c in range(3):
-                turn[a, b] += end[a, c] * start[b, c]
-        cosine += turn[a, a]
-    out[3], out[4], out[5] = turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]
-    sine = np.sqrt(out[3] ** 2 + out[4] ** 2 + out[5] ** 2)
-    scale = np.arctan2(sine, cosine) / sine if sine > 1e-9 else 0.5
-    for x in range(3, 6):
-        out[x] *= scale
-    return out
-
-
-@numba.njit(cache=True, error_model="numpy")
-def _way(twist, known, before, held, contact, origin, depth, radius, lever):
-    """Way of a tool along the skin and lever times its turn (3,) [m], and how far its contact rolled on, over a.
-
-    A tool that meets the skin within a step goes along it from there on.
-    """
-    way, rolled = np.zeros(3), 0.0
-    if not known:
-        return way, rolled
-    middle, normal, first = contact
-    second = _cross(normal, first)
-    go = twist[:3] + _cross(twist[3:], middle - origin)
-    if not held:
-        go *= min(1.0, depth / max(abs(_dot(go, normal)), 1e-12))
-    way[0], way[1], way[2] = _dot(go, first), _dot(go, second), lever * _dot(twist[3:], normal)
-    if held:
-        on = middle - before[0] - go
-        rolled = np.sqrt(_dot(on, first) ** 2 + _dot(on, second) ** 2) / radius
-    return way, rolled
-
-
-@numba.njit(cache=True, error_model="numpy")
-def _in_plane(wrench, contact, origin, lever):
-    """Forces of friction (3,) [N] of a wrench (6,); see stmpl_core.slip."""
-    middle, normal, first = contact
-    turn = _dot(wrench[3:] - _cross(middle - origin, wrench[:3]), normal)
-    return np.array([_dot(wrench, first), _dot(wrench, _cross(normal, first)), turn / lever])
-
-
-@numba.njit(cache=True, error_model="numpy")
-def _in_space(forces, springs, stiffness, contact, origin, lever):
-    """Wrench (6,) of forces of friction, way of the skin under the tool (3,) [m], and its turn."""
-    middle, normal, first = contact
-    second, wrench = _cross(normal, first), np.empty(6)
-    along = forces[0] * first + forces[1] * second
-    wrench[:3], wrench[3:] = along, _cross(middle - origin, along) + forces[2] * lever * normal
-    x, y, turn = springs[:, 0].sum() / stiffness[0], springs[:, 1].sum() / stiffness[1], springs[:, 2].sum()
-    return wrench, x * first + y * second, turn / (stiffness[2] * lever)
-
-
-@numba.njit(cache=True, error_model="numpy")
-def _along(twist, contact, pose):
-    """Way along the skin of the place of a tool that was in the middle of its contact [m]; contact: see Memory."""
-    w, d, go = twist[3:], contact[0] - pose[:3, 3], twist[:3].copy()
-    go[0] += w[1] * d[2] - w[2] * d[1]
-    go[1] += w[2] * d[0] - w[0] * d[2]
-    go[2] += w[0] * d[1] - w[1] * d[0]
-    deep = _dot(go, contact[1])
-    return np.sqrt(max(_dot(go, go) - deep * deep, 0.0))
-
-
-@numba.njit(cache=True, error_model="numpy")
-def _carried(contact, normal, held):
-    """The tangent (3,) of a contact after its normal turned, turned by the least; a new one where it was not held."""
-    old, tangent = contact[1], contact[2].copy()
-    if held:
-        over = 1 + _dot(old, normal)
-        up = _dot(tangent, normal)
-        if over > 1e-6:
-            tangent -= up / over * (old + normal)
-    else:
-        tangent[:] = 0.0
-        tangent[np.argmin(np.abs(normal))] = 1.0
-    tangent -= _dot(tangent, normal) * normal
-    return tangent / np.sqrt(_dot(tangent, tangent))
