@@ -17,7 +17,11 @@ sys.path.insert(0, str(HERE.parent))
 from tests.test_state_against_fem import FILE, Stroke  # noqa: E402
 
 COLOURS = {"slab-ball8-mu0.3": "tab:blue", "slab-ball8-mu0.6": "tab:orange", "slab-ball8-mu1.0": "tab:green"}
-TIMED = {"slab-ramp-hold": "ramp and hold", "slab-press-lift-press": "press, lift, press"}
+TIMED = {
+    "slab-ramp-hold": "ramp and hold",
+    "slab-massage": "1 Hz massage",
+    "slab-press-lift-press": "press, lift, press",
+}
 
 
 def main() -> None:

@@ -66,11 +66,12 @@ def drags(stroke: Stroke) -> tuple[np.ndarray, np.ndarray]:
     return stroke.wrench[:, :2], np.array([touch.wrench[:2] for touch in stroke.played()])
 
 
-@pytest.mark.parametrize("name", ["slab-ball8-mu0.3", "slab-ball8-mu0.6", "slab-ball8-mu1.0"])
-def test_drag_is_that_of_finite_elements(name: str) -> None:
-    """Two figures of ploughing were fitted at 0.3 and 0.6; at 1.0 the file holds the first 5 mm."""
+@pytest.mark.parametrize("name, allowed", [("slab-ball8-mu0.3", 0.06), ("slab-ball8-mu0.6", 0.04),
+                                           ("slab-ball8-mu1.0", 0.09)])  # fmt: skip
+def test_drag_is_that_of_finite_elements(name: str, allowed: float) -> None:
+    """Ploughing was fitted at 0.3 and 0.6."""
     truth, found = drags(Stroke(name))
-    assert np.abs(found - truth).max() < 0.08 * np.abs(truth).max()
+    assert np.abs(found - truth).max() < allowed * np.abs(truth).max()
 
 
 @pytest.mark.parametrize("name", ["slab-ball8-mu0.3", "slab-ball8-mu0.6"])
@@ -86,12 +87,13 @@ def test_sliding_begins_where_finite_elements_say(name: str) -> None:
     assert onset(found) == pytest.approx(onset(truth), rel=0.1)
 
 
-@pytest.mark.parametrize("name", ["slab-ramp-hold", "slab-massage"])
-def test_force_relaxes_as_that_of_finite_elements(name: str) -> None:
+@pytest.mark.parametrize("name, allowed", [("slab-ramp-hold", 0.04), ("slab-massage", 0.04),
+                                           ("slab-press-lift-press", 0.08)])  # fmt: skip
+def test_force_relaxes_as_that_of_finite_elements(name: str, allowed: float) -> None:
     """The elastic law is 2.6 % off here by itself."""
     stroke = Stroke(name)
     truth, found = stroke.wrench[:, 2], np.array([touch.wrench[2] for touch in stroke.played()])
-    assert np.abs(found - truth).max() < 0.04 * np.abs(truth).max()
+    assert np.abs(found - truth).max() < allowed * np.abs(truth).max()
 
 
 def main(folder: Path) -> None:
