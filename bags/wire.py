@@ -294,6 +294,7 @@ def tool_message(tool: Tool, stamp_ns: int) -> Any:
 
 def topology_message(layer: SoftLayer, body_frame: str, stamp_ns: int) -> Any:
     """A layer as a SkinTopology."""
+    more = not layer.tissue.single or layer.tissue.relaxes or layer.ply_scale is not None
     return message_class("stmpl_msgs/msg/SkinTopology")(
         header=header(body_frame, stamp_ns),
         layer_id=layer_id(layer),
@@ -304,7 +305,7 @@ def topology_message(layer: SoftLayer, body_frame: str, stamp_ns: int) -> Any:
         poisson_ratio=float(layer.tissue.poisson_ratio),
         density=float(layer.tissue.density),
         core=floats([] if layer.core is None else layer.core),
-        stack="" if layer.tissue.single and layer.ply_scale is None else layer_stack_to_text(layer),
+        stack=layer_stack_to_text(layer) if more else "",
     )
 
 

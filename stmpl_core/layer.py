@@ -197,6 +197,9 @@ def layer_id(layer: SoftLayer) -> str:
         digest.update(np.ascontiguousarray(values, dtype=kind).tobytes())
     if layer.core is not None:
         digest.update(np.ascontiguousarray(layer.core, dtype="<f4").tobytes())
+    if tissue.relaxes:
+        series = [one and one.relaxation for one in (tissue, tissue.skin, *tissue.deeper)]
+        digest.update(repr([one and (one.shares, one.times) for one in series]).encode())
     if not tissue.single:
         digest.update(np.array(tissue.stacked, dtype="<f8").tobytes())
     if layer.ply_scale is not None:

@@ -1,8 +1,10 @@
 """Laws of a tissue: what its numbers are, what cannot be, and that nobody ignores a part of it in silence."""
 
+from dataclasses import replace
+
 import pytest
 
-from stmpl_core import Membrane, Ply, Tissue
+from stmpl_core import Membrane, Ply, Prony, Tissue
 from stmpl_core.errors import InvalidInput
 from stmpl_core.layer import layer_id
 from stmpl_core.methods import Linear, Naive, Winkler
@@ -35,10 +37,11 @@ def test_numbers_that_cannot_be_are_refused_with_what_is_wrong(make, says):
         make()
 
 
-def test_a_skin_and_a_deeper_material_give_a_layer_another_name():
+def test_a_skin_a_deeper_material_and_a_stress_that_fades_give_a_layer_another_name():
     layer = plate()
-    names = {layer_id(one) for one in (layer, layer.with_(skin=SKIN), layer.with_(deeper=(MUSCLE,)))}
-    assert len(names) == 3
+    fading = layer.with_(tissue=replace(layer.tissue, relaxation=Prony((0.3,), (1.0,))))
+    names = {layer_id(one) for one in (layer, fading, layer.with_(skin=SKIN), layer.with_(deeper=(MUSCLE,)))}
+    assert len(names) == 4
 
 
 @pytest.mark.parametrize("method", [Naive, Winkler, Linear, TetFem])
