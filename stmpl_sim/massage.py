@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from stmpl_core.errors import InvalidInput
+from stmpl_core.friction import Friction
 from stmpl_sim.controller import ForceImpedance, Gains, Goal
 from stmpl_sim.energy import EnergyBook
 from stmpl_sim.engine import mujoco
@@ -208,13 +209,14 @@ class Massage:
         skin: Skin or Simulator of the scene's layer that is ready; made with MomentNet() unless given.
         damping: see SoftContact.
         implicit: see SoftContact.
+        friction: see SoftContact.
     """
 
     def __init__(self, scene: Scene, course: Course, *, gains: Gains | None = None, skin: Any = None,
-                 damping: float = 0.0, implicit: bool = False) -> None:  # fmt: skip
+                 damping: float = 0.0, implicit: bool = False, friction: Friction = None) -> None:  # fmt: skip
         self.scene, self.course = scene, course
         self.skin = SoftBody(scene.model, skin or scene.layer, body=LIMB, tools=[BALL], damping=damping,
-                             implicit=implicit)  # fmt: skip
+                             implicit=implicit, friction=friction)  # fmt: skip
         self.data = mujoco.MjData(scene.model)
         self.controller = ForceImpedance(scene.model, scene.joints, BALL, scene.qpos, gains)
         self.reset()

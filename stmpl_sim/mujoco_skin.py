@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike
 
 from stmpl_core.arrays import Transform, Wrench
 from stmpl_core.errors import InvalidInput
+from stmpl_core.friction import Friction
 from stmpl_core.layer import SoftLayer
 from stmpl_core.methods.base import Method
 from stmpl_core.simulator import Simulator
@@ -55,6 +56,7 @@ class SoftBody:
         pose_body_from_layer: pose of the layer's axes in the body's frame, (4, 4); the same frame unless given.
         damping: see SoftContact [s/m].
         implicit: see SoftContact; MuJoCo gives the mobility.
+        friction: see SoftContact.
 
     Attributes:
         contact: the SoftContact.
@@ -78,6 +80,7 @@ class SoftBody:
         pose_body_from_layer: ArrayLike | None = None,
         damping: float = 0.0,
         implicit: bool = False,
+        friction: Friction | Mapping[str, Friction] = None,
     ) -> None:
         self.model = model
         self.body = _body(model, body)
@@ -90,7 +93,7 @@ class SoftBody:
             _check_no_rigid_contact(model, self.body, source)
         made = [_tool(model, name, self._sources[name]) for name in tools]
         self.contact = SoftContact(layer, made, method, pose_body_from_layer=pose_body_from_layer, damping=damping,
-                                   implicit=implicit)  # fmt: skip
+                                   implicit=implicit, friction=friction)  # fmt: skip
         self.memory = Memory()
         self.reaction: Reaction | None = None
         self._time: float | None = None

@@ -14,6 +14,7 @@ from scipy.spatial import KDTree
 from stmpl_core.arrays import Transform, Wrench, finite
 from stmpl_core.contact import Contact
 from stmpl_core.errors import InvalidInput
+from stmpl_core.friction import Friction
 from stmpl_core.layer import SoftLayer
 from stmpl_core.methods import MomentNet
 from stmpl_core.methods.base import Method
@@ -103,9 +104,12 @@ class SoftContact:
             F* = (F + h k (v + h a)) / (1 + h^2 k A), with the step h, the stiffness k along the force by one more
             touch 0.05 mm deeper, the speed v into the skin, its acceleration a without the contact, and the
             mobility A [1/kg] of the tool against the body. Needs `mobility` at each step. Each tool by itself.
+        friction: coefficient of friction, or the name of a pair in stmpl_core.friction, of all tools or by tool's
+            name; None: none, or that of the Simulator that was given.
 
     Raises:
-        InvalidInput: tools of one name, no tools, a damping below 0, or a pose that is not rigid.
+        InvalidInput: tools of one name, no tools, a damping below 0, a pose that is not rigid, or friction that is none
+            or is given beside a Simulator, which has its own.
         MeshError: a surface that cannot be a tool.
     """
 
@@ -118,6 +122,7 @@ class SoftContact:
         pose_body_from_layer: ArrayLike | None = None,
         damping: float = 0.0,
         implicit: bool = False,
+        friction: Friction | Mapping[str, Friction] = None,
     ) -> None:
         names = [tool.name for tool in tools]
         if not names or len(set(names)) < len(names):
@@ -125,9 +130,12 @@ class SoftContact:
         if not (math.isfinite(damping) and damping >= 0):
             raise InvalidInput(f"damping is {damping} s/m; it must be finite and at least 0.")
         if isinstance(layer, Simulator):
+            if friction is not None:
+                raise InvalidInput("this Simulator has its own friction. Give it there: Simulator(..., friction=0.3).")
             self.simulator = layer
         else:
-            self.simulator = Simulator(layer, None if isinstance(layer, Skin) else method or MomentNet())
+            ready = None if isinstance(layer, Skin) else method or MomentNet()
+            self.simulator = Simulator(layer, ready, friction=friction)
         self.tools = {tool.name: tool for tool in tools}
         self.damping, self.implicit = damping, implicit
         self.pose_body_from_layer = _rigid("pose_body_from_layer", np.eye(4) if pose_body_from_layer is None
@@ -221,7 +229,7 @@ class SoftContact:
         if not self.damping and not self.implicit:
             return 1.0, (0.0, 0.0)
         force = touch.force
-        normal, centre = touch.wrench[:3] / force, _centre_of_pressure(touch)
+        normal, centre = touch.push / force, _centre_of_pressure(touch)
         before = memory.at.get(touch.name)
         v = 0.0
         if before is not None and dt > 0:  # of the tool's point that is at the centre of pressure now

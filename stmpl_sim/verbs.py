@@ -35,6 +35,7 @@ def sim(
     at: tuple[float, float, float] = (0.5, 0.0, 0.25),
     rate: float = 1000.0,
     damping: float = 0.0,
+    friction: str = "none",
     film: Literal["auto", "egl", "osmesa", "software", "none"] = "auto",
     as_json: Annotated[bool, tyro.conf.arg(name="json")] = False,
 ) -> int:
@@ -59,6 +60,7 @@ def sim(
         at: place of the limb in the robot's world [m].
         rate: rate of physics, with contact at every step [Hz].
         damping: damping of the contact [s/m], not measured on tissue; 0: elastic.
+        friction: coefficient of friction, or dry, moist, oiled, glove, typical, or none.
         film: what makes the film's frames: auto takes the first that works here; none makes no film.
         as_json: figures as JSON, for machines.
     """
@@ -73,7 +75,7 @@ def sim(
     site = Site.thickest(layer)
     scene = build(layer, site, robot=robot, end=end, at=at, mount=mount, radius=1e-3 * radius, timestep=1 / rate)
     course = Course(site.circle(1e-3 * circle), tuple(force), 1e-3 * speed, laps)
-    massage = Massage(scene, course, damping=damping)
+    massage = Massage(scene, course, damping=damping, friction=_friction(friction))
     out.mkdir(parents=True, exist_ok=True)
     camera = None
     if film != "none":
@@ -91,6 +93,16 @@ def sim(
         camera.close()
     print_figures(figures if as_json else table(figures))
     return 0
+
+
+def _friction(said: str) -> str | float | None:
+    """What was said of friction: a number, the name of a pair, or nothing."""
+    if said == "none":
+        return None
+    try:
+        return float(said)
+    except ValueError:
+        return said
 
 
 def limb(part: str, tissue: str) -> SoftLayer:

@@ -374,3 +374,28 @@ def test_far_tools_are_apart(simulator: Simulator) -> None:
     m = model(at="0 0 1")
     touch = SoftBody(m, simulator, body="slab", tools=["ball"]).apply(mujoco.MjData(m))["ball"]
     assert touch.status == APART and np.isnan(touch.depth) and not touch.wrench.any()
+
+
+def test_a_box_stays_on_a_slope_that_friction_can_hold_and_slides_off_one_that_it_cannot(slab: SoftLayer) -> None:
+    tool = '<geom name="ball" type="box" size=".012 .012 .006" mass=".2"/>'
+    ways = {}
+    for slope, friction in ((0.2, 0.5), (0.2, None), (0.6, 0.3)):
+        m = model(tool, at="0 0 .0058")
+        angle = np.arctan(slope)
+        m.opt.gravity[:] = GRAVITY * np.sin(angle), 0, -GRAVITY * np.cos(angle)
+        d = mujoco.MjData(m)
+        skin = SoftBody(m, slab, body="slab", tools=["ball"], method=Winkler(), damping=20.0, friction=friction)
+        for _ in range(120):
+            step(m, d, skin)
+        ways[slope, friction] = float(d.body("bob").xpos[0])
+    assert abs(ways[0.2, 0.5]) < 1e-3
+    assert ways[0.2, None] > 8e-3 and ways[0.6, 0.3] > 5e-3
+    free = 0.5 * GRAVITY * 0.12**2  # m, down a slope of one
+    assert ways[0.6, 0.3] == pytest.approx(free * (0.6 - 0.3) / np.hypot(1, 0.6), rel=0.4)
+
+
+def test_friction_stands_in_one_place(simulator: Simulator, slab: SoftLayer) -> None:
+    with pytest.raises(InvalidInput, match="has its own friction"):
+        SoftContact(simulator, [ball(RADIUS)], friction=0.3)
+    with pytest.raises(InvalidInput, match="there is no friction 'sticky'"):
+        SoftContact(slab, [ball(RADIUS)], Winkler(), friction="sticky")
