@@ -8,17 +8,25 @@ import zlib
 from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path
+from tempfile import NamedTemporaryFile
 from typing import Any
 
 import numpy as np
 
-BROKEN = (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, zlib.error)  # what a file that is none raises
+BROKEN = (OSError, ValueError, KeyError, EOFError, NotImplementedError, RuntimeError, MemoryError, zipfile.BadZipFile,
+          zlib.error)  # fmt: skip
 
 
 def folder() -> Path:
-    """STMPL_CACHE_DIR, or `stmpl` in the user's own cache folder."""
-    own = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
-    return Path(os.environ.get("STMPL_CACHE_DIR") or Path(own) / "stmpl")
+    """STMPL_CACHE_DIR, or `stmpl` in the user's own cache folder; one that cannot be, for a user without a home."""
+    own = os.environ.get("STMPL_CACHE_DIR")
+    if own:
+        return Path(own)
+    cache = os.environ.get("XDG_CACHE_HOME")
+    try:
+        return (Path(cache) if cache else Path.home() / ".cache") / "stmpl"
+    except RuntimeError:
+        return Path(os.devnull) / "stmpl"
 
 
 def read(name: str) -> dict[str, np.ndarray] | None:
@@ -41,15 +49,16 @@ def write(name: str, arrays: Mapping[str, Any], *, packed: bool = False) -> None
         packed: compression: a tenth of the size where many are zero, and ten times as slow.
     """
     path = folder() / f"{name}.npz"
-    beside = path.with_suffix(f".{os.getpid()}.tmp")
     with suppress(OSError):
         path.parent.mkdir(parents=True, exist_ok=True)
-        try:
-            with open(beside, "wb") as file:
-                (np.savez_compressed if packed else np.savez)(file, allow_pickle=False, **arrays)
-            beside.replace(path)
-        finally:
-            beside.unlink(missing_ok=True)
+        with NamedTemporaryFile(dir=path.parent, prefix=f"{name}.", suffix=".tmp", delete=False) as file:
+            beside = Path(file.name)
+            try:
+                (np.savez_compressed if packed else np.savez)(file, **arrays)
+                file.flush()
+                beside.replace(path)
+            finally:
+                beside.unlink(missing_ok=True)
 
 
 def trim(kind: str, most: float) -> None:

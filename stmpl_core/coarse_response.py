@@ -19,7 +19,7 @@ from stmpl_core.provenance import processor, versions
 
 KIND = "response-"  # beginning of the names of its files
 MOST_KEPT_MB = 300.0  # size of all that is kept, unless STMPL_CACHE_MB says another
-DECIDES = ("numpy", "scipy", "numba", "mmgpy", "libigl")  # packages that decide a response's last bit
+DECIDES = ("numpy", "scipy", "numba", "scikit-fem", "mmgpy", "libigl")  # packages that decide a response's last bit
 
 
 class CoarseResponse(NamedTuple):

@@ -12,6 +12,7 @@ the sharp part is the closed form's, the wide part the finite elements' (fem_too
 
 from __future__ import annotations
 
+from copy import copy
 from functools import cache, cached_property, lru_cache
 from weakref import WeakKeyDictionary
 
@@ -58,7 +59,7 @@ class Green:
     """
 
     def __init__(self, layer: SoftLayer, coarse: CoarseResponse | None) -> None:
-        self.layer, self.coarse = layer, coarse
+        self.layer, self.coarse = copy(layer), coarse  # the layer itself would never be let go by _KEPT
         self.thickness = float(np.median(layer.thickness))
         self.near = Surroundings.of(layer)
         self.tables = tables(layer.tissue, self.thickness) if layer.stacked else _of_one(layer.tissue.poisson_ratio)

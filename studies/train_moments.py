@@ -149,7 +149,7 @@ def _points(near: Surroundings, layer: SoftLayer, load: Load, displacement: np.n
     rows = POINT.in_order(figures=figures, curvature=near.curvature[v], slope=near.slope[v], here=sources[v],
                           constants=constants)  # fmt: skip
     if load.motion is not None:
-        rows.append(of_stack(Green.of(layer), v, load.motion))
+        rows.append(of_stack(Green.of(layer), v, float(np.linalg.norm(load.motion, axis=1).max())))
     local = np.einsum("nij,nj->ni", near.frames[v], displacement[v]) / near.thickness[v, None]
     return np.concatenate(rows, axis=1), local, near.thickness[v] / peak
 

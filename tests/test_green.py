@@ -1,5 +1,8 @@
 """Laws of a stacked limb's response to forces at nodes: closed forms, reciprocity, and what finite elements say."""
 
+import gc
+import weakref
+
 import numpy as np
 import pytest
 
@@ -136,3 +139,32 @@ def test_the_coarse_part_is_of_the_limb_not_of_its_mesh():
 
 def test_a_layer_of_one_material_straight_below_the_skin_needs_none_of_this():
     assert not SoftLayer(LIMB.vertices, LIMB.faces, 5e-3).stacked and LIMB.stacked
+
+
+def test_a_response_goes_with_its_layer() -> None:
+    layer = LIMB.with_(density=1.1e3)
+    kept = Green.of(layer)
+    assert Green.of(layer) is kept
+    gone = weakref.ref(layer)
+    del layer, kept
+    gc.collect()
+    assert gone() is None
+
+
+def test_one_material_is_a_flat_layer_as_thick_as_it_is_at_each_place() -> None:
+    """Twice as thick and pressed twice as wide, it sinks twice as far under the same pressure."""
+    found = []
+    for scale in (1.0, 2.0):
+        skin = plate(0.09)
+        layer = SoftLayer(scale * skin.vertices, skin.faces, scale * 7.5e-3)
+        green = Green.of(layer)
+        assert green.coarse is None
+        source = np.where(np.linalg.norm(layer.vertices[:, :2], axis=1) < scale * 8e-3, 0.1, 0.0)
+        found.append(green.linear(source) / scale)
+    np.testing.assert_allclose(found[1], found[0], atol=1e-9)
+    assert np.abs(found[0]).max() > 1e-5
+    uneven = SoftLayer(skin.vertices, skin.faces, np.where(skin.vertices[:, 0] > 0, 10e-3, 5e-3))
+    source = np.where(np.linalg.norm(np.abs(skin.vertices[:, :2]) - [0.025, 0.0], axis=1) < 6e-3, 0.1, 0.0)
+    sunk = -Green.of(uneven).linear(source)[:, 2]
+    right, left = sunk[skin.vertices[:, 0] > 0.01].max(), sunk[skin.vertices[:, 0] < -0.01].max()
+    assert 1.2 < right / left < 2.1  # between as thick layers of a half-space's and of a wide load's

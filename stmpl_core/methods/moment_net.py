@@ -142,7 +142,8 @@ class MomentNet:
         if self._green is not None:
             weights, displacement = self.stack, linear_motion(self._green, load)
             take_linear(figures, near, vertices, displacement)
-            more = of_stack(self._green, vertices, displacement)
+            length = np.linalg.norm(displacement[vertices], axis=1)
+            more = of_stack(self._green, vertices, float(length.max(initial=0.0)))
         a, constants = weights.arrays, np.array([layer.tissue.poisson_ratio, load.kind == "nodal"], np.float32)
 
         # What is around each vertex becomes numbers that do not turn with the scene; far vertices need none.
@@ -248,12 +249,16 @@ def take_linear(figures: np.ndarray, near: Surroundings, vertices: np.ndarray, m
     figures[:, :, :3] = local[:, None]
 
 
-def of_stack(green: Green, vertices: np.ndarray, motion: np.ndarray) -> np.ndarray:
-    """What the network reads of a stack at vertices (N,), (N, 6) float32; see stmpl_core.networks.ON_STACK."""
+def of_stack(green: Green, vertices: np.ndarray, peak: float) -> np.ndarray:
+    """What the network reads of a stack at vertices (N,) under the peak of the linear motion [m]; see ON_STACK.
+
+    Returns:
+        (N, 6) float32.
+    """
     out = np.empty((len(vertices), 6), np.float32)
     out[:, 0] = np.log(green.layer.thickness[vertices] / green.thickness)
     out[:, 1:5] = green.numbers
-    out[:, 5] = np.log(np.linalg.norm(motion[vertices], axis=1).max(initial=0.0) / green.thickness + 1e-6)
+    out[:, 5] = np.log(peak / green.thickness + 1e-6)
     return out
 
 
