@@ -53,6 +53,8 @@ class System:
         keep: projectors on the motions that each column may make, (C, 3, 3); None: all, but for the fixed ones.
     """
 
+    least = 0.0  # least load that a residual is measured by [sqrt(J)]: skin that is let go bears none
+
     def __init__(
         self,
         mesh: WedgeMesh,
@@ -66,7 +68,6 @@ class System:
         self.mu, self.lam = wedge_materials(mesh, tissue)
         self.membrane = SkinMembrane(mesh, tissue.skin) if tissue.skin else None
         self.relaxing: Relaxing | None = None
-        self.least = 0.0  # least load that a residual is measured by [sqrt(J)]: skin that is let go bears none
         self.rest = mesh.rest_positions()
         self.fixed = fixed
         self.keep = keep

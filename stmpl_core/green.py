@@ -85,6 +85,13 @@ class Green:
         """What kernels take of the coarse part; all empty if there is none."""
         return self.coarse[:4] if self.coarse is not None else NO_COARSE
 
+    @cached_property
+    def _by_source(self) -> np.ndarray:
+        """Motion of coarse vertices by where the pressure is, (C, 3 C) float32 [m]."""
+        assert self.coarse is not None
+        count = len(self.coarse.gathered)
+        return np.ascontiguousarray(self.coarse.motion.reshape(3 * count, count).T)
+
     def unit_at(self, nodes: Nodes) -> np.ndarray:
         """Thickness of the flat layer at nodes, (N,) [m]."""
         return np.full(len(nodes.area), self.thickness) if self.layer.stacked else nodes.thickness
@@ -155,7 +162,7 @@ class Green:
         source = _handed(nodes.inward, nodes.corners, nodes.shares, forces, *self.coarse[:3])
         loaded = np.flatnonzero(source)
         if len(loaded):
-            motion = _times(self.coarse.motion, loaded, source)
+            motion = (source[loaded].astype(np.float32) @ self._by_source[loaded]).reshape(-1, 3).astype(float)
             _add_between(self.coarse.corners, self.coarse.shares, motion, out)
         return out
 
@@ -437,17 +444,6 @@ def _handed(inward, corners, shares, forces, skin_corners, skin_shares, gathered
         down = inward[n, 0] * forces[n, 0] + inward[n, 1] * forces[n, 1] + inward[n, 2] * forces[n, 2]
         for a in range(9):
             out[index[n, a]] += weight[n, a] * down / gathered[index[n, a]]
-    return out
-
-
-@numba.njit(cache=True)
-def _times(motion, loaded, source):
-    """Motion of coarse vertices under sources at those that are loaded, (C, 3)."""
-    out = np.zeros((len(motion), 3))
-    for c in range(len(motion)):
-        for x in range(3):
-            for k in loaded:
-                out[c, x] += motion[c, x, k] * source[k]
     return out
 
 

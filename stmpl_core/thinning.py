@@ -213,12 +213,13 @@ def _together(start, index, some, count):
     place, group, queue = np.full(count, -1), np.full(len(some), -1), np.empty(len(some), np.int64)
     for n in range(len(some)):
         place[some[n]] = n
-    groups = 0
+    groups, left = 0, len(some)
     for n in range(len(some)):
         if group[n] >= 0:
             continue
         queue[0], group[n], many, ends = n, groups, 0, 1
-        while many < ends:
+        left -= 1
+        while many < ends and left:
             i = some[queue[many]]
             many += 1
             for p in range(start[zones * i], start[zones * (i + 1)]):
@@ -227,6 +228,7 @@ def _together(start, index, some, count):
                     group[m] = groups
                     queue[ends] = m
                     ends += 1
+                    left -= 1
         groups += 1
     return group
 
