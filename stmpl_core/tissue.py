@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
@@ -173,6 +173,12 @@ class Tissue:
     def single(self) -> bool:
         """Whether it is one material without a skin."""
         return self.skin is None and not self.deeper
+
+    def relaxing(self, series: Prony) -> Tissue:
+        """The same tissue, the stress of all its materials fading by one series."""
+        skin = self.skin and replace(self.skin, relaxation=series)
+        deeper = tuple(replace(ply, relaxation=series) for ply in self.deeper)
+        return replace(self, relaxation=series, skin=skin, deeper=deeper)
 
     @property
     def relaxes(self) -> bool:

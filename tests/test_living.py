@@ -7,17 +7,19 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from stmpl_core import SoftLayer, Tissue
+from stmpl_core import Contact, Simulator, SoftLayer, State, Tissue
 from stmpl_core.body import Body
 from stmpl_core.bones import bones_of
 from stmpl_core.errors import InvalidInput
 from stmpl_core.extrusion import fold_ratios
 from stmpl_core.living import living, read_tissue, region_of, write_tissue
-from stmpl_core.regions import region
+from stmpl_core.methods import MomentNet
+from stmpl_core.regions import HELD_SKIN, region
 from stmpl_core.soundness import border_distance
 from stmpl_core.trunk import TRUNK
 from stmpl_ros.making import at_once, check, layer_of
 from stmpl_ros.parameters import NodeConfig
+from tests.scenes import ball
 from tests.test_needs import stmpl
 
 COARSE = 8e-3  # m
@@ -145,3 +147,20 @@ def test_the_trunks_parts_are_annys_and_follow_a_body():
     assert abs(spine.start[1]) < 5e-3 and spine.end[2] - spine.start[2] > 0.4
     left, right = (bones_of(body, f"{side}_shoulder")[0] for side in ("left", "right"))
     np.testing.assert_allclose(left.start * [1, -1, 1], right.start, atol=5e-3)
+
+
+def test_a_forearm_that_is_held_eases_as_stretched_skin_was_measured_to():
+    """Lavigne's skin: 0.855, 0.752, 0.694, 0.645, 0.622 of the peak after 1, 5, 10, 30, 40 s."""
+    np.testing.assert_allclose(HELD_SKIN.left(np.array([1, 5, 10, 30, 40.0])), [0.855, 0.752, 0.694, 0.645, 0.622],
+                               atol=0.012)  # fmt: skip
+    layer = living(Body.anny(), "left_forearm", edge_length=COARSE)
+    layer = layer.with_(tissue=layer.tissue.relaxing(HELD_SKIN))
+    assert all(one.relaxation is HELD_SKIN for one in (layer.tissue, layer.tissue.skin, *layer.tissue.deeper))
+    simulator, vertex = Simulator(layer, MomentNet()), int(layer.thickness.argmax())
+    pose = np.eye(4)
+    pose[:3, 3] = layer.vertices[vertex] + (0.02 - 4e-3) * layer.normals[vertex]
+    contact, state, forces = Contact(ball(0.02), pose), State(), []
+    for dt in (1e-3, 1.0, 4.0, 5.0):
+        touches, state = simulator.touch([contact], state, dt)
+        forces.append(touches[0].force)
+    np.testing.assert_allclose(np.array(forces[1:]) / forces[0], HELD_SKIN.left(np.array([1, 5, 10.0])), atol=0.01)
