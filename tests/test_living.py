@@ -149,7 +149,7 @@ def test_the_trunks_parts_are_annys_and_follow_a_body():
     np.testing.assert_allclose(left.start * [1, -1, 1], right.start, atol=5e-3)
 
 
-def test_a_forearm_that_is_held_eases_as_stretched_skin_was_measured_to():
+def test_a_forearm_that_is_held_eases_as_its_materials_do_but_for_the_tension_of_its_skin():
     """Lavigne's skin: 0.855, 0.752, 0.694, 0.645, 0.622 of the peak after 1, 5, 10, 30, 40 s."""
     np.testing.assert_allclose(HELD_SKIN.left(np.array([1, 5, 10, 30, 40.0])), [0.855, 0.752, 0.694, 0.645, 0.622],
                                atol=0.012)  # fmt: skip
@@ -163,4 +163,5 @@ def test_a_forearm_that_is_held_eases_as_stretched_skin_was_measured_to():
     for dt in (1e-3, 1.0, 4.0, 5.0):
         touches, state = simulator.touch([contact], state, dt)
         forces.append(touches[0].force)
-    np.testing.assert_allclose(np.array(forces[1:]) / forces[0], HELD_SKIN.left(np.array([1, 5, 10.0])), atol=0.01)
+    left, lost = np.array(forces[1:]) / forces[0], 1 - HELD_SKIN.left(np.array([1, 5, 10.0]))
+    assert (0.5 * lost < 1 - left).all() and (1 - left < lost).all()
