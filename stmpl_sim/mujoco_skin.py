@@ -107,8 +107,8 @@ class SoftBody:
     def apply(self, data: Any) -> Mapping[str, Touch]:
         """Finds what touches at the positions of `data`, and exerts the wrenches during the coming step.
 
-        Between mj_step1 and mj_step2, or right before mj_step. Positions are made up to date with qpos first. A time
-        that went back (mj_resetData) starts afresh.
+        Between mj_step1 and mj_step2, or right before mj_step. Positions, and the inertia where `implicit` needs it,
+        are made up to date with qpos first. A time that went back (mj_resetData) starts afresh.
 
         Returns:
             Touch of each tool, by name, in layer axes.
@@ -117,6 +117,9 @@ class SoftBody:
             InvalidInput: positions that are not finite.
         """
         mujoco.mj_kinematics(self.model, data)
+        if self._jacobians is not None:  # what mj_jac and mj_solveM read
+            for update in (mujoco.mj_comPos, mujoco.mj_tendon, mujoco.mj_makeM, mujoco.mj_factorM):
+                update(self.model, data)
         if self._time is not None and data.time < self._time:
             self.memory = Memory()
         dt = 0.0 if self._time is None else max(0.0, data.time - self._time)
@@ -274,20 +277,33 @@ def _tool(model: Any, name: str, source: _Source) -> Tool:
     return Tool(name, *(body_surface(model, geoms) if source.geom is None else geom_surface(model, source.geom)))
 
 
+def _is_welded(model: Any, body: int, limb: int) -> bool:
+    """Whether a body is the limb's or moves with it; the world and what else stands still in it does not count."""
+    if body == limb or model.body_weldid[limb] != 0:
+        return bool(body == limb or model.body_weldid[body] == model.body_weldid[limb])
+    while body not in (limb, 0) and model.body_weldid[body] == 0:
+        body = int(model.body_parentid[body])
+    return body == limb != 0
+
+
 def _check_no_rigid_contact(model: Any, body: int, source: _Source) -> None:
-    """Raises InvalidInput where MuJoCo would make rigid contacts between the tool's geoms and the limb's."""
+    """Raises InvalidInput where MuJoCo would make rigid contacts between the tool's geoms and the limb's.
+
+    The limb has those of its body and of what is welded to it; where it is fixed to the world, of what hangs on it.
+    """
     signatures = {int(s) for s in model.exclude_signature}
     for tool in _geoms_of(model, source):
         for limb in range(model.ngeom):
-            if model.geom_bodyid[limb] != body:
+            owner = int(model.geom_bodyid[limb])
+            if not _is_welded(model, owner, body):
                 continue
-            first, second = sorted((source.body, body))
+            first, second = sorted((source.body, owner))
             meet = (model.geom_contype[tool] & model.geom_conaffinity[limb]
                     or model.geom_contype[limb] & model.geom_conaffinity[tool])  # fmt: skip
             paired = any({int(model.pair_geom1[p]), int(model.pair_geom2[p])} == {tool, limb}
                          for p in range(model.npair))  # fmt: skip
             if paired or (meet and (first << 16) + second not in signatures):
-                a, b = model.body(body).name, model.body(source.body).name
+                a, b = model.body(owner).name, model.body(source.body).name
                 raise InvalidInput(
                     f"geom '{model.geom(tool).name or tool}' of '{b}' also collides rigidly with geom "
                     f"'{model.geom(limb).name or limb}' of '{a}'. Let only the skin touch: add <exclude body1=\"{a}\" "

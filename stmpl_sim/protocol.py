@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Protocol
 
 import numpy as np
@@ -12,9 +12,11 @@ from numpy.typing import ArrayLike
 from scipy.spatial import KDTree
 
 from stmpl_core.arrays import Transform, Wrench, finite
+from stmpl_core.columns import shifted
 from stmpl_core.contact import Contact
 from stmpl_core.errors import InvalidInput
 from stmpl_core.friction import Friction
+from stmpl_core.history import FORGOTTEN
 from stmpl_core.layer import SoftLayer
 from stmpl_core.methods import MomentNet
 from stmpl_core.methods.base import Method
@@ -63,7 +65,8 @@ class Reaction:
     Args:
         tools: wrench on each tool about its own origin, by name. What a sensor behind the tool would feel.
         body: wrench on the body about its origin: the opposite of all of them.
-        touches: touch of each contact, by the name of its tool, in layer axes: the elastic answer.
+        touches: touch of each contact, by the name of its tool, in layer axes: what the tissue and its friction carry,
+            without `damping` and `implicit`.
         memory: memory for the next step.
     """
 
@@ -98,11 +101,12 @@ class SoftContact:
         tools: tools that may touch.
         method: method that finds the displacement; MomentNet() unless given. Not used with a Skin or Simulator.
         pose_body_from_layer: pose of the layer's axes in the body's frame, (4, 4); the same frame unless given.
-        damping: damping of the contact [s/m], as of Hunt and Crossley (1975): the elastic force F becomes
-            F (1 + damping v) at the speed v into the skin, and never pulls. Not measured on tissue; 0: elastic.
-        implicit: choice to take the force at the end of the step, to first order (backward Euler, linearised):
-            F* = (F + h k (v + h a)) / (1 + h^2 k A), with the step h, the stiffness k along the force by one more
-            touch 0.05 mm deeper, the speed v into the skin, its acceleration a without the contact, and the
+        damping: damping of the contact [s/m], as of Hunt and Crossley (1975): the force F that presses becomes
+            F (1 + damping v) at the speed v into the skin, and never pulls; friction stays as it is. Not measured on
+            tissue; 0: none.
+        implicit: choice to take the force that presses at the end of the step, to first order (backward Euler,
+            linearised): F* = (F + h k (v + h a)) / (1 + h^2 k A), with the step h, the stiffness k along the force by
+            one more touch 0.05 mm deeper, the speed v into the skin, its acceleration a without the contact, and the
             mobility A [1/kg] of the tool against the body. Needs `mobility` at each step. Each tool by itself.
         friction: coefficient of friction, or the name of a pair in stmpl_core.friction, of all tools or by tool's
             name; None: none, or that of the Simulator that was given.
@@ -180,8 +184,9 @@ class SoftContact:
             raise InvalidInput(f"there is no pose of {', '.join(missing)}; given: {', '.join(poses.tools) or 'none'}.")
         at = {name: layer_from_world @ _rigid(name, poses.tools[name]) for name in self.tools}
 
-        # Touch: those that are near; the others are apart, which costs nothing.
-        near = [Contact(self.tools[name], pose) for name, pose in at.items() if not self._is_far(name, pose)]
+        # Touch: those that are near, or whose imprint is still there; the others are apart, which costs nothing.
+        near = [Contact(self.tools[name], pose) for name, pose in at.items()
+                if _has_imprint(memory.tissue, name) or not self._is_far(name, pose)]  # fmt: skip
         found, tissue = self.simulator.touch(near, memory.tissue, dt)
         touches = {touch.name: touch for touch in found}
         touches = {name: touches.get(name) or Touch(name, APART, pose, np.zeros(6)) for name, pose in at.items()}
@@ -193,8 +198,10 @@ class SoftContact:
             if not touch.wrench.any():
                 wrenches[name] = np.zeros(6)
                 continue
-            factor, speed[name] = self._factor(touch, at[name], memory, dt, world_from_layer, mobility)
-            force, torque = factor * touch.wrench[:3], factor * touch.wrench[3:]
+            factor, speed[name] = self._factor(touch, near, memory, dt, world_from_layer, mobility)
+            pressing = _pressing(touch)
+            exerted = factor * pressing + (touch.wrench - pressing)
+            force, torque = exerted[:3], exerted[3:]
             torque = torque + np.cross(touch.pose_body_from_tool[:3, 3] - at[name][:3, 3], force)
             force, torque = turn @ force, turn @ torque
             wrenches[name] = -np.concatenate([force, torque])
@@ -219,17 +226,18 @@ class SoftContact:
     def _factor(
         self,
         touch: Touch,
-        pose: Transform,
+        near: Sequence[Contact],
         memory: Memory,
         dt: float,
         world_from_layer: Transform,
         mobility: Callable[[str, np.ndarray, np.ndarray], float] | None,
     ) -> tuple[float, tuple[float, float]]:
-        """Factor on the elastic wrench; and for the memory, speed into the skin [m/s] and force [N]."""
-        if not self.damping and not self.implicit:
-            return 1.0, (0.0, 0.0)
+        """Factor on the wrench that presses; and for the memory, speed into the skin [m/s] and force [N]."""
         force = touch.force
+        if force == 0 or not (self.damping or self.implicit):
+            return 1.0, (0.0, 0.0)
         normal, centre = touch.push / force, _centre_of_pressure(touch)
+        pose = next(one.pose_body_from_tool for one in near if one.name == touch.name)
         before = memory.at.get(touch.name)
         v = 0.0
         if before is not None and dt > 0:  # of the tool's point that is at the centre of pressure now
@@ -239,10 +247,11 @@ class SoftContact:
         if not self.implicit or dt <= 0:
             return max(0.0, 1 + self.damping * v), (v, force)
         assert mobility is not None
-        deeper = pose.copy()
-        deeper[:3, 3] += DEEPER_M * normal
-        harder = self.simulator.touch([Contact(self.tools[touch.name], deeper)])[0]
-        k = max(0.0, (float(harder.wrench[:3] @ normal) - force) / DEEPER_M)
+        deeper = [replace(one, pose_body_from_tool=shifted(pose, DEEPER_M * normal)) if one.name == touch.name else one
+                  for one in near]  # fmt: skip
+        touches, _ = self.simulator.touch(deeper, memory.tissue, dt)
+        harder = next(one.push for one in touches if one.name == touch.name)
+        k = max(0.0, (float(harder @ normal) - force) / DEEPER_M)
         turn = world_from_layer[:3, :3]
         a = mobility(touch.name, turn @ centre + world_from_layer[:3, 3], turn @ normal)
         # What accelerated it in the last step, less what the contact itself did of that.
@@ -260,10 +269,22 @@ def exchange(contact: SoftContact, world: World, memory: Memory | None = None, d
     return reaction
 
 
+def _has_imprint(tissue: State, name: str) -> bool:
+    """Whether the tissue has not yet come back from where this tool pressed."""
+    known = tissue.tools.get(name)
+    return known is not None and known.scalars.elastic > FORGOTTEN * known.scalars.largest
+
+
+def _pressing(touch: Touch) -> Wrench:
+    """Wrench that the tool presses with, friction left out, (6,) [N, N m]."""
+    return touch.wrench if touch.slip is None else touch.wrench - touch.slip.wrench
+
+
 def _centre_of_pressure(touch: Touch) -> np.ndarray:
-    """Point of the wrench's axis that is nearest to the tool's origin, layer axes, (3,) [m]."""
-    force = touch.wrench[:3]
-    return touch.pose_body_from_tool[:3, 3] + np.cross(force, touch.wrench[3:]) / (force @ force)
+    """Point nearest to the tool's origin on the axis of the wrench that presses, layer axes, (3,) [m]."""
+    wrench = _pressing(touch)
+    force = wrench[:3]
+    return touch.pose_body_from_tool[:3, 3] + np.cross(force, wrench[3:]) / (force @ force)
 
 
 def _rigid(name: str, pose: ArrayLike) -> Transform:

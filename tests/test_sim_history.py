@@ -1,0 +1,161 @@
+"""stmpl_sim with time and friction: damping and implicit steps of what presses, imprints; what MuJoCo must know."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from stmpl_core import Prony, Simulator, SoftLayer, Tissue
+from stmpl_core.errors import InvalidInput
+from stmpl_core.methods import Winkler
+from stmpl_sim import Memory, Poses, SoftBody, SoftContact, exchange
+from tests.scenes import ball, plate
+from tests.test_sim import CORE, MASS, RADIUS, MassOnASpring, model, pose, step
+
+mujoco = pytest.importorskip("mujoco", reason="pip install 'stmpl[sim]'")
+
+TIMES = Prony((0.3, 0.3), (0.02, 0.2))
+
+
+@pytest.fixture(scope="module")
+def slab() -> SoftLayer:
+    return plate(0.09, youngs_modulus=20e3)
+
+
+@pytest.fixture(scope="module")
+def slow(slab: SoftLayer) -> Simulator:
+    """A slab whose stress fades."""
+    return Simulator(slab.with_(tissue=Tissue(20e3, relaxation=TIMES)), Winkler())
+
+
+class Free(MassOnASpring):
+    """It says how easily the ball is moved, and is braked, so that it does not bounce."""
+
+    def step(self, dt: float) -> None:
+        self.push_ -= 40.0 * self.speed
+        super().step(dt)
+
+    def mobility(self, _name: str, _at: np.ndarray, _along: np.ndarray) -> float:
+        return 1 / MASS
+
+
+def test_an_implicit_contact_feels_tissue_relax_as_an_explicit_one_does(slow: Simulator) -> None:
+    forces = {}
+    for implicit in (False, True):
+        world, memory = Free(1000.0), Memory()
+        contact = SoftContact(slow, [ball(RADIUS)], implicit=implicit)
+        forces[implicit] = []
+        for _ in range(300):
+            memory = exchange(contact, world, memory, 1e-3).memory
+            forces[implicit].append(world.push_)
+            world.step(1e-3)
+    explicit, taken = (np.array(forces[k]) for k in (False, True))
+    assert explicit[100] > 0.3 and np.abs(np.diff(explicit)).max() > 0.01
+    np.testing.assert_allclose(taken, explicit, atol=0.05 * explicit.max())
+
+
+def test_an_implicit_contact_is_as_stiff_as_with_the_tools_beside_it(slab: SoftLayer) -> None:
+    """Two balls pressed into one dent: each shares its load with the other."""
+    tools = [ball(RADIUS).named("left"), ball(RADIUS).named("right")]
+    simulator, asked = Simulator(slab, Winkler()), []
+    touch = simulator.touch
+    contact = SoftContact(simulator, tools, implicit=True)
+    places = {"left": pose(-3e-3, z=RADIUS - 2e-3), "right": pose(3e-3, z=RADIUS - 2e-3)}
+
+    def told(contacts: Any, *more: Any) -> Any:
+        asked.append(sorted(one.name for one in contacts))
+        return touch(contacts, *more)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(simulator, "touch", told)
+        contact.step(Poses(np.eye(4), places), Memory(), 1e-3, lambda *_: 1.0)
+    assert asked == [["left", "right"]] * 3
+
+
+def test_damping_of_what_slides_and_spins_but_goes_no_deeper_is_none(slab: SoftLayer) -> None:
+    plain, damped = (SoftContact(slab, [ball(RADIUS)], Winkler(), friction=0.5, damping=c) for c in (0.0, 20.0))
+    way = [pose(z=RADIUS - 2e-3)]
+    way += [pose(0.2e-3 * k, z=RADIUS - 2e-3, turn=Rotation.from_rotvec([0, -0.02 * k, 0])) for k in range(1, 30)]
+    memory = Memory()
+    for k, at in enumerate(way):
+        poses = Poses(np.eye(4), {"probe": at})
+        one, two = (contact.step(poses, memory, 1e-3 * (k > 0)) for contact in (plain, damped))
+        touch = one.touches["probe"]
+        assert touch.slip is not None
+        if k == 0:
+            continue
+        memory = two.memory
+        np.testing.assert_allclose(two.tools["probe"], one.tools["probe"], rtol=0.02, atol=2e-4)
+    assert abs(touch.slip.wrench[0]) > 0.3 * touch.force  # it did slide
+
+
+def test_damping_of_what_goes_deeper_leaves_friction_as_it_is(slab: SoftLayer) -> None:
+    contact = SoftContact(slab, [ball(RADIUS)], Winkler(), friction=0.5, damping=10.0)
+    memory = Memory()
+    for k in range(20):
+        at = pose(0.2e-3 * k, z=RADIUS - 1e-3 - 0.1e-3 * k)
+        reaction = contact.step(Poses(np.eye(4), {"probe": at}), memory, 1e-3 * (k > 0))
+        memory = reaction.memory
+    touch = reaction.touches["probe"]
+    assert touch.slip is not None and abs(touch.slip.wrench[0]) > 0.1 * touch.force
+    pressing = touch.wrench - touch.slip.wrench
+    wanted = 2 * pressing + touch.slip.wrench  # 0.1 m/s into the skin
+    np.testing.assert_allclose(-reaction.tools["probe"], wanted, atol=0.01 * touch.force)
+
+
+def test_the_imprint_of_a_tool_that_left_at_once_comes_back(slow: Simulator) -> None:
+    contact, memory = SoftContact(slow, [ball(RADIUS)]), Memory()
+    for k in range(60):
+        memory = contact.step(Poses(np.eye(4), {"probe": pose(z=RADIUS - 3e-3)}), memory, 5e-3 * (k > 0)).memory
+    away, depths = Poses(np.eye(4), {"probe": pose(z=0.5)}), []
+    assert contact._is_far("probe", away.tools["probe"])
+    for _ in range(20):
+        reaction = contact.step(away, memory, 20e-3)
+        memory = reaction.memory
+        assert not reaction.tools["probe"].any()
+        depths.append(contact.answer(reaction).magnitude.max())
+    assert depths[0] > 0.5e-3 and (np.diff(depths) < 0).all()
+    for _ in range(200):
+        memory = contact.step(away, memory, 20e-3).memory
+    assert not memory.tissue.tools  # forgotten, and so not asked about any more
+
+
+# MuJoCo
+
+
+def test_an_implicit_contact_needs_no_step_of_mujoco_before_it(slab: SoftLayer) -> None:
+    m = mujoco.MjModel.from_xml_string(
+        f'<mujoco><worldbody><body name="slab">{CORE}</body><body name="arm" pos="0 0 .0105"><joint axis="0 1 0" '
+        'pos=".2 0 0"/><geom name="ball" type="sphere" size=".012" mass=".3"/></body></worldbody>'
+        '<contact><exclude body1="slab" body2="arm"/></contact></mujoco>')  # fmt: skip
+    simulator, found = Simulator(slab, Winkler()), []
+    for ready in (False, True):
+        d = mujoco.MjData(m)
+        skin = SoftBody(m, simulator, body="slab", tools=["ball"], implicit=True)
+        for k in range(2):
+            d.time, d.qpos[0] = 1e-3 * k, -2e-4 * k
+            if ready:
+                mujoco.mj_forward(m, d)
+            skin.apply(d)
+        found.append(d.xfrc_applied.copy())
+    assert found[0].any()
+    np.testing.assert_allclose(found[0], found[1], rtol=1e-12)
+
+
+def test_a_rigid_contact_with_what_is_welded_to_the_limb_is_seen(slab: SoftLayer) -> None:
+    splint = '<body name="splint"><geom name="rod" size=".01"/></body>'
+    simulator = Simulator(slab, Winkler())
+    for joint in ("", "<freejoint/>"):
+        with pytest.raises(InvalidInput, match=r"geom 'rod' of 'splint'.*<exclude body1=\"splint\" body2=\"bob\"/>"):
+            SoftBody(model(slab=CORE + splint, joint=joint), simulator, body="slab", tools=["ball"])
+    hinged = splint.replace("<geom", "<joint/><geom")
+    SoftBody(model(slab=CORE + hinged), simulator, body="slab", tools=["ball"])
+    beside = mujoco.MjModel.from_xml_string(
+        f'<mujoco><worldbody><geom name="floor" type="plane" size="1 1 1" pos="0 0 -.1"/><body name="slab">{CORE}'
+        '</body><body name="table"><geom size=".01" pos=".2 0 0"/></body><body name="bob" pos="0 0 .0115"><freejoint/>'
+        '<geom name="ball" size=".012"/></body></worldbody><contact><exclude body1="slab" body2="bob"/></contact>'
+        '</mujoco>')  # fmt: skip
+    d = mujoco.MjData(beside)
+    skin = SoftBody(beside, simulator, body="slab", tools=["ball"])  # floor and table stand still, as the slab does
+    step(beside, d, skin)
