@@ -52,7 +52,7 @@ class Goal:
         swing: angular acceleration of the normal, (3,) [rad/s2].
         force: force into the skin [N]; None: the tool holds `height` instead.
         height: height of the tool's origin over the point along the normal [m], used without a force.
-        closed: whether the force's error is fed back; if not, the force is a push in the open, damped by Gains.into.
+        closed: feedback of the force's error; without it the force is a push in the open, damped by Gains.into.
     """
 
     point: np.ndarray
@@ -110,7 +110,7 @@ class ForceImpedance:
 
         Args:
             data: MuJoCo data after mj_step1.
-            goal: what to do now.
+            goal: goal of now.
             wrench: wrench on the tool, world axes, (6,) [N, N m].
             dt: time since the last call [s].
         """

@@ -12,6 +12,7 @@ from stmpl_core.layer import SoftLayer
 from stmpl_core.simulator import Simulator
 from stmpl_sim.controller import Goal
 from stmpl_sim.massage import Course, Massage
+from stmpl_sim.protocol import Memory
 from stmpl_sim.scene import BALL, build
 from stmpl_sim.site import Site
 
@@ -40,11 +41,11 @@ class MassageEnv(gymnasium.Env[np.ndarray, np.ndarray]):
 
     Args:
         layer: skin, or a Simulator that is ready; the left forearm as measured unless given. Any part does:
-            living(Body.anny(), "torso").
+            living(Body.anny(), "back").
         circle: radius of the course [m].
         laps: laps of an episode.
         timestep: timestep of physics [s].
-        render_mode: rgb_array, or none.
+        render_mode: kind of frames: rgb_array, or none.
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": round(1 / CONTROL_S)}  # noqa: RUF012
@@ -78,7 +79,7 @@ class MassageEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         self.observation_space = gymnasium.spaces.Box(-MOST, MOST, (8,), np.float32)
         self._phase, self._time, self._begun = 0.0, 0.0, False
         self._press = self.course.phases[2].start
-        self._start: tuple[np.ndarray, np.ndarray] | None = None
+        self._start: tuple[np.ndarray, np.ndarray, Memory] | None = None
         self._last = np.zeros(2)
         self._goal = self.course.goal(0.0, self._mean(), self._scene.radius)
 
@@ -91,20 +92,20 @@ class MassageEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         run = self.massage
         run.reset()
         run.data.mocap_pos[0] = self._rest
-        run.data.qpos[:], run.data.qvel[:] = self._start
+        run.data.qpos[:], run.data.qvel[:], run.skin.memory = self._start
         self._time, self._begun = self._press, True
         run.skin.apply(run.data)
         self._goal = self.course.goal(self._time, self._mean(), self._scene.radius)
         self._last = self._felt()
         return self._observed(), {}
 
-    def _pressed(self) -> tuple[np.ndarray, np.ndarray]:
-        """Configuration and velocity after reaching and pressing, before it breathes."""
+    def _pressed(self) -> tuple[np.ndarray, np.ndarray, Memory]:
+        """Configuration, velocity and the skin's memory after reaching and pressing, before it breathes."""
         self.massage.reset()
         self._time, self._begun = 0.0, False
         while self._time < self._press:
             self._advance(FORCE if self._time > self.course.phases[1].start else None, np.zeros(2))
-        return self.massage.data.qpos.copy(), self.massage.data.qvel.copy()
+        return self.massage.data.qpos.copy(), self.massage.data.qvel.copy(), self.massage.skin.memory
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         """One action, held for 20 ms."""

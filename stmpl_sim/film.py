@@ -35,12 +35,12 @@ class Camera:
 
     Args:
         model: MuJoCo model of a scene.
-        layer: its skin.
+        layer: skin of the scene.
         most: displacement that has the last colour [m].
         backend: egl, osmesa or software; unless given, the first that works here.
 
     Attributes:
-        backend: what makes the frames.
+        backend: renderer of the frames: egl, osmesa or software.
         frames: frames so far, (HEIGHT, WIDTH, 3) uint8 each.
 
     Raises:
@@ -124,8 +124,8 @@ def draw(corners: np.ndarray, shades: np.ndarray, normals: np.ndarray, eye: np.n
 
     Args:
         corners: triangles in the world, (F, 3, 3) [m].
-        shades: their colours, (F, 3) [0..1].
-        normals: their normals, of any length, (F, 3).
+        shades: colours of the triangles, (F, 3) [0..1].
+        normals: normals of the triangles, of any length, (F, 3).
         eye: position of the camera, (3,) [m].
         turn: axes of the camera as columns: right, up, backwards, (3, 3).
         fovy: vertical angle of view [deg].

@@ -152,7 +152,7 @@ class Log:
         qpos: configuration, (N, nq).
         energy: energy that the skin holds of what the tool gave it [J], (N,).
         off: distance of the tool from its course, along the skin [m], (N,).
-        trusted: whether the touch was in the range that was validated, (N,).
+        trusted: verdict whether the touch was in the range that was validated, (N,) bool.
         touch_s: time that contact took in each step on this machine [s], (N,).
         step_s: time that the whole step took [s], (N,).
         cpu_s: processor time of the whole step [s], (N,): what a core of its own would have taken.
@@ -233,7 +233,7 @@ class Massage:
         """One step: contact, controller, physics.
 
         Args:
-            goal: what to do, by the pose of the limb.
+            goal: function that says what to do, by the pose of the limb, (4, 4).
 
         Returns:
             The goal, and the time that contact took [s].
@@ -270,8 +270,7 @@ class Massage:
             reaction = self.skin.reaction
             assert reaction is not None
             touch, wrench = reaction.touches[BALL], reaction.tools[BALL]
-            poses = reaction.memory.at[BALL], self.skin.contact
-            energy = book.add(poses[0], _in_layer(wrench, self.limb_pose()))
+            energy = book.add(reaction.memory.at[BALL], _in_layer(wrench, self.limb_pose()))
             off = self.data.geom(BALL).xpos - aim.point
             along = off - (off @ aim.normal) * aim.normal
             rows.append((at, wrench[:3] @ aim.normal, np.nan if aim.force is None else aim.force,

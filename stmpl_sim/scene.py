@@ -69,7 +69,7 @@ def build(
         end: name of the robot's body or site that carries the head, its z axis towards the skin; the last body of
             the longest chain unless given.
         at: place of the site in the robot's world [m].
-        mount: what holds the limb: nothing moves it, six springs do, or it is animated (a mocap body).
+        mount: mount of the limb: fixed, on six springs, or animated (a mocap body).
         radius: radius of the ball at the head [m].
         timestep: timestep [s].
         above: height of the ball over the skin at the start [m].

@@ -7,9 +7,11 @@ from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
+from scipy.spatial import KDTree
 
 from stmpl_core.errors import InvalidInput
 from stmpl_core.layer import SoftLayer
+from stmpl_core.soundness import border_distance
 
 SMOOTH_M = 12e-3  # width over which normals are averaged [m]: what a tool of that size feels as one surface
 MIDDLE = 0.2  # half width of the middle part of a limb, over its length
@@ -31,12 +33,16 @@ class Site:
 
     @classmethod
     def thickest(cls, layer: SoftLayer) -> Site:
-        """The vertex in the middle part of the limb whose tissue is thickest, averaged over its surroundings."""
-        v = layer.vertices
+        """The vertex in the middle part of the limb whose tissue is thickest, averaged over its surroundings.
+
+        The middle part is that along its length, and farther from an open border than half as far as any vertex there.
+        """
+        v, room = layer.vertices, border_distance(layer)
         along = (v - v.mean(axis=0)) @ _long_axis(layer)
         some = np.flatnonzero(np.abs(along) < MIDDLE * np.ptp(along))
-        away = np.linalg.norm(v[some, None] - v[None, some], axis=2) < 2 * SMOOTH_M
-        thick = away @ layer.thickness[some] / away.sum(axis=1)
+        some = some[room[some] >= 0.5 * room[some].max()]
+        tree, thickness = KDTree(v[some]), layer.thickness[some]
+        thick = np.array([thickness[tree.query_ball_point(one, 2 * SMOOTH_M)].mean() for one in v[some]])
         return cls(layer, int(some[(thick / thick.max() - np.abs(along[some]) / np.ptp(along)).argmax()]))
 
     @cached_property
@@ -87,11 +93,11 @@ class Place(NamedTuple):
 
     Args:
         point: point [m].
-        slope: its derivative by the angle [m/rad].
-        bend: its second derivative [m/rad2].
+        slope: derivative of the point by the angle [m/rad].
+        bend: second derivative of the point [m/rad2].
         normal: outward unit normal [-].
-        tilt: its derivative by the angle [1/rad].
-        curl: its second derivative [1/rad2].
+        tilt: derivative of the normal by the angle [1/rad].
+        curl: second derivative of the normal [1/rad2].
     """
 
     point: np.ndarray

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from stmpl_sim.massage import Log, Massage
 
 FILM_RATE = 20.0  # frames a second
-PAPER_MODULUS = 20e3  # Young's modulus of the limb of one material [Pa]
+SINGLE_MODULUS = 20e3  # Young's modulus of the limb of one material [Pa]
 ros_arguments: list[str] = []  # arguments of ROS, from --ros-args on; this verb has no use for them
 
 
@@ -46,7 +46,7 @@ def sim(
 
     Args:
         out: folder for log.npz and film.webp.
-        part: part of the average body: left_forearm, right_thigh, torso.
+        part: part of the average body: left_forearm, right_thigh, back.
         tissue: tissue of it; relaxed, tensed: skin, fat and muscle as measured in its region, with the muscle so;
             single: one material of 20 kPa, 7.5 mm thick.
         force: forces to press with, one after the other [N].
@@ -54,14 +54,14 @@ def sim(
         circle: radius of the circles [mm].
         laps: laps with each force.
         radius: radius of the ball that presses [mm].
-        mount: what holds the limb: nothing moves it, or springs do.
+        mount: mount of the limb: fixed, or on springs.
         robot: MJCF or URDF file; the 7-axis arm that ships unless given. Its actuators become torque motors.
         end: body or site of the robot that carries the ball, z axis towards the skin; the last body unless given.
         at: place of the limb in the robot's world [m].
         rate: rate of physics, with contact at every step [Hz].
-        damping: damping of the contact [s/m], not measured on tissue; 0: elastic.
+        damping: damping of the contact [s/m], not measured on tissue; 0: none.
         friction: coefficient of friction, or dry, moist, oiled, glove, typical, or none.
-        film: what makes the film's frames: auto takes the first that works here; none makes no film.
+        film: renderer of the film: auto takes the first that works here; none makes no film.
         as_json: figures as JSON, for machines.
     """
     needed("stmpl sim", "sim", "mujoco")
@@ -112,7 +112,7 @@ def limb(part: str, tissue: str) -> SoftLayer:
     from stmpl_core.tissue import Tissue
 
     if tissue == "single":
-        return Body.anny().part(part, tissue=Tissue(youngs_modulus=PAPER_MODULUS))
+        return Body.anny().part(part, tissue=Tissue(youngs_modulus=SINGLE_MODULUS))
     return living(Body.anny(), part, "tensed" if tissue == "tensed" else "relaxed")
 
 

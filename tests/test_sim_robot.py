@@ -6,16 +6,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from stmpl_core import Simulator, SoftLayer
+from stmpl_core import Prony, Simulator, SoftLayer, Tissue
 from stmpl_core.errors import InvalidInput
 from stmpl_core.methods import Winkler
+from tests.scenes import LENGTH, RADIUS, limb, plate
 
 pytest.importorskip("mujoco", reason="pip install 'stmpl[sim]'")
 
 
 @pytest.fixture(scope="module")
 def forearm() -> SoftLayer:
-    from stmpl_core import Tissue
     from stmpl_core.body import Body
 
     return Body.anny().part("left_forearm", tissue=Tissue(youngs_modulus=20e3))
@@ -58,6 +58,32 @@ def test_a_course_is_smooth_and_its_rates_are_its_derivatives(forearm: SoftLayer
     angles = np.array([course.angle(t) for t in times])
     np.testing.assert_allclose(np.gradient(angles[:, 0], times)[1:-1], angles[1:-1, 1], atol=0.02)
     assert angles[-1, 0] == pytest.approx(2 * np.pi) and angles[:, 1].max() == pytest.approx(0.05 / 0.012)
+
+
+def test_the_thickest_place_of_a_fine_mesh_takes_little_memory() -> None:
+    import tracemalloc
+
+    from stmpl_sim.site import Site
+
+    layer = limb(1.5e-3)
+    peak = np.array([RADIUS, 0, 0.45 * LENGTH])
+    bulge = np.exp(-(np.linalg.norm(layer.vertices - peak, axis=1) ** 2) / (2 * 0.02**2))
+    layer = layer.with_(thickness=7.5e-3 * (1 + 0.5 * bulge))
+    assert len(layer.vertices) > 20_000
+    tracemalloc.start()
+    site = Site.thickest(layer)
+    most = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert np.linalg.norm(site.point - peak) < 0.012 and most < 200e6  # bytes
+
+
+def test_a_patch_of_one_thickness_has_its_site_off_its_rim() -> None:
+    from stmpl_sim.site import Site
+
+    flat = plate(0.12)
+    site = Site.thickest(flat.with_(vertices=flat.vertices * [0.7, 1, 1]))
+    assert abs(site.point[0]) < 0.021 + 1e-6
+    site.circle(0.012)
 
 
 def test_a_robot_of_ones_own_is_driven_and_what_it_lacks_is_said(forearm: SoftLayer, tmp_path: Path) -> None:
@@ -122,6 +148,19 @@ def test_the_environment_passes_gymnasiums_own_check_and_its_script_solves_it(fo
     assert np.mean(still[20:]) < 0.3  # who does nothing is not paid
     with pytest.raises(InvalidInput, match="render_mode"):
         MassageEnv(forearm, render_mode="human")
+
+
+def test_an_episode_begins_on_skin_that_remembers_the_press(forearm: SoftLayer) -> None:
+    pytest.importorskip("gymnasium", reason="pip install 'stmpl[sim]'")
+    from stmpl_sim.env import MassageEnv, Scripted
+
+    slow = forearm.with_(tissue=Tissue(20e3, relaxation=Prony((0.3, 0.3), (0.1, 1.0))))
+    env, policy = MassageEnv(Simulator(slow, Winkler()), laps=0.1, timestep=4e-3), Scripted()
+    for _ in range(2):
+        observation, _ = env.reset(seed=1)
+        assert observation[0] == pytest.approx(1.0, abs=0.05)  # 10 N, not those of skin that was never pressed
+        for _ in range(10):
+            observation, *_ = env.step(policy.act(observation))
 
 
 def test_the_verb_prints_figures_and_leaves_log_and_film(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
