@@ -103,7 +103,7 @@ class SoftContact:
         pose_body_from_layer: pose of the layer's axes in the body's frame, (4, 4); the same frame unless given.
         damping: damping of the contact [s/m], as of Hunt and Crossley (1975): the force F that presses becomes
             F (1 + damping v) at the speed v into the skin, and never pulls; friction stays as it is. Not measured on
-            tissue; 0: none.
+            tissue; 0: none. Without `implicit` a step h is stable while h^2 k + 2 h c < 4 m, c = damping F.
         implicit: choice to take the force that presses at the end of the step, to first order (backward Euler,
             linearised): F* = (F + h k (v + h a)) / (1 + h^2 k A), with the step h, the stiffness k along the force by
             one more touch 0.05 mm deeper, the speed v into the skin, its acceleration a without the contact, and the

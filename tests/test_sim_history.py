@@ -10,7 +10,8 @@ from stmpl_core import Prony, Simulator, SoftLayer, Tissue
 from stmpl_core.errors import InvalidInput
 from stmpl_core.methods import Winkler
 from stmpl_sim import Memory, Poses, SoftBody, SoftContact, exchange
-from tests.scenes import ball, plate
+from tests.scenes import LENGTH, THICKNESS, ball, limb, plate
+from tests.scenes import RADIUS as LIMB_RADIUS
 from tests.test_sim import CORE, MASS, RADIUS, MassOnASpring, model, pose, step
 
 mujoco = pytest.importorskip("mujoco", reason="pip install 'stmpl[sim]'")
@@ -159,3 +160,40 @@ def test_a_rigid_contact_with_what_is_welded_to_the_limb_is_seen(slab: SoftLayer
     d = mujoco.MjData(beside)
     skin = SoftBody(beside, simulator, body="slab", tools=["ball"])  # floor and table stand still, as the slab does
     step(beside, d, skin)
+
+
+def lifted(friction: str) -> np.ndarray:
+    """A limb of 0.2 kg that two fingers squeeze with 6 N each and, from 0.2 s to 0.5 s, lift by 30 mm.
+
+    Returns:
+        Height above the floor [m] and force that each finger presses with [N], a row a millisecond, (800, 3).
+    """
+    fingers = "".join(f'<body name="{name}" pos="{side * (LIMB_RADIUS + RADIUS + 1e-3)} 0 0"><joint name="{name}" '
+                      f'type="slide" axis="{-side} 0 0" damping="5"/><geom name="{name}" size="{RADIUS}" mass=".1" '
+                      'contype="0" conaffinity="0"/></body>'
+                      for name, side in (("left", -1), ("right", 1)))  # fmt: skip
+    m = mujoco.MjModel.from_xml_string(
+        '<mujoco><option timestep="1e-3"/><worldbody><geom type="plane" size="1 1 .1"/><body name="limb"><freejoint/>'
+        f'<geom type="cylinder" size="{LIMB_RADIUS - THICKNESS} {LENGTH / 2}" pos="0 0 {LENGTH / 2}" mass=".2"/></body>'
+        f'<body name="hand" mocap="true" pos="0 0 .09">{fingers}</body></worldbody>'
+        '<actuator><motor joint="left"/><motor joint="right"/></actuator></mujoco>')  # fmt: skip
+    d = mujoco.MjData(m)
+    skin = SoftBody(m, limb(youngs_modulus=20e3), body="limb", tools=["left", "right"], method=Winkler(),
+                    damping=5.0, friction=friction)  # fmt: skip
+    d.ctrl[:] = 6.0
+    rows = []
+    for k in range(800):
+        d.mocap_pos[0, 2] = 0.09 + 1e-4 * min(max(k - 200, 0), 300)
+        step(m, d, skin)
+        assert skin.reaction is not None
+        rows.append((d.body("limb").xpos[2], *(skin.reaction.touches[name].force for name in ("left", "right"))))
+    return np.array(rows)
+
+
+def test_two_fingers_lift_a_limb_that_friction_can_hold_and_leave_one_that_it_cannot() -> None:
+    height, *forces = lifted("dry").T
+    assert np.abs(height[:200]).max() < 1e-3
+    np.testing.assert_allclose(height[500:], 0.03, atol=6e-3)  # in the air, hung on skin that bends
+    for force in forces:
+        np.testing.assert_allclose(force[200:], 6.0, atol=0.2)
+    assert np.abs(lifted("oiled")[:, 0]).max() < 1e-3  # 2 x 0.1 x 6 N carry less than its weight
