@@ -36,6 +36,7 @@ def sim(
     rate: float = 1000.0,
     damping: float = 0.0,
     friction: str = "none",
+    relaxing: bool = False,
     film: Literal["auto", "egl", "osmesa", "software", "none"] = "auto",
     as_json: Annotated[bool, tyro.conf.arg(name="json")] = False,
 ) -> int:
@@ -61,6 +62,7 @@ def sim(
         rate: rate of physics, with contact at every step [Hz].
         damping: damping of the contact [s/m], not measured on tissue; 0: none.
         friction: coefficient of friction, or dry, moist, oiled, glove, typical, or none.
+        relaxing: stress that fades, as in skin that was stretched and held (assumed of all materials).
         film: renderer of the film: auto takes the first that works here; none makes no film.
         as_json: figures as JSON, for machines.
     """
@@ -71,7 +73,7 @@ def sim(
     from stmpl_sim.scene import build
     from stmpl_sim.site import Site
 
-    layer = limb(part, tissue)
+    layer = limb(part, tissue, relaxing)
     site = Site.thickest(layer)
     scene = build(layer, site, robot=robot, end=end, at=at, mount=mount, radius=1e-3 * radius, timestep=1 / rate)
     course = Course(site.circle(1e-3 * circle), tuple(force), 1e-3 * speed, laps)
@@ -105,15 +107,18 @@ def _friction(said: str) -> str | float | None:
         return said
 
 
-def limb(part: str, tissue: str) -> SoftLayer:
+def limb(part: str, tissue: str, relaxing: bool = False) -> SoftLayer:
     """A part of the average body. Raises InvalidInput: no such part."""
     from stmpl_core.body import Body
     from stmpl_core.living import living
+    from stmpl_core.regions import HELD_SKIN
     from stmpl_core.tissue import Tissue
 
     if tissue == "single":
-        return Body.anny().part(part, tissue=Tissue(youngs_modulus=SINGLE_MODULUS))
-    return living(Body.anny(), part, "tensed" if tissue == "tensed" else "relaxed")
+        layer = Body.anny().part(part, tissue=Tissue(youngs_modulus=SINGLE_MODULUS))
+    else:
+        layer = living(Body.anny(), part, "tensed" if tissue == "tensed" else "relaxed")
+    return layer.with_(tissue=layer.tissue.relaxing(HELD_SKIN)) if relaxing else layer
 
 
 def _run(massage: Massage, camera: Any, *, quiet: bool) -> Log:
