@@ -204,18 +204,23 @@ def _matrices(voigt: np.ndarray) -> np.ndarray:
 
 
 @njit(cache=True, fastmath=FAST)
+def _gradient(u, columns, level, per, gradients, diagonal, out):
+    """out = `diagonal` I + du/dX of an element at a point with these gradients (nodes, 3); per: see held_energy."""
+    for i in range(3):
+        for j in range(3):
+            s = diagonal if i == j else 0.0
+            for a in range(len(gradients)):
+                s += u[columns[a // per], level + a % per, i] * gradients[a, j]
+            out[i, j] = s
+
+
+@njit(cache=True, fastmath=FAST)
 def _solid_stress(u, columns, layers, gradients, mus, lams, out):
-    n_nodes = gradients.shape[2]
     F, C, inv = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
     for e in range(gradients.shape[0]):
         t, level = e // layers, 2 * (e % layers)
         for q in range(gradients.shape[1]):
-            for i in range(3):
-                for j in range(3):
-                    s = 1.0 if i == j else 0.0
-                    for a in range(n_nodes):
-                        s += u[columns[t, a // 3], level + a % 3, i] * gradients[e, q, a, j]
-                    F[i, j] = s
+            _gradient(u, columns[t], level, 3, gradients[e, q], 1.0, F)
             for i in range(3):
                 for j in range(3):
                     C[i, j] = F[0, i] * F[0, j] + F[1, i] * F[1, j] + F[2, i] * F[2, j]
@@ -246,12 +251,7 @@ def held_energy(u, columns, layers, per, gradients, volumes, held):
     for e in range(gradients.shape[0]):
         t, level = e // layers, 2 * (e % layers)
         for q in range(gradients.shape[1]):
-            for i in range(3):
-                for j in range(3):
-                    s = 0.0
-                    for a in range(gradients.shape[2]):
-                        s += u[columns[t, a // per], level + a % per, i] * gradients[e, q, a, j]
-                    L[i, j] = s
+            _gradient(u, columns[t], level, per, gradients[e, q], 0.0, L)
             s = 0.0
             for i in range(3):
                 _pull(held[e, q], L[i], row)  # H : E = H : (L + L^T L / 2)
@@ -267,12 +267,7 @@ def held_forces(u, columns, layers, per, gradients, volumes, held, forces):
     for e in range(gradients.shape[0]):
         t, level = e // layers, 2 * (e % layers)
         for q in range(gradients.shape[1]):
-            for i in range(3):
-                for j in range(3):
-                    s = 0.0
-                    for a in range(gradients.shape[2]):
-                        s += u[columns[t, a // per], level + a % per, i] * gradients[e, q, a, j]
-                    L[i, j] = s
+            _gradient(u, columns[t], level, per, gradients[e, q], 0.0, L)
             for a in range(gradients.shape[2]):
                 _pull(held[e, q], gradients[e, q, a], v)
                 for i in range(3):

@@ -30,7 +30,6 @@ from stmpl_core.toucher import Toucher
 PLOUGHED = 0.33, 0.2, 0.67  # see _dragged: growth of stiffness, and of the cap without and over mu
 ROUGH = 0.12  # error of the relaxed force, over what has relaxed: 5.4 of 45 % in trials where only the shear relaxes
 HELD_OFF = 0.01  # relative error of the elastic force by wrench, from which it is asked for again
-FORGOTTEN = 1e-3  # elastic force of skin that comes back, over its largest, below which it is forgotten
 GIVEN_BACK = 0.7  # share of what an elastic contact gives back that must be covered by what was put in
 KEPT = 1.5  # work beyond what elastic skin could hold that is forgotten: what was lost before pays for nothing now
 NOTHING = np.zeros(3)
@@ -116,7 +115,7 @@ class History:
         for name, memory in state.tools.items():
             if name not in memories:
                 left = self._left(memory, dt)
-                if left.scalars.elastic > FORGOTTEN * left.scalars.largest:
+                if left.scalars.sunk:
                     memories[name] = left
         return out, State(memories)
 
@@ -144,7 +143,7 @@ class History:
             force = contact.wrench[:3]
             normal = memory.contact[1] if memory.scalars.radius > 0 else force / max(np.linalg.norm(force), 1e-300)
             wanted = float(force @ normal) / memory.scalars.net
-            owed, now = float(self.series.shares @ kept), 1 - float(self.series.shares @ gain)
+            owed, now = self.series.balance(kept, gain)
             if wanted > 0:
                 asked = replace(contact, wrench=contact.wrench * ((wanted + owed) / (wanted * now)))
         return _Asked(asked, contact, memory, known, twist, kept, gain)
@@ -158,7 +157,7 @@ class History:
         assert one.stated.wrench is not None
         whole = self._whole(touch)
         wanted = float(one.stated.wrench[:3] @ touch.push) / touch.force * whole / touch.force
-        owed, now = float(self.series.shares @ one.kept), 1 - float(self.series.shares @ one.gain)
+        owed, now = self.series.balance(one.kept, one.gain)
         return (wanted + owed) / now, whole
 
     def _again(self, one: _Asked, touch: Touch) -> _Asked | None:
@@ -174,7 +173,7 @@ class History:
     def _law(self, one: _Asked, touch: Touch, dt: float) -> _Law:
         """What a tool does, from what elastic skin does."""
         shares, before = self.series.shares, one.before.scalars
-        owed, now = float(shares @ one.kept), 1 - float(shares @ one.gain)
+        owed, now = self.series.balance(one.kept, one.gain)
         presses = touch.presses and touch.pressed is not None and touch.force > 0
         elastic = self._whole(touch) if presses else 0.0
         force = now * elastic - owed
@@ -214,7 +213,7 @@ class History:
         scalars = before._replace(pressing=0.0, elastic=elastic, share=1.0, passive=1.0)
         memory = _let_go(one.before._replace(pose=one.stated.pose_body_from_tool, wrench=touch.wrench, scalars=scalars,
                                              relaxed=one.kept + one.gain * elastic))  # fmt: skip
-        if elastic > FORGOTTEN * before.largest:
+        if scalars.sunk:
             touch = replace(touch, imprint=_imprint(memory))
         depth = before.depth * (elastic / before.imprint_force) ** (1 / before.power) if elastic > 0 else 0.0
         return _Law(self._said(one, touch), memory, 0.0, elastic * depth / (before.power + 1))
@@ -222,7 +221,8 @@ class History:
     def _left(self, memory: Memory, dt: float) -> Memory:
         """The memory of a tool that is not told of any more: the skin comes back."""
         kept, gain = self._relaxed(memory, dt, 0.0)
-        elastic = max(float(self.series.shares @ kept) / (1 - float(self.series.shares @ gain)), 0.0)
+        owed, now = self.series.balance(kept, gain)
+        elastic = max(owed / now, 0.0)
         scalars = memory.scalars._replace(pressing=-1.0, elastic=elastic, share=1.0, work=0.0, passive=1.0)
         return _let_go(memory._replace(scalars=scalars, relaxed=kept + gain * elastic, wrench=np.zeros(6)))
 

@@ -35,6 +35,10 @@ class Series(NamedTuple):
     shares: np.ndarray
     times: np.ndarray
 
+    def balance(self, kept: np.ndarray, gain: np.ndarray) -> tuple[float, float]:
+        """Numbers a and b such that an elastic force F_e is b F_e - a after a step; kept, gain: see `weights`, (P,)."""
+        return float(self.shares @ kept), 1 - float(self.shares @ gain)
+
 
 def series_of(tissue: Tissue, thickness: float) -> Series:
     """Relaxation of a force on a flat stack: each material's own times its share d ln F / d ln E in the force.

@@ -63,6 +63,8 @@ class Simulator:
             self._green.keep(self.layer)  # a Skin from another process has a layer of its own
         self.toucher = Toucher(self.layer, self.skin.near, tools)
         self.history = History(self.toucher, friction)
+        if friction is not None:  # what a slide needs is made now, not when the first one begins
+            _ = self.history.sideways, Green.of(self.layer)
 
     @property
     def tools(self) -> Tools:

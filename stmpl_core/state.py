@@ -13,6 +13,7 @@ from stmpl_core.errors import InvalidInput
 from stmpl_core.slip import SPRINGS
 
 VERSION = 1  # of packed states; older ones are not read
+FORGOTTEN = 1e-3  # elastic force of skin that comes back, over its largest, below which it is forgotten
 
 
 class Memory(NamedTuple):
@@ -70,6 +71,11 @@ class Scalars(NamedTuple):
     share: float = 1.0
     work: float = 0.0
     passive: float = 1.0
+
+    @property
+    def sunk(self) -> bool:
+        """Whether the skin is not back yet."""
+        return self.elastic > FORGOTTEN * self.largest
 
 
 def fresh(pose: np.ndarray, terms: int) -> Memory:

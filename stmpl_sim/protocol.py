@@ -16,7 +16,6 @@ from stmpl_core.columns import shifted
 from stmpl_core.contact import Contact
 from stmpl_core.errors import InvalidInput
 from stmpl_core.friction import Friction
-from stmpl_core.history import FORGOTTEN
 from stmpl_core.layer import SoftLayer
 from stmpl_core.methods import MomentNet
 from stmpl_core.methods.base import Method
@@ -272,7 +271,7 @@ def exchange(contact: SoftContact, world: World, memory: Memory | None = None, d
 def _has_imprint(tissue: State, name: str) -> bool:
     """Whether the tissue has not yet come back from where this tool pressed."""
     known = tissue.tools.get(name)
-    return known is not None and known.scalars.elastic > FORGOTTEN * known.scalars.largest
+    return known is not None and known.scalars.sunk
 
 
 def _pressing(touch: Touch) -> Wrench:
