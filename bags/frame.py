@@ -22,6 +22,9 @@ class Frame(Answer):
         inputs: stamps of the pose and the wrench of each tool that it answers [ns]; 0: no wrench.
         solve_seconds: time that the node spent on it [s].
         fade: share of its contacts' answer that it is; below 1 where the input had stopped.
+        state: memory of the tissue before it (State.pack); empty: none, elastic skin.
+        dt: time since that state [s].
+        friction: coefficient of friction of each tool [-].
     """
 
     stamp_ns: int = 0
@@ -31,6 +34,9 @@ class Frame(Answer):
     inputs: Stamps = field(default_factory=dict)
     solve_seconds: float = 0.0
     fade: float = 1.0
+    state: bytes = b""
+    dt: float = 0.0
+    friction: Mapping[str, float] = field(default_factory=dict)
 
     @property
     def peak(self) -> float:

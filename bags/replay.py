@@ -11,18 +11,27 @@ import numpy as np
 from bags.frame import Frame
 from bags.provenance import allowance
 from bags.run import Run
+from stmpl_core.layer import SoftLayer
 from stmpl_core.methods.base import Method
 from stmpl_core.provenance import versions
 from stmpl_core.simulator import Simulator
+from stmpl_core.state import State
 from stmpl_core.touch import Answer
 
 
 @dataclass(frozen=True, eq=False)
 class Replayed:
-    """A recorded answer, and the answer to the same contacts now."""
+    """A recorded answer, and the answer to the same contacts, from the same state, now.
+
+    Args:
+        frame: recorded answer.
+        answer: answer now.
+        after: state after it; None: the recorded answer carries no state, elastic skin.
+    """
 
     frame: Frame
     answer: Answer
+    after: State | None = None
 
     @property
     def identical(self) -> bool:
@@ -44,6 +53,7 @@ class ReplaySummary:
     Args:
         method: name of the method that answered now.
         frames: number of frames that were replayed.
+        remembering: number of them that carry a state.
         identical: number of them that came out bit for bit as recorded.
         worst: largest difference at any vertex of any frame [m].
         tolerance: largest difference that is allowed [m]; 0: bit for bit.
@@ -54,6 +64,7 @@ class ReplaySummary:
 
     method: str
     frames: int
+    remembering: int
     identical: int
     worst: float
     tolerance: float
@@ -68,9 +79,10 @@ class ReplaySummary:
 
     def __str__(self) -> str:
         held = f"held to {f'{self.tolerance * 1e3:.3g} mm' if self.tolerance else 'every bit'}, since {self.reason}"
+        each = f"{self.method}, {self.remembering} from a state" if self.remembering else self.method
         if self.identical == self.frames:
-            return f"{self.frames} frames replayed with {self.method}, every one bit for bit as recorded; {held}."
-        off = (f"{self.frames - self.identical} of {self.frames} frames replayed with {self.method} differ, "
+            return f"{self.frames} frames replayed with {each}, every one bit for bit as recorded; {held}."
+        off = (f"{self.frames - self.identical} of {self.frames} frames replayed with {each} differ, "
                f"by up to {self.worst * 1e3:.3g} mm; {held}")  # fmt: skip
         note = f" Changed since: {', '.join(self.changed)}." if self.changed else ""
         return f"{off}." if self.passed else f"{off}; number {self.first_difference} is the first past it.{note}"
@@ -79,7 +91,7 @@ class ReplaySummary:
 def replay(run: Path | str | Run, method: Method, *, every: int = 1) -> Iterator[Replayed]:
     """Yields each recorded answer (or every n-th) with the one that its recorded contacts give now, in the run's order.
 
-    Each is answered on the layer that it was answered on.
+    Each is answered on the layer that it was answered on, from the state that it carries: it needs none before it.
 
     Args:
         run: recording: its folder, its .mcap file, or an opened one.
@@ -88,17 +100,30 @@ def replay(run: Path | str | Run, method: Method, *, every: int = 1) -> Iterator
 
     Raises:
         BagError: the bag lacks answers, the layer, or a tool's mesh or pose.
+        InvalidInput: a state of another version.
     """
     run = run if isinstance(run, Run) else Run(run)
     simulator: Simulator | None = None
     for frame in run.frames(range(0, run.answers, every)):
-        layer = run.layer_of(frame)
-        if simulator is None or simulator.layer is not layer:
-            simulator = Simulator(layer, method)
-        answer = simulator.step(run.contacts(frame))
+        simulator = _simulator(simulator, run.layer_of(frame), method, frame)
+        contacts, after = run.contacts(frame), None
+        if frame.state:
+            touches, after = simulator.touch(contacts, State.unpack(frame.state), frame.dt)
+            answer = simulator.answer(touches)
+        else:
+            answer = simulator.step(contacts)
         if frame.fade < 1:  # the input had stopped: a share of the last answer was sent
             answer = replace(answer, displacement=frame.fade * answer.displacement)
-        yield Replayed(frame, answer)
+        yield Replayed(frame, answer, after)
+
+
+def _simulator(before: Simulator | None, layer: SoftLayer, method: Method, frame: Frame) -> Simulator:
+    """The simulator that a frame was answered by: the one from before, if layer and friction are still the same."""
+    if before is None or before.layer is not layer:
+        return Simulator(layer, method, friction=frame.friction if frame.state else None)
+    if frame.state and any(before.history.friction(name) != one for name, one in frame.friction.items()):
+        return Simulator(before.skin, tools=before.tools, friction=frame.friction)
+    return before
 
 
 def replay_run(
@@ -121,14 +146,15 @@ def replay_run(
     allowed, reason = allowance(run.provenance.processor, now["processor"])
     if tolerance is not None:
         allowed, reason = tolerance, "this tolerance was asked for"
-    frames = identical = 0
+    frames = remembering = identical = 0
     worst, first = 0.0, None
     for replayed in replay(run, method, every=every):
         frames += 1
+        remembering += bool(replayed.frame.state)
         identical += replayed.identical
         difference = 0.0 if replayed.identical else replayed.difference
         worst = max(worst, difference)
         if not replayed.identical and not (allowed and difference <= allowed) and first is None:
             first = replayed.frame.sequence
     changed = tuple(f"{k} {then[k]} -> {now.get(k, 'none')}" for k in then if now.get(k) != then[k])
-    return ReplaySummary(method.name, frames, identical, worst, allowed, reason, first, changed)
+    return ReplaySummary(method.name, frames, remembering, identical, worst, allowed, reason, first, changed)

@@ -8,6 +8,7 @@ from __future__ import annotations
 import importlib
 from array import array
 from collections.abc import Mapping
+from dataclasses import replace
 from functools import cache
 from types import MappingProxyType
 from typing import Any
@@ -22,17 +23,20 @@ from stmpl_core.errors import BagError, FrameError, InvalidInput, MeshError
 from stmpl_core.layer import MAX_EXTENT, SoftLayer, layer_id
 from stmpl_core.local_contact import LocalContact
 from stmpl_core.packed import layer_stack_from_text, layer_stack_to_text
+from stmpl_core.state import State
 from stmpl_core.tissue import Tissue
 from stmpl_core.tool import Tool
-from stmpl_core.touch import Answer, Touch
+from stmpl_core.touch import Answer, Slip, Touch
 from stmpl_core.trust import Trust
 
 FixedFrames = Mapping[str, Transform]  # pose_body_from_frame of each frame that does not move, (4, 4)
 
 NANO = 1_000_000_000  # nanoseconds in a second
 NO_FRAMES: FixedFrames = MappingProxyType({})
+NO_FRICTION: Mapping[str, float] = MappingProxyType({})
 QUATERNION_TOLERANCE = 1e-2  # error of a unit quaternion's length; through float32 or text it is far less
 NOWHERE = np.full((4, 4), np.nan)  # pose that a recording does not tell
+NOT_TOLD = np.full(3, np.nan)  # likewise a place, or a way
 
 
 # Decoding
@@ -167,7 +171,10 @@ def frame_from(message: Any, log_time_ns: int) -> Frame:
         layer_id=message.layer_id,
         inputs=inputs,
         solve_seconds=float(message.solve_seconds),
-        fade=float(getattr(message, "fade", 1.0)),  # older recordings have none
+        fade=float(getattr(message, "fade", 1.0)),  # older recordings have none of these
+        state=bytes(getattr(message, "state", b"")),
+        dt=float(getattr(message, "dt", 0.0)),
+        friction={one.tool: float(getattr(one, "friction", 0.0)) for one in getattr(message, "touches", ())},
     )
 
 
@@ -196,10 +203,19 @@ def _announced(name: str, vertices: np.ndarray, triangles: np.ndarray) -> Tool:
 
 
 def _touches(message: Any) -> tuple[dict[str, Touch], Stamps]:
-    touches = {one.tool: Touch(one.tool, one.status, pose_from(one.pose), _six(one.wrench), float(one.depth),
-                               float(one.force_bound), trust=Trust(in_range=bool(one.in_range)))
-               for one in message.touches}  # fmt: skip
+    touches = {one.tool: _touch_from(one) for one in message.touches}
     return touches, {one.tool: (_ns(one.pose_stamp), _ns(one.wrench_stamp)) for one in message.touches}
+
+
+def _touch_from(message: Any) -> Touch:
+    touch = Touch(message.tool, message.status, pose_from(message.pose), _six(message.wrench), float(message.depth),
+                  float(message.force_bound), trust=Trust(in_range=bool(message.in_range)))  # fmt: skip
+    if not hasattr(message, "slip"):  # recordings from before friction
+        return touch
+    slip = None
+    if message.slip:
+        slip = Slip(_six(message.friction_wrench), float(message.slip_share), NOT_TOLD, float("nan"), NOT_TOLD)
+    return replace(touch, missing=_six(message.missing), slip=slip, passive=float(message.passive))
 
 
 def _touches_before(message: Any) -> tuple[dict[str, Touch], Stamps]:
@@ -320,6 +336,9 @@ def displacement_message(
     inputs: Stamps,
     fade: float = 1.0,
     why: str = "",
+    state: State | None = None,
+    dt: float = 0.0,
+    friction: Mapping[str, float] = NO_FRICTION,
 ) -> Any:
     """An answer as a SkinDisplacement.
 
@@ -333,6 +352,9 @@ def displacement_message(
         inputs: stamps of the poses and wrenches that it answers [ns].
         fade: share of its contacts' answer that it is (see Answer.faded).
         why: sentence to add to the trust's own.
+        state: memory of the tissue before it; None: none, elastic skin.
+        dt: time since that state [s].
+        friction: coefficient of friction of each tool [-]; 0 unless given.
     """
     trust = answer.trust
     return message_class("stmpl_msgs/msg/SkinDisplacement")(
@@ -346,9 +368,11 @@ def displacement_message(
         in_range=bool(trust.in_range),
         error_bound=float("nan") if trust.error_bound is None else float(trust.error_bound),
         why="; ".join(filter(None, (trust.why, why))),
-        touches=[_touch(touch, *inputs[name]) for name, touch in answer.touches.items()],
+        touches=[_touch(touch, *inputs[name], friction.get(name, 0.0)) for name, touch in answer.touches.items()],
         fade=fade,
         solve_seconds=solve_seconds,
+        dt=dt,
+        state=array("B", b"" if state is None else state.pack()),
     )
 
 
@@ -374,7 +398,8 @@ def local_contact_message(tool: str, model: LocalContact, status: str, body_fram
     )
 
 
-def _touch(touch: Touch, pose_stamp: int, wrench_stamp: int) -> Any:
+def _touch(touch: Touch, pose_stamp: int, wrench_stamp: int, friction: float) -> Any:
+    slip = touch.slip
     return message_class("stmpl_msgs/msg/Touch")(
         tool=touch.name,
         status=touch.status,
@@ -385,6 +410,12 @@ def _touch(touch: Touch, pose_stamp: int, wrench_stamp: int) -> Any:
         in_range=bool(touch.trust.in_range),
         pose_stamp=_time(pose_stamp),
         wrench_stamp=_time(wrench_stamp),
+        friction=friction,
+        slip="" if slip is None else slip.kind,
+        slip_share=0.0 if slip is None else float(slip.share),
+        friction_wrench=_wrench(np.zeros(6) if slip is None else slip.wrench),
+        missing=_wrench(touch.missing),
+        passive=float(touch.passive),
     )
 
 

@@ -66,3 +66,36 @@ def coefficients(friction: Friction | Mapping[str, Friction]) -> tuple[float, di
     if isinstance(friction, Mapping):
         return 0.0, {name: coefficient(one) for name, one in friction.items()}
     return coefficient(friction), {}
+
+
+def friction_from(text: str) -> Friction | dict[str, Friction]:
+    """What a person writes of friction: a number, a pair's name, or either by tool: "ball: oiled, letter: 0.3".
+
+    Args:
+        text: what is said; empty or "none": no friction.
+
+    Raises:
+        InvalidInput: what is none of these, a name that is not known, or a number that is not from 0 to MOST.
+    """
+    if ":" not in text:
+        return _one(text)
+    found: dict[str, Friction] = {}
+    for part in text.split(","):
+        tool, colon, said = (piece.strip() for piece in part.partition(":"))
+        if not (tool and colon and said) or tool in found:
+            raise InvalidInput(f"'{text}' does not say the friction of each tool once, as in 'ball: oiled, "
+                               "letter: 0.3' does.")  # fmt: skip
+        found[tool] = _one(said)
+    return found
+
+
+def _one(text: str) -> Friction:
+    said = text.strip()
+    if said in ("", "none"):
+        return None
+    try:
+        friction: Friction = float(said)
+    except ValueError:
+        friction = said
+    coefficient(friction)
+    return friction

@@ -160,10 +160,10 @@ class SoftLayer:
         return np.unique(pairs[count == 1])
 
     def __repr__(self) -> str:
-        t = self.thickness * 1e3
+        t, more = self.thickness * 1e3, ", relaxing" if self.tissue.relaxes else ""
         return (f"SoftLayer({len(self.vertices)} vertices, {len(self.faces)} faces, "
                 f"thickness {t.min():.1f}..{t.max():.1f} mm, "
-                f"E {self.tissue.youngs_modulus:g} Pa, nu {self.tissue.poisson_ratio:g})")
+                f"E {self.tissue.youngs_modulus:g} Pa, nu {self.tissue.poisson_ratio:g}{more})")
 
 
 def single(layer: SoftLayer, who: str, *, straight: bool = True) -> SoftLayer:

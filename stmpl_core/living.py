@@ -15,7 +15,7 @@ from stmpl_core.fat import fat_map, for_person
 from stmpl_core.layer import MAX_THICKNESS, SoftLayer
 from stmpl_core.limbs import EDGE_LENGTH
 from stmpl_core.packed import stack_from_text, stack_to_text
-from stmpl_core.regions import REGIONS, Region, Tone, region
+from stmpl_core.regions import HELD_SKIN, REGIONS, Region, Tone, region
 from stmpl_core.tissue import Tissue
 from stmpl_core.trunk import TRUNK
 
@@ -66,6 +66,11 @@ def living(body: Body, part: str, tone: Tone = "relaxed", *, edge_length: float 
         skin = skin.with_(tissue=tissue, ply_scale=fat / middle)
     deepest = min(its.thickness, DEEPEST) if part in TRUNK else DEEPEST
     return to_bone(skin, bones_of(body, part), deepest)
+
+
+def held_skin(layer: SoftLayer) -> SoftLayer:
+    """The layer with the stress of all its materials fading as in skin that was stretched and held (HELD_SKIN)."""
+    return layer.with_(tissue=layer.tissue.relaxing(HELD_SKIN))
 
 
 def write_tissue(path: str | Path, tissue: Tissue, thickness: float) -> None:

@@ -44,6 +44,7 @@ class Simulator:
     Attributes:
         toucher: contact law on this layer.
         history: what time, friction and the balance of energy make of it.
+        remembers: flag of a skin that is not elastic: friction is told, or its tissue relaxes.
 
     Raises:
         InvalidInput: a layer without a method, or friction that is none.
@@ -63,6 +64,7 @@ class Simulator:
             self._green.keep(self.layer)  # a Skin from another process has a layer of its own
         self.toucher = Toucher(self.layer, self.skin.near, tools)
         self.history = History(self.toucher, friction)
+        self.remembers = friction is not None or self.layer.tissue.relaxes
         if friction is not None:  # what a slide needs is made now, not when the first one begins
             _ = self.history.sideways, Green.of(self.layer)
 

@@ -96,6 +96,15 @@ class State:
 
     tools: Mapping[str, Memory] = field(default_factory=dict)
 
+    @property
+    def finite(self) -> bool:
+        """Whether every number of it is finite."""
+        return all(np.isfinite(part).all() for memory in self.tools.values() for part in memory)
+
+    def without(self, name: str) -> State:
+        """The state without what it remembers of a tool: the skin that it pressed is at rest."""
+        return State({other: memory for other, memory in self.tools.items() if other != name})
+
     def pack(self) -> bytes:
         """The state as bytes, exact: a line of JSON, then float64 numbers, the least byte first."""
         names = sorted(self.tools)

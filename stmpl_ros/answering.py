@@ -16,6 +16,7 @@ from stmpl_ros.diagnosis import Tally
 from stmpl_ros.hearing import Hearing
 from stmpl_ros.inbox import Instant
 from stmpl_ros.limits import Limits
+from stmpl_ros.remembering import ELASTIC, Before, Remembering
 from stmpl_ros.sending import Sending
 from stmpl_ros.settings import Settings
 
@@ -43,6 +44,7 @@ class Answering:
         simulator: simulator of the skin that answers.
         sending: publishers of the answers.
         limits: limits that answers are held against, or None.
+        remembering: memory of the tissue.
         fading: flag of an answer that fades to rest.
     """
 
@@ -55,11 +57,13 @@ class Answering:
         self._node, self._settings, self._hearing, self._tally = node, settings, hearing, tally
         self._calibration = calibration
         self.limits: Limits | None = None
+        self.remembering = Remembering()
         self.start_empty()
 
     def start_empty(self) -> None:
         """Forgets what was answered."""
-        self.last: tuple[Answer, Instant] | None = None  # None: at rest
+        self.last: tuple[Answer, Instant, Before] | None = None  # None: at rest
+        self.remembering.forget()
         self.fading = False
         self._seen: set[str] = set()  # tools of the last answer
 
@@ -68,16 +72,19 @@ class Answering:
         gate, config = self._hearing.gate, self._settings.config
         started = time.perf_counter()
         try:
-            answer = self.simulator.step(instant.contacts)
+            back = self.remembering.went_back(instant)
+            reaction = self.remembering.reaction(self.simulator, instant)
+            answer = self.simulator.answer(reaction.touches)
         except Exception as error:  # the one place where an answer may fail
             tools = ", ".join(contact.name for contact in instant.contacts)
             return gate.refuse("answer", f"no answer to {tools}: {_told(error)}")
         if not np.isfinite(answer.displacement).all():
             statuses = {name: touch.status for name, touch in answer.touches.items()}
             return gate.refuse("answer", f"no answer: it would not be finite under {statuses}.")
+        self.remembering.keep(reaction, instant)
         seconds = time.perf_counter() - started
-        why = self._remarks(instant, answer)
-        self._send(answer, instant.stamp, instant.inputs, solve_seconds=seconds, why=why)
+        why = self._remarks(instant, answer, back)
+        self._send(answer, instant.stamp, instant.inputs, reaction.before, solve_seconds=seconds, why=why)
         self.sending.contacts(instant, answer, config.local_rotations)
         self._calibration.put(instant, answer)
         self._tally.solve_times.append(seconds)
@@ -86,7 +93,7 @@ class Answering:
             self.limits.put(answer)
         if self.fading:
             self._node.get_logger().info("input is back")
-        self.last, self.fading, gate.refused_since = (answer, instant), False, ""
+        self.last, self.fading, gate.refused_since = (answer, instant, reaction.before), False, ""
         self._seen = set(answer.touches)
 
     def fade_if_silent(self) -> None:
@@ -94,7 +101,7 @@ class Answering:
         now, config, gate = time.monotonic_ns(), self._settings.config, self._hearing.gate
         if self.last is None or self._hearing.inbox.live(now):
             return
-        answer, instant = self.last
+        answer, instant, before = self.last
         silent, limit = self._hearing.inbox.silence(now) / NANO, config.rest_after
         left = 1 - (silent - limit) / config.fade if config.fade else 0.0
         why = f"no pose for {limit} s"
@@ -110,13 +117,14 @@ class Answering:
             gate.say("fading", f"{why}: the last answer fades to rest within {config.fade} s")
         share = float(np.float32(left))  # as the message carries it
         faded = answer.faded(share, f"{why}: the last answer, faded to {left:.0%}")
-        self._send(faded, self._now(), instant.inputs, fade=share)
+        self._send(faded, self._now(), instant.inputs, before, fade=share)
 
     def on_other_skin(self) -> None:
         """Answers the last instant again, on the skin that took over; rest, if its tools are silent or not ready."""
         if self.last is None:
             return
-        before, instant = self.last
+        before, instant, _ = self.last
+        self.remembering.forget()
         if self._hearing.inbox.live(time.monotonic_ns()) and all(one.name in self.simulator.tools
                                                                  for one in instant.contacts):  # fmt: skip
             self.answer(instant)
@@ -125,6 +133,7 @@ class Answering:
 
     def without(self, name: str) -> None:
         """Tells that a tool, which was taken away, exerts nothing; rest, if no tool of the last answer is left."""
+        self.remembering.forget(name)
         self.sending.rest([name], self._now())
         if self.last is not None and not any(tool in self._hearing.tools for tool in self.last[0].touches):
             self.rest(f"'{name}' was taken away: back at rest")
@@ -132,19 +141,22 @@ class Answering:
     def rest(self, why: str) -> None:
         """Sends the skin at rest."""
         tools = list(self.last[0].touches) if self.last else []
-        self._send(self.simulator.step([]), self._now(), {}, why=why)
+        self._send(self.simulator.step([]), self._now(), {}, ELASTIC, why=why)
         self.sending.rest(tools, self._now())
         self.start_empty()
 
-    def _send(self, answer: Answer, stamp: int, inputs: Stamps, **said: float | str) -> None:
-        self.sending.answer(answer, stamp, inputs, **said)
+    def _send(self, answer: Answer, stamp: int, inputs: Stamps, before: Before, **said: float | str) -> None:
+        self.sending.answer(answer, stamp, inputs, **before._asdict(), **said)
         self._tally.answers = self.sending.sequence
         self._tally.methods[answer.method] += 1
 
-    def _remarks(self, instant: Instant, answer: Answer) -> str:
+    def _remarks(self, instant: Instant, answer: Answer, back: float) -> str:
         """What the node has to say of an answer beside what the core says; lines for what a person should look at."""
         say, rest_after = self._hearing.gate.say, self._settings.config.rest_after
         said = [f"stamps of tools and wrenches lie up to {instant.skew / 1e6:.1f} ms apart"] if instant.skew else []
+        if back:
+            said.append(f"the stamps went back by {back:.3g} s: no time passed for the tissue")
+            say("stamps", said[-1])
         for stream in instant.lost:
             said.append(f"no {stream} for {rest_after} s: answered without it")
             say(f"lost {stream}", said[-1])

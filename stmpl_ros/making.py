@@ -10,10 +10,11 @@ import numpy as np
 from stmpl_core.contact import Contact
 from stmpl_core.errors import InvalidInput
 from stmpl_core.layer import SoftLayer
-from stmpl_core.living import living, read_tissue, region_of
+from stmpl_core.living import held_skin, living, read_tissue, region_of
 from stmpl_core.regions import Tone
 from stmpl_core.simulator import Simulator
 from stmpl_core.skin import Skin, published
+from stmpl_core.state import State
 from stmpl_core.tissue import Tissue
 from stmpl_core.tool import Tool
 from stmpl_ros.parameters import ONE_LAYER, PAPER, NodeConfig
@@ -77,7 +78,8 @@ def at_once(config: NodeConfig, build: Build) -> bool:
 
 def skin_of(config: NodeConfig, build: Build = layer_of) -> Skin:
     """Skin that the settings ask for. Raises InvalidInput or MeshError."""
-    return Skin.of(published(build(config)), config.new_method())
+    layer = build(config)
+    return Skin.of(published(held_skin(layer) if config.relaxing else layer), config.new_method())
 
 
 def restiffened(skin: Skin, config: NodeConfig, changed: set[str]) -> Skin | None:
@@ -88,13 +90,21 @@ def restiffened(skin: Skin, config: NodeConfig, changed: set[str]) -> Skin | Non
 
 
 def warm_up(simulator: Simulator) -> None:
-    """Solves one contact of each kind, so that nothing is left to compile when the first real one comes."""
+    """Solves one contact of each kind, so that nothing is left to compile when the first real one comes.
+
+    Where time and friction count, they are one press that slides.
+    """
     corners = 0.01 * np.array([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1]])
     faces = np.array([[0, 2, 4], [2, 1, 4], [1, 3, 4], [3, 0, 4], [2, 0, 5], [1, 2, 5], [3, 1, 5], [0, 3, 5]])
     tool, layer, pose = Tool("warm up", corners, faces), simulator.layer, np.eye(4)
     vertex = int(np.linalg.norm(layer.vertices - layer.vertices.mean(axis=0), axis=1).argmin())
     push = np.concatenate([-0.01 * layer.normals[vertex], np.zeros(3)])
+    state = State()
     for away, wrench in ((0.009, push), (0.012, push), (0.009, None), (0.05, push)):
         pose[:3, 3] = layer.vertices[vertex] + away * layer.normals[vertex]
         simulator.step([Contact(tool, pose, wrench)])
+        for way in (0.0, 1e-3) if simulator.remembers else ():
+            pose[:3, 3] += way * np.roll(layer.normals[vertex], 1)
+            touches, state = simulator.touch([Contact(tool, pose.copy(), wrench)], state, 0.01)
+            simulator.answer(touches)
     simulator.tools.remove(tool.name)

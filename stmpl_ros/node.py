@@ -20,6 +20,7 @@ from stmpl_msgs.srv import SetBody
 from threadpoolctl import threadpool_limits
 
 from stmpl_core.errors import InvalidInput, StmplError
+from stmpl_core.friction import friction_from
 from stmpl_core.sdf import SignedDistance
 from stmpl_core.simulator import Simulator
 from stmpl_core.skin import Skin
@@ -99,7 +100,7 @@ class SkinNode(LifecycleNode):
             check(self.config, self._build)
             self.answering.limits = Limits.read(self.config.limits, self.config.limb)
             builders = Builders()  # start while the skin is made
-            self._answer_on(self._make_skin(), builders)
+            self._answer_on(self._make_skin(), self.config, builders)
             warm_up(self.answering.simulator)
         except StmplError as error:
             self._end()
@@ -165,15 +166,15 @@ class SkinNode(LifecycleNode):
         finally:
             making.close()
 
-    def _answer_on(self, skin: Skin, builders: Builders | None = None) -> None:
-        """From here on the answers are of this skin."""
+    def _answer_on(self, skin: Skin, config: NodeConfig, builders: Builders | None = None) -> None:
+        """From here on the answers are of this skin, with the friction of these settings."""
         tools, before = self.hearing.tools, self.workshop
         if tools.margin != margin_on(skin.layer):  # fields of another width are built anew
             self.hearing.inbox.tools = again = Tools(margin_on(skin.layer))
         else:
             again = tools
         self.skin, self.hearing.layer = skin, skin.layer
-        self.answering.simulator = Simulator(skin, tools=again)
+        self.answering.simulator = Simulator(skin, tools=again, friction=friction_from(config.friction))
         self.workshop = Workshop(self, skin.layer, builders)
         if before:
             before.close()
@@ -257,7 +258,7 @@ class SkinNode(LifecycleNode):
             self.get_logger().error(f"no other skin: {error or type(error).__name__}. The one from before goes on.")
 
     def _take_over(self, skin: Skin, config: NodeConfig) -> None:
-        self._answer_on(skin)
+        self._answer_on(skin, config)
         assert self.workshop
         self.settings.take(config)
         self.answering.limits = Limits.read(config.limits, config.limb)
@@ -278,6 +279,7 @@ class SkinNode(LifecycleNode):
     def _on_field(self, tool: Tool, future: Future[SignedDistance]) -> None:
         try:
             if self.hearing.take(tool, future.result()):
+                self.answering.remembering.forget(tool.name)  # another surface never touched
                 self.sending.open_tool(tool.name)
                 self.get_logger().info(f"tool '{tool.name}': {len(tool.vertices)} vertices, {len(tool.faces)} faces")
         except Exception as error:  # whatever happened in the other process; the node goes on

@@ -9,6 +9,7 @@ from typing import Literal
 from pydantic import BaseModel, ConfigDict, Field, field_validator
 from pydantic.config import JsonDict
 
+from stmpl_core.friction import friction_from
 from stmpl_core.layer import MAX_THICKNESS
 from stmpl_core.methods import Method, method
 from stmpl_core.tissue import SOFTEST
@@ -58,6 +59,15 @@ class NodeConfig(BaseModel):
     density: float = Field(
         default=1e3, gt=0, le=1e5, description="density of the paper's layer [kg/m3]", json_schema_extra=CONFIGURING
     )
+    friction: str = Field(
+        default="", json_schema_extra=CONFIGURING,
+        description="friction of tools on skin: a coefficient, or dry, moist, oiled, glove, typical; or by tool: "
+        "'ball: oiled, letter: 0.3'; empty: none",
+    )  # fmt: skip
+    relaxing: bool = Field(
+        default=False, json_schema_extra=CONFIGURING,
+        description="stress that fades, as in skin that was stretched and held (assumed of all materials)",
+    )  # fmt: skip
     method: Literal["moment_net", "unet", "linear", "winkler", "naive", "limb_linear", "ladder"] = Field(
         default="moment_net", description="method that solves for the displacement", json_schema_extra=CONFIGURING
     )
@@ -130,6 +140,12 @@ class NodeConfig(BaseModel):
     @classmethod
     def _phenotype(cls, text: str) -> str:
         _shares(text)
+        return text
+
+    @field_validator("friction")
+    @classmethod
+    def _friction(cls, text: str) -> str:
+        friction_from(text)
         return text
 
     @field_validator("gz_contacts")

@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 from rich.table import Table
 
+from stmpl_core.errors import BagError
+
 if TYPE_CHECKING:
     from bags.compare import Comparison, Presser
     from bags.reader import Bag
@@ -16,6 +18,7 @@ if TYPE_CHECKING:
 
 BALL_RADIUS, BALL_DEPTH = 0.010, 0.001  # ball and depth at which the stiffness of a part is told [m]
 NEEDS_RADII, NEEDS_FORCES = (5e-3, 40e-3), (1.0, 20.0)  # scene for which the smallest model of a part is told [m], [N]
+LOOKED_AT = 20  # number of answers of a recording that are looked at for their memory
 SHOWN = {"Pa": (1e-3, "kPa"), "m": (1e3, "mm"), "N/m": (1.0, "N/m"), "-": (1.0, "")}  # factor and unit for people
 
 
@@ -58,6 +61,7 @@ def figures_of(comparison: Comparison) -> dict[str, Any]:
         "latency_median": timing.latency(50),
         "latency_p99": timing.latency(99),
         "frames": len(comparison.judged),
+        "unlike": comparison.unlike,
         "failed": comparison.failed,
     }
     if comparison.judged:
@@ -99,8 +103,33 @@ def bag_figures(bag: Bag) -> dict[str, Any]:
         "method": bag.provenance.method,
         "versions": dict(bag.provenance.versions),
         "namespaces": bag.namespaces,
+        "memory": bag_memory(bag),
         "topics": {topic.name: topic._asdict() for topic in bag.topics.values()},
     }
+
+
+def bag_memory(bag: Bag) -> dict[str, Any]:
+    """What some answers of a recording, evenly over it, remember: friction of each tool, and the state's share [-]."""
+    try:
+        answers = bag.answers
+        told = list(bag.frames(sorted({k * answers // LOOKED_AT for k in range(LOOKED_AT if answers else 0)})))
+    except BagError:  # none, or those of several robots, or their schema is lost
+        told = []
+    remembering = [frame for frame in told if frame.state]
+    size = sum(len(frame.state) + frame.displacement.nbytes
+               + (0 if frame.pressure is None else frame.pressure.nbytes) for frame in told)  # fmt: skip
+    friction = {name: mu for frame in remembering for name, mu in frame.friction.items()}
+    share = sum(len(frame.state) for frame in told) / size if size else 0.0
+    return {"looked_at": len(told), "remembering": len(remembering), "friction": friction, "share": share}
+
+
+def memory_sentence(memory: dict[str, Any]) -> str:
+    """The same for people; empty where nothing is remembered."""
+    if not memory["remembering"]:
+        return ""
+    friction = ", ".join(f"{name} {mu:g}" for name, mu in memory["friction"].items() if mu)
+    return (f"memory: {memory['remembering']} of {memory['looked_at']} answers that were looked at carry a state, "
+            f"{memory['share']:.2%} of their size; friction: {friction or 'none'}")  # fmt: skip
 
 
 def bag_table(bag: Bag) -> Table:

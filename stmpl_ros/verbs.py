@@ -209,13 +209,15 @@ def info(path: Annotated[Path | None, tyro.conf.Positional] = None, part: str | 
     if part is not None:
         raise InvalidInput("Give the path of a recording or --part with a region of the body, not both.")
     from bags.reader import Bag
-    from stmpl_ros.tables import bag_figures, bag_table
+    from stmpl_ros.tables import bag_figures, bag_memory, bag_table, memory_sentence
 
     bag = Bag(path)
     skins = {name: repr(layer) for name, layer in bag.known_layers().items()}
     print_figures(bag_figures(bag) | {"skins": skins} if as_json else bag_table(bag))
     for name, layer in skins.items() if not as_json else ():
         print_figures(f"skin {name}: {layer}")
+    if not as_json and (memory := memory_sentence(bag_memory(bag))):
+        print_figures(memory)
     sound = sum(topic.messages for topic in bag.topics.values())
     if not as_json and bag.expected not in (None, sound):
         print_figures(f"{sound} of {bag.expected} messages are sound")

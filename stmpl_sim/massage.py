@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -213,7 +213,8 @@ class Massage:
     """
 
     def __init__(self, scene: Scene, course: Course, *, gains: Gains | None = None, skin: Any = None,
-                 damping: float = 0.0, implicit: bool = False, friction: Friction = None) -> None:  # fmt: skip
+                 damping: float = 0.0, implicit: bool = False,
+                 friction: Friction | Mapping[str, Friction] = None) -> None:  # fmt: skip
         self.scene, self.course = scene, course
         self.skin = SoftBody(scene.model, skin or scene.layer, body=LIMB, tools=[BALL], damping=damping,
                              implicit=implicit, friction=friction)  # fmt: skip

@@ -69,6 +69,7 @@ def sim(
     needed("stmpl sim", "sim", "mujoco")
     if not 50 <= rate <= 20_000:
         raise InvalidInput(f"--rate is {rate:g} Hz; allowed is 50 to 20000.")
+    from stmpl_core.friction import friction_from
     from stmpl_sim.massage import Course, Massage
     from stmpl_sim.scene import build
     from stmpl_sim.site import Site
@@ -77,7 +78,7 @@ def sim(
     site = Site.thickest(layer)
     scene = build(layer, site, robot=robot, end=end, at=at, mount=mount, radius=1e-3 * radius, timestep=1 / rate)
     course = Course(site.circle(1e-3 * circle), tuple(force), 1e-3 * speed, laps)
-    massage = Massage(scene, course, damping=damping, friction=_friction(friction))
+    massage = Massage(scene, course, damping=damping, friction=friction_from(friction))
     out.mkdir(parents=True, exist_ok=True)
     camera = None
     if film != "none":
@@ -97,28 +98,17 @@ def sim(
     return 0
 
 
-def _friction(said: str) -> str | float | None:
-    """What was said of friction: a number, the name of a pair, or nothing."""
-    if said == "none":
-        return None
-    try:
-        return float(said)
-    except ValueError:
-        return said
-
-
 def limb(part: str, tissue: str, relaxing: bool = False) -> SoftLayer:
     """A part of the average body. Raises InvalidInput: no such part."""
     from stmpl_core.body import Body
-    from stmpl_core.living import living
-    from stmpl_core.regions import HELD_SKIN
+    from stmpl_core.living import held_skin, living
     from stmpl_core.tissue import Tissue
 
     if tissue == "single":
         layer = Body.anny().part(part, tissue=Tissue(youngs_modulus=SINGLE_MODULUS))
     else:
         layer = living(Body.anny(), part, "tensed" if tissue == "tensed" else "relaxed")
-    return layer.with_(tissue=layer.tissue.relaxing(HELD_SKIN)) if relaxing else layer
+    return held_skin(layer) if relaxing else layer
 
 
 def _run(massage: Massage, camera: Any, *, quiet: bool) -> Log:

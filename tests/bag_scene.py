@@ -17,6 +17,7 @@ from stmpl_core import Answer, SoftLayer, Tissue, Touch
 from stmpl_core.layer import layer_id
 from stmpl_core.methods.base import Method
 from stmpl_core.simulator import Simulator
+from stmpl_core.state import State
 from stmpl_ros.cli import main
 
 TYPES = {
@@ -95,7 +96,8 @@ def topology(layer: SoftLayer) -> Any:
                    core=np.zeros(0, np.float32), stack="")  # fmt: skip
 
 
-def displacement(answer: Answer, layer: SoftLayer, stamp: int, sequence: int) -> Any:
+def displacement(answer: Answer, layer: SoftLayer, stamp: int, sequence: int, state: State | None = None,
+                 dt: float = 0.0) -> Any:  # fmt: skip
     """An answer as SkinDisplacement."""
     trust = answer.trust
     pressure = np.zeros(0) if answer.pressure is None else answer.pressure
@@ -104,7 +106,8 @@ def displacement(answer: Answer, layer: SoftLayer, stamp: int, sequence: int) ->
                    method=answer.method, converged=trust.converged, in_range=trust.in_range,
                    error_bound=float("nan") if trust.error_bound is None else trust.error_bound, why=trust.why,
                    touches=[touched(touch, stamp) for touch in answer.touches.values()],
-                   fade=1.0, solve_seconds=0.001)  # fmt: skip
+                   fade=1.0, solve_seconds=0.001, dt=dt,
+                   state=np.frombuffer(b"" if state is None else state.pack(), np.uint8))  # fmt: skip
 
 
 def touched(touch: Touch, stamp: int) -> Any:
@@ -113,12 +116,21 @@ def touched(touch: Touch, stamp: int) -> Any:
     point = message("geometry_msgs/msg/Point", x=x, y=y, z=z)
     turned = message("geometry_msgs/msg/Quaternion", **dict(zip("xyzw", turn, strict=True)))
     placed = message("geometry_msgs/msg/Pose", position=point, orientation=turned)
-    force, torque = (message("geometry_msgs/msg/Vector3", **dict(zip("xyz", values, strict=True)))
-                     for values in (touch.wrench[:3], touch.wrench[3:]))  # fmt: skip
+    slip = touch.slip
     return message("stmpl_msgs/msg/Touch", tool=touch.name, status=touch.status, pose=placed,
-                   wrench=message("geometry_msgs/msg/Wrench", force=force, torque=torque), depth=touch.depth,
+                   wrench=six(touch.wrench), depth=touch.depth,
                    force_bound=touch.force_bound, in_range=touch.trust.in_range,
-                   pose_stamp=header("", stamp).stamp, wrench_stamp=header("", stamp).stamp)  # fmt: skip
+                   pose_stamp=header("", stamp).stamp, wrench_stamp=header("", stamp).stamp,
+                   friction=0.0, slip=slip.kind if slip else "", slip_share=slip.share if slip else 0.0,
+                   friction_wrench=six(slip.wrench if slip else np.zeros(6)), missing=six(touch.missing),
+                   passive=touch.passive)  # fmt: skip
+
+
+def six(values: np.ndarray) -> Any:
+    """A wrench, (6,) [N, N m], as geometry_msgs/Wrench."""
+    force, torque = (message("geometry_msgs/msg/Vector3", **dict(zip("xyz", part, strict=True)))
+                     for part in (values[:3], values[3:]))  # fmt: skip
+    return message("geometry_msgs/msg/Wrench", force=force, torque=torque)
 
 
 def write_run(folder: Path, method: Method, *, layer: SoftLayer | None = None, frames: int = 40, rate: float = 100.0,

@@ -113,15 +113,15 @@ def test_the_node_runs_beside_another_in_any_executor(composed):
 
 def test_whatever_fails_inside_an_answer_is_told_and_the_next_instant_is_answered(composed, monkeypatch, capfd):
     simulator, failed = composed.node.answering.simulator, []
-    step = simulator.step
+    touch = simulator.touch
 
     def fails_once(contacts):
         if not failed:
             failed.append(contacts[0])
             raise RuntimeError("an accident")
-        return step(contacts)
+        return touch(contacts)
 
-    monkeypatch.setattr(simulator, "step", fails_once)
+    monkeypatch.setattr(simulator, "touch", fails_once)
     composed.wait(lambda: composed.press() and failed)
     refused = round(1e9 * failed[0].time)
     assert composed.node.tally.refused == 1

@@ -32,7 +32,7 @@ from bags.wire import (
     wrench_from,
     wrench_message,
 )
-from stmpl_core import Answer, Membrane, Ply, Tissue, Tools, Touch
+from stmpl_core import Answer, Membrane, Ply, Prony, State, Tissue, Tools, Touch
 from stmpl_core.body import Body
 from stmpl_core.bones import Bone, to_bone
 from stmpl_core.errors import FrameError, InvalidInput, MeshError
@@ -40,7 +40,8 @@ from stmpl_core.layer import layer_id
 from stmpl_core.living import living
 from stmpl_core.local_contact import LocalContact
 from stmpl_core.skin import published
-from stmpl_core.touch import BY_POSE, STALE, TOUCHING
+from stmpl_core.state import fresh
+from stmpl_core.touch import BY_POSE, STALE, TOUCHING, Slip
 from stmpl_core.trust import Trust
 from stmpl_ros.diagnosis import Tally
 from stmpl_ros.gate import SAY_EVERY, Gate
@@ -94,6 +95,13 @@ def test_a_stack_and_its_core_go_through_a_message():
     message.stack = '{"skin": 3}'
     with pytest.raises(InvalidInput, match="stack of a SkinTopology"):
         layer_from(message)
+
+
+def test_relaxation_of_one_material_goes_through_a_message():
+    layer = published(limb(6e-3)).with_(tissue=Tissue(2e4, 0.4, relaxation=Prony((0.1, 0.37), (1 / 3, 8.79), "here")))
+    back = layer_from(topology_message(layer, "body", 5))
+    assert back.tissue == layer.tissue and layer_id(back) == layer_id(layer)
+    assert layer_id(layer.with_(tissue=Tissue(2e4, 0.4))) != layer_id(layer)
 
 
 def test_a_message_from_before_stacks_is_one_material():
@@ -293,11 +301,14 @@ def test_an_answer_keeps_what_each_tool_does_through_a_message():
     turned[:3, :3] = Rotation.from_euler("xyz", (0.3, -0.7, 1.1)).as_matrix()
     touches = {"finger": Touch("finger", TOUCHING, turned, rng.normal(size=6), depth=1.2345678901e-3,
                                force_bound=0.0123456789, trust=Trust(in_range=False)),
-               "thumb": Touch("thumb", BY_POSE, np.eye(4), rng.normal(size=6))}  # fmt: skip
+               "thumb": Touch("thumb", BY_POSE, np.eye(4), rng.normal(size=6), missing=rng.normal(size=6), passive=0.7,
+                              slip=Slip(rng.normal(size=6), 0.3, np.ones(3), 0.1, np.ones(3)))}  # fmt: skip
     displacement, trust = rng.normal(0, 1e-3, (5, 3)), Trust(True, False, 2e-4, "a word")
+    state = State({"thumb": fresh(turned, 2)})
     answer = Answer(displacement, trust, "any", rng.uniform(0, 9, 5), touches)
     message = displacement_message(answer, layer_id="id", body_frame="body", stamp_ns=5 * MS, sequence=8,
-                                   solve_seconds=0.25, inputs=stamps, fade=0.5, why="another")  # fmt: skip
+                                   solve_seconds=0.25, inputs=stamps, fade=0.5, why="another",
+                                   state=state, dt=1 / 3, friction={"thumb": 0.1})  # fmt: skip
     sent = deserialize_message(serialize_message(message), SkinDisplacement)
     back = frame_from(sent, 6 * MS)
     assert (back.stamp_ns, back.log_time_ns, back.sequence, back.layer_id) == (5 * MS, 6 * MS, 8, "id")
@@ -306,11 +317,17 @@ def test_an_answer_keeps_what_each_tool_does_through_a_message():
     assert back.displacement.tobytes() == answer.displacement.astype(np.float32).tobytes()
     assert back.pressure.tobytes() == answer.pressure.astype(np.float32).tobytes()
     assert list(back.touches) == ["finger", "thumb"]
+    assert (back.state, back.dt, back.friction) == (state.pack(), 1 / 3, {"finger": 0.0, "thumb": 0.1})
     for name, touch in touches.items():
         found = back.touches[name]
         assert (found.name, found.status, found.trust.in_range) == (name, touch.status, touch.trust.in_range)
         np.testing.assert_array_equal([found.depth, found.force_bound], [touch.depth, touch.force_bound])
         assert found.wrench.tobytes() == touch.wrench.tobytes()
+        assert found.missing.tobytes() == touch.missing.tobytes() and found.passive == touch.passive
+        assert (found.slip is None) == (touch.slip is None) and found.force == touch.force
+        if found.slip and touch.slip:
+            assert found.slip.wrench.tobytes() == touch.slip.wrench.tobytes()
+            assert (found.slip.share, found.slip.kind) == (touch.slip.share, "creep")
         np.testing.assert_allclose(found.pose_body_from_tool, touch.pose_body_from_tool, atol=1e-12)
 
 

@@ -12,6 +12,8 @@ from stmpl_ros.view.latest import LatestWins
 from stmpl_ros.view.page import Page
 from stmpl_ros.view.snapshot import Snapshot
 
+NO_MEMORY = "FEM presses elastic skin without friction: where this answer remembers, their difference is no error."
+
 
 class Judge:
     """The button `FEM of this instant`, and what it does.
@@ -47,7 +49,7 @@ class Judge:
     def _judge(self, snapshot: Snapshot) -> None:
         judged = snapshot.judged_by(self._solve(snapshot))
         self._keep(snapshot, judged)
-        self._page.say("")
+        self._page.say(NO_MEMORY if getattr(snapshot.answer, "state", b"") else "")
         if self._page.snapshot is snapshot:
             self._page.show(judged)
             self._page.field = "error against FEM"

@@ -11,7 +11,7 @@ from stmpl_core.contact import Contact
 from stmpl_core.layer import SoftLayer
 from stmpl_core.methods import Naive
 from stmpl_core.simulator import Simulator
-from stmpl_core.touch import Answer
+from stmpl_core.touch import Answer, Touch
 from stmpl_core.trust import Displacement
 
 MM, MS = 1e3, 1e3  # millimetres in a metre, milliseconds in a second
@@ -20,11 +20,16 @@ NAN = float("nan")
 
 @dataclass(frozen=True)
 class Reading:
-    """Status, depth of the deepest point [m] (below 0: off the skin; NaN: far) and force [N] of one tool."""
+    """Status, depth of the deepest point [m] (below 0: off the skin; NaN: far) and force [N] of one tool.
+
+    And its friction, where it is told: the kind of slip, and the tangential force [N].
+    """
 
     status: str
     depth: float = NAN
     force: float = 0.0
+    slip: str = ""
+    along: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,6 +86,7 @@ class Snapshot:
                 ("peak displacement", f"{self.peak * MM:.2f} mm")]  # fmt: skip
         if len(self.readings) > 1:
             rows += [(name, f"{r.force:.3f} N, {max(r.depth, 0.0) * MM:.2f} mm") for name, r in self.readings.items()]
+        rows += [(f"friction of {name}", f"{r.along:.3f} N, {r.slip}") for name, r in self.readings.items() if r.slip]
         rows += [("tool", ", ".join(f"{name}: {r.status}" for name, r in self.readings.items()) or "none")]
         rows += [("solved in", f"{self.solve_seconds * MS:.1f} ms")] if np.isfinite(self.solve_seconds) else []
         rows += [("contact to answer", f"{self.latency * MS:.1f} ms")] if np.isfinite(self.latency) else []
@@ -114,4 +120,11 @@ class Gauge:
 
 def readings_of(answer: Answer) -> dict[str, Reading]:
     """The reading of each tool that an answer names."""
-    return {name: Reading(touch.status, touch.depth, touch.force) for name, touch in answer.touches.items()}
+    return {name: _reading(touch) for name, touch in answer.touches.items()}
+
+
+def _reading(touch: Touch) -> Reading:
+    if touch.slip is None:
+        return Reading(touch.status, touch.depth, touch.force)
+    along = float(np.linalg.norm(touch.slip.wrench[:3]))
+    return Reading(touch.status, touch.depth, touch.force, touch.slip.kind, along)
