@@ -22,12 +22,11 @@ from stmpl_core.footing import carried_tangent, in_plane, in_space, patch_of, tw
 from stmpl_core.friction import Friction, coefficients
 from stmpl_core.relaxation import series_of, weights
 from stmpl_core.sideways import Sideways
-from stmpl_core.slip import drag
+from stmpl_core.slip import drag, ploughing
 from stmpl_core.state import Memory, Scalars, State, fresh
 from stmpl_core.touch import APART, MIN_ONE_WAY_SHARE, Pressed, Slip, Touch
 from stmpl_core.toucher import Toucher
 
-PLOUGHED = 0.33, 0.2, 0.67  # see _dragged: growth of stiffness, and of the cap without and over mu
 ROUGH = 0.12  # error of the relaxed force, over what has relaxed: 5.4 of 45 % in trials where only the shear relaxes
 HELD_OFF = 0.01  # relative error of the elastic force by wrench, from which it is asked for again
 GIVEN_BACK = 0.7  # share of what an elastic contact gives back that must be covered by what was put in
@@ -228,18 +227,11 @@ class History:
 
     def _dragged(self, one: _Asked, touch: Touch, memory: Memory, force: float, lever: float, thickness: float,
                  dt: float) -> tuple[Touch, Memory, float]:  # fmt: skip
-        """The touch with friction, its memory, and the energy that the bent skin stores [J].
-
-        Skin that is dragged rises before the tool and leans on it (ploughing): with r = (depth / a) N / (k_t a) the
-        patch is stiffer by 1 + 0.33 r, the cap higher by 1 + (0.2 + 0.67 mu) r, fitted on slides of a ball by finite
-        elements at mu 0.3 and 0.6.
-        """
+        """The touch with friction, its memory, and the energy that the bent skin stores [J]."""
         before, now, radius = one.before, memory.scalars, memory.scalars.radius
         patch, origin = self.sideways.at(radius, thickness), touch.pose_body_from_tool[:3, 3]
-        rises = now.depth / radius * force / (patch.along * radius)
-        mu = self.friction(touch.name)
-        cap = (1 + (PLOUGHED[1] + PLOUGHED[2] * mu) * rises) * mu * force
-        stiffness = (1 + PLOUGHED[0] * rises) * np.array([patch.along, patch.along, patch.turn / (lever * lever)])
+        stiffer, cap = ploughing(now.depth, radius, force, patch.along, self.friction(touch.name))
+        stiffness = stiffer * np.array([patch.along, patch.along, patch.turn / (lever * lever)])
         stated, wanted = one.stated.wrench, NOTHING
         if stated is not None:
             wanted = in_plane(stated - touch.wrench, memory.contact, origin, lever)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -12,6 +13,7 @@ from stmpl_core.body import Body
 from stmpl_core.bones import bones_of, to_bone
 from stmpl_core.errors import InvalidInput
 from stmpl_core.fat import fat_map, for_person
+from stmpl_core.friction import Friction
 from stmpl_core.layer import MAX_THICKNESS, SoftLayer
 from stmpl_core.limbs import EDGE_LENGTH
 from stmpl_core.packed import stack_from_text, stack_to_text
@@ -73,20 +75,47 @@ def held_skin(layer: SoftLayer) -> SoftLayer:
     return layer.with_(tissue=layer.tissue.relaxing(HELD_SKIN))
 
 
-def write_tissue(path: str | Path, tissue: Tissue, thickness: float) -> None:
-    """Writes a tissue and its thickness [m] as JSON, for the node's setting `tissue`."""
-    Path(path).write_text(json.dumps({"thickness": thickness, "tissue": json.loads(stack_to_text(tissue))}, indent=1))
+class Model(NamedTuple):
+    """What `stmpl needs --out` says that a scene wants, for a node to be started with.
+
+    Args:
+        tissue: tissue under the skin.
+        thickness: its thickness [m].
+        friction: name of a pair in stmpl_core.friction or a coefficient, as text; None: slip does not matter, or a file
+            older than this.
+        relaxing: whether the tissue has to relax; False also in files older than this.
+    """
+
+    tissue: Tissue
+    thickness: float
+    friction: str | None = None
+    relaxing: bool = False
+
+
+def write_tissue(path: str | Path, tissue: Tissue, thickness: float, friction: Friction = None,
+                 relaxing: bool = False) -> None:  # fmt: skip
+    """Writes a tissue, its thickness [m] and what a scene wants beside it as JSON, for the node's setting `tissue`."""
+    told = {"thickness": thickness, "relaxing": relaxing, "tissue": json.loads(stack_to_text(tissue))}
+    more = {} if friction is None else {"friction": friction if isinstance(friction, str) else f"{friction:g}"}
+    Path(path).write_text(json.dumps(told | more, indent=1))
 
 
 def read_tissue(path: str | Path) -> tuple[Tissue, float]:
-    """The tissue and its thickness [m] that `write_tissue` wrote.
+    """The tissue and its thickness [m] that `write_tissue` wrote. Raises what `read_model` raises."""
+    return read_model(path)[:2]
+
+
+def read_model(path: str | Path) -> Model:
+    """All that `write_tissue` wrote.
 
     Raises:
         InvalidInput: no such file, or one that holds no tissue.
     """
     try:
         given = json.loads(Path(path).read_text())
-        return stack_from_text(json.dumps(given["tissue"])), float(given["thickness"])
+        friction = given.get("friction")
+        return Model(stack_from_text(json.dumps(given["tissue"])), float(given["thickness"]),
+                     None if friction is None else str(friction), bool(given.get("relaxing", False)))  # fmt: skip
     except OSError as error:
         raise InvalidInput(f"there is no tissue in {path}: {error.strerror}. stmpl needs --out writes one.") from error
     except (ValueError, KeyError, TypeError, AttributeError) as error:

@@ -19,7 +19,12 @@ import numpy as np
 from scipy.optimize import brentq
 
 from stmpl_core.errors import InvalidInput
+from stmpl_core.friction import Friction, coefficient
+from stmpl_core.regions import HELD_SKIN
+from stmpl_core.relaxation import Series, series_of
+from stmpl_core.sideways import patch
 from stmpl_core.stack import Ball, Fit, Misfit, ball, nearest, plies, response
+from stmpl_core.stroke import Missed, Stroke, played, pulled, without_time
 from stmpl_core.tissue import FRICTION, Tissue
 
 if TYPE_CHECKING:
@@ -29,9 +34,8 @@ TermName = Literal["skin", "tension", "muscle", "time", "slip", "mesh"]
 
 ENOUGH = Misfit(force=0.10, motion=0.10)  # with which a simpler model will do
 DEEPEST_OVER_THICKNESS, DEEPEST_OVER_RADIUS = 0.3, 0.5  # depth up to which the linear response is asked [-]
-RELAXING = ((0.225, 0.5), (0.225, 5.0))  # share of the modulus that relaxes, and its time [s]: assumed, of one trial
-RELAXES = (0.1, 10.0)  # times in which tissue relaxes [s]
 LARGEST_RADIUS, LARGEST_FORCE, FASTEST = 0.5, 5e3, 10.0  # of what a robot presses with [m], [N], [m/s]
+LONGEST_STAY, LONGEST_WAY = 1e6, 10.0  # of a tool at one place [s], and along the skin [m]
 RUNGS = ("one layer", "a skin membrane on one layer", "a skin membrane on layers of fat and muscle")
 
 
@@ -61,9 +65,11 @@ class Term:
     Args:
         name: skin, tension, muscle (all deeper materials), time, slip or mesh.
         force: difference of the force at the same depth without it, over the force with it [-]; below 0: too soft.
-            Of slip: of the tangential force. None: not judged.
+            Of time: largest over a stroke, over its largest force, above 0: too stiff. Of slip: the force of friction
+            over the normal force. None: not judged.
         motion: difference of the motion [-]: root of the mean square over the surface, over that of the sinking. Of
-            time and slip: over the depth. None: not judged.
+            time: depth of skin that a lifted tool leaves behind, of slip: way of skin that is dragged along, over the
+            depth of the tool. None: not judged.
         needed: whether the smallest model has it.
         why: sentence with the numbers that decide.
     """
@@ -85,6 +91,8 @@ class Needs:
         indentations: every ball under every force.
         layer: the one layer of rungs 0 and 1, fitted to the contacts of this scene; None on rung 2.
         enough: misfit that is allowed.
+        friction: coefficient of friction, or name of its pair, if slip is needed; None: not.
+        moduli: share of the moduli that elastic tissue is given: of a scene so slow that it is relaxed; else 1 [-].
     """
 
     rung: int
@@ -92,10 +100,17 @@ class Needs:
     indentations: tuple[Indentation, ...]
     layer: Fit | None
     enough: Misfit
+    friction: Friction = None
+    moduli: float = 1.0
 
     def __getitem__(self, name: TermName) -> Term:
         """The term of this name."""
         return next(term for term in self.terms if term.name == name)
+
+    @property
+    def relaxing(self) -> bool:
+        """Whether the smallest model relaxes."""
+        return self["time"].needed
 
     @property
     def beyond(self) -> bool:
@@ -115,6 +130,7 @@ class Needs:
             what += f" of {self.layer.youngs_modulus * 1e-3:.2g} kPa and {self.layer.thickness * 1e3:.2g} mm"
             is_ = f"it is {_said(self.layer.misfit)}"
         with_ = f", with {' and '.join(also)}" if also else ""
+        with_ += f", of {self.moduli:.2g} of its moduli" if self.moduli < 1 else ""
         return f"The smallest model within {most} is rung {self.rung}, {what}{with_}: {is_}."
 
 
@@ -125,8 +141,10 @@ def needs(
     speeds: Iterable[float] = (),
     *,
     thickness: float | None = None,
+    duration: float = 0.0,
+    path: float = 0.0,
     drag: float | None = None,
-    friction: float = FRICTION,
+    friction: Friction = FRICTION,
     edge: float | None = None,
     enough: Misfit = ENOUGH,
 ) -> Needs:
@@ -137,13 +155,11 @@ def needs(
     stack cannot say all: muscle whose tone changes and fat that is known place by place ask for rung 2 as well, and a
     limb is round: at a radius of 2.5 thicknesses flat figures are 10 to 20 % off.
 
-    Time: convolution of the elastic force F_e over a press and a retreat at one speed, F = int G(t - s) dF_e(s), with
-    F_e ~ depth^1.5 and G = 1 - sum g (1 - exp(-t / tau)) of RELAXING. Off are the force at the end of the press and the
-    depth that is left where the force is 0.
-
-    Slip: a ball with k_t = 8 G a / (2 - nu), a = sqrt(radius depth), G of the layer under the skin, moves sideways by
-    3/2 mu F / k_t (1 - (1 - q)^(2/3)), q = drag / mu (Cattaneo and Mindlin; Johnson, "Contact Mechanics", 1985, chapter
-    7), and by q mu F / k_t if it sticks. The skin would hold it as well and is left out: motions are upper bounds.
+    Time and slip are what a state brings, played for one stroke of each ball at each speed (`stmpl_core.stroke`):
+    pressed in, held, led along the skin, lifted. Its tissue relaxes by its own series, or where it has none by
+    HELD_SKIN, which one person's skin had. Left out, time costs the difference of the force, and the skin that comes
+    back late; it is needed where no share of the moduli makes up for that. Slip costs friction, and skin that is
+    dragged along: by the way along the skin, or by a wrench that pulls along.
 
     Mesh: root mean square of what linear triangles with sides of one length miss of a wave, 0.0685 (k edge)^2.
 
@@ -151,15 +167,19 @@ def needs(
         of: tissue, or layer whose tissue, median thickness and edge length are meant.
         radii: radii of the balls [m], > 0; two for a range.
         forces: forces on them [N], > 0; two for a range.
-        speeds: speeds of pressing [m/s], > 0; none: time is not judged.
+        speeds: speeds of pressing, of leading along and of lifting [m/s], > 0; none: time is not judged.
         thickness: thickness from the surface to the bone [m], > 0; of a layer its own unless given.
-        drag: tangential force over normal force [-], >= 0; None: slip is not judged.
-        friction: coefficient of friction mu [-], > 0.
+        duration: time that a tool stays pressed in at one place [s], >= 0.
+        path: way along the skin that it is led after that [m], >= 0.
+        drag: tangential force over normal force of a wrench that pulls along [-], >= 0. None, and no path: slip is not
+            judged.
+        friction: coefficient of friction mu [-], > 0, or the name of a pair in stmpl_core.friction.
         edge: length of the mesh's edges [m], > 0; None: of a tissue, the mesh is not judged.
         enough: misfit that is allowed.
 
     Raises:
-        InvalidInput: a number that is not above 0 or not that of a robot's tool, or a tissue without a thickness.
+        InvalidInput: a number that is not above 0 or not that of a robot's tool, a tissue without a thickness, or a
+            friction that has no name.
     """
     if not isinstance(of, Tissue):
         thickness = float(np.median(of.thickness)) if thickness is None else thickness
@@ -168,11 +188,15 @@ def needs(
     if thickness is None:
         raise InvalidInput("a tissue wants a thickness: give thickness=, in m.")
     speeds = _checked("speeds", speeds, "m/s", FASTEST)
-    for name, one in (("friction", friction), ("edge", edge), *enough._asdict().items()):
+    mu = coefficient(friction)
+    for name, one in (("friction", mu), ("edge", edge), *enough._asdict().items()):
         if one is not None and not (np.isfinite(one) and one > 0):
             raise InvalidInput(f"{name} is {one:g}; it must be finite and above 0.")
     if drag is not None and not (np.isfinite(drag) and drag >= 0):
         raise InvalidInput(f"the drag is {drag:g} of the normal force; it must be finite and not below 0.")
+    for name, one, unit, most in (("duration", duration, "s", LONGEST_STAY), ("path", path, "m", LONGEST_WAY)):
+        if not 0 <= one <= most:
+            raise InvalidInput(f"the {name} is {one:g} {unit}; from 0 to {most:g} is accepted.")
     radii, forces = _checked("radii", radii, "m", LARGEST_RADIUS), _checked("forces", forces, "N", LARGEST_FORCE)
     if not (radii and forces):
         raise InvalidInput("give at least one radius and one force.")
@@ -182,16 +206,21 @@ def needs(
     bare, loose, taut = (nearest(stack, skin, one, sorted(contacts)) for one in (None, slack, skin))
     rung = [_within(bare.misfit, enough), _within(taut.misfit, enough), True].index(True)
     pull = _tension(tissue, thickness, pressed, loose, rung, enough)
+    series = series_of(tissue if tissue.relaxes else tissue.relaxing(HELD_SKIN), thickness)
+    strokes = [stroke_of(tissue, thickness, one.judged, speed, duration, path) for one in pressed
+               for speed in speeds or (np.inf,)]  # fmt: skip
+    time, moduli = _time(strokes, series, mu if path else 0.0, bool(speeds), enough)
+    slip = _slip(strokes, series, mu, path, drag, enough)
     terms = (
         _skin(tissue, thickness, pressed, bare, rung, enough),
         pull,
         _muscle(tissue, thickness, pressed, taut, rung),
-        _time(pressed, speeds, enough),
-        _slip(pressed, thickness, taut.youngs_modulus, tissue.poisson_ratio, drag, friction, enough),
+        time,
+        slip,
         _mesh(tissue, thickness, pressed, edge, enough),
     )
     layer = (bare, taut if pull.needed else loose, None)[rung]
-    return Needs(rung, terms, pressed, layer, enough)
+    return Needs(rung, terms, pressed, layer, enough, friction if slip.needed else None, moduli)
 
 
 def _checked(name: str, given: Iterable[float], unit: str, largest: float) -> tuple[float, ...]:
@@ -267,55 +296,48 @@ def _muscle(tissue: Tissue, thickness: float, pressed: tuple[Indentation, ...], 
     return Term("muscle", *off, rung == 2, f"{why}; rigid muscle: {rigid.force:+.0%} in force." if rigid else f"{why}.")
 
 
-def relaxed(duration: float) -> Misfit:
-    """What an elastic answer misses of a press and a retreat that take this long each [s]; see `needs`.
-
-    Raises:
-        InvalidInput: a duration that is not above 0.
-    """
-    if not (np.isfinite(duration) and duration > 0):
-        raise InvalidInput(f"the press takes {duration:g} s; it must be finite and above 0.")
-    t = np.linspace(0, 2, 601)  # [duration]
-    depth = np.minimum(t, 2 - t)
-    since = duration * np.maximum(t[:, None] - 0.5 * (t[1:] + t[:-1]), 0)
-    left = 1 - sum(g * -np.expm1(-since / tau) for g, tau in RELAXING)
-    force = np.tril(left, -1) @ np.diff(depth**1.5)
-    free = int(np.flatnonzero((force <= 0) & (t > 1))[0])
-    share = np.interp(0.0, force[[free, free - 1]], depth[[free, free - 1]])
-    return Misfit(float(1 / force[300] - 1), float(share))
+def stroke_of(tissue: Tissue, thickness: float, at: Ball, speed: float, duration: float, path: float) -> Stroke:
+    """The stroke of a ball that stands so deep [m/s, s, m]; its force grows with the depth as from half of it on."""
+    power = float(np.log2(at.force / ball(tissue, thickness, at.radius, depth=0.5 * at.depth).force))
+    under = patch(tissue, thickness, at.contact_radius)
+    return Stroke(at.force, power, at.depth, at.contact_radius, under, speed, duration, path)
 
 
-def _time(pressed: tuple[Indentation, ...], speeds: tuple[float, ...], enough: Misfit) -> Term:
-    times = sorted(one.judged.depth / speed for one in pressed for speed in speeds)
-    if not times:
-        return Term("time", None, None, False, "No speed was given.")
-    off = _worst(relaxed(one) for one in times)
-    slow = times[0] > RELAXES[1]
-    needed = off.motion > enough.motion or (off.force > enough.force and not slow)
-    lasts = f"A press lasts {' to '.join(dict.fromkeys(f'{one:.2g}' for one in (times[0], times[-1])))} s"
-    if slow and not needed:
-        share = 1 - sum(g for g, _ in RELAXING)
-        return Term("time", *off, needed, f"{lasts}, more than tissue relaxes in: take {share:.2g} of the moduli.")
-    also = f"tissue relaxes in {RELAXES[0]:g} to {RELAXES[1]:g} s, and trials were 15 to 41 % off in force"
-    return Term("time", *off, needed, f"{lasts}; {also}.")
+def _time(strokes: list[Stroke], series: Series, friction: float, told: bool, enough: Misfit) -> tuple[Term, float]:
+    """What time is worth, and the share of the moduli that elastic tissue is given."""
+    if not told:
+        return Term("time", None, None, False, "No speed was given."), 1.0
+    off = without_time(strokes, series, friction)
+    needed = off.fitted > enough.force or off.lag > enough.motion
+    moduli = 1.0 if needed or off.force <= enough.force else round(off.share, 3)
+    return Term("time", off.force, off.lag, needed, _in_time(strokes, series, off)), moduli
 
 
-def _slip(pressed: tuple[Indentation, ...], thickness: float, modulus: float, nu: float, drag: float | None,
-          friction: float, enough: Misfit) -> Term:  # fmt: skip
-    judged = [one.judged for one in pressed]
-    tangential = [4 * modulus / (1 + nu) * np.sqrt(one.radius * one.depth) / (2 - nu) for one in judged]  # k_t [N/m]
-    slides = [friction * one.force / k for one, k in zip(judged, tangential, strict=True)]  # [m]
-    most = f"skin goes along by at most {max(slides) * 1e3:.2g} mm"
-    number = f"s* = mu F / (k_t t) is {max(slides) / thickness:.2g}: {most}"
-    if drag is None:
-        return Term("slip", None, None, False, f"No drag was given; {number} before the tool slides.")
-    q = min(drag / friction, 1.0)
-    further = 1.5 * (1 - (1 - q) ** (2 / 3))  # than mu F / k_t
-    force = further / q - 1 if q else 0.0
-    motion = max((further - q) * s / one.depth for s, one in zip(slides, judged, strict=True))
-    ends = "it slides, and an answer that sticks has no bound" if drag >= friction else \
-        f"it is dragged by {q:.0%} of what makes it slide"
-    return Term("slip", force, float(motion), force > enough.force or motion > enough.motion, f"{number}; {ends}.")
+def _in_time(strokes: list[Stroke], series: Series, off: Missed) -> str:
+    if not len(series.times):
+        return "The tissue is elastic."
+    presses = sorted(one.depth / one.speed for one in strokes)
+    lasts = f"A press takes {' to '.join(dict.fromkeys(f'{one:.2g}' for one in (presses[0], presses[-1])))} s"
+    held = f", then it is held for {strokes[0].stays:.3g} s" if strokes[0].stays else ""
+    fades = f"{series.shares.sum():.0%} of the force fades within {series.times.max():.2g} s"
+    return f"{lasts}{held}; {fades}. {off.share:.2g} of the moduli, elastic, are {off.fitted:.0%} off in force."
+
+
+def _slip(strokes: list[Stroke], series: Series, friction: float, path: float, drag: float | None,
+          enough: Misfit) -> Term:  # fmt: skip
+    ways = [1.5 * friction * one.force / one.patch.along for one in strokes]  # without ploughing [m]
+    slides = f"skin goes along by {max(ways) * 1e3:.2g} mm before the whole contact slides"
+    if drag is None and not path:
+        return Term("slip", None, None, False, f"No way along the skin and no drag were given; {slides}.")
+    found = [(float(one.drag.max() / one.force.max()), float(one.offset.max() / each.depth))
+             for each in strokes if path for one in (played(each, series, friction),)]  # fmt: skip
+    if drag is not None:
+        found += [(carried, gone / one.depth) for one in strokes for carried, gone in (pulled(one, friction, drag),)]
+    force, motion = (max(values) for values in zip(*found, strict=True))
+    led = [f"it is led {path / one.radius:.2g} of its contact's radius" for one in strokes[:1] if path]
+    led += [f"a wrench pulls along with {drag:.2g} of its force"] if drag is not None else []
+    return Term("slip", force, motion, force > enough.force or motion > enough.motion,
+                f"mu is {friction:.2g}, {' and '.join(led)}; {slides}.")  # fmt: skip
 
 
 def _mesh(tissue: Tissue, thickness: float, pressed: tuple[Indentation, ...], edge: float | None,

@@ -180,6 +180,12 @@ class Tissue:
         deeper = tuple(replace(ply, relaxation=series) for ply in self.deeper)
         return replace(self, relaxation=series, skin=skin, deeper=deeper)
 
+    def softened(self, share: float) -> Tissue:
+        """The same tissue with a share of all its moduli; the skin's tension stays."""
+        skin = self.skin and replace(self.skin, youngs_modulus=share * self.skin.youngs_modulus)
+        deeper = tuple(replace(ply, youngs_modulus=share * ply.youngs_modulus) for ply in self.deeper)
+        return replace(self, youngs_modulus=share * self.youngs_modulus, skin=skin, deeper=deeper)
+
     @property
     def relaxes(self) -> bool:
         """Whether the stress of any of its materials fades."""

@@ -8,9 +8,11 @@ from typing import TYPE_CHECKING, Literal
 from pydantic import BaseModel, ConfigDict, Field
 
 from stmpl_core.errors import InvalidInput
+from stmpl_core.regions import HELD_SKIN
 from stmpl_core.tissue import FRICTION, Membrane, Ply, Tissue
 
 if TYPE_CHECKING:
+    from stmpl_core.living import Model
     from stmpl_core.needs import Needs
 
 OWN = ("modulus", "skin_modulus", "skin_thickness", "tension", "muscle_modulus", "muscle_depth")
@@ -28,8 +30,12 @@ class SceneConfig(BaseModel):
     force: tuple[float, ...] = Field(default=(5.0,), description="force on the tool [N]; two for a range")
     speed: tuple[float, ...] = Field(default=(), description="speed of pressing [mm/s]; two for a range; none: time is "
                                      "not judged")  # fmt: skip
-    drag: float | None = Field(default=None, description="tangential force over normal force; none: slip is not judged")
-    friction: float = Field(default=FRICTION, description="coefficient of friction")
+    duration: float = Field(default=0.0, description="time that the tool stays pressed in at one place [s]")
+    path: float = Field(default=0.0, description="way along the skin that it is led after that [mm]")
+    drag: float | None = Field(default=None, description="tangential force over normal force; without it and without a "
+                               "path slip is not judged")  # fmt: skip
+    friction: float | str = Field(default=FRICTION, description="coefficient of friction, or the name of a pair: "
+                                  "typical, dry, moist, oiled, glove")  # fmt: skip
     edge: float | None = Field(default=None, description="length of the mesh's edges [mm]; none: it is not judged")
     accuracy: float = Field(default=10.0, description="error that is allowed, in force and in motion [%]")
     thickness: float | None = Field(default=None, description="thickness from skin to bone [mm], of a tissue of your "
@@ -50,12 +56,26 @@ class SceneConfig(BaseModel):
 
         tissue, thickness = self._tissue()
         share = self.accuracy * 1e-2
-        return needs(tissue, _si(self.radius), self.force, _si(self.speed), thickness=thickness, drag=self.drag,
-                     friction=self.friction, edge=None if self.edge is None else self.edge * 1e-3,
-                     enough=Misfit(share, share))  # fmt: skip
+        return needs(tissue, _si(self.radius), self.force, _si(self.speed), thickness=thickness,
+                     duration=self.duration, path=self.path * 1e-3, drag=self.drag, friction=self.friction,
+                     edge=None if self.edge is None else self.edge * 1e-3, enough=Misfit(share, share))  # fmt: skip
 
-    def model(self, found: Needs) -> tuple[Tissue, float]:
-        """The tissue of the smallest model that serves, and its thickness [m]."""
+    def model(self, found: Needs) -> Model:
+        """The smallest model that serves: tissue, thickness, and what a state has to follow."""
+        from stmpl_core.living import Model
+        from stmpl_core.relaxation import series_of
+
+        tissue, thickness = self._serves(found)
+        if found.relaxing:  # as much of its force fades as of the whole tissue's, whose taut skin keeps some
+            whole = series_of(*self._tissue_that_relaxes()).shares.sum()
+            own = series_of(tissue.relaxing(HELD_SKIN), thickness).shares.sum()
+            shares = tuple(float(g * whole / own) for g in HELD_SKIN.shares)
+            tissue = tissue.relaxing(replace(HELD_SKIN, shares=shares))
+        friction = None if found.friction is None else str(found.friction)
+        return Model(tissue.softened(found.moduli) if found.moduli < 1 else tissue, thickness, friction, found.relaxing)
+
+    def _serves(self, found: Needs) -> tuple[Tissue, float]:
+        """The elastic tissue of the smallest model, and its thickness [m]."""
         tissue, thickness = self._tissue()
         if found.layer is None:
             return (tissue if found["skin"].needed else replace(tissue, skin=None)), thickness
@@ -65,6 +85,10 @@ class SceneConfig(BaseModel):
         one = Tissue(found.layer.youngs_modulus, tissue.poisson_ratio, tissue.density, skin=skin,
                      source="the one layer that serves this scene, of stmpl needs")  # fmt: skip
         return one, found.layer.thickness
+
+    def _tissue_that_relaxes(self) -> tuple[Tissue, float]:
+        tissue, thickness = self._tissue()
+        return tissue.relaxing(HELD_SKIN), thickness
 
     def _tissue(self) -> tuple[Tissue, float]:
         if (self.part is None) == (self.thickness is None):

@@ -235,13 +235,15 @@ def needs(config: Annotated[SceneConfig, Flat] = SCENE, out: Path | None = None,
 
     A range of tools, forces and speeds: stmpl needs --part thigh --radius 5 40 --force 1 20 --speed 5 50 --drag 0.3
 
+    A massage: stmpl needs --part back --force 10 --speed 50 --duration 2 --path 100 --friction oiled
+
     A tissue of your own: stmpl needs --thickness 30 --modulus 3 --muscle-depth 8 --muscle-modulus 12 --radius 10
 
     Its answer for a node: stmpl needs --part forearm --out arm.json; stmpl node --part left_forearm --tissue arm.json
 
     Args:
         config: tissue, tools and forces.
-        out: file for the tissue of the smallest model that serves.
+        out: file for the smallest model that serves: its tissue, whether it relaxes, and its friction.
         as_json: figures as JSON, for machines.
     """
     from stmpl_core.living import write_tissue

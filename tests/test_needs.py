@@ -1,13 +1,17 @@
 """Laws of what a scene asks a model of tissue to have."""
 
 import json
+from dataclasses import replace
 
+import numpy as np
 import pytest
 
-from stmpl_core import Membrane, Ply, Tissue
+from stmpl_core import Membrane, Ply, Prony, Tissue
 from stmpl_core.errors import InvalidInput
-from stmpl_core.needs import needs, relaxed
-from stmpl_core.regions import region
+from stmpl_core.living import read_model, read_tissue
+from stmpl_core.needs import needs
+from stmpl_core.regions import HELD_SKIN, region
+from stmpl_core.relaxation import series_of
 from stmpl_core.stack import Misfit
 from stmpl_ros.cli import main
 from tests.scenes import plate
@@ -71,19 +75,39 @@ def test_a_force_beyond_the_linear_response_is_said_and_judged_where_it_ends():
 
 
 def test_a_press_in_the_time_that_tissue_relaxes_needs_time():
-    quick, usual, slow = (relaxed(seconds) for seconds in (1e-3, 2.0, 1e4))
-    assert max(quick) < 0.01 and slow.motion < 0.01 and slow.force == pytest.approx(1 / 0.55 - 1, rel=0.01)
-    assert 0.15 < usual.force < 0.41 and 0.18 < usual.motion < 0.31  # trials of finite elements with time
-    assert asked(LIMB, (20e-3,), (1.0,), 5e-3)["time"].needed
-    assert not asked(LIMB, (20e-3,), (1.0,), 1.0)["time"].needed
-    assert not asked(LIMB, (20e-3,), (1.0,), 1e-6)["time"].needed
-    assert asked(LIMB)["time"].force is None
+    quick, usual, held, slow = (asked(LIMB, (20e-3,), (1.0,), speed, duration=stays) for speed, stays in
+                                ((1.0, 0.0), (5e-3, 0.0), (5e-2, 10.0), (1e-6, 0.0)))  # fmt: skip
+    assert [found.relaxing for found in (quick, usual, held, slow)] == [False, True, True, False]
+    assert quick["time"].force < 0.01 and usual["time"].motion > 0.1 and held["time"].force > 0.15
+    assert quick.moduli == usual.moduli == held.moduli == 1.0 and "relaxation in time" in held.sentence
+    assert asked(LIMB)["time"].force is None and not asked(LIMB).relaxing
 
 
-def test_slip_matters_near_the_friction_and_is_worst_where_it_slides():
-    off = [asked(LIMB, (20e-3,), (1.0,), drag=drag, friction=0.5)["slip"] for drag in (0.0, 0.05, 0.4, 0.5, 2.0)]
+def test_a_scene_as_slow_as_tissue_relaxes_takes_a_share_of_the_moduli():
+    found = asked(Tissue(3e3, 0.45), (20e-3,), (1.0,), 1e-7)
+    assert found.moduli == pytest.approx(HELD_SKIN.relaxed, abs=3e-3) and "of its moduli" in found.sentence
+    assert found["time"].force == pytest.approx(1 / HELD_SKIN.relaxed - 1, rel=0.01) and found["time"].motion < 0.01
+
+
+def test_a_tissue_with_a_series_of_its_own_keeps_it():
+    quick = replace(LIMB, relaxation=Prony((0.9,), (1e-3,)))
+    assert asked(quick, (20e-3,), (1.0,), 0.1)["time"].force > 2 * asked(LIMB, (20e-3,), (1.0,), 0.1)["time"].force
+
+
+def test_slip_matters_with_friction_and_a_way():
+    off = [asked(LIMB, (20e-3,), (1.0,), friction=mu, path=path)["slip"]
+           for mu, path in ((0.05, 0.1), (0.5, 1e-4), (0.5, 1e-3), (0.5, 0.1), ("moist", 0.1))]  # fmt: skip
     assert [one.needed for one in off] == [False, False, True, True, True]
-    assert off[0].force == off[0].motion == 0 and off[3].force == pytest.approx(0.5) == off[4].force
+    assert 0 < off[1].force < off[2].force < off[3].force < off[4].force and off[3].force > 0.5
+    assert asked(LIMB)["slip"].force is None
+    assert asked(LIMB, (20e-3,), (1.0,), friction="moist", path=0.1).friction == "moist"
+    assert asked(LIMB, (20e-3,), (1.0,), friction=0.05, path=0.1).friction is None
+
+
+def test_a_wrench_that_pulls_along_is_missed_up_to_what_sticks():
+    off = [asked(LIMB, (20e-3,), (1.0,), drag=drag, friction=0.5)["slip"] for drag in (0.0, 0.05, 0.4, 2.0)]
+    assert [one.needed for one in off] == [False, False, True, True]
+    assert off[0].force == off[0].motion == 0 and off[2].force == pytest.approx(0.4) and 0.5 < off[3].force < 0.7
 
 
 def test_a_mesh_errs_with_the_square_of_its_edge():
@@ -111,6 +135,9 @@ def test_less_accuracy_asks_for_less():
         ({"friction": 0.0}, "friction is 0"),
         ({"drag": -1.0}, "drag is -1"),
         ({"edge": 0.0}, "edge is 0"),
+        ({"friction": "soap"}, "no friction 'soap'"),
+        ({"duration": -1.0}, "duration is -1 s"),
+        ({"path": float("nan")}, "path is nan m"),
         ({"thickness": None}, "thickness"),
         ({"enough": Misfit(0.0, 0.1)}, "force is 0"),
     ],
@@ -134,6 +161,30 @@ def test_the_verb_gives_machines_the_same_in_si(capsys):
     assert code == 0 and figures["rung"] == found.rung and figures["smallest"] == found.sentence
     assert figures["terms"]["skin"]["force"] == pytest.approx(found["skin"].force)
     assert figures["indentations"][0]["radius"] == 0.01
+
+
+def test_the_file_carries_time_and_slip_for_a_node(capsys, tmp_path):
+    scene = ("needs", "--part", "forearm", "--force", 1, "--speed", 50, "--path", 100, "--json")
+    code, said, _ = stmpl(capsys, *scene, "--duration", 10, "--friction", "dry", "--out", tmp_path / "rich.json")
+    rich, told = read_model(tmp_path / "rich.json"), json.loads(said)
+    assert code == 0 and rich.relaxing is told["relaxing"] is True and rich.friction == told["friction"] == "dry"
+    assert read_tissue(tmp_path / "rich.json") == rich[:2]
+    part, shares = region("forearm"), series_of(*rich[:2]).shares
+    np.testing.assert_allclose(shares, series_of(part.tissue.relaxing(HELD_SKIN), part.thickness).shares, rtol=1e-6)
+    stmpl(capsys, *scene[:-4], "--path", 100, "--friction", 0.01, "--out", tmp_path / "plain.json")
+    plain = read_model(tmp_path / "plain.json")
+    assert not plain.relaxing and plain.friction is None and not plain.tissue.relaxes
+    written = json.loads((tmp_path / "rich.json").read_text())
+    (tmp_path / "old.json").write_text(json.dumps({name: written[name] for name in ("thickness", "tissue")}))
+    assert read_model(tmp_path / "old.json")[2:] == (None, False)
+
+
+def test_a_slow_scene_writes_relaxed_moduli(capsys, tmp_path):
+    own = ("needs", "--thickness", 40, "--modulus", 3, "--force", 1, "--out")
+    stmpl(capsys, *own, tmp_path / "quick.json")
+    stmpl(capsys, *own, tmp_path / "slow.json", "--speed", 1e-4)
+    quick, slow = (read_model(tmp_path / name).tissue.youngs_modulus for name in ("quick.json", "slow.json"))
+    assert slow == pytest.approx(HELD_SKIN.relaxed * quick, rel=5e-3)
 
 
 def test_the_verb_takes_a_tissue_of_ones_own(capsys):
