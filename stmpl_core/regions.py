@@ -14,9 +14,9 @@ from stmpl_core.tissue import Membrane, Ply, Prony, Tissue
 
 HELD_SKIN = Prony(
     (0.156, 0.217), (0.656, 8.79),
-    "two terms fitted within 1 % to one person's skin, stretched by 9.45 mm and held: 0.855, 0.752, 0.694, 0.645, "
-    "0.622 of the peak after 1, 5, 10, 30, 40 s (Lavigne et al., data of Skin_porous_modelling); assumed of fat and "
-    "muscle",
+    "two terms fitted within 1 % to one person's skin, stretched by 9.45 mm and held, as if the stretch of 10 s were "
+    "sudden: 0.855, 0.752, 0.694, 0.645, 0.622 of the peak after 1, 5, 10, 30, 40 s (Lavigne et al., data of "
+    "Skin_porous_modelling); assumed of fat and muscle",
 )  # fmt: skip
 
 Tone = Literal["relaxed", "tensed"]

@@ -143,7 +143,7 @@ def times_table(measured: Measured, file: Path) -> Table:
 
 def validation_table(judged: Sequence[Judged], picture: Path) -> Table:
     """The model beside published measurements, for people."""
-    from studies.validate import said
+    from studies.validate import met, said
 
     table = Table(title="The model beside published measurements", title_justify="left", caption_justify="left")
     for heading in ("row", "model", "measured"):
@@ -152,10 +152,10 @@ def validation_table(judged: Sequence[Judged], picture: Path) -> Table:
     for heading in ("meets", "matters most"):
         table.add_column(heading)
     for one in judged:
-        verdict = "[green]yes" if one.inside else f"[red]no, {one.apart:.2g} apart"
+        verdict = f"[{'blue' if one.row.fitted else 'green' if one.inside else 'red'}]{one.verdict}"
         table.add_row(one.row.name, said(one.model), said(one.row.measured), f"{one.ratio:.2g}", verdict,
                       one.most.replace("_", " "))  # fmt: skip
-    met = sum(one.inside for one in judged)
+    inside, of = met(judged)
     where = f"drawn in {picture}, reasons and sources in {picture.parent}/table.md"
-    table.caption = f"{met} of {len(judged)} rows meet; {where}"
+    table.caption = f"{inside} of {of} rows meet; {where}"
     return table

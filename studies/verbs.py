@@ -242,7 +242,7 @@ def validate(
 ) -> int:
     """The model beside published measurements on people: value, spread, whether they meet, and why not.
 
-    Rows that do not meet stay in the table. Nothing was fitted on any row.
+    Rows that do not meet stay in the table. What a parameter was fitted on is shown, and not judged.
 
     Example: stmpl validate --quick
 

@@ -7,14 +7,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from stmpl_core import Membrane, Ply, Tissue
+from stmpl_core import Contact, Membrane, Ply, Prony, Simulator, State, Tissue
 from stmpl_core.errors import InvalidInput
+from stmpl_core.methods import Winkler
 from stmpl_core.regions import Quantity, region
+from stmpl_core.relaxation import Series
 from stmpl_core.stack import along, compliance
 from stmpl_ros.cli import main
-from studies.validate import ROWS, judge, markdown, said
+from studies.validate import ROWS, as_dict, fading, judge, markdown, met, said
 from studies.validate.closed import disc_stiffness
 from studies.validate.judge import inputs_of, judge_row, surrogate
+from tests.scenes import at, ball, plate
 
 WAYS = ("pressed in", "pulled along")
 PRESSED = next(row for row in ROWS if row.name == "forearm, small indenter")
@@ -112,8 +115,47 @@ def test_every_row_says_where_it_comes_from_and_why_it_may_fail(quick):
 
 def test_which_rows_meet(quick):
     """As docs/credibility.md says: pressed lightly and slowly, the model meets people; pulled along and tapped, not."""
-    assert {one.row.name for one in quick if one.inside} == {
-        "forearm, small indenter", "forearm, air jet, young", "leg, initial modulus"}  # fmt: skip
+    assert {one.row.name for one in quick if one.inside and not one.row.fitted} == {
+        "forearm, small indenter", "forearm, air jet, young", "leg, initial modulus", "arm, energy lost",
+        "leg, share lost", "leg, time of fading"}  # fmt: skip
+
+
+def test_a_row_that_a_parameter_was_fitted_on_is_shown_and_not_counted(quick):
+    fitted = [one for one in quick if one.row.fitted]
+    assert [one.verdict for one in fitted] == ["not judged: HELD_SKIN was fitted on it"]
+    assert met(quick) == (6, len(quick) - 1) and as_dict(quick)["of"] == len(quick) - 1
+    assert fitted[0].verdict in markdown(quick)
+
+
+# Time
+
+SERIES = Series(np.array([0.2, 0.3]), np.array([0.5, 8.0]))
+
+
+def test_a_stay_loses_what_the_series_says_and_what_a_simulator_with_a_state_says():
+    found = fading.lost_share(fading.cycles(SERIES, 0.0, 5.0, 1, slack=False))
+    assert found == pytest.approx(float(SERIES.shares @ -np.expm1(-5.0 / SERIES.times)), rel=1e-9)
+    tissue = Tissue(2e4, 0.4, relaxation=Prony(tuple(SERIES.shares), tuple(SERIES.times)))
+    simulator, state, force = Simulator(plate(0.09).with_(tissue=tissue), Winkler()), State(), []
+    for dt in (0.0, *[0.1] * 50):
+        (touch,), state = simulator.touch([Contact(ball(8e-3), at(0, 0, 5e-3))], state, dt)
+        force.append(touch.force)
+    assert found == pytest.approx(1 - force[-1] / force[0], rel=1e-6)
+
+
+def test_a_cycle_loses_nothing_when_it_is_sudden_or_endless_and_most_between():
+    lost = [fading.lost_energy(fading.cycles(SERIES, lasts, 0.0, 1, slack=False)) for lasts in (1e-6, 2.0, 1e7)]
+    assert abs(lost[0]) < 1e-5 and abs(lost[2]) < 1e-5 and lost[1] > 0.1
+
+
+def test_slack_skin_gives_nothing_back_on_the_rest_of_its_way():
+    tight, slack = (fading.cycles(SERIES, 1.0, 50.0, 2, slack=each) for each in (False, True))
+    assert tight.force.min() < -0.1 and slack.force.min() == 0
+    assert fading.last_peak(slack) < 1 and fading.lost_energy(slack) < fading.lost_energy(tight)
+
+
+def test_the_time_of_fading_of_one_term_is_its_own():
+    assert fading.fading_time(Series(np.array([0.3]), np.array([2.0]))) == pytest.approx(2.0, rel=1e-3)
 
 
 def test_the_verb_writes_report_table_and_picture(tmp_path, capsys):
@@ -121,7 +163,7 @@ def test_the_verb_writes_report_table_and_picture(tmp_path, capsys):
         main(["validate", "--quick", "--json", "--out", str(tmp_path)])
     assert ended.value.code == 0
     told = json.loads(capsys.readouterr().out)
-    assert told == json.loads((tmp_path / "report.json").read_text()) and told["of"] == len(told["rows"])
+    assert told == json.loads((tmp_path / "report.json").read_text()) and told["of"] == len(told["rows"]) - 1
     assert (tmp_path / "table.md").exists() and (tmp_path / "validate.png").stat().st_size > 1e4
 
 

@@ -9,14 +9,16 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from studies.validate.judge import Judged
+from studies.validate.report import met
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 NEAR = 0.2  # decades between points whose numbers would overlap
-KINDS = {"N/m": ("stiffness [N/mm]", 1e-3), "Pa": ("modulus [kPa]", 1e-3), "N": ("force [N]", 1.0), "-": ("ratio", 1.0)}
-COLOURS = {True: "tab:green", False: "tab:red"}
-MARKERS = {"N/m": "o", "Pa": "s", "N": "^", "-": "D"}
+KINDS = {"N/m": ("stiffness [N/mm]", 1e-3), "Pa": ("modulus [kPa]", 1e-3), "N": ("force [N]", 1.0),
+         "-": ("ratio or share", 1.0), "s": ("time [s]", 1.0)}  # fmt: skip
+COLOURS = {"yes": "tab:green", "no": "tab:red", "not judged": "tab:blue"}  # by how a verdict begins
+MARKERS = {"N/m": "o", "Pa": "s", "N": "^", "-": "D", "s": "v"}
 
 
 def draw(judged: Sequence[Judged], path: Path) -> Path:
@@ -29,11 +31,16 @@ def draw(judged: Sequence[Judged], path: Path) -> Path:
     left, right = figure.subplots(1, 2, width_ratios=(1.0, 1.0))
     _against(left, judged)
     _named(right, judged)
-    inside = sum(one.inside for one in judged)
-    figure.suptitle(f"The model beside published measurements on people: {inside} of {len(judged)} rows meet")
+    inside, of = met(judged)
+    blue = "; blue: a parameter was fitted on it" if of < len(judged) else ""
+    figure.suptitle(f"The model beside published measurements on people: {inside} of {of} rows meet{blue}")
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path)
     return path
+
+
+def _colour(one: Judged) -> str:
+    return next(colour for begins, colour in reversed(COLOURS.items()) if one.verdict.startswith(begins))
 
 
 def _against(axes: Axes, judged: Sequence[Judged]) -> None:
@@ -44,7 +51,7 @@ def _against(axes: Axes, judged: Sequence[Judged]) -> None:
         x, y = ([factor * q.value, factor * q.low, factor * q.high] for q in (one.row.measured, one.model))
         ends += x + y
         axes.errorbar(x[0], y[0], xerr=[[x[0] - x[1]], [x[2] - x[0]]], yerr=[[y[0] - y[1]], [y[2] - y[0]]],
-                      fmt=MARKERS[one.row.measured.unit], color=COLOURS[one.inside], ms=5, lw=1)  # fmt: skip
+                      fmt=MARKERS[one.row.measured.unit], color=_colour(one), ms=5, lw=1)  # fmt: skip
         points.append((x[0], y[2], number))
     for group in _groups(points):
         x, y = np.exp(np.mean(np.log([point[0] for point in group]))), max(point[1] for point in group)
@@ -83,7 +90,7 @@ def _named(axes: Axes, judged: Sequence[Judged]) -> None:
     """A line a row: both intervals over the measured middle."""
     for k, one in enumerate(judged):
         middle = one.row.measured.value
-        for shift, quantity, colour in ((0.17, one.row.measured, "0.35"), (-0.17, one.model, COLOURS[one.inside])):
+        for shift, quantity, colour in ((0.17, one.row.measured, "0.35"), (-0.17, one.model, _colour(one))):
             low, value, high = (x / middle for x in (quantity.low, quantity.value, quantity.high))
             axes.plot([low, high], [k - shift] * 2, color=colour, lw=2.5, solid_capstyle="butt")
             axes.plot(value, k - shift, MARKERS[quantity.unit], color=colour, ms=5)

@@ -9,8 +9,11 @@ from pathlib import Path
 from stmpl_core.regions import Quantity
 from studies.validate.judge import Judged
 
-UNITS = {"N/m": (1e-3, "N/mm"), "N": (1.0, "N"), "Pa": (1e-3, "kPa"), "-": (1.0, "")}  # factor, and what people read
-FITTED = "No parameter was fitted on any row; inputs have the sources, or are assumed, as stmpl_core.regions says."
+UNITS = {  # factor, and what people read
+    "N/m": (1e-3, "N/mm"), "N": (1.0, "N"), "Pa": (1e-3, "kPa"), "-": (1.0, ""), "s": (1.0, "s"),
+}  # fmt: skip
+FITTED = ("No parameter was fitted on a row that is judged; inputs have the sources, or are assumed, as "
+          "stmpl_core.regions says.")  # fmt: skip
 
 
 def said(quantity: Quantity) -> str:
@@ -23,8 +26,14 @@ def said(quantity: Quantity) -> str:
 
 def as_dict(judged: Sequence[Judged]) -> dict[str, object]:
     """Every row, and how many are inside, for machines."""
-    inside = sum(one.inside for one in judged)
-    return {"fitted": FITTED, "inside": inside, "of": len(judged), "rows": [one.as_dict() for one in judged]}
+    inside, of = met(judged)
+    return {"fitted": FITTED, "inside": inside, "of": of, "rows": [one.as_dict() for one in judged]}
+
+
+def met(judged: Sequence[Judged]) -> tuple[int, int]:
+    """How many rows meet, of how many that nothing was fitted on."""
+    fair = [one for one in judged if not one.row.fitted]
+    return sum(one.inside for one in fair), len(fair)
 
 
 def markdown(judged: Sequence[Judged]) -> str:
@@ -32,7 +41,7 @@ def markdown(judged: Sequence[Judged]) -> str:
     lines = ["| row | protocol | asked | model | measured | model / measured | meets | matters most |",
              "| --- | --- | --- | --- | --- | ---: | --- | --- |"]  # fmt: skip
     for one in judged:
-        row, verdict = one.row, "yes" if one.inside else f"no, {one.apart:.2g} apart"
+        row, verdict = one.row, one.verdict
         asked = f"{row.asked}, {row.protocol.way}"
         lines.append(f"| {row.name} | {row.protocol.said} | {asked} | {said(one.model)} | {said(row.measured)} | "
                      f"{one.ratio:.2g} | {verdict} | {one.most.replace('_', ' ')} |")  # fmt: skip

@@ -1,19 +1,22 @@
 """Rows: what others measured on people, each with its protocol, and what to ask the model for it.
 
-Nothing in the model was fitted on any of these rows. Where only an abstract was read, or somebody's quotation of it,
-the row says so. A part of a protocol that was not found is marked "assumed" and carries a spread of its own.
+A row that a parameter of the model was fitted on says so, and is not judged. Where only an abstract was read, or
+somebody's quotation of it, the row says so. A part of a protocol that was not found is marked "assumed" and carries a
+spread of its own.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 from stmpl_core.regions import Quantity, region
 from studies.validate.closed import Way
 
-Asked = Literal["stiffness", "force", "reduced modulus", "layer modulus", "tensed over relaxed", "tensed less relaxed"]
+Asked = Literal["stiffness", "force", "reduced modulus", "layer modulus", "tensed over relaxed", "tensed less relaxed",
+                "share lost", "energy lost", "last peak over first", "time of fading"]  # fmt: skip
+IN_TIME = ("share lost", "energy lost", "last peak over first", "time of fading")  # what only tissue with time answers
 Read = Literal["abstract", "quotation", "public page", "data"]
 
 
@@ -23,17 +26,23 @@ class Protocol:
 
     Args:
         said: protocol as published, in a few words.
-        way: direction of the force on the skin.
+        way: direction of the force on the skin; stretched: between two pads that are glued to it.
         radius: radius of the tool, or of its contact where it is a ball or a jet [m].
         depth: depth of the tool, or its way along [m]; None: small.
         ball: whether a ball is pressed, by finite elements; a flat disc otherwise.
+        speed: speed of the way there and back [m/s]; None: at once.
+        stays: time between the two [s]; None: none.
+        cycles: number of cycles of there and back.
     """
 
     said: str
-    way: Way
+    way: Way | Literal["stretched"]
     radius: Quantity
     depth: Quantity | None = None
     ball: bool = False
+    speed: Quantity | None = None
+    stays: Quantity | None = None
+    cycles: int = 1
 
 
 @dataclass(frozen=True)
@@ -50,6 +59,7 @@ class Row:
         read: what was read: the source's own abstract, another's quotation of it, a public page, or the data.
         outside: likely reason if model and measurement do not meet.
         own: numbers of the region that were measured on the same people, by name; the others are the library's.
+        fitted: parameter of the model that was fitted on this row, which is then not judged; none if empty.
     """
 
     name: str
@@ -61,6 +71,7 @@ class Row:
     read: Read
     outside: str
     own: Mapping[str, Quantity] = field(default_factory=dict)
+    fitted: str = ""
 
 
 def _m(value: float, low: float, high: float, source: str) -> Quantity:
@@ -69,6 +80,10 @@ def _m(value: float, low: float, high: float, source: str) -> Quantity:
 
 def _spread(value: float, deviation: float, unit: str, source: str) -> Quantity:
     return Quantity(value, value - deviation, value + deviation, unit, source)
+
+
+def _s(value: float) -> Quantity:
+    return Quantity(value, value, value, "s", "of the protocol")
 
 
 def _alone(value: float, unit: str, source: str) -> Quantity:
@@ -85,6 +100,13 @@ TONE = ("relaxed and tensed differ by the muscle's modulus only, along its fibre
         "tightens and a muscle that bulges are left out, and the fat hides what lies below")  # fmt: skip
 SPRING = ("a safety standard's spring, meant for forces near the pain limit and told without tool or depth; the model "
           "bears 8 to 13 N at a third of its thickness, and neo-Hookean tissue stiffens too little beyond")  # fmt: skip
+
+LOOP = ("the model's skin loses by what fades alone, with the series of one person; skin that is stretched far loses "
+        "more as it yields, and the speed was not found")  # fmt: skip
+RAMP = ("the series was fitted to the hold as if the stretch had been sudden; with the 10 s that it took, much of what "
+        "fades has faded before")  # fmt: skip
+AGAIN = ("preconditioning: skin that was stretched is longer and softer at once, which a series that fades is not (the "
+         "pads then go slack early on the way back)")  # fmt: skip
 
 _FLYNN = "Flynn, Taberner & Nielsen, Med Eng Phys 33 (2011) 610: largest force over largest way, 20 people"
 _PULLED = Protocol("probe 4 mm wide, taken to be glued, moved up to 1.3 mm; stiffest along the skin", "pulled along",
@@ -107,11 +129,22 @@ _RELAXED = "thigh, rectus femoris, relaxed, "
 _BADU = "Agyapong-Badu et al., J Aging Phys Act 20 (2012) S233"
 _LUMBAR = ("Stiffness of resting lumbar myofascia in healthy young subjects, J Bodyw Mov Ther 20 (2016) 388: standard "
            "error 11.3 N/m, times the root of 10")  # fmt: skip
+_ZHENG = "Zheng & Mak, J Biomech Eng 121 (1999) 330"
 _PEN = Protocol("pen-sized ultrasound indenter by hand, quasi-linear viscoelastic fit, initial modulus", "pressed in",
                 _m(4.5, 3, 6, "assumed: not found"))  # fmt: skip
 _HAND = Protocol("indenter by hand, fitted by Hertz", "pressed in", _m(10, 5, 20, "assumed: not found"),
                  _m(10, 5, 15, "assumed: not found"), ball=True)  # fmt: skip
 _ISO = "ISO/TS 15066:2016, table A.3"
+_LOOP = replace(_PULLED, said="probe 4 mm wide, taken to be glued, moved 1.3 mm along the skin and back",
+                speed=_m(1, 0.1, 10, "assumed: not found"))  # fmt: skip
+_HELD = replace(_PEN, said="pen-sized ultrasound indenter by hand, quasi-linear viscoelastic fit of one term",
+                stays=_s(60))  # fmt: skip
+_ONE = "skin of one person, site not told, taken to be a forearm"
+_LAVIGNE = ("Lavigne et al., public data of Skin_porous_modelling, Healthy_skin.xlsx: force less its mean before the "
+            "first stretch")  # fmt: skip
+_STRETCHED = Protocol("extensometer: 9.45 mm at 0.97 mm/s, held, back at the same speed", "stretched",
+                      _m(2, 2, 2, "two pads; their size is not used"), _m(9.45, 9.45, 9.45, _LAVIGNE),
+                      speed=_m(0.97, 0.97, 0.97, _LAVIGNE), stays=_s(40))  # fmt: skip
 
 
 def _robot(name: str) -> Protocol:
@@ -167,4 +200,19 @@ ROWS = (
         "public page", SPRING),
     Row("thigh, robot", "thigh", "thigh and knee", _robot("thigh"), "stiffness", _alone(50e3, "N/m", _ISO),
         "quotation", SPRING),
+    Row("arm, energy lost", "upper_arm", "several areas and directions of the arms of 20 people", _LOOP, "energy lost",
+        Quantity(0.23, 0.119, 0.342, "-", "Flynn, Taberner & Nielsen, Med Eng Phys 33 (2011) 610: range of averages; "
+                 "its middle"), "abstract", LOOP),
+    Row("leg, share lost", "calf", "four sites of the lower limb, 8 people, three postures", _HELD, "share lost",
+        Quantity(0.09, 0.029, 0.277, "-", f"{_ZHENG}: range of alpha; geometric middle"), "abstract",
+        "sites and postures are mixed"),
+    Row("leg, time of fading", "calf", "four sites of the lower limb, 8 people, three postures", _HELD,
+        "time of fading", Quantity(0.67, 0.05, 8.93, "s", f"{_ZHENG}: range of tau of one term; geometric middle"),
+        "abstract", "sites and postures are mixed"),
+    Row("skin held, share lost in 40 s", "forearm", _ONE, _STRETCHED, "share lost", _alone(0.36, "-", _LAVIGNE),
+        "data", RAMP, fitted="HELD_SKIN"),
+    Row("skin stretched again, second peak over first", "forearm", _ONE, replace(_STRETCHED, stays=_s(59), cycles=2),
+        "last peak over first", _alone(0.768, "-", _LAVIGNE), "data", AGAIN),
+    Row("skin stretched once, energy lost", "forearm", _ONE, replace(_STRETCHED, stays=_s(59)), "energy lost",
+        _alone(0.905, "-", _LAVIGNE), "data", AGAIN),
 )  # fmt: skip
