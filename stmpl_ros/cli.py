@@ -16,6 +16,7 @@ VERBS = {  # module of each verb's function, and what it does
     "sim": ("stmpl_sim.verbs", "a robot massages a limb in a simulator, without ROS"),
     "node": ("stmpl_ros.verbs", "answer contacts with the displacement of the skin"),
     "probe": ("stmpl_ros.verbs", "simulated devices along a script, on the skin of a running node"),
+    "robot": ("stmpl_ros.verbs", "a simulated robot that massages the skin of a running node"),
     "view": ("stmpl_ros.verbs", "the skin in the browser: a recording, the running node, or under a tool to drag"),
     "record": ("stmpl_ros.verbs", "record topics as MCAP, until Ctrl-C"),
     "replay": ("stmpl_ros.verbs", "answer recorded contacts again, or publish them"),

@@ -226,6 +226,42 @@ class ProbeConfig(BaseModel):
     patience: float = Field(default=60.0, gt=0, description="time after which to give up if nobody listens [s]")
 
 
+class RobotConfig(BaseModel):
+    """The simulated robot's settings."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    force: tuple[float, ...] = Field(
+        default=(5.0,), min_length=1, description="forces to press with, one after the other [N]"
+    )
+    speed: float = Field(default=50.0, ge=0, description="speed along the circles [mm/s]")
+    circle: float = Field(default=12.0, gt=0, description="radius of the circles [mm]")
+    laps: float = Field(default=2.0, ge=0, description="laps with each force")
+    radius: float = Field(default=20.0, gt=0, description="radius of the ball that presses [mm]")
+    mount: Literal["fixed", "springs"] = Field(default="fixed", description="mount of the limb")
+    friction: str = Field(
+        default="none", description="coefficient of friction, or dry, moist, oiled, glove, typical, or none"
+    )
+    robot: Path | None = Field(
+        default=None, description="MJCF or URDF file of the robot; the 7-axis arm that ships unless given"
+    )
+    end: str = Field(default="", description="body or site of it that carries the ball; empty: its last body")
+    at: tuple[float, float, float] = Field(default=(0.5, 0.0, 0.25), description="place of the limb in its world [m]")
+    physics: float = Field(default=500.0, ge=50, le=20_000, description="rate of physics and contact [Hz]")
+    rate: float = Field(default=100.0, ge=1, le=2000, description="rate of poses, wrenches and joints [Hz]")
+    told: bool = Field(
+        default=False,
+        description="wrench of the wrist on tools/ball/wrench too: the node then corrects the pose by it; without it "
+        "both answer the contact by its pose",
+    )
+    out: Path | None = Field(default=None, description="folder for the robot's own log, robot.npz")
+    listeners: int = Field(
+        default=1, ge=1, description="number of subscribers to wait for before moving; 2 with a recorder"
+    )
+    patience: float = Field(default=60.0, gt=0, description="time after which to give up if nobody listens [s]")
+    linger: float = Field(default=2.0, ge=0, description="time that the simulated clock goes on at the end [s]")
+
+
 class RecordConfig(BaseModel):
     """The recorder's settings."""
 

@@ -28,7 +28,9 @@ from stmpl_ros.spinning import ros, spin
 
 log = logging.getLogger(__name__)
 
-WANTED = re.compile(r"(contact_mesh|skin/topology|skin/displacement|tools/\w+/(pose|wrench))$|^/diagnostics$")
+WANTED = re.compile(
+    r"(contact_mesh|skin/topology|skin/displacement|tools/\w+/(pose|wrench)|wrist/wrench|joint_states)$|^/diagnostics$"
+)
 IF_HEARD = re.compile(r"tools/\w+/local_contact$")  # recorded only once a device listens: it costs the node work
 FOREVER = 1e9  # lease of a sender that never tells that it is there, at least [s]
 POLL_PERIOD_S = 0.1  # time between two looks for new topics

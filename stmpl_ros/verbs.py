@@ -13,7 +13,7 @@ from stmpl_core.errors import InvalidInput
 from stmpl_core.extras import needed
 from stmpl_core.methods import METHODS
 from stmpl_core.methods import method as method_named
-from stmpl_ros.parameters import DemoConfig, NodeConfig, ProbeConfig, RecordConfig
+from stmpl_ros.parameters import DemoConfig, NodeConfig, ProbeConfig, RecordConfig, RobotConfig
 from stmpl_ros.scene import SceneConfig
 from stmpl_ros.view.config import ViewConfig
 
@@ -26,7 +26,8 @@ Flat = tyro.conf.arg(name="")  # a configuration whose fields are flags of the v
 BagPath = Annotated[Path, tyro.conf.Positional]  # a run's folder, or its .mcap file
 MethodName = Literal["fem", "moment_net", "unet", "linear", "winkler", "naive", "ladder"]
 
-DEMO, NODE, PROBE, SCENE, VIEW = DemoConfig(), NodeConfig(), ProbeConfig(), SceneConfig(), ViewConfig()
+DEMO, NODE, PROBE, ROBOT = DemoConfig(), NodeConfig(), ProbeConfig(), RobotConfig()
+SCENE, VIEW = SceneConfig(), ViewConfig()
 
 ros_arguments: list[str] = []  # arguments of ROS, from --ros-args on
 
@@ -59,6 +60,18 @@ def probe(config: Annotated[ProbeConfig, Flat] = PROBE) -> int:
     Example: stmpl probe --scripts press --rate 500
     """
     from stmpl_ros.probe import run
+
+    return run(config, ros_arguments)
+
+
+def robot(config: Annotated[RobotConfig, Flat] = ROBOT) -> int:
+    """A simulated robot massages the skin of a running node: mesh, poses, wrench, joints and clock over ROS.
+
+    Example: stmpl node --ros-args -p use_sim_time:=true & stmpl robot --force 5 --laps 1
+    Without ROS: stmpl sim
+    """
+    needed("stmpl robot", "sim", "mujoco")
+    from stmpl_ros.robot import run
 
     return run(config, ros_arguments)
 

@@ -17,6 +17,7 @@ from stmpl_sim.site import Site
 
 ARM = Path(__file__).parent / "models" / "arm7.xml"
 LIMB, HEAD, BALL, EYE = "limb", "head", "ball", "eye"  # names of bodies, geom and camera that a scene adds
+WRIST = "wrist"  # name of the site of the force and torque sensor between the robot and its head
 SKIN_MESH, SKIN_GEOM, SKIN_MATERIAL = "skin", "skin", "skin"
 DENSITY = 1050.0  # of a limb [kg/m3]
 HEAD_LENGTH, HEAD_MASS = 0.09, 0.3  # of the massage head, flange to the ball's middle [m], [kg]
@@ -80,7 +81,7 @@ def build(
     spec = _robot_spec(ARM if robot is None else Path(robot))
     holder = _end(spec, end)
     chain = _chain(holder if hasattr(holder, "add_body") else holder.parent)
-    _add_head(holder, radius)
+    _add_head(spec, holder, radius)
     _drive(spec, chain)
     _add_limb(spec, layer, site, np.array(at), mount)
     _add_stage(spec, np.array(at))
@@ -162,7 +163,7 @@ def _drive(spec: Any, chain: list[Any]) -> None:
         motor.set_to_motor()
 
 
-def _add_head(holder: Any, radius: float) -> None:
+def _add_head(spec: Any, holder: Any, radius: float) -> None:
     site = not hasattr(holder, "add_body")
     parent = holder.parent if site else holder
     head = parent.add_body(name=HEAD, **({"pos": holder.pos, "quat": holder.quat} if site else {}))
@@ -171,6 +172,9 @@ def _add_head(holder: Any, radius: float) -> None:
                   rgba=[0.35, 0.38, 0.42, 1])  # fmt: skip
     head.add_geom(name=BALL, type=mujoco.mjtGeom.mjGEOM_SPHERE, pos=[0, 0, HEAD_LENGTH], size=[radius, 0, 0],
                   contype=0, conaffinity=0, mass=0.6 * HEAD_MASS, rgba=[0.16, 0.38, 0.54, 1])  # fmt: skip
+    head.add_site(name=WRIST)
+    for kind in (mujoco.mjtSensor.mjSENS_FORCE, mujoco.mjtSensor.mjSENS_TORQUE):
+        spec.add_sensor(type=kind, objtype=mujoco.mjtObj.mjOBJ_SITE, objname=WRIST)
 
 
 def _add_limb(spec: Any, layer: SoftLayer, site: Site, at: np.ndarray, mount: str) -> None:
