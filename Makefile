@@ -16,7 +16,7 @@ help:  ## Say what each target does
 
 setup: $(READY)  ## Make .venv with Python 3.12, ROS 2 and what the main job needs (once; needs a C++ compiler)
 
-demo: $(READY)  ## Run the main job: simulated contact over ROS 2, recorded, compared with FEM, with a report
+demo: $(READY)  ## Run the main job: a robot massages a forearm over ROS 2, recorded, compared with FEM, with film and report
 	$(BIN)/stmpl demo
 
 test: $(READY_DEV)  ## Pass the tests, two at a time; print the slowest, and the files of which they run least
@@ -47,7 +47,7 @@ $(READY): setup.py pyproject.toml $(MESSAGES)
 	@python=$$(.ci/find_python) || exit 1; \
 	[ -x $(BIN)/python ] || $$python -m venv $${ROS_DISTRO:+--system-site-packages} $(VENV)
 	$(BIN)/python -m pip install --quiet uv
-	$(INSTALL) --editable .
+	$(INSTALL) --editable ".[sim]"
 	@touch $@
 
 $(READY_DEV): $(READY)  # tools of the tests, and what all verbs need (gigabytes: torch)

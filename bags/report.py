@@ -2,12 +2,8 @@
 
 from __future__ import annotations
 
-import html
 import json
-from base64 import b64encode
 from collections import Counter
-from collections.abc import Sequence
-from io import BytesIO
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from bags.compare import Comparison, FramePair, headline
+from bags.page import STYLE, image, table, text
 from bags.pictures import (
     DIFFERENCE,
     FLAT,
@@ -38,34 +35,26 @@ STOPPED = "#d9534f"
 ROOM = 2.6  # half width of a close-up, in radii of the contact
 CLOSEST = 0.02  # half width of the narrowest close-up [m]
 
-STYLE = """
-body { font: 15px/1.45 system-ui, sans-serif; color: #2b2b2b; max-width: 1120px; margin: 2em auto; padding: 0 1em; }
-h1 { font-size: 1.5em; } h2 { font-size: 1.15em; margin-top: 2em; }
-table { border-collapse: collapse; margin: .6em 0; } td, th { padding: .22em .8em; text-align: right; }
-th { border-bottom: 1px solid #999; font-weight: 600; } td:first-child, th:first-child { text-align: left; }
-tr:nth-child(even) td { background: #f6f4f1; } img { max-width: 100%; }
-pre { background: #f6f4f1; padding: 1em; overflow: auto; }
-.verdict { padding: .6em 1em; border-left: 5px solid; } .good { border-color: #3a7d44; } .bad { border-color: #b3261e; }
-.note { color: #666; font-size: .92em; }
-"""
 
-
-def write_report(comparison: Comparison, path: Path | str, *, replay: ReplaySummary | None = None) -> Path:
+def write_report(
+    comparison: Comparison, path: Path | str, *, replay: ReplaySummary | None = None, front: str = ""
+) -> Path:
     """Writes the page; nothing in it refers to another file.
 
     Args:
         comparison: comparison with at least one frame that the reference solved.
         path: path of the .html file to write.
         replay: summary of a replay of the same run, if there was one.
+        front: HTML that the page opens with.
 
     Raises:
         BagError: nothing to show, or the file cannot be written.
     """
     path = Path(path)
     parts = [_opening(comparison, replay), _pressed(comparison), _timeline_part(comparison), _frames_part(comparison)]
-    page = "\n".join([*parts, _origin(comparison)])
+    page = "\n".join([front, *parts, _origin(comparison)])
     try:
-        path.write_text(f"<!doctype html><html lang=en><meta charset=utf-8><title>stmpl: {_h(comparison.method)}"
+        path.write_text(f"<!doctype html><html lang=en><meta charset=utf-8><title>stmpl: {text(comparison.method)}"
                         f"</title><style>{STYLE}</style><body>{page}</body></html>\n")  # fmt: skip
     except OSError as error:
         raise BagError(f"the report {path} cannot be written: {error.strerror}.") from error
@@ -216,13 +205,13 @@ def _shade(axes: Axes, time: np.ndarray, flagged: np.ndarray, colour: str, label
 
 def _opening(comparison: Comparison, replay: ReplaySummary | None) -> str:
     kind = "good" if comparison.passed else "bad"
-    lines = [f"<h1>{_h(comparison.method)} against {_h(comparison.reference)}</h1>",
-             f"<p class='verdict {kind}'>{_h(comparison.verdict)}</p>"]  # fmt: skip
+    lines = [f"<h1>{text(comparison.method)} against {text(comparison.reference)}</h1>",
+             f"<p class='verdict {kind}'>{text(comparison.verdict)}</p>"]  # fmt: skip
     if replay is not None:
-        lines.append(f"<p>{_h(str(replay))}</p>")
+        lines.append(f"<p>{text(str(replay))}</p>")
     if comparison.run.bag.damage or not comparison.run.bag.finished:
         lines.append("<p class='verdict bad'>The recording is damaged or was not finished; what is sound was read.</p>")
-    lines.append(_table(("measured", "value"), headline(comparison)))
+    lines.append(table(("measured", "value"), headline(comparison)))
     lines.append("<p class=note>Errors are means and standard deviations over the compared frames. MAE, MEE and the "
                  "shares count vertices that the reference moves by more than 0.001 mm, as the STMPL paper does; most "
                  "of them hardly move, so look at the errors under the contact and at the peak.</p>")  # fmt: skip
@@ -236,9 +225,9 @@ def _pressed(comparison: Comparison) -> str:
         shown.append(("With several tools", comparison.most_tools))
     for title, pair in shown:
         tools = "; ".join(f"{name}: {touch.status}" for name, touch in pair.frame.touches.items())
-        lines.append(f"<h3>{title}, {pair.time:.2f} s, {pair.load:.2f} N</h3><p class=note>{_h(tools)}. "
+        lines.append(f"<h3>{title}, {pair.time:.2f} s, {pair.load:.2f} N</h3><p class=note>{text(tools)}. "
                      "Drawn to scale, not exaggerated; both sides answer the same contact.</p>")  # fmt: skip
-        lines += [_image(figure) for figure in pressed_figures(comparison, pair)]
+        lines += [image(figure) for figure in pressed_figures(comparison, pair)]
     return "\n".join(lines)
 
 
@@ -247,11 +236,11 @@ def _timeline_part(comparison: Comparison) -> str:
     outside = sum(not moment.in_range for moment in moments)
     stopped = sum(not moment.converged for moment in moments)
     reasons = Counter(moment.why for moment in moments if moment.why and not moment.in_range).most_common(1)
-    most = f", most often since {_h(reasons[0][0].rstrip('.'))}" if reasons else ""
-    return (f"<h2>Over time</h2>{_image(timeline_figure(comparison))}<p class=note>Yellow: outside the range that the "
+    most = f", most often since {text(reasons[0][0].rstrip('.'))}" if reasons else ""
+    return (f"<h2>Over time</h2>{image(timeline_figure(comparison))}<p class=note>Yellow: outside the range that the "
             f"method was validated on, so that its error there is not known ({outside} of {len(moments)} answers"
             f"{most}); red: not converged ({stopped}).</p>"
-            f"<h2>Latency</h2>{_image(latency_figure(comparison))}")  # fmt: skip
+            f"<h2>Latency</h2>{image(latency_figure(comparison))}")  # fmt: skip
 
 
 def _frames_part(comparison: Comparison) -> str:
@@ -260,8 +249,8 @@ def _frames_part(comparison: Comparison) -> str:
     rows = [(f"{p.time:.2f}", f"{p.load:.3f}", f"{MM * p.score.peak:.3f}", f"{MM * p.score.peak_error:+.3f}",
              f"{100 * p.score.peak_share:+.1f}", f"{MM * p.score.contact:.3f}", f"{MM * p.score.mee:.3f}",
              _trust(p.frame.trust), _trust(p.reference.trust)) for p in comparison.pairs]  # fmt: skip
-    failed = "".join(f"<li>answer {n}: {_h(why)}</li>" for n, why in comparison.failed.items())
-    return f"<h2>The compared frames</h2>{_table(head, rows)}{f'<p>Not solved:</p><ul>{failed}</ul>' if failed else ''}"
+    failed = "".join(f"<li>answer {n}: {text(why)}</li>" for n, why in comparison.failed.items())
+    return f"<h2>The compared frames</h2>{table(head, rows)}{f'<p>Not solved:</p><ul>{failed}</ul>' if failed else ''}"
 
 
 def _origin(comparison: Comparison) -> str:
@@ -270,9 +259,9 @@ def _origin(comparison: Comparison) -> str:
     told, layers = bag.provenance, [repr(layer) for layer in bag.layers.values()]
     made = {"body": told.body, "layers": layers, "method": told.method, "config": told.config,
             "versions": told.versions}  # fmt: skip
-    recorded = _table(("topic", "type", "messages"), topics)
-    return (f"<h2>What was recorded</h2><p class=note>{_h(bag.file.name)}</p>{recorded}"
-            f"<h2>What made it</h2><pre>{_h(json.dumps(made, indent=2, default=str))}</pre>")  # fmt: skip
+    recorded = table(("topic", "type", "messages"), topics)
+    return (f"<h2>What was recorded</h2><p class=note>{text(bag.file.name)}</p>{recorded}"
+            f"<h2>What made it</h2><pre>{text(json.dumps(made, indent=2, default=str))}</pre>")  # fmt: skip
 
 
 def _trust(trust: Trust) -> str:
@@ -280,19 +269,3 @@ def _trust(trust: Trust) -> str:
     words = [word for word, good in flags.items() if not good]
     bound = "" if trust.error_bound is None else f" ±{MM * trust.error_bound:.2f} mm"
     return (", ".join(words) or "ok") + bound
-
-
-def _table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    top = "".join(f"<th>{_h(cell)}</th>" for cell in head)
-    body = "".join("<tr>" + "".join(f"<td>{_h(cell)}</td>" for cell in row) + "</tr>" for row in rows)
-    return f"<table><tr>{top}</tr>{body}</table>"
-
-
-def _image(figure: Figure) -> str:
-    stream = BytesIO()
-    figure.savefig(stream, format="png", dpi=130)
-    return f"<img src='data:image/png;base64,{b64encode(stream.getvalue()).decode()}' alt=''>"
-
-
-def _h(text: str) -> str:
-    return html.escape(str(text))

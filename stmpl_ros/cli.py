@@ -12,7 +12,7 @@ from types import FrameType
 GRACE = 1.5  # time in which a verb must end after Ctrl-C or SIGTERM, whatever it is doing [s]
 PATIENT = {"record": 30.0}  # time for verbs that have something to save [s]
 VERBS = {  # module of each verb's function, and what it does
-    "demo": ("stmpl_ros.verbs", "node, simulated devices and recorder; then the run against FEM, with a report"),
+    "demo": ("stmpl_ros.verbs", "node, a robot that massages and recorder; then the run against FEM, with a report"),
     "sim": ("stmpl_sim.verbs", "a robot massages a limb in a simulator, without ROS"),
     "node": ("stmpl_ros.verbs", "answer contacts with the displacement of the skin"),
     "probe": ("stmpl_ros.verbs", "simulated devices along a script, on the skin of a running node"),

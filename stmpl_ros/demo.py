@@ -1,4 +1,4 @@
-"""The main job on one machine: node, simulated devices and recorder as processes, then the run against FEM."""
+"""The main job on one machine: node, robot or devices, and recorder as processes; then the run against FEM."""
 
 from __future__ import annotations
 
@@ -14,17 +14,22 @@ from contextlib import contextmanager
 from datetime import datetime
 from pathlib import Path
 
+from pydantic import BaseModel
 from rich.console import Console
+from rich.status import Status
 
 from bags.compare import Comparison
 from bags.provenance import versions
 from bags.replay import ReplaySummary, replay_run
 from bags.report import write_report
+from bags.run import NANO
 from bags.writer import FILE
 from fem_tools import RigidFem
 from stmpl_core.errors import StmplError
+from stmpl_core.extras import needed
 from stmpl_core.methods import method as method_named
-from stmpl_ros.parameters import DemoConfig, ProbeConfig
+from stmpl_ros.massage_report import Massaged, front, massaged, rows
+from stmpl_ros.parameters import DemoConfig
 from stmpl_ros.tables import compare_with_progress, comparison_table
 
 log = logging.getLogger(__name__)
@@ -43,6 +48,8 @@ class DemoError(StmplError):
 
 def run(config: DemoConfig) -> int:
     """Runs all of it; 0 only if everything is there and sane. Raises DemoError with what is not."""
+    if config.device == "robot":
+        needed("stmpl demo", "sim", "mujoco")
     console = Console()
     folder = config.runs / datetime.now().strftime("%Y-%m-%d_%H-%M-%S")
     folder.mkdir(parents=True)
@@ -54,11 +61,15 @@ def run(config: DemoConfig) -> int:
 
     replay = _replay(folder, config.node.method, console)
     comparison = compare_with_progress(folder, RigidFem(), config.frames)
-    report = write_report(comparison, folder / "report.html", replay=replay)
+    done = _massaged(folder, config, comparison, console)
+    report = write_report(comparison, folder / "report.html", replay=replay,
+                          front=front(done, config.node.limb) if done else "")  # fmt: skip
     console.print(comparison_table(comparison))
+    for name, value in rows(done) if done else ():
+        console.print(f"{name}: {value}", soft_wrap=True)
     console.print(str(replay))
     console.print(f"report: {report.resolve()}", soft_wrap=True)
-    missing = list(complaints(folder, comparison, replay))
+    missing = [*complaints(folder, comparison, replay), *(done.complaints() if done else ())]
     for complaint in missing:
         console.print(f"[red]not as it should be:[/red] {complaint}")
     return int(bool(missing))
@@ -69,6 +80,14 @@ def _replay(folder: Path, method: str, console: Console) -> ReplaySummary:
         return replay_run(folder, method_named(method), every=REPLAY_EVERY)
 
 
+def _massaged(folder: Path, config: DemoConfig, comparison: Comparison, console: Console) -> Massaged | None:
+    """What the robot did, with a film; None without a robot."""
+    if config.device != "robot":
+        return None
+    with console.status("filming the run"):
+        return massaged(folder, config.robot, comparison)
+
+
 def play(config: DemoConfig, folder: Path, console: Console) -> None:
     """Starts the three processes, waits until the devices are done, and stops the others. Raises DemoError."""
     environment = os.environ | {
@@ -77,15 +96,20 @@ def play(config: DemoConfig, folder: Path, console: Console) -> None:
         "PYTHONUNBUFFERED": "1",
     }
     record = ["--path", str(folder), "--run", str(folder / "config.json")]
+    node_arguments, settled = config.node.ros_arguments(), config.node.rest_after + config.node.fade + 0.5
+    flags = flags_of(config.probe)
+    if config.device == "robot":
+        flags = flags_of(config.robot.model_copy(update={"out": folder, "linger": settled}))
+        node_arguments += ["-p", "use_sim_time:=true"]
     with (
         _process("record", record, folder, environment) as recorder,
-        _process("node", config.node.ros_arguments(), folder, environment) as node,
-        _process("probe", _probe_flags(config.probe), folder, environment) as probe,
+        _process("node", node_arguments, folder, environment) as node,
+        _process(config.device, flags, folder, environment) as device,
     ):
         with console.status("starting") as status:
-            _wait(probe, {"node": node, "record": recorder}, folder, status)
-        # the node says that the skin is at rest again once nothing has come for a while
-        time.sleep(config.node.rest_after + config.node.fade + 0.5)
+            _wait(device, config.device, {"node": node, "record": recorder}, folder, status)
+        # the node says that the skin is at rest again once nothing has come for a while; a robot waits for that itself
+        time.sleep(settled if config.device == "probe" else 0.5)
         _stop(recorder, "record", folder)
         _stop(node, "node", folder)
 
@@ -100,8 +124,10 @@ def complaints(folder: Path, comparison: Comparison, replay: ReplaySummary) -> I
     first = min(moment.sequence for moment in comparison.run.moments)
     if first or timing.lost:
         yield f"{first + timing.lost} answers are not in the recording"
-    if not timing.instant_rate >= 0.95 * LEAST_RATE:
-        yield f"contacts came at {timing.instant_rate:.0f} Hz; at least {LEAST_RATE:g} Hz was asked for"
+    stamps = comparison.run.bag.pose_stamps
+    rate = (len(stamps) - 1) / max((max(stamps) - min(stamps)) * NANO, NANO)
+    if not rate >= 0.95 * LEAST_RATE:
+        yield f"contacts came at {rate:.0f} Hz; at least {LEAST_RATE:g} Hz was asked for"
     if timing.kept < LEAST_KEPT:
         yield f"{100 * timing.kept:.0f} % of the contacts were answered; at least {100 * LEAST_KEPT:g} % should be"
     if not replay.passed:
@@ -112,13 +138,16 @@ def complaints(folder: Path, comparison: Comparison, replay: ReplaySummary) -> I
         yield "nothing moved"
 
 
-def _probe_flags(config: ProbeConfig) -> list[str]:
-    return [
-        "--scripts", *config.scripts,
-        "--rate", str(config.rate),
-        "--listeners", str(config.listeners),
-        "--patience", str(config.patience),
-    ]  # fmt: skip
+def flags_of(config: BaseModel) -> list[str]:
+    """The flags of a verb whose settings these are."""
+    flags = []
+    for name, value in config.model_dump(mode="json").items():
+        flag = name.replace("_", "-")
+        if isinstance(value, bool):
+            flags.append(f"--{flag}" if value else f"--no-{flag}")
+        elif value is not None and value != "":
+            flags += [f"--{flag}", *map(str, value if isinstance(value, list) else [value])]
+    return flags
 
 
 @contextmanager
@@ -138,18 +167,20 @@ def _process(verb: str, arguments: list[str], folder: Path, environment: dict[st
             process.wait()
 
 
-def _wait(probe: subprocess.Popen, others: dict[str, subprocess.Popen], folder: Path, status) -> None:
+def _wait(
+    device: subprocess.Popen, verb: str, others: dict[str, subprocess.Popen], folder: Path, status: Status
+) -> None:
     deadline = time.monotonic() + LONGEST
-    while probe.poll() is None:
+    while device.poll() is None:
         for name, process in others.items():
             if process.poll() is not None:
                 raise DemoError(f"{name} ended early with code {process.returncode}:\n{_tail(folder, name)}")
         if time.monotonic() > deadline:
-            raise DemoError(f"the devices were not done after {LONGEST:g} s:\n{_tail(folder, 'probe')}")
-        status.update(_tail(folder, "probe", lines=1) or _tail(folder, "node", lines=1) or "starting")
+            raise DemoError(f"the devices were not done after {LONGEST:g} s:\n{_tail(folder, verb)}")
+        status.update(_tail(folder, verb, lines=1) or _tail(folder, "node", lines=1) or "starting")
         time.sleep(POLL_PERIOD_S)
-    if probe.returncode:
-        raise DemoError(f"probe ended with code {probe.returncode}:\n{_tail(folder, 'probe')}")
+    if device.returncode:
+        raise DemoError(f"{verb} ended with code {device.returncode}:\n{_tail(folder, verb)}")
 
 
 def _stop(process: subprocess.Popen, name: str, folder: Path) -> None:

@@ -26,6 +26,7 @@ from stmpl_ros.topics import KEPT, STREAM
 
 if TYPE_CHECKING:
     from stmpl_sim.massage import Log, Massage
+    from stmpl_sim.scene import Scene
 
 TOOL = "ball"  # name of the tool on the bus
 LOG = "robot.npz"  # file of what the robot did, in the folder that it is given
@@ -149,17 +150,22 @@ class Pace:
             self._zero -= ahead + CATCH_UP_S
 
 
+def scene_of(config: RobotConfig, layer: SoftLayer) -> Scene:
+    """The robot in front of a limb. Raises InvalidInput."""
+    from stmpl_sim.scene import build
+    from stmpl_sim.site import Site
+
+    return build(layer, Site.thickest(layer), robot=config.robot, end=config.end or None, at=config.at,
+                 mount=config.mount, radius=1e-3 * config.radius, timestep=1 / config.physics)  # fmt: skip
+
+
 def massage_of(config: RobotConfig, layer: SoftLayer) -> Massage:
     """The robot on a layer, ready to start. Raises InvalidInput."""
     from stmpl_core.friction import friction_from
     from stmpl_sim.massage import Course, Massage
-    from stmpl_sim.scene import build
-    from stmpl_sim.site import Site
 
-    site = Site.thickest(layer)
-    scene = build(layer, site, robot=config.robot, end=config.end or None, at=config.at, mount=config.mount,
-                  radius=1e-3 * config.radius, timestep=1 / config.physics)  # fmt: skip
-    course = Course(site.circle(1e-3 * config.circle), config.force, 1e-3 * config.speed, config.laps)
+    scene = scene_of(config, layer)
+    course = Course(scene.site.circle(1e-3 * config.circle), config.force, 1e-3 * config.speed, config.laps)
     return Massage(scene, course, friction=friction_from(config.friction))
 
 

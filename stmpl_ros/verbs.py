@@ -33,10 +33,10 @@ ros_arguments: list[str] = []  # arguments of ROS, from --ros-args on
 
 
 def demo(config: Annotated[DemoConfig, Flat] = DEMO) -> int:
-    """Node, simulated devices and recorder on this machine; then the run against FEM, with a report.
+    """Node, a robot that massages and recorder on this machine; then the run against FEM, with a film and a report.
 
-    Example: stmpl demo --frames 6
-    One sheet on the bone, as in the paper: stmpl demo --node.tissue paper --node.method winkler
+    Example: stmpl demo --robot.force 5 10 --frames 6
+    Scripted presses, on one sheet on the bone as in the paper: stmpl demo --device probe --node.tissue paper
     """
     from stmpl_ros.demo import run
 

@@ -23,7 +23,8 @@ REACH_S, APPROACH_S, HOLD_S, RELEASE_S = 0.6, 1.4, 1.0, 1.0  # durations of phas
 SETTLE_S = 0.5  # time into a phase from which it is judged
 RAMP_S = 0.4  # time in which the speed along a circle is reached
 FIRST = 0.3  # share of the force with which the tool comes to the skin
-START_M = 0.01  # height over the skin at which the tool begins and ends [m]
+LANDED = 0.6  # share of the approach after which it is taken to touch, and the force rises
+START_M, NEAR_M = 0.01, 0.003  # height over the skin at which the tool begins and ends; from which it approaches [m]
 
 
 @dataclass(frozen=True)
@@ -99,9 +100,10 @@ class Course:
             share = _smooth((at - phase.start) / phase.duration)
             point = self.circle.site.point + share * (point - self.circle.site.point)
             normal = self.circle.site.normal + share * (normal - self.circle.site.normal)
-            normal, force, height = normal / np.linalg.norm(normal), None, radius + START_M
+            normal, force = normal / np.linalg.norm(normal), None
+            height = radius + START_M + share * (NEAR_M - START_M)
         elif phase.name == "approach":
-            force *= FIRST + (1 - FIRST) * _smooth((at - phase.start) / (0.7 * phase.duration))
+            force *= FIRST + (1 - FIRST) * _smooth(((at - phase.start) / phase.duration - LANDED) / (1 - LANDED))
         elif phase.name == "release":
             height, force = radius + START_M * _smooth((at - phase.start) / (0.7 * RELEASE_S)), None
         turn = pose_world_from_layer[:3, :3]
@@ -197,6 +199,14 @@ class Log:
                           dtype=[("name", "U16"), ("start", float), ("duration", float), ("force", float)])  # fmt: skip
         np.savez_compressed(path, **rows, phases=phases)
         return path
+
+    @classmethod
+    def load(cls, path: Path) -> Log:
+        """What `save` wrote."""
+        with np.load(path) as kept:
+            rows = {name: kept[name] for name in kept.files if name != "phases"}
+            phases = tuple(Phase(str(name), *map(float, numbers)) for name, *numbers in kept["phases"].tolist())
+        return cls(**rows, phases=phases)
 
 
 class Massage:

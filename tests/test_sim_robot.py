@@ -22,7 +22,7 @@ def forearm() -> SoftLayer:
 
 
 def test_the_arm_presses_circles_and_lets_go(forearm: SoftLayer, tmp_path: Path) -> None:
-    from stmpl_sim.massage import Course, Massage
+    from stmpl_sim.massage import Course, Log, Massage
     from stmpl_sim.scene import build
     from stmpl_sim.site import Site
 
@@ -37,8 +37,9 @@ def test_the_arm_presses_circles_and_lets_go(forearm: SoftLayer, tmp_path: Path)
             assert log.off[log.during(phase)].max() < 5e-4
     assert not log.wrench[-1].any()
     assert abs(log.energy[-1]) < 0.1 * log.energy.max()
-    kept = np.load(log.save(tmp_path / "log.npz"))
-    np.testing.assert_array_equal(kept["force"], log.force)
+    kept = Log.load(log.save(tmp_path / "log.npz"))
+    np.testing.assert_array_equal(kept.force, log.force)
+    assert kept.phases == log.phases
 
 
 def test_a_course_is_smooth_and_its_rates_are_its_derivatives(forearm: SoftLayer) -> None:

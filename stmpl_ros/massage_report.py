@@ -1,0 +1,237 @@
+"""What a recorded massage shows first: film, force against its set-point, energy, rate kept, as HTML."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from bags.compare import Comparison
+from bags.page import image, inside, table, text
+from bags.run import NANO
+from bags.wire import stamp_ns
+from stmpl_ros.parameters import RobotConfig
+from stmpl_ros.robot import LOG, TOOL, scene_of
+
+if TYPE_CHECKING:
+    from stmpl_sim.massage import Log, Phase
+
+FILM = "film.webp"
+FILM_RATE = 15.0  # frames a second
+LARGEST_OFF_N = 0.2  # difference of the mean force of a phase from what was asked for
+LARGEST_GAIN = 0.01  # energy that the contact gave out beyond what was put in, over what was stored
+LARGEST_APART = 0.01  # difference of the node's force from the simulator's, over the largest
+INK, ASKED, NODE, WRIST, TRUTH = "#2b2b2b", "#9a9a9a", "#c1440e", "#7aa6c2", "#1f4e79"
+
+
+@dataclass(frozen=True, eq=False)
+class Massaged:
+    """A recorded massage, put together from the recording and the robot's own log.
+
+    Args:
+        log: log of the robot.
+        answered: times of the node's answers since the start [s], (N,), and the forces that they say [N], (N,).
+        measured: times and forces of the wrist's sensor, as recorded, (M,) each.
+        solved: times and forces of the reference, (K,) each, and the answers' forces at the same frames, (K,).
+        real_time: simulated time over real time, from the first recorded pose to the last [-].
+        poses: rate of the recorded poses by the recorder's clock [Hz].
+        film: film, its file; None: none could be made.
+        frames_by: renderer of the film.
+        colour_m: displacement of the film's last colour [m].
+    """
+
+    log: Log
+    answered: tuple[np.ndarray, np.ndarray]
+    measured: tuple[np.ndarray, np.ndarray]
+    solved: tuple[np.ndarray, np.ndarray, np.ndarray]
+    real_time: float
+    poses: float
+    film: Path
+    frames_by: str
+    colour_m: float
+
+    @property
+    def felt(self) -> np.ndarray:
+        """Force between tool and skin in the simulation, at the times of the answers, (N,) [N]."""
+        return np.interp(self.answered[0], self.log.time, np.linalg.norm(self.log.wrench[:, :3], axis=1))
+
+    @property
+    def apart(self) -> float:
+        """Largest difference of the node's force from the simulation's, over the largest force [-]."""
+        top = float(self.felt.max())
+        return float(np.abs(self.answered[1] - self.felt).max()) / top if top > 0 else 0.0
+
+    @property
+    def off_reference(self) -> np.ndarray:
+        """Difference of the answers' forces from the reference's, over these, (K,) [-]."""
+        return self.solved[2] / self.solved[1] - 1
+
+    @property
+    def gained(self) -> float:
+        """Energy that the contact gave out beyond what was put in, over what was stored [-]."""
+        most = float(self.log.energy.max())
+        return -float(self.log.energy[-1]) / most if most > 0 else 0.0
+
+    def held(self) -> Iterator[tuple[Phase, np.ndarray]]:
+        """Phases in which a force is held, and the log's rows that are judged of each."""
+        for phase in self.log.phases:
+            if phase.name in ("press", "circle"):
+                yield phase, self.log.during(phase)
+
+    def complaints(self) -> Iterator[str]:
+        """What is not sane, one sentence each."""
+        for phase, rows in self.held():
+            mean = float(self.log.force[rows].mean())
+            if abs(mean - phase.force) > LARGEST_OFF_N:
+                yield f"the robot kept {mean:.2f} N of {phase.force:g} N during '{phase.name}'"
+        if self.apart > LARGEST_APART:
+            yield f"the node's force is up to {100 * self.apart:.1f} % off the simulation's"
+        if self.gained > LARGEST_GAIN:
+            yield f"the contact gave out {100 * self.gained:.1f} % more energy than was put in"
+
+
+def massaged(folder: Path, config: RobotConfig, comparison: Comparison) -> Massaged:
+    """Puts a massage together, and makes its film from the recorded answers.
+
+    Args:
+        folder: folder of the run.
+        config: settings of the robot.
+        comparison: comparison of the run.
+
+    Raises:
+        BagError: a recording that lacks what a massage has.
+    """
+    from stmpl_sim.film import Camera, save
+    from stmpl_sim.massage import Log
+
+    run, log = comparison.run.bag, Log.load(folder / LOG)
+    start = min(run.pose_stamps)
+    scene = scene_of(config, run.layer)
+    colour_m = 0.5 * float(run.layer.thickness[scene.site.vertex])
+    camera = Camera(scene.model, run.layer, colour_m)
+    answered, due = [], 0.0
+    for frame in run.frames():
+        at = (frame.stamp_ns - start) * NANO
+        if TOOL in frame.touches and frame.fade == 1:
+            answered.append((at, frame.touches[TOOL].force))
+        if due <= at <= log.time[-1]:
+            _take(camera, scene, log, at, frame)
+            due = max(due + 1 / FILM_RATE, at)
+    camera.close()
+    first, last = start, max(run.pose_stamps)
+    took = (run.received[last] - run.received[first]) * NANO
+    return Massaged(
+        log=log,
+        answered=_columns(answered),
+        measured=_columns([((stamp_ns(message) - start) * NANO, _length(message.wrench.force))
+                           for _, message, _ in run.messages(lambda topic: topic.endswith("wrist/wrench"))]),
+        solved=_solved(comparison, start),
+        real_time=(last - first) * NANO / took,
+        poses=(len(run.pose_stamps) - 1) / took,
+        film=save(camera.frames, folder / FILM, FILM_RATE),
+        frames_by=camera.backend,
+        colour_m=colour_m,
+    )  # fmt: skip
+
+
+def front(done: Massaged, limb: str) -> str:
+    """HTML that a report opens with; `limb` is what is massaged."""
+    drawn = " Drawn in software: there is no GL here." if done.frames_by == "software" else ""
+    forces = sorted({phase.force for phase, _ in done.held()})
+    said = " and ".join(f"{force:g}" for force in forces)
+    return "\n".join([
+        f"<h1>A robot massages a {text(limb.replace('_', ' '))} with {said} N</h1>",
+        inside("image/webp", done.film.read_bytes()),
+        f"<p class=note>The robot as its simulator moved it, the skin as the node answered it over ROS: coloured by "
+        f"displacement, from none to {1e3 * done.colour_m:.0f} mm, not exaggerated.{drawn}</p>",
+        "<h2>Force, energy, rate</h2>",
+        image(course_figure(done)),
+        table(("phase", "asked N", "kept N", "worst N", "depth mm", "off course mm", "in range %"), _phases(done)),
+        table(("measured", "value"), rows(done)),
+    ])  # fmt: skip
+
+
+def rows(done: Massaged) -> list[tuple[str, str]]:
+    """Figures of a massage as a whole, name and value with unit."""
+    off, log = done.off_reference, done.log
+    figures = [
+        ("highest force", f"{log.force.max():.2f} N"),
+        ("node's force off the simulation's", f"at most {100 * done.apart:.2f} % of the highest"),
+        ("energy stored in the skin", f"{1e3 * log.energy.max():.2f} mJ at most"),
+        ("given out beyond what was put in", f"{100 * done.gained:+.1f} % of that"),
+        ("physics and contact", f"{1 / (log.time[1] - log.time[0]):.0f} Hz"),
+        ("poses over ROS", f"{done.poses:.0f} Hz; the simulation ran at {done.real_time:.2f} of real time, which it "
+         "does not exceed"),
+    ]  # fmt: skip
+    if len(off):
+        told = ", ".join(f"{100 * one:+.1f}" for one in off)
+        figures.insert(2, ("force off finite elements", f"{told} % at the compared frames"))
+    return figures
+
+
+def course_figure(done: Massaged) -> Figure:
+    """Force against its set-point, and the energy that the skin holds, over time."""
+    log = done.log
+    figure = Figure(figsize=(10.5, 5.4), layout="constrained")
+    force, energy = figure.subplots(2, 1, sharex=True, height_ratios=(2, 1))
+    force.plot(*done.measured, color=WRIST, lw=1.0, label="measured at the wrist (recorded)")
+    force.plot(*done.answered, color=NODE, lw=1.4, label="the node's answers (recorded)")
+    force.plot(log.time, log.asked, color=INK, lw=1.2, ls="--", label="asked for")
+    if len(done.solved[0]):
+        force.plot(done.solved[0], done.solved[1], "o", color=TRUTH, ms=6, label="finite elements")
+    force.set(ylabel="force [N]", ylim=(0, None))
+    energy.plot(log.time, 1e3 * log.energy, color=INK, lw=1.2)
+    energy.set(ylabel="energy held by the skin [mJ]", xlabel="time [s]")
+    for axes in (force, energy):
+        for phase in log.phases:
+            axes.axvline(phase.start, color=ASKED, lw=0.6)
+        axes.spines[["top", "right"]].set_visible(False)
+    top = force.get_ylim()[1]
+    for phase in log.phases:
+        force.text(phase.start + 0.05, 1.01 * top, phase.name, fontsize=9, color=INK, va="bottom")
+    force.legend(frameon=False, fontsize=9, loc="upper left", bbox_to_anchor=(0.0, 0.96))
+    return figure
+
+
+def _take(camera: Any, scene: Any, log: Log, at: float, frame: Any) -> None:
+    from stmpl_sim.engine import mujoco
+
+    data, row = mujoco.MjData(scene.model), min(int(np.searchsorted(log.time, at)), len(log.time) - 1)
+    data.qpos[:] = log.qpos[row]
+    mujoco.mj_forward(scene.model, data)
+    limb = log.limb[row]
+    points = (scene.layer.vertices + frame.displacement) @ limb[:3, :3].T + limb[:3, 3]
+    camera.take(data, points, limb, frame.magnitude)
+
+
+def _solved(comparison: Comparison, start: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    key, found = f"{TOOL}.normal_n", []
+    for pair in comparison.judged:
+        if key in pair.reference.trust.figures:
+            at = (pair.frame.stamp_ns - start) * NANO
+            found.append((at, abs(pair.reference.trust.figures[key]), pair.frame.touches[TOOL].force))
+    at, reference, ours = np.array(found, dtype=float).reshape(-1, 3).T
+    return at, reference, ours
+
+
+def _columns(pairs: list[tuple[float, float]]) -> tuple[np.ndarray, np.ndarray]:
+    first, second = np.array(pairs, dtype=float).reshape(-1, 2).T
+    return first, second
+
+
+def _length(v: Any) -> float:
+    return float(np.linalg.norm([v.x, v.y, v.z]))
+
+
+def _phases(done: Massaged) -> list[tuple[str, ...]]:
+    shown = []
+    for phase, judged in done.held():
+        force, log = done.log.force[judged], done.log
+        shown.append((phase.name, f"{phase.force:.1f}", f"{force.mean():.2f} ± {force.std():.2f}",
+                      f"{np.abs(force - phase.force).max():.2f}", f"{1e3 * np.nanmean(log.depth[judged]):.1f}",
+                      f"{1e3 * log.off[judged].max():.2f}", f"{100 * log.trusted[judged].mean():.0f}"))  # fmt: skip
+    return shown

@@ -1,0 +1,45 @@
+"""The demo: its settings reach the processes that it starts, and a massage is recorded, replayed, judged and shown."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import tyro
+from pydantic import BaseModel
+
+from stmpl_ros.demo import flags_of
+from stmpl_ros.parameters import ProbeConfig, RobotConfig
+from tests.bus import ROOT
+
+
+@pytest.mark.parametrize("config", [
+    ProbeConfig(scripts=("squeeze",), rate=50.0, listeners=2),
+    RobotConfig(),
+    RobotConfig(force=(2.0, 7.5), told=True, out=Path("x"), at=(0.4, -0.1, 0.2), robot=Path("a.urdf"), end="tool0"),
+])  # fmt: skip
+def test_flags_say_what_a_configuration_holds(config: BaseModel) -> None:
+    flags = flags_of(config)
+    assert tyro.cli(type(config), args=flags) == config
+
+
+@pytest.mark.slow
+def test_a_massage_over_ros_is_recorded_replayed_judged_and_shown(tmp_path: Path) -> None:
+    pytest.importorskip("mujoco", reason="pip install 'stmpl[sim]'")
+    from stmpl_ros.cli import main
+
+    flags = "--node.edge-length 0.0075 --robot.laps 0.2 --robot.physics 250 --frames 1 --runs".split()
+    command = [sys.executable, "-m", "stmpl_ros.cli", "demo", *flags, str(tmp_path)]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=600)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert "every one bit for bit as recorded" in done.stdout.replace("\n", " ")
+    folder = tmp_path / "latest"
+    page = (folder / "report.html").read_text()
+    first = page.index("<h1>A robot massages a left forearm with 5 N</h1>")
+    assert first < page.index("data:image/webp;base64") < page.index("moment_net against rigid_fem")
+    assert (folder / "film.webp").stat().st_size > 20_000 and (folder / "robot.npz").is_file()
+    for row in ("force off finite elements", "energy stored in the skin", "poses over ROS"):
+        assert row in page
+    with pytest.raises(SystemExit) as ended:
+        main(["info", str(folder), "--json"])
+    assert ended.value.code == 0
