@@ -262,6 +262,41 @@ class RobotConfig(BaseModel):
     linger: float = Field(default=2.0, ge=0, description="time that the simulated clock goes on at the end [s]")
 
 
+class LinksConfig(BaseModel):
+    """The settings of soft skin for a simulator that talks ROS."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    body: str = Field(min_length=1, description="link that carries the skin; its axes are the skin's")
+    tools: tuple[str, ...] = Field(
+        min_length=1, description="links that may touch, each with a file of its surface [m], its axes: tip=tip.stl"
+    )
+    part: str = Field(default=FOREARM, description="part of the average body")
+    tissue: str = Field(default="relaxed", description="tissue of it, as of stmpl node: relaxed, tensed, or a file")
+    edge_length: float = Field(default=3e-3, gt=0, le=0.05, description="length of the skin mesh's edges [m]")
+    poses: str = Field(default="links/{link}/pose", description="topic of the pose of a link in the world")
+    pose_type: Literal["pose", "odometry", "tf"] = Field(
+        default="pose", description="message of it: PoseStamped, Odometry, or /tf (where tf2_msgs is installed)"
+    )
+    wrenches: str = Field(default="links/{link}/wrench", description="topic of the wrench on a link")
+    wrench_type: Literal["wrench", "entity"] = Field(
+        default="wrench",
+        description="message of it: WrenchStamped, or ros_gz_interfaces/EntityWrench, which names its link",
+    )
+    axes: Literal["world", "link"] = Field(default="world", description="axes of the wrenches")
+    about: tuple[str, ...] = Field(
+        default=(),
+        description="point of a link that its wrench is about, its axes [m], where not its origin: tip=0,0,0.02",
+    )
+    damping: float = Field(default=0.0, ge=0, description="damping of the contact [s/m]; 0: none")
+    friction: str = Field(
+        default="none", description="coefficient of friction, or dry, moist, oiled, glove, typical, or none"
+    )
+    silence: float = Field(
+        default=0.25, gt=0, description="time without a pose after which every wrench is set to nothing [s]"
+    )
+
+
 class RecordConfig(BaseModel):
     """The recorder's settings."""
 

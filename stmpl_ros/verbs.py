@@ -13,7 +13,7 @@ from stmpl_core.errors import InvalidInput
 from stmpl_core.extras import needed
 from stmpl_core.methods import METHODS
 from stmpl_core.methods import method as method_named
-from stmpl_ros.parameters import DemoConfig, NodeConfig, ProbeConfig, RecordConfig, RobotConfig
+from stmpl_ros.parameters import DemoConfig, LinksConfig, NodeConfig, ProbeConfig, RecordConfig, RobotConfig
 from stmpl_ros.scene import SceneConfig
 from stmpl_ros.view.config import ViewConfig
 
@@ -72,6 +72,20 @@ def robot(config: Annotated[RobotConfig, Flat] = ROBOT) -> int:
     """
     needed("stmpl robot", "sim", "mujoco")
     from stmpl_ros.robot import run
+
+    return run(config, ros_arguments)
+
+
+def links(config: Annotated[LinksConfig, Flat]) -> int:
+    """Soft skin for a simulator that talks ROS: poses of links in, wrenches on links out, one for each instant.
+
+    Example: stmpl links --body forearm --tools finger=finger.stl
+    Gazebo: stmpl links --body arm::forearm --tools hand::tip=tip.stl --wrench-type entity --wrenches /world/lab/wrench
+
+    Args:
+        config: settings.
+    """
+    from stmpl_ros.links import run
 
     return run(config, ros_arguments)
 

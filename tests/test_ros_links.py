@@ -1,0 +1,193 @@
+"""Soft skin for a simulator over ROS: real messages over DDS, and the motion of one process."""
+
+import importlib
+import importlib.util
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from geometry_msgs.msg import PoseStamped, WrenchStamped
+from nav_msgs.msg import Odometry
+
+from bags.wire import header, pose_message, stamp_ns
+from stmpl_core.errors import InvalidInput
+from stmpl_ros.links import RosWorld, moved_to, points_of, tools_of, topic_of
+from stmpl_ros.topics import STREAM
+from stmpl_sim import Poses, Reaction
+from tests.bus import Robot, running
+from tests.scenes import plate
+
+mujoco = pytest.importorskip("mujoco", reason="pip install 'stmpl[sim]'")
+ADAPTER = """
+import json, sys
+from stmpl_ros.links import run
+from stmpl_ros.parameters import LinksConfig
+from stmpl_core import Tool
+from tests.scenes import plate
+import trimesh
+config = LinksConfig(body="slab", tools=("bob=-",), about=("slab=0,0,-0.009",), **json.loads(sys.argv[1]))
+skin, mesh = plate(0.06, youngs_modulus=20e3), trimesh.creation.icosphere(4, 0.012)
+tools = [Tool("bob", mesh.vertices, mesh.faces)]
+sys.exit(run(config, sys.argv[2:], build=lambda settings: skin, tools=tools))
+"""
+MODEL = """
+<mujoco><option timestep="1e-3" gravity="0 0 -9.81"/><worldbody>
+  <body name="slab"><joint type="slide" axis="0 0 1" stiffness="3000" damping="20"/>
+    <geom type="box" size=".03 .03 .001" pos="0 0 -.009" mass="1"/></body>
+  <body name="bob" pos="0.004 -.003 .0118"><freejoint/><geom name="ball" type="sphere" size=".012" mass=".3"/></body>
+</worldbody><contact><exclude body1="slab" body2="bob"/></contact></mujoco>
+"""
+STEPS = 120
+GAZEBO = {"wrench_type": "entity", "wrenches": "/world/lab/wrench"}
+
+
+class Simulator(Robot):
+    """A simulator that says where its links are, and waits for the wrenches of that instant."""
+
+    def __init__(self, space: str, pose_type: str = "pose", wrench_type: str = "wrench", axes: str = "world",
+                 **_: str) -> None:  # fmt: skip
+        super().__init__("simulator", space)
+        self.axes, self.wrenches = axes, {}
+        self.model = mujoco.MjModel.from_xml_string(MODEL)
+        self.data = mujoco.MjData(self.model)
+        self.kind = {"pose": PoseStamped, "odometry": Odometry}[pose_type]
+        self.poses = {n: self.node.create_publisher(self.kind, f"links/{n}/pose", STREAM) for n in ("slab", "bob")}
+        if wrench_type == "entity":
+            kind = importlib.import_module("ros_gz_interfaces.msg").EntityWrench
+            self.node.create_subscription(kind, "/world/lab/wrench", lambda m: self.keep(m.entity.name, m), STREAM)
+        else:
+            for name in self.poses:
+                self.node.create_subscription(WrenchStamped, f"links/{name}/wrench",
+                                              lambda m, name=name: self.keep(name, m), STREAM)  # fmt: skip
+
+    def keep(self, name: str, message: Any) -> None:
+        self.wrenches[name, stamp_ns(message)] = message
+
+    def pose(self, name: str) -> np.ndarray:
+        out, body = np.eye(4), self.data.body(name)
+        out[:3, :3], out[:3, 3] = body.xmat.reshape(3, 3), body.xpos
+        return out
+
+    def step(self, number: int) -> None:
+        stamp = 1_000_000_000 + number * 1_000_000
+        mujoco.mj_step1(self.model, self.data)
+        for name, publisher in self.poses.items():
+            message = pose_message(self.pose(name), "lab", stamp)
+            if self.kind is Odometry:
+                wrapped = Odometry(header=header("lab", stamp), child_frame_id=name)
+                wrapped.pose.pose = message.pose
+                message = wrapped
+            publisher.publish(message)
+        self.wait(lambda: all((name, stamp) in self.wrenches for name in self.poses), f"the wrenches of step {number}")
+        for name in self.poses:
+            message = self.wrenches[name, stamp]
+            f, t = message.wrench.force, message.wrench.torque
+            wrench = np.array([[f.x, f.y, f.z], [t.x, t.y, t.z]])
+            if self.axes == "link":
+                assert message.header.frame_id == name
+                wrench = wrench @ self.pose(name)[:3, :3].T
+            else:
+                assert message.header.frame_id == "lab"
+            self.data.body(name).xfrc_applied[:] = wrench.ravel()
+        mujoco.mj_step2(self.model, self.data)
+
+
+@pytest.fixture(scope="module")
+def in_one_process() -> np.ndarray:
+    """Configurations of the same scene in one process, a row a step."""
+    from stmpl_core.methods import MomentNet
+    from stmpl_sim import SoftBody
+
+    model = mujoco.MjModel.from_xml_string(MODEL)
+    data = mujoco.MjData(model)
+    skin = SoftBody(model, plate(0.06, youngs_modulus=20e3), body="slab", tools=["ball"], method=MomentNet())
+    rows = []
+    for _ in range(STEPS):
+        mujoco.mj_step1(model, data)
+        skin.apply(data)
+        mujoco.mj_step2(model, data)
+        rows.append(data.qpos.copy())
+    return np.array(rows)
+
+
+@pytest.fixture(scope="module")
+def context() -> Any:
+    import rclpy
+
+    rclpy.init()
+    yield
+    rclpy.shutdown()
+
+
+@pytest.mark.parametrize("settings", [{}, {"pose_type": "odometry", "axes": "link"}, GAZEBO],
+                         ids=["poses", "odometry-link-axes", "gazebo"])  # fmt: skip
+def test_a_simulator_over_ros_moves_as_one_in_the_same_process(context, settings, in_one_process) -> None:
+    if settings is GAZEBO:
+        pytest.importorskip("ros_gz_interfaces.msg")
+    space = f"/links_{len(settings)}_{settings.get('axes', 'world')}"
+    simulator, rows = Simulator(space, **settings), []
+    with running("-c", ADAPTER, json.dumps(settings), "--ros-args", "-r", f"__ns:={space}") as adapter:
+        simulator.partner = adapter
+        simulator.wait(lambda: all(one.get_subscription_count() for one in simulator.poses.values()), "the adapter")
+        for number in range(STEPS):
+            simulator.step(number)
+            rows.append(simulator.data.qpos.copy())
+        last = max(stamp for _, stamp in simulator.wrenches)
+        pressed = simulator.wrenches["bob", last]
+        simulator.wait(lambda: simulator.wrenches["bob", last] is not pressed, "that nothing pushes, after silence")
+        assert not simulator.wrenches["bob", last].wrench.force.z
+    simulator.node.destroy_node()
+    assert pressed.wrench.force.z != 0 and abs(in_one_process[-1][0]) > 1e-3  # it pressed, and the slab gave way
+    np.testing.assert_allclose(rows, in_one_process, atol=1e-9)
+
+
+def test_an_instant_is_whole_once_all_that_moves_has_one_stamp() -> None:
+    sent: list[tuple[str, int]] = []
+    world = RosWorld("arm", ["left", "right"], lambda name, wrench, pose, stamp: sent.append((name, stamp)))
+    pose = np.eye(4)
+    assert [world.put(name, pose, 1) for name in ("arm", "left", "right")] == [False, False, True]
+    assert [world.put(name, pose, 2) for name in ("left", "right")] == [False, False]  # does the arm move?
+    assert [world.put(name, pose, 3) for name in ("left", "right")] == [False, True]  # it stands still
+    assert not world.put("left", pose, 4)
+    assert world.put("right", pose, 4)
+    assert not world.put("right", pose, 4)  # said again
+    assert list(world.poses().tools) == ["left", "right"]
+    nothing = np.zeros(6)
+    world.push(Reaction({"left": nothing, "right": nothing}, nothing, {}, None))  # type: ignore[arg-type]
+    assert sent == [("left", 4), ("right", 4), ("arm", 4)]
+    assert isinstance(world.poses(), Poses)
+
+
+def test_a_wrench_about_another_point_does_the_same_work() -> None:
+    random = np.random.default_rng(0)
+    wrench, shift, twist = random.normal(size=6), random.normal(size=3), random.normal(size=6)
+    there = np.concatenate([twist[:3] + np.cross(twist[3:], shift), twist[3:]])  # velocity of the other point
+    assert moved_to(wrench, shift) @ there == pytest.approx(wrench @ twist)
+
+
+def test_what_cannot_be_is_one_sentence(tmp_path: Path) -> None:
+    import trimesh
+
+    trimesh.creation.icosphere(2, 0.012).export(tmp_path / "tip.stl")
+    (tip,) = tools_of([f"hand::tip={tmp_path / 'tip.stl'}"])
+    assert tip.name == "hand::tip" and np.ptp(tip.vertices[:, 0]) == pytest.approx(0.024, rel=1e-3)
+    assert topic_of("links/{link}/pose", "hand::tip") == "links/hand/tip/pose"
+    with pytest.raises(InvalidInput, match=r"does not say where the link's name goes"):
+        topic_of("/pose", "tip")
+    with pytest.raises(InvalidInput, match=r"'tip' is no link=file"):
+        tools_of(["tip"])
+    with pytest.raises(InvalidInput, match=r"'tip=1,2' is no link=x,y,z"):
+        points_of(["tip=1,2"], ["tip"])
+    with pytest.raises(InvalidInput, match=r"no link 'toe'; known are arm, tip"):
+        points_of(["toe=0,0,1"], ["arm", "tip"])
+
+
+def test_links_of_gazebo_need_its_package() -> None:
+    from stmpl_ros.links import _entity_wrench
+
+    if importlib.util.find_spec("ros_gz_interfaces"):
+        pytest.skip("it is installed")
+    with pytest.raises(InvalidInput, match="need the package ros_gz_interfaces"):
+        _entity_wrench()
