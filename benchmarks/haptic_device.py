@@ -8,10 +8,13 @@ import numba
 import numpy as np
 import trimesh
 
-from stmpl_core import Contact, SoftLayer, Tool
+from stmpl_core import Contact, SoftLayer, State, Tool
 from stmpl_core.body import Body
+from stmpl_core.friction import Friction
 from stmpl_core.haptics import DeviceLoop, LoopSettings
-from stmpl_core.local_contact import LocalContact, local_contact
+from stmpl_core.history import History
+from stmpl_core.local_contact import LocalContact, local_contact, local_contacts
+from stmpl_core.tissue import Prony
 from stmpl_core.toucher import Toucher
 
 FINE = 25e-6  # s, step of the device's own motion
@@ -46,7 +49,7 @@ class Device:
 
 @dataclass(frozen=True)
 class Hand:
-    """A grip on the device, spring and damper to where the person wants it: down, hold, up.
+    """A grip on the device, spring and damper to where the person wants it: down, hold or stroke and hold, up.
 
     Args:
         stiffness: stiffness of the grip [N/m].
@@ -56,6 +59,7 @@ class Hand:
         press: time to go down [s].
         hold: time to stay [s].
         leave: time to come back [s].
+        stroke: way along the skin that it goes in the first half of the hold [m].
     """
 
     stiffness: float = 300.0
@@ -65,6 +69,7 @@ class Hand:
     press: float = 0.25
     hold: float = 0.6
     leave: float = 0.15
+    stroke: float = 0.0
 
     @property
     def duration(self) -> float:
@@ -77,15 +82,29 @@ class Hand:
         share = _smooth(down) if t < self.press + self.hold else 1 - _smooth(up)
         return self.away - share * (self.away + self.deep)
 
+    def aside(self, t: float) -> float:
+        """Wanted way along the skin [m]."""
+        return self.stroke * _smooth((t - self.press) / (0.5 * self.hold))
+
 
 @dataclass(frozen=True, eq=False)
 class Spot:
-    """A ball over one place of a skin: the node's side of the experiment. Everything here is the real contact."""
+    """A ball over one place of a skin: the node's side of the experiment. Everything here is the real contact.
+
+    Args:
+        toucher: contact law.
+        tool: ball.
+        place, out: place on the skin, and its outward normal, (3,) each.
+        friction: friction of the ball.
+        remembers: choice of a node that keeps a state; without, contacts are elastic and without friction.
+    """
 
     toucher: Toucher
     tool: Tool
     place: np.ndarray
     out: np.ndarray
+    friction: Friction = None
+    remembers: bool = False
 
     @classmethod
     def of(cls, layer: SoftLayer, vertex: int) -> Spot:
@@ -98,23 +117,50 @@ class Spot:
         """The same on a skin of another stiffness [Pa]."""
         return replace(self, toucher=Toucher(self.toucher.layer.with_(youngs_modulus=youngs_modulus)))
 
+    def with_memory(self, relaxation: Prony | None, friction: Friction) -> Spot:
+        """The same where the tissue relaxes and the ball rubs."""
+        layer = self.toucher.layer
+        if relaxation is not None:
+            tissue = layer.tissue.relaxing(relaxation) if layer.stacked else \
+                replace(layer.tissue, relaxation=relaxation)  # fmt: skip
+            layer = layer.with_(tissue=tissue)
+        return replace(self, toucher=Toucher(layer), friction=friction, remembers=True)
+
     def pose(self, origin: np.ndarray) -> np.ndarray:
         """The ball's pose with its centre there."""
         pose = np.eye(4)
         pose[:3, 3] = origin
         return pose
 
-    def centre(self, height: float) -> np.ndarray:
-        """The ball's centre when its lowest point is at `height` over the skin [m]."""
-        return self.place + (BALL + height) * self.out
+    def centre(self, height: float, aside: float = 0.0) -> np.ndarray:
+        """The ball's centre when its lowest point is at `height` over the skin, and so far aside [m]."""
+        first = np.cross(self.out, np.eye(3)[np.abs(self.out).argmin()])
+        return self.place + (BALL + height) * self.out + aside / np.linalg.norm(first) * first
 
     def model(self, origin: np.ndarray) -> LocalContact:
-        """The local model there."""
-        return local_contact(self.toucher, Contact(self.tool, self.pose(origin)), rotations=False)
+        """The local model there, elastic and without friction."""
+        return local_contact(self.toucher, Contact(self.tool, self.pose(origin)))
 
     def force(self, origin: np.ndarray) -> np.ndarray:
         """The reaction's force on the body there, (3,) [N]."""
         return self.toucher.touch(Contact(self.tool, self.pose(origin))).wrench[:3]
+
+
+class Node:
+    """The node of a spot: local models, with a memory where the spot has one."""
+
+    def __init__(self, spot: Spot) -> None:
+        self.spot, self._history = spot, History(spot.toucher, spot.friction)
+        self._state, self._time = State(), 0.0
+
+    def model(self, origin: np.ndarray, time: float) -> LocalContact:
+        """The local model of a ball there at a time [s], not before that of the last call."""
+        if not self.spot.remembers:
+            return self.spot.model(origin)
+        contact, dt = Contact(self.spot.tool, self.spot.pose(origin)), time - self._time
+        touches, self._state = self._history.step([contact], self._state, dt)
+        self._time = time
+        return local_contacts(self._history, touches, self._state)[0]
 
 
 @dataclass(frozen=True, eq=False)
@@ -183,7 +229,7 @@ def play(device: Device, hand: Hand, settings: LoopSettings, spot: Spot, *, node
         node_delay: time from that instant to the model's arrival [s].
         held_force: models that come without their stiffness: what a loop without a local model would render.
     """
-    loop, dt = DeviceLoop(settings), 1 / device.rate
+    loop, dt, node = DeviceLoop(settings), 1 / device.rate, Node(spot)
     rng, count = np.random.default_rng(0), round(hand.duration * device.rate)
     sent = [np.zeros(3)] * (device.delay_steps + 1)
     motion = np.concatenate([spot.centre(hand.height(0.0)), np.zeros(3)])
@@ -194,9 +240,9 @@ def play(device: Device, hand: Hand, settings: LoopSettings, spot: Spot, *, node
         t = k * dt
         # The node: an answer for where the proxy is now, which arrives later.
         if t >= due - 1e-9:
-            model = spot.model(loop.proxy if k else motion[:3])
+            model = node.model(loop.proxy if k else motion[:3], t)
             if held_force:
-                model = replace(model, stiffness=np.zeros((6, 6)))
+                model = replace(model, stiffness=np.zeros((6, 6)), grip=None)
             under_way.append((t + node_delay, model))
             due += 1 / node_rate
         while under_way and under_way[0][0] <= t + 1e-9:
@@ -212,7 +258,7 @@ def play(device: Device, hand: Hand, settings: LoopSettings, spot: Spot, *, node
         sent = sent[1:] + [loop.step(read, velocity, dt).copy()]
         rows[k] = (spot.out @ (motion[:3] - spot.place) - BALL, spot.out @ sent[0], *energies, -loop.taken_in,
                    loop.balance)
-        wish, wished = spot.centre(hand.height(t)), spot.centre(hand.height(t + dt))
+        wish, wished = (spot.centre(hand.height(at), hand.aside(at)) for at in (t, t + dt))
         _move(motion, energies, sent[0], wish, (wished - wish) / dt, dt, device.mass, device.damping, hand.stiffness,
               hand.damping)
     height, force, to_hand, from_loop, observed, balance = rows.T
@@ -235,7 +281,7 @@ def _move(motion, energies, force, wish, wish_velocity, dt, mass, damping, grip,
 
 
 def _stiffnesses(model: LocalContact, settings: LoopSettings) -> tuple[float, float]:
-    along = float(model.normal @ model.stiffness[:3, :3] @ model.normal)
+    along = float(model.normal @ model.push_stiffness[:3, :3] @ model.normal)
     return along, along * settings.coupling_stiffness / (along + settings.coupling_stiffness) if along > 0 else 0.0
 
 

@@ -106,7 +106,7 @@ class Columns:
 
     def clearance(self, field: SignedDistance, pose: Transform, near: np.ndarray, far: float) -> Clearance:
         """Distance of the tool from columns; those further than `far` [m] are only known to be so."""
-        least, skin = _clearances(_grid(field), pose, self.points, self.inward, self.layer.thickness, near, far)
+        least, skin = _clearances(grid_of(field), pose, self.points, self.inward, self.layer.thickness, near, far)
         return Clearance(near, least, skin)
 
     def squeeze(self, field: SignedDistance, pose: Transform, clearance: Clearance) -> Squeeze:
@@ -118,7 +118,7 @@ class Columns:
         wall = WALL * float(self.layer.thickness[covered].mean())
         under = float((-least - np.maximum(-above, 0.0)).max()) / wall
         sunk = under > LEAST_UNDER
-        grid, skin = _grid(field), (self.points, self.inward, self.layer.thickness, self.faces)
+        grid, skin = grid_of(field), (self.points, self.inward, self.layer.thickness, self.faces)
         faces = self._start, self._around, self._slot
         found, vertices, depth, rests = _cover(grid, pose, *skin, *faces, covered, sunk)
         nodes = nodes_under(grid, pose, middle_of(field, pose), skin, found, sunk)
@@ -142,7 +142,7 @@ def shifted(pose: Transform, by: np.ndarray) -> Transform:
 
 def depth_along(field: SignedDistance, pose: Transform, points: Points, way: Points, guess: np.ndarray) -> np.ndarray:
     """Way of points (N, 3) along unit vectors (N, 3) out of a tool, (N,) [m], from a guess > 0."""
-    return _depths_along(_grid(field), pose, points, np.ascontiguousarray(way), guess)
+    return _depths_along(grid_of(field), pose, points, np.ascontiguousarray(way), guess)
 
 
 def _sinking(grid: tuple, pose: Transform, nodes: Nodes) -> np.ndarray:
@@ -160,7 +160,8 @@ def _sinking(grid: tuple, pose: Transform, nodes: Nodes) -> np.ndarray:
     return np.minimum(_depths_along(grid, pose, nodes.points, way, np.maximum(depth * cosine, 1e-9)) * cosine, depth)
 
 
-def _grid(field: SignedDistance) -> tuple[np.ndarray, np.ndarray, float]:
+def grid_of(field: SignedDistance) -> tuple[np.ndarray, np.ndarray, float]:
+    """What kernels take of a distance field: coefficients, origin and spacing."""
     return field.coefficients, field.origin, field.spacing
 
 

@@ -13,7 +13,7 @@ from stmpl_core.methods.moment_net import think_few
 from stmpl_core.moments import Surroundings
 from stmpl_core.networks import ARRAYS, NODE, PRESSURE, STACK_NODE, Weights, shipped
 from stmpl_core.nodes import Nodes
-from stmpl_core.obstacle import RINGS, hold_off, moments_of, pairs, power_of, response, solve
+from stmpl_core.obstacle import RINGS, moments_of, pairs, power_of, rates_of, response, solve
 from stmpl_core.rays import column_pressure
 
 MAX_LOG_RATIO = 2.5  # largest |log| of pressure over that of the linear layer [-]
@@ -22,6 +22,7 @@ ON_STACK, STACKS_SEE, SEEN_ALIKE = STACK_NODE.at, STACK_NODE.size, STACK_NODE.at
 LINEAR_TO = 0.6  # strain to which contact is solved; beyond it the columns' barrier takes over
 HARDENING = 0.75  # power of the columns' pressure with which it does
 FADE, FADE_RING = 0.03, 2  # strain at and around a node at which half of the correction is left: a touch begins linear
+SMALL_STEP = 5e-3  # of the largest force, in which the network's part of a slope is found: far above float32's noise
 STACK_FADE = 0.1  # the same on a stack, whose linear response alone is good to some percent up to there
 
 
@@ -122,31 +123,72 @@ class ContactNet:
         corrected = _correct(*look[:3], *(self.weights.arrays[name] for name in ARRAYS["pressure"]))
         return Held(*corrected, look.power)
 
+    def slopes(self, nodes: Nodes, strain_rates: np.ndarray, sinking_rates: np.ndarray) -> np.ndarray:
+        """Rates of the pressures that `hold` gives, as depths change at nodes that stay where they are, (K, N).
+
+        The linear problem's follow from its active set A: G_AA df_A = dd_A. The network's part is a difference over a
+        small step along that.
+
+        Args:
+            nodes: contact nodes, at least one.
+            strain_rates: rates of their strains in each of K ways, (K, N).
+            sinking_rates: rates of their depths [m], or on a stack of `sinking`, likewise.
+        """
+        group = self.near.groups(nodes.corners[:, 0])
+        network = tuple(self.weights.arrays[name] for name in ARRAYS["pressure"])
+        rates = strain_rates, sinking_rates
+        if self._green is None:
+            return _slopes(*nodes[:7], group, self.near.bent, *self._table, self._moduli, self._nu, *rates, *network)
+        matrix = self._green.matrix(nodes, group)
+        return _slopes_on_stack(*nodes, group, self.near.bent, *self._table, self._moduli, self._nu, matrix,
+                                self._green.effective.thickness, self._green.numbers, *self._green.hardening,
+                                *rates, *network)  # fmt: skip
+
 
 @numba.njit(cache=True, error_model="numpy")
 def _look(points, inward, thickness, area, strain, corners, shares, group, bent, half_space, rows, moduli, nu):
     """See Look."""
-    pressure, moments, vectors, power = hold_off(points, inward, thickness, area, strain, LINEAR_TO, group, half_space,
-                                                 rows)  # fmt: skip
+    mean, here = thickness.mean(), _between(corners, shares, bent)
+    matrix, rings = pairs(points, inward, thickness, area, group, mean, half_space, rows)
+    depth = np.minimum(strain, LINEAR_TO) * thickness / mean
+    force = solve(matrix, depth)
+    seen = _see(rings, points, inward, thickness, area, mean, force, strain, here, moduli, nu)
+    return *seen, power_of(matrix, force, depth.max())
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _see(rings, points, inward, thickness, area, mean, force, strain, bent, moduli, nu):
+    """Pressure, inputs and fade of a Look under forces (N,) over E mean^2."""
+    pressure = force * mean**2 / area
+    moments, vectors = moments_of(rings, points, thickness, area, pressure, strain)
     inputs = np.empty((len(area), NODES_SEE), np.float32)
-    _inputs(pressure, moments, vectors, strain, inward, _between(corners, shares, bent), nu, inputs)
+    _inputs(pressure, moments, vectors, strain, inward, bent, nu, inputs)
     _harden(pressure, strain, moduli)
-    return pressure, inputs, _faded(strain, moments, FADE), power
+    return pressure, inputs, _faded(strain, moments, FADE)
 
 
 @numba.njit(cache=True, error_model="numpy")
 def _look_on_stack(points, inward, thickness, area, strain, corners, shares, sinking, group, bent, half_space, rows,
                    moduli, nu, matrix, t, numbers, log_thickness, hardening):  # fmt: skip
     """See Look; t: thickness of the effective layer [m]; numbers, log_thickness and hardening: those of a Green."""
-    softness = np.exp(numbers[3])
-    even, overlap = np.full(len(area), t), sinking / t
+    even, here = np.full(len(area), t), _between(corners, shares, bent)
     rings = pairs(points, inward, even, area, group, t, half_space, rows)[1]
     depth = sinking * np.minimum(LINEAR_TO / strain, 1.0)
     force = solve(matrix, depth)
-    pressure = force / area
+    seen = _see_on_stack(rings, points, inward, thickness, area, t, force, strain, sinking, here, nu, numbers,
+                         log_thickness, hardening)  # fmt: skip
+    return *seen, power_of(matrix, force, depth.max())
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _see_on_stack(rings, points, inward, thickness, area, t, force, strain, sinking, bent, nu, numbers, log_thickness,
+                  hardening):  # fmt: skip
+    """Pressure, inputs and fade of a Look under forces (N,) over E [m2]."""
+    softness, pressure = np.exp(numbers[3]), force / area
+    even, overlap = np.full(len(area), t), sinking / t
     moments, vectors = moments_of(rings, points, even, area, softness * pressure, overlap)
     alike, inputs = np.empty((len(area), NODES_SEE), np.float32), np.empty((len(area), STACKS_SEE), np.float32)
-    _inputs(softness * pressure, moments, vectors, overlap, inward, _between(corners, shares, bent), nu, alike)
+    _inputs(softness * pressure, moments, vectors, overlap, inward, bent, nu, alike)
     for n in range(len(area)):
         row = inputs[n]
         row[:SEEN_ALIKE] = alike[n, :SEEN_ALIKE]
@@ -157,7 +199,67 @@ def _look_on_stack(points, inward, thickness, area, strain, corners, shares, sin
             top = _hardening(log_thickness, hardening, thickness[n], LINEAR_TO)
             there = _hardening(log_thickness, hardening, thickness[n], strain[n])
             pressure[n] *= (strain[n] / LINEAR_TO * np.exp(there - top)) ** HARDENING
-    return pressure, inputs, _faded(overlap, moments, STACK_FADE), power_of(matrix, force, depth.max())
+    return pressure, inputs, _faded(overlap, moments, STACK_FADE)
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _reached(sinking, strain, sinking_rates, strain_rates):
+    """Rates (K, N) of the depths up to LINEAR_TO [m] for which the linear problem is solved."""
+    out = np.empty_like(strain_rates)
+    for k in range(len(out)):
+        for n in range(len(strain)):
+            over = strain[n] > LINEAR_TO
+            slower = sinking[n] / strain[n] * strain_rates[k, n] if over else 0.0
+            out[k, n] = (LINEAR_TO / strain[n] if over else 1.0) * (sinking_rates[k, n] - slower)
+    return out
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _slopes(points, inward, thickness, area, strain, corners, shares, group, bent, half_space, rows, moduli, nu,
+            strain_rates, sinking_rates, low, high, mean, scale, w1, b1, w2, b2, w3, b3, w4, b4):  # fmt: skip
+    """See ContactNet.slopes."""
+    unit, here = thickness.mean(), _between(corners, shares, bent)
+    matrix, rings = pairs(points, inward, thickness, area, group, unit, half_space, rows)
+    force = solve(matrix, np.minimum(strain, LINEAR_TO) * thickness / unit)
+    rates = rates_of(matrix, force, _reached(strain * thickness, strain, sinking_rates, strain_rates) / unit)
+    seen = _see(rings, points, inward, thickness, area, unit, force, strain, here, moduli, nu)
+    held = _correct(*seen, low, high, mean, scale, w1, b1, w2, b2, w3, b3, w4, b4)[0]
+    out = np.empty_like(rates)
+    for k in range(len(rates)):
+        h = _small(force, rates[k])
+        seen = _see(rings, points, inward, thickness, area, unit, np.maximum(force + h * rates[k], 0.0),
+                    np.maximum(strain + h * strain_rates[k], 0.0), here, moduli, nu)  # fmt: skip
+        out[k] = (_correct(*seen, low, high, mean, scale, w1, b1, w2, b2, w3, b3, w4, b4)[0] - held) / h
+    return out
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _slopes_on_stack(points, inward, thickness, area, strain, corners, shares, sinking, group, bent, half_space, rows,
+                     moduli, nu, matrix, t, numbers, log_thickness, hardening, strain_rates, sinking_rates, low, high,
+                     mean, scale, w1, b1, w2, b2, w3, b3, w4, b4):  # fmt: skip
+    """See ContactNet.slopes."""
+    even, here = np.full(len(area), t), _between(corners, shares, bent)
+    rings = pairs(points, inward, even, area, group, t, half_space, rows)[1]
+    force = solve(matrix, sinking * np.minimum(LINEAR_TO / strain, 1.0))
+    rates = rates_of(matrix, force, _reached(sinking, strain, sinking_rates, strain_rates))
+    seen = _see_on_stack(rings, points, inward, thickness, area, t, force, strain, sinking, here, nu, numbers,
+                         log_thickness, hardening)  # fmt: skip
+    held = _correct(*seen, low, high, mean, scale, w1, b1, w2, b2, w3, b3, w4, b4)[0]
+    out = np.empty_like(rates)
+    for k in range(len(rates)):
+        h = _small(force, rates[k])
+        seen = _see_on_stack(rings, points, inward, thickness, area, t, np.maximum(force + h * rates[k], 0.0),
+                             np.maximum(strain + h * strain_rates[k], 1e-9),
+                             np.maximum(sinking + h * sinking_rates[k], 0.0), here, nu, numbers, log_thickness,
+                             hardening)  # fmt: skip
+        out[k] = (_correct(*seen, low, high, mean, scale, w1, b1, w2, b2, w3, b3, w4, b4)[0] - held) / h
+    return out
+
+
+@numba.njit(cache=True)
+def _small(force, rate):
+    """Step of a difference in which the largest force changes by SMALL_STEP."""
+    return SMALL_STEP * force.max() / max(np.abs(rate).max(), 1e-300)
 
 
 @numba.njit(cache=True, error_model="numpy")

@@ -67,11 +67,14 @@ class DeviceLoop:
     translational stiffness. Rotations of the tool are taken as they were in the newest model: its wrench and
     stiffness hold the tool's attitude of then, and no torque is rendered.
 
+    Friction of the model is a spring along the skin that slips at its cone: T grows by k_t dp, |T| <= limit N, also
+    between answers; a new model's T is blended in.
+
     Passivity observer (Hannaford & Ryu 2002, "Time-domain passivity control of haptic interfaces"), on the
     held force times the way measured since (exact for a held force: Stramigioli et al. 2005), less what coupling and
     contact store (a reference as in Ryu et al. 2005):
 
-        W = -sum f(k-1) . (x(k) - x(k-1)) - V(k),    V = Kc |x - p|^2 / 2 + Fn^2 / (2 kn).
+        W = -sum f(k-1) . (x(k) - x(k-1)) - V(k),    V = Kc |x - p|^2 / 2 + Fn^2 / (2 kn) + T^2 / (2 k_t).
 
     W < 0: the loop gives out what nobody put in. The controller then damps with -W / (v^2 T), up to `most_damping`,
     what the velocity has beyond `velocity_noise`; T is 4 ms, not one sample as in the paper, whose forces jump. A
@@ -91,9 +94,10 @@ class DeviceLoop:
         self._newest: np.ndarray | None = None
         self._taken: np.ndarray | None = None
         self._state = _State(np.zeros(MODEL), np.zeros(MODEL), np.zeros(3), np.zeros(3), np.zeros(3), np.zeros(3),
-                             np.zeros(3), np.zeros((LONGEST_DELAY, 3)), np.zeros(SCALARS))
+                             np.zeros(3), np.zeros(3), np.zeros(3), np.zeros((LONGEST_DELAY, 3)), np.zeros(SCALARS))
         self._state.scalars[AGE] = math.inf
         _step(self._state, self._constants, 1e-3)  # compiles
+        _owe(self._state)
         self._state.scalars[STARTED] = 0.0
 
     def update(self, model: LocalContact) -> None:
@@ -116,6 +120,7 @@ class DeviceLoop:
         if newest is not None and newest is not self._taken:
             self._taken = newest
             state.target[:] = newest
+            _owe(state)
             state.scalars[LEFT], state.scalars[AGE] = self.settings.blend, 0.0
         state.position[:], state.velocity[:] = position, velocity
         if not _step(state, self._constants, dt):
@@ -158,10 +163,10 @@ class DeviceLoop:
         return bool(np.linalg.norm(self._state.proxy - self._state.target[PLACE]) > self._state.target[VALID])
 
 
-# A local model as the kernel reads it: force at the origin of layer axes, stiffness, normal, size, normal stiffness,
-# place, valid_m. The scalars of the loop follow.
-BIAS, STIFFNESS, NORMAL, SIZE, ALONG = slice(0, 3), slice(3, 12), slice(12, 15), 15, 16
-BLENDED, PLACE, VALID, MODEL = slice(0, 17), slice(17, 20), 20, 21
+# A local model as the kernel reads it: what presses, as force at the origin of layer axes and stiffness; normal, size,
+# normal stiffness; stiffness of friction and its limit; place, valid_m, friction there. The scalars of the loop follow.
+BIAS, STIFFNESS, NORMAL, SIZE, ALONG, STICKS, LIMIT = slice(0, 3), slice(3, 12), slice(12, 15), 15, 16, 17, 18
+BLENDED, PLACE, VALID, DRAG, MODEL = 19, slice(19, 22), 22, slice(23, 26), 26
 AGE, LEFT, STARTED, BALANCE, TAKEN_IN, STORED, WORST, ADDED, TICK, SCALARS = range(10)
 
 
@@ -173,18 +178,31 @@ class _State(NamedTuple):
     last: np.ndarray  # position one step ago, (3,) [m]
     proxy: np.ndarray  # position of the proxy, (3,) [m]
     force: np.ndarray  # force on the device, (3,) [N]
+    drag: np.ndarray  # friction at the proxy, (3,) [N]
+    owed: np.ndarray  # what of the newest model's friction is not blended in yet, (3,) [N]
     sent: np.ndarray  # ring of sent forces, (LONGEST_DELAY, 3) [N]
     scalars: np.ndarray
 
 
 def _packed(model: LocalContact, coupling: float) -> np.ndarray:
     """The model for the kernel; stiffness that falls is kept to half of the coupling's: one place for the proxy."""
-    values, vectors = np.linalg.eigh(0.5 * (model.stiffness[:3, :3] + model.stiffness[:3, :3].T))
+    whole = model.push_stiffness[:3, :3]
+    values, vectors = np.linalg.eigh(0.5 * (whole + whole.T))
     stiffness = (vectors * np.maximum(values, -0.5 * coupling)) @ vectors.T
-    place, force, normal = model.pose_body_from_tool[:3, 3], model.wrench[:3], model.normal
+    place, force, normal, grip = model.pose_body_from_tool[:3, 3], model.push[:3], model.normal, model.grip
     size = float(np.linalg.norm(force))
     along = max(float(normal @ stiffness @ normal), size / ENERGY_DEPTH_M)
-    return np.concatenate([force - stiffness @ place, stiffness.ravel(), normal, [size, along], place, [model.valid_m]])
+    sticks, limit, drag = (0.0, 0.0, np.zeros(3)) if grip is None else (grip.stiffness[0], grip.limit, grip.wrench[:3])
+    return np.concatenate([force - stiffness @ place, stiffness.ravel(), normal, [size, along, sticks, limit], place,
+                           [model.valid_m], drag])  # fmt: skip
+
+
+@numba.njit(cache=True)
+def _owe(state):
+    """What the friction of the newest model at the proxy is more than the present one, along the skin."""
+    model, p = state.target, state.proxy
+    for i in range(3):
+        state.owed[i] = model[23 + i] + model[17] * (p[i] - model[19 + i]) - state.drag[i]
 
 
 @numba.njit(cache=True)
@@ -192,6 +210,7 @@ def _step(state, constants, dt):
     """One step; False when the input cannot be used."""
     kc, bc, controlled, most, noise, limit, stale_after, decay, delay = constants
     x, v, last, p, force, s = state.position, state.velocity, state.last, state.proxy, state.force, state.scalars
+    drag, owed = state.drag, state.owed
     good = dt > 0 and np.isfinite(dt)
     for i in range(3):
         good = good and np.isfinite(x[i]) and np.isfinite(v[i])
@@ -201,7 +220,7 @@ def _step(state, constants, dt):
         s[TICK] += 1.0
         return False
     if s[STARTED] == 0.0:
-        last[:], p[:], s[STARTED] = x, x, 1.0
+        last[:], p[:], drag[:], owed[:], s[STARTED] = x, x, 0.0, 0.0, 1.0
         s[BALANCE], s[TAKEN_IN], s[STORED], s[WORST], s[ADDED], s[TICK] = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
         state.sent[:] = 0.0
 
@@ -216,34 +235,54 @@ def _step(state, constants, dt):
 
     # Model: blend to the newest; fade when it is stale.
     model, part = state.live, 1.0 if s[LEFT] <= dt else dt / s[LEFT]
-    for i in range(17):
+    for i in range(BLENDED):
         model[i] += part * (state.target[i] - model[i])
+    for i in range(3):
+        drag[i] += part * owed[i]
+        owed[i] -= part * owed[i]
     s[LEFT] = max(s[LEFT] - dt, 0.0)
     s[AGE] += dt
     fade = 1.0 if s[AGE] <= stale_after else np.exp(-(s[AGE] - stale_after) / decay)
 
-    # Proxy: balance of coupling and model, then with the model's force kept from pulling.
-    c, pressing = kc + bc / dt, 0.0
+    # Proxy: balance of coupling, model and friction that sticks; then pressing never pulls, and friction slips.
+    c, pressing, up = kc + bc / dt, 0.0, 0.0
     right = kc * x + bc * (v + p / dt)
-    k = fade * model[3:12].reshape(3, 3)
-    bias, normal = fade * model[0:3], model[12:15]
-    rest = _solved(k, c, right - bias)
+    k, sticks = fade * model[3:12].reshape(3, 3), fade * model[STICKS]
+    bias, normal, held = fade * model[0:3], model[12:15], k.copy()
+    for i in range(3):
+        for j in range(3):
+            held[i, j] += sticks * ((1.0 if i == j else 0.0) - normal[i] * normal[j])
+    way = sticks * (p - (p @ normal) * normal)
+    rest = _solved(held, c, right - bias - drag + way)
     f = bias + k @ rest
+    drag += sticks * (rest - (rest @ normal) * normal) - way
     for i in range(3):
         pressing += f[i] * normal[i]
+        up += drag[i] * normal[i]
     size = fade * model[15]
     kept = min(1.0, pressing / (FADE * size)) if size > 0 else 0.0
+    dragged = 0.0
     for i in range(3):
-        f[i] = pressing * normal[i] + kept * (f[i] - pressing * normal[i]) if pressing > 0 else 0.0
+        drag[i] -= up * normal[i]
+        dragged += drag[i] * drag[i]
+    cone = max(fade * model[LIMIT] * pressing, 0.0)
+    slips = cone / np.sqrt(dragged) if dragged > cone * cone else 1.0
+    dragged = 0.0
+    for i in range(3):
+        drag[i] *= slips
+        dragged += drag[i] * drag[i]
+        f[i] = pressing * normal[i] + kept * (f[i] - pressing * normal[i]) + drag[i] if pressing > 0 else 0.0
         p[i] = (right[i] - f[i]) / c
 
     # Balance: what was taken in, less what is stored; a surplus beyond half of that is forgotten.
     stored = 0.0
     for i in range(3):
         stored += 0.5 * kc * (x[i] - p[i]) ** 2
-    along = fade * model[16]
+    along = fade * model[ALONG]
     if pressing > 0 and along > 0:
         stored += pressing * pressing / (2 * along)
+    if sticks > 0:
+        stored += dragged / (2 * sticks)
     s[BALANCE] = min(s[BALANCE] + work - (stored - s[STORED]), 0.5 * stored)
     s[STORED] = stored
     s[WORST] = min(s[WORST], s[BALANCE])

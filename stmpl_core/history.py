@@ -242,7 +242,7 @@ class History:
             wanted, stated is not None)  # fmt: skip
         wrench, offset, turn = in_space(carried, springs, stiffness, memory.contact, origin, lever)
         slip = Slip(wrench, share, offset, turn, memory.contact[0])
-        memory = memory._replace(scalars=now._replace(share=share), stiffness=stiffness, springs=springs,
+        memory = memory._replace(scalars=now._replace(share=share, limit=cap), stiffness=stiffness, springs=springs,
                                  springs_relaxed=relaxed)  # fmt: skip
         return replace(touch, wrench=touch.wrench + wrench, slip=slip), memory, stored
 

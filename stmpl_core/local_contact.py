@@ -6,26 +6,27 @@ LocalContact (reaction, stiffness, how far it holds), and a DeviceLoop beside th
 
 from __future__ import annotations
 
-import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.spatial.transform import Rotation
 
 from stmpl_core.arrays import Transform, Wrench, finite
 from stmpl_core.contact import Contact
-from stmpl_core.errors import InvalidInput
-from stmpl_core.touch import Touch
-from stmpl_core.toucher import Toucher
+from stmpl_core.footing import in_plane, patch_of, twist_between
+from stmpl_core.history import History
+from stmpl_core.state import Memory, State
+from stmpl_core.tangent import Tangent, tangents
+from stmpl_core.touch import APART, Pressed, Touch
+from stmpl_core.toucher import STIFFENING, Toucher
 from stmpl_core.trust import Trust
 
-STEP = 1e-4  # width of the central differences [m]: far above the skin's finest kinks, far below a contact's depth
 AGREEMENT = 0.1  # error of the linear model over the wrench, inside its neighbourhood
-SMALLEST = 0.01  # reaction as which smaller ones are judged [N]: a hand does not feel 10 % of it
-WIDEST = 2e-3  # largest neighbourhood that is looked for [m]
-SHRINK = 0.9  # factor on the radius until the model agrees at the rim
+WIDEST = 2e-3  # largest neighbourhood [m]
+SAFETY = 0.8  # of the neighbourhood that a power law of the depth allows: measured rims are at 0.8 to 1.2 of it
+LEAST_POWER = 1.1  # power of the depth with which the force grows, below which it is not trusted to be straight
 FADE = 0.1  # normal force over the reaction, below which drag and torque fade with it
 
 
@@ -36,6 +37,34 @@ class Rendered(NamedTuple):
     inside: bool
 
 
+class Grip(NamedTuple):
+    """Friction of a contact to first order: a patch that sticks as a spring does, up to a cone.
+
+    Args:
+        axes: ways along the skin (two tangents, and the lever times the turn about the normal) that a twist of the tool
+            amounts to, (3, 6); their transpose takes forces to a wrench about the tool's origin.
+        forces: friction along these ways, (3,) [N].
+        stiffness: stiffness of the patch that sticks, (3,) [N/m].
+        limit: size of the forces at which all slides, over the normal force [-]; mu, raised by ploughing.
+    """
+
+    axes: np.ndarray
+    forces: np.ndarray
+    stiffness: np.ndarray
+    limit: float
+
+    @property
+    def wrench(self) -> Wrench:
+        """Wrench of the friction at the model's pose, (6,) [N, N m]."""
+        return self.axes.T @ self.forces
+
+    def carried(self, twist: np.ndarray, pressing: float) -> Wrench:
+        """Wrench of the friction after a twist (6,), never more than the limit of a normal force [N]."""
+        forces = self.forces + self.stiffness * (self.axes @ twist)
+        size, most = float(np.linalg.norm(forces)), self.limit * max(pressing, 0.0)
+        return self.axes.T @ (forces * (most / size if size > most else 1.0))
+
+
 @dataclass(frozen=True, eq=False)
 class LocalContact:
     """The reaction of one contact around a pose, to first order.
@@ -44,11 +73,13 @@ class LocalContact:
         pose_body_from_tool: pose at which it was found, (4, 4).
         wrench: force [N] and torque about the tool's origin [N m] that the tool exerts on the body, layer axes, (6,).
         stiffness: d wrench / d twist, (6, 6) [N/m, N/rad; N m/m, N m/rad]; the twist is (translation of the tool's
-            origin, rotation vector) in layer axes.
-        valid_m: translation up to which the model is within 10 % of the reaction, as seen at its rim [m].
-        valid_rad: rotation up to which it is [rad].
+            origin, rotation vector) in layer axes; other tools stay. With friction, as it sticks.
+        valid_m: translation up to which the model is within 10 % of the reaction, argued from the force's power of the
+            depth and the contact's size [m].
+        valid_rad: rotation up to which it is [rad]. Parts of a tool that do not touch yet are not known.
         status: status of the touch at the pose.
-        trust: trust in the touch at the pose; its figures count the model's touches as `evaluations`.
+        trust: trust in the touch at the pose.
+        grip: friction, part of wrench and stiffness; None: none.
     """
 
     pose_body_from_tool: Transform
@@ -58,133 +89,143 @@ class LocalContact:
     valid_rad: float
     status: str
     trust: Trust
+    grip: Grip | None = None
+
+    @property
+    def push(self) -> Wrench:
+        """Wrench that the tool presses with, friction left out, (6,) [N, N m]."""
+        return self.wrench if self.grip is None else self.wrench - self.grip.wrench
+
+    @property
+    def push_stiffness(self) -> np.ndarray:
+        """Stiffness of what presses, friction left out, (6, 6)."""
+        if self.grip is None:
+            return self.stiffness
+        return self.stiffness - (self.grip.axes.T * self.grip.stiffness) @ self.grip.axes
 
     @property
     def normal(self) -> np.ndarray:
         """Direction in which the tool presses, (3,) [-]; zeros when it does not."""
-        size = np.linalg.norm(self.wrench[:3])
-        return self.wrench[:3] / size if size > 0 else np.zeros(3)
+        push = self.push[:3]
+        size = np.linalg.norm(push)
+        return push / size if size > 0 else np.zeros(3)
 
     def wrench_at(self, pose_body_from_tool: ArrayLike) -> Rendered:
-        """Wrench (6,) at another pose, extrapolated and never pulling: no force against `normal`.
+        """Wrench (6,) at another pose, extrapolated; never pulling, and bounded.
 
-        As the normal force falls below a tenth of `wrench`, drag and torque fade with it, so that all end together.
+        No force goes against `normal`. Beyond the neighbourhood nothing grows further: the twist counts up to its rim,
+        but where the tool retreats, so that the force still ends. As the normal force falls below a tenth of `push`,
+        drag and torque fade with it, so that all end together. Friction never exceeds its cone.
 
         Raises:
             InvalidInput: a pose that is not finite.
         """
         pose = finite("pose", pose_body_from_tool, (4, 4))
-        twist = _twist(self.pose_body_from_tool, pose)
-        wrench = self.wrench + self.stiffness @ twist
-        normal, size = self.normal, float(np.linalg.norm(self.wrench[:3]))
-        pressing = float(normal @ wrench[:3])
-        if pressing <= 0:
-            wrench = np.zeros(6)
-        else:
-            fade = min(1.0, pressing / (FADE * size))
-            wrench[:3] = pressing * normal + fade * (wrench[:3] - pressing * normal)
-            wrench[3:] *= fade
+        twist = twist_between(self.pose_body_from_tool, pose)
         move, turn = float(np.linalg.norm(twist[:3])), float(np.linalg.norm(twist[3:]))
-        return Rendered(wrench, move <= self.valid_m and turn <= self.valid_rad)
+        inside = move <= self.valid_m and turn <= self.valid_rad
+        push, normal, stiffness = self.push, self.normal, self.push_stiffness
+        near = twist.copy()
+        near[:3] *= self.valid_m / move if move > self.valid_m else 1.0
+        near[3:] *= self.valid_rad / turn if turn > self.valid_rad else 1.0
+        wrench, size = push + stiffness @ near, float(np.linalg.norm(push[:3]))
+        grown = min(float(normal @ (stiffness @ near)[:3]), float(normal @ (stiffness @ twist)[:3]))
+        pressing = size + grown
+        if pressing <= 0:
+            return Rendered(np.zeros(6), inside)
+        fade = min(1.0, pressing / (FADE * size))
+        wrench[:3] = pressing * normal + fade * (wrench[:3] - normal * (normal @ wrench[:3]))
+        wrench[3:] *= fade
+        if self.grip is not None:
+            wrench += self.grip.carried(twist, pressing)
+        return Rendered(wrench, inside)
 
 
-def local_contact(toucher: Toucher, contact: Contact, *, step: float = STEP, rotations: bool = True) -> LocalContact:
-    """Finds the local model at the contact's pose; a wrench of the contact is not used.
-
-    The stiffness is found by central differences along the normal, two tangents, and about them. What these say of the
-    curvature proposes how far the model may hold; then the reaction is found at that rim, six ways, and the rim drawn
-    in until all agree. 25 touches when the first rim agrees, 13 without rotations.
+def local_contact(toucher: Toucher, contact: Contact, *, rotations: bool = True) -> LocalContact:
+    """Finds the local model of one contact alone at its pose; a wrench of the contact is not used.
 
     Args:
         toucher: contact law on the layer.
         contact: tool and pose.
-        step: width of the differences [m]; rotations move the tool's farthest corner by as much.
-        rotations: derivatives by rotations too; a device that feels forces only needs none.
-            Without, the stiffness to rotations and valid_rad are 0.
-
-    Raises:
-        InvalidInput: a step that is not above 0.
+        rotations: derivatives by rotations too. Without, the stiffness to rotations and valid_rad are 0.
     """
-    if not (math.isfinite(step) and step > 0):
-        raise InvalidInput(f"step is {step} m; it must be finite and above 0. Try {STEP:g}.")
-    probe, field = _Probe(toucher, contact), toucher.tools.field(contact.tool)
-    touch, wrench = probe.touch(np.zeros(6))
-    frame = _frame(wrench[:3])
-    lever = float(np.linalg.norm(np.maximum(*np.abs(field.tool_bounds))))
-    allowed = AGREEMENT * max(float(np.linalg.norm(wrench[:3])), SMALLEST)
-    stiffness, valid = np.zeros((6, 6)), [0.0, 0.0]
-    for block, arm in enumerate((1.0, lever)[: 1 + rotations]):  # translations, then rotations
-        axes = np.zeros((3, 6))
-        axes[:, 3 * block : 3 * block + 3] = frame.T
-        radius, least = WIDEST / arm, step / arm
-        if wrench.any():
-            columns, bend = probe.differences(wrench, axes, step / arm, lever)
-            stiffness[:, 3 * block : 3 * block + 3] = columns @ frame.T
-            radius = min(radius, math.sqrt(2 * allowed / bend) if bend > 0 else radius)
-        while radius > least:
-            off = probe.disagreement(wrench, stiffness, axes, radius, lever)
-            if off <= allowed:
-                break
-            radius *= max(SHRINK * math.sqrt(allowed / off), 0.25)  # what is left out grows like the square
-        valid[block] = radius
-    trust = replace(touch.trust, figures={**touch.trust.figures, "evaluations": float(probe.count)})
-    return LocalContact(contact.pose_body_from_tool, wrench, stiffness, valid[0], valid[1], touch.status, trust)
+    touch = toucher.touch(replace(contact, wrench=None))
+    model = _model(toucher, touch, tangents(toucher, [touch])[0], None)
+    return model if rotations else replace(model, stiffness=model.stiffness * np.repeat([1.0, 0.0], 3), valid_rad=0.0)
 
 
-class _Probe:
-    """The contact's reaction at poses around its own."""
+def local_contacts(history: History, touches: Sequence[Touch], state: State | None = None) -> list[LocalContact]:
+    """Local models of touches, from what the touches know: no further touch is asked for.
 
-    def __init__(self, toucher: Toucher, contact: Contact) -> None:
-        self.toucher, self.contact, self.count = toucher, contact, 0
+    With a state the models are those of the instant: elastic skin presses harder at once, what has relaxed stays
+    relaxed, and what sticks is as stiff as the patch, whatever of it creeps.
 
-    def touch(self, twist: np.ndarray) -> tuple[Touch, Wrench]:
-        """The touch, by pose alone, after a twist (6,), and the wrench that the tool then exerts."""
-        self.count += 1
-        pose = _moved(self.contact.pose_body_from_tool, twist)
-        touch = self.toucher.touch(replace(self.contact, pose_body_from_tool=pose, wrench=None))
-        return touch, touch.wrench
-
-    def differences(self, middle: Wrench, axes: np.ndarray, step: float, lever: float) -> tuple[np.ndarray, float]:
-        """Derivative of the wrench along each axis, (6, 3), and its largest second derivative, judged as a force."""
-        columns, bend = np.empty((6, 3)), 0.0
-        for k, axis in enumerate(axes):
-            ahead, behind = (self.touch(sign * step * axis)[1] for sign in (1, -1))
-            columns[:, k] = (ahead - behind) / (2 * step)
-            bend = max(bend, _as_force(ahead - 2 * middle + behind, lever) / step**2)
-        return columns, bend
-
-    def disagreement(self, wrench: Wrench, stiffness: np.ndarray, axes: np.ndarray, radius: float,
-                     lever: float) -> float:
-        """Largest difference between model and reaction at a rim, judged as a force [N]."""
-        twists = [sign * radius * axis for axis in axes for sign in (1, -1)]
-        return max(_as_force(self.touch(t)[1] - wrench - stiffness @ t, lever) for t in twists)
+    Args:
+        history: history of the simulator that found the touches, `simulator.history`.
+        touches: touches of one instant, by pose or by wrench; the models are about the poses that are answered for.
+        state: state that came with the touches; None: elastic touches without friction.
+    """
+    memories, toucher = {} if state is None else state.tools, history.toucher
+    return [_model(toucher, touch, tangent, memories.get(touch.name))
+            for touch, tangent in zip(touches, tangents(toucher, touches), strict=True)]  # fmt: skip
 
 
-def _moved(pose: Transform, twist: np.ndarray) -> Transform:
-    """The pose after a twist of the tool about its own origin, in layer axes."""
-    moved = pose.copy()
-    moved[:3, 3] += twist[:3]
-    if twist[3:].any():
-        moved[:3, :3] = Rotation.from_rotvec(twist[3:]).as_matrix() @ pose[:3, :3]
-    return moved
+def _model(toucher: Toucher, touch: Touch, tangent: Tangent | None, memory: Memory | None) -> LocalContact:
+    """The model of a touch."""
+    pressed = touch.pressed
+    if tangent is None or pressed is None or pressed.forces is None:
+        reach = 0.0 if touch.status != APART else WIDEST if not touch.depth < 0 else min(WIDEST, -touch.depth)
+        tool = toucher.tools.field(toucher.tools[touch.name]).tool_bounds if touch.name in toucher.tools else None
+        lever = float("inf") if tool is None else float(np.linalg.norm(np.maximum(*np.abs(tool))))
+        return LocalContact(touch.pose_body_from_tool, touch.wrench, np.zeros((6, 6)), reach, reach / lever,
+                            touch.status, touch.trust)  # fmt: skip
+    push = touch.wrench if touch.slip is None else touch.wrench - touch.slip.wrench
+    normal, nodes = push[:3] / touch.force, pressed.squeeze.nodes
+    stiffness, drawn = tangent.stiffness, pressed.factor
+    whole = float(pressed.forces.sum())
+    if memory is not None and memory.scalars.pressing > 0:  # W = W_e (1 - relaxed / F_e), and the relaxed part stays
+        by = whole / (memory.scalars.elastic * touch.passive)
+        stiffness = stiffness + (1 / by - 1) * np.outer(push / whole, tangent.whole)
+        drawn /= by * touch.passive
+    if drawn > 1 + 1e-9:  # the tool was drawn back along the normal to where it is answered for: see Toucher
+        along = np.append(normal, np.zeros(3))
+        rise = push / drawn * STIFFENING / float(toucher.layer.thickness.max())
+        stiffness = stiffness + np.outer(rise - stiffness @ along, along)
+    depth = nodes.sinking if len(nodes.sinking) else nodes.strain * nodes.thickness
+    contact = patch_of(nodes.points, nodes.area, nodes.thickness, depth, pressed.forces, normal)
+    grip = None
+    if touch.slip is not None and memory is not None:
+        grip = _grip(touch, memory, contact[2])
+        stiffness = stiffness + (grip.axes.T * grip.stiffness) @ grip.axes
+    power = max(float(normal @ stiffness[:3, :3] @ normal) * touch.depth / touch.force, pressed.power, LEAST_POWER)
+    return LocalContact(touch.pose_body_from_tool, touch.wrench, stiffness,
+                        *_neighbourhood(touch, pressed, power, contact[0], contact[1]), touch.status, touch.trust,
+                        grip)  # fmt: skip
 
 
-def _twist(start: Transform, end: Transform) -> np.ndarray:
-    """The twist (6,) that takes one pose to the other."""
-    turn = Rotation.from_matrix(end[:3, :3] @ start[:3, :3].T).as_rotvec()
-    return np.concatenate([end[:3, 3] - start[:3, 3], turn])
+def _neighbourhood(touch: Touch, pressed: Pressed, power: float, middle: np.ndarray, radius: float
+                   ) -> tuple[float, float]:  # fmt: skip
+    """How far a model holds [m] and [rad].
+
+    Along the normal F = c d^m leaves out m (m - 1) (x / d)^2 / 2 of F. Sideways the depth changes by x^2 d / a^2 at
+    most, a ball's on a plane being half of that, so m (x / a)^2 / 2 is left out. A turn moves the contact's rim so.
+    """
+    deep = SAFETY * touch.depth * (2 * AGREEMENT / (power * (power - 1))) ** 0.5
+    reach = min(deep, radius * (2 * AGREEMENT / power) ** 0.5, WIDEST)
+    assert pressed.forces is not None
+    points = pressed.squeeze.nodes.points[pressed.forces > 0]
+    rim = float(np.linalg.norm(points - middle, axis=1).max())
+    off = middle - touch.pose_body_from_tool[:3, 3]
+    along = touch.push / touch.force
+    aside = float(np.linalg.norm(off - along * (along @ off)))
+    return reach, reach / (aside + rim)
 
 
-def _frame(force: np.ndarray) -> np.ndarray:
-    """Orthonormal axes as columns, (3, 3), the first along `force`."""
-    if not force.any():
-        return np.eye(3)
-    first = force / np.linalg.norm(force)
-    second = np.cross(first, np.eye(3)[np.abs(first).argmin()])
-    second /= np.linalg.norm(second)
-    return np.stack([first, second, np.cross(first, second)], axis=1)
-
-
-def _as_force(wrench: np.ndarray, lever: float) -> float:
-    """The larger of a wrench's force and of its torque over the tool's reach [N]."""
-    return max(float(np.linalg.norm(wrench[:3])), float(np.linalg.norm(wrench[3:])) / lever)
+def _grip(touch: Touch, memory: Memory, lever: float) -> Grip:
+    """Friction of a touch."""
+    assert touch.slip is not None
+    middle, normal, first = memory.contact
+    arm, second = middle - touch.pose_body_from_tool[:3, 3], np.cross(normal, first)
+    axes = np.array([[*first, *np.cross(arm, first)], [*second, *np.cross(arm, second)], [0, 0, 0, *(lever * normal)]])
+    forces = in_plane(touch.slip.wrench, memory.contact, touch.pose_body_from_tool[:3, 3], lever)
+    return Grip(axes, forces, memory.stiffness, memory.scalars.limit / touch.force)

@@ -69,38 +69,18 @@ def response(poisson_ratio: float) -> Response:
 
 
 @numba.njit(cache=True, error_model="numpy")
-def hold_off(points, inward, thickness, area, strain, most, group, half_space, rows):
-    """How nodes are held off as a tool asks, and what each sees around it.
+def pairs(points, inward, thickness, area, group, mean, half_space, rows):
+    """Depth over `mean` of each node under a force E mean^2 at each, and its weights in rings, (N, N) and (., N, N).
+
+    All of it is symmetric.
 
     Args:
         points, inward: nodes on the skin at rest and unit vectors into it, (N, 3) [m], [-].
         thickness: thickness of the layer there, (N,) [m].
         area: area that each stands for, (N,) [m2].
-        strain: depth that the tool asks for, over the thickness, (N,) [-].
-        most: strain up to which is solved [-].
         group: numbers of groups of nodes that do not feel each other, (N,).
+        mean: unit of length [m].
         half_space, rows: tables of a Response.
-
-    Returns:
-        pressure: pressure over E that holds the skin off, (N,) [-]; 0 where the skin leaves the tool.
-        moments: of pressure and strain on the rings, (N, 2, RINGS) [-].
-        vectors: their first moments, in the body's axes, (N, 2, 3) [-].
-        power: power of the depth with which the force grows as the tool goes on [-].
-    """
-    mean = thickness.mean()
-    matrix, rings = pairs(points, inward, thickness, area, group, mean, half_space, rows)
-    depth = np.minimum(strain, most) * thickness / mean
-    force = solve(matrix, depth)
-    pressure = force * mean**2 / area
-    moments, vectors = moments_of(rings, points, thickness, area, pressure, strain)
-    return pressure, moments, vectors, power_of(matrix, force, depth.max())
-
-
-@numba.njit(cache=True, error_model="numpy")
-def pairs(points, inward, thickness, area, group, mean, half_space, rows):
-    """Depth over `mean` of each node under a force E mean^2 at each, and its weights in rings, (N, N) and (., N, N).
-
-    All of it is symmetric.
     """
     count, width = len(points), rows.shape[1] - 1
     out, rings = np.zeros((count, count)), np.zeros((width, count, count), np.float32)
@@ -128,7 +108,19 @@ def pairs(points, inward, thickness, area, group, mean, half_space, rows):
 
 @numba.njit(cache=True, error_model="numpy")
 def moments_of(rings, points, thickness, area, pressure, strain):
-    """Moments of pressure and strain on the rings, and their first moments: see hold_off."""
+    """What nodes see around them.
+
+    Args:
+        rings: weights of nodes in rings, see `pairs`.
+        points: nodes on the skin at rest, (N, 3) [m].
+        thickness: thickness of the layer there, (N,) [m].
+        area: area that each stands for, (N,) [m2].
+        pressure, strain: pressure over E, and depth over the thickness, (N,) [-].
+
+    Returns:
+        moments: of pressure and strain on the rings, (N, 2, RINGS) [-].
+        vectors: their first moments, in the body's axes, (N, 2, 3) [-].
+    """
     width, count = rings.shape[:2]
     sources, scale, centre = np.empty((count, 8), np.float32), thickness.mean(), points[0].copy()
     for j in range(count):
@@ -196,6 +188,23 @@ def solve(matrix, depth):
         if change <= TOLERANCE * largest:
             break
     return force
+
+
+@numba.njit(cache=True, error_model="numpy")
+def rates_of(matrix, force, depth_rates):
+    """Rates of forces (K, N) that `solve` gives, as the depths change (K, N): of the nodes that press, no other."""
+    some = np.flatnonzero(force > 0)
+    inner, right = np.empty((len(some), len(some))), np.empty((len(some), len(depth_rates)))
+    for a in range(len(some)):
+        for b in range(len(some)):
+            inner[a, b] = matrix[some[a], some[b]]
+        for k in range(len(depth_rates)):
+            right[a, k] = depth_rates[k, some[a]]
+    found, out = np.linalg.solve(inner, right), np.zeros_like(depth_rates)
+    for a in range(len(some)):
+        for k in range(len(depth_rates)):
+            out[k, some[a]] = found[a, k]
+    return out
 
 
 @numba.njit(cache=True, error_model="numpy")

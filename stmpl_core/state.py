@@ -58,6 +58,7 @@ class Scalars(NamedTuple):
         share: share of the contact that slid [-].
         work: work that was put into the contact and not given back [J].
         passive: factor on the wrench that kept it above 0 [-].
+        limit: tangential force at which all of it slides [N]; 0 without friction.
     """
 
     pressing: float = 0.0
@@ -71,6 +72,7 @@ class Scalars(NamedTuple):
     share: float = 1.0
     work: float = 0.0
     passive: float = 1.0
+    limit: float = 0.0
 
     @property
     def sunk(self) -> bool:

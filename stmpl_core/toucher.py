@@ -127,7 +127,8 @@ class Toucher:
         placed = [self._place(contact, self.tools.field(contact.tool), many) for contact in contacts]
         pressing = sorted((one for one in placed if len(one.squeeze.nodes.area)), key=lambda one: one.contact.name)
         held: dict[str, Held] = {}
-        for group in self._near_each_other(pressing):
+        for some in groups_of([one.squeeze.nodes.points for one in pressing], self._thickest):
+            group = [pressing[n] for n in some]
             if len(group) == 1:
                 held[group[0].contact.name] = group[0].held or self.net.hold(group[0].squeeze.nodes)
                 continue
@@ -137,19 +138,6 @@ class Toucher:
             for one, (pressure, doubt, outside) in zip(group, parts, strict=True):
                 held[one.contact.name] = Held(pressure, doubt, outside, together.power)
         return [self._answer(one, held.get(one.contact.name, NOTHING), alone) for one in placed]
-
-    def _near_each_other(self, pressing: Sequence[_Placed]) -> list[list[_Placed]]:
-        """The tools in groups, between which none feels another: what many tools cost grows with the largest."""
-        groups: list[tuple[list[_Placed], list[tuple[np.ndarray, float]]]] = []
-        for one in pressing:
-            points = one.squeeze.nodes.points
-            middle = points.mean(axis=0)
-            ball = middle, float(np.linalg.norm(points - middle, axis=1).max()) + 0.5 * REACH * self._thickest
-            near = [group for group in groups
-                    if any(np.linalg.norm(middle - other) < ball[1] + size for other, size in group[1])]  # fmt: skip
-            groups = [group for group in groups if group not in near]
-            groups.append(([*(o for group in near for o in group[0]), one], [*(b for g in near for b in g[1]), ball]))
-        return [sorted(group, key=lambda one: one.contact.name) for group, _ in groups]
 
     def _place(self, contact: Contact, field: SignedDistance, many: bool) -> _Placed:
         """Where the tool presses, or why it does not."""
@@ -377,6 +365,24 @@ class Toucher:
         if touch.drag > MAX_DRAG_RATIO * touch.force:
             trust = trust.also(f"{name} also drags with {touch.drag:.2g} N, which is not carried", in_range=False)
         return trust
+
+
+def groups_of(points: Sequence[np.ndarray], thickness: float) -> list[list[int]]:
+    """Numbers of the tools in groups, between which none feels another: what many tools cost grows with the largest.
+
+    Args:
+        points: contact nodes of each tool, (N, 3) [m].
+        thickness: thickness of the layer, the largest [m].
+    """
+    groups: list[tuple[list[int], list[tuple[np.ndarray, float]]]] = []
+    for n, some in enumerate(points):
+        middle = some.mean(axis=0)
+        ball = middle, float(np.linalg.norm(some - middle, axis=1).max()) + 0.5 * REACH * thickness
+        near = [group for group in groups
+                if any(np.linalg.norm(middle - other) < ball[1] + size for other, size in group[1])]  # fmt: skip
+        groups = [group for group in groups if group not in near]
+        groups.append(([*(o for group in near for o in group[0]), n], [*(b for g in near for b in g[1]), ball]))
+    return [sorted(group) for group, _ in groups]
 
 
 @numba.njit(cache=True)

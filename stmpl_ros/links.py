@@ -18,6 +18,7 @@ from rclpy.node import Node
 from bags.wire import NANO, pose_from, stamp_ns, wrench_message
 from stmpl_core.arrays import Points, Transform, Wrench
 from stmpl_core.errors import InvalidInput, StmplError
+from stmpl_core.friction import friction_from
 from stmpl_core.layer import SoftLayer
 from stmpl_core.tool import Tool
 from stmpl_ros.diagnosis import Tally
@@ -27,7 +28,6 @@ from stmpl_ros.parameters import LinksConfig, NodeConfig
 from stmpl_ros.spinning import ros, spin
 from stmpl_ros.topics import STREAM
 from stmpl_sim.protocol import Memory, Poses, Reaction, SoftContact, exchange
-from stmpl_sim.verbs import friction_of
 
 POLL_PERIOD_S = 0.05  # time between two looks whether the simulator fell silent
 
@@ -262,7 +262,7 @@ def run(config: LinksConfig, arguments: Sequence[str] | None = None, build: Buil
     settings = NodeConfig(part=config.part, tissue=config.tissue, edge_length=config.edge_length)
     layer: SoftLayer = build(settings)
     contact = SoftContact(layer, tools or tools_of(config.tools), settings.new_method(), damping=config.damping,
-                          friction=friction_of(config.friction))  # fmt: skip
+                          friction=friction_from(config.friction))  # fmt: skip
     with ros(list(arguments or ())) as stop:
         node = LinkNode(config, contact)
         node.get_logger().info(f"skin of '{config.body}': {layer}; tools: {', '.join(contact.tools)}")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Protocol
 
 import numpy as np
@@ -12,11 +12,11 @@ from numpy.typing import ArrayLike
 from scipy.spatial import KDTree
 
 from stmpl_core.arrays import Transform, Wrench, finite
-from stmpl_core.columns import shifted
 from stmpl_core.contact import Contact
 from stmpl_core.errors import InvalidInput
 from stmpl_core.friction import Friction
 from stmpl_core.layer import SoftLayer
+from stmpl_core.local_contact import local_contacts
 from stmpl_core.methods import MomentNet
 from stmpl_core.methods.base import Method
 from stmpl_core.simulator import Simulator
@@ -25,7 +25,6 @@ from stmpl_core.state import State
 from stmpl_core.tool import Tool
 from stmpl_core.touch import APART, Answer, Touch
 
-DEEPER_M = 5e-5  # step of the one-sided difference that finds the contact's stiffness [m]
 FAR_HOLES = 3.0  # distance of a tool from the skin, over a hole of the mesh, from which the contact law is not asked
 
 
@@ -104,9 +103,9 @@ class SoftContact:
             F (1 + damping v) at the speed v into the skin, and never pulls; friction stays as it is. Not measured on
             tissue; 0: none. Without `implicit` a step h is stable while h^2 k + 2 h c < 4 m, c = damping F.
         implicit: choice to take the force that presses at the end of the step, to first order (backward Euler,
-            linearised): F* = (F + h k (v + h a)) / (1 + h^2 k A), with the step h, the stiffness k along the force by
-            one more touch 0.05 mm deeper, the speed v into the skin, its acceleration a without the contact, and the
-            mobility A [1/kg] of the tool against the body. Needs `mobility` at each step. Each tool by itself.
+            linearised): F* = (F + h k (v + h a)) / (1 + h^2 k A), with the step h, the stiffness k along the force as a
+            LocalContact has it, the speed v into the skin, its acceleration a without the contact, and the mobility A
+            [1/kg] of the tool against the body. Needs `mobility` at each step. Each tool by itself.
         friction: coefficient of friction, or the name of a pair in stmpl_core.friction, of all tools or by tool's
             name; None: none, or that of the Simulator that was given.
 
@@ -191,13 +190,17 @@ class SoftContact:
         touches = {name: touches.get(name) or Touch(name, APART, pose, np.zeros(6)) for name, pose in at.items()}
 
         # Wrenches: from layer to world axes, about the origin of the stated pose; the body feels the opposite.
+        models = local_contacts(self.simulator.history, found, tissue) if self.implicit and dt > 0 else []
+        stiffness = {touch.name: model.push_stiffness[:3, :3] for touch, model in zip(found, models, strict=False)}
         turn = world_from_layer[:3, :3]
         wrenches, on_body, speed = {}, np.zeros(6), {}
         for name, touch in touches.items():
             if not touch.wrench.any():
                 wrenches[name] = np.zeros(6)
                 continue
-            factor, speed[name] = self._factor(touch, near, memory, dt, world_from_layer, mobility)
+            factor, speed[name] = self._factor(
+                touch, at[name], memory, dt, stiffness.get(name), world_from_layer, mobility
+            )
             pressing = _pressing(touch)
             exerted = factor * pressing + (touch.wrench - pressing)
             force, torque = exerted[:3], exerted[3:]
@@ -225,9 +228,10 @@ class SoftContact:
     def _factor(
         self,
         touch: Touch,
-        near: Sequence[Contact],
+        pose: Transform,
         memory: Memory,
         dt: float,
+        stiffness: np.ndarray | None,
         world_from_layer: Transform,
         mobility: Callable[[str, np.ndarray, np.ndarray], float] | None,
     ) -> tuple[float, tuple[float, float]]:
@@ -236,21 +240,16 @@ class SoftContact:
         if force == 0 or not (self.damping or self.implicit):
             return 1.0, (0.0, 0.0)
         normal, centre = touch.push / force, _centre_of_pressure(touch)
-        pose = next(one.pose_body_from_tool for one in near if one.name == touch.name)
         before = memory.at.get(touch.name)
         v = 0.0
         if before is not None and dt > 0:  # of the tool's point that is at the centre of pressure now
             then = before @ np.linalg.solve(pose, np.append(centre, 1.0))
             v = float((centre - then[:3]) @ normal) / dt
         c = self.damping * force
-        if not self.implicit or dt <= 0:
+        if stiffness is None:
             return max(0.0, 1 + self.damping * v), (v, force)
         assert mobility is not None
-        deeper = [replace(one, pose_body_from_tool=shifted(pose, DEEPER_M * normal)) if one.name == touch.name else one
-                  for one in near]  # fmt: skip
-        touches, _ = self.simulator.touch(deeper, memory.tissue, dt)
-        harder = next(one.push for one in touches if one.name == touch.name)
-        k = max(0.0, (float(harder @ normal) - force) / DEEPER_M)
+        k = max(0.0, float(normal @ stiffness @ normal))
         turn = world_from_layer[:3, :3]
         a = mobility(touch.name, turn @ centre + world_from_layer[:3, 3], turn @ normal)
         # What accelerated it in the last step, less what the contact itself did of that.

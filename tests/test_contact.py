@@ -28,7 +28,7 @@ from stmpl_core.touch import (
     WRAPPED,
     Touch,
 )
-from stmpl_core.toucher import Toucher
+from stmpl_core.toucher import Toucher, groups_of
 from tests.scenes import (
     LENGTH,
     RADIUS,
@@ -418,10 +418,9 @@ def test_many_tools_are_held_in_groups_that_do_not_feel_each_other() -> None:
     """Two fingers here and two there, further apart than 8 thicknesses: each pair as if the other were not there."""
     thin, small = Toucher(limb(4e-3, 3e-3)), ball(0.004)
     contacts = [press(small, at(RADIUS + 0.003, 0, z), None, f"t{z}") for z in (0.03, 0.042, 0.11, 0.122)]
-    groups = thin._near_each_other(sorted((thin._place(c, thin.tools.field(c.tool), False) for c in contacts),
-                                          key=lambda one: one.contact.name))  # fmt: skip
-    assert sorted(len(group) for group in groups) == [2, 2]
     together = thin.touch_all(contacts)
+    places = [one.pressed.squeeze.nodes.points for one in together if one.pressed is not None]
+    assert sorted(groups_of(places, 3e-3)) == [[0, 1], [2, 3]]
     for one, other in zip(together, [*thin.touch_all(contacts[:2]), *thin.touch_all(contacts[2:])], strict=True):
         np.testing.assert_array_equal(one.wrench, other.wrench)
     assert not np.allclose(thin.touch(contacts[0]).wrench, together[0].wrench, rtol=1e-3)

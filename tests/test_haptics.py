@@ -1,21 +1,49 @@
 """Laws of haptics: local models that hold where they say, and a device loop that gives out no energy."""
 
+from collections.abc import Callable
+from dataclasses import replace
+
 import numpy as np
 import pytest
+import trimesh
 
 from benchmarks.haptic_device import QUIET, Device, Felt, Hand, Spot, arm_spot, play
 from benchmarks.haptics import HARD, forces_along, paths, settings_for, slide, worst_jump
-from stmpl_core import Contact
+from benchmarks.tools import ball, block_letter, fingertip, flat
+from stmpl_core import Contact, Prony, SoftLayer, State, Tool, Touch
+from stmpl_core.body import Body
 from stmpl_core.errors import InvalidInput
 from stmpl_core.haptics import DeviceLoop, LoopSettings
-from stmpl_core.local_contact import LocalContact, local_contact
+from stmpl_core.history import History
+from stmpl_core.living import living
+from stmpl_core.local_contact import LocalContact, local_contact, local_contacts
 from stmpl_core.sdf import SignedDistance
-from stmpl_core.touch import APART
+from stmpl_core.touch import APART, IN_CORE
 from stmpl_core.toucher import Toucher
 from tests.scenes import at, contact_of, placed, plate, tool, turn
 
 DEEP = 2e-3  # m
 STILL = np.zeros(3)
+
+
+def side_by_side(one: Tool, apart: float) -> Tool:
+    """Two of a tool in one piece, so far apart [m]."""
+    both = trimesh.util.concatenate([trimesh.Trimesh(one.vertices + [0, s * apart / 2, 0], one.faces) for s in (-1, 1)])
+    return Tool("two", both.vertices, both.faces)
+
+
+SHAPES = {"ball": ball(12), "fingertip": fingertip(8, 12), "capsule": fingertip(8, 60), "disc": flat(10, 2),
+          "letter": block_letter("R", 30), "two": side_by_side(fingertip(8, 12), 0.02)}  # fmt: skip
+
+
+def standing(layer: SoftLayer, vertex: int, depth: float) -> np.ndarray:
+    """Pose of a tool that stands on z = 0, so deep in the skin at a vertex, turned about its normal."""
+    out = layer.normals[vertex]
+    pose = np.eye(4)
+    pose[:3, :3] = turn(tuple(np.cross([0, 0, 1], out)), float(np.arccos(out[2])))[:3, :3]
+    pose = pose @ turn((0, 0, 1), 0.3)
+    pose[:3, 3] = layer.vertices[vertex] - depth * out
+    return pose
 
 
 @pytest.fixture(scope="module")
@@ -31,8 +59,6 @@ def model(spot: Spot) -> LocalContact:
 @pytest.fixture(scope="module")
 def block() -> tuple[Toucher, Contact]:
     """A blunt box on a plate, off its own centre and tilted: every rotation matters."""
-    import trimesh
-
     blunt = tool(trimesh.creation.box((0.03, 0.024, 0.02), transform=at(0.004, 0.002, 0.003)), name="block")
     pose, toucher = at(0.001, 0.0007, 0.005) @ turn((0.3, 1, 0.2), 0.04), Toucher(plate())
     toucher.tools.add(blunt, SignedDistance.of(blunt, rounding=2e-3))
@@ -57,6 +83,127 @@ def turned(pose: np.ndarray, twist: np.ndarray) -> np.ndarray:
     return moved
 
 
+def differences(wrench_at: Callable[[np.ndarray], np.ndarray], pose: np.ndarray, lever: float) -> np.ndarray:
+    """d wrench / d twist by central differences, the mean over steps that the law's kinks are finer than, (6, 6)."""
+    out = np.zeros((6, 6))
+    for step in (4e-4, 2e-4, 1e-4, 5e-5):
+        for k, twist in enumerate(np.diag(np.repeat([step, step / lever], 3))):
+            out[:, k] += (wrench_at(turned(pose, twist)) - wrench_at(turned(pose, -twist))) / (8 * twist[k])
+    return out
+
+
+def error(found: np.ndarray, expected: np.ndarray, lever: float) -> float:
+    """Difference of stiffnesses over their size, turns and torques taken at a lever [m]."""
+    scale = np.outer(*2 * [np.repeat([1, 1 / lever], 3)])
+    return float(np.linalg.norm(scale * (found - expected)) / np.linalg.norm(scale * expected))
+
+
+@pytest.fixture(scope="module")
+def forearm() -> Toucher:
+    return Toucher(living(Body.anny(), "left_forearm", edge_length=4e-3))
+
+
+@pytest.mark.parametrize("name, most", [("ball", 0.05), ("fingertip", 0.06), ("capsule", 0.06), ("disc", 0.08),
+                                        ("two", 0.06)])  # fmt: skip
+@pytest.mark.parametrize("tissue", ["paper", "living"])
+def test_the_stiffness_is_that_of_differences(spot: Spot, forearm: Toucher, tissue: str, name: str,
+                                              most: float) -> None:  # fmt: skip
+    toucher = spot.toucher if tissue == "paper" else forearm
+    place = 2443 if tissue == "living" else int(np.linalg.norm(toucher.layer.vertices - spot.place, axis=1).argmin())
+    pose = standing(toucher.layer, place, 2.5e-3 if tissue == "paper" else 6e-3)
+    one = SHAPES[name]
+    found = local_contact(toucher, Contact(one, pose))
+    expected = differences(lambda at: toucher.touch(Contact(one, at)).wrench, pose, 0.02)
+    assert error(found.stiffness, expected, 0.02) < most
+    along = found.normal @ expected[:3, :3] @ found.normal
+    assert found.normal @ found.stiffness[:3, :3] @ found.normal == pytest.approx(along, rel=min(most, 0.1))
+
+
+def test_a_letter_is_about_as_stiff_as_differences_say(spot: Spot) -> None:
+    """Its sharp strokes are as wide as the nodes are apart: the law itself is rough there."""
+    toucher, letter = spot.toucher, block_letter("R", 30)
+    place = int(np.linalg.norm(toucher.layer.vertices - spot.place, axis=1).argmin())
+    pose = standing(toucher.layer, place, 2.5e-3)
+    found = local_contact(toucher, Contact(letter, pose))
+    expected = differences(lambda at: toucher.touch(Contact(letter, at)).wrench, pose, 0.02)
+    along = [found.normal @ one[:3, :3] @ found.normal for one in (found.stiffness, expected)]
+    assert along[0] == pytest.approx(along[1], rel=0.2)
+
+
+def test_a_tool_gives_way_to_the_one_beside_it(spot: Spot) -> None:
+    toucher, pose = spot.toucher, spot.pose(spot.centre(-DEEP))
+    places = {"left": spot.pose(spot.centre(-DEEP, -5e-3)), "right": spot.pose(spot.centre(-DEEP, 5e-3))}
+
+    def wrenches(moved: str, at: np.ndarray) -> dict[str, np.ndarray]:
+        contacts = [Contact(spot.tool.named(n), at if n == moved else p) for n, p in places.items()]
+        return {touch.name: touch.wrench for touch in toucher.touch_all(contacts)}
+
+    history = History(toucher)
+    touches = toucher.touch_all([Contact(spot.tool.named(n), p) for n, p in places.items()])
+    found = dict(zip(places, local_contacts(history, touches), strict=True))
+    for own in places:
+        expected = differences(lambda at, o=own: wrenches(o, at)[o], places[own], 0.02)
+        assert error(found[own].stiffness, expected, 0.02) < 0.05
+    alone = local_contact(toucher, Contact(spot.tool, pose))
+    assert np.linalg.norm(alone.stiffness) > 1.05 * np.linalg.norm(found["left"].stiffness)
+
+
+@pytest.mark.parametrize("friction", [None, 0.5])
+def test_a_model_with_a_state_is_that_of_the_instant(spot: Spot, friction: float | None) -> None:
+    """Skin that has relaxed by a third is as stiff at once as it was; a patch that sticks resists along the skin."""
+    remembers = spot.with_memory(Prony((0.2, 0.2), (0.02, 0.3)), friction)
+    history, state = History(remembers.toucher, friction), State()
+
+    def step(pose: np.ndarray, dt: float) -> tuple[Touch, State]:
+        touches, after = history.step([Contact(spot.tool, pose)], state, dt)
+        return touches[0], after
+
+    for k in range(60):
+        pose = spot.pose(spot.centre(-DEEP * min(k, 30) / 30, 2e-4 * min(max(k - 30, 0), 6)))
+        touch, state = step(pose, 0.01)
+    model = local_contacts(history, [touch], state)[0]
+    np.testing.assert_allclose(model.wrench_at(pose).wrench, touch.wrench, rtol=1e-6, atol=1e-9)
+    expected = np.empty((6, 6))
+    for k in range(6):
+        twist = 5e-5 * np.eye(6)[k] / (1 if k < 3 else 0.02)
+        expected[:, k] = (step(turned(pose, twist), 0.0)[0].wrench - step(turned(pose, -twist), 0.0)[0].wrench) / \
+            (2 * twist[k])  # fmt: skip
+    assert error(model.stiffness, expected, 0.02) < (0.05 if friction is None else 0.12)  # the patch creeps a little
+    assert (model.grip is None) == (friction is None)
+
+
+def test_a_tool_at_the_core_is_as_stiff_as_differences_say(spot: Spot) -> None:
+    deep = spot.pose(spot.centre(-9e-3))
+    model = local_contact(spot.toucher, Contact(spot.tool, deep))
+    assert model.status == IN_CORE
+    step = 1e-4 * spot.out
+    ahead, behind = (spot.toucher.touch(Contact(spot.tool, spot.pose(deep[:3, 3] + s * step))).force for s in (-1, 1))
+    along = -model.normal @ model.stiffness[:3, :3] @ spot.out
+    assert along == pytest.approx((ahead - behind) / 2e-4, rel=0.15)
+
+
+def test_friction_of_a_model_keeps_to_its_cone_and_nothing_grows_without_bound(spot: Spot) -> None:
+    rubbing = spot.with_memory(None, 0.5)
+    history = History(rubbing.toucher, 0.5)
+    touches, state = history.step([Contact(spot.tool, spot.pose(spot.centre(-1e-3)))], State(), 0.0)
+    touches, state = history.step([Contact(spot.tool, spot.pose(spot.centre(-DEEP, 5e-4)))], state, 0.01)
+    model = local_contacts(history, touches, state)[0]
+    assert model.grip is not None and np.linalg.norm(model.grip.wrench[:3]) > 0.1 * touches[0].force
+    plain = replace(model, wrench=model.push, stiffness=model.push_stiffness, grip=None)
+    rng, most = np.random.default_rng(0), float(np.linalg.norm(model.push_stiffness[:3, :3], 2)) * model.valid_m
+    turns = float(np.linalg.norm(model.push_stiffness[:3, 3:], 2)) * model.valid_rad
+    for size in (1e-4, 1e-3, 1e-2, 1.0):
+        for twist in size * rng.normal(size=(50, 6)) * np.repeat([1, 30], 3):
+            pose = turned(model.pose_body_from_tool, twist)
+            push, both = plain.wrench_at(pose).wrench, model.wrench_at(pose).wrench
+            pressing = float(model.normal @ push[:3])
+            assert pressing >= 0
+            assert np.linalg.norm(push[:3]) <= 1.001 * (touches[0].force + most + turns)
+            drag = (both - push)[:3]
+            assert abs(drag @ model.normal) < 0.05 * model.grip.limit * pressing + 1e-9
+            assert np.linalg.norm(drag) <= 1.001 * model.grip.limit * pressing
+
+
 def test_the_model_is_the_reaction_at_its_own_pose(spot: Spot, model: LocalContact) -> None:
     rendered = model.wrench_at(model.pose_body_from_tool)
     np.testing.assert_allclose(rendered.wrench, model.wrench, atol=1e-12)
@@ -68,7 +215,7 @@ def test_the_model_is_the_reaction_at_its_own_pose(spot: Spot, model: LocalConta
 def test_the_model_holds_where_it_says(
     block: tuple[Toucher, Contact], tilted: LocalContact, seed: int
 ) -> None:
-    """Six directions at the rim were measured; others are found as good, but for what lies between the axes."""
+    """The neighbourhood is argued, not measured: a corner of the box that comes in may take a little more."""
     toucher, contact = block
     assert tilted.valid_m > 5e-5 and tilted.valid_rad > 2e-3
     lever, rng = 0.03, np.random.default_rng(seed)
@@ -103,7 +250,7 @@ def test_turning_a_ball_about_its_centre_changes_nothing(spot: Spot) -> None:
     assert np.linalg.norm(model.stiffness[:3, 3:]) < 0.02 * np.linalg.norm(model.wrench[:3])
     plain = local_contact(spot.toucher, contact, rotations=False)
     np.testing.assert_array_equal(plain.stiffness[:, :3], model.stiffness[:, :3])
-    assert plain.valid_rad == 0 and plain.trust.figures["evaluations"] < model.trust.figures["evaluations"]
+    assert plain.valid_rad == 0 and not plain.stiffness[:, 3:].any()
 
 
 def test_turning_the_scene_turns_the_model(
@@ -142,8 +289,6 @@ def test_far_from_the_skin_there_is_nothing_to_feel(spot: Spot) -> None:
 def test_bad_input_is_refused_or_gives_no_force(spot: Spot, model: LocalContact) -> None:
     with pytest.raises(InvalidInput, match="pose holds"):
         model.wrench_at(np.full((4, 4), np.nan))
-    with pytest.raises(InvalidInput, match="step is 0"):
-        local_contact(spot.toucher, contact_of(spot.tool, spot.pose(spot.place), name="ball"), step=0.0)
     with pytest.raises(InvalidInput, match="coupling_stiffness is -1"):
         LoopSettings(coupling_stiffness=-1)
     with pytest.raises(InvalidInput, match="delay_steps is 300"):

@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 
 from stmpl_core import Tissue
-from stmpl_core.obstacle import hold_off, response
+from stmpl_core.obstacle import moments_of, pairs, power_of, response, solve
 
 NU = 0.4
 
 
 class Linear(NamedTuple):
-    """What `hold_off` returns."""
+    """Forces over areas, what nodes see, and the power of the depth."""
 
     pressure: np.ndarray
     moments: np.ndarray
@@ -33,8 +33,12 @@ def solved(points: np.ndarray, spacing: float, strain: np.ndarray, nu: float = N
     n = len(points)
     area = np.full(n, 0.5 * np.sqrt(3) * spacing**2)
     group = np.zeros(n, np.int64) if group is None else group
-    inward, table = np.tile([0.0, 0.0, -1.0], (n, 1)), response(nu)
-    return Linear(*hold_off(points, inward, np.full(n, thickness), area, strain, 1.0, group, *table))
+    inward, table, thick = np.tile([0.0, 0.0, -1.0], (n, 1)), response(nu), np.full(n, thickness)
+    matrix, rings = pairs(points, inward, thick, area, group, thickness, *table)
+    force = solve(matrix, strain)
+    pressure = force * thickness**2 / area
+    moments, vectors = moments_of(rings, points, thick, area, pressure, strain)
+    return Linear(pressure, moments, vectors, power_of(matrix, force, strain.max()))
 
 
 @pytest.mark.parametrize("nu", [0.3, 0.4, 0.45])

@@ -10,6 +10,7 @@ from stmpl_core import Prony, Simulator, SoftLayer, Tissue
 from stmpl_core.errors import InvalidInput
 from stmpl_core.methods import Winkler
 from stmpl_sim import Memory, Poses, SoftBody, SoftContact, exchange
+from stmpl_sim.protocol import Reaction
 from tests.scenes import LENGTH, THICKNESS, ball, limb, plate
 from tests.scenes import RADIUS as LIMB_RADIUS
 from tests.test_sim import CORE, MASS, RADIUS, MassOnASpring, model, pose, step
@@ -56,8 +57,13 @@ def test_an_implicit_contact_feels_tissue_relax_as_an_explicit_one_does(slow: Si
     np.testing.assert_allclose(taken, explicit, atol=0.05 * explicit.max())
 
 
-def test_an_implicit_contact_is_as_stiff_as_with_the_tools_beside_it(slab: SoftLayer) -> None:
-    """Two balls pressed into one dent: each shares its load with the other."""
+def taken_share(reaction: Reaction, name: str) -> float:
+    """Force that is exerted, over the one that the tissue carries."""
+    return float(np.linalg.norm(reaction.tools[name][:3])) / reaction.touches[name].force
+
+
+def test_an_implicit_contact_takes_its_stiffness_from_the_touch(slab: SoftLayer) -> None:
+    """Two balls pressed into one dent: no further touch is asked for, and each shares its load with the other."""
     tools = [ball(RADIUS).named("left"), ball(RADIUS).named("right")]
     simulator, asked = Simulator(slab, Winkler()), []
     touch = simulator.touch
@@ -70,8 +76,12 @@ def test_an_implicit_contact_is_as_stiff_as_with_the_tools_beside_it(slab: SoftL
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(simulator, "touch", told)
-        contact.step(Poses(np.eye(4), places), Memory(), 1e-3, lambda *_: 1.0)
-    assert asked == [["left", "right"]] * 3
+        reaction = contact.step(Poses(np.eye(4), places), Memory(), 1e-3, lambda *_: 1e4)
+    assert asked == [["left", "right"]]
+    alone = SoftContact(simulator, tools[:1], implicit=True).step(Poses(np.eye(4), places), Memory(), 1e-3,
+                                                                  lambda *_: 1e4)  # fmt: skip
+    shares = {len(one.touches): taken_share(one, "left") for one in (reaction, alone)}
+    assert shares[2] > 1.02 * shares[1]  # softer beside the other: less is taken off
 
 
 def test_damping_of_what_slides_and_spins_but_goes_no_deeper_is_none(slab: SoftLayer) -> None:

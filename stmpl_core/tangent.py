@@ -1,0 +1,273 @@
+"""Tangent: how a touch's wrench changes as tools move, from the touch itself: no further touch is asked for.
+
+A contact is an obstacle problem on nodes (stmpl_core.obstacle) with forces f = f(depths). The nodes go along the skin
+with the tool, as their lattice does. With g the gradient of the tool's distance where it ends in a node's column along
+n, u the velocity of the tool there and v that of the column, its depth s follows from the surface staying a surface,
+
+    ds = g . (u - v) / (g . n)
+
+and with B (6, N) the wrench of a unit force at each node, dW = B df + dB f, plus what the torque's arm changes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import pairwise
+from typing import NamedTuple
+
+import numba
+import numpy as np
+
+from stmpl_core.columns import grid_of, middle_of
+from stmpl_core.layer import SoftLayer
+from stmpl_core.nodes import FACING, Nodes
+from stmpl_core.rays import MAX_COLUMN_STRAIN, WALL, depth_in_column, distance_in_column, ray_from
+from stmpl_core.sdf import SignedDistance
+from stmpl_core.touch import MIN_ONE_WAY_SHARE, Pressed, Touch
+from stmpl_core.toucher import Toucher, groups_of
+
+LEAST_COSINE = 0.05  # of a column's angle to the tool's normal, below which its depth is taken not to change
+
+
+class Tangent(NamedTuple):
+    """Derivative of a touch of elastic skin by the twist of its tool.
+
+    Args:
+        stiffness: d wrench / d twist of its tool, (6, 6) [N/m, N/rad; N m/m, N m/rad]; the twist is (translation of
+            the tool's origin, rotation vector), in layer axes.
+        whole: d of the sum of the sizes of its forces, likewise, (6,) [N/m, N/rad].
+    """
+
+    stiffness: np.ndarray
+    whole: np.ndarray
+
+
+class _Rates(NamedTuple):
+    """What changes at nodes with each of six twists of their tool.
+
+    Args:
+        strain: strain, (6, N) [1/m, 1/rad].
+        sinking: depth, or on a stack `Nodes.sinking`, (6, N) [-, m/rad].
+        shares: barycentric coordinates, (6, N, 3).
+    """
+
+    strain: np.ndarray
+    sinking: np.ndarray
+    shares: np.ndarray
+
+
+def tangents(toucher: Toucher, touches: Sequence[Touch]) -> list[Tangent | None]:
+    """Tangent of each touch of elastic skin; None where nothing presses.
+
+    Tools that feel each other stay where they are: each one's forces give way as those beside it press.
+
+    Args:
+        toucher: contact law that found the touches.
+        touches: its touches of one instant.
+    """
+    out: list[Tangent | None] = [None] * len(touches)
+    pressing = sorted((k for k, one in enumerate(touches) if one.pressed is not None and one.force > 0),
+                      key=lambda k: touches[k].name)  # fmt: skip
+    parts = {k: touches[k].pressed for k in pressing}
+    thickest = float(toucher.layer.thickness.max())
+    for group in groups_of([parts[k].squeeze.nodes.points for k in pressing], thickest):  # type: ignore[union-attr]
+        some = [pressing[n] for n in group]
+        for k, one in zip(some, _of_group(toucher, [touches[k] for k in some]), strict=True):
+            out[k] = one
+    return out
+
+
+def _of_group(toucher: Toucher, touches: Sequence[Touch]) -> list[Tangent]:
+    """Tangents of tools that may feel each other."""
+    layer = toucher.layer
+    parts: list[Pressed] = [one.pressed for one in touches if one.pressed is not None]
+    every = [one.squeeze.nodes for one in parts]
+    ends = np.concatenate([[0], np.cumsum([len(nodes.area) for nodes in every])])
+    slices = [slice(a, b) for a, b in pairwise(ends)]
+    strain, sinking = np.zeros((2, 6 * len(touches), ends[-1]))
+    rates = []
+    for k, (touch, one) in enumerate(zip(touches, parts, strict=True)):
+        rates.append(_rates(layer, one.field, touch.pose_body_from_tool, one.squeeze.nodes))
+        strain[6 * k : 6 * k + 6, slices[k]], sinking[6 * k : 6 * k + 6, slices[k]] = rates[k].strain, rates[k].sinking
+    joined = every[0] if len(every) == 1 else Nodes.joined(every)
+    slopes = toucher.net.slopes(joined, strain, sinking) * (layer.tissue.youngs_modulus * joined.area)
+    out = []
+    for k, (touch, one) in enumerate(zip(touches, parts, strict=True)):
+        assert one.forces is not None
+        own = one.factor * slopes[6 * k : 6 * k + 6, slices[k]]
+        unit = _units(layer.vertices, layer.vertex_area_vectors, layer.vertex_areas, touch.pose_body_from_tool[:3, 3],
+                      every[k].corners)  # fmt: skip
+        stiffness = (own @ np.einsum("nc,ncx->nx", every[k].shares, unit)).T
+        stiffness += np.einsum("n,knc,ncx->xk", one.forces, rates[k].shares, unit)
+        stiffness[3:, :3] += _cross_matrix(touch.wrench[:3])
+        out.append(Tangent(stiffness, own.sum(axis=1)))
+    return out
+
+
+def _cross_matrix(force: np.ndarray) -> np.ndarray:
+    """Matrix of v -> force x v: what a translation v of the origin takes from a torque about it, -v x force."""
+    x, y, z = force
+    return np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+
+
+@numba.njit(cache=True)
+def _units(points, area_vectors, areas, origin, corners):
+    """Wrench about the origin of a unit force at each corner of each node, (N, 3, 6)."""
+    out, arm, f = np.empty((len(corners), 3, 6)), np.empty(3), np.empty(3)
+    for n in range(len(corners)):
+        for c in range(3):
+            v = corners[n, c]
+            for x in range(3):
+                f[x], arm[x] = -area_vectors[v, x] / areas[v], points[v, x] - origin[x]
+                out[n, c, x] = f[x]
+            out[n, c, 3] = arm[1] * f[2] - arm[2] * f[1]
+            out[n, c, 4] = arm[2] * f[0] - arm[0] * f[2]
+            out[n, c, 5] = arm[0] * f[1] - arm[1] * f[0]
+    return out
+
+
+def _rates(layer: SoftLayer, field: SignedDistance, pose: np.ndarray, nodes: Nodes) -> _Rates:
+    """See _Rates."""
+    origin, turn, many = pose[:3, 3].copy(), pose[:3, :3], len(nodes.area)
+    columns = _columns(grid_of(field), pose, *nodes[:5])
+    places = [nodes.points + s[:, None] * nodes.inward for s in columns]
+    depth = nodes.strain * nodes.thickness
+    mean = (nodes.area * depth) @ nodes.inward
+    size = float(np.linalg.norm(mean))
+    way = mean / max(size, 1e-300)
+    slanted = bool(len(nodes.sinking)) and size > MIN_ONE_WAY_SHARE * float(nodes.area @ depth)
+    if slanted:
+        sunk = nodes.sinking / np.maximum(nodes.inward @ way, 1e-3)
+        places.append(nodes.points + sunk[:, None] * way)
+    distance, gradient = field.distance_gradient((np.concatenate(places) - origin) @ turn)
+    distance, gradient = distance.reshape(-1, many), (gradient @ turn.T).reshape(-1, many, 3)
+    skin = layer.vertices, -layer.normals, layer.thickness
+    shares, go, turned, thicker = _carried(*skin, *nodes[:3], *nodes[5:7], way, origin, middle_of(field, pose))
+    strain, deeper = _deepened(*nodes[:5], columns, distance, gradient, go, turned, thicker, origin)
+    if not slanted:
+        return _Rates(strain, deeper, shares)
+    rates = np.einsum("kn,nx->kx", nodes.area * deeper, nodes.inward) + \
+        np.einsum("n,knx->kx", nodes.area * depth, turned)  # fmt: skip
+    swung = (rates - np.outer(rates @ way, way)) / size
+    sinking = _sunk(nodes.points, nodes.inward, depth, nodes.sinking, way, swung, gradient[3], go, turned, deeper,
+                    origin)  # fmt: skip
+    return _Rates(strain, sinking, shares)
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _columns(grid, pose, points, inward, thickness, area, strain):
+    """Depths in nodes' columns at which the tool is looked at, (3, N) [m]: where it ends, the skin, inside its wall."""
+    out = np.zeros((3, len(area)))
+    for n in range(len(area)):
+        ray = ray_from(pose, points[n, 0], points[n, 1], points[n, 2], inward[n, 0], inward[n, 1], inward[n, 2])
+        t = thickness[n]
+        out[0, n] = depth_in_column(grid, ray, t, max(-distance_in_column(grid, ray, 0.0), strain[n] * t))
+        out[2, n] = max(out[0, n] - WALL * t, 0.0)
+    return out
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _carried(vertices, normals, thicknesses, points, inward, thickness, corners, shares, mean, origin, centre):
+    """How nodes go with each of six twists: along the skin, as their lattice goes with the tool's middle and its spin.
+
+    Returns:
+        moved: rates of their barycentric coordinates, (6, N, 3).
+        go, turned: of their places and inward normals, (6, N, 3).
+        thicker: of the thickness there, (6, N).
+    """
+    many = len(points)
+    moved, go, turned = np.zeros((6, many, 3)), np.zeros((6, many, 3)), np.zeros((6, many, 3))
+    thicker, twist, raw = np.zeros((6, many)), np.zeros(6), np.zeros(3)
+    for n in range(many):
+        a, b, c = corners[n]
+        edge, other, normal = vertices[b] - vertices[a], vertices[c] - vertices[a], inward[n]
+        face = _cross(edge, other)
+        size = _dot(face, face)
+        way = mean if _dot(mean, normal) > FACING else normal
+        raw[:] = shares[n, 0] * normals[a] + shares[n, 1] * normals[b] + shares[n, 2] * normals[c]
+        root = 1 / np.sqrt(_dot(raw, raw))
+        for k in range(6):
+            twist[:] = 0.0
+            twist[k] = 1.0
+            goes = twist[:3] + _cross(twist[3:], centre - origin) + \
+                _dot(twist[3:], way) * _cross(way, points[n] - centre)  # fmt: skip
+            goes -= _dot(goes, face) / _dot(way, face) * way  # it stays on its triangle
+            beta, gamma = _dot(_cross(goes, other), face) / size, _dot(_cross(edge, goes), face) / size
+            moved[k, n, 0], moved[k, n, 1], moved[k, n, 2] = -beta - gamma, beta, gamma
+            go[k, n] = goes
+            for m in range(3):
+                thicker[k, n] += moved[k, n, m] * thicknesses[corners[n, m]]
+                turned[k, n] += root * moved[k, n, m] * normals[corners[n, m]]
+            turned[k, n] -= _dot(turned[k, n], normal) * normal
+    return moved, go, turned, thicker
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _deepened(points, inward, thickness, area, strain, columns, distance, gradient, go, turned, thicker, origin):
+    """Rates of strains and depths at nodes, (6, N) each.
+
+    The depth counts in part at the rim of a tool and beside its walls (stmpl_core.nodes): that part changes too.
+
+    Args:
+        columns: see `_columns`; distance (., N) and gradient (., N, 3) are those of the tool there, in body axes.
+        go, turned, thicker: see `_carried`.
+    """
+    many = len(area)
+    strains, depths = np.zeros((6, many)), np.zeros((6, many))
+    for n in range(many):
+        normal, t, deep, wall = inward[n], thickness[n], columns[0, n], WALL * thickness[n]
+        along = _dot(gradient[0, n], normal)
+        if deep <= 0 or abs(along) < LEAST_COSINE:
+            continue
+        share, rim, inside = strain[n] * t / deep, 1 - distance[1, n] / wall, -2 * distance[2, n] / wall
+        for k in range(6):
+            rate = _entered(gradient[0, n], points[n], normal, deep, go[k, n], turned[k, n], k, origin) / along
+            more = 0.0
+            if 0 < rim < 1:
+                more += _entered(gradient[1, n], points[n], normal, 0.0, go[k, n], turned[k, n], k, origin) / wall / rim
+            if 0 < inside < 1:
+                over = _entered(gradient[2, n], points[n], normal, columns[2, n], go[k, n], turned[k, n], k, origin)
+                more += 2 * (over - rate * _dot(gradient[2, n], normal)) / wall / inside
+            if deep < MAX_COLUMN_STRAIN * t:
+                depths[k, n] = share * (rate + more * deep)
+            strains[k, n] = (depths[k, n] - strain[n] * thicker[k, n]) / t
+    return strains, depths
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _sunk(points, inward, depth, sinking, way, swung, gradient, go, turned, deeper, origin):
+    """Rates of `Nodes.sinking`, (6, N): of depths along one way (3,) for all, which swings, (6, 3)."""
+    out = deeper.copy()
+    for n in range(len(depth)):
+        along, cosine = _dot(gradient[n], way), _dot(inward[n], way)
+        if sinking[n] >= depth[n] * (1 - 1e-9) or abs(along) < LEAST_COSINE or cosine <= 0:
+            continue
+        s = sinking[n] / cosine
+        for k in range(6):
+            rate = _entered(gradient[n], points[n], way, s, go[k, n], swung[k], k, origin) / along
+            out[k, n] = rate * cosine + s * (_dot(turned[k, n], way) + _dot(inward[n], swung[k]))
+    return out
+
+
+@numba.njit(cache=True, error_model="numpy", inline="always")
+def _entered(gradient, point, normal, s, go, turned, k, origin):
+    """Rate of the depth inside a tool of twist k, at s along a column that goes by `go` and turns by `turned`."""
+    x, y, z = (point[0] + s * normal[0] - origin[0], point[1] + s * normal[1] - origin[1],
+               point[2] + s * normal[2] - origin[2])  # fmt: skip
+    g0, g1, g2 = gradient
+    rate = -g0 * (go[0] + s * turned[0]) - g1 * (go[1] + s * turned[1]) - g2 * (go[2] + s * turned[2])
+    if k < 3:
+        return rate + gradient[k]
+    if k == 3:
+        return rate + y * g2 - z * g1
+    return rate + (z * g0 - x * g2 if k == 4 else x * g1 - y * g0)
+
+
+@numba.njit(cache=True, error_model="numpy", inline="always")
+def _dot(a, b):
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+@numba.njit(cache=True, error_model="numpy", inline="always")
+def _cross(a, b):
+    return np.array([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]])
