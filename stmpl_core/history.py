@@ -14,6 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from stmpl_core import wake
 from stmpl_core.arrays import Transform
 from stmpl_core.columns import shifted
 from stmpl_core.contact import Contact
@@ -114,7 +115,7 @@ class History:
         for name, memory in state.tools.items():
             if name not in memories:
                 left = self._left(memory, dt)
-                if left.scalars.sunk:
+                if left.scalars.sunk or left.trail.any():
                     memories[name] = left
         return out, State(memories)
 
@@ -181,7 +182,7 @@ class History:
             if abs(needed / elastic - 1) < 2 * HELD_OFF:
                 elastic, force = needed, now * needed - owed
         if not (presses and force > 0):
-            return self._free(one, touch, max(owed / now, 0.0))
+            return self._free(one, touch, max(owed / now, 0.0), dt)
         push, pressed, size = touch.push, touch.pressed, touch.force
         assert pressed is not None and pressed.forces is not None
         normal, net = push / size, min(size / elastic, 1.0)
@@ -194,8 +195,12 @@ class History:
                           work=before.work)  # fmt: skip
         relaxed = one.kept + one.gain * elastic
         memory = Memory(one.stated.pose_body_from_tool, touch.wrench, scalars, relaxed, contact,
-                        touch.pose_body_from_tool, np.zeros(3), one.before.springs,
-                        one.before.springs_relaxed)  # fmt: skip
+                        touch.pose_body_from_tool, np.zeros(3), one.before.springs, one.before.springs_relaxed,
+                        one.before.trail)  # fmt: skip
+        if len(memory.trail):
+            passing = wake.Pass(memory.imprint, middle, normal, relaxed, elastic, touch.depth, pressed.power, radius)
+            memory = memory._replace(trail=wake.after(memory.trail, self.series, dt, passing))
+            touch = replace(touch, wake=wake.grooves(memory.trail, self.series))
         done = _scaled(touch, force / elastic, ROUGH * float(shares @ relaxed))
         whole *= 0.5 + 0.5 / pressed.factor  # what draws a tool back from the core is steep: it stores less
         stored = whole * _left_over(float(shares @ relaxed) / elastic, pressed.power)
@@ -204,14 +209,16 @@ class History:
             stored, whole = stored + bent, whole + 2 * bent
         return _Law(self._said(one, done), memory._replace(wrench=done.wrench), stored, whole)
 
-    def _free(self, one: _Asked, touch: Touch, elastic: float) -> _Law:
+    def _free(self, one: _Asked, touch: Touch, elastic: float, dt: float) -> _Law:
         """Skin that the tool does not hold comes back by itself."""
         before = one.before.scalars
         if touch.presses and touch.pressed is not None:
             touch = replace(touch, status=APART, wrench=np.zeros(6), force_bound=0.0, pressure=None, pressed=None)
         scalars = before._replace(pressing=0.0, elastic=elastic, share=1.0, passive=1.0)
+        trail = wake.after(one.before.trail, self.series, dt, None)
         memory = _let_go(one.before._replace(pose=one.stated.pose_body_from_tool, wrench=touch.wrench, scalars=scalars,
-                                             relaxed=one.kept + one.gain * elastic))  # fmt: skip
+                                             relaxed=one.kept + one.gain * elastic, trail=trail))  # fmt: skip
+        touch = replace(touch, wake=wake.grooves(trail, self.series))
         if scalars.sunk:
             touch = replace(touch, imprint=_imprint(memory))
         depth = before.depth * (elastic / before.imprint_force) ** (1 / before.power) if elastic > 0 else 0.0
@@ -223,15 +230,18 @@ class History:
         owed, now = self.series.balance(kept, gain)
         elastic = max(owed / now, 0.0)
         scalars = memory.scalars._replace(pressing=-1.0, elastic=elastic, share=1.0, work=0.0, passive=1.0)
-        return _let_go(memory._replace(scalars=scalars, relaxed=kept + gain * elastic, wrench=np.zeros(6)))
+        return _let_go(memory._replace(scalars=scalars, relaxed=kept + gain * elastic, wrench=np.zeros(6),
+                                       trail=wake.after(memory.trail, self.series, dt, None)))  # fmt: skip
 
     def _dragged(self, one: _Asked, touch: Touch, memory: Memory, force: float, lever: float, thickness: float,
                  dt: float) -> tuple[Touch, Memory, float]:  # fmt: skip
         """The touch with friction, its memory, and the energy that the bent skin stores [J]."""
         before, now, radius = one.before, memory.scalars, memory.scalars.radius
         patch, origin = self.sideways.at(radius, thickness), touch.pose_body_from_tool[:3, 3]
-        stiffer, cap = ploughing(now.depth, radius, force, patch.along, self.friction(touch.name))
-        stiffness = stiffer * np.array([patch.along, patch.along, patch.turn / (lever * lever)])
+        mu = self.friction(touch.name)
+        stiffer, cap = ploughing(now.depth, radius, force, patch.along, mu)
+        along = patch.secant(mu * force)
+        stiffness = stiffer * np.array([along, along, patch.turn / (lever * lever)])
         stated, wanted = one.stated.wrench, NOTHING
         if stated is not None:
             wanted = in_plane(stated - touch.wrench, memory.contact, origin, lever)

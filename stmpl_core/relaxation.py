@@ -40,6 +40,22 @@ class Series(NamedTuple):
         return float(self.shares @ kept), 1 - float(self.shares @ gain)
 
 
+def free_decay(series: Series, dt: float) -> np.ndarray:
+    """Matrix that takes what has relaxed to what is left of it after a time in which nothing holds the skin, (P, P).
+
+    Free skin has F = 0, so F_e = sum g_i D_i, and dD/dt = (1 g^T - I) D / tau. With D = S x, S = (tau g)^-1/2, the
+    matrix is symmetric, so its exponential is that of its eigenvalues.
+
+    Args:
+        series: relaxation of the force.
+        dt: time [s].
+    """
+    size = np.sqrt(np.maximum(series.shares, 1e-12) * series.times)
+    rates = np.sqrt(np.maximum(series.shares, 1e-12) / series.times)
+    values, vectors = np.linalg.eigh(np.outer(rates, rates) - np.diag(1 / series.times))
+    return (vectors * np.exp(values * dt)) @ vectors.T * np.outer(1 / size, size)
+
+
 def series_of(tissue: Tissue, thickness: float) -> Series:
     """Relaxation of a force on a flat stack: each material's own times its share d ln F / d ln E in the force.
 

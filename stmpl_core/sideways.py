@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -16,6 +17,7 @@ WEIGHTS = np.gradient(WAVES)
 WHERE = np.linspace(0.05, 0.95, 10)  # places in the patch that move with the tool, over its radius
 POWERS = (-0.5, 0.5, 1.5)  # powers of 1 - r^2 / a^2 in the traction: the first alone is exact on a half-space
 RADII = np.geomspace(0.02, 8.0, 18)  # radii of the patch that are tabled, over the thickness
+SLACK = 2.0  # width of the skin that is ahead of a patch, over its radius
 THICKNESSES = 5  # thicknesses of a stack that are tabled
 
 
@@ -25,10 +27,25 @@ class Patch(NamedTuple):
     Args:
         along: tangential force over the way of the tool k_t [N/m].
         turn: torque about the normal over the turn of the tool [N m/rad].
+        bare: k_t of the same layer without its skin [N/m].
+        slack: force along the skin at which the skin ahead has lost its tension [N].
     """
 
     along: float
     turn: float
+    bare: float
+    slack: float
+
+    def secant(self, force: float) -> float:
+        """Tangential force over the way of the tool where the tool drags with a force [N], in N/m.
+
+        Skin carries no compression: it wrinkles. What is ahead of a tool pushes back until its tension is gone; from
+        there on the skin behind pulls alone, and half of what the skin adds to k_t is lost.
+        """
+        beyond = max(force - self.slack, 0.0)
+        if not beyond:
+            return self.along
+        return force / ((force - beyond) / self.along + beyond / (0.5 * (self.along + self.bare)))
 
 
 def patch(tissue: Tissue, thickness: float, radius: float) -> Patch:
@@ -55,7 +72,10 @@ def patch(tissue: Tissue, thickness: float, radius: float) -> Patch:
     turned = j1(np.outer(WHERE, WAVES)) * (both.crosswise * WAVES * WEIGHTS) @ _spectra(1).T * unit * radius
     found = np.linalg.lstsq(turned, WHERE * radius, rcond=None)[0]
     torque = 2 * np.pi * radius**3 * found @ [0.5 / ((n + 1) * (n + 2)) for n in POWERS]
-    return Patch(float(force), float(torque))
+    if tissue.skin is None:
+        return Patch(float(force), float(torque), float(force), 0.0)
+    bare = patch(replace(tissue, skin=None), thickness, radius).along
+    return Patch(float(force), float(torque), bare, SLACK * tissue.skin.tension * radius)
 
 
 def _spectra(order: int) -> np.ndarray:
@@ -78,8 +98,9 @@ class Sideways:
         self._logs = np.log(RADII)
         rows = [[patch(tissue, t, t * r) for r in RADII] for t in np.exp(self._log_thickness)]
         radius = np.exp(self._log_thickness)[:, None] * RADII
-        self._table = np.log(np.array(rows) / (tissue.youngs_modulus * np.stack([radius, radius**3], axis=-1)))
-        self._modulus = tissue.youngs_modulus
+        units = tissue.youngs_modulus * np.stack([radius, radius**3, radius], axis=-1)
+        self._table = np.log(np.array(rows)[..., :3] / units)
+        self._modulus, self._slack = tissue.youngs_modulus, SLACK * tissue.skin.tension if tissue.skin else 0.0
 
     def at(self, radius: float, thickness: float) -> Patch:
         """Stiffness of a patch of a radius [m] where the layer is this thick [m]."""
@@ -92,5 +113,5 @@ class Sideways:
             j = int(g)
             low = (1 - g + j) * self._table[j] + (g - j) * self._table[j + 1]
         value = (1 - f + i) * low[i] + (f - i) * low[i + 1]
-        force, turn = float(np.exp(value[0])), float(np.exp(value[1]))
-        return Patch(force * self._modulus * radius, turn * self._modulus * radius**3)
+        along, turn, bare = np.exp(value) * self._modulus * radius
+        return Patch(float(along), float(turn) * radius**2, float(bare), self._slack * radius)

@@ -25,6 +25,7 @@ from stmpl_core.tools import Tools
 from stmpl_core.touch import Answer, Touch
 from stmpl_core.toucher import Toucher
 from stmpl_core.trust import Displacement, Trust
+from stmpl_core.wake import sunk
 
 MOST_MOVED = 0.95  # motion over the thickness from which it is held back
 SHEAR = 3.0  # motion of the skin along a force, over that across it: 1.3 on a half-space, 6 on a wide contact at nu 0.4
@@ -121,6 +122,11 @@ class Simulator:
         else:
             solved = Displacement(np.zeros_like(self.layer.vertices), Trust(), self.method.name)
             fitted = Conformed(solved.displacement, 0.0, 0.0)
+
+        for touch in touches:
+            if touch.wake:
+                tool = self.tools.field(self.tools[touch.name])
+                fitted = fitted._replace(displacement=sunk(self.layer, tool, touch.wake, fitted.displacement))
 
         # Say what may be believed: what the method says, and what was found of each contact.
         trust = _joined(solved.trust, touches, fitted)

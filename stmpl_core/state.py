@@ -11,8 +11,9 @@ import numpy as np
 
 from stmpl_core.errors import InvalidInput
 from stmpl_core.slip import SPRINGS
+from stmpl_core.wake import untouched
 
-VERSION = 1  # of packed states; older ones are not read
+VERSION = 2  # of packed states; older ones are not read
 FORGOTTEN = 1e-3  # elastic force of skin that comes back, over its largest, below which it is forgotten
 
 
@@ -30,6 +31,7 @@ class Memory(NamedTuple):
         stiffness: stiffness of the patch to the ways of `springs`, (3,) [N/m]; 0: no friction yet.
         springs: forces of the springs of friction without relaxation, (SPRINGS, 3) [N].
         springs_relaxed: what of them has relaxed, (P, SPRINGS, 3) [N].
+        trail: places along the tool's way where the skin is not back yet (stmpl_core.wake).
     """
 
     pose: np.ndarray
@@ -41,6 +43,7 @@ class Memory(NamedTuple):
     stiffness: np.ndarray
     springs: np.ndarray
     springs_relaxed: np.ndarray
+    trail: np.ndarray
 
 
 class Scalars(NamedTuple):
@@ -83,7 +86,7 @@ class Scalars(NamedTuple):
 def fresh(pose: np.ndarray, terms: int) -> Memory:
     """Memory of a tool at a pose (4, 4) that has not touched, for skin with so many times of relaxation."""
     return Memory(pose, np.zeros(6), Scalars(), np.zeros(terms), np.eye(3), pose, np.zeros(3), np.zeros((SPRINGS, 3)),
-                  np.zeros((terms, SPRINGS, 3)))  # fmt: skip
+                  np.zeros((terms, SPRINGS, 3)), untouched(terms))  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)

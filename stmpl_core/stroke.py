@@ -152,7 +152,8 @@ def _dragged(stroke: Stroke, series: Series, friction: float, force: float, dept
     size = (depth / stroke.depth) ** 0.5  # of the contact, over that at the greatest depth
     radius, along, turn = stroke.radius * size, stroke.patch.along * size, stroke.patch.turn * size**3
     stiffer, cap = ploughing(depth, radius, force, along, friction)
-    stiffness = stiffer * np.array([along, along, turn / (LEVER * radius) ** 2])
+    pulled = stroke.patch.secant(friction * force / size) * size
+    stiffness = stiffer * np.array([pulled, pulled, turn / (LEVER * radius) ** 2])
     springs, faded, carried, share, _ = drag(springs, faded, *series, dt, 0.0, stiffness, before, cap,
                                              np.array([way, 0.0, 0.0]), np.zeros(3) if wanted is None else wanted,
                                              wanted is not None)  # fmt: skip

@@ -14,6 +14,7 @@ from stmpl_core.trust import Displacement, Trust
 if TYPE_CHECKING:
     from stmpl_core.columns import Squeeze
     from stmpl_core.sdf import SignedDistance
+    from stmpl_core.wake import Groove
 
 TOUCHING = "touching"  # wrench carried by the skin under the tool
 MOVED = "moved to touch"  # wrench carried so, after the tool was moved along its push to meet the skin
@@ -96,6 +97,7 @@ class Touch:
         imprint: pose of the tool at which it would press elastic skin to where the skin is that has not come back yet,
             (4, 4); None: the skin is where the tool is.
         passive: factor on the wrench that keeps the contact from giving more energy than was put in [-].
+        wake: grooves that the tool left behind where it slid over skin that relaxes.
     """
 
     name: str
@@ -112,6 +114,7 @@ class Touch:
     slip: Slip | None = None
     imprint: Transform | None = None
     passive: float = 1.0
+    wake: tuple[Groove, ...] = ()
 
     @property
     def push(self) -> np.ndarray:
@@ -168,6 +171,6 @@ class Answer(Displacement):
         """A share of this answer, whose input has stopped: every tool is STALE and exerts nothing."""
         trust = replace(self.trust, error_bound=None).also(why, in_range=False)
         touches = {name: replace(touch, status=STALE, wrench=np.zeros(6), pressure=None, pressed=None, slip=None,
-                                 imprint=None)
+                                 imprint=None, wake=())
                    for name, touch in self.touches.items()}  # fmt: skip
         return Answer(share * self.displacement, trust, self.method, None, touches)
