@@ -124,7 +124,7 @@ CONTACT_BODIES = tuple(
 
 
 TISSUE_BODIES = tuple(
-    BodyPlan(name=name, weight=w, thickness=t, poisson_ratio=nu, part=part, edge_length=edge, to_bone=True,
+    BodyPlan(name=name, weight=w, thickness=t, poisson_ratio=nu, part=part, edge_length=edge, to_bone=part != "back",
              stack=StackPlan(kappa=kappa, pull=pull, fat=fat, muscle=muscle), reach=6.0 + kappa / 5, paper_rule=False,
              out_of_distribution=False, share=share, held_out=part[:5] == "right")
     for name, w, part, t, edge, nu, kappa, pull, fat, muscle, share in (
@@ -136,6 +136,11 @@ TISSUE_BODIES = tuple(
         ("arm_12", 0.6, "left_arm", 0.012, 4e-3, 0.45, 10.0, 0.6, 1.0, 1.0, 1.0),
         ("leg_bone", 0.5, "left_leg", 0.08, 12e-3, 0.45, 1.5, 0.1, 0.2, 5.0, 0.6),
         ("leg_30", 0.7, "left_leg", 0.03, 9e-3, 0.42, 5.0, 0.3, 0.35, 12.0, 1.0),
+        # what is flatter and wider than a limb
+        ("back_14", 0.2, "back", 0.014, 7e-3, 0.45, 10.0, 0.35, 0.25, 15.0, 1.0),
+        ("back_18", 0.5, "back", 0.018, 8e-3, 0.45, 7.0, 0.25, 0.33, 12.0, 1.0),
+        ("back_22", 0.8, "back", 0.022, 9e-3, 0.43, 5.0, 0.15, 0.45, 10.0, 1.0),
+        ("back_30", 0.7, "back", 0.03, 9e-3, 0.45, 3.0, 0.1, 0.5, 8.0, 1.0),
         # the ends of the ranges
         ("bare", 0.3, "left_arm", 0.02, 6e-3, 0.42, 0.0, 0.0, 0.5, 4.0, 1.0),
         ("drum", 0.5, "left_arm", 0.015, 5e-3, 0.4, 30.0, 1.0, 1.0, 1.0, 1.0),
@@ -297,17 +302,15 @@ def layers(plan: Plan) -> dict[str, SoftLayer]:
         if isinstance(thickness, tuple):
             rng = ContactId(body.name, "disc", -2).rng(plan.seed)
             thickness = varying(patch.layer(skin, thickness=thickness[0]).vertices, thickness, rng)
-        out[body.name] = _stacked(body, skin, patch.part, patch.layer(skin, thickness=SKIN)) if body.to_bone else \
-            patch.layer(skin, thickness=thickness, tissue=Tissue(poisson_ratio=body.poisson_ratio))
+        layer = patch.layer(skin, thickness=SKIN if body.to_bone else thickness,
+                            tissue=Tissue(poisson_ratio=body.poisson_ratio))  # fmt: skip
+        if body.to_bone:
+            assert isinstance(body.thickness, float)
+            layer = to_bone(layer, bones_of(skin, patch.part), body.thickness)
+        if body.stack:
+            layer = layer.with_(tissue=body.stack.tissue(body.poisson_ratio, float(np.median(layer.thickness))))
+        out[body.name] = layer
     return out
-
-
-def _stacked(body: BodyPlan, skin: Body, part: str, layer: SoftLayer) -> SoftLayer:
-    """The layer with columns to its bones, of the body's stack."""
-    assert isinstance(body.thickness, float)
-    layer = to_bone(layer, bones_of(skin, part), body.thickness)
-    stack = body.stack or StackPlan(kappa=0)
-    return layer.with_(tissue=stack.tissue(body.poisson_ratio, float(np.median(layer.thickness))))
 
 
 def varying(points: np.ndarray, bounds: tuple[float, float], rng: np.random.Generator) -> np.ndarray:
