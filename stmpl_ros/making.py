@@ -9,8 +9,9 @@ import numpy as np
 
 from stmpl_core.contact import Contact
 from stmpl_core.errors import InvalidInput
+from stmpl_core.friction import Friction, friction_from
 from stmpl_core.layer import SoftLayer
-from stmpl_core.living import held_skin, living, read_tissue, region_of
+from stmpl_core.living import held_skin, living, read_model, read_tissue, region_of
 from stmpl_core.regions import Tone
 from stmpl_core.simulator import Simulator
 from stmpl_core.skin import Skin, published
@@ -37,6 +38,13 @@ def layer_of(config: NodeConfig) -> SoftLayer:
         return body.part(config.limb, edge_length=config.edge_length, thickness=thickness, tissue=tissue)
     tissue = Tissue(config.youngs_modulus, config.poisson_ratio, config.density)
     return body.part(config.limb, edge_length=config.edge_length, thickness=config.thickness, tissue=tissue)
+
+
+def friction_of(config: NodeConfig) -> Friction | dict[str, Friction]:
+    """Friction that the settings ask for: theirs, or what the file that `tissue` names says. Raises InvalidInput."""
+    if config.friction or config.tissue in (*get_args(Tone), PAPER):
+        return friction_from(config.friction)
+    return friction_from(read_model(config.tissue).friction or "")
 
 
 def check(config: NodeConfig, build: Build, changed: set[str] | None = None) -> None:

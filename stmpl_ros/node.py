@@ -20,7 +20,6 @@ from stmpl_msgs.srv import SetBody
 from threadpoolctl import threadpool_limits
 
 from stmpl_core.errors import InvalidInput, StmplError
-from stmpl_core.friction import friction_from
 from stmpl_core.sdf import SignedDistance
 from stmpl_core.simulator import Simulator
 from stmpl_core.skin import Skin
@@ -33,7 +32,7 @@ from stmpl_ros.calibration import Calibration
 from stmpl_ros.diagnosis import Tally, diagnostics, limits_status, skin_status
 from stmpl_ros.hearing import Hearing
 from stmpl_ros.limits import Limits
-from stmpl_ros.making import Build, at_once, check, layer_of, restiffened, skin_of, warm_up
+from stmpl_ros.making import Build, at_once, check, friction_of, layer_of, restiffened, skin_of, warm_up
 from stmpl_ros.parameters import NodeConfig
 from stmpl_ros.sending import Sending
 from stmpl_ros.settings import Settings
@@ -174,7 +173,7 @@ class SkinNode(LifecycleNode):
         else:
             again = tools
         self.skin, self.hearing.layer = skin, skin.layer
-        self.answering.simulator = Simulator(skin, tools=again, friction=friction_from(config.friction))
+        self.answering.simulator = Simulator(skin, tools=again, friction=friction_of(config))
         self.workshop = Workshop(self, skin.layer, builders)
         if before:
             before.close()

@@ -62,7 +62,7 @@ class NodeConfig(BaseModel):
     friction: str = Field(
         default="", json_schema_extra=CONFIGURING,
         description="friction of tools on skin: a coefficient, or dry, moist, oiled, glove, typical; or by tool: "
-        "'ball: oiled, letter: 0.3'; empty: none",
+        "'ball: oiled, letter: 0.3', or none; empty: as a file of stmpl needs says, else none",
     )  # fmt: skip
     relaxing: bool = Field(
         default=False, json_schema_extra=CONFIGURING,

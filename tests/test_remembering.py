@@ -1,14 +1,17 @@
 """Laws of the node's memory: whatever comes, it is the state of the instants that were answered."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
 from stmpl_core import Contact, Prony, Simulator, State, Tissue
 from stmpl_core.errors import InvalidInput
 from stmpl_core.friction import PAIRS, friction_from
+from stmpl_core.living import write_tissue
 from stmpl_core.methods import Winkler
 from stmpl_ros.inbox import Instant
-from stmpl_ros.making import skin_of, warm_up
+from stmpl_ros.making import friction_of, skin_of, warm_up
 from stmpl_ros.parameters import NodeConfig
 from stmpl_ros.remembering import ELASTIC, Remembering
 from stmpl_ros.settings import checked
@@ -136,3 +139,12 @@ def test_relaxing_is_for_whatever_skin_is_built_and_is_warmed_up() -> None:
     simulator = Simulator(fading, friction="dry")
     warm_up(simulator)
     assert simulator.remembers and not len(simulator.tools)
+
+
+def test_a_file_of_what_a_scene_needs_says_the_friction_unless_the_settings_do(tmp_path: Path) -> None:
+    path = tmp_path / "massage.json"
+    write_tissue(path, Tissue(relaxation=Prony((0.2,), (1.0,))), 0.01, "oiled", relaxing=True)
+    assert friction_of(NodeConfig(tissue=str(path))) == "oiled"
+    assert friction_of(NodeConfig(tissue=str(path), friction="0.3")) == 0.3
+    assert friction_of(NodeConfig(tissue=str(path), friction="none")) is None
+    assert friction_of(NodeConfig()) is None
