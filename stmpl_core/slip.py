@@ -29,6 +29,7 @@ STIFFNESS = _SLOPE[:-1] - _SLOPE[1:]  # of each spring, over k, (SPRINGS,)
 LIMIT = STIFFNESS * _YIELD[1:]  # force at which each slides, over the cap, (SPRINGS,)
 TRIALS, TOLERANCE = 30, 1e-9  # of the way for a force; over the cap
 MOST_CARRIED = 0.9999  # share of the cap that sticks: a force at the cap has no way
+PART, PARTS = 0.25, 16  # way over cap / k from which a step is cut, for a slide that turns; most parts
 PLOUGHED = 0.33, 0.2, 0.67  # see ploughing: growth of stiffness, and of the cap without and over mu
 
 
@@ -90,7 +91,27 @@ def _go(way, stiffness, cap, start, left, over, springs, force, slides):
 
 @numba.njit(cache=True, error_model="numpy")
 def drag(springs, relaxed, shares, times, dt, rolled, stiffness, before, cap, way, wanted, by_force):
-    """One step of the springs; see Drag.
+    """One step of the springs; see Drag, and for the arguments `_step`.
+
+    A slider that turns follows the way within a length of cap / k, so a longer step by pose is cut into parts.
+    """
+    far = 0.0
+    for x in range(3):
+        far += (stiffness[x] * way[x]) ** 2
+    parts = 1
+    if not by_force and cap > 0:
+        parts = int(min(max(np.ceil(np.sqrt(far) / (PART * cap)), 1.0), PARTS))
+    found, kept, force, share, stored = _step(springs, relaxed, shares, times, dt / parts, rolled, stiffness, before,
+                                              cap, way / parts, wanted, by_force)  # fmt: skip
+    for _ in range(parts - 1):
+        found, kept, force, share, stored = _step(found, kept, shares, times, dt / parts, 0.0, stiffness, stiffness,
+                                                  cap, way / parts, wanted, by_force)  # fmt: skip
+    return found, kept, force, share, stored
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _step(springs, relaxed, shares, times, dt, rolled, stiffness, before, cap, way, wanted, by_force):
+    """One part of a step of the springs; see Drag.
 
     Where the patch grew stiffer the springs keep their forces, where it grew softer these fall in proportion, and where
     the cap fell they are cut to it: none of that gives energy.

@@ -182,7 +182,7 @@ def calibrate(
 def stability(
     methods: tuple[str, ...] = STABILITY_METHODS,
     preset: Literal["default", "quick"] = "default",
-    only: Literal["all", "pressures", "contacts"] = "all",
+    only: Literal["all", "pressures", "contacts", "strokes"] = "all",
     out: Path | None = None,
     again: Path | None = None,
     fuzz: int = 0,
@@ -202,7 +202,7 @@ def stability(
         methods: names (zero, naive, winkler, linear, moment_net, unet, fem_1_step, fem, ladder), or
             module:attribute.
         preset: default (minutes a method, on the arm), quick (seconds, on a round limb).
-        only: axes to sweep: all, those of pressures, those of rigid tools.
+        only: axes to sweep: all, those of pressures, those of rigid tools, those of strokes with a state.
         out: folder of report, tables, picture and failures, runs/stability unless given; the picture with
             --critical-load.
         again: file of a failure to run again with the same method.

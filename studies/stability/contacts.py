@@ -127,11 +127,16 @@ class Contacts:
                    arrays.get("still"), truth)  # fmt: skip
 
 
-def simulator_of(make: Make, layer: SoftLayer) -> Simulator:
-    """A simulator with a fresh method, or the one that a method brings itself by `simulator(layer)`."""
+def simulator_of(make: Make, layer: SoftLayer, friction: float | None = None) -> Simulator:
+    """A simulator with a fresh method, or the one that a method brings itself by `simulator(layer)`.
+
+    Where there is friction, one that is brought is asked for by `simulator(layer, friction)`.
+    """
     method = make()
     own = getattr(method, "simulator", None)
-    return own(layer) if own is not None else Simulator(layer, method)
+    if own is None:
+        return Simulator(layer, method, friction=friction)
+    return own(layer) if friction is None else own(layer, friction)
 
 
 def answers_of(answers: list[Displacement]) -> list[Answer]:

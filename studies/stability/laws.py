@@ -17,6 +17,7 @@ from stmpl_core.trust import Displacement
 from studies.stability.broken import Answers, Broken, Found, Law, broken, worst
 from studies.stability.contact_laws import CONTACT_LAWS, forces_alike
 from studies.stability.scene import Pressures
+from studies.stability.stroke_laws import STROKE_LAWS
 from studies.stability.trial import Trial
 
 LEAK = 0.005  # of the peak, that may move beyond FAR thicknesses: finite elements leave 0.001 (DESIGN: locality)
@@ -142,7 +143,7 @@ LAWS: dict[str, Law] = {
     "seam": _alike("seam", SAME, SAME), "objective": _alike("objective", SAME, SAME),
     "similar": _alike("similar", SAME, FIELD), "mesh": _alike("mesh", MESH, MESH),
     "returns": returns, "additive": additive, "gain": gain,
-} | CONTACT_LAWS  # fmt: skip
+} | CONTACT_LAWS | STROKE_LAWS  # fmt: skip
 """Laws of answers, by name. Two more are judged where a method is asked: "answers" (a load that is sound is answered),
 and "refuses" (a load that is not finite is refused, or its answer flagged)."""
 
@@ -158,7 +159,9 @@ MEANING = {
     "steady": "same place by pose and wrench", "smooth": "no jump while sliding", "ripple": "no ripple while sliding",
     "outside": "no skin inside a tool", "covers": "stated bounds cover the error",
     "needless": "an ordinary touch is not flagged", "verdict": "one verdict for one scene",
-    "agrees": "stiffness agrees",
+    "agrees": "stiffness agrees", "gives": "gives no energy", "caps": "friction has a limit",
+    "alike": "the same in other steps", "masing": "reversals as Masing says", "between": "between relaxed and sudden",
+    "free": "free when lifted",
 }  # fmt: skip
 VERDICTS = frozenset(("needless", "verdict", "agrees"))  # laws of flags: alone, they do not make an answer wrong
 

@@ -20,6 +20,7 @@ LETTERS = {
     "seam": "e", "objective": "o", "similar": "s", "mesh": "m", "returns": "h", "additive": "a", "gain": "g",
     "bounded": "b", "rises": "d", "touches": "i", "presses": "F", "carries": "w", "still": "t", "steady": "P",
     "smooth": "k", "ripple": "~", "outside": "q", "covers": "±", "needless": "x", "verdict": "v", "agrees": "E",
+    "gives": "W", "caps": "µ", "alike": "2", "masing": "M", "between": "G", "free": "u",
 }  # fmt: skip
 
 

@@ -9,6 +9,7 @@ import numpy as np
 
 from studies.stability.contacts import Contacts
 from studies.stability.scene import Pressures, Scene
+from studies.stability.strokes import Strokes
 
 
 @dataclass(frozen=True, eq=False)
@@ -17,7 +18,7 @@ class Twin:
 
     Args:
         scene: scene that asks for as much as the one that it is compared with.
-        pairs: number of each common vertex in the first scene and in this one, (N, 2).
+        pairs: number of each common vertex in the first scene and in this one, (N, 2); of strokes, of each instant.
         turn: rotation or reflection, (3, 3).
         scale: scale of lengths [-].
         may_refuse: refusing the scene with an error that says why is right as well.
@@ -76,7 +77,7 @@ class Trial:
         return cls(card["axis"], card["level"], laws, _scene("scene", card, arrays), twin, card["rounds"])
 
 
-KINDS: dict[type, str] = {Pressures: "pressures", Contacts: "contacts"}
+KINDS: dict[type, str] = {Pressures: "pressures", Contacts: "contacts", Strokes: "strokes"}
 
 
 def _named(name: str, scene: Scene) -> dict[str, np.ndarray]:
