@@ -37,9 +37,11 @@ BODIES = ["anny>=0.6", "roma>=1.5", "torch>=2.4"]
 LEARN = [*BODIES, *DRAWN, "zarr>=3.0"]
 STUDIES = LEARN
 SIM = ["gymnasium>=1.0", "mujoco==4.0.0"]
+FMI = ["pythonfmu3>=0.3.4"]
 VIEW = [*DRAWN, "viser>=1.1"]
 CLUSTER = ["distributed>=2024.8"]
 TEST_TOOLS = [
+    "fmpy>=0.3.20",  # imports the unit of FMI
     "hypothesis>=6.100",
     "import-linter>=2.0",
     "meshio>=5.3",
@@ -56,8 +58,9 @@ EXTRAS = {  # by what people do
     "studies": STUDIES,  # the paper's tables, chart, stability, calibration of the ladder
     "view": VIEW,  # the page in the browser
     "sim": SIM,  # robots in simulators
+    "fmi": FMI,  # soft skin as a unit for simulators that import FMI 3.0
     "cluster": CLUSTER,  # data made on many machines
-    "dev": [*TEST_TOOLS, *STUDIES, *VIEW, *SIM, *CLUSTER],
+    "dev": [*TEST_TOOLS, *STUDIES, *VIEW, *SIM, *FMI, *CLUSTER],
     # only by name: their licences ask more than ours
     "smpl": ["smplx>=0.1.28", "torch>=2.4"],  # not for commerce
     "tetgen": ["tetgen>=0.6"],  # AGPL

@@ -18,6 +18,7 @@ VERBS = {  # module of each verb's function, and what it does
     "probe": ("stmpl_ros.verbs", "simulated devices along a script, on the skin of a running node"),
     "robot": ("stmpl_ros.verbs", "a simulated robot that massages the skin of a running node"),
     "links": ("stmpl_ros.verbs", "soft skin for a simulator over ROS: poses of links in, wrenches on links out"),
+    "fmu": ("stmpl_sim.verbs", "soft skin as a unit of FMI 3.0 for co-simulation"),
     "view": ("stmpl_ros.verbs", "the skin in the browser: a recording, the running node, or under a tool to drag"),
     "record": ("stmpl_ros.verbs", "record topics as MCAP, until Ctrl-C"),
     "replay": ("stmpl_ros.verbs", "answer recorded contacts again, or publish them"),

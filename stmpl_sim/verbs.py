@@ -1,4 +1,4 @@
-"""The verb `sim`: a robot massages a limb in a simulator, on this machine alone."""
+"""The verbs `sim` and `fmu`: a robot massages a limb in a simulator; soft skin as a unit for others."""
 
 from __future__ import annotations
 
@@ -95,6 +95,20 @@ def sim(
         figures |= {"film": str(save(camera.frames, out / "film.webp", FILM_RATE)), "frames_by": camera.backend}
         camera.close()
     print_figures(figures if as_json else table(figures))
+    return 0
+
+
+def fmu(out: Path = Path("runs")) -> int:
+    """Writes soft skin as a unit of FMI 3.0 for co-simulation: poses of a body and a tool in, wrenches out.
+
+    Example: stmpl fmu --out runs
+
+    Args:
+        out: folder for SoftSkin.fmu.
+    """
+    from stmpl_sim.fmi import write_fmu
+
+    print_figures(f"unit: {write_fmu(out)}")
     return 0
 
 
