@@ -25,6 +25,8 @@ SPRING, TWIST = (1500.0, 20.0), (30.0, 0.4)  # of a limb on springs: N/m and N s
 FROM = np.array([0.34, -0.52, 0.25])  # place of the camera, from the site [m]
 AIM = np.array([-0.03, 0.0, 0.06])  # point that it looks at, from the site [m]
 COLOURS = 256  # texels of the skin's colour scale
+ROOM = 0.08  # distance of a start's joints from their limits, over their ranges, beyond which no other start is tried
+STARTS, STEPS = 40, 200  # starts that are tried at most, and steps from each
 
 
 @dataclass(frozen=True, eq=False)
@@ -247,7 +249,10 @@ def _looking(way: np.ndarray) -> np.ndarray:
 
 
 def _reach(model: Any, joints: tuple[int, ...], site: Site, at: np.ndarray, height: float) -> np.ndarray:
-    """Configuration with the ball `height` over the site, head down; damped least squares from several starts."""
+    """Configuration with the ball `height` over the site, head down; damped least squares from several starts.
+
+    The first whose joints have room to move, or that which has most: at its limits an arm cannot keep a force.
+    """
     data, random = mujoco.MjData(model), np.random.default_rng(0)
     dofs, places = model.jnt_dofadr[list(joints)], model.jnt_qposadr[list(joints)]
     low, high = model.jnt_range[list(joints)].T
@@ -256,14 +261,15 @@ def _reach(model: Any, joints: tuple[int, ...], site: Site, at: np.ndarray, heig
     first = model.key_qpos[0][: model.nq] if model.nkey else None
     ball, target = model.geom(BALL).id, at + [0, 0, height]
     jacobian = np.zeros((6, model.nv))
-    for trial in range(40):
+    found: list[tuple[float, np.ndarray]] = []
+    for trial in range(STARTS):
         mujoco.mj_resetData(model, data)
         if trial == 0 and first is not None:
             data.qpos[places] = first[places]
         else:
             data.qpos[places] = 0.5 * (low + high) + (0 if trial < 2 else 0.3 * (high - low)) * random.uniform(
                 -1, 1, len(places))  # fmt: skip
-        for _ in range(200):
+        for k in range(STEPS):
             mujoco.mj_kinematics(model, data)
             mujoco.mj_comPos(model, data)
             axis = data.geom_xmat[ball].reshape(3, 3)[:, 2]
@@ -271,12 +277,22 @@ def _reach(model: Any, joints: tuple[int, ...], site: Site, at: np.ndarray, heig
             if axis[2] > 0:
                 error[3:] += axis[[1, 2, 0]]  # upside down: turn somewhere
             if np.abs(error).max() < 1e-6:
-                if (data.qpos[places] >= low).all() and (data.qpos[places] <= high).all():
-                    return data.qpos.copy()
+                rooms = np.minimum(data.qpos[places] - low, high - data.qpos[places]) / (high - low)
+                room = float(np.where(free, 0.5, rooms).min())
+                if room >= 0:
+                    found.append((room, data.qpos.copy()))
                 break
             mujoco.mj_jacGeom(model, data, jacobian[:3], jacobian[3:], ball)
             part = jacobian[:, dofs]
-            step = part.T @ np.linalg.solve(part @ part.T + 1e-4 * np.eye(6), error)
+            inverse = np.linalg.solve(part @ part.T + 1e-4 * np.eye(6), part).T
+            step = inverse @ error
+            if trial and k < STEPS // 2:  # what the aim leaves free goes to the middle of the ranges
+                middle = 0.1 * np.where(free, 0.0, 0.5 * (low + high) - data.qpos[places])
+                step += middle - inverse @ (part @ middle)
             data.qpos[places] = np.clip(data.qpos[places] + np.clip(step, -0.2, 0.2), low, high)
+        if found and found[-1][0] >= ROOM:
+            return found[-1][1]
+    if found:
+        return max(found, key=lambda one: one[0])[1]
     raise InvalidInput(f"the robot's head does not reach the limb at {np.round(at, 3).tolist()} m, pointing down. "
                        "Put the limb elsewhere (--at X Y Z), or name another end (--end).")  # fmt: skip

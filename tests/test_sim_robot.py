@@ -180,3 +180,22 @@ def test_the_verb_prints_figures_and_leaves_log_and_film(tmp_path: Path, capsys:
         with pytest.raises(SystemExit) as ended:
             main([*flags, str(tmp_path), *wrong])
         assert ended.value.code == 1 and why in capsys.readouterr().err
+
+
+def test_an_arm_starts_where_its_joints_have_room(forearm: SoftLayer, tmp_path: Path) -> None:
+    """Two slides carry the ball sideways: the aim leaves one free, and it goes off its limit."""
+    from stmpl_sim.scene import ROOM, build
+    from stmpl_sim.site import Site
+
+    path = tmp_path / "arm.xml"
+    inertial = '<inertial pos="0 0 0" mass="1" diaginertia="1 1 1"/>'
+    path.write_text(f"""<mujoco><worldbody>
+      <body name="a" pos="0 0 .8">{inertial}<joint name="far" type="slide" axis="1 0 0" range="-.4 .6"/>
+      <body name="b">{inertial}<joint name="x" type="slide" axis="1 0 0" range="-.02 .8"/>
+      <joint name="y" type="slide" axis="0 1 0" range="-1 1"/><joint name="z" type="slide" axis="0 0 1" range="-.6 .6"/>
+      <body name="c" quat="0 1 0 0">{inertial}</body></body></body>
+      </worldbody><keyframe><key qpos=".5 0 0 0"/></keyframe></mujoco>""")
+    scene = build(forearm, Site.thickest(forearm), robot=path, end="c")
+    low, high = scene.model.jnt_range[list(scene.joints)].T
+    room = np.minimum(scene.qpos[:4] - low, high - scene.qpos[:4]) / (high - low)
+    assert room.min() >= ROOM and scene.qpos[1] > 0.05  # the key's place would leave 2 cm of 82
