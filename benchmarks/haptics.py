@@ -19,15 +19,19 @@ import numpy as np
 from benchmarks.haptic_device import Device, Felt, Hand, Spot, arm_spot, play
 from stmpl_core import Contact
 from stmpl_core.haptics import DeviceLoop, LoopSettings
-from stmpl_core.local_contact import local_contact
+from stmpl_core.history import History
+from stmpl_core.local_contact import local_contacts
 from stmpl_core.provenance import machine
+from stmpl_core.regions import HELD_SKIN
 
 HARD = 5e5  # Pa: a skin beside which the coupling is soft, 5 kN/m under 1 N
-LEVELS = [round(100 * 2 ** (k / 2)) for k in range(15)]  # N/m, of the coupling: 100 to 12,800
+LEVELS = [round(100 * 2 ** (k / 4)) for k in range(31)]  # N/m, of the coupling: 100 to 18,100
 MODULI = [1e3 * 2**k for k in range(11)]  # Pa, of the skin: 1 kPa to 1 MPa
 COUPLING = 1000.0  # N/m, unless it is varied
 RATES, DELAYS = (500, 1000, 2000, 4000), (0.0, 2e-3, 5e-3)  # Hz of the device, s of its force
 NODE_DELAYS = (0.0, 20e-3)  # s of the local model
+STROKE = Hand(stroke=8e-3)  # along the skin, 8 mm, then still
+KINDS = {"elastic": (None, None), "relaxing": (HELD_SKIN, None), "mu 0.5": (None, 0.5), "both": (HELD_SKIN, 0.5)}
 
 
 def settings_for(device: Device, coupling: float, controller: bool) -> LoopSettings:
@@ -43,6 +47,15 @@ def stiffest_coupling(spot: Spot, rate: float, delay: float, controller: bool) -
     device = Device(rate=rate, delay_steps=round(delay * rate))
     hard = spot.with_modulus(HARD)
     last = _last_passive(LEVELS, lambda kc: play(device, Hand(), settings_for(device, kc, controller), hard))
+    return 0.0 if last is None else LEVELS[last[0]]
+
+
+def stiffest_stroke(spot: Spot, kind: str, delay: float, controller: bool) -> float:
+    """The same at 1 kHz for a press and a stroke on a hard skin of one of KINDS."""
+    device = Device(delay_steps=round(1e3 * delay))
+    hard = spot.with_modulus(HARD)
+    hard = hard if kind == "elastic" else hard.with_memory(*KINDS[kind])
+    last = _last_passive(LEVELS, lambda kc: play(device, STROKE, settings_for(device, kc, controller), hard))
     return 0.0 if last is None else LEVELS[last[0]]
 
 
@@ -132,13 +145,16 @@ def slide(spot: Spot, way: tuple[np.ndarray, np.ndarray], *, blend: float, speed
 
 def cost(spot: Spot) -> None:
     """Prints what a local model and a step of the loop take."""
-    print("what it takes                          median      p99   touches")
+    print("what it takes                          median      p99")
     contact = Contact(spot.tool, spot.pose(spot.centre(-2e-3)))
-    for name, turns in (("local model", True), ("local model without rotations", False)):
-        model = local_contact(spot.toucher, contact, rotations=turns)
-        median, p99 = _timed(lambda t=turns: local_contact(spot.toucher, contact, rotations=t), 60)
-        print(f"{name:35} {1e3 * median:7.2f}  {1e3 * p99:7.2f} ms {model.trust.figures['evaluations']:6.0f}")
-        print(f"    holds within {1e3 * model.valid_m:.2f} mm and {np.degrees(model.valid_rad):.1f} degrees")
+    touch, history = spot.toucher.touch(contact), History(spot.toucher)
+    model = local_contacts(history, [touch])[0]
+    for name, call in (("touch", lambda: spot.toucher.touch(contact)),
+                       ("local model beyond it", lambda: local_contacts(history, [touch])),
+                       ("wrench of a model", lambda: model.wrench_at(contact.pose_body_from_tool))):  # fmt: skip
+        median, p99 = _timed(call, 200)
+        print(f"{name:35} {1e3 * median:7.2f}  {1e3 * p99:7.2f} ms")
+    print(f"    the model holds within {1e3 * model.valid_m:.2f} mm and {np.degrees(model.valid_rad):.1f} degrees")
     loop, still = DeviceLoop(), np.zeros(3)
     loop.update(model)
     median, p99 = _timed(lambda: loop.step(spot.centre(-3e-3), still, 1e-3), 20_000)
@@ -190,14 +206,18 @@ def z_width(spot: Spot, kept: Path, seconds: float) -> dict[str, float]:
     """All cells of the maps; those already in `kept` are not measured again. Stops early after so many seconds."""
     cells: dict[str, float] = json.loads(kept.read_text()) if kept.exists() else {}
     wanted: dict[str, Callable[[], float]] = {}
-    for delay in DELAYS:
-        for on in (False, True):
-            for rate in RATES:
-                wanted[f"coupling {rate} {delay:g} {on}"] = partial(stiffest_coupling, spot, rate, delay, on)
+    for kind in KINDS:
+        for delay in DELAYS:
+            for on in (False, True):
+                wanted[f"stroke {kind} {delay:g} {on}"] = partial(stiffest_stroke, spot, kind, delay, on)
     for late in NODE_DELAYS:
         for on in (False, True):
             for held in (False, True):
                 wanted[f"contact {late:g} {on} {held}"] = partial(stiffest_contact, spot, late, on, held)
+    for delay in DELAYS:
+        for on in (False, True):
+            for rate in RATES:
+                wanted[f"coupling {rate} {delay:g} {on}"] = partial(stiffest_coupling, spot, rate, delay, on)
     end = time.perf_counter() + seconds
     for name, measure in wanted.items():
         if name not in cells:
@@ -212,13 +232,19 @@ def z_width(spot: Spot, kept: Path, seconds: float) -> dict[str, float]:
 
 def print_map(cells: dict[str, float]) -> None:
     """Prints both maps."""
-    print("stiffest passive coupling against a hard skin [N/m], levels a factor 1.4 apart\n"
+    print("stiffest passive coupling against a hard skin [N/m], levels a factor 1.2 apart\n"
           "force late by   controller" + "".join(f"{r:>9} Hz" for r in RATES))
     for delay in DELAYS:
         for on in (False, True):
             row = [cells.get(f"coupling {r} {delay:g} {on}", np.nan) for r in RATES]
             print(f"{1e3 * delay:10.0f} ms {'on' if on else 'off':>10}  " + "".join(f"{c:12.0f}" for c in row))
         print(f"{'2 b / (T + 2 d)':>24}  " + "".join(f"{guide(r, delay):12.0f}" for r in RATES))
+    print("\nthe same at 1 kHz, for a press and a stroke of 8 mm, by what the skin does\n"
+          "force late by   controller" + "".join(f"{kind:>12}" for kind in KINDS))
+    for delay in DELAYS:
+        for on in (False, True):
+            row = [cells.get(f"stroke {kind} {delay:g} {on}", np.nan) for kind in KINDS]
+            print(f"{1e3 * delay:10.0f} ms {'on' if on else 'off':>10}  " + "".join(f"{c:12.0f}" for c in row))
     print("\nstiffest passive contact at 1 kHz, coupling 1 kN/m, 125 models/s [N/m], moduli a factor 2 apart\n"
           "models late by  controller  linear model  force only")
     for late in NODE_DELAYS:
@@ -235,7 +261,7 @@ def draw(cells: dict[str, float], path: Path) -> None:
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
-    figure, (left, right) = plt.subplots(1, 2, figsize=(11, 4.2), layout="constrained")
+    figure, (left, middle, right) = plt.subplots(1, 3, figsize=(15, 4.2), layout="constrained")
     for delay, colour in zip(DELAYS, plt.get_cmap("viridis")(np.linspace(0, 0.85, len(DELAYS))), strict=True):
         for on in (False, True):
             row = [cells.get(f"coupling {r} {delay:g} {on}", np.nan) for r in RATES]
@@ -250,6 +276,16 @@ def draw(cells: dict[str, float], path: Path) -> None:
     left.set_xticks(RATES, [str(r) for r in RATES], minor=False)
     left.minorticks_off()
     left.legend(fontsize=8)
+    for n, kind in enumerate(KINDS):
+        for on in (False, True):
+            row = [cells.get(f"stroke {kind} {delay:g} {on}", np.nan) for delay in DELAYS]
+            middle.bar(np.arange(len(DELAYS)) + 0.2 * (n - 1.5), row, 0.18, color=f"C{n}", alpha=0.35 if on else 1.0,
+                       zorder=2 if on else 3, label=None if on else kind)
+    middle.set_yscale("log")
+    middle.set_xticks(range(len(DELAYS)), [f"{1e3 * d:.0f} ms" for d in DELAYS])
+    middle.set(xlabel="delay of the force", ylabel="stiffest passive coupling [N/m]", ylim=(100, None),
+               title="Press and stroke at 1 kHz (pale: with the controller)")
+    middle.legend(fontsize=8)
     late = 1e3 * np.array(NODE_DELAYS)
     for held, colour in ((False, "C0"), (True, "C3")):
         for on in (False, True):
@@ -260,7 +296,7 @@ def draw(cells: dict[str, float], path: Path) -> None:
     right.set(xlabel="delay of the node's answers [ms]", ylabel="stiffest passive contact [N/m]",
               title="Contact, 125 answers/s, loop at 1 kHz")
     right.legend(fontsize=8)
-    for axis in (left, right):
+    for axis in (left, middle, right):
         axis.grid(True, which="major", alpha=0.3)
     figure.savefig(path, dpi=130)
 

@@ -226,7 +226,7 @@ def _slopes(points, inward, thickness, area, strain, corners, shares, group, ben
     held = _correct(*seen, low, high, mean, scale, w1, b1, w2, b2, w3, b3, w4, b4)[0]
     out = np.empty_like(rates)
     for k in range(len(rates)):
-        h = _small(force, rates[k])
+        h = _small(force, rates[k], strain, strain_rates[k])
         seen = _see(rings, points, inward, thickness, area, unit, np.maximum(force + h * rates[k], 0.0),
                     np.maximum(strain + h * strain_rates[k], 0.0), here, moduli, nu)  # fmt: skip
         out[k] = (_correct(*seen, low, high, mean, scale, w1, b1, w2, b2, w3, b3, w4, b4)[0] - held) / h
@@ -247,7 +247,7 @@ def _slopes_on_stack(points, inward, thickness, area, strain, corners, shares, s
     held = _correct(*seen, low, high, mean, scale, w1, b1, w2, b2, w3, b3, w4, b4)[0]
     out = np.empty_like(rates)
     for k in range(len(rates)):
-        h = _small(force, rates[k])
+        h = _small(force, rates[k], strain, strain_rates[k])
         seen = _see_on_stack(rings, points, inward, thickness, area, t, np.maximum(force + h * rates[k], 0.0),
                              np.maximum(strain + h * strain_rates[k], 1e-9),
                              np.maximum(sinking + h * sinking_rates[k], 0.0), here, nu, numbers, log_thickness,
@@ -257,9 +257,10 @@ def _slopes_on_stack(points, inward, thickness, area, strain, corners, shares, s
 
 
 @numba.njit(cache=True)
-def _small(force, rate):
-    """Step of a difference in which the largest force changes by SMALL_STEP."""
-    return SMALL_STEP * force.max() / max(np.abs(rate).max(), 1e-300)
+def _small(force, force_rate, strain, strain_rate):
+    """Step of a difference in which neither force nor strain changes by more than SMALL_STEP of its largest."""
+    fastest = max(np.abs(force_rate).max() / force.max(), np.abs(strain_rate).max() / strain.max())
+    return SMALL_STEP / max(fastest, 1e-12)
 
 
 @numba.njit(cache=True, error_model="numpy")

@@ -27,14 +27,23 @@ AGREEMENT = 0.1  # error of the linear model over the wrench, inside its neighbo
 WIDEST = 2e-3  # largest neighbourhood [m]
 SAFETY = 0.8  # of the neighbourhood that a power law of the depth allows: measured rims are at 0.8 to 1.2 of it
 LEAST_POWER = 1.1  # power of the depth with which the force grows, below which it is not trusted to be straight
-FADE = 0.1  # normal force over the reaction, below which drag and torque fade with it
+MOST_POWER = 4.0  # and above which not either
+DEEPER = 4e-3  # way deeper than the model, or as much as it is deep, beyond which no force grows [m]
+FADE = 0.1  # normal force over the reaction, below which a DeviceLoop lets drag fade with it
 
 
 class Rendered(NamedTuple):
-    """Wrench of a local model at a pose, and whether the model holds there."""
+    """What a local model says of a pose.
+
+    Args:
+        wrench: wrench that the tool exerts on the body about its origin, (6,) [N, N m].
+        inside: truth of the claim that the model holds there.
+        stored: energy that the contact would give back if the tool retreated at once [J].
+    """
 
     wrench: Wrench
     inside: bool
+    stored: float = 0.0
 
 
 class Grip(NamedTuple):
@@ -58,11 +67,11 @@ class Grip(NamedTuple):
         """Wrench of the friction at the model's pose, (6,) [N, N m]."""
         return self.axes.T @ self.forces
 
-    def carried(self, twist: np.ndarray, pressing: float) -> Wrench:
-        """Wrench of the friction after a twist (6,), never more than the limit of a normal force [N]."""
+    def carried(self, twist: np.ndarray, pressing: float) -> np.ndarray:
+        """Friction along the ways after a twist (6,), never more than the limit of a normal force [N], (3,) [N]."""
         forces = self.forces + self.stiffness * (self.axes @ twist)
         size, most = float(np.linalg.norm(forces)), self.limit * max(pressing, 0.0)
-        return self.axes.T @ (forces * (most / size if size > most else 1.0))
+        return forces * (most / size if size > most else 1.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,6 +89,8 @@ class LocalContact:
         status: status of the touch at the pose.
         trust: trust in the touch at the pose.
         grip: friction, part of wrench and stiffness; None: none.
+        power: power of the depth with which the elastic force grows; 1: not told, a straight line.
+        eased: part of the elastic force that has relaxed [N].
     """
 
     pose_body_from_tool: Transform
@@ -90,6 +101,8 @@ class LocalContact:
     status: str
     trust: Trust
     grip: Grip | None = None
+    power: float = 1.0
+    eased: float = 0.0
 
     @property
     def push(self) -> Wrench:
@@ -113,9 +126,13 @@ class LocalContact:
     def wrench_at(self, pose_body_from_tool: ArrayLike) -> Rendered:
         """Wrench (6,) at another pose, extrapolated; never pulling, and bounded.
 
-        No force goes against `normal`. Beyond the neighbourhood nothing grows further: the twist counts up to its rim,
-        but where the tool retreats, so that the force still ends. As the normal force falls below a tenth of `push`,
-        drag and torque fade with it, so that all end together. Friction never exceeds its cone.
+        With g the growth of the normal force N by stiffness and twist, A what has relaxed and m the power,
+
+            N' = max((N + A) (1 + g / (m (N + A)))^m - A, 0),    W' = N' / N (W + K twist - g / N W)
+
+        so that models of one press lie on one curve, however late they come, and all ends together. Sideways the twist
+        counts up to the neighbourhood's rim, inwards up to DEEPER; beyond nothing grows. Friction never exceeds its
+        cone.
 
         Raises:
             InvalidInput: a pose that is not finite.
@@ -125,20 +142,30 @@ class LocalContact:
         move, turn = float(np.linalg.norm(twist[:3])), float(np.linalg.norm(twist[3:]))
         inside = move <= self.valid_m and turn <= self.valid_rad
         push, normal, stiffness = self.push, self.normal, self.push_stiffness
+        size = float(np.linalg.norm(push[:3]))
+        if size == 0:
+            return Rendered(np.zeros(6), inside)
+        elastic, m = size + self.eased, self.power
+        along = float(normal @ stiffness[:3, :3] @ normal)
+        depth = m * elastic / along if along > 0 else WIDEST
+        base = min(1 + float(normal @ stiffness[:3] @ twist) / (m * elastic), 1 + max(1.0, DEEPER / depth))
+        free = (self.eased / elastic) ** (1 / m)  # base at which the tool lets go
+        if base <= free:
+            return Rendered(np.zeros(6), inside)
+        pressing = elastic * base**m - self.eased
+        stored = elastic * (base ** (m + 1) - free ** (m + 1)) / (m + 1) - self.eased * (base - free)
+        stored *= depth
         near = twist.copy()
         near[:3] *= self.valid_m / move if move > self.valid_m else 1.0
         near[3:] *= self.valid_rad / turn if turn > self.valid_rad else 1.0
-        wrench, size = push + stiffness @ near, float(np.linalg.norm(push[:3]))
-        grown = min(float(normal @ (stiffness @ near)[:3]), float(normal @ (stiffness @ twist)[:3]))
-        pressing = size + grown
-        if pressing <= 0:
-            return Rendered(np.zeros(6), inside)
-        fade = min(1.0, pressing / (FADE * size))
-        wrench[:3] = pressing * normal + fade * (wrench[:3] - normal * (normal @ wrench[:3]))
-        wrench[3:] *= fade
+        turned = stiffness @ near
+        turned -= float(normal @ turned[:3]) / size * push
+        wrench = pressing / size * (push + turned)
         if self.grip is not None:
-            wrench += self.grip.carried(twist, pressing)
-        return Rendered(wrench, inside)
+            forces = self.grip.carried(twist, pressing)
+            wrench += self.grip.axes.T @ forces
+            stored += 0.5 * float((forces**2 / self.grip.stiffness).sum())
+        return Rendered(wrench, inside, stored)
 
 
 def local_contact(toucher: Toucher, contact: Contact, *, rotations: bool = True) -> LocalContact:
@@ -181,11 +208,12 @@ def _model(toucher: Toucher, touch: Touch, tangent: Tangent | None, memory: Memo
                             touch.status, touch.trust)  # fmt: skip
     push = touch.wrench if touch.slip is None else touch.wrench - touch.slip.wrench
     normal, nodes = push[:3] / touch.force, pressed.squeeze.nodes
-    stiffness, drawn = tangent.stiffness, pressed.factor
+    stiffness, drawn, eased = tangent.stiffness, pressed.factor, 0.0
     whole = float(pressed.forces.sum())
     if memory is not None and memory.scalars.pressing > 0:  # W = W_e (1 - relaxed / F_e), and the relaxed part stays
-        by = whole / (memory.scalars.elastic * touch.passive)
+        by = min(whole / (memory.scalars.elastic * touch.passive), 1.0)
         stiffness = stiffness + (1 / by - 1) * np.outer(push / whole, tangent.whole)
+        eased = (1 / by - 1) * touch.force
         drawn /= by * touch.passive
     if drawn > 1 + 1e-9:  # the tool was drawn back along the normal to where it is answered for: see Toucher
         along = np.append(normal, np.zeros(3))
@@ -193,14 +221,15 @@ def _model(toucher: Toucher, touch: Touch, tangent: Tangent | None, memory: Memo
         stiffness = stiffness + np.outer(rise - stiffness @ along, along)
     depth = nodes.sinking if len(nodes.sinking) else nodes.strain * nodes.thickness
     contact = patch_of(nodes.points, nodes.area, nodes.thickness, depth, pressed.forces, normal)
+    steep = float(normal @ stiffness[:3, :3] @ normal) * touch.depth  # power of the depth times force
+    valid = _neighbourhood(touch, pressed, max(steep / touch.force, pressed.power, LEAST_POWER), *contact[:2])
+    power = 1.0 if drawn > 1 + 1e-9 else min(max(steep / (touch.force + eased), 1.0), MOST_POWER)
     grip = None
     if touch.slip is not None and memory is not None:
         grip = _grip(touch, memory, contact[2])
         stiffness = stiffness + (grip.axes.T * grip.stiffness) @ grip.axes
-    power = max(float(normal @ stiffness[:3, :3] @ normal) * touch.depth / touch.force, pressed.power, LEAST_POWER)
-    return LocalContact(touch.pose_body_from_tool, touch.wrench, stiffness,
-                        *_neighbourhood(touch, pressed, power, contact[0], contact[1]), touch.status, touch.trust,
-                        grip)  # fmt: skip
+    return LocalContact(touch.pose_body_from_tool, touch.wrench, stiffness, *valid, touch.status, touch.trust, grip,
+                        power, eased)  # fmt: skip
 
 
 def _neighbourhood(touch: Touch, pressed: Pressed, power: float, middle: np.ndarray, radius: float
