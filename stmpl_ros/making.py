@@ -87,7 +87,8 @@ def at_once(config: NodeConfig, build: Build) -> bool:
 def skin_of(config: NodeConfig, build: Build = layer_of) -> Skin:
     """Skin that the settings ask for. Raises InvalidInput or MeshError."""
     layer = build(config)
-    return Skin.of(published(held_skin(layer) if config.relaxing else layer), config.new_method())
+    fades = config.relaxing and not layer.tissue.relaxes  # a file of stmpl needs has a series of its own
+    return Skin.of(published(held_skin(layer) if fades else layer), config.new_method())
 
 
 def restiffened(skin: Skin, config: NodeConfig, changed: set[str]) -> Skin | None:

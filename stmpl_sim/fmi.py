@@ -9,9 +9,10 @@ import numpy as np
 
 from stmpl_core.errors import InvalidInput
 from stmpl_core.extras import needed
+from stmpl_core.friction import friction_from
 from stmpl_core.tool import Tool
 from stmpl_sim.protocol import Memory, Poses, SoftContact
-from stmpl_sim.verbs import friction_of, limb
+from stmpl_sim.verbs import limb
 
 SCRIPT = """from pythonfmu3 import Boolean, Dimension, Float64, Fmi3Slave, String
 from pythonfmu3.enums import Fmi3Causality, Fmi3Initial, Fmi3Variability
@@ -113,7 +114,7 @@ class Unit:
         tool = Tool("tool", mesh.vertices, mesh.faces)
         layer = limb(self._values["part"], self._values["tissue"])
         self._contact = SoftContact(layer, [tool], damping=self._values["damping"],
-                                    friction=friction_of(self._values["friction"]))  # fmt: skip
+                                    friction=friction_from(self._values["friction"]))  # fmt: skip
         self._memory = Memory()
 
     def step(self, dt: float) -> None:
