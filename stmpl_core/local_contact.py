@@ -27,7 +27,7 @@ AGREEMENT = 0.1  # error of the linear model over the wrench, inside its neighbo
 WIDEST = 2e-3  # largest neighbourhood [m]
 SAFETY = 0.8  # of the neighbourhood that a power law of the depth allows: measured rims are at 0.8 to 1.2 of it
 LEAST_POWER = 1.1  # power of the depth with which the force grows, below which it is not trusted to be straight
-MOST_POWER = 4.0  # and above which not either
+MOST_POWER = 2.5  # and above which not either
 DEEPER = 4e-3  # way deeper than the model, or as much as it is deep, beyond which no force grows [m]
 FADE = 0.1  # normal force over the reaction, below which a DeviceLoop lets drag fade with it
 

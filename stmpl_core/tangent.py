@@ -97,8 +97,8 @@ def _of_group(toucher: Toucher, touches: Sequence[Touch]) -> list[Tangent]:
         own = one.factor * slopes[6 * k : 6 * k + 6, slices[k]]
         unit = _units(layer.vertices, layer.vertex_area_vectors, layer.vertex_areas, touch.pose_body_from_tool[:3, 3],
                       every[k].corners)  # fmt: skip
-        stiffness = (own @ np.einsum("nc,ncx->nx", every[k].shares, unit)).T
-        stiffness += np.einsum("n,knc,ncx->xk", one.forces, rates[k].shares, unit)
+        corners = own[:, :, None] * every[k].shares + one.forces[:, None] * rates[k].shares  # force at each, (6, N, 3)
+        stiffness = (corners.reshape(6, -1) @ unit.reshape(-1, 6)).T.copy()
         stiffness[3:, :3] += _cross_matrix(touch.wrench[:3])
         out.append(Tangent(stiffness, own.sum(axis=1)))
     return out
@@ -177,28 +177,47 @@ def _carried(vertices, normals, thicknesses, points, inward, thickness, corners,
     """
     many = len(points)
     moved, go, turned = np.zeros((6, many, 3)), np.zeros((6, many, 3)), np.zeros((6, many, 3))
-    thicker, twist, raw = np.zeros((6, many)), np.zeros(6), np.zeros(3)
+    thicker, raw, edge, other, face, one = (np.zeros((6, many)), np.empty(3), np.empty(3), np.empty(3), np.empty(3),
+                                            np.empty(3))  # fmt: skip
+    turn, arm, here = np.empty(3), centre - origin, np.empty(3)
     for n in range(many):
         a, b, c = corners[n]
-        edge, other, normal = vertices[b] - vertices[a], vertices[c] - vertices[a], inward[n]
-        face = _cross(edge, other)
-        size = _dot(face, face)
+        normal = inward[n]
+        for x in range(3):
+            edge[x], other[x] = vertices[b, x] - vertices[a, x], vertices[c, x] - vertices[a, x]
+            here[x] = points[n, x] - centre[x]
+            raw[x] = shares[n, 0] * normals[a, x] + shares[n, 1] * normals[b, x] + shares[n, 2] * normals[c, x]
+        _cross(edge, other, face)
+        size, root = _dot(face, face), 1 / np.sqrt(_dot(raw, raw))
         way = mean if _dot(mean, normal) > FACING else normal
-        raw[:] = shares[n, 0] * normals[a] + shares[n, 1] * normals[b] + shares[n, 2] * normals[c]
-        root = 1 / np.sqrt(_dot(raw, raw))
         for k in range(6):
-            twist[:] = 0.0
-            twist[k] = 1.0
-            goes = twist[:3] + _cross(twist[3:], centre - origin) + \
-                _dot(twist[3:], way) * _cross(way, points[n] - centre)  # fmt: skip
-            goes -= _dot(goes, face) / _dot(way, face) * way  # it stays on its triangle
-            beta, gamma = _dot(_cross(goes, other), face) / size, _dot(_cross(edge, goes), face) / size
+            goes = go[k, n]
+            if k < 3:
+                goes[k] = 1.0
+            else:
+                turn[:] = 0.0
+                turn[k - 3] = 1.0
+                _cross(turn, arm, goes)
+                _cross(way, here, one)
+                for x in range(3):
+                    goes[x] += way[k - 3] * one[x]
+            up = _dot(goes, face) / _dot(way, face)
+            for x in range(3):
+                goes[x] -= up * way[x]  # it stays on its triangle
+            _cross(goes, other, one)
+            beta = _dot(one, face) / size
+            _cross(edge, goes, one)
+            gamma = _dot(one, face) / size
             moved[k, n, 0], moved[k, n, 1], moved[k, n, 2] = -beta - gamma, beta, gamma
-            go[k, n] = goes
+            turns = turned[k, n]
             for m in range(3):
-                thicker[k, n] += moved[k, n, m] * thicknesses[corners[n, m]]
-                turned[k, n] += root * moved[k, n, m] * normals[corners[n, m]]
-            turned[k, n] -= _dot(turned[k, n], normal) * normal
+                v, share = corners[n, m], moved[k, n, m]
+                thicker[k, n] += share * thicknesses[v]
+                for x in range(3):
+                    turns[x] += root * share * normals[v, x]
+            up = _dot(turns, normal)
+            for x in range(3):
+                turns[x] -= up * normal[x]
     return moved, go, turned, thicker
 
 
@@ -220,12 +239,14 @@ def _deepened(points, inward, thickness, area, strain, columns, distance, gradie
         if deep <= 0 or abs(along) < LEAST_COSINE:
             continue
         share, rim, inside = strain[n] * t / deep, 1 - distance[1, n] / wall, -2 * distance[2, n] / wall
+        told = min(max(rim, 0.0), 1.0) * (min(max(inside, 0.0), 1.0) if deep > wall else 1.0)
+        known = abs(told - share) < 0.02 and told > 0.02  # else the tool has sunk under this skin: its share is held
         for k in range(6):
             rate = _entered(gradient[0, n], points[n], normal, deep, go[k, n], turned[k, n], k, origin) / along
             more = 0.0
-            if 0 < rim < 1:
+            if known and rim < 1:
                 more += _entered(gradient[1, n], points[n], normal, 0.0, go[k, n], turned[k, n], k, origin) / wall / rim
-            if 0 < inside < 1:
+            if known and deep > wall and inside < 1:
                 over = _entered(gradient[2, n], points[n], normal, columns[2, n], go[k, n], turned[k, n], k, origin)
                 more += 2 * (over - rate * _dot(gradient[2, n], normal)) / wall / inside
             if deep < MAX_COLUMN_STRAIN * t:
@@ -269,5 +290,5 @@ def _dot(a, b):
 
 
 @numba.njit(cache=True, error_model="numpy", inline="always")
-def _cross(a, b):
-    return np.array([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]])
+def _cross(a, b, out):
+    out[0], out[1], out[2] = a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]

@@ -16,7 +16,7 @@ from stmpl_core.errors import InvalidInput
 from stmpl_core.haptics import DeviceLoop, LoopSettings
 from stmpl_core.history import History
 from stmpl_core.living import living
-from stmpl_core.local_contact import LocalContact, local_contact, local_contacts
+from stmpl_core.local_contact import DEEPER, LocalContact, local_contact, local_contacts
 from stmpl_core.sdf import SignedDistance
 from stmpl_core.touch import APART, IN_CORE
 from stmpl_core.toucher import Toucher
@@ -130,6 +130,17 @@ def test_a_letter_is_about_as_stiff_as_differences_say(spot: Spot) -> None:
     assert along[0] == pytest.approx(along[1], rel=0.2)
 
 
+@pytest.mark.parametrize("depth", [8e-3, 11e-3, 13e-3])
+def test_a_ball_that_has_sunk_under_the_skin_is_about_as_stiff_as_differences_say(depth: float) -> None:
+    """Columns beside it enter it from below, whose depth is not that at the skin."""
+    toucher, small = Toucher(plate(0.09, thickness=0.03)), ball(6)
+    model = local_contact(toucher, Contact(small, at(0, 0, -depth)))
+    step = 2e-4
+    ahead, behind = (toucher.touch(Contact(small, at(0, 0, -depth + s * step))).force for s in (-1, 1))
+    along = model.normal @ model.stiffness[:3, :3] @ model.normal
+    assert along == pytest.approx((ahead - behind) / (2 * step), rel=0.35)
+
+
 def test_a_tool_gives_way_to_the_one_beside_it(spot: Spot) -> None:
     toucher, pose = spot.toucher, spot.pose(spot.centre(-DEEP))
     places = {"left": spot.pose(spot.centre(-DEEP, -5e-3)), "right": spot.pose(spot.centre(-DEEP, 5e-3))}
@@ -191,14 +202,17 @@ def test_friction_of_a_model_keeps_to_its_cone_and_nothing_grows_without_bound(s
     assert model.grip is not None and np.linalg.norm(model.grip.wrench[:3]) > 0.1 * touches[0].force
     plain = replace(model, wrench=model.push, stiffness=model.push_stiffness, grip=None)
     rng, most = np.random.default_rng(0), float(np.linalg.norm(model.push_stiffness[:3, :3], 2)) * model.valid_m
-    turns = float(np.linalg.norm(model.push_stiffness[:3, 3:], 2)) * model.valid_rad
+    turns, force = float(np.linalg.norm(model.push_stiffness[:3, 3:], 2)) * model.valid_rad, touches[0].force
+    depth = model.power * force / (model.normal @ model.push_stiffness[:3, :3] @ model.normal)
+    grown = force * (1 + max(1.0, DEEPER / depth)) ** model.power
     for size in (1e-4, 1e-3, 1e-2, 1.0):
         for twist in size * rng.normal(size=(50, 6)) * np.repeat([1, 30], 3):
             pose = turned(model.pose_body_from_tool, twist)
             push, both = plain.wrench_at(pose).wrench, model.wrench_at(pose).wrench
             pressing = float(model.normal @ push[:3])
             assert pressing >= 0
-            assert np.linalg.norm(push[:3]) <= 1.001 * (touches[0].force + most + turns)
+            assert pressing <= 1.001 * grown
+            assert np.linalg.norm(push[:3]) <= 1.001 * grown * (1 + (most + turns) / force)
             drag = (both - push)[:3]
             assert abs(drag @ model.normal) < 0.05 * model.grip.limit * pressing + 1e-9
             assert np.linalg.norm(drag) <= 1.001 * model.grip.limit * pressing
