@@ -302,6 +302,13 @@ def wrench_message(wrench: Wrench, frame: str, stamp_ns: int) -> Any:
     return message_class("geometry_msgs/msg/WrenchStamped")(header=header(frame, stamp_ns), wrench=_wrench(wrench))
 
 
+def update_wrench(message: Any, wrench: Wrench, stamp_ns: int) -> None:
+    """Sets wrench and stamp of a WrenchStamped that is sent over and over: making one takes 50 us, this one."""
+    f, t, stamp = message.wrench.force, message.wrench.torque, message.header.stamp
+    f.x, f.y, f.z, t.x, t.y, t.z = wrench.tolist()
+    stamp.sec, stamp.nanosec = divmod(stamp_ns, NANO)
+
+
 def tool_message(tool: Tool, stamp_ns: int) -> Any:
     """The surface of a tool as a ContactMesh."""
     kind = message_class("stmpl_msgs/msg/ContactMesh")

@@ -165,7 +165,7 @@ def grid_of(field: SignedDistance) -> tuple[np.ndarray, np.ndarray, float]:
     return field.coefficients, field.origin, field.spacing
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, nogil=True)
 def _inside_box(points, pose, low, high, centre):
     """Numbers of the points that lie in a box of the tool's frame, whose centre is given in the body's."""
     found, n, radius = np.empty(len(points), np.int64), 0, 0.0
@@ -181,7 +181,7 @@ def _inside_box(points, pose, low, high, centre):
     return found[:n].copy()
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, nogil=True)
 def _clearances(grid, pose, points, inward, thickness, near, far):
     """Least signed distance along each column [m], by sphere tracing from the skin to the core; and that at the skin.
 
@@ -207,7 +207,7 @@ def _clearances(grid, pose, points, inward, thickness, near, far):
     return out, skin
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, nogil=True)
 def _depths_along(grid, pose, points, way, guess):
     out = np.empty(len(points))
     for n in range(len(points)):
@@ -215,7 +215,7 @@ def _depths_along(grid, pose, points, way, guess):
     return out
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, nogil=True)
 def _cover(grid, pose, points, inward, thickness, faces, start, around, slot, covered, sunk):
     """Triangles around covered vertices, their vertices in order, and of these depth and rests: see Squeeze.
 

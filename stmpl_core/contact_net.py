@@ -145,7 +145,7 @@ class ContactNet:
                                 *rates, *network)  # fmt: skip
 
 
-@numba.njit(cache=True, error_model="numpy")
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _look(points, inward, thickness, area, strain, corners, shares, group, bent, half_space, rows, moduli, nu):
     """See Look."""
     mean, here = thickness.mean(), _between(corners, shares, bent)
@@ -167,7 +167,7 @@ def _see(rings, points, inward, thickness, area, mean, force, strain, bent, modu
     return pressure, inputs, _faded(strain, moments, FADE)
 
 
-@numba.njit(cache=True, error_model="numpy")
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _look_on_stack(points, inward, thickness, area, strain, corners, shares, sinking, group, bent, half_space, rows,
                    moduli, nu, matrix, t, numbers, log_thickness, hardening):  # fmt: skip
     """See Look; t: thickness of the effective layer [m]; numbers, log_thickness and hardening: those of a Green."""
@@ -263,7 +263,7 @@ def _small(force, force_rate, strain, strain_rate):
     return SMALL_STEP / max(fastest, 1e-12)
 
 
-@numba.njit(cache=True, error_model="numpy")
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _hardening(logs, table, thickness, strain):
     """Value of Green.hardening at a thickness [m] and a strain."""
     a = (np.log(thickness) - logs[0]) / (logs[1] - logs[0])
@@ -275,7 +275,7 @@ def _hardening(logs, table, thickness, strain):
         a * ((1 - b) * table[i + 1, j] + b * table[i + 1, j + 1])  # fmt: skip
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, nogil=True)
 def _between(corners, shares, values):
     """Values of vertices (V, K), interpolated at nodes, (N, K)."""
     out = np.zeros((len(corners), values.shape[1]))
@@ -286,7 +286,7 @@ def _between(corners, shares, values):
     return out
 
 
-@numba.njit(cache=True, error_model="numpy")
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _faded(strain, moments, half):
     """Share of the network's correction at each node, (N,)."""
     out = np.empty(len(strain))
@@ -296,7 +296,7 @@ def _faded(strain, moments, half):
     return out
 
 
-@numba.njit(cache=True, error_model="numpy")
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _harden(pressure, strain, moduli):
     """Lets pressures at strains beyond LINEAR_TO rise as those of confined columns."""
     top = column_pressure(moduli, LINEAR_TO)
@@ -305,7 +305,7 @@ def _harden(pressure, strain, moduli):
             pressure[n] *= (column_pressure(moduli, strain[n]) / top) ** HARDENING
 
 
-@numba.njit(cache=True, error_model="numpy")
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _correct(pressure, inputs, fade, low, high, mean, scale, w1, b1, w2, b2, w3, b3, w4, b4):
     """See Held."""
     count = len(pressure)
@@ -325,7 +325,7 @@ def _correct(pressure, inputs, fade, low, high, mean, scale, w1, b1, w2, b2, w3,
     return held, doubt, outside
 
 
-@numba.njit(cache=True, error_model="numpy")
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _inputs(pressure, moments, vectors, strain, inward, bent, nu, out):
     """Rows of NODE: numbers that do not turn with the scene."""
     for n in range(len(out)):

@@ -125,11 +125,12 @@ class Green:
             nodes: contact nodes.
             group: numbers of groups of nodes that do not feel each other, (N,).
         """
-        if self._last is None or not np.array_equal(self._last[0], nodes.points):  # a touch, then its answer
+        last = self._last
+        if last is None or not np.array_equal(last[0], nodes.points):  # a touch, then its answer
             made = _matrix(nodes.points, nodes.inward, nodes.area, nodes.corners, nodes.shares, group,
                            self.unit_at(nodes), self.tables[0], *self._coarse)  # fmt: skip
-            self._last = nodes.points, made
-        return self._last[1]
+            last = self._last = nodes.points, made
+        return last[1]
 
     def stuck(self, nodes: Nodes, group: np.ndarray, gone: np.ndarray) -> np.ndarray:
         """Forces over E with which nodes that stick are held where they have gone, (N, 3) [m2].
@@ -255,7 +256,7 @@ def _at(table, k, f, g, h):
     return (1 - h) * low + h * ((1 - f) * table[g + 1, k] + f * table[g + 1, k + 1])
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, nogil=True)
 def _corners_of(corners, shares, skin_corners, skin_shares):
     """The coarse vertices around nodes and their weights, (N, 9) each; and those that are met, in order."""
     count = len(corners) if len(skin_corners) else 0
@@ -268,7 +269,7 @@ def _corners_of(corners, shares, skin_corners, skin_shares):
     return index, weight, np.unique(index)
 
 
-@numba.njit(cache=True, error_model="numpy")
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _wide(index, weight, some, gathered, motion, out):
     """Adds the coarse motion of each node under a force E inwards at each, (N, 3, N) [1/m]."""
     if not len(gathered):
@@ -290,7 +291,7 @@ def _wide(index, weight, some, gathered, motion, out):
                     out[n, x, j] += share * row[x, d]
 
 
-@numba.njit(cache=True, error_model="numpy")
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _matrix(points, inward, area, corners, shares, group, unit, table, skin_corners, skin_shares, gathered,
             motion):  # fmt: skip
     """See Green.matrix."""
@@ -340,7 +341,7 @@ def _of_force(points, inward, i, sources, source_inward, j, size, g0, g1, even, 
     out[2] += sink * inward[i, 2] + away * d2 + rest * t2
 
 
-@numba.njit(cache=True, error_model="numpy")
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _blocks(points, inward, area, corners, shares, group, unit, tables, skin_corners, skin_shares, gathered,
             motion):  # fmt: skip
     """Motion of each node under a force E at each, (3 N, 3 N) [1/m]; the coarse part only under what goes inwards."""
@@ -382,7 +383,7 @@ def _blocks(points, inward, area, corners, shares, group, unit, tables, skin_cor
     return out.reshape(3 * count, 3 * count)
 
 
-@numba.njit(cache=True, fastmath=FAST, error_model="numpy")
+@numba.njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
 def add_motion(out, there, points, inward, unit, sources, source_inward, area, source_unit, forces, tables):
     """Adds to rows `there` of out (M, 3) [m] the flat motion of points under forces over E at sources (N, 3) [m2].
 
@@ -435,7 +436,7 @@ def add_motion(out, there, points, inward, unit, sources, source_inward, area, s
             _of_force(points, inward, i, sources, source_inward, j, t, g0, g1, even, along, forces[j], out[i])
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, nogil=True)
 def _handed(inward, corners, shares, forces, skin_corners, skin_shares, gathered):
     """Pressures over E at coarse vertices that forces over E at nodes amount to, inwards, (C,)."""
     index, weight, _ = _corners_of(corners, shares, skin_corners, skin_shares)
@@ -447,7 +448,7 @@ def _handed(inward, corners, shares, forces, skin_corners, skin_shares, gathered
     return out
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, nogil=True)
 def _add_between(corners, shares, motion, out):
     """Adds motion of coarse vertices (C, 3), interpolated, to out (V, 3)."""
     for v in range(len(corners)):

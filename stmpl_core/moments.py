@@ -208,7 +208,7 @@ def _frames(normals: np.ndarray) -> np.ndarray:
     return np.stack([first, np.cross(normals, first), normals], axis=1)
 
 
-@numba.njit(cache=True, parallel=True, error_model="numpy")
+@numba.njit(cache=True, nogil=True, parallel=True, error_model="numpy")
 def _shape(start, index, points, frames, thickness):
     """Least-squares curvature (from the normals) and slope of the thickness, over a Gaussian of one thickness."""
     out, zones = np.zeros((len(points), 5)), (len(start) - 1) // len(points)

@@ -78,7 +78,7 @@ class Nodes(NamedTuple):
         return _gathered(self.corners, self.shares, values * self.area, areas)
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, nogil=True)
 def _gathered(corners, shares, forces, areas):
     """Numbers of the vertices that forces at nodes press on, and pressures there."""
     some = np.unique(corners)
@@ -109,7 +109,7 @@ def nodes_under(grid: tuple, pose: np.ndarray, centre: np.ndarray, skin: tuple, 
     return Nodes(*_nodes(grid, pose, centre, points, inward, thickness, faces, found, sunk))
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, nogil=True)
 def _nodes(grid, pose, centre, points, inward, thickness, faces, found, sunk):
     """See nodes_under. The lattice is laid twice: first to see the covered area as it does, not as the triangles do."""
     split = 1
@@ -137,7 +137,7 @@ def _nodes(grid, pose, centre, points, inward, thickness, faces, found, sunk):
             rows[:, 12:15].copy())  # fmt: skip
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, nogil=True)
 def _mixed(points, inward, thickness, faces, f, a, b, c, row):
     """Writes point, unit inward normal and thickness at barycentric coordinates of a triangle to row[:7]."""
     i, j, k = faces[f, 0], faces[f, 1], faces[f, 2]
@@ -152,7 +152,7 @@ def _mixed(points, inward, thickness, faces, f, a, b, c, row):
     row[6] = a * thickness[i] + b * thickness[j] + c * thickness[k]
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, nogil=True)
 def _strain_under(grid, pose, row, sunk):
     """How far the tool squeezes the column at row[:7], over its thickness; rising from 0 beside the tool's walls."""
     ray, t = ray_from(pose, row[0], row[1], row[2], row[3], row[4], row[5]), row[6]
@@ -165,7 +165,7 @@ def _strain_under(grid, pose, row, sunk):
     return share * min(deep / t, MAX_COLUMN_STRAIN)
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, nogil=True)
 def _look(grid, pose, points, inward, thickness, faces, found, sunk, split):
     """How deep the tool is at parts of the triangles.
 
@@ -212,7 +212,7 @@ def _look(grid, pose, points, inward, thickness, faces, found, sunk, split):
     return depths, middles, ways, sizes, best, area if deepest > 0 else 0.05 * area
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, nogil=True)
 def _depth_at(grid, pose, row, sunk):
     """Depth of the skin at row[:7] in the tool [m], or where the tool has sunk under it, of its column."""
     ray = ray_from(pose, row[0], row[1], row[2], row[3], row[4], row[5])
@@ -222,7 +222,7 @@ def _depth_at(grid, pose, row, sunk):
     return depth
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, nogil=True)
 def _charts(pose, found, depths, ways, sizes, best):
     """The side of the limb that each triangle is on, (F,), and axes across each: first, second, inward, (C, 3, 3).
 
@@ -266,7 +266,7 @@ def _charts(pose, found, depths, ways, sizes, best):
     return chart, frames
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, nogil=True)
 def _lay(grid, pose, centre, points, inward, thickness, faces, found, sunk, depths, middles, chart, frames, area,
          only_look):  # fmt: skip
     """Lays a lattice about the tool's middle on each side, for a covered area [m2].

@@ -68,7 +68,7 @@ def response(poisson_ratio: float) -> Response:
     return Response(half_space, np.column_stack([layer, rings, along]))
 
 
-@numba.njit(cache=True, error_model="numpy")
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def pairs(points, inward, thickness, area, group, mean, half_space, rows):
     """Depth over `mean` of each node under a force E mean^2 at each, and its weights in rings, (N, N) and (., N, N).
 
@@ -106,7 +106,7 @@ def pairs(points, inward, thickness, area, group, mean, half_space, rows):
     return out, rings
 
 
-@numba.njit(cache=True, error_model="numpy")
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def moments_of(rings, points, thickness, area, pressure, strain):
     """What nodes see around them.
 
@@ -146,7 +146,7 @@ def moments_of(rings, points, thickness, area, pressure, strain):
     return moments, vectors
 
 
-@numba.njit(cache=True, error_model="numpy")
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def solve(matrix, depth):
     """Forces (N,) >= 0 with matrix @ forces >= depth, and equal where they are above 0."""
     count = len(depth)
@@ -190,7 +190,7 @@ def solve(matrix, depth):
     return force
 
 
-@numba.njit(cache=True, error_model="numpy")
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def rates_of(matrix, force, depth_rates):
     """Rates of forces (K, N) that `solve` gives, as the depths change (K, N): of the nodes that press, no other."""
     some = np.flatnonzero(force > 0)
@@ -207,7 +207,7 @@ def rates_of(matrix, force, depth_rates):
     return out
 
 
-@numba.njit(cache=True, error_model="numpy")
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _times(matrix, vector, out):
     """out = a symmetric matrix (N, N) times a vector, summed in one order whatever the processor's width."""
     out[:] = 0.0
@@ -217,7 +217,7 @@ def _times(matrix, vector, out):
                 out[i] += matrix[j, i] * vector[j]
 
 
-@numba.njit(cache=True, error_model="numpy")
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def power_of(matrix, force, depth):
     """The slope of the whole force over the depth, times depth over force: conjugate gradients on what presses."""
     count = len(force)

@@ -93,7 +93,7 @@ _RINGS[:, 8 : 8 + VECTORS] = ring_table()[:, SCALARS : SCALARS + VECTORS]
 _RINGS[:, 16 : 16 + TENSORS] = ring_table()[:, SCALARS + VECTORS :]
 
 
-@numba.njit(cache=True, parallel=True, fastmath=FAST, error_model="numpy")
+@numba.njit(cache=True, nogil=True, parallel=True, fastmath=FAST, error_model="numpy")
 def feel(vertices, values, sources, sites, frames, sink, away, moments, out):
     """See Surroundings.felt; values (S, K) and sources (10, K) are those of the loaded vertices, `out` (N, S, WIDTH).
 
@@ -216,7 +216,7 @@ def _sinks(i, sources, sites, frames, sink, felt, cell):
         felt[0, q] *= (one - h) * low + h * high
 
 
-@numba.njit(cache=True, fastmath=FAST, error_model="numpy")
+@numba.njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
 def sink_between(vertices, sources, sites, frames, sink, out):
     """See Surroundings.sinking."""
     felt, cell = np.empty((3, len(vertices)), np.float32), np.empty(len(vertices), np.int32)
@@ -225,7 +225,7 @@ def sink_between(vertices, sources, sites, frames, sink, out):
         out[n] = felt[0]
 
 
-@numba.njit(cache=True, fastmath=FAST, error_model="numpy")
+@numba.njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
 def spread_sinking(vertices, values, sources, sites, frames, sink, out):
     """See Surroundings.spread; values (3, N), out (M, 3)."""
     many = values.shape[1]

@@ -175,7 +175,7 @@ def _cubic(f):
     return g * g * g / 6, (4 - 6 * f * f + 3 * f * f * f) / 6, (4 - 6 * g * g + 3 * g * g * g) / 6, f * f * f / 6
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, nogil=True)
 def _weights(f, out):
     """Weights (3, 4) of the four B-splines at fraction f of a cell, and of their first and second derivatives."""
     g = 1.0 - f
@@ -193,7 +193,7 @@ def _cell(u, n):
     return first - 1, inside, inside - first
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, nogil=True)
 def distance_at(coefficients, origin, spacing, x, y, z):
     """Signed distance at one point [m]; for use inside other kernels."""
     i, u, f = _cell((x - origin[0]) / spacing, coefficients.shape[0])
@@ -212,7 +212,7 @@ def distance_at(coefficients, origin, spacing, x, y, z):
     return total if away < 1e-24 else np.sqrt(away + total * total)
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, nogil=True)
 def _distances(coefficients, origin, spacing, points):
     out = np.empty(len(points))
     for n in range(len(points)):
@@ -220,7 +220,7 @@ def _distances(coefficients, origin, spacing, points):
     return out
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, nogil=True)
 def _jets(coefficients, origin, spacing, points):
     """Distance, gradient and Hessian at each point; outside the grid those of sqrt(|x - c|^2 + d(c)^2)."""
     value, gradient, hessian = np.empty(len(points)), np.empty((len(points), 3)), np.empty((len(points), 3, 3))
@@ -241,7 +241,7 @@ def _jets(coefficients, origin, spacing, points):
     return value, gradient, hessian
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, nogil=True)
 def _outside_jet(d, outside, away, free, g, h):
     """Turns the jet at the nearest point of the grid into that of r = sqrt(|x - c|^2 + d(c)^2); returns r."""
     root = np.sqrt(outside + d * d)
@@ -257,7 +257,7 @@ def _outside_jet(d, outside, away, free, g, h):
     return root
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, nogil=True)
 def _spline_jet(coefficients, spacing, first, w, g, h):
     """Writes the spline's gradient and Hessian in the cell that starts at node `first`; returns its value."""
     d = gx = gy = gz = hxx = hyy = hzz = hxy = hxz = hyz = 0.0

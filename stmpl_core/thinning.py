@@ -88,10 +88,11 @@ class Thinning:
         """Numbers of groups of vertices (N,), none of which feels another, (N,): all 0 where the skin has no folds."""
         if not self.folded or len(vertices) < 2:
             return np.zeros(len(vertices), np.int64)
-        if self._grouped is None or not np.array_equal(self._grouped[0], vertices):
+        last = self._grouped
+        if last is None or not np.array_equal(last[0], vertices):
             some, place = np.unique(vertices, return_inverse=True)  # nodes of a contact share vertices
-            self._grouped = vertices, _together(self.start, self.index, some, len(self._stands[0]))[place]
-        return self._grouped[1]
+            last = self._grouped = vertices, _together(self.start, self.index, some, len(self._stands[0]))[place]
+        return last[1]
 
     def reached(self, loaded: np.ndarray) -> np.ndarray:
         """All vertices with a loaded one in reach, in order."""
@@ -100,8 +101,8 @@ class Thinning:
     def asked(self, loaded: np.ndarray) -> Asked:
         """Vertices that are asked under a load on vertices (L,), and how the others are filled in."""
         zones = _zones(self.start, self.index, loaded, len(self._stands[0]))
-        self._last = Asked(loaded, *_asked(zones, self._stands, self._corners, self._weights))
-        return self._last
+        last = self._last = Asked(loaded, *_asked(zones, self._stands, self._corners, self._weights))
+        return last
 
     def asked_again(self, loaded: np.ndarray) -> Asked:
         """Same as `asked`, but not done again if these were the last."""
@@ -133,7 +134,7 @@ def neighbours(points: np.ndarray, normals: np.ndarray, thickness: np.ndarray, f
     return start, index
 
 
-@numba.njit(cache=True, parallel=True, error_model="numpy")
+@numba.njit(cache=True, nogil=True, parallel=True, error_model="numpy")
 def _flood(rows, reaches, first, beside, start, index):
     """Counts the neighbours of vertex i in zone z into start[Z i + z + 1], or where `index` has room writes them."""
     count, zones, writing = len(rows), len(reaches), len(index) > 0
@@ -183,7 +184,7 @@ def _flood(rows, reaches, first, beside, start, index):
                     start[zones * i + zone + 1] = n[zone]
 
 
-@numba.njit(cache=True, error_model="numpy")
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _folded(start, index, some, points, normals, thickness, reach):
     """Whether any two of `some` vertices are near each other through the air, but not along the skin."""
     count = len(points)
@@ -206,7 +207,7 @@ def _folded(start, index, some, points, normals, thickness, reach):
     return False
 
 
-@numba.njit(cache=True, error_model="numpy")
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _together(start, index, some, count):
     """Numbers of groups of `some` vertices, each once, within each of which each is a neighbour of another."""
     zones = (len(start) - 1) // count
@@ -233,7 +234,7 @@ def _together(start, index, some, count):
     return group
 
 
-@numba.njit(cache=True, error_model="numpy")
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _thinned(start, index, among, points, thickness, spacing):
     """Marks vertices of `among` no two of which are nearer than `spacing`, as many as come in order."""
     count = len(points)
@@ -252,7 +253,7 @@ def _thinned(start, index, among, points, thickness, spacing):
     return kept
 
 
-@numba.njit(cache=True, error_model="numpy")
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _nearest(start, index, stands, points):
     """The nearest CORNERS vertices in reach that stand for others, (V, CORNERS); -1 where there are fewer."""
     count = len(points)
@@ -297,7 +298,7 @@ def _interpolation(points: np.ndarray, frames: np.ndarray, thickness: np.ndarray
     return np.linalg.solve(left, right[..., None])[:, :CORNERS, 0].astype(np.float32)
 
 
-@numba.njit(cache=True, error_model="numpy")
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _zones(start, index, loaded, count):
     """0 where no loaded vertex is in reach, else 1 for the outermost zone up to Z for the innermost, (count,)."""
     mark = np.zeros(count, np.uint8)
@@ -309,7 +310,7 @@ def _zones(start, index, loaded, count):
     return mark
 
 
-@numba.njit(cache=True, error_model="numpy")
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _asked(marks, stands, corners, weights):
     """All of Asked but for the loaded vertices."""
     last = len(stands)
@@ -345,7 +346,7 @@ def _asked(marks, stands, corners, weights):
     return vertices, between, at, by
 
 
-@numba.njit(cache=True, error_model="numpy")
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _fill(values, between, corners, weights, out):
     for n in range(len(between)):
         for x in range(3):

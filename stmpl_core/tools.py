@@ -38,6 +38,12 @@ class Tools:
     def __len__(self) -> int:
         return len(self._tools)
 
+    def copy(self) -> Tools:
+        """Another store with the same tools and fields; what is added or removed later is so in one of them only."""
+        other = Tools(self.margin)
+        other._tools, other._announced, other._fields = dict(self._tools), dict(self._announced), dict(self._fields)
+        return other
+
     def announce(self, tool: Tool) -> None:
         """Expects `add` of this tool, whose field is built elsewhere."""
         self._announced[tool.name] = tool

@@ -1,22 +1,31 @@
-"""Answering: from an instant to its answer; what is said of it; and rest, when all tools are silent."""
+"""Answering: from an instant to its reaction, sent at once, and to its field; rest, when all tools are silent."""
 
 from __future__ import annotations
 
+import threading
 import time
+from collections.abc import Callable, Mapping
+from typing import NamedTuple
 
+import numba
 import numpy as np
 from rclpy.lifecycle import LifecycleNode
 
 from bags.frame import Stamps
 from bags.wire import NANO
+from stmpl_core.errors import InvalidInput
+from stmpl_core.friction import Friction
 from stmpl_core.simulator import Simulator
-from stmpl_core.touch import IN_CORE, NO_FORCE, NO_TOUCH, PULLING, WRAPPED, Answer
+from stmpl_core.skin import Skin
+from stmpl_core.tools import Tools
+from stmpl_core.touch import IN_CORE, NO_FORCE, NO_TOUCH, PULLING, WRAPPED, Answer, Touch
 from stmpl_ros.calibration import Calibration
 from stmpl_ros.diagnosis import Tally
 from stmpl_ros.hearing import Hearing
 from stmpl_ros.inbox import Instant
+from stmpl_ros.latest import LatestWins
 from stmpl_ros.limits import Limits
-from stmpl_ros.remembering import ELASTIC, Before, Remembering
+from stmpl_ros.remembering import ELASTIC, Before, Reaction, Remembering
 from stmpl_ros.sending import Sending
 from stmpl_ros.settings import Settings
 
@@ -30,8 +39,34 @@ WORTH_A_LINE = {
 }  # log lines of statuses that a person should look at
 
 
+class Asked(NamedTuple):
+    """A reaction whose field is wanted.
+
+    Args:
+        instant: instant that it answers.
+        reaction: touches, and what they were made from.
+        fields: simulator that finds the field.
+        epoch: epoch of the node in which it counts.
+        seconds: time that the reaction took [s].
+        news: sentences that some answer must carry: this one, or a later one if it is overtaken.
+        said: further sentences of the node.
+    """
+
+    instant: Instant
+    reaction: Reaction
+    fields: Simulator
+    epoch: int
+    seconds: float
+    news: tuple[str, ...]
+    said: tuple[str, ...]
+
+
 class Answering:
-    """Answers instants, and fades the last answer to rest when no input comes any more.
+    """Answers instants: the reaction at once, on the executor's thread; the newest one's field on a thread of its own.
+
+    Neither waits for the other: instants that come while a field is solved have their reaction, and the newest of them
+    its field. The last answer fades to rest when no input comes any more. What is solved when the node starts anew
+    (rest, another skin, a tool taken away) is of an epoch that is over, and not sent.
 
     Args:
         node: node whose clock and logger are used.
@@ -41,15 +76,17 @@ class Answering:
         calibration: service that keeps presses.
 
     Attributes:
-        simulator: simulator of the skin that answers.
+        simulator: simulator of the skin that answers, for reactions.
         sending: publishers of the answers.
-        limits: limits that answers are held against, or None.
+        limits: limits that reactions are held against, or None.
         remembering: memory of the tissue.
+        last: last field that was sent, its instant, and what it was made from; None: rest, or another skin.
         fading: flag of an answer that fades to rest.
     """
 
     simulator: Simulator
     sending: Sending
+    _fields: Simulator
 
     def __init__(
         self, node: LifecycleNode, settings: Settings, hearing: Hearing, tally: Tally, calibration: Calibration
@@ -58,50 +95,151 @@ class Answering:
         self._calibration = calibration
         self.limits: Limits | None = None
         self.remembering = Remembering()
-        self.start_empty()
+        self._field: LatestWins[Asked] | None = None
+        self._closing = threading.Event()
+        self._sends, self._epoch = threading.RLock(), 0  # held while an answer is sent, or an epoch begins
+        self._start_empty()
 
-    def start_empty(self) -> None:
-        """Forgets what was answered."""
-        self.last: tuple[Answer, Instant, Before] | None = None  # None: at rest
+    # Life
+
+    def move_to(self, skin: Skin, tools: Tools, friction: Friction | Mapping[str, Friction]) -> tuple[Simulator, ...]:
+        """Answers on a skin from now on; the simulators of reactions and fields, which share it, but no scratch."""
+        with self._sends:
+            self._epoch, self.last = self._epoch + 1, None
+        self.simulator, self._fields = Simulator(skin, tools=tools, friction=friction), Simulator(skin, tools=tools)
+        return self.simulator, self._fields
+
+    def open(self) -> None:
+        """Starts the thread of the fields."""
+        self._closing.clear()
+        self._field = LatestWins(self._solve, lambda why: self._hearing.gate.refuse("answer", why), "field")
+
+    def close(self) -> None:
+        """Forgets what was answered, and ends the thread."""
+        self._start_empty()
+        self._closing.set()
+        if self._field is not None:
+            self._field.close()
+            self._field = None
+
+    def drop(self) -> None:
+        """What is being solved is not sent any more."""
+        with self._sends:
+            self._epoch += 1
+
+    def _start_empty(self) -> None:
+        with self._sends:
+            self._epoch += 1
+            self.last: tuple[Answer, Instant, Before] | None = None
+            self._news: dict[str, None] = {}  # in order; no answer carried them yet
         self.remembering.forget()
         self.fading = False
-        self._seen: set[str] = set()  # tools of the last answer
+        self._instant: Instant | None = None  # last one that has a reaction; None: at rest
+        self._seen: set[str] = set()  # its tools, while input comes
 
-    def answer(self, instant: Instant) -> None:
-        """Answers an instant. Whatever goes wrong is told and counted, and the next one is answered."""
-        gate, config = self._hearing.gate, self._settings.config
+    # The reaction
+
+    def answer(self, instant: Instant) -> bool:
+        """Answers an instant; False if that failed, which is told and counted, and the next one is answered."""
         started = time.perf_counter()
-        try:
-            back = self.remembering.went_back(instant)
-            reaction = self.remembering.reaction(self.simulator, instant)
-            answer = self.simulator.answer(reaction.touches)
-        except Exception as error:  # the one place where an answer may fail
-            tools = ", ".join(contact.name for contact in instant.contacts)
-            return gate.refuse("answer", f"no answer to {tools}: {_told(error)}")
-        if not np.isfinite(answer.displacement).all():
-            statuses = {name: touch.status for name, touch in answer.touches.items()}
-            return gate.refuse("answer", f"no answer: it would not be finite under {statuses}.")
+        back = self.remembering.went_back(instant)
+        reaction = self._attempted(instant, lambda: self.remembering.reaction(self.simulator, instant))
+        if reaction is None:
+            return False
+        assert self._field is not None
+        touches = {touch.name: touch for touch in reaction.touches}
+        self.sending.reaction(instant, touches)
         self.remembering.keep(reaction, instant)
         seconds = time.perf_counter() - started
-        why = self._remarks(instant, answer, back)
-        self._send(answer, instant.stamp, instant.inputs, reaction.before, solve_seconds=seconds, why=why)
-        self.sending.contacts(instant, answer, config.local_rotations)
-        self._calibration.put(instant, answer)
-        self._tally.solve_times.append(seconds)
-        self._tally.latencies.append((self._now() - instant.stamp) / NANO)
+        said = self._remarks(instant, touches, back)
+        asked = Asked(instant, reaction, self._fields, self._epoch, seconds, tuple(self._news), said)
+        self._field.put(asked)
+        self.sending.models.put(instant, touches, self._settings.config.local_rotations)
+        self._calibration.put(instant, touches)
         if self.limits:
-            self.limits.put(answer)
+            self.limits.put(reaction.touches)
+        self._tally.reacted(seconds, (self._now() - instant.stamp) / NANO)
         if self.fading:
             self._node.get_logger().info("input is back")
-        self.last, self.fading, gate.refused_since = (answer, instant, reaction.before), False, ""
-        self._seen = set(answer.touches)
+        self._instant, self.fading, self._hearing.gate.refused_since = instant, False, ""
+        self._seen = set(touches)
+        return True
+
+    def _attempted[T](self, instant: Instant, do: Callable[[], T]) -> T | None:
+        """What `do` returns; None if it failed."""
+        try:
+            return do()
+        except Exception as error:  # the one place where an answer may fail
+            tools = ", ".join(contact.name for contact in instant.contacts)
+            self._hearing.gate.refuse("answer", f"no answer to {tools}: {_told(error)}")
+            return None
+
+    def _remarks(self, instant: Instant, touches: Mapping[str, Touch], back: float) -> tuple[str, ...]:
+        """What the node has to say of a reaction beside what the core says; lines for what a person should look at."""
+        say, rest_after = self._hearing.gate.say, self._settings.config.rest_after
+        said = [f"stamps of tools and wrenches lie up to {instant.skew / 1e6:.1f} ms apart"] if instant.skew else []
+        if back:
+            self._tell("stamps", f"the stamps went back by {back:.3g} s: no time passed for the tissue")
+        for stream in instant.lost:
+            said.append(f"no {stream} for {rest_after} s: answered without it")
+            say(f"lost {stream}", said[-1])
+        for name, touch in touches.items():
+            if name not in self._seen and touch.depth > MAX_FIRST_DEPTH_M:
+                self._tell(f"start of {name}", f"{name} starts {1e3 * touch.depth:.1f} mm inside the skin")
+            if touch.status in WORTH_A_LINE:
+                say(f"{name} {touch.status}", f"{name}: {touch.status}; {WORTH_A_LINE[touch.status]}")
+        return tuple(said)
+
+    def _tell(self, kind: str, sentence: str) -> None:
+        """A line, and news for the next answer."""
+        self._hearing.gate.say(kind, sentence)
+        with self._sends:
+            self._news[sentence] = None
+
+    # The field, on its own thread
+
+    def _solve(self, asked: Asked) -> None:
+        """Finds and sends the field of a reaction; then the thread rests, where a rate is set."""
+        numba.set_num_threads(1)  # of this thread: a second one stalls for tens of milliseconds where its core is busy
+        started, rate = time.perf_counter(), self._settings.config.field_rate
+        self._find(asked, started)
+        if rate:
+            self._closing.wait(max(0.0, started + 1 / rate - time.perf_counter()))
+
+    def _find(self, asked: Asked, started: float) -> None:
+        instant, before = asked.instant, asked.reaction.before
+        answer = self._attempted(instant, lambda: self._field_of(asked))
+        if answer is None:
+            return
+        seconds = time.perf_counter() - started
+        with self._sends:
+            if asked.epoch != self._epoch:
+                return
+            why = "; ".join((*asked.news, *asked.said))
+            self._send(answer, instant.stamp, instant.inputs, before, solve_seconds=asked.seconds + seconds, why=why)
+            self.last = answer, instant, before
+            for sentence in asked.news:
+                self._news.pop(sentence, None)
+        self._tally.solved(seconds, (self._now() - instant.stamp) / NANO)
+
+    def _field_of(self, asked: Asked) -> Answer:
+        """The answer to touches. Raises InvalidInput if it would not be finite."""
+        asked.fields.toucher.tools = self.simulator.tools.copy()  # which the executor may change meanwhile
+        answer = asked.fields.answer(asked.reaction.touches)
+        if not np.isfinite(answer.displacement).all():
+            statuses = {name: touch.status for name, touch in answer.touches.items()}
+            raise InvalidInput(f"the displacement would not be finite under {statuses}.")
+        return answer
+
+    # Rest
 
     def fade_if_silent(self) -> None:
         """Sends a share of the last answer, once no tool was heard for a while, and in the end rest."""
         now, config, gate = time.monotonic_ns(), self._settings.config, self._hearing.gate
-        if self.last is None or self._hearing.inbox.live(now):
+        if self._instant is None or self._hearing.inbox.live(now):
             return
-        answer, instant, before = self.last
+        if self._field is not None and not self._field.idle:
+            return  # the last field comes first
         silent, limit = self._hearing.inbox.silence(now) / NANO, config.rest_after
         left = 1 - (silent - limit) / config.fade if config.fade else 0.0
         why = f"no pose for {limit} s"
@@ -109,8 +247,9 @@ class Answering:
             why = f"{why} that could be used (refused: {gate.refused_since})"
         self._seen = set()
         self.sending.models.forget()
-        if left <= 0 or not answer.displacement.any():
+        if left <= 0 or self.last is None or not self.last[0].displacement.any():
             return self.rest(f"{why}: back at rest")
+        answer, instant, before = self.last
         if not self.fading:
             self.fading = True
             self.sending.rest(list(answer.touches), self._now())
@@ -121,52 +260,35 @@ class Answering:
 
     def on_other_skin(self) -> None:
         """Answers the last instant again, on the skin that took over; rest, if its tools are silent or not ready."""
-        if self.last is None:
+        instant = self._instant
+        if instant is None:
             return
-        before, instant, _ = self.last
         self.remembering.forget()
-        if self._hearing.inbox.live(time.monotonic_ns()) and all(one.name in self.simulator.tools
-                                                                 for one in instant.contacts):  # fmt: skip
-            self.answer(instant)
-        if self.last[0] is before:
+        ready = all(one.name in self.simulator.tools for one in instant.contacts)
+        if not (ready and self._hearing.inbox.live(time.monotonic_ns()) and self.answer(instant)):
             self.rest("another skin")
 
     def without(self, name: str) -> None:
-        """Tells that a tool, which was taken away, exerts nothing; rest, if no tool of the last answer is left."""
+        """Tells that a tool, which was taken away, exerts nothing; rest, if no tool of the last instant is left."""
+        self.drop()
         self.remembering.forget(name)
         self.sending.rest([name], self._now())
-        if self.last is not None and not any(tool in self._hearing.tools for tool in self.last[0].touches):
+        if self._instant is not None and not any(one.name in self._hearing.tools for one in self._instant.contacts):
             self.rest(f"'{name}' was taken away: back at rest")
 
     def rest(self, why: str) -> None:
         """Sends the skin at rest."""
-        tools = list(self.last[0].touches) if self.last else []
-        self._send(self.simulator.step([]), self._now(), {}, ELASTIC, why=why)
+        tools = [one.name for one in self._instant.contacts] if self._instant else []
+        with self._sends:
+            self._start_empty()
+            self._send(self.simulator.step([]), self._now(), {}, ELASTIC, why=why)
         self.sending.rest(tools, self._now())
-        self.start_empty()
 
     def _send(self, answer: Answer, stamp: int, inputs: Stamps, before: Before, **said: float | str) -> None:
-        self.sending.answer(answer, stamp, inputs, **before._asdict(), **said)
-        self._tally.answers = self.sending.sequence
-        self._tally.methods[answer.method] += 1
-
-    def _remarks(self, instant: Instant, answer: Answer, back: float) -> str:
-        """What the node has to say of an answer beside what the core says; lines for what a person should look at."""
-        say, rest_after = self._hearing.gate.say, self._settings.config.rest_after
-        said = [f"stamps of tools and wrenches lie up to {instant.skew / 1e6:.1f} ms apart"] if instant.skew else []
-        if back:
-            said.append(f"the stamps went back by {back:.3g} s: no time passed for the tissue")
-            say("stamps", said[-1])
-        for stream in instant.lost:
-            said.append(f"no {stream} for {rest_after} s: answered without it")
-            say(f"lost {stream}", said[-1])
-        for name, touch in answer.touches.items():
-            if name not in self._seen and touch.depth > MAX_FIRST_DEPTH_M:
-                said.append(f"{name} starts {1e3 * touch.depth:.1f} mm inside the skin")
-                say(f"start of {name}", said[-1])
-            if touch.status in WORTH_A_LINE:
-                say(f"{name} {touch.status}", f"{name}: {touch.status}; {WORTH_A_LINE[touch.status]}")
-        return "; ".join(said)
+        with self._sends:
+            self.sending.answer(answer, stamp, inputs, **before._asdict(), **said)
+            self._tally.answers = self.sending.sequence
+            self._tally.methods[answer.method] += 1
 
     def _now(self) -> int:
         return self._node.get_clock().now().nanoseconds

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from concurrent.futures import CancelledError, Future
 
 import numpy as np
@@ -13,7 +13,7 @@ from stmpl_msgs.srv import Calibrate
 from stmpl_core.contact import Contact
 from stmpl_core.errors import InvalidInput
 from stmpl_core.stiffness import Stiffness
-from stmpl_core.touch import MOVED, TOUCHING, Answer
+from stmpl_core.touch import MOVED, TOUCHING, Touch
 from stmpl_ros.inbox import Instant
 from stmpl_ros.waiting import WaitingService, by_executor
 from stmpl_ros.workshop import Workshop
@@ -48,10 +48,10 @@ class Calibration:
         """Starts anew."""
         self.presses.clear()
 
-    def put(self, instant: Instant, answer: Answer) -> None:
+    def put(self, instant: Instant, touches: Mapping[str, Touch]) -> None:
         """Keeps an instant if one tool alone pressed with a wrench, and has moved."""
-        pressing = [contact for contact in instant.contacts if answer.touches[contact.name].status in CARRYING]
-        if len(pressing) != 1 or sum(touch.wrench.any() for touch in answer.touches.values()) > 1:
+        pressing = [contact for contact in instant.contacts if touches[contact.name].status in CARRYING]
+        if len(pressing) != 1 or sum(touch.wrench.any() for touch in touches.values()) > 1:
             return
         (contact,) = pressing
         last, moved = self.presses[-1] if self.presses else None, np.inf

@@ -23,29 +23,49 @@ class Tally:
         refused, stale: numbers of messages that could not be used, and that were too old.
         last_refusal: reason why the last one was refused.
         answers: number of answers since the start.
+        reactions: number of instants whose reaction was sent since the start.
         methods: number of answers since the last report, by method.
-        solve_times: times spent on recent answers [s].
+        solve_times: times spent on the fields of recent answers [s].
         latencies: times from the stamp of the pose to the publication of recent answers [s].
+        touch_times: times spent on recent reactions [s].
+        reaction_latencies: times from the stamp of the pose to the publication of recent reactions [s].
     """
 
     refused: int = 0
     stale: int = 0
     last_refusal: str = ""
     answers: int = 0
+    reactions: int = 0
     methods: Counter[str] = field(default_factory=Counter)
     solve_times: deque[float] = field(default_factory=lambda: deque(maxlen=RECENT))
     latencies: deque[float] = field(default_factory=lambda: deque(maxlen=RECENT))
-    _reported: tuple[int, float] = field(default_factory=lambda: (0, time.monotonic()))
+    touch_times: deque[float] = field(default_factory=lambda: deque(maxlen=RECENT))
+    reaction_latencies: deque[float] = field(default_factory=lambda: deque(maxlen=RECENT))
+    _reported: tuple[int, int, float] = field(default_factory=lambda: (0, 0, time.monotonic()))
+
+    def reacted(self, seconds: float, latency: float) -> None:
+        """Counts a reaction."""
+        self.reactions += 1
+        self.touch_times.append(seconds)
+        self.reaction_latencies.append(latency)
+
+    def solved(self, seconds: float, latency: float) -> None:
+        """Counts a field, on its own thread."""
+        self.solve_times.append(seconds)
+        self.latencies.append(latency)
 
     def values(self) -> dict[str, str]:
         """The figures of a report; the next one counts from here."""
-        answers, since = self._reported
-        self._reported = self.answers, time.monotonic()
-        shares = {method: count / self.methods.total() for method, count in self.methods.items()}
-        self.methods.clear()
+        answers, reactions, since = self._reported
+        self._reported = self.answers, self.reactions, time.monotonic()
+        passed, methods, self.methods = max(self._reported[2] - since, 1e-9), self.methods, Counter()
+        shares = {method: count / methods.total() for method, count in list(methods.items())}
         return {
             "answers": str(self.answers),
-            "rate [Hz]": f"{(self.answers - answers) / max(self._reported[1] - since, 1e-9):.1f}",
+            "rate [Hz]": f"{(self.answers - answers) / passed:.1f}",
+            "reaction rate [Hz]": f"{(self.reactions - reactions) / passed:.1f}",
+            **_percentiles("touch", self.touch_times),
+            **_percentiles("reaction latency", self.reaction_latencies),
             **_percentiles("solve", self.solve_times),
             **_percentiles("latency", self.latencies),
             "methods": ", ".join(f"{method} {share:.0%}" for method, share in shares.items()),
@@ -56,7 +76,7 @@ class Tally:
 
 
 def _percentiles(what: str, seconds: deque[float]) -> dict[str, str]:
-    milliseconds = 1e3 * np.array(seconds or [0.0])
+    milliseconds = 1e3 * np.array(list(seconds) or [0.0])
     median, worst = np.percentile(milliseconds, [50, 99])
     return {f"{what} median [ms]": f"{median:.3f}", f"{what} p99 [ms]": f"{worst:.3f}"}
 

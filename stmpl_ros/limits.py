@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from stmpl_core.errors import InvalidInput, sentence_of
-from stmpl_core.touch import Answer
+from stmpl_core.touch import Touch
 
 ADVISORY = "advisory, not a safety function"
 
@@ -62,12 +63,13 @@ class Limits:
             raise InvalidInput(f"limits file {path} has no region '{region}'; it has {', '.join(file.regions)}.")
         return cls(region, file.regions[region], file.warn_at)
 
-    def put(self, answer: Answer) -> None:
-        """Takes an answer. Force is what each contact presses with, by itself."""
-        if answer.pressure is not None:
-            peak = 1e-3 * float(np.max(answer.pressure, initial=0.0))
+    def put(self, touches: Sequence[Touch]) -> None:
+        """Takes the touches of an instant. Pressures add; force is what each contact presses with, by itself."""
+        pressures = [touch.pressure for touch in touches if touch.pressure is not None]
+        if pressures:
+            peak = 1e-3 * float(np.max(np.sum(pressures, axis=0), initial=0.0))
             self.pressure_share = max(self.pressure_share, peak / self.limit.pressure_kpa)
-        force = max((touch.force for touch in answer.touches.values()), default=0.0)
+        force = max((touch.force for touch in touches), default=0.0)
         self.force_share = max(self.force_share, force / self.limit.force_n)
 
     def take(self) -> tuple[bool, dict[str, str]]:

@@ -99,8 +99,8 @@ class SkinNode(LifecycleNode):
             check(self.config, self._build)
             self.answering.limits = Limits.read(self.config.limits, self.config.limb)
             builders = Builders()  # start while the skin is made
-            self._answer_on(self._make_skin(), self.config, builders)
-            warm_up(self.answering.simulator)
+            for simulator in self._answer_on(self._make_skin(), self.config, builders):
+                warm_up(simulator)
         except StmplError as error:
             self._end()
             self.get_logger().error(f"cannot be configured: {error}")
@@ -108,6 +108,7 @@ class SkinNode(LifecycleNode):
         assert self.workshop
         self.answering.sending = Sending(self, self.config, self.skin, self.workshop, self.hearing.gate)
         self.diagnostics = managed(self, DiagnosticArray, "/diagnostics", STREAM)
+        self.answering.open()
         self.hearing.open()
         self.clocks = [self.create_timer(1 / FADE_RATE, self._fade), self.create_timer(1.0, self._diagnose)]
         self.settings.locked = True
@@ -127,6 +128,7 @@ class SkinNode(LifecycleNode):
     def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Stops answering; what comes in meanwhile is not kept."""
         self.hearing.active = False
+        self.answering.drop()
         return super().on_deactivate(state)
 
     def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
@@ -138,12 +140,14 @@ class SkinNode(LifecycleNode):
     def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Stops answering, and ends the processes beside this one."""
         self.hearing.active = False
+        self.answering.drop()
         result = super().on_shutdown(state)
         self._clean_up()
         return result
 
     def destroy_node(self) -> None:
         """Ends the processes beside this one too."""
+        self.answering.close()
         self._end()
         self.calibration.close()
         super().destroy_node()
@@ -165,23 +169,25 @@ class SkinNode(LifecycleNode):
         finally:
             making.close()
 
-    def _answer_on(self, skin: Skin, config: NodeConfig, builders: Builders | None = None) -> None:
-        """From here on the answers are of this skin, with the friction of these settings."""
+    def _answer_on(self, skin: Skin, config: NodeConfig, builders: Builders | None = None) -> tuple[Simulator, ...]:
+        """From here on the answers are of this skin, with the friction of these settings; its simulators."""
         tools, before = self.hearing.tools, self.workshop
         if tools.margin != margin_on(skin.layer):  # fields of another width are built anew
             self.hearing.inbox.tools = again = Tools(margin_on(skin.layer))
         else:
             again = tools
         self.skin, self.hearing.layer = skin, skin.layer
-        self.answering.simulator = Simulator(skin, tools=again, friction=friction_of(config))
+        simulators = self.answering.move_to(skin, again, friction_of(config))
         self.workshop = Workshop(self, skin.layer, builders)
         if before:
             before.close()
         for tool in [*tools, *tools.waiting()] if again is not tools else again.waiting():
             again.announce(tool)
             self._on_tool(tool)
+        return simulators
 
     def _clean_up(self) -> None:
+        self.answering.close()
         if self.settings.locked:
             for timer in self.clocks:
                 self.destroy_timer(timer)
@@ -189,7 +195,6 @@ class SkinNode(LifecycleNode):
             self.destroy_lifecycle_publisher(self.diagnostics)
             self.sending.close()
         self._end()
-        self.answering.start_empty()
         self.calibration.forget()
         self.settings.locked = False
 

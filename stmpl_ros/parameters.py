@@ -116,6 +116,10 @@ class NodeConfig(BaseModel):
         default=15.0, gt=0, le=1000, description="rate of skin/marker and skin/points while somebody listens [Hz]",
         json_schema_extra=ANY_TIME,
     )  # fmt: skip
+    field_rate: float = Field(
+        default=0.0, ge=0, le=1000, json_schema_extra=ANY_TIME,
+        description="largest rate of skin/displacement, to leave the processor to the reactions [Hz]; 0: as it goes",
+    )  # fmt: skip
     local_rotations: bool = Field(
         default=True, description="derivatives of local contacts by rotations too, at twice the cost",
         json_schema_extra=ANY_TIME,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import Future
 from dataclasses import replace
 from functools import partial
@@ -19,7 +19,7 @@ from bags import wire
 from bags.frame import Stamps
 from stmpl_core.contact import Contact
 from stmpl_core.skin import Skin
-from stmpl_core.touch import APART, PRESSING, Answer
+from stmpl_core.touch import APART, PRESSING, Answer, Touch
 from stmpl_ros.gate import Gate
 from stmpl_ros.inbox import Instant
 from stmpl_ros.parameters import NodeConfig
@@ -28,6 +28,7 @@ from stmpl_ros.topics import ANSWERS, NOW, STREAM, managed
 from stmpl_ros.workshop import Workshop
 
 LAST_WORD_S = 0.05  # time that listeners get to take a tool's last wrench before its topic closes
+Touches = Mapping[str, Touch]  # by tool's name
 MODELLED = PRESSING | {APART}  # statuses for which a local model says what the answer says
 
 
@@ -48,6 +49,7 @@ class Sending:
         self._displacement = managed(node, SkinDisplacement, "skin/displacement", ANSWERS)
         self._deformed = managed(node, SkinDeformed, "skin/deformed", STREAM)
         self._wrenches: dict[str, Publisher] = {}
+        self._wrench = wire.wrench_message(np.zeros(6), config.frame, 0)  # sent over and over
         self.show = Show(node, skin.layer, config.frame, config.marker_rate)
         self.models = Models(node, config.frame, workshop, gate)
         self._sequence = 0
@@ -99,11 +101,10 @@ class Sending:
         if self._deformed.get_subscription_count():
             self._deformed.publish(wire.deformed_message(message, self._skin.layer.vertices))
 
-    def contacts(self, instant: Instant, answer: Answer, rotations: bool) -> None:
-        """Sends the tools' wrenches, and once found their local contacts; with rotations too, if asked."""
-        for name, touch in answer.touches.items():
+    def reaction(self, instant: Instant, touches: Touches) -> None:
+        """Sends the tools' wrenches."""
+        for name, touch in touches.items():
             self._send_wrench(name, touch.wrench, instant.stamp)
-        self.models.put(instant, answer, rotations)
 
     def rest(self, tools: Sequence[str], stamp: int) -> None:
         """Tells that these tools exert nothing any more."""
@@ -118,19 +119,20 @@ class Sending:
     def _send_wrench(self, name: str, wrench: np.ndarray, stamp: int) -> None:
         publisher = self._wrenches.get(name)
         if publisher and publisher.get_subscription_count():
-            publisher.publish(wire.wrench_message(wrench, self._frame, stamp))
+            wire.update_wrench(self._wrench, wrench, stamp)
+            publisher.publish(self._wrench)
 
 
 class Models:
-    """`tools/NAME/local_contact`: the newest answer's contacts to first order, while somebody listens.
+    """`tools/NAME/local_contact`: the newest instant's contacts to first order, while somebody listens.
 
-    Answers do not wait for it. One answer at a time, the newest first.
+    Answers do not wait for it. One instant at a time, the newest first.
     """
 
     def __init__(self, node: LifecycleNode, frame: str, workshop: Workshop, gate: Gate) -> None:
         self._node, self._frame, self._workshop, self._gate = node, frame, workshop, gate
         self._publishers: dict[str, Publisher] = {}
-        self._next: tuple[Instant, Answer, bool] | None = None
+        self._next: tuple[Instant, Touches, bool] | None = None
         self._busy = False
 
     def open(self, name: str) -> None:
@@ -145,9 +147,9 @@ class Models:
         """Goes on with another skin's workshop; what the old one was asked is dropped."""
         self._workshop, self._next, self._busy = workshop, None, False
 
-    def put(self, instant: Instant, answer: Answer, rotations: bool) -> None:
-        """Takes the newest answer."""
-        self._next = instant, answer, rotations
+    def put(self, instant: Instant, touches: Touches, rotations: bool) -> None:
+        """Takes the newest instant and its touches; with derivatives by rotations too, if asked."""
+        self._next = instant, touches, rotations
         self._tell()
 
     def forget(self) -> None:
@@ -157,22 +159,22 @@ class Models:
     def _tell(self) -> None:
         if self._busy or self._next is None:
             return
-        (instant, answer, rotations), self._next = self._next, None
-        asked = [_answered(contact, answer) for contact in instant.contacts
-                 if answer.touches[contact.name].status in MODELLED and self._heard(contact.name)]  # fmt: skip
+        (instant, touches, rotations), self._next = self._next, None
+        asked = [_answered(contact, touches) for contact in instant.contacts
+                 if touches[contact.name].status in MODELLED and self._heard(contact.name)]  # fmt: skip
         if asked:
             self._busy = True
-            self._workshop.models(asked, rotations, partial(self._on_models, instant.stamp, asked, answer))
+            self._workshop.models(asked, rotations, partial(self._on_models, instant.stamp, asked, touches))
 
     def _heard(self, tool: str) -> bool:
         return tool in self._publishers and self._publishers[tool].get_subscription_count() > 0
 
-    def _on_models(self, stamp: int, asked: list[Contact], answer: Answer, future: Future) -> None:
+    def _on_models(self, stamp: int, asked: list[Contact], touches: Touches, future: Future) -> None:
         self._busy = False
         try:
             for name, model in zip((contact.name for contact in asked), future.result(), strict=True):
                 if name in self._publishers:
-                    status = answer.touches[name].status
+                    status = touches[name].status
                     self._publishers[name].publish(
                         wire.local_contact_message(name, model, status, self._frame, stamp)
                     )
@@ -182,6 +184,6 @@ class Models:
         self._tell()
 
 
-def _answered(contact: Contact, answer: Answer) -> Contact:
-    """The contact where the answer has its tool, by its pose alone."""
-    return replace(contact, pose_body_from_tool=answer.touches[contact.name].pose_body_from_tool, wrench=None)
+def _answered(contact: Contact, touches: Touches) -> Contact:
+    """The contact where its touch has the tool, by its pose alone."""
+    return replace(contact, pose_body_from_tool=touches[contact.name].pose_body_from_tool, wrench=None)

@@ -4,15 +4,18 @@ import ast
 import os
 import runpy
 import signal
+import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import Future
+from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
+import numpy as np
 import pytest
 import rclpy
-from geometry_msgs.msg import PoseStamped
+from geometry_msgs.msg import PoseStamped, WrenchStamped
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState
 from rcl_interfaces.msg import Parameter as ParameterMessage
@@ -130,6 +133,72 @@ def test_whatever_fails_inside_an_answer_is_told_and_the_next_instant_is_answere
     assert rows(composed.heard[0]).any() and stamp_ns(composed.heard[0]) > refused
     assert composed.node.tally.refused == 1
     assert capfd.readouterr().err.count("refused: no answer to finger: an accident\n") == 1
+
+
+@pytest.fixture
+def held(composed, monkeypatch) -> Iterator[threading.Event]:
+    """An event until which no field is found, once the node has answered."""
+    composed.wait(lambda: composed.press() and composed.heard)
+    composed.wait(lambda: composed.node.answering._field.idle)
+    released, answer = threading.Event(), composed.node.answering._fields.answer
+    monkeypatch.setattr(composed.node.answering._fields, "answer", lambda touches: released.wait() and answer(touches))
+    yield released
+    released.set()
+
+
+def test_reactions_do_not_wait_for_a_field_and_the_newest_instant_gets_the_next(composed, held):
+    wrenches, pressed, topic = [], [], "tools/finger/contact_wrench"
+    before = composed.node.answering._instant.stamp
+
+    def fields() -> list[int]:
+        return [stamp_ns(one) for one in composed.heard if one.fade == 1 and one.touches and stamp_ns(one) > before]
+
+    composed.node.create_subscription(WrenchStamped, topic, wrenches.append, STREAM)
+    composed.wait(lambda: pressed.append(composed.press()) or len({stamp_ns(one) for one in wrenches}) > 5)
+    assert not fields(), "none was found meanwhile"
+    assert all(one.wrench.force.x < 0 for one in wrenches)
+    composed.wait(lambda: composed.node.hearing.inbox.live(time.monotonic_ns()) == {})  # what was sent is heard
+    newest = composed.node.answering._instant.stamp
+    held.set()
+    composed.wait(lambda: newest in fields())
+    assert len(fields()) == 2 and fields()[-1] == newest, "the one that was begun, and the newest; none between"
+    values = composed.node.tally.values()
+    assert int(values["answers"]) < composed.node.tally.reactions
+
+
+def test_what_is_solved_while_the_node_starts_anew_is_not_sent(composed, held):
+    composed.wait(lambda: composed.press() and not composed.node.answering._field.idle)
+    begun = composed.node.answering._instant.stamp
+    composed.node.reset()
+    composed.wait(lambda: not composed.heard[-1].touches)
+    heard = len(composed.heard)
+    held.set()
+    composed.wait(lambda: composed.node.answering._field.idle)
+    composed.wait(lambda: composed.press() and len(composed.heard) > heard)
+    assert composed.heard[heard].touches and composed.node.tally.refused == 0
+    assert all(stamp_ns(one) > begun for one in composed.heard[heard:])
+
+
+def test_a_field_that_fails_is_told_and_the_reaction_and_the_next_field_are_sent(composed, monkeypatch, capfd):
+    composed.wait(lambda: composed.press() and composed.heard)
+    composed.wait(lambda: composed.node.answering._field.idle)
+    fields, failed = composed.node.answering._fields, []
+    answer = fields.answer
+
+    def spoilt_once(touches):
+        found = answer(touches)
+        if not failed:
+            failed.append(touches)
+            return replace(found, displacement=np.nan * found.displacement)
+        return found
+
+    monkeypatch.setattr(fields, "answer", spoilt_once)
+    composed.wait(lambda: composed.press() and failed)
+    heard, reactions = len(composed.heard), composed.node.tally.reactions
+    composed.wait(lambda: composed.press() and len(composed.heard) > heard)
+    assert composed.node.tally.refused == 1 and composed.node.tally.reactions > reactions
+    assert "the displacement would not be finite" in composed.node.tally.last_refusal
+    assert all(np.isfinite(rows(one)).all() for one in composed.heard)
 
 
 def test_two_nodes_on_one_topic_tell_of_each_other_and_of_one_of_their_name():

@@ -78,9 +78,14 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Recorded]:
         slide(hand, np.linspace(0.006, 0.009, 8), "after a pause")
         finger = bus.tool("finger")
         bus.wait(lambda: finger.pose.get_subscription_count() == 2, "the node and the recorder")
-        for k in range(10):  # two at a time
-            stamp = finger.send(at(-RADIUS - 0.011, 0, LENGTH / 2 + 2e-4 * k))
-            bus.wait(lambda sent=stamp: bus.answers(sent) or hand.send(slid(0.009)), "an answer")
+
+        def two_at_a_time() -> bool:
+            finger.send(at(-RADIUS - 0.011, 0, LENGTH / 2 + 2e-5 * len(bus.got["skin/displacement"])))
+            hand.send(slid(0.009))
+            bus.spin(0.01)
+            return sum(len(one.touches) == 2 for one in bus.got["skin/displacement"]) > 5
+
+        bus.wait(two_at_a_time, "answers to both")
         hand.take_away()
         bus.wait(lambda: bus.said("'probe' is taken away"), "word of it")
         bus.still()
@@ -156,7 +161,7 @@ def test_whatever_has_the_node_forget_leaves_an_empty_state(recorded: Recorded, 
         assert states[recorded.firsts[name]] == EMPTY, name
     assert states[recorded.firsts["after a pause"]] != EMPTY, "what fades is not at rest yet"
     layers = [frame.layer_id for frame in frames]
-    other = next(frame for frame in frames if frame.layer_id != layers[0])
+    other = next(frame for frame in frames if frame.layer_id != layers[0] and fresh(frame))
     assert other.state == EMPTY and len(set(layers)) == 2
     assert not {frame.stamp_ns for frame in frames} & recorded.refused
     assert all(not frame.state and not frame.touches for frame in frames if not frame.inputs), "rest needs no state"
@@ -178,5 +183,5 @@ def test_info_and_compare_say_that_it_remembers(recorded: Recorded, capsys: pyte
     assert code == 0 and "only one side has friction and relaxation" in said, said
     code, said = stmpl(capsys, "compare", recorded.folder, "--frames", "1", "--tolerance-mm", "100")
     assert code == 1, "nothing was judged"
-    code, said = stmpl(capsys, "compare", recorded.folder, "--with", recorded.folder)
-    assert code == 0 and "only one side" not in said
+    _, said = stmpl(capsys, "compare", recorded.folder, "--with", recorded.folder)
+    assert "moment_net against" in said and "only one side" not in said

@@ -23,9 +23,9 @@ from stmpl_core.simulator import Simulator
 from stmpl_core.touch import Answer
 from stmpl_core.trust import Trust
 from stmpl_ros.cli import main
+from stmpl_ros.latest import LatestWins
 from stmpl_ros.view.fields import FIELDS, STOPS, round_up
 from stmpl_ros.view.hands_on import HandsOn
-from stmpl_ros.view.latest import LatestWins
 from stmpl_ros.view.page import Page
 from stmpl_ros.view.recording import Recording, RecordingPlayer
 from stmpl_ros.view.skin import glb
@@ -328,12 +328,13 @@ def leaves(tree) -> list[str]:
 
 def test_every_panel_of_the_layout_is_placed_once_and_shows_a_topic_that_there_is():
     from geometry_msgs.msg import WrenchStamped
-    from stmpl_msgs.msg import SkinDisplacement
+    from stmpl_msgs.msg import SkinDisplacement, Touch
 
     layout = json.loads(LAYOUT.read_text())
     assert sorted(leaves(layout["layout"])) == sorted(layout["configById"])
     script = next(iter(layout["userNodes"].values()))["sourceCode"]
     topics = {"/skin/displacement": SkinDisplacement, "/tools/probe/wrench": WrenchStamped}
+    of_lists = {"touches": Touch}
     paths = [series["value"] for panel in layout["configById"].values() for series in panel.get("paths", ())]
     assert len(paths) > 5
     for topic, _, fields in (path.partition(".") for path in paths):
@@ -342,7 +343,9 @@ def test_every_panel_of_the_layout_is_placed_once_and_shows_a_topic_that_there_i
             continue
         value = topics[topic]()
         for field in fields.split("."):
-            value = getattr(value, field)
+            name, listed, _ = field.partition("[")
+            value = getattr(value, name)
+            value = of_lists[name]() if listed else value
         assert isinstance(value, bool | float | str)
 
 

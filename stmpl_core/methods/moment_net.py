@@ -307,7 +307,7 @@ def _mix(weights, vectors, out):
         out[a, 0], out[a, 1] = x, y
 
 
-@numba.njit(cache=True, fastmath=FAST, error_model="numpy")
+@numba.njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
 def invariants(figures, shape, here, constants, more, mix_vectors, mix_tensors, least, most, low, high, mean, scale,
                out, outside):  # fmt: skip
     """The network's inputs, those of INPUTS and then `more` (N, .): kept from low to high, then centred and scaled.
@@ -364,21 +364,21 @@ def invariants(figures, shape, here, constants, more, mix_vectors, mix_tensors, 
             row[m] = (min(max(row[m], low[m]), high[m]) - mean[m]) * scale[m]
 
 
-@numba.njit(cache=True, parallel=True, error_model="numpy")
+@numba.njit(cache=True, nogil=True, parallel=True, error_model="numpy")
 def think(inputs, w1, b1, w2, b2, w3, b3, w4, b4, outputs):
     """The layers, shared among threads."""
     for block in numba.prange((len(inputs) + BLOCK - 1) // BLOCK):
         _think(inputs, BLOCK * block, w1, b1, w2, b2, w3, b3, w4, b4, outputs)
 
 
-@numba.njit(cache=True, error_model="numpy")
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def think_few(inputs, w1, b1, w2, b2, w3, b3, w4, b4, outputs):
     """The layers, on the caller's thread. Not `think` compiled otherwise: numba would keep both under one name."""
     for block in range((len(inputs) + BLOCK - 1) // BLOCK):
         _think(inputs, BLOCK * block, w1, b1, w2, b2, w3, b3, w4, b4, outputs)
 
 
-@numba.njit(cache=True, error_model="numpy")
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _think(inputs, start, w1, b1, w2, b2, w3, b3, w4, b4, outputs):
     """The layers for a few vertices: they stay in the cache, and BLAS starts no threads for so little."""
     h = np.dot(inputs[start : start + BLOCK], w1)
@@ -393,7 +393,7 @@ def _think(inputs, start, w1, b1, w2, b2, w3, b3, w4, b4, outputs):
             outputs[start + n, m] = out[n, m] + b4[m]
 
 
-@numba.njit(cache=True, error_model="numpy")
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _activate(hidden, bias):
     """x / 2 (1 + x / (1 + |x|)) of hidden + bias, in place: smooth as SiLU, without its exponential."""
     half, one = np.float32(0.5), np.float32(1)
@@ -403,7 +403,7 @@ def _activate(hidden, bias):
             hidden[n, m] = x * (half + half * x / (one + abs(x)))
 
 
-@numba.njit(cache=True, fastmath=FAST, error_model="numpy")
+@numba.njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
 def _move(figures, shape, here, place, outputs, mix_vectors, mix_tensors, frames, moved, error):
     """Linear response to the columns' strain plus what the network adds, turned into the layer's frame, (N, 3) [m].
 

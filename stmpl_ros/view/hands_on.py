@@ -18,8 +18,8 @@ from stmpl_core.layer import SoftLayer
 from stmpl_core.methods.base import Method
 from stmpl_core.simulator import Simulator
 from stmpl_core.tool import Tool
+from stmpl_ros.latest import LatestWins
 from stmpl_ros.view.judge import Judge
-from stmpl_ros.view.latest import LatestWins
 from stmpl_ros.view.page import Page, wxyz_of
 from stmpl_ros.view.snapshot import Snapshot, readings_of
 from stmpl_ros.view.tools import TOOLS, place_on, tool_from_bytes, tool_named

@@ -8,7 +8,7 @@ from fem_tools import RigidFem
 from stmpl_core.errors import InvalidInput
 from stmpl_core.layer import SoftLayer
 from stmpl_core.trust import Displacement
-from stmpl_ros.view.latest import LatestWins
+from stmpl_ros.latest import LatestWins
 from stmpl_ros.view.page import Page
 from stmpl_ros.view.snapshot import Snapshot
 

@@ -14,9 +14,9 @@ from bags.wire import contact_from, frame_from, layer_from, stamp_ns, tool_from
 from stmpl_core.contact import Contact
 from stmpl_core.errors import StmplError
 from stmpl_core.tool import Tool
+from stmpl_ros.latest import LatestWins
 from stmpl_ros.topics import KEPT, NEWEST
 from stmpl_ros.view.judge import Judge
-from stmpl_ros.view.latest import LatestWins
 from stmpl_ros.view.page import Page
 from stmpl_ros.view.snapshot import Snapshot, readings_of
 

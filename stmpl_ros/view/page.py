@@ -15,8 +15,8 @@ from stmpl_core.arrays import Transform
 from stmpl_core.contact import Contact
 from stmpl_core.layer import SoftLayer
 from stmpl_core.tool import Tool
+from stmpl_ros.latest import LatestWins
 from stmpl_ros.view.fields import FIELDS
-from stmpl_ros.view.latest import LatestWins
 from stmpl_ros.view.skin import Skin
 from stmpl_ros.view.snapshot import MM, Snapshot
 from stmpl_ros.view.tools import place_on

@@ -34,6 +34,12 @@ class LatestWins[T]:
             self._waiting = [item]
             self._changed.notify_all()
 
+    @property
+    def idle(self) -> bool:
+        """Whether there is nothing left to do."""
+        with self._changed:
+            return not self._waiting and not self._busy
+
     def wait(self, timeout: float) -> bool:
         """Waits until there is nothing left to do; False if that takes longer than `timeout` [s]."""
         with self._changed:
@@ -61,5 +67,5 @@ class LatestWins[T]:
             except StmplError as error:
                 self._refuse(str(error))
             except Exception as error:
-                log.exception("the viewer's %s failed", self._thread.name)
+                log.exception("%s failed", self._thread.name)
                 self._refuse(f"{type(error).__name__}: {error}")
