@@ -272,10 +272,10 @@ def draw(cells: dict[str, float], path: Path) -> None:
     left.plot([], [], "k--s", mfc="white", label="without")
     left.plot([], [], "k:", label="2 b / (T + 2 d)")
     left.set(xlabel="rate of the device loop [Hz]", ylabel="stiffest passive coupling [N/m]",
-             title="Virtual coupling on a hard skin")
+             title="Virtual coupling on a hard skin", ylim=(200, 1e5))
     left.set_xticks(RATES, [str(r) for r in RATES], minor=False)
     left.minorticks_off()
-    left.legend(fontsize=8)
+    left.legend(fontsize=8, ncols=2)
     for n, kind in enumerate(KINDS):
         for on in (False, True):
             row = [cells.get(f"stroke {kind} {delay:g} {on}", np.nan) for delay in DELAYS]

@@ -34,7 +34,7 @@ def main() -> float:
         if millisecond % 10 == 0:  # beside the node, 100 times a second: where the tool rests, not where the device is
             pose = np.eye(4)
             pose[:3, 3] = loop.proxy if millisecond else device
-            loop.update(local_contact(simulator.toucher, Contact(tool, pose), rotations=False))
+            loop.update(local_contact(simulator.toucher, Contact(tool, pose)))
         force = loop.step(device, -SPEED * outward, TICK)  # beside the device, every millisecond
         away -= SPEED * TICK
 
