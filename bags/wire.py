@@ -21,7 +21,7 @@ from stmpl_core.arrays import Transform, Wrench, finite
 from stmpl_core.contact import Contact
 from stmpl_core.errors import BagError, FrameError, InvalidInput, MeshError
 from stmpl_core.layer import MAX_EXTENT, SoftLayer, layer_id
-from stmpl_core.local_contact import LocalContact
+from stmpl_core.local_contact import Grip, LocalContact
 from stmpl_core.packed import layer_stack_from_text, layer_stack_to_text
 from stmpl_core.state import State
 from stmpl_core.tissue import Tissue
@@ -188,7 +188,21 @@ def local_contact_from(message: Any) -> LocalContact:
         float(message.valid_rad),
         message.status,
         Trust(in_range=bool(message.in_range)),
+        _grip(message),
+        float(getattr(message, "power", 1.0)),
+        float(getattr(message, "eased", 0.0)),
     )
+
+
+def _grip(message: Any) -> Grip | None:
+    """Friction of a local model; None: there is none, or the message is older than friction."""
+    limit = float(getattr(message, "friction_limit", 0.0))
+    if not limit > 0:
+        return None
+    ways, forces, stiffness = (finite(name, np.asarray(getattr(message, name), float).reshape(shape), shape)
+                               for name, shape in (("friction_ways", (3, 6)), ("friction_forces", (3,)),
+                                                   ("friction_stiffness", (3,))))  # fmt: skip
+    return Grip(ways, forces, stiffness, limit)
 
 
 def _announced(name: str, vertices: np.ndarray, triangles: np.ndarray) -> Tool:
@@ -392,6 +406,7 @@ def deformed_message(answer: Any, rest: np.ndarray) -> Any:
 
 def local_contact_message(tool: str, model: LocalContact, status: str, body_frame: str, stamp_ns: int) -> Any:
     """A local model as a message; `status` is what the answer says of the tool."""
+    grip = model.grip
     return message_class("stmpl_msgs/msg/LocalContact")(
         header=header(body_frame, stamp_ns),
         name=tool,
@@ -402,6 +417,12 @@ def local_contact_message(tool: str, model: LocalContact, status: str, body_fram
         valid_rad=float(model.valid_rad),
         status=status,
         in_range=bool(model.trust.in_range),
+        power=float(model.power),
+        eased=float(model.eased),
+        friction_limit=0.0 if grip is None else float(grip.limit),
+        friction_ways=np.zeros(18) if grip is None else np.ascontiguousarray(grip.axes, dtype=np.float64).ravel(),
+        friction_forces=np.zeros(3) if grip is None else np.asarray(grip.forces, np.float64),
+        friction_stiffness=np.zeros(3) if grip is None else np.asarray(grip.stiffness, np.float64),
     )
 
 

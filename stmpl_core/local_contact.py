@@ -168,17 +168,15 @@ class LocalContact:
         return Rendered(wrench, inside, stored)
 
 
-def local_contact(toucher: Toucher, contact: Contact, *, rotations: bool = True) -> LocalContact:
+def local_contact(toucher: Toucher, contact: Contact) -> LocalContact:
     """Finds the local model of one contact alone at its pose; a wrench of the contact is not used.
 
     Args:
         toucher: contact law on the layer.
         contact: tool and pose.
-        rotations: derivatives by rotations too. Without, the stiffness to rotations and valid_rad are 0.
     """
     touch = toucher.touch(replace(contact, wrench=None))
-    model = _model(toucher, touch, tangents(toucher, [touch])[0], None)
-    return model if rotations else replace(model, stiffness=model.stiffness * np.repeat([1.0, 0.0], 3), valid_rad=0.0)
+    return _model(toucher, touch, tangents(toucher, [touch])[0], None)
 
 
 def local_contacts(history: History, touches: Sequence[Touch], state: State | None = None) -> list[LocalContact]:

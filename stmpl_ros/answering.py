@@ -154,7 +154,7 @@ class Answering:
         said = self._remarks(instant, touches, back)
         asked = Asked(instant, reaction, self._fields, self._epoch, seconds, tuple(self._news), said)
         self._field.put(asked)
-        self.sending.models.put(instant, touches, self._settings.config.local_rotations)
+        self.sending.models.put(instant, touches, reaction.before)
         self._calibration.put(instant, touches)
         if self.limits:
             self.limits.put(reaction.touches)

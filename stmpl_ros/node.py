@@ -177,8 +177,9 @@ class SkinNode(LifecycleNode):
         else:
             again = tools
         self.skin, self.hearing.layer = skin, skin.layer
-        simulators = self.answering.move_to(skin, again, friction_of(config))
-        self.workshop = Workshop(self, skin.layer, builders)
+        friction = friction_of(config)
+        simulators = self.answering.move_to(skin, again, friction)
+        self.workshop = Workshop(self, skin.layer, friction, builders)
         if before:
             before.close()
         for tool in [*tools, *tools.waiting()] if again is not tools else again.waiting():

@@ -120,10 +120,6 @@ class NodeConfig(BaseModel):
         default=0.0, ge=0, le=1000, json_schema_extra=ANY_TIME,
         description="largest rate of skin/displacement, to leave the processor to the reactions [Hz]; 0: as it goes",
     )  # fmt: skip
-    local_rotations: bool = Field(
-        default=True, description="derivatives of local contacts by rotations too, at twice the cost",
-        json_schema_extra=ANY_TIME,
-    )  # fmt: skip
     autostart: bool = Field(default=True, description="start into the active state without being asked")
 
     @field_validator("thickness", mode="before")

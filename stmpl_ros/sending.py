@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from concurrent.futures import Future
-from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -17,12 +16,12 @@ from stmpl_msgs.msg import LocalContact, SkinDeformed, SkinDisplacement, SkinTop
 
 from bags import wire
 from bags.frame import Stamps
-from stmpl_core.contact import Contact
 from stmpl_core.skin import Skin
 from stmpl_core.touch import APART, PRESSING, Answer, Touch
 from stmpl_ros.gate import Gate
 from stmpl_ros.inbox import Instant
 from stmpl_ros.parameters import NodeConfig
+from stmpl_ros.remembering import Before
 from stmpl_ros.show import Show
 from stmpl_ros.topics import ANSWERS, NOW, STREAM, managed
 from stmpl_ros.workshop import Workshop
@@ -132,7 +131,7 @@ class Models:
     def __init__(self, node: LifecycleNode, frame: str, workshop: Workshop, gate: Gate) -> None:
         self._node, self._frame, self._workshop, self._gate = node, frame, workshop, gate
         self._publishers: dict[str, Publisher] = {}
-        self._next: tuple[Instant, Touches, bool] | None = None
+        self._next: tuple[Instant, Touches, Before] | None = None
         self._busy = False
 
     def open(self, name: str) -> None:
@@ -147,9 +146,9 @@ class Models:
         """Goes on with another skin's workshop; what the old one was asked is dropped."""
         self._workshop, self._next, self._busy = workshop, None, False
 
-    def put(self, instant: Instant, touches: Touches, rotations: bool) -> None:
-        """Takes the newest instant and its touches; with derivatives by rotations too, if asked."""
-        self._next = instant, touches, rotations
+    def put(self, instant: Instant, touches: Touches, before: Before) -> None:
+        """Takes the newest instant, its touches and what they were made from."""
+        self._next = instant, touches, before
         self._tell()
 
     def forget(self) -> None:
@@ -159,31 +158,24 @@ class Models:
     def _tell(self) -> None:
         if self._busy or self._next is None:
             return
-        (instant, touches, rotations), self._next = self._next, None
-        asked = [_answered(contact, touches) for contact in instant.contacts
-                 if touches[contact.name].status in MODELLED and self._heard(contact.name)]  # fmt: skip
-        if asked:
+        (instant, touches, before), self._next = self._next, None
+        if any(touches[one.name].status in MODELLED and self._heard(one.name) for one in instant.contacts):
             self._busy = True
-            self._workshop.models(asked, rotations, partial(self._on_models, instant.stamp, asked, touches))
+            self._workshop.models(instant.contacts, before, partial(self._on_models, instant, touches))
 
     def _heard(self, tool: str) -> bool:
         return tool in self._publishers and self._publishers[tool].get_subscription_count() > 0
 
-    def _on_models(self, stamp: int, asked: list[Contact], touches: Touches, future: Future) -> None:
+    def _on_models(self, instant: Instant, touches: Touches, future: Future) -> None:
         self._busy = False
         try:
-            for name, model in zip((contact.name for contact in asked), future.result(), strict=True):
-                if name in self._publishers:
-                    status = touches[name].status
+            for name, model in zip((one.name for one in instant.contacts), future.result(), strict=True):
+                status = touches[name].status
+                if status in MODELLED and self._heard(name):
                     self._publishers[name].publish(
-                        wire.local_contact_message(name, model, status, self._frame, stamp)
+                        wire.local_contact_message(name, model, status, self._frame, instant.stamp)
                     )
         except Exception as error:  # whatever happened in the other process; the node goes on
             self._workshop.renew(error)
             self._gate.say("model", f"no local contact: {error or type(error).__name__}")
         self._tell()
-
-
-def _answered(contact: Contact, touches: Touches) -> Contact:
-    """The contact where its touch has the tool, by its pose alone."""
-    return replace(contact, pose_body_from_tool=touches[contact.name].pose_body_from_tool, wrench=None)

@@ -4,19 +4,23 @@ from __future__ import annotations
 
 import os
 import signal
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import BrokenExecutor, Future, ProcessPoolExecutor
 
 import numpy as np
 from rclpy.node import Node
 
 from stmpl_core.contact import Contact
+from stmpl_core.friction import Friction
+from stmpl_core.history import History
 from stmpl_core.layer import SoftLayer
-from stmpl_core.local_contact import LocalContact, local_contact
+from stmpl_core.local_contact import LocalContact, local_contacts
+from stmpl_core.state import State
 from stmpl_core.stiffness import Stiffness, fit_stiffness
 from stmpl_core.tool import Tool
 from stmpl_core.toucher import Toucher, margin_on
 from stmpl_ros.beside import Builders, pool
+from stmpl_ros.remembering import Before
 
 MAX_FITTED_PRESSES = 60  # presses of a fit, from the lightest to the hardest; it takes about 25 touches of each
 
@@ -26,17 +30,19 @@ Then = Callable[[Future], None]
 class Workshop:
     """Builds distance fields side by side; finds local models and fits stiffness in one process that knows the layer.
 
-    A thread would not do: libigl keeps the interpreter's lock for half a second, and a model takes 13 to 25 touches.
+    A thread would not do: libigl keeps the interpreter's lock for half a second, and a fit takes many touches.
     What is made comes back by the node's executor. A process that died is replaced.
 
     Args:
         node: node whose executor gets what was made.
         layer: layer that contacts are on.
+        friction: friction of the tools, see Simulator.
         builders: processes that build distance fields; None: started here.
     """
 
-    def __init__(self, node: Node, layer: SoftLayer, builders: Builders | None = None) -> None:
-        self._node, self._layer, self._closed = node, layer, False
+    def __init__(self, node: Node, layer: SoftLayer, friction: Friction | Mapping[str, Friction] = None,
+                 builders: Builders | None = None) -> None:  # fmt: skip
+        self._node, self._layer, self._friction, self._closed = node, layer, friction, False
         self._fit: Future[Stiffness] | None = None
         self._pid: Future[int] | None = None
         self._models: ProcessPoolExecutor | None = None  # started when somebody asks
@@ -46,9 +52,9 @@ class Workshop:
         """Has the distance field of a tool built, for `do`. The future may raise MeshError."""
         self._then(self._builders.field(tool, margin_on(self._layer)), do)
 
-    def models(self, contacts: Sequence[Contact], rotations: bool, do: Then) -> None:
-        """Has the local model of each contact found, without the others, for `do`."""
-        self._then(self._modeller().submit(_local_contacts, list(contacts), rotations), do)
+    def models(self, contacts: Sequence[Contact], before: Before, do: Then) -> None:
+        """Has the local model of each contact found, beside the others and as the tissue remembers, for `do`."""
+        self._then(self._modeller().submit(_local_contacts, list(contacts), before.state, before.dt), do)
 
     def stiffness(self, presses: Sequence[Contact]) -> Future[Stiffness]:
         """Fits the skin's stiffness to these presses: for a thread that waits."""
@@ -70,7 +76,7 @@ class Workshop:
 
     def _modeller(self) -> ProcessPoolExecutor:
         if self._models is None:
-            self._models = pool(1, _know, self._layer)
+            self._models = pool(1, _know, self._layer, self._friction)
             self._pid = self._models.submit(os.getpid)
         return self._models
 
@@ -100,24 +106,27 @@ def then(node: Node, future: Future, do: Then) -> None:
 
 # In the process that knows the layer
 
-_toucher: Toucher
+_history: History
 
 
-def _know(layer: SoftLayer) -> None:
+def _know(layer: SoftLayer, friction: Friction | Mapping[str, Friction]) -> None:
     import numba
     from threadpoolctl import threadpool_limits
 
-    global _toucher
+    global _history
     numba.set_num_threads(1)  # what answers goes first
     threadpool_limits(1, user_api="blas")
-    _toucher = Toucher(layer)
+    _history = History(Toucher(layer), friction)
 
 
-def _local_contacts(contacts: list[Contact], rotations: bool) -> list[LocalContact]:
-    return [local_contact(_toucher, contact, rotations=rotations) for contact in contacts]
+def _local_contacts(contacts: list[Contact], state: State | None, dt: float) -> list[LocalContact]:
+    if state is None:
+        return local_contacts(_history, _history.toucher.touch_all(contacts))
+    touches, after = _history.step(contacts, state, dt)
+    return local_contacts(_history, touches, after)
 
 
 def _stiffness(presses: list[Contact]) -> Stiffness:
     presses.sort(key=lambda one: 0.0 if one.wrench is None else float(np.linalg.norm(one.wrench[:3])))
     chosen = np.unique(np.linspace(0, len(presses) - 1, MAX_FITTED_PRESSES).astype(int)) if presses else []
-    return fit_stiffness(_toucher, [presses[k] for k in chosen])
+    return fit_stiffness(_history.toucher, [presses[k] for k in chosen])

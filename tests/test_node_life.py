@@ -28,6 +28,7 @@ from std_srvs.srv import Trigger
 from stmpl_msgs.msg import ContactMesh, SkinDisplacement, SkinTopology
 
 from bags.wire import pose_message, stamp_ns, tool_message
+from stmpl_ros.inbox import Instant
 from stmpl_ros.node import SkinNode
 from stmpl_ros.parameters import NodeConfig
 from stmpl_ros.topics import KEPT, LEASE, STREAM
@@ -248,7 +249,7 @@ def test_whatever_fails_beside_the_node_is_told_and_the_tool_from_before_goes_on
     before, again = node.hearing.tools["finger"], ball().named("finger")
     node.hearing.tools.announce(again)
     node._on_field(again, failed)
-    node.sending.models._on_models(0, [contact_of(before, HERE)], composed.heard[0], failed)
+    node.sending.models._on_models(Instant([contact_of(before, HERE)], 0, 0, {}), {}, failed)
     said = capfd.readouterr().err
     assert "refused: mesh of 'finger' refused: an accident\n" in said and "no local contact: an accident\n" in said
     assert node.hearing.tools["finger"] is before and not node.hearing.tools.waiting()

@@ -1,5 +1,6 @@
 """Laws of a node whose skin relaxes and rubs: what it remembers is in its recording, whole in every frame."""
 
+import itertools
 import signal
 from collections.abc import Iterator
 from pathlib import Path
@@ -9,14 +10,17 @@ import numpy as np
 import pytest
 import rclpy
 from std_srvs.srv import Trigger
+from stmpl_msgs.msg import LocalContact, Touch
 from stmpl_msgs.srv import SetBody
 
 from bags.frame import Frame
 from bags.replay import Replayed, replay, replay_run
 from bags.run import Run
+from bags.wire import local_contact_from, stamp_ns
 from stmpl_core import State
 from stmpl_core.methods import MomentNet
 from stmpl_core.touch import STALE
+from stmpl_ros.topics import STREAM
 from tests.bag_scene import stmpl
 from tests.bus import end, start
 from tests.node_bus import Bus, Hand
@@ -185,3 +189,37 @@ def test_info_and_compare_say_that_it_remembers(recorded: Recorded, capsys: pyte
     assert code == 1, "nothing was judged"
     _, said = stmpl(capsys, "compare", recorded.folder, "--with", recorded.folder)
     assert "moment_net against" in said and "only one side" not in said
+
+
+def test_local_contacts_of_a_node_that_remembers_carry_friction_and_what_has_relaxed() -> None:
+    """The newest is that of the answer of its stamp: its wrench, friction and all."""
+    node = start("-c", NODE)
+    rclpy.init()
+    bus = Bus()
+    bus.partner = node
+    try:
+        bus.wait(lambda: bus.got["skin/topology"], "skin/topology")
+        hand = bus.tool("probe")
+        heard = bus.listen(LocalContact, "tools/probe/local_contact", STREAM)
+        bus.wait(lambda: hand.pose.get_subscription_count() == 1, "the node")
+        ways = itertools.cycle(0.005 * (1 - np.cos(np.linspace(0, 2 * np.pi, 200))))
+
+        def pair() -> tuple[LocalContact, Touch] | None:
+            hand.send(slid(next(ways)))
+            bus.spin(0.02)
+            answers = {stamp_ns(one): one for one in bus.got["skin/displacement"]}
+            both = [(one, answers[stamp_ns(one)].touches[0]) for one in bus.got["tools/probe/local_contact"]
+                    if stamp_ns(one) in answers]  # fmt: skip
+            return both[-1] if len(both) > 10 else None
+
+        model, touch = bus.wait(pair, "local contacts of answers")
+        bus.node.destroy_subscription(heard)
+    finally:
+        end(node, signal.SIGINT)
+        bus.node.destroy_node()
+        rclpy.shutdown()
+    assert model.friction_limit > 0.5 and model.eased > 0 and model.power > 1
+    told = local_contact_from(model)
+    assert told.grip is not None
+    for ours, force in ((told.wrench, touch.wrench.force), (told.grip.wrench, touch.friction_wrench.force)):
+        np.testing.assert_allclose(ours[:3], (force.x, force.y, force.z), atol=1e-9)

@@ -308,11 +308,12 @@ def test_a_local_contact_says_what_the_answer_says_and_how_it_changes(device):
     assert (message.name, message.status, message.header.frame_id) == ("probe", TOUCHING, "body")
     force = -(np.frombuffer(answer.pressure, np.float32) @ layer.vertex_area_vectors)
     np.testing.assert_allclose(model.wrench[:3], force, atol=0.01 * np.linalg.norm(force))
+    assert model.power > 1 and model.grip is None
 
-    # the node's is the model that anybody finds there
+    # the node's is the model that anybody finds there; by wrench the last bit of the way was reckoned
     own = local_contact(Toucher(layer), contact_of(ball_as_sent(), model.pose_body_from_tool))
-    np.testing.assert_allclose(model.wrench, own.wrench, atol=1e-6 * np.linalg.norm(own.wrench[:3]))
-    np.testing.assert_allclose(model.stiffness, own.stiffness, atol=1e-4 * np.abs(own.stiffness).max())
+    np.testing.assert_allclose(model.wrench, own.wrench, atol=2e-3 * np.linalg.norm(own.wrench[:3]))
+    np.testing.assert_allclose(model.stiffness, own.stiffness, atol=0.05 * np.abs(own.stiffness).max())
     assert model.valid_m == pytest.approx(own.valid_m, rel=0.05) and model.valid_rad > 0
     assert model.normal @ model.stiffness[:3, :3] @ model.normal > 0
 

@@ -38,7 +38,7 @@ from stmpl_core.bones import Bone, to_bone
 from stmpl_core.errors import FrameError, InvalidInput, MeshError
 from stmpl_core.layer import layer_id
 from stmpl_core.living import living
-from stmpl_core.local_contact import LocalContact
+from stmpl_core.local_contact import Grip, LocalContact
 from stmpl_core.skin import published
 from stmpl_core.state import fresh
 from stmpl_core.touch import BY_POSE, STALE, TOUCHING, Slip
@@ -334,13 +334,18 @@ def test_an_answer_keeps_what_each_tool_does_through_a_message():
 def test_a_local_contact_keeps_every_bit_through_a_message():
     rng, pose = np.random.default_rng(3), np.eye(4)
     pose[:3, :3], pose[:3, 3] = Rotation.from_euler("xyz", (0.3, -0.7, 1.1)).as_matrix(), (0.1, 0.2, 0.3)
-    model = LocalContact(pose, rng.normal(size=6), rng.normal(size=(6, 6)), 4e-4, 0.02, "found", Trust(in_range=False))
+    grip = Grip(rng.normal(size=(3, 6)), rng.normal(size=3), rng.uniform(1, 2, size=3), 0.55)
+    model = LocalContact(pose, rng.normal(size=6), rng.normal(size=(6, 6)), 4e-4, 0.02, "found", Trust(in_range=False),
+                         grip, 1.7, 0.3)  # fmt: skip
     message = local_contact_message("probe", model, "touching", "body", 5 * MS)
     sent = deserialize_message(serialize_message(message), LocalContactMessage)
     assert (sent.name, sent.header.frame_id, sent.header.stamp.nanosec) == ("probe", "body", 5 * MS)
     back = local_contact_from(sent)
     np.testing.assert_array_equal(back.wrench, model.wrench)
     np.testing.assert_array_equal(back.stiffness, model.stiffness)
+    assert back.grip is not None and (back.power, back.eased, back.grip.limit) == (1.7, 0.3, 0.55)
+    for told, meant in zip(back.grip, grip, strict=True):
+        np.testing.assert_array_equal(told, meant)
     np.testing.assert_allclose(back.pose_body_from_tool, pose, atol=1e-12)
     assert (back.valid_m, back.valid_rad, back.status, back.trust.in_range) == (4e-4, 0.02, "touching", False)
 
