@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from stmpl_core.arrays import VertexVectors
+from stmpl_core.arrays import Points, VertexVectors
 from stmpl_core.green import Green
 from stmpl_core.nodes import Nodes
-from stmpl_core.touch import Touch
+from stmpl_core.touch import Pressed, Touch
 
 MIN_OFFSET = 1e-6  # way of skin along a tool that is not worth an answer [m]
 
@@ -22,11 +22,25 @@ def dragged_motion(green: Green, touch: Touch) -> VertexVectors | None:
         green: response of the layer.
         touch: touch with its friction.
     """
-    slip, pressed = touch.slip, touch.pressed
-    if slip is None or pressed is None or pressed.forces is None or np.linalg.norm(slip.offset) <= MIN_OFFSET:
+    ways, pressed = ways_along(touch), touch.pressed
+    if ways is None or pressed is None:
         return None
+    nodes = _holding(pressed)
+    return green.motion(nodes, green.stuck(nodes, green.near.groups(nodes.corners[:, 0]), ways))
+
+
+def ways_along(touch: Touch) -> Points | None:
+    """Ways by which skin that presses is dragged along and turned, (N, 3) [m]; None: it stays."""
+    slip, pressed = touch.slip, touch.pressed
+    if slip is None or pressed is None or pressed.forces is None:
+        return None
+    arms = _holding(pressed).points - slip.middle
+    ways = slip.offset + slip.turn * np.cross(touch.push / touch.force, arms)
+    return ways if np.abs(ways).max() > MIN_OFFSET else None
+
+
+def _holding(pressed: Pressed) -> Nodes:
+    """The nodes that press."""
+    assert pressed.forces is not None
     holds = np.flatnonzero(pressed.forces > 0)
-    nodes = Nodes(*(values[holds] for values in pressed.squeeze.nodes if len(values)))
-    normal = touch.push / touch.force
-    gone = slip.offset + slip.turn * np.cross(normal, nodes.points - slip.middle)
-    return green.motion(nodes, green.stuck(nodes, green.near.groups(nodes.corners[:, 0]), gone))
+    return Nodes(*(values[holds] for values in pressed.squeeze.nodes if len(values)))

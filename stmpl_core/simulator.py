@@ -8,6 +8,7 @@ from typing import overload
 
 import numpy as np
 
+from stmpl_core.bounds import motion_bound
 from stmpl_core.conform import Conformed, conform, kept_out
 from stmpl_core.contact import Contact
 from stmpl_core.dragged import dragged_motion
@@ -28,7 +29,6 @@ from stmpl_core.trust import Displacement, Trust
 from stmpl_core.wake import sunk
 
 MOST_MOVED = 0.95  # motion over the thickness from which it is held back
-SHEAR = 3.0  # motion of the skin along a force, over that across it: 1.3 on a half-space, 6 on a wide contact at nu 0.4
 MAX_ENTERED_SHARE = 0.02  # depth of skin inside a tool over the thickness, which is not yet said
 
 
@@ -123,10 +123,7 @@ class Simulator:
             solved = Displacement(np.zeros_like(self.layer.vertices), Trust(), self.method.name)
             fitted = Conformed(solved.displacement, 0.0, 0.0)
 
-        for touch in touches:
-            if touch.wake:
-                tool = self.tools.field(self.tools[touch.name])
-                fitted = fitted._replace(displacement=sunk(self.layer, tool, touch.wake, fitted.displacement))
+        fitted, left = self._sunk(fitted, touches)
 
         # Say what may be believed: what the method says, and what was found of each contact.
         trust = _joined(solved.trust, touches, fitted)
@@ -136,7 +133,8 @@ class Simulator:
         if cut:
             trust = trust.also(f"{cut} vertices would move further than there is skin: held back", in_range=False)
         if trust.in_range:
-            trust = replace(trust, error_bound=self._bound(touches, peak))
+            known = getattr(self.method, "contact_bound", None)
+            trust = replace(trust, error_bound=motion_bound(known, touches, moves, peak, left))
         return Answer(displacement, trust, solved.method, pressure, {touch.name: touch for touch in touches})
 
     def _dragged(self, fitted: Conformed, touches: Sequence[Touch]) -> Conformed:
@@ -148,21 +146,14 @@ class Simulator:
                     fitted = fitted._replace(displacement=fitted.displacement + more)
         return fitted
 
-    def _bound(self, touches: Sequence[Touch], peak: float) -> float | None:
-        """Bound on the error of the motion under touches that are in range [m]; None where the method knows none.
-
-        It follows from how far the force may be off, and from the drag that a wrench tells of: the skin would go along
-        with it, by so much as it gives.
-        """
-        pressing = [touch for touch in touches if touch.presses and touch.force > 0]
-        if not pressing:
-            return 0.0
-        known = getattr(self.method, "contact_bound", None)
-        if known is None:
-            return None
-        doubt = max(touch.force_bound / touch.force for touch in pressing)
-        along = max(SHEAR * touch.drag / touch.force * touch.depth for touch in pressing)
-        return peak * known["scale"] * doubt ** known["power"] + along
+    def _sunk(self, fitted: Conformed, touches: Sequence[Touch]) -> tuple[Conformed, float]:
+        """The answer with grooves that are left, and the largest motion that these add [m]."""
+        before = after = fitted.displacement
+        for touch in touches:
+            if touch.wake and touch.name in self.tools:
+                after = sunk(self.layer, self.tools.field(self.tools[touch.name]), touch.wake, after)
+        most = 0.0 if after is before else float(np.linalg.norm(after - before, axis=1).max())
+        return fitted._replace(displacement=after), most
 
     def step(self, contacts: Sequence[Contact]) -> Answer:
         """`touch`, then `answer`. Raises what `touch` raises."""

@@ -1,12 +1,16 @@
 """Laws of the bound on the motion under tools."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from fem_tools.indenter import IndenterFem
 from fem_tools.patch import PatchFem
 from fem_tools.press import Press
-from stmpl_core import Tool
+from stmpl_core import Contact, Prony, State, Tissue, Tool, Touch
+from stmpl_core.bounds import motion_bound
 from stmpl_core.methods import MomentNet
 from stmpl_core.sdf import SignedDistance
 from stmpl_core.simulator import Simulator
@@ -55,6 +59,60 @@ def test_a_wrench_that_drags_widens_it(sim: Simulator) -> None:
     straight, slanted = (pressed(sim, 2e-3, (-0.06, drag, 0)).trust for drag in (0.0, 0.012))
     assert straight.error_bound is not None and slanted.error_bound is not None
     assert slanted.error_bound > straight.error_bound + 5e-4
+
+
+def followed(sim: Simulator, poses: list[np.ndarray], dt: float = 0.1) -> list[Touch]:
+    touches, state = [], State()
+    for pose in poses:
+        touches, state = sim.touch([Contact(BALL, pose)], state, dt)
+    return touches
+
+
+def test_skin_that_is_not_back_yet_may_be_elsewhere() -> None:
+    """Finite elements are up to 0.6 mm off where skin has come back from 6 mm to between 1 and 3."""
+    tissue = Tissue(LIMB.tissue.youngs_modulus, LIMB.tissue.poisson_ratio, relaxation=Prony((0.45,), (0.5,)))
+    relaxing = Simulator(LIMB.with_(tissue=tissue), MomentNet())
+    down, away = at(RADIUS + 0.012 - 3e-3, 0, MIDDLE), at(RADIUS + 0.02, 0, MIDDLE)
+    answer = relaxing.answer(followed(relaxing, 20 * [down] + [away]))
+    peak = float(answer.magnitude.max())
+    assert peak > 1e-3 and answer.trust.in_range and answer.trust.error_bound is not None
+    assert 0.3 * peak < answer.trust.error_bound < peak
+    rest = followed(relaxing, 20 * [down] + 40 * [away], 1.0)
+    assert relaxing.answer(rest).trust.error_bound == 0.0
+
+
+def test_a_groove_alone_may_be_off_by_itself() -> None:
+    assert motion_bound(None, [], [], 2e-3, 1e-3) == 1e-3
+
+
+def test_skin_that_is_dragged_along_widens_it() -> None:
+    rubbed, smooth = (Simulator(LIMB, MomentNet(), friction=mu) for mu in (0.6, None))
+    poses = [at(RADIUS + 0.012 - 2e-3, 0, MIDDLE + 1e-4 * k) for k in range(20)]
+    touches = followed(rubbed, poses, 0.01)
+    slip = touches[0].slip
+    assert slip is not None and np.linalg.norm(slip.offset) > 5e-4
+    dragged, straight = (one.answer(touch).trust.error_bound
+                         for one, touch in ((rubbed, touches), (smooth, followed(smooth, poses, 0.01))))  # fmt: skip
+    assert dragged is not None and straight is not None
+    assert dragged - straight > 0.9 * float(slip.offset @ slip.offset) / touches[0].depth
+
+
+def test_skin_turns_with_a_tool_that_spins_in_place() -> None:
+    """Nothing jumps where the way along the skin is next to none."""
+    sim = Simulator(LIMB, MomentNet(), friction=0.6)
+    poses = [at(RADIUS + 0.012 - 2e-3, 0, MIDDLE) for _ in range(10)]
+    for k, pose in enumerate(poses):
+        pose[:3, :3] = Rotation.from_rotvec([-0.02 * k, 0, 0]).as_matrix() @ pose[:3, :3]
+    (touch,) = followed(sim, poses, 0.01)
+    assert touch.slip is not None
+    still, near = (sim.answer([replace(touch, slip=touch.slip._replace(offset=np.array([0, 0, by])))])
+                   for by in (0.0, 2e-6))  # fmt: skip
+    straight = sim.answer([replace(touch, slip=None)])
+    turned = np.linalg.norm(still.displacement - straight.displacement, axis=1)
+    assert turned.max() > 2e-4
+    assert np.abs(still.displacement - near.displacement).max() < 2e-5
+    assert still.trust.error_bound is not None and straight.trust.error_bound is not None
+    assert still.trust.error_bound > straight.trust.error_bound
 
 
 class Silent(MomentNet):

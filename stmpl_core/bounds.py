@@ -1,0 +1,49 @@
+"""Bounds: how far the motion under touches may be off."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from stmpl_core.dragged import ways_along
+from stmpl_core.touch import Touch
+
+SHEAR = 3.0  # motion of the skin along a force, over that across it: 1.3 on a half-space, 6 on a wide contact at nu 0.4
+LATE = 0.3  # error of skin that comes back, over its depth: up to 0.22 beyond the elastic bound by finite elements
+
+
+def motion_bound(known: Mapping[str, float] | None, touches: Sequence[Touch], moves: Sequence[Touch], peak: float,
+                 sunk: float) -> float | None:  # fmt: skip
+    """Bound on the error of the motion under touches that are in range [m]; None where the method knows none.
+
+    It follows from how far the force may be off; from the drag that a wrench tells of and that is not carried: the skin
+    would go along with it, by so much as it gives; from skin that goes along by s under a tool d deep, in the linear
+    response: s^2 / d, which a ball's slides by finite elements keep at mu 0.3, 0.6 and 1.0; and from skin that is not
+    back. A groove may be off by all of itself, elsewhere than under a tool.
+
+    Args:
+        known: figures of the method's bound, `scale` and `power` of the force's relative bound; None: none.
+        touches: touches of the tools.
+        moves: elastic touches that move the skin as they do, see History.elastic.
+        peak: largest motion [m].
+        sunk: largest motion that grooves add [m].
+    """
+    late = {touch.name for touch in touches if touch.imprint is not None}
+    pressing = [touch for touch in touches if touch.presses and touch.force > 0]
+    back = [touch for touch in moves if touch.name in late and touch.force > 0]
+    if not pressing and not back:
+        return sunk
+    if known is None:
+        return None
+    doubt = max(touch.force_bound / touch.force for touch in [*pressing, *back])
+    under = peak * known["scale"] * doubt ** known["power"]
+    under += max((SHEAR * touch.drag / touch.force * touch.depth for touch in pressing), default=0.0)
+    under += max((_dragged(touch) for touch in pressing), default=0.0)
+    under += max((LATE * touch.depth for touch in back), default=0.0)
+    return max(under, sunk)
+
+
+def _dragged(touch: Touch) -> float:
+    ways = ways_along(touch)
+    return 0.0 if ways is None else float(np.einsum("nx,nx->n", ways, ways).max()) / touch.depth
