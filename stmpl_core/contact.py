@@ -32,13 +32,13 @@ class Contact:
     time: float = 0.0
 
     def __post_init__(self) -> None:
-        pose = finite(f"pose of {self.name}", self.pose_body_from_tool, (4, 4))
+        pose = finite(f"pose of {self.name}", self.pose_body_from_tool, (4, 4)).copy()  # a caller goes on with its own
         rotation = pose[:3, :3]
         if np.abs(rotation @ rotation.T - np.eye(3)).max() > 1e-4 or np.linalg.det(rotation) < 0:
             raise InvalidInput(f"pose of {self.name} is not rigid: its rotation part is\n{rotation}.")
         object.__setattr__(self, "pose_body_from_tool", pose)
         if self.wrench is not None:
-            object.__setattr__(self, "wrench", finite(f"wrench of {self.name}", self.wrench, (6,)))
+            object.__setattr__(self, "wrench", finite(f"wrench of {self.name}", self.wrench, (6,)).copy())
 
     @property
     def name(self) -> str:

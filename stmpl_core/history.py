@@ -19,6 +19,7 @@ from stmpl_core.arrays import Transform
 from stmpl_core.columns import shifted
 from stmpl_core.contact import Contact
 from stmpl_core.dragged import MIN_OFFSET
+from stmpl_core.errors import InvalidInput
 from stmpl_core.footing import carried_tangent, in_plane, in_space, patch_of, twist_between, way_along, way_of_tool
 from stmpl_core.friction import Friction, coefficients
 from stmpl_core.relaxation import series_of, weights
@@ -103,7 +104,15 @@ class History:
         return some.get(name, every)
 
     def step(self, contacts: Sequence[Contact], state: State, dt: float) -> tuple[list[Touch], State]:
-        """Touches of contacts with names of their own, dt [s] after a state; and the state then."""
+        """Touches of contacts with names of their own, dt [s] after a state; and the state then.
+
+        Raises:
+            InvalidInput: a state of skin that relaxes in another number of times.
+        """
+        for name, memory in state.tools.items():
+            if len(memory.relaxed) != len(self.series.times):
+                raise InvalidInput(f"the state of {name} is of skin with {len(memory.relaxed)} times of relaxation; "
+                                   f"this layer has {len(self.series.times)}. Try an empty State().")  # fmt: skip
         asked = [self._asked(contact, state.tools.get(contact.name), dt) for contact in contacts]
         touches = self.toucher.touch_all([one.contact for one in asked], alone=False)
         again = [self._again(one, touch) for one, touch in zip(asked, touches, strict=True)]
@@ -319,6 +328,8 @@ def _imprint(memory: Memory) -> Transform:
 def _balanced(asked: Sequence[_Asked], laws: Sequence[_Law]) -> tuple[list[Touch], dict[str, Memory]]:
     """The touches, weakened where a contact would give more than was put in, and the memories with their balance.
 
+    Memories share no array with touches, which whoever is handed them may write to.
+
     Work put in is the trapezoid of the wrench over the tool's way. Tools that feel each other pass energy on, so one is
     weakened only where all together lack it.
     """
@@ -344,7 +355,9 @@ def _balanced(asked: Sequence[_Asked], laws: Sequence[_Law]) -> tuple[list[Touch
                 touch = _weakened(touch, passive)
                 memory = memory._replace(wrench=touch.wrench)
         work = min(work if law.stored > 0 else max(work, 0.0), KEPT * law.whole)
-        memories[touch.name] = memory._replace(scalars=memory.scalars._replace(work=work, passive=passive))
+        memories[touch.name] = memory._replace(
+            scalars=memory.scalars._replace(work=work, passive=passive), pose=memory.pose.copy(),
+            wrench=memory.wrench.copy(), contact=memory.contact.copy(), imprint=memory.imprint.copy())  # fmt: skip
         touches.append(touch)
     return touches, memories
 

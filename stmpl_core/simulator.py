@@ -92,14 +92,14 @@ class Simulator:
             dt: time since that state [s].
 
         Raises:
-            InvalidInput: two contacts of one name, or a dt below 0.
+            InvalidInput: two contacts of one name, a dt below 0 or not finite, or a state of other skin.
             MeshError: a tool's surface that cannot be used.
         """
         names = [contact.name for contact in contacts]
         if len(set(names)) < len(names):
             raise InvalidInput(f"contacts must have names of their own; got {', '.join(names)}.")
-        if not dt >= 0:
-            raise InvalidInput(f"dt is {dt} s; time goes forward, allowed is 0 or more.")
+        if not 0 <= dt < np.inf:
+            raise InvalidInput(f"dt is {dt} s; time goes forward, allowed is 0 or more, and finite.")
         return self.toucher.touch_all(contacts) if state is None else self.history.step(contacts, state, dt)
 
     def answer(self, touches: Sequence[Touch]) -> Answer:

@@ -130,7 +130,9 @@ class State:
             told = json.loads(head)
             names, terms, version = list(told["tools"]), int(told["terms"]), told["version"]
             numbers = np.frombuffer(rest, "<f8").astype(float)
-        except (ValueError, KeyError, TypeError) as error:
+            if not 0 <= terms <= len(numbers):
+                raise ValueError(f"{terms} times of relaxation in {len(numbers)} numbers")
+        except (ValueError, KeyError, TypeError, OverflowError) as error:
             raise InvalidInput(f"{len(packed)} bytes are no state: {error}.") from error
         shapes = [one.shape for one in map(np.asarray, fresh(np.eye(4), terms))]
         size = sum(int(np.prod(shape)) for shape in shapes)

@@ -169,9 +169,35 @@ def test_a_replay_from_any_frame_is_bit_for_bit(sim: Simulator) -> None:
 
 def test_bytes_of_another_kind_are_no_state() -> None:
     assert not State.unpack(State().pack()).tools
-    for wrong in (b"", b"{}\n", b'{"version": 1, "terms": 0, "tools": ["a"]}\n1234', b'{"version": 9}\n'):
+    for wrong in (b"", b"{}\n", b'{"version": 1, "terms": 0, "tools": ["a"]}\n1234', b'{"version": 9}\n',
+                  b'{"version": 2, "terms": -1, "tools": []}\n', b'{"version": 2, "terms": 1e400, "tools": []}\n'):
         with pytest.raises(InvalidInput):
             State.unpack(wrong)
+
+
+def test_a_state_is_a_value_whatever_becomes_of_pose_and_touch(sim: Simulator) -> None:
+    contact = pressed(2e-3)
+    pose = contact.pose_body_from_tool.copy()
+    (touch,), state = sim.touch([Contact(contact.tool, pose)], State(), 0.1)
+    before = state.pack()
+    pose[:] = np.eye(4)
+    touch.pose_body_from_tool[:] = np.eye(4)
+    touch.wrench[:] = 0.0
+    assert state.pack() == before
+
+
+def test_a_state_of_other_skin_is_refused(sim: Simulator, elastic: Simulator) -> None:
+    _, state = elastic.touch([pressed(2e-3)], State(), 0.1)
+    with pytest.raises(InvalidInput, match="times of relaxation"):
+        sim.touch([pressed(2e-3)], state, 0.1)
+
+
+def test_time_without_end_is_refused(sim: Simulator) -> None:
+    _, state = sim.touch([pressed(2e-3)], State(), 0.1)
+    assert sim.touch([pressed(2e-3)], state, 1e9)[1].finite
+    for dt in (np.inf, np.nan, -1.0):
+        with pytest.raises(InvalidInput):
+            sim.touch([pressed(2e-3)], state, dt)
 
 
 def test_a_tool_that_was_not_told_of_for_a_while_presses_again(sim: Simulator) -> None:
