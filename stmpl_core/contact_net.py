@@ -256,7 +256,7 @@ def _slopes_on_stack(points, inward, thickness, area, strain, corners, shares, s
     return out
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, error_model="numpy")
 def _small(force, force_rate, strain, strain_rate):
     """Step of a difference in which neither force nor strain changes by more than SMALL_STEP of its largest."""
     fastest = max(np.abs(force_rate).max() / force.max(), np.abs(strain_rate).max() / strain.max())

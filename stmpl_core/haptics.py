@@ -197,7 +197,7 @@ def _packed(model: LocalContact, coupling: float) -> np.ndarray:
                            [model.valid_m], drag])  # fmt: skip
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, error_model="numpy")
 def _owe(state):
     """What the friction of the newest model at the proxy is more than the present one, along the skin."""
     model, p = state.target, state.proxy
@@ -205,7 +205,7 @@ def _owe(state):
         state.owed[i] = model[23 + i] + model[17] * (p[i] - model[19 + i]) - state.drag[i]
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, error_model="numpy")
 def _step(state, constants, dt):
     """One step; False when the input cannot be used."""
     kc, bc, controlled, most, noise, limit, stale_after, decay, delay = constants
@@ -305,7 +305,7 @@ def _step(state, constants, dt):
     return True
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, error_model="numpy")
 def _solved(k, c, right):
     """(k + c I)^-1 right for a symmetric k (3, 3), by Cramer's rule."""
     a, b, d = k[0, 0] + c, k[1, 1] + c, k[2, 2] + c

@@ -30,7 +30,7 @@ LEAST_COSINE = 0.05  # of a column's angle to the tool's normal, below which its
 
 
 class Tangent(NamedTuple):
-    """Derivative of a touch of elastic skin by the twist of its tool.
+    """Derivative of what a touch of elastic skin presses with, friction left out, by the twist of its tool.
 
     Args:
         stiffness: d wrench / d twist of its tool, (6, 6) [N/m, N/rad; N m/m, N m/rad]; the twist is (translation of
@@ -99,7 +99,7 @@ def _of_group(toucher: Toucher, touches: Sequence[Touch]) -> list[Tangent]:
                       every[k].corners)  # fmt: skip
         corners = own[:, :, None] * every[k].shares + one.forces[:, None] * rates[k].shares  # force at each, (6, N, 3)
         stiffness = (corners.reshape(6, -1) @ unit.reshape(-1, 6)).T.copy()
-        stiffness[3:, :3] += _cross_matrix(touch.wrench[:3])
+        stiffness[3:, :3] += _cross_matrix(touch.push)
         out.append(Tangent(stiffness, own.sum(axis=1)))
     return out
 
@@ -110,7 +110,7 @@ def _cross_matrix(force: np.ndarray) -> np.ndarray:
     return np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, error_model="numpy")
 def _units(points, area_vectors, areas, origin, corners):
     """Wrench about the origin of a unit force at each corner of each node, (N, 3, 6)."""
     out, arm, f = np.empty((len(corners), 3, 6)), np.empty(3), np.empty(3)

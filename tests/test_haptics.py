@@ -183,6 +183,19 @@ def test_a_model_with_a_state_is_that_of_the_instant(spot: Spot, friction: float
     assert (model.grip is None) == (friction is None)
 
 
+def test_what_presses_knows_of_no_friction(spot: Spot) -> None:
+    """Friction goes along with the contact: its arm about the tool's origin stays when the tool moves."""
+    remembers = spot.with_memory(None, 0.5)
+    history, state = History(remembers.toucher, 0.5), State()
+    for k in range(12):
+        pose = spot.pose(spot.centre(-DEEP, 4e-4 * k))
+        (touch,), state = history.step([Contact(spot.tool, pose)], state, 0.01)
+    assert touch.slip is not None and np.linalg.norm(touch.slip.wrench[:3]) > 0.1 * touch.force
+    rubbed = local_contacts(history, [touch], state)[0]
+    straight = local_contact(remembers.toucher, Contact(spot.tool, pose))
+    np.testing.assert_allclose(rubbed.push_stiffness, straight.stiffness, atol=1e-6 * np.abs(straight.stiffness).max())
+
+
 def test_a_tool_at_the_core_is_as_stiff_as_differences_say(spot: Spot) -> None:
     deep = spot.pose(spot.centre(-9e-3))
     model = local_contact(spot.toucher, Contact(spot.tool, deep))
