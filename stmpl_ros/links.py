@@ -12,24 +12,28 @@ from typing import Any
 import numpy as np
 from geometry_msgs.msg import PoseStamped, WrenchStamped
 from nav_msgs.msg import Odometry
+from rclpy.duration import Duration
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
+from rclpy.utilities import ok
 
 from bags.wire import NANO, pose_from, stamp_ns, wrench_message
 from stmpl_core.arrays import Points, Transform, Wrench
 from stmpl_core.errors import InvalidInput, StmplError
-from stmpl_core.friction import friction_from
 from stmpl_core.layer import SoftLayer
 from stmpl_core.tool import Tool
 from stmpl_ros.diagnosis import Tally
 from stmpl_ros.gate import Gate
-from stmpl_ros.making import Build, layer_of
-from stmpl_ros.parameters import LinksConfig, NodeConfig
+from stmpl_ros.making import Build, friction_of, layer_of
+from stmpl_ros.parameters import LinksConfig
+from stmpl_ros.sending import LAST_WORD_S
+from stmpl_ros.settings import checked
 from stmpl_ros.spinning import ros, spin
 from stmpl_ros.topics import STREAM
 from stmpl_sim.protocol import Memory, Poses, Reaction, SoftContact, exchange
 
 POLL_PERIOD_S = 0.05  # time between two looks whether the simulator fell silent
+LONGEST_WAIT_S = 2.0  # time that poses may come without a whole instant until that is told
 
 
 @dataclass
@@ -51,7 +55,7 @@ class RosWorld:
     """The World of a simulator over ROS: poses as they came, wrenches as they go out.
 
     An instant is whole once all links that move have a pose of one stamp. A link that sent one pose when another has
-    sent three stands still.
+    sent three stands still. Where a link's stamps go back, the simulator began anew: what stood still stays there.
 
     Args:
         body: name of the link that carries the skin.
@@ -63,12 +67,17 @@ class RosWorld:
     def __init__(self, body: str, tools: Iterable[str], send: Callable[[str, Wrench, Transform, int], None]) -> None:
         self.body, self.tools, self._send = body, tuple(tools), send
         self.links: dict[str, Link] = {}
+        self._stamp = 0  # of the pose that came last [ns]
 
     def put(self, name: str, pose: Transform, stamp: int) -> bool:
         """Keeps a pose; True if the instant of its stamp is whole now."""
         known = self.links.get(name)
-        if known is not None and stamp <= known.stamp:
+        if known is not None and stamp < known.stamp:
+            self.links = {one: Link(link.pose, stamp - 1) for one, link in self.links.items() if link.count == 1}
+            known = self.links.get(name)
+        if known is not None and stamp == known.stamp:
             return False
+        self._stamp = stamp
         self.links[name] = Link(pose, stamp, known.count + 1 if known else 1)
         most = max(link.count for link in self.links.values())
         moving = {link.stamp for link in self.links.values() if link.count > 1 or most == 2}
@@ -80,9 +89,15 @@ class RosWorld:
 
     def push(self, reaction: Reaction) -> None:
         """Sends the wrenches of the newest instant."""
-        stamp = max(link.stamp for link in self.links.values())
         for name, wrench in (*reaction.tools.items(), (self.body, reaction.body)):
-            self._send(name, wrench, self.links[name].pose, stamp)
+            self._send(name, wrench, self.links[name].pose, self._stamp)
+
+    def lacks(self) -> str:
+        """What keeps an instant from being whole, for people."""
+        if unheard := [name for name in (self.body, *self.tools) if name not in self.links]:
+            return f"poses come, but none of {', '.join(unheard)}: no wrench is sent"
+        newest = ", ".join(f"{name} {link.stamp / NANO:.6f} s" for name, link in self.links.items())
+        return f"poses come, but not with one stamp: no wrench is sent. The newest are of {newest}"
 
     def let_go(self) -> None:
         """Sends that nothing pushes any more."""
@@ -108,8 +123,9 @@ class LinkNode(Node):
         self.gate = Gate(self, Tally())
         self._last: int | None = None  # stamp of the last instant [ns]
         self._heard, self._idle = time.monotonic(), True
+        self._waits: float | None = None  # since when poses come without a whole instant
         self._about = points_of(config.about, (config.body, *contact.tools))
-        self._frame = "world"
+        self._frame, self._frames = "world", set[str]()
         names = (config.body, *contact.tools)
         if config.wrench_type == "entity":
             self._entity = _entity_wrench()
@@ -128,32 +144,53 @@ class LinkNode(Node):
 
     def _on_pose(self, name: str, message: Any) -> None:
         pose = message.pose if isinstance(message, PoseStamped) else message.pose.pose
-        self._frame = message.header.frame_id or self._frame
+        self._hear_frame(message.header.frame_id)
         self._put(name, pose, stamp_ns(message))
 
     def _on_tf(self, message: Any) -> None:
         for one in message.transforms:
             if one.child_frame_id in self._sinks:
-                self._frame = one.header.frame_id
+                self._hear_frame(one.header.frame_id)
                 moved = one.transform
                 self._put(one.child_frame_id, _Pose(moved.translation, moved.rotation), stamp_ns(one))
 
+    def _hear_frame(self, frame: str) -> None:
+        self._frame = frame or self._frame
+        if frame and frame not in self._frames:
+            self._frames.add(frame)
+            if len(self._frames) > 1:
+                self.gate.say(f"frame {frame}", f"poses come in the frames {', '.join(sorted(self._frames))}: each is "
+                              "taken as the world's, so they have to be one")  # fmt: skip
+
     def _put(self, name: str, pose: Any, stamp: int) -> None:
-        if self._last is not None and stamp < self._last:  # the simulator was reset
-            self.memory, self._last = Memory(), None
-            self.world.links.clear()
+        now = time.monotonic()
+        self._waits = self._waits or now
         try:
             if self.world.put(name, pose_from(pose), stamp):
+                self._waits = None
+                if self._last is not None and stamp < self._last:  # the simulator was reset
+                    self.memory, self._last = Memory(), None
                 dt = 0.0 if self._last is None else (stamp - self._last) / NANO
                 self.memory = exchange(self.contact, self.world, self.memory, dt).memory
-                self._last, self._heard, self._idle = stamp, time.monotonic(), False
+                self._last, self._heard, self._idle = stamp, now, False
         except StmplError as error:
             self.gate.refuse(f"pose of {name}", str(error))
 
-    def _look(self) -> None:
-        if not self._idle and time.monotonic() - self._heard > self.config.silence:
+    def let_go(self) -> None:
+        """Sends, unless that was said, that nothing pushes any more: simulators may keep the last wrench."""
+        if not self._idle and ok():
             self._idle = True
             self.world.let_go()
+            for sink in set(self._sinks.values()):
+                sink.wait_for_all_acked(Duration(seconds=LAST_WORD_S))
+
+    def _look(self) -> None:
+        now = time.monotonic()
+        if now - self._heard > self.config.silence:
+            self.let_go()
+        if self._waits is not None and now - self._waits > LONGEST_WAIT_S:
+            self._waits = None
+            self.gate.say("instant", self.world.lacks())
 
     def _send(self, name: str, wrench: Wrench, pose: Transform, stamp: int) -> None:
         wrench = moved_to(wrench, pose[:3, :3] @ self._about.get(name, np.zeros(3)))
@@ -259,10 +296,10 @@ def run(config: LinksConfig, arguments: Sequence[str] | None = None, build: Buil
     Raises:
         InvalidInput: settings that cannot be, a file that cannot be read, or a package that is missing.
     """
-    settings = NodeConfig(part=config.part, tissue=config.tissue, edge_length=config.edge_length)
+    settings = checked(config.model_dump(include={"part", "tissue", "edge_length", "friction"}))
     layer: SoftLayer = build(settings)
     contact = SoftContact(layer, tools or tools_of(config.tools), settings.new_method(), damping=config.damping,
-                          friction=friction_from(config.friction))  # fmt: skip
+                          friction=friction_of(settings))  # fmt: skip
     with ros(list(arguments or ())) as stop:
         node = LinkNode(config, contact)
         node.get_logger().info(f"skin of '{config.body}': {layer}; tools: {', '.join(contact.tools)}")
@@ -271,6 +308,7 @@ def run(config: LinksConfig, arguments: Sequence[str] | None = None, build: Buil
         try:
             spin(executor, stop)
         finally:
+            node.let_go()
             executor.shutdown()
             node.destroy_node()
     return 0

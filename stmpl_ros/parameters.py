@@ -290,7 +290,9 @@ class LinksConfig(BaseModel):
     )
     damping: float = Field(default=0.0, ge=0, description="damping of the contact [s/m]; 0: none")
     friction: str = Field(
-        default="none", description="coefficient of friction, or dry, moist, oiled, glove, typical, or none"
+        default="",
+        description="coefficient of friction, or dry, moist, oiled, glove, typical, or none; empty: as a file of stmpl "
+        "needs says, else none",
     )
     silence: float = Field(
         default=0.25, gt=0, description="time without a pose after which every wrench is set to nothing [s]"

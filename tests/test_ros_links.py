@@ -3,6 +3,7 @@
 import importlib
 import importlib.util
 import json
+import signal
 from pathlib import Path
 from typing import Any
 
@@ -158,6 +159,46 @@ def test_an_instant_is_whole_once_all_that_moves_has_one_stamp() -> None:
     world.push(Reaction({"left": nothing, "right": nothing}, nothing, {}, None))  # type: ignore[arg-type]
     assert sent == [("left", 4), ("right", 4), ("arm", 4)]
     assert isinstance(world.poses(), Poses)
+
+
+def test_a_simulator_that_begins_anew_keeps_what_stands_still() -> None:
+    sent: list[int] = []
+    world = RosWorld("arm", ["tip"], lambda name, wrench, pose, stamp: sent.append(stamp))
+    there, pose, nothing = np.eye(4), np.eye(4), np.zeros(6)
+    there[:3, 3] = 1.0
+    assert [world.put("arm", there, 900)] + [world.put("tip", pose, stamp) for stamp in (7, 8, 9)] == [
+        False, True, False, True]  # fmt: skip
+    world.push(Reaction({"tip": nothing}, nothing, {}, None))  # type: ignore[arg-type]
+    assert sent == [9, 9], "the stamp of the instant, not that of what stands still"
+    assert [world.put("tip", pose, stamp) for stamp in (3, 4, 5)] == [True, False, True]
+    np.testing.assert_array_equal(world.poses().body, there)
+    assert not world.put("arm", pose, 4), "a link that moves late is no reset"
+    assert world.links["tip"].stamp == 5
+
+
+def test_what_keeps_an_instant_from_being_whole_is_said() -> None:
+    world = RosWorld("arm", ["tip"], lambda *_: None)
+    world.put("tip", np.eye(4), 1_000_000_000)
+    assert world.lacks() == "poses come, but none of arm: no wrench is sent"
+    world.put("arm", np.eye(4), 1_500_000_000)
+    assert "not with one stamp" in world.lacks() and "tip 1.000000 s, arm 1.500000 s" in world.lacks()
+
+
+def test_who_ends_the_adapter_lets_go(context) -> None:
+    simulator = Simulator("/links_end")
+    with running("-c", ADAPTER, json.dumps({"silence": 600.0}), "--ros-args", "-r", "__ns:=/links_end",
+                 number=signal.SIGINT) as adapter:  # fmt: skip
+        simulator.partner = adapter
+        simulator.wait(lambda: all(one.get_subscription_count() for one in simulator.poses.values()), "the adapter")
+        for number in range(5):
+            simulator.step(number)
+        last = max(stamp for _, stamp in simulator.wrenches)
+        pressed = simulator.wrenches["bob", last]
+        assert pressed.wrench.force.z > 0
+    simulator.partner = None
+    simulator.wait(lambda: simulator.wrenches["bob", last] is not pressed, "that nothing pushes")
+    assert not simulator.wrenches["bob", last].wrench.force.z and not simulator.wrenches["slab", last].wrench.force.z
+    simulator.node.destroy_node()
 
 
 def test_a_wrench_about_another_point_does_the_same_work() -> None:
