@@ -106,6 +106,7 @@ class Answering:
         """Answers on a skin from now on; the simulators of reactions and fields, which share it, but no scratch."""
         with self._sends:
             self._epoch, self.last = self._epoch + 1, None
+        self.remembering.forget()
         self.simulator, self._fields = Simulator(skin, tools=tools, friction=friction), Simulator(skin, tools=tools)
         return self.simulator, self._fields
 

@@ -171,13 +171,12 @@ class SkinNode(LifecycleNode):
 
     def _answer_on(self, skin: Skin, config: NodeConfig, builders: Builders | None = None) -> tuple[Simulator, ...]:
         """From here on the answers are of this skin, with the friction of these settings; its simulators."""
-        tools, before = self.hearing.tools, self.workshop
+        tools, before, friction = self.hearing.tools, self.workshop, friction_of(config)
         if tools.margin != margin_on(skin.layer):  # fields of another width are built anew
             self.hearing.inbox.tools = again = Tools(margin_on(skin.layer))
         else:
             again = tools
         self.skin, self.hearing.layer = skin, skin.layer
-        friction = friction_of(config)
         simulators = self.answering.move_to(skin, again, friction)
         self.workshop = Workshop(self, skin.layer, friction, builders)
         if before:
@@ -284,6 +283,7 @@ class SkinNode(LifecycleNode):
     def _on_field(self, tool: Tool, future: Future[SignedDistance]) -> None:
         try:
             if self.hearing.take(tool, future.result()):
+                self.answering.drop()  # a field that is being found may lie on the surface from before
                 self.answering.remembering.forget(tool.name)  # another surface never touched
                 self.sending.open_tool(tool.name)
                 self.get_logger().info(f"tool '{tool.name}': {len(tool.vertices)} vertices, {len(tool.faces)} faces")

@@ -23,11 +23,13 @@ from rcl_interfaces.srv import SetParameters
 from rclpy.duration import Duration
 from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.executors import SingleThreadedExecutor
+from rclpy.lifecycle import TransitionCallbackReturn
 from rclpy.qos import LivelinessPolicy, QoSProfile
 from std_srvs.srv import Trigger
 from stmpl_msgs.msg import ContactMesh, SkinDisplacement, SkinTopology
 
 from bags.wire import pose_message, stamp_ns, tool_message
+from stmpl_core import Tool
 from stmpl_ros.inbox import Instant
 from stmpl_ros.node import SkinNode
 from stmpl_ros.parameters import NodeConfig
@@ -67,6 +69,7 @@ class Composed(NamedTuple):
     node: SkinNode
     heard: list[SkinDisplacement]
     press: Callable[[], int]
+    announce: Callable[[Tool], None]
     wait: Callable[[Callable[[], object]], None]
 
 
@@ -88,6 +91,9 @@ def composed():
         pose.publish(pose_message(HERE, "body", stamp))
         return stamp
 
+    def announce(tool: Tool) -> None:
+        mesh.publish(tool_message(tool, 0))
+
     def wait(done: Callable[[], object]) -> None:
         until = time.monotonic() + PATIENCE
         while not done():
@@ -99,9 +105,9 @@ def composed():
         executor.add_node(other)
         node.trigger_configure()
         node.trigger_activate()
-        mesh.publish(tool_message(ball().named("finger"), 0))
+        announce(ball().named("finger"))
         wait(pose.get_subscription_count)
-        yield Composed(node, heard, press, wait)
+        yield Composed(node, heard, press, announce, wait)
     finally:
         executor.shutdown()
         node.destroy_node()
@@ -200,6 +206,32 @@ def test_a_field_that_fails_is_told_and_the_reaction_and_the_next_field_are_sent
     assert composed.node.tally.refused == 1 and composed.node.tally.reactions > reactions
     assert "the displacement would not be finite" in composed.node.tally.last_refusal
     assert all(np.isfinite(rows(one)).all() for one in composed.heard)
+
+
+def test_a_skin_that_takes_over_while_the_node_is_inactive_remembers_nothing_of_the_other(composed):
+    node = composed.node
+    assert node.trigger_deactivate() == TransitionCallbackReturn.SUCCESS
+    assert node.trigger_cleanup() == TransitionCallbackReturn.SUCCESS
+    node.set_body(friction="dry")
+    node.trigger_configure()
+    node.trigger_activate()
+    composed.wait(lambda: composed.press() and node.answering.remembering.state.tools)
+    node.trigger_deactivate()
+    assert node.set_body(youngs_modulus=1300.0) == "taken over"
+    assert not node.answering.remembering.state.tools
+
+
+def test_another_surface_of_a_tool_ends_the_field_on_the_one_from_before(composed, held):
+    composed.wait(lambda: composed.press() and not composed.node.answering._field.idle)
+    begun = composed.node.answering._instant.stamp
+    known = composed.node.hearing.tools["finger"]
+    composed.announce(ball(0.008).named("finger"))
+    composed.wait(lambda: composed.node.hearing.tools["finger"] is not known)
+    held.set()
+    composed.wait(lambda: composed.node.answering._field.idle)
+    answered = composed.press()
+    composed.wait(lambda: stamp_ns(composed.heard[-1]) >= answered or not composed.press())
+    assert begun not in [stamp_ns(one) for one in composed.heard]
 
 
 def test_two_nodes_on_one_topic_tell_of_each_other_and_of_one_of_their_name():
