@@ -62,14 +62,14 @@ class Show:
     def _show(self) -> None:
         if self._newest is None or not self._marker.is_activated:
             return
-        answer, stamp = self._newest
+        newest = answer, stamp = self._newest
         looked_at = [publisher for publisher in (self._marker, self._points) if publisher.get_subscription_count()]
         if self._points in looked_at:
             self._points.publish(self._cloud.frame(answer, stamp))
         if self._marker in looked_at:
             self._made = self._made or SkinMarker(self._layer, self._frame)
             self._marker.publish(self._made.frame(answer.displacement, stamp))
-        if looked_at:
+        if looked_at and self._newest is newest:  # a newer one may have come, on the thread of the fields
             self._newest = None
 
 
