@@ -21,7 +21,7 @@ from bags.wire import NANO, header, layer_from, pose_message, tool_message, wren
 from stmpl_core.errors import StmplError
 from stmpl_core.layer import SoftLayer
 from stmpl_ros.parameters import RobotConfig
-from stmpl_ros.spinning import ros
+from stmpl_ros.spinning import interruptible, ros
 from stmpl_ros.topics import KEPT, STREAM
 
 if TYPE_CHECKING:
@@ -65,18 +65,19 @@ class RobotNode(Node):
         self.topology = message
 
     def wait_for_skin(self, stop: threading.Event) -> SoftLayer | None:
-        """The layer that the node answers on; None if asked to stop or out of patience."""
+        """The layer that the node answers on; None if out of patience. Raises Stopped."""
         self._wait(lambda: self.topology is not None, stop)
         return layer_from(self.topology) if self.topology else None
 
     def wait_for_listeners(self, stop: threading.Event) -> bool:
-        """Whether as many listen to the tool's poses as there should be, in time."""
+        """Whether as many listen to the tool's poses as there should be, in time. Raises Stopped."""
         return self._wait(lambda: self._pose.get_subscription_count() >= self.config.listeners, stop)
 
     def _wait(self, done: Any, stop: threading.Event) -> bool:
         deadline = time.monotonic() + self.config.patience
         while not done():
-            if stop.is_set() or time.monotonic() > deadline:
+            _go_on(stop)
+            if time.monotonic() > deadline:
                 return False
             rclpy.spin_once(self, timeout_sec=POLL_PERIOD_S)
         return True
@@ -169,6 +170,15 @@ def massage_of(config: RobotConfig, layer: SoftLayer) -> Massage:
     return Massage(scene, course, friction=friction_from(config.friction))
 
 
+def made(config: RobotConfig, layer: SoftLayer, stop: threading.Event) -> Massage:
+    """The robot on a layer with nothing left to compile, which may take a minute. Raises InvalidInput or Stopped."""
+    with interruptible(stop):
+        massage = massage_of(config, layer)
+        warm_up(massage)
+        return massage
+    raise Stopped("asked to stop")
+
+
 def run(config: RobotConfig, arguments: Sequence[str] | None = None) -> int:
     """Massages once; the exit code says whether all of the course was done."""
     with ros(list(arguments or ())) as stop:
@@ -178,8 +188,7 @@ def run(config: RobotConfig, arguments: Sequence[str] | None = None) -> int:
             if layer is None:
                 node.get_logger().error(f"no skin/topology within {config.patience:g} s. Is the node active?")
                 return 1
-            massage = massage_of(config, layer)
-            warm_up(massage)
+            massage = made(config, layer, stop)
             node.announce(massage)
             if not node.wait_for_listeners(stop):
                 node.get_logger().error(
@@ -209,6 +218,11 @@ def warm_up(massage: Massage) -> None:
     skin.contact.step(type(poses)(poses.body, {BALL: pressed}))
 
 
+def _go_on(stop: threading.Event) -> None:
+    if stop.is_set():
+        raise Stopped("asked to stop")
+
+
 def _massage(node: RobotNode, massage: Massage, stop: threading.Event) -> Log:
     """Follows the course at real time at most, and goes on telling the time for a while."""
     from stmpl_sim.wrist import Wrist
@@ -221,8 +235,7 @@ def _massage(node: RobotNode, massage: Massage, stop: threading.Event) -> Log:
 
     def see(run: Massage, at: float) -> None:
         nonlocal told
-        if stop.is_set():
-            raise Stopped("asked to stop")
+        _go_on(stop)
         if round(at / dt) % every == 0:
             node.tell(run, wrist, at)
             pace.wait(at)

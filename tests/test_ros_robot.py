@@ -1,5 +1,7 @@
 """The simulated robot over real DDS: what it says is one world, and the node answers the contact that it feels."""
 
+import signal
+import threading
 from typing import Any
 
 import numpy as np
@@ -10,6 +12,8 @@ from sensor_msgs.msg import JointState
 
 from bags.wire import pose_from, stamp_ns
 from stmpl_core.touch import BY_POSE
+from stmpl_ros.parameters import RobotConfig
+from stmpl_ros.robot import RobotNode, Stopped, made
 from tests.bus import end, running, start
 from tests.node_bus import NODE, Bus
 
@@ -86,7 +90,6 @@ def test_the_wrist_measures_what_presses_but_for_the_heads_own_motion(heard) -> 
 
 def test_joints_and_pose_are_of_one_instant(heard) -> None:
     from stmpl_core.layer import SoftLayer
-    from stmpl_ros.parameters import RobotConfig
     from stmpl_ros.robot import massage_of
     from stmpl_sim.scene import BALL
     from tests.scenes import limb
@@ -116,6 +119,31 @@ def test_a_robot_whom_nobody_hears_says_so() -> None:
     process = start("-m", "stmpl_ros.cli", "robot", "--patience", "0.5", "--ros-args", "-r", "__ns:=/alone")
     code, said = end(process)
     assert code == 1 and "no skin/topology within 0.5 s" in said
+
+
+def test_ctrl_c_ends_a_robot_that_waits_or_gets_ready() -> None:
+    import rclpy
+
+    stop, before = threading.Event(), signal.getsignal(signal.SIGINT)
+
+    def endless(*_: Any) -> None:
+        signal.raise_signal(signal.SIGINT)
+        raise AssertionError("it went on")
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("stmpl_ros.robot.massage_of", endless)
+        with pytest.raises(Stopped):
+            made(RobotConfig(), None, stop)  # type: ignore[arg-type]
+    assert stop.is_set() and signal.getsignal(signal.SIGINT) is before
+    rclpy.init()
+    try:
+        node = RobotNode(RobotConfig(patience=100.0))
+        for wait in (node.wait_for_skin, node.wait_for_listeners):
+            with pytest.raises(Stopped):
+                wait(stop)
+        node.destroy_node()
+    finally:
+        rclpy.shutdown()
 
 
 def test_a_recorder_takes_what_a_robot_says() -> None:
