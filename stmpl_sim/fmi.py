@@ -110,6 +110,8 @@ class Unit:
         import trimesh
 
         file = self._values["tool"]
+        if file and not Path(file).is_file():
+            raise InvalidInput(f"there is no file '{file}' with the tool's surface.")
         mesh: Any = trimesh.load(file, force="mesh") if file else trimesh.creation.icosphere(4, self._values["radius"])
         tool = Tool("tool", mesh.vertices, mesh.faces)
         layer = limb(self._values["part"], self._values["tissue"])

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal, cast, get_args
 
 import tyro
 
@@ -113,15 +113,18 @@ def fmu(out: Path = Path("runs")) -> int:
 
 
 def limb(part: str, tissue: str, relaxing: bool = False) -> SoftLayer:
-    """A part of the average body. Raises InvalidInput: no such part."""
+    """A part of the average body. Raises InvalidInput: no such part or tissue."""
     from stmpl_core.body import Body
     from stmpl_core.living import held_skin, living
+    from stmpl_core.regions import Tone
     from stmpl_core.tissue import Tissue
 
+    if tissue not in (known := (*get_args(Tone), "single")):
+        raise InvalidInput(f"there is no tissue '{tissue}'. Available: {', '.join(known)}.")
     if tissue == "single":
         layer = Body.anny().part(part, tissue=Tissue(youngs_modulus=SINGLE_MODULUS))
     else:
-        layer = living(Body.anny(), part, "tensed" if tissue == "tensed" else "relaxed")
+        layer = living(Body.anny(), part, cast(Tone, tissue))
     return held_skin(layer) if relaxing else layer
 
 

@@ -77,5 +77,11 @@ def test_what_a_unit_cannot_be_told_is_one_sentence() -> None:
         unit.set("pose_world_from_body", [1.0, 2.0, 3.0])
     with pytest.raises(InvalidInput, match="not initialised"):
         unit.step(STEP)
+    unit.set("tissue", "tense")
+    with pytest.raises(InvalidInput, match=r"no tissue 'tense'. Available: relaxed, tensed, single"):
+        unit.start()
+    unit.set("tool", "nowhere.stl")
+    with pytest.raises(InvalidInput, match=r"no file 'nowhere.stl'"):
+        unit.start()
     unit.set("pose_world_from_tool", range(16))
     assert unit.get("pose_world_from_tool") == list(map(float, range(16)))
