@@ -225,7 +225,7 @@ class SkinNode(LifecycleNode):
         return f"at rest; {len(self.hearing.tools)} tools are known"
 
     def _on_set_body(self, request: SetBody.Request, response: SetBody.Response) -> SetBody.Response:
-        fields = ("part", "phenotype", "edge_length", "tissue", "thickness", "youngs_modulus", "poisson_ratio")
+        fields = request.get_fields_and_field_types()
         changes = {name: getattr(request, name) for name in fields if getattr(request, name)}
         return _served(response, lambda: self.set_body(**changes))
 

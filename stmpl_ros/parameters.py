@@ -20,7 +20,7 @@ FOREARM, PAPER_ARM = "left_forearm", "left_arm"  # parts that answer unless one 
 ACCURACY = 2e-4  # error at any vertex that is asked for [m]
 PHENOTYPE = ("gender", "age", "muscle", "weight", "height", "proportions")
 ANY_TIME: JsonDict = {"when": "any time"}  # fields that a running node takes over at once
-CONFIGURING: JsonDict = {"when": "configuring"}  # fields that count when the node is configured, or by ~/set_body
+CONFIGURING: JsonDict = {"when": "configuring"}  # fields that count when the node is configured
 
 
 class NodeConfig(BaseModel):

@@ -12,6 +12,7 @@ from rcl_interfaces.msg import FloatingPointRange, ParameterDescriptor, SetParam
 from rclpy.exceptions import InvalidParameterTypeException, InvalidParameterValueException
 from rclpy.lifecycle import LifecycleNode
 from rclpy.parameter import Parameter
+from stmpl_msgs.srv import SetBody
 
 from stmpl_core.errors import InvalidInput, sentence_of
 from stmpl_ros.parameters import ANY_TIME, CONFIGURING, NodeConfig
@@ -74,7 +75,9 @@ class Settings:
             return SetParametersResult(successful=False, reason=str(error))
         late = sorted(changes.keys() & NodeConfig.names(CONFIGURING))
         if late and self.locked:
-            reason = f"{', '.join(late)} count when the node is configured: call ~/set_body, or clean up first."
+            served = set(late) <= SetBody.Request.get_fields_and_field_types().keys()
+            how = "call ~/set_body, or clean up first" if served else "clean up first"
+            reason = f"{', '.join(late)} count when the node is configured: {how}."
             return SetParametersResult(successful=False, reason=reason)
         return SetParametersResult(successful=True)
 
