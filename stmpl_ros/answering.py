@@ -208,6 +208,8 @@ class Answering:
             self._closing.wait(max(0.0, started + 1 / rate - time.perf_counter()))
 
     def _find(self, asked: Asked, started: float) -> None:
+        if asked.epoch != self._epoch:
+            return  # over before it was begun; its tool may be gone
         instant, before = asked.instant, asked.reaction.before
         answer = self._attempted(instant, lambda: self._field_of(asked))
         if answer is None:

@@ -39,7 +39,7 @@ class Massaged:
         solved: times and forces of the reference, (K,) each, and the answers' forces at the same frames, (K,).
         real_time: simulated time over real time, from the first recorded pose to the last [-].
         poses: rate of the recorded poses by the recorder's clock [Hz].
-        film: film, its file; None: none could be made.
+        film: file of the film.
         frames_by: renderer of the film.
         colour_m: displacement of the film's last colour [m].
     """

@@ -221,6 +221,19 @@ def test_a_skin_that_takes_over_while_the_node_is_inactive_remembers_nothing_of_
     assert not node.answering.remembering.state.tools
 
 
+def test_a_field_whose_time_is_over_before_it_is_begun_is_not_begun(composed, held, monkeypatch):
+    answering, asked = composed.node.answering, []
+    composed.wait(lambda: composed.press() and not answering._field.idle)
+    begun = answering._instant
+    composed.wait(lambda: composed.press() and answering._instant is not begun)  # one more waits
+    composed.wait(lambda: composed.node.hearing.inbox.live(time.monotonic_ns()) == {})  # what was sent is heard
+    monkeypatch.setattr(answering._fields, "answer", asked.append)
+    composed.node.reset()
+    held.set()
+    composed.wait(lambda: answering._field.idle)
+    assert not asked and composed.node.tally.refused == 0
+
+
 def test_another_surface_of_a_tool_ends_the_field_on_the_one_from_before(composed, held):
     composed.wait(lambda: composed.press() and not composed.node.answering._field.idle)
     begun = composed.node.answering._instant.stamp
