@@ -53,7 +53,7 @@ def free_decay(series: Series, dt: float) -> np.ndarray:
     size = np.sqrt(np.maximum(series.shares, 1e-12) * series.times)
     rates = np.sqrt(np.maximum(series.shares, 1e-12) / series.times)
     values, vectors = np.linalg.eigh(np.outer(rates, rates) - np.diag(1 / series.times))
-    return (vectors * np.exp(values * dt)) @ vectors.T * np.outer(1 / size, size)
+    return (vectors * np.exp(np.minimum(values, 0.0) * dt)) @ vectors.T * np.outer(1 / size, size)
 
 
 def series_of(tissue: Tissue, thickness: float) -> Series:
