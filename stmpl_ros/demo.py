@@ -96,11 +96,13 @@ def play(config: DemoConfig, folder: Path, console: Console) -> None:
         "PYTHONUNBUFFERED": "1",
     }
     record = ["--path", str(folder), "--run", str(folder / "config.json")]
-    node_arguments, settled = config.node.ros_arguments(), config.node.rest_after + config.node.fade + 0.5
+    told, settled = config.node, config.node.rest_after + config.node.fade + 0.5
     flags = flags_of(config.probe)
-    if config.device == "robot":
-        flags = flags_of(config.robot.model_copy(update={"out": folder, "linger": settled}))
-        node_arguments += ["-p", "use_sim_time:=true"]
+    if config.device == "robot":  # both feel the same friction, whichever of them was told
+        friction = told.friction or config.robot.friction
+        flags = flags_of(config.robot.model_copy(update={"out": folder, "linger": settled, "friction": friction}))
+        told = told.model_copy(update={"friction": friction})
+    node_arguments = told.ros_arguments() + (["-p", "use_sim_time:=true"] if config.device == "robot" else [])
     with (
         _process("record", record, folder, environment) as recorder,
         _process("node", node_arguments, folder, environment) as node,

@@ -62,7 +62,7 @@ class Massaged:
     @property
     def apart(self) -> float:
         """Largest difference of the node's force from the simulation's, over the largest force [-]."""
-        top = float(self.felt.max())
+        top = float(self.felt.max(initial=0.0))
         return float(np.abs(self.answered[1] - self.felt).max()) / top if top > 0 else 0.0
 
     @property
@@ -117,7 +117,7 @@ def massaged(folder: Path, config: RobotConfig, comparison: Comparison) -> Massa
     for frame in run.frames():
         at = (frame.stamp_ns - start) * NANO
         if TOOL in frame.touches and frame.fade == 1:
-            answered.append((at, frame.touches[TOOL].force))
+            answered.append((at, float(np.linalg.norm(frame.touches[TOOL].wrench[:3]))))
         if due <= at <= log.time[-1]:
             _take(camera, scene, log, at, frame)
             due = max(due + 1 / FILM_RATE, at)
