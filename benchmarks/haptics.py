@@ -9,7 +9,7 @@ import argparse
 import json
 import os
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -235,16 +235,12 @@ def print_map(cells: dict[str, float]) -> None:
     print("stiffest passive coupling against a hard skin [N/m], levels a factor 1.2 apart\n"
           "force late by   controller" + "".join(f"{r:>9} Hz" for r in RATES))
     for delay in DELAYS:
-        for on in (False, True):
-            row = [cells.get(f"coupling {r} {delay:g} {on}", np.nan) for r in RATES]
-            print(f"{1e3 * delay:10.0f} ms {'on' if on else 'off':>10}  " + "".join(f"{c:12.0f}" for c in row))
+        _print_delay(cells, delay, [f"coupling {rate}" for rate in RATES])
         print(f"{'2 b / (T + 2 d)':>24}  " + "".join(f"{guide(r, delay):12.0f}" for r in RATES))
     print("\nthe same at 1 kHz, for a press and a stroke of 8 mm, by what the skin does\n"
           "force late by   controller" + "".join(f"{kind:>12}" for kind in KINDS))
     for delay in DELAYS:
-        for on in (False, True):
-            row = [cells.get(f"stroke {kind} {delay:g} {on}", np.nan) for kind in KINDS]
-            print(f"{1e3 * delay:10.0f} ms {'on' if on else 'off':>10}  " + "".join(f"{c:12.0f}" for c in row))
+        _print_delay(cells, delay, [f"stroke {kind}" for kind in KINDS])
     print("\nstiffest passive contact at 1 kHz, coupling 1 kN/m, 125 models/s [N/m], moduli a factor 2 apart\n"
           "models late by  controller  linear model  force only")
     for late in NODE_DELAYS:
@@ -252,6 +248,13 @@ def print_map(cells: dict[str, float]) -> None:
             row = [cells.get(f"contact {late:g} {on} {held}", np.nan) for held in (False, True)]
             print(f"{1e3 * late:10.0f} ms {'on' if on else 'off':>10}  {row[0]:13.0f} {row[1]:11.0f}")
     print()
+
+
+def _print_delay(cells: dict[str, float], delay: float, columns: Sequence[str]) -> None:
+    """Prints two rows of a map, without and with the controller, for forces that are late by a delay [s]."""
+    for on in (False, True):
+        row = [cells.get(f"{column} {delay:g} {on}", np.nan) for column in columns]
+        print(f"{1e3 * delay:10.0f} ms {'on' if on else 'off':>10}  " + "".join(f"{c:12.0f}" for c in row))
 
 
 def draw(cells: dict[str, float], path: Path) -> None:

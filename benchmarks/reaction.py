@@ -29,12 +29,12 @@ from rclpy.signals import SignalHandlerOptions
 from stmpl_msgs.msg import ContactMesh, SkinDisplacement, SkinTopology
 
 from bags.wire import NANO, layer_from, pose_message, tool_message, wrench_message
+from benchmarks.node import wait
 from stmpl_core.provenance import machine
 from stmpl_ros.scripts import Motion, scripts_for
 from stmpl_ros.spinning import spin
 from stmpl_ros.topics import KEPT, NEWEST, STREAM
 
-PATIENCE = 300.0  # time that a node gets to start [s]
 SCENES = {"paper": ["--tissue", "paper"], "forearm": [], "dry": ["--friction", "dry", "--relaxing"]}
 HERE = Path(__file__).resolve().parents[1]
 
@@ -122,15 +122,6 @@ class Robot(Node):
         pairs = [*np.percentile(late, [50, 99]), *np.percentile(period, [50, 99])]
         return Figures(sent, len(late) / seconds, *map(float, pairs), len(later) / seconds,
                        *map(float, np.percentile(later, [50, 99])))  # fmt: skip
-
-
-def wait(done, what: str) -> None:
-    """Until `done()`."""
-    until = time.monotonic() + PATIENCE
-    while not done():
-        if time.monotonic() > until:
-            raise SystemExit(f"waited {PATIENCE:g} s for {what}")
-        time.sleep(0.05)
 
 
 def node_of(tree: Path, space: str, flags: list[str]) -> subprocess.Popen:
