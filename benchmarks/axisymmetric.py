@@ -18,15 +18,15 @@ from typing import Any
 
 import numpy as np
 import skfem
-from scipy.sparse import coo_matrix
 from scipy.sparse.linalg import spsolve
 
+from fem_tools.axisymmetric import Points, membrane, tangent_of
+from fem_tools.tool_contact import Friction
 from stmpl_core.tissue import Membrane, Ply, Tissue
 
 WIDE = 4.0  # radius of the plate, whose rim is held [thicknesses]
 PENALTY = 400.0  # stiffness of the contact [E over the ball's radius]
 SOFT = 1e-3  # depth in the ball over its radius by which that stiffness is reached, from 0
-STEP = 1e-6  # of the central differences of stresses
 TOLERANCE = 1e-7  # residual over the largest force of the step before
 UPDATES = 4  # updates of the contact's multipliers at each depth that is asked for
 LONGEST = 0.025  # longest step of the ball [thicknesses]
@@ -73,69 +73,6 @@ def neo_hookean(modulus: float, nu: float, film: float = 0.0) -> Energy:
     return stress
 
 
-def membrane(skin: Membrane) -> Energy:
-    """Forces a length of a sheet whose thickness follows from no stress across it, and of its tension [N/m]."""
-    mu = skin.youngs_modulus / (2 * (1 + skin.poisson_ratio))
-    lam = 2 * mu * skin.poisson_ratio / (1 - 2 * skin.poisson_ratio)
-
-    def stress(f: np.ndarray) -> np.ndarray:
-        rr, _, zr, _, tt = f
-        along = np.sqrt(rr * rr + zr * zr)
-        across = np.ones_like(along)
-        for _ in range(60):  # mu (l - 1 / l) + lam ln(J) / l = 0, by Newton on l
-            wrong = mu * (across**2 - 1) + lam * np.log(along * tt * across)
-            across = np.maximum(across - wrong / (2 * mu * across + lam / across), 0.2 * across)
-        log = np.log(along * tt * across)
-        pull = skin.thickness * (mu * (along - 1 / along) + lam * log / along) + skin.tension * tt
-        hoop = skin.thickness * (mu * (tt - 1 / tt) + lam * log / tt) + skin.tension * along
-        zero = np.zeros_like(hoop)
-        return np.array([pull * rr / along, zero, pull * zr / along, zero, hoop])
-
-    return stress
-
-
-def _tangent(stress: Energy, f: np.ndarray) -> np.ndarray:
-    """Derivative of the stresses, (5, 5, ...), by central differences."""
-    out = np.empty((5, *f.shape))
-    for j in range(5):
-        ahead, behind = f.copy(), f.copy()
-        ahead[j] += STEP
-        behind[j] -= STEP
-        out[:, j] = (stress(ahead) - stress(behind)) / (2 * STEP)
-    return out
-
-
-class Points:
-    """Quadrature points of a basis: what a motion does there, and forces and stiffness from there.
-
-    Args:
-        basis: vector basis in the (r, z) plane, of elements or of faces.
-    """
-
-    def __init__(self, basis: Any) -> None:
-        self.basis, self.place = basis, basis.global_coordinates()
-        fields, r = [each[0] for each in basis.basis], self.place[0]
-        self.value = np.array([np.asarray(field) for field in fields]).transpose(1, 0, 2, 3)  # (2, n, elements, points)
-        self.strain = np.array([[*field.grad[0], *field.grad[1], np.asarray(field)[0] / r] for field in fields]
-                               ).transpose(1, 0, 2, 3)  # rr, rz, zr, zz, tt  # fmt: skip
-        self.weight, self.dofs = 2 * np.pi * r * basis.dx, basis.element_dofs
-
-    def at(self, u: np.ndarray, shapes: np.ndarray) -> np.ndarray:
-        """Values of a motion, by shapes (c, n, elements, points), at the points, (c, elements, points)."""
-        return np.einsum("cnep,ne->cep", shapes, u[self.dofs])
-
-    def assembled(self, shapes: np.ndarray, first: np.ndarray, second: np.ndarray) -> tuple[np.ndarray, Any]:
-        """Forces and stiffness, from derivatives of an energy by shapes, (c, ...) and (c, c, ...)."""
-        forces = np.einsum("cnep,cep,ep->ne", shapes, first, self.weight)
-        half = np.einsum("cdep,dmep->cmep", second * self.weight, shapes)
-        blocks = np.einsum("cnep,cmep->nme", shapes, half)
-        size, count = self.basis.N, len(self.dofs)
-        out = np.bincount(self.dofs.ravel(), forces.ravel(), size)
-        rows, columns = (np.broadcast_to(self.dofs[index], (count, *self.dofs.shape)) for index in
-                         (np.index_exp[:, None], np.index_exp[None, :]))  # fmt: skip
-        return out, coo_matrix((blocks.ravel(), (rows.ravel(), columns.ravel())), shape=(size, size)).tocsr()
-
-
 def forces(plate: Plate, radius: float, depths: Sequence[float]) -> list[float]:
     """Force on a ball without friction at depths that increase [N].
 
@@ -168,11 +105,11 @@ def forces(plate: Plate, radius: float, depths: Sequence[float]) -> list[float]:
             raise FloatingPointError
         stress, tangent = np.empty_like(f), np.empty((5, *f.shape))
         for law, own in laws:
-            stress[:, own], tangent[:, :, own] = law(f[:, own]), _tangent(law, f[:, own])
+            stress[:, own], tangent[:, :, own] = law(f[:, own]), tangent_of(law, f[:, own])
         residual, stiffness = inside.assembled(inside.strain, stress, tangent)
         if pull:
             g = rest + skin.at(u, skin.strain)
-            more = skin.assembled(skin.strain, pull(g), _tangent(pull, g))
+            more = skin.assembled(skin.strain, pull(g), tangent_of(pull, g))
             residual, stiffness = residual + more[0], stiffness + more[1]
         way = skin.place + skin.at(u, skin.value) - np.array([0.0, centre])[:, None, None]
         away = np.hypot(*way)
@@ -262,7 +199,8 @@ def _mesh(plate: Plate, radius: float, depth: float) -> tuple[skfem.MeshQuad, np
     return mesh, kind[np.searchsorted(down, middle) - 1]
 
 
-def ground_truth(plate: Plate, radius: float, depths: Sequence[float], edge: float, refine: int = 2) -> list[float]:
+def ground_truth(plate: Plate, radius: float, depths: Sequence[float], edge: float, refine: int = 2, *,
+                 friction: Friction = "none") -> list[float]:  # fmt: skip
     """Force on the same ball by IndenterFem [N], on a plate of edges `edge` [m], refined near the ball."""
     import trimesh
 
@@ -277,7 +215,7 @@ def ground_truth(plate: Plate, radius: float, depths: Sequence[float], edge: flo
     field = SignedDistance.of(Tool("ball", np.asarray(ball.vertices), np.asarray(ball.faces)), margin=2 * radius)
     press = Press(field, pose, np.array([0.0, 0.0, -1.0]))
     patch = PatchFem(reach=WIDE, refine=refine, layers=1, check_stability=False)
-    fem = IndenterFem(patch, friction="none", step=0.1).prepare(layer)
+    fem = IndenterFem(patch, friction=friction, step=0.1).prepare(layer)
     return [answer.force for answer in fem.path([press], depths)]
 
 

@@ -17,8 +17,10 @@ from typing import Literal
 import numpy as np
 
 from fem_tools.mesh import WedgeMesh
+from fem_tools.plies import confined_modulus
 from fem_tools.press import Press
 from stmpl_core.arrays import Points
+from stmpl_core.tissue import Tissue
 
 NORMAL_PENALTY = 100.0  # penalty of entering [confined moduli over the thickness]
 STICK_PENALTY = 100.0  # that of sliding: what sticking points still creep costs 0.3 % of the force (at 10: 2 %, a snap)
@@ -30,9 +32,15 @@ SETTLED = 0.01  # change of the friction's limit from one update to the next tha
 Friction = Literal["stick", "none"] | float
 
 
-def penalties(friction: Friction, modulus: float) -> tuple[float, float]:
-    """Normal and tangential penalty [Pa/m]; `modulus`: confined modulus over the thickness [Pa/m]."""
-    tangential = {"stick": STICK_PENALTY, "none": 0.0}.get(str(friction), FRICTION_PENALTY) * modulus
+def penalties(friction: Friction, tissue: Tissue, thickness: float) -> tuple[float, float]:
+    """Normal and tangential penalty of contact on a layer this thick [m], [Pa/m].
+
+    Skin holds against sliding with E_s h, which may be many times what E t of the tissue holds: the tangential penalty
+    grows with it, or springs would give way where the skin should slide or stick.
+    """
+    modulus = confined_modulus(tissue, thickness) / thickness
+    kappa = tissue.skin.stiffness / (tissue.youngs_modulus * thickness) if tissue.skin else 0.0
+    tangential = {"stick": STICK_PENALTY, "none": 0.0}.get(str(friction), FRICTION_PENALTY) * modulus * (1 + kappa)
     return NORMAL_PENALTY * modulus, tangential
 
 

@@ -12,7 +12,6 @@ from fem_tools.estimates import discretisation_error, truncation_error
 from fem_tools.mesh import WedgeMesh
 from fem_tools.newton import NewtonResult, is_positive_definite, newton, work_spent
 from fem_tools.patch import Patch
-from fem_tools.plies import confined_modulus
 from fem_tools.press import Press
 from fem_tools.relaxation import Body, Memories
 from fem_tools.stroke import Stroke
@@ -120,7 +119,7 @@ class Walk:
         self.mesh: WedgeMesh = self.patch.mesh
         self.system: System = self.fem.system(self.patch, Load.zero(layer))
         self.area = column_areas(self.mesh)
-        self.stiffness = penalties(solver.friction, confined_modulus(layer.tissue, self.thickness) / self.thickness)
+        self.stiffness = penalties(solver.friction, layer.tissue, self.thickness)
         n, count = self.mesh.n_columns, len(self.way.tools(0.0))
         u = self.system.zeros()
         self.state = _State(u, None, 0.0, 0.0, [np.zeros(n)] * count, [np.full((n, 3), np.nan)] * count,
