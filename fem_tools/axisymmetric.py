@@ -79,6 +79,7 @@ class Profile(NamedTuple):
                 for middle, start, end in ends for a in [np.linspace(start, end, points)]]  # fmt: skip
         top = self.lowest + height
         below = np.vstack([*arcs, [[self.width, top], [max(self.inner[0] - self.rounding, 0.0), top]]])
+        below[below[:, 0] < 1e-9, 0] = 0.0  # on the axis, where the curve need not be closed
         below = below[np.concatenate([[True], np.hypot(*np.diff(below, axis=0).T) > 1e-9])]
         return np.vstack([below, below[:1]])
 

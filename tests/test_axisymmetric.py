@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import trimesh
 
 from benchmarks.axisymmetric import PLATE, RADIUS, Plate, forces, ground_truth, neo_hookean
 from fem_tools.axisymmetric import Flat, Profile, membrane
@@ -84,6 +85,7 @@ def test_tools_of_revolution_press_harder_the_deeper_they_are(tool):
     outline = tool.outline(20e-3)
     assert outline[:, 1].min() == pytest.approx(tool.lowest) and outline[:, 0].max() == pytest.approx(tool.width)
     np.testing.assert_allclose(tool.nearest(outline[:-3].T)[0], 0, atol=1e-12)
+    assert trimesh.creation.revolve(1e3 * outline).is_watertight  # in metres it drops triangles
 
 
 def test_a_spring_that_sticks_does_not_give_way_under_stiff_skin(monkeypatch):
