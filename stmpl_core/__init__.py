@@ -9,6 +9,7 @@ if TYPE_CHECKING:
     from stmpl_core.contact import Contact
     from stmpl_core.layer import SoftLayer
     from stmpl_core.load import Load
+    from stmpl_core.rig import Joint, Rig
     from stmpl_core.simulator import Simulator
     from stmpl_core.skin import Skin
     from stmpl_core.state import State
@@ -18,11 +19,12 @@ if TYPE_CHECKING:
     from stmpl_core.touch import Answer, Touch
     from stmpl_core.trust import Displacement, Trust
 
-__all__ = ["Answer", "Contact", "Displacement", "Load", "Membrane", "Ply", "Prony", "Simulator", "Skin", "SoftLayer",
-           "State", "Tissue", "Tool", "Tools", "Touch", "Trust"]  # fmt: skip
+__all__ = ["Answer", "Contact", "Displacement", "Joint", "Load", "Membrane", "Ply", "Prony", "Rig", "Simulator", "Skin",
+           "SoftLayer", "State", "Tissue", "Tool", "Tools", "Touch", "Trust"]  # fmt: skip
 
-_HOME = {"Answer": "touch", "Contact": "contact", "Displacement": "trust", "Load": "load", "Membrane": "tissue",
-         "Ply": "tissue", "Prony": "tissue", "Simulator": "simulator", "Skin": "skin", "SoftLayer": "layer",
+_HOME = {"Answer": "touch", "Contact": "contact", "Displacement": "trust", "Joint": "rig", "Load": "load",
+         "Membrane": "tissue", "Ply": "tissue", "Prony": "tissue", "Rig": "rig", "Simulator": "simulator",
+         "Skin": "skin", "SoftLayer": "layer",
          "State": "state", "Tissue": "tissue", "Tool": "tool", "Tools": "tools",
          "Touch": "touch", "Trust": "trust"}  # fmt: skip
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from copy import copy
 from functools import cached_property
 from typing import Any, NamedTuple
 
@@ -67,6 +68,15 @@ class Columns:
         self._around = np.argsort(corners, kind="stable") // 3  # faces around each vertex
         self._start = np.searchsorted(np.sort(corners), np.arange(len(self.points) + 1))
         self._slot = np.full(len(self.points), -1)
+        self._tree = True  # a tree of boxes pays for itself only where the skin stays
+
+    def moved(self, layer: SoftLayer) -> Columns:
+        """The same columns where joints take the skin."""
+        out = copy(self)
+        out.__dict__.pop("_skin", None)
+        out.layer, out.points, out.inward = layer, layer.vertices, np.ascontiguousarray(-layer.normals)
+        out._tree = False
+        return out
 
     @cached_property
     def _skin(self) -> Any:
@@ -91,7 +101,7 @@ class Columns:
         """
         low, high = field.tool_bounds
         centre = middle_of(field, pose)
-        if many:
+        if many and self._tree:
             import fcl
 
             box = fcl.CollisionObject(fcl.Box(*(high - low + 2 * reach)), fcl.Transform(pose[:3, :3], centre))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from copy import copy
 from typing import NamedTuple
 
 import numba
@@ -97,6 +98,12 @@ class ContactNet:
             self._green = Green.of(layer)
             one = self._green.effective
             self.network, self.unit = "stack_contact_net", one.youngs_modulus
+
+    def moved(self, near: Surroundings, green: Green | None) -> ContactNet:
+        """The same law where joints take the skin."""
+        out = copy(self)
+        out.near, out._green = near, green
+        return out
 
     @property
     def weights(self) -> Weights:

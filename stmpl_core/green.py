@@ -41,7 +41,9 @@ LEAST_KAPPA, LEAST_PULL = 0.05, 0.02  # kappa and pull that are none, in logarit
 ONE_WAY = 0.3  # least cosine between a tool's way and the skin's inward normal at a node
 
 
-NO_COARSE = (np.empty((0, 3), np.int64), np.empty((0, 3)), np.empty(0), np.empty((0, 3, 0), np.float32))
+AS_AT_REST = np.empty((0, 3, 3))  # turns of coarse vertices that did not turn
+NO_COARSE = (np.empty((0, 3), np.int64), np.empty((0, 3)), np.empty(0), np.empty((0, 3, 0), np.float32),
+             AS_AT_REST)
 _KEPT: WeakKeyDictionary[SoftLayer, Green] = WeakKeyDictionary()  # entries die with their layers
 
 
@@ -63,6 +65,7 @@ class Green:
         self.thickness = float(np.median(layer.thickness))
         self.near = Surroundings.of(layer)
         self.tables = tables(layer.tissue, self.thickness) if layer.stacked else _of_one(layer.tissue.poisson_ratio)
+        self._turns = AS_AT_REST
         self._last: tuple[np.ndarray, np.ndarray] | None = None
 
     @classmethod
@@ -80,10 +83,24 @@ class Green:
         """Lets `of` give this one for another layer, of the same shape and the same ratios of moduli."""
         _KEPT[layer] = self
 
+    def moved(self, layer: SoftLayer, near: Surroundings, turns: np.ndarray) -> Green:
+        """The same response where joints take the skin; the wide part's motion turns with the skin that it moves.
+
+        Args:
+            layer: layer there.
+            near: its neighbours.
+            turns: rotation of each vertex from rest, (V, 3, 3).
+        """
+        out = copy(self)
+        out.layer, out.near, out._last = copy(layer), near, None
+        if self.coarse is not None:
+            out._turns = _turns_of_coarse(self.coarse.corners, self.coarse.shares, turns, len(self.coarse.gathered))
+        return out
+
     @property
     def _coarse(self) -> tuple[np.ndarray, ...]:
         """What kernels take of the coarse part; all empty if there is none."""
-        return self.coarse[:4] if self.coarse is not None else NO_COARSE
+        return (*self.coarse[:4], self._turns) if self.coarse is not None else NO_COARSE
 
     @cached_property
     def _by_source(self) -> np.ndarray:
@@ -164,6 +181,8 @@ class Green:
         loaded = np.flatnonzero(source)
         if len(loaded):
             motion = (source[loaded].astype(np.float32) @ self._by_source[loaded]).reshape(-1, 3).astype(float)
+            if len(self._turns):
+                motion = np.einsum("cxy,cy->cx", self._turns, motion)
             _add_between(self.coarse.corners, self.coarse.shares, motion, out)
         return out
 
@@ -270,7 +289,7 @@ def _corners_of(corners, shares, skin_corners, skin_shares):
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _wide(index, weight, some, gathered, motion, out):
+def _wide(index, weight, some, gathered, motion, turns, out):
     """Adds the coarse motion of each node under a force E inwards at each, (N, 3, N) [1/m]."""
     if not len(gathered):
         return
@@ -282,6 +301,12 @@ def _wide(index, weight, some, gathered, motion, out):
         row[:] = 0.0
         for a in range(9):
             for x in range(3):
+                if len(turns):
+                    for y in range(3):
+                        by = weight[n, a] * turns[index[n, a], x, y]
+                        for d in range(len(some)):
+                            row[x, d] += by * motion[index[n, a], y, some[d]]
+                    continue
                 for d in range(len(some)):
                     row[x, d] += weight[n, a] * motion[index[n, a], x, some[d]]
         for j in range(count):
@@ -293,12 +318,12 @@ def _wide(index, weight, some, gathered, motion, out):
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _matrix(points, inward, area, corners, shares, group, unit, table, skin_corners, skin_shares, gathered,
-            motion):  # fmt: skip
+            motion, turns):  # fmt: skip
     """See Green.matrix."""
     count = len(points)
     index, weight, some = _corners_of(corners, shares, skin_corners, skin_shares)
     wide, out = np.zeros((count, 3, count)), np.zeros((count, count))
-    _wide(index, weight, some, gathered, motion, wide)
+    _wide(index, weight, some, gathered, motion, turns, wide)
     for i in range(count):
         for j in range(i + 1):
             if group[i] != group[j]:
@@ -343,12 +368,12 @@ def _of_force(points, inward, i, sources, source_inward, j, size, g0, g1, even, 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _blocks(points, inward, area, corners, shares, group, unit, tables, skin_corners, skin_shares, gathered,
-            motion):  # fmt: skip
+            motion, turns):  # fmt: skip
     """Motion of each node under a force E at each, (3 N, 3 N) [1/m]; the coarse part only under what goes inwards."""
     count = len(points)
     index, weight, some = _corners_of(corners, shares, skin_corners, skin_shares)
     wide, out = np.zeros((count, 3, count)), np.zeros((count, 3, count, 3))
-    _wide(index, weight, some, gathered, motion, wide)
+    _wide(index, weight, some, gathered, motion, turns, wide)
     force, moved = np.zeros(3), np.empty(3)
     for i in range(count):
         for j in range(count):
@@ -445,6 +470,23 @@ def _handed(inward, corners, shares, forces, skin_corners, skin_shares, gathered
         down = inward[n, 0] * forces[n, 0] + inward[n, 1] * forces[n, 1] + inward[n, 2] * forces[n, 2]
         for a in range(9):
             out[index[n, a]] += weight[n, a] * down / gathered[index[n, a]]
+    return out
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _turns_of_coarse(corners, shares, turns, count):
+    """Rotation of each coarse vertex, (C, 3, 3): the mean of those of the skin around it, made a rotation."""
+    out = np.zeros((count, 3, 3))
+    for v in range(len(corners)):
+        for a in range(3):
+            for x in range(3):
+                for y in range(3):
+                    out[corners[v, a], x, y] += shares[v, a] * turns[v, x, y]
+    for c in range(count):
+        if not out[c].any():
+            out[c] = np.eye(3)
+        u, _, w = np.linalg.svd(out[c])
+        out[c] = u @ w
     return out
 
 

@@ -8,6 +8,7 @@ the tool's way (`stmpl_core.slip`), and a contact that would give more energy th
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from copy import copy
 from dataclasses import replace
 from functools import cached_property
 from typing import NamedTuple
@@ -97,6 +98,12 @@ class History:
     def sideways(self) -> Sideways:
         """Stiffness of the layer to what sticks to it."""
         return Sideways(self.toucher.layer)
+
+    def moved(self, toucher: Toucher) -> History:
+        """The same history where joints take the skin."""
+        out = copy(self)
+        out.toucher = toucher
+        return out
 
     def friction(self, name: str) -> float:
         """Coefficient of friction of a tool [-]."""

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import hashlib
+from copy import copy
 from dataclasses import replace
 from functools import cached_property
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -13,6 +14,9 @@ from numpy.typing import ArrayLike
 from stmpl_core.arrays import Faces, PerVertex, Points, VertexVectors, finite
 from stmpl_core.errors import InvalidInput, MeshError
 from stmpl_core.tissue import Tissue
+
+if TYPE_CHECKING:
+    from stmpl_core.rig import Rig
 
 MAX_EXTENT = 4.0  # largest extent of a skin [m]; that of a mesh in millimetres is larger
 STEEPEST = 0.35  # cosine between the normal and a column to the core, below which the column's length counts
@@ -89,6 +93,28 @@ class SoftLayer:
         given |= below | changes
         given["tissue"] = replace(given["tissue"], **material)
         return SoftLayer(**given)
+
+    def moved(self, vertices: Points, core: Points | None, face_area_vectors: Points,
+              vertex_area_vectors: VertexVectors, vertex_areas: PerVertex,
+              normals: VertexVectors) -> SoftLayer:  # fmt: skip
+        """The same layer whose skin is elsewhere now, as joints take it: nothing is checked, nothing found again.
+
+        Faces, edges, their median length, border and tissue stay. So does the thickness, where no core says it.
+
+        Args:
+            vertices: positions of the skin, (V, 3) [m].
+            core: likewise of the core; None where there is none.
+            face_area_vectors, vertex_area_vectors, vertex_areas, normals: see the properties.
+        """
+        out = copy(self)
+        out.__dict__.pop("inner_vertices", None)
+        out.__dict__ |= {"edges": self.edges, "edge_length": self.edge_length, "border": self.border,
+                         "face_area_vectors": face_area_vectors, "vertex_area_vectors": vertex_area_vectors,
+                         "vertex_areas": vertex_areas, "normals": normals}  # fmt: skip
+        out.vertices, out.core, out.chart = vertices, core, None
+        if core is not None:
+            out.thickness = out._depth_of_core()
+        return out
 
     @property
     def stacked(self) -> bool:
@@ -185,8 +211,10 @@ def single(layer: SoftLayer, who: str, *, straight: bool = True) -> SoftLayer:
     return layer
 
 
-def layer_id(layer: SoftLayer) -> str:
+def layer_id(layer: SoftLayer, rig: Rig | None = None) -> str:
     """Sixteen hex digits that name a layer: SHA-256 of its vertices, faces, thickness and tissue, all as published.
+
+    One that hangs on a rig is named by its rest and the rig, wherever its joints are.
 
     Vertices and thickness count as float32, so a layer that went through SkinTopology keeps its name.
     """
@@ -204,6 +232,8 @@ def layer_id(layer: SoftLayer) -> str:
         digest.update(np.array(tissue.stacked, dtype="<f8").tobytes())
     if layer.ply_scale is not None:
         digest.update(np.ascontiguousarray(layer.ply_scale, dtype="<f4").tobytes())
+    if rig is not None:
+        digest.update(rig.digest.encode())
     return digest.hexdigest()[:16]
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from copy import copy
 from typing import NamedTuple
 from weakref import WeakKeyDictionary
 
@@ -23,8 +24,10 @@ from stmpl_core.response import (
     sink_between,
     spread_sinking,
 )
-from stmpl_core.soundness import Soundness
+from stmpl_core.soundness import Bend, Soundness
 from stmpl_core.thinning import SPACINGS, STACK_SPACINGS, STACK_ZONES, ZONES, Asked, Thinning
+
+WIDEST = 3.0  # distance over the thickness to which neighbours say how a place is curved
 
 
 class Felt(NamedTuple):
@@ -128,6 +131,47 @@ class Surroundings:
         asked.fill(np.einsum("nj,nji->ni", local, self.frames[asked.vertices]), out)
         return out
 
+    def standing(self, points: np.ndarray, among: np.ndarray, spacing: float) -> np.ndarray:
+        """Some of `among`, no two of which are nearer along the skin than `spacing` [m], (N,)."""
+        return self._thinning.standing(points, among, spacing)
+
+    def around(self, points: np.ndarray, vertices: np.ndarray, most: int) -> tuple[np.ndarray, np.ndarray]:
+        """Neighbours of some vertices (N,), from which their curvature is found even where a bend brings them nearer.
+
+        Args:
+            points: places of all vertices, (V, 3) [m].
+            vertices: numbers of the vertices.
+            most: number of neighbours of each; of more, these are spread evenly over them.
+
+        Returns:
+            start (N + 1,), index: those of vertex n are index[start[n] : start[n + 1]].
+        """
+        parts = []
+        for v, some in zip(vertices, self._thinning.around(vertices), strict=True):
+            wide = 1.2 * WIDEST * self.thickness[v]
+            some = some[((points[some] - points[v]) ** 2).sum(axis=1) < wide * wide]
+            parts.append(some[np.arange(min(most, len(some))) * len(some) // max(min(most, len(some)), 1)])
+        index = np.concatenate([*parts, np.empty(0, np.int32)])
+        return np.concatenate([[0], np.cumsum([len(some) for some in parts])]).astype(np.int64), index
+
+    def moved(self, layer: SoftLayer, frames: np.ndarray, curvature: np.ndarray, bend: Bend) -> Surroundings:
+        """The same skin where joints take it: it has the neighbours of its rest.
+
+        Args:
+            layer: layer there.
+            frames: tangent, tangent, normal of each vertex there, (V, 3, 3).
+            curvature: see Surroundings, there, (V, 3).
+            bend: what the joints did to it.
+        """
+        out = copy(self)
+        out.frames, out.curvature, out.sound = frames, curvature, self.sound.at(bend)
+        out._thinning = self._thinning.bent()
+        out._frames = frames.astype(np.float32)
+        out._sites = _sites(layer.vertices, layer.normals, self.thickness, layer.vertex_areas)
+        out.bent = np.empty((len(frames), 12))
+        _bent(frames, curvature, self.slope, out.bent)
+        return out
+
     @classmethod
     def of(cls, layer: SoftLayer) -> Surroundings:
         """The surroundings of a layer, made on the first call and kept as long as the layer is."""
@@ -208,6 +252,19 @@ def _frames(normals: np.ndarray) -> np.ndarray:
     return np.stack([first, np.cross(normals, first), normals], axis=1)
 
 
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _bent(frames, curvature, slope, out):
+    """Curvature and slope in the layer's axes, (V, 12); see Surroundings.bent."""
+    for v in range(len(frames)):
+        xx, xy, yy = curvature[v, 0], curvature[v, 1], curvature[v, 2]
+        for x in range(3):
+            a, b = frames[v, 0, x], frames[v, 1, x]
+            left, right = a * xx + b * xy, a * xy + b * yy
+            for y in range(3):
+                out[v, 3 * x + y] = left * frames[v, 0, y] + right * frames[v, 1, y]
+            out[v, 9 + x] = slope[v, 0] * a + slope[v, 1] * b
+
+
 @numba.njit(cache=True, nogil=True, parallel=True, error_model="numpy")
 def _shape(start, index, points, frames, thickness):
     """Least-squares curvature (from the normals) and slope of the thickness, over a Gaussian of one thickness."""
@@ -220,7 +277,7 @@ def _shape(start, index, points, frames, thickness):
             dx, dy, dz = ((points[j, 0] - points[i, 0]) / thickness[i], (points[j, 1] - points[i, 1]) / thickness[i],
                           (points[j, 2] - points[i, 2]) / thickness[i])  # fmt: skip
             r2 = dx * dx + dy * dy + dz * dz
-            if r2 > 9.0:
+            if r2 > WIDEST * WIDEST:
                 continue
             w = np.exp(-0.5 * r2)
             x = frames[i, 0, 0] * dx + frames[i, 0, 1] * dy + frames[i, 0, 2] * dz

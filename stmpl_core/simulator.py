@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import overload
+from typing import TYPE_CHECKING, overload
 
 import numpy as np
 
 from stmpl_core.bounds import motion_bound
+from stmpl_core.carrying import carried
 from stmpl_core.conform import Conformed, conform, kept_out
 from stmpl_core.contact import Contact
 from stmpl_core.dragged import dragged_motion
@@ -28,6 +29,9 @@ from stmpl_core.toucher import Toucher
 from stmpl_core.trust import Displacement, Trust
 from stmpl_core.wake import sunk
 
+if TYPE_CHECKING:
+    from stmpl_core.rig import Rig
+
 MOST_MOVED = 0.95  # motion over the thickness from which it is held back
 MAX_ENTERED_SHARE = 0.02  # depth of skin inside a tool over the thickness, which is not yet said
 
@@ -41,6 +45,7 @@ class Simulator:
         tools: tools with their distance fields; None: an empty store, to which contacts add theirs.
         friction: coefficient of friction, or the name of a pair in stmpl_core.friction, of all tools or by tool's name;
             it is felt where touches have a state. None: none.
+        rig: bones and joints that the layer hangs on, for `pose`; None, and with a Skin: that of the Skin, if any.
 
     Attributes:
         toucher: contact law on this layer.
@@ -52,15 +57,14 @@ class Simulator:
     """
 
     def __init__(self, layer: SoftLayer | Skin, method: Method | None = None, tools: Tools | None = None, *,
-                 friction: Friction | Mapping[str, Friction] = None) -> None:  # fmt: skip
+                 friction: Friction | Mapping[str, Friction] = None, rig: Rig | None = None) -> None:  # fmt: skip
         if isinstance(layer, Skin):
-            self.skin = layer
+            skin = layer
         elif method is None:
             raise InvalidInput("a simulator needs a method. Try Simulator(layer, MomentNet()).")
         else:
-            self.skin = Skin.of(layer, method)
-        self.layer, self.method = self.skin.layer, self.skin.method
-        self._green = self.skin.green
+            skin = Skin.of(layer, method, rig)
+        self._stand_on(skin.rest or skin)
         if self._green is not None:
             self._green.keep(self.layer)  # a Skin from another process has a layer of its own
         self.toucher = Toucher(self.layer, self.skin.near, tools)
@@ -68,6 +72,56 @@ class Simulator:
         self.remembers = friction is not None or self.layer.tissue.relaxes
         if friction is not None:  # what a slide needs is made now, not when the first one begins
             _ = self.history.sideways, Green.of(self.layer)
+        if skin.rest is not None:
+            self.move_to(skin)
+
+    def _stand_on(self, skin: Skin) -> None:
+        self.skin, self.layer, self.method, self._green = skin, skin.layer, skin.method, skin.green
+
+    @overload
+    def pose(self, joints: Mapping[str, float]) -> None: ...
+
+    @overload
+    def pose(self, joints: Mapping[str, float], state: State) -> State: ...
+
+    def pose(self, joints: Mapping[str, float], state: State | None = None) -> State | None:
+        """Takes the skin to where its joints are now, in milliseconds; what comes next is answered there.
+
+        Args:
+            joints: angle by the joint's name [rad]; those that are not given are at rest.
+            state: memory of the tissue where the joints were; what is returned has gone along with the skin.
+
+        Raises:
+            InvalidInput: a skin without joints, an unknown one, or an angle that is not finite or beyond its limits.
+        """
+        return self.move_to(self.skin.posed(joints), state)
+
+    @overload
+    def move_to(self, skin: Skin) -> None: ...
+
+    @overload
+    def move_to(self, skin: Skin, state: State) -> State: ...
+
+    @overload
+    def move_to(self, skin: Skin, state: State | None) -> State | None: ...
+
+    def move_to(self, skin: Skin, state: State | None = None) -> State | None:
+        """As `pose`, to this skin as it is posed elsewhere; another simulator of it may be there already.
+
+        Raises:
+            InvalidInput: another skin.
+        """
+        before = self.skin
+        if (skin.rest or skin) is not (before.rest or before):
+            raise InvalidInput("this is another skin, not this one where its joints took it. Try Simulator(skin).")
+        if skin is before:
+            return state
+        self._stand_on(skin)
+        tools = self.tools
+        self.toucher = self.toucher.moved(skin)
+        self.toucher.tools = tools
+        self.history = self.history.moved(self.toucher)
+        return None if state is None else carried(state, before, skin)
 
     @property
     def tools(self) -> Tools:
@@ -103,7 +157,7 @@ class Simulator:
         return self.toucher.touch_all(contacts) if state is None else self.history.step(contacts, state, dt)
 
     def answer(self, touches: Sequence[Touch]) -> Answer:
-        """Finds the displacement of the skin under touches of this simulator."""
+        """Finds the displacement of the skin under touches of this simulator, made where its joints are now."""
         # Sum: pressures of several tools add.
         zero = np.zeros(len(self.layer.vertices))
         pressure = sum((touch.pressure for touch in touches if touch.pressure is not None), zero)

@@ -2,15 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 
+from stmpl_core.errors import InvalidInput
 from stmpl_core.green import Green
 from stmpl_core.layer import SoftLayer, layer_id
 from stmpl_core.methods.base import Method
 from stmpl_core.moments import Surroundings
+
+if TYPE_CHECKING:
+    from stmpl_core.posing import Posing
+    from stmpl_core.rig import Rig
 
 
 @dataclass(frozen=True, eq=False)
@@ -22,34 +29,78 @@ class Skin:
         method: method, prepared for it.
         near: neighbours of its vertices, which method and contact share.
         green: linear response of a stack, likewise; None: one material straight below the skin.
+        rig: bones and joints that it hangs on; None: it does not move.
+        angles: angle of each joint of the rig [rad]; empty: at rest.
+        rest: same skin at rest; None: this is it.
     """
 
     layer: SoftLayer
     method: Method
     near: Surroundings
     green: Green | None = None
+    rig: Rig | None = None
+    angles: tuple[float, ...] = ()
+    rest: Skin | None = None
 
     @classmethod
-    def of(cls, layer: SoftLayer, method: Method) -> Skin:
+    def of(cls, layer: SoftLayer, method: Method, rig: Rig | None = None) -> Skin:
         """Prepares a layer (seconds). Raises InvalidInput or MeshError."""
         ready = method.prepare(layer)
-        return cls(layer, ready, Surroundings.of(layer), Green.of(layer) if layer.stacked else None)
+        return cls(layer, ready, Surroundings.of(layer), Green.of(layer) if layer.stacked else None, rig)
+
+    def posed(self, joints: Mapping[str, float]) -> Skin:
+        """The same skin where joints take it, in milliseconds; this one stays as it is.
+
+        Args:
+            joints: angle by the joint's name [rad]; those that are not given are at rest.
+
+        Raises:
+            InvalidInput: a skin without a rig, or what Rig.angles refuses.
+        """
+        if self.rig is None:
+            raise InvalidInput("this skin has no joints. Try Skin.of(layer, method, Rig.of(body, part, layer)).")
+        return self.at_angles(self.rig.angles(joints))
+
+    def at_angles(self, angles: Sequence[float]) -> Skin:
+        """As `posed`, by the angles of all joints in the rig's order [rad]; none: at rest."""
+        rest = self.rest or self
+        if not any(angles):
+            return rest
+        return rest.posing.skin(angles)
+
+    def turn_at(self, vertex: int) -> np.ndarray:
+        """Rotation of the skin at a vertex from its rest, (3, 3)."""
+        return np.eye(3) if self.rest is None else self.rest.posing.turn_at(vertex, self.angles)
+
+    @cached_property
+    def posing(self) -> Posing:
+        """What this skin at rest needs to be posed, found on the first call (a fifth of a second)."""
+        from stmpl_core.posing import Posing
+
+        assert self.rig is not None
+        return Posing(self, self.rig)
+
+    def at(self, layer: SoftLayer, method: Method, near: Surroundings, green: Green | None,
+           angles: tuple[float, ...]) -> Skin:  # fmt: skip
+        """This skin at rest as it is at some angles of its joints."""
+        return Skin(layer, method, near, green, self.rig, angles, self)
 
     def stiffened(self, method: Method, *, youngs_modulus: float, density: float) -> Skin:
-        """The same skin of another stiffness [Pa] and density [kg/m3], in a tenth of a second.
+        """The same skin, at rest, of another stiffness [Pa] and density [kg/m3], in a tenth of a second.
 
         Args:
             method: method, not yet prepared.
         """
-        tissue = replace(self.layer.tissue, youngs_modulus=youngs_modulus, density=density)
-        layer = self.layer.with_(tissue=tissue)
-        self.near.keep(layer)
-        return Skin(layer, method.prepare(layer), self.near)
+        rest = self.rest or self
+        tissue = replace(rest.layer.tissue, youngs_modulus=youngs_modulus, density=density)
+        layer = rest.layer.with_(tissue=tissue)
+        rest.near.keep(layer)
+        return Skin(layer, method.prepare(layer), rest.near, rig=self.rig)
 
     @cached_property
     def layer_id(self) -> str:
-        """Name of the layer in messages."""
-        return layer_id(self.layer)
+        """Name of the layer in messages: of its rest and its rig."""
+        return layer_id((self.rest or self).layer, self.rig)
 
 
 def published(layer: SoftLayer) -> SoftLayer:

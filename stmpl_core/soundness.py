@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from copy import copy
+from typing import NamedTuple, Self
+
 import numpy as np
 from scipy.spatial import KDTree
 
@@ -13,6 +16,46 @@ LONG = 2.2  # length of a triangle over its width; trained is up to about 2
 LONG_SHARE = 0.05  # share of what moves or presses that may be in such
 BORDER = 2.0  # distance of a load from the open border, over t; nearer the worst vertex is 6 to 21 % off
 BORDER_SHARE = 0.05  # share of the load that may be nearer
+FOLD = 0.15  # fold ratio of prisms under bent skin, below which they are none that the networks know
+STRETCH = (0.8, 1.25)  # stretch of bent skin over rest, outside of which thickness and mesh are not what they were
+HOLLOW = -0.25  # curvature times thickness of bent skin, below which it is more hollow than the networks know
+FACING = 1.5  # distance to skin that faces it, over t, below which a tool touches both
+BENT_SHARE = 0.05  # share of the load that may be on skin that a bend spoils
+
+
+class Bend(NamedTuple):
+    """What joints did to a skin, vertex by vertex; as at rest where a vertex goes with one bone alone.
+
+    Args:
+        fold: least fold ratio of the prisms around it (stmpl_core.extrusion), (V,) [-].
+        least, most: least and largest stretch of the triangles around it, (V,) [-].
+        curvature: least curvature of the skin times the thickness, (V,) [-]; below 0: concave.
+        gap: distance over the thickness to skin that faces it through the air and did not at rest, (V,) [-].
+    """
+
+    fold: np.ndarray
+    least: np.ndarray
+    most: np.ndarray
+    curvature: np.ndarray
+    gap: np.ndarray
+
+    def of_force(self, loaded: np.ndarray, force: np.ndarray) -> list[str]:
+        """What a bend spoils under forces (L,) on vertices (L,), as sentences."""
+        total, out = max(float(force.sum()), 1e-300), []
+        fold, least, most = self.fold[loaded], self.least[loaded], self.most[loaded]
+        curvature, gap = self.curvature[loaded], self.gap[loaded]
+        for bad, sentence in (
+            (fold < FOLD, f"its tissue folds (ratio {fold.min():.2g}, sound is from {FOLD:g} on)"),
+            ((least < STRETCH[0]) | (most > STRETCH[1]), f"its skin is {least.min():.2g} to {most.max():.2g} times as "
+             f"long as at rest, sound is {STRETCH[0]:g} to {STRETCH[1]:g}"),
+            (curvature < HOLLOW, f"its skin is hollow (curvature times thickness {curvature.min():.2g}, sound is from "
+             f"{HOLLOW:g} on)"),
+            (gap < FACING, f"its skin faces other skin, {gap.min():.2g} thicknesses away"),
+        ):  # fmt: skip
+            share = float(force[bad].sum()) / total
+            if share > BENT_SHARE:
+                out.append(f"the limb is bent so that under {share:.0%} of the force {sentence}")
+        return out
 
 
 class Soundness:
@@ -24,12 +67,21 @@ class Soundness:
     Attributes:
         steep, long: masks of vertices, (V,).
         border: distance from the open border, over t, (V,).
+        bend: what joints did to it; None: it is at rest.
     """
+
+    bend: Bend | None = None
 
     def __init__(self, layer: SoftLayer) -> None:
         self.steep = slope_of_thickness(layer) > STEEP
         self.long = longest_over_width(layer) > LONG
         self.border = border_distance(layer) / layer.thickness
+
+    def at(self, bend: Bend) -> Self:
+        """The same of a skin that joints have bent."""
+        out = copy(self)
+        out.bend = bend
+        return out
 
     def of_mesh(self, steep: float, long: float, where: str) -> list[str]:
         """What is wrong with shares of steep and long triangles, as sentences."""
@@ -43,10 +95,12 @@ class Soundness:
     def of_load(self, loaded: np.ndarray, force: np.ndarray) -> list[str]:
         """What is wrong with where forces (L,) on vertices (L,) press, as sentences."""
         total = float(force.sum())
+        bent = self.bend.of_force(loaded, force) if self.bend is not None and total > 0 else []
         if not total > 0 or float(force[self.border[loaded] < BORDER].sum()) <= BORDER_SHARE * total:
-            return []
+            return bent
         nearest = float(self.border[loaded].min())
-        return [f"the load comes to {nearest:.1f} thicknesses from the open border; trained is from {BORDER:g} on"]
+        far = f"the load comes to {nearest:.1f} thicknesses from the open border; trained is from {BORDER:g} on"
+        return [far, *bent]
 
     def of_contact(self, loaded: np.ndarray, force: np.ndarray) -> list[str]:
         """What is wrong with the skin under a tool that presses with forces (L,) on vertices (L,), as sentences."""

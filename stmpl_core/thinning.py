@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from copy import copy
 from typing import NamedTuple
 
 import numba
@@ -74,7 +75,7 @@ class Thinning:
             stands = _thinned(self.start, self.index, self._stands[zone - 1], points, thickness, spacing)
             corners = _nearest(self.start, self.index, stands, points)
             some = np.flatnonzero(~stands & (corners[:, -1] >= 0))
-            weights = _interpolation(points, frames, thickness, some, corners[some])
+            weights = interpolation(points, frames, thickness, some, corners[some])
             good = np.abs(weights).sum(axis=1) < LARGEST
             some = some[good]
             self._stands[zone] = True
@@ -93,6 +94,23 @@ class Thinning:
             some, place = np.unique(vertices, return_inverse=True)  # nodes of a contact share vertices
             last = self._grouped = vertices, _together(self.start, self.index, some, len(self._stands[0]))[place]
         return last[1]
+
+    def bent(self) -> Thinning:
+        """The same neighbours, of a skin that joints have bent: it may come near itself through the air."""
+        out = copy(self)
+        out.folded, out._grouped = True, None
+        return out
+
+    def standing(self, points: np.ndarray, among: np.ndarray, spacing: float) -> np.ndarray:
+        """Some of vertices `among`, no two of which are nearer along the skin than `spacing` [m], (N,)."""
+        mask = np.zeros(len(points), np.bool_)
+        mask[among] = True
+        return np.flatnonzero(_thinned(self.start, self.index, mask, points, np.full(len(points), spacing), 1.0))
+
+    def around(self, vertices: np.ndarray) -> list[np.ndarray]:
+        """Neighbours of some vertices."""
+        zones = (len(self.start) - 1) // len(self._stands[0])
+        return [self.index[self.start[zones * v] : self.start[zones * (v + 1)]] for v in vertices]
 
     def reached(self, loaded: np.ndarray) -> np.ndarray:
         """All vertices with a loaded one in reach, in order."""
@@ -279,7 +297,7 @@ def _nearest(start, index, stands, points):
     return out
 
 
-def _interpolation(points: np.ndarray, frames: np.ndarray, thickness: np.ndarray, some: np.ndarray,
+def interpolation(points: np.ndarray, frames: np.ndarray, thickness: np.ndarray, some: np.ndarray,
                    corners: np.ndarray) -> np.ndarray:  # fmt: skip
     """Weights of the corners (M, CORNERS) for vertices `some` (M,), in their tangent planes.
 

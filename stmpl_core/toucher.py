@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from copy import copy
 from dataclasses import replace
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numba
 import numpy as np
@@ -34,6 +35,9 @@ from stmpl_core.touch import (
     Touch,
 )
 from stmpl_core.trust import Trust
+
+if TYPE_CHECKING:
+    from stmpl_core.skin import Skin
 
 MAX_TOOL_OFFSET_M = 3e-3  # distance that calibration may leave between a pressing tool and its stated place
 MAX_TOUCHING_GAP = 0.25  # largest gap of a tool that touches between vertices, over a hole's radius
@@ -109,6 +113,15 @@ class Toucher:
         self._modulus = layer.tissue.youngs_modulus
         self._thickest = float(layer.thickness.max())
         self._inward, self.deep = self.columns.inward, Deep(self.columns)
+
+    def moved(self, skin: Skin) -> Toucher:
+        """The same law and tools where joints take the skin."""
+        out = copy(self)
+        out.layer, out.near = skin.layer, skin.near
+        out.columns, out.net = self.columns.moved(skin.layer), self.net.moved(skin.near, skin.green)
+        out._inward, out.deep = out.columns.inward, Deep(out.columns)
+        out._thickest = float(skin.layer.thickness.max())
+        return out
 
     def touch(self, contact: Contact) -> Touch:
         """Touch of one contact alone. Raises MeshError: a surface that cannot be a tool."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -105,6 +105,19 @@ def after(trail: np.ndarray, series: Series, dt: float, now: Pass | None) -> np.
         row[_NOW:FIXED] = now.force, now.force, now.depth, now.power, now.radius
     if new:
         row[FIXED:] = now.relaxed
+    return trail
+
+
+def carried_trail(trail: np.ndarray, motion_at: Callable[[np.ndarray], Transform]) -> np.ndarray:
+    """The places where the skin took them, by its motion (4, 4) near a place (3,) [m]."""
+    if not trail.any():
+        return trail
+    trail = trail.copy()
+    for k in np.flatnonzero(trail[:, _FORCE] > 0):
+        row = trail[k]
+        motion = motion_at(row[_MIDDLE])
+        row[_POSE] = (motion @ row[_POSE].reshape(4, 4)).ravel()
+        row[_MIDDLE], row[_NORMAL] = motion[:3, :3] @ row[_MIDDLE] + motion[:3, 3], motion[:3, :3] @ row[_NORMAL]
     return trail
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any, Self
+from typing import TYPE_CHECKING, Any, Self
 
 import igl
 import numpy as np
@@ -15,6 +15,9 @@ from stmpl_core.layer import SoftLayer
 from stmpl_core.load import Load
 from stmpl_core.methods.base import Method, prepared
 from stmpl_core.trust import Displacement
+
+if TYPE_CHECKING:
+    from stmpl_core.body import Body
 
 MIN_COARSENING = 1.2  # coarsening that saves more than it costs [-]
 
@@ -80,7 +83,7 @@ def interpolation(coarse: SoftLayer, fine: SoftLayer) -> sp.csr_matrix:
     return sp.csr_matrix((weights.ravel(), (rows, corners.ravel())), shape=(len(corners), len(coarse.vertices)))
 
 
-def nearest_corners(layer: SoftLayer, points: Points) -> tuple[np.ndarray, np.ndarray]:
+def nearest_corners(layer: SoftLayer | Body, points: Points) -> tuple[np.ndarray, np.ndarray]:
     """Vertices around the nearest place of a skin to each of the points (N, 3), and barycentric coordinates, (N, 3)."""
     library: Any = igl
     _, face, nearest = library.point_mesh_squared_distance(points, layer.vertices, layer.faces.astype(np.int64))

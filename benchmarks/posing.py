@@ -1,0 +1,168 @@
+"""A limb that moves: how long a pose takes beside a running contact loop, and how far off a bent limb's answers are.
+
+    .venv/bin/python -m benchmarks.posing           # time; set OMP_NUM_THREADS=1 NUMBA_NUM_THREADS=1
+    .venv/bin/python -m benchmarks.posing --fem     # against finite elements on the bent skin; about ten minutes
+    .venv/bin/python -m benchmarks.posing --fem --living     # the same of skin, fat and muscle down to the bones
+
+Errors of force, and of motion as its mean where the truth moves more than a tenth of its peak and at the worst vertex,
+in % of the peak; beside them those of a layer that is made afresh from the bent skin, which takes seconds.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+
+import numpy as np
+import trimesh
+
+from fem_tools import IndenterFem, PatchFem, Press
+from stmpl_core import Contact, Simulator, Skin, SoftLayer, State, Tool
+from stmpl_core.body import Body
+from stmpl_core.errors import StmplError
+from stmpl_core.living import living
+from stmpl_core.methods import MomentNet
+from stmpl_core.rig import Rig
+from stmpl_core.sdf import SignedDistance
+
+PART, JOINT = "left_arm", "left_elbow"
+RADIUS = 0.012  # of the ball [m]
+DEEP = 0.25  # depth of the ball over the thickness
+BENDS = (0, 30, 60, 90)  # degrees
+JOINT_RATE, LOOP_RATE, SECONDS = 60.0, 200.0, 20.0  # of the timed loop [Hz], [s]
+
+
+def ball(radius: float = RADIUS) -> Tool:
+    """A ball, about its own middle."""
+    mesh = trimesh.creation.icosphere(3, 1e3 * radius)
+    return Tool("ball", 1e-3 * np.asarray(mesh.vertices), np.asarray(mesh.faces))
+
+
+def arm(edge: float = 3e-3, stack: bool = False) -> tuple[SoftLayer, Rig]:
+    """The average body's left arm, of one material or as measured, and its rig."""
+    body = Body.anny()
+    layer = living(body, PART, edge_length=edge) if stack else body.part(PART, edge_length=edge)
+    return layer, Rig.of(body, PART, layer)
+
+
+def sites(layer: SoftLayer, rig: Rig) -> dict[str, int]:
+    """Vertices of the arm at rest, by name."""
+    shoulder, elbow = rig.heads
+    upper = (elbow - shoulder) / np.linalg.norm(elbow - shoulder)
+    hand = layer.vertices[rig.weights[:, 1] > 0.99].mean(axis=0) - elbow
+    lower = hand / np.linalg.norm(hand)
+    inside = (lower - upper) / np.linalg.norm(lower - upper)
+    places = {
+        "biceps": (elbow - 0.13 * upper, inside - inside @ upper * upper),
+        "triceps": (elbow - 0.13 * upper, -inside + inside @ upper * upper),
+        "forearm": (elbow + 0.11 * lower, inside - inside @ lower * lower),
+        "inside of the elbow": (elbow, inside),
+        "5 cm above the elbow, inside": (elbow - 0.05 * upper, inside - inside @ upper * upper),
+        "outside of the elbow": (elbow, -inside),
+    }
+    found = {}
+    for name, (place, way) in places.items():
+        way = way / np.linalg.norm(way)
+        away = layer.vertices - place
+        ahead = away @ way
+        found[name] = int(np.where(ahead > 0, np.linalg.norm(away - ahead[:, None] * way, axis=1), np.inf).argmin())
+    return found
+
+
+def compare(edge: float, stack: bool, bends: tuple[int, ...], reach: float) -> None:
+    """Prints answers on a bent arm beside finite elements."""
+    layer, rig = arm(edge, stack)
+    skin, tool = Skin.of(layer, MomentNet(), rig), ball(0.02 if stack else RADIUS)
+    radius = 0.02 if stack else RADIUS
+    print(f"{len(layer.vertices)} vertices of {1e3 * edge:g} mm; ball of {1e3 * radius:g} mm, {DEEP:g} t deep")
+    print("bend  place                         force N: FEM  posed     afresh    moves (worst) %: posed  afresh")
+    for bend in bends:
+        simulator = Simulator(skin.posed({JOINT: np.deg2rad(bend)}))
+        here = simulator.layer
+        depth = {"core": here.core} if here.core is not None else {"thickness": here.thickness}
+        again = SoftLayer(here.vertices, here.faces, **depth, tissue=here.tissue, ply_scale=here.ply_scale)
+        try:
+            afresh = Simulator(again, MomentNet())
+        except StmplError as error:
+            afresh = None
+            print(f"{bend:4d}  afresh: {error}")
+        fem = IndenterFem(PatchFem(element="P1xP2", reach=reach, refine=2, layers=1), step=0.1).prepare(again)
+        for name, vertex in sites(layer, rig).items():
+            normal, thickness = here.normals[vertex], float(here.thickness[vertex])
+            pose = np.eye(4)
+            pose[:3, 3] = here.vertices[vertex] + (radius + 0.01) * normal
+            try:
+                start = Press(SignedDistance.of(tool, margin=0.03), pose, -normal).touching(again)
+                if start is None:
+                    print(f"{bend:4d}  {name:30} the ball is in other skin before it meets this", flush=True)
+                    continue
+                truth = fem.press([start], DEEP * thickness)
+                at = start.at(DEEP * thickness).pose_body_from_tool
+                moved = np.linalg.norm(truth.displacement, axis=1)
+                true = float(np.linalg.norm(truth.pressure @ again.vertex_area_vectors))
+                words, ours = truth.trust.ok * "", []
+                for one in [simulator, afresh]:
+                    if one is None:
+                        continue
+                    answer = one.step([Contact(tool, at)])
+                    off = 100 * np.linalg.norm(answer.displacement - truth.displacement, axis=1) / moved.max()
+                    force = 100 * (answer.touches["ball"].force / true - 1)
+                    ours.append((force, off[moved > 0.1 * moved.max()].mean(), off.max()))
+                    words = words or (answer.trust.why if one is simulator else "")
+                forces = "".join(f"{force:+8.1f} %" for force, _, _ in ours)
+                motions = "  ".join(f"{moves:5.1f} ({worst:4.1f})" for _, moves, worst in ours)
+                bad = "" if truth.trust.ok else f" FEM: {truth.trust.why}"
+                print(f"{bend:4d}  {name:30} {true:8.3f} {forces}     {motions}  {words}{bad}", flush=True)
+            except StmplError as error:
+                print(f"{bend:4d}  {name:30} {error}", flush=True)
+
+
+def times(stack: bool) -> None:
+    """Prints what a pose costs, alone and beside contacts."""
+    layer, rig = arm(stack=stack)
+    skin, tool = Skin.of(layer, MomentNet(), rig), ball()
+    place, now = sites(layer, rig)["forearm"], time.perf_counter
+    skin.posed({JOINT: 0.1})
+    simulator, state = Simulator(skin, friction=0.3), State()
+    posed, touched, fields, late, last = [], [], [], [], -1.0
+    start = now()
+    for step in range(int(SECONDS * LOOP_RATE)):
+        t = step / LOOP_RATE
+        while now() - start < t:
+            pass
+        if t - last >= 1 / JOINT_RATE - 1e-9:
+            last, before = t, now()
+            state = simulator.pose({JOINT: 0.5 + 0.5 * np.sin(t)}, state)
+            posed.append(now() - before)
+        here, pose = simulator.layer, np.eye(4)
+        slide = 0.01 * np.sin(3 * t) * simulator.skin.near.frames[place, 0]
+        pose[:3, 3] = here.vertices[place] + slide + (RADIUS - DEEP * here.thickness[place]) * here.normals[place]
+        before = now()
+        touches, state = simulator.touch([Contact(tool, pose)], state, 1 / LOOP_RATE)
+        touched.append(now() - before)
+        if step % 2 == 0:
+            before = now()
+            simulator.answer(touches)
+            fields.append(now() - before)
+        late.append(now() - start - t)
+    print(f"{len(layer.vertices)} vertices; {JOINT_RATE:g} Hz of joints, {LOOP_RATE:g} Hz of touches with friction and"
+          f"  {LOOP_RATE / 2:g} Hz of fields, {SECONDS:g} s, one thread: median, p99, largest [ms]")  # fmt: skip
+    for name, some in {"pose": posed, "reaction": touched, "field": fields, "end of step after its time": late}.items():
+        print(f"  {name:28} {1e3 * np.median(some):6.2f} {1e3 * np.quantile(some, 0.99):6.2f} {1e3 * max(some):6.2f}")
+
+
+def main() -> None:
+    """Times, or compares."""
+    options = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    options.add_argument("--fem", action="store_true", help="errors against finite elements instead of times")
+    options.add_argument("--living", action="store_true", help="skin, fat and muscle down to the bones")
+    options.add_argument("--bends", type=int, nargs="+", default=BENDS, help="angles of the elbow from rest [degrees]")
+    given = options.parse_args()
+    if given.fem:
+        compare(6e-3 if given.living else 4e-3, given.living, tuple(given.bends), 3.0 if given.living else 4.0)
+    else:
+        times(given.living)
+
+
+if __name__ == "__main__":
+    main()

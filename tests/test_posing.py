@@ -1,0 +1,255 @@
+"""Laws of a limb whose joints move: what a pose keeps, what turns with it, what it spoils and says so."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from stmpl_core import Answer, Contact, Membrane, Ply, Simulator, Skin, SoftLayer, State, Tissue
+from stmpl_core.body import Body
+from stmpl_core.bones import Bone, to_bone
+from stmpl_core.errors import InvalidInput
+from stmpl_core.layer import layer_id
+from stmpl_core.methods import MomentNet, Winkler
+from stmpl_core.rig import Joint, Rig
+from tests.scenes import LENGTH, RADIUS, at, ball, limb
+
+MIDDLE = np.array([0.0, 0, LENGTH / 2])
+STACK = Tissue(3e3, 0.45, skin=Membrane(2e5, 1.5e-3, 20.0, source="a row"), deeper=(Ply(10e-3, 15e3, name="muscle"),))
+
+
+def hinged(layer: SoftLayer, width: float = 0.02, axis: tuple[float, float, float] = (0, 1, 0)) -> Rig:
+    """Two bones along z with a hinge between them; weights change over `width` [m] on both sides."""
+    share = np.clip(0.5 + (layer.vertices[:, 2] - MIDDLE[2]) / (2 * width), 0, 1)
+    lower = share**2 * (3 - 2 * share)
+    heads = np.array([[0.0, 0, 0], MIDDLE])
+    return Rig(("upper", "lower"), (-1, 0), heads, np.stack([1 - lower, lower], 1), (Joint("elbow", "lower", axis),))
+
+
+def carried_whole(layer: SoftLayer) -> Rig:
+    """All of the skin on one bone."""
+    weights = np.tile([0.0, 1.0], (len(layer.vertices), 1))
+    joint = Joint("shoulder", "arm", (0.3, -0.5, 0.8))
+    return Rig(("root", "arm"), (-1, 0), np.array([[0.0, 0, 0], [0.02, 0.01, 0.05]]), weights, (joint,))
+
+
+def pressed(layer: SoftLayer, vertex: int, depth: float = 2e-3, radius: float = 0.012) -> np.ndarray:
+    """Pose of a ball on a skin."""
+    place = layer.vertices[vertex] + (radius - depth) * layer.normals[vertex]
+    return at(*place)
+
+
+def near(layer: SoftLayer, place: tuple[float, float, float]) -> int:
+    return int(np.linalg.norm(layer.vertices - place, axis=1).argmin())
+
+
+def off_by(answer: Answer, other: Answer) -> float:
+    """Mean difference of motion over the peak, where the other moves by more than a tenth of that [-]."""
+    moved = np.linalg.norm(other.displacement, axis=1)
+    off = np.linalg.norm(answer.displacement - other.displacement, axis=1)
+    return float(off[moved > 0.1 * moved.max()].mean() / moved.max())
+
+
+def long_limb(edge: float = 5e-3) -> SoftLayer:
+    return limb(edge, length=0.24)
+
+
+@pytest.fixture(scope="module")
+def skin() -> Skin:
+    layer = limb(4e-3)
+    return Skin.of(layer, MomentNet(), hinged(layer))
+
+
+def test_bent_and_back_at_rest_every_answer_is_what_it_was_to_the_last_bit(skin):
+    contact = Contact(ball(), pressed(skin.layer, near(skin.layer, (RADIUS, 0, 0.05))))
+    simulator = Simulator(skin)
+    before = simulator.step([contact])
+    simulator.pose({"elbow": 0.4})
+    bent = simulator.step([contact])
+    assert bent.displacement.tobytes() != before.displacement.tobytes()
+    simulator.pose({})
+    after = simulator.step([contact])
+    assert after.displacement.tobytes() == before.displacement.tobytes()
+    assert after.touches["probe"].wrench.tobytes() == before.touches["probe"].wrench.tobytes()
+
+
+def test_a_pose_tends_to_the_rest(skin):
+    vertex = near(skin.layer, (RADIUS, 0, MIDDLE[2]))
+    contact = Contact(ball(), pressed(skin.layer, vertex))
+    rest, bent = Simulator(skin).step([contact]), Simulator(skin.posed({"elbow": 1e-7})).step([contact])
+    assert np.abs(bent.displacement - rest.displacement).max() < 1e-3 * np.abs(rest.displacement).max()
+    np.testing.assert_allclose(bent.touches["probe"].wrench, rest.touches["probe"].wrench, rtol=1e-3, atol=1e-6)
+
+
+@pytest.mark.parametrize("tissue", [Tissue(), STACK], ids=["one material", "stack to the bone"])
+def test_when_all_bones_move_as_one_the_answer_turns_with_them(tissue):
+    layer = limb(5e-3).with_(tissue=tissue)
+    if not tissue.single:
+        layer = to_bone(layer, [Bone(np.array([0.0, 0, -1]), np.array([0.0, 0, 1]), 0.012)])
+    rig = carried_whole(layer)
+    skin = Skin.of(layer, MomentNet(), rig)
+    motion = rig.motions((0.9,))[1]
+    pose = pressed(layer, near(layer, (RADIUS, 0, 0.08)))
+    rest = Simulator(skin).step([Contact(ball(), pose)])
+    moved = Simulator(skin.posed({"shoulder": 0.9}))
+    answer = moved.step([Contact(ball(), motion @ pose)])
+    np.testing.assert_allclose(moved.layer.vertices, layer.vertices @ motion[:3, :3].T + motion[:3, 3], atol=1e-12)
+    peak = np.abs(rest.displacement).max()
+    np.testing.assert_allclose(answer.displacement, rest.displacement @ motion[:3, :3].T, atol=1e-3 * peak)
+    force = rest.touches["probe"].wrench[:3]
+    np.testing.assert_allclose(answer.touches["probe"].wrench[:3], motion[:3, :3] @ force,
+                               atol=1e-3 * np.linalg.norm(force))  # fmt: skip
+    assert answer.trust.in_range == rest.trust.in_range
+
+
+@pytest.mark.parametrize("place", [(RADIUS, 0, 0.04), (-RADIUS, 0, 0.12)])
+def test_beside_a_bend_a_posed_skin_answers_as_one_made_afresh(place):
+    layer = long_limb()
+    moved = Simulator(Skin.of(layer, MomentNet(), hinged(layer, 0.03)).posed({"elbow": 0.6}))
+    here = moved.layer
+    afresh = Simulator(SoftLayer(here.vertices, here.faces, here.thickness, tissue=here.tissue), MomentNet())
+    contact = Contact(ball(), pressed(here, near(layer, place)))
+    posed, fresh = moved.step([contact]), afresh.step([contact])
+    assert off_by(posed, fresh) < 0.01
+    assert posed.touches["probe"].force == pytest.approx(fresh.touches["probe"].force, rel=0.01)
+
+
+def test_a_stack_beside_a_bend_answers_as_one_made_afresh():
+    layer = to_bone(long_limb().with_(tissue=STACK), [Bone(np.array([0.0, 0, -1]), np.array([0.0, 0, 1]), 0.012)])
+    moved = Simulator(Skin.of(layer, MomentNet(), hinged(layer, 0.03)).posed({"elbow": 0.5}))
+    here = moved.layer
+    assert here.core is not None and np.linalg.norm(here.core - layer.core, axis=1).max() > 0.02
+    afresh = Simulator(SoftLayer(here.vertices, here.faces, core=here.core, tissue=here.tissue), MomentNet())
+    contact = Contact(ball(0.02), pressed(here, near(layer, (RADIUS, 0, 0.045)), 5e-3, 0.02))
+    posed, fresh = moved.step([contact]), afresh.step([contact])
+    assert off_by(posed, fresh) < 0.02
+    assert posed.touches["probe"].force == pytest.approx(fresh.touches["probe"].force, rel=0.03)
+
+
+def test_the_inside_of_a_bend_is_flagged_and_says_why_and_what_is_far_from_it_is_not(skin):
+    layer = long_limb()
+    moved = Simulator(Skin.of(layer, MomentNet(), hinged(layer)).posed({"elbow": 1.0}))
+    inside = near(layer, (RADIUS, 0, 0.08))  # it turns about +y, so what is above goes towards +x
+    answer = moved.step([Contact(ball(), pressed(moved.layer, inside))])
+    assert not answer.trust.in_range and "the limb is bent so that" in answer.trust.why
+    far = moved.step([Contact(ball(), pressed(moved.layer, near(layer, (0, RADIUS, 0.03))))])
+    assert "bent" not in far.trust.why
+
+
+def test_skin_that_comes_near_through_the_air_feels_nothing():
+    body = Body.anny()
+    layer = body.part("left_arm", edge_length=6e-3)
+    rig = Rig.of(body, "left_arm", layer)
+    moved = Simulator(Skin.of(layer, MomentNet(), rig).posed({"left_elbow": 1.6}))
+    upper, lower = (np.flatnonzero(rig.weights[:, k] > 0.9) for k in (0, 1))
+    gaps = np.linalg.norm(moved.layer.vertices[upper][:, None] - moved.layer.vertices[lower], axis=2)
+    a, b = np.unravel_index(gaps.argmin(), gaps.shape)
+    assert gaps.min() < 0.05 < 0.1 < np.linalg.norm(layer.vertices[upper[a]] - layer.vertices[lower[b]])
+    answer = moved.step([Contact(ball(), pressed(moved.layer, int(upper[a])))])
+    assert np.abs(answer.displacement).max() > 1e-3
+    assert np.abs(answer.displacement[lower]).max() < 1e-3 * np.abs(answer.displacement).max()
+
+
+def test_a_tool_that_rides_on_the_limb_does_not_slide_and_one_that_stays_in_space_does():
+    layer = long_limb()
+    skin, tool = Skin.of(layer, MomentNet(), hinged(layer)), ball()
+    vertex, forces = near(layer, (0, RADIUS, 0.20)), {}
+    for rides in (True, False):
+        simulator, state = Simulator(skin, friction=0.4), State()
+        start = pressed(layer, vertex)
+        for angle in np.linspace(0, 0.06, 7):
+            state = simulator.pose({"elbow": float(angle)}, state)
+            pose = skin.rig.motions((float(angle),))[1] @ start if rides else start
+            touches, state = simulator.touch([Contact(tool, pose)], state, 0.02)
+        assert touches[0].slip is not None
+        forces[rides] = np.linalg.norm(touches[0].slip.wrench[:3]), touches[0].force
+    assert forces[True][0] < 0.02 * forces[True][1]
+    assert forces[False][0] > 0.3 * forces[False][1]
+
+
+def test_the_same_way_over_a_moving_skin_is_the_same_to_the_last_bit(skin):
+    def run() -> bytes:
+        simulator, state, tool = Simulator(skin, friction=0.4), State(), ball()
+        for k in range(5):
+            state = simulator.pose({"elbow": 0.05 * k}, state)
+            pose = pressed(simulator.layer, near(skin.layer, (RADIUS, 0, 0.05)), 1e-3 + 3e-4 * k)
+            touches, state = simulator.touch([Contact(tool, pose)], state, 0.01)
+        return state.pack() + simulator.answer(touches).displacement.tobytes()
+
+    assert run() == run()
+
+
+def test_a_skin_that_relaxes_comes_back_where_its_joints_took_it(skin):
+    """What remembers a press goes with the limb: its imprint lies on the skin, not where the skin was."""
+    from stmpl_core.living import held_skin
+
+    layer = held_skin(long_limb())
+    relaxing, tool = Skin.of(layer, MomentNet(), hinged(layer)), ball()
+    assert relaxing.rig is not None
+    simulator, state = Simulator(relaxing), State()
+    pose = pressed(layer, near(layer, (0, RADIUS, 0.20)), 3e-3)
+    for _ in range(3):
+        _, state = simulator.touch([Contact(tool, pose)], state, 1.0)
+    away = pose.copy()
+    away[1, 3] += 0.05
+    _, state = simulator.touch([Contact(tool, away)], state, 0.01)
+    stayed, _ = simulator.touch([Contact(tool, away)], state, 0.2)
+    left = simulator.answer(stayed).displacement
+    motion = relaxing.rig.motions((0.5,))[1]
+    went, _ = simulator.touch([Contact(tool, motion @ away)], simulator.pose({"elbow": 0.5}, state), 0.2)
+    moved = simulator.answer(went).displacement
+    assert np.abs(left).max() > 2e-4
+    np.testing.assert_allclose(moved, left @ motion[:3, :3].T, atol=1e-3 * np.abs(left).max())
+
+
+def test_a_skin_is_named_by_its_rest_and_its_rig_wherever_its_joints_are(skin):
+    names = {skin.layer_id, skin.posed({"elbow": 0.3}).layer_id}
+    assert len(names) == 1 and layer_id(skin.layer) not in names
+    assert names != {Skin.of(skin.layer, Winkler(), hinged(skin.layer, 0.03)).layer_id}
+
+
+def test_a_rig_comes_back_from_its_text_as_it_was(skin):
+    again = Rig.from_text(skin.rig.to_text(), skin.rig.weights.astype(np.float32))
+    assert again.digest == skin.rig.digest and again.joints == skin.rig.joints
+    assert again.weights.tobytes() == skin.rig.weights.tobytes()
+
+
+def test_what_cannot_be_is_refused_with_what_is_wrong(skin):
+    layer, rig = skin.layer, skin.rig
+    with pytest.raises(InvalidInput, match=r"unknown joint: knee. Available: elbow"):
+        skin.posed({"knee": 0.1})
+    with pytest.raises(InvalidInput, match="elbow is nan rad; it must be finite"):
+        skin.posed({"elbow": float("nan")})
+    with pytest.raises(InvalidInput, match=r"elbow is 45 rad; it goes from -3.14 to 3.14 rad. Is it in degrees"):
+        skin.posed({"elbow": 45.0})
+    with pytest.raises(InvalidInput, match="this skin has no joints"):
+        Simulator(layer, Winkler()).pose({"elbow": 0.1})
+    with pytest.raises(InvalidInput, match="weights of 1 vertices, the skin has"):
+        _ = replace(skin, rig=replace(rig, weights=np.array([[0.5, 0.5]]))).posing
+    with pytest.raises(InvalidInput, match="its rest, must be within"):
+        Joint("elbow", "lower", (0, 1, 0), 0.1, 1.0)
+    with pytest.raises(InvalidInput, match="an earlier one of each other"):
+        replace(rig, parents=(-1, 1))
+    with pytest.raises(InvalidInput, match=r"torso.* has no joints that are known. Known: left_arm"):
+        Rig.of(Body.anny(), "torso", layer)
+    with pytest.raises(InvalidInput, match="from the skin of this body"):
+        Rig.of(Body.anny(), "left_arm", layer)
+    with pytest.raises(InvalidInput, match="this is another skin"):
+        Simulator(skin).move_to(Skin.of(layer, Winkler(), rig))
+
+
+def test_the_weights_of_an_arm_are_spread_so_that_its_inside_does_not_fold_at_sixty_degrees():
+    from stmpl_core.extrusion import fold_ratios
+    from stmpl_core.rig import _weights_on
+
+    body = Body.anny()
+    layer = body.part("left_arm")
+    rig = Rig.of(body, "left_arm", layer)
+    raw = replace(rig, weights=_weights_on(body, layer, ["left_upper_arm", "left_forearm"]))
+    folded = []
+    for one in (raw, rig):
+        moved = Skin.of(layer, Winkler(), one).posed({"left_elbow": np.pi / 3}).layer
+        folded.append(int((fold_ratios(moved.vertices, moved.inner_vertices, moved.faces) <= 0).sum()))
+    assert folded[0] > 100 and folded[1] == 0
+
+
