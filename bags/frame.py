@@ -25,6 +25,7 @@ class Frame(Answer):
         state: memory of the tissue before it (State.pack); empty: none, elastic skin.
         dt: time since that state [s].
         friction: coefficient of friction of each tool [-].
+        joints: angle of each joint of the layer's rig [rad]; empty: at rest.
     """
 
     stamp_ns: int = 0
@@ -37,6 +38,7 @@ class Frame(Answer):
     state: bytes = b""
     dt: float = 0.0
     friction: Mapping[str, float] = field(default_factory=dict)
+    joints: tuple[float, ...] = ()
 
     @property
     def peak(self) -> float:

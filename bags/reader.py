@@ -19,6 +19,7 @@ from bags.schema import typestore_of
 from bags.wire import frame_from, layer_from, tool_from
 from stmpl_core.errors import BagError, StmplError
 from stmpl_core.layer import SoftLayer, layer_id
+from stmpl_core.posing import posed
 from stmpl_core.tool import Tool
 
 log = logging.getLogger(__name__)
@@ -81,6 +82,7 @@ class Bag:
         self._stores: dict[int, Typestore] = {}
         self._places: dict[str, list[Place]] = {}  # of the large messages, by topic
         self._layers: dict[str, SoftLayer] = {}  # that were read so far
+        self._posed: tuple[str, tuple[float, ...], SoftLayer] | None = None  # the last that was asked for, bent
         self._layers_read: dict[str, int] = {}  # number of messages, by topic
         self._look_over()
 
@@ -154,7 +156,18 @@ class Bag:
             yield frame_from(self.decode(record), record.log_time)
 
     def layer_of(self, frame: Frame) -> SoftLayer:
-        """The layer that `frame` answers for. Raises BagError if the bag does not hold it."""
+        """The layer that `frame` answers for, where its joints took it. Raises BagError if the bag does not hold it."""
+        rest = self.rest_of(frame)
+        if not any(frame.joints):
+            return rest
+        if rest.rig is None or len(rest.rig.joints) != len(frame.joints):
+            raise BagError(f"answer {frame.sequence} tells of {len(frame.joints)} joints; its layer has others.")
+        if self._posed is None or self._posed[:2] != (frame.layer_id, frame.joints):
+            self._posed = frame.layer_id, frame.joints, posed(rest, frame.joints)
+        return self._posed[2]
+
+    def rest_of(self, frame: Frame) -> SoftLayer:
+        """The layer that `frame` answers for, its joints at rest. Raises BagError if the bag does not hold it."""
         if frame.layer_id not in self.layers:
             raise BagError(f"answer {frame.sequence} is for layer {frame.layer_id}, the bag holds "
                            f"{', '.join(self.layers)}. Was skin/topology recorded?")  # fmt: skip

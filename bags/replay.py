@@ -105,7 +105,8 @@ def replay(run: Path | str | Run, method: Method, *, every: int = 1) -> Iterator
     run = run if isinstance(run, Run) else Run(run)
     simulator: Simulator | None = None
     for frame in run.frames(range(0, run.answers, every)):
-        simulator = _simulator(simulator, run.layer_of(frame), method, frame)
+        simulator = _simulator(simulator, run.rest_of(frame), method, frame)
+        simulator.move_to(simulator.skin.at_angles(frame.joints))
         contacts, after = run.contacts(frame), None
         if frame.state:
             touches, after = simulator.touch(contacts, State.unpack(frame.state), frame.dt)
@@ -119,7 +120,7 @@ def replay(run: Path | str | Run, method: Method, *, every: int = 1) -> Iterator
 
 def _simulator(before: Simulator | None, layer: SoftLayer, method: Method, frame: Frame) -> Simulator:
     """The simulator that a frame was answered by: the one from before, if layer and friction are still the same."""
-    if before is None or before.layer is not layer:
+    if before is None or (before.skin.rest or before.skin).layer is not layer:
         return Simulator(layer, method, friction=frame.friction if frame.state else None)
     if frame.state and any(before.history.friction(name) != one for name, one in frame.friction.items()):
         return Simulator(before.skin, tools=before.tools, friction=frame.friction)

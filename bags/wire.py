@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import importlib
 from array import array
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import cache
 from types import MappingProxyType
@@ -23,6 +23,7 @@ from stmpl_core.errors import BagError, FrameError, InvalidInput, MeshError
 from stmpl_core.layer import MAX_EXTENT, SoftLayer, layer_id
 from stmpl_core.local_contact import Grip, LocalContact
 from stmpl_core.packed import layer_stack_from_text, layer_stack_to_text
+from stmpl_core.rig import Rig
 from stmpl_core.state import State
 from stmpl_core.tissue import Tissue
 from stmpl_core.tool import Tool
@@ -58,7 +59,10 @@ def layer_from(topology: Any) -> SoftLayer:
     vertices, triangles = _rows("vertices", topology.vertices), _rows("triangles", topology.triangles)
     core = _rows("core", getattr(topology, "core", ()))
     below = {"core": core} if len(core) else {"thickness": np.asarray(topology.thickness)}
-    return SoftLayer(vertices, triangles.astype(np.int32), **below, tissue=tissue, ply_scale=scale)
+    rig = None
+    if text := getattr(topology, "rig", ""):
+        rig = Rig.from_text(text, np.asarray(topology.rig_weights, float))
+    return SoftLayer(vertices, triangles.astype(np.int32), **below, tissue=tissue, ply_scale=scale, rig=rig)
 
 
 def tool_from(message: Any) -> Tool:
@@ -137,6 +141,29 @@ def wrench_from(
     return np.concatenate([rotation @ wrench[:3], rotation @ wrench[3:]])
 
 
+def joints_from(message: Any, names: Mapping[str, str]) -> dict[str, float]:
+    """Angle of each joint [rad] that a JointState tells of, by the rig's names.
+
+    Args:
+        message: sensor_msgs/JointState; joints of no rig are passed over.
+        names: name in the message by the rig's name of each joint.
+
+    Returns:
+        Angles by joint; empty if the message is of others.
+
+    Raises:
+        InvalidInput: not as many positions as names, or an angle that is not finite.
+    """
+    if len(message.position) != len(message.name):
+        raise InvalidInput(f"joint states hold {len(message.position)} positions for {len(message.name)} names.")
+    told = dict(zip(message.name, message.position, strict=True))
+    found = {joint: float(told[name]) for joint, name in names.items() if name in told}
+    for joint, angle in found.items():
+        if not np.isfinite(angle):
+            raise InvalidInput(f"joint {names[joint]} is {angle} rad; it must be finite.")
+    return found
+
+
 def contact_from(
     tool: Tool, pose: Any, wrench: Any | None, *, body_frame: str, frames: FixedFrames = NO_FRAMES
 ) -> Contact:
@@ -175,6 +202,7 @@ def frame_from(message: Any, log_time_ns: int) -> Frame:
         state=bytes(getattr(message, "state", b"")),
         dt=float(getattr(message, "dt", 0.0)),
         friction={one.tool: float(getattr(one, "friction", 0.0)) for one in getattr(message, "touches", ())},
+        joints=tuple(float(angle) for angle in getattr(message, "joints", ())),
     )
 
 
@@ -343,6 +371,8 @@ def topology_message(layer: SoftLayer, body_frame: str, stamp_ns: int) -> Any:
         density=float(layer.tissue.density),
         core=floats([] if layer.core is None else layer.core),
         stack=layer_stack_to_text(layer) if more else "",
+        rig="" if layer.rig is None else layer.rig.to_text(),
+        rig_weights=floats([] if layer.rig is None else layer.rig.weights),
     )
 
 
@@ -360,6 +390,7 @@ def displacement_message(
     state: State | None = None,
     dt: float = 0.0,
     friction: Mapping[str, float] = NO_FRICTION,
+    joints: Sequence[float] = (),
 ) -> Any:
     """An answer as a SkinDisplacement.
 
@@ -376,6 +407,7 @@ def displacement_message(
         state: memory of the tissue before it; None: none, elastic skin.
         dt: time since that state [s].
         friction: coefficient of friction of each tool [-]; 0 unless given.
+        joints: angle of each joint of the layer's rig [rad]; empty: at rest.
     """
     trust = answer.trust
     return message_class("stmpl_msgs/msg/SkinDisplacement")(
@@ -394,11 +426,12 @@ def displacement_message(
         solve_seconds=solve_seconds,
         dt=dt,
         state=array("B", b"" if state is None else state.pack()),
+        joints=array("d", joints),
     )
 
 
 def deformed_message(answer: Any, rest: np.ndarray) -> Any:
-    """The skin under a SkinDisplacement, as a SkinDeformed: rest vertices (V, 3) [m] plus its displacement."""
+    """The skin under a SkinDisplacement, as a SkinDeformed: its displacement added to vertices (V, 3) [m]."""
     moved = rest + np.frombuffer(answer.displacement, dtype=np.float32).reshape(-1, 3)
     kind = message_class("stmpl_msgs/msg/SkinDeformed")
     return kind(header=answer.header, layer_id=answer.layer_id, vertices=floats(moved))

@@ -42,7 +42,8 @@ def arm(edge: float = 3e-3, stack: bool = False) -> tuple[SoftLayer, Rig]:
     """The average body's left arm, of one material or as measured, and its rig."""
     body = Body.anny()
     layer = living(body, PART, edge_length=edge) if stack else body.part(PART, edge_length=edge)
-    return layer, Rig.of(body, PART, layer)
+    rig = Rig.of(body, PART, layer)
+    return layer.with_(rig=rig), rig
 
 
 def sites(layer: SoftLayer, rig: Rig) -> dict[str, int]:
@@ -72,7 +73,7 @@ def sites(layer: SoftLayer, rig: Rig) -> dict[str, int]:
 def compare(edge: float, stack: bool, bends: tuple[int, ...], reach: float) -> None:
     """Prints answers on a bent arm beside finite elements."""
     layer, rig = arm(edge, stack)
-    skin, tool = Skin.of(layer, MomentNet(), rig), ball(0.02 if stack else RADIUS)
+    skin, tool = Skin.of(layer, MomentNet()), ball(0.02 if stack else RADIUS)
     radius = 0.02 if stack else RADIUS
     print(f"{len(layer.vertices)} vertices of {1e3 * edge:g} mm; ball of {1e3 * radius:g} mm, {DEEP:g} t deep")
     print("bend  place                         force N: FEM  posed     afresh    moves (worst) %: posed  afresh")
@@ -120,8 +121,8 @@ def compare(edge: float, stack: bool, bends: tuple[int, ...], reach: float) -> N
 def times(stack: bool) -> None:
     """Prints what a pose costs, alone and beside contacts."""
     layer, rig = arm(stack=stack)
-    skin, tool = Skin.of(layer, MomentNet(), rig), ball()
-    place, now = sites(layer, rig)["forearm"], time.perf_counter
+    skin, tool, now = Skin.of(layer, MomentNet()), ball(), time.perf_counter
+    place, cpu = sites(layer, rig)["forearm"], time.thread_time
     skin.posed({JOINT: 0.1})
     simulator, state = Simulator(skin, friction=0.3), State()
     posed, touched, fields, late, last = [], [], [], [], -1.0
@@ -131,24 +132,25 @@ def times(stack: bool) -> None:
         while now() - start < t:
             pass
         if t - last >= 1 / JOINT_RATE - 1e-9:
-            last, before = t, now()
+            last, before = t, cpu()
             state = simulator.pose({JOINT: 0.5 + 0.5 * np.sin(t)}, state)
-            posed.append(now() - before)
+            posed.append(cpu() - before)
         here, pose = simulator.layer, np.eye(4)
         slide = 0.01 * np.sin(3 * t) * simulator.skin.near.frames[place, 0]
         pose[:3, 3] = here.vertices[place] + slide + (RADIUS - DEEP * here.thickness[place]) * here.normals[place]
-        before = now()
+        before = cpu()
         touches, state = simulator.touch([Contact(tool, pose)], state, 1 / LOOP_RATE)
-        touched.append(now() - before)
+        touched.append(cpu() - before)
         if step % 2 == 0:
-            before = now()
+            before = cpu()
             simulator.answer(touches)
-            fields.append(now() - before)
+            fields.append(cpu() - before)
         late.append(now() - start - t)
-    print(f"{len(layer.vertices)} vertices; {JOINT_RATE:g} Hz of joints, {LOOP_RATE:g} Hz of touches with friction and"
-          f"  {LOOP_RATE / 2:g} Hz of fields, {SECONDS:g} s, one thread: median, p99, largest [ms]")  # fmt: skip
-    for name, some in {"pose": posed, "reaction": touched, "field": fields, "end of step after its time": late}.items():
-        print(f"  {name:28} {1e3 * np.median(some):6.2f} {1e3 * np.quantile(some, 0.99):6.2f} {1e3 * max(some):6.2f}")
+    print(f"{len(layer.vertices)} vertices; {JOINT_RATE:g} Hz of joints, {LOOP_RATE:g} Hz of touches with friction and "
+          f"{LOOP_RATE / 2:g} Hz of fields for {SECONDS:g} s, one thread. Processor time [ms], last row wall: median, "
+          "p99, largest")  # fmt: skip
+    for name, some in {"pose": posed, "reaction": touched, "field": fields, "end of step, late by": late}.items():
+        print(f"  {name:34} {1e3 * np.median(some):6.2f} {1e3 * np.quantile(some, 0.99):6.2f} {1e3 * max(some):6.2f}")
 
 
 def main() -> None:

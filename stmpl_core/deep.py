@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import cached_property
 
 import numpy as np
 from scipy.spatial import KDTree
@@ -26,10 +27,19 @@ class Deep:
 
     def __init__(self, columns: Columns) -> None:
         self.columns, self.layer = columns, columns.layer
-        self._low, self._high = columns.points.min(axis=0), columns.points.max(axis=0)
         self._tree: KDTree | None = None
-        self._edge = np.zeros(len(columns.points), dtype=bool)
-        self._edge[self.layer.border] = True
+
+    @cached_property
+    def _box(self) -> tuple[np.ndarray, np.ndarray]:
+        """Lowest and highest corner of the skin, (3,) each [m]."""
+        return self.columns.points.min(axis=0), self.columns.points.max(axis=0)
+
+    @cached_property
+    def _edge(self) -> np.ndarray:
+        """Mask of the vertices on the open border, (V,)."""
+        edge = np.zeros(len(self.columns.points), dtype=bool)
+        edge[self.layer.border] = True
+        return edge
 
     def strain(self, squeeze: Squeeze) -> float:
         """Largest depth over the thickness, of vertices and nodes [-]."""
@@ -41,8 +51,8 @@ class Deep:
 
         The limb goes on where it is cut off: what is nearest to its open border is not inside.
         """
-        centre = middle_of(field, pose)
-        if (centre < self._low).any() or (centre > self._high).any():
+        centre, (low, high) = middle_of(field, pose), self._box
+        if (centre < low).any() or (centre > high).any():
             return False
         some = points[:: max(1, len(points) // LOOKED_AT)] @ pose[:3, :3].T + pose[:3, 3]
         nearest = self._nearest(some)

@@ -35,6 +35,7 @@ class SoftLayer:
         tissue: what lies between skin and core.
         ply_scale: factor on the depths at which deeper materials begin below each vertex, (V,) [-], > 0; None: 1.
         chart: UV chart of the skin, if it has one (see stmpl_core.chart).
+        rig: bones and joints that the skin hangs on, for Simulator.pose; None: it does not move.
 
     Raises:
         MeshError: empty, non-manifold, inside-out or degenerate surface, or one that looks like millimetres.
@@ -51,6 +52,7 @@ class SoftLayer:
         tissue: Tissue | None = None,
         ply_scale: ArrayLike | None = None,
         chart: Any = None,
+        rig: Rig | None = None,
     ) -> None:
         self.vertices: Points = finite("vertices", vertices, (None, 3))
         self.faces: Faces = check_faces(faces, len(self.vertices))
@@ -73,11 +75,14 @@ class SoftLayer:
             self.ply_scale = finite("ply_scale", ply_scale, (len(self.vertices),))
             if (self.ply_scale <= 0).any():
                 raise InvalidInput(f"ply_scale is {self.ply_scale.min():g} at its least; it must be above 0.")
-        self.chart = chart
+        self.chart, self.rig = chart, rig
+        if rig is not None and len(rig.weights) != len(self.vertices):
+            raise InvalidInput(f"the rig has weights of {len(rig.weights)} vertices, the skin has "
+                               f"{len(self.vertices)}.")  # fmt: skip
         _check_surface(self)
 
     def with_(self, **changes: Any) -> SoftLayer:
-        """A copy with `vertices`, `thickness` or `core`, `tissue` (or its fields), `ply_scale` or `chart` changed.
+        """A copy with `vertices`, `thickness` or `core`, `tissue` (or its fields), `ply_scale`, `chart`, `rig` changed.
 
         Raises:
             InvalidInput: vertices without a core, where the layer has one.
@@ -90,6 +95,7 @@ class SoftLayer:
         material = {k: changes.pop(k) for k in ("youngs_modulus", "poisson_ratio", "density", "skin", "deeper")
                     if k in changes}
         given = {"vertices": self.vertices, "faces": self.faces, "tissue": self.tissue, "chart": self.chart}
+        given["rig"] = self.rig
         given |= below | changes
         given["tissue"] = replace(given["tissue"], **material)
         return SoftLayer(**given)
@@ -111,7 +117,7 @@ class SoftLayer:
         out.__dict__ |= {"edges": self.edges, "edge_length": self.edge_length, "border": self.border,
                          "face_area_vectors": face_area_vectors, "vertex_area_vectors": vertex_area_vectors,
                          "vertex_areas": vertex_areas, "normals": normals}  # fmt: skip
-        out.vertices, out.core, out.chart = vertices, core, None
+        out.vertices, out.core, out.chart, out.rig = vertices, core, None, None  # a rig knows the rest alone
         if core is not None:
             out.thickness = out._depth_of_core()
         return out
@@ -211,10 +217,10 @@ def single(layer: SoftLayer, who: str, *, straight: bool = True) -> SoftLayer:
     return layer
 
 
-def layer_id(layer: SoftLayer, rig: Rig | None = None) -> str:
+def layer_id(layer: SoftLayer) -> str:
     """Sixteen hex digits that name a layer: SHA-256 of its vertices, faces, thickness and tissue, all as published.
 
-    One that hangs on a rig is named by its rest and the rig, wherever its joints are.
+    One that hangs on a rig is named by that, too, and at rest: Skin.layer_id does so wherever its joints are.
 
     Vertices and thickness count as float32, so a layer that went through SkinTopology keeps its name.
     """
@@ -232,8 +238,8 @@ def layer_id(layer: SoftLayer, rig: Rig | None = None) -> str:
         digest.update(np.array(tissue.stacked, dtype="<f8").tobytes())
     if layer.ply_scale is not None:
         digest.update(np.ascontiguousarray(layer.ply_scale, dtype="<f4").tobytes())
-    if rig is not None:
-        digest.update(rig.digest.encode())
+    if layer.rig is not None:
+        digest.update(layer.rig.digest.encode())
     return digest.hexdigest()[:16]
 
 

@@ -27,6 +27,7 @@ from stmpl_core.response import (
 from stmpl_core.soundness import Bend, Soundness
 from stmpl_core.thinning import SPACINGS, STACK_SPACINGS, STACK_ZONES, ZONES, Asked, Thinning
 
+FIRST_SPREAD = float(SPREADS[0])
 WIDEST = 3.0  # distance over the thickness to which neighbours say how a place is curved
 
 
@@ -167,7 +168,8 @@ class Surroundings:
         out.frames, out.curvature, out.sound = frames, curvature, self.sound.at(bend)
         out._thinning = self._thinning.bent()
         out._frames = frames.astype(np.float32)
-        out._sites = _sites(layer.vertices, layer.normals, self.thickness, layer.vertex_areas)
+        out._sites = self._sites.copy()
+        _move_sites(layer.vertices, layer.normals, layer.vertex_areas, out._sites)
         out.bent = np.empty((len(frames), 12))
         _bent(frames, curvature, self.slope, out.bent)
         return out
@@ -242,6 +244,21 @@ def _sites(points: np.ndarray, normals: np.ndarray, thickness: np.ndarray, area:
     spread = np.log(SPREAD * area**0.5 / SPREADS[0]) - half_log
     rows = [*(points - points.mean(axis=0)).T, thickness**-0.5, area, half_log, spread, *normals.T]
     return np.ascontiguousarray(rows, dtype=np.float32)
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _move_sites(points, normals, area, out):
+    """Writes to `out` what of _sites moves with the skin; its thickness stays."""
+    middle = np.zeros(3)
+    for x in range(3):
+        for v in range(len(points)):
+            middle[x] += points[v, x]
+        middle[x] /= len(points)
+    for v in range(len(points)):
+        for x in range(3):
+            out[x, v], out[7 + x, v] = points[v, x] - middle[x], normals[v, x]
+        out[4, v] = area[v]
+        out[6, v] = np.log(SPREAD * np.sqrt(area[v]) / FIRST_SPREAD) - out[5, v]
 
 
 def _frames(normals: np.ndarray) -> np.ndarray:

@@ -11,11 +11,12 @@ import numpy as np
 
 from stmpl_core.chart import UvChart
 from stmpl_core.layer import SoftLayer
+from stmpl_core.rig import Rig
 from stmpl_core.tissue import Membrane, Ply, Prony, Tissue
 
 
 def pack(layer: SoftLayer) -> dict[str, np.ndarray]:
-    """Arrays of a layer by name: vertices, faces, thickness or core, tissue, and if it has them ply_scale and uv.
+    """Arrays of a layer by name: vertices, faces, thickness or core, tissue, and if it has them ply_scale, uv and rig.
 
     The tissue of one material is its modulus, ratio and density, (3,); what else it has is JSON, as bytes in `stack`.
     """
@@ -26,6 +27,9 @@ def pack(layer: SoftLayer) -> dict[str, np.ndarray]:
         arrays["uv"] = layer.chart.uv
     if not tissue.single or tissue.source or tissue.relaxation:
         arrays["stack"] = np.frombuffer(stack_to_text(tissue).encode(), np.uint8)
+    if layer.rig is not None:
+        arrays["rig"] = np.frombuffer(layer.rig.to_text().encode(), np.uint8)
+        arrays["rig_weights"] = layer.rig.weights.astype(np.float32)
     return arrays
 
 
@@ -93,5 +97,8 @@ def unpack(arrays: Mapping[str, np.ndarray]) -> SoftLayer:
         modulus, ratio, density = (float(x) for x in arrays["tissue"])
         tissue = Tissue(modulus, ratio, density)
     depth = {name: arrays[name] for name in ("thickness", "core", "ply_scale") if name in arrays}
-    chart = UvChart(arrays["vertices"], arrays["faces"], arrays["uv"]) if "uv" in arrays else None
-    return SoftLayer(arrays["vertices"], arrays["faces"], **depth, tissue=tissue, chart=chart)
+    chart, rig = UvChart(arrays["vertices"], arrays["faces"], arrays["uv"]) if "uv" in arrays else None, None
+    if "rig" in arrays:
+        text = np.asarray(arrays["rig"], np.uint8).tobytes().decode()
+        rig = Rig.from_text(text, np.asarray(arrays["rig_weights"], float))
+    return SoftLayer(arrays["vertices"], arrays["faces"], **depth, tissue=tissue, chart=chart, rig=rig)

@@ -15,21 +15,19 @@ import numba
 import numpy as np
 from scipy.spatial import KDTree
 
-from stmpl_core.errors import InvalidInput
 from stmpl_core.layer import SoftLayer
 from stmpl_core.moments import WIDEST, Surroundings
-from stmpl_core.rig import Rig
 from stmpl_core.soundness import Bend
 from stmpl_core.thinning import CORNERS, LARGEST, interpolation
 
 if TYPE_CHECKING:
     from stmpl_core.skin import Skin
 
-ALIKE = 1e-3  # difference of bone weights, below which skin moves as one
+ALIKE = 3e-3  # difference of bone weights, below which skin moves as one
 NEAR_ENOUGH = 2.5  # distance to which skin that faces skin is looked for, over the thickness
 APART = 6.0  # distance of two places at rest, over the thickness, from which they are no neighbours along the skin
 SPACING = 9e-3  # distance of the places at which the change of curvature is found; it is smooth [m]
-NEIGHBOURS = 400  # number of neighbours that tell of the curvature at a place
+NEIGHBOURS = 160  # number of neighbours that tell of the curvature at a place
 FELT = 2.5  # distance to which a bend changes curvature, over the thickness: it is found from skin so far around
 GAUSSIAN = np.exp(-0.5 * np.linspace(0, WIDEST**2, 2001))  # of one thickness, over the square of the distance
 
@@ -38,18 +36,13 @@ class Posing:
     """What a skin needs to be posed, found once.
 
     Args:
-        skin: skin at rest.
-        rig: bones that it hangs on.
-
-    Raises:
-        InvalidInput: a rig of another number of vertices.
+        skin: skin at rest, whose layer hangs on a rig.
     """
 
-    def __init__(self, skin: Skin, rig: Rig) -> None:
+    def __init__(self, skin: Skin) -> None:
         layer, near = skin.layer, skin.near
-        if len(rig.weights) != len(layer.vertices):
-            raise InvalidInput(f"the rig has weights of {len(rig.weights)} vertices, the skin has "
-                               f"{len(layer.vertices)}.")  # fmt: skip
+        assert layer.rig is not None
+        rig = layer.rig
         self.rest, self.rig = skin, rig
         self._faces = np.ascontiguousarray(layer.faces, dtype=np.int64)
         self._zone = np.flatnonzero(np.ptp(rig.weights[self._faces], axis=1).max(axis=1) > ALIKE)
@@ -85,21 +78,12 @@ class Posing:
             return self.rest
         rest, near, weights = self.rest, self.rest.near, self.rig.weights
         motions = self.rig.motions(angles)
-        less, quaternions = motions[:, :3, :] - np.eye(3, 4), np.array([quaternion(one[:3, :3]) for one in motions])
-        vertices, turns = np.empty_like(rest.layer.vertices), np.empty((len(weights), 3, 3))
-        _go(rest.layer.vertices, weights, less, vertices)
-        _turn(weights, quaternions, turns)
-        core = None
-        if rest.layer.core is not None:
-            core = np.empty_like(vertices)
-            _go(rest.layer.core, weights, less, core)
-        areas = _areas(vertices, self._faces)
-        layer = rest.layer.moved(vertices, core, *areas)
-
+        layer, turns = _moved(rest.layer, self._faces, motions), np.empty((len(weights), 3, 3))
+        _turn(weights, np.array([quaternion(one[:3, :3]) for one in motions]), turns)
         frames = np.empty((len(weights), 3, 3))
         _framed(turns, near.frames, layer.normals, frames)
         curvature, now = near.curvature.copy(), np.zeros_like(self._at_rest)
-        _curved(vertices, frames, near.thickness, turns, self._places, self._start, self._index, now)
+        _curved(layer.vertices, frames, near.thickness, turns, self._places, self._start, self._index, now)
         now -= self._at_rest
         _between(self._bending, self._corners, self._shares, now, near.frames, curvature)
         moved = near.moved(layer, frames, curvature, self._bend(layer, curvature))
@@ -130,6 +114,29 @@ class Posing:
         if len(self._places):
             gap[self._bending] = gap[self._places[self._corners[:, 0]]]
         return Bend(fold, least, most, lowest, gap)
+
+
+def posed(layer: SoftLayer, angles: Sequence[float]) -> SoftLayer:
+    """A layer where its joints take it, its shape alone; at rest the layer itself.
+
+    Args:
+        layer: layer at rest; it must hang on a rig, where an angle is not 0.
+        angles: angle of each joint of the rig [rad]; empty: at rest.
+    """
+    if not any(angles):
+        return layer
+    assert layer.rig is not None
+    return _moved(layer, np.ascontiguousarray(layer.faces, dtype=np.int64), layer.rig.motions(angles))
+
+
+def _moved(layer: SoftLayer, faces: np.ndarray, motions: np.ndarray) -> SoftLayer:
+    assert layer.rig is not None
+    less, vertices, core = motions[:, :3, :] - np.eye(3, 4), np.empty_like(layer.vertices), None
+    _go(layer.vertices, layer.rig.weights, less, vertices)
+    if layer.core is not None:
+        core = np.empty_like(vertices)
+        _go(layer.core, layer.rig.weights, less, core)
+    return layer.moved(vertices, core, *_areas(vertices, faces))
 
 
 def quaternion(turn: np.ndarray) -> np.ndarray:

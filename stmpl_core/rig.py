@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 import scipy.sparse as sp
 from numpy.typing import ArrayLike
-from scipy.sparse.linalg import splu
 
 from stmpl_core.arrays import finite
 from stmpl_core.body import PARTS, Body
@@ -117,11 +116,8 @@ class Rig:
         Raises:
             InvalidInput: another part, or a layer that is no part of the body's skin.
         """
+        check_part(part)
         side, _, name = part.partition("_")
-        if side not in ("left", "right") or name not in SEGMENTS:
-            known = ", ".join(f"{one}_{limb}" for one in ("left", "right") for limb in SEGMENTS)
-            raise InvalidInput(f"{part!r} has no joints that are known. Known: {known}. Or give bones, weights and "
-                               "joints of your own to Rig.")  # fmt: skip
         names = [f"{side}_{segment}" for segment in SEGMENTS[name]]
         bones = bones_of(body, part)
         weights = spread(layer, _weights_on(body, layer, names), SPREAD)
@@ -192,6 +188,14 @@ class Rig:
             raise InvalidInput(f"this is no rig: {error}.") from error
 
 
+def check_part(part: str) -> None:
+    """Raises InvalidInput for a part without joints that Rig.of knows."""
+    known = [f"{side}_{limb}" for side in ("left", "right") for limb in SEGMENTS]
+    if part not in known:
+        raise InvalidInput(f"{part!r} has no joints that are known. Known: {', '.join(known)}. Or give bones, weights "
+                           "and joints of your own to Rig.")  # fmt: skip
+
+
 def about(centre: np.ndarray, axis: np.ndarray, angle: float) -> np.ndarray:
     """Rotation by an angle [rad] about a unit axis (3,) through a point (3,) [m], (4, 4); Rodrigues' formula."""
     out, x = np.eye(4), np.array([[0, -axis[2], axis[1]], [axis[2], 0, -axis[0]], [-axis[1], axis[0], 0]])
@@ -207,6 +211,7 @@ def spread(layer: SoftLayer, values: np.ndarray, deviation: float) -> np.ndarray
     over the open border.
     """
     import igl
+    from scipy.sparse.linalg import splu
 
     laplace = sp.csc_matrix(igl.cotmatrix(layer.vertices, layer.faces.astype(np.int64)))
     areas = sp.diags(layer.vertex_areas)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, overload
+from typing import overload
 
 import numpy as np
 
@@ -29,9 +29,6 @@ from stmpl_core.toucher import Toucher
 from stmpl_core.trust import Displacement, Trust
 from stmpl_core.wake import sunk
 
-if TYPE_CHECKING:
-    from stmpl_core.rig import Rig
-
 MOST_MOVED = 0.95  # motion over the thickness from which it is held back
 MAX_ENTERED_SHARE = 0.02  # depth of skin inside a tool over the thickness, which is not yet said
 
@@ -45,7 +42,6 @@ class Simulator:
         tools: tools with their distance fields; None: an empty store, to which contacts add theirs.
         friction: coefficient of friction, or the name of a pair in stmpl_core.friction, of all tools or by tool's name;
             it is felt where touches have a state. None: none.
-        rig: bones and joints that the layer hangs on, for `pose`; None, and with a Skin: that of the Skin, if any.
 
     Attributes:
         toucher: contact law on this layer.
@@ -57,13 +53,13 @@ class Simulator:
     """
 
     def __init__(self, layer: SoftLayer | Skin, method: Method | None = None, tools: Tools | None = None, *,
-                 friction: Friction | Mapping[str, Friction] = None, rig: Rig | None = None) -> None:  # fmt: skip
+                 friction: Friction | Mapping[str, Friction] = None) -> None:  # fmt: skip
         if isinstance(layer, Skin):
             skin = layer
         elif method is None:
             raise InvalidInput("a simulator needs a method. Try Simulator(layer, MomentNet()).")
         else:
-            skin = Skin.of(layer, method, rig)
+            skin = Skin.of(layer, method)
         self._stand_on(skin.rest or skin)
         if self._green is not None:
             self._green.keep(self.layer)  # a Skin from another process has a layer of its own

@@ -17,7 +17,6 @@ from stmpl_core.moments import Surroundings
 
 if TYPE_CHECKING:
     from stmpl_core.posing import Posing
-    from stmpl_core.rig import Rig
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,8 +28,7 @@ class Skin:
         method: method, prepared for it.
         near: neighbours of its vertices, which method and contact share.
         green: linear response of a stack, likewise; None: one material straight below the skin.
-        rig: bones and joints that it hangs on; None: it does not move.
-        angles: angle of each joint of the rig [rad]; empty: at rest.
+        angles: angle of each joint of the layer's rig [rad]; empty: at rest.
         rest: same skin at rest; None: this is it.
     """
 
@@ -38,15 +36,14 @@ class Skin:
     method: Method
     near: Surroundings
     green: Green | None = None
-    rig: Rig | None = None
     angles: tuple[float, ...] = ()
     rest: Skin | None = None
 
     @classmethod
-    def of(cls, layer: SoftLayer, method: Method, rig: Rig | None = None) -> Skin:
+    def of(cls, layer: SoftLayer, method: Method) -> Skin:
         """Prepares a layer (seconds). Raises InvalidInput or MeshError."""
         ready = method.prepare(layer)
-        return cls(layer, ready, Surroundings.of(layer), Green.of(layer) if layer.stacked else None, rig)
+        return cls(layer, ready, Surroundings.of(layer), Green.of(layer) if layer.stacked else None)
 
     def posed(self, joints: Mapping[str, float]) -> Skin:
         """The same skin where joints take it, in milliseconds; this one stays as it is.
@@ -55,11 +52,12 @@ class Skin:
             joints: angle by the joint's name [rad]; those that are not given are at rest.
 
         Raises:
-            InvalidInput: a skin without a rig, or what Rig.angles refuses.
+            InvalidInput: a layer without a rig, or what Rig.angles refuses.
         """
-        if self.rig is None:
-            raise InvalidInput("this skin has no joints. Try Skin.of(layer, method, Rig.of(body, part, layer)).")
-        return self.at_angles(self.rig.angles(joints))
+        rig = (self.rest or self).layer.rig
+        if rig is None:
+            raise InvalidInput("this skin has no joints. Try layer.with_(rig=Rig.of(body, part, layer)).")
+        return self.at_angles(rig.angles(joints))
 
     def at_angles(self, angles: Sequence[float]) -> Skin:
         """As `posed`, by the angles of all joints in the rig's order [rad]; none: at rest."""
@@ -77,13 +75,12 @@ class Skin:
         """What this skin at rest needs to be posed, found on the first call (a fifth of a second)."""
         from stmpl_core.posing import Posing
 
-        assert self.rig is not None
-        return Posing(self, self.rig)
+        return Posing(self)
 
     def at(self, layer: SoftLayer, method: Method, near: Surroundings, green: Green | None,
            angles: tuple[float, ...]) -> Skin:  # fmt: skip
         """This skin at rest as it is at some angles of its joints."""
-        return Skin(layer, method, near, green, self.rig, angles, self)
+        return Skin(layer, method, near, green, angles, self)
 
     def stiffened(self, method: Method, *, youngs_modulus: float, density: float) -> Skin:
         """The same skin, at rest, of another stiffness [Pa] and density [kg/m3], in a tenth of a second.
@@ -95,12 +92,12 @@ class Skin:
         tissue = replace(rest.layer.tissue, youngs_modulus=youngs_modulus, density=density)
         layer = rest.layer.with_(tissue=tissue)
         rest.near.keep(layer)
-        return Skin(layer, method.prepare(layer), rest.near, rig=self.rig)
+        return Skin(layer, method.prepare(layer), rest.near)
 
     @cached_property
     def layer_id(self) -> str:
         """Name of the layer in messages: of its rest and its rig."""
-        return layer_id((self.rest or self).layer, self.rig)
+        return layer_id((self.rest or self).layer)
 
 
 def published(layer: SoftLayer) -> SoftLayer:

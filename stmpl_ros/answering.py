@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from typing import NamedTuple
 
 import numba
@@ -19,6 +20,7 @@ from stmpl_core.simulator import Simulator
 from stmpl_core.skin import Skin
 from stmpl_core.tools import Tools
 from stmpl_core.touch import IN_CORE, NO_FORCE, NO_TOUCH, PULLING, WRAPPED, Answer, Touch
+from stmpl_ros.bending import Bending
 from stmpl_ros.calibration import Calibration
 from stmpl_ros.diagnosis import Tally
 from stmpl_ros.hearing import Hearing
@@ -50,6 +52,8 @@ class Asked(NamedTuple):
         seconds: time that the reaction took [s].
         news: sentences that some answer must carry: this one, or a later one if it is overtaken.
         said: further sentences of the node.
+        skin: skin where the limb's joints were.
+        doubt: why that is not known; empty: it is.
     """
 
     instant: Instant
@@ -59,6 +63,8 @@ class Asked(NamedTuple):
     seconds: float
     news: tuple[str, ...]
     said: tuple[str, ...]
+    skin: Skin
+    doubt: str
 
 
 class Answering:
@@ -74,6 +80,7 @@ class Answering:
         hearing: subscriptions and what they heard.
         tally: counts of answers and refusals.
         calibration: service that keeps presses.
+        bending: joints of the limb.
 
     Attributes:
         simulator: simulator of the skin that answers, for reactions.
@@ -89,10 +96,11 @@ class Answering:
     _fields: Simulator
 
     def __init__(
-        self, node: LifecycleNode, settings: Settings, hearing: Hearing, tally: Tally, calibration: Calibration
-    ) -> None:
+        self, node: LifecycleNode, settings: Settings, hearing: Hearing, tally: Tally, calibration: Calibration,
+        bending: Bending,
+    ) -> None:  # fmt: skip
         self._node, self._settings, self._hearing, self._tally = node, settings, hearing, tally
-        self._calibration = calibration
+        self._calibration, self._bending = calibration, bending
         self.limits: Limits | None = None
         self.remembering = Remembering()
         self._field: LatestWins[Asked] | None = None
@@ -108,6 +116,7 @@ class Answering:
             self._epoch, self.last = self._epoch + 1, None
         self.remembering.forget()
         self.simulator, self._fields = Simulator(skin, tools=tools, friction=friction), Simulator(skin, tools=tools)
+        self._bending.move_to(skin)
         return self.simulator, self._fields
 
     def open(self) -> None:
@@ -143,6 +152,7 @@ class Answering:
     def answer(self, instant: Instant) -> bool:
         """Answers an instant; False if that failed, which is told and counted, and the next one is answered."""
         started = time.perf_counter()
+        self._bend()
         back = self.remembering.went_back(instant)
         reaction = self._attempted(instant, lambda: self.remembering.reaction(self.simulator, instant))
         if reaction is None:
@@ -153,10 +163,14 @@ class Answering:
         self.remembering.keep(reaction, instant)
         seconds = time.perf_counter() - started
         said = self._remarks(instant, touches, back)
-        asked = Asked(instant, reaction, self._fields, self._epoch, seconds, tuple(self._news), said)
+        doubt, skin = self._bending.doubt, self.simulator.skin
+        if doubt:
+            self._hearing.gate.say("joints", doubt)
+        asked = Asked(instant, reaction, self._fields, self._epoch, seconds, tuple(self._news), said, skin, doubt)
         self._field.put(asked)
         self.sending.models.put(instant, touches, reaction.before)
-        self._calibration.put(instant, touches)
+        if not any(skin.angles):  # a fit knows the skin at rest
+            self._calibration.put(instant, touches)
         if self.limits:
             self.limits.put(reaction.touches)
         self._tally.reacted(seconds, (self._now() - instant.stamp) / NANO)
@@ -165,6 +179,25 @@ class Answering:
         self._instant, self.fading, self._hearing.gate.refused_since = instant, False, ""
         self._seen = set(touches)
         return True
+
+    def _bend(self) -> bool:
+        """Takes skin and memory to where the joints are now; whether they were elsewhere."""
+        newest, before = self._bending.newest, self.simulator.skin
+        if newest is None or newest is before or newest.angles == before.angles:
+            return False
+        self.remembering.state = self.simulator.move_to(newest, self.remembering.state)
+        self._hearing.layer = newest.layer
+        return True
+
+    def follow(self) -> None:
+        """Sends the skin where its joints are, while no tool is there to be answered."""
+        if self._instant is None and self._bend():
+            self._send(self.simulator.step([]), self._now(), {}, self._elastic, why=self._bending.doubt)
+
+    @property
+    def _elastic(self) -> Before:
+        """What an answer without tools is made from."""
+        return ELASTIC._replace(joints=self.simulator.skin.angles)
 
     def _attempted[T](self, instant: Instant, do: Callable[[], T]) -> T | None:
         """What `do` returns; None if it failed."""
@@ -228,7 +261,10 @@ class Answering:
     def _field_of(self, asked: Asked) -> Answer:
         """The answer to touches. Raises InvalidInput if it would not be finite."""
         asked.fields.toucher.tools = self.simulator.tools.copy()  # which the executor may change meanwhile
+        asked.fields.move_to(asked.skin)
         answer = asked.fields.answer(asked.reaction.touches)
+        if asked.doubt:
+            answer = replace(answer, trust=answer.trust.also(asked.doubt, in_range=False))
         if not np.isfinite(answer.displacement).all():
             statuses = {name: touch.status for name, touch in answer.touches.items()}
             raise InvalidInput(f"the displacement would not be finite under {statuses}.")
@@ -284,7 +320,7 @@ class Answering:
         tools = [one.name for one in self._instant.contacts] if self._instant else []
         with self._sends:
             self._start_empty()
-            self._send(self.simulator.step([]), self._now(), {}, ELASTIC, why=why)
+            self._send(self.simulator.step([]), self._now(), {}, self._elastic, why=why)
         self.sending.rest(tools, self._now())
 
     def _send(self, answer: Answer, stamp: int, inputs: Stamps, before: Before, **said: float | str) -> None:

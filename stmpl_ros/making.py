@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import cast, get_args
+from typing import TYPE_CHECKING, cast, get_args
 
 import numpy as np
 
@@ -13,12 +13,16 @@ from stmpl_core.friction import Friction, friction_from
 from stmpl_core.layer import SoftLayer
 from stmpl_core.living import held_skin, living, read_model, read_tissue, region_of
 from stmpl_core.regions import Tone
+from stmpl_core.rig import Rig, check_part
 from stmpl_core.simulator import Simulator
 from stmpl_core.skin import Skin, published
 from stmpl_core.state import State
 from stmpl_core.tissue import Tissue
 from stmpl_core.tool import Tool
 from stmpl_ros.parameters import ONE_LAYER, PAPER, NodeConfig
+
+if TYPE_CHECKING:
+    from stmpl_core.body import Body
 
 Build = Callable[[NodeConfig], SoftLayer]
 STIFFNESS = {"youngs_modulus", "density"}  # settings that change neither geometry nor what is felt around a vertex
@@ -31,6 +35,11 @@ def layer_of(config: NodeConfig) -> SoftLayer:
     from stmpl_core.body import Body
 
     body = Body.anny(pose=None, **config.phenotype_values)
+    layer = _at_rest(config, body)
+    return layer.with_(rig=Rig.of(body, config.limb, layer)) if config.joint_states else layer
+
+
+def _at_rest(config: NodeConfig, body: Body) -> SoftLayer:
     if config.tissue in get_args(Tone):
         return living(body, config.limb, cast(Tone, config.tissue), edge_length=config.edge_length)
     if config.tissue != PAPER:
@@ -65,6 +74,8 @@ def check(config: NodeConfig, build: Build, changed: set[str] | None = None) -> 
                                f"or set tissue to '{PAPER}', which is one layer of your numbers.")  # fmt: skip
 
         Body.anny().level(config.limb)
+        if config.joint_states:
+            check_part(config.limb)
         stacked = config.tissue != PAPER
         if config.tissue in get_args(Tone):
             region_of(config.limb)
@@ -109,6 +120,9 @@ def warm_up(simulator: Simulator) -> None:
     vertex = int(np.linalg.norm(layer.vertices - layer.vertices.mean(axis=0), axis=1).argmin())
     push = np.concatenate([-0.01 * layer.normals[vertex], np.zeros(3)])
     state = State()
+    if layer.rig is not None:  # both ways of each kernel
+        simulator.move_to(simulator.skin.at_angles([1e-3] * len(layer.rig.joints)))
+        simulator.move_to(simulator.skin.at_angles(()))
     for away, wrench in ((0.009, push), (0.012, push), (0.009, None), (0.05, push)):
         pose[:3, 3] = layer.vertices[vertex] + away * layer.normals[vertex]
         simulator.step([Contact(tool, pose, wrench)])

@@ -27,6 +27,7 @@ from stmpl_core.tool import Tool
 from stmpl_core.tools import Tools
 from stmpl_core.toucher import margin_on
 from stmpl_ros.answering import Answering
+from stmpl_ros.bending import Bending
 from stmpl_ros.beside import Beside, Builders
 from stmpl_ros.calibration import Calibration
 from stmpl_ros.diagnosis import Tally, diagnostics, limits_status, skin_status
@@ -69,7 +70,8 @@ class SkinNode(LifecycleNode):
         self._twin = ""  # what the other node is that was told of
         self.calibration = Calibration(self, lambda: self.workshop, lambda e: self.set_body(youngs_modulus=e))
         self.hearing = Hearing(self, lambda: self.config, Tools(), self.tally)
-        self.answering = Answering(self, self.settings, self.hearing, self.tally, self.calibration)
+        self.bending = Bending(self, self.hearing, lambda: self.config)
+        self.answering = Answering(self, self.settings, self.hearing, self.tally, self.calibration, self.bending)
         self.hearing.on_tool, self.hearing.on_instant = self._on_tool, self.answering.answer
         self.hearing.on_removed = self._on_removed
         self._offer("reset", self.reset)
@@ -110,6 +112,7 @@ class SkinNode(LifecycleNode):
         self.diagnostics = managed(self, DiagnosticArray, "/diagnostics", STREAM)
         self.answering.open()
         self.hearing.open()
+        self.bending.open()
         self.clocks = [self.create_timer(1 / FADE_RATE, self._fade), self.create_timer(1.0, self._diagnose)]
         self.settings.locked = True
         gc.collect()
@@ -192,6 +195,7 @@ class SkinNode(LifecycleNode):
             for timer in self.clocks:
                 self.destroy_timer(timer)
             self.hearing.close()
+            self.bending.close()
             self.destroy_lifecycle_publisher(self.diagnostics)
             self.sending.close()
         self._end()
@@ -299,6 +303,7 @@ class SkinNode(LifecycleNode):
     def _fade(self) -> None:
         if self.active:
             self.answering.fade_if_silent()
+            self.answering.follow()
 
     def _diagnose(self) -> None:
         if not self.active:
@@ -315,7 +320,10 @@ class SkinNode(LifecycleNode):
             "another skin": "being made" if self._making else "",
             "presses kept": str(len(self.calibration.presses)),
         }
-        bad = bool(self.tally.refused or self.tally.stale or inbox.out_of_order or events.missed_deadlines)
+        if self.config.joint_states:
+            values["joints"] = self.bending.doubt or " ".join(f"{x:.4f}" for x in self.answering.simulator.skin.angles)
+        bad = bool(self.bending.doubt or self.tally.refused or self.tally.stale or inbox.out_of_order
+                   or events.missed_deadlines)  # fmt: skip
         name = self.get_fully_qualified_name()
         statuses = [skin_status(name, values, bad, self.answering.fading)]
         if self.answering.limits:

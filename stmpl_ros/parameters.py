@@ -59,6 +59,14 @@ class NodeConfig(BaseModel):
     density: float = Field(
         default=1e3, gt=0, le=1e5, description="density of the paper's layer [kg/m3]", json_schema_extra=CONFIGURING
     )
+    joint_states: str = Field(
+        default="", json_schema_extra=CONFIGURING,
+        description="topic of sensor_msgs/JointState that bends the limb, an arm or a leg; empty: it stays at rest",
+    )  # fmt: skip
+    joints: str = Field(
+        default="", json_schema_extra=CONFIGURING,
+        description="names of the limb's joints in these messages where they are not its own: 'left_elbow=elbow_2'",
+    )  # fmt: skip
     friction: str = Field(
         default="", json_schema_extra=CONFIGURING,
         description="friction of tools on skin: a coefficient, or dry, moist, oiled, glove, typical; or by tool: "
@@ -148,6 +156,12 @@ class NodeConfig(BaseModel):
         friction_from(text)
         return text
 
+    @field_validator("joints")
+    @classmethod
+    def _joints(cls, text: str) -> str:
+        _named(text, "joint=name", "left_elbow=elbow_2")
+        return text
+
     @field_validator("gz_contacts")
     @classmethod
     def _collisions(cls, text: str) -> str:
@@ -163,6 +177,11 @@ class NodeConfig(BaseModel):
     def gz_collisions(self) -> dict[str, str]:
         """The collision of each tool that takes its wrench from Gazebo."""
         return _named(self.gz_contacts)
+
+    @property
+    def joint_names(self) -> dict[str, str]:
+        """Names of joints in joint states, by the limb's own, where they differ."""
+        return _named(self.joints, "joint=name", "left_elbow=elbow_2")
 
     def new_method(self) -> Method:
         """The method, not yet prepared."""
@@ -186,12 +205,12 @@ class NodeConfig(BaseModel):
         return ["--ros-args"] + [part for name, value in values for part in ("-p", f"{name}:={json.dumps(value)}")]
 
 
-def _named(text: str) -> dict[str, str]:
-    """tool=collision, parted by blanks. Raises ValueError."""
+def _named(text: str, what: str = "tool=collision", example: str = "finger=robot::tip::collision") -> dict[str, str]:
+    """name=other name, parted by blanks. Raises ValueError."""
     pairs = [pair.partition("=") for pair in text.split()]
     for tool, _, collision in pairs:
         if not tool or not collision:
-            raise ValueError(f"'{text}' is no tool=collision, as in 'finger=robot::tip::collision'")
+            raise ValueError(f"'{text}' is no {what}, as in '{example}'")
     return {tool: collision for tool, _, collision in pairs}
 
 

@@ -22,11 +22,13 @@ class Before(NamedTuple):
         state: memory of the tissue before them; None: none, elastic skin.
         dt: time since that state [s].
         friction: coefficient of friction of each tool [-].
+        joints: angle of each joint of the skin's rig [rad]; empty: at rest.
     """
 
     state: State | None
     dt: float
     friction: Mapping[str, float]
+    joints: tuple[float, ...] = ()
 
 
 ELASTIC = Before(None, 0.0, {})
@@ -70,10 +72,12 @@ class Remembering:
         """
         if not simulator.remembers:
             touches, before, after = simulator.touch(instant.contacts), ELASTIC, None
+            if simulator.skin.angles:
+                before = before._replace(joints=simulator.skin.angles)
         else:
             dt = max(instant.stamp - self._stamp, 0) / NANO if self._stamp else 0.0
             friction = {one.name: simulator.history.friction(one.name) for one in instant.contacts}
-            before = Before(self.state, dt, friction)
+            before = Before(self.state, dt, friction, simulator.skin.angles)
             touches, after = simulator.touch(instant.contacts, self.state, dt)
         if not all(np.isfinite(touch.wrench).all() for touch in touches) or not (after is None or after.finite):
             statuses = {touch.name: touch.status for touch in touches}

@@ -16,6 +16,7 @@ from stmpl_msgs.msg import LocalContact, SkinDeformed, SkinDisplacement, SkinTop
 
 from bags import wire
 from bags.frame import Stamps
+from stmpl_core.posing import posed
 from stmpl_core.skin import Skin
 from stmpl_core.touch import APART, PRESSING, Answer, Touch
 from stmpl_ros.gate import Gate
@@ -96,9 +97,10 @@ class Sending:
         )  # fmt: skip
         self._sequence += 1
         self._displacement.publish(message)
-        self.show.put(answer, stamp)
+        joints = tuple(message.joints)
+        self.show.put(answer, stamp, joints)
         if self._deformed.get_subscription_count():
-            self._deformed.publish(wire.deformed_message(message, self._skin.layer.vertices))
+            self._deformed.publish(wire.deformed_message(message, posed(self._skin.layer, joints).vertices))
 
     def reaction(self, instant: Instant, touches: Touches) -> None:
         """Sends the tools' wrenches."""

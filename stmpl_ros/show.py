@@ -15,6 +15,7 @@ from visualization_msgs.msg import Marker
 
 from bags.wire import NANO, header
 from stmpl_core.layer import SoftLayer
+from stmpl_core.posing import posed
 from stmpl_core.trust import Displacement
 from stmpl_ros.topics import SHOWN, managed
 
@@ -49,9 +50,9 @@ class Show:
         """Sets the rate of both topics [Hz]."""
         self._timer.timer_period_ns = round(NANO / rate)
 
-    def put(self, answer: Displacement, stamp_ns: int) -> None:
-        """Takes the newest answer."""
-        self._newest = answer, stamp_ns
+    def put(self, answer: Displacement, stamp_ns: int, joints: tuple[float, ...] = ()) -> None:
+        """Takes the newest answer, and the angles of the layer's joints [rad] that it was given at."""
+        self._newest = answer, stamp_ns, joints
 
     def close(self) -> None:
         """Closes both topics."""
@@ -62,13 +63,14 @@ class Show:
     def _show(self) -> None:
         if self._newest is None or not self._marker.is_activated:
             return
-        newest = answer, stamp = self._newest
+        newest = answer, stamp, joints = self._newest
         looked_at = [publisher for publisher in (self._marker, self._points) if publisher.get_subscription_count()]
+        here = posed(self._layer, joints).vertices if looked_at else None
         if self._points in looked_at:
-            self._points.publish(self._cloud.frame(answer, stamp))
+            self._points.publish(self._cloud.frame(answer, stamp, here))
         if self._marker in looked_at:
             self._made = self._made or SkinMarker(self._layer, self._frame)
-            self._marker.publish(self._made.frame(answer.displacement, stamp))
+            self._marker.publish(self._made.frame(answer.displacement, stamp, here))
         if looked_at and self._newest is newest:  # a newer one may have come, on the thread of the fields
             self._newest = None
 
@@ -100,12 +102,12 @@ class SkinMarker:
         self._points = np.frombuffer(self._bytes, "<f8", 3 * count, points_at).reshape(-1, 3)
         self._colors = np.frombuffer(self._bytes, "<f4", 4 * count, colors_at).reshape(-1, 4)
 
-    def frame(self, displacement: np.ndarray, stamp_ns: int) -> bytes:
-        """The serialised marker of the skin moved by `displacement` (V, 3) [m]."""
+    def frame(self, displacement: np.ndarray, stamp_ns: int, here: np.ndarray | None = None) -> bytes:
+        """The serialised marker of the skin moved by `displacement` (V, 3) [m] from `here`, (V, 3) [m]; None: rest."""
         struct.pack_into("<iI", self._bytes, STAMP_AT, *divmod(stamp_ns, NANO))
         share = np.clip(np.linalg.norm(displacement, axis=1) / self._scale, 0, 1)
         colors = np.stack([np.interp(share, (0, 0.5, 1), STOPS[:, k]) for k in range(3)], axis=1)
-        self._points[:] = (self._rest + displacement)[self._corners]
+        self._points[:] = ((self._rest if here is None else here) + displacement)[self._corners]
         self._colors[:, :3] = colors[self._corners]
         return bytes(self._bytes)
 
@@ -127,10 +129,10 @@ class SkinCloud:
             PointField(name=name, offset=4 * k, datatype=PointField.FLOAT32, count=1) for k, name in enumerate(FIELDS)
         ]
 
-    def frame(self, answer: Displacement, stamp_ns: int) -> PointCloud2:
-        """The cloud of an answer."""
+    def frame(self, answer: Displacement, stamp_ns: int, here: np.ndarray | None = None) -> PointCloud2:
+        """The cloud of an answer, its skin moved from `here`, (V, 3) [m]; None: rest."""
         values, step = self._values, self._values.strides[0]
-        np.add(self._rest, answer.displacement, out=values[:, :3], casting="unsafe")
+        np.add(self._rest if here is None else here, answer.displacement, out=values[:, :3], casting="unsafe")
         values[:, 3] = 1e3 * answer.magnitude
         values[:, 4] = 0 if answer.pressure is None else 1e-3 * answer.pressure
         cloud = PointCloud2(header=header(self._frame, stamp_ns), height=1, width=len(values), fields=self._fields)

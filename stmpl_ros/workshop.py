@@ -15,6 +15,8 @@ from stmpl_core.friction import Friction
 from stmpl_core.history import History
 from stmpl_core.layer import SoftLayer
 from stmpl_core.local_contact import LocalContact, local_contacts
+from stmpl_core.methods.zero import Zero
+from stmpl_core.skin import Skin
 from stmpl_core.state import State
 from stmpl_core.stiffness import Stiffness, fit_stiffness
 from stmpl_core.tool import Tool
@@ -54,7 +56,8 @@ class Workshop:
 
     def models(self, contacts: Sequence[Contact], before: Before, do: Then) -> None:
         """Has the local model of each contact found, beside the others and as the tissue remembers, for `do`."""
-        self._then(self._modeller().submit(_local_contacts, list(contacts), before.state, before.dt), do)
+        self._then(self._modeller().submit(_local_contacts, list(contacts), before.state, before.dt,
+                                             before.joints), do)
 
     def stiffness(self, presses: Sequence[Contact]) -> Future[Stiffness]:
         """Fits the skin's stiffness to these presses: for a thread that waits."""
@@ -107,19 +110,27 @@ def then(node: Node, future: Future, do: Then) -> None:
 # In the process that knows the layer
 
 _history: History
+_skin: Skin | None = None  # where its joints are; None: it has none
 
 
 def _know(layer: SoftLayer, friction: Friction | Mapping[str, Friction]) -> None:
     import numba
     from threadpoolctl import threadpool_limits
 
-    global _history
+    global _history, _skin
     numba.set_num_threads(1)  # what answers goes first
     threadpool_limits(1, user_api="blas")
     _history = History(Toucher(layer), friction)
+    if layer.rig is not None:
+        _skin = Skin.of(layer, Zero())
 
 
-def _local_contacts(contacts: list[Contact], state: State | None, dt: float) -> list[LocalContact]:
+def _local_contacts(contacts: list[Contact], state: State | None, dt: float,
+                    joints: tuple[float, ...] = ()) -> list[LocalContact]:  # fmt: skip
+    global _history, _skin
+    if _skin is not None and _skin.angles != joints:
+        _skin = _skin.at_angles(joints)
+        _history = _history.moved(_history.toucher.moved(_skin))
     if state is None:
         return local_contacts(_history, _history.toucher.touch_all(contacts))
     touches, after = _history.step(contacts, state, dt)
@@ -127,6 +138,10 @@ def _local_contacts(contacts: list[Contact], state: State | None, dt: float) -> 
 
 
 def _stiffness(presses: list[Contact]) -> Stiffness:
+    global _history, _skin
+    if _skin is not None and _skin.rest is not None:  # presses are kept at rest only
+        _skin = _skin.rest
+        _history = _history.moved(_history.toucher.moved(_skin))
     presses.sort(key=lambda one: 0.0 if one.wrench is None else float(np.linalg.norm(one.wrench[:3])))
     chosen = np.unique(np.linspace(0, len(presses) - 1, MAX_FITTED_PRESSES).astype(int)) if presses else []
     return fit_stiffness(_history.toucher, [presses[k] for k in chosen])

@@ -93,7 +93,8 @@ def topology(layer: SoftLayer) -> Any:
                    vertices=layer.vertices.astype(np.float32).ravel(), triangles=layer.faces.astype(np.uint32).ravel(),
                    thickness=layer.thickness.astype(np.float32), youngs_modulus=layer.tissue.youngs_modulus,
                    poisson_ratio=layer.tissue.poisson_ratio, density=layer.tissue.density,
-                   core=np.zeros(0, np.float32), stack="")  # fmt: skip
+                   core=np.zeros(0, np.float32), stack="", rig="",
+                   rig_weights=np.zeros(0, np.float32))  # fmt: skip
 
 
 def displacement(answer: Answer, layer: SoftLayer, stamp: int, sequence: int, state: State | None = None,
@@ -106,7 +107,7 @@ def displacement(answer: Answer, layer: SoftLayer, stamp: int, sequence: int, st
                    method=answer.method, converged=trust.converged, in_range=trust.in_range,
                    error_bound=float("nan") if trust.error_bound is None else trust.error_bound, why=trust.why,
                    touches=[touched(touch, stamp) for touch in answer.touches.values()],
-                   fade=1.0, solve_seconds=0.001, dt=dt,
+                   fade=1.0, solve_seconds=0.001, dt=dt, joints=np.zeros(0),
                    state=np.frombuffer(b"" if state is None else state.pack(), np.uint8))  # fmt: skip
 
 

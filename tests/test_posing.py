@@ -57,7 +57,7 @@ def long_limb(edge: float = 5e-3) -> SoftLayer:
 @pytest.fixture(scope="module")
 def skin() -> Skin:
     layer = limb(4e-3)
-    return Skin.of(layer, MomentNet(), hinged(layer))
+    return Skin.of(layer.with_(rig=hinged(layer)), MomentNet())
 
 
 def test_bent_and_back_at_rest_every_answer_is_what_it_was_to_the_last_bit(skin):
@@ -87,7 +87,7 @@ def test_when_all_bones_move_as_one_the_answer_turns_with_them(tissue):
     if not tissue.single:
         layer = to_bone(layer, [Bone(np.array([0.0, 0, -1]), np.array([0.0, 0, 1]), 0.012)])
     rig = carried_whole(layer)
-    skin = Skin.of(layer, MomentNet(), rig)
+    skin = Skin.of(layer.with_(rig=rig), MomentNet())
     motion = rig.motions((0.9,))[1]
     pose = pressed(layer, near(layer, (RADIUS, 0, 0.08)))
     rest = Simulator(skin).step([Contact(ball(), pose)])
@@ -105,7 +105,7 @@ def test_when_all_bones_move_as_one_the_answer_turns_with_them(tissue):
 @pytest.mark.parametrize("place", [(RADIUS, 0, 0.04), (-RADIUS, 0, 0.12)])
 def test_beside_a_bend_a_posed_skin_answers_as_one_made_afresh(place):
     layer = long_limb()
-    moved = Simulator(Skin.of(layer, MomentNet(), hinged(layer, 0.03)).posed({"elbow": 0.6}))
+    moved = Simulator(Skin.of(layer.with_(rig=hinged(layer, 0.03)), MomentNet()).posed({"elbow": 0.6}))
     here = moved.layer
     afresh = Simulator(SoftLayer(here.vertices, here.faces, here.thickness, tissue=here.tissue), MomentNet())
     contact = Contact(ball(), pressed(here, near(layer, place)))
@@ -116,7 +116,7 @@ def test_beside_a_bend_a_posed_skin_answers_as_one_made_afresh(place):
 
 def test_a_stack_beside_a_bend_answers_as_one_made_afresh():
     layer = to_bone(long_limb().with_(tissue=STACK), [Bone(np.array([0.0, 0, -1]), np.array([0.0, 0, 1]), 0.012)])
-    moved = Simulator(Skin.of(layer, MomentNet(), hinged(layer, 0.03)).posed({"elbow": 0.5}))
+    moved = Simulator(Skin.of(layer.with_(rig=hinged(layer, 0.03)), MomentNet()).posed({"elbow": 0.5}))
     here = moved.layer
     assert here.core is not None and np.linalg.norm(here.core - layer.core, axis=1).max() > 0.02
     afresh = Simulator(SoftLayer(here.vertices, here.faces, core=here.core, tissue=here.tissue), MomentNet())
@@ -128,7 +128,7 @@ def test_a_stack_beside_a_bend_answers_as_one_made_afresh():
 
 def test_the_inside_of_a_bend_is_flagged_and_says_why_and_what_is_far_from_it_is_not(skin):
     layer = long_limb()
-    moved = Simulator(Skin.of(layer, MomentNet(), hinged(layer)).posed({"elbow": 1.0}))
+    moved = Simulator(Skin.of(layer.with_(rig=hinged(layer)), MomentNet()).posed({"elbow": 1.0}))
     inside = near(layer, (RADIUS, 0, 0.08))  # it turns about +y, so what is above goes towards +x
     answer = moved.step([Contact(ball(), pressed(moved.layer, inside))])
     assert not answer.trust.in_range and "the limb is bent so that" in answer.trust.why
@@ -140,7 +140,7 @@ def test_skin_that_comes_near_through_the_air_feels_nothing():
     body = Body.anny()
     layer = body.part("left_arm", edge_length=6e-3)
     rig = Rig.of(body, "left_arm", layer)
-    moved = Simulator(Skin.of(layer, MomentNet(), rig).posed({"left_elbow": 1.6}))
+    moved = Simulator(Skin.of(layer.with_(rig=rig), MomentNet()).posed({"left_elbow": 1.6}))
     upper, lower = (np.flatnonzero(rig.weights[:, k] > 0.9) for k in (0, 1))
     gaps = np.linalg.norm(moved.layer.vertices[upper][:, None] - moved.layer.vertices[lower], axis=2)
     a, b = np.unravel_index(gaps.argmin(), gaps.shape)
@@ -152,14 +152,14 @@ def test_skin_that_comes_near_through_the_air_feels_nothing():
 
 def test_a_tool_that_rides_on_the_limb_does_not_slide_and_one_that_stays_in_space_does():
     layer = long_limb()
-    skin, tool = Skin.of(layer, MomentNet(), hinged(layer)), ball()
+    skin, tool = Skin.of(layer.with_(rig=hinged(layer)), MomentNet()), ball()
     vertex, forces = near(layer, (0, RADIUS, 0.20)), {}
     for rides in (True, False):
         simulator, state = Simulator(skin, friction=0.4), State()
         start = pressed(layer, vertex)
         for angle in np.linspace(0, 0.06, 7):
             state = simulator.pose({"elbow": float(angle)}, state)
-            pose = skin.rig.motions((float(angle),))[1] @ start if rides else start
+            pose = skin.layer.rig.motions((float(angle),))[1] @ start if rides else start
             touches, state = simulator.touch([Contact(tool, pose)], state, 0.02)
         assert touches[0].slip is not None
         forces[rides] = np.linalg.norm(touches[0].slip.wrench[:3]), touches[0].force
@@ -184,8 +184,8 @@ def test_a_skin_that_relaxes_comes_back_where_its_joints_took_it(skin):
     from stmpl_core.living import held_skin
 
     layer = held_skin(long_limb())
-    relaxing, tool = Skin.of(layer, MomentNet(), hinged(layer)), ball()
-    assert relaxing.rig is not None
+    relaxing, tool = Skin.of(layer.with_(rig=hinged(layer)), MomentNet()), ball()
+    assert relaxing.layer.rig is not None
     simulator, state = Simulator(relaxing), State()
     pose = pressed(layer, near(layer, (0, RADIUS, 0.20)), 3e-3)
     for _ in range(3):
@@ -195,7 +195,7 @@ def test_a_skin_that_relaxes_comes_back_where_its_joints_took_it(skin):
     _, state = simulator.touch([Contact(tool, away)], state, 0.01)
     stayed, _ = simulator.touch([Contact(tool, away)], state, 0.2)
     left = simulator.answer(stayed).displacement
-    motion = relaxing.rig.motions((0.5,))[1]
+    motion = relaxing.layer.rig.motions((0.5,))[1]
     went, _ = simulator.touch([Contact(tool, motion @ away)], simulator.pose({"elbow": 0.5}, state), 0.2)
     moved = simulator.answer(went).displacement
     assert np.abs(left).max() > 2e-4
@@ -204,18 +204,18 @@ def test_a_skin_that_relaxes_comes_back_where_its_joints_took_it(skin):
 
 def test_a_skin_is_named_by_its_rest_and_its_rig_wherever_its_joints_are(skin):
     names = {skin.layer_id, skin.posed({"elbow": 0.3}).layer_id}
-    assert len(names) == 1 and layer_id(skin.layer) not in names
-    assert names != {Skin.of(skin.layer, Winkler(), hinged(skin.layer, 0.03)).layer_id}
+    assert len(names) == 1 and layer_id(skin.layer.with_(rig=None)) not in names
+    assert names != {Skin.of(skin.layer.with_(rig=hinged(skin.layer, 0.03)), Winkler()).layer_id}
 
 
 def test_a_rig_comes_back_from_its_text_as_it_was(skin):
-    again = Rig.from_text(skin.rig.to_text(), skin.rig.weights.astype(np.float32))
-    assert again.digest == skin.rig.digest and again.joints == skin.rig.joints
-    assert again.weights.tobytes() == skin.rig.weights.tobytes()
+    again = Rig.from_text(skin.layer.rig.to_text(), skin.layer.rig.weights.astype(np.float32))
+    assert again.digest == skin.layer.rig.digest and again.joints == skin.layer.rig.joints
+    assert again.weights.tobytes() == skin.layer.rig.weights.tobytes()
 
 
 def test_what_cannot_be_is_refused_with_what_is_wrong(skin):
-    layer, rig = skin.layer, skin.rig
+    layer, rig = skin.layer, skin.layer.rig
     with pytest.raises(InvalidInput, match=r"unknown joint: knee. Available: elbow"):
         skin.posed({"knee": 0.1})
     with pytest.raises(InvalidInput, match="elbow is nan rad; it must be finite"):
@@ -223,9 +223,9 @@ def test_what_cannot_be_is_refused_with_what_is_wrong(skin):
     with pytest.raises(InvalidInput, match=r"elbow is 45 rad; it goes from -3.14 to 3.14 rad. Is it in degrees"):
         skin.posed({"elbow": 45.0})
     with pytest.raises(InvalidInput, match="this skin has no joints"):
-        Simulator(layer, Winkler()).pose({"elbow": 0.1})
+        Simulator(layer.with_(rig=None), Winkler()).pose({"elbow": 0.1})
     with pytest.raises(InvalidInput, match="weights of 1 vertices, the skin has"):
-        _ = replace(skin, rig=replace(rig, weights=np.array([[0.5, 0.5]]))).posing
+        layer.with_(rig=replace(rig, weights=np.array([[0.5, 0.5]])))
     with pytest.raises(InvalidInput, match="its rest, must be within"):
         Joint("elbow", "lower", (0, 1, 0), 0.1, 1.0)
     with pytest.raises(InvalidInput, match="an earlier one of each other"):
@@ -235,7 +235,7 @@ def test_what_cannot_be_is_refused_with_what_is_wrong(skin):
     with pytest.raises(InvalidInput, match="from the skin of this body"):
         Rig.of(Body.anny(), "left_arm", layer)
     with pytest.raises(InvalidInput, match="this is another skin"):
-        Simulator(skin).move_to(Skin.of(layer, Winkler(), rig))
+        Simulator(skin).move_to(Skin.of(layer.with_(rig=rig), Winkler()))
 
 
 def test_the_weights_of_an_arm_are_spread_so_that_its_inside_does_not_fold_at_sixty_degrees():
@@ -248,7 +248,7 @@ def test_the_weights_of_an_arm_are_spread_so_that_its_inside_does_not_fold_at_si
     raw = replace(rig, weights=_weights_on(body, layer, ["left_upper_arm", "left_forearm"]))
     folded = []
     for one in (raw, rig):
-        moved = Skin.of(layer, Winkler(), one).posed({"left_elbow": np.pi / 3}).layer
+        moved = Skin.of(layer.with_(rig=one), Winkler()).posed({"left_elbow": np.pi / 3}).layer
         folded.append(int((fold_ratios(moved.vertices, moved.inner_vertices, moved.faces) <= 0).sum()))
     assert folded[0] > 100 and folded[1] == 0
 

@@ -7,10 +7,11 @@ from collections.abc import Callable
 from fem_tools import RigidFem
 from stmpl_core.errors import InvalidInput
 from stmpl_core.layer import SoftLayer
+from stmpl_core.posing import posed
 from stmpl_core.trust import Displacement
 from stmpl_ros.latest import LatestWins
 from stmpl_ros.view.page import Page
-from stmpl_ros.view.snapshot import Snapshot
+from stmpl_ros.view.snapshot import Snapshot, joints_of
 
 NO_MEMORY = "FEM presses elastic skin without friction: where this answer remembers, their difference is no error."
 
@@ -26,6 +27,7 @@ class Judge:
     def __init__(self, page: Page, keep: Callable[[Snapshot, Snapshot], None]) -> None:
         self._page, self._keep = page, keep
         self._fem: tuple[SoftLayer, RigidFem] | None = None
+        self._bent: tuple[float, ...] = ()  # angles of the layer's joints that it was prepared at [rad]
         self._working = LatestWins(self._judge, page.say, "judge")
         button = page.server.gui.add_button("FEM of this instant", hint="Presses these tools by finite elements")
         button.on_click(lambda _: self.judge())
@@ -55,11 +57,11 @@ class Judge:
             self._page.field = "error against FEM"
 
     def _solve(self, snapshot: Snapshot) -> Displacement:
-        layer, answer = self._page.layer, snapshot.answer
+        layer, answer, joints = self._page.layer, snapshot.answer, joints_of(snapshot.answer)
         if layer is None:
             raise InvalidInput("there is no skin yet.")
-        if self._fem is None or self._fem[0] is not layer:
-            self._fem = layer, RigidFem().prepare(layer)
+        if self._fem is None or self._fem[0] is not layer or self._bent != joints:
+            self._fem, self._bent = (layer, RigidFem().prepare(posed(layer, joints))), joints
         touches = answer.touches
         pressing = [one for one in snapshot.contacts if one.name in touches and touches[one.name].presses]
         solved = self._fem[1].press(pressing, answer)

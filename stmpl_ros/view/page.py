@@ -14,11 +14,12 @@ from bags.wire import quaternion_from
 from stmpl_core.arrays import Transform
 from stmpl_core.contact import Contact
 from stmpl_core.layer import SoftLayer
+from stmpl_core.posing import posed
 from stmpl_core.tool import Tool
 from stmpl_ros.latest import LatestWins
 from stmpl_ros.view.fields import FIELDS
 from stmpl_ros.view.skin import Skin
-from stmpl_ros.view.snapshot import MM, Snapshot
+from stmpl_ros.view.snapshot import MM, Snapshot, joints_of
 from stmpl_ros.view.tools import place_on
 
 STEEL = (107, 118, 131)
@@ -198,7 +199,8 @@ class Page:
         if absent or self._message.content in {f.absent for f in FIELDS.values()}:
             self.say(field.absent if absent else "")
         self._figures.content = table(snapshot.rows(), loud=() if snapshot.answer.trust.ok else ("trust",))
-        skin.show(layer.vertices + snapshot.answer.displacement, field.paint(snapshot, top))
+        here = posed(layer, joints_of(snapshot.answer)).vertices
+        skin.show(here + snapshot.answer.displacement, field.paint(snapshot, top))
 
 
 def wxyz_of(pose: Transform) -> tuple[float, float, float, float]:

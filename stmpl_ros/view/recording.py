@@ -53,7 +53,7 @@ class Recording:
         gauge: Gauge | None = None
         shown: list[tuple[Snapshot, SoftLayer]] = []
         for number, frame in zip(numbers, run.bag.frames(numbers), strict=True):
-            layer = run.bag.layer_of(frame)
+            layer = run.bag.rest_of(frame)
             if gauge is None or shown[-1][1] is not layer:
                 gauge = Gauge(layer)
             shown.append((replace(_snapshot(run, number, frame, gauge), reference=judged.get(number)), layer))

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from bags.frame import Frame
 from stmpl_core.contact import Contact
 from stmpl_core.layer import SoftLayer
 from stmpl_core.methods import Naive
@@ -99,6 +100,11 @@ class Snapshot:
         return rows + ([("why", self.answer.trust.why)] if self.answer.trust.why else [])
 
 
+def joints_of(answer: Answer) -> tuple[float, ...]:
+    """Angle of each joint of the layer's rig [rad] that an answer was given at; empty: at rest."""
+    return answer.joints if isinstance(answer, Frame) else ()
+
+
 def verdict(snapshot: Snapshot) -> str:
     """Whether the answer may be believed, in three words or so."""
     trust = snapshot.answer.trust
@@ -114,7 +120,7 @@ class Gauge:
         self._simulator = Simulator(layer, Naive())  # the fastest; every method has the same touch
 
     def read(self, contacts: Sequence[Contact]) -> dict[str, Reading]:
-        """The reading of each contact by its name. Raises InvalidInput or MeshError."""
+        """The reading of each contact by its name, joints at rest. Raises InvalidInput or MeshError."""
         return readings_of(self._simulator.answer(self._simulator.touch(contacts)))
 
 
