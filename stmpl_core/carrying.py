@@ -6,6 +6,7 @@ friction feels a tool's way along the skin, not through space, and a tool that r
 
 from __future__ import annotations
 
+from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -22,32 +23,25 @@ def carried(state: State, before: Skin, after: Skin) -> State:
     """The memory of tissue that its joints took from one pose of its skin to another."""
     if not state.tools:
         return state
-    go = _Carrier(before, after)
-    return State({name: _memory(memory, go) for name, memory in state.tools.items()})
+    return State({name: _memory(memory, before, after) for name, memory in state.tools.items()})
 
 
-class _Carrier:
-    """Rigid motion of the skin around a place between two poses: that of the vertex that is nearest to it."""
-
-    def __init__(self, before: Skin, after: Skin) -> None:
-        self.before, self.after = before, after
-
-    def at(self, place: np.ndarray) -> Transform:
-        """Motion of the skin near a place (3,) [m] of the first pose, (4, 4)."""
-        start, end = self.before.layer.vertices, self.after.layer.vertices
-        away = start - place
-        nearest = int(np.argmin(np.einsum("vx,vx->v", away, away)))
-        out = np.eye(4)
-        out[:3, :3] = self.after.turn_at(nearest) @ self.before.turn_at(nearest).T
-        out[:3, 3] = end[nearest] - out[:3, :3] @ start[nearest]
-        return out
+def carry_at(before: Skin, after: Skin, place: np.ndarray) -> Transform:
+    """Rigid motion of the skin near a place (3,) [m] from one pose to another, (4, 4): that of the nearest vertex."""
+    start, end = before.layer.vertices, after.layer.vertices
+    away = start - place
+    nearest = int(np.argmin(np.einsum("vx,vx->v", away, away)))
+    out = np.eye(4)
+    out[:3, :3] = after.turn_at(nearest) @ before.turn_at(nearest).T
+    out[:3, 3] = end[nearest] - out[:3, :3] @ start[nearest]
+    return out
 
 
-def _memory(memory: Memory, go: _Carrier) -> Memory:
-    trail = carried_trail(memory.trail, go.at)
+def _memory(memory: Memory, before: Skin, after: Skin) -> Memory:
+    trail = carried_trail(memory.trail, partial(carry_at, before, after))
     if not memory.scalars.radius > 0:  # it never touched: where it is, it is in space
         return memory._replace(trail=trail)
-    motion = go.at(memory.contact[0])
+    motion = carry_at(before, after, memory.contact[0])
     turn = motion[:3, :3]
     middle, normal, tangent = memory.contact
     contact = np.stack([turn @ middle + motion[:3, 3], turn @ normal, turn @ tangent])

@@ -14,11 +14,13 @@ from stmpl_core.errors import InvalidInput
 from stmpl_core.friction import Friction
 from stmpl_core.layer import SoftLayer
 from stmpl_core.methods.base import Method
+from stmpl_core.rig import Rig
 from stmpl_core.simulator import Simulator
 from stmpl_core.skin import Skin
 from stmpl_core.tool import Tool
 from stmpl_core.touch import Answer, Touch
 from stmpl_sim.engine import mujoco
+from stmpl_sim.jointed import POSE_STEP, Jointed
 from stmpl_sim.protocol import Memory, Poses, Reaction, SoftContact
 
 MOST_NAMES = 30  # names of a model that an error lists
@@ -57,6 +59,8 @@ class SoftBody:
         damping: see SoftContact [s/m].
         implicit: see SoftContact; MuJoCo gives the mobility.
         friction: see SoftContact.
+        joints: hinge of the model by the joint of the layer's rig that it turns, as {"left_elbow": "elbow"}: the limb
+            bends with it, and the hinge's body feels what presses on that side of it. `body` carries the rig's root.
 
     Attributes:
         contact: the SoftContact.
@@ -81,16 +85,23 @@ class SoftBody:
         damping: float = 0.0,
         implicit: bool = False,
         friction: Friction | Mapping[str, Friction] = None,
+        joints: Mapping[str, str] | None = None,
     ) -> None:
         self.model = model
         self.body = _body(model, body)
         if isinstance(tools, str):
             raise InvalidInput(f"tools is the text '{tools}'; give a list of names: ['{tools}'].")
         self._sources = {name: _source(model, name) for name in tools}
+        self._jointed = Jointed(model, _rig_of(layer), joints, self.body) if joints else None
+        limbs = {self.body} if self._jointed is None else set(self._jointed.bodies)
         for name, source in self._sources.items():
-            if model.body_weldid[source.body] == model.body_weldid[self.body] and source.body != 0:
-                raise InvalidInput(f"'{name}' is part of '{body}', or rigidly joined to it: it cannot touch its skin.")
-            _check_no_rigid_contact(model, self.body, source)
+            for limb in limbs:
+                if model.body_weldid[source.body] == model.body_weldid[limb] and source.body != 0:
+                    whose = model.body(limb).name
+                    raise InvalidInput(f"'{name}' is part of '{whose}', or rigidly joined to it: it cannot touch its "
+                                       "skin.")  # fmt: skip
+                _check_no_rigid_contact(model, limb, source)
+        self._posed: dict[str, float] = {}
         made = [_tool(model, name, self._sources[name]) for name in tools]
         self.contact = SoftContact(layer, made, method, pose_body_from_layer=pose_body_from_layer, damping=damping,
                                    implicit=implicit, friction=friction)  # fmt: skip
@@ -124,10 +135,35 @@ class SoftBody:
             self.memory = Memory()
         dt = 0.0 if self._time is None else max(0.0, data.time - self._time)
         mobility = None if self._jacobians is None else lambda name, at, along: self._mobility(data, name, at, along)
-        self.reaction = self.contact.step(self.poses(data), self.memory, dt, mobility)
+        poses = self.poses(data)
+        if self._jointed is None:
+            self.reaction = self.contact.step(poses, self.memory, dt, mobility)
+        else:
+            self.reaction = self._step_bent(self._jointed, data, poses, dt, mobility)
         self.memory, self._time = self.reaction.memory, float(data.time)
         self._push(data, self.reaction)
         return self.reaction.touches
+
+    def _step_bent(self, jointed: Jointed, data: Any, poses: Poses, dt: float, mobility: Any) -> Reaction:
+        """A step of a limb whose joints move."""
+        now = jointed.angles(data)
+        if not self._posed or max(abs(now[name] - self._posed[name]) for name in now) > POSE_STEP:
+            self.memory, self._posed = self.contact.pose(now, self.memory), now
+        world = poses.body @ self.contact.pose_body_from_layer
+        backs = {}
+        for name, pose in poses.tools.items():
+            place = world[:3, :3].T @ (pose[:3, 3] - world[:3, 3])
+            back = jointed.back(place, self.simulator.layer.vertices, self._posed, now)
+            backs[name] = world @ back @ np.linalg.inv(world)
+        there = Poses(poses.body, {name: backs[name] @ pose for name, pose in poses.tools.items()})
+        made = self.contact.step(there, self.memory, dt, mobility)
+        tools, on_body = {}, np.zeros(6)
+        for name, wrench in made.tools.items():
+            turn = backs[name][:3, :3].T
+            tools[name] = np.concatenate([turn @ wrench[:3], turn @ wrench[3:]])
+            lever = poses.tools[name][:3, 3] - poses.body[:3, 3]
+            on_body -= tools[name] + np.concatenate([np.zeros(3), np.cross(lever, tools[name][:3])])
+        return Reaction(tools, on_body, made.touches, made.memory)
 
     def poses(self, data: Any) -> Poses:
         """Places of body and tools in `data`."""
@@ -152,26 +188,45 @@ class SoftBody:
         """Takes the wrenches out of `data`, and forgets."""
         ledger = _ledger(data)
         ledger.replace(data, self, {})
-        self.memory, self.reaction, self._time = Memory(), None, None
+        self.memory, self.reaction, self._time, self._posed = Memory(), None, None, {}
 
     def _push(self, data: Any, reaction: Reaction) -> None:
         rows: dict[int, Wrench] = {}
         for name, source in self._sources.items():
             at = data.xpos[source.body] if source.geom is None else data.geom_xpos[source.geom]
             _add(rows, source.body, reaction.tools[name], at - data.xipos[source.body])
-        _add(rows, self.body, reaction.body, data.xpos[self.body] - data.xipos[self.body])
+            if self._jointed is not None and reaction.tools[name].any():
+                for limb, share in zip(self._jointed.bodies, self._jointed.on(reaction.touches[name]), strict=True):
+                    if share > 0:
+                        _add(rows, limb, -share * reaction.tools[name], at - data.xipos[limb])
+        if self._jointed is None:
+            _add(rows, self.body, reaction.body, data.xpos[self.body] - data.xipos[self.body])
         _ledger(data).replace(data, self, rows)
+
+    def _limb_under(self, name: str) -> int:
+        """Number of the body that carried most of a tool's last touch; without one or without joints, the skin's."""
+        touch = None if self.reaction is None else self.reaction.touches.get(name)
+        if self._jointed is None or touch is None or touch.pressure is None or not touch.pressure.any():
+            return self.body
+        return self._jointed.bodies[int(self._jointed.on(touch).argmax())]
 
     def _mobility(self, data: Any, name: str, at: np.ndarray, along: np.ndarray) -> float:
         """Acceleration of the tool against the body along `along` for 1 N between them there [1/kg]."""
         assert self._jacobians is not None
         tool, body = self._jacobians
         mujoco.mj_jac(self.model, data, tool, None, at, self._sources[name].body)
-        mujoco.mj_jac(self.model, data, body, None, at, self.body)
+        mujoco.mj_jac(self.model, data, body, None, at, self._limb_under(name))
         row = (along @ (tool - body))[None]
         out = np.zeros_like(row)
         mujoco.mj_solveM(self.model, data, out, row)
         return float(out[0] @ row[0])
+
+
+def _rig_of(layer: SoftLayer | Skin | Simulator) -> Rig | None:
+    """The rig of a layer at rest, if it has one."""
+    if isinstance(layer, Simulator):
+        layer = layer.skin
+    return (layer.rest or layer).layer.rig if isinstance(layer, Skin) else layer.rig
 
 
 class _Ledger:

@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike
 from scipy.spatial import KDTree
 
 from stmpl_core.arrays import Transform, Wrench, finite
+from stmpl_core.carrying import carry_at
 from stmpl_core.contact import Contact
 from stmpl_core.errors import InvalidInput
 from stmpl_core.friction import Friction
@@ -142,9 +143,8 @@ class SoftContact:
         self.damping, self.implicit = damping, implicit
         self.pose_body_from_layer = _rigid("pose_body_from_layer", np.eye(4) if pose_body_from_layer is None
                                            else pose_body_from_layer)  # fmt: skip
-        skin = self.simulator.layer
         self._far = FAR_HOLES * self.simulator.toucher.hole
-        self._tree = KDTree(skin.vertices)
+        self._tree = KDTree((self.simulator.skin.rest or self.simulator.skin).layer.vertices)
         self._balls = {}
         for tool in tools:
             low, high = self.simulator.tools.field(tool).tool_bounds
@@ -211,6 +211,21 @@ class SoftContact:
             on_body += np.concatenate([force, torque + np.cross(lever, force)])
         return Reaction(wrenches, on_body, touches, Memory(tissue, at, speed))
 
+    def pose(self, joints: Mapping[str, float], memory: Memory) -> Memory:
+        """Takes the skin to where its joints are now (milliseconds); the memory, gone along with it.
+
+        Args:
+            joints: angle by the joint's name [rad].
+            memory: memory of the step before.
+
+        Raises:
+            InvalidInput: see Simulator.pose.
+        """
+        before = self.simulator.skin
+        tissue = self.simulator.pose(joints, memory.tissue)
+        at = {name: carry_at(before, self.simulator.skin, pose[:3, 3]) @ pose for name, pose in memory.at.items()}
+        return Memory(tissue, at, memory.speed)
+
     def answer(self, reaction: Reaction) -> Answer:
         """The displacement of the skin under a reaction of this contact, layer axes."""
         return self.simulator.answer(list(reaction.touches.values()))
@@ -219,10 +234,14 @@ class SoftContact:
         """Whether a tool is outside of the skin and farther from it than the contact law looks."""
         middle, radius = self._balls[name]
         centre = pose[:3, :3] @ middle + pose[:3, 3]
-        gap, nearest = self._tree.query(centre)
+        layer = self.simulator.layer
+        if self.simulator.skin.rest is None:
+            gap, nearest = self._tree.query(centre)
+        else:  # a tree pays for itself only where the skin stays
+            nearest = int(((layer.vertices - centre) ** 2).sum(axis=1).argmin())
+            gap = np.linalg.norm(layer.vertices[nearest] - centre)
         if gap < radius + self._far:
             return False
-        layer = self.simulator.layer
         return bool((centre - layer.vertices[nearest]) @ layer.normals[nearest] > 0.5 * gap)
 
     def _factor(

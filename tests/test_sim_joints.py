@@ -1,0 +1,110 @@
+"""A limb whose hinge belongs to the simulator: its skin goes along, each side of it feels its own touches."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from stmpl_core import Contact, Simulator, Skin
+from stmpl_core.errors import InvalidInput
+from stmpl_core.methods import Winkler
+from stmpl_sim import SoftBody
+from tests.scenes import RADIUS, at, limb
+from tests.test_posing import MIDDLE, hinged
+
+mujoco = pytest.importorskip("mujoco", reason="pip install 'stmpl[sim]'")
+
+BALL = 0.012  # m
+XML = """
+<mujoco><option timestep="1e-3" gravity="0 0 0"/><worldbody>
+  <body name="upper"><geom name="humerus" type="capsule" fromto="0 0 .01 0 0 .07" size=".01" mass="1"/>
+    <body name="lower" pos="0 0 {z}">
+      <joint name="hinge" type="{kind}" axis="0 1 0" damping=".02"/>
+      <geom name="ulna" type="capsule" fromto="0 0 .01 0 0 .07" size=".01" mass=".5"/></body></body>
+  <body name="bob" mocap="true" pos="{at}"><geom name="ball" type="sphere" size=".012"/></body>
+</worldbody><contact><exclude body1="upper" body2="bob"/><exclude body1="lower" body2="bob"/></contact></mujoco>"""
+
+
+@pytest.fixture(scope="module")
+def skin() -> Skin:
+    layer = limb(4e-3, youngs_modulus=20e3)
+    return Skin.of(layer.with_(rig=hinged(layer)), Winkler())
+
+
+def made(skin: Skin, place: np.ndarray, kind: str = "hinge", joints: dict[str, str] | None = None) -> tuple[Any, ...]:
+    """Model, data and skin, with a ball of 12 mm there."""
+    text = XML.format(z=MIDDLE[2], kind=kind, at=" ".join(f"{x:.9g}" for x in place))
+    model = mujoco.MjModel.from_xml_string(text)
+    return model, mujoco.MjData(model), SoftBody(model, skin, body="upper", tools=["ball"],
+                                                 joints=joints or {"elbow": "hinge"})  # fmt: skip
+
+
+def on_the_lower_part(skin: Skin, angle: float, depth: float = 2e-3) -> np.ndarray:
+    """Place of the ball on the skin that goes with the hinge, (3,) [m]."""
+    assert skin.layer.rig is not None
+    motion = skin.layer.rig.motions((angle,))[1]
+    return motion[:3, :3] @ [RADIUS + BALL - depth, 0, 0.13] + motion[:3, 3]
+
+
+def test_the_wrench_is_that_of_the_bent_skin_and_the_hinges_body_feels_it(skin: Skin) -> None:
+    place = on_the_lower_part(skin, 0.3)
+    model, data, soft = made(skin, place)
+    data.qpos[0] = 0.3
+    touch = soft.apply(data)["ball"]
+    truth = Simulator(skin.posed({"elbow": 0.3})).touch([Contact(soft.contact.tools["ball"], at(*place))])[0]
+    assert truth.force > 0.1
+    np.testing.assert_allclose(touch.wrench, truth.wrench, atol=1e-6 * truth.force)
+    bodies = {name: data.xfrc_applied[model.body(name).id] for name in ("upper", "lower", "bob")}
+    np.testing.assert_allclose(sum(bodies.values())[:3], 0, atol=1e-9)
+    np.testing.assert_allclose(bodies["lower"][:3], truth.wrench[:3], atol=1e-3 * truth.force)
+
+
+def test_who_presses_beyond_the_hinge_turns_it_away_and_the_balance_of_angular_momentum_holds(skin: Skin) -> None:
+    place = on_the_lower_part(skin, 0.0)
+    model, data, soft = made(skin, place)
+    for _ in range(400):
+        mujoco.mj_step1(model, data)
+        soft.apply(data)
+        mujoco.mj_step2(model, data)
+    assert data.qpos[0] < -0.005  # the ball is on the side of +x: it pushes what is above the hinge towards -x
+    assert soft.simulator.skin.angles == () or abs(soft.simulator.skin.angles[0] - data.qpos[0]) < 0.021
+    moment = np.zeros(3)
+    for body in range(model.nbody):
+        force, torque = np.split(data.xfrc_applied[body], 2)
+        moment += torque + np.cross(data.xipos[body], force)
+    np.testing.assert_allclose(moment, 0, atol=1e-9)
+
+
+def test_between_two_poses_of_the_skin_it_goes_rigidly_with_its_bone(skin: Skin) -> None:
+    model, data, soft = made(skin, on_the_lower_part(skin, 0.3))
+    data.qpos[0] = 0.3
+    first = soft.apply(data)["ball"]
+    posed = soft.simulator.skin
+    data.qpos[0], data.mocap_pos[0] = 0.31, on_the_lower_part(skin, 0.31)
+    data.time = 1e-3
+    again = soft.apply(data)["ball"]
+    assert soft.simulator.skin is posed
+    assert again.force == pytest.approx(first.force, rel=1e-3)  # the ball did not turn along
+    tool = soft.contact.tools["ball"]
+    truth = Simulator(skin.posed({"elbow": 0.31})).touch([Contact(tool, at(*data.mocap_pos[0]))])[0]
+    np.testing.assert_allclose(-data.xfrc_applied[model.body("bob").id][:3], truth.wrench[:3], atol=2e-3 * truth.force)
+    data.qpos[0], data.mocap_pos[0] = 0.33, on_the_lower_part(skin, 0.33)
+    data.time = 2e-3
+    assert soft.apply(data)["ball"].force == pytest.approx(first.force, rel=1e-3)
+    assert soft.simulator.skin.angles == (0.33,)
+
+
+def test_joints_that_are_none_are_refused(skin: Skin) -> None:
+    place = on_the_lower_part(skin, 0.0)
+    with pytest.raises(InvalidInput, match=r"unknown joint: knee. Available: elbow"):
+        made(skin, place, joints={"knee": "hinge"})
+    with pytest.raises(InvalidInput, match=r"no joint 'elbow'. Joints: hinge"):
+        made(skin, place, joints={"elbow": "elbow"})
+    with pytest.raises(InvalidInput, match="is no hinge"):
+        made(skin, place, kind="slide")
+    with pytest.raises(InvalidInput, match="this layer has no joints"):
+        made(Skin.of(limb(4e-3), Winkler()), place)
+    _, data, soft = made(skin, place)
+    data.qpos[0] = np.nan
+    with pytest.raises(InvalidInput, match=r"elbow is nan rad. Has the simulation diverged"):
+        soft.apply(data)
