@@ -39,6 +39,12 @@ class Bend(NamedTuple):
     curvature: np.ndarray
     gap: np.ndarray
 
+    @property
+    def spoilt(self) -> np.ndarray:
+        """Mask of the vertices where an answer is not to be believed, (V,)."""
+        stretched = (self.least < STRETCH[0]) | (self.most > STRETCH[1])
+        return (self.fold < FOLD) | stretched | (self.curvature < HOLLOW) | (self.gap < FACING)
+
     def of_force(self, loaded: np.ndarray, force: np.ndarray) -> list[str]:
         """What a bend spoils under forces (L,) on vertices (L,), as sentences."""
         total, out = max(float(force.sum()), 1e-300), []

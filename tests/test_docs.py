@@ -100,3 +100,10 @@ def test_the_python_of_time_and_slip_runs() -> None:
     code, names = PYTHON.findall((ROOT / "docs" / "time_and_slip.md").read_text())[0], {}
     exec(compile(code, "time_and_slip.md", "exec"), names)
     assert names["touch"].slip.kind == "slide" and names["kept"]
+
+
+def test_the_python_of_a_limb_that_moves_runs() -> None:
+    code, names = PYTHON.findall((ROOT / "docs" / "moving.md").read_text())[0], {}
+    exec(compile(code, "moving.md", "exec"), names)
+    assert names["touches"][0].force > 0.005 and names["simulator"].skin.angles == (0.5,)
+    assert names["touches"][0].slip.share < 1  # it rides on the skin
