@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from copy import copy
 from dataclasses import dataclass
 
 import numpy as np
@@ -44,3 +45,10 @@ class Contact:
     def name(self) -> str:
         """Name of the tool."""
         return self.tool.name
+
+    def scaled(self, by: float) -> Contact:
+        """The same with a wrench so many times as large."""
+        assert self.wrench is not None
+        out = copy(self)
+        object.__setattr__(out, "wrench", by * self.wrench)
+        return out

@@ -7,23 +7,25 @@ the tool's way (`stmpl_core.slip`), and a contact that would give more energy th
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from copy import copy
 from dataclasses import replace
 from functools import cached_property
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
+import numba
 import numpy as np
 
 from stmpl_core import wake
-from stmpl_core.arrays import Transform
+from stmpl_core.arrays import Transform, Wrench
 from stmpl_core.columns import shifted
 from stmpl_core.contact import Contact
 from stmpl_core.dragged import MIN_OFFSET
 from stmpl_core.errors import InvalidInput
 from stmpl_core.footing import carried_tangent, in_plane, in_space, patch_of, twist_between, way_along, way_of_tool
 from stmpl_core.friction import Friction, coefficients
-from stmpl_core.relaxation import series_of, weights
+from stmpl_core.relaxation import let_go, series_of, weights
 from stmpl_core.sideways import Sideways
 from stmpl_core.slip import drag, ploughing
 from stmpl_core.state import Memory, Scalars, State, fresh
@@ -46,8 +48,11 @@ class _Asked(NamedTuple):
         before: memory of the step before.
         known: whether that memory is of this tool's way until now.
         twist: its way, (6,) [m, rad].
+        gone: way of the contact over the skin, over its radius [-].
         kept: what has relaxed, less what follows from this step's force (see relaxation.weights), (P,) [N].
         gain: what follows, over that force, (P,) [-].
+        owed, now: numbers a [N] and b [-] such that an elastic force F_e is b F_e - a after the step.
+        moved: way along its force at which the tool pressed before, where the law is asked for creeping skin [m].
     """
 
     contact: Contact
@@ -55,8 +60,12 @@ class _Asked(NamedTuple):
     before: Memory
     known: bool
     twist: np.ndarray
+    gone: float
     kept: np.ndarray
     gain: np.ndarray
+    owed: float
+    now: float
+    moved: float | None
 
 
 class _Law(NamedTuple):
@@ -73,6 +82,24 @@ class _Law(NamedTuple):
     memory: Memory
     stored: float
     whole: float
+
+
+class _Dragged(NamedTuple):
+    """Friction of a contact.
+
+    Args:
+        slip: what it carries.
+        limit: tangential force at which all of it slides [N].
+        stiffness: of the patch, (3,) [N/m]; see Memory, as springs and relaxed.
+        stored: energy that the bent skin stores [J].
+    """
+
+    slip: Slip
+    limit: float
+    stiffness: np.ndarray
+    springs: np.ndarray
+    relaxed: np.ndarray
+    stored: float
 
 
 class History:
@@ -121,11 +148,13 @@ class History:
                 raise InvalidInput(f"the state of {name} is of skin with {len(memory.relaxed)} times of relaxation; "
                                    f"this layer has {len(self.series.times)}. Try an empty State().")  # fmt: skip
         asked = [self._asked(contact, state.tools.get(contact.name), dt) for contact in contacts]
-        touches = self.toucher.touch_all([one.contact for one in asked], alone=False)
+        tried = {one.stated.name: one.moved for one in asked if one.moved is not None}
+        touches = self.toucher.touch_all([one.contact for one in asked], alone=False, tried=tried)
         again = [self._again(one, touch) for one, touch in zip(asked, touches, strict=True)]
         if any(again):
             asked = [new or one for one, new in zip(asked, again, strict=True)]
-            touches = self.toucher.touch_all([one.contact for one in asked], alone=False)
+            tried |= {touch.name: touch.moved for touch in touches if touch.name in tried}
+            touches = self.toucher.touch_all([one.contact for one in asked], alone=False, tried=tried)
         laws = [self._law(one, touch, dt) for one, touch in zip(asked, touches, strict=True)]
         out, memories = _balanced(asked, laws)
         for name, memory in state.tools.items():
@@ -135,150 +164,160 @@ class History:
                     memories[name] = left
         return out, State(memories)
 
-    def _relaxed(self, before: Memory, dt: float, gone: float) -> tuple[np.ndarray, np.ndarray]:
-        kept, gain = np.empty(len(self.series.times)), np.empty(len(self.series.times))
-        weights(self.series.times, dt, gone, before.scalars.elastic, before.relaxed, kept, gain)
-        return kept, gain
-
     def _asked(self, contact: Contact, before: Memory | None, dt: float) -> _Asked:
         """What the contact law is asked for a contact."""
         pose = contact.pose_body_from_tool
         memory = before or fresh(pose, len(self.series.times))
         known = before is not None and memory.scalars.pressing >= 0
-        twist, gone = np.zeros(6), 0.0
-        if known:
-            twist = twist_between(memory.pose, pose)
-        if memory.scalars.radius > 0:
-            held = memory.scalars.pressing > 0
-            start = memory.pose if held else memory.imprint
-            over = way_along(twist_between(start, pose), memory.contact, start)
-            gone = (memory.scalars.share if held else 1.0) * over / memory.scalars.radius
-        kept, gain = self._relaxed(memory, dt, gone)
-        asked = contact
+        scalars = memory.scalars
+        twist, gone, kept, gain, owed, now = _aged(
+            memory.pose, pose, memory.imprint, memory.contact, known, scalars.pressing > 0, scalars.share,
+            scalars.radius, *self.series, dt, scalars.elastic, memory.relaxed)  # fmt: skip
+        asked, moved = contact, None
         if contact.wrench is not None and len(kept):
             force = contact.wrench[:3]
-            normal = memory.contact[1] if memory.scalars.radius > 0 else force / max(np.linalg.norm(force), 1e-300)
-            wanted = float(force @ normal) / memory.scalars.net
-            owed, now = self.series.balance(kept, gain)
+            size = math.sqrt(force @ force)
+            normal = memory.contact[1] if scalars.radius > 0 else force / max(size, 1e-300)
+            wanted = float(force @ normal) / scalars.net
             if wanted > 0:
-                asked = replace(contact, wrench=contact.wrench * ((wanted + owed) / (wanted * now)))
-        return _Asked(asked, contact, memory, known, twist, kept, gain)
+                asked = contact.scaled((wanted + owed) / (wanted * now))
+                if scalars.pressing > 0:
+                    moved = float((memory.imprint[:3, 3] - memory.pose[:3, 3]) @ force) / size
+        return _Asked(asked, contact, memory, known, twist, gone, kept, gain, owed, now, moved)
 
     def _whole(self, touch: Touch) -> float:
         """Sum of the sizes of the forces that a touch presses with [N]."""
         return 0.0 if touch.pressure is None else float(touch.pressure @ self.toucher.layer.vertex_areas)
 
-    def _needed(self, one: _Asked, touch: Touch) -> tuple[float, float]:
-        """Elastic force that a stated wrench takes, as a sum of sizes, and the one that the touch has [N]."""
+    def _needed(self, one: _Asked, push: np.ndarray, force: float, whole: float) -> tuple[float, float]:
+        """Elastic force that a stated wrench takes, as a sum of sizes, and the one that a touch has [N].
+
+        Args:
+            one: what is asked.
+            push: force of the touch, (3,) [N].
+            force: its size [N].
+            whole: sum of the sizes of its parts [N].
+        """
         assert one.stated.wrench is not None
-        whole = self._whole(touch)
-        wanted = float(one.stated.wrench[:3] @ touch.push) / touch.force * whole / touch.force
-        owed, now = self.series.balance(one.kept, one.gain)
-        return (wanted + owed) / now, whole
+        wanted = float(one.stated.wrench[:3] @ push) / force * whole / force
+        return (wanted + one.owed) / one.now, whole
 
     def _again(self, one: _Asked, touch: Touch) -> _Asked | None:
         """The same with a wrench that fits where the contact's normal turned out to be; None where it does."""
-        if one.contact is one.stated or not (touch.presses and touch.force > 0) or one.contact.wrench is None:
+        if one.contact is one.stated or not touch.presses or one.contact.wrench is None:
             return None
-        needed, has = self._needed(one, touch)
-        carried = float(one.contact.wrench[:3] @ touch.push) / touch.force
-        if touch.force < (1 - 1e-6) * carried or not needed > 0 or abs(needed / has - 1) < HELD_OFF:
+        push = touch.push
+        force = math.sqrt(push @ push)
+        if not force > 0:
             return None
-        return one._replace(contact=replace(one.contact, wrench=one.contact.wrench * (needed / has)))
+        needed, has = self._needed(one, push, force, self._whole(touch))
+        carried = float(one.contact.wrench[:3] @ push) / force
+        if force < (1 - 1e-6) * carried or not needed > 0 or abs(needed / has - 1) < HELD_OFF:
+            return None
+        return one._replace(contact=one.contact.scaled(needed / has))
 
     def _law(self, one: _Asked, touch: Touch, dt: float) -> _Law:
         """What a tool does, from what elastic skin does."""
-        shares, before = self.series.shares, one.before.scalars
-        owed, now = self.series.balance(one.kept, one.gain)
-        presses = touch.presses and touch.pressed is not None and touch.force > 0
+        shares, before, push = self.series.shares, one.before.scalars, touch.push
+        owed, now = one.owed, one.now
+        size = math.sqrt(push @ push)
+        presses = touch.presses and touch.pressed is not None and size > 0
         elastic = self._whole(touch) if presses else 0.0
         force = now * elastic - owed
         if presses and one.contact is not one.stated:
-            needed, _ = self._needed(one, touch)
+            needed, _ = self._needed(one, push, size, elastic)
             if abs(needed / elastic - 1) < 2 * HELD_OFF:
                 elastic, force = needed, now * needed - owed
         if not (presses and force > 0):
-            return self._free(one, touch, max(owed / now, 0.0), dt)
-        push, pressed, size = touch.push, touch.pressed, touch.force
+            return self._free(one, touch, elastic, dt)
+        pressed, pose = touch.pressed, touch.pose_body_from_tool
         assert pressed is not None and pressed.forces is not None
         normal, net = push / size, min(size / elastic, 1.0)
         nodes = pressed.squeeze.nodes
         depth = nodes.sinking if len(nodes.sinking) else nodes.strain * nodes.thickness
         middle, radius, lever, thickness, whole = patch_of(
             nodes.points, nodes.area, nodes.thickness, depth, pressed.forces, normal)  # fmt: skip
-        contact = np.stack([middle, normal, carried_tangent(one.before.contact, normal, before.pressing > 0)])
+        contact = np.array((middle, normal, carried_tangent(one.before.contact, normal, before.pressing > 0)))
+        relaxed = one.kept + one.gain * elastic
+        faded = float(shares @ relaxed)
+        changed = _scaled(touch, force / elastic, ROUGH * faded)
+        trail = one.before.trail
+        if len(trail):
+            passing = wake.Pass(pose, middle, normal, relaxed, elastic, touch.depth, pressed.power, radius)
+            trail = wake.after(trail, self.series, dt, passing)
+            changed["wake"] = wake.Wake(trail, shares)
+        whole *= 0.5 + 0.5 / pressed.factor  # what draws a tool back from the core is steep: it stores less
+        stored = whole * _left_over(faded / elastic, pressed.power)
+        wrench, dragged = changed.get("wrench", touch.wrench), None
         scalars = Scalars(1.0, elastic, max(elastic, before.largest), net, radius, touch.depth, elastic, pressed.power,
                           work=before.work)  # fmt: skip
-        relaxed = one.kept + one.gain * elastic
-        memory = Memory(one.stated.pose_body_from_tool, touch.wrench, scalars, relaxed, contact,
-                        touch.pose_body_from_tool, np.zeros(3), one.before.springs, one.before.springs_relaxed,
-                        one.before.trail)  # fmt: skip
-        if len(memory.trail):
-            passing = wake.Pass(memory.imprint, middle, normal, relaxed, elastic, touch.depth, pressed.power, radius)
-            memory = memory._replace(trail=wake.after(memory.trail, self.series, dt, passing))
-            touch = replace(touch, wake=wake.grooves(memory.trail, self.series))
-        done = _scaled(touch, force / elastic, ROUGH * float(shares @ relaxed))
-        whole *= 0.5 + 0.5 / pressed.factor  # what draws a tool back from the core is steep: it stores less
-        stored = whole * _left_over(float(shares @ relaxed) / elastic, pressed.power)
+        springs = NOTHING, one.before.springs, one.before.springs_relaxed
         if self.friction(touch.name) > 0 and net > MIN_ONE_WAY_SHARE:
-            done, memory, bent = self._dragged(one, done, memory, force, lever, thickness, dt)
-            stored, whole = stored + bent, whole + 2 * bent
-        return _Law(self._said(one, done), memory._replace(wrench=done.wrench), stored, whole)
+            dragged = self._dragged(one, wrench, contact, pose[:3, 3], scalars, force, lever, thickness, dt)
+            wrench = wrench + dragged.slip.wrench
+            changed |= {"wrench": wrench, "slip": dragged.slip}
+            stored, whole = stored + dragged.stored, whole + 2 * dragged.stored
+            scalars = scalars._replace(share=dragged.slip.share, limit=dragged.limit)
+            springs = dragged.stiffness, dragged.springs, dragged.relaxed
+        memory = Memory(one.stated.pose_body_from_tool, wrench, scalars, relaxed, contact, pose, *springs, trail)
+        return _Law(self._said(one, touch, changed), memory, stored, whole)
 
-    def _free(self, one: _Asked, touch: Touch, elastic: float, dt: float) -> _Law:
-        """Skin that the tool does not hold comes back by itself."""
+    def _free(self, one: _Asked, touch: Touch, asked: float, dt: float) -> _Law:
+        """Skin that the tool does not hold comes back by itself; asked: elastic force that the tool asks for [N]."""
         before = one.before.scalars
         if touch.presses and touch.pressed is not None:
             touch = replace(touch, status=APART, wrench=np.zeros(6), force_bound=0.0, pressure=None, pressed=None)
-        scalars = before._replace(pressing=0.0, elastic=elastic, share=1.0, passive=1.0)
-        trail = wake.after(one.before.trail, self.series, dt, None)
-        memory = _let_go(one.before._replace(pose=one.stated.pose_body_from_tool, wrench=touch.wrench, scalars=scalars,
-                                             relaxed=one.kept + one.gain * elastic, trail=trail))  # fmt: skip
-        touch = replace(touch, wake=wake.grooves(trail, self.series))
-        if scalars.sunk:
-            touch = replace(touch, imprint=_imprint(memory))
+        held = before.elastic if before.pressing > 0 else 0.0
+        memory = self._back(one.before, dt, one.gone, held, asked)
+        memory = memory._replace(pose=one.stated.pose_body_from_tool, wrench=touch.wrench,
+                                 scalars=memory.scalars._replace(pressing=0.0))  # fmt: skip
+        elastic = memory.scalars.elastic
+        imprint = _imprint(memory) if memory.scalars.sunk else None
+        left = wake.Wake(memory.trail, self.series.shares) if len(memory.trail) else None
         depth = before.depth * (elastic / before.imprint_force) ** (1 / before.power) if elastic > 0 else 0.0
-        return _Law(self._said(one, touch), memory, 0.0, elastic * depth / (before.power + 1))
+        touch = self._said(one, touch, {"wake": left, "imprint": imprint})
+        return _Law(touch, memory, 0.0, elastic * depth / (before.power + 1))
 
     def _left(self, memory: Memory, dt: float) -> Memory:
         """The memory of a tool that is not told of any more: the skin comes back."""
-        kept, gain = self._relaxed(memory, dt, 0.0)
-        owed, now = self.series.balance(kept, gain)
-        elastic = max(owed / now, 0.0)
-        scalars = memory.scalars._replace(pressing=-1.0, elastic=elastic, share=1.0, work=0.0, passive=1.0)
-        return _let_go(memory._replace(scalars=scalars, relaxed=kept + gain * elastic, wrench=np.zeros(6),
+        memory = self._back(memory, dt, 0.0, 0.0, 0.0)
+        return memory._replace(scalars=memory.scalars._replace(pressing=-1.0, work=0.0), wrench=np.zeros(6))
+
+    def _back(self, memory: Memory, dt: float, gone: float, held: float, asked: float) -> Memory:
+        """The memory of skin that comes back within a step; see relaxation.let_go, `held` is its `before`."""
+        relaxed = let_go(*self.series, dt, gone, held, asked, memory.relaxed)
+        scalars = memory.scalars._replace(elastic=max(float(self.series.shares @ relaxed), 0.0), share=1.0,
+                                          passive=1.0)  # fmt: skip
+        return _let_go(memory._replace(scalars=scalars, relaxed=relaxed,
                                        trail=wake.after(memory.trail, self.series, dt, None)))  # fmt: skip
 
-    def _dragged(self, one: _Asked, touch: Touch, memory: Memory, force: float, lever: float, thickness: float,
-                 dt: float) -> tuple[Touch, Memory, float]:  # fmt: skip
-        """The touch with friction, its memory, and the energy that the bent skin stores [J]."""
-        before, now, radius = one.before, memory.scalars, memory.scalars.radius
-        patch, origin = self.sideways.at(radius, thickness), touch.pose_body_from_tool[:3, 3]
-        mu = self.friction(touch.name)
-        stiffer, cap = ploughing(now.depth, radius, force, patch.along, mu)
-        along = patch.secant(mu * force)
-        stiffness = stiffer * np.array([along, along, patch.turn / (lever * lever)])
+    def _dragged(self, one: _Asked, wrench: Wrench, contact: np.ndarray, origin: np.ndarray, scalars: Scalars,
+                 force: float, lever: float, thickness: float, dt: float) -> _Dragged:  # fmt: skip
+        """Friction of a contact that presses with a wrench (6,), as the scalars say, without friction."""
+        before, radius, depth = one.before, scalars.radius, scalars.depth
+        patch, mu = self.sideways.at(radius, thickness), self.friction(one.stated.name)
+        stiffer, cap = ploughing(depth, radius, force, patch.along, mu)
+        along = stiffer * patch.secant(mu * force)
+        stiffness = np.array((along, along, stiffer * patch.turn / (lever * lever)))
         stated, wanted = one.stated.wrench, NOTHING
         if stated is not None:
-            wanted = in_plane(stated - touch.wrench, memory.contact, origin, lever)
-        way, rolled = way_of_tool(one.twist, one.known, before.contact, before.scalars.pressing > 0, memory.contact,
-                                  origin, now.depth, radius, lever)  # fmt: skip
+            wanted = in_plane(stated - wrench, contact, origin, lever)
+        way, rolled = way_of_tool(one.twist, one.known, before.contact, before.scalars.pressing > 0, contact, origin,
+                                  depth, radius, lever)  # fmt: skip
         springs, relaxed, carried, share, stored = drag(
             before.springs, before.springs_relaxed, *self.series, dt, rolled, stiffness, before.stiffness, cap, way,
             wanted, stated is not None)  # fmt: skip
-        wrench, offset, turn = in_space(carried, springs, stiffness, memory.contact, origin, lever)
-        slip = Slip(wrench, share, offset, turn, memory.contact[0])
-        memory = memory._replace(scalars=now._replace(share=share, limit=cap), stiffness=stiffness, springs=springs,
-                                 springs_relaxed=relaxed)  # fmt: skip
-        return replace(touch, wrench=touch.wrench + wrench, slip=slip), memory, stored
+        rubs, offset, turn = in_space(carried, springs, stiffness, contact, origin, lever)
+        return _Dragged(Slip(rubs, share, offset, turn, contact[0]), cap, stiffness, springs, relaxed, stored)
 
-    def _said(self, one: _Asked, touch: Touch) -> Touch:
-        """The touch with what of the stated wrench is missing, and what that says of it."""
+    def _said(self, one: _Asked, touch: Touch, changed: dict[str, Any]) -> Touch:
+        """The touch with what changed, with what of the stated wrench is missing, and what that says of it."""
         stated = one.stated.wrench
         if stated is None:
-            return touch
-        touch = replace(touch, missing=stated - touch.wrench)
-        return replace(touch, trust=self.toucher.unmet(touch.trust, touch, stated))
+            return replace(touch, **changed) if changed else touch
+        touch = replace(touch, **changed, missing=stated - changed.get("wrench", touch.wrench))
+        trust = self.toucher.unmet(touch.trust, touch, stated)
+        return touch if trust is touch.trust else replace(touch, trust=trust)
 
     def elastic(self, touches: Sequence[Touch]) -> list[Touch]:
         """The touches of elastic skin without friction that move the skin as these do, but for what is dragged along.
@@ -298,16 +337,48 @@ class History:
         return [*out, *self.toucher.touch_all(asked)]
 
 
-def _scaled(touch: Touch, by: float, doubt: float) -> Touch:
-    """The touch with other pressures on skin that is moved as before; doubt: error of the force that comes in [N]."""
+@numba.njit(cache=True, error_model="numpy")
+def _aged(before, pose, imprint, contact, known, held, share, radius, shares, times, dt, elastic, relaxed):
+    """Twist, gone, kept, gain, owed and now of an _Asked.
+
+    Args:
+        before, pose: poses of the tool before the step and after it, (4, 4).
+        imprint, contact, relaxed: see Memory.
+        known: whether the tool was told of before.
+        held: whether it pressed.
+        share, radius, elastic: see Scalars.
+        shares, times: series of the relaxation, (P,) each.
+        dt: time of the step [s].
+    """
+    kept, gain, gone, owed, now = np.empty(len(times)), np.empty(len(times)), 0.0, 0.0, 1.0
+    twist = twist_between(before, pose) if known else np.zeros(6)
+    if radius > 0:
+        start = before if held else imprint
+        over = way_along(twist if held else twist_between(start, pose), contact, start)
+        gone = (share if held else 1.0) * over / radius
+    weights(times, dt, gone, elastic, relaxed, kept, gain)
+    for i in range(len(times)):
+        owed += shares[i] * kept[i]
+        now -= shares[i] * gain[i]
+    return twist, gone, kept, gain, owed, now
+
+
+def _scaled(touch: Touch, by: float, doubt: float) -> dict[str, Any]:
+    """What changes of a touch with other pressures on skin that is moved as before, by name.
+
+    Args:
+        touch: touch that presses.
+        by: factor on the pressures [-].
+        doubt: error of the force that comes in [N].
+    """
     if by == 1.0 and not doubt:
-        return touch
+        return {}
     assert touch.pressure is not None and touch.pressed is not None
     forces = touch.pressed.forces
     pressed: Pressed = touch.pressed._replace(factor=touch.pressed.factor * by,
                                               forces=None if forces is None else forces * by)  # fmt: skip
-    return replace(touch, wrench=touch.wrench * by, pressure=touch.pressure * by, pressed=pressed,
-                   force_bound=touch.force_bound * by + doubt)  # fmt: skip
+    return {"wrench": touch.wrench * by, "pressure": touch.pressure * by, "pressed": pressed,
+            "force_bound": touch.force_bound * by + doubt}  # fmt: skip
 
 
 def _left_over(relaxed: float, power: float) -> float:
@@ -370,6 +441,5 @@ def _balanced(asked: Sequence[_Asked], laws: Sequence[_Law]) -> tuple[list[Touch
 
 
 def _weakened(touch: Touch, by: float) -> Touch:
-    if touch.slip is not None:
-        touch = replace(touch, slip=touch.slip._replace(wrench=touch.slip.wrench * by))
-    return replace(_scaled(touch, by, 0.0), passive=by)
+    slip = touch.slip and touch.slip._replace(wrench=touch.slip.wrench * by)
+    return replace(touch, **_scaled(touch, by, 0.0), slip=slip, passive=by)

@@ -22,6 +22,7 @@ from stmpl_core.tissue import Prony, Tissue
 
 MIX_RADIUS = 9e-3  # radius of the load for which the materials of a stack share a force [m]
 LOG_STEP = 0.05  # change of a modulus by which its share is found, logarithm
+HALVINGS = 30  # of a step in which skin comes free
 
 
 class Series(NamedTuple):
@@ -38,22 +39,6 @@ class Series(NamedTuple):
     def balance(self, kept: np.ndarray, gain: np.ndarray) -> tuple[float, float]:
         """Numbers a and b such that an elastic force F_e is b F_e - a after a step; kept, gain: see `weights`, (P,)."""
         return float(self.shares @ kept), 1 - float(self.shares @ gain)
-
-
-def free_decay(series: Series, dt: float) -> np.ndarray:
-    """Matrix that takes what has relaxed to what is left of it after a time in which nothing holds the skin, (P, P).
-
-    Free skin has F = 0, so F_e = sum g_i D_i, and dD/dt = (1 g^T - I) D / tau. With D = S x, S = (tau g)^-1/2, the
-    matrix is symmetric, so its exponential is that of its eigenvalues.
-
-    Args:
-        series: relaxation of the force.
-        dt: time [s].
-    """
-    size = np.sqrt(np.maximum(series.shares, 1e-12) * series.times)
-    rates = np.sqrt(np.maximum(series.shares, 1e-12) / series.times)
-    values, vectors = np.linalg.eigh(np.outer(rates, rates) - np.diag(1 / series.times))
-    return (vectors * np.exp(np.minimum(values, 0.0) * dt)) @ vectors.T * np.outer(1 / size, size)
 
 
 def series_of(tissue: Tissue, thickness: float) -> Series:
@@ -125,3 +110,67 @@ def weights(times, dt, gone, before, relaxed, kept, gain):
         last = mean - left if x > 1e-4 else x / 2 - x * x / 3
         kept[i] = left * relaxed[i] + part / x * before * last
         gain[i] = part / x * first
+
+
+@numba.njit(cache=True, error_model="numpy")
+def decay_of_free(shares, times, dt):
+    """Matrix that takes what has relaxed to what is left of it after a time in which nothing holds the skin, (P, P).
+
+    Free skin has F = 0, so F_e = sum g_i D_i, and dD/dt = (1 g^T - I) D / tau. With D = S x, S = (tau g)^-1/2, the
+    matrix is symmetric, so its exponential is that of its eigenvalues.
+
+    Args:
+        shares, times: series of the relaxation, (P,) each.
+        dt: time [s].
+    """
+    many = len(times)
+    size, rate, out = np.empty(many), np.empty(many), np.zeros((many, many))
+    for i in range(many):
+        share = max(shares[i], 1e-12)
+        size[i], rate[i] = np.sqrt(share * times[i]), np.sqrt(share / times[i])
+    for i in range(many):
+        for j in range(many):
+            out[i, j] = rate[i] * rate[j] - (1 / times[i] if i == j else 0.0)
+    values, vectors = np.linalg.eigh(out)
+    for i in range(many):
+        for j in range(many):
+            out[i, j] = 0.0
+            for k in range(many):
+                out[i, j] += vectors[i, k] * np.exp(min(values[k], 0.0) * dt) * vectors[j, k]
+            out[i, j] *= size[j] / size[i]
+    return out
+
+
+@numba.njit(cache=True, error_model="numpy")
+def let_go(shares, times, dt, gone, before, after, relaxed):
+    """What has relaxed (P,) after a step in which the skin comes free, because the tool goes faster than it follows.
+
+    The elastic force that the tool asks for goes straight from `before` to `after`. Until the skin's force is 0 it
+    relaxes under the tool; from there on it comes back by itself. Skin that was free stays free.
+
+    Args:
+        shares, times: series of the relaxation, (P,) each.
+        dt, gone, before, relaxed: see `weights`.
+        after: elastic force that the tool asks for at the end of the step.
+    """
+    many, found = len(times), relaxed.copy()
+    kept, gain, held = np.empty(many), np.empty(many), 0.0
+    force, owed = before, 0.0
+    for i in range(many):
+        owed += shares[i] * relaxed[i]
+    if before > owed * (1 + 1e-9) and dt > 0:
+        low, high = 0.0, 1.0
+        for _ in range(HALVINGS):
+            held = 0.5 * (low + high)
+            force, owed = before + held * (after - before), 0.0
+            weights(times, held * dt, held * gone, before, relaxed, kept, gain)
+            for i in range(many):
+                owed += shares[i] * (kept[i] + gain[i] * force)
+            low, high = (held, high) if force > owed else (low, held)
+        for i in range(many):
+            found[i] = kept[i] + gain[i] * force
+    back, out = decay_of_free(shares, times, (1 - held) * dt), np.zeros(many)
+    for i in range(many):
+        for j in range(many):
+            out[i] += back[i, j] * found[j]
+    return out

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import NamedTuple
 
+import numba
 import numpy as np
 from scipy.special import gamma, j0, j1, jv
 
@@ -104,14 +105,27 @@ class Sideways:
 
     def at(self, radius: float, thickness: float) -> Patch:
         """Stiffness of a patch of a radius [m] where the layer is this thick [m]."""
-        log, radii = np.log(radius / thickness), self._logs
-        f = min(max((log - radii[0]) / (radii[1] - radii[0]), 0.0), len(radii) - 1.001)
-        i, low = int(f), self._table[0]
-        if len(self._table) > 1:
-            logs = self._log_thickness
-            g = min(max((np.log(thickness) - logs[0]) / (logs[1] - logs[0]), 0.0), len(logs) - 1.001)
-            j = int(g)
-            low = (1 - g + j) * self._table[j] + (g - j) * self._table[j + 1]
-        value = (1 - f + i) * low[i] + (f - i) * low[i + 1]
-        along, turn, bare = np.exp(value) * self._modulus * radius
-        return Patch(float(along), float(turn) * radius**2, float(bare), self._slack * radius)
+        along, turn, bare = _interpolated(self._table, self._log_thickness, self._logs, radius, thickness)
+        size = self._modulus * radius
+        return Patch(along * size, turn * size * radius**2, bare * size, self._slack * radius)
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _interpolated(table, log_thickness, log_radius, radius, thickness):
+    """The three numbers of a table (thicknesses, radii, 3) at a radius and a thickness [m], between its logarithms."""
+    log, j, g = np.log(radius / thickness), 0, 0.0
+    f = min(max((log - log_radius[0]) / (log_radius[1] - log_radius[0]), 0.0), len(log_radius) - 1.001)
+    i = int(f)
+    f -= i
+    if len(table) > 1:
+        log = np.log(thickness)
+        g = min(max((log - log_thickness[0]) / (log_thickness[1] - log_thickness[0]), 0.0), len(table) - 1.001)
+        j = int(g)
+        g -= j
+    out = np.empty(3)
+    for x in range(3):
+        out[x] = (1 - f) * table[j, i, x] + f * table[j, i + 1, x]
+        if g > 0:
+            out[x] += g * ((1 - f) * table[j + 1, i, x] + f * table[j + 1, i + 1, x] - out[x])
+        out[x] = np.exp(out[x])
+    return out[0], out[1], out[2]

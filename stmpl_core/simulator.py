@@ -200,8 +200,9 @@ class Simulator:
         """The answer with grooves that are left, and the largest motion that these add [m]."""
         before = after = fitted.displacement
         for touch in touches:
-            if touch.wake and touch.name in self.tools:
-                after = sunk(self.layer, self.tools.field(self.tools[touch.name]), touch.wake, after)
+            left = () if touch.wake is None else touch.wake.grooves()
+            if left and touch.name in self.tools:
+                after = sunk(self.layer, self.tools.field(self.tools[touch.name]), left, after)
         most = 0.0 if after is before else float(np.linalg.norm(after - before, axis=1).max())
         return fitted._replace(displacement=after), most
 

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.optimize import minimize_scalar
 
-from stmpl_core.relaxation import Series, weights
+from stmpl_core.relaxation import Series, let_go, weights
 from stmpl_core.sideways import Patch
 from stmpl_core.slip import SPRINGS, drag, ploughing
 
@@ -99,9 +99,11 @@ def played(stroke: Stroke, series: Series, friction: float) -> Course:
         weights(series.times, dt[k], share * way[k] / stroke.radius, before, relaxed, kept, gain)
         owed, now = series.balance(kept, gain)
         pressing = now * elastic[k] > owed
-        before = elastic[k] if pressing else owed / now
-        relaxed = kept + gain * before
-        if not pressing:
+        if pressing:
+            before, relaxed = elastic[k], kept + gain * elastic[k]
+        else:
+            relaxed = let_go(*series, dt[k], share * way[k] / stroke.radius, before, elastic[k], relaxed)
+            before = float(series.shares @ relaxed)
             springs[:], faded[:], stiff = 0.0, 0.0, np.zeros(3)
             continue
         force[k] = now * elastic[k] - owed

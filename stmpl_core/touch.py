@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Literal, NamedTuple
@@ -14,7 +15,7 @@ from stmpl_core.trust import Displacement, Trust
 if TYPE_CHECKING:
     from stmpl_core.columns import Squeeze
     from stmpl_core.sdf import SignedDistance
-    from stmpl_core.wake import Groove
+    from stmpl_core.wake import Wake
 
 TOUCHING = "touching"  # wrench carried by the skin under the tool
 MOVED = "moved to touch"  # wrench carried so, after the tool was moved along its push to meet the skin
@@ -114,7 +115,7 @@ class Touch:
     slip: Slip | None = None
     imprint: Transform | None = None
     passive: float = 1.0
-    wake: tuple[Groove, ...] = ()
+    wake: Wake | None = None
 
     @property
     def push(self) -> np.ndarray:
@@ -124,12 +125,14 @@ class Touch:
     @property
     def force(self) -> float:
         """Size of the force that the tool presses with, friction left out [N]."""
-        return float(np.linalg.norm(self.push))
+        push = self.push
+        return math.sqrt(push @ push)
 
     @property
     def drag(self) -> float:
         """Size of the stated force along the skin, which is not carried [N]."""
-        return float(np.linalg.norm(self.missing[:3]))
+        missing = self.missing[:3]
+        return math.sqrt(missing @ missing)
 
     @property
     def presses(self) -> bool:
@@ -171,6 +174,6 @@ class Answer(Displacement):
         """A share of this answer, whose input has stopped: every tool is STALE and exerts nothing."""
         trust = replace(self.trust, error_bound=None).also(why, in_range=False)
         touches = {name: replace(touch, status=STALE, wrench=np.zeros(6), pressure=None, pressed=None, slip=None,
-                                 imprint=None, wake=())
+                                 imprint=None, wake=None)
                    for name, touch in self.touches.items()}  # fmt: skip
         return Answer(share * self.displacement, trust, self.method, None, touches)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Mapping, Sequence
 from copy import copy
 from dataclasses import replace
 from typing import TYPE_CHECKING, NamedTuple
@@ -127,17 +128,22 @@ class Toucher:
         """Touch of one contact alone. Raises MeshError: a surface that cannot be a tool."""
         return self.touch_all([contact])[0]
 
-    def touch_all(self, contacts: Sequence[Contact], *, alone: bool = True) -> list[Touch]:
+    def touch_all(self, contacts: Sequence[Contact], *, alone: bool = True,
+                  tried: Mapping[str, float] | None = None) -> list[Touch]:  # fmt: skip
         """Touches of several contacts at once: tools side by side feel each other through the skin.
 
         Args:
             contacts: tools at one instant.
             alone: whether each touch is the last word, and tells of what of its wrench is not carried (`unmet`).
+            tried: way along its force that a tool with a wrench is tried at first, by name [m]; else where it meets
+                the skin.
         """
         if not contacts:
             return []
         many = len(contacts) >= MANY_TOOLS
-        placed = [self._place(contact, self.tools.field(contact.tool), many) for contact in contacts]
+        first = tried or {}
+        placed = [self._place(contact, self.tools.field(contact.tool), many, first.get(contact.name))
+                  for contact in contacts]  # fmt: skip
         pressing = sorted((one for one in placed if len(one.squeeze.nodes.area)), key=lambda one: one.contact.name)
         held: dict[str, Held] = {}
         for some in groups_of([one.squeeze.nodes.points for one in pressing], self._thickest):
@@ -152,9 +158,12 @@ class Toucher:
                 held[one.contact.name] = Held(pressure, doubt, outside, together.power)
         return [self._answer(one, held.get(one.contact.name, NOTHING), alone) for one in placed]
 
-    def _place(self, contact: Contact, field: SignedDistance, many: bool) -> _Placed:
-        """Where the tool presses, or why it does not."""
+    def _place(self, contact: Contact, field: SignedDistance, many: bool, tried: float | None) -> _Placed:
+        """Where the tool presses, or why it does not; tried: see `touch_all`."""
         pose = contact.pose_body_from_tool
+        if tried is not None and contact.wrench is not None:
+            stated = contact.wrench[:3]
+            pose = shifted(pose, tried / math.sqrt(stated @ stated) * stated)
         reach = 0.0 if contact.wrench is None else self.reach + self._thickest
         near = self.columns.near(field, pose, self._thickest + self.hole + reach, many=many)
         clearance = self.columns.clearance(field, pose, near, self.hole + reach)
@@ -186,9 +195,13 @@ class Toucher:
             return _Placed(contact, field, BY_POSE, pose, depth, 0.0, squeeze, None) if len(squeeze.nodes.area) \
                 else nothing(APART)
         gap = self._gap(field, pose, clearance, force)
-        if gap is None:
-            return nothing(NO_TOUCH)
-        return self._pressed(contact, field, pose, clearance, depth, gap) or nothing(PULLING)
+        found = None if gap is None else self._pressed(contact, field, pose, clearance, depth, gap)
+        if tried is None:
+            return found or nothing(NO_TOUCH if gap is None else PULLING)
+        if found is None or found.status == WRAPPED:
+            return self._place(contact, field, many, None)
+        apart = found.moved - self._depth(found.squeeze) > MAX_TOUCHING_GAP * self.hole
+        return found._replace(status=MOVED) if apart else found
 
     def _depth(self, squeeze: Squeeze) -> float:
         """Depth of the deepest column [m]."""
@@ -370,13 +383,14 @@ class Toucher:
             return trust
         name, field = touch.name, touch.pressed.field
         area = float(touch.pressed.squeeze.nodes.area.sum())
-        lever = float(np.linalg.norm(touch.missing[3:])) / max(touch.force, 1e-300)
+        force, drag = touch.force, touch.drag
+        lever = float(np.linalg.norm(touch.missing[3:])) / max(force, 1e-300)
         slack = min(self.reach, float(np.subtract(*field.tool_bounds[::-1]).max()))
         if stated is not None and stated[3:].any() and lever > max(MAX_LEVER * (area / np.pi) ** 0.5, slack):
-            trust = trust.also(f"{name} also turns with {1e3 * touch.force * lever:.2g} N mm, which is not carried",
+            trust = trust.also(f"{name} also turns with {1e3 * force * lever:.2g} N mm, which is not carried",
                                in_range=False)  # fmt: skip
-        if touch.drag > MAX_DRAG_RATIO * touch.force:
-            trust = trust.also(f"{name} also drags with {touch.drag:.2g} N, which is not carried", in_range=False)
+        if drag > MAX_DRAG_RATIO * force:
+            trust = trust.also(f"{name} also drags with {drag:.2g} N, which is not carried", in_range=False)
         return trust
 
 

@@ -5,11 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
+import numba
 import numpy as np
 
 from stmpl_core.arrays import Points, Transform, VertexVectors
 from stmpl_core.columns import shifted
-from stmpl_core.relaxation import Series, free_decay, weights
+from stmpl_core.relaxation import Series, decay_of_free, weights
 
 if TYPE_CHECKING:
     from stmpl_core.layer import SoftLayer
@@ -52,7 +53,8 @@ class Groove(NamedTuple):
     depth: float
 
 
-_POSE, _MIDDLE, _NORMAL = slice(0, 16), slice(16, 19), slice(19, 22)
+_FROM = 16  # first column of the middle
+_POSE, _NORMAL = slice(0, _FROM), slice(19, 22)
 _NOW, _FORCE, _DEPTH, _POWER, _RADIUS, FIXED = 22, 23, 24, 25, 26, 27  # columns; what has relaxed follows
 
 
@@ -61,11 +63,72 @@ def untouched(terms: int) -> np.ndarray:
     return np.zeros((PLACES if terms else 0, FIXED + terms))
 
 
-def _depths(trail: np.ndarray, series: Series) -> np.ndarray:
-    """How deep the skin would stay at each place if it were let go now [m]; 0 where there is none."""
-    some = trail[:, _FORCE] > 0
-    share = np.divide(trail[:, FIXED:] @ series.shares, trail[:, _FORCE], out=np.zeros(len(trail)), where=some)
-    return trail[:, _DEPTH] * np.clip(share, 0, 1) ** (1 / np.where(some, trail[:, _POWER], 1.0))
+@numba.njit(cache=True, error_model="numpy")
+def _depths(trail, shares):
+    """How deep the skin would stay at each place if it were let go now, (PLACES,) [m]; 0 where there is none."""
+    out = np.zeros(len(trail))
+    for k in range(len(trail)):
+        if trail[k, _FORCE] > 0:
+            share = 0.0
+            for i in range(len(shares)):
+                share += shares[i] * trail[k, FIXED + i]
+            share = min(max(share / trail[k, _FORCE], 0.0), 1.0)
+            out[k] = trail[k, _DEPTH] * share ** (1 / trail[k, _POWER])
+    return out
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _aged(trail, shares, times, dt, away, radius, force):
+    """Lets places grow older: nearer than a radius [m] they are held with an elastic force [N], others come back.
+
+    `away`: how far each is from the tool, (PLACES,) [m], infinite where there is none, as where one is forgotten.
+    """
+    terms = len(times)
+    kept, gain, back = np.empty(terms), np.empty(terms), np.empty((0, 0))
+    for k in range(len(trail)):
+        row = trail[k]
+        if not row[_FORCE] > 0:
+            continue
+        if away[k] < radius:
+            weights(times, dt, 0.0, row[_NOW], row[FIXED:], kept, gain)
+            row[_NOW] = force
+            for i in range(terms):
+                row[FIXED + i] = kept[i] + gain[i] * force
+            continue
+        if not len(back):
+            back = decay_of_free(shares, times, dt)
+        row[_NOW], kept[:] = 0.0, row[FIXED:]
+        for i in range(terms):
+            row[FIXED + i] = 0.0
+            for j in range(terms):
+                row[FIXED + i] += back[i, j] * kept[j]
+            row[_NOW] += shares[i] * row[FIXED + i]
+    depths = _depths(trail, shares)
+    for k in range(len(trail)):
+        if depths[k] < FORGOTTEN * trail[k, _DEPTH] and trail[k, _NOW] < trail[k, _FORCE]:
+            trail[k], away[k] = 0.0, np.inf
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _pressed(trail, shares, times, dt, pose, middle, normal, relaxed, force, depth, power, radius):
+    """The places after a step in which the tool presses; see Pass."""
+    trail, away = trail.copy(), np.full(len(trail), np.inf)
+    for k in range(len(trail)):
+        if trail[k, _FORCE] > 0:
+            away[k] = np.sqrt(np.sum((trail[k, _FROM : _FROM + 3] - middle) ** 2))
+    _aged(trail, shares, times, dt, away, radius, force)
+    place = np.argmin(away)
+    new = away[place] > SPACING * radius
+    if new:
+        depths = _depths(trail, shares)
+        depths[trail[:, _FORCE] == 0] = -1.0
+        place = np.argmin(depths)
+        trail[place, FIXED:] = relaxed
+    if new or (away[place] < SAME * radius and force > trail[place, _FORCE]):
+        row = trail[place]
+        row[:_FROM], row[_FROM : _FROM + 3], row[_FROM + 3 : _NOW] = pose.ravel(), middle, normal
+        row[_NOW], row[_FORCE], row[_DEPTH], row[_POWER], row[_RADIUS] = force, force, depth, power, radius
+    return trail
 
 
 def after(trail: np.ndarray, series: Series, dt: float, now: Pass | None) -> np.ndarray:
@@ -79,32 +142,12 @@ def after(trail: np.ndarray, series: Series, dt: float, now: Pass | None) -> np.
         dt: time of the step [s].
         now: the tool, if it presses.
     """
-    if not len(trail) or (now is None and not trail[:, _FORCE].any()):
+    if not len(trail):
         return trail
-    trail, n = trail.copy(), len(series.times)
-    away = np.full(len(trail), np.inf) if now is None else np.linalg.norm(trail[:, _MIDDLE] - now.middle, axis=1)
-    away[trail[:, _FORCE] == 0] = np.inf
-    back = free_decay(series, dt)
-    for k in np.flatnonzero(trail[:, _FORCE] > 0):
-        row = trail[k]
-        if now is not None and away[k] < now.radius:
-            kept, gain = np.empty(n), np.empty(n)
-            weights(series.times, dt, 0.0, row[_NOW], row[FIXED:], kept, gain)
-            row[_NOW], row[FIXED:] = now.force, kept + gain * now.force
-        else:
-            row[FIXED:] = back @ row[FIXED:]
-            row[_NOW] = series.shares @ row[FIXED:]
-    depths = _depths(trail, series)
-    trail[(depths < FORGOTTEN * trail[:, _DEPTH]) & (trail[:, _NOW] < trail[:, _FORCE])] = 0.0
-    if now is None:
-        return trail
-    new = away.min() > SPACING * now.radius
-    row = trail[int(np.argmin(np.where(trail[:, _FORCE] > 0, depths, -1.0) if new else away))]
-    if new or (away.min() < SAME * now.radius and now.force > row[_FORCE]):
-        row[_POSE], row[_MIDDLE], row[_NORMAL] = now.pose.ravel(), now.middle, now.normal
-        row[_NOW:FIXED] = now.force, now.force, now.depth, now.power, now.radius
-    if new:
-        row[FIXED:] = now.relaxed
+    if now is not None:
+        return _pressed(trail, *series, dt, *now)
+    trail = trail.copy()
+    _aged(trail, *series, dt, np.full(len(trail), np.inf), 0.0, 0.0)
     return trail
 
 
@@ -121,14 +164,18 @@ def carried_trail(trail: np.ndarray, motion_at: Callable[[np.ndarray], Transform
     return trail
 
 
-def grooves(trail: np.ndarray, series: Series) -> tuple[Groove, ...]:
-    """The places, as poses of the tool."""
-    out = []
-    for row, depth in zip(trail, _depths(trail, series), strict=True):
-        if depth > FORGOTTEN * row[_DEPTH]:
-            pose = shifted(row[_POSE].reshape(4, 4), (depth - row[_DEPTH]) * row[_NORMAL])
-            out.append(Groove(pose, float(depth)))
-    return tuple(out)
+class Wake(NamedTuple):
+    """What a tool left behind: its places and the shares of the series, as they are after a step."""
+
+    trail: np.ndarray
+    shares: np.ndarray
+
+    def grooves(self) -> tuple[Groove, ...]:
+        """The places where the skin is not back yet, as poses of the tool."""
+        depths = _depths(self.trail, self.shares)
+        some = np.flatnonzero(depths > FORGOTTEN * self.trail[:, _DEPTH])
+        return tuple(Groove(shifted(row[_POSE].reshape(4, 4), (depth - row[_DEPTH]) * row[_NORMAL]), depth)
+                     for row, depth in zip(self.trail[some], depths[some].tolist(), strict=True))  # fmt: skip
 
 
 def sunk(layer: SoftLayer, field: SignedDistance, left: Sequence[Groove], displacement: VertexVectors) -> VertexVectors:

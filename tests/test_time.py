@@ -9,7 +9,7 @@ from stmpl_core import Contact, Membrane, Ply, Prony, Simulator, SoftLayer, Stat
 from stmpl_core.errors import InvalidInput
 from stmpl_core.methods import Winkler
 from stmpl_core.relaxation import series_of
-from stmpl_core.touch import APART, BY_POSE
+from stmpl_core.touch import APART, BY_POSE, MOVED, TOUCHING
 from tests.scenes import at, ball, plate
 
 SERIES = Prony((0.225, 0.225), (0.5, 5.0))
@@ -124,6 +124,57 @@ def test_a_held_force_creeps_to_the_depth_of_relaxed_tissue(sim: Simulator) -> N
     relaxed = sim.touch([pressed(2e-3, (0.0, 0.0, -0.5 / SERIES.relaxed))])[0]
     assert depths[-1] == pytest.approx(relaxed.depth, rel=0.02)
     assert depths[0] == pytest.approx(sim.touch([pressed(2e-3, push)])[0].depth, rel=1e-6)
+
+
+def test_a_held_force_creeps_alike_wherever_the_tool_is_said_to_be(sim: Simulator) -> None:
+    """The search for the depth begins where the tool was: the answer is that of a search from the stated pose."""
+    push, times = (0.0, 0.0, -0.5), [0.0, *[0.05] * 10, 1.0, 5.0]
+    found: list[list[Touch]] = []
+    for depth in (2e-3, 3.5e-3, -0.8e-3):
+        state, touches = State(), []
+        for dt in times:
+            (touch,), state = sim.touch([pressed(depth, push)], state, dt)
+            touches.append(touch)
+        found.append(touches)
+    for here, deep, off in zip(*found, strict=True):
+        assert here.depth == pytest.approx(deep.depth, rel=0.01) and here.depth == pytest.approx(off.depth, rel=0.01)
+        assert (here.status, deep.status, off.status) == (TOUCHING, TOUCHING, MOVED)
+
+
+def test_a_tool_that_jumps_is_found_again(sim: Simulator) -> None:
+    """A pose far from where the tool was said to be before is searched anew."""
+    push, state = (0.0, 0.0, -0.5), State()
+    (_,), state = sim.touch([pressed(2e-3, push)], state, 0.1)
+    for depth in (-2.5e-3, 6e-3, 2e-3):
+        (touch,), state = sim.touch([pressed(depth, push)], state, 0.01)
+        assert touch.presses and touch.wrench[2] == pytest.approx(-0.5, rel=0.02)
+
+
+def test_free_skin_comes_back_alike_in_one_step_or_many(sim: Simulator) -> None:
+    """Not told of, and told of as lifted off, over the same place and beside it."""
+    _, start = played(sim, np.array([0, 0.1, 4.0]), np.array([-1e-4, DEPTH, DEPTH]))
+    (_,), lifted = sim.touch([pressed(-1e-3)], start, 1e-6)
+    for contacts, state in (([], start), ([pressed(-1e-3)], lifted), ([pressed(-1e-3, x=0.02)], lifted)):
+        _, once = sim.touch(contacts, state, 2.0)
+        many = state
+        for _ in range(200):
+            _, many = sim.touch(contacts, many, 0.01)
+        one, other = once.tools["probe"], many.tools["probe"]
+        assert one.scalars.elastic == pytest.approx(other.scalars.elastic, rel=0.01)
+        np.testing.assert_allclose(one.relaxed, other.relaxed, rtol=0.01)
+        np.testing.assert_allclose(one.trail, other.trail, rtol=0.01, atol=1e-12)
+        assert 0.05 * start.tools["probe"].scalars.elastic < one.scalars.elastic
+
+
+def test_a_lift_in_one_long_step_lets_the_skin_go_when_the_tool_does(sim: Simulator) -> None:
+    """One step of 1 s from the greatest depth to where a tool just leaves, or a hundred of them."""
+    _, start = played(sim, np.array([0, 0.1, 4.0]), np.array([-1e-4, DEPTH, DEPTH]))
+    (_,), once = sim.touch([pressed(0.0)], start, 1.0)
+    many = start
+    for depth in np.linspace(DEPTH, 0.0, 101)[1:]:
+        (_,), many = sim.touch([pressed(depth)], many, 0.01)
+    one, other = (state.tools["probe"].scalars for state in (once, many))
+    assert one.elastic == pytest.approx(other.elastic, rel=0.15)  # a force of d^1.5, taken as straight in time
 
 
 def test_skin_comes_back_by_itself_after_a_quick_lift(sim: Simulator) -> None:
