@@ -18,18 +18,18 @@ import numba
 import numpy as np
 
 from stmpl_core import wake
-from stmpl_core.arrays import Transform, Wrench
+from stmpl_core.arrays import Wrench
 from stmpl_core.columns import shifted
 from stmpl_core.contact import Contact
 from stmpl_core.dragged import MIN_OFFSET
 from stmpl_core.errors import InvalidInput
 from stmpl_core.footing import carried_tangent, in_plane, in_space, patch_of, twist_between, way_along, way_of_tool
 from stmpl_core.friction import Friction, coefficients
-from stmpl_core.relaxation import let_go, series_of, weights
+from stmpl_core.relaxation import depth_left, let_go, series_of, stretch, weights
 from stmpl_core.sideways import Sideways
 from stmpl_core.slip import drag, ploughing
 from stmpl_core.state import Memory, Scalars, State, fresh
-from stmpl_core.touch import APART, MIN_ONE_WAY_SHARE, Pressed, Slip, Touch
+from stmpl_core.touch import APART, MIN_ONE_WAY_SHARE, Imprint, Pressed, Slip, Touch
 from stmpl_core.toucher import Toucher
 
 ROUGH = 0.12  # error of the relaxed force, over what has relaxed: 5.4 of 45 % in trials where only the shear relaxes
@@ -51,7 +51,7 @@ class _Asked(NamedTuple):
         gone: way of the contact over the skin, over its radius [-].
         kept: what has relaxed, less what follows from this step's force (see relaxation.weights), (P,) [N].
         gain: what follows, over that force, (P,) [-].
-        owed, now: numbers a [N] and b [-] such that an elastic force F_e is b F_e - a after the step.
+        owed, now: numbers a [N] and b [-] such that after the step a force at rest of S_e is b S_e - a.
         moved: way along its force at which the tool pressed before, where the law is asked for creeping skin [m].
     """
 
@@ -180,7 +180,7 @@ class History:
             normal = memory.contact[1] if scalars.radius > 0 else force / max(size, 1e-300)
             wanted = float(force @ normal) / scalars.net
             if wanted > 0:
-                asked = contact.scaled((wanted + owed) / (wanted * now))
+                asked = contact.scaled((wanted + scalars.stretch * owed) / (wanted * now))
                 if scalars.pressing > 0:
                     moved = float((memory.imprint[:3, 3] - memory.pose[:3, 3]) @ force) / size
         return _Asked(asked, contact, memory, known, twist, gone, kept, gain, owed, now, moved)
@@ -189,28 +189,30 @@ class History:
         """Sum of the sizes of the forces that a touch presses with [N]."""
         return 0.0 if touch.pressure is None else float(touch.pressure @ self.toucher.layer.vertex_areas)
 
-    def _needed(self, one: _Asked, push: np.ndarray, force: float, whole: float) -> tuple[float, float]:
-        """Elastic force that a stated wrench takes, as a sum of sizes, and the one that a touch has [N].
+    def _needed(self, one: _Asked, push: np.ndarray, force: float, whole: float, stretch: float) -> float:
+        """Elastic force that a stated wrench takes, as a sum of sizes [N].
 
         Args:
             one: what is asked.
             push: force of the touch, (3,) [N].
             force: its size [N].
             whole: sum of the sizes of its parts [N].
+            stretch: stretch of the column under the tool [-].
         """
         assert one.stated.wrench is not None
         wanted = float(one.stated.wrench[:3] @ push) / force * whole / force
-        return (wanted + one.owed) / one.now, whole
+        return (wanted + stretch * one.owed) / one.now
 
     def _again(self, one: _Asked, touch: Touch) -> _Asked | None:
         """The same with a wrench that fits where the contact's normal turned out to be; None where it does."""
-        if one.contact is one.stated or not touch.presses or one.contact.wrench is None:
+        pressed = touch.pressed
+        if one.contact is one.stated or not touch.presses or one.contact.wrench is None or pressed is None:
             return None
-        push = touch.push
+        push, has = touch.push, self._whole(touch)
         force = math.sqrt(push @ push)
         if not force > 0:
             return None
-        needed, has = self._needed(one, push, force, self._whole(touch))
+        needed = self._needed(one, push, force, has, stretch(touch.depth, mean_thickness(pressed)))
         carried = float(one.contact.wrench[:3] @ push) / force
         if force < (1 - 1e-6) * carried or not needed > 0 or abs(needed / has - 1) < HELD_OFF:
             return None
@@ -218,39 +220,37 @@ class History:
 
     def _law(self, one: _Asked, touch: Touch, dt: float) -> _Law:
         """What a tool does, from what elastic skin does."""
-        shares, before, push = self.series.shares, one.before.scalars, touch.push
-        owed, now = one.owed, one.now
+        shares, before, push, pressed = self.series.shares, one.before.scalars, touch.push, touch.pressed
         size = math.sqrt(push @ push)
-        presses = touch.presses and touch.pressed is not None and size > 0
-        elastic = self._whole(touch) if presses else 0.0
-        force = now * elastic - owed
-        if presses and one.contact is not one.stated:
-            needed, _ = self._needed(one, push, size, elastic)
-            if abs(needed / elastic - 1) < 2 * HELD_OFF:
-                elastic, force = needed, now * needed - owed
-        if not (presses and force > 0):
-            return self._free(one, touch, elastic, dt)
-        pressed, pose = touch.pressed, touch.pose_body_from_tool
-        assert pressed is not None and pressed.forces is not None
-        normal, net = push / size, min(size / elastic, 1.0)
-        nodes = pressed.squeeze.nodes
+        if not (touch.presses and pressed is not None and pressed.forces is not None and size > 0):
+            return self._free(one, touch, 0.0, dt)
+        normal, nodes, elastic = push / size, pressed.squeeze.nodes, self._whole(touch)
         depth = nodes.sinking if len(nodes.sinking) else nodes.strain * nodes.thickness
         middle, radius, lever, thickness, whole = patch_of(
             nodes.points, nodes.area, nodes.thickness, depth, pressed.forces, normal)  # fmt: skip
+        net, long = min(size / elastic, 1.0), stretch(touch.depth, thickness)
+        force, at_rest = one.now * elastic - long * one.owed, elastic / long
+        if one.contact is not one.stated:
+            needed = self._needed(one, push, size, elastic, long)
+            if abs(needed / elastic - 1) < 2 * HELD_OFF:
+                force, at_rest = one.now * needed - long * one.owed, needed / long
+        if not force > 0:
+            return self._free(one, touch, at_rest, dt)
+        pose = touch.pose_body_from_tool
         contact = np.array((middle, normal, carried_tangent(one.before.contact, normal, before.pressing > 0)))
-        relaxed = one.kept + one.gain * elastic
+        relaxed = one.kept + one.gain * at_rest
         faded = float(shares @ relaxed)
-        changed = _scaled(touch, force / elastic, ROUGH * faded)
+        changed = _scaled(touch, force / elastic, ROUGH * long * faded)
         trail = one.before.trail
         if len(trail):
-            passing = wake.Pass(pose, middle, normal, relaxed, elastic, touch.depth, pressed.power, radius)
+            passing = wake.Pass(pose, middle, normal, relaxed, at_rest, touch.depth, pressed.power, 1 - long, radius)
             trail = wake.after(trail, self.series, dt, passing)
             changed["wake"] = wake.Wake(trail, shares)
         whole *= 0.5 + 0.5 / pressed.factor  # what draws a tool back from the core is steep: it stores less
-        stored = whole * _left_over(faded / elastic, pressed.power)
+        stored = whole * _left_over(faded / at_rest, pressed.power, 1 - long)
         wrench, dragged = changed.get("wrench", touch.wrench), None
-        scalars = Scalars(1.0, elastic, max(elastic, before.largest), net, radius, touch.depth, elastic, pressed.power,
-                          work=before.work)  # fmt: skip
+        scalars = Scalars(1.0, at_rest, max(at_rest, before.largest), net, radius, touch.depth, at_rest, pressed.power,
+                          work=before.work, stretch=long)  # fmt: skip
         springs = NOTHING, one.before.springs, one.before.springs_relaxed
         if self.friction(touch.name) > 0 and net > MIN_ONE_WAY_SHARE:
             dragged = self._dragged(one, wrench, contact, pose[:3, 3], scalars, force, lever, thickness, dt)
@@ -263,31 +263,44 @@ class History:
         return _Law(self._said(one, touch, changed), memory, stored, whole)
 
     def _free(self, one: _Asked, touch: Touch, asked: float, dt: float) -> _Law:
-        """Skin that the tool does not hold comes back by itself; asked: elastic force that the tool asks for [N]."""
+        """Skin that the tool does not hold comes back by itself; asked: force at rest that the tool asks for [N]."""
         before = one.before.scalars
         if touch.presses and touch.pressed is not None:
             touch = replace(touch, status=APART, wrench=np.zeros(6), force_bound=0.0, pressure=None, pressed=None)
-        held = before.elastic if before.pressing > 0 else 0.0
-        memory = self._back(one.before, dt, one.gone, held, asked)
+        memory = self._back(one.before, dt, one.gone, asked)
         memory = memory._replace(pose=one.stated.pose_body_from_tool, wrench=touch.wrench,
                                  scalars=memory.scalars._replace(pressing=0.0))  # fmt: skip
-        elastic = memory.scalars.elastic
-        imprint = _imprint(memory) if memory.scalars.sunk else None
-        left = wake.Wake(memory.trail, self.series.shares) if len(memory.trail) else None
-        depth = before.depth * (elastic / before.imprint_force) ** (1 / before.power) if elastic > 0 else 0.0
+        scalars, left = memory.scalars, wake.Wake(memory.trail, self.series.shares) if len(memory.trail) else None
+        depth = _depth(scalars)
+        imprint = Imprint(memory.imprint, depth) if scalars.sunk else None
         touch = self._said(one, touch, {"wake": left, "imprint": imprint})
-        return _Law(touch, memory, 0.0, elastic * depth / (before.power + 1))
+        long = stretch(depth, scalars.depth / (1 - scalars.stretch)) if scalars.stretch < 1 else 1.0
+        return _Law(touch, memory, 0.0, scalars.elastic * long * depth / (before.power + 1))
 
     def _left(self, memory: Memory, dt: float) -> Memory:
         """The memory of a tool that is not told of any more: the skin comes back."""
-        memory = self._back(memory, dt, 0.0, 0.0, 0.0)
+        memory = self._back(memory, dt, 0.0, None)
         return memory._replace(scalars=memory.scalars._replace(pressing=-1.0, work=0.0), wrench=np.zeros(6))
 
-    def _back(self, memory: Memory, dt: float, gone: float, held: float, asked: float) -> Memory:
-        """The memory of skin that comes back within a step; see relaxation.let_go, `held` is its `before`."""
-        relaxed = let_go(*self.series, dt, gone, held, asked, memory.relaxed)
-        scalars = memory.scalars._replace(elastic=max(float(self.series.shares @ relaxed), 0.0), share=1.0,
-                                          passive=1.0)  # fmt: skip
+    def _back(self, memory: Memory, dt: float, gone: float, asked: float | None) -> Memory:
+        """The memory of skin that comes back by itself.
+
+        Where the tool lets it go it is as deep as the tool, from there on it comes back as its force does: what is left
+        of a load that fades is the same motion, smaller.
+
+        Args:
+            memory: memory before.
+            dt, gone: see relaxation.let_go.
+            asked: force at rest that the tool asks for at the end of the step [N]; None: it was taken away before.
+        """
+        before, shares = memory.scalars, self.series.shares
+        held = before.elastic if before.pressing > 0 and asked is not None else 0.0
+        relaxed, least = let_go(*self.series, dt, gone, held, asked or 0.0, memory.relaxed)
+        if before.pressing > 0 and before.imprint_force > 0:
+            depth = before.depth * depth_left(min(least / before.imprint_force, 1.0), before.power, 1 - before.stretch)
+            before = before._replace(depth=depth, imprint_force=max(least, 1e-300), power=1.0,
+                                     stretch=1 - (1 - before.stretch) * depth / before.depth)  # fmt: skip
+        scalars = before._replace(elastic=max(float(shares @ relaxed), 0.0), share=1.0, passive=1.0)
         return _let_go(memory._replace(scalars=scalars, relaxed=relaxed,
                                        trail=wake.after(memory.trail, self.series, dt, None)))  # fmt: skip
 
@@ -322,19 +335,27 @@ class History:
     def elastic(self, touches: Sequence[Touch]) -> list[Touch]:
         """The touches of elastic skin without friction that move the skin as these do, but for what is dragged along.
 
-        Skin that a tool does not hold is where an imprint says; skin that is dragged along was pressed by a tool that
-        stands where the skin came from.
+        Skin that is dragged along was pressed by a tool that stands where the skin came from. Skin that no tool holds
+        is another matter: see `left_behind`.
         """
         out, asked = [], []
         for touch in touches:
-            pose = touch.imprint
-            if pose is None and touch.slip is not None and np.linalg.norm(touch.slip.offset) > MIN_OFFSET:
-                pose = shifted(touch.pose_body_from_tool, -touch.slip.offset)
-            if pose is None or touch.name not in self.toucher.tools:
+            if touch.imprint is not None:
+                continue
+            if touch.slip is None or np.linalg.norm(touch.slip.offset) <= MIN_OFFSET or \
+                    touch.name not in self.toucher.tools:  # fmt: skip
                 out.append(touch)
             else:
+                pose = shifted(touch.pose_body_from_tool, -touch.slip.offset)
                 asked.append(Contact(self.toucher.tools[touch.name], pose))
         return [*out, *self.toucher.touch_all(asked)]
+
+    def left_behind(self, touches: Sequence[Touch]) -> list[tuple[Touch, float]]:
+        """Elastic touches whose motion was left behind by a tool, and the share of it that is still there [-]."""
+        some = [touch for touch in touches if touch.imprint is not None and touch.name in self.toucher.tools]
+        found = [(self.toucher.touch(Contact(self.toucher.tools[one.name], one.imprint.pose)), one.imprint.depth)
+                 for one in some if one.imprint is not None]  # fmt: skip
+        return [(touch, min(depth / touch.depth, 1.0)) for touch, depth in found if touch.presses]
 
 
 @numba.njit(cache=True, error_model="numpy")
@@ -363,6 +384,12 @@ def _aged(before, pose, imprint, contact, known, held, share, radius, shares, ti
     return twist, gone, kept, gain, owed, now
 
 
+def mean_thickness(pressed: Pressed) -> float:
+    """Thickness under a contact, weighed with its forces [m]."""
+    assert pressed.forces is not None
+    return float(pressed.forces @ pressed.squeeze.nodes.thickness) / float(pressed.forces.sum())
+
+
 def _scaled(touch: Touch, by: float, doubt: float) -> dict[str, Any]:
     """What changes of a touch with other pressures on skin that is moved as before, by name.
 
@@ -381,13 +408,14 @@ def _scaled(touch: Touch, by: float, doubt: float) -> dict[str, Any]:
             "force_bound": touch.force_bound * by + doubt}  # fmt: skip
 
 
-def _left_over(relaxed: float, power: float) -> float:
+def _left_over(relaxed: float, power: float, strain: float) -> float:
     """What skin gives back when it is let go at once, over the energy of elastic skin, of which a share has relaxed.
 
-    The integral of depth^power - relaxed from where that is 0 to 1, times power + 1.
+    The integral of x^power - relaxed (1 - x strain) / (1 - strain) over x, from where that is 0 to 1, times power + 1.
     """
-    free = min(relaxed, 1.0) ** (1 / power)
-    return max(1 - free ** (power + 1) - (power + 1) * relaxed * (1 - free), 1e-12)
+    free = depth_left(min(relaxed, 1.0), power, strain)
+    eased = (1 - free - 0.5 * strain * (1 - free * free)) / (1 - strain)
+    return max(1 - free ** (power + 1) - (power + 1) * relaxed * eased, 1e-12)
 
 
 def _let_go(memory: Memory) -> Memory:
@@ -396,11 +424,10 @@ def _let_go(memory: Memory) -> Memory:
                            springs_relaxed=np.zeros_like(memory.springs_relaxed))  # fmt: skip
 
 
-def _imprint(memory: Memory) -> Transform:
-    """Pose at which the tool that pressed last would hold the skin where it has come back to."""
-    one = memory.scalars
-    depth = one.depth * (one.elastic / one.imprint_force) ** (1 / one.power)
-    return shifted(memory.imprint, (depth - one.depth) * memory.contact[1])
+def _depth(scalars: Scalars) -> float:
+    """Depth to which skin that is free has come back [m]."""
+    share = scalars.elastic / scalars.imprint_force if scalars.elastic > 0 else 0.0
+    return scalars.depth * depth_left(share, scalars.power, 1 - scalars.stretch)
 
 
 def _balanced(asked: Sequence[_Asked], laws: Sequence[_Law]) -> tuple[list[Touch], dict[str, Memory]]:

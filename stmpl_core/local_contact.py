@@ -208,17 +208,20 @@ def _model(toucher: Toucher, touch: Touch, tangent: Tangent | None, memory: Memo
     normal, nodes = push[:3] / touch.force, pressed.squeeze.nodes
     stiffness, drawn, eased = tangent.stiffness, pressed.factor, 0.0
     whole = float(pressed.forces.sum())
-    if memory is not None and memory.scalars.pressing > 0:  # W = W_e (1 - relaxed / F_e), and the relaxed part stays
-        by = min(whole / (memory.scalars.elastic * touch.passive), 1.0)
+    depth = nodes.sinking if len(nodes.sinking) else nodes.strain * nodes.thickness
+    contact = patch_of(nodes.points, nodes.area, nodes.thickness, depth, pressed.forces, normal)
+    if memory is not None and memory.scalars.pressing > 0:  # W = W_e - lambda A, and A stays
+        now = memory.scalars
+        by = min(whole / (now.elastic * now.stretch * touch.passive), 1.0)
         stiffness = stiffness + (1 / by - 1) * np.outer(push / whole, tangent.whole)
         eased = (1 / by - 1) * touch.force
+        along = np.append(normal, np.zeros(3))
+        stiffness = stiffness + (1 / by - 1) / (now.stretch * contact[3]) * np.outer(push, along)
         drawn /= by * touch.passive
     if drawn > 1 + 1e-9:  # the tool was drawn back along the normal to where it is answered for: see Toucher
         along = np.append(normal, np.zeros(3))
         rise = push / drawn * STIFFENING / float(toucher.layer.thickness.max())
         stiffness = stiffness + np.outer(rise - stiffness @ along, along)
-    depth = nodes.sinking if len(nodes.sinking) else nodes.strain * nodes.thickness
-    contact = patch_of(nodes.points, nodes.area, nodes.thickness, depth, pressed.forces, normal)
     steep = float(normal @ stiffness[:3, :3] @ normal) * touch.depth  # power of the depth times force
     valid = _neighbourhood(touch, pressed, max(steep / touch.force, pressed.power, LEAST_POWER), *contact[:2])
     power = 1.0 if drawn > 1 + 1e-9 else min(max(steep / (touch.force + eased), 1.0), MOST_POWER)

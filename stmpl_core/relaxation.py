@@ -2,12 +2,16 @@
 
 An elastic force F_e(t), relaxing as its moduli do, E(t) = E (1 - sum g_i (1 - exp(-t / tau_i))), is
 
-    F = F_e - sum g_i D_i,    dD_i/dt = (F_e - D_i) / tau_i - D_i / a |ds/dt|
+    F = lambda (S_e - sum g_i D_i),    S_e = F_e / lambda,    dD_i/dt = (S_e - D_i) / tau_i - D_i / a |ds/dt|
 
-with D_i the part that has relaxed. Without the last term this is the convolution int G(t - s) dF_e(s) of quasi-linear
-viscoelasticity (Fung, "Biomechanics", 1993, chapter 7), one number in place of a field. The last term is fresh skin: a
-contact of radius a that goes ds over the skin leaves what has relaxed behind. Against a ball on relaxing columns that
-starts to slide, each with a history of its own, it is within 6 % of the force at any speed, 4.5 % in steady slide.
+with D_i the part that has relaxed, and lambda = 1 - d / t the stretch of the column under a tool d deep in a layer t
+thick. Without the last term the bracket is the convolution int G(t - s) dS_e(s) of quasi-linear viscoelasticity (Fung,
+"Biomechanics", 1993, chapter 7), one number in place of a field. At finite strain it is the second Piola-Kirchhoff
+stress that relaxes, which belongs to the rest state: what a deep press has made relax pulls lambda times as hard, so
+harder once the tool goes back. Against finite elements that halves what misses while a tool lifts. The last term is
+fresh skin: a contact of radius a that goes ds over the skin leaves what has relaxed behind. Against a ball on relaxing
+columns that starts to slide, each with a history of its own, it is within 6 % of the force at any speed, 4.5 % in
+steady slide.
 """
 
 from __future__ import annotations
@@ -22,6 +26,8 @@ from stmpl_core.tissue import Prony, Tissue
 
 MIX_RADIUS = 9e-3  # radius of the load for which the materials of a stack share a force [m]
 LOG_STEP = 0.05  # change of a modulus by which its share is found, logarithm
+LEAST_STRETCH = 0.15  # of a column, to which it counts as pressed together
+DEPTH_TRIALS = 12  # for the depth of skin that is free
 HALVINGS = 30  # of a step in which skin comes free
 
 
@@ -113,6 +119,29 @@ def weights(times, dt, gone, before, relaxed, kept, gain):
 
 
 @numba.njit(cache=True, error_model="numpy")
+def stretch(depth, thickness):
+    """Stretch of the column under a tool of a depth [m] in a layer of a thickness [m], at least LEAST_STRETCH [-]."""
+    return max(1 - depth / thickness, LEAST_STRETCH)
+
+
+@numba.njit(cache=True, error_model="numpy")
+def depth_left(share, power, strain):
+    """Depth x at which a tool would hold skin that was let go, over the depth of the press [-].
+
+    There x^power / (1 - x strain) = share / (1 - strain).
+
+    Args:
+        share: force at rest S_e that is left, over that of the press [-].
+        power: power of the depth with which the elastic force grows [-].
+        strain: 1 less the stretch at the press [-].
+    """
+    x = share ** (1 / power)
+    for _ in range(DEPTH_TRIALS):
+        x = (share * (1 - x * strain) / (1 - strain)) ** (1 / power)
+    return min(x, 1.0)
+
+
+@numba.njit(cache=True, error_model="numpy")
 def decay_of_free(shares, times, dt):
     """Matrix that takes what has relaxed to what is left of it after a time in which nothing holds the skin, (P, P).
 
@@ -143,7 +172,9 @@ def decay_of_free(shares, times, dt):
 
 @numba.njit(cache=True, error_model="numpy")
 def let_go(shares, times, dt, gone, before, after, relaxed):
-    """What has relaxed (P,) after a step in which the skin comes free, because the tool goes faster than it follows.
+    """What has relaxed (P,) after a step in which the skin comes free, and the force at rest where it did.
+
+    It comes free where the tool goes faster than it follows.
 
     The elastic force that the tool asks for goes straight from `before` to `after`. Until the skin's force is 0 it
     relaxes under the tool; from there on it comes back by itself. Skin that was free stays free.
@@ -169,8 +200,9 @@ def let_go(shares, times, dt, gone, before, after, relaxed):
             low, high = (held, high) if force > owed else (low, held)
         for i in range(many):
             found[i] = kept[i] + gain[i] * force
-    back, out = decay_of_free(shares, times, (1 - held) * dt), np.zeros(many)
+    back, out, there = decay_of_free(shares, times, (1 - held) * dt), np.zeros(many), 0.0
     for i in range(many):
+        there += shares[i] * found[i]
         for j in range(many):
             out[i] += back[i, j] * found[j]
-    return out
+    return out, there

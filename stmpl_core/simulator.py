@@ -158,20 +158,15 @@ class Simulator:
         zero = np.zeros(len(self.layer.vertices))
         pressure = sum((touch.pressure for touch in touches if touch.pressure is not None), zero)
         moves = self.history.elastic(touches)
-        pressing = [(touch.pressure, touch.pressed.factor) for touch in moves
-                    if touch.pressure is not None and touch.pressed is not None]  # fmt: skip
 
         # Solve: the method moves the skin, and what is touched lies on its tool; where nothing presses, nothing moves.
-        if pressing:
-            moving = sum((one / factor for one, factor in pressing), zero)
-            motion = None if self._green is None else stuck_motion(self._green, moves)
-            solved = self.method.solve(Load.contact(moving, motion))
-            fitted = conform(self.layer, self.skin.near, solved.displacement, moves) if motion is None else \
-                kept_out(self.layer, solved.displacement, moves)
-            fitted = self._dragged(fitted, touches)
-        else:
-            solved = Displacement(np.zeros_like(self.layer.vertices), Trust(), self.method.name)
-            fitted = Conformed(solved.displacement, 0.0, 0.0)
+        solved, fitted = self._moved(moves)
+        fitted = self._dragged(fitted, touches)
+        for touch, share in self.history.left_behind(touches):
+            behind, there = self._moved([touch])
+            solved = replace(solved, trust=_lower(solved.trust, behind.trust))
+            fitted = _deeper(fitted, share, there, -self.layer.normals)
+            moves.append(replace(touch, depth=share * touch.depth))
 
         fitted, left = self._sunk(fitted, touches)
 
@@ -186,6 +181,20 @@ class Simulator:
             known = getattr(self.method, "contact_bound", None)
             trust = replace(trust, error_bound=motion_bound(known, touches, moves, peak, left))
         return Answer(displacement, trust, solved.method, pressure, {touch.name: touch for touch in touches})
+
+    def _moved(self, touches: Sequence[Touch]) -> tuple[Displacement, Conformed]:
+        """What the method says of elastic touches, and the same with what is touched on its tools."""
+        pressing = [(touch.pressure, touch.pressed.factor) for touch in touches
+                    if touch.pressure is not None and touch.pressed is not None]  # fmt: skip
+        if not pressing:
+            solved = Displacement(np.zeros_like(self.layer.vertices), Trust(), self.method.name)
+            return solved, Conformed(solved.displacement, 0.0, 0.0)
+        moving = sum((one / factor for one, factor in pressing), np.zeros(len(self.layer.vertices)))
+        motion = None if self._green is None else stuck_motion(self._green, touches)
+        solved = self.method.solve(Load.contact(moving, motion))
+        if motion is None:
+            return solved, conform(self.layer, self.skin.near, solved.displacement, touches)
+        return solved, kept_out(self.layer, solved.displacement, touches)
 
     def _dragged(self, fitted: Conformed, touches: Sequence[Touch]) -> Conformed:
         """The answer with the skin that is dragged along."""
@@ -209,6 +218,22 @@ class Simulator:
     def step(self, contacts: Sequence[Contact]) -> Answer:
         """`touch`, then `answer`. Raises what `touch` raises."""
         return self.answer(self.touch(contacts))
+
+
+def _lower(trust: Trust, other: Trust) -> Trust:
+    """The trust in two answers at once, with the figures of the first."""
+    if other.why or not other.ok:
+        return trust.also(other.why, in_range=other.in_range, converged=other.converged)
+    return trust
+
+
+def _deeper(fitted: Conformed, share: float, there: Conformed, inward: np.ndarray) -> Conformed:
+    """The answer with a share of another motion, where that goes further in."""
+    one, other = fitted.displacement, share * there.displacement
+    further = np.einsum("ni,ni->n", other - one, inward) > 0
+    if one.any():
+        other = np.where(further[:, None], other, one)
+    return Conformed(other, max(fitted.corrected, there.corrected), max(fitted.entered, share * there.entered))
 
 
 def _within(displacement: np.ndarray, thickness: np.ndarray) -> tuple[np.ndarray, float, int]:

@@ -13,7 +13,7 @@ from stmpl_core.errors import InvalidInput
 from stmpl_core.slip import SPRINGS
 from stmpl_core.wake import untouched
 
-VERSION = 2  # of packed states; older ones are not read
+VERSION = 3  # of packed states; older ones are not read
 FORGOTTEN = 1e-3  # elastic force of skin that comes back, over its largest, below which it is forgotten
 
 
@@ -51,17 +51,19 @@ class Scalars(NamedTuple):
 
     Args:
         pressing: 1 where the tool pressed, 0 where it did not, -1 where nobody told of it.
-        elastic: force of elastic skin [N]; of skin that is free, that of the depth to which it has come back.
+        elastic: force at rest of elastic skin (stmpl_core.relaxation) [N]; of skin that is free, that of the depth to
+            which it has come back.
         largest: largest of it so far [N].
         net: size of the force over the sum of its parts' sizes [-].
         radius: radius of the last contact [m].
         depth: depth of the last contact [m].
-        imprint_force: elastic force there [N].
-        power: power of the depth with which the force grows there [-].
+        imprint_force: force at rest there [N].
+        power: power of the depth with which the elastic force grows there [-].
         share: share of the contact that slid [-].
         work: work that was put into the contact and not given back [J].
         passive: factor on the wrench that kept it above 0 [-].
         limit: tangential force at which all of it slides [N]; 0 without friction.
+        stretch: stretch of the column under the last contact [-].
     """
 
     pressing: float = 0.0
@@ -76,6 +78,7 @@ class Scalars(NamedTuple):
     work: float = 0.0
     passive: float = 1.0
     limit: float = 0.0
+    stretch: float = 1.0
 
     @property
     def sunk(self) -> bool:
@@ -138,7 +141,8 @@ class State:
         size = sum(int(np.prod(shape)) for shape in shapes)
         if version != VERSION or len(numbers) != size * len(names):
             raise InvalidInput(f"a state of version {version} with {len(numbers)} numbers cannot be read; expected are "
-                               f"version {VERSION} and {size * len(names)} numbers of {len(names)} tools.")  # fmt: skip
+                               f"version {VERSION} and {size * len(names)} numbers of {len(names)} tools. Older laws need "
+                               "the release that recorded them.")  # fmt: skip
         return cls({name: _memory(part, shapes) for name, part in
                     zip(names, numbers.reshape(len(names), size), strict=True)})  # fmt: skip
 

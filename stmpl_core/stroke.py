@@ -102,7 +102,7 @@ def played(stroke: Stroke, series: Series, friction: float) -> Course:
         if pressing:
             before, relaxed = elastic[k], kept + gain * elastic[k]
         else:
-            relaxed = let_go(*series, dt[k], share * way[k] / stroke.radius, before, elastic[k], relaxed)
+            relaxed, _ = let_go(*series, dt[k], share * way[k] / stroke.radius, before, elastic[k], relaxed)
             before = float(series.shares @ relaxed)
             springs[:], faded[:], stiff = 0.0, 0.0, np.zeros(3)
             continue

@@ -78,6 +78,18 @@ class Slip(NamedTuple):
         return "slide" if self.share > 1 - 1e-9 else "creep" if self.share > 0 else "stick"
 
 
+class Imprint(NamedTuple):
+    """Skin that is not back yet after a tool left it.
+
+    Args:
+        pose: pose of the tool when it pressed last, (4, 4).
+        depth: depth at which the skin under its middle is now [m].
+    """
+
+    pose: Transform
+    depth: float
+
+
 @dataclass(frozen=True, eq=False)
 class Touch:
     """Effect of one contact: status, wrench, depth, pressure.
@@ -95,8 +107,7 @@ class Touch:
         pressure: pressure on the skin, (V,) [Pa]; None in recordings, which keep the sum over all tools.
         pressed: squeeze and field from which the motion under the tool follows; None: nothing presses, or a recording.
         slip: friction of the contact; None: none is told (no state, no friction, nothing presses, or a recording).
-        imprint: pose of the tool at which it would press elastic skin to where the skin is that has not come back yet,
-            (4, 4); None: the skin is where the tool is.
+        imprint: skin that the tool let go and that is not back yet; None: the skin is where the tool is.
         passive: factor on the wrench that keeps the contact from giving more energy than was put in [-].
         wake: grooves that the tool left behind where it slid over skin that relaxes.
     """
@@ -113,7 +124,7 @@ class Touch:
     pressure: PerVertex | None = None
     pressed: Pressed | None = None
     slip: Slip | None = None
-    imprint: Transform | None = None
+    imprint: Imprint | None = None
     passive: float = 1.0
     wake: Wake | None = None
 

@@ -9,8 +9,7 @@ import numba
 import numpy as np
 
 from stmpl_core.arrays import Points, Transform, VertexVectors
-from stmpl_core.columns import shifted
-from stmpl_core.relaxation import Series, decay_of_free, weights
+from stmpl_core.relaxation import Series, decay_of_free, depth_left, weights
 
 if TYPE_CHECKING:
     from stmpl_core.layer import SoftLayer
@@ -30,9 +29,10 @@ class Pass(NamedTuple):
         middle: middle of its contact on the skin at rest, (3,) [m].
         normal: mean inward normal there, (3,).
         relaxed: elastic force that has relaxed in each time, (P,) [N].
-        force: elastic force [N].
+        force: elastic force at rest (stmpl_core.relaxation) [N].
         depth: depth of the contact [m].
-        power: power of the depth with which the force grows [-].
+        power: power of the depth with which the elastic force grows [-].
+        strain: 1 less the stretch of the column under it [-].
         radius: radius of the contact [m].
     """
 
@@ -43,19 +43,28 @@ class Pass(NamedTuple):
     force: float
     depth: float
     power: float
+    strain: float
     radius: float
 
 
 class Groove(NamedTuple):
-    """Pose at which a tool would lie in the groove that it left, (4, 4), and how deep that is there [m]."""
+    """A place of a tool's way where the skin is not back yet.
+
+    Args:
+        pose: pose of the tool when it pressed there, (4, 4).
+        depth: depth to which the skin has come back [m].
+        share: the same over the depth of the press [-].
+    """
 
     pose: Transform
     depth: float
+    share: float
 
 
 _FROM = 16  # first column of the middle
-_POSE, _NORMAL = slice(0, _FROM), slice(19, 22)
-_NOW, _FORCE, _DEPTH, _POWER, _RADIUS, FIXED = 22, 23, 24, 25, 26, 27  # columns; what has relaxed follows
+_POSE = slice(0, _FROM)
+_NOW, _FORCE, _DEPTH, _POWER, _STRAIN = 22, 23, 24, 25, 26  # force at rest now and of the press; see Pass
+_LET_DEPTH, _LET_FORCE, FIXED = 27, 28, 29  # depth and force at rest where the tool went off, 0 under it; D_i follow
 
 
 def untouched(terms: int) -> np.ndarray:
@@ -65,15 +74,21 @@ def untouched(terms: int) -> np.ndarray:
 
 @numba.njit(cache=True, error_model="numpy")
 def _depths(trail, shares):
-    """How deep the skin would stay at each place if it were let go now, (PLACES,) [m]; 0 where there is none."""
+    """How deep the skin is at each place, or would stay if it were let go now, (PLACES,) [m]; 0 where there is none.
+
+    Skin that was let go comes back as its force does, through one shape.
+    """
     out = np.zeros(len(trail))
     for k in range(len(trail)):
-        if trail[k, _FORCE] > 0:
-            share = 0.0
+        row = trail[k]
+        if row[_FORCE] > 0:
+            force = 0.0
             for i in range(len(shares)):
-                share += shares[i] * trail[k, FIXED + i]
-            share = min(max(share / trail[k, _FORCE], 0.0), 1.0)
-            out[k] = trail[k, _DEPTH] * share ** (1 / trail[k, _POWER])
+                force += shares[i] * row[FIXED + i]
+            if row[_LET_DEPTH] > 0:
+                out[k] = row[_LET_DEPTH] * min(max(force / row[_LET_FORCE], 0.0), 1.0)
+            else:
+                out[k] = row[_DEPTH] * depth_left(min(max(force / row[_FORCE], 0.0), 1.0), row[_POWER], row[_STRAIN])
     return out
 
 
@@ -84,19 +99,23 @@ def _aged(trail, shares, times, dt, away, radius, force):
     `away`: how far each is from the tool, (PLACES,) [m], infinite where there is none, as where one is forgotten.
     """
     terms = len(times)
-    kept, gain, back = np.empty(terms), np.empty(terms), np.empty((0, 0))
+    kept, gain, back, depths = np.empty(terms), np.empty(terms), np.empty((0, 0)), _depths(trail, shares)
     for k in range(len(trail)):
         row = trail[k]
         if not row[_FORCE] > 0:
             continue
         if away[k] < radius:
             weights(times, dt, 0.0, row[_NOW], row[FIXED:], kept, gain)
-            row[_NOW] = force
+            row[_NOW], row[_LET_DEPTH] = force, 0.0
             for i in range(terms):
                 row[FIXED + i] = kept[i] + gain[i] * force
             continue
         if not len(back):
             back = decay_of_free(shares, times, dt)
+        if row[_LET_DEPTH] == 0:
+            row[_LET_DEPTH], row[_LET_FORCE] = depths[k], 0.0
+            for i in range(terms):
+                row[_LET_FORCE] += shares[i] * row[FIXED + i]
         row[_NOW], kept[:] = 0.0, row[FIXED:]
         for i in range(terms):
             row[FIXED + i] = 0.0
@@ -110,7 +129,7 @@ def _aged(trail, shares, times, dt, away, radius, force):
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _pressed(trail, shares, times, dt, pose, middle, normal, relaxed, force, depth, power, radius):
+def _pressed(trail, shares, times, dt, pose, middle, normal, relaxed, force, depth, power, strain, radius):
     """The places after a step in which the tool presses; see Pass."""
     trail, away = trail.copy(), np.full(len(trail), np.inf)
     for k in range(len(trail)):
@@ -127,7 +146,8 @@ def _pressed(trail, shares, times, dt, pose, middle, normal, relaxed, force, dep
     if new or (away[place] < SAME * radius and force > trail[place, _FORCE]):
         row = trail[place]
         row[:_FROM], row[_FROM : _FROM + 3], row[_FROM + 3 : _NOW] = pose.ravel(), middle, normal
-        row[_NOW], row[_FORCE], row[_DEPTH], row[_POWER], row[_RADIUS] = force, force, depth, power, radius
+        row[_NOW], row[_FORCE], row[_DEPTH], row[_POWER], row[_STRAIN] = force, force, depth, power, strain
+        row[_LET_DEPTH] = row[_LET_FORCE] = 0.0
     return trail
 
 
@@ -174,12 +194,12 @@ class Wake(NamedTuple):
         """The places where the skin is not back yet, as poses of the tool."""
         depths = _depths(self.trail, self.shares)
         some = np.flatnonzero(depths > FORGOTTEN * self.trail[:, _DEPTH])
-        return tuple(Groove(shifted(row[_POSE].reshape(4, 4), (depth - row[_DEPTH]) * row[_NORMAL]), depth)
+        return tuple(Groove(row[_POSE].reshape(4, 4), depth, depth / row[_DEPTH])
                      for row, depth in zip(self.trail[some], depths[some].tolist(), strict=True))  # fmt: skip
 
 
 def sunk(layer: SoftLayer, field: SignedDistance, left: Sequence[Groove], displacement: VertexVectors) -> VertexVectors:
-    """The displacement with the skin in grooves as deep as they are: straight in, onto the tool as it would lie there.
+    """The displacement with the skin in grooves as deep as they are: straight in, by a share of what the tool pressed.
 
     Args:
         layer: layer at rest.
@@ -196,7 +216,8 @@ def sunk(layer: SoftLayer, field: SignedDistance, left: Sequence[Groove], displa
     for groove in left:
         local = (layer.vertices[near] - groove.pose[:3, 3]) @ groove.pose[:3, :3]
         some = np.flatnonzero(np.all((local > low) & (local < high), axis=1))
-        wanted[some] = np.maximum(wanted[some], np.minimum(-field.distance(local[some]), groove.depth))
+        pressed = groove.share * -field.distance(local[some])
+        wanted[some] = np.maximum(wanted[some], np.minimum(pressed, groove.depth))
     inward = -layer.normals[near]
     missing = wanted - np.einsum("ni,ni->n", displacement[near], inward)
     some = np.flatnonzero((wanted > 0) & (missing > 0))

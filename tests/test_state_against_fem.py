@@ -92,8 +92,8 @@ def test_sliding_begins_where_finite_elements_say(name: str) -> None:
     assert onset(found) == pytest.approx(onset(truth), rel=0.1)
 
 
-@pytest.mark.parametrize("name, allowed", [("slab-ramp-hold", 0.04), ("slab-massage", 0.04),
-                                           ("slab-press-lift-press", 0.08)])  # fmt: skip
+@pytest.mark.parametrize("name, allowed", [("slab-ramp-hold", 0.035), ("slab-massage", 0.035),
+                                           ("slab-press-lift-press", 0.035)])  # fmt: skip
 def test_force_relaxes_as_that_of_finite_elements(name: str, allowed: float) -> None:
     """The elastic law is 2.6 % off here by itself."""
     stroke = Stroke(name)

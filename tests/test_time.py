@@ -81,18 +81,19 @@ def test_a_held_press_relaxes_as_the_series_says(sim: Simulator, elastic: Simula
 
 
 def test_the_force_is_the_convolution_until_the_skin_is_free(sim: Simulator, elastic: Simulator) -> None:
-    """1 Hz massage with lift-off, against the integral over the elastic force on a fine grid of time."""
+    """1 Hz massage with lift-off, against the integral over the elastic force at rest on a fine grid of time."""
     times = np.linspace(0, 3, 601)
     depths = 0.5 * DEPTH * (1 - 1.4 * np.cos(2 * np.pi * times))
     found = forces(sim, times, depths)
     plain = forces(elastic, times, depths)
+    stretch = 1 - np.maximum(depths, 0) / sim.layer.thickness[0]
     history, free, straight = np.zeros(2), 0.0, []
     gone = np.exp(-0.005 / np.array(SERIES.times))
-    for one in plain:  # forward Euler in the elastic force of skin that is free or held
+    for one, long in zip(plain, stretch, strict=True):  # forward Euler in the force at rest of skin, free or held
         owed = float(np.array(SERIES.shares) @ (gone * history + (1 - gone) * free))
-        free = max(one, owed)
+        free = max(one / long, owed)
         history = gone * history + (1 - gone) * free
-        straight.append(max(one - float(np.array(SERIES.shares) @ history), 0.0))
+        straight.append(max(one - long * float(np.array(SERIES.shares) @ history), 0.0))
     assert np.abs(found - straight).max() < 0.02 * plain.max()
     assert (found == 0).mean() > (plain == 0).mean() + 0.05  # skin lags: the tool leaves it early
 
@@ -175,6 +176,26 @@ def test_a_lift_in_one_long_step_lets_the_skin_go_when_the_tool_does(sim: Simula
         (_,), many = sim.touch([pressed(depth)], many, 0.01)
     one, other = (state.tools["probe"].scalars for state in (once, many))
     assert one.elastic == pytest.approx(other.elastic, rel=0.15)  # a force of d^1.5, taken as straight in time
+
+
+def test_a_quick_lift_after_a_hold_unloads_steeper_than_elastic_skin(sim: Simulator, elastic: Simulator) -> None:
+    """What relaxed pulls with the stretch of the column: F = F_e - (1 - d / t) A."""
+    thickness, back = float(sim.layer.thickness[0]), 0.9 * DEPTH
+    found = forces(sim, np.array([0, 0, 3.0, 3.0]), np.array([-1e-4, DEPTH, DEPTH, back]))
+    plain = forces(elastic, np.zeros(3), np.array([-1e-4, DEPTH, back]))
+    relaxed = (plain[1] - found[2]) / (1 - DEPTH / thickness)
+    assert found[3] == pytest.approx(plain[2] - (1 - back / thickness) * relaxed, rel=1e-3)
+    assert found[2] - found[3] > 1.02 * (plain[1] - plain[2])
+
+
+def test_skin_that_comes_back_goes_through_one_shape(sim: Simulator) -> None:
+    """What is left of a load that fades is the same motion, smaller; it begins where the tool let go."""
+    touches, _ = played(sim, np.array([0, 0.1, 5.0, 5.01, 5.3, 7.0]), np.array([-1e-4, *[DEPTH] * 2, *[-1e-3] * 3]))
+    first, *later = (sim.answer([touch]).displacement for touch in touches[3:])
+    for one in later:
+        share = np.vdot(one, first) / np.vdot(first, first)
+        assert 0.1 < share < 0.95
+        np.testing.assert_allclose(one, share * first, atol=1e-3 * DEPTH)
 
 
 def test_skin_comes_back_by_itself_after_a_quick_lift(sim: Simulator) -> None:
