@@ -15,18 +15,19 @@ MIN_OFFSET = 1e-6  # way of skin along a tool that is not worth an answer [m]
 def dragged_motion(green: Green, touch: Touch) -> VertexVectors | None:
     """Motion that comes to the skin where a touch drags what sticks to it along, (V, 3) [m]; None: it does not.
 
-    The part of the contact that presses goes and turns as one, in the linear response; it adds to the motion under the
-    same tool pressed straight, where the skin came from.
+    The part of the contact that presses goes and turns as one where it sticks, and as its friction drags it where it
+    slides, in the linear response; it adds to the motion under the same tool pressed straight, where the skin came
+    from.
 
     Args:
         green: response of the layer.
         touch: touch with its friction.
     """
-    ways, pressed = ways_along(touch), touch.pressed
-    if ways is None or pressed is None:
+    ways, pressed, slip = ways_along(touch), touch.pressed, touch.slip
+    if ways is None or pressed is None or pressed.forces is None or slip is None:
         return None
-    nodes = _holding(pressed)
-    return green.motion(nodes, green.stuck(nodes, green.near.groups(nodes.corners[:, 0]), ways))
+    nodes, pressing = _holding(pressed), pressed.forces[pressed.forces > 0]
+    return green.motion(nodes, green.rubbed(nodes, green.near.groups(nodes.corners[:, 0]), ways, pressing, slip.share))
 
 
 def ways_along(touch: Touch) -> Points | None:

@@ -157,10 +157,34 @@ class Green:
             group: numbers of groups of nodes that do not feel each other, (N,).
             gone: their motion, (N, 3) [m].
         """
-        blocks = _blocks(nodes.points, nodes.inward, nodes.area, nodes.corners, nodes.shares, group,
-                         self.unit_at(nodes), self.tables, *self._coarse)  # fmt: skip
-        np.fill_diagonal(blocks, np.diag(blocks) + RIDGE * np.abs(blocks).max())
-        return np.linalg.solve(blocks, gone.ravel()).reshape(-1, 3)
+        return _held(self._blocks(nodes, group), gone)
+
+    def rubbed(self, nodes: Nodes, group: np.ndarray, ways: np.ndarray, pressing: np.ndarray,
+               share: float) -> np.ndarray:  # fmt: skip
+        """Forces over E with which nodes are dragged along, of which a share slides, (N, 3) [m2].
+
+        What sticks goes its way, all of it. What slides is dragged with a traction mu p, so the more the harder it is
+        pressed, and goes its way in the mean, weighed with what presses.
+
+        Args:
+            nodes, group: see `stuck`.
+            ways: their ways along the tool, (N, 3) [m].
+            pressing: forces that press them, (N,) [N].
+            share: share that slides [-].
+        """
+        blocks, rubs = self._blocks(nodes, group), pressing[:, None] * ways
+        out = np.zeros_like(ways)
+        if share < 1:
+            out += (1 - share) * _held(blocks, ways)
+        if share > 0:
+            goes = (blocks @ rubs.ravel()).reshape(-1, 3)
+            out += share * np.vdot(rubs, ways) / np.vdot(rubs, goes) * rubs
+        return out
+
+    def _blocks(self, nodes: Nodes, group: np.ndarray) -> np.ndarray:
+        """Motion of each node under a force E at each, (3 N, 3 N) [1/m]."""
+        return _blocks(nodes.points, nodes.inward, nodes.area, nodes.corners, nodes.shares, group, self.unit_at(nodes),
+                       self.tables, *self._coarse)  # fmt: skip
 
     def motion(self, nodes: Nodes, forces: np.ndarray) -> np.ndarray:
         """Motion of all vertices under forces over E at nodes (N, 3) [m2], (V, 3) [m]."""
@@ -406,6 +430,13 @@ def _blocks(points, inward, area, corners, shares, group, unit, tables, skin_cor
                     if i != j:
                         out[j, y, i, x] += moved[x]
     return out.reshape(3 * count, 3 * count)
+
+
+def _held(blocks: np.ndarray, gone: np.ndarray) -> np.ndarray:
+    """Forces (N, 3) under which nodes go where they have gone, (N, 3), by `_blocks`."""
+    held = blocks.copy()
+    np.fill_diagonal(held, np.diag(held) + RIDGE * np.abs(held).max())
+    return np.linalg.solve(held, gone.ravel()).reshape(-1, 3)
 
 
 @numba.njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")

@@ -197,13 +197,13 @@ class Simulator:
         return solved, kept_out(self.layer, solved.displacement, touches)
 
     def _dragged(self, fitted: Conformed, touches: Sequence[Touch]) -> Conformed:
-        """The answer with the skin that is dragged along."""
-        for touch in touches:
-            if touch.slip is not None:
-                more = dragged_motion(Green.of(self.layer), touch)
-                if more is not None:
-                    fitted = fitted._replace(displacement=fitted.displacement + more)
-        return fitted
+        """The answer with the skin that is dragged along, and out of the tools."""
+        slides = [touch for touch in touches if touch.slip is not None]
+        more = [one for one in (dragged_motion(Green.of(self.layer), touch) for touch in slides) if one is not None]
+        if not more:
+            return fitted
+        out = kept_out(self.layer, fitted.displacement + sum(more[1:], more[0]), touches)
+        return out._replace(corrected=max(fitted.corrected, out.corrected))
 
     def _sunk(self, fitted: Conformed, touches: Sequence[Touch]) -> tuple[Conformed, float]:
         """The answer with grooves that are left, and the largest motion that these add [m]."""

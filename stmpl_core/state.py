@@ -141,8 +141,8 @@ class State:
         size = sum(int(np.prod(shape)) for shape in shapes)
         if version != VERSION or len(numbers) != size * len(names):
             raise InvalidInput(f"a state of version {version} with {len(numbers)} numbers cannot be read; expected are "
-                               f"version {VERSION} and {size * len(names)} numbers of {len(names)} tools. Older laws need "
-                               "the release that recorded them.")  # fmt: skip
+                               f"version {VERSION} and {size * len(names)} numbers of {len(names)} tools. Older ones "
+                               "need the release that recorded them.")  # fmt: skip
         return cls({name: _memory(part, shapes) for name, part in
                     zip(names, numbers.reshape(len(names), size), strict=True)})  # fmt: skip
 

@@ -145,7 +145,9 @@ def _pressed(trail, shares, times, dt, pose, middle, normal, relaxed, force, dep
         trail[place, FIXED:] = relaxed
     if new or (away[place] < SAME * radius and force > trail[place, _FORCE]):
         row = trail[place]
-        row[:_FROM], row[_FROM : _FROM + 3], row[_FROM + 3 : _NOW] = pose.ravel(), middle, normal
+        row[:_FROM] = pose.ravel()
+        if new:  # one that is pressed deeper stays where it is, however slowly the tool goes on
+            row[_FROM : _FROM + 3], row[_FROM + 3 : _NOW] = middle, normal
         row[_NOW], row[_FORCE], row[_DEPTH], row[_POWER], row[_STRAIN] = force, force, depth, power, strain
         row[_LET_DEPTH] = row[_LET_FORCE] = 0.0
     return trail

@@ -101,6 +101,29 @@ def test_nodes_that_stick_go_where_their_tool_takes_them():
         np.testing.assert_allclose(deepest, 3e-3 * straight / -straight[2], atol=4e-4)
 
 
+def test_what_slides_is_dragged_as_hard_as_it_is_pressed_and_what_sticks_goes_as_one():
+    """A traction as Hertz's pressure moves skin by about 1 - r^2 / 2 a^2 of its middle, 0.8 in the mean, so weighed."""
+    green = flat(Tissue(3e3, 0.45), 2e-3)
+    x, y = (one.ravel() for one in np.meshgrid(*2 * [np.linspace(-4e-3, 4e-3, 13)]))
+    r = np.hypot(x, y)
+    x, y, r = x[r < 4e-3], y[r < 4e-3], r[r < 4e-3]
+    points, inward = np.column_stack([x, y, 0 * x]), np.tile([0.0, 0.0, -1.0], (len(x), 1))
+    near = np.argmin(np.linalg.norm(green.layer.vertices[None] - points[:, None], axis=2), axis=1)
+    one = np.full(len(x), 1.0)
+    nodes = Nodes(points, inward, THICK * one, (4e-3 / 6) ** 2 * one, 0.1 * one, np.tile(near[:, None], 3),
+                  np.tile([1.0, 0.0, 0.0], (len(x), 1)), 1e-3 * one)  # fmt: skip
+    group, ways = green.near.groups(nodes.corners[:, 0]), np.tile([1e-3, 0.0, 0.0], (len(x), 1))
+    pressing = np.sqrt(1 - (r / 4e-3) ** 2)
+    sticks, half, slides = (green.rubbed(nodes, group, ways, pressing, share) for share in (0.0, 0.5, 1.0))
+    np.testing.assert_allclose(sticks, green.stuck(nodes, group, ways))
+    np.testing.assert_allclose(half, 0.5 * (sticks + slides), atol=1e-12)
+    np.testing.assert_allclose(slides[:, 0] / slides[:, 0].max(), pressing / pressing.max(), atol=1e-12)
+    middle = [green.motion(nodes, forces)[np.linalg.norm(green.layer.vertices, axis=1).argmin(), 0]
+              for forces in (sticks, slides)]  # fmt: skip
+    assert middle[0] == pytest.approx(1e-3, rel=0.1) and middle[1] == pytest.approx(1e-3 / 0.8, rel=0.05)
+    assert 0.8 < slides[:, 0].sum() / sticks[:, 0].sum() < 1.0  # what sticks as one is stiffest
+
+
 def test_pressures_are_forces_at_vertices(green):
     pressure = np.where(np.linalg.norm(LIMB.vertices - [-RADIUS, 0, LENGTH / 2], axis=1) < 0.01, 1.0, 0.0)
     once, twice = green.linear(pressure), green.linear(2 * pressure)

@@ -67,6 +67,19 @@ def test_a_groove_is_as_deep_as_what_has_relaxed_there_presses(ball: Tool) -> No
     assert np.median(groove(layer, answer)) == pytest.approx(expected, rel=0.25)
 
 
+def test_a_groove_begins_where_the_tool_came_down_however_slowly_it_goes_on(ball: Tool) -> None:
+    """Each step is far shorter than two places are apart, and presses a little deeper."""
+    simulator, state, touches = Simulator(slab(SERIES), Winkler(), friction=0.1), State(), []
+    for k in range(101):
+        pose = np.eye(4)
+        pose[:3, 3] = 2e-4 * k, 0.0, RADIUS - DEPTH - 1e-6 * k
+        touches, state = simulator.touch([Contact(ball, pose)], state, dt=0.01)
+    left = touches[0].wake
+    assert left is not None
+    places = sorted(groove.pose[0, 3] for groove in left.grooves())
+    assert places[0] < 2e-3 and len(places) > 3
+
+
 def test_a_groove_comes_back_and_is_forgotten(ball: Tool) -> None:
     layer = slab(SERIES)
     soon, _, _ = slid(layer, ball, lift=True)
