@@ -1,0 +1,314 @@
+"""Strokes: the friction of a tool and the relaxation of a skin, from wrenches and poses that a robot measured.
+
+What a stroke does not tell is refused: a tool that stuck says nothing of sliding, a short hold nothing of long times.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import NamedTuple
+
+import numpy as np
+
+from stmpl_core.contact import Contact
+from stmpl_core.errors import InvalidInput
+from stmpl_core.footing import patch_of
+from stmpl_core.history import mean_thickness
+from stmpl_core.regions import HELD_SKIN
+from stmpl_core.relaxation import series_of, stretch, weights
+from stmpl_core.sideways import Sideways
+from stmpl_core.slip import PLOUGHED, ploughing
+from stmpl_core.tissue import Prony
+from stmpl_core.touch import Touch
+from stmpl_core.toucher import Toucher
+from stmpl_core.trust import Trust
+
+MIN_INSTANTS = 8  # instants of one kind that a fit needs
+SLID = 1.8  # way over friction / stiffness from which a tool slides (Cattaneo, Mindlin: 1.5); twice after another way
+MOST_RUBBED = 0.95  # quantile of the force along the skin over that across it, from which follows where tools slide
+STRAIGHT = 1.05  # length of a way over the distance of its ends, up to which it counts as straight
+LEAN = 0.05  # tilt of the contact's normal that strokes one way do not tell from friction [-]
+OWN_FRICTION = 0.08  # relative error of the law of friction: 3 to 9 % of the largest by finite elements
+MAX_FRICTION_ERROR = 0.3  # standard error of a coefficient over it
+OWN_FORCE = 0.01  # error of the law of relaxation while a tool stays, over the largest force: 0.5 % by finite elements
+STAYS = 3e-4  # way along the skin within which a tool stays [m]
+MAX_RESIDUAL = 0.06  # relative error of the forces that may be left; with more it is not that series
+MAX_SHARE_ERROR = 0.1  # standard error of the share of the force that fades [-]
+
+
+@dataclass(frozen=True)
+class Rubbing:
+    """Friction of a tool, as its strokes tell it.
+
+    Args:
+        friction: coefficient mu [-]; nan where `trust` says that none could be found.
+        error: standard error of it, scatter, tilt of the normal and the law's own error together [-].
+        instants: number of instants at which the tool slid.
+        way: way that it slid [m].
+        both_ways: whether it slid there and back.
+        trust: verdict on mu: may it be used, and why not.
+    """
+
+    friction: float
+    error: float
+    instants: int
+    way: float
+    both_ways: bool
+    trust: Trust
+
+    def __str__(self) -> str:
+        back = "there and back" if self.both_ways else "one way"
+        return f"mu = {self.friction:.2f} +- {self.error:.2f} from {1e3 * self.way:.0f} mm of sliding {back}"
+
+
+@dataclass(frozen=True)
+class Fading:
+    """Relaxation of a skin, as a press that stays tells it.
+
+    Args:
+        share: share of the force that fades in the end [-]; nan where `trust` says that none could be found.
+        error: standard error of it [-].
+        relaxation: series of the materials, that which was asked for with other shares; None: nothing fades, or `trust`
+            says why none was found.
+        lasts: time that the press took [s].
+        residual: relative error of the forces that is left, root mean square [-].
+        trust: verdict: may it be used, and why not.
+    """
+
+    share: float
+    error: float
+    relaxation: Prony | None
+    lasts: float
+    residual: float
+    trust: Trust
+
+    def __str__(self) -> str:
+        return f"{self.share:.0%} +- {self.error:.0%} of the force fades, from {self.lasts:.1f} s of pressing"
+
+
+class _Rubbed(NamedTuple):
+    """An instant at which a tool rubs: normal (3,), N and F_t [N], radius [m], k_t [N/m], r of ploughing [-]."""
+
+    normal: np.ndarray
+    pressing: float
+    rubs: float
+    radius: float
+    stiffness: float
+    rises: float
+
+
+def fit_friction(toucher: Toucher, strokes: Sequence[Contact]) -> Rubbing:
+    """Finds the coefficient mu of a tool that slides.
+
+    In steady slide the force along the way is R = mu (1 + (0.2 + 0.67 mu) r) of the normal one (`slip.ploughing`),
+    which is solved for mu. A tool slides once it went straight on by SLID F / k, twice that after another way, with F
+    the largest force along the skin and k the stiffness of the skin to what sticks (`stmpl_core.sideways`): one that
+    sticks never does, since its force grows with the way. The normal is that of the contact law under the measured
+    force; how far it is off changes sign with the way, so strokes there and back are worth more than twice one of them.
+
+    Args:
+        toucher: contact law on the skin, about as stiff as it is.
+        strokes: contacts of one tool with their wrenches, in order of time.
+
+    Raises:
+        InvalidInput: a contact without a wrench, or of more than one tool.
+    """
+    _of_one_tool(strokes)
+    pressing = [one for one in strokes if one.wrench is not None and one.wrench[:3].any()]
+    places = np.array([one.pose_body_from_tool[:3, 3] for one in pressing]).reshape(-1, 3)
+    if not len(places) or not np.ptp(places, axis=0).any():
+        return _no_friction("the tool pressed nowhere, or stood still")
+    sideways = Sideways(toucher.layer)
+    found = [_rubbed(toucher, sideways, one) for one in pressing]
+    ratios = [one.rubs / one.pressing for one in found if one is not None]
+    most = float(np.quantile(ratios, MOST_RUBBED)) if ratios else 0.0
+    slid, ways, mus, furthest, needed = [], [], [], 0.0, math.inf
+    for k, (contact, one) in enumerate(zip(pressing, found, strict=True)):
+        if one is None or contact.wrench is None:
+            continue
+        wanted = SLID * most * one.pressing / one.stiffness
+        way, start = _straight(places, k, 2 * wanted)
+        way = way - (way @ one.normal) * one.normal
+        went = float(np.linalg.norm(way))
+        steps = np.diff(places[: start + 1], axis=0)
+        before = float(np.linalg.norm(steps - (steps @ one.normal)[:, None] * one.normal, axis=1).sum())
+        wanted *= 2 if before > 0.1 * went else 1
+        if went / wanted > furthest / needed:
+            furthest, needed = went, wanted
+        if went >= wanted > 0:
+            slid.append(k)
+            ways.append(way / went)
+            mus.append(_friction_of(float(contact.wrench[:3] @ way) / went / one.pressing, one.rises))
+    if len(slid) < MIN_INSTANTS:
+        went = f"; it went {1e3 * furthest:.1f} mm straight on, {1e3 * needed:.1f} mm are needed" if furthest else ""
+        return _no_friction(f"the tool slid at {len(slid)} of {len(pressing)} instants, {MIN_INSTANTS} are needed"
+                            f"{went}. Stroke further, there and back")  # fmt: skip
+    mus, axis = np.array(mus), np.linalg.svd(np.array(ways), full_matrices=False)[2][0]
+    forth = np.array(ways) @ axis > 0
+    way = sum(float(np.linalg.norm(places[b] - places[a])) for a, b in pairwise(slid) if b == a + 1)
+    radius = float(np.median([one.radius for one in found if one is not None]))
+    both = min(forth.sum(), (~forth).sum()) >= MIN_INSTANTS
+    friction = float(np.mean([np.median(mus[forth]), np.median(mus[~forth])]) if both else np.median(mus))
+    spread = 1.4826 * float(np.median(np.abs(mus - friction))) / math.sqrt(max(way / radius, 1.0))
+    error = float(np.hypot(np.hypot(spread, OWN_FRICTION * abs(friction)), 0.0 if both else LEAN))
+    trust = Trust()
+    if friction <= 0:
+        trust = trust.also("the force along the skin points against the tool's way: is it what the tool exerts on the "
+                           "body?", converged=False)  # fmt: skip
+    elif error > MAX_FRICTION_ERROR * friction:
+        trust = trust.also(f"friction is known to {error:.2f} of {friction:.2f} only, {MAX_FRICTION_ERROR:.0%} is "
+                           "needed. Stroke there and back", converged=False)  # fmt: skip
+    return Rubbing(friction, error, len(slid), way, bool(both), trust)
+
+
+def _rubbed(toucher: Toucher, sideways: Sideways, one: Contact) -> _Rubbed | None:
+    """What an instant tells, with the contact law under its force; None: nothing presses."""
+    touch = toucher.touch(one)
+    pressed = touch.pressed
+    if one.wrench is None or pressed is None or pressed.forces is None or not touch.force > 0:
+        return None
+    normal, nodes = touch.push / touch.force, pressed.squeeze.nodes
+    depth = nodes.sinking if len(nodes.sinking) else nodes.strain * nodes.thickness
+    _, radius, _, thickness, _ = patch_of(nodes.points, nodes.area, nodes.thickness, depth, pressed.forces, normal)
+    pressing = float(one.wrench[:3] @ normal)
+    if not pressing > 0:
+        return None
+    rubs = float(np.linalg.norm(one.wrench[:3] - pressing * normal))
+    patch = sideways.at(radius, thickness)
+    stiffer, _ = ploughing(touch.depth, radius, pressing, patch.along, 0.0)
+    rises = touch.depth / radius * pressing / (patch.along * radius)
+    return _Rubbed(normal, pressing, rubs, radius, stiffer * patch.secant(rubs), rises)
+
+
+def _friction_of(ratio: float, rises: float) -> float:
+    """mu from the force along the way over the normal one; see slip.ploughing."""
+    a, b = PLOUGHED[2] * rises, 1 + PLOUGHED[1] * rises
+    size = abs(ratio)
+    return math.copysign(2 * size / (b + math.sqrt(b * b + 4 * a * size)), ratio)
+
+
+def _straight(places: np.ndarray, k: int, far: float) -> tuple[np.ndarray, int]:
+    """Way that a tool went straight on to place k, (3,) [m], as far as just more than `far` [m]; and where it began."""
+    length, best, start = 0.0, np.zeros(3), k
+    for j in range(k - 1, -1, -1):
+        length += float(np.linalg.norm(places[j + 1] - places[j]))
+        way = places[k] - places[j]
+        went = float(np.linalg.norm(way))
+        if length > STRAIGHT * went + 1e-5:
+            break
+        best, start = way, j
+        if went > far:
+            break
+    return best, start
+
+
+def fit_relaxation(toucher: Toucher, press: Sequence[Contact], relaxation: Prony | None = None,
+                   offset: float = 0.0) -> Fading:  # fmt: skip
+    """Finds how much of a skin's force fades, from a press that stays in one place.
+
+    With S_e and D_i of `stmpl_core.relaxation` along the measured poses, which do not depend on the shares g_i while
+    the tool presses, the measured force is linear in two unknowns, the stiffness c and the share's factor x:
+
+        F = c lambda S_e - (c x) lambda sum g_i D_i
+
+    Args:
+        toucher: contact law on the skin, of whatever stiffness.
+        press: contacts of one tool with their wrenches and times, from the first touch on.
+        relaxation: series whose times and whose shares among each other are taken; None: the tissue's own, else
+            stmpl_core.regions.HELD_SKIN.
+        offset: distance by which the poses stand too far back along their push [m] (`fit_stiffness` tells it).
+
+    Raises:
+        InvalidInput: a contact without a wrench, of more than one tool, or times that do not go forward.
+    """
+    _of_one_tool(press)
+    taken = relaxation or toucher.layer.tissue.relaxation or HELD_SKIN
+    layer, steps = toucher.layer, np.diff([one.time for one in press])
+    if (steps <= 0).any() or not np.isfinite(steps).all():
+        raise InvalidInput("the times of a press must go forward; relaxation is a matter of time.")
+    shares, times = series_of(layer.tissue.relaxing(taken), float(np.median(layer.thickness)))
+    relaxed, kept, gain, before = np.zeros(len(times)), np.empty(len(times)), np.empty(len(times)), 0.0
+    rows, forces, when, middle = [], [], [], None
+    for k, one in enumerate(press):
+        assert one.wrench is not None
+        size = float(np.linalg.norm(one.wrench[:3]))
+        push = one.wrench[:3] / size if size > 0 else np.zeros(3)
+        touch = _at(toucher, one, offset * push)
+        weights(times, steps[k - 1] if k else 0.0, 0.0, before, relaxed, kept, gain)
+        if touch.pressed is None or not touch.force > 0:
+            if rows:
+                break
+            continue
+        middle = one.pose_body_from_tool[:3, 3] if middle is None else middle
+        normal = touch.push / touch.force
+        away = one.pose_body_from_tool[:3, 3] - middle
+        if np.linalg.norm(away - (away @ normal) * normal) > STAYS:
+            break
+        long = stretch(touch.depth, mean_thickness(touch.pressed))
+        before = touch.force / long
+        relaxed = kept + gain * before
+        rows.append((touch.force, -long * float(shares @ relaxed)))
+        forces.append(float(one.wrench[:3] @ normal))
+        when.append(one.time)
+    if len(rows) < MIN_INSTANTS:
+        return _no_fading(f"the tool stayed where it pressed for {len(rows)} instants, {MIN_INSTANTS} are needed. "
+                          "Press, and hold")  # fmt: skip
+    return _faded(np.array(rows), np.array(forces), np.array(when), shares, taken)
+
+
+def _faded(rows: np.ndarray, forces: np.ndarray, when: np.ndarray, shares: np.ndarray, taken: Prony) -> Fading:
+    """Least squares of `fit_relaxation`: F (N,) = rows (N, 2) @ (c, c x), each instant by the time it stands for."""
+    lasts = np.gradient(when)
+    root = np.sqrt(lasts / lasts.mean())[:, None]
+    (stiff, eased), *_ = np.linalg.lstsq(root * rows, root[:, 0] * forces, rcond=None)
+    largest, whole = float(forces.max()), float(when[-1] - when[0])
+    if not (stiff > 0 and largest > 0):
+        return _no_fading("no force points into the skin where the poses touch it: is it what the tool exerts on the "
+                          "body, and are the poses right?")  # fmt: skip
+    left = root[:, 0] * (forces - rows @ (stiff, eased))
+    residual = float(np.sqrt(np.mean(left**2))) / largest
+    normal = np.linalg.inv(rows.T @ (root**2 * rows) / len(rows) + 1e-12 * np.eye(2) * float((rows**2).mean()))
+    factor = float(eased / stiff)
+    slope = np.array([-factor, 1.0]) / stiff
+    spread = float(np.sqrt(slope @ normal @ slope)) * largest
+    spread *= math.hypot(OWN_FORCE, residual / math.sqrt(len(rows)))
+    share, error = factor * float(shares.sum()), spread * float(shares.sum())
+    trust = Trust()
+    if residual > MAX_RESIDUAL:
+        trust = trust.also(f"these times leave the forces off by {residual:.0%}, at most {MAX_RESIDUAL:.0%} is "
+                           "accepted: the poses may be off, or the skin fades otherwise", converged=False)  # fmt: skip
+    if error > MAX_SHARE_ERROR:
+        trust = trust.also(f"{whole:.1f} s of pressing tell the share that fades to {error:.0%} only, "
+                           f"{MAX_SHARE_ERROR:.0%} is needed. Press quickly, and hold longer", converged=False)
+    if not -2 * error <= share < 1:
+        trust = trust.also(f"{share:.0%} of the force would fade: it does not go as under a tool that stays",
+                           converged=False)  # fmt: skip
+    series = None
+    if trust.ok and factor > 0:
+        series = Prony(tuple(factor * g for g in taken.shares), taken.times, "measured by a press that stayed")
+    return Fading(share, error, series, whole, residual, trust)
+
+
+def _at(toucher: Toucher, one: Contact, shift: np.ndarray) -> Touch:
+    pose = one.pose_body_from_tool.copy()
+    pose[:3, 3] += shift
+    return toucher.touch(Contact(one.tool, pose))
+
+
+def _of_one_tool(contacts: Sequence[Contact]) -> None:
+    for one in contacts:
+        if one.wrench is None:
+            raise InvalidInput(f"an instant of {one.name} has no wrench; strokes are judged by the force.")
+        if one.tool is not contacts[0].tool:
+            raise InvalidInput(f"strokes are of one tool; these are of {contacts[0].name} and {one.name}.")
+
+
+def _no_friction(why: str) -> Rubbing:
+    return Rubbing(math.nan, math.nan, 0, 0.0, False, Trust(converged=False, why=why))
+
+
+def _no_fading(why: str) -> Fading:
+    return Fading(math.nan, math.nan, None, 0.0, math.nan, Trust(converged=False, why=why))
