@@ -62,7 +62,7 @@ class Groove(NamedTuple):
 
 
 _FROM = 16  # first column of the middle
-_POSE = slice(0, _FROM)
+_POSE, _MIDDLE, _NORMAL = slice(0, _FROM), slice(_FROM, _FROM + 3), slice(_FROM + 3, 22)
 _NOW, _FORCE, _DEPTH, _POWER, _STRAIN = 22, 23, 24, 25, 26  # force at rest now and of the press; see Pass
 _LET_DEPTH, _LET_FORCE, FIXED = 27, 28, 29  # depth and force at rest where the tool went off, 0 under it; D_i follow
 
