@@ -20,7 +20,7 @@ from stmpl_core.extras import needed
 from stmpl_core.extrusion import foldfree_thickness
 from stmpl_core.layer import SoftLayer, check_faces
 from stmpl_core.tissue import Tissue
-from stmpl_core.trunk import TRUNK, trunk_level
+from stmpl_core.trunk import STEEP, TRUNK, trunk_level
 
 if TYPE_CHECKING:
     from stmpl_core.remesh import Remeshed
@@ -45,6 +45,9 @@ SMPL_TO_BODY = np.array([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]])  # rotation; SMPL l
 SEXES = {"male": 0.0, "female": 1.0}  # share of a gender that is female [-]
 WATER = 1e3  # density of a body [kg/m3]
 PHENOTYPE = ("gender", "age", "muscle", "weight", "height", "proportions")
+AROUND = "around:"  # beginning of the name of a picked part
+NEAR_SKIN = 0.03  # distance from the skin up to which a picked place is taken to be on it [m]
+BIG = 1e3  # way to skin that is not reached [m]
 AVERAGE = 0.5  # value of every phenotype unless given
 
 
@@ -205,7 +208,7 @@ class Body:
         """A part of the body as a soft layer, evenly remeshed, with the body's UV chart attached.
 
         Args:
-            name: name of a part (`Body.parts`), or of one bone.
+            name: name of a part (`Body.parts`), or of one bone; or `around:x,y,z,radius` [m], see `around`.
             edge_length: length of the mesh's edges [m].
             thickness: thickness of the layer [m], one number or one a vertex of the new mesh; thinned, with a warning,
                 where the skin curves more tightly than that.
@@ -219,6 +222,27 @@ class Body:
         if shipped is not None:
             return _layer(*shipped, thickness, tissue)
         return self.patch(name, edge_length).layer(self, thickness=thickness, tissue=tissue)
+
+    def around(
+        self, place: ArrayLike, radius: float = 0.08, *, edge_length: float = 3e-3, thickness: ArrayLike = 7.5e-3,
+        tissue: Tissue | None = None,
+    ) -> SoftLayer:  # fmt: skip
+        """The skin around a picked place as a soft layer, whatever part of the body that is, in a second or two.
+
+        Args:
+            place: place on the skin or near it, (3,) [m].
+            radius: distance along the skin to which it reaches [m]. Tools want to stay twice the thickness and their
+                own size away from its border.
+            edge_length, thickness, tissue: see `part`.
+
+        Raises:
+            InvalidInput: a place that is not near the skin, or a radius of less than two edges.
+            MeshError: a surface that `stmpl_core.remesh` refuses.
+        """
+        if not radius >= 2 * edge_length:
+            raise InvalidInput(f"the radius is {radius:g} m; at least two edges, {2 * edge_length:g} m, are needed.")
+        return self.part(around_name(finite("place", place, (3,)), radius), edge_length=edge_length,
+                         thickness=thickness, tissue=tissue)  # fmt: skip
 
     @property
     def parts(self) -> tuple[str, ...]:
@@ -238,12 +262,46 @@ class Body:
         """
         if part in TRUNK and self._as_anny:
             return trunk_level(_average().vertices, _average().level("torso"), part)
+        if part.startswith(AROUND):
+            return self._level_around(part)
         pattern = PARTS.get(part, re.escape(part))
         columns = [k for k, bone in enumerate(self.bones) if re.fullmatch(pattern, bone)]
         if not columns:
             raise InvalidInput(f"unknown part {part!r}. Available: {', '.join(self.parts)}; "
                                f"or one bone of: {', '.join(self.bones)}.")
         return self.weights[:, columns].sum(axis=1) - 0.5
+
+    def _level_around(self, part: str) -> np.ndarray:
+        """How far each vertex lies inside a picked part, (V,) [-], by the way along the skin.
+
+        Ways go along edges and straight over pairs of triangles, so they are some percent too long.
+        """
+        from scipy.sparse import csr_matrix
+        from scipy.sparse.csgraph import dijkstra
+
+        try:
+            *place, radius = (float(number) for number in part.removeprefix(AROUND).split(","))
+            place = finite("place", place, (3,))
+        except ValueError as error:
+            raise InvalidInput(f"{part!r} is no picked part, as in 'around:0.12,0.03,0.17,0.08' [m].") from error
+        from stmpl_core.methods.coarse import nearest_corners
+
+        corners, shares = nearest_corners(self, place[None])
+        foot = shares[0] @ self.vertices[corners[0]]
+        away = float(np.linalg.norm(foot - place))
+        if not (away <= NEAR_SKIN and np.isfinite(radius) and radius > 0):
+            raise InvalidInput(f"{part!r} is {1e3 * away:.0f} mm from the skin; allowed are {1e3 * NEAR_SKIN:.0f} mm "
+                               "and a radius above 0. Is it in millimetres?")  # fmt: skip
+        edges = np.sort(np.concatenate([self.faces[:, [k, (k + 1) % 3]] for k in range(3)]), axis=1)
+        beyond, order = np.concatenate([self.faces[:, (k + 2) % 3] for k in range(3)]), np.lexsort(edges.T)
+        alike = (edges[order[1:]] == edges[order[:-1]]).all(axis=1)
+        over = np.stack([beyond[order[1:]][alike], beyond[order[:-1]][alike]], axis=1)
+        ends = np.unique(np.sort(np.concatenate([edges, over]), axis=1), axis=0)
+        lengths = np.linalg.norm(self.vertices[ends[:, 0]] - self.vertices[ends[:, 1]], axis=1)
+        ways = csr_matrix((lengths, ends.T), shape=(len(self.vertices),) * 2)
+        along = dijkstra(ways, directed=False, indices=corners[0], limit=radius + STEEP)
+        along += np.linalg.norm(self.vertices[corners[0]] - foot, axis=1)[:, None]
+        return np.clip((radius - np.minimum(along.min(axis=0), BIG)) / STEEP, -1, 1)
 
     def patch(self, part: str, edge_length: float = 3e-3) -> Patch:
         """The mesh of a part, cut where its bones weigh one half, which other poses of the same model can take."""
@@ -284,6 +342,11 @@ class Patch:
                                f"{body.name} has {len(body.vertices)}.")
         vertices = self.mesh.transfer @ body.vertices[self.source]
         return _layer(vertices, self.mesh.faces, self.mesh.uv, thickness, tissue)
+
+
+def around_name(place: np.ndarray, radius: float) -> str:
+    """Name of the part around a place (3,) [m]; see Body.around."""
+    return AROUND + ",".join(f"{number:.9g}" for number in (*place, radius))
 
 
 @cache

@@ -30,7 +30,8 @@ class NodeConfig(BaseModel):
 
     part: str = Field(
         default="", json_schema_extra=CONFIGURING,
-        description=f"part of the body that answers; empty: {FOREARM}, and with tissue 'paper' {PAPER_ARM}",
+        description=f"part of the body that answers, or a picked place and radius in metres, 'around:x,y,z,radius'; "
+        f"empty: {FOREARM}, and with tissue 'paper' {PAPER_ARM}",
     )  # fmt: skip
     phenotype: str = Field(
         default="",

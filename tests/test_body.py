@@ -9,12 +9,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from stmpl_core import anny_model, limbs
+from stmpl_core import Contact, Simulator, anny_model, limbs
 from stmpl_core.body import PARTS, Body, Patch
 from stmpl_core.errors import InvalidInput
 from stmpl_core.extrusion import fold_ratios, foldfree_thickness
 from stmpl_core.layer import SoftLayer
+from stmpl_core.methods import MomentNet
 from stmpl_core.trunk import TRUNK
+from tests.scenes import at, ball
 from tests.test_remesh import smallest_angle, tube
 
 EDGE = 4e-3
@@ -262,3 +264,28 @@ def test_a_missing_or_unreadable_smpl_file_is_refused(tmp_path: Path) -> None:
         Body.smpl(tmp_path / "SMPL_NEUTRAL.pkl")
     with pytest.raises(InvalidInput, match="available: smpl, smplh, smplx"):
         Body.smpl(tmp_path / "SMPL_NEUTRAL.pkl", model_type="star")
+
+
+PICKED = {"back": (-0.09, 0.06, 0.33), "shoulder": (0.02, 0.24, 0.42), "abdomen": (0.13, 0.04, 0.17)}
+
+
+@pytest.mark.parametrize("place", PICKED.values(), ids=PICKED)
+def test_a_picked_place_is_answered_as_on_a_wider_piece_of_the_same_body(body, place):
+    narrow, wide = (body.around(place, radius, edge_length=EDGE) for radius in (0.07, 0.1))
+    vertex = int(np.linalg.norm(narrow.vertices - place, axis=1).argmin())
+    for layer, radius in ((narrow, 0.07), (wide, 0.1)):
+        assert 0.8 * np.pi * radius**2 < layer.vertex_areas.sum() < 1.05 * np.pi * radius**2
+    pose = at(*(narrow.vertices[vertex] + 0.010 * narrow.normals[vertex]))  # a ball of 12 mm, 2 mm deep
+    one, other = (Simulator(layer, MomentNet()).step([Contact(ball(), pose)]) for layer in (narrow, wide))
+    assert one.touches["probe"].force == pytest.approx(other.touches["probe"].force, rel=0.02)
+    assert np.abs(one.displacement).max() == pytest.approx(np.abs(other.displacement).max(), rel=0.08)
+    assert one.trust.in_range
+
+
+def test_a_place_that_is_none_is_refused(body):
+    with pytest.raises(InvalidInput, match=r"mm from the skin; allowed are 30 mm"):
+        body.around((0.0, 0.0, 2.0))
+    with pytest.raises(InvalidInput, match="is no picked part, as in"):
+        body.part("around:1,2")
+    with pytest.raises(InvalidInput, match="at least two edges"):
+        body.around((0.13, 0.04, 0.17), 1e-3)
