@@ -111,11 +111,16 @@ class Answering:
     # Life
 
     def move_to(self, skin: Skin, tools: Tools, friction: Friction | Mapping[str, Friction]) -> tuple[Simulator, ...]:
-        """Answers on a skin from now on; the simulators of reactions and fields, which share it, but no scratch."""
+        """Answers on a skin from now on; the simulators of reactions and fields, which share it, but no scratch.
+
+        What was remembered is forgotten, unless it is the same skin, with another friction.
+        """
         with self._sends:
             self._epoch, self.last = self._epoch + 1, None
-        self.remembering.forget()
+        before = getattr(self, "simulator", None)
         self.simulator, self._fields = Simulator(skin, tools=tools, friction=friction), Simulator(skin, tools=tools)
+        if before is None or before.skin is not skin or not self.simulator.remembers:
+            self.remembering.forget()
         self._bending.move_to(skin)
         return self.simulator, self._fields
 
@@ -302,7 +307,6 @@ class Answering:
         instant = self._instant
         if instant is None:
             return
-        self.remembering.forget()
         ready = all(one.name in self.simulator.tools for one in instant.contacts)
         if not (ready and self._hearing.inbox.live(time.monotonic_ns()) and self.answer(instant)):
             self.rest("another skin")

@@ -27,6 +27,7 @@ if TYPE_CHECKING:
 Build = Callable[[NodeConfig], SoftLayer]
 STIFFNESS = {"youngs_modulus", "density"}  # settings that change neither geometry nor what is felt around a vertex
 ON_STACKS = ("moment_net", "limb_linear", "ladder")  # methods that know skin, fat and muscle
+AT_ONCE = {"friction"}  # settings that the skin does not know of
 QUICK = {"moment_net", "winkler", "naive"}  # methods that such a change costs no preparation
 
 
@@ -103,8 +104,10 @@ def skin_of(config: NodeConfig, build: Build = layer_of) -> Skin:
 
 
 def restiffened(skin: Skin, config: NodeConfig, changed: set[str]) -> Skin | None:
-    """The same skin of another stiffness, where nothing else changes and that is quick; else None."""
-    if not changed or not changed <= STIFFNESS or config.method not in QUICK or skin.layer.stacked:
+    """The same skin, or one of another stiffness, where nothing else changes and that is quick; else None."""
+    if changed and changed <= AT_ONCE:
+        return skin
+    if not changed or not changed <= STIFFNESS | AT_ONCE or config.method not in QUICK or skin.layer.stacked:
         return None
     return skin.stiffened(config.new_method(), youngs_modulus=config.youngs_modulus, density=config.density)
 

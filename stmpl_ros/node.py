@@ -68,7 +68,7 @@ class SkinNode(LifecycleNode):
         self.workshop: Workshop | None = None
         self._making: Beside[Skin] | None = None
         self._twin = ""  # what the other node is that was told of
-        self.calibration = Calibration(self, lambda: self.workshop, lambda e: self.set_body(youngs_modulus=e))
+        self.calibration = Calibration(self, lambda: self.workshop, self.set_body)
         self.hearing = Hearing(self, lambda: self.config, Tools(), self.tally)
         self.bending = Bending(self, self.hearing, lambda: self.config)
         self.answering = Answering(self, self.settings, self.hearing, self.tally, self.calibration, self.bending)

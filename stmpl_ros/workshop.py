@@ -6,6 +6,7 @@ import os
 import signal
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import BrokenExecutor, Future, ProcessPoolExecutor
+from typing import Any, TypeVar
 
 import numpy as np
 from rclpy.node import Node
@@ -19,13 +20,16 @@ from stmpl_core.methods.zero import Zero
 from stmpl_core.skin import Skin
 from stmpl_core.state import State
 from stmpl_core.stiffness import Stiffness, fit_stiffness
+from stmpl_core.strokes import Fading, Rubbing, fit_friction, fit_relaxation
 from stmpl_core.tool import Tool
 from stmpl_core.toucher import Toucher, margin_on
 from stmpl_ros.beside import Builders, pool
 from stmpl_ros.remembering import Before
 
+MAX_FITTED_INSTANTS = 500  # instants of a stroke or a press that stays, evenly over it; each takes a touch
 MAX_FITTED_PRESSES = 60  # presses of a fit, from the lightest to the hardest; it takes about 25 touches of each
 
+Fit = TypeVar("Fit", Stiffness, Rubbing, Fading)
 Then = Callable[[Future], None]
 
 
@@ -45,7 +49,7 @@ class Workshop:
     def __init__(self, node: Node, layer: SoftLayer, friction: Friction | Mapping[str, Friction] = None,
                  builders: Builders | None = None) -> None:  # fmt: skip
         self._node, self._layer, self._friction, self._closed = node, layer, friction, False
-        self._fit: Future[Stiffness] | None = None
+        self._fit: Future[Any] | None = None
         self._pid: Future[int] | None = None
         self._models: ProcessPoolExecutor | None = None  # started when somebody asks
         self._builders = builders or Builders()
@@ -61,9 +65,21 @@ class Workshop:
 
     def stiffness(self, presses: Sequence[Contact]) -> Future[Stiffness]:
         """Fits the skin's stiffness to these presses: for a thread that waits."""
-        self._fit = self._modeller().submit(_stiffness, list(presses))
-        self._then(self._fit, lambda future: self.renew(future.exception()))
-        return self._fit
+        return self._fitted(_stiffness, presses)
+
+    def friction(self, strokes: Sequence[Contact]) -> Future[Rubbing]:
+        """Fits the friction of one tool to its strokes: likewise."""
+        return self._fitted(_friction_of, strokes)
+
+    def relaxation(self, press: Sequence[Contact]) -> Future[Fading]:
+        """Fits the skin's relaxation to a press that stays: likewise."""
+        return self._fitted(_relaxation_of, press)
+
+    def _fitted(self, fit: Callable[[list[Contact]], Fit], contacts: Sequence[Contact]) -> Future[Fit]:
+        found = self._modeller().submit(fit, list(contacts))
+        self._fit = found
+        self._then(found, lambda future: self.renew(future.exception()))
+        return found
 
     def renew(self, error: BaseException | None) -> None:
         """Replaces the processes, if `error` says that one died."""
@@ -145,3 +161,16 @@ def _stiffness(presses: list[Contact]) -> Stiffness:
     presses.sort(key=lambda one: 0.0 if one.wrench is None else float(np.linalg.norm(one.wrench[:3])))
     chosen = np.unique(np.linspace(0, len(presses) - 1, MAX_FITTED_PRESSES).astype(int)) if presses else []
     return fit_stiffness(_history.toucher, [presses[k] for k in chosen])
+
+
+def _friction_of(strokes: list[Contact]) -> Rubbing:
+    return fit_friction(_history.toucher, _some(strokes))
+
+
+def _relaxation_of(press: list[Contact]) -> Fading:
+    return fit_relaxation(_history.toucher, _some(press))
+
+
+def _some(contacts: list[Contact]) -> list[Contact]:
+    """At most MAX_FITTED_INSTANTS of them, evenly, in their order."""
+    return contacts[:: -(-len(contacts) // MAX_FITTED_INSTANTS)] if contacts else []

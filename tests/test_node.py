@@ -9,9 +9,10 @@ from std_srvs.srv import Trigger
 from stmpl_msgs.srv import Calibrate, SetBody
 
 from bags.wire import layer_from, pose_message
-from stmpl_core import Simulator
+from stmpl_core import Simulator, State
 from stmpl_core.errors import InvalidInput
 from stmpl_core.layer import layer_id
+from stmpl_core.methods import Winkler
 from stmpl_core.skin import published
 from stmpl_core.touch import BY_POSE, MOVED, STALE, TOUCHING
 from stmpl_core.toucher import Toucher
@@ -48,7 +49,8 @@ def test_a_parameter_says_its_unit_its_range_and_when_it_counts(bus):
         ({"max_age": "old"}, "type"),
         ({"frame": "world"}, "read-only"),
         ({"youngs_modulus": 2e3}, "set_body"),
-        ({"friction": "oiled"}, "friction count when the node is configured: clean up first"),
+        ({"friction": "oiled"}, "friction count when the node is configured: call ~/set_body"),
+        ({"method": "linear"}, "method count when the node is configured: clean up first"),
     ],
 )
 def test_a_parameter_that_cannot_be_taken_is_refused_and_told_why(bus, change, says):
@@ -169,6 +171,30 @@ def test_calibrate_finds_the_stiffness_and_the_offset_that_the_robots_presses_ha
     assert topology.youngs_modulus == pytest.approx(found.youngs_modulus) == bus.get("youngs_modulus")[0]
     bus.node.destroy_timer(timer)
     assert len(bus.got["skin/displacement"]) > before + 5, "answers went on meanwhile"
+    bus.still()
+
+
+def test_calibrate_finds_the_friction_that_the_robots_strokes_had(bus):
+    """The law of friction is that of the strokes, so only noise and what the service makes of it are tried here."""
+    layer = skin(NodeConfig(**dict(zip(asked := ("thickness", "youngs_modulus"), bus.get(*asked), strict=True))))
+    robot, tool, state = Simulator(published(layer), Winkler(), friction=0.4), ball().named("finger"), State()
+    hand = bus.tool("finger").ready()
+    bus.still()
+    bus.call(Trigger, "reset")
+    along = np.concatenate([np.zeros(6), np.arange(1, 45), np.arange(43, -1, -1)]) * 4e-4
+    for depth, z in zip(np.minimum(np.arange(len(along)) / 5, 1) * 2.5e-3 + 1e-4, along, strict=True):
+        pose = at(RADIUS + 0.012 - depth, 0, LENGTH / 2 + z)
+        (touch,), state = robot.touch([contact_of(tool, pose, name="finger")], state, 0.02)
+        assert statuses(hand.ask(pose, touch.wrench))["finger"] in (TOUCHING, MOVED)
+    found = bus.call(Calibrate, "calibrate", tool="finger", what="friction")
+    assert found.success, found.message
+    assert found.friction == pytest.approx(0.4, rel=0.12) and abs(found.friction - 0.4) < 2 * found.friction_error
+    assert found.presses >= 8 and found.fading == 0 and "there and back" in found.message
+    moved = bus.call(Calibrate, "calibrate", tool="finger", what="relaxation")
+    assert not moved.success and "hold" in moved.message
+    for what, apply, says in (("colour", False, "Available"), ("relaxation", True, "not applied")):
+        refused = bus.call(Calibrate, "calibrate", what=what, apply=apply)
+        assert not refused.success and says in refused.message
     bus.still()
 
 

@@ -30,6 +30,8 @@ from stmpl_msgs.msg import ContactMesh, SkinDisplacement, SkinTopology
 
 from bags.wire import pose_message, stamp_ns, tool_message
 from stmpl_core import Tool
+from stmpl_core.errors import InvalidInput
+from stmpl_core.friction import PAIRS
 from stmpl_ros.inbox import Instant
 from stmpl_ros.node import SkinNode
 from stmpl_ros.parameters import NodeConfig
@@ -219,6 +221,27 @@ def test_a_skin_that_takes_over_while_the_node_is_inactive_remembers_nothing_of_
     node.trigger_deactivate()
     assert node.set_body(youngs_modulus=1300.0) == "taken over"
     assert not node.answering.remembering.state.tools
+
+
+def test_another_friction_is_taken_over_at_once_and_what_is_remembered_stays(composed):
+    node = composed.node
+    assert node.trigger_deactivate() == TransitionCallbackReturn.SUCCESS
+    assert node.trigger_cleanup() == TransitionCallbackReturn.SUCCESS
+    node.set_body(relaxing="true", friction="none")
+    node.trigger_configure()
+    node.trigger_activate()
+    remembering = node.answering.remembering
+    composed.wait(lambda: composed.press() and remembering.state.tools)
+    before, skin = remembering.state, node.skin
+    assert node.set_body(friction="dry") == "taken over"
+    assert node.skin is skin and node.config.friction == "dry"
+    (name,) = before.tools
+    assert remembering.state.tools[name].scalars.largest == before.tools[name].scalars.largest > 0
+    assert node.answering.simulator.history.friction(name) == PAIRS["dry"].friction
+    with pytest.raises(InvalidInput, match="friction"):
+        node.set_body(friction="wet")
+    with pytest.raises(InvalidInput, match="relaxing"):
+        node.set_body(relaxing="perhaps")
 
 
 def test_a_field_whose_time_is_over_before_it_is_begun_is_not_begun(composed, held, monkeypatch):
