@@ -167,6 +167,8 @@ class History:
     def _asked(self, contact: Contact, before: Memory | None, dt: float) -> _Asked:
         """What the contact law is asked for a contact."""
         pose = contact.pose_body_from_tool
+        if before is not None and before.scalars.surface not in (0.0, contact.tool.number):
+            before = None
         memory = before or fresh(pose, len(self.series.times))
         known = before is not None and memory.scalars.pressing >= 0
         scalars = memory.scalars
@@ -250,7 +252,7 @@ class History:
         stored = whole * _left_over(faded / at_rest, pressed.power, 1 - long)
         wrench, dragged = changed.get("wrench", touch.wrench), None
         scalars = Scalars(1.0, at_rest, max(at_rest, before.largest), net, radius, touch.depth, at_rest, pressed.power,
-                          work=before.work, stretch=long)  # fmt: skip
+                          work=before.work, stretch=long, surface=one.stated.tool.number)  # fmt: skip
         springs = NOTHING, one.before.springs, one.before.springs_relaxed
         if self.friction(touch.name) > 0 and net > MIN_ONE_WAY_SHARE:
             dragged = self._dragged(one, wrench, contact, pose[:3, 3], scalars, force, lever, thickness, dt)

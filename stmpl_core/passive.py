@@ -50,6 +50,7 @@ class PassiveContact:
         self.balance = self.damping = 0.0
         self._model: LocalContact | None = None
         self._pose: Transform | None = None
+        self._begun = False
         self._wrench, self._stored, self._surplus, self._age = np.zeros(6), 0.0, 0.0, 0.0
 
     def update(self, model: LocalContact) -> None:
@@ -75,6 +76,8 @@ class PassiveContact:
             fade = math.exp(-max(self._age / self.stale_after - 1, 0.0))
             rendered = self._model.wrench_at(pose)
             wrench, stored = fade * rendered.wrench, fade * rendered.stored
+            if not self._begun:  # a device that begins in contact owes nothing for what was stored before
+                self._begun, self._stored = True, stored
         twist = np.zeros(6) if self._pose is None else twist_between(self._pose, pose)
         work = 0.5 * float((self._wrench + wrench) @ twist)
         self._surplus = max(0.5 * stored, self._surplus * math.exp(-dt / FORGETS_S))

@@ -76,7 +76,12 @@ def patch(tissue: Tissue, thickness: float, radius: float) -> Patch:
     if tissue.skin is None:
         return Patch(float(force), float(torque), float(force), 0.0)
     bare = patch(replace(tissue, skin=None), thickness, radius).along
-    return Patch(float(force), float(torque), bare, SLACK * tissue.skin.tension * radius)
+    return Patch(float(force), float(torque), bare, slack_at(tissue, radius))
+
+
+def slack_at(tissue: Tissue, radius: float) -> float:
+    """Force along the skin at which the skin ahead of a patch of a radius [m] has lost its tension [N]."""
+    return SLACK * tissue.skin.tension * radius if tissue.skin else 0.0
 
 
 def _spectra(order: int) -> np.ndarray:
@@ -101,7 +106,7 @@ class Sideways:
         radius = np.exp(self._log_thickness)[:, None] * RADII
         units = tissue.youngs_modulus * np.stack([radius, radius**3, radius], axis=-1)
         self._table = np.log(np.array(rows)[..., :3] / units)
-        self._modulus, self._slack = tissue.youngs_modulus, SLACK * tissue.skin.tension if tissue.skin else 0.0
+        self._modulus, self._slack = tissue.youngs_modulus, slack_at(tissue, 1.0)
 
     def at(self, radius: float, thickness: float) -> Patch:
         """Stiffness of a patch of a radius [m] where the layer is this thick [m]."""

@@ -172,6 +172,10 @@ class Simulator:
 
         # Say what may be believed: what the method says, and what was found of each contact.
         trust = _joined(solved.trust, touches, fitted)
+        for touch in touches:
+            if touch.name not in self.tools and (touch.imprint is not None or (touch.wake and touch.wake.grooves())):
+                trust = trust.also(f"{touch.name} was taken away: the skin that it left sunk is shown at rest",
+                                   in_range=False)  # fmt: skip
         if fitted.entered > MAX_ENTERED_SHARE * float(self.skin.near.thickness.min()):
             trust = trust.also(f"skin is {fitted.entered * 1e3:.2f} mm inside a tool", in_range=False)
         displacement, peak, cut = _within(fitted.displacement, self.layer.thickness)

@@ -64,6 +64,7 @@ class Scalars(NamedTuple):
         passive: factor on the wrench that kept it above 0 [-].
         limit: tangential force at which all of it slides [N]; 0 without friction.
         stretch: stretch of the column under the last contact [-].
+        surface: number of the tool's surface (Tool.number): what another surface of that name pressed is forgotten.
     """
 
     pressing: float = 0.0
@@ -79,6 +80,7 @@ class Scalars(NamedTuple):
     passive: float = 1.0
     limit: float = 0.0
     stretch: float = 1.0
+    surface: float = 0.0
 
     @property
     def sunk(self) -> bool:

@@ -52,6 +52,11 @@ class Tool:
         found.update(np.ascontiguousarray(self.faces, "<i4").tobytes())
         return found.hexdigest()[:16]
 
+    @cached_property
+    def number(self) -> float:
+        """Twelve of these digits as a number, which float64 holds exactly."""
+        return float(int(self.digest[:12], 16))
+
     def named(self, name: str) -> Tool:
         """The same surface under another name."""
         return Tool(name, self.vertices, self.faces)

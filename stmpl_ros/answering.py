@@ -104,7 +104,7 @@ class Answering:
         self.limits: Limits | None = None
         self.remembering = Remembering()
         self._field: LatestWins[Asked] | None = None
-        self._closing = threading.Event()
+        self._hurry = threading.Event()
         self._sends, self._epoch = threading.RLock(), 0  # held while an answer is sent, or an epoch begins
         self._start_empty()
 
@@ -115,24 +115,26 @@ class Answering:
 
         What was remembered is forgotten, unless it is the same skin, with another friction.
         """
-        with self._sends:
-            self._epoch, self.last = self._epoch + 1, None
         before = getattr(self, "simulator", None)
+        same = before is not None and before.skin is skin
+        if not same:
+            with self._sends:
+                self._epoch, self.last = self._epoch + 1, None
         self.simulator, self._fields = Simulator(skin, tools=tools, friction=friction), Simulator(skin, tools=tools)
-        if before is None or before.skin is not skin or not self.simulator.remembers:
+        if not (same and self.simulator.remembers):
             self.remembering.forget()
         self._bending.move_to(skin)
         return self.simulator, self._fields
 
     def open(self) -> None:
         """Starts the thread of the fields."""
-        self._closing.clear()
+        self._hurry.clear()
         self._field = LatestWins(self._solve, lambda why: self._hearing.gate.refuse("answer", why), "field")
 
     def close(self) -> None:
         """Forgets what was answered, and ends the thread."""
         self._start_empty()
-        self._closing.set()
+        self._hurry.set()
         if self._field is not None:
             self._field.close()
             self._field = None
@@ -182,6 +184,7 @@ class Answering:
         if self.fading:
             self._node.get_logger().info("input is back")
         self._instant, self.fading, self._hearing.gate.refused_since = instant, False, ""
+        self._hurry.clear()
         self._seen = set(touches)
         return True
 
@@ -238,12 +241,12 @@ class Answering:
     # The field, on its own thread
 
     def _solve(self, asked: Asked) -> None:
-        """Finds and sends the field of a reaction; then the thread rests, where a rate is set."""
+        """Finds and sends the field of a reaction; then the thread rests, where a rate is set and input comes."""
         numba.set_num_threads(1)  # of this thread: a second one stalls for tens of milliseconds where its core is busy
         started, rate = time.perf_counter(), self._settings.config.field_rate
         self._find(asked, started)
         if rate:
-            self._closing.wait(max(0.0, started + 1 / rate - time.perf_counter()))
+            self._hurry.wait(max(0.0, started + 1 / rate - time.perf_counter()))
 
     def _find(self, asked: Asked, started: float) -> None:
         if asked.epoch != self._epoch:
@@ -283,7 +286,8 @@ class Answering:
         if self._instant is None or self._hearing.inbox.live(now):
             return
         if self._field is not None and not self._field.idle:
-            return  # the last field comes first
+            self._hurry.set()
+            return  # the last field comes first, without a rest before it
         silent, limit = self._hearing.inbox.silence(now) / NANO, config.rest_after
         left = 1 - (silent - limit) / config.fade if config.fade else 0.0
         why = f"no pose for {limit} s"

@@ -266,6 +266,7 @@ class SkinNode(LifecycleNode):
             self.get_logger().error(f"no other skin: {error or type(error).__name__}. The one from before goes on.")
 
     def _take_over(self, skin: Skin, config: NodeConfig) -> None:
+        same = skin is self.skin
         self._answer_on(skin, config)
         assert self.workshop
         self.settings.take(config)
@@ -273,6 +274,9 @@ class SkinNode(LifecycleNode):
         self.sending.move_to(skin, self.workshop)
         gc.collect()
         gc.freeze()
+        if same:
+            self.get_logger().info(f"from here on friction is {config.friction or 'none'}")
+            return
         self.get_logger().info(f"from here on layer {skin.layer_id}: {skin.layer}")
         if self.active:
             self.sending.topology(self._now())

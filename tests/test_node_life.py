@@ -24,6 +24,7 @@ from rclpy.duration import Duration
 from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.lifecycle import TransitionCallbackReturn
+from rclpy.parameter import Parameter
 from rclpy.qos import LivelinessPolicy, QoSProfile
 from std_srvs.srv import Trigger
 from stmpl_msgs.msg import ContactMesh, SkinDisplacement, SkinTopology
@@ -242,6 +243,18 @@ def test_another_friction_is_taken_over_at_once_and_what_is_remembered_stays(com
         node.set_body(friction="wet")
     with pytest.raises(InvalidInput, match="relaxing"):
         node.set_body(relaxing="perhaps")
+
+
+def test_a_rare_field_does_not_hold_up_what_fades(composed):
+    """At a field in a thousand seconds the thread of the fields would rest until then."""
+    node, answering = composed.node, composed.node.answering
+    node.set_parameters([Parameter("field_rate", value=1e-3)])
+    composed.wait(lambda: composed.press() and answering.last is not None)
+    composed.wait(lambda: composed.press() and not answering._field.idle)
+    newest = answering._instant.stamp
+    composed.wait(lambda: answering.fading)
+    assert answering.last is not None and answering.last[1].stamp >= newest, "the last field comes first"
+    composed.wait(lambda: answering._instant is None)
 
 
 def test_a_field_whose_time_is_over_before_it_is_begun_is_not_begun(composed, held, monkeypatch):

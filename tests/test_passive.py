@@ -114,6 +114,19 @@ def test_a_device_that_strokes_skin_which_relaxes_and_rubs_is_passive(kind: str)
     assert np.abs(felt.force[-20:]).max() < 2e-3 and hand.aside(1.0) == 8e-3 and BALL > 0
 
 
+@pytest.mark.parametrize("silent", [0, 3])
+def test_a_device_that_begins_in_contact_is_not_pulled_as_it_retreats(place: Place, silent: int) -> None:
+    """What the skin stored before the first model came is no debt of the device."""
+    tool, loop = ball(0.02), PassiveContact()
+    poses = [place.pose(place.point + (0.02 - depth) * place.out) for depth in np.linspace(6e-3, -1e-3, 71)]
+    model = local_contact(place.history.toucher, Contact(tool, poses[silent]))
+    for k, pose in enumerate(poses):
+        if k == silent:
+            loop.update(model)
+        wrench = loop.step(pose, 1e-3)
+        assert wrench[:3] @ place.out <= 0.01, f"{wrench[:3] @ place.out:.2g} N outwards at step {k}"
+
+
 def test_bad_input_is_refused_and_a_stale_model_fades(place: Place) -> None:
     with pytest.raises(InvalidInput, match="most_damping is 0"):
         PassiveContact(0.0)

@@ -279,6 +279,27 @@ def test_a_tool_that_was_not_told_of_for_a_while_presses_again(sim: Simulator) -
     assert touch.status == BY_POSE and touch.force == pytest.approx(touches[-1].force, rel=0.1)
 
 
+def test_another_surface_under_the_same_name_remembers_nothing(sim: Simulator) -> None:
+    _, state = played(sim, np.array([0, 0.1, 5.0]), np.array([-1e-4, DEPTH, DEPTH]))
+    other = ball(6e-3).named(BALL.name)
+    here = Contact(other, at(MIDDLE[0], MIDDLE[1], 6e-3 - 2e-3))
+    simulator = Simulator(sim.layer, Winkler())
+    (fresh,), clean = simulator.touch([here], State(), 0.1)
+    (touch,), after = simulator.touch([here], state, 0.1)
+    assert touch.wrench.tobytes() == fresh.wrench.tobytes() and after.pack() == clean.pack()
+    (same,), _ = sim.touch([pressed(DEPTH)], State.unpack(state.pack()), 0.1)
+    assert same.force < 0.8 * sim.touch([pressed(DEPTH)])[0].force
+
+
+def test_an_imprint_whose_tool_was_taken_away_is_told_of(sim: Simulator) -> None:
+    simulator = Simulator(sim.layer, Winkler())
+    touches, _ = played(simulator, np.array([0, 0.1, 5.0, 5.01]), np.array([-1e-4, DEPTH, DEPTH, -1e-3]))
+    assert simulator.answer(touches[-1:]).displacement.any()
+    simulator.tools.remove(BALL.name)
+    answer = simulator.answer(touches[-1:])
+    assert not answer.displacement.any() and "taken away" in answer.trust.why and not answer.trust.in_range
+
+
 def test_two_tools_by_wrench_keep_a_state_each(sim: Simulator) -> None:
     state, other, push = State(), BALL.named("other"), np.array([0, 0, -0.4, 0, 0, 0.0])
     for dt in (0.0, 0.1, 1.0, 10.0):
