@@ -162,13 +162,14 @@ def compare_run(
     frames: int = 12,
     method: Method | None = None,
     tolerance: float | None = None,
+    pressing: int | None = None,
     on_frame: Callable[[int, int], None] | None = None,
 ) -> Comparison:
     """Solves a sample of a run's frames by `reference`.
 
     A Method gets the very pressure that the run's answer had, and judges what was made of it: give a method too, since
     recorded answers also lie on their tools. A Presser gets the tools, and judges recorded answers whole; it presses
-    elastic skin, so answers with a state are not alike.
+    elastic skin, so answers with friction or relaxation are not alike.
 
     The sample holds the frame under the largest load, the heaviest one with two tools on the skin, and others evenly
     over the loaded part of the run.
@@ -179,6 +180,7 @@ def compare_run(
         frames: number of frames to sample, >= 1.
         method: method that is judged under the same pressures; None judges the recorded answers.
         tolerance: allowed mean error under the contact in the worst frame [m].
+        pressing: largest number of tools on the skin in a frame that is taken; None: any.
         on_frame: callback with (done, total) before each frame, for a progress bar.
 
     Raises:
@@ -188,8 +190,9 @@ def compare_run(
     judge = _presser(reference, run) if hasattr(reference, "press") else _solver(reference, run)  # type: ignore[arg-type]
     judged = (lambda frame: frame) if method is None else _solver(method, run)
     names = (run.method if method is None else method.name, reference.name)
-    elastic = (lambda frame: not frame.state) if method is None else (lambda frame: True)
-    return _compare(run, sample(run.moments, frames), names, judged, judge, tolerance, on_frame, alike=elastic)
+    elastic = (lambda frame: _elastic(frame, run.bag.layer_of(frame))) if method is None else (lambda frame: True)
+    taken = [moment for moment in run.moments if pressing is None or moment.pressing <= pressing]
+    return _compare(run, sample(taken, frames), names, judged, judge, tolerance, on_frame, alike=elastic)
 
 
 def compare_bags(
@@ -302,6 +305,12 @@ def _compare(
             log.warning("frame %d cannot be compared: %s", frame.sequence, error)
             failed[frame.sequence] = str(error)
     return Comparison(run, *names, tuple(pairs), failed, tolerance, reason)
+
+
+def _elastic(frame: Frame, layer: SoftLayer) -> bool:
+    """Whether the answer is that of elastic skin without friction: nothing that it remembers counts."""
+    rubs = any(touch.presses and frame.friction.get(name) for name, touch in frame.touches.items())
+    return not frame.state or not (layer.tissue.relaxes or rubs)
 
 
 def _pair(run: Survey, moment: Moment, frame: Frame, ours: Displacement, reference: Displacement,

@@ -10,8 +10,10 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
 from datetime import datetime
+from multiprocessing import get_context
 from pathlib import Path
 
 from pydantic import BaseModel
@@ -27,9 +29,11 @@ from bags.writer import FILE
 from fem_tools import RigidFem
 from stmpl_core.errors import StmplError
 from stmpl_core.extras import needed
+from stmpl_core.friction import friction_from
 from stmpl_core.methods import method as method_named
-from stmpl_ros.massage_report import Massaged, front, massaged, rows
+from stmpl_ros.massage_report import filmed, front, massaged, rows
 from stmpl_ros.parameters import DemoConfig
+from stmpl_ros.robot import TOOL
 from stmpl_ros.tables import compare_with_progress, comparison_table
 
 log = logging.getLogger(__name__)
@@ -50,6 +54,7 @@ def run(config: DemoConfig) -> int:
     """Runs all of it; 0 only if everything is there and sane. Raises DemoError with what is not."""
     if config.device == "robot":
         needed("stmpl demo", "sim", "mujoco")
+        config = gripping(config)
     console = Console()
     folder = config.runs / datetime.now().strftime("%Y-%m-%d_%H-%M-%S")
     folder.mkdir(parents=True)
@@ -59,9 +64,12 @@ def run(config: DemoConfig) -> int:
     play(config, folder, console)
     _point_latest_at(folder)
 
-    replay = _replay(folder, config.node.method, console)
-    comparison = compare_with_progress(folder, RigidFem(), config.frames)
-    done = _massaged(folder, config, comparison, console)
+    with ProcessPoolExecutor(1, get_context("spawn")) as beside:
+        filming = beside.submit(filmed, folder, config.robot) if config.device == "robot" else None
+        replay = _replay(folder, config.node.method, console)
+        # The frames of the grip take finite elements a minute each, and friction, which they lack: not compared.
+        comparison = compare_with_progress(folder, RigidFem(), config.frames, pressing=1 if config.robot.grip else None)
+        done = massaged(folder, comparison, filming.result()) if filming else None
     report = write_report(comparison, folder / "report.html", replay=replay,
                           front=front(done, config.node.limb) if done else "")  # fmt: skip
     console.print(comparison_table(comparison))
@@ -75,17 +83,22 @@ def run(config: DemoConfig) -> int:
     return int(bool(missing))
 
 
+def gripping(config: DemoConfig) -> DemoConfig:
+    """The settings, with the force that the limb is gripped with, and friction of all tools told alike to both."""
+    from stmpl_sim.grip import usual_force, with_fingers
+
+    grip = usual_force(config.node.limb) if config.robot.grip is None else config.robot.grip
+    friction = config.node.friction or config.robot.friction
+    if grip:
+        by_tool = with_fingers(friction_from(friction), TOOL)
+        friction = ", ".join(f"{name}: {'none' if one is None else one}" for name, one in by_tool.items())
+    robot = config.robot.model_copy(update={"grip": grip, "friction": friction})
+    return config.model_copy(update={"robot": robot, "node": config.node.model_copy(update={"friction": friction})})
+
+
 def _replay(folder: Path, method: str, console: Console) -> ReplaySummary:
     with console.status("replaying the run"):
         return replay_run(folder, method_named(method), every=REPLAY_EVERY)
-
-
-def _massaged(folder: Path, config: DemoConfig, comparison: Comparison, console: Console) -> Massaged | None:
-    """What the robot did, with a film; None without a robot."""
-    if config.device != "robot":
-        return None
-    with console.status("filming the run"):
-        return massaged(folder, config.robot, comparison)
 
 
 def play(config: DemoConfig, folder: Path, console: Console) -> None:
@@ -96,13 +109,11 @@ def play(config: DemoConfig, folder: Path, console: Console) -> None:
         "PYTHONUNBUFFERED": "1",
     }
     record = ["--path", str(folder), "--run", str(folder / "config.json")]
-    told, settled = config.node, config.node.rest_after + config.node.fade + 0.5
+    settled = config.node.rest_after + config.node.fade + 0.5
     flags = flags_of(config.probe)
-    if config.device == "robot":  # both feel the same friction, whichever of them was told
-        friction = told.friction or config.robot.friction
-        flags = flags_of(config.robot.model_copy(update={"out": folder, "linger": settled, "friction": friction}))
-        told = told.model_copy(update={"friction": friction})
-    node_arguments = told.ros_arguments() + (["-p", "use_sim_time:=true"] if config.device == "robot" else [])
+    if config.device == "robot":
+        flags = flags_of(config.robot.model_copy(update={"out": folder, "linger": settled}))
+    node_arguments = config.node.ros_arguments() + (["-p", "use_sim_time:=true"] if config.device == "robot" else [])
     with (
         _process("record", record, folder, environment) as recorder,
         _process("node", node_arguments, folder, environment) as node,

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -13,19 +13,33 @@ from matplotlib.figure import Figure
 from bags.compare import Comparison
 from bags.page import image, inside, table, text
 from bags.run import NANO
+from bags.survey import survey
 from bags.wire import stamp_ns
+from stmpl_core.touch import Touch
 from stmpl_ros.parameters import RobotConfig
 from stmpl_ros.robot import LOG, TOOL, scene_of
+from stmpl_sim.verbs import gripped
 
 if TYPE_CHECKING:
     from stmpl_sim.massage import Log, Phase
 
 FILM = "film.webp"
-FILM_RATE = 15.0  # frames a second
+FILM_RATE = 12.0  # frames a second
 LARGEST_OFF_N = 0.2  # difference of the mean force of a phase from what was asked for
 LARGEST_GAIN = 0.01  # energy that the contact gave out beyond what was put in, over what was stored
 LARGEST_APART = 0.01  # difference of the node's force from the simulator's, over the largest
-INK, ASKED, NODE, WRIST, TRUTH = "#2b2b2b", "#9a9a9a", "#c1440e", "#7aa6c2", "#1f4e79"
+LARGEST_SQUEEZE = 0.05  # difference of the mean force of the fingers from what was asked for, over that
+LEAST_LIFT_M = 0.005  # height that a gripped limb must be lifted by
+LARGEST_FINGERS_APART = 0.05  # as LARGEST_APART, for fingers: their friction follows from all answers before
+INK, ASKED, NODE, WRIST, TRUTH, FINGER = "#2b2b2b", "#9a9a9a", "#c1440e", "#7aa6c2", "#1f4e79", "#3d8b5f"
+
+
+class Film(NamedTuple):
+    """A film: its file, the renderer of its frames, and the displacement of its last colour [m]."""
+
+    path: Path
+    frames_by: str
+    colour_m: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,24 +49,23 @@ class Massaged:
     Args:
         log: log of the robot.
         answered: times of the node's answers since the start [s], (N,), and the forces that they say [N], (N,).
+        gripped: times of those of the node's answers with both fingers in the skin [s], (G,), and the forces that they
+            say of each, friction included [N], (G, 2).
         measured: times and forces of the wrist's sensor, as recorded, (M,) each.
         solved: times and forces of the reference, (K,) each, and the answers' forces at the same frames, (K,).
         real_time: simulated time over real time, from the first recorded pose to the last [-].
         poses: rate of the recorded poses by the recorder's clock [Hz].
-        film: file of the film.
-        frames_by: renderer of the film.
-        colour_m: displacement of the film's last colour [m].
+        film: film of it.
     """
 
     log: Log
     answered: tuple[np.ndarray, np.ndarray]
+    gripped: tuple[np.ndarray, np.ndarray]
     measured: tuple[np.ndarray, np.ndarray]
     solved: tuple[np.ndarray, np.ndarray, np.ndarray]
     real_time: float
     poses: float
-    film: Path
-    frames_by: str
-    colour_m: float
+    film: Film
 
     @property
     def felt(self) -> np.ndarray:
@@ -62,8 +75,18 @@ class Massaged:
     @property
     def apart(self) -> float:
         """Largest difference of the node's force from the simulation's, over the largest force [-]."""
-        top = float(self.felt.max(initial=0.0))
-        return float(np.abs(self.answered[1] - self.felt).max()) / top if top > 0 else 0.0
+        return _apart(self.answered[1], self.felt)
+
+    @property
+    def fingers_apart(self) -> float:
+        """The same of the forces of the fingers [-]."""
+        return _apart(self.gripped[1], self.squeezed)
+
+    @property
+    def squeezed(self) -> np.ndarray:
+        """Forces between fingers and skin in the simulation, at the times of `gripped`, (G, F) [N]."""
+        sizes = np.linalg.norm(self.log.fingers[..., :3], axis=-1)
+        return np.array([np.interp(self.gripped[0], self.log.time, one) for one in sizes.T]).T
 
     @property
     def off_reference(self) -> np.ndarray:
@@ -88,66 +111,105 @@ class Massaged:
             mean = float(self.log.force[rows].mean())
             if abs(mean - phase.force) > LARGEST_OFF_N:
                 yield f"the robot kept {mean:.2f} N of {phase.force:g} N during '{phase.name}'"
+        if grip := gripped(self.log):
+            if abs(grip["mean_N"] - grip["asked_N"]) > LARGEST_SQUEEZE * grip["asked_N"]:
+                yield f"the fingers gripped with {grip['mean_N']:.2f} N of {grip['asked_N']:g} N"
+            if grip["lifted_m"] < LEAST_LIFT_M:
+                yield f"the fingers lifted the limb by {1e3 * grip['lifted_m']:.1f} mm only"
+            if not len(self.gripped[0]):
+                yield "the node answered no contact of both fingers"
+            elif self.fingers_apart > LARGEST_FINGERS_APART:
+                yield f"the node's fingers feel up to {100 * self.fingers_apart:.1f} % else than the simulation's"
+            if grip["given_out_J"] > LARGEST_GAIN * grip["stored_J"]:
+                yield "the grip gave out more energy than was put in"
         if self.apart > LARGEST_APART:
             yield f"the node's force is up to {100 * self.apart:.1f} % off the simulation's"
         if self.gained > LARGEST_GAIN:
             yield f"the contact gave out {100 * self.gained:.1f} % more energy than was put in"
 
 
-def massaged(folder: Path, config: RobotConfig, comparison: Comparison) -> Massaged:
-    """Puts a massage together, and makes its film from the recorded answers.
+def filmed(folder: Path, config: RobotConfig) -> Film:
+    """Makes the film of a run from the recorded answers, and what moved the robot from its own log.
 
     Args:
         folder: folder of the run.
         config: settings of the robot.
-        comparison: comparison of the run.
-
-    Raises:
-        BagError: a recording that lacks what a massage has.
     """
     from stmpl_sim.film import Camera, save
     from stmpl_sim.massage import Log
 
-    run, log = comparison.run.bag, Log.load(folder / LOG)
-    start = min(run.pose_stamps)
+    run, log = survey(folder).bag, Log.load(folder / LOG)
+    start, due = min(run.pose_stamps), 0.0
     scene = scene_of(config, run.layer)
     colour_m = 0.5 * float(run.layer.thickness[scene.site.vertex])
     camera = Camera(scene.model, run.layer, colour_m)
-    answered, due = [], 0.0
     for frame in run.frames():
         at = (frame.stamp_ns - start) * NANO
-        if TOOL in frame.touches and frame.fade == 1:
-            answered.append((at, float(np.linalg.norm(frame.touches[TOOL].wrench[:3]))))
         if due <= at <= log.time[-1]:
             _take(camera, scene, log, at, frame)
             due = max(due + 1 / FILM_RATE, at)
     camera.close()
-    first, last = start, max(run.pose_stamps)
-    took = (run.received[last] - run.received[first]) * NANO
+    return Film(save(camera.frames, folder / FILM, FILM_RATE), camera.backend, colour_m)
+
+
+def massaged(folder: Path, comparison: Comparison, film: Film) -> Massaged:
+    """Puts a massage together.
+
+    Args:
+        folder: folder of the run.
+        comparison: comparison of the run.
+        film: film of the run.
+
+    Raises:
+        BagError: a recording that lacks what a massage has.
+    """
+    from stmpl_sim.grip import FINGERS
+    from stmpl_sim.massage import Log
+
+    run, log = comparison.run.bag, Log.load(folder / LOG)
+    start, last = min(run.pose_stamps), max(run.pose_stamps)
+    answered, squeezed = [], []
+    for frame in run.frames():
+        at = (frame.stamp_ns - start) * NANO
+        if TOOL in frame.touches and frame.fade == 1:
+            answered.append((at, _size(frame.touches[TOOL])))
+        fingers = [frame.touches[name] for name in FINGERS if name in frame.touches and frame.touches[name].presses]
+        if len(fingers) == len(FINGERS) and frame.fade == 1:
+            squeezed.append((at, *map(_size, fingers)))
+    took = (run.received[last] - run.received[start]) * NANO
     return Massaged(
         log=log,
         answered=_columns(answered),
+        gripped=(np.array([one[0] for one in squeezed]), np.array([one[1:] for one in squeezed]).reshape(-1, 2)),
         measured=_columns([((stamp_ns(message) - start) * NANO, _length(message.wrench.force))
                            for _, message, _ in run.messages(lambda topic: topic.endswith("wrist/wrench"))]),
         solved=_solved(comparison, start),
-        real_time=(last - first) * NANO / took,
+        real_time=(last - start) * NANO / took,
         poses=(len(run.pose_stamps) - 1) / took,
-        film=save(camera.frames, folder / FILM, FILM_RATE),
-        frames_by=camera.backend,
-        colour_m=colour_m,
+        film=film,
     )  # fmt: skip
+
+
+def _size(touch: Touch) -> float:
+    """Size of the force of a touch [N]."""
+    return float(np.linalg.norm(touch.wrench[:3]))
+
+
+def _apart(ours: np.ndarray, felt: np.ndarray) -> float:
+    top = float(felt.max(initial=0.0))
+    return float(np.abs(ours - felt).max()) / top if top > 0 else 0.0
 
 
 def front(done: Massaged, limb: str) -> str:
     """HTML that a report opens with; `limb` is what is massaged."""
-    drawn = " Drawn in software: there is no GL here." if done.frames_by == "software" else ""
+    drawn = " Drawn in software: there is no GL here." if done.film.frames_by == "software" else ""
     forces = sorted({phase.force for phase, _ in done.held()})
     said = " and ".join(f"{force:g}" for force in forces)
     return "\n".join([
         f"<h1>A robot massages a {text(limb.replace('_', ' '))} with {said} N</h1>",
-        inside("image/webp", done.film.read_bytes()),
+        inside("image/webp", done.film.path.read_bytes()),
         f"<p class=note>The robot as its simulator moved it, the skin as the node answered it over ROS: coloured by "
-        f"displacement, from none to {1e3 * done.colour_m:.0f} mm, not exaggerated.{drawn}</p>",
+        f"displacement, from none to {1e3 * done.film.colour_m:.0f} mm, not exaggerated.{drawn}</p>",
         "<h2>Force, energy, rate</h2>",
         image(course_figure(done)),
         table(("phase", "asked N", "kept N", "worst N", "depth mm", "off course mm", "in range %"), _phases(done)),
@@ -167,9 +229,18 @@ def rows(done: Massaged) -> list[tuple[str, str]]:
         ("poses over ROS", f"{done.poses:.0f} Hz; the simulation ran at {done.real_time:.2f} of real time, which it "
          "does not exceed"),
     ]  # fmt: skip
+    if grip := gripped(log):
+        figures[1:1] = [
+            ("grip of two fingers", f"{grip['mean_N']:.2f} ± {grip['deviation_N']:.2f} N each, {grip['asked_N']:g} N "
+             f"asked; they carried {grip['carried_N']:.1f} N and lifted the limb by {1e3 * grip['lifted_m']:.0f} mm"),
+            ("node's forces of the fingers off the simulation's", f"at most {100 * done.fingers_apart:.2f} % of the "
+             f"highest, in {len(done.gripped[0])} answers with both"),
+            ("energy of the grip", f"{1e3 * grip['stored_J']:.0f} mJ at most, {-1e3 * grip['given_out_J']:.0f} mJ "
+             "lost to friction"),
+        ]  # fmt: skip
     if len(off):
         told = ", ".join(f"{100 * one:+.1f}" for one in off)
-        figures.insert(2, ("force off finite elements", f"{told} % at the compared frames"))
+        figures.insert(1, ("force off finite elements", f"{told} % at the compared frames"))
     return figures
 
 
@@ -181,6 +252,9 @@ def course_figure(done: Massaged) -> Figure:
     force.plot(*done.measured, color=WRIST, lw=1.0, label="measured at the wrist (recorded)")
     force.plot(*done.answered, color=NODE, lw=1.4, label="the node's answers (recorded)")
     force.plot(log.time, log.asked, color=INK, lw=1.2, ls="--", label="asked for")
+    for name, one in zip(("fingers, simulated", None), np.linalg.norm(log.fingers[..., :3], axis=-1).T, strict=False):
+        force.plot(log.time, one, color=FINGER, lw=1.0, label=name)
+    force.plot(np.repeat(done.gripped[0], done.gripped[1].shape[1]), done.gripped[1].ravel(), ".", color=NODE, ms=2)
     if len(done.solved[0]):
         force.plot(done.solved[0], done.solved[1], "o", color=TRUTH, ms=6, label="finite elements")
     force.set(ylabel="force [N]", ylim=(0, None))

@@ -258,10 +258,18 @@ class RobotConfig(BaseModel):
     circle: float = Field(default=12.0, gt=0, description="radius of the circles [mm]")
     laps: float = Field(default=2.0, ge=0, description="laps with each force")
     radius: float = Field(default=20.0, gt=0, description="radius of the ball that presses [mm]")
-    mount: Literal["fixed", "springs"] = Field(default="fixed", description="mount of the limb")
+    mount: Literal["auto", "fixed", "springs", "rest"] = Field(
+        default="auto", description="mount of the limb; rest: hinged at its thicker end; auto: rest if it is gripped, "
+        "else fixed",
+    )  # fmt: skip
+    grip: float | None = Field(
+        default=None, ge=0, description="force of each of two fingers that grip the limb in the end, and lift it [N]; "
+        "0: none; unless given, stmpl demo takes 10 on a forearm",
+    )  # fmt: skip
     friction: str = Field(
-        default="none", description="coefficient of friction, or dry, moist, oiled, glove, typical, or none"
-    )
+        default="none", description="coefficient of friction, or dry, moist, oiled, glove, typical, or none; or by "
+        "tool: 'ball: oiled, left_finger: 0.6'; fingers that are not named: glove",
+    )  # fmt: skip
     robot: Path | None = Field(
         default=None, description="MJCF or URDF file of the robot; the 7-axis arm that ships unless given"
     )
@@ -338,7 +346,7 @@ class DemoConfig(BaseModel):
         default="robot", description="what touches: a simulated robot that massages, or devices along a script"
     )
     node: NodeConfig = NodeConfig()
-    robot: RobotConfig = RobotConfig(listeners=2, patience=400.0)
+    robot: RobotConfig = RobotConfig(laps=1.0, listeners=2, patience=400.0)
     probe: ProbeConfig = ProbeConfig(rate=125.0, listeners=2, patience=180.0)
     frames: int = Field(default=4, ge=1, description="number of frames of the run that FEM solves again")
     runs: Path = Field(default=Path("runs"), description="folder that gets one folder a run")

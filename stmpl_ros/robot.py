@@ -22,13 +22,14 @@ from stmpl_core.errors import StmplError
 from stmpl_core.layer import SoftLayer
 from stmpl_ros.parameters import RobotConfig
 from stmpl_ros.spinning import interruptible, ros
+from stmpl_ros.tf import tf_type, transforms
 from stmpl_ros.topics import KEPT, STREAM
 
 if TYPE_CHECKING:
     from stmpl_sim.massage import Log, Massage
     from stmpl_sim.scene import Scene
 
-TOOL = "ball"  # name of the tool on the bus
+TOOL = "ball"  # name of the massage's tool on the bus; the fingers of a gripper have those of stmpl_sim.grip
 LOG = "robot.npz"  # file of what the robot did, in the folder that it is given
 POLL_PERIOD_S = 0.05  # time between two looks while waiting
 CATCH_UP_S = 0.05  # simulated time that a robot behind real time makes up for
@@ -39,7 +40,7 @@ class Stopped(StmplError):
 
 
 class RobotNode(Node):
-    """Publishes mesh, poses, the wrist's wrench and the joints of a simulated robot, and the simulated clock.
+    """Publishes meshes, poses, the wrist's wrench, joints and frames of a simulated robot, and the simulated clock.
 
     The simulator owns physics and contact: its skin is the node's, by skin/topology, and its force follows from the
     pose. The tool's pose goes out alone, so that the node answers the same contact; what the wrist measures goes out
@@ -56,10 +57,15 @@ class RobotNode(Node):
         self.create_subscription(SkinTopology, "skin/topology", self._on_topology, KEPT)
         self._mesh = self.create_publisher(ContactMesh, "contact_mesh", KEPT)
         self._clock = self.create_publisher(Clock, "/clock", QoSProfile(depth=1))
-        self._pose = self.create_publisher(PoseStamped, f"tools/{TOOL}/pose", STREAM)
+        self._poses = {name: self.create_publisher(PoseStamped, f"tools/{name}/pose", STREAM)
+                       for name in tools_of(config)}  # fmt: skip
         self._wrench = self.create_publisher(WrenchStamped, f"tools/{TOOL}/wrench", STREAM) if config.told else None
         self._wrist = self.create_publisher(WrenchStamped, "wrist/wrench", STREAM)
         self._joints = self.create_publisher(JointState, "joint_states", STREAM)
+        self._tf_type = tf_type()
+        self._frames = self.create_publisher(self._tf_type, "/tf", STREAM) if self._tf_type else None
+        if not self._frames:
+            self.get_logger().info("/tf is not sent: tf2_msgs, which comes with ROS, is not installed")
 
     def _on_topology(self, message: SkinTopology) -> None:
         self.topology = message
@@ -70,8 +76,9 @@ class RobotNode(Node):
         return layer_from(self.topology) if self.topology else None
 
     def wait_for_listeners(self, stop: threading.Event) -> bool:
-        """Whether as many listen to the tool's poses as there should be, in time. Raises Stopped."""
-        return self._wait(lambda: self._pose.get_subscription_count() >= self.config.listeners, stop)
+        """Whether as many listen to each tool's poses as there should be, in time. Raises Stopped."""
+        return self._wait(lambda: all(one.get_subscription_count() >= self.config.listeners
+                                      for one in self._poses.values()), stop)  # fmt: skip
 
     def _wait(self, done: Any, stop: threading.Event) -> bool:
         deadline = time.monotonic() + self.config.patience
@@ -83,13 +90,11 @@ class RobotNode(Node):
         return True
 
     def announce(self, massage: Massage) -> None:
-        """Publishes the surface of the robot's tool, and the clock before its start."""
-        from stmpl_sim.scene import BALL
-
+        """Publishes the surfaces of the robot's tools, and the clock before its start."""
         self.started = time.time_ns()  # simulated time starts at the real one, and runs by itself
         self.tell_time(0.0)
-        tool = massage.skin.contact.tools[BALL].named(TOOL)
-        self._mesh.publish(tool_message(tool, self.started))
+        for tool in massage.skin.contact.tools.values():
+            self._mesh.publish(tool_message(tool, self.started))
 
     def tell_time(self, at: float) -> int:
         """Publishes the simulated clock; returns its stamp [ns].
@@ -111,8 +116,6 @@ class RobotNode(Node):
             wrist: stmpl_sim.wrist.Wrist of its scene.
             at: time of the step [s].
         """
-        from stmpl_sim.scene import BALL
-
         assert self.topology and massage.skin.reaction
         stamp, frame = self.tell_time(at), self.topology.header.frame_id
         turn = massage.limb_pose()[:3, :3]
@@ -121,13 +124,26 @@ class RobotNode(Node):
         self._wrist.publish(wrench)
         if self._wrench:
             self._wrench.publish(wrench)
-        self._pose.publish(pose_message(massage.skin.reaction.memory.at[BALL], frame, stamp))
+        for name, poses in self._poses.items():
+            poses.publish(pose_message(massage.skin.reaction.memory.at[name], frame, stamp))
         self._joints.publish(joint_state(massage, stamp))
+        if self._frames:
+            self._frames.publish(self._tf_type(transforms=transforms(massage, frame, stamp)))
+
+
+def tools_of(config: RobotConfig) -> tuple[str, ...]:
+    """Names of the tools on the bus."""
+    if not config.grip:
+        return (TOOL,)
+    from stmpl_sim.grip import FINGERS
+
+    return TOOL, *FINGERS
 
 
 def joint_state(massage: Massage, stamp_ns: int) -> JointState:
-    """The robot's joints after a step: positions at its instant, and the torques that were asked for."""
-    model, data, joints = massage.scene.model, massage.data, list(massage.scene.joints)
+    """The joints of robot and gripper after a step: positions at its instant, and the efforts that were asked for."""
+    model, data, scene = massage.scene.model, massage.data, massage.scene
+    joints = [*scene.joints, *(massage.gripper.joints if massage.gripper else ())]
     places, dofs = model.jnt_qposadr[joints], model.jnt_dofadr[joints]
     message = JointState(header=header("", stamp_ns), name=[model.joint(j).name for j in joints])
     message.position = (data.qpos[places] - model.opt.timestep * data.qvel[dofs]).tolist()
@@ -153,11 +169,14 @@ class Pace:
 
 def scene_of(config: RobotConfig, layer: SoftLayer) -> Scene:
     """The robot in front of a limb. Raises InvalidInput."""
+    from stmpl_sim.grip import mount_of
     from stmpl_sim.scene import build
     from stmpl_sim.site import Site
 
+    grip = config.grip or 0.0
     return build(layer, Site.thickest(layer), robot=config.robot, end=config.end or None, at=config.at,
-                 mount=config.mount, radius=1e-3 * config.radius, timestep=1 / config.physics)  # fmt: skip
+                 mount=mount_of(config.mount, grip), radius=1e-3 * config.radius, timestep=1 / config.physics,
+                 gripper=grip > 0)  # fmt: skip
 
 
 def massage_of(config: RobotConfig, layer: SoftLayer) -> Massage:
@@ -166,7 +185,8 @@ def massage_of(config: RobotConfig, layer: SoftLayer) -> Massage:
     from stmpl_sim.massage import Course, Massage
 
     scene = scene_of(config, layer)
-    course = Course(scene.site.circle(1e-3 * config.circle), config.force, 1e-3 * config.speed, config.laps)
+    course = Course(scene.site.circle(1e-3 * config.circle), config.force, 1e-3 * config.speed, config.laps,
+                    config.grip or 0.0)  # fmt: skip
     return Massage(scene, course, friction=friction_from(config.friction))
 
 
@@ -207,15 +227,21 @@ def run(config: RobotConfig, arguments: Sequence[str] | None = None) -> int:
 
 
 def warm_up(massage: Massage) -> None:
-    """One step with the tool in the skin, so that nothing is left to compile once the clock runs."""
+    """Two steps with all tools in the skin, so that nothing is left to compile once the clock runs."""
+    from stmpl_sim.grip import GAP
     from stmpl_sim.scene import BALL
 
-    skin, site = massage.skin, massage.scene.site
-    poses = skin.poses(massage.data)
-    pressed = poses.tools[BALL].copy()
-    inwards = massage.limb_pose()[:3, :3] @ site.normal
-    pressed[:3, 3] -= (0.01 + 1e-3) * inwards  # it starts 10 mm over the skin
-    skin.contact.step(type(poses)(poses.body, {BALL: pressed}))
+    skin, data = massage.skin, massage.data
+    poses = skin.poses(data)
+    normal = massage.limb_pose()[:3, :3] @ massage.scene.site.normal
+    inwards = {BALL: -(0.01 + 1e-3) * normal}  # it starts 10 mm over the skin
+    inwards |= {name: (GAP + 1e-3) * data.joint(name).xaxis for name in massage.fingers}
+    pressed = {name: pose.copy() for name, pose in poses.tools.items()}
+    for name, way in inwards.items():
+        pressed[name][:3, 3] += way
+    there, memory = type(poses)(poses.body, pressed), None
+    for _ in range(2):
+        memory = skin.contact.step(there, memory, massage.scene.model.opt.timestep).memory
 
 
 def _go_on(stop: threading.Event) -> None:

@@ -15,6 +15,8 @@ from stmpl_core.friction import Friction
 from stmpl_sim.controller import ForceImpedance, Gains, Goal
 from stmpl_sim.energy import EnergyBook
 from stmpl_sim.engine import mujoco
+from stmpl_sim.grip import FINGERS, Gripper, smooth, with_fingers
+from stmpl_sim.grip import PHASES as GRIPPING
 from stmpl_sim.mujoco_skin import SoftBody
 from stmpl_sim.scene import BALL, LIMB, Scene
 from stmpl_sim.site import Circle
@@ -32,10 +34,10 @@ class Phase:
     """Part of a course.
 
     Args:
-        name: name: reach, approach, press, circle, release.
+        name: name: reach, approach, press, circle, release; grip, lift, hold, lower, open.
         start: time at which it starts [s].
         duration: duration [s].
-        force: force into the skin [N].
+        force: force into the skin, or of each finger [N].
     """
 
     name: str
@@ -46,24 +48,28 @@ class Phase:
 
 @dataclass(frozen=True, eq=False)
 class Course:
-    """Approach, then press and circle with each force, then let go.
+    """Approach, then press and circle with each force, then let go; then grip the limb beside, lift it and lay it down.
 
     Args:
         circle: circle along the skin.
         forces: forces, one after the other [N].
         speed: speed along the circle [m/s]; 0: no circles.
         laps: laps around it with each force.
+        grip: force of each finger [N]; 0: nothing is gripped.
     """
 
     circle: Circle
     forces: tuple[float, ...] = (5.0, 10.0)
     speed: float = 0.05
     laps: float = 2.0
+    grip: float = 0.0
     phases: tuple[Phase, ...] = field(init=False)
 
     def __post_init__(self) -> None:
         if not self.forces or min(self.forces) <= 0:
             raise InvalidInput(f"forces are {self.forces}; at least one above 0 N is needed.")
+        if not 0 <= self.grip < np.inf:
+            raise InvalidInput(f"the grip is {self.grip} N; it must be finite and at least 0.")
         if self.speed < 0 or self.laps < 0:
             raise InvalidInput(f"speed is {self.speed} m/s and laps {self.laps}; neither may be below 0.")
         lap = 2 * np.pi * self.circle.radius * self.laps / self.speed + RAMP_S if self.speed and self.laps else 0.0
@@ -72,7 +78,11 @@ class Course:
             for name, duration in (("press", HOLD_S), ("circle", lap)):
                 if duration:
                     found.append(Phase(name, found[-1].start + found[-1].duration, duration, force))
-        found.append(Phase("release", found[-1].start + found[-1].duration, RELEASE_S, 0.0))
+        after = [("release", RELEASE_S, 0.0)]
+        if self.grip:
+            after += [(name, duration, self.grip) for name, duration in GRIPPING.items()]
+        for name, duration, force in after:
+            found.append(Phase(name, found[-1].start + found[-1].duration, duration, force))
         object.__setattr__(self, "phases", tuple(found))
 
     @property
@@ -97,15 +107,17 @@ class Course:
         place = self.circle.at(angle)
         point, normal, force, height = place.point, place.normal, phase.force, radius
         if phase.name == "reach":  # from over the site to over the circle's start
-            share = _smooth((at - phase.start) / phase.duration)
+            share = smooth((at - phase.start) / phase.duration)
             point = self.circle.site.point + share * (point - self.circle.site.point)
             normal = self.circle.site.normal + share * (normal - self.circle.site.normal)
             normal, force = normal / np.linalg.norm(normal), None
             height = radius + START_M + share * (NEAR_M - START_M)
+        elif phase.name in GRIPPING:  # out of the way
+            height, force = radius + START_M, None
         elif phase.name == "approach":
-            force *= FIRST + (1 - FIRST) * _smooth(((at - phase.start) / phase.duration - LANDED) / (1 - LANDED))
+            force *= FIRST + (1 - FIRST) * smooth(((at - phase.start) / phase.duration - LANDED) / (1 - LANDED))
         elif phase.name == "release":
-            height, force = radius + START_M * _smooth((at - phase.start) / (0.7 * RELEASE_S)), None
+            height, force = radius + START_M * smooth((at - phase.start) / (0.7 * RELEASE_S)), None
         turn = pose_world_from_layer[:3, :3]
         return Goal(
             point=turn @ point + pose_world_from_layer[:3, 3],
@@ -133,12 +145,6 @@ class Course:
         return angle, rate, more
 
 
-def _smooth(share: float) -> float:
-    """From 0 to 1, at rest at both."""
-    share = min(max(share, 0.0), 1.0)
-    return share * share * (3 - 2 * share)
-
-
 @dataclass(frozen=True, eq=False)
 class Log:
     """What a run did, a row a step.
@@ -155,6 +161,10 @@ class Log:
         energy: energy that the skin holds of what the tool gave it [J], (N,).
         off: distance of the tool from its course, along the skin [m], (N,).
         trusted: verdict whether the touch was in the range that was validated, (N,) bool.
+        fingers: wrenches on the fingers of a gripper, world axes, (N, F, 6) [N, N m].
+        squeeze: force that each presses with, friction left out, (N, F) [N].
+        finger: pose of each in the limb's axes, (N, F, 4, 4).
+        grip_energy: energy that the skin holds of what the fingers gave it, less what their friction took [J], (N,).
         touch_s: time that contact took in each step on this machine [s], (N,).
         step_s: time that the whole step took [s], (N,).
         cpu_s: processor time of the whole step [s], (N,): what a core of its own would have taken.
@@ -172,6 +182,10 @@ class Log:
     energy: np.ndarray
     off: np.ndarray
     trusted: np.ndarray
+    fingers: np.ndarray
+    squeeze: np.ndarray
+    finger: np.ndarray
+    grip_energy: np.ndarray
     touch_s: np.ndarray
     step_s: np.ndarray
     cpu_s: np.ndarray
@@ -226,8 +240,12 @@ class Massage:
                  damping: float = 0.0, implicit: bool = False,
                  friction: Friction | Mapping[str, Friction] = None) -> None:  # fmt: skip
         self.scene, self.course = scene, course
-        self.skin = SoftBody(scene.model, skin or scene.layer, body=LIMB, tools=[BALL], damping=damping,
+        self.fingers = tuple(name for name in scene.tools if name in FINGERS)
+        if self.fingers and not hasattr(skin, "history"):  # a Simulator has its own
+            friction = with_fingers(friction, BALL)
+        self.skin = SoftBody(scene.model, skin or scene.layer, body=LIMB, tools=scene.tools, damping=damping,
                              implicit=implicit, friction=friction)  # fmt: skip
+        self.gripper = Gripper(scene.model, course.grip) if self.fingers else None
         self.data = mujoco.MjData(scene.model)
         self.controller = ForceImpedance(scene.model, scene.joints, BALL, scene.qpos, gains)
         self.reset()
@@ -273,21 +291,31 @@ class Massage:
         self.reset()
         radius, dt = self.scene.radius, float(self.scene.model.opt.timestep)
         rows: list[tuple[Any, ...]] = []
-        book = EnergyBook()
+        book, books = EnergyBook(), [EnergyBook() for _ in self.fingers]
         for k in range(round(self.course.duration / dt)):
             at, begun, busy = k * dt, time.perf_counter(), time.process_time()
+            if self.gripper:
+                phase = self.course.phase(at)
+                self.gripper.command(self.data, phase.name, (at - phase.start) / phase.duration)
             aim, took = self.step(lambda limb, at=at: self.course.goal(at, limb, radius))
             spent, busy = time.perf_counter() - begun, time.process_time() - busy
             reaction = self.skin.reaction
             assert reaction is not None
             touch, wrench = reaction.touches[BALL], reaction.tools[BALL]
-            energy = book.add(reaction.memory.at[BALL], _in_layer(wrench, self.limb_pose()))
+            limb, held = self.limb_pose(), reaction.memory.at
+            energy = book.add(held[BALL], _in_layer(wrench, limb))
+            worked = [one.add(held[name], _in_layer(reaction.tools[name], limb))
+                      for name, one in zip(self.fingers, books, strict=True)]  # fmt: skip
             off = self.data.geom(BALL).xpos - aim.point
             along = off - (off @ aim.normal) * aim.normal
             rows.append((at, wrench[:3] @ aim.normal, np.nan if aim.force is None else aim.force,
                          touch.depth if touch.presses else np.nan, wrench, self.skin.poses(self.data).tools[BALL],
-                         self.limb_pose(), self.data.qpos.copy(), energy, np.linalg.norm(along),
-                         touch.trust.in_range is not False, took, spent, busy))  # fmt: skip
+                         limb, self.data.qpos.copy(), energy, np.linalg.norm(along),
+                         touch.trust.in_range is not False,
+                         np.array([reaction.tools[name] for name in self.fingers]).reshape(-1, 6),
+                         np.array([reaction.touches[name].force for name in self.fingers]),
+                         np.array([held[name] for name in self.fingers]).reshape(-1, 4, 4), sum(worked),
+                         took, spent, busy))  # fmt: skip
             for see in seen:
                 see(self, at)
         return Log(*(np.array(column) for column in zip(*rows, strict=True)), phases=self.course.phases)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import numpy as np
 
@@ -12,6 +12,7 @@ from stmpl_core.arrays import Transform
 from stmpl_core.errors import InvalidInput
 from stmpl_core.layer import SoftLayer
 from stmpl_sim.engine import mujoco
+from stmpl_sim.grip import END, FINGERS, add_gripper, place_of, thin_end
 from stmpl_sim.mujoco_skin import exclude
 from stmpl_sim.site import Site
 
@@ -25,8 +26,11 @@ SPRING, TWIST = (1500.0, 20.0), (30.0, 0.4)  # of a limb on springs: N/m and N s
 FROM = np.array([0.34, -0.52, 0.25])  # place of the camera, from the site [m]
 AIM = np.array([-0.03, 0.0, 0.06])  # point that it looks at, from the site [m]
 COLOURS = 256  # texels of the skin's colour scale
+ELBOW_DAMPING = 0.05  # of the hinge of a limb on a rest [N m s/rad]
 ROOM = 0.08  # distance of a start's joints from their limits, over their ranges, beyond which no other start is tried
 STARTS, STEPS = 40, 200  # starts that are tried at most, and steps from each
+
+Mount = Literal["fixed", "springs", "animated", "rest"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,6 +44,7 @@ class Scene:
         joints: numbers of the robot's joints from its base to the tool.
         qpos: start, with the tool above the site, (nq,).
         radius: radius of the ball [m].
+        tools: names of the geoms that touch: the ball, and the fingers of a gripper.
     """
 
     model: Any
@@ -48,6 +53,7 @@ class Scene:
     joints: tuple[int, ...]
     qpos: np.ndarray
     radius: float
+    tools: tuple[str, ...] = (BALL,)
 
 
 def build(
@@ -57,10 +63,11 @@ def build(
     robot: str | Path | None = None,
     end: str | None = None,
     at: tuple[float, float, float] = (0.5, 0.0, 0.25),
-    mount: Literal["fixed", "springs", "animated"] = "fixed",
+    mount: Mount = "fixed",
     radius: float = 0.02,
     timestep: float = 1e-3,
     above: float = 0.01,
+    gripper: bool = False,
 ) -> Scene:
     """Puts a robot with a massage head before a limb, the head over the site.
 
@@ -73,13 +80,16 @@ def build(
         end: name of the robot's body or site that carries the head, its z axis towards the skin; the last body of
             the longest chain unless given.
         at: place of the site in the robot's world [m].
-        mount: mount of the limb: fixed, on six springs, or animated (a mocap body).
+        mount: mount of the limb: fixed, on six springs, animated (a mocap body), or on a rest: hinged at its thicker
+            end, and lying there with its weight.
         radius: radius of the ball at the head [m].
         timestep: timestep [s].
         above: height of the ball over the skin at the start [m].
+        gripper: choice to add a gripper of two fingers beside the site.
 
     Raises:
-        InvalidInput: a file that MuJoCo does not read, an end that is not there, or a site out of reach.
+        InvalidInput: a file that MuJoCo does not read, an end that is not there, a site out of reach, or a limb that
+            cannot be gripped.
     """
     spec = _robot_spec(ARM if robot is None else Path(robot))
     holder = _end(spec, end)
@@ -87,8 +97,13 @@ def build(
     _add_head(spec, holder, radius)
     _drive(spec, chain)
     _add_limb(spec, layer, site, np.array(at), mount)
-    _add_stage(spec, np.array(at))
-    exclude(spec, LIMB, [BALL])
+    side, tools = -1.0, (BALL,)
+    if gripper:
+        place = place_of(site, world_from_limb(site, np.array(at)))
+        add_gripper(spec, place)
+        side, tools = place.side, (BALL, *FINGERS)
+    _add_stage(spec, np.array(at), side)
+    exclude(spec, LIMB, tools)
     spec.option.timestep = timestep
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     try:
@@ -97,7 +112,7 @@ def build(
         raise InvalidInput(f"MuJoCo cannot compile the scene: {' '.join(str(error).split())}") from error
     joints = tuple(model.joint(joint.name).id for joint in chain)
     qpos = _reach(model, joints, site, np.array(at), radius + above)
-    return Scene(model, layer, site, joints, qpos, radius)
+    return Scene(model, layer, site, joints, qpos, radius, tools)
 
 
 def world_from_limb(site: Site, at: np.ndarray) -> Transform:
@@ -186,11 +201,12 @@ def _add_limb(spec: Any, layer: SoftLayer, site: Site, at: np.ndarray, mount: st
     pose = world_from_limb(site, at)
     limb = spec.worldbody.add_body(name=LIMB, pos=pose[:3, 3],
                                    quat=Rotation.from_matrix(pose[:3, :3]).as_quat(scalar_first=True))  # fmt: skip
-    v = layer.vertices
-    middle, extent = v.mean(axis=0), np.ptp(v, axis=0)
-    radius = 0.5 * float(np.median(extent))
-    mass = DENSITY * np.pi * radius**2 * float(extent.max())
+    v, axes = layer.vertices, pose[:3, :3].T  # across the limb, along it, and up, in its own axes
+    middle, extent = v.mean(axis=0), np.ptp(v @ axes, axis=0)
+    radius = 0.25 * (extent[0] + extent[2])
+    mass = DENSITY * np.pi * radius**2 * extent[1]
     limb.explicitinertial, limb.mass, limb.ipos = True, mass, middle
+    limb.iquat = Rotation.from_matrix(axes).as_quat(scalar_first=True)
     limb.inertia = mass * (np.dot(extent, extent) - extent**2) / 12
     if mount == "animated":
         limb.mocap = True
@@ -202,9 +218,11 @@ def _add_limb(spec: Any, layer: SoftLayer, site: Site, at: np.ndarray, mount: st
                 joint.stiffness, joint.damping = np.resize(stiffness, 3), np.resize(damping, 3)
                 joint.springref = joint.armature = joint.frictionloss = 0.0  # the robot's defaults are not the limb's
                 joint.limited = mujoco.mjtLimited.mjLIMITED_FALSE
+    elif mount == "rest":
+        _add_rest(limb, layer, site, pose)
     elif mount != "fixed":
-        raise InvalidInput(f"a limb cannot be mounted '{mount}'. Allowed: fixed, springs, animated.")
-    limb.gravcomp = 1.0  # it rests on something that is not drawn
+        raise InvalidInput(f"a limb cannot be mounted '{mount}'. Allowed: {', '.join(get_args(Mount))}.")
+    limb.gravcomp = float(mount != "rest")  # it rests on something that is not drawn
     mesh = spec.add_mesh(name=SKIN_MESH)
     mesh.uservert, mesh.userface = v.astype(np.float32).ravel(), layer.faces.astype(np.int32).ravel()
     mesh.usertexcoord = np.tile([0.5 / COLOURS, 0.5], len(v)).astype(np.float32)
@@ -212,6 +230,19 @@ def _add_limb(spec: Any, layer: SoftLayer, site: Site, at: np.ndarray, mount: st
     _add_colours(spec)
     limb.add_geom(name=SKIN_GEOM, type=mujoco.mjtGeom.mjGEOM_MESH, meshname=SKIN_MESH, material=SKIN_MATERIAL,
                   contype=0, conaffinity=0, mass=0.0)  # fmt: skip
+
+
+def _add_rest(limb: Any, layer: SoftLayer, site: Site, pose: Transform) -> None:
+    """A hinge across the limb at its thicker end, which a rest that is not drawn keeps from turning down."""
+    across = pose[:3, :3].T @ [1.0, 0.0, 0.0]
+    along = (layer.vertices - site.point) @ site.along
+    sign = -thin_end(site)
+    end = layer.vertices[sign * along > (sign * along).max() - END]
+    joint = limb.add_joint(name="elbow", type=mujoco.mjtJoint.mjJNT_HINGE, pos=end.mean(axis=0), axis=-sign * across)
+    joint.stiffness, joint.damping = np.zeros(3), np.resize(ELBOW_DAMPING, 3)
+    joint.springref = joint.armature = joint.frictionloss = 0.0
+    joint.limited, joint.range = mujoco.mjtLimited.mjLIMITED_TRUE, [0.0, 1.0]
+    joint.solref_limit, joint.solimp_limit = [0.004, 1.0], [0.95, 0.99, 0.001, 0.5, 2.0]
 
 
 def _add_colours(spec: Any) -> None:
@@ -226,7 +257,10 @@ def _add_colours(spec: Any) -> None:
     material.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = SKIN_MATERIAL
 
 
-def _add_stage(spec: Any, at: np.ndarray) -> None:
+def _add_stage(spec: Any, at: np.ndarray, side: float) -> None:
+    """Light, floor, and a camera on that side of the limb along y."""
+    mirror = np.array([1.0, -side, 1.0])
+    look, light = FROM * mirror, np.array([0.5, -1.3, 0.9]) * mirror
     spec.visual.headlight.ambient = [0.35, 0.35, 0.35]
     spec.visual.headlight.diffuse = [0.45, 0.45, 0.45]
     spec.visual.quality.shadowsize = 1024
@@ -234,10 +268,10 @@ def _add_stage(spec: Any, at: np.ndarray) -> None:
     spec.add_texture(name="sky", type=mujoco.mjtTexture.mjTEXTURE_SKYBOX, builtin=mujoco.mjtBuiltin.mjBUILTIN_FLAT,
                      width=8, height=48, rgb1=[0.97, 0.97, 0.98], rgb2=[0.97, 0.97, 0.98])  # fmt: skip
     world = spec.worldbody
-    world.add_light(pos=at + [0.5, -1.3, 0.9], dir=[-0.5, 1.3, -0.9], diffuse=[0.45, 0.45, 0.45])
+    world.add_light(pos=at + light, dir=-light, diffuse=[0.45, 0.45, 0.45])
     world.add_geom(name="floor", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[2, 2, 0.05], contype=0, conaffinity=0,
                    rgba=[0.93, 0.93, 0.92, 1])  # fmt: skip
-    world.add_camera(name=EYE, pos=at + FROM, xyaxes=[*_looking(AIM - FROM)], fovy=33)
+    world.add_camera(name=EYE, pos=at + look, xyaxes=[*_looking(AIM - look)], fovy=33)
 
 
 def _looking(way: np.ndarray) -> np.ndarray:

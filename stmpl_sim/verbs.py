@@ -29,7 +29,8 @@ def sim(
     circle: float = 12.0,
     laps: float = 2.0,
     radius: float = 20.0,
-    mount: Literal["fixed", "springs"] = "fixed",
+    mount: Literal["auto", "fixed", "springs", "rest"] = "auto",
+    grip: float | None = None,
     robot: Path | None = None,
     end: str | None = None,
     at: tuple[float, float, float] = (0.5, 0.0, 0.25),
@@ -40,7 +41,7 @@ def sim(
     film: Literal["auto", "egl", "osmesa", "software", "none"] = "auto",
     as_json: Annotated[bool, tyro.conf.arg(name="json")] = False,
 ) -> int:
-    """A robot presses on a limb, circles on it and lets go, in MuJoCo, without ROS: force kept, energy, speed, a film.
+    """A robot presses on a limb and circles on it, two fingers grip and lift it: MuJoCo, no ROS; figures and a film.
 
     Example: stmpl sim --force 5 --laps 1 --tissue single
     With your own robot: stmpl sim --robot arm.urdf --end tool0 --at 0.6 0 0.3
@@ -55,7 +56,10 @@ def sim(
         circle: radius of the circles [mm].
         laps: laps with each force.
         radius: radius of the ball that presses [mm].
-        mount: mount of the limb: fixed, or on springs.
+        mount: mount of the limb: fixed, on springs, or on a rest, hinged at its thicker end; auto: on a rest if it is
+            gripped, else fixed.
+        grip: force with which each of two fingers grips the limb in the end, to lift it [N]; 0: not; unless given,
+            10 on a forearm.
         robot: MJCF or URDF file; the 7-axis arm that ships unless given. Its actuators become torque motors.
         end: body or site of the robot that carries the ball, z axis towards the skin; the last body unless given.
         at: place of the limb in the robot's world [m].
@@ -70,14 +74,17 @@ def sim(
     if not 50 <= rate <= 20_000:
         raise InvalidInput(f"--rate is {rate:g} Hz; allowed is 50 to 20000.")
     from stmpl_core.friction import friction_from
+    from stmpl_sim.grip import mount_of, usual_force
     from stmpl_sim.massage import Course, Massage
     from stmpl_sim.scene import build
     from stmpl_sim.site import Site
 
     layer = limb(part, tissue, relaxing)
     site = Site.thickest(layer)
-    scene = build(layer, site, robot=robot, end=end, at=at, mount=mount, radius=1e-3 * radius, timestep=1 / rate)
-    course = Course(site.circle(1e-3 * circle), tuple(force), 1e-3 * speed, laps)
+    grip = usual_force(part) if grip is None else grip
+    scene = build(layer, site, robot=robot, end=end, at=at, mount=mount_of(mount, grip), radius=1e-3 * radius,
+                  timestep=1 / rate, gripper=grip > 0)  # fmt: skip
+    course = Course(site.circle(1e-3 * circle), tuple(force), 1e-3 * speed, laps, grip)
     massage = Massage(scene, course, damping=damping, friction=friction_from(friction))
     out.mkdir(parents=True, exist_ok=True)
     camera = None
@@ -166,6 +173,7 @@ def figures_of(log: Log) -> dict[str, Any]:
     most = float(log.energy.max())
     return {
         "phases": phases,
+        "grip": gripped(log),
         "highest_force_N": float(log.force.max()),
         "stored_J": most,
         "given_out_J": -float(log.energy[-1]),
@@ -176,6 +184,30 @@ def figures_of(log: Log) -> dict[str, Any]:
         "real_time_factor_of_processor_time": log.own_core_factor,
         "touch_s": float(np.median(log.touch_s)),
         "step_s": float(np.median(log.step_s)),
+    }
+
+
+def gripped(log: Log) -> dict[str, float] | None:
+    """What a gripper kept while it lifted the limb, SI units; None without one."""
+    import numpy as np
+
+    held = {p.name: p for p in log.phases if p.name in ("lift", "hold", "lower")}
+    if not held or not log.squeeze.size:
+        return None
+    start, end = held["lift"].start, held["lower"].start
+    rows = (log.time >= start) & (log.time < end)
+    still = (log.time >= held["hold"].start) & (log.time < end)
+    middle = log.finger[:, :, :3, 3].mean(axis=1)  # between the fingers, in the limb's axes
+    grips = np.einsum("nij,nj->ni", log.limb[:, :3, :3], middle[rows][0][None]) + log.limb[:, :3, 3]
+    return {
+        "asked_N": held["hold"].force,
+        "mean_N": float(log.squeeze[rows].mean()),
+        "deviation_N": float(log.squeeze[rows].std()),
+        "carried_N": float(-log.fingers[still, :, 2].sum(axis=1).mean()),
+        "lifted_m": float(grips[still, 2].mean() - grips[rows][0, 2]),
+        "crept_m": float(np.linalg.norm(middle[rows] - middle[rows][0], axis=1).max()),
+        "stored_J": float(log.grip_energy.max()),
+        "given_out_J": -float(log.grip_energy[-1]),
     }
 
 
@@ -200,6 +232,10 @@ def table(figures: dict[str, Any]) -> Any:
         f"(contact {1e3 * figures['touch_s']:.2f} of {1e3 * figures['step_s']:.2f} ms, median)",
         f"log: {figures['log']}",
     ]
+    if grip := figures["grip"]:
+        lines.insert(1, f"grip: {grip['mean_N']:.2f} ± {grip['deviation_N']:.2f} N a finger ({grip['asked_N']:.1f} N "
+                     f"asked), {grip['carried_N']:.1f} N carried, limb lifted {1e3 * grip['lifted_m']:.1f} mm "
+                     f"there, fingers crept {1e3 * grip['crept_m']:.1f} mm")  # fmt: skip
     if "film" in figures:
         lines.append(f"film: {figures['film']}, frames by {figures['frames_by']}")
     return Group(shown, *lines)

@@ -108,6 +108,33 @@ def test_joints_and_pose_are_of_one_instant(heard) -> None:
         np.testing.assert_allclose(data.geom(BALL).xpos, world[:3, 3], atol=1e-6)
 
 
+def test_frames_hang_together_from_the_world_to_every_tool() -> None:
+    from stmpl_ros.tf import WORLD, transforms
+    from stmpl_sim.massage import Course, Massage
+    from stmpl_sim.scene import build
+    from stmpl_sim.site import Site
+    from tests.scenes import limb
+
+    layer = limb(6e-3, radius=0.03).with_(youngs_modulus=20e3)
+    site = Site.thickest(layer)
+    scene = build(layer, site, mount="rest", gripper=True)
+    massage = Massage(scene, Course(site.circle(0.012), (5.0,), grip=10.0))
+    found = {one.child_frame_id: one for one in transforms(massage, "left_arm", 5)}
+    assert len(found) == len(set(found)) and set(scene.tools) <= set(found)
+
+    def placed(frame: str) -> np.ndarray:
+        one, pose = found[frame], np.eye(4)
+        turn, way = one.transform.rotation, one.transform.translation
+        mujoco_turn = np.empty(9)
+        mujoco.mju_quat2Mat(mujoco_turn, np.array([turn.w, turn.x, turn.y, turn.z]))
+        pose[:3, :3], pose[:3, 3] = mujoco_turn.reshape(3, 3), vector(way)
+        return pose if one.header.frame_id == WORLD else placed(one.header.frame_id) @ pose
+
+    for name in scene.tools:
+        np.testing.assert_allclose(placed(name)[:3, 3], massage.data.geom(name).xpos, atol=1e-9)
+    np.testing.assert_allclose(placed("left_arm"), massage.limb_pose(), atol=1e-9)
+
+
 def test_the_clock_runs_with_the_stamps(heard) -> None:
     by_stamp, got, _ = heard
     times = np.array([one.clock.sec * 1_000_000_000 + one.clock.nanosec for one in got["/clock"]])

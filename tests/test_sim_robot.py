@@ -173,7 +173,8 @@ def test_the_verb_prints_figures_and_leaves_log_and_film(tmp_path: Path, capsys:
     assert ended.value.code == 0
     figures = json.loads(capsys.readouterr().out)
     assert figures["phases"][0]["mean_N"] == pytest.approx(5.0, abs=0.05) and figures["frames_by"] == "software"
-    assert len(np.load(tmp_path / "log.npz")["force"]) == 1000
+    assert len(np.load(tmp_path / "log.npz")["force"]) == 1750
+    assert figures["grip"]["mean_N"] == pytest.approx(10.0, abs=0.5) and figures["grip"]["lifted_m"] > 5e-3
     assert Path(figures["film"]).stat().st_size > 10_000
     for wrong, why in ((["--rate", "5"], "allowed is 50 to 20000"), (["--force", "-1"], "above 0 N"),
                        (["--robot", "nothing.urdf"], "no robot file")):  # fmt: skip
