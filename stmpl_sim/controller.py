@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from stmpl_core.arrays import Wrench
+from stmpl_core.arrays import Wrench, cross
 from stmpl_sim.engine import mujoco
 
 FILTER_S = 3e-3  # time constant of the force's rate [s]
@@ -128,12 +128,12 @@ class ForceImpedance:
         velocity = jacobian @ dq
         off = goal.point - x
         over = -(off @ n) * n  # the tool's origin goes round with the normal
-        lag = goal.velocity + np.cross(goal.spin, over) - velocity[:3]
-        ahead = goal.acceleration + np.cross(goal.swing, over) + np.cross(goal.spin, np.cross(goal.spin, over))
+        lag = goal.velocity + cross(goal.spin, over) - velocity[:3]
+        ahead = goal.acceleration + cross(goal.swing, over) + cross(goal.spin, cross(goal.spin, over))
         axis = data.geom_xmat[self._tool].reshape(3, 3)[:, 2]
         asked = np.concatenate([
             ahead + 2 * g.ratio * g.along * lag + g.along**2 * off,
-            goal.swing + 2 * g.ratio * g.turn * (goal.spin - velocity[3:]) + g.turn**2 * np.cross(axis, -n),
+            goal.swing + 2 * g.ratio * g.turn * (goal.spin - velocity[3:]) + g.turn**2 * cross(axis, -n),
         ])  # fmt: skip
         lift = ahead @ n
         if goal.force is None:

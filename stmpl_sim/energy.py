@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from stmpl_core.arrays import Transform, Wrench
 
@@ -35,7 +36,7 @@ class EnergyBook:
         """
         if self._pose is not None:
             moved = pose_body_from_tool[:3, 3] - self._pose[:3, 3]
-            turned = Rotation.from_matrix(pose_body_from_tool[:3, :3] @ self._pose[:3, :3].T).as_rotvec()
+            turned = _turned(pose_body_from_tool[:3, :3] @ self._pose[:3, :3].T)
             mean = 0.5 * (self._wrench + wrench)  # this motion follows the last wrench and comes before this one
             self.held -= float(mean[:3] @ moved + mean[3:] @ turned)
         self._pose, self._wrench = pose_body_from_tool, wrench
@@ -46,3 +47,12 @@ class EnergyBook:
     def gained(self) -> float:
         """Energy that came out and was not put in, over what was stored, after everything was let go [-]."""
         return -self.held / self.most if self.most > 0 else 0.0
+
+
+def _turned(turn: np.ndarray) -> np.ndarray:
+    """Rotation vector of a rotation by less than half a turn, (3,) [rad]."""
+    (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = turn.tolist()
+    axis = np.array([zy - yz, xz - zx, yx - xy])  # 2 sin(angle) along the axis
+    size = float(np.linalg.norm(axis))
+    angle = math.atan2(size, xx + yy + zz - 1)
+    return axis * (angle / size if size > 1e-12 else 0.5)

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from stmpl_core.arrays import cross
 from stmpl_core.errors import InvalidInput
 from stmpl_core.friction import Friction
 from stmpl_sim.controller import ForceImpedance, Gains, Goal
@@ -124,8 +125,8 @@ class Course:
             velocity=turn @ (place.slope * rate),
             acceleration=turn @ (place.bend * rate**2 + place.slope * more),
             normal=turn @ normal,
-            spin=turn @ np.cross(normal, place.tilt * rate),
-            swing=turn @ np.cross(normal, place.curl * rate**2 + place.tilt * more),
+            spin=turn @ cross(normal, place.tilt * rate),
+            swing=turn @ cross(normal, place.curl * rate**2 + place.tilt * more),
             force=force,
             height=height,
         )
@@ -280,7 +281,7 @@ class Massage:
 
     def limb_pose(self) -> np.ndarray:
         """Pose of the limb in the world, (4, 4)."""
-        return self.skin.poses(self.data).body
+        return self.skin.pose(self.data)
 
     def run(self, seen: Sequence[Callable[[Massage, float], None]] = ()) -> Log:
         """Follows the course from the start.
@@ -293,12 +294,12 @@ class Massage:
         rows: list[tuple[Any, ...]] = []
         book, books = EnergyBook(), [EnergyBook() for _ in self.fingers]
         for k in range(round(self.course.duration / dt)):
-            at, begun, busy = k * dt, time.perf_counter(), time.process_time()
+            at, begun, busy = k * dt, time.perf_counter(), time.thread_time()
             if self.gripper:
                 phase = self.course.phase(at)
                 self.gripper.command(self.data, phase.name, (at - phase.start) / phase.duration)
             aim, took = self.step(lambda limb, at=at: self.course.goal(at, limb, radius))
-            spent, busy = time.perf_counter() - begun, time.process_time() - busy
+            spent, busy = time.perf_counter() - begun, time.thread_time() - busy
             reaction = self.skin.reaction
             assert reaction is not None
             touch, wrench = reaction.touches[BALL], reaction.tools[BALL]

@@ -9,7 +9,7 @@ from weakref import WeakKeyDictionary
 import numpy as np
 from numpy.typing import ArrayLike
 
-from stmpl_core.arrays import Transform, Wrench
+from stmpl_core.arrays import Transform, Wrench, cross
 from stmpl_core.errors import InvalidInput
 from stmpl_core.friction import Friction
 from stmpl_core.layer import SoftLayer
@@ -170,7 +170,11 @@ class SoftBody:
         tools = {name: _pose(data.xpos[s.body], data.xmat[s.body]) if s.geom is None
                  else _pose(data.geom_xpos[s.geom], data.geom_xmat[s.geom])
                  for name, s in self._sources.items()}  # fmt: skip
-        return Poses(_pose(data.xpos[self.body], data.xmat[self.body]), tools)
+        return Poses(self.pose(data), tools)
+
+    def pose(self, data: Any) -> Transform:
+        """pose_world_from_body in `data`, (4, 4)."""
+        return _pose(data.xpos[self.body], data.xmat[self.body])
 
     def answer(self) -> Answer:
         """The displacement of the skin at the last `apply`, layer axes. Raises InvalidInput before the first one."""
@@ -276,7 +280,7 @@ def exclude(spec: Any, body: str, tools: Sequence[str]) -> None:
 def _add(rows: dict[int, Wrench], body: int, wrench: Wrench, lever: np.ndarray) -> None:
     """Adds a wrench about a point that is `lever` from the body's centre of mass, where MuJoCo applies it."""
     about = wrench.copy()
-    about[3:] += np.cross(lever, wrench[:3])
+    about[3:] += cross(lever, wrench[:3])
     rows[body] = rows.get(body, 0.0) + about
 
 

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial import KDTree
 
-from stmpl_core.arrays import Transform, Wrench, finite
+from stmpl_core.arrays import Transform, Wrench, cross, finite
 from stmpl_core.carrying import carry_at
 from stmpl_core.contact import Contact
 from stmpl_core.errors import InvalidInput
@@ -204,11 +204,11 @@ class SoftContact:
             pressing = _pressing(touch)
             exerted = factor * pressing + (touch.wrench - pressing)
             force, torque = exerted[:3], exerted[3:]
-            torque = torque + np.cross(touch.pose_body_from_tool[:3, 3] - at[name][:3, 3], force)
+            torque = torque + cross(touch.pose_body_from_tool[:3, 3] - at[name][:3, 3], force)
             force, torque = turn @ force, turn @ torque
             wrenches[name] = -np.concatenate([force, torque])
             lever = poses.tools[name][:3, 3] - body[:3, 3]
-            on_body += np.concatenate([force, torque + np.cross(lever, force)])
+            on_body += np.concatenate([force, torque + cross(lever, force)])
         return Reaction(wrenches, on_body, touches, Memory(tissue, at, speed))
 
     def pose(self, joints: Mapping[str, float], memory: Memory) -> Memory:
@@ -301,7 +301,7 @@ def _centre_of_pressure(touch: Touch) -> np.ndarray:
     """Point nearest to the tool's origin on the axis of the wrench that presses, layer axes, (3,) [m]."""
     wrench = _pressing(touch)
     force = wrench[:3]
-    return touch.pose_body_from_tool[:3, 3] + np.cross(force, wrench[3:]) / (force @ force)
+    return touch.pose_body_from_tool[:3, 3] + cross(force, wrench[3:]) / (force @ force)
 
 
 def _rigid(name: str, pose: ArrayLike) -> Transform:

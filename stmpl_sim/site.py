@@ -122,11 +122,17 @@ class Circle:
     radius: float
     harmonics: np.ndarray
 
+    @cached_property
+    def _derived(self) -> np.ndarray:
+        """Coefficients of points and normals and of their first two derivatives by the angle, (HARMONICS + 1, 18)."""
+        k = np.arange(len(self.harmonics))[:, None]
+        twice = np.where(k == 0, 1.0, 2.0) * self.harmonics
+        return np.concatenate([twice * (1j * k) ** order for order in range(3)], axis=1)
+
     def at(self, angle: float) -> Place:
         """What lies at an angle [rad]."""
         k = np.arange(len(self.harmonics))
-        turn = np.exp(1j * k * angle) * np.where(k == 0, 1.0, 2.0)
-        values, rates, bends = ((turn * (1j * k) ** order @ self.harmonics).real for order in range(3))
+        values, rates, bends = (np.exp(1j * k * angle) @ self._derived).real.reshape(3, 6)
         size = np.linalg.norm(values[3:])
         normal = values[3:] / size
         shrink = rates[3:] @ normal / size

@@ -197,12 +197,13 @@ def gripped(log: Log) -> dict[str, float] | None:
     start, end = held["lift"].start, held["lower"].start
     rows = (log.time >= start) & (log.time < end)
     still = (log.time >= held["hold"].start) & (log.time < end)
+    closing = np.abs(log.fingers[:, :, 0])  # the drives close along x
     middle = log.finger[:, :, :3, 3].mean(axis=1)  # between the fingers, in the limb's axes
     grips = np.einsum("nij,nj->ni", log.limb[:, :3, :3], middle[rows][0][None]) + log.limb[:, :3, 3]
     return {
         "asked_N": held["hold"].force,
-        "mean_N": float(log.squeeze[rows].mean()),
-        "deviation_N": float(log.squeeze[rows].std()),
+        "mean_N": float(closing[rows].mean()),
+        "deviation_N": float(closing[rows].std()),
         "carried_N": float(-log.fingers[still, :, 2].sum(axis=1).mean()),
         "lifted_m": float(grips[still, 2].mean() - grips[rows][0, 2]),
         "crept_m": float(np.linalg.norm(middle[rows] - middle[rows][0], axis=1).max()),

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from stmpl_core.arrays import Wrench
+from stmpl_core.arrays import Wrench, cross
 from stmpl_sim.engine import mujoco
 from stmpl_sim.scene import BALL, HEAD, WRIST, Scene
 
@@ -43,5 +43,5 @@ class Wrist:
         force = turn @ data.sensordata[self._force : self._force + 3]  # what the robot exerts on its head
         torque = turn @ data.sensordata[self._torque : self._torque + 3]
         weight = self._model.body_mass[self._head] * self._model.opt.gravity
-        force, torque = force + weight, torque + np.cross(data.xipos[self._head] - at, weight)
-        return np.concatenate([force, torque + np.cross(at - data.geom_xpos[self._ball], force)])
+        force, torque = force + weight, torque + cross(data.xipos[self._head] - at, weight)
+        return np.concatenate([force, torque + cross(at - data.geom_xpos[self._ball], force)])

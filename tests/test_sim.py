@@ -399,3 +399,17 @@ def test_friction_stands_in_one_place(simulator: Simulator, slab: SoftLayer) -> 
         SoftContact(simulator, [ball(RADIUS)], friction=0.3)
     with pytest.raises(InvalidInput, match="there is no friction 'sticky'"):
         SoftContact(slab, [ball(RADIUS)], Winkler(), friction="sticky")
+
+
+def test_quick_vectors_are_those_of_numpy_and_scipy() -> None:
+    from scipy.spatial.transform import Rotation
+
+    from stmpl_core.arrays import cross
+    from stmpl_sim.energy import _turned
+
+    random = np.random.default_rng(0)
+    for size in (0.0, 1e-9, 1e-3, 1.0, 3.0):
+        a, b = random.normal(size=(2, 3))
+        np.testing.assert_array_equal(cross(a, b), np.cross(a, b))
+        turn = Rotation.from_rotvec(size * a / np.linalg.norm(a))
+        np.testing.assert_allclose(_turned(turn.as_matrix()), turn.as_rotvec(), rtol=1e-6, atol=1e-15)
