@@ -172,3 +172,19 @@ def test_the_patch_is_kept_while_loads_press_on_the_same_vertices():
     load = press(slab(), 0.05)
     first, _, again = method.solve(load), method.solve(load.scaled(3.0)), method.solve(load)
     np.testing.assert_array_equal(first.displacement, again.displacement)
+
+
+def test_a_rigid_contact_rests_at_the_force_that_it_is_fitted_by() -> None:
+    pytest.importorskip("mujoco", reason="pip install 'stmpl[sim]'")
+    from stmpl_core.tissue import Tissue
+    from studies.peers.led_ball import Ground, RigidRig, grid
+
+    ground = Ground((0.10, 0.07), 10e-3, Tissue(20e3), 15e-3, 0.0)
+    assert grid(ground, 2) == (20, 14, 2)
+    rig, low, high, width, k = RigidRig(ground, ("-1000 -60", "0.001 0.05 0.005 0.5 1")), 0.001, 0.05, 5e-3, 1e3
+    place = np.array([0.0, 0.0, 15e-3 - 3e-3])
+    for _ in range(1500):
+        at, force = rig.step(place, np.zeros(3))
+    depth = 15e-3 - at[2]
+    d = low + (high - low) * depth / width
+    assert force[2] == pytest.approx(ground.mass * d**2 * k * depth / high**2 / (1 - d), rel=1e-3)
