@@ -32,7 +32,7 @@ def test_a_massage_over_ros_is_recorded_replayed_judged_and_shown(tmp_path: Path
     command = [sys.executable, "-m", "stmpl_ros.cli", "demo", *flags, str(tmp_path)]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=600)
     assert done.returncode == 0, done.stdout + done.stderr
-    assert "every one bit for bit as recorded" in done.stdout.replace("\n", " ")
+    assert "every one bit for bit as recorded" in " ".join(done.stdout.split())
     folder = tmp_path / "latest"
     page = (folder / "report.html").read_text()
     first = page.index("<h1>A robot massages a left forearm with 5 N</h1>")
