@@ -8,7 +8,6 @@ turns with the skin there. So a pose costs milliseconds where a new layer costs 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from copy import copy
 from typing import TYPE_CHECKING
 
 import numba
@@ -16,6 +15,7 @@ import numpy as np
 from scipy.spatial import KDTree
 
 from stmpl_core.layer import SoftLayer
+from stmpl_core.methods.base import anew
 from stmpl_core.moments import WIDEST, Surroundings
 from stmpl_core.soundness import Bend
 from stmpl_core.thinning import CORNERS, LARGEST, interpolation
@@ -92,7 +92,7 @@ class Posing:
         if rest.green is not None:
             green = rest.green.moved(layer, moved, turns)
             green.keep(layer)
-        return rest.at(layer, copy(rest.method).prepare(layer), moved, green, tuple(angles))
+        return rest.at(layer, anew(rest.method).prepare(layer), moved, green, tuple(angles))
 
     def turn_at(self, vertex: int, angles: Sequence[float]) -> np.ndarray:
         """Rotation of the skin at a vertex under angles of the joints [rad], (3, 3)."""

@@ -1,6 +1,7 @@
 """Laws of a limb whose joints move: what a pose keeps, what turns with it, what it spoils and says so."""
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -10,7 +11,9 @@ from stmpl_core.body import Body
 from stmpl_core.bones import Bone, to_bone
 from stmpl_core.errors import InvalidInput
 from stmpl_core.layer import layer_id
-from stmpl_core.methods import MomentNet, Winkler
+from stmpl_core.methods import Coarse, Linear, MomentNet, Winkler
+from stmpl_core.methods import method as method_named
+from stmpl_core.methods.base import anew
 from stmpl_core.rig import Joint, Rig
 from tests.scenes import LENGTH, RADIUS, at, ball, limb
 
@@ -71,6 +74,17 @@ def test_bent_and_back_at_rest_every_answer_is_what_it_was_to_the_last_bit(skin)
     after = simulator.step([contact])
     assert after.displacement.tobytes() == before.displacement.tobytes()
     assert after.touches["probe"].wrench.tobytes() == before.touches["probe"].wrench.tobytes()
+
+
+def test_a_pose_leaves_the_methods_inside_of_a_method_where_they_were():
+    layer = limb(6e-3)
+    skin = Skin.of(layer.with_(rig=hinged(layer)), Coarse(Linear(), 1.5))
+    simulator, contact = Simulator(skin), Contact(ball(), pressed(layer, near(layer, (RADIUS, 0, 0.05))))
+    before = simulator.step([contact])
+    skin.posed({"elbow": 0.6})  # as another thread does
+    assert simulator.step([contact]).displacement.tobytes() == before.displacement.tobytes()
+    ladder: Any = method_named("ladder")
+    assert not {id(rung) for rung in ladder.rungs} & {id(rung) for rung in anew(ladder).rungs}
 
 
 def test_a_pose_tends_to_the_rest(skin):

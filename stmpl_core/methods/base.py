@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from copy import copy
 from typing import Protocol, Self
 
 from stmpl_core.errors import NotPrepared
@@ -30,3 +31,14 @@ def prepared(layer: SoftLayer | None, method: object) -> SoftLayer:
         name = type(method).__name__
         raise NotPrepared(f"{name} has no layer yet. Call {name}().prepare(layer) before solve(load).")
     return layer
+
+
+def anew[M: Method](method: M) -> M:
+    """A copy to be prepared for another layer; the methods inside it are copies too, so this one stays as it is."""
+    out = copy(method)
+    for name, value in vars(method).items():
+        if isinstance(value, list):
+            setattr(out, name, [anew(one) if hasattr(one, "prepare") else one for one in value])
+        elif hasattr(value, "prepare"):
+            setattr(out, name, anew(value))
+    return out
