@@ -152,8 +152,10 @@ def joints_from(message: Any, names: Mapping[str, str]) -> dict[str, float]:
         Angles by joint; empty if the message is of others.
 
     Raises:
-        InvalidInput: not as many positions as names, or an angle that is not finite.
+        InvalidInput: of these joints, but not as many positions as names, or an angle that is not finite.
     """
+    if not set(names.values()) & set(message.name):
+        return {}
     if len(message.position) != len(message.name):
         raise InvalidInput(f"joint states hold {len(message.position)} positions for {len(message.name)} names.")
     told = dict(zip(message.name, message.position, strict=True))

@@ -176,7 +176,7 @@ class Answering:
         asked = Asked(instant, reaction, self._fields, self._epoch, seconds, tuple(self._news), said, skin, doubt)
         self._field.put(asked)
         self.sending.models.put(instant, touches, reaction.before)
-        if not any(skin.angles):  # a fit knows the skin at rest
+        if not any(skin.angles) and not doubt:  # a fit knows the skin at rest
             self._calibration.put(instant, touches)
         if self.limits:
             self.limits.put(reaction.touches)

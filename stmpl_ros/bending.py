@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import threading
 import time
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import numba
 from rclpy.node import Node
@@ -18,7 +19,15 @@ from stmpl_ros.latest import LatestWins
 from stmpl_ros.parameters import NodeConfig
 from stmpl_ros.topics import NEWEST
 
-SILENT_S = 1.0  # silence of the joints' sensor after which answers are flagged [s]
+SILENT_S = 1.0  # silence of a joint's sensor after which answers are flagged [s]
+
+
+class _Heard(NamedTuple):
+    """What was heard of a joint: its angle [rad], the stamp of that [ns], and when it came [s]."""
+
+    angle: float
+    stamp: int
+    came: float
 
 
 class Bending:
@@ -39,18 +48,25 @@ class Bending:
         self._node, self._hearing, self._config = node, hearing, config
         self.newest: Skin | None = None
         self._rest: Skin | None = None
-        self._told: dict[str, float] = {}  # newest angle of each joint [rad]
-        self._stamp, self._came = 0, 0.0  # of the newest message [ns], and when it came [s]
+        self._heard: dict[str, _Heard] = {}  # by joint of the limb
+        self._stands = 0.0  # when the angles came that the newest skin stands at [s]; 0: none yet
         self._others = ""  # joints that messages told of instead
+        self._lock = threading.Lock()  # held while the newest skin is changed
         self._subscription: Any = None
-        self._thread: LatestWins[tuple[Skin, tuple[float, ...]]] | None = None
+        self._thread: LatestWins[tuple[Skin, tuple[float, ...], float]] | None = None
 
     def move_to(self, rest: Skin) -> None:
         """Goes on with another skin; it is at rest until its newest angles are made."""
-        self._rest = self.newest = rest
-        rig = rest.layer.rig
-        if rig is not None and self._thread is not None and self._told.keys() <= set(rig.names):
-            self._thread.put((rest, rig.angles(self._told)))
+        with self._lock:
+            self._rest = self.newest = rest
+            self._stands, rig = 0.0, rest.layer.rig
+        self._heard = {name: one for name, one in self._heard.items() if rig is not None and name in rig.names}
+        if rig is not None and self._thread is not None and self._heard:
+            try:
+                self._put(rest, rig.angles({name: one.angle for name, one in self._heard.items()}))
+            except InvalidInput as error:  # beyond this limb's limits
+                self._heard = {}
+                self._hearing.gate.refuse("joints", str(error))
 
     def open(self) -> None:
         """Starts to listen, if the settings name a topic."""
@@ -66,22 +82,33 @@ class Bending:
         if self._thread is not None:
             self._thread.close()
         self._subscription = self._thread = self._rest = self.newest = None
-        self._told, self._stamp, self._came = {}, 0, 0.0
+        self._heard, self._stands, self._others = {}, 0.0, ""
 
     @property
     def doubt(self) -> str:
         """Why it is not known where the limb is; empty: it is known."""
         if self._thread is None:
             return ""
-        if not self._came:
+        rig, now = None if self._rest is None else self._rest.layer.rig, time.monotonic()
+        names, heard = () if rig is None else rig.names, dict(self._heard)
+        unheard = [name for name in names if name not in heard]
+        if unheard or not heard:
             others = f" (there: {self._others}; see the parameter joints)" if self._others else ""
-            return (f"no joint states of the limb on {self._config().joint_states} yet{others}: it is taken to be at "
-                    "rest")  # fmt: skip
-        silent = time.monotonic() - self._came
-        return f"no joint states for {silent:.0f} s: the limb is taken to be where it was" if silent > SILENT_S else ""
+            whose = ", ".join(unheard) if heard else "the limb"
+            return f"no joint states of {whose} on {self._config().joint_states} yet{others}: it is taken to be at rest"
+        silent = {name: now - one.came for name, one in heard.items() if now - one.came > SILENT_S}
+        if silent:
+            whose = "" if len(silent) == len(heard) else f" of {', '.join(silent)}"
+            return f"no joint states{whose} for {max(silent.values()):.0f} s: the limb is taken to be where it was"
+        if not self._stands:
+            return "the skin is not bent as the joint states say yet: it is taken to be at rest"
+        behind = max(one.came for one in heard.values()) - self._stands
+        if behind > SILENT_S:
+            return f"the skin was not bent for {behind:.0f} s: the limb is taken to be where it was"
+        return ""
 
     def _on_joints(self, message: JointState) -> None:
-        gate, stamp = self._hearing.gate, wire.stamp_ns(message)
+        gate, stamp, now = self._hearing.gate, wire.stamp_ns(message), time.monotonic()
         if not self._hearing.active or self._rest is None or self._thread is None:
             return None
         try:
@@ -89,27 +116,34 @@ class Bending:
             if rig is None:
                 raise InvalidInput("joint states come, but this skin has no joints.")
             names = {name: self._config().joint_names.get(name, name) for name in rig.names}
-            heard = wire.joints_from(message, names)
-            if not heard:  # of another limb, or of a robot
+            told = wire.joints_from(message, names)
+            if not told:  # of another limb, or of a robot
                 self._others = ", ".join(message.name) or "none"
                 return None
-            told = self._told | heard
-            angles = rig.angles(told)
+            heard = self._heard | {name: _Heard(angle, stamp, now) for name, angle in told.items()}
+            angles = rig.angles({name: one.angle for name, one in heard.items()})
         except StmplError as error:
             return gate.refuse("joints", str(error))
         if not gate.fresh(message, self._config().max_age):
             return None
-        if self._came and stamp <= self._stamp and time.monotonic() - self._came < SILENT_S:
+        last = [self._heard[name] for name in told if name in self._heard]
+        if any(stamp <= one.stamp and now - one.came < SILENT_S for one in last):
             return gate.say("order of joints", "joint states were dropped: their stamp is not after the last one's")
-        self._told, self._stamp, self._came = told, stamp, time.monotonic()
-        return self._thread.put((self._rest, angles))
+        self._heard = heard
+        return self._put(self._rest, angles)
 
-    def _make(self, item: tuple[Skin, tuple[float, ...]]) -> None:
+    def _put(self, rest: Skin, angles: tuple[float, ...]) -> None:
+        assert self._thread is not None
+        self._thread.put((rest, angles, max(one.came for one in self._heard.values())))
+
+    def _make(self, item: tuple[Skin, tuple[float, ...], float]) -> None:
         """On its own thread."""
         numba.set_num_threads(1)
-        rest, angles = item
-        if self.newest is not None and self.newest.angles == angles and rest is self._rest:
+        rest, angles, came = item
+        newest = self.newest
+        if newest is None or rest is not self._rest:
             return
-        skin = rest.at_angles(angles)
-        if rest is self._rest:
-            self.newest = skin
+        skin = newest if newest.angles == angles else rest.at_angles(angles)
+        with self._lock:  # else a skin that takes over just now would be overwritten
+            if rest is self._rest:
+                self.newest, self._stands = skin, came
