@@ -9,6 +9,7 @@ from functools import cache, cached_property
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import numpy as np
 from mcap.records import Attachment, Channel, Message, Metadata, Schema
 from rosbags.typesys.store import Typestore
 
@@ -160,18 +161,24 @@ class Bag:
         rest = self.rest_of(frame)
         if not any(frame.joints):
             return rest
-        if rest.rig is None or len(rest.rig.joints) != len(frame.joints):
-            raise BagError(f"answer {frame.sequence} tells of {len(frame.joints)} joints; its layer has others.")
         if self._posed is None or self._posed[:2] != (frame.layer_id, frame.joints):
             self._posed = frame.layer_id, frame.joints, posed(rest, frame.joints)
         return self._posed[2]
 
     def rest_of(self, frame: Frame) -> SoftLayer:
-        """The layer that `frame` answers for, its joints at rest. Raises BagError if the bag does not hold it."""
+        """The layer that `frame` answers for, its joints at rest.
+
+        Raises:
+            BagError: the bag does not hold it, or the answer's angles are not those of its joints.
+        """
         if frame.layer_id not in self.layers:
             raise BagError(f"answer {frame.sequence} is for layer {frame.layer_id}, the bag holds "
                            f"{', '.join(self.layers)}. Was skin/topology recorded?")  # fmt: skip
-        return self.layers[frame.layer_id]
+        rest, angles = self.layers[frame.layer_id], frame.joints
+        if any(angles) and (rest.rig is None or len(rest.rig.joints) != len(angles) or not np.isfinite(angles).all()):
+            raise BagError(f"answer {frame.sequence} has joints at {', '.join(map(str, angles))} rad; its layer has "
+                           f"{', '.join(rest.rig.names) if rest.rig else 'no joints'}.")  # fmt: skip
+        return rest
 
     @cached_property
     def provenance(self) -> Provenance:

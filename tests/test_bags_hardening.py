@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +18,7 @@ from bags.recover import recover
 from bags.replay import replay_run
 from bags.run import Run
 from bags.writer import BagWriter
+from stmpl_core import Joint, Rig
 from stmpl_core.errors import BagError
 from stmpl_core.methods import Linear, MomentNet, Winkler
 from tests.bag_scene import START, cdr, header, stmpl, tube, write_run
@@ -258,3 +260,17 @@ def test_the_answers_of_a_recording_from_before_touches_are_read_and_say_what_th
             assert np.isnan([touch.depth, touch.force_bound, *touch.wrench, *touch.pose_body_from_tool.ravel()]).all()
     pressed = next(frame for frame in frames if any(touch.presses for touch in frame.touches.values()))
     assert [contact.name for contact in Run(BEFORE).contacts(pressed)] == list(pressed.touches)
+
+
+@pytest.mark.parametrize(("joints", "hinges"), [((0.3,), False), ((0.3, 0.1), True), ((float("nan"),), True)])
+def test_angles_that_the_layers_joints_cannot_have_are_told(tmp_path, joints, hinges):
+    run = Run(write_run(tmp_path / "run", Winkler(), frames=3))
+    frame, layer = next(iter(run.frames())), tube()
+    if hinges:
+        weights = np.tile([0.0, 1.0], (len(layer.vertices), 1))
+        rig = Rig(("root", "arm"), (-1, 0), np.zeros((2, 3)), weights, (Joint("shoulder", "arm", (0, 0, 1)),))
+        run.layers[frame.layer_id] = layer.with_(rig=rig)
+    told = "has joints at .* rad; its layer has " + ("shoulder" if hinges else "no joints")
+    for read in (run.rest_of, run.layer_of):
+        with pytest.raises(BagError, match=told):
+            read(replace(frame, joints=joints))
