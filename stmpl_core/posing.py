@@ -29,6 +29,7 @@ APART = 6.0  # distance of two places at rest, over the thickness, from which th
 SPACING = 9e-3  # distance of the places at which the change of curvature is found; it is smooth [m]
 NEIGHBOURS = 160  # number of neighbours that tell of the curvature at a place
 FELT = 2.5  # distance to which a bend changes curvature, over the thickness: it is found from skin so far around
+MORE_HOLLOW = 0.05  # fall of the least curvature times the thickness, from which it is a bend that made a hollow
 GAUSSIAN = np.exp(-0.5 * np.linspace(0, WIDEST**2, 2001))  # of one thickness, over the square of the distance
 
 
@@ -107,8 +108,8 @@ class Posing:
         fold, least, most = np.ones(count), np.ones(count), np.ones(count)
         inner = layer.inner_vertices
         _strained(layer.vertices, inner, self._faces, self._zone, self._flat, fold, least, most)
-        xx, xy, yy = curvature.T
-        lowest = 0.5 * (xx + yy) - np.sqrt((0.5 * (xx - yy)) ** 2 + xy**2)
+        lowest = _lowest(curvature)
+        lowest[lowest > _lowest(self.rest.near.curvature) - MORE_HOLLOW] = np.inf
         gap = np.full(count, np.inf)
         _facing(layer.vertices, layer.normals, self.rest.layer.vertices, self.rest.near.thickness, self._places, gap)
         if len(self._places):
@@ -127,6 +128,12 @@ def posed(layer: SoftLayer, angles: Sequence[float]) -> SoftLayer:
         return layer
     assert layer.rig is not None
     return _moved(layer, np.ascontiguousarray(layer.faces, dtype=np.int64), layer.rig.motions(angles))
+
+
+def _lowest(curvature: np.ndarray) -> np.ndarray:
+    """Least curvature at vertices, (V,), of xx, xy, yy there, (V, 3)."""
+    xx, xy, yy = curvature.T
+    return 0.5 * (xx + yy) - np.sqrt((0.5 * (xx - yy)) ** 2 + xy**2)
 
 
 def _moved(layer: SoftLayer, faces: np.ndarray, motions: np.ndarray) -> SoftLayer:
@@ -343,7 +350,7 @@ def _strained(points, inner, faces, zone, flat, fold, least, most):
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _facing(points, normals, rest, thickness, places, gap):
-    """Distance over the thickness to skin that faces a vertex of `places` through the air and is far at rest."""
+    """Distance over the thickness to skin that faces a vertex of `places` and is far at rest; 0: inside of it."""
     for a in range(len(places)):
         i = places[a]
         for b in range(a):
@@ -360,6 +367,6 @@ def _facing(points, normals, rest, thickness, places, gap):
                 before += (rest[i, x] - rest[j, x]) ** 2
                 ahead += normals[i, x] * (points[j, x] - points[i, x])
                 back += normals[j, x] * (points[i, x] - points[j, x])
-            if facing < 0 and ahead > 0 and back > 0 and before > (APART * t) ** 2:
-                near = np.sqrt(away) / t
+            if facing < 0 and before > (APART * t) ** 2:
+                near = np.sqrt(away) / t if ahead > 0 and back > 0 else 0.0
                 gap[i], gap[j] = min(gap[i], near), min(gap[j], near)

@@ -29,8 +29,10 @@ class Bend(NamedTuple):
     Args:
         fold: least fold ratio of the prisms around it (stmpl_core.extrusion), (V,) [-].
         least, most: least and largest stretch of the triangles around it, (V,) [-].
-        curvature: least curvature of the skin times the thickness, (V,) [-]; below 0: concave.
-        gap: distance over the thickness to skin that faces it through the air and did not at rest, (V,) [-].
+        curvature: least curvature of the skin times the thickness, (V,) [-]; below 0: concave; infinite where it is no
+            more hollow than at rest.
+        gap: distance over the thickness to skin that faces it through the air and did not at rest, (V,) [-]; 0 where
+            they are inside each other.
     """
 
     fold: np.ndarray

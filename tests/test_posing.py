@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.spatial import KDTree
 
 from stmpl_core import Answer, Contact, Membrane, Ply, Simulator, Skin, SoftLayer, State, Tissue
 from stmpl_core.body import Body
@@ -15,6 +16,7 @@ from stmpl_core.methods import Coarse, Linear, MomentNet, Winkler
 from stmpl_core.methods import method as method_named
 from stmpl_core.methods.base import anew
 from stmpl_core.rig import Joint, Rig
+from stmpl_core.soundness import HOLLOW
 from tests.scenes import LENGTH, RADIUS, at, ball, limb
 
 MIDDLE = np.array([0.0, 0, LENGTH / 2])
@@ -148,6 +150,34 @@ def test_the_inside_of_a_bend_is_flagged_and_says_why_and_what_is_far_from_it_is
     assert not answer.trust.in_range and "the limb is bent so that" in answer.trust.why
     far = moved.step([Contact(ball(), pressed(moved.layer, near(layer, (0, RADIUS, 0.03))))])
     assert "bent" not in far.trust.why
+
+
+@pytest.fixture(scope="module")
+def arm() -> Skin:
+    body = Body.anny()
+    layer = body.part("left_arm", edge_length=6e-3)
+    return Skin.of(layer.with_(rig=Rig.of(body, "left_arm", layer)), Winkler())
+
+
+def test_what_was_hollow_at_rest_is_not_laid_to_a_bend(arm):
+    xx, xy, yy = arm.near.curvature.T
+    hollow = np.flatnonzero(0.5 * (xx + yy) - np.hypot(0.5 * (xx - yy), xy) < HOLLOW)
+    assert len(hollow) > 20
+    bend = arm.posed({"left_elbow": 1e-6}).near.sound.bend
+    assert bend is not None and bend.of_force(hollow, np.ones(len(hollow))) == []
+
+
+def test_skin_that_is_inside_other_skin_is_flagged(arm):
+    posed = arm.posed({"left_elbow": 1.8})
+    points, normals, t = posed.layer.vertices, posed.layer.normals, float(np.median(arm.layer.thickness))
+    a, b = KDTree(points).query_pairs(1.5 * t, output_type="ndarray").T
+    far = np.linalg.norm(arm.layer.vertices[a] - arm.layer.vertices[b], axis=1) > 6 * t
+    through = np.einsum("px,px->p", normals[a], points[b] - points[a]) < 0
+    inside = np.unique(a[far & through & (np.einsum("px,px->p", normals[a], normals[b]) < 0)])
+    bend = posed.near.sound.bend
+    assert len(inside) > 50 and bend is not None
+    told = [bool(bend.of_force(inside[k : k + 1], np.ones(1))) for k in range(len(inside))]
+    assert np.mean(told) > 0.9
 
 
 def test_skin_that_comes_near_through_the_air_feels_nothing():
