@@ -177,11 +177,13 @@ def _go(points, weights, less, out):
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _turn(weights, quaternions, out):
-    """Mean rotation of the bones at each vertex, (V, 3, 3), by their quaternions."""
+    """Mean rotation of the bones at each vertex, (V, 3, 3), by their quaternions; q and -q are one rotation."""
     for v in range(len(weights)):
         w = x = y = z = 0.0
         for b in range(weights.shape[1]):
             share, q = weights[v, b], quaternions[b]
+            if w * q[0] + x * q[1] + y * q[2] + z * q[3] < 0:
+                share = -share
             w, x, y, z = w + share * q[0], x + share * q[1], y + share * q[2], z + share * q[3]
         root = 1 / np.sqrt(w * w + x * x + y * y + z * z)
         w, x, y, z = w * root, x * root, y * root, z * root

@@ -89,6 +89,19 @@ def test_a_pose_leaves_the_methods_inside_of_a_method_where_they_were():
     assert not {id(rung) for rung in ladder.rungs} & {id(rung) for rung in anew(ladder).rungs}
 
 
+def test_skin_between_two_bones_turns_as_both_do_also_beyond_half_a_turn(skin):
+    """A chain that curls up by 100 degrees and then by 90 more: in between the skin has turned by 145."""
+    layer = skin.layer
+    share = np.clip(0.5 + (layer.vertices[:, 2] - MIDDLE[2]) / 0.04, 0, 1)
+    weights = np.stack([np.zeros_like(share), 1 - share, share], axis=1)
+    joints = Joint("first", "middle", (0, 1, 0)), Joint("second", "end", (0, 1, 0))
+    rig = Rig(("root", "middle", "end"), (-1, 0, 1), np.array([np.zeros(3), np.zeros(3), MIDDLE]), weights, joints)
+    curled = Skin.of(layer.with_(rig=rig), Winkler()).posed({"first": np.deg2rad(100), "second": np.deg2rad(90)})
+    half = int(np.abs(share - 0.5).argmin())
+    turned = np.rad2deg(np.arccos((np.trace(curled.turn_at(half)) - 1) / 2))
+    assert turned == pytest.approx(100 + 90 * share[half], abs=10)
+
+
 def test_a_pose_tends_to_the_rest(skin):
     vertex = near(skin.layer, (RADIUS, 0, MIDDLE[2]))
     contact = Contact(ball(), pressed(skin.layer, vertex))
