@@ -18,6 +18,7 @@ from stmpl_core.touch import Touch
 from stmpl_sim.engine import mujoco
 
 POSE_STEP = 0.02  # turn of a hinge after which the skin is posed again [rad]
+BEYOND = 0.02  # angle beyond a joint's limits that is not worth a word: springs that stop a hinge give way [rad]
 
 
 class Jointed:
@@ -69,6 +70,16 @@ class Jointed:
                                    "timestep.")  # fmt: skip
             out[joint.name] = min(max(angle, joint.low), joint.high)
         return out
+
+    def beyond(self, data: Any) -> str:
+        """What of the hinges' angles the skin does not follow; empty: nothing."""
+        out = []
+        for joint in self.rig.joints:
+            angle = float(data.qpos[self._places[joint.name]]) if joint.name in self._places else 0.0
+            if not joint.low - BEYOND <= angle <= joint.high + BEYOND:
+                out.append(f"{joint.name} is at {angle:.3g} rad, its skin goes from {joint.low:.3g} to {joint.high:.3g} "
+                           "rad")  # fmt: skip
+        return "; ".join(out)
 
     def on(self, touch: Touch) -> np.ndarray:
         """Share of a touch that each bone carries, by the weights of the skin under it, (B,) [-]."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any, NamedTuple
 from weakref import WeakKeyDictionary
 
@@ -163,7 +164,11 @@ class SoftBody:
             tools[name] = np.concatenate([turn @ wrench[:3], turn @ wrench[3:]])
             lever = poses.tools[name][:3, 3] - poses.body[:3, 3]
             on_body -= tools[name] + np.concatenate([np.zeros(3), np.cross(lever, tools[name][:3])])
-        return Reaction(tools, on_body, made.touches, made.memory)
+        touches = made.touches
+        if beyond := jointed.beyond(data):
+            touches = {name: replace(touch, trust=touch.trust.also(beyond, in_range=False))
+                       for name, touch in touches.items()}  # fmt: skip
+        return Reaction(tools, on_body, touches, made.memory)
 
     def poses(self, data: Any) -> Poses:
         """Places of body and tools in `data`."""

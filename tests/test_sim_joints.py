@@ -1,5 +1,6 @@
 """A limb whose hinge belongs to the simulator: its skin goes along, each side of it feels its own touches."""
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -92,6 +93,19 @@ def test_between_two_poses_of_the_skin_it_goes_rigidly_with_its_bone(skin: Skin)
     data.time = 2e-3
     assert soft.apply(data)["ball"].force == pytest.approx(first.force, rel=1e-3)
     assert soft.simulator.skin.angles == (0.33,)
+
+
+def test_a_hinge_beyond_the_limits_of_its_skin_is_flagged(skin: Skin) -> None:
+    rig = skin.layer.rig
+    assert rig is not None
+    narrow = replace(rig, joints=(replace(rig.joints[0], low=-0.1, high=0.3),))
+    limited = Skin.of(skin.layer.with_(rig=narrow), Winkler())
+    _, data, soft = made(limited, on_the_lower_part(skin, 0.3))
+    for angle, said in ((0.31, False), (0.5, True)):
+        data.qpos[0] = angle
+        touch = soft.apply(data)["ball"]
+        assert touch.presses and ("elbow is at 0.5 rad, its skin goes from -0.1 to 0.3" in touch.trust.why) == said
+        assert soft.answer().trust.in_range is False or not said
 
 
 def test_joints_that_are_none_are_refused(skin: Skin) -> None:
