@@ -6,6 +6,7 @@ POSE_STEP; in between it goes rigidly with the bone that a tool is nearest to, w
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Mapping
 from typing import Any
 
@@ -17,7 +18,10 @@ from stmpl_core.rig import Rig
 from stmpl_core.touch import Touch
 from stmpl_sim.engine import mujoco
 
+log = logging.getLogger(__name__)
+
 POSE_STEP = 0.02  # turn of a hinge after which the skin is posed again [rad]
+MAX_TURNED, MAX_AWAY_M = 10.0, 0.01  # angle [degrees] and distance of a hinge's axis from the rig's, not worth a word
 BEYOND = 0.02  # angle beyond a joint's limits that is not worth a word: springs that stop a hinge give way [rad]
 
 
@@ -46,6 +50,7 @@ class Jointed:
         names = [model.joint(k).name for k in range(model.njnt)]
         self.rig, self.bodies = rig, [root] * len(rig.bones)
         self._places: dict[str, int] = {}
+        self._hinges: dict[str, int] = {}
         for n, parent in enumerate(rig.parents):
             self.bodies[n] = root if parent < 0 else self.bodies[parent]
             for joint in rig.joints:
@@ -59,6 +64,27 @@ class Jointed:
                     raise InvalidInput(f"joint '{joints[joint.name]}' is no hinge; only hinges move a limb.")
                 self._places[joint.name] = int(model.jnt_qposadr[hinge])
                 self.bodies[n] = int(model.jnt_bodyid[hinge])
+                self._hinges[joint.name] = hinge
+
+    def compare(self, model: Any, pose_body_from_layer: Transform) -> None:
+        """Warns of hinges that are not where the rig has them: skin and body would part as they turn."""
+        data, root = mujoco.MjData(model), self.bodies[0]
+        for place in self._places.values():
+            data.qpos[place] = 0.0
+        mujoco.mj_kinematics(model, data)
+        turn = data.xmat[root].reshape(3, 3) @ pose_body_from_layer[:3, :3]
+        origin = data.xpos[root] + data.xmat[root].reshape(3, 3) @ pose_body_from_layer[:3, 3]
+        heads = dict(zip(self.rig.bones, self.rig.heads, strict=True))
+        for joint in self.rig.joints:
+            if joint.name not in self._hinges:
+                continue
+            hinge, axis = self._hinges[joint.name], np.array(joint.axis)
+            turned = np.degrees(np.arccos(np.clip(turn.T @ data.xaxis[hinge] @ axis, -1, 1)))
+            away = np.linalg.norm(np.cross(turn.T @ (data.xanchor[hinge] - origin) - heads[joint.bone], axis))
+            if turned > MAX_TURNED or away > MAX_AWAY_M:
+                log.warning("the model's hinge of %s is %.0f degrees and %.0f mm off the rig's: skin and body part as "
+                            "it turns. Has it the rig's axis, in the layer's axes, and sign?",
+                            joint.name, turned, 1e3 * away)  # fmt: skip
 
     def angles(self, data: Any) -> dict[str, float]:
         """Angle of each joint in `data` [rad], within the rig's limits. Raises InvalidInput: one is not finite."""
@@ -77,8 +103,8 @@ class Jointed:
         for joint in self.rig.joints:
             angle = float(data.qpos[self._places[joint.name]]) if joint.name in self._places else 0.0
             if not joint.low - BEYOND <= angle <= joint.high + BEYOND:
-                out.append(f"{joint.name} is at {angle:.3g} rad, its skin goes from {joint.low:.3g} to {joint.high:.3g} "
-                           "rad")  # fmt: skip
+                out.append(f"{joint.name} is at {angle:.3g} rad, its skin goes from {joint.low:.3g} to "
+                           f"{joint.high:.3g} rad")  # fmt: skip
         return "; ".join(out)
 
     def on(self, touch: Touch) -> np.ndarray:

@@ -106,6 +106,8 @@ class SoftBody:
         made = [_tool(model, name, self._sources[name]) for name in tools]
         self.contact = SoftContact(layer, made, method, pose_body_from_layer=pose_body_from_layer, damping=damping,
                                    implicit=implicit, friction=friction)  # fmt: skip
+        if self._jointed is not None:
+            self._jointed.compare(model, self.contact.pose_body_from_layer)
         self.memory = Memory()
         self.reaction: Reaction | None = None
         self._time: float | None = None

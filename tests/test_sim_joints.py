@@ -108,6 +108,20 @@ def test_a_hinge_beyond_the_limits_of_its_skin_is_flagged(skin: Skin) -> None:
         assert soft.answer().trust.in_range is False or not said
 
 
+def test_a_hinge_that_turns_about_another_axis_than_the_rigs_is_said(skin: Skin, caplog: Any) -> None:
+    rig, place = skin.layer.rig, on_the_lower_part(skin, 0.0)
+    assert rig is not None
+    made(skin, place)
+    assert not caplog.messages
+    for changed in (replace(rig.joints[0], axis=(0.0, -1.0, 0.0)), replace(rig.joints[0], axis=(0.0, 1.0, 0.3))):
+        made(Skin.of(skin.layer.with_(rig=replace(rig, joints=(changed,))), Winkler()), place)
+    lower = replace(rig, heads=rig.heads + [[0, 0, 0], [0, 0, 0.03]])
+    made(Skin.of(skin.layer.with_(rig=lower), Winkler()), place)
+    said = ["180 degrees and 0 mm off", "17 degrees and 0 mm off", "0 degrees and 30 mm off"]
+    assert len(caplog.messages) == 3
+    assert all(one in message for one, message in zip(said, caplog.messages, strict=True))
+
+
 def test_joints_that_are_none_are_refused(skin: Skin) -> None:
     place = on_the_lower_part(skin, 0.0)
     with pytest.raises(InvalidInput, match=r"unknown joint: knee. Available: elbow"):
