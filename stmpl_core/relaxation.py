@@ -27,7 +27,7 @@ from stmpl_core.tissue import Prony, Tissue
 MIX_RADIUS = 9e-3  # radius of the load for which the materials of a stack share a force [m]
 LOG_STEP = 0.05  # change of a modulus by which its share is found, logarithm
 LEAST_STRETCH = 0.15  # of a column, to which it counts as pressed together
-DEPTH_TRIALS = 12  # for the depth of skin that is free
+DEPTH_TRIALS = 12  # of Newton for the depth of skin that is free
 HALVINGS = 30  # of a step in which skin comes free
 
 
@@ -135,9 +135,12 @@ def depth_left(share, power, strain):
         power: power of the depth with which the elastic force grows [-].
         strain: 1 less the stretch at the press [-].
     """
-    x = share ** (1 / power)
+    if not share > 0:
+        return 0.0
+    x = min((share / (1 - strain)) ** (1 / power), 1.0)  # from above, where it is convex: Newton's method comes down
     for _ in range(DEPTH_TRIALS):
-        x = (share * (1 - x * strain) / (1 - strain)) ** (1 / power)
+        rise = power * x ** (power - 1) * (1 - strain) + share * strain
+        x = max(x - (x**power * (1 - strain) - share * (1 - x * strain)) / rise, 1e-12)
     return min(x, 1.0)
 
 

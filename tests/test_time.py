@@ -8,7 +8,7 @@ import pytest
 from stmpl_core import Contact, Membrane, Ply, Prony, Simulator, SoftLayer, State, Tissue, Touch
 from stmpl_core.errors import InvalidInput
 from stmpl_core.methods import Winkler
-from stmpl_core.relaxation import series_of
+from stmpl_core.relaxation import depth_left, series_of
 from stmpl_core.touch import APART, BY_POSE, MOVED, TOUCHING
 from tests.scenes import at, ball, plate
 
@@ -196,6 +196,27 @@ def test_skin_that_comes_back_goes_through_one_shape(sim: Simulator) -> None:
         share = np.vdot(one, first) / np.vdot(first, first)
         assert 0.1 < share < 0.95
         np.testing.assert_allclose(one, share * first, atol=1e-3 * DEPTH)
+
+
+@pytest.mark.parametrize("strain", [0.0, 0.3, 0.6, 0.85])
+@pytest.mark.parametrize("power", [0.8, 1.0, 1.6, 3.0])
+def test_the_depth_that_is_left_holds_its_law_at_any_strain(power: float, strain: float) -> None:
+    for share in np.geomspace(1e-6, 1, 40):
+        x = depth_left(share, power, strain)
+        assert x**power * (1 - strain) == pytest.approx(share * (1 - x * strain), rel=1e-6) and 0 < x <= 1
+    assert depth_left(0.0, power, strain) == 0
+
+
+def test_skin_that_was_pressed_deep_comes_back_ever_shallower(sim: Simulator) -> None:
+    thickness = float(sim.layer.thickness.mean())
+    state, left = State(), []
+    for _ in range(10):
+        _, state = sim.touch([pressed(0.8 * thickness)], state, 0.5)
+    for _ in range(40):
+        touches, state = sim.touch([pressed(-5 * thickness)], state, 0.02)
+        assert state.finite and touches[0].imprint is not None
+        left.append(touches[0].imprint.depth / thickness)
+    assert 0.8 > left[0] > left[-1] > 0 and (np.diff(left) < 0).all()
 
 
 def test_skin_comes_back_by_itself_after_a_quick_lift(sim: Simulator) -> None:
