@@ -15,11 +15,11 @@ from typing import NamedTuple
 
 import matplotlib.pyplot as plt
 import numpy as np
-import trimesh
 
 from benchmarks.inference import timed
+from benchmarks.slides import ball
 from fem_tools import IndenterFem, PatchFem, Press
-from stmpl_core import Contact, SoftLayer, Tool
+from stmpl_core import Contact, SoftLayer
 from stmpl_core.body import Body
 from stmpl_core.living import living
 from stmpl_core.methods import MomentNet
@@ -54,12 +54,6 @@ class Compared(NamedTuple):
     why: str
 
 
-def ball() -> Tool:
-    """The ball, about its own middle."""
-    mesh = trimesh.creation.icosphere(4, 1e3 * RADIUS)
-    return Tool("ball", 1e-3 * np.asarray(mesh.vertices), np.asarray(mesh.faces))
-
-
 def site(layer: SoftLayer, part: str) -> int:
     """A vertex in the middle of a limb where the tissue is thick; on the back beside the spine, high up."""
     v = layer.vertices
@@ -81,7 +75,7 @@ def compare(part: str, edge: float, strains: tuple[float, ...] = STRAINS, reach:
     normal, thickness = layer.normals[vertex], float(layer.thickness[vertex])
     pose = np.eye(4)
     pose[:3, 3] = layer.vertices[vertex] + (RADIUS + 0.01) * normal
-    start = Press(SignedDistance.of(ball(), margin=0.04), pose, -normal).touching(layer)
+    start = Press(SignedDistance.of(ball(RADIUS), margin=0.04), pose, -normal).touching(layer)
     assert start is not None
     fem = IndenterFem(PatchFem(element="P1xP2", reach=reach, refine=3, layers=1), step=0.1).prepare(layer)
     simulator, out = Simulator(layer, MomentNet()), []
@@ -89,7 +83,7 @@ def compare(part: str, edge: float, strains: tuple[float, ...] = STRAINS, reach:
     for strain, depth, truth in zip(strains, depths, fem.path([start], depths), strict=True):
         if not truth.trust.ok:
             break
-        answer = simulator.step([Contact(ball(), start.at(depth).pose_body_from_tool)])
+        answer = simulator.step([Contact(ball(RADIUS), start.at(depth).pose_body_from_tool)])
         touch, moved = answer.touches["ball"], np.linalg.norm(truth.displacement, axis=1)
         off = 100 * np.linalg.norm(answer.displacement - truth.displacement, axis=1) / moved.max()
         out.append(Compared(strain, 1e3 * depth, float(np.linalg.norm(truth.pressure @ layer.vertex_area_vectors)),
@@ -105,8 +99,8 @@ def trunk(part: str, edge: float, force: float = 5.0) -> None:
     normal, thickness, pose = layer.normals[vertex], float(layer.thickness[vertex]), np.eye(4)
     pose[:3, 3] = layer.vertices[vertex] + (RADIUS - 0.2 * thickness) * normal
     wrench = np.concatenate([-force * normal, np.zeros(3)])
-    touch = simulator.touch([Contact(ball(), pose, wrench)])[0]  # where the force is carried
-    answer = simulator.step([Contact(ball(), touch.pose_body_from_tool, wrench)])
+    touch = simulator.touch([Contact(ball(RADIUS), pose, wrench)])[0]  # where the force is carried
+    answer = simulator.step([Contact(ball(RADIUS), touch.pose_body_from_tool, wrench)])
     touch = answer.touches["ball"]
     print(f"{part}: {1e3 * thickness:.0f} mm thick, {force:g} N: {1e3 * touch.depth:.1f} mm deep, "
           f"{answer.trust.why or 'unflagged'}")  # fmt: skip
@@ -119,7 +113,7 @@ def trunk(part: str, edge: float, force: float = 5.0) -> None:
 def times(part: str) -> None:
     """Prints times on a mesh of 3 mm, by pose and by wrench."""
     layer = living(Body.anny(), part, edge_length=3e-3)
-    simulator, vertex, tool = Simulator(layer, MomentNet()), site(layer, part), ball()
+    simulator, vertex, tool = Simulator(layer, MomentNet()), site(layer, part), ball(RADIUS)
     normal, thickness = layer.normals[vertex], float(layer.thickness[vertex])
     print(f"  {len(layer.vertices)} vertices at 3 mm, {1e3 * thickness:.0f} mm thick: ms, median (p99)")
     for strain in (0.1, 0.4, 0.7):

@@ -14,10 +14,10 @@ import argparse
 import time
 
 import numpy as np
-import trimesh
 
+from benchmarks.slides import ball
 from fem_tools import IndenterFem, PatchFem, Press
-from stmpl_core import Contact, Simulator, Skin, SoftLayer, State, Tool
+from stmpl_core import Contact, Simulator, Skin, SoftLayer, State
 from stmpl_core.body import Body
 from stmpl_core.errors import StmplError
 from stmpl_core.living import living
@@ -26,16 +26,10 @@ from stmpl_core.rig import Rig
 from stmpl_core.sdf import SignedDistance
 
 PART, JOINT = "left_arm", "left_elbow"
-RADIUS = 0.012  # of the ball [m]
+RADIUS, SUBDIVISIONS = 0.012, 3  # of the ball [m], and of its mesh
 DEEP = 0.25  # depth of the ball over the thickness
 BENDS = (0, 30, 60, 90)  # degrees
 JOINT_RATE, LOOP_RATE, SECONDS = 60.0, 200.0, 20.0  # of the timed loop [Hz], [s]
-
-
-def ball(radius: float = RADIUS) -> Tool:
-    """A ball, about its own middle."""
-    mesh = trimesh.creation.icosphere(3, 1e3 * radius)
-    return Tool("ball", 1e-3 * np.asarray(mesh.vertices), np.asarray(mesh.faces))
 
 
 def arm(edge: float = 3e-3, stack: bool = False) -> tuple[SoftLayer, Rig]:
@@ -73,8 +67,8 @@ def sites(layer: SoftLayer, rig: Rig) -> dict[str, int]:
 def compare(edge: float, stack: bool, bends: tuple[int, ...], reach: float) -> None:
     """Prints answers on a bent arm beside finite elements."""
     layer, rig = arm(edge, stack)
-    skin, tool = Skin.of(layer, MomentNet()), ball(0.02 if stack else RADIUS)
     radius = 0.02 if stack else RADIUS
+    skin, tool = Skin.of(layer, MomentNet()), ball(radius, SUBDIVISIONS)
     print(f"{len(layer.vertices)} vertices of {1e3 * edge:g} mm; ball of {1e3 * radius:g} mm, {DEEP:g} t deep")
     print("bend  place                         force N: FEM  posed     afresh    moves (worst) %: posed  afresh")
     for bend in bends:
@@ -121,7 +115,7 @@ def compare(edge: float, stack: bool, bends: tuple[int, ...], reach: float) -> N
 def times(stack: bool) -> None:
     """Prints what a pose costs, alone and beside contacts."""
     layer, rig = arm(stack=stack)
-    skin, tool, now = Skin.of(layer, MomentNet()), ball(), time.perf_counter
+    skin, tool, now = Skin.of(layer, MomentNet()), ball(RADIUS, SUBDIVISIONS), time.perf_counter
     place, cpu = sites(layer, rig)["forearm"], time.thread_time
     skin.posed({JOINT: 0.1})
     simulator, state = Simulator(skin, friction=0.3), State()

@@ -87,9 +87,9 @@ def faded(tissue: Tissue) -> Tissue:
 
 
 @cache
-def ball(radius: float) -> Tool:
+def ball(radius: float, subdivisions: int = 4) -> Tool:
     """A ball about its middle."""
-    mesh = trimesh.creation.icosphere(4, 1e3 * radius)
+    mesh = trimesh.creation.icosphere(subdivisions, 1e3 * radius)
     return Tool("ball", 1e-3 * np.asarray(mesh.vertices), np.asarray(mesh.faces))
 
 

@@ -11,7 +11,7 @@ import trimesh
 
 HERE = Path(__file__).parent
 sys.path.insert(0, str(HERE.parent))
-from benchmarks.posing import JOINT, arm, ball, sites  # noqa: E402
+from benchmarks.posing import JOINT, RADIUS, SUBDIVISIONS, arm, ball, sites  # noqa: E402
 from stmpl_core import Contact, Simulator, Skin, State, Tool  # noqa: E402
 from stmpl_core.methods import MomentNet  # noqa: E402
 from stmpl_sim.film import colours, draw, save  # noqa: E402
@@ -41,7 +41,7 @@ def main() -> None:
     """Plays, draws, writes."""
     layer, rig = arm()
     simulator, state = Simulator(Skin.of(layer, MomentNet()), friction=0.4), State()
-    places, tools = sites(layer, rig), (disc(), ball())
+    places, tools = sites(layer, rig), (disc(), ball(RADIUS, SUBDIVISIONS))
     elbow, axis = rig.heads[1], np.array(rig.joints[0].axis)
     back = -axis
     up = np.array([0.0, 0, 1]) - back[2] * back

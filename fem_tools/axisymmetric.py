@@ -7,7 +7,7 @@ every depth can be looked at. Energies as in Bonet & Wood, 2nd ed., eq. 6.28; th
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any, NamedTuple
 
@@ -29,7 +29,6 @@ MOST = 12  # Newton steps of one set of places that stick
 SETS = 24  # such sets a step
 WITHIN = 1e-3  # depth of skin in the tool that is none, over the finest element
 STEP = 1e-6  # of central differences
-REACHED = 0.05  # least share of the thickness that the mesh is fine over
 Energy = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]  # F_rr, F_rz, F_zr, F_zz, F_tt to stresses and tangent
 
 
@@ -202,7 +201,7 @@ class Flat:
 
     tissue: Tissue
     thickness: float
-    fine: float = field(default=1.0)
+    fine: float = 1.0
 
     def press(self, tool: Profile, depths: Sequence[float]) -> list[Round]:
         """Presses a tool in that sticks wherever it touches, to depths [m] that increase; ends where Newton does."""

@@ -282,6 +282,17 @@ def _bent(frames, curvature, slope, out):
             out[v, 9 + x] = slope[v, 0] * a + slope[v, 1] * b
 
 
+@numba.njit(cache=True, nogil=True, error_model="numpy", inline="always")
+def along_tangents(frames, i, j, dx, dy, dz):
+    """A way (dx, dy, dz) from vertex i, and vertex j's normal, along the two tangents of i: x, y, u, v."""
+    x = frames[i, 0, 0] * dx + frames[i, 0, 1] * dy + frames[i, 0, 2] * dz
+    y = frames[i, 1, 0] * dx + frames[i, 1, 1] * dy + frames[i, 1, 2] * dz
+    n0, n1, n2 = frames[j, 2, 0], frames[j, 2, 1], frames[j, 2, 2]
+    u = frames[i, 0, 0] * n0 + frames[i, 0, 1] * n1 + frames[i, 0, 2] * n2
+    v = frames[i, 1, 0] * n0 + frames[i, 1, 1] * n1 + frames[i, 1, 2] * n2
+    return x, y, u, v
+
+
 @numba.njit(cache=True, nogil=True, parallel=True, error_model="numpy")
 def _shape(start, index, points, frames, thickness):
     """Least-squares curvature (from the normals) and slope of the thickness, over a Gaussian of one thickness."""
@@ -297,11 +308,7 @@ def _shape(start, index, points, frames, thickness):
             if r2 > WIDEST * WIDEST:
                 continue
             w = np.exp(-0.5 * r2)
-            x = frames[i, 0, 0] * dx + frames[i, 0, 1] * dy + frames[i, 0, 2] * dz
-            y = frames[i, 1, 0] * dx + frames[i, 1, 1] * dy + frames[i, 1, 2] * dz
-            n0, n1, n2 = frames[j, 2, 0], frames[j, 2, 1], frames[j, 2, 2]
-            u = frames[i, 0, 0] * n0 + frames[i, 0, 1] * n1 + frames[i, 0, 2] * n2
-            v = frames[i, 1, 0] * n0 + frames[i, 1, 1] * n1 + frames[i, 1, 2] * n2
+            x, y, u, v = along_tangents(frames, i, j, dx, dy, dz)
             h = thickness[j] / thickness[i] - 1
             xx += w * x * x
             xy += w * x * y

@@ -16,7 +16,7 @@ from scipy.spatial import KDTree
 
 from stmpl_core.layer import SoftLayer
 from stmpl_core.methods.base import anew
-from stmpl_core.moments import WIDEST, Surroundings
+from stmpl_core.moments import WIDEST, Surroundings, along_tangents
 from stmpl_core.soundness import Bend
 from stmpl_core.thinning import CORNERS, LARGEST, interpolation
 
@@ -251,11 +251,7 @@ def _curved(points, frames, thickness, turns, places, start, index, out):
             if r2 > WIDEST * WIDEST:
                 continue
             w = GAUSSIAN[int(r2 * (len(GAUSSIAN) - 1) / (WIDEST * WIDEST))]
-            x = frames[i, 0, 0] * dx + frames[i, 0, 1] * dy + frames[i, 0, 2] * dz
-            y = frames[i, 1, 0] * dx + frames[i, 1, 1] * dy + frames[i, 1, 2] * dz
-            n0, n1, n2 = frames[j, 2, 0], frames[j, 2, 1], frames[j, 2, 2]
-            u = frames[i, 0, 0] * n0 + frames[i, 0, 1] * n1 + frames[i, 0, 2] * n2
-            v = frames[i, 1, 0] * n0 + frames[i, 1, 1] * n1 + frames[i, 1, 2] * n2
+            x, y, u, v = along_tangents(frames, i, j, dx, dy, dz)
             xx += w * x * x
             xy += w * x * y
             yy += w * y * y
