@@ -10,16 +10,17 @@ same mesh; times on a mesh of 3 mm, on one core: set OMP_NUM_THREADS=1.
 from __future__ import annotations
 
 import argparse
+from functools import cache
 from pathlib import Path
 from typing import NamedTuple
 
 import matplotlib.pyplot as plt
 import numpy as np
+import trimesh
 
 from benchmarks.inference import timed
-from benchmarks.slides import ball
 from fem_tools import IndenterFem, PatchFem, Press
-from stmpl_core import Contact, SoftLayer
+from stmpl_core import Contact, SoftLayer, Tool
 from stmpl_core.body import Body
 from stmpl_core.living import living
 from stmpl_core.methods import MomentNet
@@ -52,6 +53,13 @@ class Compared(NamedTuple):
     moves: float
     worst: float
     why: str
+
+
+@cache
+def ball(radius: float, subdivisions: int = 4) -> Tool:
+    """A ball about its middle."""
+    mesh = trimesh.creation.icosphere(subdivisions, 1e3 * radius)
+    return Tool("ball", 1e-3 * np.asarray(mesh.vertices), np.asarray(mesh.faces))
 
 
 def site(layer: SoftLayer, part: str) -> int:

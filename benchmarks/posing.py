@@ -15,7 +15,7 @@ import time
 
 import numpy as np
 
-from benchmarks.slides import ball
+from benchmarks.living_limbs import ball
 from fem_tools import IndenterFem, PatchFem, Press
 from stmpl_core import Contact, Simulator, Skin, SoftLayer, State
 from stmpl_core.body import Body

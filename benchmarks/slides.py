@@ -20,15 +20,14 @@ from functools import cache
 from pathlib import Path
 
 import numpy as np
-import trimesh
 from scipy.spatial.transform import Rotation
 
-from benchmarks.living_limbs import site
+from benchmarks.living_limbs import ball, site
 from fem_tools import IndenterFem, PatchFem, Press
 from fem_tools.stroke import Stroke
 from fem_tools.tool_contact import Friction
 from fem_tools.walk import Indentation
-from stmpl_core import SoftLayer, Tissue, Tool
+from stmpl_core import SoftLayer, Tissue
 from stmpl_core.body import Body
 from stmpl_core.living import living
 from stmpl_core.packed import pack
@@ -84,13 +83,6 @@ def faded(tissue: Tissue) -> Tissue:
     skin = replace(tissue.skin, relaxation=RELAXATION) if tissue.skin else None
     deeper = tuple(replace(ply, relaxation=RELAXATION) for ply in tissue.deeper)
     return replace(tissue, relaxation=RELAXATION, skin=skin, deeper=deeper)
-
-
-@cache
-def ball(radius: float, subdivisions: int = 4) -> Tool:
-    """A ball about its middle."""
-    mesh = trimesh.creation.icosphere(subdivisions, 1e3 * radius)
-    return Tool("ball", 1e-3 * np.asarray(mesh.vertices), np.asarray(mesh.faces))
 
 
 @cache
