@@ -12,7 +12,7 @@ import numpy as np
 from stmpl_core.arrays import Points, Transform
 from stmpl_core.layer import SoftLayer
 from stmpl_core.nodes import Nodes, nodes_under
-from stmpl_core.rays import WALL, depth_and_share, depth_in_column, distance_in_column, ray_of, to_tool
+from stmpl_core.rays import WALL, depth_and_share, depth_in_column, distance_in_column, ray_of
 from stmpl_core.sdf import SignedDistance
 from stmpl_core.touch import MIN_ONE_WAY_SHARE
 
@@ -90,7 +90,7 @@ class Columns:
         return fcl.CollisionObject(model)
 
     def near(self, field: SignedDistance, pose: Transform, reach: float, *, many: bool = False) -> np.ndarray:
-        """Broad phase: numbers of the vertices in the tool's box.
+        """Broad phase: numbers of the vertices whose columns, skin to core, pass the tool's box.
 
         Args:
             field: distance field of the tool.
@@ -107,11 +107,11 @@ class Columns:
             box = fcl.CollisionObject(fcl.Box(*(high - low + 2 * reach)), fcl.Transform(pose[:3, :3], centre))
             if not fcl.collide(self._skin, box):
                 return np.empty(0, np.int64)
-        return _inside_box(self.points, pose, low - reach, high + reach, centre)
+        return _through_box(self.points, self.inward, self.layer.thickness, pose, low - reach, high + reach, centre)
 
     def squeezed(self, field: SignedDistance, pose: Transform) -> Squeeze:
         """Squeeze of the columns by a tool at its pose."""
-        near = self.near(field, pose, float(self.layer.thickness.max()) + self.layer.edge_length)
+        near = self.near(field, pose, self.layer.edge_length)
         return self.squeeze(field, pose, self.clearance(field, pose, near, self.layer.edge_length))
 
     def clearance(self, field: SignedDistance, pose: Transform, near: np.ndarray, far: float) -> Clearance:
@@ -175,19 +175,28 @@ def grid_of(field: SignedDistance) -> tuple[np.ndarray, np.ndarray, float]:
     return field.coefficients, field.origin, field.spacing
 
 
-@numba.njit(cache=True, nogil=True)
-def _inside_box(points, pose, low, high, centre):
-    """Numbers of the points that lie in a box of the tool's frame, whose centre is given in the body's."""
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _through_box(points, inward, thickness, pose, low, high, centre):
+    """Numbers of the columns that pass a box of the tool's frame, whose centre is given in the body's."""
     found, n, radius = np.empty(len(points), np.int64), 0, 0.0
     for x in range(3):
         radius += 0.25 * (high[x] - low[x]) ** 2
+    radius = np.sqrt(radius)
     for v in range(len(points)):
-        a, b, c = points[v, 0] - centre[0], points[v, 1] - centre[1], points[v, 2] - centre[2]
-        if a * a + b * b + c * c <= radius:
-            x, y, z = to_tool(pose, points[v, 0], points[v, 1], points[v, 2])
-            if low[0] <= x <= high[0] and low[1] <= y <= high[1] and low[2] <= z <= high[2]:
-                found[n] = v
-                n += 1
+        a, b, c, t = points[v, 0] - centre[0], points[v, 1] - centre[1], points[v, 2] - centre[2], thickness[v]
+        if a * a + b * b + c * c > (radius + t) ** 2:
+            continue
+        ray, begin, end = ray_of(pose, points, inward, v), 0.0, t
+        for x in range(3):  # the part of the column between two sides of the box
+            start, way = (ray[0], ray[3]) if x == 0 else (ray[1], ray[4]) if x == 1 else (ray[2], ray[5])
+            if abs(way) < 1e-12:
+                end = end if low[x] <= start <= high[x] else -1.0
+                continue
+            first, last = (low[x] - start) / way, (high[x] - start) / way
+            begin, end = max(begin, min(first, last)), min(end, max(first, last))
+        if begin <= end:
+            found[n] = v
+            n += 1
     return found[:n].copy()
 
 
@@ -208,7 +217,7 @@ def _clearances(grid, pose, points, inward, thickness, near, far):
             continue
         least, s = d, 0.0
         while s < t:
-            s = min(s + max(abs(d), t / 16), t)
+            s = min(s + max(abs(d), d - least, t / 16), t)  # on the way out of the tool nothing nearer comes soon
             d = distance_in_column(grid, ray, s)
             least = min(least, d)
         if d <= 0 and distance_in_column(grid, ray, t + 1e-5) < d:

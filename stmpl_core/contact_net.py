@@ -14,7 +14,7 @@ from stmpl_core.methods.moment_net import think_few
 from stmpl_core.moments import Surroundings
 from stmpl_core.networks import ARRAYS, NODE, PRESSURE, STACK_NODE, Weights, shipped
 from stmpl_core.nodes import Nodes
-from stmpl_core.obstacle import RINGS, moments_of, pairs, power_of, rates_of, response, solve
+from stmpl_core.obstacle import RINGS, moments_of, pairs, power_of, rates_of, response, rings_of, solve
 from stmpl_core.rays import column_pressure
 
 MAX_LOG_RATIO = 2.5  # largest |log| of pressure over that of the linear layer [-]
@@ -118,7 +118,7 @@ class ContactNet:
         if self._green is None:
             return Look(*_look(*nodes[:7], group, self.near.bent, *self._table, self._moduli, self._nu))
         matrix = self._green.matrix(nodes, group)
-        return Look(*_look_on_stack(*nodes, group, self.near.bent, *self._table, self._moduli, self._nu, matrix,
+        return Look(*_look_on_stack(*nodes, group, self.near.bent, self._table.rows, self._nu, matrix,
                                     self._green.effective.thickness, self._green.numbers,
                                     *self._green.hardening))  # fmt: skip
 
@@ -147,7 +147,7 @@ class ContactNet:
         if self._green is None:
             return _slopes(*nodes[:7], group, self.near.bent, *self._table, self._moduli, self._nu, *rates, *network)
         matrix = self._green.matrix(nodes, group)
-        return _slopes_on_stack(*nodes, group, self.near.bent, *self._table, self._moduli, self._nu, matrix,
+        return _slopes_on_stack(*nodes, group, self.near.bent, self._table.rows, self._nu, matrix,
                                 self._green.effective.thickness, self._green.numbers, *self._green.hardening,
                                 *rates, *network)  # fmt: skip
 
@@ -175,11 +175,10 @@ def _see(rings, points, inward, thickness, area, mean, force, strain, bent, modu
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _look_on_stack(points, inward, thickness, area, strain, corners, shares, sinking, group, bent, half_space, rows,
-                   moduli, nu, matrix, t, numbers, log_thickness, hardening):  # fmt: skip
+def _look_on_stack(points, inward, thickness, area, strain, corners, shares, sinking, group, bent, rows, nu, matrix, t,
+                   numbers, log_thickness, hardening):  # fmt: skip
     """See Look; t: thickness of the effective layer [m]; numbers, log_thickness and hardening: those of a Green."""
-    even, here = np.full(len(area), t), _between(corners, shares, bent)
-    rings = pairs(points, inward, even, area, group, t, half_space, rows)[1]
+    rings, here = rings_of(points, inward, t, group, rows), _between(corners, shares, bent)
     depth = sinking * np.minimum(LINEAR_TO / strain, 1.0)
     force = solve(matrix, depth)
     seen = _see_on_stack(rings, points, inward, thickness, area, t, force, strain, sinking, here, nu, numbers,
@@ -241,12 +240,11 @@ def _slopes(points, inward, thickness, area, strain, corners, shares, group, ben
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _slopes_on_stack(points, inward, thickness, area, strain, corners, shares, sinking, group, bent, half_space, rows,
-                     moduli, nu, matrix, t, numbers, log_thickness, hardening, strain_rates, sinking_rates, low, high,
-                     mean, scale, w1, b1, w2, b2, w3, b3, w4, b4):  # fmt: skip
+def _slopes_on_stack(points, inward, thickness, area, strain, corners, shares, sinking, group, bent, rows, nu, matrix,
+                     t, numbers, log_thickness, hardening, strain_rates, sinking_rates, low, high, mean, scale, w1, b1,
+                     w2, b2, w3, b3, w4, b4):  # fmt: skip
     """See ContactNet.slopes."""
-    even, here = np.full(len(area), t), _between(corners, shares, bent)
-    rings = pairs(points, inward, even, area, group, t, half_space, rows)[1]
+    rings, here = rings_of(points, inward, t, group, rows), _between(corners, shares, bent)
     force = solve(matrix, sinking * np.minimum(LINEAR_TO / strain, 1.0))
     rates = rates_of(matrix, force, _reached(sinking, strain, sinking_rates, strain_rates))
     seen = _see_on_stack(rings, points, inward, thickness, area, t, force, strain, sinking, here, nu, numbers,

@@ -13,7 +13,7 @@ from stmpl_core.columns import Columns, Squeeze, middle_of, shifted
 from stmpl_core.sdf import SignedDistance
 
 DEEPEST = 0.9  # depth over thickness beyond which a tool is answered for where it is drawn back to that
-LOOKED_AT = 64  # points of a tool that are looked at
+LOOKED_AT, FIRST = 64, 8  # points of a tool that are looked at; so many first, to see whether any is inside
 FACING = 0.3  # cosine to the mean of the skin's normals from which a column says which way is out
 ACCURACY = 1e-4  # of the way that a tool is drawn back, over the thickness
 
@@ -54,10 +54,14 @@ class Deep:
         centre, (low, high) = middle_of(field, pose), self._box
         if (centre < low).any() or (centre > high).any():
             return False
-        some = points[:: max(1, len(points) // LOOKED_AT)] @ pose[:3, :3].T + pose[:3, 3]
-        nearest = self._nearest(some)
-        under = np.einsum("nx,nx->n", some - self.columns.points[nearest], self.columns.inward[nearest]) > 0
-        return bool((under & ~self._edge[nearest]).mean() > 0.5)
+        return any(self._under(points[:: max(1, len(points) // FIRST)] @ pose[:3, :3].T + pose[:3, 3])) and \
+            bool(self._under(points[:: max(1, len(points) // LOOKED_AT)] @ pose[:3, :3].T + pose[:3, 3]).mean() > 0.5)
+
+    def _under(self, points: np.ndarray) -> np.ndarray:
+        """Mask of the points (N, 3) [m] of the body's frame that are under the skin, (N,)."""
+        nearest = self._nearest(points)
+        under = np.einsum("nx,nx->n", points - self.columns.points[nearest], self.columns.inward[nearest]) > 0
+        return under & ~self._edge[nearest]
 
     def drawn_back(
         self, field: SignedDistance, pose: Transform, points: np.ndarray, squeeze: Squeeze

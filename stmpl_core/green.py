@@ -31,7 +31,10 @@ from stmpl_core.tissue import Tissue
 REACH = 8.0  # distance beyond which the flat response is not felt, over t
 ROWS = 64  # rows of the tables over the root of the distance
 SPREADS = np.geomspace(0.004, 1.6, 16)  # widths of a node's force that are tabled, over t
+FIRST_LOG, STEP_LOG = float(np.log(SPREADS[0])), float(np.log(SPREADS[1] / SPREADS[0]))
 ROUND = float(np.sqrt(2 / np.pi))  # of a Gaussian that is as wide, 1 / r in its middle is 1 / (ROUND s)
+FARTHEST = float(np.sqrt(REACH * 0.9999)) * ROWS  # place in the tables of the largest distance
+AREAS = 33  # logarithms of the widths of a tool's nodes
 FAR = 16.0  # distance over the spread, from which a force may be spread wider without a difference (0.2 %)
 AROUND = 0.5  # cosine between normals below which the flat response fades: what is round the limb is the coarse part's
 COLUMNS, STRAINS = 12, 64  # thicknesses and strains of the table of confined columns
@@ -281,8 +284,14 @@ def _panels(radius: float, end: float) -> np.ndarray:
 def _place(radius, spread):
     """Place in a table: rows of the root of the distance and of the spread, and what is left, both over t."""
     f = np.sqrt(min(radius, REACH * 0.9999)) * ROWS
-    h = min(max(np.log(spread / SPREADS[0]) / np.log(SPREADS[1] / SPREADS[0]), 0.0), len(SPREADS) - 1.001)
+    h = _row_of(np.log(spread))
     return int(f), f - int(f), int(h), h - int(h)
+
+
+@numba.njit(cache=True, error_model="numpy", inline="always")
+def _row_of(log_spread):
+    """Place of a spread over t among SPREADS, from its logarithm."""
+    return min(max((log_spread - FIRST_LOG) / STEP_LOG, 0.0), len(SPREADS) - 1.001)
 
 
 @numba.njit(cache=True, inline="always")
@@ -301,43 +310,81 @@ def _at(table, k, f, g, h):
 
 @numba.njit(cache=True, nogil=True)
 def _corners_of(corners, shares, skin_corners, skin_shares):
-    """The coarse vertices around nodes and their weights, (N, 9) each; and those that are met, in order."""
+    """The coarse vertices around nodes, their weights, (N, 9) each, how many there are, (N,), and all that are met."""
     count = len(corners) if len(skin_corners) else 0
-    index, weight = np.empty((count, 9), np.int64), np.empty((count, 9))
+    index, weight, many = np.zeros((count, 9), np.int64), np.zeros((count, 9)), np.zeros(count, np.int64)
+    met = np.empty(9 * count, np.int64)
     for n in range(count):
         for a in range(3):
             for b in range(3):
-                index[n, 3 * a + b] = skin_corners[corners[n, a], b]
-                weight[n, 3 * a + b] = shares[n, a] * skin_shares[corners[n, a], b]
-    return index, weight, np.unique(index)
+                c = skin_corners[corners[n, a], b]
+                k = 0
+                while k < many[n] and index[n, k] != c:
+                    k += 1
+                if k == many[n]:
+                    index[n, k] = c
+                    many[n] += 1
+                weight[n, k] += shares[n, a] * skin_shares[corners[n, a], b]
+        met[9 * n : 9 * n + 9] = index[n, 0]
+        met[9 * n : 9 * n + many[n]] = index[n, : many[n]]
+    return index, weight, many, np.unique(met)
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _wide(index, weight, some, gathered, motion, turns, out):
+def _between_coarse(index, many, some, motion, turns):
+    """Motion of coarse vertices under a pressure at others, (S, 3, S), and the place of each node's in it, (N, 9)."""
+    place, felt = np.zeros(index.shape, np.int64), np.zeros((len(some), 3, len(some)))
+    for n in range(len(index)):
+        for a in range(many[n]):
+            place[n, a] = np.searchsorted(some, index[n, a])
+    for c in range(len(some)):
+        v = some[c]
+        for x in range(3):
+            if not len(turns):
+                for d in range(len(some)):
+                    felt[c, x, d] = motion[v, x, some[d]]
+                continue
+            for y in range(3):
+                for d in range(len(some)):
+                    felt[c, x, d] += turns[v, x, y] * motion[v, y, some[d]]
+    return felt, place
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _wide(index, weight, many, some, gathered, motion, turns, out):
     """Adds the coarse motion of each node under a force E inwards at each, (N, 3, N) [1/m]."""
     if not len(gathered):
         return
-    count, row, place = len(index), np.empty((3, len(some))), np.empty(index.shape, np.int64)
-    for n in range(count):
-        for a in range(9):
-            place[n, a] = np.searchsorted(some, index[n, a])
-    for n in range(count):
+    felt, place = _between_coarse(index, many, some, motion, turns)
+    row = np.empty((3, len(some)))
+    for n in range(len(index)):
         row[:] = 0.0
-        for a in range(9):
+        for a in range(many[n]):
             for x in range(3):
-                if len(turns):
-                    for y in range(3):
-                        by = weight[n, a] * turns[index[n, a], x, y]
-                        for d in range(len(some)):
-                            row[x, d] += by * motion[index[n, a], y, some[d]]
-                    continue
                 for d in range(len(some)):
-                    row[x, d] += weight[n, a] * motion[index[n, a], x, some[d]]
-        for j in range(count):
-            for a in range(9):
+                    row[x, d] += weight[n, a] * felt[place[n, a], x, d]
+        for j in range(len(index)):
+            for a in range(many[j]):
                 d, share = place[j, a], weight[j, a] / gathered[index[j, a]]
                 for x in range(3):
                     out[n, x, j] += share * row[x, d]
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _inwards(index, weight, many, some, gathered, motion, turns, inward, out):
+    """Adds what `_wide` moves each node inwards, (N, N) [1/m]."""
+    if not len(gathered):
+        return
+    felt, place = _between_coarse(index, many, some, motion, turns)
+    rows, spread = np.zeros((len(index), len(some))), np.zeros((len(some), len(index)))
+    for n in range(len(index)):
+        for a in range(many[n]):
+            spread[place[n, a], n] = weight[n, a] / gathered[index[n, a]]
+            for x in range(3):
+                share = weight[n, a] * inward[n, x]
+                for d in range(len(some)):
+                    rows[n, d] += share * felt[place[n, a], x, d]
+    out += np.dot(rows, spread)
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
@@ -345,24 +392,29 @@ def _matrix(points, inward, area, corners, shares, group, unit, table, skin_corn
             motion, turns):  # fmt: skip
     """See Green.matrix."""
     count = len(points)
-    index, weight, some = _corners_of(corners, shares, skin_corners, skin_shares)
-    wide, out = np.zeros((count, 3, count)), np.zeros((count, count))
-    _wide(index, weight, some, gathered, motion, turns, wide)
+    index, weight, many, some = _corners_of(corners, shares, skin_corners, skin_shares)
+    wide, out = np.zeros((count, count)), np.zeros((count, count))
+    _inwards(index, weight, many, some, gathered, motion, turns, inward, wide)
+    least, steps, logs = area.min(), (AREAS - 1) / max(np.ptp(area), 1e-9 * area.max()), np.empty(AREAS)
+    for k in range(AREAS):  # of spreads in metres: one for each pair would take as long as all else
+        logs[k] = np.log(SPREAD * np.sqrt(least + k / steps))
+    roots, own = np.sqrt(unit), 0.5 * np.log(unit)
     for i in range(count):
         for j in range(i + 1):
             if group[i] != group[j]:
                 continue
-            both = square = facing = 0.0
-            for x in range(3):
-                both += 0.5 * (wide[i, x, j] * inward[i, x] + wide[j, x, i] * inward[j, x])
-                square += (points[i, x] - points[j, x]) ** 2
-                facing += inward[i, x] * inward[j, x]
-            t = np.sqrt(unit[i] * unit[j])
-            r = np.sqrt(square) / t
-            if facing > 0 and r < REACH:
-                s = SPREAD * np.sqrt(0.5 * (area[i] + area[j])) / t
-                k, f, g, h = _place(r, s)
-                both += _share(facing) * _at(table, k, f, g, h) / (np.sqrt(r * r + (ROUND * s) ** 2) * t)
+            both = 0.5 * (wide[i, j] + wide[j, i])
+            facing = inward[i, 0] * inward[j, 0] + inward[i, 1] * inward[j, 1] + inward[i, 2] * inward[j, 2]
+            x, y, z = points[i, 0] - points[j, 0], points[i, 1] - points[j, 1], points[i, 2] - points[j, 2]
+            t = roots[i] * roots[j]
+            square = x * x + y * y + z * z
+            f = np.sqrt(np.sqrt(square) / t) * ROWS
+            if facing > 0 and f < FARTHEST:
+                k, mean = int(f), 0.5 * (area[i] + area[j])
+                a = min((mean - least) * steps, AREAS - 1.001)
+                h = _row_of(logs[int(a)] + (a - int(a)) * (logs[int(a) + 1] - logs[int(a)]) - own[i] - own[j])
+                value = _at(table, k, f - k, int(h), h - int(h))
+                both += _share(facing) * value / np.sqrt(square + mean * (ROUND * SPREAD) ** 2)
             out[i, j] = out[j, i] = both
     return out
 
@@ -395,9 +447,9 @@ def _blocks(points, inward, area, corners, shares, group, unit, tables, skin_cor
             motion, turns):  # fmt: skip
     """Motion of each node under a force E at each, (3 N, 3 N) [1/m]; the coarse part only under what goes inwards."""
     count = len(points)
-    index, weight, some = _corners_of(corners, shares, skin_corners, skin_shares)
+    index, weight, many, some = _corners_of(corners, shares, skin_corners, skin_shares)
     wide, out = np.zeros((count, 3, count)), np.zeros((count, 3, count, 3))
-    _wide(index, weight, some, gathered, motion, turns, wide)
+    _wide(index, weight, many, some, gathered, motion, turns, wide)
     force, moved = np.zeros(3), np.empty(3)
     for i in range(count):
         for j in range(count):
@@ -495,11 +547,11 @@ def add_motion(out, there, points, inward, unit, sources, source_inward, area, s
 @numba.njit(cache=True, nogil=True)
 def _handed(inward, corners, shares, forces, skin_corners, skin_shares, gathered):
     """Pressures over E at coarse vertices that forces over E at nodes amount to, inwards, (C,)."""
-    index, weight, _ = _corners_of(corners, shares, skin_corners, skin_shares)
+    index, weight, many, _ = _corners_of(corners, shares, skin_corners, skin_shares)
     out = np.zeros(len(gathered))
     for n in range(len(index)):
         down = inward[n, 0] * forces[n, 0] + inward[n, 1] * forces[n, 1] + inward[n, 2] * forces[n, 2]
-        for a in range(9):
+        for a in range(many[n]):
             out[index[n, a]] += weight[n, a] * down / gathered[index[n, a]]
     return out
 

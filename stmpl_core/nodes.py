@@ -329,19 +329,21 @@ def _lay(grid, pose, centre, points, inward, thickness, faces, found, sunk, dept
                 for x in range(3):
                     uv[c, 0] += first[x] * (points[faces[f, c], x] - centre[x])
                     uv[c, 1] += second[x] * (points[faces[f, c], x] - centre[x])
-            double = (uv[1, 0] - uv[0, 0]) * (uv[2, 1] - uv[0, 1]) - (uv[2, 0] - uv[0, 0]) * (uv[1, 1] - uv[0, 1])
-            from_row = max(low, int(np.ceil(uv[:, 1].min() / rise - 1e-9)))
-            to_row = min(high, int(np.floor(uv[:, 1].max() / rise + 1e-9)))
+            bx, by, cx, cy = uv[1, 0] - uv[0, 0], uv[1, 1] - uv[0, 1], uv[2, 0] - uv[0, 0], uv[2, 1] - uv[0, 1]
+            double = bx * cy - cx * by
+            from_row = max(low, int(np.ceil((uv[0, 1] + min(0.0, by, cy)) / rise - 1e-9)))
+            to_row = min(high, int(np.floor((uv[0, 1] + max(0.0, by, cy)) / rise + 1e-9)))
+            left_end, right_end = uv[0, 0] + min(0.0, bx, cx), uv[0, 0] + max(0.0, bx, cx)
             for j in range(from_row, to_row + 1):
                 shift, v = 0.5 * (j & 1), j * rise
-                from_one = max(left, int(np.ceil(uv[:, 0].min() / spacing - shift - 1e-9)))
-                to_one = min(right, int(np.floor(uv[:, 0].max() / spacing - shift + 1e-9)))
+                from_one = max(left, int(np.ceil(left_end / spacing - shift - 1e-9)))
+                to_one = min(right, int(np.floor(right_end / spacing - shift + 1e-9)))
                 for i in range(from_one, to_one + 1):
                     if taken[j - low, i - left]:
                         continue
                     u = (i + shift) * spacing
-                    b = ((u - uv[0, 0]) * (uv[2, 1] - uv[0, 1]) - (uv[2, 0] - uv[0, 0]) * (v - uv[0, 1])) / double
-                    c = ((uv[1, 0] - uv[0, 0]) * (v - uv[0, 1]) - (u - uv[0, 0]) * (uv[1, 1] - uv[0, 1])) / double
+                    b = ((u - uv[0, 0]) * cy - cx * (v - uv[0, 1])) / double
+                    c = (bx * (v - uv[0, 1]) - (u - uv[0, 0]) * by) / double
                     a = 1 - b - c
                     if a < -1e-9 or b < -1e-9 or c < -1e-9:
                         continue

@@ -100,10 +100,32 @@ def pairs(points, inward, thickness, area, group, mean, half_space, rows):
             value = half_space / max(r, 0.5 * (own[i] + own[j])) + per * ((1 - f) * rows[k, 0] + f * rows[k + 1, 0])
             out[i, j] = out[j, i] = mean * value
             if k < NEAR * STEPS:
-                for m in range(width):
-                    weight = per * per * ((1 - f) * rows[k, m + 1] + f * rows[k + 1, m + 1])
-                    rings[m, i, j] = rings[m, j, i] = weight
+                _weigh(rings, i, j, per * per, rows, k, f)
     return out, rings
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def rings_of(points, inward, thickness, group, rows):
+    """The weights in rings that `pairs` gives for nodes on a layer of one thickness [m], (., N, N)."""
+    count, scale = len(points), STEPS / thickness
+    rings = np.zeros((rows.shape[1] - 1, count, count), np.float32)
+    for i in range(count):
+        for j in range(i + 1):
+            facing = inward[i, 0] * inward[j, 0] + inward[i, 1] * inward[j, 1] + inward[i, 2] * inward[j, 2]
+            x, y, z = (points[i, 0] - points[j, 0], points[i, 1] - points[j, 1], points[i, 2] - points[j, 2])
+            f = np.sqrt(x * x + y * y + z * z) * scale
+            if facing > 0 and f < NEAR * STEPS and group[i] == group[j]:
+                k = int(f)
+                _weigh(rings, i, j, 1 / (thickness * thickness), rows, k, f - k)
+    return rings
+
+
+@numba.njit(cache=True, error_model="numpy", inline="always")
+def _weigh(rings, i, j, per, rows, k, f):
+    """Writes the weights of a pair of nodes at place k and fraction f of the table's rows."""
+    for m in range(len(rings)):
+        weight = per * ((1 - f) * rows[k, m + 1] + f * rows[k + 1, m + 1])
+        rings[m, i, j] = rings[m, j, i] = weight
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")

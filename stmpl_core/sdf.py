@@ -21,6 +21,8 @@ log = logging.getLogger(__name__)
 MAX_EXTENT = 2.0  # largest extent of a tool [m]; that of a mesh in millimetres is larger
 MIN_EXTENT = 2e-4  # smallest extent of a tool [m]
 COARSE = 3  # factor by which the grid far from the surface is coarser
+FAST = {"contract", "reassoc", "nsz"}  # sums of splines may be taken in any order
+ONE, TWO, THREE = np.uint64(1), np.uint64(2), np.uint64(3)
 ROUNDING_WIDTH = 0.57  # width of the smoothing over the radius that it gives a right-angled edge, measured
 
 
@@ -193,20 +195,33 @@ def _cell(u, n):
     return first - 1, inside, inside - first
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, fastmath=FAST)
+def _on_line(line, k, c0, c1, c2, c3):
+    """Spline along one line of nodes, from node k on."""
+    return c0 * line[k] + c1 * line[k + ONE] + (c2 * line[k + TWO] + c3 * line[k + THREE])
+
+
+@numba.njit(cache=True, nogil=True, fastmath=FAST)
+def _on_plane(plane, j, b0, b1, b2, b3, k, c0, c1, c2, c3):
+    """Spline on one plane of nodes, from node (j, k) on."""
+    return (b0 * _on_line(plane[j], k, c0, c1, c2, c3) + b1 * _on_line(plane[j + ONE], k, c0, c1, c2, c3)
+            + (b2 * _on_line(plane[j + TWO], k, c0, c1, c2, c3) + b3 * _on_line(plane[j + THREE], k, c0, c1, c2, c3)))
+
+
+@numba.njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
 def distance_at(coefficients, origin, spacing, x, y, z):
     """Signed distance at one point [m]; for use inside other kernels."""
     i, u, f = _cell((x - origin[0]) / spacing, coefficients.shape[0])
     j, v, g = _cell((y - origin[1]) / spacing, coefficients.shape[1])
     k, w, e = _cell((z - origin[2]) / spacing, coefficients.shape[2])
-    a, b, (c0, c1, c2, c3) = _cubic(f), _cubic(g), _cubic(e)
-    total = 0.0
-    for p in range(4):
-        row = 0.0
-        for q in range(4):
-            low = c0 * coefficients[i + p, j + q, k] + c1 * coefficients[i + p, j + q, k + 1]
-            row += b[q] * (low + c2 * coefficients[i + p, j + q, k + 2] + c3 * coefficients[i + p, j + q, k + 3])
-        total += a[p] * row
+    a0, a1, a2, a3 = _cubic(f)
+    b0, b1, b2, b3 = _cubic(g)
+    c0, c1, c2, c3 = _cubic(e)
+    i, j, k = np.uint64(i), np.uint64(j), np.uint64(k)  # no index that may count from the end
+    total = a0 * _on_plane(coefficients[i], j, b0, b1, b2, b3, k, c0, c1, c2, c3) \
+        + a1 * _on_plane(coefficients[i + ONE], j, b0, b1, b2, b3, k, c0, c1, c2, c3) \
+        + a2 * _on_plane(coefficients[i + TWO], j, b0, b1, b2, b3, k, c0, c1, c2, c3) \
+        + a3 * _on_plane(coefficients[i + THREE], j, b0, b1, b2, b3, k, c0, c1, c2, c3)  # fmt: skip
     dx, dy, dz = x - origin[0] - spacing * u, y - origin[1] - spacing * v, z - origin[2] - spacing * w
     away = dx * dx + dy * dy + dz * dz
     return total if away < 1e-24 else np.sqrt(away + total * total)

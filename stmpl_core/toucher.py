@@ -165,8 +165,7 @@ class Toucher:
             stated = contact.wrench[:3]
             pose = shifted(pose, tried / math.sqrt(stated @ stated) * stated)
         reach = 0.0 if contact.wrench is None else self.reach + self._thickest
-        near = self.columns.near(field, pose, self._thickest + self.hole + reach, many=many)
-        clearance = self.columns.clearance(field, pose, near, self.hole + reach)
+        clearance = self._clearance(field, pose, self.hole + reach, many)
         depth = -float(clearance.least.min(initial=np.inf))
 
         def nothing(status: str) -> _Placed:
@@ -178,7 +177,7 @@ class Toucher:
             return _Placed(contact, field, status, pose, depth, 0.0, NO_SQUEEZE, 0.0)
 
         force, tool = contact.wrench[:3] if contact.wrench is not None else None, contact.tool.vertices
-        light = force is not None and 0 < depth < 0.5 * float(self.layer.thickness[near].min())
+        light = force is not None and 0 < depth < 0.5 * float(self.layer.thickness[clearance.vertices].min())
         squeeze = NO_SQUEEZE if light else self.columns.squeeze(field, pose, clearance)
         inside = not light and not len(squeeze.nodes.area) and self.deep.inside(field, pose, tool)
         if force is not None and not force.any():
@@ -189,8 +188,7 @@ class Toucher:
             if force is None:
                 return _Placed(contact, field, IN_CORE if core else BY_POSE, back, self._depth(drawn) + way, -way,
                                drawn, None, factor=1 + STIFFENING * way / self._thickest)  # fmt: skip
-            pose, near = back, self.columns.near(field, back, self._thickest + self.hole + reach)
-            clearance = self.columns.clearance(field, pose, near, self.hole + reach)
+            pose, clearance = back, self._clearance(field, back, self.hole + reach)
         elif force is None:
             return _Placed(contact, field, BY_POSE, pose, depth, 0.0, squeeze, None) if len(squeeze.nodes.area) \
                 else nothing(APART)
@@ -202,6 +200,15 @@ class Toucher:
             return self._place(contact, field, many, None)
         apart = found.moved - self._depth(found.squeeze) > MAX_TOUCHING_GAP * self.hole
         return found._replace(status=MOVED) if apart else found
+
+    def _clearance(self, field: SignedDistance, pose: Transform, far: float, many: bool = False) -> Clearance:
+        """Clearance of the columns that are within `far` of a tool [m]; of more where there is none, to say how far."""
+        near = self.columns.near(field, pose, far, many=many)
+        found = self.columns.clearance(field, pose, near, far)
+        if found.least.min(initial=np.inf) < far:
+            return found
+        near = self.columns.near(field, pose, far + self._thickest, many=many)
+        return self.columns.clearance(field, pose, near, far)
 
     def _depth(self, squeeze: Squeeze) -> float:
         """Depth of the deepest column [m]."""
@@ -245,7 +252,8 @@ class Toucher:
         for _ in range(MAX_DEPTH_TRIALS):
             pose, clearance = shifted(start, moved * push), stated
             if moved:
-                near = stated.vertices[~(stated.least > abs(moved) + 2 * self.hole) | np.isinf(stated.least)]
+                near = stated.vertices[~(stated.least > abs(moved) + 2 * self.hole) | np.isinf(stated.least)] \
+                    if abs(moved) <= self.reach + self._thickest else self.columns.near(field, pose, self.hole)
                 clearance = self.columns.clearance(field, pose, near, self.hole)
             squeeze = self.columns.squeeze(field, pose, clearance)
             v, strain = squeeze.vertices, self.deep.strain(squeeze)
@@ -401,6 +409,8 @@ def groups_of(points: Sequence[np.ndarray], thickness: float) -> list[list[int]]
         points: contact nodes of each tool, (N, 3) [m].
         thickness: thickness of the layer, the largest [m].
     """
+    if len(points) < 2:
+        return [[0]] if len(points) else []
     groups: list[tuple[list[int], list[tuple[np.ndarray, float]]]] = []
     for n, some in enumerate(points):
         middle = some.mean(axis=0)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from stmpl_core import Tissue
-from stmpl_core.obstacle import moments_of, pairs, power_of, response, solve
+from stmpl_core.obstacle import moments_of, pairs, power_of, response, rings_of, solve
 
 NU = 0.4
 
@@ -97,3 +97,13 @@ def test_the_same_at_any_scale() -> None:
     here, there = solved(points, 0.1, strain), solved(7e-3 * points, 7e-4, strain, thickness=7e-3)
     np.testing.assert_allclose(there.pressure, here.pressure, rtol=1e-5)
     np.testing.assert_allclose(there.moments, here.moments, rtol=1e-4)
+
+
+def test_rings_alone_are_those_of_the_whole_response() -> None:
+    points, table = lattice(0.2, 3.0), response(NU)
+    n = len(points)
+    inward, group = np.tile([0.0, 0.0, -1.0], (n, 1)), np.arange(n) % 2
+    _, rings = pairs(points, inward, np.full(n, 0.7), np.full(n, 0.03), group, 0.7, *table)
+    alone = rings_of(points, inward, 0.7, group, table.rows)
+    np.testing.assert_allclose(alone, rings, rtol=1e-5, atol=1e-6 * rings.max())
+    assert rings.any()
