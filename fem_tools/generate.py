@@ -23,6 +23,8 @@ from pydantic import ValidationError
 from fem_tools.contact_job import Drop, Job, Part, Skin, solve_contact
 from fem_tools.dataset import FORMAT, Writer, write_layer
 from fem_tools.hand import Hand
+from fem_tools.released import Released
+from fem_tools.rounds import press
 from fem_tools.sampling import ContactId, Plan, contacts, layers
 from stmpl_core.body import Body
 from stmpl_core.errors import InvalidInput, StmplError
@@ -42,6 +44,7 @@ def generate(
     *,
     workers: int | None = None,
     scheduler: str | None = None,
+    start: str | Path | None = None,
     on_progress: OnProgress | None = None,
 ) -> dict[str, Any]:
     """Makes the data set of `plan` in the folder `out`, or goes on where an earlier run of it was stopped.
@@ -51,21 +54,26 @@ def generate(
         out: folder; each contact that is done is one file in it until all are packed.
         workers: local processes, each on one thread; None: one a core.
         scheduler: address of a Dask scheduler whose workers do the work instead (one thread each, please).
+        start: released contacts of the same plan (see fem_tools.released) that need not be solved again.
         on_progress: function that is called after each contact.
 
     Returns:
         The manifest.
 
     Raises:
-        InvalidInput: `out` holds the data of another plan, or workers below 1.
+        InvalidInput: `out` or `start` holds the data of another plan, or workers below 1.
         StmplError: a worker died; what was done is kept.
     """
     out = Path(out)
     if (kept := _manifest_of(plan, out)) and kept.get("complete"):
         return kept
     (out / "parts").mkdir(parents=True, exist_ok=True)
+    if plan.rounds:
+        (out / "rounds").mkdir(exist_ok=True)
     _write(out / "manifest.json", json.dumps({"format": FORMAT, "plan": plan.model_dump(mode="json"),
                                               "complete": False}, indent=1).encode())  # fmt: skip
+    if start is not None:
+        _go_on_from(start, plan, out)
     made = layers(plan)
     tally = _solve_all(plan, out, made, workers, scheduler, on_progress)
     manifest = _pack(plan, out, made, tally)
@@ -84,6 +92,16 @@ def _manifest_of(plan: Plan, out: Path) -> dict[str, Any] | None:
         raise InvalidInput(f"{out} holds data of another plan ({kept.get('plan', {}).get('preset')}). "
                            "Choose another folder, or remove it.")  # fmt: skip
     return kept
+
+
+def _go_on_from(start: str | Path, plan: Plan, out: Path) -> None:
+    """Puts released contacts where those of a run are kept."""
+    released = Released(start)
+    if released.plan != plan:
+        raise InvalidInput(f"{start} holds contacts of another plan ({released.plan.preset}).")
+    for contact, part in released.parts():
+        if not _part_path(out, contact).is_file():
+            _write(_part_path(out, contact), part.write())
 
 
 def _same(kept: Any, plan: Plan) -> bool:
@@ -107,18 +125,21 @@ class _Tally:
 def _solve_all(plan: Plan, out: Path, made: Mapping[str, SoftLayer], workers: int | None, scheduler: str | None,
                on_progress: OnProgress | None) -> _Tally:  # fmt: skip
     """Solves what has no file yet, in an order that mixes cheap and dear contacts, so that the rate holds."""
-    every = list(contacts(plan))
+    every: list[ContactId | int] = [*contacts(plan), *range(plan.rounds)]
     every = [every[k] for k in np.random.default_rng(plan.seed).permutation(len(every))]
     left = [c for c in every if not _part_path(out, c).is_file()]
     tally, started, done = _Tally(), time.monotonic(), len(every) - len(left)
     skins = {name: Skin.of(layer) for name, layer in made.items()}
-    hand = Hand.of(Body.anny(weight=0.5)) if any(c.set == "hand" for c in left) else None
+    hand = Hand.of(Body.anny(weight=0.5)) if any(isinstance(c, ContactId) and c.set == "hand" for c in left) else None
     with _executor(workers, scheduler) as (executor, many):
         tally.workers = f"dask {scheduler}" if scheduler else f"{many} local processes"
         waiting, running = iter(left), {}
         try:
             while True:
-                while len(running) < 2 * many and (contact := next(waiting, None)):
+                while len(running) < 2 * many and (contact := next(waiting, None)) is not None:
+                    if isinstance(contact, int):
+                        running[executor.submit(press, plan, contact)] = contact
+                        continue
                     held = hand if contact.set == "hand" else None
                     job = Job(plan, contact, skins[contact.body], held)
                     running[executor.submit(solve_contact, job)] = contact
@@ -127,8 +148,11 @@ def _solve_all(plan: Plan, out: Path, made: Mapping[str, SoftLayer], workers: in
                 for future in wait(running, return_when=FIRST_COMPLETED).done:
                     contact, content = running.pop(future), future.result()
                     _write(_part_path(out, contact), content)
-                    part, done = Part.read(content), done + 1
-                    tally.samples, tally.dropped = tally.samples + len(part.records), tally.dropped + len(part.drops)
+                    done += 1
+                    if isinstance(contact, ContactId):
+                        part = Part.read(content)
+                        tally.samples += len(part.records)
+                        tally.dropped += len(part.drops)
                     if on_progress:
                         on_progress(done, len(every), tally.samples, tally.dropped)
         except BrokenProcessPool as error:
@@ -165,7 +189,9 @@ def _executor(workers: int | None, scheduler: str | None) -> Iterator[tuple[Exec
             os.environ.pop(name) if value is None else os.environ.update({name: value})
 
 
-def _part_path(out: Path, contact: ContactId) -> Path:
+def _part_path(out: Path, contact: ContactId | int) -> Path:
+    if isinstance(contact, int):
+        return out / "rounds" / f"{contact:05d}.npz"
     return out / "parts" / f"{contact.body}-{contact.set}-{contact.number:05d}.npz"
 
 
@@ -201,6 +227,7 @@ def _pack(plan: Plan, out: Path, made: Mapping[str, SoftLayer], tally: _Tally) -
         "plan": plan.model_dump(mode="json"),
         "versions": versions(VERSIONS),
         "samples": sum(counts.values()),
+        "rounds": plan.rounds,
         "counts": dict(sorted(counts.items())),
         "wall_seconds_of_last_run": round(tally.seconds, 1),
         "workers": tally.workers,

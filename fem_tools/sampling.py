@@ -195,6 +195,7 @@ class Plan(BaseModel):
     fields: int = 0  # uneven pressures without a tool
     indenters: int = 0
     tools: int = 0  # rigid tools of all shapes, pressed in at a slant
+    rounds: int = 0  # tools of revolution pressed into the bodies' stacks laid flat, see fem_tools.rounds
     hands: int = 395
     bands: int = 40
     letters: int = 273
@@ -234,7 +235,7 @@ PRESETS = {
                      letters=0, tools=60, loads=8, deepest=0.9, indenter_step=0.08),
     "tissue": Plan(preset="tissue", bodies=TISSUE_BODIES + _drawn_bodies(DRAWN), discs=0, ellipses=0, seams=0,
                    hands=0, bands=0, letters=0, tools=18, loads=8, deepest=0.85, indenter_step=0.12, clear=4.0,
-                   thinnest=1.4, sizes=(4e-3, 40e-3), linear=True, most_work=4e10),
+                   thinnest=1.4, sizes=(4e-3, 40e-3), linear=True, most_work=4e10, rounds=400),
 }  # fmt: skip
 
 

@@ -23,6 +23,7 @@ ON_STACK, STACKS_SEE, SEEN_ALIKE = STACK_NODE.at, STACK_NODE.size, STACK_NODE.at
 LINEAR_TO = 0.6  # strain to which contact is solved; beyond it the columns' barrier takes over
 HARDENING = 0.75  # power of the columns' pressure with which it does
 FADE, FADE_RING = 0.03, 2  # strain at and around a node at which half of the correction is left: a touch begins linear
+ROUND_FROM = 0.05  # overlap over the thickness to which curvature is compared at the least
 SMALL_STEP = 5e-3  # of the largest force, in which the network's part of a slope is found: far above float32's noise
 STACK_FADE = 0.1  # the same on a stack, whose linear response alone is good to some percent up to there
 
@@ -51,7 +52,7 @@ class Look(NamedTuple):
 
     Args:
         pressure: pressure over E of the linear layer, with the barrier, (N,) [-].
-        inputs: what the network reads, (N, NODE.size) float32.
+        inputs: what the network reads, (N, NODE.size) float32; or STACK_NODE.size, of which old networks read less.
         fade: share of the network's correction, (N,) [-].
         power: power of the depth with which the linear layer's force grows [-].
     """
@@ -117,8 +118,8 @@ class ContactNet:
         group = self.near.groups(nodes.corners[:, 0])
         if self._green is None:
             return Look(*_look(*nodes[:7], group, self.near.bent, *self._table, self._moduli, self._nu))
-        matrix = self._green.matrix(nodes, group)
-        return Look(*_look_on_stack(*nodes, group, self.near.bent, self._table.rows, self._nu, matrix,
+        matrices = self._green.matrices(nodes, group)
+        return Look(*_look_on_stack(*nodes, group, self.near.bent, self._table.rows, self._nu, *matrices,
                                     self._green.effective.thickness, self._green.numbers,
                                     *self._green.hardening))  # fmt: skip
 
@@ -146,8 +147,8 @@ class ContactNet:
         rates = strain_rates, sinking_rates
         if self._green is None:
             return _slopes(*nodes[:7], group, self.near.bent, *self._table, self._moduli, self._nu, *rates, *network)
-        matrix = self._green.matrix(nodes, group)
-        return _slopes_on_stack(*nodes, group, self.near.bent, self._table.rows, self._nu, matrix,
+        matrices = self._green.matrices(nodes, group)
+        return _slopes_on_stack(*nodes, group, self.near.bent, self._table.rows, self._nu, *matrices,
                                 self._green.effective.thickness, self._green.numbers, *self._green.hardening,
                                 *rates, *network)  # fmt: skip
 
@@ -175,20 +176,20 @@ def _see(rings, points, inward, thickness, area, mean, force, strain, bent, modu
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _look_on_stack(points, inward, thickness, area, strain, corners, shares, sinking, group, bent, rows, nu, matrix, t,
-                   numbers, log_thickness, hardening):  # fmt: skip
+def _look_on_stack(points, inward, thickness, area, strain, corners, shares, sinking, group, bent, rows, nu, matrix,
+                   wide, t, numbers, log_thickness, hardening):  # fmt: skip
     """See Look; t: thickness of the effective layer [m]; numbers, log_thickness and hardening: those of a Green."""
     rings, here = rings_of(points, inward, t, group, rows), _between(corners, shares, bent)
     depth = sinking * np.minimum(LINEAR_TO / strain, 1.0)
     force = solve(matrix, depth)
     seen = _see_on_stack(rings, points, inward, thickness, area, t, force, strain, sinking, here, nu, numbers,
-                         log_thickness, hardening)  # fmt: skip
+                         log_thickness, hardening, _given_way(matrix, wide, force))  # fmt: skip
     return *seen, power_of(matrix, force, depth.max())
 
 
 @numba.njit(cache=True, error_model="numpy")
 def _see_on_stack(rings, points, inward, thickness, area, t, force, strain, sinking, bent, nu, numbers, log_thickness,
-                  hardening):  # fmt: skip
+                  hardening, given_way):  # fmt: skip
     """Pressure, inputs and fade of a Look under forces (N,) over E [m2]."""
     softness, pressure = np.exp(numbers[3]), force / area
     even, overlap = np.full(len(area), t), sinking / t
@@ -201,11 +202,26 @@ def _see_on_stack(rings, points, inward, thickness, area, t, force, strain, sink
         row[ON_STACK.log_thickness], row[ON_STACK.column_strain] = np.log(thickness[n] / t), strain[n]
         row[ON_STACK.log_kappa], row[ON_STACK.log_pull] = numbers[1], numbers[2]
         row[ON_STACK.hardening] = _hardening(log_thickness, hardening, thickness[n], sinking[n] / thickness[n])
+        row[ON_STACK.curvature] = alike[n, AT.mean_curvature]
+        row[ON_STACK.curvature_over_strain] = alike[n, AT.mean_curvature] / (overlap[n] + ROUND_FROM)
+        row[ON_STACK.given_way] = given_way
         if strain[n] > LINEAR_TO:
             top = _hardening(log_thickness, hardening, thickness[n], LINEAR_TO)
             there = _hardening(log_thickness, hardening, thickness[n], strain[n])
             pressure[n] *= (strain[n] / LINEAR_TO * np.exp(there - top)) ** HARDENING
     return pressure, inputs, _faded(overlap, moments, STACK_FADE)
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _given_way(matrix, wide, force):
+    """Share of the work of forces (N,) that the coarse part of their response does [-]."""
+    coarse = whole = 0.0
+    for i in range(len(force)):
+        if force[i] > 0:
+            for j in range(len(force)):
+                coarse += force[i] * wide[i, j] * force[j]
+                whole += force[i] * matrix[i, j] * force[j]
+    return coarse / max(whole, 1e-300)
 
 
 @numba.njit(cache=True, error_model="numpy")
@@ -241,14 +257,15 @@ def _slopes(points, inward, thickness, area, strain, corners, shares, group, ben
 
 @numba.njit(cache=True, error_model="numpy")
 def _slopes_on_stack(points, inward, thickness, area, strain, corners, shares, sinking, group, bent, rows, nu, matrix,
-                     t, numbers, log_thickness, hardening, strain_rates, sinking_rates, low, high, mean, scale, w1, b1,
-                     w2, b2, w3, b3, w4, b4):  # fmt: skip
+                     wide, t, numbers, log_thickness, hardening, strain_rates, sinking_rates, low, high, mean, scale,
+                     w1, b1, w2, b2, w3, b3, w4, b4):  # fmt: skip
     """See ContactNet.slopes."""
     rings, here = rings_of(points, inward, t, group, rows), _between(corners, shares, bent)
     force = solve(matrix, sinking * np.minimum(LINEAR_TO / strain, 1.0))
     rates = rates_of(matrix, force, _reached(sinking, strain, sinking_rates, strain_rates))
+    given_way = _given_way(matrix, wide, force)
     seen = _see_on_stack(rings, points, inward, thickness, area, t, force, strain, sinking, here, nu, numbers,
-                         log_thickness, hardening)  # fmt: skip
+                         log_thickness, hardening, given_way)  # fmt: skip
     held = _correct(*seen, low, high, mean, scale, w1, b1, w2, b2, w3, b3, w4, b4)[0]
     out = np.empty_like(rates)
     for k in range(len(rates)):
@@ -256,7 +273,7 @@ def _slopes_on_stack(points, inward, thickness, area, strain, corners, shares, s
         seen = _see_on_stack(rings, points, inward, thickness, area, t, np.maximum(force + h * rates[k], 0.0),
                              np.maximum(strain + h * strain_rates[k], 1e-9),
                              np.maximum(sinking + h * sinking_rates[k], 0.0), here, nu, numbers, log_thickness,
-                             hardening)  # fmt: skip
+                             hardening, given_way)  # fmt: skip
         out[k] = (_correct(*seen, low, high, mean, scale, w1, b1, w2, b2, w3, b3, w4, b4)[0] - held) / h
     return out
 
@@ -315,9 +332,9 @@ def _correct(pressure, inputs, fade, low, high, mean, scale, w1, b1, w2, b2, w3,
     """See Held."""
     count = len(pressure)
     held, doubt, outside = np.empty(count), np.empty(count), np.zeros(count, np.bool_)
-    kept, outputs = np.empty_like(inputs), np.empty((count, len(b4)), np.float32)
+    kept, outputs = np.empty((count, len(low)), np.float32), np.empty((count, len(b4)), np.float32)
     for n in range(count):
-        for m in range(inputs.shape[1]):
+        for m in range(len(low)):
             value = min(max(inputs[n, m], low[m]), high[m])
             if value != inputs[n, m]:
                 outside[n] = True

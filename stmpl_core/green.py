@@ -69,7 +69,7 @@ class Green:
         self.near = Surroundings.of(layer)
         self.tables = tables(layer.tissue, self.thickness) if layer.stacked else _of_one(layer.tissue.poisson_ratio)
         self._turns = AS_AT_REST
-        self._last: tuple[np.ndarray, np.ndarray] | None = None
+        self._last: tuple[np.ndarray, tuple[np.ndarray, np.ndarray]] | None = None
 
     @classmethod
     def of(cls, layer: SoftLayer) -> Green:
@@ -139,7 +139,11 @@ class Green:
         return logs, np.array([hardening(self.layer.tissue, t, strain) for t in np.exp(logs)])
 
     def matrix(self, nodes: Nodes, group: np.ndarray) -> np.ndarray:
-        """Depth at each node under a force E at each along the normals, symmetric, (N, N) [1/m].
+        """Depth at each node under a force E at each along the normals, symmetric, (N, N) [1/m]; see `matrices`."""
+        return self.matrices(nodes, group)[0]
+
+    def matrices(self, nodes: Nodes, group: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Depth at each node under a force E at each along the normals, and the coarse part of it, (N, N) each [1/m].
 
         Args:
             nodes: contact nodes.
@@ -402,6 +406,7 @@ def _matrix(points, inward, area, corners, shares, group, unit, table, skin_corn
     for i in range(count):
         for j in range(i + 1):
             if group[i] != group[j]:
+                wide[i, j] = wide[j, i] = 0.0
                 continue
             both = 0.5 * (wide[i, j] + wide[j, i])
             facing = inward[i, 0] * inward[j, 0] + inward[i, 1] * inward[j, 1] + inward[i, 2] * inward[j, 2]
@@ -416,7 +421,7 @@ def _matrix(points, inward, area, corners, shares, group, unit, table, skin_corn
                 value = _at(table, k, f - k, int(h), h - int(h))
                 both += _share(facing) * value / np.sqrt(square + mean * (ROUND * SPREAD) ** 2)
             out[i, j] = out[j, i] = both
-    return out
+    return out, wide
 
 
 @numba.njit(cache=True, error_model="numpy", inline="always")

@@ -305,6 +305,7 @@ def generate(
     out: Path | None = None,
     workers: int | None = None,
     scheduler: str | None = None,
+    start: Path | None = None,
     as_json: Json = False,
 ) -> int:
     """Makes the data set that networks learn from, or goes on with one that was stopped.
@@ -317,6 +318,7 @@ def generate(
         out: folder of the data; data/<preset> unless given.
         workers: local processes; one a core unless given.
         scheduler: address of a Dask scheduler that does the work instead.
+        start: file of released contacts to go on from, as benchmarks/limbs_v1.npz for tissue.
         as_json: manifest as JSON, for machines.
     """
     needed("stmpl generate", "learn", "anny", "torch", "zarr", "shapely")
@@ -327,7 +329,7 @@ def generate(
 
     with contacts_bar(preset, quiet=as_json) as show:
         folder = out or Path("data") / preset
-        manifest = make(PRESETS[preset], folder, workers=workers, scheduler=scheduler, on_progress=show)
+        manifest = make(PRESETS[preset], folder, workers=workers, scheduler=scheduler, start=start, on_progress=show)
     print_figures(manifest if as_json else data_table(manifest, folder))
     return 0
 

@@ -15,6 +15,7 @@ from fem_tools.scenes import Site
 from stmpl_core.arrays import Transform
 from stmpl_core.columns import Columns, Squeeze
 from stmpl_core.contact_net import ContactNet
+from stmpl_core.layer import SoftLayer
 from stmpl_core.nodes import Nodes
 from stmpl_core.sdf import SignedDistance
 from stmpl_core.tool import Tool
@@ -135,22 +136,32 @@ class Rows:
 
 def seen(one: Pressed, net: ContactNet) -> Rows | None:
     """What the network sees of a contact; None where finite elements were too coarse to know its pressure."""
-    layer, nodes = one.sample.layer, one.nodes
-    if not len(nodes.area):
+    return rows_of(one.sample.layer, one.nodes, one.true, net,
+                   LEAST_CELLS * (one.sample.layer.edge_length / 2**INDENTER_REFINE) ** 2)  # fmt: skip
+
+
+def rows_of(layer: SoftLayer, nodes: Nodes, true: np.ndarray, net: ContactNet, least: float = 0.0) -> Rows | None:
+    """What the network sees at contact nodes, and what is true at the vertices around.
+
+    Args:
+        layer: skin.
+        nodes: contact nodes.
+        true: true pressure over E at all vertices, (V,) [-].
+        net: law on that skin.
+        least: area that must touch; less is None [m2].
+    """
+    if not len(nodes.area) or not true.any():
         return None
     look = net.look(nodes)
-    touching = float(nodes.area[look.pressure > 0].sum())
-    if touching < LEAST_CELLS * (layer.edge_length / 2**INDENTER_REFINE) ** 2 or not one.true.any():
+    if float(nodes.area[look.pressure > 0].sum()) < least:
         return None
-    n = len(nodes.area)
-    vertices = np.union1d(nodes.corners, np.flatnonzero(one.true))
+    vertices, float32 = np.union1d(nodes.corners, np.flatnonzero(true)), np.float32
     areas = layer.vertex_areas[vertices]
     scale = areas.sum()
-    float32 = np.float32
     return Rows(look.inputs, look.pressure.astype(float32),
                 look.fade.astype(float32), (nodes.area / scale).astype(float32),
-                np.searchsorted(vertices, nodes.corners), nodes.shares.astype(float32), np.array([0, n]),
-                one.true[vertices].astype(float32), (areas / scale).astype(float32),
+                np.searchsorted(vertices, nodes.corners), nodes.shares.astype(float32),
+                np.array([0, len(nodes.area)]), true[vertices].astype(float32), (areas / scale).astype(float32),
                 np.array([0, len(vertices)]))  # fmt: skip
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,9 +13,12 @@ from pydantic import BaseModel, ConfigDict, Field
 from torch import Tensor
 
 from fem_tools.dataset import Dataset, Sample, Subset
+from fem_tools.rounds import Pressed, read_all
+from fem_tools.sampling import Plan
 from stmpl_core.contact_net import MAX_LOG_RATIO, ContactNet
 from stmpl_core.errors import InvalidInput
 from stmpl_core.networks import NODE, PRESSURE, STACK_NODE
+from studies.flat import flat_rows
 from studies.judge_contact import bound_force
 from studies.pressed import STRAIGHT, Rows, pressed, seen, slant_of
 from studies.train_moments import Layers, OnProgress, training_card
@@ -32,11 +35,13 @@ class ContactTraining(BaseModel):
         steps, batch, learning_rate: numbers of AdamW, the batch in contacts; the rate rises to this and falls in one
             cycle.
         weight_decay: weight decay of AdamW.
+        flat: share of each batch that is presses into flat stacks, where the data have them.
         seed: seed of weights and order.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
+    flat: float = Field(default=0.2, ge=0, lt=1)
     hidden: int = Field(default=32, ge=4)
     steps: int = Field(default=6_000, ge=10)
     batch: int = Field(default=48, ge=4)
@@ -57,6 +62,15 @@ def draw_rows(samples: Iterable[Sample], count: int, on_progress: OnProgress) ->
             parts.append(rows)
         on_progress(k + 1, count, "looking at contacts")
     return Rows.joined(parts)
+
+
+def draw_flat(plan: Plan, presses: Sequence[Pressed], on_progress: OnProgress) -> Rows | None:
+    """What the network sees of presses into flat stacks; None of none."""
+    parts: list[Rows] = []
+    for k, one in enumerate(sorted(presses, key=lambda each: each.body)):  # a stack's tables are made once
+        parts += flat_rows(plan, one)
+        on_progress(k + 1, len(presses), "looking at flat stacks")
+    return Rows.joined(parts) if parts else None
 
 
 def loss(model: Layers, data: Rows, contacts: np.ndarray) -> tuple[Tensor, Tensor, Tensor]:
@@ -92,9 +106,13 @@ def loss(model: Layers, data: Rows, contacts: np.ndarray) -> tuple[Tensor, Tenso
     return robust.mean() + 0.02 * doubtful, shape, force
 
 
-def fit(data: Rows, settings: ContactTraining, on_progress: OnProgress) -> Layers:
-    """Trains on contacts drawn at random."""
+def fit(data: Rows, settings: ContactTraining, on_progress: OnProgress, flat: Rows | None = None) -> Layers:
+    """Trains on contacts drawn at random, and on presses into flat stacks, a share of each batch."""
     torch.manual_seed(settings.seed)
+    known, count = data.contacts, settings.batch
+    of_flat = 0 if flat is None else round(settings.flat * count)
+    if flat is not None:
+        data = Rows.joined([data, flat])
     model = Layers(settings.hidden, STACK_NODE if data.rows.shape[1] == STACK_NODE.size else NODE, PRESSURE)
     model.take_range(torch.from_numpy(data.rows))
     optimiser = torch.optim.AdamW(model.parameters(), lr=settings.learning_rate, weight_decay=settings.weight_decay)
@@ -103,7 +121,10 @@ def fit(data: Rows, settings: ContactTraining, on_progress: OnProgress) -> Layer
     )
     rng, mean = np.random.default_rng(settings.seed), np.zeros(2)
     for step in range(settings.steps):
-        value, shape, force = loss(model, data, rng.integers(data.contacts, size=settings.batch))
+        some = rng.integers(known, size=count - of_flat)
+        if of_flat:
+            some = np.concatenate([some, rng.integers(known, data.contacts, size=of_flat)])
+        value, shape, force = loss(model, data, some)
         optimiser.zero_grad()
         value.backward()
         torch.nn.utils.clip_grad_norm_(model.parameters(), 0.3)
@@ -140,8 +161,9 @@ def train_contact(
     if not len(subset):
         raise InvalidInput(f"{data} holds no rigid tools. Make them with stmpl generate --preset contacts.")
     rows = draw_rows(subset, len(subset), said)
-    model = fit(rows, settings, said)
-    counts = {"contacts": rows.contacts, "rows": len(rows.rows)}
+    flat = draw_flat(Plan.model_validate(source.manifest["plan"]), read_all(data), said)
+    model = fit(rows, settings, said, flat)
+    counts = {"contacts": rows.contacts, "rows": len(rows.rows)} | ({"flat": flat.contacts} if flat else {})
     card = training_card(data, source, settings, model, _ranges(source, subset), **counts)
     card["minutes"] = round((time.monotonic() - started) / 60, 1)
     weights = model.weights(card)

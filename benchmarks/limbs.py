@@ -1,0 +1,179 @@
+"""Tools pressed into limbs of skin, fat and muscle: how far a contact law is off finite elements, in one command.
+
+    .venv/bin/python -m benchmarks.limbs                            # our row and the simpler laws'; some minutes
+    .venv/bin/python -m benchmarks.limbs --answers yours.py:answer  # and yours
+    .venv/bin/python -m benchmarks.limbs --export DIR               # the scenes as STL and JSON, for any program
+
+benchmarks/limbs.md says what is in benchmarks/limbs_v1.npz. `answer(layer, tool, pose, way)` gets a SoftLayer, a Tool,
+its pose (4, 4) in the limb's frame and the unit vector (3,) along which it came there, and returns the force of the
+tool on the limb (3,) [N] and the motion of the skin (V, 3) [m], or None for the latter.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import logging
+import runpy
+from collections import defaultdict
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import trimesh
+from rich.console import Console
+from rich.table import Table
+
+from fem_tools.plies import confined_modulus
+from fem_tools.released import Released
+from stmpl_core import Contact, SoftLayer, Tool
+from stmpl_core.columns import Columns
+from stmpl_core.console import steps_bar
+from stmpl_core.contact_net import ContactNet
+from stmpl_core.methods import MomentNet
+from stmpl_core.simulator import Simulator
+from studies.pressed import STRAIGHT, Pressed, pressed, slant_of
+
+FILE = Path(__file__).with_name("limbs_v1.npz")
+SPLITS = {"known": ("test", "val"), "unseen": ("held_out",)}  # limbs that networks learnt from, other contacts; others
+MOVES = 0.1  # motion that counts as such, over the peak
+Answer = Callable[[SoftLayer, Tool, np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray | None]]
+
+
+class Off(NamedTuple):
+    """How far one answer is off finite elements.
+
+    Args:
+        force: signed error of the force's size over the true one [-].
+        moves, worst: mean error where it moves, and the largest at any vertex, over the true peak [-].
+        flagged: truth of the claim that the answer says that it is not to be relied upon.
+        bound: bound on the force's error that is stated, over the true force [-].
+    """
+
+    force: float
+    moves: float = float("nan")
+    worst: float = float("nan")
+    flagged: bool = False
+    bound: float = float("nan")
+
+
+def off(one: Pressed, force: np.ndarray, motion: np.ndarray | None, flagged: bool = False,
+        bound: float = float("nan")) -> Off:  # fmt: skip
+    """Compares an answer with a scene."""
+    true = float(np.linalg.norm(one.touch.wrench[:3]))
+    error = float(np.linalg.norm(force)) / true - 1
+    if motion is None:
+        return Off(error, flagged=flagged, bound=bound)
+    size = np.linalg.norm(one.sample.displacement, axis=1)
+    wrong = np.linalg.norm(motion - one.sample.displacement, axis=1) / size.max()
+    return Off(error, float(wrong[size > MOVES * size.max()].mean()), float(wrong.max()), flagged, bound)
+
+
+class Laws:
+    """The laws that are compared, on one limb."""
+
+    def __init__(self, layer: SoftLayer, other: Answer | None) -> None:
+        self.layer, self.other = layer, other
+        self.simulator = Simulator(layer, MomentNet())
+        self.net, self.columns = ContactNet(layer), Columns(layer)
+        self.modulus = np.array([confined_modulus(layer.tissue, float(t)) for t in layer.thickness])
+
+    def answers(self, one: Pressed) -> dict[str, Off]:
+        """Each law's answer to a scene, compared."""
+        layer, nodes, out = self.layer, one.nodes, {}
+        self.simulator.tools.add(one.tool, one.field)
+        (touch,) = self.simulator.touch([Contact(one.tool, one.pose)])
+        if touch.pressed is not None:  # the way it came, which a wrench would tell
+            touch = replace(touch, pressed=touch.pressed._replace(way=one.way))
+        answer = self.simulator.answer([touch])
+        true = float(np.linalg.norm(one.touch.wrench[:3]))
+        out["moment_net"] = off(one, touch.wrench[:3], answer.displacement, flagged=not answer.trust.in_range,
+                                bound=touch.force_bound / true)  # fmt: skip
+        if len(nodes.area):
+            linear = self.net.look(nodes).pressure * layer.tissue.youngs_modulus * nodes.area
+            out["its linear part"] = off(one, linear @ nodes.inward, None)
+            columns = np.einsum("nc,nc->n", self.modulus[nodes.corners], nodes.shares) * nodes.strain * nodes.area
+            out["elastic foundation"] = off(one, columns @ nodes.inward, None)
+        if self.other is not None:
+            out["yours"] = off(one, *self.other(layer, one.tool, one.pose, one.way))
+        return out
+
+
+def compare(released: Released, splits: Sequence[str], other: Answer | None) -> dict[str, list[Off]]:
+    """All laws on all scenes of some splits, one limb after the other."""
+    found: dict[str, list[Off]] = defaultdict(list)
+    samples = [one for split in splits for one in released.samples(split) if slant_of(one) <= STRAIGHT]
+    laws, last = None, None
+    with steps_bar("scenes") as show:
+        for k, one in enumerate(pressed(samples)):
+            if laws is None or last is not one.sample.layer:
+                laws, last = Laws(one.sample.layer, other), one.sample.layer
+            for name, result in laws.answers(one).items():
+                found[name].append(result)
+            show(k + 1, len(samples), one.sample.info["body"])
+    return found
+
+
+def table(title: str, found: dict[str, list[Off]]) -> Table:
+    """The rows, in per cent."""
+    out = Table(title=title)
+    for heading in ("law", "scenes", "force: mean", "90 %", "worst", "where it moves", "worst vertex", "flagged",
+                    "in its bound"):  # fmt: skip
+        out.add_column(heading, justify="left" if heading == "law" else "right")
+    for name, every in found.items():
+        by_name = zip(Off._fields, np.array(every, dtype=float).T, strict=True)
+        columns = {key: np.asarray(values) for key, values in by_name}
+        force = np.abs(columns["force"])
+
+        def shown(values: np.ndarray, how: Callable[[np.ndarray], float] = np.mean) -> str:
+            return "" if np.isnan(values).all() else f"{100 * float(how(values)):.1f} %"
+
+        out.add_row(name, str(len(force)), shown(force), shown(force, lambda v: float(np.quantile(v, 0.9))),
+                    shown(force, np.max), shown(columns["moves"]), shown(columns["worst"]), shown(columns["flagged"]),
+                    shown(np.where(np.isnan(columns["bound"]), np.nan, force <= columns["bound"])))  # fmt: skip
+    return out
+
+
+def export(samples: Iterable, folder: Path) -> int:
+    """Writes each limb and tool as STL [m] and a scenes.json beside them; the number of scenes."""
+    folder.mkdir(parents=True, exist_ok=True)
+    scenes, limbs = [], set()
+    for one in pressed(samples):
+        info, layer = one.sample.info, one.sample.layer
+        limb, tool = f"{info['body']}.stl", f"{info['body']}-{info['number']:02d}-tool.stl"
+        if limb not in limbs:
+            trimesh.Trimesh(layer.vertices, layer.faces, process=False).export(folder / limb)
+            limbs.add(limb)
+        if not (folder / tool).exists():
+            trimesh.Trimesh(one.tool.vertices, one.tool.faces, process=False).export(folder / tool)
+        scenes.append({"limb": limb, "tool": tool, "split": info["split"], "depth_over_thickness": info["ratio"],
+                       "pose_limb_from_tool": one.pose.tolist(), "way": one.way.tolist(),
+                       "force_on_limb_N": one.touch.wrench[:3].tolist(), "fem_error_m": info["discretisation_m"]})
+    (folder / "scenes.json").write_text(json.dumps(scenes, indent=1) + "\n")
+    return len(scenes)
+
+
+def main() -> None:
+    """Prints a table a split, or writes the scenes."""
+    given = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    given.add_argument("--splits", nargs="+", choices=list(SPLITS), default=list(SPLITS))
+    given.add_argument("--answers", default="", help="file.py:function of a law of yours")
+    given.add_argument("--export", type=Path, default=None, help="folder to which the scenes are written instead")
+    given.add_argument("--file", type=Path, default=FILE, help="released contacts")
+    options = given.parse_args()
+    logging.disable(logging.WARNING)
+    released = Released(options.file)
+    if options.export:
+        print(f"{export(released.samples(), options.export)} scenes in {options.export}")
+        return
+    path, _, name = options.answers.rpartition(":")
+    other = runpy.run_path(path)[name] if path else None
+    for split in options.splits:
+        found = compare(released, SPLITS[split], other)
+        Console(width=130).print(table(f"{split} limbs", found))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,146 @@
+"""Laws of what is released of a data set, of presses into flat stacks, and of who is judged by them."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from benchmarks import limbs
+from fem_tools.axisymmetric import Flat, Profile
+from fem_tools.contact_job import Part
+from fem_tools.dataset import QUANTUM, Dataset, Record
+from fem_tools.generate import generate
+from fem_tools.released import LEAST, STEPS, Released, write
+from fem_tools.rounds import THICKNESS, Pressed, drawn, learnt, read_all, tissue_of
+from fem_tools.sampling import PRESETS, ContactId, contacts, layers
+from stmpl_core.errors import InvalidInput
+from stmpl_core.networks import STACK_NODE
+from studies.flat import flat_rows, plate, pressure_on
+
+TISSUE = PRESETS["tissue"]
+BODY = next(b for b in TISSUE.bodies if b.name == "arm_20").model_copy(update={"edge_length": 9e-3, "reach": 3.0})
+PLAN = TISSUE.model_copy(
+    update={"preset": "few", "bodies": (BODY,), "tools": 1, "rounds": 1, "loads": 2, "deepest": 0.2,
+            "indenter_step": 0.2}
+)  # fmt: skip
+BALL = Profile((0.0, 0.0), (0.0, 0.0), 0.01)
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+
+@pytest.fixture(scope="module")
+def press() -> Pressed:
+    rounds = Flat(tissue_of(BODY), THICKNESS, fine=0.6).press(BALL, [2e-4, 1e-3])
+    return Pressed(BODY.name, BALL, rounds)
+
+
+def made_up(plan_layers: dict) -> list[tuple[ContactId, Part]]:
+    """Two contacts of made-up numbers on a real limb: what is written must come back."""
+    rng, out = np.random.default_rng(0), []
+    for k in range(2):
+        records = []
+        for _ in range(2):
+            moved = np.arange(5, 300, 3, dtype=np.int32)
+            steps = np.round(rng.normal(size=(len(moved), 3)) * 1e5).astype(np.int32)
+            records.append(Record("indenter", np.arange(20, 40, dtype=np.int32),
+                                  rng.uniform(0, 1, 20).astype(np.float32), moved, steps, tuple(rng.uniform(0, 1, 6))))
+        about = {"set": "tool", "number": k, "split": "test" if k else "train", "drawn": {"tool": "sphere"}}
+        out.append((ContactId(next(iter(plan_layers)), "tool", k), Part(about, records, [], {})))
+    return out
+
+
+def test_what_is_written_comes_back_within_its_rounding(tmp_path: Path) -> None:
+    made = layers(PLAN)
+    parts, file = made_up(made), tmp_path / "some.npz"
+    assert write(file, PLAN, made, parts) == 4
+    again = Released(file)
+    assert again.plan == PLAN and len(again) == 2
+    for (name, part), (other, read) in zip(parts, again.parts(), strict=True):
+        assert name == other and part.about == read.about
+        for one, two in zip(part.records, read.records, strict=True):
+            np.testing.assert_array_equal(one.loaded, two.loaded)
+            np.testing.assert_allclose(one.values, two.values, rtol=1e-3, atol=1e-4)
+            size = np.linalg.norm(one.steps, axis=1)
+            np.testing.assert_array_equal(one.moved[size > LEAST * size.max()], two.moved)
+            kept = one.steps[np.isin(one.moved, two.moved)]
+            assert np.abs(kept - two.steps).max() <= 0.5 * size.max() / STEPS + 1
+            assert one.figures == pytest.approx(two.figures)
+    layer, other = made[BODY.name], again.layers[BODY.name]
+    np.testing.assert_allclose(layer.vertices, other.vertices, atol=1e-7)
+    np.testing.assert_array_equal(layer.faces, other.faces)
+    assert other.tissue == layer.tissue
+    only = list(again.samples("test"))
+    assert len(only) == 2 and only[0].info["number"] == 1
+    assert np.linalg.norm(only[0].displacement, axis=1).max() == pytest.approx(
+        QUANTUM * np.linalg.norm(parts[1][1].records[0].steps, axis=1).max(), rel=2e-3)  # fmt: skip
+
+
+@pytest.mark.parametrize("content", [b"", b"PK\x03\x04 cut", b"\x00" * 100])
+def test_a_file_that_is_none_is_refused_in_a_sentence(tmp_path: Path, content: bytes) -> None:
+    (tmp_path / "bad.npz").write_bytes(content)
+    with pytest.raises(InvalidInput, match="holds no released contacts"):
+        Released(tmp_path / "bad.npz")
+    with pytest.raises(InvalidInput, match="holds no released contacts"):
+        Released(tmp_path / "none.npz")
+
+
+@pytest.mark.slow
+def test_a_data_set_goes_on_from_released_contacts_and_holds_its_flat_presses(tmp_path: Path) -> None:
+    made, file = layers(PLAN), tmp_path / "some.npz"
+    (contact,) = contacts(PLAN)
+    first = made_up(made)[:1]
+    assert first[0][0] == contact  # so that nothing on the limb is left to solve
+    write(file, PLAN, made, first)
+    manifest = generate(PLAN, tmp_path / "out", workers=1, start=file)
+    assert manifest["samples"] == 2 and manifest["rounds"] == 1
+    assert len(Dataset.open(tmp_path / "out")) == 2
+    (press,) = read_all(tmp_path / "out")
+    assert press.body == BODY.name and press.tool == drawn(PLAN, 0)[1] and len(press.rounds) == 2
+    with pytest.raises(InvalidInput, match="another plan"):
+        generate(PLAN.model_copy(update={"seed": 1}), tmp_path / "other", workers=1, start=file)
+
+
+def test_flat_presses_take_every_stack_that_is_learnt_from_and_no_other() -> None:
+    bodies = learnt(TISSUE)
+    assert {b.name for b in bodies} == {b.name for b in TISSUE.bodies if not b.held_out}
+    names = {drawn(TISSUE, k)[0].name for k in range(len(bodies))}
+    assert len(names) == len(bodies)
+    for k in range(40):
+        _, tool, depths = drawn(TISSUE, k)
+        assert 0 < tool.rounding <= tool.width + 1e-12 and np.all(np.diff(depths) > 0)
+        assert drawn(TISSUE, k)[1:] == (tool, depths)
+    kept = Pressed.read(Pressed("x", BALL, []).write())
+    assert kept == Pressed("x", BALL, [])
+
+
+def test_a_plate_carries_what_the_rings_carry(press: Pressed) -> None:
+    layer = plate(tissue_of(BODY), 0.02, 1.5e-3)
+    for one in press.rounds:
+        force = layer.tissue.youngs_modulus * float(pressure_on(layer, one) @ layer.vertex_areas)
+        assert force == pytest.approx(one.force, rel=1e-3)
+    assert layer.normals[len(layer.vertices) // 2] @ [0, 0, 1] > 0.999
+
+
+def test_a_light_press_into_a_flat_stack_is_the_linear_layers(press: Pressed) -> None:
+    rows = list(flat_rows(PLAN, press))
+    assert len(rows) == 2
+    linear, true = ([float(getattr(r, v) @ getattr(r, a)) for r in rows] for v, a in
+                    (("prior", "area"), ("true", "vertex_area")))  # fmt: skip
+    assert linear[0] == pytest.approx(true[0], rel=0.08) and linear[1] < true[1]
+    parts = STACK_NODE.split(rows[0].rows)
+    for name in ("curvature", "curvature_over_strain", "given_way"):
+        assert not parts[name].any()  # flat, and nothing to give way as a whole
+
+
+def test_a_law_of_ones_own_is_judged_like_ours(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """The truth itself is off by nothing, half of it by half; and the file that ships can be read."""
+    scene = next(limbs.pressed(Released(limbs.FILE).samples("held_out")))
+    force, motion = scene.touch.wrench[:3], scene.sample.displacement
+    assert limbs.off(scene, force, motion)[:3] == (0, 0, 0)
+    half = limbs.off(scene, 0.5 * force, 0.5 * motion)
+    assert half.force == pytest.approx(-0.5) and half.worst == pytest.approx(0.5) and 0.05 < half.moves < 0.5
+    laws = limbs.Laws(scene.sample.layer, lambda layer, tool, pose, way: (0.9 * force, None))
+    found = laws.answers(scene)
+    assert found["yours"].force == pytest.approx(-0.1) and np.isnan(found["yours"].worst)
+    assert abs(found["moment_net"].force) < abs(found["elastic foundation"].force)
+    assert limbs.export([scene.sample], tmp_path) == 1
+    assert len(list(tmp_path.glob("*.stl"))) == 2 and "force_on_limb_N" in (tmp_path / "scenes.json").read_text()
