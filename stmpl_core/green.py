@@ -184,8 +184,9 @@ class Green:
         if share < 1:
             out += (1 - share) * _held(blocks, ways)
         if share > 0:
-            goes = (blocks @ rubs.ravel()).reshape(-1, 3)
-            out += share * np.vdot(rubs, ways) / np.vdot(rubs, goes) * rubs
+            work = float(rubs.ravel() @ (blocks @ rubs.ravel()))
+            if work > 0:  # else nothing presses, or nothing goes along the skin
+                out += share * float(np.vdot(rubs, ways)) / work * rubs
         return out
 
     def _blocks(self, nodes: Nodes, group: np.ndarray) -> np.ndarray:

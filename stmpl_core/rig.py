@@ -116,14 +116,14 @@ class Rig:
         Raises:
             InvalidInput: another part, or a layer that is no part of the body's skin.
         """
-        check_part(part)
+        (joint_name,) = joints_of(part)
         side, _, name = part.partition("_")
         names = [f"{side}_{segment}" for segment in SEGMENTS[name]]
         bones = bones_of(body, part)
         weights = spread(layer, _weights_on(body, layer, names), SPREAD)
-        hinge, axis, most = HINGES[name]
+        _, axis, most = HINGES[name]
         heads, axis, bent = _hinge(bones, np.array(axis))
-        joint = Joint(f"{side}_{hinge}", names[1], (axis[0], axis[1], axis[2]), -bent, most - bent)
+        joint = Joint(joint_name, names[1], (axis[0], axis[1], axis[2]), -bent, most - bent)
         return cls(tuple(names), (-1, 0), heads, weights, (joint,))
 
     @property
@@ -188,12 +188,14 @@ class Rig:
             raise InvalidInput(f"this is no rig: {error}.") from error
 
 
-def check_part(part: str) -> None:
-    """Raises InvalidInput for a part without joints that Rig.of knows."""
+def joints_of(part: str) -> tuple[str, ...]:
+    """Names of the joints that Rig.of gives a part. Raises InvalidInput for a part without any that it knows."""
     known = [f"{side}_{limb}" for side in ("left", "right") for limb in SEGMENTS]
     if part not in known:
         raise InvalidInput(f"{part!r} has no joints that are known. Known: {', '.join(known)}. Or give bones, weights "
                            "and joints of your own to Rig.")  # fmt: skip
+    side, _, name = part.partition("_")
+    return (f"{side}_{HINGES[name][0]}",)
 
 
 def about(centre: np.ndarray, axis: np.ndarray, angle: float) -> np.ndarray:

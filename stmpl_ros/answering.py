@@ -175,7 +175,7 @@ class Answering:
             self._hearing.gate.say("joints", doubt)
         asked = Asked(instant, reaction, self._fields, self._epoch, seconds, tuple(self._news), said, skin, doubt)
         self._field.put(asked)
-        self.sending.models.put(instant, touches, reaction.before)
+        self.sending.models.put(instant, touches, reaction.before, doubt)
         if not any(skin.angles) and not doubt:  # a fit knows the skin at rest
             self._calibration.put(instant, touches)
         if self.limits:

@@ -13,7 +13,7 @@ from stmpl_core.friction import Friction, friction_from
 from stmpl_core.layer import SoftLayer
 from stmpl_core.living import held_skin, living, read_model, read_tissue, region_of
 from stmpl_core.regions import Tone
-from stmpl_core.rig import Rig, check_part
+from stmpl_core.rig import Rig, joints_of
 from stmpl_core.simulator import Simulator
 from stmpl_core.skin import Skin, published
 from stmpl_core.state import State
@@ -27,6 +27,7 @@ if TYPE_CHECKING:
 Build = Callable[[NodeConfig], SoftLayer]
 STIFFNESS = {"youngs_modulus", "density"}  # settings that change neither geometry nor what is felt around a vertex
 ON_STACKS = ("moment_net", "limb_linear", "ladder")  # methods that know skin, fat and muscle
+MOVED = ("moment_net", "linear", "limb_linear", "winkler", "naive", "zero")  # methods that go along with joints
 AT_ONCE = {"friction"}  # settings that the skin does not know of
 QUICK = {"moment_net", "winkler", "naive"}  # methods that such a change costs no preparation
 
@@ -65,6 +66,9 @@ def check(config: NodeConfig, build: Build, changed: set[str] | None = None) -> 
         build: function that makes the layer.
         changed: names of the settings that were asked for; None: all that are not as by default.
     """
+    if config.joint_states and config.method not in MOVED:
+        raise InvalidInput(f"{config.method} knows a limb at rest only; one that moves is known to {', '.join(MOVED)}. "
+                           "Take one of these, or leave joint_states empty.")  # fmt: skip
     if build is layer_of:
         from stmpl_core.body import Body
 
@@ -76,7 +80,10 @@ def check(config: NodeConfig, build: Build, changed: set[str] | None = None) -> 
 
         Body.anny().level(config.limb)
         if config.joint_states:
-            check_part(config.limb)
+            known = joints_of(config.limb)
+            if unknown := sorted(set(config.joint_names) - set(known)):
+                raise InvalidInput(f"joints names {', '.join(unknown)}, which {config.limb} has not; it has "
+                                   f"{', '.join(known)}. Its own name comes first, as in left_elbow=elbow_2.")
         stacked = config.tissue != PAPER
         if config.tissue in get_args(Tone):
             region_of(config.limb)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import rclpy
 from sensor_msgs.msg import JointState
-from stmpl_msgs.msg import SkinDeformed
+from stmpl_msgs.msg import LocalContact, SkinDeformed
 
 from bags.replay import replay, replay_run
 from bags.run import Run
@@ -116,12 +116,16 @@ def test_what_no_joint_can_be_is_refused_and_the_limb_stays(bus, person):
 
 def test_a_sensor_that_falls_silent_is_said_and_flagged_and_comes_back(bus, person):
     hand = bus.tool("probe").ready()
+    models, heard = bus.got["tools/probe/local_contact"], bus.listen(LocalContact, "tools/probe/local_contact", STREAM)
     assert "joint states" not in at_angle(bus, person, hand, 0.1).why
     bus.spin(1.2)
     answer = hand.ask(HERE)
+    bus.wait(lambda: (hand.ask(HERE), models and not models[-1].in_range)[1], "a model that says so, too")
     assert "the limb is taken to be where it was" in answer.why and not answer.in_range
     assert list(answer.joints) == [0.1] and bus.said("the limb is taken to be where it was")
     assert "joint states" not in at_angle(bus, person, hand, 0.15).why
+    bus.wait(lambda: (at_angle(bus, person, hand, 0.15), models[-1].in_range)[1], "a model that is trusted again")
+    bus.node.destroy_subscription(heard)
 
 
 def test_without_a_tool_the_skin_follows_its_joints(bus, person):

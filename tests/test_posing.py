@@ -12,11 +12,13 @@ from stmpl_core.body import Body
 from stmpl_core.bones import Bone, to_bone
 from stmpl_core.errors import InvalidInput
 from stmpl_core.layer import layer_id
+from stmpl_core.load import Load
 from stmpl_core.methods import Coarse, Linear, MomentNet, Winkler
 from stmpl_core.methods import method as method_named
 from stmpl_core.methods.base import anew
 from stmpl_core.rig import Joint, Rig
 from stmpl_core.soundness import HOLLOW
+from stmpl_ros.making import MOVED
 from tests.scenes import LENGTH, RADIUS, at, ball, limb
 
 MIDDLE = np.array([0.0, 0, LENGTH / 2])
@@ -108,6 +110,22 @@ def test_a_pose_tends_to_the_rest(skin):
     rest, bent = Simulator(skin).step([contact]), Simulator(skin.posed({"elbow": 1e-7})).step([contact])
     assert np.abs(bent.displacement - rest.displacement).max() < 1e-3 * np.abs(rest.displacement).max()
     np.testing.assert_allclose(bent.touches["probe"].wrench, rest.touches["probe"].wrench, rtol=1e-3, atol=1e-6)
+
+
+@pytest.mark.parametrize("name", [name for name in MOVED if name != "moment_net"])
+def test_every_method_that_a_node_takes_along_turns_with_the_bones(name):
+    """A limb that one bone carries whole: what it answers is what it answered at rest, turned."""
+    layer = limb(6e-3)
+    whole = layer.with_(rig=carried_whole(layer))
+    simulator = Simulator(Skin.of(whole, method_named(name)))
+    simulator.pose({"shoulder": 0.7})
+    turn = simulator.skin.turn_at(0)
+    shift = simulator.layer.vertices[0] - turn @ layer.vertices[0]
+    pressure = np.where(np.linalg.norm(layer.vertices - [RADIUS, 0, 0.05], axis=1) < 0.01, 100.0, 0.0)
+    there, here = (one.solve(Load.pressure(pressure)).displacement
+                   for one in (simulator.skin.method, method_named(name).prepare(layer)))  # fmt: skip
+    np.testing.assert_allclose(simulator.layer.vertices, layer.vertices @ turn.T + shift, atol=1e-9)
+    np.testing.assert_allclose(there, here @ turn.T, atol=1e-4 * max(np.abs(here).max(), 1e-12))
 
 
 @pytest.mark.parametrize("tissue", [Tissue(), STACK], ids=["one material", "stack to the bone"])
