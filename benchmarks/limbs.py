@@ -14,7 +14,6 @@ from __future__ import annotations
 import argparse
 import json
 import logging
-import runpy
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
@@ -34,6 +33,7 @@ from stmpl_core.console import steps_bar
 from stmpl_core.contact_net import ContactNet
 from stmpl_core.methods import MomentNet
 from stmpl_core.simulator import Simulator
+from studies.own import own
 from studies.pressed import STRAIGHT, Pressed, pressed, slant_of
 
 FILE = Path(__file__).with_name("limbs_v1.npz")
@@ -168,8 +168,7 @@ def main() -> None:
     if options.export:
         print(f"{export(released.samples(), options.export)} scenes in {options.export}")
         return
-    path, _, name = options.answers.rpartition(":")
-    other = runpy.run_path(path)[name] if path else None
+    other = own(options.answers) if options.answers else None
     for split in options.splits:
         found = compare(released, SPLITS[split], other)
         Console(width=130).print(table(f"{split} limbs", found))

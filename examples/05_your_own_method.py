@@ -4,7 +4,7 @@ Purpose: try an idea against columns, a closed form, the network and finite elem
 Shows: the protocol of a method (`name`, `prepare`, `solve`), its trust, and `stmpl_core.metrics.score`.
 
     .venv/bin/python examples/05_your_own_method.py
-    .venv/bin/stmpl stability --preset quick --methods my_module:Halfway     # in a module of yours: where it fails
+    .venv/bin/stmpl stability --preset quick --methods examples/05_your_own_method.py    # where it fails
 """
 
 from typing import Self

@@ -193,14 +193,14 @@ def stability(
     """Where methods fail: pressures, meshes, tools and more, swept until a law breaks; a table and a picture.
 
     Example: stmpl stability --methods moment_net winkler
-    Your own: stmpl stability --methods my_module:MyMethod
+    Your own: stmpl stability --methods yours.py
     Random contacts: stmpl stability --fuzz 10000 --methods moment_net
     One failure again: stmpl stability --again runs/stability/failures/pressure_5_E.moment_net.json
     The finite elements' own limits: stmpl stability --critical-load --out critical_load.png
 
     Args:
-        methods: names (zero, naive, winkler, linear, moment_net, unet, fem_1_step, fem, ladder), or
-            module:attribute.
+        methods: names (zero, naive, winkler, linear, moment_net, unet, fem_1_step, fem, ladder), or a file of
+            yours with a class that has prepare and solve; file.py:attribute or module:attribute where there are more.
         preset: default (minutes a method, on the arm), quick (seconds, on a round limb).
         only: axes to sweep: all, those of pressures, those of rigid tools, those of strokes with a state.
         out: folder of report, tables, picture and failures, runs/stability unless given; the picture with

@@ -1,8 +1,10 @@
 """The stability suite itself: each law catches the method that is made to break it, and no other law does."""
 
 import json
+import re
 from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -251,6 +253,46 @@ def test_methods_are_found_by_name_and_by_module_and_attribute():
         with pytest.raises(InvalidInput, match=said):
             maker(name)
     assert set(METHODS) >= {"naive", "winkler", "linear", "moment_net", "unet", "fem", "fem_1_step", "ladder"}
+
+
+YOURS = """
+from stmpl_core import Displacement, Trust
+from stmpl_core.methods import Linear
+
+class Careful:
+    name = "careful"
+
+    def prepare(self, layer):
+        self.inner = Linear().prepare(layer)
+        return self
+
+    def solve(self, load):
+        return Displacement(0.9 * self.inner.solve(load).displacement, Trust(in_range=False, why="a guess"), self.name)
+"""
+
+
+def test_a_method_in_a_file_of_ones_own_is_the_class_in_it_or_the_one_that_is_named(tmp_path, monkeypatch):
+    """Word for word what docs/stability.md shows."""
+    page = (Path(__file__).parents[1] / "docs" / "stability.md").read_text()
+    (shown,) = re.findall(r"```python\n(.*?)```", page, re.S)
+    assert "".join(shown.split()) == "".join(YOURS.split())
+    file = tmp_path / "yours.py"
+    file.write_text(YOURS)
+    for name in (str(file), f"{file}:Careful"):
+        assert maker(name)().name == "careful"
+    monkeypatch.chdir(tmp_path)
+    report = stability({"yours.py": maker("yours.py")}, QUICK.only("pressures"), tmp_path)
+    counts = report.counts("yours.py")
+    assert counts["flagged"] and not counts["crashed"] and not counts["silent"]
+    for text, said in ((YOURS + "class Other(Careful):\n    pass\n", "has Careful, Other with prepare and solve. Say "
+                        "which"), ("x = 1\n", "has no class with prepare and solve"),
+                       ("import nothing_of_the_kind\n", "could not be run: ModuleNotFoundError")):  # fmt: skip
+        file.write_text(text)
+        with pytest.raises(InvalidInput, match=said):
+            maker(str(file))
+    with pytest.raises(InvalidInput, match="has no Nothing"):
+        file.write_text(YOURS)
+        maker(f"{file}:Nothing")
 
 
 def test_det_f_is_the_stretch_of_columns_that_are_pressed_evenly():

@@ -1,12 +1,9 @@
-"""Methods that the suite knows by name, and how to name any other: module:attribute."""
+"""Methods that the suite knows by name, and how to name any other: see studies.own."""
 
 from __future__ import annotations
 
 import copy
-import sys
-from importlib import import_module
-from pathlib import Path
-from typing import Any, cast
+from typing import cast
 
 from fem_tools.few_steps import FewSteps
 from fem_tools.ladder import ladder
@@ -14,7 +11,10 @@ from fem_tools.patch import PatchFem
 from stmpl_core.errors import InvalidInput
 from stmpl_core.methods import Linear, Method, MomentNet, Naive, UNet, Winkler
 from stmpl_core.methods.zero import Zero
+from studies.own import own
 from studies.stability.scene import Make
+
+PARTS = ("prepare", "solve")  # of a method
 
 
 def _ladder() -> Method:
@@ -28,23 +28,17 @@ METHODS: dict[str, Make] = {
 
 
 def maker(name: str) -> Make:
-    """What makes a method: one of METHODS, or `module:attribute`, a class, a function or a method object.
+    """What makes a method: one of METHODS, or a class, a function or a method object of one's own (see studies.own).
 
     Raises:
-        InvalidInput: no such method, module or attribute, or it lacks prepare and solve.
+        InvalidInput: no such method, module, file or attribute, or it lacks prepare and solve.
     """
     if name in METHODS:
         return METHODS[name]
-    module, colon, attribute = name.partition(":")
-    if not colon:
+    if ":" not in name and not name.endswith(".py"):
         known = ", ".join(METHODS)
-        raise InvalidInput(f"unknown method {name!r}. Available: {known}; or module:attribute of your own.")
-    if str(Path.cwd()) not in sys.path:  # where a person keeps a module of one's own
-        sys.path.insert(0, str(Path.cwd()))
-    try:
-        found: Any = getattr(import_module(module), attribute)
-    except (ImportError, AttributeError) as error:
-        raise InvalidInput(f"{name}: {error}. Give module:attribute, importable from {Path.cwd()}.") from error
+        raise InvalidInput(f"unknown method {name!r}. Available: {known}; or yours, as file.py or module:attribute.")
+    found = own(name, *PARTS)
     if callable(found):
         made = found()
         _check(name, made)
@@ -54,6 +48,6 @@ def maker(name: str) -> Make:
 
 
 def _check(name: str, method: object) -> None:
-    lacking = [part for part in ("prepare", "solve") if not callable(getattr(method, part, None))]
+    lacking = [part for part in PARTS if not callable(getattr(method, part, None))]
     if lacking:
         raise InvalidInput(f"{name} has no {' and no '.join(lacking)}: it does not follow stmpl_core.methods.Method.")
