@@ -283,7 +283,7 @@ def test_a_method_in_a_file_of_ones_own_is_the_class_in_it_or_the_one_that_is_na
     monkeypatch.chdir(tmp_path)
     report = stability({"yours.py": maker("yours.py")}, QUICK.only("pressures"), tmp_path)
     counts = report.counts("yours.py")
-    assert counts["flagged"] and not counts["crashed"] and not counts["silent"]
+    assert counts["held"] > 10 and not counts["crashed"] and not counts["silent"]
     for text, said in ((YOURS + "class Other(Careful):\n    pass\n", "has Careful, Other with prepare and solve. Say "
                         "which"), ("x = 1\n", "has no class with prepare and solve"),
                        ("import nothing_of_the_kind\n", "could not be run: ModuleNotFoundError")):  # fmt: skip
