@@ -31,6 +31,7 @@ from stmpl_core import Contact, SoftLayer, Tool
 from stmpl_core.columns import Columns
 from stmpl_core.console import steps_bar
 from stmpl_core.contact_net import ContactNet
+from stmpl_core.errors import InvalidInput
 from stmpl_core.methods import MomentNet
 from stmpl_core.simulator import Simulator
 from studies.own import own
@@ -175,7 +176,10 @@ def main() -> None:
     if options.export:
         print(f"{export(released.samples(), options.export)} scenes in {options.export}")
         return
-    other = own(options.answers) if options.answers else None
+    try:
+        other = own(options.answers) if options.answers else None
+    except InvalidInput as error:
+        given.error(str(error))
     for kind in options.limbs:
         Console(width=130).print(table(kind, compare(released, *LIMBS[kind], other)))
 

@@ -41,6 +41,8 @@ def own(name: str, *parts: str) -> Any:
         return made[attribute]
     fitting = {key: value for key, value in made.items() if isinstance(value, type)
                and value.__module__ == Path(place).stem and all(callable(getattr(value, part, None)) for part in parts)}
+    if not parts:
+        raise InvalidInput(f"{place} holds more than one thing. Say which, as in {place}:NAME.")
     if len(fitting) != 1:
         raise InvalidInput(f"{place} has {', '.join(fitting) or 'no class'} with {' and '.join(parts)}. "
                            f"Say which, as in {place}:NAME.")  # fmt: skip

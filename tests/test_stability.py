@@ -16,6 +16,7 @@ from stmpl_core.errors import InvalidInput
 from stmpl_core.methods import Winkler
 from stmpl_core.methods.zero import Zero
 from stmpl_core.trust import Trust
+from studies.own import own
 from studies.show import stability_markdown, stability_table
 from studies.stability import AXES, LAWS, METHODS, PRESETS, Report, again, maker, stability
 from studies.stability.contact_laws import CONTACT_LAWS
@@ -290,9 +291,10 @@ def test_a_method_in_a_file_of_ones_own_is_the_class_in_it_or_the_one_that_is_na
         file.write_text(text)
         with pytest.raises(InvalidInput, match=said):
             maker(str(file))
-    with pytest.raises(InvalidInput, match="has no Nothing"):
-        file.write_text(YOURS)
-        maker(f"{file}:Nothing")
+    file.write_text(YOURS)
+    for name, parts, said in ((f"{file}:Nothing", (), "has no Nothing"), (str(file), (), "Say which, as in")):
+        with pytest.raises(InvalidInput, match=said):
+            own(name, *parts)
 
 
 def test_det_f_is_the_stretch_of_columns_that_are_pressed_evenly():
