@@ -28,9 +28,7 @@ from rich.table import Table
 from fem_tools.plies import confined_modulus
 from fem_tools.released import Released
 from stmpl_core import Contact, SoftLayer, Tool
-from stmpl_core.columns import Columns
 from stmpl_core.console import steps_bar
-from stmpl_core.contact_net import ContactNet
 from stmpl_core.errors import InvalidInput
 from stmpl_core.methods import MomentNet
 from stmpl_core.simulator import Simulator
@@ -82,7 +80,7 @@ class Laws:
     def __init__(self, layer: SoftLayer, other: Answer | None) -> None:
         self.layer, self.other = layer, other
         self.simulator = Simulator(layer, MomentNet())
-        self.net, self.columns = ContactNet(layer), Columns(layer)
+        self.net = self.simulator.toucher.net
         self.modulus = np.array([confined_modulus(layer.tissue, float(t)) for t in layer.thickness])
 
     def answers(self, one: Pressed) -> dict[str, Off]:
