@@ -17,6 +17,7 @@ from stmpl_core.sdf import SignedDistance
 from stmpl_core.touch import MIN_ONE_WAY_SHARE
 
 LEAST_UNDER = 0.05  # how much further inside a tool a column gets below its skin than there, over the width of a wall
+BLOCK = 32  # columns that are looked at together
 HOLE_RADIUS = 0.6  # farthest point of a triangle from its corners, over the edge length (equilateral: 0.577)
 
 
@@ -69,6 +70,8 @@ class Columns:
         self._start = np.searchsorted(np.sort(corners), np.arange(len(self.points) + 1))
         self._slot = np.full(len(self.points), -1)
         self._tree = True  # a tree of boxes pays for itself only where the skin stays
+        self._order = _along_a_curve(self.points)
+        self._blocks = _balls(self.points, layer.thickness, self._order)
 
     def moved(self, layer: SoftLayer) -> Columns:
         """The same columns where joints take the skin."""
@@ -76,6 +79,7 @@ class Columns:
         out.__dict__.pop("_skin", None)
         out.layer, out.points, out.inward = layer, layer.vertices, np.ascontiguousarray(-layer.normals)
         out._tree = False
+        out._blocks = _balls(out.points, layer.thickness, self._order)
         return out
 
     @cached_property
@@ -107,7 +111,8 @@ class Columns:
             box = fcl.CollisionObject(fcl.Box(*(high - low + 2 * reach)), fcl.Transform(pose[:3, :3], centre))
             if not fcl.collide(self._skin, box):
                 return np.empty(0, np.int64)
-        return _through_box(self.points, self.inward, self.layer.thickness, pose, low - reach, high + reach, centre)
+        skin = self.points, self.inward, self.layer.thickness
+        return _through_box(*skin, self._order, self._blocks, pose, low - reach, high + reach, centre)
 
     def squeezed(self, field: SignedDistance, pose: Transform) -> Squeeze:
         """Squeeze of the columns by a tool at its pose."""
@@ -175,29 +180,61 @@ def grid_of(field: SignedDistance) -> tuple[np.ndarray, np.ndarray, float]:
     return field.coefficients, field.origin, field.spacing
 
 
+def _along_a_curve(points: Points) -> np.ndarray:
+    """Numbers of points (N, 3), those near each other in space mostly near each other in order: Morton's, (N,)."""
+    cells = (1023 * (points - points.min(axis=0)) / max(float(np.ptp(points, axis=0).max()), 1e-12)).astype(np.int64)
+    code = np.zeros(len(points), np.int64)
+    for bit in range(10):
+        for axis in range(3):
+            code |= (cells[:, axis] >> bit & 1) << (3 * bit + axis)
+    return np.argsort(code, kind="stable")
+
+
+@numba.njit(cache=True, nogil=True)
+def _balls(points, thickness, order):
+    """Middle and radius of a ball around each BLOCK columns in order, (B, 4) [m]."""
+    many = (len(order) + BLOCK - 1) // BLOCK
+    out = np.zeros((many, 4))
+    for b in range(many):
+        some = order[b * BLOCK : (b + 1) * BLOCK]
+        for v in some:
+            for x in range(3):
+                out[b, x] += points[v, x] / len(some)
+        for v in some:
+            square = 0.0
+            for x in range(3):
+                square += (points[v, x] - out[b, x]) ** 2
+            out[b, 3] = max(out[b, 3], np.sqrt(square) + thickness[v])
+    return out
+
+
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _through_box(points, inward, thickness, pose, low, high, centre):
-    """Numbers of the columns that pass a box of the tool's frame, whose centre is given in the body's."""
+def _through_box(points, inward, thickness, order, blocks, pose, low, high, centre):
+    """Numbers of the columns, rising, that pass a box of the tool's frame, whose centre is given in the body's."""
     found, n, radius = np.empty(len(points), np.int64), 0, 0.0
     for x in range(3):
         radius += 0.25 * (high[x] - low[x]) ** 2
     radius = np.sqrt(radius)
-    for v in range(len(points)):
-        a, b, c, t = points[v, 0] - centre[0], points[v, 1] - centre[1], points[v, 2] - centre[2], thickness[v]
-        if a * a + b * b + c * c > (radius + t) ** 2:
+    for block in range(len(blocks)):
+        a, b, c = blocks[block, 0] - centre[0], blocks[block, 1] - centre[1], blocks[block, 2] - centre[2]
+        if a * a + b * b + c * c > (radius + blocks[block, 3]) ** 2:
             continue
-        ray, begin, end = ray_of(pose, points, inward, v), 0.0, t
-        for x in range(3):  # the part of the column between two sides of the box
-            start, way = (ray[0], ray[3]) if x == 0 else (ray[1], ray[4]) if x == 1 else (ray[2], ray[5])
-            if abs(way) < 1e-12:
-                end = end if low[x] <= start <= high[x] else -1.0
+        for v in order[block * BLOCK : (block + 1) * BLOCK]:
+            a, b, c, t = points[v, 0] - centre[0], points[v, 1] - centre[1], points[v, 2] - centre[2], thickness[v]
+            if a * a + b * b + c * c > (radius + t) ** 2:
                 continue
-            first, last = (low[x] - start) / way, (high[x] - start) / way
-            begin, end = max(begin, min(first, last)), min(end, max(first, last))
-        if begin <= end:
-            found[n] = v
-            n += 1
-    return found[:n].copy()
+            ray, begin, end = ray_of(pose, points, inward, v), 0.0, t
+            for x in range(3):  # the part of the column between two sides of the box
+                start, way = (ray[0], ray[3]) if x == 0 else (ray[1], ray[4]) if x == 1 else (ray[2], ray[5])
+                if abs(way) < 1e-12:
+                    end = end if low[x] <= start <= high[x] else -1.0
+                    continue
+                first, last = (low[x] - start) / way, (high[x] - start) / way
+                begin, end = max(begin, min(first, last)), min(end, max(first, last))
+            if begin <= end:
+                found[n] = v
+                n += 1
+    return np.sort(found[:n])
 
 
 @numba.njit(cache=True, nogil=True)

@@ -20,7 +20,9 @@ from stmpl_core.rays import (
     distance_in_column,
     inside_most,
     ray_from,
+    to_tool,
 )
+from stmpl_core.sdf import distance_at
 
 NODES = 80  # number of nodes under a tool, about
 WIDEST = 0.45  # largest spacing of nodes, over the thickness
@@ -138,12 +140,19 @@ def _nodes(grid, pose, centre, points, inward, thickness, faces, found, sunk):
 
 
 @numba.njit(cache=True, nogil=True)
-def _mixed(points, inward, thickness, faces, f, a, b, c, row):
-    """Writes point, unit inward normal and thickness at barycentric coordinates of a triangle to row[:7]."""
+def _point(points, faces, f, a, b, c, row):
+    """Writes the point at barycentric coordinates of a triangle to row[:3]."""
+    i, j, k = faces[f, 0], faces[f, 1], faces[f, 2]
+    for x in range(3):
+        row[x] = a * points[i, x] + b * points[j, x] + c * points[k, x]
+
+
+@numba.njit(cache=True, nogil=True)
+def _column(inward, thickness, faces, f, a, b, c, row):
+    """Writes unit inward normal and thickness at barycentric coordinates of a triangle to row[3:7]."""
     i, j, k = faces[f, 0], faces[f, 1], faces[f, 2]
     length = 0.0
     for x in range(3):
-        row[x] = a * points[i, x] + b * points[j, x] + c * points[k, x]
         row[3 + x] = a * inward[i, x] + b * inward[j, x] + c * inward[k, x]
         length += row[3 + x] * row[3 + x]
     length = 1 / np.sqrt(max(length, 1e-300))
@@ -196,7 +205,9 @@ def _look(grid, pose, points, inward, thickness, faces, found, sunk, split):
                     if flip == 1 and r == split - p - 1:
                         continue
                     a, b = (p + (1 + flip) / 3) / split, (r + (1 + flip) / 3) / split
-                    _mixed(points, inward, thickness, faces, f, a, b, 1 - a - b, row)
+                    _point(points, faces, f, a, b, 1 - a - b, row)
+                    if sunk:
+                        _column(inward, thickness, faces, f, a, b, 1 - a - b, row)
                     depths[m, q] = _depth_at(grid, pose, row, sunk)
                     for x in range(3):
                         middles[m, q, x] = row[x]
@@ -214,10 +225,11 @@ def _look(grid, pose, points, inward, thickness, faces, found, sunk, split):
 
 @numba.njit(cache=True, nogil=True)
 def _depth_at(grid, pose, row, sunk):
-    """Depth of the skin at row[:7] in the tool [m], or where the tool has sunk under it, of its column."""
-    ray = ray_from(pose, row[0], row[1], row[2], row[3], row[4], row[5])
-    depth = -distance_in_column(grid, ray, 0.0)
+    """Depth of the skin at row[:3] in the tool [m], or where the tool has sunk under it, of its column, row[3:7]."""
+    x, y, z = to_tool(pose, row[0], row[1], row[2])
+    depth = -distance_at(grid[0], grid[1], grid[2], x, y, z)
     if sunk and depth < 0:
+        ray = ray_from(pose, row[0], row[1], row[2], row[3], row[4], row[5])
         return max(depth, inside_most(grid, ray, max(depth_in_column(grid, ray, row[6], 0.0), 0.5 * row[6])))
     return depth
 
@@ -348,11 +360,16 @@ def _lay(grid, pose, centre, points, inward, thickness, faces, found, sunk, dept
                     if a < -1e-9 or b < -1e-9 or c < -1e-9:
                         continue
                     taken[j - low, i - left] = True
-                    _mixed(points, inward, thickness, faces, f, a, b, c, row)
-                    row[7] = cell / max(row[3] * way[0] + row[4] * way[1] + row[5] * way[2], FACING)
+                    _point(points, faces, f, a, b, c, row)
+                    if sunk or not only_look:
+                        _column(inward, thickness, faces, f, a, b, c, row)
                     if only_look:
-                        sum_area += row[7] * min(max(0.5 + _depth_at(grid, pose, row, sunk) / blur, 0.0), 1.0)
+                        share = min(max(0.5 + _depth_at(grid, pose, row, sunk) / blur, 0.0), 1.0)
+                        if share > 0:
+                            _column(inward, thickness, faces, f, a, b, c, row)
+                            sum_area += share * cell / max(row[3] * way[0] + row[4] * way[1] + row[5] * way[2], FACING)
                         continue
+                    row[7] = cell / max(row[3] * way[0] + row[4] * way[1] + row[5] * way[2], FACING)
                     row[8] = _strain_under(grid, pose, row, sunk)
                     if row[8] <= 0:
                         continue

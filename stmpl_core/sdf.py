@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Self
 
 import numba
@@ -98,6 +99,12 @@ class SignedDistance:
         probes = np.concatenate([used, vertices[faces].mean(axis=1)])
         error = float(np.abs(_distances(coefficients, origin, spacing, probes)).max())
         return cls(coefficients, origin, spacing, watertight, flipped, error, (low, low + extent))
+
+    @cached_property
+    def thinnest(self) -> float:
+        """Least extent of the mesh along its axes [m]."""
+        low, high = self.tool_bounds
+        return float((high - low).min())
 
     @property
     def bounds(self) -> tuple[np.ndarray, np.ndarray]:

@@ -84,11 +84,13 @@ class Soundness:
         self.steep = slope_of_thickness(layer) > STEEP
         self.long = longest_over_width(layer) > LONG
         self.border = border_distance(layer) / layer.thickness
+        self._doubtful = self.steep | self.long | (self.border < BORDER)
 
     def at(self, bend: Bend) -> Self:
         """The same of a skin that joints have bent."""
         out = copy(self)
         out.bend = bend
+        out._doubtful = self._doubtful | bend.spoilt
         return out
 
     def of_mesh(self, steep: float, long: float, where: str) -> list[str]:
@@ -112,6 +114,8 @@ class Soundness:
 
     def of_contact(self, loaded: np.ndarray, force: np.ndarray) -> list[str]:
         """What is wrong with the skin under a tool that presses with forces (L,) on vertices (L,), as sentences."""
+        if not self._doubtful[loaded].any():
+            return []
         total = max(float(force.sum()), 1e-300)
         steep, long = (float(force[mask[loaded]].sum()) / total for mask in (self.steep, self.long))
         return [*self.of_mesh(steep, long, "the force"), *self.of_load(loaded, force)]

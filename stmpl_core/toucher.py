@@ -315,18 +315,18 @@ class Toucher:
         wrench = _wrench(pressure, v, layer.vertices, layer.vertex_area_vectors, one.pose[:3, 3])
         scale = 1.0
         if one.force is not None and len(v):
-            scale = one.force / max(float(np.linalg.norm(wrench[:3])), 1e-300)
+            scale = one.force / max(math.sqrt(wrench[:3] @ wrench[:3]), 1e-300)
             pressure, wrench = scale * pressure, scale * wrench
         values = np.zeros(len(layer.vertices))
         values[v] = pressure
         stated = one.contact.wrench
         depth = self._depth(one.squeeze) if len(v) and not one.factor > 1 else one.depth
         way = stated[:3] / np.linalg.norm(stated[:3]) if stated is not None and stated[:3].any() else None
-        size, known = float(np.linalg.norm(wrench[:3])), self.net.weights.card["bound"]
+        size, known = math.sqrt(wrench[:3] @ wrench[:3]), self.net.weights.card["bound"]
         doubt = scale * one.factor * self._modulus * float(held.doubt @ nodes.area) / max(size, 1e-300)
         doubt += held.power * one.field.surface_error / max(depth, one.field.surface_error)  # how well depth is known
         forces_there = there * nodes.area
-        strange = float(forces_there[held.outside].sum() / max(forces_there.sum(), 1e-300))
+        strange = float(forces_there @ held.outside) / max(float(forces_there.sum()), 1e-300)
         touch = Touch(
             one.contact.name, one.status, one.pose, wrench,
             depth=depth if np.isfinite(depth) else float("nan"),
@@ -362,8 +362,7 @@ class Toucher:
         if deepest > card["ranges"]["depth_over_thickness"][1] and one.status != IN_CORE:
             trust = trust.also(f"{name} presses to {deepest:.0%} of the thickness, learnt is "
                                f"{card['ranges']['depth_over_thickness'][1]:.0%}", in_range=False)  # fmt: skip
-        extent = np.subtract(*one.field.tool_bounds[::-1])
-        thinnest = float(extent.min())
+        thinnest = one.field.thinnest
         if thinnest < THIN * layer.edge_length and touch.depth > SUNK * thinnest and one.status != IN_CORE:
             trust = trust.also(f"{name} is {1e3 * thinnest:.2g} mm thick, thin beside the skin's edges of "
                                f"{1e3 * layer.edge_length:.2g} mm, and {1e3 * touch.depth:.2g} mm deep", in_range=False)
@@ -391,14 +390,14 @@ class Toucher:
         """The trust in a touch, lowered where much of the stated wrench (6,) is not carried."""
         if touch.pressed is None:
             return trust
-        name, field = touch.name, touch.pressed.field
-        area = float(touch.pressed.squeeze.nodes.area.sum())
-        force, drag = touch.force, touch.drag
-        lever = float(np.linalg.norm(touch.missing[3:])) / max(force, 1e-300)
-        slack = min(self.reach, float(np.subtract(*field.tool_bounds[::-1]).max()))
-        if stated is not None and stated[3:].any() and lever > max(MAX_LEVER * (area / np.pi) ** 0.5, slack):
-            trust = trust.also(f"{name} also turns with {1e3 * force * lever:.2g} N mm, which is not carried",
-                               in_range=False)  # fmt: skip
+        name, force, drag = touch.name, touch.force, touch.drag
+        if stated is not None and stated[3:].any():
+            lever = float(np.linalg.norm(touch.missing[3:])) / max(force, 1e-300)
+            area = float(touch.pressed.squeeze.nodes.area.sum())
+            slack = min(self.reach, float(np.subtract(*touch.pressed.field.tool_bounds[::-1]).max()))
+            if lever > max(MAX_LEVER * (area / np.pi) ** 0.5, slack):
+                trust = trust.also(f"{name} also turns with {1e3 * force * lever:.2g} N mm, which is not carried",
+                                   in_range=False)  # fmt: skip
         if drag > MAX_DRAG_RATIO * force:
             trust = trust.also(f"{name} also drags with {drag:.2g} N, which is not carried", in_range=False)
         return trust

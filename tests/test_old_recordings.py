@@ -24,7 +24,7 @@ from tests.scenes import LENGTH, RADIUS, at, ball, band, box, capsule, limb, pun
 
 FILE = Path(__file__).with_name("answers_before.npz")
 SAMPLE = Path(__file__).parents[1] / "bags" / "sample"
-ELSEWHERE = 1e-7  # m that another processor may differ by
+ELSEWHERE = 5e-7  # m, where another processor sums in another order, and an iteration may end one step later: 1.5e-7 seen
 METHODS = {"moment_net": MomentNet, "linear": Linear}
 SKINS: list[dict[str, Any]] = [  # in the order of the file's thicknesses
     {"method": "moment_net", "youngs_modulus": 1e3, "poisson_ratio": 0.4},
