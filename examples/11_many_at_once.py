@@ -1,9 +1,9 @@
-"""09 Many at once: a small policy learns to press a living forearm with 5 N, wherever it begins.
+"""11 Many at once: a small policy learns to press a living forearm with 5 N, wherever it begins.
 
 Purpose: learning and search ask about thousands of scenes that know nothing of each other.
 Shows: `Batch`: poses in, wrenches out, on all cores; each scene goes on from a state of its own.
 
-    .venv/bin/python examples/09_many_at_once.py
+    .venv/bin/python examples/11_many_at_once.py
 """
 
 import numpy as np
