@@ -11,7 +11,7 @@ and with B (6, N) the wrench of a unit force at each node, dW = B df + dB f, plu
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -36,10 +36,12 @@ class Tangent(NamedTuple):
         stiffness: d wrench / d twist of its tool, (6, 6) [N/m, N/rad; N m/m, N m/rad]; the twist is (translation of
             the tool's origin, rotation vector), in layer axes.
         whole: d of the sum of the sizes of its forces, likewise, (6,) [N/m, N/rad].
+        across: d wrench / d twist of each tool that it may feel through the skin, by that tool's name, (6, 6) each.
     """
 
     stiffness: np.ndarray
     whole: np.ndarray
+    across: Mapping[str, np.ndarray]
 
 
 class _Rates(NamedTuple):
@@ -59,22 +61,28 @@ class _Rates(NamedTuple):
 def tangents(toucher: Toucher, touches: Sequence[Touch]) -> list[Tangent | None]:
     """Tangent of each touch of elastic skin; None where nothing presses.
 
-    Tools that feel each other stay where they are: each one's forces give way as those beside it press.
+    Tools that feel each other stay where they are: each one's forces give way as those beside it press. What moving
+    those does to it is `across`.
 
     Args:
         toucher: contact law that found the touches.
         touches: its touches of one instant.
     """
     out: list[Tangent | None] = [None] * len(touches)
+    for group in groups_that_press(toucher, touches):
+        for k, one in zip(group, _of_group(toucher, [touches[k] for k in group]), strict=True):
+            out[k] = one
+    return out
+
+
+def groups_that_press(toucher: Toucher, touches: Sequence[Touch]) -> list[list[int]]:
+    """Numbers of the touches that press, in groups, between which none feels another (see `groups_of`)."""
     pressing = sorted((k for k, one in enumerate(touches) if one.pressed is not None and one.force > 0),
                       key=lambda k: touches[k].name)  # fmt: skip
     parts = {k: touches[k].pressed for k in pressing}
     thickest = float(toucher.layer.thickness.max())
-    for group in groups_of([parts[k].squeeze.nodes.points for k in pressing], thickest):  # type: ignore[union-attr]
-        some = [pressing[n] for n in group]
-        for k, one in zip(some, _of_group(toucher, [touches[k] for k in some]), strict=True):
-            out[k] = one
-    return out
+    groups = groups_of([parts[k].squeeze.nodes.points for k in pressing], thickest)  # type: ignore[union-attr]
+    return [[pressing[n] for n in group] for group in groups]
 
 
 def _of_group(toucher: Toucher, touches: Sequence[Touch]) -> list[Tangent]:
@@ -94,13 +102,15 @@ def _of_group(toucher: Toucher, touches: Sequence[Touch]) -> list[Tangent]:
     out = []
     for k, (touch, one) in enumerate(zip(touches, parts, strict=True)):
         assert one.forces is not None
-        own = one.factor * slopes[6 * k : 6 * k + 6, slices[k]]
-        unit = _units(layer.vertices, layer.vertex_area_vectors, layer.vertex_areas, touch.pose_body_from_tool[:3, 3],
-                      every[k].corners)  # fmt: skip
-        corners = own[:, :, None] * every[k].shares + one.forces[:, None] * rates[k].shares  # force at each, (6, N, 3)
-        stiffness = (corners.reshape(6, -1) @ unit.reshape(-1, 6)).T.copy()
-        stiffness[3:, :3] += _cross_matrix(touch.push)
-        out.append(Tangent(stiffness, own.sum(axis=1)))
+        by = one.factor * slopes[:, slices[k]].reshape(len(touches), 6, -1)  # rates of its forces by each tool's twist
+        unit = unit_wrenches(layer.vertices, layer.vertex_area_vectors, layer.vertex_areas,
+                             touch.pose_body_from_tool[:3, 3], every[k].corners).reshape(-1, 6)  # fmt: skip
+        corners = by[:, :, :, None] * every[k].shares  # force at each
+        corners[k] += one.forces[:, None] * rates[k].shares
+        turned = (corners.reshape(len(touches), 6, -1) @ unit).transpose(0, 2, 1).copy()
+        turned[k, 3:, :3] += _cross_matrix(touch.push)
+        across = {other.name: turned[m] for m, other in enumerate(touches) if m != k}
+        out.append(Tangent(turned[k], by[k].sum(axis=1), across))
     return out
 
 
@@ -111,7 +121,7 @@ def _cross_matrix(force: np.ndarray) -> np.ndarray:
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _units(points, area_vectors, areas, origin, corners):
+def unit_wrenches(points, area_vectors, areas, origin, corners):
     """Wrench about the origin of a unit force at each corner of each node, (N, 3, 6)."""
     out, arm, f = np.empty((len(corners), 3, 6)), np.empty(3), np.empty(3)
     for n in range(len(corners)):
