@@ -9,10 +9,10 @@ that are made once.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from copy import copy, deepcopy
 from dataclasses import dataclass, replace
-from typing import Self
+from typing import Literal, Self, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -20,7 +20,7 @@ from numpy.typing import ArrayLike
 from stmpl_core.arrays import Transform, VertexVectors, Wrench, finite
 from stmpl_core.contact import Contact
 from stmpl_core.errors import InvalidInput
-from stmpl_core.layer import SoftLayer
+from stmpl_core.layer import thicker
 from stmpl_core.methods.base import Method
 from stmpl_core.nodes import Nodes
 from stmpl_core.sdf import SignedDistance
@@ -31,6 +31,9 @@ from stmpl_core.tool import Tool
 from stmpl_core.touch import Touch
 from stmpl_core.toucher import STIFFENING
 from stmpl_core.trust import Trust
+
+By = Literal["pose", "modulus", "thickness", "tool_scale"]
+EVERY: tuple[By, ...] = get_args(By)
 
 THICKNESS_STEP = 0.03  # difference of the thickness either way: wrenches keep 1.5 %, fields rise over their jumps
 TOOL_STEP = 0.04  # of a tool's size, at most: a sharp rim goes on by half a spacing of the contact's nodes
@@ -49,8 +52,8 @@ class WrenchGradient:
         pose: d wrench / d twist of the tool, (6, 6) [N/m, N/rad; N m/m, N m/rad]; the twist, by columns, is
             (translation of the tool's origin, rotation vector), in layer axes: see `twisted`.
         modulus: d wrench / d E, all moduli and the skin's tension in proportion, (6,) [N/Pa, N m/Pa].
-        thickness: d wrench / d factor of `thicker`, at 1, (6,) [N, N m].
-        tool_scale: d wrench / d factor on the tool's size about its own origin, at 1, (6,) [N, N m].
+        thickness: d wrench / d factor of `stmpl_core.layer.thicker`, at 1, (6,) [N, N m]; None: not asked for.
+        tool_scale: d wrench / d factor on the tool's size about its own origin, at 1, likewise.
         across: d wrench / d twist of each other tool that it feels through the skin, by that tool's name, (6, 6) each.
         trust: verdict on the touch, and so on its gradient.
     """
@@ -59,8 +62,8 @@ class WrenchGradient:
     wrench: Wrench
     pose: np.ndarray
     modulus: Wrench
-    thickness: Wrench
-    tool_scale: Wrench
+    thickness: Wrench | None
+    tool_scale: Wrench | None
     across: Mapping[str, np.ndarray]
     trust: Trust
 
@@ -71,17 +74,17 @@ class FieldGradient:
 
     Args:
         displacement: displacement of each vertex, (V, 3) [m].
-        pose: d displacement / d twist of each tool, by its name, (V, 3, 6) each [-, m/rad].
+        pose: d displacement / d twist of each tool, by its name, (V, 3, 6) each [-, m/rad]; empty: not asked for.
         modulus: d displacement / d E, all moduli and the skin's tension in proportion, (V, 3) [m/Pa]: zeros.
-        thickness: d displacement / d factor of `thicker`, at 1, (V, 3) [m].
-        tool_scale: d displacement / d factor on the size of each tool, by its name, (V, 3) each [m].
+        thickness: d displacement / d factor of `stmpl_core.layer.thicker`, at 1, (V, 3) [m]; None: not asked for.
+        tool_scale: d displacement / d factor on the size of each tool, by its name, (V, 3) each [m]; empty: likewise.
         trust: verdict on the answer, and so on its gradient.
     """
 
     displacement: VertexVectors
     pose: Mapping[str, np.ndarray]
     modulus: VertexVectors
-    thickness: VertexVectors
+    thickness: VertexVectors | None
     tool_scale: Mapping[str, VertexVectors]
     trust: Trust
 
@@ -117,56 +120,66 @@ class Gradients:
         self._ends()
         return self
 
-    def wrench(self, contacts: Sequence[Contact]) -> list[WrenchGradient]:
-        """Wrench of each contact and its derivatives; some five touches of time, with `pose_step` twelve a tool more.
+    def wrench(self, contacts: Sequence[Contact], by: Collection[By] = EVERY) -> list[WrenchGradient]:
+        """Wrench of each contact and its derivatives.
+
+        By pose and modulus it takes two touches of time, by thickness two more, by tool scale three more for each tool.
 
         Args:
             contacts: tools at one instant, each once.
+            by: what to differentiate by; pose and modulus always come along.
 
         Raises:
-            InvalidInput, MeshError: what `Simulator.touch` raises.
+            InvalidInput, MeshError: what `Simulator.touch` raises, or an unknown `by`.
         """
-        bare = _bare(contacts)
+        bare = _asked(contacts, by)
         touches = self.simulator.touch(bare)
-        known, by_thickness = tangents(self.simulator.toucher, touches), self._forces_by_thickness(touches)
+        known, zero = tangents(self.simulator.toucher, touches), np.zeros(6)
+        by_thickness = self._forces_by_thickness(touches) if "thickness" in by else None
         out = []
-        for touch, tangent, rates in zip(touches, known, by_thickness, strict=True):
-            zero, trust = np.zeros(6), touch.trust
-            if tangent is None or touch.pressed is None:
-                out.append(WrenchGradient(touch.name, touch.wrench, np.zeros((6, 6)), zero, zero, zero, {}, trust))
-                continue
-            pose, thickness = tangent.stiffness, self._wrench_of(touch, rates)
-            if touch.pressed.factor > DRAWN:
-                pose, thickness = self._drawn(touch, tangent, thickness)
-                trust = trust.also(f"{touch.name} was drawn back from the core: its gradient is that of a stated law",
-                                   in_range=False)  # fmt: skip
-            out.append(WrenchGradient(touch.name, touch.wrench, pose, touch.wrench / self._modulus, thickness,
-                                      self._by_size(bare, touch), tangent.across, trust))  # fmt: skip
+        for k, (touch, tangent) in enumerate(zip(touches, known, strict=True)):
+            thickness, size = zero if by_thickness else None, zero if "tool_scale" in by else None
+            pose, across, trust = np.zeros((6, 6)), {}, touch.trust
+            if tangent is not None and touch.pressed is not None:
+                pose, across = tangent.stiffness, tangent.across
+                if touch.pressed.factor > DRAWN:
+                    pose = pose + np.outer(*self._drawn(touch, tangent))
+                    why = f"{touch.name} was drawn back from the core: its gradient is that of a stated law"
+                    trust = trust.also(why, in_range=False)
+                if by_thickness:
+                    thickness = self._by_thickness(touch, tangent, by_thickness[k])
+                if "tool_scale" in by:
+                    size = self._by_size(bare, touch)
+            out.append(WrenchGradient(touch.name, touch.wrench, pose, touch.wrench / self._modulus, thickness, size,
+                                      across, trust))  # fmt: skip
         return out if self.pose_step is None else self._by_way(bare, touches, out, self.pose_step)
 
-    def field(self, contacts: Sequence[Contact]) -> FieldGradient:
-        """Displacement under contacts and its derivatives: two answers of time, and fourteen more for each tool.
+    def field(self, contacts: Sequence[Contact], by: Collection[By] = EVERY) -> FieldGradient:
+        """Displacement under contacts and its derivatives.
+
+        By pose it takes twelve answers of time for each tool, by thickness two, by tool scale two for each tool.
 
         Args:
             contacts: tools at one instant, each once.
+            by: what to differentiate by.
 
         Raises:
-            InvalidInput, MeshError: what `Simulator.touch` raises.
+            InvalidInput, MeshError: what `Simulator.touch` raises, or an unknown `by`.
         """
-        bare = _bare(contacts)
+        bare = _asked(contacts, by)
         touches = self.simulator.touch(bare)
-        answer = self.simulator.answer(touches)
+        answer, pressing = self.simulator.answer(touches), [one for one in touches if _presses(one)]
         zero = np.zeros_like(answer.displacement)
-        pose, size, thickness = {one.name: np.zeros((*zero.shape, 6)) for one in bare}, {}, zero
-        for touch in touches:
-            size[touch.name] = zero
-            if not _presses(touch):
-                continue
-            for column, (low, high, step) in enumerate(_ways(bare, touch, _field_step(touch))):
-                pose[touch.name][:, :, column] = self._between(low, high) / step
-            (one, low), (other, high), step = self._resized(bare, touch)
-            size[touch.name] = (other.step(high).displacement - one.step(low).displacement) / step
-        if any(_presses(touch) for touch in touches):
+        pose = {one.name: np.zeros((*zero.shape, 6)) for one in bare if "pose" in by}
+        size, thickness = {one.name: zero for one in bare if "tool_scale" in by}, zero if "thickness" in by else None
+        for touch in pressing:
+            if "pose" in by:
+                for column, (low, high, step) in enumerate(_ways(bare, touch, _field_step(touch))):
+                    pose[touch.name][:, :, column] = self._between(low, high) / step
+            if "tool_scale" in by:
+                (one, low), (other, high), step = self._resized(bare, touch)
+                size[touch.name] = (other.step(high).displacement - one.step(low).displacement) / step
+        if pressing and "thickness" in by:
             thin, thick = (end.step(bare).displacement for end in self._ends())
             thickness = (thick - thin) / (2 * THICKNESS_STEP)
         return FieldGradient(answer.displacement, pose, zero, thickness, size, answer.trust)
@@ -183,7 +196,7 @@ class Gradients:
                 `Simulator.touch` raises.
             MeshError: what `Simulator.touch` raises.
         """
-        bare = _bare(contacts)
+        bare = _asked(contacts, ())
         ways = {name: finite(f"twist of {name}", twist, (6,)) for name, twist in twists.items()}
         if strange := set(ways) - {one.name for one in bare}:
             raise InvalidInput(f"there is no contact of {', '.join(sorted(strange))}. Available: "
@@ -230,29 +243,33 @@ class Gradients:
                 out[k] = one.factor * some
         return out
 
-    def _wrench_of(self, touch: Touch, forces: np.ndarray) -> Wrench:
-        """Wrench of forces (N,) [N] at a touch's nodes."""
+    def _by_thickness(self, touch: Touch, tangent: Tangent, forces: np.ndarray) -> Wrench:
+        """d wrench / d factor of the thickness, of d force at the touch's nodes (N,) [N], (6,) [N, N m]."""
         assert touch.pressed is not None
-        layer, nodes = self.simulator.layer, touch.pressed.squeeze.nodes
+        layer, nodes, factor = self.simulator.layer, touch.pressed.squeeze.nodes, touch.pressed.factor
         unit = unit_wrenches(layer.vertices, layer.vertex_area_vectors, layer.vertex_areas,
                              touch.pose_body_from_tool[:3, 3], nodes.corners)  # fmt: skip
-        return np.einsum("n,nc,ncx->x", forces, nodes.shares, unit)
+        out = np.einsum("n,nc,ncx->x", forces, nodes.shares, unit)
+        if factor > DRAWN:
+            deepest = float((nodes.strain * nodes.thickness)[nodes.strain.argmax()])
+            out -= deepest * self._drawn(touch, tangent)[0] + (factor - 1) / factor * touch.wrench
+        return out
 
-    def _drawn(self, touch: Touch, tangent: Tangent, thickness: Wrench) -> tuple[np.ndarray, Wrench]:
-        """Derivatives by pose and thickness of a tool that is drawn back by r to where its largest strain s is held.
+    def _drawn(self, touch: Touch, tangent: Tangent) -> tuple[Wrench, np.ndarray]:
+        """d wrench / d way that a tool is drawn back, (6,), and d that way / d twist, (6,).
 
-        With W = f(r) V, f = 1 + STIFFENING r / T and n inwards, dW = (d - dr d/dn) W at a given f + V df. The deepest
-        point of the tool's surface says how r follows: dr is its way along n, less s t of its column as t grows.
+        It is drawn back by r to where its largest strain s is held. With W = f(r) V, f = 1 + STIFFENING r / T and n
+        inwards, dW = dW at a given r + (f' V - dW/dn) dr. The way of the deepest point of the tool's surface along n
+        is dr, less s t of its column as t grows.
         """
         assert touch.pressed is not None
-        factor, nodes = touch.pressed.factor, touch.pressed.squeeze.nodes
-        stiffening, normal = STIFFENING / float(self.simulator.layer.thickness.max()), touch.push / touch.force
+        nodes, normal = touch.pressed.squeeze.nodes, touch.push / touch.force
+        stiffening = STIFFENING / float(self.simulator.layer.thickness.max()) / touch.pressed.factor
         deepest = int(nodes.strain.argmax())
-        depth = float(nodes.strain[deepest] * nodes.thickness[deepest])
+        depth = nodes.strain[deepest] * nodes.thickness[deepest]
         arm = nodes.points[deepest] + depth * nodes.inward[deepest] - touch.pose_body_from_tool[:3, 3]
-        rise = touch.wrench / factor * stiffening - tangent.stiffness[:, :3] @ normal  # by r
-        pose = tangent.stiffness + np.outer(rise, np.concatenate([normal, np.cross(arm, normal)]))
-        return pose, thickness - depth * rise - (factor - 1) / factor * touch.wrench
+        rise = stiffening * touch.wrench - tangent.stiffness[:, :3] @ normal
+        return rise, np.concatenate([normal, np.cross(arm, normal)])
 
     def _resized(self, contacts: list[Contact], touch: Touch
                  ) -> tuple[tuple[Simulator, list[Contact]], tuple[Simulator, list[Contact]], float]:  # fmt: skip
@@ -288,26 +305,6 @@ class Gradients:
                 for m, one in enumerate(known)]  # fmt: skip
 
 
-def thicker(layer: SoftLayer, by: float) -> SoftLayer:
-    """The layer with all depths below its surface times a factor: columns, and where deeper materials begin.
-
-    The surface stays, and so do the skin's own thickness and tension.
-
-    Args:
-        layer: soft layer.
-        by: factor [-], > 0.
-
-    Raises:
-        InvalidInput: a factor that is not above 0, or tissue that gets thicker than is accepted.
-    """
-    if not 0 < by < np.inf:
-        raise InvalidInput(f"the factor on the thickness is {by}; it must be finite and above 0.")
-    deeper = tuple(replace(ply, depth=by * ply.depth) for ply in layer.tissue.deeper)
-    if layer.core is None:
-        return layer.with_(thickness=by * layer.thickness, deeper=deeper)
-    return layer.with_(core=layer.vertices + by * (layer.core - layer.vertices), deeper=deeper)
-
-
 def twisted(pose_body_from_tool: ArrayLike, twist: ArrayLike) -> Transform:
     """Pose of a tool after a twist, (4, 4): its origin moves, then it turns about its origin.
 
@@ -326,7 +323,10 @@ def twisted(pose_body_from_tool: ArrayLike, twist: ArrayLike) -> Transform:
     return pose
 
 
-def _bare(contacts: Sequence[Contact]) -> list[Contact]:
+def _asked(contacts: Sequence[Contact], by: Collection[str]) -> list[Contact]:
+    """The contacts by their poses alone, once it is known what is asked for."""
+    if strange := set(by) - set(EVERY):
+        raise InvalidInput(f"there is no gradient by {', '.join(sorted(strange))}. Available: {', '.join(EVERY)}.")
     return [replace(one, wrench=None) for one in contacts]
 
 

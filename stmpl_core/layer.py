@@ -217,6 +217,26 @@ def single(layer: SoftLayer, who: str, *, straight: bool = True) -> SoftLayer:
     return layer
 
 
+def thicker(layer: SoftLayer, by: float) -> SoftLayer:
+    """The layer with all depths below its surface times a factor: columns, and where deeper materials begin.
+
+    The surface stays, and so do the skin's own thickness and tension.
+
+    Args:
+        layer: soft layer.
+        by: factor [-], > 0.
+
+    Raises:
+        InvalidInput: a factor that is not above 0, or tissue that gets thicker than is accepted.
+    """
+    if not 0 < by < np.inf:
+        raise InvalidInput(f"the factor on the thickness is {by}; it must be finite and above 0.")
+    deeper = tuple(replace(ply, depth=by * ply.depth) for ply in layer.tissue.deeper)
+    if layer.core is None:
+        return layer.with_(thickness=by * layer.thickness, deeper=deeper)
+    return layer.with_(core=layer.vertices + by * (layer.core - layer.vertices), deeper=deeper)
+
+
 def layer_id(layer: SoftLayer) -> str:
     """Sixteen hex digits that name a layer: SHA-256 of its vertices, faces, thickness and tissue, all as published.
 

@@ -11,7 +11,8 @@ from stmpl_core import Contact, Membrane, Simulator, SoftLayer, Tissue, Tool
 from stmpl_core.body import Body
 from stmpl_core.errors import InvalidInput
 from stmpl_core.footing import twist_between
-from stmpl_core.gradients import Gradients, WrenchGradient, thicker, twisted
+from stmpl_core.gradients import Gradients, WrenchGradient, twisted
+from stmpl_core.layer import thicker
 from stmpl_core.living import living
 from stmpl_core.methods import MomentNet
 from tests.scenes import LENGTH, RADIUS, at, limb, plate, tool, turn
@@ -246,6 +247,15 @@ def test_a_tool_that_is_drawn_back_from_the_core_says_so_and_how_steep_the_law_i
     assert np.isfinite(gradients.field_along([contact], {"ball": [*push, 0, 0, 0]})).all()
 
 
+def test_only_what_is_asked_for_is_found() -> None:
+    gradients = made(limb())
+    contact = standing(gradients.simulator, BALL, 0.3)
+    wrench, field = gradients.wrench([contact], by=("pose",))[0], gradients.field([contact], by=("modulus",))
+    assert wrench.thickness is None and wrench.tool_scale is None and wrench.pose.any()
+    assert field.thickness is None and not field.pose and not field.tool_scale
+    assert gradients._made is None  # no other skin was made
+
+
 def test_a_wrench_that_is_told_is_not_used(gradients: Gradients) -> None:
     contact = standing(gradients.simulator, BALL, 0.3)
     told = replace(contact, wrench=np.array([1.0, 0, 0, 0, 0, 0]))
@@ -273,6 +283,22 @@ def test_gradients_are_those_where_the_joints_are() -> None:
     assert off(found.thickness, expected) < 0.05
 
 
+def test_presses_tell_modulus_and_thickness_by_gauss_and_newton() -> None:
+    """From 40 and 25 % away, by two balls: a small one feels the modulus more, a large one the bone below."""
+    layer, balls = limb(), [on_its_face(trimesh.creation.icosphere(3, r), f"ball of {r} m") for r in (6e-3, 20e-3)]
+    person = Simulator(thicker(layer, 1.25).with_(youngs_modulus=1400.0), MomentNet())
+    facing = at(RADIUS, 0, LENGTH / 2) @ turn((0, 1, 0), np.pi / 2)
+    contacts = [Contact(one, at(-depth, 0, 0) @ facing) for one in balls for depth in (1e-3, 2e-3, 3e-3)]
+    forces, found = np.array([-person.touch([one])[0].wrench[0] for one in contacts]), np.array([1000.0, 1.0])
+    for _ in range(3):
+        told = Gradients(Simulator(thicker(layer, found[1]).with_(youngs_modulus=found[0]), MomentNet()))
+        each = [told.wrench([one], by=("modulus", "thickness"))[0] for one in contacts]
+        slopes = -np.array([[one.modulus[0], one.thickness[0] / found[1]] for one in each]) / forces[:, None]
+        left = (forces + [one.wrench[0] for one in each]) / forces
+        found = found + np.linalg.lstsq(slopes, left)[0]
+    np.testing.assert_allclose(found, [1400.0, 1.25], rtol=5e-3)
+
+
 def test_a_thicker_layer_is_deeper_everywhere_and_its_surface_and_skin_stay() -> None:
     layer = living(Body.anny(), "left_forearm", edge_length=8e-3)
     twice = thicker(layer, 1.2)
@@ -297,5 +323,7 @@ def test_what_cannot_be_is_refused_in_words(gradients: Gradients) -> None:
         gradients.field_along([contact], {"thumb": np.zeros(6)})
     with pytest.raises(InvalidInput, match="factor on the thickness"):
         thicker(gradients.simulator.layer, 0.0)
+    with pytest.raises(InvalidInput, match="no gradient by colour"):
+        gradients.wrench([contact], by=("colour",))  # type: ignore[arg-type]
     with pytest.raises(InvalidInput, match="names of their own"):
         gradients.wrench([contact, contact])
