@@ -25,7 +25,6 @@ from stmpl_core.methods.base import Method
 from stmpl_core.nodes import Nodes
 from stmpl_core.sdf import SignedDistance
 from stmpl_core.simulator import Simulator
-from stmpl_core.skin import Skin
 from stmpl_core.tangent import Tangent, groups_that_press, tangents, unit_wrenches
 from stmpl_core.tool import Tool
 from stmpl_core.touch import Touch
@@ -219,12 +218,13 @@ class Gradients:
 
     def _ends(self) -> tuple[Simulator, Simulator]:
         """Simulators of the thinner and the thicker skin, where the joints are now."""
-        skin, tools = self.simulator.skin, self.simulator.tools
-        if self._made is None or self._made[0].tools is not tools:
-            thin, thick = (Simulator(Skin.of(thicker((skin.rest or skin).layer, by), _fresh(skin.method)), tools=tools)
+        skin = self.simulator.skin
+        if self._made is None:
+            thin, thick = (Simulator(thicker((skin.rest or skin).layer, by), _fresh(skin.method))
                            for by in (1 - THICKNESS_STEP, 1 + THICKNESS_STEP))  # fmt: skip
             self._made = thin, thick
         for end in self._made:
+            end.toucher.tools = self.simulator.tools
             end.move_to(end.skin.at_angles(skin.angles))
         return self._made
 

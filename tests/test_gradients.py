@@ -281,6 +281,9 @@ def test_gradients_are_those_where_the_joints_are() -> None:
     assert np.linalg.norm(found.wrench) > 0
     expected = (wrench_of(thick, [contact], "ball") - wrench_of(thin, [contact], "ball")) / 0.06
     assert off(found.thickness, expected) < 0.05
+    field = gradients.field([contact], by=("thickness",)).thickness
+    moved = (thick.step([contact]).displacement - thin.step([contact]).displacement) / 0.06
+    np.testing.assert_allclose(field, moved, atol=1e-3 * np.abs(moved).max())
 
 
 def test_presses_tell_modulus_and_thickness_by_gauss_and_newton() -> None:
