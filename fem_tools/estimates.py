@@ -5,10 +5,10 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numba import njit
 from scipy.spatial import KDTree
 
 from fem_tools.system import System
-from stmpl_core.layer import SoftLayer
 
 if TYPE_CHECKING:
     from fem_tools.patch import Patch
@@ -35,20 +35,19 @@ def error_bound(discretisation: float, truncation: float, u: np.ndarray, layers:
     return DISCRETISATION_SHARE * discretisation + TRUNCATION_SHARE * truncation + depth
 
 
-def truncation_error(patch: Patch, u: np.ndarray, layer: SoftLayer) -> float:
+def truncation_error(patch: Patch, u: np.ndarray) -> float:
     """Estimate of what the held rim of the patch changes [m]: the motion one thickness inside the cut.
 
     Zero where the patch is the whole layer.
     """
-    n = len(patch.vertices)
-    own = np.isin(patch.vertices, layer.border)
-    cut = patch.vertices[patch.fixed[:n] & ~own]
-    if not len(cut):
-        return 0.0
-    points = layer.vertices[patch.vertices]
-    gap = KDTree(layer.vertices[cut]).query(points)[0]
-    near = gap < 1.25 * layer.thickness.max()
-    return float(np.linalg.norm(u[:n, 0][near], axis=1).max(initial=0.0))
+    return float(np.linalg.norm(u[patch.near_cut, 0], axis=1).max(initial=0.0))
+
+
+def near_cut(points: np.ndarray, cut: np.ndarray, width: float) -> np.ndarray:
+    """Numbers of a patch's vertices (N, 3) [m] that are nearer than `width` [m] to those on its cut, a mask (N,)."""
+    if not cut.any():
+        return np.zeros(0, dtype=np.int64)
+    return np.flatnonzero(KDTree(points[cut]).query(points, distance_upper_bound=width)[0] < width)
 
 
 def discretisation_error(system: System, u: np.ndarray) -> float:
@@ -57,25 +56,45 @@ def discretisation_error(system: System, u: np.ndarray) -> float:
     The middle of each edge is where a linear interpolation is worst: by Hermite's cubic through the recovered nodal
     slopes it is off by |(g_b - g_a) . e| / 8 (Zienkiewicz & Zhu's recovery, IJNME 24, 1987, on the skin).
     """
-    mesh, skin = system.mesh, system.rest[:, 0]
-    corners, value = mesh.triangles, u[:, 0]
-    a, b, c = (skin[corners[:, k]] for k in range(3))
-    normal = np.cross(b - a, c - a)
-    double = np.linalg.norm(normal, axis=1, keepdims=True)
-    normal = normal / double
-    slopes = (
-        sum(
-            value[corners[:, k]][:, :, None] * np.cross(normal, edge)[:, None, :]
-            for k, edge in enumerate((c - b, a - c, b - a))
-        )
-        / double[:, :, None]
-    )  # (T, 3, 3) du_i / dx_j
-    nodal, area = np.zeros((len(skin), 3, 3)), np.zeros(len(skin))
-    for k in range(3):
-        np.add.at(nodal, corners[:, k], slopes * double[:, :, None])
-        np.add.at(area, corners[:, k], double[:, 0])
-    nodal /= np.maximum(area, 1e-300)[:, None, None]
-    edges = np.unique(np.sort(corners[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1), axis=0)
-    along = skin[edges[:, 1]] - skin[edges[:, 0]]
-    bend = np.einsum("eij,ej->ei", nodal[edges[:, 1]] - nodal[edges[:, 0]], along) / 8
-    return float(np.linalg.norm(bend, axis=1).max(initial=0.0))
+    return float(_worst_bend(system.rest[:, 0], system.mesh.triangles, u[:, 0]))
+
+
+@njit(cache=True)
+def _worst_bend(skin, triangles, value):
+    """discretisation_error of values (C, 3) at the nodes `skin` (C, 3) of triangles (T, 3)."""
+    nodal, area = np.zeros((len(skin), 9)), np.zeros(len(skin))
+    ab, ac, across = np.empty(3), np.empty(3), np.empty(3)
+    for t in range(len(triangles)):
+        a, b, c = triangles[t]
+        for i in range(3):
+            ab[i], ac[i] = skin[b, i] - skin[a, i], skin[c, i] - skin[a, i]
+        n0, n1, n2 = ab[1] * ac[2] - ab[2] * ac[1], ab[2] * ac[0] - ab[0] * ac[2], ab[0] * ac[1] - ab[1] * ac[0]
+        double = (n0 * n0 + n1 * n1 + n2 * n2) ** 0.5
+        area[a], area[b], area[c] = area[a] + double, area[b] + double, area[c] + double
+        for i in range(3):
+            # the slope along the skin, times the double area: du x normal, of (u_b - u_a) ac - (u_c - u_a) ab
+            rise, run = (value[b, i] - value[a, i]) / double, (value[c, i] - value[a, i]) / double
+            for j in range(3):
+                across[j] = rise * ac[j] - run * ab[j]
+            s0 = across[1] * n2 - across[2] * n1
+            s1 = across[2] * n0 - across[0] * n2
+            s2 = across[0] * n1 - across[1] * n0
+            for v in (a, b, c):
+                nodal[v, 3 * i] += s0
+                nodal[v, 3 * i + 1] += s1
+                nodal[v, 3 * i + 2] += s2
+    for v in range(len(skin)):
+        if area[v] > 0.0:
+            for i in range(9):
+                nodal[v, i] /= area[v]
+    worst = 0.0
+    for t in range(len(triangles)):
+        for k in range(3):
+            a, b, size = triangles[t, k], triangles[t, (k + 1) % 3], 0.0
+            for i in range(3):
+                bend = 0.0
+                for j in range(3):
+                    bend += (nodal[b, 3 * i + j] - nodal[a, 3 * i + j]) * (skin[b, j] - skin[a, j])
+                size += bend * bend
+            worst = max(worst, size)
+    return worst**0.5 / 8

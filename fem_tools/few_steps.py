@@ -96,7 +96,7 @@ class FewSteps:
         if before is not None and not result.residual < LOST:
             answer = before.displacement
         ratio = load.peak_ratio(layer)
-        discretisation, truncation = discretisation_error(system, result.u), truncation_error(patch, result.u, layer)
+        discretisation, truncation = discretisation_error(system, result.u), truncation_error(patch, result.u)
         bound = error_bound(discretisation, truncation, result.u, patch.mesh.layers, ratio)
         bound += result.residual * float(np.linalg.norm(result.u[:, 0], axis=1).max())
         figures = {"residual": result.residual, "min_j": result.min_j, "peak_ratio": ratio}
@@ -104,7 +104,7 @@ class FewSteps:
         if result.residual > CLOSE:
             why = f"after {result.iterations} Newton steps {result.residual:.0%} of the load is not in balance"
             trust = trust.also(why, converged=False)
-        trust = away_from_border(validated(trust, load, ratio), patch, layer)
+        trust = away_from_border(validated(trust, load, ratio), patch, layer, load.loaded)
         return Displacement(answer, trust if trust.ok else replace(trust, error_bound=None), self.name, pressure)
 
     def _patch_for(self, loaded: np.ndarray) -> Patch:

@@ -8,7 +8,7 @@ straight-sided.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from typing import Literal
 
@@ -82,6 +82,15 @@ def _line_basis(z: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
     return [(np.asarray(phi), np.asarray(dphi)[0]) for phi, dphi in values]
 
 
+@cache
+def linear_tables() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Factors of the "P1xP2" wedge's shape functions: phi (2, 3), its slope (2, 3), and L (3, 3), a row a point."""
+    ref = reference_wedge("P1xP2")
+    line = _line_basis(ref.zeta[None, :2])
+    phi, slope = np.stack([value for value, _ in line], axis=1), np.stack([rise for _, rise in line], axis=1)
+    return phi, slope, np.ascontiguousarray(ref.geometry_value[::2])
+
+
 @dataclass(frozen=True)
 class SkinReference:
     """In-plane shape functions on the skin, exact for a linear pressure on a deformed face."""
@@ -124,6 +133,7 @@ class WedgeMesh:
         edges: edges whose middles carry the columns N, N + 1, ... (quadratic only), (E, 2).
         n_columns: number of columns.
         gradients: gradients of the shape functions at rest, (T L, Q, 3 n, 3) [1/m].
+        natural: gradients of xi, eta and zeta at rest, (T L, Q, 3, 3) [1/m].
         volumes: quadrature weight times det, (T L, Q) [m3].
         indptr, indices: block rows of the tangent, one block a pair of columns that share a triangle.
         blocks: number of the block of each pair of columns of a triangle, (T, n, n).
@@ -140,6 +150,7 @@ class WedgeMesh:
     edges: np.ndarray
     n_columns: int
     gradients: np.ndarray
+    natural: np.ndarray
     volumes: np.ndarray
     indptr: np.ndarray
     indices: np.ndarray
@@ -167,7 +178,7 @@ class WedgeMesh:
         columns, edges, n_columns = _columns(triangles, len(outer), element)
         ends = level_depths(layers)[None, ::2] if ends is None else ends
         layers = ends.shape[1] - 1
-        gradients, volumes = rest_gradients(outer, inner, triangles, reference_wedge(element), layers, ends)
+        gradients, natural, volumes = _rest(outer, inner, triangles, reference_wedge(element), layers, ends)
         if len(bad := folding(triangles, volumes, layers)):
             raise MeshError(f"the layer folds on itself below {len(bad)} vertices of the patch: {_some(bad)}.")
         indptr, indices, blocks = _block_pattern(columns, n_columns)
@@ -182,6 +193,7 @@ class WedgeMesh:
             edges,
             n_columns,
             gradients,
+            natural,
             volumes,
             indptr,
             indices,
@@ -193,6 +205,14 @@ class WedgeMesh:
     def levels(self) -> int:
         """Levels of nodes in a column, the bonded one included."""
         return 2 * self.layers + 1
+
+    def part(self, chosen: np.ndarray) -> WedgeMesh:
+        """The wedges below some triangles, a mask (T,), with all columns and blocks numbered as they are."""
+        wedges = np.repeat(chosen, self.layers)
+        return replace(
+            self, triangles=self.triangles[chosen], columns=self.columns[chosen], blocks=self.blocks[chosen],
+            gradients=self.gradients[wedges], natural=self.natural[wedges], volumes=self.volumes[wedges],
+        )  # fmt: skip
 
     def column_ends(self) -> tuple[Points, Points]:
         """Outer and inner end of every column, each (n_columns, 3) [m]."""
@@ -230,10 +250,10 @@ class WedgeMesh:
 
     def border_columns(self) -> np.ndarray:
         """Mask of the columns on the patch's border, (n_columns,)."""
-        pairs = np.sort(self.triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
-        unique, count = np.unique(pairs, axis=0, return_counts=True)
+        pairs, n = np.sort(self.triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1), len(self.outer)
+        unique, count = np.unique(pairs[:, 0] * n + pairs[:, 1], return_counts=True)
         mask = np.zeros(self.n_columns, dtype=bool)
-        mask[unique[count == 1].ravel()] = True
+        mask[unique[count == 1] // n] = mask[unique[count == 1] % n] = True
         if len(self.edges):
             mask[len(self.outer) :] = count == 1  # unique edges are in the order of self.edges
         return mask
@@ -299,18 +319,27 @@ def rest_gradients(
 
     `ends`: see WedgeMesh; None: those of `level_depths`.
     """
-    shape = (len(triangles) * layers, len(ref.weight))
-    gradients, volumes = np.empty((*shape, ref.shape_gradient.shape[1], 3)), np.empty(shape)
-    ends = level_depths(layers)[None, ::2] if ends is None else ends
-    ends = np.ascontiguousarray(np.broadcast_to(ends, (len(outer), layers + 1)))
-    _fill_rest(outer, inner, triangles, ends, ref.shape_gradient, ref.geometry_value, ref.geometry_gradient, ref.zeta,
-               ref.weight, gradients, volumes)  # fmt: skip
+    gradients, _, volumes = _rest(outer, inner, triangles, ref, layers, ends)
     return gradients, volumes
 
 
+def _rest(
+    outer: Points, inner: Points, triangles: np.ndarray, ref: Reference, layers: int, ends: np.ndarray | None
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """As rest_gradients, with WedgeMesh.natural between them."""
+    shape = (len(triangles) * layers, len(ref.weight))
+    gradients, natural = np.empty((*shape, ref.shape_gradient.shape[1], 3)), np.empty((*shape, 3, 3))
+    volumes = np.empty(shape)
+    ends = level_depths(layers)[None, ::2] if ends is None else ends
+    ends = np.ascontiguousarray(np.broadcast_to(ends, (len(outer), layers + 1)))
+    _fill_rest(outer, inner, triangles, ends, ref.shape_gradient, ref.geometry_value, ref.geometry_gradient, ref.zeta,
+               ref.weight, gradients, natural, volumes)  # fmt: skip
+    return gradients, natural, volumes
+
+
 @njit(cache=True)
-def _fill_rest(outer, inner, triangles, ends, slopes, value, plane, zeta, weight, gradients, volumes):
-    layers, jacobian, inverse = ends.shape[1] - 1, np.empty((3, 3)), np.empty((3, 3))
+def _fill_rest(outer, inner, triangles, ends, slopes, value, plane, zeta, weight, gradients, natural, volumes):
+    layers, jacobian = ends.shape[1] - 1, np.empty((3, 3))
     for t in range(len(triangles)):
         for layer in range(layers):
             e = t * layers + layer
@@ -327,6 +356,7 @@ def _fill_rest(outer, inner, triangles, ends, slopes, value, plane, zeta, weight
                         jacobian[i, 1] += x * plane[a, 1]
                         jacobian[i, 2] += (far - near) * along * value[q, a]
                 # (xi, eta) run counter-clockwise seen from outside and zeta inwards: left-handed, so minus det
+                inverse = natural[e, q]
                 volumes[e, q] = -invert(jacobian, inverse) * weight[q]
                 for n in range(slopes.shape[1]):
                     for i in range(3):

@@ -118,7 +118,8 @@ def newton(system: System, u: np.ndarray, factor: float, settings: NewtonSetting
     inverse = system.preconditioner(data)
     best = (np.inf, u, min_j)
     for iteration in range(settings.max_iterations + 1):
-        relative, scale = _relative(system, inverse, r, u, factor)  # in the last tangent's norm: a new one costs a step
+        # in the last tangent's norm: a new one costs a step
+        relative, scale = relative_residual(system, inverse, r, u, factor)
         work = product * (linear + TANGENT_COST * tangents)
         if relative < best[0]:
             best = (relative, u, min_j)
@@ -150,7 +151,7 @@ def newton(system: System, u: np.ndarray, factor: float, settings: NewtonSetting
             stepped = _descend(system, u, du, r, factor, settings)
         else:
             du, n, _ = bicgstab(m.indptr, m.indices, data, inverse, -r, forcing, most)
-            stepped = _line_search(system, u, du, r, inverse, factor, settings)
+            stepped = line_search(system, u, du, r, inverse, factor, settings)
         linear += n
         if stepped is None:
             break
@@ -159,7 +160,9 @@ def newton(system: System, u: np.ndarray, factor: float, settings: NewtonSetting
     return NewtonResult(best[1], False, best[0], best[2], iteration, linear, factor, work)
 
 
-def _relative(system: System, inverse: np.ndarray, r: np.ndarray, u: np.ndarray, factor: float) -> tuple[float, float]:
+def relative_residual(
+    system: System, inverse: np.ndarray, r: np.ndarray, u: np.ndarray, factor: float
+) -> tuple[float, float]:
     """The residual over the load, or over the internal forces where they are larger [-]; and that scale [sqrt(J)]."""
     load = _load_vector(system, u, factor)
     scale = max(_norm(inverse, load), _norm(inverse, r + load), system.least)
@@ -181,8 +184,11 @@ def _descend(system: System, u, du, r, factor: float, settings: NewtonSettings):
     return None
 
 
-def _line_search(system: System, u, du, r, inverse, factor: float, settings: NewtonSettings):
-    """Halves the step until det F stays positive and the residual does not grow; None if nothing helps."""
+def line_search(
+    system: System, u: np.ndarray, du: np.ndarray, r: np.ndarray, inverse: np.ndarray, factor: float,
+    settings: NewtonSettings,
+) -> tuple[np.ndarray, np.ndarray, float] | None:  # fmt: skip
+    """Halves a step (C, 3 m) until det F stays positive and the residual does not grow; None if nothing helps."""
     full = np.zeros_like(u)
     full[:, : system.free] = du.reshape(len(u), system.free, 3)
     now, alpha, fallback = _norm(inverse, r), 1.0, None

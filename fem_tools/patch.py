@@ -11,12 +11,12 @@ import numpy as np
 from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import dijkstra
 
-from fem_tools.estimates import discretisation_error, error_bound, truncation_error
+from fem_tools.estimates import discretisation_error, error_bound, near_cut, truncation_error
 from fem_tools.mesh import ElementName, WedgeMesh, split
 from fem_tools.newton import NewtonResult, NewtonSettings, is_positive_definite, solve, work_spent
 from fem_tools.plies import confined, largest_poisson_ratio, wedge_ends
 from fem_tools.skin_loads import DeadForces, FollowerPressure
-from fem_tools.system import System
+from fem_tools.system import SkinLoad, System
 from stmpl_core.errors import InvalidInput, MeshError
 from stmpl_core.extrusion import fold_ratios
 from stmpl_core.layer import SoftLayer
@@ -43,7 +43,16 @@ class Patch:
     mesh: WedgeMesh
     fixed: np.ndarray  # columns on the cut and on the layer's own border
     distance: np.ndarray  # of each vertex of the patch from the load, along the skin [m]
+    to_border: float  # distance of the load from the layer's open border, along the skin [m]; inf: beyond the patch
+    near_cut: np.ndarray  # numbers of the patch's vertices that are about a thickness or less from the cut
     splits: tuple[np.ndarray, ...] = ()  # edges whose middles were added by each refinement
+
+    def farthest(self, loaded: np.ndarray) -> float:
+        """Largest distance of some vertices from the load that was meshed for [m]; infinite where one is not here."""
+        place = np.minimum(np.searchsorted(self.vertices, loaded), len(self.vertices) - 1)
+        if not (self.vertices[place] == loaded).all():
+            return np.inf
+        return float(self.distance[place].max(initial=0.0))
 
     def gather(self, values: np.ndarray) -> np.ndarray:
         """Forces at the corners of the refined triangles, handed to the layer's vertices; their sum is kept."""
@@ -153,7 +162,10 @@ class PatchFem:
             splits.append(edges)
         ends = wedge_ends(layer.tissue, np.linalg.norm(inner - outer, axis=1), self.layers_for(layer), scale)
         mesh = WedgeMesh.of(outer, inner, triangles, self.element_for(layer), ends=ends, ply_scale=scale)
-        return Patch(chosen, mesh, mesh.border_columns(), distance[chosen], tuple(splits))
+        fixed, own = mesh.border_columns(), np.isin(chosen, layer.border)
+        near = near_cut(layer.vertices[chosen], fixed[: len(chosen)] & ~own, 1.25 * float(layer.thickness.max()))
+        to_border = float(distance[chosen[own]].min(initial=np.inf))
+        return Patch(chosen, mesh, fixed, distance[chosen], to_border, near, tuple(splits))
 
     def _refuse_folds(self, folded: np.ndarray) -> None:
         """Raises MeshError if there are such faces, (k, 3)."""
@@ -204,7 +216,7 @@ class PatchFem:
                 before = [*before[-1:], (float(np.abs(pressure).max()), result.u)]
             answer = np.zeros_like(layer.vertices)
             answer[patch.vertices] = result.u[: len(patch.vertices), 0]
-            yield Displacement(answer, self._trust(load, patch, system, result), self.name, pressure)
+            yield Displacement(answer, self.trust(load, patch, system, result), self.name, pressure)
 
     def guess(self, system: System, pressure: np.ndarray, factor: float) -> np.ndarray:
         """Where Newton starts under a share of a pressure at the triangle corners, (N,) [Pa]: every column confined.
@@ -218,23 +230,27 @@ class PatchFem:
 
     def system(self, patch: Patch, load: Load) -> System:
         """The equations of a patch under a load."""
+        layer, mesh, loads = prepared(self._layer, self), patch.mesh, [self.pressing(patch, load)]
+        if self.border == "clamped":
+            return System(mesh, layer.tissue, loads, patch.fixed)
+        return System(mesh, layer.tissue, loads, np.zeros_like(patch.fixed), mirror_projectors(mesh))
+
+    def pressing(self, patch: Patch, load: Load) -> SkinLoad:
+        """A load on the columns of a patch."""
         layer, mesh = prepared(self._layer, self), patch.mesh
         if load.kind != "nodal":
-            pressing = FollowerPressure(mesh, patch.interpolate(load.values))
-        else:
-            forces = load.forces_on(layer)
-            if self.refine == 0 and mesh.element == "P1xP2":
-                pressing = DeadForces.at_vertices(mesh, forces[patch.vertices])
-            else:  # a force on a point has no converged answer: spread it over the vertex's own area
-                pressing = DeadForces.of_traction(mesh, patch.interpolate(forces / layer.vertex_areas[:, None]))
-        if self.border == "clamped":
-            return System(mesh, layer.tissue, [pressing], patch.fixed)
-        return System(mesh, layer.tissue, [pressing], np.zeros_like(patch.fixed), mirror_projectors(mesh))
+            return FollowerPressure(mesh, patch.interpolate(load.values))
+        forces = load.forces_on(layer)
+        if self.refine == 0 and mesh.element == "P1xP2":
+            return DeadForces.at_vertices(mesh, forces[patch.vertices])
+        # a force on a point has no converged answer: spread it over the vertex's own area
+        return DeadForces.of_traction(mesh, patch.interpolate(forces / layer.vertex_areas[:, None]))
 
-    def _trust(self, load: Load, patch: Patch, system: System, result: NewtonResult) -> Trust:
+    def trust(self, load: Load, patch: Patch, system: System, result: NewtonResult) -> Trust:
+        """What may be believed of a result on a patch."""
         layer = prepared(self._layer, self)
         stable = not self.check_stability or is_positive_definite(system, result.u, result.load_factor)
-        discretisation, truncation = discretisation_error(system, result.u), truncation_error(patch, result.u, layer)
+        discretisation, truncation = discretisation_error(system, result.u), truncation_error(patch, result.u)
         ratio = load.peak_ratio(layer)
         trust = Trust(
             error_bound=error_bound(discretisation, truncation, result.u, patch.mesh.layers, ratio),
@@ -270,7 +286,7 @@ class PatchFem:
             trust = replace(trust, error_bound=None)
             trust = trust.also("how rigid tools pull along the skin is left out (fem_tools.IndenterFem has it)")
         if self.border == "clamped":
-            trust = away_from_border(trust, patch, layer)
+            trust = away_from_border(trust, patch, layer, load.loaded)
         return trust if trust.ok else replace(trust, error_bound=None)
 
 
@@ -284,10 +300,9 @@ def validated(trust: Trust, load: Load, ratio: float) -> Trust:
     return trust
 
 
-def away_from_border(trust: Trust, patch: Patch, layer: SoftLayer) -> Trust:
-    """The same trust, lowered where the load is close to the layer's open border."""
-    rim = patch.distance[np.isin(patch.vertices, layer.border)]
-    nearest = float(rim.min(initial=np.inf)) / float(layer.thickness.max())
+def away_from_border(trust: Trust, patch: Patch, layer: SoftLayer, loaded: np.ndarray) -> Trust:
+    """The same trust, lowered where a load on these vertices may be close to the layer's open border."""
+    nearest = (patch.to_border - patch.farthest(loaded)) / float(layer.thickness.max())
     if nearest >= NEAR_BORDER:
         return trust
     why = f"the load is {nearest:.1f} thicknesses from the layer's open border, which is held"

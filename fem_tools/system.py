@@ -8,9 +8,10 @@ from typing import Protocol
 import numpy as np
 from numba import njit
 
+from fem_tools import linear_wedges
 from fem_tools import neo_hookean as nh
 from fem_tools.membrane import SkinMembrane
-from fem_tools.mesh import WedgeMesh
+from fem_tools.mesh import WedgeMesh, linear_tables
 from fem_tools.plies import wedge_materials
 from fem_tools.relaxation import Fading, Relaxing
 from stmpl_core.tissue import Tissue
@@ -103,7 +104,12 @@ class System:
     def internal(self, u: np.ndarray) -> tuple[np.ndarray, float]:
         """Internal forces (C, levels, 3) [N] and the smallest det F, or 0 where a face of a membrane has no area."""
         m, forces = self.mesh, np.zeros_like(u)
-        smallest = nh.internal_forces(u, m.columns, m.layers, m.gradients, m.volumes, *self._moduli(), forces)
+        if m.element == "P1xP2":
+            smallest = linear_wedges.internal_forces(
+                u, m.columns, m.layers, m.natural, m.volumes, *self._moduli(), *linear_tables(), forces
+            )
+        else:
+            smallest = nh.internal_forces(u, m.columns, m.layers, m.gradients, m.volumes, *self._moduli(), forces)
         if self.relaxing:
             self.relaxing.add_forces(u, forces)
         if self.membrane:
@@ -130,7 +136,12 @@ class System:
         """Blocks of the tangent (or of its symmetric, or of a positive part), (n_blocks, 3 m, 3 m) [N/m]."""
         m, width = self.mesh, 3 * self.free
         data = np.zeros((len(m.indices), width, width))
-        nh.tangent(u, m.columns, m.blocks, m.layers, m.gradients, m.volumes, *self._moduli(), convex, data)
+        if m.element == "P1xP2":
+            linear_wedges.tangent(
+                u, m.columns, m.blocks, m.layers, m.natural, m.volumes, *self._moduli(), *linear_tables(), convex, data
+            )
+        else:
+            nh.tangent(u, m.columns, m.blocks, m.layers, m.gradients, m.volumes, *self._moduli(), convex, data)
         if self.relaxing:
             self.relaxing.add_tangent(data, convex)
         if self.membrane:
@@ -140,29 +151,54 @@ class System:
             load.add_tangent(skin, factor, data, symmetric=symmetric, convex=convex)
         return data
 
-    def preconditioner(self, data: np.ndarray) -> np.ndarray:
-        """Inverse of each column's own block, (C, 3 m, 3 m); zero where constrained, which is what constrains CG."""
-        diagonal = data[self.diagonal]
+    def preconditioner(self, data: np.ndarray, columns: np.ndarray | slice = slice(None)) -> np.ndarray:
+        """Inverse of each column's own block, (C, 3 m, 3 m); zero where constrained, which is what constrains CG.
+
+        `columns`: those that are asked for.
+        """
+        diagonal = data[self.diagonal[columns]]
         if self.keep is None:
             inverse = _inverse_spd(diagonal)
         else:
-            project = np.einsum("mn,cij->cminj", np.eye(self.free), self.keep).reshape(diagonal.shape)
+            project = np.einsum("mn,cij->cminj", np.eye(self.free), self.keep[columns]).reshape(diagonal.shape)
             rest = np.eye(diagonal.shape[1]) - project
             scale = np.trace(diagonal, axis1=1, axis2=2)[:, None, None]
             inverse = project @ _inverse_spd(project @ diagonal @ project + rest * scale) @ project
-        inverse[self.fixed] = 0.0
+        inverse[self.fixed[columns]] = 0.0
         return inverse
 
 
 def _inverse_spd(blocks: np.ndarray) -> np.ndarray:
     """Inverse of symmetric blocks; where one is not positive definite its eigenvalues are taken positive."""
-    try:
-        np.linalg.cholesky(blocks)
-        return np.linalg.inv(blocks)
-    except np.linalg.LinAlgError:
-        values, vectors = np.linalg.eigh(blocks)
-        values = np.maximum(np.abs(values), 1e-3 * np.abs(values).max(axis=1, keepdims=True))
-        return np.einsum("cij,cj,ckj->cik", vectors, 1 / values, vectors)
+    inverse = np.empty_like(blocks)
+    if _eliminate(blocks, inverse):
+        return inverse
+    values, vectors = np.linalg.eigh(blocks)
+    values = np.maximum(np.abs(values), 1e-3 * np.abs(values).max(axis=1, keepdims=True))
+    return np.einsum("cij,cj,ckj->cik", vectors, 1 / values, vectors)
+
+
+@njit(cache=True)
+def _eliminate(blocks, inverse):
+    """Writes the inverses of blocks (C, n, n) by Gauss and Jordan; False if a pivot is not positive."""
+    n = blocks.shape[1]
+    for c in range(len(blocks)):
+        a = inverse[c]
+        a[:] = blocks[c]
+        for p in range(n):
+            if not a[p, p] > 0.0:
+                return False
+            s = 1.0 / a[p, p]
+            a[p, p] = 1.0
+            for j in range(n):
+                a[p, j] *= s
+            for i in range(n):
+                if i != p:
+                    f = a[i, p]
+                    a[i, p] = 0.0
+                    for j in range(n):
+                        a[i, j] -= f * a[p, j]
+    return True
 
 
 @njit(cache=True)

@@ -292,7 +292,7 @@ class Walk:
         faces_in = max(float(-load.tool.distance(faces).min(initial=0.0)) for load in loads)
         stable = not self.fem.check_stability or is_positive_definite(self.system, result.u)
         discretisation = discretisation_error(self.system, result.u)
-        truncation = truncation_error(self.patch, result.u, self.layer)
+        truncation = truncation_error(self.patch, result.u)
         peak = float(np.linalg.norm(result.u[:, 0], axis=1).max(initial=0.0))
         touched = [(load.area, load.pressure(skin)) for load in loads]
         area = sum(float(share[p > 0].sum()) for share, p in touched)

@@ -64,6 +64,25 @@ def test_tangent_is_the_derivative_of_the_residual_for_a_varying_follower_pressu
     np.testing.assert_allclose(product, difference, atol=2e-6 * np.abs(difference).max())
 
 
+@pytest.mark.parametrize("convex", [0.0, 0.3])
+@pytest.mark.parametrize("layers", [1, 2])
+def test_wedges_that_are_linear_in_plane_are_summed_in_another_order_and_that_is_all(layers, convex):
+    system, rng = wavy_system("P1xP2", layers), np.random.default_rng(3)
+    m, moduli = system.mesh, (system.mu, system.lam)
+    u = rng.normal(scale=5e-5, size=system.zeros().shape)
+    forces, blocks = np.zeros_like(u), np.zeros((len(m.indices), 3 * system.free, 3 * system.free))
+    smallest = nh.internal_forces(u, m.columns, layers, m.gradients, m.volumes, *moduli, forces)
+    nh.tangent(u, m.columns, m.blocks, layers, m.gradients, m.volumes, *moduli, convex, blocks)
+    assert 0 < smallest < 0.95
+    found, again = system.internal(u)
+    np.testing.assert_allclose(found, forces, atol=1e-13 * np.abs(forces).max())
+    assert again == pytest.approx(smallest, rel=1e-12)
+    system.loads = []
+    np.testing.assert_allclose(system.tangent(u, 1.0, convex=convex), blocks, atol=1e-13 * np.abs(blocks).max())
+    u[len(u) // 2, 0] += 2 * THICKNESS * m.natural[0, 0, 2] / np.linalg.norm(m.natural[0, 0, 2])
+    assert system.internal(u)[1] <= 0, "a folded wedge must show"
+
+
 def test_stress_in_the_kernel_is_the_derivative_of_the_energy_density():
     """Homogeneous deformation of one wedge: its nodal forces are -volume * dpsi/dF : grad N."""
     mesh = WedgeMesh.of(
