@@ -6,7 +6,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from numba import njit
-from scipy.spatial import KDTree
 
 from fem_tools.system import System
 
@@ -43,11 +42,17 @@ def truncation_error(patch: Patch, u: np.ndarray) -> float:
     return float(np.linalg.norm(u[patch.near_cut, 0], axis=1).max(initial=0.0))
 
 
-def near_cut(points: np.ndarray, cut: np.ndarray, width: float) -> np.ndarray:
-    """Numbers of a patch's vertices (N, 3) [m] that are nearer than `width` [m] to those on its cut, a mask (N,)."""
-    if not cut.any():
-        return np.zeros(0, dtype=np.int64)
-    return np.flatnonzero(KDTree(points[cut]).query(points, distance_upper_bound=width)[0] < width)
+@njit(cache=True)
+def within(points, of, width):
+    """Numbers of points (N, 3) that are nearer than `width` to some others (M, 3) [m]."""
+    near = np.zeros(len(points), dtype=np.bool_)
+    for k in range(len(points)):
+        for n in range(len(of)):
+            x, y, z = points[k, 0] - of[n, 0], points[k, 1] - of[n, 1], points[k, 2] - of[n, 2]
+            if x * x + y * y + z * z < width * width:
+                near[k] = True
+                break
+    return np.flatnonzero(near)
 
 
 def discretisation_error(system: System, u: np.ndarray) -> float:

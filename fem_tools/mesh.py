@@ -9,7 +9,7 @@ straight-sided.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, cached_property
 from typing import Literal
 
 import numpy as np
@@ -132,7 +132,6 @@ class WedgeMesh:
         columns: columns of each triangle, (T, n).
         edges: edges whose middles carry the columns N, N + 1, ... (quadratic only), (E, 2).
         n_columns: number of columns.
-        gradients: gradients of the shape functions at rest, (T L, Q, 3 n, 3) [1/m].
         natural: gradients of xi, eta and zeta at rest, (T L, Q, 3, 3) [1/m].
         volumes: quadrature weight times det, (T L, Q) [m3].
         indptr, indices: block rows of the tangent, one block a pair of columns that share a triangle.
@@ -149,7 +148,6 @@ class WedgeMesh:
     columns: np.ndarray
     edges: np.ndarray
     n_columns: int
-    gradients: np.ndarray
     natural: np.ndarray
     volumes: np.ndarray
     indptr: np.ndarray
@@ -178,7 +176,7 @@ class WedgeMesh:
         columns, edges, n_columns = _columns(triangles, len(outer), element)
         ends = level_depths(layers)[None, ::2] if ends is None else ends
         layers = ends.shape[1] - 1
-        gradients, natural, volumes = _rest(outer, inner, triangles, reference_wedge(element), layers, ends)
+        natural, volumes = _rest(outer, inner, triangles, reference_wedge(element), layers, ends)
         if len(bad := folding(triangles, volumes, layers)):
             raise MeshError(f"the layer folds on itself below {len(bad)} vertices of the patch: {_some(bad)}.")
         indptr, indices, blocks = _block_pattern(columns, n_columns)
@@ -192,7 +190,6 @@ class WedgeMesh:
             columns,
             edges,
             n_columns,
-            gradients,
             natural,
             volumes,
             indptr,
@@ -200,6 +197,11 @@ class WedgeMesh:
             blocks,
             ply_scale,
         )
+
+    @cached_property
+    def gradients(self) -> np.ndarray:
+        """Gradients of the shape functions at rest, (T L, Q, 3 n, 3) [1/m]; made where asked for."""
+        return reference_wedge(self.element).shape_gradient @ self.natural
 
     @property
     def levels(self) -> int:
@@ -211,7 +213,7 @@ class WedgeMesh:
         wedges = np.repeat(chosen, self.layers)
         return replace(
             self, triangles=self.triangles[chosen], columns=self.columns[chosen], blocks=self.blocks[chosen],
-            gradients=self.gradients[wedges], natural=self.natural[wedges], volumes=self.volumes[wedges],
+            natural=self.natural[wedges], volumes=self.volumes[wedges],
         )  # fmt: skip
 
     def column_ends(self) -> tuple[Points, Points]:
@@ -319,26 +321,25 @@ def rest_gradients(
 
     `ends`: see WedgeMesh; None: those of `level_depths`.
     """
-    gradients, _, volumes = _rest(outer, inner, triangles, ref, layers, ends)
-    return gradients, volumes
+    natural, volumes = _rest(outer, inner, triangles, ref, layers, ends)
+    return ref.shape_gradient @ natural, volumes
 
 
 def _rest(
     outer: Points, inner: Points, triangles: np.ndarray, ref: Reference, layers: int, ends: np.ndarray | None
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """As rest_gradients, with WedgeMesh.natural between them."""
+) -> tuple[np.ndarray, np.ndarray]:
+    """WedgeMesh.natural and the integration weights."""
     shape = (len(triangles) * layers, len(ref.weight))
-    gradients, natural = np.empty((*shape, ref.shape_gradient.shape[1], 3)), np.empty((*shape, 3, 3))
-    volumes = np.empty(shape)
+    natural, volumes = np.empty((*shape, 3, 3)), np.empty(shape)
     ends = level_depths(layers)[None, ::2] if ends is None else ends
     ends = np.ascontiguousarray(np.broadcast_to(ends, (len(outer), layers + 1)))
-    _fill_rest(outer, inner, triangles, ends, ref.shape_gradient, ref.geometry_value, ref.geometry_gradient, ref.zeta,
-               ref.weight, gradients, natural, volumes)  # fmt: skip
-    return gradients, natural, volumes
+    _fill_rest(outer, inner, triangles, ends, ref.geometry_value, ref.geometry_gradient, ref.zeta, ref.weight,
+               natural, volumes)  # fmt: skip
+    return natural, volumes
 
 
 @njit(cache=True)
-def _fill_rest(outer, inner, triangles, ends, slopes, value, plane, zeta, weight, gradients, natural, volumes):
+def _fill_rest(outer, inner, triangles, ends, value, plane, zeta, weight, natural, volumes):
     layers, jacobian = ends.shape[1] - 1, np.empty((3, 3))
     for t in range(len(triangles)):
         for layer in range(layers):
@@ -356,14 +357,7 @@ def _fill_rest(outer, inner, triangles, ends, slopes, value, plane, zeta, weight
                         jacobian[i, 1] += x * plane[a, 1]
                         jacobian[i, 2] += (far - near) * along * value[q, a]
                 # (xi, eta) run counter-clockwise seen from outside and zeta inwards: left-handed, so minus det
-                inverse = natural[e, q]
-                volumes[e, q] = -invert(jacobian, inverse) * weight[q]
-                for n in range(slopes.shape[1]):
-                    for i in range(3):
-                        s = 0.0
-                        for k in range(3):
-                            s += slopes[q, n, k] * inverse[k, i]
-                        gradients[e, q, n, i] = s
+                volumes[e, q] = -invert(jacobian, natural[e, q]) * weight[q]
 
 
 def _block_pattern(columns: np.ndarray, n: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

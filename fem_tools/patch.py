@@ -8,10 +8,11 @@ from dataclasses import dataclass, replace
 from typing import Literal, Self
 
 import numpy as np
+from numba import njit
 from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import dijkstra
 
-from fem_tools.estimates import discretisation_error, error_bound, near_cut, truncation_error
+from fem_tools.estimates import discretisation_error, error_bound, truncation_error, within
 from fem_tools.mesh import ElementName, WedgeMesh, split
 from fem_tools.newton import NewtonResult, NewtonSettings, is_positive_definite, solve, work_spent
 from fem_tools.plies import confined, largest_poisson_ratio, wedge_ends
@@ -111,7 +112,8 @@ class PatchFem:
         self._folded = fold_ratios(layer.vertices, layer.inner_vertices, layer.faces) < MIN_FOLD
         length = np.linalg.norm(layer.vertices[layer.edges[:, 0]] - layer.vertices[layer.edges[:, 1]], axis=1)
         n = len(layer.vertices)
-        self._graph = csr_matrix((length, layer.edges.T), shape=(n, n))
+        one_way = csr_matrix((length, layer.edges.T), shape=(n, n))
+        self._graph = one_way + one_way.T
         self._layer = layer
         return self
 
@@ -136,12 +138,11 @@ class PatchFem:
         """
         layer = prepared(self._layer, self)
         thickness = float(layer.thickness[vertices].max())
-        distance = dijkstra(
-            self._graph, directed=False, indices=vertices, min_only=True, limit=1.1 * self.reach * thickness
-        )
+        limit = 1.1 * self.reach * thickness
+        distance = dijkstra(self._graph, indices=vertices, min_only=True, limit=limit)
         inside = np.isfinite(distance)
-        chosen_faces = inside[layer.faces].all(axis=1)
-        self._refuse_folds(layer.faces[chosen_faces & self._folded])
+        chosen_faces = _faces_of(layer.faces, inside)
+        self._refuse_folds(layer.faces[chosen_faces[self._folded[chosen_faces]]])
         faces = layer.faces[chosen_faces].astype(np.int64)
         chosen, flat = np.unique(faces, return_inverse=True)
         outer, inner, triangles = layer.vertices[chosen], layer.inner_vertices[chosen], flat.reshape(-1, 3)
@@ -163,7 +164,8 @@ class PatchFem:
         ends = wedge_ends(layer.tissue, np.linalg.norm(inner - outer, axis=1), self.layers_for(layer), scale)
         mesh = WedgeMesh.of(outer, inner, triangles, self.element_for(layer), ends=ends, ply_scale=scale)
         fixed, own = mesh.border_columns(), np.isin(chosen, layer.border)
-        near = near_cut(layer.vertices[chosen], fixed[: len(chosen)] & ~own, 1.25 * float(layer.thickness.max()))
+        points = layer.vertices[chosen]
+        near = within(points, points[fixed[: len(chosen)] & ~own], 1.25 * float(layer.thickness.max()))
         to_border = float(distance[chosen[own]].min(initial=np.inf))
         return Patch(chosen, mesh, fixed, distance[chosen], to_border, near, tuple(splits))
 
@@ -307,6 +309,18 @@ def away_from_border(trust: Trust, patch: Patch, layer: SoftLayer, loaded: np.nd
         return trust
     why = f"the load is {nearest:.1f} thicknesses from the layer's open border, which is held"
     return trust.also(why, in_range=False)
+
+
+@njit(cache=True)
+def _faces_of(faces, inside):
+    """Numbers of the faces (F, 3) whose corners are all inside, a mask of the vertices (V,)."""
+    out = np.empty(len(faces), dtype=np.int64)
+    n = 0
+    for k in range(len(faces)):
+        if inside[faces[k, 0]] and inside[faces[k, 1]] and inside[faces[k, 2]]:
+            out[n] = k
+            n += 1
+    return out[:n]
 
 
 def _ahead(before: list[tuple[float, np.ndarray]], pressure: float) -> np.ndarray:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Sequence
-from typing import Protocol
+from typing import Protocol, Self
 
 import numpy as np
 from numba import njit
@@ -74,6 +75,13 @@ class System:
         self.keep = keep
         self.free = mesh.levels - 1
         self.diagonal = diagonal_blocks(mesh.indptr, mesh.indices)  # block of each column with itself
+
+    def part(self, chosen: np.ndarray) -> Self:
+        """The same without the loads, of the wedges below some triangles alone, a mask (T,)."""
+        part, wedges = copy.copy(self), np.repeat(chosen, self.mesh.layers)
+        part.mesh, part.mu, part.lam, part.loads = self.mesh.part(chosen), self.mu[wedges], self.lam[wedges], []
+        part.membrane = SkinMembrane(part.mesh, self.tissue.skin) if self.tissue.skin else None
+        return part
 
     def zeros(self) -> np.ndarray:
         """No displacement, (C, levels, 3)."""
