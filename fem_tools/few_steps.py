@@ -1,4 +1,4 @@
-"""FewSteps: finite elements cut off after some Newton steps, started from a cheaper method's answer or the last one."""
+"""FewSteps: finite elements cut off after some Newton steps, started from a cheaper method's answer."""
 
 from __future__ import annotations
 
@@ -39,23 +39,22 @@ class FewSteps:
 
     Args:
         steps: number of Newton steps.
-        start: method whose answer is started from; None: start from the answer before, at first from rest.
+        start: method whose answer is started from; fem_tools.WarmPatchFem starts from the answer before.
         reach: width of the patch beyond the load [thicknesses].
 
     Raises:
         InvalidInput: fewer than one step.
     """
 
-    def __init__(self, steps: int = 1, start: Method | None = None, *, reach: float = 5.0) -> None:
+    def __init__(self, steps: int, start: Method, *, reach: float = 5.0) -> None:
         if steps < 1:
             raise InvalidInput(f"steps is {steps}; at least 1 is needed.")
         self.steps, self.start = steps, start
         self.fem = PatchFem(reach=reach, check_stability=False)
         self.settings = NewtonSettings(max_iterations=steps, forcing=FORCING)
-        self.name = f"fem, {steps} step{'s' * (steps > 1)} from {start.name if start else 'the last answer'}"
+        self.name = f"fem, {steps} step{'s' * (steps > 1)} from {start.name}"
         self._layer: SoftLayer | None = None
         self._patch: Patch | None = None
-        self._last: np.ndarray | None = None
 
     @classmethod
     def from_network(cls, steps: int = 1) -> Self:
@@ -65,9 +64,8 @@ class FewSteps:
     def prepare(self, layer: SoftLayer) -> Self:
         """Prepares the finite elements and the method that is started from."""
         self.fem.prepare(layer)
-        if self.start is not None:
-            self.start.prepare(layer)
-        self._layer, self._patch, self._last = layer, None, None
+        self.start.prepare(layer)
+        self._layer, self._patch = layer, None
         return self
 
     def solve(self, load: Load) -> Displacement:
@@ -82,18 +80,15 @@ class FewSteps:
         layer = prepared(self._layer, self)
         pressure = load.check(layer).pressure_on(layer)
         if not len(load.loaded):
-            self._last = None
             zero = np.zeros_like(layer.vertices)
             return Displacement(zero, Trust(error_bound=0.0, why="no load"), self.name, pressure)
         patch = self._patch_for(load.loaded)
         system = self.fem.system(patch, load)
-        before = self.start.solve(load) if self.start else None
-        u = self._start(load, patch, system, before)
-        result = newton(system, u, 1.0, self.settings)
-        self._last = result.u
+        before = self.start.solve(load)
+        result = newton(system, self._start(patch, system, before), 1.0, self.settings)
         answer = np.zeros_like(layer.vertices)
         answer[patch.vertices] = result.u[: len(patch.vertices), 0]
-        if before is not None and not result.residual < LOST:
+        if not result.residual < LOST:
             answer = before.displacement
         ratio = load.peak_ratio(layer)
         discretisation, truncation = discretisation_error(system, result.u), truncation_error(patch, result.u)
@@ -108,22 +103,13 @@ class FewSteps:
         return Displacement(answer, trust if trust.ok else replace(trust, error_bound=None), self.name, pressure)
 
     def _patch_for(self, loaded: np.ndarray) -> Patch:
-        layer, patch = prepared(self._layer, self), self._patch
-        if patch is not None:
-            place = np.searchsorted(patch.vertices, loaded)
-            place[place == len(patch.vertices)] = 0
-            near = patch.distance[place] <= KEPT * layer.thickness[loaded].max()
-            if (patch.vertices[place] == loaded).all() and near.all():
-                return patch
-        self._patch, self._last = self.fem.patch_around(loaded), None
+        layer = prepared(self._layer, self)
+        if self._patch is None or self._patch.farthest(loaded) > KEPT * layer.thickness[loaded].max():
+            self._patch = self.fem.patch_around(loaded)
         return self._patch
 
-    def _start(self, load: Load, patch: Patch, system: System, before: Displacement | None) -> np.ndarray:
+    def _start(self, patch: Patch, system: System, before: Displacement) -> np.ndarray:
         """Where Newton starts, (C, levels, 3) [m]."""
-        if before is None:
-            if self._last is not None:
-                return self._last
-            return self.fem.guess(system, patch.interpolate(load.pressure_on(prepared(self._layer, self))), 1.0)
         mesh = patch.mesh
         skin = before.displacement[patch.vertices]
         depth = mesh.depths()[:, :, None]

@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 
 from fem_tools import IndenterFem, PatchFem, Press
-from fem_tools.few_steps import FewSteps
 from fem_tools.indenter import Walk
 from fem_tools.krylov import conjugate_gradients, multiply
 from fem_tools.membrane import SkinMembrane
@@ -193,15 +192,6 @@ def test_a_stiff_skin_on_a_fine_mesh_takes_few_newton_steps():
     layer = plate(0.1, 2e-3, 0.02, crossed=True).with_(skin=Membrane(3e5, 2e-3))
     answer = PatchFem(reach=2, check_stability=False).prepare(layer).solve(disc(layer, 1.0, np.zeros(3), 0.015))
     assert answer.trust.converged and answer.trust.figures["newton_iterations"] < 20
-
-
-def test_a_few_steps_from_the_answer_before_reach_the_answer_of_a_stack():
-    layer = limb(5e-3).with_(skin=SKIN, deeper=(Ply(3e-3, 5e3),))
-    load, few = disc(layer, 0.6, layer.vertices[len(layer.vertices) // 2], 0.01), FewSteps(2, reach=3).prepare(layer)
-    answers = [few.solve(load) for _ in range(3)]
-    whole = PatchFem(reach=3).prepare(layer).solve(load)
-    assert answers[-1].trust.converged
-    np.testing.assert_allclose(answers[-1].displacement, whole.displacement, atol=1e-3 * whole.magnitude.max())
 
 
 @pytest.mark.parametrize("element", ELEMENTS)
