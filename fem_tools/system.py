@@ -140,10 +140,16 @@ class System:
         forces[:, 0] -= self.external(u, factor)
         return forces[:, : self.free].reshape(len(u), -1), smallest
 
-    def tangent(self, u: np.ndarray, factor: float, *, symmetric: bool = False, convex: float = 0.0) -> np.ndarray:
-        """Blocks of the tangent (or of its symmetric, or of a positive part), (n_blocks, 3 m, 3 m) [N/m]."""
+    def tangent(
+        self, u: np.ndarray, factor: float, *, symmetric: bool = False, convex: float = 0.0,
+        onto: np.ndarray | None = None,
+    ) -> np.ndarray:  # fmt: skip
+        """Blocks of the tangent (or of its symmetric, or of a positive part), (n_blocks, 3 m, 3 m) [N/m].
+
+        `onto`: blocks that it is added to, which are returned.
+        """
         m, width = self.mesh, 3 * self.free
-        data = np.zeros((len(m.indices), width, width))
+        data = np.zeros((len(m.indices), width, width)) if onto is None else onto
         if m.element == "P1xP2":
             linear_wedges.tangent(
                 u, m.columns, m.blocks, m.layers, m.natural, m.volumes, *self._moduli(), *linear_tables(), convex, data

@@ -20,7 +20,8 @@ from stmpl_core.trust import Displacement, Trust
 
 MAX_STEPS = 6  # Newton and chord steps of a warm frame; then it is solved as PatchFem does
 SLOW = 0.3  # share of the residual that a step may leave before the tangent is made anew
-NEAR = 2.0  # thicknesses of the load within which the tangent is made anew; strains beyond are small
+NEAR = 1.0  # thicknesses of the load within which the tangent is made anew; strains beyond are small
+JUMP = 2.0  # thicknesses from where its patch was meshed for, beyond which a load is solved anew: that is quicker
 FORCING = (0.05, 0.3)  # least and largest share of a residual that the linear solver may leave of a step's
 AIM = 0.3  # share of the tolerance that the linear solver aims at
 RESIDUAL_SHARE = 10.0  # largest error over the peak that a residual over the load left, on slides and presses [-]
@@ -31,10 +32,10 @@ class WarmPatchFem:
 
     A frame starts from the last answer, carried on along its last change by the share that leaves the least residual,
     in the preconditioner's norm and by the last tangent (Fischer, CMAME 163, 1998, with one direction). The tangent is
-    then made anew within two thicknesses of the load; Newton and chord steps follow until the residual is under
+    then made anew within a thickness of the load; Newton and chord steps follow until the residual is under
     `tolerance`, each held back by Newton's line search. If they do not get there the load is solved as PatchFem does,
     from the last answer and then from rest; if that fails too, the answer says converged False. The patch is meshed
-    anew when the load has moved by more than `slack`; what both patches have is carried over.
+    anew when the load has moved by more than `slack`; what both patches have is carried over, unless it jumped.
 
     So an answer depends on those before it, by what `tolerance` leaves. Stability is not tested (PatchFem does).
 
@@ -126,8 +127,8 @@ class WarmPatchFem:
         patch = self.fem.patch_around(loaded)
         near = patch.distance <= (NEAR + self.slack) * thickness
         frame = _Frame.of(patch, System(patch.mesh, layer.tissue, [], patch.fixed), near, self.fem.reach * thickness)
-        if last is not None:
-            frame.take_over(last, loaded)
+        if last is not None and last.patch.farthest(loaded) <= JUMP * thickness:
+            frame.take_over(last)
         return frame
 
 
@@ -174,9 +175,9 @@ class _Frame:
         columns = np.unique(patch.mesh.columns[chosen])
         return cls(patch, width, system, system.part(chosen), system.part(~chosen), columns, system.zeros())
 
-    def take_over(self, last: _Frame, loaded: np.ndarray) -> None:
-        """Carries the last answer over from another patch, if it has all of the load."""
-        if not np.isfinite(last.patch.farthest(loaded)) or last.u.shape[1:] != self.u.shape[1:]:
+    def take_over(self, last: _Frame) -> None:
+        """Carries the last answer over from another patch, if that has as many levels."""
+        if last.u.shape[1:] != self.u.shape[1:]:
             return
         _, old, new = np.intersect1d(_names(last.patch), _names(self.patch), assume_unique=True, return_indices=True)
         self.u[new] = last.u[old]
@@ -270,10 +271,11 @@ class _Frame:
         """The tangent at `u`: near the load, and beyond where it was not made on this patch."""
         if self.beyond is None:
             self.beyond = self.far.tangent(u, 1.0)
-            self.tangent = self.near.tangent(u, 1.0) + self.beyond
+            self.tangent = self.near.tangent(u, 1.0, onto=self.beyond.copy())
             self.inverse = self.system.preconditioner(self.tangent)
         else:
-            self.tangent = self.near.tangent(u, 1.0) + self.beyond
+            np.copyto(self.tangent, self.beyond)
+            self.near.tangent(u, 1.0, onto=self.tangent)
             self.inverse[self.columns] = self.system.preconditioner(self.tangent, self.columns)
 
 

@@ -61,8 +61,9 @@ def test_a_load_that_stays_is_not_solved_again():
     np.testing.assert_array_equal(first.displacement, second.displacement)
 
 
-def test_a_jump_out_of_the_patch_is_cold_and_as_good():
-    warm, there = WarmPatchFem().prepare(LAYER), disc(LAYER, 0.5, MIDDLE * [-1, -1, 1], 0.01)
+@pytest.mark.parametrize("there", [MIDDLE * [-1, -1, 1], MIDDLE + 24 * ALONG])
+def test_a_jump_is_cold_and_as_good(there):
+    warm, there = WarmPatchFem().prepare(LAYER), disc(LAYER, 0.5, there, 0.01)
     warm.solve(PATHS["slide"][0])
     answer = warm.solve(there)
     assert answer.trust.figures["cold"] == 1.0
