@@ -27,7 +27,7 @@ PUBLIC = {  # heading: modules, and the names in them that are promised to stay
                "stmpl_core.needs: needs Needs Term Indentation"],
     "Methods": ["stmpl_core.methods: Method method Naive Winkler Linear MomentNet UNet Ladder LimbLinear",
                 "stmpl_core: Displacement", "fem_tools.ladder: ladder", "stmpl_core.metrics: score Score"],
-    "Finite elements": ["fem_tools: PatchFem IndenterFem Press Stroke RigidFem"],
+    "Finite elements": ["fem_tools: PatchFem WarmPatchFem IndenterFem Press Stroke RigidFem"],
     "Stiffness, haptics and gradients": ["stmpl_core.stiffness: fit_stiffness Stiffness",
                               "stmpl_core.haptics: DeviceLoop LoopSettings",
                               "stmpl_core.local_contact: local_contact local_contacts LocalContact Grip Rendered",
