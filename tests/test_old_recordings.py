@@ -1,4 +1,4 @@
-"""Answers that were recorded before stay what they were: bit for bit on one processor, within 0.1 % of the peak on another.
+"""Answers that were recorded before stay: bit for bit on one processor, within 0.1 % of the peak on another.
 
 tests/answers_before.npz holds 60 answers with all that they were given, so that no builder of scenes has a say. Where
 they are meant to change, `python -m tests.test_old_recordings` records what the same contacts give now.
