@@ -1,7 +1,7 @@
 """What a touch, its local model, a field and a whole step cost: another tree and this one, side by side in one run.
 
-    .venv/bin/python -m benchmarks.speed --against ../before      # writes docs/speed.md; about five minutes
-    .venv/bin/python -m benchmarks.speed                          # this tree alone; prints
+    .venv/bin/python -m benchmarks.speed --against ../before      # prints the tables of docs/speed.md; some minutes
+    .venv/bin/python -m benchmarks.speed                          # this tree alone
 
 Each tree answers in a process of its own, on one thread. They take turns of a tenth of a second, scene by scene, so
 that what else the machine does falls on both. A figure is the median over all turns, in
@@ -18,11 +18,11 @@ import sys
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 HERE = Path(__file__).resolve()
-PAGE = HERE.parents[1] / "docs" / "speed.md"
 ONE = {name: "1" for name in ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")}
 DEPTH = 0.3  # of each tool, over the thickness
 TURN_S = 0.1
@@ -33,6 +33,7 @@ AIMS = {  # ms: by pose, by wrench, local model, field, step; what was set as an
     "letter H, 26 mm": (0.5, 0.8, 0.9, 1.2, 2.0), "two fingertips": (0.5, 0.8, 0.9, None, None),
 }  # fmt: skip
 WHAT = ("by pose", "by wrench", "local model", "field", "step")
+NODES, DISTANCES = 80, 1500  # of a touch: contact nodes, and places at which the tool's distance is asked, about
 
 
 def calls() -> dict[str, dict[str, Callable[[int], object]]]:
@@ -116,7 +117,7 @@ class Worker:
         )  # fmt: skip
         self.scenes: dict[str, list[str]] = self._read()
 
-    def _read(self):
+    def _read(self) -> Any:
         assert self._process.stdout is not None
         return json.loads(self._process.stdout.readline())
 
@@ -166,8 +167,67 @@ def table(times: dict[str, dict[str, list[list[float]]]]) -> list[str]:
     return out
 
 
+def limit() -> str:
+    """What the arithmetic of a touch by pose would take at one core's measured peak, as a sentence."""
+    import numba
+
+    @numba.njit(fastmath=True)
+    def fused(x: np.ndarray, times: int) -> float:
+        for _ in range(times):
+            for n in range(len(x)):
+                x[n] = x[n] * 0.999 + 1e-3
+        return x.sum()
+
+    x = np.ones(2048)
+    fused(x, 1)
+    best = np.inf
+    for _ in range(20):
+        start = time.perf_counter()
+        fused(x, 2000)
+        best = min(best, time.perf_counter() - start)
+    peak = 2 * 2000 * len(x) / best
+    splines, pairs = DISTANCES * 2 * 84, NODES**2 / 2 * 2 * 40  # 64 + 16 + 4 products a spline; 7 tables a pair
+    iterations = 15 * 2 * NODES**2
+    flops = splines + pairs + iterations
+    return (f"A touch by pose takes about {flops / 1e6:.2f} million floating-point operations ({DISTANCES} distances, "
+            f"{NODES} nodes): {1e3 * flops / peak:.3f} ms at the {peak / 1e9:.0f} GFLOP/s that this core reached.")
+
+
+def batches(seconds: float = 3.0) -> list[str]:
+    """Touches a second that Batch does on one thread and on all cores, one ball in each scene, as table rows."""
+    from benchmarks.tools import ball
+    from fem_tools.scenes import Site
+    from stmpl_core.batch import Batch
+    from stmpl_core.body import Body
+    from stmpl_core.living import living
+    from stmpl_core.methods import MomentNet
+    from stmpl_core.skin import Skin
+
+    out, cores, n = [], len(os.sched_getaffinity(0)), 256
+    layers = {"paper's arm": Body.anny().part("left_arm", edge_length=3e-3, thickness=7.5e-3),
+              "forearm as measured": living(Body.anny(), "left_forearm", edge_length=3e-3)}  # fmt: skip
+    for name, layer in layers.items():
+        skin, site, rng = Skin.of(layer, MomentNet()), Site(layer), np.random.default_rng(0)
+        vertices = rng.choice(np.flatnonzero(site.border_distance > 0.5 * site.border_distance.max()), n)
+        poses = np.tile(np.eye(4), (n, 1, 1, 1))
+        for k, v in enumerate(vertices):
+            poses[k, 0] = site.standing(int(v), 10e-3, 0.0)
+            poses[k, 0, :3, 3] -= DEPTH * layer.thickness[v] * poses[k, 0, :3, 2]
+        cells = []
+        for threads in dict.fromkeys((1, cores)):
+            batch = Batch(skin, [ball(12)], n, threads=threads)
+            batch.touch(poses)
+            start, done = time.perf_counter(), 0
+            while time.perf_counter() - start < seconds:
+                batch.touch(poses)
+                done += n
+            cells.append(f"{done / (time.perf_counter() - start):,.0f} on {threads}")
+        out.append(f"| {name} | " + " | ".join(cells) + " |")
+    return out
+
+
 def main() -> None:
-    """Measures, prints, and writes the page if there is another tree to compare with."""
+    """Measures and prints."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--worker", action="store_true", help=argparse.SUPPRESS)
     parser.add_argument("--against", type=Path, help="another checkout")
@@ -178,6 +238,7 @@ def main() -> None:
         return
     trees = [*([given.against.resolve()] if given.against else []), HERE.parents[1]]
     print("\n".join(table(measure(trees, given.rounds))))
+    print(f"\n{limit()}\n\nTouches a second of Batch, by threads:\n" + "\n".join(batches()))
 
 
 if __name__ == "__main__":
