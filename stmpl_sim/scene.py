@@ -14,6 +14,7 @@ from stmpl_core.layer import SoftLayer
 from stmpl_sim.engine import mujoco
 from stmpl_sim.grip import END, FINGERS, add_gripper, place_of, thin_end
 from stmpl_sim.mujoco_skin import exclude
+from stmpl_sim.robot_file import robot_spec
 from stmpl_sim.site import Site
 
 ARM = Path(__file__).parent / "models" / "arm7.xml"
@@ -76,7 +77,7 @@ def build(
     Args:
         layer: skin of the limb.
         site: place on it that is turned up, and put at `at`.
-        robot: MJCF or URDF file; the arm that ships unless given.
+        robot: MJCF or URDF file; the arm that ships unless given. Meshes that are not found are not drawn.
         end: name of the robot's body or site that carries the head, its z axis towards the skin; the last body of
             the longest chain unless given.
         at: place of the site in the robot's world [m].
@@ -91,7 +92,7 @@ def build(
         InvalidInput: a file that MuJoCo does not read, an end that is not there, a site out of reach, or a limb that
             cannot be gripped.
     """
-    spec = _robot_spec(ARM if robot is None else Path(robot))
+    spec = robot_spec(ARM if robot is None else Path(robot))
     holder = _end(spec, end)
     chain = _chain(holder if hasattr(holder, "add_body") else holder.parent)
     _add_head(spec, holder, radius)
@@ -123,17 +124,6 @@ def world_from_limb(site: Site, at: np.ndarray) -> Transform:
     pose[:3, :3] = frame.T
     pose[:3, 3] = at - frame.T @ site.point
     return pose
-
-
-def _robot_spec(path: Path) -> Any:
-    if not path.is_file():
-        raise InvalidInput(f"there is no robot file {path}.")
-    try:
-        spec = mujoco.MjSpec.from_file(str(path))
-    except (ValueError, OSError) as error:
-        raise InvalidInput(f"MuJoCo cannot read {path}: {' '.join(str(error).split())}") from error
-    spec.compiler.discardvisual = spec.compiler.fusestatic = False  # as URDF has them, head and skin would be lost
-    return spec
 
 
 def _end(spec: Any, name: str | None) -> Any:

@@ -116,6 +116,34 @@ def test_a_robot_of_ones_own_is_driven_and_what_it_lacks_is_said(forearm: SoftLa
         build(forearm, site, robot=path)
 
 
+def test_meshes_of_a_package_are_found_beside_the_file_or_left_out(tmp_path: Path, caplog: pytest.LogCaptureFixture
+                                                                   ) -> None:  # fmt: skip
+    """Links of a URDF as ROS has them: one mesh lies in its package, one nowhere, one is of a kind that is not read."""
+    import trimesh
+
+    from stmpl_sim.robot_file import robot_spec
+
+    body = '<inertial><mass value="1"/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial>'
+    links = "".join(f'<link name="{name}"><collision><geometry><mesh filename="package://arm/meshes/{name}.{kind}"/>'
+                    f"</geometry></collision>{body}</link>"
+                    for name, kind in (("here", "stl"), ("gone", "stl"), ("dae", "dae")))  # fmt: skip
+    joints = "".join(f'<joint name="{name}" type="continuous"><parent link="here"/><child link="{name}"/></joint>'
+                     for name in ("gone", "dae"))  # fmt: skip
+    for folder in ("urdf", "meshes"):
+        (tmp_path / "arm" / folder).mkdir(parents=True)
+    trimesh.creation.box((0.1, 0.1, 0.1)).export(tmp_path / "arm" / "meshes" / "here.stl")
+    (tmp_path / "arm" / "meshes" / "dae.dae").write_text("<COLLADA/>")
+    path = tmp_path / "arm" / "urdf" / "arm.urdf"
+    path.write_text(f'<robot name="arm">{links}{joints}</robot>')
+    model = robot_spec(path).compile()
+    assert (model.nmesh, model.ngeom, model.njnt) == (1, 1, 2) and model.body("gone").mass[0] == 1
+    assert "2 meshes of arm.urdf are not there" in caplog.text
+    xacro = tmp_path / "arm.urdf.xacro"
+    xacro.write_text("<robot>${arm}</robot")
+    with pytest.raises(InvalidInput, match=r"xacro FILE > robot\.urdf"):
+        robot_spec(xacro)
+
+
 def test_frames_drawn_in_software_show_the_nearer_of_two_triangles() -> None:
     from stmpl_sim.film import HEIGHT, WIDTH, draw
 
