@@ -349,6 +349,22 @@ def around_name(place: np.ndarray, radius: float) -> str:
     return AROUND + ",".join(f"{number:.9g}" for number in (*place, radius))
 
 
+def phenotype_from(text: str) -> dict[str, float]:
+    """A phenotype as people write it, 'weight=0.7 muscle=0.3', by name. Raises InvalidInput."""
+    values = {}
+    for pair in text.split():
+        name, _, value = pair.partition("=")
+        try:
+            values[name] = float(value)
+        except ValueError:
+            raise InvalidInput(f"'{pair}' is no name=number, as in 'weight=0.7 muscle=0.3'") from None
+        if name not in PHENOTYPE:
+            raise InvalidInput(f"'{name}' is no phenotype; known are {', '.join(PHENOTYPE)}")
+        if not 0 <= values[name] <= 1:
+            raise InvalidInput(f"{pair} is not from 0 to 1 (0.5 is the average)")
+    return values
+
+
 @cache
 def _average() -> Body:
     return Body("anny", *limbs.body())

@@ -9,6 +9,7 @@ from typing import Literal
 from pydantic import BaseModel, ConfigDict, Field, field_validator
 from pydantic.config import JsonDict
 
+from stmpl_core.body import phenotype_from
 from stmpl_core.friction import friction_from
 from stmpl_core.layer import MAX_THICKNESS
 from stmpl_core.methods import Method, method
@@ -18,7 +19,6 @@ PAPER = "paper"  # tissue of one layer, by the settings beside it
 ONE_LAYER = ("thickness", "youngs_modulus", "poisson_ratio", "density")  # settings beside it
 FOREARM, PAPER_ARM = "left_forearm", "left_arm"  # parts that answer unless one is asked for
 ACCURACY = 2e-4  # error at any vertex that is asked for [m]
-PHENOTYPE = ("gender", "age", "muscle", "weight", "height", "proportions")
 ANY_TIME: JsonDict = {"when": "any time"}  # fields that a running node takes over at once
 CONFIGURING: JsonDict = {"when": "configuring"}  # fields that count when the node is configured
 
@@ -148,7 +148,7 @@ class NodeConfig(BaseModel):
     @field_validator("phenotype")
     @classmethod
     def _phenotype(cls, text: str) -> str:
-        _shares(text)
+        phenotype_from(text)
         return text
 
     @field_validator("friction")
@@ -193,7 +193,7 @@ class NodeConfig(BaseModel):
     @property
     def phenotype_values(self) -> dict[str, float]:
         """The phenotype by name."""
-        return _shares(self.phenotype)
+        return phenotype_from(self.phenotype)
 
     @classmethod
     def names(cls, when: JsonDict) -> set[str]:
@@ -213,22 +213,6 @@ def _named(text: str, what: str = "tool=collision", example: str = "finger=robot
         if not tool or not collision:
             raise ValueError(f"'{text}' is no {what}, as in '{example}'")
     return {tool: collision for tool, _, collision in pairs}
-
-
-def _shares(text: str) -> dict[str, float]:
-    """name=value, parted by blanks. Raises ValueError."""
-    shares = {}
-    for pair in text.split():
-        name, _, value = pair.partition("=")
-        try:
-            shares[name] = float(value)
-        except ValueError:
-            raise ValueError(f"'{pair}' is no name=number, as in 'weight=0.7 muscle=0.3'") from None
-        if name not in PHENOTYPE:
-            raise ValueError(f"'{name}' is no phenotype; known are {', '.join(PHENOTYPE)}")
-        if not 0 <= shares[name] <= 1:
-            raise ValueError(f"{pair} is not from 0 to 1 (0.5 is the average)")
-    return shares
 
 
 class ProbeConfig(BaseModel):

@@ -23,6 +23,7 @@ ros_arguments: list[str] = []  # arguments of ROS, from --ros-args on; this verb
 def sim(
     out: Path = Path("runs/sim"),
     part: str = "left_forearm",
+    phenotype: str = "",
     tissue: Literal["relaxed", "tensed", "single"] = "relaxed",
     force: tuple[float, ...] = (5.0, 10.0),
     speed: float = 50.0,
@@ -48,7 +49,8 @@ def sim(
 
     Args:
         out: folder for log.npz and film.webp.
-        part: part of the average body: left_forearm, right_thigh, back.
+        part: part of the body: left_forearm, right_thigh, back.
+        phenotype: phenotype of the body, each value from 0 to 1: 'weight=0.7 muscle=0.3'; 0.5 unless given.
         tissue: tissue of it; relaxed, tensed: skin, fat and muscle as measured in its region, with the muscle so;
             single: one material of 20 kPa, 7.5 mm thick.
         force: forces to press with, one after the other [N].
@@ -79,7 +81,7 @@ def sim(
     from stmpl_sim.scene import build
     from stmpl_sim.site import Site
 
-    layer = limb(part, tissue, relaxing)
+    layer = limb(part, tissue, relaxing, phenotype)
     site = Site.thickest(layer)
     grip = usual_force(part) if grip is None else grip
     scene = build(layer, site, robot=robot, end=end, at=at, mount=mount_of(mount, grip), radius=1e-3 * radius,
@@ -119,19 +121,20 @@ def fmu(out: Path = Path("runs")) -> int:
     return 0
 
 
-def limb(part: str, tissue: str, relaxing: bool = False) -> SoftLayer:
-    """A part of the average body. Raises InvalidInput: no such part or tissue."""
-    from stmpl_core.body import Body
+def limb(part: str, tissue: str, relaxing: bool = False, phenotype: str = "") -> SoftLayer:
+    """A part of a body. Raises InvalidInput: no such part, tissue or phenotype."""
+    from stmpl_core.body import Body, phenotype_from
     from stmpl_core.living import held_skin, living
     from stmpl_core.regions import Tone
     from stmpl_core.tissue import Tissue
 
     if tissue not in (known := (*get_args(Tone), "single")):
         raise InvalidInput(f"there is no tissue '{tissue}'. Available: {', '.join(known)}.")
+    body = Body.anny(pose=None, **phenotype_from(phenotype))
     if tissue == "single":
-        layer = Body.anny().part(part, tissue=Tissue(youngs_modulus=SINGLE_MODULUS))
+        layer = body.part(part, tissue=Tissue(youngs_modulus=SINGLE_MODULUS))
     else:
-        layer = living(Body.anny(), part, cast(Tone, tissue))
+        layer = living(body, part, cast(Tone, tissue))
     return held_skin(layer) if relaxing else layer
 
 

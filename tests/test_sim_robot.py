@@ -205,7 +205,9 @@ def test_the_verb_prints_figures_and_leaves_log_and_film(tmp_path: Path, capsys:
     assert figures["grip"]["mean_N"] == pytest.approx(10.0, abs=0.5) and figures["grip"]["lifted_m"] > 5e-3
     assert Path(figures["film"]).stat().st_size > 10_000
     for wrong, why in ((["--rate", "5"], "allowed is 50 to 20000"), (["--force", "-1"], "above 0 N"),
-                       (["--robot", "nothing.urdf"], "no robot file")):  # fmt: skip
+                       (["--robot", "nothing.urdf"], "no robot file"),
+                       (["--phenotype", "weight=80"], "not from 0 to 1"),
+                       (["--phenotype", "size=1"], "no phenotype; known are gender")):  # fmt: skip
         with pytest.raises(SystemExit) as ended:
             main([*flags, str(tmp_path), *wrong])
         assert ended.value.code == 1 and why in capsys.readouterr().err
