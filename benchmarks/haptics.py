@@ -46,7 +46,7 @@ def stiffest_coupling(spot: Spot, rate: float, delay: float, controller: bool) -
     """Stiffest coupling of LEVELS that stays passive against a hard skin [N/m]; 0 when none does."""
     device = Device(rate=rate, delay_steps=round(delay * rate))
     hard = spot.with_modulus(HARD)
-    last = _last_passive(LEVELS, lambda kc: play(device, Hand(), settings_for(device, kc, controller), hard))
+    last = last_passive(LEVELS, lambda kc: play(device, Hand(), settings_for(device, kc, controller), hard))
     return 0.0 if last is None else LEVELS[last[0]]
 
 
@@ -55,7 +55,7 @@ def stiffest_stroke(spot: Spot, kind: str, delay: float, controller: bool) -> fl
     device = Device(delay_steps=round(1e3 * delay))
     hard = spot.with_modulus(HARD)
     hard = hard if kind == "elastic" else hard.with_memory(*KINDS[kind])
-    last = _last_passive(LEVELS, lambda kc: play(device, STROKE, settings_for(device, kc, controller), hard))
+    last = last_passive(LEVELS, lambda kc: play(device, STROKE, settings_for(device, kc, controller), hard))
     return 0.0 if last is None else LEVELS[last[0]]
 
 
@@ -66,7 +66,7 @@ def stiffest_contact(spot: Spot, node_delay: float, controller: bool, held_force
     """
     device = Device()
     settings = settings_for(device, COUPLING, controller)
-    last = _last_passive(MODULI, lambda e: play(device, Hand(), settings, spot.with_modulus(e), node_delay=node_delay,
+    last = last_passive(MODULI, lambda e: play(device, Hand(), settings, spot.with_modulus(e), node_delay=node_delay,
                                                 held_force=held_force))
     if last is None:
         return 0.0
@@ -74,7 +74,7 @@ def stiffest_contact(spot: Spot, node_delay: float, controller: bool, held_force
     return felt.stiffness[0]
 
 
-def _last_passive(levels: list, run: Callable[[float], Felt]) -> tuple[int, Felt] | None:
+def last_passive(levels: list, run: Callable[[float], Felt]) -> tuple[int, Felt] | None:
     """The last level that is passive, by halving: from there on up none is taken to be."""
     low, high, kept = -1, len(levels), None
     while high - low > 1:

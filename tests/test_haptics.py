@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import trimesh
 
+from benchmarks.device import found
 from benchmarks.haptic_device import QUIET, Device, Felt, Hand, Spot, arm_spot, play
 from benchmarks.haptics import HARD, forces_along, paths, settings_for, slide, worst_jump
 from benchmarks.tools import ball, block_letter, fingertip, flat
@@ -422,3 +423,11 @@ def test_a_new_model_is_blended_in(spot: Spot) -> None:
     blended, _ = slide(spot, way, blend=8e-3)
     assert blended < 0.6 * sudden
     assert error < 0.05 * np.linalg.norm(spot.force(spot.centre(-DEEP)))
+
+
+def test_what_suits_a_device_is_that_of_the_map(spot: Spot) -> None:
+    """docs/laboratory/haptics.md: with forces 5 ms late 951 N/m with the controller, 238 without."""
+    suits = found(Device(delay_steps=5), spot)
+    assert suits.settings is not None and suits.settings.delay_steps == 5
+    assert suits.settings.coupling_stiffness == pytest.approx(951, rel=0.45)  # two levels of the map
+    assert suits.without == pytest.approx(238, rel=0.45) and suits.bound == pytest.approx(418, rel=0.01)
