@@ -224,7 +224,7 @@ def rows(done: Massaged) -> list[tuple[str, str]]:
         ("highest force", f"{log.force.max():.2f} N"),
         ("node's force off the simulation's", f"at most {100 * done.apart:.2f} % of the highest"),
         ("energy stored in the skin", f"{1e3 * log.energy.max():.2f} mJ at most"),
-        ("given out beyond what was put in", f"{100 * done.gained:+.1f} % of that"),
+        ("given out beyond what was put in", f"{100 * done.gained:+.1f} % of that (below 0: lost)"),
         ("physics and contact", f"{1 / (log.time[1] - log.time[0]):.0f} Hz"),
         ("poses over ROS", f"{done.poses:.0f} Hz; the simulation ran at {done.real_time:.2f} of real time, which it "
          "does not exceed"),

@@ -230,7 +230,7 @@ def table(figures: dict[str, Any]) -> Any:
     lines = [
         f"highest force {figures['highest_force_N']:.1f} N; limb moved {1e3 * figures['limb_moved_m']:.1f} mm",
         f"energy: stored {1e3 * figures['stored_J']:.2f} mJ at most, given out beyond what was put in "
-        f"{1e3 * figures['given_out_J']:+.3f} mJ ({100 * figures['given_out_of_stored']:+.1f} %)",
+        f"{1e3 * figures['given_out_J']:+.3f} mJ ({100 * figures['given_out_of_stored']:+.1f} %; below 0: lost)",
         f"{figures['rate_Hz']:.0f} Hz, contact at every step: {figures['real_time_factor']:.2f} of real time here, "
         f"{figures['real_time_factor_of_processor_time']:.2f} by processor time "
         f"(contact {1e3 * figures['touch_s']:.2f} of {1e3 * figures['step_s']:.2f} ms, median)",

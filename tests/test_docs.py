@@ -2,6 +2,9 @@
 
 import re
 import runpy
+import shlex
+import shutil
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +20,44 @@ ROOT = Path(__file__).parent.parent
 PAGES = [*sorted(ROOT.glob("*.md")), *sorted((ROOT / "docs").rglob("*.md"))]
 MOST_WORDS = 700
 PYTHON = re.compile(r"^```python\n(.*?)^```", flags=re.M | re.S)
+
+
+STEP = re.compile(r"^( *)```(sh|python)\n(.*?)^\1```", flags=re.M | re.S)
+
+
+def steps(page: str) -> Iterator[tuple[str, str]]:
+    """Kind, sh or python, and text of each command and each block of code of a page, in its order."""
+    for indent, kind, block in STEP.findall((ROOT / "docs" / page).read_text()):
+        text = re.sub(rf"^{indent}", "", block, flags=re.M)
+        yield from [(kind, text)] if kind == "python" else ((kind, line) for line in
+                                                            text.replace("\\\n", " ").splitlines())  # fmt: skip
+
+
+def command(line: str) -> None:
+    """Runs a command of a page here: ours, and those that copy; examples and benchmarks have tests of their own."""
+    name, *arguments = shlex.split(line, comments=True)
+    if name == "cp":
+        shutil.copy(ROOT / arguments[0], arguments[1])
+    elif name == "python" and arguments[0] == "-m":
+        assert (ROOT / f"{arguments[1].replace('.', '/')}.py").is_file(), line
+    elif name == "python":
+        assert (ROOT / arguments[0]).is_file() and arguments[0].startswith("examples/"), line
+    else:
+        assert name == "stmpl", line
+        with pytest.raises(SystemExit) as ended:
+            main(arguments)
+        assert ended.value.code == 0, line
+
+
+def walk(page: str, skip: str = "") -> dict[str, Any]:
+    """Follows a page in this folder, all but commands with `skip` in them; the names that its code has defined."""
+    names: dict[str, Any] = {}
+    for kind, text in steps(page):
+        if kind == "python":
+            exec(compile(text, page, "exec"), names)
+        elif not skip or skip not in text:
+            command(text)
+    return names
 
 
 def lines_of_the_tutorial() -> list[str]:
@@ -107,3 +148,24 @@ def test_the_python_of_a_limb_that_moves_runs() -> None:
     exec(compile(code, "moving.md", "exec"), names)
     assert names["touches"][0].force > 0.005 and names["simulator"].skin.angles == (0.5,)
     assert names["touches"][0].slip.share < 1  # it rides on the skin
+
+
+@pytest.mark.ros  # its settings are the node's
+def test_the_steps_of_a_massage_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """All but the demo, which test_ros_demo runs: its flags are read, and the sample stands for what it leaves."""
+    pytest.importorskip("mujoco", reason="pip install 'stmpl[sim]'")
+    pytest.importorskip("anny", reason="pip install 'stmpl[bodies]'")
+    from stmpl_ros import demo
+
+    asked = []
+    monkeypatch.setattr(demo, "run", lambda config: asked.append(config) or 0)
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "runs").mkdir()
+    (tmp_path / "runs" / "latest").symlink_to(ROOT / "bags" / "sample")
+    names = walk("massage.md")
+    (config,) = asked
+    assert config.robot.robot == Path("robot.xml") and config.node.phenotype_values == {"weight": 0.7}
+    assert names["log"].force[names["circling"]].mean() == pytest.approx(5, abs=0.25)
+    for run in ("sim", "heavier"):
+        with np.load(tmp_path / "runs" / run / "log.npz") as log:
+            assert np.nanmedian(log["force"][log["asked"] > 4.9]) == pytest.approx(5, abs=0.25)
