@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -44,6 +45,8 @@ class MassageEnv(gymnasium.Env[np.ndarray, np.ndarray]):
             living(Body.anny(), "back").
         circle: radius of the course [m].
         laps: laps of an episode.
+        robot, end, at: robot's file, what of it carries the ball, and place of the limb, as stmpl_sim.scene.build has
+            them; the arm that ships unless given.
         timestep: timestep of physics [s].
         render_mode: kind of frames: rgb_array, or none.
     """
@@ -56,6 +59,9 @@ class MassageEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         *,
         circle: float = 0.012,
         laps: float = 2.0,
+        robot: str | Path | None = None,
+        end: str | None = None,
+        at: tuple[float, float, float] = (0.5, 0.0, 0.25),
         timestep: float = 2e-3,
         render_mode: str | None = None,
     ) -> None:
@@ -69,7 +75,7 @@ class MassageEnv(gymnasium.Env[np.ndarray, np.ndarray]):
             layer = living(Body.anny(), "left_forearm")
         ready, layer = (layer, layer.layer) if isinstance(layer, Simulator) else (None, layer)
         site = Site.thickest(layer)
-        self._scene = build(layer, site, mount="animated", timestep=timestep)
+        self._scene = build(layer, site, robot=robot, end=end, at=at, mount="animated", timestep=timestep)
         self.course = Course(site.circle(circle), (FORCE,), SPEED, laps)
         self.massage = Massage(self._scene, self.course, skin=ready)
         self._rest = self.massage.data.mocap_pos[0].copy()

@@ -1,5 +1,6 @@
 """A robot in MuJoCo: it keeps its force on skin, on a course along it; scene, film and environment around it."""
 
+import importlib.util
 import json
 from pathlib import Path
 
@@ -105,6 +106,11 @@ def test_a_robot_of_ones_own_is_driven_and_what_it_lacks_is_said(forearm: SoftLa
     scene = build(forearm, site, robot=path, at=(0.3, 0.1, 0.1), timestep=2e-3)
     log = Massage(scene, Course(site.circle(0.005), (5.0,), laps=0), skin=Simulator(forearm, Winkler())).run()
     assert log.force[log.during(log.phases[2])].mean() == pytest.approx(5, abs=0.2)
+    if importlib.util.find_spec("gymnasium"):
+        from stmpl_sim.env import MassageEnv
+
+        env = MassageEnv(Simulator(forearm, Winkler()), circle=0.005, robot=path, at=(0.3, 0.1, 0.1), timestep=2e-3)
+        assert env.reset(seed=0)[0][0] == pytest.approx(1.0, abs=0.1)  # of 10 N
     with pytest.raises(InvalidInput, match=r"no body or site 'gripper'\. Bodies: .*l3"):
         build(forearm, site, robot=path, end="gripper")
     with pytest.raises(InvalidInput, match="does not reach the limb"):
