@@ -177,3 +177,24 @@ def test_the_steps_to_a_policy_run(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     assert names["touched"].in_range.mean() > 0.7 and names["touched"].why
     assert names["found"].wrench[:3] @ names["push"] == pytest.approx(5, rel=0.02)
     assert names["learnt"][0] > names["script"][0] - 0.02 > 0.8
+
+
+@pytest.mark.ros
+def test_the_steps_of_a_haptics_lab_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The node is a process beside this one, as on the page."""
+    rclpy = pytest.importorskip("rclpy")
+    from tests.bus import running
+
+    monkeypatch.chdir(tmp_path)
+    (line,) = [text for kind, text in steps("haptics_lab.md") if kind == "sh" and text.endswith("&")]
+    name, *arguments = shlex.split(line.removesuffix("&"))
+    assert name == "stmpl"
+    try:
+        with running("-m", "stmpl_ros.cli", *arguments):
+            names = walk("haptics_lab.md", skip="&")
+    finally:
+        if rclpy.ok():
+            rclpy.shutdown()
+    assert names["held"] == pytest.approx(1.12, rel=0.05) and names["given_out"] > -1e-4
+    assert len(names["heard"]) > 20 and names["device"].force @ names["out"] > 0.5
+    assert names["model"].grip.limit > 0.3 and np.linalg.norm(names["wrench"][:3]) > 0.5
