@@ -60,7 +60,6 @@ LEAST_STEP = 2e-4  # step of the depth, over the thickness, that is likewise onl
 MAX_DEPTH_TRIALS = 14  # trials of the depth for one wrench
 STIFFER = 1.1  # power of the depth with which the force grows over that of the linear layer, until a trial says more
 POWERS = (0.7, 6.0)  # range of that power
-STRAIGHT_MARGIN = 2.2  # on the bound of stacks that end straight below the skin, as on a back: none was learnt from
 MANY_TOOLS = 8  # number of tools from which those that are apart are told by a tree of boxes
 WHY = {
     NO_TOUCH: "{name} presses, but no skin is within {reach:g} mm along its force",
@@ -113,7 +112,6 @@ class Toucher:
         self.tools = Tools(margin_on(layer)) if tools is None else tools
         self.columns, self.net = Columns(layer), ContactNet(layer, near=self.near)
         self._modulus = layer.tissue.youngs_modulus
-        self._widened = STRAIGHT_MARGIN if layer.stacked and layer.core is None else 1.0
         self._thickest = float(layer.thickness.max())
         self._inward, self.deep = self.columns.inward, Deep(self.columns)
 
@@ -336,7 +334,7 @@ class Toucher:
         touch = Touch(
             one.contact.name, one.status, one.pose, wrench,
             depth=depth if np.isfinite(depth) else float("nan"),
-            force_bound=self._widened * size * known["scale"] * doubt ** known["power"] if size > 0 else 0.0,
+            force_bound=size * known["scale"] * doubt ** known["power"] if size > 0 else 0.0,
             moved=one.moved,
             missing=np.zeros(6) if stated is None else stated - wrench,
             pressure=values,

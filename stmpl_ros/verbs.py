@@ -318,7 +318,7 @@ def generate(
         out: folder of the data; data/<preset> unless given.
         workers: local processes; one a core unless given.
         scheduler: address of a Dask scheduler that does the work instead.
-        start: file of released contacts to go on from, as benchmarks/limbs_v1.npz for tissue.
+        start: file of released contacts to go on from, as benchmarks/limbs_v2.npz for tissue.
         as_json: manifest as JSON, for machines.
     """
     needed("stmpl generate", "learn", "anny", "torch", "zarr", "shapely")

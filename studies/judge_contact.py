@@ -93,17 +93,23 @@ def score(samples: Iterable[Sample], pressures: Weights, moments: Weights | None
     return Scores(*(np.array(c) for c in columns[:-2]), *(np.array(c, dtype=bool) for c in columns[-2:]))
 
 
-def bound_force(samples: Iterable[Sample], pressures: Weights) -> dict[str, float]:
+def bound_force(parts: Iterable[tuple[Iterable[Sample], Weights]]) -> dict[str, float]:
     """Bound on the error of a contact's force, over the force, from the network's own doubt: see fit_bound.
 
     Touches that are flagged are left out. Besides, the mean errors of the others.
+
+    Args:
+        parts: samples, and the network that is judged on them.
     """
-    plain = replace(pressures, card={**pressures.card, "bound": {"scale": 1.0, "power": 1.0}})
-    scores = score(samples, plain, reaction_only=True)
-    force, held = np.abs(scores.force), scores.held
-    found = fit_bound(np.maximum(force, LEAST_ERROR)[held], scores.stated[held], scores.kind[held])
+    every = [score(samples, replace(one, card={**one.card, "bound": {"scale": 1.0, "power": 1.0}}), reaction_only=True)
+             for samples, one in parts]  # fmt: skip
+    columns = (np.concatenate([getattr(one, name) for one in every])
+               for name in ("force", "pressure", "stated", "kind", "held"))  # fmt: skip
+    force, pressure, stated, kind, held = columns
+    force = np.abs(force)
+    found = fit_bound(np.maximum(force, LEAST_ERROR)[held], stated[held], kind[held])
     if held.any():
-        found |= {"force_mean": float(force[held].mean()), "pressure_l2_mean": float(scores.pressure[held].mean())}
+        found |= {"force_mean": float(force[held].mean()), "pressure_l2_mean": float(pressure[held].mean())}
     return found
 
 

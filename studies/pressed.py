@@ -121,6 +121,17 @@ class Rows:
         """Number of contacts."""
         return len(self.starts) - 1
 
+    def some(self, contacts: np.ndarray) -> Rows:
+        """Some of the contacts, by their numbers."""
+        return Rows.joined([self._one(int(k)) for k in contacts])
+
+    def _one(self, k: int) -> Rows:
+        nodes, vertices = slice(*self.starts[k : k + 2]), slice(*self.vertex_starts[k : k + 2])
+        return Rows(self.rows[nodes], self.prior[nodes], self.fade[nodes], self.area[nodes],
+                    self.corners[nodes] - self.vertex_starts[k], self.shares[nodes],
+                    np.array([0, nodes.stop - nodes.start]), self.true[vertices], self.vertex_area[vertices],
+                    np.array([0, vertices.stop - vertices.start]))  # fmt: skip
+
     @classmethod
     def joined(cls, parts: Sequence[Rows]) -> Rows:
         """Contacts of several, in order."""
