@@ -15,6 +15,7 @@ STEEP_SHARE = 0.02  # share of what moves or presses that may be so steep
 LONG = 2.2  # length of a triangle over its width; trained is up to about 2
 LONG_SHARE = 0.05  # share of what moves or presses that may be in such
 BORDER = 2.0  # distance of a load from the open border, over t; nearer the worst vertex is 6 to 21 % off
+STACK_BORDER = 1.2  # the same on stacks, whose coarse response knows the border: to there they are no worse than inside
 BORDER_SHARE = 0.05  # share of the load that may be nearer
 FOLD = 0.15  # fold ratio of prisms under bent skin, below which they are none that the networks know
 STRETCH = (0.8, 1.25)  # stretch of bent skin over rest, outside of which thickness and mesh are not what they were
@@ -75,6 +76,7 @@ class Soundness:
     Attributes:
         steep, long: masks of vertices, (V,).
         border: distance from the open border, over t, (V,).
+        least_border: least such distance of a load that is sound [-].
         bend: what joints did to it; None: it is at rest.
     """
 
@@ -84,7 +86,8 @@ class Soundness:
         self.steep = slope_of_thickness(layer) > STEEP
         self.long = longest_over_width(layer) > LONG
         self.border = border_distance(layer) / layer.thickness
-        self._doubtful = self.steep | self.long | (self.border < BORDER)
+        self.least_border = STACK_BORDER if layer.stacked else BORDER
+        self._doubtful = self.steep | self.long | (self.border < self.least_border)
 
     def at(self, bend: Bend) -> Self:
         """The same of a skin that joints have bent."""
@@ -106,10 +109,10 @@ class Soundness:
         """What is wrong with where forces (L,) on vertices (L,) press, as sentences."""
         total = float(force.sum())
         bent = self.bend.of_force(loaded, force) if self.bend is not None and total > 0 else []
-        if not total > 0 or float(force[self.border[loaded] < BORDER].sum()) <= BORDER_SHARE * total:
+        if not total > 0 or float(force[self.border[loaded] < self.least_border].sum()) <= BORDER_SHARE * total:
             return bent
         nearest = float(self.border[loaded].min())
-        far = f"the load comes to {nearest:.1f} thicknesses from the open border; trained is from {BORDER:g} on"
+        far = f"the load comes to {nearest:.1f} thicknesses from the open border; sound is from {self.least_border:g} on"
         return [far, *bent]
 
     def of_contact(self, loaded: np.ndarray, force: np.ndarray) -> list[str]:
