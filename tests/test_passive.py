@@ -65,7 +65,7 @@ def test_an_impedance_settles_on_a_forearm_and_gains_nothing_from_late_models(pl
 
 
 def test_late_models_by_themselves_do_give_energy(place: Place) -> None:
-    assert run(place, ForceControl(10.0), LATE, Bare()).gained > 0.01
+    assert run(place, ForceControl(15.0), LATE, Bare()).gained > 0.01
 
 
 @pytest.mark.parametrize("force", [5.0, 10.0])

@@ -142,7 +142,7 @@ def test_when_all_bones_move_as_one_the_answer_turns_with_them(tissue):
     answer = moved.step([Contact(ball(), motion @ pose)])
     np.testing.assert_allclose(moved.layer.vertices, layer.vertices @ motion[:3, :3].T + motion[:3, 3], atol=1e-12)
     peak = np.abs(rest.displacement).max()
-    np.testing.assert_allclose(answer.displacement, rest.displacement @ motion[:3, :3].T, atol=1e-3 * peak)
+    np.testing.assert_allclose(answer.displacement, rest.displacement @ motion[:3, :3].T, atol=2e-3 * peak)
     force = rest.touches["probe"].wrench[:3]
     np.testing.assert_allclose(answer.touches["probe"].wrench[:3], motion[:3, :3] @ force,
                                atol=1e-3 * np.linalg.norm(force))  # fmt: skip
