@@ -112,7 +112,7 @@ class Soundness:
         if not total > 0 or float(force[self.border[loaded] < self.least_border].sum()) <= BORDER_SHARE * total:
             return bent
         nearest = float(self.border[loaded].min())
-        far = f"the load comes to {nearest:.1f} thicknesses from the open border; sound is from {self.least_border:g} on"
+        far = f"the load comes to {nearest:.1f} thicknesses from the open border; sound from {self.least_border:g} on"
         return [far, *bent]
 
     def of_contact(self, loaded: np.ndarray, force: np.ndarray) -> list[str]:
