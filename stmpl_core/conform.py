@@ -5,18 +5,21 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import NamedTuple
 
+import numba
 import numpy as np
 
 from stmpl_core.arrays import Points, VertexVectors
-from stmpl_core.columns import depth_along
+from stmpl_core.columns import grid_of
 from stmpl_core.layer import SoftLayer
 from stmpl_core.moments import Surroundings
-from stmpl_core.sdf import SignedDistance
+from stmpl_core.rays import depth_in_column, ray_of, to_tool
+from stmpl_core.sdf import FAST, jet_at
 from stmpl_core.touch import Pressed, Touch, way_of
 
 MIN_LYING_PRESSURE = 0.05  # pressure over the tool's highest, below which a covered vertex may be apart from the tool
 FIRM_DEPTH = 0.013  # depth in a tool over the thickness, from which skin is moved out with its neighbours, not alone
 MIN_FACING_COSINE = 0.3  # cosine between tool's way and inward normal, from which skin comes along
+LEAST_WEIGHT = 1e-3  # firmness from which a correction counts: one that falls to 0 lets go of its vertex continuously
 PASSES = 3  # corrections of one answer
 SMOOTHING_SHARE = 0.05  # ridge over the sinking of a vertex under its own source: it keeps neighbours from fighting
 
@@ -36,12 +39,11 @@ class Conformed(NamedTuple):
 
 
 class _Tool(NamedTuple):
-    field: SignedDistance
+    grid: tuple[np.ndarray, np.ndarray, float]
     pose: np.ndarray
     vertices: np.ndarray
     gone: Points  # way of the vertices with the tool if they lie on it, (N, 3) [m]
     lies: np.ndarray  # share from 0, may be apart, to 1, lies on the tool, (N,)
-    firm: np.ndarray  # FIRM_DEPTH, (N,) [m]
 
 
 def conform(layer: SoftLayer, near: Surroundings, displacement: VertexVectors, touches: Sequence[Touch]) -> Conformed:
@@ -62,79 +64,144 @@ def conform(layer: SoftLayer, near: Surroundings, displacement: VertexVectors, t
     tools = [_tool(touch, touch.pressed, layer) for touch in touches if touch.pressed is not None]
     if not tools:
         return Conformed(displacement, 0.0, 0.0)
-    all_of = np.unique(np.concatenate([tool.vertices for tool in tools]))
-    place = [np.searchsorted(all_of, tool.vertices) for tool in tools]
-    sinking = near.sinking(all_of).astype(float)
-    own = SMOOTHING_SHARE * float(np.diag(sinking).mean())
-    moved, sources = displacement[all_of], np.zeros((len(all_of), 3))
+    under = tools[0].vertices if len(tools) == 1 else np.unique(np.concatenate([tool.vertices for tool in tools]))
+    places = [np.searchsorted(under, tool.vertices) for tool in tools]
+    sinking, rest = near.sinking(under), layer.vertices[under]
+    firm, moved, sources = FIRM_DEPTH * layer.thickness[under], displacement[under], np.zeros((len(under), 3))
     for _ in range(PASSES):
-        wanted, weight = np.zeros((len(all_of), 3)), np.zeros(len(all_of))
-        for tool, at in zip(tools, place, strict=True):
-            some, firm = _wanted(tool, layer.vertices[tool.vertices], moved[at])
-            more = firm > weight[at]
-            wanted[at[more]], weight[at[more]] = some[more], firm[more]
-        act = np.flatnonzero(weight > 1e-3)  # a weight that falls to 0 lets go of its vertex continuously
-        if not len(act):
+        wanted, weight = np.zeros((len(under), 3)), np.zeros(len(under))
+        for tool, at in zip(tools, places, strict=True):
+            _want(tool.grid, tool.pose, rest, moved, at, tool.gone, tool.lies, firm, wanted, weight)
+        if not _correct(sinking, wanted, weight, moved, sources):
             break
-        step = np.linalg.solve(sinking[np.ix_(act, act)] + np.diag(own / weight[act] ** 2), wanted[act])
-        sources[act] += step
-        moved += sinking[:, act] @ step
-    out = near.spread(all_of, sources)
-    out += displacement
+    out = displacement.copy()
+    near.spread(under, sources, out)
     entered = _push_out(layer, touches, out)
-    corrected = float(np.linalg.norm(out[all_of] - displacement[all_of], axis=1).max())
-    return Conformed(out, corrected, entered)
+    return Conformed(out, _furthest(displacement, out, under), entered)
 
 
 def kept_out(layer: SoftLayer, displacement: VertexVectors, touches: Sequence[Touch]) -> Conformed:
     """The answer with the skin that is inside a tool on its surface: where all else lies on the tool already."""
     out = displacement.copy()
     entered = _push_out(layer, touches, out)
-    under = np.concatenate([touch.pressed.squeeze.vertices for touch in touches if touch.pressed is not None])
-    return Conformed(out, float(np.linalg.norm(out[under] - displacement[under], axis=1).max(initial=0.0)), entered)
+    under = [touch.pressed.squeeze.vertices for touch in touches if touch.pressed is not None]
+    return Conformed(out, max((_furthest(displacement, out, some) for some in under), default=0.0), entered)
 
 
 def _push_out(layer: SoftLayer, touches: Sequence[Touch], out: VertexVectors) -> float:
     """Moves what is left inside tools straight out; the largest depth that is left [m]."""
-    entered = 0.0
-    for touch in touches:
-        if touch.pressed is None:
-            continue
-        field, pose, v = touch.pressed.field, touch.pose_body_from_tool, touch.pressed.squeeze.vertices
-        phi, gradient = _jet(field, pose, layer.vertices[v] + out[v])
-        out[v] -= np.minimum(phi, 0.0)[:, None] * gradient
-        phi, _ = _jet(field, pose, layer.vertices[v] + out[v])
-        entered = max(entered, -float(phi.min(initial=0.0)))
-    return entered
-
-
-def _jet(field: SignedDistance, pose: np.ndarray, points: Points) -> tuple[np.ndarray, Points]:
-    """Signed distance [m] of a tool and its gradient at points of the layer's frame."""
-    turn = pose[:3, :3]
-    phi, gradient = field.distance_gradient((points - pose[:3, 3]) @ turn)
-    return phi, gradient @ turn.T
+    return max((_pushed(grid_of(touch.pressed.field), touch.pose_body_from_tool, layer.vertices,
+                        touch.pressed.squeeze.vertices, out)
+                for touch in touches if touch.pressed is not None), default=0.0)  # fmt: skip
 
 
 def _tool(touch: Touch, pressed: Pressed, layer: SoftLayer) -> _Tool:
     assert touch.pressure is not None
-    field, squeeze = pressed.field, pressed.squeeze
-    v = squeeze.vertices
-    pressure = touch.pressure[v]
-    way = way_of(touch, pressed, -layer.normals[v], float(pressure @ layer.vertex_areas[v]))
-    depth, cosine = squeeze.depth, -np.einsum("ni,ni->n", layer.normals[v], way)
-    lies = squeeze.rests * np.clip(pressure / (MIN_LYING_PRESSURE * pressure.max()) - 0.5, 0, 1)
-    lies *= np.clip((cosine - MIN_FACING_COSINE) / 0.1, 0, 1)
-    some, gone = np.flatnonzero(lies), np.zeros((len(v), 3))
-    points, guess = layer.vertices[v[some]], depth[some] / cosine[some]
-    far = depth_along(field, touch.pose_body_from_tool, points, way[some], guess)
-    sure = np.clip(2 * lies[some] - 1, 0, 1)  # beside a wall it is not clear where the way ends
-    gone[some] = (sure * far + (1 - sure) * guess)[:, None] * way[some]
-    return _Tool(field, touch.pose_body_from_tool, v, gone, lies, FIRM_DEPTH * layer.thickness[v])
+    grid, (v, depth, rests, _) = grid_of(pressed.field), pressed.squeeze
+    pressure, inward = touch.pressure[v], -layer.normals[v]
+    way = way_of(touch, pressed, inward, float(pressure @ layer.vertex_areas[v]))
+    pose, gone, lies = touch.pose_body_from_tool, np.zeros((len(v), 3)), np.empty(len(v))
+    _lie(grid, pose, layer.vertices[v], inward, way, depth, rests, pressure, gone, lies)
+    return _Tool(grid, pose, v, gone, lies)
 
 
-def _wanted(tool: _Tool, rest: Points, moved: Points) -> tuple[Points, np.ndarray]:
-    """How the vertices under a tool should still move, (N, 3) [m], and how firmly, (N,): 0, need not, to 1."""
-    phi, gradient = _jet(tool.field, tool.pose, rest + moved)
-    out, lies = -np.minimum(phi, 0.0)[:, None] * gradient, tool.lies[:, None]
-    wanted = lies * (tool.gone - moved) + (1 - lies) * out
-    return wanted, np.maximum(tool.lies, np.clip(-phi / tool.firm, 0, 1))
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _lie(grid, pose, points, inward, way, depth, rests, pressure, gone, lies):
+    """Writes how far vertices lie on a tool and where they have gone then; see _Tool."""
+    light = MIN_LYING_PRESSURE * pressure.max()
+    for n in range(len(points)):
+        cosine = inward[n, 0] * way[n, 0] + inward[n, 1] * way[n, 1] + inward[n, 2] * way[n, 2]
+        lies[n] = rests[n] * _clipped(pressure[n] / light - 0.5) * _clipped((cosine - MIN_FACING_COSINE) / 0.1)
+        if lies[n] == 0:
+            continue
+        guess = depth[n] / cosine
+        far = depth_in_column(grid, ray_of(pose, points, way, n), 4 * guess, guess)
+        sure = _clipped(2 * lies[n] - 1)  # beside a wall it is not clear where the way ends
+        for x in range(3):
+            gone[n, x] = (sure * far + (1 - sure) * guess) * way[n, x]
+
+
+@numba.njit(inline="always")
+def _clipped(x):
+    return min(max(x, 0.0), 1.0)
+
+
+@numba.njit(inline="always")
+def _jet(grid, pose, rest, moved):
+    """Signed distance of a point that has moved to a tool [m], and its gradient: four numbers."""
+    x, y, z = to_tool(pose, rest[0] + moved[0], rest[1] + moved[1], rest[2] + moved[2])
+    phi, a, b, c = jet_at(grid[0], grid[1], grid[2], x, y, z)
+    return (phi, pose[0, 0] * a + pose[0, 1] * b + pose[0, 2] * c, pose[1, 0] * a + pose[1, 1] * b + pose[1, 2] * c,
+            pose[2, 0] * a + pose[2, 1] * b + pose[2, 2] * c)  # fmt: skip
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _want(grid, pose, rest, moved, places, gone, lies, firm, wanted, weight):
+    """Writes how the vertices under a tool, at places, should still move [m], and how firmly: 0, need not, to 1.
+
+    Where another tool wants it more firmly that stays.
+    """
+    for n in range(len(places)):
+        k = places[n]
+        phi, a, b, c = _jet(grid, pose, rest[k], moved[k])
+        firmly = max(lies[n], _clipped(-phi / firm[k]))
+        if firmly > weight[k]:
+            weight[k], out = firmly, -(1 - lies[n]) * min(phi, 0.0)
+            wanted[k, 0] = lies[n] * (gone[n, 0] - moved[k, 0]) + out * a
+            wanted[k, 1] = lies[n] * (gone[n, 1] - moved[k, 1]) + out * b
+            wanted[k, 2] = lies[n] * (gone[n, 2] - moved[k, 2]) + out * c
+
+
+@numba.njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
+def _correct(sinking, wanted, weight, moved, sources):
+    """Moves vertices as is wanted, with those around them, and adds up the sources that do so; False: none is."""
+    count, own = len(weight), 0.0
+    act = np.flatnonzero(weight > LEAST_WEIGHT)
+    if not len(act):
+        return False
+    for n in range(count):
+        own += SMOOTHING_SHARE * sinking[n, n] / count
+    matrix, right, step = np.empty((len(act), len(act))).T, np.empty((len(act), 3)), np.zeros((3, count))
+    for a in range(len(act)):
+        for b in range(len(act)):
+            matrix[a, b] = sinking[act[a], act[b]]
+        matrix[a, a] += own / weight[act[a]] ** 2
+        right[a] = wanted[act[a]]
+    right = np.linalg.solve(matrix, right)
+    for a in range(len(act)):
+        for x in range(3):
+            step[x, act[a]] = right[a, x]
+            sources[act[a], x] += right[a, x]
+    for n in range(count):
+        x = y = z = 0.0
+        for m in range(count):
+            x += sinking[n, m] * step[0, m]
+            y += sinking[n, m] * step[1, m]
+            z += sinking[n, m] * step[2, m]
+        moved[n, 0], moved[n, 1], moved[n, 2] = moved[n, 0] + x, moved[n, 1] + y, moved[n, 2] + z
+    return True
+
+
+@numba.njit(cache=True, nogil=True)
+def _pushed(grid, pose, points, vertices, out):
+    """Moves vertices that are inside a tool straight out of it; the largest depth that is left [m]."""
+    entered = 0.0
+    for v in vertices:
+        phi, a, b, c = _jet(grid, pose, points[v], out[v])
+        if phi < 0:
+            out[v, 0], out[v, 1], out[v, 2] = out[v, 0] - phi * a, out[v, 1] - phi * b, out[v, 2] - phi * c
+            phi, a, b, c = _jet(grid, pose, points[v], out[v])
+            entered = max(entered, -phi)
+    return entered
+
+
+@numba.njit(cache=True, nogil=True)
+def _furthest(one, other, vertices):
+    """Largest distance between two motions of vertices [m]."""
+    most = 0.0
+    for v in vertices:
+        square = 0.0
+        for x in range(3):
+            square += (other[v, x] - one[v, x]) ** 2
+        most = max(most, square)
+    return np.sqrt(most)

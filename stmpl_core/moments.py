@@ -188,24 +188,27 @@ class Surroundings:
     def sinking(self, vertices: np.ndarray) -> np.ndarray:
         """Sinking of vertex i under a unit source at vertex j of those given, over t, (N, N) [-]."""
         out = np.zeros((len(vertices), len(vertices)), dtype=np.float32)
-        sources = np.ascontiguousarray(self._sites[:, vertices])
-        sink_between(vertices, sources, self._sites, self._frames, self._response[0], out)
+        sink_between(vertices, self._sites.take(vertices, axis=1), self._sites, self._frames, self._response[0], out)
         group = self.groups(vertices)
         return np.where(group[:, None] == group, out, np.float32(0)) if group.any() else out
 
-    def spread(self, vertices: np.ndarray, sources: np.ndarray) -> np.ndarray:
-        """Vectors (N, 3) at vertices (N,) spread as sinking spreads, (V, 3)."""
-        asked, out = self.asked_again(vertices), np.zeros((len(self.frames), 3))
-        by, group = np.zeros((len(asked.vertices), 3)), self.groups(vertices)
-        for one in range(group.max(initial=0) + 1):
+    def spread(self, vertices: np.ndarray, sources: np.ndarray, out: np.ndarray) -> None:
+        """Adds vectors (N, 3) at vertices (N,), spread as sinking spreads, to `out` (V, 3)."""
+        asked, group = self.asked_again(vertices), self.groups(vertices)
+        if not group.any():
+            asked.add(self._spread(vertices, sources, asked.vertices), out)
+            return
+        by = np.zeros((len(asked.vertices), 3))
+        for one in range(group.max() + 1):
             of = np.flatnonzero(group == one)
-            there, some = self.reached_among(vertices[of], asked.vertices, alone=not group.any()), vertices[of]
-            part = np.empty((len(there), 3))
-            values = np.ascontiguousarray(sources[of].T, dtype=np.float32)
-            spread_sinking(asked.vertices[there], values, np.ascontiguousarray(self._sites[:, some]), self._sites,
-                           self._frames, self._response[0], part)  # fmt: skip
-            by[there] += part
-        asked.fill(by, out)
+            there = self.reached_among(vertices[of], asked.vertices, alone=False)
+            by[there] += self._spread(vertices[of], sources[of], asked.vertices[there])
+        asked.add(by, out)
+
+    def _spread(self, vertices: np.ndarray, sources: np.ndarray, there: np.ndarray) -> np.ndarray:
+        out, values = np.empty((len(there), 3)), np.ascontiguousarray(sources.T, dtype=np.float32)
+        spread_sinking(there, values, self._sites.take(vertices, axis=1), self._sites, self._frames,
+                       self._response[0], out)  # fmt: skip
         return out
 
     def groups(self, vertices: np.ndarray) -> np.ndarray:
@@ -233,8 +236,8 @@ class Surroundings:
     def _felt(self, sources: np.ndarray, loaded: np.ndarray, vertices: np.ndarray, moments: bool) -> np.ndarray:
         figures = np.zeros((len(vertices), sources.shape[1], WIDTH), dtype=np.float32)
         values = np.ascontiguousarray(sources.T, dtype=np.float32)
-        feel(vertices, values, np.ascontiguousarray(self._sites[:, loaded]), self._sites, self._frames,
-              self._response[0], self._response[1], moments, figures)  # fmt: skip
+        feel(vertices, values, self._sites.take(loaded, axis=1), self._sites, self._frames,
+             self._response[0], self._response[1], moments, figures)  # fmt: skip
         return figures
 
 

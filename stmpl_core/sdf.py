@@ -118,8 +118,7 @@ class SignedDistance:
 
     def distance_gradient(self, points: ArrayLike) -> tuple[np.ndarray, Points]:
         """Distance (N,) [m] and its gradient (N, 3) [-], the outward direction of the tool."""
-        distance, gradient, _ = self.distance_gradient_hessian(points)
-        return distance, gradient
+        return _gradients(self.coefficients, self.origin, self.spacing, finite("points", points, (None, 3)))
 
     def distance_gradient_hessian(self, points: ArrayLike) -> tuple[np.ndarray, Points, np.ndarray]:
         """Distance (N,) [m], gradient (N, 3) [-] and Hessian (N, 3, 3) [1/m], the tool's curvature."""
@@ -232,6 +231,64 @@ def distance_at(coefficients, origin, spacing, x, y, z):
     dx, dy, dz = x - origin[0] - spacing * u, y - origin[1] - spacing * v, z - origin[2] - spacing * w
     away = dx * dx + dy * dy + dz * dz
     return total if away < 1e-24 else np.sqrt(away + total * total)
+
+
+@numba.njit(cache=True, inline="always")
+def _slopes(f):
+    """Derivatives of the weights of _cubic."""
+    g = 1.0 - f
+    return -g * g / 2, (3 * f * f - 4 * f) / 2, (4 * g - 3 * g * g) / 2, f * f / 2
+
+
+@numba.njit(cache=True, nogil=True, fastmath=FAST)
+def _jet_on_plane(plane, j, b, db, k, c, dc):
+    """Spline on one plane of nodes, from node (j, k) on, and its derivatives along both axes of it."""
+    value = across = along = 0.0
+    value, across, along = _add_line(plane[j], k, c, dc, b[0], db[0], value, across, along)
+    value, across, along = _add_line(plane[j + ONE], k, c, dc, b[1], db[1], value, across, along)
+    value, across, along = _add_line(plane[j + TWO], k, c, dc, b[2], db[2], value, across, along)
+    return _add_line(plane[j + THREE], k, c, dc, b[3], db[3], value, across, along)
+
+
+@numba.njit(cache=True, inline="always")
+def _add_line(line, k, c, dc, b, db, value, across, along):
+    here = _on_line(line, k, c[0], c[1], c[2], c[3])
+    return value + b * here, across + db * here, along + b * _on_line(line, k, dc[0], dc[1], dc[2], dc[3])
+
+
+@numba.njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
+def jet_at(coefficients, origin, spacing, x, y, z):
+    """Signed distance at one point [m], and its gradient: four numbers; for use inside other kernels."""
+    i, u, f = _cell((x - origin[0]) / spacing, coefficients.shape[0])
+    j, v, g = _cell((y - origin[1]) / spacing, coefficients.shape[1])
+    k, w, e = _cell((z - origin[2]) / spacing, coefficients.shape[2])
+    a, da, b, db, c, dc = _cubic(f), _slopes(f), _cubic(g), _slopes(g), _cubic(e), _slopes(e)
+    i, j, k = np.uint64(i), np.uint64(j), np.uint64(k)  # no index that may count from the end
+    d0, y0, z0 = _jet_on_plane(coefficients[i], j, b, db, k, c, dc)
+    d1, y1, z1 = _jet_on_plane(coefficients[i + ONE], j, b, db, k, c, dc)
+    d2, y2, z2 = _jet_on_plane(coefficients[i + TWO], j, b, db, k, c, dc)
+    d3, y3, z3 = _jet_on_plane(coefficients[i + THREE], j, b, db, k, c, dc)
+    d = a[0] * d0 + a[1] * d1 + (a[2] * d2 + a[3] * d3)
+    gx = (da[0] * d0 + da[1] * d1 + (da[2] * d2 + da[3] * d3)) / spacing
+    gy = (a[0] * y0 + a[1] * y1 + (a[2] * y2 + a[3] * y3)) / spacing
+    gz = (a[0] * z0 + a[1] * z1 + (a[2] * z2 + a[3] * z3)) / spacing
+    dx, dy, dz = x - origin[0] - spacing * u, y - origin[1] - spacing * v, z - origin[2] - spacing * w
+    away = dx * dx + dy * dy + dz * dz
+    if away < 1e-24:
+        return d, gx, gy, gz
+    root = np.sqrt(away + d * d)  # along an axis that leads out of the grid the nearest point stays
+    return (root, (dx if abs(dx) > 1e-12 else d * gx) / root, (dy if abs(dy) > 1e-12 else d * gy) / root,
+            (dz if abs(dz) > 1e-12 else d * gz) / root)  # fmt: skip
+
+
+@numba.njit(cache=True, nogil=True)
+def _gradients(coefficients, origin, spacing, points):
+    """Distance and gradient at each point."""
+    value, gradient = np.empty(len(points)), np.empty((len(points), 3))
+    for n in range(len(points)):
+        value[n], gradient[n, 0], gradient[n, 1], gradient[n, 2] = jet_at(
+            coefficients, origin, spacing, points[n, 0], points[n, 1], points[n, 2])  # fmt: skip
+    return value, gradient
 
 
 @numba.njit(cache=True, nogil=True)

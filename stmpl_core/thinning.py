@@ -37,13 +37,18 @@ class Asked(NamedTuple):
 
     def fill(self, values: np.ndarray, out: np.ndarray) -> None:
         """Writes vectors at the asked vertices (N, 3) and what follows for those between to `out` (V, 3)."""
-        out[self.vertices] = values
-        _fill(np.ascontiguousarray(values), self.between, self.corners, self.weights, out)
+        _fill(values, self.vertices, self.between, self.corners, self.weights, False, out)
+
+    def add(self, values: np.ndarray, out: np.ndarray) -> None:
+        """As `fill`, but added to what is there."""
+        _fill(values, self.vertices, self.between, self.corners, self.weights, True, out)
 
     @property
     def stand_for(self) -> np.ndarray:
         """Number of vertices that each asked one stands for, (N,)."""
-        return 1 + np.bincount(self.corners.ravel(), self.weights.ravel(), len(self.vertices))
+        out = np.ones(len(self.vertices))
+        _stand_for(self.corners, self.weights, out)
+        return out
 
 
 class Thinning:
@@ -65,7 +70,7 @@ class Thinning:
         points, normals, thickness = np.ascontiguousarray(layer.vertices), layer.normals, layer.thickness
         self.start, self.index = neighbours(points, normals, thickness, layer.faces, np.array([*zones, reach]))
         count = len(points)
-        self._last: Asked | None = None
+        self._last: tuple[Asked, ...] = ()
         self._grouped: tuple[np.ndarray, np.ndarray] | None = None
         self._stands = np.zeros((len(zones) + 1, count), dtype=np.bool_)
         self._corners = np.zeros((len(zones) + 1, count, CORNERS), dtype=np.int32)
@@ -119,13 +124,15 @@ class Thinning:
     def asked(self, loaded: np.ndarray) -> Asked:
         """Vertices that are asked under a load on vertices (L,), and how the others are filled in."""
         zones = _zones(self.start, self.index, loaded, len(self._stands[0]))
-        last = self._last = Asked(loaded, *_asked(zones, self._stands, self._corners, self._weights))
-        return last
+        return Asked(loaded, *_asked(zones, self._stands, self._corners, self._weights))
 
     def asked_again(self, loaded: np.ndarray) -> Asked:
-        """Same as `asked`, but not done again if these were the last."""
+        """Same as `asked`, but not done again if these were the last, or those before: an answer asks for two."""
         last = self._last
-        return last if last is not None and np.array_equal(last.loaded, loaded) else self.asked(loaded)
+        known = [one for one in last if np.array_equal(one.loaded, loaded)]
+        first = known[0] if known else self.asked(loaded)
+        self._last = first, *[one for one in last if one is not first][:1]
+        return first
 
 
 def neighbours(points: np.ndarray, normals: np.ndarray, thickness: np.ndarray, faces: np.ndarray,
@@ -331,9 +338,11 @@ def _zones(start, index, loaded, count):
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _asked(marks, stands, corners, weights):
     """All of Asked but for the loaded vertices."""
-    last = len(stands)
-    place = np.zeros(len(marks), np.int32)
-    between = np.empty(len(marks), np.int32)
+    last, room = len(stands), 0
+    for v in range(len(marks)):
+        room += marks[v] != 0
+    place, between = np.zeros(len(marks), np.int32), np.empty(room, np.int32)
+    at, by = np.empty((room, CORNERS), np.int32), np.empty((room, CORNERS), np.float32)
     many = 0
     for v in range(len(marks)):
         if marks[v] == 0:
@@ -341,34 +350,56 @@ def _asked(marks, stands, corners, weights):
         z = last - marks[v]
         if stands[z, v]:
             place[v] = 1
-        else:
-            between[many] = v
-            many += 1
-            for k in range(CORNERS):
-                place[corners[z, v, k]] = 1
-    count = 0
-    for n in range(many):  # asked after all
-        if place[between[n]] == 0:
-            between[count] = between[n]
-            count += 1
-    between = between[:count].copy()
-    vertices = np.flatnonzero(place).astype(np.int32)
-    for n in range(len(vertices)):
-        place[vertices[n]] = n
-    at, by = np.empty((count, CORNERS), np.int32), np.empty((count, CORNERS), np.float32)
-    for n in range(count):
-        v = between[n]
-        z = last - marks[v]
+            continue
+        between[many] = v
         for k in range(CORNERS):
-            at[n, k], by[n, k] = place[corners[z, v, k]], weights[z, v, k]
-    return vertices, between, at, by
+            at[many, k] = corners[z, v, k]
+            place[at[many, k]] = 1
+        many += 1
+    asked = 0
+    for v in range(len(marks)):
+        asked += place[v]
+    vertices, asked = np.empty(asked, np.int32), 0
+    for v in range(len(marks)):
+        if place[v]:
+            vertices[asked] = v
+            asked += 1
+            place[v] = asked  # one more than its number
+    count = 0
+    for n in range(many):
+        v = between[n]
+        if place[v]:  # asked after all
+            continue
+        z = last - marks[v]
+        between[count] = v
+        for k in range(CORNERS):
+            at[count, k], by[count, k] = place[at[n, k]] - 1, weights[z, v, k]
+        count += 1
+    return vertices, between[:count], at[:count], by[:count]
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _fill(values, between, corners, weights, out):
-    for n in range(len(between)):
+def _stand_for(corners, weights, out):
+    """Adds the weights of all that are filled in to those that they are filled in from."""
+    for n in range(len(corners)):
+        for k in range(corners.shape[1]):
+            out[corners[n, k]] += weights[n, k]
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _fill(values, vertices, between, corners, weights, add, out):
+    """See Asked.fill, and Asked.add."""
+    for n in range(len(vertices)):
         for x in range(3):
-            out[between[n], x] = 0.0
-        for k in range(CORNERS):
-            for x in range(3):
-                out[between[n], x] += weights[n, k] * values[corners[n, k], x]
+            out[vertices[n], x] = out[vertices[n], x] + values[n, x] if add else values[n, x]
+    for n in range(len(between)):
+        x = y = z = 0.0
+        for k in range(corners.shape[1]):
+            c, weight = corners[n, k], weights[n, k]
+            x += weight * values[c, 0]
+            y += weight * values[c, 1]
+            z += weight * values[c, 2]
+        v = between[n]
+        if add:
+            x, y, z = x + out[v, 0], y + out[v, 1], z + out[v, 2]
+        out[v, 0], out[v, 1], out[v, 2] = x, y, z
