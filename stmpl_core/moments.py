@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
 from copy import copy
 from typing import NamedTuple
 from weakref import WeakKeyDictionary
@@ -101,8 +102,7 @@ class Surroundings:
         self.bent = np.concatenate([bend.reshape(-1, 9), slope], axis=1)
         table = response_table(layer.tissue, float(layer.thickness[0]))
         self._response = np.ascontiguousarray(np.moveaxis(table, 2, 0))
-        with packed():
-            self._felt(np.zeros((1, 1)), np.zeros(1, np.int64), np.zeros(1, np.int32), moments=True)
+        self._felt(np.zeros((1, 1)), np.zeros(1, np.int64), np.zeros(1, np.int32), moments=True)  # compiled now
 
     def asked(self, loaded: np.ndarray) -> Asked:
         """Vertices that must be asked under sources at vertices `loaded` (L,), for all to be known."""
@@ -194,13 +194,13 @@ class Surroundings:
 
     def spread(self, vertices: np.ndarray, sources: np.ndarray, out: np.ndarray) -> None:
         """Adds vectors (N, 3) at vertices (N,), spread as sinking spreads, to `out` (V, 3)."""
-        asked, group = self.asked_again(vertices), self.groups(vertices)
+        asked, group, some = self.asked_again(vertices), self.groups(vertices), np.flatnonzero(sources.any(axis=1))
         if not group.any():
-            asked.add(self._spread(vertices, sources, asked.vertices), out)
+            asked.add(self._spread(vertices[some], sources[some], asked.vertices), out)
             return
         by = np.zeros((len(asked.vertices), 3))
         for one in range(group.max() + 1):
-            of = np.flatnonzero(group == one)
+            of = some[group[some] == one]
             there = self.reached_among(vertices[of], asked.vertices, alone=False)
             by[there] += self._spread(vertices[of], sources[of], asked.vertices[there])
         asked.add(by, out)
@@ -236,8 +236,9 @@ class Surroundings:
     def _felt(self, sources: np.ndarray, loaded: np.ndarray, vertices: np.ndarray, moments: bool) -> np.ndarray:
         figures = np.zeros((len(vertices), sources.shape[1], WIDTH), dtype=np.float32)
         values = np.ascontiguousarray(sources.T, dtype=np.float32)
-        feel(vertices, values, self._sites.take(loaded, axis=1), self._sites, self._frames,
-             self._response[0], self._response[1], moments, figures)  # fmt: skip
+        with nullcontext() if feel.overloads else packed():
+            feel(vertices, values, self._sites.take(loaded, axis=1), self._sites, self._frames,
+                 self._response[0], self._response[1], moments, figures)  # fmt: skip
         return figures
 
 

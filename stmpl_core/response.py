@@ -100,33 +100,27 @@ def feel(vertices, values, sources, sites, frames, sink, away, moments, out):
     Rows of sites and sources: x, y, z, t^-1/2, area, log(t) / 2, the same of the spread, normal. Loops over the
     sources have no branches, so that they run in vector registers.
     """
-    fields, many = values.shape
+    (fields, many), down, along = values.shape, sink.ravel(), away.ravel()
     for chunk in numba.prange((len(vertices) + CHUNK - 1) // CHUNK):
-        felt, cell = np.empty((8, many), dtype=np.float32), np.empty(many, dtype=np.int32)
+        felt, cell = np.empty((7, many), dtype=np.float32), np.empty(many, dtype=np.uint32)
         sums = np.empty((fields, 5, 8), dtype=np.float32)
         for n in range(CHUNK * chunk, min(CHUNK * (chunk + 1), len(vertices))):
-            _gather(vertices[n], sources, sites, frames, sink, away, felt, cell)
-            for s in range(fields):
-                u = v = w = np.float32(0)
-                for q in range(many):
-                    value = values[s, q]
-                    u -= value * felt[5, q]
-                    v -= value * felt[6, q]
-                    w -= value * felt[7, q]
-                out[n, s, 0], out[n, s, 1], out[n, s, 2] = u, v, w
+            _gather(vertices[n], sources, sites, frames, np.int32(sink.shape[1]), felt, cell)
+            for s in range(0, fields, 2):
+                _respond(values, s, min(s + 1, fields - 1), felt, cell, down, along, sink.shape[1], out[n])
             if moments:
                 _take_moments(values, felt, sums, out[n])
 
 
 @numba.njit(inline="always", fastmath=FAST, error_model="numpy")
-def _gather(i, sources, sites, frames, sink, away, felt, cell):
-    """What vertex i feels of each source, to `felt`: distance in table rows, its direction, area, ..., response.
+def _gather(i, sources, sites, frames, width, felt, cell):
+    """Where each source is for vertex i, to `felt`: distance in table rows, its direction, area, place in the tables.
 
-    The area, over the local thickness squared, and the response are 0 of sources that are out of reach.
+    The area, over the local thickness squared, and the scale of the response are 0 of sources that are out of reach.
     """
     one, far = np.float32(1), np.float32(REACH * REACH)
     root, log_t, per_log = sites[3, i], sites[5, i], np.float32(1 / np.log(SPREADS[1] / SPREADS[0]))
-    top, width = np.float32(len(SPREADS) - 1.001), np.int32(sink.shape[1])
+    top = np.float32(len(SPREADS) - 1.001)
     px, py, pz = sites[0, i], sites[1, i], sites[2, i]
     a0, a1, a2 = frames[i, 0, 0], frames[i, 0, 1], frames[i, 0, 2]
     b0, b1, b2 = frames[i, 1, 0], frames[i, 1, 1], frames[i, 1, 2]
@@ -145,14 +139,25 @@ def _gather(i, sources, sites, frames, sink, away, felt, cell):
         felt[0, q], felt[1, q], felt[2, q], felt[3, q] = f, x * flat, y * flat, area
         felt[4, q], felt[5, q], felt[6, q] = f - np.float32(k), h - np.float32(g), area * root / sources[3, q]
         cell[q] = g * width + k
-    down, along = sink.ravel(), away.ravel()
-    for q in range(sources.shape[1]):
-        k, rest, h, scale = cell[q], felt[4, q], felt[5, q], felt[6, q]
-        w2, w3 = h * (one - rest), h * rest
-        w0, w1 = one - rest - w2, rest - w3
-        s = w0 * down[k] + w1 * down[k + 1] + w2 * down[k + width] + w3 * down[k + width + 1]
-        t = w0 * along[k] + w1 * along[k + 1] + w2 * along[k + width] + w3 * along[k + width + 1]
-        felt[5, q], felt[6, q], felt[7, q] = scale * t * felt[1, q], scale * t * felt[2, q], scale * s
+
+
+@numba.njit(inline="always", fastmath=FAST, error_model="numpy")
+def _respond(values, s, s2, felt, cell, down, along, width, out):
+    """Writes the linear response to two source fields; it stores nothing on the way, so that it runs in registers."""
+    one, following, below = np.float32(1), np.uint64(1), np.uint64(width)
+    u = v = w = u2 = v2 = w2 = np.float32(0)
+    for q in range(values.shape[1]):
+        k, rest, h = np.uint64(cell[q]), felt[4, q], felt[5, q]
+        p2, p3 = h * (one - rest), h * rest
+        p0, p1 = one - rest - p2, rest - p3
+        low, high = p0 * down[k] + p1 * down[k + following], p2 * down[k + below] + p3 * down[k + below + following]
+        near, far = p0 * along[k] + p1 * along[k + following], p2 * along[k + below] + p3 * along[k + below + following]
+        sinks, goes = felt[6, q] * (low + high), felt[6, q] * (near + far)
+        x, y, value, value2 = goes * felt[1, q], goes * felt[2, q], values[s, q], values[s2, q]
+        u, v, w = u - value * x, v - value * y, w - value * sinks
+        u2, v2, w2 = u2 - value2 * x, v2 - value2 * y, w2 - value2 * sinks
+    out[s, 0], out[s, 1], out[s, 2] = u, v, w
+    out[s2, 0], out[s2, 1], out[s2, 2] = u2, v2, w2
 
 
 @numba.njit(inline="always", fastmath=FAST, error_model="numpy")
@@ -191,11 +196,11 @@ def _take_moments(values, felt, sums, out):
 
 
 @numba.njit(inline="always", fastmath=FAST, error_model="numpy")
-def _sinks(i, sources, sites, frames, sink, felt, cell):
-    """How far vertex i sinks under a unit of each source, in thicknesses, to felt[0]; as _gather, and nothing else."""
-    one, far = np.float32(1), np.float32(REACH * REACH)
+def _places(i, sources, sites, frames, width, felt, cell):
+    """Where each source is for vertex i in the table of sinking, and its scale, to `felt`; as _gather."""
+    far = np.float32(REACH * REACH)
     root, log_t, per_log = sites[3, i], sites[5, i], np.float32(1 / np.log(SPREADS[1] / SPREADS[0]))
-    top, width = np.float32(len(SPREADS) - 1.001), np.int32(sink.shape[1])
+    top = np.float32(len(SPREADS) - 1.001)
     px, py, pz = sites[0, i], sites[1, i], sites[2, i]
     c0, c1, c2 = frames[i, 2, 0], frames[i, 2, 1], frames[i, 2, 2]
     for q in range(sources.shape[1]):
@@ -208,35 +213,43 @@ def _sinks(i, sources, sites, frames, sink, felt, cell):
         k, g = np.int32(f), np.int32(h)
         felt[0, q] = scale if facing > 0 and square < far else np.float32(0)
         felt[1, q], felt[2, q], cell[q] = f - np.float32(k), h - np.float32(g), g * width + k
-    down = sink.ravel()
-    for q in range(sources.shape[1]):
-        k, rest, h = cell[q], felt[1, q], felt[2, q]
-        low = (one - rest) * down[k] + rest * down[k + 1]
-        high = (one - rest) * down[k + width] + rest * down[k + width + 1]
-        felt[0, q] *= (one - h) * low + h * high
+
+
+@numba.njit(inline="always", fastmath=FAST, error_model="numpy")
+def _sinks(felt, cell, q, down, width):
+    """How far a vertex sinks under a unit of source q, in thicknesses."""
+    one, following, below = np.float32(1), np.uint64(1), np.uint64(width)
+    k, rest, h = np.uint64(cell[q]), felt[1, q], felt[2, q]
+    low = (one - rest) * down[k] + rest * down[k + following]
+    high = (one - rest) * down[k + below] + rest * down[k + below + following]
+    return felt[0, q] * ((one - h) * low + h * high)
 
 
 @numba.njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
 def sink_between(vertices, sources, sites, frames, sink, out):
     """See Surroundings.sinking."""
-    felt, cell = np.empty((3, len(vertices)), np.float32), np.empty(len(vertices), np.int32)
+    felt, cell = np.empty((3, len(vertices)), np.float32), np.empty(len(vertices), np.uint32)
+    down, width = sink.ravel(), sink.shape[1]
     for n in range(len(vertices)):
-        _sinks(vertices[n], sources, sites, frames, sink, felt, cell)
-        out[n] = felt[0]
+        _places(vertices[n], sources, sites, frames, np.int32(width), felt, cell)
+        for q in range(len(vertices)):
+            out[n, q] = _sinks(felt, cell, q, down, width)
 
 
 @numba.njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
 def spread_sinking(vertices, values, sources, sites, frames, sink, out):
     """See Surroundings.spread; values (3, N), out (M, 3)."""
     many = values.shape[1]
-    felt, cell = np.empty((3, many), np.float32), np.empty(many, np.int32)
+    felt, cell = np.empty((3, many), np.float32), np.empty(many, np.uint32)
+    down, width = sink.ravel(), sink.shape[1]
     for n in range(len(vertices)):
-        _sinks(vertices[n], sources, sites, frames, sink, felt, cell)
+        _places(vertices[n], sources, sites, frames, np.int32(width), felt, cell)
         u = v = w = np.float32(0)
-        for q in range(many):
-            u += values[0, q] * felt[0, q]
-            v += values[1, q] * felt[0, q]
-            w += values[2, q] * felt[0, q]
+        for q in range(many):  # it stores nothing, so that it runs in vector registers
+            sinks = _sinks(felt, cell, q, down, width)
+            u += values[0, q] * sinks
+            v += values[1, q] * sinks
+            w += values[2, q] * sinks
         out[n, 0], out[n, 1], out[n, 2] = u, v, w
 
 

@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import overload
 
+import numba
 import numpy as np
 
 from stmpl_core.bounds import motion_bound
@@ -193,7 +194,8 @@ class Simulator:
         if not pressing:
             solved = Displacement(np.zeros_like(self.layer.vertices), Trust(), self.method.name)
             return solved, Conformed(solved.displacement, 0.0, 0.0)
-        moving = sum((one / factor for one, factor in pressing), np.zeros(len(self.layer.vertices)))
+        first, *others = (one / factor for one, factor in pressing)
+        moving = sum(others, first)
         motion = None if self._green is None else stuck_motion(self._green, touches)
         solved = self.method.solve(Load.contact(moving, motion))
         if motion is None:
@@ -242,16 +244,28 @@ def _deeper(fitted: Conformed, share: float, there: Conformed, inward: np.ndarra
 
 def _within(displacement: np.ndarray, thickness: np.ndarray) -> tuple[np.ndarray, float, int]:
     """The displacement, no longer than the layer is thick anywhere, its peak [m], how many were held back."""
-    length = np.sqrt(np.einsum("ni,ni->n", displacement, displacement))
+    peak, many = _peak(displacement, thickness)
+    if not many:
+        return displacement, peak, 0
+    length = np.linalg.norm(displacement, axis=1)
     long = np.flatnonzero(length > MOST_MOVED * thickness)
-    if not len(long):
-        return displacement, float(length.max()), 0
     over = (length[long] / thickness[long] - MOST_MOVED) / (1 - MOST_MOVED)
     held = thickness[long] * (MOST_MOVED + (1 - MOST_MOVED) * np.tanh(over))  # smooth, and never further
     out = displacement.copy()
     out[long] *= (held / length[long])[:, None]
     length[long] = held
     return out, float(length.max()), len(long)
+
+
+@numba.njit(cache=True, nogil=True)
+def _peak(displacement, thickness):
+    """Largest motion [m], and how many go too far."""
+    peak, many = 0.0, 0
+    for v in range(len(displacement)):
+        length = np.sqrt(displacement[v, 0] ** 2 + displacement[v, 1] ** 2 + displacement[v, 2] ** 2)
+        peak = max(peak, length)
+        many += length > MOST_MOVED * thickness[v]
+    return peak, many
 
 
 def _joined(trust: Trust, touches: Sequence[Touch], fitted: Conformed) -> Trust:

@@ -209,7 +209,9 @@ def test_numba_and_torch_see_the_same_inputs() -> None:
     shape = np.concatenate([parts["curvature"], parts["slope"]], axis=1)
     more = np.empty((200, 0), np.float32)
     figures = parts["figures"].reshape(200, 2, -1)
-    invariants(figures, shape, parts["here"], parts["constants"][0], more, *mixed, *ends, inputs, outside)
+    all_of = np.arange(200)
+    invariants(all_of, figures, all_of, shape, parts["here"], parts["constants"][0], more, *mixed, *ends, inputs,
+               outside)  # fmt: skip
     with torch.no_grad():
         want = model._inputs(torch.from_numpy(np.concatenate(POINT.in_order(**parts), axis=1)))[0].numpy()
     assert not outside.any()

@@ -136,39 +136,30 @@ class MomentNet:
         asked = near.asked_again(load.loaded)
         felt = near.felt(sources, asked)
         vertices, figures = felt.vertices, felt.figures
-        shape = self._shape[vertices]
         weights = self.contact if load.kind == "contact" else self.weights
         displacement, more = np.zeros_like(layer.vertices), np.empty((len(vertices), 0), np.float32)
         if self._green is not None:
             weights, displacement = self.stack, linear_motion(self._green, load)
-            take_linear(figures, near, vertices, displacement)
-            length = np.linalg.norm(displacement[vertices], axis=1)
-            more = of_stack(self._green, vertices, float(length.max(initial=0.0)))
+            more = of_stack(self._green, vertices, take_linear(figures, near, vertices, displacement))
         a, constants = weights.arrays, np.array([layer.tissue.poisson_ratio, load.kind == "nodal"], np.float32)
 
         # What is around each vertex becomes numbers that do not turn with the scene; far vertices need none.
-        near_ones = np.flatnonzero(np.abs(felt.scalars[:, 1]).sum(axis=1) > SURROUNDED)
-        place = np.full(len(vertices), -1)
-        place[near_ones] = np.arange(len(near_ones))
-        inputs = np.empty((len(near_ones), INPUTS.size + more.shape[1]), dtype=np.float32)
-        outside, strange = np.zeros(len(vertices), dtype=np.bool_), np.zeros(len(near_ones), dtype=np.bool_)
-        invariants(figures[near_ones], shape[near_ones], sources[vertices[near_ones]], constants, more[near_ones],
-                a["mix_vectors"],
-                a["mix_tensors"], a["least"], a["most"], a["low"], a["high"], a["mean"], a["scale"], inputs,
-                strange)  # fmt: skip
-        outside[near_ones] = strange
+        some = _surrounded(figures)
+        inputs = np.empty((len(some), INPUTS.size + more.shape[1]), dtype=np.float32)
+        outside = np.zeros(len(vertices), dtype=np.bool_)
+        invariants(some, figures, vertices, self._shape, sources, constants, more, a["mix_vectors"], a["mix_tensors"],
+                   a["least"], a["most"], a["low"], a["high"], a["mean"], a["scale"], inputs, outside)  # fmt: skip
 
         # Three hidden layers.
-        outputs = np.empty((len(near_ones), MOTION.size), dtype=np.float32)
+        outputs = np.empty((len(some), MOTION.size), dtype=np.float32)
         think(inputs, a["w1"], a["b1"], a["w2"], a["b2"], a["w3"], a["b3"], a["w4"], a["b4"], outputs)
 
         # Each vertex moves along its normal and along the directions of what is around it.
-        moved, error = np.empty((len(vertices), 3)), np.empty(len(vertices), dtype=np.float32)
-        _move(figures, shape, sources[vertices], place, outputs, a["mix_vectors"], a["mix_tensors"],
-              self._frames[vertices], moved, error)  # fmt: skip
+        moved, error = np.empty((len(vertices), 3)), np.zeros(len(vertices), dtype=np.float32)
+        _move(some, figures, vertices, self._shape, sources, outputs, a["mix_vectors"], a["mix_tensors"], self._frames,
+              moved, error)  # fmt: skip
         asked.fill(moved, displacement)
-        peak_error = float((error * near.thickness[vertices]).max(initial=0.0))
-        trust = self._trust(weights.card, load, pressure, asked, moved, outside, peak_error)
+        trust = self._trust(weights.card, load, pressure, asked, moved, outside, error)
         if not trust.in_range and self.fallback is not None:
             answer = self.fallback.solve(load)
             because = answer.trust.also(f"answered by {answer.method}: {trust.why}")
@@ -176,19 +167,22 @@ class MomentNet:
         return Displacement(displacement, trust, self.name, pressure)
 
     def _trust(self, card: Mapping[str, Any], load: Load, pressure: np.ndarray, asked: Asked,
-               moved: np.ndarray, outside: np.ndarray, error: float) -> Trust:  # fmt: skip
+               moved: np.ndarray, outside: np.ndarray, doubt: np.ndarray) -> Trust:  # fmt: skip
         layer = prepared(self._layer, self)
         loaded = asked.loaded
         if not len(loaded):
             return Trust(error_bound=0.0)
-        length = np.linalg.norm(moved, axis=1)
-        moving = length > 0.02 * length.max()
-        if not moving.any():  # a load so small that numbers cannot tell
+        assert self._near is not None
+        sound, pressed = self._near.sound, pressure[loaded]
+        width = np.empty(len(moved))
+        many, error, share, steep, long = _shares(
+            moved, asked.vertices, asked.stand_for, outside, sound.steep, sound.long, doubt, self._near.thickness,
+            self._width, width)  # fmt: skip
+        if not many:  # a load so small that numbers cannot tell
             return Trust(error_bound=0.0)
-        share = _share(outside, moving, asked)
-        ratio = float(pressure[loaded].max()) / self._unit.youngs_modulus
+        ratio = float(pressed.max()) / self._unit.youngs_modulus
         nu = layer.tissue.poisson_ratio
-        fine, coarse = _tenths(self._width[asked.vertices[moving]])
+        fine, coarse = _tenths(width[:many])
         trust = Trust(figures={"peak_ratio": ratio, "outside_share": share, "expected_error_m": error})
         ranges = card["ranges"]
         for what, low, high in (
@@ -202,16 +196,13 @@ class MomentNet:
             if low < least - 1e-3 * abs(least) or high > most + 1e-3 * abs(most):
                 worst = high if high > most else low
                 trust = trust.also(f"{what} is {worst:.3g}, trained is {least:.3g} to {most:.3g}", in_range=False)
-        if pressure.min() < 0:
+        if pressed.min() < 0:
             trust = trust.also("the load pulls, the network was trained under pressure only", in_range=False)
         if share > OUTSIDE_SHARE:
             why = f"{share:.0%} of the vertices that move see what no training load had"
             trust = trust.also(why, in_range=False)
-        assert self._near is not None
-        sound = self._near.sound
-        steep, long = (_share(mask[asked.vertices], moving, asked) for mask in (sound.steep, sound.long))
         for why in (*sound.of_mesh(steep, long, "the vertices that move"),
-                    *sound.of_load(loaded, np.abs(pressure[loaded]) * layer.vertex_areas[loaded])):  # fmt: skip
+                    *sound.of_load(loaded, np.abs(pressed) * layer.vertex_areas[loaded])):  # fmt: skip
             trust = trust.also(why, in_range=False)
         bound = float(card["bound"]["factor"]) * error
         return Trust(trust.converged, trust.in_range, bound if trust.in_range else None, trust.why, trust.figures)
@@ -219,15 +210,6 @@ class MomentNet:
 
 def _weights(given: str | Path | Weights | None, default: str, kind: Kind = "motion") -> Weights:
     return given if isinstance(given, Weights) else Weights.load(given, kind) if given else shipped(default)
-
-
-def _share(some: np.ndarray, moving: np.ndarray, asked: Asked) -> float:
-    """Of the vertices that move, each asked one counting for those that it stands for."""
-    both = some & moving
-    if not both.any():
-        return 0.0
-    counts = asked.stand_for
-    return float(counts[both].sum() / counts[moving].sum())
 
 
 def _tenths(values: np.ndarray) -> tuple[float, float]:
@@ -243,10 +225,21 @@ def unit_of(green: Green) -> Tissue:
     return Tissue(green.effective.youngs_modulus, green.layer.tissue.poisson_ratio)
 
 
-def take_linear(figures: np.ndarray, near: Surroundings, vertices: np.ndarray, motion: np.ndarray) -> None:
-    """Writes a linear response (V, 3) [m] into the figures (N, 2, WIDTH) of vertices (N,)."""
-    local = np.einsum("nij,nj->ni", near.frames[vertices], motion[vertices]) / near.thickness[vertices, None]
-    figures[:, :, :3] = local[:, None]
+def take_linear(figures: np.ndarray, near: Surroundings, vertices: np.ndarray, motion: np.ndarray) -> float:
+    """Writes a linear response (V, 3) [m] into the figures (N, 2, WIDTH) of vertices (N,), and says its peak [m]."""
+    return _take_linear(figures, near.frames, near.thickness, vertices, motion)
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _take_linear(figures, frames, thickness, vertices, motion):
+    most = 0.0
+    for n in range(len(vertices)):
+        v = vertices[n]
+        most = max(most, motion[v, 0] ** 2 + motion[v, 1] ** 2 + motion[v, 2] ** 2)
+        for k in range(3):
+            along = frames[v, k, 0] * motion[v, 0] + frames[v, k, 1] * motion[v, 1] + frames[v, k, 2] * motion[v, 2]
+            figures[n, 0, k] = figures[n, 1, k] = along / thickness[v]
+    return np.sqrt(most)
 
 
 def of_stack(green: Green, vertices: np.ndarray, peak: float) -> np.ndarray:
@@ -308,27 +301,64 @@ def _mix(weights, vectors, out):
 
 
 @numba.njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
-def invariants(figures, shape, here, constants, more, mix_vectors, mix_tensors, least, most, low, high, mean, scale,
-               out, outside):  # fmt: skip
+def _surrounded(figures):
+    """Places of the vertices that something presses around."""
+    out, many = np.empty(len(figures), np.int64), 0
+    for n in range(len(figures)):
+        if _amplitude(figures[n]) > np.float32(SURROUNDED):
+            out[many] = n
+            many += 1
+    return out[:many]
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _shares(moved, vertices, stand_for, outside, steep, long, doubt, thickness, width, widths):
+    """How many vertices move, the largest doubt [m], and the shares that are outside, steep and long of those.
+
+    Each asked one counts for those that it stands for. Widths of the moving ones are written to `widths`.
+    """
+    most = error = 0.0
+    for n in range(len(moved)):
+        most = max(most, moved[n, 0] ** 2 + moved[n, 1] ** 2 + moved[n, 2] ** 2)
+    least, many, total, sums = 0.02 * np.sqrt(most), 0, 0.0, np.zeros(3)
+    for n in range(len(moved)):
+        v = vertices[n]
+        error = max(error, doubt[n] * thickness[v])
+        if np.sqrt(moved[n, 0] ** 2 + moved[n, 1] ** 2 + moved[n, 2] ** 2) > least:
+            widths[many] = width[v]
+            many += 1
+            total += stand_for[n]
+            sums[0] += stand_for[n] if outside[n] else 0.0
+            sums[1] += stand_for[n] if steep[v] else 0.0
+            sums[2] += stand_for[n] if long[v] else 0.0
+    return many, error, sums[0] / total, sums[1] / total, sums[2] / total
+
+
+@numba.njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
+def invariants(some, figures, vertices, shapes, sources, constants, more, mix_vectors, mix_tensors, least, most, low,
+               high, mean, scale, out, outside):  # fmt: skip
     """The network's inputs, those of INPUTS and then `more` (N, .): kept from low to high, then centred and scaled.
 
-    Outside is who has one that no training load had.
+    Figures (N, 2, WIDTH) and `more` are those of vertices (N,), of which those at places `some` (M,) are asked; shapes
+    (V, 5) and sources (V, 2) are of all. Outside (N,) is who has an input that no training load had.
     """
     half, one = np.float32(0.5), np.float32(1)
-    for n in range(len(figures)):
+    vectors, tensors = np.empty((DIRECTIONS, 2), np.float32), np.empty((2 * TENSORS, 2), np.float32)
+    v, t = np.empty((MIXED_VECTORS, 2), np.float32), np.empty((MIXED_TENSORS, 2), np.float32)
+    for place in range(len(some)):
+        n = some[place]
+        shape, here = shapes[vertices[n]], sources[vertices[n]]
         g = _amplitude(figures[n])
-        vectors, tensors = np.empty((DIRECTIONS, 2), np.float32), np.empty((2 * TENSORS, 2), np.float32)
-        v, t = np.empty((MIXED_VECTORS, 2), np.float32), np.empty((MIXED_TENSORS, 2), np.float32)
         _directions(figures[n], g, vectors, tensors)
         _mix(mix_vectors, vectors, v)
         _mix(mix_tensors, tensors, t)
-        row, per = out[n], one / g
+        row, per = out[place], one / g
         for s in range(2):
             for m in range(SCALARS):
                 row[IN.scalars + s * SCALARS + m] = figures[n, s, 3 + m] * per
             row[IN.linear_normal + s] = figures[n, s, 2] * per
-            row[IN.here + s] = here[n, s] * per
-            row[IN.log_here + s] = np.log(abs(here[n, s]) + np.float32(0.02))
+            row[IN.here + s] = here[s] * per
+            row[IN.log_here + s] = np.log(abs(here[s]) + np.float32(0.02))
         row[IN.log_g], row[IN.g], row[IN.root_g] = np.log(g + np.float32(1e-4)), g, np.sqrt(g)
         for m in range(SCALARS):
             row[IN.field_difference + m] = figures[n, 0, 3 + m] - figures[n, 1, 3 + m]
@@ -342,7 +372,7 @@ def invariants(figures, shape, here, constants, more, mix_vectors, mix_tensors, 
             for b in range(a, MIXED_TENSORS):
                 row[k] = t[a, 0] * t[b, 0] + t[a, 1] * t[b, 1]
                 k += 1
-        turn, bend = half * (shape[n, 0] - shape[n, 2]), shape[n, 1]
+        turn, bend = half * (shape[0] - shape[2]), shape[1]
         for a in range(MIXED_TENSORS):
             x, y = v[a, 0], v[a, 1]
             row[IN.tensor_along_vector + a] = t[a, 0] * (x * x - y * y) + np.float32(2) * t[a, 1] * x * y
@@ -350,12 +380,12 @@ def invariants(figures, shape, here, constants, more, mix_vectors, mix_tensors, 
         for a in range(MIXED_VECTORS):
             x, y = v[a, 0], v[a, 1]
             row[IN.curvature_along_vector + a] = turn * (x * x - y * y) + np.float32(2) * bend * x * y
-            row[IN.slope_along_vector + a] = shape[n, 3] * x + shape[n, 4] * y
-        row[IN.mean_curvature] = half * (shape[n, 0] + shape[n, 2])
+            row[IN.slope_along_vector + a] = shape[3] * x + shape[4] * y
+        row[IN.mean_curvature] = half * (shape[0] + shape[2])
         row[IN.squared_bend] = turn * turn + bend * bend
         row[IN.constants], row[IN.constants + 1] = constants[0], constants[1]
         row[IN.volumetric] = one / (np.float32(1.02) - np.float32(2) * constants[0])
-        row[IN.squared_slope] = shape[n, 3] * shape[n, 3] + shape[n, 4] * shape[n, 4]
+        row[IN.squared_slope] = shape[3] * shape[3] + shape[4] * shape[4]
         for m in range(more.shape[1]):
             row[INPUTS_END + m] = more[n, m]
         for m in range(len(mean)):
@@ -404,39 +434,44 @@ def _activate(hidden, bias):
 
 
 @numba.njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
-def _move(figures, shape, here, place, outputs, mix_vectors, mix_tensors, frames, moved, error):
+def _move(some, figures, vertices, shapes, sources, outputs, mix_vectors, mix_tensors, frames, moved, error):
     """Linear response to the columns' strain plus what the network adds, turned into the layer's frame, (N, 3) [m].
 
     Where the moments end so does the network, but not what it knows: the linear response is too small far from a load
     that is not small. So it goes on as the multiple of it that the network says on a ring around the load.
     """
     one, told, told_of = np.float32(1), 1e-30, 1e-30
-    local, share = np.empty((len(figures), 3), np.float32), np.empty(len(figures), np.float32)
-    for n in range(len(figures)):
-        u, v, w = figures[n, 1, 0], figures[n, 1, 1], figures[n, 1, 2]
-        local[n, 0], local[n, 1], local[n, 2] = u, v, w
-        share[n], error[n] = 0, 0
-        if place[n] < 0:
-            continue
+    local, share = np.empty((len(some), 3), np.float32), np.empty(len(some), np.float32)
+    vectors, tensors = np.empty((DIRECTIONS, 2), np.float32), np.empty((2 * TENSORS, 2), np.float32)
+    v, t = np.empty((MIXED_VECTORS, 2), np.float32), np.empty((MIXED_TENSORS, 2), np.float32)
+    for k in range(len(some)):
+        n = some[k]
+        x, y, z = figures[n, 1, 0], figures[n, 1, 1], figures[n, 1, 2]
+        local[k, 0], local[k, 1], local[k, 2] = x, y, z
         g = _amplitude(figures[n])
-        _add(figures[n], g, shape[n], outputs[place[n]], mix_vectors, mix_tensors, local[n])
-        error[n] = np.float32(AMPLITUDE) * g / (one + g) * np.exp(min(outputs[place[n], OUT.log_error], np.float32(2)))
-        square = u * u + v * v + w * w
+        _directions(figures[n], g, vectors, tensors)
+        _mix(mix_vectors, vectors, v)
+        _mix(mix_tensors, tensors, t)
+        _add(g, shapes[vertices[n]], outputs[k], vectors, v, t, local[k])
+        error[n] = np.float32(AMPLITUDE) * g / (one + g) * np.exp(min(outputs[k, OUT.log_error], np.float32(2)))
+        square = x * x + y * y + z * z
         ratio = g / (np.sqrt(square) + np.float32(1e-30))
-        share[n] = _smooth(ratio / np.float32(FADE))
-        if here[n, 0] == 0:
-            weight = share[n] * (one - _smooth(ratio / np.float32(RING)))
-            told += weight * (u * local[n, 0] + v * local[n, 1] + w * local[n, 2])
+        share[k] = _smooth(ratio / np.float32(FADE))
+        if sources[vertices[n], 0] == 0:
+            weight = share[k] * (one - _smooth(ratio / np.float32(RING)))
+            told += weight * (x * local[k, 0] + y * local[k, 1] + z * local[k, 2])
             told_of += weight * square
-    gain = np.float32(min(max(told / told_of, GAINS[0]), GAINS[1]))
+    gain, k = np.float32(min(max(told / told_of, GAINS[0]), GAINS[1])), 0
     for n in range(len(figures)):
-        s, rest = share[n], (one - share[n]) * gain
+        linear, frame = figures[n, 1], frames[vertices[n]]
+        x, y, z = gain * linear[0], gain * linear[1], gain * linear[2]
+        if k < len(some) and some[k] == n:
+            s, rest = share[k], (one - share[k]) * gain
+            x, y, z = (s * local[k, 0] + rest * linear[0], s * local[k, 1] + rest * linear[1],
+                       s * local[k, 2] + rest * linear[2])  # fmt: skip
+            k += 1
         for m in range(3):
-            moved[n, m] = 0
-        for k in range(3):
-            value = s * local[n, k] + rest * figures[n, 1, k]
-            for m in range(3):
-                moved[n, m] += value * frames[n, k, m]
+            moved[n, m] = x * frame[0, m] + y * frame[1, m] + z * frame[2, m]
 
 
 @numba.njit(inline="always", fastmath=FAST, error_model="numpy")
@@ -447,13 +482,8 @@ def _smooth(x):
 
 
 @numba.njit(inline="always", fastmath=FAST, error_model="numpy")
-def _add(figures, g, shape, row, mix_vectors, mix_tensors, out):
+def _add(g, shape, row, vectors, mixed, t, out):
     """Adds what the network says of a vertex to its linear response (3,) over t, in its own frame."""
-    vectors, tensors = np.empty((DIRECTIONS, 2), np.float32), np.empty((2 * TENSORS, 2), np.float32)
-    mixed, t = np.empty((MIXED_VECTORS, 2), np.float32), np.empty((MIXED_TENSORS, 2), np.float32)
-    _directions(figures, g, vectors, tensors)
-    _mix(mix_vectors, vectors, mixed)
-    _mix(mix_tensors, tensors, t)
     x = y = np.float32(0)
     for m in range(DIRECTIONS):
         x += row[OUT.directions + m] * vectors[m, 0]
