@@ -41,6 +41,7 @@ COLUMNS, STRAINS = 12, 64  # thicknesses and strains of the table of confined co
 GAUSS = np.polynomial.legendre.leggauss(4)  # points and weights on each panel of wave numbers
 RIDGE = 1e-6  # of the matrix that sticks, over its largest number: two nodes in one place are no error
 LEAST_KAPPA, LEAST_PULL = 0.05, 0.02  # kappa and pull that are none, in logarithms
+NEXT = np.uint64(1)  # no index that may count from the end
 ONE_WAY = 0.3  # least cosine between a tool's way and the skin's inward normal at a node
 
 
@@ -210,9 +211,8 @@ class Green:
         if self.coarse is None:
             return out
         source = _handed(nodes.inward, nodes.corners, nodes.shares, forces, *self.coarse[:3])
-        loaded = np.flatnonzero(source)
-        if len(loaded):
-            motion = (source[loaded].astype(np.float32) @ self._by_source[loaded]).reshape(-1, 3).astype(float)
+        if source.any():
+            motion = _of_coarse(source, self._by_source).reshape(-1, 3)
             if len(self._turns):
                 motion = np.einsum("cxy,cy->cx", self._turns, motion)
             _add_between(self.coarse.corners, self.coarse.shares, motion, out)
@@ -426,26 +426,24 @@ def _matrix(points, inward, area, corners, shares, group, unit, table, skin_corn
 
 
 @numba.njit(cache=True, error_model="numpy", inline="always")
-def _of_force(points, inward, i, sources, source_inward, j, size, g0, g1, even, along, force, out):
-    """Adds to out (3,) the flat motion of point i under a force (3,) at source j, given the four responses there."""
-    m0, m1, m2 = (inward[i, 0] + source_inward[j, 0], inward[i, 1] + source_inward[j, 1],
-                  inward[i, 2] + source_inward[j, 2])  # fmt: skip
-    root = 1 / np.sqrt(m0 * m0 + m1 * m1 + m2 * m2)
+def _of_force(n0, n1, n2, s0, s1, s2, d0, d1, d2, size, g0, g1, even, along, f0, f1, f2):
+    """Flat motion of a point under a force f, three numbers, given the four responses there.
+
+    The point's inward normal is n, the source's is s; d leads from the source to the point.
+    """
+    m0, m1, m2 = n0 + s0, n1 + s1, n2 + s2
+    root = 1 / np.sqrt(max(m0 * m0 + m1 * m1 + m2 * m2, 1e-12))
     m0, m1, m2 = m0 * root, m1 * root, m2 * root
-    d0, d1, d2 = points[i, 0] - sources[j, 0], points[i, 1] - sources[j, 1], points[i, 2] - sources[j, 2]
     up = d0 * m0 + d1 * m1 + d2 * m2
     d0, d1, d2 = d0 - up * m0, d1 - up * m1, d2 - up * m2
     length = np.sqrt(d0 * d0 + d1 * d1 + d2 * d2)
     root = 1 / length if length > 1e-6 * size else 0.0
     d0, d1, d2 = d0 * root, d1 * root, d2 * root
-    down = force[0] * source_inward[j, 0] + force[1] * source_inward[j, 1] + force[2] * source_inward[j, 2]
-    over = force[0] * m0 + force[1] * m1 + force[2] * m2
-    t0, t1, t2 = force[0] - over * m0, force[1] - over * m1, force[2] - over * m2
+    down, over = f0 * s0 + f1 * s1 + f2 * s2, f0 * m0 + f1 * m1 + f2 * m2
+    t0, t1, t2 = f0 - over * m0, f1 - over * m1, f2 - over * m2
     radial = t0 * d0 + t1 * d1 + t2 * d2
     sink, away, rest = g0 * down - g1 * radial, g1 * down + along * radial, even - 0.5 * along
-    out[0] += sink * inward[i, 0] + away * d0 + rest * t0
-    out[1] += sink * inward[i, 1] + away * d1 + rest * t1
-    out[2] += sink * inward[i, 2] + away * d2 + rest * t2
+    return sink * n0 + away * d0 + rest * t0, sink * n1 + away * d1 + rest * t1, sink * n2 + away * d2 + rest * t2
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
@@ -481,8 +479,11 @@ def _blocks(points, inward, area, corners, shares, group, unit, tables, skin_cor
                                    per * _at(tables[2], k, f, g, h), per * _at(tables[3], k, f, g, h))  # fmt: skip
             for y in range(3):
                 force[:] = 0.0
-                force[y], moved[:] = 1.0, 0.0
-                _of_force(points, inward, i, points, inward, j, t, g0, g1, even, along, force, moved)
+                force[y] = 1.0
+                moved[0], moved[1], moved[2] = _of_force(
+                    inward[i, 0], inward[i, 1], inward[i, 2], inward[j, 0], inward[j, 1], inward[j, 2],
+                    points[i, 0] - points[j, 0], points[i, 1] - points[j, 1], points[i, 2] - points[j, 2], t,
+                    g0, g1, even, along, force[0], force[1], force[2])  # fmt: skip
                 for x in range(3):
                     out[i, x, j, y] += moved[x]
                     if i != j:
@@ -511,43 +512,47 @@ def add_motion(out, there, points, inward, unit, sources, source_inward, area, s
         forces: forces over E, (N, 3) [m2].
         tables: see `tables`.
     """
-    spread = SPREAD * np.sqrt(area) / source_unit
-    rows, row_of = np.empty((len(sources), 4, tables.shape[2])), np.empty(len(sources), np.int64)
-    kinds = 0
+    wide = tables.shape[2]
+    rows, first, kinds = np.empty((len(sources), 4, wide)), np.empty(len(sources), np.int32), 0
+    by = np.empty((11, len(sources)))  # of each source: place, inward normal, force, root of the thickness, spread
     for j in range(len(sources)):  # nodes of one tool are about as wide: few tables serve all
-        _, _, g, h = _place(0.0, spread[j])
-        at = int(16 * (g + h))
-        row_of[j] = -1
-        for k in range(kinds):
-            if rows[k, 0, -1] == at:
-                row_of[j] = k
-        if row_of[j] < 0:
+        spread = SPREAD * np.sqrt(area[j]) / source_unit[j]
+        by[9, j], by[10, j] = np.sqrt(source_unit[j]), (ROUND * spread) ** 2
+        for x in range(3):
+            by[x, j], by[3 + x, j], by[6 + x, j] = sources[j, x], source_inward[j, x], forces[j, x]
+        _, _, g, h = _place(0.0, spread)
+        at, k = int(16 * (g + h)), 0
+        while k < kinds and rows[k, 0, -1] != at:
+            k += 1
+        if k == kinds:
             g, h = at // 16, (at % 16 + 0.5) / 16
             for m in range(4):
-                for c in range(tables.shape[2]):
-                    rows[kinds, m, c] = (1 - h) * tables[m, g, c] + h * tables[m, g + 1, c]
-            rows[kinds, 0, -1] = at
-            row_of[j] = kinds
+                for c in range(wide):
+                    rows[k, m, c] = (1 - h) * tables[m, g, c] + h * tables[m, g + 1, c]
+            rows[k, 0, -1] = at
             kinds += 1
+        first[j] = 4 * wide * k
+    flat = rows.ravel()
     for n in range(len(there)):
         i = there[n]
-        for j in range(len(sources)):
-            square = facing = 0.0
-            for x in range(3):
-                square += (points[i, x] - sources[j, x]) ** 2
-                facing += inward[i, x] * source_inward[j, x]
-            t = np.sqrt(unit[i] * source_unit[j])
-            r = np.sqrt(square) / t
-            if facing <= 0 or r >= 0.98 * REACH:
-                continue
-            f = np.sqrt(r) * ROWS
-            k, row = int(f), rows[row_of[j]]
-            f -= k
-            per = _share(facing) / (np.sqrt(r * r + (ROUND * spread[j]) ** 2) * t)
-            g0, g1 = per * ((1 - f) * row[0, k] + f * row[0, k + 1]), per * ((1 - f) * row[1, k] + f * row[1, k + 1])
-            even, along = (per * ((1 - f) * row[2, k] + f * row[2, k + 1]),
-                           per * ((1 - f) * row[3, k] + f * row[3, k + 1]))  # fmt: skip
-            _of_force(points, inward, i, sources, source_inward, j, t, g0, g1, even, along, forces[j], out[i])
+        p0, p1, p2, n0, n1, n2 = points[i, 0], points[i, 1], points[i, 2], inward[i, 0], inward[i, 1], inward[i, 2]
+        root, u, v, w = np.sqrt(unit[i]), 0.0, 0.0, 0.0
+        for j in range(len(sources)):  # without branches or stores, so that it runs in vector registers
+            d0, d1, d2, t = p0 - by[0, j], p1 - by[1, j], p2 - by[2, j], root * by[9, j]
+            facing = n0 * by[3, j] + n1 * by[4, j] + n2 * by[5, j]
+            r = np.sqrt(d0 * d0 + d1 * d1 + d2 * d2) / t
+            per = _share(facing) / (np.sqrt(r * r + by[10, j]) * t)
+            per = per if r < 0.98 * REACH else 0.0
+            f = min(np.sqrt(r) * ROWS, FARTHEST)
+            k = np.int32(f)
+            f, a = f - k, np.uint64(first[j] + k)
+            b, c, d = a + np.uint64(wide), a + np.uint64(2 * wide), a + np.uint64(3 * wide)
+            g0, g1 = (1 - f) * flat[a] + f * flat[a + NEXT], (1 - f) * flat[b] + f * flat[b + NEXT]
+            even, along = (1 - f) * flat[c] + f * flat[c + NEXT], (1 - f) * flat[d] + f * flat[d + NEXT]
+            x, y, z = _of_force(n0, n1, n2, by[3, j], by[4, j], by[5, j], d0, d1, d2, t, per * g0, per * g1, per * even,
+                                per * along, by[6, j], by[7, j], by[8, j])  # fmt: skip
+            u, v, w = u + x, v + y, w + z
+        out[i, 0], out[i, 1], out[i, 2] = out[i, 0] + u, out[i, 1] + v, out[i, 2] + w
 
 
 @numba.njit(cache=True, nogil=True)
@@ -559,6 +564,17 @@ def _handed(inward, corners, shares, forces, skin_corners, skin_shares, gathered
         down = inward[n, 0] * forces[n, 0] + inward[n, 1] * forces[n, 1] + inward[n, 2] * forces[n, 2]
         for a in range(many[n]):
             out[index[n, a]] += weight[n, a] * down / gathered[index[n, a]]
+    return out
+
+
+@numba.njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
+def _of_coarse(source, by_source):
+    """Motion of coarse vertices under pressures at some of them, (3 C,)."""
+    out = np.zeros(by_source.shape[1])
+    for k in range(len(source)):
+        if source[k] != 0:
+            for c in range(len(out)):
+                out[c] += source[k] * by_source[k, c]
     return out
 
 
