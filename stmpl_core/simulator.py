@@ -257,15 +257,15 @@ def _within(displacement: np.ndarray, thickness: np.ndarray) -> tuple[np.ndarray
     return out, float(length.max()), len(long)
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, fastmath={"nnan", "nsz", "reassoc"})
 def _peak(displacement, thickness):
     """Largest motion [m], and how many go too far."""
     peak, many = 0.0, 0
     for v in range(len(displacement)):
-        length = np.sqrt(displacement[v, 0] ** 2 + displacement[v, 1] ** 2 + displacement[v, 2] ** 2)
-        peak = max(peak, length)
-        many += length > MOST_MOVED * thickness[v]
-    return peak, many
+        square = displacement[v, 0] ** 2 + displacement[v, 1] ** 2 + displacement[v, 2] ** 2
+        peak = max(peak, square)
+        many += square > (MOST_MOVED * thickness[v]) ** 2
+    return np.sqrt(peak), many
 
 
 def _joined(trust: Trust, touches: Sequence[Touch], fitted: Conformed) -> Trust:

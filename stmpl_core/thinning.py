@@ -331,7 +331,7 @@ def _zones(start, index, loaded, count):
     for z in range(zones - 1, -1, -1):
         for j in loaded:
             for p in range(start[zones * j + z], start[zones * j + z + 1]):
-                mark[index[p]] = zones - z
+                mark[np.uint32(index[p])] = zones - z  # unsigned: no index that may count from the end
     return mark
 
 
@@ -353,8 +353,8 @@ def _asked(marks, stands, corners, weights):
             continue
         between[many] = v
         for k in range(CORNERS):
-            at[many, k] = corners[z, v, k]
-            place[at[many, k]] = 1
+            at[many, k] = c = np.uint32(corners[z, v, k])
+            place[c] = 1
         many += 1
     asked = 0
     for v in range(len(marks)):
@@ -373,7 +373,7 @@ def _asked(marks, stands, corners, weights):
         z = last - marks[v]
         between[count] = v
         for k in range(CORNERS):
-            at[count, k], by[count, k] = place[at[n, k]] - 1, weights[z, v, k]
+            at[count, k], by[count, k] = place[np.uint32(at[n, k])] - 1, weights[z, v, k]
         count += 1
     return vertices, between[:count], at[:count], by[:count]
 
@@ -383,7 +383,7 @@ def _stand_for(corners, weights, out):
     """Adds the weights of all that are filled in to those that they are filled in from."""
     for n in range(len(corners)):
         for k in range(corners.shape[1]):
-            out[corners[n, k]] += weights[n, k]
+            out[np.uint32(corners[n, k])] += weights[n, k]
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
@@ -395,7 +395,7 @@ def _fill(values, vertices, between, corners, weights, add, out):
     for n in range(len(between)):
         x = y = z = 0.0
         for k in range(corners.shape[1]):
-            c, weight = corners[n, k], weights[n, k]
+            c, weight = np.uint32(corners[n, k]), weights[n, k]
             x += weight * values[c, 0]
             y += weight * values[c, 1]
             z += weight * values[c, 2]
