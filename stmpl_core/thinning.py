@@ -46,9 +46,7 @@ class Asked(NamedTuple):
     @property
     def stand_for(self) -> np.ndarray:
         """Number of vertices that each asked one stands for, (N,)."""
-        out = np.ones(len(self.vertices))
-        _stand_for(self.corners, self.weights, out)
-        return out
+        return _stand_for(self.corners, self.weights, len(self.vertices))
 
 
 class Thinning:
@@ -338,9 +336,7 @@ def _zones(start, index, loaded, count):
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _asked(marks, stands, corners, weights):
     """All of Asked but for the loaded vertices."""
-    last, room = len(stands), 0
-    for v in range(len(marks)):
-        room += marks[v] != 0
+    last, room = len(stands), np.count_nonzero(marks)
     place, between = np.zeros(len(marks), np.int32), np.empty(room, np.int32)
     at, by = np.empty((room, CORNERS), np.int32), np.empty((room, CORNERS), np.float32)
     many = 0
@@ -356,10 +352,7 @@ def _asked(marks, stands, corners, weights):
             at[many, k] = c = np.uint32(corners[z, v, k])
             place[c] = 1
         many += 1
-    asked = 0
-    for v in range(len(marks)):
-        asked += place[v]
-    vertices, asked = np.empty(asked, np.int32), 0
+    vertices, asked = np.empty(np.count_nonzero(place), np.int32), 0
     for v in range(len(marks)):
         if place[v]:
             vertices[asked] = v
@@ -379,11 +372,13 @@ def _asked(marks, stands, corners, weights):
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _stand_for(corners, weights, out):
-    """Adds the weights of all that are filled in to those that they are filled in from."""
+def _stand_for(corners, weights, count):
+    """See Asked.stand_for."""
+    out = np.ones(count)
     for n in range(len(corners)):
         for k in range(corners.shape[1]):
             out[np.uint32(corners[n, k])] += weights[n, k]
+    return out
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
