@@ -366,7 +366,8 @@ def _lay(grid, pose, centre, points, inward, thickness, faces, found, sunk, dept
                     if only_look:
                         share = min(max(0.5 + _depth_at(grid, pose, row, sunk) / blur, 0.0), 1.0)
                         if share > 0:
-                            _column(inward, thickness, faces, f, a, b, c, row)
+                            if not sunk:  # else it is there already
+                                _column(inward, thickness, faces, f, a, b, c, row)
                             sum_area += share * cell / max(row[3] * way[0] + row[4] * way[1] + row[5] * way[2], FACING)
                         continue
                     row[7] = cell / max(row[3] * way[0] + row[4] * way[1] + row[5] * way[2], FACING)
