@@ -97,11 +97,16 @@ def _manifest_of(plan: Plan, out: Path) -> dict[str, Any] | None:
 def _go_on_from(start: str | Path, plan: Plan, out: Path) -> None:
     """Puts released contacts where those of a run are kept."""
     released = Released(start)
-    if released.plan != plan:
+    if not _fewer_bodies(released.plan, plan):
         raise InvalidInput(f"{start} holds contacts of another plan ({released.plan.preset}).")
     for contact, part in released.parts():
         if not _part_path(out, contact).is_file():
             _write(_part_path(out, contact), part.write())
+
+
+def _fewer_bodies(some: Plan, plan: Plan) -> bool:
+    """Whether a plan is another one, or that without some of its bodies: contacts on the rest are the same."""
+    return set(some.bodies) <= set(plan.bodies) and some.model_copy(update={"bodies": plan.bodies}) == plan
 
 
 def _same(kept: Any, plan: Plan) -> bool:

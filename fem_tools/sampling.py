@@ -20,6 +20,8 @@ from fem_tools.scenes import EDGE, Scene, Site, UnusableContact, ellipse, letter
 from stmpl_core.body import Body
 from stmpl_core.bones import bones_of, to_bone
 from stmpl_core.layer import SoftLayer
+from stmpl_core.living import DEEPEST, SHEET, filled
+from stmpl_core.regions import Tone
 from stmpl_core.tissue import Membrane, Ply, Tissue
 
 Kind = Literal["pressure", "nodal", "indenter"]
@@ -74,13 +76,17 @@ class BodyPlan(BaseModel):
 
     name: str
     weight: float = Field(ge=0, le=1)
-    thickness: float | tuple[float, float]  # m; two: varies smoothly between them
+    gender: float = Field(default=0.5, ge=0, le=1)  # 1: female
+    thickness: float | tuple[float, float] = DEEPEST  # m; two: varies smoothly between them
     poisson_ratio: float = Field(default=0.4, ge=0, lt=0.5)
-    stack: StackPlan | None = None  # None: one material
+    stack: StackPlan | None = None  # None: one material, or what was measured
+    tone: Tone | None = None  # of the muscle: tissue as measured in the part's region, with its fat; None: as told here
     to_bone: bool = False  # columns run to the bones, or end at the thickness if they are longer
     part: str | None = None  # of the body; None: the plan's
     edge_length: float | None = None  # m, of the skin; None: the plan's
     reach: float = Field(default=6.0, gt=0)  # largest thicknesses under the load
+    clear: float | None = None  # distance of tools from the open border, thicknesses; None: the plan's
+    sizes: tuple[float, float] | None = None  # m, half the width of tools; None: the plan's
     share: float = Field(default=1.0, gt=0, le=1)  # of the plan's contacts
     paper_rule: bool = True  # the same contacts once more as the paper loads them
     out_of_distribution: bool = True
@@ -149,6 +155,21 @@ TISSUE_BODIES = tuple(
         # nothing is learnt from these
         ("forearm", 0.6, "right_forearm", 0.06, 6e-3, 0.45, 2.5, 0.2, 0.25, 6.0, 0.4),
         ("thigh", 0.3, "right_thigh", 0.05, 10e-3, 0.45, 3.0, 0.15, 0.2, 5.0, 0.4),
+    )
+)  # fmt: skip
+
+LIVING_BODIES = tuple(  # people unlike the average one, their tissue as measured
+    BodyPlan(name=f"living_{name}", weight=weight, gender=gender, part=part, tone=tone, edge_length=edge, share=share,
+             clear=2.0, reach=reach, sizes=(8e-3, 40e-3), paper_rule=False, out_of_distribution=False)
+    for name, weight, gender, part, tone, edge, reach, share in (
+        ("upper_arm_1", 0.35, 0.0, "left_upper_arm", "relaxed", 8e-3, 4.5, 0.5),
+        ("upper_arm_2", 0.6, 1.0, "left_upper_arm", "relaxed", 8e-3, 4.5, 0.5),
+        ("upper_arm_3", 0.7, 0.3, "left_upper_arm", "tensed", 8e-3, 4.5, 0.5),
+        ("forearm_1", 0.3, 1.0, "left_forearm", "relaxed", 6e-3, 6.7, 0.5),
+        ("forearm_2", 0.65, 0.0, "left_forearm", "relaxed", 7e-3, 6.7, 0.5),
+        ("forearm_3", 0.5, 1.0, "left_forearm", "tensed", 6e-3, 6.7, 0.5),
+        ("thigh", 0.4, 0.8, "left_thigh", "relaxed", 11e-3, 6.7, 0.3),
+        ("calf", 0.6, 0.2, "left_calf", "relaxed", 8e-3, 6.7, 0.3),
     )
 )  # fmt: skip
 
@@ -233,9 +254,10 @@ PRESETS = {
     "paper": Plan(preset="paper", bodies=PAPER_BODIES + VARYING_BODIES[:2], indenters=40),
     "contacts": Plan(preset="contacts", bodies=CONTACT_BODIES, discs=0, ellipses=0, seams=0, hands=0, bands=0,
                      letters=0, tools=60, loads=8, deepest=0.9, indenter_step=0.08),
-    "tissue": Plan(preset="tissue", bodies=TISSUE_BODIES + _drawn_bodies(DRAWN), discs=0, ellipses=0, seams=0,
-                   hands=0, bands=0, letters=0, tools=18, loads=8, deepest=0.85, indenter_step=0.12, clear=4.0,
-                   thinnest=1.4, sizes=(4e-3, 40e-3), linear=True, most_work=4e10, rounds=400),
+    "tissue": Plan(preset="tissue", bodies=TISSUE_BODIES + _drawn_bodies(DRAWN) + LIVING_BODIES, discs=0,
+                   ellipses=0, seams=0, hands=0, bands=0, letters=0, tools=18, loads=8, deepest=0.85,
+                   indenter_step=0.12, clear=4.0, thinnest=1.4, sizes=(4e-3, 40e-3), linear=True, most_work=4e10,
+                   rounds=400),
 }  # fmt: skip
 
 
@@ -298,7 +320,10 @@ def layers(plan: Plan) -> dict[str, SoftLayer]:
     patches = {kind: Body.anny(weight=0.5).patch(*kind) for kind in dict.fromkeys(kinds.values())}
     out = {}
     for body in plan.bodies:
-        patch, skin = patches[kinds[body.name]], Body.anny(weight=body.weight)
+        patch, skin = patches[kinds[body.name]], Body.anny(weight=body.weight, gender=body.gender)
+        if body.tone:
+            out[body.name] = filled(skin, patch.part, patch.layer(skin, thickness=SHEET), body.tone)
+            continue
         thickness = body.thickness
         if isinstance(thickness, tuple):
             rng = ContactId(body.name, "disc", -2).rng(plan.seed)
@@ -380,7 +405,7 @@ def _draw_once(
                   "loose": loose.round(4).tolist()}  # fmt: skip
         return site.grasp(vertex, hand, drawn["turn"], drawn["depth"], np.array(drawn["loose"])), drawn
     if contact.set == "tool":
-        return _draw_tool(plan, vertex, turn, site, rng, drawn)
+        return _draw_tool(plan, contact.body, vertex, turn, site, rng, drawn)
     drawn |= {"tool": str(rng.choice(["sphere", "capsule", "cylinder"])), "radius": float(rng.uniform(*BALLS))}
     mesh = rounded_tool(drawn["tool"], drawn["radius"])
     pose = site.standing(vertex, drawn["radius"], turn)
@@ -391,9 +416,10 @@ def _draw_once(
 
 
 def _draw_tool(
-    plan: Plan, vertex: int, turn: float, site: Site, rng: np.random.Generator, drawn: dict[str, Any]
+    plan: Plan, body: str, vertex: int, turn: float, site: Site, rng: np.random.Generator, drawn: dict[str, Any]
 ) -> tuple[Scene, dict[str, Any]]:
-    size = float(np.exp(rng.uniform(math.log(plan.sizes[0]), math.log(plan.sizes[1]))))
+    own = plan.body(body)
+    size = float(np.exp(rng.uniform(*np.log(own.sizes or plan.sizes))))
     slant = SLANT if rng.uniform() < SLANTED else TILT
     drawn |= {"tool": str(rng.choice(TOOLS)), "size": size, "shape": rng.uniform(0, 1, 8).round(4).tolist(),
               "tilt": rng.uniform(-TILT, TILT, 2).round(4).tolist(),
@@ -401,7 +427,7 @@ def _draw_tool(
     scene = tool_scene(site, drawn)
     assert scene.tool is not None
     radius = float(np.linalg.norm(scene.tool.vertices, axis=1).max())
-    clear = plan.clear * site.layer.thickness[vertex] + min(radius, 2 * SIZES[1])
+    clear = (plan.clear if own.clear is None else own.clear) * site.layer.thickness[vertex] + min(radius, 2 * SIZES[1])
     if site.layer.thickness[vertex] < plan.thinnest * site.layer.edge_length:
         raise UnusableContact("the tissue is thinner there than the mesh is fine")
     if (gap := float(site.border_distance[vertex])) < clear:

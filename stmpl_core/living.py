@@ -57,12 +57,26 @@ def living(body: Body, part: str, tone: Tone = "relaxed", *, edge_length: float 
     Raises:
         InvalidInput: a part without a region.
     """
-    its = for_person(region_of(part, tone), body.physique)
     if part in STRAIGHT:
+        its = for_person(region_of(part, tone), body.physique)
         return body.part(part, edge_length=edge_length, thickness=its.thickness, tissue=its.tissue)
-    skin = body.part(part, edge_length=edge_length, thickness=SHEET, tissue=its.tissue)
+    return filled(body, part, body.part(part, edge_length=edge_length, thickness=SHEET), tone)
+
+
+def filled(body: Body, part: str, skin: SoftLayer, tone: Tone = "relaxed") -> SoftLayer:
+    """A part's skin with the tissue of its region below it, down to the bones: see `living`.
+
+    Args:
+        body: body.
+        part: its part, one with bones.
+        skin: the part's skin as a thin layer.
+        tone: state of the muscle.
+    """
+    its = for_person(region_of(part, tone), body.physique)
     fat = fat_map(body, part, skin.vertices)
-    if fat is not None:
+    if fat is None:
+        skin = skin.with_(tissue=its.tissue)
+    else:
         middle = float(np.median(fat))
         tissue = replace(its, fat_thickness=replace(its.fat_thickness, value=middle)).tissue
         skin = skin.with_(tissue=tissue, ply_scale=fat / middle)

@@ -9,11 +9,13 @@ from benchmarks import limbs
 from fem_tools.axisymmetric import Flat, Profile
 from fem_tools.contact_job import Part
 from fem_tools.dataset import QUANTUM, Dataset, Record
-from fem_tools.generate import generate
+from fem_tools.generate import _fewer_bodies, generate
 from fem_tools.released import LEAST, STEPS, Released, write
 from fem_tools.rounds import THICKNESS, Pressed, drawn, learnt, read_all, tissue_of
 from fem_tools.sampling import PRESETS, ContactId, contacts, layers
+from stmpl_core.body import Body
 from stmpl_core.errors import InvalidInput
+from stmpl_core.living import living
 from stmpl_core.networks import STACK_NODE
 from studies.flat import flat_rows, plate, pressure_on
 
@@ -24,6 +26,7 @@ PLAN = TISSUE.model_copy(
             "indenter_step": 0.2}
 )  # fmt: skip
 BALL = Profile((0.0, 0.0), (0.0, 0.0), 0.01)
+COARSE = 1.2e-2
 pytestmark = pytest.mark.usefixtures("one_thread")
 
 
@@ -97,11 +100,13 @@ def test_a_data_set_goes_on_from_released_contacts_and_holds_its_flat_presses(tm
     assert press.body == BODY.name and press.tool == drawn(PLAN, 0)[1] and len(press.rounds) == 2
     with pytest.raises(InvalidInput, match="another plan"):
         generate(PLAN.model_copy(update={"seed": 1}), tmp_path / "other", workers=1, start=file)
+    more = PLAN.model_copy(update={"bodies": (BODY, BODY.model_copy(update={"name": "another", "weight": 0.8}))})
+    assert _fewer_bodies(PLAN, more) and not _fewer_bodies(more, PLAN)
 
 
 def test_flat_presses_take_every_stack_that_is_learnt_from_and_no_other() -> None:
     bodies = learnt(TISSUE)
-    assert {b.name for b in bodies} == {b.name for b in TISSUE.bodies if not b.held_out}
+    assert {b.name for b in bodies} == {b.name for b in TISSUE.bodies if b.stack and not b.held_out}
     names = {drawn(TISSUE, k)[0].name for k in range(len(bodies))}
     assert len(names) == len(bodies)
     for k in range(40):
@@ -159,3 +164,17 @@ def test_the_bound_on_force_covers_backs_that_nothing_was_learnt_from() -> None:
     covered = np.mean([abs(one.force) <= one.bound for one in off])
     assert len(off) >= 8 and covered >= 0.85
     assert max(one.bound for one in off) < 1.0  # and says something
+
+
+def test_bodies_as_measured_have_what_people_have_there_and_are_no_average_ones() -> None:
+    bodies = [b.model_copy(update={"edge_length": COARSE}) for b in TISSUE.bodies if b.tone]
+    assert len(bodies) >= 6
+    made = layers(TISSUE.model_copy(update={"bodies": tuple(bodies[:2])}))
+    for body, layer in zip(bodies, made.values(), strict=False):
+        assert body.part is not None and body.tone is not None
+        its = living(Body.anny(weight=body.weight, gender=body.gender), body.part, body.tone, edge_length=COARSE)
+        assert layer.tissue.deeper[0].youngs_modulus == its.tissue.deeper[0].youngs_modulus
+        assert layer.tissue.deeper[0].depth == pytest.approx(its.tissue.deeper[0].depth, rel=0.1)
+        assert np.median(layer.thickness) == pytest.approx(float(np.median(its.thickness)), rel=0.15)
+        assert layer.ply_scale is not None and np.ptp(layer.ply_scale) > 0.2
+        assert (body.weight, body.gender) != (0.5, 0.5)
