@@ -127,6 +127,9 @@ def wrench_from(
 ) -> Wrench:
     """geometry_msgs/WrenchStamped in the body's axes: force [N], torque about the tool's origin [N m], shape (6,).
 
+    In the body's frame and in the tool's own the torque is about the tool's origin already; in any other, such as a
+    sensor's, it is about that frame's, as tf2 has it, and taken to the tool's.
+
     Raises:
         FrameError: a frame that is neither the body's, nor the tool's own, nor in `frames`.
         InvalidInput: numbers that are not finite.
@@ -137,8 +140,9 @@ def wrench_from(
     if frame != tool and frame not in frames:  # frames of /tf are found when asked for, and not listed
         known = "', '".join([body_frame, *frames, tool])
         raise FrameError(f"the wrench of {tool} is in frame '{frame}'; known are '{known}'.")
-    rotation = (pose_body_from_tool if frame == tool else frames[frame])[:3, :3]
-    return np.concatenate([rotation @ wrench[:3], rotation @ wrench[3:]])
+    stands = pose_body_from_tool if frame == tool else frames[frame]
+    force, torque = stands[:3, :3] @ wrench[:3], stands[:3, :3] @ wrench[3:]
+    return np.concatenate([force, torque + np.cross(stands[:3, 3] - pose_body_from_tool[:3, 3], force)])
 
 
 def joints_from(message: Any, names: Mapping[str, str]) -> dict[str, float]:

@@ -76,8 +76,18 @@ def site(layer: SoftLayer, part: str) -> int:
     return int(np.where(middle & (layer.thickness < np.median(layer.thickness) + 8e-3), layer.thickness, 0).argmax())
 
 
-def compare(part: str, edge: float, strains: tuple[float, ...] = STRAINS, reach: float = 9) -> list[Compared]:
-    """Finite elements within a reach [thicknesses], and the answer, at some strains."""
+class Truth(NamedTuple):
+    """Finite elements at some depths of a part: strains, (D,); poses of the ball, (D, 4, 4); forces [N], (D,); and
+    motion of the skin [m], (D, V, 3)."""
+
+    strains: np.ndarray
+    poses: np.ndarray
+    forces: np.ndarray
+    moved: np.ndarray
+
+
+def solved(part: str, edge: float, strains: tuple[float, ...] = STRAINS, reach: float = 9) -> Truth:
+    """Finite elements within a reach [thicknesses], at those strains that they get to."""
     layer = living(Body.anny(), part, edge_length=edge)
     vertex = site(layer, part)
     normal, thickness = layer.normals[vertex], float(layer.thickness[vertex])
@@ -86,18 +96,39 @@ def compare(part: str, edge: float, strains: tuple[float, ...] = STRAINS, reach:
     start = Press(SignedDistance.of(ball(RADIUS), margin=0.04), pose, -normal).touching(layer)
     assert start is not None
     fem = IndenterFem(PatchFem(element="P1xP2", reach=reach, refine=3, layers=1), step=0.1).prepare(layer)
-    simulator, out = Simulator(layer, MomentNet()), []
-    depths = [strain * thickness for strain in strains]
+    depths, rows = [strain * thickness for strain in strains], []
     for strain, depth, truth in zip(strains, depths, fem.path([start], depths), strict=True):
         if not truth.trust.ok:
             break
-        answer = simulator.step([Contact(ball(RADIUS), start.at(depth).pose_body_from_tool)])
-        touch, moved = answer.touches["ball"], np.linalg.norm(truth.displacement, axis=1)
-        off = 100 * np.linalg.norm(answer.displacement - truth.displacement, axis=1) / moved.max()
-        out.append(Compared(strain, 1e3 * depth, float(np.linalg.norm(truth.pressure @ layer.vertex_area_vectors)),
-                            touch.force, touch.force_bound, float(off[moved > 0.1 * moved.max()].mean()),
-                            float(off.max()), answer.trust.why))  # fmt: skip
+        rows.append((strain, start.at(depth).pose_body_from_tool,
+                     np.linalg.norm(truth.pressure @ layer.vertex_area_vectors), truth.displacement))  # fmt: skip
+    return Truth(*(np.array(column) for column in zip(*rows, strict=True)))
+
+
+def compare(part: str, edge: float, truths: Truth) -> list[Compared]:
+    """The answer beside finite elements."""
+    layer = living(Body.anny(), part, edge_length=edge)
+    thickness = float(layer.thickness[site(layer, part)])
+    simulator, out = Simulator(layer, MomentNet()), []
+    for strain, pose, force, displacement in zip(*truths, strict=True):
+        answer = simulator.step([Contact(ball(RADIUS), pose)])
+        touch, moved = answer.touches["ball"], np.linalg.norm(displacement, axis=1)
+        off = 100 * np.linalg.norm(answer.displacement - displacement, axis=1) / moved.max()
+        where_it_moves = float(off[moved > 0.1 * moved.max()].mean())
+        out.append(Compared(float(strain), 1e3 * strain * thickness, float(force), touch.force, touch.force_bound,
+                            where_it_moves, float(off.max()), answer.trust.why))  # fmt: skip
     return out
+
+
+def kept(folder: Path | None, part: str, edge: float) -> Truth:
+    """Finite elements of a part, read from a folder where they are there, else solved, and kept there."""
+    if folder is None:
+        return solved(part, edge)
+    if not (file := folder / f"{part}.npz").exists():
+        folder.mkdir(parents=True, exist_ok=True)
+        np.savez_compressed(file, **solved(part, edge)._asdict())
+    with np.load(file) as read:
+        return Truth(**{name: read[name] for name in Truth._fields})
 
 
 def trunk(part: str, edge: float, force: float = 5.0) -> None:
@@ -112,7 +143,7 @@ def trunk(part: str, edge: float, force: float = 5.0) -> None:
     touch = answer.touches["ball"]
     print(f"{part}: {1e3 * thickness:.0f} mm thick, {force:g} N: {1e3 * touch.depth:.1f} mm deep, "
           f"{answer.trust.why or 'unflagged'}")  # fmt: skip
-    (row,) = compare(part, edge, (touch.depth / thickness,), reach=TRUNK_REACH)
+    (row,) = compare(part, edge, solved(part, edge, (touch.depth / thickness,), reach=TRUNK_REACH))
     print(f"    at that depth finite elements {row.truth:.2f} N, ours {row.force:.2f} +- {row.bound:.2f} N "
           f"({100 * (row.force / row.truth - 1):+.1f} %); motion off {row.moves:.1f} %, worst {row.worst:.1f} % "
           f"of the peak {row.why}")  # fmt: skip
@@ -168,6 +199,7 @@ def main() -> None:
     """Presses, prints, draws."""
     options = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     options.add_argument("--times-only", action="store_true", help="no finite elements")
+    options.add_argument("--keep", type=Path, help="folder that keeps finite elements, or has them from before")
     options.add_argument("--out", type=Path, default=PICTURE, help="picture")
     options.add_argument("--trunk", nargs="*", choices=TRUNK, help="parts of the trunk instead, at 5 N; all of them")
     given, found = options.parse_args(), {}
@@ -178,7 +210,7 @@ def main() -> None:
     for name, (part, edge) in PARTS.items():
         print(name)
         if not given.times_only:
-            found[name] = compare(part, edge)
+            found[name] = compare(part, edge, kept(given.keep, part, edge))
             print("    strain  depth   FEM     ours    bound  off     moves  worst   in range?")
             for row in found[name]:
                 off = 100 * (row.force / row.truth - 1)

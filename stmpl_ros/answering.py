@@ -282,7 +282,7 @@ class Answering:
 
     def fade_if_silent(self) -> None:
         """Sends a share of the last answer, once no tool was heard for a while, and in the end rest."""
-        now, config, gate = time.monotonic_ns(), self._settings.config, self._hearing.gate
+        now, config, gate = self._hearing.now(), self._settings.config, self._hearing.gate
         if self._instant is None or self._hearing.inbox.live(now):
             return
         if self._field is not None and not self._field.idle:
@@ -312,7 +312,7 @@ class Answering:
         if instant is None:
             return
         ready = all(one.name in self.simulator.tools for one in instant.contacts)
-        if not (ready and self._hearing.inbox.live(time.monotonic_ns()) and self.answer(instant)):
+        if not (ready and self._hearing.inbox.live(self._hearing.now()) and self.answer(instant)):
             self.rest("another skin")
 
     def without(self, name: str) -> None:

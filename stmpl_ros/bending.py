@@ -124,7 +124,7 @@ class Bending:
             angles = rig.angles({name: one.angle for name, one in heard.items()})
         except StmplError as error:
             return gate.refuse("joints", str(error))
-        if not gate.fresh(message, self._config().max_age):
+        if not gate.fresh(stamp, self._config().max_age):
             return None
         last = [self._heard[name] for name in told if name in self._heard]
         if any(stamp <= one.stamp and now - one.came < SILENT_S for one in last):

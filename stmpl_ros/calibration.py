@@ -19,7 +19,7 @@ from stmpl_core.stiffness import Stiffness
 from stmpl_core.strokes import Fading, Rubbing
 from stmpl_core.touch import MOVED, TOUCHING, Touch
 from stmpl_ros.inbox import Instant
-from stmpl_ros.waiting import WaitingService, by_executor
+from stmpl_ros.waiting import Aside, by_executor
 from stmpl_ros.workshop import Workshop
 
 KEPT = 400  # number of presses that are kept
@@ -47,7 +47,8 @@ class Calibration:
         self._node, self._workshop, self._apply = node, workshop, apply
         self.presses: deque[Contact] = deque(maxlen=KEPT)
         self.strokes: deque[Contact] = deque(maxlen=KEPT_INSTANTS)  # with their times
-        self._service = WaitingService(node, Calibrate, "calibrate", self._serve)
+        self._service = Aside(node, "calibrate",
+                              lambda hidden, name: hidden.create_service(Calibrate, name, self._serve))  # fmt: skip
 
     def close(self) -> None:
         """Ends the service."""

@@ -6,6 +6,8 @@ import time
 from collections import Counter, deque
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from types import MappingProxyType
+from typing import NamedTuple
 
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
@@ -81,22 +83,72 @@ def _percentiles(what: str, seconds: deque[float]) -> dict[str, str]:
     return {f"{what} median [ms]": f"{median:.3f}", f"{what} p99 [ms]": f"{worst:.3f}"}
 
 
-def skin_status(node: str, values: Mapping[str, str], bad: bool, fading: bool) -> DiagnosticStatus:
+class Counts:
+    """What was counted since the last look."""
+
+    def __init__(self) -> None:
+        self._last: dict[str, int] = {}
+
+    def since(self, **now: int) -> dict[str, int]:
+        """How much each count has grown."""
+        grown = {name: count - self._last.get(name, 0) for name, count in now.items()}
+        self._last = now
+        return grown
+
+
+class Health(NamedTuple):
+    """How the node is, by what happened since the last report: what is over is no longer told.
+
+    Args:
+        lately: counts since the last report: reactions; and refused, stale, out_of_order, missed.
+        refusal: why the last message was refused.
+        fading: truth of the claim that the last answer fades, as input has stopped.
+        live: truth of the claim that a tool is heard.
+        doubt: why it is not known where the limb is.
+        active: truth of the claim that the node answers.
+    """
+
+    lately: Mapping[str, int] = MappingProxyType({})
+    refusal: str = ""
+    fading: bool = False
+    live: bool = False
+    doubt: str = ""
+    active: bool = True
+
+    @property
+    def said(self) -> tuple[bytes, str]:
+        """Level and sentence: ERROR: nothing that came could be used; STALE: what should come does not."""
+        bad = {name: count for name, count in self.lately.items() if count and name != "reactions"}
+        if not self.active:
+            return DiagnosticStatus.STALE, "not active: nothing is answered"
+        if bad and not self.lately.get("reactions"):
+            why = f": {self.refusal}" if "refused" in bad else ""
+            return DiagnosticStatus.ERROR, f"nothing that came could be used{why}"
+        if self.doubt:
+            return DiagnosticStatus.STALE, self.doubt
+        if self.fading:
+            return DiagnosticStatus.STALE, "input has stopped: the last answer fades"
+        if bad:
+            told = ", ".join(f"{count} {name.replace('_', ' ')}" for name, count in bad.items())
+            return DiagnosticStatus.WARN, f"of the messages of the last second {told}"
+        return DiagnosticStatus.OK, "answering" if self.live else "at rest: no tool is heard"
+
+
+def skin_status(node: str, values: Mapping[str, str], health: Health) -> DiagnosticStatus:
     """Status of the answers."""
-    message = "some messages were refused, dropped or lost" if bad else "answering"
-    message = "input has stopped: the last answer fades, or is at rest" if fading else message
-    return _status(f"{node}: skin", bad or fading, message, values)
+    level, message = health.said
+    return _status(f"{node}: skin", level, message, values)
 
 
 def limits_status(node: str, limits: Limits) -> DiagnosticStatus:
     """Status of the limits: largest shares since the last report."""
     warn, values = limits.take()
     message = f"at least {limits.warn_at:.0%} of a limit is used" if warn else "within the limits"
-    return _status(f"{node}: limits", warn, f"{message} ({ADVISORY})", values)
-
-
-def _status(name: str, warn: bool, message: str, values: Mapping[str, str]) -> DiagnosticStatus:
     level = DiagnosticStatus.WARN if warn else DiagnosticStatus.OK
+    return _status(f"{node}: limits", level, f"{message} ({ADVISORY})", values)
+
+
+def _status(name: str, level: bytes, message: str, values: Mapping[str, str]) -> DiagnosticStatus:
     told = [KeyValue(key=key, value=str(value)) for key, value in values.items()]
     return DiagnosticStatus(level=level, name=name, message=message, hardware_id="stmpl", values=told)
 

@@ -9,6 +9,9 @@ from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
+from geometry_msgs.msg import Point, Pose
+from rclpy.clock_type import ClockType
+from rclpy.time import Time
 
 from bags.wire import pose_from
 from stmpl_core.arrays import Transform
@@ -17,13 +20,17 @@ from stmpl_core.errors import InvalidInput, StmplError
 SHAPE = "name: {position: [x, y, z], orientation: [x, y, z, w]}, in metres, both optional"
 
 
-class Frames(Mapping[str, Transform]):
-    """pose_body_from_frame, (4, 4), by the name of the frame.
+class Frames:
+    """Where other frames stand in the body's, now and lately.
 
     Args:
         body: frame_id of the body.
-        table: frames that do not move.
+        table: frames that do not move, pose_body_from_frame (4, 4) by name.
         node: node that listens to /tf for all others, if tf2_ros is installed.
+
+    Attributes:
+        table: see above.
+        listens: whether /tf is listened to.
     """
 
     def __init__(self, body: str, table: Mapping[str, Transform], node: Any = None) -> None:
@@ -31,26 +38,66 @@ class Frames(Mapping[str, Transform]):
         if node is not None and find_spec("tf2_ros"):
             from tf2_ros import Buffer, TransformListener  # pyright: ignore[reportMissingImports]
 
-            self._buffer = Buffer()
+            self._buffer: Any = Buffer()
             self._listener = TransformListener(self._buffer, node)
+        self.listens = self._buffer is not None
+
+    def at(self, stamp: int) -> FramesAt:
+        """Where the frames stand at a stamp [ns]; 0: where /tf had them last."""
+        return FramesAt(self, stamp)
+
+    def moves(self, frame: str) -> bool:
+        """Whether a frame is one of /tf."""
+        return self.listens and bool(frame) and frame != self.body and frame not in self.table
+
+    def missing(self, frame: str, stamp: int) -> str:
+        """Why /tf does not say where a frame stood at a stamp [ns]; empty if it does."""
+        known, why = self._buffer.can_transform(self.body, frame, _time(stamp), return_debug_tuple=True)
+        return "" if known else (str(why) or "nothing was heard of it")
+
+    def newest(self, frame: str) -> int | None:
+        """Stamp of the newest place of a frame of /tf [ns]; 0: it never moves; None: not known."""
+        from tf2_ros import TransformException  # pyright: ignore[reportMissingImports]
+
+        try:
+            return int(self._buffer.get_latest_common_time(self.body, frame).nanoseconds)
+        except TransformException:
+            return None
+
+    def place(self, frame: str, stamp: int) -> Pose:
+        """Where a frame of /tf stood in the body's at a stamp [ns]. Raises KeyError where it is not known."""
+        from tf2_ros import TransformException  # pyright: ignore[reportMissingImports]
+
+        try:
+            moved = self._buffer.lookup_transform(self.body, frame, _time(stamp)).transform
+        except TransformException as error:
+            raise KeyError(frame) from error
+        at = moved.translation
+        return Pose(position=Point(x=at.x, y=at.y, z=at.z), orientation=moved.rotation)
+
+
+class FramesAt(Mapping[str, Transform]):
+    """pose_body_from_frame, (4, 4), by the name of the frame, at one stamp."""
+
+    def __init__(self, frames: Frames, stamp: int) -> None:
+        self._frames, self._stamp = frames, stamp
 
     def __getitem__(self, frame: str) -> Transform:
-        if frame == self.body:
+        if frame == self._frames.body:
             return np.eye(4)
-        if frame in self.table or self._buffer is None:
-            return self.table[frame]
-        from rclpy.time import Time
-
-        if not frame or not self._buffer.can_transform(self.body, frame, Time()):
-            raise KeyError(frame)
-        moved: Any = self._buffer.lookup_transform(self.body, frame, Time()).transform
-        return pose_from(SimpleNamespace(position=moved.translation, orientation=moved.rotation))
+        if not self._frames.moves(frame):
+            return self._frames.table[frame]
+        return pose_from(self._frames.place(frame, self._stamp))
 
     def __iter__(self) -> Iterator[str]:
-        return iter(self.table)
+        return iter(self._frames.table)
 
     def __len__(self) -> int:
-        return len(self.table)
+        return len(self._frames.table)
+
+
+def _time(stamp: int) -> Time:
+    return Time(nanoseconds=stamp, clock_type=ClockType.ROS_TIME)
 
 
 def read_frames(path: str) -> dict[str, Transform]:

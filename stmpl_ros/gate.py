@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import math
 import time
-from typing import Any
 
 from rclpy.node import Node
 
-from bags.wire import NANO, stamp_ns
+from bags.wire import NANO
 from stmpl_ros.diagnosis import Tally
 
 SAY_EVERY = 1.0  # time between two lines of the same kind [s]
@@ -30,9 +29,9 @@ class Gate:
         self._said: dict[str, tuple[float, int]] = {}  # of each kind: when the last line was, how many were held back
         self.refused_since = ""
 
-    def fresh(self, message: Any, max_age: float) -> bool:
-        """Whether a stamped message is at most `max_age` [s] old; 0 takes any."""
-        age = (self._node.get_clock().now().nanoseconds - stamp_ns(message)) / NANO
+    def fresh(self, stamp: int, max_age: float) -> bool:
+        """Whether what is stamped [ns] is at most `max_age` [s] old; 0 takes any."""
+        age = (self._node.get_clock().now().nanoseconds - stamp) / NANO
         if not max_age or abs(age) <= max_age:
             return True
         self._tally.stale += 1

@@ -46,12 +46,12 @@ class GazeboContacts:
             FrameError: a simulated world that stands nobody knows where.
             InvalidInput: points without forces.
         """
-        frame = message.header.frame_id or WORLD
-        if frame not in self._frames:
+        frame, frames = message.header.frame_id or WORLD, self._frames.at(stamp_ns(message))
+        if frame not in frames:
             raise FrameError(f"contacts are in frame '{frame}'; list it in the file of the parameter `frames`.")
         for tool, collision in self._collisions.items():
             if (pose := inbox.pose_of(tool)) is not None:
-                at = self._frames[frame], layer, pose[:3, 3]
+                at = frames[frame], layer, pose[:3, 3]
                 wrench = gazebo_wrench(message.contacts, collision, self._body, *at)
                 if wrench is not None:
                     yield tool, wrench_message(wrench, self._frames.body, stamp_ns(message))

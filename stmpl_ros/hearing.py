@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
 from functools import partial
 from typing import Any
 
+import numpy as np
 from geometry_msgs.msg import PoseStamped, WrenchStamped
 from rclpy.exceptions import NameValidationException
 from rclpy.node import Node
@@ -21,11 +21,14 @@ from stmpl_core.tool import Tool
 from stmpl_core.tools import Tools
 from stmpl_ros.diagnosis import Tally
 from stmpl_ros.events import Events
+from stmpl_ros.followed import Followed
 from stmpl_ros.frames import Frames, read_frames
 from stmpl_ros.gate import Gate
 from stmpl_ros.gazebo import GazeboContacts
 from stmpl_ros.inbox import Inbox, Instant
 from stmpl_ros.parameters import NodeConfig
+from stmpl_ros.patience import Patience
+from stmpl_ros.ticks import Ticks
 from stmpl_ros.topics import KEPT, NEWEST, newest_within
 
 
@@ -51,9 +54,13 @@ class Hearing:
         self._node, self._config = node, config
         self.gate = Gate(node, tally)
         self.events = Events(self.gate.say)
+        self.now = Ticks(node)
         self.frames = Frames(config().frame, read_frames(config().frames), node)
+        self._patience = Patience(node, self.frames, self.gate, lambda: config().tf_wait)
         self.gazebo = GazeboContacts(config(), self.frames) if config().gz_contacts else None
-        self.inbox = Inbox(tools, config().frame, int(config().rest_after * wire.NANO), self.frames)
+        self.inbox = Inbox(tools, config().frame, int(config().rest_after * wire.NANO), self.frames.at)
+        self._followed = Followed(node, self.frames, config(), self._on_followed)
+        self.now.on_back = self._on_time_back
         self.active = False
         self.layer: SoftLayer | None = None
         self.on_tool: Callable[[Tool], None] = lambda tool: None
@@ -72,7 +79,7 @@ class Hearing:
     def open(self) -> None:
         """Listens for tools."""
         self._topics.append(self._listen(ContactMesh, "contact_mesh", self._on_mesh, KEPT))
-        for name in self._config().shape_tools.split():
+        for name in self._config().shape_tools:
             self._topics.append(self._listen(Mesh, f"tools/{name}/mesh", partial(self._on_shape, name), KEPT))
         if self.gazebo:
             self._topics.append(self._listen(self.gazebo.kind, "gz_contacts", self._on_gazebo, NEWEST))
@@ -85,6 +92,13 @@ class Hearing:
         for subscription in self._topics:
             self._node.destroy_subscription(subscription)
         self._topics.clear()
+        self._followed.close()
+        self.forget()
+
+    def forget(self) -> None:
+        """Forgets every pose and wrench."""
+        self._patience.forget()
+        self._followed.forget()
         self.inbox.forget()
 
     def take(self, tool: Tool, field: SignedDistance) -> bool:
@@ -133,15 +147,19 @@ class Hearing:
 
     def _listen_to(self, name: str) -> None:
         """Raises NameValidationException for a name that cannot be part of a topic."""
-        poses = newest_within(self._config().deadline)
-        self._listened[name] = [
-            self._listen(PoseStamped, f"tools/{name}/pose", partial(self._on_pose, name), poses),
-            self._listen(WrenchStamped, f"tools/{name}/wrench", partial(self._on_wrench, name), NEWEST),
-        ]
+        wrenches = self._listen(WrenchStamped, f"tools/{name}/wrench", partial(self._on_wrench, name), NEWEST)
+        self._listened[name] = [wrenches]
+        if not self._followed.follow(name):
+            poses = newest_within(self._config().deadline)
+            heard = self._listen(PoseStamped, f"tools/{name}/pose", partial(self._on_pose, name), poses)
+            self._listened[name].append(heard)
 
     def _stop_listening(self, name: str) -> None:
         for subscription in self._listened.pop(name, []):
             self._node.destroy_subscription(subscription)
+        self._followed.leave(name)
+        for stream in ("pose", "wrench"):
+            self._patience.forget(f"{stream} of {name}")
         self.inbox.forget(name)
 
     def _on_shape(self, name: str, message: Mesh) -> None:
@@ -165,27 +183,42 @@ class Hearing:
         self.on_tool(tool)
 
     def _on_pose(self, name: str, message: PoseStamped) -> None:
-        if not self._hears(name):
-            return
+        if self._hears(name) and self.gate.fresh(wire.stamp_ns(message), self._config().max_age):
+            self._patience.put(f"pose of {name}", message, partial(self._take_pose, name))
+
+    def _on_followed(self, name: str, message: PoseStamped) -> None:
+        """A pose that /tf told."""
+        if self._hears(name) and self.gate.fresh(wire.stamp_ns(message), self._config().max_age):
+            self._take_pose(name, message)
+
+    def _take_pose(self, name: str, message: PoseStamped) -> None:
+        stamp = wire.stamp_ns(message)
         try:
-            pose = wire.pose_of_tool(message, name, self._config().frame, self.frames)
+            pose = wire.pose_of_tool(message, name, self._config().frame, self.frames.at(stamp))
         except StmplError as error:
             return self.gate.refuse(f"pose of {name}, {type(error).__name__}", str(error))
-        if self.gate.fresh(message, self._config().max_age):
-            kept = self.inbox.put_pose(name, pose, wire.stamp_ns(message), time.monotonic_ns())
-            self._go_on("pose", name, kept)
+        self._go_on("pose", name, self.inbox.put_pose(name, pose, stamp, self.now()))
 
     def _on_wrench(self, name: str, message: WrenchStamped) -> None:
-        if not self._hears(name):
+        if not self._hears(name) or not self.gate.fresh(wire.stamp_ns(message), self._config().max_age):
             return
+        if message.header.frame_id == name:  # a tool's own frame is where its pose says, whatever /tf knows
+            return self._take_wrench(name, message)
+        self._patience.put(f"wrench of {name}", message, partial(self._take_wrench, name))
+
+    def _take_wrench(self, name: str, message: WrenchStamped) -> None:
+        stamp = wire.stamp_ns(message)
         try:
-            wire.wrench_from(message, body_frame=self._config().frame, tool=name, frames=self.frames,
-                             pose_body_from_tool=self.frames[self._config().frame])  # fmt: skip
+            wire.wrench_from(message, body_frame=self._config().frame, tool=name, frames=self.frames.at(stamp),
+                             pose_body_from_tool=np.eye(4))  # fmt: skip
         except StmplError as error:
             return self.gate.refuse(f"wrench of {name}, {type(error).__name__}", str(error))
-        if self.gate.fresh(message, self._config().max_age):
-            kept = self.inbox.put_wrench(name, message, wire.stamp_ns(message), time.monotonic_ns())
-            self._go_on("wrench", name, kept)
+        self._go_on("wrench", name, self.inbox.put_wrench(name, message, stamp, self.now()))
+
+    def _on_time_back(self) -> None:
+        """A simulation that begins anew: what it said lies in its future."""
+        self._node.get_logger().warning("the simulated clock went back: poses and wrenches from before are forgotten")
+        self.forget()
 
     def _on_gazebo(self, message: Any) -> None:
         assert self.gazebo and self.layer
@@ -203,7 +236,7 @@ class Hearing:
             self.gate.say(f"order of {kind} of {tool}", f"a {kind} of {tool} was dropped: its stamp is not after the "
                           "last one's. Do two devices send under one name, or was a clock set back?")  # fmt: skip
         try:
-            instant = self.inbox.take(time.monotonic_ns())
+            instant = self.inbox.take(self.now())
         except StmplError as error:  # a frame that /tf has forgotten since
             return self.gate.refuse(f"instant, {type(error).__name__}", str(error))
         if instant is not None:

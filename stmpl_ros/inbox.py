@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -65,13 +66,14 @@ class Inbox:
     Args:
         tools: tools in use; others are not listened to.
         body_frame: frame that poses are in.
-        frames: pose_body_from_frame of other frames that wrenches may be in.
+        frames: pose_body_from_frame of other frames that wrenches may be in, by the stamp [ns].
         rest_after: silence after which a stream is no longer live [ns].
     """
 
     def __init__(
-        self, tools: Tools, body_frame: str, rest_after: int, frames: wire.FixedFrames = wire.NO_FRAMES
-    ) -> None:
+        self, tools: Tools, body_frame: str, rest_after: int,
+        frames: Callable[[int], wire.FixedFrames] = lambda stamp: wire.NO_FRAMES,
+    ) -> None:  # fmt: skip
         self.tools, self.body_frame, self.frames, self.rest_after = tools, body_frame, frames, rest_after
         self.inputs: dict[str, Input] = {}
         self.out_of_order = 0
@@ -147,5 +149,5 @@ class Inbox:
         if not one.wrench.live(now, self.rest_after):
             return Contact(tool, pose, time=time)
         wrench = wire.wrench_from(one.wrench.value, body_frame=self.body_frame, tool=name, pose_body_from_tool=pose,
-                                  frames=self.frames)  # fmt: skip
+                                  frames=self.frames(one.wrench.stamp))  # fmt: skip
         return Contact(tool, pose, wrench, time)

@@ -11,12 +11,12 @@ from functools import partial
 from typing import Any
 
 import numba
-from diagnostic_msgs.msg import DiagnosticArray
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from rclpy.experimental.events_executor import EventsExecutor
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from rclpy.logging import get_logger
 from std_srvs.srv import Trigger
-from stmpl_msgs.srv import SetBody
+from stmpl_msgs.srv import GetTopology, SetBody
 from threadpoolctl import threadpool_limits
 
 from stmpl_core.errors import InvalidInput, StmplError
@@ -29,8 +29,9 @@ from stmpl_core.toucher import margin_on
 from stmpl_ros.answering import Answering
 from stmpl_ros.bending import Bending
 from stmpl_ros.beside import Beside, Builders
+from stmpl_ros.body_action import BodyAction, Done, changes_of
 from stmpl_ros.calibration import Calibration
-from stmpl_ros.diagnosis import Tally, diagnostics, limits_status, skin_status
+from stmpl_ros.diagnosis import Counts, Health, Tally, diagnostics, limits_status, skin_status
 from stmpl_ros.hearing import Hearing
 from stmpl_ros.limits import Limits
 from stmpl_ros.making import Build, at_once, check, friction_of, layer_of, restiffened, skin_of, warm_up
@@ -38,10 +39,15 @@ from stmpl_ros.parameters import NodeConfig
 from stmpl_ros.sending import Sending
 from stmpl_ros.settings import Settings
 from stmpl_ros.spinning import POLL_PERIOD_S, interruptible, ros, spin
-from stmpl_ros.topics import STREAM, managed
+from stmpl_ros.ticks import steady_timer
+from stmpl_ros.topics import STREAM
 from stmpl_ros.workshop import Workshop, then
 
 FADE_RATE = 30.0  # rate of the answers while the last one fades [Hz]
+
+
+def _nobody(why: str) -> None:
+    """Nobody is told what became of a skin."""
 
 
 class SkinNode(LifecycleNode):
@@ -64,18 +70,24 @@ class SkinNode(LifecycleNode):
         super().__init__("stmpl", **node_options)
         self.settings = Settings(self, config, self._on_settings)
         self._build = build
-        self.tally = Tally()
+        self.tally, self._counts = Tally(), Counts()
         self.workshop: Workshop | None = None
         self._making: Beside[Skin] | None = None
         self._twin = ""  # what the other node is that was told of
+        self._done: Done = _nobody  # told what became of the skin that is being made
+        self.hearing = Hearing(self, lambda: self.config, Tools(), self.tally)  # raises before threads are started
         self.calibration = Calibration(self, lambda: self.workshop, self.set_body)
-        self.hearing = Hearing(self, lambda: self.config, Tools(), self.tally)
         self.bending = Bending(self, self.hearing, lambda: self.config)
         self.answering = Answering(self, self.settings, self.hearing, self.tally, self.calibration, self.bending)
         self.hearing.on_tool, self.hearing.on_instant = self._on_tool, self.answering.answer
         self.hearing.on_removed = self._on_removed
         self._offer("reset", self.reset)
         self.create_service(SetBody, "~/set_body", self._on_set_body)
+        self.create_service(GetTopology, "~/get_topology", self._on_get_topology)
+        self._action = BodyAction(self, lambda changes, done: self.set_body(done, **changes), self._abandon,
+                                  lambda: self.skin.layer_id if self.settings.locked else "")  # fmt: skip
+        self.diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", STREAM)
+        self._diagnosing = steady_timer(self, 1.0, self._diagnose)
 
     @property
     def config(self) -> NodeConfig:
@@ -109,11 +121,10 @@ class SkinNode(LifecycleNode):
             return TransitionCallbackReturn.FAILURE
         assert self.workshop
         self.answering.sending = Sending(self, self.config, self.skin, self.workshop, self.hearing.gate)
-        self.diagnostics = managed(self, DiagnosticArray, "/diagnostics", STREAM)
         self.answering.open()
         self.hearing.open()
         self.bending.open()
-        self.clocks = [self.create_timer(1 / FADE_RATE, self._fade), self.create_timer(1.0, self._diagnose)]
+        self._fading = steady_timer(self, 1 / FADE_RATE, self._fade)
         self.settings.locked = True
         gc.collect()
         gc.freeze()  # what is set up now stays: collections at run time need not look at it
@@ -153,6 +164,7 @@ class SkinNode(LifecycleNode):
         self.answering.close()
         self._end()
         self.calibration.close()
+        self._action.close()
         super().destroy_node()
 
     def _make_skin(self) -> Skin:
@@ -192,11 +204,9 @@ class SkinNode(LifecycleNode):
     def _clean_up(self) -> None:
         self.answering.close()
         if self.settings.locked:
-            for timer in self.clocks:
-                self.destroy_timer(timer)
+            self.destroy_timer(self._fading)
             self.hearing.close()
             self.bending.close()
-            self.destroy_lifecycle_publisher(self.diagnostics)
             self.sending.close()
         self._end()
         self.calibration.forget()
@@ -207,6 +217,7 @@ class SkinNode(LifecycleNode):
             if beside:
                 beside.close()
         self._making = self.workshop = None
+        self._finish("given up: the node is cleaned up, or ends")
 
     # Settings and services
 
@@ -223,20 +234,27 @@ class SkinNode(LifecycleNode):
         """Forgets what the tools did, and sends the skin at rest. Raises InvalidInput unless active."""
         if not self.active:
             raise InvalidInput("the node is not active, so there is nothing to reset.")
-        self.hearing.inbox.forget()
+        self.hearing.forget()
         self.calibration.forget()
         self.answering.rest("reset")
         return f"at rest; {len(self.hearing.tools)} tools are known"
 
     def _on_set_body(self, request: SetBody.Request, response: SetBody.Response) -> SetBody.Response:
-        fields = request.get_fields_and_field_types()
-        changes = {name: getattr(request, name) for name in fields if getattr(request, name)}
-        return _served(response, lambda: self.set_body(**changes))
+        return _served(response, lambda: self.set_body(**changes_of(request)))
 
-    def set_body(self, **changes: Any) -> str:
+    def _on_get_topology(self, request: GetTopology.Request, response: GetTopology.Response) -> GetTopology.Response:
+        response.success = self.active
+        if self.active:
+            response.topology = self.sending.topology_message(self._now())
+        else:
+            response.message = "the node is not active, so it has no skin."
+        return response
+
+    def set_body(self, done: Done = _nobody, /, **changes: Any) -> str:
         """Changes to another skin, or another stiffness, once it is made. Raises InvalidInput.
 
         Args:
+            done: function that is told what became of it, once.
             changes: fields of NodeConfig.
         """
         config = self.settings.with_(**changes)
@@ -244,26 +262,42 @@ class SkinNode(LifecycleNode):
         Limits.read(config.limits, config.limb)
         if not self.settings.locked:
             self.settings.take(config)
+            done("")
             return "counts when the node is configured"
         if self._making:
             raise InvalidInput("another skin is being made; wait for skin/topology.")
         if stiffer := restiffened(self.skin, config, set(changes)):
             self._take_over(stiffer, config)
+            done("")
             return "taken over"
-        self._making = Beside(skin_of, config, self._build)
-        then(self, self._making.result, partial(self._on_skin, config))
+        self._done = done
+        self._making = making = Beside(skin_of, config, self._build)
+        then(self, making.result, partial(self._on_skin, making, config))
         return "being made; skin/topology comes when it takes over"
 
-    def _on_skin(self, config: NodeConfig, future: Future[Skin]) -> None:
-        if self._making is None:
-            return
-        self._making.close()
+    def _on_skin(self, making: Beside[Skin], config: NodeConfig, future: Future[Skin]) -> None:
+        if self._making is not making:
+            return  # given up meanwhile
+        making.close()
         self._making = None
         try:
             self._take_over(future.result(), config)
+            self._finish("")
         except Exception as error:  # whatever happened in the other process; the node goes on
+            self._finish(str(error) or type(error).__name__)
             self.tally.last_refusal = f"set_body: {error}"
             self.get_logger().error(f"no other skin: {error or type(error).__name__}. The one from before goes on.")
+
+    def _abandon(self, why: str) -> None:
+        """Gives the skin up that is being made."""
+        if self._making is not None:
+            self._making.close()
+            self._making = None
+            self._finish(why)
+
+    def _finish(self, why: str) -> None:
+        done, self._done = self._done, _nobody
+        done(why)
 
     def _take_over(self, skin: Skin, config: NodeConfig) -> None:
         same = skin is self.skin
@@ -310,13 +344,15 @@ class SkinNode(LifecycleNode):
             self.answering.follow()
 
     def _diagnose(self) -> None:
+        name = self.get_fully_qualified_name()
+        self.hearing.now.look()
         if not self.active:
-            return
+            return self._tell_health([skin_status(name, {}, Health(active=False))])
         self.hearing.look_for_strangers()
         self._look_for_twins()
         inbox, events = self.hearing.inbox, self.hearing.events
         values = self.tally.values() | {
-            "tools": " ".join(inbox.live(time.monotonic_ns())),
+            "tools": " ".join(inbox.live(self.hearing.now())),
             "dropped, out of order": str(inbox.out_of_order),
             "deadlines missed": str(events.missed_deadlines),
             "lost on the way": str(events.lost),
@@ -326,12 +362,16 @@ class SkinNode(LifecycleNode):
         }
         if self.config.joint_states:
             values["joints"] = self.bending.doubt or " ".join(f"{x:.4f}" for x in self.answering.simulator.skin.angles)
-        bad = bool(self.bending.doubt or self.tally.refused or self.tally.stale or inbox.out_of_order
-                   or events.missed_deadlines)  # fmt: skip
-        name = self.get_fully_qualified_name()
-        statuses = [skin_status(name, values, bad, self.answering.fading)]
+        lately = self._counts.since(reactions=self.tally.reactions, refused=self.tally.refused, stale=self.tally.stale,
+                                    out_of_order=inbox.out_of_order, missed=events.missed_deadlines)  # fmt: skip
+        health = Health(lately, self.tally.last_refusal, self.answering.fading, bool(inbox.live(self.hearing.now())),
+                        self.bending.doubt)  # fmt: skip
+        statuses = [skin_status(name, values, health)]
         if self.answering.limits:
             statuses.append(limits_status(name, self.answering.limits))
+        self._tell_health(statuses)
+
+    def _tell_health(self, statuses: list[DiagnosticStatus]) -> None:
         self.diagnostics.publish(diagnostics(statuses, self.get_clock().now().to_msg()))
 
     def _look_for_twins(self) -> None:

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Literal
 
-from pydantic import BaseModel, ConfigDict, Field, field_validator
+from pydantic import BaseModel, ConfigDict, Field, ValidationInfo, field_validator
 from pydantic.config import JsonDict
 
 from stmpl_core.body import phenotype_from
@@ -21,6 +22,13 @@ FOREARM, PAPER_ARM = "left_forearm", "left_arm"  # parts that answer unless one 
 ACCURACY = 2e-4  # error at any vertex that is asked for [m]
 ANY_TIME: JsonDict = {"when": "any time"}  # fields that a running node takes over at once
 CONFIGURING: JsonDict = {"when": "configuring"}  # fields that count when the node is configured
+LISTS: dict[str, tuple[str, str] | tuple[()]] = {  # fields of several names, and how a pair of them is written
+    "shape_tools": (),
+    "joints": ("joint=name", "left_elbow=elbow_2"),
+    "tf_tools": ("tool=frame", "finger=tool0"),
+    "gz_contacts": ("tool=collision", "finger=robot::tip::collision"),
+}
+Names = tuple[str, ...]
 
 
 class NodeConfig(BaseModel):
@@ -64,8 +72,8 @@ class NodeConfig(BaseModel):
         default="", json_schema_extra=CONFIGURING,
         description="topic of sensor_msgs/JointState that bends the limb, an arm or a leg; empty: it stays at rest",
     )  # fmt: skip
-    joints: str = Field(
-        default="", json_schema_extra=CONFIGURING,
+    joints: Names = Field(
+        default=(), json_schema_extra=CONFIGURING,
         description="names of the limb's joints in these messages where they are not its own: 'left_elbow=elbow_2'",
     )  # fmt: skip
     friction: str = Field(
@@ -99,11 +107,17 @@ class NodeConfig(BaseModel):
     deadline: float = Field(
         default=0.0, ge=0, le=3600, description="longest time between two poses that a device must promise [s]; 0: none"
     )
-    shape_tools: str = Field(
-        default="", description="tools that announce their surface as shape_msgs/Mesh, parted by blanks"
+    shape_tools: Names = Field(default=(), description="tools that announce their surface as shape_msgs/Mesh")
+    tf_tools: Names = Field(
+        default=(), description="tools whose pose is that of a frame of /tf: 'finger=tool0'; needs tf2_ros"
     )
-    gz_contacts: str = Field(
-        default="", description="tools that Gazebo's contacts push: 'finger=robot::tip::collision', parted by blanks"
+    tf_rate: float = Field(default=100.0, ge=1, le=1000, description="rate at which these frames are looked up [Hz]")
+    tf_wait: float = Field(
+        default=0.1, ge=0, le=10, json_schema_extra=ANY_TIME,
+        description="longest wait for /tf to say where a message's frame was at its stamp; then it is refused [s]",
+    )  # fmt: skip
+    gz_contacts: Names = Field(
+        default=(), description="tools that Gazebo's contacts push: 'finger=robot::tip::collision'"
     )
     gz_body: str = Field(
         default="", description="model, link or collision in Gazebo that is the body; empty: whatever the tools touch"
@@ -157,17 +171,19 @@ class NodeConfig(BaseModel):
         friction_from(text)
         return text
 
-    @field_validator("joints")
+    @field_validator(*LISTS, mode="before")
     @classmethod
-    def _joints(cls, text: str) -> str:
-        _named(text, "joint=name", "left_elbow=elbow_2")
-        return text
+    def _parted(cls, given: object) -> object:
+        """One text of names parted by blanks is as good as many; empty ones, which ROS needs in a list, are none."""
+        texts = given.split() if isinstance(given, str) else given
+        return tuple(text for text in texts if text != "") if isinstance(texts, Iterable) else given
 
-    @field_validator("gz_contacts")
+    @field_validator(*LISTS)
     @classmethod
-    def _collisions(cls, text: str) -> str:
-        _named(text)
-        return text
+    def _pairs(cls, texts: tuple[str, ...], info: ValidationInfo) -> tuple[str, ...]:
+        if pattern := LISTS[str(info.field_name)]:
+            _named(texts, *pattern)
+        return texts
 
     @property
     def limb(self) -> str:
@@ -177,12 +193,17 @@ class NodeConfig(BaseModel):
     @property
     def gz_collisions(self) -> dict[str, str]:
         """The collision of each tool that takes its wrench from Gazebo."""
-        return _named(self.gz_contacts)
+        return _named(self.gz_contacts, *LISTS["gz_contacts"])
+
+    @property
+    def tf_frames(self) -> dict[str, str]:
+        """The frame of each tool that takes its pose from /tf."""
+        return _named(self.tf_tools, *LISTS["tf_tools"])
 
     @property
     def joint_names(self) -> dict[str, str]:
         """Names of joints in joint states, by the limb's own, where they differ."""
-        return _named(self.joints, "joint=name", "left_elbow=elbow_2")
+        return _named(self.joints, *LISTS["joints"])
 
     def new_method(self) -> Method:
         """The method, not yet prepared."""
@@ -202,17 +223,19 @@ class NodeConfig(BaseModel):
 
     def ros_arguments(self) -> list[str]:
         """The settings as arguments of a ROS process: --ros-args -p name:=value ..."""
-        values = self.model_dump(mode="json").items()
+        values = {name: [""] if value == [] else value for name, value in self.model_dump(mode="json").items()}.items()
         return ["--ros-args"] + [part for name, value in values for part in ("-p", f"{name}:={json.dumps(value)}")]
 
 
-def _named(text: str, what: str = "tool=collision", example: str = "finger=robot::tip::collision") -> dict[str, str]:
-    """name=other name, parted by blanks. Raises ValueError."""
-    pairs = [pair.partition("=") for pair in text.split()]
-    for tool, _, collision in pairs:
-        if not tool or not collision:
+def _named(texts: Iterable[str], what: str, example: str) -> dict[str, str]:
+    """name=other name. Raises ValueError."""
+    found = {}
+    for text in texts:
+        name, _, other = text.partition("=")
+        if not name or not other:
             raise ValueError(f"'{text}' is no {what}, as in '{example}'")
-    return {tool: collision for tool, _, collision in pairs}
+        found[name] = other
+    return found
 
 
 class ProbeConfig(BaseModel):

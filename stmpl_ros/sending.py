@@ -88,7 +88,11 @@ class Sending:
 
     def topology(self, stamp: int) -> None:
         """Sends the skin at rest."""
-        self._topology.publish(wire.topology_message(self._skin.layer, self._frame, stamp))
+        self._topology.publish(self.topology_message(stamp))
+
+    def topology_message(self, stamp: int) -> Any:
+        """The skin at rest, as a SkinTopology."""
+        return wire.topology_message(self._skin.layer, self._frame, stamp)
 
     def answer(self, answer: Answer, stamp: int, inputs: Stamps, **said: Any) -> None:
         """Sends an answer, with what the node has to say of it (see wire.displacement_message)."""

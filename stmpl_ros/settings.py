@@ -15,7 +15,7 @@ from rclpy.parameter import Parameter
 from stmpl_msgs.srv import SetBody
 
 from stmpl_core.errors import InvalidInput, sentence_of
-from stmpl_ros.parameters import ANY_TIME, CONFIGURING, NodeConfig
+from stmpl_ros.parameters import ANY_TIME, CONFIGURING, Names, NodeConfig
 
 WHEN = {
     "any time": "A running node takes it over at once.",
@@ -46,7 +46,7 @@ class Settings:
         values = {}
         for name, field in NodeConfig.model_fields.items():
             try:
-                declared = node.declare_parameter(name, getattr(config, name), described(field))
+                declared = node.declare_parameter(name, _told(getattr(config, name)), described(field))
             except (InvalidParameterValueException, InvalidParameterTypeException) as error:
                 raise InvalidInput(f"parameter {name}: {error}") from error
             values[name] = declared.value
@@ -63,7 +63,7 @@ class Settings:
         locked, self.locked = self.locked, False
         try:
             changed = {k: v for k, v in config.model_dump().items() if getattr(self.config, k) != v}
-            self._node.set_parameters([Parameter(name, value=value) for name, value in changed.items()])
+            self._node.set_parameters([Parameter(name, value=_told(value)) for name, value in changed.items()])
         finally:
             self.locked = locked
 
@@ -92,6 +92,11 @@ class Settings:
         return {one.name: one.value for one in parameters if one.name in NodeConfig.model_fields}
 
 
+def _told(value: Any) -> Any:
+    """A setting as a parameter: ROS knows the kind of a list by what is in it, so none is one of an empty text."""
+    return (list(value) or [""]) if isinstance(value, tuple) else value
+
+
 def checked(values: dict[str, Any]) -> NodeConfig:
     """The settings of these values. Raises InvalidInput, which says what is wrong with each."""
     try:
@@ -106,7 +111,9 @@ def described(field: FieldInfo) -> ParameterDescriptor:
     when = str(extra["when"]) if isinstance(extra, dict) else "starting"
     bounds = {name: getattr(m, name) for m in field.metadata for name in ("gt", "ge", "lt", "le") if hasattr(m, name)}
     constraints = [f"{said} {bounds[name]:g}" for name, said in (("gt", "above"), ("lt", "below")) if name in bounds]
-    if field.annotation not in (str, float, bool):
+    if field.annotation == Names:
+        constraints = ["string[]; one text of several, parted by blanks, is taken too"]
+    elif field.annotation not in (str, float, bool):
         constraints = ["one of: " + ", ".join(get_args(field.annotation))]
     span = FloatingPointRange(
         from_value=float(bounds.get("ge", bounds.get("gt", -sys.float_info.max))),
@@ -117,4 +124,5 @@ def described(field: FieldInfo) -> ParameterDescriptor:
         additional_constraints="; ".join(constraints),
         floating_point_range=[span] if field.annotation is float else [],
         read_only=when == "starting",
+        dynamic_typing=field.annotation == Names,
     )

@@ -3,10 +3,14 @@
 
 import numpy as np
 import pytest
+from action_msgs.msg import GoalStatus
+from diagnostic_msgs.msg import DiagnosticStatus
 from rcl_interfaces.srv import DescribeParameters
+from rclpy.action.client import ActionClient
 from ruamel.yaml import YAML
 from std_srvs.srv import Trigger
-from stmpl_msgs.srv import Calibrate, SetBody
+from stmpl_msgs.action import SetBody as SetBodyAction
+from stmpl_msgs.srv import Calibrate, GetTopology, SetBody
 
 from bags.wire import layer_from, pose_message
 from stmpl_core import Simulator, State
@@ -16,9 +20,10 @@ from stmpl_core.methods import Winkler
 from stmpl_core.skin import published
 from stmpl_core.touch import BY_POSE, MOVED, STALE, TOUCHING
 from stmpl_core.toucher import Toucher
+from stmpl_ros.diagnosis import Counts, Health
 from stmpl_ros.making import restiffened, skin_of
 from stmpl_ros.parameters import NodeConfig
-from stmpl_ros.settings import checked
+from stmpl_ros.settings import _told, checked
 from tests.bus import ROOT, rows, statuses
 from tests.node_bus import HERE, PUSH, skin
 from tests.scenes import LENGTH, RADIUS, at, ball, contact_of
@@ -28,8 +33,17 @@ from tests.scenes import LENGTH, RADIUS, at, ball, contact_of
 
 def test_the_yaml_holds_every_parameter_with_its_default():
     read = YAML(typ="safe").load((ROOT / "config/stmpl.yaml").read_text())["/**"]["ros__parameters"]
-    assert read == NodeConfig().model_dump(mode="json")
-    assert {name: type(value) for name, value in read.items()} == {n: type(v) for n, v in NodeConfig()}
+    assert read == {name: _told(value) for name, value in NodeConfig()}, "a list of nothing is one of an empty text"
+    assert checked(read) == NodeConfig()
+
+
+def test_names_come_as_a_list_or_as_one_text(bus):
+    assert bus.get("shape_tools", "gz_contacts") == ["shaped", [""]], "as it was set"
+    assert checked({"tf_tools": "a=b c=d"}).tf_frames == checked({"tf_tools": ["a=b", "", "c=d"]}).tf_frames
+    with pytest.raises(InvalidInput, match="'finger' is no tool=frame"):
+        checked({"tf_tools": ["finger"]})
+    arguments = NodeConfig(tf_tools=("a=b",)).ros_arguments()
+    assert 'tf_tools:=["a=b"]' in arguments and 'shape_tools:=[""]' in arguments
 
 
 def test_a_parameter_says_its_unit_its_range_and_when_it_counts(bus):
@@ -102,6 +116,72 @@ def test_a_body_that_cannot_be_is_refused_and_the_node_goes_on(bus, hand, change
     answer = bus.call(SetBody, "set_body", **change)
     assert not answer.success and says in answer.message
     assert statuses(hand.ask(HERE, PUSH)) == {"probe": TOUCHING}
+
+
+@pytest.fixture
+def another(bus):
+    """Asks for another body by the action: the goal's handle, its result when it is done, and what was said of it."""
+    client, said = ActionClient(bus.node, SetBodyAction, "stmpl/set_body"), []
+    bus.wait(client.server_is_ready, "the action")
+
+    def ask(**change):
+        goal = SetBodyAction.Goal(**change)
+        asked = client.send_goal_async(goal, feedback_callback=lambda m: said.append(m.feedback))
+        bus.wait(asked.done, "the goal to be accepted")
+        return asked.result(), asked.result().get_result_async(), said
+
+    yield ask
+    client.destroy()
+
+
+def test_a_body_by_the_action_is_told_of_until_it_answers(bus, hand, another):
+    hand.ask(HERE, PUSH)
+    _, done, said = another(thickness=6.5e-3)
+    bus.wait(done.done, "the other body")
+    result = done.result()
+    assert result.status == GoalStatus.STATUS_SUCCEEDED and result.result.success
+    assert said and "being made" in said[0].stage and said[-1].seconds >= said[0].seconds > 0
+    assert hand.ask(HERE, PUSH).layer_id == result.result.layer_id
+    _, done, _ = another(youngs_modulus=1234.0)  # at hand at once
+    bus.wait(done.done, "the other stiffness")
+    assert done.result().result.success and bus.get("youngs_modulus", "thickness") == [1234.0, 6.5e-3]
+
+
+def test_a_body_by_the_action_may_be_cancelled_and_one_that_cannot_be_is_told(bus, hand, another):
+    before = hand.ask(HERE, PUSH).layer_id
+    goal, done, _ = another(thickness=8.5e-3)
+    bus.wait(goal.cancel_goal_async().done, "the cancel")
+    bus.wait(done.done, "the end of it")
+    assert done.result().status == GoalStatus.STATUS_CANCELED and "cancelled" in done.result().result.message
+    assert hand.ask(HERE, PUSH).layer_id == before
+    _, done, _ = another(thickness=-1.0)
+    bus.wait(done.done, "the refusal")
+    assert done.result().status == GoalStatus.STATUS_ABORTED and "thickness" in done.result().result.message
+    _, done, _ = another(thickness=0.05)  # only making it shows that it cannot be
+    bus.wait(done.done, "the refusal")
+    assert done.result().status == GoalStatus.STATUS_ABORTED and "thicker" in done.result().result.message
+    assert hand.ask(HERE, PUSH).layer_id == before
+
+
+def test_the_topology_may_be_asked_for(bus):
+    answer = bus.call(GetTopology, "get_topology")
+    newest = bus.got["skin/topology"][-1]
+    assert answer.success and answer.topology.layer_id == newest.layer_id
+    assert answer.topology.vertices == newest.vertices and answer.topology.triangles == newest.triangles
+
+
+def test_health_tells_what_is_so_now_and_not_what_was():
+    counts = Counts()
+    assert counts.since(reactions=5, refused=2)["refused"] == 2
+    later = counts.since(reactions=9, refused=2)
+    assert later == {"reactions": 4, "refused": 0}
+    assert Health(later, live=True).said == (DiagnosticStatus.OK, "answering")
+    assert Health({"reactions": 4, "refused": 1}).said[0] == DiagnosticStatus.WARN
+    level, said = Health({"reactions": 0, "refused": 1}, "no frame").said
+    assert level == DiagnosticStatus.ERROR and said.endswith("no frame")
+    assert Health(fading=True).said[0] == DiagnosticStatus.STALE == Health(active=False).said[0]
+    assert Health(doubt="no joints").said == (DiagnosticStatus.STALE, "no joints")
+    assert Health().said == (DiagnosticStatus.OK, "at rest: no tool is heard")
 
 
 def test_another_body_takes_over_while_the_node_goes_on_answering(bus, hand):

@@ -29,7 +29,7 @@ from stmpl_ros.node import run
 from stmpl_ros.parameters import NodeConfig
 from tests.test_node_joints import skin
 sys.exit(run(NodeConfig(tissue="paper", rest_after=0.4, fade=0.0, friction="0.4", joint_states="person/joint_states",
-                        joints="elbow=elbow_2"), sys.argv[1:], build=skin))
+                        joints=("elbow=elbow_2",)), sys.argv[1:], build=skin))
 """
 HERE = at(0, RADIUS + 0.012 - 1e-3, 0.05)
 SLIDES = [at(0, RADIUS + 0.012 - 1.5e-3, z) for z in np.linspace(0.05, 0.054, 12)]

@@ -93,9 +93,9 @@ def test_a_file_of_frames_that_cannot_be_read_is_refused(tmp_path, text):
 
 def test_the_example_of_frames_is_read_and_unknown_frames_stay_unknown():
     frames = Frames("body", read_frames(str(ROOT / "config/frames.yaml")))
-    assert frames["table"].shape == (4, 4) and "nowhere" not in frames
+    assert frames.at(0)["table"].shape == (4, 4) and "nowhere" not in frames.at(0)
     with pytest.raises(FrameError, match="in frame 'nowhere'"):
-        pose_of_tool(pose_message(np.eye(4), "nowhere", 0), "probe", "body", frames)
+        pose_of_tool(pose_message(np.eye(4), "nowhere", 0), "probe", "body", frames.at(0))
 
 
 def test_a_tool_may_announce_itself_as_a_shape(bus, hand):
@@ -240,7 +240,7 @@ def test_gazebos_contacts_answer_as_the_wrench_that_they_sum_to(bus, tmp_path):
 def test_gazebos_contacts_are_refused_where_their_package_is_not_installed():
     if importlib.util.find_spec("ros_gz_interfaces"):
         pytest.skip("it is installed")
-    config = NodeConfig(gz_contacts="finger=robot::tip::collision")
+    config = NodeConfig(gz_contacts=("finger=robot::tip::collision",))
     with pytest.raises(InvalidInput, match="needs the package ros_gz_interfaces"):
         GazeboContacts(config, Frames("body", {}))
     with pytest.raises(InvalidInput, match="is no tool=collision"):

@@ -1,0 +1,61 @@
+"""Ticks: the clock by which silence counts: of the simulation while there is one, else of the wall."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+
+from rclpy.clock import Clock, JumpThreshold
+from rclpy.clock_type import ClockType
+from rclpy.duration import Duration
+from rclpy.node import Node
+from rclpy.time_source import USE_SIM_TIME_NAME
+from rclpy.timer import Timer
+
+CLOCK = "/clock"
+
+
+def steady_timer(node: Node, period: float, do: Callable[[], None]) -> Timer:
+    """A timer [s] that a simulation can neither stop nor slow."""
+    return node.create_timer(period, do, clock=Clock(clock_type=ClockType.STEADY_TIME))
+
+
+class Ticks:
+    """Nanoseconds that go on by the simulated clock, so that a slow simulation is not silent, and a paused one neither.
+
+    A simulation that is gone (nobody sends /clock) leaves the wall's clock to count. The count itself never jumps.
+
+    Args:
+        node: node whose clock it is.
+
+    Attributes:
+        on_back: callback for a simulated clock that was set back.
+    """
+
+    def __init__(self, node: Node) -> None:
+        self._node, self._simulated, self._ahead, self._last = node, False, 0, 0
+        self.on_back: Callable[[], None] = lambda: None
+        threshold = JumpThreshold(min_forward=None, min_backward=Duration(nanoseconds=-1), on_clock_change=False)
+        self._jumps = node.get_clock().create_jump_callback(threshold, post_callback=self._back)
+
+    def __call__(self) -> int:
+        """Now [ns]."""
+        self._last = self._source() + self._ahead
+        return self._last
+
+    def look(self) -> None:
+        """Looks whether a simulation is there."""
+        asked = self._node.get_parameter_or(USE_SIM_TIME_NAME)
+        simulated = bool(asked.value) and self._node.count_publishers(CLOCK) > 0
+        if simulated != self._simulated:
+            now = self()
+            self._simulated = simulated
+            self._ahead = now - self._source()
+
+    def _source(self) -> int:
+        return self._node.get_clock().now().nanoseconds if self._simulated else time.monotonic_ns()
+
+    def _back(self, _: object) -> None:
+        if self._simulated:
+            self._ahead = self._last - self._source()
+        self.on_back()

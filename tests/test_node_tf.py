@@ -1,0 +1,268 @@
+"""Laws of frames that move: poses and wrenches wait for /tf at their stamp, a dead /tf is told, tools are frames."""
+
+import os
+import sys
+import time
+from collections.abc import Callable, Iterator
+from importlib.util import find_spec
+from types import SimpleNamespace
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+import rclpy
+from builtin_interfaces.msg import Time as TimeMessage
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from geometry_msgs.msg import PoseStamped, TransformStamped, WrenchStamped
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.parameter import Parameter
+from rosgraph_msgs.msg import Clock
+from stmpl_msgs.msg import ContactMesh, SkinDisplacement
+
+from bags.wire import NANO, header, pose_from, pose_message, stamp_ns, tool_message, wrench_from, wrench_message
+from stmpl_core.errors import InvalidInput
+from stmpl_ros.frames import Frames
+from stmpl_ros.node import SkinNode
+from stmpl_ros.parameters import NodeConfig
+from stmpl_ros.ticks import Ticks
+from stmpl_ros.topics import KEPT, STREAM
+from tests import tf2_stand_in
+from tests.bus import PATIENCE
+from tests.conftest import BUSES
+from tests.node_bus import HERE, skin
+from tests.scenes import ball
+
+MS = 1_000_000
+SPEED = np.array([0.0, 0.0, 0.126])  # of the frame "base" in the body's [m/s]
+
+
+class Scene(NamedTuple):
+    """A node in this process, and who tells it of frames, poses and wrenches."""
+
+    node: SkinNode
+    heard: list[SkinDisplacement]
+    health: list[DiagnosticStatus]
+    poses: list[PoseStamped]
+    pose: Callable[[int], None]
+    wrench: Callable[[int], None]
+    move: Callable[[int], None]
+    wait: Callable[[Callable[[], object]], None]
+
+    def now(self) -> int:
+        return self.node.get_clock().now().nanoseconds
+
+
+@pytest.fixture(autouse=True)
+def tf2(monkeypatch) -> None:
+    """tf2_ros itself where it is installed."""
+    if find_spec("tf2_ros") is None:
+        monkeypatch.setitem(sys.modules, "tf2_ros", tf2_stand_in)
+        monkeypatch.setattr(tf2_stand_in, "__spec__", SimpleNamespace(name="tf2_ros"), raising=False)
+
+
+def base_at(stamp: int) -> np.ndarray:
+    """pose_body_from_base (4, 4) at a stamp [ns]: it moves along the limb."""
+    place = np.eye(4)
+    place[:3, 3] = SPEED * ((stamp % (20 * NANO)) / NANO - 10)
+    return place
+
+
+def told(parent: str, child: str, place: np.ndarray, stamp: int) -> TransformStamped:
+    pose = pose_message(place, parent, stamp).pose
+    message = TransformStamped(header=header(parent, stamp), child_frame_id=child)
+    message.transform.translation.x, message.transform.translation.y = pose.position.x, pose.position.y
+    message.transform.translation.z, message.transform.rotation = pose.position.z, pose.orientation
+    return message
+
+
+@pytest.fixture
+def scene(request) -> Iterator[Scene]:
+    context = rclpy.Context()
+    context.init(domain_id=int(os.environ["ROS_DOMAIN_ID"]) + BUSES)
+    executor = SingleThreadedExecutor(context=context)
+    node = SkinNode(NodeConfig(**getattr(request, "param", {})), skin, context=context)
+    other = rclpy.create_node("other", context=context)
+    heard, health, poses = list[SkinDisplacement](), list[DiagnosticStatus](), list[PoseStamped]()
+    other.create_subscription(SkinDisplacement, "skin/displacement", heard.append, STREAM)
+    other.create_subscription(DiagnosticArray, "/diagnostics", lambda m: health.append(m.status[0]), STREAM)
+    other.create_subscription(PoseStamped, "tools/finger/pose", poses.append, STREAM)
+    mesh = other.create_publisher(ContactMesh, "contact_mesh", KEPT)
+    pose = other.create_publisher(PoseStamped, "tools/finger/pose", STREAM)
+    wrench = other.create_publisher(WrenchStamped, "tools/finger/wrench", STREAM)
+
+    def send(stamp: int) -> None:
+        pose.publish(pose_message(np.linalg.inv(base_at(stamp)) @ HERE, "base", stamp))
+
+    def push(stamp: int) -> None:
+        wrench.publish(wrench_message(np.array([-0.03, 0, 0, 0, 0, 0]), "base", stamp))
+
+    def move(stamp: int) -> None:
+        node.hearing.frames._buffer.set_transform(told("body", "base", base_at(stamp), stamp), "test")
+
+    def wait(done: Callable[[], object]) -> None:
+        until = time.monotonic() + PATIENCE
+        while not done():
+            assert time.monotonic() < until
+            executor.spin_once(timeout_sec=0.005)
+
+    try:
+        executor.add_node(node)
+        executor.add_node(other)
+        node.trigger_configure()
+        node.trigger_activate()
+        mesh.publish(tool_message(ball().named("finger"), 0))
+        wait(lambda: "finger" in node.hearing.tools)
+        yield Scene(node, heard, health, poses, send, push, move, wait)
+    finally:
+        executor.shutdown()
+        node.destroy_node()
+        other.destroy_node()
+        context.try_shutdown()
+        context.destroy()
+
+
+def test_a_pose_in_a_moving_frame_is_where_that_was_at_its_stamp(scene):
+    first = scene.now()
+    scene.wait(lambda: scene.pose(first) or scene.node.hearing._patience._streams)  # before /tf says where base is
+    assert scene.node.hearing.inbox.pose_of("finger") is None
+    for k in range(5):
+        scene.move(first - 20 * MS + 33 * k * MS)  # at 30 Hz; the pose's stamp lies between two of them
+    scene.wait(lambda: scene.node.hearing.inbox.pose_of("finger") is not None)
+    np.testing.assert_allclose(scene.node.hearing.inbox.pose_of("finger"), HERE, atol=1e-7)
+    assert scene.node.tally.refused == 0
+
+
+def test_a_dead_tf_is_told_within_a_fifth_of_a_second_and_its_poses_are_not_answered(scene):
+    def going() -> None:
+        scene.move(scene.now())
+        scene.pose(scene.now() - 2 * MS)
+
+    scene.wait(lambda: going() or len(scene.heard) > 3)
+    died = scene.now()
+    answered = [stamp_ns(one) for one in scene.heard]
+    scene.wait(lambda: scene.pose(scene.now()) or scene.node.tally.refused)
+    assert scene.now() - died < 1000 * MS  # 100 ms of patience, and whatever else this machine is at
+    assert "/tf did not say within 0.1 s" in scene.node.tally.last_refusal
+    assert "'base'" in scene.node.tally.last_refusal and "finger" in scene.node.tally.last_refusal
+    scene.wait(lambda: scene.pose(scene.now()) or (scene.health and scene.health[-1].level == DiagnosticStatus.ERROR))
+    assert "nothing that came could be used" in scene.health[-1].message
+    assert all(stamp_ns(one) <= died for one in scene.heard if one.touches and one.fade == 1), answered
+    scene.wait(lambda: going() or scene.health[-1].level == DiagnosticStatus.OK)  # and it recovers
+
+
+@pytest.mark.parametrize("scene", [{"tf_wait": 10.0, "max_age": 0.0}], indirect=True)
+def test_of_poses_that_waited_together_the_newest_is_answered(scene):
+    first, streams = scene.now(), scene.node.hearing._patience._streams
+    stamps = [first + k * MS for k in range(4)]
+    for k, stamp in enumerate(stamps):
+        scene.pose(stamp)
+        scene.wait(lambda k=k: len(streams.get("pose of finger", ((),))[0]) > k)
+    scene.move(first - NANO // 50)
+    scene.move(stamps[2])  # the last one's instant is not known yet
+    scene.wait(lambda: scene.heard)
+    assert scene.node.hearing.inbox.inputs["finger"].pose.stamp == stamps[2] and scene.node.tally.refused == 0
+    scene.move(stamps[3])
+    scene.wait(lambda: scene.node.hearing.inbox.inputs["finger"].pose.stamp == stamps[3])
+
+
+def test_a_wrench_in_a_moving_frame_waits_too_and_its_torque_is_taken_to_the_tool(scene):
+    def going() -> None:
+        now = scene.now()
+        scene.pose(now)
+        scene.wrench(now)
+        scene.move(now + MS)
+
+    scene.wait(lambda: going() or any(one.touches and one.touches[0].force_bound for one in scene.heard))
+    assert scene.node.hearing.inbox.inputs["finger"].wrench.value is not None and scene.node.tally.refused == 0
+
+
+@pytest.mark.parametrize("scene", [{"tf_tools": ("finger=tool0",), "tf_rate": 200.0}], indirect=True)
+def test_a_tool_may_be_a_frame_of_tf_and_what_it_is_taken_for_is_sent_for_a_recorder(scene):
+    in_base = np.eye(4)
+    in_base[:3, 3] = 0.01, 0.02, -0.03
+
+    def going() -> None:
+        now = scene.now()
+        buffer = scene.node.hearing.frames._buffer
+        scene.move(now)
+        buffer.set_transform(told("base", "tool0", np.linalg.inv(base_at(now)) @ HERE, now), "test")
+
+    scene.wait(lambda: going() or (scene.heard and scene.poses))
+    np.testing.assert_allclose(scene.node.hearing.inbox.pose_of("finger"), HERE, atol=1e-7)
+    assert scene.poses[-1].header.frame_id == "body"
+    sent = {stamp_ns(one): pose_from(one.pose) for one in scene.poses}
+    answer = next(one for one in reversed(scene.heard) if one.touches and one.touches[0].pose_stamp.sec)
+    stamp = answer.touches[0].pose_stamp.sec * NANO + answer.touches[0].pose_stamp.nanosec
+    assert stamp in sent, "the answer names the pose that was sent"
+
+
+def test_tools_of_tf_are_refused_where_nobody_listens_to_it(monkeypatch):
+    monkeypatch.setattr("stmpl_ros.frames.find_spec", lambda name: None)
+    context = rclpy.Context()
+    context.init(domain_id=int(os.environ["ROS_DOMAIN_ID"]) + BUSES)
+    try:
+        with pytest.raises(InvalidInput, match="tf_tools needs the package tf2_ros"):
+            SkinNode(NodeConfig(tf_tools=("finger=tool0",)), skin, context=context)
+    finally:
+        context.try_shutdown()
+        context.destroy()
+
+
+def test_a_sensors_torque_is_moved_to_the_tools_origin():
+    sensor = np.eye(4)
+    sensor[:3, 3] = 0.0, 0.0, 0.1
+    tool = np.eye(4)
+    tool[:3, 3] = 0.0, 0.0, 0.03
+    wrench = wrench_message(np.array([2.0, 0, 0, 0, 0.5, 0]), "sensor", 0)
+    found = wrench_from(wrench, body_frame="body", tool="ball", pose_body_from_tool=tool,
+                        frames=Frames("body", {"sensor": sensor}).at(0))  # fmt: skip
+    np.testing.assert_allclose(found, [2, 0, 0, 0, 0.5 + 0.07 * 2, 0], atol=1e-15)
+
+
+def test_a_simulation_slower_than_its_clock_is_not_silent_and_one_that_is_gone_is():
+    context = rclpy.Context()
+    context.init(domain_id=int(os.environ["ROS_DOMAIN_ID"]) + BUSES)
+    executor = SingleThreadedExecutor(context=context)
+    node = rclpy.create_node("sim", context=context, parameter_overrides=[Parameter("use_sim_time", value=True)])
+    other = rclpy.create_node("gz", context=context)
+    clock, backs = other.create_publisher(Clock, "/clock", 10), []
+    ticks = Ticks(node)
+    ticks.on_back = lambda: backs.append(1)
+
+    def say(seconds: float) -> None:
+        until = time.monotonic() + PATIENCE
+        while node.get_clock().now().nanoseconds != round(seconds * 1e9):
+            assert time.monotonic() < until
+            clock.publish(Clock(clock=TimeMessage(sec=int(seconds), nanosec=round(seconds % 1 * 1e9))))
+            executor.spin_once(timeout_sec=0.02)
+
+    try:
+        executor.add_node(node)
+        executor.add_node(other)
+        say(10.0)
+        ticks.look()
+        before = ticks()
+        time.sleep(0.05)
+        assert ticks() == before, "a paused simulation is not silent"
+        say(10.5)
+        assert ticks() - before == NANO // 2
+        say(3.0)
+        assert backs and ticks() - before == NANO // 2, "the count never goes back"
+        say(3.25)
+        assert ticks() - before == 3 * NANO // 4
+        other.destroy_publisher(clock)
+        until = time.monotonic() + PATIENCE
+        while node.count_publishers("/clock"):
+            assert time.monotonic() < until
+            executor.spin_once(timeout_sec=0.02)
+        ticks.look()
+        gone = ticks()
+        assert 0 <= gone - before - 3 * NANO // 4 < NANO, "it goes on from where it was"
+        time.sleep(0.02)
+        assert ticks() - gone >= 20 * MS, "by the wall's clock"
+    finally:
+        executor.shutdown()
+        node.destroy_node()
+        other.destroy_node()
+        context.try_shutdown()
+        context.destroy()
