@@ -7,7 +7,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 READY_DEV := $(VENV)/.ready-dev
-MESSAGES := msg_defs/pyproject.toml msg_defs/CMakeLists.txt $(wildcard msg_defs/msg/*.msg msg_defs/srv/*.srv)
+MESSAGES := msg_defs/pyproject.toml msg_defs/CMakeLists.txt $(wildcard msg_defs/msg/*.msg msg_defs/srv/*.srv msg_defs/action/*.action)
 INSTALL := $(BIN)/uv pip install --compile-bytecode --python $(BIN)/python $(if $(ROS_DISTRO),,./msg_defs)
 
 help:  ## Say what each target does

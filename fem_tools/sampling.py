@@ -158,19 +158,21 @@ TISSUE_BODIES = tuple(
     )
 )  # fmt: skip
 
+PEOPLE: tuple[tuple[str, float, float, str, Tone, float, float, float], ...] = (
+    # name, weight, gender, part, tone, edge length [m], reach, share
+    ("upper_arm_1", 0.35, 0.0, "left_upper_arm", "relaxed", 8e-3, 4.5, 0.5),
+    ("upper_arm_2", 0.6, 1.0, "left_upper_arm", "relaxed", 8e-3, 4.5, 0.5),
+    ("upper_arm_3", 0.7, 0.3, "left_upper_arm", "tensed", 8e-3, 4.5, 0.5),
+    ("forearm_1", 0.3, 1.0, "left_forearm", "relaxed", 6e-3, 6.7, 0.5),
+    ("forearm_2", 0.65, 0.0, "left_forearm", "relaxed", 7e-3, 6.7, 0.5),
+    ("forearm_3", 0.5, 1.0, "left_forearm", "tensed", 6e-3, 6.7, 0.5),
+    ("thigh", 0.4, 0.8, "left_thigh", "relaxed", 11e-3, 6.7, 0.3),
+    ("calf", 0.6, 0.2, "left_calf", "relaxed", 8e-3, 6.7, 0.3),
+)
 LIVING_BODIES = tuple(  # people unlike the average one, their tissue as measured
     BodyPlan(name=f"living_{name}", weight=weight, gender=gender, part=part, tone=tone, edge_length=edge, share=share,
              clear=2.0, reach=reach, sizes=(8e-3, 40e-3), paper_rule=False, out_of_distribution=False)
-    for name, weight, gender, part, tone, edge, reach, share in (
-        ("upper_arm_1", 0.35, 0.0, "left_upper_arm", "relaxed", 8e-3, 4.5, 0.5),
-        ("upper_arm_2", 0.6, 1.0, "left_upper_arm", "relaxed", 8e-3, 4.5, 0.5),
-        ("upper_arm_3", 0.7, 0.3, "left_upper_arm", "tensed", 8e-3, 4.5, 0.5),
-        ("forearm_1", 0.3, 1.0, "left_forearm", "relaxed", 6e-3, 6.7, 0.5),
-        ("forearm_2", 0.65, 0.0, "left_forearm", "relaxed", 7e-3, 6.7, 0.5),
-        ("forearm_3", 0.5, 1.0, "left_forearm", "tensed", 6e-3, 6.7, 0.5),
-        ("thigh", 0.4, 0.8, "left_thigh", "relaxed", 11e-3, 6.7, 0.3),
-        ("calf", 0.6, 0.2, "left_calf", "relaxed", 8e-3, 6.7, 0.3),
-    )
+    for name, weight, gender, part, tone, edge, reach, share in PEOPLE
 )  # fmt: skip
 
 
