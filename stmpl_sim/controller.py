@@ -11,6 +11,7 @@ from stmpl_core.arrays import Wrench, cross
 from stmpl_sim.engine import mujoco
 
 FILTER_S = 3e-3  # time constant of the force's rate [s]
+STEEPER = 0.4  # power of the force with which a contact's stiffness grows: of round tools on skin 0.33 to 0.5
 
 
 @dataclass(frozen=True)
@@ -20,12 +21,12 @@ class Gains:
     Args:
         along: natural frequency of the motion along the skin, and over it before it is touched [rad/s].
         turn: natural frequency of turning the tool [rad/s].
-        ratio: damping ratio of both [-].
+        ratio: damping ratio of all [-].
         into: damping of the motion into the skin before it is touched [N s/m]: a set force moves the tool through air
             at force / into.
-        rate: gain on the force's rate [s], which damps once it is touched: against the skin, wherever that goes.
-        proportional: gain on the force's error [-].
-        integral: gain on its integral [1/s].
+        force: natural frequency of the force's error [rad/s], once it is touched: on soft and on stiff skin, of a
+            light and of a heavy arm.
+        integral: rate at which what is left of that error is taken away [1/s].
         posture: natural frequency of the arm's other motion, back to where it began [rad/s].
     """
 
@@ -33,9 +34,8 @@ class Gains:
     turn: float = 30.0
     ratio: float = 0.9
     into: float = 400.0
-    rate: float = 0.1
-    proportional: float = 4.0
-    integral: float = 30.0
+    force: float = 80.0
+    integral: float = 6.0
     posture: float = 3.0
 
 
@@ -51,6 +51,7 @@ class Goal:
         spin: angular velocity of the normal, (3,) [rad/s].
         swing: angular acceleration of the normal, (3,) [rad/s2].
         force: force into the skin [N]; None: the tool holds `height` instead.
+        growth: rate of that force [N/s].
         height: height of the tool's origin over the point along the normal [m], used without a force.
         closed: feedback of the force's error; without it the force is a push in the open, damped by Gains.into.
     """
@@ -62,6 +63,7 @@ class Goal:
     spin: np.ndarray
     swing: np.ndarray
     force: float | None
+    growth: float = 0.0
     height: float = 0.0
     closed: bool = True
 
@@ -69,13 +71,16 @@ class Goal:
 class ForceImpedance:
     """Motion along the skin, force into it, in operational space (Khatib 1987):
 
-        (f, m) = M ((x''_d + 2 z w e' + w^2 e) without its part along n, turning likewise, - J' q') + (f_n, 0)
-        f_n    = -n (F_d + kp (F_d - F) + ki int (F_d - F) dt - kr F') - (what the skin pushes along itself)
+        (f, m) = M ((x''_d + 2 z w e' + w^2 e) without its part along n, + a_n, turning likewise, - J' q') - (F, 0)
+        a_n    = n (n . x''_d - (w_f^2 (E + r int E dt) + 2 z w_f E') / k),    E = F_d - F_n
         tau    = J^T (f, m) + gravity, Coriolis and damping of the joints + N^T posture
 
     with the outward normal n, the course x_d (over its point on the skin, as high as the tool is), e = x_d - x, the
     arm's inertia M at the tool, and its dynamically consistent null space N. Turning takes the tool's z axis to -n. F
-    is the force along n that a sensor behind the tool feels. Along n the course's acceleration is fed forward only.
+    is the force that a sensor behind the tool feels, F_n its part along n. As F_n' = -k n . x' on skin of stiffness k,
+    E'' + 2 z w_f E' + w_f^2 (E + r int E dt) = 0: the arm's mass and the skin's stiffness leave it as it is. A contact
+    that is quicker than w_f by itself, sqrt(k / n M n), is not slowed down. Before it touches, a_n is that of a push
+    F_d, damped by Gains.into.
 
     Args:
         model: MuJoCo model.
@@ -105,13 +110,14 @@ class ForceImpedance:
         """Forgets the force."""
         self.integral = self.felt = self.rate = 0.0
 
-    def torques(self, data: Any, goal: Goal, wrench: Wrench, dt: float) -> np.ndarray:
+    def torques(self, data: Any, goal: Goal, wrench: Wrench, stiffness: float, dt: float) -> np.ndarray:
         """Torques of the arm's motors, (joints,) [N m].
 
         Args:
             data: MuJoCo data after mj_step1.
             goal: goal of now.
             wrench: wrench on the tool, world axes, (6,) [N, N m].
+            stiffness: stiffness of the contact along the normal [N/m], of use with a closed force; 0: nothing presses.
             dt: time since the last call [s].
         """
         model, g, n = self.model, self.gains, goal.normal
@@ -135,35 +141,38 @@ class ForceImpedance:
             ahead + 2 * g.ratio * g.along * lag + g.along**2 * off,
             goal.swing + 2 * g.ratio * g.turn * (goal.spin - velocity[3:]) + g.turn**2 * cross(axis, -n),
         ])  # fmt: skip
-        lift = ahead @ n
+        felt, lift = float(wrench[:3] @ n), float(ahead @ n)
+        along = wrench[:3] - felt * n
+        against = np.zeros(3)  # what is taken back of what the skin pushes
         if goal.force is None:
             lift += 2 * g.ratio * g.along * (lag @ n) + g.along**2 * (goal.height + off @ n)
+            self.reset()
+            against = wrench[:3]
+        elif goal.closed and stiffness > 0:
+            lift -= self._pressed(goal.force, goal.growth, felt, stiffness, float(n @ inertia[:3, :3] @ n), dt)
+            against = wrench[:3]
+        else:
+            self.felt, self.rate = felt, 0.0
+            against = along + n * (goal.force - g.into * (lag @ n))
         asked[:3] += (lift - asked[:3] @ n) * n
         push = inertia @ (asked - self._rate[:, self._dofs] @ dq)
-
-        # Force: what is asked for, its error, and what the skin pushes along itself taken back.
-        felt = float(wrench[:3] @ n)
-        push[:3] -= wrench[:3] - felt * n
-        if goal.force is None:
-            self.reset()
-            push[:3] -= felt * n
-        else:
-            error, pressing = goal.force - felt, goal.closed and bool(wrench[:3].any())
-            self.integral += g.integral * error * dt * pressing
-            push[:3] -= n * goal.force
-            if pressing:
-                self.rate += min(1.0, dt / FILTER_S) * ((felt - self.felt) / dt - self.rate)
-                push[:3] += n * (g.rate * self.rate - g.proportional * error - self.integral)
-            else:
-                self.rate = 0.0
-                push[:3] += n * g.into * (lag @ n)
-            self.felt = felt
+        push[:3] -= against
 
         posture = mass @ (g.posture**2 * (self._rest - data.qpos[self._places]) - 2 * g.posture * dq)
         posture -= jacobian.T @ (inertia @ (solved.T @ posture))
         known = data.qfrc_bias[self._dofs] - data.qfrc_passive[self._dofs]
         return jacobian.T @ push + known + posture
 
-    def command(self, data: Any, goal: Goal, wrench: Wrench, dt: float) -> None:
+    def _pressed(self, force: float, growth: float, felt: float, stiffness: float, mass: float, dt: float) -> float:
+        """Acceleration into the skin that a force's error asks for [m/s2]."""
+        g, error = self.gains, force - felt
+        self.rate += min(1.0, dt / FILTER_S) * ((felt - self.felt) / dt - self.rate)
+        self.integral += g.integral * error * dt
+        self.felt = felt
+        k = stiffness * max(1.0, force / max(felt, 1e-3)) ** STEEPER  # where it is going
+        w = max(g.force, np.sqrt(k / mass))
+        return (w**2 * (error + self.integral) + 2 * g.ratio * w * (growth - self.rate)) / k
+
+    def command(self, data: Any, goal: Goal, wrench: Wrench, stiffness: float, dt: float) -> None:
         """Writes the torques into `data.ctrl`."""
-        data.ctrl[self._motors] = self.torques(data, goal, wrench, dt)
+        data.ctrl[self._motors] = self.torques(data, goal, wrench, stiffness, dt)

@@ -159,7 +159,7 @@ class MassageEnv(gymnasium.Env[np.ndarray, np.ndarray]):
             across = np.cross(self._axes()[1], aim.normal)
             beside = shift[0] * across + shift[1] * self._axes()[1]
             return Goal(aim.point + beside, aim.velocity, aim.acceleration, aim.normal, aim.spin, aim.swing, push,
-                        aim.height, closed=False)  # fmt: skip
+                        height=aim.height, closed=False)  # fmt: skip
 
         self._goal, _ = run.step(goal)
         self._time += float(self._scene.model.opt.timestep)

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from stmpl_core.arrays import cross
+from stmpl_core.arrays import Wrench, cross
 from stmpl_core.errors import InvalidInput
 from stmpl_core.friction import Friction
 from stmpl_sim.controller import ForceImpedance, Gains, Goal
@@ -23,8 +23,10 @@ from stmpl_sim.scene import BALL, LIMB, Scene
 from stmpl_sim.site import Circle
 
 REACH_S, APPROACH_S, HOLD_S, RELEASE_S = 0.6, 1.4, 1.0, 1.0  # durations of phases
-SETTLE_S = 0.5  # time into a phase from which it is judged
+BLEND_S = 0.4  # time in which one force becomes the next
+SETTLE_S = 0.5  # time into a press from which it is judged; circles are from their first instant
 RAMP_S = 0.4  # time in which the speed along a circle is reached
+STIFFNESS_S = 0.01  # time between two looks at the contact's stiffness [s]
 FIRST = 0.3  # share of the force with which the tool comes to the skin
 LANDED = 0.6  # share of the approach after which it is taken to touch, and the force rises
 START_M, NEAR_M = 0.01, 0.003  # height over the skin at which the tool begins and ends; from which it approaches [m]
@@ -106,7 +108,7 @@ class Course:
         phase = self.phase(at)
         angle, rate, more = self.angle(at)
         place = self.circle.at(angle)
-        point, normal, force, height = place.point, place.normal, phase.force, radius
+        point, normal, height, (force, growth) = place.point, place.normal, radius, self.force(at)
         if phase.name == "reach":  # from over the site to over the circle's start
             share = smooth((at - phase.start) / phase.duration)
             point = self.circle.site.point + share * (point - self.circle.site.point)
@@ -115,8 +117,6 @@ class Course:
             height = radius + START_M + share * (NEAR_M - START_M)
         elif phase.name in GRIPPING:  # out of the way
             height, force = radius + START_M, None
-        elif phase.name == "approach":
-            force *= FIRST + (1 - FIRST) * smooth(((at - phase.start) / phase.duration - LANDED) / (1 - LANDED))
         elif phase.name == "release":
             height, force = radius + START_M * smooth((at - phase.start) / (0.7 * RELEASE_S)), None
         turn = pose_world_from_layer[:3, :3]
@@ -128,8 +128,22 @@ class Course:
             spin=turn @ cross(normal, place.tilt * rate),
             swing=turn @ cross(normal, place.curl * rate**2 + place.tilt * more),
             force=force,
+            growth=growth,
             height=height,
         )
+
+    def force(self, at: float) -> tuple[float, float]:
+        """Force into the skin at a time [s], and its rate [N/s]: one becomes the next in BLEND_S."""
+        phase = self.phase(at)
+        start, least, duration = phase.start, FIRST * phase.force, (1 - LANDED) * phase.duration
+        if phase.name == "approach":
+            start += LANDED * phase.duration
+        else:
+            least = self.phases[max(self.phases.index(phase) - 1, 1)].force
+            duration = BLEND_S
+        share, more = (at - start) / duration, phase.force - least
+        rate = 6 * share * (1 - share) / duration if 0 < share < 1 else 0.0
+        return least + more * smooth(share), more * rate
 
     def angle(self, at: float) -> tuple[float, float, float]:
         """Angle along the circle, its rate [rad/s] and its acceleration: laps begin and end at rest."""
@@ -203,8 +217,8 @@ class Log:
         return float((self.time[-1] + self.time[1]) / self.cpu_s.sum())
 
     def during(self, phase: Phase) -> np.ndarray:
-        """Which rows are judged of a phase, (N,): those from SETTLE_S after its start on."""
-        late = min(SETTLE_S, 0.5 * phase.duration)
+        """Which rows are judged of a phase, (N,): of a circle all, of others those from SETTLE_S after their start on."""
+        late = 0.0 if phase.name == "circle" else min(SETTLE_S, 0.5 * phase.duration)
         return (self.time >= phase.start + late) & (self.time < phase.start + phase.duration)
 
     def save(self, path: Path) -> Path:
@@ -254,6 +268,7 @@ class Massage:
     def reset(self) -> None:
         """Back to the start."""
         self.skin.reset(self.data)
+        self._stiffness, self._looked = np.zeros((3, 3)), -np.inf
         mujoco.mj_resetData(self.scene.model, self.data)
         self.data.qpos[:] = self.scene.qpos
         self.controller.reset()
@@ -274,10 +289,20 @@ class Massage:
         self.skin.apply(data)
         took = time.perf_counter() - begun
         assert self.skin.reaction is not None
-        aim = goal(self.limb_pose())
-        self.controller.command(data, aim, self.skin.reaction.tools[BALL], model.opt.timestep)
+        aim, wrench = goal(self.limb_pose()), self.skin.reaction.tools[BALL]
+        if aim.force is not None and aim.closed:
+            self._look(wrench)
+        stiffness = float(aim.normal @ self._stiffness @ aim.normal)
+        self.controller.command(data, aim, wrench, stiffness, model.opt.timestep)
         mujoco.mj_step2(model, data)
         return aim, took
+
+    def _look(self, wrench: Wrench) -> None:
+        """Keeps the contact's stiffness as it is now."""
+        if not wrench.any():
+            self._stiffness, self._looked = np.zeros((3, 3)), -np.inf
+        elif self.data.time - self._looked >= STIFFNESS_S:
+            self._stiffness, self._looked = self.skin.stiffness(self.data, BALL), self.data.time
 
     def limb_pose(self) -> np.ndarray:
         """Pose of the limb in the world, (4, 4)."""

@@ -14,6 +14,7 @@ from stmpl_core.arrays import Transform, Wrench, cross
 from stmpl_core.errors import InvalidInput
 from stmpl_core.friction import Friction
 from stmpl_core.layer import SoftLayer
+from stmpl_core.local_contact import local_contacts
 from stmpl_core.methods.base import Method
 from stmpl_core.rig import Rig
 from stmpl_core.simulator import Simulator
@@ -188,6 +189,18 @@ class SoftBody:
         if self.reaction is None:
             raise InvalidInput("there is no answer before the first apply(data).")
         return self.contact.answer(self.reaction)
+
+    def stiffness(self, data: Any, name: str) -> np.ndarray:
+        """Stiffness of a tool's contact at the last `apply`, friction left out, world axes, (3, 3) [N/m].
+
+        Found from the touch (stmpl_core.local_contact) in half a millisecond; zeros where nothing presses.
+        """
+        if self.reaction is None:
+            return np.zeros((3, 3))
+        touch, tissue = self.reaction.touches[name], self.reaction.memory.tissue
+        (model,) = local_contacts(self.simulator.history, [touch], tissue)
+        turn = (self.pose(data) @ self.contact.pose_body_from_layer)[:3, :3]
+        return turn @ model.push_stiffness[:3, :3] @ turn.T
 
     def skin_points(self, data: Any, answer: Answer | None = None) -> np.ndarray:
         """Vertices of the skin in the world, (V, 3) [m], deformed by an answer if one is given."""
