@@ -256,16 +256,20 @@ class Toucher:
         push, stated_at = force / np.linalg.norm(force), contact.pose_body_from_tool[:3, 3]
         low, high, moved, best = -np.inf, np.inf, gap, None
         last: tuple[float, float] | None = None  # depth and force of the trial before
-        back = 0.1 * self._thickest
+        back, pressed_at = 0.1 * self._thickest, np.inf
         for _ in range(MAX_DEPTH_TRIALS):
             pose, clearance = shifted(start, moved * push), stated
             if moved:
                 clearance = self._cleared(field, pose, self.hole, self.hole)
             squeeze = self.columns.squeeze(field, pose, clearance)
             v, strain = squeeze.vertices, self.deep.strain(squeeze)
+            through = moved > pressed_at  # deeper than where it pressed: it may have gone through the limb
             if not (self._inward[v] @ push > MIN_FACING_COSINE).any() or not len(squeeze.nodes.area):
                 if best is None and gap == 0.0 and len(squeeze.nodes.area):
                     return None
+                if through:
+                    high, moved = moved, 0.5 * (low + moved)
+                    continue
                 low = max(low, moved)
                 moved += 0.05 * self._thickest if not np.isfinite(high) else 0.5 * (high - moved)
                 continue
@@ -273,18 +277,19 @@ class Toucher:
             some, pressure = squeeze.nodes.at_vertices(held.pressure * self._modulus, layer.vertex_areas)
             vector = -(pressure @ layer.vertex_area_vectors[some])
             size = float(np.linalg.norm(vector))
-            if size <= MIN_NET_FORCE_SHARE * float(pressure @ layer.vertex_areas[some]):
+            wrapped = size <= MIN_NET_FORCE_SHARE * float(pressure @ layer.vertex_areas[some])
+            if wrapped and not through:
                 return _Placed(contact, field, WRAPPED, contact.pose_body_from_tool, depth, 0.0, NO_SQUEEZE, 0.0)
-            normal = float(force @ vector) / size
-            if normal <= 0:
+            normal = 0.0 if wrapped else float(force @ vector) / size
+            if normal <= 0 and not through:
                 return None
-            if strain > MAX_PRESSED_STRAIN + 0.02:  # too deep, whatever it presses with
+            if normal <= 0 or strain > MAX_PRESSED_STRAIN + 0.02:  # too deep, whatever it presses with
                 high, back = min(high, moved), 2 * back
                 moved = 0.5 * (low + high) if np.isfinite(low) else moved - back
                 continue
             status = MOVED if gap > MAX_TOUCHING_GAP * self.hole else TOUCHING
             way = float((pose[:3, 3] - stated_at) @ push)
-            best = _Placed(contact, field, status, pose, depth, way, squeeze, normal, held=held)
+            best, pressed_at = _Placed(contact, field, status, pose, depth, way, squeeze, normal, held=held), moved
             deep = self._depth(squeeze)
             power = held.power * STIFFER
             if last is not None and abs(deep / last[0] - 1) > 1e-6:
@@ -367,9 +372,12 @@ class Toucher:
             trust = trust.also(f"{name} presses to {deepest:.0%} of the thickness, learnt is "
                                f"{card['ranges']['depth_over_thickness'][1]:.0%}", in_range=False)  # fmt: skip
         thinnest = one.field.thinnest
-        if thinnest < THIN * layer.edge_length and touch.depth > SUNK * thinnest and one.status != IN_CORE:
-            trust = trust.also(f"{name} is {1e3 * thinnest:.2g} mm thick, thin beside the skin's edges of "
-                               f"{1e3 * layer.edge_length:.2g} mm, and {1e3 * touch.depth:.2g} mm deep", in_range=False)
+        if thinnest < THIN * layer.edge_length and one.status != IN_CORE:
+            lowest = max(touch.depth, self._lowest(one, vertices))
+            if lowest > SUNK * thinnest:
+                trust = trust.also(f"{name} is {1e3 * thinnest:.2g} mm thick, thin beside the skin's edges of "
+                                   f"{1e3 * layer.edge_length:.2g} mm, and {1e3 * lowest:.2g} mm deep",
+                                   in_range=False)  # fmt: skip
         nu, (low, high) = layer.tissue.poisson_ratio, card["ranges"]["poisson_ratio"]
         if not low - 1e-3 <= nu <= high + 1e-3:
             trust = trust.also(f"contacts were learnt at Poisson's ratios from {low:g} to {high:g}, not {nu:g}",
@@ -389,6 +397,14 @@ class Toucher:
         if one.field.flipped:
             trust = trust.also(f"the mesh of {name} was inside out and was turned")
         return trust
+
+    def _lowest(self, one: _Placed, vertices: np.ndarray) -> float:
+        """Depth of a tool's lowest corner below the skin that it presses [m]: a sheet may lie under it altogether."""
+        skin, pose = self.layer.vertices[vertices], one.pose
+        away = (one.contact.tool.vertices @ pose[:3, :3].T + pose[:3, 3])[:, None] - skin
+        down = np.einsum("tvx,vx->tv", away, self._inward[vertices])
+        beside = np.einsum("tvx,tvx->tv", away, away) - down**2 > self.layer.edge_length**2
+        return float(np.where(beside, 0.0, down).max(initial=0.0))
 
     def unmet(self, trust: Trust, touch: Touch, stated: np.ndarray | None) -> Trust:
         """The trust in a touch, lowered where much of the stated wrench (6,) is not carried."""

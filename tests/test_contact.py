@@ -497,3 +497,29 @@ def test_a_sheet_thinner_than_the_mesh_that_sinks_below_the_skin_is_flagged(sim:
     touch = touch_of(sim.step([press(box(1e-3, 0.02, 0.02), at(RADIUS + 0.5e-3 - depth, 0, MIDDLE), None)]))
     assert ("thin beside the skin's edges" not in touch.trust.why) == sound
     assert sound or not touch.trust.in_range
+
+
+def test_a_sheet_that_lies_under_the_skin_is_flagged() -> None:
+    """Columns pass through it by little: its depth tells nothing."""
+    sheet, tilted = box(1.6e-4, 3e-3, 13e-3), turn((0, 1, 0), 0.95, (1e-3, 1e-3, -3.3e-3))
+    touch = Toucher(plate(0.084, 7e-3, 4.2e-3)).touch(press(sheet, tilted, None))
+    assert touch.force > 0 and touch.depth < 0.1 * 4.2e-3
+    assert "thin beside the skin's edges" in touch.trust.why and not touch.trust.in_range
+
+
+@pytest.mark.parametrize("thick", [0.03, 0.04])
+def test_no_force_presses_a_tool_through_the_limb(thick: float) -> None:
+    """Of a flat limb that is thinner where it is pressed: a trial that goes through to the far side is too deep."""
+    layer = limb(4e-3, radius=0.04, length=0.12)
+    v = layer.vertices * (0.3, 1, 1)
+    near = np.hypot(v[:, 1], v[:, 2] - 0.06) < 0.02
+    thin = near | (np.abs(v[:, 2] - 0.06) < 0.04)
+    toucher = Toucher(SoftLayer(v, layer.faces, np.where(thin, 8e-3, thick)))
+    touches = [toucher.touch(press(ball(0.015), at(0.012 + 0.015 - 4e-4, 0, 0.06), (-force, 0, 0)))
+               for force in (0.01, 0.1, 1, 10, 100, 1e4)]  # fmt: skip
+    assert {touch.status for touch in touches} == {TOUCHING}
+    for less, more in pairwise(touches):
+        assert more.force > 0.9 * less.force  # all that is too much is pressed to 0.83 to 0.87 of the thickness
+    assert not any("settle" in touch.trust.why for touch in touches)
+    assert all(touch.force > 0.97 * force or "carries" in touch.trust.why
+               for touch, force in zip(touches, (0.01, 0.1, 1, 10, 100, 1e4), strict=True))  # fmt: skip
