@@ -10,13 +10,14 @@ import pytest
 
 from stmpl_core import Answer, Contact, Simulator, SoftLayer
 from stmpl_core.errors import InvalidInput
-from stmpl_core.methods import Winkler
+from stmpl_core.methods import MomentNet, Winkler
 from stmpl_core.touch import APART, NO_TOUCH, Touch
 from stmpl_core.trust import Trust
-from studies.stability import PRESETS, Report, again, stability
+from studies.stability import PRESETS, Report, again, judge, stability
 from studies.stability.contact_axes import CONTACT_AXES, CONTACT_LEVELS, QUICK_CONTACTS
 from studies.stability.contact_laws import CONTACT_LAWS
 from studies.stability.fuzz import fuzz, random_mesh
+from studies.stability.layered_axes import TRIALS
 from studies.stability.picture import draw
 from studies.stability.shapes import ball, box, capsule, punch, ring
 from studies.stability.sweeps import Stage, trials
@@ -167,8 +168,6 @@ def made() -> dict[str, list[Trial]]:
 
 
 def broken(fault: Callable[[], Fault], some: Sequence[Trial]) -> set[str]:
-    from studies.stability import judge
-
     rows = [judge("one", lambda: Brings(fault()), trial) for trial in some]
     assert not any(row.outcome == "crashed" for row in rows), rows
     return {one.law for row in rows for one in row.broken}
@@ -198,7 +197,6 @@ def test_flags_without_need_count_apart(tmp_path):
 
 def test_a_torque_without_a_word_is_silent(made):
     """One of two torques that are dropped is flagged: the other counts."""
-    from studies.stability import judge
 
     def half_said(answer, contacts, layer):
         return answer if contacts[0].wrench[:3].any() else unsure(answer, contacts, layer)
@@ -231,6 +229,16 @@ def test_truth_is_of_the_scenes_that_are_pressed():
             assert np.linalg.norm(found.truth.displacement, axis=2).max() < found.mesh.thickness.max()
     with pytest.raises(InvalidInput, match=rf"{FILE.name} has no scene 'slant 60'"):
         truth("slant", 60)
+
+
+@pytest.mark.parametrize("told", ["first touch", "0.65 t", "1e+20 N", "slide, capsule", "by force, 0.5 t",
+                                  "edges of 0.6 t", "x 0.5", "90°"])  # fmt: skip
+def test_no_answer_on_skin_fat_and_muscle_is_silent(told):
+    (trial,) = [trial for trial in (make() for make in TRIALS) if trial.level == told]
+    row = judge("moment_net", MomentNet, trial)
+    assert row.outcome == ("flagged" if told == "1e+20 N" else "held"), row
+    refused = judge("winkler", Winkler, trial)
+    assert refused.outcome == "flagged" and refused.broken[0].measured == "refused"
 
 
 def test_tools_of_the_suite_are_closed_and_turned_outwards():

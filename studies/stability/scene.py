@@ -33,6 +33,8 @@ class Mesh:
         thickness: thickness of the layer, (V,) [m].
         tissue: tissue of the layer.
         uv: chart's coordinates of each corner, (F, 3, 2) [-].
+        core: ends of its columns, (V, 3) [m], which then say the thickness; None: straight below each vertex.
+        ply_scale: factor on the depths of deeper materials, (V,) [-]; None: 1.
     """
 
     vertices: Points
@@ -40,21 +42,27 @@ class Mesh:
     thickness: PerVertex
     tissue: Tissue
     uv: np.ndarray
+    core: Points | None = None
+    ply_scale: PerVertex | None = None
 
     @classmethod
     def of(cls, layer: SoftLayer) -> Mesh:
         """The mesh of a layer that has a UvChart."""
-        return cls(layer.vertices, layer.faces, layer.thickness, layer.tissue, layer.chart.uv)
+        return cls(layer.vertices, layer.faces, layer.thickness, layer.tissue, layer.chart.uv, layer.core,
+                   layer.ply_scale)  # fmt: skip
 
     @cached_property
     def layer(self) -> SoftLayer:
         """The layer, made on first use."""
         chart = UvChart(self.vertices, self.faces, self.uv)
-        return SoftLayer(self.vertices, self.faces, self.thickness, tissue=self.tissue, chart=chart)
+        return SoftLayer(self.vertices, self.faces, self.thickness if self.core is None else None, core=self.core,
+                         tissue=self.tissue, chart=chart, ply_scale=self.ply_scale)  # fmt: skip
 
     def arrays(self) -> dict[str, np.ndarray]:
         """All but the tissue, by name."""
-        return {"vertices": self.vertices, "faces": self.faces, "thickness": self.thickness, "uv": self.uv}
+        always = {"vertices": self.vertices, "faces": self.faces, "thickness": self.thickness, "uv": self.uv}
+        more = {"core": self.core, "ply_scale": self.ply_scale}
+        return always | {name: values for name, values in more.items() if values is not None}
 
 
 class Scene(Protocol):
@@ -131,4 +139,5 @@ class Pressures:
 def restored_mesh(card: dict[str, Any], arrays: dict[str, np.ndarray]) -> Mesh:
     """The mesh of a scene's card and arrays."""
     tissue = stack_from_text(json.dumps({name: card.get(name) or value for name, value in asdict(Tissue()).items()}))
-    return Mesh(**{key: arrays[key] for key in ("vertices", "faces", "thickness", "uv")}, tissue=tissue)
+    always = {key: arrays[key] for key in ("vertices", "faces", "thickness", "uv")}
+    return Mesh(**always, tissue=tissue, core=arrays.get("core"), ply_scale=arrays.get("ply_scale"))

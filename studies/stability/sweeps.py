@@ -14,6 +14,7 @@ from stmpl_core.body import Body
 from stmpl_core.extrusion import foldfree_thickness
 from stmpl_core.metrics import FAR
 from studies.stability.contact_axes import CONTACT_AXES, CONTACT_LEVELS, QUICK_CONTACTS
+from studies.stability.layered_axes import LAYERED_AXES, LAYERED_LEVELS, QUICK_LAYERED
 from studies.stability.meshes import inserted, limb
 from studies.stability.scene import Mesh, Pressures
 from studies.stability.stroke_axes import QUICK_STROKES, STROKE_AXES, STROKE_LEVELS
@@ -48,7 +49,7 @@ class Preset:
     def only(self, which: str) -> Preset:
         """This preset with the axes of "pressures", "contacts" or "strokes" alone; "all": itself."""
         kept = {axis: levels for axis, levels in self.levels.items()
-                if which == "all" or which == ("contacts" if axis in CONTACT_AXES else
+                if which == "all" or which == ("contacts" if axis in CONTACT_AXES | LAYERED_AXES else
                                                "strokes" if axis in STROKE_AXES else "pressures")}  # fmt: skip
         return replace(self, levels=kept)
 
@@ -73,7 +74,7 @@ AXIS_LEVELS: dict[str, Sequence[float]] = {
     "noise": (0.1, 0.5, 1, 2, 5),
     "two contacts": (16, 12, 8),
     "not finite": (0, 1, 2),
-} | CONTACT_LEVELS | STROKE_LEVELS  # fmt: skip
+} | CONTACT_LEVELS | LAYERED_LEVELS | STROKE_LEVELS  # fmt: skip
 PRESETS = {
     "default": Preset(),
     "quick": Preset(edge_length=7e-3, body=False, levels={
@@ -81,7 +82,7 @@ PRESETS = {
         "contact size": (25, 6), "edge": (6,), "seam": (2, 0), "obtuse": (0.1,), "area jump": (2,),
         "scale": (0.5, 1000), "turn": (90,), "shift": (1,), "stale start": (1,), "jump": (0.5,), "cycles": (100,),
         "noise": (0.1, 0.5), "two contacts": (8,), "not finite": (0, 1),
-    } | QUICK_CONTACTS | QUICK_STROKES, tool_edge=6e-3),
+    } | QUICK_CONTACTS | QUICK_LAYERED | QUICK_STROKES, tool_edge=6e-3),
 }  # fmt: skip
 
 
@@ -329,4 +330,4 @@ AXES: dict[str, Callable[[Stage, float], Trial]] = {
     "contact size": size, "edge": edge, "seam": seam, "obtuse": obtuse, "area jump": area_jump, "scale": scale,
     "turn": turn, "shift": shift, "stale start": stale_start, "jump": jump, "cycles": cycles, "noise": noise,
     "two contacts": two_contacts, "not finite": not_finite,
-} | CONTACT_AXES | STROKE_AXES  # fmt: skip
+} | CONTACT_AXES | LAYERED_AXES | STROKE_AXES  # fmt: skip
