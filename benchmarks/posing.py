@@ -5,7 +5,8 @@
     .venv/bin/python -m benchmarks.posing --fem --living     # the same of skin, fat and muscle down to the bones
 
 Errors of force, and of motion as its mean where the truth moves more than a tenth of its peak and at the worst vertex,
-in % of the peak; beside them those of a layer that is made afresh from the bent skin, which takes seconds.
+in % of the peak; beside them those of a layer that is made afresh from the bent skin, which takes seconds. "beyond its
+bound": the posed skin's force or motion is further off than it says.
 """
 
 from __future__ import annotations
@@ -24,6 +25,7 @@ from stmpl_core.living import living
 from stmpl_core.methods import MomentNet
 from stmpl_core.rig import Rig
 from stmpl_core.sdf import SignedDistance
+from stmpl_core.touch import Answer
 
 PART, JOINT = "left_arm", "left_elbow"
 RADIUS, SUBDIVISIONS = 0.012, 3  # of the ball [m], and of its mesh
@@ -95,7 +97,7 @@ def compare(edge: float, stack: bool, bends: tuple[int, ...], reach: float) -> N
                 at = start.at(DEEP * thickness).pose_body_from_tool
                 moved = np.linalg.norm(truth.displacement, axis=1)
                 true = float(np.linalg.norm(truth.pressure @ again.vertex_area_vectors))
-                words, ours = truth.trust.ok * "", []
+                words, ours = "", []
                 for one in [simulator, afresh]:
                     if one is None:
                         continue
@@ -103,13 +105,21 @@ def compare(edge: float, stack: bool, bends: tuple[int, ...], reach: float) -> N
                     off = 100 * np.linalg.norm(answer.displacement - truth.displacement, axis=1) / moved.max()
                     force = 100 * (answer.touches["ball"].force / true - 1)
                     ours.append((force, off[moved > 0.1 * moved.max()].mean(), off.max()))
-                    words = words or (answer.trust.why if one is simulator else "")
+                    if one is simulator:
+                        words = beyond(answer, true, 0.01 * off.max() * moved.max()) + answer.trust.why
                 forces = "".join(f"{force:+8.1f} %" for force, _, _ in ours)
                 motions = "  ".join(f"{moves:5.1f} ({worst:4.1f})" for _, moves, worst in ours)
                 bad = "" if truth.trust.ok else f" FEM: {truth.trust.why}"
                 print(f"{bend:4d}  {name:30} {true:8.3f} {forces}     {motions}  {words}{bad}", flush=True)
             except StmplError as error:
                 print(f"{bend:4d}  {name:30} {error}", flush=True)
+
+
+def beyond(answer: Answer, force: float, off: float) -> str:
+    """Which of an answer's bounds does not cover the true force [N], or by how far its motion is off [m]."""
+    touch, bound = answer.touches["ball"], answer.trust.error_bound
+    outside = {"force": abs(touch.force - force) > touch.force_bound, "motion": bound is not None and off > bound}
+    return "".join(f"{what} beyond its bound; " for what, is_off in outside.items() if is_off)
 
 
 def times(stack: bool) -> None:
