@@ -75,11 +75,16 @@ class Played:
         """The steady drag [N]."""
         return float(np.median(np.linalg.norm(forces[-STEADY:, :2], axis=1)))
 
+    @property
+    def peak(self) -> np.ndarray:
+        """What motion is off over, at the poses `at`, (K,) [m]."""
+        moved = np.linalg.norm(self.moved, axis=2)
+        return np.maximum(moved.max(axis=1) if self.slides else np.full(len(moved), moved.max()), 1e-9)
+
     def off(self, motion: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Mean where skin moves, and worst, of how far a motion is off at the poses `at`, (K,) [% of the peak]."""
         moved = np.linalg.norm(self.moved, axis=2)
-        peak = moved.max(axis=1) if self.slides else np.full(len(moved), moved.max())
-        wrong = 100 * np.linalg.norm(motion - self.moved, axis=2) / np.maximum(peak, 1e-9)[:, None]
+        wrong = 100 * np.linalg.norm(motion - self.moved, axis=2) / self.peak[:, None]
         where = moved > MOVES * moved.max(axis=1, keepdims=True)
         mean = [w[some].mean() if some.any() else 0.0 for w, some in zip(wrong, where, strict=True)]
         return np.array(mean), wrong.max(axis=1)
@@ -123,7 +128,7 @@ def between(start: np.ndarray, end: np.ndarray, share: float) -> np.ndarray:
 def told(one: Played) -> str:
     """What is to be said of a stroke."""
     about, truth, found = one.about, one.truth, one.found
-    most, pull = np.abs(truth[:, 2]).max(), np.linalg.norm(truth[:, :2], axis=1).max()
+    most, pull = np.maximum((np.abs(truth[:, 2]).max(), np.linalg.norm(truth[:, :2], axis=1).max()), 1e-12)
     normal = 100 * np.abs(found[:, 2] - truth[:, 2]) / most
     tangential = 100 * np.linalg.norm(found[:, :2] - truth[:, :2], axis=1) / pull
     mean, worst = one.off(one.motion)
@@ -150,7 +155,7 @@ def told(one: Played) -> str:
             lines.append(f"  {name}: {_ends(mean[some])} off where it moves, worst vertex {worst[some].max():.0f} %; "
                          f"without a state {_ends(bare[some])}")  # fmt: skip
     stated = np.isfinite(one.bound)
-    covered = worst / 100 * np.linalg.norm(one.moved, axis=2).max() <= one.bound
+    covered = worst / 100 * one.peak <= one.bound
     lines.append(f"  in range at {one.in_range.mean():.0%} of {len(one.at)} poses; the bound on motion covers "
                  f"{covered[stated].sum()} of {stated.sum()} that state one")  # fmt: skip
     return "\n".join(lines)
