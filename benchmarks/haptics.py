@@ -1,6 +1,6 @@
 """A simulated haptic device on the real contact: what it feels, whether that stays passive, and how stiff it may be.
 
-python -m benchmarks.haptics [--parts cost continuity slide session map] [--picture docs/pictures/z_width.png]
+python -m benchmarks.haptics [--parts cost continuity slide session stiffness map] [--picture docs/pictures/z_width.png]
 """
 
 from __future__ import annotations
@@ -18,11 +18,14 @@ import numpy as np
 
 from benchmarks.haptic_device import Device, Felt, Hand, Spot, arm_spot, play
 from stmpl_core import Contact
+from stmpl_core.body import Body
 from stmpl_core.haptics import DeviceLoop, LoopSettings
 from stmpl_core.history import History
-from stmpl_core.local_contact import local_contacts
+from stmpl_core.living import living
+from stmpl_core.local_contact import local_contact, local_contacts
 from stmpl_core.provenance import machine
 from stmpl_core.regions import HELD_SKIN
+from stmpl_core.toucher import Toucher
 
 HARD = 5e5  # Pa: a skin beside which the coupling is soft, 5 kN/m under 1 N
 LEVELS = [round(100 * 2 ** (k / 4)) for k in range(31)]  # N/m, of the coupling: 100 to 18,100
@@ -202,6 +205,27 @@ def session(spot: Spot) -> None:
     print()
 
 
+def stiffness(spot: Spot) -> None:
+    """Prints how far the stiffness of a model is off central differences of the touch, on the arm and on a forearm."""
+    from tests.test_haptics import SHAPES, differences, error, standing
+
+    forearm = Toucher(living(Body.anny(), "left_forearm", edge_length=4e-3))
+    middle = int(np.linalg.norm(spot.toucher.layer.vertices - spot.place, axis=1).argmin())
+    print(f"stiffness beside central differences [%]: all of it, along the normal\n{'':22}"
+          + "".join(f"{name:>14}" for name in SHAPES))
+    for where, toucher, vertex, depth in (("arm, 2.5 mm deep", spot.toucher, middle, 2.5e-3),
+                                          ("forearm, 6 mm deep", forearm, 2443, 6e-3)):  # fmt: skip
+        cells = []
+        for tool in SHAPES.values():
+            pose = standing(toucher.layer, vertex, depth)
+            found = local_contact(toucher, Contact(tool, pose))
+            true = differences(lambda at, t=toucher, one=tool: t.touch(Contact(one, at)).wrench, pose, 0.02)
+            ours, theirs = (found.normal @ one[:3, :3] @ found.normal for one in (found.stiffness, true))
+            cells.append(f"{100 * error(found.stiffness, true, 0.02):7.1f}, {100 * (ours / theirs - 1):+.1f}")
+        print(f"{where:22}" + "".join(f"{cell:>14}" for cell in cells), flush=True)
+    print()
+
+
 def z_width(spot: Spot, kept: Path, seconds: float) -> dict[str, float]:
     """All cells of the maps; those already in `kept` are not measured again. Stops early after so many seconds."""
     cells: dict[str, float] = json.loads(kept.read_text()) if kept.exists() else {}
@@ -316,7 +340,7 @@ def _timed(call: Callable[[], object], count: int) -> tuple[float, float]:
 
 def main() -> None:
     """Prints the tables and draws the map."""
-    parts = {"cost": cost, "continuity": continuity, "slide": sliding, "session": session}
+    parts = {"cost": cost, "continuity": continuity, "slide": sliding, "session": session, "stiffness": stiffness}
     given = argparse.ArgumentParser(description=__doc__)
     given.add_argument("--parts", nargs="+", default=[*parts, "map"], choices=[*parts, "map"])
     given.add_argument("--picture", type=Path, default=Path("docs/pictures/z_width.png"))
