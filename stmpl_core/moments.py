@@ -211,6 +211,11 @@ class Surroundings:
                        self._response[0], out)  # fmt: skip
         return out
 
+    @property
+    def folded(self) -> bool:
+        """Whether the skin comes near itself through the air, as fingers do."""
+        return self._thinning.folded
+
     def groups(self, vertices: np.ndarray) -> np.ndarray:
         """Numbers of groups of vertices (N,), none of which feels another, (N,): all 0 where the skin has no folds."""
         return self._thinning.groups(vertices)

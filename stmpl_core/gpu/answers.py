@@ -1,0 +1,196 @@
+"""Kernels that tell what tools do: wrenches, depths, bounds, and what may be believed of them: stmpl_core.toucher."""
+
+# pyright: reportInvalidTypeForm=false, reportArgumentType=false, reportCallIssue=false, reportIndexIssue=false
+# pyright: reportOperatorIssue=false, reportAttributeAccessIssue=false, reportGeneralTypeIssues=false
+
+from typing import Any
+
+import warp as wp
+
+from stmpl_core import soundness, toucher
+from stmpl_core.gpu.packs import BORDER_BIT, LONG_BIT, STEEP_BIT, OneSkin, Scratch, Skins
+from stmpl_core.gpu.places import APART, BY_POSE, DEEP, REFUSED, WRAPPED
+from stmpl_core.gpu.rays import FAR, OPTIONS, real, vec3
+from stmpl_core.obstacle import REACH
+
+HALF_REACH = wp.constant(wp.float64(0.5 * REACH))
+STEEP, LONG, BORDER = wp.constant(STEEP_BIT), wp.constant(LONG_BIT), wp.constant(BORDER_BIT)
+STEEP_SHARE, LONG_SHARE = wp.constant(wp.float64(soundness.STEEP_SHARE)), wp.constant(wp.float64(soundness.LONG_SHARE))
+BORDER_SHARE = wp.constant(wp.float64(soundness.BORDER_SHARE))
+AROUND, UNSEEN = wp.constant(wp.float64(toucher.MAX_AROUND)), wp.constant(wp.float64(toucher.MAX_UNSEEN_FORCE_SHARE))
+THIN, SUNK = wp.constant(wp.float64(toucher.THIN)), wp.constant(wp.float64(toucher.SUNK))
+NONE = wp.constant(wp.float64(1e-300))
+NAN = wp.constant(wp.float64(float("nan")))
+wp.set_module_options(OPTIONS)
+
+
+@wp.kernel
+def find_highest(lanes: wp.int32, many: wp.int32, skins: Skins, scratch: Scratch):
+    """Highest pressure over E at the corners around each node."""
+    s, lane = wp.tid()
+    for i in range(lane, scratch.nodes[s], lanes):
+        highest, corners = real(0.0), skins.faces[scratch.face[s, i]]
+        for x in range(3):
+            force = real(0.0)
+            for j in range(scratch.nodes[s]):
+                if scratch.tool[s, j] == scratch.tool[s, i]:
+                    others = skins.faces[scratch.face[s, j]]
+                    for y in range(3):
+                        if others[y] == corners[x]:
+                            force += scratch.pressure[s, j] * scratch.area[s, j] * scratch.shares[s, j][y]
+            highest = wp.max(highest, force / skins.area[corners[x]])
+        scratch.highest[s, i] = highest
+
+
+@wp.func
+def _ball(scratch: Scratch, s: wp.int32, k: wp.int32, reach: real) -> wp.vec4d:
+    """Middle of a tool's nodes, and how far it is felt; below 0: it has none."""
+    middle, count, far = vec3(), real(0.0), real(0.0)
+    for i in range(scratch.nodes[s]):
+        if scratch.tool[s, i] == k:
+            middle = middle + scratch.point[s, i]
+            count += real(1.0)
+    if count == real(0.0):
+        return wp.vec4d(real(0.0), real(0.0), real(0.0), real(-1.0))
+    middle = middle / count
+    for i in range(scratch.nodes[s]):
+        if scratch.tool[s, i] == k:
+            far = wp.max(far, wp.length(scratch.point[s, i] - middle))
+    return wp.vec4d(middle[0], middle[1], middle[2], far + reach)
+
+
+@wp.kernel
+def group(many: wp.int32, skins: Skins, scratch: Scratch):
+    """Numbers of groups of tools, between which none feels another: toucher.groups_of."""
+    s = wp.tid()
+    reach = HALF_REACH * skins.one[scratch.skin[s * many]].thickest
+    for k in range(many):
+        scratch.group[s * many + k] = k
+    for k in range(many):
+        one = _ball(scratch, s, k, reach)
+        for n in range(k):
+            other = _ball(scratch, s, n, reach)
+            away = wp.length(vec3(one[0] - other[0], one[1] - other[1], one[2] - other[2]))
+            if one[3] > real(0.0) and other[3] > real(0.0) and away < one[3] + other[3]:
+                old, new = scratch.group[s * many + k], scratch.group[s * many + n]
+                for m in range(many):
+                    if scratch.group[s * many + m] == old:
+                        scratch.group[s * many + m] = new
+
+
+@wp.func
+def _power(scratch: Scratch, one: OneSkin, s: wp.int32, many: wp.int32, k: wp.int32, linear_to: real) -> real:
+    """Power of the depth with which the force of a tool's group grows."""
+    deepest, found, force = real(0.0), real(0.0), real(0.0)
+    for i in range(scratch.nodes[s]):
+        if scratch.group[s * many + scratch.tool[s, i]] == scratch.group[s * many + k]:
+            depth = wp.min(scratch.strain[s, i], linear_to) * scratch.thick[s, i] / one.thickest
+            deepest = wp.max(deepest, depth)
+            found += scratch.found_power[s, i]
+            force += scratch.force[s, i]
+    return deepest * found / wp.max(force, NONE)
+
+
+@wp.func
+def _scene_status(scratch: Scratch, s: wp.int32, many: wp.int32) -> wp.int32:
+    """REFUSED if a tool is, else what a tool is not served for, else below REFUSED."""
+    out = int(-1)
+    for k in range(many):
+        status = scratch.status[s * many + k]
+        if status == REFUSED:
+            return REFUSED
+        out = wp.max(out, status)
+    return out
+
+
+@wp.struct
+class Known:
+    """What the network's card says: factor and power of the bound, largest pressure over E and depth that it learnt."""
+
+    scale: real
+    power: real
+    pressure: real
+    depth: real
+    linear_to: real
+
+
+@wp.kernel
+def answer(first: wp.int32, many: wp.int32, known: Known, skins: Skins, scratch: Scratch,
+           wrenches: wp.array3d(dtype=Any), depths: wp.array2d(dtype=Any), bounds: wp.array2d(dtype=Any),
+           in_range: wp.array2d(dtype=wp.bool), statuses: wp.array2d(dtype=wp.int32)):  # fmt: skip
+    """What each tool does, and whether it may be believed."""
+    c = wp.tid()
+    s, k = c // many, c % many
+    n, one, grid = first + s, skins.one[scratch.skin[c]], skins.grids[scratch.grid[c]]
+    whole = _scene_status(scratch, s, many)
+    if whole >= REFUSED:
+        for x in range(6):
+            wrenches[n, k, x] = wrenches.dtype(real(0.0))
+            if whole >= DEEP:
+                wrenches[n, k, x] = wrenches.dtype(NAN)
+        depths[n, k] = depths.dtype(NAN)
+        bounds[n, k] = bounds.dtype(NAN)
+        in_range[n, k] = False
+        statuses[n, k] = whole
+        return
+    if scratch.status[c] == APART:
+        for x in range(6):
+            wrenches[n, k, x] = wrenches.dtype(real(0.0))
+        depth = -scratch.nearest[c]
+        if depth < real(-0.5) * FAR:
+            depth = NAN
+        around = scratch.around[c] > AROUND * one.thickest
+        statuses[n, k] = APART
+        if around:
+            statuses[n, k] = WRAPPED
+        depths[n, k] = depths.dtype(depth)
+        bounds[n, k] = bounds.dtype(real(0.0))
+        in_range[n, k] = not around
+        return
+    force, torque, forces, strange, doubt = vec3(), vec3(), real(0.0), real(0.0), real(0.0)
+    steep, long, border, highest = real(0.0), real(0.0), real(0.0), real(0.0)
+    depth, thick, count = real(scratch.deep[c]), real(0.0), real(0.0)
+    for i in range(scratch.nodes[s]):
+        if scratch.tool[s, i] == k:
+            here, corners = scratch.pressure[s, i] * scratch.area[s, i], skins.faces[scratch.face[s, i]]
+            for x in range(3):
+                v, part = corners[x], here * scratch.shares[s, i][x]
+                push = -part / skins.area[v] * skins.area_vectors[v]
+                force = force + push
+                torque = torque + wp.cross(skins.points[v] - scratch.place[c], push)
+                if (skins.doubts[v] & STEEP) != 0:
+                    steep += part
+                if (skins.doubts[v] & LONG) != 0:
+                    long += part
+                if (skins.doubts[v] & BORDER) != 0:
+                    border += part
+            forces += here
+            strange += here * real(scratch.strange[s, i])
+            doubt += scratch.error[s, i] * scratch.area[s, i]
+            depth = wp.max(depth, scratch.strain[s, i] * scratch.thick[s, i])
+            thick += scratch.thick[s, i]
+            count += real(1.0)
+            highest = wp.max(highest, scratch.highest[s, i])
+    size = wp.length(force)
+    power = _power(scratch, one, s, many, k, known.linear_to)
+    doubt = doubt / wp.max(size, NONE) + power * grid.surface_error / wp.max(depth, grid.surface_error)
+    sound = steep <= STEEP_SHARE * forces and long <= LONG_SHARE * forces and border <= BORDER_SHARE * forces
+    sound = sound and highest <= known.pressure and depth * count <= known.depth * thick and one.learnt == 1
+    sound = sound and strange <= UNSEEN * forces
+    thinnest = skins.thinnest[k]
+    if thinnest < THIN * one.edge and depth > SUNK * thinnest:
+        sound = False
+    for x in range(3):
+        wrenches[n, k, x] = wrenches.dtype(one.modulus * force[x])
+        wrenches[n, k, 3 + x] = wrenches.dtype(one.modulus * torque[x])
+    depths[n, k] = depths.dtype(depth)
+    bounds[n, k] = bounds.dtype(real(0.0))
+    if size > real(0.0):
+        bounds[n, k] = bounds.dtype(one.modulus * size * known.scale * wp.pow(doubt, known.power))
+    in_range[n, k] = sound
+    statuses[n, k] = BY_POSE
+
+
+for one in (wp.float32, wp.float64):
+    wp.overload(answer, {"wrenches": wp.array3d(dtype=one), "depths": wp.array2d(dtype=one),
+                         "bounds": wp.array2d(dtype=one)})  # fmt: skip

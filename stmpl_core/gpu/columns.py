@@ -1,0 +1,260 @@
+"""Kernels that find the columns of skin that a tool meets, and the triangles around them: stmpl_core.columns."""
+
+# pyright: reportInvalidTypeForm=false, reportArgumentType=false, reportCallIssue=false, reportIndexIssue=false
+# pyright: reportOperatorIssue=false, reportAttributeAccessIssue=false, reportGeneralTypeIssues=false
+
+import warp as wp
+
+from stmpl_core.columns import BLOCK as IN_BLOCK
+from stmpl_core.columns import LEAST_UNDER
+from stmpl_core.deep import DEEPEST
+from stmpl_core.gpu.packs import EDGE_BIT, OneSkin, Scratch, Skins
+from stmpl_core.gpu.places import APART, DEEP, OVERFULL, PENDING
+from stmpl_core.gpu.rays import FAR, OPTIONS, WALL_WIDTH, clearance_of, depth_and_share, real, vec3
+
+BLOCK, EDGE = wp.constant(IN_BLOCK), wp.constant(EDGE_BIT)
+UNDER, TOO_DEEP = wp.constant(wp.float64(LEAST_UNDER)), wp.constant(wp.float64(DEEPEST))
+wp.set_module_options(OPTIONS)
+
+
+@wp.func
+def _marked(masks: wp.array2d(dtype=wp.uint32), c: wp.int32, n: wp.int32) -> bool:
+    """Whether the bit of a skin's column n is set."""
+    return ((masks[c, n // BLOCK] >> wp.uint32(n % BLOCK)) & wp.uint32(1)) == wp.uint32(1)
+
+
+@wp.func
+def _mark(masks: wp.array2d(dtype=wp.uint32), c: wp.int32, n: wp.int32):
+    masks[c, n // BLOCK] = masks[c, n // BLOCK] | (wp.uint32(1) << wp.uint32(n % BLOCK))
+
+
+@wp.func
+def _through(low: vec3, high: vec3, start: vec3, way: vec3, t: real) -> bool:
+    """Whether a column passes a box of the tool's frame."""
+    begin, end = real(0.0), t
+    for x in range(3):
+        if wp.abs(way[x]) < real(1e-12):
+            if start[x] < low[x] or start[x] > high[x]:
+                end = real(-1.0)
+        else:
+            first, last = (low[x] - start[x]) / way[x], (high[x] - start[x]) / way[x]
+            begin = wp.max(begin, wp.min(first, last))
+            end = wp.min(end, wp.max(first, last))
+    return begin <= end
+
+
+@wp.kernel
+def widen(skins: Skins, scratch: Scratch):
+    """Marks tools that are apart by more than a hole of the mesh, to be looked at again from further away."""
+    c = wp.tid()
+    if scratch.status[c] == APART and scratch.nearest[c] >= skins.one[scratch.skin[c]].hole:
+        scratch.wide[c] = 1
+
+
+@wp.func
+def _looks(scratch: Scratch, c: wp.int32, again: wp.int32) -> bool:
+    return (again == 0 and scratch.status[c] == PENDING) or (again == 1 and scratch.wide[c] == 1)
+
+
+@wp.kernel
+def find_near(lanes: wp.int32, again: wp.int32, skins: Skins, scratch: Scratch):
+    """Broad phase: masks of the columns that pass the tool's box."""
+    c, lane = wp.tid()
+    if not _looks(scratch, c, again):
+        return
+    one, grid = skins.one[scratch.skin[c]], skins.grids[scratch.grid[c]]
+    reach = real(one.hole)
+    if again == 1:
+        reach = one.hole + one.thickest
+    wide = vec3(reach, reach, reach)
+    low, high, centre, pose = grid.low - wide, grid.high + wide, scratch.centre[c], scratch.pose[c]
+    radius = real(0.5) * wp.length(high - low)
+    for b in range(one.first_ball + lane, one.end_ball, lanes):
+        local, mask = b - one.first_ball, wp.uint32(0)
+        ball = skins.balls[b]
+        middle = vec3(ball[0], ball[1], ball[2])
+        if wp.length_sq(middle - centre) <= (radius + ball[3]) * (radius + ball[3]):
+            base = one.first + local * BLOCK
+            for v in range(base, wp.min(base + BLOCK, one.end)):
+                t = skins.thickness[v]
+                if wp.length_sq(skins.points[v] - centre) <= (radius + t) * (radius + t):
+                    start = wp.transpose(pose) * (skins.points[v] - scratch.place[c])
+                    way = wp.transpose(pose) * skins.inward[v]
+                    if _through(low, high, start, way, t):
+                        mask = mask | (wp.uint32(1) << wp.uint32(v - base))
+        scratch.near[c, local] = mask
+        if again == 0:
+            scratch.covered[c, local] = wp.uint32(0)
+            scratch.seen[c, local] = wp.uint32(0)
+
+
+@wp.kernel
+def list_near(again: wp.int32, skins: Skins, scratch: Scratch):
+    """Numbers of these columns, one after the other."""
+    c = wp.tid()
+    if not _looks(scratch, c, again):
+        return
+    one, count = skins.one[scratch.skin[c]], int(0)
+    for local in range(one.end_ball - one.first_ball):
+        mask = scratch.near[c, local]
+        if mask != wp.uint32(0):
+            for bit in range(BLOCK):
+                if ((mask >> wp.uint32(bit)) & wp.uint32(1)) == wp.uint32(1):
+                    if count < scratch.columns.shape[1]:
+                        scratch.columns[c, count] = one.first + local * BLOCK + bit
+                    count += 1
+    if count > scratch.columns.shape[1]:
+        count = 0
+        if again == 0:
+            scratch.status[c] = OVERFULL
+    scratch.count[c] = count
+
+
+@wp.kernel
+def clear(lanes: wp.int32, again: wp.int32, skins: Skins, scratch: Scratch):
+    """Distance of the tool from each of these columns."""
+    c, lane = wp.tid()
+    if not _looks(scratch, c, again):
+        return
+    one, grid, pose = skins.one[scratch.skin[c]], skins.grids[scratch.grid[c]], wp.transpose(scratch.pose[c])
+    far = real(one.hole)
+    if again == 1:
+        far = one.hole + one.thickest
+    for n in range(lane, scratch.count[c], lanes):
+        v = scratch.columns[c, n]
+        start, way = pose * (skins.points[v] - scratch.place[c]), pose * skins.inward[v]
+        least, above = clearance_of(grid, skins.coefficients, start, way, skins.thickness[v], far)
+        scratch.least[c, n] = least
+        scratch.above[c, n] = above
+
+
+@wp.kernel
+def gather_clearance(again: wp.int32, skins: Skins, scratch: Scratch):
+    """Least of these distances; masks of the columns that are covered; whether the tool has sunk under skin."""
+    c = wp.tid()
+    if not _looks(scratch, c, again):
+        return
+    one = skins.one[scratch.skin[c]]
+    nearest, around, under, wall, covers = real(FAR), -FAR, -FAR, real(0.0), int(0)
+    for n in range(scratch.count[c]):
+        least, above = scratch.least[c, n], scratch.above[c, n]
+        nearest = wp.min(nearest, least)
+        around = wp.max(around, -above)
+        under = wp.max(under, -least - wp.max(-above, real(0.0)))
+        if again == 0 and least < one.hole:
+            v = scratch.columns[c, n]
+            wall += skins.thickness[v]
+            covers += 1
+            _mark(scratch.covered, c, v - one.first)
+    scratch.nearest[c] = nearest
+    scratch.around[c] = wp.max(scratch.around[c], around)
+    if again == 1:
+        return
+    scratch.sunk[c] = 0
+    if covers == 0:
+        scratch.status[c] = APART
+    elif under > UNDER * WALL_WIDTH * wall / real(covers):
+        scratch.sunk[c] = 1
+
+
+@wp.kernel
+def list_faces(skins: Skins, scratch: Scratch):
+    """Triangles around covered columns: each is listed by the first of its corners that is covered."""
+    c = wp.tid()
+    if scratch.status[c] != PENDING:
+        return
+    one, many = skins.one[scratch.skin[c]], int(0)
+    for n in range(scratch.count[c]):
+        v = scratch.columns[c, n]
+        if _marked(scratch.covered, c, v - one.first):
+            for p in range(skins.start[v], skins.start[v + 1]):
+                f, first = skins.around[p], bool(True)
+                corners = skins.faces[f]
+                for x in range(3):
+                    if corners[x] < v and _marked(scratch.covered, c, corners[x] - one.first):
+                        first = False
+                if first:
+                    if many < scratch.found.shape[1]:
+                        scratch.found[c, many] = f
+                    many += 1
+                    for x in range(3):
+                        _mark(scratch.seen, c, corners[x] - one.first)
+    if many > scratch.found.shape[1]:
+        scratch.status[c] = OVERFULL
+        many = 0
+    scratch.many[c] = many
+
+
+@wp.kernel
+def sink(lanes: wp.int32, skins: Skins, scratch: Scratch):
+    """Depth of the tool under each vertex of these triangles."""
+    c, lane = wp.tid()
+    if scratch.status[c] != PENDING:
+        return
+    one, grid, pose = skins.one[scratch.skin[c]], skins.grids[scratch.grid[c]], wp.transpose(scratch.pose[c])
+    for n in range(lane, scratch.count[c], lanes):
+        v, under = scratch.columns[c, n], real(0.0)
+        if _marked(scratch.seen, c, v - one.first):
+            start, way = pose * (skins.points[v] - scratch.place[c]), pose * skins.inward[v]
+            deep, share = depth_and_share(grid, skins.coefficients, start, way, skins.thickness[v], scratch.sunk[c])
+            under = deep * share
+        scratch.under[c, n] = under
+
+
+@wp.kernel
+def gather_depth(skins: Skins, scratch: Scratch):
+    """Largest of these depths; a tool beyond DEEPEST of the thickness is not served."""
+    c = wp.tid()
+    if scratch.status[c] != PENDING:
+        return
+    deep = real(0.0)
+    for n in range(scratch.count[c]):
+        deep = wp.max(deep, scratch.under[c, n])
+        if scratch.under[c, n] >= TOO_DEEP * skins.thickness[scratch.columns[c, n]]:
+            scratch.status[c] = DEEP
+    scratch.deep[c] = deep
+
+
+@wp.func
+def _under_skin(skins: Skins, one: OneSkin, at: vec3) -> bool:
+    """Whether a point is under its nearest vertex, which is not on the open border."""
+    best, nearest = real(FAR), wp.int32(one.first)
+    for b in range(one.first_ball, one.end_ball):
+        ball = skins.balls[b]
+        away = wp.length(at - vec3(ball[0], ball[1], ball[2])) - ball[3]
+        if away <= real(0.0) or away * away < best:
+            base = one.first + (b - one.first_ball) * BLOCK
+            for v in range(base, wp.min(base + BLOCK, one.end)):
+                square = wp.length_sq(at - skins.points[v])
+                if square < best:
+                    best = square
+                    nearest = v
+    inward = wp.dot(at - skins.points[nearest], skins.inward[nearest])
+    return inward > real(0.0) and (skins.doubts[nearest] & EDGE) == 0
+
+
+@wp.kernel
+def tell_inside(many: wp.int32, skins: Skins, scratch: Scratch):
+    """A tool that presses nothing, most of whose points are under the skin, is not served: Deep.inside."""
+    c = wp.tid()
+    if scratch.status[c] != APART:
+        return
+    one, centre = skins.one[scratch.skin[c]], scratch.centre[c]
+    for x in range(3):
+        if centre[x] < one.low[x] or centre[x] > one.high[x]:
+            return
+    k = c % many
+    few, all = skins.look_many[k, 0], skins.look_many[k, 1]
+    under, n = int(0), int(0)
+    while n < few and under == 0:
+        if _under_skin(skins, one, scratch.pose[c] * skins.looked_at[k, n] + scratch.place[c]):
+            under = 1
+        n += 1
+    if under == 0:
+        return
+    most = int(0)
+    for m in range(all):
+        if _under_skin(skins, one, scratch.pose[c] * skins.looked_at[k, few + m] + scratch.place[c]):
+            most += 1
+    if 2 * most > all:
+        scratch.status[c] = DEEP

@@ -1,0 +1,339 @@
+"""Kernels of the pressure at contact nodes: stmpl_core.obstacle and stmpl_core.contact_net.
+
+Conjugate gradients run in lock-step: a kernel over all nodes of all scenes multiplies, one over the scenes steps. Both
+sums are taken by one thread each, in the order of the nodes, so an answer does not depend on who runs first; scenes
+that are done are skipped. A launch costs microseconds, which thousands of scenes share.
+"""
+
+# pyright: reportInvalidTypeForm=false, reportArgumentType=false, reportCallIssue=false, reportIndexIssue=false
+# pyright: reportOperatorIssue=false, reportAttributeAccessIssue=false, reportGeneralTypeIssues=false
+
+import warp as wp
+
+from stmpl_core import contact_net, obstacle
+from stmpl_core.gpu.packs import Net, OneSkin, Scratch, Skins
+from stmpl_core.gpu.rays import OPTIONS, real, vec3
+from stmpl_core.networks import NODE
+
+STEPS, RINGS = wp.constant(obstacle.STEPS), wp.constant(obstacle.RINGS)
+REACH, NEAR = wp.constant(wp.float64(obstacle.REACH)), wp.constant(wp.float64(obstacle.NEAR))
+OWN = wp.constant(wp.float64(obstacle.OWN))
+TOLERANCE = wp.constant(wp.float64(obstacle.TOLERANCE))
+POWER_TOLERANCE = wp.constant(wp.float64(obstacle.POWER_TOLERANCE))
+LINEAR_TO = wp.constant(wp.float64(contact_net.LINEAR_TO))
+HARDENING = wp.constant(wp.float64(contact_net.HARDENING))
+FADE, FADE_RING = wp.constant(wp.float64(contact_net.FADE)), wp.constant(contact_net.FADE_RING)
+LARGEST = wp.constant(wp.float64(contact_net.MAX_LOG_RATIO))
+START, SMALL, SMALLER = (wp.constant(wp.float64(x)) for x in (0.3, 1e-3, 1e-4))
+LEAST_SQUARE, ALMOST_TWO = wp.constant(wp.float64(1e-6)), wp.constant(wp.float64(1.02))
+INPUTS, HIDDEN = wp.constant(NODE.size), wp.constant(32)
+AT_LOG_PRESSURE, AT_PRESSURE = wp.constant(NODE.at.log_pressure), wp.constant(NODE.at.pressure)
+AT_LOG_STRAIN, AT_STRAIN = wp.constant(NODE.at.log_strain), wp.constant(NODE.at.strain)
+AT_MOMENTS, AT_SIZES = wp.constant(NODE.at.log_moments), wp.constant(NODE.at.vector_sizes)
+AT_TOGETHER, AT_MEAN = wp.constant(NODE.at.vectors_together), wp.constant(NODE.at.mean_curvature)
+AT_SQUARED, AT_ALONG = wp.constant(NODE.at.squared_bend), wp.constant(NODE.at.curvature_along_vector)
+AT_SLOPE, AT_SLOPES = wp.constant(NODE.at.slope_along_vector), wp.constant(NODE.at.squared_slope)
+AT_NU, AT_VOLUMETRIC = wp.constant(NODE.at.poisson_ratio), wp.constant(NODE.at.volumetric)
+wp.set_module_options(OPTIONS)
+
+
+@wp.func
+def _apart(scratch: Scratch, s: wp.int32, i: wp.int32, j: wp.int32) -> real:
+    """Distance of two nodes over the thickness; beyond REACH if they face away from each other."""
+    if wp.dot(scratch.inward[s, i], scratch.inward[s, j]) <= real(0.0):
+        return real(2.0) * REACH
+    roots = real(1.0) / wp.sqrt(scratch.thick[s, i]) * (real(1.0) / wp.sqrt(scratch.thick[s, j]))
+    return wp.length(scratch.point[s, i] - scratch.point[s, j]) * roots
+
+
+@wp.func
+def _row(skins: Skins, one: OneSkin, column: wp.int32, f: real) -> real:
+    """Value of a table at a distance over the thickness, times STEPS."""
+    k = wp.int32(f)
+    share = f - real(k)
+    k += one.table
+    return (real(1.0) - share) * skins.rows[k, column] + share * skins.rows[k + 1, column]
+
+
+@wp.kernel
+def respond(lanes: wp.int32, many: wp.int32, skins: Skins, scratch: Scratch):
+    """Depth over a thickness of each node under a force E t^2 at each, (N, N): obstacle.pairs."""
+    s, lane = wp.tid()
+    one, count = skins.one[scratch.skin[s * many]], scratch.nodes[s]
+    for n in range(lane, count * count, lanes):
+        i, j = n // count, n % count
+        apart, value = _apart(scratch, s, i, j), real(0.0)
+        if apart < REACH:
+            r = wp.length(scratch.point[s, i] - scratch.point[s, j])
+            own = real(0.5) * (wp.sqrt(scratch.area[s, i]) / OWN + wp.sqrt(scratch.area[s, j]) / OWN)
+            per = real(1.0) / wp.sqrt(scratch.thick[s, i]) * (real(1.0) / wp.sqrt(scratch.thick[s, j]))
+            table = _row(skins, one, 0, apart * real(STEPS))
+            value = one.thickest * (one.half_space / wp.max(r, own) + per * table)
+        scratch.matrix[s, i, j] = value
+
+
+@wp.func
+def _wanted(scratch: Scratch, one: OneSkin, s: wp.int32, i: wp.int32) -> real:
+    """Depth that the tool asks for, up to where the barrier takes over, over a thickness."""
+    return wp.min(scratch.strain[s, i], LINEAR_TO) * scratch.thick[s, i] / one.thickest
+
+
+@wp.kernel
+def guess(many: wp.int32, skins: Skins, scratch: Scratch):
+    """First guess of the forces."""
+    s = wp.tid()
+    one = skins.one[scratch.skin[s * many]]
+    for i in range(scratch.nodes[s]):
+        scratch.force[s, i] = START * _wanted(scratch, one, s, i) / scratch.matrix[s, i, i]
+        scratch.move[s, i] = real(0.0)
+    scratch.before[s] = real(1.0)
+    scratch.restart[s] = 1
+    scratch.done[s] = 0
+    if scratch.nodes[s] == 0:
+        scratch.done[s] = 1
+
+
+@wp.kernel
+def multiply(lanes: wp.int32, scratch: Scratch, vector: wp.array2d(dtype=real), out: wp.array2d(dtype=real)):
+    """A scene's matrix times a vector."""
+    s, lane = wp.tid()
+    if scratch.done[s] == 1:
+        return
+    for i in range(lane, scratch.nodes[s], lanes):
+        sum = real(0.0)
+        for j in range(scratch.nodes[s]):
+            sum += scratch.matrix[s, j, i] * vector[s, j]
+        out[s, i] = sum
+
+
+@wp.kernel
+def turn(many: wp.int32, skins: Skins, scratch: Scratch):
+    """Direction of a step of conjugate gradients."""
+    s = wp.tid()
+    if scratch.done[s] == 1:
+        return
+    one, square = skins.one[scratch.skin[s * many]], real(0.0)
+    for i in range(scratch.nodes[s]):
+        gap = scratch.gap[s, i] - _wanted(scratch, one, s, i)
+        scratch.gap[s, i] = gap
+        if scratch.force[s, i] > real(0.0):
+            square += gap * gap
+    if square == real(0.0):
+        scratch.done[s] = 1
+        return
+    on = square / scratch.before[s]
+    if scratch.restart[s] == 1:
+        on = real(0.0)
+    for i in range(scratch.nodes[s]):
+        move = real(0.0)
+        if scratch.force[s, i] > real(0.0):
+            move = scratch.gap[s, i] + on * scratch.move[s, i]
+        scratch.move[s, i] = move
+    scratch.before[s] = square
+
+
+@wp.kernel
+def step(scratch: Scratch):
+    """A step of conjugate gradients, no node pulling; nodes that the skin would enter press after all."""
+    s = wp.tid()
+    if scratch.done[s] == 1:
+        return
+    up, down = real(0.0), real(0.0)
+    for i in range(scratch.nodes[s]):
+        up += scratch.gap[s, i] * scratch.move[s, i]
+        down += scratch.along[s, i] * scratch.move[s, i]
+    if down <= real(0.0):
+        scratch.done[s] = 1
+        return
+    restart, change, largest = int(0), real(0.0), real(0.0)
+    for i in range(scratch.nodes[s]):
+        now = real(scratch.force[s, i])
+        if now > real(0.0):
+            now = wp.max(now - up / down * scratch.move[s, i], real(0.0))
+        elif scratch.gap[s, i] < real(0.0):
+            now = -scratch.gap[s, i] / scratch.matrix[s, i, i]
+            restart = 1
+        change = wp.max(change, wp.abs(now - scratch.force[s, i]))
+        largest = wp.max(largest, now)
+        scratch.force[s, i] = now
+    scratch.restart[s] = restart
+    if change <= TOLERANCE * largest:
+        scratch.done[s] = 1
+    else:
+        wp.atomic_max(scratch.busy, 0, 1)
+
+
+@wp.kernel
+def begin_power(scratch: Scratch):
+    """Start of the conjugate gradients of obstacle.power_of."""
+    s = wp.tid()
+    sum = real(0.0)
+    for i in range(scratch.nodes[s]):
+        here = real(0.0)
+        if scratch.force[s, i] > real(0.0):
+            here = real(1.0)
+        scratch.found_power[s, i] = real(0.0)
+        scratch.left[s, i] = here
+        scratch.move[s, i] = here
+        sum += here
+    scratch.before[s] = sum
+    scratch.first_square[s] = sum
+    scratch.done[s] = 0
+    if sum == real(0.0):
+        scratch.done[s] = 1
+
+
+@wp.kernel
+def step_power(scratch: Scratch):
+    """A step of these."""
+    s = wp.tid()
+    if scratch.done[s] == 1:
+        return
+    down, square = real(0.0), real(0.0)
+    for i in range(scratch.nodes[s]):
+        if scratch.force[s, i] <= real(0.0):
+            scratch.along[s, i] = real(0.0)
+        down += scratch.along[s, i] * scratch.move[s, i]
+    size = scratch.before[s] / down
+    for i in range(scratch.nodes[s]):
+        left = scratch.left[s, i] - size * scratch.along[s, i]
+        scratch.found_power[s, i] = scratch.found_power[s, i] + size * scratch.move[s, i]
+        scratch.left[s, i] = left
+        square += left * left
+    for i in range(scratch.nodes[s]):
+        scratch.move[s, i] = scratch.left[s, i] + square / scratch.before[s] * scratch.move[s, i]
+    scratch.before[s] = square
+    if square <= POWER_TOLERANCE * scratch.first_square[s]:
+        scratch.done[s] = 1
+    else:
+        wp.atomic_max(scratch.busy, 0, 1)
+
+
+@wp.func
+def _column_pressure(one: OneSkin, strain: real) -> real:
+    stretch = real(1.0) - strain
+    return -(one.mu * (stretch - real(1.0) / stretch) + one.lam * wp.log(stretch) / stretch)
+
+
+@wp.func
+def _pressure(scratch: Scratch, one: OneSkin, s: wp.int32, i: wp.int32) -> real:
+    return scratch.force[s, i] * one.thickest * one.thickest / scratch.area[s, i]
+
+
+@wp.kernel
+def see(lanes: wp.int32, many: wp.int32, skins: Skins, scratch: Scratch):
+    """What the network reads of each node; then its pressure beyond the linear layer's, and the network's share."""
+    s, lane = wp.tid()
+    one = skins.one[scratch.skin[s * many]]
+    for i in range(lane, scratch.nodes[s], lanes):
+        moments, strains, pull, sunk = wp.vec4d(), wp.vec4d(), vec3(), vec3()
+        t, inward, strain = scratch.thick[s, i], scratch.inward[s, i], real(scratch.strain[s, i])
+        for j in range(scratch.nodes[s]):
+            apart = _apart(scratch, s, i, j)
+            if apart < NEAR:
+                f, per = apart * real(STEPS), scratch.area[s, j] / (t * scratch.thick[s, j])
+                p, e = per * _pressure(scratch, one, s, j), per * scratch.strain[s, j]
+                for m in range(RINGS):
+                    weight = _row(skins, one, 1 + m, f)
+                    moments[m] = moments[m] + weight * p
+                    strains[m] = strains[m] + weight * e
+                way = _row(skins, one, 1 + RINGS, f) / t * (scratch.point[s, j] - scratch.point[s, i])
+                pull = pull + p * way
+                sunk = sunk + e * way
+        pressure = _pressure(scratch, one, s, i)
+        pull = (pull - wp.dot(pull, inward) * inward) / (moments[1] + SMALLER)
+        sunk = (sunk - wp.dot(sunk, inward) * inward) / (strains[1] + SMALLER)
+        _write(scratch, s, i, AT_LOG_PRESSURE, wp.log(pressure + SMALL))
+        _write(scratch, s, i, AT_PRESSURE, pressure)
+        _write(scratch, s, i, AT_LOG_STRAIN, wp.log(strain + SMALL))
+        _write(scratch, s, i, AT_STRAIN, strain)
+        scratch.strange[s, i] = 0
+        for m in range(RINGS):
+            _write(scratch, s, i, AT_MOMENTS + m, wp.log(moments[m] + SMALLER))
+            _write(scratch, s, i, AT_MOMENTS + RINGS + m, wp.log(strains[m] + SMALLER))
+        _write(scratch, s, i, AT_SIZES, wp.length(pull))
+        _write(scratch, s, i, AT_SIZES + 1, wp.length(sunk))
+        _write(scratch, s, i, AT_TOGETHER, wp.dot(pull, sunk))
+        _write_shape(scratch, skins, s, i, pull)
+        _write(scratch, s, i, AT_NU, one.nu)
+        _write(scratch, s, i, AT_VOLUMETRIC, real(1.0) / (ALMOST_TWO - real(2.0) * one.nu))
+        if strain > LINEAR_TO:
+            more = _column_pressure(one, strain) / _column_pressure(one, LINEAR_TO)
+            pressure = pressure * wp.pow(more, HARDENING)
+        scratch.pressure[s, i] = pressure
+        around = strain + strains[FADE_RING]
+        scratch.fade[s, i] = around / (around + FADE)
+
+
+@wp.func
+def _write(scratch: Scratch, s: wp.int32, i: wp.int32, at: wp.int32, value: real):
+    """Writes an input."""
+    scratch.inputs[s, i, at] = wp.float32(value)
+
+
+@wp.func
+def _write_shape(scratch: Scratch, skins: Skins, s: wp.int32, i: wp.int32, v: vec3):
+    """Writes the inputs that are of the skin's shape."""
+    corners, shares = skins.faces[scratch.face[s, i]], scratch.shares[s, i]
+    trace, whole, along, slope, slopes = real(0.0), real(0.0), real(0.0), real(0.0), real(0.0)
+    for x in range(3):
+        lean = real(0.0)
+        for c in range(3):
+            lean += shares[c] * skins.bent[corners[c], 9 + x]
+        slope += lean * v[x]
+        slopes += lean * lean
+        for y in range(3):
+            bend = real(0.0)
+            for c in range(3):
+                bend += shares[c] * skins.bent[corners[c], 3 * x + y]
+            whole += bend * bend
+            along += v[x] * bend * v[y]
+            if x == y:
+                trace += bend
+    square = LEAST_SQUARE + wp.length_sq(v)
+    _write(scratch, s, i, AT_MEAN, real(0.5) * trace)
+    _write(scratch, s, i, AT_SQUARED, real(0.5) * whole - real(0.25) * trace * trace)
+    _write(scratch, s, i, AT_ALONG, along / square - real(0.5) * trace)
+    _write(scratch, s, i, AT_SLOPE, slope / wp.sqrt(square))
+    _write(scratch, s, i, AT_SLOPES, slopes)
+
+
+@wp.kernel
+def judge(lanes: wp.int32, scratch: Scratch, net: Net):
+    """Keeps inputs within what training had, says where they were not, and scales them."""
+    s, lane = wp.tid()
+    for i in range(lane, scratch.nodes[s], lanes):
+        for m in range(INPUTS):
+            given = scratch.inputs[s, i, m]
+            kept = wp.clamp(given, net.low[m], net.high[m])
+            if kept != given:
+                scratch.strange[s, i] = 1
+            scratch.inputs[s, i, m] = (kept - net.mean[m]) * net.scale[m]
+
+
+@wp.kernel
+def layer(lanes: wp.int32, scratch: Scratch, given: wp.array3d(dtype=wp.float32), w: wp.array2d(dtype=wp.float32),
+          b: wp.array(dtype=wp.float32), out: wp.array3d(dtype=wp.float32)):  # fmt: skip
+    """A hidden layer of the network."""
+    s, lane = wp.tid()
+    for n in range(lane, scratch.nodes[s] * HIDDEN, lanes):
+        i, unit, sum = n // HIDDEN, n % HIDDEN, wp.float32(0.0)
+        for m in range(w.shape[0]):
+            sum += given[s, i, m] * w[m, unit]
+        x = sum + b[unit]
+        out[s, i, unit] = x * (0.5 + 0.5 * x / (1.0 + wp.abs(x)))
+
+
+@wp.kernel
+def correct(lanes: wp.int32, scratch: Scratch, net: Net):
+    """Pressures over E, corrected by the network, and their doubt."""
+    s, lane = wp.tid()
+    for i in range(lane, scratch.nodes[s], lanes):
+        ratio, doubt = wp.float32(net.b4[0]), wp.float32(net.b4[1])
+        for m in range(HIDDEN):
+            ratio += scratch.one[s, i, m] * net.w4[m, 0]
+            doubt += scratch.one[s, i, m] * net.w4[m, 1]
+        log_ratio = wp.clamp(real(ratio), -LARGEST, LARGEST)
+        held = scratch.pressure[s, i] * wp.exp(scratch.fade[s, i] * log_ratio)
+        scratch.pressure[s, i] = held
+        scratch.error[s, i] = held * wp.exp(wp.min(real(doubt), real(1.0)))

@@ -1,0 +1,390 @@
+"""Kernels that lay contact nodes under tools: stmpl_core.nodes, on the same lattice.
+
+Each place of a lattice belongs to the lowest triangle that it lies on, found by an atomic minimum, so neither the order
+of threads nor their number changes an answer.
+"""
+
+# pyright: reportInvalidTypeForm=false, reportArgumentType=false, reportCallIssue=false, reportIndexIssue=false
+# pyright: reportOperatorIssue=false, reportAttributeAccessIssue=false, reportGeneralTypeIssues=false
+
+import math
+
+import warp as wp
+
+from stmpl_core import nodes as law
+from stmpl_core.gpu.packs import Lattice, Scratch, Skins
+from stmpl_core.gpu.places import APART, BY_POSE, DEEP, OVERFULL, PENDING
+from stmpl_core.gpu.rays import FAR, OPTIONS, WALL_WIDTH, depth_at, mat33, real, strain_under, vec3
+from stmpl_core.deep import DEEPEST
+
+NODES, SAMPLES, CHARTS = wp.constant(wp.float64(law.NODES)), wp.constant(law.SAMPLES), wp.constant(law.CHARTS)
+MOST, MOST_PLACES = wp.constant(wp.float64(law.MOST)), wp.constant(wp.float64(law.MOST_LOOKED_AT))
+WIDEST, FACING = wp.constant(wp.float64(law.WIDEST)), wp.constant(wp.float64(law.FACING))
+ONE_WAY = wp.constant(wp.float64(law.ONE_WAY))
+COS_ASKEW, SIN_ASKEW = wp.constant(wp.float64(math.cos(law.ASKEW))), wp.constant(wp.float64(math.sin(law.ASKEW)))
+RISE = wp.constant(wp.float64(0.5 * math.sqrt(3.0)))
+FIRST_OFF, SECOND_OFF = wp.constant(wp.float64(0.31)), wp.constant(wp.float64(0.17))
+ROUNDING = wp.constant(wp.float64(1e-9))
+FULL = wp.constant(wp.float64(DEEPEST))
+NO_ONE = wp.constant(2**31 - 1)
+wp.set_module_options(OPTIONS)
+
+
+@wp.func
+def _shares_of_part(split: wp.int32, q: wp.int32) -> vec3:
+    """Barycentric coordinates of the middle of part q of a triangle, row by row."""
+    p, left = int(0), q
+    while left >= 2 * (split - p) - 1:
+        left -= 2 * (split - p) - 1
+        p += 1
+    r, flip = left // 2, left % 2
+    third = real(1 + flip) / real(3.0)
+    a, b = (real(p) + third) / real(split), (real(r) + third) / real(split)
+    return vec3(a, b, real(1.0) - a - b)
+
+
+@wp.func
+def _point(skins: Skins, f: wp.int32, shares: vec3) -> vec3:
+    corners = skins.faces[f]
+    return (shares[0] * skins.points[corners[0]] + shares[1] * skins.points[corners[1]]
+            + shares[2] * skins.points[corners[2]])  # fmt: skip
+
+
+@wp.func
+def _inward(skins: Skins, f: wp.int32, shares: vec3) -> vec3:
+    corners = skins.faces[f]
+    return wp.normalize(shares[0] * skins.inward[corners[0]] + shares[1] * skins.inward[corners[1]]
+                        + shares[2] * skins.inward[corners[2]])  # fmt: skip
+
+
+@wp.func
+def _thickness(skins: Skins, f: wp.int32, shares: vec3) -> real:
+    corners = skins.faces[f]
+    return (shares[0] * skins.thickness[corners[0]] + shares[1] * skins.thickness[corners[1]]
+            + shares[2] * skins.thickness[corners[2]])  # fmt: skip
+
+
+@wp.kernel
+def begin(scratch: Scratch):
+    """Parts that each triangle is looked at in."""
+    c = wp.tid()
+    split = int(1)
+    while split < 8 and scratch.many[c] * split * split < SAMPLES:
+        split += 1
+    scratch.split[c] = split
+    if scratch.status[c] != PENDING:
+        scratch.many[c] = 0
+
+
+@wp.kernel
+def look(lanes: wp.int32, skins: Skins, scratch: Scratch):
+    """How deep the tool is at parts of the triangles."""
+    c, lane = wp.tid()
+    split, sunk, pose = scratch.split[c], scratch.sunk[c], wp.transpose(scratch.pose[c])
+    parts, grid = split * split, skins.grids[scratch.grid[c]]
+    for n in range(lane, scratch.many[c] * parts, lanes):
+        f, q = scratch.found[c, n // parts], n % parts
+        if q == 0:
+            corners = skins.faces[f]
+            way = wp.cross(skins.points[corners[1]] - skins.points[corners[0]],
+                           skins.points[corners[2]] - skins.points[corners[0]])  # fmt: skip
+            scratch.ways[c, n // parts] = -wp.normalize(way)
+            scratch.sizes[c, n // parts] = real(0.5) * wp.length(way) / real(parts)
+        shares = _shares_of_part(split, q)
+        middle = _point(skins, f, shares)
+        scratch.middles[c, n] = middle
+        scratch.depths[c, n] = depth_at(grid, skins.coefficients, pose * (middle - scratch.place[c]),
+                                        pose * _inward(skins, f, shares), _thickness(skins, f, shares), sunk)
+
+
+@wp.func
+def _deepest_of(scratch: Scratch, c: wp.int32, m: wp.int32, parts: wp.int32) -> real:
+    deepest = -FAR
+    for q in range(parts):
+        deepest = wp.max(deepest, scratch.depths[c, m * parts + q])
+    return deepest
+
+
+@wp.func
+def _axes(pose: mat33, way: vec3) -> mat33:
+    """First and second axis of a lattice, and the way inwards, as rows."""
+    first, axis = vec3(), int(0)
+    while axis < 2:
+        column = vec3(pose[0, axis], pose[1, axis], pose[2, axis])
+        far = wp.dot(column, way)
+        first = column - far * way
+        axis += 1
+        if far * far < real(0.9):
+            axis = 2
+    first = wp.normalize(first)
+    cross = wp.cross(way, first)
+    one, other = COS_ASKEW * first + SIN_ASKEW * cross, COS_ASKEW * cross - SIN_ASKEW * first
+    return mat33(one[0], one[1], one[2], other[0], other[1], other[2], way[0], way[1], way[2])
+
+
+@wp.kernel
+def gather_look(scratch: Scratch):
+    """Area that the tool covers, and the sides of the limb that its triangles are on."""
+    c = wp.tid()
+    many, parts = scratch.many[c], scratch.split[c] * scratch.split[c]
+    if many == 0:
+        return
+    best, deepest = int(0), -FAR
+    for m in range(many):
+        here = _deepest_of(scratch, c, m, parts)
+        if here > deepest or (here == deepest and scratch.found[c, m] < scratch.found[c, best]):
+            deepest = here
+            best = m
+    area, total, mean = real(0.0), real(0.0), vec3()
+    for m in range(many):
+        size = scratch.sizes[c, m]
+        blur = real(0.5) * wp.sqrt(size)
+        if deepest > real(0.0):
+            blur = wp.min(blur, real(0.5) * deepest)
+        weight = real(0.0)
+        for q in range(parts):
+            depth = scratch.depths[c, m * parts + q]
+            area += wp.clamp(real(0.5) + depth / blur, real(0.0), real(1.0)) * size
+            weight += size * wp.max(depth + real(0.05) * wp.abs(deepest), real(0.0))
+        total += weight
+        mean = mean + weight * scratch.ways[c, m]
+        scratch.chart[c, m] = -1
+    if deepest <= real(0.0):
+        area = real(0.05) * area
+    scratch.covers[c] = area
+    scratch.deepest[c] = deepest
+    way = vec3(scratch.ways[c, best])
+    if wp.length(mean) > ONE_WAY * total:
+        way = wp.normalize(mean)
+    sides = int(0)
+    if area > real(0.0):
+        while sides < CHARTS:
+            rest, highest = int(-1), real(0.0)
+            scratch.axes[c, sides] = _axes(scratch.pose[c], way)
+            for m in range(many):
+                if scratch.chart[c, m] < 0:
+                    if wp.dot(scratch.ways[c, m], way) >= FACING:
+                        scratch.chart[c, m] = sides
+                    else:
+                        here = _deepest_of(scratch, c, m, parts)
+                        if here > highest:
+                            rest = m
+                            highest = here
+            sides += 1
+            if rest < 0:
+                break
+            way = scratch.ways[c, rest]
+    scratch.sides[c] = sides
+    scratch.sees[c] = real(0.0)
+    wp.atomic_max(scratch.busy, 0, sides)
+
+
+@wp.kernel
+def lay(side: wp.int32, only_look: wp.int32, skins: Skins, scratch: Scratch):
+    """The lattice on one side, and how far it must reach."""
+    c = wp.tid()
+    lattice = Lattice()
+    scratch.lattice[c] = lattice
+    if side >= scratch.sides[c]:
+        return
+    many, parts, thick = scratch.many[c], scratch.split[c] * scratch.split[c], real(0.0)
+    for m in range(many):
+        thick += skins.thickness[skins.faces[scratch.found[c, m]][0]] / real(many)
+    cell = scratch.covers[c] / NODES
+    if only_look == 1:
+        cell = real(0.5) * thick * thick * wp.pow(real(2.0), wp.floor(wp.log2(cell / (thick * thick))))
+    least = wp.max(wp.min(cell, RISE * WIDEST * thick * WIDEST * thick), scratch.covers[c] / MOST)
+    axes, centre = scratch.axes[c, side], scratch.centre[c]
+    low_u, low_v, high_u, high_v = real(FAR), real(FAR), -FAR, -FAR
+    for m in range(many):
+        if scratch.chart[c, m] == side or scratch.chart[c, m] == side + CHARTS:
+            corners, near = skins.faces[scratch.found[c, m]], int(0)
+            edge = wp.length(skins.points[corners[0]] - skins.points[corners[1]]) / wp.sqrt(real(parts))
+            for q in range(parts):
+                if scratch.depths[c, m * parts + q] > real(-0.6) * edge - WALL_WIDTH * thick:
+                    near = CHARTS
+                    at = axes * (scratch.middles[c, m * parts + q] - centre)
+                    low_u, high_u = wp.min(low_u, at[0] - edge), wp.max(high_u, at[0] + edge)
+                    low_v, high_v = wp.min(low_v, at[1] - edge), wp.max(high_v, at[1] + edge)
+            scratch.chart[c, m] = side + near
+    if high_u < low_u:
+        return
+    cell = wp.max(least, (high_u - low_u) * (high_v - low_v) / MOST_PLACES)
+    lattice.cell = cell
+    lattice.spacing = wp.sqrt(cell / RISE)
+    lattice.rise = RISE * lattice.spacing
+    lattice.start = wp.vec2d(FIRST_OFF * lattice.spacing, SECOND_OFF * lattice.spacing)
+    lattice.blur = real(0.5) * lattice.spacing
+    if scratch.deepest[c] > real(0.0):
+        lattice.blur = wp.min(lattice.blur, real(0.5) * scratch.deepest[c])
+    lattice.low = wp.int32(wp.floor((low_v - lattice.start[1]) / lattice.rise))
+    lattice.left = wp.int32(wp.floor((low_u - lattice.start[0]) / lattice.spacing)) - 1
+    lattice.rows = wp.int32(wp.ceil((high_v - lattice.start[1]) / lattice.rise)) - lattice.low + 1
+    lattice.wide = wp.int32(wp.ceil((high_u - lattice.start[0]) / lattice.spacing)) + 1 - lattice.left + 1
+    lattice.first = vec3(axes[0, 0], axes[0, 1], axes[0, 2])
+    lattice.second = vec3(axes[1, 0], axes[1, 1], axes[1, 2])
+    lattice.way = vec3(axes[2, 0], axes[2, 1], axes[2, 2])
+    if lattice.rows * lattice.wide > scratch.owner.shape[1]:
+        scratch.status[c] = OVERFULL
+        scratch.sides[c] = 0
+        lattice.rows = 0
+        lattice.wide = 0
+    scratch.lattice[c] = lattice
+
+
+@wp.kernel
+def disown(lanes: wp.int32, scratch: Scratch):
+    """No place of the lattice lies on a triangle yet."""
+    c, lane = wp.tid()
+    for n in range(lane, scratch.lattice[c].rows * scratch.lattice[c].wide, lanes):
+        scratch.owner[c, n] = NO_ONE
+
+
+@wp.func
+def _across(lattice: Lattice, at: vec3) -> wp.vec2d:
+    """Coordinates of a point, from the tool's middle, in the lattice."""
+    return wp.vec2d(wp.dot(lattice.first, at), wp.dot(lattice.second, at)) - lattice.start
+
+
+@wp.func
+def _shares_at(lattice: Lattice, skins: Skins, f: wp.int32, centre: vec3, u: real, v: real) -> vec3:
+    """Barycentric coordinates of a place of the lattice in a triangle."""
+    corners = skins.faces[f]
+    a = _across(lattice, skins.points[corners[0]] - centre)
+    b, c = (_across(lattice, skins.points[corners[1]] - centre) - a,
+            _across(lattice, skins.points[corners[2]] - centre) - a)  # fmt: skip
+    double = b[0] * c[1] - c[0] * b[1]
+    second = ((u - a[0]) * c[1] - c[0] * (v - a[1])) / double
+    third = (b[0] * (v - a[1]) - (u - a[0]) * b[1]) / double
+    return vec3(real(1.0) - second - third, second, third)
+
+
+@wp.kernel
+def own(lanes: wp.int32, side: wp.int32, skins: Skins, scratch: Scratch):
+    """Which triangle each place of the lattice lies on."""
+    c, lane = wp.tid()
+    lattice, centre = scratch.lattice[c], scratch.centre[c]
+    if lattice.rows == 0:
+        return
+    high, right = lattice.low + lattice.rows - 1, lattice.left + lattice.wide - 1
+    for m in range(lane, scratch.many[c], lanes):
+        if scratch.chart[c, m] == side + CHARTS:
+            f = scratch.found[c, m]
+            corners = skins.faces[f]
+            one = _across(lattice, skins.points[corners[0]] - centre)
+            two = _across(lattice, skins.points[corners[1]] - centre)
+            three = _across(lattice, skins.points[corners[2]] - centre)
+            least, most = wp.min(wp.min(one, two), three), wp.max(wp.max(one, two), three)
+            from_row = wp.max(lattice.low, wp.int32(wp.ceil(least[1] / lattice.rise - ROUNDING)))
+            to_row = wp.min(high, wp.int32(wp.floor(most[1] / lattice.rise + ROUNDING)))
+            for j in range(from_row, to_row + 1):
+                shift, v = real(0.5) * real(j & 1), real(j) * lattice.rise
+                start = wp.max(lattice.left, wp.int32(wp.ceil(least[0] / lattice.spacing - shift - ROUNDING)))
+                end = wp.min(right, wp.int32(wp.floor(most[0] / lattice.spacing - shift + ROUNDING)))
+                for i in range(start, end + 1):
+                    shares = _shares_at(lattice, skins, f, centre, (real(i) + shift) * lattice.spacing, v)
+                    if wp.min(shares) >= -ROUNDING:
+                        wp.atomic_min(scratch.owner, c, (j - lattice.low) * lattice.wide + i - lattice.left, f)
+
+
+@wp.func
+def _shares_of_place(lattice: Lattice, skins: Skins, f: wp.int32, centre: vec3, n: wp.int32) -> vec3:
+    j, i = n // lattice.wide + lattice.low, n % lattice.wide + lattice.left
+    u = (real(i) + real(0.5) * real(j & 1)) * lattice.spacing
+    return _shares_at(lattice, skins, f, centre, u, real(j) * lattice.rise)
+
+
+@wp.kernel
+def sample(lanes: wp.int32, only_look: wp.int32, skins: Skins, scratch: Scratch):
+    """Covered area [m2] of each place of the lattice; or the strain of its column."""
+    c, lane = wp.tid()
+    lattice, grid, pose = scratch.lattice[c], skins.grids[scratch.grid[c]], wp.transpose(scratch.pose[c])
+    sunk, sum = scratch.sunk[c], real(0.0)
+    for n in range(lane, lattice.rows * lattice.wide, lanes):
+        f, value = scratch.owner[c, n], real(0.0)
+        if f != NO_ONE:
+            shares = _shares_of_place(lattice, skins, f, scratch.centre[c], n)
+            inward, t = _inward(skins, f, shares), _thickness(skins, f, shares)
+            start, way = pose * (_point(skins, f, shares) - scratch.place[c]), pose * inward
+            if only_look == 1:
+                depth = depth_at(grid, skins.coefficients, start, way, t, sunk)
+                value = wp.clamp(real(0.5) + depth / lattice.blur, real(0.0), real(1.0)) * lattice.cell
+                sum += value / wp.max(wp.dot(inward, lattice.way), FACING)
+            else:
+                value = strain_under(grid, skins.coefficients, start, way, t, sunk)
+        scratch.value[c, n] = value
+    scratch.partial[c, lane] = sum
+
+
+@wp.kernel
+def add_area(lanes: wp.int32, last: wp.int32, scratch: Scratch):
+    """Adds what one side's lattice sees; after the last side this is the covered area."""
+    c = wp.tid()
+    for lane in range(lanes):
+        scratch.sees[c] = scratch.sees[c] + scratch.partial[c, lane]
+    if last == 1:
+        scratch.covers[c] = scratch.sees[c]
+        if scratch.sees[c] <= real(0.0):
+            scratch.sides[c] = 0
+
+
+@wp.kernel
+def list_nodes(many: wp.int32, side: wp.int32, scratch: Scratch):
+    """Numbers of the places whose columns are squeezed, one after the other for all tools of a scene."""
+    s = wp.tid()
+    count = wp.int32(scratch.nodes[s])
+    scratch.begin[s] = count
+    for k in range(many):
+        c = s * many + k
+        for n in range(scratch.lattice[c].rows * scratch.lattice[c].wide):
+            if scratch.value[c, n] > real(0.0):
+                if count < scratch.tool.shape[1]:
+                    scratch.tool[s, count] = k
+                    scratch.cell[s, count] = n
+                    count += 1
+                else:
+                    scratch.status[c] = OVERFULL
+                if scratch.value[c, n] >= FULL and scratch.status[c] == PENDING:
+                    scratch.status[c] = DEEP
+    scratch.nodes[s] = count
+
+
+@wp.kernel
+def fill_nodes(lanes: wp.int32, many: wp.int32, skins: Skins, scratch: Scratch):
+    """The nodes that were listed last."""
+    s, lane = wp.tid()
+    for i in range(scratch.begin[s] + lane, scratch.nodes[s], lanes):
+        c, n = s * many + scratch.tool[s, i], scratch.cell[s, i]
+        lattice, f = scratch.lattice[c], scratch.owner[c, n]
+        shares = _shares_of_place(lattice, skins, f, scratch.centre[c], n)
+        inward = _inward(skins, f, shares)
+        scratch.face[s, i] = f
+        scratch.shares[s, i] = shares
+        scratch.point[s, i] = _point(skins, f, shares)
+        scratch.inward[s, i] = inward
+        scratch.thick[s, i] = _thickness(skins, f, shares)
+        scratch.area[s, i] = lattice.cell / wp.max(wp.dot(inward, lattice.way), FACING)
+        scratch.strain[s, i] = scratch.value[c, n]
+
+
+@wp.kernel
+def tell(many: wp.int32, scratch: Scratch):
+    """Status of tools whose nodes are known: BY_POSE or APART."""
+    s = wp.tid()
+    for k in range(many):
+        if scratch.status[s * many + k] == PENDING:
+            scratch.status[s * many + k] = APART
+    for i in range(scratch.nodes[s]):
+        c = s * many + scratch.tool[s, i]
+        if scratch.status[c] == APART:
+            scratch.status[c] = BY_POSE
+
+
+@wp.kernel
+def withdraw(many: wp.int32, scratch: Scratch):
+    """A scene with a tool that is refused or not served has no nodes."""
+    s = wp.tid()
+    for k in range(many):
+        status = scratch.status[s * many + k]
+        if status != APART and status != BY_POSE:
+            scratch.nodes[s] = 0

@@ -1,0 +1,260 @@
+"""Packs: skins, tools and scratch space as arrays that kernels read: all skins in one, all distance fields in one."""
+
+# pyright: reportInvalidTypeForm=false
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+import warp as wp
+from scipy.spatial import KDTree
+
+from stmpl_core.columns import BLOCK, Columns
+from stmpl_core.deep import FIRST, LOOKED_AT
+from stmpl_core.gpu.rays import Grid, mat33, real, vec3
+from stmpl_core.networks import ARRAYS, NODE, PRESSURE, shipped
+from stmpl_core.nodes import CHARTS, MOST, NODES, WIDEST
+from stmpl_core.obstacle import response
+from stmpl_core.sdf import SignedDistance
+from stmpl_core.skin import Skin
+from stmpl_core.tool import Tool
+from stmpl_core.toucher import margin_on
+from stmpl_core.tools import Tools
+
+STEEP_BIT, LONG_BIT, BORDER_BIT, EDGE_BIT = 1, 2, 4, 8  # what is to be said of a vertex, see Soundness
+MOST_PLACES = 8192  # places of a lattice: nodes.MOST_LOOKED_AT and a margin around them
+LEAST_PARTS = 800  # parts of few triangles: of 199 in 4
+MARGIN = 1.3  # room for columns over the most that were counted
+FEWEST_NODES = 192  # room for nodes of a tool at the least: a small one has 80 to 130
+
+
+@wp.struct
+class OneSkin:
+    """Numbers of a skin: where its vertices and balls lie among all, its lengths [m], and its tissue's."""
+
+    first: wp.int32
+    end: wp.int32
+    first_ball: wp.int32
+    end_ball: wp.int32
+    table: wp.int32
+    learnt: wp.int32
+    hole: real
+    thickest: real
+    edge: real
+    modulus: real
+    mu: real
+    lam: real
+    nu: real
+    half_space: real
+    low: vec3
+    high: vec3
+
+
+@wp.struct
+class Lattice:
+    """A lattice on one side of a limb: spacings and start [m], rows and columns, axes; see stmpl_core.nodes._lay."""
+
+    spacing: real
+    rise: real
+    start: wp.vec2d
+    blur: real
+    cell: real
+    low: wp.int32
+    left: wp.int32
+    rows: wp.int32
+    wide: wp.int32
+    first: vec3
+    second: vec3
+    way: vec3
+
+
+def _struct(name: str, doc: str, fields: dict[str, tuple[Any, str]]) -> Any:
+    """A struct of arrays, by their names: type of their elements, and a letter for each axis."""
+    hints = {key: wp.array(dtype=dtype, ndim=len(axes)) for key, (dtype, axes) in fields.items()}
+    return wp.struct(type(name, (), {"__annotations__": hints, "__module__": __name__, "__doc__": doc}))
+
+
+SKINS: dict[str, tuple[Any, str]] = {
+    "one": (OneSkin, "S"),
+    "points": (vec3, "V"), "inward": (vec3, "V"), "thickness": (real, "V"), "area": (real, "V"),
+    "area_vectors": (vec3, "V"), "bent": (real, "Vx"), "doubts": (wp.int32, "V"), "faces": (wp.vec3i, "F"),
+    "start": (wp.int32, "V"), "around": (wp.int32, "F"), "balls": (wp.vec4d, "B"),
+    "grids": (Grid, "G"), "coefficients": (real, "N"), "thinnest": (real, "K"),
+    "looked_at": (vec3, "Kx"), "look_many": (wp.int32, "Kx"),
+    "rows": (real, "Tx"),
+}  # fmt: skip
+# C: scene and tool, S: scene, M: columns, B: blocks of columns, F: triangles, P: their parts, L: lattice, N: nodes
+SCRATCH: dict[str, tuple[Any, str]] = {
+    "skin": (wp.int32, "C"), "grid": (wp.int32, "C"), "status": (wp.int32, "C"), "busy": (wp.int32, "1"),
+    "pose": (mat33, "C"), "place": (vec3, "C"), "centre": (vec3, "C"), "wide": (wp.int32, "C"),
+    "near": (wp.uint32, "CB"), "covered": (wp.uint32, "CB"), "seen": (wp.uint32, "CB"),
+    "columns": (wp.int32, "CM"), "count": (wp.int32, "C"), "least": (real, "CM"), "above": (real, "CM"),
+    "under": (real, "CM"), "nearest": (real, "C"), "around": (real, "C"), "sunk": (wp.int32, "C"),
+    "found": (wp.int32, "CF"), "many": (wp.int32, "C"), "split": (wp.int32, "C"), "deep": (real, "C"),
+    "depths": (real, "CP"), "middles": (vec3, "CP"), "ways": (vec3, "CF"), "sizes": (real, "CF"),
+    "chart": (wp.int32, "CF"), "sides": (wp.int32, "C"), "axes": (mat33, "C6"), "deepest": (real, "C"),
+    "covers": (real, "C"), "sees": (real, "C"), "lattice": (Lattice, "C"),
+    "owner": (wp.int32, "CL"), "value": (real, "CL"), "partial": (real, "CR"),
+    "nodes": (wp.int32, "S"), "begin": (wp.int32, "S"), "tool": (wp.int32, "SN"), "cell": (wp.int32, "SN"),
+    "face": (wp.int32, "SN"), "shares": (vec3, "SN"), "point": (vec3, "SN"), "inward": (vec3, "SN"),
+    "thick": (real, "SN"), "area": (real, "SN"), "strain": (real, "SN"),
+    "matrix": (real, "SNN"), "force": (real, "SN"), "gap": (real, "SN"), "move": (real, "SN"), "along": (real, "SN"),
+    "found_power": (real, "SN"), "left": (real, "SN"), "before": (real, "S"), "restart": (wp.int32, "S"),
+    "first_square": (real, "S"), "done": (wp.int32, "S"), "group": (wp.int32, "C"),
+    "pressure": (real, "SN"), "fade": (real, "SN"), "strange": (wp.int32, "SN"), "error": (real, "SN"),
+    "inputs": (wp.float32, "SNI"), "one": (wp.float32, "SNH"), "two": (wp.float32, "SNH"), "highest": (real, "SN"),
+}  # fmt: skip
+NET: dict[str, tuple[Any, str]] = {
+    name: (wp.float32, "io" if name.startswith("w") else "o") for name in ARRAYS["pressure"]
+}
+Skins = _struct("Skins", "Skins and the distance fields of the tools, one after the other.", SKINS)
+Scratch = _struct("Scratch", "What kernels leave for each other.", SCRATCH)
+Net = _struct("Net", "Weights of a ContactNet.", NET)
+
+
+class Room(NamedTuple):
+    """Capacities for one scene and tool: columns, blocks of columns, triangles, their parts, nodes of all its tools."""
+
+    columns: int
+    blocks: int
+    nodes: int
+    lanes: int
+
+    def sizes(self, scenes: int, tools: int) -> dict[str, int]:
+        """Length of each axis of SCRATCH."""
+        faces = 2 * self.columns + 64
+        return {"C": scenes * tools, "S": scenes, "M": self.columns, "B": self.blocks, "F": faces, "6": CHARTS,
+                "P": max(faces, LEAST_PARTS), "L": MOST_PLACES, "N": self.nodes, "R": self.lanes,
+                "I": NODE.size, "H": 32, "1": 1}  # fmt: skip
+
+    def bytes_of(self, tools: int) -> int:
+        """Memory for one scene [bytes]."""
+        sizes = self.sizes(1, tools)
+        return sum(int(np.prod([sizes[axis] for axis in axes])) * _bytes(dtype) for dtype, axes in SCRATCH.values())
+
+
+def _bytes(dtype: Any) -> int:
+    return dtype.native_type.__sizeof__(dtype.native_type()) if hasattr(dtype, "native_type") else \
+        wp.types.type_size_in_bytes(dtype)  # fmt: skip
+
+
+def scratch(room: Room, scenes: int, tools: int, device: Any) -> Any:
+    """Scratch space for so many scenes."""
+    sizes, out = room.sizes(scenes, tools), Scratch()
+    for name, (dtype, axes) in SCRATCH.items():
+        setattr(out, name, wp.zeros(tuple(sizes[axis] for axis in axes), dtype=dtype, device=device))
+    return out
+
+
+def net(device: Any) -> Any:
+    """The network for one material."""
+    out, arrays = Net(), shipped("contact_net").arrays
+    assert arrays["w1"].shape[1] == arrays["w3"].shape[1] == 32 and arrays["w4"].shape[1] == PRESSURE.size
+    for name in NET:
+        setattr(out, name, wp.array(arrays[name], dtype=wp.float32, device=device))
+    return out
+
+
+def pack(skins: Sequence[Skin], tools: Sequence[Tool], device: Any) -> tuple[Any, list[list[SignedDistance]]]:
+    """Skins, each once, and the fields of the tools that press on each, as kernels read them, and as they are."""
+    parts: dict[str, list[np.ndarray]] = {name: [] for name in SKINS}
+    ones, grids, tables, fields = [], [], [], []
+    stores: dict[float, Tools] = {}
+    offsets: dict[int, int] = {}
+    vertices = faces = balls = coefficients = 0
+    for skin in skins:
+        columns = Columns(skin.layer)
+        one, arrays = _one_skin(skin, columns, (vertices, faces, balls, len(tables)))
+        margin = margin_on(skin.layer)
+        store = stores.setdefault(margin, Tools(margin))
+        fields.append([store.field(tool) for tool in tools])
+        for field in fields[-1]:
+            if id(field) not in offsets:
+                offsets[id(field)] = coefficients
+                parts["coefficients"].append(field.coefficients.ravel())
+                coefficients += field.coefficients.size
+            grids.append(_grid(field, offsets[id(field)]))
+        table = response(skin.layer.tissue.poisson_ratio)
+        one.half_space = table.half_space
+        parts["rows"].append(table.rows)
+        tables += [None] * len(table.rows)
+        ones.append(one)
+        for name, values in arrays.items():
+            parts[name].append(values)
+        vertices, faces, balls = one.end, faces + len(skin.layer.faces), one.end_ball
+    parts["start"].append(np.array([3 * faces]))
+    looked = [_looked_at(tool) for tool in tools]
+    longest = max(len(points) for points, _ in looked)
+    parts["looked_at"] = [np.stack([np.resize(points, (longest, 3)) for points, _ in looked])]
+    parts["look_many"] = [np.array([many for _, many in looked])]
+    parts["thinnest"] = [np.array([field.thinnest for field in fields[0]])]
+    out = Skins()
+    for name, (dtype, _) in SKINS.items():
+        values: Any = {"one": ones, "grids": grids}.get(name)
+        if values is None:
+            values = np.concatenate(parts[name])
+        setattr(out, name, wp.array(values, dtype=dtype, device=device))
+    return out, fields
+
+
+def _one_skin(skin: Skin, columns: Columns, at: tuple[int, int, int, int]) -> tuple[Any, dict[str, np.ndarray]]:
+    """A skin's numbers and arrays, its vertices in the order of its balls; at: vertices, faces, ... before it."""
+    layer, sound, order = skin.layer, skin.near.sound, columns._order
+    place = np.empty(len(order), np.int64)
+    place[order] = np.arange(len(order))
+    start = np.concatenate([[0], np.cumsum(np.diff(columns._start)[order])])
+    around = np.concatenate([columns._around[columns._start[v] : columns._start[v + 1]] for v in order])
+    edge = np.zeros(len(order), bool)
+    edge[layer.border] = True
+    doubts = (STEEP_BIT * sound.steep + LONG_BIT * sound.long + EDGE_BIT * edge
+              + BORDER_BIT * (sound.border < sound.least_border))  # fmt: skip
+    arrays = {
+        "points": layer.vertices[order], "inward": columns.inward[order], "thickness": layer.thickness[order],
+        "area": layer.vertex_areas[order], "area_vectors": layer.vertex_area_vectors[order],
+        "bent": skin.near.bent[order], "doubts": doubts[order], "faces": at[0] + place[columns.faces],
+        "start": at[1] * 3 + start[:-1], "around": at[1] + around, "balls": columns._blocks,
+    }  # fmt: skip
+    one, tissue = OneSkin(), layer.tissue
+    one.first, one.end = at[0], at[0] + len(order)
+    one.first_ball, one.end_ball, one.table = at[2], at[2] + len(columns._blocks), at[3]
+    one.hole, one.thickest, one.edge = 0.6 * layer.edge_length, float(layer.thickness.max()), layer.edge_length
+    one.modulus, one.nu = tissue.youngs_modulus, tissue.poisson_ratio
+    one.mu, one.lam = tissue.shear_modulus / one.modulus, tissue.lame_lambda / one.modulus
+    low, high = shipped("contact_net").card["ranges"]["poisson_ratio"]
+    one.learnt = int(low - 1e-3 <= tissue.poisson_ratio <= high + 1e-3)
+    one.low, one.high = vec3(*layer.vertices.min(axis=0)), vec3(*layer.vertices.max(axis=0))
+    return one, arrays
+
+
+def _grid(field: SignedDistance, offset: int) -> Any:
+    out = Grid()
+    out.offset, out.shape, out.spacing = offset, wp.vec3i(*field.coefficients.shape), field.spacing
+    out.origin, out.surface_error = vec3(*field.origin), field.surface_error
+    out.low, out.high = (vec3(*corner) for corner in field.tool_bounds)
+    return out
+
+
+def _looked_at(tool: Tool) -> tuple[np.ndarray, tuple[int, int]]:
+    """Points of a tool that Deep.inside looks at, few and then many, and how many these are."""
+    few, many = (tool.vertices[:: max(1, len(tool.vertices) // count)] for count in (FIRST, LOOKED_AT))
+    return np.concatenate([few, many]), (len(few), len(many))
+
+
+def room_for(skins: Sequence[Skin], fields: Sequence[Sequence[SignedDistance]], lanes: int,
+             nodes: int | None) -> Room:  # fmt: skip
+    """Capacities that the tools need on these skins, however they lie there."""
+    columns = blocks = most = 0
+    for skin, own in zip(skins, fields, strict=True):
+        layer, tree, wanted = skin.layer, KDTree(skin.layer.vertices), 0.0
+        some = layer.vertices[:: max(1, len(layer.vertices) // 200)]
+        for field in own:
+            extent = np.sort(np.subtract(*field.tool_bounds[::-1]))
+            reach = 0.5 * float(np.linalg.norm(extent)) + 0.6 * layer.edge_length + 2 * float(layer.thickness.max())
+            columns = max(columns, int(np.max(tree.query_ball_point(some, reach, return_length=True))))
+            cell = 0.5 * 3**0.5 * (WIDEST * float(layer.thickness.min())) ** 2
+            wanted += min(max(FEWEST_NODES, 2 * NODES + 1.3 * extent[1] * extent[2] / cell), 1.2 * MOST)
+        most, blocks = max(most, int(wanted)), max(blocks, -(-len(layer.vertices) // BLOCK))
+    return Room(min(int(MARGIN * columns) + BLOCK, max(len(s.layer.vertices) for s in skins)), blocks,
+                32 * -(-(most if nodes is None else nodes) // 32), lanes)  # fmt: skip

@@ -1,0 +1,198 @@
+"""Rays in Warp: stmpl_core.sdf.distance_at and stmpl_core.rays as functions of kernels, line by line the same law."""
+
+# pyright: reportInvalidTypeForm=false, reportArgumentType=false, reportCallIssue=false, reportIndexIssue=false
+# pyright: reportOperatorIssue=false, reportAttributeAccessIssue=false, reportGeneralTypeIssues=false
+
+import warp as wp
+
+from stmpl_core.rays import MAX_COLUMN_STRAIN, PASSED, SECANT_START, SECANT_TOLERANCE, WALL
+
+real = wp.float64  # of all geometry: float32 keeps 1e-8 m on a limb, a touch of 0.1 mm wants less
+vec3, mat33 = wp.vec3d, wp.mat33d
+OPTIONS = {"enable_backward": False}
+FAR = wp.constant(wp.float64(1e30))  # stands for infinity
+WALL_WIDTH = wp.constant(wp.float64(WALL))
+MOST_STRAIN = wp.constant(wp.float64(MAX_COLUMN_STRAIN))
+PLACES = wp.constant(PASSED)
+START, TOLERANCE = wp.constant(wp.float64(SECANT_START)), wp.constant(wp.float64(SECANT_TOLERANCE))
+wp.set_module_options(OPTIONS)
+
+
+@wp.struct
+class Grid:
+    """Distance field of a tool: its place among all coefficients, shape, origin [m], cells [m], the tool's box [m]."""
+
+    offset: wp.int32
+    shape: wp.vec3i
+    origin: vec3
+    spacing: real
+    low: vec3
+    high: vec3
+    surface_error: real
+
+
+@wp.func
+def cubic(f: real):
+    """Weights of the four B-splines that reach a point at fraction f of its cell."""
+    g = real(1.0) - f
+    return wp.vec4d(
+        g * g * g / real(6.0),
+        (real(4.0) - real(6.0) * f * f + real(3.0) * f * f * f) / real(6.0),
+        (real(4.0) - real(6.0) * g * g + real(3.0) * g * g * g) / real(6.0),
+        f * f * f / real(6.0),
+    )
+
+
+@wp.func
+def distance_at(grid: Grid, coefficients: wp.array(dtype=real), at: vec3) -> real:
+    """Signed distance at one point of the tool's frame [m]."""
+    u = (at - grid.origin) / grid.spacing
+    first, inside = wp.vec3i(0, 0, 0), vec3(real(0.0), real(0.0), real(0.0))
+    for x in range(3):
+        inside[x] = wp.min(wp.max(u[x], real(1.0)), real(grid.shape[x]) - real(2.0))
+        first[x] = wp.min(wp.int32(inside[x]), grid.shape[x] - 3)
+    a, b = cubic(inside[0] - real(first[0])), cubic(inside[1] - real(first[1]))
+    c = cubic(inside[2] - real(first[2]))
+    total = real(0.0)
+    for i in range(4):
+        plane = grid.offset + (first[0] - 1 + i) * grid.shape[1] * grid.shape[2]
+        sum = real(0.0)
+        for j in range(4):
+            k = plane + (first[1] - 1 + j) * grid.shape[2] + first[2] - 1
+            sum += b[j] * (c[0] * coefficients[k] + c[1] * coefficients[k + 1]
+                           + (c[2] * coefficients[k + 2] + c[3] * coefficients[k + 3]))  # fmt: skip
+        total += a[i] * sum
+    away = wp.length_sq(u - inside) * grid.spacing * grid.spacing
+    if away < real(1e-24):
+        return total
+    return wp.sqrt(away + total * total)
+
+
+@wp.func
+def along(grid: Grid, coefficients: wp.array(dtype=real), start: vec3, way: vec3, s: real) -> real:
+    """Signed distance to the tool at depth s along a ray [m]."""
+    return distance_at(grid, coefficients, start + s * way)
+
+
+@wp.func
+def clearance_of(grid: Grid, coefficients: wp.array(dtype=real), start: vec3, way: vec3, t: real, far: real):
+    """Least signed distance along a column and that at its skin [m]: stmpl_core.columns._clearances."""
+    d = along(grid, coefficients, start, way, real(0.0))
+    skin, least, s = d, d, real(0.0)
+    if d > t + far:
+        least = d - t
+    else:
+        while s < t:
+            s = wp.min(s + wp.max(wp.max(wp.abs(d), d - least), t / real(16.0)), t)
+            d = along(grid, coefficients, start, way, s)
+            least = wp.min(least, d)
+        if d <= real(0.0):
+            if along(grid, coefficients, start, way, t + real(1e-5)) < d:
+                least = FAR
+    return least, skin
+
+
+@wp.func
+def secant(grid: Grid, coefficients: wp.array(dtype=real), start: vec3, way: vec3, t: real, guess: real) -> real:
+    """Depth by the secant rule from a guess [m]; below 0 where that goes astray."""
+    s, d = guess, along(grid, coefficients, start, way, guess)
+    last_s, last_d = s + real(1.0), d + real(1.0)
+    out, step = real(-1.0), int(0)
+    while step < 6:
+        slope = (d - last_d) / (s - last_s)
+        if slope < real(0.3):
+            step = 6
+        else:
+            last_s, last_d = s, d
+            s = s - d / slope
+            if wp.abs(s - last_s) < TOLERANCE * t:
+                if s > real(0.0):
+                    out = wp.min(s, t)
+                step = 6
+            else:
+                d = along(grid, coefficients, start, way, s)
+        step += 1
+    return out
+
+
+@wp.func
+def depth_in_column(grid: Grid, coefficients: wp.array(dtype=real), start: vec3, way: vec3, t: real,
+                    guess: real) -> real:  # fmt: skip
+    """How deep along a ray, from the skin inwards, the tool ends [m]; 0 if it is not met."""
+    if guess > WALL_WIDTH * t:
+        found = secant(grid, coefficients, start, way, t, guess)
+        if found > real(0.0):
+            return found
+    s, d = t, along(grid, coefficients, start, way, t)
+    if d <= real(0.0):
+        return t
+    last_s, last_d, out, step = s + real(1.0), d + real(1.0), real(-1.0), int(0)
+    while step < 40:
+        if s - d > real(0.0) and d > START * t:
+            last_s, last_d = s, d
+            s = s - d
+        else:
+            slope = (d - last_d) / (s - last_s)
+            following = s - d
+            if slope > real(0.2):
+                following = s - d / slope
+            last_s, last_d = s, d
+            s = following
+        if s <= real(0.0):
+            out = real(0.0)
+            step = 40
+        elif wp.abs(s - last_s) < TOLERANCE * t:
+            out = wp.min(s, t)
+            step = 40
+        else:
+            d = along(grid, coefficients, start, way, s)
+        step += 1
+    if out < real(0.0):
+        out = wp.min(s, t)
+    return out
+
+
+@wp.func
+def inside_most(grid: Grid, coefficients: wp.array(dtype=real), start: vec3, way: vec3, deep: real) -> real:
+    """How far inside the tool a ray gets at most on its way to a depth [m]; below 0: how far it passes beside it."""
+    most = -along(grid, coefficients, start, way, real(0.0))
+    for k in range(1, PLACES + 1):
+        most = wp.max(most, -along(grid, coefficients, start, way, deep * real(k) / real(PLACES + 1)))
+    return most
+
+
+@wp.func
+def depth_and_share(grid: Grid, coefficients: wp.array(dtype=real), start: vec3, way: vec3, t: real, sunk: wp.int32):
+    """How deep the tool is in a column [m], and the share of that which counts."""
+    wall, guess = WALL_WIDTH * t, -along(grid, coefficients, start, way, real(0.0))
+    share, deep = wp.clamp(real(1.0) + guess / wall, real(0.0), real(1.0)), real(0.0)
+    if share > real(0.0) or sunk == 1:
+        deep = depth_in_column(grid, coefficients, start, way, t, guess)
+        if share < real(1.0) and sunk == 1 and deep > real(0.0):
+            most = inside_most(grid, coefficients, start, way, deep)
+            share = wp.min(wp.max(share, real(2.0) * most / wall), real(1.0))
+    return deep, share
+
+
+@wp.func
+def strain_under(grid: Grid, coefficients: wp.array(dtype=real), start: vec3, way: vec3, t: real,
+                 sunk: wp.int32) -> real:  # fmt: skip
+    """How far the tool squeezes a column, over its thickness; rising from 0 beside the tool's walls."""
+    wall = WALL_WIDTH * t
+    deep, share = depth_and_share(grid, coefficients, start, way, t, sunk)
+    if deep <= real(0.0):
+        return real(0.0)
+    if deep > wall:
+        inside = -along(grid, coefficients, start, way, deep - wall)
+        share = share * wp.clamp(real(2.0) * inside / wall, real(0.0), real(1.0))
+    return share * wp.min(deep / t, MOST_STRAIN)
+
+
+@wp.func
+def depth_at(grid: Grid, coefficients: wp.array(dtype=real), start: vec3, way: vec3, t: real, sunk: wp.int32) -> real:
+    """Depth of the skin in the tool [m], or where the tool has sunk under it, of its column."""
+    depth = -distance_at(grid, coefficients, start)
+    if sunk == 1 and depth < real(0.0):
+        deep = wp.max(depth_in_column(grid, coefficients, start, way, t, real(0.0)), real(0.5) * t)
+        depth = wp.max(depth, inside_most(grid, coefficients, start, way, deep))
+    return depth

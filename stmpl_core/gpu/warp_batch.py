@@ -1,0 +1,301 @@
+"""WarpBatch: Batch on a GPU, by kernels in NVIDIA Warp that also run on a CPU, where tests hold them against numba.
+
+The law is that of stmpl_core.toucher by pose, on one material, elastic and without memory: the same lattice of contact
+nodes, the same linear complementarity problem on a dense matrix for each scene, the same network. Each stage is one
+kernel over all scenes, with LANES threads a scene that share out its columns, triangles, places or nodes; what one
+scene sums up is summed by one of its threads. So nothing waits inside a kernel and nothing is added in an order that
+threads decide: an answer is the same to the bit from run to run, and the source has no line for one kind of device only.
+The alternative, a block a scene that keeps its matrix in shared memory, saves the few hundred launches of a batch (some
+milliseconds, whatever n) but holds 100 to 200 nodes only, in float32, and its barriers would never run in a test
+without a GPU.
+
+Geometry and the linear problem are float64, the network float32, as in the law that runs on a CPU.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from contextlib import nullcontext
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from stmpl_core.contact_net import LINEAR_TO
+from stmpl_core.errors import InvalidInput
+from stmpl_core.gpu import answers, columns, hold, lattice, packs, places
+from stmpl_core.networks import shipped
+from stmpl_core.obstacle import MAX_ITERATIONS
+from stmpl_core.skin import Skin
+from stmpl_core.tool import Tool
+
+STATUSES = ("pending", "apart", "pressed by pose", "wrapped around", "refused", "too deep", "no room")
+LANES = 128  # threads that share the work of a scene on a GPU
+MEMORY = {True: 4 << 30, False: 256 << 20}  # scratch space on a GPU and on a CPU [bytes]
+ASKED_EVERY = 4  # iterations after which it is asked whether any scene goes on
+
+
+@dataclass(frozen=True, eq=False)
+class WarpTouches:
+    """What tools do in n scenes, as Warp arrays on the batch's device; `wp.to_torch` shares them with torch.
+
+    Args:
+        wrenches: force [N] and torque about each tool's origin [N m] that it exerts on its body, (n, K, 6), of the
+            poses' precision. 0 where a scene was refused, NaN where it is not served (see `statuses`).
+        depths: depth of the deepest column under each [m]; negative when apart, NaN when far or not known, (n, K).
+        force_bounds: bound on the error of each force [N]; NaN where it is not known, (n, K).
+        in_range: whether each touch is one that the law may be trusted in, (n, K).
+        statuses: numbers of STATUSES, (n, K) int32. "refused": a pose of the scene is not a finite rigid transform;
+            "too deep": a tool of the scene is deeper than 0.9 of the thickness or inside the limb, which Batch draws
+            back and this does not; "no room": a tool of the scene meets more skin than there is room for (`nodes`).
+    """
+
+    wrenches: Any
+    depths: Any
+    force_bounds: Any
+    in_range: Any
+    statuses: Any
+
+    @property
+    def served(self) -> np.ndarray:
+        """Mask of the tools whose wrenches are answers, (n, K), on the CPU."""
+        return self.statuses.numpy() < STATUSES.index("refused")
+
+
+class WarpBatch:
+    """n scenes on one skin or on many, with the same tools, on one device.
+
+    Args:
+        skins: a prepared skin for all scenes, or one for each (the same one may stand for several). One material, at
+            rest.
+        tools: tools, each with a name of its own.
+        n: number of scenes; None: that of the skins.
+        device: device as Warp names it: "cuda", "cuda:1", "cpu".
+        nodes: room for contact nodes of all tools of a scene together; None: what these tools need.
+        memory: scratch space [bytes]; scenes that do not fit go one part after the other; None: 4 GiB on a GPU, 256 MiB
+            on a CPU.
+
+    Attributes:
+        device: Warp's device.
+        room: capacities for a scene.
+
+    Raises:
+        InvalidInput: numbers that do not fit, no such device, or a skin that is not served: a stack (a living limb),
+            one that joints have moved, or one with folds.
+        MeshError: a tool's surface that cannot be used.
+    """
+
+    def __init__(self, skins: Skin | Sequence[Skin], tools: Sequence[Tool], n: int | None = None, *,
+                 device: str = "cuda", nodes: int | None = None, memory: int | None = None) -> None:  # fmt: skip
+        some = list(skins) if isinstance(skins, Sequence) else [skins]
+        count = len(some) if n is None else n
+        each = some if isinstance(skins, Sequence) else some * max(count, 0)
+        self.tools = list(tools)
+        if count < 1 or len(each) != count:
+            raise InvalidInput(f"{len(each)} skins do not fit {count} scenes: give one, or one for each.")
+        if not self.tools or len({tool.name for tool in self.tools}) < len(self.tools):
+            raise InvalidInput("a batch needs tools, each with a name of its own. Try tool.named('left').")
+        self.device = _device(device)
+        unique = list({id(skin): skin for skin in each}.values())
+        for skin in unique:
+            _check(skin)
+        self._lanes = LANES if self.device.is_cuda else 1
+        self._skins, fields = packs.pack(unique, self.tools, self.device)
+        self.room = packs.room_for(unique, fields, self._lanes, nodes)
+        self._net, self._known = packs.net(self.device), _known()
+        number = {id(skin): k for k, skin in enumerate(unique)}
+        self._skin_of = np.array([number[id(skin)] for skin in each], np.int32)
+        room = self.room.bytes_of(len(self.tools))
+        budget = MEMORY[self.device.is_cuda] if memory is None else memory
+        if room > budget:
+            raise InvalidInput(f"one scene needs {room} bytes of scratch space; {budget} are allowed.")
+        self._part = min(count, budget // room)
+        self._scratch = packs.scratch(self.room, self._part, len(self.tools), self.device)
+        self._numbers = [self._numbers_of(first) for first in range(0, count, self._part)]
+
+    def __len__(self) -> int:
+        return len(self._skin_of)
+
+    def touch(self, poses: Any, *, out: Any = None) -> WarpTouches:
+        """What all tools do in all scenes, elastic skin without friction, as if nothing had been before.
+
+        Args:
+            poses: pose_body_from_tool of each tool in each scene: place [m] and unit quaternion x, y, z, w, (n, K, 7),
+                or matrices, (n, K, 4, 4), float32 or float64. Arrays of Warp (of wp.transform, (n, K), too) and torch
+                on this device are not copied; those of numpy are, to a GPU. A scene with a pose that is not finite or
+                not rigid is refused, and no other.
+            out: array of Warp or torch on this device that takes the wrenches, (n, K, 6), of the poses' precision;
+                None: a new one.
+
+        Raises:
+            InvalidInput: shapes, precisions or devices that do not fit.
+        """
+        n, many = len(self), len(self.tools)
+        given = self._array("poses", poses)
+        if given.shape not in ((n, many, 7), (n, many, 4, 4)):
+            raise InvalidInput(f"poses have shape {given.shape}; ({n}, {many}, 7) or ({n}, {many}, 4, 4) is needed.")
+        real = given.dtype
+        wrenches = wp.empty((n, many, 6), dtype=real, device=self.device) if out is None else self._array("out", out)
+        if wrenches.shape != (n, many, 6) or wrenches.dtype != real:
+            raise InvalidInput(f"out has shape {wrenches.shape} of {wrenches.dtype.__name__}; ({n}, {many}, 6) of "
+                               f"{real.__name__} is needed.")  # fmt: skip
+        depths, bounds = (wp.empty((n, many), dtype=real, device=self.device) for _ in range(2))
+        in_range = wp.empty((n, many), dtype=wp.bool, device=self.device)
+        statuses = wp.empty((n, many), dtype=wp.int32, device=self.device)
+        with _stream_of(poses, self.device):
+            for part, first in enumerate(range(0, n, self._part)):
+                self._answer(part, first, given, (wrenches, depths, bounds, in_range, statuses))
+        return WarpTouches(wrenches, depths, bounds, in_range, statuses)
+
+    def _array(self, name: str, values: Any) -> Any:
+        """Values as a Warp array on this device, not copied but from numpy to a GPU."""
+        if isinstance(values, wp.array):
+            found = values
+            if values.dtype in (wp.transformf, wp.transformd) and values.is_contiguous:
+                real = wp.float32 if values.dtype is wp.transformf else wp.float64
+                found = wp.array(ptr=values.ptr, dtype=real, shape=(*values.shape, 7), device=values.device)
+                found._kept = values  # type: ignore[attr-defined]  # the memory is its
+        elif type(values).__module__.startswith("torch"):
+            found = wp.from_torch(values.detach())
+        else:
+            plain = np.asarray(values)
+            plain = plain if plain.dtype in (np.float32, np.float64) else plain.astype(float)
+            found = wp.from_numpy(np.ascontiguousarray(plain), device=self.device) if self.device.is_cuda else \
+                wp.array(np.ascontiguousarray(plain), copy=False, device="cpu")  # fmt: skip
+        if found.device != self.device:
+            raise InvalidInput(f"{name} is on {found.device}; this batch is on {self.device}.")
+        if found.dtype not in (wp.float32, wp.float64):
+            raise InvalidInput(f"{name} is of {found.dtype}; float32 or float64 is needed.")
+        return found
+
+    def _numbers_of(self, first: int) -> tuple[Any, Any]:
+        """Skin and distance field of each tool in each scene of a part."""
+        skin = np.repeat(self._skin_of[first : first + self._part], len(self.tools)).astype(np.int32)
+        field = skin * len(self.tools) + np.tile(np.arange(len(self.tools)), len(skin) // len(self.tools))
+        return tuple(wp.array(values, dtype=wp.int32, device=self.device) for values in (skin, field))  # type: ignore
+
+    def _run(self, kernel: Any, dim: int | tuple[int, int], *inputs: Any) -> None:
+        wp.launch(kernel, dim=dim, inputs=[*inputs], device=self.device)
+
+    def _answer(self, part: int, first: int, poses: Any, out: tuple[Any, ...]) -> None:
+        """Answers the scenes of one part."""
+        scratch, skins, many = self._scratch, self._skins, len(self.tools)
+        scratch.skin, scratch.grid = self._numbers[part]
+        tools = len(scratch.skin)
+        read = places.read_quaternions if poses.ndim == 3 else places.read_matrices
+        self._run(read, tools, poses, first, many, skins, scratch)
+        self._meet(tools, 0)
+        for kernel, dim in ((columns.list_faces, tools), (columns.sink, (tools, self._lanes)),
+                            (columns.gather_depth, tools)):  # fmt: skip
+            self._run(kernel, dim, *((self._lanes,) if dim != tools else ()), skins, scratch)
+        self._run(columns.widen, tools, skins, scratch)
+        self._meet(tools, 1)
+        self._lay(tools)
+        self._run(columns.tell_inside, tools, many, skins, scratch)
+        self._run(lattice.withdraw, tools // many, many, scratch)
+        self._hold(tools)
+        self._run(answers.answer, tools, first, many, self._known, skins, scratch, *out)
+
+    def _meet(self, tools: int, again: int) -> None:
+        """Columns near the tools, and their distances."""
+        scratch, skins, lanes = self._scratch, self._skins, self._lanes
+        self._run(columns.find_near, (tools, lanes), lanes, again, skins, scratch)
+        self._run(columns.list_near, tools, again, skins, scratch)
+        self._run(columns.clear, (tools, lanes), lanes, again, skins, scratch)
+        self._run(columns.gather_clearance, tools, again, skins, scratch)
+
+    def _lay(self, tools: int) -> None:
+        """Contact nodes under the tools. The lattice is laid twice: first to see the covered area."""
+        scratch, skins, lanes, many = self._scratch, self._skins, self._lanes, len(self.tools)
+        shared, scenes = (tools, lanes), tools // many
+        self._run(lattice.begin, tools, scratch)
+        self._run(lattice.look, shared, lanes, skins, scratch)
+        scratch.busy.zero_()
+        self._run(lattice.gather_look, tools, scratch)
+        sides = int(scratch.busy.numpy()[0])  # one, but for tools that close around a limb
+        scratch.nodes.zero_()
+        for only_look in (1, 0):
+            for side in range(sides):
+                self._run(lattice.lay, tools, side, only_look, skins, scratch)
+                self._run(lattice.disown, shared, lanes, scratch)
+                self._run(lattice.own, shared, lanes, side, skins, scratch)
+                self._run(lattice.sample, shared, lanes, only_look, skins, scratch)
+                if only_look:
+                    self._run(lattice.add_area, tools, lanes, int(side == sides - 1), scratch)
+                else:
+                    self._run(lattice.list_nodes, scenes, many, side, scratch)
+                    self._run(lattice.fill_nodes, (scenes, lanes), lanes, many, skins, scratch)
+        self._run(lattice.tell, scenes, many, scratch)
+
+    def _hold(self, tools: int) -> None:
+        """Pressures at the nodes: the linear problem, then the network."""
+        scratch, skins, lanes, many, net = self._scratch, self._skins, self._lanes, len(self.tools), self._net
+        scenes = tools // many
+        shared = scenes, lanes
+        self._run(hold.respond, shared, lanes, many, skins, scratch)
+        self._run(hold.guess, scenes, many, skins, scratch)
+
+        def turn() -> None:
+            self._run(hold.multiply, shared, lanes, scratch, scratch.force, scratch.gap)
+            self._run(hold.turn, scenes, many, skins, scratch)
+
+        self._iterate(scenes, turn, hold.step)
+        self._run(hold.begin_power, scenes, scratch)
+        self._iterate(scenes, lambda: None, hold.step_power)
+        self._run(hold.see, shared, lanes, many, skins, scratch)
+        self._run(hold.judge, shared, lanes, scratch, net)
+        self._run(hold.layer, shared, lanes, scratch, scratch.inputs, net.w1, net.b1, scratch.one)
+        self._run(hold.layer, shared, lanes, scratch, scratch.one, net.w2, net.b2, scratch.two)
+        self._run(hold.layer, shared, lanes, scratch, scratch.two, net.w3, net.b3, scratch.one)
+        self._run(hold.correct, shared, lanes, scratch, net)
+        self._run(answers.find_highest, shared, lanes, many, skins, scratch)
+        self._run(answers.group, scenes, many, skins, scratch)
+
+    def _iterate(self, scenes: int, turn: Callable[[], None], step: Any) -> None:
+        """Conjugate gradients until every scene is done."""
+        scratch, lanes = self._scratch, self._lanes
+        for number in range(MAX_ITERATIONS):
+            turn()
+            self._run(hold.multiply, (scenes, lanes), lanes, scratch, scratch.move, scratch.along)
+            scratch.busy.zero_()
+            self._run(step, scenes, scratch)
+            if number % ASKED_EVERY == ASKED_EVERY - 1 and not scratch.busy.numpy()[0]:
+                return
+
+
+def _device(name: str) -> Any:
+    try:
+        return wp.get_device(name)
+    except (RuntimeError, ValueError) as error:
+        known = ", ".join(str(one) for one in wp.get_devices())
+        raise InvalidInput(f"there is no device '{name}'. Available: {known}.") from error
+
+
+def _check(skin: Any) -> None:
+    """Refuses a skin that the kernels do not serve."""
+    if not isinstance(skin, Skin):
+        raise InvalidInput("a batch needs prepared skins. Try Skin.of(layer, MomentNet()).")
+    for refused, what in (
+        (skin.layer.stacked, "a stack (a living limb, or columns that run to bone)"),
+        (skin.rest is not None, "a skin that joints have moved"),
+        (skin.near.folded, "a skin with folds"),
+    ):
+        if refused:
+            raise InvalidInput(f"{what} is not served by WarpBatch yet; one elastic material at rest is. Try Batch.")
+
+
+def _known() -> Any:
+    """Figures of the network's card."""
+    card, out = shipped("contact_net").card, answers.Known()
+    out.scale, out.power = card["bound"]["scale"], card["bound"]["power"]
+    out.pressure, out.depth = card["ranges"]["p_over_e"][1], card["ranges"]["depth_over_thickness"][1]
+    out.linear_to = LINEAR_TO
+    return out
+
+
+def _stream_of(poses: Any, device: Any) -> Any:
+    """On a GPU, torch's stream where the poses are torch's: so nothing is read before it is written."""
+    if device.is_cuda and type(poses).__module__.startswith("torch"):
+        return wp.ScopedStream(wp.stream_from_torch(poses.device))
+    return nullcontext()
