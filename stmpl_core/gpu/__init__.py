@@ -1,1 +1,5 @@
-"""Many touches at once on a GPU: WarpBatch, and the kernels it is made of, in NVIDIA Warp."""
+"""Many touches at once on a GPU: warp_batch.WarpBatch, and the kernels that it is made of, in NVIDIA Warp."""
+
+from stmpl_core.extras import needed
+
+needed("stmpl_core.gpu", "gpu", "warp")

@@ -1,7 +1,5 @@
+# type: ignore  # kernels are in Warp's language, which pyright does not know
 """Kernels that tell what tools do: wrenches, depths, bounds, and what may be believed of them: stmpl_core.toucher."""
-
-# pyright: reportInvalidTypeForm=false, reportArgumentType=false, reportCallIssue=false, reportIndexIssue=false
-# pyright: reportOperatorIssue=false, reportAttributeAccessIssue=false, reportGeneralTypeIssues=false
 
 from typing import Any
 
@@ -72,7 +70,7 @@ def group(many: wp.int32, skins: Skins, scratch: Scratch):
             other = _ball(scratch, s, n, reach)
             away = wp.length(vec3(one[0] - other[0], one[1] - other[1], one[2] - other[2]))
             if one[3] > real(0.0) and other[3] > real(0.0) and away < one[3] + other[3]:
-                old, new = scratch.group[s * many + k], scratch.group[s * many + n]
+                old, new = wp.int32(scratch.group[s * many + k]), wp.int32(scratch.group[s * many + n])
                 for m in range(many):
                     if scratch.group[s * many + m] == old:
                         scratch.group[s * many + m] = new
@@ -94,7 +92,7 @@ def _power(scratch: Scratch, one: OneSkin, s: wp.int32, many: wp.int32, k: wp.in
 @wp.func
 def _scene_status(scratch: Scratch, s: wp.int32, many: wp.int32) -> wp.int32:
     """REFUSED if a tool is, else what a tool is not served for, else below REFUSED."""
-    out = int(-1)
+    out = wp.int32(-1)
     for k in range(many):
         status = scratch.status[s * many + k]
         if status == REFUSED:

@@ -1,7 +1,5 @@
+# type: ignore  # kernels are in Warp's language, which pyright does not know
 """Kernels that find the columns of skin that a tool meets, and the triangles around them: stmpl_core.columns."""
-
-# pyright: reportInvalidTypeForm=false, reportArgumentType=false, reportCallIssue=false, reportIndexIssue=false
-# pyright: reportOperatorIssue=false, reportAttributeAccessIssue=false, reportGeneralTypeIssues=false
 
 import warp as wp
 
@@ -31,7 +29,7 @@ def _mark(masks: wp.array2d(dtype=wp.uint32), c: wp.int32, n: wp.int32):
 @wp.func
 def _through(low: vec3, high: vec3, start: vec3, way: vec3, t: real) -> bool:
     """Whether a column passes a box of the tool's frame."""
-    begin, end = real(0.0), t
+    begin, end = real(0.0), real(t)
     for x in range(3):
         if wp.abs(way[x]) < real(1e-12):
             if start[x] < low[x] or start[x] > high[x]:
@@ -94,7 +92,7 @@ def list_near(again: wp.int32, skins: Skins, scratch: Scratch):
     c = wp.tid()
     if not _looks(scratch, c, again):
         return
-    one, count = skins.one[scratch.skin[c]], int(0)
+    one, count = skins.one[scratch.skin[c]], wp.int32(0)
     for local in range(one.end_ball - one.first_ball):
         mask = scratch.near[c, local]
         if mask != wp.uint32(0):
@@ -117,13 +115,10 @@ def clear(lanes: wp.int32, again: wp.int32, skins: Skins, scratch: Scratch):
     if not _looks(scratch, c, again):
         return
     one, grid, pose = skins.one[scratch.skin[c]], skins.grids[scratch.grid[c]], wp.transpose(scratch.pose[c])
-    far = real(one.hole)
-    if again == 1:
-        far = one.hole + one.thickest
     for n in range(lane, scratch.count[c], lanes):
         v = scratch.columns[c, n]
         start, way = pose * (skins.points[v] - scratch.place[c]), pose * skins.inward[v]
-        least, above = clearance_of(grid, skins.coefficients, start, way, skins.thickness[v], far)
+        least, above = clearance_of(grid, skins.coefficients, start, way, skins.thickness[v], one.hole)
         scratch.least[c, n] = least
         scratch.above[c, n] = above
 
@@ -135,7 +130,7 @@ def gather_clearance(again: wp.int32, skins: Skins, scratch: Scratch):
     if not _looks(scratch, c, again):
         return
     one = skins.one[scratch.skin[c]]
-    nearest, around, under, wall, covers = real(FAR), -FAR, -FAR, real(0.0), int(0)
+    nearest, around, under, wall, covers = real(FAR), -FAR, -FAR, real(0.0), wp.int32(0)
     for n in range(scratch.count[c]):
         least, above = scratch.least[c, n], scratch.above[c, n]
         nearest = wp.min(nearest, least)
@@ -163,12 +158,12 @@ def list_faces(skins: Skins, scratch: Scratch):
     c = wp.tid()
     if scratch.status[c] != PENDING:
         return
-    one, many = skins.one[scratch.skin[c]], int(0)
+    one, many = skins.one[scratch.skin[c]], wp.int32(0)
     for n in range(scratch.count[c]):
         v = scratch.columns[c, n]
         if _marked(scratch.covered, c, v - one.first):
             for p in range(skins.start[v], skins.start[v + 1]):
-                f, first = skins.around[p], bool(True)
+                f, first = skins.around[p], wp.bool(True)
                 corners = skins.faces[f]
                 for x in range(3):
                     if corners[x] < v and _marked(scratch.covered, c, corners[x] - one.first):
@@ -245,14 +240,14 @@ def tell_inside(many: wp.int32, skins: Skins, scratch: Scratch):
             return
     k = c % many
     few, all = skins.look_many[k, 0], skins.look_many[k, 1]
-    under, n = int(0), int(0)
+    under, n = wp.int32(0), wp.int32(0)
     while n < few and under == 0:
         if _under_skin(skins, one, scratch.pose[c] * skins.looked_at[k, n] + scratch.place[c]):
             under = 1
         n += 1
     if under == 0:
         return
-    most = int(0)
+    most = wp.int32(0)
     for m in range(all):
         if _under_skin(skins, one, scratch.pose[c] * skins.looked_at[k, few + m] + scratch.place[c]):
             most += 1

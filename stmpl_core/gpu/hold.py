@@ -1,12 +1,10 @@
+# type: ignore  # kernels are in Warp's language, which pyright does not know
 """Kernels of the pressure at contact nodes: stmpl_core.obstacle and stmpl_core.contact_net.
 
 Conjugate gradients run in lock-step: a kernel over all nodes of all scenes multiplies, one over the scenes steps. Both
 sums are taken by one thread each, in the order of the nodes, so an answer does not depend on who runs first; scenes
 that are done are skipped. A launch costs microseconds, which thousands of scenes share.
 """
-
-# pyright: reportInvalidTypeForm=false, reportArgumentType=false, reportCallIssue=false, reportIndexIssue=false
-# pyright: reportOperatorIssue=false, reportAttributeAccessIssue=false, reportGeneralTypeIssues=false
 
 import warp as wp
 
@@ -145,7 +143,7 @@ def step(scratch: Scratch):
     if down <= real(0.0):
         scratch.done[s] = 1
         return
-    restart, change, largest = int(0), real(0.0), real(0.0)
+    restart, change, largest = wp.int32(0), real(0.0), real(0.0)
     for i in range(scratch.nodes[s]):
         now = real(scratch.force[s, i])
         if now > real(0.0):

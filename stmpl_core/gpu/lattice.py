@@ -1,182 +1,30 @@
+# type: ignore  # kernels are in Warp's language, which pyright does not know
 """Kernels that lay contact nodes under tools: stmpl_core.nodes, on the same lattice.
 
 Each place of a lattice belongs to the lowest triangle that it lies on, found by an atomic minimum, so neither the order
 of threads nor their number changes an answer.
 """
 
-# pyright: reportInvalidTypeForm=false, reportArgumentType=false, reportCallIssue=false, reportIndexIssue=false
-# pyright: reportOperatorIssue=false, reportAttributeAccessIssue=false, reportGeneralTypeIssues=false
-
 import math
 
 import warp as wp
 
 from stmpl_core import nodes as law
+from stmpl_core.deep import DEEPEST
+from stmpl_core.gpu.looks import CHARTS, FACING, inward_on, point_on, thickness_on
 from stmpl_core.gpu.packs import Lattice, Scratch, Skins
 from stmpl_core.gpu.places import APART, BY_POSE, DEEP, OVERFULL, PENDING
-from stmpl_core.gpu.rays import FAR, OPTIONS, WALL_WIDTH, depth_at, mat33, real, strain_under, vec3
-from stmpl_core.deep import DEEPEST
+from stmpl_core.gpu.rays import FAR, OPTIONS, WALL_WIDTH, depth_at, real, strain_under, vec3
 
-NODES, SAMPLES, CHARTS = wp.constant(wp.float64(law.NODES)), wp.constant(law.SAMPLES), wp.constant(law.CHARTS)
+NODES = wp.constant(wp.float64(law.NODES))
 MOST, MOST_PLACES = wp.constant(wp.float64(law.MOST)), wp.constant(wp.float64(law.MOST_LOOKED_AT))
-WIDEST, FACING = wp.constant(wp.float64(law.WIDEST)), wp.constant(wp.float64(law.FACING))
-ONE_WAY = wp.constant(wp.float64(law.ONE_WAY))
-COS_ASKEW, SIN_ASKEW = wp.constant(wp.float64(math.cos(law.ASKEW))), wp.constant(wp.float64(math.sin(law.ASKEW)))
+WIDEST = wp.constant(wp.float64(law.WIDEST))
 RISE = wp.constant(wp.float64(0.5 * math.sqrt(3.0)))
 FIRST_OFF, SECOND_OFF = wp.constant(wp.float64(0.31)), wp.constant(wp.float64(0.17))
 ROUNDING = wp.constant(wp.float64(1e-9))
 FULL = wp.constant(wp.float64(DEEPEST))
 NO_ONE = wp.constant(2**31 - 1)
 wp.set_module_options(OPTIONS)
-
-
-@wp.func
-def _shares_of_part(split: wp.int32, q: wp.int32) -> vec3:
-    """Barycentric coordinates of the middle of part q of a triangle, row by row."""
-    p, left = int(0), q
-    while left >= 2 * (split - p) - 1:
-        left -= 2 * (split - p) - 1
-        p += 1
-    r, flip = left // 2, left % 2
-    third = real(1 + flip) / real(3.0)
-    a, b = (real(p) + third) / real(split), (real(r) + third) / real(split)
-    return vec3(a, b, real(1.0) - a - b)
-
-
-@wp.func
-def _point(skins: Skins, f: wp.int32, shares: vec3) -> vec3:
-    corners = skins.faces[f]
-    return (shares[0] * skins.points[corners[0]] + shares[1] * skins.points[corners[1]]
-            + shares[2] * skins.points[corners[2]])  # fmt: skip
-
-
-@wp.func
-def _inward(skins: Skins, f: wp.int32, shares: vec3) -> vec3:
-    corners = skins.faces[f]
-    return wp.normalize(shares[0] * skins.inward[corners[0]] + shares[1] * skins.inward[corners[1]]
-                        + shares[2] * skins.inward[corners[2]])  # fmt: skip
-
-
-@wp.func
-def _thickness(skins: Skins, f: wp.int32, shares: vec3) -> real:
-    corners = skins.faces[f]
-    return (shares[0] * skins.thickness[corners[0]] + shares[1] * skins.thickness[corners[1]]
-            + shares[2] * skins.thickness[corners[2]])  # fmt: skip
-
-
-@wp.kernel
-def begin(scratch: Scratch):
-    """Parts that each triangle is looked at in."""
-    c = wp.tid()
-    split = int(1)
-    while split < 8 and scratch.many[c] * split * split < SAMPLES:
-        split += 1
-    scratch.split[c] = split
-    if scratch.status[c] != PENDING:
-        scratch.many[c] = 0
-
-
-@wp.kernel
-def look(lanes: wp.int32, skins: Skins, scratch: Scratch):
-    """How deep the tool is at parts of the triangles."""
-    c, lane = wp.tid()
-    split, sunk, pose = scratch.split[c], scratch.sunk[c], wp.transpose(scratch.pose[c])
-    parts, grid = split * split, skins.grids[scratch.grid[c]]
-    for n in range(lane, scratch.many[c] * parts, lanes):
-        f, q = scratch.found[c, n // parts], n % parts
-        if q == 0:
-            corners = skins.faces[f]
-            way = wp.cross(skins.points[corners[1]] - skins.points[corners[0]],
-                           skins.points[corners[2]] - skins.points[corners[0]])  # fmt: skip
-            scratch.ways[c, n // parts] = -wp.normalize(way)
-            scratch.sizes[c, n // parts] = real(0.5) * wp.length(way) / real(parts)
-        shares = _shares_of_part(split, q)
-        middle = _point(skins, f, shares)
-        scratch.middles[c, n] = middle
-        scratch.depths[c, n] = depth_at(grid, skins.coefficients, pose * (middle - scratch.place[c]),
-                                        pose * _inward(skins, f, shares), _thickness(skins, f, shares), sunk)
-
-
-@wp.func
-def _deepest_of(scratch: Scratch, c: wp.int32, m: wp.int32, parts: wp.int32) -> real:
-    deepest = -FAR
-    for q in range(parts):
-        deepest = wp.max(deepest, scratch.depths[c, m * parts + q])
-    return deepest
-
-
-@wp.func
-def _axes(pose: mat33, way: vec3) -> mat33:
-    """First and second axis of a lattice, and the way inwards, as rows."""
-    first, axis = vec3(), int(0)
-    while axis < 2:
-        column = vec3(pose[0, axis], pose[1, axis], pose[2, axis])
-        far = wp.dot(column, way)
-        first = column - far * way
-        axis += 1
-        if far * far < real(0.9):
-            axis = 2
-    first = wp.normalize(first)
-    cross = wp.cross(way, first)
-    one, other = COS_ASKEW * first + SIN_ASKEW * cross, COS_ASKEW * cross - SIN_ASKEW * first
-    return mat33(one[0], one[1], one[2], other[0], other[1], other[2], way[0], way[1], way[2])
-
-
-@wp.kernel
-def gather_look(scratch: Scratch):
-    """Area that the tool covers, and the sides of the limb that its triangles are on."""
-    c = wp.tid()
-    many, parts = scratch.many[c], scratch.split[c] * scratch.split[c]
-    if many == 0:
-        return
-    best, deepest = int(0), -FAR
-    for m in range(many):
-        here = _deepest_of(scratch, c, m, parts)
-        if here > deepest or (here == deepest and scratch.found[c, m] < scratch.found[c, best]):
-            deepest = here
-            best = m
-    area, total, mean = real(0.0), real(0.0), vec3()
-    for m in range(many):
-        size = scratch.sizes[c, m]
-        blur = real(0.5) * wp.sqrt(size)
-        if deepest > real(0.0):
-            blur = wp.min(blur, real(0.5) * deepest)
-        weight = real(0.0)
-        for q in range(parts):
-            depth = scratch.depths[c, m * parts + q]
-            area += wp.clamp(real(0.5) + depth / blur, real(0.0), real(1.0)) * size
-            weight += size * wp.max(depth + real(0.05) * wp.abs(deepest), real(0.0))
-        total += weight
-        mean = mean + weight * scratch.ways[c, m]
-        scratch.chart[c, m] = -1
-    if deepest <= real(0.0):
-        area = real(0.05) * area
-    scratch.covers[c] = area
-    scratch.deepest[c] = deepest
-    way = vec3(scratch.ways[c, best])
-    if wp.length(mean) > ONE_WAY * total:
-        way = wp.normalize(mean)
-    sides = int(0)
-    if area > real(0.0):
-        while sides < CHARTS:
-            rest, highest = int(-1), real(0.0)
-            scratch.axes[c, sides] = _axes(scratch.pose[c], way)
-            for m in range(many):
-                if scratch.chart[c, m] < 0:
-                    if wp.dot(scratch.ways[c, m], way) >= FACING:
-                        scratch.chart[c, m] = sides
-                    else:
-                        here = _deepest_of(scratch, c, m, parts)
-                        if here > highest:
-                            rest = m
-                            highest = here
-            sides += 1
-            if rest < 0:
-                break
-            way = scratch.ways[c, rest]
-    scratch.sides[c] = sides
-    scratch.sees[c] = real(0.0)
-    wp.atomic_max(scratch.busy, 0, sides)
 
 
 @wp.kernel
@@ -198,7 +46,7 @@ def lay(side: wp.int32, only_look: wp.int32, skins: Skins, scratch: Scratch):
     low_u, low_v, high_u, high_v = real(FAR), real(FAR), -FAR, -FAR
     for m in range(many):
         if scratch.chart[c, m] == side or scratch.chart[c, m] == side + CHARTS:
-            corners, near = skins.faces[scratch.found[c, m]], int(0)
+            corners, near = skins.faces[scratch.found[c, m]], wp.int32(0)
             edge = wp.length(skins.points[corners[0]] - skins.points[corners[1]]) / wp.sqrt(real(parts))
             for q in range(parts):
                 if scratch.depths[c, m * parts + q] > real(-0.6) * edge - WALL_WIDTH * thick:
@@ -304,8 +152,8 @@ def sample(lanes: wp.int32, only_look: wp.int32, skins: Skins, scratch: Scratch)
         f, value = scratch.owner[c, n], real(0.0)
         if f != NO_ONE:
             shares = _shares_of_place(lattice, skins, f, scratch.centre[c], n)
-            inward, t = _inward(skins, f, shares), _thickness(skins, f, shares)
-            start, way = pose * (_point(skins, f, shares) - scratch.place[c]), pose * inward
+            inward, t = inward_on(skins, f, shares), thickness_on(skins, f, shares)
+            start, way = pose * (point_on(skins, f, shares) - scratch.place[c]), pose * inward
             if only_look == 1:
                 depth = depth_at(grid, skins.coefficients, start, way, t, sunk)
                 value = wp.clamp(real(0.5) + depth / lattice.blur, real(0.0), real(1.0)) * lattice.cell
@@ -357,12 +205,12 @@ def fill_nodes(lanes: wp.int32, many: wp.int32, skins: Skins, scratch: Scratch):
         c, n = s * many + scratch.tool[s, i], scratch.cell[s, i]
         lattice, f = scratch.lattice[c], scratch.owner[c, n]
         shares = _shares_of_place(lattice, skins, f, scratch.centre[c], n)
-        inward = _inward(skins, f, shares)
+        inward = inward_on(skins, f, shares)
         scratch.face[s, i] = f
         scratch.shares[s, i] = shares
-        scratch.point[s, i] = _point(skins, f, shares)
+        scratch.point[s, i] = point_on(skins, f, shares)
         scratch.inward[s, i] = inward
-        scratch.thick[s, i] = _thickness(skins, f, shares)
+        scratch.thick[s, i] = thickness_on(skins, f, shares)
         scratch.area[s, i] = lattice.cell / wp.max(wp.dot(inward, lattice.way), FACING)
         scratch.strain[s, i] = scratch.value[c, n]
 

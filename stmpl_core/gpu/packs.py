@@ -20,8 +20,8 @@ from stmpl_core.obstacle import response
 from stmpl_core.sdf import SignedDistance
 from stmpl_core.skin import Skin
 from stmpl_core.tool import Tool
-from stmpl_core.toucher import margin_on
 from stmpl_core.tools import Tools
+from stmpl_core.toucher import margin_on
 
 STEEP_BIT, LONG_BIT, BORDER_BIT, EDGE_BIT = 1, 2, 4, 8  # what is to be said of a vertex, see Soundness
 MOST_PLACES = 8192  # places of a lattice: nodes.MOST_LOOKED_AT and a margin around them

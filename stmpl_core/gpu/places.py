@@ -1,7 +1,5 @@
+# type: ignore  # kernels are in Warp's language, which pyright does not know
 """Kernels that read poses: quaternions or matrices, float32 or float64, and say which are no rigid transforms."""
-
-# pyright: reportInvalidTypeForm=false, reportArgumentType=false, reportCallIssue=false, reportIndexIssue=false
-# pyright: reportOperatorIssue=false, reportAttributeAccessIssue=false, reportGeneralTypeIssues=false
 
 from typing import Any
 
@@ -58,7 +56,7 @@ def read_matrices(poses: wp.array4d(dtype=Any), first: wp.int32, many: wp.int32,
     """Poses (n, K, 4, 4)."""
     c = wp.tid()
     s, k = first + c // many, c % many
-    turn, place, sound = mat33(), vec3(), bool(True)
+    turn, place, sound = mat33(), vec3(), wp.bool(True)
     for i in range(3):
         place[i] = real(poses[s, k, i, 3])
         for j in range(3):

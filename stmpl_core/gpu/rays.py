@@ -1,7 +1,5 @@
+# type: ignore  # kernels are in Warp's language, which pyright does not know
 """Rays in Warp: stmpl_core.sdf.distance_at and stmpl_core.rays as functions of kernels, line by line the same law."""
-
-# pyright: reportInvalidTypeForm=false, reportArgumentType=false, reportCallIssue=false, reportIndexIssue=false
-# pyright: reportOperatorIssue=false, reportAttributeAccessIssue=false, reportGeneralTypeIssues=false
 
 import warp as wp
 
@@ -78,7 +76,9 @@ def along(grid: Grid, coefficients: wp.array(dtype=real), start: vec3, way: vec3
 def clearance_of(grid: Grid, coefficients: wp.array(dtype=real), start: vec3, way: vec3, t: real, far: real):
     """Least signed distance along a column and that at its skin [m]: stmpl_core.columns._clearances."""
     d = along(grid, coefficients, start, way, real(0.0))
-    skin, least, s = d, d, real(0.0)
+    skin = d  # not as a tuple: Warp would not copy
+    least = d
+    s = real(0.0)
     if d > t + far:
         least = d - t
     else:
@@ -95,15 +95,17 @@ def clearance_of(grid: Grid, coefficients: wp.array(dtype=real), start: vec3, wa
 @wp.func
 def secant(grid: Grid, coefficients: wp.array(dtype=real), start: vec3, way: vec3, t: real, guess: real) -> real:
     """Depth by the secant rule from a guess [m]; below 0 where that goes astray."""
-    s, d = guess, along(grid, coefficients, start, way, guess)
+    s = guess
+    d = along(grid, coefficients, start, way, guess)
     last_s, last_d = s + real(1.0), d + real(1.0)
-    out, step = real(-1.0), int(0)
+    out, step = real(-1.0), wp.int32(0)
     while step < 6:
         slope = (d - last_d) / (s - last_s)
         if slope < real(0.3):
             step = 6
         else:
-            last_s, last_d = s, d
+            last_s = s
+            last_d = d
             s = s - d / slope
             if wp.abs(s - last_s) < TOLERANCE * t:
                 if s > real(0.0):
@@ -123,20 +125,23 @@ def depth_in_column(grid: Grid, coefficients: wp.array(dtype=real), start: vec3,
         found = secant(grid, coefficients, start, way, t, guess)
         if found > real(0.0):
             return found
-    s, d = t, along(grid, coefficients, start, way, t)
+    s = t
+    d = along(grid, coefficients, start, way, t)
     if d <= real(0.0):
         return t
-    last_s, last_d, out, step = s + real(1.0), d + real(1.0), real(-1.0), int(0)
+    last_s, last_d, out, step = s + real(1.0), d + real(1.0), real(-1.0), wp.int32(0)
     while step < 40:
         if s - d > real(0.0) and d > START * t:
-            last_s, last_d = s, d
+            last_s = s
+            last_d = d
             s = s - d
         else:
             slope = (d - last_d) / (s - last_s)
             following = s - d
             if slope > real(0.2):
                 following = s - d / slope
-            last_s, last_d = s, d
+            last_s = s
+            last_d = d
             s = following
         if s <= real(0.0):
             out = real(0.0)

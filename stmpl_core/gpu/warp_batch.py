@@ -1,13 +1,12 @@
 """WarpBatch: Batch on a GPU, by kernels in NVIDIA Warp that also run on a CPU, where tests hold them against numba.
 
-The law is that of stmpl_core.toucher by pose, on one material, elastic and without memory: the same lattice of contact
-nodes, the same linear complementarity problem on a dense matrix for each scene, the same network. Each stage is one
-kernel over all scenes, with LANES threads a scene that share out its columns, triangles, places or nodes; what one
-scene sums up is summed by one of its threads. So nothing waits inside a kernel and nothing is added in an order that
-threads decide: an answer is the same to the bit from run to run, and the source has no line for one kind of device only.
-The alternative, a block a scene that keeps its matrix in shared memory, saves the few hundred launches of a batch (some
-milliseconds, whatever n) but holds 100 to 200 nodes only, in float32, and its barriers would never run in a test
-without a GPU.
+The law is that of stmpl_core.toucher by pose, elastic and without memory: the same lattice of contact nodes, the same
+linear complementarity problem on a dense matrix for each scene, the same network. Each stage is one kernel over all
+scenes, with LANES threads a scene that share out its columns, triangles, places or nodes; what one scene sums up is
+summed by one of its threads. So nothing waits inside a kernel and nothing is added in an order that threads decide: an
+answer is the same to the bit from run to run, and the source has no line for one kind of device only. The alternative,
+a block a scene that keeps its matrix in shared memory, saves the few hundred launches of a batch (some milliseconds,
+whatever n) but holds 100 to 200 nodes only, in float32, and its barriers would never run in a test without a GPU.
 
 Geometry and the linear problem are float64, the network float32, as in the law that runs on a CPU.
 """
@@ -24,7 +23,7 @@ import warp as wp
 
 from stmpl_core.contact_net import LINEAR_TO
 from stmpl_core.errors import InvalidInput
-from stmpl_core.gpu import answers, columns, hold, lattice, packs, places
+from stmpl_core.gpu import answers, columns, hold, lattice, looks, packs, places
 from stmpl_core.networks import shipped
 from stmpl_core.obstacle import MAX_ITERATIONS
 from stmpl_core.skin import Skin
@@ -75,6 +74,7 @@ class WarpBatch:
         nodes: room for contact nodes of all tools of a scene together; None: what these tools need.
         memory: scratch space [bytes]; scenes that do not fit go one part after the other; None: 4 GiB on a GPU, 256 MiB
             on a CPU.
+        lanes: threads that share the work of a scene; None: LANES on a GPU, 1 on a CPU.
 
     Attributes:
         device: Warp's device.
@@ -87,7 +87,8 @@ class WarpBatch:
     """
 
     def __init__(self, skins: Skin | Sequence[Skin], tools: Sequence[Tool], n: int | None = None, *,
-                 device: str = "cuda", nodes: int | None = None, memory: int | None = None) -> None:  # fmt: skip
+                 device: str = "cuda", nodes: int | None = None, memory: int | None = None,
+                 lanes: int | None = None) -> None:  # fmt: skip
         some = list(skins) if isinstance(skins, Sequence) else [skins]
         count = len(some) if n is None else n
         each = some if isinstance(skins, Sequence) else some * max(count, 0)
@@ -100,7 +101,7 @@ class WarpBatch:
         unique = list({id(skin): skin for skin in each}.values())
         for skin in unique:
             _check(skin)
-        self._lanes = LANES if self.device.is_cuda else 1
+        self._lanes = lanes or (LANES if self.device.is_cuda else 1)
         self._skins, fields = packs.pack(unique, self.tools, self.device)
         self.room = packs.room_for(unique, fields, self._lanes, nodes)
         self._net, self._known = packs.net(self.device), _known()
@@ -136,13 +137,15 @@ class WarpBatch:
         if given.shape not in ((n, many, 7), (n, many, 4, 4)):
             raise InvalidInput(f"poses have shape {given.shape}; ({n}, {many}, 7) or ({n}, {many}, 4, 4) is needed.")
         real = given.dtype
+        if isinstance(out, (np.ndarray, list, tuple)):
+            raise InvalidInput("out is numpy's; an array of Warp or torch is needed. Try wp.from_numpy or torch.empty.")
         wrenches = wp.empty((n, many, 6), dtype=real, device=self.device) if out is None else self._array("out", out)
         if wrenches.shape != (n, many, 6) or wrenches.dtype != real:
             raise InvalidInput(f"out has shape {wrenches.shape} of {wrenches.dtype.__name__}; ({n}, {many}, 6) of "
                                f"{real.__name__} is needed.")  # fmt: skip
         depths, bounds = (wp.empty((n, many), dtype=real, device=self.device) for _ in range(2))
-        in_range = wp.empty((n, many), dtype=wp.bool, device=self.device)
-        statuses = wp.empty((n, many), dtype=wp.int32, device=self.device)
+        kinds: tuple[Any, Any] = wp.bool, wp.int32
+        in_range, statuses = (wp.empty((n, many), dtype=kind, device=self.device) for kind in kinds)
         with _stream_of(poses, self.device):
             for part, first in enumerate(range(0, n, self._part)):
                 self._answer(part, first, given, (wrenches, depths, bounds, in_range, statuses))
@@ -209,10 +212,10 @@ class WarpBatch:
         """Contact nodes under the tools. The lattice is laid twice: first to see the covered area."""
         scratch, skins, lanes, many = self._scratch, self._skins, self._lanes, len(self.tools)
         shared, scenes = (tools, lanes), tools // many
-        self._run(lattice.begin, tools, scratch)
-        self._run(lattice.look, shared, lanes, skins, scratch)
+        self._run(looks.begin, tools, scratch)
+        self._run(looks.look, shared, lanes, skins, scratch)
         scratch.busy.zero_()
-        self._run(lattice.gather_look, tools, scratch)
+        self._run(looks.gather_look, tools, scratch)
         sides = int(scratch.busy.numpy()[0])  # one, but for tools that close around a limb
         scratch.nodes.zero_()
         for only_look in (1, 0):

@@ -1,0 +1,166 @@
+# type: ignore  # kernels are in Warp's language, which pyright does not know
+"""Kernels that look at the skin under tools: what area they cover, and which sides of a limb it is on: nodes._look."""
+
+import math
+
+import warp as wp
+
+from stmpl_core import nodes as law
+from stmpl_core.gpu.packs import Scratch, Skins
+from stmpl_core.gpu.places import PENDING
+from stmpl_core.gpu.rays import FAR, OPTIONS, depth_at, mat33, real, vec3
+
+SAMPLES, CHARTS = wp.constant(law.SAMPLES), wp.constant(law.CHARTS)
+FACING, ONE_WAY = wp.constant(wp.float64(law.FACING)), wp.constant(wp.float64(law.ONE_WAY))
+COS_ASKEW, SIN_ASKEW = wp.constant(wp.float64(math.cos(law.ASKEW))), wp.constant(wp.float64(math.sin(law.ASKEW)))
+wp.set_module_options(OPTIONS)
+
+
+@wp.func
+def _shares_of_part(split: wp.int32, q: wp.int32) -> vec3:
+    """Barycentric coordinates of the middle of part q of a triangle, row by row."""
+    p, left = wp.int32(0), wp.int32(q)
+    while left >= 2 * (split - p) - 1:
+        left -= 2 * (split - p) - 1
+        p += 1
+    r, flip = left // 2, left % 2
+    third = real(1 + flip) / real(3.0)
+    a, b = (real(p) + third) / real(split), (real(r) + third) / real(split)
+    return vec3(a, b, real(1.0) - a - b)
+
+
+@wp.func
+def point_on(skins: Skins, f: wp.int32, shares: vec3) -> vec3:
+    corners = skins.faces[f]
+    return (shares[0] * skins.points[corners[0]] + shares[1] * skins.points[corners[1]]
+            + shares[2] * skins.points[corners[2]])  # fmt: skip
+
+
+@wp.func
+def inward_on(skins: Skins, f: wp.int32, shares: vec3) -> vec3:
+    corners = skins.faces[f]
+    return wp.normalize(shares[0] * skins.inward[corners[0]] + shares[1] * skins.inward[corners[1]]
+                        + shares[2] * skins.inward[corners[2]])  # fmt: skip
+
+
+@wp.func
+def thickness_on(skins: Skins, f: wp.int32, shares: vec3) -> real:
+    corners = skins.faces[f]
+    return (shares[0] * skins.thickness[corners[0]] + shares[1] * skins.thickness[corners[1]]
+            + shares[2] * skins.thickness[corners[2]])  # fmt: skip
+
+
+@wp.kernel
+def begin(scratch: Scratch):
+    """Parts that each triangle is looked at in."""
+    c = wp.tid()
+    split = wp.int32(1)
+    while split < 8 and scratch.many[c] * split * split < SAMPLES:
+        split += 1
+    scratch.split[c] = split
+    if scratch.status[c] != PENDING:
+        scratch.many[c] = 0
+
+
+@wp.kernel
+def look(lanes: wp.int32, skins: Skins, scratch: Scratch):
+    """How deep the tool is at parts of the triangles."""
+    c, lane = wp.tid()
+    split, sunk, pose = scratch.split[c], scratch.sunk[c], wp.transpose(scratch.pose[c])
+    parts, grid = split * split, skins.grids[scratch.grid[c]]
+    for n in range(lane, scratch.many[c] * parts, lanes):
+        f, q = scratch.found[c, n // parts], n % parts
+        if q == 0:
+            corners = skins.faces[f]
+            way = wp.cross(skins.points[corners[1]] - skins.points[corners[0]],
+                           skins.points[corners[2]] - skins.points[corners[0]])  # fmt: skip
+            scratch.ways[c, n // parts] = -wp.normalize(way)
+            scratch.sizes[c, n // parts] = real(0.5) * wp.length(way) / real(parts)
+        shares = _shares_of_part(split, q)
+        middle = point_on(skins, f, shares)
+        scratch.middles[c, n] = middle
+        start, way = pose * (middle - scratch.place[c]), pose * inward_on(skins, f, shares)
+        t = thickness_on(skins, f, shares)
+        scratch.depths[c, n] = depth_at(grid, skins.coefficients, start, way, t, sunk)
+
+
+@wp.func
+def _deepest_of(scratch: Scratch, c: wp.int32, m: wp.int32, parts: wp.int32) -> real:
+    deepest = -FAR
+    for q in range(parts):
+        deepest = wp.max(deepest, scratch.depths[c, m * parts + q])
+    return deepest
+
+
+@wp.func
+def _axes(pose: mat33, way: vec3) -> mat33:
+    """First and second axis of a lattice, and the way inwards, as rows."""
+    first, axis = vec3(), wp.int32(0)
+    while axis < 2:
+        column = vec3(pose[0, axis], pose[1, axis], pose[2, axis])
+        far = wp.dot(column, way)
+        first = column - far * way
+        axis += 1
+        if far * far < real(0.9):
+            axis = 2
+    first = wp.normalize(first)
+    cross = wp.cross(way, first)
+    one, other = COS_ASKEW * first + SIN_ASKEW * cross, COS_ASKEW * cross - SIN_ASKEW * first
+    return mat33(one[0], one[1], one[2], other[0], other[1], other[2], way[0], way[1], way[2])
+
+
+@wp.kernel
+def gather_look(scratch: Scratch):
+    """Area that the tool covers, and the sides of the limb that its triangles are on."""
+    c = wp.tid()
+    many, parts = scratch.many[c], scratch.split[c] * scratch.split[c]
+    if many == 0:
+        return
+    best, deepest = wp.int32(0), -FAR
+    for m in range(many):
+        here = _deepest_of(scratch, c, m, parts)
+        if here > deepest or (here == deepest and scratch.found[c, m] < scratch.found[c, best]):
+            deepest = here
+            best = m
+    area, total, mean = real(0.0), real(0.0), vec3()
+    for m in range(many):
+        size = scratch.sizes[c, m]
+        blur = real(0.5) * wp.sqrt(size)
+        if deepest > real(0.0):
+            blur = wp.min(blur, real(0.5) * deepest)
+        weight = real(0.0)
+        for q in range(parts):
+            depth = scratch.depths[c, m * parts + q]
+            area += wp.clamp(real(0.5) + depth / blur, real(0.0), real(1.0)) * size
+            weight += size * wp.max(depth + real(0.05) * wp.abs(deepest), real(0.0))
+        total += weight
+        mean = mean + weight * scratch.ways[c, m]
+        scratch.chart[c, m] = -1
+    if deepest <= real(0.0):
+        area = real(0.05) * area
+    scratch.covers[c] = area
+    scratch.deepest[c] = deepest
+    way = vec3(scratch.ways[c, best])
+    if wp.length(mean) > ONE_WAY * total:
+        way = wp.normalize(mean)
+    sides = wp.int32(0)
+    if area > real(0.0):
+        while sides < CHARTS:
+            rest, highest = wp.int32(-1), real(0.0)
+            scratch.axes[c, sides] = _axes(scratch.pose[c], way)
+            for m in range(many):
+                if scratch.chart[c, m] < 0:
+                    if wp.dot(scratch.ways[c, m], way) >= FACING:
+                        scratch.chart[c, m] = sides
+                    else:
+                        here = _deepest_of(scratch, c, m, parts)
+                        if here > highest:
+                            rest = m
+                            highest = here
+            sides += 1
+            if rest < 0:
+                break
+            way = scratch.ways[c, rest]
+    scratch.sides[c] = sides
+    scratch.sees[c] = real(0.0)
+    wp.atomic_max(scratch.busy, 0, sides)
