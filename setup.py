@@ -38,6 +38,7 @@ LEARN = [*BODIES, *DRAWN, "zarr>=3.0"]
 STUDIES = LEARN
 SIM = ["gymnasium>=1.0", "mujoco==4.0.0"]
 FMI = ["pythonfmu3>=0.3.4"]
+GPU = ["warp-lang>=1.8"]
 VIEW = [*DRAWN, "viser>=1.1"]
 CLUSTER = ["distributed>=2024.8"]
 TEST_TOOLS = [
@@ -59,8 +60,9 @@ EXTRAS = {  # by what people do
     "view": VIEW,  # the page in the browser
     "sim": SIM,  # robots in simulators
     "fmi": FMI,  # soft skin as a unit for simulators that import FMI 3.0
+    "gpu": GPU,  # touches by kernels on a GPU
     "cluster": CLUSTER,  # data made on many machines
-    "dev": [*TEST_TOOLS, *STUDIES, *VIEW, *SIM, *FMI, *CLUSTER],
+    "dev": [*TEST_TOOLS, *STUDIES, *VIEW, *SIM, *FMI, *GPU, *CLUSTER],
     # only by name: their licences ask more than ours
     "smpl": ["smplx>=0.1.28", "torch>=2.4"],  # not for commerce
     "tetgen": ["tetgen>=0.6"],  # AGPL

@@ -13,6 +13,10 @@ ARGUMENTS = {
         PathJoinSubstitution([FindPackageShare("stmpl_ros"), "config", "stmpl.yaml"]), "YAML file of parameters"
     ),
     "autostart": ("true", "configure and activate without being asked"),
+    "part": ("", "part of the body that answers; empty: a forearm"),
+    "frame": ("body", "frame_id of the body"),
+    "use_sim_time": ("false", "time of /clock"),
+    "respawn": ("false", "start the node again when it ends"),
     "log_level": ("info", "of the node"),
 }  # fmt: skip
 
@@ -25,7 +29,11 @@ def generate_launch_description() -> LaunchDescription:
         arguments=["node", "--ros-args", "--log-level", LaunchConfiguration("log_level")],
         name="stmpl",
         namespace=LaunchConfiguration("namespace"),
-        parameters=[LaunchConfiguration("params"), {"autostart": LaunchConfiguration("autostart")}],
+        parameters=[
+            LaunchConfiguration("params"),
+            {name: LaunchConfiguration(name) for name in ("autostart", "part", "frame", "use_sim_time")},
+        ],
+        respawn=LaunchConfiguration("respawn"),
         output="screen",
     )
     declared = [DeclareLaunchArgument(k, default_value=v, description=text) for k, (v, text) in ARGUMENTS.items()]

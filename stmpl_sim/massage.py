@@ -217,7 +217,7 @@ class Log:
         return float((self.time[-1] + self.time[1]) / self.cpu_s.sum())
 
     def during(self, phase: Phase) -> np.ndarray:
-        """Which rows are judged of a phase, (N,): of a circle all, of others those from SETTLE_S after their start on."""
+        """Which rows are judged of a phase, (N,): all of a circle, of others those from SETTLE_S after their start."""
         late = 0.0 if phase.name == "circle" else min(SETTLE_S, 0.5 * phase.duration)
         return (self.time >= phase.start + late) & (self.time < phase.start + phase.duration)
 

@@ -62,6 +62,28 @@ def step(m: Any, d: Any, *skins: SoftBody) -> None:
     mujoco.mj_step2(m, d)
 
 
+def test_the_stiffness_of_a_contact_is_how_its_force_changes(simulator: Simulator) -> None:
+    m = model()
+    m.body("slab").quat[:] = Rotation.from_euler("xyz", [0.4, -0.3, 0.2]).as_quat(scalar_first=True)
+    d, step_m, rows = mujoco.MjData(m), 2e-5, []
+    skin = SoftBody(m, simulator, body="slab", tools=["ball"])
+    assert not skin.stiffness(d, "ball").any()
+    mujoco.mj_kinematics(m, d)
+    turn = d.body("slab").xmat.reshape(3, 3)
+    start = turn @ [0.003, -0.002, RADIUS - 0.002]
+    for way in np.vstack([np.zeros(3), np.eye(3), -np.eye(3)]):
+        d.qpos[:3] = start + step_m * way
+        skin.apply(d)
+        rows.append(skin.reaction.tools["ball"][:3].copy())  # type: ignore[union-attr]
+        if not way.any():
+            found = skin.stiffness(d, "ball")
+    expected = -(np.array(rows[1:4]) - rows[4:7]).T / (2 * step_m)
+    np.testing.assert_allclose(found, expected, atol=0.03 * np.abs(expected).max())
+    d.qpos[:3] = turn @ [0, 0, 0.1]
+    skin.apply(d)
+    assert not skin.stiffness(d, "ball").any()
+
+
 # The step: poses in, wrenches out
 
 

@@ -13,7 +13,7 @@ from stmpl_core.body import Body
 from stmpl_core.errors import InvalidInput
 from stmpl_core.methods import MomentNet
 from stmpl_core.skin import Skin
-from tests.scenes import LENGTH, RADIUS, at, ball, band, box, capsule, dented, limb, punch, tool
+from tests.scenes import LENGTH, RADIUS, at, ball, band, box, capsule, limb, punch, tool
 
 wp = pytest.importorskip("warp")
 wp.config.quiet = True
@@ -187,11 +187,3 @@ def test_what_does_not_fit_is_said(cylinder: Skin) -> None:
         batch.touch(np.zeros((2, 1, 7)), out=torch.zeros((2, 1, 6)))
     with pytest.raises(InvalidInput, match="out is numpy's"):
         batch.touch(np.zeros((2, 1, 7)), out=np.zeros((2, 1, 6)))
-
-
-def test_folds_are_not_served() -> None:
-    skin = Skin.of(dented(), MomentNet())
-    if not skin.near.folded:
-        pytest.skip("this dent does not come near itself")
-    with pytest.raises(InvalidInput, match="folds"):
-        made(skin, [LEFT], 2)
