@@ -4,7 +4,7 @@
     .venv/bin/python -m benchmarks.limbs --answers yours.py:answer  # and yours
     .venv/bin/python -m benchmarks.limbs --export DIR               # the scenes as STL and JSON, for any program
 
-benchmarks/limbs.md says what is in benchmarks/limbs_v2.npz. `answer(layer, tool, pose, way)` gets a SoftLayer, a Tool,
+benchmarks/limbs.md says what is in benchmarks/limbs_v3.npz. `answer(layer, tool, pose, way)` gets a SoftLayer, a Tool,
 its pose (4, 4) in the limb's frame and the unit vector (3,) along which it came there, and returns the force of the
 tool on the limb (3,) [N] and the motion of the skin (V, 3) [m], or None for the latter.
 """
@@ -35,11 +35,12 @@ from stmpl_core.simulator import Simulator
 from studies.own import own
 from studies.pressed import STRAIGHT, Pressed, pressed, seen, slant_of
 
-FILE = Path(__file__).with_name("limbs_v2.npz")
+FILE = Path(__file__).with_name("limbs_v3.npz")
 LIMBS = {  # rows of scenes: what splits, and how the limbs are called; a network may learn from others of "train"
     "arms and legs": (("test", "val"), ("arm", "leg", "drawn", "bare", "drum", "sheet", "even")),
     "backs": (("test", "val"), ("back",)),
     "forearm and thigh": (("held_out",), ("forearm", "thigh")),
+    "people": (("train", "val", "test"), ("living",)),  # the network that ships learnt from none of them
 }
 MOVES = 0.1  # motion that counts as such, over the peak
 Answer = Callable[[SoftLayer, Tool, np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray | None]]

@@ -44,12 +44,12 @@ def truncation_error(patch: Patch, u: np.ndarray) -> float:
 
 @njit(cache=True)
 def within(points, of, width):
-    """Numbers of points (N, 3) that are nearer than `width` to some others (M, 3) [m]."""
+    """Numbers of points (N, 3) that are nearer than their own width (N,) to some others (M, 3) [m]."""
     near = np.zeros(len(points), dtype=np.bool_)
     for k in range(len(points)):
         for n in range(len(of)):
             x, y, z = points[k, 0] - of[n, 0], points[k, 1] - of[n, 1], points[k, 2] - of[n, 2]
-            if x * x + y * y + z * z < width * width:
+            if x * x + y * y + z * z < width[k] * width[k]:
                 near[k] = True
                 break
     return np.flatnonzero(near)

@@ -25,7 +25,8 @@ from stmpl_core.load import Load
 from stmpl_core.methods.base import prepared
 from stmpl_core.trust import Displacement, Trust
 
-MIN_FOLD = 0.05  # smallest determinant of a wedge at rest, over its mean, that is meshed [-]
+MIN_FOLD = 0.02  # smallest determinant of a wedge at rest, over its mean, that is meshed [-]
+FOLDS_FROM = 2.5  # distance of a fold from the load, from which it is cut out, over the thickness under the load
 QUADRATIC_ABOVE = 0.42  # Poisson's ratio above which linear in plane locks: its largest error passes 3 % of the peak
 TWO_DEEP_ABOVE = 0.49  # Poisson's ratio above which one wedge leaves 2 % of the peak, two leave 0.2 %
 REFINED_WITHIN = 1.5  # thicknesses of the load; beyond, the layer's own mesh is fine enough
@@ -131,10 +132,12 @@ class PatchFem:
     def patch_around(self, vertices: np.ndarray, edge_length: EdgeLength | None = None) -> Patch:
         """Meshes everything within `reach` thicknesses of the given vertices of the layer.
 
-        Triangles are split in four up to `refine` times: near the vertices, or where `edge_length` asks for it.
+        Triangles are split in four up to `refine` times: near the vertices, or where `edge_length` asks for it. Where
+        the layer folds on itself, FOLDS_FROM thicknesses away or farther, a hole is left, held at its rim as the
+        patch is.
 
         Raises:
-            MeshError: the layer folds on itself in there; the message names the vertices.
+            MeshError: the layer folds on itself nearer than that; the message names the vertices.
         """
         layer = prepared(self._layer, self)
         thickness = float(layer.thickness[vertices].max())
@@ -142,8 +145,9 @@ class PatchFem:
         distance = dijkstra(self._graph, indices=vertices, min_only=True, limit=limit)
         inside = np.isfinite(distance)
         chosen_faces = _faces_of(layer.faces, inside)
-        self._refuse_folds(layer.faces[chosen_faces[self._folded[chosen_faces]]])
-        faces = layer.faces[chosen_faces].astype(np.int64)
+        folded = self._folded[chosen_faces]
+        self._refuse_folds(layer.faces[chosen_faces[folded]], distance, thickness)
+        faces = layer.faces[chosen_faces[~folded]].astype(np.int64)
         chosen, flat = np.unique(faces, return_inverse=True)
         outer, inner, triangles = layer.vertices[chosen], layer.inner_vertices[chosen], flat.reshape(-1, 3)
         away, splits = distance[chosen], []
@@ -165,18 +169,19 @@ class PatchFem:
         mesh = WedgeMesh.of(outer, inner, triangles, self.element_for(layer), ends=ends, ply_scale=scale)
         fixed, own = mesh.border_columns(), np.isin(chosen, layer.border)
         points = layer.vertices[chosen]
-        near = within(points, points[fixed[: len(chosen)] & ~own], 1.25 * float(layer.thickness.max()))
+        near = within(points, points[fixed[: len(chosen)] & ~own], 1.25 * layer.thickness[chosen])
         to_border = float(distance[chosen[own]].min(initial=np.inf))
         return Patch(chosen, mesh, fixed, distance[chosen], to_border, near, tuple(splits))
 
-    def _refuse_folds(self, folded: np.ndarray) -> None:
-        """Raises MeshError if there are such faces, (k, 3)."""
-        if len(folded):
-            bad = np.unique(folded)
+    def _refuse_folds(self, folded: np.ndarray, distance: np.ndarray, thickness: float) -> None:
+        """Raises MeshError if some of such faces, (k, 3), are near: distances from the load are (V,) [m]."""
+        near = min(self.reach, FOLDS_FROM)
+        bad = np.unique(folded[distance[folded].min(axis=1) < near * thickness])
+        if len(bad):
             raise MeshError(
-                f"the layer folds on itself below {len(bad)} vertices within {self.reach:g} thicknesses of the load: "
+                f"the layer folds on itself below {len(bad)} vertices within {near:g} thicknesses of the load: "
                 f"{', '.join(map(str, bad[:12]))}{', ...' if len(bad) > 12 else ''}. "
-                "Press elsewhere, lower reach, thin the layer there, coarsen the skin, or smooth it."
+                "Press elsewhere, thin the layer there, coarsen the skin, or smooth it."
             )
 
     def solve(self, load: Load) -> Displacement:
@@ -185,7 +190,7 @@ class PatchFem:
         Never raises for a load that has no solution: the answer then says converged False, and how far it came.
 
         Raises:
-            MeshError: the layer folds on itself within `reach` of the load.
+            MeshError: the layer folds on itself near the load (see patch_around).
         """
         layer = prepared(self._layer, self)
         load.check(layer)

@@ -160,9 +160,9 @@ TISSUE_BODIES = tuple(
 
 PEOPLE: tuple[tuple[str, float, float, str, Tone, float, float, float], ...] = (
     # name, weight, gender, part, tone, edge length [m], reach, share
-    ("upper_arm_1", 0.35, 0.0, "left_upper_arm", "relaxed", 8e-3, 4.5, 0.5),
-    ("upper_arm_2", 0.6, 1.0, "left_upper_arm", "relaxed", 8e-3, 4.5, 0.5),
-    ("upper_arm_3", 0.7, 0.3, "left_upper_arm", "tensed", 8e-3, 4.5, 0.5),
+    ("upper_arm_1", 0.35, 0.0, "left_upper_arm", "relaxed", 8e-3, 6.0, 1.0),
+    ("upper_arm_2", 0.6, 1.0, "left_upper_arm", "relaxed", 8e-3, 6.0, 1.0),
+    ("upper_arm_3", 0.7, 0.3, "left_upper_arm", "tensed", 8e-3, 6.0, 1.0),
     ("forearm_1", 0.3, 1.0, "left_forearm", "relaxed", 6e-3, 6.7, 0.5),
     ("forearm_2", 0.65, 0.0, "left_forearm", "relaxed", 7e-3, 6.7, 0.5),
     ("forearm_3", 0.5, 1.0, "left_forearm", "tensed", 6e-3, 6.7, 0.5),

@@ -90,7 +90,7 @@ class WarmPatchFem:
         Raises:
             NotPrepared: before `prepare`.
             InvalidInput: the load does not fit the layer.
-            MeshError: the layer folds on itself within `reach` and `slack` of the load.
+            MeshError: the layer folds on itself near the load (see PatchFem.patch_around).
         """
         layer = prepared(self._layer, self)
         loaded, pressure = load.check(layer).loaded, load.pressure_on(layer)

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from copy import copy
+from functools import cached_property
 from typing import NamedTuple
 
 import numba
@@ -113,13 +115,23 @@ class ContactNet:
             self._weights = shipped(self.network)
         return self._weights
 
+    @cached_property
+    def _network(self) -> tuple[np.ndarray, ...]:
+        return tuple(self.weights.arrays[name] for name in ARRAYS["pressure"])
+
+    def unlike(self, nodes: Nodes, forces: np.ndarray) -> float:
+        """|log| of the tissue's thickness under forces (N,) at nodes, over the limb's median; 0 of one material."""
+        if self._green is None:
+            return 0.0
+        return abs(math.log(float(forces @ nodes.thickness) / (float(forces.sum()) * self._green.thickness)))
+
     def look(self, nodes: Nodes) -> Look:
         """Solves the linear problem at the nodes, at least one, and gathers what the network reads."""
-        group = self.near.groups(nodes.corners[:, 0])
+        group, bent = self.near.groups(nodes.corners[:, 0]), self.near.bent_at(nodes.corners)
         if self._green is None:
-            return Look(*_look(*nodes[:7], group, self.near.bent, *self._table, self._moduli, self._nu))
+            return Look(*_look(*nodes[:7], group, bent, *self._table, self._moduli, self._nu))
         matrices = self._green.matrices(nodes, group)
-        return Look(*_look_on_stack(*nodes, group, self.near.bent, self._table.rows, self._nu, *matrices,
+        return Look(*_look_on_stack(*nodes, group, bent, self._table.rows, self._nu, *matrices,
                                     self._green.effective.thickness, self._green.numbers,
                                     *self._green.hardening))  # fmt: skip
 
@@ -128,7 +140,7 @@ class ContactNet:
         if not len(nodes.area):
             return NOTHING
         look = self.look(nodes)
-        corrected = _correct(*look[:3], *(self.weights.arrays[name] for name in ARRAYS["pressure"]))
+        corrected = _correct(*look[:3], *self._network)
         return Held(*corrected, look.power)
 
     def slopes(self, nodes: Nodes, strain_rates: np.ndarray, sinking_rates: np.ndarray) -> np.ndarray:
@@ -142,15 +154,14 @@ class ContactNet:
             strain_rates: rates of their strains in each of K ways, (K, N).
             sinking_rates: rates of their depths [m], or on a stack of `sinking`, likewise.
         """
-        group = self.near.groups(nodes.corners[:, 0])
-        network = tuple(self.weights.arrays[name] for name in ARRAYS["pressure"])
+        group, bent = self.near.groups(nodes.corners[:, 0]), self.near.bent_at(nodes.corners)
         rates = strain_rates, sinking_rates
         if self._green is None:
-            return _slopes(*nodes[:7], group, self.near.bent, *self._table, self._moduli, self._nu, *rates, *network)
+            return _slopes(*nodes[:7], group, bent, *self._table, self._moduli, self._nu, *rates, *self._network)
         matrices = self._green.matrices(nodes, group)
-        return _slopes_on_stack(*nodes, group, self.near.bent, self._table.rows, self._nu, *matrices,
+        return _slopes_on_stack(*nodes, group, bent, self._table.rows, self._nu, *matrices,
                                 self._green.effective.thickness, self._green.numbers, *self._green.hardening,
-                                *rates, *network)  # fmt: skip
+                                *rates, *self._network)  # fmt: skip
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from copy import copy
-from typing import NamedTuple, Self
+from typing import TYPE_CHECKING, NamedTuple, Self
 
 import numpy as np
 from scipy.spatial import KDTree
 
 from stmpl_core.layer import SoftLayer
+
+if TYPE_CHECKING:
+    from stmpl_core.bend import Bend
 
 STEEP = 0.25  # slope of the thickness from triangle to triangle; trained is up to 0.2
 STEEP_SHARE = 0.02  # share of what moves or presses that may be so steep
@@ -24,15 +27,15 @@ FACING = 1.5  # distance to skin that faces it, over t, below which a tool touch
 BENT_SHARE = 0.05  # share of the load that may be on skin that a bend spoils
 
 
-class Bend(NamedTuple):
-    """What joints did to a skin, vertex by vertex; as at rest where a vertex goes with one bone alone.
+class Bent(NamedTuple):
+    """What joints did to N vertices of a skin; as at rest where a vertex goes with one bone alone.
 
     Args:
-        fold: least fold ratio of the prisms around it (stmpl_core.extrusion), (V,) [-].
-        least, most: least and largest stretch of the triangles around it, (V,) [-].
-        curvature: least curvature of the skin times the thickness, (V,) [-]; below 0: concave; infinite where it is no
+        fold: least fold ratio of the prisms around it (stmpl_core.extrusion), (N,) [-].
+        least, most: least and largest stretch of the triangles around it, (N,) [-].
+        curvature: least curvature of the skin times the thickness, (N,) [-]; below 0: concave; infinite where it is no
             more hollow than at rest.
-        gap: distance over the thickness to skin that faces it through the air and did not at rest, (V,) [-]; 0 where
+        gap: distance over the thickness to skin that faces it through the air and did not at rest, (N,) [-]; 0 where
             they are inside each other.
     """
 
@@ -44,15 +47,14 @@ class Bend(NamedTuple):
 
     @property
     def spoilt(self) -> np.ndarray:
-        """Mask of the vertices where an answer is not to be believed, (V,)."""
+        """Mask of the vertices where an answer is not to be believed, (N,)."""
         stretched = (self.least < STRETCH[0]) | (self.most > STRETCH[1])
         return (self.fold < FOLD) | stretched | (self.curvature < HOLLOW) | (self.gap < FACING)
 
-    def of_force(self, loaded: np.ndarray, force: np.ndarray) -> list[str]:
-        """What a bend spoils under forces (L,) on vertices (L,), as sentences."""
+    def of_force(self, force: np.ndarray) -> list[str]:
+        """What a bend spoils under forces (N,) on these vertices, as sentences."""
         total, out = max(float(force.sum()), 1e-300), []
-        fold, least, most = self.fold[loaded], self.least[loaded], self.most[loaded]
-        curvature, gap = self.curvature[loaded], self.gap[loaded]
+        fold, least, most, curvature, gap = self
         for bad, sentence in (
             (fold < FOLD, f"its tissue folds (ratio {fold.min():.2g}, sound is from {FOLD:g} on)"),
             ((least < STRETCH[0]) | (most > STRETCH[1]), f"its skin is {least.min():.2g} to {most.max():.2g} times as "
@@ -93,7 +95,6 @@ class Soundness:
         """The same of a skin that joints have bent."""
         out = copy(self)
         out.bend = bend
-        out._doubtful = self._doubtful | bend.spoilt
         return out
 
     def of_mesh(self, steep: float, long: float, where: str) -> list[str]:
@@ -117,7 +118,7 @@ class Soundness:
 
     def of_contact(self, loaded: np.ndarray, force: np.ndarray) -> list[str]:
         """What is wrong with the skin under a tool that presses with forces (L,) on vertices (L,), as sentences."""
-        if not self._doubtful[loaded].any():
+        if self.bend is None and not self._doubtful[loaded].any():
             return []
         total = max(float(force.sum()), 1e-300)
         steep, long = (float(force[mask[loaded]].sum()) / total for mask in (self.steep, self.long))

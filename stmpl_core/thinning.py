@@ -94,8 +94,7 @@ class Thinning:
             return np.zeros(len(vertices), np.int64)
         last = self._grouped
         if last is None or not np.array_equal(last[0], vertices):
-            some, place = np.unique(vertices, return_inverse=True)  # nodes of a contact share vertices
-            last = self._grouped = vertices, _together(self.start, self.index, some, len(self._stands[0]))[place]
+            last = self._grouped = vertices, _together(self.start, self.index, vertices, len(self._stands[0]))
         return last[1]
 
     def bent(self) -> Thinning:
@@ -231,9 +230,9 @@ def _folded(start, index, some, points, normals, thickness, reach):
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _together(start, index, some, count):
-    """Numbers of groups of `some` vertices, each once, within each of which each is a neighbour of another."""
-    zones = (len(start) - 1) // count
+def _together(start, index, vertices, count):
+    """Numbers of groups of `vertices`, within each of which each is a neighbour of another; one may come twice."""
+    zones, some = (len(start) - 1) // count, np.unique(vertices)
     place, group, queue = np.full(count, -1), np.full(len(some), -1), np.empty(len(some), np.int64)
     for n in range(len(some)):
         place[some[n]] = n
@@ -254,7 +253,10 @@ def _together(start, index, some, count):
                     ends += 1
                     left -= 1
         groups += 1
-    return group
+    out = np.empty(len(vertices), np.int64)
+    for n in range(len(vertices)):
+        out[n] = group[place[vertices[n]]]
+    return out
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")

@@ -19,7 +19,7 @@ from stmpl_core.contact_net import MAX_LOG_RATIO, ContactNet
 from stmpl_core.errors import InvalidInput
 from stmpl_core.networks import NODE, PRESSURE, STACK_NODE, Weights
 from studies.flat import flat_rows
-from studies.judge_contact import bound_force
+from studies.judge_contact import UNEVEN, bound_force
 from studies.pressed import STRAIGHT, Rows, pressed, seen, slant_of
 from studies.train_moments import Layers, OnProgress, stacked, training_card
 
@@ -185,7 +185,7 @@ def train_contact(
     card["minutes"] = round((time.monotonic() - started) / 60, 1)
     weights = model.weights(card)
     if stacked(source):  # a stack's own network knows it better than one that never met it
-        card["bound"] = bound_force(_left_out(source, drawn, flat, settings, card, said))
+        card["bound"] = bound_force(_left_out(source, drawn, flat, settings, card, said), uneven=UNEVEN)
     else:
         card["bound"] = bound_force([(source.split("val", kind="indenter", sets=("tool",)), weights)])
     weights.save(out / f"{name}.safetensors")

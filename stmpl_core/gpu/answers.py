@@ -6,6 +6,7 @@ from typing import Any
 import warp as wp
 
 from stmpl_core import soundness, toucher
+from stmpl_core.gpu.hold import _wanted
 from stmpl_core.gpu.packs import BORDER_BIT, LONG_BIT, STEEP_BIT, OneSkin, Scratch, Skins
 from stmpl_core.gpu.places import APART, BY_POSE, DEEP, REFUSED, WRAPPED
 from stmpl_core.gpu.rays import FAR, OPTIONS, real, vec3
@@ -77,13 +78,12 @@ def group(many: wp.int32, skins: Skins, scratch: Scratch):
 
 
 @wp.func
-def _power(scratch: Scratch, one: OneSkin, s: wp.int32, many: wp.int32, k: wp.int32, linear_to: real) -> real:
+def _power(scratch: Scratch, one: OneSkin, s: wp.int32, many: wp.int32, k: wp.int32) -> real:
     """Power of the depth with which the force of a tool's group grows."""
     deepest, found, force = real(0.0), real(0.0), real(0.0)
     for i in range(scratch.nodes[s]):
         if scratch.group[s * many + scratch.tool[s, i]] == scratch.group[s * many + k]:
-            depth = wp.min(scratch.strain[s, i], linear_to) * scratch.thick[s, i] / one.thickest
-            deepest = wp.max(deepest, depth)
+            deepest = wp.max(deepest, _wanted(scratch, one, s, i))
             found += scratch.found_power[s, i]
             force += scratch.force[s, i]
     return deepest * found / wp.max(force, NONE)
@@ -103,13 +103,13 @@ def _scene_status(scratch: Scratch, s: wp.int32, many: wp.int32) -> wp.int32:
 
 @wp.struct
 class Known:
-    """What the network's card says: factor and power of the bound, largest pressure over E and depth that it learnt."""
+    """Of a network's card: factor and power of the bound and what uneven limbs add, largest p/E and depth learnt."""
 
     scale: real
     power: real
+    uneven: real
     pressure: real
     depth: real
-    linear_to: real
 
 
 @wp.kernel
@@ -147,7 +147,7 @@ def answer(first: wp.int32, many: wp.int32, known: Known, skins: Skins, scratch:
         return
     force, torque, forces, strange, doubt = vec3(), vec3(), real(0.0), real(0.0), real(0.0)
     steep, long, border, highest = real(0.0), real(0.0), real(0.0), real(0.0)
-    depth, thick, count = real(scratch.deep[c]), real(0.0), real(0.0)
+    depth, thick, count, carried = real(scratch.deep[c]), real(0.0), real(0.0), real(0.0)
     for i in range(scratch.nodes[s]):
         if scratch.tool[s, i] == k:
             here, corners = scratch.pressure[s, i] * scratch.area[s, i], skins.faces[scratch.face[s, i]]
@@ -167,14 +167,18 @@ def answer(first: wp.int32, many: wp.int32, known: Known, skins: Skins, scratch:
             doubt += scratch.error[s, i] * scratch.area[s, i]
             depth = wp.max(depth, scratch.strain[s, i] * scratch.thick[s, i])
             thick += scratch.thick[s, i]
+            carried += here * scratch.thick[s, i]
             count += real(1.0)
             highest = wp.max(highest, scratch.highest[s, i])
     size = wp.length(force)
-    power = _power(scratch, one, s, many, k, known.linear_to)
+    power = _power(scratch, one, s, many, k)
     doubt = doubt / wp.max(size, NONE) + power * grid.surface_error / wp.max(depth, grid.surface_error)
+    if one.stacked == 1 and forces > real(0.0):
+        unlike = known.uneven * wp.log(carried / (forces * one.flat))
+        doubt = wp.sqrt(doubt * doubt + unlike * unlike)
     sound = steep <= STEEP_SHARE * forces and long <= LONG_SHARE * forces and border <= BORDER_SHARE * forces
-    sound = sound and highest <= known.pressure and depth * count <= known.depth * thick and one.learnt == 1
-    sound = sound and strange <= UNSEEN * forces
+    sound = sound and one.softness * highest <= known.pressure and depth * count <= known.depth * thick
+    sound = sound and strange <= UNSEEN * forces and one.learnt == 1
     thinnest = skins.thinnest[k]
     if thinnest < THIN * one.edge and depth > SUNK * thinnest:
         sound = False

@@ -100,9 +100,11 @@ class MomentNet:
             InvalidInput, MeshError: a stack's skin that cannot be meshed coarsely.
         """
         self._near = near = Surroundings.of(layer)
-        self._shape = np.concatenate([near.curvature, near.slope], axis=1).astype(np.float32)
-        self._frames = near.frames.astype(np.float32) * near.thickness[:, None, None].astype(np.float32)
-        self._width = EDGE_OVER_ROOT_AREA * np.sqrt(layer.vertex_areas) / near.thickness
+        many = len(near.thickness)
+        self._shape, self._frames = np.empty((many, 5), np.float32), np.empty((many, 3, 3), np.float32)
+        self._width = np.empty(many)
+        _take_shape(near.curvature, near.slope, near.frames, near.thickness, layer.vertex_areas, self._shape,
+                    self._frames, self._width)  # fmt: skip
         self._layer, self._green, self._unit = layer, None, layer.tissue
         if layer.stacked:
             self._green = Green.of(layer)
@@ -228,6 +230,18 @@ def unit_of(green: Green) -> Tissue:
 def take_linear(figures: np.ndarray, near: Surroundings, vertices: np.ndarray, motion: np.ndarray) -> float:
     """Writes a linear response (V, 3) [m] into the figures (N, 2, WIDTH) of vertices (N,), and says its peak [m]."""
     return _take_linear(figures, near.frames, near.thickness, vertices, motion)
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _take_shape(curvature, slope, frames, thickness, areas, shape, lengths, width):
+    """Curvature and slope, (V, 5); frames times the thickness, (V, 3, 3); edges over it, (V,): of a skin's vertices."""
+    for v in range(len(thickness)):
+        for x in range(3):
+            shape[v, x] = curvature[v, x]
+            for y in range(3):
+                lengths[v, x, y] = np.float32(frames[v, x, y]) * np.float32(thickness[v])
+        shape[v, 3], shape[v, 4] = slope[v, 0], slope[v, 1]
+        width[v] = EDGE_OVER_ROOT_AREA * np.sqrt(areas[v]) / thickness[v]
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
