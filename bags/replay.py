@@ -109,7 +109,7 @@ def replay(run: Path | str | Run, method: Method, *, every: int = 1) -> Iterator
         simulator.move_to(simulator.skin.at_angles(frame.joints))
         contacts, after = run.contacts(frame), None
         if frame.state:
-            touches, after = simulator.touch(contacts, State.unpack(frame.state), frame.dt)
+            touches, after = simulator.touch(contacts, State.unpack(frame.state, frame.joints), frame.dt)
             answer = simulator.answer(touches)
         else:
             answer = simulator.step(contacts)

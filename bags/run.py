@@ -62,7 +62,7 @@ class Run(Bag):
         """The contacts that `frame` answers: of each of its tools the pose and the wrench that it names.
 
         Raises:
-            BagError: a pose, a wrench or a mesh that it answers is not in the bag.
+            BagError: a pose, a wrench or a mesh that it answers is not in the bag, or in a frame of /tf.
         """
         return [self._contact(tool, *stamps) for tool, stamps in frame.inputs.items()]
 
@@ -78,8 +78,10 @@ class Run(Bag):
         try:
             return contact_from(known, pose, wrench, body_frame=self.body_frame, frames=frames)
         except FrameError as error:
-            raise BagError(f"{error} The recording carries the frames of stmpl record --frames, and none that "
-                           "move (/tf).") from error  # fmt: skip
+            raise BagError(f"an answer to tool {tool} at {posed * NANO:.3f} s cannot be repeated offline: "
+                           f"{str(error).partition('. ')[0].rstrip('.')}. A recording carries the table of "
+                           "stmpl record --frames; what /tf said, only a node finds out: stmpl replay --publish "
+                           "sends it one.") from error  # fmt: skip
 
     def _told_at(self, tool: str, kind: str, stamp: int) -> Any | None:
         record = self._sent.get((tool, kind), {}).get(stamp)

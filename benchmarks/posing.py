@@ -1,6 +1,7 @@
 """A limb that moves: how long a pose takes beside a running contact loop, and how far off a bent limb's answers are.
 
     .venv/bin/python -m benchmarks.posing           # time; set OMP_NUM_THREADS=1 NUMBA_NUM_THREADS=1
+    .venv/bin/python -m benchmarks.posing --against OTHER   # the same beside another checkout's, by turns
     .venv/bin/python -m benchmarks.posing --fem     # against finite elements on the bent skin; about ten minutes
     .venv/bin/python -m benchmarks.posing --fem --living     # the same of skin, fat and muscle down to the bones
 
@@ -12,7 +13,12 @@ bound": the posed skin's force or motion is further off than it says.
 from __future__ import annotations
 
 import argparse
+import os
+import re
+import subprocess
+import sys
 import time
+from pathlib import Path
 
 import numpy as np
 
@@ -31,7 +37,10 @@ PART, JOINT = "left_arm", "left_elbow"
 RADIUS, SUBDIVISIONS = 0.012, 3  # of the ball [m], and of its mesh
 DEEP = 0.25  # depth of the ball over the thickness
 BENDS = (0, 30, 60, 90)  # degrees
-JOINT_RATE, LOOP_RATE, SECONDS = 60.0, 200.0, 20.0  # of the timed loop [Hz], [s]
+JOINT_RATE, LOOP_RATE, SECONDS = 60.0, 200.0, 5.0  # of the timed loop [Hz], [s]
+ALONE = 200  # poses that are timed with nothing between them
+TURNS = 3  # runs of each checkout, by turns
+ROOT = Path(__file__).parents[1]
 
 
 def arm(edge: float = 3e-3, stack: bool = False) -> tuple[SoftLayer, Rig]:
@@ -129,7 +138,11 @@ def times(stack: bool) -> None:
     place, cpu = sites(layer, rig)["forearm"], time.thread_time
     skin.posed({JOINT: 0.1})
     simulator, state = Simulator(skin, friction=0.3), State()
-    posed, touched, fields, late, last = [], [], [], [], -1.0
+    alone, posed, touched, fields, late, last = [], [], [], [], [], -1.0
+    for step in range(ALONE):
+        before = cpu()
+        simulator.pose({JOINT: 0.5 + 0.5 * np.sin(step / JOINT_RATE)})
+        alone.append(cpu() - before)
     start = now()
     for step in range(int(SECONDS * LOOP_RATE)):
         t = step / LOOP_RATE
@@ -153,8 +166,27 @@ def times(stack: bool) -> None:
     print(f"{len(layer.vertices)} vertices; {JOINT_RATE:g} Hz of joints, {LOOP_RATE:g} Hz of touches with friction and "
           f"{LOOP_RATE / 2:g} Hz of fields for {SECONDS:g} s, one thread. Processor time [ms], last row wall: median, "
           "p99, largest")  # fmt: skip
-    for name, some in {"pose": posed, "reaction": touched, "field": fields, "end of step, late by": late}.items():
+    rows = {"pose, nothing between": alone, "pose": posed, "reaction": touched, "field": fields}
+    for name, some in (rows | {"end of step, late by": late}).items():
         print(f"  {name:34} {1e3 * np.median(some):6.2f} {1e3 * np.quantile(some, 0.99):6.2f} {1e3 * max(some):6.2f}")
+
+
+def side_by_side(other: Path, stack: bool) -> None:
+    """Prints what this and another checkout take, by turns, and the ratio: median over the turns of the medians."""
+    found: dict[str, tuple[list[float], list[float]]] = {}
+    for _ in range(TURNS):
+        for number, root in enumerate((other.resolve(), ROOT)):
+            print(f"load {os.getloadavg()[0]:.1f}; {root}", flush=True)
+            said = subprocess.run([sys.executable, "-m", "benchmarks.posing", *["--living"][: int(stack)]], cwd=root,
+                                  env=os.environ | {"PYTHONPATH": str(root)}, check=True, capture_output=True,
+                                  text=True).stdout  # fmt: skip
+            for name, median in re.findall(r"^  (\S.*?) {2,}(\d+\.\d+)", said, re.MULTILINE):
+                found.setdefault(name, ([], []))[number].append(float(median))
+    print("processor time [ms], median of the turns' medians: other, this, this over other")
+    for name, (before, after) in found.items():
+        if before and after and not name.startswith("end of step"):
+            print(f"  {name:34} {np.median(before):6.2f} {np.median(after):6.2f} "
+                  f"{np.median(np.divide(after, before)):6.2f}")  # fmt: skip
 
 
 def main() -> None:
@@ -163,8 +195,11 @@ def main() -> None:
     options.add_argument("--fem", action="store_true", help="errors against finite elements instead of times")
     options.add_argument("--living", action="store_true", help="skin, fat and muscle down to the bones")
     options.add_argument("--bends", type=int, nargs="+", default=BENDS, help="angles of the elbow from rest [degrees]")
+    options.add_argument("--against", type=Path, help="another checkout, to be timed by turns with this one")
     given = options.parse_args()
-    if given.fem:
+    if given.against:
+        side_by_side(given.against, given.living)
+    elif given.fem:
         compare(6e-3 if given.living else 4e-3, given.living, tuple(given.bends), 3.0 if given.living else 4.0)
     else:
         times(given.living)

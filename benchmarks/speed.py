@@ -193,39 +193,6 @@ def limit() -> str:
             f"{NODES} nodes): {1e3 * flops / peak:.3f} ms at the {peak / 1e9:.0f} GFLOP/s that this core reached.")
 
 
-def batches(seconds: float = 3.0) -> list[str]:
-    """Touches a second that Batch does on one thread and on all cores, one ball in each scene, as table rows."""
-    from benchmarks.tools import ball
-    from fem_tools.scenes import Site
-    from stmpl_core.batch import Batch
-    from stmpl_core.body import Body
-    from stmpl_core.living import living
-    from stmpl_core.methods import MomentNet
-    from stmpl_core.skin import Skin
-
-    out, cores, n = [], len(os.sched_getaffinity(0)), 256
-    layers = {"paper's arm": Body.anny().part("left_arm", edge_length=3e-3, thickness=7.5e-3),
-              "forearm as measured": living(Body.anny(), "left_forearm", edge_length=3e-3)}  # fmt: skip
-    for name, layer in layers.items():
-        skin, site, rng = Skin.of(layer, MomentNet()), Site(layer), np.random.default_rng(0)
-        vertices = rng.choice(np.flatnonzero(site.border_distance > 0.5 * site.border_distance.max()), n)
-        poses = np.tile(np.eye(4), (n, 1, 1, 1))
-        for k, v in enumerate(vertices):
-            poses[k, 0] = site.standing(int(v), 10e-3, 0.0)
-            poses[k, 0, :3, 3] -= DEPTH * layer.thickness[v] * poses[k, 0, :3, 2]
-        cells = []
-        for threads in dict.fromkeys((1, cores)):
-            batch = Batch(skin, [ball(12)], n, threads=threads)
-            batch.touch(poses)
-            start, done = time.perf_counter(), 0
-            while time.perf_counter() - start < seconds:
-                batch.touch(poses)
-                done += n
-            cells.append(f"{done / (time.perf_counter() - start):,.0f} on {threads}")
-        out.append(f"| {name} | " + " | ".join(cells) + " |")
-    return out
-
-
 def main() -> None:
     """Measures and prints."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -238,7 +205,7 @@ def main() -> None:
         return
     trees = [*([given.against.resolve()] if given.against else []), HERE.parents[1]]
     print("\n".join(table(measure(trees, given.rounds))))
-    print(f"\n{limit()}\n\nTouches a second of Batch, by threads:\n" + "\n".join(batches()))
+    print(f"\n{limit()}")
 
 
 if __name__ == "__main__":

@@ -6,12 +6,14 @@ friction feels a tool's way along the skin, not through space, and a tool that r
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from stmpl_core.arrays import Transform
+from stmpl_core.errors import InvalidInput
 from stmpl_core.state import Memory, State
 from stmpl_core.wake import carried_trail
 
@@ -19,11 +21,34 @@ if TYPE_CHECKING:
     from stmpl_core.skin import Skin
 
 
-def carried(state: State, before: Skin, after: Skin) -> State:
-    """The memory of tissue that its joints took from one pose of its skin to another."""
-    if not state.tools:
+def carried(state: State, skin: Skin, after: Skin) -> State:
+    """The memory of tissue where its joints took it, from wherever they were when it was told.
+
+    Args:
+        state: memory.
+        skin: same skin, most likely where it was told: elsewhere it costs a pose.
+        after: same skin where it is now.
+
+    Raises:
+        InvalidInput: a memory that does not say where its joints were, or of other joints, or beyond their limits.
+    """
+    if state.joints == after.angles:
         return state
-    return State({name: _memory(memory, before, after) for name, memory in state.tools.items()})
+    if not state.tools:
+        return replace(state, joints=after.angles)
+    rig = (after.rest or after).layer.rig
+    if state.joints is None:
+        if rig is None:
+            return replace(state, joints=())
+        raise InvalidInput("this state of a skin with joints does not say where its joints were. Try "
+                           "State.unpack(packed, joints=...) with the angles that it was recorded at.")  # fmt: skip
+    names = () if rig is None else rig.names
+    if state.joints and len(state.joints) != len(names):
+        many = len(state.joints)
+        raise InvalidInput(f"this state was told at {many} joint{'s' * (many > 1)}; this skin has "
+                           f"{', '.join(names) or 'none'}. Try an empty State().")  # fmt: skip
+    before = skin if skin.angles == state.joints else skin.posed(dict(zip(names, state.joints, strict=False)))
+    return State({name: _memory(memory, before, after) for name, memory in state.tools.items()}, after.angles)
 
 
 def carry_at(before: Skin, after: Skin, place: np.ndarray) -> Transform:

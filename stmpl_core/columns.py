@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from copy import copy
 from functools import cached_property
 from typing import Any, NamedTuple
@@ -130,7 +131,7 @@ class Columns:
         covered = near[least < HOLE_RADIUS * self.layer.edge_length]
         if not len(covered):
             return NO_SQUEEZE
-        wall = WALL * float(self.layer.thickness[covered].mean())
+        wall = WALL * (float(self.layer.thickness[covered].sum()) / len(covered))
         under = float((-least - np.maximum(-above, 0.0)).max()) / wall
         sunk = under > LEAST_UNDER
         grid, skin = grid_of(field), (self.points, self.inward, self.layer.thickness, self.faces)
@@ -167,11 +168,11 @@ def _sinking(grid: tuple, pose: Transform, nodes: Nodes) -> np.ndarray:
     """
     depth = nodes.strain * nodes.thickness
     mean = (nodes.area * depth) @ nodes.inward
-    size = float(np.linalg.norm(mean))
+    size = math.sqrt(mean @ mean)
     if size <= MIN_ONE_WAY_SHARE * float(nodes.area @ depth):
         return depth
     cosine = nodes.inward @ (mean / size)
-    way = np.tile(mean / size, (len(depth), 1))
+    way = np.full((len(depth), 3), mean / size)
     return np.minimum(_depths_along(grid, pose, nodes.points, way, np.maximum(depth * cosine, 1e-9)) * cosine, depth)
 
 

@@ -33,9 +33,11 @@ from stmpl_core.touch import APART, MIN_ONE_WAY_SHARE, Imprint, Pressed, Slip, T
 from stmpl_core.toucher import Toucher
 
 ROUGH = 0.12  # error of the relaxed force, over what has relaxed: 5.4 of 45 % in trials where only the shear relaxes
+PILED = 0.5  # of drag^2 / force: error of skin that piles up; 0.7 of it on a back, where the elastic bound was 0.45
 HELD_OFF = 0.01  # relative error of the elastic force by wrench, from which it is asked for again
 GIVEN_BACK = 0.7  # share of what an elastic contact gives back that must be covered by what was put in
 KEPT = 1.5  # work beyond what elastic skin could hold that is forgotten: what was lost before pays for nothing now
+WEAKEST = 1e-12  # factor on a wrench that has nothing left to give: by 0 nobody could divide to find how it is pressed
 NOTHING = np.zeros(3)
 
 
@@ -141,8 +143,12 @@ class History:
         """Touches of contacts with names of their own, dt [s] after a state; and the state then.
 
         Raises:
-            InvalidInput: a state of skin that relaxes in another number of times.
+            InvalidInput: a state of skin that relaxes in another number of times, or whose joints were elsewhere.
         """
+        here = self.toucher.joints
+        if state.tools and state.joints != here:
+            raise InvalidInput(f"the skin's joints are at {here} rad, the state was told at {state.joints}. Try "
+                               "Simulator.touch, which takes it along.")  # fmt: skip
         for name, memory in state.tools.items():
             if len(memory.relaxed) != len(self.series.times):
                 raise InvalidInput(f"the state of {name} is of skin with {len(memory.relaxed)} times of relaxation; "
@@ -162,7 +168,7 @@ class History:
                 left = self._left(memory, dt)
                 if left.scalars.sunk or left.trail.any():
                     memories[name] = left
-        return out, State(memories)
+        return out, State(memories, here)
 
     def _asked(self, contact: Contact, before: Memory | None, dt: float) -> _Asked:
         """What the contact law is asked for a contact."""
@@ -256,6 +262,10 @@ class History:
         springs = NOTHING, one.before.springs, one.before.springs_relaxed
         if self.friction(touch.name) > 0 and net > MIN_ONE_WAY_SHARE:
             dragged = self._dragged(one, wrench, contact, pose[:3, 3], scalars, force, lever, thickness, dt)
+            if self.toucher.layer.tissue.skin is not None:
+                rubs = dragged.slip.wrench[:3]
+                piled = PILED * float(rubs @ rubs) / math.sqrt(wrench[:3] @ wrench[:3])
+                changed["force_bound"] = changed.get("force_bound", touch.force_bound) + piled
             wrench = wrench + dragged.slip.wrench
             changed |= {"wrench": wrench, "slip": dragged.slip}
             stored, whole = stored + dragged.stored, whole + 2 * dragged.stored
@@ -452,12 +462,13 @@ def _balanced(asked: Sequence[_Asked], laws: Sequence[_Law]) -> tuple[list[Touch
     for one, law, work in zip(asked, laws, works, strict=True):
         touch, memory, passive = law.touch, law.memory, 1.0
         if law.stored > 0:
-            passive = min(1.0, max(work / (GIVEN_BACK * law.stored), together if len(laws) > 1 else 0.0, 0.0))
+            passive = min(1.0, max(work / (GIVEN_BACK * law.stored), together if len(laws) > 1 else 0.0, WEAKEST))
             if passive < 1:
                 at_rest = one.before.scalars.work + 0.5 * float(one.before.wrench @ one.twist)
                 given = 0.5 * float(memory.wrench @ one.twist)
                 if len(laws) == 1 and at_rest + passive * given < 0 and given < 0:
-                    passive = max(-at_rest / given, 0.0)
+                    passive = -at_rest / given
+                passive = max(passive, WEAKEST)
                 work = at_rest + passive * given
                 touch = _weakened(touch, passive)
                 memory = memory._replace(wrench=touch.wrench)

@@ -100,8 +100,7 @@ class SoftLayer:
         given["tissue"] = replace(given["tissue"], **material)
         return SoftLayer(**given)
 
-    def moved(self, vertices: Points, core: Points | None, face_area_vectors: Points,
-              vertex_area_vectors: VertexVectors, vertex_areas: PerVertex,
+    def moved(self, vertices: Points, core: Points | None, vertex_area_vectors: VertexVectors, vertex_areas: PerVertex,
               normals: VertexVectors) -> SoftLayer:  # fmt: skip
         """The same layer whose skin is elsewhere now, as joints take it: nothing is checked, nothing found again.
 
@@ -110,13 +109,14 @@ class SoftLayer:
         Args:
             vertices: positions of the skin, (V, 3) [m].
             core: likewise of the core; None where there is none.
-            face_area_vectors, vertex_area_vectors, vertex_areas, normals: see the properties.
+            vertex_area_vectors, vertex_areas, normals: see the properties.
         """
         out = copy(self)
-        out.__dict__.pop("inner_vertices", None)
+        for name in ("inner_vertices", "face_area_vectors"):
+            out.__dict__.pop(name, None)
         out.__dict__ |= {"edges": self.edges, "edge_length": self.edge_length, "border": self.border,
-                         "face_area_vectors": face_area_vectors, "vertex_area_vectors": vertex_area_vectors,
-                         "vertex_areas": vertex_areas, "normals": normals}  # fmt: skip
+                         "vertex_area_vectors": vertex_area_vectors, "vertex_areas": vertex_areas,
+                         "normals": normals}  # fmt: skip
         out.vertices, out.core, out.chart, out.rig = vertices, core, None, None  # a rig knows the rest alone
         if core is not None:
             out.thickness = out._depth_of_core()

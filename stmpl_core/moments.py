@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from contextlib import nullcontext
 from copy import copy
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 from weakref import WeakKeyDictionary
 
 import numba
@@ -25,8 +25,11 @@ from stmpl_core.response import (
     sink_between,
     spread_sinking,
 )
-from stmpl_core.soundness import Bend, Soundness
+from stmpl_core.soundness import Soundness
 from stmpl_core.thinning import SPACINGS, STACK_SPACINGS, STACK_ZONES, ZONES, Asked, Thinning
+
+if TYPE_CHECKING:
+    from stmpl_core.bend import Bend
 
 FIRST_SPREAD = float(SPREADS[0])
 WIDEST = 3.0  # distance over the thickness to which neighbours say how a place is curved
@@ -80,7 +83,6 @@ class Surroundings:
         frames: tangent, tangent, outward normal of each vertex, (V, 3, 3) [-].
         curvature: thickness times the skin's curvature in the tangents, xx, xy, yy, (V, 3) [-]; convex is positive.
         slope: gradient of the thickness along the tangents, (V, 2) [-].
-        bent: both in the layer's axes, a (3, 3) tensor and a vector, (V, 12) [-].
         sound: where the layer is as the networks know skin.
     """
 
@@ -99,7 +101,7 @@ class Surroundings:
         tangents, (xx, xy, yy) = self.frames[:, :2], self.curvature.T
         own = np.stack([xx, xy, xy, yy], axis=1).reshape(-1, 2, 2)
         bend, slope = tangents.transpose(0, 2, 1) @ own @ tangents, np.einsum("va,vax->vx", self.slope, tangents)
-        self.bent = np.concatenate([bend.reshape(-1, 9), slope], axis=1)
+        self._bent, self._posed = np.concatenate([bend.reshape(-1, 9), slope], axis=1), False
         table = response_table(layer.tissue, float(layer.thickness[0]))
         self._response = np.ascontiguousarray(np.moveaxis(table, 2, 0))
         self._felt(np.zeros((1, 1)), np.zeros(1, np.int64), np.zeros(1, np.int32), moments=True)  # compiled now
@@ -167,12 +169,20 @@ class Surroundings:
         out = copy(self)
         out.frames, out.curvature, out.sound = frames, curvature, self.sound.at(bend)
         out._thinning = self._thinning.bent()
-        out._frames = frames.astype(np.float32)
-        out._sites = self._sites.copy()
-        _move_sites(layer.vertices, layer.normals, layer.vertex_areas, out._sites)
-        out.bent = np.empty((len(frames), 12))
-        _bent(frames, curvature, self.slope, out.bent)
+        out._frames, out._sites = np.empty_like(self._frames), self._sites.copy()
+        _move(layer.vertices, layer.vertex_areas, frames, out._frames, out._sites)
+        out._bent, out._posed = np.empty((len(frames), 12)), True
         return out
+
+    def bent_at(self, vertices: np.ndarray) -> np.ndarray:
+        """Curvature, a (3, 3) tensor, and slope in the layer's axes, (V, 12) [-], right at the vertices that are named.
+
+        Args:
+            vertices: numbers of vertices, of any shape; what joints took elsewhere is turned there alone.
+        """
+        if self._posed:
+            _turn_bent(vertices.ravel(), self.frames, self.curvature, self.slope, self._bent)
+        return self._bent
 
     @classmethod
     def of(cls, layer: SoftLayer) -> Surroundings:
@@ -256,18 +266,33 @@ def _sites(points: np.ndarray, normals: np.ndarray, thickness: np.ndarray, area:
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _move_sites(points, normals, area, out):
-    """Writes to `out` what of _sites moves with the skin; its thickness stays."""
-    middle = np.zeros(3)
-    for x in range(3):
-        for v in range(len(points)):
-            middle[x] += points[v, x]
-        middle[x] /= len(points)
+def _move(points, areas, frames, narrow, sites):
+    """Writes frames as float32, and what of _sites moves with the skin; the thickness stays."""
+    m0 = m1 = m2 = 0.0
     for v in range(len(points)):
+        m0, m1, m2 = m0 + points[v, 0], m1 + points[v, 1], m2 + points[v, 2]
+    m0, m1, m2 = m0 / len(points), m1 / len(points), m2 / len(points)
+    for v in range(len(points)):
+        sites[0, v], sites[1, v], sites[2, v] = points[v, 0] - m0, points[v, 1] - m1, points[v, 2] - m2
+        sites[4, v] = areas[v]
+        sites[6, v] = np.log(SPREAD * np.sqrt(areas[v]) / FIRST_SPREAD) - sites[5, v]
         for x in range(3):
-            out[x, v], out[7 + x, v] = points[v, x] - middle[x], normals[v, x]
-        out[4, v] = area[v]
-        out[6, v] = np.log(SPREAD * np.sqrt(area[v]) / FIRST_SPREAD) - out[5, v]
+            sites[7 + x, v] = frames[v, 2, x]
+            for a in range(3):
+                narrow[v, a, x] = frames[v, a, x]
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _turn_bent(vertices, frames, curvature, slope, out):
+    """Writes Surroundings.bent_at at vertices."""
+    for v in vertices:
+        xx, xy, yy = curvature[v, 0], curvature[v, 1], curvature[v, 2]
+        for x in range(3):
+            a, b = frames[v, 0, x], frames[v, 1, x]
+            left, right = a * xx + b * xy, a * xy + b * yy
+            for y in range(3):
+                out[v, 3 * x + y] = left * frames[v, 0, y] + right * frames[v, 1, y]
+            out[v, 9 + x] = slope[v, 0] * a + slope[v, 1] * b
 
 
 def _frames(normals: np.ndarray) -> np.ndarray:
@@ -276,19 +301,6 @@ def _frames(normals: np.ndarray) -> np.ndarray:
     first = np.cross(normals, least)
     first /= np.linalg.norm(first, axis=1, keepdims=True)
     return np.stack([first, np.cross(normals, first), normals], axis=1)
-
-
-@numba.njit(cache=True, nogil=True, error_model="numpy")
-def _bent(frames, curvature, slope, out):
-    """Curvature and slope in the layer's axes, (V, 12); see Surroundings.bent."""
-    for v in range(len(frames)):
-        xx, xy, yy = curvature[v, 0], curvature[v, 1], curvature[v, 2]
-        for x in range(3):
-            a, b = frames[v, 0, x], frames[v, 1, x]
-            left, right = a * xx + b * xy, a * xy + b * yy
-            for y in range(3):
-                out[v, 3 * x + y] = left * frames[v, 0, y] + right * frames[v, 1, y]
-            out[v, 9 + x] = slope[v, 0] * a + slope[v, 1] * b
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy", inline="always")

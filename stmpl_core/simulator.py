@@ -86,10 +86,11 @@ class Simulator:
 
         Args:
             joints: angle by the joint's name [rad]; those that are not given are at rest.
-            state: memory of the tissue where the joints were; what is returned has gone along with the skin.
+            state: memory of the tissue; what is returned has gone along with the skin.
 
         Raises:
-            InvalidInput: a skin without joints, an unknown one, or an angle that is not finite or beyond its limits.
+            InvalidInput: a skin without joints, an unknown one, an angle that is not finite or beyond its limits, or a
+                state of other joints.
         """
         return self.move_to(self.skin.posed(joints), state)
 
@@ -106,19 +107,20 @@ class Simulator:
         """As `pose`, to this skin as it is posed elsewhere; another simulator of it may be there already.
 
         Raises:
-            InvalidInput: another skin.
+            InvalidInput: another skin, or a state of other joints.
         """
         before = self.skin
         if (skin.rest or skin) is not (before.rest or before):
             raise InvalidInput("this is another skin, not this one where its joints took it. Try Simulator(skin).")
+        after = None if state is None else carried(state, before, skin)
         if skin is before:
-            return state
+            return after
         self._stand_on(skin)
         tools = self.tools
         self.toucher = self.toucher.moved(skin)
         self.toucher.tools = tools
         self.history = self.history.moved(self.toucher)
-        return None if state is None else carried(state, before, skin)
+        return after
 
     @property
     def tools(self) -> Tools:
@@ -138,12 +140,12 @@ class Simulator:
 
         Args:
             contacts: tools at one instant, each once.
-            state: memory of the steps before, empty at the beginning; None: elastic skin without friction, as if
-                nothing had been before, and no state is returned.
+            state: memory of the steps before, empty at the beginning, which goes along with the skin if its joints were
+                elsewhere; None: elastic skin without friction, as if nothing had been before, and no state is returned.
             dt: time since that state [s].
 
         Raises:
-            InvalidInput: two contacts of one name, a dt below 0 or not finite, or a state of other skin.
+            InvalidInput: two contacts of one name, a dt below 0 or not finite, or a state of other skin or joints.
             MeshError: a tool's surface that cannot be used.
         """
         names = [contact.name for contact in contacts]
@@ -151,7 +153,9 @@ class Simulator:
             raise InvalidInput(f"contacts must have names of their own; got {', '.join(names)}.")
         if not 0 <= dt < np.inf:
             raise InvalidInput(f"dt is {dt} s; time goes forward, allowed is 0 or more, and finite.")
-        return self.toucher.touch_all(contacts) if state is None else self.history.step(contacts, state, dt)
+        if state is None:
+            return self.toucher.touch_all(contacts)
+        return self.history.step(contacts, carried(state, self.skin, self.skin), dt)
 
     def answer(self, touches: Sequence[Touch]) -> Answer:
         """Finds the displacement of the skin under touches of this simulator, made where its joints are now."""

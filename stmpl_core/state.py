@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -13,7 +13,7 @@ from stmpl_core.errors import InvalidInput
 from stmpl_core.slip import SPRINGS
 from stmpl_core.wake import untouched
 
-VERSION = 3  # of packed states; older ones are not read
+VERSION = 4  # of packed states; those of version 3, which do not say where the joints were, are read too
 FORGOTTEN = 1e-3  # elastic force of skin that comes back, over its largest, below which it is forgotten
 
 
@@ -102,9 +102,12 @@ class State:
 
     Args:
         tools: memory of each tool that touches or has touched, by name.
+        joints: angle of each joint of the skin's rig at which it is told [rad], in whose axes it is; empty: at rest;
+            None: nobody said, which only a skin without joints may read.
     """
 
     tools: Mapping[str, Memory] = field(default_factory=dict)
+    joints: tuple[float, ...] | None = ()
 
     @property
     def finite(self) -> bool:
@@ -113,19 +116,23 @@ class State:
 
     def without(self, name: str) -> State:
         """The state without what it remembers of a tool: the skin that it pressed is at rest."""
-        return State({other: memory for other, memory in self.tools.items() if other != name})
+        return replace(self, tools={other: memory for other, memory in self.tools.items() if other != name})
 
     def pack(self) -> bytes:
         """The state as bytes, exact: a line of JSON, then float64 numbers, the least byte first."""
         names = sorted(self.tools)
         terms = max((len(self.tools[name].relaxed) for name in names), default=0)
-        head = json.dumps({"version": VERSION, "terms": terms, "tools": names}) + "\n"
+        head = json.dumps({"version": VERSION, "terms": terms, "tools": names, "joints": self.joints}) + "\n"
         numbers = [np.ravel(one) for name in names for one in self.tools[name]]
         return head.encode() + np.concatenate([*numbers, np.empty(0)]).astype("<f8").tobytes()
 
     @classmethod
-    def unpack(cls, packed: bytes) -> State:
+    def unpack(cls, packed: bytes, joints: Sequence[float] | None = None) -> State:
         """The state of such bytes.
+
+        Args:
+            packed: what `pack` gave, also of version 3.
+            joints: angle of each joint [rad] at which a state of version 3 was told; None: not known.
 
         Raises:
             InvalidInput: bytes of another kind.
@@ -134,6 +141,9 @@ class State:
         try:
             told = json.loads(head)
             names, terms, version = list(told["tools"]), int(told["terms"]), told["version"]
+            if version == VERSION:
+                joints = told["joints"]
+            where = None if joints is None else tuple(map(float, joints)) if any(joints) else ()
             numbers = np.frombuffer(rest, "<f8").astype(float)
             if not 0 <= terms <= len(numbers):
                 raise ValueError(f"{terms} times of relaxation in {len(numbers)} numbers")
@@ -141,12 +151,12 @@ class State:
             raise InvalidInput(f"{len(packed)} bytes are no state: {error}.") from error
         shapes = [one.shape for one in map(np.asarray, fresh(np.eye(4), terms))]
         size = sum(int(np.prod(shape)) for shape in shapes)
-        if version != VERSION or len(numbers) != size * len(names):
+        if version not in (VERSION - 1, VERSION) or len(numbers) != size * len(names):
             raise InvalidInput(f"a state of version {version} with {len(numbers)} numbers cannot be read; expected are "
-                               f"version {VERSION} and {size * len(names)} numbers of {len(names)} tools. Older ones "
-                               "need the release that recorded them.")  # fmt: skip
+                               f"version {VERSION - 1} or {VERSION} and {size * len(names)} numbers of {len(names)} "
+                               "tools. Older ones need the release that recorded them.")  # fmt: skip
         return cls({name: _memory(part, shapes) for name, part in
-                    zip(names, numbers.reshape(len(names), size), strict=True)})  # fmt: skip
+                    zip(names, numbers.reshape(len(names), size), strict=True)}, where)  # fmt: skip
 
 
 def _memory(numbers: np.ndarray, shapes: list[tuple[int, ...]]) -> Memory:

@@ -102,11 +102,14 @@ class Toucher:
         near: neighbours of its vertices; None: found here.
         tools: tools with their distance fields; None: an empty store.
         reach: distance that a pressing tool may be from where its force says that it is [m].
+
+    Attributes:
+        joints: angle of each joint where the skin is [rad]; empty: at rest.
     """
 
     def __init__(self, layer: SoftLayer, near: Surroundings | None = None, tools: Tools | None = None, *,
                  reach: float = MAX_TOOL_OFFSET_M) -> None:  # fmt: skip
-        self.layer, self.reach = layer, reach
+        self.layer, self.reach, self.joints = layer, reach, ()
         self.near = near or Surroundings.of(layer)
         self.hole = HOLE_RADIUS * layer.edge_length
         self.tools = Tools(margin_on(layer)) if tools is None else tools
@@ -118,7 +121,7 @@ class Toucher:
     def moved(self, skin: Skin) -> Toucher:
         """The same law and tools where joints take the skin."""
         out = copy(self)
-        out.layer, out.near = skin.layer, skin.near
+        out.layer, out.near, out.joints = skin.layer, skin.near, skin.angles
         out.columns, out.net = self.columns.moved(skin.layer), self.net.moved(skin.near, skin.green)
         out._inward, out.deep = out.columns.inward, Deep(out.columns)
         out._thickest = float(skin.layer.thickness.max())
@@ -335,6 +338,8 @@ class Toucher:
         doubt = scale * one.factor * self._modulus * float(held.doubt @ nodes.area) / max(size, 1e-300)
         doubt += held.power * one.field.surface_error / max(depth, one.field.surface_error)  # how well depth is known
         forces_there = there * nodes.area
+        if "uneven" in known and size > 0:
+            doubt = math.hypot(doubt, known["uneven"] * self.net.unlike(nodes, forces_there))
         strange = float(forces_there @ held.outside) / max(float(forces_there.sum()), 1e-300)
         touch = Touch(
             one.contact.name, one.status, one.pose, wrench,

@@ -30,6 +30,7 @@ TYPES = {
 STORE = typestore_of([(s.name, s.text) for s in map(find_schema, TYPES.values())])
 ANGLES = {"ball": 0.3, "finger": 0.3 + 2.2}  # rad around the tube
 START = 1_700_000_000_000_000_000  # ns
+TURNED = np.array([[0.8, -0.6, 0, 0], [0.6, 0.8, 0, 0], [0, 0, 1, 0.01], [0, 0, 0, 1]])  # pose_body_from_frame
 
 
 def message(kind: str, **values: Any) -> Any:
@@ -136,15 +137,18 @@ def six(values: np.ndarray) -> Any:
 
 def write_run(folder: Path, method: Method, *, layer: SoftLayer | None = None, frames: int = 40, rate: float = 100.0,
               lose: tuple[int, ...] = (), skip: tuple[int, ...] = (), delay: float = 0.002,
-              namespace: str = "/stmpl") -> Path:  # fmt: skip
+              namespace: str = "/stmpl", frame: str = "body", table: bool = True) -> Path:  # fmt: skip
     """Records a ball that presses and slides, joined in the last third by a second one; returns the folder.
 
-    Frames in `lose` are answered but not recorded, those in `skip` are not answered at all.
+    Frames in `lose` are answered but not recorded, those in `skip` are not answered at all. Poses come in `frame`,
+    which if it is not the body's stands at TURNED; the recording says so if it carries a `table`, else only /tf did.
     """
+    known_frames = {} if frame == "body" else {frame: TURNED}
     layer = layer or tube()
     simulator, (vertices, triangles) = Simulator(layer, method), ball()
     with BagWriter(folder) as bag:
-        write_provenance(bag, None, method=method.name, body="tube", config={"rate": rate, "frames": frames})
+        write_provenance(bag, None, method=method.name, body="tube", config={"rate": rate, "frames": frames},
+                         frames=known_frames if table else {})  # fmt: skip
         kept, stream = qos_yaml(transient_local=True), qos_yaml()
         skin = bag.add_channel(f"{namespace}/skin/topology", TYPES["topology"], kept)
         surface = bag.add_channel(f"{namespace}/contact_mesh", TYPES["mesh"], kept)
@@ -164,9 +168,10 @@ def write_run(folder: Path, method: Method, *, layer: SoftLayer | None = None, f
             for tool, newtons in script(k / frames).items():
                 height, gap = 0.06 + 0.03 * k / frames, -0.5e-3 if newtons else 5e-3
                 instant = pose(ANGLES[tool], height, gap, stamp), wrench(tool, newtons, stamp)
+                instant[0].header.frame_id = frame
                 for kind, made in zip(("pose", "wrench"), instant, strict=True):
                     bag.write(tools[tool, kind], cdr(made), stamp + 100_000, stamp)
-                contacts.append(contact_from(known[tool], *instant, body_frame="body"))
+                contacts.append(contact_from(known[tool], *instant, body_frame="body", frames=known_frames))
             if k in skip:
                 continue
             answer = simulator.step(contacts)

@@ -61,6 +61,19 @@ def test_a_replay_repeats_the_run_bit_for_bit(run):
     assert "every one bit for bit" in str(replayed)
 
 
+def test_poses_in_a_frame_that_the_recording_carries_are_replayed_and_those_of_tf_are_refused(tmp_path, capsys):
+    told = write_run(tmp_path / "told", Winkler(), frames=6, frame="base")
+    assert replay_run(told, Winkler()).identical == 6
+    by_tf = write_run(tmp_path / "by_tf", Winkler(), frames=6, frame="base", table=False)
+    code, said = stmpl(capsys, "replay", by_tf)
+    assert code == 1
+    assert "cannot be repeated offline: the pose of ball is in frame 'base'; known are 'body'." in said
+    assert "stmpl replay --publish" in said and "Traceback" not in said
+    comparison = compare_run(by_tf, Winkler(), method=Winkler(), frames=2)
+    assert not comparison.judged and all("frame 'base'" in why for why in comparison.failed.values())
+    assert len(Recording.of(by_tf, frames=6).snapshots) == 6, "what was answered is shown all the same"
+
+
 def test_a_recording_names_the_processor_and_another_one_may_differ_in_the_last_bit(run, monkeypatch):
     assert Bag(run).provenance.processor == processor() and replay_run(run, Winkler()).tolerance == 0
     nearly = replay_run(run, Stiffer(1 + 1e-6))

@@ -1,5 +1,6 @@
 """Laws of a limb whose joints move: what a pose keeps, what turns with it, what it spoils and says so."""
 
+import json
 from dataclasses import replace
 from typing import Any
 
@@ -328,3 +329,55 @@ def test_the_weights_of_an_arm_are_spread_so_that_its_inside_does_not_fold_at_si
     assert folded[0] > 100 and folded[1] == 0
 
 
+def held(simulator: Simulator, vertex: int, joints: dict[str, float]) -> tuple[np.ndarray, State]:
+    """Pose of a ball that pressed for three steps with the joints there, and the state then."""
+    simulator.pose(joints)
+    pose, state = pressed(simulator.layer, vertex), State()
+    for _ in range(3):
+        _, state = simulator.touch([Contact(ball(), pose)], state, 0.02)
+    return pose, state
+
+
+def test_a_state_that_was_told_at_another_bend_goes_along_though_nobody_took_it(skin):
+    """Pressed at rest, bent, and gone on with: the tool rode on the skin, so nothing slid."""
+    vertex, simulator = near(skin.layer, (0, RADIUS, 0.12)), Simulator(skin, friction=0.4)
+    pose, state = held(simulator, vertex, {})
+    contact = Contact(ball(), skin.layer.rig.motions((0.7,))[1] @ pose)
+    taken = simulator.pose({"elbow": 0.7}, state)
+    told, same = (simulator.touch([contact], one, 0.02) for one in (taken, state))
+    assert same[1].pack() == told[1].pack() and same[0][0].wrench.tobytes() == told[0][0].wrench.tobytes()
+    (touch,), _ = same
+    assert touch.slip is not None and np.linalg.norm(touch.slip.wrench[:3]) < 0.02 * touch.force
+    assert (state.joints, taken.joints, same[1].joints) == ((), (0.7,), (0.7,))
+    for elsewhere in (0.7, 0.2):  # wherever the skin is now, it is taken from where it was told
+        simulator.pose({"elbow": 0.5})
+        straight = Simulator(skin).pose({"elbow": elsewhere}, state)
+        assert simulator.pose({"elbow": elsewhere}, state).pack() == straight.pack()
+    with pytest.raises(InvalidInput, match=r"the skin's joints are at \(0.2,\) rad, the state was told at \(\)"):
+        simulator.history.step([contact], state, 0.02)
+
+
+def test_a_state_comes_back_with_the_joints_that_it_was_told_at(skin):
+    simulator = Simulator(skin, friction=0.4)
+    pose, state = held(simulator, near(skin.layer, (0, RADIUS, 0.12)), {"elbow": 0.3})
+    again = State.unpack(state.pack())
+    assert again.joints == (0.3,) and again.pack() == state.pack()
+    assert state.without("another").joints == (0.3,)
+    head, _, numbers = state.pack().partition(b"\n")
+    told = json.loads(head)
+    third = json.dumps({"version": 3, "terms": told["terms"], "tools": told["tools"]}).encode() + b"\n" + numbers
+    assert State.unpack(third, joints=(0.3,)).pack() == state.pack()
+    with pytest.raises(InvalidInput, match="does not say where its joints were"):
+        simulator.touch([Contact(ball(), pose)], State.unpack(third), 0.02)
+    still = Simulator(skin.layer.with_(rig=None), skin.method.__class__(), friction=0.4)
+    assert still.touch([Contact(ball(), pose)], State.unpack(third), 0.02)[1].joints == ()
+
+
+def test_a_state_of_other_joints_is_refused(skin):
+    simulator = Simulator(skin, friction=0.4)
+    pose, state = held(simulator, near(skin.layer, (0, RADIUS, 0.12)), {"elbow": 0.3})
+    with pytest.raises(InvalidInput, match="told at 2 joints; this skin has elbow"):
+        simulator.touch([Contact(ball(), pose)], replace(state, joints=(0.1, 0.2)), 0.02)
+    still = Simulator(skin.layer.with_(rig=None), Winkler(), friction=0.4)
+    with pytest.raises(InvalidInput, match="told at 1 joint; this skin has none"):
+        still.touch([Contact(ball(), pose)], state, 0.02)

@@ -9,10 +9,12 @@ from scipy.spatial.transform import Rotation
 from stmpl_core import Contact, Prony, Simulator, State, Tissue, Tool, Touch
 from stmpl_core.errors import InvalidInput
 from stmpl_core.friction import PAIRS, coefficient
-from stmpl_core.methods import Winkler
+from stmpl_core.methods import MomentNet, Winkler
 from stmpl_core.sideways import Sideways, patch
 from stmpl_core.slip import LIMIT, SPRINGS, drag
-from tests.scenes import at, ball, plate, punch, turn
+from stmpl_core.tissue import Membrane
+from tests.scenes import RADIUS as LIMB_RADIUS
+from tests.scenes import at, ball, limb, plate, punch, turn
 
 RADIUS, DEPTH, MU = 8e-3, 3e-3, 0.5
 BALL = ball(RADIUS)
@@ -175,6 +177,17 @@ def test_halving_the_steps_changes_the_drag_by_less_than_one_percent(living: Sim
     assert off < 0.01 * coarse[-1].force
 
 
+def test_where_skin_is_taut_the_bound_on_force_grows_with_the_drag(sim: Simulator) -> None:
+    """Skin that piles up before a dry tool presses up to a fifth more than is answered (a back, by finite elements)."""
+    poses = down() + along(np.arange(1, 31) * 2e-4)
+    taut = sim.layer.with_(tissue=Tissue(2e4, 0.4, skin=Membrane(1e6, 1.5e-3, 50.0)))
+    pressed, slid = (led(Simulator(taut, MomentNet(), friction=mu), poses)[0][-1] for mu in (None, MU))
+    assert slid.slip is not None and slid.slip.kind == "slide"
+    rubs, force = np.linalg.norm(slid.slip.wrench[:3]), pressed.force
+    assert 0.2 * MU**2 * force < slid.force_bound - pressed.force_bound < rubs**2 / force
+    assert led(sim, poses)[0][-1].force_bound == pytest.approx(led(sim, poses[:12])[0][-1].force_bound, rel=0.05)
+
+
 def test_a_wrench_within_the_cap_is_carried(living: Simulator) -> None:
     state, force = State(), np.array([0.2, -0.1, -0.8])
     for dt in (0.0, 0.01, 0.3, 2.0):
@@ -248,3 +261,13 @@ def test_no_closed_path_gives_energy(
                 net, put = net + work, put + max(work, 0.0)
             before, wrench = pose, touch.wrench
         assert net > -0.005 * put
+
+
+def test_a_tool_that_has_nothing_left_to_give_still_has_an_answer() -> None:
+    """It jumps to the other side of a limb and presses harder there than what was put in can pay for."""
+    sim, state, found = Simulator(limb(6e-3), Winkler(), friction=0.3), State(), []
+    for side, depth in ((1, 1e-3), (-1, 3e-3)):
+        pose = at(side * (LIMB_RADIUS + RADIUS - depth), 0, 0.06 + depth)
+        touches, state = sim.touch([Contact(BALL, pose)], state, 0.01)
+        found.append(np.abs(sim.answer(touches).displacement).max())
+    assert 0 < touches[0].force < 1e-9 and 2e-3 < found[1] < 4e-3, "the skin lies on the tool, which is not pushed"
