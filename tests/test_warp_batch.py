@@ -7,20 +7,22 @@ import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from stmpl_core import Tool
+from stmpl_core import Membrane, Ply, Tissue, Tool
 from stmpl_core.batch import Batch, BatchTouches
 from stmpl_core.body import Body
+from stmpl_core.bones import Bone, to_bone
 from stmpl_core.errors import InvalidInput
-from stmpl_core.methods import MomentNet
+from stmpl_core.methods import MomentNet, Winkler
 from stmpl_core.skin import Skin
 from tests.scenes import LENGTH, RADIUS, at, ball, band, box, capsule, limb, punch, tool
+from tests.test_folds import FINGERS
 
 wp = pytest.importorskip("warp")
 wp.config.quiet = True
 
 from stmpl_core.gpu.warp_batch import STATUSES, WarpBatch, WarpTouches  # noqa: E402
 
-N = 64
+N, THICK, LONG = 64, 0.02, 0.3  # scenes; radius and length of a limb with layers [m]
 LEFT, RIGHT = ball(0.012).named("left"), ball(0.009).named("right")
 LUMP = trimesh.creation.icosphere(3, 0.01)
 LUMP.vertices = LUMP.vertices * [1, 0.6, 1.5] + 1e-3 * np.sin(900 * LUMP.vertices[:, [1, 2, 0]])
@@ -34,6 +36,14 @@ def arm() -> Skin:
 @pytest.fixture(scope="module")
 def cylinder() -> Skin:
     return Skin.of(limb(5e-3, youngs_modulus=5e3, poisson_ratio=0.35), MomentNet())
+
+
+@pytest.fixture(scope="module")
+def layered() -> Skin:
+    """Skin, fat and muscle on a bone that lies off the limb's axis."""
+    tissue = Tissue(3e3, 0.45, skin=Membrane(1.3e5, 1.2e-3, 11.0), deeper=(Ply(6e-3, 15e3, 0.45),))
+    bone = Bone(np.array([0.003, 0, -1]), np.array([0.003, 0, 1]), 0.006)
+    return Skin.of(to_bone(limb(8e-3, 8e-3, THICK, LONG), [bone]).with_(tissue=tissue), MomentNet())
 
 
 def scattered(skin: Skin, reach: float, n: int = N, deepest: float = 0.8, seed: int = 0) -> np.ndarray:
@@ -104,6 +114,34 @@ def test_a_tool_around_the_limb_lies_on_several_charts(cylinder: Skin) -> None:
     same(made(cylinder, [band()], 1).touch(poses), Batch(cylinder, [band()], 1).touch(poses))
 
 
+@pytest.mark.parametrize("one", [ball(0.012), punch(), tool(LUMP)], ids=["ball", "punch", "lump"])
+def test_touches_of_layers_are_those_of_numba(layered: Skin, one: Tool) -> None:
+    poses = scattered(layered, 0.01, 24, 0.9)
+    found, expected = made(layered, [one], 24).touch(poses), Batch(layered, [one], 24).touch(poses)
+    assert (expected.statuses == "pressed by pose").sum() > 12 and expected.in_range.any()
+    same(found, expected, 0.6)
+
+
+def test_tools_on_layers_feel_each_other_where_they_are_near(layered: Skin) -> None:
+    poses = np.empty((3, 2, 4, 4))
+    for i, away in enumerate((0.0, 0.03, 0.2)):  # on the other side, side by side, far along the limb
+        x = -THICK - 0.009 + 4e-3 if away else THICK + 0.009 - 2e-3
+        poses[i] = at(-THICK - 0.012 + 3e-3, 0, (LONG - away) / 2), at(x, 0, (LONG + away) / 2)
+    pair = made(layered, [LEFT, RIGHT], 3)
+    same(pair.touch(poses), Batch(layered, [LEFT, RIGHT], 3, threads=1).touch(poses))
+    alone = made(layered, [LEFT], 3).touch(poses[:, :1]).wrenches.numpy()[:, 0, :3]
+    beside = pair.touch(poses).wrenches.numpy()[:, 0, :3]
+    changes = np.linalg.norm(beside - alone, axis=1) / np.linalg.norm(alone, axis=1)
+    assert changes[1] > 1e-3 > 1e-5 > changes[2]  # the solver stops at 3e-6
+
+
+def test_skin_beyond_a_gap_is_not_felt() -> None:
+    skin, tip = Skin.of(FINGERS, MomentNet()), ball(0.008)
+    poses = np.stack([at(0.0, 0.02, 0.008 - depth)[None] for depth in (5e-4, 1e-3, 2e-3)])
+    assert skin.near.folded
+    same(made(skin, [tip], 3).touch(poses), Batch(skin, [tip], 3, threads=1).touch(poses))
+
+
 def test_tools_side_by_side_feel_each_other(cylinder: Skin) -> None:
     same(made(cylinder, [LEFT, RIGHT], 6).touch(pairs()), Batch(cylinder, [LEFT, RIGHT], 6).touch(pairs()))
 
@@ -135,6 +173,85 @@ def test_arrays_of_torch_are_shared_not_copied(cylinder: Skin) -> None:
     assert torch.equal(out, torch.from_numpy(batch.touch(poses.detach().numpy()).wrenches.numpy()))
 
 
+def moved(batch: WarpBatch, expected: Batch, poses: np.ndarray, least: int) -> np.ndarray:
+    """Fields of all scenes, held to 1e-4 of each peak where there is one; NaN where there is none."""
+    n = len(poses)
+    found, other = batch.touch(poses, fields=range(n)), expected.touch(poses, fields=range(n))
+    motion, served, moving = found.fields.numpy(), found.served.all(axis=1), 0
+    assert found.fields.dtype == found.wrenches.dtype
+    assert np.isnan(motion[~served]).all()
+    for i in np.flatnonzero(served).tolist():
+        there = other.fields[i]
+        peak = np.linalg.norm(there, axis=1).max()
+        assert np.linalg.norm(motion[i, : len(there)] - there, axis=1).max() <= 1e-4 * peak
+        assert not motion[i, len(there) :].any()
+        moving += peak > 1e-4
+    assert moving >= least
+    return motion
+
+
+@pytest.mark.parametrize(
+    ("one", "reach", "deepest"), [(ball(0.012), 0.012, 0.8), (punch(), 0.012, 0.5), (tool(LUMP), 0.009, 0.6)],
+    ids=["ball", "punch", "lump"],
+)  # fmt: skip
+def test_fields_are_those_of_numba(arm: Skin, one: Tool, reach: float, deepest: float) -> None:
+    poses = scattered(arm, reach, 10, deepest)
+    moved(made(arm, [one], 10), Batch(arm, [one], 10, threads=1), poses, 4)
+
+
+def test_fields_of_several_tools_and_of_one_around_a_limb(cylinder: Skin) -> None:
+    moved(made(cylinder, [LEFT, RIGHT], 6), Batch(cylinder, [LEFT, RIGHT], 6, threads=1), pairs(), 6)
+    around = at(0.0, 2e-4, LENGTH / 2)[None, None]
+    moved(made(cylinder, [band()], 1), Batch(cylinder, [band()], 1, threads=1), around, 1)
+
+
+def test_fields_of_skins_that_differ(arm: Skin, cylinder: Skin) -> None:
+    poses = np.concatenate([scattered(arm, 0.012, 4), scattered(cylinder, 0.012, 4)])
+    skins = [arm] * 4 + [cylinder] * 4
+    moved(made(skins, [LEFT]), Batch(skins, [LEFT], threads=1), poses, 3)
+
+
+def test_fields_come_for_the_scenes_that_are_asked(cylinder: Skin) -> None:
+    poses, batch = pairs(), made(cylinder, [LEFT, RIGHT], 6)
+    whole = batch.touch(poses, fields=range(6)).fields.numpy()
+    assert batch.touch(poses).fields is None
+    assert np.array_equal(batch.touch(poses, fields=[4, 1]).fields.numpy(), whole[[4, 1]])
+    batch.touch(poses, fields=[0])
+    assert batch._fields is not None
+    room = batch.room.bytes_of(2)
+    few = made(cylinder, [LEFT, RIGHT], 6, memory=max(room, batch._fields._room.bytes_of()) + room)
+    assert np.array_equal(few.touch(poses, fields=range(6)).fields.numpy(), whole)
+    many = made(cylinder, [LEFT, RIGHT], 6, lanes=5).touch(poses, fields=range(6)).fields.numpy()
+    assert np.abs(many - whole).max() < 1e-6 * np.abs(whole).max()
+    poses[2, 1, 0, 3] = np.nan
+    spoilt = batch.touch(poses, fields=range(6)).fields.numpy()
+    assert np.isnan(spoilt[2]).all() and np.array_equal(spoilt[[0, 1, 3, 4, 5]], whole[[0, 1, 3, 4, 5]])
+
+
+def test_fields_are_written_to_arrays_of_torch_and_warp(cylinder: Skin) -> None:
+    torch, batch = pytest.importorskip("torch"), made(cylinder, [LEFT, RIGHT], 6)
+    poses, count = torch.from_numpy(sevens(pairs())), len(cylinder.layer.vertices)
+    ours, theirs = wp.empty((2, count, 3), dtype=wp.float32, device="cpu"), torch.zeros((2, count, 3))
+    assert batch.touch(poses, fields=[0, 1], fields_out=ours).fields is ours
+    found = batch.touch(poses, fields=[0, 1], fields_out=theirs)
+    assert found.fields.ptr == theirs.data_ptr() == wp.to_torch(found.fields).data_ptr()
+    assert theirs.abs().max() > 1e-4 and np.array_equal(theirs.numpy(), ours.numpy())
+    given = wp.array(sevens(pairs()), dtype=wp.float64, device="cpu")
+    assert batch._array("poses", given) is given
+
+
+def test_fields_that_are_not_served_are_refused(cylinder: Skin, layered: Skin) -> None:
+    poses, batch = pairs(2), made(cylinder, [LEFT, RIGHT], 2)
+    with pytest.raises(InvalidInput, match="there are 2"):
+        batch.touch(poses, fields=[2])
+    with pytest.raises(InvalidInput, match="fields_out has shape"):
+        batch.touch(poses, fields=[0], fields_out=wp.empty((1, 5, 3), dtype=wp.float64, device="cpu"))
+    with pytest.raises(InvalidInput, match="from one MomentNet"):
+        made(Skin.of(cylinder.layer, Winkler()), [LEFT, RIGHT], 2).touch(poses, fields=[0])
+    with pytest.raises(InvalidInput, match="fields of stacks"):
+        made(layered, [LEFT, RIGHT], 2).touch(poses, fields=[0])
+
+
 def test_a_scene_that_is_refused_spoils_no_other(cylinder: Skin) -> None:
     scenes, batch = pairs(), made(cylinder, [LEFT, RIGHT], 6)
     whole = batch.touch(scenes).wrenches.numpy()
@@ -164,7 +281,9 @@ def test_a_tool_without_room_is_told(cylinder: Skin) -> None:
     assert not found.in_range.numpy().any()
 
 
-def test_what_is_not_served_is_refused_when_it_is_made(cylinder: Skin) -> None:
+def test_what_is_not_served_is_refused_when_it_is_made(cylinder: Skin, layered: Skin) -> None:
+    with pytest.raises(InvalidInput, match="do not go into one"):
+        made([cylinder, layered], [LEFT])
     with pytest.raises(InvalidInput, match="no device 'cuda:7'"):
         WarpBatch(cylinder, [LEFT], 2, device="cuda:7")
     with pytest.raises(InvalidInput, match="prepared skins"):

@@ -9,6 +9,7 @@ that are done are skipped. A launch costs microseconds, which thousands of scene
 import warp as wp
 
 from stmpl_core import contact_net, obstacle
+from stmpl_core.gpu.packs import HIDDEN as UNITS
 from stmpl_core.gpu.packs import Net, OneSkin, Scratch, Skins
 from stmpl_core.gpu.rays import OPTIONS, real, vec3
 from stmpl_core.networks import NODE
@@ -24,7 +25,7 @@ FADE, FADE_RING = wp.constant(wp.float64(contact_net.FADE)), wp.constant(contact
 LARGEST = wp.constant(wp.float64(contact_net.MAX_LOG_RATIO))
 START, SMALL, SMALLER = (wp.constant(wp.float64(x)) for x in (0.3, 1e-3, 1e-4))
 LEAST_SQUARE, ALMOST_TWO = wp.constant(wp.float64(1e-6)), wp.constant(wp.float64(1.02))
-INPUTS, HIDDEN = wp.constant(NODE.size), wp.constant(32)
+HIDDEN = wp.constant(UNITS)
 AT_LOG_PRESSURE, AT_PRESSURE = wp.constant(NODE.at.log_pressure), wp.constant(NODE.at.pressure)
 AT_LOG_STRAIN, AT_STRAIN = wp.constant(NODE.at.log_strain), wp.constant(NODE.at.strain)
 AT_MOMENTS, AT_SIZES = wp.constant(NODE.at.log_moments), wp.constant(NODE.at.vector_sizes)
@@ -38,7 +39,7 @@ wp.set_module_options(OPTIONS)
 @wp.func
 def _apart(scratch: Scratch, s: wp.int32, i: wp.int32, j: wp.int32) -> real:
     """Distance of two nodes over the thickness; beyond REACH if they face away from each other."""
-    if wp.dot(scratch.inward[s, i], scratch.inward[s, j]) <= real(0.0):
+    if wp.dot(scratch.inward[s, i], scratch.inward[s, j]) <= real(0.0) or scratch.fold[s, i] != scratch.fold[s, j]:
         return real(2.0) * REACH
     roots = real(1.0) / wp.sqrt(scratch.thick[s, i]) * (real(1.0) / wp.sqrt(scratch.thick[s, j]))
     return wp.length(scratch.point[s, i] - scratch.point[s, j]) * roots
@@ -72,7 +73,9 @@ def respond(lanes: wp.int32, many: wp.int32, skins: Skins, scratch: Scratch):
 
 @wp.func
 def _wanted(scratch: Scratch, one: OneSkin, s: wp.int32, i: wp.int32) -> real:
-    """Depth that the tool asks for, up to where the barrier takes over, over a thickness."""
+    """Depth that the tool asks for, up to where the barrier takes over, over a thickness; on a stack [m]."""
+    if one.stacked == 1:
+        return scratch.sinking[s, i] * wp.min(LINEAR_TO / scratch.strain[s, i], real(1.0))
     return wp.min(scratch.strain[s, i], LINEAR_TO) * scratch.thick[s, i] / one.thickest
 
 
@@ -225,7 +228,7 @@ def see(lanes: wp.int32, many: wp.int32, skins: Skins, scratch: Scratch):
     one = skins.one[scratch.skin[s * many]]
     for i in range(lane, scratch.nodes[s], lanes):
         moments, strains, pull, sunk = wp.vec4d(), wp.vec4d(), vec3(), vec3()
-        t, inward, strain = scratch.thick[s, i], scratch.inward[s, i], real(scratch.strain[s, i])
+        t, strain = scratch.thick[s, i], real(scratch.strain[s, i])
         for j in range(scratch.nodes[s]):
             apart = _apart(scratch, s, i, j)
             if apart < NEAR:
@@ -239,19 +242,7 @@ def see(lanes: wp.int32, many: wp.int32, skins: Skins, scratch: Scratch):
                 pull = pull + p * way
                 sunk = sunk + e * way
         pressure = _pressure(scratch, one, s, i)
-        pull = (pull - wp.dot(pull, inward) * inward) / (moments[1] + SMALLER)
-        sunk = (sunk - wp.dot(sunk, inward) * inward) / (strains[1] + SMALLER)
-        _write(scratch, s, i, AT_LOG_PRESSURE, wp.log(pressure + SMALL))
-        _write(scratch, s, i, AT_PRESSURE, pressure)
-        _write(scratch, s, i, AT_LOG_STRAIN, wp.log(strain + SMALL))
-        _write(scratch, s, i, AT_STRAIN, strain)
-        scratch.strange[s, i] = 0
-        for m in range(RINGS):
-            _write(scratch, s, i, AT_MOMENTS + m, wp.log(moments[m] + SMALLER))
-            _write(scratch, s, i, AT_MOMENTS + RINGS + m, wp.log(strains[m] + SMALLER))
-        _write(scratch, s, i, AT_SIZES, wp.length(pull))
-        _write(scratch, s, i, AT_SIZES + 1, wp.length(sunk))
-        _write(scratch, s, i, AT_TOGETHER, wp.dot(pull, sunk))
+        pull = _write_alike(scratch, s, i, pressure, strain, moments, strains, pull, sunk)
         _write_shape(scratch, skins, s, i, pull)
         _write(scratch, s, i, AT_NU, one.nu)
         _write(scratch, s, i, AT_VOLUMETRIC, real(1.0) / (ALMOST_TWO - real(2.0) * one.nu))
@@ -267,6 +258,27 @@ def see(lanes: wp.int32, many: wp.int32, skins: Skins, scratch: Scratch):
 def _write(scratch: Scratch, s: wp.int32, i: wp.int32, at: wp.int32, value: real):
     """Writes an input."""
     scratch.inputs[s, i, at] = wp.float32(value)
+
+
+@wp.func
+def _write_alike(scratch: Scratch, s: wp.int32, i: wp.int32, pressure: real, strain: real, moments: wp.vec4d,
+                 strains: wp.vec4d, pull: vec3, sunk: vec3) -> vec3:  # fmt: skip
+    """Writes what a node of one material and one of a stack read alike; their `pull` along the skin."""
+    inward = scratch.inward[s, i]
+    pull = (pull - wp.dot(pull, inward) * inward) / (moments[1] + SMALLER)
+    sunk = (sunk - wp.dot(sunk, inward) * inward) / (strains[1] + SMALLER)
+    _write(scratch, s, i, AT_LOG_PRESSURE, wp.log(pressure + SMALL))
+    _write(scratch, s, i, AT_PRESSURE, pressure)
+    _write(scratch, s, i, AT_LOG_STRAIN, wp.log(strain + SMALL))
+    _write(scratch, s, i, AT_STRAIN, strain)
+    scratch.strange[s, i] = 0
+    for m in range(RINGS):
+        _write(scratch, s, i, AT_MOMENTS + m, wp.log(moments[m] + SMALLER))
+        _write(scratch, s, i, AT_MOMENTS + RINGS + m, wp.log(strains[m] + SMALLER))
+    _write(scratch, s, i, AT_SIZES, wp.length(pull))
+    _write(scratch, s, i, AT_SIZES + 1, wp.length(sunk))
+    _write(scratch, s, i, AT_TOGETHER, wp.dot(pull, sunk))
+    return pull
 
 
 @wp.func
@@ -301,7 +313,7 @@ def judge(lanes: wp.int32, scratch: Scratch, net: Net):
     """Keeps inputs within what training had, says where they were not, and scales them."""
     s, lane = wp.tid()
     for i in range(lane, scratch.nodes[s], lanes):
-        for m in range(INPUTS):
+        for m in range(net.low.shape[0]):
             given = scratch.inputs[s, i, m]
             kept = wp.clamp(given, net.low[m], net.high[m])
             if kept != given:

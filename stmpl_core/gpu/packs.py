@@ -14,7 +14,9 @@ from scipy.spatial import KDTree
 from stmpl_core.columns import BLOCK, Columns
 from stmpl_core.deep import FIRST, LOOKED_AT
 from stmpl_core.gpu.rays import Grid, mat33, real, vec3
-from stmpl_core.networks import ARRAYS, NODE, PRESSURE, shipped
+from stmpl_core.green import COLUMNS, STRAINS
+from stmpl_core.layer import SoftLayer
+from stmpl_core.networks import ARRAYS, NODE, PRESSURE, STACK_NODE, shipped
 from stmpl_core.nodes import CHARTS, MOST, NODES, WIDEST
 from stmpl_core.obstacle import response
 from stmpl_core.sdf import SignedDistance
@@ -27,6 +29,7 @@ STEEP_BIT, LONG_BIT, BORDER_BIT, EDGE_BIT = 1, 2, 4, 8  # what is to be said of 
 MOST_PLACES = 8192  # places of a lattice: nodes.MOST_LOOKED_AT and a margin around them
 LEAST_PARTS = 800  # parts of few triangles: of 199 in 4
 MARGIN = 1.3  # room for columns over the most that were counted
+HIDDEN = 32  # units of a hidden layer; a smaller network's are filled up with units that say nothing
 FEWEST_NODES = 192  # room for nodes of a tool at the least: a small one has 80 to 130
 
 
@@ -50,6 +53,16 @@ class OneSkin:
     half_space: real
     low: vec3
     high: vec3
+    folded: wp.int32
+    stacked: wp.int32
+    coarse: wp.int32
+    first_coarse: wp.int32
+    first_motion: wp.int32
+    flat: real
+    effective: real
+    softness: real
+    log_kappa: real
+    log_pull: real
 
 
 @wp.struct
@@ -70,7 +83,7 @@ class Lattice:
     way: vec3
 
 
-def _struct(name: str, doc: str, fields: dict[str, tuple[Any, str]]) -> Any:
+def struct_of(name: str, doc: str, fields: dict[str, tuple[Any, str]]) -> Any:
     """A struct of arrays, by their names: type of their elements, and a letter for each axis."""
     hints = {key: wp.array(dtype=dtype, ndim=len(axes)) for key, (dtype, axes) in fields.items()}
     return wp.struct(type(name, (), {"__annotations__": hints, "__module__": __name__, "__doc__": doc}))
@@ -83,9 +96,12 @@ SKINS: dict[str, tuple[Any, str]] = {
     "start": (wp.int32, "V"), "around": (wp.int32, "F"), "balls": (wp.vec4d, "B"),
     "grids": (Grid, "G"), "coefficients": (real, "N"), "thinnest": (real, "K"),
     "looked_at": (vec3, "Kx"), "look_many": (wp.int32, "Kx"),
-    "rows": (real, "Tx"),
+    "rows": (real, "Tx"), "linked": (wp.uint32, "Vb"),
+    "green": (real, "SgR"), "coarse_corner": (wp.vec3i, "V"), "coarse_share": (vec3, "V"), "gathered": (real, "c"),
+    "motion": (wp.float32, "m"), "hard_logs": (real, "St"), "hard": (real, "Sts"),
 }  # fmt: skip
-# C: scene and tool, S: scene, M: columns, B: blocks of columns, F: triangles, P: their parts, L: lattice, N: nodes
+# C: scene and tool, S: scene, M: columns, B: blocks of columns, F: triangles, P: their parts, L: lattice, N: nodes,
+# Q, K: nodes and coarse vertices of stacks
 SCRATCH: dict[str, tuple[Any, str]] = {
     "skin": (wp.int32, "C"), "grid": (wp.int32, "C"), "status": (wp.int32, "C"), "busy": (wp.int32, "1"),
     "pose": (mat33, "C"), "place": (vec3, "C"), "centre": (vec3, "C"), "wide": (wp.int32, "C"),
@@ -100,6 +116,11 @@ SCRATCH: dict[str, tuple[Any, str]] = {
     "nodes": (wp.int32, "S"), "begin": (wp.int32, "S"), "tool": (wp.int32, "SN"), "cell": (wp.int32, "SN"),
     "face": (wp.int32, "SN"), "shares": (vec3, "SN"), "point": (vec3, "SN"), "inward": (vec3, "SN"),
     "thick": (real, "SN"), "area": (real, "SN"), "strain": (real, "SN"),
+    "fold": (wp.int32, "SN"), "queue": (wp.int32, "SN"), "mean": (vec3, "C"), "least_area": (real, "C"),
+    "most_area": (real, "C"), "sinking": (real, "SQ"), "slot": (wp.int32, "SK"), "met": (wp.int32, "SK"),
+    "meets": (wp.int32, "S"), "slots": (wp.int32, "SQ9"), "weights": (real, "SQ9"), "parts": (real, "SQ9"),
+    "around_node": (wp.int32, "SQ"), "rows": (real, "SQK"),
+    "wide_part": (real, "SQQ"), "given_way": (real, "C"),
     "matrix": (real, "SNN"), "force": (real, "SN"), "gap": (real, "SN"), "move": (real, "SN"), "along": (real, "SN"),
     "found_power": (real, "SN"), "left": (real, "SN"), "before": (real, "S"), "restart": (wp.int32, "S"),
     "first_square": (real, "S"), "done": (wp.int32, "S"), "group": (wp.int32, "C"),
@@ -109,9 +130,9 @@ SCRATCH: dict[str, tuple[Any, str]] = {
 NET: dict[str, tuple[Any, str]] = {
     name: (wp.float32, "io" if name.startswith("w") else "o") for name in ARRAYS["pressure"]
 }
-Skins = _struct("Skins", "Skins and the distance fields of the tools, one after the other.", SKINS)
-Scratch = _struct("Scratch", "What kernels leave for each other.", SCRATCH)
-Net = _struct("Net", "Weights of a ContactNet.", NET)
+Skins = struct_of("Skins", "Skins and the distance fields of the tools, one after the other.", SKINS)
+Scratch = struct_of("Scratch", "What kernels leave for each other.", SCRATCH)
+Net = struct_of("Net", "Weights of a ContactNet.", NET)
 
 
 class Room(NamedTuple):
@@ -121,18 +142,31 @@ class Room(NamedTuple):
     blocks: int
     nodes: int
     lanes: int
+    coarse: int  # coarse vertices of a stack; 0: one material
 
     def sizes(self, scenes: int, tools: int) -> dict[str, int]:
         """Length of each axis of SCRATCH."""
         faces = 2 * self.columns + 64
         return {"C": scenes * tools, "S": scenes, "M": self.columns, "B": self.blocks, "F": faces, "6": CHARTS,
                 "P": max(faces, LEAST_PARTS), "L": MOST_PLACES, "N": self.nodes, "R": self.lanes,
-                "I": NODE.size, "H": 32, "1": 1}  # fmt: skip
+                "I": max(NODE.size, STACK_NODE.size), "H": HIDDEN, "1": 1, "K": max(1, self.coarse), "9": 9,
+                "Q": self.nodes if self.coarse else 1}  # fmt: skip
 
     def bytes_of(self, tools: int) -> int:
         """Memory for one scene [bytes]."""
-        sizes = self.sizes(1, tools)
-        return sum(int(np.prod([sizes[axis] for axis in axes])) * _bytes(dtype) for dtype, axes in SCRATCH.values())
+        return bytes_of(SCRATCH, self.sizes(1, tools))
+
+
+def bytes_of(fields: dict[str, tuple[Any, str]], sizes: dict[str, int]) -> int:
+    """Memory that arrays take, given the lengths of their axes [bytes]."""
+    return sum(int(np.prod([sizes[axis] for axis in axes])) * _bytes(dtype) for dtype, axes in fields.values())
+
+
+def filled(out: Any, fields: dict[str, tuple[Any, str]], sizes: dict[str, int], device: Any) -> Any:
+    """A struct with its arrays, all zero."""
+    for name, (dtype, axes) in fields.items():
+        setattr(out, name, wp.zeros(tuple(sizes[axis] for axis in axes), dtype=dtype, device=device))
+    return out
 
 
 def _bytes(dtype: Any) -> int:
@@ -142,18 +176,20 @@ def _bytes(dtype: Any) -> int:
 
 def scratch(room: Room, scenes: int, tools: int, device: Any) -> Any:
     """Scratch space for so many scenes."""
-    sizes, out = room.sizes(scenes, tools), Scratch()
-    for name, (dtype, axes) in SCRATCH.items():
-        setattr(out, name, wp.zeros(tuple(sizes[axis] for axis in axes), dtype=dtype, device=device))
-    return out
+    return filled(Scratch(), SCRATCH, room.sizes(scenes, tools), device)
 
 
-def net(device: Any) -> Any:
-    """The network for one material."""
-    out, arrays = Net(), shipped("contact_net").arrays
-    assert arrays["w1"].shape[1] == arrays["w3"].shape[1] == 32 and arrays["w4"].shape[1] == PRESSURE.size
+def net(network: str, device: Any) -> Any:
+    """A network of contact nodes, by its name."""
+    out, arrays = Net(), shipped(network).arrays
+    assert arrays["w1"].shape[1] == arrays["w3"].shape[1] <= HIDDEN and arrays["w4"].shape[1] == PRESSURE.size
     for name in NET:
-        setattr(out, name, wp.array(arrays[name], dtype=wp.float32, device=device))
+        values = arrays[name]
+        if name[0] in "wb":
+            rows = (0, HIDDEN - len(values)) if name in ("w2", "w3", "w4") else (0, 0)
+            wide = (0, HIDDEN - values.shape[-1]) if name[1] != "4" else (0, 0)
+            values = np.pad(values, (rows, wide) if name[0] == "w" else wide)
+        setattr(out, name, wp.array(values, dtype=wp.float32, device=device))
     return out
 
 
@@ -163,10 +199,12 @@ def pack(skins: Sequence[Skin], tools: Sequence[Tool], device: Any) -> tuple[Any
     ones, grids, tables, fields = [], [], [], []
     stores: dict[float, Tools] = {}
     offsets: dict[int, int] = {}
-    vertices = faces = balls = coefficients = 0
+    vertices = faces = balls = coefficients = coarse = motion = 0
     for skin in skins:
         columns = Columns(skin.layer)
         one, arrays = _one_skin(skin, columns, (vertices, faces, balls, len(tables)))
+        arrays |= _of_stack(one, skin, columns._order, (coarse, motion))
+        coarse, motion = coarse + len(arrays["gathered"]), motion + len(arrays["motion"])
         margin = margin_on(skin.layer)
         store = stores.setdefault(margin, Tools(margin))
         fields.append([store.field(tool) for tool in tools])
@@ -194,7 +232,9 @@ def pack(skins: Sequence[Skin], tools: Sequence[Tool], device: Any) -> tuple[Any
     for name, (dtype, _) in SKINS.items():
         values: Any = {"one": ones, "grids": grids}.get(name)
         if values is None:
-            values = np.concatenate(parts[name])
+            wide = max(each.shape[-1] for each in parts[name])
+            values = np.concatenate([np.pad(each, ((0, 0), (0, wide - each.shape[1]))) for each in parts[name]]) \
+                if name == "linked" else np.concatenate(parts[name])
         setattr(out, name, wp.array(values, dtype=dtype, device=device))
     return out, fields
 
@@ -213,7 +253,7 @@ def _one_skin(skin: Skin, columns: Columns, at: tuple[int, int, int, int]) -> tu
     arrays = {
         "points": layer.vertices[order], "inward": columns.inward[order], "thickness": layer.thickness[order],
         "area": layer.vertex_areas[order], "area_vectors": layer.vertex_area_vectors[order],
-        "bent": skin.near.bent[order], "doubts": doubts[order], "faces": at[0] + place[columns.faces],
+        "bent": skin.near.bent_at(order)[order], "doubts": doubts[order], "faces": at[0] + place[columns.faces],
         "start": at[1] * 3 + start[:-1], "around": at[1] + around, "balls": columns._blocks,
     }  # fmt: skip
     one, tissue = OneSkin(), layer.tissue
@@ -222,10 +262,51 @@ def _one_skin(skin: Skin, columns: Columns, at: tuple[int, int, int, int]) -> tu
     one.hole, one.thickest, one.edge = 0.6 * layer.edge_length, float(layer.thickness.max()), layer.edge_length
     one.modulus, one.nu = tissue.youngs_modulus, tissue.poisson_ratio
     one.mu, one.lam = tissue.shear_modulus / one.modulus, tissue.lame_lambda / one.modulus
-    low, high = shipped("contact_net").card["ranges"]["poisson_ratio"]
+    low, high = shipped(network_of(layer)).card["ranges"]["poisson_ratio"]
     one.learnt = int(low - 1e-3 <= tissue.poisson_ratio <= high + 1e-3)
     one.low, one.high = vec3(*layer.vertices.min(axis=0)), vec3(*layer.vertices.max(axis=0))
     return one, arrays
+
+
+def network_of(layer: SoftLayer) -> str:
+    """Name of the network of contact nodes that belongs to a layer."""
+    return "stack_contact_net" if layer.stacked else "contact_net"
+
+
+def _of_stack(one: Any, skin: Skin, order: np.ndarray, at: tuple[int, int]) -> dict[str, np.ndarray]:
+    """What a stack has more, and skin with folds; at: coarse vertices, and numbers of their motion, before it."""
+    one.folded, one.stacked, one.coarse, one.softness = int(skin.near.folded), 0, 0, 1.0
+    one.first_coarse, one.first_motion = at
+    out: dict[str, np.ndarray] = {
+        "linked": _linked(skin, order) if skin.near.folded else np.zeros((len(order), 1), np.uint32),
+        "green": np.zeros((1, 1, 1)), "coarse_corner": np.zeros((1, 3), int), "coarse_share": np.zeros((1, 3)),
+        "gathered": np.zeros(0), "motion": np.zeros(0), "hard_logs": np.zeros((1, COLUMNS)),
+        "hard": np.zeros((1, COLUMNS, STRAINS)),
+    }  # fmt: skip
+    green = skin.green
+    if green is None:
+        return out
+    assert green.coarse is not None
+    corners, shares, gathered, motion, *_ = green.coarse
+    logs, hard = green.hardening
+    one.stacked, one.coarse = 1, len(gathered)
+    one.flat, one.effective = green.thickness, green.effective.thickness
+    _, one.log_kappa, one.log_pull, log_softness = (float(x) for x in green.numbers)
+    one.softness = float(np.exp(log_softness))
+    return out | {
+        "green": green.tables[None, 0], "coarse_corner": corners[order], "coarse_share": shares[order],
+        "gathered": gathered, "motion": motion.ravel(), "hard_logs": logs[None], "hard": hard[None],
+    }  # fmt: skip
+
+
+def _linked(skin: Skin, order: np.ndarray) -> np.ndarray:
+    """Bits that say which vertices are neighbours along the skin, (V, V / 32)."""
+    thin, count, place = skin.near._thinning, len(order), np.empty(len(order), np.int64)
+    place[order] = np.arange(count)
+    zones = (len(thin.start) - 1) // count
+    bits = np.zeros((count, 32 * -(-count // 32)), bool)
+    bits[np.repeat(place, np.diff(thin.start[::zones])), place[thin.index]] = True
+    return np.packbits(bits, axis=1, bitorder="little").view(np.uint32)
 
 
 def _grid(field: SignedDistance, offset: int) -> Any:
@@ -257,4 +338,5 @@ def room_for(skins: Sequence[Skin], fields: Sequence[Sequence[SignedDistance]], 
             wanted += min(max(FEWEST_NODES, 2 * NODES + 1.3 * extent[1] * extent[2] / cell), 1.2 * MOST)
         most, blocks = max(most, int(wanted)), max(blocks, -(-len(layer.vertices) // BLOCK))
     return Room(min(int(MARGIN * columns) + BLOCK, max(len(s.layer.vertices) for s in skins)), blocks,
-                32 * -(-(most if nodes is None else nodes) // 32), lanes)  # fmt: skip
+                32 * -(-(most if nodes is None else nodes) // 32), lanes,
+                max(len(skin.green.coarse.gathered) if skin.green and skin.green.coarse else 0 for skin in skins))

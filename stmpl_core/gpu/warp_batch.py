@@ -13,7 +13,7 @@ Geometry and the linear problem are float64, the network float32, as in the law 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass
 from typing import Any
@@ -21,9 +21,9 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from stmpl_core.contact_net import LINEAR_TO
 from stmpl_core.errors import InvalidInput
-from stmpl_core.gpu import answers, columns, hold, lattice, looks, packs, places
+from stmpl_core.gpu import answers, columns, hold, lattice, looks, packs, places, stacks
+from stmpl_core.gpu.fields import Fields
 from stmpl_core.networks import shipped
 from stmpl_core.obstacle import MAX_ITERATIONS
 from stmpl_core.skin import Skin
@@ -48,6 +48,8 @@ class WarpTouches:
         statuses: numbers of STATUSES, (n, K) int32. "refused": a pose of the scene is not a finite rigid transform;
             "too deep": a tool of the scene is deeper than 0.9 of the thickness or inside the limb, which Batch draws
             back and this does not; "no room": a tool of the scene meets more skin than there is room for (`nodes`).
+        fields: motion of the vertices of each scene that was asked for it, in the order asked, (F, V, 3) [m]; NaN where
+            the scene was refused or is not served, 0 beyond the vertices of a smaller skin. None: none was asked for.
     """
 
     wrenches: Any
@@ -55,6 +57,7 @@ class WarpTouches:
     force_bounds: Any
     in_range: Any
     statuses: Any
+    fields: Any = None
 
     @property
     def served(self) -> np.ndarray:
@@ -66,14 +69,14 @@ class WarpBatch:
     """n scenes on one skin or on many, with the same tools, on one device.
 
     Args:
-        skins: a prepared skin for all scenes, or one for each (the same one may stand for several). One material, at
-            rest.
+        skins: a prepared skin for all scenes, or one for each (the same one may stand for several). Elastic and
+            at rest: all of one material, or all stacks (living limbs, columns that run to bone).
         tools: tools, each with a name of its own.
         n: number of scenes; None: that of the skins.
         device: device as Warp names it: "cuda", "cuda:1", "cpu".
         nodes: room for contact nodes of all tools of a scene together; None: what these tools need.
         memory: scratch space [bytes]; scenes that do not fit go one part after the other; None: 4 GiB on a GPU, 256 MiB
-            on a CPU.
+            on a CPU. Fields take as much again.
         lanes: threads that share the work of a scene; None: LANES on a GPU, 1 on a CPU.
 
     Attributes:
@@ -81,8 +84,7 @@ class WarpBatch:
         room: capacities for a scene.
 
     Raises:
-        InvalidInput: numbers that do not fit, no such device, or a skin that is not served: a stack (a living limb),
-            one that joints have moved, or one with folds.
+        InvalidInput: numbers that do not fit, no such device, skins of both kinds, or one that joints have moved.
         MeshError: a tool's surface that cannot be used.
     """
 
@@ -98,17 +100,22 @@ class WarpBatch:
         if not self.tools or len({tool.name for tool in self.tools}) < len(self.tools):
             raise InvalidInput("a batch needs tools, each with a name of its own. Try tool.named('left').")
         self.device = _device(device)
-        unique = list({id(skin): skin for skin in each}.values())
+        self._unique = unique = list({id(skin): skin for skin in each}.values())
+        self._fields: Fields | None = None  # made when the first is asked for
         for skin in unique:
             _check(skin)
+        if len({skin.layer.stacked for skin in unique}) > 1:
+            raise InvalidInput("stacks and skins of one material do not go into one WarpBatch. Try one for each kind.")
         self._lanes = lanes or (LANES if self.device.is_cuda else 1)
         self._skins, fields = packs.pack(unique, self.tools, self.device)
         self.room = packs.room_for(unique, fields, self._lanes, nodes)
-        self._net, self._known = packs.net(self.device), _known()
+        network = packs.network_of(unique[0].layer)
+        self._stacked = unique[0].layer.stacked
+        self._net, self._known = packs.net(network, self.device), _known(network)
         number = {id(skin): k for k, skin in enumerate(unique)}
         self._skin_of = np.array([number[id(skin)] for skin in each], np.int32)
         room = self.room.bytes_of(len(self.tools))
-        budget = MEMORY[self.device.is_cuda] if memory is None else memory
+        self._memory = budget = MEMORY[self.device.is_cuda] if memory is None else memory
         if room > budget:
             raise InvalidInput(f"one scene needs {room} bytes of scratch space; {budget} are allowed.")
         self._part = min(count, budget // room)
@@ -118,7 +125,8 @@ class WarpBatch:
     def __len__(self) -> int:
         return len(self._skin_of)
 
-    def touch(self, poses: Any, *, out: Any = None) -> WarpTouches:
+    def touch(self, poses: Any, *, fields: Iterable[int] = (), out: Any = None,
+              fields_out: Any = None) -> WarpTouches:  # fmt: skip
         """What all tools do in all scenes, elastic skin without friction, as if nothing had been before.
 
         Args:
@@ -126,30 +134,50 @@ class WarpBatch:
                 or matrices, (n, K, 4, 4), float32 or float64. Arrays of Warp (of wp.transform, (n, K), too) and torch
                 on this device are not copied; those of numpy are, to a GPU. A scene with a pose that is not finite or
                 not rigid is refused, and no other.
+            fields: numbers of the scenes whose skin's motion is wanted too.
             out: array of Warp or torch on this device that takes the wrenches, (n, K, 6), of the poses' precision;
                 None: a new one.
+            fields_out: array that takes the fields, (F, V, 3), float32 or float64, likewise.
 
         Raises:
-            InvalidInput: shapes, precisions or devices that do not fit.
+            InvalidInput: shapes, precisions, devices or numbers of scenes that do not fit; fields of stacks, of skin
+                with folds, of skins that are not moved by one MomentNet, or one that there is no memory for.
         """
         n, many = len(self), len(self.tools)
+        wanted = np.array(list(fields), dtype=np.int64)
+        if len(wanted) and not (0 <= wanted.min() and wanted.max() < n):
+            raise InvalidInput(f"fields are asked for scenes {wanted.min()} to {wanted.max()}; there are {n}.")
         given = self._array("poses", poses)
         if given.shape not in ((n, many, 7), (n, many, 4, 4)):
             raise InvalidInput(f"poses have shape {given.shape}; ({n}, {many}, 7) or ({n}, {many}, 4, 4) is needed.")
         real = given.dtype
-        if isinstance(out, (np.ndarray, list, tuple)):
-            raise InvalidInput("out is numpy's; an array of Warp or torch is needed. Try wp.from_numpy or torch.empty.")
-        wrenches = wp.empty((n, many, 6), dtype=real, device=self.device) if out is None else self._array("out", out)
-        if wrenches.shape != (n, many, 6) or wrenches.dtype != real:
-            raise InvalidInput(f"out has shape {wrenches.shape} of {wrenches.dtype.__name__}; ({n}, {many}, 6) of "
-                               f"{real.__name__} is needed.")  # fmt: skip
+        wrenches = self._output("out", out, (n, many, 6), (real,))
+        motion = None
+        if len(wanted):
+            self._fields = self._fields or Fields(self._unique, many, self._lanes, self._memory, self.device)
+            motion = self._output("fields_out", fields_out, (len(wanted), self._fields.vertices, 3),
+                                  (real, wp.float32, wp.float64))  # fmt: skip
         depths, bounds = (wp.empty((n, many), dtype=real, device=self.device) for _ in range(2))
         kinds: tuple[Any, Any] = wp.bool, wp.int32
         in_range, statuses = (wp.empty((n, many), dtype=kind, device=self.device) for kind in kinds)
         with _stream_of(poses, self.device):
             for part, first in enumerate(range(0, n, self._part)):
                 self._answer(part, first, given, (wrenches, depths, bounds, in_range, statuses))
-        return WarpTouches(wrenches, depths, bounds, in_range, statuses)
+                rows = np.flatnonzero((wanted >= first) & (wanted < first + self._part))
+                if len(rows) and self._fields is not None:
+                    self._fields.move(wanted[rows] - first, rows, self._skins, self._scratch, motion)
+        return WarpTouches(wrenches, depths, bounds, in_range, statuses, motion)
+
+    def _output(self, name: str, given: Any, shape: tuple[int, ...], reals: tuple[Any, ...]) -> Any:
+        """An array that takes an answer, of one of these precisions: the one given, or a new one of the first."""
+        if isinstance(given, (np.ndarray, list, tuple)):
+            raise InvalidInput(f"{name} is numpy's; an array of Warp or torch is needed. Try wp.from_numpy or "
+                               "torch.empty.")  # fmt: skip
+        found = wp.empty(shape, dtype=reals[0], device=self.device) if given is None else self._array(name, given)
+        if found.shape != shape or found.dtype not in reals:
+            raise InvalidInput(f"{name} has shape {found.shape} of {found.dtype.__name__}; {shape} of "
+                               f"{' or '.join(real.__name__ for real in reals[-2:])} is needed.")  # fmt: skip
+        return found
 
     def _array(self, name: str, values: Any) -> Any:
         """Values as a Warp array on this device, not copied but from numpy to a GPU."""
@@ -236,7 +264,14 @@ class WarpBatch:
         scratch, skins, lanes, many, net = self._scratch, self._skins, self._lanes, len(self.tools), self._net
         scenes = tools // many
         shared = scenes, lanes
-        self._run(hold.respond, shared, lanes, many, skins, scratch)
+        self._run(answers.group, scenes, many, skins, scratch)
+        self._run(stacks.fold, scenes, many, skins, scratch)
+        if self._stacked:
+            self._run(stacks.find_mean, tools, many, skins, scratch)
+            self._run(stacks.sink, shared, lanes, many, skins, scratch)
+            self._run(stacks.meet, scenes, many, skins, scratch)
+            self._run(stacks.give_way, shared, lanes, many, skins, scratch)
+        self._run(stacks.respond if self._stacked else hold.respond, shared, lanes, many, skins, scratch)
         self._run(hold.guess, scenes, many, skins, scratch)
 
         def turn() -> None:
@@ -246,14 +281,15 @@ class WarpBatch:
         self._iterate(scenes, turn, hold.step)
         self._run(hold.begin_power, scenes, scratch)
         self._iterate(scenes, lambda: None, hold.step_power)
-        self._run(hold.see, shared, lanes, many, skins, scratch)
+        if self._stacked:
+            self._run(stacks.share_given_way, tools, many, scratch)
+        self._run(stacks.see if self._stacked else hold.see, shared, lanes, many, skins, scratch)
         self._run(hold.judge, shared, lanes, scratch, net)
         self._run(hold.layer, shared, lanes, scratch, scratch.inputs, net.w1, net.b1, scratch.one)
         self._run(hold.layer, shared, lanes, scratch, scratch.one, net.w2, net.b2, scratch.two)
         self._run(hold.layer, shared, lanes, scratch, scratch.two, net.w3, net.b3, scratch.one)
         self._run(hold.correct, shared, lanes, scratch, net)
         self._run(answers.find_highest, shared, lanes, many, skins, scratch)
-        self._run(answers.group, scenes, many, skins, scratch)
 
     def _iterate(self, scenes: int, turn: Callable[[], None], step: Any) -> None:
         """Conjugate gradients until every scene is done."""
@@ -279,21 +315,16 @@ def _check(skin: Any) -> None:
     """Refuses a skin that the kernels do not serve."""
     if not isinstance(skin, Skin):
         raise InvalidInput("a batch needs prepared skins. Try Skin.of(layer, MomentNet()).")
-    for refused, what in (
-        (skin.layer.stacked, "a stack (a living limb, or columns that run to bone)"),
-        (skin.rest is not None, "a skin that joints have moved"),
-        (skin.near.folded, "a skin with folds"),
-    ):
-        if refused:
-            raise InvalidInput(f"{what} is not served by WarpBatch yet; one elastic material at rest is. Try Batch.")
+    if skin.rest is not None:
+        raise InvalidInput("a skin that joints have moved is not served by WarpBatch yet; skin at rest is. Try Batch.")
 
 
-def _known() -> Any:
-    """Figures of the network's card."""
-    card, out = shipped("contact_net").card, answers.Known()
+def _known(network: str) -> Any:
+    """Figures of a network's card."""
+    card, out = shipped(network).card, answers.Known()
     out.scale, out.power = card["bound"]["scale"], card["bound"]["power"]
+    out.uneven = card["bound"].get("uneven", 0.0)
     out.pressure, out.depth = card["ranges"]["p_over_e"][1], card["ranges"]["depth_over_thickness"][1]
-    out.linear_to = LINEAR_TO
     return out
 
 

@@ -1,0 +1,131 @@
+"""Packs of what the motion of skin takes: neighbours, responses, a network; and scratch space for it."""
+
+# pyright: reportInvalidTypeForm=false
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+import warp as wp
+
+from stmpl_core.columns import Columns
+from stmpl_core.errors import InvalidInput
+from stmpl_core.gpu.packs import bytes_of, filled, struct_of
+from stmpl_core.gpu.rays import real, vec3
+from stmpl_core.methods.moment_net import MomentNet
+from stmpl_core.networks import INPUTS, MOTION
+from stmpl_core.response import _RINGS
+from stmpl_core.skin import Skin
+
+vec8 = wp.types.vector(length=8, dtype=wp.float32)
+
+# V: vertices of all skins, Z: zones and vertices, N: neighbours, z: zones, R: rows of tables
+SKIN_FIELDS: dict[str, tuple[Any, str]] = {
+    "reach": (wp.int32, "Z"), "index": (wp.int32, "N"), "stands": (wp.uint8, "zV"), "corners": (wp.int32, "zVc"),
+    "weights": (wp.float32, "zVc"), "at": (wp.vec3f, "V"), "site": (wp.vec4f, "V"), "normal": (wp.vec3f, "V"),
+    "frame": (wp.mat33f, "V"), "shape": (wp.float32, "Vs"), "original": (wp.int32, "V"),
+    "sink": (wp.float32, "SgR"), "away": (wp.float32, "SgR"), "rings": (vec8, "Rk"),
+}  # fmt: skip
+# F: scene whose field is asked, C: scene and tool, V: vertices of a skin, W: vertices under its tools, R: lanes
+FIELD_SCRATCH: dict[str, tuple[Any, str]] = {
+    "many": (wp.int32, "F"), "under": (wp.int32, "FW"), "of": (wp.int32, "FW"), "source": (wp.vec2f, "FW"),
+    "press": (real, "CW"), "lies": (real, "CW"), "gone": (vec3, "CW"), "way": (vec3, "C"), "one_way": (wp.int32, "C"),
+    "mark": (wp.int32, "FV"), "ask": (wp.int32, "FV"), "here": (wp.vec2f, "FV"), "fixed": (wp.vec3f, "FV"),
+    "scaled": (wp.vec3f, "FV"), "told": (wp.vec2d, "FR"), "gain": (real, "F"), "motion": (vec3, "FV"),
+    "sinking": (wp.float32, "FWW"), "left": (real, "FWW"), "right": (vec3, "FW"), "wanted": (vec3, "FW"),
+    "weight": (real, "FW"), "moved": (vec3, "FW"), "pulls": (vec3, "FW"), "act": (wp.int32, "FW"),
+    "acts": (wp.int32, "F"), "own": (real, "F"), "spread": (vec3, "FV"), "most": (wp.int32, "1"),
+}  # fmt: skip
+MOTION_NET: dict[str, tuple[Any, str]] = {
+    name: (wp.float32, "io" if name[0] == "w" or name.startswith("mix") else "o")
+    for name in ("mix_vectors", "mix_tensors", "low", "high", "mean", "scale", "w1", "b1", "w2", "b2", "w3", "b3",
+                 "w4", "b4")
+}  # fmt: skip
+SkinFields = struct_of("SkinFields", "What a field takes of the skins.", SKIN_FIELDS)
+FieldScratch = struct_of("FieldScratch", "What kernels of fields leave for each other.", FIELD_SCRATCH)
+MotionNet = struct_of("MotionNet", "Weights of a MomentNet for what tools press with.", MOTION_NET)
+
+
+class FieldRoom(NamedTuple):
+    """Capacities for one scene: vertices of its skin, vertices under its tools, tools, lanes."""
+
+    vertices: int
+    under: int
+    tools: int
+    lanes: int
+
+    def sizes(self, scenes: int) -> dict[str, int]:
+        """Length of each axis of FIELD_SCRATCH."""
+        return {"F": scenes, "C": scenes * self.tools, "V": self.vertices, "W": self.under, "R": self.lanes, "1": 1}
+
+    def bytes_of(self) -> int:
+        """Memory for one scene [bytes]."""
+        return bytes_of(FIELD_SCRATCH, self.sizes(1))
+
+    def scratch(self, scenes: int, device: Any) -> Any:
+        """Scratch space for so many scenes."""
+        return filled(FieldScratch(), FIELD_SCRATCH, self.sizes(scenes), device)
+
+
+def method_of(skins: Sequence[Skin]) -> MomentNet:
+    """The one network that moves these skins. Raises InvalidInput: another method, or several networks."""
+    methods = [skin.method for skin in skins]
+    first = methods[0]
+    if not isinstance(first, MomentNet) or any(
+        not isinstance(one, MomentNet) or one.fallback is not None or one.contact is not first.contact
+        for one in methods
+    ):
+        names = ", ".join(sorted({one.name for one in methods}))
+        raise InvalidInput(f"fields of WarpBatch come from one MomentNet without a fallback; the skins have {names}. "
+                           "Try Batch, or Skin.of(layer, MomentNet()).")  # fmt: skip
+    return first
+
+
+def motion_net(skins: Sequence[Skin], device: Any) -> Any:
+    """The network that says how tools move these skins."""
+    arrays, out = method_of(skins).contact.arrays, MotionNet()
+    assert arrays["w1"].shape == (INPUTS.size, arrays["w2"].shape[0]) and arrays["w4"].shape[1] == MOTION.size
+    for name in MOTION_NET:
+        setattr(out, name, wp.array(arrays[name], dtype=wp.float32, device=device))
+    return out
+
+
+def pack(skins: Sequence[Skin], device: Any) -> Any:
+    """What fields take of skins, in the order and with the numbers of packs.pack."""
+    parts: dict[str, list[np.ndarray]] = {name: [] for name in SKIN_FIELDS}
+    vertices = neighbours = 0
+    for skin in skins:
+        arrays, near = _of_one(skin, vertices, neighbours)
+        for name, values in arrays.items():
+            parts[name].append(values)
+        vertices, neighbours = vertices + len(skin.layer.vertices), neighbours + near
+    parts["reach"].append(np.array([neighbours]))
+    parts["rings"] = [_RINGS.reshape(-1, 3, 8)]
+    out = SkinFields()
+    for name, (dtype, axes) in SKIN_FIELDS.items():
+        values = np.concatenate(parts[name], axis=axes.index("V") if axes.startswith("z") else 0)
+        setattr(out, name, wp.array(values, dtype=dtype, device=device))
+    return out
+
+
+def _of_one(skin: Skin, before: int, neighbours: int) -> tuple[dict[str, np.ndarray], int]:
+    """What fields take of one skin, after so many vertices and neighbours of others; the number of its neighbours."""
+    near, order = skin.near, Columns(skin.layer)._order
+    thin, count, place = near._thinning, len(order), np.empty(len(order), np.int64)
+    place[order] = np.arange(count)
+    zones = (len(thin.start) - 1) // count
+    rows = (zones * order[:, None] + np.arange(zones)).ravel()
+    sizes = np.diff(thin.start)[rows]
+    ends = np.cumsum(sizes)
+    index = thin.index[np.arange(ends[-1]) - np.repeat(ends - sizes - thin.start[rows], sizes)]
+    shape, sites = np.concatenate([near.curvature, near.slope], axis=1)[order], near._sites[:, order]
+    return {
+        "reach": neighbours + ends - sizes, "index": before + place[index],
+        "stands": thin._stands[:, order].astype(np.uint8),
+        "corners": before + place[thin._corners[:, order]], "weights": thin._weights[:, order],
+        "at": sites[:3].T, "site": sites[3:7].T, "normal": sites[7:].T, "frame": near.frames[order],
+        "shape": shape, "original": order, "sink": near._response[None, 0], "away": near._response[None, 1],
+    }, int(ends[-1])  # fmt: skip
+

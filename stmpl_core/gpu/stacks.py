@@ -1,0 +1,279 @@
+# type: ignore  # kernels are in Warp's language, which pyright does not know
+"""Kernels of what a stack does under contact nodes: stmpl_core.green._matrix and what a ContactNet reads on a stack."""
+
+import math
+
+import warp as wp
+
+from stmpl_core import contact_net, green
+from stmpl_core.columns import MIN_ONE_WAY_SHARE
+from stmpl_core.gpu.hold import FADE_RING, HARDENING, LINEAR_TO, NEAR, RINGS, STEPS, _row, _write, _write_alike
+from stmpl_core.gpu.packs import Scratch, Skins
+from stmpl_core.gpu.rays import OPTIONS, depth_in_column, real, vec3
+from stmpl_core.networks import STACK_NODE
+from stmpl_core.response import SPREAD as SPREAD_OF_AREA
+
+ONE_WAY = wp.constant(wp.float64(MIN_ONE_WAY_SHARE))
+ROWS, FARTHEST, AROUND = (wp.constant(wp.float64(x)) for x in (green.ROWS, green.FARTHEST, green.AROUND))
+FIRST_LOG, STEP_LOG = wp.constant(wp.float64(green.FIRST_LOG)), wp.constant(wp.float64(green.STEP_LOG))
+LAST_ROW = wp.constant(wp.float64(len(green.SPREADS) - 1.001))
+SPREAD, LAST_AREA = wp.constant(wp.float64(SPREAD_OF_AREA)), wp.constant(wp.float64(green.AREAS - 1.001))
+MORE_AREAS = wp.constant(wp.float64(green.AREAS - 1))
+ROUND_SQUARE = wp.constant(wp.float64((green.ROUND * SPREAD_OF_AREA) ** 2))
+THICKNESSES, STRAINS = wp.constant(green.COLUMNS), wp.constant(green.STRAINS)
+STACK_FADE = wp.constant(wp.float64(contact_net.STACK_FADE))
+ROUND_FROM = wp.constant(wp.float64(contact_net.ROUND_FROM))
+AT_THICKNESS, AT_COLUMN = wp.constant(STACK_NODE.at.log_thickness), wp.constant(STACK_NODE.at.column_strain)
+AT_HARDENING, AT_KAPPA = wp.constant(STACK_NODE.at.hardening), wp.constant(STACK_NODE.at.log_kappa)
+AT_PULL, AT_CURVATURE = wp.constant(STACK_NODE.at.log_pull), wp.constant(STACK_NODE.at.curvature)
+AT_OVER, AT_GIVEN = wp.constant(STACK_NODE.at.curvature_over_strain), wp.constant(STACK_NODE.at.given_way)
+assert math.isclose(green.SPREADS[0], math.exp(green.FIRST_LOG))
+wp.set_module_options({**OPTIONS, "max_unroll": 4})
+
+
+@wp.kernel
+def find_mean(many: wp.int32, skins: Skins, scratch: Scratch):
+    """Mean way of the skin under each tool, 0 where it has none: columns._sinking; and the extremes of its areas."""
+    c = wp.tid()
+    s, k = c // many, c % many
+    mean, total, least, most = vec3(), real(0.0), real(1e30), real(0.0)
+    for i in range(scratch.nodes[s]):
+        if scratch.tool[s, i] == k:
+            push = scratch.area[s, i] * scratch.strain[s, i] * scratch.thick[s, i]
+            mean = mean + push * scratch.inward[s, i]
+            total += push
+        if scratch.group[s * many + scratch.tool[s, i]] == scratch.group[c]:
+            least = wp.min(least, scratch.area[s, i])
+            most = wp.max(most, scratch.area[s, i])
+    if wp.length(mean) <= ONE_WAY * total:
+        mean = vec3()
+    scratch.mean[c] = wp.normalize(mean)
+    scratch.least_area[c] = least
+    scratch.most_area[c] = most
+
+
+@wp.kernel
+def sink(lanes: wp.int32, many: wp.int32, skins: Skins, scratch: Scratch):
+    """Depth by which the skin sinks at each node if it goes with its tool."""
+    s, lane = wp.tid()
+    for i in range(lane, scratch.nodes[s], lanes):
+        c, depth = s * many + scratch.tool[s, i], scratch.strain[s, i] * scratch.thick[s, i]
+        sinking, way = real(depth), scratch.mean[c]
+        if wp.length_sq(way) > real(0.0):
+            pose, cosine = wp.transpose(scratch.pose[c]), wp.dot(scratch.inward[s, i], way)
+            guess = wp.max(depth * cosine, real(1e-9))
+            start = pose * (scratch.point[s, i] - scratch.place[c])
+            far = depth_in_column(skins.grids[scratch.grid[c]], skins.coefficients, start, pose * way,
+                                  real(4.0) * guess, guess)  # fmt: skip
+            sinking = wp.min(far * cosine, depth)
+        scratch.sinking[s, i] = sinking
+
+
+@wp.kernel
+def fold(many: wp.int32, skins: Skins, scratch: Scratch):
+    """Numbers of groups of nodes of which none feels another, on skin with folds: thinning._together."""
+    s = wp.tid()
+    one = skins.one[scratch.skin[s * many]]
+    for i in range(scratch.nodes[s]):
+        scratch.fold[s, i] = 0
+        if one.folded == 1:
+            scratch.fold[s, i] = -1
+    if one.folded == 0:
+        return
+    groups = wp.int32(0)
+    for i in range(scratch.nodes[s]):
+        if scratch.fold[s, i] < 0:
+            scratch.fold[s, i] = groups
+            scratch.queue[s, 0] = i
+            done, end = wp.int32(0), wp.int32(1)
+            while done < end:
+                n = scratch.queue[s, done]
+                done += 1
+                v, group = skins.faces[scratch.face[s, n]][0], scratch.group[s * many + scratch.tool[s, n]]
+                for j in range(scratch.nodes[s]):
+                    if scratch.fold[s, j] < 0 and scratch.group[s * many + scratch.tool[s, j]] == group:
+                        w = skins.faces[scratch.face[s, j]][0] - one.first
+                        if ((skins.linked[v, w // 32] >> wp.uint32(w % 32)) & wp.uint32(1)) == wp.uint32(1):
+                            scratch.fold[s, j] = groups
+                            scratch.queue[s, end] = j
+                            end += 1
+            groups += 1
+
+
+@wp.kernel
+def meet(many: wp.int32, skins: Skins, scratch: Scratch):
+    """Coarse vertices around the nodes of a scene, each once; and those around each node, with their weights."""
+    s = wp.tid()
+    one, count = skins.one[scratch.skin[s * many]], wp.int32(0)
+    for n in range(one.coarse):
+        scratch.slot[s, n] = -1
+    for i in range(scratch.nodes[s]):
+        corners, shares, own = skins.faces[scratch.face[s, i]], scratch.shares[s, i], wp.int32(0)
+        for q in range(9):
+            v = corners[q // 3]
+            n, weight = skins.coarse_corner[v][q % 3], shares[q // 3] * skins.coarse_share[v][q % 3]
+            if scratch.slot[s, n] < 0:
+                scratch.slot[s, n] = count
+                scratch.met[s, count] = n
+                count += 1
+            slot, k = scratch.slot[s, n], wp.int32(0)
+            while k < own and scratch.slots[s, i, k] != slot:
+                k += 1
+            if k == own:
+                scratch.slots[s, i, k] = slot
+                scratch.weights[s, i, k] = real(0.0)
+                own += 1
+            scratch.weights[s, i, k] = scratch.weights[s, i, k] + weight
+        for k in range(own):
+            area = skins.gathered[one.first_coarse + scratch.met[s, scratch.slots[s, i, k]]]
+            scratch.parts[s, i, k] = scratch.weights[s, i, k] / area
+        scratch.around_node[s, i] = own
+    scratch.meets[s] = count
+
+
+@wp.kernel
+def give_way(lanes: wp.int32, many: wp.int32, skins: Skins, scratch: Scratch):
+    """How far each node goes inwards under a pressure at each of these."""
+    s, lane = wp.tid()
+    one, count = skins.one[scratch.skin[s * many]], scratch.meets[s]
+    for n in range(lane, scratch.nodes[s] * count, lanes):
+        i, d = n // count, n % count
+        sum, inward, to = real(0.0), scratch.inward[s, i], one.first_motion + scratch.met[s, d]
+        for k in range(scratch.around_node[s, i]):
+            row = to + 3 * one.coarse * scratch.met[s, scratch.slots[s, i, k]]
+            moved = vec3(real(skins.motion[row]), real(skins.motion[row + one.coarse]),
+                         real(skins.motion[row + 2 * one.coarse]))  # fmt: skip
+            sum += scratch.weights[s, i, k] * wp.dot(inward, moved)
+        scratch.rows[s, i, d] = sum
+
+
+@wp.func
+def _wide(scratch: Scratch, s: wp.int32, i: wp.int32, j: wp.int32) -> real:
+    """How far node i goes inwards with the limb under a force at node j."""
+    sum = real(0.0)
+    for k in range(scratch.around_node[s, j]):
+        sum += scratch.parts[s, j, k] * scratch.rows[s, i, scratch.slots[s, j, k]]
+    return sum
+
+
+@wp.func
+def _together(scratch: Scratch, s: wp.int32, many: wp.int32, i: wp.int32, j: wp.int32) -> bool:
+    """Whether two nodes feel each other: their tools do, and no air is between them."""
+    one, other = scratch.group[s * many + scratch.tool[s, i]], scratch.group[s * many + scratch.tool[s, j]]
+    return one == other and scratch.fold[s, i] == scratch.fold[s, j]
+
+
+@wp.func
+def _log_spread(least: real, steps: real, n: real) -> real:
+    return wp.log(SPREAD * wp.sqrt(least + n / steps))
+
+
+@wp.kernel
+def respond(lanes: wp.int32, many: wp.int32, skins: Skins, scratch: Scratch):
+    """Depth of each node under a force E at each, and the limb's part of it, (N, N) each [1/m]."""
+    s, lane = wp.tid()
+    id, count = scratch.skin[s * many], scratch.nodes[s]
+    one = skins.one[id]
+    for n in range(lane, count * count, lanes):
+        i, j = n // count, n % count
+        value, both = real(0.0), real(0.0)
+        c = s * many + scratch.tool[s, i]
+        if _together(scratch, s, many, i, j):
+            both = real(0.5) * (_wide(scratch, s, i, j) + _wide(scratch, s, j, i))
+            facing = wp.dot(scratch.inward[s, i], scratch.inward[s, j])
+            square = wp.length_sq(scratch.point[s, i] - scratch.point[s, j])
+            f = wp.sqrt(wp.sqrt(square) / one.flat) * ROWS
+            if facing > real(0.0) and f < FARTHEST:
+                least, most = scratch.least_area[c], scratch.most_area[c]
+                steps = MORE_AREAS / wp.max(most - least, real(1e-9) * most)
+                mean = real(0.5) * (scratch.area[s, i] + scratch.area[s, j])
+                a = wp.min((mean - least) * steps, LAST_AREA)
+                low, share = wp.floor(a), a - wp.floor(a)
+                log_spread = (real(1.0) - share) * _log_spread(least, steps, low)
+                log_spread += share * _log_spread(least, steps, low + real(1.0))
+                h = wp.clamp((log_spread - wp.log(one.flat) - FIRST_LOG) / STEP_LOG, real(0.0), LAST_ROW)
+                k, g = wp.int32(f), wp.int32(h)
+                x, y, near = f - real(k), h - real(g), wp.clamp(facing / AROUND, real(0.0), real(1.0))
+                first = (real(1.0) - x) * skins.green[id, g, k] + x * skins.green[id, g, k + 1]
+                second = (real(1.0) - x) * skins.green[id, g + 1, k] + x * skins.green[id, g + 1, k + 1]
+                value = near * near * (real(3.0) - real(2.0) * near) * ((real(1.0) - y) * first + y * second)
+                value = value / wp.sqrt(square + mean * ROUND_SQUARE)
+        scratch.wide_part[s, i, j] = both
+        scratch.matrix[s, i, j] = value + both
+
+
+@wp.kernel
+def share_given_way(many: wp.int32, scratch: Scratch):
+    """Share of the work of the forces of each tool's group that goes into the limb as a whole."""
+    c = wp.tid()
+    s, coarse, whole = c // many, real(0.0), real(0.0)
+    for i in range(scratch.nodes[s]):
+        force = scratch.force[s, i]
+        if force > real(0.0) and scratch.group[s * many + scratch.tool[s, i]] == scratch.group[c]:
+            for j in range(scratch.nodes[s]):
+                if scratch.group[s * many + scratch.tool[s, j]] == scratch.group[c]:
+                    coarse += force * scratch.wide_part[s, i, j] * scratch.force[s, j]
+                    whole += force * scratch.matrix[s, i, j] * scratch.force[s, j]
+    scratch.given_way[c] = coarse / wp.max(whole, real(1e-300))
+
+
+@wp.func
+def _hardening(skins: Skins, id: wp.int32, thickness: real, strain: real) -> real:
+    """Value of Green.hardening at a thickness [m] and a strain."""
+    first = skins.hard_logs[id, 0]
+    a = (wp.log(thickness) - first) / (skins.hard_logs[id, 1] - first)
+    b = wp.min(strain, real(0.999)) * real(STRAINS)
+    a = wp.clamp(a, real(0.0), real(THICKNESSES) - real(1.001))
+    b = wp.clamp(b, real(0.0), real(STRAINS) - real(1.001))
+    i, j = wp.int32(a), wp.int32(b)
+    a = a - real(i)
+    b = b - real(j)
+    low = (real(1.0) - b) * skins.hard[id, i, j] + b * skins.hard[id, i, j + 1]
+    high = (real(1.0) - b) * skins.hard[id, i + 1, j] + b * skins.hard[id, i + 1, j + 1]
+    return (real(1.0) - a) * low + a * high
+
+
+@wp.kernel
+def see(lanes: wp.int32, many: wp.int32, skins: Skins, scratch: Scratch):
+    """What the network reads of each node of a stack: contact_net._see_on_stack."""
+    s, lane = wp.tid()
+    id = scratch.skin[s * many]
+    one = skins.one[id]
+    t = one.effective
+    for i in range(lane, scratch.nodes[s], lanes):
+        moments, strains, pull, sunk = wp.vec4d(), wp.vec4d(), vec3(), vec3()
+        inward, strain, thick = scratch.inward[s, i], real(scratch.strain[s, i]), scratch.thick[s, i]
+        for j in range(scratch.nodes[s]):
+            apart = wp.length(scratch.point[s, i] - scratch.point[s, j]) / t
+            if _together(scratch, s, many, i, j) and apart < NEAR and wp.dot(inward, scratch.inward[s, j]) > real(0.0):
+                f, per = apart * real(STEPS), scratch.area[s, j] / (t * t)
+                p = per * one.softness * scratch.force[s, j] / scratch.area[s, j]
+                e = per * scratch.sinking[s, j] / t
+                for m in range(RINGS):
+                    weight = _row(skins, one, 1 + m, f)
+                    moments[m] = moments[m] + weight * p
+                    strains[m] = strains[m] + weight * e
+                way = _row(skins, one, 1 + RINGS, f) / t * (scratch.point[s, j] - scratch.point[s, i])
+                pull = pull + p * way
+                sunk = sunk + e * way
+        linear = scratch.force[s, i] / scratch.area[s, i]
+        pressure, overlap = one.softness * linear, scratch.sinking[s, i] / t
+        _write_alike(scratch, s, i, pressure, overlap, moments, strains, pull, sunk)
+        corners, shares, curvature = skins.faces[scratch.face[s, i]], scratch.shares[s, i], real(0.0)
+        for n in range(3):
+            v = corners[n]
+            curvature += real(0.5) * shares[n] * (skins.bent[v, 0] + skins.bent[v, 4] + skins.bent[v, 8])
+        _write(scratch, s, i, AT_THICKNESS, wp.log(thick / t))
+        _write(scratch, s, i, AT_COLUMN, strain)
+        _write(scratch, s, i, AT_HARDENING, _hardening(skins, id, thick, scratch.sinking[s, i] / thick))
+        _write(scratch, s, i, AT_KAPPA, one.log_kappa)
+        _write(scratch, s, i, AT_PULL, one.log_pull)
+        _write(scratch, s, i, AT_CURVATURE, curvature)
+        _write(scratch, s, i, AT_OVER, curvature / (overlap + ROUND_FROM))
+        _write(scratch, s, i, AT_GIVEN, scratch.given_way[s * many + scratch.tool[s, i]])
+        if strain > LINEAR_TO:
+            more = _hardening(skins, id, thick, strain) - _hardening(skins, id, thick, LINEAR_TO)
+            linear = linear * wp.pow(strain / LINEAR_TO * wp.exp(more), HARDENING)
+        scratch.pressure[s, i] = linear
+        around = overlap + strains[FADE_RING]
+        scratch.fade[s, i] = around / (around + STACK_FADE)
