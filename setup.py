@@ -40,6 +40,7 @@ SIM = ["gymnasium>=1.0", "mujoco==4.0.0"]
 FMI = ["pythonfmu3>=0.3.4"]
 GPU = ["warp-lang>=1.8"]
 VIEW = [*DRAWN, "viser>=1.1"]
+FOXGLOVE = ["foxglove-sdk>=0.30"]
 CLUSTER = ["distributed>=2024.8"]
 TEST_TOOLS = [
     "fmpy>=0.3.20",  # imports the unit of FMI
@@ -52,17 +53,20 @@ TEST_TOOLS = [
     "pytest-cov>=5",
     "pytest-xdist>=3.6",
     "ruff>=0.6",
+    "websockets>=13",  # a viewer of the topics, as Foxglove is one
 ]
 EXTRAS = {  # by what people do
+    "test": ["pytest>=8"],  # by this `colcon test` knows that pytest runs the tests
     "bodies": BODIES,  # other bodies and poses than the average at rest, which ships
     "learn": LEARN,  # make data, train; the method unet
     "studies": STUDIES,  # the paper's tables, chart, stability, calibration of the ladder
     "view": VIEW,  # the page in the browser
+    "foxglove": FOXGLOVE,  # topics live in Foxglove
     "sim": SIM,  # robots in simulators
     "fmi": FMI,  # soft skin as a unit for simulators that import FMI 3.0
     "gpu": GPU,  # touches by kernels on a GPU
     "cluster": CLUSTER,  # data made on many machines
-    "dev": [*TEST_TOOLS, *STUDIES, *VIEW, *SIM, *FMI, *GPU, *CLUSTER],
+    "dev": [*TEST_TOOLS, *STUDIES, *VIEW, *FOXGLOVE, *SIM, *FMI, *GPU, *CLUSTER],
     # only by name: their licences ask more than ours
     "smpl": ["smplx>=0.1.28", "torch>=2.4"],  # not for commerce
     "tetgen": ["tetgen>=0.6"],  # AGPL
@@ -93,5 +97,6 @@ setup(
     else [],
     install_requires=REQUIRED + ([] if ON_ROS_MACHINE else ROS_WHEELS),
     extras_require=EXTRAS,
+    **({"tests_require": ["pytest"]} if ON_ROS_MACHINE else {}),  # the same to an older colcon
     entry_points={"console_scripts": ["stmpl = stmpl_ros.cli:main"]},
 )

@@ -2,6 +2,7 @@
 
 python -m benchmarks.node [--rates 100 200 500] [--seconds 10]
 python -m benchmarks.node --minutes 30 --rates 200 --picture docs/pictures/soak.png
+python -m benchmarks.node --joints --rates 250 500    # the tool rides on a forearm whose elbow bends, 60 times a second
 """
 
 from __future__ import annotations
@@ -27,10 +28,11 @@ from geometry_msgs.msg import PoseStamped, WrenchStamped
 from rclpy.experimental.events_executor import EventsExecutor
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
+from sensor_msgs.msg import JointState
 from stmpl_msgs.msg import ContactMesh, LocalContact, SkinDisplacement, SkinTopology
 from stmpl_msgs.srv import SetBody
 
-from bags.wire import layer_from, pose_message, stamp_ns, tool_message, wrench_message
+from bags.wire import header, layer_from, pose_message, stamp_ns, tool_message, wrench_message
 from stmpl_core.layer import SoftLayer
 from stmpl_core.provenance import machine
 from stmpl_ros.scripts import PRESS, Motion
@@ -40,6 +42,7 @@ from stmpl_ros.topics import KEPT, STREAM
 PATIENCE = 300.0  # s for the node to start
 PAGE = os.sysconf("SC_PAGE_SIZE")
 WINDOW = 10.0  # s that a point of the soak's picture stands for
+JOINT_RATE, BEND, TURNS = 60.0, 0.4, 1.0  # rate of joint states [Hz], half of the elbow's way [rad], its speed [rad/s]
 
 
 @dataclass
@@ -54,6 +57,9 @@ class Figures:
         p50_ms, p99_ms, worst_ms: times from the pose's stamp to the answer's arrival [ms].
         solve_p50_ms, solve_p99_ms: times that the node states for itself [ms].
         models: local contacts that came.
+        wrenches: contact wrenches that came, where joints move.
+        wrench_p50_ms, wrench_p99_ms, wrench_worst_ms: times from the pose's stamp to the wrench's arrival [ms].
+        poses: number of joint angles that the answers were given at.
     """
 
     rate: float
@@ -66,13 +72,20 @@ class Figures:
     solve_p50_ms: float
     solve_p99_ms: float
     models: int
+    wrenches: int = 0
+    wrench_p50_ms: float = float("nan")
+    wrench_p99_ms: float = float("nan")
+    wrench_worst_ms: float = float("nan")
+    poses: int = 0
 
     def __str__(self) -> str:
+        bent = (f"  wrenches {self.wrenches}, p50 {self.wrench_p50_ms:6.2f}  p99 {self.wrench_p99_ms:6.2f}  worst "
+                f"{self.wrench_worst_ms:7.2f} ms, at {self.poses} angles") if self.wrenches else ""  # fmt: skip
         lost = self.instants - self.answered
         return (
             f"{self.rate:5.0f} Hz  {self.instants:7} instants, {lost:5} unanswered ({lost / self.instants:7.2%})"
             f"  latency p50 {self.p50_ms:6.2f}  p99 {self.p99_ms:6.2f}  worst {self.worst_ms:7.2f} ms"
-            f"  solve p50 {self.solve_p50_ms:5.2f}  p99 {self.solve_p99_ms:5.2f} ms  local models {self.models}"
+            f"  solve p50 {self.solve_p50_ms:5.2f}  p99 {self.solve_p99_ms:5.2f} ms  local models {self.models}{bent}"
         )
 
 
@@ -82,13 +95,16 @@ class Heard:
 
     answers: deque[tuple[float, float, float]] = field(default_factory=deque)
     models: int = 0
+    wrenches: deque[float] = field(default_factory=deque)  # latency [s]
+    angles: set[float] = field(default_factory=set)
 
 
 class Robot(Node):
     """A device that presses along a script, and listens."""
 
-    def __init__(self, models: bool) -> None:
+    def __init__(self, models: bool, joints: bool) -> None:
         super().__init__("bench")
+        self.joints = joints
         self.topologies: list[SkinTopology] = []
         self.heard = Heard()
         self.sent: set[int] = set()
@@ -101,6 +117,9 @@ class Robot(Node):
         self.create_subscription(SkinDisplacement, "skin/displacement", self._on_answer, STREAM)
         if models:
             self.create_subscription(LocalContact, "tools/probe/local_contact", self._on_model, STREAM)
+        if joints:
+            self.states = self.create_publisher(JointState, "joint_states", STREAM)
+            self.create_subscription(WrenchStamped, "tools/probe/contact_wrench", self._on_wrench, STREAM)
 
     def _on_answer(self, message: SkinDisplacement) -> None:
         stamp = stamp_ns(message)
@@ -108,21 +127,35 @@ class Robot(Node):
             self.sent.discard(stamp)
             latency = 1e-9 * (self.get_clock().now().nanoseconds - stamp)
             self.heard.answers.append((time.monotonic(), latency, message.solve_seconds))
+            self.heard.angles |= set(message.joints)
+
+    def _on_wrench(self, message: WrenchStamped) -> None:
+        self.heard.wrenches.append(1e-9 * (self.get_clock().now().nanoseconds - stamp_ns(message)))
 
     def _on_model(self, message: LocalContact) -> None:
         self.heard.models += 1
 
     def play(self, layer: SoftLayer, frame: str, rate: float, seconds: float) -> int:
-        """Sends the script over and over, with its moments made before; the number of instants sent."""
+        """Sends the script over and over, with its moments made before; the number of instants sent.
+
+        Where joints move, the tool rides on the last bone.
+        """
         if rate not in self.moments:
             motion = Motion(PRESS.devices[0], layer)
             self.moments[rate] = [motion.at(k / rate) for k in range(round(PRESS.seconds * rate))]
         moments = self.moments[rate]
-        started, count = time.perf_counter(), round(seconds * rate)
+        started, count, bent, motion = time.perf_counter(), round(seconds * rate), -1, np.eye(4)
         for k in range(count):
             pose, wrench = moments[k % len(moments)]
             time.sleep(max(0.0, started + k / rate - time.perf_counter()))
             stamp = self.get_clock().now().nanoseconds
+            if self.joints and int(k / rate * JOINT_RATE) > bent:
+                assert layer.rig is not None
+                bent, angle = int(k / rate * JOINT_RATE), BEND * (1 - np.cos(TURNS * k / rate))
+                motion = layer.rig.motions((angle,))[-1]
+                self.states.publish(JointState(header=header("", stamp), name=list(layer.rig.names), position=[angle]))
+            if self.joints:
+                pose, wrench = motion @ pose, (motion[:3, :3] @ wrench.reshape(2, 3, 1)).ravel()
             self.sent.add(stamp)
             self.wrench.publish(wrench_message(wrench, frame, stamp))
             self.pose.publish(pose_message(pose, frame, stamp))
@@ -147,8 +180,10 @@ def measure(robot: Robot, layer: SoftLayer, frame: str, rate: float, seconds: fl
     latency, solve = np.array([(a, s) for _, a, s in robot.heard.answers]).T * 1e3
     p50, p99, worst = map(float, np.percentile(latency, [50, 99, 100]))
     solve_p50, solve_p99 = map(float, np.percentile(solve, [50, 99]))
-    seconds = time.perf_counter() - started
-    return Figures(rate, seconds, instants, len(latency), p50, p99, worst, solve_p50, solve_p99, robot.heard.models)
+    seconds, heard = time.perf_counter() - started, robot.heard
+    quick, late, latest = map(float, np.percentile(1e3 * np.array(heard.wrenches or [np.nan]), [50, 99, 100]))
+    return Figures(rate, seconds, instants, len(latency), p50, p99, worst, solve_p50, solve_p99, heard.models,
+                   len(heard.wrenches), quick, late, latest, len(heard.angles))  # fmt: skip
 
 
 def memory(pid: int) -> dict[str, float]:
@@ -236,6 +271,7 @@ def main() -> None:
     given.add_argument("--seconds", type=float, default=10.0, help="at each rate")
     given.add_argument("--minutes", type=float, default=0.0, help="soak at the first rate instead")
     given.add_argument("--models", action="store_true", help="listen to local contacts as well")
+    given.add_argument("--joints", action="store_true", help="bend the elbow beside it; the contact wrench counts")
     given.add_argument("--change-body", action="store_true", help="time ~/set_body as well")
     given.add_argument("--picture", type=Path, default=Path("docs/pictures/soak.png"), help="of the soak")
     given.add_argument("--out", type=Path, default=None, help="JSON file for the figures")
@@ -243,12 +279,13 @@ def main() -> None:
                        help="flags of stmpl node, as in tissue=paper edge-length=0.004")
     options = given.parse_args()
     flags = [part for one in options.node for part in ("--" + one.split("=")[0], one.split("=")[1])]
+    flags += ["--joint-states", "joint_states"] * options.joints
     print(f"{machine()}; load {os.getloadavg()[0]:.1f} before the run", flush=True)
     node = subprocess.Popen([sys.executable, "-m", "stmpl_ros.cli", "node", *flags], stdout=subprocess.DEVNULL,
                             stderr=subprocess.DEVNULL)  # fmt: skip
     rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
     signal.signal(signal.SIGTERM, lambda number, frame: sys.exit(1))
-    robot, executor, stop = Robot(options.models), EventsExecutor(), threading.Event()
+    robot, executor, stop = Robot(options.models, options.joints), EventsExecutor(), threading.Event()
     executor.add_node(robot)
     listening = threading.Thread(target=spin, args=(executor, stop))
     listening.start()
@@ -259,6 +296,8 @@ def main() -> None:
         print(f"{layer}", flush=True)
         robot.mesh.publish(tool_message(Motion(PRESS.devices[0], layer).tool, 0))
         wait(lambda: robot.pose.get_subscription_count() and robot.wrench.get_subscription_count(), "the node")
+        if options.joints:
+            wait(robot.states.get_subscription_count, "the node to listen to joints")
         robot.play(layer, frame, 100.0, 2.0)
         figures: dict = {"machine": machine(), "layer": str(layer)}
         if options.minutes:
@@ -269,7 +308,7 @@ def main() -> None:
             for rate in options.rates:
                 one = measure(robot, layer, frame, rate, options.seconds)
                 figures["rates"].append(asdict(one))
-                print(one, flush=True)
+                print(f"{one}; load {os.getloadavg()[0]:.1f}", flush=True)
         if options.change_body:
             print(change_body(robot, layer, frame, options.rates[0]))
         if options.out:

@@ -13,11 +13,21 @@ ARGUMENTS = {
     "namespace": ("", "of nodes and topics"),
     "scripts": ("press", "press or squeeze"),
     "rate": ("125", "of poses and wrenches [Hz]"),
+    "patience": ("600", "time that the devices wait for the node [s]; its first start compiles for minutes"),
 }
 
 
+def ended(event, context):
+    """Ends all once one process ended; with an error if that one failed, which makes ros2 launch return 1."""
+    if context.is_shutdown:
+        return None
+    if event.returncode:
+        raise RuntimeError(f"{event.process_name} ended with {event.returncode}; its lines say why")
+    return EmitEvent(event=Shutdown(reason=f"{event.process_name} is done"))
+
+
 def generate_launch_description() -> LaunchDescription:
-    """Ends once the devices are done."""
+    """Ends once the devices are done. The arguments of node.launch.py are taken too."""
     namespace = LaunchConfiguration("namespace")
     node = IncludeLaunchDescription(
         PythonLaunchDescriptionSource(PathJoinSubstitution([ThisLaunchFileDir(), "node.launch.py"])),
@@ -26,11 +36,10 @@ def generate_launch_description() -> LaunchDescription:
     probe = Node(
         package="stmpl_ros",
         executable="stmpl",
-        arguments=["probe", "--patience", "180", "--scripts", LaunchConfiguration("scripts"),
+        arguments=["probe", "--patience", LaunchConfiguration("patience"), "--scripts", LaunchConfiguration("scripts"),
                    "--rate", LaunchConfiguration("rate")],
         namespace=namespace,
         output="screen",
     )  # fmt: skip
-    done = RegisterEventHandler(OnProcessExit(target_action=probe, on_exit=[EmitEvent(event=Shutdown())]))
     declared = [DeclareLaunchArgument(k, default_value=v, description=text) for k, (v, text) in ARGUMENTS.items()]
-    return LaunchDescription([*declared, node, probe, done])
+    return LaunchDescription([*declared, RegisterEventHandler(OnProcessExit(on_exit=ended)), node, probe])

@@ -31,6 +31,7 @@ from stmpl_ros.remembering import ELASTIC, Before, Reaction, Remembering
 from stmpl_ros.sending import Sending
 from stmpl_ros.settings import Settings
 
+HELD_UP_S, HELD_UP = 0.9, 3  # time for sending an answer [s], and how many in a row that take longer are told
 MAX_FIRST_DEPTH_M = 2e-3  # depth in a tool's first answer, beyond which it was not seen coming
 WORTH_A_LINE = {
     NO_FORCE: "it touches, but its wrench is zero",
@@ -105,6 +106,7 @@ class Answering:
         self.remembering = Remembering()
         self._field: LatestWins[Asked] | None = None
         self._hurry = threading.Event()
+        self._held = 0  # answers in a row that took long to send
         self._sends, self._epoch = threading.RLock(), 0  # held while an answer is sent, or an epoch begins
         self._start_empty()
 
@@ -333,7 +335,13 @@ class Answering:
 
     def _send(self, answer: Answer, stamp: int, inputs: Stamps, before: Before, **said: float | str) -> None:
         with self._sends:
+            started = time.monotonic()
             self.sending.answer(answer, stamp, inputs, **before._asdict(), **said)
+            self._held = self._held + 1 if time.monotonic() - started > HELD_UP_S else 0
+            if self._held >= HELD_UP:
+                self._hearing.gate.say("held up", f"{self._held} answers in a row took a second to send. Fast DDS may "
+                                       "wait for a listener that was killed, for ever: start this node anew, with "
+                                       "FASTDDS_BUILTIN_TRANSPORTS=UDPv4, and a discovery range other than LOCALHOST")
             self._tally.answers = self.sending.sequence
             self._tally.methods[answer.method] += 1
 

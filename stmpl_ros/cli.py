@@ -20,6 +20,7 @@ VERBS = {  # module of each verb's function, and what it does
     "links": ("stmpl_ros.verbs", "soft skin for a simulator over ROS: poses of links in, wrenches on links out"),
     "fmu": ("stmpl_sim.verbs", "soft skin as a unit of FMI 3.0 for co-simulation"),
     "view": ("stmpl_ros.verbs", "the skin in the browser: a recording, the running node, or under a tool to drag"),
+    "foxglove": ("stmpl_ros.verbs", "the node's topics live in Foxglove, by its websocket"),
     "record": ("stmpl_ros.verbs", "record topics as MCAP, until Ctrl-C"),
     "replay": ("stmpl_ros.verbs", "answer recorded contacts again, or publish them"),
     "compare": ("stmpl_ros.verbs", "judge a recorded run by finite elements, a method or another recording"),

@@ -273,13 +273,14 @@ def course_figure(done: Massaged) -> Figure:
 
 def _take(camera: Any, scene: Any, log: Log, at: float, frame: Any) -> None:
     from stmpl_sim.engine import mujoco
+    from stmpl_sim.film import caption_of
 
     data, row = mujoco.MjData(scene.model), min(int(np.searchsorted(log.time, at)), len(log.time) - 1)
     data.qpos[:] = log.qpos[row]
     mujoco.mj_forward(scene.model, data)
     limb = log.limb[row]
     points = (scene.layer.vertices + frame.displacement) @ limb[:3, :3].T + limb[:3, 3]
-    camera.take(data, points, limb, frame.magnitude)
+    camera.take(data, points, limb, frame.magnitude, caption_of(at, frame.touches))
 
 
 def _solved(comparison: Comparison, start: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -7,7 +7,8 @@ import multiprocessing
 import time
 from collections.abc import Callable
 from concurrent.futures import BrokenExecutor, Future, TimeoutError
-from functools import partial
+from contextlib import ExitStack
+from functools import partial, wraps
 from typing import Any
 
 import numba
@@ -30,6 +31,7 @@ from stmpl_ros.answering import Answering
 from stmpl_ros.bending import Bending
 from stmpl_ros.beside import Beside, Builders
 from stmpl_ros.body_action import BodyAction, Done, changes_of
+from stmpl_ros.bond import Bond
 from stmpl_ros.calibration import Calibration
 from stmpl_ros.diagnosis import Counts, Health, Tally, diagnostics, limits_status, skin_status
 from stmpl_ros.hearing import Hearing
@@ -46,8 +48,25 @@ from stmpl_ros.workshop import Workshop, then
 FADE_RATE = 30.0  # rate of the answers while the last one fades [Hz]
 
 
+Transit = Callable[["SkinNode", LifecycleState], TransitionCallbackReturn]
+
+
 def _nobody(why: str) -> None:
     """Nobody is told what became of a skin."""
+
+
+def _told(transit: Transit) -> Transit:
+    """A callback of the lifecycle; what fails in it, which rclpy would swallow, is told, and on_error comes next."""
+
+    @wraps(transit)
+    def told(node: SkinNode, state: LifecycleState) -> TransitionCallbackReturn:
+        try:
+            return transit(node, state)
+        except Exception as error:
+            node.get_logger().error(f"{transit.__name__} failed: {type(error).__name__}: {error}")
+            return TransitionCallbackReturn.ERROR
+
+    return told
 
 
 class SkinNode(LifecycleNode):
@@ -75,6 +94,8 @@ class SkinNode(LifecycleNode):
         self._making: Beside[Skin] | None = None
         self._twin = ""  # what the other node is that was told of
         self._done: Done = _nobody  # told what became of the skin that is being made
+        self._open = ExitStack()  # what was opened when the node was configured
+        self.bond = Bond(self)
         self.hearing = Hearing(self, lambda: self.config, Tools(), self.tally)  # raises before threads are started
         self.calibration = Calibration(self, lambda: self.workshop, self.set_body)
         self.bending = Bending(self, self.hearing, lambda: self.config)
@@ -106,6 +127,7 @@ class SkinNode(LifecycleNode):
 
     # Lifecycle
 
+    @_told
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Builds the skin, warms the method up, and opens all topics."""
         started = time.monotonic()
@@ -121,46 +143,62 @@ class SkinNode(LifecycleNode):
             return TransitionCallbackReturn.FAILURE
         assert self.workshop
         self.answering.sending = Sending(self, self.config, self.skin, self.workshop, self.hearing.gate)
+        self._open.callback(self.sending.close)
         self.answering.open()
-        self.hearing.open()
-        self.bending.open()
-        self._fading = steady_timer(self, 1 / FADE_RATE, self._fade)
+        for part in (self.hearing, self.bending):
+            self._open.callback(part.close)
+            part.open()
+        self._open.callback(self.destroy_timer, steady_timer(self, 1 / FADE_RATE, self._fade))
         self.settings.locked = True
         gc.collect()
         gc.freeze()  # what is set up now stays: collections at run time need not look at it
         self.get_logger().info(f"configured in {time.monotonic() - started:.1f} s: {self.skin.layer}")
+        if self.bond.missing:
+            self.get_logger().info(self.bond.missing)
         return super().on_configure(state)
 
+    @_told
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Sends the topology and starts to answer."""
         result = super().on_activate(state)
         self.sending.topology(self._now())
         self.hearing.active = True
+        self.bond.form()
         self.get_logger().info(f"answering with {self.skin.method.name} on layer {self.skin.layer_id}")
         return result
 
+    @_told
     def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Stops answering; what comes in meanwhile is not kept."""
-        self.hearing.active = False
-        self.answering.drop()
+        self._stop()
         return super().on_deactivate(state)
 
+    @_told
     def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Closes all topics and forgets skin and tools; parameters that count when configuring can be set again."""
         result = super().on_cleanup(state)
         self._clean_up()
         return result
 
+    @_told
     def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Stops answering, and ends the processes beside this one."""
-        self.hearing.active = False
-        self.answering.drop()
+        self._stop()
         result = super().on_shutdown(state)
         self._clean_up()
         return result
 
+    @_told
+    def on_error(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """After a callback that failed: stops, and closes whatever is open, so that the node can be configured anew."""
+        self._stop()
+        self._clean_up()
+        self.get_logger().error("everything is closed after that error; the node may be configured anew")
+        return super().on_error(state)
+
     def destroy_node(self) -> None:
         """Ends the processes beside this one too."""
+        self.bond.end()
         self.answering.close()
         self._end()
         self.calibration.close()
@@ -201,16 +239,17 @@ class SkinNode(LifecycleNode):
             self._on_tool(tool)
         return simulators
 
+    def _stop(self) -> None:
+        self.bond.end()
+        self.hearing.active = False
+        self.answering.drop()
+
     def _clean_up(self) -> None:
+        self.settings.locked = False
         self.answering.close()
-        if self.settings.locked:
-            self.destroy_timer(self._fading)
-            self.hearing.close()
-            self.bending.close()
-            self.sending.close()
         self._end()
         self.calibration.forget()
-        self.settings.locked = False
+        self._open.close()  # last: all are closed, then raises what one of them raised
 
     def _end(self) -> None:
         for beside in (self._making, self.workshop):

@@ -6,15 +6,16 @@ import json
 import logging
 import queue
 import re
+import struct
 import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.experimental.events_executor import EventsExecutor
 from rclpy.node import Node
-from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
 from rclpy.utilities import ok
 
 from bags.provenance import write_provenance
@@ -25,12 +26,16 @@ from stmpl_core.errors import BagError, InvalidInput
 from stmpl_ros.frames import read_frames
 from stmpl_ros.parameters import RecordConfig
 from stmpl_ros.spinning import ros, spin
+from stmpl_ros.topics import as_offered
 
 log = logging.getLogger(__name__)
 
 WANTED = re.compile(
-    r"(contact_mesh|skin/topology|skin/displacement|tools/\w+/(pose|wrench)|wrist/wrench|joint_states)$|^/diagnostics$"
+    r"(contact_mesh|skin/topology|skin/displacement|tools/\w+/(pose|wrench)|wrist/wrench|joint_states)$"
+    r"|^/(diagnostics|tf|tf_static)$"
 )
+EVERYBODYS = ("/diagnostics", "/tf", "/tf_static")  # topics of no namespace that belong to a run
+PLACED = re.compile(r"(skin/topology|tools/(\w+)/(?:pose|wrench))$")  # topics whose frame_id says where things are
 IF_HEARD = re.compile(r"tools/\w+/local_contact$")  # recorded only once a device listens: it costs the node work
 FOREVER = 1e9  # lease of a sender that never tells that it is there, at least [s]
 POLL_PERIOD_S = 0.1  # time between two looks for new topics
@@ -58,6 +63,7 @@ class RecorderNode(Node):
         self.received = self.lost = 0
         self.error: BagError | None = None
         self._channels: dict[str, int] = {}
+        self._placed: set[tuple[str, str]] = set()  # topics and the frames that they came in
         self._queue: queue.SimpleQueue[Item | None] = queue.SimpleQueue()
         self._thread = threading.Thread(target=self._write, name="writer")
         self._thread.start()
@@ -78,27 +84,26 @@ class RecorderNode(Node):
             return bool(self._wanted.fullmatch(topic))
         own = self.get_namespace().rstrip("/") + "/"
         run = WANTED.search(topic) or (IF_HEARD.search(topic) and self.count_subscribers(topic))
-        return bool(run) and (topic.startswith(own) or topic == "/diagnostics")
+        return bool(run) and (topic.startswith(own) or topic in EVERYBODYS)
 
     def _subscribe(self, topic: str, type_name: str) -> None:
         find_schema(type_name)  # raises BagError here, not in the thread that writes
+        profile = as_offered(self, topic, DEPTH)
+        reliable = profile.reliability == ReliabilityPolicy.RELIABLE
+        kept = profile.durability == DurabilityPolicy.TRANSIENT_LOCAL
         offered = [info.qos_profile for info in self.get_publishers_info_by_topic(topic)]
-        reliable = all(qos.reliability == ReliabilityPolicy.RELIABLE for qos in offered)
-        kept = all(qos.durability == DurabilityPolicy.TRANSIENT_LOCAL for qos in offered)
-        profile = QoSProfile(
-            depth=DEPTH,
-            reliability=ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT,
-            durability=DurabilityPolicy.TRANSIENT_LOCAL if kept else DurabilityPolicy.VOLATILE,
-        )
         leases = [o.liveliness_lease_duration.nanoseconds * 1e-9 for o in offered]
         lease = max((one for one in leases if one < FOREVER), default=0.0)
         depth = max((o.depth for o in offered), default=10) or 10
         qos = qos_yaml(depth=depth, reliable=reliable, transient_local=kept, lease=lease)
+        placed = PLACED.search(topic) is not None
 
         def keep(data: Any) -> None:
             if self._queue.qsize() > MAX_QUEUED_MESSAGES:
                 return self._count_lost(1, f"the disk is {MAX_QUEUED_MESSAGES} messages behind")
             self.received += 1
+            if placed:
+                self._placed.add((topic, frame_of(data)))
             self._queue.put((topic, type_name, qos, data, time.time_ns()))
 
         self.create_subscription(
@@ -110,6 +115,18 @@ class RecorderNode(Node):
             event_callbacks=SubscriptionEventCallbacks(message_lost=self._on_lost),
         )
         self.get_logger().info(f"recording {topic} ({type_name})")
+
+    def foreign(self, frames: Mapping[str, Any]) -> Iterator[str]:
+        """What a replay cannot place, a sentence each: poses and wrenches in frames that are not in the table."""
+        topology = {topic.removesuffix("skin/topology"): frame for topic, frame in self._placed
+                    if topic.endswith("skin/topology")}  # fmt: skip
+        for topic, frame in sorted(self._placed):
+            found = PLACED.search(topic)
+            assert found
+            body = topology.get(topic[: found.start()])
+            if body is not None and frame not in (body, found[2], *frames):
+                yield (f"{topic} came in frame '{frame}', which is neither '{body}' nor in --frames: these contacts "
+                       "are not replayed offline, only to a node that hears /tf (stmpl replay --publish)")  # fmt: skip
 
     def _on_lost(self, status: Any) -> None:
         self._count_lost(status.total_count_change, "lost on the way")
@@ -140,6 +157,12 @@ class RecorderNode(Node):
         """Waits until all that was received is written."""
         self._queue.put(None)
         self._thread.join()
+
+
+def frame_of(data: bytes) -> str:
+    """frame_id of a serialised message that begins with its header."""
+    (length,) = struct.unpack_from("<I" if data[1] else ">I", data, 12)
+    return data[16 : 15 + length].decode(errors="replace")
 
 
 def pattern(topics: Sequence[str]) -> re.Pattern[str]:
@@ -188,6 +211,8 @@ def run(config: RecordConfig, arguments: list[str] | None = None, topics: Sequen
             node.destroy_node()
         if node.error:
             raise node.error
+        for sentence in node.foreign(frames):
+            log.warning(sentence)
         writer.add_metadata("recorder", {"received": str(node.received), "lost": str(node.lost)})
     log.info("%d messages recorded, %d lost", node.received, node.lost)
     return 0

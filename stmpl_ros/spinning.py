@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import threading
 from collections.abc import Iterator
@@ -14,11 +15,17 @@ from rclpy.signals import SignalHandlerOptions
 from rclpy.utilities import ok, try_shutdown
 
 POLL_PERIOD_S = 0.1  # time between two looks of a spinning process whether it is to stop
+TRANSPORTS = "FASTDDS_BUILTIN_TRANSPORTS"  # variable by which a person chooses another: DEFAULT
 
 
 @contextmanager
 def ros(arguments: list[str] | None = None) -> Iterator[threading.Event]:
-    """ROS while inside; yields an event that SIGINT and SIGTERM set. rclpy's own handlers stay out of the way."""
+    """ROS while inside; yields an event that SIGINT and SIGTERM set. rclpy's own handlers stay out of the way.
+
+    Messages go by UDP unless a person chose otherwise: by the shared memory of Fast DDS 2.14 a listener that is killed,
+    or starved for a second, can leave its sender waiting for a lock of its own for ever (docs/laboratory/node.md).
+    """
+    os.environ.setdefault(TRANSPORTS, "UDPv4")
     stop = threading.Event()
 
     def ask(_signal: int, _frame: FrameType | None) -> None:

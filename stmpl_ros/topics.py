@@ -5,6 +5,7 @@ from typing import Any, cast
 from rclpy.duration import Duration
 from rclpy.lifecycle import LifecycleNode
 from rclpy.lifecycle.publisher import LifecyclePublisher
+from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, LivelinessPolicy, QoSProfile, ReliabilityPolicy
 
 LEASE = 1.0  # silence on the bus after which a node is told to be gone, to listeners who ask for that [s]
@@ -24,6 +25,18 @@ def newest_within(deadline: float) -> QoSProfile:
     if not deadline:
         return NEWEST
     return QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT, deadline=Duration(seconds=deadline))
+
+
+def as_offered(node: Node, topic: str, depth: int) -> QoSProfile:
+    """A profile for who takes a topic as all of its present senders offer it; `depth` messages wait."""
+    offered = [info.qos_profile for info in node.get_publishers_info_by_topic(topic)]
+    reliable = all(one.reliability == ReliabilityPolicy.RELIABLE for one in offered)
+    kept = all(one.durability == DurabilityPolicy.TRANSIENT_LOCAL for one in offered)
+    return QoSProfile(
+        depth=depth,
+        reliability=ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT,
+        durability=DurabilityPolicy.TRANSIENT_LOCAL if kept else DurabilityPolicy.VOLATILE,
+    )
 
 
 def managed(node: LifecycleNode, kind: Any, topic: str, profile: QoSProfile) -> LifecyclePublisher:

@@ -107,6 +107,23 @@ def view(path: Annotated[Path | None, tyro.conf.Positional] = None, live: bool =
     return run(config, path, live, ros_arguments)
 
 
+def foxglove(host: str = "127.0.0.1", port: int = 8765, topics: tuple[str, ...] = ()) -> int:
+    """Serves the node's topics to Foxglove over its websocket, live: the deformed skin, its colours, tools, wrenches.
+
+    Example: stmpl foxglove
+    In Foxglove connect to ws://localhost:8765 and import stmpl_ros/foxglove/stmpl.json.
+
+    Args:
+        host: address to listen at; 0.0.0.0: any, so that others may look too.
+        port: port to listen at.
+        topics: regular expressions of whole topic names; the node's own and /tf unless given.
+    """
+    needed("stmpl foxglove", "foxglove", "foxglove")
+    from stmpl_ros.forwarder import run
+
+    return run(host, port, topics, ros_arguments)
+
+
 def record(config: Annotated[RecordConfig, Flat], topics: tuple[str, ...] = ()) -> int:
     """Records topics as they come over the wire, as MCAP, until Ctrl-C.
 
@@ -318,7 +335,7 @@ def generate(
         out: folder of the data; data/<preset> unless given.
         workers: local processes; one a core unless given.
         scheduler: address of a Dask scheduler that does the work instead.
-        start: file of released contacts to go on from, as benchmarks/limbs_v2.npz for tissue.
+        start: file of released contacts to go on from, as benchmarks/limbs_v3.npz for tissue.
         as_json: manifest as JSON, for machines.
     """
     needed("stmpl generate", "learn", "anny", "torch", "zarr", "shapely")

@@ -172,8 +172,11 @@ def test_the_steps_of_a_massage_run(tmp_path: Path, monkeypatch: pytest.MonkeyPa
 def test_the_steps_to_a_policy_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("mujoco", reason="pip install 'stmpl[sim]'")
     pytest.importorskip("gymnasium", reason="pip install 'stmpl[sim]'")
+    pytest.importorskip("warp", reason="pip install 'stmpl[gpu]'")
     monkeypatch.chdir(tmp_path)
     names = walk("learning.md")
+    off = np.abs(np.linalg.norm(names["same"], axis=1) - names["force"])
+    assert names["served"].mean() > 0.9 and off[names["served"]].max() < 1e-4 * names["force"].max()
     assert names["touched"].in_range.mean() > 0.7 and names["touched"].why
     assert names["found"].wrench[:3] @ names["push"] == pytest.approx(5, rel=0.02)
     assert names["learnt"][0] > names["script"][0] - 0.02 > 0.8

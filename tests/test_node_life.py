@@ -9,8 +9,10 @@ import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future
 from dataclasses import replace
+from importlib.util import find_spec
 from pathlib import Path
-from typing import NamedTuple
+from types import SimpleNamespace
+from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
@@ -33,9 +35,12 @@ from bags.wire import pose_message, stamp_ns, tool_message
 from stmpl_core import Tool
 from stmpl_core.errors import InvalidInput
 from stmpl_core.friction import PAIRS
+from stmpl_ros.answering import HELD_UP
+from stmpl_ros.hearing import Hearing
 from stmpl_ros.inbox import Instant
 from stmpl_ros.node import SkinNode
 from stmpl_ros.parameters import NodeConfig
+from stmpl_ros.sending import Sending
 from stmpl_ros.topics import KEPT, LEASE, STREAM
 from tests.bus import PATIENCE, ROOT, end, rows, running, start
 from tests.conftest import BUSES
@@ -143,6 +148,85 @@ def test_whatever_fails_inside_an_answer_is_told_and_the_next_instant_is_answere
     assert rows(composed.heard[0]).any() and stamp_ns(composed.heard[0]) > refused
     assert composed.node.tally.refused == 1
     assert capfd.readouterr().err.count("refused: no answer to finger: an accident\n") == 1
+
+
+def test_answers_that_take_long_to_send_are_told(composed, monkeypatch, capfd):
+    composed.wait(lambda: composed.press() and composed.heard)
+    monkeypatch.setattr("stmpl_ros.answering.HELD_UP_S", -1.0)
+    count = len(composed.heard)
+    composed.wait(lambda: composed.press() and len(composed.heard) > count + HELD_UP)
+    assert "FASTDDS_BUILTIN_TRANSPORTS=UDPv4" in capfd.readouterr().err
+
+
+def refuse(*_: object) -> None:
+    raise RuntimeError("an accident")
+
+
+@pytest.mark.parametrize("where", ["hearing.open", "sending.topology"])
+def test_a_transition_that_fails_is_told_and_leaves_a_node_that_is_closed_and_can_be_configured_again(
+    composed, monkeypatch, capfd, where
+):
+    """Configuring fails, or activating."""
+    node, (part, method) = composed.node, where.split(".")
+    node.trigger_deactivate()
+    node.trigger_cleanup()
+    closed = {publisher.topic_name for publisher in node.publishers}
+    with monkeypatch.context() as broken:
+        broken.setattr(Hearing if part == "hearing" else Sending, method, refuse)
+        failed = node.trigger_configure() if part == "hearing" else node.trigger_configure() and node.trigger_activate()
+    assert failed == TransitionCallbackReturn.ERROR
+    assert "failed: RuntimeError: an accident" in capfd.readouterr().err
+    assert node._state_machine.current_state[1] == "unconfigured"
+    assert not node.active and not node.settings.locked and node.workshop is None
+    assert {publisher.topic_name for publisher in node.publishers} == closed
+    assert node.trigger_configure() == node.trigger_activate() == TransitionCallbackReturn.SUCCESS
+    composed.announce(ball().named("finger"))
+    composed.heard.clear()
+    composed.wait(lambda: composed.press() and composed.heard and rows(composed.heard[-1]).any())
+
+
+def test_a_node_that_cannot_even_be_closed_is_finalized(composed, monkeypatch, capfd):
+    monkeypatch.setattr(composed.node.answering, "drop", refuse)
+    assert composed.node.trigger_deactivate() == TransitionCallbackReturn.ERROR
+    said = capfd.readouterr().err
+    assert "on_deactivate failed" in said and "on_error failed" in said
+    assert composed.node._state_machine.current_state[1] == "finalized"
+
+
+class Beat(SimpleNamespace):
+    """A stand-in for bond/msg/Status, which is on no package registry."""
+
+
+def test_an_active_node_beats_for_a_lifecycle_manager_and_tells_when_it_stops(composed, monkeypatch):
+    node, beats = composed.node, list[Any]()
+    assert ("'bond' is not installed" in node.bond.missing) == (find_spec("bond") is None)
+    publisher = SimpleNamespace(publish=beats.append, wait_for_all_acked=lambda _: None)
+    monkeypatch.setattr(node.bond, "_kind", Beat)
+    monkeypatch.setattr(node, "create_publisher", lambda kind, *_: publisher)
+    monkeypatch.setattr(node, "destroy_publisher", lambda one: one is publisher)
+    node.trigger_deactivate()
+    node.trigger_activate()
+    composed.wait(lambda: len(beats) > 3)
+    assert {(beat.id, beat.active, beat.heartbeat_timeout) for beat in beats} == {("stmpl", True, 4.0)}
+    assert len({beat.instance_id for beat in beats}) == 1
+    node.trigger_deactivate()
+    count = len(beats)
+    assert [beat.active for beat in beats].index(False) == count - 1
+    composed.wait(lambda: composed.press() and node.count_publishers("tools/finger/pose"))
+    node.trigger_activate()
+    assert beats[count].active and beats[count].instance_id == beats[0].instance_id
+    node.trigger_deactivate()
+
+
+def test_a_manager_hears_the_beats(composed):
+    """Over the middleware, where the real messages are."""
+    status = pytest.importorskip("bond.msg", reason="the package 'bond' is not installed").Status
+    beats = list[Any]()
+    composed.node.create_subscription(status, "bond", beats.append, STREAM)
+    composed.wait(lambda: beats)
+    assert beats[0].id == "stmpl" and beats[0].active
+    composed.node.trigger_deactivate()
+    composed.wait(lambda: not beats[-1].active)
 
 
 @pytest.fixture

@@ -8,13 +8,15 @@ from random import Random
 
 import pytest
 import rclpy
+from geometry_msgs.msg import PoseStamped
 from rclpy.qos import QoSProfile
 from std_msgs.msg import Header, String
+from stmpl_msgs.msg import SkinTopology
 
 from bags.reader import Bag
 from bags.recover import recover
 from bags.writer import FILE
-from stmpl_ros.topics import STREAM
+from stmpl_ros.topics import NOW, STREAM
 from tests.bus import PATIENCE, Robot, end, start
 
 STMPL = ("-m", "stmpl_ros.cli")
@@ -45,6 +47,28 @@ def talker():
     yield made
     made.node.destroy_node()
     rclpy.shutdown()
+
+
+def test_a_recorder_tells_of_poses_that_only_a_node_that_hears_tf_can_place(talker, tmp_path):
+    skin = talker.node.create_publisher(SkinTopology, "skin/topology", NOW)
+    poses = {name: talker.node.create_publisher(PoseStamped, f"tools/{name}/pose", STREAM) for name in ("one", "other")}
+    skin.publish(SkinTopology(header=Header(frame_id="body")))
+    (tmp_path / "frames.yaml").write_text("table: {position: [0, 0, 0.1]}\n")
+    arguments = ("record", "--path", str(tmp_path / "run"), "--frames", str(tmp_path / "frames.yaml"))
+    recorder = start(*STMPL, *arguments)
+    try:
+        talker.wait_for_recorder(*poses.values())
+        talker.wait(lambda: skin.get_subscription_count() == 2, "the recorder beside the talker's own ear")
+        for name, frame in (("one", "table"), ("one", "body"), ("other", "moving_base")):
+            poses[name].publish(PoseStamped(header=Header(frame_id=frame)))
+        talker.spin(0.5)
+    finally:
+        code, said = end(recorder, signal.SIGINT)
+        for publisher in (skin, *poses.values()):
+            talker.node.destroy_publisher(publisher)
+    assert code == 0
+    assert "/tools/other/pose came in frame 'moving_base', which is neither 'body' nor in --frames" in said
+    assert said.count(" came in frame ") == 1
 
 
 @pytest.fixture(scope="module")
