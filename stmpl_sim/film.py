@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +12,7 @@ import numba
 import numpy as np
 
 from stmpl_core.errors import InvalidInput
+from stmpl_core.touch import Touch
 
 log = logging.getLogger(__name__)
 logging.getLogger("OpenGL.acceleratesupport").setLevel(logging.WARNING)  # says on every import what it lacks
@@ -20,6 +21,7 @@ SKIN = np.array([[242, 228, 218], [247, 178, 103], [228, 87, 46], [140, 28, 63],
 WIDTH, HEIGHT = 640, 480  # of a frame [pixels]
 BACKENDS = ("egl", "osmesa")  # ways to render without a screen, in the order in which they are tried
 SKY = np.array([0.97, 0.97, 0.98])
+INK = (40, 40, 48)  # of captions
 LIGHT = np.array([-0.35, -0.55, 0.76])  # direction to the light of drawn frames, world axes
 AMBIENT = 0.45  # share of the light that comes from everywhere
 
@@ -57,19 +59,21 @@ class Camera:
 
             self._mesh = model.mesh(SKIN_MESH).id
 
-    def take(self, data: Any, skin_in_world: np.ndarray, pose_world_from_layer: np.ndarray, moved: np.ndarray) -> None:
-        """Takes a frame.
+    def take(self, data: Any, skin_in_world: np.ndarray, pose_world_from_layer: np.ndarray, moved: np.ndarray,
+             caption: str = "") -> None:  # fmt: skip
+        """Takes a frame, and writes a caption and what the colours mean on it.
 
         Args:
             data: MuJoCo data.
             skin_in_world: vertices of the deformed skin, (V, 3) [m].
             pose_world_from_layer: pose of the layer's axes, (4, 4).
             moved: displacement of each vertex, (V,) [m].
+            caption: what is said of the frame.
         """
         share = np.clip(moved / self.most, 0, 1)
         frame = self._drawn(data, skin_in_world, share) if self._renderer is None else \
             self._rendered(data, skin_in_world, pose_world_from_layer, share)
-        self.frames.append(frame)
+        self.frames.append(told(frame, caption, self.most))
 
     def close(self) -> None:
         """Gives the renderer back."""
@@ -116,6 +120,26 @@ class Camera:
         camera = data.camera(EYE)
         return draw(np.concatenate(corners), np.concatenate(shades), np.concatenate(normals), camera.xpos,
                     camera.xmat.reshape(3, 3), float(self.model.camera(EYE).fovy[0]))  # fmt: skip
+
+
+def caption_of(at: float, touches: Mapping[str, Touch]) -> str:
+    """What the tools do at a time [s]: 2.5 s   ball 5.0 N."""
+    pressing = (touch for touch in touches.values() if touch.presses)
+    return "   ".join([f"{at:.1f} s", *(f"{touch.name.replace('_', ' ')} {touch.force:.1f} N" for touch in pressing)])
+
+
+def told(frame: np.ndarray, caption: str, most: float) -> np.ndarray:
+    """A frame with a caption above, and below the scale of its colours up to a displacement `most` [m]."""
+    from PIL import Image, ImageDraw, ImageFont
+
+    image = Image.fromarray(frame)
+    left, top, wide, high = 12, image.height - 22, 150, 10
+    bar = np.broadcast_to(colours(np.linspace(0, 1, wide)), (high, wide, 3))
+    image.paste(Image.fromarray((255 * bar).astype(np.uint8)), (left, top))
+    write, font = ImageDraw.Draw(image), ImageFont.load_default(15)
+    write.text((left, top - 20), f"skin moved by 0 to {1e3 * most:.0f} mm", INK, font)
+    write.text((left, 8), caption, INK, font)
+    return np.asarray(image)
 
 
 def draw(corners: np.ndarray, shades: np.ndarray, normals: np.ndarray, eye: np.ndarray, turn: np.ndarray,

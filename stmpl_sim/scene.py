@@ -24,8 +24,8 @@ SKIN_MESH, SKIN_GEOM, SKIN_MATERIAL = "skin", "skin", "skin"
 DENSITY = 1050.0  # of a limb [kg/m3]
 HEAD_LENGTH, HEAD_MASS = 0.09, 0.3  # of the massage head, flange to the ball's middle [m], [kg]
 SPRING, TWIST = (1500.0, 20.0), (30.0, 0.4)  # of a limb on springs: N/m and N s/m; N m/rad and N m s/rad
-FROM = np.array([0.34, -0.52, 0.25])  # place of the camera, from the site [m]
-AIM = np.array([-0.03, 0.0, 0.06])  # point that it looks at, from the site [m]
+FROM = np.array([0.44, -0.20, 0.24])  # place of the camera, from the site [m]
+AIM = np.array([-0.03, 0.0, 0.045])  # point that it looks at, from the site [m]
 COLOURS = 256  # texels of the skin's colour scale
 ELBOW_DAMPING = 0.05  # of the hinge of a limb on a rest [N m s/rad]
 ROOM = 0.08  # distance of a start's joints from their limits, over their ranges, beyond which no other start is tried
@@ -253,12 +253,11 @@ def _add_stage(spec: Any, at: np.ndarray, side: float) -> None:
     look, light = FROM * mirror, np.array([0.5, -1.3, 0.9]) * mirror
     spec.visual.headlight.ambient = [0.35, 0.35, 0.35]
     spec.visual.headlight.diffuse = [0.45, 0.45, 0.45]
-    spec.visual.quality.shadowsize = 1024
     spec.visual.global_.offwidth, spec.visual.global_.offheight = 1280, 960
     spec.add_texture(name="sky", type=mujoco.mjtTexture.mjTEXTURE_SKYBOX, builtin=mujoco.mjtBuiltin.mjBUILTIN_FLAT,
                      width=8, height=48, rgb1=[0.97, 0.97, 0.98], rgb2=[0.97, 0.97, 0.98])  # fmt: skip
     world = spec.worldbody
-    world.add_light(pos=at + light, dir=-light, diffuse=[0.45, 0.45, 0.45])
+    world.add_light(pos=at + light, dir=-light, diffuse=[0.45, 0.45, 0.45], castshadow=False)  # shades look like motion
     world.add_geom(name="floor", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[2, 2, 0.05], contype=0, conaffinity=0,
                    rgba=[0.93, 0.93, 0.92, 1])  # fmt: skip
     world.add_camera(name=EYE, pos=at + look, xyaxes=[*_looking(AIM - look)], fovy=33)

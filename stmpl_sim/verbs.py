@@ -141,6 +141,7 @@ def limb(part: str, tissue: str, relaxing: bool = False, phenotype: str = "") ->
 def _run(massage: Massage, camera: Any, *, quiet: bool) -> Log:
     """Runs the course under a progress bar; the camera takes its frames."""
     from stmpl_core.console import steps_bar
+    from stmpl_sim.film import caption_of
 
     dt = float(massage.scene.model.opt.timestep)
     steps, every = round(massage.course.duration / dt), max(1, round(1 / (FILM_RATE * dt)))
@@ -152,7 +153,8 @@ def _run(massage: Massage, camera: Any, *, quiet: bool) -> Log:
                 show(k, steps, run.course.phase(at).name)
             if camera is not None and k % every == 0:
                 answer = run.skin.answer()
-                camera.take(run.data, run.skin.skin_points(run.data, answer), run.limb_pose(), answer.magnitude)
+                said = caption_of(at, answer.touches)
+                camera.take(run.data, run.skin.skin_points(run.data, answer), run.limb_pose(), answer.magnitude, said)
 
         return massage.run([see])
 
