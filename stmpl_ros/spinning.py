@@ -22,6 +22,9 @@ TRANSPORTS = "FASTDDS_BUILTIN_TRANSPORTS"  # variable by which a person chooses 
 def ros(arguments: list[str] | None = None) -> Iterator[threading.Event]:
     """ROS while inside; yields an event that SIGINT and SIGTERM set. rclpy's own handlers stay out of the way.
 
+    A KeyboardInterrupt that comes out of it once that is set ends it without a word: a signal can come just where
+    `interruptible` is being left.
+
     Messages go by UDP unless a person chose otherwise: by the shared memory of Fast DDS 2.14 a listener that is killed,
     or starved for a second, can leave its sender waiting for a lock of its own for ever (docs/laboratory/node.md).
     """
@@ -35,6 +38,9 @@ def ros(arguments: list[str] | None = None) -> Iterator[threading.Event]:
     rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO)
     try:
         yield stop
+    except KeyboardInterrupt:
+        if not stop.is_set():
+            raise
     finally:
         try_shutdown()
         for number, handler in before.items():

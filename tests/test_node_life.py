@@ -488,3 +488,19 @@ def test_everything_that_colcon_installs_is_there(monkeypatch):
     for folder in ("launch", "config"):
         assert installed[f"share/stmpl_ros/{folder}"] == {path.resolve() for path in (ROOT / folder).iterdir()}
     assert all(file.is_file() for files in installed.values() for file in files)
+
+
+LEAVING = """
+import os, signal, sys
+from stmpl_ros.spinning import interruptible, ros
+with ros() as stop:
+    inside = interruptible(stop)
+    inside.__enter__()
+    os.kill(os.getpid(), getattr(signal, sys.argv[1]))
+"""
+
+
+@pytest.mark.parametrize("number", ["SIGINT", "SIGTERM"])
+def test_a_signal_ends_a_process_cleanly_just_where_it_stops_being_interruptible_too(number):
+    code, said = end(start("-c", LEAVING, number))
+    assert (code, said) == (0, "")
