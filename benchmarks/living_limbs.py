@@ -4,7 +4,7 @@
     .venv/bin/python -m benchmarks.living_limbs --trunk     # 5 N on back, abdomen, neck and shoulder; prints
 
 Finite elements press the ball in along the skin's normal; the answer gets each pose, and then each force. Both on the
-same mesh; times on a mesh of 3 mm, on one core: set OMP_NUM_THREADS=1.
+same mesh; times on that mesh and on one of 3 mm, on one core: set OMP_NUM_THREADS=1.
 """
 
 from __future__ import annotations
@@ -149,12 +149,12 @@ def trunk(part: str, edge: float, force: float = 5.0) -> None:
           f"of the peak {row.why}")  # fmt: skip
 
 
-def times(part: str) -> None:
-    """Prints times on a mesh of 3 mm, by pose and by wrench."""
-    layer = living(Body.anny(), part, edge_length=3e-3)
+def times(part: str, edge: float) -> None:
+    """Prints times on a mesh of such edges [m], by pose and by wrench."""
+    layer = living(Body.anny(), part, edge_length=edge)
     simulator, vertex, tool = Simulator(layer, MomentNet()), site(layer, part), ball(RADIUS)
     normal, thickness = layer.normals[vertex], float(layer.thickness[vertex])
-    print(f"  {len(layer.vertices)} vertices at 3 mm, {1e3 * thickness:.0f} mm thick: ms, median (p99)")
+    print(f"  {len(layer.vertices)} vertices at {1e3 * edge:.0f} mm, {1e3 * thickness:.0f} mm thick: ms, median (p99)")
     for strain in (0.1, 0.4, 0.7):
         pose = np.eye(4)
         pose[:3, 3] = layer.vertices[vertex] + (RADIUS - strain * thickness) * normal
@@ -216,7 +216,8 @@ def main() -> None:
                 off = 100 * (row.force / row.truth - 1)
                 print(f"    {row.strain:5.2f} {row.depth:6.1f} mm {row.truth:6.2f} {row.force:7.2f} {row.bound:7.2f} "
                       f"{off:+6.1f} % {row.moves:5.1f} {row.worst:6.1f} %  {row.why}")  # fmt: skip
-        times(part)
+        for wide in (edge, 3e-3):
+            times(part, wide)
     if found:
         draw(found, given.out)
         print(f"{given.out} is drawn")
