@@ -42,7 +42,9 @@ from stmpl_core.tissue import Tissue
 PICTURE = Path(__file__).parents[1] / "docs" / "pictures" / "models.png"
 PART, EDGE = "left_forearm", 7e-3  # limb, and the edges of its mesh [m]
 RADIUS, DEPTH, LENGTH, SPEED, MU = 0.02, 8e-3, 24e-3, 0.05, 0.6  # ball [m], its stroke [m, m, m/s], friction [-]
-TRUTH = "skin, fat, muscle + time + slip"
+RUNGS = ("one layer", "skin on one layer", "skin, fat, muscle")
+MARKERS = {(False, False): "o", (True, False): "^", (False, True): "s", (True, True): "D"}  # of time and slip
+LEAST = 0.3  # error at which the truth is drawn [%]
 BETWEEN = 4  # steps of ours between two poses of finite elements
 
 
@@ -64,7 +66,7 @@ class Model:
     def name(self) -> str:
         """How people call it."""
         more = [word for word, has in (("time", self.time), ("slip", self.slip)) if has]
-        return " + ".join([("one layer", "skin on one layer", "skin, fat, muscle")[self.rung], *more])
+        return " + ".join([RUNGS[self.rung], *more])
 
     def layer(self) -> SoftLayer:
         """The forearm as this model has it."""
@@ -111,14 +113,14 @@ class Off(NamedTuple):
 
     Args:
         who: "ours" or "finite elements".
-        name: name of the model.
+        model: model.
         force, motion: root mean squares [%].
         took: time of a step [ms].
         flagged: share of the steps that say that they are not to be relied upon [-].
     """
 
     who: str
-    name: str
+    model: Model
     force: float
     motion: float
     took: float
@@ -157,7 +159,7 @@ def ours(model: Model, truth: dict[str, np.ndarray]) -> Off:
         flags.append(not answer.trust.in_range)
         if k in truth["at"]:
             moved.append(answer.displacement)
-    return Off("ours", model.name, *off(np.array(wrenches), np.array(moved), truth), 1e3 * float(np.median(took)),
+    return Off("ours", model, *off(np.array(wrenches), np.array(moved), truth), 1e3 * float(np.median(took)),
                float(np.mean(flags)))  # fmt: skip
 
 
@@ -165,7 +167,7 @@ def theirs(model: Model, folder: Path, truth: dict[str, np.ndarray]) -> Off:
     """Finite elements of a model, from where they lie."""
     found = read(folder, model)
     about = json.loads(str(found["about"]))
-    return Off("finite elements", model.name, *off(found["wrench"], found["displacement"], truth),
+    return Off("finite elements", model, *off(found["wrench"], found["displacement"], truth),
                1e3 * about["seconds"] / about["played"])  # fmt: skip
 
 
@@ -177,17 +179,20 @@ def read(folder: Path, model: Model) -> dict[str, np.ndarray]:
 
 def draw(rows: list[Off], path: Path) -> None:
     """Error of the force, and of the motion, over the time of a step."""
-    figure, axes = plt.subplots(1, 2, figsize=(12, 5.2), layout="constrained", sharex=True)
+    figure, axes = plt.subplots(1, 2, figsize=(12, 5), layout="constrained", sharex=True)
     for axis, what in zip(axes, ("force", "motion"), strict=True):
         for row in rows:
-            rich, fem = row.name == TRUTH, row.who != "ours"
-            colour = f"C{('one', 'ski').index(row.name[:3]) if row.name[:3] != 'ski' or 'layer' in row.name else 2}"
-            marker = {(False, False): "o", (True, False): "^", (False, True): "s", (True, True): "*"}[
-                "time" in row.name, "slip" in row.name]  # fmt: skip
-            axis.plot(row.took, max(getattr(row, what), 0.3), marker, color=colour, mfc="none" if fem else colour,
-                      ms=13 if marker == "*" else 8, zorder=3 if rich else 2)  # fmt: skip
-        axis.set(xscale="log", yscale="log", xlabel="time of a step [ms]", ylabel=f"{what} off [%]", title=what)
+            colour, fem = f"C{row.model.rung}", row.who != "ours"
+            axis.plot(row.took, max(getattr(row, what), LEAST), MARKERS[row.model.time, row.model.slip], color=colour,
+                      mfc="none" if fem else colour, ms=11, mew=1.6)  # fmt: skip
+        axis.set(xscale="log", yscale="log", xlabel="time of a step [ms]", ylabel="off [%]", title=what)
         axis.grid(alpha=0.3, which="both")
+    for rung in range(len(RUNGS)):
+        axes[1].plot([], [], "o", color=f"C{rung}", label=RUNGS[rung])
+    for (slow, slips), marker in MARKERS.items():
+        axes[1].plot([], [], marker, color="0.4", label=" + ".join([*["time"] * slow, *["slip"] * slips]) or "neither")
+    axes[1].plot([], [], "o", color="0.4", mfc="none", label="finite elements; the truth, 0 %, at the bottom")
+    axes[1].legend(fontsize=8)
     figure.savefig(path, dpi=110)
 
 
@@ -196,7 +201,7 @@ def table(rows: list[Off]) -> Iterator[str]:
     yield "| who | model | force off | motion off | a step | flagged |"
     yield "| --- | --- | ---: | ---: | ---: | ---: |"
     for row in rows:
-        yield (f"| {row.who} | {row.name} | {row.force:.1f} % | {row.motion:.1f} % | {row.took:.3g} ms | "
+        yield (f"| {row.who} | {row.model.name} | {row.force:.1f} % | {row.motion:.1f} % | {row.took:.3g} ms | "
                f"{100 * row.flagged:.0f} % |")  # fmt: skip
 
 
