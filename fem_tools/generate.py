@@ -24,7 +24,7 @@ from fem_tools.contact_job import Drop, Job, Part, Skin, solve_contact
 from fem_tools.dataset import FORMAT, Writer, write_layer
 from fem_tools.hand import Hand
 from fem_tools.released import Released
-from fem_tools.rounds import press
+from fem_tools.rounds import drawn, press, released
 from fem_tools.sampling import ContactId, Plan, contacts, layers
 from stmpl_core.body import Body
 from stmpl_core.errors import InvalidInput, StmplError
@@ -45,6 +45,7 @@ def generate(
     workers: int | None = None,
     scheduler: str | None = None,
     start: str | Path | None = None,
+    flat: str | Path | None = None,
     on_progress: OnProgress | None = None,
 ) -> dict[str, Any]:
     """Makes the data set of `plan` in the folder `out`, or goes on where an earlier run of it was stopped.
@@ -55,13 +56,14 @@ def generate(
         workers: local processes, each on one thread; None: one a core.
         scheduler: address of a Dask scheduler whose workers do the work instead (one thread each, please).
         start: released contacts of the same plan (see fem_tools.released) that need not be solved again.
+        flat: released presses of its flat stacks (see fem_tools.rounds), likewise.
         on_progress: function that is called after each contact.
 
     Returns:
         The manifest.
 
     Raises:
-        InvalidInput: `out` or `start` holds the data of another plan, or workers below 1.
+        InvalidInput: `out`, `start` or `flat` holds the data of another plan, or workers below 1.
         StmplError: a worker died; what was done is kept.
     """
     out = Path(out)
@@ -74,6 +76,8 @@ def generate(
                                               "complete": False}, indent=1).encode())  # fmt: skip
     if start is not None:
         _go_on_from(start, plan, out)
+    if flat is not None:
+        _press_on_from(flat, plan, out)
     made = layers(plan)
     tally = _solve_all(plan, out, made, workers, scheduler, on_progress)
     manifest = _pack(plan, out, made, tally)
@@ -102,6 +106,17 @@ def _go_on_from(start: str | Path, plan: Plan, out: Path) -> None:
     for contact, part in released.parts():
         if not _part_path(out, contact).is_file():
             _write(_part_path(out, contact), part.write())
+
+
+def _press_on_from(flat: str | Path, plan: Plan, out: Path) -> None:
+    """Puts released presses where those of a run are kept."""
+    presses = released(flat)
+    if len(presses) > plan.rounds or any(drawn(plan, k)[0].name != one.body or not np.allclose(
+            np.hstack(drawn(plan, k)[1]), np.hstack(one.tool)) for k, one in enumerate(presses)):  # fmt: skip
+        raise InvalidInput(f"{flat} holds flat presses of another plan.")
+    for k, one in enumerate(presses):
+        if not _part_path(out, k).is_file():
+            _write(_part_path(out, k), one.write())
 
 
 def _fewer_bodies(some: Plan, plan: Plan) -> bool:

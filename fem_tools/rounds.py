@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import io
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -15,12 +16,15 @@ import numpy as np
 
 from fem_tools.axisymmetric import Flat, Profile, Round
 from fem_tools.sampling import BodyPlan, Plan, ratios
+from stmpl_core.errors import InvalidInput
 from stmpl_core.tissue import Tissue
 
 THICKNESS = 0.02  # of every flat stack [m]
 WIDTHS = (0.15, 2.0)  # radii of the tools, over it
 KINDS = ("ball", "flat", "cone", "ring")
 SHARES = (0.45, 0.25, 0.15, 0.15)  # of the kinds
+BEYOND = 1e-4  # share of the force that a release does not say where it is carried
+FULL = 20_000  # steps of what a release rounds
 
 
 @dataclass(frozen=True)
@@ -91,6 +95,59 @@ def press(plan: Plan, number: int) -> bytes:
     body, tool, depths = drawn(plan, number)
     return Pressed(body.name, tool, Flat(tissue_of(body), THICKNESS).press(tool, depths)).write()
 
+
+def release(presses: Sequence[Pressed], path: str | Path) -> None:
+    """Writes presses as one small file: where the skin bears what, not how it moved.
+
+    Args:
+        presses: presses of a plan, by their numbers from 0 on.
+        path: file, .npz.
+    """
+    every = [one for press in presses for one in press.rounds]
+    ends = [int(np.flatnonzero(np.abs(one.carried / one.force - 1) > BEYOND)[-1]) + 2 for one in every]
+    radii = [one.radius[:end] for one, end in zip(every, ends, strict=True)]
+    shares = [np.append(one.carried[: end - 1] / one.force, 1.0) for one, end in zip(every, ends, strict=True)]
+    np.savez_compressed(
+        path,
+        bodies=np.array([press.body for press in presses]),
+        tools=np.array([(*press.tool.inner, *press.tool.outer, press.tool.rounding) for press in presses]),
+        depths=np.array([len(press.rounds) for press in presses]),
+        depth=np.array([one.depth for one in every]),
+        force=np.array([one.force for one in every]),
+        places=np.array(ends),
+        widest=np.array([places[-1] for places in radii]),
+        steps=np.concatenate([_steps(places / places[-1]) for places in radii]),
+        bears=np.concatenate([_steps(share) for share in shares]),
+    )
+
+
+def released(path: str | Path) -> list[Pressed]:
+    """The presses that `release` wrote; motion, which it leaves out, is NaN.
+
+    Raises:
+        InvalidInput: no such file, or one that holds no presses.
+    """
+    try:
+        with np.load(path) as read:
+            file = dict(read)
+        ends, first = np.cumsum(file["places"]), np.cumsum(file["depths"])
+        rounds = []
+        for k, end in enumerate(ends):
+            some = slice(end - file["places"][k], end)
+            radius, carried = (np.cumsum(file[name][some]) / FULL for name in ("steps", "bears"))
+            force = float(file["force"][k])
+            rounds.append(Round(float(file["depth"][k]), force, file["widest"][k] * radius, force * carried,
+                                np.full((2, len(radius)), np.nan)))  # fmt: skip
+        tools = [Profile((a, b), (c, d), e) for a, b, c, d, e in file["tools"].tolist()]
+        return [Pressed(str(body), tool, rounds[end - many : end])
+                for body, tool, many, end in zip(file["bodies"], tools, file["depths"], first, strict=True)]
+    except (OSError, ValueError, KeyError) as error:
+        raise InvalidInput(f"{path} holds no flat presses ({error}).") from error
+
+
+def _steps(shares: np.ndarray) -> np.ndarray:
+    """Steps of numbers that grow to 1, in FULLths."""
+    return np.diff(np.round(FULL * shares).astype(np.int32), prepend=0).astype(np.int16)
 
 
 def read_all(folder: str | Path) -> list[Pressed]:

@@ -323,6 +323,7 @@ def generate(
     workers: int | None = None,
     scheduler: str | None = None,
     start: Path | None = None,
+    flat: Path | None = None,
     as_json: Json = False,
 ) -> int:
     """Makes the data set that networks learn from, or goes on with one that was stopped.
@@ -336,6 +337,7 @@ def generate(
         workers: local processes; one a core unless given.
         scheduler: address of a Dask scheduler that does the work instead.
         start: file of released contacts to go on from, as benchmarks/limbs_v3.npz for tissue.
+        flat: file of released presses of its flat stacks, benchmarks/rounds_v1.npz; without, twenty minutes more.
         as_json: manifest as JSON, for machines.
     """
     needed("stmpl generate", "learn", "anny", "torch", "zarr", "shapely")
@@ -346,7 +348,8 @@ def generate(
 
     with contacts_bar(preset, quiet=as_json) as show:
         folder = out or Path("data") / preset
-        manifest = make(PRESETS[preset], folder, workers=workers, scheduler=scheduler, start=start, on_progress=show)
+        manifest = make(PRESETS[preset], folder, workers=workers, scheduler=scheduler, start=start, flat=flat,
+                        on_progress=show)  # fmt: skip
     print_figures(manifest if as_json else data_table(manifest, folder))
     return 0
 

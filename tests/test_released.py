@@ -11,7 +11,7 @@ from fem_tools.contact_job import Part
 from fem_tools.dataset import QUANTUM, Dataset, Record
 from fem_tools.generate import _fewer_bodies, generate
 from fem_tools.released import LEAST, STEPS, Released, write
-from fem_tools.rounds import THICKNESS, Pressed, drawn, learnt, read_all, tissue_of
+from fem_tools.rounds import THICKNESS, Pressed, drawn, learnt, read_all, release, released, tissue_of
 from fem_tools.sampling import PRESETS, ContactId, contacts, layers
 from stmpl_core import Contact, Simulator
 from stmpl_core.body import Body
@@ -118,6 +118,28 @@ def test_flat_presses_take_every_stack_that_is_learnt_from_and_no_other() -> Non
         assert drawn(TISSUE, k)[1:] == (tool, depths)
     kept = Pressed.read(Pressed("x", BALL, []).write())
     assert kept == Pressed("x", BALL, [])
+
+
+def test_flat_presses_are_kept_in_a_small_file_and_not_pressed_again(press: Pressed, tmp_path: Path) -> None:
+    file = tmp_path / "flat.npz"
+    release([press, press], file)
+    one, other = released(file)
+    assert one.body == other.body == press.body and one.tool == press.tool and len(one.rounds) == len(press.rounds)
+    for kept, true in zip(other.rounds, press.rounds, strict=True):
+        many = len(kept.radius)
+        assert kept.depth == true.depth and kept.force == true.force
+        np.testing.assert_allclose(kept.radius, true.radius[:many], atol=1e-4 * true.radius[many - 1])
+        np.testing.assert_allclose(kept.carried, true.carried[:many], atol=2e-4 * true.force)
+        assert abs(true.carried[many:] / true.force - 1).max(initial=0) < 2e-4
+    with pytest.raises(InvalidInput, match="flat presses of another plan"):
+        generate(PLAN, tmp_path / "out", workers=1, flat=file)
+    with pytest.raises(InvalidInput, match="holds no flat presses"):
+        released(tmp_path / "none.npz")
+    known = released(limbs.FILE.with_name("rounds_v1.npz"))
+    for k in (0, len(known) // 2, len(known) - 1):
+        body, tool, depths = drawn(TISSUE, k)
+        assert known[k].body == body.name and np.allclose(np.hstack(known[k].tool), np.hstack(tool))
+        assert np.allclose([each.depth for each in known[k].rounds], depths[: len(known[k].rounds)])
 
 
 def test_a_plate_carries_what_the_rings_carry(press: Pressed) -> None:
