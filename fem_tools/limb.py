@@ -14,9 +14,10 @@ from fem_tools.slabs import Slabs, slabs_of
 from fem_tools.system import System
 from stmpl_core.bones import shortened, unfolded
 from stmpl_core.coarse_response import CoarseResponse
-from stmpl_core.green import add_motion, tables
+from stmpl_core.green import add_motion, bank
 from stmpl_core.layer import SoftLayer
 from stmpl_core.methods.coarse import nearest_corners
+from stmpl_core.softness import Softness
 
 VERTICES = 900  # vertices of the coarse skin, about: its operator has 3 times their square numbers
 FINEST = 1.1  # edges of the coarse mesh over the layer's own, below which the layer's own is taken
@@ -37,12 +38,13 @@ def coarse_response(layer: SoftLayer, vertices: int = VERTICES) -> CoarseRespons
     """
     coarse = _coarse(layer, vertices)
     wide, thickness = _compliance(coarse), float(np.median(layer.thickness))
-    table, every = tables(layer.tissue, thickness), np.arange(len(coarse.vertices))
+    softness, every = Softness.of(layer, thickness), np.arange(len(coarse.vertices))
+    banked, soft = bank(layer.tissue, thickness, softness), softness.at(coarse, thickness)
     inward, area, unit = -coarse.normals, coarse.vertex_areas, np.full(len(every), thickness)
     for v in every:  # less the flat stack's
         flat, one = np.zeros_like(coarse.vertices), slice(v, v + 1)
         add_motion(flat, every, coarse.vertices, inward, unit, coarse.vertices[one], inward[one], area[one], unit[one],
-                   area[v] * inward[one], table)  # fmt: skip
+                   soft[one], area[v] * inward[one], banked)  # fmt: skip
         wide[:, v] -= flat.ravel()
     corners, shares = nearest_corners(coarse, layer.vertices)
     gathered = np.bincount(corners.ravel(), (shares * layer.vertex_areas[:, None]).ravel(), len(coarse.vertices))

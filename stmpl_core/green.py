@@ -7,7 +7,9 @@ interpolation from there and R the way there (forces keep their sum),
 
     u = G f + C (K^-1 - G_coarse) R f
 
-the sharp part is the closed form's, the wide part the finite elements' (fem_tools.limb).
+the sharp part is the closed form's, the wide part the finite elements' (fem_tools.limb). G is of one thickness, but
+knows how soft the stack is at each place (stmpl_core.softness): under small tools the coarse part feels little of fat
+that is thin here and thick there.
 """
 
 from __future__ import annotations
@@ -25,12 +27,14 @@ from stmpl_core.layer import SoftLayer
 from stmpl_core.moments import Surroundings
 from stmpl_core.nodes import Nodes
 from stmpl_core.response import FAST, SPREAD
+from stmpl_core.softness import BANK, Softness
 from stmpl_core.stack import Effective, along, compliance, effective, hardening
 from stmpl_core.tissue import Tissue
 
 REACH = 8.0  # distance beyond which the flat response is not felt, over t
 ROWS = 64  # rows of the tables over the root of the distance
 SPREADS = np.geomspace(0.004, 1.6, 16)  # widths of a node's force that are tabled, over t
+TABLED = np.geomspace(1e-5, 10 / SPREADS[0], 3000)  # wave numbers at which a stack's response is known [1/t]
 FIRST_LOG, STEP_LOG = float(np.log(SPREADS[0])), float(np.log(SPREADS[1] / SPREADS[0]))
 ROUND = float(np.sqrt(2 / np.pi))  # of a Gaussian that is as wide, 1 / r in its middle is 1 / (ROUND s)
 FARTHEST = float(np.sqrt(REACH * 0.9999)) * ROWS  # place in the tables of the largest distance
@@ -62,13 +66,19 @@ class Green:
         thickness: thickness of the flat stack, the median of the layer's [m].
         effective: single layer under the same skin that is nearest to the stack.
         near: neighbours of the layer's vertices, with the flat stack's response.
+        tables: responses of the flat stack by softness, (BANK, 4, spread, root of the distance); see `tables`.
+        soft: softness of each vertex, its place among them, (V,).
     """
 
     def __init__(self, layer: SoftLayer, coarse: CoarseResponse | None) -> None:
         self.layer, self.coarse = copy(layer), coarse  # the layer itself would never be let go by _KEPT
         self.thickness = float(np.median(layer.thickness))
         self.near = Surroundings.of(layer)
-        self.tables = tables(layer.tissue, self.thickness) if layer.stacked else _of_one(layer.tissue.poisson_ratio)
+        if layer.stacked:
+            softness = Softness.of(layer, self.thickness)
+            self.tables, self.soft = bank(layer.tissue, self.thickness, softness), softness.at(layer, self.thickness)
+        else:
+            self.tables, self.soft = _of_one(layer.tissue.poisson_ratio), np.zeros(len(layer.vertices))
         self._turns = AS_AT_REST
         self._last: tuple[np.ndarray, tuple[np.ndarray, np.ndarray]] | None = None
 
@@ -117,6 +127,10 @@ class Green:
         """Thickness of the flat layer at nodes, (N,) [m]."""
         return np.full(len(nodes.area), self.thickness) if self.layer.stacked else nodes.thickness
 
+    def soft_at(self, nodes: Nodes) -> np.ndarray:
+        """Softness at nodes, (N,)."""
+        return (self.soft[nodes.corners] * nodes.shares).sum(axis=1)
+
     @cached_property
     def effective(self) -> Effective:
         """See the class."""
@@ -153,7 +167,7 @@ class Green:
         last = self._last
         if last is None or not np.array_equal(last[0], nodes.points):  # a touch, then its answer
             made = _matrix(nodes.points, nodes.inward, nodes.area, nodes.corners, nodes.shares, group,
-                           self.unit_at(nodes), self.tables[0], *self._coarse)  # fmt: skip
+                           self.unit_at(nodes), self.soft_at(nodes), self.tables[:, 0], *self._coarse)  # fmt: skip
             last = self._last = nodes.points, made
         return last[1]
 
@@ -193,19 +207,20 @@ class Green:
     def _blocks(self, nodes: Nodes, group: np.ndarray) -> np.ndarray:
         """Motion of each node under a force E at each, (3 N, 3 N) [1/m]."""
         return _blocks(nodes.points, nodes.inward, nodes.area, nodes.corners, nodes.shares, group, self.unit_at(nodes),
-                       self.tables, *self._coarse)  # fmt: skip
+                       self.soft_at(nodes), self.tables, *self._coarse)  # fmt: skip
 
     def motion(self, nodes: Nodes, forces: np.ndarray) -> np.ndarray:
         """Motion of all vertices under forces over E at nodes (N, 3) [m2], (V, 3) [m]."""
         layer = self.layer
         asked = self.near.asked_again(np.unique(nodes.corners))
         by, group = np.zeros((len(asked.vertices), 3)), self.near.groups(nodes.corners[:, 0])
+        unit, soft = self.unit_at(nodes), self.soft_at(nodes)
         for one in np.unique(group):
             of = group == one
             there = self.near.reached_among(np.unique(nodes.corners[of]), asked.vertices, alone=not group.any())
             add_motion(by, there, layer.vertices[asked.vertices], -layer.normals[asked.vertices],
                        self.near.thickness[asked.vertices], nodes.points[of], nodes.inward[of], nodes.area[of],
-                       self.unit_at(nodes)[of], forces[of], self.tables)  # fmt: skip
+                       unit[of], soft[of], forces[of], self.tables)  # fmt: skip
         out = np.zeros_like(layer.vertices)
         asked.fill(by, out)
         if self.coarse is None:
@@ -233,12 +248,22 @@ class Green:
 @cache
 def _of_one(poisson_ratio: float) -> np.ndarray:
     """Tables of one material, whose thickness does not matter."""
-    return tables(Tissue(poisson_ratio=poisson_ratio), 1.0)
+    return bank(Tissue(poisson_ratio=poisson_ratio), 1.0, None)
 
 
 @lru_cache(maxsize=4)  # coarse elements and their layer ask for the same
-def tables(tissue: Tissue, thickness: float) -> np.ndarray:
-    """Responses of a flat stack with E = t = 1 to a force spread as a Gaussian, (4, spread, root of the distance).
+def _bank(tissue: Tissue, thickness: float, factors: bytes) -> np.ndarray:
+    found = tables(tissue, thickness, np.frombuffer(factors).reshape(BANK, 4, -1) if factors else None)
+    return found if factors else np.repeat(found, BANK, axis=0)
+
+
+def bank(tissue: Tissue, thickness: float, softness: Softness | None) -> np.ndarray:
+    """`tables` of BANK stacks that are softer from one to the next; None, or places that are all alike: the same."""
+    return _bank(tissue, thickness, softness.factors(TABLED).tobytes() if softness and softness.step else b"")
+
+
+def tables(tissue: Tissue, thickness: float, factors: np.ndarray | None = None) -> np.ndarray:
+    """Responses of flat stacks with E = t = 1 to a force spread as a Gaussian, (B, 4, spread, root of the distance).
 
     In order: motion inwards and outwards from a force inwards; of one along the skin the even part of the motion and
     the part that goes with the direction. With A, B of stmpl_core.stack.compliance and L, C of `along`,
@@ -246,36 +271,43 @@ def tables(tissue: Tissue, thickness: float) -> np.ndarray:
         int A J0, int B J1, int (L + C) / 2 J0, -int (L - C) J2, each times exp(-(k s)^2 / 2) k dk / (2 pi)
 
     and times sqrt(r^2 + (ROUND s)^2), which takes out how steep it is.
+
+    Args:
+        tissue: materials, and the skin on them.
+        thickness: thickness of the stack [m].
+        factors: what A, B, L and C are to be multiplied by at TABLED, (B, 4, K); None: by 1, once.
     """
-    waves = np.geomspace(1e-5, 10 / SPREADS[0], 3000)
-    sink, away = compliance(tissue, thickness, waves)
-    lengthwise, crosswise = along(tissue, thickness, waves)
-    curves, logs = (sink, away, 0.5 * (lengthwise + crosswise), crosswise - lengthwise), np.log(waves)
+    responses = np.array([*compliance(tissue, thickness, TABLED), *along(tissue, thickness, TABLED)])
+    each = responses[None] if factors is None else responses * factors
+    lengthwise, crosswise = each[:, 2], each[:, 3]
+    curves = np.stack([each[:, 0], each[:, 1], 0.5 * (lengthwise + crosswise), crosswise - lengthwise], axis=1)
     radii = (np.arange(int(np.sqrt(REACH) * ROWS) + 2) / ROWS) ** 2
-    out = np.empty((4, len(SPREADS), len(radii)))
+    out = np.empty((len(each), 4, len(SPREADS), len(radii)))
     for row, radius in enumerate(radii):
         for n, spread in enumerate(np.maximum(SPREADS, radius / FAR)):
             if n and spread > SPREADS[n]:
-                out[:, n, row] = out[:, n - 1, row] if spread == radius / FAR and radius / FAR > SPREADS[n - 1] \
-                    else _transforms(curves, logs, radius, spread)  # fmt: skip
+                out[:, :, n, row] = out[:, :, n - 1, row] if spread == radius / FAR and radius / FAR > SPREADS[n - 1] \
+                    else _transforms(curves, radius, spread)  # fmt: skip
             else:
-                out[:, n, row] = _transforms(curves, logs, radius, spread)
+                out[:, :, n, row] = _transforms(curves, radius, spread)
     fade = np.clip((REACH - radii) / 1.5, 0, 1)
     return out * np.sqrt(radii**2 + (ROUND * SPREADS[:, None]) ** 2) * fade * fade * (3 - 2 * fade)
 
 
-def _transforms(curves: tuple, logs: np.ndarray, radius: float, spread: float) -> np.ndarray:
-    """The four transforms at one radius and spread, on panels as fine as the waves there."""
+def _transforms(curves: np.ndarray, radius: float, spread: float) -> np.ndarray:
+    """The four transforms of curves at TABLED (B, 4, K), at a radius and a spread, (B, 4), on fine panels."""
     edges = _panels(radius, 6 / spread)
     x, w = GAUSS
     middle, half = 0.5 * (edges[1:] + edges[:-1]), 0.5 * np.diff(edges)
     k, weight = (middle[:, None] + half[:, None] * x).ravel(), (half[:, None] * w).ravel()
     weight = weight * np.exp(-0.5 * (k * spread) ** 2) * k / (2 * np.pi)
-    f, log = k * radius, np.log(k)
+    f = k * radius
     first, zeroth = j1(f), j0(f)
     second = np.where(f > 1e-4, 2 * first / np.maximum(f, 1e-4) - zeroth, f * f / 8)
-    values = (np.interp(log, logs, curve) for curve in curves)
-    return np.array([weight @ (v * j) for v, j in zip(values, (zeroth, first, zeroth, second), strict=True)])
+    place = np.clip(np.log(k / TABLED[0]) / np.log(TABLED[1] / TABLED[0]), 0, len(TABLED) - 1.001)
+    low = place.astype(int)
+    values = curves[..., low] + (place - low) * (curves[..., low + 1] - curves[..., low])
+    return np.einsum("bcw,cw->bc", values, weight * np.array([zeroth, first, zeroth, second]))
 
 
 def _panels(radius: float, end: float) -> np.ndarray:
@@ -311,6 +343,14 @@ def _at(table, k, f, g, h):
     """Value of one table at a place."""
     low = (1 - f) * table[g, k] + f * table[g, k + 1]
     return (1 - h) * low + h * ((1 - f) * table[g + 1, k] + f * table[g + 1, k + 1])
+
+
+@numba.njit(cache=True, error_model="numpy", inline="always")
+def _softly(banked, soft, k, f, g, h):
+    """Value of one table of each softness (BANK, spread, root of the distance), at a place."""
+    b = int(soft)
+    value = _at(banked[b], k, f, g, h)
+    return value + (soft - b) * (_at(banked[b + 1], k, f, g, h) - value) if soft > b else value
 
 
 @numba.njit(cache=True, nogil=True)
@@ -393,7 +433,7 @@ def _inwards(index, weight, many, some, gathered, motion, turns, inward, out):
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _matrix(points, inward, area, corners, shares, group, unit, table, skin_corners, skin_shares, gathered,
+def _matrix(points, inward, area, corners, shares, group, unit, soft, banked, skin_corners, skin_shares, gathered,
             motion, turns):  # fmt: skip
     """See Green.matrix."""
     count = len(points)
@@ -419,7 +459,7 @@ def _matrix(points, inward, area, corners, shares, group, unit, table, skin_corn
                 k, mean = int(f), 0.5 * (area[i] + area[j])
                 a = min((mean - least) * steps, AREAS - 1.001)
                 h = _row_of(logs[int(a)] + (a - int(a)) * (logs[int(a) + 1] - logs[int(a)]) - own[i] - own[j])
-                value = _at(table, k, f - k, int(h), h - int(h))
+                value = _softly(banked, 0.5 * (soft[i] + soft[j]), k, f - k, int(h), h - int(h))
                 both += _share(facing) * value / np.sqrt(square + mean * (ROUND * SPREAD) ** 2)
             out[i, j] = out[j, i] = both
     return out, wide
@@ -447,7 +487,7 @@ def _of_force(n0, n1, n2, s0, s1, s2, d0, d1, d2, size, g0, g1, even, along, f0,
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _blocks(points, inward, area, corners, shares, group, unit, tables, skin_corners, skin_shares, gathered,
+def _blocks(points, inward, area, corners, shares, group, unit, soft, tables, skin_corners, skin_shares, gathered,
             motion, turns):  # fmt: skip
     """Motion of each node under a force E at each, (3 N, 3 N) [1/m]; the coarse part only under what goes inwards."""
     count = len(points)
@@ -475,8 +515,9 @@ def _blocks(points, inward, area, corners, shares, group, unit, tables, skin_cor
             s = SPREAD * np.sqrt(0.5 * (area[i] + area[j])) / t
             k, f, g, h = _place(r, s)
             per = _share(facing) / (np.sqrt(r * r + (ROUND * s) ** 2) * t)
-            g0, g1, even, along = (per * _at(tables[0], k, f, g, h), per * _at(tables[1], k, f, g, h),
-                                   per * _at(tables[2], k, f, g, h), per * _at(tables[3], k, f, g, h))  # fmt: skip
+            c = 0.5 * (soft[i] + soft[j])
+            g0, g1 = per * _softly(tables[:, 0], c, k, f, g, h), per * _softly(tables[:, 1], c, k, f, g, h)
+            even, along = per * _softly(tables[:, 2], c, k, f, g, h), per * _softly(tables[:, 3], c, k, f, g, h)
             for y in range(3):
                 force[:] = 0.0
                 force[y] = 1.0
@@ -499,7 +540,7 @@ def _held(blocks: np.ndarray, gone: np.ndarray) -> np.ndarray:
 
 
 @numba.njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
-def add_motion(out, there, points, inward, unit, sources, source_inward, area, source_unit, forces, tables):
+def add_motion(out, there, points, inward, unit, sources, source_inward, area, source_unit, soft, forces, tables):
     """Adds to rows `there` of out (M, 3) [m] the flat motion of points under forces over E at sources (N, 3) [m2].
 
     Args:
@@ -509,10 +550,11 @@ def add_motion(out, there, points, inward, unit, sources, source_inward, area, s
         sources, source_inward: the same of the sources, (N, 3).
         area: area that each source stands for, (N,) [m2].
         source_unit: thickness of the flat layer there, (N,) [m].
+        soft: softness there, (N,).
         forces: forces over E, (N, 3) [m2].
-        tables: see `tables`.
+        tables: see `bank`.
     """
-    wide = tables.shape[2]
+    wide = tables.shape[3]
     rows, first, kinds = np.empty((len(sources), 4, wide)), np.empty(len(sources), np.int32), 0
     by = np.empty((11, len(sources)))  # of each source: place, inward normal, force, root of the thickness, spread
     for j in range(len(sources)):  # nodes of one tool are about as wide: few tables serve all
@@ -521,15 +563,18 @@ def add_motion(out, there, points, inward, unit, sources, source_inward, area, s
         for x in range(3):
             by[x, j], by[3 + x, j], by[6 + x, j] = sources[j, x], source_inward[j, x], forces[j, x]
         _, _, g, h = _place(0.0, spread)
-        at, k = int(16 * (g + h)), 0
-        while k < kinds and rows[k, 0, -1] != at:
+        at, one, k = int(16 * (g + h)), int(32 * soft[j] + 0.5), 0
+        while k < kinds and (rows[k, 0, -1] != at or rows[k, 1, -1] != one):
             k += 1
         if k == kinds:
-            g, h = at // 16, (at % 16 + 0.5) / 16
+            g, h, b, w = at // 16, (at % 16 + 0.5) / 16, one // 32, (one % 32) / 32
             for m in range(4):
                 for c in range(wide):
-                    rows[k, m, c] = (1 - h) * tables[m, g, c] + h * tables[m, g + 1, c]
-            rows[k, 0, -1] = at
+                    value = (1 - h) * tables[b, m, g, c] + h * tables[b, m, g + 1, c]
+                    if w > 0:
+                        value += w * ((1 - h) * tables[b + 1, m, g, c] + h * tables[b + 1, m, g + 1, c] - value)
+                    rows[k, m, c] = value
+            rows[k, 0, -1], rows[k, 1, -1] = at, one
             kinds += 1
         first[j] = 4 * wide * k
     flat = rows.ravel()

@@ -1,15 +1,7 @@
-"""judge_contact: how far ContactNet and MomentNet are off under rigid tools, and the bounds that follow.
-
-    .venv/bin/python -m studies.judge_contact benchmarks/limbs_v3.npz living    # some minutes
-
-writes into the card of the stack's network that ships what bound on force the contacts of a release ask for, on bodies
-whose names begin so, and from which it learnt nothing.
-"""
+"""judge_contact: how far ContactNet and MomentNet are off under rigid tools, and the bounds that follow."""
 
 from __future__ import annotations
 
-import json
-import sys
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -17,11 +9,10 @@ from pathlib import Path
 import numpy as np
 
 from fem_tools.dataset import Dataset, Sample
-from fem_tools.released import Released
 from stmpl_core.contact import Contact
 from stmpl_core.contact_net import ContactNet
 from stmpl_core.methods import MomentNet, Zero
-from stmpl_core.networks import NETWORKS, Weights, shipped
+from stmpl_core.networks import NETWORKS, Weights
 from stmpl_core.simulator import Simulator
 from studies.pressed import STRAIGHT, pressed, seen, slant_of
 
@@ -126,27 +117,6 @@ def bound_force(parts: Iterable[tuple[Iterable[Sample], Weights]], **more: float
     return found
 
 
-def bound_shipped(release: str | Path, names: str) -> dict[str, float]:
-    """The bound on force of the stack's network that ships, from bodies that it never met; written to its card.
-
-    The bound on motion, which is one on top of it, stays what it was.
-
-    Args:
-        release: released contacts.
-        names: what the names of these bodies begin with.
-    """
-    samples = [one for one in Released(release).samples() if one.info["body"].startswith(names)]
-    pressures, moments = shipped("stack_contact_net"), shipped("stack_moment_net")
-    before, motion = pressures.card["bound"], moments.card["contact_bound"]
-    found = bound_force([(samples, pressures)], uneven=UNEVEN)
-    flatter = before["power"] / found["power"]
-    kept = motion | {"scale": motion["scale"] * (before["scale"] / found["scale"] ** flatter) ** motion["power"],
-                     "power": motion["power"] * flatter}  # fmt: skip
-    replace(pressures, card={**pressures.card, "bound": found}).save(NETWORKS["stack_contact_net"].path)
-    replace(moments, card={**moments.card, "contact_bound": kept}).save(NETWORKS["stack_moment_net"].path)
-    return found
-
-
 def bound_motion(data: str | Path, out: str | Path, motion: str = "moment_net_contact",
                  pressure: str = "contact_net") -> dict[str, float]:  # fmt: skip
     """How far the motion under a tool that came straight is off, from how far its force may be: see fit_bound.
@@ -202,6 +172,3 @@ def fit_bound(errors: np.ndarray, doubts: np.ndarray, kinds: np.ndarray,
         "median_bound_over_error": float(np.median(scale * doubts**power / without)),
     }
 
-
-if __name__ == "__main__":
-    print(json.dumps(bound_shipped(*sys.argv[1:3]), indent=1))

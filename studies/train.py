@@ -14,7 +14,7 @@ TrainPreset = Literal[
     "default", "contacts", "tissue", "paper", "paper-reduced", "paper-3-bodies", "paper-reduced-3-bodies"
 ]
 TOOLS: dict[str, Any] = {"kinds": ("indenter",), "steps": 20_000}  # settings of a MomentNet for what tools press with
-STACK_CONTACTS = {"hidden": 24, "weight_decay": 0.1, "steps": 2_500}  # stacks are few: more would learn them by heart
+STACK_CONTACTS = {"hidden": 24, "weight_decay": 0.3, "steps": 3_000, "batch": 96}  # few stacks: more is learnt by heart
 STACK_MOMENTS = {"hidden": 64, "weight_decay": 0.3, "steps": 3_000, "points": 64}
 OnProgress = Callable[[int, int, str], None]  # done, in all, what to say of it
 

@@ -50,14 +50,14 @@ def under(green: Green, field: SignedDistance, pose: np.ndarray) -> tuple[Nodes,
 def test_a_wide_force_sinks_the_stack_as_its_table_says():
     rows, spread = response_table(STACK, THICK), 1.6
     radius = (np.arange(int(np.sqrt(REACH) * ROWS) + 2) / ROWS) ** 2
-    found = tables(STACK, THICK)[0, np.abs(SPREADS - spread).argmin()] / np.hypot(radius, ROUND * spread)
+    found = tables(STACK, THICK)[0, 0, np.abs(SPREADS - spread).argmin()] / np.hypot(radius, ROUND * spread)
     known = np.interp(radius[radius < 6], np.arange(rows.shape[1]) / 48, rows[-1, :, 0])
     np.testing.assert_allclose(found[radius < 6], known, atol=5e-3 * known[0])
 
 
 def test_far_from_a_force_on_bare_tissue_the_half_space_is_not_felt_and_near_it_is_all():
     nu = 0.4
-    table, radius = tables(Tissue(1e3, nu), 0.02)[0, 0], 0.05
+    table, radius = tables(Tissue(1e3, nu), 0.02)[0, 0, 0], 0.05
     row = round(np.sqrt(radius) * ROWS)
     radius = (row / ROWS) ** 2
     near = table[row] / np.hypot(radius, ROUND * SPREADS[0])

@@ -97,8 +97,8 @@ SKINS: dict[str, tuple[Any, str]] = {
     "grids": (Grid, "G"), "coefficients": (real, "N"), "thinnest": (real, "K"),
     "looked_at": (vec3, "Kx"), "look_many": (wp.int32, "Kx"),
     "rows": (real, "Tx"), "linked": (wp.uint32, "Vb"),
-    "green": (real, "SgR"), "coarse_corner": (wp.vec3i, "V"), "coarse_share": (vec3, "V"), "gathered": (real, "c"),
-    "motion": (wp.float32, "m"), "hard_logs": (real, "St"), "hard": (real, "Sts"),
+    "green": (real, "SbgR"), "soft": (real, "V"), "coarse_corner": (wp.vec3i, "V"), "coarse_share": (vec3, "V"),
+    "gathered": (real, "c"), "motion": (wp.float32, "m"), "hard_logs": (real, "St"), "hard": (real, "Sts"),
 }  # fmt: skip
 # C: scene and tool, S: scene, M: columns, B: blocks of columns, F: triangles, P: their parts, L: lattice, N: nodes,
 # Q, K: nodes and coarse vertices of stacks
@@ -117,9 +117,9 @@ SCRATCH: dict[str, tuple[Any, str]] = {
     "face": (wp.int32, "SN"), "shares": (vec3, "SN"), "point": (vec3, "SN"), "inward": (vec3, "SN"),
     "thick": (real, "SN"), "area": (real, "SN"), "strain": (real, "SN"),
     "fold": (wp.int32, "SN"), "queue": (wp.int32, "SN"), "mean": (vec3, "C"), "least_area": (real, "C"),
-    "most_area": (real, "C"), "sinking": (real, "SQ"), "slot": (wp.int32, "SK"), "met": (wp.int32, "SK"),
-    "meets": (wp.int32, "S"), "slots": (wp.int32, "SQ9"), "weights": (real, "SQ9"), "parts": (real, "SQ9"),
-    "around_node": (wp.int32, "SQ"), "rows": (real, "SQK"),
+    "most_area": (real, "C"), "sinking": (real, "SQ"), "soft": (real, "SQ"), "slot": (wp.int32, "SK"),
+    "met": (wp.int32, "SK"), "meets": (wp.int32, "S"), "slots": (wp.int32, "SQ9"), "weights": (real, "SQ9"),
+    "parts": (real, "SQ9"), "around_node": (wp.int32, "SQ"), "rows": (real, "SQK"),
     "wide_part": (real, "SQQ"), "given_way": (real, "C"),
     "matrix": (real, "SNN"), "force": (real, "SN"), "gap": (real, "SN"), "move": (real, "SN"), "along": (real, "SN"),
     "found_power": (real, "SN"), "left": (real, "SN"), "before": (real, "S"), "restart": (wp.int32, "S"),
@@ -279,9 +279,9 @@ def _of_stack(one: Any, skin: Skin, order: np.ndarray, at: tuple[int, int]) -> d
     one.first_coarse, one.first_motion = at
     out: dict[str, np.ndarray] = {
         "linked": _linked(skin, order) if skin.near.folded else np.zeros((len(order), 1), np.uint32),
-        "green": np.zeros((1, 1, 1)), "coarse_corner": np.zeros((1, 3), int), "coarse_share": np.zeros((1, 3)),
-        "gathered": np.zeros(0), "motion": np.zeros(0), "hard_logs": np.zeros((1, COLUMNS)),
-        "hard": np.zeros((1, COLUMNS, STRAINS)),
+        "green": np.zeros((1, 1, 1, 1)), "soft": np.zeros(len(order)), "coarse_corner": np.zeros((1, 3), int),
+        "coarse_share": np.zeros((1, 3)), "gathered": np.zeros(0), "motion": np.zeros(0),
+        "hard_logs": np.zeros((1, COLUMNS)), "hard": np.zeros((1, COLUMNS, STRAINS)),
     }  # fmt: skip
     green = skin.green
     if green is None:
@@ -294,8 +294,9 @@ def _of_stack(one: Any, skin: Skin, order: np.ndarray, at: tuple[int, int]) -> d
     _, one.log_kappa, one.log_pull, log_softness = (float(x) for x in green.numbers)
     one.softness = float(np.exp(log_softness))
     return out | {
-        "green": green.tables[None, 0], "coarse_corner": corners[order], "coarse_share": shares[order],
-        "gathered": gathered, "motion": motion.ravel(), "hard_logs": logs[None], "hard": hard[None],
+        "green": green.tables[None, :, 0], "soft": green.soft[order], "coarse_corner": corners[order],
+        "coarse_share": shares[order], "gathered": gathered, "motion": motion.ravel(),
+        "hard_logs": logs[None], "hard": hard[None],
     }  # fmt: skip
 
 

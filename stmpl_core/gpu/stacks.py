@@ -109,6 +109,8 @@ def meet(many: wp.int32, skins: Skins, scratch: Scratch):
         scratch.slot[s, n] = -1
     for i in range(scratch.nodes[s]):
         corners, shares, own = skins.faces[scratch.face[s, i]], scratch.shares[s, i], wp.int32(0)
+        scratch.soft[s, i] = (shares[0] * skins.soft[corners[0]] + shares[1] * skins.soft[corners[1]]
+                              + shares[2] * skins.soft[corners[2]])  # fmt: skip
         for q in range(9):
             v = corners[q // 3]
             n, weight = skins.coarse_corner[v][q % 3], shares[q // 3] * skins.coarse_share[v][q % 3]
@@ -168,6 +170,14 @@ def _log_spread(least: real, steps: real, n: real) -> real:
     return wp.log(SPREAD * wp.sqrt(least + n / steps))
 
 
+@wp.func
+def _at(skins: Skins, id: wp.int32, b: wp.int32, g: wp.int32, k: wp.int32, x: real, y: real) -> real:
+    """Response of the flat stack of one softness at a place of its table."""
+    first = (real(1.0) - x) * skins.green[id, b, g, k] + x * skins.green[id, b, g, k + 1]
+    second = (real(1.0) - x) * skins.green[id, b, g + 1, k] + x * skins.green[id, b, g + 1, k + 1]
+    return (real(1.0) - y) * first + y * second
+
+
 @wp.kernel
 def respond(lanes: wp.int32, many: wp.int32, skins: Skins, scratch: Scratch):
     """Depth of each node under a force E at each, and the limb's part of it, (N, N) each [1/m]."""
@@ -194,9 +204,13 @@ def respond(lanes: wp.int32, many: wp.int32, skins: Skins, scratch: Scratch):
                 h = wp.clamp((log_spread - wp.log(one.flat) - FIRST_LOG) / STEP_LOG, real(0.0), LAST_ROW)
                 k, g = wp.int32(f), wp.int32(h)
                 x, y, near = f - real(k), h - real(g), wp.clamp(facing / AROUND, real(0.0), real(1.0))
-                first = (real(1.0) - x) * skins.green[id, g, k] + x * skins.green[id, g, k + 1]
-                second = (real(1.0) - x) * skins.green[id, g + 1, k] + x * skins.green[id, g + 1, k + 1]
-                value = near * near * (real(3.0) - real(2.0) * near) * ((real(1.0) - y) * first + y * second)
+                soft = real(0.5) * (scratch.soft[s, i] + scratch.soft[s, j])
+                b = wp.int32(soft)
+                z = soft - real(b)
+                value = _at(skins, id, b, g, k, x, y)
+                if z > real(0.0):
+                    value += z * (_at(skins, id, b + 1, g, k, x, y) - value)
+                value *= near * near * (real(3.0) - real(2.0) * near)
                 value = value / wp.sqrt(square + mean * ROUND_SQUARE)
         scratch.wide_part[s, i, j] = both
         scratch.matrix[s, i, j] = value + both
