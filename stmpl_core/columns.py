@@ -122,7 +122,7 @@ class Columns:
 
     def clearance(self, field: SignedDistance, pose: Transform, near: np.ndarray, far: float) -> Clearance:
         """Distance of the tool from columns; those further than `far` [m] are only known to be so."""
-        least, skin = _clearances(grid_of(field), pose, self.points, self.inward, self.layer.thickness, near, far)
+        least, skin = clearances(grid_of(field), pose, self.points, self.inward, self.layer.thickness, near, far)
         return Clearance(near, least, skin)
 
     def squeeze(self, field: SignedDistance, pose: Transform, clearance: Clearance) -> Squeeze:
@@ -239,7 +239,7 @@ def _through_box(points, inward, thickness, order, blocks, pose, low, high, cent
 
 
 @numba.njit(cache=True, nogil=True)
-def _clearances(grid, pose, points, inward, thickness, near, far):
+def clearances(grid, pose, points, inward, thickness, near, far):
     """Least signed distance along each column [m], by sphere tracing from the skin to the core; and that at the skin.
 
     A column whose core end lies inside the tool counts only if the tool comes from outside: where the distance still

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from functools import cached_property
 
+import numba
 import numpy as np
 from scipy.spatial import KDTree
 
 from stmpl_core.arrays import Transform
-from stmpl_core.columns import Columns, Squeeze, middle_of, shifted
+from stmpl_core.columns import LEAST_UNDER, Columns, Squeeze, clearances, grid_of, middle_of, shifted
+from stmpl_core.rays import WALL, depth_and_share, distance_in_column, ray_of
 from stmpl_core.sdf import SignedDistance
 
 DEEPEST = 0.9  # depth over thickness beyond which a tool is answered for where it is drawn back to that
@@ -74,18 +75,42 @@ class Deep:
         if out is None:
             return pose, squeeze, 0.0
         thickness = float(self.layer.thickness.max())
-
-        def there(way: float) -> float:
-            at = shifted(pose, way * out)
-            found = self.columns.squeezed(field, at)
-            return self.strain(found) if len(found.nodes.area) else float(self.inside(field, at, points))
-
         low, high = 0.0, 0.1 * thickness
-        while there(high) > DEEPEST and high < 1e3 * thickness:
+        while self.beyond(field, shifted(pose, high * out), points) and high < 1e3 * thickness:
             low, high = high, 2 * high
-        way = _root(lambda x: there(x) - DEEPEST, low, high, ACCURACY * thickness)
-        at = shifted(pose, way * out)
-        return at, self.columns.squeezed(field, at), way
+        some = self._which_may_be(field, shifted(pose, 0.5 * (low + high) * out), 0.5 * (high - low))
+        while high - low > ACCURACY * thickness:
+            way = 0.5 * (low + high)
+            deeper = self.beyond(field, shifted(pose, way * out), points, some)
+            low, high = (way, high) if deeper else (low, way)
+        at = shifted(pose, high * out)
+        return at, self.columns.squeezed(field, at), high
+
+    def beyond(self, field: SignedDistance, pose: Transform, points: np.ndarray,
+               some: np.ndarray | None = None) -> bool:  # fmt: skip
+        """Whether a tool squeezes a column beyond DEEPEST; of one that squeezes none, whether it is inside.
+
+        Most columns are told by a distance or two; all is squeezed only where these do not say. Nodes never say: their
+        strain ends at MAX_COLUMN_STRAIN.
+
+        Args:
+            field: distance field of the tool.
+            pose: pose_body_from_tool, (4, 4).
+            points: points of the tool, in its frame, (N, 3) [m].
+            some: numbers of all columns that may be squeezed so far; None: found here.
+        """
+        some = self._which_may_be(field, pose, 0.0) if some is None else some
+        said = _said(grid_of(field), pose, self.columns.points, self.columns.inward, self.layer.thickness, some)
+        if said >= 0:
+            return said > 0
+        found = self.columns.squeezed(field, pose)
+        return self.strain(found) > DEEPEST if len(found.nodes.area) else self.inside(field, pose, points)
+
+    def _which_may_be(self, field: SignedDistance, pose: Transform, moved: float) -> np.ndarray:
+        """Numbers of all columns that a tool at its pose, or moved from it that far [m], may squeeze beyond DEEPEST."""
+        columns = self.columns
+        near = columns.near(field, pose, self.layer.edge_length + moved)
+        return _reached(grid_of(field), pose, columns.points, columns.inward, self.layer.thickness, near, moved)
 
     def _nearest(self, points: np.ndarray) -> np.ndarray:
         if self._tree is None:
@@ -103,9 +128,39 @@ class Deep:
         return mean / size if size > FACING * float(self.layer.vertex_areas[v].sum()) else None
 
 
-def _root(value: Callable[[float], float], low: float, high: float, accuracy: float) -> float:
-    """Where a falling function is 0 between two places, by bisection."""
-    while high - low > accuracy:
-        middle = 0.5 * (low + high)
-        low, high = (middle, high) if value(middle) > 0 else (low, middle)
-    return high
+@numba.njit(cache=True, nogil=True)
+def _reached(grid, pose, points, inward, thickness, near, moved):
+    """Those of `near` whose last tenth the tool may reach; half of it more is for what distances are off by."""
+    out, count = np.empty(len(near), np.int64), 0
+    for v in near:
+        t, ray = thickness[v], ray_of(pose, points, inward, v)
+        if distance_in_column(grid, ray, 0.5 * (1 + DEEPEST) * t) <= (1 - DEEPEST) * t + moved:
+            out[count] = v
+            count += 1
+    return out[:count]
+
+
+@numba.njit(cache=True, nogil=True)
+def _said(grid, pose, points, inward, thickness, some):
+    """What columns say without their neighbours: 1, one is squeezed beyond DEEPEST; 0, some, and none so far; or -1."""
+    touched, unsure, thickest = False, False, 0.0
+    for v in some:
+        thickest = max(thickest, thickness[v])
+    for n in range(len(some)):
+        v = some[n]
+        t, ray = thickness[v], ray_of(pose, points, inward, v)
+        above = distance_in_column(grid, ray, 0.0)
+        deep, share = depth_and_share(grid, ray, t, True)
+        touched = touched or (share == 1 and deep > 0)
+        if share * deep / t <= DEEPEST:
+            continue
+        if min(max(1 - above / (WALL * t), 0.0), 1.0) * deep / t <= DEEPEST:  # so only under skin out of its reach
+            least = clearances(grid, pose, points, inward, thickness, some[n : n + 1], t)[0][0]
+            if -least - max(-above, 0.0) <= LEAST_UNDER * WALL * thickest:
+                unsure = True
+                continue
+        if deep == t and distance_in_column(grid, ray, t + 1e-5) < distance_in_column(grid, ray, t):
+            unsure = True  # the tool comes through the core: it counts where its neighbours do
+            continue
+        return 1
+    return 0 if touched and not unsure else -1

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from stmpl_core import Simulator, Tool
+from stmpl_core.deep import DEEPEST
 from stmpl_core.methods import MomentNet, Winkler
 from stmpl_core.touch import APART, IN_CORE, NO_FORCE
 from tests.scenes import LENGTH, RADIUS, at, ball, box, capsule, limb, press, punch, touch_of, turn
@@ -83,3 +84,17 @@ def _ring(radius: float, thick: float) -> tuple[np.ndarray, np.ndarray]:
 
     mesh = trimesh.creation.torus(1e3 * radius, 1e3 * thick, 64, 24)
     return 1e-3 * np.asarray(mesh.vertices), np.asarray(mesh.faces)
+
+
+@pytest.mark.parametrize("name", TOOLS)
+def test_columns_alone_say_what_all_that_is_squeezed_says(sim: Simulator, name: str) -> None:
+    tool, half = TOOLS[name]
+    field, deep = sim.tools.field(tool), sim.history.toucher.deep
+    said = []
+    for depth in np.linspace(4e-3, 0.012, 17):
+        pose = at(RADIUS + half - depth, 0, LENGTH / 2)
+        squeeze = deep.columns.squeezed(field, pose)
+        beyond = deep.strain(squeeze) > DEEPEST if len(squeeze.nodes.area) else deep.inside(field, pose, tool.vertices)
+        said.append(deep.beyond(field, pose, tool.vertices))
+        assert said[-1] == beyond, f"{1e3 * depth:.1f} mm"
+    assert any(said) and not all(said)

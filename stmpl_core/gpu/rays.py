@@ -74,7 +74,7 @@ def along(grid: Grid, coefficients: wp.array(dtype=real), start: vec3, way: vec3
 
 @wp.func
 def clearance_of(grid: Grid, coefficients: wp.array(dtype=real), start: vec3, way: vec3, t: real, far: real):
-    """Least signed distance along a column and that at its skin [m]: stmpl_core.columns._clearances."""
+    """Least signed distance along a column and that at its skin [m]: stmpl_core.columns.clearances."""
     d = along(grid, coefficients, start, way, real(0.0))
     skin = d  # not as a tuple: Warp would not copy
     least = d
