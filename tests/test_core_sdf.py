@@ -90,6 +90,14 @@ def test_outside_the_grid_the_distance_is_a_continuous_lower_bound(sphere: Signe
     np.testing.assert_allclose(sphere.distance(high * (1 + 1e-9)), sphere.distance(high * (1 - 1e-9)), atol=1e-9)
 
 
+def test_distance_alone_is_that_which_comes_with_its_derivatives(sphere: SignedDistance) -> None:
+    low, high = sphere.bounds
+    points = np.random.default_rng(3).uniform(low - 5e-3, high + 5e-3, (500, 3))
+    alone = sphere.distance(points)
+    np.testing.assert_allclose(alone, sphere.distance_gradient_hessian(points)[0], rtol=0, atol=1e-15)
+    np.testing.assert_allclose(alone, sphere.distance_gradient(points)[0], rtol=0, atol=1e-15)
+
+
 def test_an_open_shell_still_has_an_inside() -> None:
     shell = trimesh.creation.icosphere(4, 0.01)
     shell.update_faces(shell.triangles_center[:, 2] < 0.008)
