@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from bags.frame import Frame
-from bags.provenance import allowance
+from bags.provenance import OTHER_PROCESSOR, allowance
 from bags.run import Run
 from stmpl_core.layer import SoftLayer
 from stmpl_core.methods.base import Method
@@ -137,7 +137,7 @@ def replay_run(
         method: method that answers.
         every: step from frame to frame; 1 takes each.
         tolerance: largest difference that is allowed [m]; None: exact where this processor recorded the run,
-            provenance.OTHER_PROCESSOR where another did.
+            provenance.OTHER_PROCESSOR where another did, or where /tf says where its poses are.
 
     Raises:
         BagError: the bag lacks answers, the layer, or a tool's mesh or pose.
@@ -145,12 +145,14 @@ def replay_run(
     run = run if isinstance(run, Run) else Run(run)
     then, now = run.provenance.versions, versions()
     allowed, reason = allowance(run.provenance.processor, now["processor"])
+    if not allowed and (frames := run.placed_by_tf):
+        allowed, reason = OTHER_PROCESSOR, f"/tf placed its poses ('{"', '".join(frames)}'), and tf2 rounds otherwise"
     if tolerance is not None:
         allowed, reason = tolerance, "this tolerance was asked for"
-    frames = remembering = identical = 0
+    many = remembering = identical = 0
     worst, first = 0.0, None
     for replayed in replay(run, method, every=every):
-        frames += 1
+        many += 1
         remembering += bool(replayed.frame.state)
         identical += replayed.identical
         difference = 0.0 if replayed.identical else replayed.difference
@@ -158,4 +160,4 @@ def replay_run(
         if not replayed.identical and not (allowed and difference <= allowed) and first is None:
             first = replayed.frame.sequence
     changed = tuple(f"{k} {then[k]} -> {now.get(k, 'none')}" for k in then if now.get(k) != then[k])
-    return ReplaySummary(method.name, frames, remembering, identical, worst, allowed, reason, first, changed)
+    return ReplaySummary(method.name, many, remembering, identical, worst, allowed, reason, first, changed)

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import cached_property
 from pathlib import Path
 from typing import Any, Self
 
 from mcap.records import Message
 
 from bags.frame import Frame
+from bags.moving import TF, TF_STATIC, FramesAt, MovingFrames
 from bags.reader import DISPLACEMENT, Bag, ends, tool_topic
 from bags.records import Place
 from bags.wire import contact_from, frame_from, stamp_ns
@@ -40,6 +42,7 @@ class Run(Bag):
         self.received: dict[int, int] = {}
         self.pose_stamps: set[int] = set()
         self._sent: dict[tuple[str, str], dict[int, Message]] = {}  # by tool and kind, then stamp
+        self._frame_ids: set[tuple[str, str]] = set()  # tools, and frames of their poses and wrenches
         self._on_answer, self._answering = on_answer, ""
         super().__init__(path, namespace)
 
@@ -47,7 +50,9 @@ class Run(Bag):
         """Keeps poses and wrenches, and hands on the answers."""
         super().see(topic, record, place)
         if contact := tool_topic(topic):
-            stamp = stamp_ns(self.decode(record))
+            message = self.decode(record)
+            stamp = stamp_ns(message)
+            self._frame_ids.add((contact[0], message.header.frame_id))
             self._sent.setdefault(contact, {})[stamp] = record
             self.received[stamp] = max(self.received.get(stamp, 0), record.log_time)
             if contact[1] == "pose":
@@ -62,7 +67,7 @@ class Run(Bag):
         """The contacts that `frame` answers: of each of its tools the pose and the wrench that it names.
 
         Raises:
-            BagError: a pose, a wrench or a mesh that it answers is not in the bag, or in a frame of /tf.
+            BagError: a pose, a wrench or a mesh that it answers is not in the bag, or its /tf does not cover it.
         """
         return [self._contact(tool, *stamps) for tool, stamps in frame.inputs.items()]
 
@@ -74,14 +79,31 @@ class Run(Bag):
         if known is None or lacks:
             raise BagError(f"an answer to tool {tool} at {posed * NANO:.3f} s cannot be repeated: "
                            f"the bag has no {' and no '.join(lacks)} for it.")
-        frames = self.provenance.frames
         try:
-            return contact_from(known, pose, wrench, body_frame=self.body_frame, frames=frames)
+            return contact_from(known, pose, wrench, body_frame=self.body_frame, frames=self._frames_at(posed),
+                                wrench_frames=self._frames_at(pushed))  # fmt: skip
         except FrameError as error:
-            raise BagError(f"an answer to tool {tool} at {posed * NANO:.3f} s cannot be repeated offline: "
-                           f"{str(error).partition('. ')[0].rstrip('.')}. A recording carries the table of "
-                           "stmpl record --frames; what /tf said, only a node finds out: stmpl replay --publish "
-                           "sends it one.") from error  # fmt: skip
+            raise BagError(f"an answer to tool {tool} at {posed * NANO:.3f} s cannot be repeated offline: {error}. A "
+                           "recording carries what came on /tf while stmpl record ran, and the table of its --frames; "
+                           "stmpl replay --publish sends the poses to a node.") from error  # fmt: skip
+
+    @cached_property
+    def moving(self) -> MovingFrames:
+        """Frames of the recorded /tf, read when they are first asked for."""
+        found = MovingFrames()
+        for topic, message, _ in self.messages(lambda name: name in (TF, TF_STATIC)):
+            found.hear(message, still=topic == TF_STATIC)
+        return found
+
+    @property
+    def placed_by_tf(self) -> list[str]:
+        """Frames of poses and wrenches that only /tf knows."""
+        known = {self.body_frame, *self.provenance.frames}
+        return sorted({frame for tool, frame in self._frame_ids if frame not in known and frame != tool})
+
+    def _frames_at(self, stamp: int) -> FramesAt:
+        body = self.body_frame
+        return FramesAt(body, self.provenance.frames, lambda frame: self.moving.place(body, frame, stamp))
 
     def _told_at(self, tool: str, kind: str, stamp: int) -> Any | None:
         record = self._sent.get((tool, kind), {}).get(stamp)

@@ -85,7 +85,12 @@ def pose_from(pose: Any) -> Transform:
         InvalidInput: numbers that are not finite, or the quaternion is no unit quaternion.
     """
     p, q = pose.position, pose.orientation
-    xyzw = np.array([q.x, q.y, q.z, q.w], dtype=np.float64)
+    return rigid((p.x, p.y, p.z), (q.x, q.y, q.z, q.w))
+
+
+def rigid(place: Sequence[float], quaternion: Sequence[float]) -> Transform:
+    """Rigid transform (4, 4) of a place [m] and a quaternion x y z w. Raises as `pose_from`."""
+    xyzw = np.array(quaternion, dtype=np.float64)
     length = float(np.sqrt(xyzw @ xyzw))
     if not abs(length - 1) <= QUATERNION_TOLERANCE:
         raise InvalidInput(f"quaternion {xyzw.tolist()} has length {length:g}; it must be 1 (no turn: 0, 0, 0, 1).")
@@ -96,7 +101,7 @@ def pose_from(pose: Any) -> Transform:
         [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
         [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
     ]
-    transform[:3, 3] = p.x, p.y, p.z
+    transform[:3, 3] = place
     return transform
 
 
@@ -171,9 +176,13 @@ def joints_from(message: Any, names: Mapping[str, str]) -> dict[str, float]:
 
 
 def contact_from(
-    tool: Tool, pose: Any, wrench: Any | None, *, body_frame: str, frames: FixedFrames = NO_FRAMES
-) -> Contact:
+    tool: Tool, pose: Any, wrench: Any | None, *, body_frame: str, frames: FixedFrames = NO_FRAMES,
+    wrench_frames: FixedFrames | None = None,
+) -> Contact:  # fmt: skip
     """One tool at one instant, from its PoseStamped and, where there is a force sensor, its WrenchStamped.
+
+    Args:
+        wrench_frames: frames at the wrench's stamp; None: as at the pose's.
 
     Raises:
         FrameError: pose or wrench in a frame that is not known.
@@ -182,7 +191,8 @@ def contact_from(
     at, time = pose_of_tool(pose, tool.name, body_frame, frames), stamp_ns(pose) / NANO
     if wrench is None:
         return Contact(tool, at, time=time)
-    values = wrench_from(wrench, body_frame=body_frame, tool=tool.name, pose_body_from_tool=at, frames=frames)
+    values = wrench_from(wrench, body_frame=body_frame, tool=tool.name, pose_body_from_tool=at,
+                         frames=frames if wrench_frames is None else wrench_frames)  # fmt: skip
     return Contact(tool, at, values, time)
 
 

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from importlib.util import find_spec
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -13,7 +12,8 @@ from geometry_msgs.msg import Point, Pose
 from rclpy.clock_type import ClockType
 from rclpy.time import Time
 
-from bags.wire import pose_from
+from bags.moving import FramesAt
+from bags.wire import pose_from, rigid
 from stmpl_core.arrays import Transform
 from stmpl_core.errors import InvalidInput, StmplError
 
@@ -44,7 +44,13 @@ class Frames:
 
     def at(self, stamp: int) -> FramesAt:
         """Where the frames stand at a stamp [ns]; 0: where /tf had them last."""
-        return FramesAt(self, stamp)
+
+        def look(frame: str) -> Transform:
+            if not self.moves(frame):
+                raise KeyError(frame)
+            return pose_from(self.place(frame, stamp))
+
+        return FramesAt(self.body, self.table, look)
 
     def moves(self, frame: str) -> bool:
         """Whether a frame is one of /tf."""
@@ -76,26 +82,6 @@ class Frames:
         return Pose(position=Point(x=at.x, y=at.y, z=at.z), orientation=moved.rotation)
 
 
-class FramesAt(Mapping[str, Transform]):
-    """pose_body_from_frame, (4, 4), by the name of the frame, at one stamp."""
-
-    def __init__(self, frames: Frames, stamp: int) -> None:
-        self._frames, self._stamp = frames, stamp
-
-    def __getitem__(self, frame: str) -> Transform:
-        if frame == self._frames.body:
-            return np.eye(4)
-        if not self._frames.moves(frame):
-            return self._frames.table[frame]
-        return pose_from(self._frames.place(frame, self._stamp))
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self._frames.table)
-
-    def __len__(self) -> int:
-        return len(self._frames.table)
-
-
 def _time(stamp: int) -> Time:
     return Time(nanoseconds=stamp, clock_type=ClockType.ROS_TIME)
 
@@ -119,11 +105,8 @@ def _placed(path: str, name: str, given: Any) -> Transform:
     try:
         if not isinstance(given, dict) or given.keys() - {"position", "orientation"}:
             raise ValueError(f"it is {given!r}")
-        position = dict(zip("xyz", (float(v) for v in given.get("position", (0, 0, 0))), strict=True))
-        orientation = dict(zip("xyzw", (float(v) for v in given.get("orientation", (0, 0, 0, 1))), strict=True))
-        pose = pose_from(
-            SimpleNamespace(position=SimpleNamespace(**position), orientation=SimpleNamespace(**orientation))
-        )
+        place, turn = given.get("position", (0, 0, 0)), given.get("orientation", (0, 0, 0, 1))
+        pose = rigid([float(v) for v in place], [float(v) for v in turn])
         if not np.isfinite(pose).all():
             raise ValueError("it is not finite")
         return pose

@@ -18,6 +18,7 @@ from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
 from rclpy.utilities import ok
 
+from bags.moving import TF, TF_STATIC
 from bags.provenance import write_provenance
 from bags.schema import find_schema
 from bags.wire import message_class
@@ -34,7 +35,7 @@ WANTED = re.compile(
     r"(contact_mesh|skin/topology|skin/displacement|tools/\w+/(pose|wrench)|wrist/wrench|joint_states)$"
     r"|^/(diagnostics|tf|tf_static)$"
 )
-EVERYBODYS = ("/diagnostics", "/tf", "/tf_static")  # topics of no namespace that belong to a run
+EVERYBODYS = ("/diagnostics", TF, TF_STATIC)  # topics of no namespace that belong to a run
 PLACED = re.compile(r"(skin/topology|tools/(\w+)/(?:pose|wrench))$")  # topics whose frame_id says where things are
 IF_HEARD = re.compile(r"tools/\w+/local_contact$")  # recorded only once a device listens: it costs the node work
 FOREVER = 1e9  # lease of a sender that never tells that it is there, at least [s]
@@ -117,7 +118,9 @@ class RecorderNode(Node):
         self.get_logger().info(f"recording {topic} ({type_name})")
 
     def foreign(self, frames: Mapping[str, Any]) -> Iterator[str]:
-        """What a replay cannot place, a sentence each: poses and wrenches in frames that are not in the table."""
+        """What a replay cannot place, a sentence each: poses and wrenches in frames of a /tf that was not recorded."""
+        if {TF, TF_STATIC} & self._channels.keys():
+            return
         topology = {topic.removesuffix("skin/topology"): frame for topic, frame in self._placed
                     if topic.endswith("skin/topology")}  # fmt: skip
         for topic, frame in sorted(self._placed):
@@ -125,8 +128,9 @@ class RecorderNode(Node):
             assert found
             body = topology.get(topic[: found.start()])
             if body is not None and frame not in (body, found[2], *frames):
-                yield (f"{topic} came in frame '{frame}', which is neither '{body}' nor in --frames: these contacts "
-                       "are not replayed offline, only to a node that hears /tf (stmpl replay --publish)")  # fmt: skip
+                yield (f"{topic} came in frame '{frame}', which is neither '{body}' nor in --frames, and no /tf was "
+                       "recorded: these contacts are not replayed offline, only to a node that hears /tf (stmpl replay "
+                       "--publish)")  # fmt: skip
 
     def _on_lost(self, status: Any) -> None:
         self._count_lost(status.total_count_change, "lost on the way")

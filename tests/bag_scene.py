@@ -26,11 +26,13 @@ TYPES = {
     "wrench": "geometry_msgs/msg/WrenchStamped",
     "topology": "stmpl_msgs/msg/SkinTopology",
     "displacement": "stmpl_msgs/msg/SkinDisplacement",
+    "tf": "tf2_msgs/msg/TFMessage",
 }
 STORE = typestore_of([(s.name, s.text) for s in map(find_schema, TYPES.values())])
 ANGLES = {"ball": 0.3, "finger": 0.3 + 2.2}  # rad around the tube
 START = 1_700_000_000_000_000_000  # ns
 TURNED = np.array([[0.8, -0.6, 0, 0], [0.6, 0.8, 0, 0], [0, 0, 1, 0.01], [0, 0, 0, 1]])  # pose_body_from_frame
+STANDS = np.array([[1, 0, 0, 0.5], [0, 0.8, -0.6, 0.2], [0, 0.6, 0.8, 0.9], [0, 0, 0, 1]])  # pose_world_from_body
 
 
 def message(kind: str, **values: Any) -> Any:
@@ -128,6 +130,32 @@ def touched(touch: Touch, stamp: int) -> Any:
                    passive=touch.passive)  # fmt: skip
 
 
+def going(stamp: int) -> np.ndarray:
+    """pose_body_from_frame (4, 4) of a frame that turns about the tube and goes along it, at TURNED at the start."""
+    seconds = (stamp - START) * 1e-9
+    pose, angle = TURNED.copy(), 1.5 * seconds
+    pose[:2, :2] = TURNED[:2, :2] @ [[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]
+    pose[2, 3] += 0.05 * seconds
+    return pose
+
+
+def transform(parent: str, child: str, pose: np.ndarray, stamp: int) -> Any:
+    """A TFMessage of one frame in its parent."""
+    place = message("geometry_msgs/msg/Vector3", **dict(zip("xyz", pose[:3, 3], strict=True)))
+    turn = message("geometry_msgs/msg/Quaternion", **dict(zip("xyzw", quaternion_from(pose[:3, :3]), strict=True)))
+    placed = message("geometry_msgs/msg/Transform", translation=place, rotation=turn)
+    return message("tf", transforms=[message("geometry_msgs/msg/TransformStamped", header=header(parent, stamp),
+                                             child_frame_id=child, transform=placed)])  # fmt: skip
+
+
+def write_tf(bag: BagWriter, child: str, since: int, until: int) -> None:
+    """The body stands still in the world; a frame goes there, told at 30 Hz between two stamps [ns]."""
+    still, moving = (bag.add_channel(topic, TYPES["tf"], qos_yaml()) for topic in ("/tf_static", "/tf"))
+    bag.write(still, cdr(transform("world", "body", STANDS, START)), START, START)
+    for stamp in range(since, until, 33_000_000):
+        bag.write(moving, cdr(transform("world", child, STANDS @ going(stamp), stamp)), stamp, stamp)
+
+
 def six(values: np.ndarray) -> Any:
     """A wrench, (6,) [N, N m], as geometry_msgs/Wrench."""
     force, torque = (message("geometry_msgs/msg/Vector3", **dict(zip("xyz", part, strict=True)))
@@ -137,13 +165,15 @@ def six(values: np.ndarray) -> Any:
 
 def write_run(folder: Path, method: Method, *, layer: SoftLayer | None = None, frames: int = 40, rate: float = 100.0,
               lose: tuple[int, ...] = (), skip: tuple[int, ...] = (), delay: float = 0.002,
-              namespace: str = "/stmpl", frame: str = "body", table: bool = True) -> Path:  # fmt: skip
+              namespace: str = "/stmpl", frame: str = "body", table: bool = True,
+              tf: tuple[int, int] | None = None) -> Path:  # fmt: skip
     """Records a ball that presses and slides, joined in the last third by a second one; returns the folder.
 
     Frames in `lose` are answered but not recorded, those in `skip` are not answered at all. Poses come in `frame`,
     which if it is not the body's stands at TURNED; the recording says so if it carries a `table`, else only /tf did.
+    With `tf` it is `going`, and /tf between these stamps [ns] is recorded.
     """
-    known_frames = {} if frame == "body" else {frame: TURNED}
+    known_frames = {} if frame == "body" or tf else {frame: TURNED}
     layer = layer or tube()
     simulator, (vertices, triangles) = Simulator(layer, method), ball()
     with BagWriter(folder) as bag:
@@ -156,6 +186,8 @@ def write_run(folder: Path, method: Method, *, layer: SoftLayer | None = None, f
         tools = {(tool, kind): bag.add_channel(f"{namespace}/tools/{tool}/{kind}", TYPES[kind], stream)
                  for tool in ANGLES for kind in ("pose", "wrench")}  # fmt: skip
         bag.write(skin, cdr(topology(layer)), START, START)
+        if tf:
+            write_tf(bag, frame, *tf)
         known = {}
         for tool in ANGLES:
             sent = message("mesh", header=header(tool, START), vertices=vertices.ravel(), triangles=triangles.ravel())
@@ -171,7 +203,8 @@ def write_run(folder: Path, method: Method, *, layer: SoftLayer | None = None, f
                 instant[0].header.frame_id = frame
                 for kind, made in zip(("pose", "wrench"), instant, strict=True):
                     bag.write(tools[tool, kind], cdr(made), stamp + 100_000, stamp)
-                contacts.append(contact_from(known[tool], *instant, body_frame="body", frames=known_frames))
+                frames_now = {frame: going(stamp)} if tf else known_frames
+                contacts.append(contact_from(known[tool], *instant, body_frame="body", frames=frames_now))
             if k in skip:
                 continue
             answer = simulator.step(contacts)

@@ -25,7 +25,7 @@ from stmpl_core.provenance import processor
 from stmpl_core.touch import Answer
 from stmpl_core.trust import Displacement, Trust
 from stmpl_ros.view.recording import Recording
-from tests.bag_scene import stmpl, tube, write_run
+from tests.bag_scene import START, stmpl, tube, write_run
 
 LOST, SKIPPED, DELAY = (5, 6, 20), (10, 11), 0.003
 
@@ -61,16 +61,31 @@ def test_a_replay_repeats_the_run_bit_for_bit(run):
     assert "every one bit for bit" in str(replayed)
 
 
-def test_poses_in_a_frame_that_the_recording_carries_are_replayed_and_those_of_tf_are_refused(tmp_path, capsys):
+def test_poses_in_a_frame_that_moves_are_replayed_where_tf_was_recorded_around_their_stamps(tmp_path, capsys):
+    last = START + 240 * 10**6
+    whole = write_run(tmp_path / "whole", Winkler(), frames=24, frame="base", tf=(START - 10**7, last + 10**8))
+    replayed = replay_run(whole, Winkler())
+    assert replayed.frames == 24 and replayed.worst < 1e-10 and replayed.passed
+    assert "/tf placed its poses ('base')" in str(replayed)
+    comparison = compare_run(whole, Winkler(), method=Winkler(), frames=4)
+    assert not comparison.failed and comparison.worst_under_contact < 1e-9
+    code, said = stmpl(capsys, "replay", write_run(tmp_path / "part", Winkler(), frames=24, frame="base",
+                                                   tf=(START, START + 10**8)))  # fmt: skip
+    assert code == 1 and "/tf does not say where 'base' was at" in said
+    assert f"'base' was told from {START * 1e-9:.3f} to {START * 1e-9 + 0.099:.3f} s" in said
+
+
+def test_poses_in_a_frame_that_the_recording_carries_are_replayed_and_of_an_unknown_one_refused(tmp_path, capsys):
     told = write_run(tmp_path / "told", Winkler(), frames=6, frame="base")
     assert replay_run(told, Winkler()).identical == 6
     by_tf = write_run(tmp_path / "by_tf", Winkler(), frames=6, frame="base", table=False)
     code, said = stmpl(capsys, "replay", by_tf)
     assert code == 1
-    assert "cannot be repeated offline: the pose of ball is in frame 'base'; known are 'body'." in said
+    assert "cannot be repeated offline: /tf does not say where 'base' was at" in said
+    assert "nothing joins it to 'body'" in said
     assert "stmpl replay --publish" in said and "Traceback" not in said
     comparison = compare_run(by_tf, Winkler(), method=Winkler(), frames=2)
-    assert not comparison.judged and all("frame 'base'" in why for why in comparison.failed.values())
+    assert not comparison.judged and all("'base'" in why for why in comparison.failed.values())
     assert len(Recording.of(by_tf, frames=6).snapshots) == 6, "what was answered is shown all the same"
 
 

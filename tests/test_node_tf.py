@@ -16,11 +16,24 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import PoseStamped, TransformStamped, WrenchStamped
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.parameter import Parameter
+from rclpy.time import Time
 from rosgraph_msgs.msg import Clock
+from scipy.spatial.transform import Rotation
 from stmpl_msgs.msg import ContactMesh, SkinDisplacement
 
-from bags.wire import NANO, header, pose_from, pose_message, stamp_ns, tool_message, wrench_from, wrench_message
-from stmpl_core.errors import InvalidInput
+from bags.moving import MovingFrames
+from bags.wire import (
+    NANO,
+    header,
+    pose_from,
+    pose_message,
+    rigid,
+    stamp_ns,
+    tool_message,
+    wrench_from,
+    wrench_message,
+)
+from stmpl_core.errors import FrameError, InvalidInput
 from stmpl_ros.frames import Frames
 from stmpl_ros.node import SkinNode
 from stmpl_ros.parameters import NodeConfig
@@ -130,6 +143,33 @@ def test_a_pose_in_a_moving_frame_is_where_that_was_at_its_stamp(scene):
     scene.wait(lambda: scene.node.hearing.inbox.pose_of("finger") is not None)
     np.testing.assert_allclose(scene.node.hearing.inbox.pose_of("finger"), HERE, atol=1e-7)
     assert scene.node.tally.refused == 0
+
+
+def test_a_replay_finds_frames_where_a_node_does():
+    """A tree of moving frames, one beside the other and one on the other, and one that stands still."""
+    rng, hears, plays = np.random.default_rng(5), tf2_stand_in.Buffer(), MovingFrames()
+    if find_spec("tf2_ros"):
+        from tf2_ros import Buffer
+
+        hears = Buffer()
+    for parent, child, stamps in (("world", "body", range(0, 900, 90)), ("world", "arm", range(5, 900, 31)),
+                                  ("arm", "hand", range(0, 900, 45)), ("hand", "camera", [0])):  # fmt: skip
+        for stamp in stamps:
+            place = np.eye(4)
+            place[:3, :3], place[:3, 3] = Rotation.random(random_state=rng).as_matrix(), rng.normal(size=3)
+            sent, still = told(parent, child, place, NANO + stamp * MS), child == "camera"
+            (hears.set_transform_static if still else hears.set_transform)(sent, "test")
+            plays.hear(SimpleNamespace(transforms=[sent]), still=still)
+    for body, frame in (("body", "camera"), ("world", "hand"), ("camera", "arm"), ("hand", "camera")):
+        for stamp in NANO + MS * np.array([90, 222, 333, 500, 801]):
+            found = hears.lookup_transform(body, frame, Time(nanoseconds=int(stamp))).transform
+            t, q = found.translation, found.rotation
+            np.testing.assert_allclose(plays.place(body, frame, int(stamp)),
+                                       rigid((t.x, t.y, t.z), (q.x, q.y, q.z, q.w)), atol=1e-9)  # fmt: skip
+    with pytest.raises(FrameError, match=r"'camera' was at 1\.950 s: 'arm' was told from 1\.005 to 1\.873 s"):
+        plays.place("world", "camera", NANO + 950 * MS)
+    with pytest.raises(FrameError, match="nothing joins it to 'body'"):
+        plays.place("body", "elsewhere", NANO + 100 * MS)
 
 
 def test_a_dead_tf_is_told_within_a_fifth_of_a_second_and_its_poses_are_not_answered(scene):
