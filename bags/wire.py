@@ -22,7 +22,7 @@ from stmpl_core.contact import Contact
 from stmpl_core.errors import BagError, FrameError, InvalidInput, MeshError
 from stmpl_core.layer import MAX_EXTENT, SoftLayer, layer_id
 from stmpl_core.local_contact import Grip, LocalContact
-from stmpl_core.packed import layer_stack_from_text, layer_stack_to_text
+from stmpl_core.packed import stack_from_text, stack_to_text
 from stmpl_core.rig import Rig
 from stmpl_core.state import State
 from stmpl_core.tissue import Tissue
@@ -53,7 +53,7 @@ def layer_from(topology: Any) -> SoftLayer:
     tissue, scale = Tissue(topology.youngs_modulus, topology.poisson_ratio, topology.density), None
     if stack := getattr(topology, "stack", ""):  # recordings from before stacks have none
         try:
-            tissue, scale = layer_stack_from_text(stack)
+            tissue, scale = stack_from_text(stack)
         except (KeyError, TypeError, ValueError, AttributeError) as error:
             raise InvalidInput(f"the stack of a SkinTopology cannot be read: {error}.") from error
     vertices, triangles = _rows("vertices", topology.vertices), _rows("triangles", topology.triangles)
@@ -386,7 +386,7 @@ def topology_message(layer: SoftLayer, body_frame: str, stamp_ns: int) -> Any:
         poisson_ratio=float(layer.tissue.poisson_ratio),
         density=float(layer.tissue.density),
         core=floats([] if layer.core is None else layer.core),
-        stack=layer_stack_to_text(layer) if more else "",
+        stack=stack_to_text(layer.tissue, layer.ply_scale) if more else "",
         rig="" if layer.rig is None else layer.rig.to_text(),
         rig_weights=floats([] if layer.rig is None else layer.rig.weights),
     )

@@ -45,6 +45,15 @@ class Sample(NamedTuple):
     displacement: VertexVectors  # (V, 3) [m]
     info: dict[str, Any]
 
+    @classmethod
+    def of(cls, layer: SoftLayer, info: dict[str, Any], loaded: np.ndarray, values: np.ndarray, moved: np.ndarray,
+           steps: np.ndarray) -> Self:  # fmt: skip
+        """The sample of what a Record holds."""
+        load, displacement = np.zeros(len(layer.vertices)), np.zeros_like(layer.vertices)
+        load[loaded] = values * layer.tissue.youngs_modulus
+        displacement[moved] = steps * QUANTUM
+        return cls(layer, Load(LOADS[info["kind"]], load), displacement, info)
+
 
 @dataclass(frozen=True, eq=False)
 class Record:
@@ -179,12 +188,9 @@ class _BodyStore:
                 **{name: float(table[name][k]) for name in FIGURES}}  # fmt: skip
 
     def sample(self, k: int) -> Sample:
-        layer, info = self.layer, self.info(k)
         (a, b), (c, d) = (self.table[f"{name}_ends"][k : k + 2] for name in ("loaded", "moved"))
-        values, displacement = np.zeros(len(layer.vertices)), np.zeros_like(layer.vertices)
-        values[self.rows["loaded"][a:b]] = self.rows["values"][a:b] * layer.tissue.youngs_modulus
-        displacement[self.rows["moved"][c:d]] = self.rows["steps"][c:d] * QUANTUM
-        return Sample(layer, Load(LOADS[info["kind"]], values), displacement, info)
+        rows = (self.rows["loaded"][a:b], self.rows["values"][a:b], self.rows["moved"][c:d], self.rows["steps"][c:d])
+        return Sample.of(self.layer, self.info(k), *rows)
 
 
 class Subset:

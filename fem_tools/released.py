@@ -14,11 +14,10 @@ from typing import Any
 import numpy as np
 
 from fem_tools.contact_job import Part
-from fem_tools.dataset import FIGURES, LOADS, QUANTUM, Record, Sample
+from fem_tools.dataset import FIGURES, QUANTUM, Record, Sample
 from fem_tools.sampling import ContactId, Plan
 from stmpl_core.errors import InvalidInput
 from stmpl_core.layer import SoftLayer
-from stmpl_core.load import Load
 from stmpl_core.packed import pack, unpack
 
 FORMAT = 1
@@ -130,9 +129,6 @@ class Released:
         for contact, part in self.parts():
             layer = self.layers[contact.body]
             for record in part.records if split in (None, part.about["split"]) else ():
-                values, displacement = np.zeros(len(layer.vertices)), np.zeros_like(layer.vertices)
-                values[record.loaded] = record.values * layer.tissue.youngs_modulus
-                displacement[record.moved] = record.steps * QUANTUM
                 info = {"body": contact.body, "kind": record.kind, **part.about,
                         **dict(zip(FIGURES, record.figures, strict=True))}  # fmt: skip
-                yield Sample(layer, Load(LOADS[record.kind], values), displacement, info)
+                yield Sample.of(layer, info, record.loaded, record.values, record.moved, record.steps)

@@ -128,7 +128,7 @@ def read_model(path: str | Path) -> Model:
     try:
         given = json.loads(Path(path).read_text())
         friction = given.get("friction")
-        return Model(stack_from_text(json.dumps(given["tissue"])), float(given["thickness"]),
+        return Model(stack_from_text(json.dumps(given["tissue"]))[0], float(given["thickness"]),
                      None if friction is None else str(friction), bool(given.get("relaxing", False)))  # fmt: skip
     except OSError as error:
         raise InvalidInput(f"there is no tissue in {path}: {error.strerror}. stmpl needs --out writes one.") from error

@@ -33,9 +33,15 @@ def pack(layer: SoftLayer) -> dict[str, np.ndarray]:
     return arrays
 
 
-def stack_to_text(tissue: Tissue) -> str:
-    """A tissue as JSON. A series that is not there is not written: elastic tissues read as they always did."""
-    return json.dumps(_plain(asdict(tissue)))
+def stack_to_text(tissue: Tissue, ply_scale: np.ndarray | None = None) -> str:
+    """A tissue as JSON, with a layer's ply_scale if that is given, the factors as float32.
+
+    A series that is not there is not written: elastic tissues read as they always did.
+    """
+    given = _plain(asdict(tissue))
+    if ply_scale is not None:
+        given["ply_scale"] = [float(f"{x:.9g}") for x in ply_scale.astype(np.float32)]
+    return json.dumps(given)
 
 
 def _plain(values: dict[str, Any]) -> dict[str, Any]:
@@ -47,35 +53,19 @@ def _plain(values: dict[str, Any]) -> dict[str, Any]:
     return out
 
 
-def layer_stack_to_text(layer: SoftLayer) -> str:
-    """Tissue and ply_scale of a layer as JSON; the factors as float32."""
-    given = _plain(asdict(layer.tissue))
-    if layer.ply_scale is not None:
-        given["ply_scale"] = [float(f"{x:.9g}") for x in layer.ply_scale.astype(np.float32)]
-    return json.dumps(given)
-
-
-def layer_stack_from_text(text: str) -> tuple[Tissue, np.ndarray | None]:
-    """Tissue and ply_scale, (V,) or None, of such JSON. Raises what `stack_from_text` raises."""
-    given = json.loads(text)
-    scale = given.pop("ply_scale", None)
-    return _stack(given), None if scale is None else np.array(scale, np.float32).astype(float)
-
-
-def stack_from_text(text: str) -> Tissue:
-    """The tissue of such JSON.
+def stack_from_text(text: str) -> tuple[Tissue, np.ndarray | None]:
+    """Tissue and ply_scale, (V,) or None, of such JSON.
 
     Raises:
         KeyError, TypeError, ValueError: text of another kind.
         InvalidInput: numbers that are no tissue's.
     """
-    return _stack(json.loads(text))
-
-
-def _stack(given: dict[str, Any]) -> Tissue:
+    given = json.loads(text)
+    scale = given.pop("ply_scale", None)
     skin, deeper = given.pop("skin"), given.pop("deeper")
     membrane = Membrane(**_with_series(skin)) if skin else None
-    return Tissue(**_with_series(given), skin=membrane, deeper=tuple(Ply(**_with_series(one)) for one in deeper))
+    tissue = Tissue(**_with_series(given), skin=membrane, deeper=tuple(Ply(**_with_series(one)) for one in deeper))
+    return tissue, None if scale is None else np.array(scale, np.float32).astype(float)
 
 
 def _with_series(values: dict[str, Any]) -> dict[str, Any]:
@@ -92,7 +82,7 @@ def unpack(arrays: Mapping[str, np.ndarray]) -> SoftLayer:
         InvalidInput, MeshError: arrays that are no layer.
     """
     if "stack" in arrays:
-        tissue = stack_from_text(np.asarray(arrays["stack"], np.uint8).tobytes().decode())
+        tissue, _ = stack_from_text(np.asarray(arrays["stack"], np.uint8).tobytes().decode())
     else:
         modulus, ratio, density = (float(x) for x in arrays["tissue"])
         tissue = Tissue(modulus, ratio, density)
