@@ -20,11 +20,10 @@ from rclpy.utilities import ok
 from bags.wire import NANO, pose_from, stamp_ns, wrench_message
 from stmpl_core.arrays import Points, Transform, Wrench
 from stmpl_core.errors import InvalidInput, StmplError
-from stmpl_core.layer import SoftLayer
 from stmpl_core.tool import Tool
 from stmpl_ros.diagnosis import Tally
 from stmpl_ros.gate import Gate
-from stmpl_ros.making import Build, friction_of, layer_of
+from stmpl_ros.making import Build, faded, friction_of, layer_of
 from stmpl_ros.parameters import LinksConfig
 from stmpl_ros.sending import LAST_WORD_S
 from stmpl_ros.settings import checked
@@ -296,8 +295,8 @@ def run(config: LinksConfig, arguments: Sequence[str] | None = None, build: Buil
     Raises:
         InvalidInput: settings that cannot be, a file that cannot be read, or a package that is missing.
     """
-    settings = checked(config.model_dump(include={"part", "tissue", "edge_length", "friction"}))
-    layer: SoftLayer = build(settings)
+    settings = checked(config.model_dump(include={"part", "tissue", "edge_length", "friction", "relaxing"}))
+    layer = faded(build(settings), settings)
     contact = SoftContact(layer, tools or tools_of(config.tools), settings.new_method(), damping=config.damping,
                           friction=friction_of(settings))  # fmt: skip
     with ros(list(arguments or ())) as stop:

@@ -105,9 +105,12 @@ def at_once(config: NodeConfig, build: Build) -> bool:
 
 def skin_of(config: NodeConfig, build: Build = layer_of) -> Skin:
     """Skin that the settings ask for. Raises InvalidInput or MeshError."""
-    layer = build(config)
-    fades = config.relaxing and not layer.tissue.relaxes  # a file of stmpl needs has a series of its own
-    return Skin.of(published(held_skin(layer) if fades else layer), config.new_method())
+    return Skin.of(published(faded(build(config), config)), config.new_method())
+
+
+def faded(layer: SoftLayer, config: NodeConfig) -> SoftLayer:
+    """The layer, which relaxes if the settings ask for it: as held skin, or by a series of its own."""
+    return held_skin(layer) if config.relaxing and not layer.tissue.relaxes else layer
 
 
 def restiffened(skin: Skin, config: NodeConfig, changed: set[str]) -> Skin | None:

@@ -329,6 +329,7 @@ class LinksConfig(BaseModel):
         description="coefficient of friction, or dry, moist, oiled, glove, typical, or none; empty: as a file of stmpl "
         "needs says, else none",
     )
+    relaxing: bool = Field(default=False, description="stress that fades, as in skin that was stretched and held")
     silence: float = Field(
         default=0.25, gt=0, description="time without a pose after which every wrench is set to nothing [s]"
     )
