@@ -97,13 +97,16 @@ def test_a_node_that_is_not_to_start_by_itself_waits_to_be_configured(installed,
     assert code == 0 and "process has finished cleanly" in said, said
 
 
-def test_the_demo_ends_by_itself_once_the_devices_have_pressed(installed, robot):
-    robot.partner = launched(installed, "demo.launch.py", "namespace:=/launched", "rate:=50")
-    robot.wait(lambda: any(answer.touches for answer in robot.got["skin/displacement"]), "an answer to the devices")
+@pytest.mark.parametrize("device", ["probe", "robot"])
+def test_the_demo_ends_by_itself_once_its_device_has_pressed(installed, robot, device):
+    if device == "robot":
+        pytest.importorskip("mujoco")
+    robot.partner = launched(installed, "demo.launch.py", "namespace:=/launched", "rate:=50", f"device:={device}")
+    robot.wait(lambda: any(answer.touches for answer in robot.got["skin/displacement"]), "an answer to the device")
     code, said = end(robot.partner)
     assert code == 0 and said.count("process has finished cleanly") == 2, said
 
 
 def test_a_demo_whose_node_cannot_start_fails_at_once(installed):
-    code, said = end(launched(installed, "demo.launch.py", "part:=nose"))
+    code, said = end(launched(installed, "demo.launch.py", "part:=nose", "device:=probe"))
     assert code == 1 and "stmpl-1 ended with 1" in said and "nose" in said, said
