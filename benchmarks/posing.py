@@ -37,6 +37,7 @@ PART, JOINT = "left_arm", "left_elbow"
 RADIUS, SUBDIVISIONS = 0.012, 3  # of the ball [m], and of its mesh
 DEEP = 0.25  # depth of the ball over the thickness
 BENDS = (0, 30, 60, 90)  # degrees
+STRAIGHT = 20.0  # slant of a ball's way from which it is told [degrees]
 JOINT_RATE, LOOP_RATE, SECONDS = 60.0, 200.0, 5.0  # of the timed loop [Hz], [s]
 ALONE = 200  # poses that are timed with nothing between them
 TURNS = 3  # runs of each checkout, by turns
@@ -116,6 +117,7 @@ def compare(edge: float, stack: bool, bends: tuple[int, ...], reach: float) -> N
                     ours.append((force, off[moved > 0.1 * moved.max()].mean(), off.max()))
                     if one is simulator:
                         words = beyond(answer, true, 0.01 * off.max() * moved.max()) + answer.trust.why
+                        words += slanted(answer.touches["ball"].push, -normal)
                 forces = "".join(f"{force:+8.1f} %" for force, _, _ in ours)
                 motions = "  ".join(f"{moves:5.1f} ({worst:4.1f})" for _, moves, worst in ours)
                 bad = "" if truth.trust.ok else f" FEM: {truth.trust.why}"
@@ -129,6 +131,12 @@ def beyond(answer: Answer, force: float, off: float) -> str:
     touch, bound = answer.touches["ball"], answer.trust.error_bound
     outside = {"force": abs(touch.force - force) > touch.force_bound, "motion": bound is not None and off > bound}
     return "".join(f"{what} beyond its bound; " for what, is_off in outside.items() if is_off)
+
+
+def slanted(push: np.ndarray, way: np.ndarray) -> str:
+    """By how much a ball's way (3,) slants to the skin that it meets, in words; no pose tells of it."""
+    slant = np.rad2deg(np.arccos(np.clip(push @ way / max(float(np.linalg.norm(push)), 1e-300), -1, 1)))
+    return f"; came at a slant of {slant:.0f} degrees" if slant > STRAIGHT else ""
 
 
 def times(stack: bool) -> None:

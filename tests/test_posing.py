@@ -8,6 +8,10 @@ import numpy as np
 import pytest
 from scipy.spatial import KDTree
 
+from benchmarks.living_limbs import ball as ball_of
+from benchmarks.posing import JOINT, sites
+from benchmarks.posing import arm as arm_of
+from fem_tools import IndenterFem, PatchFem, Press
 from stmpl_core import Answer, Contact, Membrane, Ply, Simulator, Skin, SoftLayer, State, Tissue
 from stmpl_core.body import Body
 from stmpl_core.bones import Bone, to_bone
@@ -18,6 +22,7 @@ from stmpl_core.methods import Coarse, Linear, MomentNet, Winkler
 from stmpl_core.methods import method as method_named
 from stmpl_core.methods.base import anew
 from stmpl_core.rig import Joint, Rig
+from stmpl_core.sdf import SignedDistance
 from stmpl_core.soundness import HOLLOW
 from stmpl_ros.making import MOVED
 from tests.scenes import LENGTH, RADIUS, at, ball, limb
@@ -224,6 +229,41 @@ def test_skin_that_comes_near_through_the_air_feels_nothing():
     answer = moved.step([Contact(ball(), pressed(moved.layer, int(upper[a])))])
     assert np.abs(answer.displacement).max() > 1e-3
     assert np.abs(answer.displacement[lower]).max() < 1e-3 * np.abs(answer.displacement).max()
+
+
+@pytest.mark.slow
+def test_a_slant_into_a_fold_is_seen_where_a_wrench_or_a_state_tells_of_it_and_no_error_where_the_tool_is_smooth():
+    """Inside an elbow bent by 30 degrees a ball meets the forearm's wall at 65 degrees: its pose does not say so."""
+    layer, rig = arm_of(6e-3, stack=True)
+    skin, tool = Skin.of(layer, MomentNet()).posed({JOINT: np.deg2rad(30)}), ball_of(0.02, 3)
+    here, vertex = skin.layer, sites(layer, rig)["inside of the elbow"]
+    again = SoftLayer(here.vertices, here.faces, core=here.core, tissue=here.tissue, ply_scale=here.ply_scale)
+    inward, travel = -here.normals[vertex], 0.25 * float(here.thickness[vertex])
+    start = Press(SignedDistance.of(tool, margin=0.03), at(*(here.vertices[vertex] - 0.03 * inward)), inward)
+    touching = start.touching(again)
+    assert touching is not None
+    mesh = PatchFem(element="P1xP2", reach=3.0, refine=2, layers=1)
+    smooth, stuck = (IndenterFem(mesh, friction=law, step=0.1).prepare(again).press([touching], travel).displacement
+                     for law in ("none", "stick"))  # fmt: skip
+    pose = touching.at(travel).pose_body_from_tool
+    told_nothing = Simulator(skin).step([Contact(tool, pose)])
+    touch = told_nothing.touches["ball"]
+    assert touch.push @ inward < 0.5 * touch.force and told_nothing.trust.ok
+    assert worst(told_nothing, smooth) < told_nothing.trust.error_bound < worst(told_nothing, stuck)
+    wrench = np.concatenate([touch.force * inward, np.zeros(3)])
+    by_force = Simulator(skin).step([Contact(tool, pose, wrench)])
+    assert not by_force.trust.ok and "also drags" in by_force.trust.why
+    rough, state = Simulator(skin, friction=3.0), State()
+    for way in np.linspace(-0.02, 1, 40) * travel:
+        touches, state = rough.touch([Contact(tool, touching.at(way).pose_body_from_tool)], state, 0.02)
+    by_state = rough.answer(touches)
+    assert worst(by_state, stuck) < 0.5 * worst(told_nothing, stuck)
+    assert by_state.trust.error_bound is None or by_state.trust.error_bound > worst(by_state, stuck)
+
+
+def worst(answer: Answer, truth: np.ndarray) -> float:
+    """Largest error of motion at any vertex [m]."""
+    return float(np.linalg.norm(answer.displacement - truth, axis=1).max())
 
 
 def test_a_tool_that_rides_on_the_limb_does_not_slide_and_one_that_stays_in_space_does():
