@@ -422,8 +422,7 @@ def _ranges(data: Dataset, settings: MomentTraining) -> dict[str, list[float]]:
     for kind, load in LOADS.items():
         subset = data.split("train", kind=kind)
         highest = 0.0
-        for k in range(0, len(subset), max(1, len(subset) // 400)):
-            sample = subset[k]
+        for sample in (subset[k] for k in range(len(subset))):
             layer, ratio = sample.layer, sample.load.peak_ratio(sample.layer)
             if layer.stacked:
                 ratio *= layer.tissue.youngs_modulus / unit_of(Green.of(layer)).youngs_modulus
