@@ -33,6 +33,7 @@ from stmpl_core.touch import APART, MIN_ONE_WAY_SHARE, Imprint, Pressed, Slip, T
 from stmpl_core.toucher import Toucher
 
 ROUGH = 0.12  # error of the relaxed force, over what has relaxed: 5.4 of 45 % in trials where only the shear relaxes
+RUBBED = 0.1  # of the force: what skin that gives way beneath a dry tool is off, as the law was learnt from what sticks
 PILED = 0.5  # of drag^2 / force: error of skin that piles up; 0.7 of it on a back, where the elastic bound was 0.45
 HELD_OFF = 0.01  # relative error of the elastic force by wrench, from which it is asked for again
 GIVEN_BACK = 0.7  # share of what an elastic contact gives back that must be covered by what was put in
@@ -264,8 +265,9 @@ class History:
             dragged = self._dragged(one, wrench, contact, pose[:3, 3], scalars, force, lever, thickness, dt)
             if self.toucher.layer.tissue.skin is not None:
                 rubs = dragged.slip.wrench[:3]
-                piled = PILED * float(rubs @ rubs) / math.sqrt(wrench[:3] @ wrench[:3])
-                changed["force_bound"] = changed.get("force_bound", touch.force_bound) + piled
+                pressing = math.sqrt(wrench[:3] @ wrench[:3])
+                besides = RUBBED * pressing + PILED * float(rubs @ rubs) / pressing
+                changed["force_bound"] = changed.get("force_bound", touch.force_bound) + besides
             wrench = wrench + dragged.slip.wrench
             changed |= {"wrench": wrench, "slip": dragged.slip}
             stored, whole = stored + dragged.stored, whole + 2 * dragged.stored
