@@ -47,7 +47,7 @@ class Softness(NamedTuple):
         axes = _even(log_t, GRID[0]), _even(log_scale, GRID[1])
         median = _responses(tissue, thickness, 0.0, 0.0)
         some = np.unique(np.linspace(0, len(log_t) - 1, SEEN).astype(int))
-        there = np.array([_responses(tissue, thickness, log_t[v], log_scale[v]) for v in some])
+        there = np.array([_responses(tissue, thickness, float(log_t[v]), float(log_scale[v])) for v in some])
         felt = (WAVES > FELT[0]) & (WAVES < FELT[1])
         differs = np.log(there[:, 0, felt] / median[0, felt])
         _, _, ways = np.linalg.svd(differs, full_matrices=False)
@@ -67,7 +67,8 @@ class Softness(NamedTuple):
         inside = (c >= least) & (c <= most)
         terms = np.column_stack([c, c * c])[inside]
         fits = np.linalg.lstsq(terms, (there[inside] / median - 1).reshape(len(terms), -1), rcond=None)[0]
-        return cls(least, (most - least) / (BANK - 1), *fits.reshape(2, 4, -1), axes, table)
+        first, second = fits.reshape(2, 4, -1)
+        return cls(least, (most - least) / (BANK - 1), first, second, axes, table)
 
     def at(self, layer: SoftLayer, thickness: float) -> np.ndarray:
         """Place of each vertex among the BANK, (V,), from 0 to BANK - 1. The median's thickness is in m."""
