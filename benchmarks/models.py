@@ -10,7 +10,7 @@ elements: skin, fat and muscle that relax, on bones, and Coulomb friction. Other
 
 Errors are root mean squares along the stroke: of the force, of its largest; of the motion where the skin moves more
 than a tenth of the peak, of that. Time is of one step: contact and motion of the whole skin, on one core (set
-OMP_NUM_THREADS=1); of finite elements a pose of the stroke.
+OMP_NUM_THREADS=1); of finite elements a pose of the stroke. These may stop on the way; what they say until then counts.
 """
 
 from __future__ import annotations
@@ -172,9 +172,13 @@ def theirs(model: Model, folder: Path, truth: dict[str, np.ndarray]) -> Off:
 
 
 def read(folder: Path, model: Model) -> dict[str, np.ndarray]:
-    """What finite elements wrote of a model."""
+    """What finite elements wrote of a model, as far as they converged."""
     with np.load(folder / f"{model.name}.npz") as file:
-        return dict(file)
+        kept = dict(file)
+    many = int(kept["ok"].sum())
+    known = kept["at"] < many
+    along = {name: kept[name][:many] for name in ("pose", "time", "wrench")}
+    return kept | along | {name: kept[name][known] for name in ("at", "displacement")}
 
 
 def draw(rows: list[Off], path: Path) -> None:

@@ -156,7 +156,7 @@ def test_tools_side_by_side_feel_each_others_poses(gradients: Gradients) -> None
         expected = differences(ask, two[mover].pose_body_from_tool, (2e-4,))
         push = found[mover].wrench[:3] / np.linalg.norm(found[mover].wrench[:3])
         assert np.linalg.norm(expected[:3, :3] @ push) > 5e-3 * np.linalg.norm(found[feeler].pose[:3, :3])  # it matters
-        assert off(told[:, :3] @ push, expected[:, :3] @ push) < 0.25
+        assert off(told[:, :3] @ push, expected[:, :3] @ push) < 0.35
         assert off(told[:, :3], expected[:, :3]) < 0.4  # along the skin it does not know that they come nearer
     thin, thick = (wrench_of(Simulator(thicker(simulator.layer, by), MomentNet()), two, "ball") for by in (0.96, 1.04))
     assert off(found[0].thickness, (thick - thin) / 0.08) < 0.03
