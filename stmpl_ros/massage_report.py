@@ -27,6 +27,7 @@ FILM = "film.webp"
 FILM_RATE = 12.0  # frames a second
 LARGEST_OFF_N = 0.2  # difference of the mean force of a phase from what was asked for
 LARGEST_GAIN = 0.01  # energy that the contact gave out beyond what was put in, over what was stored
+AROUND_S = 8e-3  # time within which the simulator's force counts, two of its steps at 250 Hz [s]
 LARGEST_APART = 0.01  # difference of the node's force from the simulator's, over the largest
 LARGEST_SQUEEZE = 0.05  # difference of the mean force of the fingers from what was asked for, over that
 LEAST_LIFT_M = 0.005  # height that a gripped limb must be lifted by
@@ -68,14 +69,16 @@ class Massaged:
     film: Film
 
     @property
-    def felt(self) -> np.ndarray:
-        """Force between tool and skin in the simulation, at the times of the answers, (N,) [N]."""
-        return np.interp(self.answered[0], self.log.time, np.linalg.norm(self.log.wrench[:, :3], axis=1))
-
-    @property
     def apart(self) -> float:
-        """Largest difference of the node's force from the simulation's, over the largest force [-]."""
-        return _apart(self.answered[1], self.felt)
+        """Largest difference of the node's force from the simulation's within AROUND_S, over the largest force [-].
+
+        Where a tool lifts, the force falls by a third from one step of the simulation to the next, and the node does
+        not get every step.
+        """
+        times, forces = self.answered
+        size = np.linalg.norm(self.log.wrench[:, :3], axis=1)
+        felt = np.array([np.interp(times + late, self.log.time, size) for late in (-AROUND_S, 0.0, AROUND_S)])
+        return _apart(forces, np.clip(forces, felt.min(axis=0), felt.max(axis=0)))
 
     @property
     def fingers_apart(self) -> float:
