@@ -167,7 +167,10 @@ def theirs(model: Model, folder: Path, truth: dict[str, np.ndarray]) -> Off:
     """Finite elements of a model, from where they lie."""
     found = read(folder, model)
     about = json.loads(str(found["about"]))
-    return Off("finite elements", model, *off(found["wrench"], found["displacement"], truth),
+    both = np.intersect1d(found["at"], truth["at"])  # the poses at which both files have the motion
+    moved = found["displacement"][np.isin(found["at"], both)]
+    same = truth | {"displacement": truth["displacement"][np.isin(truth["at"], both)]}
+    return Off("finite elements", model, *off(found["wrench"], moved, same),
                1e3 * about["seconds"] / about["played"])  # fmt: skip
 
 
