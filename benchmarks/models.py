@@ -23,29 +23,26 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import matplotlib.pyplot as plt
 import numpy as np
 from scipy.optimize import brentq
 
 from benchmarks import slides
-from benchmarks.beside_slides import MOVES, between
+from benchmarks.beside_slides import BETWEEN, MOVES, between
 from benchmarks.living_limbs import ball, site
 from stmpl_core import Contact, Simulator, SoftLayer, State
-from stmpl_core.body import Body
-from stmpl_core.living import held_skin, living
+from stmpl_core.living import held_skin
 from stmpl_core.methods import MomentNet
 from stmpl_core.stack import ball as pressed
 from stmpl_core.tissue import Tissue
 
 PICTURE = Path(__file__).parents[1] / "docs" / "pictures" / "models.png"
-PART, EDGE = "left_forearm", 7e-3  # limb, and the edges of its mesh [m]
 RADIUS, DEPTH, LENGTH, SPEED, MU = 0.02, 8e-3, 24e-3, 0.05, 0.6  # ball [m], its stroke [m, m, m/s], friction [-]
 RUNGS = ("one layer", "skin on one layer", "skin, fat, muscle")
 MARKERS = {(False, False): "o", (True, False): "^", (False, True): "s", (True, True): "D"}  # of time and slip
 LEAST = 0.3  # error at which the truth is drawn [%]
-BETWEEN = 4  # steps of ours between two poses of finite elements
 
 
 @dataclass(frozen=True)
@@ -82,10 +79,10 @@ THEIRS = [Model(2, True, True), Model(1, True, True), Model(0, True, True), Mode
 @cache
 def forearm(rung: int) -> SoftLayer:
     """A forearm as measured, or one material of such a modulus that it presses back as hard under the ball at first."""
-    measured = living(Body.anny(), PART, edge_length=EDGE)
+    measured = slides.forearm(False).layer
     if rung == 2:
         return measured
-    tissue, here = measured.tissue, float(measured.thickness[site(measured, PART)])
+    tissue, here = measured.tissue, float(measured.thickness[site(measured, "left_forearm")])
     skin = tissue.skin if rung else None
     small = 0.1 * DEPTH
     wanted = pressed(tissue, here, RADIUS, depth=small).force
@@ -93,7 +90,7 @@ def forearm(rung: int) -> SoftLayer:
     def one(modulus: float) -> Tissue:
         return Tissue(modulus, tissue.poisson_ratio, skin=skin)
 
-    modulus = brentq(lambda e: pressed(one(e), here, RADIUS, depth=small).force - wanted, 100.0, 1e6)
+    modulus: Any = brentq(lambda e: pressed(one(e), here, RADIUS, depth=small).force - wanted, 100.0, 1e6)
     return measured.with_(tissue=one(modulus), ply_scale=None)
 
 
