@@ -64,8 +64,8 @@ def slab(thickness: float, stacked: bool, fading: bool) -> Ground:
 
 
 @cache
-def forearm(fading: bool) -> Ground:
-    """A forearm as measured, down to its bones; the stroke goes along it."""
+def forearm(fading: bool, around: bool = False) -> Ground:
+    """A forearm as measured, down to its bones; the stroke goes along it, or around it."""
     layer = living(Body.anny(), "left_forearm", edge_length=7e-3)
     layer = layer.with_(tissue=faded(layer.tissue)) if fading else layer
     vertex = site(layer, "left_forearm")
@@ -74,7 +74,8 @@ def forearm(fading: bool) -> Ground:
     x = axis - (axis @ z) * z
     x /= np.linalg.norm(x)
     frame = np.eye(4)
-    frame[:3, :3], frame[:3, 3] = np.stack([x, np.cross(z, x), z], axis=1), v[vertex]
+    x, y = (np.cross(z, x), -x) if around else (x, np.cross(z, x))
+    frame[:3, :3], frame[:3, 3] = np.stack([x, y, z], axis=1), v[vertex]
     return Ground(layer, frame, PatchFem(element="P1xP2", layers=1, refine=3, reach=9, check_stability=False))
 
 
@@ -200,6 +201,11 @@ def _scenes() -> Iterator[tuple[str, Scene]]:
     for mu in (0.6, 0.3, 1.0):
         yield f"forearm-ball20-mu{mu}", Scene(lambda: forearm(False), 0.02,
                                               lambda g: slide(g, 0.02, 9e-3, 30e-3, 1.5e-3), mu, 0.15)  # fmt: skip
+    for mu in (0.3, 0.6):
+        yield (
+            f"forearm-ball20-around-mu{mu}",
+            Scene(lambda: forearm(False, around=True), 0.02, lambda g: slide(g, 0.02, 9e-3, 18e-3, 1.5e-3), mu, 0.15),
+        )
     yield "slab-ramp-hold", Scene(flat(fading=True), 0.02, lambda g: ramp_hold(g, 0.02, 6e-3, 0.02), "stick")
     yield "slab-massage", Scene(flat(fading=True), 0.02, lambda g: massage(g, 0.02, 6e-3), "stick")
     yield "slab-press-lift-press", Scene(flat(fading=True), 0.02, lambda g: press_lift_press(g, 0.02, 6e-3), "stick")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import scipy.sparse as sp
@@ -13,7 +13,7 @@ from fem_tools.plies import wedge_ends
 from fem_tools.slabs import Slabs, slabs_of
 from fem_tools.system import System
 from stmpl_core.bones import shortened, unfolded
-from stmpl_core.coarse_response import CoarseResponse
+from stmpl_core.coarse_response import CoarseDrag, CoarseResponse
 from stmpl_core.green import add_motion, bank
 from stmpl_core.layer import SoftLayer
 from stmpl_core.methods.coarse import nearest_corners
@@ -23,6 +23,7 @@ VERTICES = 900  # vertices of the coarse skin, about: its operator has 3 times t
 FINEST = 1.1  # edges of the coarse mesh over the layer's own, below which the layer's own is taken
 ELEMENT: ElementName = "P1xP2"
 PASSES, SHORTER, TURNED = 40, 0.85, 0.25  # columns of the coarse mesh whose wedges fold: passes, and what each does
+RING = 0.5, 2.4  # distances of vertices whose motion is that of a whole contact, over the edges
 HAT = np.array([[2.0, 1.0, 1.0], [1.0, 2.0, 1.0], [1.0, 1.0, 2.0]]) / 12  # forces of linear pressures on a triangle
 
 
@@ -37,19 +38,60 @@ def coarse_response(layer: SoftLayer, vertices: int = VERTICES) -> CoarseRespons
         InvalidInput, MeshError: the skin cannot be meshed so coarsely.
     """
     coarse = _coarse(layer, vertices)
-    wide, thickness = _compliance(coarse), float(np.median(layer.thickness))
+    wide = _Elements.of(coarse).pressed()
+    _less_flat(wide, layer, coarse, -coarse.normals)
+    corners, shares, gathered = _spread(layer, coarse)
+    motion = np.ascontiguousarray(wide.reshape(-1, 3, len(coarse.vertices)))
+    return CoarseResponse(corners, shares, gathered, motion, coarse.edge_length)
+
+
+def coarse_drag(layer: SoftLayer, vertices: int = VERTICES) -> CoarseDrag:
+    """The same where skin is dragged along: solved for each coarse vertex, along two tangents of the skin.
+
+    Args, Raises: see `coarse_response`.
+    """
+    coarse = _coarse(layer, vertices)
+    elements, count = _Elements.of(coarse), len(coarse.vertices)
+    tangents, give = _tangents(coarse.normals), np.zeros((count, 3, 3))
+    by_source = np.empty((2, count, 3 * count), np.float32)
+    apart = np.linalg.norm(coarse.vertices[:, None] - coarse.vertices, axis=2) / coarse.edge_length
+    ring = (apart > RING[0]) & (apart < RING[1])
+    ring = ring / np.maximum(ring.sum(axis=0), 1) / coarse.vertex_areas
+    for k, along in enumerate(tangents):
+        wide = elements.dragged(along)
+        _less_flat(wide, layer, coarse, along)
+        by_source[k] = wide.T
+        give += np.einsum("vxs,vs,sy->sxy", wide.reshape(count, 3, count), ring, along)
+    corners, shares, gathered = _spread(layer, coarse)
+    return CoarseDrag(corners, shares, gathered, tangents, by_source, 0.5 * (give + give.transpose(0, 2, 1)))
+
+
+def _less_flat(wide: np.ndarray, layer: SoftLayer, coarse: SoftLayer, ways: np.ndarray) -> None:
+    """Takes the flat stack's motion from that of all coarse vertices under a traction E along a way at each (V, 3)."""
+    thickness = float(np.median(layer.thickness))
     softness, every = Softness.of(layer, thickness), np.arange(len(coarse.vertices))
     banked, soft = bank(layer.tissue, thickness, softness), softness.at(coarse, thickness)
     inward, area, unit = -coarse.normals, coarse.vertex_areas, np.full(len(every), thickness)
-    for v in every:  # less the flat stack's
+    for v in every:
         flat, one = np.zeros_like(coarse.vertices), slice(v, v + 1)
         add_motion(flat, every, coarse.vertices, inward, unit, coarse.vertices[one], inward[one], area[one], unit[one],
-                   soft[one], area[v] * inward[one], banked)  # fmt: skip
+                   soft[one], area[v] * ways[one], banked)  # fmt: skip
         wide[:, v] -= flat.ravel()
+
+
+def _spread(layer: SoftLayer, coarse: SoftLayer) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Coarse vertices around each of the skin's, (V, 3), their shares, (V, 3), and the area that comes to each (C,)."""
     corners, shares = nearest_corners(coarse, layer.vertices)
     gathered = np.bincount(corners.ravel(), (shares * layer.vertex_areas[:, None]).ravel(), len(coarse.vertices))
-    motion = np.ascontiguousarray(wide.reshape(-1, 3, len(coarse.vertices)))
-    return CoarseResponse(corners, shares, np.maximum(gathered, 1e-12), motion, coarse.edge_length)
+    return corners, shares, np.maximum(gathered, 1e-12)
+
+
+def _tangents(normals: np.ndarray) -> np.ndarray:
+    """Two unit vectors along the skin at each vertex, at right angles, (2, V, 3)."""
+    least = np.eye(3)[np.abs(normals).argmin(axis=1)]
+    first = np.cross(normals, least)
+    first /= np.linalg.norm(first, axis=1, keepdims=True)
+    return np.stack([first, np.cross(normals, first)])
 
 
 def _coarse(layer: SoftLayer, vertices: int) -> SoftLayer:
@@ -92,27 +134,58 @@ def _folding(skin: SoftLayer, columns: np.ndarray) -> np.ndarray:
     return folding(faces, volumes, layers)
 
 
-def _compliance(layer: SoftLayer) -> np.ndarray:
-    """Motion of every vertex under a pressure E at each, its edges held, (3 V, V) [m]."""
-    ends = wedge_ends(layer.tissue, np.linalg.norm(layer.inner_vertices - layer.vertices, axis=1), 1, layer.ply_scale)
-    faces = layer.faces.astype(np.int64)
-    mesh = WedgeMesh.of(layer.vertices, layer.inner_vertices, faces, ELEMENT, ends=ends, ply_scale=layer.ply_scale)
-    system = System(mesh, layer.tissue, [], mesh.border_columns())
-    blocks: Any = system.tangent(system.zeros(), 1.0)
-    count, width = len(layer.vertices), blocks.shape[1]
-    free = np.repeat(~system.fixed, width)
-    stiffness = sp.bsr_matrix((blocks, mesh.indices, mesh.indptr), shape=(count * width,) * 2).tocsr()[free][:, free]
-    forces = -np.einsum("ij,fx->fxij", HAT, layer.face_area_vectors)  # on corner i by a pressure at corner j
-    rows = faces[:, None, :, None] * width + np.arange(3)[None, :, None, None]
-    columns = np.broadcast_to(faces[:, None, None, :], forces.shape)
-    loads = sp.csc_matrix((forces.ravel(), (np.broadcast_to(rows, forces.shape).ravel(), columns.ravel())),
-                          shape=(count * width, count))[free]  # fmt: skip
-    column = np.flatnonzero(~system.fixed)  # of each free column, its number
-    touch = sp.csr_matrix((np.ones(len(mesh.indices)), mesh.indices, mesh.indptr), shape=(count, count))
-    slabs = [(width * one[:, None] + np.arange(width)).ravel() for one in slabs_of(touch[column][:, column])]
-    at_skin = (width * np.arange(len(column))[:, None] + np.arange(3)).ravel()
-    with threadpool_limits(1, user_api="blas"):  # where a core is busy, OpenBLAS' two take 0.2 s for one's 5 ms
-        moved = Slabs.of(stiffness, slabs).solve(loads, at_skin)
-    out = np.zeros((count, 3, count), np.float32)
-    out[column] = moved.reshape(-1, 3, count) * layer.tissue.youngs_modulus
-    return out.reshape(3 * count, count)
+class _Elements(NamedTuple):
+    """Coarse elements of a layer, eliminated once for many loads.
+
+    Args:
+        layer: layer whose edges are held.
+        width: unknowns of a column.
+        free: mask of the unknowns that are not held.
+        column: numbers of the columns that are not held.
+        slabs: their stiffness [N/m].
+    """
+
+    layer: SoftLayer
+    width: int
+    free: np.ndarray
+    column: np.ndarray
+    slabs: Slabs
+
+    @classmethod
+    def of(cls, layer: SoftLayer) -> _Elements:
+        """Meshes and eliminates."""
+        deep = np.linalg.norm(layer.inner_vertices - layer.vertices, axis=1)
+        ends, faces = wedge_ends(layer.tissue, deep, 1, layer.ply_scale), layer.faces.astype(np.int64)
+        mesh = WedgeMesh.of(layer.vertices, layer.inner_vertices, faces, ELEMENT, ends=ends, ply_scale=layer.ply_scale)
+        system = System(mesh, layer.tissue, [], mesh.border_columns())
+        blocks: Any = system.tangent(system.zeros(), 1.0)
+        count, width = len(layer.vertices), blocks.shape[1]
+        free, column = np.repeat(~system.fixed, width), np.flatnonzero(~system.fixed)
+        whole = sp.bsr_matrix((blocks, mesh.indices, mesh.indptr), shape=(count * width,) * 2).tocsr()
+        touch = sp.csr_matrix((np.ones(len(mesh.indices)), mesh.indices, mesh.indptr), shape=(count, count))
+        slabs = [(width * one[:, None] + np.arange(width)).ravel() for one in slabs_of(touch[column][:, column])]
+        with threadpool_limits(1, user_api="blas"):  # where a core is busy, OpenBLAS' two take 0.2 s for one's 5 ms
+            return cls(layer, width, free, column, Slabs.of(whole[free][:, free], slabs))
+
+    def pressed(self) -> np.ndarray:
+        """Motion of every vertex under a pressure E at each, (3 V, V) [m]."""
+        return self._moved(-np.einsum("ij,fx->fxij", HAT, self.layer.face_area_vectors))
+
+    def dragged(self, ways: np.ndarray) -> np.ndarray:
+        """Motion of every vertex under a traction E at each, along a way at each (V, 3), (3 V, V) [m]."""
+        area = np.linalg.norm(self.layer.face_area_vectors, axis=1)
+        return self._moved(np.einsum("ij,f,fjx->fxij", HAT, area, ways[self.layer.faces]))
+
+    def _moved(self, forces: np.ndarray) -> np.ndarray:
+        """The same under forces of each face on its corners i by a load at its corners j, (F, 3, i, j) [m2]."""
+        count, faces = len(self.layer.vertices), self.layer.faces.astype(np.int64)
+        rows = faces[:, None, :, None] * self.width + np.arange(3)[None, :, None, None]
+        columns = np.broadcast_to(faces[:, None, None, :], forces.shape)
+        loads = sp.csc_matrix((forces.ravel(), (np.broadcast_to(rows, forces.shape).ravel(), columns.ravel())),
+                              shape=(count * self.width, count))[self.free]  # fmt: skip
+        at_skin = (self.width * np.arange(len(self.column))[:, None] + np.arange(3)).ravel()
+        with threadpool_limits(1, user_api="blas"):
+            moved = self.slabs.solve(loads, at_skin)
+        out = np.zeros((count, 3, count), np.float32)
+        out[self.column] = moved.reshape(-1, 3, count) * self.layer.tissue.youngs_modulus
+        return out.reshape(3 * count, count)

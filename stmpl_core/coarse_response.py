@@ -1,4 +1,4 @@
-"""CoarseResponse: the wide part of a limb's linear response, made once for a layer and kept in the user's cache."""
+"""The wide part of a limb's linear response, made once for a layer and kept in the user's cache."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from functools import cache
 from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -17,8 +17,7 @@ from stmpl_core.cache import read, trim, write
 from stmpl_core.layer import SoftLayer
 from stmpl_core.provenance import processor, versions
 
-KIND = "response-"  # beginning of the names of its files
-MOST_KEPT_MB = 300.0  # size of all that is kept, unless STMPL_CACHE_MB says another
+MOST_KEPT_MB = 300.0  # size of all that is kept of a kind, unless STMPL_CACHE_MB says another
 DECIDES = ("numpy", "scipy", "numba", "scikit-fem", "mmgpy", "libigl")  # packages that decide a response's last bit
 
 
@@ -48,17 +47,48 @@ class CoarseResponse(NamedTuple):
         Raises:
             InvalidInput, MeshError: the skin cannot be meshed coarsely.
         """
-        most = 1e6 * _most_kept_mb()
-        name = KIND + digest(layer) if most > 0 else ""
-        known = read(name) if name else None
-        if known is not None and known.keys() == set(cls._fields):
-            edge_length = float(known.pop("edge_length"))
-            return cls(**known, edge_length=edge_length)
-        made: CoarseResponse = import_module("fem_tools.limb").coarse_response(layer)
-        if made.motion.nbytes < most:
-            write(name, made._asdict())
-            trim(KIND, most)
-        return made
+        kept = _kept("response-", layer, cls._fields, "coarse_response")
+        return cls(**{**kept, "edge_length": float(kept["edge_length"])})
+
+
+class CoarseDrag(NamedTuple):
+    """The wide part of a limb's response where its skin is dragged along, on the mesh of its CoarseResponse.
+
+    A limb's skin is a tube: it turns about the bone and goes along it as one, more easily than flat skin.
+
+    Args:
+        corners, shares, gathered: see CoarseResponse.
+        tangents: two ways along the skin at coarse vertices, (2, C, 3).
+        by_source: motion of coarse vertices under a traction E along each way at one, less that of the flat stack,
+            (2, C, 3 C) float32 [m].
+        give: motion of a contact under a force E on it, less that of the flat stack, symmetric, (C, 3, 3) [1/m].
+    """
+
+    corners: np.ndarray
+    shares: np.ndarray
+    gathered: np.ndarray
+    tangents: np.ndarray
+    by_source: np.ndarray
+    give: np.ndarray
+
+    @classmethod
+    def of(cls, layer: SoftLayer) -> CoarseDrag:
+        """The response of a layer, made or read as CoarseResponse. Raises what that raises."""
+        return cls(**_kept("drag-", layer, cls._fields, "coarse_drag"))
+
+
+def _kept(kind: str, layer: SoftLayer, fields: tuple[str, ...], maker: str) -> dict[str, Any]:
+    """Arrays of a layer by name, as they are kept, or made by a function of fem_tools.limb and kept."""
+    most = 1e6 * _most_kept_mb()
+    name = kind + digest(layer) if most > 0 else ""
+    known = read(name) if name else None
+    if known is not None and known.keys() == set(fields):
+        return known
+    made = getattr(import_module("fem_tools.limb"), maker)(layer)._asdict()
+    if sum(np.asarray(one).nbytes for one in made.values()) < most:
+        write(name, made)
+        trim(kind, most)
+    return made
 
 
 def digest(layer: SoftLayer) -> str:

@@ -27,7 +27,8 @@ def dragged_motion(green: Green, touch: Touch) -> VertexVectors | None:
     if ways is None or pressed is None or pressed.forces is None or slip is None:
         return None
     nodes, pressing = _holding(pressed), pressed.forces[pressed.forces > 0]
-    return green.motion(nodes, green.rubbed(nodes, green.near.groups(nodes.corners[:, 0]), ways, pressing, slip.share))
+    forces = green.rubbed(nodes, green.near.groups(nodes.corners[:, 0]), ways, pressing, slip.share)
+    return green.motion(nodes, forces, dragged=True)
 
 
 def ways_along(touch: Touch) -> Points | None:

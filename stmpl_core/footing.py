@@ -88,6 +88,44 @@ def way_of_tool(twist, known, before, held, contact, origin, depth, radius, leve
 
 
 @numba.njit(cache=True, error_model="numpy")
+def curvature_at(corners, shares, forces, frames, curvature, thickness):
+    """Mean curvature of skin at nodes, weighed with their forces (N,), (3, 3) [1/m]; see moments.Surroundings."""
+    out, total = np.zeros((3, 3)), 0.0
+    for n in range(len(corners)):
+        total += forces[n]
+        for a in range(3):
+            v = corners[n, a]
+            weight = shares[n, a] * forces[n] / thickness[v]
+            xx, xy, yy = weight * curvature[v, 0], weight * curvature[v, 1], weight * curvature[v, 2]
+            for x in range(3):
+                p, q = xx * frames[v, 0, x] + xy * frames[v, 1, x], xy * frames[v, 0, x] + yy * frames[v, 1, x]
+                for y in range(3):
+                    out[x, y] += p * frames[v, 0, y] + q * frames[v, 1, y]
+    return out / total if total > 0 else out
+
+
+@numba.njit(cache=True, error_model="numpy")
+def given_way(along, give, aim, contact):
+    """Stiffness of a patch where a force (3,) along the skin aims [N/m], that of a flat layer being `along`.
+
+    Args:
+        along: stiffness on a flat layer [N/m].
+        give: how the contact gives beyond that, (3, 3) [m/N].
+        aim: force as in `in_plane`, of which the way matters, (3,).
+        contact: see Memory.
+    """
+    first, second = contact[2], _cross(contact[1], contact[2])
+    x, y = aim[0], aim[1]
+    size = x * x + y * y
+    if size > 0:
+        way = x * first + y * second
+        more = _dot(way, give @ way) / size
+    else:
+        more = 0.5 * (_dot(first, give @ first) + _dot(second, give @ second))
+    return 1 / max(1 / along + more, 0.5 / along)
+
+
+@numba.njit(cache=True, error_model="numpy")
 def in_plane(wrench, contact, origin, lever):
     """Forces of friction (3,) [N] of a wrench (6,); see stmpl_core.slip."""
     middle, normal, first = contact

@@ -22,7 +22,7 @@ import numba
 import numpy as np
 from scipy.special import j0, j1
 
-from stmpl_core.coarse_response import CoarseResponse
+from stmpl_core.coarse_response import CoarseDrag, CoarseResponse
 from stmpl_core.layer import SoftLayer
 from stmpl_core.moments import Surroundings
 from stmpl_core.nodes import Nodes
@@ -49,7 +49,7 @@ NEXT = np.uint64(1)  # no index that may count from the end
 ONE_WAY = 0.3  # least cosine between a tool's way and the skin's inward normal at a node
 
 
-AS_AT_REST = np.empty((0, 3, 3))  # turns of coarse vertices that did not turn
+AS_AT_REST = np.empty((0, 3, 3))  # turns of vertices that did not turn
 NO_COARSE = (np.empty((0, 3), np.int64), np.empty((0, 3)), np.empty(0), np.empty((0, 3, 0), np.float32),
              AS_AT_REST)
 _KEPT: WeakKeyDictionary[SoftLayer, Green] = WeakKeyDictionary()  # entries die with their layers
@@ -79,7 +79,8 @@ class Green:
             self.tables, self.soft = bank(layer.tissue, self.thickness, softness), softness.at(layer, self.thickness)
         else:
             self.tables, self.soft = _of_one(layer.tissue.poisson_ratio), np.zeros(len(layer.vertices))
-        self._turns = AS_AT_REST
+        self._turns = self._skin_turns = AS_AT_REST
+        self._at_rest: Green | None = None
         self._last: tuple[np.ndarray, tuple[np.ndarray, np.ndarray]] | None = None
 
     @classmethod
@@ -107,9 +108,40 @@ class Green:
         """
         out = copy(self)
         out.layer, out.near, out._last = copy(layer), near, None
+        out._skin_turns, out._at_rest = turns, self._at_rest or self
         if self.coarse is not None:
             out._turns = _turns_of_coarse(self.coarse.corners, self.coarse.shares, turns, len(self.coarse.gathered))
         return out
+
+    @cached_property
+    def drag(self) -> CoarseDrag | None:
+        """The wide part where skin is dragged along, made or read on the first call; None: there is none.
+
+        Raises:
+            InvalidInput, MeshError: the skin cannot be meshed coarsely.
+        """
+        if self._at_rest is not None:
+            return self._at_rest.drag
+        return None if self.coarse is None else CoarseDrag.of(self.layer)
+
+    @cached_property
+    def _give(self) -> np.ndarray:
+        """CoarseDrag.give at each vertex of the skin, (V, 3, 3) [1/m]."""
+        if self._at_rest is not None:
+            return self._at_rest._give
+        assert self.drag is not None
+        return np.einsum("va,vaxy->vxy", self.drag.shares, self.drag.give[self.drag.corners])
+
+    def give(self, nodes: Nodes, forces: np.ndarray) -> np.ndarray:
+        """How a contact as a whole gives where it is dragged along, beyond a flat stack, (3, 3) [1/m].
+
+        Args:
+            nodes: nodes that press.
+            forces: forces that press them, (N,) [N].
+        """
+        if self.drag is None:
+            return np.zeros((3, 3))
+        return _give_at(nodes.corners, nodes.shares, forces, self._give, self._skin_turns)
 
     @property
     def _coarse(self) -> tuple[np.ndarray, ...]:
@@ -195,6 +227,8 @@ class Green:
             share: share that slides [-].
         """
         blocks, rubs = self._blocks(nodes, group), pressing[:, None] * ways
+        if self.drag is not None:
+            blocks += np.tile(self.give(nodes, pressing), (len(ways), len(ways)))
         out = np.zeros_like(ways)
         if share < 1:
             out += (1 - share) * _held(blocks, ways)
@@ -209,8 +243,13 @@ class Green:
         return _blocks(nodes.points, nodes.inward, nodes.area, nodes.corners, nodes.shares, group, self.unit_at(nodes),
                        self.soft_at(nodes), self.tables, *self._coarse)  # fmt: skip
 
-    def motion(self, nodes: Nodes, forces: np.ndarray) -> np.ndarray:
-        """Motion of all vertices under forces over E at nodes (N, 3) [m2], (V, 3) [m]."""
+    def motion(self, nodes: Nodes, forces: np.ndarray, dragged: bool = False) -> np.ndarray:
+        """Motion of all vertices under forces over E at nodes (N, 3) [m2], (V, 3) [m].
+
+        Args:
+            nodes, forces: nodes, and what acts at them.
+            dragged: whether the limb gives along the skin too, as it does to what `rubbed` says.
+        """
         layer = self.layer
         asked = self.near.asked_again(np.unique(nodes.corners))
         by, group = np.zeros((len(asked.vertices), 3)), self.near.groups(nodes.corners[:, 0])
@@ -227,11 +266,22 @@ class Green:
             return out
         source = _handed(nodes.inward, nodes.corners, nodes.shares, forces, *self.coarse[:3])
         if source.any():
-            motion = _of_coarse(source, self._by_source).reshape(-1, 3)
-            if len(self._turns):
-                motion = np.einsum("cxy,cy->cx", self._turns, motion)
-            _add_between(self.coarse.corners, self.coarse.shares, motion, out)
+            self._add_coarse(_of_coarse(source, self._by_source), out)
+        if dragged and self.drag is not None:
+            drag = self.drag
+            for ways, by_source in zip(drag.tangents, drag.by_source, strict=True):
+                along = ways if not len(self._turns) else np.einsum("cxy,cy->cx", self._turns, ways)
+                source = _handed_along(along, nodes.corners, nodes.shares, forces, *drag[:3])
+                self._add_coarse(_of_coarse(source, by_source), out)
         return out
+
+    def _add_coarse(self, motion: np.ndarray, out: np.ndarray) -> None:
+        """Adds motion of coarse vertices as at rest, (3 C,) [m], to that of all vertices, (V, 3)."""
+        assert self.coarse is not None
+        motion = motion.reshape(-1, 3)
+        if len(self._turns):
+            motion = np.einsum("cxy,cy->cx", self._turns, motion)
+        _add_between(self.coarse.corners, self.coarse.shares, motion, out)
 
     def linear(self, source: np.ndarray) -> np.ndarray:
         """Motion of all vertices under a pressure over E at each (V,) [-], (V, 3) [m]."""
@@ -600,6 +650,23 @@ def add_motion(out, there, points, inward, unit, sources, source_inward, area, s
         out[i, 0], out[i, 1], out[i, 2] = out[i, 0] + u, out[i, 1] + v, out[i, 2] + w
 
 
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _give_at(corners, shares, forces, give, turns):
+    """Mean of give (V, 3, 3) at nodes, weighed with forces (N,), turned with the skin by turns (V, 3, 3), (3, 3)."""
+    out, total = np.zeros((3, 3)), 0.0
+    for n in range(len(corners)):
+        total += forces[n]
+        for a in range(3):
+            v, weight = corners[n, a], shares[n, a] * forces[n]
+            if not len(turns):
+                for x in range(3):
+                    for y in range(3):
+                        out[x, y] += weight * give[v, x, y]
+            elif weight:
+                out += weight * (turns[v] @ give[v] @ turns[v].T)
+    return out / total if total > 0 else out
+
+
 @numba.njit(cache=True, nogil=True)
 def _handed(inward, corners, shares, forces, skin_corners, skin_shares, gathered):
     """Pressures over E at coarse vertices that forces over E at nodes amount to, inwards, (C,)."""
@@ -609,6 +676,19 @@ def _handed(inward, corners, shares, forces, skin_corners, skin_shares, gathered
         down = inward[n, 0] * forces[n, 0] + inward[n, 1] * forces[n, 1] + inward[n, 2] * forces[n, 2]
         for a in range(many[n]):
             out[index[n, a]] += weight[n, a] * down / gathered[index[n, a]]
+    return out
+
+
+@numba.njit(cache=True, nogil=True)
+def _handed_along(ways, corners, shares, forces, skin_corners, skin_shares, gathered):
+    """Tractions over E along ways (C, 3) at coarse vertices that forces over E at nodes amount to, (C,)."""
+    index, weight, many, _ = _corners_of(corners, shares, skin_corners, skin_shares)
+    out = np.zeros(len(gathered))
+    for n in range(len(index)):
+        for a in range(many[n]):
+            c = index[n, a]
+            along = ways[c, 0] * forces[n, 0] + ways[c, 1] * forces[n, 1] + ways[c, 2] * forces[n, 2]
+            out[c] += weight[n, a] * along / gathered[c]
     return out
 
 

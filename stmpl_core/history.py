@@ -23,8 +23,20 @@ from stmpl_core.columns import shifted
 from stmpl_core.contact import Contact
 from stmpl_core.dragged import MIN_OFFSET
 from stmpl_core.errors import InvalidInput
-from stmpl_core.footing import carried_tangent, in_plane, in_space, patch_of, twist_between, way_along, way_of_tool
+from stmpl_core.footing import (
+    carried_tangent,
+    curvature_at,
+    given_way,
+    in_plane,
+    in_space,
+    patch_of,
+    twist_between,
+    way_along,
+    way_of_tool,
+)
 from stmpl_core.friction import Friction, coefficients
+from stmpl_core.green import Green
+from stmpl_core.nodes import Nodes
 from stmpl_core.relaxation import depth_left, let_go, series_of, stretch, weights
 from stmpl_core.sideways import Sideways
 from stmpl_core.slip import drag, ploughing
@@ -35,6 +47,7 @@ from stmpl_core.toucher import Toucher
 ROUGH = 0.12  # error of the relaxed force, over what has relaxed: 5.4 of 45 % in trials where only the shear relaxes
 RUBBED = 0.1  # of the force: what skin that gives way beneath a dry tool is off, as the law was learnt from what sticks
 PILED = 0.5  # of drag^2 / force: error of skin that piles up; 0.7 of it on a back, where the elastic bound was 0.45
+MOST_LEAN = 0.5  # turn of the normal under skin that is dragged along, of which a push takes note [rad]
 HELD_OFF = 0.01  # relative error of the elastic force by wrench, from which it is asked for again
 GIVEN_BACK = 0.7  # share of what an elastic contact gives back that must be covered by what was put in
 KEPT = 1.5  # work beyond what elastic skin could hold that is forgotten: what was lost before pays for nothing now
@@ -95,6 +108,7 @@ class _Dragged(NamedTuple):
         limit: tangential force at which all of it slides [N].
         stiffness: of the patch, (3,) [N/m]; see Memory, as springs and relaxed.
         stored: energy that the bent skin stores [J].
+        lean: force by which the push leans, since the skin came from where the limb faces another way, (3,) [N].
     """
 
     slip: Slip
@@ -103,6 +117,7 @@ class _Dragged(NamedTuple):
     springs: np.ndarray
     relaxed: np.ndarray
     stored: float
+    lean: np.ndarray
 
 
 class History:
@@ -262,7 +277,9 @@ class History:
                           work=before.work, stretch=long, surface=one.stated.tool.number)  # fmt: skip
         springs = NOTHING, one.before.springs, one.before.springs_relaxed
         if self.friction(touch.name) > 0 and net > MIN_ONE_WAY_SHARE:
-            dragged = self._dragged(one, wrench, contact, pose[:3, 3], scalars, force, lever, thickness, dt)
+            give, bend = self._give(nodes, pressed.forces), self._bend(nodes, pressed.forces)
+            dragged = self._dragged(one, wrench, contact, pose[:3, 3], scalars, force, lever, thickness, give, bend, dt)
+            wrench = wrench + np.concatenate([dragged.lean, np.cross(middle - pose[:3, 3], dragged.lean)])
             if self.toucher.layer.tissue.skin is not None:
                 rubs = dragged.slip.wrench[:3]
                 pressing = math.sqrt(wrench[:3] @ wrench[:3])
@@ -318,24 +335,42 @@ class History:
         return _let_go(memory._replace(scalars=scalars, relaxed=relaxed,
                                        trail=wake.after(memory.trail, self.series, dt, None)))  # fmt: skip
 
+    def _give(self, nodes: Nodes, forces: np.ndarray) -> np.ndarray | None:
+        """How a contact gives where it is dragged along, beyond a flat layer, (3, 3) [m/N]; None: as that."""
+        layer = self.toucher.layer
+        return Green.of(layer).give(nodes, forces) / layer.tissue.youngs_modulus if layer.stacked else None
+
+    def _bend(self, nodes: Nodes, forces: np.ndarray) -> np.ndarray:
+        """Curvature of the skin under a contact, convex is positive, (3, 3) [1/m]."""
+        near = self.toucher.near
+        return curvature_at(nodes.corners, nodes.shares, forces, near.frames, near.curvature, near.thickness)
+
     def _dragged(self, one: _Asked, wrench: Wrench, contact: np.ndarray, origin: np.ndarray, scalars: Scalars,
-                 force: float, lever: float, thickness: float, dt: float) -> _Dragged:  # fmt: skip
+                 force: float, lever: float, thickness: float, give: np.ndarray | None, bend: np.ndarray, dt: float,
+                 ) -> _Dragged:  # fmt: skip
         """Friction of a contact that presses with a wrench (6,), as the scalars say, without friction."""
         before, radius, depth = one.before, scalars.radius, scalars.depth
         patch, mu = self.sideways.at(radius, thickness), self.friction(one.stated.name)
-        stiffer, cap = ploughing(depth, radius, force, patch.along, mu)
-        along = stiffer * patch.secant(mu * force)
-        stiffness = np.array((along, along, stiffer * patch.turn / (lever * lever)))
         stated, wanted = one.stated.wrench, NOTHING
         if stated is not None:
             wanted = in_plane(stated - wrench, contact, origin, lever)
         way, rolled = way_of_tool(one.twist, one.known, before.contact, before.scalars.pressing > 0, contact, origin,
                                   depth, radius, lever)  # fmt: skip
+        stiffer, cap = ploughing(depth, radius, force, patch.along, patch.bare, mu)
+        along = stiffer * patch.secant(mu * force)
+        if give is not None:
+            aim = wanted if stated is not None else before.springs.sum(axis=0) + along * way
+            along = given_way(along, give, aim, contact)
+        stiffness = np.array((along, along, stiffer * patch.turn / (lever * lever)))
         springs, relaxed, carried, share, stored = drag(
             before.springs, before.springs_relaxed, *self.series, dt, rolled, stiffness, before.stiffness, cap, way,
             wanted, stated is not None)  # fmt: skip
         rubs, offset, turn = in_space(carried, springs, stiffness, contact, origin, lever)
-        return _Dragged(Slip(rubs, share, offset, turn, contact[0]), cap, stiffness, springs, relaxed, stored)
+        turned = bend @ offset  # of the normal, between where the skin came from and here
+        size = math.sqrt(turned @ turned)
+        lean = math.sqrt(wrench[:3] @ wrench[:3]) * min(1.0, MOST_LEAN / max(size, 1e-300)) * turned
+        stored += 0.5 * max(float(lean @ offset), 0.0)
+        return _Dragged(Slip(rubs, share, offset, turn, contact[0]), cap, stiffness, springs, relaxed, stored, lean)
 
     def _said(self, one: _Asked, touch: Touch, changed: dict[str, Any]) -> Touch:
         """The touch with what changed, with what of the stated wrench is missing, and what that says of it."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -18,7 +19,6 @@ WEIGHTS = np.gradient(WAVES)
 WHERE = np.linspace(0.05, 0.95, 10)  # places in the patch that move with the tool, over its radius
 POWERS = (-0.5, 0.5, 1.5)  # powers of 1 - r^2 / a^2 in the traction: the first alone is exact on a half-space
 RADII = np.geomspace(0.02, 8.0, 18)  # radii of the patch that are tabled, over the thickness
-SLACK = 2.0  # width of the skin that is ahead of a patch, over its radius
 THICKNESSES = 5  # thicknesses of a stack that are tabled
 
 
@@ -29,7 +29,7 @@ class Patch(NamedTuple):
         along: tangential force over the way of the tool k_t [N/m].
         turn: torque about the normal over the turn of the tool [N m/rad].
         bare: k_t of the same layer without its skin [N/m].
-        slack: force along the skin at which the skin ahead has lost its tension [N].
+        slack: force that skin carries when what is just ahead has lost its tension T, 2 pi a T [N].
     """
 
     along: float
@@ -40,13 +40,17 @@ class Patch(NamedTuple):
     def secant(self, force: float) -> float:
         """Tangential force over the way of the tool where the tool drags with a force [N], in N/m.
 
-        Skin carries no compression: it wrinkles. What is ahead of a tool pushes back until its tension is gone; from
-        there on the skin behind pulls alone, and half of what the skin adds to k_t is lost.
+        Skin carries no compression: it wrinkles. The traction around a rigid disc that is drawn along a sheet is even
+        (Muskhelishvili, "Some Basic Problems of the Mathematical Theory of Elasticity", 1953, on rigid inclusions), so
+        the sheet pushes back with F cos(angle) / (2 pi a) ahead. What is beyond its tension T there, from cos(angle) =
+        2 pi a T / F on, is lost: a quarter of what skin carries in the end.
         """
-        beyond = max(force - self.slack, 0.0)
-        if not beyond:
+        carried = force * (1 - self.bare / self.along)
+        if not carried > self.slack:
             return self.along
-        return force / ((force - beyond) / self.along + beyond / (0.5 * (self.along + self.bare)))
+        angle = math.acos(self.slack / carried)
+        lost = (angle - math.sin(angle) * self.slack / carried) / (2 * math.pi)
+        return self.along - lost * (self.along - self.bare)
 
 
 def patch(tissue: Tissue, thickness: float, radius: float) -> Patch:
@@ -80,8 +84,8 @@ def patch(tissue: Tissue, thickness: float, radius: float) -> Patch:
 
 
 def slack_at(tissue: Tissue, radius: float) -> float:
-    """Force along the skin at which the skin ahead of a patch of a radius [m] has lost its tension [N]."""
-    return SLACK * tissue.skin.tension * radius if tissue.skin else 0.0
+    """Force that skin carries along itself when what is ahead of a patch of a radius [m] has lost its tension [N]."""
+    return 2 * math.pi * radius * tissue.skin.tension if tissue.skin else 0.0
 
 
 def _spectra(order: int) -> np.ndarray:

@@ -68,7 +68,7 @@ class Simulator:
         self.history = History(self.toucher, friction)
         self.remembers = friction is not None or self.layer.tissue.relaxes
         if friction is not None:  # what a slide needs is made now, not when the first one begins
-            _ = self.history.sideways, Green.of(self.layer)
+            _ = self.history.sideways, Green.of(self.layer).drag
         if skin.rest is not None:
             self.move_to(skin)
 

@@ -51,22 +51,26 @@ class Drag(NamedTuple):
     stored: float
 
 
-def ploughing(depth: float, radius: float, force: float, along: float, friction: float) -> tuple[float, float]:
+def ploughing(
+    depth: float, radius: float, force: float, along: float, bare: float, friction: float
+) -> tuple[float, float]:
     """Factor on the stiffness of a patch [-], and force at which it slides [N].
 
     Skin that is dragged rises before the tool and leans on it: with r = (depth / a) N / (k_t a) the patch is stiffer by
-    1 + 0.33 r, the cap mu N higher by 1 + (0.2 + 0.67 mu) r, fitted on slides of a ball by finite elements at mu 0.3
-    and 0.6.
+    1 + 0.33 r, the cap mu N higher by 1 + (0.2 + 0.67 mu) r, fitted on slides of a ball on one material by finite
+    elements at mu 0.3 and 0.6. Taut skin is held down: the share of k_t that is skin's does not grow.
 
     Args:
         depth: depth of the tool [m].
         radius: radius a of the contact [m].
         force: normal force N [N].
         along: stiffness k_t of the patch [N/m].
+        bare: the same without skin [N/m].
         friction: coefficient mu [-].
     """
     rises = depth / radius * force / (along * radius)
-    return 1 + PLOUGHED[0] * rises, (1 + (PLOUGHED[1] + PLOUGHED[2] * friction) * rises) * friction * force
+    higher = 1 + (PLOUGHED[1] + PLOUGHED[2] * friction) * rises
+    return 1 + PLOUGHED[0] * rises * bare / along, higher * friction * force
 
 
 @numba.njit(cache=True, error_model="numpy")

@@ -153,7 +153,7 @@ def _dragged(stroke: Stroke, series: Series, friction: float, force: float, dept
     """One step of friction: springs, what of them relaxed, force (3,), share that slides, stiffness (3,)."""
     size = (depth / stroke.depth) ** 0.5  # of the contact, over that at the greatest depth
     radius, along, turn = stroke.radius * size, stroke.patch.along * size, stroke.patch.turn * size**3
-    stiffer, cap = ploughing(depth, radius, force, along, friction)
+    stiffer, cap = ploughing(depth, radius, force, along, stroke.patch.bare * size, friction)
     pulled = stroke.patch.secant(friction * force / size) * size
     stiffness = stiffer * np.array([pulled, pulled, turn / (LEVER * radius) ** 2])
     springs, faded, carried, share, _ = drag(springs, faded, *series, dt, 0.0, stiffness, before, cap,

@@ -178,7 +178,7 @@ def _rubbed(toucher: Toucher, sideways: Sideways, one: Contact) -> _Rubbed | Non
         return None
     rubs = float(np.linalg.norm(one.wrench[:3] - pressing * normal))
     patch = sideways.at(radius, thickness)
-    stiffer, _ = ploughing(touch.depth, radius, pressing, patch.along, 0.0)
+    stiffer, _ = ploughing(touch.depth, radius, pressing, patch.along, patch.bare, 0.0)
     rises = touch.depth / radius * pressing / (patch.along * radius)
     return _Rubbed(normal, pressing, rubs, radius, stiffer * patch.secant(rubs), rises)
 
