@@ -25,7 +25,6 @@ from stmpl_core.dragged import MIN_OFFSET
 from stmpl_core.errors import InvalidInput
 from stmpl_core.footing import (
     carried_tangent,
-    curvature_at,
     given_way,
     in_plane,
     in_space,
@@ -277,7 +276,7 @@ class History:
                           work=before.work, stretch=long, surface=one.stated.tool.number)  # fmt: skip
         springs = NOTHING, one.before.springs, one.before.springs_relaxed
         if self.friction(touch.name) > 0 and net > MIN_ONE_WAY_SHARE:
-            give, bend = self._give(nodes, pressed.forces), self._bend(nodes, pressed.forces)
+            give, bend = self._give(nodes, pressed.forces), self.toucher.curvature(nodes, pressed.forces)
             dragged = self._dragged(one, wrench, contact, pose[:3, 3], scalars, force, lever, thickness, give, bend, dt)
             wrench = wrench + np.concatenate([dragged.lean, np.cross(middle - pose[:3, 3], dragged.lean)])
             if self.toucher.layer.tissue.skin is not None:
@@ -339,11 +338,6 @@ class History:
         """How a contact gives where it is dragged along, beyond a flat layer, (3, 3) [m/N]; None: as that."""
         layer = self.toucher.layer
         return Green.of(layer).give(nodes, forces) / layer.tissue.youngs_modulus if layer.stacked else None
-
-    def _bend(self, nodes: Nodes, forces: np.ndarray) -> np.ndarray:
-        """Curvature of the skin under a contact, convex is positive, (3, 3) [1/m]."""
-        near = self.toucher.near
-        return curvature_at(nodes.corners, nodes.shares, forces, near.frames, near.curvature, near.thickness)
 
     def _dragged(self, one: _Asked, wrench: Wrench, contact: np.ndarray, origin: np.ndarray, scalars: Scalars,
                  force: float, lever: float, thickness: float, give: np.ndarray | None, bend: np.ndarray, dt: float,

@@ -229,6 +229,10 @@ def _model(toucher: Toucher, touch: Touch, tangent: Tangent | None, memory: Memo
     if touch.slip is not None and memory is not None:
         grip = _grip(touch, memory, contact[2])
         stiffness = stiffness + (grip.axes.T * grip.stiffness) @ grip.axes
+        along, arm = np.eye(3) - np.outer(normal, normal), memory.contact[0] - touch.pose_body_from_tool[:3, 3]
+        ways = np.hstack([along, np.cross(arm, along)])
+        sticks = (1 - touch.slip.share) * touch.force  # what sticks takes the way that it faces along
+        stiffness = stiffness + ways.T @ (sticks * toucher.curvature(nodes, pressed.forces)) @ ways
     return LocalContact(touch.pose_body_from_tool, touch.wrench, stiffness, *valid, touch.status, touch.trust, grip,
                         power, eased)  # fmt: skip
 

@@ -16,6 +16,7 @@ from stmpl_core.columns import HOLE_RADIUS, NO_SQUEEZE, Clearance, Columns, Sque
 from stmpl_core.contact import Contact
 from stmpl_core.contact_net import NOTHING, ContactNet, Held
 from stmpl_core.deep import DEEPEST, Deep
+from stmpl_core.footing import curvature_at
 from stmpl_core.layer import SoftLayer
 from stmpl_core.moments import Surroundings
 from stmpl_core.nodes import Nodes
@@ -117,6 +118,11 @@ class Toucher:
         self._modulus = layer.tissue.youngs_modulus
         self._thickest = float(layer.thickness.max())
         self._inward, self.deep = self.columns.inward, Deep(self.columns)
+
+    def curvature(self, nodes: Nodes, forces: np.ndarray) -> np.ndarray:
+        """Curvature of the skin at nodes, weighed with their forces (N,), (3, 3) [1/m]; convex is positive."""
+        near = self.near
+        return curvature_at(nodes.corners, nodes.shares, forces, near.frames, near.curvature, near.thickness)
 
     def moved(self, skin: Skin) -> Toucher:
         """The same law and tools where joints take the skin."""
