@@ -27,6 +27,7 @@ RINGS = len(RING_AT)
 OWN = 3.921  # of an even pressure on a lattice of triangles: sum of 1 / r with this / sqrt(area) for the node itself
 TOLERANCE = 3e-6  # largest change of the forces of one iteration, over the largest, at which it ends
 MAX_ITERATIONS = 200
+NEXT = np.uint64(1)
 ONE_THREAD = 2**18  # multiplications up to which OpenBLAS takes one thread, and so always sums in the same order
 POWER_TOLERANCE = 1e-4  # square of the residual over the first, at which the power is known
 
@@ -82,50 +83,80 @@ def pairs(points, inward, thickness, area, group, mean, half_space, rows):
         mean: unit of length [m].
         half_space, rows: tables of a Response.
     """
-    count, width = len(points), rows.shape[1] - 1
-    out, rings = np.zeros((count, count)), np.zeros((width, count, count), np.float32)
-    roots = 1 / np.sqrt(thickness)
-    own = np.sqrt(area) / OWN
+    count, width, by = len(points), rows.shape[1] - 1, _columns_of(points, inward)
+    out, rings = np.empty((count, count)), np.empty((width, count, count), np.float32)
+    roots, own = 1 / np.sqrt(thickness), np.sqrt(area) / OWN
+    away, place, per = np.empty(count), np.empty(count), np.empty(count)
     for i in range(count):
+        _apart(by, group, i, away)
         for j in range(i + 1):
-            facing = inward[i, 0] * inward[j, 0] + inward[i, 1] * inward[j, 1] + inward[i, 2] * inward[j, 2]
-            x, y, z = (points[i, 0] - points[j, 0], points[i, 1] - points[j, 1], points[i, 2] - points[j, 2])
-            per = roots[i] * roots[j]
-            r = np.sqrt(x * x + y * y + z * z)
-            f = r * per * STEPS
-            if facing <= 0 or f >= REACH * STEPS or group[i] != group[j]:
-                continue
-            k = int(f)
-            f -= k
-            value = half_space / max(r, 0.5 * (own[i] + own[j])) + per * ((1 - f) * rows[k, 0] + f * rows[k + 1, 0])
-            out[i, j] = out[j, i] = mean * value
-            if k < NEAR * STEPS:
-                _weigh(rings, i, j, per * per, rows, k, f)
+            per[j] = roots[i] * roots[j]
+            place[j] = min(away[j] * per[j] * STEPS, REACH * STEPS)
+            away[j] = half_space / max(away[j], 0.5 * (own[i] + own[j]))
+        _read(rows[:, 0], place, per, out[i], i)
+        for j in range(i + 1):
+            out[i, j] = mean * (away[j] + out[i, j]) if place[j] < REACH * STEPS else 0.0
+            per[j] *= per[j]
+        for m in range(width):
+            _read(rows[:, m + 1], place, per, rings[m, i], i)
+    _mirror(out)
+    for m in range(width):
+        _mirror(rings[m])
     return out, rings
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def rings_of(points, inward, thickness, group, rows):
     """The weights in rings that `pairs` gives for nodes on a layer of one thickness [m], (., N, N)."""
-    count, scale = len(points), STEPS / thickness
-    rings = np.zeros((rows.shape[1] - 1, count, count), np.float32)
+    count, scale, by = len(points), STEPS / thickness, _columns_of(points, inward)
+    rings = np.empty((rows.shape[1] - 1, count, count), np.float32)
+    away, per = np.empty(count), np.full(count, 1 / (thickness * thickness))
     for i in range(count):
+        _apart(by, group, i, away)
         for j in range(i + 1):
-            facing = inward[i, 0] * inward[j, 0] + inward[i, 1] * inward[j, 1] + inward[i, 2] * inward[j, 2]
-            x, y, z = (points[i, 0] - points[j, 0], points[i, 1] - points[j, 1], points[i, 2] - points[j, 2])
-            f = np.sqrt(x * x + y * y + z * z) * scale
-            if facing > 0 and f < NEAR * STEPS and group[i] == group[j]:
-                k = int(f)
-                _weigh(rings, i, j, 1 / (thickness * thickness), rows, k, f - k)
+            away[j] = min(away[j] * scale, REACH * STEPS)
+        for m in range(len(rings)):
+            _read(rows[:, m + 1], away, per, rings[m, i], i)
+    for m in range(len(rings)):
+        _mirror(rings[m])
     return rings
 
 
-@numba.njit(cache=True, error_model="numpy", inline="always")
-def _weigh(rings, i, j, per, rows, k, f):
-    """Writes the weights of a pair of nodes at place k and fraction f of the table's rows."""
-    for m in range(len(rings)):
-        weight = per * ((1 - f) * rows[k, m + 1] + f * rows[k + 1, m + 1])
-        rings[m, i, j] = rings[m, j, i] = weight
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _columns_of(points, inward):
+    """Places and normals of nodes, one below the other, (6, N): loops over nodes then run in vector registers."""
+    by = np.empty((6, len(points)))
+    for n in range(len(points)):
+        for x in range(3):
+            by[x, n], by[3 + x, n] = points[n, x], inward[n, x]
+    return by
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _apart(by, group, i, out):
+    """Writes how far node i is from those up to it [m]; inf from one that it does not face, or of another group."""
+    p0, p1, p2, n0, n1, n2, its = by[0, i], by[1, i], by[2, i], by[3, i], by[4, i], by[5, i], group[i]
+    for j in range(i + 1):
+        facing = n0 * by[3, j] + n1 * by[4, j] + n2 * by[5, j]
+        x, y, z = p0 - by[0, j], p1 - by[1, j], p2 - by[2, j]
+        out[j] = np.sqrt(x * x + y * y + z * z) if (facing > 0) & (its == group[j]) else np.inf
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _read(table, place, per, out, i):
+    """Writes per times a table's value at places, for node i and those up to it."""
+    for j in range(i + 1):
+        whole = np.int32(place[j])
+        f, k = place[j] - whole, np.uint64(whole)  # no index that may count from the end
+        out[j] = per[j] * ((1 - f) * table[k] + f * table[k + NEXT])
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _mirror(matrix):
+    """Writes the upper triangle from the lower one."""
+    for i in range(len(matrix)):
+        for j in range(i):
+            matrix[j, i] = matrix[i, j]
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
@@ -172,16 +203,15 @@ def moments_of(rings, points, thickness, area, pressure, strain):
 def solve(matrix, depth):
     """Forces (N,) >= 0 with matrix @ forces >= depth, and equal where they are above 0."""
     count = len(depth)
-    force, gap, way, along = np.zeros(count), np.empty(count), np.zeros(count), np.empty(count)
+    force, gap, way, along = np.zeros(count), -depth, np.zeros(count), np.empty(count)
     for i in range(count):
         if depth[i] > 0:
             force[i] = 0.3 * depth[i] / matrix[i, i]
-    before, restart = 1.0, True
+    _add_times(matrix, force, gap)
+    before, restart, beside = 1.0, True, np.empty(count)
     for _ in range(MAX_ITERATIONS):
         square = 0.0
-        _times(matrix, force, gap)
         for i in range(count):
-            gap[i] -= depth[i]
             if force[i] > 0:
                 square += gap[i] * gap[i]
         if square == 0:
@@ -190,7 +220,8 @@ def solve(matrix, depth):
             way[i] = 0.0 if force[i] <= 0 else gap[i] + (0.0 if restart else square / before * way[i])
         before = square
         up = down = 0.0
-        _times(matrix, way, along)
+        along[:] = 0.0
+        _add_times(matrix, way, along)
         for i in range(count):
             up += gap[i] * way[i]
             down += along[i] * way[i]
@@ -199,16 +230,18 @@ def solve(matrix, depth):
         step = up / down
         restart, change, largest = False, 0.0, 0.0
         for i in range(count):
-            now = force[i]
-            if now > 0:
-                now = max(now - step * way[i], 0.0)
+            straight = now = force[i] - step * way[i]
+            if force[i] > 0:
+                now = max(now, 0.0)
             elif gap[i] < 0:
                 now = -gap[i] / matrix[i, i]  # the skin would be inside the tool: it presses after all
                 restart = True
             change, largest = max(change, abs(now - force[i])), max(largest, now)
-            force[i] = now
+            force[i], beside[i] = now, now - straight
+            gap[i] -= step * along[i]
         if change <= TOLERANCE * largest:
             break
+        _add_times(matrix, beside, gap)  # few left the straight way: the gap follows without another whole product
     return force
 
 
@@ -230,9 +263,8 @@ def rates_of(matrix, force, depth_rates):
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _times(matrix, vector, out):
-    """out = a symmetric matrix (N, N) times a vector, summed in one order whatever the processor's width."""
-    out[:] = 0.0
+def _add_times(matrix, vector, out):
+    """Adds a symmetric matrix (N, N) times a vector to out, in one order whatever the processor's width."""
     for j in range(len(vector)):
         if vector[j] != 0.0:
             for i in range(len(out)):
@@ -249,7 +281,8 @@ def power_of(matrix, force, depth):
     for _ in range(MAX_ITERATIONS):
         if square <= POWER_TOLERANCE * start:
             break
-        _times(matrix, way, along)
+        along[:] = 0.0
+        _add_times(matrix, way, along)
         down = 0.0
         for i in range(count):
             along[i] = along[i] if force[i] > 0 else 0.0
