@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from copy import copy
 from functools import cached_property
 from typing import Any, NamedTuple
@@ -13,7 +12,7 @@ import numpy as np
 from stmpl_core.arrays import Points, Transform
 from stmpl_core.layer import SoftLayer
 from stmpl_core.nodes import Nodes, nodes_under
-from stmpl_core.rays import WALL, depth_and_share, depth_in_column, distance_in_column, ray_of
+from stmpl_core.rays import WALL, depth_and_share, depth_in_column, distance_in_column, ray_from, ray_of
 from stmpl_core.sdf import SignedDistance
 from stmpl_core.touch import MIN_ONE_WAY_SHARE
 
@@ -48,11 +47,13 @@ class Clearance(NamedTuple):
         vertices: numbers of the columns' vertices, (N,).
         least: signed distance along each column (N,) [m]; inf where the tool comes through the core.
         skin: signed distance at its skin, (N,) [m].
+        nearest: smallest of `least` [m]; inf where there is none.
     """
 
     vertices: np.ndarray
     least: np.ndarray
     skin: np.ndarray
+    nearest: float
 
 
 class Columns:
@@ -105,15 +106,15 @@ class Columns:
                 of an arm takes 14, and 60 us for one that touches: it pays where many tools are, most of them apart.
         """
         low, high = field.tool_bounds
-        centre = middle_of(field, pose)
         if many and self._tree:
             import fcl
 
-            box = fcl.CollisionObject(fcl.Box(*(high - low + 2 * reach)), fcl.Transform(pose[:3, :3], centre))
+            at = fcl.Transform(pose[:3, :3], middle_of(field, pose))
+            box = fcl.CollisionObject(fcl.Box(*(high - low + 2 * reach)), at)
             if not fcl.collide(self._skin, box):
                 return np.empty(0, np.int64)
         skin = self.points, self.inward, self.layer.thickness
-        return _through_box(*skin, self._order, self._blocks, pose, low - reach, high + reach, centre)
+        return _through_box(*skin, self._order, self._blocks, pose, low, high, reach)
 
     def squeezed(self, field: SignedDistance, pose: Transform) -> Squeeze:
         """Squeeze of the columns by a tool at its pose."""
@@ -122,25 +123,18 @@ class Columns:
 
     def clearance(self, field: SignedDistance, pose: Transform, near: np.ndarray, far: float) -> Clearance:
         """Distance of the tool from columns; those further than `far` [m] are only known to be so."""
-        least, skin = clearances(grid_of(field), pose, self.points, self.inward, self.layer.thickness, near, far)
-        return Clearance(near, least, skin)
+        return Clearance(near, *clearances(grid_of(field), pose, self.points, self.inward, self.layer.thickness, near,
+                                           far))  # fmt: skip
 
     def squeeze(self, field: SignedDistance, pose: Transform, clearance: Clearance) -> Squeeze:
         """Columns that the tool covers."""
-        near, least, above = clearance
-        covered = near[least < HOLE_RADIUS * self.layer.edge_length]
-        if not len(covered):
+        hole = HOLE_RADIUS * self.layer.edge_length
+        if not clearance.nearest < hole:
             return NO_SQUEEZE
-        wall = WALL * (float(self.layer.thickness[covered].sum()) / len(covered))
-        under = float((-least - np.maximum(-above, 0.0)).max()) / wall
-        sunk = under > LEAST_UNDER
-        grid, skin = grid_of(field), (self.points, self.inward, self.layer.thickness, self.faces)
-        faces = self._start, self._around, self._slot
-        found, vertices, depth, rests = _cover(grid, pose, *skin, *faces, covered, sunk)
-        nodes = nodes_under(grid, pose, middle_of(field, pose), skin, found, sunk)
-        if self.layer.stacked and len(nodes.area):
-            nodes = nodes._replace(sinking=_sinking(grid, pose, nodes))
-        return Squeeze(vertices, depth, rests, nodes)
+        vertices, depth, rests, *nodes = _squeezed(
+            grid_of(field), pose, middle_of(field, pose), self.points, self.inward, self.layer.thickness, self.faces,
+            self._start, self._around, self._slot, *clearance[:3], hole, self.layer.stacked)  # fmt: skip
+        return Squeeze(vertices, depth, rests, Nodes(*nodes))
 
 
 def middle_of(field: SignedDistance, pose: Transform) -> np.ndarray:
@@ -159,21 +153,6 @@ def shifted(pose: Transform, by: np.ndarray) -> Transform:
 def depth_along(field: SignedDistance, pose: Transform, points: Points, way: Points, guess: np.ndarray) -> np.ndarray:
     """Way of points (N, 3) along unit vectors (N, 3) out of a tool, (N,) [m], from a guess > 0."""
     return _depths_along(grid_of(field), pose, points, np.ascontiguousarray(way), guess)
-
-
-def _sinking(grid: tuple, pose: Transform, nodes: Nodes) -> np.ndarray:
-    """Depth by which skin sinks along its normal if it goes with the tool along the mean normal, (N,) [m].
-
-    On a limb that is no wider than its contact, columns along the normals meet the tool at a slant, and too deep.
-    """
-    depth = nodes.strain * nodes.thickness
-    mean = (nodes.area * depth) @ nodes.inward
-    size = math.sqrt(mean @ mean)
-    if size <= MIN_ONE_WAY_SHARE * float(nodes.area @ depth):
-        return depth
-    cosine = nodes.inward @ (mean / size)
-    way = np.full((len(depth), 3), mean / size)
-    return np.minimum(_depths_along(grid, pose, nodes.points, way, np.maximum(depth * cosine, 1e-9)) * cosine, depth)
 
 
 def grid_of(field: SignedDistance) -> tuple[np.ndarray, np.ndarray, float]:
@@ -210,11 +189,14 @@ def _balls(points, thickness, order):
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _through_box(points, inward, thickness, order, blocks, pose, low, high, centre):
-    """Numbers of the columns, rising, that pass a box of the tool's frame, whose centre is given in the body's."""
-    found, n, radius = np.empty(len(points), np.int64), 0, 0.0
+def _through_box(points, inward, thickness, order, blocks, pose, low, high, reach):
+    """Numbers of the columns, rising, that pass a box of the tool's frame that is made larger by a reach [m]."""
+    found, n, radius, centre = np.empty(len(points), np.int64), 0, 0.0, pose[:3, 3].copy()
+    low, high = low - reach, high + reach
     for x in range(3):
         radius += 0.25 * (high[x] - low[x]) ** 2
+        for y in range(3):
+            centre[x] += pose[x, y] * 0.5 * (low[y] + high[y])
     radius = np.sqrt(radius)
     for block in range(len(blocks)):
         a, b, c = blocks[block, 0] - centre[0], blocks[block, 1] - centre[1], blocks[block, 2] - centre[2]
@@ -245,13 +227,14 @@ def clearances(grid, pose, points, inward, thickness, near, far):
     A column whose core end lies inside the tool counts only if the tool comes from outside: where the distance still
     rises along the inward normal there.
     """
-    out, skin = np.full(len(near), np.inf), np.empty(len(near))
+    out, skin, nearest = np.empty(len(near)), np.empty(len(near)), np.inf
     for n in range(len(near)):
         v = near[n]
         t, ray = thickness[v], ray_of(pose, points, inward, v)
         skin[n] = d = distance_in_column(grid, ray, 0.0)
         if d > t + far:
             out[n] = d - t  # the rest of the column cannot be nearer
+            nearest = min(nearest, out[n])
             continue
         least, s = d, 0.0
         while s < t:
@@ -261,7 +244,54 @@ def clearances(grid, pose, points, inward, thickness, near, far):
         if d <= 0 and distance_in_column(grid, ray, t + 1e-5) < d:
             least = np.inf
         out[n] = least
-    return out, skin
+        nearest = min(nearest, least)
+    return out, skin, nearest
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _squeezed(grid, pose, centre, points, inward, thickness, faces, start, around, slot, near, least, above, hole,
+              stacked):  # fmt: skip
+    """Parts of a Squeeze: vertices, depth, rests, and those of its nodes; their sinking only of a stack.
+
+    Args:
+        centre: middle of the tool, in the body's frame, (3,) [m].
+        near, least, above: what a Clearance knows.
+        hole: distance from which a tool is beside a column [m].
+    """
+    covered, under, wall = near[least < hole], -np.inf, 0.0
+    for n in range(len(near)):
+        under = max(under, -least[n] - max(-above[n], 0.0))
+        wall += WALL * thickness[near[n]] / len(covered) if least[n] < hole else 0.0
+    sunk = under > LEAST_UNDER * wall
+    found, vertices, depth, rests = _cover(grid, pose, points, inward, thickness, faces, start, around, slot, covered,
+                                           sunk)  # fmt: skip
+    nodes = nodes_under(grid, pose, centre, points, inward, thickness, faces, found, sunk)
+    places, ways, heights, areas, strains = nodes[:5]
+    sinking = _sinking(grid, pose, places, ways, heights, areas, strains) if stacked else np.empty(0)
+    return (vertices, depth, rests) + nodes + (sinking,)
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _sinking(grid, pose, points, inward, thickness, area, strain):
+    """Depth by which skin sinks along its normal if it goes with the tool along the mean normal, (N,) [m].
+
+    On a limb that is no wider than its contact, columns along the normals meet the tool at a slant, and too deep.
+    """
+    depth, way, whole = strain * thickness, np.zeros(3), 0.0
+    for n in range(len(depth)):
+        whole += area[n] * depth[n]
+        for x in range(3):
+            way[x] += area[n] * depth[n] * inward[n, x]
+    size = np.sqrt(way[0] * way[0] + way[1] * way[1] + way[2] * way[2])
+    if size <= MIN_ONE_WAY_SHARE * whole:
+        return depth
+    way /= size
+    for n in range(len(depth)):
+        cosine = inward[n, 0] * way[0] + inward[n, 1] * way[1] + inward[n, 2] * way[2]
+        guess = max(depth[n] * cosine, 1e-9)
+        ray = ray_from(pose, points[n, 0], points[n, 1], points[n, 2], way[0], way[1], way[2])
+        depth[n] = min(depth_in_column(grid, ray, 4 * guess, guess) * cosine, depth[n])
+    return depth
 
 
 @numba.njit(cache=True, nogil=True)

@@ -14,6 +14,7 @@ import numpy as np
 
 from stmpl_core.rays import (
     MAX_COLUMN_STRAIN,
+    STEEPEST,
     WALL,
     depth_and_share,
     depth_in_column,
@@ -32,6 +33,7 @@ FACING = 0.35  # cosine between a triangle's normal and the chart's, from which 
 ONE_WAY = 0.6  # size of the mean normal from which one chart begins with it
 CHARTS = 6  # charts of a tool that closes around a limb
 ASKEW = 0.3  # angle between lattice and tool [rad]: no row of a round or square tool's rim comes in all at once
+BESIDE = 0.6  # farthest that a part of a triangle reaches from its middle, over its side
 SAMPLES = 200  # points, about, from which the covered area is reckoned
 
 
@@ -77,11 +79,11 @@ class Nodes(NamedTuple):
             values: pressures at the nodes, (N,).
             areas: areas of all vertices, (V,) [m2].
         """
-        return _gathered(self.corners, self.shares, values * self.area, areas)
+        return gathered(self.corners, self.shares, values * self.area, areas)
 
 
 @numba.njit(cache=True, nogil=True)
-def _gathered(corners, shares, forces, areas):
+def gathered(corners, shares, forces, areas):
     """Numbers of the vertices that forces at nodes press on, and pressures there."""
     some = np.unique(corners)
     sums, count = np.zeros(len(some)), 0
@@ -95,37 +97,33 @@ def _gathered(corners, shares, forces, areas):
     return some[:count].copy(), sums[:count].copy()
 
 
-def nodes_under(grid: tuple, pose: np.ndarray, centre: np.ndarray, skin: tuple, found: np.ndarray,
-                sunk: bool) -> Nodes:  # fmt: skip
-    """Nodes under a tool.
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def nodes_under(grid, pose, centre, points, inward, thickness, faces, found, sunk):
+    """Nodes under a tool, all but their sinking. The lattice is laid twice: at first to see the area as it does.
 
     Args:
         grid: coefficients, origin and spacing of the tool's distance field.
         pose: pose_body_from_tool, (4, 4).
         centre: middle of the tool, in the body's frame, (3,) [m].
-        skin: points, inward normals, thickness and faces of the layer.
+        points, inward, thickness, faces: points, inward normals, thickness and faces of the layer.
         found: numbers of the triangles that the tool may touch, (F,).
         sunk: truth of the claim that the tool is under skin which it does not reach.
     """
-    points, inward, thickness, faces = skin
-    return Nodes(*_nodes(grid, pose, centre, points, inward, thickness, faces, found, sunk))
-
-
-@numba.njit(cache=True, nogil=True)
-def _nodes(grid, pose, centre, points, inward, thickness, faces, found, sunk):
-    """See nodes_under. The lattice is laid twice: first to see the covered area as it does, not as the triangles do."""
     split = 1
     while split < 8 and len(found) * split**2 < SAMPLES:
         split += 1
-    depths, middles, ways, sizes, best, area = _look(
-        grid, pose, points, inward, thickness, faces, found, sunk, split
+    thick = 0.0
+    for f in found:
+        thick += thickness[faces[f, 0]] / len(found)
+    depths, middles, ways, sizes, edges, best, area = _look(
+        grid, pose, points, inward, thickness, faces, found, sunk, split, thick
     )
     rows = np.empty((0, 15))
     if area > 0:
         chart, frames = _charts(pose, found, depths, ways, sizes, best)
         for only_look in (True, False):
-            seen, rows = _lay(grid, pose, centre, points, inward, thickness, faces, found, sunk, depths, middles,
-                              chart, frames, area, only_look)  # fmt: skip
+            seen, rows = _lay(grid, pose, centre, points, inward, thickness, faces, found, sunk, split, thick, depths,
+                              middles, edges, chart, frames, area, only_look)  # fmt: skip
             if only_look:
                 area = seen
                 if area <= 0:
@@ -139,32 +137,25 @@ def _nodes(grid, pose, centre, points, inward, thickness, faces, found, sunk):
             rows[:, 12:15].copy())  # fmt: skip
 
 
-@numba.njit(cache=True, nogil=True)
-def _point(points, faces, f, a, b, c, row):
-    """Writes the point at barycentric coordinates of a triangle to row[:3]."""
-    i, j, k = faces[f, 0], faces[f, 1], faces[f, 2]
-    for x in range(3):
-        row[x] = a * points[i, x] + b * points[j, x] + c * points[k, x]
+@numba.njit(cache=True, inline="always")
+def _between_corners(values, i, j, k, a, b, c):
+    """Vector at barycentric coordinates a, b, c of the triangle of vertices i, j, k, three numbers."""
+    return (a * values[i, 0] + b * values[j, 0] + c * values[k, 0],
+            a * values[i, 1] + b * values[j, 1] + c * values[k, 1],
+            a * values[i, 2] + b * values[j, 2] + c * values[k, 2])  # fmt: skip
 
 
-@numba.njit(cache=True, nogil=True)
-def _column(inward, thickness, faces, f, a, b, c, row):
-    """Writes unit inward normal and thickness at barycentric coordinates of a triangle to row[3:7]."""
-    i, j, k = faces[f, 0], faces[f, 1], faces[f, 2]
-    length = 0.0
-    for x in range(3):
-        row[3 + x] = a * inward[i, x] + b * inward[j, x] + c * inward[k, x]
-        length += row[3 + x] * row[3 + x]
-    length = 1 / np.sqrt(max(length, 1e-300))
-    for x in range(3):
-        row[3 + x] *= length
-    row[6] = a * thickness[i] + b * thickness[j] + c * thickness[k]
+@numba.njit(cache=True, inline="always")
+def _column(inward, thickness, i, j, k, a, b, c):
+    """Unit inward normal and thickness at barycentric coordinates of the triangle of these vertices, four numbers."""
+    x, y, z = _between_corners(inward, i, j, k, a, b, c)
+    length = 1 / np.sqrt(max(x * x + y * y + z * z, 1e-300))
+    return x * length, y * length, z * length, a * thickness[i] + b * thickness[j] + c * thickness[k]
 
 
-@numba.njit(cache=True, nogil=True)
-def _strain_under(grid, pose, row, sunk):
-    """How far the tool squeezes the column at row[:7], over its thickness; rising from 0 beside the tool's walls."""
-    ray, t = ray_from(pose, row[0], row[1], row[2], row[3], row[4], row[5]), row[6]
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _strain_under(grid, ray, t, sunk):
+    """How far the tool squeezes a column, over its thickness; rising from 0 beside the tool's walls."""
     wall = WALL * t
     deep, share = depth_and_share(grid, ray, t, sunk)
     if deep <= 0:
@@ -174,21 +165,27 @@ def _strain_under(grid, pose, row, sunk):
     return share * min(deep / t, MAX_COLUMN_STRAIN)
 
 
-@numba.njit(cache=True, nogil=True)
-def _look(grid, pose, points, inward, thickness, faces, found, sunk, split):
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _look(grid, pose, points, inward, thickness, faces, found, sunk, split, thick):
     """How deep the tool is at parts of the triangles.
 
     Returns:
-        depths: of the middles of the parts of each triangle, (F, P) [m].
+        depths: of the middles of the parts of each triangle, (F, P) [m]; far above a sunk tool only that it is so.
         middles: these places, (F, P, 3) [m].
         ways: inward normals of the triangles, (F, 3).
         sizes: areas of the parts, (F,) [m2].
+        edges: their sides, (F,) [m].
         best: place in `found` of the deepest.
         area: area that is covered [m2]; a small share of what is near, where the tool touches between the middles.
     """
-    many, parts, row = len(found), split * split, np.empty(15)
+    many, parts = len(found), split * split
     depths, middles, ways = np.empty((many, parts)), np.empty((many, parts, 3)), np.empty((many, 3))
-    sizes, deepest, best = np.empty(many), -np.inf, 0
+    sizes, edges, shares, deepest, best = np.empty(many), np.empty(many), np.empty((parts, 2)), -np.inf, 0
+    for p in range(split):
+        for r in range(split - p):
+            for flip in range(2 if r < split - p - 1 else 1):
+                q = _part(p, r, flip, split)
+                shares[q, 0], shares[q, 1] = (p + (1 + flip) / 3) / split, (r + (1 + flip) / 3) / split
     for m in range(many):
         f = found[m]
         i, j, k = faces[f, 0], faces[f, 1], faces[f, 2]
@@ -197,44 +194,53 @@ def _look(grid, pose, points, inward, thickness, faces, found, sunk, split):
         cx, cy, cz = ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx
         size = np.sqrt(cx * cx + cy * cy + cz * cz)
         ways[m, 0], ways[m, 1], ways[m, 2] = -cx / size, -cy / size, -cz / size
-        sizes[m] = 0.5 * size / parts
-        q = 0
-        for p in range(split):
-            for r in range(split - p):
-                for flip in range(2):
-                    if flip == 1 and r == split - p - 1:
-                        continue
-                    a, b = (p + (1 + flip) / 3) / split, (r + (1 + flip) / 3) / split
-                    _point(points, faces, f, a, b, 1 - a - b, row)
-                    if sunk:
-                        _column(inward, thickness, faces, f, a, b, 1 - a - b, row)
-                    depths[m, q] = _depth_at(grid, pose, row, sunk)
-                    for x in range(3):
-                        middles[m, q, x] = row[x]
-                    if depths[m, q] > deepest:
-                        deepest, best = depths[m, q], m
-                    q += 1
+        sizes[m], edges[m] = 0.5 * size / parts, np.sqrt((ax * ax + ay * ay + az * az) / parts)
+        for q in range(parts):
+            a, b = shares[q, 0], shares[q, 1]
+            x, y, z = _between_corners(points, i, j, k, a, b, 1 - a - b)
+            depth = -_distance(grid, pose, x, y, z)
+            if sunk and depth < 0:
+                n0, n1, n2, t = _column(inward, thickness, i, j, k, a, b, 1 - a - b)
+                least = -BESIDE * edges[m] - WALL * thick
+                depth = _inside(grid, ray_from(pose, x, y, z, n0, n1, n2), t, depth, least)
+            depths[m, q], middles[m, q, 0], middles[m, q, 1], middles[m, q, 2] = depth, x, y, z
+            if depth > deepest:
+                deepest, best = depth, m
     area = 0.0
     for m in range(many):
         blur = 0.5 * np.sqrt(sizes[m])
         blur = min(blur, 0.5 * deepest) if deepest > 0 else blur
         for q in range(parts):
             area += min(max(0.5 + depths[m, q] / blur, 0.0), 1.0) * sizes[m]
-    return depths, middles, ways, sizes, best, area if deepest > 0 else 0.05 * area
+    return depths, middles, ways, sizes, edges, best, area if deepest > 0 else 0.05 * area
 
 
-@numba.njit(cache=True, nogil=True)
-def _depth_at(grid, pose, row, sunk):
-    """Depth of the skin at row[:3] in the tool [m], or where the tool has sunk under it, of its column, row[3:7]."""
-    x, y, z = to_tool(pose, row[0], row[1], row[2])
-    depth = -distance_at(grid[0], grid[1], grid[2], x, y, z)
-    if sunk and depth < 0:
-        ray = ray_from(pose, row[0], row[1], row[2], row[3], row[4], row[5])
-        return max(depth, inside_most(grid, ray, max(depth_in_column(grid, ray, row[6], 0.0), 0.5 * row[6])))
-    return depth
+@numba.njit(cache=True, inline="always")
+def _part(p, r, flip, split):
+    """Number of the part of a triangle at steps p and r to its first two corners; flip 1: beyond its diagonal."""
+    return p * (2 * split - p) + 2 * r + flip
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, inline="always")
+def _distance(grid, pose, x, y, z):
+    """Distance of a point of the body's frame to the tool [m]."""
+    x, y, z = to_tool(pose, x, y, z)
+    return distance_at(grid[0], grid[1], grid[2], x, y, z)
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _inside(grid, ray, t, depth, least):
+    """How far the column gets into a tool that has sunk under skin which it does not reach [m].
+
+    Args:
+        ray, t: column, and its thickness.
+        depth: depth of its skin in the tool [m], below 0.
+        least: depth up to which the answer does not matter.
+    """
+    return inside_most(grid, ray, max(depth_in_column(grid, ray, t, 0.0, 0.5 * t), 0.5 * t), depth, least)
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _charts(pose, found, depths, ways, sizes, best):
     """The side of the limb that each triangle is on, (F,), and axes across each: first, second, inward, (C, 3, 3).
 
@@ -278,19 +284,16 @@ def _charts(pose, found, depths, ways, sizes, best):
     return chart, frames
 
 
-@numba.njit(cache=True, nogil=True)
-def _lay(grid, pose, centre, points, inward, thickness, faces, found, sunk, depths, middles, chart, frames, area,
-         only_look):  # fmt: skip
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _lay(grid, pose, centre, points, inward, thickness, faces, found, sunk, split, thick, depths, middles, edges,
+         chart, frames, area, only_look):  # fmt: skip
     """Lays a lattice about the tool's middle on each side, for a covered area [m2].
 
     Returns:
         area: area that is covered, as the lattice sees it [m2]; it does not depend on the triangles.
         rows: rows of Nodes: point, inward, thickness, area, strain, corners, shares, (N, 15), unless only to look.
     """
-    out, count, row, sum_area, deepest = np.empty((128, 15)), 0, np.empty(15), 0.0, depths.max()
-    thick = 0.0
-    for m in range(len(found)):
-        thick += thickness[faces[found[m], 0]] / len(found)
+    out, count, sum_area, deepest = np.empty((128, 15)), 0, 0.0, depths.max()
     cell = area / NODES
     if only_look:  # a spacing of a few steps only, so that the lattice stays as it is while the tool moves
         cell = 0.5 * thick * thick * 2.0 ** np.floor(np.log2(cell / (thick * thick)))
@@ -302,14 +305,11 @@ def _lay(grid, pose, centre, points, inward, thickness, faces, found, sunk, dept
         near = np.zeros(len(found), np.bool_)
         reach = np.array([np.inf, np.inf, -np.inf, -np.inf])
         for m in range(len(found)):
-            f, edge = found[m], 0.0
+            edge = edges[m]
             if chart[m] != side:
                 continue
-            for x in range(3):
-                edge += (points[faces[f, 0], x] - points[faces[f, 1], x]) ** 2
-            edge = np.sqrt(edge / depths.shape[1])
             for q in range(depths.shape[1]):
-                if depths[m, q] > -0.6 * edge - WALL * thick:  # a part may reach that far beyond its middle
+                if depths[m, q] > -BESIDE * edge - WALL * thick:
                     near[m] = True
                     u = v = 0.0
                     for x in range(3):
@@ -335,12 +335,13 @@ def _lay(grid, pose, centre, points, inward, thickness, faces, found, sunk, dept
         for m in range(len(found)):
             if not near[m]:
                 continue
-            f = found[m]
+            f0, f1, f2 = faces[found[m], 0], faces[found[m], 1], faces[found[m], 2]
+            border = 0.5 * blur if only_look else WALL * max(thickness[f0], thickness[f1], thickness[f2])
             for c in range(3):
                 uv[c, 0], uv[c, 1] = -start[0], -start[1]
                 for x in range(3):
-                    uv[c, 0] += first[x] * (points[faces[f, c], x] - centre[x])
-                    uv[c, 1] += second[x] * (points[faces[f, c], x] - centre[x])
+                    uv[c, 0] += first[x] * (points[faces[found[m], c], x] - centre[x])
+                    uv[c, 1] += second[x] * (points[faces[found[m], c], x] - centre[x])
             bx, by, cx, cy = uv[1, 0] - uv[0, 0], uv[1, 1] - uv[0, 1], uv[2, 0] - uv[0, 0], uv[2, 1] - uv[0, 1]
             double = bx * cy - cx * by
             from_row = max(low, int(np.ceil((uv[0, 1] + min(0.0, by, cy)) / rise - 1e-9)))
@@ -360,26 +361,43 @@ def _lay(grid, pose, centre, points, inward, thickness, faces, found, sunk, dept
                     if a < -1e-9 or b < -1e-9 or c < -1e-9:
                         continue
                     taken[j - low, i - left] = True
-                    _point(points, faces, f, a, b, c, row)
-                    if sunk or not only_look:
-                        _column(inward, thickness, faces, f, a, b, c, row)
+                    x, y, z = _between_corners(points, f0, f1, f2, a, b, c)
+
+                    share = -1.0
+                    if not sunk:  # what is known of the middle of its part may say enough
+                        p = min(max(int(a * split), 0), split - 1)
+                        o = min(max(int(b * split), 0), split - 1 - p)
+                        flip = 1 if o < split - 1 - p and a * split - p + b * split - o > 1 else 0
+                        q = _part(p, o, flip, split)
+                        away = STEEPEST * np.sqrt((x - middles[m, q, 0]) ** 2 + (y - middles[m, q, 1]) ** 2
+                                                  + (z - middles[m, q, 2]) ** 2)  # fmt: skip
+                        if depths[m, q] + away < -border:
+                            continue
+                        if depths[m, q] - away > border:
+                            share = 1.0
+                    if only_look and share < 0:
+                        depth = -_distance(grid, pose, x, y, z)
+                        if sunk and depth < 0:
+                            n0, n1, n2, t = _column(inward, thickness, f0, f1, f2, a, b, c)
+                            depth = _inside(grid, ray_from(pose, x, y, z, n0, n1, n2), t, depth, -border)
+                        share = min(max(0.5 + depth / blur, 0.0), 1.0)
+                        if share <= 0:
+                            continue
+                    n0, n1, n2, t = _column(inward, thickness, f0, f1, f2, a, b, c)
+                    part = cell / max(n0 * way[0] + n1 * way[1] + n2 * way[2], FACING)
                     if only_look:
-                        share = min(max(0.5 + _depth_at(grid, pose, row, sunk) / blur, 0.0), 1.0)
-                        if share > 0:
-                            if not sunk:  # else it is there already
-                                _column(inward, thickness, faces, f, a, b, c, row)
-                            sum_area += share * cell / max(row[3] * way[0] + row[4] * way[1] + row[5] * way[2], FACING)
+                        sum_area += share * part
                         continue
-                    row[7] = cell / max(row[3] * way[0] + row[4] * way[1] + row[5] * way[2], FACING)
-                    row[8] = _strain_under(grid, pose, row, sunk)
-                    if row[8] <= 0:
+                    strain = _strain_under(grid, ray_from(pose, x, y, z, n0, n1, n2), t, sunk)
+                    if strain <= 0:
                         continue
-                    row[9], row[10], row[11] = faces[f, 0], faces[f, 1], faces[f, 2]
-                    row[12], row[13], row[14] = a, b, c
                     if count == len(out):
                         longer = np.empty((2 * count, 15))
                         longer[:count] = out
                         out = longer
-                    out[count] = row
+                    row = out[count]
+                    row[0], row[1], row[2], row[3], row[4], row[5], row[6] = x, y, z, n0, n1, n2, t
+                    row[7], row[8], row[9], row[10], row[11] = part, strain, f0, f1, f2
+                    row[12], row[13], row[14] = a, b, c
                     count += 1
     return sum_area, out[:count].copy()

@@ -10,6 +10,7 @@ from stmpl_core.sdf import distance_at
 WALL = 0.05  # width over which depth rises beside a tool's wall, over the thickness: nothing pops in while it slides
 PASSED = 6  # places along a column at which it is looked how far it is inside a tool, or passes beside it
 MAX_COLUMN_STRAIN = 0.9  # strain beyond which no column is squeezed
+STEEPEST = 1.5  # slope that a distance field does not exceed on its way to 0 [-]; its spline's is above 1 beside edges
 SECANT_START = 3e-3  # distance to the tool, over the thickness, at which the secant rule takes over from sphere tracing
 SECANT_TOLERANCE = 4e-4  # largest last step of the secant rule, likewise; the depth is then known far better
 
@@ -42,12 +43,13 @@ def distance_in_column(grid, ray, s):
     return distance_at(grid[0], grid[1], grid[2], ray[0] + s * ray[3], ray[1] + s * ray[4], ray[2] + s * ray[5])
 
 
-@numba.njit(cache=True)
-def depth_in_column(grid, ray, t, guess):
+@numba.njit(cache=True, error_model="numpy")
+def depth_in_column(grid, ray, t, guess, least=0.0):
     """How deep along a ray, from the skin inwards, the tool ends [m]; 0 if it is not met.
 
     From a guess above WALL of the thickness by the secant rule. Where that goes astray, as along a wall of the tool, or
-    without such a guess: from the core by sphere tracing, then the secant rule.
+    without such a guess: from the core by sphere tracing, then the secant rule. Where the depth is not above `least`,
+    any up to that is told.
     """
     if guess > WALL * t:
         s, d = guess, distance_in_column(grid, ray, guess)
@@ -71,6 +73,8 @@ def depth_in_column(grid, ray, t, guess):
         if s - d > 0 and d > SECANT_START * t:
             last_s, last_d = s, d
             s -= d
+            if s <= least:
+                return least
         else:
             slope = (d - last_d) / (s - last_s)
             following = s - d / slope if slope > 0.2 else s - d
@@ -84,16 +88,24 @@ def depth_in_column(grid, ray, t, guess):
     return min(s, t)
 
 
-@numba.njit(cache=True)
-def inside_most(grid, ray, deep):
-    """How far inside the tool a ray gets at most on its way to a depth [m]; below 0: how far it passes beside it."""
-    most = -distance_in_column(grid, ray, 0.0)
+@numba.njit(cache=True, error_model="numpy")
+def inside_most(grid, ray, deep, most, least):
+    """How far inside the tool a ray gets at most on its way to a depth [m]; below 0: how far it passes beside it.
+
+    Args:
+        most: how far inside it begins [m].
+        least: value up to which the answer does not matter [m].
+    """
+    at, there = 0.0, most
     for k in range(1, PASSED + 1):
-        most = max(most, -distance_in_column(grid, ray, deep * k / (PASSED + 1)))
+        s = deep * k / (PASSED + 1)
+        if there + STEEPEST * (s - at) > max(most, least):
+            at, there = s, -distance_in_column(grid, ray, s)
+            most = max(most, there)
     return most
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, error_model="numpy")
 def depth_and_share(grid, ray, t, sunk):
     """How deep the tool is in a column [m], and the share of that which counts: rising from 0 over WALL at its skin.
 
@@ -105,7 +117,7 @@ def depth_and_share(grid, ray, t, sunk):
         return 0.0, 0.0
     deep = depth_in_column(grid, ray, t, guess)
     if share < 1 and sunk and deep > 0:
-        share = min(max(share, 2 * inside_most(grid, ray, deep) / wall), 1.0)
+        share = min(max(share, 2 * inside_most(grid, ray, deep, guess, 0.5 * share * wall) / wall), 1.0)
     return deep, share
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from copy import copy
-from dataclasses import replace
 from typing import TYPE_CHECKING, NamedTuple
 
 import numba
@@ -19,7 +18,7 @@ from stmpl_core.deep import DEEPEST, Deep
 from stmpl_core.footing import curvature_at
 from stmpl_core.layer import SoftLayer
 from stmpl_core.moments import Surroundings
-from stmpl_core.nodes import Nodes
+from stmpl_core.nodes import Nodes, gathered
 from stmpl_core.obstacle import REACH
 from stmpl_core.sdf import SignedDistance
 from stmpl_core.tools import Tools
@@ -175,7 +174,7 @@ class Toucher:
             pose = shifted(pose, tried / math.sqrt(stated @ stated) * stated)
         reach = 0.0 if contact.wrench is None else self.reach + self._thickest
         clearance = self._clearance(field, pose, reach, many)
-        depth = -float(clearance.least.min(initial=np.inf))
+        depth = -clearance.nearest
 
         def nothing(status: str) -> _Placed:
             around = -float(clearance.skin.min(initial=np.inf))
@@ -217,11 +216,10 @@ class Toucher:
         """
         far = self.hole
         found = self._cleared(field, pose, far, far, many)
-        if found.least.min(initial=np.inf) > 0 and reach > 0:
+        if found.nearest > 0 and reach > 0:
             far += reach
             found = self._cleared(field, pose, far, far, many)
-        return found if found.least.min(initial=np.inf) < far else \
-            self._cleared(field, pose, far + self._thickest, far, many)
+        return found if found.nearest < far else self._cleared(field, pose, far + self._thickest, far, many)
 
     def _cleared(self, field: SignedDistance, pose: Transform, within: float, far: float,
                  many: bool = False) -> Clearance:  # fmt: skip
@@ -229,8 +227,7 @@ class Toucher:
 
     def _depth(self, squeeze: Squeeze) -> float:
         """Depth of the deepest column [m]."""
-        nodes = squeeze.nodes
-        return max(float(squeeze.depth.max(initial=0.0)), float((nodes.strain * nodes.thickness).max(initial=0.0)))
+        return _deepest(squeeze.depth, squeeze.nodes.strain, squeeze.nodes.thickness)
 
     def _gap(self, field: SignedDistance, pose: Transform, clearance: Clearance, force: np.ndarray) -> float | None:
         """How far a tool that is apart must go along `force` to be 0 from the skin that faces it, by sphere tracing.
@@ -238,14 +235,13 @@ class Toucher:
         0 where it touches. A tool that passes between vertices stops where it is nearest. None: it comes no nearer
         than a hole of the mesh within `reach` [m].
         """
-        if clearance.least.min(initial=np.inf) <= 0:
+        if clearance.nearest <= 0:
             return 0.0
         push = force / np.linalg.norm(force)
         facing = clearance.vertices[self._inward[clearance.vertices] @ push > MIN_FACING_COSINE]
         moved, best, nearest = 0.0, None, self.hole
         while moved <= self.reach:
-            there = self.columns.clearance(field, shifted(pose, moved * push), facing, self.reach + self.hole)
-            gap = float(there.least.min(initial=np.inf))
+            gap = self.columns.clearance(field, shifted(pose, moved * push), facing, self.reach + self.hole).nearest
             if gap < nearest:
                 best, nearest = moved, gap
             if gap < GAP_TOLERANCE_M:
@@ -327,37 +323,29 @@ class Toucher:
 
     def _answer(self, one: _Placed, held: Held, alone: bool) -> Touch:
         """What a placed tool does, scaled to its wrench, with what may be believed of it."""
-        layer, nodes = self.layer, one.squeeze.nodes
-        there = held.pressure * (one.factor * self._modulus)
-        v, pressure = nodes.at_vertices(there, layer.vertex_areas)
-        wrench = _wrench(pressure, v, layer.vertices, layer.vertex_area_vectors, one.pose[:3, 3])
-        scale = 1.0
-        if one.force is not None and len(v):
-            scale = one.force / max(math.sqrt(wrench[:3] @ wrench[:3]), 1e-300)
-            pressure, wrench = scale * pressure, scale * wrench
-        values = np.zeros(len(layer.vertices))
-        values[v] = pressure
+        layer, nodes, unit = self.layer, one.squeeze.nodes, one.factor * self._modulus
+        v, pressure, values, wrench, forces, scale, size, doubt, strange = _carried(
+            nodes.corners, nodes.shares, nodes.area, *held[:3], unit, math.nan if one.force is None else one.force,
+            layer.vertex_areas, layer.vertices, layer.vertex_area_vectors, one.pose[:3, 3])  # fmt: skip
         stated = one.contact.wrench
         depth = self._depth(one.squeeze) if len(v) and not one.factor > 1 else one.depth
         way = stated[:3] / np.linalg.norm(stated[:3]) if stated is not None and stated[:3].any() else None
-        size, known = math.sqrt(wrench[:3] @ wrench[:3]), self.net.weights.card["bound"]
-        doubt = scale * one.factor * self._modulus * float(held.doubt @ nodes.area) / max(size, 1e-300)
+        known = self.net.weights.card["bound"]
         doubt += held.power * one.field.surface_error / max(depth, one.field.surface_error)  # how well depth is known
-        forces_there = there * nodes.area
         if "uneven" in known and size > 0:
-            doubt = math.hypot(doubt, known["uneven"] * self.net.unlike(nodes, forces_there))
-        strange = float(forces_there @ held.outside) / max(float(forces_there.sum()), 1e-300)
+            doubt = math.hypot(doubt, known["uneven"] * self.net.unlike(nodes, forces))
         touch = Touch(
             one.contact.name, one.status, one.pose, wrench,
-            depth=depth if np.isfinite(depth) else float("nan"),
+            depth=depth if math.isfinite(depth) else float("nan"),
             force_bound=size * known["scale"] * doubt ** known["power"] if size > 0 else 0.0,
             moved=one.moved,
             missing=np.zeros(6) if stated is None else stated - wrench,
             pressure=values,
-            pressed=Pressed(one.field, one.squeeze, way, one.factor, scale * forces_there, held.power * STIFFER)
+            pressed=Pressed(one.field, one.squeeze, way, one.factor, scale * forces, held.power * STIFFER)
             if len(v) else None,
         )  # fmt: skip
-        return replace(touch, trust=self._trust(one, touch, v, pressure, strange, alone))
+        object.__setattr__(touch, "trust", self._trust(one, touch, v, pressure, strange, alone))  # nobody has it yet
+        return touch
 
     def _trust(self, one: _Placed, touch: Touch, vertices: np.ndarray, pressure: np.ndarray, strange: float,
                alone: bool) -> Trust:  # fmt: skip
@@ -378,7 +366,7 @@ class Toucher:
         if ratio > highest:
             trust = trust.also(f"{name} presses with p/E = {ratio:.2g}; contacts were learnt up to {highest:.2g}",
                                in_range=False)  # fmt: skip
-        deepest = touch.depth / float(one.squeeze.nodes.thickness.mean())
+        deepest = touch.depth / (float(one.squeeze.nodes.thickness.sum()) / len(one.squeeze.nodes.thickness))
         if deepest > card["ranges"]["depth_over_thickness"][1] and one.status != IN_CORE:
             trust = trust.also(f"{name} presses to {deepest:.0%} of the thickness, learnt is "
                                f"{card['ranges']['depth_over_thickness'][1]:.0%}", in_range=False)  # fmt: skip
@@ -445,8 +433,8 @@ def groups_of(points: Sequence[np.ndarray], thickness: float) -> list[list[int]]
         return [[0]] if len(points) else []
     groups: list[tuple[list[int], list[tuple[np.ndarray, float]]]] = []
     for n, some in enumerate(points):
-        middle = some.mean(axis=0)
-        ball = middle, float(np.linalg.norm(some - middle, axis=1).max()) + 0.5 * REACH * thickness
+        middle, radius = _ball_around(some)
+        ball = middle, radius + 0.5 * REACH * thickness
         near = [group for group in groups
                 if any(np.linalg.norm(middle - other) < ball[1] + size for other, size in group[1])]  # fmt: skip
         groups = [group for group in groups if group not in near]
@@ -454,7 +442,73 @@ def groups_of(points: Sequence[np.ndarray], thickness: float) -> list[list[int]]
     return [sorted(group) for group, _ in groups]
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, nogil=True)
+def _ball_around(points):
+    """Middle of points (N, 3), and the distance of the farthest from it [m]."""
+    middle, square = np.zeros(3), 0.0
+    for n in range(len(points)):
+        for x in range(3):
+            middle[x] += points[n, x] / len(points)
+    for n in range(len(points)):
+        a, b, c = points[n, 0] - middle[0], points[n, 1] - middle[1], points[n, 2] - middle[2]
+        square = max(square, a * a + b * b + c * c)
+    return middle, np.sqrt(square)
+
+
+@numba.njit(cache=True, nogil=True)
+def _deepest(depth, strain, thickness):
+    """Depth of the deepest column, of vertices or nodes [m]; numpy's own calls take three times as long."""
+    deepest = 0.0
+    for n in range(len(depth)):
+        deepest = max(deepest, depth[n])
+    for n in range(len(strain)):
+        deepest = max(deepest, strain[n] * thickness[n])
+    return deepest
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _carried(corners, shares, area, held, doubts, outside, unit, carries, areas, points, area_vectors, origin):
+    """What the pressure at contact nodes amounts to.
+
+    Args:
+        corners, shares, area: those of Nodes.
+        held, doubts, outside: those of a Held.
+        unit: modulus that they are told over [Pa].
+        carries: force that all is scaled to [N]; NaN: none.
+        areas, points, area_vectors: of all vertices.
+        origin: point about which torque is told, (3,) [m].
+
+    Returns:
+        vertices, pressure: numbers of the vertices that are pressed on, and pressures there, (M,) [Pa].
+        values: pressures at all vertices, (V,) [Pa].
+        wrench: force [N] and torque [N m], (6,).
+        forces: forces at the nodes before they are scaled, (N,) [N].
+        scale: factor on what the nodes are held with.
+        size: size of the force [N].
+        doubt: error to expect of it, over it.
+        strange: share of it that nodes carry that see what no training contact had.
+    """
+    forces, doubt, strange, total = np.empty(len(area)), 0.0, 0.0, 0.0
+    for n in range(len(area)):
+        forces[n] = held[n] * unit * area[n]
+        doubt += doubts[n] * area[n]
+        strange += forces[n] if outside[n] else 0.0
+        total += forces[n]
+    vertices, pressure = gathered(corners, shares, forces, areas)
+    wrench = _wrench(pressure, vertices, points, area_vectors, origin)
+    size = np.sqrt(wrench[0] * wrench[0] + wrench[1] * wrench[1] + wrench[2] * wrench[2])
+    scale = carries / max(size, 1e-300) if len(vertices) and carries == carries else 1.0
+    values, size = np.zeros(len(areas)), scale * size
+    for x in range(6):
+        wrench[x] *= scale
+    for n in range(len(vertices)):
+        pressure[n] *= scale
+        values[vertices[n]] = pressure[n]
+    return (vertices, pressure, values, wrench, forces, scale, size, scale * unit * doubt / max(size, 1e-300),
+            strange / max(total, 1e-300))  # fmt: skip
+
+
+@numba.njit(cache=True, nogil=True)
 def _wrench(pressure, vertices, points, area_vectors, origin):
     """Force and torque about a point, (6,), of pressures (N,) at vertices (N,)."""
     out, f, arm = np.zeros(6), np.empty(3), np.empty(3)
