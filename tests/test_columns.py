@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from stmpl_core import Tool
-from stmpl_core.columns import Columns, Squeeze
+from stmpl_core.columns import Columns, Squeeze, grid_of
 from stmpl_core.methods.winkler import column_pressure
 from stmpl_core.nodes import NODES
-from stmpl_core.rays import MAX_COLUMN_STRAIN
+from stmpl_core.rays import MAX_COLUMN_STRAIN, PASSED, inside_most
 from stmpl_core.sdf import SignedDistance
 from tests.scenes import LENGTH, RADIUS, at, ball, box, capsule, enlarged, limb, placed, plate, punch, scaled, turn
 
@@ -221,3 +221,15 @@ def test_clearance_is_the_least_distance_along_the_column(round_limb: Columns) -
     known = np.minimum(clearance.least, far)  # outside, the skin is nearest
     np.testing.assert_allclose(known[facing], np.minimum(exact, far)[facing], atol=1e-9)
     assert (clearance.least <= clearance[2] + 1e-12).all()
+
+
+@pytest.mark.parametrize("least", [-np.inf, -1e-3])
+def test_places_along_a_column_that_are_not_looked_at_are_not_the_deepest(least: float) -> None:
+    rng, deep = np.random.default_rng(5), 4e-3
+    starts, ways = rng.uniform(-0.02, 0.02, (2000, 3)) * (1, 1, 0.3), rng.normal(size=(2000, 3))
+    ways /= np.linalg.norm(ways, axis=1, keepdims=True)
+    at = starts[:, None] + deep * np.arange(PASSED + 1)[:, None] / (PASSED + 1) * ways[:, None]
+    inside = -SLAB.distance(at.reshape(-1, 3)).reshape(2000, -1)
+    found = [inside_most(grid_of(SLAB), (*start, *way), deep, first, least)
+             for start, way, first in zip(starts, ways, inside[:, 0], strict=True)]  # fmt: skip
+    assert np.maximum(found, least) == pytest.approx(np.maximum(inside.max(axis=1), least), abs=1e-12)
