@@ -15,6 +15,7 @@ from stmpl_core.local_contact import LocalContact
 PAYBACK_S = 4e-3  # time in which the damper takes back what was given out
 FORGETS_S = 0.3  # time in which a surplus of paid work is forgotten
 SPARED = 0.05  # share of what is stored that must not be paid for: between it and nothing models are rounded
+MUST_BE_PAID = 0.5  # share of what is stored, below which the wrench falls with what was paid
 
 
 class PassiveContact:
@@ -27,7 +28,8 @@ class PassiveContact:
 
     is below 0 by that. A damper then takes it back along the tool's motion, with -B / (v^2 T), T = 4 ms, up to
     `most_damping`; a surplus beyond half of what S was in the last FORGETS_S is forgotten, so that what was lost before
-    pays for nothing now.
+    pays for nothing now. Where less than half of S was paid, B + S < S / 2, the wrench is (B + S) / (S / 2) of what the
+    model says: a softer spring, which never gives back more than was put in.
 
     Args:
         most_damping: largest damping that may be added [N s/m]. A robot of effective mass m and sample time T bears
@@ -37,6 +39,7 @@ class PassiveContact:
     Attributes:
         balance: B [J].
         damping: damping that is added now [N s/m].
+        share: share of the model's wrench that is rendered now [-]; below 1 too little was put in for all of it.
 
     Raises:
         InvalidInput: settings that are not above 0.
@@ -47,7 +50,7 @@ class PassiveContact:
             if not (math.isfinite(value) and value > 0):
                 raise InvalidInput(f"{name} is {value}; it must be finite and above 0.")
         self.most_damping, self.stale_after = most_damping, stale_after
-        self.balance = self.damping = 0.0
+        self.balance, self.damping, self.share = 0.0, 0.0, 1.0
         self._model: LocalContact | None = None
         self._pose: Transform | None = None
         self._begun = False
@@ -79,8 +82,12 @@ class PassiveContact:
             if not self._begun:  # a device that begins in contact owes nothing for what was stored before
                 self._begun, self._stored = True, stored
         twist = np.zeros(6) if self._pose is None else twist_between(self._pose, pose)
-        work = 0.5 * float((self._wrench + wrench) @ twist)
+        half = 0.5 * float(self._wrench @ twist)
         self._surplus = max(0.5 * stored, self._surplus * math.exp(-dt / FORGETS_S))
+        paid = self.balance + self._stored + half + 0.5 * self.share * float(wrench @ twist)
+        self.share = min(max(paid / (MUST_BE_PAID * stored), 0.0), 1.0) if stored > 0 else 1.0
+        wrench *= self.share
+        work = half + 0.5 * float(wrench @ twist)
         self.balance = min(self.balance + work - (stored - self._stored), self._surplus)
         self._stored, self._pose, self.damping = stored, pose, 0.0
         velocity = twist[:3] / dt

@@ -68,7 +68,7 @@ def test_late_models_by_themselves_do_give_energy(place: Place) -> None:
     assert run(place, ForceControl(15.0), LATE, Bare()).gained > 0.01
 
 
-@pytest.mark.parametrize("force", [5.0, 10.0])
+@pytest.mark.parametrize("force", [5.0, 10.0, 20.0])
 def test_a_set_force_settles_on_a_forearm_under_late_models(place: Place, force: float) -> None:
     one = run(place, ForceControl(force), LATE, PassiveContact(MOST_DAMPING))
     held = one.during(1.6, 2.0)
