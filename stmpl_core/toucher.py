@@ -298,7 +298,8 @@ class Toucher:
             deep = self._depth(squeeze)
             power = held.power * STIFFER
             if last is not None and abs(deep / last[0] - 1) > 1e-6:
-                power = float(np.clip(np.log(size / last[1]) / np.log(deep / last[0]), *POWERS))
+                power = float(np.log(size / last[1]) / np.log(deep / last[0]))
+            power = min(max(power, POWERS[0]), POWERS[1])
             gain = max(normal / float(np.linalg.norm(force)), MIN_FACING_COSINE)
             further = deep * ((normal / size) ** (1 / power) - 1) / gain
             if abs(size / normal - 1) < FORCE_TOLERANCE or abs(further) < LEAST_STEP * self._thickest:

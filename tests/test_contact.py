@@ -507,6 +507,16 @@ def test_a_sheet_that_lies_under_the_skin_is_flagged() -> None:
     assert "thin beside the skin's edges" in touch.trust.why and not touch.trust.in_range
 
 
+@pytest.mark.parametrize("power", [-2e-7, 1e-9, 1e9])
+def test_a_power_that_is_none_leaves_a_light_force_on_a_deep_tool_answered(power: float, monkeypatch) -> None:
+    """Found by fuzz: of a wild stack the linear response said -2e-7, and 1e-8 N of 5e10 N overflowed."""
+    toucher = Toucher(limb(4e-3, radius=0.04, length=0.12))
+    hold = toucher.net.hold
+    monkeypatch.setattr(toucher.net, "hold", lambda nodes: hold(nodes)._replace(power=power))
+    touch = toucher.touch(press(ball(0.015), at(0.055 - 2e-3, 0, 0.06), (-1e-9, 0, 0)))
+    assert touch.status == TOUCHING and touch.force == pytest.approx(1e-9, rel=0.03)
+
+
 @pytest.mark.parametrize("thick", [0.03, 0.04])
 def test_no_force_presses_a_tool_through_the_limb(thick: float) -> None:
     """Of a flat limb that is thinner where it is pressed: a trial that goes through to the far side is too deep."""
