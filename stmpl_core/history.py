@@ -107,7 +107,6 @@ class _Dragged(NamedTuple):
         limit: tangential force at which all of it slides [N].
         stiffness: of the patch, (3,) [N/m]; see Memory, as springs and relaxed.
         stored: energy that the bent skin stores [J].
-        lean: force by which the push leans, since the skin came from where the limb faces another way, (3,) [N].
     """
 
     slip: Slip
@@ -116,7 +115,6 @@ class _Dragged(NamedTuple):
     springs: np.ndarray
     relaxed: np.ndarray
     stored: float
-    lean: np.ndarray
 
 
 class History:
@@ -278,7 +276,8 @@ class History:
         if self.friction(touch.name) > 0 and net > MIN_ONE_WAY_SHARE:
             give, bend = self._give(nodes, pressed.forces), self.toucher.curvature(nodes, pressed.forces)
             dragged = self._dragged(one, wrench, contact, pose[:3, 3], scalars, force, lever, thickness, give, bend, dt)
-            wrench = wrench + np.concatenate([dragged.lean, np.cross(middle - pose[:3, 3], dragged.lean)])
+            lean = dragged.slip.lean
+            wrench = wrench + np.concatenate([lean, np.cross(middle - pose[:3, 3], lean)])
             if self.toucher.layer.tissue.skin is not None:
                 rubs = dragged.slip.wrench[:3]
                 pressing = math.sqrt(wrench[:3] @ wrench[:3])
@@ -364,7 +363,7 @@ class History:
         size = math.sqrt(turned @ turned)
         lean = math.sqrt(wrench[:3] @ wrench[:3]) * min(1.0, MOST_LEAN / max(size, 1e-300)) * turned
         stored += 0.5 * max(float(lean @ offset), 0.0)
-        return _Dragged(Slip(rubs, share, offset, turn, contact[0]), cap, stiffness, springs, relaxed, stored, lean)
+        return _Dragged(Slip(rubs, share, offset, turn, contact[0], lean), cap, stiffness, springs, relaxed, stored)
 
     def _said(self, one: _Asked, touch: Touch, changed: dict[str, Any]) -> Touch:
         """The touch with what changed, with what of the stated wrench is missing, and what that says of it."""
@@ -512,5 +511,5 @@ def _balanced(asked: Sequence[_Asked], laws: Sequence[_Law]) -> tuple[list[Touch
 
 
 def _weakened(touch: Touch, by: float) -> Touch:
-    slip = touch.slip and touch.slip._replace(wrench=touch.slip.wrench * by)
+    slip = touch.slip and touch.slip._replace(wrench=touch.slip.wrench * by, lean=touch.slip.lean * by)
     return replace(touch, **_scaled(touch, by, 0.0), slip=slip, passive=by)

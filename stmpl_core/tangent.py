@@ -108,7 +108,8 @@ def _of_group(toucher: Toucher, touches: Sequence[Touch]) -> list[Tangent]:
         corners = by[:, :, :, None] * every[k].shares  # force at each
         corners[k] += one.forces[:, None] * rates[k].shares
         turned = (corners.reshape(len(touches), 6, -1) @ unit).transpose(0, 2, 1).copy()
-        turned[k, 3:, :3] += _cross_matrix(touch.push)
+        lean = 0.0 if touch.slip is None else touch.slip.lean  # its arm goes along with the contact
+        turned[k, 3:, :3] += _cross_matrix(touch.push - lean)
         across = {other.name: turned[m] for m, other in enumerate(touches) if m != k}
         out.append(Tangent(turned[k], by[k].sum(axis=1), across))
     return out

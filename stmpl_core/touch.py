@@ -55,6 +55,9 @@ class Pressed(NamedTuple):
 SlipKind = Literal["stick", "creep", "slide"]
 
 
+NO_LEAN = np.zeros(3)
+
+
 class Slip(NamedTuple):
     """Friction of a contact: what it carries, and how far the skin goes along.
 
@@ -64,6 +67,7 @@ class Slip(NamedTuple):
         offset: way by which the skin under the tool is dragged along it, (3,) [m].
         turn: turn by which it is, about the inward normal of the contact [rad].
         middle: middle of the contact on the skin at rest, (3,) [m].
+        lean: part of the push that is so since the skin came from where the limb faces another way, (3,) [N].
     """
 
     wrench: Wrench
@@ -71,6 +75,7 @@ class Slip(NamedTuple):
     offset: np.ndarray
     turn: float
     middle: np.ndarray
+    lean: np.ndarray = NO_LEAN
 
     @property
     def kind(self) -> SlipKind:
