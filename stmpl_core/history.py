@@ -34,8 +34,6 @@ from stmpl_core.footing import (
     way_of_tool,
 )
 from stmpl_core.friction import Friction, coefficients
-from stmpl_core.green import Green
-from stmpl_core.nodes import Nodes
 from stmpl_core.relaxation import depth_left, let_go, series_of, stretch, weights
 from stmpl_core.sideways import Sideways
 from stmpl_core.slip import drag, ploughing
@@ -274,7 +272,7 @@ class History:
                           work=before.work, stretch=long, surface=one.stated.tool.number)  # fmt: skip
         springs = NOTHING, one.before.springs, one.before.springs_relaxed
         if self.friction(touch.name) > 0 and net > MIN_ONE_WAY_SHARE:
-            give, bend = self._give(nodes, pressed.forces), self.toucher.curvature(nodes, pressed.forces)
+            give, bend = self.toucher.give(nodes, pressed.forces), self.toucher.curvature(nodes, pressed.forces)
             dragged = self._dragged(one, wrench, contact, pose[:3, 3], scalars, force, lever, thickness, give, bend, dt)
             lean = dragged.slip.lean
             wrench = wrench + np.concatenate([lean, np.cross(middle - pose[:3, 3], lean)])
@@ -332,11 +330,6 @@ class History:
         scalars = before._replace(elastic=max(float(shares @ relaxed), 0.0), share=1.0, passive=1.0)
         return _let_go(memory._replace(scalars=scalars, relaxed=relaxed,
                                        trail=wake.after(memory.trail, self.series, dt, None)))  # fmt: skip
-
-    def _give(self, nodes: Nodes, forces: np.ndarray) -> np.ndarray | None:
-        """How a contact gives where it is dragged along, beyond a flat layer, (3, 3) [m/N]; None: as that."""
-        layer = self.toucher.layer
-        return Green.of(layer).give(nodes, forces) / layer.tissue.youngs_modulus if layer.stacked else None
 
     def _dragged(self, one: _Asked, wrench: Wrench, contact: np.ndarray, origin: np.ndarray, scalars: Scalars,
                  force: float, lever: float, thickness: float, give: np.ndarray | None, bend: np.ndarray, dt: float,

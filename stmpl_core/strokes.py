@@ -176,11 +176,15 @@ def _rubbed(toucher: Toucher, sideways: Sideways, one: Contact) -> _Rubbed | Non
     pressing = float(one.wrench[:3] @ normal)
     if not pressing > 0:
         return None
-    rubs = float(np.linalg.norm(one.wrench[:3] - pressing * normal))
-    patch = sideways.at(radius, thickness)
+    along = one.wrench[:3] - pressing * normal
+    rubs = float(np.linalg.norm(along))
+    patch, give = sideways.at(radius, thickness), toucher.give(nodes, pressed.forces)
     stiffer, _ = ploughing(touch.depth, radius, pressing, patch.along, patch.bare, 0.0)
     rises = touch.depth / radius * pressing / (patch.along * radius)
-    return _Rubbed(normal, pressing, rubs, radius, stiffer * patch.secant(rubs), rises)
+    stiffness = stiffer * patch.secant(rubs)
+    if give is not None and rubs > 0:
+        stiffness = 1 / (1 / stiffness + max(float(along @ give @ along) / rubs**2, 0.0))
+    return _Rubbed(normal, pressing, rubs, radius, stiffness, rises)
 
 
 def _friction_of(ratio: float, rises: float) -> float:

@@ -16,6 +16,7 @@ from stmpl_core.contact import Contact
 from stmpl_core.contact_net import NOTHING, ContactNet, Held
 from stmpl_core.deep import DEEPEST, Deep
 from stmpl_core.footing import curvature_at
+from stmpl_core.green import Green
 from stmpl_core.layer import SoftLayer
 from stmpl_core.moments import Surroundings
 from stmpl_core.nodes import Nodes, gathered
@@ -117,6 +118,11 @@ class Toucher:
         self._modulus = layer.tissue.youngs_modulus
         self._thickest = float(layer.thickness.max())
         self._inward, self.deep = self.columns.inward, Deep(self.columns)
+
+    def give(self, nodes: Nodes, forces: np.ndarray) -> np.ndarray | None:
+        """How a contact gives along the skin, beyond a flat layer, (3, 3) [m/N]; None: as that. See `curvature`."""
+        layer = self.layer
+        return Green.of(layer).give(nodes, forces) / layer.tissue.youngs_modulus if layer.stacked else None
 
     def curvature(self, nodes: Nodes, forces: np.ndarray) -> np.ndarray:
         """Curvature of the skin at nodes, weighed with their forces (N,), (3, 3) [1/m]; convex is positive."""
