@@ -47,8 +47,7 @@ class CoarseResponse(NamedTuple):
         Raises:
             InvalidInput, MeshError: the skin cannot be meshed coarsely.
         """
-        kept = _kept("response-", layer, cls._fields, "coarse_response")
-        return cls(**{**kept, "edge_length": float(kept["edge_length"])})
+        return _kept(cls, "response-", layer, "coarse_response")
 
 
 class CoarseDrag(NamedTuple):
@@ -74,19 +73,19 @@ class CoarseDrag(NamedTuple):
     @classmethod
     def of(cls, layer: SoftLayer) -> CoarseDrag:
         """The response of a layer, made or read as CoarseResponse. Raises what that raises."""
-        return cls(**_kept("drag-", layer, cls._fields, "coarse_drag"))
+        return _kept(cls, "drag-", layer, "coarse_drag")
 
 
-def _kept(kind: str, layer: SoftLayer, fields: tuple[str, ...], maker: str) -> dict[str, Any]:
-    """Arrays of a layer by name, as they are kept, or made by a function of fem_tools.limb and kept."""
+def _kept(cls: Any, kind: str, layer: SoftLayer, maker: str) -> Any:
+    """What of a class is kept of a layer, or made by a function of fem_tools.limb and kept."""
     most = 1e6 * _most_kept_mb()
     name = kind + digest(layer) if most > 0 else ""
     known = read(name) if name else None
-    if known is not None and known.keys() == set(fields):
-        return known
-    made = getattr(import_module("fem_tools.limb"), maker)(layer)._asdict()
-    if sum(np.asarray(one).nbytes for one in made.values()) < most:
-        write(name, made)
+    if known is not None and known.keys() == set(cls._fields):
+        return cls(**{key: one if one.ndim else float(one) for key, one in known.items()})
+    made = getattr(import_module("fem_tools.limb"), maker)(layer)
+    if sum(np.asarray(one).nbytes for one in made) < most:
+        write(name, made._asdict())
         trim(kind, most)
     return made
 

@@ -72,7 +72,7 @@ def test_a_broken_file_is_made_anew(folder, asked, content):
 def test_a_folder_that_cannot_be_is_no_error(folder, asked):
     folder.write_text("a file stands in its place")
     for _ in range(2):
-        assert CoarseResponse.of(layer()).motion is MADE.motion
+        assert CoarseResponse.of(layer()) is MADE
     assert len(asked) == 2
 
 
