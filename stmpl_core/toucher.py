@@ -21,6 +21,7 @@ from stmpl_core.layer import SoftLayer
 from stmpl_core.moments import Surroundings
 from stmpl_core.nodes import Nodes, gathered
 from stmpl_core.obstacle import REACH
+from stmpl_core.pieces import DEEP, GROUP, WIDER, pins
 from stmpl_core.sdf import SignedDistance
 from stmpl_core.tools import Tools
 from stmpl_core.touch import (
@@ -49,7 +50,7 @@ MIN_NET_FORCE_SHARE = 0.1  # force over the sum of its parts' sizes, below which
 MAX_DRAG_RATIO = 0.3  # tangential over normal force that is not yet worth a word
 MARGIN_SHARE = 2 / 3  # width of the distance fields around tools, over the thickness
 MAX_AROUND = 0.02  # depth of skin in a tool that presses nothing, over the thickness, that is not yet worth a word
-THIN = 0.5  # least extent of a tool, over the skin's edges, below which it is thin
+THIN = 0.7  # least extent of a tool, over the skin's edges, below which it is thin
 SUNK = 0.8  # depth of a thin tool over its least extent, beyond which its force may fall as it goes deeper
 MAX_LEVER = 1.0  # torque that is not carried over the force, over the contact's radius, that is not yet worth a word
 MAX_FIELD_ERROR_M = 5e-4  # error of a distance field that is not yet worth a word
@@ -341,17 +342,24 @@ class Toucher:
         doubt += held.power * one.field.surface_error / max(depth, one.field.surface_error)  # how well depth is known
         if "uneven" in known and size > 0:
             doubt = math.hypot(doubt, known["uneven"] * self.net.unlike(nodes, forces))
+        beside, radius = pins(nodes.points, nodes.area, nodes.thickness, forces)
+        wider = WIDER if beside > GROUP and depth > DEEP * radius else 1.0
         touch = Touch(
             one.contact.name, one.status, one.pose, wrench,
             depth=depth if math.isfinite(depth) else float("nan"),
-            force_bound=size * known["scale"] * doubt ** known["power"] if size > 0 else 0.0,
+            force_bound=size * known["scale"] * doubt ** known["power"] * wider if size > 0 else 0.0,
             moved=one.moved,
             missing=np.zeros(6) if stated is None else stated - wrench,
             pressure=values,
             pressed=Pressed(one.field, one.squeeze, way, one.factor, scale * forces, held.power * STIFFER)
             if len(v) else None,
         )  # fmt: skip
-        object.__setattr__(touch, "trust", self._trust(one, touch, v, pressure, strange, alone))  # nobody has it yet
+        trust = self._trust(one, touch, v, pressure, strange, alone)
+        if wider > 1 and len(v):
+            trust = trust.also(f"{touch.name} presses with pins of {1e3 * radius:.2g} mm radius, "
+                               f"{1e3 * depth:.2g} mm deep, that feel each other; contacts were learnt of one area",
+                               in_range=False)  # fmt: skip
+        object.__setattr__(touch, "trust", trust)  # nobody has it yet
         return touch
 
     def _trust(self, one: _Placed, touch: Touch, vertices: np.ndarray, pressure: np.ndarray, strange: float,

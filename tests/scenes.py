@@ -98,6 +98,14 @@ def capsule(height: float, radius: float, count: int = 32) -> Tool:
     return tool(trimesh.creation.capsule(1e3 * height, 1e3 * radius, count=[count, count]), 1e-3)
 
 
+def brush(count: int = 7) -> Tool:
+    """Pins of 2.2 mm radius along z, one in the middle and up to six 8 mm around it."""
+    pin, angle = capsule(0.01, 2.2e-3, 16), np.arange(count - 1) * np.pi / 3
+    places = np.vstack([np.zeros(3), 8e-3 * np.column_stack([np.cos(angle), np.sin(angle), 0 * angle])])
+    faces = [pin.faces + k * len(pin.vertices) for k in range(count)]
+    return Tool("brush", np.concatenate([pin.vertices + place for place in places]), np.concatenate(faces))
+
+
 def scaled(tool: Tool, by: float) -> Tool:
     return Tool(tool.name, by * tool.vertices, tool.faces)
 

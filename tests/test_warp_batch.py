@@ -14,7 +14,7 @@ from stmpl_core.bones import Bone, to_bone
 from stmpl_core.errors import InvalidInput
 from stmpl_core.methods import MomentNet, Winkler
 from stmpl_core.skin import Skin
-from tests.scenes import LENGTH, RADIUS, at, ball, band, box, capsule, limb, punch, tool
+from tests.scenes import LENGTH, RADIUS, at, ball, band, box, brush, capsule, limb, punch, tool
 from tests.test_folds import FINGERS
 
 wp = pytest.importorskip("warp")
@@ -97,8 +97,8 @@ def same(found: WarpTouches, expected: BatchTouches, least_served: float = 1.0) 
 @pytest.mark.parametrize(
     ("one", "reach"),
     [(ball(0.012), 0.012), (capsule(0.03, 0.008), 0.012), (punch(), 0.012), (box(0.03, 0.02, 1e-3), 0.01),
-     (tool(LUMP), 0.009)],
-    ids=["ball", "capsule", "punch", "thin plate", "lump"],
+     (tool(LUMP), 0.009), (brush(), 0.009)],
+    ids=["ball", "capsule", "punch", "thin plate", "lump", "brush"],
 )  # fmt: skip
 def test_touches_are_those_of_numba(arm: Skin, one: Tool, reach: float) -> None:
     poses = scattered(arm, reach)

@@ -1,11 +1,12 @@
 # type: ignore  # kernels are in Warp's language, which pyright does not know
 """Kernels that tell what tools do: wrenches, depths, bounds, and what may be believed of them: stmpl_core.toucher."""
 
+import math
 from typing import Any
 
 import warp as wp
 
-from stmpl_core import soundness, toucher
+from stmpl_core import pieces, soundness, toucher
 from stmpl_core.gpu.hold import _wanted
 from stmpl_core.gpu.packs import BORDER_BIT, LONG_BIT, STEEP_BIT, OneSkin, Scratch, Skins
 from stmpl_core.gpu.places import APART, BY_POSE, DEEP, REFUSED, WRAPPED
@@ -18,8 +19,12 @@ STEEP_SHARE, LONG_SHARE = wp.constant(wp.float64(soundness.STEEP_SHARE)), wp.con
 BORDER_SHARE = wp.constant(wp.float64(soundness.BORDER_SHARE))
 AROUND, UNSEEN = wp.constant(wp.float64(toucher.MAX_AROUND)), wp.constant(wp.float64(toucher.MAX_UNSEEN_FORCE_SHARE))
 THIN, SUNK = wp.constant(wp.float64(toucher.THIN)), wp.constant(wp.float64(toucher.SUNK))
+WIDER = wp.constant(wp.float64(pieces.WIDER))
+GROUP, PINS_DEEP = wp.constant(wp.float64(pieces.GROUP)), wp.constant(wp.float64(pieces.DEEP))
+PIECE = wp.constant(wp.float64(2.0 / 3.0**0.5 * pieces.SPACINGS**2))
+NEAR_PIECE = wp.constant(wp.float64(pieces.NEAR))
 NONE = wp.constant(wp.float64(1e-300))
-NAN = wp.constant(wp.float64(float("nan")))
+NAN, PI = wp.constant(wp.float64(float("nan"))), wp.constant(wp.float64(math.pi))
 wp.set_module_options(OPTIONS)
 
 
@@ -112,6 +117,47 @@ class Known:
     depth: real
 
 
+@wp.func
+def _pins(scratch: Scratch, s: wp.int32, start: wp.int32, end: wp.int32) -> wp.vec2d:
+    """Force beside each piece over its own, and radius of a piece [m], of nodes from start to end: pieces.pins."""
+    found = wp.int32(0)
+    for n in range(start, end):
+        scratch.fold[s, n] = -1
+    for n in range(start, end):
+        if scratch.fold[s, n] < 0:
+            scratch.fold[s, n] = found
+            scratch.queue[s, start] = n
+            first, last = wp.int32(start), wp.int32(start + 1)
+            while first < last:
+                i = scratch.queue[s, first]
+                first += 1
+                for j in range(start, end):
+                    if scratch.fold[s, j] < 0 and \
+                            wp.length_sq(scratch.point[s, i] - scratch.point[s, j]) < PIECE * scratch.area[s, i]:
+                        scratch.fold[s, j] = found
+                        scratch.queue[s, last] = j
+                        last += 1
+            found += 1
+    if found < 2:
+        return wp.vec2d(real(0.0), real(0.0))
+    beside, size, total = real(0.0), real(0.0), real(0.0)
+    for i in range(start, end):
+        own, other, wide = real(0.0), real(0.0), real(0.0)
+        near = NEAR_PIECE * scratch.thick[s, i]
+        for j in range(start, end):
+            force = scratch.pressure[s, j] * scratch.area[s, j]
+            if scratch.fold[s, i] == scratch.fold[s, j]:
+                own += force
+                wide += scratch.area[s, j]
+            elif wp.length_sq(scratch.point[s, i] - scratch.point[s, j]) < near * near:
+                other += force
+        force = scratch.pressure[s, i] * scratch.area[s, i]
+        beside += force * other / wp.max(own, NONE)
+        size += force * wp.sqrt(wide / PI)
+        total += force
+    return wp.vec2d(beside / wp.max(total, NONE), size / wp.max(total, NONE))
+
+
 @wp.kernel
 def answer(first: wp.int32, many: wp.int32, known: Known, skins: Skins, scratch: Scratch,
            wrenches: wp.array3d(dtype=Any), depths: wp.array2d(dtype=Any), bounds: wp.array2d(dtype=Any),
@@ -148,8 +194,10 @@ def answer(first: wp.int32, many: wp.int32, known: Known, skins: Skins, scratch:
     force, torque, forces, strange, doubt = vec3(), vec3(), real(0.0), real(0.0), real(0.0)
     steep, long, border, highest = real(0.0), real(0.0), real(0.0), real(0.0)
     depth, thick, count, carried = real(scratch.deep[c]), real(0.0), real(0.0), real(0.0)
+    start = wp.int32(scratch.nodes[s])
     for i in range(scratch.nodes[s]):
         if scratch.tool[s, i] == k:
+            start = wp.min(start, i)
             here, corners = scratch.pressure[s, i] * scratch.area[s, i], skins.faces[scratch.face[s, i]]
             for x in range(3):
                 v, part = corners[x], here * scratch.shares[s, i][x]
@@ -179,6 +227,9 @@ def answer(first: wp.int32, many: wp.int32, known: Known, skins: Skins, scratch:
     sound = steep <= STEEP_SHARE * forces and long <= LONG_SHARE * forces and border <= BORDER_SHARE * forces
     sound = sound and one.softness * highest <= known.pressure and depth * count <= known.depth * thick
     sound = sound and strange <= UNSEEN * forces and one.learnt == 1
+    pins = _pins(scratch, s, start, start + wp.int32(count))
+    group = pins[0] > GROUP and depth > PINS_DEEP * pins[1]
+    sound = sound and not group
     thinnest = skins.thinnest[k]
     if thinnest < THIN * one.edge and depth > SUNK * thinnest:
         sound = False
@@ -188,7 +239,10 @@ def answer(first: wp.int32, many: wp.int32, known: Known, skins: Skins, scratch:
     depths[n, k] = depths.dtype(depth)
     bounds[n, k] = bounds.dtype(real(0.0))
     if size > real(0.0):
-        bounds[n, k] = bounds.dtype(one.modulus * size * known.scale * wp.pow(doubt, known.power))
+        bound = known.scale * wp.pow(doubt, known.power)
+        if group:
+            bound *= WIDER
+        bounds[n, k] = bounds.dtype(one.modulus * size * bound)
     in_range[n, k] = sound
     statuses[n, k] = BY_POSE
 
