@@ -22,6 +22,7 @@ from stmpl_ros.topics import ANSWERS, NOW
 ENDINGS = CLEAN, KILLED, EARLY = "went cleanly", "were killed", "were killed early"
 EARLY_S = 3.0  # longest life of a listener that is killed early [s]
 PATIENCE = 60.0  # time in which a listener is to have heard something [s]
+HUNG_S = 2 * PATIENCE  # life of a listener after which it hangs, and is killed [s]
 PRELOADED = [__name__, "bags.wire", "stmpl_ros.scripts"]  # what a process would import each time anew
 
 
@@ -38,6 +39,8 @@ class Listener:
         answer: time at which the first answer came.
         answers: number of answers.
         gaps: number of answers that are missing between the first and the last.
+        hung: whether it did not end, and was killed for it: Fast DDS 2.14.5 may go round for ever in the listener's own
+            `take` of a message that it cannot read (eProsima/Fast-DDS issue 6500).
     """
 
     ending: str
@@ -48,6 +51,7 @@ class Listener:
     answer: float | None = None
     answers: int = 0
     gaps: int = 0
+    hung: bool = False
 
 
 def listen(pipe: Connection, domain: int, ending: str, stay: float, late: float) -> None:
@@ -114,7 +118,7 @@ class Crowd:
         self._stay, self._late, self._dice = stay, late, random.Random(0)
         self._from = multiprocessing.get_context("forkserver")
         self._from.set_forkserver_preload(PRELOADED)
-        self._here: list[tuple[Listener, multiprocessing.process.BaseProcess, Connection]] = []
+        self._here: list[tuple[Listener, multiprocessing.process.BaseProcess, Connection, float]] = []
         self.all: list[Listener] = []
 
     def run(self, ended: threading.Event) -> None:
@@ -125,7 +129,7 @@ class Crowd:
             if len(self.all) < self._count and len(self._here) < self._at_once and time.monotonic() >= due:
                 self._start()
             self._here = [one for one in self._here if self._look(*one)]
-        for _, process, _ in self._here:
+        for _, process, *_ in self._here:
             process.kill()
 
     def _start(self) -> None:
@@ -138,11 +142,14 @@ class Crowd:
         if one.ending == EARLY and near.poll(PATIENCE):
             threading.Timer(self._dice.uniform(0.0, EARLY_S), process.kill).start()
         self.all.append(one)
-        self._here.append((one, process, near))
+        self._here.append((one, process, near, time.monotonic()))
 
     @staticmethod
-    def _look(one: Listener, process: multiprocessing.process.BaseProcess, pipe: Connection) -> bool:
+    def _look(one: Listener, process: multiprocessing.process.BaseProcess, pipe: Connection, began: float) -> bool:
         """Takes what a listener told; False once it is gone."""
+        if not one.hung and time.monotonic() - began > HUNG_S:
+            one.hung = True
+            process.kill()
         alive = process.is_alive()
         try:
             while pipe.poll():

@@ -127,15 +127,16 @@ def told(crowd: list[Listener]) -> list[str]:
                      f"{worst:.2f} s (worst), by the service {sum(one.asked is not None for one in these)}, "
                      f"answers {sum(one.answer is not None for one in these)}, "
                      f"answers missing in between {sum(one.gaps for one in these)}")  # fmt: skip
+    lines.append(f"{sum(one.hung for one in crowd):5} hung by themselves")
     return lines
 
 
 def verdict(crowd: list[Listener], readings: list[Reading]) -> dict[str, str]:
     """What was lost, and what leaks, each in a sentence; none where all is well.
 
-    The listeners that were killed early are not held to have heard anything.
+    The listeners that were killed early are not held to have heard anything, nor are those that hung by themselves.
     """
-    lived = [one for one in crowd if one.ending != EARLY]
+    lived = [one for one in crowd if one.ending != EARLY and not one.hung]
     found = Counter({
         "of {} listeners did not get the latched topology": sum(one.topology is None for one in lived),
         "of {} listeners got no topology at all": sum(one.topology is None and one.asked is None for one in lived),

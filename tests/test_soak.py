@@ -26,13 +26,25 @@ def test_listeners_come_and_go_or_are_killed_and_all_who_lived_got_the_skin_and_
     assert last["threads"] <= first["threads"] and last["files"] <= first["files"], said
 
 
+def test_a_listener_that_hangs_is_ended_and_told(monkeypatch):
+    """No node is there: it would wait for a minute."""
+    from threading import Event
+
+    from benchmarks import crowd
+
+    monkeypatch.setattr(crowd, "HUNG_S", 3.0)
+    some = crowd.Crowd(int(os.environ["ROS_DOMAIN_ID"]), 1, 0.1, 1, 0.1, 5.0)
+    some.run(Event())
+    assert [(one.here, one.hung) for one in some.all] == [(True, True)]
+
+
 def test_a_verdict_names_what_was_lost_and_what_leaks():
     from benchmarks.crowd import EARLY, KILLED, Listener
     from benchmarks.soak import Reading, verdict
 
     well = Listener(KILLED, topology=0.1, answer=0.2, answers=3)
     calm = [Reading(seconds, 400.0, 20, 30, 10, 100.0, 1) for seconds in (0.0, 5.0, 10.0)]
-    assert verdict([well, Listener(EARLY)], calm) == {}
+    assert verdict([well, Listener(EARLY), Listener(KILLED, hung=True)], calm) == {}
     asked = Listener(KILLED, asked=5.0, answer=0.2, gaps=2)
     busy = [*calm[:2], Reading(10.0, 450.0, 22, 35, 10, 0.0, 3)]
     said = "; ".join(verdict([well, asked, Listener(KILLED)], busy).values())
