@@ -52,6 +52,7 @@ MARGIN_SHARE = 2 / 3  # width of the distance fields around tools, over the thic
 MAX_AROUND = 0.02  # depth of skin in a tool that presses nothing, over the thickness, that is not yet worth a word
 THIN = 0.7  # least extent of a tool, over the skin's edges, below which it is thin
 SUNK = 0.8  # depth of a thin tool over its least extent, beyond which its force may fall as it goes deeper
+STUCK = 1.3  # what skin that sticks carries along itself on a limb of layers, over `stuck`: 1.2 to 1.6 on a forearm
 MAX_LEVER = 1.0  # torque that is not carried over the force, over the contact's radius, that is not yet worth a word
 MAX_FIELD_ERROR_M = 5e-4  # error of a distance field that is not yet worth a word
 MAX_UNSEEN_FORCE_SHARE = 0.1  # share of the force that vertices unlike all training contacts may carry
@@ -332,7 +333,7 @@ class Toucher:
     def _answer(self, one: _Placed, held: Held, alone: bool) -> Touch:
         """What a placed tool does, scaled to its wrench, with what may be believed of it."""
         layer, nodes, unit = self.layer, one.squeeze.nodes, one.factor * self._modulus
-        v, pressure, values, wrench, forces, scale, size, doubt, strange = _carried(
+        v, pressure, values, wrench, forces, scale, size, doubt, strange, stuck = _carried(
             nodes.corners, nodes.shares, nodes.area, *held[:3], unit, math.nan if one.force is None else one.force,
             layer.vertex_areas, layer.vertices, layer.vertex_area_vectors, one.pose[:3, 3])  # fmt: skip
         stated = one.contact.wrench
@@ -342,12 +343,15 @@ class Toucher:
         doubt += held.power * one.field.surface_error / max(depth, one.field.surface_error)  # how well depth is known
         if "uneven" in known and size > 0:
             doubt = math.hypot(doubt, known["uneven"] * self.net.unlike(nodes, forces))
+        bound = known["scale"] * doubt ** known["power"] if size > 0 else 0.0
+        if "uneven" in known:  # networks of layers learnt what is across the skin at rest
+            bound += STUCK * stuck
         beside, radius = pins(nodes.points, nodes.area, nodes.thickness, forces)
         wider = WIDER if beside > GROUP and depth > DEEP * radius else 1.0
         touch = Touch(
             one.contact.name, one.status, one.pose, wrench,
             depth=depth if math.isfinite(depth) else float("nan"),
-            force_bound=size * known["scale"] * doubt ** known["power"] * wider if size > 0 else 0.0,
+            force_bound=size * bound * wider if size > 0 else 0.0,
             moved=one.moved,
             missing=np.zeros(6) if stated is None else stated - wrench,
             pressure=values,
@@ -502,8 +506,10 @@ def _carried(corners, shares, area, held, doubts, outside, unit, carries, areas,
         size: size of the force [N].
         doubt: error to expect of it, over it.
         strange: share of it that nodes carry that see what no training contact had.
+        stuck: what skin that sticks carries along itself if it is all pushed along the mean normal, over the force,
+            which is of pressures across the skin at rest alone.
     """
-    forces, doubt, strange, total = np.empty(len(area)), 0.0, 0.0, 0.0
+    forces, doubt, strange, total, stuck = np.empty(len(area)), 0.0, 0.0, 0.0, 0.0
     for n in range(len(area)):
         forces[n] = held[n] * unit * area[n]
         doubt += doubts[n] * area[n]
@@ -519,8 +525,18 @@ def _carried(corners, shares, area, held, doubts, outside, unit, carries, areas,
     for n in range(len(vertices)):
         pressure[n] *= scale
         values[vertices[n]] = pressure[n]
+        stuck += pressure[n] * _along(area_vectors[vertices[n]], wrench, size)
     return (vertices, pressure, values, wrench, forces, scale, size, scale * unit * doubt / max(size, 1e-300),
-            strange / max(total, 1e-300))  # fmt: skip
+            strange / max(total, 1e-300), stuck / max(size, 1e-300))  # fmt: skip
+
+
+@numba.njit(cache=True, inline="always", error_model="numpy")
+def _along(area_vector, wrench, size):
+    """Area of skin times sin^2 / cos of its angle to a force [N, size] [m2]; 0 where it faces away."""
+    area = np.sqrt(area_vector[0] ** 2 + area_vector[1] ** 2 + area_vector[2] ** 2)
+    towards = -(area_vector[0] * wrench[0] + area_vector[1] * wrench[1] + area_vector[2] * wrench[2])
+    cosine = towards / max(area * size, 1e-300)
+    return area * max(1 - cosine * cosine, 0.0) / max(cosine, 0.5) if cosine > 0 else 0.0
 
 
 @numba.njit(cache=True, nogil=True)

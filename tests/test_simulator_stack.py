@@ -45,7 +45,7 @@ def test_a_ball_presses_and_moves_as_finite_elements_say_and_no_further_than_the
     for depth, truth in zip(depths, fem.path([start], depths), strict=True):
         answer = simulator.step([contact_of(ball(BALL), start.at(depth).pose_body_from_tool)])
         touch, moved = answer.touches["probe"], np.linalg.norm(truth.displacement, axis=1)
-        force = float(np.linalg.norm(truth.pressure @ LIMB.vertex_area_vectors))
+        force = truth.force  # with what sticking skin carries along itself, which ours leaves to its bound
         off = np.linalg.norm(answer.displacement - truth.displacement, axis=1)
         assert answer.trust.ok, answer.trust.why
         assert touch.force == pytest.approx(force, rel=0.1) and abs(touch.force - force) < touch.force_bound

@@ -19,7 +19,7 @@ STEEP_SHARE, LONG_SHARE = wp.constant(wp.float64(soundness.STEEP_SHARE)), wp.con
 BORDER_SHARE = wp.constant(wp.float64(soundness.BORDER_SHARE))
 AROUND, UNSEEN = wp.constant(wp.float64(toucher.MAX_AROUND)), wp.constant(wp.float64(toucher.MAX_UNSEEN_FORCE_SHARE))
 THIN, SUNK = wp.constant(wp.float64(toucher.THIN)), wp.constant(wp.float64(toucher.SUNK))
-WIDER = wp.constant(wp.float64(pieces.WIDER))
+STUCK, WIDER = wp.constant(wp.float64(toucher.STUCK)), wp.constant(wp.float64(pieces.WIDER))
 GROUP, PINS_DEEP = wp.constant(wp.float64(pieces.GROUP)), wp.constant(wp.float64(pieces.DEEP))
 PIECE = wp.constant(wp.float64(2.0 / 3.0**0.5 * pieces.SPACINGS**2))
 NEAR_PIECE = wp.constant(wp.float64(pieces.NEAR))
@@ -115,6 +115,22 @@ class Known:
     uneven: real
     pressure: real
     depth: real
+
+
+@wp.func
+def _stuck(skins: Skins, scratch: Scratch, s: wp.int32, start: wp.int32, end: wp.int32, way: vec3) -> real:
+    """Force that skin which sticks carries along itself, over E [m2], of nodes from start to end: toucher._carried."""
+    out = real(0.0)
+    for i in range(start, end):
+        corners = skins.faces[scratch.face[s, i]]
+        for x in range(3):
+            v = corners[x]
+            cosine = -wp.dot(wp.normalize(skins.area_vectors[v]), way)
+            if cosine > real(0.0):
+                part = scratch.pressure[s, i] * scratch.area[s, i] * scratch.shares[s, i][x]
+                part *= wp.length(skins.area_vectors[v]) / skins.area[v]
+                out += part * wp.max(real(1.0) - cosine * cosine, real(0.0)) / wp.max(cosine, real(0.5))
+    return out
 
 
 @wp.func
@@ -240,6 +256,8 @@ def answer(first: wp.int32, many: wp.int32, known: Known, skins: Skins, scratch:
     bounds[n, k] = bounds.dtype(real(0.0))
     if size > real(0.0):
         bound = known.scale * wp.pow(doubt, known.power)
+        if one.stacked == 1:
+            bound += STUCK * _stuck(skins, scratch, s, start, start + wp.int32(count), force / size) / size
         if group:
             bound *= WIDER
         bounds[n, k] = bounds.dtype(one.modulus * size * bound)
