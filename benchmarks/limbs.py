@@ -31,7 +31,9 @@ from stmpl_core import Contact, SoftLayer, Tool
 from stmpl_core.console import steps_bar
 from stmpl_core.errors import InvalidInput
 from stmpl_core.methods import MomentNet
+from stmpl_core.nodes import Nodes
 from stmpl_core.simulator import Simulator
+from stmpl_core.touch import Touch
 from studies.own import own
 from studies.pressed import STRAIGHT, Pressed, pressed, seen, slant_of
 
@@ -75,6 +77,12 @@ def off(one: Pressed, force: np.ndarray, motion: np.ndarray | None, flagged: boo
     return Off(error, float(wrong[size > MOVES * size.max()].mean()), float(wrong.max()), flagged, bound)
 
 
+def met(simulator: Simulator, one: Pressed) -> Touch:
+    """Our touch of a scene, which is told the way that the tool came, as a wrench would tell it."""
+    (touch,) = simulator.touch([Contact(one.tool, one.pose)])
+    return touch if touch.pressed is None else replace(touch, pressed=touch.pressed._replace(way=one.way))
+
+
 class Laws:
     """The laws that are compared, on one limb."""
 
@@ -84,22 +92,26 @@ class Laws:
         self.net = self.simulator.toucher.net
         self.modulus = np.array([confined_modulus(layer.tissue, float(t)) for t in layer.thickness])
 
+    def linear(self, nodes: Nodes) -> np.ndarray:
+        """Pressure of the linear response at contact nodes, (N,) [Pa]."""
+        return self.net.look(nodes).pressure * self.layer.tissue.youngs_modulus
+
+    def columns(self, nodes: Nodes) -> np.ndarray:
+        """Pressure at contact nodes if each column is pressed for itself, (N,) [Pa]."""
+        return np.einsum("nc,nc->n", self.modulus[nodes.corners], nodes.shares) * nodes.strain
+
     def answers(self, one: Pressed) -> dict[str, Off]:
         """Each law's answer to a scene, compared."""
         layer, nodes, out = self.layer, one.nodes, {}
         self.simulator.tools.add(one.tool, one.field)
-        (touch,) = self.simulator.touch([Contact(one.tool, one.pose)])
-        if touch.pressed is not None:  # the way it came, which a wrench would tell
-            touch = replace(touch, pressed=touch.pressed._replace(way=one.way))
+        touch = met(self.simulator, one)
         answer = self.simulator.answer([touch])
         true = float(np.linalg.norm(one.touch.wrench[:3]))
         out["moment_net"] = off(one, touch.wrench[:3], answer.displacement, flagged=not answer.trust.in_range,
                                 bound=touch.force_bound / true)  # fmt: skip
         if len(nodes.area):
-            linear = self.net.look(nodes).pressure * layer.tissue.youngs_modulus * nodes.area
-            out["its linear part"] = off(one, linear @ nodes.inward, None)
-            columns = np.einsum("nc,nc->n", self.modulus[nodes.corners], nodes.shares) * nodes.strain * nodes.area
-            out["elastic foundation"] = off(one, columns @ nodes.inward, None)
+            out["its linear part"] = off(one, self.linear(nodes) * nodes.area @ nodes.inward, None)
+            out["elastic foundation"] = off(one, self.columns(nodes) * nodes.area @ nodes.inward, None)
         if self.other is not None:
             out["yours"] = off(one, *self.other(layer, one.tool, one.pose, one.way))
         return out

@@ -112,14 +112,15 @@ def _sums(rows: np.ndarray, n: int) -> csr_matrix:
     return csr_matrix((np.ones(len(rows)), (rows, np.arange(len(rows)))), shape=(n, len(rows)))
 
 
-def split_wedges(outer: Points, inner: Points, triangles: np.ndarray, layers: int) -> TetMesh:
-    """Wedges cut in three tetrahedra each, alike on both sides of every face.
+def split_wedges(outer: Points, inner: Points, triangles: np.ndarray, layers: int, ends: np.ndarray | None = None
+                 ) -> TetMesh:  # fmt: skip
+    """Wedges cut in three tetrahedra each, alike on both sides of every face, at depths `ends`, or evenly.
 
     The corners of each triangle are taken in the order of their numbers, so that every face's diagonal starts at its
     lower number (Dompierre et al., "How to subdivide pyramids, prisms and hexahedra into tetrahedra", 1999).
     """
     n, (a, b, c) = len(outer), np.sort(triangles, axis=1).T
-    depth = np.linspace(0, 1, layers + 1)[:, None, None]
+    depth = (np.linspace(0, 1, layers + 1)[:, None] if ends is None else ends.T)[:, :, None]
     points = (outer * (1 - depth) + inner * depth).reshape(-1, 3)
     tets = []
     for level in range(layers):

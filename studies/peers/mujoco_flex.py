@@ -92,8 +92,8 @@ class MujocoFlex(PatchPeer):
         points, volume = tets.tets.points, float(tets.tets.volumes.sum())
         scene = SCENE.format(
             timestep=self.timestep, damping=self.damping, mass=tissue.density * volume, young=tissue.youngs_modulus,
-            poisson=tissue.poisson_ratio, points=_words(points), tets=_words(tets.tets.tets),
-            pinned=_words(np.flatnonzero(tets.held)),
+            poisson=tissue.poisson_ratio, points=words(points), tets=words(tets.tets.tets),
+            pinned=words(np.flatnonzero(tets.held)),
         )  # fmt: skip
         spec = mujoco.MjSpec.from_string(scene)
         spec.flexes[0].elastic3d = int(self.material == "snh")
@@ -145,5 +145,6 @@ def warnings_logged() -> Iterator[None]:
         mujoco.set_mju_user_warning(before)
 
 
-def _words(values: np.ndarray) -> str:
+def words(values: np.ndarray) -> str:
+    """Numbers as MJCF wants them."""
     return " ".join(map(repr, values.ravel().tolist()))
