@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks.layered_chart import ONE_LAYER, OURS, Row, best, draw, force_of, points, table
+from benchmarks.layered_chart import ONE_LAYER, OURS, Row, best, draw, force_of, points, shared, table
 from stmpl_core import SoftLayer
 from stmpl_core.load import Load
 from stmpl_core.tissue import Membrane, Ply, Tissue
@@ -32,6 +32,11 @@ def test_one_layer_alone_is_given_its_modulus_and_all_are_shown(tmp_path: Path) 
     assert list(table([one, ours]))[-1].startswith(f"| {OURS} |  | 3 | 6.7 % | 10 % | 5 % | 2 ms |")
     draw([ours], tmp_path / "chart.png")
     assert (tmp_path / "chart.png").stat().st_size > 1000
+
+
+def test_what_is_shared_is_what_all_answer() -> None:
+    every = [*rows(OURS, [1.0, 1.0, 1.0]), *rows(ONE_LAYER, [0.2])]
+    assert [row.scene for row in shared(every)] == ["scene 0", "scene 0"]
 
 
 def test_a_force_is_what_presses_along_the_normals() -> None:
