@@ -134,25 +134,27 @@ def in_plane(wrench, contact, origin, lever):
 
 
 @numba.njit(cache=True, error_model="numpy")
-def in_space(forces, springs, stiffness, contact, origin, lever):
-    """Wrench (6,) of forces of friction, way of the skin under the tool (3,) [m], and its turn."""
-    middle, normal, first = contact
-    second, wrench = _cross(normal, first), np.empty(6)
-    along = forces[0] * first + forces[1] * second
-    wrench[:3], wrench[3:] = along, _cross(middle - origin, along) + forces[2] * lever * normal
-    x, y, turn = springs[:, 0].sum() / stiffness[0], springs[:, 1].sum() / stiffness[1], springs[:, 2].sum()
-    return wrench, x * first + y * second, turn / (stiffness[2] * lever)
+def faced(springs, stiffness, contact, bend, most):
+    """How skin that is dragged along faced where it came from: turn of the normal as a way along the skin, (3,) [rad];
+    and half of the work of a unit force through it [m].
 
+    Skin that comes a way s around a limb of curvature B faced another way by B s, so a push N leans by N B s. What
+    takes and gives that work is an energy, W(d) + N(d) s B s / 2 at a depth d, whose slope along d is the push too: it
+    grows by dN/dd s B s / 2, as if the tool were s B s / 2 deeper (Maxwell's reciprocity).
 
-@numba.njit(cache=True, error_model="numpy")
-def way_along(twist, contact, pose):
-    """Way along the skin of the place of a tool that was in the middle of its contact [m]; contact: see Memory."""
-    w, d, go = twist[3:], contact[0] - pose[:3, 3], twist[:3].copy()
-    go[0] += w[1] * d[2] - w[2] * d[1]
-    go[1] += w[2] * d[0] - w[0] * d[2]
-    go[2] += w[0] * d[1] - w[1] * d[0]
-    deep = _dot(go, contact[1])
-    return np.sqrt(max(_dot(go, go) - deep * deep, 0.0))
+    Args:
+        springs, stiffness, contact: see Memory.
+        bend: curvature of the skin, (3, 3) [1/m].
+        most: largest turn of which note is taken [rad].
+    """
+    normal, first = contact[1], contact[2]
+    way = springs[:, 0].sum() / stiffness[0] * first + springs[:, 1].sum() / stiffness[1] * _cross(normal, first)
+    turned = bend @ way
+    turned -= _dot(turned, normal) * normal
+    size = np.sqrt(_dot(turned, turned))
+    if size > most:
+        turned *= most / size
+    return turned, 0.5 * _dot(turned, way)
 
 
 @numba.njit(cache=True, error_model="numpy")
@@ -169,3 +171,45 @@ def carried_tangent(contact, normal, held):
         tangent[np.argmin(np.abs(normal))] = 1.0
     tangent -= _dot(tangent, normal) * normal
     return tangent / np.sqrt(_dot(tangent, tangent))
+
+
+@numba.njit(cache=True, error_model="numpy")
+def leaned(contact, turned):
+    """The contact whose normal is turned, as `faced` says: friction is along the skin, at right angles to the push."""
+    out, normal = contact.copy(), contact[1] + turned
+    normal /= np.sqrt(_dot(normal, normal))
+    out[1], out[2] = normal, carried_tangent(contact, normal, True)
+    return out
+
+
+@numba.njit(cache=True, error_model="numpy")
+def carried_more(wrench, normal, turned):
+    """Factor on a push along a normal, by which one that leans carries its part of a stated wrench (6,) [-]."""
+    stated = _dot(wrench, normal)
+    size = 1 + _dot(turned, turned)
+    return min(max((stated + _dot(wrench, turned)) / (size * stated), 0.5), 2.0) if stated > 0 else 1.0
+
+
+@numba.njit(cache=True, error_model="numpy")
+def in_space(forces, springs, stiffness, leaned, contact, origin, lever):
+    """Wrench (6,) of forces of friction along a contact that leans, way of the skin under the tool (3,) [m], and its
+    turn.
+    """
+    middle, normal, first = leaned
+    wrench = np.empty(6)
+    along = forces[0] * first + forces[1] * _cross(normal, first)
+    wrench[:3], wrench[3:] = along, _cross(middle - origin, along) + forces[2] * lever * normal
+    first, second = contact[2], _cross(contact[1], contact[2])
+    x, y, turn = springs[:, 0].sum() / stiffness[0], springs[:, 1].sum() / stiffness[1], springs[:, 2].sum()
+    return wrench, x * first + y * second, turn / (stiffness[2] * lever)
+
+
+@numba.njit(cache=True, error_model="numpy")
+def way_along(twist, contact, pose):
+    """Way along the skin of the place of a tool that was in the middle of its contact [m]; contact: see Memory."""
+    w, d, go = twist[3:], contact[0] - pose[:3, 3], twist[:3].copy()
+    go[0] += w[1] * d[2] - w[2] * d[1]
+    go[1] += w[2] * d[0] - w[0] * d[2]
+    go[2] += w[0] * d[1] - w[1] * d[0]
+    deep = _dot(go, contact[1])
+    return np.sqrt(max(_dot(go, go) - deep * deep, 0.0))

@@ -24,10 +24,13 @@ from stmpl_core.contact import Contact
 from stmpl_core.dragged import MIN_OFFSET
 from stmpl_core.errors import InvalidInput
 from stmpl_core.footing import (
+    carried_more,
     carried_tangent,
+    faced,
     given_way,
     in_plane,
     in_space,
+    leaned,
     patch_of,
     twist_between,
     way_along,
@@ -45,6 +48,8 @@ ROUGH = 0.12  # error of the relaxed force, over what has relaxed: 5.4 of 45 % i
 RUBBED = 0.1  # of the force: what skin that gives way beneath a dry tool is off, as the law was learnt from what sticks
 PILED = 0.5  # of drag^2 / force: error of skin that piles up; 0.7 of it on a back, where the elastic bound was 0.45
 MOST_LEAN = 0.5  # turn of the normal under skin that is dragged along, of which a push takes note [rad]
+LEAST_GROWN = 0.5  # depth over the tool's that counts at least, where skin came from a hollow
+MOST_PASSES, SETTLED = 4, 1e-3  # turn of the normal [rad] at which push and friction agree
 HELD_OFF = 0.01  # relative error of the elastic force by wrench, from which it is asked for again
 GIVEN_BACK = 0.7  # share of what an elastic contact gives back that must be covered by what was put in
 KEPT = 1.5  # work beyond what elastic skin could hold that is forgotten: what was lost before pays for nothing now
@@ -275,6 +280,9 @@ class History:
             give, bend = self.toucher.give(nodes, pressed.forces), self.toucher.curvature(nodes, pressed.forces)
             dragged = self._dragged(one, wrench, contact, pose[:3, 3], scalars, force, lever, thickness, give, bend, dt)
             lean = dragged.slip.lean
+            if (grown := dragged.slip.grown) != 1:
+                changed |= _scaled(touch, grown * force / elastic, grown * ROUGH * long * faded)
+                wrench = changed["wrench"]
             wrench = wrench + np.concatenate([lean, np.cross(middle - pose[:3, 3], lean)])
             if self.toucher.layer.tissue.skin is not None:
                 rubs = dragged.slip.wrench[:3]
@@ -334,29 +342,44 @@ class History:
     def _dragged(self, one: _Asked, wrench: Wrench, contact: np.ndarray, origin: np.ndarray, scalars: Scalars,
                  force: float, lever: float, thickness: float, give: np.ndarray | None, bend: np.ndarray, dt: float,
                  ) -> _Dragged:  # fmt: skip
-        """Friction of a contact that presses with a wrench (6,), as the scalars say, without friction."""
+        """Friction of a contact that presses with a wrench (6,), as the scalars say, without friction.
+
+        Friction turns the way that the push faces, and the push bounds friction: both are asked until they agree.
+        """
         before, radius, depth = one.before, scalars.radius, scalars.depth
         patch, mu = self.sideways.at(radius, thickness), self.friction(one.stated.name)
-        stated, wanted = one.stated.wrench, NOTHING
-        if stated is not None:
-            wanted = in_plane(stated - wrench, contact, origin, lever)
+        stated, wanted, turned, out, grown = one.stated.wrench, NOTHING, NOTHING, 0.0, 1.0
+        if before.stiffness[0] > 0:
+            turned, out = faced(before.springs, before.stiffness, contact, bend, MOST_LEAN)
         way, rolled = way_of_tool(one.twist, one.known, before.contact, before.scalars.pressing > 0, contact, origin,
                                   depth, radius, lever)  # fmt: skip
-        stiffer, cap = ploughing(depth, radius, force, patch.along, patch.bare, mu)
-        along = stiffer * patch.secant(mu * force)
-        if give is not None:
-            aim = wanted if stated is not None else before.springs.sum(axis=0) + along * way
-            along = given_way(along, give, aim, contact)
-        stiffness = np.array((along, along, stiffer * patch.turn / (lever * lever)))
-        springs, relaxed, carried, share, stored = drag(
-            before.springs, before.springs_relaxed, *self.series, dt, rolled, stiffness, before.stiffness, cap, way,
-            wanted, stated is not None)  # fmt: skip
-        rubs, offset, turn = in_space(carried, springs, stiffness, contact, origin, lever)
-        turned = bend @ offset  # of the normal, between where the skin came from and here
-        size = math.sqrt(turned @ turned)
-        lean = math.sqrt(wrench[:3] @ wrench[:3]) * min(1.0, MOST_LEAN / max(size, 1e-300)) * turned
-        stored += 0.5 * max(float(lean @ offset), 0.0)
-        return _Dragged(Slip(rubs, share, offset, turn, contact[0], lean), cap, stiffness, springs, relaxed, stored)
+        size = math.sqrt(wrench[:3] @ wrench[:3])
+        for _ in range(MOST_PASSES):
+            if stated is None:
+                grown = max(1 + out / depth, LEAST_GROWN) ** scalars.power
+            else:
+                grown, lean = carried_more(stated, contact[1], turned), size * turned
+                push = grown * (wrench + np.concatenate([lean, np.cross(contact[0] - origin, lean)]))
+                wanted = in_plane(stated - push, leaned(contact, turned), origin, lever)
+            stiffer, cap = ploughing(depth, radius, grown * force, patch.along, patch.bare, mu)
+            alone = along = stiffer * patch.secant(mu * grown * force)
+            if give is not None:
+                aim = wanted if stated is not None else before.springs.sum(axis=0) + along * way
+                along = given_way(along, give, aim, contact)
+            if out > 0:  # skin leans before the tool once: as it turns about the bone, or as it is ploughed
+                by_turn = max(1 - along / alone, 0.0) * math.sqrt(turned @ turned)
+                cap -= min(by_turn * grown * force, cap - mu * grown * force)
+            stiffness = np.array((along, along, stiffer * patch.turn / (lever * lever)))
+            springs, relaxed, carried, share, stored = drag(
+                before.springs, before.springs_relaxed, *self.series, dt, rolled, stiffness, before.stiffness, cap, way,
+                wanted, stated is not None)  # fmt: skip
+            last, (turned, out) = turned, faced(springs, stiffness, contact, bend, MOST_LEAN)
+            if abs(turned - last).max() < SETTLED:
+                break
+        rubs, offset, turn = in_space(carried, springs, stiffness, leaned(contact, turned), contact, origin, lever)
+        stored += max(0.5 * (1 + grown) * size * out, 0.0)
+        slip = Slip(rubs, share, offset, turn, contact[0], grown * size * turned, grown)
+        return _Dragged(slip, cap, stiffness, springs, relaxed, stored)
 
     def _said(self, one: _Asked, touch: Touch, changed: dict[str, Any]) -> Touch:
         """The touch with what changed, with what of the stated wrench is missing, and what that says of it."""

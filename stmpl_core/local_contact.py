@@ -6,6 +6,7 @@ LocalContact (reaction, stiffness, how far it holds), and a DeviceLoop beside th
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
@@ -15,7 +16,7 @@ from numpy.typing import ArrayLike
 
 from stmpl_core.arrays import Transform, Wrench, finite
 from stmpl_core.contact import Contact
-from stmpl_core.footing import in_plane, patch_of, twist_between
+from stmpl_core.footing import in_plane, leaned, patch_of, twist_between
 from stmpl_core.history import History
 from stmpl_core.state import Memory, State
 from stmpl_core.tangent import Tangent, tangents
@@ -212,12 +213,13 @@ def _model(toucher: Toucher, touch: Touch, tangent: Tangent | None, memory: Memo
     contact = patch_of(nodes.points, nodes.area, nodes.thickness, depth, pressed.forces, normal)
     if memory is not None and memory.scalars.pressing > 0:  # W = W_e - lambda A, and A stays
         now = memory.scalars
-        by = min(whole / (now.elastic * now.stretch * touch.passive), 1.0)
+        grown = touch.passive * (1.0 if touch.slip is None else touch.slip.grown)
+        by = min(whole / (now.elastic * now.stretch * grown), 1.0)
         stiffness = stiffness + (1 / by - 1) * np.outer(push / whole, tangent.whole)
         eased = (1 / by - 1) * touch.force
         along = np.append(normal, np.zeros(3))
         stiffness = stiffness + (1 / by - 1) / (now.stretch * contact[3]) * np.outer(push, along)
-        drawn /= by * touch.passive
+        drawn /= by * grown
     if drawn > 1 + 1e-9:  # the tool was drawn back along the normal to where it is answered for: see Toucher
         along = np.append(normal, np.zeros(3))
         rise = push / drawn * STIFFENING / float(toucher.layer.thickness.max())
@@ -258,8 +260,9 @@ def _neighbourhood(touch: Touch, pressed: Pressed, power: float, middle: np.ndar
 def _grip(touch: Touch, memory: Memory, lever: float) -> Grip:
     """Friction of a touch."""
     assert touch.slip is not None
-    middle, normal, first = memory.contact
+    contact = leaned(memory.contact, touch.slip.lean / math.sqrt(touch.force**2 - touch.slip.lean @ touch.slip.lean))
+    middle, normal, first = contact
     arm, second = middle - touch.pose_body_from_tool[:3, 3], np.cross(normal, first)
     axes = np.array([[*first, *np.cross(arm, first)], [*second, *np.cross(arm, second)], [0, 0, 0, *(lever * normal)]])
-    forces = in_plane(touch.slip.wrench, memory.contact, touch.pose_body_from_tool[:3, 3], lever)
+    forces = in_plane(touch.slip.wrench, contact, touch.pose_body_from_tool[:3, 3], lever)
     return Grip(axes, forces, memory.stiffness, memory.scalars.limit / touch.force)

@@ -226,6 +226,54 @@ def test_friction_is_by_tool_and_by_name(sim: Simulator) -> None:
             coefficient(wrong)
 
 
+# Around a limb
+
+
+@pytest.fixture(scope="module")
+def thick() -> Simulator:
+    """A limb that turns away from a ball within the way of its skin."""
+    return Simulator(limb(4e-3, 0.015, 0.03, 0.12, youngs_modulus=2e4), Winkler(), friction=MU)
+
+
+def around(deepest: float, way: float) -> list[np.ndarray]:
+    """A ball pressed into that limb along x, then led on along y."""
+    down = [at(0.03 + RADIUS - z, 0, 0.06) for z in np.linspace(-1e-4, deepest, 12)]
+    return down + [at(0.03 + RADIUS - deepest, y, 0.06) for y in np.linspace(0, way, 25)[1:]]
+
+
+def test_a_push_grows_by_the_energy_that_its_lean_takes() -> None:
+    """Reciprocity: what the lean over a way gains from a greater depth, the push gains from the way."""
+    sim, leans = Simulator(limb(4e-3, 0.015, 0.03, 0.12, youngs_modulus=2e4), Winkler(), friction=5.0), []
+    depths = np.array([3.5e-3, 4e-3, 4.5e-3])
+    for depth in depths:
+        (*_, touch), _ = led(sim, around(depth, 2e-3))
+        way = float(np.linalg.norm(touch.slip.offset))
+        leans.append(np.linalg.norm(touch.slip.lean) / touch.slip.grown / way)
+        if depth == depths[1]:
+            alone = sim.toucher.touch(Contact(BALL, touch.pose_body_from_tool)).force
+            grown, stuck = (touch.slip.grown - 1) * alone, way
+    assert touch.slip.share < 0.1 and grown > 0.01 * alone
+    assert grown == pytest.approx(0.5 * stuck**2 * (leans[2] - leans[0]) / (depths[2] - depths[0]), rel=0.2)
+
+
+def test_friction_is_at_right_angles_to_a_push_that_leans(thick: Simulator) -> None:
+    touches, _ = led(thick, around(4e-3, 8e-3))
+    assert touches[-1].slip.kind == "slide" and np.linalg.norm(touches[-1].slip.lean) > 0.03 * touches[-1].force
+    for touch in touches[13:]:
+        rubs = touch.slip.wrench[:3]
+        assert abs(rubs @ touch.push) < 1e-3 * np.linalg.norm(rubs) * touch.force
+
+
+def test_a_wrench_around_a_limb_is_carried_with_the_lean_of_its_push(thick: Simulator) -> None:
+    pose, state, stated = at(0.03 + RADIUS - 3e-3, 0, 0.06), State(), np.zeros(6)
+    stated[:2] = -1.0, 0.3
+    for share in np.linspace(0.1, 1, 10):
+        (touch,), state = thick.touch([Contact(BALL, pose, stated * [1, share, 1, 1, 1, 1])], state, 0.0)
+        pose = touch.pose_body_from_tool
+    assert touch.slip.kind != "slide" and np.linalg.norm(touch.slip.lean) > 0.03
+    np.testing.assert_allclose(touch.wrench[:3], stated[:3], atol=0.02)
+
+
 # Energy
 
 
