@@ -40,6 +40,7 @@ class Played:
         about: what was done.
         way: way of the tool from its first pose, (N,) [m].
         truth, found: forces on the body along the stroke, aside and outwards, finite elements' and ours, (N, 3) [N].
+        true_friction, friction: their parts that are friction, (N, 3) [N].
         at: numbers of the poses whose motion is known, (K,).
         moved: motion of the skin by finite elements, (K, V, 3) [m].
         motion: ours, (K, V, 3) [m].
@@ -53,6 +54,8 @@ class Played:
     way: np.ndarray
     truth: np.ndarray
     found: np.ndarray
+    true_friction: np.ndarray
+    friction: np.ndarray
     at: np.ndarray
     moved: np.ndarray
     motion: np.ndarray
@@ -98,13 +101,14 @@ def played(path: Path) -> Played:
     law = about["friction"]
     simulator = Simulator(layer, MomentNet(), friction=None if isinstance(law, str) else law)
     tool, poses, times = ball(about["radius"]), kept["pose"], kept["time"]
-    state, found, motion, elastic, trusts = State(), [], [], [], []
+    state, found, rubs, motion, elastic, trusts = State(), [], [], [], [], []
     for k, pose in enumerate(poses):
         for part in range(1, BETWEEN + 1) if k else (1,):
             there = between(poses[k - 1], pose, part / BETWEEN) if k else pose
             dt = (times[k] - times[k - 1]) / BETWEEN if k else 0.0
             (touch,), state = simulator.touch([Contact(tool, there)], state, dt)
         found.append(touch.wrench[:3])
+        rubs.append(np.zeros(3) if touch.slip is None else touch.slip.wrench[:3])
         if k in kept["at"]:
             answer = simulator.answer([touch])
             motion.append(answer.displacement)
@@ -113,8 +117,9 @@ def played(path: Path) -> Played:
     axes = frame[:3, :3]
     way = np.linalg.norm((poses[:, :3, 3] - poses[0, :3, 3]) @ axes[:, :2], axis=1)
     in_range, bound = np.array(trusts).T
-    return Played(path.stem, about, way, kept["wrench"][:, :3] @ axes, np.array(found) @ axes, kept["at"],
-                  kept["displacement"], np.array(motion), np.array(elastic), in_range, bound)  # fmt: skip
+    return Played(path.stem, about, way, kept["wrench"][:, :3] @ axes, np.array(found) @ axes,
+                  kept["friction"][:, :3] @ axes, np.array(rubs) @ axes, kept["at"], kept["displacement"],
+                  np.array(motion), np.array(elastic), in_range, bound)  # fmt: skip
 
 
 def between(start: np.ndarray, end: np.ndarray, share: float) -> np.ndarray:
@@ -142,6 +147,10 @@ def told(one: Played) -> str:
             mean_normal = 100 * (found[when, 2] / truth[when, 2] - 1).mean()
             lines.append(f"  {name}: tangential off by at most {tangential[when].max():.1f} %, normal "
                          f"{normal[when].max():.1f} % ({mean_normal:+.1f} % in the mean)")  # fmt: skip
+        k, off = int(tangential.argmax()), 100 * (found - truth) / pull
+        rubs = 100 * (one.friction - one.true_friction) / pull
+        lines.append(f"  most is off at {1e3 * one.way[k]:.1f} mm; along the way by {off[k, 0]:+.1f} %: of the push "
+                     f"{off[k, 0] - rubs[k, 0]:+.1f} %, of friction {rubs[k, 0]:+.1f} %")  # fmt: skip
         there, ours = one.onset(truth), one.onset(found)
         lines.append(f"  onset: {1e3 * ours:.2f} mm, finite elements {1e3 * there:.2f} mm "
                      f"({100 * (ours / there - 1):+.0f} %); steady drag {one.drag(found):.3f} N, finite elements "

@@ -311,6 +311,19 @@ def test_no_closed_path_gives_energy(
         assert net > -0.005 * put
 
 
+def test_no_closed_path_around_a_limb_gives_energy(thick: Simulator) -> None:
+    """Where skin is dragged the push leans and grows: pressed, led, pressed deeper or less, led back, and lifted."""
+    rng = np.random.default_rng(5)
+    for _ in range(3):
+        deep, way = rng.uniform(2e-3, 4e-3, 2), rng.uniform(2e-3, 8e-3)
+        keys = np.array([[-1e-4, 0], [deep[0], 0], [deep[0], way], [deep[1], way], [deep[1], 0], [-1e-4, 0]])
+        steps = np.vstack([np.linspace(a, b, 25)[1:] for a, b in pairwise(keys)])
+        touches, _ = led(thick, [at(0.03 + RADIUS - depth, y, 0.06) for depth, y in np.vstack([keys[:1], steps])])
+        forces = np.array([touch.wrench[:2] for touch in touches])
+        works = 0.5 * ((forces[1:] + forces[:-1]) * np.diff(np.vstack([keys[:1], steps]) * [-1, 1], axis=0)).sum(axis=1)
+        assert works.sum() > -0.005 * works[works > 0].sum()
+
+
 def test_a_tool_that_has_nothing_left_to_give_still_has_an_answer() -> None:
     """It jumps to the other side of a limb and presses harder there than what was put in can pay for."""
     sim, state, found = Simulator(limb(6e-3), Winkler(), friction=0.3), State(), []
