@@ -3,6 +3,7 @@
     .venv/bin/python -m benchmarks.limbs                            # our row and the simpler laws'; some minutes
     .venv/bin/python -m benchmarks.limbs --answers yours.py:answer  # and yours
     .venv/bin/python -m benchmarks.limbs --export DIR               # the scenes as STL and JSON, for any program
+    .venv/bin/python -m benchmarks.limbs --kept                     # share of the tools' forces that the scenes keep
 
 benchmarks/limbs.md says what is in benchmarks/limbs_v3.npz. `answer(layer, tool, pose, way)` gets a SoftLayer, a Tool,
 its pose (4, 4) in the limb's frame and the unit vector (3,) along which it came there, and returns the force of the
@@ -12,6 +13,7 @@ tool on the limb (3,) [N] and the motion of the skin (V, 3) [m], or None for the
 from __future__ import annotations
 
 import argparse
+import itertools
 import json
 import logging
 from collections import defaultdict
@@ -25,6 +27,7 @@ import trimesh
 from rich.console import Console
 from rich.table import Table
 
+from fem_tools.dataset import Sample
 from fem_tools.plies import confined_modulus
 from fem_tools.released import Released
 from stmpl_core import Contact, SoftLayer, Tool
@@ -44,6 +47,7 @@ LIMBS = {  # rows of scenes: what splits, and how the limbs are called; a networ
     "forearm and thigh": (("held_out",), ("forearm", "thigh")),
     "people": (("test", "val"), ("living",)),
 }
+DEPTHS = (0.0, 0.1, 0.3, 0.6, 1.0)  # over the thickness, between which --kept takes means
 MOVES = 0.1  # motion that counts as such, over the peak
 Answer = Callable[[SoftLayer, Tool, np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray | None]]
 
@@ -174,11 +178,26 @@ def export(samples: Iterable, folder: Path) -> int:
     return len(scenes)
 
 
+def kept(title: str, samples: Iterable[Sample]) -> Table:
+    """Share of the tools' forces that pressures along the skin's normals at rest make, by depth (Pressed.kept)."""
+    shares = [(one.sample.info["ratio"], one.kept) for one in pressed(samples) if one.true.any()]
+    ratio, share = np.array(shares).T
+    out = Table(title=f"{title}: share of the tools' forces that is kept")
+    for heading in ("depth over thickness", "scenes", "mean", "tenth below", "least"):
+        out.add_column(heading, justify="right")
+    for low, high in itertools.pairwise(DEPTHS):
+        if (some := (ratio >= low) & (ratio < high)).any():
+            figures = share[some].mean(), np.quantile(share[some], 0.1), share[some].min()
+            out.add_row(f"{low:g} to {high:g}", str(some.sum()), *(f"{100 * one:.1f} %" for one in figures))
+    return out
+
+
 def main() -> None:
     """Prints a table for each kind of limb, or writes the scenes."""
     given = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     given.add_argument("--limbs", nargs="+", choices=list(LIMBS), default=list(LIMBS))
     given.add_argument("--answers", default="", help="file.py:function of a law of yours")
+    given.add_argument("--kept", action="store_true", help="what the scenes keep of the tools' forces instead; no law")
     given.add_argument("--export", type=Path, default=None, help="folder to which the scenes are written instead")
     given.add_argument("--file", type=Path, default=FILE, help="released contacts")
     options = given.parse_args()
@@ -191,7 +210,12 @@ def main() -> None:
         other = own(options.answers) if options.answers else None
     except InvalidInput as error:
         given.error(str(error))
-    for kind in options.limbs:
+    for kind in options.limbs if options.kept else ():
+        splits, names = LIMBS[kind]
+        samples = [one for one in released.samples() if one.info["split"] in splits and slant_of(one) <= STRAIGHT
+                   and one.info["body"].startswith(names)]  # fmt: skip
+        Console(width=130).print(kept(kind, samples))
+    for kind in () if options.kept else options.limbs:
         Console(width=130).print(table(kind, compare(released, *LIMBS[kind], other)))
 
 

@@ -12,7 +12,7 @@ from fem_tools.dataset import Sample
 from fem_tools.press import Press
 from fem_tools.sampling import tool_scene
 from fem_tools.scenes import Site
-from stmpl_core.arrays import Transform
+from stmpl_core.arrays import PerVertex, Transform, VertexVectors
 from stmpl_core.columns import Columns, Squeeze
 from stmpl_core.contact_net import ContactNet
 from stmpl_core.layer import SoftLayer
@@ -23,6 +23,7 @@ from stmpl_core.touch import BY_POSE, Touch
 from stmpl_core.touch import Pressed as Touched
 
 LEAST_CELLS = 20  # area of a contact over the square of the finite elements' edge, from which they know its pressure
+LEAST_FACING = 0.3  # least cosine between a traction and the skin's normal at rest that is reckoned with
 STRAIGHT = 0.36  # largest slant of a tool's way that is learnt from: no pose tells of it [rad]
 
 
@@ -53,11 +54,20 @@ class Pressed:
 
     @property
     def touch(self) -> Touch:
-        """What a contact law that knows the true pressure would say, of a force along the tool's way."""
+        """What a contact law that knows the true pressure would say, of a force along the tool's way.
+
+        As all laws here, it makes the force of pressures along the skin's normals at rest, `kept` of the tool's.
+        """
         layer, pressure = self.sample.layer, self.sample.load.values
         force = -(pressure @ layer.vertex_area_vectors)
         return Touch(self.tool.name, BY_POSE, self.pose, np.concatenate([force, np.zeros(3)]), pressure=pressure,
                      pressed=Touched(self.field, self.squeeze, self.way))  # fmt: skip
+
+    @property
+    def kept(self) -> float:
+        """See `kept_by_normals`."""
+        one = self.sample
+        return kept_by_normals(one.layer, Press(self.field, self.pose, self.way), one.load.values, one.displacement)
 
     @property
     def true(self) -> np.ndarray:
@@ -86,6 +96,27 @@ def pressed(samples: Iterable[Sample]) -> Iterator[Pressed]:
         _, tool, mesh, thickness = last
         pose = tool.at(sample.info["ratio"] * thickness).pose_body_from_tool
         yield Pressed(sample, mesh, tool.field, pose, tool.direction, columns.squeezed(tool.field, pose))
+
+
+def kept_by_normals(layer: SoftLayer, tool: Press, pressure: PerVertex, displacement: VertexVectors) -> float:
+    """Share of a tool's force along its way that pressures along the skin's normals at rest make, about [-].
+
+    Data keep of the tractions only that pressure. Here they are taken to lie halfway between the tool's way and the
+    normal of its surface where the skin came to: under balls on limbs the force is then known to 3 %.
+
+    Args:
+        layer: skin at rest.
+        tool: tool where it stands.
+        pressure: normal part of the tractions on the skin at rest, (V,) [Pa].
+        displacement: motion of the skin, (V, 3) [m].
+    """
+    on = np.flatnonzero(pressure > 0)
+    inward, carried = -layer.normals[on], pressure[on] * layer.vertex_areas[on]
+    surface = tool.jet(layer.vertices[on] + displacement[on])[1]
+    along = tool.direction + surface / np.maximum(np.linalg.norm(surface, axis=1, keepdims=True), 1e-9)
+    along /= np.maximum(np.linalg.norm(along, axis=1, keepdims=True), 1e-9)
+    facing = np.maximum(np.einsum("vx,vx->v", inward, along), LEAST_FACING)
+    return float(carried @ (inward @ tool.direction) / (carried @ (along @ tool.direction / facing)))
 
 
 @dataclass(frozen=True, eq=False)
