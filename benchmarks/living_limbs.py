@@ -42,12 +42,14 @@ FORCES = (5.0, 20.0, 50.0)  # N
 
 
 class Compared(NamedTuple):
-    """One depth: strain, depth [mm], true force and ours with its bound [N], motion off [% of the peak]: mean where it
-    moves more than a tenth of that, and at the worst vertex; in range or why not."""
+    """One depth: strain, depth [mm], true force, the share of it that pressures along the skin's normals at rest make,
+    our force with its bound [N], motion off [% of the peak]: mean where it moves more than a tenth of that, and at the
+    worst vertex; in range or why not."""
 
     strain: float
     depth: float
     truth: float
+    kept: float
     force: float
     bound: float
     moves: float
@@ -77,12 +79,13 @@ def site(layer: SoftLayer, part: str) -> int:
 
 
 class Truth(NamedTuple):
-    """Finite elements at some depths of a part: strains, (D,); poses of the ball, (D, 4, 4); forces [N], (D,); and
-    motion of the skin [m], (D, V, 3)."""
+    """Finite elements at some depths of a part: strains, (D,); poses of the ball, (D, 4, 4); forces along its way, and
+    of their pressures along the skin's normals at rest alone [N], (D,) each; and motion of the skin [m], (D, V, 3)."""
 
     strains: np.ndarray
     poses: np.ndarray
     forces: np.ndarray
+    projected: np.ndarray
     moved: np.ndarray
 
 
@@ -100,8 +103,8 @@ def solved(part: str, edge: float, strains: tuple[float, ...] = STRAINS, reach: 
     for strain, depth, truth in zip(strains, depths, fem.path([start], depths), strict=True):
         if not truth.trust.ok:
             break
-        rows.append((strain, start.at(depth).pose_body_from_tool,
-                     np.linalg.norm(truth.pressure @ layer.vertex_area_vectors), truth.displacement))  # fmt: skip
+        projected = -(truth.pressure @ layer.vertex_area_vectors) @ start.direction
+        rows.append((strain, start.at(depth).pose_body_from_tool, truth.force, projected, truth.displacement))
     return Truth(*(np.array(column) for column in zip(*rows, strict=True)))
 
 
@@ -110,13 +113,14 @@ def compare(part: str, edge: float, truths: Truth) -> list[Compared]:
     layer = living(Body.anny(), part, edge_length=edge)
     thickness = float(layer.thickness[site(layer, part)])
     simulator, out = Simulator(layer, MomentNet()), []
-    for strain, pose, force, displacement in zip(*truths, strict=True):
+    for strain, pose, force, projected, displacement in zip(*truths, strict=True):
         answer = simulator.step([Contact(ball(RADIUS), pose)])
         touch, moved = answer.touches["ball"], np.linalg.norm(displacement, axis=1)
         off = 100 * np.linalg.norm(answer.displacement - displacement, axis=1) / moved.max()
         where_it_moves = float(off[moved > 0.1 * moved.max()].mean())
-        out.append(Compared(float(strain), 1e3 * strain * thickness, float(force), touch.force, touch.force_bound,
-                            where_it_moves, float(off.max()), answer.trust.why))  # fmt: skip
+        out.append(Compared(float(strain), 1e3 * strain * thickness, float(force), float(projected / force),
+                            touch.force, touch.force_bound, where_it_moves, float(off.max()),
+                            answer.trust.why))  # fmt: skip
     return out
 
 
@@ -179,7 +183,7 @@ def draw(found: dict[str, list[Compared]], path: Path) -> None:
     """Force over depth of each part, and the error of force and motion over depth over thickness."""
     figure, (left, middle, right) = plt.subplots(1, 3, figsize=(13, 4.2), layout="constrained")
     for name, rows in found.items():
-        strain, depth, truth, force, bound, moves, _, _ = (np.array(x) for x in zip(*rows, strict=True))
+        strain, depth, truth, _, force, bound, moves, _, _ = (np.array(x) for x in zip(*rows, strict=True))
         (line,) = left.plot(depth, force, label=name)
         left.fill_between(depth, np.maximum(force - bound, 0), force + bound, color=line.get_color(), alpha=0.15, lw=0)
         left.plot(depth, truth, "o", color=line.get_color(), ms=5)
@@ -211,11 +215,12 @@ def main() -> None:
         print(name)
         if not given.times_only:
             found[name] = compare(part, edge, kept(given.keep, part, edge))
-            print("    strain  depth   FEM     ours    bound  off     moves  worst   in range?")
+            print("    strain  depth   FEM  by normals   ours    bound  off     moves  worst   in range?")
             for row in found[name]:
                 off = 100 * (row.force / row.truth - 1)
-                print(f"    {row.strain:5.2f} {row.depth:6.1f} mm {row.truth:6.2f} {row.force:7.2f} {row.bound:7.2f} "
-                      f"{off:+6.1f} % {row.moves:5.1f} {row.worst:6.1f} %  {row.why}")  # fmt: skip
+                print(f"    {row.strain:5.2f} {row.depth:6.1f} mm {row.truth:6.2f} {100 * row.kept:6.1f} %     "
+                      f"{row.force:7.2f} {row.bound:7.2f} {off:+6.1f} % "
+                      f"{row.moves:5.1f} {row.worst:6.1f} %  {row.why}")  # fmt: skip
         for wide in (edge, 3e-3):
             times(part, wide)
     if found:
