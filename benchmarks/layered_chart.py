@@ -38,7 +38,7 @@ from stmpl_core.methods import Coarse, MomentNet
 from stmpl_core.methods.coarse import interpolation
 from stmpl_core.simulator import Simulator
 from studies.peers import installed
-from studies.pressed import STRAIGHT, Pressed, pressed, seen, slant_of
+from studies.pressed import STRAIGHT, Pressed, force_of, pressed, seen, slant_of
 
 log = logging.getLogger(__name__)
 
@@ -120,12 +120,12 @@ def simpler(layer: SoftLayer, columns: bool) -> Solver:
         squeeze = under.squeezed(one.field, one.pose)
         nodes = squeeze.nodes
         pressure = laws.columns(nodes) if columns else laws.linear(nodes)
-        forces = (pressure * nodes.area)[:, None] * nodes.inward
+        force = force_of(layer, nodes, pressure)
         if not columns:
-            return forces.sum(axis=0), green.motion(nodes, forces / modulus)
+            return force, green.motion(nodes, (pressure * nodes.area / modulus)[:, None] * nodes.inward)
         motion = np.zeros_like(layer.vertices)
         motion[squeeze.vertices] = -squeeze.depth[:, None] * layer.normals[squeeze.vertices]
-        return forces.sum(axis=0), motion
+        return force, motion
 
     return lambda every: warm(answer, every)
 
@@ -145,14 +145,9 @@ def elements(layer: SoftLayer, reach: float, refine: int, step: float) -> Solver
             answer = next(answers, None)
             took = time.process_time() - began
             known = answer is not None and answer.trust.converged
-            yield (force_of(layer, answer.traction), answer.displacement, took) if answer and known else None
+            yield (layer.vertex_areas @ answer.traction, answer.displacement, took) if answer and known else None
 
     return found
-
-
-def force_of(layer: SoftLayer, traction: np.ndarray) -> np.ndarray:
-    """Force (3,) [N] of contact tractions (V, 3) [Pa] as the file has it: of what presses along the skin's normals."""
-    return np.minimum(0.0, np.einsum("vi,vi->v", traction, layer.normals)) @ layer.vertex_area_vectors
 
 
 def flex(layer: SoftLayer, refine: int) -> Solver:
@@ -174,7 +169,7 @@ def flex(layer: SoftLayer, refine: int) -> Solver:
             began = time.process_time()
             held = peer.press(start + share * (end - start))
             log.info("flex: %s, min det F %.2f, %.2f mm in the ball", held.rests, held.min_j, 1e3 * held.entered)
-            yield force_of(layer, held.traction), held.displacement, time.process_time() - began
+            yield layer.vertex_areas @ held.traction, held.displacement, time.process_time() - began
 
     return found
 

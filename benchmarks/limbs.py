@@ -38,7 +38,7 @@ from stmpl_core.nodes import Nodes
 from stmpl_core.simulator import Simulator
 from stmpl_core.touch import Touch
 from studies.own import own
-from studies.pressed import STRAIGHT, Pressed, pressed, seen, slant_of
+from studies.pressed import STRAIGHT, Pressed, force_of, pressed, seen, slant_of
 
 FILE = Path(__file__).with_name("limbs_v3.npz")
 LIMBS = {  # rows of scenes: what splits, and how the limbs are called; a network may learn from others of "train"
@@ -72,7 +72,7 @@ class Off(NamedTuple):
 def off(one: Pressed, force: np.ndarray, motion: np.ndarray | None, flagged: bool = False,
         bound: float = float("nan")) -> Off:  # fmt: skip
     """Compares an answer with a scene."""
-    true = float(np.linalg.norm(one.touch.wrench[:3]))
+    true = float(np.linalg.norm(one.force))
     error = float(np.linalg.norm(force)) / true - 1
     if motion is None:
         return Off(error, flagged=flagged, bound=bound)
@@ -110,12 +110,12 @@ class Laws:
         self.simulator.tools.add(one.tool, one.field)
         touch = met(self.simulator, one)
         answer = self.simulator.answer([touch])
-        true = float(np.linalg.norm(one.touch.wrench[:3]))
+        true = float(np.linalg.norm(one.force))
         out["moment_net"] = off(one, touch.wrench[:3], answer.displacement, flagged=not answer.trust.in_range,
                                 bound=touch.force_bound / true)  # fmt: skip
         if len(nodes.area):
-            out["its linear part"] = off(one, self.linear(nodes) * nodes.area @ nodes.inward, None)
-            out["elastic foundation"] = off(one, self.columns(nodes) * nodes.area @ nodes.inward, None)
+            out["its linear part"] = off(one, force_of(layer, nodes, self.linear(nodes)), None)
+            out["elastic foundation"] = off(one, force_of(layer, nodes, self.columns(nodes)), None)
         if self.other is not None:
             out["yours"] = off(one, *self.other(layer, one.tool, one.pose, one.way))
         return out
@@ -173,7 +173,7 @@ def export(samples: Iterable, folder: Path) -> int:
             trimesh.Trimesh(one.tool.vertices, one.tool.faces, process=False).export(folder / tool)
         scenes.append({"limb": limb, "tool": tool, "split": info["split"], "depth_over_thickness": info["ratio"],
                        "pose_limb_from_tool": one.pose.tolist(), "way": one.way.tolist(),
-                       "force_on_limb_N": one.touch.wrench[:3].tolist(), "fem_error_m": info["discretisation_m"]})
+                       "force_on_limb_N": one.force.tolist(), "fem_error_m": info["discretisation_m"]})
     (folder / "scenes.json").write_text(json.dumps(scenes, indent=1) + "\n")
     return len(scenes)
 

@@ -106,7 +106,7 @@ def compare(edge: float, stack: bool, bends: tuple[int, ...], reach: float) -> N
                 truth = fem.press([start], DEEP * thickness)
                 at = start.at(DEEP * thickness).pose_body_from_tool
                 moved = np.linalg.norm(truth.displacement, axis=1)
-                true = float(np.linalg.norm(truth.pressure @ again.vertex_area_vectors))
+                true = truth.force
                 words, ours = "", []
                 for one in [simulator, afresh]:
                     if one is None:

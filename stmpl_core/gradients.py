@@ -25,11 +25,12 @@ from stmpl_core.methods.base import Method
 from stmpl_core.nodes import Nodes
 from stmpl_core.sdf import SignedDistance
 from stmpl_core.simulator import Simulator
-from stmpl_core.tangent import Tangent, groups_that_press, tangents, unit_wrenches
+from stmpl_core.tangent import Tangent, groups_that_press, tangents
 from stmpl_core.tool import Tool
 from stmpl_core.touch import Touch
 from stmpl_core.toucher import STIFFENING
 from stmpl_core.trust import Trust
+from stmpl_core.wrenches import unit_wrenches
 
 By = Literal["pose", "modulus", "thickness", "tool_scale"]
 EVERY: tuple[By, ...] = get_args(By)
@@ -248,7 +249,7 @@ class Gradients:
         assert touch.pressed is not None
         layer, nodes, factor = self.simulator.layer, touch.pressed.squeeze.nodes, touch.pressed.factor
         unit = unit_wrenches(layer.vertices, layer.vertex_area_vectors, layer.vertex_areas,
-                             touch.pose_body_from_tool[:3, 3], nodes.corners)  # fmt: skip
+                             touch.pose_body_from_tool[:3, 3], nodes.corners, touch.pressed.stuck)  # fmt: skip
         out = np.einsum("n,nc,ncx->x", forces, nodes.shares, unit)
         if factor > DRAWN:
             deepest = float((nodes.strain * nodes.thickness)[nodes.strain.argmax()])

@@ -278,7 +278,8 @@ class History:
         springs = NOTHING, one.before.springs, one.before.springs_relaxed
         if self.friction(touch.name) > 0 and net > MIN_ONE_WAY_SHARE:
             give, bend = self.toucher.give(nodes, pressed.forces), self.toucher.curvature(nodes, pressed.forces)
-            dragged = self._dragged(one, wrench, contact, pose[:3, 3], scalars, force, lever, thickness, give, bend, dt)
+            dragged = self._dragged(one, wrench, contact, pose[:3, 3], scalars, force, lever, thickness, give, bend, dt,
+                                    pressed.along)
             lean = dragged.slip.lean
             if (grown := dragged.slip.grown) != 1:
                 changed |= _scaled(touch, grown * force / elastic, grown * ROUGH * long * faded)
@@ -341,14 +342,14 @@ class History:
 
     def _dragged(self, one: _Asked, wrench: Wrench, contact: np.ndarray, origin: np.ndarray, scalars: Scalars,
                  force: float, lever: float, thickness: float, give: np.ndarray | None, bend: np.ndarray, dt: float,
-                 ) -> _Dragged:  # fmt: skip
+                 along_itself: float) -> _Dragged:  # fmt: skip
         """Friction of a contact that presses with a wrench (6,), as the scalars say, without friction.
 
         Friction turns the way that the push faces, and the push bounds friction: both are asked until they agree.
         """
         before, radius, depth = one.before, scalars.radius, scalars.depth
         patch, mu = self.sideways.at(radius, thickness), self.friction(one.stated.name)
-        stated, wanted, turned, out, grown = one.stated.wrench, NOTHING, NOTHING, 0.0, 1.0
+        stated, wanted, turned, out, grown, share = one.stated.wrench, NOTHING, NOTHING, 0.0, 1.0, 0.0
         if before.stiffness[0] > 0:
             turned, out = faced(before.springs, before.stiffness, contact, bend, MOST_LEAN)
         way, rolled = way_of_tool(one.twist, one.known, before.contact, before.scalars.pressing > 0, contact, origin,
@@ -356,7 +357,7 @@ class History:
         size = math.sqrt(wrench[:3] @ wrench[:3])
         for _ in range(MOST_PASSES):
             if stated is None:
-                grown = max(1 + out / depth, LEAST_GROWN) ** scalars.power
+                grown = max(1 + out / depth, LEAST_GROWN) ** scalars.power * (1 - along_itself * share)
             else:
                 grown, lean = carried_more(stated, contact[1], turned), size * turned
                 push = grown * (wrench + np.concatenate([lean, np.cross(contact[0] - origin, lean)]))
@@ -370,11 +371,11 @@ class History:
                 by_turn = max(1 - along / alone, 0.0) * math.sqrt(turned @ turned)
                 cap -= min(by_turn * grown * force, cap - mu * grown * force)
             stiffness = np.array((along, along, stiffer * patch.turn / (lever * lever)))
-            springs, relaxed, carried, share, stored = drag(
+            slid, (springs, relaxed, carried, share, stored) = share, drag(
                 before.springs, before.springs_relaxed, *self.series, dt, rolled, stiffness, before.stiffness, cap, way,
                 wanted, stated is not None)  # fmt: skip
             last, (turned, out) = turned, faced(springs, stiffness, contact, bend, MOST_LEAN)
-            if abs(turned - last).max() < SETTLED:
+            if abs(turned - last).max() + along_itself * abs(share - slid) < SETTLED:
                 break
         rubs, offset, turn = in_space(carried, springs, stiffness, leaned(contact, turned), contact, origin, lever)
         stored += max(0.5 * (1 + grown) * size * out, 0.0)

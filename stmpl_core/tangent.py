@@ -25,6 +25,7 @@ from stmpl_core.rays import MAX_COLUMN_STRAIN, WALL, depth_in_column, distance_i
 from stmpl_core.sdf import SignedDistance
 from stmpl_core.touch import MIN_ONE_WAY_SHARE, Pressed, Touch
 from stmpl_core.toucher import Toucher, groups_of
+from stmpl_core.wrenches import unit_wrenches
 
 LEAST_COSINE = 0.05  # of a column's angle to the tool's normal, below which its depth is taken not to change
 
@@ -104,7 +105,7 @@ def _of_group(toucher: Toucher, touches: Sequence[Touch]) -> list[Tangent]:
         assert one.forces is not None
         by = one.factor * slopes[:, slices[k]].reshape(len(touches), 6, -1)  # rates of its forces by each tool's twist
         unit = unit_wrenches(layer.vertices, layer.vertex_area_vectors, layer.vertex_areas,
-                             touch.pose_body_from_tool[:3, 3], every[k].corners).reshape(-1, 6)  # fmt: skip
+                             touch.pose_body_from_tool[:3, 3], every[k].corners, one.stuck).reshape(-1, 6)  # fmt: skip
         corners = by[:, :, :, None] * every[k].shares  # force at each
         corners[k] += one.forces[:, None] * rates[k].shares
         turned = (corners.reshape(len(touches), 6, -1) @ unit).transpose(0, 2, 1).copy()
@@ -119,22 +120,6 @@ def _cross_matrix(force: np.ndarray) -> np.ndarray:
     """Matrix of v -> force x v: what a translation v of the origin takes from a torque about it, -v x force."""
     x, y, z = force
     return np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-
-
-@numba.njit(cache=True, error_model="numpy")
-def unit_wrenches(points, area_vectors, areas, origin, corners):
-    """Wrench about the origin of a unit force at each corner of each node, (N, 3, 6)."""
-    out, arm, f = np.empty((len(corners), 3, 6)), np.empty(3), np.empty(3)
-    for n in range(len(corners)):
-        for c in range(3):
-            v = corners[n, c]
-            for x in range(3):
-                f[x], arm[x] = -area_vectors[v, x] / areas[v], points[v, x] - origin[x]
-                out[n, c, x] = f[x]
-            out[n, c, 3] = arm[1] * f[2] - arm[2] * f[1]
-            out[n, c, 4] = arm[2] * f[0] - arm[0] * f[2]
-            out[n, c, 5] = arm[0] * f[1] - arm[1] * f[0]
-    return out
 
 
 def _rates(layer: SoftLayer, field: SignedDistance, pose: np.ndarray, nodes: Nodes) -> _Rates:

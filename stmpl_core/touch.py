@@ -30,6 +30,7 @@ STALE = "stale"  # input that has stopped: the answer is a share of its last one
 
 MIN_ONE_WAY_SHARE = 0.7  # share of the pressure that points one way, and its cosine to a force: all skin then goes so
 PRESSING = frozenset((TOUCHING, MOVED, BY_POSE, IN_CORE))  # statuses of a tool that loads the skin
+NONE = np.zeros(3)
 
 
 class Pressed(NamedTuple):
@@ -42,6 +43,8 @@ class Pressed(NamedTuple):
         factor: factor on the pressure that moves no skin: of a tool that was drawn back from the core, and of time.
         forces: forces along the normals at the squeeze's nodes, (N,) [N]; None: not told.
         power: power of the depth with which the force grows, about [-].
+        stuck: see `wrench_of`, (3,).
+        along: share of the force that sticking skin carries along itself [-].
     """
 
     field: SignedDistance
@@ -50,12 +53,11 @@ class Pressed(NamedTuple):
     factor: float = 1.0
     forces: np.ndarray | None = None
     power: float = 1.5
+    stuck: np.ndarray = NONE
+    along: float = 0.0
 
 
 SlipKind = Literal["stick", "creep", "slide"]
-
-
-NO_LEAN = np.zeros(3)
 
 
 class Slip(NamedTuple):
@@ -68,7 +70,8 @@ class Slip(NamedTuple):
         turn: turn by which it is, about the inward normal of the contact [rad].
         middle: middle of the contact on the skin at rest, (3,) [m].
         lean: part of the push that is so since the skin came from where the limb faces another way, (3,) [N].
-        grown: factor on the push, of the same energy as the lean [-].
+        grown: factor on the push, of the same energy as the lean, and of skin that slides: besides friction it carries
+            nothing along itself [-].
     """
 
     wrench: Wrench
@@ -76,7 +79,7 @@ class Slip(NamedTuple):
     offset: np.ndarray
     turn: float
     middle: np.ndarray
-    lean: np.ndarray = NO_LEAN
+    lean: np.ndarray = NONE
     grown: float = 1.0
 
     @property

@@ -38,6 +38,7 @@ from stmpl_core.touch import (
     Touch,
 )
 from stmpl_core.trust import Trust
+from stmpl_core.wrenches import wrench_of
 
 if TYPE_CHECKING:
     from stmpl_core.skin import Skin
@@ -52,7 +53,7 @@ MARGIN_SHARE = 2 / 3  # width of the distance fields around tools, over the thic
 MAX_AROUND = 0.02  # depth of skin in a tool that presses nothing, over the thickness, that is not yet worth a word
 THIN = 0.7  # least extent of a tool, over the skin's edges, below which it is thin
 SUNK = 0.8  # depth of a thin tool over its least extent, beyond which its force may fall as it goes deeper
-STUCK = 1.3  # what skin that sticks carries along itself on a limb of layers, over `stuck`: 1.2 to 1.6 on a forearm
+STUCK = 0.5  # error of what skin that sticks carries along itself, over that
 MAX_LEVER = 1.0  # torque that is not carried over the force, over the contact's radius, that is not yet worth a word
 MAX_FIELD_ERROR_M = 5e-4  # error of a distance field that is not yet worth a word
 MAX_UNSEEN_FORCE_SHARE = 0.1  # share of the force that vertices unlike all training contacts may carry
@@ -288,7 +289,8 @@ class Toucher:
                 continue
             held = self.net.hold(squeeze.nodes)
             some, pressure = squeeze.nodes.at_vertices(held.pressure * self._modulus, layer.vertex_areas)
-            vector = -(pressure @ layer.vertex_area_vectors[some])
+            vector = wrench_of(pressure, some, layer.vertices, layer.vertex_area_vectors, pose[:3, 3],
+                               layer.stacked)[0][:3]  # fmt: skip
             size = float(np.linalg.norm(vector))
             wrapped = size <= MIN_NET_FORCE_SHARE * float(pressure @ layer.vertex_areas[some])
             if wrapped and not through:
@@ -333,9 +335,9 @@ class Toucher:
     def _answer(self, one: _Placed, held: Held, alone: bool) -> Touch:
         """What a placed tool does, scaled to its wrench, with what may be believed of it."""
         layer, nodes, unit = self.layer, one.squeeze.nodes, one.factor * self._modulus
-        v, pressure, values, wrench, forces, scale, size, doubt, strange, stuck = _carried(
+        v, pressure, values, wrench, forces, scale, size, doubt, strange, stuck, along = _carried(
             nodes.corners, nodes.shares, nodes.area, *held[:3], unit, math.nan if one.force is None else one.force,
-            layer.vertex_areas, layer.vertices, layer.vertex_area_vectors, one.pose[:3, 3])  # fmt: skip
+            layer.vertex_areas, layer.vertices, layer.vertex_area_vectors, one.pose[:3, 3], layer.stacked)  # fmt: skip
         stated = one.contact.wrench
         depth = self._depth(one.squeeze) if len(v) and not one.factor > 1 else one.depth
         way = stated[:3] / np.linalg.norm(stated[:3]) if stated is not None and stated[:3].any() else None
@@ -344,8 +346,7 @@ class Toucher:
         if "uneven" in known and size > 0:
             doubt = math.hypot(doubt, known["uneven"] * self.net.unlike(nodes, forces))
         bound = known["scale"] * doubt ** known["power"] if size > 0 else 0.0
-        if "uneven" in known:  # networks of layers learnt what is across the skin at rest
-            bound += STUCK * stuck
+        bound += STUCK * along
         beside, radius = pins(nodes.points, nodes.area, nodes.thickness, forces)
         wider = WIDER if beside > GROUP and depth > DEEP * radius else 1.0
         touch = Touch(
@@ -355,8 +356,8 @@ class Toucher:
             moved=one.moved,
             missing=np.zeros(6) if stated is None else stated - wrench,
             pressure=values,
-            pressed=Pressed(one.field, one.squeeze, way, one.factor, scale * forces, held.power * STIFFER)
-            if len(v) else None,
+            pressed=Pressed(one.field, one.squeeze, way, one.factor, scale * forces, held.power * STIFFER,
+                            stuck, along) if len(v) else None,
         )  # fmt: skip
         trust = self._trust(one, touch, v, pressure, strange, alone)
         if wider > 1 and len(v):
@@ -486,7 +487,7 @@ def _deepest(depth, strain, thickness):
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _carried(corners, shares, area, held, doubts, outside, unit, carries, areas, points, area_vectors, origin):
+def _carried(corners, shares, area, held, doubts, outside, unit, carries, areas, points, area_vectors, origin, sticks):
     """What the pressure at contact nodes amounts to.
 
     Args:
@@ -496,6 +497,7 @@ def _carried(corners, shares, area, held, doubts, outside, unit, carries, areas,
         carries: force that all is scaled to [N]; NaN: none.
         areas, points, area_vectors: of all vertices.
         origin: point about which torque is told, (3,) [m].
+        sticks: see wrench_of.
 
     Returns:
         vertices, pressure: numbers of the vertices that are pressed on, and pressures there, (M,) [Pa].
@@ -506,18 +508,20 @@ def _carried(corners, shares, area, held, doubts, outside, unit, carries, areas,
         size: size of the force [N].
         doubt: error to expect of it, over it.
         strange: share of it that nodes carry that see what no training contact had.
-        stuck: what skin that sticks carries along itself if it is all pushed along the mean normal, over the force,
-            which is of pressures across the skin at rest alone.
+        stuck: see wrench_of.
+        along: share of the force that skin carries along itself.
     """
-    forces, doubt, strange, total, stuck = np.empty(len(area)), 0.0, 0.0, 0.0, 0.0
+    forces, doubt, strange, total = np.empty(len(area)), 0.0, 0.0, 0.0
     for n in range(len(area)):
         forces[n] = held[n] * unit * area[n]
         doubt += doubts[n] * area[n]
         strange += forces[n] if outside[n] else 0.0
         total += forces[n]
     vertices, pressure = gathered(corners, shares, forces, areas)
-    wrench = _wrench(pressure, vertices, points, area_vectors, origin)
+    wrench, stuck, along = wrench_of(pressure, vertices, points, area_vectors, origin, sticks)
     size = np.sqrt(wrench[0] * wrench[0] + wrench[1] * wrench[1] + wrench[2] * wrench[2])
+    doubt *= unit / max(size - along, 1e-300)
+    along /= max(size, 1e-300)
     scale = carries / max(size, 1e-300) if len(vertices) and carries == carries else 1.0
     values, size = np.zeros(len(areas)), scale * size
     for x in range(6):
@@ -525,33 +529,8 @@ def _carried(corners, shares, area, held, doubts, outside, unit, carries, areas,
     for n in range(len(vertices)):
         pressure[n] *= scale
         values[vertices[n]] = pressure[n]
-        stuck += pressure[n] * _along(area_vectors[vertices[n]], wrench, size)
-    return (vertices, pressure, values, wrench, forces, scale, size, scale * unit * doubt / max(size, 1e-300),
-            strange / max(total, 1e-300), stuck / max(size, 1e-300))  # fmt: skip
-
-
-@numba.njit(cache=True, inline="always", error_model="numpy")
-def _along(area_vector, wrench, size):
-    """Area of skin times sin^2 / cos of its angle to a force [N, size] [m2]; 0 where it faces away."""
-    area = np.sqrt(area_vector[0] ** 2 + area_vector[1] ** 2 + area_vector[2] ** 2)
-    towards = -(area_vector[0] * wrench[0] + area_vector[1] * wrench[1] + area_vector[2] * wrench[2])
-    cosine = towards / max(area * size, 1e-300)
-    return area * max(1 - cosine * cosine, 0.0) / max(cosine, 0.5) if cosine > 0 else 0.0
-
-
-@numba.njit(cache=True, nogil=True)
-def _wrench(pressure, vertices, points, area_vectors, origin):
-    """Force and torque about a point, (6,), of pressures (N,) at vertices (N,)."""
-    out, f, arm = np.zeros(6), np.empty(3), np.empty(3)
-    for n in range(len(vertices)):
-        v = vertices[n]
-        for x in range(3):
-            f[x], arm[x] = -pressure[n] * area_vectors[v, x], points[v, x] - origin[x]
-            out[x] += f[x]
-        out[3] += arm[1] * f[2] - arm[2] * f[1]
-        out[4] += arm[2] * f[0] - arm[0] * f[2]
-        out[5] += arm[0] * f[1] - arm[1] * f[0]
-    return out
+    return (vertices, pressure, values, wrench, forces, scale, size, doubt, strange / max(total, 1e-300), stuck,
+            along)  # fmt: skip
 
 
 def margin_on(layer: SoftLayer) -> float:

@@ -14,6 +14,7 @@ from stmpl_core.contact_net import ContactNet
 from stmpl_core.methods import MomentNet, Zero
 from stmpl_core.networks import NETWORKS, Weights
 from stmpl_core.simulator import Simulator
+from stmpl_core.toucher import STUCK
 from studies.pressed import STRAIGHT, pressed, seen, slant_of
 
 COVERED = 0.95  # share of contacts of kinds left out, whose force and motion the stated bounds must reach
@@ -31,7 +32,7 @@ class Scores:
         force: signed error of the force over the true one.
         pressure: area-weighted L2 error over the L2 norm of the true pressure, all vertices.
         motion: largest error at a vertex over the largest displacement that is answered.
-        stated: bound on the force that is stated, over the force.
+        stated: bound on the force that is stated, over the force, without what skin carries along itself.
         linear: signed error of the force without the network.
         kind: kind of the tool; on stacks the body, as each has a stack of its own.
         slant: angle between its way and the skin's normal that the answer does not know of [rad].
@@ -86,7 +87,7 @@ def score(samples: Iterable[Sample], pressures: Weights, moments: Weights | None
             float(area @ ours) / force - 1,
             float(np.sqrt(area @ (ours - true) ** 2 / (area @ true**2))),
             motion,
-            touch.force_bound / touch.force,
+            touch.force_bound / touch.force - (STUCK * touch.pressed.along if touch.pressed else 0.0),
             float(nodes.area @ simulator.toucher.net.look(nodes).pressure) / force - 1,
             kind, slant, touch.trust.in_range, trusted,
         ))  # fmt: skip

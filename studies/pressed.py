@@ -21,6 +21,7 @@ from stmpl_core.sdf import SignedDistance
 from stmpl_core.tool import Tool
 from stmpl_core.touch import BY_POSE, Touch
 from stmpl_core.touch import Pressed as Touched
+from stmpl_core.wrenches import wrench_of
 
 LEAST_CELLS = 20  # area of a contact over the square of the finite elements' edge, from which they know its pressure
 LEAST_FACING = 0.3  # least cosine between a traction and the skin's normal at rest that is reckoned with
@@ -54,14 +55,17 @@ class Pressed:
 
     @property
     def touch(self) -> Touch:
-        """What a contact law that knows the true pressure would say, of a force along the tool's way.
-
-        As all laws here, it makes the force of pressures along the skin's normals at rest, `kept` of the tool's.
-        """
+        """What a contact law that knows the true pressure would say: the force is that of these pressures alone."""
         layer, pressure = self.sample.layer, self.sample.load.values
         force = -(pressure @ layer.vertex_area_vectors)
         return Touch(self.tool.name, BY_POSE, self.pose, np.concatenate([force, np.zeros(3)]), pressure=pressure,
                      pressed=Touched(self.field, self.squeeze, self.way))  # fmt: skip
+
+    @property
+    def force(self) -> np.ndarray:
+        """Force of the tool on the limb, (3,) [N]: that of the pressures, and along its way what they leave out."""
+        across = self.touch.wrench[:3]
+        return across + (1 / self.kept - 1) * (across @ self.way) * self.way
 
     @property
     def kept(self) -> float:
@@ -96,6 +100,13 @@ def pressed(samples: Iterable[Sample]) -> Iterator[Pressed]:
         _, tool, mesh, thickness = last
         pose = tool.at(sample.info["ratio"] * thickness).pose_body_from_tool
         yield Pressed(sample, mesh, tool.field, pose, tool.direction, columns.squeezed(tool.field, pose))
+
+
+def force_of(layer: SoftLayer, nodes: Nodes, pressure: np.ndarray) -> np.ndarray:
+    """Force on the limb, (3,) [N], of pressures at contact nodes (N,) [Pa], on skin that sticks."""
+    some, values = nodes.at_vertices(pressure, layer.vertex_areas)
+    wrench, _, _ = wrench_of(values, some, layer.vertices, layer.vertex_area_vectors, np.zeros(3), layer.stacked)
+    return wrench[:3]
 
 
 def kept_by_normals(layer: SoftLayer, tool: Press, pressure: PerVertex, displacement: VertexVectors) -> float:

@@ -185,7 +185,7 @@ def test_a_model_with_a_state_is_that_of_the_instant(spot: Spot, friction: float
 
 
 def test_what_presses_knows_of_no_friction(spot: Spot) -> None:
-    """Friction goes along with the contact: its arm about the tool's origin stays. What leans and grew is stiffer so."""
+    """Friction goes along with the contact: its arm about the tool's origin stays. A push that grew is stiffer so."""
     remembers = spot.with_memory(None, 0.5)
     history, state = History(remembers.toucher, 0.5), State()
     for k in range(12):

@@ -7,6 +7,7 @@ from typing import Any
 import warp as wp
 
 from stmpl_core import pieces, soundness, toucher
+from stmpl_core import wrenches as wrenches_of_skin
 from stmpl_core.gpu.hold import _wanted
 from stmpl_core.gpu.packs import BORDER_BIT, LONG_BIT, STEEP_BIT, OneSkin, Scratch, Skins
 from stmpl_core.gpu.places import APART, BY_POSE, DEEP, REFUSED, WRAPPED
@@ -23,6 +24,10 @@ STUCK, WIDER = wp.constant(wp.float64(toucher.STUCK)), wp.constant(wp.float64(pi
 GROUP, PINS_DEEP = wp.constant(wp.float64(pieces.GROUP)), wp.constant(wp.float64(pieces.DEEP))
 PIECE = wp.constant(wp.float64(2.0 / 3.0**0.5 * pieces.SPACINGS**2))
 NEAR_PIECE = wp.constant(wp.float64(pieces.NEAR))
+MORE = wp.constant(wp.float64(wrenches_of_skin.MORE))
+LEAST_COSINE = wp.constant(wp.float64(wrenches_of_skin.LEAST_COSINE))
+ONE_WAY = wp.constant(wp.float64(wrenches_of_skin.ONE_WAY))
+ALL_ONE_WAY = wp.constant(wp.float64(wrenches_of_skin.ALL_ONE_WAY))
 NONE = wp.constant(wp.float64(1e-300))
 NAN, PI = wp.constant(wp.float64(float("nan"))), wp.constant(wp.float64(math.pi))
 wp.set_module_options(OPTIONS)
@@ -118,18 +123,12 @@ class Known:
 
 
 @wp.func
-def _stuck(skins: Skins, scratch: Scratch, s: wp.int32, start: wp.int32, end: wp.int32, way: vec3) -> real:
-    """Force that skin which sticks carries along itself, over E [m2], of nodes from start to end: toucher._carried."""
-    out = real(0.0)
-    for i in range(start, end):
-        corners = skins.faces[scratch.face[s, i]]
-        for x in range(3):
-            v = corners[x]
-            cosine = -wp.dot(wp.normalize(skins.area_vectors[v]), way)
-            if cosine > real(0.0):
-                part = scratch.pressure[s, i] * scratch.area[s, i] * scratch.shares[s, i][x]
-                part *= wp.length(skins.area_vectors[v]) / skins.area[v]
-                out += part * wp.max(real(1.0) - cosine * cosine, real(0.0)) / wp.max(cosine, real(0.5))
+def _along(area_vector: vec3, way: vec3) -> real:
+    """Force along a way that skin carries along itself, for a pressure [m2]: wrenches.along."""
+    area, out = wp.length(area_vector), real(0.0)
+    cosine = -wp.dot(area_vector, way) / wp.max(area, NONE)
+    if cosine > real(0.0):
+        out = MORE * area * wp.max(real(1.0) - cosine * cosine, real(0.0)) / wp.max(cosine, LEAST_COSINE)
     return out
 
 
@@ -208,6 +207,7 @@ def answer(first: wp.int32, many: wp.int32, known: Known, skins: Skins, scratch:
         in_range[n, k] = not around
         return
     force, torque, forces, strange, doubt = vec3(), vec3(), real(0.0), real(0.0), real(0.0)
+    total = real(0.0)
     steep, long, border, highest = real(0.0), real(0.0), real(0.0), real(0.0)
     depth, thick, count, carried = real(scratch.deep[c]), real(0.0), real(0.0), real(0.0)
     start = wp.int32(scratch.nodes[s])
@@ -218,6 +218,7 @@ def answer(first: wp.int32, many: wp.int32, known: Known, skins: Skins, scratch:
             for x in range(3):
                 v, part = corners[x], here * scratch.shares[s, i][x]
                 push = -part / skins.area[v] * skins.area_vectors[v]
+                total += wp.length(push)
                 force = force + push
                 torque = torque + wp.cross(skins.points[v] - scratch.place[c], push)
                 if (skins.doubts[v] & STEEP) != 0:
@@ -235,11 +236,24 @@ def answer(first: wp.int32, many: wp.int32, known: Known, skins: Skins, scratch:
             count += real(1.0)
             highest = wp.max(highest, scratch.highest[s, i])
     size = wp.length(force)
+    along = real(0.0)
+    if one.stacked == 1 and size > real(0.0):
+        way = force / size
+        share = wp.clamp((size / total - ONE_WAY) / (ALL_ONE_WAY - ONE_WAY), real(0.0), real(1.0))
+        for i in range(start, start + wp.int32(count)):
+            trio = skins.faces[scratch.face[s, i]]
+            for x in range(3):
+                pressed = scratch.pressure[s, i] * scratch.area[s, i] * scratch.shares[s, i][x] / skins.area[trio[x]]
+                more = share * pressed * _along(skins.area_vectors[trio[x]], way)
+                along += more
+                torque = torque + wp.cross(skins.points[trio[x]] - scratch.place[c], more * way)
+        force = force + along * way
     power = _power(scratch, one, s, many, k)
     doubt = doubt / wp.max(size, NONE) + power * grid.surface_error / wp.max(depth, grid.surface_error)
     if one.stacked == 1 and forces > real(0.0):
         unlike = known.uneven * wp.log(carried / (forces * one.flat))
         doubt = wp.sqrt(doubt * doubt + unlike * unlike)
+    size += along
     sound = steep <= STEEP_SHARE * forces and long <= LONG_SHARE * forces and border <= BORDER_SHARE * forces
     sound = sound and one.softness * highest <= known.pressure and depth * count <= known.depth * thick
     sound = sound and strange <= UNSEEN * forces and one.learnt == 1
@@ -256,8 +270,7 @@ def answer(first: wp.int32, many: wp.int32, known: Known, skins: Skins, scratch:
     bounds[n, k] = bounds.dtype(real(0.0))
     if size > real(0.0):
         bound = known.scale * wp.pow(doubt, known.power)
-        if one.stacked == 1:
-            bound += STUCK * _stuck(skins, scratch, s, start, start + wp.int32(count), force / size) / size
+        bound += STUCK * along / size
         if group:
             bound *= WIDER
         bounds[n, k] = bounds.dtype(one.modulus * size * bound)
