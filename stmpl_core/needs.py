@@ -36,6 +36,7 @@ ENOUGH = Misfit(force=0.10, motion=0.10)  # with which a simpler model will do
 DEEPEST_OVER_THICKNESS, DEEPEST_OVER_RADIUS = 0.3, 0.5  # depth up to which the linear response is asked [-]
 LARGEST_RADIUS, LARGEST_FORCE, FASTEST = 0.5, 5e3, 10.0  # of what a robot presses with [m], [N], [m/s]
 LONGEST_STAY, LONGEST_WAY = 1e6, 10.0  # of a tool at one place [s], and along the skin [m]
+STIFFENING = 1.18  # power of 1 / stretch^2 with which people's fat gets stiffer (Hatt et al. 2023)
 RUNGS = ("one layer", "a skin membrane on one layer", "a skin membrane on layers of fat and muscle")
 
 
@@ -49,6 +50,7 @@ class Indentation:
         depth: depth by the linear response [m]; too large where `beyond`.
         beyond: whether that depth is more than 0.3 of the thickness or 0.5 of the radius.
         judged: ball for which terms are judged: this one, or where `beyond` the same at the greatest depth allowed.
+        strain: depth of that over the thickness [-].
     """
 
     radius: float
@@ -56,6 +58,12 @@ class Indentation:
     depth: float
     beyond: bool
     judged: Ball
+    strain: float
+
+    @property
+    def stiffer(self) -> float:
+        """Shear modulus of people's fat pressed together by that strain, over that at rest [-]; neo-Hookean: 1."""
+        return (1 - self.strain) ** (-2 * STIFFENING)
 
 
 @dataclass(frozen=True)
@@ -239,7 +247,7 @@ def _indentation(tissue: Tissue, thickness: float, radius: float, force: float) 
     deepest = min(DEEPEST_OVER_THICKNESS * thickness, DEEPEST_OVER_RADIUS * radius)
     beyond = by_force.depth > deepest
     judged = ball(tissue, thickness, radius, depth=deepest) if beyond else by_force
-    return Indentation(radius, force, by_force.depth, beyond, judged)
+    return Indentation(radius, force, by_force.depth, beyond, judged, judged.depth / thickness)
 
 
 def _off(tissue: Tissue, thickness: float, other: Tissue, its_thickness: float, pressed: Ball) -> Misfit:

@@ -11,6 +11,8 @@ from stmpl_core.needs import Indentation, Needs, Term
 WORDS = {"skin": "skin", "tension": "tension of the skin", "muscle": "muscle as its own layer",
          "time": "relaxation in time", "slip": "slip", "mesh": "finer mesh"}  # fmt: skip
 
+STIFFER = 1.2  # factor on the modulus of people's fat from which it is told
+
 
 def needs_figures(found: Needs) -> dict[str, Any]:
     """What a scene asks for, for machines; SI."""
@@ -29,7 +31,8 @@ def needs_figures(found: Needs) -> dict[str, Any]:
 
 def _indentation_figures(one: Indentation) -> dict[str, Any]:
     judged = {"depth": one.judged.depth, "force": one.judged.force, "contact_radius": one.judged.contact_radius}
-    return {"radius": one.radius, "force": one.force, "depth": one.depth, "beyond": one.beyond, "judged": judged}
+    return {"radius": one.radius, "force": one.force, "depth": one.depth, "beyond": one.beyond, "judged": judged,
+            "fat_stiffer": one.stiffer}
 
 
 def needs_table(found: Needs, title: str) -> Table:
@@ -47,6 +50,9 @@ def needs_table(found: Needs, title: str) -> Table:
     lines += [_depth(one) for one in found.indentations]
     if found.beyond:
         lines.append("Deeper, skin and muscle matter more than these figures say, tension less: docs/tissue.md.")
+    if (deepest := max(found.indentations, key=lambda one: one.stiffer)).stiffer > STIFFER:
+        lines.append(f"Pressed together by {deepest.strain:.0%}, people's fat is {deepest.stiffer:.1f} times as stiff "
+                     "as at rest, which is left out here: forces are a low end (docs/credibility.md).")
     table.caption = "\n".join([*lines, "", found.sentence])
     return table
 

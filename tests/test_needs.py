@@ -72,6 +72,7 @@ def test_a_force_beyond_the_linear_response_is_said_and_judged_where_it_ends():
     light, heavy = found.indentations
     assert not light.beyond and light.judged.force == pytest.approx(2.0, rel=1e-4)
     assert heavy.beyond and heavy.judged.depth == pytest.approx(10e-3, rel=1e-4) and heavy.judged.force < 50
+    assert heavy.stiffer == pytest.approx(0.75 ** (-2 * 1.18)) and 1 < light.stiffer < heavy.stiffer
 
 
 def test_a_press_in_the_time_that_tissue_relaxes_needs_time():
@@ -150,7 +151,8 @@ def test_what_cannot_be_is_refused_with_what_is_wrong(change, says):
 def test_the_verb_says_the_smallest_model_with_units(capsys):
     code, said, _ = stmpl(capsys, "needs", "--part", "back", "--radius", 20, "--force", 10)
     assert code == 0
-    for word in ("skin", "tension", "muscle", "time", "slip", "mesh", "mm", "N", "rung 1", "smallest model", "linear"):
+    for word in ("skin", "tension", "muscle", "time", "slip", "mesh", "mm", "N", "rung 1", "smallest model", "linear",
+                 "low end"):  # fmt: skip
         assert word in said
 
 
