@@ -4,7 +4,7 @@ Pressures are across the skin at rest. Skin that sticks to a tool which comes st
 so it carries something along itself too: where the skin's normal stands at an angle a to the way, a force f across it
 belongs to one of f / cos a along the way, f sin^2 a / cos a more there than f itself has. Where the tool is round the
 force turns on, the way that its surface faces. Under balls, discs and capsules on limbs finite elements say that 1 to
-13 % of the force is carried so, and with MORE the whole is right to 1.2 %.
+13 % of the force is carried so, and with MORE the whole is right to 1.3 %.
 """
 
 from __future__ import annotations

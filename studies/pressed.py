@@ -64,9 +64,8 @@ class Pressed:
 
     @property
     def force(self) -> np.ndarray:
-        """Force of the tool on the limb, (3,) [N]: that of the pressures, and along its way what they leave out."""
-        across = self.touch.wrench[:3]
-        return across + (1 / self.kept - 1) * (across @ self.way) * self.way
+        """Force that the tool presses with, (3,) [N]: that of the pressures, and what they leave out of it."""
+        return self.touch.wrench[:3] / self.kept
 
     @property
     def kept(self) -> float:
@@ -111,7 +110,7 @@ def force_of(layer: SoftLayer, nodes: Nodes, pressure: np.ndarray) -> np.ndarray
 
 
 def kept_by_normals(layer: SoftLayer, tool: Press, pressure: PerVertex, displacement: VertexVectors) -> float:
-    """Share of a tool's force along its way that pressures along the skin's normals at rest make, about [-].
+    """Share of the force that a tool presses with, that pressures along the skin's normals at rest make, about [-].
 
     Data keep of the tractions only that pressure. Here they are taken to lie between the tool's way and the normal of
     its surface where the skin came to, nearer to the way: under balls, discs and capsules on limbs the force is then
@@ -128,8 +127,8 @@ def kept_by_normals(layer: SoftLayer, tool: Press, pressure: PerVertex, displace
     surface = tool.jet(layer.vertices[on] + displacement[on])[1]
     along = tool.direction + TURNED * surface / np.maximum(np.linalg.norm(surface, axis=1, keepdims=True), 1e-9)
     along /= np.maximum(np.linalg.norm(along, axis=1, keepdims=True), 1e-9)
-    facing = np.maximum(np.einsum("vx,vx->v", inward, along), LEAST_FACING)
-    return float(carried @ (inward @ tool.direction) / (carried @ (along @ tool.direction / facing)))
+    facing, across = np.maximum(np.einsum("vx,vx->v", inward, along), LEAST_FACING), carried @ inward
+    return float(across @ across / (across @ ((carried / facing) @ along)))
 
 
 @dataclass(frozen=True, eq=False)
