@@ -282,7 +282,7 @@ def main() -> None:
     plt.switch_backend("agg")
     options = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     options.add_argument("--out", type=Path, required=True, help="folder of what was found")
-    options.add_argument("--limbs", choices=list(LIMBS), default="forearm and thigh", help="row of benchmarks.limbs")
+    options.add_argument("--limbs", choices=list(LIMBS), default="a forearm left out", help="row of benchmarks.limbs")
     options.add_argument("--picture", type=Path, default=PICTURE, help="picture")
     given = options.parse_args()
     logging.basicConfig(level=logging.INFO, format="%(message)s")

@@ -106,7 +106,8 @@ def compare(edge: float, stack: bool, bends: tuple[int, ...], reach: float) -> N
                 truth = fem.press([start], DEEP * thickness)
                 at = start.at(DEEP * thickness).pose_body_from_tool
                 moved = np.linalg.norm(truth.displacement, axis=1)
-                true = truth.force
+                across = -(truth.pressure @ again.vertex_area_vectors)
+                true = float(again.vertex_areas @ truth.traction @ across / np.linalg.norm(across))
                 words, ours = "", []
                 for one in [simulator, afresh]:
                     if one is None:
