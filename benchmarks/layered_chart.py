@@ -145,9 +145,15 @@ def elements(layer: SoftLayer, reach: float, refine: int, step: float) -> Solver
             answer = next(answers, None)
             took = time.process_time() - began
             known = answer is not None and answer.trust.converged
-            yield (layer.vertex_areas @ answer.traction, answer.displacement, took) if answer and known else None
+            yield (pressing(layer, answer.traction), answer.displacement, took) if answer and known else None
 
     return found
+
+
+def pressing(layer: SoftLayer, traction: np.ndarray) -> np.ndarray:
+    """Force (3,) [N] that contact tractions (V, 3) [Pa] press with: along what is across the skin, without drag."""
+    across = np.minimum(0.0, np.einsum("vi,vi->v", traction, layer.normals)) @ layer.vertex_area_vectors
+    return (layer.vertex_areas @ traction) @ across / (across @ across) * across
 
 
 def flex(layer: SoftLayer, refine: int) -> Solver:
@@ -169,7 +175,7 @@ def flex(layer: SoftLayer, refine: int) -> Solver:
             began = time.process_time()
             held = peer.press(start + share * (end - start))
             log.info("flex: %s, min det F %.2f, %.2f mm in the ball", held.rests, held.min_j, 1e3 * held.entered)
-            yield layer.vertex_areas @ held.traction, held.displacement, time.process_time() - began
+            yield pressing(layer, held.traction), held.displacement, time.process_time() - began
 
     return found
 

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks.layered_chart import ONE_LAYER, OURS, Row, best, draw, points, shared, table
+from benchmarks.layered_chart import ONE_LAYER, OURS, Row, best, draw, points, pressing, shared, table
 from stmpl_core import SoftLayer
 from stmpl_core.tissue import Membrane, Ply, Tissue
 from studies.peers import installed
@@ -36,6 +36,13 @@ def test_one_layer_alone_is_given_its_modulus_and_all_are_shown(tmp_path: Path) 
 def test_what_is_shared_is_what_all_answer() -> None:
     every = [*rows(OURS, [1.0, 1.0, 1.0]), *rows(ONE_LAYER, [0.2])]
     assert [row.scene for row in shared(every)] == ["scene 0", "scene 0"]
+
+
+def test_a_force_is_what_presses_without_drag() -> None:
+    layer = plate(0.03, 6e-3)
+    tractions = np.cross(layer.normals, [1.0, 0.0, 0.0]) * 50.0 - 100.0 * layer.normals
+    expected = -(np.full(len(layer.vertices), 100.0) @ layer.vertex_area_vectors)
+    np.testing.assert_allclose(pressing(layer, tractions), expected, rtol=1e-9, atol=1e-12)
 
 
 @pytest.mark.skipif("mujoco_flex" not in installed(), reason="needs mujoco")
