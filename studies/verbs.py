@@ -199,8 +199,9 @@ def stability(
     The finite elements' own limits: stmpl stability --critical-load --out critical_load.png
 
     Args:
-        methods: names (zero, naive, winkler, linear, moment_net, unet, fem_1_step, fem, ladder), or a file of
-            yours with a class that has prepare and solve; file.py:attribute or module:attribute where there are more.
+        methods: names (zero, naive, winkler, linear, limb_linear, moment_net, unet, fem_1_step, fem, ladder), or a
+            file of yours with a class that has prepare and solve; file.py:attribute or module:attribute where there are
+            more.
         preset: default (minutes a method, on the arm), quick (seconds, on a round limb).
         only: axes to sweep: all, those of pressures, those of rigid tools, those of strokes with a state.
         out: folder of report, tables, picture and failures, runs/stability unless given; the picture with

@@ -107,7 +107,11 @@ def jumping(answer, contacts, layer):
 
 
 def rippling(answer, contacts, layer):
-    return stronger(answer, 1 + 0.05 * np.sin(2e3 * contacts[0].pose_body_from_tool[2, 3]))
+    return stronger(answer, 1 + 0.007 * np.sin(2e3 * contacts[0].pose_body_from_tool[2, 3]))
+
+
+def trembling(answer, contacts, layer):
+    return moved(answer, (1 + 0.016 * np.sin(2e3 * contacts[0].pose_body_from_tool[2, 3])) * answer.displacement)
 
 
 def shallow(answer, contacts, layer):
@@ -187,6 +191,10 @@ def test_a_sound_simulator_is_not_caught(made):
 def test_every_law_of_contacts_is_broken_here_and_every_axis_has_levels():
     assert set(FAULTS) >= set(CONTACT_LAWS)
     assert list(CONTACT_AXES) == list(CONTACT_LEVELS) == list(QUICK_CONTACTS)
+
+
+def test_a_peak_that_ripples_under_a_steady_force_is_caught(made):
+    assert broken(lambda: trembling, made["slide"]) == {"ripple"}
 
 
 def test_flags_without_need_count_apart(tmp_path):

@@ -16,7 +16,7 @@ from stmpl_core.tool import Tool
 from studies.stability import shapes
 from studies.stability.contact_laws import SLIDE
 from studies.stability.contacts import Contacts, Placed
-from studies.stability.meshes import even_plate, fingers, inserted, irregular, limb, plate
+from studies.stability.meshes import even_plate, fingers, inserted, irregular, limb, plate, slanted_plate
 from studies.stability.scene import Mesh
 from studies.stability.trial import Trial, Twin
 from studies.stability.truth import truth
@@ -30,6 +30,8 @@ PRESSED = {  # tools with the half of their size along x at the limb
     "ball": (BALL, 0.012), "slab": (shapes.box(0.004, 0.03, 0.03, "slab"), 0.002),
     "pin": (shapes.capsule(0.002, 0.02, "pin"), 0.002), "box": (shapes.box(0.03, 0.03, 0.03), 0.015),
 }  # fmt: skip
+SLID = {"ball": PRESSED["ball"], "finger": (shapes.capsule(0.008, 0.014, "finger"), 0.008), "pin": PRESSED["pin"]}
+UNEVEN = 0.2  # shift of vertices along the skin over its edges, which makes no triangle too long yet
 DEEP_LEVELS = (0.15, 0.3, 0.5, 0.65, 0.8, 0.9, 1.0, 1.5, 2.0, 3.0, 5.0, 7.5, 9.0)
 FELT = 8.0  # thicknesses along the skin, within which a tool may be felt
 COUNT = 5  # instants of a series
@@ -194,14 +196,20 @@ def fit(stage: Stage, level: float) -> Trial:
 
 
 def slide(stage: Stage, level: float) -> Trial:
-    """30 mm along an even limb at 0.2 t, a ball and a pin, on meshes of 3 and 5 mm, even and uneven."""
-    uneven, rest = divmod(int(level) % 4, 2)
-    name, edge = ("ball", "pin")[int(level) // 4], (3e-3, 5e-3)[rest]
-    mesh = irregular(skin(edge), 0.3) if uneven else skin(edge)
-    way = LENGTH / 2 + np.linspace(-0.015, 0.015, 61)
-    placed = [on_limb(name, 0.2 * THICKNESS, z) for z in way]
-    told = f"{name}, {edge * 1e3:g} mm{', uneven' if uneven else ''}"
-    return Trial("", told, (*SOUND, "ripple"), Contacts(mesh, alone(placed)))
+    """30 mm at 0.2 t with three tools, on 3 and 5 mm, along an even limb and on an uneven plate, whose facets are even.
+
+    Facets of an uneven mesh of a limb are no even skin: they lie up to edge^2 / (8 radius) below it, here and there.
+    """
+    number, rest = divmod(int(level), 4)
+    name, flat, edge = list(SLID)[number], rest >= 2, (3e-3, 5e-3)[rest % 2]
+    tool, half = SLID[name]
+    mesh = irregular(slanted_plate(0.12, edge, THICKNESS), UNEVEN) if flat else skin(edge)
+    lying = Rotation.from_euler("x", 90, degrees=True).as_matrix() if flat else None
+    high = half - 0.2 * THICKNESS
+    places = [(x, 0, high) if flat else (RADIUS + high, 0, LENGTH / 2 + x) for x in np.linspace(-0.015, 0.015, 61)]
+    instants = alone(Placed(tool, posed(np.array(place), lying)) for place in places)
+    told = f"{name}, {edge * 1e3:g} mm{', uneven plate' if flat else ''}"
+    return Trial("", told, (*SOUND, "ripple"), Contacts(mesh, instants))
 
 
 def creep(stage: Stage, level: float) -> Trial:
@@ -306,7 +314,7 @@ CONTACT_LEVELS: dict[str, Sequence[float]] = {
     "massage": (10, 20, 40, 10.5, 20.5, 40.5),
     "first touch": (0.15, 0.05, 0.01),
     "fit": (0.3, 0.5, 0.62),
-    "slide": tuple(range(8)),
+    "slide": tuple(range(12)),
     "creep": (0, 1, 2, 3),
     "pop": (0.1, 0.3, 0.6, 0.8, 0.89),
     "scale of contact": (0.5, 0.1, 2),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
@@ -22,12 +22,16 @@ STILL = 0.005  # of the peak, that skin may move which is far from the tool alon
 POP = 0.02  # of the thickness, by which a tool may move when its own force is given instead of its pose alone
 SMOOTH = 0.005  # of the peak or of the force, by which an answer may change while a tool slides by SLIDE
 SLIDE = 2e-6  # m
-RIPPLE = 0.05  # peak to peak over the mean, of force and of displaced volume while a tool slides along an even limb
+RIPPLE = 0.01  # peak to peak over the mean, of the force while a tool slides along an even limb
+RIPPLE_PEAK = 0.03  # the same of the motion's peak over the tool's largest depth at a vertex, which the mesh samples
+RIPPLE_VOLUME = 0.05  # the same of the volume that is pressed in
+HIT = 0.5  # share of the tool's depth that vertices must sample all the way, or its peak is not judged
 ENTERED = 0.03  # of the thickness, that skin may be inside a tool: it is said from 0.02 on
 UNSTATED = 0.15  # of the peak or of the force, by which an answer may be off that states no bound
 TRUTH = 0.015  # of the peak and of the force, by which the finite elements themselves are off
 LEARNT = 0.65  # depth over thickness up to which an ordinary touch must not be flagged
 COVERED = 0.05  # depth over thickness of a vertex of the skin inside a tool, from which the tool is not apart
+STEPS_OUT = 20  # steps of a vertex out of a tool, after which it is out to a thousandth of its way
 PRESSURE = 20.0  # pressure over the confined modulus, above which no answer may be trusted
 
 
@@ -150,20 +154,27 @@ def smooth(trial: Trial, answers: Answers) -> Found:
 
 @worst
 def ripple(trial: Trial, answers: Answers) -> Found:
-    """While a tool slides along an even limb, force and the volume that is pressed in stay the same within RIPPLE.
+    """While a tool slides along even skin force, motion's peak and the volume that is pressed in stay the same.
 
-    The volume also within the bound that is stated, to either side: vertices sample it, on a coarse mesh badly.
+    The peak beside the depth at which the tool meets a vertex at all: motion is known at vertices only. The volume also
+    within the bound that is stated, to either side: vertices sample it, on a coarse mesh badly.
     """
     scene, given = _scene(trial), answers_of(answers.scene)
-    inward = -scene.mesh.layer.vertex_area_vectors
+    layer, inward = scene.mesh.layer, -scene.mesh.layer.vertex_area_vectors
     for run in scene.runs():
-        force = np.array([sum(t.force for t in given[k].touches.values()) for k in run])
-        volume = np.array([np.maximum((given[k].displacement * inward).sum(axis=1), 0).sum() for k in run])
-        waves = [float(np.ptp(x) / x.mean()) for x in (force, volume)]
-        stated = [2 * (given[k].trust.error_bound or 0.0) / float(given[k].magnitude.max()) for k in run]
-        if waves[0] > RIPPLE or waves[1] > max(RIPPLE, max(stated)):
-            yield broken("ripple", f"force {100 * waves[0]:.2g} %, volume {100 * waves[1]:.2g} % peak to peak",
-                          *(given[k] for k in run))  # fmt: skip
+        some = [given[k] for k in run]
+        peak = np.array([float(one.magnitude.max()) for one in some])
+        met = np.array([max(_met(placed, layer) for placed in scene.instants[k]) for k in run])
+        waves = {
+            "force": _wave([sum(t.force for t in one.touches.values()) for one in some]),
+            "peak": _wave(peak / met) if met.min() > HIT * met.max() else 0.0,
+            "volume": _wave([np.maximum((one.displacement * inward).sum(axis=1), 0).sum() for one in some]),
+        }
+        stated = float(max(2 * (one.trust.error_bound or 0.0) / most for one, most in zip(some, peak, strict=True)))
+        most = {"force": RIPPLE, "peak": RIPPLE_PEAK, "volume": max(RIPPLE_VOLUME, stated)}
+        if any(waves[name] > most[name] for name in waves):
+            told = ", ".join(f"{name} {100 * wave:.2g} %" for name, wave in waves.items())
+            yield broken("ripple", f"{told} peak to peak", *some)
 
 
 @worst
@@ -284,6 +295,20 @@ def _scene(trial: Trial) -> Contacts:
 
 def _distance(tool: Tool, layer: SoftLayer, pose: np.ndarray, points: np.ndarray) -> np.ndarray:
     return field_of(tool, margin_on(layer)).distance((points - pose[:3, 3]) @ pose[:3, :3])
+
+
+def _met(placed: Placed, layer: SoftLayer) -> float:
+    """The furthest that a vertex must go in along its normal to be out of a tool [m]."""
+    inside = np.flatnonzero(_distance(placed.tool, layer, placed.pose, layer.vertices) < 0)
+    way = np.zeros(len(inside))
+    for _ in range(STEPS_OUT):  # sphere tracing, from inside
+        points = layer.vertices[inside] - way[:, None] * layer.normals[inside]
+        way += np.maximum(-_distance(placed.tool, layer, placed.pose, points), 0)
+    return float(way.max(initial=0.0))
+
+
+def _wave(values: Sequence[float] | np.ndarray) -> float:
+    return float(np.ptp(values) / np.mean(values))
 
 
 def _size(vector: np.ndarray) -> float:

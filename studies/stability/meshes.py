@@ -78,6 +78,12 @@ def even_plate(size: float, edge_length: float, thickness: float, tissue: Tissue
     return plate(steps, steps, thickness, tissue)
 
 
+def slanted_plate(size: float, edge_length: float, thickness: float) -> Mesh:
+    """A rhomb around the origin, of triangles with equal sides."""
+    mesh = even_plate(size, edge_length, thickness)
+    return replace(mesh, vertices=mesh.vertices @ np.array([[1.0, 0, 0], [-0.5, 0.75**0.5, 0], [0, 0, 1]]))
+
+
 def saddle(edge_length: float, size: float, radius: float, thickness: float) -> Mesh:
     """A square patch that is curved by 1 / radius along x and by as much the other way along y."""
     mesh = even_plate(size, edge_length, thickness)
@@ -96,12 +102,17 @@ def fingers(gap: float, edge_length: float, length: float, thickness: float) -> 
 
 
 def irregular(mesh: Mesh, share: float, seed: int = 0) -> Mesh:
-    """A round limb along z whose vertices are shifted along its skin by up to this share of an edge; not its border."""
+    """A round limb along z, or a plate, whose vertices are shifted along it by up to this share of an edge.
+
+    Those of its border stay.
+    """
     rng, edge = np.random.default_rng(seed), mesh.layer.edge_length
     x, y, z = mesh.vertices.T
-    aside, along = share * edge * rng.uniform(-1, 1, (2, len(x)))
     free = np.ones(len(x))
     free[mesh.layer.border] = 0
+    aside, along = free * share * edge * rng.uniform(-1, 1, (2, len(x)))
+    if not np.ptp(z):
+        return replace(mesh, vertices=np.column_stack([x + aside, y + along, z]))
     radius = np.hypot(x, y)
-    angle = np.arctan2(y, x) + free * aside / radius
-    return replace(mesh, vertices=np.column_stack([radius * np.cos(angle), radius * np.sin(angle), z + free * along]))
+    angle = np.arctan2(y, x) + aside / radius
+    return replace(mesh, vertices=np.column_stack([radius * np.cos(angle), radius * np.sin(angle), z + along]))

@@ -9,7 +9,7 @@ from fem_tools.few_steps import FewSteps
 from fem_tools.ladder import ladder
 from fem_tools.patch import PatchFem
 from stmpl_core.errors import InvalidInput
-from stmpl_core.methods import Linear, Method, MomentNet, Naive, UNet, Winkler
+from stmpl_core.methods import LimbLinear, Linear, Method, MomentNet, Naive, UNet, Winkler
 from stmpl_core.methods.zero import Zero
 from studies.own import own
 from studies.stability.scene import Make
@@ -22,8 +22,8 @@ def _ladder() -> Method:
 
 
 METHODS: dict[str, Make] = {
-    "zero": Zero, "naive": Naive, "winkler": Winkler, "linear": Linear, "moment_net": MomentNet, "unet": UNet,
-    "fem_1_step": FewSteps.from_network, "fem": PatchFem, "ladder": _ladder,
+    "zero": Zero, "naive": Naive, "winkler": Winkler, "linear": Linear, "limb_linear": LimbLinear,
+    "moment_net": MomentNet, "unet": UNet, "fem_1_step": FewSteps.from_network, "fem": PatchFem, "ladder": _ladder,
 }  # fmt: skip
 
 
