@@ -20,6 +20,7 @@ MIN_LYING_PRESSURE = 0.05  # pressure over the tool's highest, below which a cov
 FIRM_DEPTH = 0.013  # depth in a tool over the thickness, from which skin is moved out with its neighbours, not alone
 MIN_FACING_COSINE = 0.3  # cosine between tool's way and inward normal, from which skin comes along
 LEAST_WEIGHT = 1e-3  # firmness from which a correction counts: one that falls to 0 lets go of its vertex continuously
+PUSHES = 5  # steps of a vertex out of a tool
 PASSES = 3  # corrections of one answer
 SMOOTHING_SHARE = 0.05  # ridge over the sinking of a vertex under its own source: it keeps neighbours from fighting
 
@@ -188,10 +189,12 @@ def _pushed(grid, pose, points, vertices, out):
     entered = 0.0
     for v in vertices:
         phi, a, b, c = _jet(grid, pose, points[v], out[v])
-        if phi < 0:
+        for _ in range(PUSHES):  # one is enough where the distance is one; between walls its gradient is shorter
+            if phi >= 0:
+                break
             out[v, 0], out[v, 1], out[v, 2] = out[v, 0] - phi * a, out[v, 1] - phi * b, out[v, 2] - phi * c
             phi, a, b, c = _jet(grid, pose, points[v], out[v])
-            entered = max(entered, -phi)
+        entered = max(entered, -phi)
     return entered
 
 

@@ -27,6 +27,7 @@ HARDENING = 0.75  # power of the columns' pressure with which it does
 FADE, FADE_RING = 0.03, 2  # strain at and around a node at which half of the correction is left: a touch begins linear
 ROUND_FROM = 0.05  # overlap over the thickness to which curvature is compared at the least
 SMALL_STEP = 5e-3  # of the largest force, in which the network's part of a slope is found: far above float32's noise
+FAR_OUTSIDE = 0.1  # standard deviations beyond the training contacts, from which a node is all outside
 STACK_FADE = 0.1  # the same on a stack, whose linear response alone is good to some percent up to there
 
 
@@ -36,7 +37,7 @@ class Held(NamedTuple):
     Args:
         pressure: pressure over E at the nodes, (N,) [-].
         doubt: error to expect of it, over E, (N,) [-].
-        outside: mask of the nodes that see what no training contact had, (N,).
+        outside: degree to which the nodes see what no training contact had, from 0 to 1, (N,) [-].
         power: power of the depth with which the force grows, about [-].
     """
 
@@ -46,7 +47,7 @@ class Held(NamedTuple):
     power: float
 
 
-NOTHING = Held(np.empty(0), np.empty(0), np.empty(0, np.bool_), 1.0)
+NOTHING = Held(np.empty(0), np.empty(0), np.empty(0), 1.0)
 
 
 class Look(NamedTuple):
@@ -342,13 +343,12 @@ def _harden(pressure, strain, moduli):
 def _correct(pressure, inputs, fade, low, high, mean, scale, w1, b1, w2, b2, w3, b3, w4, b4):
     """See Held."""
     count = len(pressure)
-    held, doubt, outside = np.empty(count), np.empty(count), np.zeros(count, np.bool_)
+    held, doubt, outside = np.empty(count), np.empty(count), np.zeros(count)
     kept, outputs = np.empty((count, len(low)), np.float32), np.empty((count, len(b4)), np.float32)
     for n in range(count):
         for m in range(len(low)):
             value = min(max(inputs[n, m], low[m]), high[m])
-            if value != inputs[n, m]:
-                outside[n] = True
+            outside[n] = max(outside[n], min(abs(inputs[n, m] - value) * scale[m] / FAR_OUTSIDE, 1.0))
             kept[n, m] = (value - mean[m]) * scale[m]
     think_few(kept, w1, b1, w2, b2, w3, b3, w4, b4, outputs)
     for n in range(count):

@@ -515,7 +515,7 @@ def _carried(corners, shares, area, held, doubts, outside, unit, carries, areas,
     for n in range(len(area)):
         forces[n] = held[n] * unit * area[n]
         doubt += doubts[n] * area[n]
-        strange += forces[n] if outside[n] else 0.0
+        strange += outside[n] * forces[n]
         total += forces[n]
     vertices, pressure = gathered(corners, shares, forces, areas)
     wrench, stuck, along = wrench_of(pressure, vertices, points, area_vectors, origin, sticks)

@@ -1,0 +1,61 @@
+"""Laws of trust along an approach: it comes at most once and goes at most once."""
+
+import numpy as np
+import pytest
+
+from benchmarks.tools import ball, block_letter, fingertip, flat
+from stmpl_core import Contact, Membrane, Ply, Simulator, Tissue, Tool
+from stmpl_core.conform import kept_out
+from stmpl_core.methods import MomentNet, Winkler
+from tests.scenes import limb, plate, turn
+
+TOOLS = {"ball": ball(12), "fingertip": fingertip(8, 14), "punch": flat(9, 1.5), "letter": block_letter("H", 26)}
+STACK = Tissue(3e3, 0.4, skin=Membrane(2e5, 1.5e-3, 15.0), deeper=(Ply(8e-3, 15e3, 0.4),))
+SIDEWAYS = turn((0, 1, 0), np.pi / 2)  # z of a tool to x of the limb
+DEPTHS = np.concatenate([np.arange(0.005, 0.1, 0.01), np.arange(0.1, 0.905, 0.02)])  # over the thickness
+LAYERS = {"paper": limb(4e-3), "layered": limb(6e-3, 0.02, 0.05, 0.2).with_(tissue=STACK),
+          "thin": limb(6e-3, 4.5e-3, 0.05, 0.2).with_(tissue=STACK)}  # fmt: skip
+
+
+@pytest.fixture(scope="module", params=LAYERS)
+def simulator(request: pytest.FixtureRequest) -> Simulator:
+    return Simulator(LAYERS[request.param], MomentNet())
+
+
+def down(simulator: Simulator, tool: Tool, depth: float) -> Contact:
+    """A tool so deep over the thickness, from +x, over a vertex in the middle of the limb."""
+    vertices = simulator.layer.vertices
+    middle = vertices[np.argmin(np.linalg.norm(vertices - [vertices[:, 0].max(), 0, vertices[:, 2].mean()], axis=1))]
+    pose = SIDEWAYS.copy()
+    pose[:3, 3] = middle - [depth * simulator.layer.thickness.max(), 0, 0]
+    return Contact(tool, pose)
+
+
+@pytest.mark.parametrize("name", TOOLS)
+def test_trust_comes_at_most_once_and_goes_at_most_once(simulator: Simulator, name: str) -> None:
+    answers = [simulator.step([down(simulator, TOOLS[name], depth)]) for depth in DEPTHS]
+    trusted = np.array([answer.trust.in_range for answer in answers])
+    changes = np.flatnonzero(np.diff(trusted))
+    assert len(changes) <= 2 - trusted[0], [(DEPTHS[k + 1], answers[k].trust.why, answers[k + 1].trust.why)
+                                            for k in changes]  # fmt: skip
+
+
+def test_a_node_just_beyond_what_was_learnt_counts_for_little() -> None:
+    """At first touch all nodes are beyond, later none: in between some are so in part."""
+    simulator, seen = Simulator(LAYERS["paper"], Winkler()), []
+    for depth in np.geomspace(0.002, 0.02, 15):
+        (touch,) = simulator.touch([down(simulator, TOOLS["ball"], depth)])
+        assert touch.pressed is not None
+        seen.append(simulator.toucher.net.hold(touch.pressed.squeeze.nodes).outside)
+    assert seen[0].mean() > 0.5 and not seen[-1].any()
+    partly = [one for one in seen if ((one > 0) & (one < 1)).any()]
+    assert len(partly) > 2 and max(one.max() for one in seen) <= 1
+
+
+@pytest.mark.parametrize("depth", [0.3, 0.5, 0.8])
+def test_skin_between_the_walls_of_a_letter_is_moved_out_of_it(depth: float) -> None:
+    layer = plate(0.1, 2e-3)
+    simulator, pose = Simulator(layer, Winkler()), np.eye(4)
+    pose[2, 3] = -depth * layer.thickness.max()
+    touches = simulator.touch([Contact(TOOLS["letter"], pose)])
+    assert kept_out(layer, np.zeros_like(layer.vertices), touches).entered < 0.005 * layer.thickness.max()
