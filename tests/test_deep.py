@@ -3,13 +3,16 @@
 import numpy as np
 import pytest
 
-from stmpl_core import Simulator, Tool
+from stmpl_core import Membrane, Ply, Simulator, Tissue, Tool
 from stmpl_core.deep import DEEPEST
 from stmpl_core.methods import MomentNet, Winkler
 from stmpl_core.touch import APART, IN_CORE, NO_FORCE
 from tests.scenes import LENGTH, RADIUS, at, ball, box, capsule, limb, press, punch, touch_of, turn
 
 LIMB = limb(4e-3)
+STACK = Tissue(3e3, 0.4, skin=Membrane(2e5, 1.5e-3, 15.0), deeper=(Ply(8e-3, 15e3, 0.4),))
+LIMBS = {"paper": LIMB, "layered": limb(6e-3, 0.02, 0.05, LENGTH).with_(tissue=STACK)}
+BALLS = {"paper": (ball(), 0.012), "layered": (ball(0.02), 0.02)}
 LYING = turn((0, 1, 0), np.pi / 2)
 TOOLS = {"ball": (ball(), 0.012), "small ball": (ball(0.004), 0.004), "slab": (box(0.004, 0.03, 0.03), 0.002),
          "capsule": (capsule(0.02, 0.008), 0.008)}  # fmt: skip
@@ -18,6 +21,11 @@ TOOLS = {"ball": (ball(), 0.012), "small ball": (ball(0.004), 0.004), "slab": (b
 @pytest.fixture(scope="module")
 def sim() -> Simulator:
     return Simulator(LIMB, MomentNet())
+
+
+@pytest.fixture(scope="module")
+def touched() -> dict[str, Simulator]:
+    return {kind: Simulator(layer, MomentNet()) for kind, layer in LIMBS.items()}
 
 
 def pressed(sim: Simulator, tool: Tool, half: float, depth: float, side: float = 1.0):
@@ -98,3 +106,32 @@ def test_columns_alone_say_what_all_that_is_squeezed_says(sim: Simulator, name: 
         said.append(deep.beyond(field, pose, tool.vertices))
         assert said[-1] == beyond, f"{1e3 * depth:.1f} mm"
     assert any(said) and not all(said)
+
+
+@pytest.mark.parametrize(("mass", "integral", "steps"), [(1.0, 0.0, 700), (3.0, 0.0, 700), (2.0, 2.0, 3000)])
+@pytest.mark.parametrize("depth", [0.86, 0.9, 1.05, 1.2])
+@pytest.mark.parametrize("kind", LIMBS)
+def test_a_force_controller_settles_on_the_barrier(touched: dict[str, Simulator], kind: str, depth: float, mass: float,
+                                                   integral: float, steps: int) -> None:  # fmt: skip
+    """1 kHz, semi-implicit Euler: mass [kg] and damper, half of the error fed back, and its integral [1/s] or none.
+
+    The damper knows the stiffness at the force that is asked for; a limit cycle would stay.
+    """
+    sim, t, dt = touched[kind], LIMBS[kind].thickness.max(), 1e-3
+    tool, half = BALLS[kind]
+    front = LIMBS[kind].vertices[:, 0].max() + half
+
+    def force(way: float) -> float:
+        return sim.touch([press(tool, at(front - way, 0, LENGTH / 2), None)])[0].force
+
+    wanted, way, speed, total, found = force(depth * t), 0.8 * t, 0.0, 0.0, []
+    stiffness = (force((depth + 0.01) * t) - force((depth - 0.01) * t)) / (0.02 * t)
+    damping = 2 * np.sqrt(1.5 * mass * stiffness)
+    for _ in range(steps):
+        found.append(force(way))
+        error = wanted - found[-1]
+        total += integral * dt * error
+        speed += dt / mass * (1.5 * error + total - damping * speed)
+        way += dt * speed
+    off = np.abs(np.array(found) / wanted - 1)
+    assert off[-100:].max() < 0.01 and np.ptp(off[-50:]) < 1e-3
