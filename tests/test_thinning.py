@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from stmpl_core import Load, SoftLayer
+from benchmarks.tools import ball, block_letter, flat
+from stmpl_core import Contact, Load, Simulator, SoftLayer, Tool
 from stmpl_core.methods import Linear, MomentNet
 from stmpl_core.moments import Surroundings
 from stmpl_core.response import REACH
@@ -90,6 +91,19 @@ def test_answers_are_those_of_asking_everybody(method: type, t: float, monkeypat
     whole = solver.solve(load).displacement
     error, peak = np.linalg.norm(thinned - whole, axis=1), np.linalg.norm(whole, axis=1).max()
     assert 0 < error.max() < 0.01 * peak and error.mean() < 5e-4 * peak
+
+
+@pytest.mark.parametrize("tool", [ball(12), flat(9, 1.5), block_letter("H", 26)], ids=["ball", "punch", "letter"])
+def test_under_rigid_tools_thinning_costs_little(tool: Tool, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of the motion, which lies on the tool; on average over the vertices that feel it, and at the worst one."""
+    simulator, pose = Simulator(arm(), MomentNet()), scenes.turn((0, 1, 0), np.pi / 2)
+    pose[:3, 3] = 0.04 - 0.3 * T, 0, 0.08
+    thinned = simulator.step([Contact(tool, pose)]).displacement
+    monkeypatch.setattr(Thinning, "asked", everybody)
+    monkeypatch.setattr(Thinning, "asked_again", everybody)
+    whole = simulator.step([Contact(tool, pose)]).displacement
+    error, size = np.linalg.norm(thinned - whole, axis=1), np.linalg.norm(whole, axis=1)
+    assert 0 < error.max() < 0.01 * size.max() and error[size > 1e-3 * size.max()].mean() < 5e-4 * size.max()
 
 
 def test_no_load_asks_nobody(layer: SoftLayer) -> None:
