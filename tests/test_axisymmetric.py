@@ -7,9 +7,13 @@ import pytest
 import trimesh
 
 from benchmarks.axisymmetric import PLATE, RADIUS, Plate, forces, ground_truth, neo_hookean
+from benchmarks.tools import flat
+from fem_tools import IndenterFem, PatchFem, Press
 from fem_tools.axisymmetric import Flat, Profile, membrane
+from stmpl_core.sdf import SignedDistance
 from stmpl_core.stack import ball_force
 from stmpl_core.tissue import Membrane, Tissue
+from tests.scenes import at, plate
 
 ROUGH = replace(PLATE, fine=0.5)
 T = PLATE.thickness
@@ -99,3 +103,16 @@ def test_a_spring_that_sticks_does_not_give_way_under_stiff_skin(monkeypatch):
     np.testing.assert_allclose(got[2:], got[:2], rtol=6e-3)
     np.testing.assert_allclose(got[:2], [one.force for one in Flat(PLATE.tissue, T).press(BALL, [0.1 * T, 0.2 * T])],
                                rtol=0.035)  # fmt: skip
+
+
+def test_indenter_fem_agrees_under_a_flat_punch_from_first_touch_on():
+    """A rounded rim of 1.5 mm on one material of 7.5 mm."""
+    thick = 7.5e-3
+    layer = plate(0.075, 3e-3, thick, crossed=True, youngs_modulus=1e3, poisson_ratio=0.4)
+    depths = [0.05 * thick, 0.5 * thick]
+    start = Press(SignedDistance.of(flat(9, 1.5), margin=2e-2), at(0, 0, 1e-4), np.array([0, 0, -1.0])).touching(layer)
+    assert start is not None
+    fem = IndenterFem(PatchFem(refine=3, reach=4, layers=1, check_stability=False)).prepare(layer)
+    ours = [answer.force for answer in fem.path([start], depths)]
+    others = [one.force for one in Flat(layer.tissue, thick).press(Profile((0, 0), (7.5e-3, 0), 1.5e-3), depths)]
+    np.testing.assert_allclose(ours, others, rtol=0.04)
