@@ -20,7 +20,8 @@ MIN_LYING_PRESSURE = 0.05  # pressure over the tool's highest, below which a cov
 FIRM_DEPTH = 0.013  # depth in a tool over the thickness, from which skin is moved out with its neighbours, not alone
 MIN_FACING_COSINE = 0.3  # cosine between tool's way and inward normal, from which skin comes along
 LEAST_WEIGHT = 1e-3  # firmness from which a correction counts: one that falls to 0 lets go of its vertex continuously
-PUSHES = 5  # steps of a vertex out of a tool
+PUSHES = 5  # steps of a vertex out of a tool, at most
+LEFT_DEPTH = 1e-3  # depth over the thickness that a step may leave, or another one follows
 PASSES = 3  # corrections of one answer
 SMOOTHING_SHARE = 0.05  # ridge over the sinking of a vertex under its own source: it keeps neighbours from fighting
 
@@ -92,7 +93,7 @@ def kept_out(layer: SoftLayer, displacement: VertexVectors, touches: Sequence[To
 def _push_out(layer: SoftLayer, touches: Sequence[Touch], out: VertexVectors) -> float:
     """Moves what is left inside tools straight out; the largest depth that is left [m]."""
     return max((_pushed(grid_of(touch.pressed.field), touch.pose_body_from_tool, layer.vertices,
-                        touch.pressed.squeeze.vertices, out)
+                        layer.thickness, touch.pressed.squeeze.vertices, out)
                 for touch in touches if touch.pressed is not None), default=0.0)  # fmt: skip
 
 
@@ -184,13 +185,13 @@ def _correct(sinking, wanted, weight, moved, sources):
 
 
 @numba.njit(cache=True, nogil=True)
-def _pushed(grid, pose, points, vertices, out):
+def _pushed(grid, pose, points, thickness, vertices, out):
     """Moves vertices that are inside a tool straight out of it; the largest depth that is left [m]."""
     entered = 0.0
     for v in vertices:
         phi, a, b, c = _jet(grid, pose, points[v], out[v])
-        for _ in range(PUSHES):  # one is enough where the distance is one; between walls its gradient is shorter
-            if phi >= 0:
+        for push in range(PUSHES):  # one is enough where the gradient is 1 long; between walls it is shorter
+            if phi >= (-LEFT_DEPTH * thickness[v] if push else 0.0):
                 break
             out[v, 0], out[v, 1], out[v, 2] = out[v, 0] - phi * a, out[v, 1] - phi * b, out[v, 2] - phi * c
             phi, a, b, c = _jet(grid, pose, points[v], out[v])
