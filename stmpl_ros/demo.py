@@ -80,6 +80,8 @@ def run(config: DemoConfig) -> int:
     missing = [*complaints(folder, comparison, replay), *(done.complaints() if done else ())]
     for complaint in missing:
         console.print(f"[red]not as it should be:[/red] {complaint}")
+    for remark in done.remarks() if done else ():
+        console.print(f"to note: {remark}", soft_wrap=True)
     return int(bool(missing))
 
 

@@ -21,7 +21,10 @@ from stmpl_ros.robot import LOG, TOOL, scene_of
 from stmpl_sim.verbs import gripped
 
 if TYPE_CHECKING:
+    from bags.frame import Frame
+    from stmpl_sim.film import Film, Shot
     from stmpl_sim.massage import Log, Phase
+    from stmpl_sim.scene import Scene
 
 FILM = "film.webp"
 FILM_RATE = 12.0  # frames a second
@@ -30,17 +33,41 @@ LARGEST_GAIN = 0.01  # energy that the contact gave out beyond what was put in, 
 AROUND_S = 8e-3  # time within which the simulator's force counts, two of its steps at 250 Hz [s]
 LARGEST_APART = 0.01  # difference of the node's force from the simulator's, over the largest
 LARGEST_SQUEEZE = 0.05  # difference of the mean force of the fingers from what was asked for, over that
+LARGEST_OFF = 0.05  # difference of the answers' force from the reference's at a frame, over that [-]
 LEAST_LIFT_M = 0.005  # height that a gripped limb must be lifted by
 LARGEST_FINGERS_APART = 0.05  # as LARGEST_APART, for fingers: their friction follows from all answers before
 INK, ASKED, NODE, WRIST, TRUTH, FINGER = "#2b2b2b", "#9a9a9a", "#c1440e", "#7aa6c2", "#1f4e79", "#3d8b5f"
 
 
-class Film(NamedTuple):
-    """A film: its file, the renderer of its frames, and the displacement of its last colour [m]."""
+class Solved(NamedTuple):
+    """Force at a compared frame.
 
-    path: Path
-    frames_by: str
-    colour_m: float
+    Args:
+        at: time since the start [s].
+        reference: force of the reference [N].
+        ours: force of the answer [N].
+        bound: bound that the answer states of its error [N]; NaN: none.
+    """
+
+    at: float
+    reference: float
+    ours: float
+    bound: float
+
+    @property
+    def off(self) -> float:
+        """Difference of the answer's force from the reference's, over that [-]."""
+        return self.ours / self.reference - 1
+
+    @property
+    def stated(self) -> bool:
+        """Whether the answer states that it may be so far off."""
+        return abs(self.ours - self.reference) <= self.bound
+
+    def __str__(self) -> str:
+        bound = f"±{100 * self.bound / self.ours:.0f} %" if self.bound < np.inf else "no bound"
+        return (f"at {self.at:.1f} s the force is {100 * self.off:+.1f} % off finite elements ({self.ours:.2f} for "
+                f"{self.reference:.2f} N; it states {bound})")  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,7 +80,7 @@ class Massaged:
         gripped: times of those of the node's answers with both fingers in the skin [s], (G,), and the forces that they
             say of each, friction included [N], (G, 2).
         measured: times and forces of the wrist's sensor, as recorded, (M,) each.
-        solved: times and forces of the reference, (K,) each, and the answers' forces at the same frames, (K,).
+        solved: forces at the compared frames.
         real_time: simulated time over real time, from the first recorded pose to the last [-].
         poses: rate of the recorded poses by the recorder's clock [Hz].
         film: film of it.
@@ -63,7 +90,7 @@ class Massaged:
     answered: tuple[np.ndarray, np.ndarray]
     gripped: tuple[np.ndarray, np.ndarray]
     measured: tuple[np.ndarray, np.ndarray]
-    solved: tuple[np.ndarray, np.ndarray, np.ndarray]
+    solved: tuple[Solved, ...]
     real_time: float
     poses: float
     film: Film
@@ -90,11 +117,6 @@ class Massaged:
         """Forces between fingers and skin in the simulation, at the times of `gripped`, (G, F) [N]."""
         sizes = np.linalg.norm(self.log.fingers[..., :3], axis=-1)
         return np.array([np.interp(self.gripped[0], self.log.time, one) for one in sizes.T]).T
-
-    @property
-    def off_reference(self) -> np.ndarray:
-        """Difference of the answers' forces from the reference's, over these, (K,) [-]."""
-        return self.solved[2] / self.solved[1] - 1
 
     @property
     def gained(self) -> float:
@@ -125,10 +147,15 @@ class Massaged:
                 yield f"the node's fingers feel up to {100 * self.fingers_apart:.1f} % else than the simulation's"
             if grip["given_out_J"] > LARGEST_GAIN * grip["stored_J"]:
                 yield "the grip gave out more energy than was put in"
+        yield from (str(one) for one in self.solved if abs(one.off) > LARGEST_OFF and not one.stated)
         if self.apart > LARGEST_APART:
             yield f"the node's force is up to {100 * self.apart:.1f} % off the simulation's"
         if self.gained > LARGEST_GAIN:
             yield f"the contact gave out {100 * self.gained:.1f} % more energy than was put in"
+
+    def remarks(self) -> Iterator[str]:
+        """What is farther off than one would wish, and said so, one sentence each."""
+        yield from (str(one) for one in self.solved if abs(one.off) > LARGEST_OFF and one.stated)
 
 
 def filmed(folder: Path, config: RobotConfig) -> Film:
@@ -138,21 +165,19 @@ def filmed(folder: Path, config: RobotConfig) -> Film:
         folder: folder of the run.
         config: settings of the robot.
     """
-    from stmpl_sim.film import Camera, save
+    from stmpl_sim.film import film
     from stmpl_sim.massage import Log
 
     run, log = survey(folder).bag, Log.load(folder / LOG)
-    start, due = min(run.pose_stamps), 0.0
+    start, due, shots = min(run.pose_stamps), 0.0, []
     scene = scene_of(config, run.layer)
-    colour_m = 0.5 * float(run.layer.thickness[scene.site.vertex])
-    camera = Camera(scene.model, run.layer, colour_m)
     for frame in run.frames():
         at = (frame.stamp_ns - start) * NANO
         if due <= at <= log.time[-1]:
-            _take(camera, scene, log, at, frame)
+            shots.append(_shot(scene, log, at, frame))
             due = max(due + 1 / FILM_RATE, at)
-    camera.close()
-    return Film(save(camera.frames, folder / FILM, FILM_RATE), camera.backend, colour_m)
+    most = 0.5 * float(run.layer.thickness[scene.site.vertex])
+    return film(scene.model, run.layer, shots, folder / FILM, most=most, rate=FILM_RATE)
 
 
 def massaged(folder: Path, comparison: Comparison, film: Film) -> Massaged:
@@ -206,15 +231,20 @@ def _apart(ours: np.ndarray, felt: np.ndarray) -> float:
 def front(done: Massaged, limb: str) -> str:
     """HTML that a report opens with; `limb` is what is massaged."""
     drawn = " Drawn in software: there is no GL here." if done.film.frames_by == "software" else ""
+    hardest = done.film.colour_pa
+    pressed = "" if hardest is None else (f" Below, the skin from above and without the tools: pressure up to "
+                                          f"{1e-3 * hardest:.0f} kPa.")  # fmt: skip
     forces = sorted({phase.force for phase, _ in done.held()})
     said = " and ".join(f"{force:g}" for force in forces)
     return "\n".join([
         f"<h1>A robot massages a {text(limb.replace('_', ' '))} with {said} N</h1>",
         inside("image/webp", done.film.path.read_bytes()),
         f"<p class=note>The robot as its simulator moved it, the skin as the node answered it over ROS: coloured by "
-        f"displacement, from none to {1e3 * done.film.colour_m:.0f} mm, not exaggerated.{drawn}</p>",
+        f"displacement, from none to {1e3 * done.film.colour_m:.0f} mm, not exaggerated.{pressed}{drawn}</p>",
         "<h2>Force, energy, rate</h2>",
         image(course_figure(done)),
+        *(f"<p class=note>{kind}: {text(said)}.</p>" for kind, sentences in (
+            ("Not as it should be", done.complaints()), ("To note", done.remarks())) for said in sentences),
         table(("phase", "asked N", "kept N", "worst N", "depth mm", "off course mm", "in range %"), _phases(done)),
         table(("measured", "value"), rows(done)),
     ])  # fmt: skip
@@ -222,7 +252,7 @@ def front(done: Massaged, limb: str) -> str:
 
 def rows(done: Massaged) -> list[tuple[str, str]]:
     """Figures of a massage as a whole, name and value with unit."""
-    off, log = done.off_reference, done.log
+    log = done.log
     figures = [
         ("highest force", f"{log.force.max():.2f} N"),
         ("node's force off the simulation's", f"at most {100 * done.apart:.2f} % of the highest"),
@@ -241,9 +271,10 @@ def rows(done: Massaged) -> list[tuple[str, str]]:
             ("energy of the grip", f"{1e3 * grip['stored_J']:.0f} mJ at most, {-1e3 * grip['given_out_J']:.0f} mJ "
              "lost to friction"),
         ]  # fmt: skip
-    if len(off):
-        told = ", ".join(f"{100 * one:+.1f}" for one in off)
-        figures.insert(1, ("force off finite elements", f"{told} % at the compared frames"))
+    if done.solved:
+        told = ", ".join(f"{100 * one.off:+.1f}" for one in done.solved)
+        bound = 100 * max(one.bound / one.ours for one in done.solved)
+        figures.insert(1, ("force off finite elements", f"{told} % at the compared frames, ±{bound:.0f} % stated"))
     return figures
 
 
@@ -258,8 +289,9 @@ def course_figure(done: Massaged) -> Figure:
     for name, one in zip(("fingers, simulated", None), np.linalg.norm(log.fingers[..., :3], axis=-1).T, strict=False):
         force.plot(log.time, one, color=FINGER, lw=1.0, label=name)
     force.plot(np.repeat(done.gripped[0], done.gripped[1].shape[1]), done.gripped[1].ravel(), ".", color=NODE, ms=2)
-    if len(done.solved[0]):
-        force.plot(done.solved[0], done.solved[1], "o", color=TRUTH, ms=6, label="finite elements")
+    if done.solved:
+        solved = _columns([(one.at, one.reference) for one in done.solved])
+        force.plot(*solved, "o", color=TRUTH, ms=6, label="finite elements")
     force.set(ylabel="force [N]", ylim=(0, None))
     energy.plot(log.time, 1e3 * log.energy, color=INK, lw=1.2)
     energy.set(ylabel="energy held by the skin [mJ]", xlabel="time [s]")
@@ -274,26 +306,25 @@ def course_figure(done: Massaged) -> Figure:
     return figure
 
 
-def _take(camera: Any, scene: Any, log: Log, at: float, frame: Any) -> None:
+def _shot(scene: Scene, log: Log, at: float, frame: Frame) -> Shot:
     from stmpl_sim.engine import mujoco
-    from stmpl_sim.film import caption_of
+    from stmpl_sim.film import Shot, caption_of
 
     data, row = mujoco.MjData(scene.model), min(int(np.searchsorted(log.time, at)), len(log.time) - 1)
     data.qpos[:] = log.qpos[row]
     mujoco.mj_forward(scene.model, data)
     limb = log.limb[row]
     points = (scene.layer.vertices + frame.displacement) @ limb[:3, :3].T + limb[:3, 3]
-    camera.take(data, points, limb, frame.magnitude, caption_of(at, frame.touches))
+    return Shot(data, points, limb, frame.magnitude, frame.pressure, caption_of(at, frame.touches))
 
 
-def _solved(comparison: Comparison, start: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _solved(comparison: Comparison, start: int) -> tuple[Solved, ...]:
     key, found = f"{TOOL}.normal_n", []
     for pair in comparison.judged:
-        if key in pair.reference.trust.figures:
-            at = (pair.frame.stamp_ns - start) * NANO
-            found.append((at, abs(pair.reference.trust.figures[key]), pair.frame.touches[TOOL].force))
-    at, reference, ours = np.array(found, dtype=float).reshape(-1, 3).T
-    return at, reference, ours
+        if key in (forces := pair.reference.trust.figures):
+            at, touch = (pair.frame.stamp_ns - start) * NANO, pair.frame.touches[TOOL]
+            found.append(Solved(at, abs(forces[key]), touch.force, touch.force_bound))
+    return tuple(found)
 
 
 def _columns(pairs: list[tuple[float, float]]) -> tuple[np.ndarray, np.ndarray]:

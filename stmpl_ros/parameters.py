@@ -354,7 +354,7 @@ class DemoConfig(BaseModel):
         default="robot", description="what touches: a simulated robot that massages, or devices along a script"
     )
     node: NodeConfig = NodeConfig()
-    robot: RobotConfig = RobotConfig(laps=1.0, listeners=2, patience=400.0)
+    robot: RobotConfig = RobotConfig(force=(10.0,), laps=1.0, listeners=2, patience=400.0)
     probe: ProbeConfig = ProbeConfig(rate=125.0, listeners=2, patience=180.0)
     frames: int = Field(default=4, ge=1, description="number of frames of the run that FEM solves again")
     runs: Path = Field(default=Path("runs"), description="folder that gets one folder a run")

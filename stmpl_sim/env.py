@@ -130,15 +130,15 @@ class MassageEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         """A frame, (480, 640, 3) uint8."""
         if self.render_mode is None:
             return None
-        from stmpl_sim.film import Camera, caption_of
+        from stmpl_sim.film import Camera, Shot, caption_of
 
         if self._camera is None:
             layer = self._scene.layer
             self._camera = Camera(self._scene.model, layer, 0.5 * float(layer.thickness.max()))
         skin, data = self.massage.skin, self.massage.data
         answer = skin.answer()
-        said = caption_of(self._time, answer.touches)
-        self._camera.take(data, skin.skin_points(data, answer), self.massage.limb_pose(), answer.magnitude, said)
+        self._camera.take(Shot(data, skin.skin_points(data, answer), self.massage.limb_pose(), answer.magnitude,
+                               answer.pressure, caption_of(self._time, answer.touches)))  # fmt: skip
         return self._camera.frames.pop()
 
     def close(self) -> None:

@@ -1,4 +1,7 @@
-"""Film: robot and skin coloured by displacement, without a screen: by MuJoCo's renderer, or drawn in software."""
+"""Film: robot and skin coloured by displacement, without a screen: by MuJoCo's renderer, or drawn in software.
+
+Below, the same skin from above and coloured by pressure, without the tools that hide it: always drawn in software.
+"""
 
 from __future__ import annotations
 
@@ -6,7 +9,7 @@ import logging
 import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numba
 import numpy as np
@@ -18,7 +21,9 @@ log = logging.getLogger(__name__)
 logging.getLogger("OpenGL.acceleratesupport").setLevel(logging.WARNING)  # says on every import what it lacks
 
 SKIN = np.array([[242, 228, 218], [247, 178, 103], [228, 87, 46], [140, 28, 63], [46, 10, 60]]) / 255
-WIDTH, HEIGHT = 640, 480  # of a frame [pixels]
+PRESSED = np.array([[236, 236, 232], [150, 201, 198], [59, 142, 165], [30, 77, 122], [16, 24, 62]]) / 255
+WIDTH, HEIGHT, STRIP = 640, 480, 240  # of a frame, and of its strip with the pressure [pixels]
+ABOVE, FOVY, MARGIN = np.radians(60), 20.0, 1.15  # height and angle of view over the strip [rad, deg], room around [-]
 BACKENDS = ("egl", "osmesa")  # ways to render without a screen, in the order in which they are tried
 SKY = np.array([0.97, 0.97, 0.98])
 INK = (40, 40, 48)  # of captions
@@ -26,10 +31,61 @@ LIGHT = np.array([-0.35, -0.55, 0.76])  # direction to the light of drawn frames
 AMBIENT = 0.45  # share of the light that comes from everywhere
 
 
-def colours(values: np.ndarray) -> np.ndarray:
-    """Colours, (N, 3) [0..1], of values from 0 to 1, (N,)."""
-    at = np.linspace(0, 1, len(SKIN))
-    return np.stack([np.interp(values, at, channel) for channel in SKIN.T], axis=-1)
+def colours(values: np.ndarray, scale: np.ndarray = SKIN) -> np.ndarray:
+    """Colours, (N, 3) [0..1], of values from 0 to 1, (N,), on a scale of colours, (K, 3)."""
+    at = np.linspace(0, 1, len(scale))
+    return np.stack([np.interp(values, at, channel) for channel in scale.T], axis=-1)
+
+
+class Shot(NamedTuple):
+    """What a frame shows.
+
+    Args:
+        data: MuJoCo data, kept for it alone.
+        skin: vertices of the deformed skin in the world, (V, 3) [m].
+        limb: pose of the layer's axes in the world, (4, 4).
+        moved: displacement of each vertex, (V,) [m].
+        pressure: pressure at each vertex, (V,) [Pa]; None: not known.
+        caption: what is said of it.
+    """
+
+    data: Any
+    skin: np.ndarray
+    limb: np.ndarray
+    moved: np.ndarray
+    pressure: np.ndarray | None
+    caption: str
+
+
+class Film(NamedTuple):
+    """A film: its file, the renderer of its frames, and displacement [m] and pressure [Pa] of the last colours."""
+
+    path: Path
+    frames_by: str
+    colour_m: float
+    colour_pa: float | None
+
+
+def film(model: Any, layer: Any, shots: Sequence[Shot], path: Path, *, most: float, rate: float,
+         backend: str | None = None) -> Film:  # fmt: skip
+    """Makes a film of shots; nine in ten of those under pressure stay within its scale.
+
+    Args:
+        model: MuJoCo model of the scene.
+        layer: skin of the scene.
+        shots: shots, in order.
+        path: file, see `save`.
+        most: displacement that has the last colour [m].
+        rate: frames a second.
+        backend: see Camera.
+    """
+    peaks = [float(one.pressure.max()) for one in shots if one.pressure is not None and one.pressure.max() > 0]
+    hardest = 1e3 * float(np.ceil(1e-3 * np.percentile(peaks, 90))) if peaks else None
+    camera = Camera(model, layer, most, backend, hardest)
+    for shot in shots:
+        camera.take(shot)
+    camera.close()
+    return Film(save(camera.frames, path, rate), camera.backend, most, hardest)
 
 
 class Camera:
@@ -40,17 +96,20 @@ class Camera:
         layer: skin of the scene.
         most: displacement that has the last colour [m].
         backend: egl, osmesa or software; unless given, the first that works here.
+        hardest: pressure that has the last colour [Pa]; None: frames have no strip that shows it.
 
     Attributes:
         backend: renderer of the frames: egl, osmesa or software.
-        frames: frames so far, (HEIGHT, WIDTH, 3) uint8 each.
+        frames: frames so far, (HEIGHT, WIDTH, 3) uint8 each, or (HEIGHT + STRIP, WIDTH, 3) with pressure.
 
     Raises:
         InvalidInput: a backend that does not work here.
     """
 
-    def __init__(self, model: Any, layer: Any, most: float, backend: str | None = None) -> None:
-        self.model, self.layer, self.most = model, layer, most
+    def __init__(self, model: Any, layer: Any, most: float, backend: str | None = None,
+                 hardest: float | None = None) -> None:  # fmt: skip
+        self.model, self.layer, self.most, self.hardest = model, layer, most, hardest
+        self._above: tuple[np.ndarray, np.ndarray] | None = None
         self.frames: list[np.ndarray] = []
         self._surfaces: dict[int, Any] = {}
         self.backend, self._renderer = _renderer(model, backend)
@@ -59,26 +118,30 @@ class Camera:
 
             self._mesh = model.mesh(SKIN_MESH).id
 
-    def take(self, data: Any, skin_in_world: np.ndarray, pose_world_from_layer: np.ndarray, moved: np.ndarray,
-             caption: str = "") -> None:  # fmt: skip
-        """Takes a frame, and writes a caption and what the colours mean on it.
-
-        Args:
-            data: MuJoCo data.
-            skin_in_world: vertices of the deformed skin, (V, 3) [m].
-            pose_world_from_layer: pose of the layer's axes, (4, 4).
-            moved: displacement of each vertex, (V,) [m].
-            caption: what is said of the frame.
-        """
-        share = np.clip(moved / self.most, 0, 1)
-        frame = self._drawn(data, skin_in_world, share) if self._renderer is None else \
-            self._rendered(data, skin_in_world, pose_world_from_layer, share)
-        self.frames.append(told(frame, caption, self.most))
+    def take(self, shot: Shot) -> None:
+        """Takes a frame, and writes its caption and what the colours mean on it."""
+        share = np.clip(shot.moved / self.most, 0, 1)
+        frame = self._drawn(shot.data, shot.skin, share) if self._renderer is None else \
+            self._rendered(shot.data, shot.skin, shot.limb, share)
+        frame = told(frame, shot.caption, f"skin moved by 0 to {1e3 * self.most:.0f} mm", SKIN)
+        if self.hardest is not None:
+            frame = np.concatenate([frame, self._pressed(shot, self.hardest)])
+        self.frames.append(frame)
 
     def close(self) -> None:
         """Gives the renderer back."""
         if self._renderer is not None:
             self._renderer.close()
+
+    def _pressed(self, shot: Shot, hardest: float) -> np.ndarray:
+        """The strip: skin without tools, from above, its pressure."""
+        if self._above is None:
+            self._above = _view_above(shot.data, shot.skin)
+        pressure = np.zeros(len(shot.skin)) if shot.pressure is None else shot.pressure
+        shades = colours(np.clip(pressure / hardest, 0, 1), PRESSED)[self.layer.faces].mean(axis=1)
+        normals = _normals(shot.skin, self.layer.faces)[self.layer.faces].mean(axis=1)
+        strip = draw(shot.skin[self.layer.faces], shades, normals, *self._above, FOVY, STRIP)
+        return told(strip, "", f"pressure 0 to {1e-3 * hardest:.0f} kPa, from above, tools left out", PRESSED)
 
     def _rendered(self, data: Any, skin: np.ndarray, pose: np.ndarray, share: np.ndarray) -> np.ndarray:
         from stmpl_sim.engine import mujoco
@@ -128,23 +191,23 @@ def caption_of(at: float, touches: Mapping[str, Touch]) -> str:
     return "   ".join([f"{at:.1f} s", *(f"{touch.name.replace('_', ' ')} {touch.force:.1f} N" for touch in pressing)])
 
 
-def told(frame: np.ndarray, caption: str, most: float) -> np.ndarray:
-    """A frame with a caption above, and below the scale of its colours up to a displacement `most` [m]."""
+def told(frame: np.ndarray, caption: str, meaning: str, scale: np.ndarray) -> np.ndarray:
+    """A frame with a caption above, and below a scale of colours, (K, 3), and its meaning."""
     from PIL import Image, ImageDraw, ImageFont
 
     image = Image.fromarray(frame)
     left, top, wide, high = 12, image.height - 22, 150, 10
-    bar = np.broadcast_to(colours(np.linspace(0, 1, wide)), (high, wide, 3))
+    bar = np.broadcast_to(colours(np.linspace(0, 1, wide), scale), (high, wide, 3))
     image.paste(Image.fromarray((255 * bar).astype(np.uint8)), (left, top))
     write, font = ImageDraw.Draw(image), ImageFont.load_default(15)
-    write.text((left, top - 20), f"skin moved by 0 to {1e3 * most:.0f} mm", INK, font)
+    write.text((left, top - 20), meaning, INK, font)
     write.text((left, 8), caption, INK, font)
     return np.asarray(image)
 
 
 def draw(corners: np.ndarray, shades: np.ndarray, normals: np.ndarray, eye: np.ndarray, turn: np.ndarray,
-         fovy: float) -> np.ndarray:  # fmt: skip
-    """Draws triangles with a depth buffer, (HEIGHT, WIDTH, 3) uint8.
+         fovy: float, high: int = HEIGHT) -> np.ndarray:  # fmt: skip
+    """Draws triangles with a depth buffer, (high, WIDTH, 3) uint8.
 
     Args:
         corners: triangles in the world, (F, 3, 3) [m].
@@ -153,18 +216,19 @@ def draw(corners: np.ndarray, shades: np.ndarray, normals: np.ndarray, eye: np.n
         eye: position of the camera, (3,) [m].
         turn: axes of the camera as columns: right, up, backwards, (3, 3).
         fovy: vertical angle of view [deg].
+        high: height [pixels].
     """
     normals = normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30)
     lit = AMBIENT + (1 - AMBIENT) * np.abs(normals @ LIGHT)
     seen = (corners - eye) @ turn
-    scale = 0.5 * HEIGHT / np.tan(np.radians(fovy) / 2)
+    scale = 0.5 * high / np.tan(np.radians(fovy) / 2)
     depth = -seen[..., 2]
     seen, depth, shown = seen[depth.min(axis=1) > 0.01], depth, (lit[:, None] * shades)[depth.min(axis=1) > 0.01]
     depth = depth[depth.min(axis=1) > 0.01]
     x = 0.5 * WIDTH + scale * seen[..., 0] / depth
-    y = 0.5 * HEIGHT - scale * seen[..., 1] / depth
-    picture = np.tile(SKY, (HEIGHT, WIDTH, 1))
-    _raster(x, y, 1 / depth, np.ascontiguousarray(shown), picture, np.zeros((HEIGHT, WIDTH)))
+    y = 0.5 * high - scale * seen[..., 1] / depth
+    picture = np.tile(SKY, (high, WIDTH, 1))
+    _raster(x, y, 1 / depth, np.ascontiguousarray(shown), picture, np.zeros((high, WIDTH)))
     return (255 * np.clip(picture, 0, 1)).astype(np.uint8)
 
 
@@ -257,6 +321,20 @@ def _works(backend: str) -> bool:
                               timeout=60).returncode == 0  # fmt: skip
     except subprocess.TimeoutExpired:
         return False
+
+
+def _view_above(data: Any, skin: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Eye, (3,) [m], and axes, (3, 3), of a view from above of all of a skin, from the camera's side."""
+    from stmpl_sim.scene import EYE
+
+    right = data.camera(EYE).xmat.reshape(3, 3)[:, 0]
+    back = np.cos(ABOVE) * np.cross(right, [0, 0, 1.0]) + np.sin(ABOVE) * np.array([0, 0, 1.0])
+    turn = np.stack([right, np.cross(back, right), back], axis=1)
+    seen = skin @ turn
+    low, high = seen.min(axis=0), seen.max(axis=0)
+    half = MARGIN * max((high[0] - low[0]) * STRIP / WIDTH, high[1] - low[1]) / 2
+    middle = 0.5 * (low + high)
+    return turn @ [middle[0], middle[1], high[2] + half / np.tan(np.radians(FOVY) / 2)], turn
 
 
 def _normals(points: np.ndarray, faces: np.ndarray) -> np.ndarray:

@@ -89,20 +89,16 @@ def sim(
     course = Course(site.circle(1e-3 * circle), tuple(force), 1e-3 * speed, laps, grip)
     massage = Massage(scene, course, damping=damping, friction=friction_from(friction))
     out.mkdir(parents=True, exist_ok=True)
-    camera = None
-    if film != "none":
-        from stmpl_sim.film import Camera
-
-        most = 0.5 * float(layer.thickness[site.vertex])
-        camera = Camera(scene.model, layer, most, None if film == "auto" else film)
-    log = _run(massage, camera, quiet=as_json)
+    shots: list[Any] | None = None if film == "none" else []
+    log = _run(massage, shots, quiet=as_json)
     log.save(out / "log.npz")
     figures = figures_of(log) | {"log": str(out / "log.npz")}
-    if camera is not None:
-        from stmpl_sim.film import save
+    if shots is not None:
+        from stmpl_sim.film import film as made
 
-        figures |= {"film": str(save(camera.frames, out / "film.webp", FILM_RATE)), "frames_by": camera.backend}
-        camera.close()
+        done = made(scene.model, layer, shots, out / "film.webp", most=0.5 * float(layer.thickness[site.vertex]),
+                    rate=FILM_RATE, backend=None if film == "auto" else film)  # fmt: skip
+        figures |= {"film": str(done.path), "frames_by": done.frames_by}
     print_figures(figures if as_json else table(figures))
     return 0
 
@@ -138,10 +134,12 @@ def limb(part: str, tissue: str, relaxing: bool = False, phenotype: str = "") ->
     return held_skin(layer) if relaxing else layer
 
 
-def _run(massage: Massage, camera: Any, *, quiet: bool) -> Log:
-    """Runs the course under a progress bar; the camera takes its frames."""
+def _run(massage: Massage, shots: list[Any] | None, *, quiet: bool) -> Log:
+    """Runs the course under a progress bar; what a film will show is added to the shots."""
+    from copy import copy
+
     from stmpl_core.console import steps_bar
-    from stmpl_sim.film import caption_of
+    from stmpl_sim.film import Shot, caption_of
 
     dt = float(massage.scene.model.opt.timestep)
     steps, every = round(massage.course.duration / dt), max(1, round(1 / (FILM_RATE * dt)))
@@ -151,10 +149,10 @@ def _run(massage: Massage, camera: Any, *, quiet: bool) -> Log:
             k = round(at / dt)
             if k % 50 == 0:
                 show(k, steps, run.course.phase(at).name)
-            if camera is not None and k % every == 0:
+            if shots is not None and k % every == 0:
                 answer = run.skin.answer()
-                said = caption_of(at, answer.touches)
-                camera.take(run.data, run.skin.skin_points(run.data, answer), run.limb_pose(), answer.magnitude, said)
+                shots.append(Shot(copy(run.data), run.skin.skin_points(run.data, answer), run.limb_pose(),
+                                  answer.magnitude, answer.pressure, caption_of(at, answer.touches)))  # fmt: skip
 
         return massage.run([see])
 

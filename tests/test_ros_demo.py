@@ -35,7 +35,7 @@ def test_a_massage_over_ros_is_recorded_replayed_judged_and_shown(tmp_path: Path
     assert "every one bit for bit as recorded" in " ".join(done.stdout.split())
     folder = tmp_path / "latest"
     page = (folder / "report.html").read_text()
-    first = page.index("<h1>A robot massages a left forearm with 5 N</h1>")
+    first = page.index("<h1>A robot massages a left forearm with 10 N</h1>")
     assert first < page.index("data:image/webp;base64") < page.index("moment_net against rigid_fem")
     assert (folder / "film.webp").stat().st_size > 20_000 and (folder / "robot.npz").is_file()
     for row in ("force off finite elements", "energy stored in the skin", "poses over ROS"):

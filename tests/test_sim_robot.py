@@ -188,6 +188,34 @@ def test_frames_drawn_in_software_show_the_nearer_of_two_triangles() -> None:
     assert rim[0] > 100 and rim[1] == 0
 
 
+def test_a_film_shows_where_the_skin_is_pressed(forearm: SoftLayer, tmp_path: Path) -> None:
+    from PIL import Image
+
+    from stmpl_sim.engine import mujoco
+    from stmpl_sim.film import HEIGHT, STRIP, Shot, film
+    from stmpl_sim.scene import build
+    from stmpl_sim.site import Site
+
+    scene = build(forearm, site := Site.thickest(forearm))
+    data = mujoco.MjData(scene.model)
+    mujoco.mj_forward(scene.model, data)
+    limb = np.eye(4)
+    limb[:3, :3], limb[:3, 3] = data.body("limb").xmat.reshape(3, 3), data.body("limb").xpos
+    there = forearm.vertices @ limb[:3, :3].T + limb[:3, 3]
+    pressure = 2e4 * (np.linalg.norm(forearm.vertices - site.point, axis=1) < 0.012)
+    shots = [Shot(data, there, limb, np.zeros(len(there)), one, "") for one in (0 * pressure, pressure, None)]
+    made = film(scene.model, forearm, shots, tmp_path / "film.png", most=0.01, rate=5.0, backend="software")
+    assert made.colour_pa == 20e3
+    with Image.open(made.path) as frames:
+        pictures = []
+        for k in range(3):
+            frames.seek(k)
+            pictures.append(np.asarray(frames.convert("RGB"), dtype=float)[:HEIGHT + STRIP])
+    changed = np.abs(pictures[1] - pictures[0]).max(axis=2) > 60
+    assert len(changed) == HEIGHT + STRIP and not changed[:HEIGHT].any() and 100 < changed.sum() < 10_000
+    np.testing.assert_array_equal(pictures[0], pictures[2])
+
+
 def test_the_environment_passes_gymnasiums_own_check_and_its_script_solves_it(forearm: SoftLayer) -> None:
     pytest.importorskip("gymnasium", reason="pip install 'stmpl[sim]'")
     from gymnasium.utils.env_checker import check_env
