@@ -41,9 +41,9 @@ def _place_meshes(spec: Any, path: Path) -> None:
     Nothing of a robot collides with anything but the skin, so only a picture lacks them; a link without an inertial,
     whose mass would follow from them, is refused by MuJoCo itself.
     """
-    urdf, missing = path.suffix.lower() == ".urdf", set()
+    missing = set()
     for mesh in spec.meshes:
-        if not mesh.file.startswith(PACKAGE) and (not urdf or not mesh.file or _found(mesh.file, spec, path)):
+        if not mesh.file or (not mesh.file.startswith(PACKAGE) and _found(mesh.file, spec, path)):
             continue
         if (found := _in_package(mesh.file, path)) is None:
             missing.add(_name(mesh))

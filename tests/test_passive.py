@@ -55,8 +55,19 @@ def test_what_a_model_says_is_stored_is_the_work_that_was_put_in(place: Place) -
     assert model.wrench_at(pose).stored == pytest.approx(work, rel=0.1)
 
 
-@pytest.mark.parametrize("stiffness", [300.0, 3000.0])
-def test_an_impedance_settles_on_a_forearm_and_gains_nothing_from_late_models(place: Place, stiffness: float) -> None:
+@pytest.fixture(scope="module")
+def rubbing(forearm: SoftLayer) -> Place:
+    """Skin that relaxes and rubs: as a ball slides around it, its push leans and grows with that."""
+    skin = forearm.with_(tissue=forearm.tissue.relaxing(HELD_SKIN))
+    return Place.of(skin, Site.thickest(skin).vertex, 0.3)
+
+
+@pytest.mark.parametrize("stiffness, where", [(300.0, "place"), (3000.0, "place"), (300.0, "rubbing"),
+                                              (3000.0, "rubbing")])  # fmt: skip
+def test_an_impedance_settles_on_a_forearm_and_gains_nothing_from_late_models(
+    stiffness: float, where: str, request: pytest.FixtureRequest
+) -> None:
+    place: Place = request.getfixturevalue(where)
     one = run(place, impedance(stiffness), LATE, PassiveContact(MOST_DAMPING))
     held = one.during(0.9, 1.1)
     assert held.mean() > 1 and held.std() < 0.05 * held.mean()
@@ -68,8 +79,11 @@ def test_late_models_by_themselves_do_give_energy(place: Place) -> None:
     assert run(place, ForceControl(15.0), LATE, Bare()).gained > 0.01
 
 
-@pytest.mark.parametrize("force", [5.0, 10.0, 20.0])
-def test_a_set_force_settles_on_a_forearm_under_late_models(place: Place, force: float) -> None:
+@pytest.mark.parametrize("force, where", [(5.0, "place"), (10.0, "place"), (20.0, "place"), (30.0, "rubbing")])
+def test_a_set_force_settles_on_a_forearm_under_late_models(
+    force: float, where: str, request: pytest.FixtureRequest
+) -> None:
+    place: Place = request.getfixturevalue(where)
     one = run(place, ForceControl(force), LATE, PassiveContact(MOST_DAMPING))
     held = one.during(1.6, 2.0)
     assert held.mean() == pytest.approx(force, rel=0.02) and held.std() < 0.02 * force

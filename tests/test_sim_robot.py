@@ -239,6 +239,29 @@ def test_the_environment_passes_gymnasiums_own_check_and_its_script_solves_it(fo
         MassageEnv(forearm, render_mode="human")
 
 
+def test_the_script_holds_ten_newtons_on_the_back_of_a_person_who_breathes_sways_and_turns() -> None:
+    pytest.importorskip("gymnasium", reason="pip install 'stmpl[sim]'")
+    from stmpl_core.body import Body
+    from stmpl_core.living import living
+    from stmpl_sim.env import SWAY_M, MassageEnv, Scripted
+
+    back = living(Body.anny(), "back", edge_length=8e-3)
+    env, policy = MassageEnv(back, laps=0.3, timestep=4e-3, friction="oiled", relaxing=True), Scripted()
+    observation, _ = env.reset(seed=3)
+    rest, done, failed, told, moved = env.massage.limb_pose(), False, False, [], 0.0
+    while not (done or failed):
+        observation, reward, failed, done, info = env.step(policy.act(observation))
+        told.append((info["force_N"], reward, info["off_course_m"], info["in_range"]))
+        there = env.massage.limb_pose() @ np.linalg.inv(rest) @ [*env.massage.data.geom("ball").xpos, 1]
+        moved = max(moved, np.linalg.norm(there[:2] - env.massage.data.geom("ball").xpos[:2]))
+    force, rewards, off, in_range = np.array(told).T
+    assert moved > SWAY_M and done
+    assert force.mean() == pytest.approx(10.0, abs=0.3) and np.abs(force - 10.0).max() < 3
+    assert rewards.mean() > 0.8 and off.max() < 3e-3 and in_range.mean() > 0.9
+    with pytest.raises(InvalidInput, match="its own friction"):
+        MassageEnv(Simulator(back, Winkler()), relaxing=True)
+
+
 def test_an_episode_begins_on_skin_that_remembers_the_press(forearm: SoftLayer) -> None:
     pytest.importorskip("gymnasium", reason="pip install 'stmpl[sim]'")
     from stmpl_sim.env import MassageEnv, Scripted
