@@ -12,6 +12,7 @@ from stmpl_sim.engine import mujoco
 
 FILTER_S = 3e-3  # time constant of the force's rate [s]
 STEEPER = 0.4  # power of the force with which a contact's stiffness grows: of round tools on skin 0.33 to 0.5
+MOST = 20.0  # acceleration that an error of the force may ask for [m/s2]: at first touch there is next to no stiffness
 
 
 @dataclass(frozen=True)
@@ -171,7 +172,8 @@ class ForceImpedance:
         self.felt = felt
         k = stiffness * max(1.0, force / max(felt, 1e-3)) ** STEEPER  # where it is going
         w = max(g.force, np.sqrt(k / mass))
-        return (w**2 * (error + self.integral) + 2 * g.ratio * w * (growth - self.rate)) / k
+        asked = (w**2 * (error + self.integral) + 2 * g.ratio * w * (growth - self.rate)) / k
+        return float(np.clip(asked, -MOST, MOST))
 
     def command(self, data: Any, goal: Goal, wrench: Wrench, stiffness: float, dt: float) -> None:
         """Writes the torques into `data.ctrl`."""

@@ -154,21 +154,26 @@ def _chain(body: Any) -> list[Any]:
 
 
 def _drive(spec: Any, chain: list[Any]) -> None:
-    """A torque motor on each joint of the chain, in place of the robot's own actuators there."""
+    """A torque motor on each joint of the chain, in place of the robot's own actuators there, servos with damping."""
     if not chain:
         raise InvalidInput("no joint moves the robot's end. Give the body behind the last joint with --end.")
     for k, joint in enumerate(chain):
         joint.name = joint.name or f"joint_{k + 1}"
         if joint.type not in (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE):
             raise InvalidInput(f"joint '{joint.name}' is no hinge and no slide; the controller drives only these.")
-    names = {joint.name for joint in chain}
+    names, servos = {joint.name for joint in chain}, set()
     for actuator in list(spec.actuators):
         if actuator.target in names:
+            if actuator.biastype != mujoco.mjtBias.mjBIAS_NONE:
+                servos.add(actuator.target)
             spec.delete(actuator)
     for joint in chain:
+        if joint.name in servos:  # its damping is the servo's
+            joint.damping = np.zeros(3)
         motor = spec.add_actuator(name=f"torque_{joint.name}", target=joint.name)
         motor.trntype = mujoco.mjtTrn.mjTRN_JOINT
-        motor.set_to_motor()
+        motor.set_to_motor()  # the robot's defaults are its servos'
+        motor.ctrllimited = motor.forcelimited = mujoco.mjtLimited.mjLIMITED_FALSE
 
 
 def _add_head(spec: Any, holder: Any, radius: float) -> None:

@@ -148,6 +148,28 @@ def test_a_robot_of_ones_own_is_driven_and_what_it_lacks_is_said(forearm: SoftLa
         build(forearm, site, robot=path)
 
 
+def test_a_robot_whose_joints_are_servos_keeps_its_force(forearm: SoftLayer, tmp_path: Path) -> None:
+    """A gantry of 30 kg whose servos have limits by default, and damping; one mesh is nowhere."""
+    from stmpl_sim.massage import Course, Massage
+    from stmpl_sim.scene import build
+    from stmpl_sim.site import Site
+
+    heavy = '<inertial pos="0 0 0" mass="10" diaginertia=".1 .1 .1"/>'
+    moved = "".join(f'<body>{heavy}<joint name="j{k}" type="slide" axis="{axis}" range="-1 1" damping="500"/>'
+                    for k, axis in enumerate(("1 0 0", "0 1 0", "0 0 1")))  # fmt: skip
+    path = tmp_path / "gantry.xml"
+    path.write_text(f"""<mujoco><compiler meshdir="assets" autolimits="true"/>
+      <default><position ctrlrange="-6 6" kp="1000"/></default><asset><mesh file="gone.obj"/></asset>
+      <worldbody><body pos="0 0 .5">{moved}<geom type="mesh" mesh="gone"/>
+      <site name="tool" quat="0 1 0 0"/></body></body></body></body></worldbody>
+      <actuator><position joint="j0"/><position joint="j1"/><position joint="j2"/></actuator></mujoco>""")
+    site = Site.thickest(forearm)
+    scene = build(forearm, site, robot=path, end="tool", timestep=2e-3)
+    log = Massage(scene, Course(site.circle(0.012), (5.0,), laps=0.1), skin=Simulator(forearm, Winkler())).run()
+    for phase in log.phases[2:4]:
+        assert np.abs(log.force[log.during(phase)] - 5.0).max() < 0.2
+
+
 def test_meshes_of_a_package_are_found_beside_the_file_or_left_out(tmp_path: Path, caplog: pytest.LogCaptureFixture
                                                                    ) -> None:  # fmt: skip
     """Links of a URDF as ROS has them: one mesh lies in its package, one nowhere, one is of a kind that is not read."""
@@ -237,6 +259,8 @@ def test_the_environment_passes_gymnasiums_own_check_and_its_script_solves_it(fo
     assert np.mean(still[20:]) < 0.3  # who does nothing is not paid
     with pytest.raises(InvalidInput, match="render_mode"):
         MassageEnv(forearm, render_mode="human")
+    with pytest.raises(InvalidInput, match="its own friction"):
+        MassageEnv(Simulator(forearm, Winkler()), relaxing=True)
 
 
 def test_the_script_holds_ten_newtons_on_the_back_of_a_person_who_breathes_sways_and_turns() -> None:
@@ -258,8 +282,6 @@ def test_the_script_holds_ten_newtons_on_the_back_of_a_person_who_breathes_sways
     assert moved > SWAY_M and done
     assert force.mean() == pytest.approx(10.0, abs=0.3) and np.abs(force - 10.0).max() < 3
     assert rewards.mean() > 0.8 and off.max() < 3e-3 and in_range.mean() > 0.9
-    with pytest.raises(InvalidInput, match="its own friction"):
-        MassageEnv(Simulator(back, Winkler()), relaxing=True)
 
 
 def test_an_episode_begins_on_skin_that_remembers_the_press(forearm: SoftLayer) -> None:
