@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from stmpl_core.body import Body
+from stmpl_core.body import AROUND, Body
 from stmpl_core.bones import bones_of, to_bone
 from stmpl_core.errors import InvalidInput
 from stmpl_core.fat import fat_map, for_person
@@ -24,6 +24,7 @@ from stmpl_core.trunk import TRUNK
 WHOLE = {"arm": "forearm", "leg": "thigh", "torso": "back"}  # region whose numbers serve a part of several
 STRAIGHT = ("torso", "back")  # parts whose bones are not known: their tissue lies straight below the skin
 SHEET = 2e-3  # thickness with which a part is meshed before its columns are known [m]
+NEARLY, LEAST_HELD = 0.9, 0.5  # shares of picked skin: of the most that any part holds of it, and least of that
 DEEPEST = 0.95 * MAX_THICKNESS  # depth at which tissue ends above the bone, as in a heavy person's groin [m]
 
 
@@ -44,23 +45,48 @@ def region_of(part: str, tone: Tone = "relaxed") -> Region:
 def living(body: Body, part: str, tone: Tone = "relaxed", *, edge_length: float = EDGE_LENGTH) -> SoftLayer:
     """A part of a body with the tissue that was measured in its region (stmpl_core.regions).
 
+    Skin around a picked place (Body.around) has that of the smallest part which holds nearly all of it.
+
     Arms and legs reach to their bones, so how thick their tissue is follows the body. Torso and back are as thick as
     their region; abdomen, neck and shoulders no thicker than theirs, in columns to spine or humerus. Fat and skin
     follow the person's weight and sex, fat also the side of a limb (stmpl_core.fat).
 
     Args:
         body: body.
-        part: its part.
+        part: its part, or `around:x,y,z,radius`.
         tone: state of the muscle.
         edge_length: length of the skin mesh's edges [m].
 
     Raises:
         InvalidInput: a part without a region.
     """
-    if part in STRAIGHT:
-        its = for_person(region_of(part, tone), body.physique)
+    named = part_around(body, part) if part.startswith(AROUND) else part
+    if named in STRAIGHT:
+        its = for_person(region_of(named, tone), body.physique)
         return body.part(part, edge_length=edge_length, thickness=its.thickness, tissue=its.tissue)
-    return filled(body, part, body.part(part, edge_length=edge_length, thickness=SHEET), tone)
+    return filled(body, named, body.part(part, edge_length=edge_length, thickness=SHEET), tone)
+
+
+def part_around(body: Body, picked: str) -> str:
+    """The part whose tissue is that around a picked place: the smallest that holds nearly all of that skin.
+
+    Raises:
+        InvalidInput: skin of which no part whose tissue was measured holds half.
+    """
+    inside, held = body.level(picked) > 0, {}
+    for part in body.parts:
+        try:
+            region_of(part)
+        except InvalidInput:
+            continue
+        own = body.level(part) > 0
+        held[part] = float((own & inside).sum() / inside.sum()), int(own.sum())
+    most = max((share for share, _ in held.values()), default=0.0)
+    if most < LEAST_HELD:
+        outside = 100 * (1 - most)
+        raise InvalidInput(f"the tissue of {picked!r} was not measured: at least {outside:.0f} % of that skin is "
+                           f"outside of each of {', '.join(held)}. Give it a tissue of one material.")  # fmt: skip
+    return min((size, part) for part, (share, size) in held.items() if share > NEARLY * most)[1]
 
 
 def filled(body: Body, part: str, skin: SoftLayer, tone: Tone = "relaxed") -> SoftLayer:

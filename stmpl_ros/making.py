@@ -11,7 +11,7 @@ from stmpl_core.contact import Contact
 from stmpl_core.errors import InvalidInput
 from stmpl_core.friction import Friction, friction_from
 from stmpl_core.layer import SoftLayer
-from stmpl_core.living import held_skin, living, read_model, read_tissue, region_of
+from stmpl_core.living import held_skin, living, part_around, read_model, read_tissue, region_of
 from stmpl_core.regions import Tone
 from stmpl_core.rig import Rig, joints_of
 from stmpl_core.simulator import Simulator
@@ -70,7 +70,7 @@ def check(config: NodeConfig, build: Build, changed: set[str] | None = None) -> 
         raise InvalidInput(f"{config.method} knows a limb at rest only; one that moves is known to {', '.join(MOVED)}. "
                            "Take one of these, or leave joint_states empty.")  # fmt: skip
     if build is layer_of:
-        from stmpl_core.body import Body
+        from stmpl_core.body import AROUND, Body
 
         default = NodeConfig()
         asked = {name for name in ONE_LAYER if getattr(config, name) != getattr(default, name)}
@@ -86,7 +86,7 @@ def check(config: NodeConfig, build: Build, changed: set[str] | None = None) -> 
                                    f"{', '.join(known)}. Its own name comes first, as in left_elbow=elbow_2.")
         stacked = config.tissue != PAPER
         if config.tissue in get_args(Tone):
-            region_of(config.limb)
+            region_of(part_around(Body.anny(), config.limb) if config.limb.startswith(AROUND) else config.limb)
         elif stacked:
             stacked = not read_tissue(config.tissue)[0].single
         if stacked and config.method not in ON_STACKS:

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from stmpl_core import Contact, Simulator, SoftLayer, State, Tissue
-from stmpl_core.body import Body
+from stmpl_core.body import Body, around_name
 from stmpl_core.bones import bones_of
 from stmpl_core.errors import InvalidInput
 from stmpl_core.extrusion import fold_ratios
-from stmpl_core.living import living, read_tissue, region_of, write_tissue
+from stmpl_core.living import living, part_around, read_tissue, region_of, write_tissue
 from stmpl_core.methods import MomentNet
 from stmpl_core.regions import HELD_SKIN, region
 from stmpl_core.soundness import border_distance
@@ -171,3 +171,27 @@ def test_a_forearm_that_is_held_eases_as_its_materials_do_but_for_the_tension_of
         forces.append(touches[0].force)
     left, lost = np.array(forces[1:]) / forces[0], 1 - HELD_SKIN.left(np.array([1, 5, 10.0]))
     assert (0.5 * lost < 1 - left).all() and (1 - left < lost).all()
+
+
+@pytest.mark.parametrize("part, named", [("left_thigh", "left_thigh"), ("abdomen", "abdomen"), ("back", "back")])
+def test_skin_around_a_picked_place_has_the_tissue_that_its_part_has_there(part: str, named: str) -> None:
+    body = Body.anny()
+    whole = living(body, part, edge_length=COARSE)
+    place = whole.vertices[border_distance(whole).argmax()]
+    picked = around_name(place, 0.07)
+    assert part_around(body, picked) == named
+    layer = living(body, picked, edge_length=COARSE)
+    near = np.linalg.norm(layer.vertices - place, axis=1) < 0.04
+    there = np.linalg.norm(whole.vertices - layer.vertices[near][:, None], axis=2).argmin(axis=1)
+    assert near.sum() > 20
+    np.testing.assert_allclose(np.median(layer.thickness[near] / whole.thickness[there]), 1.0, atol=0.02)
+    assert len(layer.tissue.deeper) == len(whole.tissue.deeper) > 0
+
+
+def test_skin_whose_tissue_nobody_measured_is_not_made_up() -> None:
+    body = Body.anny()
+    face = around_name(body.vertices[body.vertices[:, 2].argmax()], 0.06)
+    for ask in (lambda: living(body, face), lambda: check(NodeConfig(part=face), layer_of)):
+        with pytest.raises(InvalidInput, match="was not measured: at least 100 % of that skin is"):
+            ask()
+    check(NodeConfig(part=around_name(living(body, "back", edge_length=COARSE).vertices[0], 0.07)), layer_of)
