@@ -162,7 +162,7 @@ def compare_run(
     frames: int = 12,
     method: Method | None = None,
     tolerance: float | None = None,
-    pressing: int | None = None,
+    tool: str = "",
     on_frame: Callable[[int, int], None] | None = None,
 ) -> Comparison:
     """Solves a sample of a run's frames by `reference`.
@@ -180,7 +180,7 @@ def compare_run(
         frames: number of frames to sample, >= 1.
         method: method that is judged under the same pressures; None judges the recorded answers.
         tolerance: allowed mean error under the contact in the worst frame [m].
-        pressing: largest number of tools on the skin in a frame that is taken; None: any.
+        tool: name of the tool that alone is on the skin in a frame that is taken; empty: any tools.
         on_frame: callback with (done, total) before each frame, for a progress bar.
 
     Raises:
@@ -191,7 +191,7 @@ def compare_run(
     judged = (lambda frame: frame) if method is None else _solver(method, run)
     names = (run.method if method is None else method.name, reference.name)
     elastic = (lambda frame: _elastic(frame, run.bag.layer_of(frame))) if method is None else (lambda frame: True)
-    taken = [moment for moment in run.moments if pressing is None or moment.pressing <= pressing]
+    taken = [moment for moment in run.moments if not tool or moment.tools == (tool,)]
     return _compare(run, sample(taken, frames), names, judged, judge, tolerance, on_frame, alike=elastic)
 
 
@@ -243,7 +243,7 @@ def sample(moments: Sequence[Moment], frames: int) -> list[Moment]:
     if not loaded:
         raise BagError(f"nothing pressed on the skin in any of {len(moments)} answers, so there is nothing to compare.")
     chosen = {max(loaded, key=lambda moment: moment.load)}
-    several = [moment for moment in loaded if moment.pressing > 1]
+    several = [moment for moment in loaded if len(moment.tools) > 1]
     if several:
         chosen.add(max(several, key=lambda moment: moment.load))
     rest = [moment for moment in loaded if moment not in chosen]

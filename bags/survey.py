@@ -24,7 +24,7 @@ class Moment:
         time: time since the first answer's stamp [s].
         load: force on the skin in all, sum of pressure times area [N]; NaN where the pressure is not known.
         peak: largest displacement [m].
-        pressing: number of tools that load the skin.
+        tools: names of the tools that load the skin.
         converged, in_range, why: flags of the answer, and its reason for them.
         solve_seconds: time that the node spent on it [s].
         latency: time from its last contact message to itself, by the recorder's clock [s]; NaN: unknown.
@@ -36,7 +36,7 @@ class Moment:
     time: float
     load: float
     peak: float
-    pressing: int
+    tools: tuple[str, ...]
     converged: bool
     in_range: bool
     why: str
@@ -134,7 +134,7 @@ def _moment(number: int, frame: Frame, first_ns: int, layer: SoftLayer | None) -
         time=(frame.stamp_ns - first_ns) * NANO,
         load=float("nan") if layer is None else _load(frame, layer),
         peak=frame.peak,
-        pressing=sum(touch.presses for touch in frame.touches.values()),
+        tools=tuple(name for name, touch in frame.touches.items() if touch.presses),
         converged=frame.trust.converged,
         in_range=frame.trust.in_range,
         why=frame.trust.why,

@@ -68,7 +68,7 @@ def run(config: DemoConfig) -> int:
         filming = beside.submit(filmed, folder, config.robot) if config.device == "robot" else None
         replay = _replay(folder, config.node.method, console)
         # The frames of the grip take finite elements a minute each, and friction, which they lack: not compared.
-        comparison = compare_with_progress(folder, RigidFem(), config.frames, pressing=1 if config.robot.grip else None)
+        comparison = compare_with_progress(folder, RigidFem(), config.frames, tool=TOOL if filming else "")
         done = massaged(folder, comparison, filming.result()) if filming else None
     report = write_report(comparison, folder / "report.html", replay=replay,
                           front=front(done, config.node.limb) if done else "")  # fmt: skip

@@ -24,7 +24,7 @@ SHOWN = {"Pa": (1e-3, "kPa"), "m": (1e3, "mm"), "N/m": (1.0, "N/m"), "-": (1.0, 
 
 def compare_with_progress(
     run: Path | Survey, reference: Method | Presser, frames: int, *, method: Method | None = None,
-    pressing: int | None = None, quiet: bool = False,
+    tool: str = "", quiet: bool = False,
 ) -> Comparison:  # fmt: skip
     """bags.compare.compare_run under a progress bar on stderr. Raises BagError."""
     from rich.console import Console
@@ -39,7 +39,7 @@ def compare_with_progress(
         def show(done: int, total: int) -> None:
             progress.update(task, completed=done, total=total)
 
-        return compare_run(run, reference, frames=frames, method=method, pressing=pressing, on_frame=show)
+        return compare_run(run, reference, frames=frames, method=method, tool=tool, on_frame=show)
 
 
 def figures_of(comparison: Comparison) -> dict[str, Any]:

@@ -153,7 +153,10 @@ def test_the_sample_holds_the_heaviest_frame_and_both_tools_and_spreads(run):
         picks = sample(moments, count)
         assert len(picks) == min(count, sum(moment.load > 0 for moment in moments))
         assert max(moments, key=lambda moment: moment.load) in picks
-        assert any(moment.pressing > 1 for moment in picks)
+        assert any(len(moment.tools) > 1 for moment in picks)
+    (first, *_) = next(moment.tools for moment in moments if len(moment.tools) == 1)
+    only = compare_run(run, Winkler(), method=Winkler(), frames=3, tool=first)
+    assert all([name for name, touch in pair.frame.touches.items() if touch.presses] == [first] for pair in only.pairs)
     alone = [replace(moment, load=0.0) for moment in moments]
     with pytest.raises(BagError, match="nothing pressed"):
         sample(alone, 5)
