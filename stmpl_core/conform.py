@@ -23,6 +23,8 @@ LEAST_WEIGHT = 1e-3  # firmness from which a correction counts: one that falls t
 PUSHES = 5  # steps of a vertex out of a tool, at most
 LEFT_DEPTH = 1e-3  # depth over the thickness that a step may leave, or another one follows
 PASSES = 3  # corrections of one answer
+LEFT_SHARE = 1e-4  # share of what is wanted that one of these passes may leave: the next asks for it again
+ITERATIONS, BACK = 40, 2  # most steps of its linear solver, and how many steps before each is held against
 SMOOTHING_SHARE = 0.05  # ridge over the sinking of a vertex under its own source: it keeps neighbours from fighting
 
 
@@ -156,32 +158,82 @@ def _want(grid, pose, rest, moved, places, gone, lies, firm, wanted, weight):
 
 @numba.njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
 def _correct(sinking, wanted, weight, moved, sources):
-    """Moves vertices as is wanted, with those around them, and adds up the sources that do so; False: none is."""
-    count, own = len(weight), 0.0
-    act = np.flatnonzero(weight > LEAST_WEIGHT)
-    if not len(act):
+    """Moves vertices as is wanted, with those around them, and adds up the sources that do so; False: none is.
+
+    Solves (sinking + ridge) x = wanted by conjugate residuals with the diagonal as preconditioner. The matrix is not
+    quite symmetric: each way is held against the BACK before it (Orthomin: Vinsome, SPE 5729, 1976).
+    """
+    count, own, active = len(weight), np.float32(0), False
+    for n in range(count):
+        own += np.float32(SMOOTHING_SHARE) * sinking[n, n] / np.float32(count)
+    left, ridge, per = np.zeros((3, count), np.float32), np.zeros(count, np.float32), np.zeros(count, np.float32)
+    for n in range(count):
+        if weight[n] > LEAST_WEIGHT:
+            active, ridge[n] = True, own / np.float32(weight[n]) ** 2
+            per[n] = np.float32(1) / (sinking[n, n] + ridge[n])
+            for x in range(3):
+                left[x, n] = wanted[n, x]
+    if not active:
         return False
+    ways = np.zeros((BACK + 1, 3, count), np.float32)
+    sinks, images = np.zeros_like(ways), np.zeros_like(ways)
+    step, sunk, squares = np.zeros_like(left), np.zeros_like(left), np.ones(BACK + 1, np.float32)
+    enough = np.float32(LEFT_SHARE) ** 2 * _dot(left, left)
+    for k in range(ITERATIONS):
+        if _dot(left, left) <= enough:
+            break
+        at = k % (BACK + 1)
+        _follow(sinking, left, per, ridge, ways[at], sinks[at], images[at])
+        for other in range(min(k, BACK + 1)):
+            if other != at:
+                share = -_dot(images[at], images[other]) / squares[other]
+                _add(share, ways[other], ways[at])
+                _add(share, sinks[other], sinks[at])
+                _add(share, images[other], images[at])
+        squares[at] = _dot(images[at], images[at])
+        share = _dot(left, images[at]) / squares[at]
+        _add(share, ways[at], step)
+        _add(share, sinks[at], sunk)
+        _add(-share, images[at], left)
     for n in range(count):
-        own += SMOOTHING_SHARE * sinking[n, n] / count
-    matrix, right, step = np.empty((len(act), len(act))).T, np.empty((len(act), 3)), np.zeros((3, count))
-    for a in range(len(act)):
-        for b in range(len(act)):
-            matrix[a, b] = sinking[act[a], act[b]]
-        matrix[a, a] += own / weight[act[a]] ** 2
-        right[a] = wanted[act[a]]
-    right = np.linalg.solve(matrix, right)
-    for a in range(len(act)):
         for x in range(3):
-            step[x, act[a]] = right[a, x]
-            sources[act[a], x] += right[a, x]
-    for n in range(count):
-        x = y = z = 0.0
-        for m in range(count):
-            x += sinking[n, m] * step[0, m]
-            y += sinking[n, m] * step[1, m]
-            z += sinking[n, m] * step[2, m]
-        moved[n, 0], moved[n, 1], moved[n, 2] = moved[n, 0] + x, moved[n, 1] + y, moved[n, 2] + z
+            sources[n, x] += step[x, n]
+            moved[n, x] += sunk[x, n]
     return True
+
+
+@numba.njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
+def _follow(sinking, left, per, ridge, way, sinks, image):
+    """Writes the preconditioned residual, how vertices sink by it, and its image under the matrix, (3, N) each."""
+    for x in range(3):
+        for n in range(len(per)):
+            way[x, n] = per[n] * left[x, n]
+    for n in range(len(per)):
+        a = b = c = np.float32(0)
+        for m in range(len(per)):
+            a += sinking[n, m] * way[0, m]
+            b += sinking[n, m] * way[1, m]
+            c += sinking[n, m] * way[2, m]
+        sinks[0, n], sinks[1, n], sinks[2, n] = a, b, c
+    for x in range(3):
+        for n in range(len(per)):
+            image[x, n] = sinks[x, n] + ridge[n] * way[x, n] if per[n] > 0 else np.float32(0)
+
+
+@numba.njit(inline="always", fastmath=FAST, error_model="numpy")
+def _dot(one, other):
+    total = np.float32(0)
+    for x in range(3):
+        for n in range(one.shape[1]):
+            total += one[x, n] * other[x, n]
+    return total
+
+
+@numba.njit(inline="always", fastmath=FAST, error_model="numpy")
+def _add(share, more, to):
+    for x in range(3):
+        for n in range(to.shape[1]):
+            to[x, n] += share * more[x, n]
 
 
 @numba.njit(cache=True, nogil=True)

@@ -9,11 +9,11 @@ import numba
 import numpy as np
 
 from stmpl_core.layer import SoftLayer
+from stmpl_core.neighbours import along_edges, neighbours
 
 ZONES = (2.5, 5.0)  # distances from the load, over t, at which the first and the second thinning begin
 SPACINGS = (0.6, 1.5)  # least distances between the vertices that are asked there, over t
 CORNERS = 12  # number of asked vertices from which one between is filled in
-CHUNK = 64  # vertices that one thread takes at a time
 STACK_ZONES, STACK_SPACINGS = (0.8, 2.5), (0.25, 0.4)  # the same of a stack, which is thicker beside what presses
 LARGEST = 2.5  # sum of the weights' sizes, from which a vertex is rather asked itself: it would be extrapolated
 
@@ -67,6 +67,7 @@ class Thinning:
                  spacings: tuple[float, float] = SPACINGS) -> None:  # fmt: skip
         points, normals, thickness = np.ascontiguousarray(layer.vertices), layer.normals, layer.thickness
         self.start, self.index = neighbours(points, normals, thickness, layer.faces, np.array([*zones, reach]))
+        self._first, self._beside = along_edges(layer.faces, len(points))
         count = len(points)
         self._last: tuple[Asked, ...] = ()
         self._grouped: tuple[np.ndarray, np.ndarray] | None = None
@@ -116,12 +117,14 @@ class Thinning:
 
     def reached(self, loaded: np.ndarray) -> np.ndarray:
         """All vertices with a loaded one in reach, in order."""
-        return np.flatnonzero(_zones(self.start, self.index, loaded, len(self._stands[0]))).astype(np.int32)
+        return np.flatnonzero(self._zones(loaded)).astype(np.int32)
 
     def asked(self, loaded: np.ndarray) -> Asked:
         """Vertices that are asked under a load on vertices (L,), and how the others are filled in."""
-        zones = _zones(self.start, self.index, loaded, len(self._stands[0]))
-        return Asked(loaded, *_asked(zones, self._stands, self._corners, self._weights))
+        return Asked(loaded, *_asked(self._zones(loaded), self._stands, self._corners, self._weights))
+
+    def _zones(self, loaded: np.ndarray) -> np.ndarray:
+        return _zones(self.start, self.index, self._first, self._beside, loaded, len(self._stands[0]))
 
     def asked_again(self, loaded: np.ndarray) -> Asked:
         """Same as `asked`, but not done again if these were the last, or those before: an answer asks for two."""
@@ -130,80 +133,6 @@ class Thinning:
         first = known[0] if known else self.asked(loaded)
         self._last = first, *[one for one in last if one is not first][:1]
         return first
-
-
-def neighbours(points: np.ndarray, normals: np.ndarray, thickness: np.ndarray, faces: np.ndarray,
-               reaches: np.ndarray) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
-    """Pairs within each of `reaches`, rising, thicknesses (their geometric mean), normals less than 90 degrees apart.
-
-    Only along the skin: a vertex is a neighbour if edges lead to it that never come back nearer, or if it is beside one
-    that is. So what is near through the air, as another finger, is none.
-
-    Returns:
-        start (Z V + 1,), index: the neighbours of vertex v, itself among them, that lie between reach z - 1 and reach
-        z of Z are index[start[Z v + z] : start[Z v + z + 1]].
-    """
-    ends = np.concatenate([faces[:, [k, (k + 1) % 3]] for k in range(3)])
-    ends = np.unique(np.concatenate([ends, ends[:, ::-1]]), axis=0)
-    first = np.searchsorted(ends[:, 0], np.arange(len(points) + 1))
-    beside = np.ascontiguousarray(ends[:, 1], dtype=np.int32)
-    rows = np.column_stack([points, normals, thickness])
-    start = np.zeros(len(reaches) * len(points) + 1, dtype=np.int64)
-    _flood(rows, reaches, first, beside, start, np.empty(0, dtype=np.int32))
-    start = np.cumsum(start)
-    index = np.empty(start[-1], dtype=np.int32)
-    _flood(rows, reaches, first, beside, start, index)
-    return start, index
-
-
-@numba.njit(cache=True, nogil=True, parallel=True, error_model="numpy")
-def _flood(rows, reaches, first, beside, start, index):
-    """Counts the neighbours of vertex i in zone z into start[Z i + z + 1], or where `index` has room writes them."""
-    count, zones, writing = len(rows), len(reaches), len(index) > 0
-    squares = reaches**2
-    for chunk in numba.prange((count + CHUNK - 1) // CHUNK):
-        seen, away = np.full(count, -1, np.int32), np.empty(count)
-        queue, side, n = np.empty(count, np.int32), np.empty(count, np.int32), np.empty(zones, np.int64)
-        for i in range(CHUNK * chunk, min(CHUNK * (chunk + 1), count)):
-            n[:] = 0
-            many, ends, sides = 0, 1, 0
-            queue[0], seen[i], away[i] = i, 2 * i + 1, 0.0
-            while many < ends:
-                k = queue[many]
-                many += 1
-                for p in range(first[k], first[k + 1]):
-                    j = beside[p]
-                    if seen[j] == 2 * i + 1:
-                        continue
-                    if seen[j] != 2 * i:  # not looked at yet
-                        x, y, z = rows[j, 0] - rows[i, 0], rows[j, 1] - rows[i, 1], rows[j, 2] - rows[i, 2]
-                        facing = rows[i, 3] * rows[j, 3] + rows[i, 4] * rows[j, 4] + rows[i, 5] * rows[j, 5]
-                        away[j] = (x * x + y * y + z * z) if facing > 0 else np.inf
-                        seen[j] = 2 * i
-                        if away[j] < squares[-1] * rows[i, 6] * rows[j, 6]:
-                            side[sides] = j
-                            sides += 1
-                        else:
-                            away[j] = np.inf
-                    if away[j] < np.inf and away[j] >= away[k]:
-                        seen[j] = 2 * i + 1
-                        queue[ends] = j
-                        ends += 1
-            for m in range(sides):  # beside the flood
-                if seen[side[m]] == 2 * i:
-                    queue[ends] = side[m]
-                    ends += 1
-            for m in range(ends):
-                j = queue[m]
-                square, zone = away[j] / (rows[i, 6] * rows[j, 6]), 0
-                while square >= squares[zone]:
-                    zone += 1
-                if writing:
-                    index[start[zones * i + zone] + n[zone]] = j
-                n[zone] += 1
-            if not writing:
-                for zone in range(zones):
-                    start[zones * i + zone + 1] = n[zone]
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
@@ -324,14 +253,27 @@ def interpolation(points: np.ndarray, frames: np.ndarray, thickness: np.ndarray,
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _zones(start, index, loaded, count):
-    """0 where no loaded vertex is in reach, else 1 for the outermost zone up to Z for the innermost, (count,)."""
-    mark = np.zeros(count, np.uint8)
-    zones = (len(start) - 1) // count
+def _zones(start, index, first, beside, loaded, count):
+    """0 where no loaded vertex is in reach, else 1 for the outermost zone up to Z for the innermost, (count,).
+
+    Only the rim of what is loaded is looked at: who is outside is nearest to that.
+    """
+    mark, inside = np.zeros(count, np.uint8), np.zeros(count, np.bool_)
+    zones, rim, many = (len(start) - 1) // count, np.empty(len(loaded), np.int64), 0
+    for j in loaded:
+        inside[j] = True
+    for j in loaded:
+        for p in range(first[j], first[j + 1]):
+            if not inside[beside[p]]:
+                rim[many] = j
+                many += 1
+                break
     for z in range(zones - 1, -1, -1):
-        for j in loaded:
+        for j in rim[:many]:
             for p in range(start[zones * j + z], start[zones * j + z + 1]):
                 mark[np.uint32(index[p])] = zones - z  # unsigned: no index that may count from the end
+    for j in loaded:
+        mark[j] = zones
     return mark
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from stmpl_core import Contact, Tool
-from stmpl_core.conform import conform
+from stmpl_core.conform import SMOOTHING_SHARE, _correct, conform
 from stmpl_core.methods import Linear, MomentNet, Winkler
 from stmpl_core.methods.base import Method
 from stmpl_core.moments import Surroundings
@@ -140,3 +140,19 @@ def test_the_same_step_gives_the_same_answer(sim: Simulator) -> None:
     first = sim.step(SCENES["two fingers"]).displacement
     sim.step(SCENES["punch"])
     assert sim.step(SCENES["two fingers"]).displacement.tobytes() == first.tobytes()
+
+
+@pytest.mark.parametrize("many", [4, 40, 300])
+def test_a_correction_solves_its_equations_as_a_factor_does(near: Surroundings, many: int) -> None:
+    rng = np.random.default_rng(0)
+    under = np.sort(np.linalg.norm(LIMB.vertices - LIMB.vertices[500], axis=1).argsort()[:many])
+    sinking, weight = near.sinking(under), rng.choice([0.0, 0.01, 0.4, 1.0], many)
+    wanted, moved, sources = rng.normal(size=(many, 3)), np.zeros((many, 3)), np.zeros((many, 3))
+    act = np.flatnonzero(weight)
+    ridge = SMOOTHING_SHARE * np.diag(sinking).mean() / weight[act] ** 2
+    true = np.zeros((many, 3))
+    true[act] = np.linalg.solve(sinking[np.ix_(act, act)] + np.diag(ridge), wanted[act])
+    assert _correct(sinking, wanted, weight, moved, sources)
+    assert np.linalg.norm(sources - true) < 1e-3 * np.linalg.norm(true)
+    assert np.linalg.norm(moved - sinking @ true) < 1e-3 * np.linalg.norm(sinking @ true)
+    assert not _correct(sinking, wanted, np.zeros(many), moved, sources)

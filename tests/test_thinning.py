@@ -47,6 +47,13 @@ def test_every_vertex_in_reach_is_asked_or_filled_in_once(layer: SoftLayer, aske
     assert apart.max() < REACH * T + 1e-9
 
 
+def test_zones_are_those_of_the_nearest_loaded_vertex_though_only_the_rim_is_looked_at(layer: SoftLayer) -> None:
+    thinning, loaded = Thinning(layer, Surroundings.of(layer).frames, REACH), np.flatnonzero(pressed(layer).values)
+    alone = np.max([thinning._zones(loaded[k : k + 1]) for k in range(len(loaded))], axis=0)
+    assert len(loaded) > 20
+    assert (thinning._zones(loaded) != alone).sum() <= 0.002 * (alone > 0).sum()
+
+
 def test_near_the_load_all_are_asked_and_far_from_it_few(layer: SoftLayer, asked: Asked) -> None:
     loaded = layer.vertices[np.flatnonzero(pressed(layer).values)]
     apart = np.linalg.norm(layer.vertices[asked.between][:, None] - loaded, axis=2).min(axis=1)
