@@ -7,6 +7,7 @@ from pathlib import Path
 
 from fem_tools.few_steps import FewSteps
 from fem_tools.patch import PatchFem
+from fem_tools.warm import WarmPatchFem
 from stmpl_core.cache import folder
 from stmpl_core.methods.base import Method
 from stmpl_core.methods.coarse import Coarse
@@ -16,21 +17,29 @@ from stmpl_core.methods.moment_net import MomentNet
 from stmpl_core.methods.winkler import Winkler
 
 
-def default_rungs() -> list[Method]:
-    """Methods that a Ladder climbs by default, cheapest first."""
-    return [Winkler(), Linear(), Coarse(MomentNet(), 1.5), MomentNet(), FewSteps.from_network(1),
-            PatchFem(reach=4, check_stability=False)]  # fmt: skip
+def default_rungs(*, warm: bool = False) -> list[Method]:
+    """Methods that a Ladder climbs by default, cheapest first; `warm`: finite elements that start from the last frame.
+
+    A warm rung takes PatchFem's place, whose errors it has.
+    """
+    fem = WarmPatchFem(reach=4) if warm else PatchFem(reach=4, check_stability=False)
+    return [Winkler(), Linear(), Coarse(MomentNet(), 1.5), MomentNet(), FewSteps.from_network(1), fem]
 
 
-def ladder(*, accuracy: float = 1e-4, deadline: float | None = None, rungs: Sequence[Method] | None = None) -> Ladder:
+def ladder(*, accuracy: float = 1e-4, deadline: float | None = None, warm: bool = False,
+           rungs: Sequence[Method] | None = None) -> Ladder:  # fmt: skip
     """A Ladder of the default methods by the shipped chart, with this machine's own times if it was calibrated.
 
     Args:
         accuracy: largest error wanted at any vertex [m].
         deadline: time for each solve [s]; None: no limit.
+        warm: choice to start finite elements from their last frame: a fifth to two fifths of the time where a load is
+            near the last one; answers then depend on those before. Under a deadline that a first frame does not keep it
+            begins once the rung, the last of `rungs`, was asked by itself.
         rungs: methods to choose from.
     """
-    return Ladder(default_rungs() if rungs is None else rungs, measured(), accuracy=accuracy, deadline=deadline)
+    rungs = default_rungs(warm=warm) if rungs is None else rungs
+    return Ladder(rungs, measured(), accuracy=accuracy, deadline=deadline)
 
 
 def times_file() -> Path:

@@ -151,14 +151,8 @@ class Site:
         near = np.flatnonzero(facing & (np.linalg.norm(local, axis=1) < radius + DEEPEST_FACE + EDGE))
         return self.scene(mesh, pose, near, 0.0, EDGE)
 
-    def strap(self, vertex: int, width: float, tilt: float, depth: float = 2 * EDGE) -> Scene:
-        """A strap pulled tight around the limb: along the convex hull of the slice under it.
-
-        Args:
-            vertex: number of a vertex under it.
-            width: width of the strap [m].
-            tilt: angle of the limb's axis to the strap's, about the vertex's normal [rad].
-            depth: depth of its inside below that hull [m].
+    def strap(self, vertex: int, width: float, tilt: float) -> Scene:
+        """A strap of `width` [m] pulled tight around the limb: along the convex hull of the slice under it.
 
         Raises:
             UnusableContact: the slice is no limb's, and as `scene`.
@@ -173,7 +167,7 @@ class Site:
         hull = shapely.MultiPoint(local[slab, :2]).convex_hull
         if not isinstance(hull, shapely.Polygon) or hull.area > 0.04:
             raise UnusableContact("the slice under it is not that of a limb")
-        ring = hull.buffer(STRAP).difference(hull.buffer(-depth))
+        ring = hull.buffer(STRAP).difference(hull.buffer(-2 * EDGE))
         near = np.flatnonzero(np.abs(local[:, 2]) <= width / 2 + EDGE)
         return self.scene(extruded(ring, -width / 2, width / 2), pose, near, 0.0, EDGE)
 

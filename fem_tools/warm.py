@@ -22,6 +22,8 @@ MAX_STEPS = 6  # Newton and chord steps of a warm frame; then it is solved as Pa
 SLOW = 0.3  # share of the residual that a step may leave before the tangent is made anew
 NEAR = 1.0  # thicknesses of the load within which the tangent is made anew; strains beyond are small
 JUMP = 2.0  # thicknesses from where its patch was meshed for, beyond which a load is solved anew: that is quicker
+WARM_SHARE, MESHED_SHARE = 0.4, 0.6  # most of PatchFem's time that a warm frame takes, and one that meshes anew [-]
+CHANGED = 0.5  # change of the load over the load, from which a frame is expected to be solved anew [-]
 FORCING = (0.05, 0.3)  # least and largest share of a residual that the linear solver may leave of a step's
 AIM = 0.3  # share of the tolerance that the linear solver aims at
 RESIDUAL_SHARE = 10.0  # largest error over the peak that a residual over the load left, on slides and presses [-]
@@ -72,7 +74,7 @@ class WarmPatchFem:
             element=element, layers=layers, reach=reach + slack, settings=settings, check_stability=False
         )
         self.reach, self.slack, self.tolerance = reach, slack, tolerance
-        self.name = "warm_patch_fem"
+        self.name, self.measured_as = "warm_patch_fem", "patch_fem"
         self._layer: SoftLayer | None = None
         self._frame: _Frame | None = None
 
@@ -94,6 +96,7 @@ class WarmPatchFem:
         """
         layer = prepared(self._layer, self)
         loaded, pressure = load.check(layer).loaded, load.pressure_on(layer)
+        self._pressure = pressure
         answer = np.zeros_like(layer.vertices)
         if not len(loaded):
             if self._frame is not None:
@@ -117,6 +120,17 @@ class WarmPatchFem:
         if bound is not None:
             bound += RESIDUAL_SHARE * result.residual * float(np.linalg.norm(answer, axis=1).max())
         return Displacement(answer, replace(trust, error_bound=bound, figures=figures), self.name, pressure)
+
+    def share_of_time(self, load: Load) -> float:
+        """Share of PatchFem's time that a load takes after the last one: 1 where it is not near [-]."""
+        frame, layer, loaded = self._frame, prepared(self._layer, self), load.loaded
+        if frame is None or not frame.warm or not len(loaded):
+            return 1.0
+        pressure = load.pressure_on(layer)
+        away, thickness = frame.patch.farthest(loaded), float(layer.thickness[loaded].max())
+        if away > JUMP * thickness or np.abs(pressure - self._pressure).sum() > CHANGED * np.abs(pressure).sum():
+            return 1.0
+        return WARM_SHARE if away <= frame.width - self.reach * thickness else MESHED_SHARE
 
     def _frame_for(self, loaded: np.ndarray) -> _Frame:
         """The last frame, or one on a new patch with what that patch shares with the last."""

@@ -374,3 +374,27 @@ def test_the_shipped_chart_knows_every_default_method_and_its_bounds_hold(layer,
     answer = ladder(accuracy=1e-6, deadline=0.1).prepare(layer).solve(disc(layer))
     assert answer.method == "winkler", "this machine's times count"
     assert json.loads(times_file().read_text())["methods"]
+
+
+def test_a_load_near_the_last_one_is_given_to_finite_elements_that_start_from_it(layer):
+    rungs = default_rungs(warm=True)
+    shares = []
+    method = Ladder(rungs, measured(), accuracy=1e-6).prepare(layer)
+    cold = PatchFem(reach=4.75, check_stability=False).prepare(layer)
+    for ratio in (0.5, 0.52, 0.54, 1.2):
+        load = disc(layer, ratio)
+        shares.append(rungs[-1].share_of_time(load))
+        answer, true = method.solve(load), cold.solve(load)
+        off = np.linalg.norm(answer.displacement - true.displacement, axis=1).max()
+        assert answer.method == "warm_patch_fem" and off < 0.01 * true.magnitude.max()
+    assert shares[0] == shares[3] == 1.0 and shares[1] == shares[2] < 0.5
+
+
+def test_under_a_deadline_finite_elements_are_taken_where_they_are_warm(layer):
+    rungs, load = default_rungs(warm=True)[-1:], disc(layer)
+    fast, rough = rungs[0], Rung("a")
+    chart = Measured({"patch_fem": known(0.003, 1.0), "a": known(0.3, 1e-4)}, {"pressure": WIDE})
+    method = Ladder([rough, fast], chart, accuracy=0.01 * unit(layer, load), deadline=0.5).prepare(layer)
+    assert method.solve(load).method == "a"
+    fast.solve(load)
+    assert method.solve(load).method == "warm_patch_fem"

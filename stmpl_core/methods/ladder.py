@@ -8,7 +8,7 @@ import time
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, Protocol, Self, runtime_checkable
 
 import numba
 import numpy as np
@@ -215,6 +215,25 @@ class _Expected:
     seconds: float  # 95 % quantile of the time [s]
 
 
+@runtime_checkable
+class FromFrames(Protocol):
+    """A method that starts from its last answer, and so is quicker where the load is near the last one.
+
+    Attributes:
+        measured_as: name of the method whose measured error and time it has where it starts anew.
+    """
+
+    measured_as: str
+
+    def share_of_time(self, load: Load) -> float:
+        """Share of that time that this load takes, by what it answered last [-]."""
+        ...
+
+
+def _measured_as(rung: Method) -> str:
+    return rung.measured_as if isinstance(rung, FromFrames) else rung.name
+
+
 class Ladder:
     """Hands each load to the cheapest of several methods that is expected to meet the accuracy in time.
 
@@ -245,13 +264,13 @@ class Ladder:
                  deadline: float | None = None) -> None:  # fmt: skip
         if not accuracy > 0 or (deadline is not None and not deadline > 0):
             raise InvalidInput(f"Ladder(accuracy={accuracy}, deadline={deadline}): both must be positive, m and s.")
-        self.rungs = [rung for rung in rungs if rung.name in measured.methods]
+        self.rungs = [rung for rung in rungs if _measured_as(rung) in measured.methods]
         if not self.rungs:
             raise InvalidInput("none of the methods was measured. stmpl calibrate --errors measures them.")
         self.measured, self.accuracy, self.deadline = measured, accuracy, deadline
         self._unknown = {rung.name: "the chart does not know it" for rung in rungs if rung not in self.rungs}
         self.left_out: dict[str, str] = dict(self._unknown)
-        known = [measured.methods[rung.name] for rung in self.rungs]
+        known = self._known = [measured.methods[_measured_as(rung)] for rung in self.rungs]
         self._seconds = np.array([k.seconds for k in known])
         self._slow = np.array([k.slow for k in known])
         self._layer: SoftLayer | None = None
@@ -292,7 +311,7 @@ class Ladder:
         if scene is None:
             zero = np.zeros_like(layer.vertices)
             return Displacement(zero, Trust(error_bound=0.0), self.name, load.pressure_on(layer))
-        options, outside = self._expected(scene, load.kind)
+        options, outside = self._expected(scene, load)
         if not options:
             raise InvalidInput(f"no method was measured under loads of the kind {load.kind!r}.")
         tried: list[tuple[_Expected, Displacement]] = []
@@ -303,7 +322,7 @@ class Ladder:
             if choice is None:
                 break
             options = [o for o in options if o.rung != choice.rung]
-            known = self.measured.methods[self.rungs[choice.rung].name]
+            known = self._known[choice.rung]
             try:
                 answer = self._ask(choice, load, scene)
             except StmplError as error:
@@ -322,15 +341,16 @@ class Ladder:
         choice, answer = sound[0] if outside else min(sound, key=lambda pair: pair[0].error)
         return self._told(choice, answer, outside, len(tried), [*self.left_out, *refused])
 
-    def _expected(self, scene: SceneFigures, kind: str) -> tuple[list[_Expected], str]:
+    def _expected(self, scene: SceneFigures, load: Load) -> tuple[list[_Expected], str]:
         """What to expect of each method that was measured under such loads, and how the scene is outside of that."""
-        unit = self._reader.unit(scene)
-        seconds = self._seconds @ scene.for_time() * self._slow
+        unit, kind = self._reader.unit(scene), load.kind
+        shares = [rung.share_of_time(load) if isinstance(rung, FromFrames) else 1.0 for rung in self.rungs]
+        self._shares = np.array(shares)
+        seconds = self._seconds @ scene.for_time() * self._slow * self._shares
         if self.deadline is not None:  # without one, the same loads get the same answers on every run
             seconds = seconds * self._pace
         options = []
-        for k, rung in enumerate(self.rungs):
-            known = self.measured.methods[rung.name]
+        for k, known in enumerate(self._known):
             if self._ready[k] and kind in known.error:
                 options.append(_Expected(k, known.bound(scene, kind, unit), float(seconds[k])))
         return options, self.measured.outside(scene, kind)
@@ -354,7 +374,7 @@ class Ladder:
         started = time.perf_counter()
         answer = self.rungs[choice.rung].solve(load)
         spent, k = time.perf_counter() - started, choice.rung
-        usual = float(self._seconds[k] @ scene.for_time()) * self._slow[k]
+        usual = float(self._seconds[k] @ scene.for_time()) * self._slow[k] * self._shares[k]
         self._pace[k] = max(1.0, (1 - PACE) * self._pace[k] + PACE * spent / max(usual, 1e-6))
         return answer
 
