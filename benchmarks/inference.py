@@ -26,7 +26,10 @@ from stmpl_core.layer import SoftLayer
 from stmpl_core.methods import Linear, Method, MomentNet, UNet, Winkler
 from stmpl_core.methods import moment_net as parts
 from stmpl_core.methods.pix2pix import Pix2PixUNet
+from stmpl_core.methods.unet import recorded
 from stmpl_core.provenance import machine
+
+NO_CUDA = "not measured: no CUDA device"
 
 
 def footprints(layer: SoftLayer) -> dict[str, np.ndarray]:
@@ -86,7 +89,6 @@ def main() -> None:
     given.add_argument("--seconds", type=float, default=3.0, help="time of each measurement [s]")
     given.add_argument("--picture", type=Path, help="file for a drawing of the asked vertices; measures nothing then")
     options = given.parse_args()
-    import torch
 
     layer = Body.anny().part("left_arm", edge_length=3e-3, thickness=7.5e-3)
     print(f"{layer}\n{machine()}; load {os.getloadavg()[0]:.1f} before the run\n")
@@ -117,17 +119,49 @@ def main() -> None:
         sources = parts.source_fields(load.values, layer.tissue)
         median, _ = timed(lambda s=sources, a=asked: net._near.felt(s, a), options.seconds / 3)  # type: ignore[union-attr]
         print(f"    of that, feeling the load: {median:.2f} ms")
-    paper = Pix2PixUNet(512, 64).eval()
-    maps = torch.zeros(1, 2, 512, 512)
-
-    def whole() -> object:
-        with torch.inference_mode():
-            return paper(maps)
-
     ours, _ = timed(lambda: net.solve(loads["disc, 20 mm"]), options.seconds)
-    median, p99 = timed(whole, options.seconds)
-    print(f"\nthe paper's UNet, 512 x 512, the network alone: {median:.0f} ms, p99 {p99:.0f}; "
-          f"{median / ours:.0f} times ours end to end")  # fmt: skip
+    print("\nthe paper's UNet, 512 x 512, the network alone; beside it MomentNet end to end, times as long:")
+    for name, told in papers(options.seconds, ours).items():
+        print(f"    {name:44} {told}")
+
+
+def papers(seconds: float, ours: float) -> dict[str, str]:
+    """The paper's network of random weights on the processor and on a GPU: what each took, or why it was not measured.
+
+    Args:
+        seconds: time of each measurement [s].
+        ours: time of our answer to a disc [ms].
+    """
+    import torch
+
+    told, network, maps = {}, Pix2PixUNet(512, 64).eval(), torch.zeros(1, 2, 512, 512)
+    for device, half, graph in (("cpu", False, False), ("cpu", True, False), ("cuda", False, False),
+                                ("cuda", True, False), ("cuda", True, True)):  # fmt: skip
+        name = f"{device}{', half precision' if half else ''}{', CUDA graph' if graph else ''}"
+        if device == "cuda" and not torch.cuda.is_available():
+            told[name] = NO_CUDA
+            continue
+        on = network.to(device)
+        images = maps.to(device)
+
+        def run(given: torch.Tensor, on: Pix2PixUNet = on, device: str = device, half: bool = half,
+                graph: bool = graph) -> torch.Tensor:  # fmt: skip
+            with torch.autocast(device, torch.bfloat16 if device == "cpu" else torch.float16, enabled=half,
+                                cache_enabled=not graph):  # fmt: skip
+                return on(given)
+
+        with torch.inference_mode():
+            last = recorded(run, images) if graph else run
+
+        def whole(run: Callable[[torch.Tensor], torch.Tensor] = last, images: torch.Tensor = images) -> None:
+            with torch.inference_mode():
+                run(images)
+                if images.is_cuda:
+                    torch.cuda.synchronize()
+
+        median, p99 = timed(whole, seconds)
+        told[name] = f"{median:.1f} ms, p99 {p99:.1f}; {median / ours:.1f}"
+    return told
 
 
 if __name__ == "__main__":

@@ -75,8 +75,8 @@ def main() -> None:
     layer = Body.anny().part("left_arm", edge_length=1e-3 * options.edge_mm)
     title = f"{layer}\n{machine()}, one thread; shortest of {options.repeats} runs of each frame; ms, in the middle"
     table = Table(title=title, title_justify="left")
-    columns = ("PatchFem", "first frame", "warm", "over PatchFem", "slowest", "a ladder with it", "meshed anew", "off PatchFem, % of peak",
-               "bound over error")  # fmt: skip
+    columns = ("PatchFem", "first frame", "warm", "over PatchFem", "slowest", "a ladder with it", "meshed anew",
+               "off PatchFem, % of peak", "bound over error")  # fmt: skip
     for column in ("load", "path", *columns):
         table.add_column(column, justify="left" if column in ("load", "path") else "right")
     with threadpool_limits(1):
@@ -103,7 +103,8 @@ def row(usual: np.ndarray, truth: list[Displacement], spent: np.ndarray, climbed
     peak = np.array([t.magnitude.max() for t in truth])
     off = np.array([largest(answer, true) for answer, true in zip(answers, truth, strict=True)])
     return [f"{np.median(usual):.1f}", f"{spent[0]:.1f}", f"{np.median(spent[kept]):.1f}",
-            f"{np.median(spent[kept] / usual[kept]):.2f}", f"{spent[kept].max():.1f}", f"{np.median(climbed[kept]):.1f}",
+            f"{np.median(spent[kept] / usual[kept]):.2f}", f"{spent[kept].max():.1f}",
+            f"{np.median(climbed[kept]):.1f}",
             f"{np.median(spent[anew]):.1f}, {anew.sum()} of {len(spent)}" if anew.any() else "-",
             f"{100 * (off / peak).max():.2f}"]  # fmt: skip
 

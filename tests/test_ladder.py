@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from fem_tools import PatchFem
+from fem_tools import PatchFem, WarmPatchFem
 from fem_tools.few_steps import FewSteps
 from fem_tools.ladder import default_rungs, ladder, measured, times_file
 from fem_tools.sampling import BodyPlan
@@ -378,12 +378,13 @@ def test_the_shipped_chart_knows_every_default_method_and_its_bounds_hold(layer,
 
 def test_a_load_near_the_last_one_is_given_to_finite_elements_that_start_from_it(layer):
     rungs = default_rungs(warm=True)
-    shares = []
+    shares, warm = [], rungs[-1]
+    assert isinstance(warm, WarmPatchFem)
     method = Ladder(rungs, measured(), accuracy=1e-6).prepare(layer)
     cold = PatchFem(reach=4.75, check_stability=False).prepare(layer)
     for ratio in (0.5, 0.52, 0.54, 1.2):
         load = disc(layer, ratio)
-        shares.append(rungs[-1].share_of_time(load))
+        shares.append(warm.share_of_time(load))
         answer, true = method.solve(load), cold.solve(load)
         off = np.linalg.norm(answer.displacement - true.displacement, axis=1).max()
         assert answer.method == "warm_patch_fem" and off < 0.01 * true.magnitude.max()

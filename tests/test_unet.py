@@ -102,6 +102,29 @@ def test_only_force_over_modulus_matters(arm: SoftLayer, drawn: Path) -> None:
     assert answers[1].trust.error_bound == pytest.approx(answers[0].trust.error_bound)
 
 
+def test_half_precision_moves_the_skin_as_whole_precision_does(arm: SoftLayer, drawn: Path) -> None:
+    load = press(arm, 0.3)
+    whole, half = (UNet(drawn, half=half).prepare(arm).solve(load).displacement for half in (False, True))
+    assert 0 < np.abs(half - whole).max() < 0.02 * np.abs(whole).max()
+
+
+def test_what_needs_a_gpu_is_refused_without_one(drawn: Path) -> None:
+    with pytest.raises(InvalidInput, match="graph of CUDA was asked for on cpu"):
+        UNet(drawn, graph=True)
+    if not torch.cuda.is_available():
+        with pytest.raises(InvalidInput, match="sees no CUDA device"):
+            UNet(drawn, device="cuda", graph=True)
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
+def test_a_recorded_graph_answers_each_load_as_its_kernels_do(arm: SoftLayer, drawn: Path) -> None:
+    one, other = (UNet(drawn, device="cuda", half=True, graph=graph).prepare(arm) for graph in (False, True))
+    for ratio in (0.1, 0.3):
+        load = press(arm, ratio)
+        true = one.solve(load).displacement
+        assert np.abs(other.solve(load).displacement - true).max() < 1e-3 * np.abs(true).max()
+
+
 def test_a_pressure_acts_as_its_nodal_forces(arm: SoftLayer, drawn: Path) -> None:
     method, nodal = UNet(drawn).prepare(arm), press(arm, 0.2)
     force = np.linalg.norm(arm.vertex_area_vectors, axis=1)

@@ -19,7 +19,13 @@ from stmpl_core.networks import NETWORKS
 from stmpl_core.trust import Displacement, Trust
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    import torch
+
     from stmpl_core.methods.pix2pix import Pix2PixUNet
+
+    Runs = Callable[[torch.Tensor], torch.Tensor]
 
 THICKNESS = (2.5e-3, 12.5e-3)  # thicknesses that are drawn as 0 and 1 [m] (STMPL paper)
 MOTION = 30e-3  # displacement that is drawn as 1 [m] (STMPL paper)
@@ -84,16 +90,27 @@ class UNet:
     Args:
         path: path of a .safetensors file with its .json card beside it; None: the weights that come with stmpl.
         device: device of torch, "cpu" or "cuda".
+        half: choice of half precision inside the network: float16 on a GPU, bfloat16 on a CPU.
+        graph: choice to record the network as a CUDA graph on the first call, which is then launched as one piece.
 
     Raises:
-        InvalidInput: a path without weights, or a card that does not fit them.
+        InvalidInput: a path without weights, a card that does not fit them, or a graph or a GPU where torch has none.
     """
 
     name = "unet"
 
-    def __init__(self, path: str | Path | None = None, *, device: str = "cpu") -> None:
+    def __init__(self, path: str | Path | None = None, *, device: str = "cpu", half: bool = False,
+                 graph: bool = False) -> None:  # fmt: skip
+        needed("the method unet", "learn", "torch")
+        import torch
+
+        if graph and not device.startswith("cuda"):
+            raise InvalidInput(f"a graph of CUDA was asked for on {device}. Try device='cuda', or graph=False.")
+        if device.startswith("cuda") and not torch.cuda.is_available():
+            raise InvalidInput(f"{device} was asked for, and torch sees no CUDA device here. Try device='cpu'.")
         self.card, self.network = load_unet(NETWORKS["unet"].path if path is None else Path(path), device)
-        self.device = device
+        self.device, self.half, self.graph = device, half, graph
+        self._run: Runs | None = None
         self._layer: SoftLayer | None = None
 
     def prepare(self, layer: SoftLayer) -> Self:
@@ -123,7 +140,17 @@ class UNet:
 
         with torch.inference_mode():
             images = torch.from_numpy(self._images)[None].to(self.device)
-            return self.network(images)[0].permute(1, 2, 0).contiguous().cpu().numpy()
+            if self._run is None:
+                self._run = recorded(self._through, images) if self.graph else self._through
+            return self._run(images)[0].permute(1, 2, 0).contiguous().cpu().numpy()
+
+    def _through(self, images: torch.Tensor) -> torch.Tensor:
+        import torch
+
+        kind = self.device.split(":")[0]
+        with torch.autocast(kind, torch.bfloat16 if kind == "cpu" else torch.float16, enabled=self.half,
+                            cache_enabled=not self.graph):  # fmt: skip
+            return self.network(images).float()
 
     def _trust(self, layer: SoftLayer, load: Load) -> Trust:
         seen, ratio = self.card.seen, load.peak_ratio(layer)
@@ -140,6 +167,28 @@ class UNet:
             bound = self.card.error_ratio * ratio * float(layer.thickness[load.loaded].max())
             trust = Trust(error_bound=bound, figures=trust.figures)
         return trust
+
+
+def recorded(run: Runs, images: torch.Tensor) -> Runs:
+    """The same as `run`, recorded as a CUDA graph for images of this shape: its kernels are launched as one piece."""
+    import torch
+
+    given, side = images.clone(), torch.cuda.Stream()
+    side.wait_stream(torch.cuda.current_stream())
+    with torch.cuda.stream(side):  # kernels are chosen before they are recorded
+        for _ in range(3):
+            run(given)
+    torch.cuda.current_stream().wait_stream(side)
+    graph = torch.cuda.CUDAGraph()
+    with torch.cuda.graph(graph):
+        out = run(given)
+
+    def again(images: torch.Tensor) -> torch.Tensor:
+        given.copy_(images)
+        graph.replay()
+        return out
+
+    return again
 
 
 def load_unet(path: Path, device: str = "cpu") -> tuple[UNetCard, Pix2PixUNet]:
