@@ -2,6 +2,7 @@
 
     .venv/bin/python -m benchmarks.limbs                            # our row and the simpler laws'; some minutes
     .venv/bin/python -m benchmarks.limbs --answers yours.py:answer  # and yours
+    .venv/bin/python -m benchmarks.limbs --peer                     # MuJoCo's flex, and all others, under balls alone
     .venv/bin/python -m benchmarks.limbs --export DIR               # the scenes as STL and JSON, for any program
     .venv/bin/python -m benchmarks.limbs --kept                     # share of the tools' forces that the scenes keep
 
@@ -48,6 +49,8 @@ LIMBS = {  # rows of scenes: what splits, and how the limbs are called; a networ
     "people": (("test", "val"), ("living",)),
 }
 DEPTHS = (0.0, 0.1, 0.3, 0.6, 1.0)  # over the thickness, between which --kept takes means
+PEER_AT = (0.2, 0.4)  # depths at which a peer is asked [thicknesses]
+PEER = "studies/peers/layered_flex.py:ball"
 MOVES = 0.1  # motion that counts as such, over the peak
 Answer = Callable[[SoftLayer, Tool, np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray | None]]
 
@@ -117,16 +120,29 @@ class Laws:
             out["its linear part"] = off(one, force_of(layer, nodes, self.linear(nodes)), None)
             out["elastic foundation"] = off(one, force_of(layer, nodes, self.columns(nodes)), None)
         if self.other is not None:
-            out["yours"] = off(one, *self.other(layer, one.tool, one.pose, one.way))
+            force, motion = self.other(layer, one.tool, one.pose, one.way)
+            if np.isfinite(force).all():  # else it has no answer
+                out["yours"] = off(one, force, motion)
         return out
 
 
-def compare(released: Released, splits: Sequence[str], names: tuple[str, ...], other: Answer | None
-            ) -> dict[str, list[Off]]:  # fmt: skip
-    """All laws on the scenes of some splits on limbs of such names, where finite elements know the pressure."""
+def compare(released: Released, splits: Sequence[str], names: tuple[str, ...], other: Answer | None,
+            balls: bool = False) -> dict[str, list[Off]]:  # fmt: skip
+    """All laws on the scenes of some splits on limbs of such names, where finite elements know the pressure.
+
+    Args:
+        released: contacts.
+        splits: splits of which scenes count.
+        names: beginnings of the limbs' names.
+        other: law that is compared too.
+        balls: choice of balls alone, in the middle of their depths.
+    """
     found: dict[str, list[Off]] = defaultdict(list)
     samples = [one for split in splits for one in released.samples(split)
                if slant_of(one) <= STRAIGHT and one.info["body"].startswith(names)]  # fmt: skip
+    if balls:
+        samples = [one for one in samples if one.info["drawn"].get("tool") == "sphere"
+                   and PEER_AT[0] < one.info["ratio"] < PEER_AT[1]]  # fmt: skip
     laws, last = None, None
     with steps_bar("scenes") as show:
         for k, one in enumerate(pressed(samples)):
@@ -197,6 +213,7 @@ def main() -> None:
     given = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     given.add_argument("--limbs", nargs="+", choices=list(LIMBS), default=list(LIMBS))
     given.add_argument("--answers", default="", help="file.py:function of a law of yours")
+    given.add_argument("--peer", action="store_true", help="MuJoCo's flex under balls instead (extra peers)")
     given.add_argument("--kept", action="store_true", help="what the scenes keep of the tools' forces instead; no law")
     given.add_argument("--export", type=Path, default=None, help="folder to which the scenes are written instead")
     given.add_argument("--file", type=Path, default=FILE, help="released contacts")
@@ -207,7 +224,8 @@ def main() -> None:
         print(f"{export(released.samples(), options.export)} scenes in {options.export}")
         return
     try:
-        other = own(options.answers) if options.answers else None
+        law = str(FILE.parents[1] / PEER) if options.peer else options.answers
+        other = own(law) if law else None
     except InvalidInput as error:
         given.error(str(error))
     for kind in options.limbs if options.kept else ():
@@ -216,7 +234,7 @@ def main() -> None:
                    and one.info["body"].startswith(names)]  # fmt: skip
         Console(width=130).print(kept(kind, samples))
     for kind in () if options.kept else options.limbs:
-        Console(width=130).print(table(kind, compare(released, *LIMBS[kind], other)))
+        Console(width=130).print(table(kind, compare(released, *LIMBS[kind], other, options.peer)))
 
 
 if __name__ == "__main__":

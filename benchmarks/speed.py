@@ -4,8 +4,8 @@
     .venv/bin/python -m benchmarks.speed                                # this tree alone
 
 Each tree answers in a process of its own, on one thread. They take turns of a tenth of a second, scene by scene, so
-that what else the machine does falls on both. A figure is the median over all turns, in brackets the 99th percentile
-over it. The limit of a row is what its arithmetic alone would take at the peak of one core, and its memory at the rate
+that what else the machine does falls on both. A figure is the processor's time, in the median over all turns, in
+brackets the 99th percentile over it. The limit of a row is what its arithmetic alone would take at the peak of one core, and its memory at the rate
 of a copy, both as measured here; see `least_work`.
 """
 
@@ -163,11 +163,11 @@ def work() -> None:
             print(json.dumps(call(0)), flush=True)
             continue
         call(0)
-        end = time.perf_counter() + TURN_S
-        while time.perf_counter() < end or n < 3:
-            start = time.perf_counter()
+        end = time.process_time() + TURN_S
+        while time.process_time() < end or n < 3:
+            start = time.process_time()
             call(n)
-            spent.append(1e3 * (time.perf_counter() - start))
+            spent.append(1e3 * (time.process_time() - start))
             n += 1
         print(json.dumps(spent), flush=True)
 

@@ -10,7 +10,9 @@ import numpy as np
 
 from fem_tools.patch import PatchFem
 from fem_tools.plies import materials, wedge_plies
+from stmpl_core.arrays import Transform
 from stmpl_core.layer import SoftLayer
+from stmpl_core.tool import Tool
 from studies.peers.mujoco_flex import warnings_logged, words
 from studies.tets import split_wedges
 
@@ -33,6 +35,8 @@ SCENE = """
   </worldbody>
 </mujoco>
 """
+ROUND = 0.98  # least radius of a tool's surface over the largest, from which it is a ball
+STEPS, TIMESTEP = 20, 0.02  # steps in which `ball` goes in, and how long each is [s]
 PER_MODULUS = 23  # of an element's 24 numbers, those that are proportional to its modulus (the last is of its shape)
 SOLREF, SOLIMP = "-1e7 -3e3", "0.95 0.99 0.0001"  # contact much stiffer than the skin
 
@@ -137,3 +141,26 @@ class LayeredFlex:
         """Smallest det F of the tetrahedra with their nodes at `points`, (N, 3) [m]."""
         corners = points[self.tets.tets]
         return float((np.linalg.det(corners[:, 1:] - corners[:, :1]) / 6 / self.tets.volumes).min())
+
+
+def ball(layer: SoftLayer, tool: Tool, pose: Transform, way: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:
+    """Force of a ball on the limb (3,) [N] and motion of the skin (V, 3) [m], as benchmarks.limbs asks a law for them.
+
+    Not a number for a tool that is no ball, and where the flex does not come to rest.
+    """
+    away = np.linalg.norm(tool.vertices - tool.vertices.mean(axis=0), axis=1)
+    radius = float(away.max())
+    if away.min() < ROUND * radius:
+        return np.full(3, np.nan), None
+    end = pose[:3, :3] @ tool.vertices.mean(axis=0) + pose[:3, 3]
+    from_end = layer.vertices - end
+    back = -(from_end @ way)
+    beside = np.linalg.norm(from_end + back[:, None] * way, axis=1)
+    deep = np.where(beside < radius, back + np.sqrt(np.clip(radius**2 - beside**2, 0, None)), 0.0)
+    deep[np.linalg.norm(from_end, axis=1) > 2 * radius] = 0.0
+    start = end - max(float(deep.max()), 0.0) * way
+    peer = LayeredFlex(layer, np.flatnonzero(np.linalg.norm(from_end, axis=1) < radius), radius, refine=0,
+                       timestep=TIMESTEP)  # fmt: skip
+    held = peer.press(start + np.linspace(0, 1, STEPS + 1)[1:, None] * (end - start))
+    force = layer.vertex_areas @ held.traction
+    return force if held.rests else np.full(3, np.nan), held.displacement
