@@ -5,8 +5,8 @@
 
 Each tree answers in a process of its own, on one thread. They take turns of a tenth of a second, scene by scene, so
 that what else the machine does falls on both. A figure is the processor's time, in the median over all turns, in
-brackets the 99th percentile over it. The limit of a row is what its arithmetic alone would take at the peak of one core, and its memory at the rate
-of a copy, both as measured here; see `least_work`.
+brackets the 99th percentile over it. The limit of a row is what its arithmetic alone would take at the peak of one
+core, and its memory at the rate of a copy, both as measured here; see `least_work`.
 """
 
 from __future__ import annotations
