@@ -253,12 +253,12 @@ def peak() -> tuple[float, float]:
 
     @numba.njit(fastmath=True)
     def fused(x: np.ndarray, times: int) -> float:
-        c, b = np.float32(0.999), np.float32(1e-3)
+        b = np.float32(-0.5)
         for _ in range(times):
             for n in range(len(x)):
                 v = x[n]
                 for _ in range(32):
-                    v = v * c + b
+                    v = v * v + b  # bounded, and no two of these make one
                 x[n] = v
         return x.sum()
 
@@ -266,9 +266,9 @@ def peak() -> tuple[float, float]:
         call()
         spent = []
         for _ in range(20):
-            start = time.perf_counter()
+            start = time.process_time()
             call()
-            spent.append(time.perf_counter() - start)
+            spent.append(time.process_time() - start)
         return min(spent)
 
     x, here, there = np.ones(2048, np.float32), np.ones(1 << 23), np.ones(1 << 23)

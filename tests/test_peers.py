@@ -8,8 +8,12 @@ import pytest
 from fem_tools import PatchFem
 from stmpl_core import Load, SoftLayer
 from stmpl_core.errors import InvalidInput, NotPrepared
+from stmpl_core.methods import Linear
+from stmpl_core.simulator import Simulator
+from stmpl_core.tissue import Tissue
 from studies.peers import PEERS, installed, peer
 from studies.tets import TetFem
+from tests import scenes
 from tests.scenes import THICKNESS, disc, plate
 
 RADIUS, EDGE = 8e-3, 4e-3  # m
@@ -188,3 +192,16 @@ def test_a_rigid_contact_rests_at_the_force_that_it_is_fitted_by() -> None:
     depth = 15e-3 - at[2]
     d = low + (high - low) * depth / width
     assert force[2] == pytest.approx(ground.mass * d**2 * k * depth / high**2 / (1 - d), rel=1e-3)
+
+
+def test_a_flex_under_a_ball_bears_about_what_we_answer_and_answers_no_other_tool() -> None:
+    pytest.importorskip("mujoco", reason="pip install 'stmpl[peers]'")
+    from studies.peers.layered_flex import ball as flex_ball
+
+    limb = scenes.limb(6e-3).with_(tissue=Tissue(5e4, 0.4))
+    pose = scenes.at(scenes.RADIUS + 0.0085, 0.0, scenes.LENGTH / 2)
+    way = np.array([-1.0, 0.0, 0.0])
+    (touch,) = Simulator(limb, Linear()).touch([scenes.press(scenes.ball(), pose, None)])
+    force, motion = flex_ball(limb, scenes.ball(), pose, way)
+    assert motion is not None and 0.5 < (force @ way) / touch.force < 1.5
+    assert np.isnan(flex_ball(limb, scenes.punch(), pose, way)[0]).all()
