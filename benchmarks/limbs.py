@@ -234,7 +234,8 @@ def main() -> None:
                    and one.info["body"].startswith(names)]  # fmt: skip
         Console(width=130).print(kept(kind, samples))
     for kind in () if options.kept else options.limbs:
-        Console(width=130).print(table(kind, compare(released, *LIMBS[kind], other, options.peer)))
+        splits, names = LIMBS[kind]
+        Console(width=130).print(table(kind, compare(released, splits, names, other, balls=options.peer)))
 
 
 if __name__ == "__main__":
