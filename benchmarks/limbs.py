@@ -235,7 +235,10 @@ def main() -> None:
         Console(width=130).print(kept(kind, samples))
     for kind in () if options.kept else options.limbs:
         splits, names = LIMBS[kind]
-        Console(width=130).print(table(kind, compare(released, splits, names, other, balls=options.peer)))
+        found = compare(released, splits, names, other, balls=options.peer)
+        if options.peer and "yours" in found:
+            found["MuJoCo flex, the limb's mesh"] = found.pop("yours")
+        Console(width=130).print(table(kind, found))
 
 
 if __name__ == "__main__":

@@ -164,7 +164,7 @@ def test_a_light_press_into_a_flat_stack_is_the_linear_layers(press: Pressed) ->
 def test_a_law_of_ones_own_is_judged_like_ours(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """The truth itself is off by nothing, half of it by half; and the file that ships can be read."""
     scene = next(limbs.pressed(Released(limbs.FILE).samples("held_out")))
-    force, motion = scene.touch.wrench[:3], scene.sample.displacement
+    force, motion = scene.force, scene.sample.displacement
     assert limbs.off(scene, force, motion)[:3] == (0, 0, 0)
     half = limbs.off(scene, 0.5 * force, 0.5 * motion)
     assert half.force == pytest.approx(-0.5) and half.worst == pytest.approx(0.5) and 0.05 < half.moves < 0.5
