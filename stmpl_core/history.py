@@ -110,6 +110,7 @@ class _Dragged(NamedTuple):
         limit: tangential force at which all of it slides [N].
         stiffness: of the patch, (3,) [N/m]; see Memory, as springs and relaxed.
         stored: energy that the bent skin stores [J].
+        slid: see Scalars.
     """
 
     slip: Slip
@@ -118,6 +119,7 @@ class _Dragged(NamedTuple):
     springs: np.ndarray
     relaxed: np.ndarray
     stored: float
+    slid: float
 
 
 class History:
@@ -198,13 +200,13 @@ class History:
             memory.pose, pose, memory.imprint, memory.contact, known, scalars.pressing > 0, scalars.share,
             scalars.radius, *self.series, dt, scalars.elastic, memory.relaxed)  # fmt: skip
         asked, moved = contact, None
-        if contact.wrench is not None and len(kept):
+        if contact.wrench is not None and (len(kept) or memory.slid < 1):
             force = contact.wrench[:3]
             size = math.sqrt(force @ force)
             normal = memory.contact[1] if scalars.radius > 0 else force / max(size, 1e-300)
-            wanted = float(force @ normal) / scalars.net
+            wanted = float(force @ normal) / (scalars.net * memory.slid)
             if wanted > 0:
-                asked = contact.scaled((wanted + scalars.stretch * owed) / (wanted * now))
+                asked = contact.scaled((wanted + scalars.stretch * owed) / (wanted * now * memory.slid))
                 if scalars.pressing > 0:
                     moved = float((memory.imprint[:3, 3] - memory.pose[:3, 3]) @ force) / size
         return _Asked(asked, contact, memory, known, twist, gone, kept, gain, owed, now, moved)
@@ -224,7 +226,7 @@ class History:
             stretch: stretch of the column under the tool [-].
         """
         assert one.stated.wrench is not None
-        wanted = float(one.stated.wrench[:3] @ push) / force * whole / force
+        wanted = float(one.stated.wrench[:3] @ push) / force * whole / force / one.before.slid
         return (wanted + stretch * one.owed) / one.now
 
     def _again(self, one: _Asked, touch: Touch) -> _Asked | None:
@@ -284,7 +286,7 @@ class History:
             if (grown := dragged.slip.grown) != 1:
                 changed |= _scaled(touch, grown * force / elastic, grown * ROUGH * long * faded)
                 wrench = changed["wrench"]
-            wrench = wrench + np.concatenate([lean, np.cross(middle - pose[:3, 3], lean)])
+            wrench = dragged.slid * wrench + np.concatenate([lean, np.cross(middle - pose[:3, 3], lean)])
             if self.toucher.layer.tissue.skin is not None:
                 rubs = dragged.slip.wrench[:3]
                 pressing = math.sqrt(wrench[:3] @ wrench[:3])
@@ -293,7 +295,7 @@ class History:
             wrench = wrench + dragged.slip.wrench
             changed |= {"wrench": wrench, "slip": dragged.slip}
             stored, whole = stored + dragged.stored, whole + 2 * dragged.stored
-            scalars = scalars._replace(share=dragged.slip.share, limit=dragged.limit)
+            scalars = scalars._replace(share=dragged.slip.share, limit=dragged.limit, slid=dragged.slid)
             springs = dragged.stiffness, dragged.springs, dragged.relaxed
         memory = Memory(one.stated.pose_body_from_tool, wrench, scalars, relaxed, contact, pose, *springs, trail)
         return _Law(self._said(one, touch, changed), memory, stored, whole)
@@ -346,6 +348,8 @@ class History:
         """Friction of a contact that presses with a wrench (6,), as the scalars say, without friction.
 
         Friction turns the way that the push faces, and the push bounds friction: both are asked until they agree.
+        What skin carried along itself while it stuck (stmpl_core.wrenches) a slide takes from it: it drags the other
+        way. When the slide ends that does not come back, but where the tool presses on.
         """
         before, radius, depth = one.before, scalars.radius, scalars.depth
         patch, mu = self.sideways.at(radius, thickness), self.friction(one.stated.name)
@@ -354,13 +358,14 @@ class History:
             turned, out = faced(before.springs, before.stiffness, contact, bend, MOST_LEAN)
         way, rolled = way_of_tool(one.twist, one.known, before.contact, before.scalars.pressing > 0, contact, origin,
                                   depth, radius, lever)  # fmt: skip
-        size = math.sqrt(wrench[:3] @ wrench[:3])
+        size, lost = math.sqrt(wrench[:3] @ wrench[:3]), (1 - before.slid) * before.scalars.elastic / scalars.elastic
         for _ in range(MOST_PASSES):
+            slid = 1 - along_itself * share if lost < along_itself * share else 1 - min(lost, along_itself)
             if stated is None:
-                grown = max(1 + out / depth, LEAST_GROWN) ** scalars.power * (1 - along_itself * share)
+                grown = max(1 + out / depth, LEAST_GROWN) ** scalars.power
             else:
-                grown, lean = carried_more(stated, contact[1], turned), size * turned
-                push = grown * (wrench + np.concatenate([lean, np.cross(contact[0] - origin, lean)]))
+                grown, lean = carried_more(stated, contact[1], turned) * before.slid / slid, size * turned
+                push = grown * slid * (wrench + np.concatenate([lean, np.cross(contact[0] - origin, lean)]))
                 wanted = in_plane(stated - push, leaned(contact, turned), origin, lever)
             stiffer, cap = ploughing(depth, radius, grown * force, patch.along, patch.bare, mu)
             alone = along = stiffer * patch.secant(mu * grown * force)
@@ -371,16 +376,16 @@ class History:
                 by_turn = max(1 - along / alone, 0.0) * math.sqrt(turned @ turned)
                 cap -= min(by_turn * grown * force, cap - mu * grown * force)
             stiffness = np.array((along, along, stiffer * patch.turn / (lever * lever)))
-            slid, (springs, relaxed, carried, share, stored) = share, drag(
+            before_share, (springs, relaxed, carried, share, stored) = share, drag(
                 before.springs, before.springs_relaxed, *self.series, dt, rolled, stiffness, before.stiffness, cap, way,
                 wanted, stated is not None)  # fmt: skip
             last, (turned, out) = turned, faced(springs, stiffness, contact, bend, MOST_LEAN)
-            if abs(turned - last).max() + along_itself * abs(share - slid) < SETTLED:
+            if abs(turned - last).max() + along_itself * abs(share - before_share) < SETTLED:
                 break
         rubs, offset, turn = in_space(carried, springs, stiffness, leaned(contact, turned), contact, origin, lever)
-        stored += max(0.5 * (1 + grown) * size * out, 0.0)
-        slip = Slip(rubs, share, offset, turn, contact[0], grown * size * turned, grown)
-        return _Dragged(slip, cap, stiffness, springs, relaxed, stored)
+        stored += max(0.5 * (1 + grown * slid) * size * out, 0.0)
+        slip = Slip(rubs, share, offset, turn, contact[0], grown * slid * size * turned, grown)
+        return _Dragged(slip, cap, stiffness, springs, relaxed, stored, slid)
 
     def _said(self, one: _Asked, touch: Touch, changed: dict[str, Any]) -> Touch:
         """The touch with what changed, with what of the stated wrench is missing, and what that says of it."""

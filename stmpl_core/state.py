@@ -13,7 +13,8 @@ from stmpl_core.errors import InvalidInput
 from stmpl_core.slip import SPRINGS
 from stmpl_core.wake import untouched
 
-VERSION = 4  # of packed states; those of version 3, which do not say where the joints were, are read too
+VERSION = 5  # of packed states; those of version 4 know no Scalars.slid, those of 3 nor where the joints were
+OLDEST = 3  # version that is still read
 FORGOTTEN = 1e-3  # elastic force of skin that comes back, over its largest, below which it is forgotten
 
 
@@ -45,6 +46,11 @@ class Memory(NamedTuple):
     springs_relaxed: np.ndarray
     trail: np.ndarray
 
+    @property
+    def slid(self) -> float:
+        """The factor on the push of skin that has slid and is held still [-]."""
+        return self.scalars.slid if self.scalars.pressing > 0 else 1.0
+
 
 class Scalars(NamedTuple):
     """The numbers of a Memory.
@@ -65,6 +71,7 @@ class Scalars(NamedTuple):
         limit: tangential force at which all of it slides [N]; 0 without friction.
         stretch: stretch of the column under the last contact [-].
         surface: number of the tool's surface (Tool.number): what another surface of that name pressed is forgotten.
+        slid: factor on the push of skin that has slid, by what it no longer carries along itself [-].
     """
 
     pressing: float = 0.0
@@ -81,6 +88,7 @@ class Scalars(NamedTuple):
     limit: float = 0.0
     stretch: float = 1.0
     surface: float = 0.0
+    slid: float = 1.0
 
     @property
     def sunk(self) -> bool:
@@ -131,7 +139,7 @@ class State:
         """The state of such bytes.
 
         Args:
-            packed: what `pack` gave, also of version 3.
+            packed: what `pack` gave, also of older versions.
             joints: angle of each joint [rad] at which a state of version 3 was told; None: not known.
 
         Raises:
@@ -141,7 +149,7 @@ class State:
         try:
             told = json.loads(head)
             names, terms, version = list(told["tools"]), int(told["terms"]), told["version"]
-            if version == VERSION:
+            if version != OLDEST:
                 joints = told["joints"]
             where = None if joints is None else tuple(map(float, joints)) if any(joints) else ()
             numbers = np.frombuffer(rest, "<f8").astype(float)
@@ -150,10 +158,12 @@ class State:
         except (ValueError, KeyError, TypeError, OverflowError) as error:
             raise InvalidInput(f"{len(packed)} bytes are no state: {error}.") from error
         shapes = [one.shape for one in map(np.asarray, fresh(np.eye(4), terms))]
+        if version != VERSION:
+            shapes[Memory._fields.index("scalars")] = (len(Scalars._fields) - 1,)
         size = sum(int(np.prod(shape)) for shape in shapes)
-        if version not in (VERSION - 1, VERSION) or len(numbers) != size * len(names):
+        if version not in range(OLDEST, VERSION + 1) or len(numbers) != size * len(names):
             raise InvalidInput(f"a state of version {version} with {len(numbers)} numbers cannot be read; expected are "
-                               f"version {VERSION - 1} or {VERSION} and {size * len(names)} numbers of {len(names)} "
+                               f"versions {OLDEST} to {VERSION} and {size * len(names)} numbers of {len(names)} "
                                "tools. Older ones need the release that recorded them.")  # fmt: skip
         return cls({name: _memory(part, shapes) for name, part in
                     zip(names, numbers.reshape(len(names), size), strict=True)}, where)  # fmt: skip

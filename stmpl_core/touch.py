@@ -70,8 +70,7 @@ class Slip(NamedTuple):
         turn: turn by which it is, about the inward normal of the contact [rad].
         middle: middle of the contact on the skin at rest, (3,) [m].
         lean: part of the push that is so since the skin came from where the limb faces another way, (3,) [N].
-        grown: factor on the push, of the same energy as the lean, and of skin that slides: besides friction it carries
-            nothing along itself [-].
+        grown: factor on the pressure, of the same energy as the lean [-].
     """
 
     wrench: Wrench

@@ -9,6 +9,7 @@ from stmpl_core import Contact, Membrane, Ply, Prony, Simulator, SoftLayer, Stat
 from stmpl_core.errors import InvalidInput
 from stmpl_core.methods import Winkler
 from stmpl_core.relaxation import depth_left, series_of
+from stmpl_core.state import VERSION, Scalars
 from stmpl_core.touch import APART, BY_POSE, MOVED, TOUCHING
 from tests.scenes import at, ball, plate
 
@@ -258,6 +259,15 @@ def test_a_replay_from_any_frame_is_bit_for_bit(sim: Simulator) -> None:
             (touch,), state = sim.touch([pressed(depths[k])], state, times[k] - times[k - 1])
             assert touch.wrench.tobytes() == all_of[k].wrench.tobytes()
         assert state.pack() == last.pack()
+
+
+def test_a_state_of_the_version_before_is_read(sim: Simulator) -> None:
+    """It has no last scalar, which says what a slide took."""
+    state = played(sim, np.array([0.0, 0.1, 0.3]), np.array([-1e-4, 2e-3, 2e-3]))[1]
+    head, _, rest = state.pack().partition(b"\n")
+    numbers = np.delete(np.frombuffer(rest), 16 + 6 + len(Scalars._fields) - 1)
+    old = head.replace(f'"version": {VERSION}'.encode(), f'"version": {VERSION - 1}'.encode()) + b"\n"
+    assert State.unpack(old + numbers.tobytes()).pack() == state.pack()
 
 
 def test_bytes_of_another_kind_are_no_state() -> None:
