@@ -33,12 +33,13 @@ class Pair:
 
 _VEIJGEN = "Veijgen et al., Tribol Lett 49 (2013) 251: 450 measurements, median static 0.52, dynamic 0.36"
 _DERLER = "Derler & Gerhardt, Tribol Lett 45 (2012) 1: review; dry about 0.5, moist above 1, falling with pressure"
+_ZHANG = "0.61 +- 0.21 on untreated skin at six places of ten people (Zhang & Mak, Prosthet Orthot Int 23 (1999) 135)"
 PAIRS: dict[Surface, Pair] = {
     "typical": Pair(FRICTION, (0.36, 0.52), _VEIJGEN),
     "dry": Pair(0.5, (0.2, 0.7), _DERLER),
     "moist": Pair(1.2, (0.7, 2.0), _DERLER),
     "oiled": Pair(0.1, (0.05, 0.2), "assumed: a lubricated contact; no measurement is quoted for oil on skin"),
-    "glove": Pair(0.6, (0.3, 1.0), "assumed: rubber on dry skin, a little above dry skin; measure yours"),
+    "glove": Pair(0.61, (0.4, 0.82), f"rubber in place of gloves: silicone rubber, {_ZHANG}"),
 }
 
 Friction = float | str | None
