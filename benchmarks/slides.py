@@ -16,7 +16,7 @@ import logging
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 
 import numpy as np
@@ -40,6 +40,8 @@ log = logging.getLogger(__name__)
 RELAXATION = Prony((0.225, 0.225), (0.5, 5.0), "45 % in equal parts, for trials")
 SLAB = Tissue(5e3, 0.45)
 STACK = Tissue(3e3, 0.45, skin=Membrane(2e5, 1.5e-3, 15.0), deeper=(Ply(8e-3, 15e3, 0.45),))
+LEARNT_NU = 0.4  # Poisson's ratio that contacts were learnt with, as far as 0.42
+SPEEDS = 5e-4, 5e-3, 0.05, 0.3  # of presses [m/s]
 FULL = 12  # fields that a file holds, about
 
 Path3 = tuple[np.ndarray, np.ndarray | None]  # poses (N, 4, 4), times (N,) [s] or None
@@ -55,9 +57,9 @@ class Ground:
 
 
 @cache
-def slab(thickness: float, stacked: bool, fading: bool) -> Ground:
-    """A flat slab of one material, or of skin, fat and muscle."""
-    tissue = STACK if stacked else SLAB
+def slab(thickness: float, stacked: bool, fading: bool, nu: float = SLAB.poisson_ratio) -> Ground:
+    """A flat slab of one material with a Poisson's ratio, or of skin, fat and muscle."""
+    tissue = STACK if stacked else replace(SLAB, poisson_ratio=nu)
     layer = plate(0.168, 6e-3, thickness, crossed=True).with_(tissue=faded(tissue) if fading else tissue)
     fem = PatchFem(element="P1xP2", layers=1 if stacked else 2, refine=3, reach=5, check_stability=False)
     return Ground(layer, np.eye(4), fem)
@@ -152,9 +154,10 @@ def massage(ground: Ground, radius: float, depth: float, cycles: int = 3) -> Pat
     return timed(ground, radius, times, -2e-3 + (depth + 2e-3) * (1 - np.cos(2 * np.pi * times)) / 2)
 
 
-def press_lift_press(ground: Ground, radius: float, depth: float) -> Path3:
-    """Pressed in 0.3 s, held for 2 s, lifted in 0.3 s, away for 1 s, pressed again, and held for 3 s."""
-    knots = np.cumsum([0.0, 0.3, 2.0, 0.3, 1.0, 0.3, 3.0])
+def press_lift_press(ground: Ground, radius: float, depth: float, speed: float) -> Path3:
+    """Pressed in at a speed [m/s], held for 2 s, lifted in the same time, away for 1 s, pressed again, held for 3 s."""
+    ramp = depth / speed
+    knots = np.cumsum([0.0, ramp, 2.0, ramp, 1.0, ramp, 3.0])
     marks = [
         np.linspace(a, b, n, endpoint=False) for a, b, n in zip(knots, knots[1:], (8, 10, 8, 5, 8, 12), strict=False)
     ]
@@ -198,6 +201,8 @@ def _scenes() -> Iterator[tuple[str, Scene]]:
 
     for mu in (0.6, 0.3, 1.0):
         yield f"slab-ball8-mu{mu}", Scene(flat(), 8e-3, lambda g: slide(g, 8e-3, 4e-3, 24e-3), mu)
+    for mu in (0.1, 1.5):
+        yield f"slab-ball8-mu{mu}", Scene(flat(), 8e-3, lambda g: slide(g, 8e-3, 4e-3, 30e-3), mu)
     for mu in (0.6, 0.3, 1.0):
         yield f"forearm-ball20-mu{mu}", Scene(lambda: forearm(False), 0.02,
                                               lambda g: slide(g, 0.02, 9e-3, 30e-3, 1.5e-3), mu, 0.15)  # fmt: skip
@@ -206,9 +211,20 @@ def _scenes() -> Iterator[tuple[str, Scene]]:
             f"forearm-ball20-around-mu{mu}",
             Scene(lambda: forearm(False, around=True), 0.02, lambda g: slide(g, 0.02, 9e-3, 18e-3, 1.5e-3), mu, 0.15),
         )
+    yield (
+        "forearm-ball20-back-mu0.3",
+        Scene(lambda: forearm(False), 0.02, lambda g: slide(g, 0.02, 9e-3, 9e-3, 1.5e-3, back=9e-3), 0.3, 0.15),
+    )
     yield "slab-ramp-hold", Scene(flat(fading=True), 0.02, lambda g: ramp_hold(g, 0.02, 6e-3, 0.02), "stick")
     yield "slab-massage", Scene(flat(fading=True), 0.02, lambda g: massage(g, 0.02, 6e-3), "stick")
-    yield "slab-press-lift-press", Scene(flat(fading=True), 0.02, lambda g: press_lift_press(g, 0.02, 6e-3), "stick")
+    yield (
+        "slab-press-lift-press",
+        Scene(flat(fading=True), 0.02, lambda g: press_lift_press(g, 0.02, 6e-3, 0.02), "stick"),
+    )
+    for speed in SPEEDS:
+        for name, path in (("ramp-hold", ramp_hold), ("press-lift-press", press_lift_press)):
+            yield f"slab-{name}-{1e3 * speed:g}", Scene(lambda: slab(15e-3, False, True, LEARNT_NU), 0.02, partial(
+                path, radius=0.02, depth=6e-3, speed=speed), "stick")  # fmt: skip
     yield "slab-ball8-spin-mu0.6", Scene(flat(), 8e-3, lambda g: spin(g, 8e-3, 4e-3, np.pi / 3), 0.6)
     yield "stack-ball20-mu0.6", Scene(flat(True, thickness=25e-3), 0.02, lambda g: slide(g, 0.02, 6e-3, 24e-3), 0.6)
     yield "slab-ball8-back-mu0.6", Scene(flat(), 8e-3, lambda g: slide(g, 8e-3, 4e-3, 10e-3, back=10e-3), 0.6)
@@ -220,7 +236,7 @@ def _scenes() -> Iterator[tuple[str, Scene]]:
         Scene(lambda: forearm(True), 0.02, lambda g: ramp_hold(g, 0.02, 9e-3, 0.02), "stick", 0.15),
     )
     yield "forearm-press-lift-press", Scene(lambda: forearm(True), 0.02,
-                                            lambda g: press_lift_press(g, 0.02, 9e-3), "stick", 0.15)  # fmt: skip
+                                            lambda g: press_lift_press(g, 0.02, 9e-3, 0.03), "stick", 0.15)  # fmt: skip
     yield "slab-stroke-mu0.6", Scene(flat(fading=True), 8e-3, lambda g: stroked(g, 8e-3, 4e-3, 15e-3, 0.03), 0.6)
 
 
