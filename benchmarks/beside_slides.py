@@ -144,6 +144,8 @@ def told(one: Played) -> str:
     if one.slides:
         begins = one.way < one.onset(truth)
         for name, when in {"begins": begins & (one.way > 0), "slides": ~begins}.items():
+            if not when.any():
+                continue
             mean_normal = 100 * (found[when, 2] / truth[when, 2] - 1).mean()
             lines.append(f"  {name}: tangential off by at most {tangential[when].max():.1f} %, normal "
                          f"{normal[when].max():.1f} % ({mean_normal:+.1f} % in the mean)")  # fmt: skip
