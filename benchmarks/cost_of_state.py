@@ -4,8 +4,8 @@
 
 A ball and a box are led along a slab, and a ball along a forearm as measured, by pose and by a wrench that also drags.
 By wrench the stated pose is either just where elastic skin carries it, so that one trial of the depth does, or off it
-by a third of the depth. Both kinds of touch are taken in turn; medians. On the forearm also of whole steps, which
-answer how the skin moves.
+by a third of the depth. Both kinds of touch are taken in turn, BLOCK of each, so that neither finds in the processor's
+caches what the other just did; medians. On the forearm also of whole steps, which answer how the skin moves.
 """
 
 from __future__ import annotations
@@ -25,6 +25,7 @@ from stmpl_core.methods import MomentNet, Winkler
 from tests.scenes import at, ball, box, plate
 
 SERIES = Prony((0.225, 0.225), (0.5, 5.0))
+BLOCK = 15  # touches of one kind in a row
 LIMB_DEPTHS = 4e-3, 9e-3  # m
 DEPTHS, STEPS, STEP, DT = (1.5e-3, 3e-3), 150, 1e-5, 1e-3  # [m], [m], [s]
 TOOLS = (("ball of 8 mm", ball(8e-3), 8e-3), ("box of 30 mm", box(0.03, 0.03, 0.02), 0.01))  # with its height [m]
@@ -48,19 +49,25 @@ def limb(kind: str) -> Simulator:
 
 def ratio(simulator: Simulator, contacts: Sequence[Contact], whole: bool = False) -> tuple[float, float]:
     """Median processor time of an elastic touch [s], and of one with a state over it; whole: of steps."""
-    state, spent = State(), np.empty((len(contacts), 2))
-    for k, contact in enumerate(contacts):
+    state, spent = State(), ([], [])
+
+    def timed(kind: int, contact: Contact) -> None:
+        nonlocal state
         began = time.thread_time()
-        touches = simulator.touch([contact])
+        if kind:
+            touches, state = simulator.touch([contact], state, DT)
+        else:
+            touches = simulator.touch([contact])
         if whole:
             simulator.answer(touches)
-        between = time.thread_time()
-        touches, state = simulator.touch([contact], state, DT)
-        if whole:
-            simulator.answer(touches)
-        spent[k] = between - began, time.thread_time() - between
-    plain, remembered = np.median(spent[len(contacts) // 5 :], axis=0)
-    return float(plain), float(remembered / plain)
+        spent[kind].append(time.thread_time() - began)
+
+    for first in range(0, len(contacts), BLOCK):
+        for kind in (0, 1):
+            for contact in contacts[first : first + BLOCK]:
+                timed(kind, contact)
+    plain, remembered = (float(np.median(one[len(contacts) // 5 :])) for one in spent)
+    return plain, remembered / plain
 
 
 def scenes(simulator: Simulator, tool: Tool, height: float, depth: float,

@@ -19,6 +19,14 @@ def _cross(a, b):
 
 
 @numba.njit(cache=True, error_model="numpy")
+def wrench_at(force, arm):
+    """Wrench (6,) of a force (3,) that acts at the end of an arm (3,)."""
+    out = np.empty(6)
+    out[:3], out[3:] = force, _cross(arm, force)
+    return out
+
+
+@numba.njit(cache=True, error_model="numpy")
 def patch_of(points, area, thickness, depth, forces, normal):
     """What a contact is as a whole: its middle (3,) [m]; the radius of a circle as large [m]; the mean distance of its
     forces from the middle [m]; its mean thickness [m]; and the energy of its forces if they grew as linear ones do,

@@ -35,6 +35,7 @@ from stmpl_core.footing import (
     twist_between,
     way_along,
     way_of_tool,
+    wrench_at,
 )
 from stmpl_core.friction import Friction, coefficients
 from stmpl_core.relaxation import depth_left, let_go, series_of, stretch, weights
@@ -286,7 +287,7 @@ class History:
             if (grown := dragged.slip.grown) != 1:
                 changed |= _scaled(touch, grown * force / elastic, grown * ROUGH * long * faded)
                 wrench = changed["wrench"]
-            wrench = dragged.slid * wrench + np.concatenate([lean, np.cross(middle - pose[:3, 3], lean)])
+            wrench = dragged.slid * wrench + wrench_at(lean, middle - pose[:3, 3])
             if self.toucher.layer.tissue.skin is not None:
                 rubs = dragged.slip.wrench[:3]
                 pressing = math.sqrt(wrench[:3] @ wrench[:3])
@@ -353,7 +354,7 @@ class History:
         """
         before, radius, depth = one.before, scalars.radius, scalars.depth
         patch, mu = self.sideways.at(radius, thickness), self.friction(one.stated.name)
-        stated, wanted, turned, out, grown, share = one.stated.wrench, NOTHING, NOTHING, 0.0, 1.0, 0.0
+        stated, wanted, turned, out, grown, share = one.stated.wrench, NOTHING, NOTHING, 0.0, 1.0, before.share
         if before.stiffness[0] > 0:
             turned, out = faced(before.springs, before.stiffness, contact, bend, MOST_LEAN)
         way, rolled = way_of_tool(one.twist, one.known, before.contact, before.scalars.pressing > 0, contact, origin,
@@ -365,7 +366,7 @@ class History:
                 grown = max(1 + out / depth, LEAST_GROWN) ** scalars.power
             else:
                 grown, lean = carried_more(stated, contact[1], turned) * before.slid / slid, size * turned
-                push = grown * slid * (wrench + np.concatenate([lean, np.cross(contact[0] - origin, lean)]))
+                push = grown * slid * (wrench + wrench_at(lean, contact[0] - origin))
                 wanted = in_plane(stated - push, leaned(contact, turned), origin, lever)
             stiffer, cap = ploughing(depth, radius, grown * force, patch.along, patch.bare, mu)
             alone = along = stiffer * patch.secant(mu * grown * force)

@@ -175,6 +175,20 @@ def _step(springs, relaxed, shares, times, dt, rolled, stiffness, before, cap, w
 
 
 @numba.njit(cache=True, error_model="numpy")
+def _solve(a, b, out):
+    """Solves a matrix (3, 3) for a vector by Cramer's rule; LAPACK's call takes longer than the rest of a trial."""
+    rows = np.empty((3, 3))
+    for i in range(3):
+        j, k = (i + 1) % 3, (i + 2) % 3
+        for x in range(3):
+            y, z = (x + 1) % 3, (x + 2) % 3
+            rows[x, i] = a[j, y] * a[k, z] - a[j, z] * a[k, y]
+    size = a[0, 0] * rows[0, 0] + a[0, 1] * rows[1, 0] + a[0, 2] * rows[2, 0]
+    for x in range(3):
+        out[x] = (rows[x, 0] * b[0] + rows[x, 1] * b[1] + rows[x, 2] * b[2]) / size
+
+
+@numba.njit(cache=True, error_model="numpy")
 def _find(wanted, stiffness, cap, start, left, over, springs, force, slides, go):
     """The way (3,) for a force within the cap, to `go`: Newton on a convex problem, with the springs' own tangent."""
     step, tangent = np.empty(3), np.empty((3, 3))
@@ -206,6 +220,6 @@ def _find(wanted, stiffness, cap, start, left, over, springs, force, slides, go)
                     tangent[x, y] += over * STIFFNESS[j] * stiffness[y] * ((1.0 if x == y else 0.0) - along)
         for x in range(3):
             tangent[x, x] += 1e-9 * stiffness[x]
-        step[:] = np.linalg.solve(tangent, wanted - force)
+        _solve(tangent, wanted - force, step)
         for x in range(3):
             go[x] += step[x]
