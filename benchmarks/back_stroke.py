@@ -1,6 +1,7 @@
 """A stroke of 100 mm along the back at 50 mm/s and 10 N, oiled and dry: a film and a table.
 
     .venv/bin/python -m benchmarks.back_stroke --out runs/back     # half an hour or more of one core
+    .venv/bin/python -m benchmarks.back_stroke --out runs/back oiled    # one of the two
     .venv/bin/python -m benchmarks.back_stroke --out runs/back --draw   # from what lies there
 
 A ball of 40 mm is pressed beside the spine with 10 N in 0.5 s and led down for 2 s; skin, fat and muscle as
@@ -178,10 +179,11 @@ def off(mine: dict[str, np.ndarray], theirs: dict[str, np.ndarray]) -> tuple[np.
 
 def table(out: Path) -> str:
     """Ours beside finite elements while the ball is pressed in and while it slides, as Markdown."""
+    there = [friction for friction in FRICTIONS if (out / f"{friction}-fem.npz").exists()]
     rows = ["| ours / finite elements | force without friction [N] | friction [N] | largest motion [mm] | motion off: "
             "mean where it moves / worst [% of the largest] | in range | time a step |",
             "| --- " * 7 + "|"]  # fmt: skip
-    for friction in FRICTIONS:
+    for friction in there:
         mine, theirs = read(out, friction)
         played = len(theirs["wrench"])
         mine = {name: x[:played] for name, x in mine.items()}
@@ -241,6 +243,7 @@ def main() -> None:
     """Plays, prints, draws."""
     plt.switch_backend("agg")
     options = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    options.add_argument("frictions", nargs="*", help=f"those to play, of {', '.join(FRICTIONS)}; all unless given")
     options.add_argument("--out", type=Path, required=True, help="folder of the runs and the film")
     options.add_argument("--ours", action="store_true", help="only ours again, at the poses that lie there")
     options.add_argument("--draw", action="store_true", help="only table and film, of what lies there")
@@ -248,13 +251,15 @@ def main() -> None:
     logging.basicConfig(level=logging.INFO, format="%(message)s")
     given.out.mkdir(parents=True, exist_ok=True)
     ground = back()
-    for friction in () if given.draw else FRICTIONS:
+    for friction in () if given.draw else given.frictions or FRICTIONS:
         mine = given.out / f"{friction}-ours.npz"
         played = ours(ground, friction, np.load(mine)["pose"] if given.ours else None)
         np.savez_compressed(mine, **played)
         if not given.ours:
             finite_elements(ground, friction, played, given.out / f"{friction}-fem.npz")
-    log.info("%s\n%s is drawn", table(given.out), film(ground, given.out))
+    log.info("%s", table(given.out))
+    if all((given.out / f"{friction}-fem.npz").exists() for friction in FRICTIONS):
+        log.info("%s is drawn", film(ground, given.out))
 
 
 if __name__ == "__main__":

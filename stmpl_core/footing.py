@@ -5,6 +5,8 @@ from __future__ import annotations
 import numba
 import numpy as np
 
+from stmpl_core.relaxation import weights
+
 EDGE_SHARE = 0.3  # pressure over its mean from which skin counts as touched in full
 
 
@@ -221,3 +223,29 @@ def way_along(twist, contact, pose):
     go[2] += w[0] * d[1] - w[1] * d[0]
     deep = _dot(go, contact[1])
     return np.sqrt(max(_dot(go, go) - deep * deep, 0.0))
+
+
+@numba.njit(cache=True, error_model="numpy")
+def aged(before, pose, imprint, contact, known, held, share, radius, shares, times, dt, elastic, relaxed):
+    """Twist, gone, kept, gain, owed and now of an Asked (stmpl_core.balance).
+
+    Args:
+        before, pose: poses of the tool before the step and after it, (4, 4).
+        imprint, contact, relaxed: see Memory.
+        known: whether the tool was told of before.
+        held: whether it pressed.
+        share, radius, elastic: see Scalars.
+        shares, times: series of the relaxation, (P,) each.
+        dt: time of the step [s].
+    """
+    kept, gain, gone, owed, now = np.empty(len(times)), np.empty(len(times)), 0.0, 0.0, 1.0
+    twist = twist_between(before, pose) if known else np.zeros(6)
+    if radius > 0:
+        start = before if held else imprint
+        over = way_along(twist if held else twist_between(start, pose), contact, start)
+        gone = (share if held else 1.0) * over / radius
+    weights(times, dt, gone, elastic, relaxed, kept, gain)
+    for i in range(len(times)):
+        owed += shares[i] * kept[i]
+        now -= shares[i] * gain[i]
+    return twist, gone, kept, gain, owed, now

@@ -14,16 +14,17 @@ from dataclasses import replace
 from functools import cached_property
 from typing import Any, NamedTuple
 
-import numba
 import numpy as np
 
 from stmpl_core import wake
 from stmpl_core.arrays import Wrench
+from stmpl_core.balance import Asked, Law, balanced, scaled
 from stmpl_core.columns import shifted
 from stmpl_core.contact import Contact
 from stmpl_core.dragged import MIN_OFFSET
 from stmpl_core.errors import InvalidInput
 from stmpl_core.footing import (
+    aged,
     carried_more,
     carried_tangent,
     faced,
@@ -32,13 +33,11 @@ from stmpl_core.footing import (
     in_space,
     leaned,
     patch_of,
-    twist_between,
-    way_along,
     way_of_tool,
     wrench_at,
 )
 from stmpl_core.friction import Friction, coefficients
-from stmpl_core.relaxation import depth_left, let_go, series_of, stretch, weights
+from stmpl_core.relaxation import depth_left, left_over, let_go, series_of, stretch
 from stmpl_core.sideways import Sideways
 from stmpl_core.slip import drag, ploughing
 from stmpl_core.state import Memory, Scalars, State, fresh
@@ -52,55 +51,7 @@ MOST_LEAN = 0.5  # turn of the normal under skin that is dragged along, of which
 LEAST_GROWN = 0.5  # depth over the tool's that counts at least, where skin came from a hollow
 MOST_PASSES, SETTLED = 4, 1e-3  # turn of the normal [rad] at which push and friction agree
 HELD_OFF = 0.01  # relative error of the elastic force by wrench, from which it is asked for again
-GIVEN_BACK = 0.7  # share of what an elastic contact gives back that must be covered by what was put in
-KEPT = 1.5  # work beyond what elastic skin could hold that is forgotten: what was lost before pays for nothing now
-WEAKEST = 1e-12  # factor on a wrench that has nothing left to give: by 0 nobody could divide to find how it is pressed
 NOTHING = np.zeros(3)
-
-
-class _Asked(NamedTuple):
-    """What a step knows of a tool before the contact law is asked.
-
-    Args:
-        contact: what the law is asked.
-        stated: what was stated.
-        before: memory of the step before.
-        known: whether that memory is of this tool's way until now.
-        twist: its way, (6,) [m, rad].
-        gone: way of the contact over the skin, over its radius [-].
-        kept: what has relaxed, less what follows from this step's force (see relaxation.weights), (P,) [N].
-        gain: what follows, over that force, (P,) [-].
-        owed, now: numbers a [N] and b [-] such that after the step a force at rest of S_e is b S_e - a.
-        moved: way along its force at which the tool pressed before, where the law is asked for creeping skin [m].
-    """
-
-    contact: Contact
-    stated: Contact
-    before: Memory
-    known: bool
-    twist: np.ndarray
-    gone: float
-    kept: np.ndarray
-    gain: np.ndarray
-    owed: float
-    now: float
-    moved: float | None
-
-
-class _Law(NamedTuple):
-    """What a tool does before the balance of energy.
-
-    Args:
-        touch: touch with the forces of relaxed skin and friction.
-        memory: what is remembered, less work.
-        stored: energy that the contact could give back [J].
-        whole: energy that it could hold [J].
-    """
-
-    touch: Touch
-    memory: Memory
-    stored: float
-    whole: float
 
 
 class _Dragged(NamedTuple):
@@ -181,7 +132,7 @@ class History:
             tried |= {touch.name: touch.moved for touch in touches if touch.name in tried}
             touches = self.toucher.touch_all([one.contact for one in asked], alone=False, tried=tried)
         laws = [self._law(one, touch, dt) for one, touch in zip(asked, touches, strict=True)]
-        out, memories = _balanced(asked, laws)
+        out, memories = balanced(asked, laws)
         for name, memory in state.tools.items():
             if name not in memories:
                 left = self._left(memory, dt)
@@ -189,7 +140,7 @@ class History:
                     memories[name] = left
         return out, State(memories, here)
 
-    def _asked(self, contact: Contact, before: Memory | None, dt: float) -> _Asked:
+    def _asked(self, contact: Contact, before: Memory | None, dt: float) -> Asked:
         """What the contact law is asked for a contact."""
         pose = contact.pose_body_from_tool
         if before is not None and before.scalars.surface not in (0.0, contact.tool.number):
@@ -197,7 +148,7 @@ class History:
         memory = before or fresh(pose, len(self.series.times))
         known = before is not None and memory.scalars.pressing >= 0
         scalars = memory.scalars
-        twist, gone, kept, gain, owed, now = _aged(
+        twist, gone, kept, gain, owed, now = aged(
             memory.pose, pose, memory.imprint, memory.contact, known, scalars.pressing > 0, scalars.share,
             scalars.radius, *self.series, dt, scalars.elastic, memory.relaxed)  # fmt: skip
         asked, moved = contact, None
@@ -210,13 +161,13 @@ class History:
                 asked = contact.scaled((wanted + scalars.stretch * owed) / (wanted * now * memory.slid))
                 if scalars.pressing > 0:
                     moved = float((memory.imprint[:3, 3] - memory.pose[:3, 3]) @ force) / size
-        return _Asked(asked, contact, memory, known, twist, gone, kept, gain, owed, now, moved)
+        return Asked(asked, contact, memory, known, twist, gone, kept, gain, owed, now, moved)
 
     def _whole(self, touch: Touch) -> float:
         """Sum of the sizes of the forces that a touch presses with [N]."""
         return 0.0 if touch.pressure is None else float(touch.pressure @ self.toucher.layer.vertex_areas)
 
-    def _needed(self, one: _Asked, push: np.ndarray, force: float, whole: float, stretch: float) -> float:
+    def _needed(self, one: Asked, push: np.ndarray, force: float, whole: float, stretch: float) -> float:
         """Elastic force that a stated wrench takes, as a sum of sizes [N].
 
         Args:
@@ -230,7 +181,7 @@ class History:
         wanted = float(one.stated.wrench[:3] @ push) / force * whole / force / one.before.slid
         return (wanted + stretch * one.owed) / one.now
 
-    def _again(self, one: _Asked, touch: Touch) -> _Asked | None:
+    def _again(self, one: Asked, touch: Touch) -> Asked | None:
         """The same with a wrench that fits where the contact's normal turned out to be; None where it does."""
         pressed = touch.pressed
         if one.contact is one.stated or not touch.presses or one.contact.wrench is None or pressed is None:
@@ -245,7 +196,7 @@ class History:
             return None
         return one._replace(contact=one.contact.scaled(needed / has))
 
-    def _law(self, one: _Asked, touch: Touch, dt: float) -> _Law:
+    def _law(self, one: Asked, touch: Touch, dt: float) -> Law:
         """What a tool does, from what elastic skin does."""
         shares, before, push, pressed = self.series.shares, one.before.scalars, touch.push, touch.pressed
         size = math.sqrt(push @ push)
@@ -267,14 +218,14 @@ class History:
         contact = np.array((middle, normal, carried_tangent(one.before.contact, normal, before.pressing > 0)))
         relaxed = one.kept + one.gain * at_rest
         faded = float(shares @ relaxed)
-        changed = _scaled(touch, force / elastic, ROUGH * long * faded)
+        changed = scaled(touch, force / elastic, ROUGH * long * faded)
         trail = one.before.trail
         if len(trail):
             passing = wake.Pass(pose, middle, normal, relaxed, at_rest, touch.depth, pressed.power, 1 - long, radius)
             trail = wake.after(trail, self.series, dt, passing)
             changed["wake"] = wake.Wake(trail, shares)
         whole *= 0.5 + 0.5 / pressed.factor  # what draws a tool back from the core is steep: it stores less
-        stored = whole * _left_over(faded / at_rest, pressed.power, 1 - long)
+        stored = whole * left_over(faded / at_rest, pressed.power, 1 - long)
         wrench, dragged = changed.get("wrench", touch.wrench), None
         scalars = Scalars(1.0, at_rest, max(at_rest, before.largest), net, radius, touch.depth, at_rest, pressed.power,
                           work=before.work, stretch=long, surface=one.stated.tool.number)  # fmt: skip
@@ -285,7 +236,7 @@ class History:
                                     pressed.along)
             lean = dragged.slip.lean
             if (grown := dragged.slip.grown) != 1:
-                changed |= _scaled(touch, grown * force / elastic, grown * ROUGH * long * faded)
+                changed |= scaled(touch, grown * force / elastic, grown * ROUGH * long * faded)
                 wrench = changed["wrench"]
             wrench = dragged.slid * wrench + wrench_at(lean, middle - pose[:3, 3])
             if self.toucher.layer.tissue.skin is not None:
@@ -299,9 +250,9 @@ class History:
             scalars = scalars._replace(share=dragged.slip.share, limit=dragged.limit, slid=dragged.slid)
             springs = dragged.stiffness, dragged.springs, dragged.relaxed
         memory = Memory(one.stated.pose_body_from_tool, wrench, scalars, relaxed, contact, pose, *springs, trail)
-        return _Law(self._said(one, touch, changed), memory, stored, whole)
+        return Law(self._said(one, touch, changed), memory, stored, whole)
 
-    def _free(self, one: _Asked, touch: Touch, asked: float, dt: float) -> _Law:
+    def _free(self, one: Asked, touch: Touch, asked: float, dt: float) -> Law:
         """Skin that the tool does not hold comes back by itself; asked: force at rest that the tool asks for [N]."""
         before = one.before.scalars
         if touch.presses and touch.pressed is not None:
@@ -314,7 +265,7 @@ class History:
         imprint = Imprint(memory.imprint, depth) if scalars.sunk else None
         touch = self._said(one, touch, {"wake": left, "imprint": imprint})
         long = stretch(depth, scalars.depth / (1 - scalars.stretch)) if scalars.stretch < 1 else 1.0
-        return _Law(touch, memory, 0.0, scalars.elastic * long * depth / (before.power + 1))
+        return Law(touch, memory, 0.0, scalars.elastic * long * depth / (before.power + 1))
 
     def _left(self, memory: Memory, dt: float) -> Memory:
         """The memory of a tool that is not told of any more: the skin comes back."""
@@ -343,7 +294,7 @@ class History:
         return _let_go(memory._replace(scalars=scalars, relaxed=relaxed,
                                        trail=wake.after(memory.trail, self.series, dt, None)))  # fmt: skip
 
-    def _dragged(self, one: _Asked, wrench: Wrench, contact: np.ndarray, origin: np.ndarray, scalars: Scalars,
+    def _dragged(self, one: Asked, wrench: Wrench, contact: np.ndarray, origin: np.ndarray, scalars: Scalars,
                  force: float, lever: float, thickness: float, give: np.ndarray | None, bend: np.ndarray, dt: float,
                  along_itself: float) -> _Dragged:  # fmt: skip
         """Friction of a contact that presses with a wrench (6,), as the scalars say, without friction.
@@ -388,7 +339,7 @@ class History:
         slip = Slip(rubs, share, offset, turn, contact[0], grown * slid * size * turned, grown)
         return _Dragged(slip, cap, stiffness, springs, relaxed, stored, slid)
 
-    def _said(self, one: _Asked, touch: Touch, changed: dict[str, Any]) -> Touch:
+    def _said(self, one: Asked, touch: Touch, changed: dict[str, Any]) -> Touch:
         """The touch with what changed, with what of the stated wrench is missing, and what that says of it."""
         stated = one.stated.wrench
         if stated is None:
@@ -423,64 +374,10 @@ class History:
         return [(touch, min(depth / touch.depth, 1.0)) for touch, depth in found if touch.presses]
 
 
-@numba.njit(cache=True, error_model="numpy")
-def _aged(before, pose, imprint, contact, known, held, share, radius, shares, times, dt, elastic, relaxed):
-    """Twist, gone, kept, gain, owed and now of an _Asked.
-
-    Args:
-        before, pose: poses of the tool before the step and after it, (4, 4).
-        imprint, contact, relaxed: see Memory.
-        known: whether the tool was told of before.
-        held: whether it pressed.
-        share, radius, elastic: see Scalars.
-        shares, times: series of the relaxation, (P,) each.
-        dt: time of the step [s].
-    """
-    kept, gain, gone, owed, now = np.empty(len(times)), np.empty(len(times)), 0.0, 0.0, 1.0
-    twist = twist_between(before, pose) if known else np.zeros(6)
-    if radius > 0:
-        start = before if held else imprint
-        over = way_along(twist if held else twist_between(start, pose), contact, start)
-        gone = (share if held else 1.0) * over / radius
-    weights(times, dt, gone, elastic, relaxed, kept, gain)
-    for i in range(len(times)):
-        owed += shares[i] * kept[i]
-        now -= shares[i] * gain[i]
-    return twist, gone, kept, gain, owed, now
-
-
 def mean_thickness(pressed: Pressed) -> float:
     """Thickness under a contact, weighed with its forces [m]."""
     assert pressed.forces is not None
     return float(pressed.forces @ pressed.squeeze.nodes.thickness) / float(pressed.forces.sum())
-
-
-def _scaled(touch: Touch, by: float, doubt: float) -> dict[str, Any]:
-    """What changes of a touch with other pressures on skin that is moved as before, by name.
-
-    Args:
-        touch: touch that presses.
-        by: factor on the pressures [-].
-        doubt: error of the force that comes in [N].
-    """
-    if by == 1.0 and not doubt:
-        return {}
-    assert touch.pressure is not None and touch.pressed is not None
-    forces = touch.pressed.forces
-    pressed: Pressed = touch.pressed._replace(factor=touch.pressed.factor * by,
-                                              forces=None if forces is None else forces * by)  # fmt: skip
-    return {"wrench": touch.wrench * by, "pressure": touch.pressure * by, "pressed": pressed,
-            "force_bound": touch.force_bound * by + doubt}  # fmt: skip
-
-
-def _left_over(relaxed: float, power: float, strain: float) -> float:
-    """What skin gives back when it is let go at once, over the energy of elastic skin, of which a share has relaxed.
-
-    The integral of x^power - relaxed (1 - x strain) / (1 - strain) over x, from where that is 0 to 1, times power + 1.
-    """
-    free = depth_left(min(relaxed, 1.0), power, strain)
-    eased = (1 - free - 0.5 * strain * (1 - free * free)) / (1 - strain)
-    return max(1 - free ** (power + 1) - (power + 1) * relaxed * eased, 1e-12)
 
 
 def _let_go(memory: Memory) -> Memory:
@@ -493,46 +390,3 @@ def _depth(scalars: Scalars) -> float:
     """Depth to which skin that is free has come back [m]."""
     share = scalars.elastic / scalars.imprint_force if scalars.elastic > 0 else 0.0
     return scalars.depth * depth_left(share, scalars.power, 1 - scalars.stretch)
-
-
-def _balanced(asked: Sequence[_Asked], laws: Sequence[_Law]) -> tuple[list[Touch], dict[str, Memory]]:
-    """The touches, weakened where a contact would give more than was put in, and the memories with their balance.
-
-    Memories share no array with touches, which whoever is handed them may write to.
-
-    Work put in is the trapezoid of the wrench over the tool's way. Tools that feel each other pass energy on, so one is
-    weakened only where all together lack it.
-    """
-    works = []
-    for one, law in zip(asked, laws, strict=True):
-        new = not one.known or one.stated.wrench is not None
-        work = one.before.scalars.work + 0.5 * float((one.before.wrench + law.memory.wrench) @ one.twist)
-        work = max(work, law.stored) if new else work
-        works.append(work)
-    all_stored = sum(law.stored for law in laws)
-    together = sum(works) / (GIVEN_BACK * all_stored) if all_stored > 0 else 1.0
-    touches, memories = [], {}
-    for one, law, work in zip(asked, laws, works, strict=True):
-        touch, memory, passive = law.touch, law.memory, 1.0
-        if law.stored > 0:
-            passive = min(1.0, max(work / (GIVEN_BACK * law.stored), together if len(laws) > 1 else 0.0, WEAKEST))
-            if passive < 1:
-                at_rest = one.before.scalars.work + 0.5 * float(one.before.wrench @ one.twist)
-                given = 0.5 * float(memory.wrench @ one.twist)
-                if len(laws) == 1 and at_rest + passive * given < 0 and given < 0:
-                    passive = -at_rest / given
-                passive = max(passive, WEAKEST)
-                work = at_rest + passive * given
-                touch = _weakened(touch, passive)
-                memory = memory._replace(wrench=touch.wrench)
-        work = min(work if law.stored > 0 else max(work, 0.0), KEPT * law.whole)
-        memories[touch.name] = memory._replace(
-            scalars=memory.scalars._replace(work=work, passive=passive), pose=memory.pose.copy(),
-            wrench=memory.wrench.copy(), contact=memory.contact.copy(), imprint=memory.imprint.copy())  # fmt: skip
-        touches.append(touch)
-    return touches, memories
-
-
-def _weakened(touch: Touch, by: float) -> Touch:
-    slip = touch.slip and touch.slip._replace(wrench=touch.slip.wrench * by, lean=touch.slip.lean * by)
-    return replace(touch, **_scaled(touch, by, 0.0), slip=slip, passive=by)

@@ -209,3 +209,13 @@ def let_go(shares, times, dt, gone, before, after, relaxed):
         for j in range(many):
             out[i] += back[i, j] * found[j]
     return out, there
+
+
+def left_over(relaxed: float, power: float, strain: float) -> float:
+    """What skin gives back when it is let go at once, over the energy of elastic skin, of which a share has relaxed.
+
+    The integral of x^power - relaxed (1 - x strain) / (1 - strain) over x, from where that is 0 to 1, times power + 1.
+    """
+    free = depth_left(min(relaxed, 1.0), power, strain)
+    eased = (1 - free - 0.5 * strain * (1 - free * free)) / (1 - strain)
+    return max(1 - free ** (power + 1) - (power + 1) * relaxed * eased, 1e-12)
