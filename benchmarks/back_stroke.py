@@ -162,10 +162,13 @@ def read(out: Path, friction: str) -> tuple[dict[str, np.ndarray], dict[str, np.
     return mine, theirs
 
 
-def forces(played: dict[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """Sizes of the force without friction and of friction at each pose, (N,) [N]."""
-    rub = played["friction"][:, :3]
-    return np.linalg.norm(played["wrench"][:, :3] - rub, axis=1), np.linalg.norm(rub, axis=1)
+def forces(ground: Ground, played: dict[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """The whole force into the back and along it at each pose, (N,) [N].
+
+    What of it is friction is not compared: by finite elements that holds what sticking skin carries along itself.
+    """
+    force = played["wrench"][:, :3] @ ground.frame[:3, :3]
+    return -force[:, 2], np.linalg.norm(force[:, :2], axis=1)
 
 
 def off(mine: dict[str, np.ndarray], theirs: dict[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -177,17 +180,18 @@ def off(mine: dict[str, np.ndarray], theirs: dict[str, np.ndarray]) -> tuple[np.
     return peak, np.array(mean) / peak, wrong.max(axis=1) / peak
 
 
-def table(out: Path) -> str:
+def table(ground: Ground, out: Path) -> str:
     """Ours beside finite elements while the ball is pressed in and while it slides, as Markdown."""
     there = [friction for friction in FRICTIONS if (out / f"{friction}-fem.npz").exists()]
-    rows = ["| ours / finite elements | force without friction [N] | friction [N] | largest motion [mm] | motion off: "
-            "mean where it moves / worst [% of the largest] | in range | time a step |",
+    rows = ["| ours / finite elements | force into the back [N] | force along it [N] | largest motion [mm] | motion "
+            "off: mean where it moves / worst [% of the largest] | in range | time a step |",
             "| --- " * 7 + "|"]  # fmt: skip
     for friction in there:
         mine, theirs = read(out, friction)
         played = len(theirs["wrench"])
         mine = {name: x[:played] for name, x in mine.items()}
-        (push, rub), (true_push, true_rub), (peak, mean, worst) = forces(mine), forces(theirs), off(mine, theirs)
+        (push, rub), (true_push, true_rub) = forces(ground, mine), forces(ground, theirs)
+        peak, mean, worst = off(mine, theirs)
         slides = mine["time"] > RAMP + SETTLED
         for name, when in (("pressed in", np.isclose(mine["time"], RAMP)), ("slides", slides)):
             if when.any():
@@ -226,8 +230,9 @@ def film(ground: Ground, out: Path) -> Path:
                 axis.plot(at[0], at[1], "+", color="tab:cyan", ms=9)
             figure.colorbar(skin, ax=row[1], label="motion [mm]")
         for axis, (name, mine, theirs) in zip(axes[2], every, strict=True):
-            for force, true, colour, label in zip(forces(mine), forces(theirs), ("tab:blue", "tab:orange"),
-                                                  ("without friction", "friction"), strict=True):  # fmt: skip
+            both = zip(forces(ground, mine), forces(ground, theirs), strict=True)
+            for (force, true), colour, label in zip(both, ("tab:blue", "tab:orange"), ("into the back", "along it"),
+                                                    strict=True):  # fmt: skip
                 axis.plot(mine["time"], force, "-", color=colour, label=label)
                 axis.plot(mine["time"][: len(true[: k + 1])], true[: k + 1], ".", color=colour, ms=4)
             axis.axvline(mine["time"][k], color="0.7", lw=0.8)
@@ -257,7 +262,7 @@ def main() -> None:
         np.savez_compressed(mine, **played)
         if not given.ours:
             finite_elements(ground, friction, played, given.out / f"{friction}-fem.npz")
-    log.info("%s", table(given.out))
+    log.info("%s", table(ground, given.out))
     if all((given.out / f"{friction}-fem.npz").exists() for friction in FRICTIONS):
         log.info("%s is drawn", film(ground, given.out))
 

@@ -7,7 +7,9 @@
 Ours takes BETWEEN steps from pose to pose. Differences of force are the largest of any pose, in % of the largest force
 of finite elements; of slides once before and once after the onset, where nine tenths of the steady drag are reached.
 Motion is off in the mean where finite elements move more than a tenth of their peak, and at the worst vertex, in % of
-that peak; of presses the peak is the largest of the whole stroke.
+that peak; of presses the peak is the largest of the whole stroke. Forces are whole ones. Where one is told apart, push
+and friction are not the same to both while skin sticks: what it carries along itself is push to ours (as it comes and
+goes with the depth), friction to finite elements.
 """
 
 from __future__ import annotations
