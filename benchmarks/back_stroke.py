@@ -151,7 +151,7 @@ def finite_elements(ground: Ground, friction: str, played: dict[str, np.ndarray]
                  answer.trust.why or "ok")  # fmt: skip
         names = ("wrench", "friction", "displacement", "slipping", "faces_entered", "ok")
         if len(rows) % 10 == 0 or len(rows) == len(played["pose"]) or not answer.trust.converged:
-            np.savez_compressed(path, seconds=seconds, columns=figures["columns"],
+            np.savez_compressed(path, allow_pickle=False, seconds=seconds, columns=figures["columns"],
                                 **dict(zip(names, map(np.array, zip(*rows, strict=True)), strict=True)))  # fmt: skip
 
 
@@ -259,7 +259,7 @@ def main() -> None:
     for friction in () if given.draw else given.frictions or FRICTIONS:
         mine = given.out / f"{friction}-ours.npz"
         played = ours(ground, friction, np.load(mine)["pose"] if given.ours else None)
-        np.savez_compressed(mine, **played)
+        np.savez_compressed(mine, allow_pickle=False, **played)
         if not given.ours:
             finite_elements(ground, friction, played, given.out / f"{friction}-fem.npz")
     log.info("%s", table(ground, given.out))

@@ -270,6 +270,7 @@ def write(path: Path, scene: Scene, ground: Ground, poses: np.ndarray, answers: 
              "why": answers[-1].trust.why}  # fmt: skip
     np.savez_compressed(
         path,
+        allow_pickle=False,
         about=np.array(json.dumps(about)),
         frame=ground.frame,
         pose=poses[: len(answers)],
