@@ -218,15 +218,14 @@ class History:
         contact = np.array((middle, normal, carried_tangent(one.before.contact, normal, before.pressing > 0)))
         relaxed = one.kept + one.gain * at_rest
         faded = float(shares @ relaxed)
-        changed = scaled(touch, force / elastic, ROUGH * long * faded)
-        trail = one.before.trail
+        by, doubt, trail, left = force / elastic, ROUGH * long * faded, one.before.trail, None
         if len(trail):
             passing = wake.Pass(pose, middle, normal, relaxed, at_rest, touch.depth, pressed.power, 1 - long, radius)
             trail = wake.after(trail, self.series, dt, passing)
-            changed["wake"] = wake.Wake(trail, shares)
+            left = wake.Wake(trail, shares)
         whole *= 0.5 + 0.5 / pressed.factor  # what draws a tool back from the core is steep: it stores less
         stored = whole * left_over(faded / at_rest, pressed.power, 1 - long)
-        wrench, dragged = changed.get("wrench", touch.wrench), None
+        wrench = by * touch.wrench
         scalars = Scalars(1.0, at_rest, max(at_rest, before.largest), net, radius, touch.depth, at_rest, pressed.power,
                           work=before.work, stretch=long, surface=one.stated.tool.number)  # fmt: skip
         springs = NOTHING, one.before.springs, one.before.springs_relaxed
@@ -234,11 +233,9 @@ class History:
             give, bend = self.toucher.give(nodes, pressed.forces), self.toucher.curvature(nodes, pressed.forces)
             dragged = self._dragged(one, wrench, contact, pose[:3, 3], scalars, force, lever, thickness, give, bend, dt,
                                     pressed.along)
-            lean = dragged.slip.lean
-            if (grown := dragged.slip.grown) != 1:
-                changed |= scaled(touch, grown * force / elastic, grown * ROUGH * long * faded)
-                wrench = changed["wrench"]
-            wrench = dragged.slid * wrench + wrench_at(lean, middle - pose[:3, 3])
+            lean, grown = dragged.slip.lean, dragged.slip.grown
+            changed = scaled(touch, grown * by, grown * doubt)
+            wrench = grown * dragged.slid * wrench + wrench_at(lean, middle - pose[:3, 3])
             if self.toucher.layer.tissue.skin is not None:
                 rubs = dragged.slip.wrench[:3]
                 pressing = math.sqrt(wrench[:3] @ wrench[:3])
@@ -249,6 +246,10 @@ class History:
             stored, whole = stored + dragged.stored, whole + 2 * dragged.stored
             scalars = scalars._replace(share=dragged.slip.share, limit=dragged.limit, slid=dragged.slid)
             springs = dragged.stiffness, dragged.springs, dragged.relaxed
+        else:
+            changed = scaled(touch, by, doubt)
+        if left is not None:
+            changed["wake"] = left
         memory = Memory(one.stated.pose_body_from_tool, wrench, scalars, relaxed, contact, pose, *springs, trail)
         return Law(self._said(one, touch, changed), memory, stored, whole)
 
