@@ -301,24 +301,23 @@ class History:
         """Friction of a contact that presses with a wrench (6,), as the scalars say, without friction.
 
         Friction turns the way that the push faces, and the push bounds friction: both are asked until they agree.
-        What skin carried along itself while it stuck (stmpl_core.wrenches) a slide takes from it: it drags the other
-        way. When the slide ends that does not come back, but where the tool presses on.
+        What skin carried along itself while it stuck (stmpl_core.wrenches) a drag takes from it, as far as it is used
+        up. When it turns back that does not come back, but where the tool presses on.
         """
         before, radius, depth = one.before, scalars.radius, scalars.depth
         patch, mu = self.sideways.at(radius, thickness), self.friction(one.stated.name)
-        stated, wanted, turned, out, grown, share = one.stated.wrench, NOTHING, NOTHING, 0.0, 1.0, before.share
+        stated, wanted, turned, out, held, slid = one.stated.wrench, NOTHING, NOTHING, 0.0, 1.0, before.slid
         if before.stiffness[0] > 0:
             turned, out = faced(before.springs, before.stiffness, contact, bend, MOST_LEAN)
         way, rolled = way_of_tool(one.twist, one.known, before.contact, before.scalars.pressing > 0, contact, origin,
                                   depth, radius, lever)  # fmt: skip
         size, lost = math.sqrt(wrench[:3] @ wrench[:3]), (1 - before.slid) * before.scalars.elastic / scalars.elastic
         for _ in range(MOST_PASSES):
-            slid = 1 - along_itself * share if lost < along_itself * share else 1 - min(lost, along_itself)
             if stated is None:
                 grown = max(1 + out / depth, LEAST_GROWN) ** scalars.power
             else:
-                grown, lean = carried_more(stated, contact[1], turned) * before.slid / slid, size * turned
-                push = grown * slid * (wrench + wrench_at(lean, contact[0] - origin))
+                held, lean = carried_more(stated, contact[1], turned) * before.slid, size * turned
+                grown, push = held / slid, held * (wrench + wrench_at(lean, contact[0] - origin))
                 wanted = in_plane(stated - push, leaned(contact, turned), origin, lever)
             stiffer, cap = ploughing(depth, radius, grown * force, patch.along, patch.bare, mu)
             alone = along = stiffer * patch.secant(mu * grown * force)
@@ -329,12 +328,15 @@ class History:
                 by_turn = max(1 - along / alone, 0.0) * math.sqrt(turned @ turned)
                 cap -= min(by_turn * grown * force, cap - mu * grown * force)
             stiffness = np.array((along, along, stiffer * patch.turn / (lever * lever)))
-            before_share, (springs, relaxed, carried, share, stored) = share, drag(
+            springs, relaxed, carried, share, stored = drag(
                 before.springs, before.springs_relaxed, *self.series, dt, rolled, stiffness, before.stiffness, cap, way,
                 wanted, stated is not None)  # fmt: skip
             last, (turned, out) = turned, faced(springs, stiffness, contact, bend, MOST_LEAN)
-            if abs(turned - last).max() + along_itself * abs(share - before_share) < SETTLED:
+            took = along_itself * min(math.sqrt(carried @ carried) / cap, 1.0)
+            before_slid, slid = slid, 1 - max(took, min(lost, along_itself))
+            if abs(turned - last).max() + abs(slid - before_slid) < SETTLED:
                 break
+        grown = grown if stated is None else held / slid
         rubs, offset, turn = in_space(carried, springs, stiffness, leaned(contact, turned), contact, origin, lever)
         stored += max(0.5 * (1 + grown * slid) * size * out, 0.0)
         slip = Slip(rubs, share, offset, turn, contact[0], grown * slid * size * turned, grown)

@@ -51,11 +51,6 @@ class Memory(NamedTuple):
         """The factor on the push of skin that has slid and is held still [-]."""
         return self.scalars.slid if self.scalars.pressing > 0 else 1.0
 
-    @property
-    def share(self) -> float:
-        """The share of the contact that slid, where skin is held [-]."""
-        return self.scalars.share if self.scalars.pressing > 0 else 0.0
-
 
 class Scalars(NamedTuple):
     """The numbers of a Memory.
