@@ -50,6 +50,7 @@ PILED = 0.5  # of drag^2 / force: error of skin that piles up; 0.7 of it on a ba
 MOST_LEAN = 0.5  # turn of the normal under skin that is dragged along, of which a push takes note [rad]
 LEAST_GROWN = 0.5  # depth over the tool's that counts at least, where skin came from a hollow
 MOST_PASSES, SETTLED = 4, 1e-3  # turn of the normal [rad] at which push and friction agree
+LOST = 0.5  # of what skin carries along itself: what is gone once all of it slides; 0.4 to 0.6 by slides on a forearm
 HELD_OFF = 0.01  # relative error of the elastic force by wrench, from which it is asked for again
 NOTHING = np.zeros(3)
 
@@ -232,7 +233,7 @@ class History:
         if self.friction(touch.name) > 0 and net > MIN_ONE_WAY_SHARE:
             give, bend = self.toucher.give(nodes, pressed.forces), self.toucher.curvature(nodes, pressed.forces)
             dragged = self._dragged(one, wrench, contact, pose[:3, 3], scalars, force, lever, thickness, give, bend, dt,
-                                    pressed.along)
+                                    LOST * pressed.along)
             lean, grown = dragged.slip.lean, dragged.slip.grown
             changed = scaled(touch, grown * by, grown * doubt)
             wrench = grown * dragged.slid * wrench + wrench_at(lean, middle - pose[:3, 3])
