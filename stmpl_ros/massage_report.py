@@ -97,12 +97,16 @@ class Massaged:
 
     @property
     def apart(self) -> float:
-        """Largest difference of the node's force from the simulation's within AROUND_S, over the largest force [-].
+        """Largest difference of the node's force from the simulation's within AROUND_S while a force is held, over the
+        largest force [-].
 
-        Where a tool lifts, the force falls by a third from one step of the simulation to the next, and the node does
-        not get every step.
+        Where a tool lifts, the force falls by a third from one step of the simulation to the next. What either gives
+        back then is bounded by what it was told of the way (Touch.passive), and the node does not get every step.
         """
         times, forces = self.answered
+        ends = [self.log.time[rows][[0, -1]] for _, rows in self.held()]
+        held = np.any([(times >= first) & (times <= last) for first, last in ends], axis=0)
+        times, forces = times[held], forces[held]
         size = np.linalg.norm(self.log.wrench[:, :3], axis=1)
         felt = np.array([np.interp(times + late, self.log.time, size) for late in (-AROUND_S, 0.0, AROUND_S)])
         return _apart(forces, np.clip(forces, felt.min(axis=0), felt.max(axis=0)))
@@ -255,7 +259,7 @@ def rows(done: Massaged) -> list[tuple[str, str]]:
     log = done.log
     figures = [
         ("highest force", f"{log.force.max():.2f} N"),
-        ("node's force off the simulation's", f"at most {100 * done.apart:.2f} % of the highest"),
+        ("node's force off the simulation's while held", f"at most {100 * done.apart:.2f} % of the highest"),
         ("energy stored in the skin", f"{1e3 * log.energy.max():.2f} mJ at most"),
         ("given out beyond what was put in", f"{100 * done.gained:+.1f} % of that (below 0: lost)"),
         ("physics and contact", f"{1 / (log.time[1] - log.time[0]):.0f} Hz"),
