@@ -277,7 +277,7 @@ def draw(every: Sequence[Point], path: Path) -> None:
                  ylim=(0.8 * LEAST, None))  # fmt: skip
         axis.grid(alpha=0.3, which="both")
     axes[0].axhspan(LEAST / 2, TRUTH_OFF, color="0.9", zorder=0, label="no more than the truth itself is off")
-    axes[1].plot([], [], "o", color="0.4", mfc="none", label="the truth's own setting again, 0.1 % or less")
+    axes[1].plot([], [], "o", color="0.4", mfc="none", label="the truth's own setting again")
     for axis in axes:
         axis.legend(fontsize=8)
     figure.savefig(path, dpi=110)
