@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple
 
+import numba
 import numpy as np
 
 from stmpl_core.contact import Contact
@@ -14,6 +15,9 @@ from stmpl_core.touch import Pressed, Touch
 
 GIVEN_BACK = 0.7  # share of what an elastic contact gives back that must be covered by what was put in
 KEPT = 1.5  # work beyond what elastic skin could hold that is forgotten: what was lost before pays for nothing now
+UNSURE = 1e-3  # of the largest force so far times the depth: energy that a contact may lack, as no sum is exact
+POWERS = (1.0, 12.0)  # range of the power of the depth with which a force grows between two depths
+MIN_SPREAD = 1e-3  # logarithm of two depths' ratio, from which their forces say that power
 WEAKEST = 1e-12  # factor on a wrench that has nothing left to give: by 0 nobody could divide to find how it is pressed
 
 
@@ -62,34 +66,42 @@ class Law(NamedTuple):
     whole: float
 
 
-def balanced(asked: Sequence[Asked], laws: Sequence[Law]) -> tuple[list[Touch], dict[str, Memory]]:
+def balanced(asked: Sequence[Asked], laws: Sequence[Law], shares: np.ndarray) -> tuple[list[Touch], dict[str, Memory]]:
     """The touches, weakened where a contact would give more than was put in, and the memories with their balance.
 
     Memories share no array with touches, which whoever is handed them may write to.
 
-    Work put in is the trapezoid of the wrench over the tool's way. Tools that feel each other pass energy on, so one is
-    weakened only where all together lack it.
+    Where steps are long they leave open how much work was done; within that it is what the contact stores. Tools that
+    feel each other pass energy on, so one is weakened only where all together lack it.
+
+    Args:
+        asked, laws: what was asked, and what each tool does.
+        shares: shares of the force that relax (see relaxation.Series), (P,) [-].
     """
-    works = []
+    works, parts = [], []
     for one, law in zip(asked, laws, strict=True):
-        new = not one.known or one.stated.wrench is not None
-        work = one.before.scalars.work + 0.5 * float((one.before.wrench + law.memory.wrench) @ one.twist)
-        work = max(work, law.stored) if new else work
+        before, memory, new = one.before, law.memory, not one.known or one.stated.wrench is not None
+        work, doubt, given = work_of(
+            one.twist, before.wrench, memory.wrench, before.contact, memory.contact, memory.pose[:3, 3],
+            _elastic(before, shares), _elastic(memory, shares), before.scalars.depth, memory.scalars.depth,
+            memory.scalars.power)  # fmt: skip
+        work += before.scalars.work
+        work = max(work, law.stored if new else min(law.stored, work + doubt))
         works.append(work)
-    all_stored = sum(law.stored for law in laws)
-    together = sum(works) / (GIVEN_BACK * all_stored) if all_stored > 0 else 1.0
+        parts.append((given, UNSURE * memory.scalars.largest * memory.scalars.depth))
+    all_stored, lent = sum(law.stored for law in laws), sum(spare for _, spare in parts)
+    together = (sum(works) + lent) / (GIVEN_BACK * all_stored) if all_stored > 0 else 1.0
     touches, memories = [], {}
-    for one, law, work in zip(asked, laws, works, strict=True):
-        touch, memory, passive = law.touch, law.memory, 1.0
+    for law, work, (given, spare) in zip(laws, works, parts, strict=True):
+        touch, memory, passive, there = law.touch, law.memory, 1.0, work + spare
         if law.stored > 0:
-            passive = min(1.0, max(work / (GIVEN_BACK * law.stored), together if len(laws) > 1 else 0.0, WEAKEST))
+            passive = min(1.0, max(there / (GIVEN_BACK * law.stored), together if len(laws) > 1 else 0.0, WEAKEST))
             if passive < 1:
-                at_rest = one.before.scalars.work + 0.5 * float(one.before.wrench @ one.twist)
-                given = 0.5 * float(memory.wrench @ one.twist)
+                at_rest = there - given
                 if len(laws) == 1 and at_rest + passive * given < 0 and given < 0:
                     passive = -at_rest / given
                 passive = max(passive, WEAKEST)
-                work = at_rest + passive * given
+                work -= (1 - passive) * given
                 touch = _weakened(touch, passive)
                 memory = memory._replace(wrench=touch.wrench)
         work = min(work if law.stored > 0 else max(work, 0.0), KEPT * law.whole)
@@ -98,6 +110,64 @@ def balanced(asked: Sequence[Asked], laws: Sequence[Law]) -> tuple[list[Touch], 
             wrench=memory.wrench.copy(), contact=memory.contact.copy(), imprint=memory.imprint.copy())  # fmt: skip
         touches.append(touch)
     return touches, memories
+
+
+def _elastic(memory: Memory, shares: np.ndarray) -> float:
+    """What a tool that presses would press with along the normal, had nothing relaxed [N]; 0 where it does not."""
+    scalars = memory.scalars
+    if scalars.pressing <= 0:
+        return 0.0
+    relaxed = scalars.stretch * float(shares @ memory.relaxed) if len(shares) else 0.0
+    return max(float(memory.wrench[:3] @ memory.contact[1]) + scalars.net * scalars.passive * relaxed, 0.0)
+
+
+@numba.njit(cache=True, error_model="numpy")
+def work_of(twist, before, after, old, new, origin, first, last, depth_first, depth_last, power):
+    """Work of a wrench over a tool's way in a step; how far it may be from that; and the last wrench's part of it [J].
+
+    The wrench goes straight from one to the other, but for the force of elastic skin along the normal, which grows with
+    a power m of the depth: F_1 d_1 - F_0 d_0 over (m + 1) (d_1 - d_0) in the mean. That is less than (F_0 + F_1) / 2,
+    and the truth may be as far off on either side. A tool that comes or leaves in the step meets skin on as much of its
+    way as it was deep.
+
+    Args:
+        twist: way of the tool, (6,) [m, rad].
+        before, after: wrenches, (6,) [N, N m].
+        old, new: contacts (see Memory), (3, 3).
+        origin: origin of the tool, (3,) [m].
+        first, last: force of elastic skin along the normal before and after [N]; 0: none.
+        depth_first, depth_last: depths there [m].
+        power: power of the depth with which it grows, where the depths do not say it [-].
+    """
+    contact, deep = (new, depth_last) if last > 0 else (old, depth_first)
+    go, share, less = 0.0, 1.0, 0.0
+    for x in range(3):
+        y, z = (x + 1) % 3, (x + 2) % 3
+        turned = twist[3 + y] * (contact[0, z] - origin[z]) - twist[3 + z] * (contact[0, y] - origin[y])
+        go += contact[1, x] * (twist[x] + turned)
+    if first > 0 and last > 0:
+        spread = np.log(depth_last / depth_first)
+        if abs(spread) > MIN_SPREAD:
+            power = np.log(last / first) / spread
+        less = _less(first, last, min(max(power, POWERS[0]), POWERS[1]))
+    elif first > 0 or last > 0:
+        share = min(1.0, deep / max(abs(go), 1e-12))
+        less = _less(first, last, max(power, POWERS[0]))
+    given = taken = 0.0
+    for x in range(6):
+        given += 0.5 * share * before[x] * twist[x]
+        taken += 0.5 * share * after[x] * twist[x]
+    return given + taken - share * less * go, share * less * abs(go), taken
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _less(first, last, power):
+    """How much less than halfway between two forces the mean of one is that grows with a power of the depth [N]."""
+    most, ratio = max(first, last), min(first, last) / max(first, last)
+    shallow = ratio ** (1 / power)
+    if shallow > 1 - 1e-4:
+        return 0.0
+    return most * (0.5 * (1 + ratio) - (1 - ratio * shallow) / ((power + 1) * (1 - shallow)))
 
 
 def _weakened(touch: Touch, by: float) -> Touch:

@@ -133,7 +133,7 @@ class History:
             tried |= {touch.name: touch.moved for touch in touches if touch.name in tried}
             touches = self.toucher.touch_all([one.contact for one in asked], alone=False, tried=tried)
         laws = [self._law(one, touch, dt) for one, touch in zip(asked, touches, strict=True)]
-        out, memories = balanced(asked, laws)
+        out, memories = balanced(asked, laws, self.series.shares)
         for name, memory in state.tools.items():
             if name not in memories:
                 left = self._left(memory, dt)
