@@ -5,25 +5,43 @@ from __future__ import annotations
 import copy
 from typing import cast
 
+import numpy as np
+
 from fem_tools.few_steps import FewSteps
 from fem_tools.ladder import ladder
 from fem_tools.patch import PatchFem
-from stmpl_core.errors import InvalidInput
+from stmpl_core.errors import InvalidInput, NotPrepared
+from stmpl_core.layer import SoftLayer
+from stmpl_core.load import Load
 from stmpl_core.methods import LimbLinear, Linear, Method, MomentNet, Naive, UNet, Winkler
 from stmpl_core.methods.zero import Zero
+from stmpl_core.trust import Displacement
 from studies.own import own
 from studies.stability.scene import Make
 
 PARTS = ("prepare", "solve")  # of a method
+WANTED = 2e-4 / 7.5e-3  # error that the ladder is asked for, over the thickness: 0.2 mm of 7.5 mm
 
 
-def _ladder() -> Method:
-    return ladder(accuracy=2e-4)
+class ScaledLadder:
+    """A ladder that is asked for the same share of the thickness whatever the size: in metres a scene of another size
+    would be another question.
+    """
+
+    name = "ladder"
+
+    def prepare(self, layer: SoftLayer) -> Method:
+        """The ladder for a layer."""
+        return ladder(accuracy=WANTED * float(np.median(layer.thickness))).prepare(layer)
+
+    def solve(self, load: Load) -> Displacement:
+        """Refused: there is no layer yet."""
+        raise NotPrepared("ScaledLadder has no layer yet. Call ScaledLadder().prepare(layer) and ask what it returns.")
 
 
 METHODS: dict[str, Make] = {
     "zero": Zero, "naive": Naive, "winkler": Winkler, "linear": Linear, "limb_linear": LimbLinear,
-    "moment_net": MomentNet, "unet": UNet, "fem_1_step": FewSteps.from_network, "fem": PatchFem, "ladder": _ladder,
+    "moment_net": MomentNet, "unet": UNet, "fem_1_step": FewSteps.from_network, "fem": PatchFem, "ladder": ScaledLadder,
 }  # fmt: skip
 
 
