@@ -5,6 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from studies.stability.laws import MEANING
 from studies.stability.suite import Report, Row
 
@@ -24,33 +26,39 @@ LETTERS = {
 }  # fmt: skip
 
 
+MOST_ACROSS = 8  # squares of a line; longer axes go on in the next
+NARROW = 3  # methods up to which nothing is broken into lines
+
+
 def draw(report: Report, path: str | Path) -> Path:
-    """Draws a row an axis, a column a method; in it a square a level from easy to hard. Writes a PNG."""
+    """Draws a row an axis, a column a method; in it a square a level from easy to hard, line by line. Writes a PNG."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     methods, axes = report.methods, report.axes
-    width = {axis: len(report.cell(methods[0], axis)) for axis in axes}
-    widest = max(width.values())
-    column = widest + 1.2
-    figure = Figure(figsize=(2.6 + 0.125 * column * len(methods), 1.9 + 0.34 * len(axes)), layout="constrained")
+    trials = {axis: len(report.cell(methods[0], axis)) for axis in axes}
+    across = max(trials.values()) if len(methods) <= NARROW else min(MOST_ACROSS, max(trials.values()))
+    lines = np.array([-(-trials[axis] // across) for axis in axes])
+    first = np.append(0, np.cumsum(lines))
+    column = across + 1.2
+    figure = Figure(figsize=(2.6 + 0.125 * column * len(methods), 1.9 + 0.34 * first[-1]), layout="constrained")
     plot = figure.subplots()
     for m, method in enumerate(methods):
-        for a, axis in enumerate(axes):
+        for axis, top in zip(axes, first, strict=False):
             for k, row in enumerate(report.cell(method, axis)):
-                _square(plot, m * column + k, a, row)
+                _square(plot, m * column + k % across, top + k // across, row)
         counts = report.counts(method)
-        plot.text(m * column + widest / 2, -0.75, method, ha="center", va="bottom", fontsize=10, weight="bold")
-        plot.text(m * column + widest / 2, len(axes) - 0.1, f"{counts['flagged']} flagged\n"
+        plot.text(m * column + across / 2, -0.75, method, ha="center", va="bottom", fontsize=10, weight="bold")
+        plot.text(m * column + across / 2, first[-1] - 0.1, f"{counts['flagged']} flagged\n"
                   f"{counts['silent']} silent"
                   + "".join(f"\n{counts[o]} {o}" for o in ("needless", "crashed") if counts[o]),
                   ha="center", va="top", fontsize=8)  # fmt: skip
-    for a, axis in enumerate(axes):
+    for axis, top in zip(axes, first, strict=False):
         cell = report.cell(methods[0], axis)
         span = cell[0].level if len(cell) == 1 else f"{cell[0].level} … {cell[-1].level}"
-        plot.text(-0.8, a, f"{axis}  ", ha="right", va="bottom", fontsize=9)
-        plot.text(-0.8, a, f"{span}  ", ha="right", va="top", fontsize=7, color="0.35")
-    plot.set(xlim=(-1, column * len(methods)), ylim=(len(axes) + 0.9, -1.6))
+        plot.text(-0.8, top, f"{axis}  ", ha="right", va="bottom", fontsize=9)
+        plot.text(-0.8, top, f"{span}  ", ha="right", va="top", fontsize=7, color="0.35")
+    plot.set(xlim=(-1, column * len(methods)), ylim=(first[-1] + 0.9, -1.6))
     plot.set_axis_off()
     _legend(figure, report)
     path = Path(path)
