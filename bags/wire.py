@@ -6,6 +6,7 @@ Decoding takes rclpy's messages and those of a recording alike. Encoding imports
 from __future__ import annotations
 
 import importlib
+import math
 from array import array
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -90,19 +91,18 @@ def pose_from(pose: Any) -> Transform:
 
 def rigid(place: Sequence[float], quaternion: Sequence[float]) -> Transform:
     """Rigid transform (4, 4) of a place [m] and a quaternion x y z w. Raises as `pose_from`."""
-    xyzw = np.array(quaternion, dtype=np.float64)
-    length = float(np.sqrt(xyzw @ xyzw))
+    x, y, z, w = map(float, quaternion)  # numpy takes five times as long for four numbers
+    length = math.sqrt(x * x + y * y + z * z + w * w)
     if not abs(length - 1) <= QUATERNION_TOLERANCE:
-        raise InvalidInput(f"quaternion {xyzw.tolist()} has length {length:g}; it must be 1 (no turn: 0, 0, 0, 1).")
-    x, y, z, w = xyzw / length
-    transform = np.eye(4)
-    transform[:3, :3] = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ]
-    transform[:3, 3] = place
-    return transform
+        raise InvalidInput(f"quaternion {[x, y, z, w]} has length {length:g}; it must be 1 (no turn: 0, 0, 0, 1).")
+    x, y, z, w = x / length, y / length, z / length, w / length
+    a, b, c = place
+    return np.array([
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y), a],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x), b],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y), c],
+        [0.0, 0.0, 0.0, 1.0],
+    ], dtype=np.float64)  # fmt: skip
 
 
 def pose_of_tool(message: Any, tool: str, body_frame: str, frames: FixedFrames = NO_FRAMES) -> Transform:
@@ -358,13 +358,6 @@ def pose_message(pose: Transform, body_frame: str, stamp_ns: int) -> Any:
 def wrench_message(wrench: Wrench, frame: str, stamp_ns: int) -> Any:
     """Force [N] and torque about the tool's origin [N m] that the tool exerts on the body, as a WrenchStamped."""
     return message_class("geometry_msgs/msg/WrenchStamped")(header=header(frame, stamp_ns), wrench=_wrench(wrench))
-
-
-def update_wrench(message: Any, wrench: Wrench, stamp_ns: int) -> None:
-    """Sets wrench and stamp of a WrenchStamped that is sent over and over: making one takes 50 us, this one."""
-    f, t, stamp = message.wrench.force, message.wrench.torque, message.header.stamp
-    f.x, f.y, f.z, t.x, t.y, t.z = wrench.tolist()
-    stamp.sec, stamp.nanosec = divmod(stamp_ns, NANO)
 
 
 def tool_message(tool: Tool, stamp_ns: int) -> Any:

@@ -19,9 +19,6 @@ from collections import deque
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
-os.environ["ROS_DOMAIN_ID"] = str(1 + os.getpid() % 100)  # a bus of its own, on this machine only
-os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
-
 import numpy as np
 import rclpy
 from geometry_msgs.msg import PoseStamped, WrenchStamped
@@ -33,6 +30,7 @@ from stmpl_msgs.msg import ContactMesh, LocalContact, SkinDisplacement, SkinTopo
 from stmpl_msgs.srv import SetBody
 
 from bags.wire import header, layer_from, pose_message, stamp_ns, tool_message, wrench_message
+from benchmarks import bus
 from stmpl_core.layer import SoftLayer
 from stmpl_core.provenance import machine
 from stmpl_ros.scripts import PRESS, Motion
@@ -270,6 +268,7 @@ def main() -> None:
     given.add_argument("--rates", type=float, nargs="+", default=[100.0, 200.0, 500.0], help="of poses [Hz]")
     given.add_argument("--seconds", type=float, default=10.0, help="at each rate")
     given.add_argument("--minutes", type=float, default=0.0, help="soak at the first rate instead")
+    given.add_argument("--shared", action="store_true", help="send by shared memory, not by UDP")
     given.add_argument("--models", action="store_true", help="listen to local contacts as well")
     given.add_argument("--joints", action="store_true", help="bend the elbow beside it; the contact wrench counts")
     given.add_argument("--change-body", action="store_true", help="time ~/set_body as well")
@@ -278,6 +277,7 @@ def main() -> None:
     given.add_argument("--node", nargs="*", default=["tissue=paper"],
                        help="flags of stmpl node, as in tissue=paper edge-length=0.004")
     options = given.parse_args()
+    bus.take_own(options.shared)
     flags = [part for one in options.node for part in ("--" + one.split("=")[0], one.split("=")[1])]
     flags += ["--joint-states", "joint_states"] * options.joints
     print(f"{machine()}; load {os.getloadavg()[0]:.1f} before the run", flush=True)

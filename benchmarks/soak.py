@@ -33,7 +33,7 @@ from bags.wire import layer_from, pose_message, tool_message
 from benchmarks.crowd import EARLY, ENDINGS, Crowd, Listener
 from stmpl_core.provenance import machine
 from stmpl_ros.scripts import PRESS, Motion
-from stmpl_ros.spinning import TRANSPORTS, spin
+from stmpl_ros.spinning import TRANSPORTS, UDP, spin
 from stmpl_ros.topics import KEPT, NOW, STREAM
 
 START = 300.0  # time for the node to start [s]
@@ -177,7 +177,7 @@ def main() -> None:
     os.environ.update(ROS_DOMAIN_ID=str(options.domain), ROS_AUTOMATIC_DISCOVERY_RANGE="SUBNET")
     print(f"{machine()}; load {os.getloadavg()[0]:.1f} before the run", flush=True)
     node = subprocess.Popen([sys.executable, *options.node], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
-                            env=os.environ | {TRANSPORTS: "DEFAULT" if options.shared_memory else "UDPv4"})  # fmt: skip
+                            env=os.environ | {TRANSPORTS: "DEFAULT" if options.shared_memory else UDP})  # fmt: skip
     rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
     signal.signal(signal.SIGTERM, lambda number, frame: sys.exit(1))
     presser, executor, ended = Presser(), EventsExecutor(), threading.Event()

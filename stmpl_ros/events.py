@@ -25,8 +25,9 @@ class Events:
         self.missed_deadlines = self.lost = 0
         self.supported = True
 
-    def subscribe(self, node: Node, kind: Any, topic: str, callback: Callable, profile: QoSProfile) -> Subscription:
-        """A subscription whose events are told, as far as the middleware knows them."""
+    def subscribe(self, node: Node, kind: Any, topic: str, callback: Callable, profile: QoSProfile, *,
+                  raw: bool = False) -> Subscription:  # fmt: skip
+        """A subscription whose events are told, as far as the middleware knows them; raw: the callback gets bytes."""
         told = SubscriptionEventCallbacks(
             deadline=partial(self._on_deadline, topic) if profile.deadline.nanoseconds else None,
             matched=partial(self._on_matched, topic),
@@ -34,10 +35,10 @@ class Events:
             incompatible_qos=partial(self._on_incompatible, topic),
         )
         try:
-            return node.create_subscription(kind, topic, callback, profile, event_callbacks=told)
+            return node.create_subscription(kind, topic, callback, profile, event_callbacks=told, raw=raw)
         except UnsupportedEventTypeError:
             self.supported = False
-            return node.create_subscription(kind, topic, callback, profile)
+            return node.create_subscription(kind, topic, callback, profile, raw=raw)
 
     def _on_deadline(self, topic: str, event: Any) -> None:
         self.missed_deadlines += event.total_count_change

@@ -19,6 +19,7 @@ from stmpl_core.layer import SoftLayer
 from stmpl_core.sdf import SignedDistance
 from stmpl_core.tool import Tool
 from stmpl_core.tools import Tools
+from stmpl_ros.cdr import Read, read_pose, read_wrench
 from stmpl_ros.diagnosis import Tally
 from stmpl_ros.events import Events
 from stmpl_ros.followed import Followed
@@ -142,17 +143,29 @@ class Hearing:
         """Whether a tool is in use, or its field is being built."""
         return name in self.tools or any(tool.name == name for tool in self.tools.waiting())
 
-    def _listen(self, kind: Any, topic: str, callback: Callable, profile: Any) -> Any:
-        return self.events.subscribe(self._node, kind, topic, callback, profile)
+    def _listen(self, kind: Any, topic: str, callback: Callable, profile: Any, *, raw: bool = False) -> Any:
+        return self.events.subscribe(self._node, kind, topic, callback, profile, raw=raw)
+
+    def _read(self, read: Read, data: bytes, what: str, take: Callable[[Any], None]) -> None:
+        """Hands on the message in these bytes."""
+        try:
+            message = read(data)
+        except StmplError as error:
+            return self.gate.refuse(f"{what}, {type(error).__name__}", f"{what}: {error}")
+        take(message)
 
     def _listen_to(self, name: str) -> None:
         """Raises NameValidationException for a name that cannot be part of a topic."""
-        wrenches = self._listen(WrenchStamped, f"tools/{name}/wrench", partial(self._on_wrench, name), NEWEST)
-        self._listened[name] = [wrenches]
+        def wrench(data: bytes) -> None:
+            self._read(read_wrench, data, f"wrench of {name}", partial(self._on_wrench, name))
+
+        def pose(data: bytes) -> None:
+            self._read(read_pose, data, f"pose of {name}", partial(self._on_pose, name))
+
+        self._listened[name] = [self._listen(WrenchStamped, f"tools/{name}/wrench", wrench, NEWEST, raw=True)]
         if not self._followed.follow(name):
             poses = newest_within(self._config().deadline)
-            heard = self._listen(PoseStamped, f"tools/{name}/pose", partial(self._on_pose, name), poses)
-            self._listened[name].append(heard)
+            self._listened[name].append(self._listen(PoseStamped, f"tools/{name}/pose", pose, poses, raw=True))
 
     def _stop_listening(self, name: str) -> None:
         for subscription in self._listened.pop(name, []):

@@ -20,6 +20,7 @@ from bags.frame import Stamps
 from stmpl_core.posing import posed
 from stmpl_core.skin import Skin
 from stmpl_core.touch import APART, PRESSING, Answer, Touch
+from stmpl_ros.cdr import WrenchBytes
 from stmpl_ros.gate import Gate
 from stmpl_ros.inbox import Instant
 from stmpl_ros.parameters import NodeConfig
@@ -50,7 +51,7 @@ class Sending:
         self._displacement = managed(node, SkinDisplacement, "skin/displacement", ANSWERS)
         self._deformed = managed(node, SkinDeformed, "skin/deformed", STREAM)
         self._wrenches: dict[str, Publisher] = {}
-        self._wrench = wire.wrench_message(np.zeros(6), config.frame, 0)  # sent over and over
+        self._wrench = WrenchBytes(config.frame)
         self.show = Show(node, skin.layer, config.frame, config.marker_rate)
         self.models = Models(node, config.frame, workshop, gate)
         self._sequence = 0
@@ -125,8 +126,7 @@ class Sending:
     def _send_wrench(self, name: str, wrench: np.ndarray, stamp: int) -> None:
         publisher = self._wrenches.get(name)
         if publisher and publisher.get_subscription_count():
-            wire.update_wrench(self._wrench, wrench, stamp)
-            publisher.publish(self._wrench)
+            publisher.publish(self._wrench.of(wrench, stamp))
 
 
 class Models:

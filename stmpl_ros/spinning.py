@@ -12,10 +12,12 @@ from types import FrameType
 import rclpy
 from rclpy.executors import Executor, ExternalShutdownException
 from rclpy.signals import SignalHandlerOptions
+from rclpy.task import Future
 from rclpy.utilities import ok, try_shutdown
 
 POLL_PERIOD_S = 0.1  # time between two looks of a spinning process whether it is to stop
 TRANSPORTS = "FASTDDS_BUILTIN_TRANSPORTS"  # variable by which a person chooses another: DEFAULT
+UDP = "UDPv4?sockets_size=4MB"  # an answer overflows the usual 212 kB of a socket; what is lost is sent again, late
 
 
 @contextmanager
@@ -28,7 +30,7 @@ def ros(arguments: list[str] | None = None) -> Iterator[threading.Event]:
     Messages go by UDP unless a person chose otherwise: by the shared memory of Fast DDS 2.14 a listener that is killed,
     or starved for a second, can leave its sender waiting for a lock of its own for ever (docs/laboratory/node.md).
     """
-    os.environ.setdefault(TRANSPORTS, "UDPv4")
+    os.environ.setdefault(TRANSPORTS, UDP)
     stop = threading.Event()
 
     def ask(_signal: int, _frame: FrameType | None) -> None:
@@ -67,9 +69,22 @@ def interruptible(stop: threading.Event) -> Iterator[None]:
 
 
 def spin(executor: Executor, stop: threading.Event) -> None:
-    """Runs callbacks until `stop` is set or ROS shuts down."""
+    """Runs callbacks until `stop` is set or ROS shuts down.
+
+    One call of the executor runs many callbacks: leaving and entering it for each takes as long as rclpy's share of a
+    small one. Python's handlers of signals run between two callbacks, or two polls.
+    """
+    polls = [Future()]
+
+    def end() -> None:
+        stop.wait()
+        polls[0].set_result(None)  # else an executor that always has something to do would not come back
+
+    threading.Thread(target=end, name="stop", daemon=True).start()
     try:
         while not stop.is_set() and ok():
-            executor.spin_once(timeout_sec=POLL_PERIOD_S)
+            polls[0] = Future()
+            if not stop.is_set():  # between the two the thread may have ended the last poll
+                executor.spin_until_future_complete(polls[0], timeout_sec=POLL_PERIOD_S)
     except ExternalShutdownException:
         pass
