@@ -2,6 +2,7 @@
 
 import importlib.util
 import json
+import re
 from pathlib import Path
 
 import numpy as np
@@ -141,6 +142,10 @@ def test_a_robot_of_ones_own_is_driven_and_what_it_lacks_is_said(forearm: SoftLa
         build(forearm, site, robot=path, end="gripper")
     with pytest.raises(InvalidInput, match="does not reach the limb"):
         build(forearm, site, robot=path, at=(3.0, 0, 0))
+    far = tmp_path / "millimetres.urdf"
+    far.write_text(re.sub(r'xyz="0 0 (0\.\d+)"', r'xyz="0 0 \g<1>e3"', path.read_text()))
+    with pytest.raises(InvalidInput, match=r"links are .* m long in all\. Is its file in millimetres"):
+        build(forearm, site, robot=far, at=(0.3, 0.1, 0.1))
     with pytest.raises(InvalidInput, match="no robot file"):
         build(forearm, site, robot=tmp_path / "nothing.xml")
     path.write_text("<robot><link>")
