@@ -258,7 +258,7 @@ PRESETS = {
     "default": Plan(preset="default", discs=150, ellipses=24, seams=44, fields=40, indenters=5),
     "paper": Plan(preset="paper", bodies=PAPER_BODIES + VARYING_BODIES[:2], indenters=40),
     "tables": Plan(preset="tables", discs=12, ellipses=3, seams=4, fields=3, hands=80, bands=8, letters=55,
-                   bodies=PAPER_BODIES + VARYING_BODIES + tuple(
+                   bodies=PAPER_BODIES + VARYING_BODIES[:4] + tuple(
                        body.model_copy(update={"share": 1.0}) for body in OTHER_LIMBS), shares=(0.2, 0.2), seed=NEW),
     "contacts": Plan(preset="contacts", bodies=CONTACT_BODIES, discs=0, ellipses=0, seams=0, hands=0, bands=0,
                      letters=0, tools=60, loads=8, deepest=0.9, indenter_step=0.08),
