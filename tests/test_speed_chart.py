@@ -131,7 +131,7 @@ def test_a_chart_is_kept_drawn_and_put_on_a_page(chart, tmp_path):
     assert Image.open(draw(again, tmp_path / "chart.png")).size[0] > 400
     assert Image.open(draw_break_even(break_even(again), tmp_path / "even.png")).size[0] > 400
     page = write_page(again, tmp_path / "chart.html").read_text()
-    assert page.count("<svg") == 2 and page.count("<circle") == 4 and "it takes no layer" in page
+    assert page.count("<svg") == 2 and page.count("<circle") == 6 and "it takes no layer" in page
     assert "http" not in page.replace("http-equiv", ""), "it needs nothing else"
     for panel in page.split("<figure>")[1:]:
         ET.fromstring(_quoted(panel.split("</figure>")[0]))
