@@ -333,7 +333,7 @@ def generate(
     Args:
         preset: size of the data: tiny (seconds), default (under an hour on two cores), paper (hours); contacts
             (rigid tools), tissue (the same on stacks to the bone): hours; tables (new contacts to judge by, which
-            nothing was learnt from: a quarter of an hour of one core).
+            nothing was learnt from: some twenty minutes of one core).
         out: folder of the data; data/<preset> unless given.
         workers: local processes; one a core unless given.
         scheduler: address of a Dask scheduler that does the work instead.
