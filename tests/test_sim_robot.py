@@ -314,7 +314,8 @@ def test_the_verb_prints_figures_and_leaves_log_and_film(tmp_path: Path, capsys:
     assert len(np.load(tmp_path / "log.npz")["force"]) == 1750
     assert figures["grip"]["mean_N"] == pytest.approx(10.0, abs=0.5) and figures["grip"]["lifted_m"] > 5e-3
     assert Path(figures["film"]).stat().st_size > 10_000
-    for wrong, why in ((["--rate", "5"], "allowed is 50 to 20000"), (["--force", "-1"], "above 0 N"),
+    for wrong, why in ((["--rate", "5"], "allowed is 50 to 20000"), (["--speed", "0.05"], "Is it in metres?"),
+                       (["--force", "-1"], "above 0 N"),
                        (["--robot", "nothing.urdf"], "no robot file"),
                        (["--phenotype", "weight=80"], "not from 0 to 1"),
                        (["--phenotype", "size=1"], "no phenotype; known are gender")):  # fmt: skip
