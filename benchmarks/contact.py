@@ -1,6 +1,7 @@
 """Contact against rigid tools solved by finite elements: force, pressure, area and motion; and what a step costs.
 
     .venv/bin/python -m benchmarks.contact      # prints tables, writes docs/contact.json and docs/pictures/contact.png
+    .venv/bin/python -m benchmarks.contact --tools cone star brush --finer    # these alone, elements half as long
 
 The tools are pressed straight into the 3 mm arm. None was trained on: their sizes, places and this skin are new, and
 twenty are of kinds that no training contact had. What finite elements answered is kept in data/contact_truth.
@@ -8,6 +9,7 @@ twenty are of kinds that no training contact had. What finite elements answered 
 
 from __future__ import annotations
 
+import argparse
 import json
 import time
 from collections.abc import Callable, Sequence
@@ -23,6 +25,7 @@ from rich.table import Table
 from benchmarks.strange_tools import strange_tools
 from benchmarks.tools import ball, block_letter, fingertip, flat
 from fem_tools.indenter import IndenterFem
+from fem_tools.patch import PatchFem
 from fem_tools.press import Press
 from fem_tools.scenes import Site
 from stmpl_core.body import Body
@@ -154,9 +157,9 @@ def scenes() -> list[Scene]:
     ]  # fmt: skip
 
 
-def truths(scene: Scene, layer: SoftLayer, fem: IndenterFem) -> list[Truth]:
-    """What FEM answers to a scene, as far as it may be believed; kept from the last run."""
-    path, tools = KEPT / f"{scene.name.replace(' ', '_')}.npz", scene.tools(layer)
+def truths(scene: Scene, layer: SoftLayer, fem: IndenterFem, folder: Path = KEPT) -> list[Truth]:
+    """What FEM answers to a scene, as far as it may be believed; kept in a folder from the last run."""
+    path, tools = folder / f"{scene.name.replace(' ', '_')}.npz", scene.tools(layer)
     if not path.is_file():
         answers = [one for one in fem.path(tools, np.array(DEPTHS) * THICKNESS) if one.trust.ok]
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -257,11 +260,21 @@ def timings(simulator: Simulator, scene: Scene, depth: float) -> dict[str, list[
 
 
 def main() -> None:
-    console, layer = Console(width=150), arm()
-    simulator, fem = Simulator(layer, MomentNet()), IndenterFem().prepare(layer)
+    """All tools with tables and picture, or some with the table of these."""
     every = scenes()
-    rows = [row(scene, simulator, truth) for scene in track(every, "pressing by finite elements", console=console)
-            for truth in truths(scene, layer, fem)]  # fmt: skip
+    given = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    given.add_argument("--tools", nargs="+", choices=[one.name for one in every], help="tools that are pressed; all")
+    given.add_argument("--finer", action="store_true", help="finite elements half as long")
+    options = given.parse_args()
+    console, layer = Console(width=150), arm()
+    finer = PatchFem(refine=4, layers=2) if options.finer else None
+    simulator, fem = Simulator(layer, MomentNet()), IndenterFem(finer).prepare(layer)
+    some = [one for one in every if not options.tools or one.name in options.tools]
+    rows = [row(scene, simulator, truth) for scene in track(some, "pressing by finite elements", console=console)
+            for truth in truths(scene, layer, fem, KEPT / "finer" if finer else KEPT)]  # fmt: skip
+    if options.tools or options.finer:
+        console.print(_table(rows))
+        return
     times = {scene.name: timings(simulator, scene, 0.4 * THICKNESS) for scene in every if not scene.strange}
     console.print(_table(rows))
     console.print(_summary(rows))

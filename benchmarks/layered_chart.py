@@ -113,7 +113,7 @@ def alone(layer: SoftLayer) -> SoftLayer:
 
 def simpler(layer: SoftLayer, columns: bool) -> Solver:
     """The linear response, or columns each for itself; their motion is that of the same pressures."""
-    laws = Laws(layer, None)
+    laws = Laws(layer, {})
     under, green, modulus = laws.simulator.toucher.columns, Green.of(layer), layer.tissue.youngs_modulus
 
     def answer(one: Pressed) -> tuple[np.ndarray, np.ndarray]:

@@ -18,7 +18,7 @@ import itertools
 import json
 import logging
 from collections import defaultdict
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
@@ -50,7 +50,7 @@ LIMBS = {  # rows of scenes: what splits, and how the limbs are called; a networ
 }
 DEPTHS = (0.0, 0.1, 0.3, 0.6, 1.0)  # over the thickness, between which --kept takes means
 PEER_AT = (0.2, 0.4)  # depths at which a peer is asked [thicknesses]
-PEER = "studies/peers/layered_flex.py:ball"
+PEER, FLEX = "MuJoCo flex, the limb's mesh", "studies/peers/layered_flex.py:ball"
 MOVES = 0.1  # motion that counts as such, over the peak
 Answer = Callable[[SoftLayer, Tool, np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray | None]]
 
@@ -93,8 +93,8 @@ def met(simulator: Simulator, one: Pressed) -> Touch:
 class Laws:
     """The laws that are compared, on one limb."""
 
-    def __init__(self, layer: SoftLayer, other: Answer | None) -> None:
-        self.layer, self.other = layer, other
+    def __init__(self, layer: SoftLayer, others: Mapping[str, Answer]) -> None:
+        self.layer, self.others = layer, others
         self.simulator = Simulator(layer, MomentNet())
         self.net = self.simulator.toucher.net
         self.modulus = np.array([confined_modulus(layer.tissue, float(t)) for t in layer.thickness])
@@ -119,14 +119,14 @@ class Laws:
         if len(nodes.area):
             out["its linear part"] = off(one, force_of(layer, nodes, self.linear(nodes)), None)
             out["elastic foundation"] = off(one, force_of(layer, nodes, self.columns(nodes)), None)
-        if self.other is not None:
-            force, motion = self.other(layer, one.tool, one.pose, one.way)
+        for name, other in self.others.items():
+            force, motion = other(layer, one.tool, one.pose, one.way)
             if np.isfinite(force).all():  # else it has no answer
-                out["yours"] = off(one, force, motion)
+                out[name] = off(one, force, motion)
         return out
 
 
-def compare(released: Released, splits: Sequence[str], names: tuple[str, ...], other: Answer | None,
+def compare(released: Released, splits: Sequence[str], names: tuple[str, ...], others: Mapping[str, Answer],
             balls: bool = False) -> dict[str, list[Off]]:  # fmt: skip
     """All laws on the scenes of some splits on limbs of such names, where finite elements know the pressure.
 
@@ -134,7 +134,7 @@ def compare(released: Released, splits: Sequence[str], names: tuple[str, ...], o
         released: contacts.
         splits: splits of which scenes count.
         names: beginnings of the limbs' names.
-        other: law that is compared too.
+        others: laws that are compared too, by name.
         balls: choice of balls alone, in the middle of their depths.
     """
     found: dict[str, list[Off]] = defaultdict(list)
@@ -147,7 +147,7 @@ def compare(released: Released, splits: Sequence[str], names: tuple[str, ...], o
     with steps_bar("scenes") as show:
         for k, one in enumerate(pressed(samples)):
             if laws is None or last is not one.sample.layer:
-                laws, last = Laws(one.sample.layer, other), one.sample.layer
+                laws, last = Laws(one.sample.layer, others), one.sample.layer
             if seen(one, laws.net) is not None:
                 for name, result in laws.answers(one).items():
                     found[name].append(result)
@@ -224,8 +224,8 @@ def main() -> None:
         print(f"{export(released.samples(), options.export)} scenes in {options.export}")
         return
     try:
-        law = str(FILE.parents[1] / PEER) if options.peer else options.answers
-        other = own(law) if law else None
+        laws = {PEER: str(FILE.parents[1] / FLEX)} if options.peer else {"yours": options.answers}
+        others = {name: own(law) for name, law in laws.items() if law}
     except InvalidInput as error:
         given.error(str(error))
     for kind in options.limbs if options.kept else ():
@@ -235,10 +235,7 @@ def main() -> None:
         Console(width=130).print(kept(kind, samples))
     for kind in () if options.kept else options.limbs:
         splits, names = LIMBS[kind]
-        found = compare(released, splits, names, other, balls=options.peer)
-        if options.peer and "yours" in found:
-            found["MuJoCo flex, the limb's mesh"] = found.pop("yours")
-        Console(width=130).print(table(kind, found))
+        Console(width=130).print(table(kind, compare(released, splits, names, others, balls=options.peer)))
 
 
 if __name__ == "__main__":

@@ -31,6 +31,7 @@ Split = Literal["train", "val", "test", "ood", "held_out"]
 IN_DISTRIBUTION: tuple[SetName, ...] = ("disc", "ellipse", "seam", "field", "indenter", "tool")
 OUT_OF_DISTRIBUTION: tuple[SetName, ...] = ("hand", "band", "letter")
 SHARES = (0.8, 0.9)  # of the contacts of a set on a body: training up to the first, validation up to the second
+NEW = 1  # seed of contacts that judge: no network has learnt from one of that seed
 ATTEMPTS = 60  # at a contact before it is given up
 RADII = (5e-3, 20e-3)  # m, of discs and of the larger semi-axis of ellipses
 ASPECTS = (1.3, 3.0)  # of ellipses
@@ -203,6 +204,7 @@ class Plan(BaseModel):
         discs, ellipses, seams, fields, indenters, tools: numbers of contacts a body, by set.
         hands, bands, letters: numbers of contacts in all, by set, shared among the bodies.
         loads, loads_out_of_distribution: numbers of loads of each contact.
+        shares: shares of the contacts up to which they are for training, and for validation [-]; the rest are tests.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -224,6 +226,7 @@ class Plan(BaseModel):
     letters: int = 273
     loads: int = Field(default=10, ge=1)
     loads_out_of_distribution: int = Field(default=5, ge=1)
+    shares: tuple[float, float] = SHARES
     highest_pressure: float = Field(default=1.5, gt=0)  # p / E, of follower pressures
     highest_nodal: float = Field(default=0.4, gt=0)  # p / E at the worst vertex, of the paper's rule
     deepest: float = Field(default=0.7, gt=0, lt=1)  # thicknesses, of indenters
@@ -254,6 +257,9 @@ PRESETS = {
                  fields=1, indenters=1, hands=1, bands=1, letters=1, loads=3, loads_out_of_distribution=2),
     "default": Plan(preset="default", discs=150, ellipses=24, seams=44, fields=40, indenters=5),
     "paper": Plan(preset="paper", bodies=PAPER_BODIES + VARYING_BODIES[:2], indenters=40),
+    "tables": Plan(preset="tables", discs=12, ellipses=3, seams=4, fields=3, hands=80, bands=8, letters=55,
+                   bodies=PAPER_BODIES + VARYING_BODIES[:4] + tuple(
+                       body.model_copy(update={"share": 1.0}) for body in OTHER_LIMBS), shares=(0.2, 0.2), seed=NEW),
     "contacts": Plan(preset="contacts", bodies=CONTACT_BODIES, discs=0, ellipses=0, seams=0, hands=0, bands=0,
                      letters=0, tools=60, loads=8, deepest=0.9, indenter_step=0.08),
     "tissue": Plan(preset="tissue", bodies=TISSUE_BODIES + _drawn_bodies(DRAWN) + LIVING_BODIES, discs=0,
@@ -300,7 +306,7 @@ def split_of(plan: Plan, contact: ContactId) -> Split:
         return "held_out"
     count = plan.count(contact.set, contact.body)
     place = (_shuffled(plan.seed, contact.body, contact.set, count)[contact.number] + 0.5) / count
-    return "train" if place < SHARES[0] else "val" if place < SHARES[1] else "test"
+    return "train" if place < plan.shares[0] else "val" if place < plan.shares[1] else "test"
 
 
 @cache

@@ -267,8 +267,8 @@ class Body:
         pattern = PARTS.get(part, re.escape(part))
         columns = [k for k, bone in enumerate(self.bones) if re.fullmatch(pattern, bone)]
         if not columns:
-            raise InvalidInput(f"unknown part {part!r}. Available: {', '.join(self.parts)}; "
-                               f"or one bone of: {', '.join(self.bones)}.")
+            raise InvalidInput(f"unknown part {part!r}. Available: {', '.join(self.parts or self.bones)}; "
+                               f"or a bone by its name, of {len(self.bones)} in Body.bones.")
         return self.weights[:, columns].sum(axis=1) - 0.5
 
     def _level_around(self, part: str) -> np.ndarray:

@@ -113,12 +113,14 @@ def region(name: str, tone: Tone = "relaxed") -> Region:
     """A region of a typical adult's body.
 
     Args:
-        name: name of the region: forearm, upper_arm, shoulder, neck, back, abdomen, thigh or calf.
+        name: name of the region: forearm, upper_arm, shoulder, neck, back, abdomen, thigh or calf; or of a body's part
+            that is one, with its side: left_forearm.
         tone: state of the muscle: relaxed or tensed.
 
     Raises:
         InvalidInput: a region or a tone that is not listed.
     """
+    name = name.removeprefix("left_").removeprefix("right_")
     if name not in REGIONS:
         raise InvalidInput(f"there is no region '{name}'. Regions: {', '.join(REGIONS)}.")
     if tone not in get_args(Tone):

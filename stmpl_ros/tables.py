@@ -157,7 +157,7 @@ def part_figures(name: str) -> dict[str, Any]:
     from stmpl_core.regions import region
 
     both = [region(name), region(name, "tensed")]
-    return {"part": name, "where": both[0].where, "fat": _fat(name)} | {
+    return {"part": name, "where": both[0].where, "fat": _fat(both[0].name)} | {
         one.tone: {
             "quantities": {key: asdict(quantity) for key, quantity in one.quantities.items()},
             "thickness": one.thickness,
@@ -224,7 +224,7 @@ def part_table(name: str) -> Table:
             ("pull = T / (E t)", "", "pull", 1.0, "with effective E and t"),
             ("stiffness", "N/mm", "ball_stiffness", 1e-3,
              f"linear response to a ball of {BALL_RADIUS * 1e3:g} mm, {BALL_DEPTH * 1e3:g} mm deep")]  # fmt: skip
-    fat = _fat(name)
+    fat = _fat(relaxed.name)
     table.add_section()
     for side in ("front", "back"):
         if side in fat:

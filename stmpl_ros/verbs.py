@@ -318,7 +318,7 @@ def recover(path: BagPath, target: Path | None = None) -> int:
 
 
 def generate(
-    preset: Literal["tiny", "default", "paper", "contacts", "tissue"] = "default",
+    preset: Literal["tiny", "default", "paper", "contacts", "tissue", "tables"] = "default",
     out: Path | None = None,
     workers: int | None = None,
     scheduler: str | None = None,
@@ -332,7 +332,8 @@ def generate(
 
     Args:
         preset: size of the data: tiny (seconds), default (under an hour on two cores), paper (hours); contacts
-            (rigid tools), tissue (the same on stacks to the bone): hours.
+            (rigid tools), tissue (the same on stacks to the bone): hours; tables (new contacts to judge by, which
+            nothing was learnt from: some twenty minutes of one core).
         out: folder of the data; data/<preset> unless given.
         workers: local processes; one a core unless given.
         scheduler: address of a Dask scheduler that does the work instead.

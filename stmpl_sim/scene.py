@@ -29,6 +29,7 @@ AIM = np.array([-0.03, 0.0, 0.045])  # point that it looks at, from the site [m]
 COLOURS = 256  # texels of the skin's colour scale
 ELBOW_DAMPING = 0.05  # of the hinge of a limb on a rest [N m s/rad]
 ROOM = 0.08  # distance of a start's joints from their limits, over their ranges, beyond which no other start is tried
+LONGEST = 10.0  # length of a robot's links beyond which its file is taken to be in millimetres [m]
 STARTS, STEPS = 40, 200  # starts that are tried at most, and steps from each
 
 Mount = Literal["fixed", "springs", "animated", "rest"]
@@ -110,7 +111,8 @@ def build(
     try:
         model = spec.compile()
     except ValueError as error:
-        raise InvalidInput(f"MuJoCo cannot compile the scene: {' '.join(str(error).split())}") from error
+        what = " Give each link that a joint moves its <inertial>." if "mjMINVAL" in str(error) else ""
+        raise InvalidInput(f"MuJoCo cannot compile the scene: {' '.join(str(error).split())}.{what}") from error
     joints = tuple(model.joint(joint.name).id for joint in chain)
     qpos = _reach(model, joints, site, np.array(at), radius + above)
     return Scene(model, layer, site, joints, qpos, radius, tools)
@@ -322,5 +324,10 @@ def _reach(model: Any, joints: tuple[int, ...], site: Site, at: np.ndarray, heig
             return found[-1][1]
     if found:
         return max(found, key=lambda one: one[0])[1]
-    raise InvalidInput(f"the robot's head does not reach the limb at {np.round(at, 3).tolist()} m, pointing down. "
-                       "Put the limb elsewhere (--at X Y Z), or name another end (--end).")  # fmt: skip
+    body, long = model.geom_bodyid[ball], 0.0
+    while body:
+        long, body = long + float(np.linalg.norm(model.body_pos[body])), model.body_parentid[body]
+    what = ("Is its file in millimetres? MuJoCo takes metres." if long > LONGEST else
+            "Put the limb elsewhere (--at X Y Z), or name another end (--end).")  # fmt: skip
+    raise InvalidInput(f"the robot's head does not reach the limb at {np.round(at, 3).tolist()} m, pointing down; its "
+                       f"links are {long:.3g} m long in all. {what}")  # fmt: skip

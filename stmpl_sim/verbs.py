@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from stmpl_sim.massage import Log, Massage
 
 FILM_RATE = 20.0  # frames a second
+LEAST_MM = 0.5  # least radius and speed of the verb [mm, mm/s]: what is told in metres is smaller
 SINGLE_MODULUS = 20e3  # Young's modulus of the limb of one material [Pa]
 ros_arguments: list[str] = []  # arguments of ROS, from --ros-args on; this verb has no use for them
 
@@ -75,6 +76,10 @@ def sim(
     needed("stmpl sim", "sim", "mujoco")
     if not 50 <= rate <= 20_000:
         raise InvalidInput(f"--rate is {rate:g} Hz; allowed is 50 to 20000.")
+    for flag, value in (("radius", radius), ("circle", circle), ("speed", speed)):
+        if 0 < value < LEAST_MM:
+            raise InvalidInput(f"--{flag} is {value:g}, told in millimetres; at least {LEAST_MM:g} is accepted. "
+                               "Is it in metres? Scale it by 1e3.")  # fmt: skip
     from stmpl_core.friction import friction_from
     from stmpl_sim.grip import mount_of, usual_force
     from stmpl_sim.massage import Course, Massage

@@ -136,6 +136,9 @@ def test_the_presets_are_as_large_as_they_say() -> None:
     assert samples(PRESETS["paper"], None, "nodal") == 132_750  # five bodies of constant thickness, as the paper
     assert samples(PRESETS["default"], "train", "pressure", "nodal") >= 20_000
     assert samples(PRESETS["default"], "test", "pressure") >= 2_000
+    judges = PRESETS["tables"]  # new contacts: none of the data that networks learn from, whatever its split
+    assert samples(judges, "test", "nodal") >= 400
+    assert judges.seed not in {plan.seed for plan in PRESETS.values() if plan is not judges}
     assert (PRESETS["default"].hands, PRESETS["default"].bands, PRESETS["default"].letters) == (395, 40, 273)
 
 

@@ -5,6 +5,9 @@ import runpy
 import shlex
 import shutil
 from collections.abc import Iterator
+from contextlib import redirect_stdout
+from functools import cache
+from io import StringIO
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +25,9 @@ MOST_WORDS = 700
 PYTHON = re.compile(r"^```python\n(.*?)^```", flags=re.M | re.S)
 
 
+BLOCK = re.compile(r"^( *)```\w*\n(.*?)^\1```", flags=re.M | re.S)
+OURS = r"(stmpl (?=[a-z])|python -m (?=benchmarks|studies)|python (?=docs/|examples/))"  # commands
+NAMED = re.compile(rf"(?:\w+=\S+ )*(?:\.venv/bin/)?{OURS}(.+)")
 STEP = re.compile(r"^( *)```(sh|python)\n(.*?)^\1```", flags=re.M | re.S)
 
 
@@ -63,6 +69,41 @@ def walk(page: str, skip: str = "") -> dict[str, Any]:
 def lines_of_the_tutorial() -> list[str]:
     blocks = re.findall(r"^```sh\n(.*?)^```", (ROOT / "docs" / "tutorial.md").read_text(), flags=re.M | re.S)
     return [line for block in blocks for line in block.splitlines()]
+
+
+def named(page: Path) -> Iterator[tuple[str, list[str]]]:
+    """Kind (stmpl, a module or a file) and words of each of our commands that a page names."""
+    text = page.read_text().replace("\\\n", " ")
+    rest = BLOCK.sub("", text)
+    lines = [line for _, block in BLOCK.findall(text) for line in block.splitlines()]
+    lines += re.findall(r"^    (.+)$", rest, flags=re.M) + re.findall(r"`([^`]+)`", rest)
+    for line in lines:
+        if told := NAMED.match(" ".join(line.split())):
+            yield told[1].strip(), shlex.split(told[2].removesuffix("&"), comments=True)
+
+
+@cache
+def help_of(verb: str) -> str:
+    """What `stmpl VERB --help` prints."""
+    with pytest.raises(SystemExit), redirect_stdout(StringIO()) as printed:
+        main([verb, "--help"])
+    return printed.getvalue()
+
+
+NOW = [page for page in PAGES if page.name != "CHANGELOG.md"] + [ROOT / "benchmarks" / "limbs.md"]
+
+
+@pytest.mark.parametrize("page", NOW, ids=lambda page: str(page.relative_to(ROOT)))
+def test_pages_name_commands_with_options_that_exist(page: Path) -> None:
+    for kind, (name, *arguments) in named(page):
+        file = ROOT / (f"{name.replace('.', '/')}.py" if kind.endswith("-m") else name)
+        if kind != "stmpl" and not file.is_file():
+            file = file.with_suffix("") / "__main__.py"
+        known = help_of(name) if kind == "stmpl" else file.read_text()
+        asked = arguments[: arguments.index("--ros-args")] if "--ros-args" in arguments else arguments
+        for option in (word for word in asked if word.startswith("--")):
+            flag = option.split("=")[0]
+            assert re.search(rf"{re.escape(flag)}\b", known), f"{page.name}: {kind} {name} has no {flag}"
 
 
 @pytest.mark.parametrize("line", lines_of_the_tutorial())

@@ -50,6 +50,10 @@ def test_no_region_is_a_single_layer(name):
     assert near.bare.motion > 0.2 and near.misfit.motion < near.bare.motion
 
 
+def test_a_part_with_its_side_is_of_its_region():
+    assert region("left_upper_arm", "tensed") == region("upper_arm", "tensed")
+
+
 @pytest.mark.parametrize("asked, says", [(("knee",), "Regions: forearm"), (("back", "asleep"), "Tones: relaxed")])
 def test_what_is_not_listed_is_refused_with_what_is(asked, says):
     with pytest.raises(InvalidInput, match=says):

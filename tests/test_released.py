@@ -168,7 +168,7 @@ def test_a_law_of_ones_own_is_judged_like_ours(monkeypatch: pytest.MonkeyPatch, 
     assert limbs.off(scene, force, motion)[:3] == (0, 0, 0)
     half = limbs.off(scene, 0.5 * force, 0.5 * motion)
     assert half.force == pytest.approx(-0.5) and half.worst == pytest.approx(0.5) and 0.05 < half.moves < 0.5
-    laws = limbs.Laws(scene.sample.layer, lambda layer, tool, pose, way: (0.9 * force, None))
+    laws = limbs.Laws(scene.sample.layer, {"yours": lambda layer, tool, pose, way: (0.9 * force, None)})
     found = laws.answers(scene)
     assert found["yours"].force == pytest.approx(-0.1) and np.isnan(found["yours"].worst)
     assert abs(found["moment_net"].force) < abs(found["elastic foundation"].force)
@@ -181,7 +181,7 @@ def test_the_bound_on_force_covers_backs_and_people(bodies: tuple[str, ...]) -> 
     """Of people an upper arm and a thigh, which were missed most before the bound knew how even a limb is."""
     scenes = [one for split in ("test", "val") for one in Released(limbs.FILE).samples(split)
               if one.info["body"] in bodies and limbs.slant_of(one) <= limbs.STRAIGHT]  # fmt: skip
-    made = {one.info["body"]: limbs.Laws(one.layer, None) for one in scenes}
+    made = {one.info["body"]: limbs.Laws(one.layer, {}) for one in scenes}
     off = []
     for one in limbs.pressed(scenes):
         laws = made[one.sample.info["body"]]

@@ -2,6 +2,7 @@
 
 import importlib.util
 import json
+import re
 from pathlib import Path
 
 import numpy as np
@@ -141,6 +142,10 @@ def test_a_robot_of_ones_own_is_driven_and_what_it_lacks_is_said(forearm: SoftLa
         build(forearm, site, robot=path, end="gripper")
     with pytest.raises(InvalidInput, match="does not reach the limb"):
         build(forearm, site, robot=path, at=(3.0, 0, 0))
+    far = tmp_path / "millimetres.urdf"
+    far.write_text(re.sub(r'xyz="0 0 (0\.\d+)"', r'xyz="0 0 \g<1>e3"', path.read_text()))
+    with pytest.raises(InvalidInput, match=r"links are .* m long in all\. Is its file in millimetres"):
+        build(forearm, site, robot=far, at=(0.3, 0.1, 0.1))
     with pytest.raises(InvalidInput, match="no robot file"):
         build(forearm, site, robot=tmp_path / "nothing.xml")
     path.write_text("<robot><link>")
@@ -309,7 +314,8 @@ def test_the_verb_prints_figures_and_leaves_log_and_film(tmp_path: Path, capsys:
     assert len(np.load(tmp_path / "log.npz")["force"]) == 1750
     assert figures["grip"]["mean_N"] == pytest.approx(10.0, abs=0.5) and figures["grip"]["lifted_m"] > 5e-3
     assert Path(figures["film"]).stat().st_size > 10_000
-    for wrong, why in ((["--rate", "5"], "allowed is 50 to 20000"), (["--force", "-1"], "above 0 N"),
+    for wrong, why in ((["--rate", "5"], "allowed is 50 to 20000"), (["--speed", "0.05"], "Is it in metres?"),
+                       (["--force", "-1"], "above 0 N"),
                        (["--robot", "nothing.urdf"], "no robot file"),
                        (["--phenotype", "weight=80"], "not from 0 to 1"),
                        (["--phenotype", "size=1"], "no phenotype; known are gender")):  # fmt: skip

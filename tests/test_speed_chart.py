@@ -1,6 +1,7 @@
 """The chart of speed against accuracy: every point measured, the front right, failures shown, the pictures there."""
 
 import math
+import time
 import xml.etree.ElementTree as ET
 from dataclasses import replace
 
@@ -39,6 +40,15 @@ class Stuck(Linear):
         return Displacement(answer.displacement, Trust(converged=False, why="stuck"), self.name)
 
 
+class Compiles(Winkler):
+    """A method whose first solve takes half a second longer than the others."""
+
+    def solve(self, load):
+        time.sleep(0.0 if hasattr(self, "compiled") else 0.5)
+        self.compiled = True
+        return super().solve(load)
+
+
 @pytest.fixture(scope="module")
 def chart() -> Chart:
     curves = (
@@ -46,6 +56,7 @@ def chart() -> Chart:
         Curve("reference", "-", (("-", PatchFem),), fast=False),
         Curve("refuses", "-", (("-", Refuses),)),
         Curve("stuck", "-", (("-", Stuck),)),
+        Curve("compiles", "-", (("-", Compiles),)),
         Curve("a peer", "-", (("-", Winkler),), extra="no_such_package"),
     )
     return measure(SMALL, curves, reference=PatchFem())
@@ -65,13 +76,15 @@ def test_a_run_that_was_stopped_goes_on(tmp_path):
 
 
 def test_every_step_is_measured_on_every_scene_and_what_is_not_installed_is_named(chart):
-    assert len(chart.points) == 4 * 2 and chart.about["missing"] == ["a peer (no no_such_package)"]
+    assert len(chart.points) == 5 * 2 and chart.about["missing"] == ["a peer (no no_such_package)"]
     for point in chart.points:
         if point.curve == "reference":
             assert point.error < 1e-4 and point.largest < 1e-3 and point.seconds > 0 and not point.failed
         if point.curve == "Winkler":
             assert 0.02 < point.error < 0.8 and not math.isnan(point.contact) and not point.failed
             assert point.error <= point.largest
+        if point.curve == "compiles":
+            assert point.seconds < 0.1  # what compiles is paid once
 
 
 def test_what_fails_is_a_point_that_says_why(chart):
@@ -118,7 +131,7 @@ def test_a_chart_is_kept_drawn_and_put_on_a_page(chart, tmp_path):
     assert Image.open(draw(again, tmp_path / "chart.png")).size[0] > 400
     assert Image.open(draw_break_even(break_even(again), tmp_path / "even.png")).size[0] > 400
     page = write_page(again, tmp_path / "chart.html").read_text()
-    assert page.count("<svg") == 2 and page.count("<circle") == 4 and "it takes no layer" in page
+    assert page.count("<svg") == 2 and page.count("<circle") == 6 and "it takes no layer" in page
     assert "http" not in page.replace("http-equiv", ""), "it needs nothing else"
     for panel in page.split("<figure>")[1:]:
         ET.fromstring(_quoted(panel.split("</figure>")[0]))
