@@ -41,7 +41,8 @@ class ScaledLadder:
 
 METHODS: dict[str, Make] = {
     "zero": Zero, "naive": Naive, "winkler": Winkler, "linear": Linear, "limb_linear": LimbLinear,
-    "moment_net": MomentNet, "unet": UNet, "fem_1_step": FewSteps.from_network, "fem": PatchFem, "ladder": ScaledLadder,
+    "moment_net": MomentNet, "unet": UNet, "fem_1_step": FewSteps.from_network, "fem": PatchFem,
+    "ladder": cast(Make, ScaledLadder),
 }  # fmt: skip
 
 
