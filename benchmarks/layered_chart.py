@@ -183,7 +183,7 @@ def flex(layer: SoftLayer, refine: int) -> Solver:
 def solvers(plan: Plan, body: str, layer: SoftLayer) -> Iterator[tuple[str, str, Callable[[], Solver]]]:
     """Curve, setting, and what prepares the solver."""
     yield "elastic foundation", "", lambda: simpler(layer, columns=True)
-    yield "our linear part", "", lambda: simpler(layer, columns=False)
+    yield "ours without its network", "", lambda: simpler(layer, columns=False)
     yield ONE_LAYER, "", lambda: ours(alone(layer))
     yield OURS, "the limb's mesh", lambda: ours(layer)
     yield OURS, "a coarser mesh", lambda: ours(layer, COARSER)

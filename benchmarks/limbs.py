@@ -99,8 +99,8 @@ class Laws:
         self.net = self.simulator.toucher.net
         self.modulus = np.array([confined_modulus(layer.tissue, float(t)) for t in layer.thickness])
 
-    def linear(self, nodes: Nodes) -> np.ndarray:
-        """Pressure of the linear response at contact nodes, (N,) [Pa]."""
+    def unlearnt(self, nodes: Nodes) -> np.ndarray:
+        """Pressure at contact nodes without the network, (N,) [Pa]."""
         return self.net.look(nodes).pressure * self.layer.tissue.youngs_modulus
 
     def columns(self, nodes: Nodes) -> np.ndarray:
@@ -117,7 +117,7 @@ class Laws:
         out["moment_net"] = off(one, touch.wrench[:3], answer.displacement, flagged=not answer.trust.in_range,
                                 bound=touch.force_bound / true)  # fmt: skip
         if len(nodes.area):
-            out["its linear part"] = off(one, force_of(layer, nodes, self.linear(nodes)), None)
+            out["without its network"] = off(one, force_of(layer, nodes, self.unlearnt(nodes)), None)
             out["elastic foundation"] = off(one, force_of(layer, nodes, self.columns(nodes)), None)
         for name, other in self.others.items():
             force, motion = other(layer, one.tool, one.pose, one.way)

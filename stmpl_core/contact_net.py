@@ -23,6 +23,8 @@ MAX_LOG_RATIO = 2.5  # largest |log| of pressure over that of the linear layer [
 AT, SAY, NODES_SEE = NODE.at, PRESSURE.at, NODE.size  # first columns, constants to numba
 ON_STACK, STACKS_SEE, SEEN_ALIKE = STACK_NODE.at, STACK_NODE.size, STACK_NODE.at.log_thickness
 LINEAR_TO = 0.6  # strain to which contact is solved; beyond it the columns' barrier takes over
+STACK_LINEAR_TO = 0.85  # likewise, on a stack
+STACK_HARDENS = 0.5  # power of its column's hardening with which a stack's pressure grows up to there
 HARDENING = 0.75  # power of the columns' pressure with which it does
 FADE, FADE_RING = 0.03, 2  # strain at and around a node at which half of the correction is left: a touch begins linear
 ROUND_FROM = 0.05  # overlap over the thickness to which curvature is compared at the least
@@ -78,7 +80,9 @@ class ContactNet:
     their own that also reads kappa, T / (E t) and how thick the tissue is; its units are those of the effective layer.
 
     Beyond LINEAR_TO of the thickness the problem is solved there, and each node's pressure rises as its confined
-    column's to the power HARDENING: it never falls as the tool goes deeper.
+    column's to the power HARDENING: it never falls as the tool goes deeper. A stack's pressure is that of the linear
+    problem times its confined column's hardening to the power STACK_HARDENS, up to STACK_LINEAR_TO: of finite elements
+    that is the mean at every depth, within 1 %, before the network says anything.
 
     Args:
         layer: soft layer at rest.
@@ -192,7 +196,7 @@ def _look_on_stack(points, inward, thickness, area, strain, corners, shares, sin
                    wide, t, numbers, log_thickness, hardening):  # fmt: skip
     """See Look; t: thickness of the effective layer [m]; numbers, log_thickness and hardening: those of a Green."""
     rings, here = rings_of(points, inward, t, group, rows), _between(corners, shares, bent)
-    depth = sinking * np.minimum(LINEAR_TO / strain, 1.0)
+    depth = sinking * np.minimum(STACK_LINEAR_TO / strain, 1.0)
     force = solve(matrix, depth)
     seen = _see_on_stack(rings, points, inward, thickness, area, t, force, strain, sinking, here, nu, numbers,
                          log_thickness, hardening, _given_way(matrix, wide, force))  # fmt: skip
@@ -217,10 +221,12 @@ def _see_on_stack(rings, points, inward, thickness, area, t, force, strain, sink
         row[ON_STACK.curvature] = alike[n, AT.mean_curvature]
         row[ON_STACK.curvature_over_strain] = alike[n, AT.mean_curvature] / (overlap[n] + ROUND_FROM)
         row[ON_STACK.given_way] = given_way
-        if strain[n] > LINEAR_TO:
-            top = _hardening(log_thickness, hardening, thickness[n], LINEAR_TO)
+        solved = min(strain[n], STACK_LINEAR_TO)
+        top = _hardening(log_thickness, hardening, thickness[n], solved)
+        pressure[n] *= np.exp(STACK_HARDENS * top)
+        if strain[n] > solved:
             there = _hardening(log_thickness, hardening, thickness[n], strain[n])
-            pressure[n] *= (strain[n] / LINEAR_TO * np.exp(there - top)) ** HARDENING
+            pressure[n] *= (strain[n] / solved * np.exp(there - top)) ** HARDENING
     return pressure, inputs, _faded(overlap, moments, STACK_FADE)
 
 
@@ -237,14 +243,14 @@ def _given_way(matrix, wide, force):
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _reached(sinking, strain, sinking_rates, strain_rates):
-    """Rates (K, N) of the depths up to LINEAR_TO [m] for which the linear problem is solved."""
+def _reached(sinking, strain, sinking_rates, strain_rates, linear_to):
+    """Rates (K, N) of the depths up to a strain [m] for which the linear problem is solved."""
     out = np.empty_like(strain_rates)
     for k in range(len(out)):
         for n in range(len(strain)):
-            over = strain[n] > LINEAR_TO
+            over = strain[n] > linear_to
             slower = sinking[n] / strain[n] * strain_rates[k, n] if over else 0.0
-            out[k, n] = (LINEAR_TO / strain[n] if over else 1.0) * (sinking_rates[k, n] - slower)
+            out[k, n] = (linear_to / strain[n] if over else 1.0) * (sinking_rates[k, n] - slower)
     return out
 
 
@@ -255,7 +261,7 @@ def _slopes(points, inward, thickness, area, strain, corners, shares, group, ben
     unit, here = thickness.mean(), _between(corners, shares, bent)
     matrix, rings = pairs(points, inward, thickness, area, group, unit, half_space, rows)
     force = solve(matrix, np.minimum(strain, LINEAR_TO) * thickness / unit)
-    rates = rates_of(matrix, force, _reached(strain * thickness, strain, sinking_rates, strain_rates) / unit)
+    rates = rates_of(matrix, force, _reached(strain * thickness, strain, sinking_rates, strain_rates, LINEAR_TO) / unit)
     seen = _see(rings, points, inward, thickness, area, unit, force, strain, here, moduli, nu)
     held = _correct(*seen, low, high, mean, scale, w1, b1, w2, b2, w3, b3, w4, b4)[0]
     out = np.empty_like(rates)
@@ -273,8 +279,8 @@ def _slopes_on_stack(points, inward, thickness, area, strain, corners, shares, s
                      w1, b1, w2, b2, w3, b3, w4, b4):  # fmt: skip
     """See ContactNet.slopes."""
     rings, here = rings_of(points, inward, t, group, rows), _between(corners, shares, bent)
-    force = solve(matrix, sinking * np.minimum(LINEAR_TO / strain, 1.0))
-    rates = rates_of(matrix, force, _reached(sinking, strain, sinking_rates, strain_rates))
+    force = solve(matrix, sinking * np.minimum(STACK_LINEAR_TO / strain, 1.0))
+    rates = rates_of(matrix, force, _reached(sinking, strain, sinking_rates, strain_rates, STACK_LINEAR_TO))
     given_way = _given_way(matrix, wide, force)
     seen = _see_on_stack(rings, points, inward, thickness, area, t, force, strain, sinking, here, nu, numbers,
                          log_thickness, hardening, given_way)  # fmt: skip

@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 import trimesh
 
 from fem_tools.dataset import Dataset
@@ -13,12 +14,13 @@ from fem_tools.scenes import Site
 from fem_tools.tool_shapes import FILLETS, any_tool
 from stmpl_core.contact_net import ContactNet
 from stmpl_core.errors import InvalidInput
-from stmpl_core.networks import Weights
+from stmpl_core.networks import NODE, PRESSURE, Weights
 from stmpl_core.sdf import SignedDistance
 from studies.judge_contact import fit_bound, score
-from studies.pressed import pressed
+from studies.pressed import Rows, pressed
 from studies.train import train
-from studies.train_contact import ContactTraining, train_contact
+from studies.train_contact import ContactTraining, loss, train_contact
+from studies.train_moments import Layers
 from tests import scenes
 
 BODY = CONTACT_BODIES[1].model_copy(update={"edge_length": 6e-3, "reach": 3.0})
@@ -153,3 +155,22 @@ def test_a_bound_holds_for_kinds_that_it_was_not_fitted_to_and_is_not_loose() ->
     others = errors(kinds + 12)
     assert np.mean(others <= known["scale"] * doubts ** known["power"]) > 0.9
     assert fit_bound(others[:10], doubts[:10], kinds[:10])["scale"] == np.inf  # too few say nothing
+
+
+def test_of_shapes_that_are_not_known_no_less_force_is_learnt() -> None:
+    rng, many, contacts = np.random.default_rng(0), 40, 41
+    one = np.full(many, 1 / many, np.float32)
+    parts = []
+    for more in np.expm1(np.linspace(-0.4, 0.4, contacts)):  # which no input tells, as no input tells the shape
+        prior, true = rng.uniform(0.2, 2.0, (2, many)).astype(np.float32)
+        prior, true = prior / prior.mean(), np.float32(1 + more) * true / true.mean()
+        corners, alone = np.tile(np.arange(many)[:, None], 3), np.tile(np.float32([1, 0, 0]), (many, 1))
+        parts.append(Rows(np.zeros((many, NODE.size), np.float32), prior, 1 + 0 * one, one, corners, alone,
+                          np.array([0, many]), true, one, np.array([0, many])))  # fmt: skip
+    model, found = Layers(4, NODE, PRESSURE), {}
+    for log_ratio in np.linspace(-0.2, 0.2, 21):
+        with torch.no_grad():
+            model.layers[-1].bias[PRESSURE.at.log_ratio] = float(log_ratio)  # type: ignore[union-attr, index]
+            found[float(log_ratio)] = float(loss(model, Rows.joined(parts), np.arange(contacts))[0])
+    best = min(found, key=lambda each: found[each])
+    assert abs(best) < 0.12, best  # 0.14 if shapes are judged as they come

@@ -20,6 +20,7 @@ OWN = wp.constant(wp.float64(obstacle.OWN))
 TOLERANCE = wp.constant(wp.float64(obstacle.TOLERANCE))
 POWER_TOLERANCE = wp.constant(wp.float64(obstacle.POWER_TOLERANCE))
 LINEAR_TO = wp.constant(wp.float64(contact_net.LINEAR_TO))
+STACK_LINEAR_TO = wp.constant(wp.float64(contact_net.STACK_LINEAR_TO))
 HARDENING = wp.constant(wp.float64(contact_net.HARDENING))
 FADE, FADE_RING = wp.constant(wp.float64(contact_net.FADE)), wp.constant(contact_net.FADE_RING)
 LARGEST = wp.constant(wp.float64(contact_net.MAX_LOG_RATIO))
@@ -75,7 +76,7 @@ def respond(lanes: wp.int32, many: wp.int32, skins: Skins, scratch: Scratch):
 def _wanted(scratch: Scratch, one: OneSkin, s: wp.int32, i: wp.int32) -> real:
     """Depth that the tool asks for, up to where the barrier takes over, over a thickness; on a stack [m]."""
     if one.stacked == 1:
-        return scratch.sinking[s, i] * wp.min(LINEAR_TO / scratch.strain[s, i], real(1.0))
+        return scratch.sinking[s, i] * wp.min(STACK_LINEAR_TO / scratch.strain[s, i], real(1.0))
     return wp.min(scratch.strain[s, i], LINEAR_TO) * scratch.thick[s, i] / one.thickest
 
 

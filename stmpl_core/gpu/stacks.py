@@ -7,7 +7,7 @@ import warp as wp
 
 from stmpl_core import contact_net, green
 from stmpl_core.columns import MIN_ONE_WAY_SHARE
-from stmpl_core.gpu.hold import FADE_RING, HARDENING, LINEAR_TO, NEAR, RINGS, STEPS, _row, _write, _write_alike
+from stmpl_core.gpu.hold import FADE_RING, HARDENING, NEAR, RINGS, STACK_LINEAR_TO, STEPS, _row, _write, _write_alike
 from stmpl_core.gpu.packs import Scratch, Skins
 from stmpl_core.gpu.rays import OPTIONS, depth_in_column, real, vec3
 from stmpl_core.networks import STACK_NODE
@@ -17,6 +17,7 @@ ONE_WAY = wp.constant(wp.float64(MIN_ONE_WAY_SHARE))
 ROWS, FARTHEST, AROUND = (wp.constant(wp.float64(x)) for x in (green.ROWS, green.FARTHEST, green.AROUND))
 FIRST_LOG, STEP_LOG = wp.constant(wp.float64(green.FIRST_LOG)), wp.constant(wp.float64(green.STEP_LOG))
 LAST_ROW = wp.constant(wp.float64(len(green.SPREADS) - 1.001))
+STACK_HARDENS = wp.constant(wp.float64(contact_net.STACK_HARDENS))
 SPREAD, LAST_AREA = wp.constant(wp.float64(SPREAD_OF_AREA)), wp.constant(wp.float64(green.AREAS - 1.001))
 MORE_AREAS = wp.constant(wp.float64(green.AREAS - 1))
 ROUND_SQUARE = wp.constant(wp.float64((green.ROUND * SPREAD_OF_AREA) ** 2))
@@ -285,9 +286,12 @@ def see(lanes: wp.int32, many: wp.int32, skins: Skins, scratch: Scratch):
         _write(scratch, s, i, AT_CURVATURE, curvature)
         _write(scratch, s, i, AT_OVER, curvature / (overlap + ROUND_FROM))
         _write(scratch, s, i, AT_GIVEN, scratch.given_way[s * many + scratch.tool[s, i]])
-        if strain > LINEAR_TO:
-            more = _hardening(skins, id, thick, strain) - _hardening(skins, id, thick, LINEAR_TO)
-            linear = linear * wp.pow(strain / LINEAR_TO * wp.exp(more), HARDENING)
+        solved = wp.min(strain, STACK_LINEAR_TO)
+        top = _hardening(skins, id, thick, solved)
+        linear = linear * wp.exp(STACK_HARDENS * top)
+        if strain > solved:
+            more = _hardening(skins, id, thick, strain) - top
+            linear = linear * wp.pow(strain / solved * wp.exp(more), HARDENING)
         scratch.pressure[s, i] = linear
         around = overlap + strains[FADE_RING]
         scratch.fade[s, i] = around / (around + STACK_FADE)
