@@ -20,6 +20,7 @@ demo: $(READY)  ## Run the main job: a robot massages a forearm over ROS 2, reco
 	$(BIN)/stmpl demo
 
 test: $(READY_DEV)  ## Pass the tests, two at a time; print the slowest, and the files of which they run least
+	$(BIN)/python -m tests.warm  # one process compiles: two at once round otherwise in the last bits
 	COVERAGE_CORE=sysmon $(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder --cov --cov-report=
 	@$(BIN)/coverage report | sed -n '1,12p;$$p'
 

@@ -76,7 +76,7 @@ def test_an_impedance_settles_on_a_forearm_and_gains_nothing_from_late_models(
 
 
 def test_late_models_by_themselves_do_give_energy(place: Place) -> None:
-    assert run(place, ForceControl(15.0), LATE, Bare()).gained > 0.01
+    assert run(place, ForceControl(20.0), LATE, Bare()).gained > 0.01
 
 
 @pytest.mark.parametrize("force, where", [(5.0, "place"), (10.0, "place"), (20.0, "place"), (30.0, "rubbing")])
