@@ -18,7 +18,7 @@ from tests.scenes import at, ball, box, limb
 
 
 def main() -> None:
-    """Touches by pose and wrench, with and without a state, their answers and models, on one material and on a stack."""
+    """Touches by pose and wrench, with and without a state, answers and models, on one material and on a stack."""
     plain = limb(4e-3, 7.5e-3)
     stack = living(Body.anny(), "left_forearm", edge_length=6e-3)
     for layer in (plain, stack):
