@@ -86,30 +86,27 @@ Read = Callable[[bytes], Any]
 
 def read_pose(data: bytes) -> Any:
     """The PoseStamped in these bytes. Raises InvalidInput if there is none."""
-    order = ORDERS.get(data[:2])
-    if order is None:
-        return deserialize_message(data, PoseStamped)
-    header, v = _stamped(data, order, 7)
-    return StampedPose(header, Pose(Vector(*v[:3]), Quaternion(*v[3:])))
+    return _read(data, PoseStamped, 7, lambda header, v: StampedPose(header, Pose(Vector(*v[:3]), Quaternion(*v[3:]))))
 
 
 def read_wrench(data: bytes) -> Any:
     """The WrenchStamped in these bytes. Raises InvalidInput if there is none."""
+    return _read(data, WrenchStamped, 6,
+                 lambda header, v: StampedWrench(header, ForceAndTorque(Vector(*v[:3]), Vector(*v[3:]))))  # fmt: skip
+
+
+def _read(data: bytes, kind: type, count: int, made: Callable[[Header, tuple[float, ...]], Any]) -> Any:
+    """What is made of the header and the numbers after it; the message by rclpy where the bytes are no plain CDR."""
     order = ORDERS.get(data[:2])
     if order is None:
-        return deserialize_message(data, WrenchStamped)
-    header, v = _stamped(data, order, 6)
-    return StampedWrench(header, ForceAndTorque(Vector(*v[:3]), Vector(*v[3:])))
-
-
-def _stamped(data: bytes, order: str, count: int) -> tuple[Header, tuple[float, ...]]:
-    """Header, and the numbers after it."""
+        return deserialize_message(data, kind)
     try:
         sec, nanosec, length = struct.unpack_from(f"{order}iII", data, STAMP_AT)
         frame = str(data[FRAME_AT : FRAME_AT + max(length - 1, 0)], "utf-8")  # it ends with a zero
-        return Header(Stamp(sec, nanosec), frame), struct.unpack_from(f"{order}{count}d", data, _aligned(length))
+        numbers = struct.unpack_from(f"{order}{count}d", data, _aligned(length))
     except (struct.error, UnicodeDecodeError) as error:
         raise InvalidInput(f"its bytes are no message of this kind: {error}") from error
+    return made(Header(Stamp(sec, nanosec), frame), numbers)
 
 
 def _aligned(length: int) -> int:

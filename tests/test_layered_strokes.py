@@ -170,10 +170,9 @@ def test_a_quick_lift_of_which_steps_are_lost_gives_back_what_it_got(
     elastic: Simulator, frame: np.ndarray, tissue: Tissue | None, speed: float, lost: float
 ) -> None:
     """Force that grows more than straight with the depth does less work than a trapezoid says, most in long steps."""
-    sim = elastic
+    sim, deep = elastic, 15.5e-3
     if tissue is not None:
-        sim = Simulator(elastic.layer.with_(tissue=tissue), MomentNet(), elastic.tools)
-    deep = {None: 15.5e-3}.get(tissue, 12.9e-3)
+        sim, deep = Simulator(elastic.layer.with_(tissue=tissue), MomentNet(), elastic.tools), 12.9e-3
     for seed in range(2):
         state, forces, factors = State(), [0.0], []
         times, depths = pressed_and_lifted(deep, speed, lost, np.random.default_rng(seed))
