@@ -306,7 +306,7 @@ def _of_one_tool(contacts: Sequence[Contact]) -> None:
     for one in contacts:
         if one.wrench is None:
             raise InvalidInput(f"an instant of {one.name} has no wrench; strokes are judged by the force.")
-        if one.tool is not contacts[0].tool:
+        if (one.name, one.tool.digest) != (contacts[0].name, contacts[0].tool.digest):
             raise InvalidInput(f"strokes are of one tool; these are of {contacts[0].name} and {one.name}.")
 
 

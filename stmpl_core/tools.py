@@ -48,6 +48,11 @@ class Tools:
         """Expects `add` of this tool, whose field is built elsewhere."""
         self._announced[tool.name] = tool
 
+    def known(self, tool: Tool) -> bool:
+        """Whether the newest surface of its name is the same, in use or announced."""
+        newest = self._announced.get(tool.name) or self._tools.get(tool.name)
+        return newest is not None and newest.digest == tool.digest
+
     def expected(self, tool: Tool) -> bool:
         """Whether this very tool was announced last under its name, and not added or removed since."""
         return self._announced.get(tool.name) is tool

@@ -69,7 +69,7 @@ class Calibration:
         if not (self.strokes and 0 <= time - self.strokes[-1].time < EVERY):
             self.strokes.append(replace(contact, time=time))
         last, moved = self.presses[-1] if self.presses else None, np.inf
-        if last is not None and last.tool is contact.tool:
+        if last is not None and last.tool.digest == contact.tool.digest:
             moved = np.abs((contact.pose_body_from_tool - last.pose_body_from_tool)[:3, 3]).max()
         if moved >= APART:
             self.presses.append(contact)
@@ -99,14 +99,15 @@ class Calibration:
             return workshop.friction(strokes) if what == "friction" else workshop.relaxation(_longest(strokes))
         if what not in ("", "stiffness"):
             raise InvalidInput(f"there is no '{what}' to calibrate. Available: stiffness, friction, relaxation.")
-        newest = {press.name: press.tool for press in self.presses}  # a tool that changed is another one
-        chosen = [press for press in self.presses if press.tool is newest[press.name]]
+        newest = {press.name: press.tool.digest for press in self.presses}  # a tool that changed is another one
+        chosen = [press for press in self.presses if press.tool.digest == newest[press.name]]
         return workshop.stiffness([press for press in chosen if tool in ("", press.name)])
 
     def _strokes(self, tool: str) -> list[Contact]:
         """The instants of a tool, empty: of the last one, in order of time."""
         chosen = [one for one in self.strokes if tool in ("", one.name)]
-        return sorted((one for one in chosen if one.tool is chosen[-1].tool), key=lambda one: one.time)
+        newest = chosen[-1].tool.digest if chosen else ""
+        return sorted((one for one in chosen if one.tool.digest == newest), key=lambda one: one.time)
 
 
 def _longest(strokes: list[Contact]) -> list[Contact]:

@@ -192,8 +192,9 @@ class Hearing:
             tool = read()
         except StmplError as error:
             return self.gate.refuse("mesh", f"mesh of '{name}' refused: {error}")
-        self.tools.announce(tool)
-        self.on_tool(tool)
+        if not self.tools.known(tool):  # sent once more, for who came late: what it touched is not forgotten
+            self.tools.announce(tool)
+            self.on_tool(tool)
 
     def _on_pose(self, name: str, message: PoseStamped) -> None:
         if self._hears(name) and self.gate.fresh(wire.stamp_ns(message), self._config().max_age):
