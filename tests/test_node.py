@@ -269,7 +269,7 @@ def test_calibrate_finds_the_friction_that_the_robots_strokes_had(bus):
         (touch,), state = robot.touch([contact_of(tool, pose, name="finger")], state, 0.02)
         assert statuses(hand.ask(pose, touch.wrench))["finger"] in (TOUCHING, MOVED)
         time.sleep(EVERY)  # instants that come sooner are not kept
-        if z == along[50]:
+        if z == along.max():  # where it turns
             bus.mesh.publish(tool_message(tool, bus.now()))  # its own surface once more, for who came late
             bus.spin(1.0)
     found = bus.call(Calibrate, "calibrate", tool="finger", what="friction")
