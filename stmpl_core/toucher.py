@@ -64,6 +64,7 @@ LEAST_STEP = 2e-4  # step of the depth, over the thickness, that is likewise onl
 MAX_DEPTH_TRIALS = 14  # trials of the depth for one wrench
 STIFFER = 1.1  # power of the depth with which the force grows over that of the linear layer, until a trial says more
 POWERS = (0.7, 6.0)  # range of that power
+FAR = 10.0  # distance of a tool from the limb beyond which its pose is taken to be in millimetres [m]
 MANY_TOOLS = 8  # number of tools from which those that are apart are told by a tree of boxes
 WHY = {
     NO_TOUCH: "{name} presses, but no skin is within {reach:g} mm along its force",
@@ -191,6 +192,9 @@ class Toucher:
                 why = f"{1e3 * around:.1f} mm of skin are inside {contact.name}, which no column meets from outside: " \
                       "check its pose, its scale and which side of its surface is out"  # fmt: skip
                 return _Placed(contact, field, WRAPPED, pose, depth, 0.0, NO_SQUEEZE, 0.0, why=why)
+            if status in (APART, NO_TOUCH) and (off := float(np.abs(pose[:3, 3] - self.layer.vertices[0]).max())) > FAR:
+                why = f"{contact.name} is {off:.3g} m from the limb: is its pose in millimetres? Scale it by 1e-3"
+                return _Placed(contact, field, status, pose, depth, 0.0, NO_SQUEEZE, 0.0, why=why)
             return _Placed(contact, field, status, pose, depth, 0.0, NO_SQUEEZE, 0.0)
 
         force, tool = contact.wrench[:3] if contact.wrench is not None else None, contact.tool.vertices

@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from stmpl_core.needs import Needs
 
 OWN = ("modulus", "skin_modulus", "skin_thickness", "tension", "muscle_modulus", "muscle_depth")
+LEAST_MM = 0.2  # least length of a scene [mm]: what is told in metres is smaller
 
 
 class SceneConfig(BaseModel):
@@ -54,6 +55,12 @@ class SceneConfig(BaseModel):
         from stmpl_core.needs import needs
         from stmpl_core.stack import Misfit
 
+        for name in ("radius", "path", "edge", "thickness"):
+            value = getattr(self, name)
+            least = min(value if isinstance(value, tuple) else (value or 0.0,), default=0.0)
+            if 0 < least < LEAST_MM:
+                raise InvalidInput(f"--{name} is {least:g}, told in millimetres; at least {LEAST_MM:g} is accepted. "
+                                   "Is it in metres? Scale it by 1e3.")  # fmt: skip
         tissue, thickness = self._tissue()
         share = self.accuracy * 1e-2
         return needs(tissue, _si(self.radius), self.force, _si(self.speed), thickness=thickness,

@@ -372,6 +372,13 @@ def test_a_tool_on_triangles_of_unlike_sizes_carries_its_wrench(seed: int) -> No
     assert carried > 25
 
 
+@pytest.mark.parametrize("force, status", [(None, APART), ((-1.0, 0, 0), NO_TOUCH)])
+def test_a_pose_in_millimetres_is_said_and_one_across_the_room_is_not(sim: Simulator, force, status) -> None:
+    far = touch_of(sim.step([press(BALL, at(1e3 * RADIUS, 0, 1e3 * MIDDLE), force)]))
+    assert far.status == status and not far.force and not far.trust.in_range and "millimetres" in far.trust.why
+    assert "millimetres" not in touch_of(sim.step([press(BALL, at(3.0, 0, MIDDLE), force)])).trust.why
+
+
 def test_pulling_loads_nothing(sim: Simulator) -> None:
     answer = sim.step([press(BALL, on_limb(), (1, 0, 0))])
     assert touch_of(answer).status == PULLING and not answer.displacement.any()

@@ -207,6 +207,8 @@ def test_the_verb_takes_a_tissue_of_ones_own(capsys):
         (("--part", "back", "--tension", 20), "--tension"),
         (("--thickness", 20, "--modulus", 3, "--tension", 20), "--skin-modulus"),
         (("--part", "back", "--radius", 0), "radii is 0 m"),
+        (("--part", "back", "--radius", 0.02), "Is it in metres?"),
+        (("--thickness", 0.02, "--modulus", 3), "Is it in metres?"),
         (("--part", "back", "--force", 1e9), "forces is 1e+09 N"),
         (("--part", "back", "--accuracy", 0), "force is 0"),
     ],
