@@ -1,7 +1,7 @@
 # `make` alone says what there is. Everything lives in .venv; nothing else on the machine is touched.
 SHELL := /bin/bash
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test check weights clean
+.PHONY: help setup demo test coverage check weights clean
 
 VENV := .venv
 BIN := $(VENV)/bin
@@ -19,9 +19,14 @@ setup: $(READY)  ## Make .venv with Python 3.12, ROS 2 and what the main job nee
 demo: $(READY)  ## Run the main job: a robot massages a forearm over ROS 2, recorded, compared with FEM, with film and report
 	$(BIN)/stmpl demo
 
-test: $(READY_DEV)  ## Pass the tests, two at a time; print the slowest, and the files of which they run least
+test: export NUMBA_NUM_THREADS = 1  # two processes have two cores; threads of their own would wait for each other
+test: $(READY_DEV)  ## Pass the tests, two at a time; print the slowest
 	$(BIN)/python -m tests.warm  # one process compiles: two at once round otherwise in the last bits
-	COVERAGE_CORE=sysmon $(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder --cov --cov-report=
+	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder $(TESTS)
+
+coverage: TESTS = --cov --cov-report=
+coverage: export COVERAGE_CORE = sysmon
+coverage: test  ## Pass the tests, and print the files of which they run least
 	@$(BIN)/coverage report | sed -n '1,12p;$$p'
 
 check: $(READY_DEV)  ## Lint, types and the one-way import rule

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import lru_cache
 
 import numba
 import numpy as np
@@ -23,6 +24,7 @@ WIDTH = 32  # figures of one source field at one vertex, the last of them unused
 SPREAD = 0.408  # deviation over the root of the vertex area of the Gaussian with the mean 1 / r of a linear hat
 
 
+@lru_cache(maxsize=32)
 def response_table(tissue: Tissue, thickness: float = 1.0) -> np.ndarray:
     """Response of a flat bonded layer to a unit normal force on its surface, E = 1, t = 1, (spread, radius, 2).
 

@@ -108,8 +108,9 @@ def test_columns_alone_say_what_all_that_is_squeezed_says(sim: Simulator, name: 
     assert any(said) and not all(said)
 
 
-@pytest.mark.parametrize(("mass", "integral", "steps"), [(1.0, 0.0, 700), (3.0, 0.0, 700), (2.0, 2.0, 3000)])
-@pytest.mark.parametrize("depth", [0.86, 0.9, 1.05, 1.2])
+@pytest.mark.parametrize(("depth", "mass", "integral", "steps"), [
+    (0.86, 1.0, 0.0, 700), (0.9, 3.0, 0.0, 700), (0.9, 2.0, 2.0, 3000), (1.05, 1.0, 0.0, 700), (1.2, 3.0, 0.0, 700),
+    (1.2, 2.0, 2.0, 3000)])  # fmt: skip
 @pytest.mark.parametrize("kind", LIMBS)
 def test_a_force_controller_settles_on_the_barrier(touched: dict[str, Simulator], kind: str, depth: float, mass: float,
                                                    integral: float, steps: int) -> None:  # fmt: skip
