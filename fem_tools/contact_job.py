@@ -130,7 +130,8 @@ class Bench:
         paper_fem = PatchFem(reach=body.reach).prepare(layer)
         element, layers = ("P1xP2", 1) if plan.linear else (None, INDENTER_LAYERS)
         pressed = PatchFem(element=element, reach=body.reach, refine=INDENTER_REFINE, layers=layers)
-        indenting = IndenterFem(pressed, step=plan.indenter_step, max_work=plan.most_work).prepare(layer)
+        work = body.most_work or plan.most_work
+        indenting = IndenterFem(pressed, step=plan.indenter_step, max_work=work).prepare(layer)
         return cls(Site(layer), pressing, paper_fem, indenting)
 
 
@@ -148,7 +149,8 @@ def solve_contact(job: Job) -> bytes:
     drops: list[Drop] = []
     drawn, seconds = {}, {}
     loads: dict[Kind, np.ndarray] = {
-        kind: ratios(plan, kind, plan.loads_of(contact.set), rng) for kind in kinds_of(plan, contact)
+        kind: ratios(plan, kind, plan.loads_of(contact.set), rng, plan.body(contact.body).shallowest)
+        for kind in kinds_of(plan, contact)
     }
     try:
         started = time.process_time()

@@ -8,7 +8,7 @@ import os
 import shutil
 import time
 from collections import Counter, defaultdict
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, Executor, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
@@ -44,7 +44,7 @@ def generate(
     *,
     workers: int | None = None,
     scheduler: str | None = None,
-    start: str | Path | None = None,
+    start: str | Path | Sequence[str | Path] | None = None,
     flat: str | Path | None = None,
     on_progress: OnProgress | None = None,
 ) -> dict[str, Any]:
@@ -55,7 +55,7 @@ def generate(
         out: folder; each contact that is done is one file in it until all are packed.
         workers: local processes, each on one thread; None: one a core.
         scheduler: address of a Dask scheduler whose workers do the work instead (one thread each, please).
-        start: released contacts of the same plan (see fem_tools.released) that need not be solved again.
+        start: files of released contacts of the same plan (see fem_tools.released) that need not be solved again.
         flat: released presses of its flat stacks (see fem_tools.rounds), likewise.
         on_progress: function that is called after each contact.
 
@@ -74,8 +74,8 @@ def generate(
         (out / "rounds").mkdir(exist_ok=True)
     _write(out / "manifest.json", json.dumps({"format": FORMAT, "plan": plan.model_dump(mode="json"),
                                               "complete": False}, indent=1).encode())  # fmt: skip
-    if start is not None:
-        _go_on_from(start, plan, out)
+    for file in [start] if isinstance(start, str | Path) else start or ():
+        _go_on_from(file, plan, out)
     if flat is not None:
         _press_on_from(flat, plan, out)
     made = layers(plan)

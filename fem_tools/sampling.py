@@ -88,6 +88,9 @@ class BodyPlan(BaseModel):
     reach: float = Field(default=6.0, gt=0)  # largest thicknesses under the load
     clear: float | None = None  # distance of tools from the open border, thicknesses; None: the plan's
     sizes: tuple[float, float] | None = None  # m, half the width of tools; None: the plan's
+    tools: tuple[str, ...] | None = None  # kinds of tools; None: all
+    shallowest: float = Field(default=0.0, ge=0, lt=1)  # thicknesses, from which tools are looked at
+    most_work: float | None = None  # multiplications of a press; None: the plan's
     share: float = Field(default=1.0, gt=0, le=1)  # of the plan's contacts
     paper_rule: bool = True  # the same contacts once more as the paper loads them
     out_of_distribution: bool = True
@@ -170,10 +173,25 @@ PEOPLE: tuple[tuple[str, float, float, str, Tone, float, float, float], ...] = (
     ("thigh", 0.4, 0.8, "left_thigh", "relaxed", 11e-3, 6.7, 0.3),
     ("calf", 0.6, 0.2, "left_calf", "relaxed", 8e-3, 6.7, 0.3),
 )
+DEEP: tuple[tuple[str, float, float, str, Tone, float, float, float], ...] = (
+    ("upper_arm_1", 0.45, 0.2, "left_upper_arm", "relaxed", 8e-3, 6.7, 0.38),
+    ("upper_arm_2", 0.75, 0.9, "left_upper_arm", "relaxed", 8e-3, 6.7, 0.38),
+    ("upper_arm_3", 0.25, 0.6, "left_upper_arm", "tensed", 8e-3, 6.7, 0.27),
+    ("forearm_1", 0.7, 0.4, "left_forearm", "relaxed", 7e-3, 6.7, 0.27),
+    ("forearm_2", 0.4, 0.1, "left_forearm", "tensed", 7e-3, 6.7, 0.21),
+    ("calf", 0.4, 0.8, "left_calf", "relaxed", 9e-3, 6.7, 0.16),
+    ("thigh", 0.65, 0.3, "left_thigh", "relaxed", 12e-3, 6.0, 0.1),
+)
 LIVING_BODIES = tuple(  # people unlike the average one, their tissue as measured
     BodyPlan(name=f"living_{name}", weight=weight, gender=gender, part=part, tone=tone, edge_length=edge, share=share,
              clear=2.0, reach=reach, sizes=(8e-3, 40e-3), paper_rule=False, out_of_distribution=False)
     for name, weight, gender, part, tone, edge, reach, share in PEOPLE
+)  # fmt: skip
+DEEP_BODIES = tuple(  # likewise, and round tools that go deep where the tissue is thick: most others end before
+    BodyPlan(name=f"deep_{name}", weight=weight, gender=gender, part=part, tone=tone, edge_length=edge, share=share,
+             clear=2.0, reach=reach, sizes=(12e-3, 30e-3), tools=("sphere", "ellipsoid", "capsule"), shallowest=0.45,
+             most_work=1e11, paper_rule=False, out_of_distribution=False)
+    for name, weight, gender, part, tone, edge, reach, share in DEEP
 )  # fmt: skip
 
 
@@ -262,7 +280,7 @@ PRESETS = {
                        body.model_copy(update={"share": 1.0}) for body in OTHER_LIMBS), shares=(0.2, 0.2), seed=NEW),
     "contacts": Plan(preset="contacts", bodies=CONTACT_BODIES, discs=0, ellipses=0, seams=0, hands=0, bands=0,
                      letters=0, tools=60, loads=8, deepest=0.9, indenter_step=0.08),
-    "tissue": Plan(preset="tissue", bodies=TISSUE_BODIES + _drawn_bodies(DRAWN) + LIVING_BODIES, discs=0,
+    "tissue": Plan(preset="tissue", bodies=TISSUE_BODIES + _drawn_bodies(DRAWN) + LIVING_BODIES + DEEP_BODIES, discs=0,
                    ellipses=0, seams=0, hands=0, bands=0, letters=0, tools=18, loads=8, deepest=0.85,
                    indenter_step=0.12, clear=4.0, thinnest=1.4, sizes=(4e-3, 40e-3), linear=True, most_work=4e10,
                    rounds=400),
@@ -355,11 +373,16 @@ def varying(points: np.ndarray, bounds: tuple[float, float], rng: np.random.Gene
     return bounds[0] + (bounds[1] - bounds[0]) * (field - field.min()) / np.ptp(field)
 
 
-def ratios(plan: Plan, kind: Kind, count: int, rng: np.random.Generator) -> np.ndarray:
-    """`count` loads of one contact, increasing, one in each equal part of the range: p / E, or depth over thickness."""
+def ratios(plan: Plan, kind: Kind, count: int, rng: np.random.Generator, shallowest: float = 0.0) -> np.ndarray:
+    """`count` loads of one contact, increasing, one in each equal part of the range: p / E, or depth over thickness.
+
+    Those of indenters lie closer together where the contact begins, or evenly from `shallowest` thicknesses on.
+    """
     highest = {"pressure": plan.highest_pressure, "nodal": plan.highest_nodal, "indenter": plan.deepest}[kind]
     share = (np.arange(count) + rng.uniform(0.05, 1.0, count)) / count
-    if kind == "indenter":  # closer together where the contact begins
+    if kind == "indenter" and shallowest:
+        return shallowest + (highest - shallowest) * share
+    if kind == "indenter":
         return np.maximum(highest * share**2, SHALLOWEST * (1 + np.arange(count)))
     return share * highest
 
@@ -429,7 +452,8 @@ def _draw_tool(
     own = plan.body(body)
     size = float(np.exp(rng.uniform(*np.log(own.sizes or plan.sizes))))
     slant = SLANT if rng.uniform() < SLANTED else TILT
-    drawn |= {"tool": str(rng.choice(TOOLS)), "size": size, "shape": rng.uniform(0, 1, 8).round(4).tolist(),
+    drawn |= {"tool": str(rng.choice(own.tools or TOOLS)), "size": size,
+              "shape": rng.uniform(0, 1, 8).round(4).tolist(),
               "tilt": rng.uniform(-TILT, TILT, 2).round(4).tolist(),
               "slant": rng.uniform(-slant, slant, 2).round(4).tolist()}  # fmt: skip
     scene = tool_scene(site, drawn)

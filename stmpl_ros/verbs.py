@@ -322,7 +322,7 @@ def generate(
     out: Path | None = None,
     workers: int | None = None,
     scheduler: str | None = None,
-    start: Path | None = None,
+    start: tuple[Path, ...] = (),
     flat: Path | None = None,
     as_json: Json = False,
 ) -> int:
@@ -337,7 +337,7 @@ def generate(
         out: folder of the data; data/<preset> unless given.
         workers: local processes; one a core unless given.
         scheduler: address of a Dask scheduler that does the work instead.
-        start: file of released contacts to go on from, as benchmarks/limbs_v3.npz for tissue.
+        start: files of released contacts to go on from; for tissue benchmarks/limbs_v3.npz and benchmarks/deep_v1.npz.
         flat: file of released presses of its flat stacks, benchmarks/rounds_v1.npz; without, twenty minutes more.
         as_json: manifest as JSON, for machines.
     """

@@ -17,7 +17,7 @@ from fem_tools import PatchFem
 from fem_tools.dataset import MOVES, QUANTUM, Dataset
 from fem_tools.generate import generate
 from fem_tools.hand import Hand
-from fem_tools.sampling import PRESETS, Plan, contacts, draw, kinds_of, ratios, split_of, varying
+from fem_tools.sampling import PRESETS, TOOLS, Plan, contacts, draw, kinds_of, ratios, split_of, varying
 from fem_tools.scenes import Site, UnusableContact, ellipse, letter, signed_distance
 from stmpl_core import Load, SoftLayer
 from stmpl_core.body import Body
@@ -146,6 +146,16 @@ def test_loads_increase_and_stay_in_their_range() -> None:
     for kind, highest in (("pressure", 1.5), ("nodal", 0.4), ("indenter", 0.7)):
         drawn = ratios(PRESETS["paper"], kind, 10, np.random.default_rng(3))
         assert len(drawn) == 10 and drawn[0] > 0 and drawn[-1] <= highest
+        assert all(a < b for a, b in pairwise(drawn))
+
+
+def test_deep_presses_are_looked_at_where_they_are_deep() -> None:
+    plan = PRESETS["tissue"]
+    deep = [body for body in plan.bodies if body.shallowest]
+    assert deep and all(set(body.tools or ()) < set(TOOLS) for body in deep)
+    for body in deep:
+        drawn = ratios(plan, "indenter", plan.loads, np.random.default_rng(4), body.shallowest)
+        assert body.shallowest < drawn[0] and drawn[-1] <= plan.deepest
         assert all(a < b for a, b in pairwise(drawn))
 
 

@@ -8,11 +8,11 @@ import pytest
 from benchmarks import limbs
 from fem_tools.axisymmetric import Flat, Profile
 from fem_tools.contact_job import Part
-from fem_tools.dataset import QUANTUM, Dataset, Record
+from fem_tools.dataset import FIGURES, QUANTUM, Dataset, Record
 from fem_tools.generate import _fewer_bodies, generate
 from fem_tools.released import LEAST, STEPS, Released, write
 from fem_tools.rounds import THICKNESS, Pressed, drawn, learnt, read_all, release, released, tissue_of
-from fem_tools.sampling import PRESETS, ContactId, contacts, layers
+from fem_tools.sampling import PRESETS, ContactId, contacts, layers, split_of
 from stmpl_core import Contact, Simulator
 from stmpl_core.body import Body
 from stmpl_core.errors import InvalidInput
@@ -96,7 +96,7 @@ def test_a_data_set_goes_on_from_released_contacts_and_holds_its_flat_presses(tm
     first = made_up(made)[:1]
     assert first[0][0] == contact  # so that nothing on the limb is left to solve
     write(file, PLAN, made, first)
-    manifest = generate(PLAN, tmp_path / "out", workers=1, start=file)
+    manifest = generate(PLAN, tmp_path / "out", workers=1, start=[file])
     assert manifest["samples"] == 2 and manifest["rounds"] == 1
     assert len(Dataset.open(tmp_path / "out")) == 2
     (press,) = read_all(tmp_path / "out")
@@ -105,6 +105,20 @@ def test_a_data_set_goes_on_from_released_contacts_and_holds_its_flat_presses(tm
         generate(PLAN.model_copy(update={"seed": 1}), tmp_path / "other", workers=1, start=file)
     more = PLAN.model_copy(update={"bodies": (BODY, BODY.model_copy(update={"name": "another", "weight": 0.8}))})
     assert _fewer_bodies(PLAN, more) and not _fewer_bodies(more, PLAN)
+
+
+def test_the_files_that_ship_hold_contacts_of_the_plan_that_networks_learn_from() -> None:
+    found = {}
+    for name in ("limbs_v3.npz", "deep_v1.npz"):
+        some = Released(limbs.FILE.with_name(name))
+        assert _fewer_bodies(some.plan, TISSUE)
+        for contact, part in some.parts():
+            assert part.about["split"] == split_of(TISSUE, contact)
+            found[contact] = part
+    assert set(found) <= set(contacts(TISSUE)) and len(found) > 450
+    deep = [dict(zip(FIGURES, one.figures, strict=True)) for contact, part in found.items()
+            if contact.body.startswith("deep_") for one in part.records]  # fmt: skip
+    assert len(deep) > 150 and min(one["ratio"] for one in deep) > 0.45
 
 
 def test_flat_presses_take_every_stack_that_is_learnt_from_and_no_other() -> None:
