@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from contextlib import nullcontext
 from copy import copy
 from typing import TYPE_CHECKING, NamedTuple
@@ -30,8 +31,10 @@ from stmpl_core.thinning import SPACINGS, STACK_SPACINGS, STACK_ZONES, ZONES, As
 
 if TYPE_CHECKING:
     from stmpl_core.bend import Bend
+    from stmpl_core.nodes import Nodes
 
 FIRST_SPREAD = float(SPREADS[0])
+SMOOTH = 1.25  # reach of what a contact node presses with, over the spacing of nodes: even within 4 %
 WIDEST = 3.0  # distance over the thickness to which neighbours say how a place is curved
 
 
@@ -137,6 +140,11 @@ class Surroundings:
     def standing(self, points: np.ndarray, among: np.ndarray, spacing: float) -> np.ndarray:
         """Some of `among`, no two of which are nearer along the skin than `spacing` [m], (N,)."""
         return self._thinning.standing(points, among, spacing)
+
+    def spread_on(self, layer: SoftLayer, pressure: np.ndarray, nodes: Nodes) -> np.ndarray:
+        """Pressure (V,) that came from contact nodes, spread over the area of each where the mesh is finer."""
+        spacing = math.sqrt(float(nodes.area.mean()) / (0.5 * math.sqrt(3.0)))
+        return self._thinning.spread(layer.vertices, layer.vertex_areas, pressure, SMOOTH * spacing)
 
     def around(self, points: np.ndarray, vertices: np.ndarray, most: int) -> tuple[np.ndarray, np.ndarray]:
         """Neighbours of some vertices (N,), from which their curvature is found even where a bend brings them nearer.

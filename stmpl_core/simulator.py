@@ -193,14 +193,17 @@ class Simulator:
 
     def _moved(self, touches: Sequence[Touch]) -> tuple[Displacement, Conformed]:
         """What the method says of elastic touches, and the same with what is touched on its tools."""
-        pressing = [(touch.pressure, touch.pressed.factor) for touch in touches
-                    if touch.pressure is not None and touch.pressed is not None]  # fmt: skip
-        if not pressing:
+        pressed = [(touch.pressure, touch.pressed) for touch in touches
+                   if touch.pressure is not None and touch.pressed is not None]  # fmt: skip
+        if not pressed:
             solved = Displacement(np.zeros_like(self.layer.vertices), Trust(), self.method.name)
             return solved, Conformed(solved.displacement, 0.0, 0.0)
-        first, *others = (one / factor for one, factor in pressing)
-        moving = sum(others, first)
         motion = None if self._green is None else stuck_motion(self._green, touches)
+        if motion is not None:  # under thick tissue nodes lie far apart, and a mesh may be finer
+            near, layer = self.skin.near, self.layer
+            pressed = [(near.spread_on(layer, values, one.squeeze.nodes), one) for values, one in pressed]
+        first, *others = (values / one.factor for values, one in pressed)
+        moving = sum(others, first)
         solved = self.method.solve(Load.contact(moving, motion))
         if motion is None:
             return solved, conform(self.layer, self.skin.near, solved.displacement, touches)

@@ -110,6 +110,10 @@ class Thinning:
         mask[among] = True
         return np.flatnonzero(_thinned(self.start, self.index, mask, points, np.full(len(points), spacing), 1.0))
 
+    def spread(self, points: np.ndarray, areas: np.ndarray, values: np.ndarray, reach: float) -> np.ndarray:
+        """Values (V,) on areas (V,) [m2], each spread along the skin as far as `reach` [m]; their integral stays."""
+        return _spread(self._first, self._beside, points, areas, values, reach)
+
     def around(self, vertices: np.ndarray) -> list[np.ndarray]:
         """Neighbours of some vertices."""
         zones = (len(self.start) - 1) // len(self._stands[0])
@@ -250,6 +254,33 @@ def interpolation(points: np.ndarray, frames: np.ndarray, thickness: np.ndarray,
     left += 1e-9 * np.eye(size)
     right[:, :CORNERS], right[:, CORNERS] = np.linalg.norm(flat, axis=-1) ** 3, 1.0
     return np.linalg.solve(left, right[..., None])[:, :CORNERS, 0].astype(np.float32)
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _spread(first, beside, points, areas, values, reach):
+    """Each value among the vertices that edges lead to within its reach, by (1 - (d / reach)^2)^2 of the distance."""
+    out, seen, square = np.zeros(len(values)), np.full(len(values), -1), reach * reach
+    queue, weight = np.empty(len(values), np.int64), np.empty(len(values))
+    for i in np.flatnonzero(values):
+        queue[0], seen[i], weight[0], many, ends, total = i, i, 1.0, 0, 1, areas[i]
+        while many < ends:
+            k = queue[many]
+            many += 1
+            for p in range(first[k], first[k + 1]):
+                j = beside[p]
+                if seen[j] == i:
+                    continue
+                seen[j] = i
+                x, y, z = points[j, 0] - points[i, 0], points[j, 1] - points[i, 1], points[j, 2] - points[i, 2]
+                near = 1 - (x * x + y * y + z * z) / square
+                if near > 0:
+                    queue[ends], weight[ends] = j, near * near
+                    total += areas[j] * near * near
+                    ends += 1
+        share = values[i] * areas[i] / total
+        for k in range(ends):
+            out[queue[k]] += share * weight[k]
+    return out
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")

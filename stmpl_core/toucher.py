@@ -386,7 +386,10 @@ class Toucher:
             return trust
         for why in self.near.sound.of_contact(vertices, pressure * layer.vertex_areas[vertices]):
             trust = trust.also(why, in_range=False)
-        ratio, highest = float(pressure.max()) / self.net.unit, card["ranges"]["p_over_e"][1]
+        highest, most = card["ranges"]["p_over_e"][1], float(pressure.max())
+        if touch.pressed is not None and touch.pressed.forces is not None:  # on a mesh finer than the nodes
+            most = min(most, float((touch.pressed.forces / one.squeeze.nodes.area).max()))
+        ratio = most / self.net.unit
         if ratio > highest:
             trust = trust.also(f"{name} presses with p/E = {ratio:.2g}; contacts were learnt up to {highest:.2g}",
                                in_range=False)  # fmt: skip

@@ -17,7 +17,9 @@ ONE_WAY = wp.constant(wp.float64(MIN_ONE_WAY_SHARE))
 ROWS, FARTHEST, AROUND = (wp.constant(wp.float64(x)) for x in (green.ROWS, green.FARTHEST, green.AROUND))
 FIRST_LOG, STEP_LOG = wp.constant(wp.float64(green.FIRST_LOG)), wp.constant(wp.float64(green.STEP_LOG))
 LAST_ROW = wp.constant(wp.float64(len(green.SPREADS) - 1.001))
-STACK_HARDENS = wp.constant(wp.float64(contact_net.STACK_HARDENS))
+DEEP_GIVES, ROUND_GIVES, ROUNDEST = (
+    wp.constant(wp.float64(x)) for x in (contact_net.DEEP_GIVES, contact_net.ROUND_GIVES, contact_net.ROUNDEST)
+)
 SPREAD, LAST_AREA = wp.constant(wp.float64(SPREAD_OF_AREA)), wp.constant(wp.float64(green.AREAS - 1.001))
 MORE_AREAS = wp.constant(wp.float64(green.AREAS - 1))
 ROUND_SQUARE = wp.constant(wp.float64((green.ROUND * SPREAD_OF_AREA) ** 2))
@@ -288,7 +290,8 @@ def see(lanes: wp.int32, many: wp.int32, skins: Skins, scratch: Scratch):
         _write(scratch, s, i, AT_GIVEN, scratch.given_way[s * many + scratch.tool[s, i]])
         solved = wp.min(strain, STACK_LINEAR_TO)
         top = _hardening(skins, id, thick, solved)
-        linear = linear * wp.exp(STACK_HARDENS * top)
+        share = (real(1.0) - DEEP_GIVES * solved) * (real(1.0) - ROUND_GIVES * wp.clamp(curvature, real(0.0), ROUNDEST))
+        linear = linear * wp.exp(share * top)
         if strain > solved:
             more = _hardening(skins, id, thick, strain) - top
             linear = linear * wp.pow(strain / solved * wp.exp(more), HARDENING)
