@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Self
+from typing import Any, Self
 
 import numba
 import numpy as np
@@ -138,7 +138,7 @@ class SignedDistance:
         return _jets(self.coefficients, self.origin, self.spacing, finite("points", points, (None, 3)))
 
 
-_KEPT: dict[tuple, SignedDistance] = {}  # the last built, by what they were built from
+_KEPT: dict[tuple, Any] = {}  # the last built, by what they were built from
 
 
 def _checked(mesh: Tool) -> tuple[Points, np.ndarray, bool, bool]:
