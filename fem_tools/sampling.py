@@ -162,7 +162,8 @@ TISSUE_BODIES = tuple(
     )
 )  # fmt: skip
 
-PEOPLE: tuple[tuple[str, float, float, str, Tone, float, float, float], ...] = (
+Person = tuple[str, float, float, str, Tone, float, float, float]
+PEOPLE: tuple[Person, ...] = (
     # name, weight, gender, part, tone, edge length [m], reach, share
     ("upper_arm_1", 0.35, 0.0, "left_upper_arm", "relaxed", 8e-3, 6.0, 1.0),
     ("upper_arm_2", 0.6, 1.0, "left_upper_arm", "relaxed", 8e-3, 6.0, 1.0),
@@ -173,7 +174,7 @@ PEOPLE: tuple[tuple[str, float, float, str, Tone, float, float, float], ...] = (
     ("thigh", 0.4, 0.8, "left_thigh", "relaxed", 11e-3, 6.7, 0.3),
     ("calf", 0.6, 0.2, "left_calf", "relaxed", 8e-3, 6.7, 0.3),
 )
-DEEP: tuple[tuple[str, float, float, str, Tone, float, float, float], ...] = (
+DEEP: tuple[Person, ...] = (
     ("upper_arm_1", 0.45, 0.2, "left_upper_arm", "relaxed", 8e-3, 6.7, 0.38),
     ("upper_arm_2", 0.75, 0.9, "left_upper_arm", "relaxed", 8e-3, 6.7, 0.38),
     ("upper_arm_3", 0.25, 0.6, "left_upper_arm", "tensed", 8e-3, 6.7, 0.27),
@@ -182,17 +183,20 @@ DEEP: tuple[tuple[str, float, float, str, Tone, float, float, float], ...] = (
     ("calf", 0.4, 0.8, "left_calf", "relaxed", 9e-3, 6.7, 0.16),
     ("thigh", 0.65, 0.3, "left_thigh", "relaxed", 12e-3, 6.0, 0.1),
 )
-LIVING_BODIES = tuple(  # people unlike the average one, their tissue as measured
-    BodyPlan(name=f"living_{name}", weight=weight, gender=gender, part=part, tone=tone, edge_length=edge, share=share,
-             clear=2.0, reach=reach, sizes=(8e-3, 40e-3), paper_rule=False, out_of_distribution=False)
-    for name, weight, gender, part, tone, edge, reach, share in PEOPLE
-)  # fmt: skip
-DEEP_BODIES = tuple(  # likewise, and round tools that go deep where the tissue is thick: most others end before
-    BodyPlan(name=f"deep_{name}", weight=weight, gender=gender, part=part, tone=tone, edge_length=edge, share=share,
-             clear=2.0, reach=reach, sizes=(12e-3, 30e-3), tools=("sphere", "ellipsoid", "capsule"), shallowest=0.45,
-             most_work=1e11, paper_rule=False, out_of_distribution=False)
-    for name, weight, gender, part, tone, edge, reach, share in DEEP
-)  # fmt: skip
+
+
+def _living(kind: str, people: tuple[Person, ...], **more: Any) -> tuple[BodyPlan, ...]:
+    """People unlike the average one, their tissue as measured."""
+    return tuple(
+        BodyPlan(name=f"{kind}_{name}", weight=weight, gender=gender, part=part, tone=tone, edge_length=edge,
+                 share=share, clear=2.0, reach=reach, paper_rule=False, out_of_distribution=False, **more)
+        for name, weight, gender, part, tone, edge, reach, share in people
+    )  # fmt: skip
+
+
+LIVING_BODIES = _living("living", PEOPLE, sizes=(8e-3, 40e-3))
+DEEP_BODIES = _living("deep", DEEP, sizes=(12e-3, 30e-3), tools=("sphere", "ellipsoid", "capsule"),
+                      shallowest=0.45, most_work=1e11)  # that go deep where tissue is thick: most others end before
 
 
 def _drawn_bodies(count: int) -> tuple[BodyPlan, ...]:

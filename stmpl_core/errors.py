@@ -27,6 +27,13 @@ class FrameError(InvalidInput):
     """A pose or message in a frame that is not known."""
 
 
+def check_millimetres(name: str, value: float, least: float) -> None:
+    """Raises InvalidInput for a length above 0 but below `least` [mm], as one that is told in metres is."""
+    if 0 < value < least:
+        raise InvalidInput(f"{name} is {value:g}, told in millimetres; at least {least:g} is accepted. "
+                           "Is it in metres? Scale it by 1e3.")  # fmt: skip
+
+
 class NotPrepared(StmplError, RuntimeError):
     """A method was asked to solve before it was given a layer."""
 

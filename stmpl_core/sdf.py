@@ -109,8 +109,8 @@ class SignedDistance:
         built = cls(coefficients, origin, spacing, watertight, flipped, error, (low, low + extent))
         if coefficients.nbytes <= MOST_KEPT_BYTES:
             _KEPT[key] = built
-            while len(_KEPT) > MOST_KEPT:
-                _KEPT.pop(next(iter(_KEPT)), None)
+            for old in list(_KEPT)[:-MOST_KEPT]:
+                _KEPT.pop(old, None)  # another thread may have
         return built
 
     @cached_property

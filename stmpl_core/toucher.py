@@ -187,15 +187,14 @@ class Toucher:
         depth = -clearance.nearest
 
         def nothing(status: str) -> _Placed:
-            around = -float(clearance.skin.min(initial=np.inf))
+            around, why = -float(clearance.skin.min(initial=np.inf)), ""
+            off = float(np.abs(pose[:3, 3] - self.layer.vertices[0]).max())
             if status == APART and around > MAX_AROUND * self._thickest:
-                why = f"{1e3 * around:.1f} mm of skin are inside {contact.name}, which no column meets from outside: " \
-                      "check its pose, its scale and which side of its surface is out"  # fmt: skip
-                return _Placed(contact, field, WRAPPED, pose, depth, 0.0, NO_SQUEEZE, 0.0, why=why)
-            if status in (APART, NO_TOUCH) and (off := float(np.abs(pose[:3, 3] - self.layer.vertices[0]).max())) > FAR:
+                status, why = WRAPPED, f"{1e3 * around:.1f} mm of skin are inside {contact.name}, which no column " \
+                    "meets from outside: check its pose, its scale and which side of its surface is out"  # fmt: skip
+            elif status in (APART, NO_TOUCH) and off > FAR:
                 why = f"{contact.name} is {off:.3g} m from the limb: is its pose in millimetres? Scale it by 1e-3"
-                return _Placed(contact, field, status, pose, depth, 0.0, NO_SQUEEZE, 0.0, why=why)
-            return _Placed(contact, field, status, pose, depth, 0.0, NO_SQUEEZE, 0.0)
+            return _Placed(contact, field, status, pose, depth, 0.0, NO_SQUEEZE, 0.0, why=why)
 
         force, tool = contact.wrench[:3] if contact.wrench is not None else None, contact.tool.vertices
         light = force is not None and 0 < depth < 0.5 * float(self.layer.thickness[clearance.vertices].min())

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from stmpl_core.errors import InvalidInput
+from stmpl_core.errors import InvalidInput, check_millimetres
 from stmpl_core.regions import HELD_SKIN
 from stmpl_core.tissue import FRICTION, Membrane, Ply, Tissue
 
@@ -57,10 +57,8 @@ class SceneConfig(BaseModel):
 
         for name in ("radius", "path", "edge", "thickness"):
             value = getattr(self, name)
-            least = min(value if isinstance(value, tuple) else (value or 0.0,), default=0.0)
-            if 0 < least < LEAST_MM:
-                raise InvalidInput(f"--{name} is {least:g}, told in millimetres; at least {LEAST_MM:g} is accepted. "
-                                   "Is it in metres? Scale it by 1e3.")  # fmt: skip
+            for one in value if isinstance(value, tuple) else (value or 0.0,):
+                check_millimetres(f"--{name}", one, LEAST_MM)
         tissue, thickness = self._tissue()
         share = self.accuracy * 1e-2
         return needs(tissue, _si(self.radius), self.force, _si(self.speed), thickness=thickness,

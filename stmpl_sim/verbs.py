@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, cast, get_args
 import tyro
 
 from stmpl_core.console import print_figures
-from stmpl_core.errors import InvalidInput
+from stmpl_core.errors import InvalidInput, check_millimetres
 from stmpl_core.extras import needed
 
 if TYPE_CHECKING:
@@ -77,9 +77,7 @@ def sim(
     if not 50 <= rate <= 20_000:
         raise InvalidInput(f"--rate is {rate:g} Hz; allowed is 50 to 20000.")
     for flag, value in (("radius", radius), ("circle", circle), ("speed", speed)):
-        if 0 < value < LEAST_MM:
-            raise InvalidInput(f"--{flag} is {value:g}, told in millimetres; at least {LEAST_MM:g} is accepted. "
-                               "Is it in metres? Scale it by 1e3.")  # fmt: skip
+        check_millimetres(f"--{flag}", value, LEAST_MM)
     from stmpl_core.friction import friction_from
     from stmpl_sim.grip import mount_of, usual_force
     from stmpl_sim.massage import Course, Massage

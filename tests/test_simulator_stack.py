@@ -138,7 +138,8 @@ def test_a_skin_from_another_process_is_ready_at_once(simulator):
 
 def test_a_mesh_finer_than_the_contact_nodes_moves_as_a_coarser_one() -> None:
     """Forces of nodes 3 mm apart on vertices 1.7 mm apart are spread; as they come they were 20 % of the peak off."""
-    edge, length, moved = 2 * np.pi * RADIUS / 44, 26 * 2 * np.pi * RADIUS / 44 * 3**0.5 / 2, []
+    edge = 2 * np.pi * RADIUS / 44
+    length, moved = 26 * edge * 3**0.5 / 2, []
     tool, pose = ball(0.02), at(-RADIUS - 0.02 + 0.6 * 0.016, 0, length / 2)
     for finer in (1, 3):
         layer = limb(edge / finer, 0.016, RADIUS, length).with_(tissue=STACK)
