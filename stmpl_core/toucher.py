@@ -338,9 +338,10 @@ class Toucher:
     def _answer(self, one: _Placed, held: Held, alone: bool) -> Touch:
         """What a placed tool does, scaled to its wrench, with what may be believed of it."""
         layer, nodes, unit = self.layer, one.squeeze.nodes, one.factor * self._modulus
-        v, pressure, values, wrench, forces, scale, size, doubt, strange, stuck, along = _carried(
+        v, pressure, values, wrench, forces, scale, size, doubt, strange, stuck, along, below = _carried(
             nodes.corners, nodes.shares, nodes.area, *held[:3], unit, math.nan if one.force is None else one.force,
-            layer.vertex_areas, layer.vertices, layer.vertex_area_vectors, one.pose[:3, 3], layer.stacked)  # fmt: skip
+            layer.vertex_areas, layer.vertices, layer.vertex_area_vectors, one.pose[:3, 3], layer.stacked,
+            self.near.sound.facets)  # fmt: skip
         stated = one.contact.wrench
         depth = self._depth(one.squeeze) if len(v) and not one.factor > 1 else one.depth
         way = stated[:3] / np.linalg.norm(stated[:3]) if stated is not None and stated[:3].any() else None
@@ -349,7 +350,7 @@ class Toucher:
         if "uneven" in known and size > 0:
             doubt = math.hypot(doubt, known["uneven"] * self.net.unlike(nodes, forces))
         bound = known["scale"] * doubt ** known["power"] if size > 0 else 0.0
-        bound += STUCK * along
+        bound += STUCK * along + held.power * below / max(depth, below, 1e-300)  # the skin is no facets
         beside, radius = pins(nodes.points, nodes.area, nodes.thickness, forces)
         wider = WIDER if beside > GROUP and depth > DEEP * radius else 1.0
         touch = Touch(
@@ -493,7 +494,8 @@ def _deepest(depth, strain, thickness):
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _carried(corners, shares, area, held, doubts, outside, unit, carries, areas, points, area_vectors, origin, sticks):
+def _carried(corners, shares, area, held, doubts, outside, unit, carries, areas, points, area_vectors, origin, sticks,
+             facets):  # fmt: skip
     """What the pressure at contact nodes amounts to.
 
     Args:
@@ -504,6 +506,7 @@ def _carried(corners, shares, area, held, doubts, outside, unit, carries, areas,
         areas, points, area_vectors: of all vertices.
         origin: point about which torque is told, (3,) [m].
         sticks: see wrench_of.
+        facets: how far the flat triangles around a vertex lie below curved skin, (V,) [m].
 
     Returns:
         vertices, pressure: numbers of the vertices that are pressed on, and pressures there, (M,) [Pa].
@@ -516,6 +519,7 @@ def _carried(corners, shares, area, held, doubts, outside, unit, carries, areas,
         strange: share of it that nodes carry that see what no training contact had.
         stuck: see wrench_of.
         along: share of the force that skin carries along itself.
+        below: how far facets lie below curved skin where it presses [m].
     """
     forces, doubt, strange, total = np.empty(len(area)), 0.0, 0.0, 0.0
     for n in range(len(area)):
@@ -529,14 +533,16 @@ def _carried(corners, shares, area, held, doubts, outside, unit, carries, areas,
     doubt *= unit / max(size - along, 1e-300)
     along /= max(size, 1e-300)
     scale = carries / max(size, 1e-300) if len(vertices) and carries == carries else 1.0
-    values, size = np.zeros(len(areas)), scale * size
+    values, size, below = np.zeros(len(areas)), scale * size, 0.0
     for x in range(6):
         wrench[x] *= scale
     for n in range(len(vertices)):
+        v = vertices[n]
+        below += pressure[n] * areas[v] * facets[v] / max(total, 1e-300)
         pressure[n] *= scale
-        values[vertices[n]] = pressure[n]
+        values[v] = pressure[n]
     return (vertices, pressure, values, wrench, forces, scale, size, doubt, strange / max(total, 1e-300), stuck,
-            along)  # fmt: skip
+            along, abs(below))  # fmt: skip
 
 
 def margin_on(layer: SoftLayer) -> float:

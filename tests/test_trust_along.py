@@ -6,6 +6,7 @@ import pytest
 from benchmarks.tools import ball, block_letter, fingertip, flat
 from stmpl_core import Contact, Membrane, Ply, Simulator, Tissue, Tool
 from stmpl_core.conform import kept_out
+from stmpl_core.layer import SoftLayer
 from stmpl_core.methods import MomentNet, Winkler
 from tests.scenes import limb, plate, turn
 
@@ -59,3 +60,33 @@ def test_skin_between_the_walls_of_a_letter_is_moved_out_of_it(depth: float) -> 
     pose[2, 3] = -depth * layer.thickness.max()
     touches = simulator.touch([Contact(TOOLS["letter"], pose)])
     assert kept_out(layer, np.zeros_like(layer.vertices), touches).entered < 0.005 * layer.thickness.max()
+
+
+@pytest.mark.parametrize("depth", [0.1, 0.3, 0.6])
+def test_bounds_know_that_the_facets_of_a_coarse_mesh_lie_below_round_skin(depth: float) -> None:
+    fine, coarse = (Simulator(limb(edge, 0.02, 0.05, 0.2).with_(tissue=STACK), MomentNet()) for edge in (4e-3, 0.011))
+    contact = down(fine, ball(40), depth)
+    (expected,), answer = fine.touch([contact]), coarse.step([contact])
+    (touch,) = answer.touches.values()
+    assert answer.trust.in_range
+    assert touch.force < 0.985 * expected.force
+    assert expected.force - touch.force < touch.force_bound < 0.35 * touch.force
+
+
+def cut_in_three(layer: SoftLayer, some: np.ndarray) -> SoftLayer:
+    """These faces cut at their centres, into triangles three times as long as wide."""
+    corners, centre = layer.faces[some], len(layer.vertices) + np.arange(len(some))
+    thirds = [np.column_stack([corners[:, k], corners[:, (k + 1) % 3], centre]) for k in range(3)]
+    return SoftLayer(np.concatenate([layer.vertices, layer.vertices[corners].mean(axis=1)]),
+                     np.concatenate([np.delete(layer.faces, some, axis=0), *thirds]),
+                     float(layer.thickness.max()), tissue=layer.tissue)  # fmt: skip
+
+
+def test_a_long_triangle_among_even_ones_is_not_flagged_and_many_are() -> None:
+    layer = LAYERS["paper"]
+    contact = down(Simulator(layer, Winkler()), ball(40), 0.3)
+    place = contact.pose_body_from_tool[:3, 3]  # its tip
+    near = np.linalg.norm(layer.vertices[layer.faces].mean(axis=1) - place, axis=1).argsort()
+    answers = [Simulator(cut_in_three(layer, some), MomentNet()).step([contact]) for some in (near[:1], near[:90:2])]
+    assert [answer.trust.in_range for answer in answers] == [True, False]
+    assert "longer than 2.2 times" in answers[1].trust.why

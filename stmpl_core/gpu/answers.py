@@ -207,7 +207,7 @@ def answer(first: wp.int32, many: wp.int32, known: Known, skins: Skins, scratch:
         in_range[n, k] = not around
         return
     force, torque, forces, strange, doubt = vec3(), vec3(), real(0.0), real(0.0), real(0.0)
-    total = real(0.0)
+    total, below = real(0.0), real(0.0)
     steep, long, border, highest = real(0.0), real(0.0), real(0.0), real(0.0)
     depth, thick, count, carried = real(scratch.deep[c]), real(0.0), real(0.0), real(0.0)
     start = wp.int32(scratch.nodes[s])
@@ -219,6 +219,7 @@ def answer(first: wp.int32, many: wp.int32, known: Known, skins: Skins, scratch:
                 v, part = corners[x], here * scratch.shares[s, i][x]
                 push = -part / skins.area[v] * skins.area_vectors[v]
                 total += wp.length(push)
+                below += part * skins.facets[v]
                 force = force + push
                 torque = torque + wp.cross(skins.points[v] - scratch.place[c], push)
                 if (skins.doubts[v] & STEEP) != 0:
@@ -270,7 +271,8 @@ def answer(first: wp.int32, many: wp.int32, known: Known, skins: Skins, scratch:
     bounds[n, k] = bounds.dtype(real(0.0))
     if size > real(0.0):
         bound = known.scale * wp.pow(doubt, known.power)
-        bound += STUCK * along / size
+        below = wp.abs(below) / wp.max(forces, NONE)
+        bound += STUCK * along / size + power * below / wp.max(depth, wp.max(below, NONE))
         if group:
             bound *= WIDER
         bounds[n, k] = bounds.dtype(one.modulus * size * bound)

@@ -92,7 +92,8 @@ def struct_of(name: str, doc: str, fields: dict[str, tuple[Any, str]]) -> Any:
 SKINS: dict[str, tuple[Any, str]] = {
     "one": (OneSkin, "S"),
     "points": (vec3, "V"), "inward": (vec3, "V"), "thickness": (real, "V"), "area": (real, "V"),
-    "area_vectors": (vec3, "V"), "bent": (real, "Vx"), "doubts": (wp.int32, "V"), "faces": (wp.vec3i, "F"),
+    "area_vectors": (vec3, "V"), "bent": (real, "Vx"), "facets": (real, "V"), "doubts": (wp.int32, "V"),
+    "faces": (wp.vec3i, "F"),
     "start": (wp.int32, "V"), "around": (wp.int32, "F"), "balls": (wp.vec4d, "B"),
     "grids": (Grid, "G"), "coefficients": (real, "N"), "thinnest": (real, "K"),
     "looked_at": (vec3, "Kx"), "look_many": (wp.int32, "Kx"),
@@ -253,7 +254,8 @@ def _one_skin(skin: Skin, columns: Columns, at: tuple[int, int, int, int]) -> tu
     arrays = {
         "points": layer.vertices[order], "inward": columns.inward[order], "thickness": layer.thickness[order],
         "area": layer.vertex_areas[order], "area_vectors": layer.vertex_area_vectors[order],
-        "bent": skin.near.bent_at(order)[order], "doubts": doubts[order], "faces": at[0] + place[columns.faces],
+        "bent": skin.near.bent_at(order)[order], "facets": sound.facets[order], "doubts": doubts[order],
+        "faces": at[0] + place[columns.faces],
         "start": at[1] * 3 + start[:-1], "around": at[1] + around, "balls": columns._blocks,
     }  # fmt: skip
     one, tissue = OneSkin(), layer.tissue
