@@ -31,7 +31,7 @@ HARDENING = 0.75  # power of the columns' pressure with which it does
 FADE, FADE_RING = 0.03, 2  # strain at and around a node at which half of the correction is left: a touch begins linear
 ROUND_FROM = 0.05  # overlap over the thickness to which curvature is compared at the least
 SMALL_STEP = 5e-3  # of the largest force, in which the network's part of a slope is found: far above float32's noise
-FAR_OUTSIDE = 0.1  # standard deviations beyond the training contacts, from which a node is all outside
+FAR_OUTSIDE = 0.3  # standard deviations beyond the training contacts, from which a node is all outside
 STACK_FADE = 0.1  # the same on a stack, whose linear response alone is good to some percent up to there
 
 

@@ -30,6 +30,7 @@ from stmpl_core.toucher import Toucher
 from stmpl_core.trust import Displacement, Trust
 from stmpl_core.wake import sunk
 
+LEAST_HELD = 0.02  # motion that is held back, over the peak, from which it is said
 MOST_MOVED = 0.95  # motion over the thickness from which it is held back
 MAX_ENTERED_SHARE = 0.02  # depth of skin inside a tool over the thickness, which is not yet said
 
@@ -250,7 +251,10 @@ def _deeper(fitted: Conformed, share: float, there: Conformed, inward: np.ndarra
 
 
 def _within(displacement: np.ndarray, thickness: np.ndarray) -> tuple[np.ndarray, float, int]:
-    """The displacement, no longer than the layer is thick anywhere, its peak [m], how many were held back."""
+    """The displacement, no longer than the layer is thick anywhere, its peak [m], how many were held back by much.
+
+    A motion's far end may reach skin a tenth of a millimetre thick, as in the folds of an armpit: that changes nothing.
+    """
     peak, many = _peak(displacement, thickness)
     if not many:
         return displacement, peak, 0
@@ -260,8 +264,9 @@ def _within(displacement: np.ndarray, thickness: np.ndarray) -> tuple[np.ndarray
     held = thickness[long] * (MOST_MOVED + (1 - MOST_MOVED) * np.tanh(over))  # smooth, and never further
     out = displacement.copy()
     out[long] *= (held / length[long])[:, None]
+    many = int((length[long] - held > LEAST_HELD * peak).sum())
     length[long] = held
-    return out, float(length.max()), len(long)
+    return out, float(length.max()), many
 
 
 @numba.njit(cache=True, nogil=True, fastmath={"nnan", "nsz", "reassoc"})

@@ -90,3 +90,16 @@ def test_a_long_triangle_among_even_ones_is_not_flagged_and_many_are() -> None:
     answers = [Simulator(cut_in_three(layer, some), MomentNet()).step([contact]) for some in (near[:1], near[:90:2])]
     assert [answer.trust.in_range for answer in answers] == [True, False]
     assert "longer than 2.2 times" in answers[1].trust.why
+
+
+def test_skin_as_thin_as_paper_far_from_a_press_is_held_back_without_a_flag() -> None:
+    """As in the folds of an armpit."""
+    layer = LAYERS["layered"]
+    simulator = Simulator(layer, MomentNet())
+    contact = down(simulator, ball(40), 0.5)
+    moved = np.linalg.norm(simulator.step([contact]).displacement, axis=1)
+    far = int(np.abs(np.linalg.norm(layer.vertices - contact.pose_body_from_tool[:3, 3], axis=1) - 0.06).argmin())
+    thin = np.where(np.arange(len(moved)) == far, 0.4 * moved[far], layer.thickness)
+    answer = Simulator(layer.with_(thickness=thin), MomentNet()).step([contact])
+    assert answer.trust.in_range, answer.trust.why
+    assert 0.95 * thin[far] < np.linalg.norm(answer.displacement[far]) <= thin[far]
