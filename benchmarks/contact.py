@@ -115,6 +115,7 @@ class Row:
         pressure_error: L2 error of the pressure, over the L2 norm of FEM's.
         mee: mean Euclidean error over vertices that FEM moves by more than 1e-6 m, over the peak.
         moving: mean error over vertices that move more than 10 % of the peak.
+        told: moving, where a wrench tells FEM's force and way.
         worst: largest error at a vertex, over the peak.
         peak: signed error of the largest displacement.
         entered: depth of the deepest vertex of the whole skin inside a tool, over the thickness.
@@ -133,6 +134,7 @@ class Row:
     pressure_error: float
     mee: float
     moving: float
+    told: float
     worst: float
     peak: float
     entered: float
@@ -210,6 +212,9 @@ def row(scene: Scene, simulator: Simulator, truth: Truth) -> Row:
     length, skin = np.linalg.norm(truth.displacement, axis=1), layer.vertices + answer.displacement
     peak, bound = float(length.max()), answer.trust.error_bound
     forces = [float(f @ tool.direction) for f, tool in zip(truth.forces, truth.tools, strict=True)]
+    by_force = contacts(scene, truth.tools, forces)
+    _touched(toucher, by_force, truth.tools)
+    told = np.linalg.norm(simulator.step(by_force).displacement - truth.displacement, axis=1)
     back = [tool.shifted(-OFF * tool.direction) for tool in truth.tools]
     found = [_touched(toucher, [contact], [tool])[0].moved - OFF
              for contact, tool in zip(contacts(scene, back, forces), truth.tools, strict=True)]  # fmt: skip
@@ -225,6 +230,7 @@ def row(scene: Scene, simulator: Simulator, truth: Truth) -> Row:
         pressure_error=float(np.sqrt(area @ (ours - truth.pressure) ** 2 / (area @ truth.pressure**2))),
         mee=float(error[length > 1e-6].mean()) / peak,
         moving=float(error[length > 0.1 * peak].mean()) / peak,
+        told=float(told[length > 0.1 * peak].mean()) / peak,
         worst=float(error.max()) / peak,
         peak=float(answer.magnitude.max()) / peak - 1,
         entered=max(0.0, *(-float(t.distance(skin).min()) for t in truth.tools)) / thick,
@@ -266,7 +272,7 @@ def main() -> None:
     given.add_argument("--tools", nargs="+", choices=[one.name for one in every], help="tools that are pressed; all")
     given.add_argument("--finer", action="store_true", help="finite elements half as long")
     options = given.parse_args()
-    console, layer = Console(width=150), arm()
+    console, layer = Console(width=165), arm()
     finer = PatchFem(refine=4, layers=2) if options.finer else None
     simulator, fem = Simulator(layer, MomentNet()), IndenterFem(finer).prepare(layer)
     some = [one for one in every if not options.tools or one.name in options.tools]
@@ -293,29 +299,30 @@ def _table(rows: Sequence[Row]) -> Table:
     """A line a tool, its depths side by side."""
     table = Table(title=f"Ours against FEM at {', '.join(f'{d:g}' for d in DEPTHS)} t; errors in %",
                   caption=f"* flagged; the last column: by wrench, the pose being {OFF * 1e3:g} mm off")  # fmt: skip
-    for name in ("tool", "force", "linear", "pressure L2", "moving", "worst", "depth by wrench/t"):
+    for name in ("tool", "force", "linear", "pressure L2", "moving", "way told", "worst",
+                 "depth by wrench/t"):  # fmt: skip
         table.add_column(name, justify="left" if name == "tool" else "right")
     for name in dict.fromkeys(r.name for r in rows):
         mine = [r for r in rows if r.name == name]
         table.add_row(name, " ".join(f"{100 * r.force_error:+.1f}{'' if r.in_range else '*'}" for r in mine),
                       *(" ".join(f"{100 * getattr(r, k):{form}}" for r in mine)
                         for k, form in (("linear_error", "+.0f"), ("pressure_error", ".0f"), ("moving", ".1f"),
-                                        ("worst", ".0f"), ("by_wrench", ".1f"))))  # fmt: skip
+                                        ("told", ".1f"), ("worst", ".0f"), ("by_wrench", ".1f"))))  # fmt: skip
     return table
 
 
 def _summary(rows: Sequence[Row]) -> Table:
     """Means and worst of known kinds and of strange ones, of all answers and of those that are not flagged."""
     table = Table(title="Means / worst, in %; what bounds cover, and their median over the error")
-    for name in ("tools", "answers", "flagged", "force", "pressure L2", "moving", "worst vertex", "force bound",
-                 "motion bound"):  # fmt: skip
+    for name in ("tools", "answers", "flagged", "force", "pressure L2", "moving", "way told", "worst vertex",
+                 "force bound", "motion bound"):  # fmt: skip
         table.add_column(name, justify="left" if name == "tools" else "right")
     for strange in (False, True):
         for in_range in (False, True):
             some = [r for r in rows if r.strange == strange and (r.in_range or not in_range)]
             flagged = np.mean([not r.in_range for r in some])
             cells = [np.abs([getattr(r, k) for r in some])
-                     for k in ("force_error", "pressure_error", "moving", "worst")]  # fmt: skip
+                     for k in ("force_error", "pressure_error", "moving", "told", "worst")]  # fmt: skip
             bounds = [np.array([getattr(r, k) for r in some if np.isfinite(getattr(r, k))])
                       for k in ("force_bound", "motion_bound")]  # fmt: skip
             errors = [np.array([abs(getattr(r, of)) for r in some if np.isfinite(getattr(r, k))])

@@ -350,7 +350,7 @@ class Toucher:
         if "uneven" in known and size > 0:
             doubt = math.hypot(doubt, known["uneven"] * self.net.unlike(nodes, forces))
         bound = known["scale"] * doubt ** known["power"] if size > 0 else 0.0
-        bound += STUCK * along + held.power * below / max(depth, below, 1e-300)  # the skin is no facets
+        bound = math.hypot(bound, held.power * below / max(depth, below, 1e-300)) + STUCK * along  # skin is no facets
         beside, radius = pins(nodes.points, nodes.area, nodes.thickness, forces)
         wider = WIDER if beside > GROUP and depth > DEEP * radius else 1.0
         touch = Touch(
