@@ -27,6 +27,7 @@ RINGS = len(RING_AT)
 OWN = 3.921  # of an even pressure on a lattice of triangles: sum of 1 / r with this / sqrt(area) for the node itself
 TOLERANCE = 3e-6  # largest change of the forces of one iteration, over the largest, at which it ends
 MAX_ITERATIONS = 200
+FARTHEST = 1e3  # force of a node over what it needs alone, beyond which there is no solution: the response is no layer's
 NEXT = np.uint64(1)
 ONE_THREAD = 2**18  # multiplications up to which OpenBLAS takes one thread, and so always sums in the same order
 POWER_TOLERANCE = 1e-4  # square of the residual over the first, at which the power is known
@@ -201,12 +202,17 @@ def moments_of(rings, points, thickness, area, pressure, strain):
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def solve(matrix, depth):
-    """Forces (N,) >= 0 with matrix @ forces >= depth, and equal where they are above 0."""
-    count = len(depth)
+    """Forces (N,) >= 0 with matrix @ forces >= depth, and equal where they are above 0.
+
+    A matrix that is not positive, as that of a tool around half of a small limb, has none: what was found is large, and
+    not to be trusted.
+    """
+    count, most = len(depth), 0.0
     force, gap, way, along = np.zeros(count), -depth, np.zeros(count), np.empty(count)
     for i in range(count):
         if depth[i] > 0:
             force[i] = 0.3 * depth[i] / matrix[i, i]
+            most = max(most, FARTHEST * depth[i] / matrix[i, i])
     _add_times(matrix, force, gap)
     before, restart, beside = 1.0, True, np.empty(count)
     for _ in range(MAX_ITERATIONS):
@@ -239,7 +245,7 @@ def solve(matrix, depth):
             change, largest = max(change, abs(now - force[i])), max(largest, now)
             force[i], beside[i] = now, now - straight
             gap[i] -= step * along[i]
-        if change <= TOLERANCE * largest:
+        if change <= TOLERANCE * largest or largest > most:
             break
         _add_times(matrix, beside, gap)  # few left the straight way: the gap follows without another whole product
     return force

@@ -16,7 +16,7 @@ from stmpl_core.trust import Trust
 from studies.stability import PRESETS, Report, again, judge, stability
 from studies.stability.contact_axes import CONTACT_AXES, CONTACT_LEVELS, QUICK_CONTACTS
 from studies.stability.contact_laws import CONTACT_LAWS
-from studies.stability.fuzz import fuzz, random_mesh
+from studies.stability.fuzz import TOOLS, fuzz, random_mesh, random_tool, random_trial
 from studies.stability.layered_axes import TRIALS
 from studies.stability.picture import draw
 from studies.stability.shapes import ball, box, capsule, punch, ring
@@ -308,3 +308,18 @@ def test_what_is_flagged_hides_nothing_that_is_not():
 def test_the_report_names_contacts(tmp_path):
     report: Report = stability({"sound": lambda: Brings(nothing)}, some("depth", "first touch"), tmp_path)
     assert report.axes == ["depth", "first touch"]
+
+
+def test_where_the_linear_problem_has_no_solution_forces_and_motion_are_numbers() -> None:
+    """A large tool in a small limb, by 344 nodes whose response is not positive: forces grew to 1e30 N."""
+    rng = np.random.default_rng([330, 1000])
+    mesh = random_mesh(rng)
+    tools = [random_tool(rng, mesh, f"tool {k}") for k in range(TOOLS)]
+    trial = [random_trial(rng, mesh, tools) for _ in range(431)][-1]
+    simulator = Simulator(mesh.layer, MomentNet())
+    (instant,) = trial.scene.instants
+    answer = simulator.step([Contact(*placed) for placed in instant])
+    assert [touch.status for touch in answer.touches.values()] == ["inside the core", "pulling"]
+    assert np.isfinite(answer.displacement).all() and not answer.trust.in_range
+    unit = mesh.tissue.youngs_modulus * mesh.thickness.max() ** 2
+    assert 0 < answer.touches[instant[0].tool.name].force < 1e6 * unit
