@@ -17,6 +17,7 @@ from stmpl_core.sdf import FAST, jet_at
 from stmpl_core.touch import Pressed, Touch, way_of
 
 MIN_LYING_PRESSURE = 0.05  # pressure over the tool's highest, below which a covered vertex may be apart from the tool
+BEYOND = 0.05  # way that skin under a tool may go beyond it, over its way
 FIRM_DEPTH = 0.013  # depth in a tool over the thickness, from which skin is moved out with its neighbours, not alone
 MIN_FACING_COSINE = 0.3  # cosine between tool's way and inward normal, from which skin comes along
 LEAST_WEIGHT = 1e-3  # firmness from which a correction counts: one that falls to 0 lets go of its vertex continuously
@@ -90,6 +91,31 @@ def kept_out(layer: SoftLayer, displacement: VertexVectors, touches: Sequence[To
     entered = _push_out(layer, touches, out)
     under = [touch.pressed.squeeze.vertices for touch in touches if touch.pressed is not None]
     return Conformed(out, max((_furthest(displacement, out, some) for some in under), default=0.0), entered)
+
+
+def no_further(layer: SoftLayer, motion: VertexVectors, displacement: VertexVectors, touches: Sequence[Touch]
+               ) -> VertexVectors:  # fmt: skip
+    """An answer on a stack, in which no tool's skin goes further than the tool by more than BEYOND.
+
+    The linear motion of skin that sticks lies on its tools, and a method adds to it what is not linear. Where that goes
+    through a tool, as of small tools on thick tissue and fine meshes, less is added everywhere.
+
+    Args:
+        layer: soft layer at rest.
+        motion: linear motion (stmpl_core.stick), (V, 3) [m].
+        displacement: a method's answer, (V, 3) [m].
+        touches: touches of all contacts.
+    """
+    share = 1.0
+    for touch in touches:
+        if touch.pressed is None or touch.pressure is None:
+            continue
+        v = np.flatnonzero(touch.pressure > MIN_LYING_PRESSURE * touch.pressure.max())
+        way = way_of(touch, touch.pressed, -layer.normals[v], float(touch.pressure @ layer.vertex_areas))
+        goes, went = (float(np.einsum("nx,nx->n", each[v], way).max(initial=0.0)) for each in (motion, displacement))
+        if went > (1 + BEYOND) * goes:
+            share = min(share, BEYOND * goes / (went - goes))
+    return motion + share * (displacement - motion) if share < 1 else displacement
 
 
 def _push_out(layer: SoftLayer, touches: Sequence[Touch], out: VertexVectors) -> float:

@@ -11,7 +11,7 @@ import numpy as np
 
 from stmpl_core.bounds import motion_bound
 from stmpl_core.carrying import carried
-from stmpl_core.conform import Conformed, conform, kept_out
+from stmpl_core.conform import Conformed, conform, kept_out, no_further
 from stmpl_core.contact import Contact
 from stmpl_core.dragged import dragged_motion
 from stmpl_core.errors import InvalidInput
@@ -208,7 +208,7 @@ class Simulator:
         solved = self.method.solve(Load.contact(moving, motion))
         if motion is None:
             return solved, conform(self.layer, self.skin.near, solved.displacement, touches)
-        return solved, kept_out(self.layer, solved.displacement, touches)
+        return solved, kept_out(self.layer, no_further(self.layer, motion, solved.displacement, touches), touches)
 
     def _dragged(self, fitted: Conformed, touches: Sequence[Touch]) -> Conformed:
         """The answer with the skin that is dragged along, and out of the tools."""

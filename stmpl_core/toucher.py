@@ -56,6 +56,8 @@ SUNK = 0.8  # depth of a thin tool over its least extent, beyond which its force
 STUCK = 0.5  # error of what skin that sticks carries along itself, over that
 MAX_LEVER = 1.0  # torque that is not carried over the force, over the contact's radius, that is not yet worth a word
 MAX_FIELD_ERROR_M = 5e-4  # error of a distance field that is not yet worth a word
+PINS = 3  # tools side by side from which they may be pins of one brush
+SIDES = (0.2, 0.8)  # share of the force that points one way: below, a tool closes around; between, its drag counts
 MAX_UNSEEN_FORCE_SHARE = 0.1  # share of the force that vertices unlike all training contacts may carry
 MAX_PRESSED_STRAIN = 0.85  # depth over thickness beyond which no wrench presses a tool
 STIFFENING = 10.0  # growth of the force beyond, relative, a thickness of the way that it was drawn back
@@ -164,17 +166,24 @@ class Toucher:
                   for contact in contacts]  # fmt: skip
         pressing = sorted((one for one in placed if len(one.squeeze.nodes.area)), key=lambda one: one.contact.name)
         held: dict[str, Held] = {}
+        beside: dict[str, tuple[float, float]] = {}
         for some in groups_of([one.squeeze.nodes.points for one in pressing], self._thickest):
             group = [pressing[n] for n in some]
             if len(group) == 1:
                 held[group[0].contact.name] = group[0].held or self.net.hold(group[0].squeeze.nodes)
                 continue
-            together = self.net.hold(Nodes.joined([one.squeeze.nodes for one in group]))
+            nodes = Nodes.joined([one.squeeze.nodes for one in group])
+            together = self.net.hold(nodes)
+            if len(group) >= PINS:
+                forces = together.pressure * nodes.area
+                among = pins(nodes.points, nodes.area, nodes.thickness, forces)
+                beside |= {one.contact.name: among for one in group}
             ends = np.cumsum([len(one.squeeze.nodes.area) for one in group])[:-1]
             parts = zip(*(np.split(values, ends) for values in together[:3]), strict=True)
             for one, (pressure, doubt, outside) in zip(group, parts, strict=True):
                 held[one.contact.name] = Held(pressure, doubt, outside, together.power)
-        return [self._answer(one, held.get(one.contact.name, NOTHING), alone) for one in placed]
+        return [self._answer(one, held.get(one.contact.name, NOTHING), beside.get(one.contact.name), alone)
+                for one in placed]  # fmt: skip
 
     def _place(self, contact: Contact, field: SignedDistance, many: bool, tried: float | None) -> _Placed:
         """Where the tool presses, or why it does not; tried: see `touch_all`."""
@@ -335,8 +344,11 @@ class Toucher:
             best = best._replace(force=min(size, best.force), why=f"{contact.name} did not settle within 2 %")
         return best
 
-    def _answer(self, one: _Placed, held: Held, alone: bool) -> Touch:
-        """What a placed tool does, scaled to its wrench, with what may be believed of it."""
+    def _answer(self, one: _Placed, held: Held, among: tuple[float, float] | None, alone: bool) -> Touch:
+        """What a placed tool does, scaled to its wrench, with what may be believed of it.
+
+        among: what `pins` says of the tools that press beside it, if there are many.
+        """
         layer, nodes, unit = self.layer, one.squeeze.nodes, one.factor * self._modulus
         v, pressure, values, wrench, forces, scale, size, doubt, strange, stuck, along, below = _carried(
             nodes.corners, nodes.shares, nodes.area, *held[:3], unit, math.nan if one.force is None else one.force,
@@ -350,8 +362,8 @@ class Toucher:
         if "uneven" in known and size > 0:
             doubt = math.hypot(doubt, known["uneven"] * self.net.unlike(nodes, forces))
         bound = known["scale"] * doubt ** known["power"] if size > 0 else 0.0
-        bound = math.hypot(bound, held.power * below / max(depth, below, 1e-300)) + STUCK * along  # skin is no facets
-        beside, radius = pins(nodes.points, nodes.area, nodes.thickness, forces)
+        bound += STUCK * along + held.power * below / max(depth, below, 1e-300)  # the skin is no facets
+        beside, radius = among or pins(nodes.points, nodes.area, nodes.thickness, forces)
         wider = WIDER if beside > GROUP and depth > DEEP * radius else 1.0
         touch = Touch(
             one.contact.name, one.status, one.pose, wrench,
@@ -386,6 +398,10 @@ class Toucher:
             return trust
         for why in self.near.sound.of_contact(vertices, pressure * layer.vertex_areas[vertices]):
             trust = trust.also(why, in_range=False)
+        one_way = touch.force / float(pressure @ layer.vertex_areas[vertices])
+        if SIDES[0] < one_way < SIDES[1]:
+            trust = trust.also(f"{name} presses from several sides: {one_way:.0%} of its force points one way, and "
+                               "what drags along its walls is not known", in_range=False)  # fmt: skip
         highest, most = card["ranges"]["p_over_e"][1], float(pressure.max())
         if touch.pressed is not None and touch.pressed.forces is not None:  # on a mesh finer than the nodes
             most = min(most, float((touch.pressed.forces / one.squeeze.nodes.area).max()))

@@ -157,3 +157,12 @@ def test_a_mesh_finer_than_the_contact_nodes_moves_as_a_coarser_one() -> None:
     values[len(values) // 2] = 1e3
     spread = near.spread_on(fine, values, Nodes.none()._replace(area=np.full(4, 8e-6)))
     assert spread @ fine.vertex_areas == pytest.approx(values @ fine.vertex_areas) and spread.max() < 300
+
+
+@pytest.mark.parametrize("depth", [0.15, 0.35])
+def test_skin_under_a_small_tool_on_thick_tissue_and_a_fine_mesh_goes_no_further_than_the_tool(depth):
+    simulator = Simulator(limb(4e-3, 0.045, 0.06, LENGTH).with_(tissue=STACK), MomentNet())
+    contact = contact_of(ball(8e-3), at(-0.06 - 8e-3 + depth * 0.045, 0, HALF))
+    answer = simulator.step([contact])
+    deep = answer.touches["probe"].depth
+    assert 0.95 * deep < answer.magnitude.max() < 1.1 * deep

@@ -272,8 +272,7 @@ def answer(first: wp.int32, many: wp.int32, known: Known, skins: Skins, scratch:
     if size > real(0.0):
         bound = known.scale * wp.pow(doubt, known.power)
         below = wp.abs(below) / wp.max(forces, NONE)
-        below = power * below / wp.max(depth, wp.max(below, NONE))
-        bound = wp.sqrt(bound * bound + below * below) + STUCK * along / size
+        bound += STUCK * along / size + power * below / wp.max(depth, wp.max(below, NONE))
         if group:
             bound *= WIDER
         bounds[n, k] = bounds.dtype(one.modulus * size * bound)
