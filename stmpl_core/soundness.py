@@ -6,6 +6,7 @@ from copy import copy
 from typing import TYPE_CHECKING, NamedTuple, Self
 
 import numpy as np
+import scipy.sparse as sp
 from scipy.spatial import KDTree
 
 from stmpl_core.layer import SoftLayer
@@ -78,7 +79,7 @@ class Soundness:
     Attributes:
         steep, long: masks of vertices, (V,).
         border: distance from the open border, over t, (V,).
-        facets: how far the flat triangles around a vertex lie below the curved skin at rest, (V,) [m].
+        facets: how far the flat triangles around a vertex lie off the smooth skin that they stand for, (V,) [m].
         least_border: least such distance of a load that is sound [-].
         bend: what joints did to it; None: it is at rest.
     """
@@ -89,7 +90,7 @@ class Soundness:
         self.steep = slope_of_thickness(layer) > STEEP
         self.long = longest_over_width(layer) > LONG
         self.border = border_distance(layer) / layer.thickness
-        self.facets = below_curved(layer)
+        self.facets = np.abs(below_curved(layer)) + roughness(layer)
         self.least_border = STACK_BORDER if layer.stacked else BORDER
         self._doubtful = self.steep | self.long | (self.border < self.least_border)
 
@@ -166,6 +167,21 @@ def below_curved(layer: SoftLayer) -> np.ndarray:
     weights, sums = (np.bincount(layer.faces.ravel(), np.repeat(each, 3), len(layer.vertices))
                      for each in (areas, below))  # fmt: skip
     return sums / np.maximum(weights, 1e-300)
+
+
+def roughness(layer: SoftLayer) -> np.ndarray:
+    """How far each vertex lies off its neighbours beyond what they do off theirs, along its normal, (V,) [m].
+
+    Smooth skin, however curved, has next to none; that of a scan with noise is its noise. None at the border.
+    """
+    one, other = layer.faces.ravel(), np.roll(layer.faces, -1, axis=1).ravel()
+    linked = sp.csr_matrix((np.ones(2 * len(one)), (np.r_[one, other], np.r_[other, one])), (len(layer.vertices),) * 2)
+    linked.data[:] = 1.0
+    mean = sp.diags(1 / np.maximum(np.asarray(linked.sum(axis=1)).ravel(), 1.0)) @ linked
+    off = np.einsum("vx,vx->v", mean @ layer.vertices - layer.vertices, layer.normals)
+    out = np.abs(off - mean @ off)
+    out[layer.border] = 0.0
+    return out
 
 
 def border_distance(layer: SoftLayer) -> np.ndarray:

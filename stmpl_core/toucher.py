@@ -522,7 +522,7 @@ def _carried(corners, shares, area, held, doubts, outside, unit, carries, areas,
         areas, points, area_vectors: of all vertices.
         origin: point about which torque is told, (3,) [m].
         sticks: see wrench_of.
-        facets: how far the flat triangles around a vertex lie below curved skin, (V,) [m].
+        facets: how far the flat triangles around a vertex lie off smooth skin, (V,) [m].
 
     Returns:
         vertices, pressure: numbers of the vertices that are pressed on, and pressures there, (M,) [Pa].
@@ -535,7 +535,7 @@ def _carried(corners, shares, area, held, doubts, outside, unit, carries, areas,
         strange: share of it that nodes carry that see what no training contact had.
         stuck: see wrench_of.
         along: share of the force that skin carries along itself.
-        below: how far facets lie below curved skin where it presses [m].
+        below: how far facets lie off smooth skin where it presses [m].
     """
     forces, doubt, strange, total = np.empty(len(area)), 0.0, 0.0, 0.0
     for n in range(len(area)):
@@ -558,7 +558,7 @@ def _carried(corners, shares, area, held, doubts, outside, unit, carries, areas,
         pressure[n] *= scale
         values[v] = pressure[n]
     return (vertices, pressure, values, wrench, forces, scale, size, doubt, strange / max(total, 1e-300), stuck,
-            along, abs(below))  # fmt: skip
+            along, below)  # fmt: skip
 
 
 def margin_on(layer: SoftLayer) -> float:

@@ -103,3 +103,16 @@ def test_skin_as_thin_as_paper_far_from_a_press_is_held_back_without_a_flag() ->
     answer = Simulator(layer.with_(thickness=thin), MomentNet()).step([contact])
     assert answer.trust.in_range, answer.trust.why
     assert 0.95 * thin[far] < np.linalg.norm(answer.displacement[far]) <= thin[far]
+
+
+@pytest.mark.parametrize("depth", [0.15, 0.3])
+def test_bounds_know_the_noise_of_a_scan(depth: float) -> None:
+    layer, covered = LAYERS["paper"], []
+    contact = down(Simulator(layer, Winkler()), TOOLS["ball"], depth)
+    (smooth,) = Simulator(layer, Winkler()).touch([contact])
+    for seed in range(8):
+        noise = np.random.default_rng(seed).normal(0, 1e-4, layer.vertices.shape)
+        (touch,) = Simulator(layer.with_(vertices=layer.vertices + noise), Winkler()).touch([contact])
+        covered.append(abs(touch.force - smooth.force) < touch.force_bound)
+        assert touch.force_bound / touch.force > smooth.force_bound / smooth.force + 0.05
+    assert sum(covered) >= 7

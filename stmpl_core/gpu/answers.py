@@ -271,7 +271,7 @@ def answer(first: wp.int32, many: wp.int32, known: Known, skins: Skins, scratch:
     bounds[n, k] = bounds.dtype(real(0.0))
     if size > real(0.0):
         bound = known.scale * wp.pow(doubt, known.power)
-        below = wp.abs(below) / wp.max(forces, NONE)
+        below /= wp.max(forces, NONE)
         bound += STUCK * along / size + power * below / wp.max(depth, wp.max(below, NONE))
         if group:
             bound *= WIDER
