@@ -10,6 +10,7 @@ import scipy.sparse as sp
 from scipy.spatial import KDTree
 
 from stmpl_core.layer import SoftLayer
+from stmpl_core.seams import edge_table
 
 if TYPE_CHECKING:
     from stmpl_core.bend import Bend
@@ -174,9 +175,8 @@ def roughness(layer: SoftLayer) -> np.ndarray:
 
     Smooth skin, however curved, has next to none; that of a scan with noise is its noise. None at the border.
     """
-    one, other = layer.faces.ravel(), np.roll(layer.faces, -1, axis=1).ravel()
+    one, other = edge_table(layer.faces)[0].T
     linked = sp.csr_matrix((np.ones(2 * len(one)), (np.r_[one, other], np.r_[other, one])), (len(layer.vertices),) * 2)
-    linked.data[:] = 1.0
     mean = sp.diags(1 / np.maximum(np.asarray(linked.sum(axis=1)).ravel(), 1.0)) @ linked
     off = np.einsum("vx,vx->v", mean @ layer.vertices - layer.vertices, layer.normals)
     out = np.abs(off - mean @ off)

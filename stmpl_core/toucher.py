@@ -400,9 +400,11 @@ class Toucher:
             trust = trust.also(one.why, in_range=False)
         if not len(pressure):
             return trust
-        for why in self.near.sound.of_contact(vertices, pressure * layer.vertex_areas[vertices]):
+        forces = pressure * layer.vertex_areas[vertices]
+        for why in self.near.sound.of_contact(vertices, forces):
             trust = trust.also(why, in_range=False)
-        one_way = touch.force / float(pressure @ layer.vertex_areas[vertices])
+        total = float(forces.sum())
+        one_way = touch.force / max(total, 1e-300)
         if SIDES[0] < one_way < SIDES[1]:
             trust = trust.also(f"{name} presses from several sides: {one_way:.0%} of its force points one way, and "
                                "what drags along its walls is not known", in_range=False)  # fmt: skip
@@ -562,11 +564,11 @@ def _carried(corners, shares, area, held, doubts, outside, unit, carries, areas,
         wrench[x] *= scale
     for n in range(len(vertices)):
         v = vertices[n]
-        below += pressure[n] * areas[v] * facets[v] / max(total, 1e-300)
+        below += pressure[n] * areas[v] * facets[v]
         pressure[n] *= scale
         values[v] = pressure[n]
     return (vertices, pressure, values, wrench, forces, scale, size, doubt, strange / max(total, 1e-300), stuck,
-            along, below)  # fmt: skip
+            along, below / max(total, 1e-300))  # fmt: skip
 
 
 def soft_depth(tissue: Tissue) -> float:

@@ -6,8 +6,9 @@ import pytest
 from benchmarks.tools import ball, block_letter, fingertip, flat
 from stmpl_core import Contact, Membrane, Ply, Simulator, Tissue, Tool
 from stmpl_core.conform import kept_out
-from stmpl_core.layer import SoftLayer
 from stmpl_core.methods import MomentNet, Winkler
+from studies.stability.meshes import inserted
+from studies.stability.meshes import limb as round_limb
 from tests.scenes import limb, plate, turn
 
 TOOLS = {"ball": ball(12), "fingertip": fingertip(8, 14), "punch": flat(9, 1.5), "letter": block_letter("H", 26)}
@@ -73,21 +74,13 @@ def test_bounds_know_that_the_facets_of_a_coarse_mesh_lie_below_round_skin(depth
     assert expected.force - touch.force < touch.force_bound < 0.35 * touch.force
 
 
-def cut_in_three(layer: SoftLayer, some: np.ndarray) -> SoftLayer:
-    """These faces cut at their centres, into triangles three times as long as wide."""
-    corners, centre = layer.faces[some], len(layer.vertices) + np.arange(len(some))
-    thirds = [np.column_stack([corners[:, k], corners[:, (k + 1) % 3], centre]) for k in range(3)]
-    return SoftLayer(np.concatenate([layer.vertices, layer.vertices[corners].mean(axis=1)]),
-                     np.concatenate([np.delete(layer.faces, some, axis=0), *thirds]),
-                     float(layer.thickness.max()), tissue=layer.tissue)  # fmt: skip
-
-
 def test_a_long_triangle_among_even_ones_is_not_flagged_and_many_are() -> None:
-    layer = LAYERS["paper"]
-    contact = down(Simulator(layer, Winkler()), ball(40), 0.3)
+    mesh = round_limb(4e-3, 0.04, 0.12, 7.5e-3)
+    contact = down(Simulator(mesh.layer, Winkler()), ball(40), 0.3)
     place = contact.pose_body_from_tool[:3, 3]  # its tip
-    near = np.linalg.norm(layer.vertices[layer.faces].mean(axis=1) - place, axis=1).argsort()
-    answers = [Simulator(cut_in_three(layer, some), MomentNet()).step([contact]) for some in (near[:1], near[:90:2])]
+    near = np.linalg.norm(mesh.vertices[mesh.faces].mean(axis=1) - place, axis=1).argsort()
+    answers = [Simulator(inserted(mesh, some, (1 / 3, 1 / 3, 1 / 3)).layer, MomentNet()).step([contact])
+               for some in (near[:1], near[:90:2])]  # fmt: skip
     assert [answer.trust.in_range for answer in answers] == [True, False]
     assert "longer than 2.2 times" in answers[1].trust.why
 
