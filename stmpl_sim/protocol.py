@@ -50,11 +50,13 @@ class Memory:
         tissue: memory of the tissue.
         at: pose_body_from_tool of the step before, by the tool's name, layer axes.
         speed: speed at which each tool that pressed went into the skin [m/s], and the force that it pressed with [N].
+        free: way that each tool that is apart may go before it may touch, by name [m].
     """
 
     tissue: State = field(default_factory=State)
     at: Mapping[str, Transform] = field(default_factory=dict)
     speed: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    free: Mapping[str, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, eq=False)
@@ -143,7 +145,8 @@ class SoftContact:
         self.damping, self.implicit = damping, implicit
         self.pose_body_from_layer = _rigid("pose_body_from_layer", np.eye(4) if pose_body_from_layer is None
                                            else pose_body_from_layer)  # fmt: skip
-        self._far = FAR_HOLES * self.simulator.toucher.hole
+        hole = self.simulator.toucher.hole
+        self._far, self._seen = FAR_HOLES * hole, hole + float(self.simulator.layer.thickness.max())
         self._tree = KDTree((self.simulator.skin.rest or self.simulator.skin).layer.vertices)
         self._balls = {}
         for tool in tools:
@@ -183,10 +186,13 @@ class SoftContact:
         at = {name: layer_from_world @ _rigid(name, poses.tools[name]) for name in self.tools}
 
         # Touch: those that are near, or whose imprint is still there; the others are apart, which costs nothing.
-        near = [Contact(self.tools[name], pose) for name, pose in at.items()
-                if _has_imprint(memory.tissue, name) or not self._is_far(name, pose)]  # fmt: skip
+        free = {name: self._free(name, pose, memory) for name, pose in at.items()
+                if not _has_imprint(memory.tissue, name)}  # fmt: skip
+        near = [Contact(self.tools[name], pose) for name, pose in at.items() if not free.get(name, 0.0) > 0]
         found, tissue = self.simulator.touch(near, memory.tissue, dt)
         touches = {touch.name: touch for touch in found}
+        hole, seen = self.simulator.toucher.hole, self._seen
+        free |= {touch.name: min(-touch.depth, seen) - hole for touch in found if touch.status == APART}
         touches = {name: touches.get(name) or Touch(name, APART, pose, np.zeros(6)) for name, pose in at.items()}
 
         # Wrenches: from layer to world axes, about the origin of the stated pose; the body feels the opposite.
@@ -209,7 +215,7 @@ class SoftContact:
             wrenches[name] = -np.concatenate([force, torque])
             lever = poses.tools[name][:3, 3] - body[:3, 3]
             on_body += np.concatenate([force, torque + cross(lever, force)])
-        return Reaction(wrenches, on_body, touches, Memory(tissue, at, speed))
+        return Reaction(wrenches, on_body, touches, Memory(tissue, at, speed, free))
 
     def pose(self, joints: Mapping[str, float], memory: Memory) -> Memory:
         """Takes the skin to where its joints are now (milliseconds); the memory, gone along with it.
@@ -230,9 +236,15 @@ class SoftContact:
         """The displacement of the skin under a reaction of this contact, layer axes."""
         return self.simulator.answer(list(reaction.touches.values()))
 
-    def _is_far(self, name: str, pose: Transform) -> bool:
-        """Whether a tool is outside of the skin and farther from it than the contact law looks."""
-        middle, radius = self._balls[name]
+    def _free(self, name: str, pose: Transform, memory: Memory) -> float:
+        """Way that a tool may go from its pose before the contact law need be asked [m]; not above 0: it must be."""
+        (middle, radius), before = self._balls[name], memory.at.get(name)
+        if before is not None and memory.free.get(name, 0.0) > 0:
+            way = pose - before
+            left = memory.free[name] - float(np.linalg.norm(way[:3, :3] @ middle + way[:3, 3])
+                                             + np.linalg.norm(way[:3, :3]) * radius)  # fmt: skip
+            if left > 0:
+                return left
         centre = pose[:3, :3] @ middle + pose[:3, 3]
         layer = self.simulator.layer
         if self.simulator.skin.rest is None:
@@ -240,9 +252,8 @@ class SoftContact:
         else:  # a tree pays for itself only where the skin stays
             nearest = int(((layer.vertices - centre) ** 2).sum(axis=1).argmin())
             gap = np.linalg.norm(layer.vertices[nearest] - centre)
-        if gap < radius + self._far:
-            return False
-        return bool((centre - layer.vertices[nearest]) @ layer.normals[nearest] > 0.5 * gap)
+        outside = (centre - layer.vertices[nearest]) @ layer.normals[nearest] > 0.5 * gap
+        return float(gap) - radius - self._far if outside else 0.0
 
     def _factor(
         self,

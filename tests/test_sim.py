@@ -7,13 +7,14 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from stmpl_core import Contact, Simulator, SoftLayer, Touch
+from stmpl_core import Contact, Simulator, SoftLayer, State, Touch
 from stmpl_core.errors import InvalidInput
 from stmpl_core.methods import Winkler
 from stmpl_core.touch import APART
 from stmpl_sim import Memory, Poses, Reaction, SoftBody, SoftContact, exchange
 from stmpl_sim.energy import EnergyBook
-from tests.scenes import ball, limb, plate
+from tests.scenes import RADIUS as LIMB_RADIUS
+from tests.scenes import ball, box, limb, plate
 
 mujoco = pytest.importorskip("mujoco", reason="pip install 'stmpl[sim]'")
 
@@ -127,8 +128,32 @@ def test_a_tool_that_is_not_asked_about_would_have_been_apart() -> None:
         law = simulator.touch([Contact(tool, at)])[0]
         assert touch.status == law.status
         np.testing.assert_array_equal(touch.wrench, law.wrench)
-        far += contact._is_far("probe", at)
+        far += contact._free("probe", at, Memory()) > 0
     assert 30 < far < 140  # both happened
+
+
+def test_a_tool_that_was_apart_a_step_ago_is_asked_about_where_it_may_touch() -> None:
+    """Steps of 2 mm and 3 degrees, or a leap: each as if there had been none before."""
+    simulator, random = Simulator(limb(5e-3), Winkler()), np.random.default_rng(3)
+    tool, touching, left = box(0.02, 0.008, 0.008), 0, 0
+    contact, memory = SoftContact(simulator, [tool]), Memory()
+    at = pose(0.09, 0.0, 0.08)
+    for n in range(400):
+        way = np.array([LIMB_RADIUS + 0.005, 0.0, 0.08]) - at[:3, 3]
+        turn = Rotation.from_rotvec(0.05 * random.normal(size=3))
+        at = pose(*(at[:3, 3] + 2e-4 * random.normal(size=3) + 2e-3 * way / np.linalg.norm(way)),
+                  turn * Rotation.from_matrix(at[:3, :3]))  # fmt: skip
+        if n % 40 == 39:
+            at = pose(*random.uniform([0.06, -0.05, 0.03], [0.1, 0.05, 0.13]))
+        made = contact.step(Poses(np.eye(4), {tool.name: at}), memory, 1e-3)
+        alone = contact.step(Poses(np.eye(4), {tool.name: at}))
+        touch, fresh = made.touches[tool.name], alone.touches[tool.name]
+        assert touch.status == fresh.status
+        np.testing.assert_allclose(touch.wrench, fresh.wrench, atol=1e-9)
+        memory = Memory(State(), made.memory.at, made.memory.speed, made.memory.free)
+        touching += touch.presses
+        left += memory.free.get(tool.name, 0.0) > 0
+    assert touching > 50 and left > 100  # both happened
 
 
 def test_poses_that_cannot_be_used_are_one_sentence(simulator: Simulator) -> None:
