@@ -283,6 +283,10 @@ class RobotConfig(BaseModel):
     end: str = Field(default="", description="body or site of it that carries the ball; empty: its last body")
     at: tuple[float, float, float] = Field(default=(0.5, 0.0, 0.25), description="place of the limb in its world [m]")
     physics: float = Field(default=500.0, ge=50, le=20_000, description="rate of physics and contact [Hz]")
+    every: int = Field(
+        default=1, ge=1, description="steps from one at which the contact law is asked to the next; in between contact "
+        "goes on to first order",
+    )  # fmt: skip
     rate: float = Field(default=100.0, ge=1, le=2000, description="rate of poses, wrenches and joints [Hz]")
     told: bool = Field(
         default=False,

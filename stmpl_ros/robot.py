@@ -187,7 +187,7 @@ def massage_of(config: RobotConfig, layer: SoftLayer) -> Massage:
     scene = scene_of(config, layer)
     course = Course(scene.site.circle(1e-3 * config.circle), config.force, 1e-3 * config.speed, config.laps,
                     config.grip or 0.0)  # fmt: skip
-    return Massage(scene, course, friction=friction_from(config.friction))
+    return Massage(scene, course, friction=friction_from(config.friction), every=config.every)
 
 
 def made(config: RobotConfig, layer: SoftLayer, stop: threading.Event) -> Massage:

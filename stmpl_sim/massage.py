@@ -249,17 +249,18 @@ class Massage:
         damping: see SoftContact.
         implicit: see SoftContact.
         friction: see SoftContact.
+        every: see SoftContact.
     """
 
     def __init__(self, scene: Scene, course: Course, *, gains: Gains | None = None, skin: Any = None,
                  damping: float = 0.0, implicit: bool = False,
-                 friction: Friction | Mapping[str, Friction] = None) -> None:  # fmt: skip
+                 friction: Friction | Mapping[str, Friction] = None, every: int = 1) -> None:  # fmt: skip
         self.scene, self.course = scene, course
         self.fingers = tuple(name for name in scene.tools if name in FINGERS)
         if self.fingers and not hasattr(skin, "history"):  # a Simulator has its own
             friction = with_fingers(friction, BALL)
         self.skin = SoftBody(scene.model, skin or scene.layer, body=LIMB, tools=scene.tools, damping=damping,
-                             implicit=implicit, friction=friction)  # fmt: skip
+                             implicit=implicit, friction=friction, every=every)  # fmt: skip
         self.gripper = Gripper(scene.model, course.grip) if self.fingers else None
         self.data = mujoco.MjData(scene.model)
         self.controller = ForceImpedance(scene.model, scene.joints, BALL, scene.qpos, gains)

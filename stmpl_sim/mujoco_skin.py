@@ -63,6 +63,7 @@ class SoftBody:
         friction: see SoftContact.
         joints: hinge of the model by the joint of the layer's rig that it turns, as {"left_elbow": "elbow"}: the limb
             bends with it, and the hinge's body feels what presses on that side of it. `body` carries the rig's root.
+        every: see SoftContact.
 
     Attributes:
         contact: the SoftContact.
@@ -88,6 +89,7 @@ class SoftBody:
         implicit: bool = False,
         friction: Friction | Mapping[str, Friction] = None,
         joints: Mapping[str, str] | None = None,
+        every: int = 1,
     ) -> None:
         self.model = model
         self.body = _body(model, body)
@@ -106,7 +108,7 @@ class SoftBody:
         self._posed: dict[str, float] = {}
         made = [_tool(model, name, self._sources[name]) for name in tools]
         self.contact = SoftContact(layer, made, method, pose_body_from_layer=pose_body_from_layer, damping=damping,
-                                   implicit=implicit, friction=friction)  # fmt: skip
+                                   implicit=implicit, friction=friction, every=every)  # fmt: skip
         if self._jointed is not None:
             self._jointed.compare(model, self.contact.pose_body_from_layer)
         self.memory = Memory()
@@ -197,8 +199,10 @@ class SoftBody:
         """
         if self.reaction is None:
             return np.zeros((3, 3))
-        touch, tissue = self.reaction.touches[name], self.reaction.memory.tissue
-        (model,) = local_contacts(self.simulator.history, [touch], tissue)
+        touch, memory = self.reaction.touches[name], self.reaction.memory
+        model = None if memory.asked is None else memory.asked.models.get(name)
+        if model is None:
+            (model,) = local_contacts(self.simulator.history, [touch], memory.tissue)
         turn = (self.pose(data) @ self.contact.pose_body_from_layer)[:3, :3]
         return turn @ model.push_stiffness[:3, :3] @ turn.T
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Protocol
 
 import numpy as np
@@ -17,7 +17,7 @@ from stmpl_core.contact import Contact
 from stmpl_core.errors import InvalidInput
 from stmpl_core.friction import Friction
 from stmpl_core.layer import SoftLayer
-from stmpl_core.local_contact import local_contacts
+from stmpl_core.local_contact import LocalContact, local_contacts
 from stmpl_core.methods import MomentNet
 from stmpl_core.methods.base import Method
 from stmpl_core.simulator import Simulator
@@ -43,6 +43,25 @@ class Poses:
 
 
 @dataclass(frozen=True, eq=False)
+class Asked:
+    """The last step at which the contact law was asked, for the steps up to the next one.
+
+    Args:
+        at: pose_body_from_tool then, by the tool's name, layer axes.
+        touches: touches then, by the tool's name.
+        models: local models of those that press, by name.
+        steps: steps since then.
+        waited: time since then [s].
+    """
+
+    at: Mapping[str, Transform]
+    touches: Mapping[str, Touch]
+    models: Mapping[str, LocalContact]
+    steps: int = 0
+    waited: float = 0.0
+
+
+@dataclass(frozen=True, eq=False)
 class Memory:
     """Memory of a soft contact: a value that goes into a step and comes out of it.
 
@@ -51,12 +70,14 @@ class Memory:
         at: pose_body_from_tool of the step before, by the tool's name, layer axes.
         speed: speed at which each tool that pressed went into the skin [m/s], and the force that it pressed with [N].
         free: way that each tool that is apart may go before it may touch, by name [m].
+        asked: when the contact law was asked; None where it is asked at every step.
     """
 
     tissue: State = field(default_factory=State)
     at: Mapping[str, Transform] = field(default_factory=dict)
     speed: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     free: Mapping[str, float] = field(default_factory=dict)
+    asked: Asked | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,7 +88,8 @@ class Reaction:
         tools: wrench on each tool about its own origin, by name. What a sensor behind the tool would feel.
         body: wrench on the body about its origin: the opposite of all of them.
         touches: touch of each contact, by the name of its tool, in layer axes: what the tissue and its friction carry,
-            without `damping` and `implicit`.
+            without `damping` and `implicit`. Between two steps that ask (`every`) wrench and pose are of now, all else
+            is of when the law was asked.
         memory: memory for the next step.
     """
 
@@ -111,10 +133,13 @@ class SoftContact:
             [1/kg] of the tool against the body. Needs `mobility` at each step. Each tool by itself.
         friction: coefficient of friction, or the name of a pair in stmpl_core.friction, of all tools or by tool's
             name; None: none, or that of the Simulator that was given.
+        every: steps from one at which the contact law is asked to the next. In between the contact goes on to first
+            order, by its local model, while that holds; what is apart is asked about as soon as it may touch. Not with
+            `damping` nor `implicit`.
 
     Raises:
-        InvalidInput: tools of one name, no tools, a damping below 0, a pose that is not rigid, or friction that is none
-            or is given beside a Simulator, which has its own.
+        InvalidInput: tools of one name, no tools, a damping below 0, a pose that is not rigid, an `every` below 1 or
+            beside `damping` or `implicit`, or friction that is none or is given beside a Simulator, which has its own.
         MeshError: a surface that cannot be a tool.
     """
 
@@ -128,12 +153,16 @@ class SoftContact:
         damping: float = 0.0,
         implicit: bool = False,
         friction: Friction | Mapping[str, Friction] = None,
+        every: int = 1,
     ) -> None:
         names = [tool.name for tool in tools]
         if not names or len(set(names)) < len(names):
             raise InvalidInput(f"a skin wants tools with names of their own; got {', '.join(names) or 'none'}.")
         if not (math.isfinite(damping) and damping >= 0):
             raise InvalidInput(f"damping is {damping} s/m; it must be finite and at least 0.")
+        if every < 1 or (every > 1 and (damping or implicit)):
+            raise InvalidInput(f"the contact law is asked at every {every} steps; that must be at least 1, and 1 with "
+                               "damping or implicit=True.")  # fmt: skip
         if isinstance(layer, Simulator):
             if friction is not None:
                 raise InvalidInput("this Simulator has its own friction. Give it there: Simulator(..., friction=0.3).")
@@ -142,7 +171,7 @@ class SoftContact:
             ready = None if isinstance(layer, Skin) else method or MomentNet()
             self.simulator = Simulator(layer, ready, friction=friction)
         self.tools = {tool.name: tool for tool in tools}
-        self.damping, self.implicit = damping, implicit
+        self.damping, self.implicit, self.every = damping, implicit, every
         self.pose_body_from_layer = _rigid("pose_body_from_layer", np.eye(4) if pose_body_from_layer is None
                                            else pose_body_from_layer)  # fmt: skip
         hole = self.simulator.toucher.hole
@@ -185,28 +214,19 @@ class SoftContact:
             raise InvalidInput(f"there is no pose of {', '.join(missing)}; given: {', '.join(poses.tools) or 'none'}.")
         at = {name: layer_from_world @ _rigid(name, poses.tools[name]) for name in self.tools}
 
-        # Touch: those that are near, or whose imprint is still there; the others are apart, which costs nothing.
-        free = {name: self._free(name, pose, memory) for name, pose in at.items()
-                if not _has_imprint(memory.tissue, name)}  # fmt: skip
-        near = [Contact(self.tools[name], pose) for name, pose in at.items() if not free.get(name, 0.0) > 0]
-        found, tissue = self.simulator.touch(near, memory.tissue, dt)
-        touches = {touch.name: touch for touch in found}
-        hole, seen = self.simulator.toucher.hole, self._seen
-        free |= {touch.name: min(-touch.depth, seen) - hole for touch in found if touch.status == APART}
-        touches = {name: touches.get(name) or Touch(name, APART, pose, np.zeros(6)) for name, pose in at.items()}
+        # Touch: to first order from the last step that asked, or asked.
+        touches, now = self._between(at, memory, dt) or self._ask(at, memory, dt)
+        models = now.asked.models if now.asked is not None and self.implicit else {}
 
         # Wrenches: from layer to world axes, about the origin of the stated pose; the body feels the opposite.
-        models = local_contacts(self.simulator.history, found, tissue) if self.implicit and dt > 0 else []
-        stiffness = {touch.name: model.push_stiffness[:3, :3] for touch, model in zip(found, models, strict=False)}
         turn = world_from_layer[:3, :3]
         wrenches, on_body, speed = {}, np.zeros(6), {}
         for name, touch in touches.items():
             if not touch.wrench.any():
                 wrenches[name] = np.zeros(6)
                 continue
-            factor, speed[name] = self._factor(
-                touch, at[name], memory, dt, stiffness.get(name), world_from_layer, mobility
-            )
+            factor, speed[name] = self._factor(touch, at[name], memory, dt, models.get(name), world_from_layer,
+                                               mobility)  # fmt: skip
             pressing = _pressing(touch)
             exerted = factor * pressing + (touch.wrench - pressing)
             force, torque = exerted[:3], exerted[3:]
@@ -215,7 +235,50 @@ class SoftContact:
             wrenches[name] = -np.concatenate([force, torque])
             lever = poses.tools[name][:3, 3] - body[:3, 3]
             on_body += np.concatenate([force, torque + cross(lever, force)])
-        return Reaction(wrenches, on_body, touches, Memory(tissue, at, speed, free))
+        return Reaction(wrenches, on_body, touches, replace(now, speed=speed))
+
+    def _ask(self, at: Mapping[str, Transform], memory: Memory, dt: float) -> tuple[dict[str, Touch], Memory]:
+        """Touches by the contact law, and the memory then, but for speeds; at: see Memory.
+
+        Of tools that are near, or whose imprint is still there; the others are apart, which costs nothing.
+        """
+        free = {name: self._free(name, pose, memory) for name, pose in at.items()
+                if not _has_imprint(memory.tissue, name)}  # fmt: skip
+        near = [Contact(self.tools[name], pose) for name, pose in at.items() if not free.get(name, 0.0) > 0]
+        waited = dt if memory.asked is None else dt + memory.asked.waited
+        found, tissue = self.simulator.touch(near, memory.tissue, waited)
+        hole, seen, models = self.simulator.toucher.hole, self._seen, {}
+        free |= {touch.name: min(-touch.depth, seen) - hole for touch in found if touch.status == APART}
+        if self.every > 1 or (self.implicit and dt > 0):
+            pressing = [touch for touch in found if touch.wrench.any()]
+            made = local_contacts(self.simulator.history, pressing, tissue)
+            models = {touch.name: model for touch, model in zip(pressing, made, strict=True)}
+        by_name = {touch.name: touch for touch in found}
+        touches = {name: by_name.get(name) or Touch(name, APART, pose, np.zeros(6)) for name, pose in at.items()}
+        return touches, Memory(tissue, at, free=free, asked=Asked(at, touches, models))
+
+    def _between(self, at: Mapping[str, Transform], memory: Memory, dt: float
+                 ) -> tuple[dict[str, Touch], Memory] | None:  # fmt: skip
+        """The same to first order from the last step that asked; None: the law must be asked."""
+        asked = memory.asked
+        if asked is None or asked.steps + 1 >= self.every:
+            return None
+        touches, free = {}, {}
+        for name, pose in at.items():
+            touch, model = asked.touches[name], asked.models.get(name)
+            if model is None:
+                free[name] = 0.0 if _has_imprint(memory.tissue, name) else self._free(name, pose, memory)
+                if not free[name] > 0:
+                    return None
+                touches[name] = replace(touch, pose_body_from_tool=pose)
+                continue
+            there = pose @ _inverse(asked.at[name]) @ model.pose_body_from_tool
+            rendered = model.wrench_at(there)
+            if not rendered.inside:
+                return None
+            touches[name] = replace(touch, wrench=rendered.wrench, pose_body_from_tool=there)
+        later = replace(asked, steps=asked.steps + 1, waited=asked.waited + dt)
+        return touches, Memory(memory.tissue, at, free=free, asked=later)
 
     def pose(self, joints: Mapping[str, float], memory: Memory) -> Memory:
         """Takes the skin to where its joints are now (milliseconds); the memory, gone along with it.
@@ -261,7 +324,7 @@ class SoftContact:
         pose: Transform,
         memory: Memory,
         dt: float,
-        stiffness: np.ndarray | None,
+        model: LocalContact | None,
         world_from_layer: Transform,
         mobility: Callable[[str, np.ndarray, np.ndarray], float] | None,
     ) -> tuple[float, tuple[float, float]]:
@@ -276,10 +339,10 @@ class SoftContact:
             then = before @ np.linalg.solve(pose, np.append(centre, 1.0))
             v = float((centre - then[:3]) @ normal) / dt
         c = self.damping * force
-        if stiffness is None:
+        if model is None:
             return max(0.0, 1 + self.damping * v), (v, force)
         assert mobility is not None
-        k = max(0.0, float(normal @ stiffness @ normal))
+        k = max(0.0, float(normal @ model.push_stiffness[:3, :3] @ normal))
         turn = world_from_layer[:3, :3]
         a = mobility(touch.name, turn @ centre + world_from_layer[:3, 3], turn @ normal)
         # What accelerated it in the last step, less what the contact itself did of that.

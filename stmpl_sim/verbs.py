@@ -37,6 +37,7 @@ def sim(
     end: str | None = None,
     at: tuple[float, float, float] = (0.5, 0.0, 0.25),
     rate: float = 1000.0,
+    every: int = 1,
     damping: float = 0.0,
     friction: str = "none",
     relaxing: bool = False,
@@ -67,6 +68,7 @@ def sim(
         end: body or site of the robot that carries the ball, z axis towards the skin; the last body unless given.
         at: place of the limb in the robot's world [m].
         rate: rate of physics, with contact at every step [Hz].
+        every: steps from one at which the contact law is asked to the next; in between contact goes on to first order.
         damping: damping of the contact [s/m], not measured on tissue; 0: none.
         friction: coefficient of friction, or dry, moist, oiled, glove, typical, or none.
         relaxing: stress that fades, as in skin that was stretched and held (assumed of all materials).
@@ -90,12 +92,12 @@ def sim(
     scene = build(layer, site, robot=robot, end=end, at=at, mount=mount_of(mount, grip), radius=1e-3 * radius,
                   timestep=1 / rate, gripper=grip > 0)  # fmt: skip
     course = Course(site.circle(1e-3 * circle), tuple(force), 1e-3 * speed, laps, grip)
-    massage = Massage(scene, course, damping=damping, friction=friction_from(friction))
+    massage = Massage(scene, course, damping=damping, friction=friction_from(friction), every=every)
     out.mkdir(parents=True, exist_ok=True)
     shots: list[Any] | None = None if film == "none" else []
     log = _run(massage, shots, quiet=as_json)
     log.save(out / "log.npz")
-    figures = figures_of(log) | {"log": str(out / "log.npz")}
+    figures = figures_of(log) | {"log": str(out / "log.npz"), "every": every}
     if shots is not None:
         from stmpl_sim.film import film as made
 
@@ -218,6 +220,10 @@ def gripped(log: Log) -> dict[str, float] | None:
     }
 
 
+def _often(every: int) -> str:
+    return "at every step" if every == 1 else f"asked at every {every} steps, to first order between"
+
+
 def table(figures: dict[str, Any]) -> Any:
     """The figures for people."""
     from rich.console import Group
@@ -234,7 +240,8 @@ def table(figures: dict[str, Any]) -> Any:
         f"highest force {figures['highest_force_N']:.1f} N; limb moved {1e3 * figures['limb_moved_m']:.1f} mm",
         f"energy: stored {1e3 * figures['stored_J']:.2f} mJ at most, given out beyond what was put in "
         f"{1e3 * figures['given_out_J']:+.3f} mJ ({100 * figures['given_out_of_stored']:+.1f} %; below 0: lost)",
-        f"{figures['rate_Hz']:.0f} Hz, contact at every step: {figures['real_time_factor']:.2f} of real time here, "
+        f"{figures['rate_Hz']:.0f} Hz, contact {_often(figures['every'])}: "
+        f"{figures['real_time_factor']:.2f} of real time here, "
         f"{figures['real_time_factor_of_processor_time']:.2f} by processor time "
         f"(contact {1e3 * figures['touch_s']:.2f} of {1e3 * figures['step_s']:.2f} ms, median)",
         f"log: {figures['log']}",

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from stmpl_core import Contact, Simulator, SoftLayer, State, Touch
 from stmpl_core.errors import InvalidInput
-from stmpl_core.methods import Winkler
+from stmpl_core.methods import MomentNet, Winkler
 from stmpl_core.touch import APART
 from stmpl_sim import Memory, Poses, Reaction, SoftBody, SoftContact, exchange
 from stmpl_sim.energy import EnergyBook
@@ -460,3 +460,50 @@ def test_quick_vectors_are_those_of_numpy_and_scipy() -> None:
         np.testing.assert_array_equal(cross(a, b), np.cross(a, b))
         turn = Rotation.from_rotvec(size * a / np.linalg.norm(a))
         np.testing.assert_allclose(_turned(turn.as_matrix()), turn.as_rotvec(), rtol=1e-6, atol=1e-15)
+
+
+def pressed_and_slid(contact: SoftContact, tool: str, steps: int = 240) -> tuple[np.ndarray, float, list[Memory]]:
+    """A tool that goes 2 mm down and 10 mm along: forces (N, 3) [N], work done on the skin [J], and memories."""
+    memory, forces, memories, work, before = Memory(), [], [], 0.0, None
+    for k in range(steps + 1):
+        s = k / steps
+        at = pose(0.01 * s, 0.0, RADIUS - 2e-3 * np.sin(np.pi * s), Rotation.from_rotvec([0, 0.2 * s, 0]))
+        made = contact.step(Poses(np.eye(4), {tool: at}), memory, 1e-3 * (k > 0))
+        memory = made.memory
+        forces.append(made.tools[tool][:3])
+        memories.append(memory)
+        if before is not None:
+            work -= 0.5 * (made.tools[tool][:3] + forces[-2]) @ (at[:3, 3] - before)
+        before = at[:3, 3]
+    return np.array(forces), work, memories
+
+
+def test_contact_between_two_steps_that_ask_goes_on_to_first_order(slab: SoftLayer) -> None:
+    simulator = Simulator(slab, MomentNet(), friction=0.4)
+    tool = ball(RADIUS)
+    exact, spent, memories = pressed_and_slid(SoftContact(simulator, [tool]), tool.name)
+    assert all(memory.asked is None or memory.asked.steps == 0 for memory in memories)
+    fast, spent_fast, memories = pressed_and_slid(SoftContact(simulator, [tool], every=4), tool.name)
+    steps = np.array([memory.asked.steps for memory in memories if memory.asked is not None])
+    assert steps.max() == 3 and (steps > 0).mean() > 0.6
+    size = np.linalg.norm(exact, axis=1)
+    assert np.linalg.norm(fast - exact, axis=1).max() < 0.02 * size.max()
+    assert not np.array_equal(fast, exact)
+    assert spent > 0 and abs(spent_fast - spent) < 0.02 * spent
+
+
+def test_a_step_that_leaves_what_a_model_holds_asks_again(slab: SoftLayer) -> None:
+    simulator, tool = Simulator(slab, MomentNet()), ball(RADIUS)
+    often, seldom = (SoftContact(simulator, [tool], every=every) for every in (1, 100))
+    memory = Memory()
+    for k, deep in enumerate((1e-3, 1.05e-3, 3e-3, -0.02, 2e-3)):
+        at = Poses(np.eye(4), {tool.name: pose(z=RADIUS - deep)})
+        made = seldom.step(at, memory, 1e-3 * (k > 0))
+        memory = made.memory
+        assert memory.asked is not None and (memory.asked.steps > 0) == (k == 1)
+        fresh = often.step(at).tools[tool.name]
+        np.testing.assert_allclose(made.tools[tool.name], fresh, rtol=1e-3 if k == 1 else 1e-9, atol=1e-4)
+    wrong: list[dict[str, Any]] = [{"every": 0}, {"every": 2, "damping": 1.0}, {"every": 2, "implicit": True}]
+    for options in wrong:
+        with pytest.raises(InvalidInput, match="asked at every"):
+            SoftContact(simulator, [tool], **options)
