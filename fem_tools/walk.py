@@ -332,6 +332,8 @@ class Walk:
             trust = trust.also(f"an element is crushed to {result.min_j:.2f} of its volume", in_range=False)
         if not stable:
             trust = trust.also("the tangent is not positive definite: the equilibrium is unstable", in_range=False)
+        if isinstance(self.way, PressWay) and self.force() < 0:
+            trust = trust.also(f"the skin pulls at the tool with {-self.force():.3g} N", in_range=False)
         if self.last is not None and self.last.depth < self.state.travel and isinstance(self.way, PressWay):
             if self.force() < self.last.force:
                 trust = trust.also(f"the force fell from {self.last.force:.3g} to {self.force():.3g} N", in_range=False)

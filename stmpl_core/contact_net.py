@@ -196,19 +196,20 @@ def _see(rings, points, inward, thickness, area, mean, force, strain, bent, modu
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _look_on_stack(points, inward, thickness, area, strain, corners, shares, sinking, group, bent, rows, nu, matrix,
-                   wide, t, numbers, log_thickness, hardening):  # fmt: skip
-    """See Look; t: thickness of the effective layer [m]; numbers, log_thickness and hardening: those of a Green."""
+                   wide, t, numbers, log_thickness, hardening, alike):  # fmt: skip
+    """See Look; t: thickness of the effective layer [m]; numbers and what follows: those of a Green."""
     rings, here = rings_of(points, inward, t, group, rows), _between(corners, shares, bent)
     depth = sinking * np.minimum(STACK_LINEAR_TO / strain, 1.0)
     force = solve(matrix, depth)
     seen = _see_on_stack(rings, points, inward, thickness, area, t, force, strain, sinking, here, nu, numbers,
-                         log_thickness, hardening, _given_way(matrix, wide, force))  # fmt: skip
+                         log_thickness, hardening, _mixed(corners, shares, alike),
+                         _given_way(matrix, wide, force))  # fmt: skip
     return *seen, power_of(matrix, force, depth.max())
 
 
 @numba.njit(cache=True, error_model="numpy")
 def _see_on_stack(rings, points, inward, thickness, area, t, force, strain, sinking, bent, nu, numbers, log_thickness,
-                  hardening, given_way):  # fmt: skip
+                  hardening, alike_at, given_way):  # fmt: skip
     """Pressure, inputs and fade of a Look under forces (N,) over E [m2]."""
     softness, pressure = np.exp(numbers[3]), force / area
     even, overlap = np.full(len(area), t), sinking / t
@@ -220,17 +221,27 @@ def _see_on_stack(rings, points, inward, thickness, area, t, force, strain, sink
         row[:SEEN_ALIKE] = alike[n, :SEEN_ALIKE]
         row[ON_STACK.log_thickness], row[ON_STACK.column_strain] = np.log(thickness[n] / t), strain[n]
         row[ON_STACK.log_kappa], row[ON_STACK.log_pull] = numbers[1], numbers[2]
-        row[ON_STACK.hardening] = _hardening(log_thickness, hardening, thickness[n], sinking[n] / thickness[n])
+        row[ON_STACK.hardening] = _hardening(log_thickness, hardening, alike_at[n], sinking[n] / thickness[n])
         row[ON_STACK.curvature] = alike[n, AT.mean_curvature]
         row[ON_STACK.curvature_over_strain] = alike[n, AT.mean_curvature] / (overlap[n] + ROUND_FROM)
         row[ON_STACK.given_way] = given_way
         solved = min(strain[n], STACK_LINEAR_TO)
-        top = _hardening(log_thickness, hardening, thickness[n], solved)
+        top = _hardening(log_thickness, hardening, alike_at[n], solved)
         pressure[n] *= np.exp(_share(solved, row[ON_STACK.curvature]) * top)
         if strain[n] > solved:
-            there = _hardening(log_thickness, hardening, thickness[n], strain[n])
+            there = _hardening(log_thickness, hardening, alike_at[n], strain[n])
             pressure[n] *= (strain[n] / solved * np.exp(there - top)) ** HARDENING
     return pressure, inputs, _faded(overlap, moments, STACK_FADE)
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _mixed(corners, shares, values):
+    """Values of vertices (V,) at nodes, (N,)."""
+    out = np.empty(len(corners))
+    for n in range(len(corners)):
+        out[n] = shares[n, 0] * values[corners[n, 0]] + shares[n, 1] * values[corners[n, 1]] \
+            + shares[n, 2] * values[corners[n, 2]]  # fmt: skip
+    return out
 
 
 @numba.njit(cache=True, error_model="numpy")
@@ -278,15 +289,15 @@ def _slopes(points, inward, thickness, area, strain, corners, shares, group, ben
 
 @numba.njit(cache=True, error_model="numpy")
 def _slopes_on_stack(points, inward, thickness, area, strain, corners, shares, sinking, group, bent, rows, nu, matrix,
-                     wide, t, numbers, log_thickness, hardening, strain_rates, sinking_rates, low, high, mean, scale,
-                     w1, b1, w2, b2, w3, b3, w4, b4):  # fmt: skip
+                     wide, t, numbers, log_thickness, hardening, alike, strain_rates, sinking_rates, low, high, mean,
+                     scale, w1, b1, w2, b2, w3, b3, w4, b4):  # fmt: skip
     """See ContactNet.slopes."""
     rings, here = rings_of(points, inward, t, group, rows), _between(corners, shares, bent)
     force = solve(matrix, sinking * np.minimum(STACK_LINEAR_TO / strain, 1.0))
     rates = rates_of(matrix, force, _reached(sinking, strain, sinking_rates, strain_rates, STACK_LINEAR_TO))
-    given_way = _given_way(matrix, wide, force)
+    given_way, alike_at = _given_way(matrix, wide, force), _mixed(corners, shares, alike)
     seen = _see_on_stack(rings, points, inward, thickness, area, t, force, strain, sinking, here, nu, numbers,
-                         log_thickness, hardening, given_way)  # fmt: skip
+                         log_thickness, hardening, alike_at, given_way)  # fmt: skip
     held = _correct(*seen, low, high, mean, scale, w1, b1, w2, b2, w3, b3, w4, b4)[0]
     out = np.empty_like(rates)
     for k in range(len(rates)):
@@ -294,7 +305,7 @@ def _slopes_on_stack(points, inward, thickness, area, strain, corners, shares, s
         seen = _see_on_stack(rings, points, inward, thickness, area, t, np.maximum(force + h * rates[k], 0.0),
                              np.maximum(strain + h * strain_rates[k], 1e-9),
                              np.maximum(sinking + h * sinking_rates[k], 0.0), here, nu, numbers, log_thickness,
-                             hardening, given_way)  # fmt: skip
+                             hardening, alike_at, given_way)  # fmt: skip
         out[k] = (_correct(*seen, low, high, mean, scale, w1, b1, w2, b2, w3, b3, w4, b4)[0] - held) / h
     return out
 

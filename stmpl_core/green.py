@@ -179,11 +179,21 @@ class Green:
                        self.layer.tissue.youngs_modulus / one.youngs_modulus])  # fmt: skip
 
     @cached_property
-    def hardening(self) -> tuple[np.ndarray, np.ndarray]:
-        """Logarithms of thicknesses, (T,), and stmpl_core.stack.hardening at even strains from 0 to below 1, (T, S)."""
-        least, most = np.log(self.layer.thickness.min()), np.log(self.layer.thickness.max())
-        logs, strain = np.linspace(least, most + 1e-6, COLUMNS), np.linspace(0, 1, STRAINS, endpoint=False)
-        return logs, np.array([hardening(self.layer.tissue, t, strain) for t in np.exp(logs)])
+    def hardening(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """How columns harden, of tissue whose materials begin as deep as it says.
+
+        A column whose materials begin elsewhere (`ply_scale`) hardens as one as much thinner or thicker.
+
+        Returns:
+            logs: logarithms of thicknesses, (T,).
+            table: stmpl_core.stack.hardening there, at even strains from 0 to below 1, (T, S).
+            alike: thickness of the column that each vertex' hardens as, (V,) [m].
+        """
+        layer = self.layer
+        alike = layer.thickness if layer.ply_scale is None else layer.thickness / layer.ply_scale
+        logs = np.linspace(np.log(alike.min()), np.log(alike.max()) + 1e-6, COLUMNS)
+        strain = np.linspace(0, 1, STRAINS, endpoint=False)
+        return logs, np.array([hardening(layer.tissue, t, strain) for t in np.exp(logs)]), alike
 
     def matrix(self, nodes: Nodes, group: np.ndarray) -> np.ndarray:
         """Depth at each node under a force E at each along the normals, symmetric, (N, N) [1/m]; see `matrices`."""

@@ -137,12 +137,17 @@ class Rig:
         Raises:
             InvalidInput: an unknown joint, or an angle that is not finite or beyond the joint's limits.
         """
+        if not isinstance(joints, Mapping):
+            raise InvalidInput(f"joints are {joints!r}; angles by name are wanted, as {{'{self.names[0]}': 0.5}}.")
         unknown = sorted(set(joints) - set(self.names))
         if unknown:
             raise InvalidInput(f"unknown joint: {', '.join(unknown)}. Available: {', '.join(self.names)}.")
         out = []
         for joint in self.joints:
-            angle = float(joints.get(joint.name, 0.0))
+            try:
+                angle = float(joints.get(joint.name, 0.0))
+            except (TypeError, ValueError):
+                raise InvalidInput(f"{joint.name} is {joints[joint.name]!r}; a number [rad] is wanted.") from None
             if not np.isfinite(angle):
                 raise InvalidInput(f"{joint.name} is {angle} rad; it must be finite.")
             if not joint.low - 1e-9 <= angle <= joint.high + 1e-9:

@@ -221,7 +221,9 @@ def _between_faces(h: float, modulus: float, nu: float, k: np.ndarray) -> tuple[
 def hardening(tissue: Tissue, thickness: float, strain: ArrayLike) -> np.ndarray:
     """Logarithm of what a confined column of a stack presses back with, over that of a linear one, (K,) [-].
 
-    Its materials carry the same pressure, each with the strain that this takes.
+    Its materials carry the same pressure, each with the strain that this takes. All have the Poisson's ratio that they
+    have in the mean of what each gives, h / E: tissue that is not confined makes room, and a column of one that hardly
+    does would say that all else is pressed flat.
 
     Args:
         tissue: materials.
@@ -233,7 +235,10 @@ def hardening(tissue: Tissue, thickness: float, strain: ArrayLike) -> np.ndarray
     """
     pressure, whole = np.geomspace(1e-5, 1e5, 800), np.zeros(800)  # over E
     each = 1 - np.geomspace(1, 1e-4, 400)
-    for h, modulus, nu in plies(tissue, thickness):
+    some = plies(tissue, thickness)
+    first, gives = some[0][2], sum(h / modulus for h, modulus, _ in some)
+    nu = first + sum((each - first) * h / modulus for h, modulus, each in some) / gives  # alike: exactly that
+    for h, modulus, _ in some:
         moduli = np.array([0.5 / (1 + nu), nu / ((1 + nu) * (1 - 2 * nu))]) * modulus / tissue.youngs_modulus
         whole += h / thickness * np.interp(pressure, column_pressure(moduli, each), each)
     logs = np.log(pressure / whole) - np.log(pressure[0] / whole[0])

@@ -79,6 +79,10 @@ def _run(given: list[str]) -> int:
         if not isinstance(error, StmplError) and type(error).__name__ != "ValidationError":
             raise
         return _refuse(sentence_of(error))
+    except OSError as error:
+        if error.filename is None:
+            raise
+        return _refuse(f"{error.filename}: {error.strerror or error}.")
 
 
 def _end_soon_after_a_signal(grace: float) -> None:

@@ -34,7 +34,7 @@ Names = tuple[str, ...]
 class NodeConfig(BaseModel):
     """The node's settings. What is neither ANY_TIME nor CONFIGURING counts from the start to the end."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     part: str = Field(
         default="", json_schema_extra=CONFIGURING,
@@ -241,7 +241,7 @@ def _named(texts: Iterable[str], what: str, example: str) -> dict[str, str]:
 class ProbeConfig(BaseModel):
     """The simulated devices' settings."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     scripts: tuple[Literal["press", "squeeze"], ...] = Field(
         default=("press", "squeeze"), description="scripts to play, one after the other"
@@ -256,7 +256,7 @@ class ProbeConfig(BaseModel):
 class RobotConfig(BaseModel):
     """The simulated robot's settings."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     force: tuple[float, ...] = Field(
         default=(5.0,), min_length=1, description="forces to press with, one after the other [N]"
@@ -304,7 +304,7 @@ class RobotConfig(BaseModel):
 class LinksConfig(BaseModel):
     """The settings of soft skin for a simulator that talks ROS."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     body: str = Field(min_length=1, description="link that carries the skin; its axes are the skin's")
     tools: tuple[str, ...] = Field(
@@ -342,7 +342,7 @@ class LinksConfig(BaseModel):
 class RecordConfig(BaseModel):
     """The recorder's settings."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     path: Path = Field(description="folder for run_0.mcap and metadata.yaml")
     run: Path | None = Field(default=None, description="JSON file that says what made the run; kept in the recording")
@@ -352,7 +352,7 @@ class RecordConfig(BaseModel):
 class DemoConfig(BaseModel):
     """The demo's settings."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     device: Literal["robot", "probe"] = Field(
         default="robot", description="what touches: a simulated robot that massages, or devices along a script"

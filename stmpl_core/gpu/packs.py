@@ -98,7 +98,8 @@ SKINS: dict[str, tuple[Any, str]] = {
     "grids": (Grid, "G"), "coefficients": (real, "N"), "thinnest": (real, "K"),
     "looked_at": (vec3, "Kx"), "look_many": (wp.int32, "Kx"),
     "rows": (real, "Tx"), "linked": (wp.uint32, "Vb"),
-    "green": (real, "SbgR"), "soft": (real, "V"), "coarse_corner": (wp.vec3i, "V"), "coarse_share": (vec3, "V"),
+    "green": (real, "SbgR"), "soft": (real, "V"), "alike": (real, "V"), "coarse_corner": (wp.vec3i, "V"),
+    "coarse_share": (vec3, "V"),
     "gathered": (real, "c"), "motion": (wp.float32, "m"), "hard_logs": (real, "St"), "hard": (real, "Sts"),
 }  # fmt: skip
 # C: scene and tool, S: scene, M: columns, B: blocks of columns, F: triangles, P: their parts, L: lattice, N: nodes,
@@ -281,7 +282,8 @@ def _of_stack(one: Any, skin: Skin, order: np.ndarray, at: tuple[int, int]) -> d
     one.first_coarse, one.first_motion = at
     out: dict[str, np.ndarray] = {
         "linked": _linked(skin, order) if skin.near.folded else np.zeros((len(order), 1), np.uint32),
-        "green": np.zeros((1, 1, 1, 1)), "soft": np.zeros(len(order)), "coarse_corner": np.zeros((1, 3), int),
+        "green": np.zeros((1, 1, 1, 1)), "soft": np.zeros(len(order)), "alike": np.zeros(len(order)),
+        "coarse_corner": np.zeros((1, 3), int),
         "coarse_share": np.zeros((1, 3)), "gathered": np.zeros(0), "motion": np.zeros(0),
         "hard_logs": np.zeros((1, COLUMNS)), "hard": np.zeros((1, COLUMNS, STRAINS)),
     }  # fmt: skip
@@ -290,14 +292,14 @@ def _of_stack(one: Any, skin: Skin, order: np.ndarray, at: tuple[int, int]) -> d
         return out
     assert green.coarse is not None
     corners, shares, gathered, motion, *_ = green.coarse
-    logs, hard = green.hardening
+    logs, hard, alike = green.hardening
     one.stacked, one.coarse = 1, len(gathered)
     one.flat, one.effective = green.thickness, green.effective.thickness
     _, one.log_kappa, one.log_pull, log_softness = (float(x) for x in green.numbers)
     one.softness = float(np.exp(log_softness))
     return out | {
-        "green": green.tables[None, :, 0], "soft": green.soft[order], "coarse_corner": corners[order],
-        "coarse_share": shares[order], "gathered": gathered, "motion": motion.ravel(),
+        "green": green.tables[None, :, 0], "soft": green.soft[order], "alike": alike[order],
+        "coarse_corner": corners[order], "coarse_share": shares[order], "gathered": gathered, "motion": motion.ravel(),
         "hard_logs": logs[None], "hard": hard[None],
     }  # fmt: skip
 

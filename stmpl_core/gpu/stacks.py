@@ -277,23 +277,25 @@ def see(lanes: wp.int32, many: wp.int32, skins: Skins, scratch: Scratch):
         pressure, overlap = one.softness * linear, scratch.sinking[s, i] / t
         _write_alike(scratch, s, i, pressure, overlap, moments, strains, pull, sunk)
         corners, shares, curvature = skins.faces[scratch.face[s, i]], scratch.shares[s, i], real(0.0)
+        alike = real(0.0)
         for n in range(3):
             v = corners[n]
+            alike += shares[n] * skins.alike[v]
             curvature += real(0.5) * shares[n] * (skins.bent[v, 0] + skins.bent[v, 4] + skins.bent[v, 8])
         _write(scratch, s, i, AT_THICKNESS, wp.log(thick / t))
         _write(scratch, s, i, AT_COLUMN, strain)
-        _write(scratch, s, i, AT_HARDENING, _hardening(skins, id, thick, scratch.sinking[s, i] / thick))
+        _write(scratch, s, i, AT_HARDENING, _hardening(skins, id, alike, scratch.sinking[s, i] / thick))
         _write(scratch, s, i, AT_KAPPA, one.log_kappa)
         _write(scratch, s, i, AT_PULL, one.log_pull)
         _write(scratch, s, i, AT_CURVATURE, curvature)
         _write(scratch, s, i, AT_OVER, curvature / (overlap + ROUND_FROM))
         _write(scratch, s, i, AT_GIVEN, scratch.given_way[s * many + scratch.tool[s, i]])
         solved = wp.min(strain, STACK_LINEAR_TO)
-        top = _hardening(skins, id, thick, solved)
+        top = _hardening(skins, id, alike, solved)
         share = (real(1.0) - DEEP_GIVES * solved) * (real(1.0) - ROUND_GIVES * wp.clamp(curvature, real(0.0), ROUNDEST))
         linear = linear * wp.exp(share * top)
         if strain > solved:
-            more = _hardening(skins, id, thick, strain) - top
+            more = _hardening(skins, id, alike, strain) - top
             linear = linear * wp.pow(strain / solved * wp.exp(more), HARDENING)
         scratch.pressure[s, i] = linear
         around = overlap + strains[FADE_RING]
