@@ -202,7 +202,7 @@ def _look_on_stack(points, inward, thickness, area, strain, corners, shares, sin
     depth = sinking * np.minimum(STACK_LINEAR_TO / strain, 1.0)
     force = solve(matrix, depth)
     seen = _see_on_stack(rings, points, inward, thickness, area, t, force, strain, sinking, here, nu, numbers,
-                         log_thickness, hardening, _mixed(corners, shares, alike),
+                         log_thickness, hardening, _between(corners, shares, alike)[:, 0],
                          _given_way(matrix, wide, force))  # fmt: skip
     return *seen, power_of(matrix, force, depth.max())
 
@@ -232,16 +232,6 @@ def _see_on_stack(rings, points, inward, thickness, area, t, force, strain, sink
             there = _hardening(log_thickness, hardening, alike_at[n], strain[n])
             pressure[n] *= (strain[n] / solved * np.exp(there - top)) ** HARDENING
     return pressure, inputs, _faded(overlap, moments, STACK_FADE)
-
-
-@numba.njit(cache=True, error_model="numpy")
-def _mixed(corners, shares, values):
-    """Values of vertices (V,) at nodes, (N,)."""
-    out = np.empty(len(corners))
-    for n in range(len(corners)):
-        out[n] = shares[n, 0] * values[corners[n, 0]] + shares[n, 1] * values[corners[n, 1]] \
-            + shares[n, 2] * values[corners[n, 2]]  # fmt: skip
-    return out
 
 
 @numba.njit(cache=True, error_model="numpy")
@@ -295,7 +285,7 @@ def _slopes_on_stack(points, inward, thickness, area, strain, corners, shares, s
     rings, here = rings_of(points, inward, t, group, rows), _between(corners, shares, bent)
     force = solve(matrix, sinking * np.minimum(STACK_LINEAR_TO / strain, 1.0))
     rates = rates_of(matrix, force, _reached(sinking, strain, sinking_rates, strain_rates, STACK_LINEAR_TO))
-    given_way, alike_at = _given_way(matrix, wide, force), _mixed(corners, shares, alike)
+    given_way, alike_at = _given_way(matrix, wide, force), _between(corners, shares, alike)[:, 0]
     seen = _see_on_stack(rings, points, inward, thickness, area, t, force, strain, sinking, here, nu, numbers,
                          log_thickness, hardening, alike_at, given_way)  # fmt: skip
     held = _correct(*seen, low, high, mean, scale, w1, b1, w2, b2, w3, b3, w4, b4)[0]

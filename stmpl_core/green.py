@@ -187,13 +187,13 @@ class Green:
         Returns:
             logs: logarithms of thicknesses, (T,).
             table: stmpl_core.stack.hardening there, at even strains from 0 to below 1, (T, S).
-            alike: thickness of the column that each vertex' hardens as, (V,) [m].
+            alike: thickness of the column that each vertex' hardens as, (V, 1) [m].
         """
         layer = self.layer
         alike = layer.thickness if layer.ply_scale is None else layer.thickness / layer.ply_scale
         logs = np.linspace(np.log(alike.min()), np.log(alike.max()) + 1e-6, COLUMNS)
         strain = np.linspace(0, 1, STRAINS, endpoint=False)
-        return logs, np.array([hardening(layer.tissue, t, strain) for t in np.exp(logs)]), alike
+        return logs, np.array([hardening(layer.tissue, t, strain) for t in np.exp(logs)]), alike[:, None]
 
     def matrix(self, nodes: Nodes, group: np.ndarray) -> np.ndarray:
         """Depth at each node under a force E at each along the normals, symmetric, (N, N) [1/m]; see `matrices`."""

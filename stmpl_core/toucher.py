@@ -128,8 +128,8 @@ class Toucher:
         self._modulus = layer.tissue.youngs_modulus
         self._thickest = float(layer.thickness.max())
         self._inward, self.deep = self.columns.inward, Deep(self.columns)
-        self._soft, deeper = soft_depth(layer.tissue), (ply.poisson_ratio for ply in layer.tissue.deeper)
-        self._ratios = {layer.tissue.poisson_ratio, *deeper}
+        self._soft = soft_depth(layer.tissue)
+        self._ratios = {layer.tissue.poisson_ratio, *(ply.poisson_ratio for ply in layer.tissue.deeper)}
 
     def give(self, nodes: Nodes, forces: np.ndarray) -> np.ndarray | None:
         """How a contact gives along the skin, beyond a flat layer, (3, 3) [m/N]; None: as that. See `curvature`."""

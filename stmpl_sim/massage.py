@@ -69,12 +69,12 @@ class Course:
     phases: tuple[Phase, ...] = field(init=False)
 
     def __post_init__(self) -> None:
-        if not self.forces or min(self.forces) <= 0:
-            raise InvalidInput(f"forces are {self.forces}; at least one above 0 N is needed.")
+        if not self.forces or not all(0 < force < np.inf for force in self.forces):
+            raise InvalidInput(f"forces are {self.forces}; at least one is needed, each finite and above 0 N.")
         if not 0 <= self.grip < np.inf:
             raise InvalidInput(f"the grip is {self.grip} N; it must be finite and at least 0.")
-        if self.speed < 0 or self.laps < 0:
-            raise InvalidInput(f"speed is {self.speed} m/s and laps {self.laps}; neither may be below 0.")
+        if not (0 <= self.speed < np.inf and 0 <= self.laps < np.inf):
+            raise InvalidInput(f"speed is {self.speed} m/s and laps {self.laps}; both must be finite and at least 0.")
         lap = 2 * np.pi * self.circle.radius * self.laps / self.speed + RAMP_S if self.speed and self.laps else 0.0
         found = [Phase("reach", 0.0, REACH_S, 0.0), Phase("approach", REACH_S, APPROACH_S, self.forces[0])]
         for force in self.forces:

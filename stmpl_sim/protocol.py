@@ -51,14 +51,12 @@ class Asked:
         touches: touches then, by the tool's name.
         models: local models of those that press, by name.
         steps: steps since then.
-        waited: time since then [s].
     """
 
     at: Mapping[str, Transform]
     touches: Mapping[str, Touch]
     models: Mapping[str, LocalContact]
     steps: int = 0
-    waited: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,7 +68,8 @@ class Memory:
         at: pose_body_from_tool of the step before, by the tool's name, layer axes.
         speed: speed at which each tool that pressed went into the skin [m/s], and the force that it pressed with [N].
         free: way that each tool that is apart may go before it may touch, by name [m].
-        asked: when the contact law was asked; None where it is asked at every step.
+        asked: step at which the contact law was asked last; None: it must be asked now.
+        waited: time since that step [s].
     """
 
     tissue: State = field(default_factory=State)
@@ -78,6 +77,7 @@ class Memory:
     speed: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     free: Mapping[str, float] = field(default_factory=dict)
     asked: Asked | None = None
+    waited: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -245,8 +245,7 @@ class SoftContact:
         free = {name: self._free(name, pose, memory) for name, pose in at.items()
                 if not _has_imprint(memory.tissue, name)}  # fmt: skip
         near = [Contact(self.tools[name], pose) for name, pose in at.items() if not free.get(name, 0.0) > 0]
-        waited = dt if memory.asked is None else dt + memory.asked.waited
-        found, tissue = self.simulator.touch(near, memory.tissue, waited)
+        found, tissue = self.simulator.touch(near, memory.tissue, memory.waited + dt)
         hole, seen, models = self.simulator.toucher.hole, self._seen, {}
         free |= {touch.name: min(-touch.depth, seen) - hole for touch in found if touch.status == APART}
         if self.every > 1 or (self.implicit and dt > 0):
@@ -277,8 +276,8 @@ class SoftContact:
             if not rendered.inside:
                 return None
             touches[name] = replace(touch, wrench=rendered.wrench, pose_body_from_tool=there)
-        later = replace(asked, steps=asked.steps + 1, waited=asked.waited + dt)
-        return touches, Memory(memory.tissue, at, free=free, asked=later)
+        later = replace(asked, steps=asked.steps + 1)
+        return touches, Memory(memory.tissue, at, free=free, asked=later, waited=memory.waited + dt)
 
     def pose(self, joints: Mapping[str, float], memory: Memory) -> Memory:
         """Takes the skin to where its joints are now (milliseconds); the memory, gone along with it.
@@ -293,7 +292,7 @@ class SoftContact:
         before = self.simulator.skin
         tissue = self.simulator.pose(joints, memory.tissue)
         at = {name: carry_at(before, self.simulator.skin, pose[:3, 3]) @ pose for name, pose in memory.at.items()}
-        return Memory(tissue, at, memory.speed)
+        return Memory(tissue, at, memory.speed, waited=memory.waited)
 
     def answer(self, reaction: Reaction) -> Answer:
         """The displacement of the skin under a reaction of this contact, layer axes."""

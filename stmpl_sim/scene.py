@@ -8,7 +8,7 @@ from typing import Any, Literal, get_args
 
 import numpy as np
 
-from stmpl_core.arrays import Transform
+from stmpl_core.arrays import Transform, finite
 from stmpl_core.errors import InvalidInput
 from stmpl_core.layer import SoftLayer
 from stmpl_sim.engine import mujoco
@@ -90,18 +90,18 @@ def build(
         gripper: choice to add a gripper of two fingers beside the site.
 
     Raises:
-        InvalidInput: a file that MuJoCo does not read, an end that is not there, a site out of reach, or a limb that
-            cannot be gripped.
+        InvalidInput: a place that is not finite, a file that MuJoCo does not read, an end that is not there, a site out
+            of reach, or a limb that cannot be gripped.
     """
-    spec = robot_spec(ARM if robot is None else Path(robot))
+    where, spec = finite("at", at, (3,)), robot_spec(ARM if robot is None else Path(robot))
     holder = _end(spec, end)
     chain = _chain(holder if hasattr(holder, "add_body") else holder.parent)
     _add_head(spec, holder, radius)
     _drive(spec, chain)
-    _add_limb(spec, layer, site, np.array(at), mount)
+    _add_limb(spec, layer, site, where, mount)
     side, tools = -1.0, (BALL,)
     if gripper:
-        place = place_of(site, world_from_limb(site, np.array(at)))
+        place = place_of(site, world_from_limb(site, where))
         add_gripper(spec, place)
         side, tools = place.side, (BALL, *FINGERS)
     _add_stage(spec, np.array(at), side)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, cast, get_args
 
@@ -79,10 +78,6 @@ def sim(
     needed("stmpl sim", "sim", "mujoco")
     if not 50 <= rate <= 20_000:
         raise InvalidInput(f"--rate is {rate:g} Hz; allowed is 50 to 20000.")
-    told = {"force": force, "at": at, "laps": (laps,), "damping": (damping,), "grip": (grip or 0.0,)}
-    for flag, values in told.items():
-        if not all(map(math.isfinite, values)):
-            raise InvalidInput(f"--{flag} is {' '.join(map(str, values))}; every number must be finite.")
     for flag, value in (("radius", radius), ("circle", circle), ("speed", speed)):
         check_millimetres(f"--{flag}", value, LEAST_MM)
     from stmpl_core.friction import friction_from

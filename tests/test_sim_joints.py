@@ -9,8 +9,8 @@ import pytest
 from stmpl_core import Contact, Simulator, Skin
 from stmpl_core.errors import InvalidInput
 from stmpl_core.methods import Winkler
-from stmpl_sim import SoftBody
-from tests.scenes import RADIUS, at, limb
+from stmpl_sim import Memory, Poses, SoftBody, SoftContact
+from tests.scenes import RADIUS, at, ball, limb
 from tests.test_posing import MIDDLE, hinged
 
 mujoco = pytest.importorskip("mujoco", reason="pip install 'stmpl[sim]'")
@@ -136,3 +136,16 @@ def test_joints_that_are_none_are_refused(skin: Skin) -> None:
     data.qpos[0] = np.nan
     with pytest.raises(InvalidInput, match=r"elbow is nan rad. Has the simulation diverged"):
         soft.apply(data)
+
+
+def test_no_time_is_lost_where_joints_move_between_two_steps_that_ask(skin: Skin) -> None:
+    tool = ball(BALL)
+    contact, memory = SoftContact(skin, [tool], every=100), Memory()
+    poses = Poses(np.eye(4), {tool.name: at(*on_the_lower_part(skin, 0.0))})
+    for k in range(4):
+        memory = contact.step(poses, memory, 1e-3 * (k > 0)).memory
+    assert memory.asked is not None and memory.asked.steps == 3 and memory.waited == pytest.approx(3e-3)
+    memory = contact.pose({"elbow": 0.05}, memory)
+    assert memory.asked is None and memory.waited == pytest.approx(3e-3)
+    memory = contact.step(poses, memory, 1e-3).memory
+    assert memory.asked is not None and memory.asked.steps == 0 and memory.waited == 0

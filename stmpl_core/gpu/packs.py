@@ -298,7 +298,7 @@ def _of_stack(one: Any, skin: Skin, order: np.ndarray, at: tuple[int, int]) -> d
     _, one.log_kappa, one.log_pull, log_softness = (float(x) for x in green.numbers)
     one.softness = float(np.exp(log_softness))
     return out | {
-        "green": green.tables[None, :, 0], "soft": green.soft[order], "alike": alike[order],
+        "green": green.tables[None, :, 0], "soft": green.soft[order], "alike": alike[order, 0],
         "coarse_corner": corners[order], "coarse_share": shares[order], "gathered": gathered, "motion": motion.ravel(),
         "hard_logs": logs[None], "hard": hard[None],
     }  # fmt: skip
