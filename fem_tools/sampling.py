@@ -78,6 +78,7 @@ class BodyPlan(BaseModel):
     name: str
     weight: float = Field(ge=0, le=1)
     gender: float = Field(default=0.5, ge=0, le=1)  # 1: female
+    muscle: float = Field(default=0.5, ge=0, le=1)
     thickness: float | tuple[float, float] = DEEPEST  # m; two: varies smoothly between them
     poisson_ratio: float = Field(default=0.4, ge=0, lt=0.5)
     stack: StackPlan | None = None  # None: one material, or what was measured
@@ -163,6 +164,7 @@ TISSUE_BODIES = tuple(
 )  # fmt: skip
 
 Person = tuple[str, float, float, str, Tone, float, float, float]
+Stout = tuple[str, float, float, float, str, Tone, float, float]
 PEOPLE: tuple[Person, ...] = (
     # name, weight, gender, part, tone, edge length [m], reach, share
     ("upper_arm_1", 0.35, 0.0, "left_upper_arm", "relaxed", 8e-3, 6.0, 1.0),
@@ -183,6 +185,17 @@ DEEP: tuple[Person, ...] = (
     ("calf", 0.4, 0.8, "left_calf", "relaxed", 9e-3, 6.7, 0.16),
     ("thigh", 0.65, 0.3, "left_thigh", "relaxed", 12e-3, 6.0, 0.1),
 )
+STOUT: tuple[Stout, ...] = (  # much fat under a skin that is stiff beside it, on limbs as round as they are thick
+    # name, weight, gender, muscle, part, tone, edge length [m], share
+    ("upper_arm_1", 0.9, 0.9, 0.2, "left_upper_arm", "relaxed", 8e-3, 0.5),
+    ("upper_arm_2", 1.0, 0.5, 0.4, "left_upper_arm", "relaxed", 8e-3, 0.5),
+    ("upper_arm_3", 0.8, 1.0, 0.1, "left_upper_arm", "tensed", 8e-3, 0.5),
+    ("upper_arm_4", 0.95, 1.0, 0.35, "left_upper_arm", "relaxed", 9e-3, 0.5),
+    ("forearm", 1.0, 1.0, 0.1, "left_forearm", "relaxed", 7e-3, 0.4),
+    ("thigh_1", 0.55, 0.7, 0.6, "left_thigh", "relaxed", 11e-3, 0.4),
+    ("thigh_2", 0.95, 0.9, 0.2, "left_thigh", "relaxed", 12e-3, 0.3),
+    ("calf", 0.95, 0.7, 0.2, "left_calf", "relaxed", 9e-3, 0.3),
+)
 
 
 def _living(kind: str, people: tuple[Person, ...], **more: Any) -> tuple[BodyPlan, ...]:
@@ -197,6 +210,12 @@ def _living(kind: str, people: tuple[Person, ...], **more: Any) -> tuple[BodyPla
 LIVING_BODIES = _living("living", PEOPLE, sizes=(8e-3, 40e-3))
 DEEP_BODIES = _living("deep", DEEP, sizes=(12e-3, 30e-3), tools=("sphere", "ellipsoid", "capsule"),
                       shallowest=0.45, most_work=1e11)  # that go deep where tissue is thick: most others end before
+STOUT_BODIES = tuple(
+    BodyPlan(name=f"stout_{name}", weight=weight, gender=gender, muscle=muscle, part=part, tone=tone, edge_length=edge,
+             share=share, clear=2.0, reach=6.0, sizes=(8e-3, 40e-3), most_work=8e10, paper_rule=False,
+             out_of_distribution=False)
+    for name, weight, gender, muscle, part, tone, edge, share in STOUT
+)  # fmt: skip
 
 
 def _drawn_bodies(count: int) -> tuple[BodyPlan, ...]:
@@ -284,7 +303,8 @@ PRESETS = {
                        body.model_copy(update={"share": 1.0}) for body in OTHER_LIMBS), shares=(0.2, 0.2), seed=NEW),
     "contacts": Plan(preset="contacts", bodies=CONTACT_BODIES, discs=0, ellipses=0, seams=0, hands=0, bands=0,
                      letters=0, tools=60, loads=8, deepest=0.9, indenter_step=0.08),
-    "tissue": Plan(preset="tissue", bodies=TISSUE_BODIES + _drawn_bodies(DRAWN) + LIVING_BODIES + DEEP_BODIES, discs=0,
+    "tissue": Plan(preset="tissue", bodies=TISSUE_BODIES + _drawn_bodies(DRAWN) + LIVING_BODIES + DEEP_BODIES +
+                   STOUT_BODIES, discs=0,
                    ellipses=0, seams=0, hands=0, bands=0, letters=0, tools=18, loads=8, deepest=0.85,
                    indenter_step=0.12, clear=4.0, thinnest=1.4, sizes=(4e-3, 40e-3), linear=True, most_work=4e10,
                    rounds=400),
@@ -350,7 +370,7 @@ def layers(plan: Plan) -> dict[str, SoftLayer]:
     patches = {kind: Body.anny(weight=0.5).patch(*kind) for kind in dict.fromkeys(kinds.values())}
     out = {}
     for body in plan.bodies:
-        patch, skin = patches[kinds[body.name]], Body.anny(weight=body.weight, gender=body.gender)
+        patch, skin = patches[kinds[body.name]], Body.anny(weight=body.weight, gender=body.gender, muscle=body.muscle)
         if body.tone:
             out[body.name] = filled(skin, patch.part, patch.layer(skin, thickness=SHEET), body.tone)
             continue
