@@ -12,7 +12,7 @@ from bags.frame import Frame
 from bags.provenance import allowance
 from bags.survey import Moment, Survey, survey
 from stmpl_core.contact import Contact
-from stmpl_core.errors import BagError, StmplError
+from stmpl_core.errors import BagError, InvalidInput, StmplError
 from stmpl_core.layer import SoftLayer
 from stmpl_core.load import Load
 from stmpl_core.methods.base import Method
@@ -237,8 +237,11 @@ def sample(moments: Sequence[Moment], frames: int) -> list[Moment]:
     Always there are the largest load and, if any, the largest load under two or more tools.
 
     Raises:
+        InvalidInput: frames below 1.
         BagError: nothing was pressed in the whole run.
     """
+    if frames < 1:
+        raise InvalidInput(f"frames is {frames}; at least 1 is compared.")
     loaded = [moment for moment in moments if moment.load > 0]
     if not loaded:
         raise BagError(f"nothing pressed on the skin in any of {len(moments)} answers, so there is nothing to compare.")

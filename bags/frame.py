@@ -26,6 +26,7 @@ class Frame(Answer):
         dt: time since that state [s].
         friction: coefficient of friction of each tool [-].
         joints: angle of each joint of the layer's rig [rad]; empty: at rest.
+        surfaces: name of the surface of each tool (Tool.digest); empty: recordings from before it was told.
     """
 
     stamp_ns: int = 0
@@ -39,6 +40,7 @@ class Frame(Answer):
     dt: float = 0.0
     friction: Mapping[str, float] = field(default_factory=dict)
     joints: tuple[float, ...] = ()
+    surfaces: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def peak(self) -> float:

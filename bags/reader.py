@@ -237,20 +237,31 @@ class Bag:
         """Name of the first layer. Raises BagError."""
         return next(iter(self.layers))
 
-    @cached_property
+    @property
     def tools(self) -> dict[str, Tool]:
         """The tools by their names; the last surface of one that was changed. What a node refuses is left out."""
+        return {tool.name: tool for tool in self._surfaces}
+
+    def surface(self, name: str, digest: str) -> Tool | None:
+        """A tool with a surface of that name (Tool.digest), its last one if that is empty; None: it is not there."""
+        some = [tool for tool in self._surfaces if tool.name == name and digest in ("", tool.digest)]
+        return some[-1] if some else None
+
+    @cached_property
+    def _surfaces(self) -> list[Tool]:
+        """All surfaces that tools had, in the order in which they had them last."""
         places = sorted(place for topic in self._told(MESH) for place in self._places[topic])
-        told = [message for message in map(self.decode, read_places(self.file, places)) if len(message.triangles)]
-        found: dict[str, Tool] = {}
-        for message in reversed(told):
+        found: dict[tuple[str, bytes, bytes], Tool] = {}
+        for message in map(self.decode, read_places(self.file, places)):
+            if not len(message.triangles):
+                continue
             name = message.header.frame_id
-            if name not in found:
-                try:
-                    found[name] = tool_from(message)
-                except StmplError as error:
-                    log.warning("%s: a surface of '%s' is left out: %s", self.file, name, error)
-        return dict(reversed(found.items()))
+            same = name, np.asarray(message.vertices).tobytes(), np.asarray(message.triangles).tobytes()
+            try:
+                found[same] = found.pop(same, None) or tool_from(message)
+            except StmplError as error:
+                log.warning("%s: a surface of '%s' is left out: %s", self.file, name, error)
+        return list(found.values())
 
     def see(self, topic: str, record: Message, place: Place) -> None:
         """Called for each message while the file is looked over; keeps the places of the large ones."""

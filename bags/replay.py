@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -11,6 +11,7 @@ import numpy as np
 from bags.frame import Frame
 from bags.provenance import OTHER_PROCESSOR, allowance
 from bags.run import Run
+from stmpl_core.errors import BagError
 from stmpl_core.layer import SoftLayer
 from stmpl_core.methods.base import Method
 from stmpl_core.provenance import versions
@@ -59,6 +60,9 @@ class ReplaySummary:
         tolerance: largest difference that is allowed [m]; 0: bit for bit.
         reason: sentence that tells why this tolerance.
         first_difference: sequence number of the first frame past the tolerance, or None.
+        left_out: number of answers that cannot be repeated, as what they answer was not recorded.
+        gap: truth of the claim that one of these came after an answer that was: the recording was not just begun late.
+        why: sentence that tells why the first of these cannot; empty: all can.
         changed: packages with another version now than when the run was recorded, "numpy 2.4 -> 2.5".
     """
 
@@ -70,25 +74,31 @@ class ReplaySummary:
     tolerance: float
     reason: str
     first_difference: int | None
+    left_out: int
+    gap: bool
+    why: str
     changed: tuple[str, ...]
 
     @property
     def passed(self) -> bool:
-        """Whether no frame is past the tolerance."""
-        return self.first_difference is None
+        """Whether no frame is past the tolerance, and none was left out but at the start."""
+        return self.first_difference is None and not self.gap
 
     def __str__(self) -> str:
         held = f"held to {f'{self.tolerance * 1e3:.3g} mm' if self.tolerance else 'every bit'}, since {self.reason}"
         each = f"{self.method}, {self.remembering} from a state" if self.remembering else self.method
+        lost = f" {self.left_out} more were left out: {self.why}" * bool(self.left_out)
         if self.identical == self.frames:
-            return f"{self.frames} frames replayed with {each}, every one bit for bit as recorded; {held}."
+            return f"{self.frames} frames replayed with {each}, every one bit for bit as recorded; {held}.{lost}"
         off = (f"{self.frames - self.identical} of {self.frames} frames replayed with {each} differ, "
                f"by up to {self.worst * 1e3:.3g} mm; {held}")  # fmt: skip
         note = f" Changed since: {', '.join(self.changed)}." if self.changed else ""
-        return f"{off}." if self.passed else f"{off}; number {self.first_difference} is the first past it.{note}"
+        past = "." if self.first_difference is None else f"; number {self.first_difference} is the first past it.{note}"
+        return off + past + lost
 
 
-def replay(run: Path | str | Run, method: Method, *, every: int = 1) -> Iterator[Replayed]:
+def replay(run: Path | str | Run, method: Method, *, every: int = 1,
+           left_out: Callable[[Frame, BagError], None] | None = None) -> Iterator[Replayed]:  # fmt: skip
     """Yields each recorded answer (or every n-th) with the one that its recorded contacts give now, in the run's order.
 
     Each is answered on the layer that it was answered on, from the state that it carries: it needs none before it.
@@ -97,9 +107,11 @@ def replay(run: Path | str | Run, method: Method, *, every: int = 1) -> Iterator
         run: recording: its folder, its .mcap file, or an opened one.
         method: method that answers.
         every: step from frame to frame; 1 takes each.
+        left_out: function that gets each answer to what was not recorded, a tool's surface or pose, with the error;
+            None: that is raised.
 
     Raises:
-        BagError: the bag lacks answers, the layer, or a tool's mesh or pose.
+        BagError: the bag lacks answers, the layer, or a tool's surface or pose.
         InvalidInput: a state of another version.
     """
     run = run if isinstance(run, Run) else Run(run)
@@ -107,7 +119,13 @@ def replay(run: Path | str | Run, method: Method, *, every: int = 1) -> Iterator
     for frame in run.frames(range(0, run.answers, every)):
         simulator = _simulator(simulator, run.rest_of(frame), method, frame)
         simulator.move_to(simulator.skin.at_angles(frame.joints))
-        contacts, after = run.contacts(frame), None
+        try:
+            contacts, after = run.contacts(frame), None
+        except BagError as error:
+            if left_out is None:
+                raise
+            left_out(frame, error)
+            continue
         if frame.state:
             touches, after = simulator.touch(contacts, State.unpack(frame.state, frame.joints), frame.dt)
             answer = simulator.answer(touches)
@@ -140,24 +158,28 @@ def replay_run(
             provenance.OTHER_PROCESSOR where another did, or where /tf says where its poses are.
 
     Raises:
-        BagError: the bag lacks answers, the layer, or a tool's mesh or pose.
+        BagError: the bag lacks answers, the layer, or whatever all of them answer.
     """
     run = run if isinstance(run, Run) else Run(run)
     then, now = run.provenance.versions, versions()
+    many = remembering = early = 0
+    off: list[tuple[int, float]] = []  # number and difference of what is not as recorded
+    lost: list[BagError] = []
+    for replayed in replay(run, method, every=every, left_out=lambda _, error: lost.append(error)):
+        early = early if many else len(lost)
+        many += 1
+        remembering += bool(replayed.frame.state)
+        if not replayed.identical:
+            off.append((replayed.frame.sequence, replayed.difference))
+    if lost and not many:
+        raise lost[0]
     allowed, reason = allowance(run.provenance.processor, now["processor"])
-    if not allowed and (frames := run.placed_by_tf):
+    if not allowed and (frames := sorted(run.placed_by_tf)):
         allowed, reason = OTHER_PROCESSOR, f"/tf placed its poses ('{"', '".join(frames)}'), and tf2 rounds otherwise"
     if tolerance is not None:
         allowed, reason = tolerance, "this tolerance was asked for"
-    many = remembering = identical = 0
-    worst, first = 0.0, None
-    for replayed in replay(run, method, every=every):
-        many += 1
-        remembering += bool(replayed.frame.state)
-        identical += replayed.identical
-        difference = 0.0 if replayed.identical else replayed.difference
-        worst = max(worst, difference)
-        if not replayed.identical and not (allowed and difference <= allowed) and first is None:
-            first = replayed.frame.sequence
+    first = next((number for number, much in off if not (allowed and much <= allowed)), None)
+    worst = max((much for _, much in off), default=0.0)
     changed = tuple(f"{k} {then[k]} -> {now.get(k, 'none')}" for k in then if now.get(k) != then[k])
-    return ReplaySummary(method.name, many, remembering, identical, worst, allowed, reason, first, changed)
+    return ReplaySummary(method.name, many, remembering, many - len(off), worst, allowed, reason, first, len(lost),
+                         len(lost) > early, str(lost[0]) if lost else "", changed)  # fmt: skip

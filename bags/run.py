@@ -31,6 +31,7 @@ class Run(Bag):
     Attributes:
         received: time at which the last contact message of a stamp was received [ns], by the stamp.
         pose_stamps: stamps of all poses.
+        placed_by_tf: frames of poses and wrenches that /tf placed, as far as contacts were asked for.
 
     Raises:
         BagError: a file that `Bag` refuses, or several robots and no namespace.
@@ -42,7 +43,7 @@ class Run(Bag):
         self.received: dict[int, int] = {}
         self.pose_stamps: set[int] = set()
         self._sent: dict[tuple[str, str], dict[int, Message]] = {}  # by tool and kind, then stamp
-        self._frame_ids: set[tuple[str, str]] = set()  # tools, and frames of their poses and wrenches
+        self.placed_by_tf: set[str] = set()
         self._on_answer, self._answering = on_answer, ""
         super().__init__(path, namespace)
 
@@ -52,7 +53,6 @@ class Run(Bag):
         if contact := tool_topic(topic):
             message = self.decode(record)
             stamp = stamp_ns(message)
-            self._frame_ids.add((contact[0], message.header.frame_id))
             self._sent.setdefault(contact, {})[stamp] = record
             self.received[stamp] = max(self.received.get(stamp, 0), record.log_time)
             if contact[1] == "pose":
@@ -69,10 +69,10 @@ class Run(Bag):
         Raises:
             BagError: a pose, a wrench or a mesh that it answers is not in the bag, or its /tf does not cover it.
         """
-        return [self._contact(tool, *stamps) for tool, stamps in frame.inputs.items()]
+        return [self._contact(tool, frame.surfaces.get(tool, ""), *stamps) for tool, stamps in frame.inputs.items()]
 
-    def _contact(self, tool: str, posed: int, pushed: int) -> Contact:
-        known, pose, wrench = self.tools.get(tool), self._told_at(tool, "pose", posed), None
+    def _contact(self, tool: str, surface: str, posed: int, pushed: int) -> Contact:
+        known, pose, wrench = self.surface(tool, surface), self._told_at(tool, "pose", posed), None
         lacks = ["mesh"] * (known is None) + ["pose"] * (pose is None)
         if pushed and (wrench := self._told_at(tool, "wrench", pushed)) is None:
             lacks.append("wrench")
@@ -95,15 +95,12 @@ class Run(Bag):
             found.hear(message, still=topic == TF_STATIC)
         return found
 
-    @property
-    def placed_by_tf(self) -> list[str]:
-        """Frames of poses and wrenches that only /tf knows."""
-        known = {self.body_frame, *self.provenance.frames}
-        return sorted({frame for tool, frame in self._frame_ids if frame not in known and frame != tool})
-
     def _frames_at(self, stamp: int) -> FramesAt:
-        body = self.body_frame
-        return FramesAt(body, self.provenance.frames, lambda frame: self.moving.place(body, frame, stamp))
+        return FramesAt(self.body_frame, self.provenance.frames, lambda frame: self._moved(frame, stamp))
+
+    def _moved(self, frame: str, stamp: int) -> Any:
+        self.placed_by_tf.add(frame)
+        return self.moving.place(self.body_frame, frame, stamp)
 
     def _told_at(self, tool: str, kind: str, stamp: int) -> Any | None:
         record = self._sent.get((tool, kind), {}).get(stamp)

@@ -36,6 +36,7 @@ FixedFrames = Mapping[str, Transform]  # pose_body_from_frame of each frame that
 NANO = 1_000_000_000  # nanoseconds in a second
 NO_FRAMES: FixedFrames = MappingProxyType({})
 NO_FRICTION: Mapping[str, float] = MappingProxyType({})
+NO_SURFACES: Mapping[str, str] = MappingProxyType({})
 QUATERNION_TOLERANCE = 1e-2  # error of a unit quaternion's length; through float32 or text it is far less
 NOWHERE = np.full((4, 4), np.nan)  # pose that a recording does not tell
 NOT_TOLD = np.full(3, np.nan)  # likewise a place, or a way
@@ -219,6 +220,7 @@ def frame_from(message: Any, log_time_ns: int) -> Frame:
         dt=float(getattr(message, "dt", 0.0)),
         friction={one.tool: float(getattr(one, "friction", 0.0)) for one in getattr(message, "touches", ())},
         joints=tuple(float(angle) for angle in getattr(message, "joints", ())),
+        surfaces={one.tool: getattr(one, "surface", "") for one in getattr(message, "touches", ())},
     )
 
 
@@ -400,6 +402,7 @@ def displacement_message(
     dt: float = 0.0,
     friction: Mapping[str, float] = NO_FRICTION,
     joints: Sequence[float] = (),
+    surfaces: Mapping[str, str] = NO_SURFACES,
 ) -> Any:
     """An answer as a SkinDisplacement.
 
@@ -417,6 +420,7 @@ def displacement_message(
         dt: time since that state [s].
         friction: coefficient of friction of each tool [-]; 0 unless given.
         joints: angle of each joint of the layer's rig [rad]; empty: at rest.
+        surfaces: name of each tool's surface (Tool.digest); empty unless given.
     """
     trust = answer.trust
     return message_class("stmpl_msgs/msg/SkinDisplacement")(
@@ -430,7 +434,8 @@ def displacement_message(
         in_range=bool(trust.in_range),
         error_bound=float("nan") if trust.error_bound is None else float(trust.error_bound),
         why="; ".join(filter(None, (trust.why, why))),
-        touches=[_touch(touch, *inputs[name], friction.get(name, 0.0)) for name, touch in answer.touches.items()],
+        touches=[_touch(touch, *inputs[name], friction.get(name, 0.0), surfaces.get(name, ""))
+                 for name, touch in answer.touches.items()],
         fade=fade,
         solve_seconds=solve_seconds,
         dt=dt,
@@ -468,7 +473,7 @@ def local_contact_message(tool: str, model: LocalContact, status: str, body_fram
     )
 
 
-def _touch(touch: Touch, pose_stamp: int, wrench_stamp: int, friction: float) -> Any:
+def _touch(touch: Touch, pose_stamp: int, wrench_stamp: int, friction: float, surface: str) -> Any:
     slip = touch.slip
     return message_class("stmpl_msgs/msg/Touch")(
         tool=touch.name,
@@ -486,6 +491,7 @@ def _touch(touch: Touch, pose_stamp: int, wrench_stamp: int, friction: float) ->
         friction_wrench=_wrench(np.zeros(6) if slip is None else slip.wrench),
         missing=_wrench(touch.missing),
         passive=float(touch.passive),
+        surface=surface,
     )
 
 

@@ -11,6 +11,7 @@ import threading
 from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from numbers import Integral
 from typing import Any
 
 import numpy as np
@@ -18,7 +19,7 @@ from scipy.spatial.transform import Rotation
 
 from stmpl_core.contact import Contact
 from stmpl_core.errors import InvalidInput, StmplError
-from stmpl_core.friction import Friction
+from stmpl_core.friction import Friction, check_tools
 from stmpl_core.simulator import Simulator
 from stmpl_core.skin import Skin
 from stmpl_core.state import State
@@ -78,12 +79,13 @@ class Batch:
                  friction: Friction | Mapping[str, Friction] = None, threads: int | None = None) -> None:  # fmt: skip
         some = list(skins) if isinstance(skins, Sequence) else [skins]
         count = len(some) if n is None else n
-        self.skins = some if isinstance(skins, Sequence) else some * count
+        self.skins = some if isinstance(skins, Sequence) or not isinstance(count, Integral) else some * count
         self.tools = list(tools)
         if not all(isinstance(skin, Skin) for skin in self.skins):
             raise InvalidInput("a batch needs prepared skins. Try Skin.of(layer, MomentNet()).")
-        if count < 1 or len(self.skins) != count:
+        if not isinstance(count, Integral) or count < 1 or len(self.skins) != count:
             raise InvalidInput(f"{len(self.skins)} skins do not fit {count} scenes: give one, or one for each.")
+        check_tools(friction, [tool.name for tool in self.tools])
         if not self.tools or len({tool.name for tool in self.tools}) < len(self.tools):
             raise InvalidInput("a batch needs tools, each with a name of its own. Try tool.named('left').")
         many = len(os.sched_getaffinity(0)) if threads is None else threads

@@ -6,10 +6,14 @@ from copy import copy
 from dataclasses import dataclass
 
 import numba
+import numpy as np
+from numpy.typing import ArrayLike
 
 from stmpl_core.arrays import Transform, Wrench, finite
 from stmpl_core.errors import InvalidInput
 from stmpl_core.tool import Tool
+
+MOST = 1e100  # largest number of a pose or a wrench that is counted: its square is one, too
 
 
 @dataclass(frozen=True, eq=False)
@@ -24,7 +28,7 @@ class Contact:
         time: instant [s], on any clock that all contacts share.
 
     Raises:
-        InvalidInput: numbers that are not finite, or a pose that is not rigid.
+        InvalidInput: numbers that are not finite or beyond MOST, or a pose that is not rigid.
     """
 
     tool: Tool
@@ -33,13 +37,11 @@ class Contact:
     time: float = 0.0
 
     def __post_init__(self) -> None:
-        pose = finite(f"pose of {self.name}", self.pose_body_from_tool, (4, 4)).copy()  # a caller goes on with its own
-        rotation = pose[:3, :3]
-        if not _rigid(rotation):
-            raise InvalidInput(f"pose of {self.name} is not rigid: its rotation part is\n{rotation}.")
+        pose = rigid(f"pose of {self.name}", self.pose_body_from_tool).copy()  # a caller goes on with its own
         object.__setattr__(self, "pose_body_from_tool", pose)
         if self.wrench is not None:
-            object.__setattr__(self, "wrench", finite(f"wrench of {self.name}", self.wrench, (6,)).copy())
+            wrench = _counted(f"wrench of {self.name}", finite(f"wrench of {self.name}", self.wrench, (6,)))
+            object.__setattr__(self, "wrench", wrench.copy())
 
     @property
     def name(self) -> str:
@@ -54,9 +56,30 @@ class Contact:
         return out
 
 
+def rigid(what: str, pose: ArrayLike) -> Transform:
+    """A pose as an array (4, 4), if it is one.
+
+    Raises:
+        InvalidInput: numbers that are not finite or beyond MOST, or a pose that is not rigid.
+    """
+    array = _counted(what, finite(what, pose, (4, 4)))
+    if not _rigid(array):
+        raise InvalidInput(f"{what} is not rigid: it is\n{array}.")
+    return array
+
+
+def _counted(what: str, array: np.ndarray) -> np.ndarray:
+    if max(array.max(), -array.min()) > MOST:
+        raise InvalidInput(f"{what} holds a number beyond {MOST:g}.")
+    return array
+
+
 @numba.njit(cache=True, nogil=True)
 def _rigid(rotation):
-    """Whether a matrix (3, 3) is a rotation, to 1e-4; numpy's own calls take ten times as long."""
+    """Whether a matrix (4, 4) turns and moves, to 1e-4; numpy's own calls take ten times as long."""
+    for x in range(4):
+        if abs(rotation[3, x] - (1.0 if x == 3 else 0.0)) > 1e-4:
+            return False
     for i in range(3):
         for j in range(3):
             product = -1.0 if i == j else 0.0

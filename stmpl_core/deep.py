@@ -10,6 +10,7 @@ from scipy.spatial import KDTree
 
 from stmpl_core.arrays import Transform
 from stmpl_core.columns import LEAST_UNDER, Columns, Squeeze, clearances, grid_of, middle_of, shifted
+from stmpl_core.layer import SoftLayer
 from stmpl_core.rays import WALL, depth_and_share, distance_in_column, ray_of
 from stmpl_core.sdf import SignedDistance
 
@@ -17,6 +18,15 @@ DEEPEST = 0.9  # depth over thickness beyond which a tool is answered for where 
 LOOKED_AT, FIRST = 64, 8  # points of a tool that are looked at; so many first, to see whether any is inside
 FACING = 0.3  # cosine to the mean of the skin's normals from which a column says which way is out
 ACCURACY = 1e-4  # of the way that a tool is drawn back, over the thickness
+
+
+def where_inside(layer: SoftLayer) -> tuple[np.ndarray, np.ndarray]:
+    """Lowest and highest corner of where a tool's middle may be inside a limb, (3,) each [m].
+
+    It goes on beyond the core of a flat layer by its thickness.
+    """
+    both, more = np.concatenate([layer.vertices, layer.inner_vertices]), float(layer.thickness.max())
+    return both.min(axis=0) - more, both.max(axis=0) + more
 
 
 class Deep:
@@ -31,9 +41,8 @@ class Deep:
         self._tree: KDTree | None = None
 
     @cached_property
-    def _box(self) -> tuple[np.ndarray, np.ndarray]:
-        """Lowest and highest corner of the skin, (3,) each [m]."""
-        return self.columns.points.min(axis=0), self.columns.points.max(axis=0)
+    def _looked(self) -> tuple[np.ndarray, np.ndarray]:
+        return where_inside(self.layer)
 
     @cached_property
     def _edge(self) -> np.ndarray:
@@ -51,7 +60,7 @@ class Deep:
 
         The limb goes on where it is cut off: what is nearest to its open border is not inside.
         """
-        centre, (low, high) = middle_of(field, pose), self._box
+        centre, (low, high) = middle_of(field, pose), self._looked
         if (centre < low).any() or (centre > high).any():
             return False
         return any(self._under(points[:: max(1, len(points) // FIRST)] @ pose[:3, :3].T + pose[:3, 3])) and \

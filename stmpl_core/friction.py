@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Literal
 
@@ -69,6 +69,13 @@ def coefficients(friction: Friction | Mapping[str, Friction]) -> tuple[float, di
     if isinstance(friction, Mapping):
         return 0.0, {name: coefficient(one) for name, one in friction.items()}
     return coefficient(friction), {}
+
+
+def check_tools(friction: Friction | Mapping[str, Friction], names: Iterable[str]) -> None:
+    """Raises InvalidInput where friction is told of a tool that is not among the names."""
+    if isinstance(friction, Mapping) and (strange := set(friction) - set(names)):
+        raise InvalidInput(f"friction is told of {', '.join(sorted(map(str, strange)))}, which is no tool; these are: "
+                           f"{', '.join(names)}.")  # fmt: skip
 
 
 def friction_from(text: str) -> Friction | dict[str, Friction]:

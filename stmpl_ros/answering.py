@@ -6,7 +6,7 @@ import threading
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numba
 import numpy as np
@@ -262,7 +262,8 @@ class Answering:
             if asked.epoch != self._epoch:
                 return
             why = "; ".join((*asked.news, *asked.said))
-            self._send(answer, instant.stamp, instant.inputs, before, solve_seconds=asked.seconds + seconds, why=why)
+            self._send(answer, instant.stamp, instant.inputs, before, solve_seconds=asked.seconds + seconds, why=why,
+                       surfaces=_surfaces(instant))  # fmt: skip
             self.last = answer, instant, before
             for sentence in asked.news:
                 self._news.pop(sentence, None)
@@ -306,7 +307,7 @@ class Answering:
             gate.say("fading", f"{why}: the last answer fades to rest within {config.fade} s")
         share = float(np.float32(left))  # as the message carries it
         faded = answer.faded(share, f"{why}: the last answer, faded to {left:.0%}")
-        self._send(faded, self._now(), instant.inputs, before, fade=share)
+        self._send(faded, self._now(), instant.inputs, before, fade=share, surfaces=_surfaces(instant))
 
     def on_other_skin(self) -> None:
         """Answers the last instant again, on the skin that took over; rest, if its tools are silent or not ready."""
@@ -333,7 +334,7 @@ class Answering:
             self._send(self.simulator.step([]), self._now(), {}, self._elastic, why=why)
         self.sending.rest(tools, self._now())
 
-    def _send(self, answer: Answer, stamp: int, inputs: Stamps, before: Before, **said: float | str) -> None:
+    def _send(self, answer: Answer, stamp: int, inputs: Stamps, before: Before, **said: Any) -> None:
         with self._sends:
             started = time.monotonic()
             self.sending.answer(answer, stamp, inputs, **before._asdict(), **said)
@@ -347,6 +348,10 @@ class Answering:
 
     def _now(self) -> int:
         return self._node.get_clock().now().nanoseconds
+
+
+def _surfaces(instant: Instant) -> dict[str, str]:
+    return {one.name: one.tool.digest for one in instant.contacts}
 
 
 def _told(error: Exception) -> str:

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from stmpl_core.arrays import finite
 from stmpl_core.errors import InvalidInput
 from stmpl_core.extras import needed
 from stmpl_core.friction import Friction
@@ -61,7 +63,9 @@ class MassageEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         render_mode: kind of frames: rgb_array, or none.
 
     Raises:
-        InvalidInput: another render_mode; friction or relaxing beside a Simulator, which has its own.
+        InvalidInput: another render_mode; friction or relaxing beside a Simulator, which has its own; a timestep of
+            which no whole number makes 20 ms; a circle that is none; an action that is not finite.
+        gymnasium.error.ResetNeeded: a step before the first `reset`.
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": round(1 / CONTROL_S)}  # noqa: RUF012
@@ -84,6 +88,12 @@ class MassageEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         if render_mode not in (None, *self.metadata["render_modes"]):
             raise InvalidInput(f"render_mode is {render_mode}; allowed is rgb_array or none.")
         self.render_mode = render_mode
+        steps = CONTROL_S / timestep if timestep > 0 else 0.0
+        if not (steps >= 1 and abs(steps - round(steps)) < 1e-6):
+            raise InvalidInput(f"timestep is {timestep:g} s; {CONTROL_S:g} s, for which an action is held, must be a "
+                               "whole number of steps.")  # fmt: skip
+        if not (math.isfinite(circle) and circle > 0):
+            raise InvalidInput(f"circle is {circle:g} m; a radius above 0 is needed.")
         if isinstance(layer, Simulator):
             if friction is not None or relaxing:
                 raise InvalidInput("a Simulator has its own friction and relaxation: give a layer, or neither.")
@@ -95,7 +105,7 @@ class MassageEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         self.course = Course(site.circle(circle), (FORCE,), SPEED, laps)
         self.massage = Massage(self._scene, self.course, skin=ready, friction=friction)
         self._rest, self._moving = self.massage.limb_pose(), moving
-        self._steps = max(1, round(CONTROL_S / timestep))
+        self._steps = round(steps)
         self._camera: Any = None
         self.action_space = gymnasium.spaces.Box(-1.0, 1.0, (3,), np.float32)
         self.observation_space = gymnasium.spaces.Box(-MOST, MOST, (8,), np.float32)
@@ -131,7 +141,9 @@ class MassageEnv(gymnasium.Env[np.ndarray, np.ndarray]):
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         """One action, held for 20 ms."""
-        action = np.clip(np.asarray(action, dtype=float), -1, 1)
+        if self._start is None:
+            raise gymnasium.error.ResetNeeded("call reset() before step().")
+        action = np.clip(finite("action", action, (3,)), -1, 1)
         self._last = self._felt()
         for _ in range(self._steps):
             self._advance(PUSH_LIMIT * 0.5 * (1 + float(action[0])), SHIFT_LIMIT * action[1:])

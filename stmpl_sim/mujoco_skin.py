@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections import OrderedDict
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from itertools import count
 from typing import Any, NamedTuple
-from weakref import WeakKeyDictionary
+from weakref import WeakKeyDictionary, WeakValueDictionary
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -26,6 +28,7 @@ from stmpl_sim.jointed import POSE_STEP, Jointed
 from stmpl_sim.protocol import Memory, Poses, Reaction, SoftContact
 
 MOST_NAMES = 30  # names of a model that an error lists
+KNOWN = 10_000  # rows of xfrc_applied that are known again
 
 
 class _Source(NamedTuple):
@@ -47,8 +50,9 @@ class SoftBody:
 
     The wrenches go into `data.xfrc_applied`, the limb's opposite to the tools', so whatever carries the limb is
     moved: a free joint, springs, joints; an animated (mocap) or fixed body takes them without moving. Each call takes
-    the wrenches of the call before out again and leaves what others added there; rows that somebody set to zero are
-    not touched twice. Works with as many skins as there are limbs.
+    the wrenches of the call before out again; numbers that others set there meanwhile, to zero or to a push, count as
+    theirs and are added to. So set a push (`=`): adding to it (`+=`) would keep a skin's last wrench as well. Works
+    with as many skins as there are limbs.
 
     Args:
         model: MuJoCo model.
@@ -95,6 +99,9 @@ class SoftBody:
         self.body = _body(model, body)
         if isinstance(tools, str):
             raise InvalidInput(f"tools is the text '{tools}'; give a list of names: ['{tools}'].")
+        if model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4:
+            raise InvalidInput("the model's integrator is RK4, to which forces that are held over a step add energy. "
+                               "Choose implicitfast, implicit or Euler.")  # fmt: skip
         self._sources = {name: _source(model, name) for name in tools}
         self._jointed = Jointed(model, _rig_of(layer), joints, self.body) if joints else None
         limbs = {self.body} if self._jointed is None else set(self._jointed.bodies)
@@ -111,6 +118,9 @@ class SoftBody:
                                    implicit=implicit, friction=friction, every=every)  # fmt: skip
         if self._jointed is not None:
             self._jointed.compare(model, self.contact.pose_body_from_layer)
+        self._key = next(_KEYS)
+        _LIVE[self._key] = self
+        self._felt = {self.body, *limbs, *(source.body for source in self._sources.values())}
         self.memory = Memory()
         self.reaction: Reaction | None = None
         self._time: float | None = None
@@ -214,8 +224,7 @@ class SoftBody:
 
     def reset(self, data: Any) -> None:
         """Takes the wrenches out of `data`, and forgets."""
-        ledger = _ledger(data)
-        ledger.replace(data, self, {})
+        self._exert(data, {})
         self.memory, self.reaction, self._time, self._posed = Memory(), None, None, {}
 
     def _push(self, data: Any, reaction: Reaction) -> None:
@@ -229,7 +238,12 @@ class SoftBody:
                         _add(rows, limb, -share * reaction.tools[name], at - data.xipos[limb])
         if self._jointed is None:
             _add(rows, self.body, reaction.body, data.xpos[self.body] - data.xipos[self.body])
-        _ledger(data).replace(data, self, rows)
+        self._exert(data, rows)
+
+    def _exert(self, data: Any, rows: Mapping[int, Wrench]) -> None:
+        """Puts wrenches, by body, in place of the last ones; zero where there is none."""
+        every = {body: rows.get(body, np.zeros(6)) for body in self._felt}
+        _LEDGERS.setdefault(self.model, _Ledger()).replace(data, self._key, every)
 
     def _limb_under(self, name: str) -> int:
         """Number of the body that carried most of a tool's last touch; without one or without joints, the skin's."""
@@ -257,32 +271,55 @@ def _rig_of(layer: SoftLayer | Skin | Simulator) -> Rig | None:
     return (layer.rest or layer).layer.rig if isinstance(layer, Skin) else layer.rig
 
 
+class _Row(NamedTuple):
+    """What a row of xfrc_applied is made of: what others want, (6,), and what skins exert, (6,) each, by their keys."""
+
+    others: Wrench
+    skins: dict[int, Wrench]
+
+
 class _Ledger:
-    """What all skins put into one MjData's xfrc_applied, so that each takes out what it put in, and no more."""
+    """What skins put into xfrc_applied of a model's data, so that each takes out what it put in, and no more.
+
+    A number that is no longer what skins left there is what others want. Rows are known again where a state is
+    restored or copied, KNOWN of them.
+    """
 
     def __init__(self) -> None:
-        self._of: WeakKeyDictionary[SoftBody, dict[int, Wrench]] = WeakKeyDictionary()
+        self._known: OrderedDict[tuple[int, bytes], _Row] = OrderedDict()
+        self._left: WeakKeyDictionary[Any, dict[int, tuple[Wrench, _Row]]] = WeakKeyDictionary()
 
-    def replace(self, data: Any, owner: SoftBody, rows: dict[int, Wrench]) -> None:
-        """Puts these wrenches, by body, in place of the owner's last ones."""
-        applied, last = data.xfrc_applied, self._of.get(owner, {})
-        for body in set(last) | set(rows):
-            if not applied[body].any():  # somebody cleared the row, with all that skins had put there
-                for theirs in self._of.values():
-                    theirs.pop(body, None)
-            others = sum((theirs[body] for one, theirs in self._of.items() if one is not owner and body in theirs),
-                         np.zeros(6))  # fmt: skip
-            strange = applied[body] - others - last.get(body, 0.0)
-            strange[np.abs(strange) < 1e-9] = 0.0  # rounding must not pile up over a million steps
-            applied[body] = strange + others + rows.get(body, 0.0)
-        self._of[owner] = dict(rows)
+    def replace(self, data: Any, owner: int, rows: Mapping[int, Wrench]) -> None:
+        """Puts these wrenches, by body, in place of a skin's last ones."""
+        left = self._left.setdefault(data, {})
+        for body, wrench in rows.items():
+            others, skins = self._read(data.xfrc_applied[body], body, left)
+            skins = {key: each for key, each in skins.items() if key != owner and key in _LIVE}
+            if wrench.any():
+                skins[owner] = wrench
+            row = _Row(others, skins)
+            numbers = data.xfrc_applied[body] = others + sum(skins.values(), np.zeros(6))
+            left[body] = numbers, row
+            if skins:
+                self._known[body, numbers.tobytes()] = row
+                if len(self._known) > KNOWN:
+                    self._known.popitem(last=False)
+
+    def _read(self, numbers: Wrench, body: int, left: Mapping[int, tuple[Wrench, _Row]]) -> _Row:
+        if not numbers.any():
+            return _Row(np.zeros(6), {})
+        if known := self._known.get((body, numbers.tobytes())):
+            return known
+        if body not in left:
+            return _Row(numbers.copy(), {})
+        last, row = left[body]
+        same = numbers == last
+        return _Row(np.where(same, row.others, numbers), {key: each * same for key, each in row.skins.items()})
 
 
-_LEDGERS: WeakKeyDictionary[Any, _Ledger] = WeakKeyDictionary()
-
-
-def _ledger(data: Any) -> _Ledger:
-    return _LEDGERS.setdefault(data, _Ledger())
+_LEDGERS: WeakKeyDictionary[Any, _Ledger] = WeakKeyDictionary()  # by model
+_LIVE: WeakValueDictionary[int, SoftBody] = WeakValueDictionary()
+_KEYS = count()
 
 
 def exclude(spec: Any, body: str, tools: Sequence[str]) -> None:
@@ -369,6 +406,15 @@ def _is_welded(model: Any, body: int, limb: int) -> bool:
     return body == limb != 0
 
 
+def _filtered(model: Any, one: int, other: int) -> bool:
+    """Whether MuJoCo takes two bodies not to collide, as one hangs on the other."""
+    if model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_FILTERPARENT:
+        return False
+    a, b = (int(model.body_weldid[body]) for body in (one, other))
+    above = [int(model.body_weldid[model.body_parentid[body]]) for body in (a, b)]
+    return bool(a and b and (a == above[1] or b == above[0]))
+
+
 def _check_no_rigid_contact(model: Any, body: int, source: _Source) -> None:
     """Raises InvalidInput where MuJoCo would make rigid contacts between the tool's geoms and the limb's.
 
@@ -381,8 +427,9 @@ def _check_no_rigid_contact(model: Any, body: int, source: _Source) -> None:
             if not _is_welded(model, owner, body):
                 continue
             first, second = sorted((source.body, owner))
-            meet = (model.geom_contype[tool] & model.geom_conaffinity[limb]
-                    or model.geom_contype[limb] & model.geom_conaffinity[tool])  # fmt: skip
+            meet = not _filtered(model, source.body, owner) and (
+                model.geom_contype[tool] & model.geom_conaffinity[limb]
+                or model.geom_contype[limb] & model.geom_conaffinity[tool])  # fmt: skip
             paired = any({int(model.pair_geom1[p]), int(model.pair_geom2[p])} == {tool, limb}
                          for p in range(model.npair))  # fmt: skip
             if paired or (meet and (first << 16) + second not in signatures):

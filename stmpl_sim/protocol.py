@@ -5,17 +5,18 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from numbers import Integral
 from typing import Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial import KDTree
 
-from stmpl_core.arrays import Transform, Wrench, cross, finite
+from stmpl_core.arrays import Transform, Wrench, cross
 from stmpl_core.carrying import carry_at
-from stmpl_core.contact import Contact
+from stmpl_core.contact import Contact, rigid
 from stmpl_core.errors import InvalidInput
-from stmpl_core.friction import Friction
+from stmpl_core.friction import Friction, check_tools
 from stmpl_core.layer import SoftLayer
 from stmpl_core.local_contact import LocalContact, local_contacts
 from stmpl_core.methods import MomentNet
@@ -160,9 +161,10 @@ class SoftContact:
             raise InvalidInput(f"a skin wants tools with names of their own; got {', '.join(names) or 'none'}.")
         if not (math.isfinite(damping) and damping >= 0):
             raise InvalidInput(f"damping is {damping} s/m; it must be finite and at least 0.")
-        if every < 1 or (every > 1 and (damping or implicit)):
-            raise InvalidInput(f"the contact law is asked at every {every} steps; that must be at least 1, and 1 with "
-                               "damping or implicit=True.")  # fmt: skip
+        if not isinstance(every, Integral) or every < 1 or (every > 1 and (damping or implicit)):
+            raise InvalidInput(f"the contact law is asked at every {every} steps; that must be a whole number of at "
+                               "least 1, and 1 with damping or implicit=True.")  # fmt: skip
+        check_tools(friction, names)
         if isinstance(layer, Simulator):
             if friction is not None:
                 raise InvalidInput("this Simulator has its own friction. Give it there: Simulator(..., friction=0.3).")
@@ -172,8 +174,8 @@ class SoftContact:
             self.simulator = Simulator(layer, ready, friction=friction)
         self.tools = {tool.name: tool for tool in tools}
         self.damping, self.implicit, self.every = damping, implicit, every
-        self.pose_body_from_layer = _rigid("pose_body_from_layer", np.eye(4) if pose_body_from_layer is None
-                                           else pose_body_from_layer)  # fmt: skip
+        self.pose_body_from_layer = rigid("pose_body_from_layer", np.eye(4) if pose_body_from_layer is None
+                                          else pose_body_from_layer)  # fmt: skip
         hole = self.simulator.toucher.hole
         self._far, self._seen = FAR_HOLES * hole, hole + float(self.simulator.layer.thickness.max())
         self._tree = KDTree((self.simulator.skin.rest or self.simulator.skin).layer.vertices)
@@ -378,9 +380,9 @@ def _centre_of_pressure(touch: Touch) -> np.ndarray:
 
 
 def _rigid(name: str, pose: ArrayLike) -> Transform:
-    """The pose, if it is finite; Contact checks that it is rigid."""
+    """The pose, if it is one."""
     try:
-        return finite(f"the pose of {name}", pose, (4, 4))
+        return rigid(f"the pose of {name}", pose)
     except InvalidInput as error:
         raise InvalidInput(f"{error} Has the simulation diverged? Try a shorter timestep.") from error
 

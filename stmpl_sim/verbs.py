@@ -171,12 +171,13 @@ def figures_of(log: Log) -> dict[str, Any]:
         rows = log.during(phase)
         if phase.name not in ("press", "circle"):
             continue
-        force, depth = log.force[rows], log.depth[rows]
+        force, depth, met = log.force[rows], log.depth[rows], np.isfinite(log.depth[rows])
         phases.append({
             "name": phase.name, "asked_N": phase.force, "mean_N": float(force.mean()),
             "deviation_N": float(force.std()), "worst_N": float(np.abs(force - phase.force).max()),
-            "depth_m": float(np.nanmean(depth)) if np.isfinite(depth).any() else float("nan"),
-            "off_course_m": float(log.off[rows].max()), "in_range": float(log.trusted[rows].mean()),
+            "depth_m": float(depth[met].mean()) if met.any() else float("nan"),
+            "off_course_m": float(log.off[rows].max()), "pressed": float(met.mean()),
+            "in_range": float(log.trusted[rows][met].mean()) if met.any() else 0.0,
         })  # fmt: skip
     most = float(log.energy.max())
     return {
@@ -230,12 +231,13 @@ def table(figures: dict[str, Any]) -> Any:
     from rich.table import Table
 
     shown = Table(title="force kept", title_justify="left")
-    for heading in ("phase", "asked [N]", "kept [N]", "worst [N]", "depth [mm]", "off course [mm]", "in range [%]"):
+    for heading in ("phase", "asked [N]", "kept [N]", "worst [N]", "depth [mm]", "off course [mm]", "pressed [%]",
+                    "in range [%]"):  # fmt: skip
         shown.add_column(heading, justify="left" if heading == "phase" else "right", no_wrap=heading == "kept [N]")
     for p in figures["phases"]:
-        shown.add_row(p["name"], f"{p['asked_N']:.1f}", f"{p['mean_N']:.2f} ± {p['deviation_N']:.2f}",
+        shown.add_row(p["name"], f"{p['asked_N']:.3g}", f"{p['mean_N']:.2f} ± {p['deviation_N']:.2f}",
                       f"{p['worst_N']:.2f}", f"{1e3 * p['depth_m']:.1f}", f"{1e3 * p['off_course_m']:.2f}",
-                      f"{100 * p['in_range']:.0f}")  # fmt: skip
+                      f"{100 * p['pressed']:.0f}", f"{100 * p['in_range']:.0f}")  # fmt: skip
     lines = [
         f"highest force {figures['highest_force_N']:.1f} N; limb moved {1e3 * figures['limb_moved_m']:.1f} mm",
         f"energy: stored {1e3 * figures['stored_J']:.2f} mJ at most, given out beyond what was put in "

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +12,7 @@ import trimesh
 
 from bags.provenance import write_provenance
 from bags.schema import find_schema, typestore_of
-from bags.wire import contact_from, quaternion_from, tool_from
+from bags.wire import NO_SURFACES, contact_from, quaternion_from, tool_from
 from bags.writer import BagWriter, qos_yaml
 from stmpl_core import Answer, SoftLayer, Tissue, Touch
 from stmpl_core.layer import layer_id
@@ -101,7 +102,7 @@ def topology(layer: SoftLayer) -> Any:
 
 
 def displacement(answer: Answer, layer: SoftLayer, stamp: int, sequence: int, state: State | None = None,
-                 dt: float = 0.0) -> Any:  # fmt: skip
+                 dt: float = 0.0, surfaces: Mapping[str, str] = NO_SURFACES) -> Any:  # fmt: skip
     """An answer as SkinDisplacement."""
     trust = answer.trust
     pressure = np.zeros(0) if answer.pressure is None else answer.pressure
@@ -109,12 +110,12 @@ def displacement(answer: Answer, layer: SoftLayer, stamp: int, sequence: int, st
                    displacement=answer.displacement.astype(np.float32).ravel(), pressure=pressure.astype(np.float32),
                    method=answer.method, converged=trust.converged, in_range=trust.in_range,
                    error_bound=float("nan") if trust.error_bound is None else trust.error_bound, why=trust.why,
-                   touches=[touched(touch, stamp) for touch in answer.touches.values()],
+                   touches=[touched(touch, stamp, surfaces.get(name, "")) for name, touch in answer.touches.items()],
                    fade=1.0, solve_seconds=0.001, dt=dt, joints=np.zeros(0),
                    state=np.frombuffer(b"" if state is None else state.pack(), np.uint8))  # fmt: skip
 
 
-def touched(touch: Touch, stamp: int) -> Any:
+def touched(touch: Touch, stamp: int, surface: str = "") -> Any:
     """What one tool does, by pose and wrench of one stamp, as stmpl_msgs/Touch."""
     (x, y, z), turn = touch.pose_body_from_tool[:3, 3], quaternion_from(touch.pose_body_from_tool[:3, :3])
     point = message("geometry_msgs/msg/Point", x=x, y=y, z=z)
@@ -127,7 +128,7 @@ def touched(touch: Touch, stamp: int) -> Any:
                    pose_stamp=header("", stamp).stamp, wrench_stamp=header("", stamp).stamp,
                    friction=0.0, slip=slip.kind if slip else "", slip_share=slip.share if slip else 0.0,
                    friction_wrench=six(slip.wrench if slip else np.zeros(6)), missing=six(touch.missing),
-                   passive=touch.passive)  # fmt: skip
+                   passive=touch.passive, surface=surface)  # fmt: skip
 
 
 def going(stamp: int) -> np.ndarray:
@@ -166,10 +167,11 @@ def six(values: np.ndarray) -> Any:
 def write_run(folder: Path, method: Method, *, layer: SoftLayer | None = None, frames: int = 40, rate: float = 100.0,
               lose: tuple[int, ...] = (), skip: tuple[int, ...] = (), delay: float = 0.002,
               namespace: str = "/stmpl", frame: str = "body", table: bool = True,
-              tf: tuple[int, int] | None = None) -> Path:  # fmt: skip
+              tf: tuple[int, int] | None = None, grow: int = -1, unheard: tuple[int, ...] = ()) -> Path:  # fmt: skip
     """Records a ball that presses and slides, joined in the last third by a second one; returns the folder.
 
-    Frames in `lose` are answered but not recorded, those in `skip` are not answered at all. Poses come in `frame`,
+    Frames in `lose` are answered but not recorded, those in `skip` are not answered at all; poses of those in `unheard`
+    are not recorded. From frame `grow` on the tools are larger. Poses come in `frame`,
     which if it is not the body's stands at TURNED; the recording says so if it carries a `table`, else only /tf did.
     With `tf` it is `going`, and /tf between these stamps [ns] is recorded.
     """
@@ -197,11 +199,17 @@ def write_run(folder: Path, method: Method, *, layer: SoftLayer | None = None, f
         for k in range(frames):
             stamp = START + round((k + 1) * 1e9 / rate)
             contacts = []
+            if k == grow:
+                for tool in ANGLES:
+                    sent = message("mesh", header=header(tool, stamp), vertices=1.3 * vertices.ravel(),
+                                   triangles=triangles.ravel())  # fmt: skip
+                    bag.write(surface, cdr(sent), stamp, stamp)
+                    known[tool] = tool_from(sent)
             for tool, newtons in script(k / frames).items():
                 height, gap = 0.06 + 0.03 * k / frames, -0.5e-3 if newtons else 5e-3
                 instant = pose(ANGLES[tool], height, gap, stamp), wrench(tool, newtons, stamp)
                 instant[0].header.frame_id = frame
-                for kind, made in zip(("pose", "wrench"), instant, strict=True):
+                for kind, made in zip(("pose", "wrench"), instant, strict=True) if k not in unheard else ():
                     bag.write(tools[tool, kind], cdr(made), stamp + 100_000, stamp)
                 frames_now = {frame: going(stamp)} if tf else known_frames
                 contacts.append(contact_from(known[tool], *instant, body_frame="body", frames=frames_now))
@@ -210,7 +218,9 @@ def write_run(folder: Path, method: Method, *, layer: SoftLayer | None = None, f
             answer = simulator.step(contacts)
             if k not in lose:
                 received = stamp + 100_000 + round(delay * 1e9)
-                bag.write(answers, cdr(displacement(answer, layer, stamp, sequence)), received, received)
+                surfaces = {one.name: one.tool.digest for one in contacts}
+                said = displacement(answer, layer, stamp, sequence, surfaces=surfaces)
+                bag.write(answers, cdr(said), received, received)
             sequence += 1
     return folder
 

@@ -18,7 +18,7 @@ from bags.report import write_report
 from bags.run import Run
 from bags.survey import survey
 from bags.writer import BagWriter
-from stmpl_core.errors import BagError
+from stmpl_core.errors import BagError, InvalidInput
 from stmpl_core.layer import layer_id
 from stmpl_core.methods import Winkler
 from stmpl_core.provenance import processor
@@ -87,6 +87,30 @@ def test_poses_in_a_frame_that_the_recording_carries_are_replayed_and_of_an_unkn
     comparison = compare_run(by_tf, Winkler(), method=Winkler(), frames=2)
     assert not comparison.judged and all("'base'" in why for why in comparison.failed.values())
     assert len(Recording.of(by_tf, frames=6).snapshots) == 6, "what was answered is shown all the same"
+
+
+def test_an_answer_is_replayed_with_the_surface_that_its_tool_had(tmp_path):
+    changed = Run(write_run(tmp_path / "changed", Winkler(), frames=24, grow=12))
+    replayed = replay_run(changed, Winkler())
+    assert replayed.passed and replayed.identical == replayed.frames == 24
+    first, last = (changed.contacts(frame)[0].tool for frame in (next(changed.frames([2])), next(changed.frames([20]))))
+    assert np.ptp(last.vertices) == pytest.approx(1.3 * np.ptp(first.vertices), rel=1e-6)
+    assert changed.tools["ball"] is last
+
+
+def test_answers_to_what_was_not_recorded_are_left_out_of_a_replay_and_told(tmp_path, capsys):
+    late = write_run(tmp_path / "late", Winkler(), frames=12, unheard=(0, 1, 2))
+    replayed = replay_run(late, Winkler())
+    assert (replayed.frames, replayed.identical, replayed.left_out, replayed.passed) == (9, 9, 3, True)
+    code, said = stmpl(capsys, "replay", late, "--method", "winkler")
+    assert code == 0 and "3 more were left out: an answer to tool ball" in said and "no pose and no wrench" in said
+    torn = replay_run(write_run(tmp_path / "torn", Winkler(), frames=12, unheard=(5,)), Winkler())
+    assert (torn.frames, torn.left_out, torn.passed, torn.first_difference) == (11, 1, False, None)
+    nothing = write_run(tmp_path / "nothing", Winkler(), frames=6, unheard=tuple(range(6)))
+    with pytest.raises(BagError, match="no pose and no wrench"):
+        replay_run(nothing, Winkler())
+    with pytest.raises(InvalidInput, match="frames is 0"):
+        compare_run(late, Winkler(), method=Winkler(), frames=0)
 
 
 def test_a_recording_names_the_processor_and_another_one_may_differ_in_the_last_bit(run, monkeypatch):

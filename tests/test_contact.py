@@ -484,8 +484,15 @@ def test_what_the_skin_cannot_carry_is_said_and_not_scaled(sim: Simulator, force
 def test_bad_input_is_refused_with_a_reason(sim: Simulator) -> None:
     with pytest.raises(InvalidInput, match="wrench of probe holds 1"):
         press(BALL, on_limb(), (np.nan, 0, 0))
-    with pytest.raises(InvalidInput, match="pose of probe is not rigid"):
-        press(BALL, np.diag([1.0, 1.0, 2.0, 1.0]), (1, 0, 0))
+    for odd in (np.diag([1.0, 1.0, 2.0, 1.0]), np.diag([1.0, 1.0, 1.0, 2.0]), 2 * np.eye(4), np.diag([1.0, 1, -1, 1])):
+        with pytest.raises(InvalidInput, match="pose of probe is not rigid"):
+            press(BALL, odd, (1, 0, 0))
+    with pytest.raises(InvalidInput, match="wrench of probe holds a number beyond"):  # its square is no number
+        press(BALL, on_limb(), (-1e155, 0, 0))
+    with pytest.raises(InvalidInput, match="pose of probe holds a number beyond"):
+        press(BALL, at(1e155, 0, 0), None)
+    held = touch_of(sim.step([press(BALL, on_limb(), (-1e99, 0, 0))]))
+    assert not held.trust.in_range and "carries" in held.trust.why
     with pytest.raises(InvalidInput, match="names of their own"):
         sim.step([press(BALL, on_limb(), None), press(BALL, on_limb(), None)])
     with pytest.raises(MeshError, match="millimetres"):

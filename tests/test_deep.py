@@ -7,7 +7,7 @@ from stmpl_core import Membrane, Ply, Simulator, Tissue, Tool
 from stmpl_core.deep import DEEPEST
 from stmpl_core.methods import MomentNet, Winkler
 from stmpl_core.touch import APART, IN_CORE, NO_FORCE
-from tests.scenes import LENGTH, RADIUS, at, ball, box, capsule, limb, press, punch, touch_of, turn
+from tests.scenes import LENGTH, RADIUS, at, ball, box, capsule, limb, plate, press, punch, touch_of, turn
 
 LIMB = limb(4e-3)
 STACK = Tissue(3e3, 0.4, skin=Membrane(2e5, 1.5e-3, 15.0), deeper=(Ply(8e-3, 15e3, 0.4),))
@@ -77,6 +77,17 @@ def test_what_is_beside_or_around_the_limb_is_not_inside(sim: Simulator) -> None
         assert touch_of(sim.step([contact])).status == APART
     inside = press(ball(), at(0, 0, LENGTH / 2), (0, 0, 0))
     assert touch_of(sim.step([inside])).status == NO_FORCE
+
+
+def test_a_tool_under_a_flat_layer_is_in_its_core() -> None:
+    layer, radius = plate(0.09), 0.004
+    sim, t = Simulator(layer, Winkler()), float(layer.thickness.max())
+    touches = [touch_of(sim.step([press(ball(radius), at(0, 0, radius - depth * t), None)]))
+               for depth in (0.9, 1.1, 1.5, 1.9, 2.4)]  # fmt: skip
+    assert all(touch.status == IN_CORE and not touch.trust.in_range for touch in touches[1:])
+    assert (np.diff([touch.force for touch in touches]) > 0).all()
+    beside = touch_of(sim.step([press(ball(radius), at(0.06, 0, -t), None)]))
+    assert beside.status == APART
 
 
 def test_a_torque_without_a_force_is_told_of() -> None:

@@ -1,5 +1,6 @@
 """stmpl_sim: soft skin in a rigid-body simulator: what it exerts is what the contact law says, on both, once."""
 
+import copy
 from collections.abc import Mapping
 from typing import Any
 
@@ -277,9 +278,11 @@ def test_wrenches_of_others_stay_and_ours_do_not_pile_up(simulator: Simulator) -
     skin.apply(d)
     alone = d.xfrc_applied.copy()
     assert alone.any()
-    d.xfrc_applied[2, 0] += 3.0
+    d.xfrc_applied[2, 0] = 3.0
     for _ in range(5):
         skin.apply(d)
+        d.xfrc_applied[2, 0] = 3.0  # set anew at each step, as most programs do
+    skin.apply(d)
     np.testing.assert_allclose(d.xfrc_applied[2] - alone[2], [3, 0, 0, 0, 0, 0], atol=1e-12)
     other.apply(d)
     skin.apply(d)
@@ -291,6 +294,40 @@ def test_wrenches_of_others_stay_and_ours_do_not_pile_up(simulator: Simulator) -
     other.reset(d)
     skin.reset(d)
     assert not d.xfrc_applied.any()
+
+
+def test_a_copy_or_a_restored_state_keeps_no_wrench_of_ours(simulator: Simulator) -> None:
+    m = model()
+    d = mujoco.MjData(m)
+    skin = SoftBody(m, simulator, body="slab", tools=["ball"])
+    d.xfrc_applied[2, 1] = 2.0
+    skin.apply(d)
+    everything = mujoco.mjtState.mjSTATE_INTEGRATION
+    kept = np.empty(mujoco.mj_stateSize(m, everything))
+    mujoco.mj_getState(m, d, kept, everything)
+    other = copy.copy(d)
+    for _ in range(30):
+        step(m, d, skin)
+    mujoco.mj_setState(m, d, kept, everything)
+    for data in (other, d):
+        assert data.xfrc_applied[1].any()
+        data.qpos[2] += 1.0  # away from the skin
+        skin.apply(data)
+        np.testing.assert_array_equal(data.xfrc_applied[1:3], [[0] * 6, [0, 2, 0, 0, 0, 0]])
+    other = SoftBody(m, simulator, body="slab", tools=["ball"])
+    d.qpos[2] -= 1.0
+    other.apply(d)
+    del other  # and what it exerted goes with it
+    d.qpos[2] += 1.0
+    skin.apply(d)
+    np.testing.assert_array_equal(d.xfrc_applied[1:3], [[0] * 6, [0, 2, 0, 0, 0, 0]])
+
+
+def test_an_integrator_that_gives_energy_is_refused(simulator: Simulator) -> None:
+    m = model()
+    m.opt.integrator = mujoco.mjtIntegrator.mjINT_RK4
+    with pytest.raises(InvalidInput, match="RK4"):
+        SoftBody(m, simulator, body="slab", tools=["ball"])
 
 
 def test_reset_begins_the_same_run_again(simulator: Simulator) -> None:
@@ -503,7 +540,29 @@ def test_a_step_that_leaves_what_a_model_holds_asks_again(slab: SoftLayer) -> No
         assert memory.asked is not None and (memory.asked.steps > 0) == (k == 1)
         fresh = often.step(at).tools[tool.name]
         np.testing.assert_allclose(made.tools[tool.name], fresh, rtol=1e-3 if k == 1 else 1e-9, atol=1e-4)
-    wrong: list[dict[str, Any]] = [{"every": 0}, {"every": 2, "damping": 1.0}, {"every": 2, "implicit": True}]
-    for options in wrong:
+    wrong: list[dict[str, Any]] = [{"every": 2, "damping": 1.0}, {"every": 2, "implicit": True}]
+    for options in [*wrong, *({"every": odd} for odd in (0, 2.5, np.nan, "2"))]:
         with pytest.raises(InvalidInput, match="asked at every"):
             SoftContact(simulator, [tool], **options)
+
+
+def test_what_does_not_fit_a_soft_contact_is_refused(simulator: Simulator) -> None:
+    tool = ball(0.01)
+    for odd in (1000.0, 2.0, -1.0):
+        with pytest.raises(InvalidInput, match="pose_body_from_layer is not rigid"):
+            SoftContact(simulator, [tool], pose_body_from_layer=np.diag([1.0, 1.0, odd, 1.0]))
+        with pytest.raises(InvalidInput, match="the body is not rigid"):
+            SoftContact(simulator, [tool]).step(Poses(np.diag([1.0, 1.0, odd, 1.0]), {tool.name: np.eye(4)}))
+    with pytest.raises(InvalidInput, match="friction is told of Ball, which is no tool"):
+        SoftContact(simulator.skin, [tool], friction={"Ball": 0.3})
+
+
+def test_a_tool_that_hangs_on_the_limb_needs_no_exclude(simulator: Simulator) -> None:
+    hung = """<mujoco><worldbody><body name="limb"><freejoint/><geom size=".01" mass="1"/>
+    <body name="hand" pos="0 0 .05"><joint type="slide" axis="0 0 1"/><geom name="ball" size=".01" mass=".1"/></body>
+    </body></worldbody></mujoco>"""
+    SoftBody(mujoco.MjModel.from_xml_string(hung), simulator, body="limb", tools=["ball"])
+    spec = mujoco.MjSpec.from_string(hung)
+    spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_FILTERPARENT
+    with pytest.raises(InvalidInput, match="also collides rigidly"):
+        SoftBody(spec.compile(), simulator, body="limb", tools=["ball"])

@@ -266,6 +266,11 @@ def test_the_environment_passes_gymnasiums_own_check_and_its_script_solves_it(fo
         MassageEnv(forearm, render_mode="human")
     with pytest.raises(InvalidInput, match="its own friction"):
         MassageEnv(Simulator(forearm, Winkler()), relaxing=True)
+    for odd in (0.0, -1e-3, 3e-3, 0.03, np.nan):  # an action is held for 20 ms, no more and no less
+        with pytest.raises(InvalidInput, match="timestep"):
+            MassageEnv(forearm, timestep=odd)
+    with pytest.raises(InvalidInput, match="circle is 0 m"):
+        MassageEnv(forearm, circle=0.0)
 
 
 def test_the_script_holds_ten_newtons_on_the_back_of_a_person_who_breathes_sways_and_turns() -> None:

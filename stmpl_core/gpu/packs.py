@@ -12,7 +12,7 @@ import warp as wp
 from scipy.spatial import KDTree
 
 from stmpl_core.columns import BLOCK, Columns
-from stmpl_core.deep import FIRST, LOOKED_AT
+from stmpl_core.deep import FIRST, LOOKED_AT, where_inside
 from stmpl_core.gpu.rays import Grid, mat33, real, vec3
 from stmpl_core.green import COLUMNS, STRAINS
 from stmpl_core.layer import SoftLayer
@@ -267,7 +267,7 @@ def _one_skin(skin: Skin, columns: Columns, at: tuple[int, int, int, int]) -> tu
     one.mu, one.lam = tissue.shear_modulus / one.modulus, tissue.lame_lambda / one.modulus
     low, high = shipped(network_of(layer)).card["ranges"]["poisson_ratio"]
     one.learnt = int(low - 1e-3 <= tissue.poisson_ratio <= high + 1e-3)
-    one.low, one.high = vec3(*layer.vertices.min(axis=0)), vec3(*layer.vertices.max(axis=0))
+    one.low, one.high = (vec3(*corner) for corner in where_inside(layer))
     return one, arrays
 
 
