@@ -119,7 +119,7 @@ def simpler(layer: SoftLayer, columns: bool) -> Solver:
     def answer(one: Pressed) -> tuple[np.ndarray, np.ndarray]:
         squeeze = under.squeezed(one.field, one.pose)
         nodes = squeeze.nodes
-        pressure = laws.columns(nodes) if columns else laws.linear(nodes)
+        pressure = laws.columns(nodes) if columns else laws.unlearnt(nodes)
         force = force_of(layer, nodes, pressure)
         if not columns:
             return force, green.motion(nodes, (pressure * nodes.area / modulus)[:, None] * nodes.inward)

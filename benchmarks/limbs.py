@@ -20,6 +20,7 @@ import logging
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 from typing import NamedTuple
 
@@ -47,7 +48,9 @@ LIMBS = {  # rows of scenes: what splits, and how the limbs are called; a networ
     "backs": (("test", "val"), ("back",)),
     "a forearm left out": (("held_out",), ("forearm",)),
     "people": (("test", "val"), ("living",)),
+    "heavy people": (("test", "val"), ("stout",)),
 }
+STOUT = Path(__file__).with_name("stout_v1.npz")  # where the last are
 DEPTHS = (0.0, 0.1, 0.3, 0.6, 1.0)  # over the thickness, between which --kept takes means
 PEER_AT = (0.2, 0.4)  # depths at which a peer is asked [thicknesses]
 PEER, FLEX = "MuJoCo flex, the limb's mesh", "studies/peers/layered_flex.py:ball"
@@ -216,12 +219,16 @@ def main() -> None:
     given.add_argument("--peer", action="store_true", help="MuJoCo's flex under balls instead (extra peers)")
     given.add_argument("--kept", action="store_true", help="what the scenes keep of the tools' forces instead; no law")
     given.add_argument("--export", type=Path, default=None, help="folder to which the scenes are written instead")
-    given.add_argument("--file", type=Path, default=FILE, help="released contacts")
+    given.add_argument("--file", type=Path, default=None, help="released contacts; those of this folder unless given")
     options = given.parse_args()
     logging.disable(logging.WARNING)
-    released = Released(options.file)
+    read = cache(Released)
+
+    def released(kind: str = "") -> Released:
+        return read(options.file or (STOUT if kind == "heavy people" else FILE))
+
     if options.export:
-        print(f"{export(released.samples(), options.export)} scenes in {options.export}")
+        print(f"{export(released().samples(), options.export)} scenes in {options.export}")
         return
     try:
         laws = {PEER: str(FILE.parents[1] / FLEX)} if options.peer else {"yours": options.answers}
@@ -230,12 +237,12 @@ def main() -> None:
         given.error(str(error))
     for kind in options.limbs if options.kept else ():
         splits, names = LIMBS[kind]
-        samples = [one for one in released.samples() if one.info["split"] in splits and slant_of(one) <= STRAIGHT
+        samples = [one for one in released(kind).samples() if one.info["split"] in splits and slant_of(one) <= STRAIGHT
                    and one.info["body"].startswith(names)]  # fmt: skip
         Console(width=130).print(kept(kind, samples))
     for kind in () if options.kept else options.limbs:
         splits, names = LIMBS[kind]
-        Console(width=130).print(table(kind, compare(released, splits, names, others, balls=options.peer)))
+        Console(width=130).print(table(kind, compare(released(kind), splits, names, others, balls=options.peer)))
 
 
 if __name__ == "__main__":

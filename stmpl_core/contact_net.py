@@ -43,12 +43,15 @@ class Held(NamedTuple):
         doubt: error to expect of it, over E, (N,) [-].
         outside: degree to which the nodes see what no training contact had, from 0 to 1, (N,) [-].
         power: power of the depth with which the force grows, about [-].
+        shell: share of the linear work by which a limb is stiffer than its flat stack [-]; stiff skin around it stands
+            up like a shell, until it is dented.
     """
 
     pressure: np.ndarray
     doubt: np.ndarray
     outside: np.ndarray
     power: float
+    shell: float = 0.0
 
 
 NOTHING = Held(np.empty(0), np.empty(0), np.empty(0), 1.0)
@@ -149,7 +152,8 @@ class ContactNet:
             return NOTHING
         look = self.look(nodes)
         corrected = _correct(*look[:3], *self._network)
-        return Held(*corrected, look.power)
+        shell = 0.0 if self._green is None else -float(look.inputs[0, STACK_NODE.at.given_way])
+        return Held(*corrected, look.power, shell)
 
     def slopes(self, nodes: Nodes, strain_rates: np.ndarray, sinking_rates: np.ndarray) -> np.ndarray:
         """Rates of the pressures that `hold` gives, as depths change at nodes that stay where they are, (K, N).

@@ -54,6 +54,7 @@ MARGIN_SHARE = 2 / 3  # width of the distance fields around tools, over the thic
 MAX_AROUND = 0.02  # depth of skin in a tool that presses nothing, over the thickness, that is not yet worth a word
 THIN = 0.7  # least extent of a tool, over the skin's edges, below which it is thin
 SUNK = 0.8  # depth of a thin tool over its least extent, beyond which its force may fall as it goes deeper
+SHELL, SHELL_FROM = 2.5, 0.02  # bound on a force per share of work above this by which a limb is stiff as a shell
 STUCK = 0.5  # error of what skin that sticks carries along itself, over that
 MAX_LEVER = 1.0  # torque that is not carried over the force, over the contact's radius, that is not yet worth a word
 MAX_FIELD_ERROR_M = 5e-4  # error of a distance field that is not yet worth a word
@@ -187,7 +188,7 @@ class Toucher:
             ends = np.cumsum([len(one.squeeze.nodes.area) for one in group])[:-1]
             parts = zip(*(np.split(values, ends) for values in together[:3]), strict=True)
             for one, (pressure, doubt, outside) in zip(group, parts, strict=True):
-                held[one.contact.name] = Held(pressure, doubt, outside, together.power)
+                held[one.contact.name] = together._replace(pressure=pressure, doubt=doubt, outside=outside)
         return [self._answer(one, held.get(one.contact.name, NOTHING), beside.get(one.contact.name), alone)
                 for one in placed]  # fmt: skip
 
@@ -368,6 +369,7 @@ class Toucher:
         if "uneven" in known and size > 0:
             doubt = math.hypot(doubt, known["uneven"] * self.net.unlike(nodes, forces))
         bound = known["scale"] * doubt ** known["power"] if size > 0 else 0.0
+        bound += SHELL * max(held.shell - SHELL_FROM, 0.0)
         bound += STUCK * along + held.power * below / max(depth, below, 1e-300)  # the skin is no facets
         beside, radius = among or pins(nodes.points, nodes.area, nodes.thickness, forces)
         wider = WIDER if beside > GROUP and depth > DEEP * radius else 1.0

@@ -162,8 +162,8 @@ def fit_bound(errors: np.ndarray, doubts: np.ndarray, kinds: np.ndarray,
     missed = np.empty(len(errors))
     for kind in np.unique(kinds):
         here = kinds == kind
-        missed[here] = log_error[here] - terms[here] @ np.linalg.lstsq(terms[~here], log_error[~here], rcond=None)[0]
-    offset, power = (fitted := np.linalg.lstsq(terms, log_error, rcond=None)[0])[:2]
+        missed[here] = log_error[here] - terms[here] @ _fitted(terms[~here], log_error[~here])
+    offset, power = (fitted := _fitted(terms, log_error))[:2]
     scale = float(np.exp(offset + np.quantile(missed, COVERED)))
     without = errors / np.exp(terms[:, 2:] @ fitted[2:])
     return {
@@ -173,3 +173,12 @@ def fit_bound(errors: np.ndarray, doubts: np.ndarray, kinds: np.ndarray,
         "median_bound_over_error": float(np.median(scale * doubts**power / without)),
     }
 
+
+def _fitted(terms: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Coefficients of terms (N, K) in values (N,) by least squares, (K,); the second, of the doubt, not below 0."""
+    out = np.linalg.lstsq(terms, values, rcond=None)[0]
+    if out[1] < 0:
+        out[1] = 0.0
+        rest = np.arange(terms.shape[1]) != 1
+        out[rest] = np.linalg.lstsq(terms[:, rest], values, rcond=None)[0]
+    return out

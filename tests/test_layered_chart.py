@@ -5,10 +5,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks.layered_chart import ONE_LAYER, OURS, Row, best, draw, points, pressing, shared, table
+from benchmarks.layered_chart import ONE_LAYER, OURS, Row, best, draw, points, pressing, shared, simpler, table
+from benchmarks.limbs import FILE
+from fem_tools.released import Released
 from stmpl_core import SoftLayer
 from stmpl_core.tissue import Membrane, Ply, Tissue
 from studies.peers import installed
+from studies.pressed import STRAIGHT, pressed, slant_of
 from tests.scenes import plate
 
 RADIUS, DEPTH = 12e-3, 2e-3  # m, of a ball
@@ -43,6 +46,18 @@ def test_a_force_is_what_presses_without_drag() -> None:
     tractions = np.cross(layer.normals, [1.0, 0.0, 0.0]) * 50.0 - 100.0 * layer.normals
     expected = -(np.full(len(layer.vertices), 100.0) @ layer.vertex_area_vectors)
     np.testing.assert_allclose(pressing(layer, tractions), expected, rtol=1e-9, atol=1e-12)
+
+
+def test_the_simpler_laws_answer_a_scene_that_is_released() -> None:
+    released = Released(FILE)
+    sample = next(one for one in released.samples("held_out") if slant_of(one) <= STRAIGHT and one.info["ratio"] > 0.2)
+    every = list(pressed([sample]))
+    linear, columns = (next(simpler(every[0].sample.layer, alone)(every)) for alone in (False, True))
+    assert linear is not None and columns is not None
+    true = float(np.linalg.norm(every[0].force))
+    assert 0.6 * true < np.linalg.norm(linear[0]) < 1.6 * true
+    assert 0 < np.linalg.norm(columns[0]) < true  # no column holds its neighbours
+    assert all(np.isfinite(motion).all() and motion.any() and took > 0 for _, motion, took in (linear, columns))
 
 
 @pytest.mark.skipif("mujoco_flex" not in installed(), reason="needs mujoco")

@@ -20,6 +20,7 @@ STEEP_SHARE, LONG_SHARE = wp.constant(wp.float64(soundness.STEEP_SHARE)), wp.con
 BORDER_SHARE = wp.constant(wp.float64(soundness.BORDER_SHARE))
 AROUND, UNSEEN = wp.constant(wp.float64(toucher.MAX_AROUND)), wp.constant(wp.float64(toucher.MAX_UNSEEN_FORCE_SHARE))
 THIN, SUNK = wp.constant(wp.float64(toucher.THIN)), wp.constant(wp.float64(toucher.SUNK))
+SHELL, SHELL_FROM = wp.constant(wp.float64(toucher.SHELL)), wp.constant(wp.float64(toucher.SHELL_FROM))
 STUCK, WIDER = wp.constant(wp.float64(toucher.STUCK)), wp.constant(wp.float64(pieces.WIDER))
 GROUP, PINS_DEEP = wp.constant(wp.float64(pieces.GROUP)), wp.constant(wp.float64(pieces.DEEP))
 PIECE = wp.constant(wp.float64(2.0 / 3.0**0.5 * pieces.SPACINGS**2))
@@ -272,6 +273,8 @@ def answer(first: wp.int32, many: wp.int32, known: Known, skins: Skins, scratch:
     if size > real(0.0):
         bound = known.scale * wp.pow(doubt, known.power)
         below /= wp.max(forces, NONE)
+        if one.stacked == 1:
+            bound += SHELL * wp.max(-scratch.given_way[c] - SHELL_FROM, real(0.0))
         bound += STUCK * along / size + power * below / wp.max(depth, wp.max(below, NONE))
         if group:
             bound *= WIDER
