@@ -12,7 +12,16 @@ import numpy as np
 from stmpl_core.arrays import Points, Transform
 from stmpl_core.layer import SoftLayer
 from stmpl_core.nodes import Nodes, nodes_under
-from stmpl_core.rays import WALL, depth_and_share, depth_in_column, distance_in_column, ray_from, ray_of
+from stmpl_core.rays import (
+    NOT_SUNK,
+    UNSAID,
+    WALL,
+    depth_and_share,
+    depth_in_column,
+    distance_in_column,
+    ray_from,
+    ray_of,
+)
 from stmpl_core.sdf import SignedDistance
 from stmpl_core.touch import MIN_ONE_WAY_SHARE
 
@@ -262,13 +271,33 @@ def _squeezed(grid, pose, centre, points, inward, thickness, faces, start, aroun
     for n in range(len(near)):
         under = max(under, -least[n] - max(-above[n], 0.0))
         wall += WALL * thickness[near[n]] / len(covered) if least[n] < hole else 0.0
-    sunk = under > LEAST_UNDER * wall
+    top = NOT_SUNK.copy()
+    if under > LEAST_UNDER * wall:  # a layer that is thin beside the limb has no columns that lead so far aside
+        top = _top(pose, inward, near, above) if stacked else UNSAID.copy()
     found, vertices, depth, rests = _cover(grid, pose, points, inward, thickness, faces, start, around, slot, covered,
-                                           sunk)  # fmt: skip
-    nodes = nodes_under(grid, pose, centre, points, inward, thickness, faces, found, sunk)
+                                           top)  # fmt: skip
+    nodes = nodes_under(grid, pose, centre, points, inward, thickness, faces, found, top)
     places, ways, heights, areas, strains = nodes[:5]
     sinking = _sinking(grid, pose, places, ways, heights, areas, strains) if stacked else np.empty(0)
     return (vertices, depth, rests) + nodes + (sinking,)
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _top(pose, inward, near, above):
+    """Against the mean inward normal of columns whose skin a tool has met, in its frame, (3,); UNSAID if none is."""
+    way, whole, out = np.zeros(3), 0.0, np.zeros(3)
+    for n in range(len(near)):
+        deep = max(-above[n], 0.0)
+        whole += deep
+        for x in range(3):
+            way[x] += deep * inward[near[n], x]
+    size = np.sqrt(way[0] * way[0] + way[1] * way[1] + way[2] * way[2])
+    if size <= MIN_ONE_WAY_SHARE * whole:
+        return UNSAID.copy()
+    for x in range(3):
+        for y in range(3):
+            out[x] -= pose[y, x] * way[y] / size
+    return out
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
@@ -303,7 +332,7 @@ def _depths_along(grid, pose, points, way, guess):
 
 
 @numba.njit(cache=True, nogil=True)
-def _cover(grid, pose, points, inward, thickness, faces, start, around, slot, covered, sunk):
+def _cover(grid, pose, points, inward, thickness, faces, start, around, slot, covered, top):
     """Triangles around covered vertices, their vertices in order, and of these depth and rests: see Squeeze.
 
     At the border the depth falls to 0 over WALL beside a wall of the tool, and where a tool has sunk under skin that it
@@ -331,7 +360,7 @@ def _cover(grid, pose, points, inward, thickness, faces, start, around, slot, co
         v = vertices[n]
         slot[v] = -1
         wall, ray = WALL * thickness[v], ray_of(pose, points, inward, v)
-        deep, share = depth_and_share(grid, ray, thickness[v], sunk)
+        deep, share = depth_and_share(grid, ray, thickness[v], top)
         depth[n] = share * deep
         if depth[n] > 0:
             inside = -distance_in_column(grid, ray, depth[n] - wall)

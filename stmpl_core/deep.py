@@ -9,9 +9,9 @@ import numpy as np
 from scipy.spatial import KDTree
 
 from stmpl_core.arrays import Transform
-from stmpl_core.columns import LEAST_UNDER, Columns, Squeeze, clearances, grid_of, middle_of, shifted
+from stmpl_core.columns import Columns, Squeeze, grid_of, middle_of, shifted
 from stmpl_core.layer import SoftLayer
-from stmpl_core.rays import WALL, depth_and_share, distance_in_column, ray_of
+from stmpl_core.rays import UNSAID, WALL, depth_and_share, distance_in_column, ray_of
 from stmpl_core.sdf import SignedDistance
 
 DEEPEST = 0.9  # depth over thickness beyond which a tool is answered for where it is drawn back to that
@@ -162,22 +162,18 @@ def _reached(grid, pose, points, inward, thickness, near, moved):
 @numba.njit(cache=True, nogil=True)
 def _said(grid, pose, points, inward, thickness, some):
     """What columns say without their neighbours: 1, one is squeezed beyond DEEPEST; 0, some, and none so far; or -1."""
-    touched, unsure, thickest = False, False, 0.0
-    for v in some:
-        thickest = max(thickest, thickness[v])
+    touched, unsure, top = False, False, UNSAID.copy()
     for n in range(len(some)):
         v = some[n]
         t, ray = thickness[v], ray_of(pose, points, inward, v)
         above = distance_in_column(grid, ray, 0.0)
-        deep, share = depth_and_share(grid, ray, t, True)
+        deep, share = depth_and_share(grid, ray, t, top)
         touched = touched or (share == 1 and deep > 0)
         if share * deep / t <= DEEPEST:
             continue
         if min(max(1 - above / (WALL * t), 0.0), 1.0) * deep / t <= DEEPEST:  # so only under skin out of its reach
-            least = clearances(grid, pose, points, inward, thickness, some[n : n + 1], t)[0][0]
-            if -least - max(-above, 0.0) <= LEAST_UNDER * WALL * thickest:
-                unsure = True
-                continue
+            unsure = True
+            continue
         if deep == t and distance_in_column(grid, ray, t + 1e-5) < distance_in_column(grid, ray, t):
             unsure = True  # the tool comes through the core: it counts where its neighbours do
             continue

@@ -21,6 +21,7 @@ from stmpl_core.rays import (
     distance_in_column,
     inside_most,
     ray_from,
+    sunk_under,
     to_tool,
 )
 from stmpl_core.sdf import distance_at
@@ -98,7 +99,7 @@ def gathered(corners, shares, forces, areas):
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def nodes_under(grid, pose, centre, points, inward, thickness, faces, found, sunk):
+def nodes_under(grid, pose, centre, points, inward, thickness, faces, found, top):
     """Nodes under a tool, all but their sinking. The lattice is laid twice: at first to see the area as it does.
 
     Args:
@@ -107,7 +108,7 @@ def nodes_under(grid, pose, centre, points, inward, thickness, faces, found, sun
         centre: middle of the tool, in the body's frame, (3,) [m].
         points, inward, thickness, faces: points, inward normals, thickness and faces of the layer.
         found: numbers of the triangles that the tool may touch, (F,).
-        sunk: truth of the claim that the tool is under skin which it does not reach.
+        top: against the way of a tool that is under skin which it does not reach, see rays.sunk_under; else NOT_SUNK.
     """
     split = 1
     while split < 8 and len(found) * split**2 < SAMPLES:
@@ -116,13 +117,13 @@ def nodes_under(grid, pose, centre, points, inward, thickness, faces, found, sun
     for f in found:
         thick += thickness[faces[f, 0]] / len(found)
     depths, middles, ways, sizes, edges, best, area = _look(
-        grid, pose, points, inward, thickness, faces, found, sunk, split, thick
+        grid, pose, points, inward, thickness, faces, found, top, split, thick
     )
     rows = np.empty((0, 15))
     if area > 0:
         chart, frames = _charts(pose, found, depths, ways, sizes, best)
         for only_look in (True, False):
-            seen, rows = _lay(grid, pose, centre, points, inward, thickness, faces, found, sunk, split, thick, depths,
+            seen, rows = _lay(grid, pose, centre, points, inward, thickness, faces, found, top, split, thick, depths,
                               middles, edges, chart, frames, area, only_look)  # fmt: skip
             if only_look:
                 area = seen
@@ -154,10 +155,10 @@ def _column(inward, thickness, i, j, k, a, b, c):
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _strain_under(grid, ray, t, sunk):
+def _strain_under(grid, ray, t, top):
     """How far the tool squeezes a column, over its thickness; rising from 0 beside the tool's walls."""
     wall = WALL * t
-    deep, share = depth_and_share(grid, ray, t, sunk)
+    deep, share = depth_and_share(grid, ray, t, top)
     if deep <= 0:
         return 0.0
     inside = -distance_in_column(grid, ray, deep - wall)
@@ -166,7 +167,7 @@ def _strain_under(grid, ray, t, sunk):
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _look(grid, pose, points, inward, thickness, faces, found, sunk, split, thick):
+def _look(grid, pose, points, inward, thickness, faces, found, top, split, thick):
     """How deep the tool is at parts of the triangles.
 
     Returns:
@@ -178,7 +179,7 @@ def _look(grid, pose, points, inward, thickness, faces, found, sunk, split, thic
         best: place in `found` of the deepest.
         area: area that is covered [m2]; a small share of what is near, where the tool touches between the middles.
     """
-    many, parts = len(found), split * split
+    many, parts, sunk = len(found), split * split, top.any()
     depths, middles, ways = np.empty((many, parts)), np.empty((many, parts, 3)), np.empty((many, 3))
     sizes, edges, shares, deepest, best = np.empty(many), np.empty(many), np.empty((parts, 2)), -np.inf, 0
     for p in range(split):
@@ -202,7 +203,7 @@ def _look(grid, pose, points, inward, thickness, faces, found, sunk, split, thic
             if sunk and depth < 0:
                 n0, n1, n2, t = _column(inward, thickness, i, j, k, a, b, 1 - a - b)
                 least = -BESIDE * edges[m] - WALL * thick
-                depth = _inside(grid, ray_from(pose, x, y, z, n0, n1, n2), t, depth, least)
+                depth = _inside(grid, ray_from(pose, x, y, z, n0, n1, n2), t, depth, least, top)
             depths[m, q], middles[m, q, 0], middles[m, q, 1], middles[m, q, 2] = depth, x, y, z
             if depth > deepest:
                 deepest, best = depth, m
@@ -229,15 +230,17 @@ def _distance(grid, pose, x, y, z):
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _inside(grid, ray, t, depth, least):
+def _inside(grid, ray, t, depth, least, top):
     """How far the column gets into a tool that has sunk under skin which it does not reach [m].
 
     Args:
         ray, t: column, and its thickness.
         depth: depth of its skin in the tool [m], below 0.
         least: depth up to which the answer does not matter.
+        top: see rays.sunk_under.
     """
-    return inside_most(grid, ray, max(depth_in_column(grid, ray, t, 0.0, 0.5 * t), 0.5 * t), depth, least)
+    most = inside_most(grid, ray, max(depth_in_column(grid, ray, t, 0.0, 0.5 * t), 0.5 * t), depth, least)
+    return depth + (most - depth) * sunk_under(grid, ray, t, top) if most > depth else depth
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
@@ -285,7 +288,7 @@ def _charts(pose, found, depths, ways, sizes, best):
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _lay(grid, pose, centre, points, inward, thickness, faces, found, sunk, split, thick, depths, middles, edges,
+def _lay(grid, pose, centre, points, inward, thickness, faces, found, top, split, thick, depths, middles, edges,
          chart, frames, area, only_look):  # fmt: skip
     """Lays a lattice about the tool's middle on each side, for a covered area [m2].
 
@@ -293,7 +296,7 @@ def _lay(grid, pose, centre, points, inward, thickness, faces, found, sunk, spli
         area: area that is covered, as the lattice sees it [m2]; it does not depend on the triangles.
         rows: rows of Nodes: point, inward, thickness, area, strain, corners, shares, (N, 15), unless only to look.
     """
-    out, count, sum_area, deepest = np.empty((128, 15)), 0, 0.0, depths.max()
+    out, count, sum_area, deepest, sunk = np.empty((128, 15)), 0, 0.0, depths.max(), top.any()
     cell = area / NODES
     if only_look:  # a spacing of a few steps only, so that the lattice stays as it is while the tool moves
         cell = 0.5 * thick * thick * 2.0 ** np.floor(np.log2(cell / (thick * thick)))
@@ -379,7 +382,7 @@ def _lay(grid, pose, centre, points, inward, thickness, faces, found, sunk, spli
                         depth = -_distance(grid, pose, x, y, z)
                         if sunk and depth < 0:
                             n0, n1, n2, t = _column(inward, thickness, f0, f1, f2, a, b, c)
-                            depth = _inside(grid, ray_from(pose, x, y, z, n0, n1, n2), t, depth, -border)
+                            depth = _inside(grid, ray_from(pose, x, y, z, n0, n1, n2), t, depth, -border, top)
                         share = min(max(0.5 + depth / blur, 0.0), 1.0)
                         if share <= 0:
                             continue
@@ -388,7 +391,7 @@ def _lay(grid, pose, centre, points, inward, thickness, faces, found, sunk, spli
                     if only_look:
                         sum_area += share * part
                         continue
-                    strain = _strain_under(grid, ray_from(pose, x, y, z, n0, n1, n2), t, sunk)
+                    strain = _strain_under(grid, ray_from(pose, x, y, z, n0, n1, n2), t, top)
                     if strain <= 0:
                         continue
                     if count == len(out):

@@ -9,6 +9,8 @@ from stmpl_core.sdf import distance_at
 
 WALL = 0.05  # width over which depth rises beside a tool's wall, over the thickness: nothing pops in while it slides
 PASSED = 6  # places along a column at which it is looked how far it is inside a tool, or passes beside it
+ENTERS, LOOKS_BACK = 12, 0.3  # steps to where a column enters a tool, cosine from which its surface looks back there
+NOT_SUNK, UNSAID = np.zeros(3), np.full(3, 9.0)  # what is said of a tool that has not sunk under skin, or anyhow
 MAX_COLUMN_STRAIN = 0.9  # strain beyond which no column is squeezed
 STEEPEST = 1.5  # slope that a distance field does not exceed on its way to 0 [-]; its spline's is above 1 beside edges
 SECANT_START = 3e-3  # distance to the tool, over the thickness, at which the secant rule takes over from sphere tracing
@@ -106,18 +108,47 @@ def inside_most(grid, ray, deep, most, least):
 
 
 @numba.njit(cache=True, error_model="numpy")
-def depth_and_share(grid, ray, t, sunk):
+def sunk_under(grid, ray, t, top):
+    """Share to which a tool has sunk under a column's skin, from 0, it comes to the column from beside, to 1.
+
+    Where the column enters the tool, its surface looks back along the way that the tool went: the column comes from
+    above. On a thick, round limb columns around a deep tool lead into its lower half.
+
+    Args:
+        top: against the way that a tool went, in its frame, (3,); UNSAID: any column that it is under; NOT_SUNK.
+    """
+    size = top[0] * top[0] + top[1] * top[1] + top[2] * top[2]
+    if size == 0 or size > 2:
+        return min(size, 1.0)
+    s, d = 0.0, distance_in_column(grid, ray, 0.0)
+    for _ in range(ENTERS):
+        if d < SECANT_START * t:
+            break
+        s += d
+        if s >= t:
+            return 0.0
+        d = distance_in_column(grid, ray, s)
+    step = WALL * t
+    rise = distance_at(grid[0], grid[1], grid[2], ray[0] + s * ray[3] + step * top[0],
+                       ray[1] + s * ray[4] + step * top[1], ray[2] + s * ray[5] + step * top[2]) - d  # fmt: skip
+    return min(max(rise / (LOOKS_BACK * step), 0.0), 1.0)
+
+
+@numba.njit(cache=True, error_model="numpy")
+def depth_and_share(grid, ray, t, top):
     """How deep the tool is in a column [m], and the share of that which counts: rising from 0 over WALL at its skin.
 
     Where the tool has sunk under skin that it does not reach, a column counts as far as it is inside the tool.
     """
     wall, guess = WALL * t, -distance_in_column(grid, ray, 0.0)
-    share = min(max(1 + guess / wall, 0.0), 1.0)
+    share, sunk = min(max(1 + guess / wall, 0.0), 1.0), top.any()
     if share <= 0 and not sunk:
         return 0.0, 0.0
     deep = depth_in_column(grid, ray, t, guess)
     if share < 1 and sunk and deep > 0:
-        share = min(max(share, 2 * inside_most(grid, ray, deep, guess, 0.5 * share * wall) / wall), 1.0)
+        within = min(2 * inside_most(grid, ray, deep, guess, 0.5 * share * wall) / wall, 1.0)
+        if within > share:
+            share += (within - share) * sunk_under(grid, ray, t, top)
     return deep, share
 
 

@@ -5,11 +5,14 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
+from benchmarks.living_limbs import site
 from stmpl_core import Tool
+from stmpl_core.body import Body
 from stmpl_core.columns import Columns, Squeeze, grid_of
+from stmpl_core.living import living
 from stmpl_core.methods.winkler import column_pressure
 from stmpl_core.nodes import NODES
-from stmpl_core.rays import MAX_COLUMN_STRAIN, PASSED, inside_most
+from stmpl_core.rays import MAX_COLUMN_STRAIN, NOT_SUNK, PASSED, UNSAID, inside_most, sunk_under
 from stmpl_core.sdf import SignedDistance
 from tests.scenes import LENGTH, RADIUS, at, ball, box, capsule, enlarged, limb, placed, plate, punch, scaled, turn
 
@@ -233,3 +236,30 @@ def test_places_along_a_column_that_are_not_looked_at_are_not_the_deepest(least:
     found = [inside_most(grid_of(SLAB), (*start, *way), deep, first, least)
              for start, way, first in zip(starts, ways, inside[:, 0], strict=True)]  # fmt: skip
     assert np.maximum(found, least) == pytest.approx(np.maximum(inside.max(axis=1), least), abs=1e-12)
+
+
+def test_columns_beside_a_deep_ball_are_not_under_it() -> None:
+    """On an arm that is as thick as it is round they lead towards the bone, and into the ball's lower half."""
+    layer = living(Body.anny(), "left_upper_arm", edge_length=3e-3)
+    vertex, radius = site(layer, "left_upper_arm"), 0.02
+    columns, field = Columns(layer), SignedDistance.of(ball(radius), margin=0.04)
+    t = float(layer.thickness[vertex])
+    for strain in (0.6, 0.7, 0.75):  # its middle is under the skin from 0.52 on
+        pose = np.eye(4)
+        pose[:3, 3] = layer.vertices[vertex] + (radius - strain * t) * layer.normals[vertex]
+        squeeze = columns.squeezed(field, pose)
+        assert (squeeze.depth / layer.thickness[squeeze.vertices]).max() < strain + 0.02
+        assert strain - 0.02 < squeeze.nodes.strain.max() < strain + 0.02
+
+
+def test_a_tool_has_sunk_under_columns_that_enter_it_from_above() -> None:
+    grid, t, up = grid_of(SignedDistance.of(ball(0.01), margin=0.04)), 0.05, np.array([0.0, 0.0, 1.0])
+
+    def under(x: float, z: float, a: float, c: float, top: np.ndarray = up) -> float:
+        return sunk_under(grid, (x, 0.0, z, a, 0.0, c), t, top)
+
+    assert under(0, 0.02, 0, -1) == 1 and under(0.006, 0.02, 0, -1) == 1  # down into its upper half
+    assert under(0.03, 0.002, -0.8, -0.6) == 0 and under(0.03, -0.012, -1, 0.1) == 0  # sideways into its lower half
+    assert 0 < under(0.03, 0.001, -1, 0) < 1 and under(0.03, 0.0, -1, 0) == pytest.approx(0.0, abs=0.5)
+    assert under(0.03, 0.02, 0, -1) == 0  # past it
+    assert under(0, 0.02, 0, -1, NOT_SUNK) == 0 and under(0.03, -0.012, -1, 0.1, UNSAID) == 1

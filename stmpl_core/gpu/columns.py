@@ -3,8 +3,9 @@
 
 import warp as wp
 
+from stmpl_core import rays
 from stmpl_core.columns import BLOCK as IN_BLOCK
-from stmpl_core.columns import LEAST_UNDER
+from stmpl_core.columns import LEAST_UNDER, MIN_ONE_WAY_SHARE
 from stmpl_core.deep import DEEPEST
 from stmpl_core.gpu.packs import EDGE_BIT, OneSkin, Scratch, Skins
 from stmpl_core.gpu.places import APART, DEEP, OVERFULL, PENDING
@@ -12,6 +13,7 @@ from stmpl_core.gpu.rays import FAR, OPTIONS, WALL_WIDTH, clearance_of, depth_an
 
 BLOCK, EDGE = wp.constant(IN_BLOCK), wp.constant(EDGE_BIT)
 UNDER, TOO_DEEP = wp.constant(wp.float64(LEAST_UNDER)), wp.constant(wp.float64(DEEPEST))
+UNSAID, ONE_WAY = wp.constant(wp.float64(rays.UNSAID[0])), wp.constant(wp.float64(MIN_ONE_WAY_SHARE))
 wp.set_module_options(OPTIONS)
 
 
@@ -131,10 +133,13 @@ def gather_clearance(again: wp.int32, skins: Skins, scratch: Scratch):
         return
     one = skins.one[scratch.skin[c]]
     nearest, around, under, wall, covers = real(FAR), -FAR, -FAR, real(0.0), wp.int32(0)
+    met, whole = vec3(), real(0.0)
     for n in range(scratch.count[c]):
         least, above = scratch.least[c, n], scratch.above[c, n]
         nearest = wp.min(nearest, least)
         around = wp.max(around, -above)
+        whole += wp.max(-above, real(0.0))
+        met = met + wp.max(-above, real(0.0)) * skins.inward[scratch.columns[c, n]]
         under = wp.max(under, -least - wp.max(-above, real(0.0)))
         if again == 0 and least < one.hole:
             v = scratch.columns[c, n]
@@ -145,11 +150,13 @@ def gather_clearance(again: wp.int32, skins: Skins, scratch: Scratch):
     scratch.around[c] = wp.max(scratch.around[c], around)
     if again == 1:
         return
-    scratch.sunk[c] = 0
+    scratch.top[c] = vec3()
     if covers == 0:
         scratch.status[c] = APART
     elif under > UNDER * WALL_WIDTH * wall / real(covers):
-        scratch.sunk[c] = 1
+        scratch.top[c] = UNSAID * vec3(real(1.0), real(1.0), real(1.0))
+        if one.stacked == 1 and wp.length(met) > ONE_WAY * whole:
+            scratch.top[c] = -(wp.transpose(scratch.pose[c]) * wp.normalize(met))
 
 
 @wp.kernel
@@ -191,7 +198,7 @@ def sink(lanes: wp.int32, skins: Skins, scratch: Scratch):
         v, under = scratch.columns[c, n], real(0.0)
         if _marked(scratch.seen, c, v - one.first):
             start, way = pose * (skins.points[v] - scratch.place[c]), pose * skins.inward[v]
-            deep, share = depth_and_share(grid, skins.coefficients, start, way, skins.thickness[v], scratch.sunk[c])
+            deep, share = depth_and_share(grid, skins.coefficients, start, way, skins.thickness[v], scratch.top[c])
             under = deep * share
         scratch.under[c, n] = under
 

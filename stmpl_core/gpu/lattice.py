@@ -147,7 +147,7 @@ def sample(lanes: wp.int32, only_look: wp.int32, skins: Skins, scratch: Scratch)
     """Covered area [m2] of each place of the lattice; or the strain of its column."""
     c, lane = wp.tid()
     lattice, grid, pose = scratch.lattice[c], skins.grids[scratch.grid[c]], wp.transpose(scratch.pose[c])
-    sunk, sum = scratch.sunk[c], real(0.0)
+    top, sum = scratch.top[c], real(0.0)
     for n in range(lane, lattice.rows * lattice.wide, lanes):
         f, value = scratch.owner[c, n], real(0.0)
         if f != NO_ONE:
@@ -155,11 +155,11 @@ def sample(lanes: wp.int32, only_look: wp.int32, skins: Skins, scratch: Scratch)
             inward, t = inward_on(skins, f, shares), thickness_on(skins, f, shares)
             start, way = pose * (point_on(skins, f, shares) - scratch.place[c]), pose * inward
             if only_look == 1:
-                depth = depth_at(grid, skins.coefficients, start, way, t, sunk)
+                depth = depth_at(grid, skins.coefficients, start, way, t, top)
                 value = wp.clamp(real(0.5) + depth / lattice.blur, real(0.0), real(1.0)) * lattice.cell
                 sum += value / wp.max(wp.dot(inward, lattice.way), FACING)
             else:
-                value = strain_under(grid, skins.coefficients, start, way, t, sunk)
+                value = strain_under(grid, skins.coefficients, start, way, t, top)
         scratch.value[c, n] = value
     scratch.partial[c, lane] = sum
 

@@ -66,7 +66,7 @@ def begin(scratch: Scratch):
 def look(lanes: wp.int32, skins: Skins, scratch: Scratch):
     """How deep the tool is at parts of the triangles."""
     c, lane = wp.tid()
-    split, sunk, pose = scratch.split[c], scratch.sunk[c], wp.transpose(scratch.pose[c])
+    split, top, pose = scratch.split[c], scratch.top[c], wp.transpose(scratch.pose[c])
     parts, grid = split * split, skins.grids[scratch.grid[c]]
     for n in range(lane, scratch.many[c] * parts, lanes):
         f, q = scratch.found[c, n // parts], n % parts
@@ -81,7 +81,7 @@ def look(lanes: wp.int32, skins: Skins, scratch: Scratch):
         scratch.middles[c, n] = middle
         start, way = pose * (middle - scratch.place[c]), pose * inward_on(skins, f, shares)
         t = thickness_on(skins, f, shares)
-        scratch.depths[c, n] = depth_at(grid, skins.coefficients, start, way, t, sunk)
+        scratch.depths[c, n] = depth_at(grid, skins.coefficients, start, way, t, top)
 
 
 @wp.func

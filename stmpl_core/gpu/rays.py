@@ -3,6 +3,8 @@
 
 import warp as wp
 
+from stmpl_core.rays import ENTERS as MOST_ENTERS
+from stmpl_core.rays import LOOKS_BACK as LOOKED_BACK
 from stmpl_core.rays import MAX_COLUMN_STRAIN, PASSED, SECANT_START, SECANT_TOLERANCE, WALL
 
 real = wp.float64  # of all geometry: float32 keeps 1e-8 m on a limb, a touch of 0.1 mm wants less
@@ -11,7 +13,7 @@ OPTIONS = {"enable_backward": False}
 FAR = wp.constant(wp.float64(1e30))  # stands for infinity
 WALL_WIDTH = wp.constant(wp.float64(WALL))
 MOST_STRAIN = wp.constant(wp.float64(MAX_COLUMN_STRAIN))
-PLACES = wp.constant(PASSED)
+PLACES, ENTERS, LOOKS_BACK = wp.constant(PASSED), wp.constant(MOST_ENTERS), wp.constant(wp.float64(LOOKED_BACK))
 START, TOLERANCE = wp.constant(wp.float64(SECANT_START)), wp.constant(wp.float64(SECANT_TOLERANCE))
 wp.set_module_options(OPTIONS)
 
@@ -167,24 +169,49 @@ def inside_most(grid: Grid, coefficients: wp.array(dtype=real), start: vec3, way
 
 
 @wp.func
-def depth_and_share(grid: Grid, coefficients: wp.array(dtype=real), start: vec3, way: vec3, t: real, sunk: wp.int32):
+def sunk_under(grid: Grid, coefficients: wp.array(dtype=real), start: vec3, way: vec3, t: real, top: vec3) -> real:
+    """Share to which a tool has sunk under a column's skin, from 0, it comes from beside, to 1."""
+    size = wp.length_sq(top)
+    if size == real(0.0) or size > real(2.0):
+        return wp.min(size, real(1.0))
+    s, d, step = real(0.0), along(grid, coefficients, start, way, real(0.0)), wp.int32(0)
+    while step < ENTERS:
+        step += 1
+        if d < START * t:
+            step = ENTERS
+        else:
+            s = s + d
+            d = along(grid, coefficients, start, way, wp.min(s, t))
+            if s >= t:
+                step = ENTERS
+    if s >= t:
+        return real(0.0)
+    by = WALL_WIDTH * t
+    rise = distance_at(grid, coefficients, start + s * way + by * top) - d
+    return wp.clamp(rise / (LOOKS_BACK * by), real(0.0), real(1.0))
+
+
+@wp.func
+def depth_and_share(grid: Grid, coefficients: wp.array(dtype=real), start: vec3, way: vec3, t: real, top: vec3):
     """How deep the tool is in a column [m], and the share of that which counts."""
     wall, guess = WALL_WIDTH * t, -along(grid, coefficients, start, way, real(0.0))
     share, deep = wp.clamp(real(1.0) + guess / wall, real(0.0), real(1.0)), real(0.0)
-    if share > real(0.0) or sunk == 1:
+    sunk = wp.length_sq(top) > real(0.0)
+    if share > real(0.0) or sunk:
         deep = depth_in_column(grid, coefficients, start, way, t, guess)
-        if share < real(1.0) and sunk == 1 and deep > real(0.0):
-            most = inside_most(grid, coefficients, start, way, deep)
-            share = wp.min(wp.max(share, real(2.0) * most / wall), real(1.0))
+        if share < real(1.0) and sunk and deep > real(0.0):
+            within = wp.min(real(2.0) * inside_most(grid, coefficients, start, way, deep) / wall, real(1.0))
+            if within > share:
+                share = share + (within - share) * sunk_under(grid, coefficients, start, way, t, top)
     return deep, share
 
 
 @wp.func
 def strain_under(grid: Grid, coefficients: wp.array(dtype=real), start: vec3, way: vec3, t: real,
-                 sunk: wp.int32) -> real:  # fmt: skip
+                 top: vec3) -> real:  # fmt: skip
     """How far the tool squeezes a column, over its thickness; rising from 0 beside the tool's walls."""
     wall = WALL_WIDTH * t
-    deep, share = depth_and_share(grid, coefficients, start, way, t, sunk)
+    deep, share = depth_and_share(grid, coefficients, start, way, t, top)
     if deep <= real(0.0):
         return real(0.0)
     if deep > wall:
@@ -194,10 +221,12 @@ def strain_under(grid: Grid, coefficients: wp.array(dtype=real), start: vec3, wa
 
 
 @wp.func
-def depth_at(grid: Grid, coefficients: wp.array(dtype=real), start: vec3, way: vec3, t: real, sunk: wp.int32) -> real:
+def depth_at(grid: Grid, coefficients: wp.array(dtype=real), start: vec3, way: vec3, t: real, top: vec3) -> real:
     """Depth of the skin in the tool [m], or where the tool has sunk under it, of its column."""
     depth = -distance_at(grid, coefficients, start)
-    if sunk == 1 and depth < real(0.0):
+    if depth < real(0.0) and wp.length_sq(top) > real(0.0):
         deep = wp.max(depth_in_column(grid, coefficients, start, way, t, real(0.0)), real(0.5) * t)
-        depth = wp.max(depth, inside_most(grid, coefficients, start, way, deep))
+        most = inside_most(grid, coefficients, start, way, deep)
+        if most > depth:
+            depth = depth + (most - depth) * sunk_under(grid, coefficients, start, way, t, top)
     return depth
