@@ -244,13 +244,17 @@ def test_a_film_shows_where_the_skin_is_pressed(forearm: SoftLayer, tmp_path: Pa
 
 
 def test_the_environment_passes_gymnasiums_own_check_and_its_script_solves_it(forearm: SoftLayer) -> None:
-    pytest.importorskip("gymnasium", reason="pip install 'stmpl[sim]'")
+    gymnasium = pytest.importorskip("gymnasium", reason="pip install 'stmpl[sim]'")
     from gymnasium.utils.env_checker import check_env
 
     from stmpl_sim.env import MassageEnv, Scripted
 
     env, policy = MassageEnv(forearm, laps=0.3), Scripted()
+    with pytest.raises(gymnasium.error.ResetNeeded):
+        env.step(np.zeros(3))
     check_env(env, skip_render_check=True)
+    with pytest.raises(InvalidInput, match="action holds 1 values that are not finite"):
+        env.step(np.array([np.nan, 0.0, 0.0]))
     observation, _ = env.reset(seed=3)
     rewards, done, failed = [], False, False
     while not (done or failed):
