@@ -163,59 +163,53 @@ TISSUE_BODIES = tuple(
     )
 )  # fmt: skip
 
-Person = tuple[str, float, float, str, Tone, float, float, float]
-Stout = tuple[str, float, float, float, str, Tone, float, float]
+Person = tuple[str, float, float, float, str, Tone, float, float, float]
 PEOPLE: tuple[Person, ...] = (
-    # name, weight, gender, part, tone, edge length [m], reach, share
-    ("upper_arm_1", 0.35, 0.0, "left_upper_arm", "relaxed", 8e-3, 6.0, 1.0),
-    ("upper_arm_2", 0.6, 1.0, "left_upper_arm", "relaxed", 8e-3, 6.0, 1.0),
-    ("upper_arm_3", 0.7, 0.3, "left_upper_arm", "tensed", 8e-3, 6.0, 1.0),
-    ("forearm_1", 0.3, 1.0, "left_forearm", "relaxed", 6e-3, 6.7, 0.5),
-    ("forearm_2", 0.65, 0.0, "left_forearm", "relaxed", 7e-3, 6.7, 0.5),
-    ("forearm_3", 0.5, 1.0, "left_forearm", "tensed", 6e-3, 6.7, 0.5),
-    ("thigh", 0.4, 0.8, "left_thigh", "relaxed", 11e-3, 6.7, 0.3),
-    ("calf", 0.6, 0.2, "left_calf", "relaxed", 8e-3, 6.7, 0.3),
+    # name, weight, gender, muscle, part, tone, edge length [m], reach, share
+    ("upper_arm_1", 0.35, 0.0, 0.5, "left_upper_arm", "relaxed", 8e-3, 6.0, 1.0),
+    ("upper_arm_2", 0.6, 1.0, 0.5, "left_upper_arm", "relaxed", 8e-3, 6.0, 1.0),
+    ("upper_arm_3", 0.7, 0.3, 0.5, "left_upper_arm", "tensed", 8e-3, 6.0, 1.0),
+    ("forearm_1", 0.3, 1.0, 0.5, "left_forearm", "relaxed", 6e-3, 6.7, 0.5),
+    ("forearm_2", 0.65, 0.0, 0.5, "left_forearm", "relaxed", 7e-3, 6.7, 0.5),
+    ("forearm_3", 0.5, 1.0, 0.5, "left_forearm", "tensed", 6e-3, 6.7, 0.5),
+    ("thigh", 0.4, 0.8, 0.5, "left_thigh", "relaxed", 11e-3, 6.7, 0.3),
+    ("calf", 0.6, 0.2, 0.5, "left_calf", "relaxed", 8e-3, 6.7, 0.3),
 )
 DEEP: tuple[Person, ...] = (
-    ("upper_arm_1", 0.45, 0.2, "left_upper_arm", "relaxed", 8e-3, 6.7, 0.38),
-    ("upper_arm_2", 0.75, 0.9, "left_upper_arm", "relaxed", 8e-3, 6.7, 0.38),
-    ("upper_arm_3", 0.25, 0.6, "left_upper_arm", "tensed", 8e-3, 6.7, 0.27),
-    ("forearm_1", 0.7, 0.4, "left_forearm", "relaxed", 7e-3, 6.7, 0.27),
-    ("forearm_2", 0.4, 0.1, "left_forearm", "tensed", 7e-3, 6.7, 0.21),
-    ("calf", 0.4, 0.8, "left_calf", "relaxed", 9e-3, 6.7, 0.16),
-    ("thigh", 0.65, 0.3, "left_thigh", "relaxed", 12e-3, 6.0, 0.1),
+    ("upper_arm_1", 0.45, 0.2, 0.5, "left_upper_arm", "relaxed", 8e-3, 6.7, 0.38),
+    ("upper_arm_2", 0.75, 0.9, 0.5, "left_upper_arm", "relaxed", 8e-3, 6.7, 0.38),
+    ("upper_arm_3", 0.25, 0.6, 0.5, "left_upper_arm", "tensed", 8e-3, 6.7, 0.27),
+    ("forearm_1", 0.7, 0.4, 0.5, "left_forearm", "relaxed", 7e-3, 6.7, 0.27),
+    ("forearm_2", 0.4, 0.1, 0.5, "left_forearm", "tensed", 7e-3, 6.7, 0.21),
+    ("calf", 0.4, 0.8, 0.5, "left_calf", "relaxed", 9e-3, 6.7, 0.16),
+    ("thigh", 0.65, 0.3, 0.5, "left_thigh", "relaxed", 12e-3, 6.0, 0.1),
 )
-STOUT: tuple[Stout, ...] = (  # much fat under a skin that is stiff beside it, on limbs as round as they are thick
-    # name, weight, gender, muscle, part, tone, edge length [m], share
-    ("upper_arm_1", 0.9, 0.9, 0.2, "left_upper_arm", "relaxed", 8e-3, 0.5),
-    ("upper_arm_2", 1.0, 0.5, 0.4, "left_upper_arm", "relaxed", 8e-3, 0.5),
-    ("upper_arm_3", 0.8, 1.0, 0.1, "left_upper_arm", "tensed", 8e-3, 0.5),
-    ("upper_arm_4", 0.95, 1.0, 0.35, "left_upper_arm", "relaxed", 9e-3, 0.5),
-    ("forearm", 1.0, 1.0, 0.1, "left_forearm", "relaxed", 7e-3, 0.4),
-    ("thigh_1", 0.55, 0.7, 0.6, "left_thigh", "relaxed", 11e-3, 0.4),
-    ("thigh_2", 0.95, 0.9, 0.2, "left_thigh", "relaxed", 12e-3, 0.3),
-    ("calf", 0.95, 0.7, 0.2, "left_calf", "relaxed", 9e-3, 0.3),
+STOUT: tuple[Person, ...] = (  # much fat under a skin that is stiff beside it, on limbs as round as they are thick
+    ("upper_arm_1", 0.9, 0.9, 0.2, "left_upper_arm", "relaxed", 8e-3, 6.0, 0.5),
+    ("upper_arm_2", 1.0, 0.5, 0.4, "left_upper_arm", "relaxed", 8e-3, 6.0, 0.5),
+    ("upper_arm_3", 0.8, 1.0, 0.1, "left_upper_arm", "tensed", 8e-3, 6.0, 0.5),
+    ("upper_arm_4", 0.95, 1.0, 0.35, "left_upper_arm", "relaxed", 9e-3, 6.0, 0.5),
+    ("forearm", 1.0, 1.0, 0.1, "left_forearm", "relaxed", 7e-3, 6.0, 0.4),
+    ("thigh_1", 0.55, 0.7, 0.6, "left_thigh", "relaxed", 11e-3, 6.0, 0.4),
+    ("thigh_2", 0.95, 0.9, 0.2, "left_thigh", "relaxed", 12e-3, 6.0, 0.3),
+    ("calf", 0.95, 0.7, 0.2, "left_calf", "relaxed", 9e-3, 6.0, 0.3),
 )
 
 
 def _living(kind: str, people: tuple[Person, ...], **more: Any) -> tuple[BodyPlan, ...]:
     """People unlike the average one, their tissue as measured."""
     return tuple(
-        BodyPlan(name=f"{kind}_{name}", weight=weight, gender=gender, part=part, tone=tone, edge_length=edge,
-                 share=share, clear=2.0, reach=reach, paper_rule=False, out_of_distribution=False, **more)
-        for name, weight, gender, part, tone, edge, reach, share in people
+        BodyPlan(name=f"{kind}_{name}", weight=weight, gender=gender, muscle=muscle, part=part, tone=tone,
+                 edge_length=edge, share=share, clear=2.0, reach=reach, paper_rule=False, out_of_distribution=False,
+                 **more)
+        for name, weight, gender, muscle, part, tone, edge, reach, share in people
     )  # fmt: skip
 
 
 LIVING_BODIES = _living("living", PEOPLE, sizes=(8e-3, 40e-3))
 DEEP_BODIES = _living("deep", DEEP, sizes=(12e-3, 30e-3), tools=("sphere", "ellipsoid", "capsule"),
                       shallowest=0.45, most_work=1e11)  # that go deep where tissue is thick: most others end before
-STOUT_BODIES = tuple(
-    BodyPlan(name=f"stout_{name}", weight=weight, gender=gender, muscle=muscle, part=part, tone=tone, edge_length=edge,
-             share=share, clear=2.0, reach=6.0, sizes=(8e-3, 40e-3), most_work=8e10, paper_rule=False,
-             out_of_distribution=False)
-    for name, weight, gender, muscle, part, tone, edge, share in STOUT
-)  # fmt: skip
+STOUT_BODIES = _living("stout", STOUT, sizes=(8e-3, 40e-3), most_work=8e10)
 
 
 def _drawn_bodies(count: int) -> tuple[BodyPlan, ...]:

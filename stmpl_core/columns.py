@@ -285,19 +285,25 @@ def _squeezed(grid, pose, centre, points, inward, thickness, faces, start, aroun
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _top(pose, inward, near, above):
     """Against the mean inward normal of columns whose skin a tool has met, in its frame, (3,); UNSAID if none is."""
-    way, whole, out = np.zeros(3), 0.0, np.zeros(3)
-    for n in range(len(near)):
-        deep = max(-above[n], 0.0)
-        whole += deep
-        for x in range(3):
-            way[x] += deep * inward[near[n], x]
-    size = np.sqrt(way[0] * way[0] + way[1] * way[1] + way[2] * way[2])
-    if size <= MIN_ONE_WAY_SHARE * whole:
+    way, out = _one_way(inward[near], np.maximum(-above, 0.0)), np.zeros(3)
+    if not way.any():
         return UNSAID.copy()
     for x in range(3):
         for y in range(3):
-            out[x] -= pose[y, x] * way[y] / size
+            out[x] -= pose[y, x] * way[y]
     return out
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _one_way(inward, weights):
+    """Mean of unit vectors (N, 3) by weights (N,), 1 long, (3,); 0 where they have no one way."""
+    way, whole = np.zeros(3), 0.0
+    for n in range(len(weights)):
+        whole += weights[n]
+        for x in range(3):
+            way[x] += weights[n] * inward[n, x]
+    size = np.sqrt(way[0] * way[0] + way[1] * way[1] + way[2] * way[2])
+    return way / size if size > MIN_ONE_WAY_SHARE * whole else np.zeros(3)
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
@@ -306,15 +312,10 @@ def _sinking(grid, pose, points, inward, thickness, area, strain):
 
     On a limb that is no wider than its contact, columns along the normals meet the tool at a slant, and too deep.
     """
-    depth, way, whole = strain * thickness, np.zeros(3), 0.0
-    for n in range(len(depth)):
-        whole += area[n] * depth[n]
-        for x in range(3):
-            way[x] += area[n] * depth[n] * inward[n, x]
-    size = np.sqrt(way[0] * way[0] + way[1] * way[1] + way[2] * way[2])
-    if size <= MIN_ONE_WAY_SHARE * whole:
+    depth = strain * thickness
+    way = _one_way(inward, area * depth)
+    if not way.any():
         return depth
-    way /= size
     for n in range(len(depth)):
         cosine = inward[n, 0] * way[0] + inward[n, 1] * way[1] + inward[n, 2] * way[2]
         guess = max(depth[n] * cosine, 1e-9)

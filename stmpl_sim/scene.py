@@ -104,7 +104,7 @@ def build(
         place = place_of(site, world_from_limb(site, where))
         add_gripper(spec, place)
         side, tools = place.side, (BALL, *FINGERS)
-    _add_stage(spec, np.array(at), side)
+    _add_stage(spec, where, side)
     exclude(spec, LIMB, tools)
     spec.option.timestep = timestep
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
