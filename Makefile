@@ -34,10 +34,10 @@ check: $(READY_DEV)  ## Lint, types and the one-way import rule
 	$(BIN)/pyright
 	$(BIN)/lint-imports
 
-weights: $(READY_DEV)  ## Make the networks that ship, from nothing: data, training (hours: data of pressures 56 minutes on two cores, rigid contacts besides, training 67 on one; goes on if stopped)
+weights: $(READY_DEV)  ## Make the networks that ship, from nothing: data, training (hours: data of pressures 56 minutes on two cores, training 67 on one; goes on if stopped)
 	$(BIN)/stmpl generate --preset default --out data/default
 	$(BIN)/stmpl train --preset default --data data/default --out stmpl_core/weights
-	$(BIN)/stmpl generate --preset contacts --out data/contacts
+	$(BIN)/stmpl generate --preset contacts --out data/contacts --start benchmarks/contacts_v1.npz
 	$(BIN)/stmpl train --preset contacts --data data/contacts --out stmpl_core/weights
 	$(BIN)/stmpl generate --preset tissue --out data/tissue --start benchmarks/limbs_v3.npz benchmarks/deep_v1.npz benchmarks/stout_v1.npz --flat benchmarks/rounds_v1.npz
 	$(BIN)/stmpl train --preset tissue --data data/tissue --out stmpl_core/weights
