@@ -21,6 +21,7 @@ import numpy as np
 from stmpl_core import Contact, Simulator
 from stmpl_core.batch import Batch
 from stmpl_core.errors import StmplError
+from stmpl_core.methods import MomentNet
 from stmpl_core.skin import Skin
 from stmpl_core.tool import Tool
 
@@ -37,7 +38,6 @@ def skins() -> dict[str, Skin]:
     """The paper's arm, of one material, and a living forearm: skin, fat and muscle on bone."""
     from stmpl_core.body import Body
     from stmpl_core.living import living
-    from stmpl_core.methods import MomentNet
 
     layers = {"one material (the paper's arm)": Body.anny().part("left_arm", edge_length=3e-3, thickness=7.5e-3),
               "layers (a forearm as measured)": living(Body.anny(), "left_forearm", edge_length=3e-3)}  # fmt: skip
@@ -74,6 +74,8 @@ def rows(skin: Skin, tool: Tool, what: str) -> dict[str, Row]:
         batch = Batch(skin, [tool], n, threads=threads)
         name = f"Batch, {threads} thread{'s' * (threads > 1)}"
         out[name] = lambda batch=batch: batch.touch(poses, fields=wanted)
+    if fields and not skin.layer.stacked:
+        skin = Skin.of(skin.layer, MomentNet(sticks=False))
     return out | {f"WarpBatch, {device}": _on_device(skin, tool, poses, wanted, device)
                   for device in ("cpu", "cuda")}  # fmt: skip
 

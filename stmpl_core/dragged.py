@@ -44,5 +44,4 @@ def ways_along(touch: Touch) -> Points | None:
 def _holding(pressed: Pressed) -> Nodes:
     """The nodes that press."""
     assert pressed.forces is not None
-    holds = np.flatnonzero(pressed.forces > 0)
-    return Nodes(*(values[holds] for values in pressed.squeeze.nodes if len(values)))
+    return pressed.squeeze.nodes.some(pressed.forces > 0)

@@ -16,12 +16,14 @@ from __future__ import annotations
 
 from copy import copy
 from functools import cache, cached_property, lru_cache
+from typing import NamedTuple
 from weakref import WeakKeyDictionary
 
 import numba
 import numpy as np
 from scipy.special import j0, j1
 
+from stmpl_core import nodewise
 from stmpl_core.coarse_response import CoarseDrag, CoarseResponse
 from stmpl_core.layer import SoftLayer
 from stmpl_core.moments import Surroundings
@@ -53,6 +55,24 @@ AS_AT_REST = np.empty((0, 3, 3))  # turns of vertices that did not turn
 NO_COARSE = (np.empty((0, 3), np.int64), np.empty((0, 3)), np.empty(0), np.empty((0, 3, 0), np.float32),
              AS_AT_REST)
 _KEPT: WeakKeyDictionary[SoftLayer, Green] = WeakKeyDictionary()  # entries die with their layers
+
+
+class _OfOne(NamedTuple):
+    """A layer of one material as the kernels of stmpl_core.nodewise take it.
+
+    Args:
+        origin: what is taken off all places, (3,) [m].
+        points: the vertices, less that, (V, 3) float32 [m].
+        inward: unit vectors into the skin, (V, 3) float32.
+        roots: roots of the thickness, (V,) float32.
+        rows: tables at places between each two spreads, (S, 4, root of the distance) float32.
+    """
+
+    origin: np.ndarray
+    points: np.ndarray
+    inward: np.ndarray
+    roots: np.ndarray
+    rows: np.ndarray
 
 
 class Green:
@@ -213,15 +233,36 @@ class Green:
             last = self._last = nodes.points, made
         return last[1]
 
-    def stuck(self, nodes: Nodes, group: np.ndarray, gone: np.ndarray) -> np.ndarray:
+    def stuck(self, nodes: Nodes, group: np.ndarray, gone: np.ndarray, guess: np.ndarray | None = None) -> np.ndarray:
         """Forces over E with which nodes that stick are held where they have gone, (N, 3) [m2].
 
         Args:
             nodes: nodes that press.
             group: numbers of groups of nodes that do not feel each other, (N,).
             gone: their motion, (N, 3) [m].
+            guess: about these forces, (N, 3) [m2]: without a coarse part some steps lead from there.
         """
-        return _held(self._blocks(nodes, group), gone)
+        if self.layer.stacked or guess is None:
+            return _held(self._blocks(nodes, group), gone)
+        least, most, float32 = float(nodes.area.min()), float(nodes.area.max()), np.float32
+        range_ = max(most - least, 1e-9 * most)
+        areas = least + range_ * np.arange(nodewise.AREAS) / (nodewise.AREAS - 1)
+        logs = (np.log(SPREAD * np.sqrt(areas)) - FIRST_LOG) / STEP_LOG
+        by = self._by_node(nodes, 0.5 * np.log(nodes.thickness) / STEP_LOG, nodes.area)
+        held = nodewise.blocks(by, group, logs.astype(float32), float32(least), float32((nodewise.AREAS - 1) / range_),
+                               self._of_one.rows)  # fmt: skip
+        return nodewise.approached(held, gone.astype(float32).ravel(), guess.astype(float32).ravel()).reshape(-1, 3)
+
+    def _by_node(self, nodes: Nodes, row: np.ndarray, area: np.ndarray) -> np.ndarray:
+        """Nodes as the kernels of stmpl_core.nodewise take them, (9, N) float32."""
+        places = (nodes.points - self._of_one.origin).T
+        return np.stack([*places, *nodes.inward.T, np.sqrt(nodes.thickness), row, area]).astype(np.float32)
+
+    @cached_property
+    def _of_one(self) -> _OfOne:
+        layer, origin, float32 = self.layer, self.layer.vertices.mean(axis=0), np.float32
+        return _OfOne(origin, (layer.vertices - origin).astype(float32), -layer.normals.astype(float32),
+                      np.sqrt(layer.thickness).astype(float32), _rows_of_one(layer.tissue.poisson_ratio))  # fmt: skip
 
     def rubbed(self, nodes: Nodes, group: np.ndarray, ways: np.ndarray, pressing: np.ndarray,
                share: float) -> np.ndarray:  # fmt: skip
@@ -253,23 +294,21 @@ class Green:
         return _blocks(nodes.points, nodes.inward, nodes.area, nodes.corners, nodes.shares, group, self.unit_at(nodes),
                        self.soft_at(nodes), self.tables, *self._coarse)  # fmt: skip
 
-    def motion(self, nodes: Nodes, forces: np.ndarray, dragged: bool = False) -> np.ndarray:
+    def motion(self, nodes: Nodes, forces: np.ndarray, dragged: bool = False,
+               loaded: np.ndarray | None = None) -> np.ndarray:  # fmt: skip
         """Motion of all vertices under forces over E at nodes (N, 3) [m2], (V, 3) [m].
 
         Args:
             nodes, forces: nodes, and what acts at them.
             dragged: whether the limb gives along the skin too, as it does to what `rubbed` says.
+            loaded: vertices about the nodes, under which others are asked soon; None: those around each.
         """
         layer = self.layer
-        asked = self.near.asked_again(np.unique(nodes.corners))
-        by, group = np.zeros((len(asked.vertices), 3)), self.near.groups(nodes.corners[:, 0])
-        unit, soft = self.unit_at(nodes), self.soft_at(nodes)
-        for one in np.unique(group):
-            of = group == one
-            there = self.near.reached_among(np.unique(nodes.corners[of]), asked.vertices, alone=not group.any())
-            add_motion(by, there, layer.vertices[asked.vertices], -layer.normals[asked.vertices],
-                       self.near.thickness[asked.vertices], nodes.points[of], nodes.inward[of], nodes.area[of],
-                       unit[of], soft[of], forces[of], self.tables)  # fmt: skip
+        asked = self.near.asked_again(np.unique(nodes.corners) if loaded is None else loaded)
+        group, flat = self.near.groups(nodes.corners[:, 0]), self._flat_of_stack if layer.stacked else self._flat_of_one
+        by = flat(nodes, forces, asked.vertices, [
+            (group == one, self.near.reached_among(np.unique(nodes.corners[group == one]), asked.vertices,
+                                                   alone=not group.any())) for one in np.unique(group)])  # fmt: skip
         out = np.zeros_like(layer.vertices)
         asked.fill(by, out)
         if self.coarse is None:
@@ -283,6 +322,28 @@ class Green:
                 along = ways if not len(self._turns) else np.einsum("cxy,cy->cx", self._turns, ways)
                 source = _handed_along(along, nodes.corners, nodes.shares, forces, *drag[:3])
                 self._add_coarse(_of_coarse(source, by_source), out)
+        return out
+
+    def _flat_of_stack(self, nodes: Nodes, forces: np.ndarray, vertices: np.ndarray,
+                       felt: list[tuple[np.ndarray, np.ndarray]]) -> np.ndarray:  # fmt: skip
+        """Flat motion of vertices (N,) under forces at nodes; felt: masks of these, and which vertices feel them."""
+        out, unit, soft = np.zeros((len(vertices), 3)), self.unit_at(nodes), self.soft_at(nodes)
+        points, inward = self.layer.vertices[vertices], -self.layer.normals[vertices]
+        for of, there in felt:
+            add_motion(out, there, points, inward, self.near.thickness[vertices], nodes.points[of], nodes.inward[of],
+                       nodes.area[of], unit[of], soft[of], forces[of], self.tables)  # fmt: skip
+        return out
+
+    def _flat_of_one(self, nodes: Nodes, forces: np.ndarray, vertices: np.ndarray,
+                     felt: list[tuple[np.ndarray, np.ndarray]]) -> np.ndarray:  # fmt: skip
+        """The same on one material."""
+        ratio, one = np.sqrt(nodes.area) / nodes.thickness, self._of_one
+        by = self._by_node(nodes, (np.log(SPREAD * ratio) - FIRST_LOG) / STEP_LOG, ratio**2)
+        out, given = np.zeros((len(vertices), 3), np.float32), forces.T.astype(np.float32)
+        points, inward, roots = one.points[vertices], one.inward[vertices], one.roots[vertices]
+        for of, there in felt:
+            nodewise.add_motion(out, there, points, inward, roots, by.compress(of, axis=1), given.compress(of, axis=1),
+                                one.rows)  # fmt: skip
         return out
 
     def _add_coarse(self, motion: np.ndarray, out: np.ndarray) -> None:
@@ -309,6 +370,14 @@ class Green:
 def _of_one(poisson_ratio: float) -> np.ndarray:
     """Tables of one material, whose thickness does not matter."""
     return bank(Tissue(poisson_ratio=poisson_ratio), 1.0, None)
+
+
+@cache
+def _rows_of_one(poisson_ratio: float) -> np.ndarray:
+    """The same at places between each two spreads, (S, 4, root of the distance) float32."""
+    place = (np.arange(nodewise.FINER * (len(SPREADS) - 1)) + 0.5) / nodewise.FINER
+    low, share, tables = place.astype(int), (place % 1)[:, None, None], np.moveaxis(_of_one(poisson_ratio)[0], 1, 0)
+    return ((1 - share) * tables[low] + share * tables[low + 1]).astype(np.float32)
 
 
 @lru_cache(maxsize=4)  # coarse elements and their layer ask for the same

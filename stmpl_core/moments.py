@@ -107,7 +107,7 @@ class Surroundings:
         self._bent, self._posed = np.concatenate([bend.reshape(-1, 9), slope], axis=1), False
         table = response_table(layer.tissue, float(layer.thickness[0]))
         self._response = np.ascontiguousarray(np.moveaxis(table, 2, 0))
-        self._felt(np.zeros((1, 1)), np.zeros(1, np.int64), np.zeros(1, np.int32), moments=True)  # compiled now
+        self._felt(np.zeros((1, 1)), np.zeros(1, np.int64), np.zeros(1, np.int32))  # compiled now
 
     def asked(self, loaded: np.ndarray) -> Asked:
         """Vertices that must be asked under sources at vertices `loaded` (L,), for all to be known."""
@@ -117,11 +117,14 @@ class Surroundings:
         """Same as `asked`, but not looked for again if these were the last."""
         return self._thinning.asked_again(loaded)
 
-    def felt(self, sources: np.ndarray, asked: Asked | None = None) -> Felt:
-        """Response and moments, at the vertices that are asked or at all, of source fields (V, S) over E [-]."""
+    def felt(self, sources: np.ndarray, asked: Asked | None = None, *, linear: bool = True) -> Felt:
+        """Response and moments, at the vertices that are asked or at all, of source fields (V, S) over E [-].
+
+        Without `linear` the response is zeros: where it is known better, and written by who knows it.
+        """
         loaded = np.flatnonzero(sources.any(axis=1)) if asked is None else asked.loaded
         vertices = self._thinning.reached(loaded) if asked is None else asked.vertices
-        return Felt(vertices, self._by_groups(sources[loaded], loaded, vertices, moments=True))
+        return Felt(vertices, self._by_groups(sources[loaded], loaded, vertices, linear=linear))
 
     def of_one(self, vertex: int) -> np.ndarray:
         """Linear response to a unit source at one vertex, (V, 3) [m], computed at every vertex."""
@@ -244,24 +247,26 @@ class Surroundings:
             return np.arange(len(vertices))
         return np.flatnonzero(np.isin(vertices, self._thinning.reached(loaded)))
 
-    def _by_groups(self, sources: np.ndarray, loaded: np.ndarray, vertices: np.ndarray, moments: bool) -> np.ndarray:
+    def _by_groups(self, sources: np.ndarray, loaded: np.ndarray, vertices: np.ndarray, linear: bool = True,
+                   moments: bool = True) -> np.ndarray:  # fmt: skip
         """As _felt; no vertex feels a load that is near it through the air only."""
         group = self.groups(loaded)
         if not group.any():
-            return self._felt(sources, loaded, vertices, moments)
+            return self._felt(sources, loaded, vertices, linear, moments)
         figures = np.zeros((len(vertices), sources.shape[1], WIDTH), dtype=np.float32)
         for one in range(group.max() + 1):
             of = group == one
             there = self.reached_among(loaded[of], vertices, alone=False)
-            figures[there] += self._felt(sources[of], loaded[of], vertices[there], moments)
+            figures[there] += self._felt(sources[of], loaded[of], vertices[there], linear, moments)
         return figures
 
-    def _felt(self, sources: np.ndarray, loaded: np.ndarray, vertices: np.ndarray, moments: bool) -> np.ndarray:
+    def _felt(self, sources: np.ndarray, loaded: np.ndarray, vertices: np.ndarray, linear: bool = True,
+              moments: bool = True) -> np.ndarray:  # fmt: skip
         figures = np.zeros((len(vertices), sources.shape[1], WIDTH), dtype=np.float32)
         values = np.ascontiguousarray(sources.T, dtype=np.float32)
         with nullcontext() if feel.overloads else packed():
             feel(vertices, values, self._sites.take(loaded, axis=1), self._sites, self._frames,
-                 self._response[0], self._response[1], moments, figures)  # fmt: skip
+                 self._response[0], self._response[1], linear, moments, figures)  # fmt: skip
         return figures
 
 

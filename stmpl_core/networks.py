@@ -219,6 +219,7 @@ _FOLDER = Path(__file__).parent / "weights"
 NETWORKS = {
     "moment_net": Network("motion", _FOLDER / "moment_net.safetensors"),  # pressures and nodal forces
     "moment_net_contact": Network("motion", _FOLDER / "moment_net_contact.safetensors"),  # what rigid tools press with
+    "moment_net_stick": Network("motion", _FOLDER / "moment_net_stick.safetensors"),  # ... if linear motion is known
     "contact_net": Network("pressure", _FOLDER / "contact_net.safetensors"),
     "stack_contact_net": Network("stack_pressure", _FOLDER / "stack_contact_net.safetensors"),
     "stack_moment_net": Network("stack_motion", _FOLDER / "stack_moment_net.safetensors"),

@@ -73,6 +73,10 @@ class Nodes(NamedTuple):
         """Nodes of several tools, one after the other."""
         return cls(*(np.concatenate(columns) for columns in zip(*parts, strict=True))) if parts else cls.none()
 
+    def some(self, which: np.ndarray) -> Nodes:
+        """Those of these numbers, or where a mask (N,) says so."""
+        return Nodes(*(values[which] for values in self if len(values)))
+
     def at_vertices(self, values: np.ndarray, areas: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Pressures at the nodes (N,) as pressures at the vertices around them: their numbers, (M,), and values, (M,).
 

@@ -96,8 +96,10 @@ _RINGS[:, 16 : 16 + TENSORS] = ring_table()[:, SCALARS + VECTORS :]
 
 
 @numba.njit(cache=True, nogil=True, parallel=True, fastmath=FAST, error_model="numpy")
-def feel(vertices, values, sources, sites, frames, sink, away, moments, out):
+def feel(vertices, values, sources, sites, frames, sink, away, linear, moments, out):
     """See Surroundings.felt; values (S, K) and sources (10, K) are those of the loaded vertices, `out` (N, S, WIDTH).
+
+    Linear and moments say what of it is wanted; the rest of `out` stays.
 
     Rows of sites and sources: x, y, z, t^-1/2, area, log(t) / 2, the same of the spread, normal. Loops over the
     sources have no branches, so that they run in vector registers.
@@ -108,7 +110,7 @@ def feel(vertices, values, sources, sites, frames, sink, away, moments, out):
         sums = np.empty((fields, 5, 8), dtype=np.float32)
         for n in range(CHUNK * chunk, min(CHUNK * (chunk + 1), len(vertices))):
             _gather(vertices[n], sources, sites, frames, np.int32(sink.shape[1]), felt, cell)
-            for s in range(0, fields, 2):
+            for s in range(0, fields if linear else 0, 2):
                 _respond(values, s, min(s + 1, fields - 1), felt, cell, down, along, sink.shape[1], out[n])
             if moments:
                 _take_moments(values, felt, sums, out[n])

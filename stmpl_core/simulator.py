@@ -9,9 +9,10 @@ from typing import overload
 import numba
 import numpy as np
 
+from stmpl_core.arrays import PerVertex
 from stmpl_core.bounds import motion_bound
 from stmpl_core.carrying import carried
-from stmpl_core.conform import Conformed, conform, kept_out, no_further
+from stmpl_core.conform import Conformed, conform, kept_out, laid_on, no_further
 from stmpl_core.contact import Contact
 from stmpl_core.dragged import dragged_motion
 from stmpl_core.errors import InvalidInput
@@ -25,13 +26,14 @@ from stmpl_core.skin import Skin
 from stmpl_core.state import State
 from stmpl_core.stick import stuck_motion
 from stmpl_core.tools import Tools
-from stmpl_core.touch import Answer, Touch
+from stmpl_core.touch import Answer, Pressed, Touch
 from stmpl_core.toucher import Toucher
 from stmpl_core.trust import Displacement, Trust
 from stmpl_core.wake import sunk
 
 LEAST_HELD = 0.02  # motion that is held back, over the peak, from which it is said
 MOST_MOVED = 0.95  # motion over the thickness from which it is held back
+FEW_NODES, MANY_NODES = 160, 240  # nodes up to which skin goes with its tools node by node, and from which by vertices
 MAX_ENTERED_SHARE = 0.02  # depth of skin inside a tool over the thickness, which is not yet said
 
 
@@ -166,10 +168,10 @@ class Simulator:
         moves = self.history.elastic(touches)
 
         # Solve: the method moves the skin, and what is touched lies on its tool; where nothing presses, nothing moves.
-        solved, fitted = self._moved(moves)
+        solved, fitted, by_vertices = self._moved(moves)
         fitted = self._dragged(fitted, touches)
         for touch, share in self.history.left_behind(touches):
-            behind, there = self._moved([touch])
+            behind, there, _ = self._moved([touch])
             solved = replace(solved, trust=_lower(solved.trust, behind.trust))
             fitted = _deeper(fitted, share, there, -self.layer.normals)
             moves.append(replace(touch, depth=share * touch.depth))
@@ -188,27 +190,50 @@ class Simulator:
         if cut:
             trust = trust.also(f"{cut} vertices would move further than there is skin: held back", in_range=False)
         if trust.in_range:
-            known = getattr(self.method, "contact_bound", None)
+            known = getattr(self.method, "contact_bound" if by_vertices else "stick_bound", None)
             trust = replace(trust, error_bound=motion_bound(known, touches, moves, peak, left))
         return Answer(displacement, trust, solved.method, pressure, {touch.name: touch for touch in touches})
 
-    def _moved(self, touches: Sequence[Touch]) -> tuple[Displacement, Conformed]:
-        """What the method says of elastic touches, and the same with what is touched on its tools."""
+    def _moved(self, touches: Sequence[Touch]) -> tuple[Displacement, Conformed, bool]:
+        """What the method says of elastic touches, the same with what is touched on its tools, whether by vertices.
+
+        Skin that sticks goes with its tools node by node where the method knows that (`sticks`), and on stacks. This
+        costs the square of the nodes: under many, vertices are fine enough, and one way fades into the other.
+        """
         pressed = [(touch.pressure, touch.pressed) for touch in touches
                    if touch.pressure is not None and touch.pressed is not None]  # fmt: skip
         if not pressed:
             solved = Displacement(np.zeros_like(self.layer.vertices), Trust(), self.method.name)
-            return solved, Conformed(solved.displacement, 0.0, 0.0)
-        motion = None if self._green is None else stuck_motion(self._green, touches)
-        if motion is not None:  # under thick tissue nodes lie far apart, and a mesh may be finer
+            return solved, Conformed(solved.displacement, 0.0, 0.0), False
+        share = 1.0 if self._green is not None else 0.0
+        if not share and getattr(self.method, "sticks", False):
+            nodes = sum(len(one.squeeze.nodes.area) for _, one in pressed)
+            share = min(max((MANY_NODES - nodes) / (MANY_NODES - FEW_NODES), 0.0), 1.0)
+        if not share:
+            return *self._by_vertices(touches, _summed(pressed)), True
+        if self._green is None:
+            moving = _summed(pressed)
+            motion = stuck_motion(Green.of(self.layer), touches, np.flatnonzero(moving))
+        else:  # under thick tissue nodes lie far apart, and a mesh may be finer
+            motion = stuck_motion(self._green, touches)
             near, layer = self.skin.near, self.layer
-            pressed = [(near.spread_on(layer, values, one.squeeze.nodes), one) for values, one in pressed]
-        first, *others = (values / one.factor for values, one in pressed)
-        moving = sum(others, first)
+            moving = _summed([(near.spread_on(layer, values, one.squeeze.nodes), one) for values, one in pressed])
         solved = self.method.solve(Load.contact(moving, motion))
-        if motion is None:
-            return solved, conform(self.layer, self.skin.near, solved.displacement, touches)
-        return solved, kept_out(self.layer, no_further(self.layer, motion, solved.displacement, touches), touches)
+        if self._green is None:
+            fitted = laid_on(self.layer, solved.displacement, touches)
+        else:
+            fitted = kept_out(self.layer, no_further(self.layer, motion, solved.displacement, touches), touches)
+        if share == 1:
+            return solved, fitted, False
+        other, rest = self._by_vertices(touches, moving)
+        both = share * fitted.displacement + (1 - share) * rest.displacement
+        fitted = Conformed(both, max(fitted.corrected, rest.corrected), max(fitted.entered, rest.entered))
+        return replace(solved, trust=_lower(solved.trust, other.trust)), fitted, True
+
+    def _by_vertices(self, touches: Sequence[Touch], pressure: np.ndarray) -> tuple[Displacement, Conformed]:
+        """What the method says of the pressure alone, and the same with the touched vertices on their tools."""
+        solved = self.method.solve(Load.contact(pressure))
+        return solved, conform(self.layer, self.skin.near, solved.displacement, touches)
 
     def _dragged(self, fitted: Conformed, touches: Sequence[Touch]) -> Conformed:
         """The answer with the skin that is dragged along, and out of the tools."""
@@ -232,6 +257,12 @@ class Simulator:
     def step(self, contacts: Sequence[Contact]) -> Answer:
         """`touch`, then `answer`. Raises what `touch` raises."""
         return self.answer(self.touch(contacts))
+
+
+def _summed(pressed: Sequence[tuple[PerVertex, Pressed]]) -> PerVertex:
+    """Pressure of all tools that moves skin, (V,) [Pa]."""
+    first, *others = (values / one.factor for values, one in pressed)
+    return sum(others, first)
 
 
 def _lower(trust: Trust, other: Trust) -> Trust:

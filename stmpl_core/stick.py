@@ -1,4 +1,4 @@
-"""Stick: how the skin of a stacked limb moves when what a tool touches sticks to it, in the linear response."""
+"""Stick: how the skin of a limb moves when what a tool touches sticks to it, in the linear response."""
 
 from __future__ import annotations
 
@@ -16,22 +16,33 @@ from stmpl_core.touch import Pressed, Touch, way_of
 FURTHEST = 1.5  # way of a node over its depth along the tool's way: beside a wall it is not clear where that ends
 
 
-def stuck_motion(green: Green, touches: Sequence[Touch]) -> VertexVectors:
+def stuck_motion(green: Green, touches: Sequence[Touch], loaded: np.ndarray | None = None) -> VertexVectors:
     """Motion of the skin under tools that press, (V, 3) [m].
 
-    The linear problem without friction says which nodes press; those go with their tools, in all directions, and the
-    forces that this takes move the rest of the skin. So the motion follows from the pose, not from the pressure: it
-    depends little on how tissue stiffens.
+    The nodes that press, in the linear problem without friction, go with their tools in all directions, and the forces
+    that this takes move the rest of the skin. So the motion follows from the pose, not from the pressure: it depends
+    little on how tissue stiffens.
+
+    Args:
+        green: response of the layer.
+        touches: touches of the tools.
+        loaded: vertices on which they press, (L,); None: those around the nodes.
     """
     pressed = [(touch, touch.pressed) for touch in touches if touch.pressed is not None]
     nodes = Nodes.joined([one.squeeze.nodes for _, one in pressed])
     group = green.near.groups(nodes.corners[:, 0])
     gone = np.concatenate([_gone(touch, one, green.layer.vertex_areas) for touch, one in pressed])
-    holds = np.flatnonzero(solve(green.matrix(nodes, group), nodes.sinking) > 0)
+    if green.layer.stacked:
+        forces = solve(green.matrix(nodes, group), nodes.sinking)
+    else:
+        forces = np.concatenate([one.forces for _, one in pressed if one.forces is not None])
+        forces /= green.layer.tissue.youngs_modulus
+    holds = np.flatnonzero(forces > 0)
     if not len(holds):
         return np.zeros_like(green.layer.vertices)
-    some = Nodes(*(values[holds] for values in nodes))
-    return green.motion(some, green.stuck(some, group[holds], gone[holds]))
+    some = nodes.some(holds)
+    guess = None if green.layer.stacked else forces[holds, None] * some.inward
+    return green.motion(some, green.stuck(some, group[holds], gone[holds], guess), loaded=loaded)
 
 
 def _gone(touch: Touch, pressed: Pressed, areas: np.ndarray) -> np.ndarray:

@@ -51,20 +51,22 @@ class Scores:
 
 
 def score(samples: Iterable[Sample], pressures: Weights, moments: Weights | None = None, *,
-          reaction_only: bool = False) -> Scores:  # fmt: skip
+          stick: bool = False, reaction_only: bool = False) -> Scores:  # fmt: skip
     """Scores on the contacts of samples that came straight, and whose pressure finite elements know.
 
     Args:
         samples: samples of the data.
         pressures: network that says what tools press with.
         moments: network that says what that moves; None: the one that comes with the package.
+        stick: truth of the claim that it is for skin that sticks to its tools node by node.
         reaction_only: choice to leave the motion out; its errors are NaN then, and touches decide what is trusted.
     """
     simulator, rows, last = None, [], None
     for one in pressed(sample for sample in samples if slant_of(sample) <= STRAIGHT):
         layer, true, area = one.sample.layer, one.true, one.sample.layer.vertex_areas
         if simulator is None or last is not layer:
-            method = Zero() if reaction_only else MomentNet(contact=moments, stack=moments)
+            tools = {"stick" if stick else "contact": moments, "stack": moments, "sticks": stick}
+            method = Zero() if reaction_only else MomentNet(**tools)
             simulator, last = Simulator(layer, method), layer
             simulator.toucher.net = ContactNet(layer, pressures, simulator.toucher.near)
         if seen(one, simulator.toucher.net) is None:
@@ -135,7 +137,8 @@ def bound_motion(data: str | Path, out: str | Path, motion: str = "moment_net_co
     path = Path(out) / f"{motion}.safetensors"
     moments = Weights.load(path, NETWORKS[motion].kind)
     pressures = Weights.load(Path(out) / f"{pressure}.safetensors", NETWORKS[pressure].kind)
-    scores = score(Dataset.open(data).split("val", kind="indenter", sets=("tool",)), pressures, moments)
+    scores = score(Dataset.open(data).split("val", kind="indenter", sets=("tool",)), pressures, moments,
+                   stick=motion == "moment_net_stick")  # fmt: skip
     some = scores.trusted
     found = fit_bound(scores.motion[some], scores.stated[some], scores.kind[some], scores.slant[some])
     if NETWORKS[motion].kind == "stack_motion":  # validation is of the stacks that were learnt; others are further off

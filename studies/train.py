@@ -14,6 +14,7 @@ TrainPreset = Literal[
     "default", "contacts", "tissue", "paper", "paper-reduced", "paper-3-bodies", "paper-reduced-3-bodies"
 ]
 TOOLS: dict[str, Any] = {"kinds": ("indenter",), "steps": 20_000}  # settings of a MomentNet for what tools press with
+STICK = {"stick": True, "hidden": 64, "points": 160}  # of one for what is left where skin goes with its tools
 STACK_CONTACTS = {"hidden": 24, "weight_decay": 0.3, "steps": 3_000, "batch": 96}  # few stacks: more is learnt by heart
 STACK_MOMENTS = {"hidden": 64, "weight_decay": 0.3, "steps": 3_000, "points": 64}
 OnProgress = Callable[[int, int, str], None]  # done, in all, what to say of it
@@ -56,6 +57,7 @@ def train(
     changes |= {} if steps is None else {"steps": steps}
     if preset == "default":
         return train_moments(data, out, _settings(MomentTraining, changes), on_progress=on_progress)
+    from stmpl_core.networks import Weights
     from studies.judge_contact import bound_motion
     from studies.train_contact import ContactTraining, train_contact
 
@@ -67,6 +69,11 @@ def train(
         ("moment_net_contact", "contact_net")  # fmt: skip
     train_moments(data, out, moments, name=motion, on_progress=on_progress)
     card = train_contact(data, out, contacts, name=pressure, on_progress=on_progress)
+    if preset == "contacts":
+        law = Weights.load(out / f"{pressure}.safetensors", "pressure")
+        moments = _settings(MomentTraining, TOOLS | STICK | changes)
+        train_moments(data, out, moments, name="moment_net_stick", law=law, on_progress=on_progress)
+        card |= {"stick": bound_motion(data, out, "moment_net_stick", pressure)}
     return card | {"motion": bound_motion(data, out, motion, pressure)}
 
 

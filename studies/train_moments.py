@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +15,8 @@ from torch import Tensor, nn
 
 from fem_tools.dataset import LOADS, Dataset, Sample, data_card
 from fem_tools.sampling import Kind
+from stmpl_core.contact import Contact
+from stmpl_core.contact_net import ContactNet
 from stmpl_core.green import Green
 from stmpl_core.layer import SoftLayer
 from stmpl_core.load import Load
@@ -44,6 +46,7 @@ from stmpl_core.networks import (
 from stmpl_core.provenance import commit, machine, versions
 from stmpl_core.response import SCALARS, TENSORS, VECTORS, WIDTH
 from stmpl_core.stick import stuck_motion
+from stmpl_core.toucher import Toucher
 from studies.pressed import STRAIGHT, pressed, slant_of
 
 VERSIONS = ("stmpl", "torch", "numpy", "numba", "safetensors")
@@ -61,7 +64,9 @@ class MomentTraining(BaseModel):
 
     Args:
         hidden: width of each of the three hidden layers.
-        kinds: kinds of load; rigid tools that stick also pull along the skin, so they have a network of their own.
+        kinds: kinds of load; rigid tools that stick also pull along the skin, so they have networks of their own.
+        stick: choice to learn what is left of the motion where that of skin that sticks is known in the linear response
+            (stmpl_core.stick), under the pressure that the contact law says.
         points: vertices drawn of each sample, most from where it moves.
         steps, batch, learning_rate: numbers of Adam, the rate rising to this and falling in one cycle.
         weight_decay: weight decay of AdamW.
@@ -73,6 +78,7 @@ class MomentTraining(BaseModel):
 
     hidden: int = Field(default=96, ge=4)
     kinds: tuple[Kind, ...] = ("pressure", "nodal")
+    stick: bool = False
     points: int = Field(default=128, ge=8)
     steps: int = Field(default=40_000, ge=10)
     batch: int = Field(default=2048, ge=8)
@@ -97,8 +103,8 @@ class Points:
     weight: np.ndarray
 
 
-def draw_points(data: Dataset, settings: MomentTraining, on_progress: OnProgress) -> Points:
-    """Points of the training split, as many of each sample as the settings say."""
+def draw_points(data: Dataset, settings: MomentTraining, on_progress: OnProgress, law: Weights | None = None) -> Points:
+    """Points of the training split, as many of each sample as the settings say; law: see `as_asked`."""
     rng = np.random.default_rng(settings.seed)
     subsets = [data.split("train", kind=kind) for kind in settings.kinds]
     total, done = sum(map(len, subsets)), 0
@@ -106,7 +112,7 @@ def draw_points(data: Dataset, settings: MomentTraining, on_progress: OnProgress
     motion, weight = np.empty((len(rows), 3), np.float32), np.empty(len(rows), np.float32)
     end, near, last = 0, None, None
     for subset in subsets:
-        for sample in stuck(subset) if stacked(data) else subset:
+        for sample in as_asked(subset, stacked(data), settings.stick, law):
             if near is None or sample.layer is not last:
                 near, last = Surroundings.of(sample.layer), sample.layer
             row, moved, scale = _points(near, sample.layer, sample.load, sample.displacement, settings.points, rng)
@@ -121,6 +127,36 @@ def draw_points(data: Dataset, settings: MomentTraining, on_progress: OnProgress
 def stacked(data: Dataset) -> bool:
     """Whether a data set is of stacks, or of columns that run to bone."""
     return all(layer.stacked for layer in data.layers.values())
+
+
+def as_asked(samples: Iterable[Sample], stacks: bool, stick: bool, law: Weights | None) -> Iterable[Sample]:
+    """Samples with the load that their network is asked about.
+
+    Args:
+        samples: samples of a data set.
+        stacks: truth of the claim that they are of stacks.
+        stick: see MomentTraining.
+        law: network of the contact law that says the pressure where `stick` is chosen; None: the one that ships.
+    """
+    return stuck(samples) if stacks else laid(samples, law) if stick else samples
+
+
+def laid(samples: Iterable[Sample], law: Weights | None) -> Iterator[Sample]:
+    """Contacts of samples, not just now begun, with the pressure and the linear motion that follow from their poses."""
+    toucher = None
+    for one in pressed(samples):
+        layer = one.sample.layer
+        if toucher is None or toucher.layer is not layer:
+            toucher = Toucher(layer)
+            toucher.net = ContactNet(layer, law, toucher.near)
+        toucher.tools.add(one.tool, one.field)
+        (touch,) = toucher.touch_all([Contact(one.tool, one.pose)])
+        if touch.pressed is None or touch.pressure is None or not touch.force > 0:
+            continue
+        if one.sample.info["ratio"] >= STUCK_FROM:
+            told = replace(touch, pressed=touch.pressed._replace(way=one.way))
+            motion = stuck_motion(Green.of(layer), [told])
+            yield one.sample._replace(load=Load.contact(touch.pressure / touch.pressed.factor, motion))
 
 
 def stuck(samples: Iterable[Sample]) -> Iterator[Sample]:
@@ -148,7 +184,7 @@ def _points(near: Surroundings, layer: SoftLayer, load: Load, displacement: np.n
     constants = np.broadcast_to([layer.tissue.poisson_ratio, load.kind == "nodal"], (len(v), 2))
     rows = POINT.in_order(figures=figures, curvature=near.curvature[v], slope=near.slope[v], here=sources[v],
                           constants=constants)  # fmt: skip
-    if load.motion is not None:
+    if layer.stacked and load.motion is not None:
         rows.append(of_stack(Green.of(layer), v, float(np.linalg.norm(load.motion, axis=1).max())))
     local = np.einsum("nij,nj->ni", near.frames[v], displacement[v]) / near.thickness[v, None]
     return np.concatenate(rows, axis=1), local, near.thickness[v] / peak
@@ -350,6 +386,7 @@ def train_moments(
     settings: MomentTraining | None = None,
     *,
     name: str = "moment_net",
+    law: Weights | None = None,
     on_progress: OnProgress | None = None,
 ) -> dict[str, Any]:
     """Trains a MomentNet on a data set, and writes out/`name`.safetensors with its card `name`.json.
@@ -359,6 +396,7 @@ def train_moments(
         out: folder; what it holds of the same run is used again.
         settings: settings of the training; None: the defaults.
         name: name of the files.
+        law: see `as_asked`.
         on_progress: function that is called often.
 
     Returns:
@@ -371,12 +409,12 @@ def train_moments(
     source, out = Dataset.open(data), Path(out)
     out.mkdir(parents=True, exist_ok=True)
     started = time.monotonic()
-    points = draw_points(source, settings, said)
+    points = draw_points(source, settings, said, law)
     model = fit(points, settings, out, said)
     card = training_card(data, source, settings, model, _ranges(source, settings), points=len(points.rows))
     card["minutes"] = round((time.monotonic() - started) / 60, 1)
     weights = model.weights(card)
-    card["bound"] = calibrate(source, weights, settings.kinds, said)
+    card["bound"] = calibrate(source, weights, settings, said, law)
     weights.save(out / f"{name}.safetensors")
     (out / "moment_net.checkpoint").unlink(missing_ok=True)
     return card
@@ -431,19 +469,19 @@ def _ranges(data: Dataset, settings: MomentTraining) -> dict[str, list[float]]:
     return out
 
 
-def calibrate(data: Dataset, weights: Weights, kinds: Sequence[Kind], on_progress: OnProgress,
-              limit: int = 800) -> dict[str, float]:  # fmt: skip
+def calibrate(data: Dataset, weights: Weights, settings: MomentTraining, on_progress: OnProgress,
+              law: Weights | None = None, limit: int = 800) -> dict[str, float]:  # fmt: skip
     """The factor on the network's own expectation that covers the largest error of validation answers with a margin.
 
     Answers that the method itself flags are left out. Returns the factor, how many answers, and the median of bound
     over error.
     """
-    subsets = [data.split("val", kind=kind) for kind in kinds]
-    method, layer, ratios = MomentNet(weights, contact=weights, stack=weights), None, []
+    subsets = [data.split("val", kind=kind) for kind in settings.kinds]
+    method, layer, ratios = MomentNet(weights, contact=weights, stick=weights, stack=weights), None, []
     total = sum(map(len, subsets))
     for subset in subsets:
         some = (subset[k] for k in range(0, len(subset), max(1, total // limit)))
-        for sample in stuck(some) if stacked(data) else some:
+        for sample in as_asked(some, stacked(data), settings.stick, law):
             if sample.layer is not layer:
                 layer = sample.layer
                 method.prepare(layer)

@@ -118,7 +118,7 @@ def test_skin_turns_with_a_tool_that_spins_in_place() -> None:
 class Silent(MomentNet):
     """A method that says nothing of contacts."""
 
-    contact_bound = None
+    contact_bound = stick_bound = None
 
 
 def test_a_method_that_knows_none_states_none() -> None:

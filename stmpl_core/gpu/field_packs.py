@@ -70,16 +70,16 @@ class FieldRoom(NamedTuple):
 
 
 def method_of(skins: Sequence[Skin]) -> MomentNet:
-    """The one network that moves these skins. Raises InvalidInput: another method, or several networks."""
+    """The one network that moves these skins by vertices. Raises InvalidInput: another method, or several networks."""
     methods = [skin.method for skin in skins]
     first = methods[0]
     if not isinstance(first, MomentNet) or any(
-        not isinstance(one, MomentNet) or one.fallback is not None or one.contact is not first.contact
+        not isinstance(one, MomentNet) or one.fallback is not None or one.sticks or one.contact is not first.contact
         for one in methods
     ):
         names = ", ".join(sorted({one.name for one in methods}))
-        raise InvalidInput(f"fields of WarpBatch come from one MomentNet without a fallback; the skins have {names}. "
-                           "Try Batch, or Skin.of(layer, MomentNet()).")  # fmt: skip
+        raise InvalidInput("fields of WarpBatch come from one MomentNet(sticks=False) without a fallback; the skins "
+                           f"have {names}. Try Batch, or Skin.of(layer, MomentNet(sticks=False)).")  # fmt: skip
     return first
 
 

@@ -50,8 +50,11 @@ class MomentNet:
     Args:
         weights: path of a .safetensors file made by `stmpl train`; None: those that come with the package.
         contact: weights for what rigid tools press with (Load.contact), given likewise.
+        stick: weights for that where the load knows the linear motion of what sticks to the tools, given likewise.
         stack: weights for that on a stack, or on columns that run to bone, given likewise. Other loads on these are
             answered by LimbLinear.
+        sticks: choice of a simulator: it tells that linear motion under contacts of few nodes. False: it never does on
+            one material; answers come TIMES sooner and are a third less exact.
         fallback: method that answers loads outside the range that the network was trained on; None: the network's
             answer is given, and flagged.
         threads: number of threads of the kernels. Two are nearly twice as fast where two cores are idle, and stall for
@@ -68,7 +71,9 @@ class MomentNet:
         weights: str | Path | Weights | None = None,
         *,
         contact: str | Path | Weights | None = None,
+        stick: str | Path | Weights | None = None,
         stack: str | Path | Weights | None = None,
+        sticks: bool = True,
         fallback: Method | None = None,
         threads: int = 1,
     ) -> None:
@@ -76,6 +81,7 @@ class MomentNet:
             raise InvalidInput(f"threads is {threads}; at least 1 is needed.")
         self.threads = min(threads, numba.config.NUMBA_NUM_THREADS)  # type: ignore[attr-defined]
         self.weights, self.contact = _weights(weights, "moment_net"), _weights(contact, "moment_net_contact")
+        self.stick, self.sticks = _weights(stick, "moment_net_stick"), sticks
         self._on_stack = stack
         self.fallback = fallback
         self._green: Green | None = None
@@ -86,6 +92,11 @@ class MomentNet:
     def contact_bound(self) -> Mapping[str, float] | None:
         """Figures of a bound on the motion under tools, see studies.judge_contact; None: not known."""
         return (self.contact if self._green is None else self.stack).card.get("contact_bound")
+
+    @property
+    def stick_bound(self) -> Mapping[str, float] | None:
+        """The same where skin goes with its tools node by node."""
+        return (self.stick if self._green is None else self.stack).card.get("contact_bound")
 
     @property
     def stack(self) -> Weights:
@@ -137,13 +148,18 @@ class MomentNet:
     def _solve(self, layer: SoftLayer, near: Surroundings, load: Load, pressure: np.ndarray) -> Displacement:
         sources = source_fields(pressure, self._unit)
         asked = near.asked_again(load.loaded)
-        felt = near.felt(sources, asked)
+        felt = near.felt(sources, asked, linear=load.motion is None and self._green is None)
         vertices, figures = felt.vertices, felt.figures
         weights = self.contact if load.kind == "contact" else self.weights
-        displacement, more = np.zeros_like(layer.vertices), np.empty((len(vertices), 0), np.float32)
+        more = np.empty((len(vertices), 0), np.float32)
         if self._green is not None:
             weights, displacement = self.stack, linear_motion(self._green, load)
             more = of_stack(self._green, vertices, take_linear(figures, near, vertices, displacement))
+        elif load.motion is not None:
+            weights, displacement = self.stick, load.motion.copy()
+            take_linear(figures, near, vertices, displacement)
+        else:
+            displacement = np.zeros_like(layer.vertices)
         a, constants = weights.arrays, np.array([layer.tissue.poisson_ratio, load.kind == "nodal"], np.float32)
 
         # What is around each vertex becomes numbers that do not turn with the scene; far vertices need none.
@@ -229,7 +245,7 @@ def unit_of(green: Green) -> Tissue:
 
 
 def take_linear(figures: np.ndarray, near: Surroundings, vertices: np.ndarray, motion: np.ndarray) -> float:
-    """Writes a linear response (V, 3) [m] into the figures (N, 2, WIDTH) of vertices (N,), and says its peak [m]."""
+    """Writes a linear response (V, 3) [m] into figures (N, S, WIDTH) of vertices (N,), and says its peak [m]."""
     return _take_linear(figures, near.frames, near.thickness, vertices, motion)
 
 
@@ -253,7 +269,7 @@ def _take_linear(figures, frames, thickness, vertices, motion):
         most = max(most, motion[v, 0] ** 2 + motion[v, 1] ** 2 + motion[v, 2] ** 2)
         for k in range(3):
             along = frames[v, k, 0] * motion[v, 0] + frames[v, k, 1] * motion[v, 1] + frames[v, k, 2] * motion[v, 2]
-            figures[n, 0, k] = figures[n, 1, k] = along / thickness[v]
+            figures[n, :, k] = along / thickness[v]
     return np.sqrt(most)
 
 
