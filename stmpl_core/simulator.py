@@ -72,6 +72,8 @@ class Simulator:
         self.remembers = friction is not None or self.layer.tissue.relaxes
         if friction is not None:  # what a slide needs is made now, not when the first one begins
             _ = self.history.sideways, Green.of(self.layer).drag
+        if self._green is None and getattr(self.method, "sticks", False):  # likewise what the first touch needs
+            _ = Green.of(self.layer)
         if skin.rest is not None:
             self.move_to(skin)
 

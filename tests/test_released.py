@@ -121,6 +121,13 @@ def test_the_files_that_ship_hold_contacts_of_the_plan_that_networks_learn_from(
     assert len(deep) > 150 and min(one["ratio"] for one in deep) > 0.45
 
 
+def test_the_file_of_one_material_holds_the_whole_plan_of_contacts() -> None:
+    plan, some = PRESETS["contacts"], Released(limbs.FILE.with_name("contacts_v1.npz"))
+    assert some.plan == plan
+    found = {contact for contact, part in some.parts() if part.about["split"] == split_of(plan, contact)}
+    assert found <= set(contacts(plan)) and len(found) == len(some) > 0.99 * len(list(contacts(plan)))
+
+
 def test_flat_presses_take_every_stack_that_is_learnt_from_and_no_other() -> None:
     bodies = learnt(TISSUE)
     assert {b.name for b in bodies} == {b.name for b in TISSUE.bodies if b.stack and not b.held_out}
