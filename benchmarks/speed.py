@@ -38,6 +38,7 @@ AIMS = {  # ms: by pose, by wrench, touch and local model, field, step; what was
 WHAT = ("by pose", "by wrench", "touch and local model", "field", "step")
 AROUND = ("band, 25 mm", "hand")  # they hold the limb from all sides: no wrench tells their pose
 PAIR = 80 + 45  # operations of a pair: where it is, two tables, two fields; once more for the skin on the tool
+NODES, OF_NODE, MOMENTS, STEPS = 160, 110, 40, 14  # nodes that stick: most, operations of a pair; of a moment; products
 TOUCH, LIMITS = ("limit of a touch", "limit of a field"), "limits"
 DOCS, MARKS = HERE.parents[1] / "docs" / "speed.md", ("<!-- benchmarks.speed -->", "<!-- end -->")
 Work = dict[str, list[float]]  # by TOUCH: floating-point operations, and bytes
@@ -48,11 +49,14 @@ def least_work(simulator: Any, touches: Any) -> Work:
 
     A touch: four distances for each column under the tool, of 84 products each; the response between each two contact
     nodes; ten products of that matrix; the network at each node. A field: the response of each vertex that is asked
-    to each that presses, the network at each, and once more the response for the skin that is laid on the tool; it
-    reads the tables of the vertices and writes the answer.
+    to each that presses, the network at each, and once more the response for the skin that is laid on the tool; where
+    nodes stick, instead the response to each of them, and some products of their matrix. It reads the tables of the
+    vertices and writes the answer.
     """
     network = 2 * sum(a.size for a in simulator.toucher.net._network if a.ndim == 2)
-    moved = simulator.method.contact if simulator.method._green is None else simulator.method.stack
+    method, many = simulator.method, sum(len(one.pressed.squeeze.nodes.area) for one in touches)
+    sticks = method._green is None and method.sticks and many <= NODES
+    moved = method.stack if method._green is not None else method.stick if sticks else method.contact
     layers = 2 * sum(a.size for name, a in moved.arrays.items() if name.startswith("w"))
     touch = field = 0.0
     every, near = len(simulator.layer.vertices), simulator.skin.near
@@ -61,7 +65,8 @@ def least_work(simulator: Any, touches: Any) -> Work:
         touch += 4 * (columns + nodes) * 2 * 84 + nodes**2 / 2 * 2 * 40 + 10 * 2 * nodes**2 + nodes * network
         loaded = np.flatnonzero(one.pressure)
         asked = len(near.asked(loaded).vertices)
-        field += asked * (len(loaded) * PAIR + layers)
+        field += asked * ((nodes * OF_NODE + len(loaded) * MOMENTS if sticks else len(loaded) * PAIR) + layers)
+        field += nodes**2 / 2 * OF_NODE + STEPS * 2 * (3 * nodes) ** 2 if sticks else 0.0
     return {TOUCH[0]: [touch, 0.0], TOUCH[1]: [field, every * (3 * 8 * 2 + 4 * (10 + 9))]}
 
 

@@ -94,20 +94,16 @@ def laid_on(layer: SoftLayer, displacement: VertexVectors, touches: Sequence[Tou
             v, depth, rests, _ = touch.pressed.squeeze
             _lay(grid_of(touch.pressed.field), touch.pose_body_from_tool, layer.vertices, v, rests, touch.pressure[v],
                  NEARLY * float(depth.max(initial=0.0)), out)  # fmt: skip
-    return kept_out(layer, out, touches, displacement)
+    return _pushed_out(layer, displacement, touches, out)
 
 
-def kept_out(layer: SoftLayer, displacement: VertexVectors, touches: Sequence[Touch],
-             before: VertexVectors | None = None) -> Conformed:  # fmt: skip
-    """The answer with the skin that is inside a tool on its surface: where all else lies on the tool already.
+def kept_out(layer: SoftLayer, displacement: VertexVectors, touches: Sequence[Touch]) -> Conformed:
+    """The answer with the skin that is inside a tool on its surface: where all else lies on the tool already."""
+    return _pushed_out(layer, displacement, touches, displacement.copy())
 
-    Args:
-        layer: soft layer at rest.
-        displacement: answer, (V, 3) [m].
-        touches: touches of all contacts.
-        before: what the correction is counted from; None: the answer.
-    """
-    out, before = displacement.copy(), displacement if before is None else before
+
+def _pushed_out(layer: SoftLayer, before: VertexVectors, touches: Sequence[Touch], out: VertexVectors) -> Conformed:
+    """What came of an answer, with the skin that is inside a tool on its surface."""
     entered = _push_out(layer, touches, out)
     under = [touch.pressed.squeeze.vertices for touch in touches if touch.pressed is not None]
     return Conformed(out, max((_furthest(before, out, some) for some in under), default=0.0), entered)

@@ -306,9 +306,11 @@ class Green:
         layer = self.layer
         asked = self.near.asked_again(np.unique(nodes.corners) if loaded is None else loaded)
         group, flat = self.near.groups(nodes.corners[:, 0]), self._flat_of_stack if layer.stacked else self._flat_of_one
-        by = flat(nodes, forces, asked.vertices, [
-            (group == one, self.near.reached_among(np.unique(nodes.corners[group == one]), asked.vertices,
-                                                   alone=not group.any())) for one in np.unique(group)])  # fmt: skip
+        felt = [(np.ones(len(group), bool), np.arange(len(asked.vertices)))]
+        if group.any():
+            felt = [(of, self.near.reached_among(np.unique(nodes.corners[of]), asked.vertices, alone=False))
+                    for of in (group == one for one in np.unique(group))]  # fmt: skip
+        by = flat(nodes, forces, asked.vertices, felt)
         out = np.zeros_like(layer.vertices)
         asked.fill(by, out)
         if self.coarse is None:
