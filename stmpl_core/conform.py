@@ -18,7 +18,6 @@ from stmpl_core.touch import Pressed, Touch, way_of
 
 MIN_LYING_PRESSURE = 0.05  # pressure over the tool's highest, below which a covered vertex may be apart from the tool
 BEYOND = 0.05  # way that skin under a tool may go beyond it, over its way
-NEARLY = 0.05  # distance of touched skin from its tool over its depth, up to which it is laid on it, and not by twice
 FIRM_DEPTH = 0.013  # depth in a tool over the thickness, from which skin is moved out with its neighbours, not alone
 MIN_FACING_COSINE = 0.3  # cosine between tool's way and inward normal, from which skin comes along
 LEAST_WEIGHT = 1e-3  # firmness from which a correction counts: one that falls to 0 lets go of its vertex continuously
@@ -87,13 +86,12 @@ def conform(layer: SoftLayer, near: Surroundings, displacement: VertexVectors, t
 
 
 def laid_on(layer: SoftLayer, displacement: VertexVectors, touches: Sequence[Touch]) -> Conformed:
-    """The answer with the skin that is touched, and lies on its tool already but for a little, right on its surface."""
+    """The answer with the skin that is touched moved along its tool's way onto it; the skin around it stays."""
     out = displacement.copy()
     for touch in touches:
-        if touch.pressed is not None and touch.pressure is not None:
-            v, depth, rests, _ = touch.pressed.squeeze
-            _lay(grid_of(touch.pressed.field), touch.pose_body_from_tool, layer.vertices, v, rests, touch.pressure[v],
-                 NEARLY * float(depth.max(initial=0.0)), out)  # fmt: skip
+        if touch.pressed is not None:
+            tool = _tool(touch, touch.pressed, layer)
+            _lay(tool.vertices, tool.gone, tool.lies, out)
     return _pushed_out(layer, displacement, touches, out)
 
 
@@ -168,15 +166,15 @@ def _lie(grid, pose, points, inward, way, depth, rests, pressure, gone, lies):
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _lay(grid, pose, points, vertices, rests, pressure, near, out):
-    """Moves vertices that press and are near a tool's surface onto it, along its normal; farther ones less, or not."""
-    light = MIN_LYING_PRESSURE * max(pressure.max(), 1e-300) if len(pressure) else 1.0
+def _lay(vertices, gone, lies, out):
+    """Moves vertices along the way that they have gone with a tool by their share of what is missing."""
     for n in range(len(vertices)):
-        v, lies = vertices[n], rests[n] * _clipped(pressure[n] / light - 0.5)
-        for _ in range(2 if lies > 0 else 0):
-            phi, a, b, c = _jet(grid, pose, points[v], out[v])
-            share = lies * _clipped(2.0 - abs(phi) / near) * phi / max(a * a + b * b + c * c, 0.25)
-            out[v, 0], out[v, 1], out[v, 2] = out[v, 0] - share * a, out[v, 1] - share * b, out[v, 2] - share * c
+        v, size, missing = vertices[n], 0.0, 0.0
+        for x in range(3):
+            size += gone[n, x] ** 2
+            missing += gone[n, x] * (gone[n, x] - out[v, x])
+        for x in range(3 if size > 0 else 0):
+            out[v, x] += lies[n] * missing / size * gone[n, x]
 
 
 @numba.njit(inline="always")

@@ -96,11 +96,14 @@ class Points:
         rows: figures of each vertex, laid out as POINT, (N, POINT.size) float32.
         motion: displacement over the local thickness in the vertex's frame, (N, 3) float32 [-].
         weight: local thickness over the sample's largest displacement, (N,) float32.
+        light: rows of contacts just begun, (M, POINT.size) float32: finite elements do not know them well enough to be
+            learnt from, but they are within what a network may be asked; there the linear motion is nearly all.
     """
 
     rows: np.ndarray
     motion: np.ndarray
     weight: np.ndarray
+    light: np.ndarray
 
 
 def draw_points(data: Dataset, settings: MomentTraining, on_progress: OnProgress, law: Weights | None = None) -> Points:
@@ -110,18 +113,21 @@ def draw_points(data: Dataset, settings: MomentTraining, on_progress: OnProgress
     total, done = sum(map(len, subsets)), 0
     rows = np.empty((total * settings.points, (STACK_POINT if stacked(data) else POINT).size), np.float32)
     motion, weight = np.empty((len(rows), 3), np.float32), np.empty(len(rows), np.float32)
-    end, near, last = 0, None, None
+    end, near, last, light = 0, None, None, [np.empty((0, rows.shape[1]), np.float32)]
     for subset in subsets:
         for sample in as_asked(subset, stacked(data), settings.stick, law):
             if near is None or sample.layer is not last:
                 near, last = Surroundings.of(sample.layer), sample.layer
             row, moved, scale = _points(near, sample.layer, sample.load, sample.displacement, settings.points, rng)
+            done += 1
+            if settings.stick and sample.info["ratio"] < STUCK_FROM:
+                light.append(row.astype(np.float32))
+                continue
             here = slice(end, end := end + len(row))
             rows[here], motion[here], weight[here] = row, moved, scale
-            done += 1
             if done % 50 == 0 or done == total:
                 on_progress(done, total, "drawing points")
-    return Points(rows[:end], motion[:end], weight[:end])
+    return Points(rows[:end], motion[:end], weight[:end], np.concatenate(light))
 
 
 def stacked(data: Dataset) -> bool:
@@ -142,7 +148,7 @@ def as_asked(samples: Iterable[Sample], stacks: bool, stick: bool, law: Weights 
 
 
 def laid(samples: Iterable[Sample], law: Weights | None) -> Iterator[Sample]:
-    """Contacts of samples, not just now begun, with the pressure and the linear motion that follow from their poses."""
+    """Contacts of samples with the pressure and the linear motion that follow from their poses."""
     toucher = None
     for one in pressed(samples):
         layer = one.sample.layer
@@ -153,10 +159,9 @@ def laid(samples: Iterable[Sample], law: Weights | None) -> Iterator[Sample]:
         (touch,) = toucher.touch_all([Contact(one.tool, one.pose)])
         if touch.pressed is None or touch.pressure is None or not touch.force > 0:
             continue
-        if one.sample.info["ratio"] >= STUCK_FROM:
-            told = replace(touch, pressed=touch.pressed._replace(way=one.way))
-            motion = stuck_motion(Green.of(layer), [told])
-            yield one.sample._replace(load=Load.contact(touch.pressure / touch.pressed.factor, motion))
+        told = replace(touch, pressed=touch.pressed._replace(way=one.way))
+        motion = stuck_motion(Green.of(layer), [told])
+        yield one.sample._replace(load=Load.contact(touch.pressure / touch.pressed.factor, motion))
 
 
 def stuck(samples: Iterable[Sample]) -> Iterator[Sample]:
@@ -375,7 +380,7 @@ def fit(points: Points, settings: MomentTraining, out: Path, on_progress: OnProg
             checkpoint.with_suffix(".tmp").replace(checkpoint)
             saved = time.monotonic()
     low, high = model.low, model.high
-    model.take_seen(rows)
+    model.take_seen(torch.cat([rows, torch.from_numpy(points.light)]))
     model.low, model.high = low, high
     return model
 
@@ -482,6 +487,8 @@ def calibrate(data: Dataset, weights: Weights, settings: MomentTraining, on_prog
     for subset in subsets:
         some = (subset[k] for k in range(0, len(subset), max(1, total // limit)))
         for sample in as_asked(some, stacked(data), settings.stick, law):
+            if settings.stick and sample.info["ratio"] < STUCK_FROM:
+                continue
             if sample.layer is not layer:
                 layer = sample.layer
                 method.prepare(layer)

@@ -27,6 +27,7 @@ def mean(some: list[Row], name: str, strange: bool = True) -> float:
 def test_strange_tools_press_and_move_the_skin_as_finite_elements_say(nodewise: list[Row]) -> None:
     assert len([one for one in nodewise if one.strange]) > 85
     assert mean(nodewise, "force_error") < 0.03 and mean(nodewise, "moving") < 0.03
+    assert max(one.moving for one in nodewise if one.strange) < 0.085
     assert np.median([one.moving for one in nodewise if one.strange]) < 0.028
 
 
@@ -36,4 +37,6 @@ def test_skin_that_goes_with_nodes_is_a_quarter_less_off_than_with_vertices(node
 
 def test_bounds_cover(nodewise: list[Row]) -> None:
     assert np.mean([abs(one.force_error) <= one.force_bound for one in nodewise]) > 0.95
-    assert np.mean([one.worst <= one.motion_bound for one in nodewise]) > 0.93
+    covered = np.array([one.worst <= one.motion_bound for one in nodewise])
+    strange = np.array([one.strange for one in nodewise])
+    assert covered[strange].mean() >= 0.95 and covered.mean() > 0.9  # one of the known came at 17 degrees
