@@ -10,7 +10,8 @@ from stmpl_core.methods import MomentNet, Winkler
 from stmpl_core.nodes import Nodes
 from stmpl_core.sdf import SignedDistance
 from stmpl_core.stick import stuck_motion
-from tests.scenes import RADIUS, at, ball, limb, placed, plate, turn
+from studies.stability.contact_axes import PRESSED
+from tests.scenes import LENGTH, RADIUS, THICKNESS, at, ball, limb, placed, plate, turn
 
 LIMB = limb(4e-3, 7e-3, youngs_modulus=2e3, poisson_ratio=0.38)
 
@@ -96,3 +97,21 @@ def test_a_method_that_knows_no_sticking_skin_is_asked_for_pressures_alone() -> 
     for method in (Winkler(), MomentNet(sticks=False)):
         answer = Simulator(LIMB, method).step([contact])
         assert answer.trust.figures["conformed_m"] > 0 and np.isfinite(answer.displacement).all()
+
+
+@pytest.mark.parametrize("name", ["ball", "box"])
+def test_nothing_jumps_while_a_tool_slides_and_no_first_touch_is_flagged(name: str) -> None:
+    """By 2 um at a time, beside a box's walls too; and 0.01 t deep."""
+    simulator = Simulator(limb(4e-3), MomentNet())
+    tool, half = PRESSED[name]
+    before = None
+    for k in range(60):
+        pose = at(RADIUS + half - 0.3 * THICKNESS, 0, LENGTH / 2 + k * 2e-6)
+        answer = simulator.step([Contact(tool, pose)])
+        if before is not None:
+            assert np.linalg.norm(answer.displacement - before, axis=1).max() < 5e-3 * answer.magnitude.max()
+        before = answer.displacement
+    top = simulator.layer.vertices[np.abs(simulator.layer.vertices[:, 2] - LENGTH / 2).argmin()]
+    first = top * [1 + (half - 0.01 * THICKNESS) / RADIUS, 1 + (half - 0.01 * THICKNESS) / RADIUS, 1]
+    answer = simulator.step([Contact(tool, at(*first) @ turn((0, 0, 1), float(np.arctan2(top[1], top[0]))))])
+    assert answer.magnitude.max() > 0 and answer.trust.in_range, answer.trust.why
