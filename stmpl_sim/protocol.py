@@ -25,9 +25,11 @@ from stmpl_core.simulator import Simulator
 from stmpl_core.skin import Skin
 from stmpl_core.state import State
 from stmpl_core.tool import Tool
-from stmpl_core.touch import APART, Answer, Touch
+from stmpl_core.touch import APART, IN_CORE, Answer, Touch
 
+WAY_THROUGH = 0.5  # way of a tool, over the thickness, from which it may have gone through the limb
 FAR_HOLES = 3.0  # distance of a tool from the skin, over a hole of the mesh, from which the contact law is not asked
+WENT_THROUGH = "{name} went through the body, and is pushed out on a side that it did not come from"
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,6 +73,8 @@ class Memory:
         free: way that each tool that is apart may go before it may touch, by name [m].
         asked: step at which the contact law was asked last; None: it must be asked now.
         waited: time since that step [s].
+        pushes: way in which each tool that presses pushed last while it was not in the core, unit vector (3,), by name.
+        through: names of tools that went through the body and have not been apart since.
     """
 
     tissue: State = field(default_factory=State)
@@ -79,6 +83,8 @@ class Memory:
     free: Mapping[str, float] = field(default_factory=dict)
     asked: Asked | None = None
     waited: float = 0.0
+    pushes: Mapping[str, np.ndarray] = field(default_factory=dict)
+    through: frozenset[str] = frozenset()
 
 
 @dataclass(frozen=True, eq=False)
@@ -177,7 +183,8 @@ class SoftContact:
         self.pose_body_from_layer = rigid("pose_body_from_layer", np.eye(4) if pose_body_from_layer is None
                                           else pose_body_from_layer)  # fmt: skip
         hole = self.simulator.toucher.hole
-        self._far, self._seen = FAR_HOLES * hole, hole + float(self.simulator.layer.thickness.max())
+        self._thickest = float(self.simulator.layer.thickness.max())
+        self._far, self._seen = FAR_HOLES * hole, hole + self._thickest
         self._tree = KDTree((self.simulator.skin.rest or self.simulator.skin).layer.vertices)
         self._balls = {}
         for tool in tools:
@@ -248,6 +255,9 @@ class SoftContact:
                 if not _has_imprint(memory.tissue, name)}  # fmt: skip
         near = [Contact(self.tools[name], pose) for name, pose in at.items() if not free.get(name, 0.0) > 0]
         found, tissue = self.simulator.touch(near, memory.tissue, memory.waited + dt)
+        through = frozenset(touch.name for touch in found if self._went_through(touch, at[touch.name], memory))
+        found = [replace(touch, trust=touch.trust.also(WENT_THROUGH.format(name=touch.name), in_range=False))
+                 if touch.name in through else touch for touch in found]  # fmt: skip
         hole, seen, models = self.simulator.toucher.hole, self._seen, {}
         free |= {touch.name: min(-touch.depth, seen) - hole for touch in found if touch.status == APART}
         if self.every > 1 or (self.implicit and dt > 0):
@@ -256,7 +266,22 @@ class SoftContact:
             models = {touch.name: model for touch, model in zip(pressing, made, strict=True)}
         by_name = {touch.name: touch for touch in found}
         touches = {name: by_name.get(name) or Touch(name, APART, pose, np.zeros(6)) for name, pose in at.items()}
-        return touches, Memory(tissue, at, free=free, asked=Asked(at, touches, models))
+        return touches, Memory(tissue, at, free=free, asked=Asked(at, touches, models),
+                               pushes=_pushes(found, memory), through=through)  # fmt: skip
+
+    def _went_through(self, touch: Touch, pose: Transform, memory: Memory) -> bool:
+        """Whether a tool presses on skin that it came to through the body; pose: of now, layer axes.
+
+        It moved out of the skin that it presses by more than it was deep in any; or it was deep, and came from the
+        other side.
+        """
+        force, asked = touch.force, memory.asked
+        if not force > 0 or asked is None or touch.name in memory.through:
+            return force > 0 and touch.name in memory.through
+        before, push = asked.touches[touch.name], touch.push / force
+        deep, far = max(before.depth, 0.0) if before.presses else 0.0, WAY_THROUGH * self._thickest
+        out = -float((pose - asked.at[touch.name])[:3] @ np.append(self._balls[touch.name][0], 1.0) @ push)
+        return out > deep + far or (out > 0 and deep > far and memory.pushes.get(touch.name, push) @ push < 0)
 
     def _between(self, at: Mapping[str, Transform], memory: Memory, dt: float
                  ) -> tuple[dict[str, Touch], Memory] | None:  # fmt: skip
@@ -279,7 +304,8 @@ class SoftContact:
                 return None
             touches[name] = replace(touch, wrench=rendered.wrench, pose_body_from_tool=there)
         later = replace(asked, steps=asked.steps + 1)
-        return touches, Memory(memory.tissue, at, free=free, asked=later, waited=memory.waited + dt)
+        return touches, Memory(memory.tissue, at, free=free, asked=later, waited=memory.waited + dt,
+                               pushes=memory.pushes, through=memory.through)  # fmt: skip
 
     def pose(self, joints: Mapping[str, float], memory: Memory) -> Memory:
         """Takes the skin to where its joints are now (milliseconds); the memory, gone along with it.
@@ -294,7 +320,8 @@ class SoftContact:
         before = self.simulator.skin
         tissue = self.simulator.pose(joints, memory.tissue)
         at = {name: carry_at(before, self.simulator.skin, pose[:3, 3]) @ pose for name, pose in memory.at.items()}
-        return Memory(tissue, at, memory.speed, waited=memory.waited)
+        return Memory(tissue, at, memory.speed, waited=memory.waited, pushes=memory.pushes,
+                      through=memory.through)  # fmt: skip
 
     def answer(self, reaction: Reaction) -> Answer:
         """The displacement of the skin under a reaction of this contact, layer axes."""
@@ -365,6 +392,13 @@ def _has_imprint(tissue: State, name: str) -> bool:
     """Whether the tissue has not yet come back from where this tool pressed."""
     known = tissue.tools.get(name)
     return known is not None and known.scalars.sunk
+
+
+def _pushes(touches: Sequence[Touch], memory: Memory) -> dict[str, np.ndarray]:
+    """The `pushes` of the next memory."""
+    now = {touch.name: touch.push / touch.force for touch in touches if touch.force > 0}
+    kept = {touch.name for touch in touches if touch.status == IN_CORE} & set(memory.pushes)
+    return now | {name: memory.pushes[name] for name in kept}
 
 
 def _pressing(touch: Touch) -> Wrench:

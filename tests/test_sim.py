@@ -6,9 +6,10 @@ from typing import Any
 
 import numpy as np
 import pytest
+import trimesh
 from scipy.spatial.transform import Rotation
 
-from stmpl_core import Contact, Simulator, SoftLayer, State, Touch
+from stmpl_core import Contact, Simulator, SoftLayer, State, Tool, Touch
 from stmpl_core.errors import InvalidInput
 from stmpl_core.methods import MomentNet, Winkler
 from stmpl_core.touch import APART
@@ -155,6 +156,41 @@ def test_a_tool_that_was_apart_a_step_ago_is_asked_about_where_it_may_touch() ->
         touching += touch.presses
         left += memory.free.get(tool.name, 0.0) > 0
     assert touching > 50 and left > 100  # both happened
+
+
+@pytest.mark.parametrize("way_m", [0.004, 0.011, 0.03, 0.07, 0.105])
+def test_a_tool_that_flew_through_the_limb_is_flagged_until_it_is_apart(way_m: float) -> None:
+    contact, found = SoftContact(Simulator(limb(5e-3), Winkler()), [ball(0.012)]), 0
+    for start in np.linspace(0.0, 1.0, 5):
+        memory, flagged = Memory(), []
+        for x in np.arange(0.051 + way_m * start, -0.07, -way_m):
+            reaction = contact.step(Poses(np.eye(4), {"probe": pose(x, 0.004, 0.08)}), memory, 1e-3)
+            touch, memory = reaction.touches["probe"], reaction.memory
+            if touch.force > 0 and abs(x) > 0.02:
+                flagged.append((touch.push[0] > 0, "went through" in touch.trust.why))  # pushed in from the far side
+            assert touch.trust.ok or abs(x) < 0.06
+        assert all(far == told for far, told in flagged)
+        found += sum(far for far, _ in flagged)
+        for x in (-0.08, -0.05):  # apart, and back from where it is now
+            reaction = contact.step(Poses(np.eye(4), {"probe": pose(x, 0.004, 0.08)}), memory, 1e-3)
+            memory = reaction.memory
+        assert reaction.touches["probe"].force > 0 and reaction.touches["probe"].trust.ok
+    assert found > 0
+
+
+def test_what_goes_in_and_out_or_holds_from_two_sides_did_not_go_through() -> None:
+    simulator = Simulator(limb(5e-3), Winkler())
+    round_it = Tool("ring", *(lambda made: (made.vertices, made.faces))(
+        trimesh.creation.annulus(LIMB_RADIUS + 0.001, LIMB_RADIUS + 0.012, 0.02)))  # fmt: skip
+    for one, ways in ((ball(0.012), LIMB_RADIUS + 0.012 - np.array([0, 6, 1, 7, 9, 2, -1, 9, 4, -5, 8, 0]) * 1e-3),
+                      (round_it, 1e-3 * np.array([0, 3, -3, 5, -5, 6, 0, -6, 4]))):
+        contact, memory, sides = SoftContact(simulator, [one]), Memory(), set()
+        for x in ways:
+            reaction = contact.step(Poses(np.eye(4), {one.name: pose(x, 0.0, 0.08)}), memory, 1e-3)
+            touch, memory = reaction.touches[one.name], reaction.memory
+            assert "went through" not in touch.trust.why
+            sides |= {np.sign(touch.push[0])} if touch.force > 0 else set()
+        assert len(sides) == 1 + (one is round_it)  # a ring presses from either side
 
 
 def test_poses_that_cannot_be_used_are_one_sentence(simulator: Simulator) -> None:
