@@ -118,7 +118,7 @@ def main() -> None:
             cells.append(f"{median:12.2f} ({p99:7.2f})")
         feel = len(asked.vertices) + len(asked.between)
         print(f"{name:24} {len(load.loaded):8} {feel:8} {len(asked.vertices):8} " + "".join(f"{c:>22}" for c in cells))
-        sources = parts.source_fields(load.values, layer.tissue)
+        sources = parts.source_fields(load.values, layer.tissue, load.loaded)
         median, _ = timed(lambda s=sources, a=asked: net._near.felt(s, a), options.seconds / 3)  # type: ignore[union-attr]
         print(f"    of that, feeling the load: {median:.2f} ms", flush=True)
     ours, _ = timed(lambda: net.solve(loads["disc, 20 mm"]), options.seconds)

@@ -159,11 +159,6 @@ def shifted(pose: Transform, by: np.ndarray) -> Transform:
     return out
 
 
-def depth_along(field: SignedDistance, pose: Transform, points: Points, way: Points, guess: np.ndarray) -> np.ndarray:
-    """Way of points (N, 3) along unit vectors (N, 3) out of a tool, (N,) [m], from a guess > 0."""
-    return _depths_along(grid_of(field), pose, points, np.ascontiguousarray(way), guess)
-
-
 def grid_of(field: SignedDistance) -> tuple[np.ndarray, np.ndarray, float]:
     """What kernels take of a distance field: coefficients, origin and spacing."""
     return field.coefficients, field.origin, field.spacing
@@ -322,14 +317,6 @@ def _sinking(grid, pose, points, inward, thickness, area, strain):
         ray = ray_from(pose, points[n, 0], points[n, 1], points[n, 2], way[0], way[1], way[2])
         depth[n] = min(depth_in_column(grid, ray, 4 * guess, guess) * cosine, depth[n])
     return depth
-
-
-@numba.njit(cache=True, nogil=True)
-def _depths_along(grid, pose, points, way, guess):
-    out = np.empty(len(points))
-    for n in range(len(points)):
-        out[n] = depth_in_column(grid, ray_of(pose, points, way, n), 4 * guess[n], guess[n])
-    return out
 
 
 @numba.njit(cache=True, nogil=True)

@@ -28,16 +28,14 @@ from stmpl_core.coarse_response import CoarseDrag, CoarseResponse
 from stmpl_core.layer import SoftLayer
 from stmpl_core.moments import Surroundings
 from stmpl_core.nodes import Nodes
+from stmpl_core.nodewise import FIRST_LOG, REACH, SPREADS, STEP_LOG, Packed
 from stmpl_core.response import FAST, SPREAD
 from stmpl_core.softness import BANK, Softness
 from stmpl_core.stack import Effective, along, compliance, effective, hardening
 from stmpl_core.tissue import Tissue
 
-REACH = 8.0  # distance beyond which the flat response is not felt, over t
 ROWS = 64  # rows of the tables over the root of the distance
-SPREADS = np.geomspace(0.004, 1.6, 16)  # widths of a node's force that are tabled, over t
 TABLED = np.geomspace(1e-5, 10 / SPREADS[0], 3000)  # wave numbers at which a stack's response is known [1/t]
-FIRST_LOG, STEP_LOG = float(np.log(SPREADS[0])), float(np.log(SPREADS[1] / SPREADS[0]))
 ROUND = float(np.sqrt(2 / np.pi))  # of a Gaussian that is as wide, 1 / r in its middle is 1 / (ROUND s)
 FARTHEST = float(np.sqrt(REACH * 0.9999)) * ROWS  # place in the tables of the largest distance
 AREAS = 33  # logarithms of the widths of a tool's nodes
@@ -64,8 +62,8 @@ class _OfOne(NamedTuple):
         origin: what is taken off all places, (3,) [m].
         points: the vertices, less that, (V, 3) float32 [m].
         inward: unit vectors into the skin, (V, 3) float32.
-        roots: roots of the thickness, (V,) float32.
-        rows: tables at places between each two spreads, (S, 4, root of the distance) float32.
+        roots: 1 / sqrt(t) of the thickness t, (V,) float32.
+        rows, scales: see Packed, the rows one after the other.
     """
 
     origin: np.ndarray
@@ -73,6 +71,7 @@ class _OfOne(NamedTuple):
     inward: np.ndarray
     roots: np.ndarray
     rows: np.ndarray
+    scales: np.ndarray
 
 
 class Green:
@@ -244,25 +243,16 @@ class Green:
         """
         if self.layer.stacked or guess is None:
             return _held(self._blocks(nodes, group), gone)
-        least, most, float32 = float(nodes.area.min()), float(nodes.area.max()), np.float32
-        range_ = max(most - least, 1e-9 * most)
-        areas = least + range_ * np.arange(nodewise.AREAS) / (nodewise.AREAS - 1)
-        logs = (np.log(SPREAD * np.sqrt(areas)) - FIRST_LOG) / STEP_LOG
-        by = self._by_node(nodes, 0.5 * np.log(nodes.thickness) / STEP_LOG, nodes.area)
-        held = nodewise.blocks(by, group, logs.astype(float32), float32(least), float32((nodewise.AREAS - 1) / range_),
-                               self._of_one.rows)  # fmt: skip
-        return nodewise.approached(held, gone.astype(float32).ravel(), guess.astype(float32).ravel()).reshape(-1, 3)
-
-    def _by_node(self, nodes: Nodes, row: np.ndarray, area: np.ndarray) -> np.ndarray:
-        """Nodes as the kernels of stmpl_core.nodewise take them, (9, N) float32."""
-        places = (nodes.points - self._of_one.origin).T
-        return np.stack([*places, *nodes.inward.T, np.sqrt(nodes.thickness), row, area]).astype(np.float32)
+        one = self._of_one
+        by = nodewise.by_node(nodes.points, nodes.inward, nodes.thickness, nodes.area, one.origin)
+        return nodewise.approached(nodewise.blocks(by, group, one.rows, one.scales), gone, guess)
 
     @cached_property
     def _of_one(self) -> _OfOne:
         layer, origin, float32 = self.layer, self.layer.vertices.mean(axis=0), np.float32
+        rows, scales = _packed(layer.tissue.poisson_ratio)
         return _OfOne(origin, (layer.vertices - origin).astype(float32), -layer.normals.astype(float32),
-                      np.sqrt(layer.thickness).astype(float32), _rows_of_one(layer.tissue.poisson_ratio))  # fmt: skip
+                      (layer.thickness**-0.5).astype(float32), rows.ravel(), scales)  # fmt: skip
 
     def rubbed(self, nodes: Nodes, group: np.ndarray, ways: np.ndarray, pressing: np.ndarray,
                share: float) -> np.ndarray:  # fmt: skip
@@ -339,13 +329,12 @@ class Green:
     def _flat_of_one(self, nodes: Nodes, forces: np.ndarray, vertices: np.ndarray,
                      felt: list[tuple[np.ndarray, np.ndarray]]) -> np.ndarray:  # fmt: skip
         """The same on one material."""
-        ratio, one = np.sqrt(nodes.area) / nodes.thickness, self._of_one
-        by = self._by_node(nodes, (np.log(SPREAD * ratio) - FIRST_LOG) / STEP_LOG, ratio**2)
-        out, given = np.zeros((len(vertices), 3), np.float32), forces.T.astype(np.float32)
+        one, out = self._of_one, np.zeros((len(vertices), 3), np.float32)
         points, inward, roots = one.points[vertices], one.inward[vertices], one.roots[vertices]
         for of, there in felt:
-            nodewise.add_motion(out, there, points, inward, roots, by.compress(of, axis=1), given.compress(of, axis=1),
-                                one.rows)  # fmt: skip
+            some = nodes if of.all() else nodes.some(of)
+            by = nodewise.by_node(some.points, some.inward, some.thickness, some.area, one.origin)
+            nodewise.add_motion(out, there, points, inward, roots, by, forces[of], one.rows, one.scales)
         return out
 
     def _add_coarse(self, motion: np.ndarray, out: np.ndarray) -> None:
@@ -375,11 +364,8 @@ def _of_one(poisson_ratio: float) -> np.ndarray:
 
 
 @cache
-def _rows_of_one(poisson_ratio: float) -> np.ndarray:
-    """The same at places between each two spreads, (S, 4, root of the distance) float32."""
-    place = (np.arange(nodewise.FINER * (len(SPREADS) - 1)) + 0.5) / nodewise.FINER
-    low, share, tables = place.astype(int), (place % 1)[:, None, None], np.moveaxis(_of_one(poisson_ratio)[0], 1, 0)
-    return ((1 - share) * tables[low] + share * tables[low + 1]).astype(np.float32)
+def _packed(poisson_ratio: float) -> Packed:
+    return Packed.of(_of_one(poisson_ratio)[0], ROWS)
 
 
 @lru_cache(maxsize=4)  # coarse elements and their layer ask for the same

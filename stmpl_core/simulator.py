@@ -165,8 +165,8 @@ class Simulator:
     def answer(self, touches: Sequence[Touch]) -> Answer:
         """Finds the displacement of the skin under touches of this simulator, made where its joints are now."""
         # Sum: pressures of several tools add.
-        zero = np.zeros(len(self.layer.vertices))
-        pressure = sum((touch.pressure for touch in touches if touch.pressure is not None), zero)
+        pressing = [touch.pressure for touch in touches if touch.pressure is not None]
+        pressure = sum(pressing[1:], pressing[0]) if pressing else np.zeros(len(self.layer.vertices))
         moves = self.history.elastic(touches)
 
         # Solve: the method moves the skin, and what is touched lies on its tool; where nothing presses, nothing moves.
@@ -263,7 +263,7 @@ class Simulator:
 
 def _summed(pressed: Sequence[tuple[PerVertex, Pressed]]) -> PerVertex:
     """Pressure of all tools that moves skin, (V,) [Pa]."""
-    first, *others = (values / one.factor for values, one in pressed)
+    first, *others = (values if one.factor == 1 else values / one.factor for values, one in pressed)
     return sum(others, first)
 
 

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+import numba
 import numpy as np
 
 from stmpl_core.arrays import VertexVectors
-from stmpl_core.columns import depth_along
+from stmpl_core.columns import grid_of
 from stmpl_core.green import ONE_WAY, Green
 from stmpl_core.nodes import Nodes
 from stmpl_core.obstacle import solve
+from stmpl_core.rays import depth_in_column, ray_of
 from stmpl_core.touch import Pressed, Touch, way_of
 
 FURTHEST = 1.5  # way of a node over its depth along the tool's way: beside a wall it is not clear where that ends
@@ -50,6 +52,18 @@ def _gone(touch: Touch, pressed: Pressed, areas: np.ndarray) -> np.ndarray:
     nodes = pressed.squeeze.nodes
     assert touch.pressure is not None
     way = way_of(touch, pressed, nodes.inward, float(touch.pressure @ areas))
-    depth = nodes.strain * nodes.thickness / np.maximum(np.einsum("ni,ni->n", nodes.inward, way), ONE_WAY)
-    far = depth_along(pressed.field, touch.pose_body_from_tool, nodes.points, way, depth)
-    return np.minimum(far, FURTHEST * depth)[:, None] * way
+    return _along(grid_of(pressed.field), touch.pose_body_from_tool, nodes.points, nodes.inward, way, nodes.strain,
+                  nodes.thickness)  # fmt: skip
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _along(grid, pose, points, inward, way, strain, thickness):
+    """Way of nodes (N, 3) along unit vectors (N, 3) out of a tool, (N, 3) [m]."""
+    out = np.empty((len(points), 3))
+    for n in range(len(points)):
+        cosine = inward[n, 0] * way[n, 0] + inward[n, 1] * way[n, 1] + inward[n, 2] * way[n, 2]
+        depth = strain[n] * thickness[n] / max(cosine, ONE_WAY)
+        far = min(depth_in_column(grid, ray_of(pose, points, way, n), 4 * depth, depth), FURTHEST * depth)
+        for x in range(3):
+            out[n, x] = far * way[n, x]
+    return out

@@ -177,7 +177,7 @@ def way_of(touch: Touch, pressed: Pressed, inward: np.ndarray, total: float) -> 
     one = touch.push / touch.force
     if pressed.way is not None and pressed.way @ one > MIN_ONE_WAY_SHARE:
         one = pressed.way
-    return np.tile(one, (len(inward), 1))
+    return np.full(inward.shape, one)
 
 
 @dataclass(frozen=True, eq=False)

@@ -175,7 +175,7 @@ def stuck(samples: Iterable[Sample]) -> Iterator[Sample]:
 def _points(near: Surroundings, layer: SoftLayer, load: Load, displacement: np.ndarray, count: int,
             rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:  # fmt: skip
     unit = unit_of(Green.of(layer)) if layer.stacked else layer.tissue
-    sources = source_fields(load.pressure_on(layer), unit)
+    sources = source_fields(load.pressure_on(layer), unit, load.loaded)
     felt = near.felt(sources)
     if load.motion is not None:
         take_linear(felt.figures, near, felt.vertices, load.motion)

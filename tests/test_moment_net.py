@@ -231,7 +231,7 @@ def test_the_method_computes_what_was_trained() -> None:
     torch.nn.init.normal_(model.layers[-1].weight, std=0.1)  # type: ignore[arg-type]
     layer = limb()
     load = pad(layer, 0.7)
-    near, sources = Surroundings(layer), source_fields(load.values, layer.tissue)
+    near, sources = Surroundings(layer), source_fields(load.values, layer.tissue, load.loaded)
     felt = near.felt(sources)
     v = felt.vertices
     constants = np.tile([layer.tissue.poisson_ratio, 0.0], (len(v), 1))

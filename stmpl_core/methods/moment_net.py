@@ -146,8 +146,8 @@ class MomentNet:
             numba.set_num_threads(before)
 
     def _solve(self, layer: SoftLayer, near: Surroundings, load: Load, pressure: np.ndarray) -> Displacement:
-        sources = source_fields(pressure, self._unit)
-        asked = near.asked_again(load.loaded)
+        loaded = load.loaded
+        sources, asked = source_fields(pressure, self._unit, loaded), near.asked_again(loaded)
         felt = near.felt(sources, asked, linear=load.motion is None and self._green is None)
         vertices, figures = felt.vertices, felt.figures
         weights = self.contact if load.kind == "contact" else self.weights
@@ -171,7 +171,8 @@ class MomentNet:
 
         # Three hidden layers.
         outputs = np.empty((len(some), MOTION.size), dtype=np.float32)
-        think(inputs, a["w1"], a["b1"], a["w2"], a["b2"], a["w3"], a["b3"], a["w4"], a["b4"], outputs)
+        through = think if self.threads > 1 else think_few
+        through(inputs, a["w1"], a["b1"], a["w2"], a["b2"], a["w3"], a["b3"], a["w4"], a["b4"], outputs)
 
         # Each vertex moves along its normal and along the directions of what is around it.
         moved, error = np.empty((len(vertices), 3)), np.zeros(len(vertices), dtype=np.float32)
@@ -286,10 +287,15 @@ def of_stack(green: Green, vertices: np.ndarray, peak: float) -> np.ndarray:
     return out
 
 
-def source_fields(pressure: np.ndarray, tissue: Tissue) -> np.ndarray:
-    """The two fields that a vertex feels: p / E, and the strain of a confined column times M / E, (V, 2) [-]."""
+def source_fields(pressure: np.ndarray, tissue: Tissue, loaded: np.ndarray) -> np.ndarray:
+    """The two fields that a vertex feels: p / E, and the strain of a confined column times M / E, (V, 2) [-].
+
+    Args:
+        pressure: pressure at each vertex, (V,) [Pa].
+        tissue: material of the columns.
+        loaded: numbers of the vertices where it is not 0, (L,).
+    """
     sources = np.zeros((len(pressure), 2), dtype=np.float32)
-    loaded = np.flatnonzero(pressure != 0)
     sources[loaded, 0] = pressure[loaded] / tissue.youngs_modulus
     strain = 1 - column_stretch(pressure[loaded], tissue)
     sources[loaded, 1] = strain * (tissue.confined_modulus / tissue.youngs_modulus)
