@@ -61,6 +61,7 @@ MAX_FIELD_ERROR_M = 5e-4  # error of a distance field that is not yet worth a wo
 MUCH_STIFFER = 50.0  # stiffness over that of the tissue above from which a material is nearly bone: people's are below
 SOFT_SHARE = 0.7  # depth over the soft tissue's there; at 0.62 force is 9 % off, at 0.87 by 18 to 33 %
 RATIOS_APART = 0.06  # difference of the materials' Poisson's ratios: 0.05 cost nothing, of 0.1 force is 15 % off
+MAX_PULL = 1.0  # T / (E t) of the effective layer: beyond, force on round limbs is up to 14 % too small; people's is 0.7
 PINS = 3  # tools side by side from which they may be pins of one brush
 SIDES = (0.2, 0.8)  # share of the force that points one way: below, a tool closes around; between, its drag counts
 MAX_UNSEEN_FORCE_SHARE = 0.1  # share of the force that vertices unlike all training contacts may carry
@@ -130,6 +131,7 @@ class Toucher:
         self._thickest = float(layer.thickness.max())
         self._inward, self.deep = self.columns.inward, Deep(self.columns)
         self._soft = soft_depth(layer.tissue)
+        self._pull = Green.of(layer).effective.pull if layer.tissue.skin is not None else 0.0
         self._ratios = {layer.tissue.poisson_ratio, *(ply.poisson_ratio for ply in layer.tissue.deeper)}
 
     def give(self, nodes: Nodes, forces: np.ndarray) -> np.ndarray | None:
@@ -442,6 +444,9 @@ class Toucher:
         if (apart := max(self._ratios) - min(self._ratios)) > RATIOS_APART:
             trust = trust.also(f"Poisson's ratios of the materials differ by {apart:.2g}; tried is {RATIOS_APART:g}",
                                in_range=False)  # fmt: skip
+        if self._pull > MAX_PULL:
+            trust = trust.also(f"the skin's tension is {self._pull:.2g} times E t of the tissue under it; tried is "
+                               f"{MAX_PULL:g}", in_range=False)  # fmt: skip
         if strange > MAX_UNSEEN_FORCE_SHARE:
             trust = trust.also(f"{strange:.0%} of the force of {name} is where no training contact was like it",
                                in_range=False)  # fmt: skip
