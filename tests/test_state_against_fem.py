@@ -107,7 +107,7 @@ def test_bound_on_the_motion_covers_a_slide(name: str) -> None:
     method = MomentNet()
     stroke = Stroke(name, method)
     simulator = stroke.simulator
-    known, touches = simulator.method.contact_bound, stroke.played()
+    known, touches = simulator.method.stick_bound, stroke.played()
     assert stroke.moved is not None
     for pose, truth in zip(MOVED, stroke.moved, strict=True):
         touch = [touches[pose]]

@@ -54,7 +54,7 @@ class MomentNet:
         stack: weights for that on a stack, or on columns that run to bone, given likewise. Other loads on these are
             answered by LimbLinear.
         sticks: choice of a simulator: it tells that linear motion under contacts of few nodes. False: it never does on
-            one material; fields take 0.6 to 0.9 of the time and are nearly twice as far off.
+            one material; fields take 0.8 to 1.1 of the time and are nearly twice as far off.
         fallback: method that answers loads outside the range that the network was trained on; None: the network's
             answer is given, and flagged.
         threads: number of threads of the kernels. Two are nearly twice as fast where two cores are idle, and stall for
