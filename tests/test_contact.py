@@ -543,7 +543,7 @@ def test_pins_that_are_tools_of_their_own_are_flagged_like_those_of_one(depth, c
     assert sound or all("pins of 2.2 mm radius" in touch.trust.why for touch in touches)
 
 
-@pytest.mark.parametrize("opening, sound", [(60, False), (170, True)])
+@pytest.mark.parametrize("opening, sound", [(60, False), (120, False), (150, True)])
 def test_a_block_whose_walls_press_from_several_sides_is_flagged(opening: float, sound: bool) -> None:
     """Finite elements: one of 60 degrees, pushed straight, presses 2.5 times as hard as is said, by its walls' drag."""
     walls, half = [], np.radians(opening / 2)
