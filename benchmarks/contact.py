@@ -11,10 +11,8 @@ twenty are of kinds that no training contact had. What finite elements answered 
 from __future__ import annotations
 
 import argparse
-import io
 import json
 import time
-import zipfile
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -30,6 +28,7 @@ from benchmarks.tools import ball, block_letter, fingertip, flat
 from fem_tools.indenter import IndenterFem
 from fem_tools.patch import PatchFem
 from fem_tools.press import Press
+from fem_tools.released import write_arrays
 from fem_tools.scenes import Site
 from stmpl_core.body import Body
 from stmpl_core.contact import Contact
@@ -188,22 +187,19 @@ def truths(scene: Scene, layer: SoftLayer, fem: IndenterFem | None = None, folde
 
 def release(every: Sequence[tuple[Scene, list[Truth]]]) -> None:
     """Writes what FEM answered, rounded to a thousandth of each peak, for `truths`."""
-    with zipfile.ZipFile(RELEASED, "w", zipfile.ZIP_LZMA) as file:
-        for scene, some in every:
-            units = np.array([float(np.abs(one.displacement).max()) / STEPS for one in some])
-            columns = {
-                "depth": np.array([one.depth for one in some]),
-                "forces": np.array([one.forces for one in some]),
-                "pressure": np.array([one.pressure for one in some], np.float16),
-                "unit": units,
-                "moved": np.array([np.round(one.displacement / unit) for one, unit in zip(some, units, strict=True)],
-                                  np.int16),
-            }  # fmt: skip
-            for column, values in columns.items():
-                buffer = io.BytesIO()
-                np.lib.format.write_array(buffer, values)
-                name = zipfile.ZipInfo(f"{scene.name.replace(' ', '_')}/{column}.npy")
-                file.writestr(name, buffer.getvalue(), zipfile.ZIP_LZMA)
+    arrays: dict[str, np.ndarray] = {}
+    for scene, some in every:
+        units = np.array([float(np.abs(one.displacement).max()) / STEPS for one in some])
+        moved = [np.round(one.displacement / unit) for one, unit in zip(some, units, strict=True)]
+        columns = {
+            "depth": np.array([one.depth for one in some]),
+            "forces": np.array([one.forces for one in some]),
+            "pressure": np.array([one.pressure for one in some], np.float16),
+            "unit": units,
+            "moved": np.array(moved, np.int16),
+        }
+        arrays |= {f"{scene.name.replace(' ', '_')}/{column}": values for column, values in columns.items()}
+    write_arrays(RELEASED, arrays)
 
 
 def arm(edge: float = 3e-3) -> SoftLayer:

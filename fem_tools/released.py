@@ -47,12 +47,17 @@ def write(path: str | Path, plan: Plan, layers: Mapping[str, SoftLayer],
             arrays[f"{body}/{name}_count"] = np.array([len(one) for one in columns[name]], np.int32)
     header = {"format": FORMAT, "plan": plan.model_dump(mode="json"), "figures": FIGURES, "contacts": contacts}
     arrays["header"] = np.frombuffer(json.dumps(header).encode(), np.uint8)
+    write_arrays(path, arrays)
+    return count
+
+
+def write_arrays(path: str | Path, arrays: Mapping[str, np.ndarray]) -> None:
+    """Writes arrays to an .npz file, in the order of their names, as small as numpy can read: the same to the bit."""
     with zipfile.ZipFile(path, "w", zipfile.ZIP_LZMA) as file:
         for name, values in sorted(arrays.items()):
             buffer = io.BytesIO()
             np.lib.format.write_array(buffer, np.ascontiguousarray(values))
             file.writestr(zipfile.ZipInfo(f"{name}.npy"), buffer.getvalue(), zipfile.ZIP_LZMA)
-    return count
 
 
 def _small(values: np.ndarray) -> np.ndarray:
