@@ -108,6 +108,7 @@ class ContactNet:
         self._moduli = np.array([tissue.shear_modulus, tissue.lame_lambda]) / tissue.youngs_modulus
         self._table = response(self._nu)
         self.network, self.unit, self._green = "contact_net", tissue.youngs_modulus, None
+        self._last: tuple[Nodes, tuple[np.ndarray, ...]] | None = None
         if layer.stacked:
             self._green = Green.of(layer)
             one = self._green.effective
@@ -116,7 +117,7 @@ class ContactNet:
     def moved(self, near: Surroundings, green: Green | None) -> ContactNet:
         """The same law where joints take the skin."""
         out = copy(self)
-        out.near, out._green = near, green
+        out.near, out._green, out._last = near, green, None
         return out
 
     @property
@@ -140,11 +141,24 @@ class ContactNet:
         """Solves the linear problem at the nodes, at least one, and gathers what the network reads."""
         group, bent = self.near.groups(nodes.corners[:, 0]), self.near.bent_at(nodes.corners)
         if self._green is None:
-            return Look(*_look(*nodes[:7], group, bent, *self._table, self._moduli, self._nu))
-        matrices = self._green.matrices(nodes, group)
-        return Look(*_look_on_stack(*nodes, group, bent, self._table.rows, self._nu, *matrices,
-                                    self._green.effective.thickness, self._green.numbers,
-                                    *self._green.hardening))  # fmt: skip
+            *seen, matrix, rings, force = _look(*nodes[:7], group, bent, *self._table, self._moduli, self._nu)
+        else:
+            matrix, wide = self._green.matrices(nodes, group)
+            *seen, rings, force = _look_on_stack(*nodes, group, bent, self._table.rows, self._nu, matrix, wide,
+                                                 self._green.effective.thickness, self._green.numbers,
+                                                 *self._green.hardening)  # fmt: skip
+        self._last = nodes, (matrix, rings, force)
+        return Look(*seen)
+
+    def _solved(self, nodes: Nodes) -> tuple[np.ndarray, ...]:
+        """Matrix, rings and forces of the linear problem at the nodes; known after a touch, whose model asks."""
+        last = self._last
+        if last is None or not all(np.array_equal(getattr(last[0], one), getattr(nodes, one))
+                                   for one in ("points", "strain", "sinking")):  # fmt: skip
+            self.look(nodes)
+            last = self._last
+        assert last is not None
+        return last[1]
 
     def hold(self, nodes: Nodes) -> Held:
         """Pressure at contact nodes."""
@@ -166,12 +180,11 @@ class ContactNet:
             strain_rates: rates of their strains in each of K ways, (K, N).
             sinking_rates: rates of their depths [m], or on a stack of `sinking`, likewise.
         """
-        group, bent = self.near.groups(nodes.corners[:, 0]), self.near.bent_at(nodes.corners)
-        rates = strain_rates, sinking_rates
+        bent, solved, rates = self.near.bent_at(nodes.corners), self._solved(nodes), (strain_rates, sinking_rates)
         if self._green is None:
-            return _slopes(*nodes[:7], group, bent, *self._table, self._moduli, self._nu, *rates, *self._network)
-        matrices = self._green.matrices(nodes, group)
-        return _slopes_on_stack(*nodes, group, bent, self._table.rows, self._nu, *matrices,
+            return _slopes(*nodes[:7], bent, *solved, self._moduli, self._nu, *rates, *self._network)
+        wide = self._green.matrices(nodes, self.near.groups(nodes.corners[:, 0]))[1]
+        return _slopes_on_stack(*nodes, bent, *solved, self._nu, wide,
                                 self._green.effective.thickness, self._green.numbers, *self._green.hardening,
                                 *rates, *self._network)  # fmt: skip
 
@@ -184,7 +197,7 @@ def _look(points, inward, thickness, area, strain, corners, shares, group, bent,
     depth = np.minimum(strain, LINEAR_TO) * thickness / mean
     force = solve(matrix, depth)
     seen = _see(rings, points, inward, thickness, area, mean, force, strain, here, moduli, nu)
-    return *seen, power_of(matrix, force, depth.max())
+    return *seen, power_of(matrix, force, depth.max()), matrix, rings, force
 
 
 @numba.njit(cache=True, error_model="numpy")
@@ -208,7 +221,7 @@ def _look_on_stack(points, inward, thickness, area, strain, corners, shares, sin
     seen = _see_on_stack(rings, points, inward, thickness, area, t, force, strain, sinking, here, nu, numbers,
                          log_thickness, hardening, _between(corners, shares, alike)[:, 0],
                          _given_way(matrix, wide, force))  # fmt: skip
-    return *seen, power_of(matrix, force, depth.max())
+    return *seen, power_of(matrix, force, depth.max()), rings, force
 
 
 @numba.njit(cache=True, error_model="numpy")
@@ -263,12 +276,10 @@ def _reached(sinking, strain, sinking_rates, strain_rates, linear_to):
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _slopes(points, inward, thickness, area, strain, corners, shares, group, bent, half_space, rows, moduli, nu,
+def _slopes(points, inward, thickness, area, strain, corners, shares, bent, matrix, rings, force, moduli, nu,
             strain_rates, sinking_rates, low, high, mean, scale, w1, b1, w2, b2, w3, b3, w4, b4):  # fmt: skip
     """See ContactNet.slopes."""
     unit, here = thickness.mean(), _between(corners, shares, bent)
-    matrix, rings = pairs(points, inward, thickness, area, group, unit, half_space, rows)
-    force = solve(matrix, np.minimum(strain, LINEAR_TO) * thickness / unit)
     rates = rates_of(matrix, force, _reached(strain * thickness, strain, sinking_rates, strain_rates, LINEAR_TO) / unit)
     seen = _see(rings, points, inward, thickness, area, unit, force, strain, here, moduli, nu)
     held = _correct(*seen, low, high, mean, scale, w1, b1, w2, b2, w3, b3, w4, b4)[0]
@@ -282,12 +293,11 @@ def _slopes(points, inward, thickness, area, strain, corners, shares, group, ben
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _slopes_on_stack(points, inward, thickness, area, strain, corners, shares, sinking, group, bent, rows, nu, matrix,
+def _slopes_on_stack(points, inward, thickness, area, strain, corners, shares, sinking, bent, matrix, rings, force, nu,
                      wide, t, numbers, log_thickness, hardening, alike, strain_rates, sinking_rates, low, high, mean,
                      scale, w1, b1, w2, b2, w3, b3, w4, b4):  # fmt: skip
     """See ContactNet.slopes."""
-    rings, here = rings_of(points, inward, t, group, rows), _between(corners, shares, bent)
-    force = solve(matrix, sinking * np.minimum(STACK_LINEAR_TO / strain, 1.0))
+    here = _between(corners, shares, bent)
     rates = rates_of(matrix, force, _reached(sinking, strain, sinking_rates, strain_rates, STACK_LINEAR_TO))
     given_way, alike_at = _given_way(matrix, wide, force), _between(corners, shares, alike)[:, 0]
     seen = _see_on_stack(rings, points, inward, thickness, area, t, force, strain, sinking, here, nu, numbers,
