@@ -196,15 +196,21 @@ def _look(points, inward, thickness, area, strain, corners, shares, group, bent,
     matrix, rings = pairs(points, inward, thickness, area, group, mean, half_space, rows)
     depth = np.minimum(strain, LINEAR_TO) * thickness / mean
     force = solve(matrix, depth)
-    seen = _see(rings, points, inward, thickness, area, mean, force, strain, here, moduli, nu)
+    pressure = force * mean**2 / area
+    moments, vectors = moments_of(rings, points, thickness, area, _one(pressure), _one(strain))
+    seen = _see(moments[0], vectors[0], inward, area, pressure, strain, here, moduli, nu)
     return *seen, power_of(matrix, force, depth.max()), matrix, rings, force
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _see(rings, points, inward, thickness, area, mean, force, strain, bent, moduli, nu):
-    """Pressure, inputs and fade of a Look under forces (N,) over E mean^2."""
-    pressure = force * mean**2 / area
-    moments, vectors = moments_of(rings, points, thickness, area, pressure, strain)
+def _one(values):
+    """Values (N,) of one case, (1, N)."""
+    return values.copy().reshape(1, len(values))
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _see(moments, vectors, inward, area, pressure, strain, bent, moduli, nu):
+    """Pressure, inputs and fade of a Look, from pressures over E before they harden, and what nodes see around them."""
     inputs = np.empty((len(area), NODES_SEE), np.float32)
     _inputs(pressure, moments, vectors, strain, inward, bent, nu, inputs)
     _harden(pressure, strain, moduli)
@@ -218,19 +224,19 @@ def _look_on_stack(points, inward, thickness, area, strain, corners, shares, sin
     rings, here = rings_of(points, inward, t, group, rows), _between(corners, shares, bent)
     depth = sinking * np.minimum(STACK_LINEAR_TO / strain, 1.0)
     force = solve(matrix, depth)
-    seen = _see_on_stack(rings, points, inward, thickness, area, t, force, strain, sinking, here, nu, numbers,
+    moments, vectors = moments_of(rings, points, np.full(len(area), t), area,
+                                  _one(np.exp(numbers[3]) * (force / area)), _one(sinking / t))  # fmt: skip
+    seen = _see_on_stack(moments[0], vectors[0], inward, thickness, area, t, force, strain, sinking, here, nu, numbers,
                          log_thickness, hardening, _between(corners, shares, alike)[:, 0],
                          _given_way(matrix, wide, force))  # fmt: skip
     return *seen, power_of(matrix, force, depth.max()), rings, force
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _see_on_stack(rings, points, inward, thickness, area, t, force, strain, sinking, bent, nu, numbers, log_thickness,
-                  hardening, alike_at, given_way):  # fmt: skip
-    """Pressure, inputs and fade of a Look under forces (N,) over E [m2]."""
-    softness, pressure = np.exp(numbers[3]), force / area
-    even, overlap = np.full(len(area), t), sinking / t
-    moments, vectors = moments_of(rings, points, even, area, softness * pressure, overlap)
+def _see_on_stack(moments, vectors, inward, thickness, area, t, force, strain, sinking, bent, nu, numbers,
+                  log_thickness, hardening, alike_at, given_way):  # fmt: skip
+    """Pressure, inputs and fade of a Look under forces (N,) over E [m2], and what nodes see around them."""
+    softness, pressure, overlap = np.exp(numbers[3]), force / area, sinking / t
     alike, inputs = np.empty((len(area), NODES_SEE), np.float32), np.empty((len(area), STACKS_SEE), np.float32)
     _inputs(softness * pressure, moments, vectors, overlap, inward, bent, nu, alike)
     for n in range(len(area)):
@@ -281,15 +287,14 @@ def _slopes(points, inward, thickness, area, strain, corners, shares, bent, matr
     """See ContactNet.slopes."""
     unit, here = thickness.mean(), _between(corners, shares, bent)
     rates = rates_of(matrix, force, _reached(strain * thickness, strain, sinking_rates, strain_rates, LINEAR_TO) / unit)
-    seen = _see(rings, points, inward, thickness, area, unit, force, strain, here, moduli, nu)
-    held = _correct(*seen, low, high, mean, scale, w1, b1, w2, b2, w3, b3, w4, b4)[0]
-    out = np.empty_like(rates)
-    for k in range(len(rates)):
-        h = _small(force, rates[k], strain, strain_rates[k])
-        seen = _see(rings, points, inward, thickness, area, unit, np.maximum(force + h * rates[k], 0.0),
-                    np.maximum(strain + h * strain_rates[k], 0.0), here, moduli, nu)  # fmt: skip
-        out[k] = (_correct(*seen, low, high, mean, scale, w1, b1, w2, b2, w3, b3, w4, b4)[0] - held) / h
-    return out
+    steps = _steps(force, rates, strain, strain_rates)
+    pressures, strains = _stepped(force, rates, steps, 0.0) * unit**2 / area, _stepped(strain, strain_rates, steps, 0.0)
+    moments, vectors = moments_of(rings, points, thickness, area, pressures, strains)
+    held = np.empty_like(pressures)
+    for k in range(len(held)):
+        seen = _see(moments[k], vectors[k], inward, area, pressures[k], strains[k], here, moduli, nu)
+        held[k] = _correct(*seen, low, high, mean, scale, w1, b1, w2, b2, w3, b3, w4, b4)[0]
+    return _differences(held, steps)
 
 
 @numba.njit(cache=True, error_model="numpy")
@@ -300,25 +305,46 @@ def _slopes_on_stack(points, inward, thickness, area, strain, corners, shares, s
     here = _between(corners, shares, bent)
     rates = rates_of(matrix, force, _reached(sinking, strain, sinking_rates, strain_rates, STACK_LINEAR_TO))
     given_way, alike_at = _given_way(matrix, wide, force), _between(corners, shares, alike)[:, 0]
-    seen = _see_on_stack(rings, points, inward, thickness, area, t, force, strain, sinking, here, nu, numbers,
-                         log_thickness, hardening, alike_at, given_way)  # fmt: skip
-    held = _correct(*seen, low, high, mean, scale, w1, b1, w2, b2, w3, b3, w4, b4)[0]
-    out = np.empty_like(rates)
+    steps = _steps(force, rates, strain, strain_rates)
+    forces, strains = _stepped(force, rates, steps, 0.0), _stepped(strain, strain_rates, steps, 1e-9)
+    depths = _stepped(sinking, sinking_rates, steps, 0.0)
+    moments, vectors = moments_of(rings, points, np.full(len(area), t), area, np.exp(numbers[3]) * (forces / area),
+                                  depths / t)  # fmt: skip
+    held = np.empty_like(forces)
+    for k in range(len(held)):
+        seen = _see_on_stack(moments[k], vectors[k], inward, thickness, area, t, forces[k], strains[k], depths[k], here,
+                             nu, numbers, log_thickness, hardening, alike_at, given_way)  # fmt: skip
+        held[k] = _correct(*seen, low, high, mean, scale, w1, b1, w2, b2, w3, b3, w4, b4)[0]
+    return _differences(held, steps)
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _steps(force, rates, strain, strain_rates):
+    """Steps of K differences, (K,): neither force nor strain changes by more than SMALL_STEP of its largest."""
+    out = np.empty(len(rates))
     for k in range(len(rates)):
-        h = _small(force, rates[k], strain, strain_rates[k])
-        seen = _see_on_stack(rings, points, inward, thickness, area, t, np.maximum(force + h * rates[k], 0.0),
-                             np.maximum(strain + h * strain_rates[k], 1e-9),
-                             np.maximum(sinking + h * sinking_rates[k], 0.0), here, nu, numbers, log_thickness,
-                             hardening, alike_at, given_way)  # fmt: skip
-        out[k] = (_correct(*seen, low, high, mean, scale, w1, b1, w2, b2, w3, b3, w4, b4)[0] - held) / h
+        fastest = max(np.abs(rates[k]).max() / force.max(), np.abs(strain_rates[k]).max() / strain.max())
+        out[k] = SMALL_STEP / max(fastest, 1e-12)
     return out
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _small(force, force_rate, strain, strain_rate):
-    """Step of a difference in which neither force nor strain changes by more than SMALL_STEP of its largest."""
-    fastest = max(np.abs(force_rate).max() / force.max(), np.abs(strain_rate).max() / strain.max())
-    return SMALL_STEP / max(fastest, 1e-12)
+def _stepped(values, rates, steps, least):
+    """Values (N,) as they are, and after each of K steps at their rates (K, N), not below the least, (K + 1, N)."""
+    out = np.empty((len(steps) + 1, len(values)))
+    out[0] = values
+    for k in range(len(steps)):
+        out[k + 1] = np.maximum(values + steps[k] * rates[k], least)
+    return out
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _differences(held, steps):
+    """Rates (K, N) from values (K + 1, N) as they are and after each step."""
+    out = np.empty((len(steps), held.shape[1]))
+    for k in range(len(steps)):
+        out[k] = (held[k + 1] - held[0]) / steps[k]
+    return out
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")

@@ -162,41 +162,42 @@ def _mirror(matrix):
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def moments_of(rings, points, thickness, area, pressure, strain):
-    """What nodes see around them.
+    """What nodes see around them, of K cases at once: so the rings are read once.
 
     Args:
         rings: weights of nodes in rings, see `pairs`.
         points: nodes on the skin at rest, (N, 3) [m].
         thickness: thickness of the layer there, (N,) [m].
         area: area that each stands for, (N,) [m2].
-        pressure, strain: pressure over E, and depth over the thickness, (N,) [-].
+        pressure, strain: pressure over E, and depth over the thickness, (K, N) [-].
 
     Returns:
-        moments: of pressure and strain on the rings, (N, 2, RINGS) [-].
-        vectors: their first moments, in the body's axes, (N, 2, 3) [-].
+        moments: of pressure and strain on the rings, (K, N, 2, RINGS) [-].
+        vectors: their first moments, in the body's axes, (K, N, 2, 3) [-].
     """
     width, count = rings.shape[:2]
-    sources, scale, centre = np.empty((count, 8), np.float32), thickness.mean(), points[0].copy()
+    wide = 8 * len(pressure)
+    sources, scale, centre = np.empty((count, wide), np.float32), thickness.mean(), points[0].copy()
     for j in range(count):
-        for s in range(2):
-            value = area[j] / scale**2 * (pressure[j] if s == 0 else strain[j])
-            sources[j, 4 * s] = value
+        for c in range(wide // 4):
+            value = area[j] / scale**2 * (pressure[c // 2, j] if c % 2 == 0 else strain[c // 2, j])
+            sources[j, 4 * c] = value
             for x in range(3):
-                sources[j, 4 * s + 1 + x] = value * (points[j, x] - centre[x]) / scale
-    flat, sums = rings.reshape(width * count, count), np.empty((width * count, 8), np.float32)
-    block = max(1, ONE_THREAD // (8 * count))
+                sources[j, 4 * c + 1 + x] = value * (points[j, x] - centre[x]) / scale
+    flat, sums = rings.reshape(width * count, count), np.empty((width * count, wide), np.float32)
+    block = max(1, ONE_THREAD // (wide * count))
     for start in range(0, width * count, block):
         sums[start : start + block] = np.dot(flat[start : start + block], sources)
-    sums = sums.reshape(width, count, 8)
-    moments, vectors = np.empty((count, 2, width - 1)), np.empty((count, 2, 3))
+    sums = sums.reshape(width, count, wide)
+    moments, vectors = np.empty((len(pressure), count, 2, width - 1)), np.empty((len(pressure), count, 2, 3))
     for i in range(count):
-        for s in range(2):
+        for c in range(wide // 4):
             for m in range(width - 1):
-                moments[i, s, m] = sums[m, i, 4 * s] * scale**2
+                moments[c // 2, i, c % 2, m] = sums[m, i, 4 * c] * scale**2
             for x in range(3):
                 here = (points[i, x] - centre[x]) / scale
-                around = sums[width - 1, i, 4 * s + 1 + x] - here * sums[width - 1, i, 4 * s]
-                vectors[i, s, x] = around * scale**3 / thickness[i]
+                around = sums[width - 1, i, 4 * c + 1 + x] - here * sums[width - 1, i, 4 * c]
+                vectors[c // 2, i, c % 2, x] = around * scale**3 / thickness[i]
     return moments, vectors
 
 

@@ -37,7 +37,7 @@ def solved(points: np.ndarray, spacing: float, strain: np.ndarray, nu: float = N
     matrix, rings = pairs(points, inward, thick, area, group, thickness, *table)
     force = solve(matrix, strain)
     pressure = force * thickness**2 / area
-    moments, vectors = moments_of(rings, points, thick, area, pressure, strain)
+    moments, vectors = (one[0] for one in moments_of(rings, points, thick, area, pressure[None], strain[None]))
     return Linear(pressure, moments, vectors, power_of(matrix, force, strain.max()))
 
 
