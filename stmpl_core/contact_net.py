@@ -139,6 +139,10 @@ class ContactNet:
 
     def look(self, nodes: Nodes) -> Look:
         """Solves the linear problem at the nodes, at least one, and gathers what the network reads."""
+        return self._looked(nodes)[0]
+
+    def _looked(self, nodes: Nodes) -> tuple[Look, tuple[np.ndarray, ...]]:
+        """See `look` and `_solved`."""
         group, bent = self.near.groups(nodes.corners[:, 0]), self.near.bent_at(nodes.corners)
         if self._green is None:
             *seen, matrix, rings, force = _look(*nodes[:7], group, bent, *self._table, self._moduli, self._nu)
@@ -147,17 +151,16 @@ class ContactNet:
             *seen, rings, force = _look_on_stack(*nodes, group, bent, self._table.rows, self._nu, matrix, wide,
                                                  self._green.effective.thickness, self._green.numbers,
                                                  *self._green.hardening)  # fmt: skip
-        self._last = nodes, (matrix, rings, force)
-        return Look(*seen)
+        solved = matrix, rings, force
+        self._last = nodes, solved
+        return Look(*seen), solved
 
     def _solved(self, nodes: Nodes) -> tuple[np.ndarray, ...]:
         """Matrix, rings and forces of the linear problem at the nodes; known after a touch, whose model asks."""
-        last = self._last
+        last = self._last  # another thread may write it
         if last is None or not all(np.array_equal(getattr(last[0], one), getattr(nodes, one))
                                    for one in ("points", "strain", "sinking")):  # fmt: skip
-            self.look(nodes)
-            last = self._last
-        assert last is not None
+            return self._looked(nodes)[1]
         return last[1]
 
     def hold(self, nodes: Nodes) -> Held:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from copy import copy
+from functools import cached_property
 from typing import TYPE_CHECKING, NamedTuple
 
 import numba
@@ -131,8 +132,10 @@ class Toucher:
         self._thickest = float(layer.thickness.max())
         self._inward, self.deep = self.columns.inward, Deep(self.columns)
         self._soft = soft_depth(layer.tissue)
-        self._pull = Green.of(layer).effective.pull if layer.tissue.skin is not None else 0.0
-        self._ratios = {layer.tissue.poisson_ratio, *(ply.poisson_ratio for ply in layer.tissue.deeper)}
+
+    @cached_property
+    def _unlearnt(self) -> list[str]:
+        return unlearnt(self.layer, *self.net.weights.card["ranges"]["poisson_ratio"])
 
     def give(self, nodes: Nodes, forces: np.ndarray) -> np.ndarray | None:
         """How a contact gives along the skin, beyond a flat layer, (3, 3) [m/N]; None: as that. See `curvature`."""
@@ -436,17 +439,8 @@ class Toucher:
                 trust = trust.also(f"{name} is {1e3 * thinnest:.2g} mm thick, thin beside the skin's edges of "
                                    f"{1e3 * layer.edge_length:.2g} mm, and {1e3 * lowest:.2g} mm deep",
                                    in_range=False)  # fmt: skip
-        low, high = card["ranges"]["poisson_ratio"]
-        for nu in sorted(self._ratios):
-            if not low - 1e-3 <= nu <= high + 1e-3:
-                trust = trust.also(f"contacts were learnt at Poisson's ratios from {low:g} to {high:g}, not {nu:g}",
-                                   in_range=False)  # fmt: skip
-        if (apart := max(self._ratios) - min(self._ratios)) > RATIOS_APART:
-            trust = trust.also(f"Poisson's ratios of the materials differ by {apart:.2g}; tried is {RATIOS_APART:g}",
-                               in_range=False)  # fmt: skip
-        if self._pull > MAX_PULL:
-            trust = trust.also(f"the skin's tension is {self._pull:.2g} times E t of the tissue under it; tried is "
-                               f"{MAX_PULL:g}", in_range=False)  # fmt: skip
+        for why in self._unlearnt:
+            trust = trust.also(why, in_range=False)
         if strange > MAX_UNSEEN_FORCE_SHARE:
             trust = trust.also(f"{strange:.0%} of the force of {name} is where no training contact was like it",
                                in_range=False)  # fmt: skip
@@ -582,6 +576,20 @@ def _carried(corners, shares, area, held, doubts, outside, unit, carries, areas,
         values[v] = pressure[n]
     return (vertices, pressure, values, wrench, forces, scale, size, doubt, strange / max(total, 1e-300), stuck,
             along, below / max(total, 1e-300))  # fmt: skip
+
+
+def unlearnt(layer: SoftLayer, low: float, high: float) -> list[str]:
+    """What of a layer's tissue no contact was learnt with, as sentences; Poisson's ratios from low to high were."""
+    tissue, out = layer.tissue, []
+    ratios = {tissue.poisson_ratio, *(ply.poisson_ratio for ply in tissue.deeper)}
+    pull = Green.of(layer).effective.pull if tissue.skin is not None else 0.0
+    out += [f"contacts were learnt at Poisson's ratios from {low:g} to {high:g}, not {nu:g}"
+            for nu in sorted(ratios) if not low - 1e-3 <= nu <= high + 1e-3]  # fmt: skip
+    if (apart := max(ratios) - min(ratios)) > RATIOS_APART:
+        out.append(f"Poisson's ratios of the materials differ by {apart:.2g}; tried is {RATIOS_APART:g}")
+    if pull > MAX_PULL:
+        out.append(f"the skin's tension is {pull:.2g} times E t of the tissue under it; tried is {MAX_PULL:g}")
+    return out
 
 
 def soft_depth(tissue: Tissue) -> float:

@@ -106,6 +106,17 @@ def brush(count: int = 7) -> Tool:
     return Tool("brush", np.concatenate([pin.vertices + place for place in places]), np.concatenate(faces))
 
 
+def v_block(opening: float) -> Tool:
+    """Two walls that open along -x by so many degrees."""
+    walls, half = [], np.radians(opening / 2)
+    for side in (1, -1):
+        wall, frame = trimesh.creation.box((0.12, 0.01, 0.05)), np.eye(4)
+        along, out = np.array([-np.cos(half), side * np.sin(half), 0]), np.array([np.sin(half), side * np.cos(half), 0])
+        frame[:3, :3], frame[:3, 3] = np.column_stack([along, out, np.cross(along, out)]), 0.06 * along + 0.005 * out
+        walls.append(wall.apply_transform(frame))
+    return tool(trimesh.util.concatenate(walls))
+
+
 def scaled(tool: Tool, by: float) -> Tool:
     return Tool(tool.name, by * tool.vertices, tool.faces)
 

@@ -46,9 +46,9 @@ from tests.scenes import (
     press,
     punch,
     scaled,
-    tool,
     touch_of,
     turn,
+    v_block,
 )
 
 LIMB, PLATE, BALL, PUNCH = limb(), plate(), ball(), punch()
@@ -546,15 +546,8 @@ def test_pins_that_are_tools_of_their_own_are_flagged_like_those_of_one(depth, c
 @pytest.mark.parametrize("opening, sound", [(60, False), (120, False), (150, True)])
 def test_a_block_whose_walls_press_from_several_sides_is_flagged(opening: float, sound: bool) -> None:
     """Finite elements: one of 60 degrees, pushed straight, presses 2.5 times as hard as is said, by its walls' drag."""
-    walls, half = [], np.radians(opening / 2)
-    for side in (1, -1):
-        wall, frame = trimesh.creation.box((0.12, 0.01, 0.05)), np.eye(4)
-        along, out = np.array([-np.cos(half), side * np.sin(half), 0]), np.array([np.sin(half), side * np.cos(half), 0])
-        frame[:3, :3], frame[:3, 3] = np.column_stack([along, out, np.cross(along, out)]), 0.06 * along + 0.005 * out
-        walls.append(wall.apply_transform(frame))
-    block = tool(trimesh.util.concatenate(walls))
-    apart = RADIUS / np.sin(half)
-    touch = Toucher(limb(4e-3)).touch(press(block, at(apart - 1.5e-3, 0, LENGTH / 2), None))
+    apart = RADIUS / np.sin(np.radians(opening / 2))
+    touch = Toucher(limb(4e-3)).touch(press(v_block(opening), at(apart - 1.5e-3, 0, LENGTH / 2), None))
     assert touch.force > 0
     assert ("several sides" in touch.trust.why) != sound
 

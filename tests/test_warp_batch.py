@@ -14,7 +14,7 @@ from stmpl_core.bones import Bone, to_bone
 from stmpl_core.errors import InvalidInput
 from stmpl_core.methods import MomentNet, Winkler
 from stmpl_core.skin import Skin
-from tests.scenes import LENGTH, RADIUS, at, ball, band, box, brush, capsule, limb, punch, tool
+from tests.scenes import LENGTH, RADIUS, at, ball, band, box, brush, capsule, limb, punch, tool, v_block
 from tests.test_folds import FINGERS
 
 wp = pytest.importorskip("warp")
@@ -113,6 +113,26 @@ def test_touches_are_those_of_numba(arm: Skin, one: Tool, reach: float) -> None:
 def test_a_tool_around_the_limb_lies_on_several_charts(cylinder: Skin) -> None:
     poses = at(0.0, 2e-4, LENGTH / 2)[None, None]
     same(made(cylinder, [band()], 1).touch(poses), Batch(cylinder, [band()], 1).touch(poses))
+
+
+@pytest.mark.parametrize(("opening", "sound"), [(60, False), (120, False), (150, True)])
+def test_a_tool_that_presses_from_several_sides_is_flagged_here_too(cylinder: Skin, opening: float, sound: bool):
+    poses = at(RADIUS / np.sin(np.radians(opening / 2)) - 1.5e-3, 0, LENGTH / 2)[None, None]
+    found = made(cylinder, [v_block(opening)], 1).touch(poses)
+    same(found, Batch(cylinder, [v_block(opening)], 1).touch(poses))
+    assert found.in_range.numpy().all() == sound
+
+
+@pytest.mark.parametrize("tissue", [
+    Tissue(1e3, 0.45, deeper=(Ply(0.012, 80e3, 0.45),)), Tissue(3e3, 0.45, deeper=(Ply(6e-3, 15e3, 0.36),)),
+    Tissue(3e3, 0.45, skin=Membrane(1e5, 1.2e-3, 90.0), deeper=(Ply(6e-3, 15e3, 0.45),))],
+    ids=["nearly bone", "two ratios", "tight skin"])  # fmt: skip
+def test_tissue_that_no_contact_was_learnt_with_is_flagged_here_too(tissue: Tissue) -> None:
+    skin, tool = Skin.of(limb(8e-3, 20e-3, THICK, LONG).with_(tissue=tissue), MomentNet()), ball(0.02)
+    poses = at(THICK + 0.02 - 9e-3, 0, LONG / 2)[None, None]
+    found, expected = made(skin, [tool], 1).touch(poses), Batch(skin, [tool], 1).touch(poses)
+    same(found, expected)
+    assert not found.in_range.numpy().any()
 
 
 @pytest.mark.parametrize("one", [ball(0.012), punch(), tool(LUMP)], ids=["ball", "punch", "lump"])

@@ -19,6 +19,8 @@ STEEP, LONG, BORDER = wp.constant(STEEP_BIT), wp.constant(LONG_BIT), wp.constant
 STEEP_SHARE, LONG_SHARE = wp.constant(wp.float64(soundness.STEEP_SHARE)), wp.constant(wp.float64(soundness.LONG_SHARE))
 BORDER_SHARE = wp.constant(wp.float64(soundness.BORDER_SHARE))
 AROUND, UNSEEN = wp.constant(wp.float64(toucher.MAX_AROUND)), wp.constant(wp.float64(toucher.MAX_UNSEEN_FORCE_SHARE))
+SIDES = wp.constant(wp.vec2d(*toucher.SIDES))
+SOFT_SHARE = wp.constant(wp.float64(toucher.SOFT_SHARE))
 THIN, SUNK = wp.constant(wp.float64(toucher.THIN)), wp.constant(wp.float64(toucher.SUNK))
 SHELL, SHELL_FROM = wp.constant(wp.float64(toucher.SHELL)), wp.constant(wp.float64(toucher.SHELL_FROM))
 STUCK, WIDER = wp.constant(wp.float64(toucher.STUCK)), wp.constant(wp.float64(pieces.WIDER))
@@ -259,6 +261,8 @@ def answer(first: wp.int32, many: wp.int32, known: Known, skins: Skins, scratch:
     sound = steep <= STEEP_SHARE * forces and long <= LONG_SHARE * forces and border <= BORDER_SHARE * forces
     sound = sound and one.softness * highest <= known.pressure and depth * count <= known.depth * thick
     sound = sound and strange <= UNSEEN * forces and one.learnt == 1
+    sound = sound and depth <= SOFT_SHARE * one.soft
+    sound = sound and (size <= SIDES[0] * forces or size >= SIDES[1] * forces)
     pins = _pins(scratch, s, start, start + wp.int32(count))
     group = pins[0] > GROUP and depth > PINS_DEEP * pins[1]
     sound = sound and not group

@@ -23,7 +23,7 @@ from stmpl_core.sdf import SignedDistance
 from stmpl_core.skin import Skin
 from stmpl_core.tool import Tool
 from stmpl_core.tools import Tools
-from stmpl_core.toucher import margin_on
+from stmpl_core.toucher import margin_on, soft_depth, unlearnt
 
 STEEP_BIT, LONG_BIT, BORDER_BIT, EDGE_BIT = 1, 2, 4, 8  # what is to be said of a vertex, see Soundness
 MOST_PLACES = 8192  # places of a lattice: nodes.MOST_LOOKED_AT and a margin around them
@@ -61,6 +61,7 @@ class OneSkin:
     flat: real
     effective: real
     softness: real
+    soft: real
     log_kappa: real
     log_pull: real
 
@@ -265,8 +266,8 @@ def _one_skin(skin: Skin, columns: Columns, at: tuple[int, int, int, int]) -> tu
     one.hole, one.thickest, one.edge = 0.6 * layer.edge_length, float(layer.thickness.max()), layer.edge_length
     one.modulus, one.nu = tissue.youngs_modulus, tissue.poisson_ratio
     one.mu, one.lam = tissue.shear_modulus / one.modulus, tissue.lame_lambda / one.modulus
-    low, high = shipped(network_of(layer)).card["ranges"]["poisson_ratio"]
-    one.learnt = int(low - 1e-3 <= tissue.poisson_ratio <= high + 1e-3)
+    known = shipped(network_of(layer)).card["ranges"]["poisson_ratio"]
+    one.learnt, one.soft = int(not unlearnt(layer, *known)), soft_depth(tissue)
     one.low, one.high = (vec3(*corner) for corner in where_inside(layer))
     return one, arrays
 
