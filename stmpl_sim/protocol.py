@@ -272,7 +272,7 @@ class SoftContact:
     def _went_through(self, touch: Touch, pose: Transform, memory: Memory) -> bool:
         """Whether a tool presses on skin that it came to through the body; pose: of now, layer axes.
 
-        It moved out of the skin that it presses by more than it was deep in any; or it was deep, and came from the
+        Where it presses it moved out of that skin by more than it was deep in any; or it was deep, and came from the
         other side.
         """
         force, asked = touch.force, memory.asked
@@ -280,7 +280,7 @@ class SoftContact:
             return force > 0 and touch.name in memory.through
         before, push = asked.touches[touch.name], touch.push / force
         deep, far = max(before.depth, 0.0) if before.presses else 0.0, WAY_THROUGH * self._thickest
-        out = -float((pose - asked.at[touch.name])[:3] @ np.append(self._balls[touch.name][0], 1.0) @ push)
+        out = -float(_way(asked.at[touch.name], pose, _centre_of_pressure(touch)) @ push)
         return out > deep + far or (out > 0 and deep > far and memory.pushes.get(touch.name, push) @ push < 0)
 
     def _between(self, at: Mapping[str, Transform], memory: Memory, dt: float
@@ -364,8 +364,7 @@ class SoftContact:
         before = memory.at.get(touch.name)
         v = 0.0
         if before is not None and dt > 0:  # of the tool's point that is at the centre of pressure now
-            then = before @ np.linalg.solve(pose, np.append(centre, 1.0))
-            v = float((centre - then[:3]) @ normal) / dt
+            v = float(_way(before, pose, centre) @ normal) / dt
         c = self.damping * force
         if model is None:
             return max(0.0, 1 + self.damping * v), (v, force)
@@ -411,6 +410,11 @@ def _centre_of_pressure(touch: Touch) -> np.ndarray:
     wrench = _pressing(touch)
     force = wrench[:3]
     return touch.pose_body_from_tool[:3, 3] + cross(force, wrench[3:]) / (force @ force)
+
+
+def _way(before: Transform, now: Transform, point: np.ndarray) -> np.ndarray:
+    """Way of a tool's point from one pose to another, after which it is here, (3,) [m]."""
+    return point - (before @ _inverse(now) @ np.append(point, 1.0))[:3]
 
 
 def _rigid(name: str, pose: ArrayLike) -> Transform:
