@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from copy import copy
 from functools import cached_property
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numba
 import numpy as np
@@ -73,6 +73,21 @@ class Look(NamedTuple):
     power: float
 
 
+class Solved(NamedTuple):
+    """The linear problem at contact nodes, as a touch leaves it to its model.
+
+    Args:
+        matrix, rings: those of stmpl_core.obstacle.pairs, or a stack's.
+        force: forces over E that solve it, (N,).
+        given_way: see `_given_way`; 0 of one material.
+    """
+
+    matrix: np.ndarray
+    rings: np.ndarray
+    force: np.ndarray
+    given_way: float = 0.0
+
+
 class ContactNet:
     """Signorini's problem on the linear layer, corrected at every node by a network that sees the pressure around it.
 
@@ -108,7 +123,7 @@ class ContactNet:
         self._moduli = np.array([tissue.shear_modulus, tissue.lame_lambda]) / tissue.youngs_modulus
         self._table = response(self._nu)
         self.network, self.unit, self._green = "contact_net", tissue.youngs_modulus, None
-        self._last: tuple[Nodes, tuple[np.ndarray, ...]] | None = None
+        self._last: tuple[Nodes, Solved] | None = None
         if layer.stacked:
             self._green = Green.of(layer)
             one = self._green.effective
@@ -141,22 +156,23 @@ class ContactNet:
         """Solves the linear problem at the nodes, at least one, and gathers what the network reads."""
         return self._looked(nodes)[0]
 
-    def _looked(self, nodes: Nodes) -> tuple[Look, tuple[np.ndarray, ...]]:
+    def _looked(self, nodes: Nodes) -> tuple[Look, Solved]:
         """See `look` and `_solved`."""
         group, bent = self.near.groups(nodes.corners[:, 0]), self.near.bent_at(nodes.corners)
+        found: tuple[Any, ...]
         if self._green is None:
-            *seen, matrix, rings, force = _look(*nodes[:7], group, bent, *self._table, self._moduli, self._nu)
+            found = _look(*nodes[:7], group, bent, *self._table, self._moduli, self._nu)
         else:
-            matrix, wide = self._green.matrices(nodes, group)
-            *seen, rings, force = _look_on_stack(*nodes, group, bent, self._table.rows, self._nu, matrix, wide,
-                                                 self._green.effective.thickness, self._green.numbers,
-                                                 *self._green.hardening)  # fmt: skip
-        solved = matrix, rings, force
+            matrices = self._green.matrices(nodes, group)
+            found = _look_on_stack(*nodes, group, bent, self._table.rows, self._nu, *matrices,
+                                   self._green.effective.thickness, self._green.numbers,
+                                   *self._green.hardening)  # fmt: skip
+        seen, solved = Look(*found[:4]), Solved(*found[4:])
         self._last = nodes, solved
-        return Look(*seen), solved
+        return seen, solved
 
-    def _solved(self, nodes: Nodes) -> tuple[np.ndarray, ...]:
-        """Matrix, rings and forces of the linear problem at the nodes; known after a touch, whose model asks."""
+    def _solved(self, nodes: Nodes) -> Solved:
+        """The linear problem at the nodes, known after a touch."""
         last = self._last  # another thread may write it
         if last is None or not all(np.array_equal(getattr(last[0], one), getattr(nodes, one))
                                    for one in ("points", "strain", "sinking")):  # fmt: skip
@@ -185,11 +201,9 @@ class ContactNet:
         """
         bent, solved, rates = self.near.bent_at(nodes.corners), self._solved(nodes), (strain_rates, sinking_rates)
         if self._green is None:
-            return _slopes(*nodes[:7], bent, *solved, self._moduli, self._nu, *rates, *self._network)
-        wide = self._green.matrices(nodes, self.near.groups(nodes.corners[:, 0]))[1]
-        return _slopes_on_stack(*nodes, bent, *solved, self._nu, wide,
-                                self._green.effective.thickness, self._green.numbers, *self._green.hardening,
-                                *rates, *self._network)  # fmt: skip
+            return _slopes(*nodes[:7], bent, *solved[:3], self._moduli, self._nu, *rates, *self._network)
+        return _slopes_on_stack(*nodes, bent, *solved, self._nu, self._green.effective.thickness,
+                                self._green.numbers, *self._green.hardening, *rates, *self._network)  # fmt: skip
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
@@ -229,10 +243,10 @@ def _look_on_stack(points, inward, thickness, area, strain, corners, shares, sin
     force = solve(matrix, depth)
     moments, vectors = moments_of(rings, points, np.full(len(area), t), area,
                                   _one(np.exp(numbers[3]) * (force / area)), _one(sinking / t))  # fmt: skip
+    given_way = _given_way(matrix, wide, force)
     seen = _see_on_stack(moments[0], vectors[0], inward, thickness, area, t, force, strain, sinking, here, nu, numbers,
-                         log_thickness, hardening, _between(corners, shares, alike)[:, 0],
-                         _given_way(matrix, wide, force))  # fmt: skip
-    return *seen, power_of(matrix, force, depth.max()), rings, force
+                         log_thickness, hardening, _between(corners, shares, alike)[:, 0], given_way)  # fmt: skip
+    return *seen, power_of(matrix, force, depth.max()), matrix, rings, force, given_way
 
 
 @numba.njit(cache=True, error_model="numpy")
@@ -301,13 +315,13 @@ def _slopes(points, inward, thickness, area, strain, corners, shares, bent, matr
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _slopes_on_stack(points, inward, thickness, area, strain, corners, shares, sinking, bent, matrix, rings, force, nu,
-                     wide, t, numbers, log_thickness, hardening, alike, strain_rates, sinking_rates, low, high, mean,
-                     scale, w1, b1, w2, b2, w3, b3, w4, b4):  # fmt: skip
+def _slopes_on_stack(points, inward, thickness, area, strain, corners, shares, sinking, bent, matrix, rings, force,
+                     given_way, nu, t, numbers, log_thickness, hardening, alike, strain_rates, sinking_rates, low, high,
+                     mean, scale, w1, b1, w2, b2, w3, b3, w4, b4):  # fmt: skip
     """See ContactNet.slopes."""
     here = _between(corners, shares, bent)
     rates = rates_of(matrix, force, _reached(sinking, strain, sinking_rates, strain_rates, STACK_LINEAR_TO))
-    given_way, alike_at = _given_way(matrix, wide, force), _between(corners, shares, alike)[:, 0]
+    alike_at = _between(corners, shares, alike)[:, 0]
     steps = _steps(force, rates, strain, strain_rates)
     forces, strains = _stepped(force, rates, steps, 0.0), _stepped(strain, strain_rates, steps, 1e-9)
     depths = _stepped(sinking, sinking_rates, steps, 0.0)

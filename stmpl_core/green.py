@@ -243,9 +243,12 @@ class Green:
         """
         if self.layer.stacked or guess is None:
             return _held(self._blocks(nodes, group), gone)
-        one = self._of_one
-        by = nodewise.by_node(nodes.points, nodes.inward, nodes.thickness, nodes.area, one.origin)
-        return nodewise.approached(nodewise.blocks(by, group, one.rows, one.scales), gone, guess)
+        blocks = nodewise.blocks(self._by_node(nodes), group, self._of_one.rows, self._of_one.scales)
+        return nodewise.approached(blocks, gone, guess)
+
+    def _by_node(self, nodes: Nodes) -> np.ndarray:
+        """Nodes as the kernels of stmpl_core.nodewise take them."""
+        return nodewise.by_node(nodes.points, nodes.inward, nodes.thickness, nodes.area, self._of_one.origin)
 
     @cached_property
     def _of_one(self) -> _OfOne:
@@ -332,8 +335,7 @@ class Green:
         one, out = self._of_one, np.zeros((len(vertices), 3), np.float32)
         points, inward, roots = one.points[vertices], one.inward[vertices], one.roots[vertices]
         for of, there in felt:
-            some = nodes if of.all() else nodes.some(of)
-            by = nodewise.by_node(some.points, some.inward, some.thickness, some.area, one.origin)
+            by = self._by_node(nodes if of.all() else nodes.some(of))
             nodewise.add_motion(out, there, points, inward, roots, by, forces[of], one.rows, one.scales)
         return out
 

@@ -73,10 +73,12 @@ class Packed(NamedTuple):
         return cls(bits[0] << 48 | bits[1] << 32 | bits[2] << 16 | bits[3], scales.astype(np.float32))
 
 
-@intrinsic
-def _bits(_: Any, number: Any) -> Any:
+def _as_bits(_: Any, number: Any) -> Any:
     """The bits of a float32 as an int32, in a register; numpy's `view` goes through memory."""
     return types.int32(number), lambda context, builder, sig, args: builder.bitcast(args[0], ir.IntType(32))
+
+
+_bits: Any = intrinsic(_as_bits)
 
 
 @numba.njit(inline="always", fastmath=FAST, error_model="numpy")

@@ -281,7 +281,7 @@ class SoftContact:
         before, push = asked.touches[touch.name], touch.push / force
         deep, far = max(before.depth, 0.0) if before.presses else 0.0, WAY_THROUGH * self._thickest
         out = -float(_way(asked.at[touch.name], pose, _centre_of_pressure(touch)) @ push)
-        return out > deep + far or (out > 0 and deep > far and memory.pushes.get(touch.name, push) @ push < 0)
+        return out > deep + far or (out > 0 and deep > far and float(memory.pushes.get(touch.name, push) @ push) < 0)
 
     def _between(self, at: Mapping[str, Transform], memory: Memory, dt: float
                  ) -> tuple[dict[str, Touch], Memory] | None:  # fmt: skip

@@ -9,14 +9,14 @@ import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from stmpl_core import Contact, Simulator, SoftLayer, State, Tool, Touch
+from stmpl_core import Contact, Simulator, SoftLayer, State, Touch
 from stmpl_core.errors import InvalidInput
 from stmpl_core.methods import MomentNet, Winkler
 from stmpl_core.touch import APART
 from stmpl_sim import Memory, Poses, Reaction, SoftBody, SoftContact, exchange
 from stmpl_sim.energy import EnergyBook
 from tests.scenes import RADIUS as LIMB_RADIUS
-from tests.scenes import ball, box, limb, plate
+from tests.scenes import ball, box, limb, plate, tool
 
 mujoco = pytest.importorskip("mujoco", reason="pip install 'stmpl[sim]'")
 
@@ -180,8 +180,7 @@ def test_a_tool_that_flew_through_the_limb_is_flagged_until_it_is_apart(way_m: f
 
 def test_what_goes_in_and_out_or_holds_from_two_sides_did_not_go_through() -> None:
     simulator = Simulator(limb(5e-3), Winkler())
-    round_it = Tool("ring", *(lambda made: (made.vertices, made.faces))(
-        trimesh.creation.annulus(LIMB_RADIUS + 0.001, LIMB_RADIUS + 0.012, 0.02)))  # fmt: skip
+    round_it = tool(trimesh.creation.annulus(LIMB_RADIUS + 0.001, LIMB_RADIUS + 0.012, 0.02), name="ring")
     for one, ways in ((ball(0.012), LIMB_RADIUS + 0.012 - np.array([0, 6, 1, 7, 9, 2, -1, 9, 4, -5, 8, 0]) * 1e-3),
                       (round_it, 1e-3 * np.array([0, 3, -3, 5, -5, 6, 0, -6, 4]))):
         contact, memory, sides = SoftContact(simulator, [one]), Memory(), set()

@@ -25,6 +25,7 @@ from studies.stability.trial import Trial
 from studies.stability.truth import FILE, SCENES, truth
 
 QUICK = PRESETS["quick"]
+LAYERED = ("first touch", "0.65 t", "1e+20 N", "slide, capsule", "by force, 0.5 t", "edges of 0.6 t", "x 0.5", "90°")
 Fault = Callable[[Answer, Sequence[Contact], SoftLayer], Answer]
 
 
@@ -245,10 +246,15 @@ def test_no_answer_to_a_rigid_tool_is_silent_or_flagged_in_vain(tmp_path):
     counts = report.counts("moment_net")
     assert counts["silent"] == counts["needless"] == counts["crashed"] == 0, list(tmp_path.glob("failures/*"))
     assert len(report.rows) > 140 and counts["flagged"] <= 20
+    of_layers = {row.level: row.outcome for row in report.rows if row.axis == "skin, fat, muscle"}
+    assert {told: of_layers[told] for told in LAYERED} == {
+        told: "flagged" if told == "1e+20 N" else "held" for told in LAYERED}  # fmt: skip
 
 
-def test_one_material_is_not_mistaken_for_skin_fat_and_muscle():
-    refused = judge("winkler", Winkler, TRIALS[0]())
+@pytest.mark.parametrize("told", LAYERED)
+def test_one_material_is_not_mistaken_for_skin_fat_and_muscle(told):
+    (trial,) = [trial for trial in (make() for make in TRIALS) if trial.level == told]
+    refused = judge("winkler", Winkler, trial)
     assert refused.outcome == "flagged" and refused.broken[0].measured == "refused"
 
 
