@@ -226,7 +226,7 @@ def way_along(twist, contact, pose):
 
 
 @numba.njit(cache=True, error_model="numpy")
-def aged(before, pose, imprint, contact, known, held, share, radius, shares, times, dt, elastic, relaxed):
+def aged(before, pose, imprint, contact, known, held, share, goes, radius, shares, times, dt, elastic, relaxed):
     """Twist, gone, kept, gain, owed and now of an Asked (stmpl_core.balance).
 
     Args:
@@ -235,6 +235,7 @@ def aged(before, pose, imprint, contact, known, held, share, radius, shares, tim
         known: whether the tool was told of before.
         held: whether it pressed.
         share, radius, elastic: see Scalars.
+        goes: way that skin goes along with the tool until all of it slides [m].
         shares, times: series of the relaxation, (P,) each.
         dt: time of the step [s].
     """
@@ -243,7 +244,7 @@ def aged(before, pose, imprint, contact, known, held, share, radius, shares, tim
     if radius > 0:
         start = before if held else imprint
         over = way_along(twist if held else twist_between(start, pose), contact, start)
-        gone = (share if held else 1.0) * over / radius
+        gone = (max(share * over, over - goes) if held else over) / radius
     weights(times, dt, gone, elastic, relaxed, kept, gain)
     for i in range(len(times)):
         owed += shares[i] * kept[i]

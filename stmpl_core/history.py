@@ -51,6 +51,7 @@ MOST_LEAN = 0.5  # turn of the normal under skin that is dragged along, of which
 LEAST_GROWN = 0.5  # depth over the tool's that counts at least, where skin came from a hollow
 MOST_PASSES, SETTLED = 4, 1e-3  # turn of the normal [rad] at which push and friction agree
 LOST = 0.5  # of what skin carries along itself: what is gone once all of it slides; 0.4 to 0.6 by slides on a forearm
+STRAYED = 0.03  # of the elastic force: part of the memory from touches out of range, beyond which an answer is, too
 HELD_OFF = 0.01  # relative error of the elastic force by wrench, from which it is asked for again
 NOTHING = np.zeros(3)
 
@@ -134,12 +135,26 @@ class History:
             touches = self.toucher.touch_all([one.contact for one in asked], alone=False, tried=tried)
         laws = [self._law(one, touch, dt) for one, touch in zip(asked, touches, strict=True)]
         out, memories = balanced(asked, laws, self.series.shares)
+        out = [self._doubted(one, touch, memories, dt) for one, touch in zip(asked, out, strict=True)]
         for name, memory in state.tools.items():
             if name not in memories:
                 left = self._left(memory, dt)
                 if left.scalars.sunk or left.trail.any():
                     memories[name] = left
         return out, State(memories, here)
+
+    def _doubted(self, one: Asked, touch: Touch, memories: dict[str, Memory], dt: float) -> Touch:
+        """The touch, out of range where its skin's memory rests on one that was; the memory learns how far it does."""
+        memory = memories.get(touch.name)
+        if memory is None or not len(memory.relaxed):
+            return touch
+        scalars, relaxed = memory.scalars, max(float(self.series.shares @ memory.relaxed), 0.0)
+        strayed = relaxed if not touch.trust.in_range else self._strayed(one.before, memory, dt, one.gone)
+        memories[touch.name] = memory._replace(scalars=scalars._replace(strayed=strayed))
+        if touch.trust.in_range and strayed > STRAYED * scalars.elastic > 0:
+            return replace(touch, trust=touch.trust.also(
+                f"{touch.name} meets skin that still relaxes from a touch out of range", in_range=False))  # fmt: skip
+        return touch
 
     def _asked(self, contact: Contact, before: Memory | None, dt: float) -> Asked:
         """What the contact law is asked for a contact."""
@@ -149,8 +164,9 @@ class History:
         memory = before or fresh(pose, len(self.series.times))
         known = before is not None and memory.scalars.pressing >= 0
         scalars = memory.scalars
+        goes = scalars.limit / memory.stiffness[0] if memory.stiffness[0] > 0 else 0.0
         twist, gone, kept, gain, owed, now = aged(
-            memory.pose, pose, memory.imprint, memory.contact, known, scalars.pressing > 0, scalars.share,
+            memory.pose, pose, memory.imprint, memory.contact, known, scalars.pressing > 0, scalars.share, goes,
             scalars.radius, *self.series, dt, scalars.elastic, memory.relaxed)  # fmt: skip
         asked, moved = contact, None
         if contact.wrench is not None and (len(kept) or memory.slid < 1):
@@ -271,8 +287,18 @@ class History:
 
     def _left(self, memory: Memory, dt: float) -> Memory:
         """The memory of a tool that is not told of any more: the skin comes back."""
-        memory = self._back(memory, dt, 0.0, None)
-        return memory._replace(scalars=memory.scalars._replace(pressing=-1.0, work=0.0), wrench=np.zeros(6))
+        after = self._back(memory, dt, 0.0, None)
+        scalars = after.scalars._replace(pressing=-1.0, work=0.0, strayed=self._strayed(memory, after, dt, 0.0))
+        return after._replace(scalars=scalars, wrench=np.zeros(6))
+
+    def _strayed(self, before: Memory, after: Memory, dt: float, gone: float) -> float:
+        """What is left of `Scalars.strayed` after a step in range, at most [N]; gone: see Asked."""
+        if not before.scalars.strayed > 0:
+            return 0.0
+        had, has = (float(self.series.shares @ memory.relaxed) for memory in (before, after))
+        if after.scalars.pressing > 0:  # what is new is in range
+            return max(min(before.scalars.strayed * math.exp(-dt / self.series.times[-1] - gone), has), 0.0)
+        return before.scalars.strayed * max(has, 0.0) / max(had, 1e-300)
 
     def _back(self, memory: Memory, dt: float, gone: float, asked: float | None) -> Memory:
         """The memory of skin that comes back by itself.

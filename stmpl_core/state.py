@@ -13,8 +13,8 @@ from stmpl_core.errors import InvalidInput
 from stmpl_core.slip import SPRINGS
 from stmpl_core.wake import untouched
 
-VERSION = 5  # of packed states; those of version 4 know no Scalars.slid, those of 3 nor where the joints were
-OLDEST = 3  # version that is still read
+VERSION = 6  # of packed states; 5 knows no Scalars.strayed, 4 no Scalars.slid either, 3 nor where the joints were
+OLDEST, UNKNOWN = 3, {3: 2, 4: 2, 5: 1}  # version that is still read; how many of the last Scalars a version lacks
 FORGOTTEN = 1e-3  # elastic force of skin that comes back, over its largest, below which it is forgotten
 
 
@@ -72,6 +72,7 @@ class Scalars(NamedTuple):
         stretch: stretch of the column under the last contact [-].
         surface: number of the tool's surface (Tool.number): what another surface of that name pressed is forgotten.
         slid: factor on the push of skin that has slid, by what it no longer carries along itself [-].
+        strayed: part of what has relaxed that rests on touches out of range, at most [N].
     """
 
     pressing: float = 0.0
@@ -89,6 +90,7 @@ class Scalars(NamedTuple):
     stretch: float = 1.0
     surface: float = 0.0
     slid: float = 1.0
+    strayed: float = 0.0
 
     @property
     def sunk(self) -> bool:
@@ -158,8 +160,7 @@ class State:
         except (ValueError, KeyError, TypeError, OverflowError) as error:
             raise InvalidInput(f"{len(packed)} bytes are no state: {error}.") from error
         shapes = [one.shape for one in map(np.asarray, fresh(np.eye(4), terms))]
-        if version != VERSION:
-            shapes[Memory._fields.index("scalars")] = (len(Scalars._fields) - 1,)
+        shapes[Memory._fields.index("scalars")] = (len(Scalars._fields) - UNKNOWN.get(version, 0),)
         size = sum(int(np.prod(shape)) for shape in shapes)
         if version not in range(OLDEST, VERSION + 1) or len(numbers) != size * len(names):
             raise InvalidInput(f"a state of version {version} with {len(numbers)} numbers cannot be read; expected are "

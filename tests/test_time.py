@@ -249,6 +249,38 @@ def test_fresh_skin_is_met_where_a_tool_slides_to(sim: Simulator) -> None:
     assert stays < 0.6 * fresh and found[-1] > 0.98 * fresh and (np.diff(found) > -0.02 * fresh).all()
 
 
+@pytest.mark.parametrize("friction", [0.05, 0.5])
+def test_skin_that_a_tool_slides_to_is_fresh_however_long_the_step(sim: Simulator, friction: float) -> None:
+    """Before the step it stuck; one step is as good as forty."""
+    rubbing = Simulator(sim.layer, sim.method, sim.tools, friction=friction)
+    for way in (3e-3, 5e-3, 0.02):
+        ends = []
+        for steps in (1, 2, 40):
+            _, state = rubbing.touch([pressed(DEPTH)], State(), 0.01)
+            (held,), state = rubbing.touch([pressed(DEPTH)], state, 60.0)
+            for k in range(steps):
+                (touch,), state = rubbing.touch([pressed(DEPTH, x=way * (k + 1) / steps)], state, 0.1 / steps)
+            ends.append(touch.force)
+        assert held.force < 0.9 * ends[2] and ends[:2] == pytest.approx([ends[2]] * 2, rel=0.08)
+
+
+def test_what_rests_on_a_touch_out_of_range_is_until_that_has_faded(sim: Simulator) -> None:
+    _, state = played(sim, 0.1 * np.arange(3), np.array([0.0, 2e-3, 2e-3]))
+    assert all(touch.trust.in_range for touch in sim.touch([pressed(2e-3)], state, 0.1)[0])
+    (deep,), after = sim.touch([pressed(8e-3)], state, 0.02)
+    assert not deep.trust.in_range
+    waits = []
+    for _ in range(60):
+        (touch,), after = sim.touch([pressed(2e-3)], after, 0.5)
+        assert touch.trust.in_range or "relaxes from a touch out of range" in touch.trust.why
+        waits.append(touch.trust.in_range)
+    (plain,), _ = sim.touch([pressed(2e-3)], state, 30.02)
+    assert not waits[0] and waits[-1] and touch.force == pytest.approx(plain.force, rel=0.02)
+    assert np.all(np.diff(np.array(waits, int)) >= 0)  # once
+    (fresh,), _ = sim.touch([pressed(2e-3, x=0.02)], after, 0.02)
+    assert fresh.trust.in_range
+
+
 def test_a_replay_from_any_frame_is_bit_for_bit(sim: Simulator) -> None:
     times, depths = np.linspace(0, 2, 21), DEPTH * np.sin(np.linspace(-0.1, 6, 21))
     all_of, last = played(sim, times, depths)
