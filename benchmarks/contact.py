@@ -356,6 +356,8 @@ def _summary(rows: Sequence[Row]) -> Table:
     for strange in (False, True):
         for in_range in (False, True):
             some = [r for r in rows if r.strange == strange and (r.in_range or not in_range)]
+            if not some:
+                continue
             flagged = np.mean([not r.in_range for r in some])
             cells = [np.abs([getattr(r, k) for r in some])
                      for k in ("force_error", "pressure_error", "moving", "told", "worst")]  # fmt: skip

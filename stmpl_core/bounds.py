@@ -17,13 +17,14 @@ def motion_bound(known: Mapping[str, float] | None, touches: Sequence[Touch], mo
                  sunk: float) -> float | None:  # fmt: skip
     """Bound on the error of the motion under touches that are in range [m]; None where the method knows none.
 
-    It follows from how far the force may be off; from the drag that a wrench tells of and that is not carried: the skin
-    would go along with it, by so much as it gives; from skin that goes along by s under a tool d deep, in the linear
-    response: s^2 / d, which a ball's slides by finite elements keep at mu 0.3, 0.6 and 1.0; and from skin that is not
-    back. A groove may be off by all of itself, elsewhere than under a tool.
+    It follows from how far the force may be off and how deep the tools are; from the drag that a wrench tells of and
+    that is not carried: the skin would go along with it, by so much as it gives; from skin that goes along by s under a
+    tool d deep, in the linear response: s^2 / d, which a ball's slides by finite elements keep at mu 0.3, 0.6 and 1.0;
+    and from skin that is not back. A groove may be off by all of itself, elsewhere than under a tool.
 
     Args:
-        known: figures of the method's bound, `scale` and `power` of the force's relative bound; None: none.
+        known: figures of the method's bound: `scale`, `power` of the force's relative bound, and `depth_power` of the
+            depth over the thickness; None: none.
         touches: touches of the tools.
         moves: elastic touches that move the skin as they do, see History.elastic.
         peak: largest motion [m].
@@ -36,12 +37,20 @@ def motion_bound(known: Mapping[str, float] | None, touches: Sequence[Touch], mo
         return sunk
     if known is None:
         return None
-    doubt = max(touch.force_bound / touch.force for touch in [*pressing, *back])
-    under = peak * known["scale"] * doubt ** known["power"]
+    under = peak * known["scale"] * max(
+        (touch.force_bound / touch.force) ** known["power"] * deepest(touch) ** known.get("depth_power", 0.0)
+        for touch in [*pressing, *back]
+    )
     under += max((SHEAR * touch.drag / touch.force * touch.depth for touch in pressing), default=0.0)
     under += max((_dragged(touch) for touch in pressing), default=0.0)
     under += max((LATE * touch.depth for touch in back), default=0.0)
     return max(under, sunk)
+
+
+def deepest(touch: Touch) -> float:
+    """Depth of a tool over the thickness, where it is deepest [-]; 1 where nothing is known of it."""
+    depths = () if touch.pressed is None else touch.pressed.squeeze.nodes.strain
+    return float(np.max(depths)) if len(depths) else 1.0
 
 
 def _dragged(touch: Touch) -> float:

@@ -7,8 +7,10 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+from scipy.optimize import lsq_linear
 
 from fem_tools.dataset import Dataset, Sample
+from stmpl_core.bounds import deepest
 from stmpl_core.contact import Contact
 from stmpl_core.contact_net import ContactNet
 from stmpl_core.methods import MomentNet, Zero
@@ -36,6 +38,7 @@ class Scores:
         linear: signed error of the force without the network.
         kind: kind of the tool; on stacks the body, as each has a stack of its own.
         slant: angle between its way and the skin's normal that the answer does not know of [rad].
+        deep: depth of the tool over the thickness, where it is deepest.
         held, trusted: truth of the claim that the touch, and that the whole answer is not flagged.
     """
 
@@ -46,6 +49,7 @@ class Scores:
     linear: np.ndarray
     kind: np.ndarray
     slant: np.ndarray
+    deep: np.ndarray
     held: np.ndarray
     trusted: np.ndarray
 
@@ -91,9 +95,9 @@ def score(samples: Iterable[Sample], pressures: Weights, moments: Weights | None
             motion,
             touch.force_bound / touch.force - (STUCK * touch.pressed.along if touch.pressed else 0.0),
             float(nodes.area @ simulator.toucher.net.look(nodes).pressure) / force - 1,
-            kind, slant, touch.trust.in_range, trusted,
+            kind, slant, deepest(touch), touch.trust.in_range, trusted,
         ))  # fmt: skip
-    columns = list(zip(*rows, strict=True)) or [()] * 9
+    columns = list(zip(*rows, strict=True)) or [()] * 10
     return Scores(*(np.array(c) for c in columns[:-2]), *(np.array(c, dtype=bool) for c in columns[-2:]))
 
 
@@ -140,48 +144,47 @@ def bound_motion(data: str | Path, out: str | Path, motion: str = "moment_net_co
     scores = score(Dataset.open(data).split("val", kind="indenter", sets=("tool",)), pressures, moments,
                    stick=motion == "moment_net_stick")  # fmt: skip
     some = scores.trusted
-    found = fit_bound(scores.motion[some], scores.stated[some], scores.kind[some], scores.slant[some])
+    every = (scores.motion, scores.stated, scores.kind, scores.slant, scores.deep)
+    found = fit_bound(*(column[some] for column in every))
     if NETWORKS[motion].kind == "stack_motion":  # validation is of the stacks that were learnt; others are further off
         found |= {name: STACK_MARGIN * found[name] for name in ("scale", "median_bound_over_error")}
     replace(moments, card={**moments.card, "contact_bound": found}).save(path)
     return found
 
 
-def fit_bound(errors: np.ndarray, doubts: np.ndarray, kinds: np.ndarray,
-              besides: np.ndarray | None = None) -> dict[str, float]:  # fmt: skip
-    """Scale and power of a bound scale doubt^power on errors, all (N,), that holds for kinds that it was not fitted to.
+def fit_bound(errors: np.ndarray, doubts: np.ndarray, kinds: np.ndarray, besides: np.ndarray | None = None,
+              deep: np.ndarray | None = None) -> dict[str, float]:  # fmt: skip
+    """Scale and powers of a bound scale doubt^power deep^depth_power on errors, for kinds that it was not fitted to.
 
     Args:
         errors, doubts, kinds: of N contacts.
         besides: something else that makes errors larger, exponentially, and is 0 where the bound shall hold, (N,).
+        deep: depths over the thickness, (N,); None: the bound does not read them.
 
     Returns:
-        Scale, power, how many contacts, and the median of bound over error without what is besides.
+        Scale, powers, how many contacts, and the median of bound over error without what is besides.
     """
     if len(errors) < FEWEST or len(np.unique(kinds)) < 2:
         return {"scale": float("inf"), "power": 0.0, "contacts": len(errors), "median_bound_over_error": float("nan")}
-    columns = [np.ones(len(errors)), np.log(doubts)] + ([] if besides is None else [besides])
-    log_error, terms = np.log(errors), np.column_stack(columns)
+    columns = [np.ones(len(errors)), np.log(doubts)] + ([] if deep is None else [np.log(deep)])
+    stated = len(columns)
+    log_error, terms = np.log(errors), np.column_stack(columns + ([] if besides is None else [besides]))
+
+    def fitted(which: np.ndarray) -> np.ndarray:  # powers are not below 0
+        lowest = np.where((np.arange(terms.shape[1]) > 0) & (np.arange(terms.shape[1]) < stated), 0.0, -np.inf)
+        return np.asarray(lsq_linear(terms[which], log_error[which], (lowest, np.inf), method="bvls").x)
+
     missed = np.empty(len(errors))
     for kind in np.unique(kinds):
         here = kinds == kind
-        missed[here] = log_error[here] - terms[here] @ _fitted(terms[~here], log_error[~here])
-    offset, power = (fitted := _fitted(terms, log_error))[:2]
-    scale = float(np.exp(offset + np.quantile(missed, COVERED)))
-    without = errors / np.exp(terms[:, 2:] @ fitted[2:])
+        missed[here] = log_error[here] - terms[here] @ fitted(~here)
+    found = fitted(np.ones(len(errors), dtype=bool))
+    found[0] += np.quantile(missed, COVERED)
+    without = log_error - terms[:, stated:] @ found[stated:]
     return {
-        "scale": scale,
-        "power": float(power),
+        "scale": float(np.exp(found[0])),
+        "power": float(found[1]),
+        **({} if deep is None else {"depth_power": float(found[2])}),
         "contacts": len(errors),
-        "median_bound_over_error": float(np.median(scale * doubts**power / without)),
+        "median_bound_over_error": float(np.exp(np.median(terms[:, :stated] @ found[:stated] - without))),
     }
-
-
-def _fitted(terms: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """Coefficients of terms (N, K) in values (N,) by least squares, (K,); the second, of the doubt, not below 0."""
-    out = np.linalg.lstsq(terms, values, rcond=None)[0]
-    if out[1] < 0:
-        out[1] = 0.0
-        rest = np.arange(terms.shape[1]) != 1
-        out[rest] = np.linalg.lstsq(terms[:, rest], values, rcond=None)[0]
-    return out

@@ -155,6 +155,10 @@ def test_a_bound_holds_for_kinds_that_it_was_not_fitted_to_and_is_not_loose() ->
     others = errors(kinds + 12)
     assert np.mean(others <= known["scale"] * doubts ** known["power"]) > 0.9
     assert fit_bound(others[:10], doubts[:10], kinds[:10])["scale"] == np.inf  # too few say nothing
+    deep = np.exp(rng.uniform(-4, -0.2, 600))
+    known = fit_bound(errors(kinds) * deep**0.4, doubts, kinds, deep=deep)
+    assert known["depth_power"] == pytest.approx(0.4, abs=0.05) and known["power"] == pytest.approx(0.5, abs=0.05)
+    assert fit_bound(errors(kinds) * deep**-0.4, doubts, kinds, deep=deep)["depth_power"] == 0  # none falls with depth
 
 
 def test_of_shapes_that_are_not_known_no_less_force_is_learnt() -> None:
