@@ -21,6 +21,7 @@ from stmpl_core.rays import (
     distance_in_column,
     ray_from,
     ray_of,
+    wall_in,
 )
 from stmpl_core.sdf import SignedDistance
 from stmpl_core.touch import MIN_ONE_WAY_SHARE
@@ -159,9 +160,9 @@ def shifted(pose: Transform, by: np.ndarray) -> Transform:
     return out
 
 
-def grid_of(field: SignedDistance) -> tuple[np.ndarray, np.ndarray, float]:
-    """What kernels take of a distance field: coefficients, origin and spacing."""
-    return field.coefficients, field.origin, field.spacing
+def grid_of(field: SignedDistance) -> tuple[np.ndarray, np.ndarray, float, float]:
+    """What kernels take of a distance field: coefficients, origin, spacing and half thickness."""
+    return field.coefficients, field.origin, field.spacing, field.half_thickness
 
 
 def _along_a_curve(points: Points) -> np.ndarray:
@@ -242,7 +243,8 @@ def clearances(grid, pose, points, inward, thickness, near, far):
             continue
         least, s = d, 0.0
         while s < t:
-            s = min(s + max(abs(d), d - least, t / 16), t)  # on the way out of the tool nothing nearer comes soon
+            step = max(abs(d), d - least, min(t / 16, grid[3]))  # on the way out of the tool nothing nearer comes soon
+            s = min(s + step, t)
             d = distance_in_column(grid, ray, s)
             least = min(least, d)
         if d <= 0 and distance_in_column(grid, ray, t + 1e-5) < d:
@@ -323,7 +325,7 @@ def _sinking(grid, pose, points, inward, thickness, area, strain):
 def _cover(grid, pose, points, inward, thickness, faces, start, around, slot, covered, top):
     """Triangles around covered vertices, their vertices in order, and of these depth and rests: see Squeeze.
 
-    At the border the depth falls to 0 over WALL beside a wall of the tool, and where a tool has sunk under skin that it
+    At the border the depth falls to 0 beside a wall of the tool, and where a tool has sunk under skin that it
     does not reach, within half of that inside it.
     """
     room = 0
@@ -347,7 +349,7 @@ def _cover(grid, pose, points, inward, thickness, faces, start, around, slot, co
     for n in range(count):
         v = vertices[n]
         slot[v] = -1
-        wall, ray = WALL * thickness[v], ray_of(pose, points, inward, v)
+        wall, ray = wall_in(grid[3], thickness[v]), ray_of(pose, points, inward, v)
         deep, share = depth_and_share(grid, ray, thickness[v], top)
         depth[n] = share * deep
         if depth[n] > 0:

@@ -11,7 +11,7 @@ from scipy.spatial import KDTree
 from stmpl_core.arrays import Transform
 from stmpl_core.columns import Columns, Squeeze, grid_of, middle_of, shifted
 from stmpl_core.layer import SoftLayer
-from stmpl_core.rays import UNSAID, WALL, depth_and_share, distance_in_column, ray_of
+from stmpl_core.rays import UNSAID, depth_and_share, distance_in_column, ray_of, wall_in
 from stmpl_core.sdf import SignedDistance
 
 DEEPEST = 0.9  # depth over thickness beyond which a tool is answered for where it is drawn back to that
@@ -171,7 +171,7 @@ def _said(grid, pose, points, inward, thickness, some):
         touched = touched or (share == 1 and deep > 0)
         if share * deep / t <= DEEPEST:
             continue
-        if min(max(1 - above / (WALL * t), 0.0), 1.0) * deep / t <= DEEPEST:  # so only under skin out of its reach
+        if min(max(1 - above / wall_in(grid[3], t), 0.0), 1.0) * deep / t <= DEEPEST:  # skin out of its reach
             unsure = True
             continue
         if deep == t and distance_in_column(grid, ray, t + 1e-5) < distance_in_column(grid, ray, t):

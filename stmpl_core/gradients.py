@@ -390,4 +390,5 @@ def _sized_field(field: SignedDistance, by: float) -> SignedDistance:
     """The distance field of a tool so many times as large: s d(x / s), exactly."""
     low, high = field.tool_bounds
     return replace(field, coefficients=by * field.coefficients, origin=by * field.origin, spacing=by * field.spacing,
-                   surface_error=by * field.surface_error, tool_bounds=(by * low, by * high))  # fmt: skip
+                   surface_error=by * field.surface_error, tool_bounds=(by * low, by * high),
+                   half_thickness=by * field.half_thickness, openings=by * field.openings)  # fmt: skip

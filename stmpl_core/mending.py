@@ -82,6 +82,15 @@ def closed(vertices: Points, faces: Faces) -> bool:
     return _Edges.of(places(vertices)[faces]).closed
 
 
+def openings(vertices: Points, faces: Faces) -> Points:
+    """Middles of the edges at which the surface ends, or where more faces meet one way than the other, (K, 3) [m]."""
+    edges = _Edges.of(places(vertices)[faces])
+    uneven = np.add.reduceat(np.where(edges.up[edges.half], 1, -1), edges.start) != 0
+    half = edges.half[edges.start[uneven]]
+    face, corner = half // 3, half % 3
+    return 0.5 * (vertices[faces[face, corner]] + vertices[faces[face, (corner + 1) % 3]])
+
+
 def mended(vertices: ArrayLike, faces: ArrayLike) -> Mended:
     """A surface without useless faces and vertices, wound one way, and no finer than its distance field.
 

@@ -23,6 +23,7 @@ from stmpl_core.rays import (
     ray_from,
     sunk_under,
     to_tool,
+    wall_in,
 )
 from stmpl_core.sdf import distance_at
 
@@ -161,7 +162,7 @@ def _column(inward, thickness, i, j, k, a, b, c):
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _strain_under(grid, ray, t, top):
     """How far the tool squeezes a column, over its thickness; rising from 0 beside the tool's walls."""
-    wall = WALL * t
+    wall = wall_in(grid[3], t)
     deep, share = depth_and_share(grid, ray, t, top)
     if deep <= 0:
         return 0.0

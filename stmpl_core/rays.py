@@ -8,7 +8,7 @@ import numpy as np
 from stmpl_core.sdf import distance_at
 
 WALL = 0.05  # width over which depth rises beside a tool's wall, over the thickness: nothing pops in while it slides
-PASSED = 6  # places along a column at which it is looked how far it is inside a tool, or passes beside it
+PASSED, MOST_PASSED = 7, 64  # parts of a column's way between which it is looked how far it is inside a tool, or beside
 ENTERS, LOOKS_BACK = 12, 0.3  # steps to where a column enters a tool, cosine from which its surface looks back there
 NOT_SUNK, UNSAID = np.zeros(3), np.full(3, 9.0)  # what is said of a tool that has not sunk under skin, or anyhow
 MAX_COLUMN_STRAIN = 0.9  # strain beyond which no column is squeezed
@@ -43,6 +43,12 @@ def ray_of(pose, points, ways, n):
 def distance_in_column(grid, ray, s):
     """Signed distance to the tool at depth s along a ray [m]."""
     return distance_at(grid[0], grid[1], grid[2], ray[0] + s * ray[3], ray[1] + s * ray[4], ray[2] + s * ray[5])
+
+
+@numba.njit(cache=True, inline="always")
+def wall_in(half, t):
+    """Width over which depth rises beside a wall of a tool of this half thickness, in a column t long [m]."""
+    return min(WALL * t, half)
 
 
 @numba.njit(cache=True, error_model="numpy")
@@ -94,13 +100,16 @@ def depth_in_column(grid, ray, t, guess, least=0.0):
 def inside_most(grid, ray, deep, most, least):
     """How far inside the tool a ray gets at most on its way to a depth [m]; below 0: how far it passes beside it.
 
+    It is looked as often as a plate of the tool's half thickness wants.
+
     Args:
         most: how far inside it begins [m].
         least: value up to which the answer does not matter [m].
     """
     at, there = 0.0, most
-    for k in range(1, PASSED + 1):
-        s = deep * k / (PASSED + 1)
+    parts = int(min(max(2 * deep / grid[3], PASSED), MOST_PASSED))
+    for k in range(1, parts):
+        s = deep * k / parts
         if there + STEEPEST * (s - at) > max(most, least):
             at, there = s, -distance_in_column(grid, ray, s)
             most = max(most, there)
@@ -136,15 +145,17 @@ def sunk_under(grid, ray, t, top):
 
 @numba.njit(cache=True, error_model="numpy")
 def depth_and_share(grid, ray, t, top):
-    """How deep the tool is in a column [m], and the share of that which counts: rising from 0 over WALL at its skin.
+    """How deep the tool is in a column [m], and the share of that which counts: rising from 0 at its skin over a wall.
 
     Where the tool has sunk under skin that it does not reach, a column counts as far as it is inside the tool.
     """
-    wall, guess = WALL * t, -distance_in_column(grid, ray, 0.0)
+    wall, guess = wall_in(grid[3], t), -distance_in_column(grid, ray, 0.0)
     share, sunk = min(max(1 + guess / wall, 0.0), 1.0), top.any()
     if share <= 0 and not sunk:
         return 0.0, 0.0
     deep = depth_in_column(grid, ray, t, guess)
+    if deep == 0 and guess > 0:
+        deep = guess  # the skin is no deeper in the tool than distances are off by
     if share < 1 and sunk and deep > 0:
         within = min(2 * inside_most(grid, ray, deep, guess, 0.5 * share * wall) / wall, 1.0)
         if within > share:

@@ -3,18 +3,20 @@
 from __future__ import annotations
 
 import logging
-from dataclasses import dataclass
+import math
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any, Self
 
 import numba
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.spatial import KDTree
 
 from stmpl_core.arrays import Points, finite
 from stmpl_core.decimation import BAND_CELLS, MARGIN, MAX_NODES, field_spacing
 from stmpl_core.errors import InvalidInput, MeshError
-from stmpl_core.mending import closed
+from stmpl_core.mending import closed, openings
 from stmpl_core.spline import spline_sum
 from stmpl_core.tool import Tool
 
@@ -23,10 +25,13 @@ log = logging.getLogger(__name__)
 MAX_EXTENT = 2.0  # largest extent of a tool [m]; that of a mesh in millimetres is larger
 MIN_EXTENT = 2e-4  # smallest extent of a tool [m]
 COARSE = 3  # factor by which the grid far from the surface is coarser
+COLLAR = 2 * COARSE  # nodes around the grid that splines end beyond: at their ends they are flat, and far off
 FAST = {"contract", "reassoc", "nsz"}  # sums of splines may be taken in any order
 ONE, TWO, THREE = np.uint64(1), np.uint64(2), np.uint64(3)
 SIXTH = 1 / 6  # dividing takes several times as long as multiplying
 MOST_KEPT, MOST_KEPT_BYTES = 16, 8e6  # fields that are kept for the next caller, and the largest of them
+MOST_OPENINGS, NO_POINTS = 1000, np.empty((0, 3))  # places at the rims of holes that are kept
+PROBED, THICK = 600, 5e-3  # places of a tool from which its thickness is told, and the largest half of it [m]
 ROUNDING_WIDTH = 0.57  # width of the smoothing over the radius that it gives a right-angled edge, measured
 
 
@@ -49,6 +54,8 @@ class SignedDistance:
         flipped: flag of a mesh that came inside out, and was turned.
         surface_error: largest |distance| at the vertices and face centres of the mesh, where it should be 0 [m].
         tool_bounds: lowest and highest corner of the mesh, (3,) [m] each.
+        half_thickness: how far inside the tool one gets at most from most of its surface [m]; at most THICK.
+        openings: places at the rims of its holes, (K, 3) [m].
     """
 
     coefficients: np.ndarray
@@ -58,6 +65,8 @@ class SignedDistance:
     flipped: bool
     surface_error: float
     tool_bounds: tuple[np.ndarray, np.ndarray]
+    half_thickness: float = math.inf
+    openings: Points = field(default_factory=lambda: NO_POINTS)
 
     @classmethod
     def of(
@@ -100,24 +109,30 @@ class SignedDistance:
         from scipy import ndimage  # who only reads a field need not wait for what builds it
 
         origin = low + extent / 2 - spacing * (shape - 1) / 2
-        values = _node_distances(vertices, faces, origin, spacing, shape)
+        values = _node_distances(vertices, faces, origin - COLLAR * spacing, spacing, shape + 2 * COLLAR)
         if rounding > 0:
             values = ndimage.gaussian_filter(values, ROUNDING_WIDTH * rounding / spacing, mode="nearest")
-        coefficients = np.asarray(ndimage.spline_filter(values, order=3, mode="mirror"))
+        inner = (slice(COLLAR, -COLLAR),) * 3
+        coefficients = np.ascontiguousarray(ndimage.spline_filter(values, order=3, mode="mirror")[inner])
         probes = np.concatenate([used, vertices[faces].mean(axis=1)])
         error = float(np.abs(_distances(coefficients, origin, spacing, probes)).max())
-        built = cls(coefficients, origin, spacing, watertight, flipped, error, (low, low + extent))
+        half = _half_thickness(coefficients, origin, spacing, vertices, faces)
+        rims = NO_POINTS if watertight else openings(vertices, faces)
+        rims = rims[:: 1 + len(rims) // MOST_OPENINGS]
+        built = cls(coefficients, origin, spacing, watertight, flipped, error, (low, low + extent), half, rims)
         if coefficients.nbytes <= MOST_KEPT_BYTES:
             _KEPT[key] = built
             for old in list(_KEPT)[:-MOST_KEPT]:
                 _KEPT.pop(old, None)  # another thread may have
         return built
 
+    def opening(self, points: ArrayLike) -> float:
+        """Least distance of points (N, 3) [m] of the tool's frame from the rim of a hole [m]; infinite without one."""
+        return float(self._rims.query(np.asarray(points))[0].min(initial=np.inf)) if len(self.openings) else np.inf
+
     @cached_property
-    def thinnest(self) -> float:
-        """Least extent of the mesh along its axes [m]."""
-        low, high = self.tool_bounds
-        return float((high - low).min())
+    def _rims(self) -> KDTree:
+        return KDTree(self.openings)
 
     @property
     def bounds(self) -> tuple[np.ndarray, np.ndarray]:
@@ -192,6 +207,21 @@ def _finer(coarse: np.ndarray) -> np.ndarray:
             fine[r::COARSE] = sum(w * lines[q : q + ends] for q, w in enumerate(_cubic.py_func(r / COARSE)))
         out = np.moveaxis(fine, 0, axis)
     return np.ascontiguousarray(out)
+
+
+def _half_thickness(coefficients: np.ndarray, origin: np.ndarray, spacing: float, vertices: Points,
+                    faces: np.ndarray) -> float:  # fmt: skip
+    """See SignedDistance; from PROBED places of the surface, a third of which may be less thick: edges are."""
+    corners, areas, rng = vertices[faces], _face_areas(vertices, faces), np.random.default_rng(0)
+    some = rng.choice(len(faces), PROBED, p=areas / areas.sum())
+    shares = np.diff(np.sort(rng.uniform(size=(PROBED, 2))), prepend=0.0, append=1.0)
+    a, b, c = np.swapaxes(corners[some], 0, 1)
+    inwards = -np.cross(b - a, c - a) / (2 * areas[some, None])
+    way = np.linspace(0.0, THICK, 1 + int(THICK / min(max(0.5 * spacing, 2e-4), 1e-3)))[1:]
+    places = np.einsum("pc,pcx->px", shares, corners[some])[:, None] + way[:, None] * inwards[:, None]
+    inside = -_distances(coefficients, origin, spacing, places.reshape(-1, 3)).reshape(PROBED, -1)
+    inside[np.cumsum(inside <= 0, axis=1) > 0] = 0.0  # beyond the tool's other side
+    return max(float(np.quantile(inside.max(axis=1), 2 / 3)), 0.25 * spacing)
 
 
 def _node_distances(vertices: Points, faces: np.ndarray, origin: np.ndarray, h: float, shape: np.ndarray) -> np.ndarray:

@@ -21,7 +21,7 @@ import numpy as np
 from stmpl_core.columns import grid_of, middle_of
 from stmpl_core.layer import SoftLayer
 from stmpl_core.nodes import FACING, Nodes
-from stmpl_core.rays import MAX_COLUMN_STRAIN, WALL, depth_in_column, distance_in_column, ray_from
+from stmpl_core.rays import MAX_COLUMN_STRAIN, depth_in_column, distance_in_column, ray_from, wall_in
 from stmpl_core.sdf import SignedDistance
 from stmpl_core.touch import MIN_ONE_WAY_SHARE, Pressed, Touch
 from stmpl_core.toucher import Toucher, groups_of
@@ -139,7 +139,8 @@ def _rates(layer: SoftLayer, field: SignedDistance, pose: np.ndarray, nodes: Nod
     distance, gradient = distance.reshape(-1, many), (gradient @ turn.T).reshape(-1, many, 3)
     skin = layer.vertices, -layer.normals, layer.thickness
     shares, go, turned, thicker = _carried(*skin, *nodes[:3], *nodes[5:7], way, origin, middle_of(field, pose))
-    strain, deeper = _deepened(*nodes[:5], columns, distance, gradient, go, turned, thicker, origin)
+    strain, deeper = _deepened(*nodes[:5], columns, distance, gradient, go, turned, thicker, origin,
+                               field.half_thickness)  # fmt: skip
     if not slanted:
         return _Rates(strain, deeper, shares)
     rates = np.einsum("kn,nx->kx", nodes.area * deeper, nodes.inward) + \
@@ -158,7 +159,7 @@ def _columns(grid, pose, points, inward, thickness, area, strain):
         ray = ray_from(pose, points[n, 0], points[n, 1], points[n, 2], inward[n, 0], inward[n, 1], inward[n, 2])
         t = thickness[n]
         out[0, n] = depth_in_column(grid, ray, t, max(-distance_in_column(grid, ray, 0.0), strain[n] * t))
-        out[2, n] = max(out[0, n] - WALL * t, 0.0)
+        out[2, n] = max(out[0, n] - wall_in(grid[3], t), 0.0)
     return out
 
 
@@ -218,7 +219,8 @@ def _carried(vertices, normals, thicknesses, points, inward, thickness, corners,
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _deepened(points, inward, thickness, area, strain, columns, distance, gradient, go, turned, thicker, origin):
+def _deepened(points, inward, thickness, area, strain, columns, distance, gradient, go, turned, thicker, origin,
+              half):  # fmt: skip
     """Rates of strains and depths at nodes, (6, N) each.
 
     The depth counts in part at the rim of a tool and beside its walls (stmpl_core.nodes): that part changes too.
@@ -226,11 +228,12 @@ def _deepened(points, inward, thickness, area, strain, columns, distance, gradie
     Args:
         columns: see `_columns`; distance (., N) and gradient (., N, 3) are those of the tool there, in body axes.
         go, turned, thicker: see `_carried`.
+        half: half thickness of the tool [m].
     """
     many = len(area)
     strains, depths = np.zeros((6, many)), np.zeros((6, many))
     for n in range(many):
-        normal, t, deep, wall = inward[n], thickness[n], columns[0, n], WALL * thickness[n]
+        normal, t, deep, wall = inward[n], thickness[n], columns[0, n], wall_in(half, thickness[n])
         along = _dot(gradient[0, n], normal)
         if deep <= 0 or abs(along) < LEAST_COSINE:
             continue

@@ -23,6 +23,7 @@ from stmpl_core.moments import Surroundings
 from stmpl_core.nodes import Nodes, gathered
 from stmpl_core.obstacle import REACH
 from stmpl_core.pieces import DEEP, GROUP, WIDER, pins
+from stmpl_core.rays import WALL
 from stmpl_core.sdf import SignedDistance
 from stmpl_core.tools import Tools
 from stmpl_core.touch import (
@@ -53,8 +54,7 @@ MIN_NET_FORCE_SHARE = 0.1  # force over the sum of its parts' sizes, below which
 MAX_DRAG_RATIO = 0.3  # tangential over normal force that is not yet worth a word
 MARGIN_SHARE = 2 / 3  # width of the distance fields around tools, over the thickness
 MAX_AROUND = 0.02  # depth of skin in a tool that presses nothing, over the thickness, that is not yet worth a word
-THIN = 0.7  # least extent of a tool, over the skin's edges, below which it is thin
-SUNK = 0.8  # depth of a thin tool over its least extent, beyond which its force may fall as it goes deeper
+OPEN = 2.0  # distance of a hole in a tool's mesh over the depth, up to which what is inside the tool there is a guess
 SHELL, SHELL_FROM = 2.5, 0.02  # bound on a force per share of work above this by which a limb is stiff as a shell
 STUCK = 0.5  # error of what skin that sticks carries along itself, over that
 MAX_LEVER = 1.0  # torque that is not carried over the force, over the contact's radius, that is not yet worth a word
@@ -408,6 +408,8 @@ class Toucher:
         if one.why:
             trust = trust.also(one.why, in_range=False)
         if not len(pressure):
+            if one.status == BY_POSE:
+                trust = trust.also(f"{name} is in the skin and presses nothing: check its mesh", in_range=False)
             return trust
         forces = pressure * layer.vertex_areas[vertices]
         for why in self.near.sound.of_contact(vertices, forces):
@@ -432,13 +434,6 @@ class Toucher:
         if softly > SOFT_SHARE and one.status != IN_CORE:
             trust = trust.also(f"{name} presses to {softly:.0%} of what lies over a material over {MUCH_STIFFER:g} "
                                f"times as stiff, tried is {SOFT_SHARE:.0%}", in_range=False)  # fmt: skip
-        thinnest = one.field.thinnest
-        if thinnest < THIN * layer.edge_length and one.status != IN_CORE:
-            lowest = max(touch.depth, self._lowest(one, vertices))
-            if lowest > SUNK * thinnest:
-                trust = trust.also(f"{name} is {1e3 * thinnest:.2g} mm thick, thin beside the skin's edges of "
-                                   f"{1e3 * layer.edge_length:.2g} mm, and {1e3 * lowest:.2g} mm deep",
-                                   in_range=False)  # fmt: skip
         for why in self._unlearnt:
             trust = trust.also(why, in_range=False)
         if strange > MAX_UNSEEN_FORCE_SHARE:
@@ -452,18 +447,14 @@ class Toucher:
             error_mm = one.field.surface_error * 1e3
             trust = trust.also(f"the distance field of {name} is off by up to {error_mm:.1f} mm")
         if not one.field.watertight:
+            nodes, pose = one.squeeze.nodes, one.pose
+            away = one.field.opening((nodes.points - pose[:3, 3]) @ pose[:3, :3])
             trust = trust.also(f"the mesh of {name} has holes")
+            if away < OPEN * touch.depth + WALL * float(nodes.thickness.max()):
+                trust = trust.also(f"a hole of {name} is {1e3 * away:.2g} mm from where it presses", in_range=False)
         if one.field.flipped:
             trust = trust.also(f"the mesh of {name} was inside out and was turned")
         return trust
-
-    def _lowest(self, one: _Placed, vertices: np.ndarray) -> float:
-        """Depth of a tool's lowest corner below the skin that it presses [m]: a sheet may lie under it altogether."""
-        skin, pose = self.layer.vertices[vertices], one.pose
-        away = (one.contact.tool.vertices @ pose[:3, :3].T + pose[:3, 3])[:, None] - skin
-        down = np.einsum("tvx,vx->tv", away, self._inward[vertices])
-        beside = np.einsum("tvx,tvx->tv", away, away) - down**2 > self.layer.edge_length**2
-        return float(np.where(beside, 0.0, down).max(initial=0.0))
 
     def unmet(self, trust: Trust, touch: Touch, stated: np.ndarray | None) -> Trust:
         """The trust in a touch, lowered where much of the stated wrench (6,) is not carried."""

@@ -231,7 +231,7 @@ def test_places_along_a_column_that_are_not_looked_at_are_not_the_deepest(least:
     rng, deep = np.random.default_rng(5), 4e-3
     starts, ways = rng.uniform(-0.02, 0.02, (2000, 3)) * (1, 1, 0.3), rng.normal(size=(2000, 3))
     ways /= np.linalg.norm(ways, axis=1, keepdims=True)
-    at = starts[:, None] + deep * np.arange(PASSED + 1)[:, None] / (PASSED + 1) * ways[:, None]
+    at = starts[:, None] + deep * np.arange(PASSED)[:, None] / PASSED * ways[:, None]
     inside = -SLAB.distance(at.reshape(-1, 3)).reshape(2000, -1)
     found = [inside_most(grid_of(SLAB), (*start, *way), deep, first, least)
              for start, way, first in zip(starts, ways, inside[:, 0], strict=True)]  # fmt: skip
@@ -263,3 +263,16 @@ def test_a_tool_has_sunk_under_columns_that_enter_it_from_above() -> None:
     assert 0 < under(0.03, 0.001, -1, 0) < 1 and under(0.03, 0.0, -1, 0) == pytest.approx(0.0, abs=0.5)
     assert under(0.03, 0.02, 0, -1) == 0  # past it
     assert under(0, 0.02, 0, -1, NOT_SUNK) == 0 and under(0.03, -0.012, -1, 0.1, UNSAID) == 1
+
+
+@pytest.mark.parametrize("radius", [0.03, 0.04, 0.06, 0.08])
+def test_a_tool_as_wide_as_a_limb_presses_from_first_touch_on(round_limb: Columns, radius: float) -> None:
+    """Its distance field ends above the core: no column may miss it for that."""
+    field, pose = SignedDistance.of(ball(radius, subdivisions=5), margin=MARGIN), np.eye(4)
+    vertex = int(np.linalg.norm(LIMB.vertices - (RADIUS, 0, LENGTH / 2), axis=1).argmin())
+    pose[:3, :3] = turn((0, 1, 0), 0.7)[:3, :3]  # so that it meets the skin beside its grid's middle
+    for depth in (1e-4, 2e-4, 4e-4, 8e-4):
+        pose[:3, 3] = LIMB.vertices[vertex] + (radius - depth) * LIMB.normals[vertex]
+        squeeze = round_limb.squeezed(field, pose)
+        deepest = float(max(squeeze.depth.max(), (squeeze.nodes.strain * squeeze.nodes.thickness).max(initial=0.0)))
+        assert deepest == pytest.approx(depth, rel=0.15, abs=2e-5)

@@ -7,12 +7,14 @@ import pytest
 import trimesh
 from scipy.spatial import Delaunay
 
+from benchmarks.living_limbs import site
 from fem_tools.indenter import IndenterFem
 from fem_tools.patch import PatchFem
 from fem_tools.press import Press
 from stmpl_core import Contact, Load, SoftLayer, Tissue, Tool
 from stmpl_core.body import Body
 from stmpl_core.errors import InvalidInput, MeshError
+from stmpl_core.living import living
 from stmpl_core.methods import Linear, Naive, Winkler
 from stmpl_core.sdf import SignedDistance
 from stmpl_core.simulator import Simulator
@@ -508,19 +510,42 @@ def test_reach_is_the_callers(sim: Simulator) -> None:
     assert Toucher(LIMB, reach=5e-3).touch(contact).status == MOVED
 
 
-@pytest.mark.parametrize("depth, sound", [(0.4e-3, True), (2e-3, False)])
-def test_a_sheet_thinner_than_the_mesh_that_sinks_below_the_skin_is_flagged(sim: Simulator, depth, sound) -> None:
-    touch = touch_of(sim.step([press(box(1e-3, 0.02, 0.02), at(RADIUS + 0.5e-3 - depth, 0, MIDDLE), None)]))
-    assert ("thin beside the skin's edges" not in touch.trust.why) == sound
-    assert sound or not touch.trust.in_range
+@pytest.mark.parametrize("depth", [0.4e-3, 2e-3, 4e-3])
+def test_a_sheet_thinner_than_the_mesh_presses_as_a_block_with_its_lower_face(sim: Simulator, depth: float) -> None:
+    thin, thick = (touch_of(sim.step([press(box(wide, 0.02, 0.02), at(RADIUS + wide / 2 - depth, 0, MIDDLE), None)]))
+                   for wide in (1e-3, 2e-2))  # fmt: skip
+    assert thin.trust.in_range == thick.trust.in_range and thin.force == pytest.approx(thick.force, rel=0.06)
 
 
-def test_a_sheet_that_lies_under_the_skin_is_flagged() -> None:
-    """Columns pass through it by little: its depth tells nothing."""
+@pytest.mark.parametrize("place, high", [("right_thigh", 3e-3), ("left_upper_arm", 2e-3)])
+def test_a_plate_presses_thick_tissue_as_a_block_with_its_lower_face(place: str, high: float) -> None:
+    """A twentieth of the tissue is as thick as the plate."""
+    layer = living(Body.anny(), place, edge_length=8e-3)
+    vertex, toucher = site(layer, place), Toucher(layer)
+    normal, t = layer.normals[vertex], float(layer.thickness[vertex])
+    turned = trimesh.geometry.align_vectors([0, 0, 1], normal)
+    for strain in (0.1, 0.3, 0.5):
+        forces = []
+        for wide in (high, 0.04):
+            pose = turned.copy()
+            pose[:3, 3] = layer.vertices[vertex] + (wide / 2 - strain * t) * normal
+            forces.append(toucher.touch(press(box(0.03, 0.03, wide), pose, None)).force)
+        assert forces[0] == pytest.approx(forces[1], rel=0.08)
+
+
+def test_a_sheet_under_the_skin_is_as_deep_as_it_lies() -> None:
     sheet, tilted = box(1.6e-4, 3e-3, 13e-3), turn((0, 1, 0), 0.95, (1e-3, 1e-3, -3.3e-3))
     touch = Toucher(plate(0.084, 7e-3, 4.2e-3)).touch(press(sheet, tilted, None))
-    assert touch.force > 0 and touch.depth < 0.1 * 4.2e-3
-    assert "thin beside the skin's edges" in touch.trust.why and not touch.trust.in_range
+    assert touch.force > 0 and touch.depth > 0.9 * 4.2e-3 and not touch.trust.in_range
+
+
+def test_holes_are_flagged_where_they_are_near_what_presses(sim: Simulator) -> None:
+    ways = BALL.vertices[BALL.faces].mean(axis=1)[:, 0] / np.abs(BALL.vertices).max()
+    whole = touch_of(sim.step([press(BALL, on_limb(), None)]))
+    for kept, sound in ((ways < 0.3, True), (ways < -0.7, False), (np.abs(ways + 0.5) < 0.48, False)):
+        touch = touch_of(sim.step([press(Tool("probe", BALL.vertices, BALL.faces[kept]), on_limb(), None)]))
+        assert touch.trust.in_range == sound
+        assert touch.trust.why if not sound else touch.force == pytest.approx(whole.force, rel=0.02)
 
 
 @pytest.mark.parametrize("depth, count, sound", [(0.6e-3, 7, True), (4.5e-3, 7, False), (4.5e-3, 1, True)])

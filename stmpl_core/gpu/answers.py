@@ -21,7 +21,6 @@ BORDER_SHARE = wp.constant(wp.float64(soundness.BORDER_SHARE))
 AROUND, UNSEEN = wp.constant(wp.float64(toucher.MAX_AROUND)), wp.constant(wp.float64(toucher.MAX_UNSEEN_FORCE_SHARE))
 SIDES = wp.constant(wp.vec2d(*toucher.SIDES))
 SOFT_SHARE = wp.constant(wp.float64(toucher.SOFT_SHARE))
-THIN, SUNK = wp.constant(wp.float64(toucher.THIN)), wp.constant(wp.float64(toucher.SUNK))
 SHELL, SHELL_FROM = wp.constant(wp.float64(toucher.SHELL)), wp.constant(wp.float64(toucher.SHELL_FROM))
 STUCK, WIDER = wp.constant(wp.float64(toucher.STUCK)), wp.constant(wp.float64(pieces.WIDER))
 GROUP, PINS_DEEP = wp.constant(wp.float64(pieces.GROUP)), wp.constant(wp.float64(pieces.DEEP))
@@ -266,9 +265,7 @@ def answer(first: wp.int32, many: wp.int32, known: Known, skins: Skins, scratch:
     pins = _pins(scratch, s, start, start + wp.int32(count))
     group = pins[0] > GROUP and depth > PINS_DEEP * pins[1]
     sound = sound and not group
-    thinnest = skins.thinnest[k]
-    if thinnest < THIN * one.edge and depth > SUNK * thinnest:
-        sound = False
+    sound = sound and skins.holes[k] == 0
     for x in range(3):
         wrenches[n, k, x] = wrenches.dtype(one.modulus * force[x])
         wrenches[n, k, 3 + x] = wrenches.dtype(one.modulus * torque[x])

@@ -125,7 +125,8 @@ def lie(pick: wp.array(dtype=wp.int32), lanes: wp.int32, many: wp.int32, skins: 
         v, lies, gone = field.under[f, n], real(0.0), vec3()
         if _met(scratch, c, v - first) and highest > real(0.0):
             inward, thick = skins.inward[v], skins.thickness[v]
-            start, down, wall = pose * (skins.points[v] - scratch.place[c]), pose * inward, WALL_WIDTH * thick
+            start, down = pose * (skins.points[v] - scratch.place[c]), pose * inward
+            wall = wp.min(WALL_WIDTH * thick, grid.half)
             deep, share = depth_and_share(grid, skins.coefficients, start, down, thick, scratch.top[c])
             depth, rests = share * deep, real(0.0)
             if depth > real(0.0):

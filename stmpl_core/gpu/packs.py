@@ -96,7 +96,7 @@ SKINS: dict[str, tuple[Any, str]] = {
     "area_vectors": (vec3, "V"), "bent": (real, "Vx"), "facets": (real, "V"), "doubts": (wp.int32, "V"),
     "faces": (wp.vec3i, "F"),
     "start": (wp.int32, "V"), "around": (wp.int32, "F"), "balls": (wp.vec4d, "B"),
-    "grids": (Grid, "G"), "coefficients": (real, "N"), "thinnest": (real, "K"),
+    "grids": (Grid, "G"), "coefficients": (real, "N"), "holes": (wp.int32, "K"),
     "looked_at": (vec3, "Kx"), "look_many": (wp.int32, "Kx"),
     "rows": (real, "Tx"), "linked": (wp.uint32, "Vb"),
     "green": (real, "SbgR"), "soft": (real, "V"), "alike": (real, "V"), "coarse_corner": (wp.vec3i, "V"),
@@ -230,7 +230,7 @@ def pack(skins: Sequence[Skin], tools: Sequence[Tool], device: Any) -> tuple[Any
     longest = max(len(points) for points, _ in looked)
     parts["looked_at"] = [np.stack([np.resize(points, (longest, 3)) for points, _ in looked])]
     parts["look_many"] = [np.array([many for _, many in looked])]
-    parts["thinnest"] = [np.array([field.thinnest for field in fields[0]])]
+    parts["holes"] = [np.array([len(field.openings) for field in fields[0]])]
     out = Skins()
     for name, (dtype, _) in SKINS.items():
         values: Any = {"one": ones, "grids": grids}.get(name)
@@ -318,7 +318,7 @@ def _linked(skin: Skin, order: np.ndarray) -> np.ndarray:
 def _grid(field: SignedDistance, offset: int) -> Any:
     out = Grid()
     out.offset, out.shape, out.spacing = offset, wp.vec3i(*field.coefficients.shape), field.spacing
-    out.origin, out.surface_error = vec3(*field.origin), field.surface_error
+    out.origin, out.surface_error, out.half = vec3(*field.origin), field.surface_error, field.half_thickness
     out.low, out.high = (vec3(*corner) for corner in field.tool_bounds)
     return out
 

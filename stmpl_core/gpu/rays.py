@@ -5,7 +5,7 @@ import warp as wp
 
 from stmpl_core.rays import ENTERS as MOST_ENTERS
 from stmpl_core.rays import LOOKS_BACK as LOOKED_BACK
-from stmpl_core.rays import MAX_COLUMN_STRAIN, PASSED, SECANT_START, SECANT_TOLERANCE, WALL
+from stmpl_core.rays import MAX_COLUMN_STRAIN, MOST_PASSED, PASSED, SECANT_START, SECANT_TOLERANCE, WALL
 
 real = wp.float64  # of all geometry: float32 keeps 1e-8 m on a limb, a touch of 0.1 mm wants less
 vec3, mat33 = wp.vec3d, wp.mat33d
@@ -13,14 +13,15 @@ OPTIONS = {"enable_backward": False}
 FAR = wp.constant(wp.float64(1e30))  # stands for infinity
 WALL_WIDTH = wp.constant(wp.float64(WALL))
 MOST_STRAIN = wp.constant(wp.float64(MAX_COLUMN_STRAIN))
-PLACES, ENTERS, LOOKS_BACK = wp.constant(PASSED), wp.constant(MOST_ENTERS), wp.constant(wp.float64(LOOKED_BACK))
+PARTS, MOST_PARTS = wp.constant(wp.float64(PASSED)), wp.constant(wp.float64(MOST_PASSED))
+ENTERS, LOOKS_BACK = wp.constant(MOST_ENTERS), wp.constant(wp.float64(LOOKED_BACK))
 START, TOLERANCE = wp.constant(wp.float64(SECANT_START)), wp.constant(wp.float64(SECANT_TOLERANCE))
 wp.set_module_options(OPTIONS)
 
 
 @wp.struct
 class Grid:
-    """Distance field of a tool: its place among all coefficients, shape, origin [m], cells [m], the tool's box [m]."""
+    """Distance field of a tool: its place among all coefficients, shape, origin, cells, the tool's box, [m] all."""
 
     offset: wp.int32
     shape: wp.vec3i
@@ -29,6 +30,7 @@ class Grid:
     low: vec3
     high: vec3
     surface_error: real
+    half: real
 
 
 @wp.func
@@ -85,7 +87,7 @@ def clearance_of(grid: Grid, coefficients: wp.array(dtype=real), start: vec3, wa
         least = d - t
     else:
         while s < t:
-            s = wp.min(s + wp.max(wp.max(wp.abs(d), d - least), t / real(16.0)), t)
+            s = wp.min(s + wp.max(wp.max(wp.abs(d), d - least), wp.min(t / real(16.0), grid.half)), t)
             d = along(grid, coefficients, start, way, s)
             least = wp.min(least, d)
         if d <= real(0.0):
@@ -163,8 +165,9 @@ def depth_in_column(grid: Grid, coefficients: wp.array(dtype=real), start: vec3,
 def inside_most(grid: Grid, coefficients: wp.array(dtype=real), start: vec3, way: vec3, deep: real) -> real:
     """How far inside the tool a ray gets at most on its way to a depth [m]; below 0: how far it passes beside it."""
     most = -along(grid, coefficients, start, way, real(0.0))
-    for k in range(1, PLACES + 1):
-        most = wp.max(most, -along(grid, coefficients, start, way, deep * real(k) / real(PLACES + 1)))
+    parts = wp.int32(wp.min(wp.max(real(2.0) * deep / grid.half, PARTS), MOST_PARTS))
+    for k in range(1, parts):
+        most = wp.max(most, -along(grid, coefficients, start, way, deep * real(k) / real(parts)))
     return most
 
 
@@ -194,11 +197,13 @@ def sunk_under(grid: Grid, coefficients: wp.array(dtype=real), start: vec3, way:
 @wp.func
 def depth_and_share(grid: Grid, coefficients: wp.array(dtype=real), start: vec3, way: vec3, t: real, top: vec3):
     """How deep the tool is in a column [m], and the share of that which counts."""
-    wall, guess = WALL_WIDTH * t, -along(grid, coefficients, start, way, real(0.0))
+    wall, guess = wp.min(WALL_WIDTH * t, grid.half), -along(grid, coefficients, start, way, real(0.0))
     share, deep = wp.clamp(real(1.0) + guess / wall, real(0.0), real(1.0)), real(0.0)
     sunk = wp.length_sq(top) > real(0.0)
     if share > real(0.0) or sunk:
         deep = depth_in_column(grid, coefficients, start, way, t, guess)
+        if deep == real(0.0):
+            deep = wp.max(guess, real(0.0))
         if share < real(1.0) and sunk and deep > real(0.0):
             within = wp.min(real(2.0) * inside_most(grid, coefficients, start, way, deep) / wall, real(1.0))
             if within > share:
@@ -210,7 +215,7 @@ def depth_and_share(grid: Grid, coefficients: wp.array(dtype=real), start: vec3,
 def strain_under(grid: Grid, coefficients: wp.array(dtype=real), start: vec3, way: vec3, t: real,
                  top: vec3) -> real:  # fmt: skip
     """How far the tool squeezes a column, over its thickness; rising from 0 beside the tool's walls."""
-    wall = WALL_WIDTH * t
+    wall = wp.min(WALL_WIDTH * t, grid.half)
     deep, share = depth_and_share(grid, coefficients, start, way, t, top)
     if deep <= real(0.0):
         return real(0.0)
