@@ -1,0 +1,40 @@
+"""Laws of what a node refuses: whoever asks for what cannot be gets a sentence, and the node serves on."""
+
+import pytest
+from lifecycle_msgs.msg import Transition
+from lifecycle_msgs.srv import ChangeState, GetState
+
+from tests.node_bus import HERE, PUSH
+
+
+def change(bus, number: int = 0, label: str = "") -> bool:
+    """Whether the node changed its state so."""
+    return bus.call(ChangeState, "change_state", transition=Transition(id=number, label=label)).success
+
+
+def state(bus) -> str:
+    return bus.call(GetState, "get_state").current_state.label
+
+
+@pytest.mark.parametrize(("asked", "said"), [
+    ({"number": 1}, "no transition 1 from"), ({"number": 2}, "no transition 2 from"), ({"number": 99}, "99 from"),
+    ({}, "no transition 0 from"), ({"number": 4, "label": "cleanup"}, "no transition 'cleanup' from"),
+])  # fmt: skip
+def test_a_transition_that_the_state_does_not_know_is_refused_and_the_node_answers_on(bus, hand, asked, said):
+    before = len(bus.said(said))
+    assert not change(bus, **asked)
+    line = bus.wait(lambda: bus.said(said)[before:], "the log line")[0]
+    assert line.endswith("the state 'active'; possible are deactivate (4), shutdown (7).")
+    assert state(bus) == "active"
+    assert hand.ask(HERE, PUSH).touches
+
+
+def test_a_node_whose_configuring_was_refused_may_be_asked_for_anything_and_is_configured_in_the_end(bus, hand):
+    assert change(bus, label="deactivate") and change(bus, label="cleanup")
+    assert bus.set(thickness=0.05)[0].successful  # more than the limb bears
+    assert not change(bus, label="configure") and not change(bus, label="activate")
+    assert not change(bus, Transition.TRANSITION_ACTIVATE)
+    assert state(bus) == "unconfigured"
+    assert bus.set(thickness=0.01)[0].successful
+    assert change(bus, Transition.TRANSITION_CONFIGURE) and change(bus, Transition.TRANSITION_ACTIVATE)
+    assert hand.ready().ask(HERE, PUSH).touches
