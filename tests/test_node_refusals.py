@@ -4,6 +4,7 @@ import pytest
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState, GetState
 
+from tests.bus import end, start
 from tests.node_bus import HERE, PUSH
 
 
@@ -38,3 +39,14 @@ def test_a_node_whose_configuring_was_refused_may_be_asked_for_anything_and_is_c
     assert bus.set(thickness=0.01)[0].successful
     assert change(bus, Transition.TRANSITION_CONFIGURE) and change(bus, Transition.TRANSITION_ACTIVATE)
     assert hand.ready().ask(HERE, PUSH).touches
+
+
+@pytest.mark.parametrize(("given", "says"), [
+    (["--params-file", "/nope.yaml"], "ROS does not take its arguments: Couldn't parse params file"),
+    (["-p", "part"], "ROS does not take its arguments: Couldn't parse parameter override rule: '-p part'"),
+    (["garbage", "--"], "ROS does not know what ['garbage'] means after --ros-args"),
+])  # fmt: skip
+def test_arguments_that_ros_does_not_take_end_a_verb_with_one_sentence(given, says):
+    code, said = end(start("-m", "stmpl_ros.cli", "node", "--ros-args", *given))
+    assert code == 1 and said.splitlines()[-1].startswith(f"stmpl: {says}")
+    assert "/src/" not in said and "Traceback" not in said
