@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Sequence
+from difflib import get_close_matches
 from typing import Any, get_args
 
 from pydantic import ValidationError
@@ -51,6 +52,7 @@ class Settings:
                 raise InvalidInput(f"parameter {name}: {error}") from error
             values[name] = declared.value
         self.config = checked(values)
+        self._tell_of_unknown()
         node.add_on_set_parameters_callback(self._check)
         node.add_post_set_parameters_callback(self._take)
 
@@ -66,6 +68,14 @@ class Settings:
             self._node.set_parameters([Parameter(name, value=_told(value)) for name, value in changed.items()])
         finally:
             self.locked = locked
+
+    def _tell_of_unknown(self) -> None:
+        """A line for each parameter that somebody gave and nobody declared, which rclpy ignores in silence."""
+        for name in sorted(self._node._parameter_overrides):
+            if not self._node.has_parameter(name) and not name.startswith("qos_overrides."):
+                near = get_close_matches(name, NodeConfig.model_fields, 1)
+                meant = f" Is {near[0]} meant?" if near else ""
+                self._node.get_logger().warning(f"there is no parameter {name}: it is ignored.{meant}")
 
     def _check(self, parameters: Sequence[Parameter]) -> SetParametersResult:
         changes = self._ours(parameters)

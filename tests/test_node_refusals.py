@@ -1,11 +1,15 @@
 """Laws of what a node refuses: whoever asks for what cannot be gets a sentence, and the node serves on."""
 
+import re
+from collections import defaultdict
+
 import pytest
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState, GetState
 
-from tests.bus import end, start
-from tests.node_bus import HERE, PUSH
+from stmpl_ros.parameters import ANY_TIME, CONFIGURING, NodeConfig
+from tests.bus import ROOT, end, running, start
+from tests.node_bus import HERE, NODE, PUSH, Bus
 
 
 def change(bus, number: int = 0, label: str = "") -> bool:
@@ -50,3 +54,28 @@ def test_arguments_that_ros_does_not_take_end_a_verb_with_one_sentence(given, sa
     code, said = end(start("-m", "stmpl_ros.cli", "node", "--ros-args", *given))
     assert code == 1 and said.splitlines()[-1].startswith(f"stmpl: {says}")
     assert "/src/" not in said and "Traceback" not in said
+
+
+def test_a_parameter_that_nobody_declared_is_told_once_and_with_it_the_one_that_may_be_meant(bus):
+    space, given = Bus("/typos"), ("-p", "bogus:=1", "-p", "fede:=0.5", "-p", "use_sim_time:=false")
+    try:
+        with running("-c", NODE, "--ros-args", "-r", "__ns:=/typos", *given):
+            space.wait(lambda: space.got["skin/topology"], "skin/topology")
+            space.wait(lambda: len(space.said("there is no parameter")) > 1, "both log lines")
+            assert sorted(space.said("there is no parameter")) == [
+                "there is no parameter bogus: it is ignored.",
+                "there is no parameter fede: it is ignored. Is fade meant?",
+            ]
+    finally:
+        space.node.destroy_node()
+
+
+def test_the_page_names_every_parameter_where_it_counts():
+    page = (ROOT / "docs/node.md").read_text().split("## Parameters")[1].split("\n## ")[0]
+    named = defaultdict[str, set[str]](set)
+    for when, names in re.findall(r"^\| ([^|]+?)(?:, or| \(| \|)(?:[^|]*\|)? (`.*) \|$", page, re.M):
+        named[when] |= set(re.findall(r"`([a-z_]+)`", names))
+    anytime, configuring = NodeConfig.names(ANY_TIME), NodeConfig.names(CONFIGURING)
+    assert named["at any time"] == anytime
+    assert named["when the node is configured"] == configuring
+    assert named["from the start"] == NodeConfig.model_fields.keys() - anytime - configuring
