@@ -60,6 +60,14 @@ def friction_of(config: NodeConfig) -> Friction | dict[str, Friction]:
     return friction_from(read_model(config.tissue).friction or "")
 
 
+def check_part(config: NodeConfig, build: Build) -> None:
+    """Raises InvalidInput for a part that `layer_of` does not know; other builds are not asked."""
+    if build is layer_of:
+        from stmpl_core.body import Body
+
+        Body.anny().level(config.limb)
+
+
 def check(config: NodeConfig, build: Build, changed: set[str] | None = None) -> None:
     """Raises InvalidInput, at once, for what `layer_of` does not know; other builds are not asked.
 
@@ -80,7 +88,7 @@ def check(config: NodeConfig, build: Build, changed: set[str] | None = None) -> 
             raise InvalidInput(f"{', '.join(idle)} would change nothing: '{config.tissue}' has its own. Leave it out, "
                                f"or set tissue to '{PAPER}', which is one layer of your numbers.")  # fmt: skip
 
-        Body.anny().level(config.limb)
+        check_part(config, build)
         if config.joint_states:
             known = joints_of(config.limb)
             if unknown := sorted(set(config.joint_names) - set(known)):

@@ -37,7 +37,17 @@ from stmpl_ros.diagnosis import Counts, Health, Tally, diagnostics, limits_statu
 from stmpl_ros.hearing import Hearing
 from stmpl_ros.lifecycle import ServingNode, told
 from stmpl_ros.limits import Limits
-from stmpl_ros.making import Build, at_once, check, friction_of, layer_of, restiffened, skin_of, warm_up
+from stmpl_ros.making import (
+    Build,
+    at_once,
+    check,
+    check_part,
+    friction_of,
+    layer_of,
+    restiffened,
+    skin_of,
+    warm_up,
+)
 from stmpl_ros.parameters import NodeConfig
 from stmpl_ros.sending import Sending
 from stmpl_ros.settings import Settings
@@ -71,7 +81,7 @@ class SkinNode(ServingNode):
 
     def __init__(self, config: NodeConfig, build: Build = layer_of, **node_options: Any) -> None:
         super().__init__("stmpl", **node_options)
-        self.settings = Settings(self, config, self._on_settings)
+        self.settings = Settings(self, config, self._on_settings, lambda config: check_part(config, build))
         self._build = build
         self.tally, self._counts = Tally(), Counts()
         self.workshop: Workshop | None = None
@@ -289,6 +299,9 @@ class SkinNode(ServingNode):
             return "counts when the node is configured"
         if self._making:
             raise InvalidInput("another skin is being made; wait for skin/topology.")
+        if config == self.config:
+            done("")
+            return "nothing changes: the node answers on it already"
         if stiffer := restiffened(self.skin, config, set(changes)):
             self._take_over(stiffer, config)
             done("")

@@ -32,6 +32,7 @@ class Settings:
         node: node that declares them.
         config: values, which ROS overrides.
         on_change: callback with the new settings once a running node took some over.
+        check: function that raises InvalidInput for settings of another part, if there is no such part.
 
     Attributes:
         config: settings as they are now.
@@ -41,8 +42,9 @@ class Settings:
         InvalidInput: a parameter that ROS overrides with what its field does not allow.
     """
 
-    def __init__(self, node: LifecycleNode, config: NodeConfig, on_change: Callable[[NodeConfig], None]) -> None:
-        self._node, self._on_change = node, on_change
+    def __init__(self, node: LifecycleNode, config: NodeConfig, on_change: Callable[[NodeConfig], None],
+                 check: Callable[[NodeConfig], None] = lambda config: None) -> None:  # fmt: skip
+        self._node, self._on_change, self._check_part = node, on_change, check
         self.locked = False
         values = {}
         for name, field in NodeConfig.model_fields.items():
@@ -80,14 +82,16 @@ class Settings:
     def _check(self, parameters: Sequence[Parameter]) -> SetParametersResult:
         changes = self._ours(parameters)
         try:
-            self.with_(**changes)
+            config = self.with_(**changes)
+            if config.limb != self.config.limb:
+                self._check_part(config)
         except InvalidInput as error:
             return SetParametersResult(successful=False, reason=str(error))
         late = sorted(changes.keys() & NodeConfig.names(CONFIGURING))
         if late and self.locked:
             served = set(late) <= SetBody.Request.get_fields_and_field_types().keys()
             how = "call ~/set_body, or clean up first" if served else "clean up first"
-            reason = f"{', '.join(late)} count when the node is configured: {how}."
+            reason = f"a configured node takes no other {', '.join(late)} as a parameter: {how}."
             return SetParametersResult(successful=False, reason=reason)
         return SetParametersResult(successful=True)
 

@@ -1,14 +1,20 @@
 """Laws of what a node refuses: whoever asks for what cannot be gets a sentence, and the node serves on."""
 
+import os
 import re
 from collections import defaultdict
 
 import pytest
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState, GetState
+from rclpy.context import Context
+from rclpy.parameter import Parameter
+from stmpl_msgs.srv import SetBody
 
+from stmpl_ros.node import SkinNode
 from stmpl_ros.parameters import ANY_TIME, CONFIGURING, NodeConfig
 from tests.bus import ROOT, end, running, start
+from tests.conftest import BUSES
 from tests.node_bus import HERE, NODE, PUSH, Bus
 
 
@@ -79,3 +85,26 @@ def test_the_page_names_every_parameter_where_it_counts():
     assert named["at any time"] == anytime
     assert named["when the node is configured"] == configuring
     assert named["from the start"] == NodeConfig.model_fields.keys() - anytime - configuring
+
+
+def test_a_part_that_no_body_has_is_refused_before_the_node_is_configured_too():
+    context = Context()
+    context.init(domain_id=int(os.environ["ROS_DOMAIN_ID"]) + BUSES)
+    node = SkinNode(NodeConfig(), context=context)
+    try:
+        refused, taken = (node.set_parameters([Parameter("part", value=part)])[0] for part in ("nose", "right_forearm"))
+        assert not refused.successful and refused.reason.startswith("unknown part 'nose'. Available: left_arm")
+        assert taken.successful and node.config.part == "right_forearm"
+    finally:
+        node.destroy_node()
+        context.try_shutdown()
+        context.destroy()
+
+
+def test_who_asks_for_the_body_that_answers_is_told_so_at_once_and_nothing_is_made(bus, hand):
+    layers = len(bus.got["skin/topology"])
+    for same in ({}, {"thickness": bus.get("thickness")[0]}):
+        done = bus.call(SetBody, "set_body", **same)
+        assert done.success and done.message == "nothing changes: the node answers on it already"
+    bus.spin(0.5)
+    assert hand.ask(HERE, PUSH).touches and len(bus.got["skin/topology"]) == layers
