@@ -401,7 +401,7 @@ class SkinNode(ServingNode):
         lately = self._counts.since(reactions=self.tally.reactions, refused=self.tally.refused, stale=self.tally.stale,
                                     out_of_order=inbox.out_of_order, missed=events.missed_deadlines)  # fmt: skip
         health = Health(lately, self.tally.last_refusal, self.answering.fading, bool(inbox.live(self.hearing.now())),
-                        self.bending.doubt)  # fmt: skip
+                        self.bending.doubt, drop=self.tally.last_drop, rivals=self.hearing.rivals())  # fmt: skip
         statuses = [skin_status(name, values, health)]
         if self.answering.limits:
             statuses.append(limits_status(name, self.answering.limits))

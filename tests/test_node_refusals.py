@@ -5,14 +5,19 @@ import re
 from collections import defaultdict
 
 import pytest
+import rclpy
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from geometry_msgs.msg import PoseStamped
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState, GetState
 from rclpy.context import Context
 from rclpy.parameter import Parameter
 from stmpl_msgs.srv import SetBody
 
+from bags.wire import pose_message
 from stmpl_ros.node import SkinNode
 from stmpl_ros.parameters import ANY_TIME, CONFIGURING, NodeConfig
+from stmpl_ros.topics import STREAM
 from tests.bus import ROOT, end, running, start
 from tests.conftest import BUSES
 from tests.node_bus import HERE, NODE, PUSH, Bus
@@ -108,3 +113,37 @@ def test_who_asks_for_the_body_that_answers_is_told_so_at_once_and_nothing_is_ma
         assert done.success and done.message == "nothing changes: the node answers on it already"
     bus.spin(0.5)
     assert hand.ask(HERE, PUSH).touches and len(bus.got["skin/topology"]) == layers
+
+
+def told(bus, do) -> DiagnosticStatus:
+    """What /diagnostics tells once it is not well, while `do` is done again and again."""
+    heard: list[DiagnosticStatus] = []
+    ear = bus.node.create_subscription(DiagnosticArray, "/diagnostics", lambda m: heard.append(m.status[0]), STREAM)
+    level = {DiagnosticStatus.WARN, DiagnosticStatus.ERROR}
+    bus.wait(lambda: (do(), bus.spin(0.05), heard and heard[-1].level in level)[-1], "a level")
+    bus.node.destroy_subscription(ear)
+    return heard[-1]
+
+
+@pytest.mark.parametrize("seconds", [-5.0, 5.0])
+def test_stamps_that_are_too_old_or_to_come_are_told_in_the_diagnostics(bus, hand, seconds):
+    bus.still()
+    hand.send(HERE, frame="nowhere")  # refused, and nothing to do with it
+    bus.spin(2.5)
+    late = told(bus, lambda: hand.pose.publish(pose_message(HERE, "body", bus.now() + int(seconds * 1e9))))
+    assert late.level == DiagnosticStatus.ERROR
+    assert f"nothing that came could be used: a message stamped {-seconds:+.2f}"[:-1] in late.message
+    assert "nowhere" not in late.message and "max_age:=0" in late.message
+    assert "max_age:=0" in {one.key: one.value for one in late.values}["last dropped"]
+
+
+def test_two_senders_of_one_tool_are_told_in_the_diagnostics_by_their_names(bus, hand):
+    other = rclpy.create_node("impostor", namespace="/robot")
+    try:
+        other.create_publisher(PoseStamped, "tools/probe/pose", STREAM)
+        both = told(bus, lambda: hand.send(HERE))
+        assert both.level == DiagnosticStatus.WARN
+        senders = "/robot/tools/probe/pose has 2 senders, /robot/impostor, /robot/robot; only one can be the tool"
+        assert both.message.endswith(senders)
+    finally:
+        other.destroy_node()
