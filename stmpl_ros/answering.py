@@ -32,6 +32,7 @@ from stmpl_ros.sending import Sending
 from stmpl_ros.settings import Settings
 
 HELD_UP_S, HELD_UP = 0.9, 3  # time for sending an answer [s], and how many in a row that take longer are told
+DEAF_S = 0.1  # time for a reaction beyond which the node was held up, so that it is no silence of a sensor
 MAX_FIRST_DEPTH_M = 2e-3  # depth in a tool's first answer, beyond which it was not seen coming
 WORTH_A_LINE = {
     NO_FORCE: "it touches, but its wrench is zero",
@@ -171,6 +172,8 @@ class Answering:
         self.sending.reaction(instant, touches)
         self.remembering.keep(reaction, instant)
         seconds = time.perf_counter() - started
+        if seconds > DEAF_S:
+            self._bending.held_up(seconds)
         said = self._remarks(instant, touches, back)
         doubt, skin = self._bending.doubt, self.simulator.skin
         if doubt:

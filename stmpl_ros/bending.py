@@ -23,7 +23,7 @@ SILENT_S = 1.0  # silence of a joint's sensor after which answers are flagged [s
 
 
 class _Heard(NamedTuple):
-    """What was heard of a joint: its angle [rad], the stamp of that [ns], and when it came [s]."""
+    """What was heard of a joint: its angle [rad], the stamp of that [ns], and when it came, see Bending._now [s]."""
 
     angle: float
     stamp: int
@@ -49,6 +49,7 @@ class Bending:
         self.newest: Skin | None = None
         self._rest: Skin | None = None
         self._heard: dict[str, _Heard] = {}  # by joint of the limb
+        self._held = 0.0  # time in which the node could not listen [s]
         self._stands = 0.0  # when the angles came that the newest skin stands at [s]; 0: none yet
         self._others = ""  # joints that messages told of instead
         self._lock = threading.Lock()  # held while the newest skin is changed
@@ -84,12 +85,20 @@ class Bending:
         self._subscription = self._thread = self._rest = self.newest = None
         self._heard, self._stands, self._others = {}, 0.0, ""
 
+    def held_up(self, seconds: float) -> None:
+        """Takes time in which the node could not listen [s] out of the silence of its sensors."""
+        self._held += seconds
+
+    def _now(self) -> float:
+        """Time in which the node could listen [s]."""
+        return time.monotonic() - self._held
+
     @property
     def doubt(self) -> str:
         """Why it is not known where the limb is; empty: it is known."""
         if self._thread is None:
             return ""
-        rig, now = None if self._rest is None else self._rest.layer.rig, time.monotonic()
+        rig, now = None if self._rest is None else self._rest.layer.rig, self._now()
         names, heard = () if rig is None else rig.names, dict(self._heard)
         unheard = [name for name in names if name not in heard]
         if unheard or not heard:
@@ -108,7 +117,7 @@ class Bending:
         return ""
 
     def _on_joints(self, message: JointState) -> None:
-        gate, stamp, now = self._hearing.gate, wire.stamp_ns(message), time.monotonic()
+        gate, stamp, now = self._hearing.gate, wire.stamp_ns(message), self._now()
         if not self._hearing.active or self._rest is None or self._thread is None:
             return None
         try:

@@ -7,6 +7,7 @@ import signal
 import sys
 import threading
 import time
+from collections.abc import Callable
 from types import FrameType
 
 GRACE = 1.5  # time in which a verb must end after Ctrl-C or SIGTERM, whatever it is doing [s]
@@ -70,11 +71,12 @@ def _run(given: list[str]) -> int:
 
     logging.basicConfig(level=logging.INFO, format="%(levelname)s %(name)s: %(message)s")
     module = import_module(VERBS[verb][0])
+    called = getattr(module, verb)
     if "--ros-args" in rest:
         at = rest.index("--ros-args")
         module.ros_arguments[:], rest = rest[at:], rest[:at]
     try:
-        return tyro.cli(getattr(module, verb), prog=f"stmpl {verb}", args=rest) or 0
+        return tyro.cli(called, prog=f"stmpl {verb}", description=_said_of(called), args=rest) or 0
     except (StmplError, ValueError) as error:
         if not isinstance(error, StmplError) and type(error).__name__ != "ValidationError":
             raise
@@ -83,6 +85,14 @@ def _run(given: list[str]) -> int:
         if error.filename is None:
             raise
         return _refuse(f"{error.filename}: {error.strerror or error}.")
+
+
+def _said_of(called: Callable) -> str:
+    """What the docstring says before its arguments; each example is a paragraph, else tyro joins their lines."""
+    from inspect import getdoc
+
+    about, example, examples = (getdoc(called) or "").partition("\nArgs:")[0].partition("\nExample:")
+    return about + example + "\n\n".join(line for line in examples.splitlines() if line)
 
 
 def _end_soon_after_a_signal(grace: float) -> None:

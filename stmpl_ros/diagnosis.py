@@ -24,6 +24,7 @@ class Tally:
     Attributes:
         refused, stale: numbers of messages that could not be used, and that were too old.
         last_refusal: reason why the last one was refused.
+        last_drop: reason why the last one was dropped, too old or out of order.
         answers: number of answers since the start.
         reactions: number of instants whose reaction was sent since the start.
         methods: number of answers since the last report, by method.
@@ -36,6 +37,7 @@ class Tally:
     refused: int = 0
     stale: int = 0
     last_refusal: str = ""
+    last_drop: str = ""
     answers: int = 0
     reactions: int = 0
     methods: Counter[str] = field(default_factory=Counter)
@@ -74,6 +76,7 @@ class Tally:
             "dropped, stale": str(self.stale),
             "refused": str(self.refused),
             "last refusal": self.last_refusal,
+            "last dropped": self.last_drop,
         }
 
 
@@ -102,10 +105,12 @@ class Health(NamedTuple):
     Args:
         lately: counts since the last report: reactions; and refused, stale, out_of_order, missed.
         refusal: why the last message was refused.
+        drop: why the last message was dropped.
         fading: truth of the claim that the last answer fades, as input has stopped.
         live: truth of the claim that a tool is heard.
         doubt: why it is not known where the limb is.
         active: truth of the claim that the node answers.
+        rivals: sentence on who sends for one tool beside another; empty: nobody.
     """
 
     lately: Mapping[str, int] = MappingProxyType({})
@@ -114,6 +119,8 @@ class Health(NamedTuple):
     live: bool = False
     doubt: str = ""
     active: bool = True
+    drop: str = ""
+    rivals: str = ""
 
     @property
     def said(self) -> tuple[bytes, str]:
@@ -121,16 +128,20 @@ class Health(NamedTuple):
         bad = {name: count for name, count in self.lately.items() if count and name != "reactions"}
         if not self.active:
             return DiagnosticStatus.STALE, "not active: nothing is answered"
+        why = [self.refusal] if "refused" in bad else []
+        why += [self.drop] if bad.keys() & {"stale", "out_of_order"} else []
         if bad and not self.lately.get("reactions"):
-            why = f": {self.refusal}" if "refused" in bad else ""
-            return DiagnosticStatus.ERROR, f"nothing that came could be used{why}"
+            return DiagnosticStatus.ERROR, ": ".join(["nothing that came could be used", *why])
         if self.doubt:
             return DiagnosticStatus.STALE, self.doubt
         if self.fading:
             return DiagnosticStatus.STALE, "input has stopped: the last answer fades"
         if bad:
             told = ", ".join(f"{count} {name.replace('_', ' ')}" for name, count in bad.items())
-            return DiagnosticStatus.WARN, f"of the messages of the last second {told}"
+            said = ": ".join([f"of the messages of the last second {told}", *why])
+            return DiagnosticStatus.WARN, f"{said.rstrip('.')}; {self.rivals}" if self.rivals else said
+        if self.rivals:
+            return DiagnosticStatus.WARN, self.rivals
         return DiagnosticStatus.OK, "answering" if self.live else "at rest: no tool is heard"
 
 

@@ -51,7 +51,7 @@ class Events:
         self._senders[topic] = event.current_count
         if before and not event.current_count:
             self._say(f"senders of {topic}", f"{topic}: the sender is gone")
-        if before <= 1 < event.current_count:
+        if before <= 1 < event.current_count and topic.startswith("tools/"):
             self._say(f"senders of {topic}", f"{topic}: {event.current_count} senders; only one can be the tool")
 
     def _on_lost(self, event: Any) -> None:

@@ -35,8 +35,8 @@ class Gate:
         if not max_age or abs(age) <= max_age:
             return True
         self._tally.stale += 1
-        self.say("age", f"a message stamped {age:+.2f} s before now was dropped; allowed is {max_age} s. "
-                 "Are the clocks in step, or is this a replay? max_age:=0 accepts any age.")  # fmt: skip
+        self.drop("age", f"a message stamped {age:+.2f} s before now was dropped; allowed is {max_age} s. "
+                  "Are the clocks in step, or is this a replay? max_age:=0 accepts any age.")  # fmt: skip
         return False
 
     def refuse(self, kind: str, why: str) -> None:
@@ -44,6 +44,11 @@ class Gate:
         self._tally.refused += 1
         self._tally.last_refusal = self.refused_since = why
         self.say(kind, f"refused: {why}")
+
+    def drop(self, kind: str, why: str) -> None:
+        """Tells of what came too late, or out of order."""
+        self._tally.last_drop = why
+        self.say(kind, why)
 
     def say(self, kind: str, text: str) -> None:
         """A warning, one of a kind in SAY_EVERY seconds; it tells how many of its kind were held back."""

@@ -139,6 +139,16 @@ class Hearing:
             self.gate.say(f"stranger {name}", f"{topic}: poses come, but no surface of '{name}' that can be used is on "
                           "contact_mesh; they are not heard")  # fmt: skip
 
+    def rivals(self) -> str:
+        """Who sends poses of one tool beside another; empty: no tool has two senders."""
+        for name in self._listened:
+            topic = self._node.resolve_topic_name(f"tools/{name}/pose")
+            senders = [f"{one.node_namespace.rstrip('/')}/{one.node_name}"
+                       for one in self._node.get_publishers_info_by_topic(topic)]  # fmt: skip
+            if len(senders) > 1:
+                return f"{topic} has {len(senders)} senders, {', '.join(sorted(senders))}; only one can be the tool"
+        return ""
+
     def _knows(self, name: str) -> bool:
         """Whether a tool is in use, or its field is being built."""
         return name in self.tools or any(tool.name == name for tool in self.tools.waiting())
@@ -247,8 +257,8 @@ class Hearing:
 
     def _go_on(self, kind: str, tool: str, kept: bool) -> None:
         if not kept:
-            self.gate.say(f"order of {kind} of {tool}", f"a {kind} of {tool} was dropped: its stamp is not after the "
-                          "last one's. Do two devices send under one name, or was a clock set back?")  # fmt: skip
+            self.gate.drop(f"order of {kind} of {tool}", f"a {kind} of {tool} was dropped: its stamp is not after the "
+                           "last one's. Do two devices send under one name, or was a clock set back?")  # fmt: skip
         try:
             instant = self.inbox.take(self.now())
         except StmplError as error:  # a frame that /tf has forgotten since

@@ -254,15 +254,14 @@ def points_of(said: Sequence[str], links: Sequence[str]) -> dict[str, Points]:
 
 def tools_of(said: Sequence[str]) -> list[Tool]:
     """Tools from link=file. Raises InvalidInput or MeshError."""
-    import trimesh
+    from stmpl_ros.view.tools import tool_from_bytes
 
     tools = []
     for text in said:
         link, _, file = text.rpartition("=")
         if not link or not Path(file).is_file():
             raise InvalidInput(f"'{text}' is no link=file of a mesh that is there, as in 'tip=tip.stl'.")
-        mesh: Any = trimesh.load(file, force="mesh")
-        tools.append(Tool(link, mesh.vertices, mesh.faces))
+        tools.append(tool_from_bytes(file, Path(file).read_bytes()).named(link))
     return tools
 
 

@@ -12,6 +12,7 @@ from stmpl_core.errors import InvalidInput
 from stmpl_core.friction import Friction, friction_from
 from stmpl_core.layer import SoftLayer
 from stmpl_core.living import held_skin, living, part_around, read_model, read_tissue, region_of
+from stmpl_core.local_contact import local_contacts
 from stmpl_core.regions import Tone
 from stmpl_core.rig import Rig, joints_of
 from stmpl_core.simulator import Simulator
@@ -30,6 +31,7 @@ ON_STACKS = ("moment_net", "limb_linear", "ladder")  # methods that know skin, f
 MOVED = ("moment_net", "linear", "limb_linear", "winkler", "naive", "zero")  # methods that go along with joints
 AT_ONCE = {"friction"}  # settings that the skin does not know of
 QUICK = {"moment_net", "winkler", "naive"}  # methods that such a change costs no preparation
+WARM_BEND = 0.1  # angle of each joint at which a bent skin is warmed up [rad]
 
 
 def layer_of(config: NodeConfig) -> SoftLayer:
@@ -58,6 +60,14 @@ def friction_of(config: NodeConfig) -> Friction | dict[str, Friction]:
     return friction_from(read_model(config.tissue).friction or "")
 
 
+def check_part(config: NodeConfig, build: Build) -> None:
+    """Raises InvalidInput for a part that `layer_of` does not know; other builds are not asked."""
+    if build is layer_of:
+        from stmpl_core.body import Body
+
+        Body.anny().level(config.limb)
+
+
 def check(config: NodeConfig, build: Build, changed: set[str] | None = None) -> None:
     """Raises InvalidInput, at once, for what `layer_of` does not know; other builds are not asked.
 
@@ -78,7 +88,7 @@ def check(config: NodeConfig, build: Build, changed: set[str] | None = None) -> 
             raise InvalidInput(f"{', '.join(idle)} would change nothing: '{config.tissue}' has its own. Leave it out, "
                                f"or set tissue to '{PAPER}', which is one layer of your numbers.")  # fmt: skip
 
-        Body.anny().level(config.limb)
+        check_part(config, build)
         if config.joint_states:
             known = joints_of(config.limb)
             if unknown := sorted(set(config.joint_names) - set(known)):
@@ -125,22 +135,30 @@ def restiffened(skin: Skin, config: NodeConfig, changed: set[str]) -> Skin | Non
 def warm_up(simulator: Simulator) -> None:
     """Solves one contact of each kind, so that nothing is left to compile when the first real one comes.
 
-    Where time and friction count, they are one press that slides.
+    Where time and friction count, they are one press that slides; where joints bend the skin, all is done bent and at
+    rest. The deepest reaches into the core. Of each comes a local model.
     """
     corners = 0.01 * np.array([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1]])
     faces = np.array([[0, 2, 4], [2, 1, 4], [1, 3, 4], [3, 0, 4], [2, 0, 5], [1, 2, 5], [3, 1, 5], [0, 3, 5]])
-    tool, layer, pose = Tool("warm up", corners, faces), simulator.layer, np.eye(4)
+    tool, rig = Tool("warm up", corners, faces), simulator.layer.rig
+    for angles in ([WARM_BEND] * len(rig.joints), ()) if rig else ((),):
+        if rig:
+            simulator.move_to(simulator.skin.at_angles(angles))
+        _press(simulator, tool)
+    simulator.tools.remove(tool.name)
+
+
+def _press(simulator: Simulator, tool: Tool) -> None:
+    """Touches the skin where it stands, in each way."""
+    layer, pose, state = simulator.layer, np.eye(4), State()
     vertex = int(np.linalg.norm(layer.vertices - layer.vertices.mean(axis=0), axis=1).argmin())
-    push = np.concatenate([-0.01 * layer.normals[vertex], np.zeros(3)])
-    state = State()
-    if layer.rig is not None:  # both ways of each kernel
-        simulator.move_to(simulator.skin.at_angles([1e-3] * len(layer.rig.joints)))
-        simulator.move_to(simulator.skin.at_angles(()))
-    for away, wrench in ((0.009, push), (0.012, push), (0.009, None), (0.05, push)):
+    push, deep = np.concatenate([-0.01 * layer.normals[vertex], np.zeros(3)]), -float(layer.thickness[vertex])
+    for away, wrench in ((0.009, push), (0.012, push), (0.009, None), (deep, None), (0.05, push)):
         pose[:3, 3] = layer.vertices[vertex] + away * layer.normals[vertex]
+        local_contacts(simulator.history, simulator.touch([Contact(tool, pose, wrench)]))
         simulator.step([Contact(tool, pose, wrench)])
         for way in (0.0, 1e-3) if simulator.remembers else ():
             pose[:3, 3] += way * np.roll(layer.normals[vertex], 1)
             touches, state = simulator.touch([Contact(tool, pose.copy(), wrench)], state, 0.01)
             simulator.answer(touches)
-    simulator.tools.remove(tool.name)
+            local_contacts(simulator.history, touches, state)

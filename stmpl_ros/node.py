@@ -8,13 +8,13 @@ import time
 from collections.abc import Callable
 from concurrent.futures import BrokenExecutor, Future, TimeoutError
 from contextlib import ExitStack
-from functools import partial, wraps
+from functools import partial
 from typing import Any
 
 import numba
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from rclpy.experimental.events_executor import EventsExecutor
-from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
+from rclpy.lifecycle import LifecycleState, TransitionCallbackReturn
 from rclpy.logging import get_logger
 from std_srvs.srv import Trigger
 from stmpl_msgs.srv import GetTopology, SetBody
@@ -35,8 +35,19 @@ from stmpl_ros.bond import Bond
 from stmpl_ros.calibration import Calibration
 from stmpl_ros.diagnosis import Counts, Health, Tally, diagnostics, limits_status, skin_status
 from stmpl_ros.hearing import Hearing
+from stmpl_ros.lifecycle import ServingNode, told
 from stmpl_ros.limits import Limits
-from stmpl_ros.making import Build, at_once, check, friction_of, layer_of, restiffened, skin_of, warm_up
+from stmpl_ros.making import (
+    Build,
+    at_once,
+    check,
+    check_part,
+    friction_of,
+    layer_of,
+    restiffened,
+    skin_of,
+    warm_up,
+)
 from stmpl_ros.parameters import NodeConfig
 from stmpl_ros.sending import Sending
 from stmpl_ros.settings import Settings
@@ -48,28 +59,11 @@ from stmpl_ros.workshop import Workshop, then
 FADE_RATE = 30.0  # rate of the answers while the last one fades [Hz]
 
 
-Transit = Callable[["SkinNode", LifecycleState], TransitionCallbackReturn]
-
-
 def _nobody(why: str) -> None:
     """Nobody is told what became of a skin."""
 
 
-def _told(transit: Transit) -> Transit:
-    """A callback of the lifecycle; what fails in it, which rclpy would swallow, is told, and on_error comes next."""
-
-    @wraps(transit)
-    def told(node: SkinNode, state: LifecycleState) -> TransitionCallbackReturn:
-        try:
-            return transit(node, state)
-        except Exception as error:
-            node.get_logger().error(f"{transit.__name__} failed: {type(error).__name__}: {error}")
-            return TransitionCallbackReturn.ERROR
-
-    return told
-
-
-class SkinNode(LifecycleNode):
+class SkinNode(ServingNode):
     """ROS 2 lifecycle node that answers contacts: it hears (Hearing), answers (Answering) and sends (Sending).
 
     What comes in while an answer is being computed waits as the newest; older ones are never answered. When all tools
@@ -87,7 +81,7 @@ class SkinNode(LifecycleNode):
 
     def __init__(self, config: NodeConfig, build: Build = layer_of, **node_options: Any) -> None:
         super().__init__("stmpl", **node_options)
-        self.settings = Settings(self, config, self._on_settings)
+        self.settings = Settings(self, config, self._on_settings, lambda config: check_part(config, build))
         self._build = build
         self.tally, self._counts = Tally(), Counts()
         self.workshop: Workshop | None = None
@@ -127,7 +121,7 @@ class SkinNode(LifecycleNode):
 
     # Lifecycle
 
-    @_told
+    @told
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Builds the skin, warms the method up, and opens all topics."""
         started = time.monotonic()
@@ -157,7 +151,7 @@ class SkinNode(LifecycleNode):
             self.get_logger().info(self.bond.missing)
         return super().on_configure(state)
 
-    @_told
+    @told
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Sends the topology and starts to answer."""
         result = super().on_activate(state)
@@ -167,20 +161,20 @@ class SkinNode(LifecycleNode):
         self.get_logger().info(f"answering with {self.skin.method.name} on layer {self.skin.layer_id}")
         return result
 
-    @_told
+    @told
     def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Stops answering; what comes in meanwhile is not kept."""
         self._stop()
         return super().on_deactivate(state)
 
-    @_told
+    @told
     def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Closes all topics and forgets skin and tools; parameters that count when configuring can be set again."""
         result = super().on_cleanup(state)
         self._clean_up()
         return result
 
-    @_told
+    @told
     def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Stops answering, and ends the processes beside this one."""
         self._stop()
@@ -188,7 +182,7 @@ class SkinNode(LifecycleNode):
         self._clean_up()
         return result
 
-    @_told
+    @told
     def on_error(self, state: LifecycleState) -> TransitionCallbackReturn:
         """After a callback that failed: stops, and closes whatever is open, so that the node can be configured anew."""
         self._stop()
@@ -305,6 +299,9 @@ class SkinNode(LifecycleNode):
             return "counts when the node is configured"
         if self._making:
             raise InvalidInput("another skin is being made; wait for skin/topology.")
+        if config == self.config:
+            done("")
+            return "nothing changes: the node answers on it already"
         if stiffer := restiffened(self.skin, config, set(changes)):
             self._take_over(stiffer, config)
             done("")
@@ -404,7 +401,7 @@ class SkinNode(LifecycleNode):
         lately = self._counts.since(reactions=self.tally.reactions, refused=self.tally.refused, stale=self.tally.stale,
                                     out_of_order=inbox.out_of_order, missed=events.missed_deadlines)  # fmt: skip
         health = Health(lately, self.tally.last_refusal, self.answering.fading, bool(inbox.live(self.hearing.now())),
-                        self.bending.doubt)  # fmt: skip
+                        self.bending.doubt, drop=self.tally.last_drop, rivals=self.hearing.rivals())  # fmt: skip
         statuses = [skin_status(name, values, health)]
         if self.answering.limits:
             statuses.append(limits_status(name, self.answering.limits))

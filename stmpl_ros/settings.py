@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Sequence
+from difflib import get_close_matches
 from typing import Any, get_args
 
 from pydantic import ValidationError
@@ -31,6 +32,7 @@ class Settings:
         node: node that declares them.
         config: values, which ROS overrides.
         on_change: callback with the new settings once a running node took some over.
+        check: function that raises InvalidInput for settings of another part, if there is no such part.
 
     Attributes:
         config: settings as they are now.
@@ -40,8 +42,9 @@ class Settings:
         InvalidInput: a parameter that ROS overrides with what its field does not allow.
     """
 
-    def __init__(self, node: LifecycleNode, config: NodeConfig, on_change: Callable[[NodeConfig], None]) -> None:
-        self._node, self._on_change = node, on_change
+    def __init__(self, node: LifecycleNode, config: NodeConfig, on_change: Callable[[NodeConfig], None],
+                 check: Callable[[NodeConfig], None] = lambda config: None) -> None:  # fmt: skip
+        self._node, self._on_change, self._check_part = node, on_change, check
         self.locked = False
         values = {}
         for name, field in NodeConfig.model_fields.items():
@@ -51,6 +54,7 @@ class Settings:
                 raise InvalidInput(f"parameter {name}: {error}") from error
             values[name] = declared.value
         self.config = checked(values)
+        self._tell_of_unknown()
         node.add_on_set_parameters_callback(self._check)
         node.add_post_set_parameters_callback(self._take)
 
@@ -67,17 +71,27 @@ class Settings:
         finally:
             self.locked = locked
 
+    def _tell_of_unknown(self) -> None:
+        """A line for each parameter that somebody gave and nobody declared, which rclpy ignores in silence."""
+        for name in sorted(self._node._parameter_overrides):
+            if not self._node.has_parameter(name) and not name.startswith("qos_overrides."):
+                near = get_close_matches(name, NodeConfig.model_fields, 1)
+                meant = f" Is {near[0]} meant?" if near else ""
+                self._node.get_logger().warning(f"there is no parameter {name}: it is ignored.{meant}")
+
     def _check(self, parameters: Sequence[Parameter]) -> SetParametersResult:
         changes = self._ours(parameters)
         try:
-            self.with_(**changes)
+            config = self.with_(**changes)
+            if config.limb != self.config.limb:
+                self._check_part(config)
         except InvalidInput as error:
             return SetParametersResult(successful=False, reason=str(error))
         late = sorted(changes.keys() & NodeConfig.names(CONFIGURING))
         if late and self.locked:
             served = set(late) <= SetBody.Request.get_fields_and_field_types().keys()
             how = "call ~/set_body, or clean up first" if served else "clean up first"
-            reason = f"{', '.join(late)} count when the node is configured: {how}."
+            reason = f"a configured node takes no other {', '.join(late)} as a parameter: {how}."
             return SetParametersResult(successful=False, reason=reason)
         return SetParametersResult(successful=True)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import signal
 import threading
 from collections.abc import Iterator
@@ -10,10 +11,13 @@ from contextlib import contextmanager
 from types import FrameType
 
 import rclpy
+from rclpy._rclpy_pybind11 import RCLError, UnknownROSArgsError
 from rclpy.executors import Executor, ExternalShutdownException
 from rclpy.signals import SignalHandlerOptions
 from rclpy.task import Future
 from rclpy.utilities import ok, try_shutdown
+
+from stmpl_core.errors import InvalidInput
 
 POLL_PERIOD_S = 0.1  # time between two looks of a spinning process whether it is to stop
 TRANSPORTS = "FASTDDS_BUILTIN_TRANSPORTS"  # variable by which a person chooses another: DEFAULT
@@ -29,6 +33,9 @@ def ros(arguments: list[str] | None = None) -> Iterator[threading.Event]:
 
     Messages go by UDP unless a person chose otherwise: by the shared memory of Fast DDS 2.14 a listener that is killed,
     or starved for a second, can leave its sender waiting for a lock of its own for ever (docs/laboratory/node.md).
+
+    Raises:
+        InvalidInput: arguments that ROS does not take, or a file of parameters that it cannot read.
     """
     os.environ.setdefault(TRANSPORTS, UDP)
     stop = threading.Event()
@@ -37,8 +44,8 @@ def ros(arguments: list[str] | None = None) -> Iterator[threading.Event]:
         stop.set()
 
     before = {number: signal.signal(number, ask) for number in (signal.SIGINT, signal.SIGTERM)}
-    rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO)
     try:
+        _init(arguments)
         yield stop
     except KeyboardInterrupt:
         if not stop.is_set():
@@ -47,6 +54,17 @@ def ros(arguments: list[str] | None = None) -> Iterator[threading.Event]:
         try_shutdown()
         for number, handler in before.items():
             signal.signal(number, handler)
+
+
+def _init(arguments: list[str] | None) -> None:
+    try:
+        rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO)
+    except UnknownROSArgsError as error:
+        raise InvalidInput(f"ROS does not know what {error} means after --ros-args; it takes -p name:=value, "
+                           "-r from:=to and --params-file FILE.") from error  # fmt: skip
+    except RCLError as error:
+        why = re.sub(r", at \S+:\d+|\s*\n\s*", "", str(error)).removeprefix("failed to initialize rcl: ")
+        raise InvalidInput(f"ROS does not take its arguments: {why.rstrip('.')}.") from error
 
 
 @contextmanager

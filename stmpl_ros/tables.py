@@ -11,6 +11,7 @@ from stmpl_core.errors import BagError
 
 if TYPE_CHECKING:
     from bags.compare import Comparison, Presser
+    from bags.provenance import Provenance
     from bags.reader import Bag
     from bags.survey import Survey
     from stmpl_core.methods.base import Method
@@ -19,6 +20,7 @@ if TYPE_CHECKING:
 BALL_RADIUS, BALL_DEPTH = 0.010, 0.001  # ball and depth at which the stiffness of a part is told [m]
 NEEDS_RADII, NEEDS_FORCES = (5e-3, 40e-3), (1.0, 20.0)  # scene for which the smallest model of a part is told [m], [N]
 LOOKED_AT = 20  # number of answers of a recording that are looked at for their memory
+RATED, RATED_S = 5, 0.1  # messages, and time over which they came [s], from which on a topic has a rate
 SHOWN = {"Pa": (1e-3, "kPa"), "m": (1e3, "mm"), "N/m": (1.0, "N/m"), "-": (1.0, "")}  # factor and unit for people
 
 
@@ -133,6 +135,13 @@ def memory_sentence(memory: dict[str, Any]) -> str:
             f"{memory['share']:.2%} of their size; friction: {friction or 'none'}")  # fmt: skip
 
 
+def provenance_sentence(made: Provenance) -> str:
+    """What made a recording, as far as it is named; empty where nothing is."""
+    versions = ", ".join(f"{name} {version}" for name, version in made.versions.items())
+    said = {"method: ": made.method, "body: ": made.body, "made by ": versions}
+    return "; ".join(f"{label}{value}" for label, value in said.items() if value)
+
+
 def bag_table(bag: Bag) -> Table:
     """What a recording holds, for people."""
     table = Table(title=str(bag.file), title_justify="left", caption_justify="left")
@@ -142,7 +151,7 @@ def bag_table(bag: Bag) -> Table:
         table.add_column(heading, justify="right")
     for topic in sorted(bag.topics.values()):
         seconds = (topic.last_ns - topic.first_ns) / 1e9
-        rate = f"{(topic.messages - 1) / seconds:.1f}" if seconds > 0 else ""
+        rate = f"{(topic.messages - 1) / seconds:.1f}" if topic.messages >= RATED and seconds >= RATED_S else ""
         table.add_row(topic.name, topic.type_name, f"{topic.messages:,}", f"{seconds:.2f}", rate)
     robots = f"{len(bag.namespaces)} robots: {', '.join(bag.namespaces)}; " if len(bag.namespaces) > 1 else ""
     state = "finished" if bag.finished else "not finished by its writer"

@@ -255,7 +255,7 @@ def info(path: Annotated[Path | None, tyro.conf.Positional] = None, part: str | 
     if part is not None:
         raise InvalidInput("Give the path of a recording or --part with a region of the body, not both.")
     from bags.reader import Bag
-    from stmpl_ros.tables import bag_figures, bag_memory, bag_table, memory_sentence
+    from stmpl_ros.tables import bag_figures, bag_memory, bag_table, memory_sentence, provenance_sentence
 
     bag = Bag(path)
     skins = {name: repr(layer) for name, layer in bag.known_layers().items()}
@@ -267,10 +267,8 @@ def info(path: Annotated[Path | None, tyro.conf.Positional] = None, part: str | 
     sound = sum(topic.messages for topic in bag.topics.values())
     if not as_json and bag.expected not in (None, sound):
         print_figures(f"{sound} of {bag.expected} messages are sound")
-    if not as_json and bag.provenance.versions:
-        made_by = ", ".join(f"{name} {version}" for name, version in bag.provenance.versions.items())
-        print_figures(f"method: {bag.provenance.method or 'not named'}; body: {bag.provenance.body or 'not named'}; "
-                       f"made by {made_by}")
+    if not as_json and (made := provenance_sentence(bag.provenance)):
+        print_figures(made)
     return 0 if bag.finished and not bag.damage else 1
 
 
@@ -343,6 +341,8 @@ def generate(
         flat: file of released presses of its flat stacks, benchmarks/rounds_v1.npz; without, twenty minutes more.
         as_json: manifest as JSON, for machines.
     """
+    if workers is not None and workers < 1:
+        raise InvalidInput(f"--workers {workers} makes nothing; give 1 or more.")
     needed("stmpl generate", "learn", "anny", "torch", "zarr", "shapely")
     from fem_tools.generate import generate as make
     from fem_tools.sampling import PRESETS

@@ -11,9 +11,9 @@ import pytest
 BUSES = 50  # test_node_life.py uses the domain that lies so much higher as a second bus
 LOCKS = 27_400  # the first of the ports that stand for the buses; below those that systems hand out by themselves
 ROOMS = {  # every other file is of the room "unit"
-    "ros": ["test_foxglove", "test_launch", "test_node", "test_node_life", "test_node_memory", "test_node_tf",
-            "test_node_topics", "test_record_and_publish", "test_ros", "test_ros_demo", "test_ros_links",
-            "test_ros_parts", "test_ros_robot", "test_soak", "test_view"],
+    "ros": ["test_foxglove", "test_launch", "test_node", "test_node_life", "test_node_memory", "test_node_refusals",
+            "test_node_tf", "test_node_topics", "test_record_and_publish", "test_ros", "test_ros_demo",
+            "test_ros_links", "test_ros_parts", "test_ros_robot", "test_soak", "test_view"],
     "studies": ["test_axisymmetric", "test_evaluate", "test_fem_limits", "test_multis", "test_peers",
                 "test_speed_chart", "test_stability", "test_stability_contacts", "test_train_contact", "test_unet",
                 "test_validate"],

@@ -85,6 +85,19 @@ def test_a_joint_that_falls_silent_beside_one_that_speaks_is_named(bent, monkeyp
     assert "no joint states of second for 3000 s" in hears.doubt
 
 
+def test_time_in_which_the_node_could_not_listen_is_no_silence(bent, monkeypatch):
+    hears, _ = bent
+    tell(hears, 1, first=0.1, second=0.2)
+    settle(hears)
+    now = time.monotonic()
+    monkeypatch.setattr(module.time, "monotonic", lambda: now + 3e3)
+    assert "no joint states for 3000 s" in hears.doubt
+    hears.held_up(2.5e3)
+    assert hears.doubt == ""
+    monkeypatch.setattr(module.time, "monotonic", lambda: now + 5e3)
+    assert "no joint states for 2500 s" in hears.doubt
+
+
 def test_until_the_skin_is_bent_as_was_told_answers_are_in_doubt(bent, layer):
     hears, _ = bent
     tell(hears, 1, first=0.1, second=0.2)

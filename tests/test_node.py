@@ -65,8 +65,8 @@ def test_a_parameter_says_its_unit_its_range_and_when_it_counts(bus):
         ({"max_age": "old"}, "type"),
         ({"frame": "world"}, "read-only"),
         ({"youngs_modulus": 2e3}, "set_body"),
-        ({"friction": "oiled"}, "friction count when the node is configured: call ~/set_body"),
-        ({"method": "linear"}, "method count when the node is configured: clean up first"),
+        ({"friction": "oiled"}, "a configured node takes no other friction as a parameter: call ~/set_body"),
+        ({"method": "linear"}, "a configured node takes no other method as a parameter: clean up first"),
     ],
 )
 def test_a_parameter_that_cannot_be_taken_is_refused_and_told_why(bus, change, says):

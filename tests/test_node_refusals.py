@@ -1,0 +1,149 @@
+"""Laws of what a node refuses: whoever asks for what cannot be gets a sentence, and the node serves on."""
+
+import os
+import re
+from collections import defaultdict
+
+import pytest
+import rclpy
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from geometry_msgs.msg import PoseStamped
+from lifecycle_msgs.msg import Transition
+from lifecycle_msgs.srv import ChangeState, GetState
+from rclpy.context import Context
+from rclpy.parameter import Parameter
+from stmpl_msgs.srv import SetBody
+
+from bags.wire import pose_message
+from stmpl_ros.node import SkinNode
+from stmpl_ros.parameters import ANY_TIME, CONFIGURING, NodeConfig
+from stmpl_ros.topics import STREAM
+from tests.bus import ROOT, end, running, start
+from tests.conftest import BUSES
+from tests.node_bus import HERE, NODE, PUSH, Bus
+
+
+def change(bus, number: int = 0, label: str = "") -> bool:
+    """Whether the node changed its state so."""
+    return bus.call(ChangeState, "change_state", transition=Transition(id=number, label=label)).success
+
+
+def state(bus) -> str:
+    return bus.call(GetState, "get_state").current_state.label
+
+
+@pytest.mark.parametrize(("asked", "said"), [
+    ({"number": 1}, "no transition 1 from"), ({"number": 2}, "no transition 2 from"), ({"number": 99}, "99 from"),
+    ({}, "no transition 0 from"), ({"number": 4, "label": "cleanup"}, "no transition 'cleanup' from"),
+])  # fmt: skip
+def test_a_transition_that_the_state_does_not_know_is_refused_and_the_node_answers_on(bus, hand, asked, said):
+    before = len(bus.said(said))
+    assert not change(bus, **asked)
+    line = bus.wait(lambda: bus.said(said)[before:], "the log line")[0]
+    assert line.endswith("the state 'active'; possible are deactivate (4), shutdown (7).")
+    assert state(bus) == "active"
+    assert hand.ask(HERE, PUSH).touches
+
+
+def test_a_node_whose_configuring_was_refused_may_be_asked_for_anything_and_is_configured_in_the_end(bus, hand):
+    assert change(bus, label="deactivate") and change(bus, label="cleanup")
+    assert bus.set(thickness=0.05)[0].successful  # more than the limb bears
+    assert not change(bus, label="configure") and not change(bus, label="activate")
+    assert not change(bus, Transition.TRANSITION_ACTIVATE)
+    assert state(bus) == "unconfigured"
+    assert bus.set(thickness=0.01)[0].successful
+    assert change(bus, Transition.TRANSITION_CONFIGURE) and change(bus, Transition.TRANSITION_ACTIVATE)
+    assert hand.ready().ask(HERE, PUSH).touches
+
+
+@pytest.mark.parametrize(("given", "says"), [
+    (["--params-file", "/nope.yaml"], "ROS does not take its arguments: Couldn't parse params file"),
+    (["-p", "part"], "ROS does not take its arguments: Couldn't parse parameter override rule: '-p part'"),
+    (["garbage", "--"], "ROS does not know what ['garbage'] means after --ros-args"),
+])  # fmt: skip
+def test_arguments_that_ros_does_not_take_end_a_verb_with_one_sentence(given, says):
+    code, said = end(start("-m", "stmpl_ros.cli", "node", "--ros-args", *given))
+    assert code == 1 and said.splitlines()[-1].startswith(f"stmpl: {says}")
+    assert "/src/" not in said and "Traceback" not in said
+
+
+def test_a_parameter_that_nobody_declared_is_told_once_and_with_it_the_one_that_may_be_meant(bus):
+    space, given = Bus("/typos"), ("-p", "bogus:=1", "-p", "fede:=0.5", "-p", "use_sim_time:=false")
+    try:
+        with running("-c", NODE, "--ros-args", "-r", "__ns:=/typos", *given):
+            space.wait(lambda: space.got["skin/topology"], "skin/topology")
+            space.wait(lambda: len(space.said("there is no parameter")) > 1, "both log lines")
+            assert sorted(space.said("there is no parameter")) == [
+                "there is no parameter bogus: it is ignored.",
+                "there is no parameter fede: it is ignored. Is fade meant?",
+            ]
+    finally:
+        space.node.destroy_node()
+
+
+def test_the_page_names_every_parameter_where_it_counts():
+    page = (ROOT / "docs/node.md").read_text().split("## Parameters")[1].split("\n## ")[0]
+    named = defaultdict[str, set[str]](set)
+    for when, names in re.findall(r"^\| ([^|]+?)(?:, or| \(| \|)(?:[^|]*\|)? (`.*) \|$", page, re.M):
+        named[when] |= set(re.findall(r"`([a-z_]+)`", names))
+    anytime, configuring = NodeConfig.names(ANY_TIME), NodeConfig.names(CONFIGURING)
+    assert named["at any time"] == anytime
+    assert named["when the node is configured"] == configuring
+    assert named["from the start"] == NodeConfig.model_fields.keys() - anytime - configuring
+
+
+def test_a_part_that_no_body_has_is_refused_before_the_node_is_configured_too():
+    context = Context()
+    context.init(domain_id=int(os.environ["ROS_DOMAIN_ID"]) + BUSES)
+    node = SkinNode(NodeConfig(), context=context)
+    try:
+        refused, taken = (node.set_parameters([Parameter("part", value=part)])[0] for part in ("nose", "right_forearm"))
+        assert not refused.successful and refused.reason.startswith("unknown part 'nose'. Available: left_arm")
+        assert taken.successful and node.config.part == "right_forearm"
+    finally:
+        node.destroy_node()
+        context.try_shutdown()
+        context.destroy()
+
+
+def test_who_asks_for_the_body_that_answers_is_told_so_at_once_and_nothing_is_made(bus, hand):
+    layers = len(bus.got["skin/topology"])
+    for same in ({}, {"thickness": bus.get("thickness")[0]}):
+        done = bus.call(SetBody, "set_body", **same)
+        assert done.success and done.message == "nothing changes: the node answers on it already"
+    bus.spin(0.5)
+    assert hand.ask(HERE, PUSH).touches and len(bus.got["skin/topology"]) == layers
+
+
+def told(bus, do) -> DiagnosticStatus:
+    """What /diagnostics tells once it is not well, while `do` is done again and again."""
+    heard: list[DiagnosticStatus] = []
+    ear = bus.node.create_subscription(DiagnosticArray, "/diagnostics", lambda m: heard.append(m.status[0]), STREAM)
+    level = {DiagnosticStatus.WARN, DiagnosticStatus.ERROR}
+    bus.wait(lambda: (do(), bus.spin(0.05), heard and heard[-1].level in level)[-1], "a level")
+    bus.node.destroy_subscription(ear)
+    return heard[-1]
+
+
+@pytest.mark.parametrize("seconds", [-5.0, 5.0])
+def test_stamps_that_are_too_old_or_to_come_are_told_in_the_diagnostics(bus, hand, seconds):
+    bus.still()
+    hand.send(HERE, frame="nowhere")  # refused, and nothing to do with it
+    bus.spin(2.5)
+    late = told(bus, lambda: hand.pose.publish(pose_message(HERE, "body", bus.now() + int(seconds * 1e9))))
+    assert late.level == DiagnosticStatus.ERROR
+    assert f"nothing that came could be used: a message stamped {-seconds:+.2f}"[:-1] in late.message
+    assert "nowhere" not in late.message and "max_age:=0" in late.message
+    assert "max_age:=0" in {one.key: one.value for one in late.values}["last dropped"]
+
+
+def test_two_senders_of_one_tool_are_told_in_the_diagnostics_by_their_names(bus, hand):
+    other = rclpy.create_node("impostor", namespace="/robot")
+    try:
+        other.create_publisher(PoseStamped, "tools/probe/pose", STREAM)
+        both = told(bus, lambda: hand.send(HERE))
+        assert both.level == DiagnosticStatus.WARN
+        senders = "/robot/tools/probe/pose has 2 senders, /robot/impostor, /robot/robot; only one can be the tool"
+        assert both.message.endswith(senders)
+    finally:
+        other.destroy_node()

@@ -1,0 +1,52 @@
+"""Laws of what a node does before its first answer: nothing is left to compile when a tool comes."""
+
+import pytest
+
+from tests.bus import end, start
+
+FRESH = """
+import sys
+import numpy as np
+from numba.core.dispatcher import Dispatcher
+from stmpl_core import Contact, Simulator
+from stmpl_core.friction import friction_from
+from stmpl_core.local_contact import local_contacts
+from stmpl_core.methods import MomentNet
+from stmpl_core.state import State
+from stmpl_ros.making import warm_up
+from tests.scenes import RADIUS, at, ball, limb
+from tests.test_posing import hinged
+
+
+def kernels():
+    ours = [vars(module) for name, module in sys.modules.items() if name.startswith("stmpl_core")]
+    found = {one for names in ours for one in names.values() if isinstance(one, Dispatcher)}
+    return {(one.py_func.__module__, one.__name__, str(kind)) for one in found for kind in one.signatures}
+
+
+layer = limb(8e-3)
+simulator = Simulator(layer.with_(rig=hinged(layer)), MomentNet(), friction=friction_from(sys.argv[1]))
+warm_up(simulator)
+assert simulator.skin.angles == () and not len(simulator.tools)
+before, state, push = kernels(), State(), np.array([0, -0.3, 0, 0, 0, 0])
+for angle in (0.0, 0.4):
+    simulator.move_to(simulator.skin.at_angles([angle]))
+    state = State()
+    for depth in (1e-3, 3e-3, 8e-3, 0.02):
+        for wrench in (None, push):
+            contacts = [Contact(ball(), at(0, RADIUS + 0.012 - depth, 0.05 + depth), wrench)]
+            simulator.step(contacts)
+            local_contacts(simulator.history, simulator.touch(contacts))
+            if simulator.remembers:
+                touches, state = simulator.touch(contacts, state, 0.01)
+                simulator.answer(touches)
+                local_contacts(simulator.history, touches, state)
+print(sorted(kernels() - before))
+"""
+
+
+@pytest.mark.parametrize("friction", ["none", "0.4"])
+def test_nothing_is_left_to_compile_when_a_tool_comes_to_a_limb_at_rest_or_bent(friction):
+    """In a process that touched nothing before."""
+    code, said = end(start("-c", FRESH, friction))
+    assert (code, said) == (0, "[]\n")
