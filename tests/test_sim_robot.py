@@ -175,6 +175,37 @@ def test_a_robot_whose_joints_are_servos_keeps_its_force(forearm: SoftLayer, tmp
         assert np.abs(log.force[log.during(phase)] - 5.0).max() < 0.2
 
 
+def arm_of(axes: int, path: Path, geoms: str = 'contype="0" conaffinity="0"') -> Path:
+    """A column, upper and lower arm and wrist, turning about z, y, y, y and, of five axes, x."""
+    last = '<joint name="j5" axis="1 0 0" range="-1.5 1.5" damping=".2"/>' if axes == 5 else ""
+    path.write_text(f"""<mujoco><compiler angle="radian" autolimits="true"/><worldbody><body pos="0 0 .3">
+      <joint name="j1" axis="0 0 1" range="-2.5 2.5" damping=".5"/>
+      <geom type="cylinder" size=".05 .1" mass="3" {geoms}/><body pos="0 0 .1">
+      <joint name="j2" axis="0 1 0" range="-2 2" damping=".5"/>
+      <geom type="capsule" fromto="0 0 0 0 0 .35" size=".035" mass="2" {geoms}/><body pos="0 0 .35">
+      <joint name="j3" axis="0 1 0" range="-.2 2.7" damping=".5"/>
+      <geom name="lower" type="capsule" fromto="0 0 0 0 0 .3" size=".03" mass="1.5" {geoms}/><body pos="0 0 .3">
+      <joint name="j4" axis="0 1 0" range="-2.5 2.5" damping=".2"/>
+      <geom type="capsule" fromto="0 0 0 0 0 .08" size=".02" mass=".5" {geoms}/><body pos="0 0 .1">{last}
+      <geom name="roller" type="capsule" fromto="0 -.03 0 0 .03 0" size=".02" mass=".2" {geoms}/>
+      <site name="tcp" pos="0 0 .02"/></body></body></body></body></body></worldbody></mujoco>""")
+    return path
+
+
+@pytest.mark.parametrize("axes", [4, 5])
+def test_an_arm_of_few_axes_keeps_its_place_before_it_points(forearm: SoftLayer, tmp_path: Path, axes: int) -> None:
+    from stmpl_sim.massage import Course, Massage
+    from stmpl_sim.scene import build
+    from stmpl_sim.site import Site
+
+    site = Site.thickest(forearm)
+    scene = build(forearm, site, robot=arm_of(axes, tmp_path / "arm.xml"), end="tcp", timestep=2e-3)
+    log = Massage(scene, Course(site.circle(0.012), (5.0,), laps=0.5), skin=Simulator(forearm, Winkler())).run()
+    for phase in log.phases[2:4]:
+        rows = log.during(phase)
+        assert np.abs(log.force[rows] - 5.0).max() < 0.1 and log.off[rows].max() < 3e-4
+
+
 def test_meshes_of_a_package_are_found_beside_the_file_or_left_out(tmp_path: Path, caplog: pytest.LogCaptureFixture
                                                                    ) -> None:  # fmt: skip
     """Links of a URDF as ROS has them: one mesh lies in its package, one nowhere, one is of a kind that is not read."""
