@@ -18,17 +18,16 @@ from bags.wire import stamp_ns
 from stmpl_core.touch import Touch
 from stmpl_ros.parameters import RobotConfig
 from stmpl_ros.robot import LOG, TOOL, scene_of
-from stmpl_sim.verbs import gripped
+from stmpl_sim.verbs import course_left, force_missed, gripped, held
 
 if TYPE_CHECKING:
     from bags.frame import Frame
     from stmpl_sim.film import Film, Shot
-    from stmpl_sim.massage import Log, Phase
+    from stmpl_sim.massage import Log
     from stmpl_sim.scene import Scene
 
 FILM = "film.webp"
 FILM_RATE = 12.0  # frames a second
-LARGEST_OFF_N = 0.2  # difference of the mean force of a phase from what was asked for
 LARGEST_GAIN = 0.01  # energy that the contact gave out beyond what was put in, over what was stored
 AROUND_S = 8e-3  # time within which the simulator's force counts, two of its steps at 250 Hz [s]
 LARGEST_APART = 0.01  # difference of the node's force from the simulator's, over the largest
@@ -104,9 +103,9 @@ class Massaged:
         back then is bounded by what it was told of the way (Touch.passive), and the node does not get every step.
         """
         times, forces = self.answered
-        ends = [self.log.time[rows][[0, -1]] for _, rows in self.held()]
-        held = np.any([(times >= first) & (times <= last) for first, last in ends], axis=0)
-        times, forces = times[held], forces[held]
+        ends = [self.log.time[rows][[0, -1]] for _, rows in held(self.log)]
+        holding = np.any([(times >= first) & (times <= last) for first, last in ends], axis=0)
+        times, forces = times[holding], forces[holding]
         size = np.linalg.norm(self.log.wrench[:, :3], axis=1)
         felt = np.array([np.interp(times + late, self.log.time, size) for late in (-AROUND_S, 0.0, AROUND_S)])
         return _apart(forces, np.clip(forces, felt.min(axis=0), felt.max(axis=0)))
@@ -128,18 +127,9 @@ class Massaged:
         most = float(self.log.energy.max())
         return -float(self.log.energy[-1]) / most if most > 0 else 0.0
 
-    def held(self) -> Iterator[tuple[Phase, np.ndarray]]:
-        """Phases in which a force is held, and the log's rows that are judged of each."""
-        for phase in self.log.phases:
-            if phase.name in ("press", "circle"):
-                yield phase, self.log.during(phase)
-
     def complaints(self) -> Iterator[str]:
         """What is not sane, one sentence each."""
-        for phase, rows in self.held():
-            mean = float(self.log.force[rows].mean())
-            if abs(mean - phase.force) > LARGEST_OFF_N:
-                yield f"the robot kept {mean:.2f} N of {phase.force:g} N during '{phase.name}'"
+        yield from force_missed(self.log)
         if grip := gripped(self.log):
             if abs(grip["mean_N"] - grip["asked_N"]) > LARGEST_SQUEEZE * grip["asked_N"]:
                 yield f"the fingers gripped with {grip['mean_N']:.2f} N of {grip['asked_N']:g} N"
@@ -160,6 +150,8 @@ class Massaged:
     def remarks(self) -> Iterator[str]:
         """What is farther off than one would wish, and said so, one sentence each."""
         yield from (str(one) for one in self.solved if abs(one.off) > LARGEST_OFF and one.stated)
+        yield from course_left(self.log)
+        yield from self.log.notes
 
 
 def filmed(folder: Path, config: RobotConfig) -> Film:
@@ -238,7 +230,7 @@ def front(done: Massaged, limb: str) -> str:
     hardest = done.film.colour_pa
     pressed = "" if hardest is None else (f" Below, the skin from above and without the tools: pressure up to "
                                           f"{1e-3 * hardest:.0f} kPa.")  # fmt: skip
-    forces = sorted({phase.force for phase, _ in done.held()})
+    forces = sorted({phase.force for phase, _ in held(done.log)})
     said = " and ".join(f"{force:g}" for force in forces)
     return "\n".join([
         f"<h1>A robot massages a {text(limb.replace('_', ' '))} with {said} N</h1>",
@@ -257,8 +249,10 @@ def front(done: Massaged, limb: str) -> str:
 def rows(done: Massaged) -> list[tuple[str, str]]:
     """Figures of a massage as a whole, name and value with unit."""
     log = done.log
+    off = max((float(log.off[judged].max()) for _, judged in held(log)), default=0.0)
     figures = [
         ("highest force", f"{log.force.max():.2f} N"),
+        ("off course", f"at most {1e3 * off:.2f} mm along the skin while a force was held"),
         ("node's force off the simulation's while held", f"at most {100 * done.apart:.2f} % of the highest"),
         ("energy stored in the skin", f"{1e3 * log.energy.max():.2f} mJ at most"),
         ("given out beyond what was put in", f"{100 * done.gained:+.1f} % of that (below 0: lost)"),
@@ -342,7 +336,7 @@ def _length(v: Any) -> float:
 
 def _phases(done: Massaged) -> list[tuple[str, ...]]:
     shown = []
-    for phase, judged in done.held():
+    for phase, judged in held(done.log):
         force, log = done.log.force[judged], done.log
         shown.append((phase.name, f"{phase.force:.1f}", f"{force.mean():.2f} ± {force.std():.2f}",
                       f"{np.abs(force - phase.force).max():.2f}", f"{1e3 * np.nanmean(log.depth[judged]):.1f}",

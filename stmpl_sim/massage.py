@@ -184,6 +184,7 @@ class Log:
         step_s: time that the whole step took [s], (N,).
         cpu_s: processor time of the whole step [s], (N,): what a core of its own would have taken.
         phases: phases.
+        notes: what the scene had to say of the robot, one sentence each.
     """
 
     time: np.ndarray
@@ -205,6 +206,7 @@ class Log:
     step_s: np.ndarray
     cpu_s: np.ndarray
     phases: tuple[Phase, ...]
+    notes: tuple[str, ...] = ()
 
     @property
     def real_time_factor(self) -> float:
@@ -223,19 +225,20 @@ class Log:
 
     def save(self, path: Path) -> Path:
         """Writes all rows as .npz."""
-        rows = {name: value for name, value in vars(self).items() if name != "phases"}
+        rows = {name: value for name, value in vars(self).items() if name not in ("phases", "notes")}
         phases = np.array([(p.name, p.start, p.duration, p.force) for p in self.phases],
                           dtype=[("name", "U16"), ("start", float), ("duration", float), ("force", float)])  # fmt: skip
-        np.savez_compressed(path, **rows, phases=phases)
+        np.savez_compressed(path, **rows, phases=phases, notes=np.array(self.notes, dtype=str))
         return path
 
     @classmethod
     def load(cls, path: Path) -> Log:
         """What `save` wrote."""
         with np.load(path) as kept:
-            rows = {name: kept[name] for name in kept.files if name != "phases"}
+            rows = {name: kept[name] for name in kept.files if name not in ("phases", "notes")}
             phases = tuple(Phase(str(name), *map(float, numbers)) for name, *numbers in kept["phases"].tolist())
-        return cls(**rows, phases=phases)
+            notes = tuple(map(str, kept["notes"])) if "notes" in kept else ()
+        return cls(**rows, phases=phases, notes=notes)
 
 
 class Massage:
@@ -345,7 +348,8 @@ class Massage:
                          took, spent, busy))  # fmt: skip
             for see in seen:
                 see(self, at)
-        return Log(*(np.array(column) for column in zip(*rows, strict=True)), phases=self.course.phases)
+        return Log(*(np.array(column) for column in zip(*rows, strict=True)), phases=self.course.phases,
+                   notes=self.scene.notes)  # fmt: skip
 
 
 def _in_layer(wrench: np.ndarray, limb: np.ndarray) -> np.ndarray:

@@ -11,6 +11,7 @@ import numpy as np
 from stmpl_core.arrays import Transform, finite
 from stmpl_core.errors import InvalidInput
 from stmpl_core.layer import SoftLayer
+from stmpl_sim.ability import start_notes
 from stmpl_sim.engine import mujoco
 from stmpl_sim.grip import END, FINGERS, add_gripper, place_of, thin_end
 from stmpl_sim.mujoco_skin import exclude
@@ -47,6 +48,7 @@ class Scene:
         qpos: start, with the tool above the site, (nq,).
         radius: radius of the ball [m].
         tools: names of the geoms that touch: the ball, and the fingers of a gripper.
+        notes: what will take the tool off its course or its direction, one sentence each.
     """
 
     model: Any
@@ -56,6 +58,7 @@ class Scene:
     qpos: np.ndarray
     radius: float
     tools: tuple[str, ...] = (BALL,)
+    notes: tuple[str, ...] = ()
 
 
 def build(
@@ -115,7 +118,7 @@ def build(
         raise InvalidInput(f"MuJoCo cannot compile the scene: {' '.join(str(error).split())}.{what}") from error
     joints = tuple(model.joint(joint.name).id for joint in chain)
     qpos = _reach(model, joints, site, np.array(at), radius + above)
-    return Scene(model, layer, site, joints, qpos, radius, tools)
+    return Scene(model, layer, site, joints, qpos, radius, tools, start_notes(model, joints, qpos))
 
 
 def world_from_limb(site: Site, at: np.ndarray) -> Transform:

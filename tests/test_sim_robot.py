@@ -206,6 +206,35 @@ def test_an_arm_of_few_axes_keeps_its_place_before_it_points(forearm: SoftLayer,
         assert np.abs(log.force[rows] - 5.0).max() < 0.1 and log.off[rows].max() < 3e-4
 
 
+def test_what_takes_an_arm_off_its_course_is_said_before_and_after(forearm: SoftLayer, tmp_path: Path) -> None:
+    from dataclasses import replace
+
+    from rich.console import Console
+
+    from stmpl_sim.massage import Course, Log, Massage
+    from stmpl_sim.scene import build
+    from stmpl_sim.site import Site
+    from stmpl_sim.verbs import figures_of, table
+
+    site = Site.thickest(forearm)
+    assert build(forearm, site, gripper=True, mount="rest").notes == ()
+    path = arm_of(5, tmp_path / "arm.xml")
+    assert build(forearm, site, robot=path, end="tcp").notes == ()
+    path.write_text(arm_of(5, path, geoms="").read_text().replace('size=".02" mass=".2"', 'size=".08" mass=".2"'))
+    touching = build(forearm, site, robot=path, end="tcp").notes
+    assert len(touching) == 1 and "lower and roller" in touching[0]
+    scene = build(forearm, site, robot=arm_of(4, path), end="tcp", timestep=4e-3)
+    assert len(scene.notes) == 1 and "4 axes" in scene.notes[0]
+    log = Massage(scene, Course(site.circle(0.012), (5.0,), laps=0), skin=Simulator(forearm, Winkler())).run()
+    log = Log.load(log.save(tmp_path / "log.npz"))
+    assert figures_of(log)["notes"] == [*scene.notes]
+    notes = figures_of(replace(log, off=log.off + 2e-3, force=log.force - 1.0))["notes"]
+    assert "kept 4.00 N of 5 N during 'press'" in notes[0] and "2.0 mm off its course" in notes[1]
+    console = Console(record=True, width=300)
+    console.print(table(figures_of(log) | {"log": "", "every": 1}))
+    assert f"to note: {scene.notes[0]}" in console.export_text()
+
+
 def test_meshes_of_a_package_are_found_beside_the_file_or_left_out(tmp_path: Path, caplog: pytest.LogCaptureFixture
                                                                    ) -> None:  # fmt: skip
     """Links of a URDF as ROS has them: one mesh lies in its package, one nowhere, one is of a kind that is not read."""
