@@ -1,4 +1,4 @@
-"""What an arm is able to do where it starts: its axes, and links that touch each other."""
+"""What an arm is able to do where it starts: its axes, links that touch each other, how hard it can press."""
 
 from __future__ import annotations
 
@@ -38,6 +38,31 @@ def start_notes(model: Any, joints: tuple[int, ...], qpos: np.ndarray) -> tuple[
     for note in found:
         log.warning("%s.", note)
     return tuple(found)
+
+
+def strength(model: Any, joints: tuple[int, ...], qpos: np.ndarray, tool: str) -> tuple[float, str]:
+    """Largest force that an arm presses down with [N], and the joint whose motor is at its limit then.
+
+    Args:
+        model: MuJoCo model.
+        joints: numbers of the arm's joints.
+        qpos: pose of all, at rest, (nq,).
+        tool: name of the geom that presses.
+    """
+    data, jacobian = mujoco.MjData(model), np.zeros((3, model.nv))
+    data.qpos[:] = qpos
+    mujoco.mj_forward(model, data)
+    mujoco.mj_jacGeom(model, data, jacobian, None, model.geom(tool).id)
+    most, weakest = np.inf, ""
+    for joint in joints:
+        dof = model.jnt_dofadr[joint]
+        if not model.jnt_actfrclimited[joint] or abs(arm := -jacobian[2, dof]) < 1e-6:
+            continue
+        limit = model.jnt_actfrcrange[joint][int(arm > 0)]
+        force = max(0.0, float(limit - data.qfrc_bias[dof] + data.qfrc_passive[dof]) / arm)
+        if force < most:
+            most, weakest = force, model.joint(joint).name
+    return most, weakest
 
 
 def _name(model: Any, geom: int) -> str:

@@ -13,6 +13,7 @@ import numpy as np
 from stmpl_core.arrays import Wrench, cross
 from stmpl_core.errors import InvalidInput
 from stmpl_core.friction import Friction
+from stmpl_sim.ability import strength
 from stmpl_sim.controller import ForceImpedance, Gains, Goal
 from stmpl_sim.energy import EnergyBook
 from stmpl_sim.engine import mujoco
@@ -253,12 +254,20 @@ class Massage:
         implicit: see SoftContact.
         friction: see SoftContact.
         every: see SoftContact.
+
+    Raises:
+        InvalidInput: a force that the arm's motors do not press with.
     """
 
     def __init__(self, scene: Scene, course: Course, *, gains: Gains | None = None, skin: Any = None,
                  damping: float = 0.0, implicit: bool = False,
                  friction: Friction | Mapping[str, Friction] = None, every: int = 1) -> None:  # fmt: skip
         self.scene, self.course = scene, course
+        most, weakest = strength(scene.model, scene.joints, scene.qpos, BALL)
+        if max(course.forces) > most:
+            raise InvalidInput(f"the arm cannot press with {max(course.forces):g} N: at the start the motor of "
+                               f"'{weakest}' is at its limit from {most:.3g} N on. Ask for less, or put the limb "
+                               "elsewhere (--at).")  # fmt: skip
         self.fingers = tuple(name for name in scene.tools if name in FINGERS)
         if self.fingers and not hasattr(skin, "history"):  # a Simulator has its own
             friction = with_fingers(friction, BALL)

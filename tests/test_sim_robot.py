@@ -235,6 +235,27 @@ def test_what_takes_an_arm_off_its_course_is_said_before_and_after(forearm: Soft
     assert f"to note: {scene.notes[0]}" in console.export_text()
 
 
+def test_an_arm_presses_with_its_weight_and_what_its_weakest_motor_gives(forearm: SoftLayer, tmp_path: Path) -> None:
+    from stmpl_sim.ability import strength
+    from stmpl_sim.massage import Course, Massage
+    from stmpl_sim.scene import BALL, HEAD_MASS, build
+    from stmpl_sim.site import Site
+
+    inertial, site = '<inertial pos="0 0 0" mass="2" diaginertia=".1 .1 .1"/>', Site.thickest(forearm)
+    course, path = Course(site.circle(0.012), (5.0, 80.0), laps=0), tmp_path / "lift.xml"
+    for limits, most in (('actuatorfrcrange="-50 50"', 50 + 9.81 * (2 + HEAD_MASS)), ("", np.inf)):
+        path.write_text(f"""<mujoco><compiler autolimits="true"/><worldbody><body pos=".5 0 .4">{inertial}
+          <joint name="up" type="slide" axis="0 0 1" {limits}/><site name="tool" quat="0 1 0 0"/></body></worldbody>
+          </mujoco>""")
+        scene = build(forearm, site, robot=path, end="tool")
+        assert strength(scene.model, scene.joints, scene.qpos, BALL)[0] == pytest.approx(most, rel=1e-6)
+        if np.isfinite(most):
+            with pytest.raises(InvalidInput, match=r"with 80 N: .* motor of 'up' is at its limit from 72\.6 N on"):
+                Massage(scene, course, skin=Simulator(forearm, Winkler()))
+        else:
+            Massage(scene, course, skin=Simulator(forearm, Winkler()))
+
+
 def test_meshes_of_a_package_are_found_beside_the_file_or_left_out(tmp_path: Path, caplog: pytest.LogCaptureFixture
                                                                    ) -> None:  # fmt: skip
     """Links of a URDF as ROS has them: one mesh lies in its package, one nowhere, one is of a kind that is not read."""
@@ -384,7 +405,8 @@ def test_the_verb_prints_figures_and_leaves_log_and_film(tmp_path: Path, capsys:
     assert figures["grip"]["mean_N"] == pytest.approx(10.0, abs=0.5) and figures["grip"]["lifted_m"] > 5e-3
     assert Path(figures["film"]).stat().st_size > 10_000
     for wrong, why in ((["--rate", "5"], "allowed is 50 to 20000"), (["--speed", "0.05"], "Is it in metres?"),
-                       (["--force", "-1"], "above 0 N"),
+                       (["--force", "-1"], "above 0 N"), (["--circle", "0"], "a radius above 0 is needed"),
+                       (["--radius", "0"], "ball's radius is 0 m"), (["--force", "5000"], "cannot press with 5000 N"),
                        (["--robot", "nothing.urdf"], "no robot file"),
                        (["--phenotype", "weight=80"], "not from 0 to 1"),
                        (["--phenotype", "size=1"], "no phenotype; known are gender")):  # fmt: skip
