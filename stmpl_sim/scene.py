@@ -123,6 +123,16 @@ def build(
     return Scene(model, layer, site, joints, qpos, radius, tools, start_notes(model, joints, qpos))
 
 
+def check_robot(robot: Path | None, end: str | None) -> None:
+    """Reads a robot's file and finds its end, where `build` comes later. Raises InvalidInput, as build does.
+
+    Args:
+        robot: see `build`.
+        end: see `build`.
+    """
+    _end(robot_spec(ARM if robot is None else robot), end)
+
+
 def world_from_limb(site: Site, at: np.ndarray) -> Transform:
     """Pose of a limb whose site lies at `at`, turned up, its length across the robot's view."""
     pose = np.eye(4)

@@ -24,6 +24,25 @@ def test_flags_say_what_a_configuration_holds(config: BaseModel) -> None:
     assert tyro.cli(type(config), args=flags) == config
 
 
+@pytest.mark.parametrize(("flags", "why"), [
+    (["--robot", "nothing.xml"], "no robot file nothing.xml"), (["--end", "hand"], "no body or site 'hand'"),
+])  # fmt: skip
+def test_a_robot_that_is_not_there_is_said_before_anything_starts(
+    flags: list[str], why: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("mujoco", reason="pip install 'stmpl[sim]'")
+    from stmpl_ros.cli import main
+
+    for place in ("stmpl_ros.demo.play", "stmpl_ros.robot.RobotNode"):
+        monkeypatch.setattr(place, lambda *_: pytest.fail("it started"))
+    (flag, value), runs = flags, ["--runs", str(tmp_path)]
+    for command in (["demo", f"--robot.{flag[2:]}", value, *runs], ["robot", flag, value]):
+        with pytest.raises(SystemExit) as ended:
+            main(command)
+        assert ended.value.code == 1 and why in " ".join(capsys.readouterr().err.split())
+    assert not [*tmp_path.iterdir()]
+
+
 def test_a_force_is_held_to_finite_elements_of_the_same_skin_only() -> None:
     pytest.importorskip("mujoco", reason="pip install 'stmpl[sim]'")
     from stmpl_ros.massage_report import Massaged, Solved, rows
