@@ -54,6 +54,9 @@ def run(config: DemoConfig) -> int:
     """Runs all of it; 0 only if everything is there and sane. Raises DemoError with what is not."""
     if config.device == "robot":
         needed("stmpl demo", "sim", "mujoco")
+        from stmpl_sim.scene import check_robot
+
+        check_robot(config.robot.robot, config.robot.end or None)
         config = gripping(config)
     console = Console()
     folder = config.runs / datetime.now().strftime("%Y-%m-%d_%H-%M-%S")

@@ -18,17 +18,16 @@ from bags.wire import stamp_ns
 from stmpl_core.touch import Touch
 from stmpl_ros.parameters import RobotConfig
 from stmpl_ros.robot import LOG, TOOL, scene_of
-from stmpl_sim.verbs import gripped
+from stmpl_sim.verbs import course_left, force_missed, gripped, held
 
 if TYPE_CHECKING:
     from bags.frame import Frame
     from stmpl_sim.film import Film, Shot
-    from stmpl_sim.massage import Log, Phase
+    from stmpl_sim.massage import Log
     from stmpl_sim.scene import Scene
 
 FILM = "film.webp"
 FILM_RATE = 12.0  # frames a second
-LARGEST_OFF_N = 0.2  # difference of the mean force of a phase from what was asked for
 LARGEST_GAIN = 0.01  # energy that the contact gave out beyond what was put in, over what was stored
 AROUND_S = 8e-3  # time within which the simulator's force counts, two of its steps at 250 Hz [s]
 LARGEST_APART = 0.01  # difference of the node's force from the simulator's, over the largest
@@ -47,12 +46,14 @@ class Solved(NamedTuple):
         reference: force of the reference [N].
         ours: force of the answer [N].
         bound: bound that the answer states of its error [N]; NaN: none.
+        alike: whether both sides have friction and relaxation, or neither; else their difference is no error.
     """
 
     at: float
     reference: float
     ours: float
     bound: float
+    alike: bool = True
 
     @property
     def off(self) -> float:
@@ -104,9 +105,9 @@ class Massaged:
         back then is bounded by what it was told of the way (Touch.passive), and the node does not get every step.
         """
         times, forces = self.answered
-        ends = [self.log.time[rows][[0, -1]] for _, rows in self.held()]
-        held = np.any([(times >= first) & (times <= last) for first, last in ends], axis=0)
-        times, forces = times[held], forces[held]
+        ends = [self.log.time[rows][[0, -1]] for _, rows in held(self.log)]
+        holding = np.any([(times >= first) & (times <= last) for first, last in ends], axis=0)
+        times, forces = times[holding], forces[holding]
         size = np.linalg.norm(self.log.wrench[:, :3], axis=1)
         felt = np.array([np.interp(times + late, self.log.time, size) for late in (-AROUND_S, 0.0, AROUND_S)])
         return _apart(forces, np.clip(forces, felt.min(axis=0), felt.max(axis=0)))
@@ -115,6 +116,11 @@ class Massaged:
     def fingers_apart(self) -> float:
         """The same of the forces of the fingers [-]."""
         return _apart(self.gripped[1], self.squeezed)
+
+    @property
+    def judged(self) -> tuple[Solved, ...]:
+        """Forces at those of the compared frames whose reference is of the same skin."""
+        return tuple(one for one in self.solved if one.alike)
 
     @property
     def squeezed(self) -> np.ndarray:
@@ -128,18 +134,9 @@ class Massaged:
         most = float(self.log.energy.max())
         return -float(self.log.energy[-1]) / most if most > 0 else 0.0
 
-    def held(self) -> Iterator[tuple[Phase, np.ndarray]]:
-        """Phases in which a force is held, and the log's rows that are judged of each."""
-        for phase in self.log.phases:
-            if phase.name in ("press", "circle"):
-                yield phase, self.log.during(phase)
-
     def complaints(self) -> Iterator[str]:
         """What is not sane, one sentence each."""
-        for phase, rows in self.held():
-            mean = float(self.log.force[rows].mean())
-            if abs(mean - phase.force) > LARGEST_OFF_N:
-                yield f"the robot kept {mean:.2f} N of {phase.force:g} N during '{phase.name}'"
+        yield from force_missed(self.log)
         if grip := gripped(self.log):
             if abs(grip["mean_N"] - grip["asked_N"]) > LARGEST_SQUEEZE * grip["asked_N"]:
                 yield f"the fingers gripped with {grip['mean_N']:.2f} N of {grip['asked_N']:g} N"
@@ -151,7 +148,7 @@ class Massaged:
                 yield f"the node's fingers feel up to {100 * self.fingers_apart:.1f} % else than the simulation's"
             if grip["given_out_J"] > LARGEST_GAIN * grip["stored_J"]:
                 yield "the grip gave out more energy than was put in"
-        yield from (str(one) for one in self.solved if abs(one.off) > LARGEST_OFF and not one.stated)
+        yield from (str(one) for one in self.judged if abs(one.off) > LARGEST_OFF and not one.stated)
         if self.apart > LARGEST_APART:
             yield f"the node's force is up to {100 * self.apart:.1f} % off the simulation's"
         if self.gained > LARGEST_GAIN:
@@ -159,7 +156,12 @@ class Massaged:
 
     def remarks(self) -> Iterator[str]:
         """What is farther off than one would wish, and said so, one sentence each."""
-        yield from (str(one) for one in self.solved if abs(one.off) > LARGEST_OFF and one.stated)
+        yield from (str(one) for one in self.judged if abs(one.off) > LARGEST_OFF and one.stated)
+        if unlike := len(self.solved) - len(self.judged):
+            yield (f"the force of {unlike} compared frames is not held to finite elements: those have neither friction "
+                   "nor relaxation, and the run has")  # fmt: skip
+        yield from course_left(self.log)
+        yield from self.log.notes
 
 
 def filmed(folder: Path, config: RobotConfig) -> Film:
@@ -238,7 +240,7 @@ def front(done: Massaged, limb: str) -> str:
     hardest = done.film.colour_pa
     pressed = "" if hardest is None else (f" Below, the skin from above and without the tools: pressure up to "
                                           f"{1e-3 * hardest:.0f} kPa.")  # fmt: skip
-    forces = sorted({phase.force for phase, _ in done.held()})
+    forces = sorted({phase.force for phase, _ in held(done.log)})
     said = " and ".join(f"{force:g}" for force in forces)
     return "\n".join([
         f"<h1>A robot massages a {text(limb.replace('_', ' '))} with {said} N</h1>",
@@ -257,8 +259,10 @@ def front(done: Massaged, limb: str) -> str:
 def rows(done: Massaged) -> list[tuple[str, str]]:
     """Figures of a massage as a whole, name and value with unit."""
     log = done.log
+    off = max((float(log.off[judged].max()) for _, judged in held(log)), default=0.0)
     figures = [
         ("highest force", f"{log.force.max():.2f} N"),
+        ("off course", f"at most {1e3 * off:.2f} mm along the skin while a force was held"),
         ("node's force off the simulation's while held", f"at most {100 * done.apart:.2f} % of the highest"),
         ("energy stored in the skin", f"{1e3 * log.energy.max():.2f} mJ at most"),
         ("given out beyond what was put in", f"{100 * done.gained:+.1f} % of that (below 0: lost)"),
@@ -275,9 +279,9 @@ def rows(done: Massaged) -> list[tuple[str, str]]:
             ("energy of the grip", f"{1e3 * grip['stored_J']:.0f} mJ at most, {-1e3 * grip['given_out_J']:.0f} mJ "
              "lost to friction"),
         ]  # fmt: skip
-    if done.solved:
-        told = ", ".join(f"{100 * one.off:+.1f}" for one in done.solved)
-        bound = 100 * max(one.bound / one.ours for one in done.solved)
+    if done.judged:
+        told = ", ".join(f"{100 * one.off:+.1f}" for one in done.judged)
+        bound = 100 * max(one.bound / one.ours for one in done.judged)
         figures.insert(1, ("force off finite elements", f"{told} % at the compared frames, ±{bound:.0f} % stated"))
     return figures
 
@@ -295,7 +299,8 @@ def course_figure(done: Massaged) -> Figure:
     force.plot(np.repeat(done.gripped[0], done.gripped[1].shape[1]), done.gripped[1].ravel(), ".", color=NODE, ms=2)
     if done.solved:
         solved = _columns([(one.at, one.reference) for one in done.solved])
-        force.plot(*solved, "o", color=TRUTH, ms=6, label="finite elements")
+        force.plot(*solved, "o", color=TRUTH, ms=6, label="finite elements" if len(done.judged) == len(done.solved) else
+                   "finite elements, elastic and without friction")  # fmt: skip
     force.set(ylabel="force [N]", ylim=(0, None))
     energy.plot(log.time, 1e3 * log.energy, color=INK, lw=1.2)
     energy.set(ylabel="energy held by the skin [mJ]", xlabel="time [s]")
@@ -327,7 +332,7 @@ def _solved(comparison: Comparison, start: int) -> tuple[Solved, ...]:
     for pair in comparison.judged:
         if key in (forces := pair.reference.trust.figures):
             at, touch = (pair.frame.stamp_ns - start) * NANO, pair.frame.touches[TOOL]
-            found.append(Solved(at, abs(forces[key]), touch.force, touch.force_bound))
+            found.append(Solved(at, abs(forces[key]), touch.force, touch.force_bound, pair.alike))
     return tuple(found)
 
 
@@ -342,7 +347,7 @@ def _length(v: Any) -> float:
 
 def _phases(done: Massaged) -> list[tuple[str, ...]]:
     shown = []
-    for phase, judged in done.held():
+    for phase, judged in held(done.log):
         force, log = done.log.force[judged], done.log
         shown.append((phase.name, f"{phase.force:.1f}", f"{force.mean():.2f} ± {force.std():.2f}",
                       f"{np.abs(force - phase.force).max():.2f}", f"{1e3 * np.nanmean(log.depth[judged]):.1f}",

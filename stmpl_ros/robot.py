@@ -200,7 +200,10 @@ def made(config: RobotConfig, layer: SoftLayer, stop: threading.Event) -> Massag
 
 
 def run(config: RobotConfig, arguments: Sequence[str] | None = None) -> int:
-    """Massages once; the exit code says whether all of the course was done."""
+    """Massages once; the exit code says whether all of the course was done. Raises InvalidInput: no such robot."""
+    from stmpl_sim.scene import check_robot
+
+    check_robot(config.robot, config.end or None)  # before it waits for a node
     with ros(list(arguments or ())) as stop:
         node = RobotNode(config)
         try:

@@ -12,6 +12,7 @@ from stmpl_sim.engine import mujoco
 
 FILTER_S = 3e-3  # time constant of the force's rate [s]
 STEEPER = 0.4  # power of the force with which a contact's stiffness grows: of round tools on skin 0.33 to 0.5
+LEAST = 1e-3  # mobility of a turn that is left by what goes before, over its own, below which it is given up [-]
 MOST = 20.0  # acceleration that an error of the force may ask for [m/s2]: at first touch there is next to no stiffness
 
 
@@ -70,17 +71,19 @@ class Goal:
 
 
 class ForceImpedance:
-    """Motion along the skin, force into it, in operational space (Khatib 1987):
+    """Motion along the skin, force into it, in operational space (Khatib 1987), the place before the pointing:
 
-        (f, m) = M ((x''_d + 2 z w e' + w^2 e) without its part along n, + a_n, turning likewise, - J' q') - (F, 0)
-        a_n    = n (n . x''_d - (w_f^2 (E + r int E dt) + 2 z w_f E') / k),    E = F_d - F_n
-        tau    = J^T (f, m) + gravity, Coriolis and damping of the joints + N^T posture
+        tau = J^T (L (a - J' q') - F) + pointing, spin, posture + gravity, Coriolis and damping of the joints
+        a   = (x''_d + 2 z w e' + w^2 e) without its part along n, + a_n
+        a_n = n (n . x''_d - (w_f^2 (E + r int E dt) + 2 z w_f E') / k),    E = F_d - F_n
 
-    with the outward normal n, the course x_d (over its point on the skin, as high as the tool is), e = x_d - x, the
-    arm's inertia M at the tool, and its dynamically consistent null space N. Turning takes the tool's z axis to -n. F
-    is the force that a sensor behind the tool feels, F_n its part along n. As F_n' = -k n . x' on skin of stiffness k,
+    with the outward normal n, the course x_d (over its point on the skin, as high as the tool is), e = x_d - x, and the
+    arm's inertia L at the tool's origin. Pointing takes the tool's z axis to -n likewise, spin about that axis is
+    damped, and posture is kept, each in what those before leave free (dynamically consistent null spaces, Sentis and
+    Khatib 2005): an arm of fewer than five axes keeps the place and points as well as it can. F is the force that a
+    sensor behind the tool feels, F_n its part along n. As F_n' = -k n . x' on skin of stiffness k,
     E'' + 2 z w_f E' + w_f^2 (E + r int E dt) = 0: the arm's mass and the skin's stiffness leave it as it is. A contact
-    that is quicker than w_f by itself, sqrt(k / n M n), is not slowed down. Before it touches, a_n is that of a push
+    that is quicker than w_f by itself, sqrt(k / n L n), is not slowed down. Before it touches, a_n is that of a push
     F_d, damped by Gains.into.
 
     Args:
@@ -126,10 +129,10 @@ class ForceImpedance:
         mujoco.mj_jac(model, data, self._jacobian[:3], self._jacobian[3:], x, self._body)
         mujoco.mj_jacDot(model, data, self._rate[:3], self._rate[3:], x, self._body)
         mujoco.mj_fullM(model, data, self._mass)
-        jacobian, mass = self._jacobian[:, self._dofs], self._mass[np.ix_(self._dofs, self._dofs)]
-        dq = data.qvel[self._dofs]
-        solved = np.linalg.solve(mass, jacobian.T)
-        inertia = np.linalg.inv(jacobian @ solved + 1e-6 * np.eye(6))
+        mass, dq = self._mass[np.ix_(self._dofs, self._dofs)], data.qvel[self._dofs]
+        jacobian, bend = self._jacobian[:, self._dofs], self._rate[:, self._dofs] @ dq
+        mobility = np.linalg.inv(mass)
+        inertia = np.linalg.inv(jacobian[:3] @ mobility @ jacobian[:3].T + 1e-6 * np.eye(3))
 
         # Motion: along the skin and of the tool's axis; without a force over the skin, too.
         velocity = jacobian @ dq
@@ -137,11 +140,9 @@ class ForceImpedance:
         over = -(off @ n) * n  # the tool's origin goes round with the normal
         lag = goal.velocity + cross(goal.spin, over) - velocity[:3]
         ahead = goal.acceleration + cross(goal.swing, over) + cross(goal.spin, cross(goal.spin, over))
+        asked = ahead + 2 * g.ratio * g.along * lag + g.along**2 * off
         axis = data.geom_xmat[self._tool].reshape(3, 3)[:, 2]
-        asked = np.concatenate([
-            ahead + 2 * g.ratio * g.along * lag + g.along**2 * off,
-            goal.swing + 2 * g.ratio * g.turn * (goal.spin - velocity[3:]) + g.turn**2 * cross(axis, -n),
-        ])  # fmt: skip
+        turned = goal.swing + 2 * g.ratio * g.turn * (goal.spin - velocity[3:]) + g.turn**2 * cross(axis, -n) - bend[3:]
         felt, lift = float(wrench[:3] @ n), float(ahead @ n)
         along = wrench[:3] - felt * n
         against = np.zeros(3)  # what is taken back of what the skin pushes
@@ -150,19 +151,24 @@ class ForceImpedance:
             self.reset()
             against = wrench[:3]
         elif goal.closed and stiffness > 0:
-            lift -= self._pressed(goal.force, goal.growth, felt, stiffness, float(n @ inertia[:3, :3] @ n), dt)
+            lift -= self._pressed(goal.force, goal.growth, felt, stiffness, float(n @ inertia @ n), dt)
             against = wrench[:3]
         else:
             self.felt, self.rate = felt, 0.0
             against = along + n * (goal.force - g.into * (lag @ n))
-        asked[:3] += (lift - asked[:3] @ n) * n
-        push = inertia @ (asked - self._rate[:, self._dofs] @ dq)
-        push[:3] -= against
+        asked += (lift - asked @ n) * n - bend[:3]
 
+        torques = jacobian[:3].T @ (inertia @ asked)
+        free = np.eye(len(dq)) - mobility @ jacobian[:3].T @ inertia @ jacobian[:3]
+        for ways in (_square_to(axis), axis[None]):  # pointing, then spin
+            rows = ways @ jacobian[3:]
+            left = rows @ free
+            heft = _inverse(left @ mobility @ left.T, float(np.trace(rows @ mobility @ rows.T)))
+            torques += left.T @ (heft @ (ways @ turned - rows @ mobility @ torques))
+            free -= mobility @ left.T @ heft @ left
         posture = mass @ (g.posture**2 * (self._rest - data.qpos[self._places]) - 2 * g.posture * dq)
-        posture -= jacobian.T @ (inertia @ (solved.T @ posture))
         known = data.qfrc_bias[self._dofs] - data.qfrc_passive[self._dofs]
-        return jacobian.T @ push + known + posture
+        return torques - jacobian[:3].T @ against + free.T @ posture + known
 
     def _pressed(self, force: float, growth: float, felt: float, stiffness: float, mass: float, dt: float) -> float:
         """Acceleration into the skin that a force's error asks for [m/s2]."""
@@ -178,3 +184,21 @@ class ForceImpedance:
     def command(self, data: Any, goal: Goal, wrench: Wrench, stiffness: float, dt: float) -> None:
         """Writes the torques into `data.ctrl`."""
         data.ctrl[self._motors] = self.torques(data, goal, wrench, stiffness, dt)
+
+
+def _square_to(axis: np.ndarray) -> np.ndarray:
+    """Two unit vectors square to an axis and to each other, (2, 3)."""
+    one = cross(axis, np.eye(3)[np.abs(axis).argmin()])
+    one /= np.linalg.norm(one)
+    return np.stack([one, cross(axis, one)])
+
+
+def _inverse(mobility: np.ndarray, whole: float) -> np.ndarray:
+    """Inertia of a mobility (n, n) of which something else took its share; none where next to nothing is left.
+
+    Args:
+        mobility: mobility that is left.
+        whole: trace of what it was before.
+    """
+    values, axes = np.linalg.eigh(mobility)
+    return (axes * (values / (values**2 + (LEAST * whole) ** 2 + 1e-12))) @ axes.T

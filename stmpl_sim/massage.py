@@ -13,6 +13,7 @@ import numpy as np
 from stmpl_core.arrays import Wrench, cross
 from stmpl_core.errors import InvalidInput
 from stmpl_core.friction import Friction
+from stmpl_sim.ability import strength
 from stmpl_sim.controller import ForceImpedance, Gains, Goal
 from stmpl_sim.energy import EnergyBook
 from stmpl_sim.engine import mujoco
@@ -184,6 +185,7 @@ class Log:
         step_s: time that the whole step took [s], (N,).
         cpu_s: processor time of the whole step [s], (N,): what a core of its own would have taken.
         phases: phases.
+        notes: what the scene had to say of the robot, one sentence each.
     """
 
     time: np.ndarray
@@ -205,6 +207,7 @@ class Log:
     step_s: np.ndarray
     cpu_s: np.ndarray
     phases: tuple[Phase, ...]
+    notes: tuple[str, ...] = ()
 
     @property
     def real_time_factor(self) -> float:
@@ -223,19 +226,20 @@ class Log:
 
     def save(self, path: Path) -> Path:
         """Writes all rows as .npz."""
-        rows = {name: value for name, value in vars(self).items() if name != "phases"}
+        rows = {name: value for name, value in vars(self).items() if name not in ("phases", "notes")}
         phases = np.array([(p.name, p.start, p.duration, p.force) for p in self.phases],
                           dtype=[("name", "U16"), ("start", float), ("duration", float), ("force", float)])  # fmt: skip
-        np.savez_compressed(path, **rows, phases=phases)
+        np.savez_compressed(path, **rows, phases=phases, notes=np.array(self.notes, dtype=str))
         return path
 
     @classmethod
     def load(cls, path: Path) -> Log:
         """What `save` wrote."""
         with np.load(path) as kept:
-            rows = {name: kept[name] for name in kept.files if name != "phases"}
+            rows = {name: kept[name] for name in kept.files if name not in ("phases", "notes")}
             phases = tuple(Phase(str(name), *map(float, numbers)) for name, *numbers in kept["phases"].tolist())
-        return cls(**rows, phases=phases)
+            notes = tuple(map(str, kept["notes"])) if "notes" in kept else ()
+        return cls(**rows, phases=phases, notes=notes)
 
 
 class Massage:
@@ -250,12 +254,20 @@ class Massage:
         implicit: see SoftContact.
         friction: see SoftContact.
         every: see SoftContact.
+
+    Raises:
+        InvalidInput: a force that the arm's motors do not press with.
     """
 
     def __init__(self, scene: Scene, course: Course, *, gains: Gains | None = None, skin: Any = None,
                  damping: float = 0.0, implicit: bool = False,
                  friction: Friction | Mapping[str, Friction] = None, every: int = 1) -> None:  # fmt: skip
         self.scene, self.course = scene, course
+        most, weakest = strength(scene.model, scene.joints, scene.qpos, BALL)
+        if max(course.forces) > most:
+            raise InvalidInput(f"the arm cannot press with {max(course.forces):g} N: at the start the motor of "
+                               f"'{weakest}' is at its limit from {most:.3g} N on. Ask for less, or put the limb "
+                               "elsewhere (--at).")  # fmt: skip
         self.fingers = tuple(name for name in scene.tools if name in FINGERS)
         if self.fingers and not hasattr(skin, "history"):  # a Simulator has its own
             friction = with_fingers(friction, BALL)
@@ -345,7 +357,8 @@ class Massage:
                          took, spent, busy))  # fmt: skip
             for see in seen:
                 see(self, at)
-        return Log(*(np.array(column) for column in zip(*rows, strict=True)), phases=self.course.phases)
+        return Log(*(np.array(column) for column in zip(*rows, strict=True)), phases=self.course.phases,
+                   notes=self.scene.notes)  # fmt: skip
 
 
 def _in_layer(wrench: np.ndarray, limb: np.ndarray) -> np.ndarray:

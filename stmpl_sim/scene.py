@@ -11,6 +11,7 @@ import numpy as np
 from stmpl_core.arrays import Transform, finite
 from stmpl_core.errors import InvalidInput
 from stmpl_core.layer import SoftLayer
+from stmpl_sim.ability import start_notes
 from stmpl_sim.engine import mujoco
 from stmpl_sim.grip import END, FINGERS, add_gripper, place_of, thin_end
 from stmpl_sim.mujoco_skin import exclude
@@ -47,6 +48,7 @@ class Scene:
         qpos: start, with the tool above the site, (nq,).
         radius: radius of the ball [m].
         tools: names of the geoms that touch: the ball, and the fingers of a gripper.
+        notes: what will take the tool off its course or its direction, one sentence each.
     """
 
     model: Any
@@ -56,6 +58,7 @@ class Scene:
     qpos: np.ndarray
     radius: float
     tools: tuple[str, ...] = (BALL,)
+    notes: tuple[str, ...] = ()
 
 
 def build(
@@ -90,10 +93,12 @@ def build(
         gripper: choice to add a gripper of two fingers beside the site.
 
     Raises:
-        InvalidInput: a place that is not finite, a file that MuJoCo does not read, an end that is not there, a site out
-            of reach, or a limb that cannot be gripped.
+        InvalidInput: a place that is not finite, a ball without a radius, a file that MuJoCo does not read, an end that
+            is not there, a site out of reach, or a limb that cannot be gripped.
     """
     where, spec = finite("at", at, (3,)), robot_spec(ARM if robot is None else Path(robot))
+    if not 0 < radius < np.inf:
+        raise InvalidInput(f"the ball's radius is {radius:g} m; it must be finite and above 0.")
     holder = _end(spec, end)
     chain = _chain(holder if hasattr(holder, "add_body") else holder.parent)
     _add_head(spec, holder, radius)
@@ -115,7 +120,17 @@ def build(
         raise InvalidInput(f"MuJoCo cannot compile the scene: {' '.join(str(error).split())}.{what}") from error
     joints = tuple(model.joint(joint.name).id for joint in chain)
     qpos = _reach(model, joints, site, np.array(at), radius + above)
-    return Scene(model, layer, site, joints, qpos, radius, tools)
+    return Scene(model, layer, site, joints, qpos, radius, tools, start_notes(model, joints, qpos))
+
+
+def check_robot(robot: Path | None, end: str | None) -> None:
+    """Reads a robot's file and finds its end, where `build` comes later. Raises InvalidInput, as build does.
+
+    Args:
+        robot: see `build`.
+        end: see `build`.
+    """
+    _end(robot_spec(ARM if robot is None else robot), end)
 
 
 def world_from_limb(site: Site, at: np.ndarray) -> Transform:

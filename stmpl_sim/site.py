@@ -80,7 +80,9 @@ class Site:
         return start - float(hits.min()) * self.normal
 
     def circle(self, radius: float) -> Circle:
-        """A circle around the site, laid on the skin. Raises InvalidInput: it leaves the skin."""
+        """A circle around the site, laid on the skin. Raises InvalidInput: no radius, or it leaves the skin."""
+        if not radius > 0:
+            raise InvalidInput(f"the circle is {radius:g} m; a radius above 0 is needed. Without circles: --laps 0.")
         angle = 2 * np.pi * np.arange(SAMPLES) / SAMPLES
         points = np.array([self.on_skin(radius * np.cos(a), radius * np.sin(a)) for a in angle])
         normals = np.array([self.normal_at(p) for p in points])

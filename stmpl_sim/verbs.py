@@ -12,11 +12,17 @@ from stmpl_core.errors import InvalidInput, check_millimetres
 from stmpl_core.extras import needed
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    import numpy as np
+
     from stmpl_core.layer import SoftLayer
-    from stmpl_sim.massage import Log, Massage
+    from stmpl_sim.massage import Log, Massage, Phase
 
 FILM_RATE = 20.0  # frames a second
 LEAST_MM = 0.5  # least radius and speed of the verb [mm, mm/s]: what is told in metres is smaller
+LARGEST_OFF_N = 0.2  # difference of the mean force of a phase from what was asked for that is told
+LARGEST_OFF_M = 1e-3  # distance off the course that is told
 SINGLE_MODULUS = 20e3  # Young's modulus of the limb of one material [Pa]
 ros_arguments: list[str] = []  # arguments of ROS, from --ros-args on; this verb has no use for them
 
@@ -167,10 +173,7 @@ def figures_of(log: Log) -> dict[str, Any]:
     import numpy as np
 
     phases = []
-    for phase in log.phases:
-        rows = log.during(phase)
-        if phase.name not in ("press", "circle"):
-            continue
+    for phase, rows in held(log):
         force, depth, met = log.force[rows], log.depth[rows], np.isfinite(log.depth[rows])
         phases.append({
             "name": phase.name, "asked_N": phase.force, "mean_N": float(force.mean()),
@@ -193,24 +196,48 @@ def figures_of(log: Log) -> dict[str, Any]:
         "real_time_factor_of_processor_time": log.own_core_factor,
         "touch_s": float(np.median(log.touch_s)),
         "step_s": float(np.median(log.step_s)),
+        "notes": [*force_missed(log), *course_left(log), *log.notes],
     }
+
+
+def held(log: Log) -> Iterator[tuple[Phase, np.ndarray]]:
+    """Phases in which a force is held, and the log's rows that are judged of each."""
+    for phase in log.phases:
+        if phase.name in ("press", "circle"):
+            yield phase, log.during(phase)
+
+
+def force_missed(log: Log) -> Iterator[str]:
+    """Which forces were not kept in the mean, one sentence each."""
+    for phase, rows in held(log):
+        mean = float(log.force[rows].mean())
+        if abs(mean - phase.force) > LARGEST_OFF_N:
+            yield f"the robot kept {mean:.2f} N of {phase.force:g} N during '{phase.name}'"
+
+
+def course_left(log: Log) -> Iterator[str]:
+    """When the tool left its course while a force was held, one sentence each."""
+    for phase, rows in held(log):
+        off = float(log.off[rows].max())
+        if off > LARGEST_OFF_M:
+            yield f"the tool was up to {1e3 * off:.1f} mm off its course during '{phase.name}' with {phase.force:g} N"
 
 
 def gripped(log: Log) -> dict[str, float] | None:
     """What a gripper kept while it lifted the limb, SI units; None without one."""
     import numpy as np
 
-    held = {p.name: p for p in log.phases if p.name in ("lift", "hold", "lower")}
-    if not held or not log.squeeze.size:
+    lifting = {p.name: p for p in log.phases if p.name in ("lift", "hold", "lower")}
+    if not lifting or not log.squeeze.size:
         return None
-    start, end = held["lift"].start, held["lower"].start
+    start, end = lifting["lift"].start, lifting["lower"].start
     rows = (log.time >= start) & (log.time < end)
-    still = (log.time >= held["hold"].start) & (log.time < end)
+    still = (log.time >= lifting["hold"].start) & (log.time < end)
     closing = np.abs(log.fingers[:, :, 0])  # the drives close along x
     middle = log.finger[:, :, :3, 3].mean(axis=1)  # between the fingers, in the limb's axes
     grips = np.einsum("nij,nj->ni", log.limb[:, :3, :3], middle[rows][0][None]) + log.limb[:, :3, 3]
     return {
-        "asked_N": held["hold"].force,
+        "asked_N": lifting["hold"].force,
         "mean_N": float(closing[rows].mean()),
         "deviation_N": float(closing[rows].std()),
         "carried_N": float(-log.fingers[still, :, 2].sum(axis=1).mean()),
@@ -252,6 +279,7 @@ def table(figures: dict[str, Any]) -> Any:
         lines.insert(1, f"grip: {grip['mean_N']:.2f} ± {grip['deviation_N']:.2f} N a finger ({grip['asked_N']:.1f} N "
                      f"asked), {grip['carried_N']:.1f} N carried, limb lifted {1e3 * grip['lifted_m']:.1f} mm "
                      f"there, fingers crept {1e3 * grip['crept_m']:.1f} mm")  # fmt: skip
+    lines += [f"to note: {note}" for note in figures["notes"]]
     if "film" in figures:
         lines.append(f"film: {figures['film']}, frames by {figures['frames_by']}")
     return Group(shown, *lines)

@@ -175,6 +175,87 @@ def test_a_robot_whose_joints_are_servos_keeps_its_force(forearm: SoftLayer, tmp
         assert np.abs(log.force[log.during(phase)] - 5.0).max() < 0.2
 
 
+def arm_of(axes: int, path: Path, geoms: str = 'contype="0" conaffinity="0"') -> Path:
+    """A column, upper and lower arm and wrist, turning about z, y, y, y and, of five axes, x."""
+    last = '<joint name="j5" axis="1 0 0" range="-1.5 1.5" damping=".2"/>' if axes == 5 else ""
+    path.write_text(f"""<mujoco><compiler angle="radian" autolimits="true"/><worldbody><body pos="0 0 .3">
+      <joint name="j1" axis="0 0 1" range="-2.5 2.5" damping=".5"/>
+      <geom type="cylinder" size=".05 .1" mass="3" {geoms}/><body pos="0 0 .1">
+      <joint name="j2" axis="0 1 0" range="-2 2" damping=".5"/>
+      <geom type="capsule" fromto="0 0 0 0 0 .35" size=".035" mass="2" {geoms}/><body pos="0 0 .35">
+      <joint name="j3" axis="0 1 0" range="-.2 2.7" damping=".5"/>
+      <geom name="lower" type="capsule" fromto="0 0 0 0 0 .3" size=".03" mass="1.5" {geoms}/><body pos="0 0 .3">
+      <joint name="j4" axis="0 1 0" range="-2.5 2.5" damping=".2"/>
+      <geom type="capsule" fromto="0 0 0 0 0 .08" size=".02" mass=".5" {geoms}/><body pos="0 0 .1">{last}
+      <geom name="roller" type="capsule" fromto="0 -.03 0 0 .03 0" size=".02" mass=".2" {geoms}/>
+      <site name="tcp" pos="0 0 .02"/></body></body></body></body></body></worldbody></mujoco>""")
+    return path
+
+
+@pytest.mark.parametrize("axes", [4, 5])
+def test_an_arm_of_few_axes_keeps_its_place_before_it_points(forearm: SoftLayer, tmp_path: Path, axes: int) -> None:
+    from stmpl_sim.massage import Course, Massage
+    from stmpl_sim.scene import build
+    from stmpl_sim.site import Site
+
+    site = Site.thickest(forearm)
+    scene = build(forearm, site, robot=arm_of(axes, tmp_path / "arm.xml"), end="tcp", timestep=2e-3)
+    log = Massage(scene, Course(site.circle(0.012), (5.0,), laps=0.5), skin=Simulator(forearm, Winkler())).run()
+    for phase in log.phases[2:4]:
+        rows = log.during(phase)
+        assert np.abs(log.force[rows] - 5.0).max() < 0.1 and log.off[rows].max() < 3e-4
+
+
+def test_what_takes_an_arm_off_its_course_is_said_before_and_after(forearm: SoftLayer, tmp_path: Path) -> None:
+    from dataclasses import replace
+
+    from rich.console import Console
+
+    from stmpl_sim.massage import Course, Log, Massage
+    from stmpl_sim.scene import build
+    from stmpl_sim.site import Site
+    from stmpl_sim.verbs import figures_of, table
+
+    site = Site.thickest(forearm)
+    assert build(forearm, site, gripper=True, mount="rest").notes == ()
+    path = arm_of(5, tmp_path / "arm.xml")
+    assert build(forearm, site, robot=path, end="tcp").notes == ()
+    path.write_text(arm_of(5, path, geoms="").read_text().replace('size=".02" mass=".2"', 'size=".08" mass=".2"'))
+    touching = build(forearm, site, robot=path, end="tcp").notes
+    assert len(touching) == 1 and "lower and roller" in touching[0]
+    scene = build(forearm, site, robot=arm_of(4, path), end="tcp", timestep=4e-3)
+    assert len(scene.notes) == 1 and "4 axes" in scene.notes[0]
+    log = Massage(scene, Course(site.circle(0.012), (5.0,), laps=0), skin=Simulator(forearm, Winkler())).run()
+    log = Log.load(log.save(tmp_path / "log.npz"))
+    assert figures_of(log)["notes"] == [*scene.notes]
+    notes = figures_of(replace(log, off=log.off + 2e-3, force=log.force - 1.0))["notes"]
+    assert "kept 4.00 N of 5 N during 'press'" in notes[0] and "2.0 mm off its course" in notes[1]
+    console = Console(record=True, width=300)
+    console.print(table(figures_of(log) | {"log": "", "every": 1}))
+    assert f"to note: {scene.notes[0]}" in console.export_text()
+
+
+def test_an_arm_presses_with_its_weight_and_what_its_weakest_motor_gives(forearm: SoftLayer, tmp_path: Path) -> None:
+    from stmpl_sim.ability import strength
+    from stmpl_sim.massage import Course, Massage
+    from stmpl_sim.scene import BALL, HEAD_MASS, build
+    from stmpl_sim.site import Site
+
+    inertial, site = '<inertial pos="0 0 0" mass="2" diaginertia=".1 .1 .1"/>', Site.thickest(forearm)
+    course, path = Course(site.circle(0.012), (5.0, 80.0), laps=0), tmp_path / "lift.xml"
+    for limits, most in (('actuatorfrcrange="-50 50"', 50 + 9.81 * (2 + HEAD_MASS)), ("", np.inf)):
+        path.write_text(f"""<mujoco><compiler autolimits="true"/><worldbody><body pos=".5 0 .4">{inertial}
+          <joint name="up" type="slide" axis="0 0 1" {limits}/><site name="tool" quat="0 1 0 0"/></body></worldbody>
+          </mujoco>""")
+        scene = build(forearm, site, robot=path, end="tool")
+        assert strength(scene.model, scene.joints, scene.qpos, BALL)[0] == pytest.approx(most, rel=1e-6)
+        if np.isfinite(most):
+            with pytest.raises(InvalidInput, match=r"with 80 N: .* motor of 'up' is at its limit from 72\.6 N on"):
+                Massage(scene, course, skin=Simulator(forearm, Winkler()))
+        else:
+            Massage(scene, course, skin=Simulator(forearm, Winkler()))
+
+
 def test_meshes_of_a_package_are_found_beside_the_file_or_left_out(tmp_path: Path, caplog: pytest.LogCaptureFixture
                                                                    ) -> None:  # fmt: skip
     """Links of a URDF as ROS has them: one mesh lies in its package, one nowhere, one is of a kind that is not read."""
@@ -324,7 +405,8 @@ def test_the_verb_prints_figures_and_leaves_log_and_film(tmp_path: Path, capsys:
     assert figures["grip"]["mean_N"] == pytest.approx(10.0, abs=0.5) and figures["grip"]["lifted_m"] > 5e-3
     assert Path(figures["film"]).stat().st_size > 10_000
     for wrong, why in ((["--rate", "5"], "allowed is 50 to 20000"), (["--speed", "0.05"], "Is it in metres?"),
-                       (["--force", "-1"], "above 0 N"),
+                       (["--force", "-1"], "above 0 N"), (["--circle", "0"], "a radius above 0 is needed"),
+                       (["--radius", "0"], "ball's radius is 0 m"), (["--force", "5000"], "cannot press with 5000 N"),
                        (["--robot", "nothing.urdf"], "no robot file"),
                        (["--phenotype", "weight=80"], "not from 0 to 1"),
                        (["--phenotype", "size=1"], "no phenotype; known are gender")):  # fmt: skip

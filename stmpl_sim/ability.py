@@ -1,0 +1,69 @@
+"""What an arm is able to do where it starts: its axes, links that touch each other, how hard it can press."""
+
+from __future__ import annotations
+
+import logging
+from typing import Any
+
+import numpy as np
+
+from stmpl_sim.engine import mujoco
+
+AXES = 5  # of a place and a direction to point in; to spin about it is of no use to a ball
+MOST_NAMED = 4  # pairs of links that are named
+log = logging.getLogger(__name__)
+
+
+def start_notes(model: Any, joints: tuple[int, ...], qpos: np.ndarray) -> tuple[str, ...]:
+    """What will take a tool off its course or its direction, one sentence each; each is a warning of the log, too.
+
+    Args:
+        model: MuJoCo model.
+        joints: numbers of the arm's joints.
+        qpos: start, (nq,).
+    """
+    found = []
+    if len(joints) < AXES:
+        found.append(f"the robot has {len(joints)} axes; a place and a direction need {AXES}: the tool keeps its "
+                     "place, and points as well as that leaves it")  # fmt: skip
+    data = mujoco.MjData(model)
+    data.qpos[:] = qpos
+    mujoco.mj_forward(model, data)
+    pairs = dict.fromkeys(f"{_name(model, one.geom1)} and {_name(model, one.geom2)}"
+                          for one in data.contact if one.exclude == 0)  # fmt: skip
+    if pairs:
+        named = ", ".join([*pairs][:MOST_NAMED]) + (", ..." if len(pairs) > MOST_NAMED else "")
+        found.append(f"links touch each other at the start ({named}), which pushes the tool off its course; set "
+                     "contype and conaffinity of these geoms to 0")  # fmt: skip
+    for note in found:
+        log.warning("%s.", note)
+    return tuple(found)
+
+
+def strength(model: Any, joints: tuple[int, ...], qpos: np.ndarray, tool: str) -> tuple[float, str]:
+    """Largest force that an arm presses down with [N], and the joint whose motor is at its limit then.
+
+    Args:
+        model: MuJoCo model.
+        joints: numbers of the arm's joints.
+        qpos: pose of all, at rest, (nq,).
+        tool: name of the geom that presses.
+    """
+    data, jacobian = mujoco.MjData(model), np.zeros((3, model.nv))
+    data.qpos[:] = qpos
+    mujoco.mj_forward(model, data)
+    mujoco.mj_jacGeom(model, data, jacobian, None, model.geom(tool).id)
+    most, weakest = np.inf, ""
+    for joint in joints:
+        dof = model.jnt_dofadr[joint]
+        if not model.jnt_actfrclimited[joint] or abs(arm := -jacobian[2, dof]) < 1e-6:
+            continue
+        limit = model.jnt_actfrcrange[joint][int(arm > 0)]
+        force = max(0.0, float(limit - data.qfrc_bias[dof] + data.qfrc_passive[dof]) / arm)
+        if force < most:
+            most, weakest = force, model.joint(joint).name
+    return most, weakest
+
+
+def _name(model: Any, geom: int) -> str:
+    return model.geom(geom).name or f"a geom of {model.body(model.geom_bodyid[geom]).name or 'a body without a name'}"
