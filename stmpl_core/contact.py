@@ -13,7 +13,7 @@ from stmpl_core.arrays import Transform, Wrench, finite
 from stmpl_core.errors import InvalidInput
 from stmpl_core.tool import Tool
 
-MOST = 1e100  # largest number of a pose or a wrench that is counted: its square is one, too
+MOST = 1e100  # largest number of a pose or a wrench that is counted, and the least one's inverse: squares are, too
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,7 +40,9 @@ class Contact:
         pose = rigid(f"pose of {self.name}", self.pose_body_from_tool).copy()  # a caller goes on with its own
         object.__setattr__(self, "pose_body_from_tool", pose)
         if self.wrench is not None:
-            object.__setattr__(self, "wrench", _counted(f"wrench of {self.name}", self.wrench, (6,)).copy())
+            wrench = _counted(f"wrench of {self.name}", self.wrench, (6,)).copy()
+            wrench[np.abs(wrench) < 1 / MOST] = 0.0
+            object.__setattr__(self, "wrench", wrench)
 
     @property
     def name(self) -> str:

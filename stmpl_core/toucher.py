@@ -54,6 +54,7 @@ MIN_NET_FORCE_SHARE = 0.1  # force over the sum of its parts' sizes, below which
 MAX_DRAG_RATIO = 0.3  # tangential over normal force that is not yet worth a word
 MARGIN_SHARE = 2 / 3  # width of the distance fields around tools, over the thickness
 MAX_AROUND = 0.02  # depth of skin in a tool that presses nothing, over the thickness, that is not yet worth a word
+MAX_BESIDE = 0.3  # change of a force by the tools beside, beyond which the pose of a tool with a wrench is worth little
 OPEN = 2.0  # distance of a hole in a tool's mesh over the depth, up to which what is inside the tool there is a guess
 SHELL, SHELL_FROM = 2.5, 0.02  # bound on a force per share of work above this by which a limb is stiff as a shell
 STUCK = 0.5  # error of what skin that sticks carries along itself, over that
@@ -375,6 +376,9 @@ class Toucher:
             doubt = math.hypot(doubt, known["uneven"] * self.net.unlike(nodes, forces))
         bound = known["scale"] * doubt ** known["power"] if size > 0 else 0.0
         bound += SHELL * max(held.shell - SHELL_FROM, 0.0)
+        beside_off = abs(1 / scale - 1) if len(v) and one.force is not None else 0.0  # each was placed as if alone
+        if beside_off > 2 * FORCE_TOLERANCE:
+            bound += beside_off
         bound += STUCK * along + held.power * below / max(depth, below, 1e-300)  # the skin is no facets
         beside, radius = among or pins(nodes.points, nodes.area, nodes.thickness, forces)
         wider = WIDER if beside > GROUP and depth > DEEP * radius else 1.0
@@ -389,6 +393,9 @@ class Toucher:
                             stuck, along) if len(v) else None,
         )  # fmt: skip
         trust = self._trust(one, touch, v, pressure, strange, alone)
+        if beside_off > MAX_BESIDE:
+            trust = trust.also(f"{touch.name} was moved to where it presses so alone; beside the other tools that is "
+                               f"{beside_off:.0%} off", in_range=False)  # fmt: skip
         if wider > 1 and len(v):
             trust = trust.also(f"{touch.name} presses with pins of {1e3 * radius:.2g} mm radius, "
                                f"{1e3 * depth:.2g} mm deep, that feel each other; contacts were learnt of one area",

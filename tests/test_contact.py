@@ -493,12 +493,28 @@ def test_bad_input_is_refused_with_a_reason(sim: Simulator) -> None:
         press(BALL, on_limb(), (-1e155, 0, 0))
     with pytest.raises(InvalidInput, match="pose of probe holds a number beyond"):
         press(BALL, at(1e155, 0, 0), None)
+    assert touch_of(sim.step([press(BALL, on_limb(), (-1e-300, 0, 0))])).status == NO_FORCE
     held = touch_of(sim.step([press(BALL, on_limb(), (-1e99, 0, 0))]))
     assert not held.trust.in_range and "carries" in held.trust.why
     with pytest.raises(InvalidInput, match="names of their own"):
         sim.step([press(BALL, on_limb(), None), press(BALL, on_limb(), None)])
     with pytest.raises(MeshError, match="millimetres"):
         sim.step([press(ball(12.0), on_limb(), (-1, 0, 0))])
+
+
+@pytest.mark.parametrize("apart, sound", [(0.0, False), (0.022, True), (0.06, True)])
+def test_where_tools_with_wrenches_feel_each_other_the_bound_says_so(apart: float, sound: bool) -> None:
+    """Each is moved to where it presses alone: beside the other that pose presses with something else."""
+    toucher, tool = Toucher(LIMB), ball(0.012)
+    poses = [at(RADIUS + 0.012 - 2e-3, 0, MIDDLE + z) for z in (-0.5 * apart, 0.5 * apart)]
+    asked = [Contact(tool.named(name), pose, np.array([-0.1, 0, 0, 0, 0, 0]))
+             for name, pose in zip("ab", poses, strict=True)]  # fmt: skip
+    touches = toucher.touch_all(asked)
+    again = toucher.touch_all([Contact(one.tool, touch.pose_body_from_tool)
+                               for one, touch in zip(asked, touches, strict=True)])  # fmt: skip
+    for touch, posed in zip(touches, again, strict=True):
+        assert touch.force == pytest.approx(0.1, rel=0.02) and touch.trust.in_range == sound
+        assert abs(posed.force - touch.force) < touch.force_bound
 
 
 def test_a_tool_is_measured_once(sim: Simulator) -> None:
