@@ -44,7 +44,7 @@ class Conformed(NamedTuple):
 
 
 class _Tool(NamedTuple):
-    grid: tuple[np.ndarray, np.ndarray, float]
+    grid: tuple[np.ndarray, np.ndarray, float, float]
     pose: np.ndarray
     vertices: np.ndarray
     gone: Points  # way of the vertices with the tool if they lie on it, (N, 3) [m]
