@@ -67,9 +67,14 @@ class _Edges:
         return int((self.count % 2).sum())
 
     @property
+    def uneven(self) -> np.ndarray:
+        """Mask of the edges that are not used as often one way as the other, (E,)."""
+        return np.add.reduceat(np.where(self.up[self.half], 1, -1), self.start) != 0
+
+    @property
     def closed(self) -> bool:
         """Whether each edge is used as often one way as the other."""
-        return not np.add.reduceat(np.where(self.up[self.half], 1, -1), self.start).any()
+        return not self.uneven.any()
 
 
 def places(vertices: Points) -> np.ndarray:
@@ -85,8 +90,7 @@ def closed(vertices: Points, faces: Faces) -> bool:
 def openings(vertices: Points, faces: Faces) -> Points:
     """Middles of the edges at which the surface ends, or where more faces meet one way than the other, (K, 3) [m]."""
     edges = _Edges.of(places(vertices)[faces])
-    uneven = np.add.reduceat(np.where(edges.up[edges.half], 1, -1), edges.start) != 0
-    half = edges.half[edges.start[uneven]]
+    half = edges.half[edges.start[edges.uneven]]
     face, corner = half // 3, half % 3
     return 0.5 * (vertices[faces[face, corner]] + vertices[faces[face, (corner + 1) % 3]])
 

@@ -155,8 +155,9 @@ def _press(simulator: Simulator, tool: Tool) -> None:
     push, deep = np.concatenate([-0.01 * layer.normals[vertex], np.zeros(3)]), -float(layer.thickness[vertex])
     for away, wrench in ((0.009, push), (0.012, push), (0.009, None), (deep, None), (0.05, push)):
         pose[:3, 3] = layer.vertices[vertex] + away * layer.normals[vertex]
-        local_contacts(simulator.history, simulator.touch([Contact(tool, pose, wrench)]))
-        simulator.step([Contact(tool, pose, wrench)])
+        touches = simulator.touch([Contact(tool, pose, wrench)])
+        local_contacts(simulator.history, touches)
+        simulator.answer(touches)
         for way in (0.0, 1e-3) if simulator.remembers else ():
             pose[:3, 3] += way * np.roll(layer.normals[vertex], 1)
             touches, state = simulator.touch([Contact(tool, pose.copy(), wrench)], state, 0.01)

@@ -11,7 +11,7 @@ from stmpl_core.gpu.field_packs import FieldScratch, SkinFields
 from stmpl_core.gpu.motion import FAR, PER_LOG, STEPS, TOP, _at
 from stmpl_core.gpu.packs import Scratch, Skins
 from stmpl_core.gpu.places import BY_POSE, REFUSED
-from stmpl_core.gpu.rays import OPTIONS, WALL_WIDTH, Grid, along, cubic, depth_and_share, depth_in_column, real, vec3
+from stmpl_core.gpu.rays import OPTIONS, Grid, along, cubic, depth_and_share, depth_in_column, real, vec3, wall_in
 
 LYING = wp.constant(wp.float64(conform.MIN_LYING_PRESSURE))
 FIRM, FACING = wp.constant(wp.float64(conform.FIRM_DEPTH)), wp.constant(wp.float64(conform.MIN_FACING_COSINE))
@@ -125,8 +125,7 @@ def lie(pick: wp.array(dtype=wp.int32), lanes: wp.int32, many: wp.int32, skins: 
         v, lies, gone = field.under[f, n], real(0.0), vec3()
         if _met(scratch, c, v - first) and highest > real(0.0):
             inward, thick = skins.inward[v], skins.thickness[v]
-            start, down = pose * (skins.points[v] - scratch.place[c]), pose * inward
-            wall = wp.min(WALL_WIDTH * thick, grid.half)
+            start, down, wall = pose * (skins.points[v] - scratch.place[c]), pose * inward, wall_in(grid, thick)
             deep, share = depth_and_share(grid, skins.coefficients, start, down, thick, scratch.top[c])
             depth, rests = share * deep, real(0.0)
             if depth > real(0.0):

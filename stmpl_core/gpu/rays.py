@@ -21,7 +21,7 @@ wp.set_module_options(OPTIONS)
 
 @wp.struct
 class Grid:
-    """Distance field of a tool: its place among all coefficients, shape, origin, cells, the tool's box, [m] all."""
+    """Distance field of a tool: place among all coefficients, shape, origin, cells, box and half thickness, [m] all."""
 
     offset: wp.int32
     shape: wp.vec3i
@@ -31,6 +31,12 @@ class Grid:
     high: vec3
     surface_error: real
     half: real
+
+
+@wp.func
+def wall_in(grid: Grid, t: real) -> real:
+    """Width over which depth rises beside a wall of the tool, in a column t long [m]."""
+    return wp.min(WALL_WIDTH * t, grid.half)
 
 
 @wp.func
@@ -197,7 +203,7 @@ def sunk_under(grid: Grid, coefficients: wp.array(dtype=real), start: vec3, way:
 @wp.func
 def depth_and_share(grid: Grid, coefficients: wp.array(dtype=real), start: vec3, way: vec3, t: real, top: vec3):
     """How deep the tool is in a column [m], and the share of that which counts."""
-    wall, guess = wp.min(WALL_WIDTH * t, grid.half), -along(grid, coefficients, start, way, real(0.0))
+    wall, guess = wall_in(grid, t), -along(grid, coefficients, start, way, real(0.0))
     share, deep = wp.clamp(real(1.0) + guess / wall, real(0.0), real(1.0)), real(0.0)
     sunk = wp.length_sq(top) > real(0.0)
     if share > real(0.0) or sunk:
@@ -215,7 +221,7 @@ def depth_and_share(grid: Grid, coefficients: wp.array(dtype=real), start: vec3,
 def strain_under(grid: Grid, coefficients: wp.array(dtype=real), start: vec3, way: vec3, t: real,
                  top: vec3) -> real:  # fmt: skip
     """How far the tool squeezes a column, over its thickness; rising from 0 beside the tool's walls."""
-    wall = wp.min(WALL_WIDTH * t, grid.half)
+    wall = wall_in(grid, t)
     deep, share = depth_and_share(grid, coefficients, start, way, t, top)
     if deep <= real(0.0):
         return real(0.0)
