@@ -298,7 +298,7 @@ def _reached(sinking, strain, sinking_rates, strain_rates, linear_to):
     return out
 
 
-@numba.njit(cache=True, error_model="numpy")
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _slopes(points, inward, thickness, area, strain, corners, shares, bent, matrix, rings, force, moduli, nu,
             strain_rates, sinking_rates, low, high, mean, scale, w1, b1, w2, b2, w3, b3, w4, b4):  # fmt: skip
     """See ContactNet.slopes."""
@@ -314,7 +314,7 @@ def _slopes(points, inward, thickness, area, strain, corners, shares, bent, matr
     return _differences(held, steps)
 
 
-@numba.njit(cache=True, error_model="numpy")
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _slopes_on_stack(points, inward, thickness, area, strain, corners, shares, sinking, bent, matrix, rings, force,
                      given_way, nu, t, numbers, log_thickness, hardening, alike, strain_rates, sinking_rates, low, high,
                      mean, scale, w1, b1, w2, b2, w3, b3, w4, b4):  # fmt: skip

@@ -151,7 +151,7 @@ def _rates(layer: SoftLayer, field: SignedDistance, pose: np.ndarray, nodes: Nod
     return _Rates(strain, sinking, shares)
 
 
-@numba.njit(cache=True, error_model="numpy")
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _columns(grid, pose, points, inward, thickness, area, strain):
     """Depths in nodes' columns at which the tool is looked at, (3, N) [m]: where it ends, the skin, inside its wall."""
     out = np.zeros((3, len(area)))
@@ -163,7 +163,7 @@ def _columns(grid, pose, points, inward, thickness, area, strain):
     return out
 
 
-@numba.njit(cache=True, error_model="numpy")
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _carried(vertices, normals, thicknesses, points, inward, thickness, corners, shares, mean, origin, centre):
     """How nodes go with each of six twists: along the skin, as their lattice goes with the tool's middle and its spin.
 
@@ -218,7 +218,7 @@ def _carried(vertices, normals, thicknesses, points, inward, thickness, corners,
     return moved, go, turned, thicker
 
 
-@numba.njit(cache=True, error_model="numpy")
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _deepened(points, inward, thickness, area, strain, columns, distance, gradient, go, turned, thicker, origin,
               half):  # fmt: skip
     """Rates of strains and depths at nodes, (6, N) each.
@@ -254,7 +254,7 @@ def _deepened(points, inward, thickness, area, strain, columns, distance, gradie
     return strains, depths
 
 
-@numba.njit(cache=True, error_model="numpy")
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _sunk(points, inward, depth, sinking, way, swung, gradient, go, turned, deeper, origin):
     """Rates of `Nodes.sinking`, (6, N): of depths along one way (3,) for all, which swings, (6, 3)."""
     out = deeper.copy()

@@ -35,7 +35,6 @@ from bags.wire import pose_message, stamp_ns, tool_message
 from stmpl_core import Tool
 from stmpl_core.errors import InvalidInput
 from stmpl_core.friction import PAIRS
-from stmpl_ros.answering import HELD_UP
 from stmpl_ros.hearing import Hearing
 from stmpl_ros.inbox import Instant
 from stmpl_ros.node import SkinNode
@@ -153,9 +152,7 @@ def test_whatever_fails_inside_an_answer_is_told_and_the_next_instant_is_answere
 def test_answers_that_take_long_to_send_are_told(composed, monkeypatch, capfd):
     composed.wait(lambda: composed.press() and composed.heard)
     monkeypatch.setattr("stmpl_ros.answering.HELD_UP_S", -1.0)
-    count = len(composed.heard)
-    composed.wait(lambda: composed.press() and len(composed.heard) > count + HELD_UP)
-    assert "FASTDDS_BUILTIN_TRANSPORTS=UDPv4" in capfd.readouterr().err
+    composed.wait(lambda: composed.press() and "FASTDDS_BUILTIN_TRANSPORTS=UDPv4" in capfd.readouterr().err)
 
 
 def refuse(*_: object) -> None:
