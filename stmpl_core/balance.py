@@ -34,6 +34,7 @@ class Asked(NamedTuple):
         kept: what has relaxed, less what follows from this step's force (see relaxation.weights), (P,) [N].
         gain: what follows, over that force, (P,) [-].
         owed, now: numbers a [N] and b [-] such that after the step a force at rest of S_e is b S_e - a.
+        passed: where the contact is in the room that it has slid over (footing.beyond), (3,) [m].
         moved: way along its force at which the tool pressed before, where the law is asked for creeping skin [m].
     """
 
@@ -47,6 +48,7 @@ class Asked(NamedTuple):
     gain: np.ndarray
     owed: float
     now: float
+    passed: np.ndarray
     moved: float | None
 
 

@@ -7,6 +7,7 @@ import numpy as np
 
 from stmpl_core.relaxation import weights
 
+ROLLED, PASSED = 0.5, 0.25  # radius of the room that a contact has rolled over, and of that it has slid over, over a
 EDGE_SHARE = 0.3  # pressure over its mean from which skin counts as touched in full
 
 
@@ -77,24 +78,59 @@ def twist_between(start, end):
 
 
 @numba.njit(cache=True, error_model="numpy")
-def way_of_tool(twist, known, before, held, contact, origin, depth, radius, lever):
-    """Way of a tool along the skin and lever times its turn (3,) [m], and how far its contact rolled on, over a.
+def swung(turn, arm, sign):
+    """How far the end of an arm (3,) goes under a turn (3,), exactly; sign 1: an arm as before it, -1: as after it."""
+    size = np.sqrt(_dot(turn, turn))
+    one = _cross(turn, arm)
+    if size < 1e-9:
+        return one
+    return np.sin(size) / size * one + sign * (1 - np.cos(size)) / (size * size) * _cross(turn, one)
 
-    A tool that meets the skin within a step goes along it from there on.
+
+@numba.njit(cache=True, error_model="numpy")
+def beyond(at, first, second, most):
+    """Where a contact is in the room that it has been over, after a way in it; and how far it went beyond.
+
+    What goes to and fro over the same skin meets nothing new. A room that is left grows, up to `most`, and then goes
+    along: a way straight on is all beyond.
+
+    Args:
+        at: place from the room's middle, along two tangents, and the room's radius, (3,) [m].
+        first, second: way along these [m].
+        most: largest radius of a room [m].
     """
-    way, rolled = np.zeros(3), 0.0
+    room, x, y = min(at[2], most), at[0] + first, at[1] + second
+    far = np.sqrt(x * x + y * y)
+    over = max(far - room, 0.0)
+    if over > 0:
+        room = min(room + 0.5 * over, most)
+        x, y = room / far * x, room / far * y
+    return np.array([x, y, room]), over
+
+
+@numba.njit(cache=True, error_model="numpy")
+def way_of_tool(twist, known, before, held, contact, origin, depth, radius, lever, at):
+    """Way of a tool along the skin and lever times its turn (3,) [m]; how far its contact rolled on, over a; and where
+    that is in the room that it has rolled over, see `beyond`.
+
+    A tool that meets the skin within a step goes along it from there on. Of a contact of radius a that has rolled by D,
+    in all, a lens of the skin has been under the tool ever since, as large as a circle of a - D / pi; far on all that
+    was dragged is left behind.
+    """
+    way, rolled, room = np.zeros(3), 0.0, np.zeros(3)
     if not known:
-        return way, rolled
+        return way, rolled, room
     middle, normal, first = contact
     second = _cross(normal, first)
-    go = twist[:3] + _cross(twist[3:], middle - origin)
+    go = twist[:3] + swung(twist[3:], middle - origin, -1.0)
     if not held:
         go *= min(1.0, depth / max(abs(_dot(go, normal)), 1e-12))
     way[0], way[1], way[2] = _dot(go, first), _dot(go, second), lever * _dot(twist[3:], normal)
     if held:
         on = middle - before[0] - go
-        rolled = np.sqrt(_dot(on, first) ** 2 + _dot(on, second) ** 2) / radius
-    return way, rolled
+        room, over = beyond(at, _dot(on, first), _dot(on, second), ROLLED * radius)
+        rolled = (1 / np.pi + (1 - 1 / np.pi) * room[2] / (ROLLED * radius)) * over / radius
+    return way, rolled, room
 
 
 @numba.njit(cache=True, error_model="numpy")
@@ -216,18 +252,16 @@ def in_space(forces, springs, stiffness, leaned, contact, origin, lever):
 
 @numba.njit(cache=True, error_model="numpy")
 def way_along(twist, contact, pose):
-    """Way along the skin of the place of a tool that was in the middle of its contact [m]; contact: see Memory."""
-    w, d, go = twist[3:], contact[0] - pose[:3, 3], twist[:3].copy()
-    go[0] += w[1] * d[2] - w[2] * d[1]
-    go[1] += w[2] * d[0] - w[0] * d[2]
-    go[2] += w[0] * d[1] - w[1] * d[0]
-    deep = _dot(go, contact[1])
-    return np.sqrt(max(_dot(go, go) - deep * deep, 0.0))
+    """Way along the skin, by its two tangents [m], of the place of a tool that was in the middle of its contact;
+    contact: see Memory.
+    """
+    go = twist[:3] + swung(twist[3:], contact[0] - pose[:3, 3], 1.0)
+    return _dot(go, contact[2]), _dot(go, _cross(contact[1], contact[2]))
 
 
 @numba.njit(cache=True, error_model="numpy")
-def aged(before, pose, imprint, contact, known, held, share, goes, radius, shares, times, dt, elastic, relaxed):
-    """Twist, gone, kept, gain, owed and now of an Asked (stmpl_core.balance).
+def aged(before, pose, imprint, contact, known, held, share, goes, radius, at, shares, times, dt, elastic, relaxed):
+    """Twist, gone, kept, gain, owed, now and passed of an Asked (stmpl_core.balance).
 
     Args:
         before, pose: poses of the tool before the step and after it, (4, 4).
@@ -236,17 +270,21 @@ def aged(before, pose, imprint, contact, known, held, share, goes, radius, share
         held: whether it pressed.
         share, radius, elastic: see Scalars.
         goes: way that skin goes along with the tool until all of it slides [m].
+        at: where the contact is in the room that it has slid over, see `beyond`, (3,) [m].
         shares, times: series of the relaxation, (P,) each.
         dt: time of the step [s].
     """
     kept, gain, gone, owed, now = np.empty(len(times)), np.empty(len(times)), 0.0, 0.0, 1.0
-    twist = twist_between(before, pose) if known else np.zeros(6)
-    if radius > 0:
-        start = before if held else imprint
-        over = way_along(twist if held else twist_between(start, pose), contact, start)
-        gone = (max(share * over, over - goes) if held else over) / radius
+    twist, passed = twist_between(before, pose) if known else np.zeros(6), np.zeros(3)
+    if radius > 0 and held:
+        first, second = way_along(twist, contact, before)
+        passed, over = beyond(at, first, second, PASSED * radius)
+        gone = max(share * over, over - goes) / radius
+    elif radius > 0:
+        first, second = way_along(twist_between(imprint, pose), contact, imprint)
+        gone = np.sqrt(first * first + second * second) / radius
     weights(times, dt, gone, elastic, relaxed, kept, gain)
     for i in range(len(times)):
         owed += shares[i] * kept[i]
         now -= shares[i] * gain[i]
-    return twist, gone, kept, gain, owed, now
+    return twist, gone, kept, gain, owed, now, passed

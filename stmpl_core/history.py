@@ -37,7 +37,7 @@ from stmpl_core.footing import (
     wrench_at,
 )
 from stmpl_core.friction import Friction, coefficients
-from stmpl_core.relaxation import depth_left, left_over, let_go, series_of, stretch
+from stmpl_core.relaxation import depth_left, left_over, let_go, series_of, share_of_tension, stretch
 from stmpl_core.sideways import Sideways
 from stmpl_core.slip import drag, ploughing
 from stmpl_core.state import Memory, Scalars, State, fresh
@@ -45,6 +45,7 @@ from stmpl_core.touch import APART, MIN_ONE_WAY_SHARE, Imprint, Pressed, Slip, T
 from stmpl_core.toucher import Toucher
 
 ROUGH = 0.12  # error of the relaxed force, over what has relaxed: 5.4 of 45 % in trials where only the shear relaxes
+TAUT = 3.0  # times the strain: share of the tension's part of a small press that deep ones have lost, at most 1
 RUBBED = 0.1  # of the force: what skin that gives way beneath a dry tool is off, as the law was learnt from what sticks
 PILED = 0.5  # of drag^2 / force: error of skin that piles up; 0.7 of it on a back, where the elastic bound was 0.45
 MOST_LEAN = 0.5  # turn of the normal under skin that is dragged along, of which a push takes note [rad]
@@ -64,7 +65,8 @@ class _Dragged(NamedTuple):
         limit: tangential force at which all of it slides [N].
         stiffness: of the patch, (3,) [N/m]; see Memory, as springs and relaxed.
         stored: energy that the bent skin stores [J].
-        slid: see Scalars.
+        slid, held: see Scalars.
+        rolled: where the contact is in the room that it has rolled over (footing.beyond), (3,) [m].
     """
 
     slip: Slip
@@ -74,6 +76,8 @@ class _Dragged(NamedTuple):
     relaxed: np.ndarray
     stored: float
     slid: float
+    held: float
+    rolled: np.ndarray
 
 
 class History:
@@ -93,7 +97,10 @@ class History:
     def __init__(self, toucher: Toucher, friction: Friction | Mapping[str, Friction] = None) -> None:
         self.toucher, layer = toucher, toucher.layer
         self._friction = coefficients(friction)
-        self.series = series_of(layer.tissue, float(np.median(layer.thickness)))
+        thickness = float(np.median(layer.thickness))
+        self.series = series_of(layer.tissue, thickness)
+        pulled = min(share_of_tension(layer.tissue, thickness), 0.5) if len(self.series.times) else 0.0
+        self._taut = pulled / (1 - pulled)  # what more would relax if the tension held nothing, over what does
 
     @cached_property
     def sideways(self) -> Sideways:
@@ -149,8 +156,11 @@ class History:
         if memory is None or not len(memory.relaxed):
             return touch
         scalars, relaxed = memory.scalars, max(float(self.series.shares @ memory.relaxed), 0.0)
-        strayed = relaxed if not touch.trust.in_range else self._strayed(one.before, memory, dt, one.gone)
-        memories[touch.name] = memory._replace(scalars=scalars._replace(strayed=strayed))
+        strayed, doubted = self._strayed(one.before, memory, dt, one.gone), not touch.trust.in_range
+        if doubted or one.before.scalars.doubted:  # what this step may have added rests on one of its ends
+            most = max(scalars.elastic, one.before.scalars.elastic)
+            strayed = min(strayed + most * float(self.series.shares @ -np.expm1(-dt / self.series.times)), relaxed)
+        memories[touch.name] = memory._replace(scalars=scalars._replace(strayed=strayed, doubted=float(doubted)))
         if touch.trust.in_range and strayed > STRAYED * scalars.elastic > 0:
             return replace(touch, trust=touch.trust.also(
                 f"{touch.name} meets skin that still relaxes from a touch out of range", in_range=False))  # fmt: skip
@@ -165,9 +175,10 @@ class History:
         known = before is not None and memory.scalars.pressing >= 0
         scalars = memory.scalars
         goes = scalars.limit / memory.stiffness[0] if memory.stiffness[0] > 0 else 0.0
-        twist, gone, kept, gain, owed, now = aged(
+        at = np.array((scalars.passed_first, scalars.passed_second, scalars.passed))
+        twist, gone, kept, gain, owed, now, passed = aged(
             memory.pose, pose, memory.imprint, memory.contact, known, scalars.pressing > 0, scalars.share, goes,
-            scalars.radius, *self.series, dt, scalars.elastic, memory.relaxed)  # fmt: skip
+            scalars.radius, at, *self.series, dt, scalars.elastic, memory.relaxed)  # fmt: skip
         asked, moved = contact, None
         if contact.wrench is not None and (len(kept) or memory.slid < 1):
             force = contact.wrench[:3]
@@ -178,7 +189,7 @@ class History:
                 asked = contact.scaled((wanted + scalars.stretch * owed) / (wanted * now * memory.slid))
                 if scalars.pressing > 0:
                     moved = float((memory.imprint[:3, 3] - memory.pose[:3, 3]) @ force) / size
-        return Asked(asked, contact, memory, known, twist, gone, kept, gain, owed, now, moved)
+        return Asked(asked, contact, memory, known, twist, gone, kept, gain, owed, now, passed, moved)
 
     def _whole(self, touch: Touch) -> float:
         """Sum of the sizes of the forces that a touch presses with [N]."""
@@ -232,10 +243,12 @@ class History:
         if not force > 0:
             return self._free(one, touch, at_rest, dt)
         pose = touch.pose_body_from_tool
+        middle = middle + 2 * whole / float(pressed.forces.sum()) * normal
         contact = np.array((middle, normal, carried_tangent(one.before.contact, normal, before.pressing > 0)))
         relaxed = one.kept + one.gain * at_rest
         faded = float(shares @ relaxed)
-        by, doubt, trail, left = force / elastic, ROUGH * long * faded, one.before.trail, None
+        rough = ROUGH * long + self._taut * min(TAUT * (1 - long), 1.0)
+        by, doubt, trail, left = force / elastic, rough * faded, one.before.trail, None
         if len(trail):
             passing = wake.Pass(pose, middle, normal, relaxed, at_rest, touch.depth, pressed.power, 1 - long, radius)
             trail = wake.after(trail, self.series, dt, passing)
@@ -244,7 +257,8 @@ class History:
         stored = whole * left_over(faded / at_rest, pressed.power, 1 - long)
         wrench = by * touch.wrench
         scalars = Scalars(1.0, at_rest, max(at_rest, before.largest), net, radius, touch.depth, at_rest, pressed.power,
-                          work=before.work, stretch=long, surface=one.stated.tool.number)  # fmt: skip
+                          work=before.work, stretch=long, surface=one.stated.tool.number,
+                          passed_first=one.passed[0], passed_second=one.passed[1], passed=one.passed[2])  # fmt: skip
         springs = NOTHING, one.before.springs, one.before.springs_relaxed
         if self.friction(touch.name) > 0 and net > MIN_ONE_WAY_SHARE:
             give, bend = self.toucher.give(nodes, pressed.forces), self.toucher.curvature(nodes, pressed.forces)
@@ -261,7 +275,10 @@ class History:
             wrench = wrench + dragged.slip.wrench
             changed |= {"wrench": wrench, "slip": dragged.slip}
             stored, whole = stored + dragged.stored, whole + 2 * dragged.stored
-            scalars = scalars._replace(share=dragged.slip.share, limit=dragged.limit, slid=dragged.slid)
+            first, second, rolled = dragged.rolled
+            scalars = scalars._replace(share=dragged.slip.share, limit=dragged.limit, slid=dragged.slid,
+                                       held=dragged.held, rolled_first=first, rolled_second=second,
+                                       rolled=rolled)  # fmt: skip
             springs = dragged.stiffness, dragged.springs, dragged.relaxed
         else:
             changed = scaled(touch, by, doubt)
@@ -336,8 +353,12 @@ class History:
         stated, wanted, turned, out, held, slid = one.stated.wrench, NOTHING, NOTHING, 0.0, 1.0, before.slid
         if before.stiffness[0] > 0:
             turned, out = faced(before.springs, before.stiffness, contact, bend, MOST_LEAN)
-        way, rolled = way_of_tool(one.twist, one.known, before.contact, before.scalars.pressing > 0, contact, origin,
-                                  depth, radius, lever)  # fmt: skip
+        had = before.scalars
+        way, rolled, room = way_of_tool(
+            one.twist, one.known, before.contact, had.pressing > 0, contact, origin, depth, radius, lever,
+            np.array((had.rolled_first, had.rolled_second, had.rolled)))  # fmt: skip
+        last_held = had.held or before.stiffness[0]
+        held_at = before.stiffness * (last_held / before.stiffness[0]) if last_held > 0 else before.stiffness
         size, lost = math.sqrt(wrench[:3] @ wrench[:3]), (1 - before.slid) * before.scalars.elastic / scalars.elastic
         for _ in range(MOST_PASSES):
             if stated is None:
@@ -356,7 +377,7 @@ class History:
                 cap -= min(by_turn * grown * force, cap - mu * grown * force)
             stiffness = np.array((along, along, stiffer * patch.turn / (lever * lever)))
             springs, relaxed, carried, share, stored = drag(
-                before.springs, before.springs_relaxed, *self.series, dt, rolled, stiffness, before.stiffness, cap, way,
+                before.springs, before.springs_relaxed, *self.series, dt, rolled, stiffness, held_at, cap, way,
                 wanted, stated is not None)  # fmt: skip
             last, (turned, out) = turned, faced(springs, stiffness, contact, bend, MOST_LEAN)
             took = along_itself * min(math.sqrt(carried @ carried) / cap, 1.0)
@@ -367,7 +388,11 @@ class History:
         rubs, offset, turn = in_space(carried, springs, stiffness, leaned(contact, turned), contact, origin, lever)
         stored += max(0.5 * (1 + grown * slid) * size * out, 0.0)
         slip = Slip(rubs, share, offset, turn, contact[0], grown * slid * size * turned, grown)
-        return _Dragged(slip, cap, stiffness, springs, relaxed, stored, slid)
+        old, new = last_held and min(along, last_held), math.sqrt(float((springs.sum(axis=0) ** 2).sum()))
+        kept = old and old / last_held * math.exp(-rolled) * math.sqrt(float((before.springs.sum(axis=0) ** 2).sum()))
+        share_old = min(kept / new, 1.0) if new > 0 else 0.0  # what is new is held at what the patch is now
+        return _Dragged(slip, cap, stiffness, springs, relaxed, stored, slid, share_old * old + (1 - share_old) * along,
+                        share_old * room)  # fmt: skip
 
     def _said(self, one: Asked, touch: Touch, changed: dict[str, Any]) -> Touch:
         """The touch with what changed, with what of the stated wrench is missing, and what that says of it."""

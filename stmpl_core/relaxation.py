@@ -71,6 +71,15 @@ def series_of(tissue: Tissue, thickness: float) -> Series:
     return Series(np.array([found[tau] for tau in times]), np.array(times))
 
 
+def share_of_tension(tissue: Tissue, thickness: float) -> float:
+    """Share of the force of a small press on a flat stack that the skin's tension holds, which does not relax [-].
+
+    Args:
+        tissue, thickness: see series_of.
+    """
+    return max(1 - sum(_shares(tissue, thickness)), 0.0)
+
+
 def _shares(tissue: Tissue, thickness: float) -> list[float]:
     """d ln F / d ln E of each material of a stack, from the skin inwards, and last of the skin if there is one."""
     stack = plies(tissue, thickness)

@@ -117,8 +117,8 @@ def drag(springs, relaxed, shares, times, dt, rolled, stiffness, before, cap, wa
 def _step(springs, relaxed, shares, times, dt, rolled, stiffness, before, cap, way, wanted, by_force):
     """One part of a step of the springs; see Drag.
 
-    Where the patch grew stiffer the springs keep their forces, where it grew softer these fall in proportion, and where
-    the cap fell they are cut to it: none of that gives energy.
+    Where the patch grew stiffer the springs keep their forces, where it grew softer than it ever was under them these
+    fall in proportion, and where the cap fell they are cut to it: none of that gives energy.
 
     Args:
         springs, relaxed: see Drag, before the step.
@@ -126,7 +126,7 @@ def _step(springs, relaxed, shares, times, dt, rolled, stiffness, before, cap, w
         dt: time of the step [s].
         rolled: way that the contact rolled on, over its radius [-]: rolling leaves strained skin behind.
         stiffness: of the patch to (way, way, rho times turn), (3,) [N/m].
-        before: the same one step before, (3,).
+        before: that at which the springs' forces are held, (3,).
         cap: force at which all slides [N].
         way: way of the tool along the skin and rho times its turn, (3,) [m]; not read by force.
         wanted: forces to carry, (3,) [N]; read by force: the nearest that the cap allows is carried.
@@ -221,5 +221,10 @@ def _find(wanted, stiffness, cap, start, left, over, springs, force, slides, go)
         for x in range(3):
             tangent[x, x] += 1e-9 * stiffness[x]
         _solve(tangent, wanted - force, step)
+        far = 0.0
+        for x in range(3):
+            far += (stiffness[x] * step[x]) ** 2
+        if far > (2 * cap) ** 2:  # where all slide the tangent says nothing along the force
+            step *= 2 * cap / np.sqrt(far)
         for x in range(3):
             go[x] += step[x]

@@ -13,8 +13,8 @@ from stmpl_core.errors import InvalidInput
 from stmpl_core.slip import SPRINGS
 from stmpl_core.wake import untouched
 
-VERSION = 6  # of packed states; 5 knows no Scalars.strayed, 4 no Scalars.slid either, 3 nor where the joints were
-OLDEST, UNKNOWN = 3, {3: 2, 4: 2, 5: 1}  # version that is still read; how many of the last Scalars a version lacks
+VERSION = 7  # of packed states; 6 knows no Scalars.held and what follows, 5 no strayed, 4 no slid, 3 no joints
+OLDEST, UNKNOWN = 3, {3: 10, 4: 10, 5: 9, 6: 8}  # version that is still read; how many of the last Scalars one lacks
 FORGOTTEN = 1e-3  # elastic force of skin that comes back, over its largest, below which it is forgotten
 
 
@@ -26,8 +26,8 @@ class Memory(NamedTuple):
         wrench: wrench that it exerted, (6,) [N, N m].
         scalars: see Scalars, in that order.
         relaxed: elastic force that has relaxed in each time, (P,) [N].
-        contact: middle of the last contact on the skin at rest [m], its inward normal, and a tangent that goes with
-            it, (3, 3).
+        contact: middle of the last contact, as deep as its forces sink the skin [m], its inward normal, and a tangent
+            that goes with it, (3, 3).
         imprint: pose of the tool when it pressed last, (4, 4).
         stiffness: stiffness of the patch to the ways of `springs`, (3,) [N/m]; 0: no friction yet.
         springs: forces of the springs of friction without relaxation, (SPRINGS, 3) [N].
@@ -73,6 +73,12 @@ class Scalars(NamedTuple):
         surface: number of the tool's surface (Tool.number): what another surface of that name pressed is forgotten.
         slid: factor on the push of skin that has slid, by what it no longer carries along itself [-].
         strayed: part of what has relaxed that rests on touches out of range, at most [N].
+        held: stiffness of the patch along the skin at which the springs' forces are held: the least that it had under
+            them, weighed with what came when [N/m]; 0: as it is.
+        rolled_first, rolled_second, rolled: where the contact is in the room that it has rolled over, by the tangents,
+            and the radius of that (footing.beyond) [m].
+        passed_first, passed_second, passed: the same of the room that it has slid over [m].
+        doubted: 1 where the last touch was out of range.
     """
 
     pressing: float = 0.0
@@ -91,6 +97,14 @@ class Scalars(NamedTuple):
     surface: float = 0.0
     slid: float = 1.0
     strayed: float = 0.0
+    held: float = 0.0
+    rolled_first: float = 0.0
+    rolled_second: float = 0.0
+    rolled: float = 0.0
+    passed_first: float = 0.0
+    passed_second: float = 0.0
+    passed: float = 0.0
+    doubted: float = 0.0
 
     @property
     def sunk(self) -> bool:

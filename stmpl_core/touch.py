@@ -68,7 +68,7 @@ class Slip(NamedTuple):
         share: share of the normal force under which the skin slides [-]: 0 all sticks, 1 all slides.
         offset: way by which the skin under the tool is dragged along it, (3,) [m].
         turn: turn by which it is, about the inward normal of the contact [rad].
-        middle: middle of the contact on the skin at rest, (3,) [m].
+        middle: middle of the contact, as deep as its forces sink the skin, (3,) [m].
         lean: part of the push that is so since the skin came from where the limb faces another way, (3,) [N].
         grown: factor on the pressure, of the same energy as the lean [-].
     """

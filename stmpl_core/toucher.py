@@ -415,7 +415,7 @@ class Toucher:
         if one.why:
             trust = trust.also(one.why, in_range=False)
         if not len(pressure):
-            if one.status == BY_POSE:
+            if one.status == BY_POSE and not touch.depth <= MAX_AROUND * self._thickest:  # less: another took its skin
                 trust = trust.also(f"{name} is in the skin and presses nothing: check its mesh", in_range=False)
             return trust
         forces = pressure * layer.vertex_areas[vertices]
