@@ -37,7 +37,7 @@ from stmpl_core.footing import (
     wrench_at,
 )
 from stmpl_core.friction import Friction, coefficients
-from stmpl_core.relaxation import depth_left, left_over, let_go, series_of, share_of_tension, stretch
+from stmpl_core.relaxation import depth_left, fading, left_over, let_go, series_of, stretch
 from stmpl_core.sideways import Sideways
 from stmpl_core.slip import drag, ploughing
 from stmpl_core.state import Memory, Scalars, State, fresh
@@ -45,7 +45,6 @@ from stmpl_core.touch import APART, MIN_ONE_WAY_SHARE, Imprint, Pressed, Slip, T
 from stmpl_core.toucher import Toucher
 
 ROUGH = 0.12  # error of the relaxed force, over what has relaxed: 5.4 of 45 % in trials where only the shear relaxes
-TAUT = 3.0  # times the strain: share of the tension's part of a small press that deep ones have lost, at most 1
 RUBBED = 0.1  # of the force: what skin that gives way beneath a dry tool is off, as the law was learnt from what sticks
 PILED = 0.5  # of drag^2 / force: error of skin that piles up; 0.7 of it on a back, where the elastic bound was 0.45
 MOST_LEAN = 0.5  # turn of the normal under skin that is dragged along, of which a push takes note [rad]
@@ -99,8 +98,7 @@ class History:
         self._friction = coefficients(friction)
         thickness = float(np.median(layer.thickness))
         self.series = series_of(layer.tissue, thickness)
-        pulled = min(share_of_tension(layer.tissue, thickness), 0.5) if len(self.series.times) else 0.0
-        self._taut = pulled / (1 - pulled)  # what more would relax if the tension held nothing, over what does
+        self._fading = fading(layer.tissue, thickness) if len(self.series.times) else (np.zeros(1), np.ones(1))
 
     @cached_property
     def sideways(self) -> Sideways:
@@ -178,7 +176,9 @@ class History:
         at = np.array((scalars.passed_first, scalars.passed_second, scalars.passed))
         twist, gone, kept, gain, owed, now, passed = aged(
             memory.pose, pose, memory.imprint, memory.contact, known, scalars.pressing > 0, scalars.share, goes,
-            scalars.radius, at, *self.series, dt, scalars.elastic, memory.relaxed)  # fmt: skip
+            scalars.radius, at, *self.series, dt, self._fades(scalars.radius) * scalars.elastic,
+            memory.relaxed)  # fmt: skip
+        now = 1 - self._fades(scalars.radius) * (1 - now)
         asked, moved = contact, None
         if contact.wrench is not None and (len(kept) or memory.slid < 1):
             force = contact.wrench[:3]
@@ -190,6 +190,11 @@ class History:
                 if scalars.pressing > 0:
                     moved = float((memory.imprint[:3, 3] - memory.pose[:3, 3]) @ force) / size
         return Asked(asked, contact, memory, known, twist, gone, kept, gain, owed, now, passed, moved)
+
+    def _fades(self, radius: float) -> float:
+        """Factor on the force that relaxes under a contact of a radius [m]; see relaxation.fading."""
+        logs, factors = self._fading
+        return float(np.interp(math.log(radius), logs, factors)) if radius > 0 else 1.0
 
     def _whole(self, touch: Touch) -> float:
         """Sum of the sizes of the forces that a touch presses with [N]."""
@@ -234,7 +239,8 @@ class History:
         depth = nodes.sinking if len(nodes.sinking) else nodes.strain * nodes.thickness
         middle, radius, lever, thickness, whole = patch_of(
             nodes.points, nodes.area, nodes.thickness, depth, pressed.forces, normal)  # fmt: skip
-        net, long = min(size / elastic, 1.0), stretch(touch.depth, thickness)
+        net, long, fades = min(size / elastic, 1.0), stretch(touch.depth, thickness), self._fades(radius)
+        one = one._replace(now=1 - fades * float(shares @ one.gain))
         force, at_rest = one.now * elastic - long * one.owed, elastic / long
         if one.contact is not one.stated:
             needed = self._needed(one, push, size, elastic, long)
@@ -245,10 +251,9 @@ class History:
         pose = touch.pose_body_from_tool
         middle = middle + 2 * whole / float(pressed.forces.sum()) * normal
         contact = np.array((middle, normal, carried_tangent(one.before.contact, normal, before.pressing > 0)))
-        relaxed = one.kept + one.gain * at_rest
+        relaxed = one.kept + fades * one.gain * at_rest
         faded = float(shares @ relaxed)
-        rough = ROUGH * long + self._taut * min(TAUT * (1 - long), 1.0)
-        by, doubt, trail, left = force / elastic, rough * faded, one.before.trail, None
+        by, doubt, trail, left = force / elastic, ROUGH * long * faded, one.before.trail, None
         if len(trail):
             passing = wake.Pass(pose, middle, normal, relaxed, at_rest, touch.depth, pressed.power, 1 - long, radius)
             trail = wake.after(trail, self.series, dt, passing)

@@ -25,6 +25,8 @@ from stmpl_core.stack import plies, response
 from stmpl_core.tissue import Prony, Tissue
 
 MIX_RADIUS = 9e-3  # radius of the load for which the materials of a stack share a force [m]
+WIDER = 1.8  # radius of such a load over that of a contact: finite elements of balls on a back, 2 to 8 mm deep
+RADII = 1e-3, 0.1, 25  # of contacts, from the least to the most, for which it is known how much fades [m]
 LOG_STEP = 0.05  # change of a modulus by which its share is found, logarithm
 LEAST_STRETCH = 0.15  # of a column, to which it counts as pressed together
 DEPTH_TRIALS = 12  # of Newton for the depth of skin that is free
@@ -57,10 +59,7 @@ def series_of(tissue: Tissue, thickness: float) -> Series:
         tissue: materials, and the skin on them.
         thickness: thickness from the surface to the base [m], > 0.
     """
-    there = [ply for ply in tissue.deeper if ply.depth < thickness]
-    each: list[Prony | None] = [tissue.relaxation, *(ply.relaxation for ply in there)]
-    if tissue.skin:
-        each.append(tissue.skin.relaxation)
+    each = _relaxations(tissue, thickness)
     if not any(each):
         return Series(np.empty(0), np.empty(0))
     found: dict[float, float] = {}
@@ -71,22 +70,40 @@ def series_of(tissue: Tissue, thickness: float) -> Series:
     return Series(np.array([found[tau] for tau in times]), np.array(times))
 
 
-def share_of_tension(tissue: Tissue, thickness: float) -> float:
-    """Share of the force of a small press on a flat stack that the skin's tension holds, which does not relax [-].
+def fading(tissue: Tissue, thickness: float) -> tuple[np.ndarray, np.ndarray]:
+    """How much more of a force fades under wide contacts than a Series says, and less under small ones.
+
+    Skin's tension does not relax, and it holds much under a tip and little under a palm.
 
     Args:
         tissue, thickness: see series_of.
+
+    Returns:
+        Logarithms of contacts' radii in metres, rising, (R,), and the factors there, (R,) [-].
     """
-    return max(1 - sum(_shares(tissue, thickness)), 0.0)
+    radii = np.geomspace(*RADII)
+    if tissue.single:
+        return np.log(radii), np.ones(len(radii))
+    each = _relaxations(tissue, thickness)
+    fades = [sum(share * sum(one.shares) for one, share in zip(each, _shares(tissue, thickness, radius), strict=True)
+                 if one) for radius in (*WIDER * radii, MIX_RADIUS)]  # fmt: skip
+    return np.log(radii), np.array(fades[:-1]) / max(fades[-1], 1e-300)
 
 
-def _shares(tissue: Tissue, thickness: float) -> list[float]:
+def _relaxations(tissue: Tissue, thickness: float) -> list[Prony | None]:
+    """Series of each material of a stack, from the skin inwards, and last of the skin if there is one."""
+    there = [ply for ply in tissue.deeper if ply.depth < thickness]
+    skin = [tissue.skin.relaxation] if tissue.skin else []
+    return [tissue.relaxation, *(ply.relaxation for ply in there), *skin]
+
+
+def _shares(tissue: Tissue, thickness: float, radius: float = MIX_RADIUS) -> list[float]:
     """d ln F / d ln E of each material of a stack, from the skin inwards, and last of the skin if there is one."""
     stack = plies(tissue, thickness)
     if tissue.single:
         return [1.0]
-    k = np.geomspace(0.02, 8, 200) / MIX_RADIUS
-    weight = np.exp(-0.25 * (k * MIX_RADIUS) ** 2) * k * k
+    k = np.geomspace(0.02, 8, 200) / radius
+    weight = np.exp(-0.25 * (k * radius) ** 2) * k * k
 
     def log_force(number: int, by: float) -> float:
         changed = [(h, modulus * np.exp(by * (n == number)), nu) for n, (h, modulus, nu) in enumerate(stack)]
