@@ -7,6 +7,7 @@ import numpy as np
 
 from stmpl_core.relaxation import weights
 
+LEFT = 0.6  # of what is dragged: what a way of one radius leaves behind, far on; a ball that rolls by finite elements
 ROLLED, PASSED = 0.5, 0.25  # radius of the room that a contact has rolled over, and of that it has slid over, over a
 EDGE_SHARE = 0.3  # pressure over its mean from which skin counts as touched in full
 
@@ -129,7 +130,7 @@ def way_of_tool(twist, known, before, held, contact, origin, depth, radius, leve
     if held:
         on = middle - before[0] - go
         room, over = beyond(at, _dot(on, first), _dot(on, second), ROLLED * radius)
-        rolled = (1 / np.pi + (1 - 1 / np.pi) * room[2] / (ROLLED * radius)) * over / radius
+        rolled = (1 / np.pi + (LEFT - 1 / np.pi) * room[2] / (ROLLED * radius)) * over / radius
     return way, rolled, room
 
 

@@ -217,13 +217,16 @@ class History:
     def _again(self, one: Asked, touch: Touch) -> Asked | None:
         """The same with a wrench that fits where the contact's normal turned out to be; None where it does."""
         pressed = touch.pressed
-        if one.contact is one.stated or not touch.presses or one.contact.wrench is None or pressed is None:
+        if one.contact is one.stated or not touch.presses or one.contact.wrench is None or pressed is None or \
+                pressed.forces is None:  # fmt: skip
             return None
         push, has = touch.push, self._whole(touch)
         force = math.sqrt(push @ push)
         if not force > 0:
             return None
-        needed = self._needed(one, push, force, has, stretch(touch.depth, mean_thickness(pressed)))
+        fades = self._fades(math.sqrt(float(pressed.squeeze.nodes.area[pressed.forces > 0].sum()) / math.pi))
+        eased = one._replace(now=1 - fades * float(self.series.shares @ one.gain))
+        needed = self._needed(eased, push, force, has, stretch(touch.depth, mean_thickness(pressed)))
         carried = float(one.contact.wrench[:3] @ push) / force
         if force < (1 - 1e-6) * carried or not needed > 0 or abs(needed / has - 1) < HELD_OFF:
             return None
@@ -362,8 +365,9 @@ class History:
         way, rolled, room = way_of_tool(
             one.twist, one.known, before.contact, had.pressing > 0, contact, origin, depth, radius, lever,
             np.array((had.rolled_first, had.rolled_second, had.rolled)))  # fmt: skip
-        last_held = had.held or before.stiffness[0]
-        held_at = before.stiffness * (last_held / before.stiffness[0]) if last_held > 0 else before.stiffness
+        was = float(before.stiffness[0])
+        last_held = had.held or was
+        held_at = before.stiffness * (last_held / was) if was > 0 else before.stiffness
         size, lost = math.sqrt(wrench[:3] @ wrench[:3]), (1 - before.slid) * before.scalars.elastic / scalars.elastic
         for _ in range(MOST_PASSES):
             if stated is None:
@@ -397,7 +401,7 @@ class History:
         kept = old and old / last_held * math.exp(-rolled) * math.sqrt(float((before.springs.sum(axis=0) ** 2).sum()))
         share_old = min(kept / new, 1.0) if new > 0 else 0.0  # what is new is held at what the patch is now
         return _Dragged(slip, cap, stiffness, springs, relaxed, stored, slid, share_old * old + (1 - share_old) * along,
-                        share_old * room)  # fmt: skip
+                        room)  # fmt: skip
 
     def _said(self, one: Asked, touch: Touch, changed: dict[str, Any]) -> Touch:
         """The touch with what changed, with what of the stated wrench is missing, and what that says of it."""
@@ -442,7 +446,9 @@ def mean_thickness(pressed: Pressed) -> float:
 
 def _let_go(memory: Memory) -> Memory:
     """The memory without springs of friction."""
-    return memory._replace(stiffness=np.zeros(3), springs=np.zeros_like(memory.springs),
+    scalars = memory.scalars._replace(held=0.0, rolled_first=0.0, rolled_second=0.0, rolled=0.0, passed_first=0.0,
+                                      passed_second=0.0, passed=0.0)  # fmt: skip
+    return memory._replace(scalars=scalars, stiffness=np.zeros(3), springs=np.zeros_like(memory.springs),
                            springs_relaxed=np.zeros_like(memory.springs_relaxed))  # fmt: skip
 
 

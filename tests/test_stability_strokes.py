@@ -9,6 +9,8 @@ import pytest
 from stmpl_core import Simulator, SoftLayer, State, Touch
 from stmpl_core.methods import Winkler
 from studies.stability import PRESETS, again, judge, stability
+from studies.stability.laws import MEANING
+from studies.stability.picture import LETTERS
 from studies.stability.stroke_axes import QUICK_STROKES, STROKE_AXES, STROKE_LEVELS
 from studies.stability.stroke_laws import STROKE_LAWS
 from studies.stability.sweeps import Stage
@@ -81,10 +83,14 @@ def clinging(touch, time, dt):
     return {} if touch.presses else {"wrench": np.array([0, 0, 1e-3, 0, 0, 0])}
 
 
+def waning(touch, time, dt):
+    return {} if touch.slip is None else {"slip": touch.slip._replace(wrench=touch.slip.wrench * np.exp(-time))}
+
+
 FAULTS: dict[str, tuple[str, Fault]] = {
     "finite": ("spin", nan), "gives": ("closed path", pushing), "caps": ("friction", sticky),
     "alike": ("time step", by_step), "masing": ("reversal", one_sided), "between": ("time of relaxation", too_stiff),
-    "free": ("lift-off", clinging),
+    "free": ("lift-off", clinging), "lasts": ("rocking", waning),
 }  # fmt: skip
 
 
@@ -112,7 +118,7 @@ def test_a_sound_simulator_holds_every_axis(made, axis):
 
 
 def test_every_law_is_broken_here_and_every_axis_has_levels():
-    assert set(FAULTS) == set(STROKE_LAWS) | {"finite"}
+    assert set(FAULTS) == set(STROKE_LAWS) | {"finite"} and STROKE_LAWS.keys() <= LETTERS.keys() & MEANING.keys()
     assert list(STROKE_AXES) == list(STROKE_LEVELS) == list(QUICK_STROKES)
     assert set(QUICK.only("strokes").levels) == set(STROKE_AXES)
 

@@ -199,10 +199,42 @@ def on_a_limb(stage: Stage, level: float) -> Trial:
     return Trial("", f"{level:g}°", LAWS, scene)
 
 
+def noise(stage: Stage, level: float) -> Trial:
+    """Noise of the pose in micrometres, at 100 Hz for 3 s, of a tool that was dragged and is held."""
+    places = keys((0, 0, 0, 0), (0.1, 0, 0, DEEP), (0.2, 3e-4, 0, DEEP), (3.2, 3e-4, 0, DEEP))
+    scene = stroke(places, every(places, STEP))
+    shaken = scene.poses.copy()
+    shaken[21:-1, :3, 3] += 1e-6 * level * np.random.default_rng(stage.seed).normal(size=(len(shaken) - 22, 3))
+    return Trial("", f"{level:g} um", (*LAWS, "lasts"), replace(scene, poses=shaken), _at_last(scene, scene))
+
+
+def rocking(stage: Stage, level: float) -> Trial:
+    """Way in mm by which a tool that was dragged and sticks rolls to either side, eight times; and up and down."""
+    way = 1e-3 * level
+    once = [(way, way / RADIUS), (0, 0), (-way, -way / RADIUS), (0, 0)]
+    start = [(0, 0, 0, 0), (0.1, 0, 0, DEEP), (0.2, 3e-4, 0, DEEP)]
+
+    def rocked(times: int) -> Strokes:
+        moves: list[tuple[float, ...]] = []
+        for k, (x, turn) in enumerate(once * times):
+            moves.append((0.25 + 0.05 * k, 3e-4 + x, 0, DEEP * (1 - 0.2 * (k % 2)), 0, turn, 0))
+        moves.append((moves[-1][0] + 0.05, 3e-4, 0, DEEP))
+        places = keys(*start, *moves)
+        return stroke(places, every(places, STEP), ELASTIC, 1.0)
+
+    scene = rocked(8)
+    return Trial("", f"{level:g} mm", (*LAWS, "lasts"), scene, _at_last(scene, rocked(1)))
+
+
+def _at_last(scene: Strokes, twin: Strokes) -> Twin:
+    """A path that ends as another does."""
+    return Twin(twin, np.array([[len(scene.times) - 1, len(twin.times) - 1]]), np.eye(3))
+
+
 STROKE_AXES: dict[str, Callable[[Stage, float], Trial]] = {
     "time step": time_step, "lost steps": cut, "long gap": long_gap, "time of relaxation": fading, "friction": friction,
     "reversal": reversal, "spin": spin, "stick-slip": stick_slip, "lift-off": lift_off, "round a limb": on_a_limb,
-    "closed path": closed_path,
+    "noise of a pose": noise, "rocking": rocking, "closed path": closed_path,
 }  # fmt: skip
 STROKE_LEVELS: dict[str, Sequence[float]] = {
     "time step": (0.1, 0.5, 2, 5, 10, 20, 50),
@@ -215,10 +247,12 @@ STROKE_LEVELS: dict[str, Sequence[float]] = {
     "stick-slip": (10, 40, 150, 600),
     "lift-off": (0, 0.05, 1, 100, 1e6),
     "round a limb": (2, 10, 45),
+    "noise of a pose": (1, 3, 10),
+    "rocking": (0.1, 0.2, 0.4),
     "closed path": tuple(range(24)),
 }
 QUICK_STROKES: dict[str, Sequence[float]] = {
     "time step": (10,), "lost steps": (0.3,), "long gap": (10,), "time of relaxation": (0.1,), "friction": (0.5,),
     "reversal": (0.5,), "spin": (15,), "stick-slip": (100,), "lift-off": (100,), "round a limb": (10,),
-    "closed path": (7,),
+    "noise of a pose": (3,), "rocking": (0.3,), "closed path": (7,),
 }  # fmt: skip

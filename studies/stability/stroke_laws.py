@@ -18,6 +18,7 @@ GIVEN = 0.005  # of the work that was put in, that may come out again beyond it
 CUT = 0.01  # of the largest force, by which the same path in other steps may change a force
 CAPPED = 1.7  # friction over mu N at most: ploughing raises it
 DOUBLED = 0.03  # of the largest friction, by which a reversal may miss the first loading, twice as large
+LASTS = 0.15  # of friction that sticks, and a third of that of the force, that may be lost to and fro
 BETWEEN = 0.01  # of the elastic force, by which a force may leave what lies between relaxed and sudden
 
 
@@ -106,8 +107,25 @@ def free(trial: Trial, answers: Answers) -> Found:
             yield broken("free", f"off the skin, and {touch.status} with {touch.force:.2g} N", answer)
 
 
+@worst
+def lasts(trial: Trial, answers: Answers) -> Found:
+    """What sticks stays, and so does what has relaxed: after moves to and fro as without, or as after the first."""
+    assert trial.twin is not None
+    ours, theirs = answers_of(answers.scene), answers_of(answers.twin)
+    for k, m in trial.twin.pairs:
+        one, other = _touch(ours[k].touches), _touch(theirs[m].touches)
+        if one.slip is None or other.slip is None:
+            continue
+        held, meant = np.linalg.norm(one.slip.wrench[:3]), np.linalg.norm(other.slip.wrench[:3])
+        if abs(held - meant) > LASTS * meant:
+            yield broken("lasts", f"{held:.3g} N of friction, where {meant:.3g} stuck", ours[k], theirs[m])
+        if abs(one.force - other.force) > LASTS / 3 * other.force:
+            yield broken("lasts", f"presses with {one.force:.3g} N for {other.force:.3g}", ours[k], theirs[m])
+
+
 STROKE_LAWS: dict[str, Law] = {
     "gives": gives, "caps": caps, "alike": alike, "masing": masing, "between": between, "free": free,
+    "lasts": lasts,
 }  # fmt: skip
 """Laws of strokes, by name."""
 
