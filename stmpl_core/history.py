@@ -98,7 +98,7 @@ class History:
         self._friction = coefficients(friction)
         thickness = float(np.median(layer.thickness))
         self.series = series_of(layer.tissue, thickness)
-        self._fading = fading(layer.tissue, thickness) if len(self.series.times) else (np.zeros(1), np.ones(1))
+        self._fading = fading(layer.tissue, thickness)
 
     @cached_property
     def sideways(self) -> Sideways:
@@ -173,12 +173,11 @@ class History:
         known = before is not None and memory.scalars.pressing >= 0
         scalars = memory.scalars
         goes = scalars.limit / memory.stiffness[0] if memory.stiffness[0] > 0 else 0.0
-        at = np.array((scalars.passed_first, scalars.passed_second, scalars.passed))
+        fades, at = self._fades(scalars.radius), np.array((scalars.passed_first, scalars.passed_second, scalars.passed))
         twist, gone, kept, gain, owed, now, passed = aged(
             memory.pose, pose, memory.imprint, memory.contact, known, scalars.pressing > 0, scalars.share, goes,
-            scalars.radius, at, *self.series, dt, self._fades(scalars.radius) * scalars.elastic,
-            memory.relaxed)  # fmt: skip
-        now = 1 - self._fades(scalars.radius) * (1 - now)
+            scalars.radius, at, *self.series, dt, fades * scalars.elastic, memory.relaxed)  # fmt: skip
+        now = 1 - fades * (1 - now)
         asked, moved = contact, None
         if contact.wrench is not None and (len(kept) or memory.slid < 1):
             force = contact.wrench[:3]

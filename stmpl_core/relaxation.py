@@ -79,10 +79,10 @@ def fading(tissue: Tissue, thickness: float) -> tuple[np.ndarray, np.ndarray]:
         tissue, thickness: see series_of.
 
     Returns:
-        Logarithms of contacts' radii in metres, rising, (R,), and the factors there, (R,) [-].
+        Logarithms of contacts' radii in metres, rising, (R,), and the factors there, (R,) [-]; 1 where nothing relaxes.
     """
     radii = np.geomspace(*RADII)
-    if tissue.single:
+    if tissue.single or not tissue.relaxes:
         return np.log(radii), np.ones(len(radii))
     each = _relaxations(tissue, thickness)
     fades = [sum(share * sum(one.shares) for one, share in zip(each, _shares(tissue, thickness, radius), strict=True)
