@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numba
@@ -85,8 +84,8 @@ def balanced(asked: Sequence[Asked], laws: Sequence[Law], shares: np.ndarray) ->
         before, memory, new = one.before, law.memory, not one.known or one.stated.wrench is not None
         work, doubt, given = work_of(
             one.twist, before.wrench, memory.wrench, before.contact, memory.contact, memory.pose[:3, 3],
-            _elastic(before, shares), _elastic(memory, shares), before.scalars.depth, memory.scalars.depth,
-            memory.scalars.power)  # fmt: skip
+            before.scalars.pressing > 0, memory.scalars.pressing > 0, _factor(before), _factor(memory), before.relaxed,
+            memory.relaxed, shares, before.scalars.depth, memory.scalars.depth, memory.scalars.power)  # fmt: skip
         work += before.scalars.work
         work = max(work, law.stored if new else min(law.stored, work + doubt))
         works.append(work)
@@ -114,17 +113,15 @@ def balanced(asked: Sequence[Asked], laws: Sequence[Law], shares: np.ndarray) ->
     return touches, memories
 
 
-def _elastic(memory: Memory, shares: np.ndarray) -> float:
-    """What a tool that presses would press with along the normal, had nothing relaxed [N]; 0 where it does not."""
+def _factor(memory: Memory) -> float:
+    """Force along the normal over one that relaxed at rest, by what a tool presses with [-]."""
     scalars = memory.scalars
-    if scalars.pressing <= 0:
-        return 0.0
-    relaxed = scalars.stretch * float(shares @ memory.relaxed) if len(shares) else 0.0
-    return max(float(memory.wrench[:3] @ memory.contact[1]) + scalars.net * scalars.passive * relaxed, 0.0)
+    return scalars.net * scalars.passive * scalars.stretch
 
 
 @numba.njit(cache=True, error_model="numpy")
-def work_of(twist, before, after, old, new, origin, first, last, depth_first, depth_last, power):
+def work_of(twist, before, after, old, new, origin, presses_first, presses_last, factor_first, factor_last,
+            relaxed_first, relaxed_last, shares, depth_first, depth_last, power):  # fmt: skip
     """Work of a wrench over a tool's way in a step; how far it may be from that; and the last wrench's part of it [J].
 
     The wrench goes straight from one to the other, but for the force of elastic skin along the normal, which grows with
@@ -137,10 +134,15 @@ def work_of(twist, before, after, old, new, origin, first, last, depth_first, de
         before, after: wrenches, (6,) [N, N m].
         old, new: contacts (see Memory), (3, 3).
         origin: origin of the tool, (3,) [m].
-        first, last: force of elastic skin along the normal before and after [N]; 0: none.
+        presses_first, presses_last: whether the tool presses before and after.
+        factor_first, factor_last: see `_factor`.
+        relaxed_first, relaxed_last: what has relaxed there, (P,) [N].
+        shares: shares of the force that relax, (P,) [-].
         depth_first, depth_last: depths there [m].
         power: power of the depth with which it grows, where the depths do not say it [-].
     """
+    first = _elastic(before, old, factor_first, relaxed_first, shares) if presses_first else 0.0
+    last = _elastic(after, new, factor_last, relaxed_last, shares) if presses_last else 0.0
     contact, deep = (new, depth_last) if last > 0 else (old, depth_first)
     go, share, less = 0.0, 1.0, 0.0
     for x in range(3):
@@ -163,6 +165,17 @@ def work_of(twist, before, after, old, new, origin, first, last, depth_first, de
 
 
 @numba.njit(cache=True, error_model="numpy")
+def _elastic(wrench, contact, factor, relaxed, shares):
+    """What a tool that presses would press with along the normal, had nothing relaxed [N]."""
+    force = 0.0
+    for x in range(3):
+        force += wrench[x] * contact[1, x]
+    for i in range(len(shares)):
+        force += factor * shares[i] * relaxed[i]
+    return max(force, 0.0)
+
+
+@numba.njit(cache=True, error_model="numpy")
 def _less(first, last, power):
     """How much less than halfway between two forces the mean of one is that grows with a power of the depth [N]."""
     most, ratio = max(first, last), min(first, last) / max(first, last)
@@ -174,7 +187,7 @@ def _less(first, last, power):
 
 def _weakened(touch: Touch, by: float) -> Touch:
     slip = touch.slip and touch.slip._replace(wrench=touch.slip.wrench * by, lean=touch.slip.lean * by)
-    return replace(touch, **scaled(touch, by, 0.0), slip=slip, passive=by)
+    return touch.with_(**scaled(touch, by, 0.0), slip=slip, passive=by)
 
 
 def scaled(touch: Touch, by: float, doubt: float) -> dict[str, Any]:

@@ -5,11 +5,13 @@ from __future__ import annotations
 import numba
 import numpy as np
 
-from stmpl_core.relaxation import weights
+from stmpl_core.relaxation import faded, left_over, stretch, weights
 
 LEFT = 0.6  # of what is dragged: what a way of one radius leaves behind, far on; a ball that rolls by finite elements
 ROLLED, PASSED = 0.5, 0.25  # radius of the room that a contact has rolled over, and of that it has slid over, over a
 EDGE_SHARE = 0.3  # pressure over its mean from which skin counts as touched in full
+ROUGH = 0.12  # error of the relaxed force, over what has relaxed: 5.4 of 45 % in trials where only the shear relaxes
+HELD_OFF = 0.01  # relative error of the elastic force by wrench, from which it is asked for again
 
 
 @numba.njit(cache=True, error_model="numpy", inline="always")
@@ -56,6 +58,73 @@ def patch_of(points, area, thickness, depth, forces, normal):
         lever += forces[n] * np.sqrt(max(square - up * up, 0.0))
     radius = np.sqrt(size / np.pi)
     return middle, radius, max(lever / total, 0.1 * radius), thick / total, energy
+
+
+@numba.njit(cache=True, error_model="numpy")
+def needed(stated, push, size, whole, long, owed, now, slid):
+    """Elastic force that a stated wrench takes, as a sum of sizes [N].
+
+    Args:
+        stated: wrench, (6,) [N, N m].
+        push, size: force of the touch, (3,) [N], and its size.
+        whole: sum of the sizes of its parts [N].
+        long: stretch of the column under the tool [-].
+        owed, now: see Asked (stmpl_core.balance).
+        slid: see Scalars.
+    """
+    return (_dot(stated, push) / size * whole / size / slid + long * owed) / now
+
+
+@numba.njit(cache=True, error_model="numpy")
+def bearing(push, points, area, thickness, depth, forces, deepest, power, factor, before, held, fades, kept, gain, owed,
+            shares, stated, creeps, slid):  # fmt: skip
+    """What skin that relaxes bears of an elastic touch.
+
+    Args:
+        push: force of the touch, (3,) [N].
+        points, area, thickness, depth, forces: see `patch_of`.
+        deepest: depth of the tool [m].
+        power, factor: see Pressed.
+        before, held: contact before the step (see Memory), and whether the tool pressed there.
+        fades: see relaxation.faded.
+        kept, gain, owed: see Asked (stmpl_core.balance).
+        shares: shares of the series, (P,).
+        stated: wrench that the touch carries, (6,); read where skin creeps under one.
+        creeps: whether the contact law was asked for another.
+        slid: see Scalars.
+
+    Returns:
+        force, elastic: sum of the sizes of the forces, relaxed and not [N]; the former is not above 0 where the skin
+            came free.
+        at_rest: the latter over the stretch [N].
+        net, radius, stretch: see Scalars.
+        lever, thickness: see `patch_of`.
+        contact, relaxed: see Memory, after the step.
+        stored, whole: see Law (stmpl_core.balance) [J].
+        doubt: error of the force that relaxing brings [N].
+    """
+    size = np.sqrt(_dot(push, push))
+    normal = push / size
+    middle, radius, lever, mean, whole = patch_of(points, area, thickness, depth, forces, normal)
+    elastic = forces.sum()
+    net, long, more, now = min(size / elastic, 1.0), stretch(deepest, mean), faded(fades, radius), 1.0
+    for i in range(len(shares)):
+        now -= more * shares[i] * gain[i]
+    force, at_rest = now * elastic - long * owed, elastic / long
+    if creeps:
+        asked = needed(stated, push, size, elastic, long, owed, now, slid)
+        if abs(asked / elastic - 1) < 2 * HELD_OFF:
+            force, at_rest = now * asked - long * owed, asked / long
+    contact, relaxed, gone = np.empty((3, 3)), np.empty(len(shares)), 0.0
+    contact[0] = middle + 2 * whole / elastic * normal
+    contact[1], contact[2] = normal, carried_tangent(before, normal, held)
+    for i in range(len(shares)):
+        relaxed[i] = kept[i] + more * gain[i] * at_rest
+        gone += shares[i] * relaxed[i]
+    whole *= 0.5 + 0.5 / factor  # what draws a tool back from the core is steep: it stores less
+    stored = whole * left_over(gone / at_rest, power, 1 - long)
+    return (force, elastic, at_rest, net, radius, long, lever, mean, contact, relaxed, stored, whole,
+            ROUGH * long * gone)  # fmt: skip
 
 
 @numba.njit(cache=True, error_model="numpy")
@@ -261,7 +330,8 @@ def way_along(twist, contact, pose):
 
 
 @numba.njit(cache=True, error_model="numpy")
-def aged(before, pose, imprint, contact, known, held, share, goes, radius, at, shares, times, dt, elastic, relaxed):
+def aged(before, pose, imprint, contact, known, held, share, goes, radius, at, shares, times, fades, dt, elastic,
+         relaxed):  # fmt: skip
     """Twist, gone, kept, gain, owed, now and passed of an Asked (stmpl_core.balance).
 
     Args:
@@ -273,6 +343,7 @@ def aged(before, pose, imprint, contact, known, held, share, goes, radius, at, s
         goes: way that skin goes along with the tool until all of it slides [m].
         at: where the contact is in the room that it has slid over, see `beyond`, (3,) [m].
         shares, times: series of the relaxation, (P,) each.
+        fades: see relaxation.faded.
         dt: time of the step [s].
     """
     kept, gain, gone, owed, now = np.empty(len(times)), np.empty(len(times)), 0.0, 0.0, 1.0
@@ -284,8 +355,9 @@ def aged(before, pose, imprint, contact, known, held, share, goes, radius, at, s
     elif radius > 0:
         first, second = way_along(twist_between(imprint, pose), contact, imprint)
         gone = np.sqrt(first * first + second * second) / radius
-    weights(times, dt, gone, elastic, relaxed, kept, gain)
+    more = faded(fades, radius)
+    weights(times, dt, gone, more * elastic, relaxed, kept, gain)
     for i in range(len(times)):
         owed += shares[i] * kept[i]
-        now -= shares[i] * gain[i]
+        now -= more * shares[i] * gain[i]
     return twist, gone, kept, gain, owed, now, passed

@@ -10,73 +10,31 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from copy import copy
-from dataclasses import replace
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from stmpl_core import wake
-from stmpl_core.arrays import Wrench
 from stmpl_core.balance import Asked, Law, balanced, scaled
 from stmpl_core.columns import shifted
 from stmpl_core.contact import Contact
 from stmpl_core.dragged import MIN_OFFSET
 from stmpl_core.errors import InvalidInput
-from stmpl_core.footing import (
-    aged,
-    carried_more,
-    carried_tangent,
-    faced,
-    given_way,
-    in_plane,
-    in_space,
-    leaned,
-    patch_of,
-    way_of_tool,
-    wrench_at,
-)
+from stmpl_core.footing import HELD_OFF, aged, bearing, needed
 from stmpl_core.friction import Friction, coefficients
-from stmpl_core.relaxation import depth_left, fading, left_over, let_go, series_of, stretch
+from stmpl_core.relaxation import depth_left, faded, fading, let_go, series_of, stretch
 from stmpl_core.sideways import Sideways
-from stmpl_core.slip import drag, ploughing
+from stmpl_core.slip import rub
 from stmpl_core.state import Memory, Scalars, State, fresh
 from stmpl_core.touch import APART, MIN_ONE_WAY_SHARE, Imprint, Pressed, Slip, Touch
 from stmpl_core.toucher import Toucher
 
-ROUGH = 0.12  # error of the relaxed force, over what has relaxed: 5.4 of 45 % in trials where only the shear relaxes
 RUBBED = 0.1  # of the force: what skin that gives way beneath a dry tool is off, as the law was learnt from what sticks
 PILED = 0.5  # of drag^2 / force: error of skin that piles up; 0.7 of it on a back, where the elastic bound was 0.45
-MOST_LEAN = 0.5  # turn of the normal under skin that is dragged along, of which a push takes note [rad]
-LEAST_GROWN = 0.5  # depth over the tool's that counts at least, where skin came from a hollow
-MOST_PASSES, SETTLED = 4, 1e-3  # turn of the normal [rad] at which push and friction agree
 LOST = 0.5  # of what skin carries along itself: what is gone once all of it slides; 0.4 to 0.6 by slides on a forearm
 STRAYED = 0.03  # of the elastic force: part of the memory from touches out of range, beyond which an answer is, too
-HELD_OFF = 0.01  # relative error of the elastic force by wrench, from which it is asked for again
-NOTHING = np.zeros(3)
-
-
-class _Dragged(NamedTuple):
-    """Friction of a contact.
-
-    Args:
-        slip: what it carries.
-        limit: tangential force at which all of it slides [N].
-        stiffness: of the patch, (3,) [N/m]; see Memory, as springs and relaxed.
-        stored: energy that the bent skin stores [J].
-        slid, held: see Scalars.
-        rolled: where the contact is in the room that it has rolled over (footing.beyond), (3,) [m].
-    """
-
-    slip: Slip
-    limit: float
-    stiffness: np.ndarray
-    springs: np.ndarray
-    relaxed: np.ndarray
-    stored: float
-    slid: float
-    held: float
-    rolled: np.ndarray
+NONE, NO_ROOM, FLAT = np.zeros(6), np.zeros(3), np.zeros((3, 3))
 
 
 class History:
@@ -98,7 +56,7 @@ class History:
         self._friction = coefficients(friction)
         thickness = float(np.median(layer.thickness))
         self.series = series_of(layer.tissue, thickness)
-        self._fading = fading(layer.tissue, thickness)
+        self._fades = fading(layer.tissue, thickness)
 
     @cached_property
     def sideways(self) -> Sideways:
@@ -158,9 +116,10 @@ class History:
         if doubted or one.before.scalars.doubted:  # what this step may have added rests on one of its ends
             most = max(scalars.elastic, one.before.scalars.elastic)
             strayed = min(strayed + most * float(self.series.shares @ -np.expm1(-dt / self.series.times)), relaxed)
-        memories[touch.name] = memory._replace(scalars=scalars._replace(strayed=strayed, doubted=float(doubted)))
+        if (strayed, doubted) != (scalars.strayed, scalars.doubted):
+            memories[touch.name] = memory._replace(scalars=scalars._replace(strayed=strayed, doubted=float(doubted)))
         if touch.trust.in_range and strayed > STRAYED * scalars.elastic > 0:
-            return replace(touch, trust=touch.trust.also(
+            return touch.with_(trust=touch.trust.also(
                 f"{touch.name} meets skin that still relaxes from a touch out of range", in_range=False))  # fmt: skip
         return touch
 
@@ -173,11 +132,10 @@ class History:
         known = before is not None and memory.scalars.pressing >= 0
         scalars = memory.scalars
         goes = scalars.limit / memory.stiffness[0] if memory.stiffness[0] > 0 else 0.0
-        fades, at = self._fades(scalars.radius), np.array((scalars.passed_first, scalars.passed_second, scalars.passed))
+        at = np.array((scalars.passed_first, scalars.passed_second, scalars.passed))
         twist, gone, kept, gain, owed, now, passed = aged(
             memory.pose, pose, memory.imprint, memory.contact, known, scalars.pressing > 0, scalars.share, goes,
-            scalars.radius, at, *self.series, dt, fades * scalars.elastic, memory.relaxed)  # fmt: skip
-        now = 1 - fades * (1 - now)
+            scalars.radius, at, *self.series, self._fades, dt, scalars.elastic, memory.relaxed)  # fmt: skip
         asked, moved = contact, None
         if contact.wrench is not None and (len(kept) or memory.slid < 1):
             force = contact.wrench[:3]
@@ -190,115 +148,82 @@ class History:
                     moved = float((memory.imprint[:3, 3] - memory.pose[:3, 3]) @ force) / size
         return Asked(asked, contact, memory, known, twist, gone, kept, gain, owed, now, passed, moved)
 
-    def _fades(self, radius: float) -> float:
-        """Factor on the force that relaxes under a contact of a radius [m]; see relaxation.fading."""
-        logs, factors = self._fading
-        return float(np.interp(math.log(radius), logs, factors)) if radius > 0 else 1.0
-
-    def _whole(self, touch: Touch) -> float:
-        """Sum of the sizes of the forces that a touch presses with [N]."""
-        return 0.0 if touch.pressure is None else float(touch.pressure @ self.toucher.layer.vertex_areas)
-
-    def _needed(self, one: Asked, push: np.ndarray, force: float, whole: float, stretch: float) -> float:
-        """Elastic force that a stated wrench takes, as a sum of sizes [N].
-
-        Args:
-            one: what is asked.
-            push: force of the touch, (3,) [N].
-            force: its size [N].
-            whole: sum of the sizes of its parts [N].
-            stretch: stretch of the column under the tool [-].
-        """
-        assert one.stated.wrench is not None
-        wanted = float(one.stated.wrench[:3] @ push) / force * whole / force / one.before.slid
-        return (wanted + stretch * one.owed) / one.now
-
     def _again(self, one: Asked, touch: Touch) -> Asked | None:
         """The same with a wrench that fits where the contact's normal turned out to be; None where it does."""
         pressed = touch.pressed
         if one.contact is one.stated or not touch.presses or one.contact.wrench is None or pressed is None or \
                 pressed.forces is None:  # fmt: skip
             return None
-        push, has = touch.push, self._whole(touch)
+        push, has = touch.push, float(pressed.forces.sum())
         force = math.sqrt(push @ push)
         if not force > 0:
             return None
-        fades = self._fades(math.sqrt(float(pressed.squeeze.nodes.area[pressed.forces > 0].sum()) / math.pi))
-        eased = one._replace(now=1 - fades * float(self.series.shares @ one.gain))
-        needed = self._needed(eased, push, force, has, stretch(touch.depth, mean_thickness(pressed)))
+        fades = faded(self._fades, math.sqrt(float(pressed.squeeze.nodes.area[pressed.forces > 0].sum()) / math.pi))
+        now, long = 1 - fades * float(self.series.shares @ one.gain), stretch(touch.depth, mean_thickness(pressed))
+        takes = needed(one.stated.wrench, push, force, has, long, one.owed, now, one.before.slid)
         carried = float(one.contact.wrench[:3] @ push) / force
-        if force < (1 - 1e-6) * carried or not needed > 0 or abs(needed / has - 1) < HELD_OFF:
+        if force < (1 - 1e-6) * carried or not takes > 0 or abs(takes / has - 1) < HELD_OFF:
             return None
-        return one._replace(contact=one.contact.scaled(needed / has))
+        return one._replace(contact=one.contact.scaled(takes / has))
 
     def _law(self, one: Asked, touch: Touch, dt: float) -> Law:
         """What a tool does, from what elastic skin does."""
         shares, before, push, pressed = self.series.shares, one.before.scalars, touch.push, touch.pressed
-        size = math.sqrt(push @ push)
-        if not (touch.presses and pressed is not None and pressed.forces is not None and size > 0):
+        if not (touch.presses and pressed is not None and pressed.forces is not None and push @ push > 0):
             return self._free(one, touch, 0.0, dt)
-        normal, nodes, elastic = push / size, pressed.squeeze.nodes, self._whole(touch)
-        depth = nodes.sinking if len(nodes.sinking) else nodes.strain * nodes.thickness
-        middle, radius, lever, thickness, whole = patch_of(
-            nodes.points, nodes.area, nodes.thickness, depth, pressed.forces, normal)  # fmt: skip
-        net, long, fades = min(size / elastic, 1.0), stretch(touch.depth, thickness), self._fades(radius)
-        one = one._replace(now=1 - fades * float(shares @ one.gain))
-        force, at_rest = one.now * elastic - long * one.owed, elastic / long
-        if one.contact is not one.stated:
-            needed = self._needed(one, push, size, elastic, long)
-            if abs(needed / elastic - 1) < 2 * HELD_OFF:
-                force, at_rest = one.now * needed - long * one.owed, needed / long
+        nodes, stated, pose = pressed.squeeze.nodes, one.stated.wrench, touch.pose_body_from_tool
+        depths = nodes.sinking if len(nodes.sinking) else nodes.strain * nodes.thickness
+        (force, elastic, at_rest, net, radius, long, lever, thickness, contact, relaxed, stored, whole,
+         doubt) = bearing(
+            push, nodes.points, nodes.area, nodes.thickness, depths, pressed.forces, touch.depth, pressed.power,
+            pressed.factor, one.before.contact, before.pressing > 0, self._fades, one.kept, one.gain, one.owed, shares,
+            NONE if stated is None else stated, one.contact is not one.stated, one.before.slid)  # fmt: skip
         if not force > 0:
             return self._free(one, touch, at_rest, dt)
-        pose = touch.pose_body_from_tool
-        middle = middle + 2 * whole / float(pressed.forces.sum()) * normal
-        contact = np.array((middle, normal, carried_tangent(one.before.contact, normal, before.pressing > 0)))
-        relaxed = one.kept + fades * one.gain * at_rest
-        faded = float(shares @ relaxed)
-        by, doubt, trail, left = force / elastic, ROUGH * long * faded, one.before.trail, None
+        by, trail = force / elastic, one.before.trail
+        changed: dict[str, Any] = {}
         if len(trail):
-            passing = wake.Pass(pose, middle, normal, relaxed, at_rest, touch.depth, pressed.power, 1 - long, radius)
+            passing = wake.Pass(pose, contact[0], contact[1], relaxed, at_rest, touch.depth, pressed.power, 1 - long,
+                                radius)  # fmt: skip
             trail = wake.after(trail, self.series, dt, passing)
-            left = wake.Wake(trail, shares)
-        whole *= 0.5 + 0.5 / pressed.factor  # what draws a tool back from the core is steep: it stores less
-        stored = whole * left_over(faded / at_rest, pressed.power, 1 - long)
-        wrench = by * touch.wrench
-        scalars = Scalars(1.0, at_rest, max(at_rest, before.largest), net, radius, touch.depth, at_rest, pressed.power,
-                          work=before.work, stretch=long, surface=one.stated.tool.number,
-                          passed_first=one.passed[0], passed_second=one.passed[1], passed=one.passed[2])  # fmt: skip
-        springs = NOTHING, one.before.springs, one.before.springs_relaxed
-        if self.friction(touch.name) > 0 and net > MIN_ONE_WAY_SHARE:
-            give, bend = self.toucher.give(nodes, pressed.forces), self.toucher.curvature(nodes, pressed.forces)
-            dragged = self._dragged(one, wrench, contact, pose[:3, 3], scalars, force, lever, thickness, give, bend, dt,
-                                    LOST * pressed.along)
-            lean, grown = dragged.slip.lean, dragged.slip.grown
-            changed = scaled(touch, grown * by, grown * doubt)
-            wrench = grown * dragged.slid * wrench + wrench_at(lean, middle - pose[:3, 3])
+            changed["wake"] = wake.Wake(trail, shares)
+        share, limit, slid, held, room = 1.0, 0.0, 1.0, 0.0, NO_ROOM
+        stiffness, springs, eased = NO_ROOM, one.before.springs, one.before.springs_relaxed
+        mu = self.friction(touch.name)
+        if mu > 0 and net > MIN_ONE_WAY_SHARE:
+            give = self.toucher.give(nodes, pressed.forces)
+            (wrench, rubs, share, offset, turn, lean, grown, limit, stiffness, springs, eased, bent, slid, held,
+             room) = rub(
+                by * touch.wrench, NONE if stated is None else stated, stated is not None, contact, pose[:3, 3],
+                self.toucher.curvature(nodes, pressed.forces), FLAT if give is None else give, mu,
+                LOST * pressed.along, force, lever, at_rest, touch.depth, radius, pressed.power,
+                *self.sideways.at(radius, thickness), one.twist, one.known, before.pressing > 0, one.before.contact,
+                before.elastic, one.before.slid, before.held,
+                np.array((before.rolled_first, before.rolled_second, before.rolled)), one.before.springs,
+                one.before.springs_relaxed, one.before.stiffness, *self.series, dt)  # fmt: skip
+            changed |= scaled(touch, grown * by, grown * doubt)
             if self.toucher.layer.tissue.skin is not None:
-                rubs = dragged.slip.wrench[:3]
                 pressing = math.sqrt(wrench[:3] @ wrench[:3])
-                besides = RUBBED * pressing + PILED * float(rubs @ rubs) / pressing
+                besides = RUBBED * pressing + PILED * float(rubs[:3] @ rubs[:3]) / pressing
                 changed["force_bound"] = changed.get("force_bound", touch.force_bound) + besides
-            wrench = wrench + dragged.slip.wrench
-            changed |= {"wrench": wrench, "slip": dragged.slip}
-            stored, whole = stored + dragged.stored, whole + 2 * dragged.stored
-            first, second, rolled = dragged.rolled
-            scalars = scalars._replace(share=dragged.slip.share, limit=dragged.limit, slid=dragged.slid,
-                                       held=dragged.held, rolled_first=first, rolled_second=second,
-                                       rolled=rolled)  # fmt: skip
-            springs = dragged.stiffness, dragged.springs, dragged.relaxed
+            wrench = wrench + rubs
+            changed |= {"wrench": wrench, "slip": Slip(rubs, share, offset, turn, contact[0], lean, grown)}
+            stored, whole = stored + bent, whole + 2 * bent
         else:
-            changed = scaled(touch, by, doubt)
-        if left is not None:
-            changed["wake"] = left
-        memory = Memory(one.stated.pose_body_from_tool, wrench, scalars, relaxed, contact, pose, *springs, trail)
+            wrench = by * touch.wrench
+            changed |= scaled(touch, by, doubt)
+        scalars = Scalars(1.0, at_rest, max(at_rest, before.largest), net, radius, touch.depth, at_rest, pressed.power,
+                          share, before.work, 1.0, limit, long, one.stated.tool.number, slid, 0.0, held, *room.tolist(),
+                          *one.passed.tolist())  # fmt: skip
+        memory = Memory(one.stated.pose_body_from_tool, wrench, scalars, relaxed, contact, pose, stiffness, springs,
+                        eased, trail)  # fmt: skip
         return Law(self._said(one, touch, changed), memory, stored, whole)
 
     def _free(self, one: Asked, touch: Touch, asked: float, dt: float) -> Law:
         """Skin that the tool does not hold comes back by itself; asked: force at rest that the tool asks for [N]."""
         before = one.before.scalars
         if touch.presses and touch.pressed is not None:
-            touch = replace(touch, status=APART, wrench=np.zeros(6), force_bound=0.0, pressure=None, pressed=None)
+            touch = touch.with_(status=APART, wrench=np.zeros(6), force_bound=0.0, pressure=None, pressed=None)
         memory = self._back(one.before, dt, one.gone, asked)
         memory = memory._replace(pose=one.stated.pose_body_from_tool, wrench=touch.wrench,
                                  scalars=memory.scalars._replace(pressing=0.0))  # fmt: skip
@@ -346,70 +271,14 @@ class History:
         return _let_go(memory._replace(scalars=scalars, relaxed=relaxed,
                                        trail=wake.after(memory.trail, self.series, dt, None)))  # fmt: skip
 
-    def _dragged(self, one: Asked, wrench: Wrench, contact: np.ndarray, origin: np.ndarray, scalars: Scalars,
-                 force: float, lever: float, thickness: float, give: np.ndarray | None, bend: np.ndarray, dt: float,
-                 along_itself: float) -> _Dragged:  # fmt: skip
-        """Friction of a contact that presses with a wrench (6,), as the scalars say, without friction.
-
-        Friction turns the way that the push faces, and the push bounds friction: both are asked until they agree.
-        What skin carried along itself while it stuck (stmpl_core.wrenches) a drag takes from it, as far as it is used
-        up. When it turns back that does not come back, but where the tool presses on.
-        """
-        before, radius, depth = one.before, scalars.radius, scalars.depth
-        patch, mu = self.sideways.at(radius, thickness), self.friction(one.stated.name)
-        stated, wanted, turned, out, held, slid = one.stated.wrench, NOTHING, NOTHING, 0.0, 1.0, before.slid
-        if before.stiffness[0] > 0:
-            turned, out = faced(before.springs, before.stiffness, contact, bend, MOST_LEAN)
-        had = before.scalars
-        way, rolled, room = way_of_tool(
-            one.twist, one.known, before.contact, had.pressing > 0, contact, origin, depth, radius, lever,
-            np.array((had.rolled_first, had.rolled_second, had.rolled)))  # fmt: skip
-        was = float(before.stiffness[0])
-        last_held = had.held or was
-        held_at = before.stiffness * (last_held / was) if was > 0 else before.stiffness
-        size, lost = math.sqrt(wrench[:3] @ wrench[:3]), (1 - before.slid) * before.scalars.elastic / scalars.elastic
-        for _ in range(MOST_PASSES):
-            if stated is None:
-                grown = max(1 + out / depth, LEAST_GROWN) ** scalars.power
-            else:
-                held, lean = carried_more(stated, contact[1], turned) * before.slid, size * turned
-                grown, push = held / slid, held * (wrench + wrench_at(lean, contact[0] - origin))
-                wanted = in_plane(stated - push, leaned(contact, turned), origin, lever)
-            stiffer, cap = ploughing(depth, radius, grown * force, patch.along, patch.bare, mu)
-            alone = along = stiffer * patch.secant(mu * grown * force)
-            if give is not None:
-                aim = wanted if stated is not None else before.springs.sum(axis=0) + along * way
-                along = given_way(along, give, aim, contact)
-            if out > 0:  # skin leans before the tool once: as it turns about the bone, or as it is ploughed
-                by_turn = max(1 - along / alone, 0.0) * math.sqrt(turned @ turned)
-                cap -= min(by_turn * grown * force, cap - mu * grown * force)
-            stiffness = np.array((along, along, stiffer * patch.turn / (lever * lever)))
-            springs, relaxed, carried, share, stored = drag(
-                before.springs, before.springs_relaxed, *self.series, dt, rolled, stiffness, held_at, cap, way,
-                wanted, stated is not None)  # fmt: skip
-            last, (turned, out) = turned, faced(springs, stiffness, contact, bend, MOST_LEAN)
-            took = along_itself * min(math.sqrt(carried @ carried) / cap, 1.0)
-            before_slid, slid = slid, 1 - max(took, min(lost, along_itself))
-            if abs(turned - last).max() + abs(slid - before_slid) < SETTLED:
-                break
-        grown = grown if stated is None else held / slid
-        rubs, offset, turn = in_space(carried, springs, stiffness, leaned(contact, turned), contact, origin, lever)
-        stored += max(0.5 * (1 + grown * slid) * size * out, 0.0)
-        slip = Slip(rubs, share, offset, turn, contact[0], grown * slid * size * turned, grown)
-        old, new = last_held and min(along, last_held), math.sqrt(float((springs.sum(axis=0) ** 2).sum()))
-        kept = old and old / last_held * math.exp(-rolled) * math.sqrt(float((before.springs.sum(axis=0) ** 2).sum()))
-        share_old = min(kept / new, 1.0) if new > 0 else 0.0  # what is new is held at what the patch is now
-        return _Dragged(slip, cap, stiffness, springs, relaxed, stored, slid, share_old * old + (1 - share_old) * along,
-                        room)  # fmt: skip
-
     def _said(self, one: Asked, touch: Touch, changed: dict[str, Any]) -> Touch:
         """The touch with what changed, with what of the stated wrench is missing, and what that says of it."""
         stated = one.stated.wrench
         if stated is None:
-            return replace(touch, **changed) if changed else touch
-        touch = replace(touch, **changed, missing=stated - changed.get("wrench", touch.wrench))
+            return touch.with_(**changed) if changed else touch
+        touch = touch.with_(**changed, missing=stated - changed.get("wrench", touch.wrench))
         trust = self.toucher.unmet(touch.trust, touch, stated)
-        return touch if trust is touch.trust else replace(touch, trust=trust)
+        return touch if trust is touch.trust else touch.with_(trust=trust)
 
     def elastic(self, touches: Sequence[Touch]) -> list[Touch]:
         """The touches of elastic skin without friction that move the skin as these do, but for what is dragged along.

@@ -70,7 +70,7 @@ def series_of(tissue: Tissue, thickness: float) -> Series:
     return Series(np.array([found[tau] for tau in times]), np.array(times))
 
 
-def fading(tissue: Tissue, thickness: float) -> tuple[np.ndarray, np.ndarray]:
+def fading(tissue: Tissue, thickness: float) -> np.ndarray:
     """How much more of a force fades under wide contacts than a Series says, and less under small ones.
 
     Skin's tension does not relax, and it holds much under a tip and little under a palm.
@@ -79,15 +79,16 @@ def fading(tissue: Tissue, thickness: float) -> tuple[np.ndarray, np.ndarray]:
         tissue, thickness: see series_of.
 
     Returns:
-        Logarithms of contacts' radii in metres, rising, (R,), and the factors there, (R,) [-]; 1 where nothing relaxes.
+        Logarithms of contacts' radii in metres, rising evenly, and the factors there [-], (2, R); 1 where nothing
+        relaxes.
     """
     radii = np.geomspace(*RADII)
     if tissue.single or not tissue.relaxes:
-        return np.log(radii), np.ones(len(radii))
+        return np.stack([np.log(radii), np.ones(len(radii))])
     each = _relaxations(tissue, thickness)
     fades = [sum(share * sum(one.shares) for one, share in zip(each, _shares(tissue, thickness, radius), strict=True)
                  if one) for radius in (*WIDER * radii, MIX_RADIUS)]  # fmt: skip
-    return np.log(radii), np.array(fades[:-1]) / max(fades[-1], 1e-300)
+    return np.stack([np.log(radii), np.array(fades[:-1]) / max(fades[-1], 1e-300)])
 
 
 def _relaxations(tissue: Tissue, thickness: float) -> list[Prony | None]:
@@ -114,6 +115,22 @@ def _shares(tissue: Tissue, thickness: float, radius: float = MIX_RADIUS) -> lis
 
     many = len(stack) + (tissue.skin is not None)
     return [(log_force(n, LOG_STEP) - log_force(n, -LOG_STEP)) / (2 * LOG_STEP) for n in range(many)]
+
+
+@numba.njit(cache=True, error_model="numpy")
+def faded(fades, radius):
+    """How much more of a force fades under a contact of a radius [m] than a Series says [-]; 1 where there is none.
+
+    Args:
+        fades: rows of `fading`: logarithms of radii, evenly, and the factors there, (2, R).
+        radius: radius of the contact [m]; 0: none.
+    """
+    if not radius > 0:
+        return 1.0
+    logs, factors = fades
+    at = min(max((np.log(radius) - logs[0]) / (logs[1] - logs[0]), 0.0), len(logs) - 1.0)
+    low = min(int(at), len(logs) - 2)
+    return factors[low] + (at - low) * (factors[low + 1] - factors[low])
 
 
 @numba.njit(cache=True, error_model="numpy")
@@ -237,7 +254,8 @@ def let_go(shares, times, dt, gone, before, after, relaxed):
     return out, there
 
 
-def left_over(relaxed: float, power: float, strain: float) -> float:
+@numba.njit(cache=True, error_model="numpy")
+def left_over(relaxed, power, strain):
     """What skin gives back when it is let go at once, over the energy of elastic skin, of which a share has relaxed.
 
     The integral of x^power - relaxed (1 - x strain) / (1 - strain) over x, from where that is 0 to 1, times power + 1.

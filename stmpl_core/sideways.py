@@ -45,12 +45,18 @@ class Patch(NamedTuple):
         the sheet pushes back with F cos(angle) / (2 pi a) ahead. What is beyond its tension T there, from cos(angle) =
         2 pi a T / F on, is lost: a quarter of what skin carries in the end.
         """
-        carried = force * (1 - self.bare / self.along)
-        if not carried > self.slack:
-            return self.along
-        angle = math.acos(self.slack / carried)
-        lost = (angle - math.sin(angle) * self.slack / carried) / (2 * math.pi)
-        return self.along - lost * (self.along - self.bare)
+        return secant(self.along, self.bare, self.slack, force)
+
+
+@numba.njit(cache=True, error_model="numpy")
+def secant(along, bare, slack, force):
+    """See Patch.secant, and Patch for the arguments."""
+    carried = force * (1 - bare / along)
+    if not carried > slack:
+        return along
+    angle = np.arccos(slack / carried)
+    lost = (angle - np.sin(angle) * slack / carried) / (2 * np.pi)
+    return along - lost * (along - bare)
 
 
 def patch(tissue: Tissue, thickness: float, radius: float) -> Patch:

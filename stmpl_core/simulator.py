@@ -176,7 +176,7 @@ class Simulator:
             behind, there, _ = self._moved([touch])
             solved = replace(solved, trust=_lower(solved.trust, behind.trust))
             fitted = _deeper(fitted, share, there, -self.layer.normals)
-            moves.append(replace(touch, depth=share * touch.depth))
+            moves.append(touch.with_(depth=share * touch.depth))
 
         fitted, left = self._sunk(fitted, touches)
 

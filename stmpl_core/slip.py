@@ -19,7 +19,9 @@ from typing import NamedTuple
 import numba
 import numpy as np
 
+from stmpl_core.footing import carried_more, faced, given_way, in_plane, in_space, leaned, way_of_tool, wrench_at
 from stmpl_core.relaxation import weights
+from stmpl_core.sideways import secant
 
 SPRINGS = 8
 _LEFT = (1 - np.arange(SPRINGS + 1) / SPRINGS) ** (4 / 3)  # 1 - x / 1.5 where springs begin to slide; finer at the end
@@ -31,6 +33,9 @@ TRIALS, TOLERANCE = 30, 1e-9  # of the way for a force; over the cap
 MOST_CARRIED = 0.9999  # share of the cap that sticks: a force at the cap has no way
 PART, PARTS = 0.25, 16  # way over cap / k from which a step is cut, for a slide that turns; most parts
 PLOUGHED = 0.33, 0.2, 0.67  # see ploughing: growth of stiffness, and of the cap without and over mu
+MOST_LEAN = 0.5  # turn of the normal under skin that is dragged along, of which a push takes note [rad]
+LEAST_GROWN = 0.5  # depth over the tool's that counts at least, where skin came from a hollow
+MOST_PASSES, SETTLED = 4, 1e-3  # turn of the normal [rad] at which push and friction agree
 
 
 class Drag(NamedTuple):
@@ -51,9 +56,8 @@ class Drag(NamedTuple):
     stored: float
 
 
-def ploughing(
-    depth: float, radius: float, force: float, along: float, bare: float, friction: float
-) -> tuple[float, float]:
+@numba.njit(cache=True, error_model="numpy")
+def ploughing(depth, radius, force, along, bare, friction):
     """Factor on the stiffness of a patch [-], and force at which it slides [N].
 
     Skin that is dragged rises before the tool and leans on it: with r = (depth / a) N / (k_t a) the patch is stiffer by
@@ -228,3 +232,93 @@ def _find(wanted, stiffness, cap, start, left, over, springs, force, slides, go)
             step *= 2 * cap / np.sqrt(far)
         for x in range(3):
             go[x] += step[x]
+
+
+@numba.njit(cache=True, error_model="numpy")
+def rub(wrench, stated, by_force, contact, origin, bend, give, mu, along_itself, force, lever, elastic, depth, radius,
+        power, along, turn, bare, slack, twist, known, pressed, before_contact, before_elastic, before_slid,
+        before_held, room, springs, relaxed, stiffness, shares, times, dt):  # fmt: skip
+    """Friction of a contact that would press with a wrench (6,) without friction.
+
+    Friction turns the way that the push faces, and the push bounds friction: both are asked until they agree.
+    What skin carried along itself while it stuck (stmpl_core.wrenches) a drag takes from it, as far as it is used
+    up. When it turns back that does not come back, but where the tool presses on.
+
+    Args:
+        wrench, stated: wrench without friction and that to carry, (6,) [N, N m]; the latter is read by force.
+        by_force: whether the contact is told by a wrench.
+        contact: contact, see Memory, (3, 3).
+        origin: origin of the tool, (3,) [m].
+        bend: curvature of the skin there, (3, 3) [1/m].
+        give: how it gives along the skin beyond a flat layer, (3, 3) [m/N].
+        mu: coefficient of friction [-].
+        along_itself: what skin carries along itself once all of it slides, over its force [-].
+        force: normal force [N].
+        lever: mean distance of the forces from the middle [m].
+        elastic, depth, radius, power: see Scalars.
+        along, turn, bare, slack: see Patch.
+        twist, known: see Asked (stmpl_core.balance).
+        pressed: whether the tool pressed before the step.
+        before_contact, before_elastic, before_slid, before_held: see Memory and Scalars, before the step.
+        room: Scalars.rolled_first, .rolled_second and .rolled before it, (3,) [m].
+        springs, relaxed, stiffness: see Memory, before it.
+        shares, times: series of the relaxation, (P,) each.
+        dt: time of the step [s].
+
+    Returns:
+        push, rubs: wrench of the push and that of friction, (6,) each [N, N m].
+        share, offset, turn, lean, grown: see Slip.
+        cap: tangential force at which all of it slides [N].
+        stiffness, springs, relaxed: see Memory, after the step.
+        stored: energy that springs and bent skin store [J].
+        slid, held, room: see Scalars.
+    """
+    wanted, turned, out, carries, slid = np.zeros(3), np.zeros(3), 0.0, 1.0, before_slid
+    if stiffness[0] > 0:
+        turned, out = faced(springs, stiffness, contact, bend, MOST_LEAN)
+    way, rolled, room = way_of_tool(twist, known, before_contact, pressed, contact, origin, depth, radius, lever, room)
+    was = stiffness[0]
+    last_held = before_held if before_held > 0 else was
+    held_at = stiffness * (last_held / was) if was > 0 else stiffness.copy()
+    size = np.sqrt(wrench[0] ** 2 + wrench[1] ** 2 + wrench[2] ** 2)
+    lost = (1 - before_slid) * before_elastic / elastic
+    before = np.array([springs[:, x].sum() for x in range(3)])
+    arm, grown, cap, share, stored = contact[0] - origin, 1.0, 0.0, 0.0, 0.0
+    carried, after, new, kept = np.zeros(3), stiffness.copy(), springs.copy(), relaxed.copy()
+    for _ in range(MOST_PASSES):
+        if by_force:
+            carries = carried_more(stated, contact[1], turned) * before_slid
+            grown = carries / slid
+            push = carries * (wrench + wrench_at(size * turned, arm))
+            wanted = in_plane(stated - push, leaned(contact, turned), origin, lever)
+        else:
+            grown = max(1 + out / depth, LEAST_GROWN) ** power
+        stiffer, cap = ploughing(depth, radius, grown * force, along, bare, mu)
+        alone = stiffer * secant(along, bare, slack, mu * grown * force)
+        sticks = given_way(alone, give, wanted if by_force else before + alone * way, contact)
+        if out > 0:  # skin leans before the tool once: as it turns about the bone, or as it is ploughed
+            by_turn = max(1 - sticks / alone, 0.0) * np.sqrt(np.sum(turned**2))
+            cap -= min(by_turn * grown * force, cap - mu * grown * force)
+        after = np.array([sticks, sticks, stiffer * turn / (lever * lever)])
+        new, kept, carried, share, stored = drag(
+            springs, relaxed, shares, times, dt, rolled, after, held_at, cap, way, wanted, by_force)  # fmt: skip
+        last, last_slid = turned, slid
+        turned, out = faced(new, after, contact, bend, MOST_LEAN)
+        slid = 1 - max(along_itself * min(np.sqrt(np.sum(carried**2)) / cap, 1.0), min(lost, along_itself))
+        if np.abs(turned - last).max() + abs(slid - last_slid) < SETTLED:
+            break
+    if by_force:
+        grown = carries / slid
+    rubs, offset, turns = in_space(carried, new, after, leaned(contact, turned), contact, origin, lever)
+    stored += max(0.5 * (1 + grown * slid) * size * out, 0.0)
+    lean = grown * slid * size * turned
+    held, total = min(after[0], last_held) if last_held > 0 else 0.0, 0.0
+    for x in range(3):
+        total += new[:, x].sum() ** 2
+    if held > 0 and total > 0:  # what is new is held at what the patch is now
+        old = held / last_held * np.exp(-rolled) * np.sqrt(np.sum(before**2) / total)
+        held = after[0] + min(old, 1.0) * (held - after[0])
+    else:
+        held = after[0]
+    push = grown * slid * wrench + wrench_at(lean, arm)
+    return push, rubs, share, offset, turns, lean, grown, cap, after, new, kept, stored, slid, held, room

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections import OrderedDict
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from itertools import count
 from typing import Any, NamedTuple
 from weakref import WeakKeyDictionary, WeakValueDictionary
@@ -181,7 +180,7 @@ class SoftBody:
             on_body -= tools[name] + np.concatenate([np.zeros(3), np.cross(lever, tools[name][:3])])
         touches = made.touches
         if beyond := jointed.beyond(data):
-            touches = {name: replace(touch, trust=touch.trust.also(beyond, in_range=False))
+            touches = {name: touch.with_(trust=touch.trust.also(beyond, in_range=False))
                        for name, touch in touches.items()}  # fmt: skip
         return Reaction(tools, on_body, touches, made.memory)
 

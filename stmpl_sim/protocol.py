@@ -256,7 +256,7 @@ class SoftContact:
         near = [Contact(self.tools[name], pose) for name, pose in at.items() if not free.get(name, 0.0) > 0]
         found, tissue = self.simulator.touch(near, memory.tissue, memory.waited + dt)
         through = frozenset(touch.name for touch in found if self._went_through(touch, at[touch.name], memory))
-        found = [replace(touch, trust=touch.trust.also(WENT_THROUGH.format(name=touch.name), in_range=False))
+        found = [touch.with_(trust=touch.trust.also(WENT_THROUGH.format(name=touch.name), in_range=False))
                  if touch.name in through else touch for touch in found]  # fmt: skip
         hole, seen, models = self.simulator.toucher.hole, self._seen, {}
         free |= {touch.name: min(-touch.depth, seen) - hole for touch in found if touch.status == APART}
@@ -296,13 +296,13 @@ class SoftContact:
                 free[name] = 0.0 if _has_imprint(memory.tissue, name) else self._free(name, pose, memory)
                 if not free[name] > 0:
                     return None
-                touches[name] = replace(touch, pose_body_from_tool=pose)
+                touches[name] = touch.with_(pose_body_from_tool=pose)
                 continue
             there = pose @ _inverse(asked.at[name]) @ model.pose_body_from_tool
             rendered = model.wrench_at(there)
             if not rendered.inside:
                 return None
-            touches[name] = replace(touch, wrench=rendered.wrench, pose_body_from_tool=there)
+            touches[name] = touch.with_(wrench=rendered.wrench, pose_body_from_tool=there)
         later = replace(asked, steps=asked.steps + 1)
         return touches, Memory(memory.tissue, at, free=free, asked=later, waited=memory.waited + dt,
                                pushes=memory.pushes, through=memory.through)  # fmt: skip
