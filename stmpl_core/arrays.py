@@ -23,6 +23,18 @@ def cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return np.array([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx])
 
 
+@numba.njit(cache=True, nogil=True)
+def inverted(pose):
+    """The inverse of a rigid transform (4, 4), far sooner than numpy's of a matrix."""
+    out = np.zeros((4, 4))
+    out[3, 3] = 1.0
+    for x in range(3):
+        for y in range(3):
+            out[x, y] = pose[y, x]
+            out[x, 3] -= pose[y, x] * pose[y, 3]
+    return out
+
+
 @numba.njit(cache=True, nogil=True, fastmath={"reassoc", "nsz"})
 def _all_finite(values):
     """Whether all values (N,) are finite: a tenth of numpy's time on a limb."""

@@ -5,9 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
+import numba
 import numpy as np
 
-from stmpl_core.arrays import Wrench, cross
+from stmpl_core.arrays import Wrench
 from stmpl_sim.engine import mujoco
 
 FILTER_S = 3e-3  # time constant of the force's rate [s]
@@ -107,12 +108,11 @@ class ForceImpedance:
         self._motors = np.array([motors[j] for j in joints])
         self._rest = qpos[self._places].copy()
         self._jacobian, self._rate = np.zeros((6, model.nv)), np.zeros((6, model.nv))
-        self._mass = np.zeros((model.nv, model.nv))
-        self.reset()
+        self._mass, self._felt = np.zeros((model.nv, model.nv)), np.zeros(3)
 
     def reset(self) -> None:
         """Forgets the force."""
-        self.integral = self.felt = self.rate = 0.0
+        self._felt[:] = 0.0
 
     def torques(self, data: Any, goal: Goal, wrench: Wrench, stiffness: float, dt: float) -> np.ndarray:
         """Torques of the arm's motors, (joints,) [N m].
@@ -124,76 +124,106 @@ class ForceImpedance:
             stiffness: stiffness of the contact along the normal [N/m], of use with a closed force; 0: nothing presses.
             dt: time since the last call [s].
         """
-        model, g, n = self.model, self.gains, goal.normal
-        x = data.geom_xpos[self._tool]
+        model, dofs, x, g = self.model, self._dofs, data.geom_xpos[self._tool], self.gains
         mujoco.mj_jac(model, data, self._jacobian[:3], self._jacobian[3:], x, self._body)
         mujoco.mj_jacDot(model, data, self._rate[:3], self._rate[3:], x, self._body)
         mujoco.mj_fullM(model, data, self._mass)
-        mass, dq = self._mass[np.ix_(self._dofs, self._dofs)], data.qvel[self._dofs]
-        jacobian, bend = self._jacobian[:, self._dofs], self._rate[:, self._dofs] @ dq
-        mobility = np.linalg.inv(mass)
-        inertia = np.linalg.inv(jacobian[:3] @ mobility @ jacobian[:3].T + 1e-6 * np.eye(3))
-
-        # Motion: along the skin and of the tool's axis; without a force over the skin, too.
-        velocity = jacobian @ dq
-        off = goal.point - x
-        over = -(off @ n) * n  # the tool's origin goes round with the normal
-        lag = goal.velocity + cross(goal.spin, over) - velocity[:3]
-        ahead = goal.acceleration + cross(goal.swing, over) + cross(goal.spin, cross(goal.spin, over))
-        asked = ahead + 2 * g.ratio * g.along * lag + g.along**2 * off
-        axis = data.geom_xmat[self._tool].reshape(3, 3)[:, 2]
-        turned = goal.swing + 2 * g.ratio * g.turn * (goal.spin - velocity[3:]) + g.turn**2 * cross(axis, -n) - bend[3:]
-        felt, lift = float(wrench[:3] @ n), float(ahead @ n)
-        along = wrench[:3] - felt * n
-        against = np.zeros(3)  # what is taken back of what the skin pushes
-        if goal.force is None:
-            lift += 2 * g.ratio * g.along * (lag @ n) + g.along**2 * (goal.height + off @ n)
-            self.reset()
-            against = wrench[:3]
-        elif goal.closed and stiffness > 0:
-            lift -= self._pressed(goal.force, goal.growth, felt, stiffness, float(n @ inertia @ n), dt)
-            against = wrench[:3]
-        else:
-            self.felt, self.rate = felt, 0.0
-            against = along + n * (goal.force - g.into * (lag @ n))
-        asked += (lift - asked @ n) * n - bend[:3]
-
-        torques = jacobian[:3].T @ (inertia @ asked)
-        free = np.eye(len(dq)) - mobility @ jacobian[:3].T @ inertia @ jacobian[:3]
-        for ways in (_square_to(axis), axis[None]):  # pointing, then spin
-            rows = ways @ jacobian[3:]
-            left = rows @ free
-            heft = _inverse(left @ mobility @ left.T, float(np.trace(rows @ mobility @ rows.T)))
-            torques += left.T @ (heft @ (ways @ turned - rows @ mobility @ torques))
-            free -= mobility @ left.T @ heft @ left
-        posture = mass @ (g.posture**2 * (self._rest - data.qpos[self._places]) - 2 * g.posture * dq)
-        known = data.qfrc_bias[self._dofs] - data.qfrc_passive[self._dofs]
-        return torques - jacobian[:3].T @ against + free.T @ posture + known
-
-    def _pressed(self, force: float, growth: float, felt: float, stiffness: float, mass: float, dt: float) -> float:
-        """Acceleration into the skin that a force's error asks for [m/s2]."""
-        g, error = self.gains, force - felt
-        self.rate += min(1.0, dt / FILTER_S) * ((felt - self.felt) / dt - self.rate)
-        self.integral += g.integral * error * dt
-        self.felt = felt
-        k = stiffness * max(1.0, force / max(felt, 1e-3)) ** STEEPER  # where it is going
-        w = max(g.force, np.sqrt(k / mass))
-        asked = (w**2 * (error + self.integral) + 2 * g.ratio * w * (growth - self.rate)) / k
-        return float(np.clip(asked, -MOST, MOST))
+        return _torques(
+            self._jacobian, self._rate, self._mass, dofs, data.qvel[dofs], self._rest - data.qpos[self._places],
+            data.qfrc_bias[dofs] - data.qfrc_passive[dofs], goal.point - x, data.geom_xmat[self._tool, 2::3].copy(),
+            goal.velocity, goal.acceleration, goal.normal, goal.spin, goal.swing,
+            np.nan if goal.force is None else float(goal.force), float(goal.growth), float(goal.height), goal.closed,
+            wrench, stiffness, dt, (g.along, g.turn, g.ratio, g.into, g.force, g.integral, g.posture),
+            self._felt)  # fmt: skip
 
     def command(self, data: Any, goal: Goal, wrench: Wrench, stiffness: float, dt: float) -> None:
         """Writes the torques into `data.ctrl`."""
         data.ctrl[self._motors] = self.torques(data, goal, wrench, stiffness, dt)
 
 
-def _square_to(axis: np.ndarray) -> np.ndarray:
+@numba.njit(cache=True)
+def _torques(jacobian, rate, mass, dofs, dq, away, known, off, axis, velocity, acceleration, n, spin, swing, force,
+             growth, height, closed, wrench, stiffness, dt, gains, felt):  # fmt: skip
+    """See ForceImpedance; numpy's own calls take six times as long.
+
+    Args:
+        jacobian, rate, mass: of all of the model's motions, (6, nv), (6, nv), (nv, nv).
+        dofs: those of the arm, (joints,).
+        dq, away, known: its rates, how far it is from its posture, and torques of gravity, Coriolis and damping.
+        off, axis: from the tool to the goal's point, and the tool's axis, (3,).
+        velocity, acceleration, n, spin, swing, force, growth, height, closed: see Goal; force: NaN for none.
+        wrench, stiffness, dt: see ForceImpedance.torques.
+        gains: see Gains, in that order.
+        felt: integral of the force's error [N], force that was felt [N] and its rate [N/s]; written to.
+    """
+    many = len(dofs)
+    moves, turns, bend, weight = np.empty((3, many)), np.empty((3, many)), np.zeros(6), np.empty((many, many))
+    for j in range(many):
+        for i in range(3):
+            moves[i, j], turns[i, j] = jacobian[i, dofs[j]], jacobian[3 + i, dofs[j]]
+        for i in range(6):
+            bend[i] += rate[i, dofs[j]] * dq[j]
+        for i in range(many):
+            weight[i, j] = mass[dofs[i], dofs[j]]
+    along, turn, ratio, into, quickest, integral, posture = gains
+    mobility = np.linalg.inv(weight)
+    inertia = np.linalg.inv(moves @ mobility @ moves.T + 1e-6 * np.eye(3))
+
+    # Motion: along the skin and of the tool's axis; without a force over the skin, too.
+    over = -(off @ n) * n  # the tool's origin goes round with the normal
+    lag = velocity + _cross(spin, over) - moves @ dq
+    ahead = acceleration + _cross(swing, over) + _cross(spin, _cross(spin, over))
+    asked = ahead + 2 * ratio * along * lag + along**2 * off
+    turned = swing + 2 * ratio * turn * (spin - turns @ dq) + turn**2 * _cross(axis, -n) - bend[3:]
+    against, lift = wrench[:3].copy(), ahead @ n  # against: what is taken back of what the skin pushes
+    feels = against @ n
+    if np.isnan(force):
+        lift += 2 * ratio * along * (lag @ n) + along**2 * (height + off @ n)
+        felt[:] = 0.0
+    elif closed and stiffness > 0:  # acceleration into the skin that a force's error asks for
+        error = force - feels
+        felt[2] += min(1.0, dt / FILTER_S) * ((feels - felt[1]) / dt - felt[2])
+        felt[0] += integral * error * dt
+        felt[1] = feels
+        k = stiffness * max(1.0, force / max(feels, 1e-3)) ** STEEPER  # where it is going
+        w = max(quickest, np.sqrt(k / (n @ (inertia @ n))))
+        pushed = (w**2 * (error + felt[0]) + 2 * ratio * w * (growth - felt[2])) / k
+        lift -= min(max(pushed, -MOST), MOST)
+    else:
+        felt[1], felt[2] = feels, 0.0
+        against += (force - into * (lag @ n) - feels) * n
+    asked += (lift - asked @ n) * n - bend[:3]
+
+    torques = moves.T @ (inertia @ asked)
+    free = np.eye(many) - mobility @ moves.T @ inertia @ moves
+    for rows in (_square_to(axis) @ turns, axis.reshape(1, 3) @ turns):  # pointing, then spin
+        wanted = (_square_to(axis) if len(rows) == 2 else axis.reshape(1, 3)) @ turned
+        left = rows @ free
+        heft = _inverse(left @ mobility @ left.T, np.trace(rows @ mobility @ rows.T))
+        torques += left.T @ (heft @ (wanted - rows @ (mobility @ torques)))
+        free -= mobility @ left.T @ heft @ left
+    kept = weight @ (posture**2 * away - 2 * posture * dq)
+    return torques - moves.T @ against + free.T @ kept + known
+
+
+@numba.njit(cache=True)
+def _cross(a, b):
+    return np.array([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]])
+
+
+@numba.njit(cache=True)
+def _square_to(axis):
     """Two unit vectors square to an axis and to each other, (2, 3)."""
-    one = cross(axis, np.eye(3)[np.abs(axis).argmin()])
-    one /= np.linalg.norm(one)
-    return np.stack([one, cross(axis, one)])
+    least, out = np.zeros(3), np.empty((2, 3))
+    least[np.argmin(np.abs(axis))] = 1.0
+    one = _cross(axis, least)
+    out[0] = one / np.sqrt(one @ one)
+    out[1] = _cross(axis, out[0])
+    return out
 
 
-def _inverse(mobility: np.ndarray, whole: float) -> np.ndarray:
+@numba.njit(cache=True)
+def _inverse(mobility, whole):
     """Inertia of a mobility (n, n) of which something else took its share; none where next to nothing is left.
 
     Args:

@@ -11,7 +11,7 @@ from weakref import WeakKeyDictionary, WeakValueDictionary
 import numpy as np
 from numpy.typing import ArrayLike
 
-from stmpl_core.arrays import Transform, Wrench, cross
+from stmpl_core.arrays import Transform, Wrench, cross, inverted
 from stmpl_core.errors import InvalidInput
 from stmpl_core.friction import Friction
 from stmpl_core.layer import SoftLayer
@@ -169,7 +169,7 @@ class SoftBody:
         for name, pose in poses.tools.items():
             place = world[:3, :3].T @ (pose[:3, 3] - world[:3, 3])
             back = jointed.back(place, self.simulator.layer.vertices, self._posed, now)
-            backs[name] = world @ back @ np.linalg.inv(world)
+            backs[name] = world @ back @ inverted(world)
         there = Poses(poses.body, {name: backs[name] @ pose for name, pose in poses.tools.items()})
         made = self.contact.step(there, self.memory, dt, mobility)
         tools, on_body = {}, np.zeros(6)
@@ -345,8 +345,8 @@ def _add(rows: dict[int, Wrench], body: int, wrench: Wrench, lever: np.ndarray) 
 
 
 def _pose(position: np.ndarray, turn: np.ndarray) -> Transform:
-    pose = np.eye(4)
-    pose[:3, :3], pose[:3, 3] = turn.reshape(3, 3), position
+    pose = np.zeros((4, 4))
+    pose[:3, :3], pose[:3, 3], pose[3, 3] = turn.reshape(3, 3), position, 1.0
     return pose
 
 

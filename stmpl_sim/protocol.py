@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial import KDTree
 
-from stmpl_core.arrays import Transform, Wrench, cross
+from stmpl_core.arrays import Transform, Wrench, cross, inverted
 from stmpl_core.carrying import carry_at
 from stmpl_core.contact import Contact, rigid
 from stmpl_core.errors import InvalidInput
@@ -217,7 +217,7 @@ class SoftContact:
         memory = memory or Memory()
         body = _rigid("the body", poses.body)
         world_from_layer = body @ self.pose_body_from_layer
-        layer_from_world = _inverse(world_from_layer)
+        layer_from_world = inverted(world_from_layer)
         missing = [name for name in self.tools if name not in poses.tools]
         if missing:
             raise InvalidInput(f"there is no pose of {', '.join(missing)}; given: {', '.join(poses.tools) or 'none'}.")
@@ -298,7 +298,7 @@ class SoftContact:
                     return None
                 touches[name] = touch.with_(pose_body_from_tool=pose)
                 continue
-            there = pose @ _inverse(asked.at[name]) @ model.pose_body_from_tool
+            there = pose @ inverted(asked.at[name]) @ model.pose_body_from_tool
             rendered = model.wrench_at(there)
             if not rendered.inside:
                 return None
@@ -414,7 +414,8 @@ def _centre_of_pressure(touch: Touch) -> np.ndarray:
 
 def _way(before: Transform, now: Transform, point: np.ndarray) -> np.ndarray:
     """Way of a tool's point from one pose to another, after which it is here, (3,) [m]."""
-    return point - (before @ _inverse(now) @ np.append(point, 1.0))[:3]
+    at = (point - now[:3, 3]) @ now[:3, :3]
+    return point - before[:3, :3] @ at - before[:3, 3]
 
 
 def _rigid(name: str, pose: ArrayLike) -> Transform:
@@ -424,9 +425,3 @@ def _rigid(name: str, pose: ArrayLike) -> Transform:
     except InvalidInput as error:
         raise InvalidInput(f"{error} Has the simulation diverged? Try a shorter timestep.") from error
 
-
-def _inverse(pose: Transform) -> Transform:
-    out = np.eye(4)
-    out[:3, :3] = pose[:3, :3].T
-    out[:3, 3] = -out[:3, :3] @ pose[:3, 3]
-    return out

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
@@ -125,17 +126,21 @@ class Circle:
     harmonics: np.ndarray
 
     @cached_property
-    def _derived(self) -> np.ndarray:
-        """Coefficients of points and normals and of their first two derivatives by the angle, (HARMONICS + 1, 18)."""
-        k = np.arange(len(self.harmonics))[:, None]
+    def _derived(self) -> tuple[np.ndarray, np.ndarray]:
+        """Orders k, (HARMONICS + 1,), and of points and normals and of their first two derivatives by the angle the
+        coefficients of cos(k angle), then of sin, (2 HARMONICS + 2, 18).
+        """
+        k = np.arange(len(self.harmonics), dtype=float)[:, None]
         twice = np.where(k == 0, 1.0, 2.0) * self.harmonics
-        return np.concatenate([twice * (1j * k) ** order for order in range(3)], axis=1)
+        every = np.concatenate([twice * (1j * k) ** order for order in range(3)], axis=1)
+        return k[:, 0], np.concatenate([every.real, -every.imag])
 
     def at(self, angle: float) -> Place:
         """What lies at an angle [rad]."""
-        k = np.arange(len(self.harmonics))
-        values, rates, bends = (np.exp(1j * k * angle) @ self._derived).real.reshape(3, 6)
-        size = np.linalg.norm(values[3:])
+        k, derived = self._derived
+        turned = angle * k
+        values, rates, bends = (np.concatenate([np.cos(turned), np.sin(turned)]) @ derived).reshape(3, 6)
+        size = math.sqrt(values[3:] @ values[3:])
         normal = values[3:] / size
         shrink = rates[3:] @ normal / size
         tilt = rates[3:] / size - shrink * normal
