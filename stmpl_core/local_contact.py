@@ -11,6 +11,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
+import numba
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -249,12 +250,22 @@ def _neighbourhood(touch: Touch, pressed: Pressed, power: float, middle: np.ndar
     deep = SAFETY * touch.depth * (2 * AGREEMENT / (power * (power - 1))) ** 0.5
     reach = min(deep, radius * (2 * AGREEMENT / power) ** 0.5, WIDEST)
     assert pressed.forces is not None
-    points = pressed.squeeze.nodes.points[pressed.forces > 0]
-    rim = float(np.linalg.norm(points - middle, axis=1).max())
-    off = middle - touch.pose_body_from_tool[:3, 3]
-    along = touch.push / touch.force
-    aside = float(np.linalg.norm(off - along * (along @ off)))
-    return reach, reach / (aside + rim)
+    far = _arms(pressed.squeeze.nodes.points, pressed.forces, middle, touch.pose_body_from_tool[:3, 3], touch.push)
+    return reach, reach / far
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _arms(points, forces, middle, origin, push):
+    """How far the rim of a contact is from its middle, and that from the axis of the push through the origin [m]."""
+    rim = off = along = square = 0.0
+    for n in range(len(points)):
+        if forces[n] > 0:
+            rim = max(rim, np.sum((points[n] - middle) ** 2))
+    for x in range(3):
+        off += (middle[x] - origin[x]) ** 2
+        along += (middle[x] - origin[x]) * push[x]
+        square += push[x] ** 2
+    return np.sqrt(rim) + np.sqrt(max(off - along * along / square, 0.0))
 
 
 def _grip(touch: Touch, memory: Memory, lever: float) -> Grip:

@@ -146,7 +146,8 @@ class SignedDistance:
 
     def distance_gradient(self, points: ArrayLike) -> tuple[np.ndarray, Points]:
         """Distance (N,) [m] and its gradient (N, 3) [-], the outward direction of the tool."""
-        return _gradients(self.coefficients, self.origin, self.spacing, finite("points", points, (None, 3)))
+        points = finite("points", points, (None, 3))
+        return distances_and_gradients(self.coefficients, self.origin, self.spacing, points)
 
     def distance_gradient_hessian(self, points: ArrayLike) -> tuple[np.ndarray, Points, np.ndarray]:
         """Distance (N,) [m], gradient (N, 3) [-] and Hessian (N, 3, 3) [1/m], the tool's curvature."""
@@ -334,7 +335,7 @@ def jet_at(coefficients, origin, spacing, x, y, z):
 
 
 @numba.njit(cache=True, nogil=True)
-def _gradients(coefficients, origin, spacing, points):
+def distances_and_gradients(coefficients, origin, spacing, points):
     """Distance and gradient at each point."""
     value, gradient = np.empty(len(points)), np.empty((len(points), 3))
     for n in range(len(points)):

@@ -18,11 +18,10 @@ from typing import NamedTuple
 import numba
 import numpy as np
 
-from stmpl_core.columns import grid_of, middle_of
-from stmpl_core.layer import SoftLayer
+from stmpl_core.columns import grid_of
 from stmpl_core.nodes import FACING, Nodes
 from stmpl_core.rays import MAX_COLUMN_STRAIN, depth_in_column, distance_in_column, ray_from, wall_in
-from stmpl_core.sdf import SignedDistance
+from stmpl_core.sdf import distances_and_gradients
 from stmpl_core.touch import MIN_ONE_WAY_SHARE, Pressed, Touch
 from stmpl_core.toucher import Toucher, groups_of
 from stmpl_core.wrenches import unit_wrenches
@@ -43,20 +42,6 @@ class Tangent(NamedTuple):
     stiffness: np.ndarray
     whole: np.ndarray
     across: Mapping[str, np.ndarray]
-
-
-class _Rates(NamedTuple):
-    """What changes at nodes with each of six twists of their tool.
-
-    Args:
-        strain: strain, (6, N) [1/m, 1/rad].
-        sinking: depth, or on a stack `Nodes.sinking`, (6, N) [-, m/rad].
-        shares: barycentric coordinates, (6, N, 3).
-    """
-
-    strain: np.ndarray
-    sinking: np.ndarray
-    shares: np.ndarray
 
 
 def tangents(toucher: Toucher, touches: Sequence[Touch]) -> list[Tangent | None]:
@@ -94,61 +79,111 @@ def _of_group(toucher: Toucher, touches: Sequence[Touch]) -> list[Tangent]:
     ends = np.concatenate([[0], np.cumsum([len(nodes.area) for nodes in every])])
     slices = [slice(a, b) for a, b in pairwise(ends)]
     strain, sinking = np.zeros((2, 6 * len(touches), ends[-1]))
-    rates = []
+    moved, skin = [], (layer.vertices, layer.normals, layer.thickness)
     for k, (touch, one) in enumerate(zip(touches, parts, strict=True)):
-        rates.append(_rates(layer, one.field, touch.pose_body_from_tool, one.squeeze.nodes))
-        strain[6 * k : 6 * k + 6, slices[k]], sinking[6 * k : 6 * k + 6, slices[k]] = rates[k].strain, rates[k].sinking
+        low, high = one.field.tool_bounds
+        rows = slice(6 * k, 6 * k + 6)
+        strain[rows, slices[k]], sinking[rows, slices[k]], shares = _rates(
+            grid_of(one.field), 0.5 * (low + high), touch.pose_body_from_tool, *skin, *one.squeeze.nodes)  # fmt: skip
+        moved.append(shares)
     joined = every[0] if len(every) == 1 else Nodes.joined(every)
-    slopes = toucher.net.slopes(joined, strain, sinking) * (layer.tissue.youngs_modulus * joined.area)
+    slopes = toucher.net.slopes(joined, strain, sinking)
+    unit = layer.tissue.youngs_modulus
     out = []
-    for k, (touch, one) in enumerate(zip(touches, parts, strict=True)):
+    for k, (touch, one, nodes) in enumerate(zip(touches, parts, every, strict=True)):
         assert one.forces is not None
-        by = one.factor * slopes[:, slices[k]].reshape(len(touches), 6, -1)  # rates of its forces by each tool's twist
-        unit = unit_wrenches(layer.vertices, layer.vertex_area_vectors, layer.vertex_areas,
-                             touch.pose_body_from_tool[:3, 3], every[k].corners, one.stuck).reshape(-1, 6)  # fmt: skip
-        corners = by[:, :, :, None] * every[k].shares  # force at each
-        corners[k] += one.forces[:, None] * rates[k].shares
-        turned = (corners.reshape(len(touches), 6, -1) @ unit).transpose(0, 2, 1).copy()
         lean = 0.0 if touch.slip is None else touch.slip.lean  # its arm goes along with the contact
-        turned[k, 3:, :3] += _cross_matrix(touch.push - lean)
+        turned, whole = _turned(slopes[:, slices[k]], one.factor * unit, nodes.area, nodes.corners, nodes.shares,
+                                one.forces, moved[k], k, layer.vertices, layer.vertex_area_vectors,
+                                layer.vertex_areas, touch.pose_body_from_tool[:3, 3], one.stuck,
+                                touch.push - lean)  # fmt: skip
         across = {other.name: turned[m] for m, other in enumerate(touches) if m != k}
-        out.append(Tangent(turned[k], by[k].sum(axis=1), across))
+        out.append(Tangent(turned[k], whole, across))
     return out
 
 
-def _cross_matrix(force: np.ndarray) -> np.ndarray:
-    """Matrix of v -> force x v: what a translation v of the origin takes from a torque about it, -v x force."""
-    x, y, z = force
-    return np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _turned(slopes, unit, area, corners, shares, forces, moved, k, vertices, area_vectors, areas, origin, stuck,
+            push):  # fmt: skip
+    """Tangents of tool k by the twist of each of M tools, (M, 6, 6), and `Tangent.whole`.
+
+    Args:
+        slopes, unit: rates of the pressures at its nodes by each twist, (6 M, N), over a modulus [Pa].
+        area, corners, shares, forces, moved: see Nodes, Pressed and `_rates`.
+        vertices, area_vectors, areas, origin, stuck: see unit_wrenches.
+        push: what its torque's arm is of, (3,) [N]: it presses on as its origin moves by v, which takes v x push.
+    """
+    wrenches = unit_wrenches(vertices, area_vectors, areas, origin, corners, stuck)
+    out, whole = np.zeros((len(slopes) // 6, 6, 6)), np.zeros(6)
+    for row in range(len(slopes)):
+        m, i = divmod(row, 6)
+        for n in range(len(area)):
+            more = unit * area[n] * slopes[row, n]
+            for c in range(3):
+                force = more * shares[n, c]
+                if m == k:
+                    force += forces[n] * moved[i, n, c]
+                for x in range(6):
+                    out[m, x, i] += force * wrenches[n, c, x]
+            if m == k:
+                whole[i] += more
+    x, y, z = push
+    out[k, 3, 1] -= z
+    out[k, 3, 2] += y
+    out[k, 4, 0] += z
+    out[k, 4, 2] -= x
+    out[k, 5, 0] -= y
+    out[k, 5, 1] += x
+    return out, whole
 
 
-def _rates(layer: SoftLayer, field: SignedDistance, pose: np.ndarray, nodes: Nodes) -> _Rates:
-    """See _Rates."""
-    origin, turn, many = pose[:3, 3].copy(), pose[:3, :3], len(nodes.area)
-    columns = _columns(grid_of(field), pose, *nodes[:5])
-    places = [nodes.points + s[:, None] * nodes.inward for s in columns]
-    depth = nodes.strain * nodes.thickness
-    mean = (nodes.area * depth) @ nodes.inward
-    size = float(np.linalg.norm(mean))
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _rates(grid, middle, pose, vertices, normals, thicknesses, points, inward, thickness, area, strain, corners, shares,
+           sinking):  # fmt: skip
+    """What changes at nodes with each of six twists of their tool.
+
+    Args:
+        grid, middle: see columns.grid_of, and the middle of the tool's box, in its frame, (3,) [m].
+        pose: pose of the tool, (4, 4).
+        vertices, normals, thicknesses: of the skin.
+        points, inward, thickness, area, strain, corners, shares, sinking: see Nodes.
+
+    Returns:
+        Rates of strain, (6, N) [1/m, 1/rad]; of the depth, or on a stack of `Nodes.sinking`, (6, N) [-, m/rad]; and of
+        barycentric coordinates, (6, N, 3).
+    """
+    many, origin, turn = len(area), pose[:3, 3].copy(), np.ascontiguousarray(pose[:3, :3])
+    columns, depth = _columns(grid, pose, points, inward, thickness, area, strain), strain * thickness
+    mean, total = np.zeros(3), 0.0
+    for n in range(many):
+        total += area[n] * depth[n]
+        for x in range(3):
+            mean[x] += area[n] * depth[n] * inward[n, x]
+    size = np.sqrt(_dot(mean, mean))
     way = mean / max(size, 1e-300)
-    slanted = bool(len(nodes.sinking)) and size > MIN_ONE_WAY_SHARE * float(nodes.area @ depth)
-    if slanted:
-        sunk = nodes.sinking / np.maximum(nodes.inward @ way, 1e-3)
-        places.append(nodes.points + sunk[:, None] * way)
-    distance, gradient = field.distance_gradient((np.concatenate(places) - origin) @ turn)
-    distance, gradient = distance.reshape(-1, many), (gradient @ turn.T).reshape(-1, many, 3)
-    skin = layer.vertices, -layer.normals, layer.thickness
-    shares, go, turned, thicker = _carried(*skin, *nodes[:3], *nodes[5:7], way, origin, middle_of(field, pose))
-    strain, deeper = _deepened(*nodes[:5], columns, distance, gradient, go, turned, thicker, origin,
-                               field.half_thickness)  # fmt: skip
+    slanted = len(sinking) > 0 and size > MIN_ONE_WAY_SHARE * total
+    places = np.empty(((4 if slanted else 3) * many, 3))
+    for n in range(many):
+        for m in range(3):
+            places[m * many + n] = points[n] + columns[m, n] * inward[n]
+        if slanted:
+            places[3 * many + n] = points[n] + sinking[n] / max(_dot(inward[n], way), 1e-3) * way
+    found, out = distances_and_gradients(grid[0], grid[1], grid[2], (places - origin) @ turn)
+    distance, gradient = found.reshape(-1, many), (out @ turn.T).reshape(-1, many, 3)
+    moved, go, turned, thicker = _carried(vertices, normals, thicknesses, points, inward, thickness, corners, shares,
+                                          way, origin, turn @ middle + origin)  # fmt: skip
+    strains, deeper = _deepened(points, inward, thickness, area, strain, columns, distance, gradient, go, turned,
+                                thicker, origin, grid[3])  # fmt: skip
     if not slanted:
-        return _Rates(strain, deeper, shares)
-    rates = np.einsum("kn,nx->kx", nodes.area * deeper, nodes.inward) + \
-        np.einsum("n,knx->kx", nodes.area * depth, turned)  # fmt: skip
-    swung = (rates - np.outer(rates @ way, way)) / size
-    sinking = _sunk(nodes.points, nodes.inward, depth, nodes.sinking, way, swung, gradient[3], go, turned, deeper,
-                    origin)  # fmt: skip
-    return _Rates(strain, sinking, shares)
+        return strains, deeper, moved
+    swung = np.zeros((6, 3))
+    for k in range(6):
+        for n in range(many):
+            for x in range(3):
+                swung[k, x] += area[n] * (deeper[k, n] * inward[n, x] + depth[n] * turned[k, n, x])
+        swung[k] = (swung[k] - _dot(swung[k], way) * way) / size
+    sunk = _sunk(points, inward, depth, sinking, way, swung, gradient[3], go, turned, deeper, origin)
+    return strains, sunk, moved
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
@@ -183,7 +218,7 @@ def _carried(vertices, normals, thicknesses, points, inward, thickness, corners,
         for x in range(3):
             edge[x], other[x] = vertices[b, x] - vertices[a, x], vertices[c, x] - vertices[a, x]
             here[x] = points[n, x] - centre[x]
-            raw[x] = shares[n, 0] * normals[a, x] + shares[n, 1] * normals[b, x] + shares[n, 2] * normals[c, x]
+            raw[x] = -shares[n, 0] * normals[a, x] - shares[n, 1] * normals[b, x] - shares[n, 2] * normals[c, x]
         _cross(edge, other, face)
         size, root = _dot(face, face), 1 / np.sqrt(_dot(raw, raw))
         way = mean if _dot(mean, normal) > FACING else normal
@@ -211,7 +246,7 @@ def _carried(vertices, normals, thicknesses, points, inward, thickness, corners,
                 v, share = corners[n, m], moved[k, n, m]
                 thicker[k, n] += share * thicknesses[v]
                 for x in range(3):
-                    turns[x] += root * share * normals[v, x]
+                    turns[x] -= root * share * normals[v, x]
             up = _dot(turns, normal)
             for x in range(3):
                 turns[x] -= up * normal[x]
