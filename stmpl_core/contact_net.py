@@ -146,11 +146,9 @@ class ContactNet:
     def _network(self) -> tuple[np.ndarray, ...]:
         return tuple(self.weights.arrays[name] for name in ARRAYS["pressure"])
 
-    def unlike(self, nodes: Nodes, forces: np.ndarray) -> float:
-        """|log| of the tissue's thickness under forces (N,) at nodes, over the limb's median; 0 of one material."""
-        if self._green is None:
-            return 0.0
-        return abs(math.log(float(forces @ nodes.thickness) / (float(forces.sum()) * self._green.thickness)))
+    def unlike(self, thickness: float) -> float:
+        """|log| of the tissue's mean thickness under a contact [m], over the limb's median; 0 of one material."""
+        return 0.0 if self._green is None else abs(math.log(thickness / self._green.thickness))
 
     def look(self, nodes: Nodes) -> Look:
         """Solves the linear problem at the nodes, at least one, and gathers what the network reads."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 from copy import copy
 from typing import TYPE_CHECKING, NamedTuple, Self
 
+import numba
 import numpy as np
 import scipy.sparse as sp
 from scipy.spatial import KDTree
@@ -93,7 +94,7 @@ class Soundness:
         self.border = border_distance(layer) / layer.thickness
         self.facets = np.abs(below_curved(layer)) + roughness(layer)
         self.least_border = STACK_BORDER if layer.stacked else BORDER
-        self._doubtful = self.steep | self.long | (self.border < self.least_border)
+        self._near = self.border < self.least_border
 
     def at(self, bend: Bend) -> Self:
         """The same of a skin that joints have bent."""
@@ -122,11 +123,21 @@ class Soundness:
 
     def of_contact(self, loaded: np.ndarray, force: np.ndarray) -> list[str]:
         """What is wrong with the skin under a tool that presses with forces (L,) on vertices (L,), as sentences."""
-        if self.bend is None and not self._doubtful[loaded].any():
-            return []
-        total = max(float(force.sum()), 1e-300)
-        steep, long = (float(force[mask[loaded]].sum()) / total for mask in (self.steep, self.long))
-        return [*self.of_mesh(steep, long, "the force"), *self.of_load(loaded, force)]
+        steep, long, near = _shares(loaded, force, self.steep, self.long, self._near)
+        sound = steep <= STEEP_SHARE and long <= LONG_SHARE
+        told = [] if sound else self.of_mesh(steep, long, "the force")
+        return told if self.bend is None and near <= BORDER_SHARE else [*told, *self.of_load(loaded, force)]
+
+
+@numba.njit(cache=True, nogil=True)
+def _shares(loaded, force, *masks):
+    """Shares of forces (L,) on vertices (L,) that are on masks (V,) of all vertices."""
+    total, out = 1e-300, np.zeros(len(masks))
+    for n in range(len(loaded)):
+        total += force[n]
+        for m in range(len(masks)):
+            out[m] += force[n] if masks[m][loaded[n]] else 0.0
+    return out / total
 
 
 def slope_of_thickness(layer: SoftLayer) -> np.ndarray:

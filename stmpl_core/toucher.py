@@ -363,17 +363,17 @@ class Toucher:
         among: what `pins` says of the tools that press beside it, if there are many.
         """
         layer, nodes, unit = self.layer, one.squeeze.nodes, one.factor * self._modulus
-        v, pressure, values, wrench, forces, scale, size, doubt, strange, stuck, along, below = _carried(
-            nodes.corners, nodes.shares, nodes.area, *held[:3], unit, math.nan if one.force is None else one.force,
-            layer.vertex_areas, layer.vertices, layer.vertex_area_vectors, one.pose[:3, 3], layer.stacked,
-            self.near.sound.facets)  # fmt: skip
+        v, pressure, values, wrench, forces, scale, size, doubt, strange, stuck, along, below, thickness = _carried(
+            nodes.corners, nodes.shares, nodes.area, nodes.thickness, *held[:3], unit,
+            math.nan if one.force is None else one.force, layer.vertex_areas, layer.vertices,
+            layer.vertex_area_vectors, one.pose[:3, 3], layer.stacked, self.near.sound.facets)  # fmt: skip
         stated = one.contact.wrench
         depth = self._depth(one.squeeze) if len(v) and not one.factor > 1 else one.depth
         way = stated[:3] / np.linalg.norm(stated[:3]) if stated is not None and stated[:3].any() else None
         known = self.net.weights.card["bound"]
         doubt += held.power * one.field.surface_error / max(depth, one.field.surface_error)  # how well depth is known
         if "uneven" in known and size > 0:
-            doubt = math.hypot(doubt, known["uneven"] * self.net.unlike(nodes, forces))
+            doubt = math.hypot(doubt, known["uneven"] * self.net.unlike(thickness))
         bound = known["scale"] * doubt ** known["power"] if size > 0 else 0.0
         bound += SHELL * max(held.shell - SHELL_FROM, 0.0)
         beside_off = abs(1 / scale - 1) if len(v) and one.force is not None else 0.0  # each was placed as if alone
@@ -525,12 +525,12 @@ def _deepest(depth, strain, thickness):
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _carried(corners, shares, area, held, doubts, outside, unit, carries, areas, points, area_vectors, origin, sticks,
-             facets):  # fmt: skip
+def _carried(corners, shares, area, thickness, held, doubts, outside, unit, carries, areas, points, area_vectors,
+             origin, sticks, facets):  # fmt: skip
     """What the pressure at contact nodes amounts to.
 
     Args:
-        corners, shares, area: those of Nodes.
+        corners, shares, area, thickness: those of Nodes.
         held, doubts, outside: those of a Held.
         unit: modulus that they are told over [Pa].
         carries: force that all is scaled to [N]; NaN: none.
@@ -551,12 +551,14 @@ def _carried(corners, shares, area, held, doubts, outside, unit, carries, areas,
         stuck: see wrench_of.
         along: share of the force that skin carries along itself.
         below: how far facets lie off smooth skin where it presses [m].
+        thick: mean thickness of the layer there [m].
     """
-    forces, doubt, strange, total = np.empty(len(area)), 0.0, 0.0, 0.0
+    forces, doubt, strange, total, thick = np.empty(len(area)), 0.0, 0.0, 0.0, 0.0
     for n in range(len(area)):
         forces[n] = held[n] * unit * area[n]
         doubt += doubts[n] * area[n]
         strange += outside[n] * forces[n]
+        thick += forces[n] * thickness[n]
         total += forces[n]
     vertices, pressure = gathered(corners, shares, forces, areas)
     wrench, stuck, along = wrench_of(pressure, vertices, points, area_vectors, origin, sticks)
@@ -573,7 +575,7 @@ def _carried(corners, shares, area, held, doubts, outside, unit, carries, areas,
         pressure[n] *= scale
         values[v] = pressure[n]
     return (vertices, pressure, values, wrench, forces, scale, size, doubt, strange / max(total, 1e-300), stuck,
-            along, below / max(total, 1e-300))  # fmt: skip
+            along, below / max(total, 1e-300), thick / max(total, 1e-300))  # fmt: skip
 
 
 def unlearnt(layer: SoftLayer, low: float, high: float) -> list[str]:
