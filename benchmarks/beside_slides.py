@@ -141,7 +141,8 @@ def told(one: Played) -> str:
     mean, worst = one.off(one.motion)
     bare, _ = one.off(one.elastic)
     lines = [f"{one.name}: {about['played']} of {about['poses']} poses in {about['seconds']:.0f} s; largest force "
-             f"{most:.3f} N normal, {pull:.3f} N tangential; normal off by at most {normal.max():.1f} %"]  # fmt: skip
+             f"{most:.3f} N normal, {pull:.3f} N tangential; normal off by at most {normal.max():.1f} %"
+             + ("" if isinstance(about["friction"], str) else f", tangential {tangential.max():.1f} %")]  # fmt: skip
     pressed = np.abs(truth[:, 2]) > LIFTED * most
     if one.slides:
         begins = one.way < one.onset(truth)
