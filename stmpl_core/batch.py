@@ -134,6 +134,9 @@ class Batch:
         wrenches = np.zeros((n, many, 6)) if out is None else np.asarray(out)
         if wrenches.shape != (n, many, 6) or (out is not None and not np.shares_memory(wrenches, np.asarray(out))):
             raise InvalidInput(f"out has shape {wrenches.shape}; ({n}, {many}, 6) is needed, on a CPU.")
+        if wrenches.dtype.kind != "f" or not wrenches.flags.writeable:
+            raise InvalidInput(f"out is an array of {wrenches.dtype}; floating-point numbers that may be written are "
+                               "needed.")  # fmt: skip
         depths, bounds = np.full((n, many), np.nan), np.full((n, many), np.nan)
         in_range, statuses = np.zeros((n, many), bool), np.full((n, many), REFUSED, dtype=object)
         why: dict[tuple[int, int], str] = {}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, fields
+from numbers import Integral
 from typing import NamedTuple
 
 import numba
@@ -14,6 +15,8 @@ from stmpl_core.errors import InvalidInput
 from stmpl_core.local_contact import FADE, LocalContact
 
 LONGEST_DELAY = 256  # device samples that a force may be under way
+JUMP = 2.0  # speed beyond the measured one that a position shows at most [m/s]
+STRAYS = 5  # samples that show more, after which they are believed
 PAYBACK_S = 4e-3  # time in which the controller takes back the energy that was given out
 ENERGY_DEPTH_M = 1e-2  # depth over which a reaction is taken to grow from nothing, for its energy
 
@@ -51,8 +54,8 @@ class LoopSettings:
             value, least = getattr(self, name), name in ("coupling_damping", "most_damping", "velocity_noise", "blend")
             if not (math.isfinite(value) and (value > 0 or (least and value == 0))):
                 raise InvalidInput(f"{name} is {value}; it must be finite and {'at least' if least else 'above'} 0.")
-        if not 0 <= self.delay_steps < LONGEST_DELAY:
-            raise InvalidInput(f"delay_steps is {self.delay_steps}; allowed is 0..{LONGEST_DELAY - 1}.")
+        if not isinstance(self.delay_steps, Integral) or not 0 <= self.delay_steps < LONGEST_DELAY:
+            raise InvalidInput(f"delay_steps is {self.delay_steps}; allowed are whole numbers, 0..{LONGEST_DELAY - 1}.")
 
 
 class DeviceLoop:
@@ -114,7 +117,8 @@ class DeviceLoop:
 
         Returns:
             Force on the device, (3,) [N]; the same array at every call. Zero, and one more in `refused`, when the
-            input is not finite or dt not above 0.
+            input is not finite, dt not above 0, or the position farther from the last than it can have come (2 m/s
+            more than the velocity); where that stays so for 5 samples the loop begins anew there.
         """
         state, newest = self._state, self._newest
         if newest is not None and newest is not self._taken:
@@ -167,7 +171,7 @@ class DeviceLoop:
 # normal stiffness; stiffness of friction and its limit; place, valid_m, friction there. The scalars of the loop follow.
 BIAS, STIFFNESS, NORMAL, SIZE, ALONG, STICKS, LIMIT = slice(0, 3), slice(3, 12), slice(12, 15), 15, 16, 17, 18
 BLENDED, PLACE, VALID, DRAG, MODEL = 19, slice(19, 22), 22, slice(23, 26), 26
-AGE, LEFT, STARTED, BALANCE, TAKEN_IN, STORED, WORST, ADDED, TICK, SCALARS = range(10)
+AGE, LEFT, STARTED, BALANCE, TAKEN_IN, STORED, WORST, ADDED, TICK, STRAY, SCALARS = range(11)
 
 
 class _State(NamedTuple):
@@ -214,6 +218,16 @@ def _step(state, constants, dt):
     good = dt > 0 and np.isfinite(dt)
     for i in range(3):
         good = good and np.isfinite(x[i]) and np.isfinite(v[i])
+    if good and s[STARTED] > 0:  # one wrong sample of an encoder would be paid for over seconds
+        far = speed = 0.0
+        for i in range(3):
+            far += (x[i] - last[i]) ** 2
+            speed += v[i] * v[i]
+        strays = np.sqrt(far) > (s[STRAY] + 1) * dt * (JUMP + np.sqrt(speed))
+        s[STRAY] = s[STRAY] + 1 if strays else 0.0
+        if s[STRAY] > STRAYS:  # it is elsewhere indeed: begun anew
+            s[STARTED] = s[STRAY] = 0.0
+        good = not strays or s[STARTED] == 0.0
     if not good:
         force[:] = 0.0
         state.sent[int(s[TICK]) % len(state.sent)] = 0.0

@@ -20,8 +20,9 @@ from scipy.optimize import brentq
 
 from stmpl_core.errors import InvalidInput
 from stmpl_core.friction import Friction, coefficient
+from stmpl_core.layer import MAX_THICKNESS
 from stmpl_core.regions import HELD_SKIN
-from stmpl_core.relaxation import Series, series_of
+from stmpl_core.relaxation import Series, faded, fading, series_of
 from stmpl_core.sideways import patch
 from stmpl_core.stack import Ball, Fit, Misfit, ball, nearest, plies, response
 from stmpl_core.stroke import Missed, Stroke, played, pulled, without_time
@@ -33,6 +34,7 @@ if TYPE_CHECKING:
 TermName = Literal["skin", "tension", "muscle", "time", "slip", "mesh"]
 
 ENOUGH = Misfit(force=0.10, motion=0.10)  # with which a simpler model will do
+FINEST = 1e-4  # misfit that may be asked for [-]
 DEEPEST_OVER_THICKNESS, DEEPEST_OVER_RADIUS = 0.3, 0.5  # depth up to which the linear response is asked [-]
 LARGEST_RADIUS, LARGEST_FORCE, FASTEST = 0.5, 5e3, 10.0  # of what a robot presses with [m], [N], [m/s]
 LONGEST_STAY, LONGEST_WAY = 1e6, 10.0  # of a tool at one place [s], and along the skin [m]
@@ -129,13 +131,11 @@ class Needs:
     def sentence(self) -> str:
         """The smallest model, in a sentence."""
         what = "every material as its own layer" if self.rung == 2 and not self["skin"].needed else RUNGS[self.rung]
-        if self["skin"].needed and not self["tension"].needed:
-            what = what.replace("membrane", "membrane without tension")
         more: dict[TermName, str] = {"time": "relaxation in time", "slip": "slip", "mesh": "a finer mesh"}
         also = [said for name, said in more.items() if self[name].needed]
         is_, most = "no single layer is", f"{self.enough.force:.0%} in force and {self.enough.motion:.0%} in motion"
         if self.layer:
-            what += f" of {self.layer.youngs_modulus * 1e-3:.2g} kPa and {self.layer.thickness * 1e3:.2g} mm"
+            what += f" of {self.layer.youngs_modulus * 1e-3:.3g} kPa and {self.layer.thickness * 1e3:.3g} mm"
             is_ = f"it is {_said(self.layer.misfit)}"
         with_ = f", with {' and '.join(also)}" if also else ""
         with_ += f", of {self.moduli:.2g} of its moduli" if self.moduli < 1 else ""
@@ -200,6 +200,8 @@ def needs(
     for name, one in (("friction", mu), ("edge", edge), *enough._asdict().items()):
         if one is not None and not (np.isfinite(one) and one > 0):
             raise InvalidInput(f"{name} is {one:g}; it must be finite and above 0.")
+    if min(enough) < FINEST:
+        raise InvalidInput(f"an accuracy of {min(enough):g} is asked for; from {FINEST:g} on a model is chosen.")
     if drag is not None and not (np.isfinite(drag) and drag >= 0):
         raise InvalidInput(f"the drag is {drag:g} of the normal force; it must be finite and not below 0.")
     for name, one, unit, most in (("duration", duration, "s", LONGEST_STAY), ("path", path, "m", LONGEST_WAY)):
@@ -211,12 +213,15 @@ def needs(
     pressed = tuple(_indentation(tissue, thickness, r, f) for r in radii for f in forces)
     stack, skin, contacts = plies(tissue, thickness), tissue.skin, {one.judged.contact_radius for one in pressed}
     slack = replace(skin, tension=0.0) if skin else None
-    bare, loose, taut = (nearest(stack, skin, one, sorted(contacts)) for one in (None, slack, skin))
+    bare, loose, taut = (nearest(stack, skin, one, sorted(contacts), 0.99 * MAX_THICKNESS)
+                         for one in (None, slack, skin))  # fmt: skip
     rung = [_within(bare.misfit, enough), _within(taut.misfit, enough), True].index(True)
     pull = _tension(tissue, thickness, pressed, loose, rung, enough)
-    series = series_of(tissue if tissue.relaxes else tissue.relaxing(HELD_SKIN), thickness)
-    strokes = [stroke_of(tissue, thickness, one.judged, speed, duration, path) for one in pressed
-               for speed in speeds or (np.inf,)]  # fmt: skip
+    eases = tissue if tissue.relaxes else tissue.relaxing(HELD_SKIN)
+    series, fades = series_of(eases, thickness), fading(eases, thickness)
+    strokes = [stroke_of(tissue, thickness, one.judged, speed, duration, path)._replace(
+                   fades=float(faded(fades, one.judged.contact_radius)))
+               for one in pressed for speed in speeds or (np.inf,)]  # fmt: skip
     time, moduli = _time(strokes, series, mu if path else 0.0, bool(speeds), enough)
     slip = _slip(strokes, series, mu, path, drag, enough)
     terms = (
@@ -227,12 +232,15 @@ def needs(
         slip,
         _mesh(tissue, thickness, pressed, edge, enough),
     )
-    layer = (bare, taut if pull.needed else loose, None)[rung]
+    layer = (bare, taut, None)[rung]  # with the skin's tension also where that is not needed: it costs nothing
     return Needs(rung, terms, pressed, layer, enough, friction if slip.needed else None, moduli)
 
 
 def _checked(name: str, given: Iterable[float], unit: str, largest: float) -> tuple[float, ...]:
-    each = tuple(float(one) for one in given)
+    try:
+        each = tuple(float(one) for one in given)
+    except (TypeError, ValueError) as error:
+        raise InvalidInput(f"{name} are numbers in {unit}, as a list or a range of two; got {given!r}.") from error
     if wrong := [one for one in each if not 0 < one <= largest]:
         raise InvalidInput(f"one of the {name} is {wrong[0]:g} {unit}; above 0 and up to {largest:g} is accepted.")
     return each
@@ -327,7 +335,9 @@ def _in_time(strokes: list[Stroke], series: Series, off: Missed) -> str:
     presses = sorted(one.depth / one.speed for one in strokes)
     lasts = f"A press takes {' to '.join(dict.fromkeys(f'{one:.2g}' for one in (presses[0], presses[-1])))} s"
     held = f", then it is held for {strokes[0].stays:.3g} s" if strokes[0].stays else ""
-    fades = f"{series.shares.sum():.0%} of the force fades within {series.times.max():.2g} s"
+    shares = sorted(series.shares.sum() * one.fades for one in strokes)
+    share = " to ".join(dict.fromkeys(f"{one:.0%}" for one in (shares[0], shares[-1])))
+    fades = f"{share} of the force fades within {series.times.max():.2g} s"
     return f"{lasts}{held}; {fades}. {off.share:.2g} of the moduli, elastic, are {off.fitted:.0%} off in force."
 
 

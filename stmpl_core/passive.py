@@ -7,7 +7,8 @@ import math
 import numpy as np
 from numpy.typing import ArrayLike
 
-from stmpl_core.arrays import Transform, Wrench, finite
+from stmpl_core.arrays import Transform, Wrench
+from stmpl_core.contact import rigid
 from stmpl_core.errors import InvalidInput
 from stmpl_core.footing import twist_between
 from stmpl_core.local_contact import LocalContact
@@ -24,12 +25,13 @@ class PassiveContact:
     A model that comes late, or differs from the last one, makes energy: it says more force, or more stored energy S,
     than the tool has paid for. The balance (Hannaford & Ryu 2002)
 
-        B = sum W . dx - S
+        B = sum W . dx - S,
 
-    is below 0 by that. A damper then takes it back along the tool's motion, with -B / (v^2 T), T = 4 ms, up to
-    `most_damping`; a surplus beyond half of what S was in the last FORGETS_S is forgotten, so that what was lost before
-    pays for nothing now. Where less than half of S was paid, B + S < S / 2, the wrench is (B + S) / (S / 2) of what the
-    model says: a softer spring, which never gives back more than was put in.
+    with W the wrench that was held along the way dx, is below 0 by that. A damper then takes it back along the tool's
+    motion, with -B / (v^2 T), T = 4 ms, up to `most_damping`; a surplus beyond half of what S was in the last FORGETS_S
+    is forgotten, so that what was lost before pays for nothing now. Where less than half of S was paid, B + S < S / 2,
+    the wrench is (B + S) / (S / 2) of what the model says: a softer spring, which never gives back more than was put
+    in.
 
     Args:
         most_damping: largest damping that may be added [N s/m]. A robot of effective mass m and sample time T bears
@@ -68,9 +70,9 @@ class PassiveContact:
             dt: time since the last step [s].
 
         Raises:
-            InvalidInput: a pose that is not finite, or a dt that is not above 0.
+            InvalidInput: a pose that is not finite or not rigid, or a dt that is not above 0.
         """
-        pose = finite("pose", pose_body_from_tool, (4, 4))
+        pose = rigid("the tool's pose", pose_body_from_tool)
         if not (math.isfinite(dt) and dt > 0):
             raise InvalidInput(f"dt is {dt} s; it must be finite and above 0.")
         wrench, stored = np.zeros(6), 0.0
@@ -82,12 +84,11 @@ class PassiveContact:
             if not self._begun:  # a device that begins in contact owes nothing for what was stored before
                 self._begun, self._stored = True, stored
         twist = np.zeros(6) if self._pose is None else twist_between(self._pose, pose)
-        half = 0.5 * float(self._wrench @ twist)
+        work = float(self._wrench @ twist)  # the robot was given this wrench on all of its way
         self._surplus = max(0.5 * stored, self._surplus * math.exp(-dt / FORGETS_S))
-        paid = self.balance + self._stored + half + 0.5 * self.share * float(wrench @ twist)
+        paid = self.balance + self._stored + work
         self.share = min(max(paid / (MUST_BE_PAID * stored), 0.0), 1.0) if stored > 0 else 1.0
         wrench *= self.share
-        work = half + 0.5 * float(wrench @ twist)
         self.balance = min(self.balance + work - (stored - self._stored), self._surplus)
         self._stored, self._pose, self.damping = stored, pose, 0.0
         velocity = twist[:3] / dt

@@ -334,8 +334,10 @@ def _shapes(x: np.ndarray) -> np.ndarray:
 
 
 def nearest(stack: list[tuple[float, float, float]], skin: Membrane | None, its_skin: Membrane | None,
-            radii: Iterable[float]) -> Fit:  # fmt: skip
-    """The single layer under `its_skin` that answers most like plies under `skin`; see `effective`."""
+            radii: Iterable[float], thickest: float = np.inf) -> Fit:  # fmt: skip
+    """The single layer under `its_skin`, at most so thick [m], that answers most like plies under `skin`; see
+    `effective`.
+    """
     each = np.array(list(radii), dtype=float)
     if not (len(each) and (np.isfinite(each) & (each > 0)).all()):
         raise InvalidInput(f"the loads' radii are {each.tolist()} m; all must be finite and above 0.")
@@ -358,9 +360,10 @@ def nearest(stack: list[tuple[float, float, float]], skin: Membrane | None, its_
 
     t = sum(h for h, _, _ in stack)
     middle = np.exp(np.mean(np.log([modulus for _, modulus, _ in stack])))
-    bounds = np.log([[1e-4 * middle, THINNEST * t], [1e4 * middle, THICKEST * t]])
-    tries = [least_squares(lambda logs: off(logs).ravel(), np.log([middle, share * t]), bounds=bounds, x_scale=0.3)
-             for share in (0.7, 0.2)]  # fmt: skip
+    most = min(THICKEST * t, thickest)
+    bounds = np.log([[1e-4 * middle, THINNEST * t], [1e4 * middle, most]])
+    tries = [least_squares(lambda logs: off(logs).ravel(), np.log([middle, min(share * t, 0.9 * most)]), bounds=bounds,
+                           x_scale=0.3) for share in (0.7, 0.2)]  # fmt: skip
     best = min(tries, key=lambda one: one.cost).x
     rest = off(best)
     misfit = Misfit(float(np.abs(np.expm1(rest[:, 0])).max()), float(np.linalg.norm(rest[:, 1:], axis=1).max()))

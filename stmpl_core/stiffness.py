@@ -71,7 +71,8 @@ def fit_stiffness(toucher: Toucher, presses: Sequence[Contact]) -> Stiffness:
     modelled one, weighed by relative error and, against outliers, by Huber's weights (Huber 1981, "Robust
     Statistics"). s itself, which hand-eye calibration leaves, is sought within the toucher's reach. Depth and offset
     are told apart only by presses of different depth: what they leave open is in `relative_error`, where the contact
-    law's own error counts once for all presses, since it is alike in all of them.
+    law's own error counts once for all presses, since it is alike in all of them. A sensor's zero must be right: one
+    that is off by 3 % of the largest force makes E 12 % wrong, which looks like an offset and is not in that error.
 
     Args:
         toucher: contact law on the skin, of whatever stiffness.

@@ -34,6 +34,7 @@ class Stroke(NamedTuple):
         speed: speed of pressing, of the way along the skin and of lifting [m/s]; infinite: no time goes by.
         stays: time that the ball stays when it is pressed in [s].
         way: way along the skin after that [m].
+        fades: how much more fades under a contact as wide than the series says (relaxation.faded) [-].
     """
 
     force: float
@@ -44,6 +45,7 @@ class Stroke(NamedTuple):
     speed: float = np.inf
     stays: float = 0.0
     way: float = 0.0
+    fades: float = 1.0
 
 
 class Course(NamedTuple):
@@ -96,7 +98,8 @@ def played(stroke: Stroke, series: Series, friction: float) -> Course:
     relaxed, kept, gain = np.zeros(terms), np.empty(terms), np.empty(terms)
     springs, faded = np.zeros((SPRINGS, 3)), np.zeros((terms, SPRINGS, 3))
     for k in range(1, len(depth)):
-        weights(series.times, dt[k], share * way[k] / stroke.radius, before, relaxed, kept, gain)
+        weights(series.times, dt[k], share * way[k] / stroke.radius, stroke.fades * before, relaxed, kept, gain)
+        gain *= stroke.fades
         owed, now = series.balance(kept, gain)
         pressing = now * elastic[k] > owed
         if pressing:

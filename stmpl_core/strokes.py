@@ -11,14 +11,14 @@ from dataclasses import dataclass
 from itertools import pairwise
 from typing import NamedTuple
 
+import numba
 import numpy as np
 
 from stmpl_core.contact import Contact
 from stmpl_core.errors import InvalidInput
 from stmpl_core.footing import patch_of
-from stmpl_core.history import mean_thickness
 from stmpl_core.regions import HELD_SKIN
-from stmpl_core.relaxation import series_of, stretch, weights
+from stmpl_core.relaxation import faded, fading, series_of, stretch, weights
 from stmpl_core.sideways import Sideways
 from stmpl_core.slip import PLOUGHED, ploughing
 from stmpl_core.tissue import Prony
@@ -30,6 +30,8 @@ MIN_INSTANTS = 8  # instants of one kind that a fit needs
 SLID = 1.8  # way over friction / stiffness from which a tool slides (Cattaneo, Mindlin: 1.5); twice after another way
 MOST_RUBBED = 0.95  # quantile of the force along the skin over that across it, from which follows where tools slide
 STRAIGHT = 1.05  # length of a way over the distance of its ends, up to which it counts as straight
+JITTER = 3e-4  # way by which a tool has moved, and not only what measures it trembled [m]
+BEGUN = 0.25  # force at the first instant over the largest, up to which a press counts as told from its beginning
 LEAN = 0.05  # tilt of the contact's normal that strokes one way do not tell from friction [-]
 OWN_FRICTION = 0.08  # relative error of the law of friction: 3 to 9 % of the largest by finite elements
 MAX_FRICTION_ERROR = 0.3  # standard error of a coefficient over it
@@ -114,9 +116,11 @@ def fit_friction(toucher: Toucher, strokes: Sequence[Contact]) -> Rubbing:
         strokes: contacts of one tool with their wrenches, in order of time.
 
     Raises:
-        InvalidInput: a contact without a wrench, or of more than one tool.
+        InvalidInput: a contact without a wrench, of more than one tool, or times that go back.
     """
     _of_one_tool(strokes)
+    if not (np.diff([one.time for one in strokes]) >= 0).all():
+        raise InvalidInput("the times of strokes go back; a tool's way is told in their order.")
     pressing = [one for one in strokes if one.wrench is not None and one.wrench[:3].any()]
     places = np.array([one.pose_body_from_tool[:3, 3] for one in pressing]).reshape(-1, 3)
     if not len(places) or not np.ptp(places, axis=0).any():
@@ -126,16 +130,15 @@ def fit_friction(toucher: Toucher, strokes: Sequence[Contact]) -> Rubbing:
     ratios = [one.rubs / one.pressing for one in found if one is not None]
     most = float(np.quantile(ratios, MOST_RUBBED)) if ratios else 0.0
     slid, ways, mus, furthest, needed = [], [], [], 0.0, math.inf
+    lengths = _lengths(places, np.zeros(3))
     for k, (contact, one) in enumerate(zip(pressing, found, strict=True)):
         if one is None or contact.wrench is None:
             continue
         wanted = SLID * most * one.pressing / one.stiffness
-        way, start = _straight(places, k, 2 * wanted)
+        way, start = _straight(places, lengths, k, 2 * wanted)
         way = way - (way @ one.normal) * one.normal
         went = float(np.linalg.norm(way))
-        steps = np.diff(places[: start + 1], axis=0)
-        before = float(np.linalg.norm(steps - (steps @ one.normal)[:, None] * one.normal, axis=1).sum())
-        wanted *= 2 if before > 0.1 * went else 1
+        wanted *= 2 if _lengths(places[: start + 1], one.normal)[-1] > 0.1 * went else 1
         if went / wanted > furthest / needed:
             furthest, needed = went, wanted
         if went >= wanted > 0:
@@ -194,14 +197,34 @@ def _friction_of(ratio: float, rises: float) -> float:
     return math.copysign(2 * size / (b + math.sqrt(b * b + 4 * a * size)), ratio)
 
 
-def _straight(places: np.ndarray, k: int, far: float) -> tuple[np.ndarray, int]:
-    """Way that a tool went straight on to place k, (3,) [m], as far as just more than `far` [m]; and where it began."""
-    length, best, start = 0.0, np.zeros(3), k
+@numba.njit(cache=True)
+def _lengths(places, normal):
+    """Length of a way to each place (N, 3), but for what it trembles by and goes along a normal (3,), (N,) [m]."""
+    out, last = np.zeros(len(places)), 0
+    for k in range(1, len(places)):
+        step = places[k] - places[last]
+        up = step[0] * normal[0] + step[1] * normal[1] + step[2] * normal[2]
+        far = np.sqrt(np.sum((step - up * normal) ** 2))
+        out[k] = out[k - 1]
+        if far >= JITTER:
+            out[k], last = out[k] + far, k
+    return out
+
+
+def _straight(places: np.ndarray, lengths: np.ndarray, k: int, far: float) -> tuple[np.ndarray, int]:
+    """Way that a tool went straight on to place k, (3,) [m], as far as just more than `far` [m]; and where it began.
+
+    Args:
+        places: its places, (N, 3) [m].
+        lengths: length of its way to each, (N,) [m].
+        k: number of a place.
+        far: way that is enough [m].
+    """
+    best, start = np.zeros(3), k
     for j in range(k - 1, -1, -1):
-        length += float(np.linalg.norm(places[j + 1] - places[j]))
         way = places[k] - places[j]
         went = float(np.linalg.norm(way))
-        if length > STRAIGHT * went + 1e-5:
+        if lengths[k] - lengths[j] > STRAIGHT * went + JITTER:
             break
         best, start = way, j
         if went > far:
@@ -233,34 +256,43 @@ def fit_relaxation(toucher: Toucher, press: Sequence[Contact], relaxation: Prony
     layer, steps = toucher.layer, np.diff([one.time for one in press])
     if (steps <= 0).any() or not np.isfinite(steps).all():
         raise InvalidInput("the times of a press must go forward; relaxation is a matter of time.")
-    shares, times = series_of(layer.tissue.relaxing(taken), float(np.median(layer.thickness)))
+    tissue, thickness = layer.tissue.relaxing(taken), float(np.median(layer.thickness))
+    (shares, times), fades = series_of(tissue, thickness), fading(tissue, thickness)
     relaxed, kept, gain, before = np.zeros(len(times)), np.empty(len(times)), np.empty(len(times)), 0.0
-    rows, forces, when, middle = [], [], [], None
+    rows, forces, when, more, middle, free = [], [], [], [], None, False
     for k, one in enumerate(press):
         assert one.wrench is not None
         size = float(np.linalg.norm(one.wrench[:3]))
         push = one.wrench[:3] / size if size > 0 else np.zeros(3)
         touch = _at(toucher, one, offset * push)
-        weights(times, steps[k - 1] if k else 0.0, 0.0, before, relaxed, kept, gain)
-        if touch.pressed is None or not touch.force > 0:
+        if touch.pressed is None or touch.pressed.forces is None or not touch.force > 0:
             if rows:
                 break
+            free = True
             continue
         middle = one.pose_body_from_tool[:3, 3] if middle is None else middle
         normal = touch.push / touch.force
         away = one.pose_body_from_tool[:3, 3] - middle
         if np.linalg.norm(away - (away @ normal) * normal) > STAYS:
             break
-        long = stretch(touch.depth, mean_thickness(touch.pressed))
+        nodes, pressing = touch.pressed.squeeze.nodes, touch.pressed.forces
+        _, radius, _, thick, _ = patch_of(nodes.points, nodes.area, nodes.thickness, nodes.thickness, pressing, normal)
+        long = stretch(touch.depth, thick)
+        more.append(float(faded(fades, radius)))
+        weights(times, steps[k - 1] if k else 0.0, 0.0, more[-1] * before, relaxed, kept, gain)
         before = touch.force / long
-        relaxed = kept + gain * before
+        relaxed = kept + more[-1] * gain * before
         rows.append((touch.force, -long * float(shares @ relaxed)))
         forces.append(float(one.wrench[:3] @ normal))
         when.append(one.time)
     if len(rows) < MIN_INSTANTS:
         return _no_fading(f"the tool stayed where it pressed for {len(rows)} instants, {MIN_INSTANTS} are needed. "
                           "Press, and hold")  # fmt: skip
-    return _faded(np.array(rows), np.array(forces), np.array(when), shares, taken)
+    elastic = np.array(rows)[:, 0]
+    if not free and elastic[0] > BEGUN * elastic.max():
+        return _no_fading(f"the first instant presses with {elastic[0] / elastic.max():.0%} of the largest force: what "
+                          "faded before is not known. Begin before the tool touches, and press anew")  # fmt: skip
+    return _faded(np.array(rows), np.array(forces), np.array(when), shares * float(np.mean(more)), taken)
 
 
 def _faded(rows: np.ndarray, forces: np.ndarray, when: np.ndarray, shares: np.ndarray, taken: Prony) -> Fading:

@@ -25,7 +25,7 @@ from stmpl_ros.workshop import Workshop
 KEPT = 400  # number of presses that are kept
 APART = 1e-4  # way of a tool between two presses that are kept [m]
 KEPT_INSTANTS = 6000  # number of instants of strokes that are kept
-EVERY = 0.01  # time between two of them [s]
+EVERY = 0.0095  # least time between two of them [s]: of what comes at 100 Hz, all
 GAP = 0.5  # time from which two of them are of different presses [s]
 CARRYING = frozenset((TOUCHING, MOVED))  # statuses of a tool whose wrench the skin carries
 

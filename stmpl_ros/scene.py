@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from statistics import geometric_mean
 from typing import TYPE_CHECKING, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
@@ -68,13 +69,14 @@ class SceneConfig(BaseModel):
     def model(self, found: Needs) -> Model:
         """The smallest model that serves: tissue, thickness, and what a state has to follow."""
         from stmpl_core.living import Model
-        from stmpl_core.relaxation import series_of
+        from stmpl_core.relaxation import faded, fading, series_of
 
         tissue, thickness = self._serves(found)
         if found.relaxing:  # as much of its force fades as of the whole tissue's, whose taut skin keeps some
-            whole = series_of(*self._tissue_that_relaxes()).shares.sum()
-            own = series_of(tissue.relaxing(HELD_SKIN), thickness).shares.sum()
-            shares = tuple(float(g * whole / own) for g in HELD_SKIN.shares)
+            radius = geometric_mean([one.judged.contact_radius for one in found.indentations])
+            whole, own = (float(series_of(*one).shares.sum() * faded(fading(*one), radius))
+                          for one in (self._tissue_that_relaxes(), (tissue.relaxing(HELD_SKIN), thickness)))
+            shares = tuple(g * whole / own for g in HELD_SKIN.shares)
             tissue = tissue.relaxing(replace(HELD_SKIN, shares=shares))
         friction = None if found.friction is None else str(found.friction)
         return Model(tissue.softened(found.moduli) if found.moduli < 1 else tissue, thickness, friction, found.relaxing)
@@ -84,10 +86,8 @@ class SceneConfig(BaseModel):
         tissue, thickness = self._tissue()
         if found.layer is None:
             return (tissue if found["skin"].needed else replace(tissue, skin=None)), thickness
-        skin = tissue.skin if found.rung else None
-        if skin and not found["tension"].needed:
-            skin = replace(skin, tension=0.0)
-        one = Tissue(found.layer.youngs_modulus, tissue.poisson_ratio, tissue.density, skin=skin,
+        one = Tissue(found.layer.youngs_modulus, tissue.poisson_ratio, tissue.density,
+                     skin=tissue.skin if found.rung else None,
                      source="the one layer that serves this scene, of stmpl needs")  # fmt: skip
         return one, found.layer.thickness
 

@@ -133,6 +133,8 @@ def test_what_does_not_fit_is_said(skin: Skin) -> None:
         batch.touch(poses(), out=np.zeros((N, 2, 3)))
     with pytest.raises(InvalidInput, match="out has shape"):
         batch.touch(poses(), out=np.zeros((N, 2, 6)).tolist())
+    with pytest.raises(InvalidInput, match="array of int64"):
+        batch.touch(poses(), out=np.zeros((N, 2, 6), int))
     with pytest.raises(InvalidInput, match="dt is"):
         batch.touch(poses(), [None] * N, -1.0)
     with pytest.raises(InvalidInput, match="do not fit 3"):

@@ -327,6 +327,28 @@ def test_bad_input_is_refused_or_gives_no_force(spot: Spot, model: LocalContact)
     assert not loop.step(deep * np.nan, STILL, 1e-3).any() and not loop.step(deep, STILL, 0.0).any()
     assert loop.refused == 2
     np.testing.assert_allclose(loop.step(deep, STILL, 1e-3), pressed, rtol=0.05)
+    with pytest.raises(InvalidInput, match=r"delay_steps is 1\.5"):
+        LoopSettings(delay_steps=1.5)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("off", [5e-3, 0.1, 1e200])
+def test_a_wrong_sample_is_left_out_and_a_new_place_is_believed(spot: Spot, model: LocalContact, off: float) -> None:
+    loop, calm, out = DeviceLoop(), DeviceLoop(), np.array([0, 0, 1.0])
+    for k in range(300):
+        depth, speed = 3e-3 + 1e-3 * np.sin(0.02 * k), -0.02 * np.cos(0.02 * k)
+        for one in (loop, calm):
+            if k % 10 == 0:
+                one.update(model)
+            place = spot.centre(-depth) + off * out * (one is loop and k == 100)
+            force = one.step(place, speed * out, 1e-3).copy()
+            if one is loop:
+                wrong = force
+        if k > 110:
+            np.testing.assert_allclose(wrong, force, atol=0.02 * np.linalg.norm(force))
+    assert loop.refused == 1 and np.isfinite(loop.balance)
+    for _ in range(50):
+        loop.step(spot.centre(-2e-3) + [0.3, 0, 0], STILL, 1e-3)
+    assert loop.refused == 6
 
 
 def test_at_rest_spring_proxy_and_contact_balance(spot: Spot, model: LocalContact) -> None:

@@ -8,10 +8,11 @@ import pytest
 
 from stmpl_core import Membrane, Ply, Prony, Tissue
 from stmpl_core.errors import InvalidInput
+from stmpl_core.layer import MAX_THICKNESS
 from stmpl_core.living import read_model, read_tissue
 from stmpl_core.needs import needs
 from stmpl_core.regions import HELD_SKIN, region
-from stmpl_core.relaxation import series_of
+from stmpl_core.relaxation import faded, fading, series_of
 from stmpl_core.stack import Misfit
 from stmpl_ros.cli import main
 from tests.scenes import plate
@@ -141,6 +142,8 @@ def test_less_accuracy_asks_for_less():
         ({"path": float("nan")}, "path is nan m"),
         ({"thickness": None}, "thickness"),
         ({"enough": Misfit(0.0, 0.1)}, "force is 0"),
+        ({"enough": Misfit(1e-7, 0.1)}, "accuracy of 1e-07"),
+        ({"radii": 8e-3}, "radii are numbers in m"),
     ],
 )
 def test_what_cannot_be_is_refused_with_what_is_wrong(change, says):
@@ -171,14 +174,24 @@ def test_the_file_carries_time_and_slip_for_a_node(capsys, tmp_path):
     rich, told = read_model(tmp_path / "rich.json"), json.loads(said)
     assert code == 0 and rich.relaxing is told["relaxing"] is True and rich.friction == told["friction"] == "dry"
     assert read_tissue(tmp_path / "rich.json") == rich[:2]
-    part, shares = region("forearm"), series_of(*rich[:2]).shares
-    np.testing.assert_allclose(shares, series_of(part.tissue.relaxing(HELD_SKIN), part.thickness).shares, rtol=1e-6)
+    part, (ball,) = region("forearm"), told["indentations"]
+    both = [series_of(*one).shares * faded(fading(*one), ball["judged"]["contact_radius"])
+            for one in (rich[:2], (part.tissue.relaxing(HELD_SKIN), part.thickness))]  # fmt: skip
+    np.testing.assert_allclose(*both, rtol=1e-6)
     stmpl(capsys, *scene[:-4], "--path", 100, "--friction", 0.01, "--out", tmp_path / "plain.json")
     plain = read_model(tmp_path / "plain.json")
     assert not plain.relaxing and plain.friction is None and not plain.tissue.relaxes
     written = json.loads((tmp_path / "rich.json").read_text())
     (tmp_path / "old.json").write_text(json.dumps({name: written[name] for name in ("thickness", "tissue")}))
     assert read_model(tmp_path / "old.json")[2:] == (None, False)
+
+
+def test_a_skin_keeps_its_tension_and_a_layer_is_one_that_a_node_accepts(capsys, tmp_path):
+    for part in ("upper_arm", "abdomen"):
+        stmpl(capsys, "needs", "--part", part, "--radius", 20, "--force", 2, "--out", tmp_path / "one.json")
+        one, whole = read_model(tmp_path / "one.json"), region(part).tissue
+        assert one.tissue.skin is not None and one.tissue.skin.tension == whole.skin.tension > 0
+        assert not one.tissue.deeper and one.thickness < MAX_THICKNESS
 
 
 def test_a_slow_scene_writes_relaxed_moduli(capsys, tmp_path):

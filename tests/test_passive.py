@@ -141,6 +141,24 @@ def test_a_device_that_begins_in_contact_is_not_pulled_as_it_retreats(place: Pla
         assert wrench[:3] @ place.out <= 0.01, f"{wrench[:3] @ place.out:.2g} N outwards at step {k}"
 
 
+@pytest.mark.parametrize("dt, period", [(2e-3, 1), (2e-3, 10)])
+def test_a_mass_that_bounces_under_held_forces_gains_nothing(place: Place, dt: float, period: int) -> None:
+    """0.2 kg between the skin and a ceiling that gives all back; each wrench is held for a step, as by a robot."""
+    tool, loop, mass, ceiling = ball(0.02), PassiveContact(most_damping=30.0), 0.2, 2e-3
+    height, speed, out = ceiling, -0.05, []
+    for k in range(1500):
+        pose = place.pose(place.point + (0.02 + height) * place.out)
+        if k % period == 0:
+            loop.update(local_contact(place.history.toucher, Contact(tool, pose)))
+        force = -float(loop.step(pose, dt)[:3] @ place.out)
+        height += speed * dt + 0.5 * force / mass * dt * dt
+        speed += force / mass * dt
+        if height > ceiling and speed > 0:
+            height, speed = 2 * ceiling - height, -speed
+            out.append(speed)
+    assert len(out) > 10 and min(out) > -1.01 * 0.05, f"energy times {(min(out) / 0.05) ** 2:.2f}"
+
+
 def test_bad_input_is_refused_and_a_stale_model_fades(place: Place) -> None:
     with pytest.raises(InvalidInput, match="most_damping is 0"):
         PassiveContact(0.0)
@@ -153,3 +171,5 @@ def test_bad_input_is_refused_and_a_stale_model_fades(place: Place) -> None:
         loop.step(pose, 0.0)
     with pytest.raises(InvalidInput, match="pose holds"):
         loop.step(np.full((4, 4), np.nan), 1e-3)
+    with pytest.raises(InvalidInput, match="not rigid"):
+        loop.step(np.zeros((4, 4)), 1e-3)

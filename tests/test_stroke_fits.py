@@ -7,8 +7,10 @@ import pytest
 
 from stmpl_core import Contact, Prony, Simulator, State, Tissue
 from stmpl_core.errors import InvalidInput
+from stmpl_core.history import History
 from stmpl_core.methods import Winkler
 from stmpl_core.strokes import fit_friction, fit_relaxation
+from stmpl_core.tissue import Membrane, Ply
 from stmpl_core.toucher import Toucher
 from tests.scenes import at, ball, plate
 from tests.test_state_against_fem import Stroke
@@ -132,3 +134,34 @@ def test_what_tells_nothing_by_its_kind_is_refused(toucher: Toucher) -> None:
                 fit(toucher, wrong)
     with pytest.raises(InvalidInput, match="go forward"):
         fit_relaxation(toucher, both[:1] * 10)
+    with pytest.raises(InvalidInput, match="go back"):
+        fit_friction(toucher, measured(*wiped(0.02, True), 0.4)[::-1])
+
+
+def test_a_recording_that_begins_in_mid_hold_tells_no_relaxation(toucher: Toucher) -> None:
+    press = measured(*held(10.0), None, SERIES)
+    found = fit_relaxation(toucher, press[12:], SERIES)
+    assert not found.trust.ok and np.isnan(found.share) and "Begin before the tool touches" in found.trust.why
+
+
+@pytest.mark.parametrize("radius, depth", [(4e-3, 2e-3), (25e-3, 6e-3)])
+def test_a_stack_tells_the_series_of_its_materials_under_tips_and_palms(radius: float, depth: float) -> None:
+    skin = Membrane(2e5, 1.5e-3, 15.0)
+    layer = plate(0.15, 5e-3, 0.025).with_(tissue=Tissue(3e3, 0.4, skin=skin, deeper=(Ply(8e-3, 15e3, 0.4),)))
+    history, state, press = History(Toucher(layer.with_(tissue=layer.tissue.relaxing(SERIES)))), State(), []
+    for place, time, before in zip(*held(10.0), [0.0, *held(10.0)[1]], strict=False):
+        pose = at(*place[:2], radius - depth * (RADIUS - place[2]) / DEPTH)
+        (touch,), state = history.step([Contact(ball(radius), pose)], state, time - before)
+        press.append(Contact(ball(radius), pose, touch.wrench, time=time))
+    found = fit_relaxation(Toucher(layer), press, SERIES)
+    assert found.trust.ok and found.relaxation is not None, found.trust.why
+    np.testing.assert_allclose(found.relaxation.shares, SERIES.shares, rtol=0.02)
+
+
+def test_poses_that_tremble_tell_friction_as_well(toucher: Toucher) -> None:
+    random = np.random.default_rng(1)
+    strokes = [replace(one, pose_body_from_tool=one.pose_body_from_tool + np.pad(
+        np.column_stack([np.zeros((3, 3)), 2e-5 * random.normal(size=3)]), ((0, 1), (0, 0))))
+        for one in measured(*wiped(0.02, True), 0.45)]  # fmt: skip
+    found = fit_friction(toucher, strokes)
+    assert found.trust.ok and abs(found.friction - 0.45) < 2 * found.error < 0.2, found.trust.why

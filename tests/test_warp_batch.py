@@ -125,8 +125,9 @@ def test_a_tool_that_presses_from_several_sides_is_flagged_here_too(cylinder: Sk
 
 @pytest.mark.parametrize("tissue", [
     Tissue(1e3, 0.45, deeper=(Ply(0.012, 80e3, 0.45),)), Tissue(3e3, 0.45, deeper=(Ply(6e-3, 15e3, 0.36),)),
-    Tissue(3e3, 0.45, skin=Membrane(1e5, 1.2e-3, 90.0), deeper=(Ply(6e-3, 15e3, 0.45),))],
-    ids=["nearly bone", "two ratios", "tight skin"])  # fmt: skip
+    Tissue(3e3, 0.45, skin=Membrane(1e5, 1.2e-3, 90.0), deeper=(Ply(6e-3, 15e3, 0.45),)),
+    Tissue(3e3, 0.42, skin=Membrane(1e5, 1.2e-3, 0.0))],
+    ids=["nearly bone", "two ratios", "tight skin", "slack skin"])  # fmt: skip
 def test_tissue_that_no_contact_was_learnt_with_is_flagged_here_too(tissue: Tissue) -> None:
     skin, tool = Skin.of(limb(8e-3, 20e-3, THICK, LONG).with_(tissue=tissue), MomentNet()), ball(0.02)
     poses = at(THICK + 0.02 - 9e-3, 0, LONG / 2)[None, None]

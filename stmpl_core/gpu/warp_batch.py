@@ -16,6 +16,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass
+from numbers import Integral
 from typing import Any
 
 import numpy as np
@@ -93,9 +94,12 @@ class WarpBatch:
                  lanes: int | None = None) -> None:  # fmt: skip
         some = list(skins) if isinstance(skins, Sequence) else [skins]
         count = len(some) if n is None else n
-        each = some if isinstance(skins, Sequence) else some * max(count, 0)
+        for name, one in (("n", count), ("lanes", 1 if lanes is None else lanes)):
+            if not isinstance(one, Integral) or one < 1:
+                raise InvalidInput(f"{name} is {one}; a whole number of at least 1 is needed.")
+        each = some if isinstance(skins, Sequence) else some * count
         self.tools = list(tools)
-        if count < 1 or len(each) != count:
+        if len(each) != count:
             raise InvalidInput(f"{len(each)} skins do not fit {count} scenes: give one, or one for each.")
         if not self.tools or len({tool.name for tool in self.tools}) < len(self.tools):
             raise InvalidInput("a batch needs tools, each with a name of its own. Try tool.named('left').")
