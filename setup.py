@@ -36,7 +36,7 @@ DRAWN = ["mapbox-earcut>=1.0", "shapely>=2.0"]  # tools that are extruded from a
 BODIES = ["anny>=0.6", "roma>=1.5", "torch>=2.4"]
 LEARN = [*BODIES, *DRAWN, "zarr>=3.0"]
 STUDIES = LEARN
-SIM = ["gymnasium>=1.0", "mujoco==4.0.0"]
+SIM = ["gymnasium>=1.0", "manifold3d>=3.0", "mujoco==4.0.0"]
 FMI = ["pythonfmu3>=0.3.4"]
 GPU = ["warp-lang>=1.8"]
 VIEW = [*DRAWN, "viser>=1.1"]

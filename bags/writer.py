@@ -119,6 +119,8 @@ class BagWriter:
             self.path.parent.mkdir(parents=True, exist_ok=True)
             self._file = open(self.path, "xb", buffering=1 << 20)
         except FileExistsError as error:
+            if not self.path.parent.is_dir():
+                raise BagError(f"{self.path.parent} is a file, not a folder. Record into a folder.") from error
             raise BagError(f"{self.path} exists already. Record into another folder, or remove it.") from error
         except OSError as error:
             raise BagError(f"{self.path} cannot be written: {error.strerror}.") from error

@@ -15,7 +15,11 @@ def print_figures(shown: object) -> None:
         return
     from rich.console import Console
 
-    Console().print(shown)
+    class Plain(Console):
+        def on_broken_pipe(self) -> None:  # rich ends the process with 1, as if something were wrong
+            raise BrokenPipeError
+
+    Plain().print(shown)
 
 
 @contextmanager

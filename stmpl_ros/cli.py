@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import signal
 import sys
@@ -48,6 +49,10 @@ def main(arguments: list[str] | None = None) -> None:
         sys.stdout.flush()
     except KeyboardInterrupt as interrupt:
         code = 128 + next(iter(interrupt.args), signal.SIGINT)
+    except SystemError as error:  # how a compiled call tells of an interrupt that came in it
+        if not isinstance(error.__cause__ or error.__context__, KeyboardInterrupt):
+            raise
+        code = 128 + signal.SIGINT
     except BrokenPipeError:  # `stmpl ... | head`
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         code = 0
@@ -82,9 +87,9 @@ def _run(given: list[str]) -> int:
             raise
         return _refuse(sentence_of(error))
     except OSError as error:
-        if error.filename is None:
+        if error.filename is None and error.errno != errno.ENOSPC:
             raise
-        return _refuse(f"{error.filename}: {error.strerror or error}.")
+        return _refuse(f"{error.filename or 'the output'}: {error.strerror or error}.")
 
 
 def _said_of(called: Callable) -> str:

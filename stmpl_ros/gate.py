@@ -35,7 +35,8 @@ class Gate:
         if not max_age or abs(age) <= max_age:
             return True
         self._tally.stale += 1
-        self.drop("age", f"a message stamped {age:+.2f} s before now was dropped; allowed is {max_age} s. "
+        self.drop("age", f"a message stamped {abs(age):.2f} s {'before' if age > 0 else 'after'} now was dropped; "
+                  f"allowed is {max_age} s. "
                   "Are the clocks in step, or is this a replay? max_age:=0 accepts any age.")  # fmt: skip
         return False
 

@@ -26,6 +26,7 @@ from stmpl_sim.site import Circle
 REACH_S, APPROACH_S, HOLD_S, RELEASE_S = 0.6, 1.4, 1.0, 1.0  # durations of phases
 BLEND_S = 0.4  # time in which one force becomes the next
 SETTLE_S = 0.5  # time into a press from which it is judged; circles are from their first instant
+DIVERGED = tuple(getattr(mujoco.mjtWarning, f"mjWARN_BAD{what}") for what in ("QPOS", "QVEL", "QACC", "CTRL"))
 RAMP_S = 0.4  # time in which the speed along a circle is reached
 STIFFNESS_S = 0.01  # time between two looks at the contact's stiffness [s]
 FIRST = 0.3  # share of the force with which the tool comes to the skin
@@ -326,6 +327,9 @@ class Massage:
 
         Args:
             seen: functions that are called after each step with this and the time [s]; their time is not counted.
+
+        Raises:
+            InvalidInput: a simulation that diverged.
         """
         self.reset()
         radius, dt = self.scene.radius, float(self.scene.model.opt.timestep)
@@ -337,6 +341,9 @@ class Massage:
                 phase = self.course.phase(at)
                 self.gripper.command(self.data, phase.name, (at - phase.start) / phase.duration)
             aim, took = self.step(lambda limb, at=at: self.course.goal(at, limb, radius))
+            if any(self.data.warning[kind].number for kind in DIVERGED):
+                raise InvalidInput(f"the simulation diverged at {at:.3f} s. Try a higher rate; if that does not help, "
+                                   "check the masses of the robot's links.")  # fmt: skip
             spent, busy = time.perf_counter() - begun, time.thread_time() - busy
             reaction = self.skin.reaction
             assert reaction is not None

@@ -120,10 +120,19 @@ class SoftBody:
         self._key = next(_KEYS)
         _LIVE[self._key] = self
         self._felt = {self.body, *limbs, *(source.body for source in self._sources.values())}
+        self._times: WeakKeyDictionary[Memory, float] = WeakKeyDictionary()  # at which memories were made [s]
         self.memory = Memory()
         self.reaction: Reaction | None = None
-        self._time: float | None = None
         self._jacobians = np.zeros((2, 3, model.nv)) if implicit else None
+
+    @property
+    def memory(self) -> Memory:
+        """Memory of the contact after the last `apply`, or as it was put: with a state of `data`, one from then."""
+        return self._memory
+
+    @memory.setter
+    def memory(self, memory: Memory) -> None:
+        self._memory, self._time, self._put = memory, self._times.get(memory), True
 
     @property
     def simulator(self) -> Simulator:
@@ -146,8 +155,8 @@ class SoftBody:
         if self._jacobians is not None:  # what mj_jac and mj_solveM read
             for update in (mujoco.mj_comPos, mujoco.mj_tendon, mujoco.mj_makeM, mujoco.mj_factorM):
                 update(self.model, data)
-        if self._time is not None and data.time < self._time:
-            self.memory = Memory()
+        if self._time is not None and data.time < self._time and not self._put:
+            self._memory = Memory()
         dt = 0.0 if self._time is None else max(0.0, data.time - self._time)
         mobility = None if self._jacobians is None else lambda name, at, along: self._mobility(data, name, at, along)
         poses = self.poses(data)
@@ -155,7 +164,8 @@ class SoftBody:
             self.reaction = self.contact.step(poses, self.memory, dt, mobility)
         else:
             self.reaction = self._step_bent(self._jointed, data, poses, dt, mobility)
-        self.memory, self._time = self.reaction.memory, float(data.time)
+        self._memory, self._time, self._put = self.reaction.memory, float(data.time), False
+        self._times[self._memory] = self._time
         self._push(data, self.reaction)
         return self.reaction.touches
 
@@ -163,7 +173,7 @@ class SoftBody:
         """A step of a limb whose joints move."""
         now = jointed.angles(data)
         if not self._posed or max(abs(now[name] - self._posed[name]) for name in now) > POSE_STEP:
-            self.memory, self._posed = self.contact.pose(now, self.memory), now
+            self._memory, self._posed = self.contact.pose(now, self.memory), now
         world = poses.body @ self.contact.pose_body_from_layer
         backs = {}
         for name, pose in poses.tools.items():
@@ -224,7 +234,7 @@ class SoftBody:
     def reset(self, data: Any) -> None:
         """Takes the wrenches out of `data`, and forgets."""
         self._exert(data, {})
-        self.memory, self.reaction, self._time, self._posed = Memory(), None, None, {}
+        self.memory, self.reaction, self._posed = Memory(), None, {}
 
     def _push(self, data: Any, reaction: Reaction) -> None:
         rows: dict[int, Wrench] = {}

@@ -20,6 +20,7 @@ from stmpl_sim.site import Site
 
 ARM = Path(__file__).parent / "models" / "arm7.xml"
 LIMB, HEAD, BALL, EYE = "limb", "head", "ball", "eye"  # names of bodies, geom and camera that a scene adds
+HINGE, FLOOR = "limb_hinge", "stage_floor"  # of the joint of a rest, and of a geom: robots have elbows and floors
 WRIST = "wrist"  # name of the site of the force and torque sensor between the robot and its head
 SKIN_MESH, SKIN_GEOM, SKIN_MATERIAL = "skin", "skin", "skin"
 DENSITY = 1050.0  # of a limb [kg/m3]
@@ -99,24 +100,30 @@ def build(
     where, spec = finite("at", at, (3,)), robot_spec(ARM if robot is None else Path(robot))
     if not 0 < radius < np.inf:
         raise InvalidInput(f"the ball's radius is {radius:g} m; it must be finite and above 0.")
-    holder = _end(spec, end)
+    holder, side, tools = _end(spec, end), -1.0, (BALL,)
     chain = _chain(holder if hasattr(holder, "add_body") else holder.parent)
-    _add_head(spec, holder, radius)
-    _drive(spec, chain)
-    _add_limb(spec, layer, site, where, mount)
-    side, tools = -1.0, (BALL,)
-    if gripper:
-        place = place_of(site, world_from_limb(site, where))
-        add_gripper(spec, place)
-        side, tools = place.side, (BALL, *FINGERS)
-    _add_stage(spec, where, side)
+    try:
+        _add_head(spec, holder, radius)
+        _drive(spec, chain)
+        _add_limb(spec, layer, site, where, mount)
+        if gripper:
+            place = place_of(site, world_from_limb(site, where))
+            add_gripper(spec, place)
+            side, tools = place.side, (BALL, *FINGERS)
+        _add_stage(spec, where, side)
+    except ValueError as error:
+        if "repeated name" not in str(error):
+            raise
+        raise InvalidInput(f"a name of the robot's file is one that the scene takes: {' '.join(str(error).split())}. "
+                           "Rename it there.") from error  # fmt: skip
     exclude(spec, LIMB, tools)
     spec.option.timestep = timestep
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     try:
         model = spec.compile()
     except ValueError as error:
-        what = " Give each link that a joint moves its <inertial>." if "mjMINVAL" in str(error) else ""
+        light = "mjMINVAL" in str(error)
+        what = " Give each link that a joint moves its <inertial>, with a mass above 0." if light else ""
         raise InvalidInput(f"MuJoCo cannot compile the scene: {' '.join(str(error).split())}.{what}") from error
     joints = tuple(model.joint(joint.name).id for joint in chain)
     qpos = _reach(model, joints, site, np.array(at), radius + above)
@@ -151,6 +158,8 @@ def _end(spec: Any, name: str | None) -> Any:
             bodies, sites = (", ".join(one.name for one in many if one.name) for many in (spec.bodies, spec.sites))
             raise InvalidInput(f"the robot has no body or site '{name}'. Bodies: {bodies}. Sites: {sites or 'none'}.")
         return found
+    if len(spec.bodies) < 2:
+        raise InvalidInput("the robot's file has no body. Is it a xacro that was not expanded, or an empty scene?")
     return max(spec.bodies[1:], key=lambda body: (len(_chain(body)), _depth(body)))
 
 
@@ -190,6 +199,7 @@ def _drive(spec: Any, chain: list[Any]) -> None:
         motor = spec.add_actuator(name=f"torque_{joint.name}", target=joint.name)
         motor.trntype = mujoco.mjtTrn.mjTRN_JOINT
         motor.set_to_motor()  # the robot's defaults are its servos'
+        motor.gear = [1, 0, 0, 0, 0, 0]
         motor.ctrllimited = motor.forcelimited = mujoco.mjtLimited.mjLIMITED_FALSE
 
 
@@ -231,7 +241,7 @@ def _add_limb(spec: Any, layer: SoftLayer, site: Site, at: np.ndarray, mount: st
                 joint.springref = joint.armature = joint.frictionloss = 0.0  # the robot's defaults are not the limb's
                 joint.limited = mujoco.mjtLimited.mjLIMITED_FALSE
     elif mount == "rest":
-        _add_rest(limb, layer, site, pose)
+        _add_rest(limb, layer, site, pose, bool(spec.compiler.degree))
     elif mount != "fixed":
         raise InvalidInput(f"a limb cannot be mounted '{mount}'. Allowed: {', '.join(get_args(Mount))}.")
     limb.gravcomp = float(mount != "rest")  # it rests on something that is not drawn
@@ -244,16 +254,21 @@ def _add_limb(spec: Any, layer: SoftLayer, site: Site, at: np.ndarray, mount: st
                   contype=0, conaffinity=0, mass=0.0)  # fmt: skip
 
 
-def _add_rest(limb: Any, layer: SoftLayer, site: Site, pose: Transform) -> None:
-    """A hinge across the limb at its thicker end, which a rest that is not drawn keeps from turning down."""
+def _add_rest(limb: Any, layer: SoftLayer, site: Site, pose: Transform, degrees: bool) -> None:
+    """A hinge across the limb at its thicker end, which a rest that is not drawn keeps from turning down.
+
+    Args:
+        limb, layer, site, pose: the limb's body, its skin, the place on it, and its pose in the world, (4, 4).
+        degrees: whether the robot's file counts angles so, and with it all of its model.
+    """
     across = pose[:3, :3].T @ [1.0, 0.0, 0.0]
     along = (layer.vertices - site.point) @ site.along
     sign = -thin_end(site)
     end = layer.vertices[sign * along > (sign * along).max() - END]
-    joint = limb.add_joint(name="elbow", type=mujoco.mjtJoint.mjJNT_HINGE, pos=end.mean(axis=0), axis=-sign * across)
+    joint = limb.add_joint(name=HINGE, type=mujoco.mjtJoint.mjJNT_HINGE, pos=end.mean(axis=0), axis=-sign * across)
     joint.stiffness, joint.damping = np.zeros(3), np.resize(ELBOW_DAMPING, 3)
     joint.springref = joint.armature = joint.frictionloss = 0.0
-    joint.limited, joint.range = mujoco.mjtLimited.mjLIMITED_TRUE, [0.0, 1.0]
+    joint.limited, joint.range = mujoco.mjtLimited.mjLIMITED_TRUE, [0.0, np.rad2deg(1.0) if degrees else 1.0]
     joint.solref_limit, joint.solimp_limit = [0.004, 1.0], [0.95, 0.99, 0.001, 0.5, 2.0]
 
 
@@ -280,7 +295,7 @@ def _add_stage(spec: Any, at: np.ndarray, side: float) -> None:
                      width=8, height=48, rgb1=[0.97, 0.97, 0.98], rgb2=[0.97, 0.97, 0.98])  # fmt: skip
     world = spec.worldbody
     world.add_light(pos=at + light, dir=-light, diffuse=[0.45, 0.45, 0.45], castshadow=False)  # shades look like motion
-    world.add_geom(name="floor", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[2, 2, 0.05], contype=0, conaffinity=0,
+    world.add_geom(name=FLOOR, type=mujoco.mjtGeom.mjGEOM_PLANE, size=[2, 2, 0.05], contype=0, conaffinity=0,
                    rgba=[0.93, 0.93, 0.92, 1])  # fmt: skip
     world.add_camera(name=EYE, pos=at + look, xyaxes=[*_looking(AIM - look)], fovy=33)
 

@@ -12,6 +12,7 @@ from stmpl_sim.engine import mujoco
 
 BALL_SPLITS = 4  # times that the icosahedron of a ball is split: 2,562 corners, radius met to 0.05 %
 ROUND = 64  # corners around a cylinder or a capsule
+CELLS, NODES = 6, 3e6  # of a grid across the thinnest part of a union with open parts, and in all
 OFF_NODES = 0.37  # cells by which the nodes of a union's grid are off its faces: on them marching cubes leaves gaps
 KINDS = "sphere, capsule, ellipsoid, cylinder, box and mesh"
 
@@ -43,7 +44,8 @@ def geom_surface(model: Any, geom: int) -> Surface:
         shift = np.where(arc < 0, -size[1], size[1])
         outline = np.stack([size[0] * np.cos(arc), size[0] * np.sin(arc) + shift], axis=1)
         outline[[0, -1], 0] = 0.0
-        mesh = trimesh.creation.revolve(outline, sections=ROUND)
+        mesh = trimesh.creation.revolve(1e3 * outline, sections=ROUND)  # in metres it drops the triangles at the ends
+        mesh.apply_scale(1e-3)
     elif kind == kinds.mjGEOM_CYLINDER:
         mesh = trimesh.creation.cylinder(radius=size[0], height=2 * size[1], sections=ROUND)
     elif kind == kinds.mjGEOM_BOX:
@@ -79,13 +81,35 @@ def geom_in_body(model: Any, geom: int) -> Transform:
     return pose
 
 
-def _union(parts: list[Surface], cells: int = 72) -> Surface:
-    """Zero of the least of the parts' distances, by marching cubes: corners are rounded by about a cell."""
+def _union(parts: list[Surface]) -> Surface:
+    """Surface around all parts: exact where they are closed, else by a grid (`_union_on_grid`)."""
+    import trimesh
+
+    meshes = [trimesh.Trimesh(part.vertices, part.faces, process=True) for part in parts]
+    for mesh in meshes:
+        mesh.update_faces(mesh.nondegenerate_faces())
+    if not all(mesh.is_volume for mesh in meshes):
+        return _union_on_grid(parts)
+    whole = trimesh.boolean.union(meshes, engine="manifold")
+    return Surface(np.asarray(whole.vertices), np.asarray(whole.faces, dtype=np.int32))
+
+
+def _union_on_grid(parts: list[Surface]) -> Surface:
+    """Zero of the least of the parts' distances, by marching cubes: corners are rounded by about a cell.
+
+    Raises:
+        InvalidInput: parts so thin that a grid with CELLS across them has more than NODES nodes.
+    """
     import igl
 
     points = np.concatenate([part.vertices for part in parts])
     low, high = points.min(axis=0), points.max(axis=0)
-    spacing = float((high - low).max()) / cells
+    thinnest = min(float(np.ptp(part.vertices, axis=0).min()) for part in parts)
+    spacing = min(float((high - low).max()) / 72, thinnest / CELLS)
+    if not np.prod((high - low) / max(spacing, 1e-300) + 5) < NODES:
+        raise InvalidInput(f"geoms of one body that is a tool are {1e3 * thinnest:.2g} mm thin and "
+                           f"{1e3 * (high - low).max():.3g} mm long together, and one of their meshes is open. Close "
+                           "it, or name the geom that touches as the tool.")  # fmt: skip
     axes = [np.arange(a - (2 + OFF_NODES) * spacing, b + 3 * spacing, spacing) for a, b in zip(low, high, strict=True)]
     grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
     nodes = np.ascontiguousarray(grid.transpose(2, 1, 0, 3).reshape(-1, 3))  # x runs fastest, as igl counts

@@ -153,6 +153,45 @@ def test_a_robot_of_ones_own_is_driven_and_what_it_lacks_is_said(forearm: SoftLa
         build(forearm, site, robot=path)
 
 
+def test_a_file_in_degrees_with_names_and_gears_of_its_own_is_as_another(forearm: SoftLayer, tmp_path: Path) -> None:
+    """MJCF counts angles in degrees unless it says otherwise; a rest lets a limb turn up by one radian."""
+    from stmpl_sim.scene import HINGE, build
+    from stmpl_sim.site import Site
+
+    path, site = tmp_path / "arm.xml", Site.thickest(forearm)
+    inertial = '<inertial pos="0 0 0" mass="1" diaginertia="1 1 1"/>'
+    file = f"""<mujoco><default><motor gear="50"/><general gear="20"/></default><worldbody>
+      <geom name="floor" type="plane" size="1 1 .1" contype="0" conaffinity="0"/>
+      <body name="a" pos="0 0 .8">{inertial}<joint name="elbow" type="slide" axis="1 0 0" range="-.4 .8"/>
+      <joint name="y" type="slide" axis="0 1 0" range="-1 1"/><joint name="z" type="slide" axis="0 0 1" range="-.6 .6"/>
+      <body name="c" quat="0 1 0 0">{inertial}</body></body></worldbody></mujoco>"""
+    for degrees in (True, False):
+        path.write_text(file if degrees else file.replace("<default>", '<compiler angle="radian"/><default>', 1))
+        model = build(forearm, site, robot=path, mount="rest").model
+        np.testing.assert_allclose(model.joint(HINGE).range, [0, 1], atol=1e-9)
+        np.testing.assert_array_equal(model.actuator_gear[:, 0], 1)
+    for name in ("limb", "head", "ball", "wrist"):
+        path.write_text(file.replace('name="c"', f'name="{name}"').replace(
+            "</body></body>", f'<site name="{name}"/><geom name="{name}" size=".01"/></body></body>'))
+        with pytest.raises(InvalidInput, match="a name of the robot's file is one that the scene takes"):
+            build(forearm, site, robot=path)
+    path.write_text("<mujoco/>")
+    with pytest.raises(InvalidInput, match="has no body"):
+        build(forearm, site, robot=path)
+
+
+def test_a_run_that_diverges_ends_with_a_sentence(forearm: SoftLayer) -> None:
+    from stmpl_sim.massage import Course, Massage
+    from stmpl_sim.scene import build
+    from stmpl_sim.site import Site
+
+    site = Site.thickest(forearm)
+    massage = Massage(build(forearm, site), Course(site.circle(0.012)), skin=Simulator(forearm, Winkler()))
+    massage.controller.torques = lambda *_: np.full(7, np.nan)  # type: ignore[method-assign]
+    with pytest.raises(InvalidInput, match="the simulation diverged at 0"):
+        massage.run()
+
+
 def test_a_robot_whose_joints_are_servos_keeps_its_force(forearm: SoftLayer, tmp_path: Path) -> None:
     """A gantry of 30 kg whose servos have limits by default, and damping; one mesh is nowhere."""
     from stmpl_sim.massage import Course, Massage

@@ -106,7 +106,7 @@ def pressed(name: str, make: Make, rng: np.random.Generator, count: int) -> Iter
     tools = [random_tool(rng, mesh, f"tool {k}") for k in range(TOOLS)]
     try:
         simulator = simulator_of(make, mesh.layer)
-    except Exception as error:
+    except (Exception, SystemExit) as error:  # a method of others may end itself
         trial = Trial("fuzz", "", ("finite",), Contacts(mesh, (), ()))
         yield _failed(name, trial, error), trial, []
         return
@@ -123,7 +123,7 @@ def asked(name: str, simulator: Simulator, trial: Trial) -> tuple[Row, Trial, li
         if (further := _deeper(scene, answers)) is not None:
             trial = replace(trial, scene=further, laws=(*trial.laws, "rises"))
             answers = list(further.asked(simulator))
-    except Exception as error:
+    except (Exception, SystemExit) as error:  # a method of others may end itself
         return _failed(name, trial, error), trial, []
     statuses = [touch.status for answer in answers_of(answers)[:1] for touch in answer.touches.values()]
     return judged(name, trial, Answers(answers, [])), trial, statuses
@@ -141,7 +141,7 @@ def _deeper(scene: Contacts, answers: list[Displacement]) -> Contacts | None:
     return replace(scene, instants=(instant, (one._replace(pose=pose),)))
 
 
-def _failed(name: str, trial: Trial, error: Exception) -> Row:
+def _failed(name: str, trial: Trial, error: BaseException) -> Row:
     """A refusal in a sentence, or a crash."""
     from studies.stability.broken import Broken
 

@@ -155,7 +155,7 @@ def judge(name: str, make: Make, trial: Trial, *, patience: float = PATIENCE) ->
     except (StmplError, ValueError) as error:
         broken = Broken("answers", "refused", True, str(error))
         return Row(name, trial.axis, trial.level, "flagged", (broken,))
-    except Exception as error:
+    except (Exception, SystemExit) as error:  # a method of others may end itself
         log.debug("%s crashed at %s %s", name, trial.axis, trial.level, exc_info=True)
         broken = Broken("answers", f"crashed: {error!r}", False)
         return Row(name, trial.axis, trial.level, "crashed", (broken,))
@@ -184,7 +184,7 @@ def _refused(name: str, method: Method, trial: Trial, scene: Pressures) -> Row:
             answer = method.solve(load)
         except (StmplError, ValueError):
             continue
-        except Exception as error:
+        except (Exception, SystemExit) as error:  # a method of others may end itself
             broken.append(Broken("refuses", f"crashed: {error!r}", False))
             outcome = "crashed"
             continue

@@ -139,7 +139,7 @@ def surrogate(row: Row, inputs: Inputs) -> float:
     radius, depth = inputs["radius"].value, inputs["depth"].value if "depth" in inputs else 0.0
     contact = math.sqrt(radius * depth) if row.protocol.ball else radius
     if row.asked in IN_TIME:
-        return _in_time(row, inputs)
+        return _in_time(row, inputs, contact)
     way = row.protocol.way
     assert way != "stretched"  # only with time
     relaxed, tensed = (_with(region(row.region, tone), inputs) for tone in ("relaxed", "tensed"))
@@ -160,15 +160,15 @@ def surrogate(row: Row, inputs: Inputs) -> float:
     return stiffness(relaxed)
 
 
-def _in_time(row: Row, inputs: Inputs) -> float:
-    """What is asked of tissue that fades, from the values of the inputs."""
+def _in_time(row: Row, inputs: Inputs, contact: float) -> float:
+    """What is asked of tissue that fades under a contact of a radius [m], from the values of the inputs."""
     fades, protocol = inputs["fades"].value, row.protocol
     if protocol.way == "stretched":
         law = fading.series(fades)
         left = Series(np.array(law.shares), np.array(law.times))
     else:
         body = _with(region(row.region), inputs)
-        left = fading.series_under(body.tissue, body.thickness, fades)
+        left = fading.series_under(body.tissue, body.thickness, fades, contact)
     if row.asked == "time of fading":
         return fading.fading_time(left)
     lasts = inputs["depth"].value / inputs["speed"].value if "speed" in inputs else 0.0
