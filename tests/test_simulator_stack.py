@@ -197,8 +197,8 @@ def test_a_deeper_material_of_another_poissons_ratio_presses_as_finite_elements_
     assert ("Poisson's ratio" in touch.trust.why) == (deeper != 0.40)
 
 
-@pytest.mark.parametrize("tension, sound", [(0.0, True), (50.0, True), (100.0, False)])
-def test_force_under_tight_skin_is_within_its_bound_or_flagged(tension: float, sound: bool) -> None:
+@pytest.mark.parametrize("tension, sound", [(0.0, False), (50.0, True), (100.0, False)])
+def test_force_under_slack_and_tight_skin_is_within_its_bound_or_flagged(tension: float, sound: bool) -> None:
     """Beside finite elements: 6 % too small at 50 N/m round a limb of 45 mm, 14 at 100; people's is 6 to 22."""
     thickness, radius = 25e-3, 45e-3
     layer = limb(5e-3, thickness, radius, 0.18).with_(tissue=Tissue(3e3, 0.45, skin=Membrane(5e4, 1.5e-3, tension)))
@@ -208,7 +208,7 @@ def test_force_under_tight_skin_is_within_its_bound_or_flagged(tension: float, s
     truth = fem.press([start.touching(layer)], depth)
     (touch,) = Simulator(layer, MomentNet()).touch([contact_of(tool, at(radius + 20e-3 - depth, 0, 0.09))])
     assert touch.trust.in_range == sound and ("tension" in touch.trust.why) != sound
-    if sound:  # linear elements press up to 4 % too hard
+    if tension < 100:  # linear elements press up to 4 % too hard
         assert abs(touch.force - truth.force) < 1.4 * touch.force_bound
 
 
