@@ -16,7 +16,7 @@ from rich.progress import track
 
 from stmpl_core.needs import stroke_of
 from stmpl_core.regions import HELD_SKIN, region
-from stmpl_core.relaxation import faded, fading, series_of
+from stmpl_core.relaxation import fades_under, series_of
 from stmpl_core.stack import ball
 from stmpl_core.stroke import played, without_time
 
@@ -33,7 +33,7 @@ def maps() -> tuple[np.ndarray, np.ndarray]:
     eases = part.tissue.relaxing(HELD_SKIN), part.thickness
     series, pressed = series_of(*eases), ball(part.tissue, part.thickness, RADIUS, force=FORCE)
     still = stroke_of(part.tissue, part.thickness, pressed, np.inf, 0.0, 0.0)
-    still = still._replace(fades=float(faded(fading(*eases), still.radius)))
+    still = still._replace(fades=fades_under(*eases, still.radius))
 
     def late(speed: float, stays: float) -> tuple[float, float]:
         return without_time([still._replace(speed=speed, stays=stays)], series, 0.0)[:2]

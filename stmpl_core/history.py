@@ -172,10 +172,9 @@ class History:
         if not (touch.presses and pressed is not None and pressed.forces is not None and push @ push > 0):
             return self._free(one, touch, 0.0, dt)
         nodes, stated, pose = pressed.squeeze.nodes, one.stated.wrench, touch.pose_body_from_tool
-        depths = nodes.sinking if len(nodes.sinking) else nodes.strain * nodes.thickness
         (force, elastic, at_rest, net, radius, long, lever, thickness, contact, relaxed, stored, whole,
          doubt) = bearing(
-            push, nodes.points, nodes.area, nodes.thickness, depths, pressed.forces, touch.depth, pressed.power,
+            push, nodes.points, nodes.area, nodes.thickness, nodes.depths, pressed.forces, touch.depth, pressed.power,
             pressed.factor, one.before.contact, before.pressing > 0, self._fades, one.kept, one.gain, one.owed, shares,
             NONE if stated is None else stated, one.contact is not one.stated, one.before.slid)  # fmt: skip
         if not force > 0:

@@ -210,8 +210,7 @@ def _model(toucher: Toucher, touch: Touch, tangent: Tangent | None, memory: Memo
     normal, nodes = push[:3] / touch.force, pressed.squeeze.nodes
     stiffness, drawn, eased = tangent.stiffness, pressed.factor, 0.0
     whole = float(pressed.forces.sum())
-    depth = nodes.sinking if len(nodes.sinking) else nodes.strain * nodes.thickness
-    contact = patch_of(nodes.points, nodes.area, nodes.thickness, depth, pressed.forces, normal)
+    contact = patch_of(nodes.points, nodes.area, nodes.thickness, nodes.depths, pressed.forces, normal)
     if memory is not None and memory.scalars.pressing > 0:  # W = W_e - lambda A, and A stays
         now = memory.scalars
         grown = touch.passive * (1.0 if touch.slip is None else touch.slip.grown)

@@ -63,6 +63,11 @@ class Nodes(NamedTuple):
     shares: np.ndarray
     sinking: np.ndarray = np.empty(0)
 
+    @property
+    def depths(self) -> np.ndarray:
+        """Depth by which the skin sinks, in its column where no other is known, (N,) [m]."""
+        return self.sinking if len(self.sinking) else self.strain * self.thickness
+
     @classmethod
     def none(cls) -> Nodes:
         """No nodes."""

@@ -133,6 +133,11 @@ def faded(fades, radius):
     return factors[low] + (at - low) * (factors[low + 1] - factors[low])
 
 
+def fades_under(tissue: Tissue, thickness: float, radius: float) -> float:
+    """`faded` of one contact of a radius [m] on a stack; see `fading`."""
+    return float(faded(fading(tissue, thickness), radius))
+
+
 @numba.njit(cache=True, error_model="numpy")
 def weights(times, dt, gone, before, relaxed, kept, gain):
     """What has relaxed after a step is kept + gain F, with F the elastic force at its end, straight in between.

@@ -124,8 +124,7 @@ class Soundness:
     def of_contact(self, loaded: np.ndarray, force: np.ndarray) -> list[str]:
         """What is wrong with the skin under a tool that presses with forces (L,) on vertices (L,), as sentences."""
         steep, long, near = _shares(loaded, force, self.steep, self.long, self._near)
-        sound = steep <= STEEP_SHARE and long <= LONG_SHARE
-        told = [] if sound else self.of_mesh(steep, long, "the force")
+        told = self.of_mesh(steep, long, "the force")
         return told if self.bend is None and near <= BORDER_SHARE else [*told, *self.of_load(loaded, force)]
 
 

@@ -174,8 +174,8 @@ def _rubbed(toucher: Toucher, sideways: Sideways, one: Contact) -> _Rubbed | Non
     if one.wrench is None or pressed is None or pressed.forces is None or not touch.force > 0:
         return None
     normal, nodes = touch.push / touch.force, pressed.squeeze.nodes
-    depth = nodes.sinking if len(nodes.sinking) else nodes.strain * nodes.thickness
-    _, radius, _, thickness, _ = patch_of(nodes.points, nodes.area, nodes.thickness, depth, pressed.forces, normal)
+    _, radius, _, thickness, _ = patch_of(nodes.points, nodes.area, nodes.thickness, nodes.depths, pressed.forces,
+                                          normal)  # fmt: skip
     pressing = float(one.wrench[:3] @ normal)
     if not pressing > 0:
         return None
@@ -276,7 +276,7 @@ def fit_relaxation(toucher: Toucher, press: Sequence[Contact], relaxation: Prony
         if np.linalg.norm(away - (away @ normal) * normal) > STAYS:
             break
         nodes, pressing = touch.pressed.squeeze.nodes, touch.pressed.forces
-        _, radius, _, thick, _ = patch_of(nodes.points, nodes.area, nodes.thickness, nodes.thickness, pressing, normal)
+        _, radius, _, thick, _ = patch_of(nodes.points, nodes.area, nodes.thickness, nodes.depths, pressing, normal)
         long = stretch(touch.depth, thick)
         more.append(float(faded(fades, radius)))
         weights(times, steps[k - 1] if k else 0.0, 0.0, more[-1] * before, relaxed, kept, gain)

@@ -69,12 +69,12 @@ class SceneConfig(BaseModel):
     def model(self, found: Needs) -> Model:
         """The smallest model that serves: tissue, thickness, and what a state has to follow."""
         from stmpl_core.living import Model
-        from stmpl_core.relaxation import faded, fading, series_of
+        from stmpl_core.relaxation import fades_under, series_of
 
         tissue, thickness = self._serves(found)
         if found.relaxing:  # as much of its force fades as of the whole tissue's, whose taut skin keeps some
             radius = geometric_mean([one.judged.contact_radius for one in found.indentations])
-            whole, own = (float(series_of(*one).shares.sum() * faded(fading(*one), radius))
+            whole, own = (float(series_of(*one).shares.sum()) * fades_under(*one, radius)
                           for one in (self._tissue_that_relaxes(), (tissue.relaxing(HELD_SKIN), thickness)))
             shares = tuple(g * whole / own for g in HELD_SKIN.shares)
             tissue = tissue.relaxing(replace(HELD_SKIN, shares=shares))

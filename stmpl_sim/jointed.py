@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from stmpl_core.arrays import Transform
+from stmpl_core.arrays import Transform, inverted
 from stmpl_core.errors import InvalidInput
 from stmpl_core.rig import Rig
 from stmpl_core.touch import Touch
@@ -126,4 +126,4 @@ class Jointed:
             return np.eye(4)
         bone = int(self.rig.weights[int(((vertices - place) ** 2).sum(axis=1).argmin())].argmax())
         start, end = (self.rig.motions(self.rig.angles(one))[bone] for one in (now, posed))
-        return end @ np.linalg.inv(start)
+        return end @ inverted(start)

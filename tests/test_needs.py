@@ -12,7 +12,7 @@ from stmpl_core.layer import MAX_THICKNESS
 from stmpl_core.living import read_model, read_tissue
 from stmpl_core.needs import needs
 from stmpl_core.regions import HELD_SKIN, region
-from stmpl_core.relaxation import faded, fading, series_of
+from stmpl_core.relaxation import fades_under, series_of
 from stmpl_core.stack import Misfit
 from stmpl_ros.cli import main
 from tests.scenes import plate
@@ -175,7 +175,7 @@ def test_the_file_carries_time_and_slip_for_a_node(capsys, tmp_path):
     assert code == 0 and rich.relaxing is told["relaxing"] is True and rich.friction == told["friction"] == "dry"
     assert read_tissue(tmp_path / "rich.json") == rich[:2]
     part, (ball,) = region("forearm"), told["indentations"]
-    both = [series_of(*one).shares * faded(fading(*one), ball["judged"]["contact_radius"])
+    both = [series_of(*one).shares * fades_under(*one, ball["judged"]["contact_radius"])
             for one in (rich[:2], (part.tissue.relaxing(HELD_SKIN), part.thickness))]  # fmt: skip
     np.testing.assert_allclose(*both, rtol=1e-6)
     stmpl(capsys, *scene[:-4], "--path", 100, "--friction", 0.01, "--out", tmp_path / "plain.json")

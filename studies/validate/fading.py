@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from stmpl_core.regions import HELD_SKIN
-from stmpl_core.relaxation import Series, faded, fading, series_of, weights
+from stmpl_core.relaxation import Series, fades_under, series_of, weights
 from stmpl_core.tissue import Prony, Tissue
 
 STEPS = 60  # of a way there, of a stay, of a way back
@@ -39,7 +39,7 @@ def series_under(tissue: Tissue, thickness: float, fades: float, radius: float) 
     """What fades of the force on a stack, by a contact of a radius [m], whose materials all fade by that share."""
     stack = tissue.relaxing(series(fades)), thickness
     shares, times = series_of(*stack)
-    return Series(shares * float(faded(fading(*stack), radius)), times)
+    return Series(shares * fades_under(*stack, radius), times)
 
 
 def cycles(fading: Series, lasts: float, stays: float, many: int, *, slack: bool) -> Cycles:
