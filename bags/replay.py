@@ -138,10 +138,11 @@ def replay(run: Path | str | Run, method: Method, *, every: int = 1,
 
 def _simulator(before: Simulator | None, layer: SoftLayer, method: Method, frame: Frame) -> Simulator:
     """The simulator that a frame was answered by: the one from before, if layer and friction are still the same."""
+    friction = {name: one or None for name, one in frame.friction.items()}  # 0: none was told
     if before is None or (before.skin.rest or before.skin).layer is not layer:
-        return Simulator(layer, method, friction=frame.friction if frame.state else None)
+        return Simulator(layer, method, friction=friction if frame.state else None)
     if frame.state and any(before.history.friction(name) != one for name, one in frame.friction.items()):
-        return Simulator(before.skin, tools=before.tools, friction=frame.friction)
+        return Simulator(before.skin, tools=before.tools, friction=friction)
     return before
 
 

@@ -51,7 +51,7 @@ def main() -> None:
     for k in range(taken[0] + 1, len(frames)):
         if np.linalg.norm(poses[k, :3, 3] - poses[taken[-1], :3, 3]) > SPACING or at[k] - at[taken[-1]] > PAUSE:
             taken.append(k)
-    friction = coefficient(frames[-1].friction.get(given.tool))
+    friction = coefficient(frames[-1].friction.get(given.tool) or None)
     print(f"{len(taken)} poses, friction {friction:g}, {'relaxing' if layer.tissue.relaxes else 'elastic'}")
     print("time [s]   FEM [N] (friction)   answer [N] (friction)   off")
     patch = PatchFem(reach=REACH, check_stability=False, element="P1xP2", layers=1)

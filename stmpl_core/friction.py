@@ -12,6 +12,7 @@ from stmpl_core.errors import InvalidInput
 from stmpl_core.tissue import FRICTION
 
 MOST = 5.0  # largest coefficient of friction that is accepted [-]; skin that is moist sticks with 1 to 3
+LEAST = 1e-3  # least that acts: no tool slides as freely, and where none is told the skin sticks
 
 Surface = Literal["typical", "dry", "moist", "oiled", "glove"]
 
@@ -46,7 +47,9 @@ Friction = float | str | None
 
 
 def coefficient(friction: Friction) -> float:
-    """Coefficient of friction mu of a number, of the name of a pair, or of None, which is 0.
+    """Coefficient of friction mu of a number, of the name of a pair, or of None, which is 0: none is told.
+
+    A number below LEAST is answered as that: a tool that slides freely is not one of which nothing is told.
 
     Raises:
         InvalidInput: a name that is not known, or a number that is not from 0 to MOST.
@@ -61,7 +64,7 @@ def coefficient(friction: Friction) -> float:
         raise InvalidInput(f"friction is {friction!r}; a number, the name of a pair, or these by tool are accepted.")
     if not (np.isfinite(friction) and 0 <= friction <= MOST):
         raise InvalidInput(f"friction is {friction:g}; a coefficient from 0 to {MOST:g} is accepted.")
-    return float(friction)
+    return max(float(friction), LEAST)
 
 
 def coefficients(friction: Friction | Mapping[str, Friction]) -> tuple[float, dict[str, float]]:
@@ -82,7 +85,7 @@ def friction_from(text: str) -> Friction | dict[str, Friction]:
     """What a person writes of friction: a number, a pair's name, or either by tool: "ball: oiled, letter: 0.3".
 
     Args:
-        text: what is said; empty or "none": no friction.
+        text: what is said; empty or "none": none is told, and the skin sticks to the tool.
 
     Raises:
         InvalidInput: what is none of these, a name that is not known, or a number that is not from 0 to MOST.

@@ -134,7 +134,7 @@ def test_less_accuracy_asks_for_less():
         ({"radii": (20.0,)}, "radii is 20 m"),
         ({"radii": ()}, "at least one radius"),
         ({"forces": (-1.0,)}, "forces is -1 N"),
-        ({"friction": 0.0}, "friction is 0"),
+        ({"friction": -0.1}, "friction is -0.1"),
         ({"drag": -1.0}, "drag is -1"),
         ({"edge": 0.0}, "edge is 0"),
         ({"friction": "soap"}, "no friction 'soap'"),

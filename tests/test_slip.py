@@ -294,6 +294,7 @@ def test_friction_is_by_tool_and_by_name(sim: Simulator) -> None:
     some = Simulator(sim.layer, Winkler(), sim.tools, friction={"probe": "oiled"})
     assert some.history.friction("probe") == PAIRS["oiled"].friction and some.history.friction("other") == 0
     assert coefficient(None) == 0 and coefficient("dry") == PAIRS["dry"].friction
+    assert coefficient(0) == coefficient(0.001) == 0.001
     for wrong in ("wet", -0.1, 9.0, float("nan")):
         with pytest.raises(InvalidInput):
             coefficient(wrong)
