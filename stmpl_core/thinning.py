@@ -14,7 +14,7 @@ from stmpl_core.neighbours import along_edges, neighbours
 ZONES = (2.5, 5.0)  # distances from the load, over t, at which the first and the second thinning begin
 SPACINGS = (0.6, 1.5)  # least distances between the vertices that are asked there, over t
 CORNERS = 12  # number of asked vertices from which one between is filled in
-STACK_ZONES, STACK_SPACINGS = (0.8, 2.5), (0.25, 0.4)  # the same of a stack, which is thicker beside what presses
+STACK_ZONES, STACK_SPACINGS = (0.4, 0.9, 2.5), (0.1, 0.2, 0.4)  # of a stack, which is thicker beside what presses
 LARGEST = 2.5  # sum of the weights' sizes, from which a vertex is rather asked itself: it would be extrapolated
 
 
@@ -56,15 +56,15 @@ class Thinning:
         layer: soft layer at rest.
         frames: two tangents and the normal of each vertex, (V, 3, 3).
         reach: distance to which a load is felt, over t.
-        zones: distances from the load, over t, at which the first and the second thinning begin.
+        zones: distances from the load, over t, at which each thinning begins.
         spacings: least distances between the vertices that are asked there, over t.
 
     Attributes:
         folded: flag of a skin that comes near itself through the air, as fingers do.
     """
 
-    def __init__(self, layer: SoftLayer, frames: np.ndarray, reach: float, zones: tuple[float, float] = ZONES,
-                 spacings: tuple[float, float] = SPACINGS) -> None:  # fmt: skip
+    def __init__(self, layer: SoftLayer, frames: np.ndarray, reach: float, zones: tuple[float, ...] = ZONES,
+                 spacings: tuple[float, ...] = SPACINGS) -> None:  # fmt: skip
         points, normals, thickness = np.ascontiguousarray(layer.vertices), layer.normals, layer.thickness
         self.start, self.index = neighbours(points, normals, thickness, layer.faces, np.array([*zones, reach]))
         self._first, self._beside = along_edges(layer.faces, len(points))
@@ -76,7 +76,8 @@ class Thinning:
         self._weights = np.zeros((len(zones) + 1, count, CORNERS), dtype=np.float32)
         self._stands[0] = True
         for zone, spacing in enumerate(spacings, start=1):
-            stands = _thinned(self.start, self.index, self._stands[zone - 1], points, thickness, spacing)
+            within = 1 + int(np.searchsorted(zones[:-1], spacing))
+            stands = _thinned(self.start, self.index, self._stands[zone - 1], points, thickness, spacing, within)
             corners = _nearest(self.start, self.index, stands, points)
             some = np.flatnonzero(~stands & (corners[:, -1] >= 0))
             weights = interpolation(points, frames, thickness, some, corners[some])
@@ -87,7 +88,7 @@ class Thinning:
             self._corners[zone, some], self._weights[zone, some] = corners[some], weights[good]
 
         some = np.flatnonzero(self._stands[-1])
-        self.folded = _folded(self.start, self.index, some, points, normals, thickness, zones[1])
+        self.folded = _folded(self.start, self.index, some, points, normals, thickness, zones[-1])
 
     def groups(self, vertices: np.ndarray) -> np.ndarray:
         """Numbers of groups of vertices (N,), none of which feels another, (N,): all 0 where the skin has no folds."""
@@ -108,7 +109,8 @@ class Thinning:
         """Some of vertices `among`, no two of which are nearer along the skin than `spacing` [m], (N,)."""
         mask = np.zeros(len(points), np.bool_)
         mask[among] = True
-        return np.flatnonzero(_thinned(self.start, self.index, mask, points, np.full(len(points), spacing), 1.0))
+        apart, zones = np.full(len(points), spacing), len(self._stands)
+        return np.flatnonzero(_thinned(self.start, self.index, mask, points, apart, 1.0, zones))
 
     def spread(self, points: np.ndarray, areas: np.ndarray, values: np.ndarray, reach: float) -> np.ndarray:
         """Values (V,) on areas (V,) [m2], each spread along the skin as far as `reach` [m]; their integral stays."""
@@ -193,8 +195,11 @@ def _together(start, index, vertices, count):
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _thinned(start, index, among, points, thickness, spacing):
-    """Marks vertices of `among` no two of which are nearer than `spacing`, as many as come in order."""
+def _thinned(start, index, among, points, thickness, spacing, within):
+    """Marks vertices of `among` no two of which are nearer than `spacing`, as many as come in order.
+
+    Such two are neighbours within so many zones.
+    """
     count = len(points)
     zones = (len(start) - 1) // count
     kept, free = np.zeros(count, np.bool_), among.copy()
@@ -202,7 +207,7 @@ def _thinned(start, index, among, points, thickness, spacing):
         if not free[v]:
             continue
         kept[v] = True
-        for p in range(start[zones * v], start[zones * v + 1]):
+        for p in range(start[zones * v], start[zones * v + within]):
             away = 0.0
             for x in range(3):
                 away += (points[v, x] - points[index[p], x]) ** 2
