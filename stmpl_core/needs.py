@@ -36,6 +36,7 @@ TermName = Literal["skin", "tension", "muscle", "time", "slip", "mesh"]
 ENOUGH = Misfit(force=0.10, motion=0.10)  # with which a simpler model will do
 FINEST = 1e-4  # misfit that may be asked for [-]
 DEEPEST_OVER_THICKNESS, DEEPEST_OVER_RADIUS = 0.3, 0.5  # depth up to which the linear response is asked [-]
+DEEPEST_IN_LAYER = 0.45  # the same over a fitted layer's thickness: at 0.76 and beyond force was 30 to 70 % too large
 LARGEST_RADIUS, LARGEST_FORCE, FASTEST = 0.5, 5e3, 10.0  # of what a robot presses with [m], [N], [m/s]
 LONGEST_STAY, LONGEST_WAY = 1e6, 10.0  # of a tool at one place [s], and along the skin [m]
 STIFFENING = 1.18  # power of 1 / stretch^2 with which people's fat gets stiffer (Hatt et al. 2023)
@@ -212,9 +213,9 @@ def needs(
         raise InvalidInput("give at least one radius and one force.")
     pressed = tuple(_indentation(tissue, thickness, r, f) for r in radii for f in forces)
     stack, skin, contacts = plies(tissue, thickness), tissue.skin, {one.judged.contact_radius for one in pressed}
-    slack = replace(skin, tension=0.0) if skin else None
-    bare, loose, taut = (nearest(stack, skin, one, sorted(contacts), 0.99 * MAX_THICKNESS)
-                         for one in (None, slack, skin))  # fmt: skip
+    slack, deepest = replace(skin, tension=0.0) if skin else None, max(one.judged.depth for one in pressed)
+    bare, loose, taut = (nearest(stack, skin, one, sorted(contacts), 0.99 * MAX_THICKNESS,
+                                 deepest / DEEPEST_IN_LAYER) for one in (None, slack, skin))  # fmt: skip
     rung = [_within(bare.misfit, enough), _within(taut.misfit, enough), True].index(True)
     pull = _tension(tissue, thickness, pressed, loose, rung, enough)
     eases = tissue if tissue.relaxes else tissue.relaxing(HELD_SKIN)

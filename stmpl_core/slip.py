@@ -9,7 +9,9 @@ Mechanics", 1985, chapter 7)
 Springs in parallel, each of which slides at its share of the cap, answer so on first loading, and by Masing's rule on
 every reversal (Iwan, J. Appl. Mech. 33, 893, 1966). Whatever the path, they give no energy. Forces are vectors
 (F_x, F_y, M / rho) in the tangent plane, with M the torque about the contact's normal and rho its lever, the mean
-distance of the pressure from the middle; so translation and spin share one limit. Springs relax as the force does.
+distance of the pressure from the middle; so translation and spin share one limit. What slides goes the way of its
+force (the flow rule of a limit surface: Goyal, Ruina & Papadopoulos, Wear 143, 307, 1991), however much stiffer skin is
+to the one than to the other. Springs relax as the force does.
 """
 
 from __future__ import annotations
@@ -30,6 +32,7 @@ _SLOPE = np.append(np.diff(_FORCE) / np.diff(_YIELD), 0.0)
 STIFFNESS = _SLOPE[:-1] - _SLOPE[1:]  # of each spring, over k, (SPRINGS,)
 LIMIT = STIFFNESS * _YIELD[1:]  # force at which each slides, over the cap, (SPRINGS,)
 TRIALS, TOLERANCE = 30, 1e-9  # of the way for a force; over the cap
+SLIDES = 8  # trials of how far a spring slides
 MOST_CARRIED = 0.9999  # share of the cap that sticks: a force at the cap has no way
 PART, PARTS = 0.25, 16  # way over cap / k from which a step is cut, for a slide that turns; most parts
 PLOUGHED = 0.33, 0.2, 0.67  # see ploughing: growth of stiffness, and of the cap without and over mu
@@ -89,12 +92,37 @@ def _go(way, stiffness, cap, start, left, over, springs, force, slides):
             square += one * one
         most, size = LIMIT[j] * cap, np.sqrt(square)
         slides[j] = size >= most
-        scale = most / size if size > most else 1.0
+        slip = _slipped(springs[j], left[j], stiffness, over, most, size) if size > most else 0.0
         for x in range(3):
-            one = (over * springs[j, x] - left[j, x]) * scale
-            if scale < 1.0:
+            one = over * springs[j, x] - left[j, x]
+            if slip > 0:
+                one /= 1 + slip * stiffness[x]
                 springs[j, x] = (one + left[j, x]) / over
             force[x] += one
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _slipped(spring, left, stiffness, over, most, size):
+    """How far a spring slides over its force [m/N], so that this falls from `size` to `most` [N].
+
+    A force f_x that would be without slip is f_x / (1 + slip k_x) with it. What is solved for is where one over its
+    size is one over `most`, by Newton's method, as of trust regions: in one step where the stiffnesses are alike.
+    """
+    slip, now = 0.0, size
+    if not most > 0:
+        return np.inf
+    for _ in range(SLIDES):
+        square = slope = 0.0
+        for x in range(3):
+            softer = 1 + slip * stiffness[x]
+            one = (over * spring[x] - left[x]) / softer
+            square += one * one
+            slope += one * one * stiffness[x] / softer
+        now = np.sqrt(square)
+        if not now > most * (1 + 1e-12):
+            break
+        slip += square / slope * (now - most) / most
+    return slip
 
 
 @numba.njit(cache=True, error_model="numpy")
@@ -214,14 +242,17 @@ def _find(wanted, stiffness, cap, start, left, over, springs, force, slides, go)
         last, back = off, 1.0
         tangent[:] = 0.0
         for j in range(len(springs)):
-            most = LIMIT[j] * cap
+            along = 0.0
+            if slides[j]:
+                for x in range(3):
+                    along += stiffness[x] * (over * springs[j, x] - left[j, x]) ** 2
             for x in range(3):
-                for y in range(3):
-                    along = 0.0
-                    if slides[j] and most > 0:
-                        a, b = over * springs[j, x] - left[j, x], over * springs[j, y] - left[j, y]
-                        along = a * b / (most * most)
-                    tangent[x, y] += over * STIFFNESS[j] * stiffness[y] * ((1.0 if x == y else 0.0) - along)
+                tangent[x, x] += over * STIFFNESS[j] * stiffness[x]
+                if along > 0:
+                    a = over * springs[j, x] - left[j, x]
+                    for y in range(3):
+                        b = over * springs[j, y] - left[j, y]
+                        tangent[x, y] -= over * STIFFNESS[j] * stiffness[x] * stiffness[y] * a * b / along
         for x in range(3):
             tangent[x, x] += 1e-9 * stiffness[x]
         _solve(tangent, wanted - force, step)
@@ -284,22 +315,27 @@ def rub(wrench, stated, by_force, contact, origin, bend, give, mu, along_itself,
     lost = (1 - before_slid) * before_elastic / elastic
     before = np.array([springs[:, x].sum() for x in range(3)])
     arm, grown, cap, share, stored = contact[0] - origin, 1.0, 0.0, 0.0, 0.0
+    turns, arm_of_turn = way[2] / lever, lever
     carried, after, new, kept = np.zeros(3), stiffness.copy(), springs.copy(), relaxed.copy()
     for _ in range(MOST_PASSES):
         if by_force:
             carries = carried_more(stated, contact[1], turned) * before_slid
             grown = carries / slid
-            push = carries * (wrench + wrench_at(size * turned, arm))
-            wanted = in_plane(stated - push, leaned(contact, turned), origin, lever)
         else:
             grown = max(1 + out / depth, LEAST_GROWN) ** power
         stiffer, cap = ploughing(depth, radius, grown * force, along, bare, mu)
+        plain = mu * grown * force / cap  # what turns in place has nothing before it that friction raises
+        arm_of_turn = lever * (plain + (1 - plain) * PLOUGHED[1] / (PLOUGHED[1] + PLOUGHED[2] * mu))
+        way[2] = turns * arm_of_turn
+        if by_force:
+            push = carries * (wrench + wrench_at(size * turned, arm))
+            wanted = in_plane(stated - push, leaned(contact, turned), origin, arm_of_turn)
         alone = stiffer * secant(along, bare, slack, mu * grown * force)
         sticks = given_way(alone, give, wanted if by_force else before + alone * way, contact)
         if out > 0:  # skin leans before the tool once: as it turns about the bone, or as it is ploughed
             by_turn = max(1 - sticks / alone, 0.0) * np.sqrt(np.sum(turned**2))
             cap -= min(by_turn * grown * force, cap - mu * grown * force)
-        after = np.array([sticks, sticks, stiffer * turn / (lever * lever)])
+        after = np.array([sticks, sticks, stiffer * turn / (arm_of_turn * arm_of_turn)])
         new, kept, carried, share, stored = drag(
             springs, relaxed, shares, times, dt, rolled, after, held_at, cap, way, wanted, by_force)  # fmt: skip
         last, last_slid = turned, slid
@@ -309,7 +345,7 @@ def rub(wrench, stated, by_force, contact, origin, bend, give, mu, along_itself,
             break
     if by_force:
         grown = carries / slid
-    rubs, offset, turns = in_space(carried, new, after, leaned(contact, turned), contact, origin, lever)
+    rubs, offset, turns = in_space(carried, new, after, leaned(contact, turned), contact, origin, arm_of_turn)
     stored += max(0.5 * (1 + grown * slid) * size * out, 0.0)
     lean = grown * slid * size * turned
     held, total = min(after[0], last_held) if last_held > 0 else 0.0, 0.0

@@ -334,9 +334,10 @@ def _shapes(x: np.ndarray) -> np.ndarray:
 
 
 def nearest(stack: list[tuple[float, float, float]], skin: Membrane | None, its_skin: Membrane | None,
-            radii: Iterable[float], thickest: float = np.inf) -> Fit:  # fmt: skip
-    """The single layer under `its_skin`, at most so thick [m], that answers most like plies under `skin`; see
-    `effective`.
+            radii: Iterable[float], thickest: float = np.inf, thinnest: float = 0.0) -> Fit:  # fmt: skip
+    """The single layer under `its_skin` that answers most like plies under `skin`; see `effective`.
+
+    It is from `thinnest` to `thickest` [m]: what presses deep wants room, of which a linear response knows nothing.
     """
     each = np.array(list(radii), dtype=float)
     if not (len(each) and (np.isfinite(each) & (each > 0)).all()):
@@ -361,9 +362,10 @@ def nearest(stack: list[tuple[float, float, float]], skin: Membrane | None, its_
     t = sum(h for h, _, _ in stack)
     middle = np.exp(np.mean(np.log([modulus for _, modulus, _ in stack])))
     most = min(THICKEST * t, thickest)
-    bounds = np.log([[1e-4 * middle, THINNEST * t], [1e4 * middle, most]])
-    tries = [least_squares(lambda logs: off(logs).ravel(), np.log([middle, min(share * t, 0.9 * most)]), bounds=bounds,
-                           x_scale=0.3) for share in (0.7, 0.2)]  # fmt: skip
+    least = min(max(THINNEST * t, thinnest), 0.8 * most)
+    bounds = np.log([[1e-4 * middle, least], [1e4 * middle, most]])
+    starts = [np.log([middle, np.clip(share * t, 1.1 * least, 0.9 * most)]) for share in (0.7, 0.2)]
+    tries = [least_squares(lambda logs: off(logs).ravel(), one, bounds=bounds, x_scale=0.3) for one in starts]
     best = min(tries, key=lambda one: one.cost).x
     rest = off(best)
     misfit = Misfit(float(np.abs(np.expm1(rest[:, 0])).max()), float(np.linalg.norm(rest[:, 1:], axis=1).max()))

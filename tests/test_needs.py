@@ -194,6 +194,15 @@ def test_a_skin_keeps_its_tension_and_a_layer_is_one_that_a_node_accepts(capsys,
         assert not one.tissue.deeper and one.thickness < MAX_THICKNESS
 
 
+def test_a_fitted_layer_has_room_for_the_press() -> None:
+    """A layer of 5.8 mm fits the linear response of a back, which a ball of 20 mm enters by 5.3 mm at 2 N."""
+    back, neck = region("back"), region("neck")
+    found = needs(back.tissue, [20e-3], [2.0], thickness=back.thickness)
+    assert found.layer is not None and found.layer.thickness > 2 * found.indentations[0].depth
+    found = needs(neck.tissue, [20e-3], [1.5], thickness=neck.thickness)
+    assert found.layer is None or found.layer.thickness > 2 * found.indentations[0].judged.depth
+
+
 def test_a_slow_scene_writes_relaxed_moduli(capsys, tmp_path):
     own = ("needs", "--thickness", 40, "--modulus", 3, "--force", 1, "--out")
     stmpl(capsys, *own, tmp_path / "quick.json")
