@@ -105,7 +105,21 @@ class History:
                 left = self._left(memory, dt)
                 if left.scalars.sunk or left.trail.any():
                     memories[name] = left
-        return out, State(memories, here)
+        return [self._after_others(touch, memories) for touch in out], State(memories, here)
+
+    def _after_others(self, touch: Touch, memories: Mapping[str, Memory]) -> Touch:
+        """The touch with a bound that counts what others have made relax where it presses, which it does not feel."""
+        own = memories.get(touch.name)
+        if not touch.presses or own is None or not len(own.relaxed) or len(memories) < 2:
+            return touch
+        owed, reach = 0.0, own.scalars.radius
+        for name, other in memories.items():
+            if name != touch.name and not other.scalars.pressing > 0 and other.scalars.sunk:
+                away = other.contact[0] - own.contact[0]
+                apart = math.sqrt(away @ away) / (reach + other.scalars.radius)
+                owed += max(1 - apart, 0.0) * float(self.series.shares @ other.relaxed)
+        bound = touch.force_bound + owed * own.scalars.stretch * own.scalars.net
+        return touch.with_(force_bound=bound) if owed > 0 else touch
 
     def _doubted(self, one: Asked, touch: Touch, memories: dict[str, Memory], dt: float) -> Touch:
         """The touch, out of range where its skin's memory rests on one that was; the memory learns how far it does."""

@@ -22,12 +22,13 @@ import numba
 import numpy as np
 
 from stmpl_core.stack import plies, response
-from stmpl_core.tissue import Prony, Tissue
+from stmpl_core.tissue import Membrane, Prony, Tissue
 
 MIX_RADIUS = 9e-3  # radius of the load for which the materials of a stack share a force [m]
 WIDER = 1.8  # radius of such a load over that of a contact: finite elements of balls on a back, 2 to 8 mm deep
 RADII = 1e-3, 0.1, 25  # of contacts, from the least to the most, for which it is known how much fades [m]
 LOG_STEP = 0.05  # change of a modulus by which its share is found, logarithm
+LEAST_LEFT = 1e-6  # share of a modulus that is left at least
 LEAST_STRETCH = 0.15  # of a column, to which it counts as pressed together
 DEPTH_TRIALS = 12  # of Newton for the depth of skin that is free
 HALVINGS = 30  # of a step in which skin comes free
@@ -50,10 +51,10 @@ class Series(NamedTuple):
 
 
 def series_of(tissue: Tissue, thickness: float) -> Series:
-    """Relaxation of a force on a flat stack: each material's own times its share d ln F / d ln E in the force.
+    """Relaxation of a force on a flat stack: each material's own times its share in the force.
 
-    The shares are those of the linear response under a Gaussian load of MIX_RADIUS (`stmpl_core.stack.effective`); they
-    sum to one less that of the skin's tension, which does not relax.
+    The shares are those of the linear response under a Gaussian load of MIX_RADIUS (`stmpl_core.stack.effective`), such
+    that in the end as much has faded as the force on relaxed moduli is less. The skin's tension does not relax.
 
     Args:
         tissue: materials, and the skin on them.
@@ -99,22 +100,30 @@ def _relaxations(tissue: Tissue, thickness: float) -> list[Prony | None]:
 
 
 def _shares(tissue: Tissue, thickness: float, radius: float = MIX_RADIUS) -> list[float]:
-    """d ln F / d ln E of each material of a stack, from the skin inwards, and last of the skin if there is one."""
-    stack = plies(tissue, thickness)
+    """Share of the force that each material bears, from the skin inwards, and last of the skin if there is one.
+
+    That is d ln F / d ln E, times a factor by which all together fade as much as the force on relaxed moduli falls: a
+    material that softens much bears less and less of it.
+    """
+    stack, skin = plies(tissue, thickness), tissue.skin
     if tissue.single:
         return [1.0]
     k = np.geomspace(0.02, 8, 200) / radius
     weight = np.exp(-0.25 * (k * radius) ** 2) * k * k
 
-    def log_force(number: int, by: float) -> float:
-        changed = [(h, modulus * np.exp(by * (n == number)), nu) for n, (h, modulus, nu) in enumerate(stack)]
-        skin = tissue.skin
-        if skin and number == len(stack):
-            skin = type(skin)(skin.youngs_modulus * float(np.exp(by)), skin.thickness, skin.tension, skin.poisson_ratio)
-        return -float(np.log(weight @ response(changed, skin, k)[0]))
+    def log_force(factors: np.ndarray) -> float:
+        """Logarithm of the force, with factors on the moduli."""
+        changed = [(h, modulus * by, nu) for (h, modulus, nu), by in zip(stack, factors, strict=False)]
+        sheet = skin and Membrane(skin.youngs_modulus * factors[-1], skin.thickness, skin.tension, skin.poisson_ratio)
+        return -float(np.log(weight @ response(changed, sheet, k)[0]))
 
-    many = len(stack) + (tissue.skin is not None)
-    return [(log_force(n, LOG_STEP) - log_force(n, -LOG_STEP)) / (2 * LOG_STEP) for n in range(many)]
+    many = len(stack) + (skin is not None)
+    steps = np.exp(LOG_STEP * np.eye(many))
+    shares = [(log_force(step) - log_force(1 / step)) / (2 * LOG_STEP) for step in steps]
+    fade = np.array([sum(one.shares) if one else 0.0 for one in _relaxations(tissue, thickness)])
+    whole = float(shares @ fade)
+    left = np.exp(log_force(np.maximum(1 - fade, LEAST_LEFT)) - log_force(np.ones(many)))
+    return [share * float(1 - left) / whole for share in shares] if whole > 0 else shares
 
 
 @numba.njit(cache=True, error_model="numpy")

@@ -177,7 +177,7 @@ def test_the_file_carries_time_and_slip_for_a_node(capsys, tmp_path):
     part, (ball,) = region("forearm"), told["indentations"]
     both = [series_of(*one).shares * fades_under(*one, ball["judged"]["contact_radius"])
             for one in (rich[:2], (part.tissue.relaxing(HELD_SKIN), part.thickness))]  # fmt: skip
-    np.testing.assert_allclose(*both, rtol=1e-6)
+    np.testing.assert_allclose(*both, rtol=1e-3)
     stmpl(capsys, *scene[:-4], "--path", 100, "--friction", 0.01, "--out", tmp_path / "plain.json")
     plain = read_model(tmp_path / "plain.json")
     assert not plain.relaxing and plain.friction is None and not plain.tissue.relaxes

@@ -8,7 +8,8 @@ import pytest
 from stmpl_core import Contact, Membrane, Ply, Prony, Simulator, SoftLayer, State, Tissue, Touch
 from stmpl_core.errors import InvalidInput
 from stmpl_core.methods import Winkler
-from stmpl_core.relaxation import depth_left, series_of
+from stmpl_core.relaxation import depth_left, fades_under, series_of
+from stmpl_core.stack import ball as pressed_ball
 from stmpl_core.state import UNKNOWN, VERSION, Scalars
 from stmpl_core.touch import APART, BY_POSE, MOVED, TOUCHING
 from tests.scenes import at, ball, plate
@@ -397,3 +398,29 @@ def test_materials_share_a_stacks_relaxation() -> None:
     assert fat.times.tolist() == muscle.times.tolist() == list(SERIES.times)
     assert 0 < muscle.shares.sum() < fat.shares.sum() and fat.shares.sum() + muscle.shares.sum() < 0.45
     np.testing.assert_allclose(series_of(Tissue(3e3, 0.45, relaxation=SERIES), 0.04).shares, SERIES.shares)
+
+
+@pytest.mark.parametrize("radius, left", [(12e-3, 0.662), (30e-3, 0.571)])
+def test_of_materials_that_fade_apart_as_much_is_left_as_of_relaxed_moduli(radius: float, left: float) -> None:
+    """Share by axisymmetric finite elements of a ball 4 mm deep, where the muscle alone fades by 80 %."""
+    muscle = Ply(8e-3, 2e4, 0.42, relaxation=Prony((0.8,), (1.0,)))
+    tissue = Tissue(3e3, 0.42, skin=Membrane(1.3e5, 1.5e-3, tension=11.0), deeper=(muscle,))
+    contact = pressed_ball(tissue, 20e-3, radius, depth=4e-3).contact_radius
+    fades = float(series_of(tissue, 20e-3).shares.sum()) * fades_under(tissue, 20e-3, contact)
+    assert 1 - fades == pytest.approx(left, rel=0.06)
+
+
+def test_the_bound_counts_what_another_tool_made_relax(sim: Simulator) -> None:
+    """Relaxation is remembered by tool, so another meets skin that is answered as fresh."""
+    found = []
+    for name in ("first", "second"):
+        state, touch = State(), None
+        press = (("first", DEPTH, 0.0), ("first", DEPTH, 10.0), ("first", -1e-3, 1e-3))
+        for tool, depth, dt in (*press, (name, DEPTH, 1e-3)):
+            contact = Contact(BALL.named(tool), pressed(depth).pose_body_from_tool)
+            (touch,), state = sim.touch([contact], state, dt)
+        assert touch is not None
+        found.append(touch)
+    same, other = found
+    assert other.force > 1.3 * same.force
+    assert other.force - same.force < other.force_bound < other.force
