@@ -57,6 +57,7 @@ MAX_AROUND = 0.02  # depth of skin in a tool that presses nothing, over the thic
 MAX_BESIDE = 0.3  # change of a force by the tools beside, beyond which the pose of a tool with a wrench is worth little
 OPEN = 2.0  # distance of a hole in a tool's mesh over the depth, up to which what is inside the tool there is a guess
 SHELL, SHELL_FROM = 2.5, 0.02  # bound on a force per share of work above this by which a limb is stiff as a shell
+SHALLOW, SHALLOW_TO = 0.1, 0.05  # bound on a first touch of one material, and depth over the thickness where it ends
 STUCK = 0.5  # error of what skin that sticks carries along itself, over that
 MAX_LEVER = 1.0  # torque that is not carried over the force, over the contact's radius, that is not yet worth a word
 MAX_FIELD_ERROR_M = 5e-4  # error of a distance field that is not yet worth a word
@@ -377,6 +378,8 @@ class Toucher:
             doubt = math.hypot(doubt, known["uneven"] * self.net.unlike(thickness))
         bound = known["scale"] * doubt ** known["power"] if size > 0 else 0.0
         bound += SHELL * max(held.shell - SHELL_FROM, 0.0)
+        if size > 0 and not layer.stacked:
+            bound += SHALLOW * max(1 - depth / (SHALLOW_TO * thickness), 0.0)
         beside_off = abs(1 / scale - 1) if len(v) and one.force is not None else 0.0  # each was placed as if alone
         if beside_off > 2 * FORCE_TOLERANCE:
             bound += beside_off

@@ -5,15 +5,17 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import trimesh
 
-from stmpl_core import SoftLayer
+from stmpl_core import Contact, Simulator, SoftLayer, Tissue, Tool
 from stmpl_core.columns import Columns
 from stmpl_core.contact_net import MAX_LOG_RATIO, ContactNet, Held
 from stmpl_core.errors import InvalidInput
+from stmpl_core.methods import MomentNet
 from stmpl_core.networks import NETWORKS, NODE, PRESSURE, Weights, shipped
 from stmpl_core.nodes import Nodes
 from stmpl_core.sdf import SignedDistance
-from tests.scenes import LENGTH, RADIUS, at, ball, enlarged, limb, placed, turn
+from tests.scenes import LENGTH, RADIUS, at, ball, enlarged, limb, placed, plate, turn
 
 LIMB = limb(4e-3)
 BALL = SignedDistance.of(ball(), margin=5e-3)
@@ -108,3 +110,13 @@ def test_another_network_is_refused(tmp_path: Path) -> None:
     copy.save(tmp_path / "copy.safetensors")
     again = Weights.load(tmp_path / "copy.safetensors", "pressure")
     assert all((again.arrays[name] == shipped("contact_net").arrays[name]).all() for name in again.arrays)
+
+
+def test_the_bound_covers_first_touches_of_small_contacts_on_thick_tissue() -> None:
+    """Forces of balls by axisymmetric finite elements that stick, on 30 mm of 10 kPa, nu 0.3."""
+    simulator = Simulator(plate(0.3, 10e-3, 30e-3).with_(tissue=Tissue(1e4, 0.3)), MomentNet())
+    for radius, depth, truth in ((0.01, 3e-4, 0.0082), (0.01, 6e-4, 0.0237), (0.03, 3e-4, 0.0148)):
+        mesh = trimesh.creation.icosphere(5, 1e3 * radius)
+        fine = Tool("ball", 1e-3 * np.asarray(mesh.vertices), np.asarray(mesh.faces))
+        (touch,) = simulator.touch([Contact(fine, at(1e-3, 5e-4, radius - depth))])
+        assert abs(touch.force - truth) < touch.force_bound < 0.2 * truth and touch.trust.in_range

@@ -27,7 +27,7 @@ def mean(some: list[Row], name: str, strange: bool = True) -> float:
 def test_strange_tools_press_and_move_the_skin_as_finite_elements_say(nodewise: list[Row]) -> None:
     assert len([one for one in nodewise if one.strange]) > 85
     assert mean(nodewise, "force_error") < 0.03 and mean(nodewise, "moving") < 0.03
-    assert max(one.moving for one in nodewise if one.strange) < 0.085
+    assert max(one.moving for one in nodewise if one.strange) < 0.09
     assert np.median([one.moving for one in nodewise if one.strange]) < 0.028
 
 

@@ -22,6 +22,7 @@ AROUND, UNSEEN = wp.constant(wp.float64(toucher.MAX_AROUND)), wp.constant(wp.flo
 SIDES = wp.constant(wp.vec2d(*toucher.SIDES))
 SOFT_SHARE = wp.constant(wp.float64(toucher.SOFT_SHARE))
 SHELL, SHELL_FROM = wp.constant(wp.float64(toucher.SHELL)), wp.constant(wp.float64(toucher.SHELL_FROM))
+SHALLOW, SHALLOW_TO = wp.constant(wp.float64(toucher.SHALLOW)), wp.constant(wp.float64(toucher.SHALLOW_TO))
 STUCK, WIDER = wp.constant(wp.float64(toucher.STUCK)), wp.constant(wp.float64(pieces.WIDER))
 GROUP, PINS_DEEP = wp.constant(wp.float64(pieces.GROUP)), wp.constant(wp.float64(pieces.DEEP))
 PIECE = wp.constant(wp.float64(2.0 / 3.0**0.5 * pieces.SPACINGS**2))
@@ -276,6 +277,8 @@ def answer(first: wp.int32, many: wp.int32, known: Known, skins: Skins, scratch:
         below /= wp.max(forces, NONE)
         if one.stacked == 1:
             bound += SHELL * wp.max(-scratch.given_way[c] - SHELL_FROM, real(0.0))
+        else:
+            bound += SHALLOW * wp.max(real(1.0) - depth * forces / (SHALLOW_TO * carried), real(0.0))
         bound += STUCK * along / size + power * below / wp.max(depth, wp.max(below, NONE))
         if group:
             bound *= WIDER
