@@ -15,7 +15,7 @@ from stmpl_sim.protocol import Memory, Poses, SoftContact
 from stmpl_sim.verbs import limb
 
 SCRIPT = """from pythonfmu3 import Boolean, Dimension, Float64, Fmi3Slave, String
-from pythonfmu3.enums import Fmi3Causality, Fmi3Initial, Fmi3Variability
+from pythonfmu3.enums import Fmi3Causality, Fmi3Initial, Fmi3Status, Fmi3Variability
 from pythonfmu3.fmi3slave import Fmi3StepResult
 from stmpl_sim.fmi import Unit
 
@@ -43,14 +43,32 @@ class SoftSkin(Fmi3Slave):
                     getter=lambda name=name: unit.get(name), setter=lambda value, name=name: unit.set(name, value),
                     **more))
 
+    def set_float64(self, vrs, values):
+        self.unit.refused |= dict.fromkeys(vrs, self.refusal(super().set_float64, vrs, values))
+
+    def set_string(self, vrs, values):
+        self.unit.refused |= dict.fromkeys(vrs, self.refusal(super().set_string, vrs, values))
+
     def exit_initialization_mode(self):
-        self.unit.start()
+        self.refusal(self.unit.start)
 
     def do_step(self, current_time, step_size):
-        self.unit.step(step_size)
+        if self.refusal(self.unit.step, step_size):
+            return Fmi3StepResult(status=Fmi3Status.error)
         self.time = current_time + step_size
         return Fmi3StepResult()
+
+    def refusal(self, call, *given):
+        # What leaves Python is fatal to pythonfmu3, and ends the importer's process at the next call.
+        try:
+            call(*given)
+        except Exception as error:
+            why = str(error) or type(error).__name__
+            self.log(why, Fmi3Status.error)
+            return why
+        return ""
 """
+AWAY = np.eye(4) + np.outer([0, 0, 1, 0], [0, 0, 0, 1])  # pose of a tool that was not told one, off the skin
 
 
 class Unit:
@@ -58,6 +76,7 @@ class Unit:
 
     Attributes:
         PARAMETERS, INPUTS, OUTPUTS: shape and meaning of each value, by its name.
+        refused: why a value was refused, by its reference; empty: it was taken. Until all are, no step is taken.
     """
 
     PARAMETERS: ClassVar[dict[str, tuple[tuple[int, ...], str]]] = {
@@ -78,15 +97,17 @@ class Unit:
         "depth": ((), "depth of the deepest column of skin under the tool [m]; below 0: apart; NaN: far"),
         "in_range": ((), "verdict whether the touch lies in the range that was validated"),
     }
+    NOTHING: ClassVar[dict[str, Any]] = {  # outputs of what is not known
+        "wrench_on_tool": np.full(6, np.nan), "wrench_on_body": np.full(6, np.nan), "depth": np.nan, "in_range": False,
+    }  # fmt: skip
 
     def __init__(self) -> None:
         self._values: dict[str, Any] = {
             "part": "left_forearm", "tissue": "relaxed", "tool": "", "radius": 0.02, "damping": 0.0,
             "friction": "none",
-            "pose_world_from_body": np.eye(4), "pose_world_from_tool": np.eye(4),
-            "wrench_on_tool": np.zeros(6), "wrench_on_body": np.zeros(6), "depth": -1.0, "in_range": True,
-        }  # fmt: skip
-        self._values["pose_world_from_tool"][2, 3] = 1.0  # away from the skin until it is told
+            "pose_world_from_body": np.eye(4), "pose_world_from_tool": AWAY,
+        } | self.NOTHING  # fmt: skip
+        self.refused: dict[int, str] = {}
         self._contact: SoftContact | None = None
         self._memory = Memory()
 
@@ -106,23 +127,35 @@ class Unit:
             raise InvalidInput(f"{name} has {known.size} values; got {np.size(value)}.")
 
     def start(self) -> None:
-        """Makes the skin and the tool by the parameters. Raises InvalidInput or MeshError."""
+        """Makes the skin and the tool by the parameters, and finds the wrenches. Raises InvalidInput or MeshError."""
         import trimesh
 
-        file = self._values["tool"]
+        file, radius = self._values["tool"], self._values["radius"]
+        if not (file or (np.isfinite(radius) and radius > 0)):
+            raise InvalidInput(f"the radius of the ball is {radius:g} m; it must be finite and above 0.")
         if file and not Path(file).is_file():
             raise InvalidInput(f"there is no file '{file}' with the tool's surface.")
-        mesh: Any = trimesh.load(file, force="mesh") if file else trimesh.creation.icosphere(4, self._values["radius"])
+        mesh: Any = trimesh.load(file, force="mesh") if file else trimesh.creation.icosphere(4, radius)
         tool = Tool("tool", mesh.vertices, mesh.faces)
         layer = limb(self._values["part"], self._values["tissue"])
         self._contact = SoftContact(layer, [tool], damping=self._values["damping"],
                                     friction=friction_from(self._values["friction"]))  # fmt: skip
         self._memory = Memory()
+        self.step(0.0)
+        if np.array_equal(self._values["pose_world_from_tool"], AWAY):
+            self._memory = Memory()  # a tool that is told its first pose later does not fly there
 
     def step(self, dt: float) -> None:
-        """Finds the wrenches at the poses of now, `dt` [s] after the last ones. Raises InvalidInput before `start`."""
+        """Finds the wrenches at the poses of now, `dt` [s] after the last ones; NaN where it raises.
+
+        Raises:
+            InvalidInput: a unit that `start` has not made, values that were refused, or what SoftContact.step refuses.
+        """
+        self._values |= self.NOTHING
         if self._contact is None:
-            raise InvalidInput("the unit is not initialised.")
+            raise InvalidInput("the unit is not initialised, or its parameters were refused. Reset it, and try others.")
+        if why := next(filter(None, self.refused.values()), ""):
+            raise InvalidInput(why)
         poses = Poses(self._values["pose_world_from_body"], {"tool": self._values["pose_world_from_tool"]})
         reaction = self._contact.step(poses, self._memory, dt)
         touch, self._memory = reaction.touches["tool"], reaction.memory
