@@ -88,6 +88,13 @@ class Switching(Winkler):
         return replace(answer, displacement=u, method=name, trust=Trust(error_bound=self.bound * np.abs(u).max()))
 
 
+class Short(Winkler):
+    """Answers three vertices alone."""
+
+    def solve(self, load: Load) -> Displacement:
+        return Displacement(np.zeros((3, 3)), Trust(), "short")
+
+
 class Crashing(Winkler):
     """Stumbles over high pressures."""
 
@@ -106,6 +113,14 @@ def creeping(layer, load, u):
 def saturating(layer, load, u):
     force = load.values * layer.vertex_areas
     return u * min(1.0, 50 * force.sum() / (force @ load.values)) if force.any() else u
+
+
+def lifting(layer, load, u):
+    return -u
+
+
+def multiplied(layer, load, u):
+    return u @ np.zeros((4, 3))  # numpy's ValueError
 
 
 def too_deep(layer, load, u):
@@ -147,8 +162,9 @@ def faulty(fault, flags: bool = False):
 
 
 FAULTS = {
-    "finite": faulty(nan), "zero": faulty(creeping), "monotone": faulty(saturating), "unfolded": faulty(too_deep),
-    "leak": faulty(drifting), "objective": faulty(along_x), "seam": faulty(one_side_of_the_seam),
+    "finite": faulty(nan), "zero": faulty(creeping), "monotone": faulty(saturating),
+    "sinks": faulty(lifting), "unfolded": faulty(too_deep), "leak": faulty(drifting),
+    "objective": faulty(along_x), "seam": faulty(one_side_of_the_seam),
     "similar": faulty(in_its_own_units), "mesh": faulty(by_vertex_area), "additive": faulty(by_loaded_area),
     "gain": faulty(with_a_threshold), "returns": Remembering, "refuses": Swallowing, "answers": Choosy,
 }  # fmt: skip
@@ -159,6 +175,7 @@ def run(tmp_path_factory) -> tuple[Report, object]:
     """All faulty methods, a sound one, Zero, one that flags its fault and one that crashes, in one quick sweep."""
     out = tmp_path_factory.mktemp("stability")
     others = {"sound": Winkler, "nothing": Zero, "honest": faulty(too_deep, flags=True), "crashing": Crashing,
+              "short": Short, "multiplied": faulty(multiplied),
               "candid": lambda: Switching(0.3), "boastful": lambda: Switching(0.01)}  # fmt: skip
     return stability(FAULTS | others, PRESSURES, out), out
 
@@ -191,7 +208,7 @@ def test_two_methods_of_one_that_chooses_agree_within_the_bounds_that_they_state
 
 def test_zero_breaks_only_what_it_must_and_says_so(run):
     report = run[0]
-    assert broken(report, "nothing") == {"monotone"}
+    assert broken(report, "nothing") == {"monotone", "sinks"}
     assert report.counts("nothing")["silent"] == 0 < report.counts("nothing")["flagged"]
 
 
@@ -211,6 +228,16 @@ def test_a_refusal_of_a_sound_input_is_flagged_and_a_crash_is_not(run):
     crashed = [row for row in report.rows if row.method == "crashing" and row.outcome == "crashed"]
     assert {row.axis for row in crashed} >= {"pressure", "not finite"}
     assert "KeyError" in crashed[0].broken[0].measured
+
+
+@pytest.mark.parametrize(("method", "said"), [("short", r"TypeError.*shape \(3, 3\)"), ("multiplied", "ValueError")])
+def test_an_answer_of_another_shape_and_an_error_that_is_none_of_ours_are_crashes_of_that_method_alone(
+    run, method, said
+):
+    """The one ended the sweep, the other counted as a refusal, which is flagged."""
+    rows = [row for row in run[0].rows if row.method == method]
+    assert {row.outcome for row in rows if row.axis != "not finite"} == {"crashed"}
+    assert all(re.search(said, row.broken[0].measured) for row in rows if row.outcome == "crashed")
 
 
 def test_the_summary_names_the_range_held_and_the_first_failure(run):

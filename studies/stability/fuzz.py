@@ -25,7 +25,7 @@ from studies.stability.broken import Answers
 from studies.stability.contacts import Contacts, Instant, Placed, answers_of, simulator_of
 from studies.stability.meshes import even_plate, inserted, irregular, limb, saddle
 from studies.stability.scene import Make, Mesh
-from studies.stability.suite import VERSIONS, Row, judged
+from studies.stability.suite import VERSIONS, Row, checked, judged
 from studies.stability.trial import Trial
 
 log = logging.getLogger(__name__)
@@ -119,10 +119,10 @@ def asked(name: str, simulator: Simulator, trial: Trial) -> tuple[Row, Trial, li
     scene = trial.scene
     assert isinstance(scene, Contacts)
     try:
-        answers: list[Displacement] = list(scene.asked(simulator))
+        answers: list[Displacement] = checked(scene, list(scene.asked(simulator)))
         if (further := _deeper(scene, answers)) is not None:
             trial = replace(trial, scene=further, laws=(*trial.laws, "rises"))
-            answers = list(further.asked(simulator))
+            answers = checked(further, list(further.asked(simulator)))
     except (Exception, SystemExit) as error:  # a method of others may end itself
         return _failed(name, trial, error), trial, []
     statuses = [touch.status for answer in answers_of(answers)[:1] for touch in answer.touches.values()]

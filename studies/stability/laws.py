@@ -56,6 +56,17 @@ def monotone(trial: Trial, answers: Answers) -> Broken | None:
     return None
 
 
+def sinks(trial: Trial, answers: Answers) -> Broken | None:
+    """Pressure does work on the skin: the sum of p A u over the vertices, u inwards, is above 0."""
+    for scene, pressure, answer in _all(trial, answers):
+        layer = scene.mesh.layer
+        forces = pressure * layer.vertex_areas
+        work = -float(forces @ (answer.displacement * layer.normals).sum(axis=1))
+        if pressure.any() and not work > 0:
+            return broken("sinks", f"{1e3 * work / forces.sum():.2g} mm inwards on average, where it presses", answer)
+    return None
+
+
 def unfolded(trial: Trial, answers: Answers) -> Broken | None:
     """J = det F > 0 in the layer under the skin (see `least_det_f`)."""
     for scene, _, answer in _all(trial, answers):
@@ -139,7 +150,7 @@ def gain(trial: Trial, answers: Answers) -> Broken | None:
 
 
 LAWS: dict[str, Law] = {
-    "finite": finite, "zero": zero, "monotone": monotone, "unfolded": unfolded, "leak": leak,
+    "finite": finite, "zero": zero, "monotone": monotone, "sinks": sinks, "unfolded": unfolded, "leak": leak,
     "seam": _alike("seam", SAME, SAME), "objective": _alike("objective", SAME, SAME),
     "similar": _alike("similar", SAME, FIELD), "mesh": _alike("mesh", MESH, MESH),
     "returns": returns, "additive": additive, "gain": gain,
@@ -149,10 +160,10 @@ and "refuses" (a load that is not finite is refused, or its answer flagged)."""
 
 MEANING = {
     "answers": "answers a sound input", "refuses": "refuses what is not finite", "finite": "finite",
-    "zero": "zero in, zero out", "monotone": "peak grows with the load", "unfolded": "J > 0",
-    "leak": "nothing beyond 8 thicknesses", "seam": "equal on both sides of the seam", "objective": "objective",
-    "similar": "the same at any scale", "mesh": "the same on another mesh", "returns": "forgets what came before",
-    "additive": "far contacts add up", "gain": "noise is not amplified",
+    "zero": "zero in, zero out", "monotone": "peak grows with the load", "sinks": "sinks under pressure",
+    "unfolded": "J > 0", "leak": "nothing beyond 8 thicknesses", "seam": "equal on both sides of the seam",
+    "objective": "objective", "similar": "the same at any scale", "mesh": "the same on another mesh",
+    "returns": "forgets what came before", "additive": "far contacts add up", "gain": "noise is not amplified",
     "bounded": "motion and force have a bound", "rises": "force never falls with depth",
     "touches": "not apart with skin inside", "presses": "a force where it presses",
     "carries": "carries the wrench, or says", "still": "nothing moves through air",

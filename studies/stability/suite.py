@@ -18,7 +18,7 @@ from stmpl_core.provenance import commit, machine, versions
 from stmpl_core.trust import Displacement
 from studies.stability import failures
 from studies.stability.laws import LAWS, VERDICTS, Answers, Broken
-from studies.stability.scene import Make, Pressures
+from studies.stability.scene import Make, Pressures, Scene
 from studies.stability.sweeps import Preset, Stage, trials
 from studies.stability.trial import Trial
 
@@ -152,7 +152,7 @@ def judge(name: str, make: Make, trial: Trial, *, patience: float = PATIENCE) ->
             assert isinstance(trial.scene, Pressures)
             return _refused(name, make().prepare(trial.scene.mesh.layer), trial, trial.scene)
         answers, done = _answers(make, trial, patience)
-    except (StmplError, ValueError) as error:
+    except StmplError as error:
         broken = Broken("answers", "refused", True, str(error))
         return Row(name, trial.axis, trial.level, "flagged", (broken,))
     except (Exception, SystemExit) as error:  # a method of others may end itself
@@ -175,6 +175,14 @@ def judged(name: str, trial: Trial, answers: Answers) -> Row:
     return Row(name, trial.axis, trial.level, _outcome(broken) if broken else "held", tuple(broken))
 
 
+def checked(scene: Scene, answers: list[Displacement]) -> list[Displacement]:
+    """Answers that laws can be judged on. Raises TypeError: of another shape."""
+    for answer in answers:
+        if (shape := np.shape(answer.displacement)) != scene.mesh.vertices.shape:
+            raise TypeError(f"a displacement of shape {shape}; {scene.mesh.vertices.shape} is asked for")
+    return answers
+
+
 def _refused(name: str, method: Method, trial: Trial, scene: Pressures) -> Row:
     """Whether loads that are not finite are refused with an error that says so, or answered and flagged."""
     broken: list[Broken] = []
@@ -182,7 +190,7 @@ def _refused(name: str, method: Method, trial: Trial, scene: Pressures) -> Row:
     for load in scene.loads():
         try:
             answer = method.solve(load)
-        except (StmplError, ValueError):
+        except StmplError:
             continue
         except (Exception, SystemExit) as error:  # a method of others may end itself
             broken.append(Broken("refuses", f"crashed: {error!r}", False))
@@ -215,9 +223,10 @@ def _answers(make: Make, trial: Trial, patience: float) -> tuple[Answers, int]:
     ask = trial.scene.prepared(make)
     until = time.process_time() + patience
     while done < trial.rounds and (done == 0 or time.process_time() < until):
-        scene = ask()
+        scene = checked(trial.scene, ask())
         done += 1
-    fresh = trial.scene.last.prepared(make)()[-1] if "returns" in trial.laws else None
+    last = trial.scene.last
+    fresh = checked(last, last.prepared(make)())[-1] if "returns" in trial.laws else None
     return Answers(scene, _twin(make, trial), fresh), done
 
 
@@ -230,4 +239,4 @@ def _twin(make: Make, trial: Trial) -> list[Displacement]:
         if trial.twin.may_refuse:
             return []
         raise
-    return trial.twin.scene.prepared(make)()
+    return checked(trial.twin.scene, trial.twin.scene.prepared(make)())

@@ -25,7 +25,7 @@ RADIUS, RAMP = 12e-3, 6e-3  # m, of the contact and of its smooth edge
 RATIO = 0.5  # p / E of the contact where another axis is swept
 AROUND = 25e-3  # m from the contact, where the mesh is made bad
 NOISE = 0.05  # of the load
-SWEEP = ("finite", "zero", "monotone", "unfolded", "leak")
+SWEEP = ("finite", "zero", "monotone", "sinks", "unfolded", "leak")
 
 
 @dataclass(frozen=True)
@@ -217,7 +217,7 @@ def seam(stage: Stage, level: float) -> Trial:
     partner = np.asarray(KDTree(mesh.vertices).query(mesh.vertices @ mirror)[1])
     pairs = np.stack([np.arange(len(partner)), partner], axis=1)
     scene, other = (Pressures(mesh, RATIO * disc(mesh, c)[None]) for c in (centre, mirror @ centre))
-    return Trial("", f"{level:g} t", ("finite", "seam"), scene, Twin(other, pairs, mirror))
+    return Trial("", f"{level:g} t", ("finite", "sinks", "seam"), scene, Twin(other, pairs, mirror))
 
 
 def obtuse(stage: Stage, level: float) -> Trial:
@@ -259,7 +259,7 @@ def scale(stage: Stage, level: float) -> Trial:
     other = replace(mesh, vertices=level * mesh.vertices, thickness=level * mesh.thickness)
     same = np.arange(len(mesh.vertices))
     twin = Twin(Pressures(other, pressed), np.stack([same, same], axis=1), np.eye(3), level, may_refuse=level >= 100)
-    return Trial("", f"x {level:g}", ("finite", "similar"), Pressures(mesh, pressed), twin)
+    return Trial("", f"x {level:g}", ("finite", "sinks", "similar"), Pressures(mesh, pressed), twin)
 
 
 def turn(stage: Stage, level: float) -> Trial:
@@ -277,7 +277,7 @@ def _moved(stage: Stage, rotation: np.ndarray, by: np.ndarray, level: str) -> Tr
     mesh, pressed = stage.mesh, RATIO * disc(stage.mesh, stage.centre)[None]
     other = Pressures(replace(mesh, vertices=mesh.vertices @ rotation.T + by), pressed)
     same = np.arange(len(mesh.vertices))
-    return Trial("", level, ("finite", "objective"), Pressures(mesh, pressed),
+    return Trial("", level, ("finite", "sinks", "objective"), Pressures(mesh, pressed),
                  Twin(other, np.stack([same, same], axis=1), rotation))  # fmt: skip
 
 
@@ -286,28 +286,28 @@ def stale_start(stage: Stage, level: float) -> Trial:
     mesh = stage.mesh
     here, there = disc(mesh, stage.centre), disc(mesh, stage.apart(2))
     loads = np.stack([level * there, level * here, RATIO * here])
-    return Trial("", f"{level:g} E", ("finite", "returns"), Pressures(mesh, loads))
+    return Trial("", f"{level:g} E", ("finite", "sinks", "returns"), Pressures(mesh, loads))
 
 
 def jump(stage: Stage, level: float) -> Trial:
     """Full load at p / E, none, full load."""
     pressed = level * disc(stage.mesh, stage.centre)
     scene = Pressures(stage.mesh, np.stack([pressed, 0 * pressed, pressed]))
-    return Trial("", f"{level:g} E", ("finite", "zero", "returns"), scene)
+    return Trial("", f"{level:g} E", ("finite", "zero", "sinks", "returns"), scene)
 
 
 def cycles(stage: Stage, level: float) -> Trial:
     """Pressing and releasing so often."""
     pressed = RATIO * disc(stage.mesh, stage.centre, 8e-3)
     scene = Pressures(stage.mesh, np.stack([0 * pressed, pressed]))
-    return Trial("", f"{int(level):,}", ("finite", "zero", "returns"), scene, rounds=int(level))
+    return Trial("", f"{int(level):,}", ("finite", "zero", "sinks", "returns"), scene, rounds=int(level))
 
 
 def noise(stage: Stage, level: float) -> Trial:
     """Noise of 5 % on the load at each vertex, at p / E."""
     rng, pressed = np.random.default_rng(stage.seed), level * disc(stage.mesh, stage.centre)
     noisy = [pressed * (1 + NOISE * rng.normal(size=len(pressed))) for _ in range(3)]
-    return Trial("", f"{level:g} E", ("finite", "gain"), Pressures(stage.mesh, np.stack([pressed, *noisy])))
+    return Trial("", f"{level:g} E", ("finite", "sinks", "gain"), Pressures(stage.mesh, np.stack([pressed, *noisy])))
 
 
 def two_contacts(stage: Stage, level: float) -> Trial:
@@ -315,7 +315,7 @@ def two_contacts(stage: Stage, level: float) -> Trial:
     assert level >= FAR
     here, there = (RATIO * disc(stage.mesh, c) for c in (stage.centre, stage.apart(level)))
     scene = Pressures(stage.mesh, np.stack([here, there, here + there]))
-    return Trial("", f"{level:g} t", ("finite", "additive"), scene)
+    return Trial("", f"{level:g} t", ("finite", "sinks", "additive"), scene)
 
 
 def not_finite(stage: Stage, level: float) -> Trial:
