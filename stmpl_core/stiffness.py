@@ -11,6 +11,7 @@ import numpy as np
 from stmpl_core.contact import Contact
 from stmpl_core.errors import InvalidInput
 from stmpl_core.layer import single
+from stmpl_core.tissue import SOFTEST
 from stmpl_core.touch import Touch
 from stmpl_core.toucher import MAX_DRAG_RATIO, Toucher
 from stmpl_core.trust import Trust
@@ -25,6 +26,7 @@ OFFSET_PENALTY = 2e-3  # relative error of the forces up to which the smaller of
 MAX_RESIDUAL = 0.15  # relative error of the forces that may be left; with more it is no skin of one stiffness
 DEVIATION = 1.25  # standard deviation of an error over the mean of its size, sqrt(pi / 2)
 MAX_RELATIVE_ERROR = 0.2  # standard error of the modulus over it
+HARDEST = 1e6  # Young's modulus above any soft layer's [Pa]: 8 times that of skin's sheet (stmpl_core.regions)
 OFFSET_MARGIN_M = 1e-4  # distance from the ends of the search, within which the offset may as well lie outside
 
 
@@ -177,6 +179,9 @@ class _Presses:
         residual = float(np.sqrt(fit.cost))
         error = self._error(offset, fit, residual)
         trust, reach = Trust(), self._toucher.reach
+        if not SOFTEST <= fit.modulus <= HARDEST:
+            trust = trust.also(f"no soft layer has {fit.modulus:.4g} Pa, {SOFTEST:g} to {HARDEST:g} Pa are accepted: "
+                               "are wrenches in newtons, and poses in metres?", converged=False)  # fmt: skip
         if residual > MAX_RESIDUAL:
             trust = trust.also(f"one stiffness leaves the forces off by {residual:.0%}, at most {MAX_RESIDUAL:.0%} is "
                                "accepted: check frames, wrench and thickness", converged=False)  # fmt: skip

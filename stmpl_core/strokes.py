@@ -34,6 +34,7 @@ JITTER = 3e-4  # way by which a tool has moved, and not only what measures it tr
 BEGUN = 0.25  # force at the first instant over the largest, up to which a press counts as told from its beginning
 LEAN = 0.05  # tilt of the contact's normal that strokes one way do not tell from friction [-]
 OWN_FRICTION = 0.08  # relative error of the law of friction: 3 to 9 % of the largest by finite elements
+FREE = 0.005  # coefficient that is none: a contact's normal that is 0.3 degrees off makes as much [-]
 MAX_FRICTION_ERROR = 0.3  # standard error of a coefficient over it
 OWN_FORCE = 0.01  # error of the law of relaxation while a tool stays, over the largest force: 0.5 % by finite elements
 STAYS = 3e-4  # way along the skin within which a tool stays [m]
@@ -63,7 +64,7 @@ class Rubbing:
 
     def __str__(self) -> str:
         back = "there and back" if self.both_ways else "one way"
-        return f"mu = {self.friction:.2f} +- {self.error:.2f} from {1e3 * self.way:.0f} mm of sliding {back}"
+        return f"mu = {self.friction:z.2f} +- {self.error:.2f} from {1e3 * self.way:.0f} mm of sliding {back}"
 
 
 @dataclass(frozen=True)
@@ -128,7 +129,7 @@ def fit_friction(toucher: Toucher, strokes: Sequence[Contact]) -> Rubbing:
     sideways = Sideways(toucher.layer)
     found = [_rubbed(toucher, sideways, one) for one in pressing]
     ratios = [one.rubs / one.pressing for one in found if one is not None]
-    most = float(np.quantile(ratios, MOST_RUBBED)) if ratios else 0.0
+    most = max(FREE, float(np.quantile(ratios or [0.0], MOST_RUBBED)))
     slid, ways, mus, furthest, needed = [], [], [], 0.0, math.inf
     lengths = _lengths(places, np.zeros(3))
     for k, (contact, one) in enumerate(zip(pressing, found, strict=True)):
@@ -158,7 +159,9 @@ def fit_friction(toucher: Toucher, strokes: Sequence[Contact]) -> Rubbing:
     spread = 1.4826 * float(np.median(np.abs(mus - friction))) / math.sqrt(max(way / radius, 1.0))
     error = float(np.hypot(np.hypot(spread, OWN_FRICTION * abs(friction)), 0.0 if both else LEAN))
     trust = Trust()
-    if friction <= 0:
+    if -max(FREE, error) <= friction <= FREE:
+        trust = trust.also("no friction was found: the tool slides freely", converged=False)
+    elif friction < 0:
         trust = trust.also("the force along the skin points against the tool's way: is it what the tool exerts on the "
                            "body?", converged=False)  # fmt: skip
     elif error > MAX_FRICTION_ERROR * friction:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import CancelledError, Future
 from dataclasses import replace
 from itertools import groupby
@@ -95,7 +95,7 @@ class Calibration:
         if (workshop := self._workshop()) is None:
             raise InvalidInput("the node is not configured, so it has no skin to calibrate.")
         if what in ("friction", "relaxation"):
-            strokes = self._strokes(tool)
+            strokes = strokes_of(tool, self.strokes)
             return workshop.friction(strokes) if what == "friction" else workshop.relaxation(_longest(strokes))
         if what not in ("", "stiffness"):
             raise InvalidInput(f"there is no '{what}' to calibrate. Available: stiffness, friction, relaxation.")
@@ -103,11 +103,11 @@ class Calibration:
         chosen = [press for press in self.presses if press.tool.digest == newest[press.name]]
         return workshop.stiffness([press for press in chosen if tool in ("", press.name)])
 
-    def _strokes(self, tool: str) -> list[Contact]:
-        """The instants of a tool, empty: of the last one, in order of time."""
-        chosen = [one for one in self.strokes if tool in ("", one.name)]
-        newest = chosen[-1].tool.digest if chosen else ""
-        return sorted((one for one in chosen if one.tool.digest == newest), key=lambda one: one.time)
+
+def strokes_of(tool: str, kept: Iterable[Contact]) -> list[Contact]:
+    """The instants of a tool, empty: of the last one, as it is since it changed last; in order of time."""
+    chosen = [(one, (one.name, one.tool.digest)) for one in kept if tool in ("", one.name)]
+    return sorted((one for one, of in chosen if of == chosen[-1][1]), key=lambda one: one.time)
 
 
 def _longest(strokes: list[Contact]) -> list[Contact]:

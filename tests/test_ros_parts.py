@@ -1,6 +1,7 @@
 """Laws of what the ROS side is made of: conversions, instants, scripts, the marker's bytes. No process is started."""
 
 from collections.abc import Mapping
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -32,7 +33,7 @@ from bags.wire import (
     wrench_from,
     wrench_message,
 )
-from stmpl_core import Answer, Membrane, Ply, Prony, State, Tissue, Tools, Touch
+from stmpl_core import Answer, Contact, Membrane, Ply, Prony, State, Tissue, Tools, Touch
 from stmpl_core.body import Body
 from stmpl_core.bones import Bone, to_bone
 from stmpl_core.errors import FrameError, InvalidInput, MeshError
@@ -43,6 +44,7 @@ from stmpl_core.skin import published
 from stmpl_core.state import fresh
 from stmpl_core.touch import BY_POSE, STALE, TOUCHING, Slip
 from stmpl_core.trust import Trust
+from stmpl_ros.calibration import strokes_of
 from stmpl_ros.diagnosis import Tally
 from stmpl_ros.gate import SAY_EVERY, Gate
 from stmpl_ros.inbox import PATIENCE, Inbox
@@ -432,3 +434,14 @@ def test_settings_travel_as_ros_arguments():
     arguments = NodeConfig(edge_length=4e-3, part="left_leg").ros_arguments()
     assert arguments[0] == "--ros-args"
     assert "edge_length:=0.004" in arguments and 'part:="left_leg"' in arguments and "autostart:=true" in arguments
+
+
+def test_strokes_of_no_tool_by_name_are_those_of_the_last_one_also_of_the_same_surface():
+    """Two tools of one surface were mixed, and refused as of two."""
+    kept = [Contact(ball().named(name), at(0, 0, 0.01 * time), np.ones(6), time=time)
+            for time, name in enumerate(["a", "b", "a", "b"])]  # fmt: skip
+    kept.append(replace(kept[0], time=5.0))
+    for tool, times in (("", [0, 2, 5]), ("a", [0, 2, 5]), ("b", [1, 3]), ("c", [])):
+        assert [one.time for one in strokes_of(tool, kept)] == times
+    kept.append(Contact(scaled(ball(), 2.0).named("a"), at(0, 0, 0), np.ones(6), time=6.0))
+    assert [one.time for one in strokes_of("a", kept)] == [6]

@@ -104,6 +104,12 @@ def test_forces_that_no_stiffness_explains_are_refused(toucher, pressed):
     assert not found.trust.ok and "check frames, wrench and thickness" in found.trust.why
 
 
+def test_wrenches_in_another_unit_are_no_soft_tissue(toucher, pressed):
+    for factor in (1e3, 1e-3):  # mN, kN
+        found = fit_stiffness(toucher, presses([(pose, factor * wrench) for pose, wrench in pressed], times=2))
+        assert not found.trust.ok and "are wrenches in newtons" in found.trust.why
+
+
 def test_poses_further_off_than_calibration_may_leave_are_told(toucher, pressed):
     found = fit_stiffness(toucher, presses(pressed, back=5e-3, times=2))
     assert not found.trust.ok and "3 mm along their push or more" in found.trust.why

@@ -92,6 +92,14 @@ def test_a_force_the_wrong_way_round_is_no_friction(toucher: Toucher) -> None:
     assert not found.trust.ok and "against the tool's way" in found.trust.why
 
 
+def test_a_tool_that_slides_freely_has_no_friction_to_be_found(toucher: Toucher) -> None:
+    """It was told that its force points the wrong way."""
+    for friction, noise in ((None, 0.0), (0.0, 0.02)):
+        found = fit_friction(toucher, measured(*wiped(0.02, back=True), friction, noise=noise))
+        assert not found.trust.ok and "no friction was found" in found.trust.why, (found, found.trust.why)
+    assert "mu = 0.00 +-" in str(replace(found, friction=-1e-4))
+
+
 def test_little_friction_one_way_is_not_told_from_a_tilt(toucher: Toucher) -> None:
     found = fit_friction(toucher, measured(*wiped(0.02, back=False), 0.1))
     assert not found.trust.ok and "there and back" in found.trust.why
