@@ -301,7 +301,10 @@ class Body:
         ways = csr_matrix((lengths, ends.T), shape=(len(self.vertices),) * 2)
         along = dijkstra(ways, directed=False, indices=corners[0], limit=radius + STEEP)
         along += np.linalg.norm(self.vertices[corners[0]] - foot, axis=1)[:, None]
-        return np.clip((radius - np.minimum(along.min(axis=0), BIG)) / STEEP, -1, 1)
+        level = np.clip((radius - np.minimum(along.min(axis=0), BIG)) / STEEP, -1, 1)
+        if not (level > 0).any():
+            raise InvalidInput(f"no vertex of the body is within the radius of {part!r}. Try a larger one, as 0.08.")
+        return level
 
     def patch(self, part: str, edge_length: float = 3e-3) -> Patch:
         """The mesh of a part, cut where its bones weigh one half, which other poses of the same model can take."""

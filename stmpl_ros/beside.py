@@ -8,6 +8,7 @@ import signal
 import threading
 from collections.abc import Callable
 from concurrent.futures import Future, ProcessPoolExecutor
+from multiprocessing.context import SpawnContext, SpawnProcess
 from typing import Any
 
 from stmpl_core.sdf import SignedDistance
@@ -55,14 +56,28 @@ class Builders:
         self._pool.shutdown(wait=False, cancel_futures=True)
 
 
+class _Deaf(SpawnProcess):
+    """A process that Ctrl-C does not reach: it starts with the signal blocked, as its imports take a second."""
+
+    def start(self) -> None:
+        before = signal.pthread_sigmask(signal.SIG_BLOCK, (signal.SIGINT,))
+        try:
+            super().start()
+        finally:
+            signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+class _Spawning(SpawnContext):
+    Process = _Deaf
+
+
 def pool(workers: int, start: Callable | None = None, *arguments: Any) -> ProcessPoolExecutor:
     """Processes that call `start` with `arguments` first."""
-    return ProcessPoolExecutor(workers, multiprocessing.get_context("spawn"), stand_beside, (start, *arguments))
+    return ProcessPoolExecutor(workers, _Spawning(), stand_beside, (start, *arguments))
 
 
 def stand_beside(start: Callable | None = None, *arguments: Any) -> None:
     """What a process beside the node does first: it ends with the node, and yields to it."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C goes to the node, which ends this process
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
     threading.Thread(target=_end_with_the_node, daemon=True).start()
     os.nice(YIELDS)

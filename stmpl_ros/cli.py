@@ -46,7 +46,8 @@ def main(arguments: list[str] | None = None) -> None:
         _end_soon_after_a_signal(PATIENT.get(given[0] if given else "", GRACE))
     try:
         code = _run(given)
-        sys.stdout.flush()
+        if sys.stdout:  # None: `stmpl ... >&-`
+            sys.stdout.flush()
     except KeyboardInterrupt as interrupt:
         code = 128 + next(iter(interrupt.args), signal.SIGINT)
     except SystemError as error:  # how a compiled call tells of an interrupt that came in it

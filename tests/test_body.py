@@ -14,6 +14,7 @@ from stmpl_core.body import PARTS, Body, Patch
 from stmpl_core.errors import InvalidInput
 from stmpl_core.extrusion import fold_ratios, foldfree_thickness
 from stmpl_core.layer import SoftLayer
+from stmpl_core.living import living
 from stmpl_core.methods import MomentNet
 from stmpl_core.trunk import TRUNK
 from tests.scenes import at, ball
@@ -291,3 +292,6 @@ def test_a_place_that_is_none_is_refused(body):
         body.part("around:1,2")
     with pytest.raises(InvalidInput, match="at least two edges"):
         body.around((0.13, 0.04, 0.17), 1e-3)
+    for ask in (body.part, lambda part: living(body, part)):  # between the vertices, which are further apart
+        with pytest.raises(InvalidInput, match=r"no vertex of the body is within the radius of 'around:.*Try a larger"):
+            ask("around:-0.09,0.06,0.33,0.005")

@@ -4,6 +4,8 @@ import ast
 import os
 import runpy
 import signal
+import subprocess
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -501,3 +503,26 @@ with ros() as stop:
 def test_a_signal_ends_a_process_cleanly_just_where_it_stops_being_interruptible_too(number):
     code, said = end(start("-c", LEAVING, number))
     assert (code, said) == (0, "")
+
+
+CTRL_C = """
+import os, signal, time
+from stmpl_ros.beside import Beside
+signal.signal(signal.SIGINT, lambda *_: None)  # as a node that takes its time to end
+one = Beside(os.getpid)
+while not one.result.done():
+    os.killpg(0, signal.SIGINT)
+    time.sleep(0.05)
+assert one.result.result() != os.getpid()
+one.close()
+"""
+
+
+def test_ctrl_c_does_not_reach_a_process_beside_the_node_that_still_imports():
+    ended = subprocess.run([sys.executable, "-c", CTRL_C], start_new_session=True, capture_output=True, text=True)
+    assert (ended.returncode, ended.stderr) == (0, "")
+
+
+def test_a_verb_whose_output_nobody_wants_ends_well():
+    ended = subprocess.run(["sh", "-c", 'exec "$0" -m stmpl_ros.cli --help >&-', sys.executable], capture_output=True)
+    assert (ended.returncode, ended.stderr) == (0, b"")
