@@ -225,11 +225,11 @@ def frame_from(message: Any, log_time_ns: int) -> Frame:
 
 
 def local_contact_from(message: Any) -> LocalContact:
-    """The local model that a message carries, for a DeviceLoop. Raises InvalidInput if it is not finite."""
-    return LocalContact(
-        finite("pose", pose_from(message.pose), (4, 4)),
-        finite("wrench", _six(message.wrench), (6,)),
-        finite("stiffness", np.asarray(message.stiffness).reshape(6, 6), (6, 6)),
+    """The local model that a message carries, for a DeviceLoop. Raises InvalidInput if it cannot be rendered."""
+    model = LocalContact(
+        pose_from(message.pose),
+        _six(message.wrench),
+        np.asarray(message.stiffness, float).reshape(6, 6),
         float(message.valid_m),
         float(message.valid_rad),
         message.status,
@@ -238,17 +238,17 @@ def local_contact_from(message: Any) -> LocalContact:
         float(getattr(message, "power", 1.0)),
         float(getattr(message, "eased", 0.0)),
     )
+    model.check()
+    return model
 
 
 def _grip(message: Any) -> Grip | None:
     """Friction of a local model; None: there is none, or the message is older than friction."""
     limit = float(getattr(message, "friction_limit", 0.0))
-    if not limit > 0:
+    if limit == 0:
         return None
-    ways, forces, stiffness = (finite(name, np.asarray(getattr(message, name), float).reshape(shape), shape)
-                               for name, shape in (("friction_ways", (3, 6)), ("friction_forces", (3,)),
-                                                   ("friction_stiffness", (3,))))  # fmt: skip
-    return Grip(ways, forces, stiffness, limit)
+    ways = np.asarray(message.friction_ways, float).reshape(3, 6)
+    return Grip(ways, np.asarray(message.friction_forces, float), np.asarray(message.friction_stiffness, float), limit)
 
 
 def _announced(name: str, vertices: np.ndarray, triangles: np.ndarray) -> Tool:

@@ -86,6 +86,10 @@ class DeviceLoop:
 
     `step` takes constant time, allocates nothing that grows, and takes no lock; `update` may be called from another
     thread, and is one assignment to it.
+
+    Attributes:
+        settings: settings of the loop.
+        refused: number of samples and of local models so far that could not be used.
     """
 
     def __init__(self, settings: LoopSettings | None = None) -> None:
@@ -104,7 +108,15 @@ class DeviceLoop:
         self._state.scalars[STARTED] = 0.0
 
     def update(self, model: LocalContact) -> None:
-        """Hands the newest local model over; the next `step` begins to blend to it."""
+        """Hands the newest local model over; the next `step` begins to blend to it.
+
+        One that cannot be rendered (`model.check()` says why) is counted in `refused`, and the last one goes on.
+        """
+        try:
+            model.check()
+        except InvalidInput:
+            self.refused += 1
+            return
         self._newest = _packed(model, self.settings.coupling_stiffness)
 
     def step(self, position: ArrayLike, velocity: ArrayLike, dt: float) -> np.ndarray:

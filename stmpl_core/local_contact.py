@@ -16,7 +16,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from stmpl_core.arrays import Transform, Wrench, finite
-from stmpl_core.contact import Contact
+from stmpl_core.contact import MOST, Contact, rigid
+from stmpl_core.errors import InvalidInput
 from stmpl_core.footing import in_plane, leaned, patch_of, twist_between
 from stmpl_core.history import History
 from stmpl_core.state import Memory, State
@@ -31,6 +32,8 @@ SAFETY = 0.8  # of the neighbourhood that a power law of the depth allows: measu
 LEAST_POWER = 1.1  # power of the depth with which the force grows, below which it is not trusted to be straight
 MOST_POWER = 2.5  # and above which not either
 DEEPER = 4e-3  # way deeper than the model, or as much as it is deep, beyond which no force grows [m]
+LARGEST, HIGHEST = 1e15, 10.0  # number of a model, and power, beyond which it is refused: no contact has such ones
+STEEPEST = 1e12  # way that a model follows its power of the depth for, over its own depth
 FADE = 0.1  # normal force over the reaction, below which a DeviceLoop lets drag fade with it
 
 
@@ -91,7 +94,7 @@ class LocalContact:
         status: status of the touch at the pose.
         trust: trust in the touch at the pose.
         grip: friction, part of wrench and stiffness; None: none.
-        power: power of the depth with which the elastic force grows; 1: not told, a straight line.
+        power: power of the depth with which the elastic force grows, from 1; 1: not told, a straight line.
         eased: part of the elastic force that has relaxed [N].
     """
 
@@ -105,6 +108,30 @@ class LocalContact:
     grip: Grip | None = None
     power: float = 1.0
     eased: float = 0.0
+
+    def check(self) -> None:
+        """Does nothing if the model can be rendered.
+
+        Raises:
+            InvalidInput: numbers that are not finite or beyond LARGEST, a pose that is not rigid, a power outside
+                1..HIGHEST, negative `valid_m`, `valid_rad`, `eased` or limit of the friction, or a patch that sticks
+                without stiffness.
+        """
+        rigid("the local model's pose", self.pose_body_from_tool)
+        arrays = [("wrench", self.wrench, (6,)), ("stiffness", self.stiffness, (6, 6))]
+        ranges = [("valid_m", self.valid_m, 0.0, LARGEST), ("valid_rad", self.valid_rad, 0.0, LARGEST),
+                  ("eased", self.eased, 0.0, LARGEST), ("power", self.power, 1.0, HIGHEST)]  # fmt: skip
+        if self.grip is not None:
+            for name, shape in (("axes", (3, 6)), ("forces", (3,)), ("stiffness", (3,))):
+                arrays.append((f"friction's {name}", getattr(self.grip, name), shape))
+            ranges.append(("friction's limit", self.grip.limit, 0.0, LARGEST))
+            ranges.append(("friction's least stiffness", min(self.grip.stiffness), 1 / LARGEST, LARGEST))
+        for name, values, shape in arrays:
+            if (size := float(np.abs(finite(f"the local model's {name}", values, shape)).max())) > LARGEST:
+                raise InvalidInput(f"the local model's {name} holds {size:g}; at most {LARGEST:g} is accepted.")
+        for name, value, least, most in ranges:
+            if not least <= value <= most:
+                raise InvalidInput(f"the local model's {name} is {value}; it must be from {least:g} to {most:g}.")
 
     @property
     def push(self) -> Wrench:
@@ -145,12 +172,13 @@ class LocalContact:
         inside = move <= self.valid_m and turn <= self.valid_rad
         push, normal, stiffness = self.push, self.normal, self.push_stiffness
         size = float(np.linalg.norm(push[:3]))
-        if size == 0:
+        if size < 1 / MOST:
             return Rendered(np.zeros(6), inside)
         elastic, m = size + self.eased, self.power
         along = float(normal @ stiffness[:3, :3] @ normal)
         depth = m * elastic / along if along > 0 else WIDEST
-        base = min(1 + float(normal @ stiffness[:3] @ twist) / (m * elastic), 1 + max(1.0, DEEPER / depth))
+        most = min(max(1.0, DEEPER / depth), STEEPEST)
+        base = 1 + min(float(normal @ stiffness[:3] @ twist) / (m * elastic), most)
         free = (self.eased / elastic) ** (1 / m)  # base at which the tool lets go
         if base <= free:
             return Rendered(np.zeros(6), inside)

@@ -41,6 +41,7 @@ class PassiveContact:
     Attributes:
         balance: B [J].
         damping: damping that is added now [N s/m].
+        refused: number of models so far that could not be rendered.
         share: share of the model's wrench that is rendered now [-]; below 1 too little was put in for all of it.
 
     Raises:
@@ -52,14 +53,22 @@ class PassiveContact:
             if not (math.isfinite(value) and value > 0):
                 raise InvalidInput(f"{name} is {value}; it must be finite and above 0.")
         self.most_damping, self.stale_after = most_damping, stale_after
-        self.balance, self.damping, self.share = 0.0, 0.0, 1.0
+        self.balance, self.damping, self.share, self.refused = 0.0, 0.0, 1.0, 0
         self._model: LocalContact | None = None
         self._pose: Transform | None = None
         self._begun = False
         self._wrench, self._stored, self._surplus, self._age = np.zeros(6), 0.0, 0.0, 0.0
 
     def update(self, model: LocalContact) -> None:
-        """Hands the newest model over."""
+        """Hands the newest model over.
+
+        One that cannot be rendered (`model.check()` says why) is counted in `refused`, and the last one goes on.
+        """
+        try:
+            model.check()
+        except InvalidInput:
+            self.refused += 1
+            return
         self._model, self._age = model, 0.0
 
     def step(self, pose_body_from_tool: ArrayLike, dt: float) -> Wrench:

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -17,7 +18,8 @@ from stmpl_core.errors import InvalidInput
 from stmpl_core.haptics import DeviceLoop, LoopSettings
 from stmpl_core.history import History
 from stmpl_core.living import living
-from stmpl_core.local_contact import DEEPER, LocalContact, local_contact, local_contacts
+from stmpl_core.local_contact import DEEPER, Grip, LocalContact, local_contact, local_contacts
+from stmpl_core.passive import PassiveContact
 from stmpl_core.sdf import SignedDistance
 from stmpl_core.touch import APART, IN_CORE
 from stmpl_core.toucher import Toucher
@@ -329,6 +331,39 @@ def test_bad_input_is_refused_or_gives_no_force(spot: Spot, model: LocalContact)
     np.testing.assert_allclose(loop.step(deep, STILL, 1e-3), pressed, rtol=0.05)
     with pytest.raises(InvalidInput, match=r"delay_steps is 1\.5"):
         LoopSettings(delay_steps=1.5)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("spoilt", [{"wrench": np.full(6, np.nan)}, {"wrench": np.full(6, 1e200)}, {"valid_m": np.nan},
+                                    {"stiffness": np.full((6, 6), np.inf)}, {"valid_rad": -1.0}, {"eased": np.nan},
+                                    {"eased": -1.0}, {"power": 0.0}, {"power": np.inf},
+                                    {"grip": Grip(np.zeros((3, 6)), np.zeros(3), np.zeros(3), 0.4)},
+                                    {"grip": Grip(np.zeros((3, 6)), np.zeros(3), np.ones(3), np.nan)}])  # fmt: skip
+def test_a_model_that_cannot_be_rendered_is_counted_and_the_last_one_goes_on(
+        spot: Spot, model: LocalContact, spoilt: dict[str, Any]) -> None:  # fmt: skip
+    bad, deep, pose = replace(model, **spoilt), spot.centre(-3e-3), at(*spot.centre(-3e-3))
+    with pytest.raises(InvalidInput, match="the local model's"):
+        bad.check()
+    loop, robot = DeviceLoop(), PassiveContact()
+    for one in (loop, robot):
+        one.update(model)
+    before = [loop.step(deep, STILL, 1e-3).copy() for _ in range(50)][-1], robot.step(pose, 1e-3).copy()
+    for one in (loop, robot):
+        one.update(bad)
+        assert one.refused == 1
+    assert np.linalg.norm(before[0]) > 0.01 and np.linalg.norm(before[1]) > 0.01
+    for _ in range(2):
+        np.testing.assert_allclose(loop.step(deep, STILL, 1e-3), before[0], rtol=0.05)
+        np.testing.assert_allclose(robot.step(pose, 1e-3), before[1], rtol=1e-9)
+        loop.update(model)
+
+
+def test_no_number_of_a_model_that_is_accepted_makes_one_that_is_not_finite(spot: Spot, model: LocalContact) -> None:
+    slight, firm = 1e-90 * model.wrench, 1e12 * model.stiffness
+    for one in (replace(model, wrench=slight, power=10.0), replace(model, wrench=slight, stiffness=firm, power=2.5),
+                replace(model, wrench=1e-10 * slight), replace(model, eased=1e15, power=1.0)):  # fmt: skip
+        one.check()
+        for depth in (3e-3, 0.0, -3e-3, -20e-3):
+            assert np.isfinite([*(found := one.wrench_at(at(*spot.centre(depth)))).wrench, found.stored]).all()
 
 
 @pytest.mark.parametrize("off", [5e-3, 0.1, 1e200])

@@ -350,6 +350,12 @@ def test_a_local_contact_keeps_every_bit_through_a_message():
         np.testing.assert_array_equal(told, meant)
     np.testing.assert_allclose(back.pose_body_from_tool, pose, atol=1e-12)
     assert (back.valid_m, back.valid_rad, back.status, back.trust.in_range) == (4e-4, 0.02, "touching", False)
+    for name, value in (("power", float("nan")), ("eased", -1.0), ("valid_m", float("inf")), ("friction_limit", -1.0),
+                        ("friction_stiffness", [0.0] * 3)):  # fmt: skip
+        spoilt = deserialize_message(serialize_message(message), LocalContactMessage)
+        setattr(spoilt, name, value)
+        with pytest.raises(InvalidInput, match="the local model's"):
+            local_contact_from(spoilt)
 
 
 def test_two_tools_in_step_are_answered_once_an_instant():
