@@ -142,6 +142,10 @@ class Answering:
             self._field.close()
             self._field = None
 
+    def wake(self) -> None:
+        """The thread of the fields goes on at once: how long it rests may have been changed."""
+        self._hurry.set()
+
     def drop(self) -> None:
         """What is being solved is not sent any more."""
         with self._sends:

@@ -258,6 +258,7 @@ class SkinNode(ServingNode):
         self.hearing.inbox.rest_after = int(config.rest_after * 1e9)
         if self.settings.locked:
             self.sending.show.set_rate(config.marker_rate)
+            self.answering.wake()
 
     def _offer(self, name: str, do: Callable[[], str]) -> None:
         """A std_srvs/Trigger service `~/NAME`: `do` returns what to say, or raises a StmplError."""

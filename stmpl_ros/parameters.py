@@ -19,6 +19,7 @@ from stmpl_core.tissue import SOFTEST
 PAPER = "paper"  # tissue of one layer, by the settings beside it
 ONE_LAYER = ("thickness", "youngs_modulus", "poisson_ratio", "density")  # settings beside it
 FOREARM, PAPER_ARM = "left_forearm", "left_arm"  # parts that answer unless one is asked for
+LEAST = {"deadline": 1e-3, "max_age": 1e-3, "field_rate": 1e-3}  # of fields in which 0 is a choice of its own
 ACCURACY = 2e-4  # error at any vertex that is asked for [m]
 ANY_TIME: JsonDict = {"when": "any time"}  # fields that a running node takes over at once
 CONFIGURING: JsonDict = {"when": "configuring"}  # fields that count when the node is configured
@@ -105,8 +106,9 @@ class NodeConfig(BaseModel):
         default="", description="YAML file of other frames that poses may come in, fixed in the body's; empty: none"
     )
     deadline: float = Field(
-        default=0.0, ge=0, le=3600, description="longest time between two poses that a device must promise [s]; 0: none"
-    )
+        default=0.0, ge=0, le=3600, description="longest time between two poses that a device must promise, from "
+        "0.001 [s]; 0: none",
+    )  # fmt: skip
     shape_tools: Names = Field(default=(), description="tools that announce their surface as shape_msgs/Mesh")
     tf_tools: Names = Field(
         default=(), description="tools whose pose is that of a frame of /tf: 'finger=tool0'; needs tf2_ros"
@@ -123,7 +125,7 @@ class NodeConfig(BaseModel):
         default="", description="model, link or collision in Gazebo that is the body; empty: whatever the tools touch"
     )
     rest_after: float = Field(
-        default=0.25, gt=0, le=3600, description="silence after which a tool is no longer in contact [s]",
+        default=0.25, ge=0.01, le=3600, description="silence after which a tool is no longer in contact [s]",
         json_schema_extra=ANY_TIME,
     )  # fmt: skip
     fade: float = Field(
@@ -132,16 +134,17 @@ class NodeConfig(BaseModel):
         json_schema_extra=ANY_TIME,
     )  # fmt: skip
     max_age: float = Field(
-        default=1.0, ge=0, le=1e9, description="age beyond which a message is dropped [s]; 0: never",
+        default=1.0, ge=0, le=1e9, description="age beyond which a message is dropped, from 0.001 [s]; 0: never",
         json_schema_extra=ANY_TIME,
     )  # fmt: skip
     marker_rate: float = Field(
-        default=15.0, gt=0, le=1000, description="rate of skin/marker and skin/points while somebody listens [Hz]",
+        default=15.0, ge=1e-3, le=1000, description="rate of skin/marker and skin/points while somebody listens [Hz]",
         json_schema_extra=ANY_TIME,
     )  # fmt: skip
     field_rate: float = Field(
         default=0.0, ge=0, le=1000, json_schema_extra=ANY_TIME,
-        description="largest rate of skin/displacement, to leave the processor to the reactions [Hz]; 0: as it goes",
+        description="largest rate of skin/displacement, to leave the processor to the reactions, from 0.001 [Hz]; 0: "
+        "as it goes",
     )  # fmt: skip
     autostart: bool = Field(default=True, description="start into the active state without being asked")
 
@@ -157,6 +160,13 @@ class NodeConfig(BaseModel):
     def _in_pascals(cls, value: float) -> float:
         if isinstance(value, (int, float)) and 0 < value < SOFTEST:
             raise ValueError(f"at least {SOFTEST:g} Pa is accepted. Is it in kilopascals? Scale it by 1e3")
+        return value
+
+    @field_validator(*LEAST)
+    @classmethod
+    def _none_or_enough(cls, value: float, info: ValidationInfo) -> float:
+        if 0 < value < (least := LEAST[str(info.field_name)]):
+            raise ValueError(f"it must be 0 or at least {least:g}")
         return value
 
     @field_validator("phenotype")

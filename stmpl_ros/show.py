@@ -47,8 +47,9 @@ class Show:
         self._cloud = SkinCloud(layer, self._frame)
 
     def set_rate(self, rate: float) -> None:
-        """Sets the rate of both topics [Hz]."""
+        """Sets the rate of both topics [Hz], from now on."""
         self._timer.timer_period_ns = round(NANO / rate)
+        self._timer.reset()  # or the last period ends first
 
     def put(self, answer: Displacement, stamp_ns: int, joints: tuple[float, ...] = ()) -> None:
         """Takes the newest answer, and the angles of the layer's joints [rad] that it was given at."""

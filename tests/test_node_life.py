@@ -341,6 +341,27 @@ def test_a_rare_field_does_not_hold_up_what_fades(composed):
     composed.wait(lambda: answering._instant is None)
 
 
+def test_a_rate_that_was_rare_is_another_one_at_once(composed):
+    """At 1 mHz the thread of the fields rests, and the display waits, for a thousand seconds."""
+    node, answering = composed.node, composed.node.answering
+    node.set_parameters([Parameter("field_rate", value=1e-3), Parameter("marker_rate", value=1e-3)])
+    composed.wait(lambda: composed.press() and answering.last is not None)
+    composed.wait(lambda: composed.press() and not answering._field.idle)
+    composed.wait(lambda: node.sending.show._timer.time_until_next_call() > 10**11)
+    solved = answering.last[1].stamp
+    node.set_parameters([Parameter("field_rate", value=0.0), Parameter("marker_rate", value=15.0)])
+    composed.wait(lambda: composed.press() and answering.last is not None and answering.last[1].stamp > solved)
+    assert node.sending.show._timer.time_until_next_call() < 10**8
+
+
+@pytest.mark.parametrize(("name", "least"), [("marker_rate", 1e-3), ("field_rate", 1e-3), ("rest_after", 1e-2),
+                                             ("max_age", 1e-3)])  # fmt: skip
+def test_a_setting_too_small_to_mean_anything_is_refused(composed, name, least):
+    (refused,) = composed.node.set_parameters([Parameter(name, value=1e-300)])
+    assert not refused.successful and f"{least:g}" in refused.reason
+    assert composed.node.set_parameters([Parameter(name, value=least)])[0].successful
+
+
 def test_a_field_whose_time_is_over_before_it_is_begun_is_not_begun(composed, held, monkeypatch):
     answering, asked = composed.node.answering, []
     composed.wait(lambda: composed.press() and not answering._field.idle)
