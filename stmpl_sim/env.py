@@ -48,6 +48,7 @@ class MassageEnv(gymnasium.Env[np.ndarray, np.ndarray]):
     each within -100..100.
     Reward, 0..1 a step: exp(-(force error / 2 N)^2) exp(-(off course / 5 mm)^2).
     An episode ends after its laps; it ends at once, with -10, at 40 N.
+    Processes of environments must be started afresh (`vector_kwargs={"context": "spawn"}`), not forked.
 
     Args:
         layer: skin, or a Simulator that is ready; the back as measured unless given. Any part does:

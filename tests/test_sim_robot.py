@@ -2,7 +2,10 @@
 
 import importlib.util
 import json
+import os
 import re
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -416,6 +419,33 @@ def test_the_script_holds_ten_newtons_on_the_back_of_a_person_who_breathes_sways
     assert moved > SWAY_M and done
     assert force.mean() == pytest.approx(10.0, abs=0.3) and np.abs(force - 10.0).max() < 3
     assert rewards.mean() > 0.8 and off.max() < 3e-3 and in_range.mean() > 0.9
+
+
+MANY = """
+import gymnasium
+from stmpl_core import Tissue
+from stmpl_core.body import Body
+from stmpl_sim.env import register
+
+if __name__ == "__main__":
+    register()
+    flesh = Body.anny().part("left_forearm", edge_length=6e-3, tissue=Tissue(youngs_modulus=20e3))
+    many = gymnasium.make_vec("stmpl/Massage-v0", num_envs=2, HOW, laps=0.1, timestep=4e-3, layer=flesh,
+                              relaxing=True)
+    print(many.reset(seed=[5, 6])[0][:, 0].round(1), many.step(many.action_space.sample())[1].shape)
+    many.close()
+"""
+
+
+def test_many_environments_run_in_processes_of_their_own(tmp_path: Path) -> None:
+    """In a program of its own, as docs/learning.md has it; forked ones ended where their skin was prepared."""
+    pytest.importorskip("gymnasium", reason="pip install 'stmpl[sim]'")
+    root, way = Path(__file__).parent.parent, 'vectorization_mode="async", vector_kwargs={"context": "spawn"}'
+    assert way in (root / "docs/learning.md").read_text()
+    (tmp_path / "many.py").write_text(MANY.replace("HOW", way))
+    ran = subprocess.run([sys.executable, tmp_path / "many.py"], cwd=root, env=os.environ | {"PYTHONPATH": str(root)},
+                         capture_output=True, text=True, timeout=300)  # fmt: skip
+    assert ran.returncode == 0 and "[1. 1.] (2,)" in ran.stdout, ran.stderr
 
 
 def test_an_episode_begins_on_skin_that_remembers_the_press(forearm: SoftLayer) -> None:
