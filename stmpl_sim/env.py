@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 import numpy as np
 
@@ -115,6 +115,11 @@ class MassageEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         self._start: tuple[np.ndarray, np.ndarray, Memory] | None = None
         self._last = np.zeros(2)
         self._goal = self.course.goal(0.0, self._rest, self._scene.radius)
+
+    def __reduce_ex__(self, protocol: Any) -> NoReturn:
+        raise InvalidInput("a MassageEnv is neither copied nor pickled. Make another one, which may share the skin, "
+                           "MassageEnv(env.massage.skin.simulator, ...), and take it there by reset(seed=...) and the "
+                           "same actions.")  # fmt: skip
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict]:
         """A new episode: the ball presses with 10 N, and the person begins to move somewhere in a breath."""

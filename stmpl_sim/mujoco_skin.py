@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections import OrderedDict
-from collections.abc import Mapping, Sequence
-from itertools import count
-from typing import Any, NamedTuple
-from weakref import WeakKeyDictionary, WeakValueDictionary
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
+from typing import Any, NamedTuple, NoReturn
+from uuid import uuid4
+from weakref import ReferenceType, WeakKeyDictionary, WeakValueDictionary, ref
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -24,7 +25,7 @@ from stmpl_core.tool import Tool
 from stmpl_core.touch import Answer, Touch
 from stmpl_sim.engine import mujoco
 from stmpl_sim.jointed import POSE_STEP, Jointed
-from stmpl_sim.protocol import Memory, Poses, Reaction, SoftContact
+from stmpl_sim.protocol import Exerted, Memory, Poses, Reaction, Row, SoftContact
 
 MOST_NAMES = 30  # names of a model that an error lists
 KNOWN = 10_000  # rows of xfrc_applied that are known again
@@ -71,7 +72,9 @@ class SoftBody:
     Attributes:
         contact: the SoftContact.
         reaction: last reaction, with the wrenches in world axes; None before the first `apply`.
-        memory: memory of the steps; may be set.
+        memory: memory of the steps; may be set. It goes with a state of `data`, also into another process: read it when
+            the state is read, and set it when the state is put back, or a skin may take its wrench in that state for
+            somebody's push.
 
     Raises:
         InvalidInput: names that the model does not have, kinds of geoms that cannot be tools, a tool that is part of
@@ -117,10 +120,10 @@ class SoftBody:
                                    implicit=implicit, friction=friction, every=every)  # fmt: skip
         if self._jointed is not None:
             self._jointed.compare(model, self.contact.pose_body_from_layer)
-        self._key = next(_KEYS)
+        self._key = uuid4().hex
         _LIVE[self._key] = self
         self._felt = {self.body, *limbs, *(source.body for source in self._sources.values())}
-        self._times: WeakKeyDictionary[Memory, float] = WeakKeyDictionary()  # at which memories were made [s]
+        self._exerted_in: ReferenceType[Any] | None = None  # data of the last apply, unless a memory was put since
         self.memory = Memory()
         self.reaction: Reaction | None = None
         self._jacobians = np.zeros((2, 3, model.nv)) if implicit else None
@@ -128,11 +131,31 @@ class SoftBody:
     @property
     def memory(self) -> Memory:
         """Memory of the contact after the last `apply`, or as it was put: with a state of `data`, one from then."""
+        if self._exerted_in is not None and (data := self._exerted_in()) is not None:  # others may have come since
+            self._keep(data)
         return self._memory
 
     @memory.setter
     def memory(self, memory: Memory) -> None:
-        self._memory, self._time, self._put = memory, self._times.get(memory), True
+        self._memory, self._time, self._exerted_in, self._put = memory, None, None, True
+        if memory.exerted is not None:
+            self._time = memory.exerted.time
+            self._ledger.know(self._key, memory.exerted)
+
+    def _keep(self, data: Any) -> None:
+        """Keeps with the memory what stands in `data` of this skin."""
+        assert self._time is not None
+        rows = self._ledger.rows(data, self._key, self._felt)
+        self._memory = replace(self._memory, exerted=Exerted(self._key, self._time, rows))
+
+    @property
+    def _ledger(self) -> _Ledger:
+        return _LEDGERS.setdefault(self.model, _Ledger())
+
+    def __reduce_ex__(self, protocol: Any) -> NoReturn:
+        raise InvalidInput("a SoftBody is neither copied nor pickled, as wrenches of it stand in its data. Make "
+                           "another one, SoftBody(model, skin.simulator, ...), and put state and memory into it: "
+                           "mj_setState, then other.memory = skin.memory.")  # fmt: skip
 
     @property
     def simulator(self) -> Simulator:
@@ -161,19 +184,21 @@ class SoftBody:
         mobility = None if self._jacobians is None else lambda name, at, along: self._mobility(data, name, at, along)
         poses = self.poses(data)
         if self._jointed is None:
-            self.reaction = self.contact.step(poses, self.memory, dt, mobility)
+            reaction = self.contact.step(poses, self._memory, dt, mobility)
         else:
-            self.reaction = self._step_bent(self._jointed, data, poses, dt, mobility)
-        self._memory, self._time, self._put = self.reaction.memory, float(data.time), False
-        self._times[self._memory] = self._time
-        self._push(data, self.reaction)
-        return self.reaction.touches
+            reaction = self._step_bent(self._jointed, data, poses, dt, mobility)
+        self._memory, self._time, self._put = reaction.memory, float(data.time), False
+        self._push(data, reaction)
+        self._exerted_in = ref(data)
+        self._keep(data)
+        self.reaction = replace(reaction, memory=self._memory)
+        return reaction.touches
 
     def _step_bent(self, jointed: Jointed, data: Any, poses: Poses, dt: float, mobility: Any) -> Reaction:
         """A step of a limb whose joints move."""
         now = jointed.angles(data)
         if not self._posed or max(abs(now[name] - self._posed[name]) for name in now) > POSE_STEP:
-            self._memory, self._posed = self.contact.pose(now, self.memory), now
+            self._memory, self._posed = self.contact.pose(now, self._memory), now
         world = poses.body @ self.contact.pose_body_from_layer
         backs = {}
         for name, pose in poses.tools.items():
@@ -181,7 +206,7 @@ class SoftBody:
             back = jointed.back(place, self.simulator.layer.vertices, self._posed, now)
             backs[name] = world @ back @ inverted(world)
         there = Poses(poses.body, {name: backs[name] @ pose for name, pose in poses.tools.items()})
-        made = self.contact.step(there, self.memory, dt, mobility)
+        made = self.contact.step(there, self._memory, dt, mobility)
         tools, on_body = {}, np.zeros(6)
         for name, wrench in made.tools.items():
             turn = backs[name][:3, :3].T
@@ -252,7 +277,7 @@ class SoftBody:
     def _exert(self, data: Any, rows: Mapping[int, Wrench]) -> None:
         """Puts wrenches, by body, in place of the last ones; zero where there is none."""
         every = {body: rows.get(body, np.zeros(6)) for body in self._felt}
-        _LEDGERS.setdefault(self.model, _Ledger()).replace(data, self._key, every)
+        self._ledger.replace(data, self._key, every)
 
     def _limb_under(self, name: str) -> int:
         """Number of the body that carried most of a tool's last touch; without one or without joints, the skin's."""
@@ -280,25 +305,46 @@ def _rig_of(layer: SoftLayer | Skin | Simulator) -> Rig | None:
     return (layer.rest or layer).layer.rig if isinstance(layer, Skin) else layer.rig
 
 
-class _Row(NamedTuple):
+class _Shares(NamedTuple):
     """What a row of xfrc_applied is made of: what others want, (6,), and what skins exert, (6,) each, by their keys."""
 
     others: Wrench
-    skins: dict[int, Wrench]
+    skins: dict[str, Wrench]
 
 
 class _Ledger:
     """What skins put into xfrc_applied of a model's data, so that each takes out what it put in, and no more.
 
     A number that is no longer what skins left there is what others want. Rows are known again where a state is
-    restored or copied, KNOWN of them.
+    restored or copied: the last KNOWN of them, and those that came with a memory.
     """
 
     def __init__(self) -> None:
-        self._known: OrderedDict[tuple[int, bytes], _Row] = OrderedDict()
-        self._left: WeakKeyDictionary[Any, dict[int, tuple[Wrench, _Row]]] = WeakKeyDictionary()
+        self._known: OrderedDict[tuple[int, bytes], _Shares] = OrderedDict()
+        self._left: WeakKeyDictionary[Any, dict[int, tuple[Wrench, _Shares]]] = WeakKeyDictionary()
+        self._put: dict[int, tuple[Wrench, _Shares]] = {}  # rows of the last memories that were put
 
-    def replace(self, data: Any, owner: int, rows: Mapping[int, Wrench]) -> None:
+    def know(self, owner: str, exerted: Exerted) -> None:
+        """Knows the rows of a memory, in which what was its skin's is now this skin's."""
+        for body, (numbers, others, ours) in exerted.rows.items():
+            known = self._known.get((body, numbers.tobytes()))
+            skins = {} if known is None else {key: each for key, each in known.skins.items() if key != exerted.owner}
+            self._put[body] = numbers, _Shares(others, skins | {owner: ours})
+            self._remember(body, *self._put[body])
+
+    def rows(self, data: Any, owner: str, bodies: Iterable[int]) -> dict[int, Row]:
+        """The rows in which a skin's wrench stands, as skins left them."""
+        left = self._left.get(data, {})
+        return {body: Row(numbers, shares.others, shares.skins[owner]) for body in bodies if body in left
+                for numbers, shares in [left[body]] if owner in shares.skins}  # fmt: skip
+
+    def _remember(self, body: int, numbers: Wrench, shares: _Shares) -> None:
+        self._known[body, numbers.tobytes()] = shares
+        self._known.move_to_end((body, numbers.tobytes()))
+        if len(self._known) > KNOWN:
+            self._known.popitem(last=False)
+
+    def replace(self, data: Any, owner: str, rows: Mapping[int, Wrench]) -> None:
         """Puts these wrenches, by body, in place of a skin's last ones."""
         left = self._left.setdefault(data, {})
         for body, wrench in rows.items():
@@ -306,29 +352,29 @@ class _Ledger:
             skins = {key: each for key, each in skins.items() if key != owner and key in _LIVE}
             if wrench.any():
                 skins[owner] = wrench
-            row = _Row(others, skins)
+            shares = _Shares(others, skins)
             numbers = data.xfrc_applied[body] = others + sum(skins.values(), np.zeros(6))
-            left[body] = numbers, row
+            left[body] = numbers, shares
             if skins:
-                self._known[body, numbers.tobytes()] = row
-                if len(self._known) > KNOWN:
-                    self._known.popitem(last=False)
+                self._remember(body, numbers, shares)
 
-    def _read(self, numbers: Wrench, body: int, left: Mapping[int, tuple[Wrench, _Row]]) -> _Row:
+    def _read(self, numbers: Wrench, body: int, left: Mapping[int, tuple[Wrench, _Shares]]) -> _Shares:
         if not numbers.any():
-            return _Row(np.zeros(6), {})
+            return _Shares(np.zeros(6), {})
+        if body in left and (numbers == left[body][0]).all():
+            return left[body][1]
         if known := self._known.get((body, numbers.tobytes())):
             return known
-        if body not in left:
-            return _Row(numbers.copy(), {})
-        last, row = left[body]
+        guesses = [guess[body] for guess in (left, self._put) if body in guess]
+        if not guesses:
+            return _Shares(numbers.copy(), {})
+        last, shares = max(guesses, key=lambda guess: (numbers == guess[0]).sum())
         same = numbers == last
-        return _Row(np.where(same, row.others, numbers), {key: each * same for key, each in row.skins.items()})
+        return _Shares(np.where(same, shares.others, numbers), {key: each * same for key, each in shares.skins.items()})
 
 
 _LEDGERS: WeakKeyDictionary[Any, _Ledger] = WeakKeyDictionary()  # by model
-_LIVE: WeakValueDictionary[int, SoftBody] = WeakValueDictionary()
-_KEYS = count()
+_LIVE: WeakValueDictionary[str, SoftBody] = WeakValueDictionary()
 
 
 def exclude(spec: Any, body: str, tools: Sequence[str]) -> None:

@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from numbers import Integral
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -62,6 +62,34 @@ class Asked:
     steps: int = 0
 
 
+class Row(NamedTuple):
+    """What a simulator's side keeps of a body, to which skins and others add wrenches, each (6,) [N, N m].
+
+    Args:
+        numbers: sum, as it stood with the body.
+        others: part that is not of skins.
+        ours: part of this skin.
+    """
+
+    numbers: Wrench
+    others: Wrench
+    ours: Wrench
+
+
+class Exerted(NamedTuple):
+    """What a skin had put into a simulator's state, so that it is known again where the state is put back.
+
+    Args:
+        owner: key of the skin, of which there is one in the world.
+        time: time of the simulation [s].
+        rows: rows by the number of the body.
+    """
+
+    owner: str
+    time: float
+    rows: Mapping[int, Row]
+
+
 @dataclass(frozen=True, eq=False)
 class Memory:
     """Memory of a soft contact: a value that goes into a step and comes out of it.
@@ -75,6 +103,7 @@ class Memory:
         waited: time since that step [s].
         pushes: way in which each tool that presses pushed last while it was not in the core, unit vector (3,), by name.
         through: names of tools that went through the body and have not been apart since.
+        exerted: what the skin's wrenches were in the state that this belongs to, where somebody keeps it (SoftBody).
     """
 
     tissue: State = field(default_factory=State)
@@ -85,6 +114,7 @@ class Memory:
     waited: float = 0.0
     pushes: Mapping[str, np.ndarray] = field(default_factory=dict)
     through: frozenset[str] = frozenset()
+    exerted: Exerted | None = None
 
 
 @dataclass(frozen=True, eq=False)

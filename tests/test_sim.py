@@ -1,6 +1,7 @@
 """stmpl_sim: soft skin in a rigid-body simulator: what it exerts is what the contact law says, on both, once."""
 
 import copy
+import pickle
 from collections.abc import Mapping
 from typing import Any
 
@@ -469,6 +470,67 @@ def test_a_memory_that_is_put_back_with_a_state_goes_on_as_before(slab: SoftLaye
         ways.append(np.array(wrenches))
     assert np.abs(ways[0][:, 0]).max() > 1e-3
     np.testing.assert_array_equal(*ways)
+
+
+@pytest.mark.parametrize("elsewhere", [False, True])
+def test_a_state_that_is_put_back_late_or_elsewhere_with_its_memories_keeps_no_wrench_of_ours(
+        simulator: Simulator, monkeypatch: pytest.MonkeyPatch, elsewhere: bool) -> None:  # fmt: skip
+    """Two skins and somebody's push; what was left in between is forgotten, or never was known in that process."""
+    monkeypatch.setattr("stmpl_sim.mujoco_skin.KNOWN", 4)
+    whole = mujoco.mjtState.mjSTATE_INTEGRATION
+
+    def made() -> tuple[Any, Any, list[SoftBody]]:
+        m = model()
+        return m, mujoco.MjData(m), [SoftBody(m, simulator, body="slab", tools=["ball"]) for _ in range(2)]
+
+    def walked(m: Any, d: Any, skins: list[SoftBody], steps: int) -> np.ndarray:
+        for _ in range(steps):
+            mujoco.mj_step1(m, d)
+            for skin in skins:
+                skin.apply(d)
+            mujoco.mj_step2(m, d)
+        return d.qpos.copy()
+
+    m, d, skins = made()
+    d.xfrc_applied[2, 1], d.qvel[0] = 0.2, 0.05
+    walked(m, d, skins, 20)
+    state = np.empty(mujoco.mj_stateSize(m, whole))
+    mujoco.mj_getState(m, d, state, whole)
+    kept = pickle.dumps([skin.memory for skin in skins])
+    went = walked(m, d, skins, 20)
+    if elsewhere:
+        before = skins  # alive, and another's
+        m, d, skins = made()
+        assert before[0].memory.exerted and before[0].memory.exerted.rows
+    mujoco.mj_setState(m, d, state, whole)
+    for skin, memory in zip(skins, pickle.loads(kept), strict=True):
+        skin.memory = memory
+    np.testing.assert_array_equal(walked(m, d, skins, 20), went)
+    mujoco.mj_setState(m, d, state, whole)
+    for skin, memory in zip(skins, pickle.loads(kept), strict=True):
+        skin.memory = memory
+    d.xfrc_applied[2, 0] = 3.0  # set by somebody, after the state
+    d.qpos[2] += 1.0  # away from the skin
+    walked(m, d, skins, 1)
+    np.testing.assert_allclose(d.xfrc_applied[1:3], [[0] * 6, [3, 0.2, 0, 0, 0, 0]], atol=1e-12)
+
+
+def test_a_memory_of_before_its_rows_is_still_taken(simulator: Simulator) -> None:
+    m = model()
+    d, skin = mujoco.MjData(m), SoftBody(m, simulator, body="slab", tools=["ball"])
+    skin.apply(d)
+    old = skin.memory
+    del old.__dict__["exerted"]
+    skin.memory = pickle.loads(pickle.dumps(old))
+    assert skin.apply(d)["ball"].force > 0
+
+
+def test_a_skin_is_not_copied_but_made_anew(simulator: Simulator) -> None:
+    m = model()
+    skin = SoftBody(m, simulator, body="slab", tools=["ball"])
+    for attempt in (lambda: copy.copy(skin), lambda: copy.deepcopy((m, skin)), lambda: pickle.dumps(skin)):
+        with pytest.raises(InvalidInput, match="Make another"):
+            attempt()
 
 
 def test_several_tools_feel_each_other_and_each_gets_its_own(simulator: Simulator) -> None:

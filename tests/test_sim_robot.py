@@ -1,5 +1,6 @@
 """A robot in MuJoCo: it keeps its force on skin, on a course along it; scene, film and environment around it."""
 
+import copy
 import importlib.util
 import json
 import os
@@ -389,6 +390,8 @@ def test_the_environment_passes_gymnasiums_own_check_and_its_script_solves_it(fo
     for _ in rewards:
         still.append(env.step(np.array([-1.0, 0, 0]))[1])
     assert np.mean(still[20:]) < 0.3  # who does nothing is not paid
+    with pytest.raises(InvalidInput, match="neither copied nor pickled"):
+        copy.deepcopy(env)
     with pytest.raises(InvalidInput, match="render_mode"):
         MassageEnv(forearm, render_mode="human")
     with pytest.raises(InvalidInput, match="its own friction"):
