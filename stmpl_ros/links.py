@@ -13,9 +13,11 @@ import numpy as np
 from geometry_msgs.msg import PoseStamped, WrenchStamped
 from nav_msgs.msg import Odometry
 from rclpy.duration import Duration
+from rclpy.exceptions import InvalidTopicNameException
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.utilities import ok
+from rclpy.validate_topic_name import validate_topic_name
 
 from bags.wire import NANO, pose_from, stamp_ns, wrench_message
 from stmpl_core.arrays import Points, Transform, Wrench
@@ -235,7 +237,14 @@ def topic_of(pattern: str, link: str) -> str:
     """Topic of a link: its name in place of {link}, with / where simulators scope by ::. Raises InvalidInput."""
     if "{link}" not in pattern:
         raise InvalidInput(f"topic '{pattern}' does not say where the link's name goes, as in 'links/{{link}}/pose'.")
-    return pattern.replace("{link}", link.replace("::", "/"))
+    topic = pattern.replace("{link}", link.replace("::", "/"))
+    try:
+        validate_topic_name(topic)
+    except InvalidTopicNameException as error:
+        why = str(error).splitlines()[0].partition(": ")[2].rstrip(":")
+        raise InvalidInput(f"'{topic}' cannot be a topic: {why}. Try another --poses or --wrenches, or another "
+                           "name of the link.") from error  # fmt: skip
+    return topic
 
 
 def points_of(said: Sequence[str], links: Sequence[str]) -> dict[str, Points]:
@@ -247,6 +256,8 @@ def points_of(said: Sequence[str], links: Sequence[str]) -> dict[str, Points]:
             found[link] = np.array([float(part) for part in point.split(",")]).reshape(3)
         except ValueError:
             raise InvalidInput(f"'{text}' is no link=x,y,z, as in 'tip=0,0,0.02'.") from None
+        if not np.isfinite(found[link]).all():
+            raise InvalidInput(f"'{text}' is no place: its numbers have to be finite, as in 'tip=0,0,0.02'.")
         if link not in links:
             raise InvalidInput(f"there is no link '{link}'; known are {', '.join(links)}.")
     return found
@@ -298,6 +309,8 @@ def run(config: LinksConfig, arguments: Sequence[str] | None = None, build: Buil
     layer = faded(build(settings), settings)
     contact = SoftContact(layer, tools or tools_of(config.tools), settings.new_method(), damping=config.damping,
                           friction=friction_of(settings))  # fmt: skip
+    if config.body in contact.tools:
+        raise InvalidInput(f"'{config.body}' carries the skin and is a tool as well; a link cannot touch itself.")
     with ros(list(arguments or ())) as stop:
         node = LinkNode(config, contact)
         node.get_logger().info(f"skin of '{config.body}': {layer}; tools: {', '.join(contact.tools)}")

@@ -15,7 +15,9 @@ from nav_msgs.msg import Odometry
 
 from bags.wire import header, pose_message, stamp_ns
 from stmpl_core.errors import InvalidInput
-from stmpl_ros.links import RosWorld, moved_to, points_of, tools_of, topic_of
+from stmpl_core.tool import Tool
+from stmpl_ros.links import RosWorld, moved_to, points_of, run, tools_of, topic_of
+from stmpl_ros.parameters import LinksConfig
 from stmpl_ros.topics import STREAM
 from stmpl_sim import Poses, Reaction
 from tests.bus import Robot, running
@@ -230,6 +232,13 @@ def test_what_cannot_be_is_one_sentence(tmp_path: Path) -> None:
         points_of(["tip=1,2"], ["tip"])
     with pytest.raises(InvalidInput, match=r"no link 'toe'; known are arm, tip"):
         points_of(["toe=0,0,1"], ["arm", "tip"])
+    with pytest.raises(InvalidInput, match=r"'tip=nan,0,0' is no place"):
+        points_of(["tip=nan,0,0"], ["arm", "tip"])
+    with pytest.raises(InvalidInput, match=r"'links/left arm/pose' cannot be a topic: .* Try another"):
+        topic_of("links/{link}/pose", "left arm")
+    ball = Tool("arm", tip.vertices, tip.faces)
+    with pytest.raises(InvalidInput, match=r"'arm' carries the skin and is a tool as well"):
+        run(LinksConfig(body="arm", tools=("arm=-",)), build=lambda settings: plate(0.06), tools=[ball])
 
 
 def test_links_of_gazebo_need_its_package() -> None:
