@@ -21,7 +21,7 @@ from stmpl_core.columns import shifted
 from stmpl_core.contact import Contact
 from stmpl_core.dragged import MIN_OFFSET
 from stmpl_core.errors import InvalidInput
-from stmpl_core.footing import HELD_OFF, aged, bearing, in_plane, needed
+from stmpl_core.footing import HELD_OFF, aged, bearing, needed
 from stmpl_core.friction import Friction, coefficients
 from stmpl_core.relaxation import depth_left, faded, fading, let_go, series_of, stretch
 from stmpl_core.sideways import Sideways
@@ -32,7 +32,6 @@ from stmpl_core.toucher import Toucher
 
 RUBBED = 0.1  # of the force: what skin that gives way beneath a dry tool is off, as the law was learnt from what sticks
 PILED = 0.5  # of drag^2 / force: error of skin that piles up; 0.7 of it on a back, where the elastic bound was 0.45
-SPUN = 0.8  # of slide times spin over their limit: force aside that a turning tool takes; 0.64 by finite elements
 LOST = 0.5  # of what skin carries along itself: what is gone once all of it slides; 0.4 to 0.6 by slides on a forearm
 STRAYED = 0.03  # of the elastic force: part of the memory from touches out of range, beyond which an answer is, too
 NONE, NO_ROOM, FLAT = np.zeros(6), np.zeros(3), np.zeros((3, 3))
@@ -206,8 +205,8 @@ class History:
         mu = self.friction(touch.name)
         if mu > 0 and net > MIN_ONE_WAY_SHARE:
             give = self.toucher.give(nodes, pressed.forces)
-            (wrench, rubs, share, offset, turn, lean, grown, limit, stiffness, springs, eased, bent, slid, held,
-             room) = rub(
+            (wrench, rubs, share, offset, turn, lean, grown, limit, stiffness, springs, eased, bent, slid, held, room,
+             aside) = rub(
                 by * touch.wrench, NONE if stated is None else stated, stated is not None, contact, pose[:3, 3],
                 self.toucher.curvature(nodes, pressed.forces), FLAT if give is None else give, mu,
                 LOST * pressed.along, force, lever, at_rest, touch.depth, radius, pressed.power,
@@ -216,8 +215,7 @@ class History:
                 np.array((before.rolled_first, before.rolled_second, before.rolled)), one.before.springs,
                 one.before.springs_relaxed, one.before.stiffness, *self.series, dt)  # fmt: skip
             changed |= scaled(touch, grown * by, grown * doubt)
-            first, second, turning = in_plane(rubs, contact, pose[:3, 3], lever)
-            besides = SPUN * abs(turning) * math.hypot(first, second) / limit if limit > 0 else 0.0
+            besides = aside
             if self.toucher.layer.tissue.skin is not None:
                 pressing = math.sqrt(wrench[:3] @ wrench[:3])
                 besides += RUBBED * pressing + PILED * float(rubs[:3] @ rubs[:3]) / pressing

@@ -35,6 +35,7 @@ TRIALS, TOLERANCE = 30, 1e-9  # of the way for a force; over the cap
 SLIDES = 8  # trials of how far a spring slides
 MOST_CARRIED = 0.9999  # share of the cap that sticks: a force at the cap has no way
 PART, PARTS = 0.25, 16  # way over cap / k from which a step is cut, for a slide that turns; most parts
+SPUN = 0.8  # of slide times spin over their limit: force aside that a turning tool takes; 0.64 by finite elements
 PLOUGHED = 0.33, 0.2, 0.67  # see ploughing: growth of stiffness, and of the cap without and over mu
 MOST_LEAN = 0.5  # turn of the normal under skin that is dragged along, of which a push takes note [rad]
 LEAST_GROWN = 0.5  # depth over the tool's that counts at least, where skin came from a hollow
@@ -303,6 +304,7 @@ def rub(wrench, stated, by_force, contact, origin, bend, give, mu, along_itself,
         stiffness, springs, relaxed: see Memory, after the step.
         stored: energy that springs and bent skin store [J].
         slid, held, room: see Scalars.
+        aside: error of the force where the tool spins as it slides [N].
     """
     wanted, turned, out, carries, slid = np.zeros(3), np.zeros(3), 0.0, 1.0, before_slid
     if stiffness[0] > 0:
@@ -357,4 +359,5 @@ def rub(wrench, stated, by_force, contact, origin, bend, give, mu, along_itself,
     else:
         held = after[0]
     push = grown * slid * wrench + wrench_at(lean, arm)
-    return push, rubs, share, offset, turns, lean, grown, cap, after, new, kept, stored, slid, held, room
+    aside = SPUN * abs(carried[2]) * np.sqrt(carried[0] ** 2 + carried[1] ** 2) / cap if cap > 0 else 0.0
+    return push, rubs, share, offset, turns, lean, grown, cap, after, new, kept, stored, slid, held, room, aside

@@ -302,7 +302,7 @@ def test_a_tool_that_spins_while_it_slides_is_dragged_as_finite_elements_say() -
         (touch,), state = simulator.touch([Contact(tool, pose)], state, 0.05)
     assert touch.wrench[0] == pytest.approx(0.349, rel=0.08)
     assert touch.wrench[5] == pytest.approx(0.734e-3, rel=0.05)
-    assert np.linalg.norm(touch.wrench[:2] - [0.349, 0.112]) < touch.force_bound < 0.2
+    assert np.linalg.norm(touch.wrench[:2] - [0.349, 0.112]) < touch.force_bound < 0.25
 
 
 def test_friction_is_by_tool_and_by_name(sim: Simulator) -> None:
