@@ -16,6 +16,7 @@ import json
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
+from functools import cache
 from pathlib import Path
 
 import matplotlib.pyplot as plt
@@ -308,12 +309,16 @@ def main() -> None:
     console, layer = Console(width=165), arm()
     simulator = Simulator(layer, MomentNet(sticks=not options.by_vertices))
     some = [one for one in every if not options.tools or one.name in options.tools]
+
+    @cache
+    def solver(fine: bool) -> IndenterFem:
+        return IndenterFem(PatchFem(refine=4, layers=2) if fine else None).prepare(layer)
+
     asked = []
     for scene in track(some, "finite elements", console=console):
         if options.finer or options.again:
             fine = options.finer or scene.name in FINE
-            fem = IndenterFem(PatchFem(refine=4, layers=2) if fine else None).prepare(layer)
-            asked.append((scene, truths(scene, layer, fem, KEPT / "finer" if fine else KEPT)))
+            asked.append((scene, truths(scene, layer, solver(fine), KEPT / "finer" if fine else KEPT)))
         else:
             asked.append((scene, truths(scene, layer)))
     rows = [row(scene, simulator, truth) for scene, answers in asked for truth in answers]

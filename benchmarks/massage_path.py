@@ -21,7 +21,6 @@ from fem_tools import IndenterFem, PatchFem
 from fem_tools.rigid import ROUNDED, STACK_STEP
 from fem_tools.stroke import Stroke
 from stmpl_core.errors import BagError
-from stmpl_core.friction import coefficient
 from stmpl_core.sdf import SignedDistance
 
 SPACING, PAUSE = 2e-3, 0.25  # between two poses that are taken [m], [s]
@@ -51,7 +50,7 @@ def main() -> None:
     for k in range(taken[0] + 1, len(frames)):
         if np.linalg.norm(poses[k, :3, 3] - poses[taken[-1], :3, 3]) > SPACING or at[k] - at[taken[-1]] > PAUSE:
             taken.append(k)
-    friction = coefficient(frames[-1].friction.get(given.tool) or None)
+    friction = frames[-1].friction.get(given.tool, 0.0)
     print(f"{len(taken)} poses, friction {friction:g}, {'relaxing' if layer.tissue.relaxes else 'elastic'}")
     print("time [s]   FEM [N] (friction)   answer [N] (friction)   off")
     patch = PatchFem(reach=REACH, check_stability=False, element="P1xP2", layers=1)

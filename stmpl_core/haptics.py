@@ -112,9 +112,7 @@ class DeviceLoop:
 
         One that cannot be rendered (`model.check()` says why) is counted in `refused`, and the last one goes on.
         """
-        try:
-            model.check()
-        except InvalidInput:
+        if not model.renderable:
             self.refused += 1
             return
         self._newest = _packed(model, self.settings.coupling_stiffness)

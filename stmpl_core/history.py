@@ -206,7 +206,7 @@ class History:
         if mu > 0 and net > MIN_ONE_WAY_SHARE:
             give = self.toucher.give(nodes, pressed.forces)
             (wrench, rubs, share, offset, turn, lean, grown, limit, stiffness, springs, eased, bent, slid, held, room,
-             aside) = rub(
+             besides) = rub(
                 by * touch.wrench, NONE if stated is None else stated, stated is not None, contact, pose[:3, 3],
                 self.toucher.curvature(nodes, pressed.forces), FLAT if give is None else give, mu,
                 LOST * pressed.along, force, lever, at_rest, touch.depth, radius, pressed.power,
@@ -215,7 +215,6 @@ class History:
                 np.array((before.rolled_first, before.rolled_second, before.rolled)), one.before.springs,
                 one.before.springs_relaxed, one.before.stiffness, *self.series, dt)  # fmt: skip
             changed |= scaled(touch, grown * by, grown * doubt)
-            besides = aside
             if self.toucher.layer.tissue.skin is not None:
                 pressing = math.sqrt(wrench[:3] @ wrench[:3])
                 besides += RUBBED * pressing + PILED * float(rubs[:3] @ rubs[:3]) / pressing

@@ -134,6 +134,15 @@ class LocalContact:
                 raise InvalidInput(f"the local model's {name} is {value}; it must be from {least:g} to {most:g}.")
 
     @property
+    def renderable(self) -> bool:
+        """Whether the model can be rendered; `check` says why not."""
+        try:
+            self.check()
+        except InvalidInput:
+            return False
+        return True
+
+    @property
     def push(self) -> Wrench:
         """Wrench that the tool presses with, friction left out, (6,) [N, N m]."""
         return self.wrench if self.grip is None else self.wrench - self.grip.wrench

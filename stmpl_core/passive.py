@@ -64,9 +64,7 @@ class PassiveContact:
 
         One that cannot be rendered (`model.check()` says why) is counted in `refused`, and the last one goes on.
         """
-        try:
-            model.check()
-        except InvalidInput:
+        if not model.renderable:
             self.refused += 1
             return
         self._model, self._age = model, 0.0

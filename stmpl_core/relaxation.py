@@ -86,9 +86,7 @@ def fading(tissue: Tissue, thickness: float) -> np.ndarray:
     radii = np.geomspace(*RADII)
     if tissue.single or not tissue.relaxes:
         return np.stack([np.log(radii), np.ones(len(radii))])
-    each = _relaxations(tissue, thickness)
-    fades = [sum(share * sum(one.shares) for one, share in zip(each, _shares(tissue, thickness, radius), strict=True)
-                 if one) for radius in (*WIDER * radii, MIX_RADIUS)]  # fmt: skip
+    fades = [_fades(tissue, thickness, radius) for radius in (*WIDER * radii, MIX_RADIUS)]
     return np.stack([np.log(radii), np.array(fades[:-1]) / max(fades[-1], 1e-300)])
 
 
@@ -99,31 +97,41 @@ def _relaxations(tissue: Tissue, thickness: float) -> list[Prony | None]:
     return [tissue.relaxation, *(ply.relaxation for ply in there), *skin]
 
 
-def _shares(tissue: Tissue, thickness: float, radius: float = MIX_RADIUS) -> list[float]:
-    """Share of the force that each material bears, from the skin inwards, and last of the skin if there is one.
+def _fading_moduli(tissue: Tissue, thickness: float) -> np.ndarray:
+    """Share of each material's modulus that fades in the end, in the order of `_relaxations`."""
+    return np.array([sum(one.shares) if one else 0.0 for one in _relaxations(tissue, thickness)])
+
+
+def _log_force(tissue: Tissue, thickness: float, radius: float, factors: np.ndarray) -> float:
+    """Logarithm of the force under a Gaussian load of a radius [m], with factors on the moduli, as `_relaxations`."""
+    k, skin = np.geomspace(0.02, 8, 200) / radius, tissue.skin
+    weight = np.exp(-0.25 * (k * radius) ** 2) * k * k
+    changed = [(h, modulus * by, nu) for (h, modulus, nu), by in zip(plies(tissue, thickness), factors, strict=False)]
+    sheet = skin and Membrane(skin.youngs_modulus * factors[-1], skin.thickness, skin.tension, skin.poisson_ratio)
+    return -float(np.log(weight @ response(changed, sheet, k)[0]))
+
+
+def _fades(tissue: Tissue, thickness: float, radius: float) -> float:
+    """Share of the force under such a load that is gone once every material has relaxed [-]."""
+    left = np.maximum(1 - _fading_moduli(tissue, thickness), LEAST_LEFT)
+    whole = _log_force(tissue, thickness, radius, np.ones(len(left)))
+    return 1 - float(np.exp(_log_force(tissue, thickness, radius, left) - whole))
+
+
+def _shares(tissue: Tissue, thickness: float) -> list[float]:
+    """Share of the force that each material bears, in the order of `_relaxations`.
 
     That is d ln F / d ln E, times a factor by which all together fade as much as the force on relaxed moduli falls: a
     material that softens much bears less and less of it.
     """
-    stack, skin = plies(tissue, thickness), tissue.skin
     if tissue.single:
         return [1.0]
-    k = np.geomspace(0.02, 8, 200) / radius
-    weight = np.exp(-0.25 * (k * radius) ** 2) * k * k
-
-    def log_force(factors: np.ndarray) -> float:
-        """Logarithm of the force, with factors on the moduli."""
-        changed = [(h, modulus * by, nu) for (h, modulus, nu), by in zip(stack, factors, strict=False)]
-        sheet = skin and Membrane(skin.youngs_modulus * factors[-1], skin.thickness, skin.tension, skin.poisson_ratio)
-        return -float(np.log(weight @ response(changed, sheet, k)[0]))
-
-    many = len(stack) + (skin is not None)
-    steps = np.exp(LOG_STEP * np.eye(many))
-    shares = [(log_force(step) - log_force(1 / step)) / (2 * LOG_STEP) for step in steps]
-    fade = np.array([sum(one.shares) if one else 0.0 for one in _relaxations(tissue, thickness)])
-    whole = float(shares @ fade)
-    left = np.exp(log_force(np.maximum(1 - fade, LEAST_LEFT)) - log_force(np.ones(many)))
-    return [share * float(1 - left) / whole for share in shares] if whole > 0 else shares
+    fade = _fading_moduli(tissue, thickness)
+    steps = np.exp(LOG_STEP * np.eye(len(fade)))
+    up, down = ([_log_force(tissue, thickness, MIX_RADIUS, one) for one in some] for some in (steps, 1 / steps))
+    shares = np.subtract(up, down) / (2 * LOG_STEP)
+    first_order = float(shares @ fade)
+    return list(shares * (_fades(tissue, thickness, MIX_RADIUS) / first_order) if first_order > 0 else shares)
 
 
 @numba.njit(cache=True, error_model="numpy")

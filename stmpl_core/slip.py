@@ -93,7 +93,7 @@ def _go(way, stiffness, cap, start, left, over, springs, force, slides):
             square += one * one
         most, size = LIMIT[j] * cap, np.sqrt(square)
         slides[j] = size >= most
-        slip = _slipped(springs[j], left[j], stiffness, over, most, size) if size > most else 0.0
+        slip = _slipped(springs[j], left[j], stiffness, over, most) if size > most else 0.0
         for x in range(3):
             one = over * springs[j, x] - left[j, x]
             if slip > 0:
@@ -103,15 +103,15 @@ def _go(way, stiffness, cap, start, left, over, springs, force, slides):
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _slipped(spring, left, stiffness, over, most, size):
-    """How far a spring slides over its force [m/N], so that this falls from `size` to `most` [N].
+def _slipped(spring, left, stiffness, over, most):
+    """How far a spring slides over its force [m/N], so that this falls to `most` [N].
 
     A force f_x that would be without slip is f_x / (1 + slip k_x) with it. What is solved for is where one over its
     size is one over `most`, by Newton's method, as of trust regions: in one step where the stiffnesses are alike.
     """
-    slip, now = 0.0, size
     if not most > 0:
         return np.inf
+    slip = 0.0
     for _ in range(SLIDES):
         square = slope = 0.0
         for x in range(3):
@@ -317,7 +317,7 @@ def rub(wrench, stated, by_force, contact, origin, bend, give, mu, along_itself,
     lost = (1 - before_slid) * before_elastic / elastic
     before = np.array([springs[:, x].sum() for x in range(3)])
     arm, grown, cap, share, stored = contact[0] - origin, 1.0, 0.0, 0.0, 0.0
-    turns, arm_of_turn = way[2] / lever, lever
+    turned_by, arm_of_turn = way[2] / lever, lever
     carried, after, new, kept = np.zeros(3), stiffness.copy(), springs.copy(), relaxed.copy()
     for _ in range(MOST_PASSES):
         if by_force:
@@ -328,7 +328,7 @@ def rub(wrench, stated, by_force, contact, origin, bend, give, mu, along_itself,
         stiffer, cap = ploughing(depth, radius, grown * force, along, bare, mu)
         plain = mu * grown * force / cap  # what turns in place has nothing before it that friction raises
         arm_of_turn = lever * (plain + (1 - plain) * PLOUGHED[1] / (PLOUGHED[1] + PLOUGHED[2] * mu))
-        way[2] = turns * arm_of_turn
+        way[2] = turned_by * arm_of_turn
         if by_force:
             push = carries * (wrench + wrench_at(size * turned, arm))
             wanted = in_plane(stated - push, leaned(contact, turned), origin, arm_of_turn)
