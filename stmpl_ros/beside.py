@@ -7,7 +7,8 @@ import os
 import signal
 import threading
 from collections.abc import Callable
-from concurrent.futures import Future, ProcessPoolExecutor
+from concurrent.futures import BrokenExecutor, Future, ProcessPoolExecutor
+from contextlib import suppress
 from multiprocessing.context import SpawnContext, SpawnProcess
 from typing import Any
 
@@ -35,9 +36,12 @@ class Beside[T]:
 
     def close(self) -> None:
         """Ends the process, whether the job is done or not."""
-        if self._pid.done() and not self.result.done():
-            os.kill(self._pid.result(), signal.SIGTERM)
-        self._pool.shutdown(wait=False, cancel_futures=True)
+        started = self._pid.done()
+        if started and not (self.result.done() and isinstance(self.result.exception(), BrokenExecutor)):
+            with suppress(ProcessLookupError):  # closed before
+                os.kill(self._pid.result(), signal.SIGTERM)
+        # waits for what ends at once: a pool's thread that still ends trips over an interpreter that ends too
+        self._pool.shutdown(wait=started, cancel_futures=True)
 
 
 class Builders:
