@@ -27,7 +27,7 @@ from stmpl_core.response import (
     spread_sinking,
 )
 from stmpl_core.soundness import Soundness
-from stmpl_core.thinning import SPACINGS, STACK_SPACINGS, STACK_ZONES, ZONES, Asked, Thinning
+from stmpl_core.thinning import Asked, Thinning
 
 if TYPE_CHECKING:
     from stmpl_core.bend import Bend
@@ -90,12 +90,11 @@ class Surroundings:
     """
 
     def __init__(self, layer: SoftLayer) -> None:
-        thinned = (STACK_ZONES, STACK_SPACINGS) if layer.stacked else (ZONES, SPACINGS)
         if layer.stacked:  # to a stack, and to bone, belongs one flat response
             layer = SoftLayer(layer.vertices, layer.faces, float(np.median(layer.thickness)), tissue=layer.tissue)
         self.frames, self.thickness = _frames(layer.normals), layer.thickness
         points = np.ascontiguousarray(layer.vertices)
-        self._thinning = Thinning(layer, self.frames, REACH, *thinned)
+        self._thinning = Thinning(layer, self.frames, REACH)
         self.sound = Soundness(layer)
         self._frames = self.frames.astype(np.float32)
         self._sites = _sites(points, layer.normals, layer.thickness, layer.vertex_areas)

@@ -11,8 +11,8 @@ import numpy as np
 from stmpl_core.layer import SoftLayer
 from stmpl_core.neighbours import along_edges, neighbours
 
-ZONES = (2.5, 5.0)  # distances from the load, over t, at which the first and the second thinning begin
-SPACINGS = (0.6, 1.5)  # least distances between the vertices that are asked there, over t
+ZONES, SPACINGS = (2.5,), (0.6,)  # distance from the load at which it begins; least between those asked there; over t
+FOLDS, STACK_FOLDS = 5.0, 2.5  # distances through the air from which folds of the skin do not matter, over t
 CORNERS = 12  # number of asked vertices from which one between is filled in
 STACK_ZONES, STACK_SPACINGS = (0.4, 0.9, 2.5), (0.1, 0.2, 0.4)  # of a stack, which is thicker beside what presses
 LARGEST = 2.5  # sum of the weights' sizes, from which a vertex is rather asked itself: it would be extrapolated
@@ -56,15 +56,15 @@ class Thinning:
         layer: soft layer at rest.
         frames: two tangents and the normal of each vertex, (V, 3, 3).
         reach: distance to which a load is felt, over t.
-        zones: distances from the load, over t, at which each thinning begins.
-        spacings: least distances between the vertices that are asked there, over t.
 
     Attributes:
         folded: flag of a skin that comes near itself through the air, as fingers do.
     """
 
-    def __init__(self, layer: SoftLayer, frames: np.ndarray, reach: float, zones: tuple[float, ...] = ZONES,
-                 spacings: tuple[float, ...] = SPACINGS) -> None:  # fmt: skip
+    def __init__(self, layer: SoftLayer, frames: np.ndarray, reach: float) -> None:
+        zones, spacings, folds = (
+            (STACK_ZONES, STACK_SPACINGS, STACK_FOLDS) if layer.stacked else (ZONES, SPACINGS, FOLDS)
+        )
         points, normals, thickness = np.ascontiguousarray(layer.vertices), layer.normals, layer.thickness
         self.start, self.index = neighbours(points, normals, thickness, layer.faces, np.array([*zones, reach]))
         self._first, self._beside = along_edges(layer.faces, len(points))
@@ -88,7 +88,7 @@ class Thinning:
             self._corners[zone, some], self._weights[zone, some] = corners[some], weights[good]
 
         some = np.flatnonzero(self._stands[-1])
-        self.folded = _folded(self.start, self.index, some, points, normals, thickness, zones[-1])
+        self.folded = _folded(self.start, self.index, some, points, normals, thickness, folds)
 
     def groups(self, vertices: np.ndarray) -> np.ndarray:
         """Numbers of groups of vertices (N,), none of which feels another, (N,): all 0 where the skin has no folds."""

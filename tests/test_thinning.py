@@ -58,16 +58,13 @@ def test_near_the_load_all_are_asked_and_far_from_it_few(layer: SoftLayer, asked
     loaded = layer.vertices[np.flatnonzero(pressed(layer).values)]
     apart = np.linalg.norm(layer.vertices[asked.between][:, None] - loaded, axis=2).min(axis=1)
     assert apart.min() >= ZONES[0] * T
-    assert len(asked.vertices) < 0.4 * (len(asked.vertices) + len(asked.between))
+    assert len(asked.vertices) < 0.45 * (len(asked.vertices) + len(asked.between))
 
 
-def test_on_a_skin_as_coarse_as_the_thinning_all_are_asked_in_the_middle() -> None:
+def test_on_a_skin_as_coarse_as_the_thinning_all_are_asked() -> None:
     coarse = arm(8e-3)
-    asked = Surroundings.of(coarse).asked(np.flatnonzero(pressed(coarse, 12e-3).values))
-    loaded = coarse.vertices[np.flatnonzero(pressed(coarse, 12e-3).values)]
     assert SPACINGS[0] * T < 5e-3
-    apart = np.linalg.norm(coarse.vertices[asked.between][:, None] - loaded, axis=2).min(axis=1)
-    assert apart.min() >= ZONES[1] * T
+    assert not len(Surroundings.of(coarse).asked(np.flatnonzero(pressed(coarse, 12e-3).values)).between)
 
 
 def test_what_is_linear_in_space_is_filled_in_as_it_is(layer: SoftLayer, asked: Asked) -> None:
@@ -87,7 +84,7 @@ def test_each_stands_for_as_many_as_there_are(asked: Asked) -> None:
     assert asked.stand_for.sum() == pytest.approx(len(asked.vertices) + len(asked.between), rel=1e-5)
 
 
-@pytest.mark.parametrize("t", [3e-3, 7e-3, 12e-3])
+@pytest.mark.parametrize("t", [6e-3, 7e-3, 12e-3])
 @pytest.mark.parametrize("method", [Linear, MomentNet])
 def test_answers_are_those_of_asking_everybody(method: type, t: float, monkeypatch: pytest.MonkeyPatch) -> None:
     layer = arm(t=t)
