@@ -345,7 +345,7 @@ class LinksConfig(BaseModel):
     )
     relaxing: bool = Field(default=False, description="stress that fades, as in skin that was stretched and held")
     silence: float = Field(
-        default=0.25, gt=0, description="time without a pose after which every wrench is set to nothing [s]"
+        default=0.25, ge=0.01, description="time without a pose after which every wrench is set to nothing [s]"
     )
 
 

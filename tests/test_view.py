@@ -60,6 +60,12 @@ def opened(title: str = "test"):
         page.close()
 
 
+@pytest.mark.parametrize("host", ["300.1.1.1", "192.0.2.1"], ids=["no address", "another machine's"])
+def test_an_address_that_is_none_of_this_machine_is_refused(host):
+    with pytest.raises(InvalidInput, match="nothing can be served"):
+        Page(host, 0, "test")
+
+
 @pytest.fixture(scope="module")
 def layer():
     return limb(5e-3)

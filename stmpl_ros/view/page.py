@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import html
+import socket
 from collections.abc import Sequence
 from time import sleep
 
@@ -13,6 +14,7 @@ from viser import uplot
 from bags.wire import quaternion_from
 from stmpl_core.arrays import Transform
 from stmpl_core.contact import Contact
+from stmpl_core.errors import InvalidInput
 from stmpl_core.layer import SoftLayer
 from stmpl_core.posing import posed
 from stmpl_core.tool import Tool
@@ -38,9 +40,18 @@ class Page:
     Args:
         host, port: address and port to serve on; the next free port is taken.
         title: title of the page, a few words.
+
+    Raises:
+        InvalidInput: an address that is none of this machine's.
     """
 
     def __init__(self, host: str, port: int, title: str) -> None:
+        try:
+            family, kind, _, _, place = socket.getaddrinfo(host, 0, type=socket.SOCK_STREAM)[0]
+            with socket.socket(family, kind) as trial:
+                trial.bind(place)
+        except OSError as error:  # the server would wait for it without a word
+            raise InvalidInput(f"nothing can be served on {host!r}: {error.strerror}. Try 127.0.0.1.") from None
         self.server = viser.ViserServer(host=host, port=port, label="stmpl", verbose=False)
         self.layer: SoftLayer | None = None
         self.snapshot: Snapshot | None = None
