@@ -232,7 +232,7 @@ def approached(held, gone, guess):
             left[x, n] -= image[x, n]
             way[x, n] = per[x, n] * left[x, n]
             size += left[x, n] * way[x, n]
-    enough = np.float32(SETTLED**2) * whole
+    enough = np.float32(SETTLED**2) * (whole if whole > ZERO else size)  # nodes may have gone nowhere at all
     for _ in range(MOST_STEPS):
         if size <= enough:
             break

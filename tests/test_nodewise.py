@@ -39,6 +39,14 @@ def test_nodes_do_to_each_other_what_the_general_response_says(nodes: Nodes) -> 
     assert found.dtype == np.float32
 
 
+@pytest.mark.parametrize("count", [1, 40])
+def test_nodes_that_have_gone_nowhere_need_no_force_whatever_was_guessed(nodes: Nodes, count: int) -> None:
+    some, green = nodes.some(np.arange(count)), Green.of(LIMB)
+    guess = 1e-9 * some.inward
+    found = green.stuck(some, np.zeros(count, np.int64), np.zeros((count, 3)), guess)
+    assert np.abs(found).max() < 1e-4 * np.abs(guess).max()
+
+
 def test_forces_at_nodes_move_the_skin_as_the_general_response_says(nodes: Nodes) -> None:
     green, rng = Green.of(LIMB), np.random.default_rng(1)
     forces = rng.normal(size=(len(nodes.area), 3)) * nodes.area[:, None]
