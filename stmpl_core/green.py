@@ -47,6 +47,7 @@ RIDGE = 1e-6  # of the matrix that sticks, over its largest number: two nodes in
 LEAST_KAPPA, LEAST_PULL = 0.05, 0.02  # kappa and pull that are none, in logarithms
 NEXT = np.uint64(1)  # no index that may count from the end
 ONE_WAY = 0.3  # least cosine between a tool's way and the skin's inward normal at a node
+TAKEN_BACK = 0.5  # most that the limb takes back of what a node does to itself in the flat response
 
 
 AS_AT_REST = np.empty((0, 3, 3))  # turns of vertices that did not turn
@@ -581,7 +582,33 @@ def _matrix(points, inward, area, corners, shares, group, unit, soft, banked, sk
                 value = _softly(banked, 0.5 * (soft[i] + soft[j]), k, f - k, int(h), h - int(h))
                 both += _share(facing) * value / np.sqrt(square + mean * (ROUND * SPREAD) ** 2)
             out[i, j] = out[j, i] = both
+    _temper(out, wide)
     return out, wide
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _temper(matrix, wide):
+    """Lets a limb's part take back no more than TAKEN_BACK of what a node does to itself in the flat response.
+
+    Beside an open border, which is held, its coarse mesh says more; then no forces are a solution. Elsewhere it is a
+    tenth.
+    """
+    count, kept = len(wide), np.ones(len(wide))
+    for i in range(count):
+        most = TAKEN_BACK * (matrix[i, i] - wide[i, i])
+        if -wide[i, i] > most:
+            kept[i] = np.sqrt(max(most, 0.0) / -wide[i, i])
+    if kept.min() == 1.0:
+        return
+    for i in range(count):
+        for j in range(i + 1):
+            share = kept[i] * kept[j]
+            less = 0.5 * (share - 1) * (wide[i, j] + wide[j, i])
+            matrix[i, j] += less
+            wide[i, j] *= share
+            if i != j:
+                matrix[j, i] += less
+                wide[j, i] *= share
 
 
 @numba.njit(cache=True, error_model="numpy", inline="always")

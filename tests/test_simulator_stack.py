@@ -8,9 +8,11 @@ from scipy.spatial import cKDTree
 
 from fem_tools import IndenterFem, PatchFem, Press
 from stmpl_core import Load, Membrane, Ply, Simulator, SoftLayer, Tissue
+from stmpl_core.body import Body
 from stmpl_core.bones import Bone, to_bone
 from stmpl_core.contact_net import ContactNet
 from stmpl_core.errors import InvalidInput
+from stmpl_core.living import living
 from stmpl_core.methods import LimbLinear, MomentNet
 from stmpl_core.moments import Surroundings
 from stmpl_core.networks import STACK_NODE
@@ -39,6 +41,19 @@ def pressed(depth: float, wrench: np.ndarray | None = None):
 
 def push(force: float) -> np.ndarray:
     return np.array([force, 0, 0, 0, 0, 0])
+
+
+def test_at_the_open_border_force_rises_with_depth_and_its_bound_is_finite():
+    """There the limb's coarse mesh takes back more than the flat response gives, and no forces were a solution."""
+    layer, vertex = living(Body.anny(), "left_calf", edge_length=6e-3), 2964
+    simulator, pose = Simulator(layer, MomentNet()), np.eye(4)
+    touches = []
+    for depth in np.arange(6e-3, 10.1e-3, 2.5e-4):
+        pose[:3, 3] = layer.vertices[vertex] + (0.02 - depth) * layer.normals[vertex]
+        touches += simulator.touch([contact_of(ball(0.02), pose.copy())])
+    forces = np.array([touch.force for touch in touches])
+    assert (forces[1:] > 0.98 * forces[:-1]).all() and 2 * forces[0] < forces[-1] < 20
+    assert all(touch.force_bound < 15 * touch.force and not touch.trust.ok for touch in touches)
 
 
 def test_a_ball_presses_and_moves_as_finite_elements_say_and_no_further_than_the_bounds(simulator):

@@ -12,6 +12,7 @@ from stmpl_core.batch import Batch, BatchTouches
 from stmpl_core.body import Body
 from stmpl_core.bones import Bone, to_bone
 from stmpl_core.errors import InvalidInput
+from stmpl_core.living import living
 from stmpl_core.methods import MomentNet, Winkler
 from stmpl_core.skin import Skin
 from tests.scenes import LENGTH, RADIUS, at, ball, band, box, brush, capsule, limb, punch, tool, v_block
@@ -142,6 +143,14 @@ def test_touches_of_layers_are_those_of_numba(layered: Skin, one: Tool) -> None:
     found, expected = made(layered, [one], 24).touch(poses), Batch(layered, [one], 24).touch(poses)
     assert (expected.statuses == "pressed by pose").sum() > 12 and expected.in_range.any()
     same(found, expected, 0.6)
+
+
+def test_at_the_open_border_of_layers_the_limb_takes_back_as_little() -> None:
+    skin, one = Skin.of(living(Body.anny(), "left_calf", edge_length=6e-3), MomentNet()), ball(0.02)
+    poses, vertex = np.tile(np.eye(4), (8, 1, 1, 1)), 2964
+    for pose, depth in zip(poses[:, 0], np.linspace(6e-3, 9.5e-3, 8), strict=True):
+        pose[:3, 3] = skin.layer.vertices[vertex] + (0.02 - depth) * skin.layer.normals[vertex]
+    same(made(skin, [one], 8).touch(poses), Batch(skin, [one], 8).touch(poses))
 
 
 def test_tools_on_layers_feel_each_other_where_they_are_near(layered: Skin) -> None:

@@ -123,7 +123,7 @@ SCRATCH: dict[str, tuple[Any, str]] = {
     "most_area": (real, "C"), "sinking": (real, "SQ"), "soft": (real, "SQ"), "slot": (wp.int32, "SK"),
     "met": (wp.int32, "SK"), "meets": (wp.int32, "S"), "slots": (wp.int32, "SQ9"), "weights": (real, "SQ9"),
     "parts": (real, "SQ9"), "around_node": (wp.int32, "SQ"), "rows": (real, "SQK"),
-    "wide_part": (real, "SQQ"), "given_way": (real, "C"),
+    "wide_part": (real, "SQQ"), "kept": (real, "SQ"), "given_way": (real, "C"),
     "matrix": (real, "SNN"), "force": (real, "SN"), "gap": (real, "SN"), "move": (real, "SN"), "along": (real, "SN"),
     "found_power": (real, "SN"), "left": (real, "SN"), "before": (real, "S"), "restart": (wp.int32, "S"),
     "first_square": (real, "S"), "done": (wp.int32, "S"), "group": (wp.int32, "C"),

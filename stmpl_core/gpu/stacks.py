@@ -22,6 +22,7 @@ DEEP_GIVES, ROUND_GIVES, ROUNDEST = (
 )
 SPREAD, LAST_AREA = wp.constant(wp.float64(SPREAD_OF_AREA)), wp.constant(wp.float64(green.AREAS - 1.001))
 MORE_AREAS = wp.constant(wp.float64(green.AREAS - 1))
+TAKEN_BACK = wp.constant(wp.float64(green.TAKEN_BACK))
 ROUND_SQUARE = wp.constant(wp.float64((green.ROUND * SPREAD_OF_AREA) ** 2))
 THICKNESSES, STRAINS = wp.constant(green.COLUMNS), wp.constant(green.STRAINS)
 STACK_FADE = wp.constant(wp.float64(contact_net.STACK_FADE))
@@ -217,6 +218,31 @@ def respond(lanes: wp.int32, many: wp.int32, skins: Skins, scratch: Scratch):
                 value = value / wp.sqrt(square + mean * ROUND_SQUARE)
         scratch.wide_part[s, i, j] = both
         scratch.matrix[s, i, j] = value + both
+
+
+@wp.kernel
+def find_kept(lanes: wp.int32, scratch: Scratch):
+    """Root of the share of the limb's part that each node keeps: see green._temper."""
+    s, lane = wp.tid()
+    for i in range(lane, scratch.nodes[s], lanes):
+        wide = scratch.wide_part[s, i, i]
+        most, kept = TAKEN_BACK * (scratch.matrix[s, i, i] - wide), real(1.0)
+        if -wide > most:
+            kept = wp.sqrt(wp.max(most, real(0.0)) / -wide)
+        scratch.kept[s, i] = kept
+
+
+@wp.kernel
+def temper(lanes: wp.int32, scratch: Scratch):
+    """Leaves the limb's part at that: see green._temper."""
+    s, lane = wp.tid()
+    count = scratch.nodes[s]
+    for n in range(lane, count * count, lanes):
+        i, j = n // count, n % count
+        share = scratch.kept[s, i] * scratch.kept[s, j]
+        if share < real(1.0):
+            scratch.matrix[s, i, j] = scratch.matrix[s, i, j] + (share - real(1.0)) * scratch.wide_part[s, i, j]
+            scratch.wide_part[s, i, j] = share * scratch.wide_part[s, i, j]
 
 
 @wp.kernel

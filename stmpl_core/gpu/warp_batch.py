@@ -276,6 +276,9 @@ class WarpBatch:
             self._run(stacks.meet, scenes, many, skins, scratch)
             self._run(stacks.give_way, shared, lanes, many, skins, scratch)
         self._run(stacks.respond if self._stacked else hold.respond, shared, lanes, many, skins, scratch)
+        if self._stacked:
+            self._run(stacks.find_kept, shared, lanes, scratch)
+            self._run(stacks.temper, shared, lanes, scratch)
         self._run(hold.guess, scenes, many, skins, scratch)
 
         def turn() -> None:
