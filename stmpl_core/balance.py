@@ -17,6 +17,7 @@ KEPT = 1.5  # work beyond what elastic skin could hold that is forgotten: what w
 UNSURE = 1e-3  # of the largest force so far times the depth: energy that a contact may lack, as no sum is exact
 POWERS = (1.0, 12.0)  # range of the power of the depth with which a force grows between two depths
 MIN_SPREAD = 1e-3  # logarithm of two depths' ratio, from which their forces say that power
+MUCH = 0.1  # of the largest force so far: what is taken off a force, beyond which it is flagged
 WEAKEST = 1e-12  # factor on a wrench that has nothing left to give: by 0 nobody could divide to find how it is pressed
 
 
@@ -85,7 +86,8 @@ def balanced(asked: Sequence[Asked], laws: Sequence[Law], shares: np.ndarray) ->
         work, doubt, given = work_of(
             one.twist, before.wrench, memory.wrench, before.contact, memory.contact, memory.pose[:3, 3],
             before.scalars.pressing > 0, memory.scalars.pressing > 0, _factor(before), _factor(memory), before.relaxed,
-            memory.relaxed, shares, before.scalars.depth, memory.scalars.depth, memory.scalars.power)  # fmt: skip
+            memory.relaxed, shares, before.scalars.depth, memory.scalars.depth, memory.scalars.power,
+            memory.scalars.radius)  # fmt: skip
         work += before.scalars.work
         work = max(work, law.stored if new else min(law.stored, work + doubt))
         works.append(work)
@@ -103,9 +105,10 @@ def balanced(asked: Sequence[Asked], laws: Sequence[Law], shares: np.ndarray) ->
                     passive = -at_rest / given
                 passive = max(passive, WEAKEST)
                 work -= (1 - passive) * given
-                touch = _weakened(touch, passive)
+                touch = _weakened(touch, passive, MUCH * memory.scalars.largest)
                 memory = memory._replace(wrench=touch.wrench)
-        work = min(work if law.stored > 0 else max(work, 0.0), KEPT * law.whole)
+        # A tool that left the skin sideways, in the air for a moment, has what it put in: it gave nothing back.
+        work = min(work, KEPT * law.whole) if law.stored > 0 else max(work, 0.0)
         memories[touch.name] = memory._replace(
             scalars=memory.scalars._replace(work=work, passive=passive), pose=memory.pose.copy(),
             wrench=memory.wrench.copy(), contact=memory.contact.copy(), imprint=memory.imprint.copy())  # fmt: skip
@@ -121,13 +124,13 @@ def _factor(memory: Memory) -> float:
 
 @numba.njit(cache=True, error_model="numpy")
 def work_of(twist, before, after, old, new, origin, presses_first, presses_last, factor_first, factor_last,
-            relaxed_first, relaxed_last, shares, depth_first, depth_last, power):  # fmt: skip
+            relaxed_first, relaxed_last, shares, depth_first, depth_last, power, radius):  # fmt: skip
     """Work of a wrench over a tool's way in a step; how far it may be from that; and the last wrench's part of it [J].
 
     The wrench goes straight from one to the other, but for the force of elastic skin along the normal, which grows with
     a power m of the depth: F_1 d_1 - F_0 d_0 over (m + 1) (d_1 - d_0) in the mean. That is less than (F_0 + F_1) / 2,
     and the truth may be as far off on either side. A tool that comes or leaves in the step meets skin on as much of its
-    way as it was deep.
+    way as it was deep. One that came along the skin from further than its contact is wide may have done any work.
 
     Args:
         twist: way of the tool, (6,) [m, rad].
@@ -140,15 +143,17 @@ def work_of(twist, before, after, old, new, origin, presses_first, presses_last,
         shares: shares of the force that relax, (P,) [-].
         depth_first, depth_last: depths there [m].
         power: power of the depth with which it grows, where the depths do not say it [-].
+        radius: radius of the contact there [m].
     """
     first = _elastic(before, old, factor_first, relaxed_first, shares) if presses_first else 0.0
     last = _elastic(after, new, factor_last, relaxed_last, shares) if presses_last else 0.0
     contact, deep = (new, depth_last) if last > 0 else (old, depth_first)
-    go, share, less = 0.0, 1.0, 0.0
+    go, square, share, less = 0.0, 0.0, 1.0, 0.0
     for x in range(3):
         y, z = (x + 1) % 3, (x + 2) % 3
         turned = twist[3 + y] * (contact[0, z] - origin[z]) - twist[3 + z] * (contact[0, y] - origin[y])
         go += contact[1, x] * (twist[x] + turned)
+        square += (twist[x] + turned) ** 2
     if first > 0 and last > 0:
         spread = np.log(depth_last / depth_first)
         if abs(spread) > MIN_SPREAD:
@@ -161,7 +166,8 @@ def work_of(twist, before, after, old, new, origin, presses_first, presses_last,
     for x in range(6):
         given += 0.5 * share * before[x] * twist[x]
         taken += 0.5 * share * after[x] * twist[x]
-    return given + taken - share * less * go, share * less * abs(go), taken
+    doubt = share * less * abs(go) if first > 0 or last <= 0 or square - go * go <= radius * radius else np.inf
+    return given + taken - share * less * go, doubt, taken
 
 
 @numba.njit(cache=True, error_model="numpy")
@@ -185,9 +191,15 @@ def _less(first, last, power):
     return most * (0.5 * (1 + ratio) - (1 - ratio * shallow) / ((power + 1) * (1 - shallow)))
 
 
-def _weakened(touch: Touch, by: float) -> Touch:
-    slip = touch.slip and touch.slip._replace(wrench=touch.slip.wrench * by, lean=touch.slip.lean * by)
-    return touch.with_(**scaled(touch, by, 0.0), slip=slip, passive=by)
+def _weakened(touch: Touch, by: float, most: float) -> Touch:
+    """The touch with a factor on its forces; what is taken off is in the bound, and flagged beyond so many N."""
+    slip, less, trust = touch.slip, (1 - by) * touch.force, touch.trust
+    if slip is not None:
+        slip = slip._replace(wrench=slip.wrench * by, lean=slip.lean * by)
+    if less > most:
+        why = f"{touch.name} came to where it is with less work than it could give back: weakened to {by:.0%}"
+        trust = trust.also(why, in_range=False)
+    return touch.with_(**scaled(touch, by, less), slip=slip, passive=by, trust=trust)
 
 
 def scaled(touch: Touch, by: float, doubt: float) -> dict[str, Any]:

@@ -12,7 +12,7 @@ from stmpl_core.living import living
 from stmpl_core.methods import MomentNet
 from stmpl_core.regions import HELD_SKIN
 from stmpl_sim.site import Site
-from tests.scenes import ball
+from tests.scenes import at, ball, plate
 
 BALL, RADIUS, DEEPEST = ball(0.02), 0.02, 9e-3  # m
 KEPT = 0.005  # of what was put in, that a closed path may give back more
@@ -152,6 +152,23 @@ def test_pressing_as_it_slides_and_lifting_as_it_sticks_gives_no_energy(elastic:
     touches = led(elastic, poses_of(frame, between(rows, 2e-4)), 1e-3)
     assert max(touch.slip.share for touch in touches if touch.slip) == 1
     assert gained(touches) < KEPT and min(touch.passive for touch in touches[5:-5]) == 1, "the law itself gives none"
+
+
+@pytest.mark.parametrize("steps", [1, 20], ids=["for one pose", "slowly"])
+def test_a_tool_that_leaves_the_skin_sideways_and_comes_back_presses_as_before_or_says_so(steps: int) -> None:
+    """One pose 60 mm aside, of a tracker, was a tool that had put nothing in: it pressed with 1 % for ever."""
+    sim, state, touches = Simulator(plate(0.06).with_(tissue=Tissue(2e4, 0.4)), MomentNet()), State(), []
+    aside = np.concatenate([np.linspace(0, 0.06, steps + 1)[1:], np.linspace(0.06, 0, steps + 1)[1:]])
+    for way, depth in [*((0.0, depth) for depth in np.linspace(0, 3e-3, 20)), *((way, 3e-3) for way in aside)]:
+        (touch,), state = sim.touch([Contact(BALL, at(way, 0, RADIUS - depth))], state, 0.01)
+        touches.append(touch)
+    held, back = touches[19], touches[-1]
+    assert touches[19 + steps].status == "apart" and held.trust.ok and held.force > 1
+    assert abs(back.force - held.force) <= back.force_bound
+    if steps == 1:
+        assert back.force == pytest.approx(held.force) and back.trust.ok and back.force_bound < 0.2 * back.force
+    else:
+        assert not back.trust.ok and "less work" in back.trust.why
 
 
 def pressed_and_lifted(deep: float, speed: float, lost: float, rng: np.random.Generator) -> tuple[np.ndarray, ...]:
