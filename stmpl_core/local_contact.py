@@ -20,6 +20,7 @@ from stmpl_core.contact import MOST, Contact, rigid
 from stmpl_core.errors import InvalidInput
 from stmpl_core.footing import in_plane, leaned, patch_of, twist_between
 from stmpl_core.history import History
+from stmpl_core.layer import MAX_THICKNESS
 from stmpl_core.state import Memory, State
 from stmpl_core.tangent import Tangent, tangents
 from stmpl_core.touch import APART, Pressed, Touch
@@ -185,7 +186,7 @@ class LocalContact:
             return Rendered(np.zeros(6), inside)
         elastic, m = size + self.eased, self.power
         along = float(normal @ stiffness[:3, :3] @ normal)
-        depth = m * elastic / along if along > 0 else WIDEST
+        depth = min(m * elastic / along, MAX_THICKNESS) if along > 0 else WIDEST
         most = min(max(1.0, DEEPER / depth), STEEPEST)
         base = 1 + min(float(normal @ stiffness[:3] @ twist) / (m * elastic), most)
         free = (self.eased / elastic) ** (1 / m)  # base at which the tool lets go
@@ -245,7 +246,7 @@ def _model(toucher: Toucher, touch: Touch, tangent: Tangent | None, memory: Memo
                             touch.status, touch.trust)  # fmt: skip
     push = touch.wrench if touch.slip is None else touch.wrench - touch.slip.wrench
     normal, nodes = push[:3] / touch.force, pressed.squeeze.nodes
-    stiffness, drawn, eased = tangent.stiffness, pressed.factor, 0.0
+    stiffness, drawn, eased, along = tangent.stiffness, pressed.factor, 0.0, np.append(normal, np.zeros(3))
     whole = float(pressed.forces.sum())
     contact = patch_of(nodes.points, nodes.area, nodes.thickness, nodes.depths, pressed.forces, normal)
     if memory is not None and memory.scalars.pressing > 0:  # W = W_e - lambda A, and A stays
@@ -254,11 +255,12 @@ def _model(toucher: Toucher, touch: Touch, tangent: Tangent | None, memory: Memo
         by = min(whole / (now.elastic * now.stretch * grown), 1.0)
         stiffness = stiffness + (1 / by - 1) * np.outer(push / whole, tangent.whole)
         eased = (1 / by - 1) * touch.force
-        along = np.append(normal, np.zeros(3))
         stiffness = stiffness + (1 / by - 1) / (now.stretch * contact[3]) * np.outer(push, along)
         drawn /= by * grown
+    lacks = (touch.force + eased) / touch.depth - float(normal @ stiffness[:3, :3] @ normal) if touch.depth > 0 else 0.0
+    if lacks > 0:  # a sliver of contact in another tool's dent: what came from nothing rises by no less than that
+        stiffness = stiffness + lacks * np.outer(push / touch.force, along)
     if drawn > 1 + 1e-9:  # the tool was drawn back along the normal to where it is answered for: see Toucher
-        along = np.append(normal, np.zeros(3))
         rise = push / drawn * STIFFENING / float(toucher.layer.thickness.max())
         stiffness = stiffness + np.outer(rise - stiffness @ along, along)
     steep = float(normal @ stiffness[:3, :3] @ normal) * touch.depth  # power of the depth times force
@@ -268,8 +270,8 @@ def _model(toucher: Toucher, touch: Touch, tangent: Tangent | None, memory: Memo
     if touch.slip is not None and memory is not None:
         grip = _grip(touch, memory, contact[2])
         stiffness = stiffness + (grip.axes.T * grip.stiffness) @ grip.axes
-        along, arm = np.eye(3) - np.outer(normal, normal), memory.contact[0] - touch.pose_body_from_tool[:3, 3]
-        ways = np.hstack([along, np.cross(arm, along)])
+        flat, arm = np.eye(3) - np.outer(normal, normal), memory.contact[0] - touch.pose_body_from_tool[:3, 3]
+        ways = np.hstack([flat, np.cross(arm, flat)])
         sticks = (1 - touch.slip.share) * touch.force  # what sticks takes the way that it faces along
         stiffness = stiffness + ways.T @ (sticks * toucher.curvature(nodes, pressed.forces)) @ ways
     return LocalContact(touch.pose_body_from_tool, touch.wrench, stiffness, *valid, touch.status, touch.trust, grip,
