@@ -7,7 +7,7 @@ import numpy as np
 from stmpl_core.arrays import Points, VertexVectors
 from stmpl_core.green import Green
 from stmpl_core.nodes import Nodes
-from stmpl_core.touch import Pressed, Touch
+from stmpl_core.touch import Pressed, Slip, Touch
 
 MIN_OFFSET = 1e-6  # way of skin along a tool that is not worth an answer [m]
 
@@ -15,19 +15,26 @@ MIN_OFFSET = 1e-6  # way of skin along a tool that is not worth an answer [m]
 def dragged_motion(green: Green, touch: Touch) -> VertexVectors | None:
     """Motion that comes to the skin where a touch drags what sticks to it along, (V, 3) [m]; None: it does not.
 
-    The part of the contact that presses goes and turns as one where it sticks, and as its friction drags it where it
-    slides, in the linear response; it adds to the motion under the same tool pressed straight, where the skin came
-    from.
+    What presses goes and turns as one by the part of the way that is of skin that sticks, and as its friction drags it
+    by the part that is of skin that slides, in the linear response; both add to the motion under the same tool pressed
+    straight, where the skin came from.
 
     Args:
         green: response of the layer.
         touch: touch with its friction.
     """
-    ways, pressed, slip = ways_along(touch), touch.pressed, touch.slip
-    if ways is None or pressed is None or pressed.forces is None or slip is None:
+    slip, pressed = touch.slip, touch.pressed
+    if slip is None or pressed is None or pressed.forces is None:
         return None
     nodes, pressing = _holding(pressed), pressed.forces[pressed.forces > 0]
-    forces = green.rubbed(nodes, green.near.groups(nodes.corners[:, 0]), ways, pressing, slip.share)
+    ways, slides = (_ways(touch, slip, nodes, *part) for part in
+                    ((slip.offset, slip.turn), (slip.slid_offset, slip.slid_turn)))  # fmt: skip
+    sticks: Points | None = ways - slides
+    if np.abs(sticks).max() <= MIN_OFFSET:
+        if np.abs(ways).max() <= MIN_OFFSET:
+            return None
+        sticks, slides = None, ways
+    forces = green.rubbed(nodes, green.near.groups(nodes.corners[:, 0]), sticks, slides, pressing)
     return green.motion(nodes, forces, dragged=True)
 
 
@@ -36,9 +43,13 @@ def ways_along(touch: Touch) -> Points | None:
     slip, pressed = touch.slip, touch.pressed
     if slip is None or pressed is None or pressed.forces is None:
         return None
-    arms = _holding(pressed).points - slip.middle
-    ways = slip.offset + slip.turn * np.cross(touch.push / touch.force, arms)
+    ways = _ways(touch, slip, _holding(pressed), slip.offset, slip.turn)
     return ways if np.abs(ways).max() > MIN_OFFSET else None
+
+
+def _ways(touch: Touch, slip: Slip, nodes: Nodes, offset: np.ndarray, turn: float) -> Points:
+    """Ways of nodes that go by an offset and turn about the contact's middle, (N, 3) [m]."""
+    return offset + turn * np.cross(touch.push / touch.force, nodes.points - slip.middle)
 
 
 def _holding(pressed: Pressed) -> Nodes:

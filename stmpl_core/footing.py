@@ -315,9 +315,17 @@ def in_space(forces, springs, stiffness, leaned, contact, origin, lever):
     wrench = np.empty(6)
     along = forces[0] * first + forces[1] * _cross(normal, first)
     wrench[:3], wrench[3:] = along, _cross(middle - origin, along) + forces[2] * lever * normal
+    drawn = np.array([springs[:, 0].sum(), springs[:, 1].sum(), springs[:, 2].sum()])
+    offset, turn = way_of_skin(drawn, stiffness, contact, lever)
+    return wrench, offset, turn
+
+
+@numba.njit(cache=True, error_model="numpy")
+def way_of_skin(drawn, stiffness, contact, lever):
+    """Way of the skin under the tool (3,) [m] and its turn, by forces of springs without relaxation, (3,) [N]."""
     first, second = contact[2], _cross(contact[1], contact[2])
-    x, y, turn = springs[:, 0].sum() / stiffness[0], springs[:, 1].sum() / stiffness[1], springs[:, 2].sum()
-    return wrench, x * first + y * second, turn / (stiffness[2] * lever)
+    x, y = drawn[0] / stiffness[0], drawn[1] / stiffness[1]
+    return x * first + y * second, drawn[2] / (stiffness[2] * lever)
 
 
 @numba.njit(cache=True, error_model="numpy")

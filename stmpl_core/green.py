@@ -258,29 +258,25 @@ class Green:
         return _OfOne(origin, (layer.vertices - origin).astype(float32), -layer.normals.astype(float32),
                       (layer.thickness**-0.5).astype(float32), rows.ravel(), scales)  # fmt: skip
 
-    def rubbed(self, nodes: Nodes, group: np.ndarray, ways: np.ndarray, pressing: np.ndarray,
-               share: float) -> np.ndarray:  # fmt: skip
-        """Forces over E with which nodes are dragged along, of which a share slides, (N, 3) [m2].
+    def rubbed(self, nodes: Nodes, group: np.ndarray, sticks: np.ndarray | None, slides: np.ndarray,
+               pressing: np.ndarray) -> np.ndarray:  # fmt: skip
+        """Forces over E with which nodes are dragged along, as what sticks and as what slides, (N, 3) [m2].
 
         What sticks goes its way, all of it. What slides is dragged with a traction mu p, so the more the harder it is
         pressed, and goes its way in the mean, weighed with what presses.
 
         Args:
             nodes, group: see `stuck`.
-            ways: their ways along the tool, (N, 3) [m].
+            sticks, slides: parts of their ways along the tool, (N, 3) [m]; None: nothing sticks.
             pressing: forces that press them, (N,) [N].
-            share: share that slides [-].
         """
-        blocks, rubs = self._blocks(nodes, group), pressing[:, None] * ways
+        blocks, rubs = self._blocks(nodes, group), pressing[:, None] * slides
         if self.drag is not None:
-            blocks += np.tile(self.give(nodes, pressing), (len(ways), len(ways)))
-        out = np.zeros_like(ways)
-        if share < 1:
-            out += (1 - share) * _held(blocks, ways)
-        if share > 0:
-            work = float(rubs.ravel() @ (blocks @ rubs.ravel()))
-            if work > 0:  # else nothing presses, or nothing goes along the skin
-                out += share * float(np.vdot(rubs, ways)) / work * rubs
+            blocks += np.tile(self.give(nodes, pressing), (len(slides), len(slides)))
+        out = np.zeros_like(slides) if sticks is None else _held(blocks, sticks)
+        work = float(rubs.ravel() @ (blocks @ rubs.ravel()))
+        if work > 0:  # else nothing presses, or nothing goes along the skin
+            out += float(np.vdot(rubs, slides)) / work * rubs
         return out
 
     def _blocks(self, nodes: Nodes, group: np.ndarray) -> np.ndarray:

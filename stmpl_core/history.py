@@ -205,8 +205,8 @@ class History:
         mu = self.friction(touch.name)
         if mu > 0 and net > MIN_ONE_WAY_SHARE:
             give = self.toucher.give(nodes, pressed.forces)
-            (wrench, rubs, share, offset, turn, lean, grown, limit, stiffness, springs, eased, bent, slid, held, room,
-             besides) = rub(
+            (wrench, rubs, share, offset, turn, lean, grown, slid_offset, slid_turn, limit, stiffness, springs, eased,
+             bent, slid, held, room, besides) = rub(
                 by * touch.wrench, NONE if stated is None else stated, stated is not None, contact, pose[:3, 3],
                 self.toucher.curvature(nodes, pressed.forces), FLAT if give is None else give, mu,
                 LOST * pressed.along, force, lever, at_rest, touch.depth, radius, pressed.power,
@@ -221,7 +221,8 @@ class History:
             if besides > 0:
                 changed["force_bound"] = changed.get("force_bound", touch.force_bound) + besides
             wrench = wrench + rubs
-            changed |= {"wrench": wrench, "slip": Slip(rubs, share, offset, turn, contact[0], lean, grown)}
+            slip = Slip(rubs, share, offset, turn, contact[0], lean, grown, slid_offset, slid_turn)
+            changed |= {"wrench": wrench, "slip": slip}
             stored, whole = stored + bent, whole + 2 * bent
         else:
             wrench = by * touch.wrench

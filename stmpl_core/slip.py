@@ -12,6 +12,10 @@ every reversal (Iwan, J. Appl. Mech. 33, 893, 1966). Whatever the path, they giv
 distance of the pressure from the middle; so translation and spin share one limit. What slides goes the way of its
 force (the flow rule of a limit surface: Goyal, Ruina & Papadopoulos, Wear 143, 307, 1991), however much stiffer skin is
 to the one than to the other. Springs relax as the force does.
+
+Skin moves as one where it sticks, and the more the harder it is pressed where it slides. A spring stands for a ring of
+the contact, so the part of the way that is of skin that slides is a fixed sum of the springs' forces: nothing of it
+while all stick, F / cap of it on first loading, all of it in a slide; and it stays where a tool stops or turns back.
 """
 
 from __future__ import annotations
@@ -21,7 +25,17 @@ from typing import NamedTuple
 import numba
 import numpy as np
 
-from stmpl_core.footing import carried_more, faced, given_way, in_plane, in_space, leaned, way_of_tool, wrench_at
+from stmpl_core.footing import (
+    carried_more,
+    faced,
+    given_way,
+    in_plane,
+    in_space,
+    leaned,
+    way_of_skin,
+    way_of_tool,
+    wrench_at,
+)
 from stmpl_core.relaxation import weights
 from stmpl_core.sideways import secant
 
@@ -31,6 +45,9 @@ _YIELD, _FORCE = 1.5 * (1 - _LEFT), 1 - _LEFT**1.5  # k s / cap and F / cap ther
 _SLOPE = np.append(np.diff(_FORCE) / np.diff(_YIELD), 0.0)
 STIFFNESS = _SLOPE[:-1] - _SLOPE[1:]  # of each spring, over k, (SPRINGS,)
 LIMIT = STIFFNESS * _YIELD[1:]  # force at which each slides, over the cap, (SPRINGS,)
+_SLID = np.where(_YIELD > _YIELD[1], _FORCE**2, 0.0)  # part of F / cap there that moves skin as what slides
+_SLID_SLOPE = np.append(np.diff(_SLID) / np.diff(_YIELD), 0.0)
+SLID = (_SLID_SLOPE[:-1] - _SLID_SLOPE[1:]) / STIFFNESS  # the same of each spring's force, (SPRINGS,)
 TRIALS, TOLERANCE = 30, 1e-9  # of the way for a force; over the cap
 SLIDES = 8  # trials of how far a spring slides
 MOST_CARRIED = 0.9999  # share of the cap that sticks: a force at the cap has no way
@@ -299,7 +316,7 @@ def rub(wrench, stated, by_force, contact, origin, bend, give, mu, along_itself,
 
     Returns:
         push, rubs: wrench of the push and that of friction, (6,) each [N, N m].
-        share, offset, turn, lean, grown: see Slip.
+        share, offset, turn, lean, grown, slid_offset, slid_turn: see Slip.
         cap: tangential force at which all of it slides [N].
         stiffness, springs, relaxed: see Memory, after the step.
         stored: energy that springs and bent skin store [J].
@@ -348,6 +365,8 @@ def rub(wrench, stated, by_force, contact, origin, bend, give, mu, along_itself,
     if by_force:
         grown = carries / slid
     rubs, offset, turns = in_space(carried, new, after, leaned(contact, turned), contact, origin, arm_of_turn)
+    part = np.array([np.dot(SLID, np.ascontiguousarray(new[:, x])) for x in range(3)])
+    slid_offset, slid_turn = way_of_skin(part, after, contact, arm_of_turn)
     stored += max(0.5 * (1 + grown * slid) * size * out, 0.0)
     lean = grown * slid * size * turned
     held, total = min(after[0], last_held) if last_held > 0 else 0.0, 0.0
@@ -360,4 +379,5 @@ def rub(wrench, stated, by_force, contact, origin, bend, give, mu, along_itself,
         held = after[0]
     push = grown * slid * wrench + wrench_at(lean, arm)
     aside = SPUN * abs(carried[2]) * np.sqrt(carried[0] ** 2 + carried[1] ** 2) / cap if cap > 0 else 0.0
-    return push, rubs, share, offset, turns, lean, grown, cap, after, new, kept, stored, slid, held, room, aside
+    return (push, rubs, share, offset, turns, lean, grown, slid_offset, slid_turn, cap, after, new, kept, stored, slid,
+            held, room, aside)  # fmt: skip

@@ -71,6 +71,8 @@ class Slip(NamedTuple):
         middle: middle of the contact, as deep as its forces sink the skin, (3,) [m].
         lean: part of the push that is so since the skin came from where the limb faces another way, (3,) [N].
         grown: factor on the pressure, of the same energy as the lean [-].
+        slid_offset, slid_turn: part of offset and turn that moves skin as what slides does: none while all sticks, all
+            in a slide, which it stays where the tool stops or turns back, (3,) [m], [rad].
     """
 
     wrench: Wrench
@@ -80,6 +82,8 @@ class Slip(NamedTuple):
     middle: np.ndarray
     lean: np.ndarray = NONE
     grown: float = 1.0
+    slid_offset: np.ndarray = NONE
+    slid_turn: float = 0.0
 
     @property
     def kind(self) -> SlipKind:

@@ -118,7 +118,9 @@ def test_what_slides_is_dragged_as_hard_as_it_is_pressed_and_what_sticks_goes_as
                   np.tile([1.0, 0.0, 0.0], (len(x), 1)), 1e-3 * one)  # fmt: skip
     group, ways = green.near.groups(nodes.corners[:, 0]), np.tile([1e-3, 0.0, 0.0], (len(x), 1))
     pressing = np.sqrt(1 - (r / 4e-3) ** 2)
-    sticks, half, slides = (green.rubbed(nodes, group, ways, pressing, share) for share in (0.0, 0.5, 1.0))
+    sticks, half, slides = (green.rubbed(nodes, group, (1 - share) * ways, share * ways, pressing)
+                            for share in (0.0, 0.5, 1.0))  # fmt: skip
+    np.testing.assert_array_equal(green.rubbed(nodes, group, None, ways, pressing), slides)
     np.testing.assert_allclose(sticks, green.stuck(nodes, group, ways))
     np.testing.assert_allclose(half, 0.5 * (sticks + slides), atol=1e-12)
     np.testing.assert_allclose(slides[:, 0] / slides[:, 0].max(), pressing / pressing.max(), atol=1e-12)
