@@ -31,6 +31,7 @@ HARDENING = 0.75  # power of the columns' pressure with which it does
 FADE, FADE_RING = 0.03, 2  # strain at and around a node at which half of the correction is left: a touch begins linear
 ROUND_FROM = 0.05  # overlap over the thickness to which curvature is compared at the least
 SMALL_STEP = 5e-3  # of the largest force, in which the network's part of a slope is found: far above float32's noise
+APART = 1e-3  # depth, relative, that skin may miss beside other tools and still be off a tool that does not press
 FAR_OUTSIDE = 0.3  # standard deviations beyond the training contacts, from which a node is all outside
 STACK_FADE = 0.1  # the same on a stack, whose linear response alone is good to some percent up to there
 
@@ -185,6 +186,14 @@ class ContactNet:
         corrected = _correct(*look[:3], *self._network)
         shell = 0.0 if self._green is None else -float(look.inputs[0, STACK_NODE.at.given_way])
         return Held(*corrected, look.power, shell)
+
+    def apart(self, nodes: Nodes) -> np.ndarray:
+        """Mask of contact nodes at which the skin lies further in than their tool's surface, (N,)."""
+        solved = self._solved(nodes)
+        most = STACK_LINEAR_TO if self._green is not None else LINEAR_TO
+        depth = nodes.depths * np.minimum(most / nodes.strain, 1.0)
+        sunk = solved.matrix @ solved.force * (1.0 if self._green is not None else nodes.thickness.mean())
+        return (solved.force == 0) & (sunk > (1 - APART) * depth)
 
     def slopes(self, nodes: Nodes, strain_rates: np.ndarray, sinking_rates: np.ndarray) -> np.ndarray:
         """Rates of the pressures that `hold` gives, as depths change at nodes that stay where they are, (K, N).

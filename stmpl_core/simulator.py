@@ -29,6 +29,7 @@ from stmpl_core.tools import Tools
 from stmpl_core.touch import Answer, Pressed, Touch
 from stmpl_core.toucher import Toucher
 from stmpl_core.trust import Displacement, Trust
+from stmpl_core.twins import going_together
 from stmpl_core.wake import sunk
 
 LEAST_HELD = 0.02  # motion that is held back, over the peak, from which it is said
@@ -202,6 +203,7 @@ class Simulator:
         Skin that sticks goes with its tools node by node where the method knows that (`sticks`), and on stacks. This
         costs the square of the nodes: under many, vertices are fine enough, and one way fades into the other.
         """
+        touches = going_together(touches)
         pressed = [(touch.pressure, touch.pressed) for touch in touches
                    if touch.pressure is not None and touch.pressed is not None]  # fmt: skip
         if not pressed:

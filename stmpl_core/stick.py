@@ -14,6 +14,7 @@ from stmpl_core.nodes import Nodes
 from stmpl_core.obstacle import solve
 from stmpl_core.rays import depth_in_column, ray_of
 from stmpl_core.touch import Pressed, Touch, way_of
+from stmpl_core.twins import NO_TWINS, Twins, twins
 
 FURTHEST = 1.5  # way of a node over its depth along the tool's way: beside a wall it is not clear where that ends
 
@@ -44,7 +45,11 @@ def stuck_motion(green: Green, touches: Sequence[Touch], loaded: np.ndarray | No
         return np.zeros_like(green.layer.vertices)
     some = nodes.some(holds)
     guess = None if green.layer.stacked else forces[holds, None] * some.inward
-    return green.motion(some, green.stuck(some, group[holds], gone[holds], guess), loaded=loaded)
+    same = NO_TWINS
+    if len(pressed) > 1:
+        of = np.repeat(np.arange(len(pressed)), [len(one.squeeze.nodes.area) for _, one in pressed])
+        same = Twins(*twins(some.points, some.inward, some.area, group[holds], of[holds]))
+    return green.motion(some, green.stuck(some, group[holds], gone[holds], guess, same), loaded=loaded)
 
 
 def _gone(touch: Touch, pressed: Pressed, areas: np.ndarray) -> np.ndarray:

@@ -182,6 +182,7 @@ class Toucher:
         pressing = sorted((one for one in placed if len(one.squeeze.nodes.area)), key=lambda one: one.contact.name)
         held: dict[str, Held] = {}
         beside: dict[str, tuple[float, float]] = {}
+        covered: set[str] = set()
         for some in groups_of([one.squeeze.nodes.points for one in pressing], self._thickest):
             group = [pressing[n] for n in some]
             if len(group) == 1:
@@ -197,8 +198,25 @@ class Toucher:
             parts = zip(*(np.split(values, ends) for values in together[:3]), strict=True)
             for one, (pressure, doubt, outside) in zip(group, parts, strict=True):
                 held[one.contact.name] = together._replace(pressure=pressure, doubt=doubt, outside=outside)
-        return [self._answer(one, held.get(one.contact.name, NOTHING), beside.get(one.contact.name), alone)
-                for one in placed]  # fmt: skip
+            covered |= self._covered(group, nodes, held)
+        return [self._answer(one, held.get(one.contact.name, NOTHING), beside.get(one.contact.name), alone,
+                             one.contact.name in covered) for one in placed]  # fmt: skip
+
+    def _covered(self, group: Sequence[_Placed], nodes: Nodes, held: Mapping[str, Held]) -> set[str]:
+        """Names of the tools of a group that would press alone, had not the others pushed all skin off their way.
+
+        Args:
+            group: tools that feel each other.
+            nodes: their nodes, one after the other.
+            held: what holds the skin against each, by name.
+        """
+        free = [not held[one.contact.name].pressure.any() for one in group]
+        if not any(free):
+            return set()
+        ends = np.cumsum([len(one.squeeze.nodes.area) for one in group])[:-1]
+        parts = zip(group, free, np.split(self.net.apart(nodes), ends), strict=True)
+        off = [one for one, nothing, apart in parts if nothing and apart.all()]
+        return {one.contact.name for one in off if (one.held or self.net.hold(one.squeeze.nodes)).pressure.any()}
 
     def _place(self, contact: Contact, field: SignedDistance, many: bool, tried: float | None) -> _Placed:
         """Where the tool presses, or why it does not; tried: see `touch_all`."""
@@ -359,10 +377,11 @@ class Toucher:
             best = best._replace(force=min(size, best.force), why=f"{contact.name} did not settle within 2 %")
         return best
 
-    def _answer(self, one: _Placed, held: Held, among: tuple[float, float] | None, alone: bool) -> Touch:
+    def _answer(self, one: _Placed, held: Held, among: tuple[float, float] | None, alone: bool,
+                covered: bool) -> Touch:  # fmt: skip
         """What a placed tool does, scaled to its wrench, with what may be believed of it.
 
-        among: what `pins` says of the tools that press beside it, if there are many.
+        among: what `pins` says of the tools that press beside it, if there are many; covered: see `_covered`.
         """
         layer, nodes, unit = self.layer, one.squeeze.nodes, one.factor * self._modulus
         v, pressure, values, wrench, forces, scale, size, doubt, strange, stuck, along, below, thickness = _carried(
@@ -396,7 +415,7 @@ class Toucher:
             pressed=Pressed(one.field, one.squeeze, way, one.factor, scale * forces, held.power * STIFFER,
                             stuck, along) if len(v) else None,
         )  # fmt: skip
-        trust = self._trust(one, touch, v, pressure, strange, alone)
+        trust = self._trust(one, touch, v, pressure, strange, alone, covered)
         if beside_off > MAX_BESIDE:
             trust = trust.also(f"{touch.name} was moved to where it presses so alone; beside the other tools that is "
                                f"{beside_off:.0%} off", in_range=False)  # fmt: skip
@@ -408,7 +427,7 @@ class Toucher:
         return touch
 
     def _trust(self, one: _Placed, touch: Touch, vertices: np.ndarray, pressure: np.ndarray, strange: float,
-               alone: bool) -> Trust:  # fmt: skip
+               alone: bool, covered: bool) -> Trust:  # fmt: skip
         name, layer, card, trust = touch.name, self.layer, self.net.weights.card, Trust()
         if one.status in WHY and not one.why:
             why = WHY[one.status].format(name=name, reach=1e3 * self.reach, depth=1e3 * touch.depth)
@@ -419,7 +438,8 @@ class Toucher:
         if one.why:
             trust = trust.also(one.why, in_range=False)
         if not len(pressure):
-            if one.status == BY_POSE and not touch.depth <= MAX_AROUND * self._thickest:  # less: another took its skin
+            deep = not touch.depth <= MAX_AROUND * self._thickest
+            if one.status == BY_POSE and deep and not covered:  # else others took its skin
                 trust = trust.also(f"{name} is in the skin and presses nothing: check its mesh", in_range=False)
             return trust
         forces = pressure * layer.vertex_areas[vertices]
