@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import logging
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any, Self
 
 import numba
@@ -19,6 +20,7 @@ from stmpl_core.errors import InvalidInput, MeshError
 from stmpl_core.mending import closed, openings
 from stmpl_core.spline import spline_sum
 from stmpl_core.tool import Tool
+from stmpl_core.walls import outer_walls
 
 log = logging.getLogger(__name__)
 
@@ -41,10 +43,11 @@ class SignedDistance:
 
     Nodes within three cells of the surface hold exact distances, signed by the fast winding number (Barill et al.
     2018), so that open or slightly broken meshes have an inside too; the others are interpolated from a grid three
-    times coarser. Smooth faces are met to about spacing^2 / radius / 100, edges and corners are rounded by about
-    a sixth of the spacing; `surface_error` is what was measured on this mesh. Outside the grid the answer is
-    sqrt(|x - c|^2 + d(c)^2), c the nearest point of the grid: continuous, and never more than the true distance,
-    because the tool lies inside the (convex) grid.
+    times coarser. Walls inside the tool, of bodies that overlap or abut, are no surface (see stmpl_core.walls).
+    Smooth faces are met to about spacing^2 / radius / 100, edges and corners are rounded by about a sixth of the
+    spacing; `surface_error` is what was measured on this mesh. Outside the grid the answer is sqrt(|x - c|^2 +
+    d(c)^2), c the nearest point of the grid: continuous, and never more than the true distance, because the tool lies
+    inside the (convex) grid.
 
     Args:
         coefficients: weights of the spline, (I, J, K) [m].
@@ -93,11 +96,12 @@ class SignedDistance:
         if kept := _KEPT.get(key):
             return kept
         vertices, faces, watertight, flipped = _checked(mesh)
-        area = float(_face_areas(vertices, faces).sum())
         used = vertices[np.unique(faces)]
         low, extent = used.min(axis=0), np.ptp(used, axis=0)
+        area = float(_face_areas(vertices, faces).sum())
+        outer, seen = _outside(vertices, faces, field_spacing(area, extent, margin))
         if spacing is None:
-            spacing = field_spacing(area, extent, margin)
+            spacing = field_spacing(float(_face_areas(*outer).sum()), extent, margin)
         elif not (np.isfinite(spacing) and spacing > 0):
             raise InvalidInput(f"spacing is {spacing} m; it must be finite and above 0.")
         coarse = np.ceil((extent + 2 * margin) / (COARSE * spacing)).astype(int) + 2  # nodes each way
@@ -109,14 +113,14 @@ class SignedDistance:
         from scipy import ndimage  # who only reads a field need not wait for what builds it
 
         origin = low + extent / 2 - spacing * (shape - 1) / 2
-        values = _node_distances(vertices, faces, origin - COLLAR * spacing, spacing, shape + 2 * COLLAR)
+        exact = partial(_exact, vertices, faces, outer)
+        values = _node_distances(exact, origin - COLLAR * spacing, spacing, shape + 2 * COLLAR)
         if rounding > 0:
             values = ndimage.gaussian_filter(values, ROUNDING_WIDTH * rounding / spacing, mode="nearest")
         inner = (slice(COLLAR, -COLLAR),) * 3
         coefficients = np.ascontiguousarray(ndimage.spline_filter(values, order=3, mode="mirror")[inner])
-        probes = np.concatenate([used, vertices[faces].mean(axis=1)])
-        error = float(np.abs(_distances(coefficients, origin, spacing, probes)).max())
-        half = _half_thickness(coefficients, origin, spacing, vertices, faces)
+        error = float(np.abs(_distances(coefficients, origin, spacing, seen)).max())
+        half = _half_thickness(coefficients, origin, spacing, *outer)
         rims = NO_POINTS if watertight else openings(vertices, faces)
         rims = rims[:: 1 + len(rims) // MOST_OPENINGS]
         built = cls(coefficients, origin, spacing, watertight, flipped, error, (low, low + extent), half, rims)
@@ -225,19 +229,37 @@ def _half_thickness(coefficients: np.ndarray, origin: np.ndarray, spacing: float
     return max(float(np.quantile(inside.max(axis=1), 2 / 3)), 0.25 * spacing)
 
 
-def _node_distances(vertices: Points, faces: np.ndarray, origin: np.ndarray, h: float, shape: np.ndarray) -> np.ndarray:
-    """Distances at all nodes (I, J, K) [m]: exact in the band around the surface, from the coarse grid elsewhere."""
+def _outside(vertices: Points, faces: np.ndarray, spacing: float) -> tuple[tuple[Points, np.ndarray], Points]:
+    """Vertices and faces of what is outside of a surface, itself if it has no inner walls, and places on that [m]."""
+    walls = outer_walls(vertices, faces, spacing)
+    if walls is None:
+        return (vertices, faces), np.concatenate([vertices[np.unique(faces)], vertices[faces].mean(axis=1)])
+    log.info("the tool's mesh has walls inside it, of bodies that overlap; they are left out")
+    pieces, whole = walls.pieces, walls.pieces[walls.whole]
+    return ((np.ascontiguousarray(pieces.reshape(-1, 3)), np.arange(3 * len(pieces)).reshape(-1, 3)),
+            np.concatenate([whole.reshape(-1, 3), whole.mean(axis=1)]))  # fmt: skip
+
+
+def _exact(vertices: Points, faces: np.ndarray, outer: tuple[Points, np.ndarray], points: Points) -> np.ndarray:
+    """Signed distances of points (N, 3) [m] to what is outside of a surface, (N,) [m]."""
     import igl
 
-    def exact(index: np.ndarray) -> np.ndarray:
-        kind = igl.SignedDistanceType.SIGNED_DISTANCE_TYPE_FAST_WINDING_NUMBER
-        return np.asarray(igl.signed_distance(origin + h * index, vertices, faces, kind)[0])
+    kinds = igl.SignedDistanceType
+    if outer[1] is faces:
+        kind = kinds.SIGNED_DISTANCE_TYPE_FAST_WINDING_NUMBER
+        return np.asarray(igl.signed_distance(points, vertices, faces, kind)[0])
+    number = np.minimum(np.abs(igl.fast_winding_number(vertices, faces, points)), 1.0)  # 2 where two bodies are
+    return (1 - 2 * number) * np.asarray(igl.signed_distance(points, *outer, kinds.SIGNED_DISTANCE_TYPE_UNSIGNED)[0])
 
+
+def _node_distances(exact: Callable[[Points], np.ndarray], origin: np.ndarray, h: float,
+                    shape: np.ndarray) -> np.ndarray:  # fmt: skip
+    """Distances at all nodes (I, J, K) [m]: exact in the band around the surface, from the coarse grid elsewhere."""
     index = np.stack(np.meshgrid(*(np.arange(0, n, COARSE) for n in shape), indexing="ij"), axis=-1)
-    coarse = exact(index.reshape(-1, 3).astype(float)).reshape(index.shape[:3])
+    coarse = exact(origin + h * index.reshape(-1, 3).astype(float)).reshape(index.shape[:3])
     values = _finer(coarse)
     band = np.argwhere(np.abs(values) < BAND_CELLS * h)
-    values[tuple(band.T)] = exact(band.astype(float))
+    values[tuple(band.T)] = exact(origin + h * band.astype(float))
     return values
 
 
