@@ -119,12 +119,7 @@ def build(
     exclude(spec, LIMB, tools)
     spec.option.timestep = timestep
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
-    try:
-        model = spec.compile()
-    except ValueError as error:
-        light = "mjMINVAL" in str(error)
-        what = " Give each link that a joint moves its <inertial>, with a mass above 0." if light else ""
-        raise InvalidInput(f"MuJoCo cannot compile the scene: {' '.join(str(error).split())}.{what}") from error
+    model = _compiled(spec, "the scene")
     joints = tuple(model.joint(joint.name).id for joint in chain)
     qpos = _reach(model, joints, site, np.array(at), radius + above)
     return Scene(model, layer, site, joints, qpos, radius, tools, start_notes(model, joints, qpos))
@@ -203,10 +198,22 @@ def _drive(spec: Any, chain: list[Any]) -> None:
         motor.ctrllimited = motor.forcelimited = mujoco.mjtLimited.mjLIMITED_FALSE
 
 
+def _compiled(spec: Any, what: str) -> Any:
+    """The model of a spec. Raises InvalidInput: MuJoCo cannot compile it."""
+    try:
+        return spec.compile()
+    except ValueError as error:
+        light = "mjMINVAL" in str(error)
+        more = " Give each link that a joint moves its <inertial>, with a mass above 0." if light else ""
+        raise InvalidInput(f"MuJoCo cannot compile {what}: {' '.join(str(error).split())}.{more}") from error
+
+
 def _add_head(spec: Any, holder: Any, radius: float) -> None:
-    site = not hasattr(holder, "add_body")
-    parent = holder.parent if site else holder
-    head = parent.add_body(name=HEAD, **({"pos": holder.pos, "quat": holder.quat} if site else {}))
+    place = {}
+    if not hasattr(holder, "add_body"):  # a site: only MuJoCo knows what its euler, zaxis, fromto or frame come to
+        alone = _compiled(spec.copy(), "the robot").site(holder.name)
+        place, holder = {"pos": alone.pos, "quat": alone.quat}, holder.parent
+    head = holder.add_body(name=HEAD, **place)
     head.add_geom(name="stem", type=mujoco.mjtGeom.mjGEOM_CAPSULE, fromto=[0, 0, 0.005, 0, 0, HEAD_LENGTH],
                   size=[0.35 * radius, 0, 0], contype=0, conaffinity=0, mass=0.4 * HEAD_MASS,
                   rgba=[0.35, 0.38, 0.42, 1])  # fmt: skip

@@ -184,6 +184,40 @@ def test_a_file_in_degrees_with_names_and_gears_of_its_own_is_as_another(forearm
         build(forearm, site, robot=path)
 
 
+@pytest.mark.parametrize("angle", ["degree", "radian"])
+def test_the_ball_is_turned_as_its_site_or_body_however_that_is_written(
+    forearm: SoftLayer, tmp_path: Path, angle: str
+) -> None:
+    """Also in a frame, of a class of defaults, beside a mesh, and as the file counts angles."""
+    from stmpl_sim.engine import mujoco
+    from stmpl_sim.scene import BALL, HEAD, build
+    from stmpl_sim.site import Site
+
+    path, place = tmp_path / "arm.xml", Site.thickest(forearm)
+    some, more = (40, 10) if angle == "degree" else (0.7, 0.2)
+    (tmp_path / "part.obj").write_text("v 0 0 0\nv .1 0 0\nv 0 .1 0\nv 0 0 .1\nf 1 3 2\nf 1 2 4\nf 2 3 4\nf 1 4 3\n")
+    inertial = '<inertial pos="0 0 0" mass="1" diaginertia="1 1 1"/>'
+    slides, hinges = ("".join(f'<joint type="{kind}" axis="{axis}"/>' for axis in ("1 0 0", "0 1 0", "0 0 1"))
+                      for kind in ("slide", "hinge"))  # fmt: skip
+    for turn in (f'euler="{some} 0 {more}"', f'axisangle="1 .2 0 {some}"', 'zaxis="0 -.64 .77"', 'quat=".94 .34 0 0"',
+                 'xyaxes="1 0 0 0 .77 .64"', 'type="capsule" size=".01" fromto="0 0 0 .01 .03 .05"', 'class="turned"'):
+        body = f'<body name="link" {turn}/>' if turn[0] not in "ct" else ""
+        path.write_text(f"""<mujoco><compiler angle="{angle}" eulerseq="zyx"/>
+          <default><default class="turned"><site euler="{some} 0 {more}"/></default></default>
+          <asset><mesh name="part" file="part.obj"/></asset><worldbody>
+          <body>{inertial}{slides}<body>{inertial}{hinges}<geom type="mesh" mesh="part" contype="0" conaffinity="0"/>
+          <frame pos="0 0 .1" euler="{more} 0 0"><site name="mine" {turn}/>{body}</frame></body></body>
+          </worldbody></mujoco>""")
+        for end in ("mine", "link") if body else ("mine",):
+            model = build(forearm, place, robot=path, end=end).model
+            data = mujoco.MjData(model)
+            mujoco.mj_kinematics(model, data)
+            its = data.site(end) if end == "mine" else data.body(end)
+            assert abs(its.xmat[8]) < 0.99
+            np.testing.assert_allclose(data.body(HEAD).xpos, its.xpos, atol=1e-9)
+            np.testing.assert_allclose(data.geom(BALL).xmat, its.xmat, atol=1e-9)
+
+
 def test_a_run_that_diverges_ends_with_a_sentence(forearm: SoftLayer) -> None:
     from stmpl_sim.massage import Course, Massage
     from stmpl_sim.scene import build
