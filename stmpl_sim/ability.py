@@ -10,25 +10,28 @@ import numpy as np
 from stmpl_sim.engine import mujoco
 
 AXES = 5  # of a place and a direction to point in; to spin about it is of no use to a ball
+LEANS = 1.0  # angle off straight down from which it is said [degrees]
 MOST_NAMED = 4  # pairs of links that are named
 log = logging.getLogger(__name__)
 
 
-def start_notes(model: Any, joints: tuple[int, ...], qpos: np.ndarray) -> tuple[str, ...]:
+def start_notes(model: Any, joints: tuple[int, ...], qpos: np.ndarray, tool: str) -> tuple[str, ...]:
     """What will take a tool off its course or its direction, one sentence each; each is a warning of the log, too.
 
     Args:
         model: MuJoCo model.
         joints: numbers of the arm's joints.
         qpos: start, (nq,).
+        tool: name of the geom whose z axis is to point down.
     """
-    found = []
-    if len(joints) < AXES:
-        found.append(f"the robot has {len(joints)} axes; a place and a direction need {AXES}: the tool keeps its "
-                     "place, and points as well as that leaves it")  # fmt: skip
-    data = mujoco.MjData(model)
+    data, found = mujoco.MjData(model), []
     data.qpos[:] = qpos
     mujoco.mj_forward(model, data)
+    if len(joints) < AXES:
+        lean = np.rad2deg(np.arccos(np.clip(-data.geom_xmat[model.geom(tool).id, 8], -1, 1)))
+        off = f", {lean:.0f} degrees off straight down at the start" if lean > LEANS else ""
+        found.append(f"the robot has {len(joints)} axes; a place and a direction need {AXES}: the tool keeps its "
+                     f"place, and points as well as that leaves it{off}")  # fmt: skip
     pairs = dict.fromkeys(f"{_name(model, one.geom1)} and {_name(model, one.geom2)}"
                           for one in data.contact if one.exclude == 0)  # fmt: skip
     if pairs:

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any, Literal, NamedTuple, get_args
 
 import numpy as np
 
 from stmpl_core.arrays import Transform, finite
 from stmpl_core.errors import InvalidInput
 from stmpl_core.layer import SoftLayer
-from stmpl_sim.ability import start_notes
+from stmpl_sim.ability import AXES, start_notes
 from stmpl_sim.engine import mujoco
 from stmpl_sim.grip import END, FINGERS, add_gripper, place_of, thin_end
 from stmpl_sim.mujoco_skin import exclude
@@ -33,6 +33,11 @@ ELBOW_DAMPING = 0.05  # of the hinge of a limb on a rest [N m s/rad]
 ROOM = 0.08  # distance of a start's joints from their limits, over their ranges, beyond which no other start is tried
 LONGEST = 10.0  # length of a robot's links beyond which its file is taken to be in millimetres [m]
 STARTS, STEPS = 40, 200  # starts that are tried at most, and steps from each
+POINTING = 150  # of these steps where the place goes before pointing: after them only the place is found
+EXACT = 1e-6  # of the place [m] and the direction of a start
+LEAN = np.deg2rad(45)  # most that a tool of few axes leans [rad]
+ROUNDED = 1e-3  # most that one of more axes leans: that its file's angles are rounded [rad]
+ALIKE = np.deg2rad(1)  # angle by which a tool may lean more, for room
 
 Mount = Literal["fixed", "springs", "animated", "rest"]
 
@@ -121,8 +126,8 @@ def build(
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     model = _compiled(spec, "the scene")
     joints = tuple(model.joint(joint.name).id for joint in chain)
-    qpos = _reach(model, joints, site, np.array(at), radius + above)
-    return Scene(model, layer, site, joints, qpos, radius, tools, start_notes(model, joints, qpos))
+    qpos = _reach(model, joints, where, radius + above)
+    return Scene(model, layer, site, joints, qpos, radius, tools, start_notes(model, joints, qpos, BALL))
 
 
 def check_robot(robot: Path | None, end: str | None) -> None:
@@ -315,10 +320,49 @@ def _looking(way: np.ndarray) -> np.ndarray:
     return np.concatenate([right, np.cross(back, right)])
 
 
-def _reach(model: Any, joints: tuple[int, ...], site: Site, at: np.ndarray, height: float) -> np.ndarray:
-    """Configuration with the ball `height` over the site, head down; damped least squares from several starts.
+class _Start(NamedTuple):
+    """A configuration with the ball in its place.
 
-    The first whose joints have room to move, or that which has most: at its limits an arm cannot keep a force.
+    Args:
+        room: distance of the joints from their limits, over their ranges.
+        lean: angle of the tool from straight down [rad].
+        qpos: configuration, (nq,).
+    """
+
+    room: float
+    lean: float
+    qpos: np.ndarray
+
+
+def _reach(model: Any, joints: tuple[int, ...], at: np.ndarray, height: float) -> np.ndarray:
+    """Configuration with the ball `height` over a place, head down: the first whose joints have room, or most of it.
+
+    An arm of few axes points as well as its place leaves it. At its limits an arm cannot keep a force.
+    """
+    target, most = at + [0, 0, height], LEAN if len(joints) < AXES else ROUNDED
+    if found := _starts(model, joints, target):
+        return found[-1].qpos if found[-1].room >= ROOM else max(found, key=lambda one: one.room).qpos
+    placed = _starts(model, joints, target, place_first=True)
+    least = min((one.lean for one in placed), default=np.inf)
+    if least <= most:
+        return max((one for one in placed if one.lean <= least + ALIKE), key=lambda one: one.room).qpos
+    body, long = model.geom_bodyid[model.geom(BALL).id], 0.0
+    while body:
+        long, body = long + float(np.linalg.norm(model.body_pos[body])), model.body_parentid[body]
+    what = ("Is its file in millimetres? MuJoCo takes metres." if long > LONGEST else
+            "Put the limb elsewhere (--at X Y Z), or name another end (--end).")  # fmt: skip
+    best = f" (at best {np.rad2deg(least):.3g} degrees off)" if placed else ""
+    raise InvalidInput(f"the robot's head does not reach the limb at {np.round(at, 3).tolist()} m, "
+                       f"pointing down{best}; its links are {long:.3g} m long in all. {what}")  # fmt: skip
+
+
+def _starts(model: Any, joints: tuple[int, ...], target: np.ndarray, *, place_first: bool = False) -> list[_Start]:
+    """Configurations with the ball at a point, by damped least squares from several starts; the last one has room, or
+    none has.
+
+    Args:
+        model, joints, target: model, the arm's joints, and the point, (3,).
+        place_first: choice to point down only as well as the place leaves it.
     """
     data, random = mujoco.MjData(model), np.random.default_rng(0)
     dofs, places = model.jnt_dofadr[list(joints)], model.jnt_qposadr[list(joints)]
@@ -326,10 +370,9 @@ def _reach(model: Any, joints: tuple[int, ...], site: Site, at: np.ndarray, heig
     free = ~model.jnt_limited[list(joints)].astype(bool)
     low, high = np.where(free, -np.pi, low), np.where(free, np.pi, high)
     first = model.key_qpos[0][: model.nq] if model.nkey else None
-    ball, target = model.geom(BALL).id, at + [0, 0, height]
-    jacobian = np.zeros((6, model.nv))
-    found: list[tuple[float, np.ndarray]] = []
-    for trial in range(STARTS):
+    ball, jacobian = model.geom(BALL).id, np.zeros((6, model.nv))
+    found: list[_Start] = []
+    for trial in range(STARTS // 4 if place_first else STARTS):
         mujoco.mj_resetData(model, data)
         if trial == 0 and first is not None:
             data.qpos[places] = first[places]
@@ -343,28 +386,25 @@ def _reach(model: Any, joints: tuple[int, ...], site: Site, at: np.ndarray, heig
             error = np.concatenate([target - data.geom_xpos[ball], np.cross(axis, [0, 0, -1.0])])
             if axis[2] > 0:
                 error[3:] += axis[[1, 2, 0]]  # upside down: turn somewhere
-            if np.abs(error).max() < 1e-6:
+            pointed = k >= POINTING if place_first else np.abs(error[3:]).max() < EXACT
+            if pointed and np.abs(error[:3]).max() < EXACT:
                 rooms = np.minimum(data.qpos[places] - low, high - data.qpos[places]) / (high - low)
                 room = float(np.where(free, 0.5, rooms).min())
                 if room >= 0:
-                    found.append((room, data.qpos.copy()))
+                    found.append(_Start(room, float(np.arccos(np.clip(-axis[2], -1, 1))), data.qpos.copy()))
                 break
             mujoco.mj_jacGeom(model, data, jacobian[:3], jacobian[3:], ball)
             part = jacobian[:, dofs]
-            inverse = np.linalg.solve(part @ part.T + 1e-4 * np.eye(6), part).T
-            step = inverse @ error
+            aims = [slice(0, 6)] if not place_first else [slice(0, 3), slice(3, 6)] if k < POINTING else [slice(0, 3)]
+            step, left = np.zeros(len(dofs)), np.eye(len(dofs))
+            for aim in aims:  # each in what those before leave free
+                rows = part[aim] @ left
+                inverse = np.linalg.solve(rows @ rows.T + 1e-4 * np.eye(len(rows)), rows).T
+                step += inverse @ (error[aim] - part[aim] @ step)
+                left = left - (np.linalg.pinv(rows, rcond=1e-3) if place_first else inverse) @ rows
             if trial and k < STEPS // 2:  # what the aim leaves free goes to the middle of the ranges
-                middle = 0.1 * np.where(free, 0.0, 0.5 * (low + high) - data.qpos[places])
-                step += middle - inverse @ (part @ middle)
+                step += left @ (0.1 * np.where(free, 0.0, 0.5 * (low + high) - data.qpos[places]))
             data.qpos[places] = np.clip(data.qpos[places] + np.clip(step, -0.2, 0.2), low, high)
-        if found and found[-1][0] >= ROOM:
-            return found[-1][1]
-    if found:
-        return max(found, key=lambda one: one[0])[1]
-    body, long = model.geom_bodyid[ball], 0.0
-    while body:
-        long, body = long + float(np.linalg.norm(model.body_pos[body])), model.body_parentid[body]
-    what = ("Is its file in millimetres? MuJoCo takes metres." if long > LONGEST else
-            "Put the limb elsewhere (--at X Y Z), or name another end (--end).")  # fmt: skip
-    raise InvalidInput(f"the robot's head does not reach the limb at {np.round(at, 3).tolist()} m, pointing down; its "
-                       f"links are {long:.3g} m long in all. {what}")  # fmt: skip
+        if not place_first and found and found[-1].room >= ROOM:
+            break
+    return found

@@ -283,6 +283,45 @@ def test_an_arm_of_few_axes_keeps_its_place_before_it_points(forearm: SoftLayer,
         assert np.abs(log.force[rows] - 5.0).max() < 0.1 and log.off[rows].max() < 3e-4
 
 
+@pytest.mark.parametrize(("roll", "lean"), [(3.14159, 0.0), (2.8, 19.57), (2.0, None)])
+def test_a_tool_of_few_axes_points_as_well_as_its_place_leaves_it(
+    forearm: SoftLayer, tmp_path: Path, roll: float, lean: float | None
+) -> None:
+    """A gantry of three slides, whose end points nearly down or elsewhere; then a hinge turns it down."""
+    from stmpl_sim.engine import mujoco
+    from stmpl_sim.scene import BALL, build
+    from stmpl_sim.site import Site
+
+    path, site = tmp_path / "arm.xml", Site.thickest(forearm)
+    slides = "".join(f'<joint type="slide" axis="{axis}" range="-1 1"/>' for axis in ("1 0 0", "0 1 0", "0 0 1"))
+    path.write_text(f"""<mujoco><compiler angle="radian"/><worldbody><body name="a" pos="0 0 .5">{slides}
+      <inertial pos="0 0 0" mass="1" diaginertia="1 1 1"/><body name="b" pos="0 0 .1">
+      <inertial pos="0 0 0" mass="1" diaginertia="1 1 1"/><body name="c" euler="{roll} 0 0"/></body></body>
+      </worldbody></mujoco>""")
+    if lean is None:
+        with pytest.raises(InvalidInput, match=r"pointing down \(at best 65.4 degrees off\)"):
+            build(forearm, site, robot=path, end="c", at=(0.3, 0.1, 0.25))
+    else:
+        scene = build(forearm, site, robot=path, end="c", at=(0.3, 0.1, 0.25))
+        data = mujoco.MjData(scene.model)
+        data.qpos[:] = scene.qpos
+        mujoco.mj_kinematics(scene.model, data)
+        np.testing.assert_allclose(data.geom(BALL).xpos, [0.3, 0.1, 0.28], atol=1e-6)
+        said = ", 20 degrees off straight down at the start" if lean else ""
+        assert scene.notes[0].endswith(f"points as well as that leaves it{said}")
+    hinge = '<body name="b" pos="0 0 .1"><joint axis="1 0 0" range="-.3 .6"/>'
+    path.write_text(path.read_text().replace('<body name="b" pos="0 0 .1">', hinge))
+    if lean == 0:
+        return
+    scene = build(forearm, site, robot=path, end="c", at=(0.3, 0.1, 0.25))
+    data = mujoco.MjData(scene.model)
+    data.qpos[:] = scene.qpos
+    mujoco.mj_kinematics(scene.model, data)
+    np.testing.assert_allclose(data.geom(BALL).xpos, [0.3, 0.1, 0.28], atol=1e-6)
+    off = 0 if lean else np.pi - 2.0 - 0.6  # the hinge stops
+    assert np.arccos(min(1.0, -data.geom(BALL).xmat[8])) == pytest.approx(off, abs=1e-5)
+
+
 def test_what_takes_an_arm_off_its_course_is_said_before_and_after(forearm: SoftLayer, tmp_path: Path) -> None:
     from dataclasses import replace
 
