@@ -63,6 +63,13 @@ def _nobody(why: str) -> None:
     """Nobody is told what became of a skin."""
 
 
+def _settle() -> None:
+    """What is set up now stays: collections at run time need not look at it. What was set up before is let go."""
+    gc.unfreeze()
+    gc.collect()
+    gc.freeze()
+
+
 class SkinNode(ServingNode):
     """ROS 2 lifecycle node that answers contacts: it hears (Hearing), answers (Answering) and sends (Sending).
 
@@ -144,8 +151,7 @@ class SkinNode(ServingNode):
             part.open()
         self._open.callback(self.destroy_timer, steady_timer(self, 1 / FADE_RATE, self._fade))
         self.settings.locked = True
-        gc.collect()
-        gc.freeze()  # what is set up now stays: collections at run time need not look at it
+        _settle()
         self.get_logger().info(f"configured in {time.monotonic() - started:.1f} s: {self.skin.layer}")
         if self.bond.missing:
             self.get_logger().info(self.bond.missing)
@@ -243,7 +249,10 @@ class SkinNode(ServingNode):
         self.answering.close()
         self._end()
         self.calibration.forget()
-        self._open.close()  # last: all are closed, then raises what one of them raised
+        try:
+            self._open.close()  # last: all are closed, then raises what one of them raised
+        finally:
+            _settle()
 
     def _end(self) -> None:
         for beside in (self._making, self.workshop):
@@ -343,8 +352,7 @@ class SkinNode(ServingNode):
         self.settings.take(config)
         self.answering.limits = Limits.read(config.limits, config.limb)
         self.sending.move_to(skin, self.workshop)
-        gc.collect()
-        gc.freeze()
+        _settle()
         if same:
             self.get_logger().info(f"from here on friction is {config.friction or 'none'}")
             return

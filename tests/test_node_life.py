@@ -8,6 +8,7 @@ import subprocess
 import sys
 import threading
 import time
+import weakref
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future
 from dataclasses import replace
@@ -190,6 +191,20 @@ def test_a_node_that_cannot_even_be_closed_is_finalized(composed, monkeypatch, c
     said = capfd.readouterr().err
     assert "on_deactivate failed" in said and "on_error failed" in said
     assert composed.node._state_machine.current_state[1] == "finalized"
+
+
+def test_skins_of_before_are_let_go_by_a_node_that_starts_anew_and_by_one_that_changes(composed):
+    """What is set up is frozen for the collector; nothing ever thawed it, and each skin stayed with its cycles."""
+    node, layers = composed.node, []
+    for stiff in (2000.0, 2100.0, 2200.0):
+        layers.append(weakref.ref(node.skin.layer))
+        node.trigger_deactivate()
+        node.trigger_cleanup()
+        node.trigger_configure()
+        node.trigger_activate()
+        layers.append(weakref.ref(node.skin.layer))
+        assert node.set_body(youngs_modulus=stiff) == "taken over"
+    assert not [layer for layer in layers[:-1] if layer() is not None]  # the stiffened one is made of the last
 
 
 class Beat(SimpleNamespace):
