@@ -28,11 +28,15 @@ def own(name: str, *parts: str) -> Any:
             sys.path.insert(0, str(Path.cwd()))
         try:
             return getattr(import_module(place), attribute)
+        except SystemExit as error:
+            raise InvalidInput(f"{name} could not be imported: it ends the process (exit {error.code}).") from error
         except (ImportError, AttributeError, ValueError) as error:
             raise InvalidInput(f"{name}: {error}. Give module:attribute, importable from {Path.cwd()}, or "
                                "file.py:attribute.") from error
     try:
         made = runpy.run_path(place, run_name=Path(place).stem)
+    except SystemExit as error:
+        raise InvalidInput(f"{place} could not be run: it ends the process (exit {error.code}).") from error
     except Exception as error:  # whatever a person's file does when it is run
         raise InvalidInput(f"{place} could not be run: {type(error).__name__}: {error}") from error
     if attribute:

@@ -4,7 +4,9 @@ import json
 import re
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -95,6 +97,25 @@ class Short(Winkler):
         return Displacement(np.zeros((3, 3)), Trust(), "short")
 
 
+class Odd(Winkler):
+    """Answers as Winkler does, in another kind: complex or object arrays, words for trust, no Displacement."""
+
+    def __init__(self, kind: str) -> None:
+        super().__init__()
+        self.kind = kind
+
+    def solve(self, load: Load) -> Any:
+        answer = super().solve(load)
+        if self.kind in ("complex", "object"):
+            return replace(answer, displacement=answer.displacement.astype(self.kind))
+        trust = cast(Any, "sure") if self.kind == "trust" else Trust(error_bound=cast(Any, "small"))
+        return answer.displacement if self.kind == "array" else replace(answer, trust=trust)
+
+
+ODD = {"complex": "displacement of complex128", "object": "displacement of object", "trust": "trust of type str",
+       "bound": "error bound of type str", "array": "answer of type ndarray"}  # fmt: skip
+
+
 class Crashing(Winkler):
     """Stumbles over high pressures."""
 
@@ -175,7 +196,7 @@ def run(tmp_path_factory) -> tuple[Report, object]:
     """All faulty methods, a sound one, Zero, one that flags its fault and one that crashes, in one quick sweep."""
     out = tmp_path_factory.mktemp("stability")
     others = {"sound": Winkler, "nothing": Zero, "honest": faulty(too_deep, flags=True), "crashing": Crashing,
-              "short": Short, "multiplied": faulty(multiplied),
+              "short": Short, "multiplied": faulty(multiplied), **{kind: partial(Odd, kind) for kind in ODD},
               "candid": lambda: Switching(0.3), "boastful": lambda: Switching(0.01)}  # fmt: skip
     return stability(FAULTS | others, PRESSURES, out), out
 
@@ -230,7 +251,9 @@ def test_a_refusal_of_a_sound_input_is_flagged_and_a_crash_is_not(run):
     assert "KeyError" in crashed[0].broken[0].measured
 
 
-@pytest.mark.parametrize(("method", "said"), [("short", r"TypeError.*shape \(3, 3\)"), ("multiplied", "ValueError")])
+@pytest.mark.parametrize(
+    ("method", "said"), [("short", r"TypeError.*shape \(3, 3\)"), ("multiplied", "ValueError"), *ODD.items()]
+)
 def test_an_answer_of_another_shape_and_an_error_that_is_none_of_ours_are_crashes_of_that_method_alone(
     run, method, said
 ):
@@ -314,10 +337,14 @@ def test_a_method_in_a_file_of_ones_own_is_the_class_in_it_or_the_one_that_is_na
     assert counts["held"] > 10 and not counts["crashed"] and not counts["silent"]
     for text, said in ((YOURS + "class Other(Careful):\n    pass\n", "has Careful, Other with prepare and solve. Say "
                         "which"), ("x = 1\n", "has no class with prepare and solve"),
-                       ("import nothing_of_the_kind\n", "could not be run: ModuleNotFoundError")):  # fmt: skip
+                       ("import nothing_of_the_kind\n", "could not be run: ModuleNotFoundError"),
+                       ("import sys\nsys.exit(5)\n", r"it ends the process \(exit 5\)")):  # fmt: skip
         file.write_text(text)
         with pytest.raises(InvalidInput, match=said):
             maker(str(file))
+    (tmp_path / "ending.py").write_text("raise SystemExit(5)")
+    with pytest.raises(InvalidInput, match=r"it ends the process \(exit 5\)"):
+        maker("ending:Careful")
     file.write_text(YOURS)
     for name, parts, said in ((f"{file}:Nothing", (), "has no Nothing"), (str(file), (), "Say which, as in")):
         with pytest.raises(InvalidInput, match=said):

@@ -15,7 +15,7 @@ import numpy as np
 from stmpl_core.errors import InvalidInput, StmplError
 from stmpl_core.methods.base import Method
 from stmpl_core.provenance import commit, machine, versions
-from stmpl_core.trust import Displacement
+from stmpl_core.trust import Displacement, Trust
 from studies.stability import failures
 from studies.stability.laws import LAWS, VERDICTS, Answers, Broken
 from studies.stability.scene import Make, Pressures, Scene
@@ -176,11 +176,25 @@ def judged(name: str, trial: Trial, answers: Answers) -> Row:
 
 
 def checked(scene: Scene, answers: list[Displacement]) -> list[Displacement]:
-    """Answers that laws can be judged on. Raises TypeError: of another shape."""
+    """Answers that laws can be judged on. Raises TypeError: of another shape or kind."""
     for answer in answers:
-        if (shape := np.shape(answer.displacement)) != scene.mesh.vertices.shape:
-            raise TypeError(f"a displacement of shape {shape}; {scene.mesh.vertices.shape} is asked for")
+        _check(answer, scene)
     return answers
+
+
+def _check(answer: object, scene: Scene) -> None:
+    if not isinstance(answer, Displacement):
+        raise TypeError(f"an answer of type {type(answer).__name__}; a Displacement is asked for")
+    if not isinstance(answer.trust, Trust):
+        raise TypeError(f"a trust of type {type(answer.trust).__name__}; a Trust is asked for")
+    if not isinstance(bound := answer.trust.error_bound, float | int | np.floating | np.integer | None):
+        raise TypeError(f"an error bound of type {type(bound).__name__}; metres or None are asked for")
+    found, asked = answer.displacement, scene.mesh.vertices.shape
+    if not isinstance(found, np.ndarray) or not np.issubdtype(found.dtype, np.floating):
+        kind = found.dtype if isinstance(found, np.ndarray) else type(found).__name__
+        raise TypeError(f"a displacement of {kind}; an array of real floating numbers is asked for")
+    if found.shape != asked:
+        raise TypeError(f"a displacement of shape {found.shape}; {asked} is asked for")
 
 
 def _refused(name: str, method: Method, trial: Trial, scene: Pressures) -> Row:
@@ -189,7 +203,7 @@ def _refused(name: str, method: Method, trial: Trial, scene: Pressures) -> Row:
     outcome: Outcome = "held"
     for load in scene.loads():
         try:
-            answer = method.solve(load)
+            _check(answer := method.solve(load), scene)
         except StmplError:
             continue
         except (Exception, SystemExit) as error:  # a method of others may end itself
