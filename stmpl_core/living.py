@@ -18,6 +18,7 @@ from stmpl_core.layer import MAX_THICKNESS, SoftLayer
 from stmpl_core.limbs import EDGE_LENGTH
 from stmpl_core.packed import stack_from_text, stack_to_text
 from stmpl_core.regions import HELD_SKIN, REGIONS, Region, Tone, region
+from stmpl_core.text_file import text_of
 from stmpl_core.tissue import Tissue
 from stmpl_core.trunk import TRUNK
 
@@ -149,14 +150,14 @@ def read_model(path: str | Path) -> Model:
     """All that `write_tissue` wrote.
 
     Raises:
-        InvalidInput: no such file, or one that holds no tissue.
+        InvalidInput: no such file, one that is no regular file, or one that holds no tissue.
     """
     try:
-        given = json.loads(Path(path).read_text())
+        given = json.loads(text_of(path))
         friction = given.get("friction")
         return Model(stack_from_text(json.dumps(given["tissue"]))[0], float(given["thickness"]),
                      None if friction is None else str(friction), bool(given.get("relaxing", False)))  # fmt: skip
     except OSError as error:
         raise InvalidInput(f"there is no tissue in {path}: {error.strerror}. stmpl needs --out writes one.") from error
-    except (ValueError, KeyError, TypeError, AttributeError) as error:
+    except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         raise InvalidInput(f"{path} holds no tissue ({error}). stmpl needs --out writes one.") from error

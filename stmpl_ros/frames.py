@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from importlib.util import find_spec
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,6 +15,7 @@ from bags.moving import FramesAt
 from bags.wire import pose_from, rigid
 from stmpl_core.arrays import Transform
 from stmpl_core.errors import InvalidInput, StmplError
+from stmpl_core.text_file import text_of
 
 SHAPE = "name: {position: [x, y, z], orientation: [x, y, z, w]}, in metres, both optional"
 
@@ -93,8 +93,8 @@ def read_frames(path: str) -> dict[str, Transform]:
     from ruamel.yaml import YAML, YAMLError
 
     try:
-        read = YAML(typ="safe").load(Path(path).read_text()) or {}
-    except (OSError, UnicodeDecodeError, YAMLError) as error:
+        read = YAML(typ="safe").load(text_of(path)) or {}
+    except (OSError, UnicodeDecodeError, YAMLError, RecursionError) as error:
         raise InvalidInput(f"frames file {path}: {error}. It holds {SHAPE}.") from error
     if not isinstance(read, dict):
         raise InvalidInput(f"frames file {path} holds no table of frames. It holds {SHAPE}.")

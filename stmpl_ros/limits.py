@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from pathlib import Path
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from stmpl_core.errors import InvalidInput, sentence_of
+from stmpl_core.text_file import text_of
 from stmpl_core.touch import Touch
 
 ADVISORY = "advisory, not a safety function"
@@ -54,8 +54,8 @@ class Limits:
         from ruamel.yaml import YAML, YAMLError
 
         try:
-            file = LimitsFile.model_validate(YAML(typ="safe").load(Path(path).read_text()))
-        except (OSError, UnicodeDecodeError, YAMLError) as error:
+            file = LimitsFile.model_validate(YAML(typ="safe").load(text_of(path)))
+        except (OSError, UnicodeDecodeError, YAMLError, RecursionError) as error:
             raise InvalidInput(f"limits file {path}: {error}") from error
         except ValidationError as error:
             raise InvalidInput(f"limits file {path}: {sentence_of(error)}. See config/limits.yaml.") from error

@@ -1,5 +1,6 @@
 """Laws of parts of a body as people were measured, and of the tissue that a node is started with."""
 
+import os
 import subprocess
 import sys
 from dataclasses import replace
@@ -14,9 +15,13 @@ from stmpl_core.errors import InvalidInput
 from stmpl_core.extrusion import fold_ratios
 from stmpl_core.living import living, part_around, read_tissue, region_of, write_tissue
 from stmpl_core.methods import MomentNet
+from stmpl_core.methods.ladder import Measured
 from stmpl_core.regions import HELD_SKIN, region
 from stmpl_core.soundness import border_distance
+from stmpl_core.text_file import MOST
 from stmpl_core.trunk import TRUNK
+from stmpl_ros.frames import read_frames
+from stmpl_ros.limits import Limits
 from stmpl_ros.making import at_once, check, layer_of
 from stmpl_ros.parameters import NodeConfig
 from tests.scenes import ball
@@ -57,7 +62,8 @@ def test_a_tissue_goes_through_a_file(tmp_path):
     assert read_tissue(tmp_path / "back.json") == (tissue, 0.018)
 
 
-@pytest.mark.parametrize("content", ["", "{}", "[1]", '{"tissue": 3, "thickness": 1}', '{"tissue": {"skin": null}}'])
+@pytest.mark.parametrize("content", ["", "{}", "[1]", '{"tissue": 3, "thickness": 1}', '{"tissue": {"skin": null}}',
+                                     "[" * 100_000])  # fmt: skip
 def test_a_file_that_holds_no_tissue_is_refused_with_how_to_make_one(tmp_path, content):
     path = tmp_path / "tissue.json"
     path.write_text(content)
@@ -65,6 +71,20 @@ def test_a_file_that_holds_no_tissue_is_refused_with_how_to_make_one(tmp_path, c
         read_tissue(path)
     with pytest.raises(InvalidInput, match="stmpl needs --out"):
         read_tissue(tmp_path / "none.json")
+
+
+def test_a_file_without_end_is_refused_by_all_that_a_node_reads(tmp_path):
+    """A device that never ends took all memory, a pipe that nobody writes to held the node."""
+    pipe, large = tmp_path / "pipe", tmp_path / "large"
+    os.mkfifo(pipe)
+    large.write_bytes(b" " * (MOST + 1))
+    reads = (read_tissue, lambda path: check(config(tissue=path), layer_of), read_frames, Measured.load,
+             lambda path: Limits.read(path, "left_arm"))  # fmt: skip
+    for path, said in (("/dev/zero", "no regular file"), (pipe, "no regular file"), (tmp_path, "no regular file"),
+                       (large, "larger than 4 MB"), ("a\0b", "no regular file")):  # fmt: skip
+        for read in reads:
+            with pytest.raises(InvalidInput, match=said):
+                read(str(path))
 
 
 def config(**changes) -> NodeConfig:

@@ -18,6 +18,7 @@ from stmpl_core.layer import SoftLayer
 from stmpl_core.load import Load
 from stmpl_core.methods.base import Method, prepared
 from stmpl_core.methods.winkler import column_stretch
+from stmpl_core.text_file import text_of
 from stmpl_core.trust import Displacement, Trust
 
 log = logging.getLogger(__name__)
@@ -174,7 +175,7 @@ class Measured:
     def load(cls, path: str | Path) -> Self:
         """Reads a file that `save` wrote. Raises InvalidInput if there is no such file or it holds something else."""
         try:
-            found = json.loads(Path(path).read_text())
+            found = json.loads(text_of(path))
             return cls({name: Known(**known) for name, known in found["methods"].items()},
                        found["ranges"], found["about"])  # fmt: skip
         except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
