@@ -113,3 +113,19 @@ def test_a_cavity_that_a_body_fills_is_none_and_the_rest_of_it_stays_one() -> No
     field = SignedDistance.of(together(ball, cavity, rod), spacing=FINE)
     found = field.distance([[0, 0, 0.0], [0, 0, 0.008], [0.004, 0, 0], [0, 0, 0.014]])
     np.testing.assert_allclose(found, [-0.002, -np.hypot(0.002, 0.0018), 0.002, -0.001], atol=4e-4)
+
+
+def test_a_body_that_comes_twice_with_other_triangles_is_one() -> None:
+    once, points = block(0.02, 0.02, 0.016), np.random.default_rng(3).uniform(-0.013, 0.013, (20_000, 3))
+    twice = SignedDistance.of(together(once, once.subdivide().subdivide()), spacing=FINE)
+    off = twice.distance(points) - SignedDistance.of(tool(once), spacing=FINE).distance(points)
+    assert np.abs(off).max() < 0.1 * FINE
+
+
+def test_a_body_inside_another_one_is_not_felt_and_where_the_tool_lies_does_not_matter() -> None:
+    outer, inner = block(0.02, 0.02, 0.016).subdivide(), block(0.01, 0.01, 0.01, (0.001, 0, 0))
+    points = np.random.default_rng(4).uniform(-0.013, 0.013, (20_000, 3))
+    alone = SignedDistance.of(tool(outer), spacing=FINE).distance(points)
+    far = trimesh.util.concatenate([outer, inner]).apply_translation([1, 1, 1])
+    assert np.abs(SignedDistance.of(together(outer, inner), spacing=FINE).distance(points) - alone).max() < 0.1 * FINE
+    assert np.abs(SignedDistance.of(tool(far), spacing=FINE).distance(points + 1) - alone).max() < 0.1 * FINE
