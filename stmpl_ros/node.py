@@ -352,7 +352,8 @@ class SkinNode(ServingNode):
         self.settings.take(config)
         self.answering.limits = Limits.read(config.limits, config.limb)
         self.sending.move_to(skin, self.workshop)
-        _settle()
+        gc.collect()
+        gc.freeze()  # without a thaw, which would take 0.1 s of the answers
         if same:
             self.get_logger().info(f"from here on friction is {config.friction or 'none'}")
             return
