@@ -33,7 +33,7 @@ from stmpl_core.response import FAST, SPREAD
 from stmpl_core.softness import BANK, Softness
 from stmpl_core.stack import Effective, along, compliance, effective, hardening
 from stmpl_core.tissue import Tissue
-from stmpl_core.twins import NO_TWINS, Twins
+from stmpl_core.twins import NO_TWINS, Twins, give_way
 
 ROWS = 64  # rows of the tables over the root of the distance
 TABLED = np.geomspace(1e-5, 10 / SPREADS[0], 3000)  # wave numbers at which a stack's response is known [1/t]
@@ -248,11 +248,11 @@ class Green:
         if self.layer.stacked or guess is None:
             blocks = self._blocks(nodes, group)
             if len(twins.share):
-                _give_way(blocks.reshape(len(gone), 3, len(gone), 3), *twins)
+                give_way(blocks.reshape(len(gone), 3, len(gone), 3).transpose(0, 1, 3, 2), *twins)
             return _held(blocks, gone)
         blocks = nodewise.blocks(self._by_node(nodes), group, self._of_one.rows, self._of_one.scales)
         if len(twins.share):
-            nodewise.give_way(blocks, *twins)
+            give_way(blocks.reshape(len(blocks), 3, 3, -1), *twins)
         return nodewise.approached(blocks, gone, guess)
 
     def _by_node(self, nodes: Nodes) -> np.ndarray:
@@ -680,25 +680,6 @@ def _blocks(points, inward, area, corners, shares, group, unit, soft, tables, sk
                     if i != j:
                         out[j, y, i, x] += moved[x]
     return out.reshape(3 * count, 3 * count)
-
-
-@numba.njit(cache=True, nogil=True, error_model="numpy")
-def _give_way(blocks, pairs, share):
-    """Adds to blocks (N, 3, N, 3) what `twins` give way to each other, to what their forces differ by."""
-    gives = np.empty(len(share))
-    for k in range(len(share)):
-        i, j = pairs[k]
-        own = 0.0
-        for x in range(3):
-            own += (blocks[i, x, i, x] + blocks[j, x, j, x]) / 6
-        gives[k] = share[k] * own
-    for k in range(len(share)):
-        i, j = pairs[k]
-        for x in range(3):
-            blocks[i, x, i, x] += gives[k]
-            blocks[j, x, j, x] += gives[k]
-            blocks[i, x, j, x] -= gives[k]
-            blocks[j, x, i, x] -= gives[k]
 
 
 def _held(blocks: np.ndarray, gone: np.ndarray) -> np.ndarray:

@@ -62,6 +62,12 @@ class _Edges:
         return cls(half, start, np.diff(start, append=len(key)), a < b)
 
     @property
+    def pairs(self) -> tuple[np.ndarray, np.ndarray]:
+        """The two half-edges of each edge that two faces share; one of more faces joins none."""
+        pair = self.start[self.count == 2]
+        return self.half[pair], self.half[pair + 1]
+
+    @property
     def odd(self) -> int:
         """Number of edges with an odd number of faces."""
         return int((self.count % 2).sum())
@@ -85,6 +91,11 @@ def places(vertices: Points) -> np.ndarray:
 def closed(vertices: Points, faces: Faces) -> bool:
     """Whether the surface has no holes and is wound one way; vertices at one place count as one."""
     return _Edges.of(places(vertices)[faces]).closed
+
+
+def parts(vertices: Points, faces: Faces) -> np.ndarray:
+    """Number of the part that each face belongs to, of those that hang together by their edges, (F,)."""
+    return _parts(_Edges.of(places(vertices)[faces]), len(faces))[0]
 
 
 def openings(vertices: Points, faces: Faces) -> Points:
@@ -162,12 +173,16 @@ def _without_useless(faces: Faces, place: np.ndarray, said: list[str]) -> Faces:
     return faces[kept]
 
 
+def _parts(edges: _Edges, count: int) -> tuple[np.ndarray, np.ndarray, int]:
+    """What `_flood` finds over the edges that two of `count` faces share."""
+    one, other = edges.pairs
+    return _flood(one // 3, other // 3, edges.up[one] == edges.up[other], count)
+
+
 def _wound_one_way(points: Points, faces: Faces, place: np.ndarray, said: list[str]) -> Faces:
     corners = place[faces]
     edges = _Edges.of(corners)
-    pair = edges.start[edges.count == 2]
-    one, other = edges.half[pair], edges.half[pair + 1]
-    part, turned, one_sided = _flood(one // 3, other // 3, edges.up[one] == edges.up[other], len(faces))
+    part, turned, one_sided = _parts(edges, len(faces))
     if one_sided:
         raise MeshError(f"{_many(one_sided, 'part')} of the tool's surface {'has' if one_sided == 1 else 'have'} one "
                         "side only, like a Moebius strip, so that nothing is inside; try a closed surface.")

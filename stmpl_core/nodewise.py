@@ -199,25 +199,6 @@ def blocks(by, group, flat, scales):
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def give_way(held, pairs, share):
-    """Adds to `blocks` what `twins` (stmpl_core.twins) give way to each other, to what their forces differ by."""
-    gives = np.empty(len(share), np.float32)
-    for k in range(len(share)):
-        i, j = pairs[k]
-        own = ZERO
-        for x in range(3):
-            own += held[i, 4 * x, i] + held[j, 4 * x, j]
-        gives[k] = share[k] * own / 6
-    for k in range(len(share)):
-        i, j = pairs[k]
-        for x in range(3):
-            held[i, 4 * x, i] += gives[k]
-            held[j, 4 * x, j] += gives[k]
-            held[i, 4 * x, j] -= gives[k]
-            held[j, 4 * x, i] -= gives[k]
-
-
-@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _tiled(by, group):
     """Nodes (8, M) and their groups in tiles, (T TILE,): what fills them up is of no group."""
     tiles = by.shape[1] // LANES

@@ -20,7 +20,7 @@ from stmpl_core.errors import InvalidInput, MeshError
 from stmpl_core.mending import closed, openings
 from stmpl_core.spline import spline_sum
 from stmpl_core.tool import Tool
-from stmpl_core.walls import outer_walls
+from stmpl_core.walls import areas, outer_walls
 
 log = logging.getLogger(__name__)
 
@@ -98,10 +98,10 @@ class SignedDistance:
         vertices, faces, watertight, flipped = _checked(mesh)
         used = vertices[np.unique(faces)]
         low, extent = used.min(axis=0), np.ptp(used, axis=0)
-        area = float(_face_areas(vertices, faces).sum())
+        area = float(areas(vertices[faces]).sum())
         outer, seen = _outside(vertices, faces, field_spacing(area, extent, margin))
         if spacing is None:
-            spacing = field_spacing(float(_face_areas(*outer).sum()), extent, margin)
+            spacing = field_spacing(float(areas(outer[0][outer[1]]).sum()), extent, margin)
         elif not (np.isfinite(spacing) and spacing > 0):
             raise InvalidInput(f"spacing is {spacing} m; it must be finite and above 0.")
         coarse = np.ceil((extent + 2 * margin) / (COARSE * spacing)).astype(int) + 2  # nodes each way
@@ -175,7 +175,7 @@ def _checked(mesh: Tool) -> tuple[Points, np.ndarray, bool, bool]:
     if extent < MIN_EXTENT:
         raise MeshError(f"the tool is {extent:.2g} m wide; at least {MIN_EXTENT:g} m is needed. Is its mesh in metres?")
     watertight = closed(vertices, faces)
-    area = _face_areas(vertices, faces)
+    area = areas(vertices[faces])
     faces = faces[area > 1e-12 * area.max()].astype(np.int64)
     if not len(faces) or area.max() < 1e-12:
         raise MeshError(f"the tool's largest face has {area.max():.2g} m2: there is no surface to touch with.")
@@ -188,11 +188,6 @@ def _checked(mesh: Tool) -> tuple[Points, np.ndarray, bool, bool]:
     if not watertight:
         log.warning("the tool's mesh has holes; what is inside it near them is a guess")
     return np.ascontiguousarray(vertices), faces, watertight, flipped
-
-
-def _face_areas(vertices: Points, faces: np.ndarray) -> np.ndarray:
-    a, b, c = (vertices[faces[:, k]] for k in range(3))
-    return 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)
 
 
 def _finer(coarse: np.ndarray) -> np.ndarray:
@@ -217,11 +212,12 @@ def _finer(coarse: np.ndarray) -> np.ndarray:
 def _half_thickness(coefficients: np.ndarray, origin: np.ndarray, spacing: float, vertices: Points,
                     faces: np.ndarray) -> float:  # fmt: skip
     """See SignedDistance; from PROBED places of the surface, a third of which may be less thick: edges are."""
-    corners, areas, rng = vertices[faces], _face_areas(vertices, faces), np.random.default_rng(0)
-    some = rng.choice(len(faces), PROBED, p=areas / areas.sum())
+    corners, rng = vertices[faces], np.random.default_rng(0)
+    area = areas(corners)
+    some = rng.choice(len(faces), PROBED, p=area / area.sum())
     shares = np.diff(np.sort(rng.uniform(size=(PROBED, 2))), prepend=0.0, append=1.0)
     a, b, c = np.swapaxes(corners[some], 0, 1)
-    inwards = -np.cross(b - a, c - a) / (2 * areas[some, None])
+    inwards = -np.cross(b - a, c - a) / (2 * area[some, None])
     way = np.linspace(0.0, THICK, 1 + int(THICK / min(max(0.5 * spacing, 2e-4), 1e-3)))[1:]
     places = np.einsum("pc,pcx->px", shares, corners[some])[:, None] + way[:, None] * inwards[:, None]
     inside = -_distances(coefficients, origin, spacing, places.reshape(-1, 3)).reshape(PROBED, -1)

@@ -138,3 +138,25 @@ def twins(points, inward, area, group, of):
             pairs[found, 0], pairs[found, 1], share[found] = i, j, GIVES * (1 - over) ** 2
             found += 1
     return pairs[:found].copy(), share[:found].copy()
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def give_way(blocks, pairs, share):
+    """Adds to motions of nodes under forces at each, (N, 3, 3, M): by node, direction of both, node, what Twins give.
+
+    They give way to what their forces differ by.
+    """
+    gives = np.empty(len(share), blocks.dtype)
+    for k in range(len(share)):
+        i, j = pairs[k]
+        own = 0.0
+        for x in range(3):
+            own += blocks[i, x, x, i] + blocks[j, x, x, j]
+        gives[k] = share[k] * own / 6
+    for k in range(len(share)):
+        i, j = pairs[k]
+        for x in range(3):
+            blocks[i, x, x, i] += gives[k]
+            blocks[j, x, x, j] += gives[k]
+            blocks[i, x, x, j] -= gives[k]
+            blocks[j, x, x, i] -= gives[k]

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from stmpl_core.arrays import Faces, Points
-from stmpl_core.mending import places
+from stmpl_core.mending import parts
 
 FINE = 2.0  # longest edge over the spacing of the pieces that are looked at
 HALVINGS = 5  # of an edge, to find where a wall ends on it
@@ -52,7 +52,7 @@ def outer_walls(vertices: Points, faces: Faces, spacing: float) -> OuterWalls | 
     corners, boxes = walls.vertices[faces], None
     tried = _drawn(corners)
     found = tried[walls.inner(tried, MIDDLE)[:, 0]]
-    part = _parts(walls.vertices, faces)
+    part = parts(walls.vertices, faces)
     some = np.full(len(faces), len(found) > 0)
     if 0 < part.max() < MANY_PARTS:
         boxes = _boxes(corners, part)
@@ -172,29 +172,15 @@ class _Walls:
 def _drawn(corners: np.ndarray) -> np.ndarray:
     """About TRIED triangles of those given (F, 3, 3), spread evenly over their area; pieces where they are few."""
     if len(corners) < TRIED:
-        corners = _halved(corners, 2 * (_areas(corners).sum() / TRIED) ** 0.5)
-    area = np.cumsum(_areas(corners))
+        corners = _halved(corners, 2 * (areas(corners).sum() / TRIED) ** 0.5)
+    area = np.cumsum(areas(corners))
     return corners[np.unique(np.searchsorted(area, area[-1] * (np.arange(TRIED) + 0.5) / TRIED))]
 
 
-def _areas(pieces: np.ndarray) -> np.ndarray:
+def areas(pieces: np.ndarray) -> np.ndarray:
+    """Areas of triangles (T, 3, 3), (T,)."""
     a, b, c = np.swapaxes(pieces, 0, 1)
     return 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)
-
-
-def _parts(vertices: Points, faces: Faces) -> np.ndarray:
-    """Number of the part that each face belongs to, of those that hang together by their edges, (F,)."""
-    from scipy.sparse import coo_array, csgraph
-
-    corners = places(vertices)[faces]
-    half = np.sort(np.stack([corners, corners[:, [1, 2, 0]]], axis=-1).reshape(-1, 2), axis=1)
-    key = half[:, 0] * len(vertices) + half[:, 1]
-    order = np.argsort(key)
-    start = np.flatnonzero(np.diff(key[order], prepend=-1))
-    pair = start[np.diff(start, append=len(order)) == 2]  # an edge of more faces joins no parts
-    ends = order[pair] // 3, order[pair + 1] // 3
-    graph = coo_array((np.ones(len(pair), np.int8), ends), (len(faces), len(faces)))
-    return csgraph.connected_components(graph, directed=False)[1]
 
 
 def _boxes(corners: np.ndarray, part: np.ndarray) -> np.ndarray:
