@@ -41,6 +41,7 @@ def main() -> None:
         for rate in given.rates if mount == "fixed" else given.rates[:1]:
             run = Massage(build(layer, site, mount=mount, radius=RADIUS, timestep=1 / rate), course, skin=ready)
             ready = run.skin.simulator
+            run.warm_up()
             log = run.run()
             kept = figures_of(log)
             press, circle = kept["phases"]

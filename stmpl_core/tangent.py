@@ -93,7 +93,8 @@ def _of_group(toucher: Toucher, touches: Sequence[Touch]) -> list[Tangent]:
     for k, (touch, one, nodes) in enumerate(zip(touches, parts, every, strict=True)):
         assert one.forces is not None
         lean = 0.0 if touch.slip is None else touch.slip.lean  # its arm goes along with the contact
-        turned, whole = _turned(slopes[:, slices[k]], one.factor * unit, nodes.area, nodes.corners, nodes.shares,
+        own = np.ascontiguousarray(slopes[:, slices[k]])  # of one tool it is, and compiled code asks which
+        turned, whole = _turned(own, one.factor * unit, nodes.area, nodes.corners, nodes.shares,
                                 one.forces, moved[k], k, layer.vertices, layer.vertex_area_vectors,
                                 layer.vertex_areas, touch.pose_body_from_tool[:3, 3], one.stuck,
                                 touch.push - lean)  # fmt: skip

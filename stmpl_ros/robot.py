@@ -194,7 +194,7 @@ def made(config: RobotConfig, layer: SoftLayer, stop: threading.Event) -> Massag
     """The robot on a layer with nothing left to compile, which may take a minute. Raises InvalidInput or Stopped."""
     with interruptible(stop):
         massage = massage_of(config, layer)
-        warm_up(massage)
+        massage.warm_up()
         return massage
     raise Stopped("asked to stop")
 
@@ -227,24 +227,6 @@ def run(config: RobotConfig, arguments: Sequence[str] | None = None) -> int:
             return 1
         finally:
             node.destroy_node()
-
-
-def warm_up(massage: Massage) -> None:
-    """Two steps with all tools in the skin, so that nothing is left to compile once the clock runs."""
-    from stmpl_sim.grip import GAP
-    from stmpl_sim.scene import BALL
-
-    skin, data = massage.skin, massage.data
-    poses = skin.poses(data)
-    normal = massage.limb_pose()[:3, :3] @ massage.scene.site.normal
-    inwards = {BALL: -(0.01 + 1e-3) * normal}  # it starts 10 mm over the skin
-    inwards |= {name: (GAP + 1e-3) * data.joint(name).xaxis for name in massage.fingers}
-    pressed = {name: pose.copy() for name, pose in poses.tools.items()}
-    for name, way in inwards.items():
-        pressed[name][:3, 3] += way
-    there, memory = type(poses)(poses.body, pressed), None
-    for _ in range(2):
-        memory = skin.contact.step(there, memory, massage.scene.model.opt.timestep).memory
 
 
 def _go_on(stop: threading.Event) -> None:

@@ -13,13 +13,15 @@ import numpy as np
 from stmpl_core.arrays import Wrench, cross
 from stmpl_core.errors import InvalidInput
 from stmpl_core.friction import Friction
+from stmpl_core.local_contact import local_contacts
 from stmpl_sim.ability import strength
 from stmpl_sim.controller import ForceImpedance, Gains, Goal
 from stmpl_sim.energy import EnergyBook
 from stmpl_sim.engine import mujoco
-from stmpl_sim.grip import FINGERS, Gripper, smooth, with_fingers
+from stmpl_sim.grip import FINGERS, GAP, Gripper, smooth, with_fingers
 from stmpl_sim.grip import PHASES as GRIPPING
 from stmpl_sim.mujoco_skin import SoftBody
+from stmpl_sim.protocol import Memory, Poses
 from stmpl_sim.scene import BALL, LIMB, Scene
 from stmpl_sim.site import Circle
 
@@ -287,6 +289,23 @@ class Massage:
         self.data.qpos[:] = self.scene.qpos
         self.controller.reset()
         mujoco.mj_forward(self.scene.model, self.data)
+
+    def warm_up(self) -> None:
+        """Goes back to the start after steps with all tools in the skin: then nothing is left to compile."""
+        skin, data = self.skin, self.data
+        poses, normal = skin.poses(data), self.limb_pose()[:3, :3] @ self.scene.site.normal
+        inwards = {BALL: -(START_M + 1e-3) * normal}
+        inwards |= {name: (GAP + 1e-3) * data.joint(name).xaxis for name in self.fingers}
+        pressed = {name: pose.copy() for name, pose in poses.tools.items()}
+        for name, way in inwards.items():
+            pressed[name][:3, 3] += way
+        memory = Memory()
+        for _ in range(2):
+            reaction = skin.contact.step(Poses(poses.body, pressed), memory, self.scene.model.opt.timestep)
+            memory = reaction.memory
+        local_contacts(skin.simulator.history, list(reaction.touches.values()), memory.tissue)
+        self.step(lambda limb: self.course.goal(0.0, limb, self.scene.radius))
+        self.reset()
 
     def step(self, goal: Callable[[np.ndarray], Goal]) -> tuple[Goal, float]:
         """One step: contact, controller, physics.

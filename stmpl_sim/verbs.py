@@ -99,6 +99,7 @@ def sim(
                   timestep=1 / rate, gripper=grip > 0)  # fmt: skip
     course = Course(site.circle(1e-3 * circle), tuple(force), 1e-3 * speed, laps, grip)
     massage = Massage(scene, course, damping=damping, friction=friction_from(friction), every=every)
+    massage.warm_up()
     out.mkdir(parents=True, exist_ok=True)
     shots: list[Any] | None = None if film == "none" else []
     log = _run(massage, shots, quiet=as_json)

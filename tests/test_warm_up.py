@@ -4,10 +4,20 @@ import pytest
 
 from tests.bus import end, start
 
-FRESH = """
+KERNELS = """
 import sys
-import numpy as np
 from numba.core.dispatcher import Dispatcher
+
+
+def kernels():
+    ours = [vars(module) for name, module in sys.modules.items() if name.startswith(("stmpl_core", "stmpl_sim"))]
+    found = {one for names in ours for one in names.values() if isinstance(one, Dispatcher)}
+    return {(one.py_func.__module__, one.__name__, str(kind)) for one in found for kind in one.signatures}
+
+
+"""
+FRESH = KERNELS + """
+import numpy as np
 from stmpl_core import Contact, Simulator
 from stmpl_core.friction import friction_from
 from stmpl_core.local_contact import local_contacts
@@ -16,12 +26,6 @@ from stmpl_core.state import State
 from stmpl_ros.making import warm_up
 from tests.scenes import RADIUS, at, ball, limb
 from tests.test_posing import hinged
-
-
-def kernels():
-    ours = [vars(module) for name, module in sys.modules.items() if name.startswith("stmpl_core")]
-    found = {one for names in ours for one in names.values() if isinstance(one, Dispatcher)}
-    return {(one.py_func.__module__, one.__name__, str(kind)) for one in found for kind in one.signatures}
 
 
 layer = limb(8e-3)
@@ -43,6 +47,30 @@ for angle in (0.0, 0.4):
                 local_contacts(simulator.history, touches, state)
 print(sorted(kernels() - before))
 """
+
+
+ROBOT = KERNELS + """
+from stmpl_core.body import Body
+from stmpl_core.living import living
+from stmpl_ros.parameters import RobotConfig
+from stmpl_ros.robot import massage_of
+
+layer = living(Body.anny(), "left_forearm", edge_length=8e-3)
+massage = massage_of(RobotConfig(laps=0.1, grip=5.0, physics=250.0, friction=sys.argv[1]), layer)
+massage.warm_up()
+before = kernels()
+log = massage.run()
+assert log.force.max() > 4 and log.squeeze.max() > 4
+print(sorted(kernels() - before))
+"""
+
+
+@pytest.mark.parametrize("friction", ["none", "oiled"])
+def test_nothing_is_left_to_compile_once_the_clock_of_a_robot_runs(friction):
+    """One that massages, then grips."""
+    pytest.importorskip("mujoco", reason="pip install 'stmpl[sim]'")
+    code, said = end(start("-c", ROBOT, friction))
+    assert (code, said) == (0, "[]\n")
 
 
 @pytest.mark.parametrize("friction", ["none", "0.4"])
