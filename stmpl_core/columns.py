@@ -21,6 +21,7 @@ from stmpl_core.rays import (
     distance_in_column,
     ray_from,
     ray_of,
+    to_tool,
     wall_in,
 )
 from stmpl_core.sdf import SignedDistance
@@ -211,6 +212,9 @@ def _through_box(points, inward, thickness, order, blocks, pose, low, high, reac
             a, b, c, t = points[v, 0] - centre[0], points[v, 1] - centre[1], points[v, 2] - centre[2], thickness[v]
             if a * a + b * b + c * c > (radius + t) ** 2:
                 continue
+            x, y, z = to_tool(pose, points[v, 0], points[v, 1], points[v, 2])
+            if max(low[0] - x, x - high[0], low[1] - y, y - high[1], low[2] - z, z - high[2]) > t:
+                continue
             ray, begin, end = ray_of(pose, points, inward, v), 0.0, t
             for x in range(3):  # the part of the column between two sides of the box
                 start, way = (ray[0], ray[3]) if x == 0 else (ray[1], ray[4]) if x == 1 else (ray[2], ray[5])
@@ -328,22 +332,29 @@ def _cover(grid, pose, points, inward, thickness, faces, start, around, slot, co
     At the border the depth falls to 0 beside a wall of the tool, and where a tool has sunk under skin that it
     does not reach, within half of that inside it.
     """
-    room = 0
+    room, many, count, vertices = 0, 0, 0, np.empty(len(slot), np.int64)
     for v in covered:
-        room += start[v + 1] - start[v]
-    found, vertices, many, count = np.empty(room, np.int64), np.empty(3 * room, np.int64), 0, 0
-    for v in covered:
-        for p in range(start[v], start[v + 1]):
-            f = around[p]
+        if start[v + 1] > start[v]:
+            room += start[v + 1] - start[v]
+            vertices[count], slot[v] = v, count
+            count += 1
+    found, inner = np.empty(room, np.int64), count
+    for n in range(inner):
+        for p in range(start[vertices[n]], start[vertices[n] + 1]):
+            f, first = around[p], True
+            for k in range(3):
+                first = first and not 0 <= slot[faces[f, k]] < n  # else it came with another corner
+            if not first:
+                continue
+            found[many] = f
+            many += 1
             for k in range(3):
                 w = faces[f, k]
                 if slot[w] < 0:
                     slot[w] = count
                     vertices[count] = w
                     count += 1
-            found[many] = f
-            many += 1
-    found = np.unique(found[:many])
+    found = np.sort(found[:many])
     vertices = np.sort(vertices[:count])
     depth, rests = np.empty(count), np.zeros(count)
     for n in range(count):

@@ -29,6 +29,7 @@ from stmpl_core.layer import SoftLayer
 from stmpl_core.moments import Surroundings
 from stmpl_core.nodes import Nodes
 from stmpl_core.nodewise import FIRST_LOG, REACH, SPREADS, STEP_LOG, Packed
+from stmpl_core.obstacle import columns_of
 from stmpl_core.response import FAST, SPREAD
 from stmpl_core.softness import BANK, Softness
 from stmpl_core.stack import Effective, along, compliance, effective, hardening
@@ -547,12 +548,13 @@ def _inwards(index, weight, many, some, gathered, motion, turns, inward, out):
     felt, place = _between_coarse(index, many, some, motion, turns)
     rows, spread = np.zeros((len(index), len(some))), np.zeros((len(some), len(index)))
     for n in range(len(index)):
+        row = rows[n]
         for a in range(many[n]):
             spread[place[n, a], n] = weight[n, a] / gathered[index[n, a]]
-            for x in range(3):
-                share = weight[n, a] * inward[n, x]
-                for d in range(len(some)):
-                    rows[n, d] += share * felt[place[n, a], x, d]
+            at = felt[place[n, a]]
+            s0, s1, s2 = (weight[n, a] * inward[n, 0], weight[n, a] * inward[n, 1], weight[n, a] * inward[n, 2])
+            for d in range(len(some)):  # one loop: the row stays in registers
+                row[d] = row[d] + s0 * at[0, d] + s1 * at[1, d] + s2 * at[2, d]
     out += np.dot(rows, spread)
 
 
@@ -567,24 +569,28 @@ def _matrix(points, inward, area, corners, shares, group, unit, soft, banked, sk
     least, steps, logs = area.min(), (AREAS - 1) / max(np.ptp(area), 1e-9 * area.max()), np.empty(AREAS)
     for k in range(AREAS):  # of spreads in metres: one for each pair would take as long as all else
         logs[k] = np.log(SPREAD * np.sqrt(least + k / steps))
-    roots, own = np.sqrt(unit), 0.5 * np.log(unit)
+    roots, own, by = np.sqrt(unit), 0.5 * np.log(unit), columns_of(points, inward)
+    facing, place, spot, away = np.empty(count), np.empty(count), np.empty(count), np.empty(count)
     for i in range(count):
+        p0, p1, p2, n0, n1, n2 = by[0, i], by[1, i], by[2, i], by[3, i], by[4, i], by[5, i]
+        its, root = area[i], roots[i]
+        for j in range(i + 1):  # what runs in vector registers
+            facing[j] = n0 * by[3, j] + n1 * by[4, j] + n2 * by[5, j]
+            x, y, z, mean = p0 - by[0, j], p1 - by[1, j], p2 - by[2, j], 0.5 * (its + area[j])
+            square = x * x + y * y + z * z
+            place[j] = np.sqrt(np.sqrt(square) / (root * roots[j])) * ROWS
+            spot[j] = min((mean - least) * steps, AREAS - 1.001)
+            away[j] = np.sqrt(square + mean * (ROUND * SPREAD) ** 2)
         for j in range(i + 1):
             if group[i] != group[j]:
                 wide[i, j] = wide[j, i] = 0.0
                 continue
-            both = 0.5 * (wide[i, j] + wide[j, i])
-            facing = inward[i, 0] * inward[j, 0] + inward[i, 1] * inward[j, 1] + inward[i, 2] * inward[j, 2]
-            x, y, z = points[i, 0] - points[j, 0], points[i, 1] - points[j, 1], points[i, 2] - points[j, 2]
-            t = roots[i] * roots[j]
-            square = x * x + y * y + z * z
-            f = np.sqrt(np.sqrt(square) / t) * ROWS
-            if facing > 0 and f < FARTHEST:
-                k, mean = int(f), 0.5 * (area[i] + area[j])
-                a = min((mean - least) * steps, AREAS - 1.001)
-                h = _row_of(logs[int(a)] + (a - int(a)) * (logs[int(a) + 1] - logs[int(a)]) - own[i] - own[j])
+            both, f = 0.5 * (wide[i, j] + wide[j, i]), place[j]
+            if facing[j] > 0 and f < FARTHEST:
+                k, a = int(f), int(spot[j])
+                h = _row_of(logs[a] + (spot[j] - a) * (logs[a + 1] - logs[a]) - own[i] - own[j])
                 value = _softly(banked, 0.5 * (soft[i] + soft[j]), k, f - k, int(h), h - int(h))
-                both += _share(facing) * value / np.sqrt(square + mean * (ROUND * SPREAD) ** 2)
+                both += _share(facing[j]) * value / away[j]
             out[i, j] = out[j, i] = both
     _temper(out, wide)
     return out, wide

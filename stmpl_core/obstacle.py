@@ -84,7 +84,7 @@ def pairs(points, inward, thickness, area, group, mean, half_space, rows):
         mean: unit of length [m].
         half_space, rows: tables of a Response.
     """
-    count, width, by = len(points), rows.shape[1] - 1, _columns_of(points, inward)
+    count, width, by = len(points), rows.shape[1] - 1, columns_of(points, inward)
     out, rings = np.empty((count, count)), np.empty((width, count, count), np.float32)
     roots, own = 1 / np.sqrt(thickness), np.sqrt(area) / OWN
     away, place, per = np.empty(count), np.empty(count), np.empty(count)
@@ -109,7 +109,7 @@ def pairs(points, inward, thickness, area, group, mean, half_space, rows):
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def rings_of(points, inward, thickness, group, rows):
     """The weights in rings that `pairs` gives for nodes on a layer of one thickness [m], (., N, N)."""
-    count, scale, by = len(points), STEPS / thickness, _columns_of(points, inward)
+    count, scale, by = len(points), STEPS / thickness, columns_of(points, inward)
     rings = np.empty((rows.shape[1] - 1, count, count), np.float32)
     away, per = np.empty(count), np.full(count, 1 / (thickness * thickness))
     for i in range(count):
@@ -124,7 +124,7 @@ def rings_of(points, inward, thickness, group, rows):
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _columns_of(points, inward):
+def columns_of(points, inward):
     """Places and normals of nodes, one below the other, (6, N): loops over nodes then run in vector registers."""
     by = np.empty((6, len(points)))
     for n in range(len(points)):
