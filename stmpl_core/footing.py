@@ -5,7 +5,7 @@ from __future__ import annotations
 import numba
 import numpy as np
 
-from stmpl_core.relaxation import faded, left_over, stretch, weights
+from stmpl_core.relaxation import decay_of_free, faded, left_over, stretch, weights
 
 LEFT = 0.6  # of what is dragged: what a way of one radius leaves behind, far on; a ball that rolls by finite elements
 ROLLED, PASSED = 0.5, 0.25  # radius of the room that a contact has rolled over, and of that it has slid over, over a
@@ -337,8 +337,25 @@ def way_along(twist, contact, pose):
     return _dot(go, contact[2]), _dot(go, _cross(contact[1], contact[2]))
 
 
+def part_of_way(way: np.ndarray, normal: np.ndarray, depth: float, radius: float, power: float) -> float:
+    """Share of a step in which a tool is in the skin that it comes to, or leaves [-].
+
+    Its force rises with a power of the depth, and is taken to rise straight: in a shorter time, at the end of which as
+    much has been pressed.
+
+    Args:
+        way: way of its middle into the skin, or out of it, (3,) [m].
+        normal: unit vector into the skin, or out of it, (3,).
+        depth, radius: depth and radius of the contact that it comes to, or leaves [m].
+        power: that power [-].
+    """
+    across = float(way @ normal)
+    aside = float(np.linalg.norm(way - across * normal))
+    return min(1.0, depth / max(across, depth), radius / max(aside, radius)) * 2 / (max(power, 1.0) + 1)
+
+
 @numba.njit(cache=True, error_model="numpy")
-def aged(before, pose, imprint, contact, known, held, share, goes, radius, at, shares, times, fades, dt, elastic,
+def aged(before, pose, imprint, contact, known, held, share, goes, radius, at, part, shares, times, fades, dt, elastic,
          relaxed):  # fmt: skip
     """Twist, gone, kept, gain, owed, now and passed of an Asked (stmpl_core.balance).
 
@@ -350,6 +367,7 @@ def aged(before, pose, imprint, contact, known, held, share, goes, radius, at, s
         share, radius, elastic: see Scalars.
         goes: way that skin goes along with the tool until all of it slides [m].
         at: where the contact is in the room that it has slid over, see `beyond`, (3,) [m].
+        part: share of the step, its end, in which skin is held [-]; before that it is free.
         shares, times: series of the relaxation, (P,) each.
         fades: see relaxation.faded.
         dt: time of the step [s].
@@ -364,7 +382,11 @@ def aged(before, pose, imprint, contact, known, held, share, goes, radius, at, s
         first, second = way_along(twist_between(imprint, pose), contact, imprint)
         gone = np.sqrt(first * first + second * second) / radius
     more = faded(fades, radius)
-    weights(times, dt, gone, more * elastic, relaxed, kept, gain)
+    if part < 1:
+        relaxed, elastic = decay_of_free(shares, times, (1 - part) * dt) @ relaxed, 0.0
+        for i in range(len(times)):
+            elastic += shares[i] * relaxed[i]
+    weights(times, part * dt, gone, more * elastic, relaxed, kept, gain)
     for i in range(len(times)):
         owed += shares[i] * kept[i]
         now -= more * shares[i] * gain[i]

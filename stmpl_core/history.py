@@ -16,23 +16,26 @@ from typing import Any
 import numpy as np
 
 from stmpl_core import wake
+from stmpl_core.arrays import Transform, inverted
 from stmpl_core.balance import Asked, Law, balanced, scaled
 from stmpl_core.columns import shifted
 from stmpl_core.contact import Contact
 from stmpl_core.dragged import MIN_OFFSET
 from stmpl_core.errors import InvalidInput
-from stmpl_core.footing import HELD_OFF, aged, bearing, needed
+from stmpl_core.footing import HELD_OFF, aged, bearing, needed, part_of_way
 from stmpl_core.friction import Friction, coefficients
 from stmpl_core.relaxation import depth_left, faded, fading, let_go, series_of, stretch
 from stmpl_core.sideways import Sideways
-from stmpl_core.slip import rub
+from stmpl_core.slip import MOST_GROWN, rub
 from stmpl_core.state import Memory, Scalars, State, fresh
 from stmpl_core.touch import APART, MIN_ONE_WAY_SHARE, Imprint, Pressed, Slip, Touch
 from stmpl_core.toucher import Toucher
+from stmpl_core.trust import Trust
 
 RUBBED = 0.1  # of the force: what skin that gives way beneath a dry tool is off, as the law was learnt from what sticks
 PILED = 0.5  # of drag^2 / force: error of skin that piles up; 0.7 of it on a back, where the elastic bound was 0.45
 LOST = 0.5  # of what skin carries along itself: what is gone once all of it slides; 0.4 to 0.6 by slides on a forearm
+MOST_DRAGGED = 0.9  # way by which sticking skin is dragged along, over the thickness, up to which it was tried
 STRAYED = 0.03  # of the elastic force: part of the memory from touches out of range, beyond which an answer is, too
 NONE, NO_ROOM, FLAT = np.zeros(6), np.zeros(3), np.zeros((3, 3))
 
@@ -96,6 +99,7 @@ class History:
             asked = [new or one for one, new in zip(asked, again, strict=True)]
             tried |= {touch.name: touch.moved for touch in touches if touch.name in tried}
             touches = self.toucher.touch_all([one.contact for one in asked], alone=False, tried=tried)
+        asked = [self._late(one, touch, dt) for one, touch in zip(asked, touches, strict=True)]
         laws = [self._law(one, touch, dt) for one, touch in zip(asked, touches, strict=True)]
         out, memories = balanced(asked, laws, self.series.shares)
         out = [self._doubted(one, touch, memories, dt) for one, touch in zip(asked, out, strict=True)]
@@ -132,7 +136,7 @@ class History:
             strayed = min(strayed + most * float(self.series.shares @ -np.expm1(-dt / self.series.times)), relaxed)
         if (strayed, doubted) != (scalars.strayed, scalars.doubted):
             memories[touch.name] = memory._replace(scalars=scalars._replace(strayed=strayed, doubted=float(doubted)))
-        if touch.trust.in_range and strayed > STRAYED * scalars.elastic > 0:
+        if touch.trust.in_range and (scalars.pressing > 0 or scalars.sunk) and strayed > STRAYED * scalars.elastic > 0:
             return touch.with_(trust=touch.trust.also(
                 f"{touch.name} meets skin that still relaxes from a touch out of range", in_range=False))  # fmt: skip
         return touch
@@ -145,11 +149,7 @@ class History:
         memory = before or fresh(pose, len(self.series.times))
         known = before is not None and memory.scalars.pressing >= 0
         scalars = memory.scalars
-        goes = scalars.limit / memory.stiffness[0] if memory.stiffness[0] > 0 else 0.0
-        at = np.array((scalars.passed_first, scalars.passed_second, scalars.passed))
-        twist, gone, kept, gain, owed, now, passed = aged(
-            memory.pose, pose, memory.imprint, memory.contact, known, scalars.pressing > 0, scalars.share, goes,
-            scalars.radius, at, *self.series, self._fades, dt, scalars.elastic, memory.relaxed)  # fmt: skip
+        twist, gone, kept, gain, owed, now, passed = self._aged(memory, known, pose, dt)
         asked, moved = contact, None
         if contact.wrench is not None and (len(kept) or memory.slid < 1):
             force = contact.wrench[:3]
@@ -161,6 +161,29 @@ class History:
                 if scalars.pressing > 0:
                     moved = float((memory.imprint[:3, 3] - memory.pose[:3, 3]) @ force) / size
         return Asked(asked, contact, memory, known, twist, gone, kept, gain, owed, now, passed, moved)
+
+    def _aged(self, memory: Memory, known: bool, pose: Transform, dt: float, part: float = 1.0) -> tuple[Any, ...]:
+        """See footing.aged: of a tool that is at a pose (4, 4) now, and held its skin for a part of the step."""
+        scalars = memory.scalars
+        goes = scalars.limit / memory.stiffness[0] if memory.stiffness[0] > 0 else 0.0
+        at = np.array((scalars.passed_first, scalars.passed_second, scalars.passed))
+        return aged(memory.pose, pose, memory.imprint, memory.contact, known, scalars.pressing > 0, scalars.share, goes,
+                    scalars.radius, at, part, *self.series, self._fades, dt, scalars.elastic,
+                    memory.relaxed)  # fmt: skip
+
+    def _late(self, one: Asked, touch: Touch, dt: float) -> Asked:
+        """The same where a tool came to the skin late in the step: from then on it relaxes."""
+        pressed = touch.pressed
+        if one.stated.wrench is not None or not one.known or one.before.scalars.pressing > 0 or not len(one.kept) or \
+                not touch.presses or pressed is None or pressed.forces is None or not touch.force > 0:  # fmt: skip
+            return one
+        some, pose = pressed.forces > 0, one.stated.pose_body_from_tool
+        middle = pressed.forces @ pressed.squeeze.nodes.points / pressed.forces.sum()
+        way = -_gone(pose, one.before.pose, middle)
+        radius = math.sqrt(float(pressed.squeeze.nodes.area[some].sum()) / math.pi)
+        part = part_of_way(way, touch.push / touch.force, touch.depth, radius, pressed.power)
+        _, gone, kept, gain, owed, now, passed = self._aged(one.before, one.known, pose, dt, part)
+        return one._replace(gone=gone, kept=kept, gain=gain, owed=owed, now=now, passed=passed)
 
     def _again(self, one: Asked, touch: Touch) -> Asked | None:
         """The same with a wrench that fits where the contact's normal turned out to be; None where it does."""
@@ -204,11 +227,11 @@ class History:
         stiffness, springs, eased = NO_ROOM, one.before.springs, one.before.springs_relaxed
         mu = self.friction(touch.name)
         if mu > 0 and net > MIN_ONE_WAY_SHARE:
-            give = self.toucher.give(nodes, pressed.forces)
+            give, bend = self.toucher.give(nodes, pressed.forces), self.toucher.curvature(nodes, pressed.forces)
             (wrench, rubs, share, offset, turn, lean, grown, slid_offset, slid_turn, limit, stiffness, springs, eased,
              bent, slid, held, room, besides) = rub(
                 by * touch.wrench, NONE if stated is None else stated, stated is not None, contact, pose[:3, 3],
-                self.toucher.curvature(nodes, pressed.forces), FLAT if give is None else give, mu,
+                bend, FLAT if give is None else give, mu,
                 LOST * pressed.along, force, lever, at_rest, touch.depth, radius, pressed.power,
                 *self.sideways.at(radius, thickness), one.twist, one.known, before.pressing > 0, one.before.contact,
                 before.elastic, one.before.slid, before.held,
@@ -218,6 +241,16 @@ class History:
             if self.toucher.layer.tissue.skin is not None:
                 pressing = math.sqrt(wrench[:3] @ wrench[:3])
                 besides += RUBBED * pressing + PILED * float(rubs[:3] @ rubs[:3]) / pressing
+            elif (drag := float(rubs[:3] @ rubs[:3])) > 0:  # a round limb gives more than flat skin
+                besides += thickness * max(float(rubs[:3] @ bend @ rubs[:3]), 0.0) / math.sqrt(drag)
+            if grown >= MOST_GROWN and stated is None:
+                touch = touch.with_(trust=touch.trust.also(
+                    f"{touch.name} drags skin around the limb, which would press {grown - 1:.0%} harder than pressed "
+                    "straight, or more; that was not tried", in_range=False))  # fmt: skip
+            if (dragged := math.sqrt(offset @ offset) / thickness) > MOST_DRAGGED:
+                touch = touch.with_(trust=touch.trust.also(
+                    f"{touch.name} drags skin along by {dragged:.2g} of its thickness; tried is {MOST_DRAGGED:g}",
+                    in_range=False))  # fmt: skip
             if besides > 0:
                 changed["force_bound"] = changed.get("force_bound", touch.force_bound) + besides
             wrench = wrench + rubs
@@ -238,8 +271,14 @@ class History:
         """Skin that the tool does not hold comes back by itself; asked: force at rest that the tool asks for [N]."""
         before = one.before.scalars
         if touch.presses and touch.pressed is not None:
-            touch = touch.with_(status=APART, wrench=np.zeros(6), force_bound=0.0, pressure=None, pressed=None)
-        memory = self._back(one.before, dt, one.gone, asked)
+            touch = touch.with_(status=APART, wrench=np.zeros(6), force_bound=0.0, pressure=None, pressed=None,
+                                trust=Trust())  # fmt: skip
+        part = 1.0
+        if asked == 0 and before.radius > 0 and before.pressing > 0:
+            middle, normal = one.before.contact[:2]
+            way = _gone(one.before.pose, one.stated.pose_body_from_tool, middle)
+            part = part_of_way(way, -normal, before.depth, before.radius, before.power)
+        memory = self._back(one.before, dt, one.gone, asked, part)
         memory = memory._replace(pose=one.stated.pose_body_from_tool, wrench=touch.wrench,
                                  scalars=memory.scalars._replace(pressing=0.0))  # fmt: skip
         scalars, left = memory.scalars, wake.Wake(memory.trail, self.series.shares) if len(memory.trail) else None
@@ -251,7 +290,7 @@ class History:
 
     def _left(self, memory: Memory, dt: float) -> Memory:
         """The memory of a tool that is not told of any more: the skin comes back."""
-        after = self._back(memory, dt, 0.0, None)
+        after = self._back(memory, dt, 0.0, None, 1.0)
         scalars = after.scalars._replace(pressing=-1.0, work=0.0, strayed=self._strayed(memory, after, dt, 0.0))
         return after._replace(scalars=scalars, wrench=np.zeros(6))
 
@@ -264,7 +303,7 @@ class History:
             return max(min(before.scalars.strayed * math.exp(-dt / self.series.times[-1] - gone), has), 0.0)
         return before.scalars.strayed * max(has, 0.0) / max(had, 1e-300)
 
-    def _back(self, memory: Memory, dt: float, gone: float, asked: float | None) -> Memory:
+    def _back(self, memory: Memory, dt: float, gone: float, asked: float | None, part: float) -> Memory:
         """The memory of skin that comes back by itself.
 
         Where the tool lets it go it is as deep as the tool, from there on it comes back as its force does: what is left
@@ -274,10 +313,11 @@ class History:
             memory: memory before.
             dt, gone: see relaxation.let_go.
             asked: force at rest that the tool asks for at the end of the step [N]; None: it was taken away before.
+            part: share of the step until it asks for that [-].
         """
         before, shares = memory.scalars, self.series.shares
         held = before.elastic if before.pressing > 0 and asked is not None else 0.0
-        relaxed, least = let_go(*self.series, dt, gone, held, asked or 0.0, memory.relaxed)
+        relaxed, least = let_go(*self.series, dt, gone, part, held, asked or 0.0, memory.relaxed)
         if before.pressing > 0 and before.imprint_force > 0:
             depth = before.depth * depth_left(min(least / before.imprint_force, 1.0), before.power, 1 - before.stretch)
             before = before._replace(depth=depth, imprint_force=max(least, 1e-300), power=1.0,
@@ -319,6 +359,12 @@ class History:
         found = [(self.toucher.touch(Contact(self.toucher.tools[one.name], one.imprint.pose)), one.imprint.depth)
                  for one in some if one.imprint is not None]  # fmt: skip
         return [(touch, min(depth / touch.depth, 1.0)) for touch, depth in found if touch.presses]
+
+
+def _gone(before: Transform, after: Transform, point: np.ndarray) -> np.ndarray:
+    """Way of a tool's point, that is at `point` (3,) before, between poses (4, 4), (3,) [m]."""
+    motion = after @ inverted(before)
+    return motion[:3, :3] @ point + motion[:3, 3] - point
 
 
 def mean_thickness(pressed: Pressed) -> float:

@@ -239,18 +239,19 @@ def decay_of_free(shares, times, dt):
 
 
 @numba.njit(cache=True, error_model="numpy")
-def let_go(shares, times, dt, gone, before, after, relaxed):
+def let_go(shares, times, dt, gone, part, before, after, relaxed):
     """What has relaxed (P,) after a step in which the skin comes free, and the force at rest where it did.
 
     It comes free where the tool goes faster than it follows.
 
-    The elastic force that the tool asks for goes straight from `before` to `after`. Until the skin's force is 0 it
-    relaxes under the tool; from there on it comes back by itself. Skin that was free stays free.
+    The elastic force that the tool asks for goes straight from `before` to `after` in the first part of the step. Until
+    the skin's force is 0 it relaxes under the tool; from there on it comes back by itself. What was free stays free.
 
     Args:
         shares, times: series of the relaxation, (P,) each.
         dt, gone, before, relaxed: see `weights`.
-        after: elastic force that the tool asks for at the end of the step.
+        part: share of the step in which it does [-].
+        after: elastic force that the tool asks for at its end.
     """
     many, found = len(times), relaxed.copy()
     kept, gain, held = np.empty(many), np.empty(many), 0.0
@@ -258,10 +259,10 @@ def let_go(shares, times, dt, gone, before, after, relaxed):
     for i in range(many):
         owed += shares[i] * relaxed[i]
     if before > owed * (1 + 1e-9) and dt > 0:
-        low, high = 0.0, 1.0
+        low, high = 0.0, part
         for _ in range(HALVINGS):
             held = 0.5 * (low + high)
-            force, owed = before + held * (after - before), 0.0
+            force, owed = before + held / part * (after - before), 0.0
             weights(times, held * dt, held * gone, before, relaxed, kept, gain)
             for i in range(many):
                 owed += shares[i] * (kept[i] + gain[i] * force)

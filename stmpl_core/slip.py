@@ -55,6 +55,7 @@ PART, PARTS = 0.25, 16  # way over cap / k from which a step is cut, for a slide
 SPUN = 0.8  # of slide times spin over their limit: force aside that a turning tool takes; 0.64 by finite elements
 PLOUGHED = 0.33, 0.2, 0.67  # see ploughing: growth of stiffness, and of the cap without and over mu
 MOST_LEAN = 0.5  # turn of the normal under skin that is dragged along, of which a push takes note [rad]
+MOST_GROWN = 1.5  # factor on the push by which skin that is dragged around a limb grows; 1.38 by finite elements
 LEAST_GROWN = 0.5  # depth over the tool's that counts at least, where skin came from a hollow
 MOST_PASSES, SETTLED = 4, 1e-3  # turn of the normal [rad] at which push and friction agree
 
@@ -321,7 +322,7 @@ def rub(wrench, stated, by_force, contact, origin, bend, give, mu, along_itself,
         stiffness, springs, relaxed: see Memory, after the step.
         stored: energy that springs and bent skin store [J].
         slid, held, room: see Scalars.
-        aside: error of the force where the tool spins as it slides [N].
+        off: error of the force where the tool spins as it slides, or would grow by more than MOST_GROWN [N].
     """
     wanted, turned, out, carries, slid = np.zeros(3), np.zeros(3), 0.0, 1.0, before_slid
     if stiffness[0] > 0:
@@ -333,7 +334,7 @@ def rub(wrench, stated, by_force, contact, origin, bend, give, mu, along_itself,
     size = np.sqrt(wrench[0] ** 2 + wrench[1] ** 2 + wrench[2] ** 2)
     lost = (1 - before_slid) * before_elastic / elastic
     before = np.array([springs[:, x].sum() for x in range(3)])
-    arm, grown, cap, share, stored = contact[0] - origin, 1.0, 0.0, 0.0, 0.0
+    arm, wants, grown, cap, share, stored = contact[0] - origin, 1.0, 1.0, 0.0, 0.0, 0.0
     turned_by, arm_of_turn = way[2] / lever, lever
     carried, after, new, kept = np.zeros(3), stiffness.copy(), springs.copy(), relaxed.copy()
     for _ in range(MOST_PASSES):
@@ -341,7 +342,8 @@ def rub(wrench, stated, by_force, contact, origin, bend, give, mu, along_itself,
             carries = carried_more(stated, contact[1], turned) * before_slid
             grown = carries / slid
         else:
-            grown = max(1 + out / depth, LEAST_GROWN) ** power
+            wants = max(1 + out / depth, LEAST_GROWN) ** power
+            grown = min(wants, MOST_GROWN)
         stiffer, cap = ploughing(depth, radius, grown * force, along, bare, mu)
         plain = mu * grown * force / cap  # what turns in place has nothing before it that friction raises
         arm_of_turn = lever * (plain + (1 - plain) * PLOUGHED[1] / (PLOUGHED[1] + PLOUGHED[2] * mu))
@@ -363,7 +365,7 @@ def rub(wrench, stated, by_force, contact, origin, bend, give, mu, along_itself,
         if np.abs(turned - last).max() + abs(slid - last_slid) < SETTLED:
             break
     if by_force:
-        grown = carries / slid
+        grown = wants = carries / slid
     rubs, offset, turns = in_space(carried, new, after, leaned(contact, turned), contact, origin, arm_of_turn)
     part = np.array([np.dot(SLID, np.ascontiguousarray(new[:, x])) for x in range(3)])
     slid_offset, slid_turn = way_of_skin(part, after, contact, arm_of_turn)
@@ -378,6 +380,9 @@ def rub(wrench, stated, by_force, contact, origin, bend, give, mu, along_itself,
     else:
         held = after[0]
     push = grown * slid * wrench + wrench_at(lean, arm)
-    aside = SPUN * abs(carried[2]) * np.sqrt(carried[0] ** 2 + carried[1] ** 2) / cap if cap > 0 else 0.0
+    drags = np.sqrt(carried[0] ** 2 + carried[1] ** 2)
+    off = (wants - grown) * size
+    if cap > 0:
+        off += SPUN * abs(carried[2]) * drags / cap
     return (push, rubs, share, offset, turns, lean, grown, slid_offset, slid_turn, cap, after, new, kept, stored, slid,
-            held, room, aside)  # fmt: skip
+            held, room, off)  # fmt: skip

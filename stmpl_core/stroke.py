@@ -105,7 +105,8 @@ def played(stroke: Stroke, series: Series, friction: float) -> Course:
         if pressing:
             before, relaxed = elastic[k], kept + gain * elastic[k]
         else:
-            relaxed, _ = let_go(*series, dt[k], share * way[k] / stroke.radius, before, elastic[k], relaxed)
+            relaxed, _ = let_go(*series, dt[k], share * way[k] / stroke.radius, 1.0, before, elastic[k],
+                                relaxed)
             before = float(series.shares @ relaxed)
             springs[:], faded[:], stiff = 0.0, 0.0, np.zeros(3)
             continue

@@ -123,6 +123,16 @@ def faded(layer: SoftLayer, config: NodeConfig) -> SoftLayer:
     return held_skin(layer) if config.relaxing and not layer.tissue.relaxes else layer
 
 
+def compiled(skin: Skin | None, config: NodeConfig, build: Build) -> Skin | None:
+    """A skin that the settings ask for, unless one is given; for a process beside the node.
+
+    It answers first there, which may take half a minute: what is compiled is kept on disk, so the node need not.
+    """
+    made = skin_of(config, build) if skin is None else skin
+    warm_up(Simulator(made, friction=friction_of(config)))
+    return made if skin is None else None
+
+
 def restiffened(skin: Skin, config: NodeConfig, changed: set[str]) -> Skin | None:
     """The same skin, or one of another stiffness, where nothing else changes and that is quick; else None."""
     if changed and changed <= AT_ONCE:

@@ -42,6 +42,7 @@ from stmpl_ros.making import (
     at_once,
     check,
     check_part,
+    compiled,
     friction_of,
     layer_of,
     restiffened,
@@ -92,7 +93,7 @@ class SkinNode(ServingNode):
         self._build = build
         self.tally, self._counts = Tally(), Counts()
         self.workshop: Workshop | None = None
-        self._making: Beside[Skin] | None = None
+        self._making: Beside[Skin | None] | None = None
         self._twin = ""  # what the other node is that was told of
         self._done: Done = _nobody  # told what became of the skin that is being made
         self._open = ExitStack()  # what was opened when the node was configured
@@ -312,22 +313,27 @@ class SkinNode(ServingNode):
         if config == self.config:
             done("")
             return "nothing changes: the node answers on it already"
-        if stiffer := restiffened(self.skin, config, set(changes)):
+        stiffer = restiffened(self.skin, config, set(changes))
+        begins = friction_of(config) is not None and not self.answering.simulator.remembers
+        if stiffer and not begins:
             self._take_over(stiffer, config)
             done("")
             return "taken over"
         self._done = done
-        self._making = making = Beside(skin_of, config, self._build)
-        then(self, making.result, partial(self._on_skin, making, config))
+        self._making = making = Beside(compiled, stiffer, config, self._build)
+        then(self, making.result, partial(self._on_skin, making, stiffer, config))
         return "being made; skin/topology comes when it takes over"
 
-    def _on_skin(self, making: Beside[Skin], config: NodeConfig, future: Future[Skin]) -> None:
+    def _on_skin(self, making: Beside[Skin | None], stiffer: Skin | None, config: NodeConfig,
+                 future: Future[Skin | None]) -> None:  # fmt: skip
         if self._making is not making:
             return  # given up meanwhile
         making.close()
         self._making = None
         try:
-            self._take_over(future.result(), config)
+            skin = future.result() or stiffer
+            assert skin
+            self._take_over(skin, config)
             self._finish("")
         except Exception as error:  # whatever happened in the other process; the node goes on
             self._finish(str(error) or type(error).__name__)

@@ -324,6 +324,16 @@ def test_a_skin_that_takes_over_while_the_node_is_inactive_remembers_nothing_of_
     assert not node.answering.remembering.state.tools
 
 
+def test_friction_that_an_elastic_node_takes_over_is_compiled_beside_it(composed):
+    """Its first answer may take half a minute elsewhere, not here."""
+    node, skin = composed.node, composed.node.skin
+    assert not node.answering.simulator.remembers
+    assert node.set_body(friction="dry").startswith("being made")
+    composed.wait(lambda: composed.press() and node.answering.simulator.remembers)
+    assert node.config.friction == "dry" and node.skin is skin
+    composed.wait(lambda: composed.press() and node.answering.remembering.state.tools)
+
+
 def test_another_friction_is_taken_over_at_once_and_what_is_remembered_stays(composed):
     node = composed.node
     assert node.trigger_deactivate() == TransitionCallbackReturn.SUCCESS

@@ -145,6 +145,22 @@ def test_friction_turns_with_the_way(sim: Simulator) -> None:
         np.testing.assert_allclose(last.slip.wrench[:2] / np.linalg.norm(last.slip.wrench[:2]), [c, s], atol=0.02)
 
 
+@pytest.mark.parametrize("mu", [0.8, 1.2, 3.0])
+def test_skin_that_sticks_around_a_limb_does_not_run_away(mu: float) -> None:
+    """Its push grows with the drag and bounds it; where that is beyond what was tried, it ends, and is said."""
+    sim, state, out = Simulator(limb(5e-3, 0.01, youngs_modulus=2e4), Winkler(), friction=mu), State(), []
+    for angle in [0.0] * 12 + list(np.linspace(0, 2.0, 90)):
+        depth = 4e-3 * min(len(out) / 10, 1)
+        pose = turn((0, 0, 1), angle) @ at(LIMB_RADIUS + 0.012 - depth, 0, 0.08)
+        (touch,), state = sim.touch([Contact(ball(), pose)], state, 0.01)
+        out.append(touch)
+    press, drags = out[11].force, np.array([touch.force for touch in out[12:]])
+    assert drags.max() < 1.8 * press and np.abs(np.diff(drags)).max() < 0.1 * press
+    assert all(touch.trust.in_range for touch in out) == (mu < 1), [touch.trust.why for touch in out[12::20]]
+    if mu > 1:
+        assert "drags skin" in out[-1].trust.why
+
+
 def test_a_reversed_slide_has_the_same_drag_the_other_way(sim: Simulator) -> None:
     touches, _ = led(sim, down() + along(np.append(np.arange(1, 31), np.arange(29, -1, -1)) * 2e-4))
     there, back = touches[41].wrench[0], touches[-1].wrench[0]
