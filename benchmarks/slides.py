@@ -33,7 +33,7 @@ from stmpl_core.living import living
 from stmpl_core.packed import pack
 from stmpl_core.sdf import SignedDistance
 from stmpl_core.tissue import Membrane, Ply, Prony
-from tests.scenes import plate
+from tests.scenes import at, limb, plate, turn
 
 log = logging.getLogger(__name__)
 
@@ -42,6 +42,7 @@ SLAB = Tissue(5e3, 0.45)
 STACK = Tissue(3e3, 0.45, skin=Membrane(2e5, 1.5e-3, 15.0), deeper=(Ply(8e-3, 15e3, 0.45),))
 LEARNT_NU = 0.4  # Poisson's ratio that contacts were learnt with, as far as 0.42
 SPEEDS = 5e-4, 5e-3, 0.05, 0.3  # of presses [m/s]
+TUBE = 0.045  # radius of the tube [m]
 FULL = 12  # fields that a file holds, about
 
 Path3 = tuple[np.ndarray, np.ndarray | None]  # poses (N, 4, 4), times (N,) [s] or None
@@ -79,6 +80,15 @@ def forearm(fading: bool, around: bool = False) -> Ground:
     x, y = (np.cross(z, x), -x) if around else (x, np.cross(z, x))
     frame[:3, :3], frame[:3, 3] = np.stack([x, y, z], axis=1), v[vertex]
     return Ground(layer, frame, PatchFem(element="P1xP2", layers=1, refine=3, reach=9, check_stability=False))
+
+
+@cache
+def tube() -> Ground:
+    """A tube of one material, TUBE round and 12 mm thick; the stroke goes around it."""
+    frame = np.eye(4)
+    frame[:3, :3], frame[:3, 3] = [[0, 0, 1], [1, 0, 0], [0, 1, 0]], [TUBE, 0, 0.11]
+    return Ground(limb(6e-3, 12e-3, TUBE, 0.22, youngs_modulus=2e4, poisson_ratio=0.4), frame,
+                  PatchFem(element="P1xP2", layers=2, refine=3, reach=5, check_stability=False))  # fmt: skip
 
 
 def faded(tissue: Tissue) -> Tissue:
@@ -122,6 +132,14 @@ def slide(ground: Ground, radius: float, depth: float, length: float, step: floa
     way = np.concatenate([np.arange(step, length + step / 2, step), length - np.arange(step, back + step / 2, step)])
     along = np.concatenate([0 * down, way]) - length / 2
     return led(ground, radius, along, np.concatenate([down, np.full(len(way), depth)])), None
+
+
+def led_around(radius: float, depth: float, length: float, step: float) -> Path3:
+    """Pressed into the tube, and led around it by a length along its skin [m]."""
+    angles = np.concatenate([np.zeros(6), np.arange(step, length + step / 2, step) / TUBE])
+    depths = np.append(np.linspace(-1e-5, depth, 6), np.full(len(angles) - 6, depth))
+    poses = [turn((0, 0, 1), a) @ at(TUBE + radius - d, 0, 0.11) for a, d in zip(angles, depths, strict=True)]
+    return np.array(poses), None
 
 
 def spin(ground: Ground, radius: float, depth: float, angle: float) -> Path3:
@@ -215,6 +233,8 @@ def _scenes() -> Iterator[tuple[str, Scene]]:
         "forearm-ball20-back-mu0.3",
         Scene(lambda: forearm(False), 0.02, lambda g: slide(g, 0.02, 9e-3, 9e-3, 1.5e-3, back=9e-3), 0.3, 0.15),
     )
+    for mu in (0.5, 0.9, 1.2):
+        yield f"tube-ball12-mu{mu}", Scene(tube, 0.012, lambda g: led_around(0.012, 4.8e-3, 21e-3, 7e-4), mu)
     yield "slab-ramp-hold", Scene(flat(fading=True), 0.02, lambda g: ramp_hold(g, 0.02, 6e-3, 0.02), "stick")
     yield "slab-massage", Scene(flat(fading=True), 0.02, lambda g: massage(g, 0.02, 6e-3), "stick")
     yield (

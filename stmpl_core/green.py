@@ -14,6 +14,7 @@ that is thin here and thick there.
 
 from __future__ import annotations
 
+from contextlib import suppress
 from copy import copy
 from functools import cache, cached_property, lru_cache
 from typing import NamedTuple
@@ -25,6 +26,7 @@ from scipy.special import j0, j1
 
 from stmpl_core import nodewise
 from stmpl_core.coarse_response import CoarseDrag, CoarseResponse
+from stmpl_core.errors import StmplError
 from stmpl_core.layer import SoftLayer
 from stmpl_core.moments import Surroundings
 from stmpl_core.nodes import Nodes
@@ -49,6 +51,7 @@ RIDGE = 1e-6  # of the matrix that sticks, over its largest number: two nodes in
 LEAST_KAPPA, LEAST_PULL = 0.05, 0.02  # kappa and pull that are none, in logarithms
 NEXT = np.uint64(1)  # no index that may count from the end
 ONE_WAY = 0.3  # least cosine between a tool's way and the skin's inward normal at a node
+FLAT = 0.05  # thickness over a radius of the skin up to which what is dragged gives as on a flat layer
 TAKEN_BACK = 0.5  # most that the limb takes back of what a node does to itself in the flat response
 
 
@@ -131,20 +134,26 @@ class Green:
         out = copy(self)
         out.layer, out.near, out._last = copy(layer), near, None
         out._skin_turns, out._at_rest = turns, self._at_rest or self
-        if self.coarse is not None:
-            out._turns = _turns_of_coarse(self.coarse.corners, self.coarse.shares, turns, len(self.coarse.gathered))
+        mesh = self.coarse or vars(out._at_rest).get("drag")  # what was not needed so far is not made for a pose
+        if mesh is not None:
+            out._turns = _turns_of_coarse(mesh.corners, mesh.shares, turns, len(mesh.gathered))
         return out
 
     @cached_property
     def drag(self) -> CoarseDrag | None:
-        """The wide part where skin is dragged along, made or read on the first call; None: there is none.
+        """The wide part where skin is dragged along, made or read on the first call; None: as flat skin.
 
         Raises:
-            InvalidInput, MeshError: the skin cannot be meshed coarsely.
+            InvalidInput, MeshError: a stack's skin cannot be meshed coarsely.
         """
         if self._at_rest is not None:
             return self._at_rest.drag
-        return None if self.coarse is None else CoarseDrag.of(self.layer)
+        if self.coarse is not None:
+            return CoarseDrag.of(self.layer)
+        if np.median(np.abs(self.near.curvature[:, ::2]).max(axis=1)) > FLAT:
+            with suppress(StmplError):  # of one material flat skin is an answer, too
+                return CoarseDrag.of(self.layer)
+        return None
 
     @cached_property
     def _give(self) -> np.ndarray:
@@ -312,17 +321,15 @@ class Green:
         by = flat(nodes, forces, asked.vertices, felt)
         out = np.zeros_like(layer.vertices)
         asked.fill(by, out)
-        if self.coarse is None:
-            return out
-        source = _handed(nodes.inward, nodes.corners, nodes.shares, forces, *self.coarse[:3])
-        if source.any():
-            self._add_coarse(_of_coarse(source, self._by_source), out)
-        if dragged and self.drag is not None:
-            drag = self.drag
+        if self.coarse is not None:
+            source = _handed(nodes.inward, nodes.corners, nodes.shares, forces, *self.coarse[:3])
+            if source.any():
+                self._add_coarse(self.coarse, _of_coarse(source, self._by_source), out)
+        if dragged and (drag := self.drag) is not None:
             for ways, by_source in zip(drag.tangents, drag.by_source, strict=True):
                 along = ways if not len(self._turns) else np.einsum("cxy,cy->cx", self._turns, ways)
                 source = _handed_along(along, nodes.corners, nodes.shares, forces, *drag[:3])
-                self._add_coarse(_of_coarse(source, by_source), out)
+                self._add_coarse(drag, _of_coarse(source, by_source), out)
         return out
 
     def _flat_of_stack(self, nodes: Nodes, forces: np.ndarray, vertices: np.ndarray,
@@ -345,13 +352,12 @@ class Green:
             nodewise.add_motion(out, there, points, inward, roots, by, forces[of], one.rows, one.scales)
         return out
 
-    def _add_coarse(self, motion: np.ndarray, out: np.ndarray) -> None:
+    def _add_coarse(self, mesh: CoarseResponse | CoarseDrag, motion: np.ndarray, out: np.ndarray) -> None:
         """Adds motion of coarse vertices as at rest, (3 C,) [m], to that of all vertices, (V, 3)."""
-        assert self.coarse is not None
         motion = motion.reshape(-1, 3)
         if len(self._turns):
             motion = np.einsum("cxy,cy->cx", self._turns, motion)
-        _add_between(self.coarse.corners, self.coarse.shares, motion, out)
+        _add_between(mesh.corners, mesh.shares, motion, out)
 
     def linear(self, source: np.ndarray) -> np.ndarray:
         """Motion of all vertices under a pressure over E at each (V,) [-], (V, 3) [m]."""

@@ -35,9 +35,10 @@ from stmpl_core.trust import Trust
 RUBBED = 0.1  # of the force: what skin that gives way beneath a dry tool is off, as the law was learnt from what sticks
 PILED = 0.5  # of drag^2 / force: error of skin that piles up; 0.7 of it on a back, where the elastic bound was 0.45
 LOST = 0.5  # of what skin carries along itself: what is gone once all of it slides; 0.4 to 0.6 by slides on a forearm
+ROUND = 0.5  # of a drag and the thickness over the radius it goes around: its error on one material; 0.4 by one tube
 MOST_DRAGGED = 0.9  # way by which sticking skin is dragged along, over the thickness, up to which it was tried
 STRAYED = 0.03  # of the elastic force: part of the memory from touches out of range, beyond which an answer is, too
-NONE, NO_ROOM, FLAT = np.zeros(6), np.zeros(3), np.zeros((3, 3))
+NONE, NO_ROOM = np.zeros(6), np.zeros(3)
 
 
 class History:
@@ -231,7 +232,7 @@ class History:
             (wrench, rubs, share, offset, turn, lean, grown, slid_offset, slid_turn, limit, stiffness, springs, eased,
              bent, slid, held, room, besides) = rub(
                 by * touch.wrench, NONE if stated is None else stated, stated is not None, contact, pose[:3, 3],
-                bend, FLAT if give is None else give, mu,
+                bend, give, mu,
                 LOST * pressed.along, force, lever, at_rest, touch.depth, radius, pressed.power,
                 *self.sideways.at(radius, thickness), one.twist, one.known, before.pressing > 0, one.before.contact,
                 before.elastic, one.before.slid, before.held,
@@ -241,8 +242,8 @@ class History:
             if self.toucher.layer.tissue.skin is not None:
                 pressing = math.sqrt(wrench[:3] @ wrench[:3])
                 besides += RUBBED * pressing + PILED * float(rubs[:3] @ rubs[:3]) / pressing
-            elif (drag := float(rubs[:3] @ rubs[:3])) > 0:  # a round limb gives more than flat skin
-                besides += thickness * max(float(rubs[:3] @ bend @ rubs[:3]), 0.0) / math.sqrt(drag)
+            elif (drag := float(rubs[:3] @ rubs[:3])) > 0:
+                besides += ROUND * thickness * max(float(rubs[:3] @ bend @ rubs[:3]), 0.0) / math.sqrt(drag)
             if grown >= MOST_GROWN and stated is None:
                 touch = touch.with_(trust=touch.trust.also(
                     f"{touch.name} drags skin around the limb, which would press {grown - 1:.0%} harder than pressed "

@@ -272,7 +272,7 @@ class Surroundings:
 def _sites(points: np.ndarray, normals: np.ndarray, thickness: np.ndarray, area: np.ndarray) -> np.ndarray:
     """Points as the kernels take them, see stmpl_core.response.feel, (10, N) float32."""
     half_log = 0.5 * np.log(thickness)
-    spread = np.log(SPREAD * area**0.5 / SPREADS[0]) - half_log
+    spread = np.log(SPREAD * np.maximum(area, 1e-300) ** 0.5 / SPREADS[0]) - half_log  # a vertex without faces has none
     rows = [*(points - points.mean(axis=0)).T, thickness**-0.5, area, half_log, spread, *normals.T]
     return np.ascontiguousarray(rows, dtype=np.float32)
 
@@ -311,7 +311,7 @@ def _frames(normals: np.ndarray) -> np.ndarray:
     """Any two tangents with each normal, right-handed, as rows, (V, 3, 3)."""
     least = np.eye(3)[np.abs(normals).argmin(axis=1)]
     first = np.cross(normals, least)
-    first /= np.linalg.norm(first, axis=1, keepdims=True)
+    first /= np.maximum(np.linalg.norm(first, axis=1, keepdims=True), 1e-300)  # a vertex without faces has no normal
     return np.stack([first, np.cross(normals, first), normals], axis=1)
 
 

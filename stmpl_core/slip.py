@@ -354,7 +354,7 @@ def rub(wrench, stated, by_force, contact, origin, bend, give, mu, along_itself,
         alone = stiffer * secant(along, bare, slack, mu * grown * force)
         sticks = given_way(alone, give, wanted if by_force else before + alone * way, contact)
         if out > 0:  # skin leans before the tool once: as it turns about the bone, or as it is ploughed
-            by_turn = max(1 - sticks / alone, 0.0) * np.sqrt(np.sum(turned**2))
+            by_turn = max(1 - sticks / alone, bare / along) * np.sqrt(np.sum(turned**2))
             cap -= min(by_turn * grown * force, cap - mu * grown * force)
         after = np.array([sticks, sticks, stiffer * turn / (arm_of_turn * arm_of_turn)])
         new, kept, carried, share, stored = drag(

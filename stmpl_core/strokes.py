@@ -20,7 +20,7 @@ from stmpl_core.footing import patch_of
 from stmpl_core.regions import HELD_SKIN
 from stmpl_core.relaxation import faded, fading, series_of, stretch, weights
 from stmpl_core.sideways import Sideways
-from stmpl_core.slip import PLOUGHED, ploughing
+from stmpl_core.slip import MOST_LEAN, PLOUGHED, ploughing
 from stmpl_core.tissue import Prony
 from stmpl_core.touch import Touch
 from stmpl_core.toucher import Toucher
@@ -93,7 +93,11 @@ class Fading:
 
 
 class _Rubbed(NamedTuple):
-    """An instant at which a tool rubs: normal (3,), N and F_t [N], radius [m], k_t [N/m], r of ploughing [-]."""
+    """An instant at which a tool rubs: normal (3,), N and F_t [N], radius [m], k_t [N/m], r of ploughing [-].
+
+    leans: turn of the push, as skin came from where the limb faces another way [rad]; once: share of it by which skin
+    is not ploughed, see slip.rub [-].
+    """
 
     normal: np.ndarray
     pressing: float
@@ -101,16 +105,19 @@ class _Rubbed(NamedTuple):
     radius: float
     stiffness: float
     rises: float
+    leans: float
+    once: float
 
 
 def fit_friction(toucher: Toucher, strokes: Sequence[Contact]) -> Rubbing:
     """Finds the coefficient mu of a tool that slides.
 
     In steady slide the force along the way is R = mu (1 + (0.2 + 0.67 mu) r) of the normal one (`slip.ploughing`),
-    which is solved for mu. A tool slides once it went straight on by SLID F / k, twice that after another way, with F
-    the largest force along the skin and k the stiffness of the skin to what sticks (`stmpl_core.sideways`): one that
-    sticks never does, since its force grows with the way. The normal is that of the contact law under the measured
-    force; how far it is off changes sign with the way, so strokes there and back are worth more than twice one of them.
+    which is solved for mu; around a limb the push leans besides. A tool slides once it went straight on by SLID F / k,
+    twice that after another way, with F the largest force along the skin and k the stiffness of the skin to what sticks
+    (`stmpl_core.sideways`): one that sticks never does, since its force grows with the way. The normal is that of the
+    contact law under the measured force; how far it is off changes sign with the way, so strokes there and back are
+    worth more than twice one of them.
 
     Args:
         toucher: contact law on the skin, about as stiff as it is.
@@ -145,7 +152,7 @@ def fit_friction(toucher: Toucher, strokes: Sequence[Contact]) -> Rubbing:
         if went >= wanted > 0:
             slid.append(k)
             ways.append(way / went)
-            mus.append(_friction_of(float(contact.wrench[:3] @ way) / went / one.pressing, one.rises))
+            mus.append(_friction_of(float(contact.wrench[:3] @ way) / went / one.pressing, one))
     if len(slid) < MIN_INSTANTS:
         went = f"; it went {1e3 * furthest:.1f} mm straight on, {1e3 * needed:.1f} mm are needed" if furthest else ""
         return _no_friction(f"the tool slid at {len(slid)} of {len(pressing)} instants, {MIN_INSTANTS} are needed"
@@ -187,17 +194,21 @@ def _rubbed(toucher: Toucher, sideways: Sideways, one: Contact) -> _Rubbed | Non
     patch, give = sideways.at(radius, thickness), toucher.give(nodes, pressed.forces)
     stiffer, _ = ploughing(touch.depth, radius, pressing, patch.along, patch.bare, 0.0)
     rises = touch.depth / radius * pressing / (patch.along * radius)
-    stiffness = stiffer * patch.secant(rubs)
-    if give is not None and rubs > 0:
-        stiffness = 1 / (1 / stiffness + max(float(along @ give @ along) / rubs**2, 0.0))
-    return _Rubbed(normal, pressing, rubs, radius, stiffness, rises)
+    alone = stiffness = stiffer * patch.secant(rubs)
+    leans = 0.0
+    if rubs > 0:
+        stiffness = 1 / (1 / alone + max(float(along @ give @ along) / rubs**2, 0.0))
+        leans = float(along @ toucher.curvature(nodes, pressed.forces) @ along) / rubs / stiffness
+    once = max(1 - stiffness / alone, patch.bare / patch.along)
+    return _Rubbed(normal, pressing, rubs, radius, stiffness, rises, min(leans, MOST_LEAN), once)
 
 
-def _friction_of(ratio: float, rises: float) -> float:
-    """mu from the force along the way over the normal one; see slip.ploughing."""
-    a, b = PLOUGHED[2] * rises, 1 + PLOUGHED[1] * rises
-    size = abs(ratio)
-    return math.copysign(2 * size / (b + math.sqrt(b * b + 4 * a * size)), ratio)
+def _friction_of(ratio: float, one: _Rubbed) -> float:
+    """mu from the force along the way over the normal one; see slip.ploughing and slip.rub."""
+    a, b = PLOUGHED[2] * one.rises, 1 + PLOUGHED[1] * one.rises
+    plain = max(math.tan(math.atan(abs(ratio)) - one.leans), 0.0)
+    size = plain + one.once * max(one.leans, 0.0)
+    return math.copysign(min(2 * size / (b + math.sqrt(b * b + 4 * a * size)), plain), ratio)
 
 
 @numba.njit(cache=True)

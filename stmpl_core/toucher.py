@@ -140,10 +140,9 @@ class Toucher:
     def _unlearnt(self) -> list[str]:
         return unlearnt(self.layer, *self.net.weights.card["ranges"]["poisson_ratio"])
 
-    def give(self, nodes: Nodes, forces: np.ndarray) -> np.ndarray | None:
-        """How a contact gives along the skin, beyond a flat layer, (3, 3) [m/N]; None: as that. See `curvature`."""
-        layer = self.layer
-        return Green.of(layer).give(nodes, forces) / layer.tissue.youngs_modulus if layer.stacked else None
+    def give(self, nodes: Nodes, forces: np.ndarray) -> np.ndarray:
+        """How a contact gives along the skin, beyond a flat layer, (3, 3) [m/N]. See `curvature`."""
+        return Green.of(self.layer).give(nodes, forces) / self.layer.tissue.youngs_modulus
 
     def curvature(self, nodes: Nodes, forces: np.ndarray) -> np.ndarray:
         """Curvature of the skin at nodes, weighed with their forces (N,), (3, 3) [1/m]; convex is positive."""

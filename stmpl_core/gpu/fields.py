@@ -69,7 +69,7 @@ class Fields:
         room = self._room.bytes_of()
         if room > self._memory:
             raise InvalidInput(f"the field of one scene needs {room} bytes of scratch space; {self._memory} are "
-                               "allowed.")  # fmt: skip
+                               "allowed. Raise WarpBatch's memory.")  # fmt: skip
         many = min(wanted, self._memory // room)
         if self._scratch is None or len(self._scratch.many) < many:
             self._scratch = self._room.scratch(many, self._device)

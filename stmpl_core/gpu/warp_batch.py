@@ -77,7 +77,7 @@ class WarpBatch:
         device: device as Warp names it: "cuda", "cuda:1", "cpu".
         nodes: room for contact nodes of all tools of a scene together; None: what these tools need.
         memory: scratch space [bytes]; scenes that do not fit go one part after the other; None: 4 GiB on a GPU, 256 MiB
-            on a CPU. Fields take as much again.
+            on a CPU, or what one scene needs. Fields take as much again.
         lanes: threads that share the work of a scene; None: LANES on a GPU, 1 on a CPU.
 
     Attributes:
@@ -119,9 +119,10 @@ class WarpBatch:
         number = {id(skin): k for k, skin in enumerate(unique)}
         self._skin_of = np.array([number[id(skin)] for skin in each], np.int32)
         room = self.room.bytes_of(len(self.tools))
-        self._memory = budget = MEMORY[self.device.is_cuda] if memory is None else memory
+        self._memory = budget = max(MEMORY[self.device.is_cuda], room) if memory is None else memory
         if room > budget:
-            raise InvalidInput(f"one scene needs {room} bytes of scratch space; {budget} are allowed.")
+            raise InvalidInput(f"one scene needs {room} bytes of scratch space; {budget} are allowed. Raise memory, or "
+                               "leave it out.")  # fmt: skip
         self._part = min(count, budget // room)
         self._scratch = packs.scratch(self.room, self._part, len(self.tools), self.device)
         self._numbers = [self._numbers_of(first) for first in range(0, count, self._part)]
