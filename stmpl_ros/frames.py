@@ -52,6 +52,11 @@ class Frames:
 
         return FramesAt(self.body, self.table, look)
 
+    def forget(self) -> None:
+        """Forgets where the frames of /tf moved; what /tf_static told once stays, as it is not told again."""
+        if self.listens:
+            self._buffer.clear()
+
     def moves(self, frame: str) -> bool:
         """Whether a frame is one of /tf."""
         return self.listens and bool(frame) and frame != self.body and frame not in self.table

@@ -240,8 +240,10 @@ class Hearing:
         self._go_on("wrench", name, self.inbox.put_wrench(name, message, stamp, self.now()))
 
     def _on_time_back(self) -> None:
-        """A simulation that begins anew: what it said lies in its future."""
-        self._node.get_logger().warning("the simulated clock went back: poses and wrenches from before are forgotten")
+        """A simulation that begins anew: what it and its /tf said lies in its future."""
+        self._node.get_logger().warning("the simulated clock went back: poses, wrenches and /tf from before are "
+                                        "forgotten")  # fmt: skip
+        self.frames.forget()
         self.forget()
 
     def _on_gazebo(self, message: Any) -> None:

@@ -234,6 +234,20 @@ def test_a_tool_may_be_a_frame_of_tf_and_what_it_is_taken_for_is_sent_for_a_reco
     scene.wait(lambda: any(stamp_ns(one) == stamp for one in scene.poses))  # the answer names a pose that was sent
 
 
+@pytest.mark.parametrize("scene", [{"tf_tools": ("finger=tool0",), "tf_rate": 200.0, "max_age": 0.0}], indirect=True)
+def test_a_simulation_that_begins_anew_is_not_placed_by_the_tf_of_its_last_run(scene):
+    hearing, buffer = scene.node.hearing, scene.node.hearing.frames._buffer
+    buffer.set_transform_static(told("body", "table", np.eye(4), 0), "test")
+    off = HERE.copy()
+    off[2, 3] += 0.02
+    buffer.set_transform(told("table", "tool0", off, scene.now() + 8 * NANO), "test")
+    scene.wait(lambda: hearing.inbox.pose_of("finger") is not None)
+    hearing.now.on_back()
+    scene.wait(lambda: buffer.set_transform(told("table", "tool0", HERE, scene.now()), "test")
+               or hearing.inbox.pose_of("finger") is not None)  # fmt: skip
+    np.testing.assert_allclose(hearing.inbox.pose_of("finger"), HERE, atol=1e-7)
+
+
 def test_tools_of_tf_are_refused_where_nobody_listens_to_it(monkeypatch):
     monkeypatch.setattr("stmpl_ros.frames.find_spec", lambda name: None)
     context = rclpy.Context()

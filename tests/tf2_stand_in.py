@@ -36,6 +36,10 @@ class Buffer:
         self._parents: dict[str, str] = {}
         self._static: set[str] = set()
 
+    def clear(self) -> None:
+        """Forgets what moves; a static transform stays, as in tf2's StaticCache."""
+        self._told = defaultdict(list, {f: told for f, told in self._told.items() if f in self._static})
+
     def set_transform(self, told: TransformStamped, authority: str) -> None:
         self._keep(told, moves=True)
 
@@ -62,6 +66,8 @@ class Buffer:
         if not common:
             raise TransformException(f"'{source}' and '{target}' are not connected")
         way = [f for f in moving if f not in common]
+        if not all(self._told[f] for f in way):
+            raise TransformException(f"'{source}' was not told of since the buffer was cleared")
         return Time(nanoseconds=min((self._told[f][-1][0] for f in way), default=0))
 
     def can_transform(self, target: str, source: str, time: Time, timeout: Duration | None = None,
@@ -96,6 +102,8 @@ class Buffer:
         return place
 
     def _at(self, frame: str, stamp: int) -> np.ndarray:
+        if not self._told[frame]:
+            raise TransformException(f"nothing is known of '{frame}' since the buffer was cleared")
         times, places = zip(*self._told[frame], strict=True)
         if frame in self._static:
             return places[0]
