@@ -26,7 +26,8 @@ from stmpl_core.tool import Tool
 log = logging.getLogger(__name__)
 
 DISPLACEMENT, TOPOLOGY, MESH = "skin/displacement", "skin/topology", "contact_mesh"
-_OF_ROBOT = re.compile(r"(?:(.*?)/)?(?:skin/\w+|contact_mesh|tools/[^/]+/\w+)")  # topics of a robot's run
+_OF_ROBOT = re.compile(r"(?:(.*)/)?(?:skin/\w+|contact_mesh)")  # topics of a robot's run
+_OF_TOOL = re.compile(r"(?:(.*)/)?tools/(.+)/(pose|wrench|mesh|contact_wrench|local_contact)")  # NAME may hold "/"
 
 
 class Recorded(NamedTuple):
@@ -341,16 +342,14 @@ class Bag:
 
 def tool_topic(topic: str) -> tuple[str, str] | None:
     """(tool, "pose" or "wrench") if the topic is of a tool: .../tools/NAME/pose."""
-    parts = topic.split("/")
-    if len(parts) >= 3 and parts[-3] == "tools" and parts[-1] in ("pose", "wrench"):
-        return parts[-2], parts[-1]
-    return None
+    found = _OF_TOOL.fullmatch(topic)
+    return (found[2], found[3]) if found and found[3] in ("pose", "wrench") else None
 
 
 @cache
 def namespace_of(topic: str) -> str | None:
     """Namespace of the robot that a topic is of, "/" for none; None if the topic is of no robot's run."""
-    found = _OF_ROBOT.fullmatch(topic)
+    found = _OF_TOOL.fullmatch(topic) or _OF_ROBOT.fullmatch(topic)
     return found and (found[1] or "/")
 
 

@@ -25,7 +25,7 @@ from stmpl_ros.topics import as_offered
 
 POLL_PERIOD_S = 0.1  # time between two looks for new topics and new viewers
 DEPTH = 10  # messages of a topic that wait for this process
-WANTED = r".*/(contact_mesh|skin/\w+|tools/\w+/\w+|wrist/wrench|joint_states)|/(diagnostics|tf|tf_static)"
+WANTED = r".*/(contact_mesh|skin/\w+|tools/[\w/]+/\w+|wrist/wrench|joint_states)|/(diagnostics|tf|tf_static)"
 
 
 class Viewers(ServerListener):

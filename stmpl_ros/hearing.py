@@ -129,10 +129,11 @@ class Hearing:
     def look_for_strangers(self) -> None:
         """Tells once of each tool whose poses are sent and whose surface is not known, at the second look."""
         before, self._unknown = self._unknown, {}
+        tools = self._node.get_namespace().rstrip("/") + "/tools/"
         for topic, _ in self._node.get_topic_names_and_types():
-            parts = topic.removeprefix(self._node.get_namespace().rstrip("/") + "/").split("/")
-            if len(parts) == 3 and parts[0] == "tools" and parts[2] == "pose" and self._node.count_publishers(topic):
-                self._unknown |= {} if self._knows(parts[1]) else {parts[1]: topic}
+            name = topic.removeprefix(tools).removesuffix("/pose")
+            if topic == f"{tools}{name}/pose" and not self._knows(name) and self._node.count_publishers(topic):
+                self._unknown[name] = topic
         for name in self._unknown.keys() & before.keys() - self._strangers:
             self._strangers.add(name)
             topic = self._unknown[name]

@@ -32,12 +32,12 @@ from stmpl_ros.topics import as_offered
 log = logging.getLogger(__name__)
 
 WANTED = re.compile(
-    r"(contact_mesh|skin/topology|skin/displacement|tools/\w+/(pose|wrench)|wrist/wrench|joint_states)$"
+    r"(contact_mesh|skin/topology|skin/displacement|tools/[\w/]+/(pose|wrench)|wrist/wrench|joint_states)$"
     r"|^/(diagnostics|tf|tf_static)$"
 )
 EVERYBODYS = ("/diagnostics", TF, TF_STATIC)  # topics of no namespace that belong to a run
-PLACED = re.compile(r"(skin/topology|tools/(\w+)/(?:pose|wrench))$")  # topics whose frame_id says where things are
-IF_HEARD = re.compile(r"tools/\w+/local_contact$")  # recorded only once a device listens: it costs the node work
+PLACED = re.compile(r"(.*/)(?:skin/topology|tools/(.+)/(?:pose|wrench))")  # their frame_id says where things are
+IF_HEARD = re.compile(r"tools/[\w/]+/local_contact$")  # recorded only once a device listens: it costs the node work
 FOREVER = 1e9  # lease of a sender that never tells that it is there, at least [s]
 POLL_PERIOD_S = 0.1  # time between two looks for new topics
 DEPTH = 1000  # messages of a topic that the middleware keeps while this process is busy
@@ -97,7 +97,7 @@ class RecorderNode(Node):
         lease = max((one for one in leases if one < FOREVER), default=0.0)
         depth = max((o.depth for o in offered), default=10) or 10
         qos = qos_yaml(depth=depth, reliable=reliable, transient_local=kept, lease=lease)
-        placed = PLACED.search(topic) is not None
+        placed = PLACED.fullmatch(topic) is not None
 
         def keep(data: Any) -> None:
             if self._queue.qsize() > MAX_QUEUED_MESSAGES:
@@ -124,9 +124,9 @@ class RecorderNode(Node):
         topology = {topic.removesuffix("skin/topology"): frame for topic, frame in self._placed
                     if topic.endswith("skin/topology")}  # fmt: skip
         for topic, frame in sorted(self._placed):
-            found = PLACED.search(topic)
+            found = PLACED.fullmatch(topic)
             assert found
-            body = topology.get(topic[: found.start()])
+            body = topology.get(found[1])
             if body is not None and frame not in (body, found[2], *frames):
                 yield (f"{topic} came in frame '{frame}', which is neither '{body}' nor in --frames, and no /tf was "
                        "recorded: these contacts are not replayed offline, only to a node that hears /tf (stmpl replay "

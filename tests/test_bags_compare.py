@@ -25,6 +25,7 @@ from stmpl_core.provenance import processor
 from stmpl_core.touch import Answer
 from stmpl_core.trust import Displacement, Trust
 from stmpl_ros.view.recording import Recording
+from tests import bag_scene
 from tests.bag_scene import START, stmpl, tube, write_run
 
 LOST, SKIPPED, DELAY = (5, 6, 20), (10, 11), 0.003
@@ -315,6 +316,17 @@ def test_a_recording_of_two_robots_is_read_by_namespace(two_robots):
         assert [moment.load for moment in ours.moments] == [moment.load for moment in alone.moments]
         assert compare_run(ours, Winkler(), method=Winkler(), tolerance=0.0).passed
         assert Recording.of(ours, frames=4).layer.tissue == skins[name].tissue
+
+
+@pytest.mark.parametrize("namespace", ["", "/tools/left"])
+def test_tools_with_slashes_in_their_names_are_read_and_replayed(tmp_path, monkeypatch, namespace):
+    names, script = {"ball": "panda/tool0", "finger": "skin/_tip"}, bag_scene.script
+    monkeypatch.setattr(bag_scene, "ANGLES", {names[tool]: angle for tool, angle in bag_scene.ANGLES.items()})
+    monkeypatch.setattr(bag_scene, "script", lambda share: {names[tool]: n for tool, n in script(share).items()})
+    run = write_run(tmp_path / "run", Winkler(), layer=tube(edge=9e-3), frames=8, namespace=namespace)
+    replayed = replay_run(Run(run, namespace), Winkler())
+    assert replayed.frames == replayed.identical == 8 and Bag(run).namespaces == [namespace or "/"]
+    assert compare_run(survey(run), Winkler(), method=Winkler(), tolerance=0.0).passed
 
 
 @pytest.mark.parametrize("read", [survey, Run, lambda run: Bag(run).layers, lambda run: list(Bag(run).frames())])

@@ -168,13 +168,13 @@ def test_a_tool_that_is_taken_away_while_its_field_is_built_is_not_taken_into_us
 
 
 def test_poses_of_a_tool_that_nobody_announced_are_told_of_once(bus):
-    ghost, until = Hand(bus, "ghost", announce=False), time.monotonic() + 5.0
-    bus.wait(lambda: bus.said("no surface of 'ghost'"), "the log line")
+    ghost, until = Hand(bus, "ghost/tip", announce=False), time.monotonic() + 5.0
+    bus.wait(lambda: bus.said("no surface of 'ghost/tip'"), "the log line")
     while time.monotonic() < until:
         ghost.press()
         bus.spin(0.05)
-    (line,) = bus.said("no surface of 'ghost'")
-    assert line.startswith("/robot/tools/ghost/pose: poses come") and "they are not heard" in line
+    (line,) = bus.said("no surface of 'ghost/tip'")
+    assert line.startswith("/robot/tools/ghost/tip/pose: poses come") and "they are not heard" in line
     assert not ghost.pose.get_subscription_count()
     assert not bus.said("no surface of 'probe'"), "a tool that was announced is none"
 

@@ -176,6 +176,7 @@ def test_ctrl_c_ends_a_robot_that_waits_or_gets_ready() -> None:
 def test_a_recorder_takes_what_a_robot_says() -> None:
     from stmpl_ros.recorder import WANTED
 
-    for topic in ("/tools/ball/pose", "/wrist/wrench", "/left/joint_states", "/contact_mesh"):
+    for topic in ("/tools/ball/pose", "/tools/panda/tool0/wrench", "/wrist/wrench", "/left/joint_states",
+                  "/contact_mesh"):  # fmt: skip
         assert WANTED.search(topic), topic
     assert not WANTED.search("/clock")  # the stamps of the poses tell its time
