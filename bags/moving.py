@@ -49,13 +49,16 @@ class MovingFrames:
     """All that a recording holds of /tf and /tf_static."""
 
     def __init__(self) -> None:
-        self._tracks: dict[str, _Track] = {}
+        self._tracks: dict[str, list[_Track]] = {}  # of each frame, in the order in which it was still or moved
 
     def hear(self, message: Any, *, still: bool) -> None:
         """Takes a tf2_msgs/TFMessage; still: it came on /tf_static."""
         for told in message.transforms:
             child = told.child_frame_id.removeprefix("/")
-            self._tracks.setdefault(child, _Track(child, still)).put(told)
+            tracks = self._tracks.setdefault(child, [])
+            if not tracks or tracks[-1].still != still:  # in tf2, too, a frame goes over to how it was told last
+                tracks.append(_Track(child, still))
+            tracks[-1].put(told)
 
     def place(self, body: str, frame: str, stamp: int) -> Transform:
         """pose_body_from_frame (4, 4) at a stamp [ns], between the two that were told around it.
@@ -78,7 +81,8 @@ class MovingFrames:
     def _up(self, frame: str, until: str, stamp: int) -> tuple[dict[str, Placed], str]:
         """Where a frame stands in itself and in those that it hangs on, up to the last that is known, and why not."""
         found: dict[str, Placed] = {frame: ((0.0, 0.0, 0.0, 1.0), (0.0, 0.0, 0.0))}
-        while frame != until and (track := self._tracks.get(frame)) is not None:
+        while frame != until and (tracks := self._tracks.get(frame)) is not None:
+            track = _of(tracks, stamp)
             told = track.at(stamp)
             if told is None:
                 return found, track.span
@@ -89,18 +93,26 @@ class MovingFrames:
         return found, ""
 
 
+def _of(tracks: list[_Track], stamp: int) -> _Track:
+    """The one that holds at a stamp [ns]: a frame is still until its first stamp on /tf, or after its last."""
+    for before, track in zip(tracks[-2::-1], tracks[:0:-1], strict=True):
+        if stamp > before.last if track.still else stamp >= track.first:
+            return track
+    return tracks[0]
+
+
 class _Track:
     """Where one frame was told to stand in its parent, by the stamp; one that is still, the last time."""
 
     def __init__(self, child: str, still: bool) -> None:
-        self._child, self._still = child, still
+        self._child, self.still = child, still
         self._stamps, self._numbers, self._parents = array("q"), array("d"), list[str]()
 
     def put(self, told: Any) -> None:
         """Takes a geometry_msgs/TransformStamped; one of a stamp that was told already counts for nothing."""
         p, q = told.transform.translation, told.transform.rotation
         stamp, parent = stamp_ns(told), told.header.frame_id.removeprefix("/")
-        if self._still:
+        if self.still:
             del self._stamps[:], self._numbers[:], self._parents[:]
         n = bisect_left(self._stamps, stamp)
         if n == len(self._stamps) or self._stamps[n] != stamp:
@@ -111,7 +123,7 @@ class _Track:
 
     def at(self, stamp: int) -> tuple[str, Placed] | None:
         """Its parent, and where it stood there at a stamp [ns]; None: it was not told."""
-        if self._still:
+        if self.still:
             return self._parents[0], self._told(0)
         n = bisect_left(self._stamps, stamp)
         if n < len(self._stamps) and self._stamps[n] == stamp:
@@ -127,6 +139,16 @@ class _Track:
     def _told(self, n: int) -> Placed:
         x, y, z, w, *place = self._numbers[7 * n : 7 * n + 7]
         return (x, y, z, w), (place[0], place[1], place[2])
+
+    @property
+    def first(self) -> int:
+        """Its first stamp [ns]."""
+        return self._stamps[0]
+
+    @property
+    def last(self) -> int:
+        """Its last stamp [ns]."""
+        return self._stamps[-1]
 
     @property
     def span(self) -> str:

@@ -171,6 +171,22 @@ def test_a_replay_finds_frames_where_a_node_does():
         plays.place("body", "elsewhere", NANO + 100 * MS)
 
 
+def test_a_replay_places_a_frame_that_stood_still_then_moved_and_stood_still_again():
+    plays = MovingFrames()
+
+    def tell(x: float, stamp: int, *, still: bool) -> None:
+        place = np.eye(4)
+        place[0, 3] = x
+        plays.hear(SimpleNamespace(transforms=[told("body", "arm", place, stamp)]), still=still)
+
+    tell(7.0, 0, still=True)
+    for k in range(5):
+        tell(float(k), NANO + k * NANO, still=False)
+    tell(9.0, 0, still=True)
+    asked = np.array([0.5, 1.0, 2.5, 5.0, 5.5])
+    assert [plays.place("body", "arm", int(t * NANO))[0, 3] for t in asked] == [7.0, 0.0, 1.5, 4.0, 9.0]
+
+
 def test_a_dead_tf_is_told_within_a_fifth_of_a_second_and_its_poses_are_not_answered(scene):
     def going() -> None:
         scene.move(scene.now())
