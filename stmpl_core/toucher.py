@@ -76,6 +76,7 @@ LEAST_STEP = 2e-4  # step of the depth, over the thickness, that is likewise onl
 MAX_DEPTH_TRIALS = 14  # trials of the depth for one wrench
 STIFFER = 1.1  # power of the depth with which the force grows over that of the linear layer, until a trial says more
 POWERS = (0.7, 6.0)  # range of that power
+DISAGREES = 0.1, 0.05  # depth over the thickness, and pull over what the pose presses with, that cannot both be true
 FAR = 10.0  # distance of a tool from the limb beyond which its pose is taken to be in millimetres [m]
 MANY_TOOLS = 8  # number of tools from which those that are apart are told by a tree of boxes
 WHY = {
@@ -256,11 +257,35 @@ class Toucher:
         gap = self._gap(field, pose, clearance, force)
         found = None if gap is None else self._pressed(contact, field, pose, clearance, depth, gap)
         if tried is None:
+            if found is None and gap == 0.0:
+                return nothing(PULLING)._replace(why=self._disagrees(contact, field, pose, clearance, depth))
             return found or nothing(NO_TOUCH if gap is None else PULLING)
         if found is None or found.status == WRAPPED:
             return self._place(contact, field, many, None)
         apart = found.moved - self._depth(found.squeeze) > MAX_TOUCHING_GAP * self.hole
         return found._replace(status=MOVED) if apart else found
+
+    def _disagrees(self, contact: Contact, field: SignedDistance, pose: Transform, clearance: Clearance,
+                   depth: float) -> str:  # fmt: skip
+        """Why a wrench that pulls a tool out of the skin is not believed: the pose is deep; empty: it may be so.
+
+        pose: the stated one, or where it was drawn back to from deeper; depth: of the stated one [m].
+        """
+        assert contact.wrench is not None
+        squeeze, force = self.columns.squeeze(field, pose, clearance), contact.wrench[:3]
+        nodes = squeeze.nodes
+        if not len(nodes.area) or max(depth, self._depth(squeeze)) < DISAGREES[0] * float(nodes.thickness.mean()):
+            return ""
+        v, pressure = nodes.at_vertices(self.net.hold(nodes).pressure * self._modulus, self.layer.vertex_areas)
+        vector = wrench_of(pressure, v, self.layer.vertices, self.layer.vertex_area_vectors, pose[:3, 3],
+                           self.layer.stacked)[0][:3]  # fmt: skip
+        size = float(np.linalg.norm(vector))
+        pull = -float(force @ vector) / max(size, 1e-300)
+        if not pull > DISAGREES[1] * size:
+            return ""
+        return (f"{contact.name} is {1e3 * max(depth, self._depth(squeeze)):.2g} mm deep in the skin by its pose, and "
+                f"its wrench pulls with {pull:.2g} N: they disagree, and nothing is loaded. Check the wrench's sign: "
+                "it is what the tool exerts on the body")  # fmt: skip
 
     def _clearance(self, field: SignedDistance, pose: Transform, reach: float, many: bool = False) -> Clearance:
         """Clearance of the columns that a tool touches, or misses by a hole of the mesh.

@@ -387,6 +387,14 @@ def test_pulling_loads_nothing(sim: Simulator) -> None:
     assert touch_of(answer).status == PULLING and not answer.displacement.any()
 
 
+@pytest.mark.parametrize("depth, pull, believed", [(4e-3, 1.0, False), (4e-3, 1e-4, True), (3e-4, 1.0, True),
+                                                   (0.02, 1.0, False)])  # fmt: skip
+def test_a_wrench_of_the_wrong_sign_is_flagged_where_the_pose_is_deep(sim, depth, pull, believed) -> None:
+    touch = touch_of(sim.step([press(BALL, on_limb(depth), (pull, 0, 0))]))
+    assert touch.status == PULLING and not touch.force
+    assert touch.trust.in_range is believed and ("wrench's sign" in touch.trust.why) is not believed
+
+
 def test_a_closed_band_has_no_direction(sim: Simulator) -> None:
     ring = band()
     answer = sim.step([press(ring, at(0, 0, MIDDLE), (-1, 0, 0))])
