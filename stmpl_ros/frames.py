@@ -91,8 +91,8 @@ def _time(stamp: int) -> Time:
     return Time(nanoseconds=stamp, clock_type=ClockType.ROS_TIME)
 
 
-def read_frames(path: str) -> dict[str, Transform]:
-    """The table of a YAML file; none if `path` is empty. Raises InvalidInput."""
+def read_frames(path: str, body: str = "") -> dict[str, Transform]:
+    """The table of a YAML file of frames in the body's; none if `path` is empty. Raises InvalidInput."""
     if not path:
         return {}
     from ruamel.yaml import YAML, YAMLError
@@ -103,6 +103,8 @@ def read_frames(path: str) -> dict[str, Transform]:
         raise InvalidInput(f"frames file {path}: {error}. It holds {SHAPE}.") from error
     if not isinstance(read, dict):
         raise InvalidInput(f"frames file {path} holds no table of frames. It holds {SHAPE}.")
+    if body in map(str, read):
+        raise InvalidInput(f"frames file {path} places '{body}', which is the body's own frame. Leave it out.")
     return {str(name): _placed(path, str(name), given) for name, given in read.items()}
 
 

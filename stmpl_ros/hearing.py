@@ -14,7 +14,7 @@ from shape_msgs.msg import Mesh
 from stmpl_msgs.msg import ContactMesh
 
 from bags import wire
-from stmpl_core.errors import StmplError
+from stmpl_core.errors import FrameError, StmplError
 from stmpl_core.layer import SoftLayer
 from stmpl_core.sdf import SignedDistance
 from stmpl_core.tool import Tool
@@ -56,7 +56,7 @@ class Hearing:
         self.gate = Gate(node, tally)
         self.events = Events(self.gate.say)
         self.now = Ticks(node)
-        self.frames = Frames(config().frame, read_frames(config().frames), node)
+        self.frames = Frames(config().frame, read_frames(config().frames, config().frame), node)
         self._patience = Patience(node, self.frames, self.gate, lambda: config().tf_wait)
         self.gazebo = GazeboContacts(config(), self.frames) if config().gz_contacts else None
         self.inbox = Inbox(tools, config().frame, int(config().rest_after * wire.NANO), self.frames.at)
@@ -200,6 +200,9 @@ class Hearing:
             self._node.get_logger().info(f"tool '{name}' is taken away")
             return self.on_removed(name)
         try:
+            if name == self._config().frame:
+                raise FrameError(f"'{name}' is the body's own frame, in whose axes its wrenches would be read; "
+                                 "give the tool another name.")  # fmt: skip
             tool = read()
         except StmplError as error:
             return self.gate.refuse("mesh", f"mesh of '{name}' refused: {error}")

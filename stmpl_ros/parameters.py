@@ -193,6 +193,9 @@ class NodeConfig(BaseModel):
     def _pairs(cls, texts: tuple[str, ...], info: ValidationInfo) -> tuple[str, ...]:
         if pattern := LISTS[str(info.field_name)]:
             _named(texts, *pattern)
+        body = info.data.get("frame")
+        if info.field_name != "joints" and body in [text.partition("=")[0] for text in texts]:
+            raise ValueError(f"'{body}' is the body's own frame; a tool needs another name")
         return texts
 
     @property

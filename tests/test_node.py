@@ -48,6 +48,13 @@ def test_names_come_as_a_list_or_as_one_text(bus):
     assert 'tf_tools:=["a=b"]' in arguments and 'shape_tools:=[""]' in arguments
 
 
+@pytest.mark.parametrize("given", [{"tf_tools": "limb=tool0"}, {"shape_tools": "limb"}, {"gz_contacts": "limb=a::b"}])
+def test_no_tool_is_named_as_the_bodys_frame(given):
+    with pytest.raises(InvalidInput, match="'limb' is the body's own frame; a tool needs another name"):
+        checked({"frame": "limb"} | given)
+    assert checked(given)
+
+
 def test_a_parameter_says_its_unit_its_range_and_when_it_counts(bus):
     asked = ["edge_length", "max_age", "frame", "method"]
     edge, age, frame, method = bus.call(DescribeParameters, "describe_parameters", names=asked).descriptors

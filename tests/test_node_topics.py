@@ -91,6 +91,13 @@ def test_a_file_of_frames_that_cannot_be_read_is_refused(tmp_path, text):
         read_frames(str(tmp_path / "frames.yaml"))
 
 
+def test_a_file_of_frames_does_not_place_the_bodys_own(tmp_path):
+    (tmp_path / "frames.yaml").write_text("limb: {position: [0, 0, 0.1]}\n")
+    assert read_frames(str(tmp_path / "frames.yaml"), "body")
+    with pytest.raises(InvalidInput, match="places 'limb', which is the body's own frame"):
+        read_frames(str(tmp_path / "frames.yaml"), "limb")
+
+
 def test_the_example_of_frames_is_read_and_unknown_frames_stay_unknown():
     frames = Frames("body", read_frames(str(ROOT / "config/frames.yaml")))
     assert frames.at(0)["table"].shape == (4, 4) and "nowhere" not in frames.at(0)
@@ -165,6 +172,12 @@ def test_a_tool_that_is_taken_away_while_its_field_is_built_is_not_taken_into_us
     bus.tool("later").ready()
     bus.spin(2.0)
     assert not early.pose.get_subscription_count() and not bus.said("tool 'early': ")
+
+
+def test_a_tool_named_as_the_bodys_frame_is_refused(bus):
+    Hand(bus, "body")
+    (line,) = bus.wait(lambda: bus.said("mesh of 'body' refused"), "the log line")
+    assert "'body' is the body's own frame" in line and "give the tool another name" in line
 
 
 def test_poses_of_a_tool_that_nobody_announced_are_told_of_once(bus):
