@@ -162,12 +162,17 @@ def joints_from(message: Any, names: Mapping[str, str]) -> dict[str, float]:
         Angles by joint; empty if the message is of others.
 
     Raises:
-        InvalidInput: of these joints, but not as many positions as names, or an angle that is not finite.
+        InvalidInput: of these joints, but not as many positions as names, one of them twice, or an angle that is not
+            finite.
     """
     if not set(names.values()) & set(message.name):
         return {}
     if len(message.position) != len(message.name):
         raise InvalidInput(f"joint states hold {len(message.position)} positions for {len(message.name)} names.")
+    for name in names.values():
+        if list(message.name).count(name) > 1:
+            raise InvalidInput(f"joint {name} is there {list(message.name).count(name)} times in one message of joint "
+                               "states; which of its angles holds is not known.")  # fmt: skip
     told = dict(zip(message.name, message.position, strict=True))
     found = {joint: float(told[name]) for joint, name in names.items() if name in told}
     for joint, angle in found.items():

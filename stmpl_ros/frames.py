@@ -17,6 +17,7 @@ from stmpl_core.arrays import Transform
 from stmpl_core.errors import InvalidInput, StmplError
 from stmpl_core.text_file import text_of
 
+FAR = 10.0  # distance of a frame from the body's origin beyond which it is taken to be in millimetres [m]
 SHAPE = "name: {position: [x, y, z], orientation: [x, y, z, w]}, in metres, both optional"
 
 
@@ -116,6 +117,10 @@ def _placed(path: str, name: str, given: Any) -> Transform:
         pose = rigid([float(v) for v in place], [float(v) for v in turn])
         if not np.isfinite(pose).all():
             raise ValueError("it is not finite")
+        far = float(np.abs(pose[:3, 3]).max())
+        if far > FAR:
+            raise ValueError(f"it is {far:.1f} m from the body's origin; at most {FAR:g} m is accepted. "
+                             "Is its position in millimetres? Scale it by 1e-3")  # fmt: skip
         return pose
     except (ValueError, TypeError, StmplError) as error:
         raise InvalidInput(f"frame '{name}' of {path}: {error}. Expected {SHAPE}.") from error

@@ -138,3 +138,11 @@ def test_who_tells_of_other_joints_may_leave_positions_out():
     assert joints_from(JointState(name=["gripper"], effort=[1.0]), names) == {}
     with pytest.raises(InvalidInput, match="0 positions for 1 names"):
         joints_from(JointState(name=["elbow_2"], effort=[1.0]), names)
+
+
+def test_a_joint_that_is_told_twice_in_one_message_is_refused_and_one_of_no_rig_is_not():
+    names = {"elbow": "elbow_2"}
+    with pytest.raises(InvalidInput, match="joint elbow_2 is there 2 times"):
+        joints_from(JointState(name=["elbow_2", "elbow_2"], position=[0.1, 0.9]), names)
+    twice = JointState(name=["elbow_2", "gripper", "gripper"], position=[0.1, 0.0, 0.0])
+    assert joints_from(twice, names) == {"elbow": 0.1}

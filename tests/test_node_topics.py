@@ -84,7 +84,8 @@ def test_a_recording_of_another_frame_and_of_two_skins_is_replayed_bit_for_bit(b
 
 
 @pytest.mark.parametrize("text", ["[1, 2]", "t: {position: [1, 2]}", "t: {orientation: [0, 0, 0, 2]}", "t: {pos: 1}",
-                                  "t: 3", "{", "t: {position: [1, 2, .nan]}"])  # fmt: skip
+                                  "t: 3", "{", "t: {position: [1, 2, .nan]}",
+                                  "t: {position: [0, 0, 250]}"])  # fmt: skip
 def test_a_file_of_frames_that_cannot_be_read_is_refused(tmp_path, text):
     (tmp_path / "frames.yaml").write_text(text)
     with pytest.raises(InvalidInput, match=r"frames\.yaml"):
