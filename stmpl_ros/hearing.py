@@ -116,15 +116,16 @@ class Hearing:
         for sentence in tool.mendings:
             self.gate.say(f"mended {tool.name} {sentence}", f"the mesh of '{tool.name}' was mended: {sentence}")
         if field.flipped:
-            self.gate.say("inside out", f"the mesh of '{tool.name}' came inside out and was turned")
+            self.gate.say(f"inside out {tool.name}", f"the mesh of '{tool.name}' came inside out and was turned")
         if not field.watertight:
-            self.gate.say("holes", f"the mesh of '{tool.name}' has holes; what is inside it near them is a guess")
+            self.gate.say(f"holes {tool.name}",
+                          f"the mesh of '{tool.name}' has holes; what is inside it near them is a guess")
         return True
 
     def refuse(self, tool: Tool, error: BaseException) -> None:
         """Gives an announced tool up; the one of its name from before, if there is one, stays."""
         self.tools.withdraw(tool)
-        self.gate.refuse("mesh", f"mesh of '{tool.name}' refused: {error}")
+        self.gate.refuse(f"mesh of {tool.name}", f"mesh of '{tool.name}' refused: {error}")
 
     def look_for_strangers(self) -> None:
         """Tells once of each tool whose poses are sent and whose surface is not known, at the second look."""
@@ -205,7 +206,7 @@ class Hearing:
                                  "give the tool another name.")  # fmt: skip
             tool = read()
         except StmplError as error:
-            return self.gate.refuse("mesh", f"mesh of '{name}' refused: {error}")
+            return self.gate.refuse(f"mesh of {name}", f"mesh of '{name}' refused: {error}")
         if not self.tools.known(tool):  # sent once more, for who came late: what it touched is not forgotten
             self.tools.announce(tool)
             self.on_tool(tool)

@@ -13,12 +13,12 @@ from geometry_msgs.msg import Point, Vector3, WrenchStamped
 from geometry_msgs.msg import Wrench as WrenchMessage
 from sensor_msgs.msg import PointCloud2
 from shape_msgs.msg import Mesh, MeshTriangle
-from stmpl_msgs.msg import LocalContact, SkinDisplacement
+from stmpl_msgs.msg import ContactMesh, LocalContact, SkinDisplacement
 from stmpl_msgs.srv import SetBody
 
 from bags.reader import Bag
 from bags.replay import replay_run
-from bags.wire import layer_from, pose_message, pose_of_tool, stamp_ns, tool_message
+from bags.wire import header, layer_from, pose_message, pose_of_tool, stamp_ns, tool_message
 from stmpl_core import Tool
 from stmpl_core.errors import FrameError, InvalidInput
 from stmpl_core.methods import MomentNet
@@ -179,6 +179,13 @@ def test_a_tool_named_as_the_bodys_frame_is_refused(bus):
     Hand(bus, "body")
     (line,) = bus.wait(lambda: bus.said("mesh of 'body' refused"), "the log line")
     assert "'body' is the body's own frame" in line and "give the tool another name" in line
+
+
+def test_each_tool_whose_mesh_is_refused_is_told_of_however_soon_they_come(bus):
+    for name in ("flat", "broken"):
+        bus.mesh.publish(ContactMesh(header=header(name, bus.now()), vertices=[0.0] * 4, triangles=[0, 1, 2]))
+    for name in ("flat", "broken"):
+        bus.wait(lambda name=name: bus.said(f"mesh of '{name}' refused"), f"the log line of {name}")
 
 
 def test_poses_of_a_tool_that_nobody_announced_are_told_of_once(bus):
