@@ -20,7 +20,8 @@ from tests.scenes import limb, plate
 
 FILE = Path(__file__).with_name("strokes_of_fem.npz")
 SCENES = ("slab-ball8-mu0.3", "slab-ball8-mu0.6", "slab-ball8-mu1.0", "slab-ball8-spin-mu0.6", "slab-ball8-back-mu0.6",
-          "slab-ramp-hold", "slab-massage", "slab-press-lift-press", "tube-ball12-mu0.5", "tube-ball12-mu0.9")  # fmt: skip
+          "slab-ramp-hold", "slab-massage", "slab-press-lift-press", "tube-ball12-mu0.5",
+          "tube-ball12-mu0.9")  # fmt: skip
 SERIES = Prony((0.225, 0.225), (0.5, 5.0))
 MOVED = (15, 23)  # poses of slides whose motion is kept: where ours misses most at mu 1.0, and at 0.6
 BETWEEN = 4  # steps between two poses of finite elements
