@@ -220,8 +220,9 @@ class History:
         by, trail = force / elastic, one.before.trail
         changed: dict[str, Any] = {}
         if len(trail):
+            came = one.before.contact[0] if before.pressing > 0 else contact[0]
             passing = wake.Pass(pose, contact[0], contact[1], relaxed, at_rest, touch.depth, pressed.power, 1 - long,
-                                radius)  # fmt: skip
+                                radius, came)  # fmt: skip
             trail = wake.after(trail, self.series, dt, passing)
             changed["wake"] = wake.Wake(trail, shares)
         share, limit, slid, held, room = 1.0, 0.0, 1.0, 0.0, NO_ROOM

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 PLACES = 16  # places that are remembered; the shallowest gives way to a new one
 SPACING = 0.4  # way between two of them, over the radius of the contact
 SAME = 0.1  # way over that radius within which a tool that presses harder deepens a place
+HARDER = 1e-6  # how much harder, relative, that is: far above rounding
 FORGOTTEN = 0.02  # depth of a place over that of the press, below which it is forgotten
 
 
@@ -34,6 +35,7 @@ class Pass(NamedTuple):
         power: power of the depth with which the elastic force grows [-].
         strain: 1 less the stretch of the column under it [-].
         radius: radius of the contact [m].
+        came: middle of its contact before the step, or where it is now, if it did not press, (3,) [m].
     """
 
     pose: Transform
@@ -45,6 +47,7 @@ class Pass(NamedTuple):
     power: float
     strain: float
     radius: float
+    came: np.ndarray
 
 
 class Groove(NamedTuple):
@@ -73,83 +76,118 @@ def untouched(terms: int) -> np.ndarray:
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _depths(trail, shares):
-    """How deep the skin is at each place, or would stay if it were let go now, (PLACES,) [m]; 0 where there is none.
+def _depth(row, shares):
+    """How deep the skin is at a place, or would stay if it were let go now [m]; 0 where there is none.
 
     Skin that was let go comes back as its force does, through one shape.
     """
-    out = np.zeros(len(trail))
+    if not row[_FORCE] > 0:
+        return 0.0
+    force = 0.0
+    for i in range(len(shares)):
+        force += shares[i] * row[FIXED + i]
+    if row[_LET_DEPTH] > 0:
+        return row[_LET_DEPTH] * min(max(force / row[_LET_FORCE], 0.0), 1.0)
+    return row[_DEPTH] * depth_left(min(max(force / row[_FORCE], 0.0), 1.0), row[_POWER], row[_STRAIN])
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _depths(trail, shares):
+    """`_depth` of each place, (PLACES,) [m]."""
+    out = np.empty(len(trail))
     for k in range(len(trail)):
-        row = trail[k]
-        if row[_FORCE] > 0:
-            force = 0.0
-            for i in range(len(shares)):
-                force += shares[i] * row[FIXED + i]
-            if row[_LET_DEPTH] > 0:
-                out[k] = row[_LET_DEPTH] * min(max(force / row[_LET_FORCE], 0.0), 1.0)
-            else:
-                out[k] = row[_DEPTH] * depth_left(min(max(force / row[_FORCE], 0.0), 1.0), row[_POWER], row[_STRAIN])
+        out[k] = _depth(trail[k], shares)
     return out
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _aged(trail, shares, times, dt, away, radius, force):
-    """Lets places grow older: nearer than a radius [m] they are held with an elastic force [N], others come back.
+def _aged(trail, shares, times, dt, away, stays, force):
+    """Lets places grow older: each is held with an elastic force [N] for the first part of the step, then comes back.
 
-    `away`: how far each is from the tool, (PLACES,) [m], infinite where there is none, as where one is forgotten.
+    Args:
+        away: how far each is from the tool, (PLACES,) [m], infinite where there is none, as where one is forgotten.
+        stays: share of the step for which it is held, (PLACES,) [-].
     """
     terms = len(times)
-    kept, gain, back, depths = np.empty(terms), np.empty(terms), np.empty((0, 0)), _depths(trail, shares)
+    kept, gain, free = np.empty(terms), np.empty(terms), np.empty(terms)
     for k in range(len(trail)):
         row = trail[k]
         if not row[_FORCE] > 0:
             continue
-        if away[k] < radius:
-            weights(times, dt, 0.0, row[_NOW], row[FIXED:], kept, gain)
+        if stays[k] > 0:
+            weights(times, stays[k] * dt, 0.0, row[_NOW], row[FIXED:], kept, gain)
             row[_NOW], row[_LET_DEPTH] = force, 0.0
             for i in range(terms):
                 row[FIXED + i] = kept[i] + gain[i] * force
-            continue
-        if not len(back):
-            back = decay_of_free(shares, times, dt)
-        if row[_LET_DEPTH] == 0:
-            row[_LET_DEPTH], row[_LET_FORCE] = depths[k], 0.0
+        if stays[k] < 1:
+            if row[_LET_DEPTH] == 0:
+                row[_LET_DEPTH], row[_LET_FORCE] = _depth(row, shares), 0.0
+                for i in range(terms):
+                    row[_LET_FORCE] += shares[i] * row[FIXED + i]
+            back = decay_of_free(shares, times, (1 - stays[k]) * dt)
+            row[_NOW], free[:] = 0.0, row[FIXED:]
             for i in range(terms):
-                row[_LET_FORCE] += shares[i] * row[FIXED + i]
-        row[_NOW], kept[:] = 0.0, row[FIXED:]
-        for i in range(terms):
-            row[FIXED + i] = 0.0
-            for j in range(terms):
-                row[FIXED + i] += back[i, j] * kept[j]
-            row[_NOW] += shares[i] * row[FIXED + i]
-    depths = _depths(trail, shares)
-    for k in range(len(trail)):
-        if depths[k] < FORGOTTEN * trail[k, _DEPTH] and trail[k, _NOW] < trail[k, _FORCE]:
-            trail[k], away[k] = 0.0, np.inf
+                row[FIXED + i] = 0.0
+                for j in range(terms):
+                    row[FIXED + i] += back[i, j] * free[j]
+                row[_NOW] += shares[i] * row[FIXED + i]
+            if _depth(row, shares) < FORGOTTEN * row[_DEPTH] and row[_NOW] < row[_FORCE]:
+                row[:], away[k] = 0.0, np.inf
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _pressed(trail, shares, times, dt, pose, middle, normal, relaxed, force, depth, power, strain, radius):
-    """The places after a step in which the tool presses; see Pass."""
-    trail, away = trail.copy(), np.full(len(trail), np.inf)
+def _share_of_way(came, middle, place, far):
+    """Share of the way from `came` to `middle` (3,) at which a tool is `far` from a place it leaves; 1: not yet."""
+    a = b = 0.0
+    c = -far * far
+    for x in range(3):
+        way, off = middle[x] - came[x], came[x] - place[x]
+        a, b, c = a + way * way, b + way * off, c + off * off
+    return min((np.sqrt(b * b - a * c) - b) / a, 1.0) if c < 0 and a > 0 else 1.0
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _pressed(trail, shares, times, dt, pose, middle, normal, relaxed, force, depth, power, strain, radius, came):
+    """The places after a step in which the tool presses; see Pass.
+
+    They lie SPACING apart on its way, wherever its steps end.
+    """
+    trail, away, stays = trail.copy(), np.full(len(trail), np.inf), np.ones(len(trail))
     for k in range(len(trail)):
         if trail[k, _FORCE] > 0:
-            away[k] = np.sqrt(np.sum((trail[k, _FROM : _FROM + 3] - middle) ** 2))
-    _aged(trail, shares, times, dt, away, radius, force)
+            place = trail[k, _FROM : _FROM + 3]
+            away[k] = np.sqrt(np.sum((place - middle) ** 2))
+            if away[k] >= radius:
+                part = _share_of_way(came, middle, place, radius)
+                stays[k] = part if part < 1 else 0.0
+    _aged(trail, shares, times, dt, away, stays, force)
     place = np.argmin(away)
-    new = away[place] > SPACING * radius
-    if new:
+    if not away[place] > SPACING * radius:
+        if not (away[place] < SAME * radius and force > trail[place, _FORCE] * (1 + HARDER)):
+            return trail
+        row = trail[place]  # one that is pressed deeper stays where it is, however slowly the tool goes on
+        row[:_FROM] = pose.ravel()
+        row[_NOW], row[_FORCE], row[_DEPTH], row[_POWER], row[_STRAIN] = force, force, depth, power, strain
+        row[_LET_DEPTH] = row[_LET_FORCE] = 0.0
+        return trail
+    for _ in range(PLACES):
+        share = 1.0
+        if away[place] < np.inf:
+            share = _share_of_way(came, middle, trail[place, _FROM : _FROM + 3], SPACING * radius)
         depths = _depths(trail, shares)
         depths[trail[:, _FORCE] == 0] = -1.0
         place = np.argmin(depths)
-        trail[place, FIXED:] = relaxed
-    if new or (away[place] < SAME * radius and force > trail[place, _FORCE]):
-        row = trail[place]
+        row, back = trail[place], (1 - share) * (came - middle)
+        row[:] = 0.0
         row[:_FROM] = pose.ravel()
-        if new:  # one that is pressed deeper stays where it is, however slowly the tool goes on
-            row[_FROM : _FROM + 3], row[_FROM + 3 : _NOW] = middle, normal
+        for x in range(3):
+            row[4 * x + 3] += back[x]
+        row[_FROM : _FROM + 3], row[_FROM + 3 : _NOW] = middle + back, normal
         row[_NOW], row[_FORCE], row[_DEPTH], row[_POWER], row[_STRAIN] = force, force, depth, power, strain
-        row[_LET_DEPTH] = row[_LET_FORCE] = 0.0
+        row[FIXED:] = relaxed
+        away[place] = np.sqrt(np.sum(back**2))
+        if not away[place] > SPACING * radius:
+            break
     return trail
 
 
@@ -169,7 +207,7 @@ def after(trail: np.ndarray, series: Series, dt: float, now: Pass | None) -> np.
     if now is not None:
         return _pressed(trail, *series, dt, *now)
     trail = trail.copy()
-    _aged(trail, *series, dt, np.full(len(trail), np.inf), 0.0, 0.0)
+    _aged(trail, *series, dt, np.full(len(trail), np.inf), np.zeros(len(trail)), 0.0)
     return trail
 
 
