@@ -7,6 +7,7 @@ import numpy as np
 
 from stmpl_core.relaxation import decay_of_free, faded, left_over, stretch, weights
 
+LEAST = 1e-9  # depth and radius of a contact that are none [m]
 LEFT = 0.6  # of what is dragged: what a way of one radius leaves behind, far on; a ball that rolls by finite elements
 ROLLED, PASSED = 0.5, 0.25  # radius of the room that a contact has rolled over, and of that it has slid over, over a
 EDGE_SHARE = 0.3  # pressure over its mean from which skin counts as touched in full
@@ -349,7 +350,7 @@ def part_of_way(way: np.ndarray, normal: np.ndarray, depth: float, radius: float
         depth, radius: depth and radius of the contact that it comes to, or leaves [m].
         power: that power [-].
     """
-    across = float(way @ normal)
+    across, depth, radius = float(way @ normal), max(depth, LEAST), max(radius, LEAST)
     aside = float(np.linalg.norm(way - across * normal))
     return min(1.0, depth / max(across, depth), radius / max(aside, radius)) * 2 / (max(power, 1.0) + 1)
 

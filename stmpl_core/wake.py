@@ -109,7 +109,7 @@ def _aged(trail, shares, times, dt, away, stays, force):
         stays: share of the step for which it is held, (PLACES,) [-].
     """
     terms = len(times)
-    kept, gain, free = np.empty(terms), np.empty(terms), np.empty(terms)
+    kept, gain, free, whole = np.empty(terms), np.empty(terms), np.empty(terms), np.empty((0, 0))
     for k in range(len(trail)):
         row = trail[k]
         if not row[_FORCE] > 0:
@@ -124,7 +124,9 @@ def _aged(trail, shares, times, dt, away, stays, force):
                 row[_LET_DEPTH], row[_LET_FORCE] = _depth(row, shares), 0.0
                 for i in range(terms):
                     row[_LET_FORCE] += shares[i] * row[FIXED + i]
-            back = decay_of_free(shares, times, (1 - stays[k]) * dt)
+            if stays[k] == 0 and not len(whole):
+                whole = decay_of_free(shares, times, dt)
+            back = whole if stays[k] == 0 else decay_of_free(shares, times, (1 - stays[k]) * dt)
             row[_NOW], free[:] = 0.0, row[FIXED:]
             for i in range(terms):
                 row[FIXED + i] = 0.0
