@@ -83,6 +83,10 @@ def clinging(touch, time, dt):
     return {} if touch.presses else {"wrench": np.array([0, 0, 1e-3, 0, 0, 0])}
 
 
+def growing(touch, time, dt):
+    return {"wrench": touch.wrench * (1 + time)}
+
+
 def waning(touch, time, dt):
     return {} if touch.slip is None else {"slip": touch.slip._replace(wrench=touch.slip.wrench * np.exp(-time))}
 
@@ -90,7 +94,7 @@ def waning(touch, time, dt):
 FAULTS: dict[str, tuple[str, Fault]] = {
     "finite": ("spin", nan), "gives": ("closed path", pushing), "caps": ("friction", sticky),
     "alike": ("time step", by_step), "masing": ("reversal", one_sided), "between": ("time of relaxation", too_stiff),
-    "free": ("lift-off", clinging), "lasts": ("rocking", waning),
+    "free": ("lift-off", clinging), "lasts": ("rocking", waning), "ends": ("friction round a limb", growing),
 }  # fmt: skip
 
 

@@ -172,7 +172,7 @@ MEANING = {
     "needless": "an ordinary touch is not flagged", "verdict": "one verdict for one scene",
     "agrees": "stiffness agrees", "gives": "gives no energy", "caps": "friction has a limit",
     "alike": "the same in other steps", "masing": "reversals as Masing says", "between": "between relaxed and sudden",
-    "free": "free when lifted", "lasts": "what sticks stays",
+    "free": "free when lifted", "lasts": "what sticks stays", "ends": "a drag grows no force",
 }  # fmt: skip
 VERDICTS = frozenset(("needless", "verdict", "agrees"))  # laws of flags: alone, they do not make an answer wrong
 

@@ -23,7 +23,7 @@ LETTERS = {
     "bounded": "b", "rises": "d", "touches": "i", "presses": "F", "carries": "w", "still": "t", "steady": "P",
     "smooth": "k", "ripple": "~", "outside": "q", "covers": "±", "needless": "x", "verdict": "v", "agrees": "E",
     "gives": "W", "caps": "µ", "alike": "2", "masing": "M", "between": "G", "free": "u",
-    "lasts": "L", "sinks": "S",
+    "lasts": "L", "sinks": "S", "ends": "Q",
 }  # fmt: skip
 
 

@@ -199,6 +199,18 @@ def on_a_limb(stage: Stage, level: float) -> Trial:
     return Trial("", f"{level:g}°", LAWS, scene)
 
 
+def grip_on_a_limb(stage: Stage, level: float) -> Trial:
+    """Coefficient of friction: a ball is pressed in and led by half a turn round a limb of 40 mm radius."""
+    mesh = limb(stage.tool_edge, 0.04, 0.16, THICKNESS)
+    depth = DEEP * np.minimum(np.arange(221) / 20, 1)
+    angle = np.pi * np.maximum(np.arange(221) - 20, 0) / 200
+    poses = np.tile(np.eye(4), (len(angle), 1, 1))
+    away = 0.04 + RADIUS - depth
+    poses[:, :3, 3] = np.stack([away * np.cos(angle), away * np.sin(angle), 0.08 + 0 * angle], axis=1)
+    scene = Strokes(replace(mesh, tissue=ELASTIC), BALL, poses, STEP * np.arange(len(angle)), level)
+    return Trial("", f"{level:g}", (*LAWS, "ends"), scene)
+
+
 def noise(stage: Stage, level: float) -> Trial:
     """Noise of the pose in micrometres, at 100 Hz for 3 s, of a tool that was dragged and is held."""
     places = keys((0, 0, 0, 0), (0.1, 0, 0, DEEP), (0.2, 3e-4, 0, DEEP), (3.2, 3e-4, 0, DEEP))
@@ -234,7 +246,7 @@ def _at_last(scene: Strokes, twin: Strokes) -> Twin:
 STROKE_AXES: dict[str, Callable[[Stage, float], Trial]] = {
     "time step": time_step, "lost steps": cut, "long gap": long_gap, "time of relaxation": fading, "friction": friction,
     "reversal": reversal, "spin": spin, "stick-slip": stick_slip, "lift-off": lift_off, "round a limb": on_a_limb,
-    "noise of a pose": noise, "rocking": rocking, "closed path": closed_path,
+    "friction round a limb": grip_on_a_limb, "noise of a pose": noise, "rocking": rocking, "closed path": closed_path,
 }  # fmt: skip
 STROKE_LEVELS: dict[str, Sequence[float]] = {
     "time step": (0.1, 0.5, 2, 5, 10, 20, 50),
@@ -247,6 +259,7 @@ STROKE_LEVELS: dict[str, Sequence[float]] = {
     "stick-slip": (10, 40, 150, 600),
     "lift-off": (0, 0.05, 1, 100, 1e6),
     "round a limb": (2, 10, 45),
+    "friction round a limb": (0.3, 0.6, 0.8, 1.0, 1.2, 3.0),
     "noise of a pose": (1, 3, 10),
     "rocking": (0.1, 0.2, 0.4),
     "closed path": tuple(range(24)),
@@ -254,5 +267,5 @@ STROKE_LEVELS: dict[str, Sequence[float]] = {
 QUICK_STROKES: dict[str, Sequence[float]] = {
     "time step": (10,), "lost steps": (0.3,), "long gap": (10,), "time of relaxation": (0.1,), "friction": (0.5,),
     "reversal": (0.5,), "spin": (15,), "stick-slip": (100,), "lift-off": (100,), "round a limb": (10,),
-    "noise of a pose": (3,), "rocking": (0.3,), "closed path": (7,),
+    "friction round a limb": (0.8,), "noise of a pose": (3,), "rocking": (0.3,), "closed path": (7,),
 }  # fmt: skip

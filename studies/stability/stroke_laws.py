@@ -19,6 +19,7 @@ CUT = 0.01  # of the largest force, by which the same path in other steps may ch
 CAPPED = 1.7  # friction over mu N at most: ploughing raises it
 DOUBLED = 0.03  # of the largest friction, by which a reversal may miss the first loading, twice as large
 LASTS = 0.15  # of friction that sticks, and a third of that of the force, that may be lost to and fro
+GROWS, JUMPS = 2.0, 0.2  # of the force pressed straight: most that it becomes where skin is dragged along, and at once
 BETWEEN = 0.01  # of the elastic force, by which a force may leave what lies between relaxed and sudden
 
 
@@ -123,9 +124,20 @@ def lasts(trial: Trial, answers: Answers) -> Found:
             yield broken("lasts", f"presses with {one.force:.3g} N for {other.force:.3g}", ours[k], theirs[m])
 
 
+@worst
+def ends(trial: Trial, answers: Answers) -> Found:
+    """Led on at one depth a tool presses at most GROWS times as hard as it pressed at first, and not at once."""
+    given = answers_of(answers.scene)
+    forces, depths = (np.array([getattr(_touch(one.touches), what) for one in given]) for what in ("force", "depth"))
+    first = int(np.argmax(depths > 0.95 * depths.max()))  # where triangles are flat it goes up and down
+    for k in range(first + 1, len(given)):
+        if forces[k] > GROWS * forces[first] or abs(forces[k] - forces[k - 1]) > JUMPS * forces[first]:
+            yield broken("ends", f"presses with {forces[k]:.3g} N, straight it was {forces[first]:.3g}", given[k])
+
+
 STROKE_LAWS: dict[str, Law] = {
     "gives": gives, "caps": caps, "alike": alike, "masing": masing, "between": between, "free": free,
-    "lasts": lasts,
+    "lasts": lasts, "ends": ends,
 }  # fmt: skip
 """Laws of strokes, by name."""
 
