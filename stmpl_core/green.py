@@ -119,6 +119,11 @@ class Green:
             _KEPT[layer] = cls(layer, CoarseResponse.of(layer) if layer.stacked else None)
         return _KEPT[layer]
 
+    @staticmethod
+    def kept(layer: SoftLayer) -> Green | None:
+        """The response of a layer, if it was made."""
+        return _KEPT.get(layer)
+
     def keep(self, layer: SoftLayer) -> None:
         """Lets `of` give this one for another layer, of the same shape and the same ratios of moduli."""
         _KEPT[layer] = self
@@ -132,6 +137,7 @@ class Green:
             turns: rotation of each vertex from rest, (V, 3, 3).
         """
         out = copy(self)
+        vars(out).pop("_of_one", None)
         out.layer, out.near, out._last = copy(layer), near, None
         out._skin_turns, out._at_rest = turns, self._at_rest or self
         mesh = self.coarse or vars(out._at_rest).get("drag")  # what was not needed so far is not made for a pose
@@ -150,7 +156,7 @@ class Green:
             return self._at_rest.drag
         if self.coarse is not None:
             return CoarseDrag.of(self.layer)
-        if np.median(np.abs(self.near.curvature[:, ::2]).max(axis=1)) > FLAT:
+        if not self.near.posed and np.median(np.abs(self.near.curvature[:, ::2]).max(axis=1)) > FLAT:
             with suppress(StmplError):  # of one material flat skin is an answer, too
                 return CoarseDrag.of(self.layer)
         return None

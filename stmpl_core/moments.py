@@ -87,6 +87,7 @@ class Surroundings:
         curvature: thickness times the skin's curvature in the tangents, xx, xy, yy, (V, 3) [-]; convex is positive.
         slope: gradient of the thickness along the tangents, (V, 2) [-].
         sound: where the layer is as the networks know skin.
+        posed: flag of skin that joints took elsewhere.
     """
 
     def __init__(self, layer: SoftLayer) -> None:
@@ -103,7 +104,7 @@ class Surroundings:
         tangents, (xx, xy, yy) = self.frames[:, :2], self.curvature.T
         own = np.stack([xx, xy, xy, yy], axis=1).reshape(-1, 2, 2)
         bend, slope = tangents.transpose(0, 2, 1) @ own @ tangents, np.einsum("va,vax->vx", self.slope, tangents)
-        self._bent, self._posed = np.concatenate([bend.reshape(-1, 9), slope], axis=1), False
+        self._bent, self.posed = np.concatenate([bend.reshape(-1, 9), slope], axis=1), False
         table = response_table(layer.tissue, float(layer.thickness[0]))
         self._response = np.ascontiguousarray(np.moveaxis(table, 2, 0))
         self._felt(np.zeros((1, 1)), np.zeros(1, np.int64), np.zeros(1, np.int32))  # compiled now
@@ -181,7 +182,7 @@ class Surroundings:
         out._thinning = self._thinning.bent()
         out._frames, out._sites = np.empty_like(self._frames), self._sites.copy()
         _move(layer.vertices, layer.vertex_areas, frames, out._frames, out._sites)
-        out._bent, out._posed = np.empty((len(frames), 12)), True
+        out._bent, out.posed = np.empty((len(frames), 12)), True
         return out
 
     def bent_at(self, vertices: np.ndarray) -> np.ndarray:
@@ -190,7 +191,7 @@ class Surroundings:
         Args:
             vertices: numbers of vertices, of any shape; what joints took elsewhere is turned there alone.
         """
-        if self._posed:
+        if self.posed:
             _turn_bent(vertices.ravel(), self.frames, self.curvature, self.slope, self._bent)
         return self._bent
 

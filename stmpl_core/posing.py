@@ -15,6 +15,7 @@ import numpy as np
 from scipy.spatial import KDTree
 
 from stmpl_core.bend import Bend, Zone
+from stmpl_core.green import Green
 from stmpl_core.layer import SoftLayer
 from stmpl_core.methods.base import anew
 from stmpl_core.moments import WIDEST, Surroundings
@@ -82,11 +83,12 @@ class Posing:
         _between(self._bending, self._corners, self._shares, change, near.frames, curvature)
         moved = near.moved(layer, frames, curvature, Bend(self._zone, layer, curvature))
         moved.keep(layer)
-        green = None
-        if rest.green is not None:
-            green = rest.green.moved(layer, moved, _turns(weights, quaternions))
+        green = rest.green or Green.kept(rest.layer)  # of one material, if somebody asked for it
+        if green is not None:
+            green = green.moved(layer, moved, _turns(weights, quaternions))
             green.keep(layer)
-        return rest.at(layer, anew(rest.method).prepare(layer), moved, green, tuple(angles))
+        stacks = green if rest.green is not None else None
+        return rest.at(layer, anew(rest.method).prepare(layer), moved, stacks, tuple(angles))
 
     def turn_at(self, vertex: int, angles: Sequence[float]) -> np.ndarray:
         """Rotation of the skin at a vertex under angles of the joints [rad], (3, 3)."""

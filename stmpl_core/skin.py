@@ -92,6 +92,8 @@ class Skin:
         tissue = replace(rest.layer.tissue, youngs_modulus=youngs_modulus, density=density)
         layer = rest.layer.with_(tissue=tissue)
         rest.near.keep(layer)
+        if rest.green is None and (green := Green.kept(rest.layer)):
+            green.keep(layer)
         return Skin(layer, method.prepare(layer), rest.near)
 
     @cached_property

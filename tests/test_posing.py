@@ -16,11 +16,13 @@ from stmpl_core import Answer, Contact, Membrane, Ply, Simulator, Skin, SoftLaye
 from stmpl_core.body import Body
 from stmpl_core.bones import Bone, to_bone
 from stmpl_core.errors import InvalidInput
+from stmpl_core.green import Green
 from stmpl_core.layer import layer_id
 from stmpl_core.load import Load
 from stmpl_core.methods import Coarse, Linear, MomentNet, Winkler
 from stmpl_core.methods import method as method_named
 from stmpl_core.methods.base import anew
+from stmpl_core.nodes import Nodes
 from stmpl_core.rig import Joint, Rig
 from stmpl_core.sdf import SignedDistance
 from stmpl_core.soundness import HOLLOW
@@ -426,3 +428,20 @@ def test_a_state_of_other_joints_is_refused(skin):
     still = Simulator(skin.layer.with_(rig=None), Winkler(), friction=0.4)
     with pytest.raises(InvalidInput, match="told at 1 joint; this skin has none"):
         still.touch([Contact(ball(), pose)], state, 0.02)
+
+
+def test_what_a_round_limb_of_one_material_gives_goes_along_and_is_not_found_again():
+    """Coarse elements take seconds: they are those of the skin at rest, of any stiffness, turned where it is bent."""
+    layer = limb(5e-3)
+    simulator = Simulator(layer.with_(rig=hinged(layer)), MomentNet(), friction=0.4)
+    rest = simulator.skin
+    made = Green.of(rest.layer).drag
+    bent = rest.at_angles([0.3])
+    assert made is not None and Green.of(bent.layer).drag is made
+    assert Green.of(rest.stiffened(MomentNet(), youngs_modulus=5e3, density=1e3).layer).drag is made
+    vertex = int(np.abs(bent.layer.vertices - rest.layer.vertices).max(axis=1).argmax())
+    nodes = Nodes.none()._replace(corners=np.full((1, 3), vertex), shares=np.array([[1.0, 0, 0]]))
+    here, there = (Green.of(one.layer).give(nodes, np.ones(1)) for one in (rest, bent))
+    turn = bent.turn_at(vertex)
+    np.testing.assert_allclose(there, turn @ here @ turn.T, atol=1e-6 * np.abs(here).max())
+    assert np.abs(here).max() > 0 and np.abs(there - here).max() > 0.05 * np.abs(here).max()
