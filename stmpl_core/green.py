@@ -128,6 +128,12 @@ class Green:
         """Lets `of` give this one for another layer, of the same shape and the same ratios of moduli."""
         _KEPT[layer] = self
 
+    def stiffened(self, layer: SoftLayer, near: Surroundings) -> Green:
+        """The same response of a layer that differs in E alone, with its neighbours."""
+        out = copy(self)
+        out.layer, out.near, out._last = copy(layer), near, None
+        return out
+
     def moved(self, layer: SoftLayer, near: Surroundings, turns: np.ndarray) -> Green:
         """The same response where joints take the skin; the wide part's motion turns with the skin that it moves.
 
@@ -136,9 +142,8 @@ class Green:
             near: its neighbours.
             turns: rotation of each vertex from rest, (V, 3, 3).
         """
-        out = copy(self)
+        out = self.stiffened(layer, near)
         vars(out).pop("_of_one", None)
-        out.layer, out.near, out._last = copy(layer), near, None
         out._skin_turns, out._at_rest = turns, self._at_rest or self
         mesh = self.coarse or vars(out._at_rest).get("drag")  # what was not needed so far is not made for a pose
         if mesh is not None:
@@ -158,7 +163,7 @@ class Green:
             return CoarseDrag.of(self.layer)
         if not self.near.posed and np.median(np.abs(self.near.curvature[:, ::2]).max(axis=1)) > FLAT:
             with suppress(StmplError):  # of one material flat skin is an answer, too
-                return CoarseDrag.of(self.layer)
+                return CoarseDrag.of(self.layer.with_(tissue=Tissue(1.0, self.layer.tissue.poisson_ratio)))
         return None
 
     @cached_property

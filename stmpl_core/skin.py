@@ -93,7 +93,7 @@ class Skin:
         layer = rest.layer.with_(tissue=tissue)
         rest.near.keep(layer)
         if rest.green is None and (green := Green.kept(rest.layer)):
-            green.keep(layer)
+            green.stiffened(layer, rest.near).keep(layer)
         return Skin(layer, method.prepare(layer), rest.near)
 
     @cached_property
