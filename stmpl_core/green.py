@@ -51,6 +51,7 @@ RIDGE = 1e-6  # of the matrix that sticks, over its largest number: two nodes in
 LEAST_KAPPA, LEAST_PULL = 0.05, 0.02  # kappa and pull that are none, in logarithms
 NEXT = np.uint64(1)  # no index that may count from the end
 ONE_WAY = 0.3  # least cosine between a tool's way and the skin's inward normal at a node
+ANY_MODULUS = 1e4  # of one material, whose response over E is found once for all stiffnesses, to the bit [Pa]
 FLAT = 0.05  # thickness over a radius of the skin up to which what is dragged gives as on a flat layer
 TAKEN_BACK = 0.5  # most that the limb takes back of what a node does to itself in the flat response
 
@@ -163,7 +164,7 @@ class Green:
             return CoarseDrag.of(self.layer)
         if not self.near.posed and np.median(np.abs(self.near.curvature[:, ::2]).max(axis=1)) > FLAT:
             with suppress(StmplError):  # of one material flat skin is an answer, too
-                return CoarseDrag.of(self.layer.with_(tissue=Tissue(1.0, self.layer.tissue.poisson_ratio)))
+                return CoarseDrag.of(self.layer.with_(tissue=Tissue(ANY_MODULUS, self.layer.tissue.poisson_ratio)))
         return None
 
     @cached_property
