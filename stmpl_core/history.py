@@ -178,11 +178,10 @@ class History:
         if one.stated.wrench is not None or not one.known or one.before.scalars.pressing > 0 or not len(one.kept) or \
                 not touch.presses or pressed is None or pressed.forces is None or not touch.force > 0:  # fmt: skip
             return one
-        some, pose = pressed.forces > 0, one.stated.pose_body_from_tool
+        pose = one.stated.pose_body_from_tool
         middle = pressed.forces @ pressed.squeeze.nodes.points / pressed.forces.sum()
         way = -_gone(pose, one.before.pose, middle)
-        radius = math.sqrt(float(pressed.squeeze.nodes.area[some].sum()) / math.pi)
-        part = part_of_way(way, touch.push / touch.force, touch.depth, radius, pressed.power)
+        part = part_of_way(way, touch.push / touch.force, touch.depth, _radius(pressed), pressed.power)
         _, gone, kept, gain, owed, now, passed = self._aged(one.before, one.known, pose, dt, part)
         return one._replace(gone=gone, kept=kept, gain=gain, owed=owed, now=now, passed=passed)
 
@@ -196,7 +195,7 @@ class History:
         force = math.sqrt(push @ push)
         if not force > 0:
             return None
-        fades = faded(self._fades, math.sqrt(float(pressed.squeeze.nodes.area[pressed.forces > 0].sum()) / math.pi))
+        fades = faded(self._fades, _radius(pressed))
         now, long = 1 - fades * float(self.series.shares @ one.gain), stretch(touch.depth, mean_thickness(pressed))
         takes = needed(one.stated.wrench, push, force, has, long, one.owed, now, one.before.slid)
         carried = float(one.contact.wrench[:3] @ push) / force
@@ -367,6 +366,12 @@ def _gone(before: Transform, after: Transform, point: np.ndarray) -> np.ndarray:
     """Way of a tool's point, that is at `point` (3,) before, between poses (4, 4), (3,) [m]."""
     motion = after @ inverted(before)
     return motion[:3, :3] @ point + motion[:3, 3] - point
+
+
+def _radius(pressed: Pressed) -> float:
+    """Radius of a circle as large as what presses [m]."""
+    assert pressed.forces is not None
+    return math.sqrt(float(pressed.squeeze.nodes.area[pressed.forces > 0].sum()) / math.pi)
 
 
 def mean_thickness(pressed: Pressed) -> float:
