@@ -84,7 +84,8 @@ class Batch:
         if not all(isinstance(skin, Skin) for skin in self.skins):
             raise InvalidInput("a batch needs prepared skins. Try Skin.of(layer, MomentNet()).")
         if not isinstance(count, Integral) or count < 1 or len(self.skins) != count:
-            raise InvalidInput(f"{len(self.skins)} skins do not fit {count} scenes: give one, or one for each.")
+            raise InvalidInput(f"{len(self.skins)} skins do not fit {count} scenes: give one, or one for each of at "
+                               "least one scene.")  # fmt: skip
         check_tools(friction, [tool.name for tool in self.tools])
         if not self.tools or len({tool.name for tool in self.tools}) < len(self.tools):
             raise InvalidInput("a batch needs tools, each with a name of its own. Try tool.named('left').")
@@ -197,5 +198,6 @@ def _matrices(poses: Any, n: int, many: int) -> np.ndarray:
     out = np.full((n * many, 4, 4), np.nan)
     out[:, 3] = (0.0, 0.0, 0.0, 1.0)
     out[sound, :3, :3] = Rotation.from_quat(flat[sound, 3:]).as_matrix()
-    out[sound, :3, 3] = flat[sound, :3]
+    out[:, :3, 3] = flat[:, :3]
+    out[np.isfinite(flat).all(axis=1) & ~sound, :3, :3] = 0.0  # no unit quaternion: refused as not rigid
     return out.reshape(n, many, 4, 4)

@@ -47,6 +47,7 @@ if TYPE_CHECKING:
     from stmpl_core.tissue import Tissue
 
 MAX_TOOL_OFFSET_M = 3e-3  # distance that calibration may leave between a pressing tool and its stated place
+MUCH_MOVED = 0.5  # way of a tool to where it presses as told, over the thickness, that is not yet worth a word
 MAX_TOUCHING_GAP = 0.25  # largest gap of a tool that touches between vertices, over a hole's radius
 GAP_TOLERANCE_M = 1e-6  # gap at which the search along the force ends
 MIN_FACING_COSINE = 0.1  # cosine between push and inward normal from which the skin faces a tool that looks for it
@@ -65,7 +66,7 @@ MUCH_STIFFER = 50.0  # stiffness over that of the tissue above from which a mate
 SOFT_SHARE = 0.7  # depth over the soft tissue's there; at 0.62 force is 9 % off, at 0.87 by 18 to 33 %
 RATIOS_APART = 0.06  # difference of the materials' Poisson's ratios: 0.05 cost nothing, of 0.1 force is 15 % off
 MAX_PULL = 1.0  # T / (E t) of the effective layer: beyond, force on round limbs is up to 14 % off; people have 0.7
-SLACK = 0.01, 0.5  # T / (E t), and kappa, below and above which skin is slack and matters
+SLACK = 0.04, 0.5  # T / (E t), and kappa, below and above which skin is slack and matters: force then falls with T
 PINS = 3  # tools side by side from which they may be pins of one brush
 SIDES = (0.2, 0.9)  # share of the force that points one way: below, a tool closes around; between, none was learnt
 MAX_UNSEEN_FORCE_SHARE = 0.1  # share of the force that vertices unlike all training contacts may carry
@@ -73,6 +74,7 @@ MAX_PRESSED_STRAIN = 0.85  # depth over thickness beyond which no wrench presses
 STIFFENING = 10.0  # growth of the force beyond, relative, a thickness of the way that it was drawn back
 FORCE_TOLERANCE = 0.015  # relative error of the force at which trials end; the rest of the way is reckoned
 LEAST_STEP = 2e-4  # step of the depth, over the thickness, that is likewise only reckoned
+FIRST_DEPTH = 0.05  # depth of the first trial of a tool that is at the skin or over it, over the thickness
 MAX_DEPTH_TRIALS = 14  # trials of the depth for one wrench
 STIFFER = 1.1  # power of the depth with which the force grows over that of the linear layer, until a trial says more
 POWERS = (0.7, 6.0)  # range of that power
@@ -224,7 +226,7 @@ class Toucher:
         if tried is not None and contact.wrench is not None:
             stated = contact.wrench[:3]
             pose = shifted(pose, tried / math.sqrt(stated @ stated) * stated)
-        reach = 0.0 if contact.wrench is None else self.reach + self._thickest
+        reach = 0.0 if contact.wrench is None else self.reach
         clearance = self._clearance(field, pose, reach, many)
         depth = -clearance.nearest
 
@@ -297,7 +299,10 @@ class Toucher:
         if found.nearest > 0 and reach > 0:
             far += reach
             found = self._cleared(field, pose, far, far, many)
-        return found if found.nearest < far else self._cleared(field, pose, far + self._thickest, far, many)
+        if found.nearest < far:
+            return found
+        wide = far + self._thickest
+        return self._cleared(field, pose, wide, wide if reach > 0 else far, many)
 
     def _cleared(self, field: SignedDistance, pose: Transform, within: float, far: float,
                  many: bool = False) -> Clearance:  # fmt: skip
@@ -338,14 +343,19 @@ class Toucher:
         layer, force = self.layer, contact.wrench[:3]
         push, stated_at = force / np.linalg.norm(force), contact.pose_body_from_tool[:3, 3]
         low, high, moved, best = -np.inf, np.inf, gap, None
+        if stated.nearest > -FIRST_DEPTH * self._thickest:  # of a first touch little follows for what is deeper
+            moved = gap + FIRST_DEPTH * self._thickest
         last: tuple[float, float] | None = None  # depth and force of the trial before
-        back, pressed_at = 0.1 * self._thickest, np.inf
+        strains: list[tuple[float, float]] = []  # way and strain of those that do not reach the core
+        pressed_at = np.inf
         for _ in range(MAX_DEPTH_TRIALS):
             pose, clearance = shifted(start, moved * push), stated
             if moved:
                 clearance = self._cleared(field, pose, self.hole, self.hole)
             squeeze = self.columns.squeeze(field, pose, clearance)
             v, strain = squeeze.vertices, self.deep.strain(squeeze)
+            if strain < 1 or not strains:
+                strains.append((moved, strain))
             through = moved > pressed_at  # deeper than where it pressed: it may have gone through the limb
             if not (self._inward[v] @ push > MIN_FACING_COSINE).any() or not len(squeeze.nodes.area):
                 if best is None and gap == 0.0 and len(squeeze.nodes.area):
@@ -368,8 +378,10 @@ class Toucher:
             if normal <= 0 and not through:
                 return None
             if normal <= 0 or strain > MAX_PRESSED_STRAIN + 0.02:  # too deep, whatever it presses with
-                high, back = min(high, moved), 2 * back
-                moved = 0.5 * (low + high) if np.isfinite(low) else moved - back
+                high, following = min(high, moved), _strained(strains, squeeze)
+                least = moved - 0.05 * self._thickest
+                moved = min(following, least) if low == -np.inf else following
+                moved = moved if low < moved < high else 0.5 * (low + high)
                 continue
             status = MOVED if gap > MAX_TOUCHING_GAP * self.hole else TOUCHING
             way = float((pose[:3, 3] - stated_at) @ push)
@@ -385,13 +397,12 @@ class Toucher:
                 under = np.where(squeeze.depth > 0, squeeze.depth + further * (self._inward[v] @ push), 0.0)
                 return best._replace(pose=shifted(pose, further * push), moved=way + further,
                                      squeeze=squeeze._replace(depth=np.maximum(under, 0.0)))  # fmt: skip
-            if size < normal and strain > MAX_PRESSED_STRAIN - 0.01:
+            if size < normal and strain > MAX_PRESSED_STRAIN - 0.005:
                 why = (f"{contact.name} carries {size:.2g} of {normal:.2g} N along the skin's normal, "
                        f"pressed to {strain:.0%} of the layer")  # fmt: skip
                 return best._replace(force=size, why=why)
             low, high, last = (moved, high, (deep, size)) if size < normal else (low, moved, (deep, size))
-            room = (MAX_PRESSED_STRAIN - strain) * self._thickest / gain
-            following = moved + min(further, max(room, 0.002 * self._thickest))
+            following = min(moved + further, _strained(strains, squeeze))
             if not low < following < high:  # halve the bracket, or go to where its open end must be
                 least = 0.05 * self._thickest
                 inside = np.isfinite(high - low)
@@ -491,10 +502,11 @@ class Toucher:
                                f"times as stiff, tried is {SOFT_SHARE:.0%}", in_range=False)  # fmt: skip
         for why in self._unlearnt:
             trust = trust.also(why, in_range=False)
+        thickest = float(one.squeeze.nodes.thickness.max())
         if strange > MAX_UNSEEN_FORCE_SHARE:
             trust = trust.also(f"{strange:.0%} of the force of {name} is where no training contact was like it",
                                in_range=False)  # fmt: skip
-        if one.force is not None and abs(one.moved) > self.reach:
+        if one.force is not None and abs(one.moved) > max(self.reach, MUCH_MOVED * thickest):
             trust = trust.also(f"{name} was moved {one.moved * 1e3:+.1f} mm along its force: check its calibration")
         if alone:
             trust = self.unmet(trust, touch, stated)
@@ -526,6 +538,16 @@ class Toucher:
         if drag > MAX_DRAG_RATIO * force:
             trust = trust.also(f"{name} also drags with {drag:.2g} N, which is not carried", in_range=False)
         return trust
+
+
+def _strained(trials: Sequence[tuple[float, float]], squeeze: Squeeze) -> float:
+    """Way at which a tool presses to MAX_PRESSED_STRAIN, by trials (way [m], strain) and the last one's squeeze [m]."""
+    near = sorted(trials, key=lambda one: abs(one[1] - MAX_PRESSED_STRAIN))[:2]
+    way, strain = near[0]
+    slope = 1 / float(squeeze.nodes.thickness.min())
+    if len(near) > 1 and (near[1][1] - strain) * (near[1][0] - way) > 0:
+        slope = (near[1][1] - strain) / (near[1][0] - way)
+    return way + (MAX_PRESSED_STRAIN - strain) / slope
 
 
 def groups_of(points: Sequence[np.ndarray], thickness: float) -> list[list[int]]:
@@ -636,7 +658,8 @@ def unlearnt(layer: SoftLayer, low: float, high: float) -> list[str]:
     if (apart := max(ratios) - min(ratios)) > RATIOS_APART:
         out.append(f"Poisson's ratios of the materials differ by {apart:.2g}; tried is {RATIOS_APART:g}")
     if tissue.skin is not None and pull < SLACK[0] and Green.of(layer).effective.kappa > SLACK[1]:
-        out.append("the skin has no tension: such skin is answered 10 to 22 % too stiff; people's is taut")
+        out.append(f"the skin has next to no tension, T / (E t) = {pull:.2g}: such skin is answered 10 to 22 % too "
+                   "stiff; people's is taut")  # fmt: skip
     if pull > MAX_PULL:
         out.append(f"the skin's tension is {pull:.2g} times E t of the tissue under it; tried is {MAX_PULL:g}")
     return out

@@ -109,7 +109,8 @@ def test_a_scene_that_is_refused_spoils_no_other(skin: Skin) -> None:
         else:
             assert np.array_equal(found.wrenches[i], expected[i])
     seven = np.zeros((N, 2, 7))  # quaternions of nothing
-    assert (Batch(skin, TOOLS, N).touch(seven).statuses == REFUSED).all()
+    refused = Batch(skin, TOOLS, N).touch(seven)
+    assert (refused.statuses == REFUSED).all() and "is not rigid" in refused.why[0, 0]
 
 
 def test_arrays_of_torch_are_shared_not_copied(skin: Skin) -> None:
@@ -139,6 +140,8 @@ def test_what_does_not_fit_is_said(skin: Skin) -> None:
         batch.touch(poses(), [None] * N, -1.0)
     with pytest.raises(InvalidInput, match="do not fit 3"):
         Batch([skin, skin], TOOLS, 3)
+    with pytest.raises(InvalidInput, match="at least one scene"):
+        Batch(skin, TOOLS, 0)
     with pytest.raises(InvalidInput, match="name of its own"):
         Batch(skin, (TOOLS[0], TOOLS[0]), 3)
     with pytest.raises(InvalidInput, match="threads"):

@@ -19,7 +19,7 @@ from stmpl_core.networks import STACK_NODE
 from stmpl_core.nodes import Nodes
 from stmpl_core.sdf import SignedDistance
 from stmpl_core.stiffness import fit_stiffness
-from stmpl_core.toucher import Toucher
+from stmpl_core.toucher import Toucher, unlearnt
 from tests.scenes import at, ball, contact_of, limb, placed, punch, turn
 
 RADIUS, LENGTH, BALL = 0.035, 0.3, 0.015
@@ -225,6 +225,31 @@ def test_force_under_slack_and_tight_skin_is_within_its_bound_or_flagged(tension
     assert touch.trust.in_range == sound and ("tension" in touch.trust.why) != sound
     if tension < 100:  # linear elements press up to 4 % too hard
         assert abs(touch.force - truth.force) < 1.4 * touch.force_bound
+
+
+@pytest.mark.parametrize("tension, sound", [(0.6, False), (4.0, True)])
+def test_skin_with_next_to_no_tension_is_flagged(tension: float, sound: bool) -> None:
+    """The force on a ball falls as the tension rises to 4 N/m, which no skin does: by a sixth from 0.6 on."""
+    skin = Membrane(2e5, 1.5e-3, tension)
+    tissue = Tissue(3e3, 0.45, skin=skin, deeper=(Ply(10e-3, 15e3, 0.45),))
+    layer = limb(6e-3, 25e-3, 45e-3, LENGTH).with_(tissue=tissue)
+    assert any("next to no tension" in why for why in unlearnt(layer, 0.3, 0.49)) != sound
+
+
+@pytest.mark.parametrize("force", [0.3, 3.0, 10.0, 100.0])
+def test_few_trials_find_where_a_tool_that_is_stated_at_the_skin_presses(force, monkeypatch) -> None:
+    simulator = Simulator(LIMB, MomentNet())
+    toucher, tried = simulator.toucher, []
+    hold = toucher.net.hold
+    monkeypatch.setattr(toucher.net, "hold", lambda nodes: tried.append(nodes) or hold(nodes))
+    (touch,) = simulator.touch([pressed(0.0, push(force))])
+    assert len(tried) <= 4
+    if force < 100:
+        assert touch.force == pytest.approx(force, rel=1e-5) and touch.trust.ok
+        assert ("calibration" in touch.trust.why) == (force > 3)
+    else:
+        assert toucher.deep.strain(touch.pressed.squeeze) == pytest.approx(0.85, abs=0.02)
+        assert "carries" in touch.trust.why and touch.force < 100
 
 
 def test_a_place_whose_fat_ends_deeper_hardens_as_tissue_of_such_fat():

@@ -8,11 +8,11 @@ from stmpl_core.methods import MomentNet
 from stmpl_core.simulator import Simulator
 
 
-def rows(method: MomentNet) -> list[Row]:
+def rows(method: MomentNet, every: int = 1) -> list[Row]:
     layer = arm()
     simulator = Simulator(layer, method)
-    return [one for scene in scenes() for truth in truths(scene, layer) for one in [row(scene, simulator, truth)]
-            if one.in_range]  # fmt: skip
+    return [one for scene in scenes()[::every] for truth in truths(scene, layer)
+            for one in [row(scene, simulator, truth)] if one.in_range]  # fmt: skip
 
 
 @pytest.fixture(scope="module")
@@ -32,7 +32,10 @@ def test_strange_tools_press_and_move_the_skin_as_finite_elements_say(nodewise: 
 
 
 def test_skin_that_goes_with_nodes_is_a_quarter_less_off_than_with_vertices(nodewise: list[Row]) -> None:
-    assert mean(nodewise, "told") < 0.75 * mean(rows(MomentNet(sticks=False)), "told")
+    by_vertices = [one for one in rows(MomentNet(sticks=False), every=3) if one.strange]
+    theirs = {(one.name, one.depth) for one in by_vertices}
+    assert len(theirs) > 25
+    assert mean([one for one in nodewise if (one.name, one.depth) in theirs], "told") < 0.75 * mean(by_vertices, "told")
 
 
 def test_bounds_cover(nodewise: list[Row]) -> None:
