@@ -151,6 +151,7 @@ class SkinNode(ServingNode):
             self._open.callback(part.close)
             part.open()
         self._open.callback(self.destroy_timer, steady_timer(self, 1 / FADE_RATE, self._fade))
+        self.settings.take(self.config.model_copy(update={"part": self.config.limb}))  # another tissue keeps it
         self.settings.locked = True
         _settle()
         self.get_logger().info(f"configured in {time.monotonic() - started:.1f} s: {self.skin.layer}")

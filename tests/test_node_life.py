@@ -324,6 +324,16 @@ def test_a_skin_that_takes_over_while_the_node_is_inactive_remembers_nothing_of_
     assert not node.answering.remembering.state.tools
 
 
+def test_another_tissue_keeps_the_part_that_answers_where_none_was_asked_for(composed):
+    node = composed.node
+    assert node.settings.with_(tissue="paper").limb == node.config.limb == "left_forearm"
+    node.trigger_deactivate()
+    node.trigger_cleanup()
+    node.settings.take(NodeConfig(tissue="paper"))
+    node.trigger_configure()
+    assert node.settings.with_(tissue="relaxed").limb == node.config.limb == "left_arm"
+
+
 def test_friction_that_an_elastic_node_takes_over_is_compiled_beside_it(composed):
     """Its first answer may take half a minute elsewhere, not here."""
     node, skin = composed.node, composed.node.skin
