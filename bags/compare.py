@@ -88,6 +88,7 @@ class Comparison:
         failed: sampled frames that the reference could not solve, with its reason, by sequence number.
         tolerance: allowed mean error under the contact, in the worst frame [m]; None: no verdict is asked for.
         reason: sentence that tells why this tolerance, where nobody gave one.
+        left_out: number of answers at the start that answer what was not recorded; none of them is sampled.
     """
 
     run: Survey
@@ -97,6 +98,7 @@ class Comparison:
     failed: dict[int, str]
     tolerance: float | None
     reason: str = ""
+    left_out: int = 0
 
     @property
     def judged(self) -> tuple[FramePair, ...]:
@@ -152,7 +154,9 @@ class Comparison:
         if self.unlike:
             sentence += (f"; in {self.unlike} of them only one side has friction and relaxation, so their difference "
                          "is no error, and they are held to no tolerance")  # fmt: skip
-        return sentence + (f"; {skipped} frames could not be judged." if skipped else ".")
+        sentence += f"; {skipped} frames could not be judged." if skipped else "."
+        late = f" The first {self.left_out} answers were left out: the bag has no contacts for them."
+        return sentence + late * bool(self.left_out)
 
 
 def compare_run(
@@ -172,7 +176,7 @@ def compare_run(
     elastic skin, so answers with friction or relaxation are not alike.
 
     The sample holds the frame under the largest load, the heaviest one with two tools on the skin, and others evenly
-    over the loaded part of the run.
+    over the loaded part of the run. Answers before the first whose contacts were recorded are left out.
 
     Args:
         run: recording: its folder, its .mcap file, or what a survey of it gave.
@@ -191,8 +195,9 @@ def compare_run(
     judged = (lambda frame: frame) if method is None else _solver(method, run)
     names = (run.method if method is None else method.name, reference.name)
     elastic = (lambda frame: _elastic(frame, run.bag.layer_of(frame))) if method is None else (lambda frame: True)
-    taken = [moment for moment in run.moments if not tool or moment.tools == (tool,)]
-    return _compare(run, sample(taken, frames), names, judged, judge, tolerance, on_frame, alike=elastic)
+    late = _left_out(run)
+    taken = [moment for moment in run.moments[late:] if not tool or moment.tools == (tool,)]
+    return _compare(run, sample(taken, frames), names, judged, judge, tolerance, on_frame, late, alike=elastic)
 
 
 def compare_bags(
@@ -213,7 +218,8 @@ def compare_bags(
     """
     run, other = (one if isinstance(one, Survey) else survey(one) for one in (run, other))
     theirs = {moment.stamp_ns: moment.number for moment in other.moments}
-    common = [moment for moment in run.moments if moment.stamp_ns in theirs]
+    late = _left_out(run)
+    common = [moment for moment in run.moments[late:] if moment.stamp_ns in theirs]
     if not common:
         raise BagError(f"{run.bag.file} and {other.bag.file} answer no common stamp. Compare a run with its replay.")
     picks = sample(common, frames)
@@ -227,8 +233,10 @@ def compare_bags(
     names, reason = (run.method, f"{other.method} of {other.bag.file.parent.name}"), ""
     if tolerance is None and run.method == other.method:
         tolerance, reason = allowance(other.bag.provenance.processor, run.bag.provenance.processor)
-    return _compare(run, picks, names, lambda frame: frame, lambda frame: answers[frame.stamp_ns], tolerance, None,
-                    reason, alike=lambda frame: bool(frame.state) == bool(answers[frame.stamp_ns].state))  # fmt: skip
+    return _compare(
+        run, picks, names, lambda frame: frame, lambda frame: answers[frame.stamp_ns], tolerance, None, late, reason,
+        alike=lambda frame: bool(frame.state) == bool(answers[frame.stamp_ns].state),
+    )  # fmt: skip
 
 
 def sample(moments: Sequence[Moment], frames: int) -> list[Moment]:
@@ -292,6 +300,7 @@ def _compare(
     reference: Side,
     tolerance: float | None,
     on_frame: Callable[[int, int], None] | None,
+    left_out: int,
     reason: str = "",
     *,
     alike: Callable[[Frame], bool],
@@ -307,7 +316,18 @@ def _compare(
         except StmplError as error:
             log.warning("frame %d cannot be compared: %s", frame.sequence, error)
             failed[frame.sequence] = str(error)
-    return Comparison(run, *names, tuple(pairs), failed, tolerance, reason)
+    return Comparison(run, *names, tuple(pairs), failed, tolerance, reason, left_out)
+
+
+def _left_out(run: Survey) -> int:
+    """Number of answers before the first whose contacts were recorded; 0 where no answer's were."""
+    for number, frame in enumerate(run.bag.frames()):
+        try:
+            run.bag.contacts(frame)
+        except BagError:
+            continue
+        return number
+    return 0
 
 
 def _elastic(frame: Frame, layer: SoftLayer) -> bool:

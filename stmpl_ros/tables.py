@@ -66,6 +66,7 @@ def figures_of(comparison: Comparison) -> dict[str, Any]:
         "frames": len(comparison.judged),
         "unlike": comparison.unlike,
         "failed": comparison.failed,
+        "left_out": comparison.left_out,
     }
     if comparison.judged:
         figures["score"] = vars(mean_and_deviation([pair.score for pair in comparison.judged])[0])

@@ -110,6 +110,12 @@ def test_answers_to_what_was_not_recorded_are_left_out_of_a_replay_and_told(tmp_
     nothing = write_run(tmp_path / "nothing", Winkler(), frames=6, unheard=tuple(range(6)))
     with pytest.raises(BagError, match="no pose and no wrench"):
         replay_run(nothing, Winkler())
+    compared = compare_run(late, Winkler(), method=Winkler(), frames=100, tolerance=0.0)
+    assert compared.passed and len(compared.pairs) == 9 and "The first 3 answers were left out" in compared.verdict
+    same = compare_bags(late, late, frames=100)
+    assert same.passed and len(same.pairs) == 9 and same.left_out == 3
+    torn = compare_run(tmp_path / "torn", Winkler(), method=Winkler(), frames=100)
+    assert len(torn.failed) == 1 and not torn.passed and not torn.left_out, "one in the middle fails"
     with pytest.raises(InvalidInput, match="frames is 0"):
         compare_run(late, Winkler(), method=Winkler(), frames=0)
 
