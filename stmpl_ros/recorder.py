@@ -35,6 +35,7 @@ WANTED = re.compile(
     r"(contact_mesh|skin/topology|skin/displacement|tools/[\w/]+/(pose|wrench)|wrist/wrench|joint_states)$"
     r"|^/(diagnostics|tf|tf_static)$"
 )
+NEEDED = {"answers": re.compile(r"skin/displacement$"), "contacts": re.compile(r"tools/[\w/]+/pose$")}  # for a replay
 EVERYBODYS = ("/diagnostics", TF, TF_STATIC)  # topics of no namespace that belong to a run
 PLACED = re.compile(r"(.*/)(?:skin/topology|tools/(.+)/(?:pose|wrench))")  # their frame_id says where things are
 IF_HEARD = re.compile(r"tools/[\w/]+/local_contact$")  # recorded only once a device listens: it costs the node work
@@ -42,6 +43,7 @@ FOREVER = 1e9  # lease of a sender that never tells that it is there, at least [
 POLL_PERIOD_S = 0.1  # time between two looks for new topics
 DEPTH = 1000  # messages of a topic that the middleware keeps while this process is busy
 MAX_QUEUED_MESSAGES = 4000  # messages that may wait for the disk; later ones are counted as lost
+SILENCE_S = 10.0  # time after which what is missing for a replay is told of, once [s]
 DRAIN_S = 0.5  # time in which messages still on their way are taken, after being asked to stop
 
 Item = tuple[str, str, str, bytes, int]  # topic, type, quality of service, serialised message, when it came [ns]
@@ -60,6 +62,7 @@ class RecorderNode(Node):
 
     def __init__(self, writer: BagWriter, stop: threading.Event, wanted: re.Pattern[str] | None = None) -> None:
         super().__init__("recorder")
+        self._space = self.get_namespace()
         self.writer, self._stop, self._wanted = writer, stop, wanted
         self.received = self.lost = 0
         self.error: BagError | None = None
@@ -70,6 +73,7 @@ class RecorderNode(Node):
         self._thread.start()
         self._subscribed: set[str] = set()
         self.create_timer(POLL_PERIOD_S, self._look)
+        self._waiting = self.create_timer(SILENCE_S, self._tell_of_silence)
 
     def _look(self) -> None:
         for topic, types in self.get_topic_names_and_types():
@@ -80,10 +84,24 @@ class RecorderNode(Node):
                 except BagError as error:
                     self.get_logger().error(f"{topic} is not recorded: {error}")
 
+    def _tell_of_silence(self) -> None:
+        self._waiting.cancel()
+        if missing := self.missing():
+            self.get_logger().warning(f"so far {missing}")
+
+    def missing(self) -> str:
+        """What did not come, in a sentence: anything at all, or what a replay of the run's own topics needs."""
+        lacks = [what for what, topic in NEEDED.items() if not any(map(topic.search, list(self._channels)))]
+        if self._wanted:
+            return "" if self._channels else "nothing was heard on --topics: is ROS_DOMAIN_ID the sender's?"
+        said = (f"no {' and no '.join(lacks)} were heard in namespace {self._space}, so this cannot be replayed: are "
+                "ROS_DOMAIN_ID and the namespace (--ros-args -r __ns:=/left) the node's?")  # fmt: skip
+        return said * bool(lacks)
+
     def _is_wanted(self, topic: str) -> bool:
         if self._wanted:
             return bool(self._wanted.fullmatch(topic))
-        own = self.get_namespace().rstrip("/") + "/"
+        own = self._space.rstrip("/") + "/"
         run = WANTED.search(topic) or (IF_HEARD.search(topic) and self.count_subscribers(topic))
         return bool(run) and (topic.startswith(own) or topic in EVERYBODYS)
 
@@ -178,7 +196,7 @@ def pattern(topics: Sequence[str]) -> re.Pattern[str]:
 
 
 def run(config: RecordConfig, arguments: list[str] | None = None, topics: Sequence[str] = ()) -> int:
-    """Records until SIGINT or SIGTERM; the exit code says whether everything is on disk.
+    """Records until SIGINT or SIGTERM; the exit code says whether anything came, and everything is on disk.
 
     Args:
         config: folder and files of the recording.
@@ -217,6 +235,8 @@ def run(config: RecordConfig, arguments: list[str] | None = None, topics: Sequen
             raise node.error
         for sentence in node.foreign(frames):
             log.warning(sentence)
+        if missing := node.missing():
+            log.warning(missing)
         writer.add_metadata("recorder", {"received": str(node.received), "lost": str(node.lost)})
     log.info("%d messages recorded, %d lost", node.received, node.lost)
-    return 0
+    return 0 if node.received else 1

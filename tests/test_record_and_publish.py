@@ -16,6 +16,8 @@ from stmpl_msgs.msg import SkinTopology
 from bags.reader import Bag
 from bags.recover import recover
 from bags.writer import FILE
+from stmpl_ros import recorder
+from stmpl_ros.parameters import RecordConfig
 from stmpl_ros.topics import NOW, STREAM
 from tests.bus import PATIENCE, Robot, end, start
 
@@ -38,6 +40,13 @@ class Talker(Robot):
 
     def wait_for_recorder(self, *publishers) -> None:
         self.wait(lambda: all(p.get_subscription_count() == 1 for p in publishers), "the recorder")
+
+
+@pytest.mark.parametrize(("topics", "says"), [((), "no answers and no contacts were heard in namespace /"),
+                                              (("/nothing",), "nothing was heard on --topics")])  # fmt: skip
+def test_a_recorder_that_hears_nothing_says_so_and_ends_with_1(tmp_path, monkeypatch, caplog, topics, says):
+    monkeypatch.setattr(recorder, "spin", lambda executor, stop: None)
+    assert recorder.run(RecordConfig(path=tmp_path / "run"), topics=topics) == 1 and says in caplog.text
 
 
 @pytest.fixture(scope="module")
@@ -70,6 +79,7 @@ def test_a_recorder_tells_of_poses_that_only_a_node_that_hears_tf_can_place(talk
     assert code == 0
     assert "/tools/other/pose came in frame 'moving_base', which is neither 'body' nor in --frames" in said
     assert said.count(" came in frame ") == 1
+    assert "no answers were heard in namespace /, so this cannot be replayed" in said
 
 
 @pytest.fixture(scope="module")
