@@ -89,11 +89,6 @@ def check(config: NodeConfig, build: Build, changed: set[str] | None = None) -> 
                                f"or set tissue to '{PAPER}', which is one layer of your numbers.")  # fmt: skip
 
         check_part(config, build)
-        if config.joint_states:
-            known = joints_of(config.limb)
-            if unknown := sorted(set(config.joint_names) - set(known)):
-                raise InvalidInput(f"joints names {', '.join(unknown)}, which {config.limb} has not; it has "
-                                   f"{', '.join(known)}. Its own name comes first, as in left_elbow=elbow_2.")
         stacked = config.tissue != PAPER
         if config.tissue in get_args(Tone):
             region_of(part_around(Body.anny(), config.limb) if config.limb.startswith(AROUND) else config.limb)
@@ -102,6 +97,11 @@ def check(config: NodeConfig, build: Build, changed: set[str] | None = None) -> 
         if stacked and config.method not in ON_STACKS:
             raise InvalidInput(f"{config.method} knows one soft material only; of skin, fat and muscle know "
                                f"{', '.join(ON_STACKS)}. Take one of these, or set tissue to '{PAPER}'.")  # fmt: skip
+        if config.joint_states:
+            known = joints_of(config.limb)
+            if unknown := sorted(set(config.joint_names) - set(known)):
+                raise InvalidInput(f"joints names {', '.join(unknown)}, which {config.limb} has not; it has "
+                                   f"{', '.join(known)}. Its own name comes first, as in left_elbow=elbow_2.")
 
 
 def at_once(config: NodeConfig, build: Build) -> bool:

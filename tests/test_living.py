@@ -118,6 +118,8 @@ def test_a_node_refuses_at_once_what_cannot_be(tmp_path):
             check(NodeConfig(tissue="paper", method=method, joint_states="joints", part="left_arm"), layer_of)
     with pytest.raises(InvalidInput, match="joints names elbow, which left_arm has not; it has left_elbow"):
         check(NodeConfig(joint_states="joints", part="left_arm", joints=("elbow=elbow_2",)), layer_of)
+    with pytest.raises(InvalidInput, match="there is no tissue in"):
+        check(NodeConfig(joint_states="joints", part="left_forearm", tissue=str(tmp_path / "none.json")), layer_of)
     check(NodeConfig(joint_states="joints", part="right_leg", joints=("right_knee=knee_2",)), layer_of)
     check(config(), layer_of)
     check(config(tissue="paper", youngs_modulus=5e3), layer_of)
