@@ -2,19 +2,19 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from functools import partial
 from typing import Any
 
 import numpy as np
 from geometry_msgs.msg import PoseStamped, WrenchStamped
-from rclpy.exceptions import NameValidationException
 from rclpy.node import Node
 from shape_msgs.msg import Mesh
 from stmpl_msgs.msg import ContactMesh
 
 from bags import wire
-from stmpl_core.errors import FrameError, StmplError
+from stmpl_core.errors import FrameError, InvalidInput, StmplError
 from stmpl_core.layer import SoftLayer
 from stmpl_core.sdf import SignedDistance
 from stmpl_core.tool import Tool
@@ -31,6 +31,9 @@ from stmpl_ros.parameters import NodeConfig
 from stmpl_ros.patience import Patience
 from stmpl_ros.ticks import Ticks
 from stmpl_ros.topics import KEPT, NEWEST, newest_within
+
+ROS_NAME = re.compile(r"[A-Za-z_]\w*(/[A-Za-z_]\w*)*", re.ASCII)
+MAX_NAME = 200  # letters of namespace and tool: a topic of ROS has 247, of which '/tools/' and '/contact_wrench' are 22
 
 
 class Hearing:
@@ -106,12 +109,8 @@ class Hearing:
         """Takes a tool into use, its distance field being there; False if it is not wanted any more."""
         if not self.tools.expected(tool):
             return False
-        try:
-            if tool.name not in self._listened:
-                self._listen_to(tool.name)
-        except NameValidationException as error:
-            self.refuse(tool, error)
-            return False
+        if tool.name not in self._listened:
+            self._listen_to(tool.name)
         self.tools.add(tool, field)
         for sentence in tool.mendings:
             self.gate.say(f"mended {tool.name} {sentence}", f"the mesh of '{tool.name}' was mended: {sentence}")
@@ -167,7 +166,6 @@ class Hearing:
         take(message)
 
     def _listen_to(self, name: str) -> None:
-        """Raises NameValidationException for a name that cannot be part of a topic."""
         def wrench(data: bytes) -> None:
             self._read(read_wrench, data, f"wrench of {name}", partial(self._on_wrench, name))
 
@@ -204,9 +202,12 @@ class Hearing:
             if name == self._config().frame:
                 raise FrameError(f"'{name}' is the body's own frame, in whose axes its wrenches would be read; "
                                  "give the tool another name.")  # fmt: skip
+            if name and not (ROS_NAME.fullmatch(name) and len(self._node.get_namespace() + name) <= MAX_NAME):
+                raise InvalidInput("a tool's name must be a ROS name: letters, digits, _ and /, each part beginning "
+                                   f"with a letter or _, at most {MAX_NAME} letters with the namespace.")  # fmt: skip
             tool = read()
         except StmplError as error:
-            return self.gate.refuse(f"mesh of {name}", f"mesh of '{name}' refused: {error}")
+            return self.gate.refuse(f"mesh of {name}", f"mesh of '{name:.60}' refused: {error}")
         if not self.tools.known(tool):  # sent once more, for who came late: what it touched is not forgotten
             self.tools.announce(tool)
             self.on_tool(tool)

@@ -181,6 +181,14 @@ def test_a_tool_named_as_the_bodys_frame_is_refused(bus):
     assert "'body' is the body's own frame" in line and "give the tool another name" in line
 
 
+@pytest.mark.parametrize("name", ["ball-1", "9ball", "a b", "ball/", "/ball", "a//b", "héllo", "{node}", 300 * "x"])
+def test_a_tool_whose_name_no_topic_can_have_is_refused_in_one_sentence(bus, name):
+    bus.mesh.publish(tool_message(ball().named(name), bus.now()))
+    (line,) = bus.wait(lambda: bus.said(f"mesh of '{name[:60]}' refused"), "the log line")
+    assert "a tool's name must be a ROS name: letters, digits, _ and /" in line
+    assert len(line) < 250 and "\n" not in line and "^" not in line
+
+
 def test_each_tool_whose_mesh_is_refused_is_told_of_however_soon_they_come(bus):
     for name in ("flat", "broken"):
         bus.mesh.publish(ContactMesh(header=header(name, bus.now()), vertices=[0.0] * 4, triangles=[0, 1, 2]))

@@ -264,7 +264,7 @@ def test_a_mesh_with_a_hole_is_told_of(device, another):
 
 @pytest.mark.parametrize(
     ("name", "scale", "says"),
-    [("mm", 1e3, "millimetres"), ("no tool!", 1.0, "Invalid topic name"), ("dust", 1e-3, "metres")]
+    [("mm", 1e3, "millimetres"), ("no tool!", 1.0, "must be a ROS name"), ("dust", 1e-3, "metres")]
 )
 def test_a_mesh_that_cannot_be_used_is_refused_and_the_node_stays_up(device, name, scale, says):
     device.spin(1.1)  # one line of a kind in a second
