@@ -56,7 +56,7 @@ class BodyAction:
             stage = by_executor(self._node, self._begin, changes_of(goal.request), done)
         except StmplError as error:
             goal.abort()
-            return SetBody.Result(message=str(error))
+            return SetBody.Result(message=str(error), layer_id=self._layer_id())
         while not finished.wait(FEEDBACK_S):
             goal.publish_feedback(SetBody.Feedback(stage=stage, seconds=time.monotonic() - started))
             if goal.is_cancel_requested:

@@ -166,6 +166,7 @@ def test_a_body_by_the_action_may_be_cancelled_and_one_that_cannot_be_is_told(bu
     _, done, _ = another(thickness=-1.0)
     bus.wait(done.done, "the refusal")
     assert done.result().status == GoalStatus.STATUS_ABORTED and "thickness" in done.result().result.message
+    assert done.result().result.layer_id == before, "the layer that answers is told of a refusal too"
     _, done, _ = another(thickness=0.05)  # only making it shows that it cannot be
     bus.wait(done.done, "the refusal")
     assert done.result().status == GoalStatus.STATUS_ABORTED and "thicker" in done.result().result.message
