@@ -106,6 +106,8 @@ def bag_file(path: Path | str) -> Path:
     path = Path(path)
     if path.is_file():
         return path
+    if not path.exists():
+        raise BagError(f"{path} does not exist. stmpl record or stmpl demo makes a recording.")
     found = sorted(path.glob("*.mcap"))
     if len(found) != 1:
         names = ", ".join(f.name for f in found) or "none"

@@ -219,7 +219,10 @@ def test_what_is_no_recording_is_refused(tmp_path):
     (tmp_path / "text.mcap").write_bytes(b"")
     with pytest.raises(BagError):
         Bag(tmp_path / "text.mcap")
+    (tmp_path / "text.mcap").unlink()
     with pytest.raises(BagError, match=r"expected one \.mcap file, found none"):
+        Bag(tmp_path)
+    with pytest.raises(BagError, match="nowhere does not exist"):
         Bag(tmp_path / "nowhere")
 
 
