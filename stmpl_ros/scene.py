@@ -60,6 +60,9 @@ class SceneConfig(BaseModel):
             value = getattr(self, name)
             for one in value if isinstance(value, tuple) else (value or 0.0,):
                 check_millimetres(f"--{name}", one, LEAST_MM)
+        for name in ("radius", "force", "speed"):
+            if len(values := getattr(self, name)) > 2:
+                raise InvalidInput(f"--{name} has {len(values)} values; give one, or two for a range.")
         tissue, thickness = self._tissue()
         share = self.accuracy * 1e-2
         return needs(tissue, _si(self.radius), self.force, _si(self.speed), thickness=thickness,
@@ -114,8 +117,12 @@ class SceneConfig(BaseModel):
             skin = Membrane(self._with("skin_modulus", "a skin") * 1e3, self._with("skin_thickness", "a skin") * 1e-3,
                             self.tension or 0.0)  # fmt: skip
         if {"muscle_modulus", "muscle_depth"} & set(given):
-            deeper = (Ply(self._with("muscle_depth", "a muscle") * 1e-3,
-                          self._with("muscle_modulus", "a muscle") * 1e3, self.nu, "muscle"),)  # fmt: skip
+            depth, thickness = self._with("muscle_depth", "a muscle"), self.thickness or 0.0
+            if depth >= thickness:
+                raise InvalidInput(f"--muscle-depth is {depth:g} mm; it must be less than --thickness, {thickness:g} "
+                                   "mm, where the bone begins.")  # fmt: skip
+            modulus_of_muscle = self._with("muscle_modulus", "a muscle")
+            deeper = (Ply(depth * 1e-3, modulus_of_muscle * 1e3, self.nu, "muscle"),)
         return Tissue(modulus * 1e3, self.nu, skin=skin, deeper=deeper), (self.thickness or 0.0) * 1e-3
 
     def _with(self, name: str, what: str) -> float:

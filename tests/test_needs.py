@@ -228,6 +228,8 @@ def test_the_verb_takes_a_tissue_of_ones_own(capsys):
         (("--part", "back", "--thickness", 20), "one of them"),
         (("--part", "back", "--tension", 20), "--tension"),
         (("--thickness", 20, "--modulus", 3, "--tension", 20), "--skin-modulus"),
+        (("--part", "back", "--radius", 20, 40, 60), "--radius has 3 values; give one, or two for a range"),
+        (("--thickness", 30, "--modulus", 3, "--muscle-modulus", 10, "--muscle-depth", 40), "--muscle-depth is 40 mm"),
         (("--part", "back", "--radius", 0), "radii is 0 m"),
         (("--part", "back", "--radius", 0.02), "Is it in metres?"),
         (("--thickness", 0.02, "--modulus", 3), "Is it in metres?"),
