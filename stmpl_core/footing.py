@@ -239,7 +239,44 @@ def given_way(along, give, aim, contact):
         more = _dot(way, give @ way) / size
     else:
         more = 0.5 * (_dot(first, give @ first) + _dot(second, give @ second))
+    return softened(along, more)
+
+
+@numba.njit(cache=True, inline="always", error_model="numpy")
+def softened(along, more):
+    """Stiffness of a patch that gives more than on a flat layer, where it is `along`, by so much [N/m], [m/N]."""
     return 1 / max(1 / along + more, 0.5 / along)
+
+
+@numba.njit(cache=True, error_model="numpy")
+def along_give(contact, give, springs, relaxed, rolled, passed):
+    """A contact whose tangents are the ways in which it gives most and least, and what is told by tangents, by those.
+
+    Args:
+        contact, springs, relaxed: see Memory.
+        give: how it gives beyond a flat layer, (3, 3) [m/N].
+        rolled, passed: where it is in the rooms of Scalars, (3,) [m].
+
+    Returns:
+        contact, springs, relaxed, rolled, passed, turned, and the gives along both tangents, (2,) [m/N].
+    """
+    first, second = contact[2], _cross(contact[1], contact[2])
+    a, b, c = _dot(first, give @ first), 0.5 * _dot(first, (give + give.T) @ second), _dot(second, give @ second)
+    if not abs(b) > 1e-9 * max(abs(a), abs(c)):
+        return contact, springs, relaxed, rolled, passed, np.array([a, c])
+    angle = 0.5 * np.arctan(2 * b / (a - c)) if a != c else 0.25 * np.pi
+    x, y = np.cos(angle), np.sin(angle)
+    contact, springs, relaxed = contact.copy(), springs.copy(), relaxed.copy()
+    contact[2] = x * first + y * second
+    for j in range(len(springs)):
+        springs[j, 0], springs[j, 1] = x * springs[j, 0] + y * springs[j, 1], x * springs[j, 1] - y * springs[j, 0]
+        for i in range(len(relaxed)):
+            one, other = relaxed[i, j, 0], relaxed[i, j, 1]
+            relaxed[i, j, 0], relaxed[i, j, 1] = x * one + y * other, x * other - y * one
+    rolled = np.array([x * rolled[0] + y * rolled[1], x * rolled[1] - y * rolled[0], rolled[2]])
+    passed = np.array([x * passed[0] + y * passed[1], x * passed[1] - y * passed[0], passed[2]])
+    return contact, springs, relaxed, rolled, passed, np.array([x * x * a + 2 * x * y * b + y * y * c,
+                                                                y * y * a - 2 * x * y * b + x * x * c])
 
 
 @numba.njit(cache=True, error_model="numpy")

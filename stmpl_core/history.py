@@ -224,19 +224,19 @@ class History:
                                 radius, came)  # fmt: skip
             trail = wake.after(trail, self.series, dt, passing)
             changed["wake"] = wake.Wake(trail, shares)
-        share, limit, slid, held, room = 1.0, 0.0, 1.0, 0.0, NO_ROOM
+        share, limit, slid, held, room, passed = 1.0, 0.0, 1.0, 0.0, NO_ROOM, one.passed
         stiffness, springs, eased = NO_ROOM, one.before.springs, one.before.springs_relaxed
         mu = self.friction(touch.name)
         if mu > 0 and net > MIN_ONE_WAY_SHARE:
             give, bend = self.toucher.give(nodes, pressed.forces), self.toucher.curvature(nodes, pressed.forces)
             (wrench, rubs, share, offset, turn, lean, grown, slid_offset, slid_turn, limit, stiffness, springs, eased,
-             bent, slid, held, room, besides) = rub(
+             bent, slid, held, room, passed, contact, besides) = rub(
                 by * touch.wrench, NONE if stated is None else stated, stated is not None, contact, pose[:3, 3],
                 bend, give, mu,
                 LOST * pressed.along, force, lever, at_rest, touch.depth, radius, pressed.power,
                 *self.sideways.at(radius, thickness), one.twist, one.known, before.pressing > 0, one.before.contact,
                 before.elastic, one.before.slid, before.held,
-                np.array((before.rolled_first, before.rolled_second, before.rolled)), one.before.springs,
+                np.array((before.rolled_first, before.rolled_second, before.rolled)), one.passed, one.before.springs,
                 one.before.springs_relaxed, one.before.stiffness, *self.series, dt)  # fmt: skip
             changed |= scaled(touch, grown * by, grown * doubt)
             if self.toucher.layer.tissue.skin is not None:
@@ -263,7 +263,7 @@ class History:
             changed |= scaled(touch, by, doubt)
         scalars = Scalars(1.0, at_rest, max(at_rest, before.largest), net, radius, touch.depth, at_rest, pressed.power,
                           share, before.work, 1.0, limit, long, one.stated.tool.number, slid, 0.0, held, *room.tolist(),
-                          *one.passed.tolist())  # fmt: skip
+                          *passed.tolist())  # fmt: skip
         memory = Memory(one.stated.pose_body_from_tool, wrench, scalars, relaxed, contact, pose, stiffness, springs,
                         eased, trail)  # fmt: skip
         return Law(self._said(one, touch, changed), memory, stored, whole)

@@ -26,12 +26,14 @@ import numba
 import numpy as np
 
 from stmpl_core.footing import (
+    along_give,
     carried_more,
     faced,
     given_way,
     in_plane,
     in_space,
     leaned,
+    softened,
     way_of_skin,
     way_of_tool,
     wrench_at,
@@ -287,7 +289,7 @@ def _find(wanted, stiffness, cap, start, left, over, springs, force, slides, go)
 @numba.njit(cache=True, error_model="numpy")
 def rub(wrench, stated, by_force, contact, origin, bend, give, mu, along_itself, force, lever, elastic, depth, radius,
         power, along, turn, bare, slack, twist, known, pressed, before_contact, before_elastic, before_slid,
-        before_held, room, springs, relaxed, stiffness, shares, times, dt):  # fmt: skip
+        before_held, room, passed, springs, relaxed, stiffness, shares, times, dt):  # fmt: skip
     """Friction of a contact that would press with a wrench (6,) without friction.
 
     Friction turns the way that the push faces, and the push bounds friction: both are asked until they agree.
@@ -310,7 +312,7 @@ def rub(wrench, stated, by_force, contact, origin, bend, give, mu, along_itself,
         twist, known: see Asked (stmpl_core.balance).
         pressed: whether the tool pressed before the step.
         before_contact, before_elastic, before_slid, before_held: see Memory and Scalars, before the step.
-        room: Scalars.rolled_first, .rolled_second and .rolled before it, (3,) [m].
+        room, passed: Scalars.rolled_first, .rolled_second and .rolled before it, and those of `passed`, (3,) [m].
         springs, relaxed, stiffness: see Memory, before it.
         shares, times: series of the relaxation, (P,) each.
         dt: time of the step [s].
@@ -321,10 +323,12 @@ def rub(wrench, stated, by_force, contact, origin, bend, give, mu, along_itself,
         cap: tangential force at which all of it slides [N].
         stiffness, springs, relaxed: see Memory, after the step.
         stored: energy that springs and bent skin store [J].
-        slid, held, room: see Scalars.
+        slid, held, room, passed: see Scalars.
+        contact: the contact with tangents by which all this is told.
         off: error of the force where the tool spins as it slides, or would grow by more than MOST_GROWN [N].
     """
     wanted, turned, out, carries, slid = np.zeros(3), np.zeros(3), 0.0, 1.0, before_slid
+    contact, springs, relaxed, room, passed, gives = along_give(contact, give, springs, relaxed, room, passed)
     if stiffness[0] > 0:
         turned, out = faced(springs, stiffness, contact, bend, MOST_LEAN)
     way, rolled, room = way_of_tool(twist, known, before_contact, pressed, contact, origin, depth, radius, lever, room)
@@ -356,7 +360,7 @@ def rub(wrench, stated, by_force, contact, origin, bend, give, mu, along_itself,
         if out > 0:  # skin leans before the tool once: as it turns about the bone, or as it is ploughed
             by_turn = max(1 - sticks / alone, bare / along) * np.sqrt(np.sum(turned**2))
             cap -= min(by_turn * grown * force, cap - mu * grown * force)
-        after = np.array([sticks, sticks, stiffer * turn / (arm_of_turn * arm_of_turn)])
+        after = np.array([softened(alone, gives[0]), softened(alone, gives[1]), stiffer * turn / arm_of_turn**2])
         new, kept, carried, share, stored = drag(
             springs, relaxed, shares, times, dt, rolled, after, held_at, cap, way, wanted, by_force)  # fmt: skip
         last, last_slid = turned, slid
@@ -385,4 +389,4 @@ def rub(wrench, stated, by_force, contact, origin, bend, give, mu, along_itself,
     if cap > 0:
         off += SPUN * abs(carried[2]) * drags / cap
     return (push, rubs, share, offset, turns, lean, grown, slid_offset, slid_turn, cap, after, new, kept, stored, slid,
-            held, room, off)  # fmt: skip
+            held, room, passed, contact, off)  # fmt: skip

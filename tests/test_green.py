@@ -158,25 +158,24 @@ def test_a_ball_on_a_limb_is_held_and_moves_the_skin_as_finite_elements_say(gree
     assert off[length > 0.1 * length.max()].mean() < 0.05 and off.max() < 0.12
 
 
-@pytest.mark.parametrize(("around", "flat"), [(False, 1.15), (True, 1.5)])
-def test_skin_that_sticks_to_a_tool_gives_along_and_around_a_limb_as_finite_elements_say(around, flat):
+def test_skin_that_sticks_to_a_tool_gives_along_and_around_a_limb_as_finite_elements_say():
     """Skin is a tube: it turns about the bone more easily than flat skin gives way, by which the drag would be off."""
     field, depth, way = SignedDistance.of(ball(0.015), margin=0.02), 4e-3, 0.2e-3
     start = Press(field, at(-RADIUS - 0.02, 0, LENGTH / 2), np.array([1.0, 0, 0])).touching(LIMB)
     assert start is not None
     poses = np.tile(start.pose_body_from_tool, (6, 1, 1))
     poses[:, 0, 3] += depth * np.array([0, 0.3, 0.6, 1, 1, 1])
-    poses[4:, 1 if around else 2, 3] += way * np.array([0.5, 1])
+    poses[4:, 1:3, 3] += way * np.array([[0.5], [1]])
     fem = IndenterFem(PatchFem(element="P1xP2", reach=12, refine=3, layers=1), friction="stick", step=0.3).prepare(LIMB)
     *_, truth = fem.follow([Stroke(field, poses, np.array([1.0, 0, 0]))])
     simulator, tool, state = Simulator(LIMB, MomentNet(), friction=1.0), ball(0.015), State()
     for pose in poses:
         (touch,), state = simulator.touch([Contact(tool, pose)], state, 0.0)
-    drag, true_drag = (wrench[1 if around else 2] for wrench in (touch.wrench, truth.wrenches[0]))
-    assert drag == pytest.approx(true_drag, rel=0.1)
+    drag, true_drag = (wrench[1:3] for wrench in (touch.wrench, truth.wrenches[0]))  # around and along
+    np.testing.assert_allclose(drag, true_drag, rtol=0.1)
     (memory,) = state.tools.values()
     alone = simulator.history.sideways.at(memory.scalars.radius, THICK).along * way
-    assert alone > flat * true_drag
+    assert (alone > np.array([1.5, 1.15]) * true_drag).all()
 
 
 def test_the_coarse_part_is_of_the_limb_not_of_its_mesh():
