@@ -52,10 +52,10 @@ def stamp_ns(message: Any) -> int:
 
 def layer_from(topology: Any) -> SoftLayer:
     """The layer that a SkinTopology message describes. Raises MeshError or InvalidInput."""
-    tissue, scale = Tissue(topology.youngs_modulus, topology.poisson_ratio, topology.density), None
+    tissue, scale, bony = Tissue(topology.youngs_modulus, topology.poisson_ratio, topology.density), None, None
     if stack := getattr(topology, "stack", ""):  # recordings from before stacks have none
         try:
-            tissue, scale = stack_from_text(stack)
+            tissue, scale, bony = stack_from_text(stack)
         except (KeyError, TypeError, ValueError, AttributeError) as error:
             raise InvalidInput(f"the stack of a SkinTopology cannot be read: {error}.") from error
     vertices, triangles = _rows("vertices", topology.vertices), _rows("triangles", topology.triangles)
@@ -64,7 +64,9 @@ def layer_from(topology: Any) -> SoftLayer:
     rig = None
     if text := getattr(topology, "rig", ""):
         rig = Rig.from_text(text, np.asarray(topology.rig_weights, float))
-    return SoftLayer(vertices, triangles.astype(np.int32), **below, tissue=tissue, ply_scale=scale, rig=rig)
+    if bony is not None:
+        bony = np.isin(np.arange(len(vertices)), bony)
+    return SoftLayer(vertices, triangles.astype(np.int32), **below, tissue=tissue, ply_scale=scale, bony=bony, rig=rig)
 
 
 def tool_from(message: Any) -> Tool:
@@ -375,7 +377,7 @@ def tool_message(tool: Tool, stamp_ns: int) -> Any:
 
 def topology_message(layer: SoftLayer, body_frame: str, stamp_ns: int) -> Any:
     """A layer as a SkinTopology."""
-    more = not layer.tissue.single or layer.tissue.relaxes or layer.ply_scale is not None
+    more = not layer.tissue.single or layer.tissue.relaxes or layer.ply_scale is not None or layer.bony is not None
     return message_class("stmpl_msgs/msg/SkinTopology")(
         header=header(body_frame, stamp_ns),
         layer_id=layer_id(layer),
@@ -386,7 +388,7 @@ def topology_message(layer: SoftLayer, body_frame: str, stamp_ns: int) -> Any:
         poisson_ratio=float(layer.tissue.poisson_ratio),
         density=float(layer.tissue.density),
         core=floats([] if layer.core is None else layer.core),
-        stack=stack_to_text(layer.tissue, layer.ply_scale) if more else "",
+        stack=stack_to_text(layer.tissue, layer.ply_scale, layer.bony) if more else "",
         rig="" if layer.rig is None else layer.rig.to_text(),
         rig_weights=floats([] if layer.rig is None else layer.rig.weights),
     )

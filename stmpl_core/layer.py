@@ -34,6 +34,7 @@ class SoftLayer:
         core: points of the rigid core at which the tissue's columns end, (V, 3) [m]; None: straight below each vertex.
         tissue: what lies between skin and core.
         ply_scale: factor on the depths at which deeper materials begin below each vertex, (V,) [-], > 0; None: 1.
+        bony: mask of vertices under which bone is nearer than the layer knows (stmpl_core.bony), (V,); None: of none.
         chart: UV chart of the skin, if it has one (see stmpl_core.chart).
         rig: bones and joints that the skin hangs on, for Simulator.pose; None: it does not move.
 
@@ -51,6 +52,7 @@ class SoftLayer:
         core: ArrayLike | None = None,
         tissue: Tissue | None = None,
         ply_scale: ArrayLike | None = None,
+        bony: ArrayLike | None = None,
         chart: Any = None,
         rig: Rig | None = None,
     ) -> None:
@@ -75,6 +77,9 @@ class SoftLayer:
             self.ply_scale = finite("ply_scale", ply_scale, (len(self.vertices),))
             if (self.ply_scale <= 0).any():
                 raise InvalidInput(f"ply_scale is {self.ply_scale.min():g} at its least; it must be above 0.")
+        self.bony: np.ndarray | None = None if bony is None else np.array(bony, bool)
+        if self.bony is not None and self.bony.shape != (len(self.vertices),):
+            raise InvalidInput(f"bony has shape {self.bony.shape}, the skin has {len(self.vertices)} vertices.")
         self.chart, self.rig = chart, rig
         if rig is not None and len(rig.weights) != len(self.vertices):
             raise InvalidInput(f"the rig has weights of {len(rig.weights)} vertices, the skin has "
@@ -82,7 +87,7 @@ class SoftLayer:
         _check_surface(self)
 
     def with_(self, **changes: Any) -> SoftLayer:
-        """A copy with `vertices`, `thickness` or `core`, `tissue` (or its fields), `ply_scale`, `chart`, `rig` changed.
+        """A copy with other vertices, thickness or core, tissue (or its fields), ply_scale, bony, chart or rig.
 
         Raises:
             InvalidInput: vertices without a core, where the layer has one.
@@ -95,7 +100,7 @@ class SoftLayer:
         material = {k: changes.pop(k) for k in ("youngs_modulus", "poisson_ratio", "density", "skin", "deeper")
                     if k in changes}
         given = {"vertices": self.vertices, "faces": self.faces, "tissue": self.tissue, "chart": self.chart}
-        given["rig"] = self.rig
+        given |= {"rig": self.rig, "bony": self.bony}
         given |= below | changes
         given["tissue"] = replace(given["tissue"], **material)
         return SoftLayer(**given)
@@ -258,6 +263,8 @@ def layer_id(layer: SoftLayer) -> str:
         digest.update(np.array(tissue.stacked, dtype="<f8").tobytes())
     if layer.ply_scale is not None:
         digest.update(np.ascontiguousarray(layer.ply_scale, dtype="<f4").tobytes())
+    if layer.bony is not None:
+        digest.update(np.flatnonzero(layer.bony).astype("<u4").tobytes())
     if layer.rig is not None:
         digest.update(layer.rig.digest.encode())
     return digest.hexdigest()[:16]

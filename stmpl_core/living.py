@@ -11,6 +11,7 @@ import numpy as np
 
 from stmpl_core.body import AROUND, Body
 from stmpl_core.bones import bones_of, to_bone
+from stmpl_core.bony import bony
 from stmpl_core.errors import InvalidInput
 from stmpl_core.fat import fat_map, for_person
 from stmpl_core.friction import Friction
@@ -107,6 +108,7 @@ def filled(body: Body, part: str, skin: SoftLayer, tone: Tone = "relaxed") -> So
         middle = float(np.median(fat))
         tissue = replace(its, fat_thickness=replace(its.fat_thickness, value=middle)).tissue
         skin = skin.with_(tissue=tissue, ply_scale=fat / middle)
+    skin = skin.with_(bony=bony(body, part, skin.vertices))
     deepest = min(its.thickness, DEEPEST) if part in TRUNK else DEEPEST
     return to_bone(skin, bones_of(body, part), deepest)
 

@@ -27,6 +27,7 @@ FOLD = 0.15  # fold ratio of prisms under bent skin, below which they are none t
 STRETCH = (0.8, 1.25)  # stretch of bent skin over rest, outside of which thickness and mesh are not what they were
 HOLLOW = -0.25  # curvature times thickness of bent skin, below which it is more hollow than the networks know
 FACING = 1.5  # distance to skin that faces it, over t, below which a tool touches both
+BONY_SHARE = 0.2  # share of the force that may be where bone is nearer than the layer knows
 BENT_SHARE = 0.05  # share of the load that may be on skin that a bend spoils
 
 
@@ -79,7 +80,7 @@ class Soundness:
         layer: soft layer at rest.
 
     Attributes:
-        steep, long: masks of vertices, (V,).
+        steep, long, bony: masks of vertices, (V,).
         border: distance from the open border, over t, (V,).
         facets: how far the flat triangles around a vertex lie off the smooth skin that they stand for, (V,) [m].
         least_border: least such distance of a load that is sound [-].
@@ -95,6 +96,7 @@ class Soundness:
         self.facets = np.abs(below_curved(layer)) + roughness(layer)
         self.least_border = STACK_BORDER if layer.stacked else BORDER
         self._near = self.border < self.least_border
+        self.bony = np.zeros(len(self.steep), bool) if layer.bony is None else layer.bony
 
     def at(self, bend: Bend) -> Self:
         """The same of a skin that joints have bent."""
@@ -123,8 +125,11 @@ class Soundness:
 
     def of_contact(self, loaded: np.ndarray, force: np.ndarray) -> list[str]:
         """What is wrong with the skin under a tool that presses with forces (L,) on vertices (L,), as sentences."""
-        steep, long, near = _shares(loaded, force, self.steep, self.long, self._near)
+        steep, long, near, bony = _shares(loaded, force, self.steep, self.long, self._near, self.bony)
         told = self.of_mesh(steep, long, "the force")
+        if bony > BONY_SHARE:
+            told.append(f"{bony:.0%} of the force is over a kneecap, a shin or the tip of an elbow, where people have "
+                        "bone right under the skin: far too soft here")  # fmt: skip
         return told if self.bend is None and near <= BORDER_SHARE else [*told, *self.of_load(loaded, force)]
 
 

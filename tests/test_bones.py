@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from bags.provenance import layer_from_bytes, layer_to_bytes
+from bags.wire import layer_from, topology_message
 from fem_tools import PatchFem
 from stmpl_core import Membrane, Ply, Tissue
 from stmpl_core.body import Body
@@ -11,7 +12,10 @@ from stmpl_core.bones import Bone, bones_of, to_bone
 from stmpl_core.errors import InvalidInput
 from stmpl_core.extrusion import fold_ratios
 from stmpl_core.layer import layer_id
+from stmpl_core.living import living
 from stmpl_core.methods import Winkler
+from stmpl_core.packed import pack, unpack
+from stmpl_core.soundness import Soundness
 from tests.scenes import LENGTH, RADIUS, disc, limb
 
 AXIS = Bone(np.array([0.0, 0, -1]), np.array([0.0, 0, 1]), 0.012)
@@ -66,3 +70,31 @@ def test_what_cannot_be_is_refused_with_what_is_wrong():
         Winkler().prepare(layer)
     with pytest.raises(InvalidInput, match="one of them"):
         layer.with_(thickness=5e-3, core=layer.core)
+
+
+@pytest.mark.parametrize(("part", "bony", "soft"), [
+    ("left_leg", [(0.088, 0.134, -0.386), (0.048, 0.121, -0.55)], [(0.1, 0.1, -0.2), (-0.06, 0.15, -0.52)]),
+    ("right_leg", [(0.088, -0.134, -0.386), (0.048, -0.121, -0.55)], [(0.1, -0.1, -0.2), (-0.06, -0.15, -0.52)]),
+    ("left_arm", [(-0.013, 0.34, 0.235)], [(0.05, 0.3, 0.25), (0.1, 0.4, 0.2)]),
+])  # fmt: skip
+def test_kneecap_shin_and_tip_of_the_elbow_are_told_of_and_flesh_is_not(part, bony, soft):
+    """Forty millimetres of tissue over a kneecap, seventeen over the tip of an elbow, are not people's."""
+    layer = living(Body.anny(), part, edge_length=8e-3)
+    sound = Soundness(layer)
+
+    def told(place) -> bool:
+        distance = np.linalg.norm(layer.vertices - place, axis=1)
+        near = np.flatnonzero(distance < distance.min() + 0.012)
+        return any("right under the skin" in why for why in sound.of_contact(near, np.ones(len(near))))
+
+    assert [told(place) for place in bony + soft] == [True] * len(bony) + [False] * len(soft)
+    assert 0.01 < layer.bony.mean() < 0.12
+
+
+def test_what_is_bony_travels_with_the_layer():
+    layer = living(Body.anny(), "left_calf", edge_length=12e-3)
+    for back in (unpack(pack(layer)), layer_from(topology_message(layer, "body", 0)), layer.with_(density=1.0)):
+        np.testing.assert_array_equal(back.bony, layer.bony)
+    assert layer_id(unpack(pack(layer))) == layer_id(layer) != layer_id(layer.with_(bony=None))
+    with pytest.raises(InvalidInput, match="bony has shape"):
+        layer.with_(bony=[True])

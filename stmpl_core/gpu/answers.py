@@ -9,13 +9,14 @@ import warp as wp
 from stmpl_core import pieces, soundness, toucher
 from stmpl_core import wrenches as wrenches_of_skin
 from stmpl_core.gpu.hold import _wanted
-from stmpl_core.gpu.packs import BORDER_BIT, LONG_BIT, STEEP_BIT, OneSkin, Scratch, Skins
+from stmpl_core.gpu.packs import BONY_BIT, BORDER_BIT, LONG_BIT, STEEP_BIT, OneSkin, Scratch, Skins
 from stmpl_core.gpu.places import APART, BY_POSE, DEEP, REFUSED, WRAPPED
 from stmpl_core.gpu.rays import FAR, OPTIONS, real, vec3
 from stmpl_core.obstacle import REACH
 
 HALF_REACH = wp.constant(wp.float64(0.5 * REACH))
 STEEP, LONG, BORDER = wp.constant(STEEP_BIT), wp.constant(LONG_BIT), wp.constant(BORDER_BIT)
+BONY, BONY_SHARE = wp.constant(BONY_BIT), wp.constant(wp.float64(soundness.BONY_SHARE))
 STEEP_SHARE, LONG_SHARE = wp.constant(wp.float64(soundness.STEEP_SHARE)), wp.constant(wp.float64(soundness.LONG_SHARE))
 BORDER_SHARE = wp.constant(wp.float64(soundness.BORDER_SHARE))
 AROUND, UNSEEN = wp.constant(wp.float64(toucher.MAX_AROUND)), wp.constant(wp.float64(toucher.MAX_UNSEEN_FORCE_SHARE))
@@ -211,7 +212,7 @@ def answer(first: wp.int32, many: wp.int32, known: Known, skins: Skins, scratch:
         return
     force, torque, forces, strange, doubt = vec3(), vec3(), real(0.0), real(0.0), real(0.0)
     total, below = real(0.0), real(0.0)
-    steep, long, border, highest = real(0.0), real(0.0), real(0.0), real(0.0)
+    steep, long, border, bony, highest = real(0.0), real(0.0), real(0.0), real(0.0), real(0.0)
     depth, thick, count, carried = real(scratch.deep[c]), real(0.0), real(0.0), real(0.0)
     start = wp.int32(scratch.nodes[s])
     for i in range(scratch.nodes[s]):
@@ -231,6 +232,8 @@ def answer(first: wp.int32, many: wp.int32, known: Known, skins: Skins, scratch:
                     long += part
                 if (skins.doubts[v] & BORDER) != 0:
                     border += part
+                if (skins.doubts[v] & BONY) != 0:
+                    bony += part
             forces += here
             strange += here * real(scratch.strange[s, i])
             doubt += scratch.error[s, i] * scratch.area[s, i]
@@ -259,6 +262,7 @@ def answer(first: wp.int32, many: wp.int32, known: Known, skins: Skins, scratch:
         doubt = wp.sqrt(doubt * doubt + unlike * unlike)
     size += along
     sound = steep <= STEEP_SHARE * forces and long <= LONG_SHARE * forces and border <= BORDER_SHARE * forces
+    sound = sound and bony <= BONY_SHARE * forces
     sound = sound and one.softness * highest <= known.pressure and depth * count <= known.depth * thick
     sound = sound and strange <= UNSEEN * forces and one.learnt == 1
     sound = sound and depth <= SOFT_SHARE * one.soft

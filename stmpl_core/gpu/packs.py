@@ -25,7 +25,7 @@ from stmpl_core.tool import Tool
 from stmpl_core.tools import Tools
 from stmpl_core.toucher import margin_on, soft_depth, unlearnt
 
-STEEP_BIT, LONG_BIT, BORDER_BIT, EDGE_BIT = 1, 2, 4, 8  # what is to be said of a vertex, see Soundness
+STEEP_BIT, LONG_BIT, BORDER_BIT, EDGE_BIT, BONY_BIT = 1, 2, 4, 8, 16  # what is to be said of a vertex, see Soundness
 MOST_PLACES = 8192  # places of a lattice: nodes.MOST_LOOKED_AT and a margin around them
 LEAST_PARTS = 800  # parts of few triangles: of 199 in 4
 MARGIN = 1.3  # room for columns over the most that were counted
@@ -251,7 +251,7 @@ def _one_skin(skin: Skin, columns: Columns, at: tuple[int, int, int, int]) -> tu
     around = np.concatenate([columns._around[columns._start[v] : columns._start[v + 1]] for v in order])
     edge = np.zeros(len(order), bool)
     edge[layer.border] = True
-    doubts = (STEEP_BIT * sound.steep + LONG_BIT * sound.long + EDGE_BIT * edge
+    doubts = (STEEP_BIT * sound.steep + LONG_BIT * sound.long + EDGE_BIT * edge + BONY_BIT * sound.bony
               + BORDER_BIT * (sound.border < sound.least_border))  # fmt: skip
     arrays = {
         "points": layer.vertices[order], "inward": columns.inward[order], "thickness": layer.thickness[order],

@@ -138,6 +138,7 @@ class Pressures:
 
 def restored_mesh(card: dict[str, Any], arrays: dict[str, np.ndarray]) -> Mesh:
     """The mesh of a scene's card and arrays."""
-    tissue, _ = stack_from_text(json.dumps({name: card.get(name) or value for name, value in asdict(Tissue()).items()}))
+    told = {name: card.get(name) or value for name, value in asdict(Tissue()).items()}
+    tissue, *_ = stack_from_text(json.dumps(told))
     always = {key: arrays[key] for key in ("vertices", "faces", "thickness", "uv")}
     return Mesh(**always, tissue=tissue, core=arrays.get("core"), ply_scale=arrays.get("ply_scale"))
