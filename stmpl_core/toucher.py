@@ -70,7 +70,7 @@ SLACK = 0.04, 0.5  # T / (E t), and kappa, below and above which skin is slack a
 PINS = 3  # tools side by side from which they may be pins of one brush
 SIDES = (0.2, 0.9)  # share of the force that points one way: below, a tool closes around; between, none was learnt
 MAX_UNSEEN_FORCE_SHARE = 0.1  # share of the force that vertices unlike all training contacts may carry
-MAX_PRESSED_STRAIN = 0.85  # depth over thickness beyond which no wrench presses a tool
+MAX_PRESSED_STRAIN, STRAINED = 0.85, 0.003  # depth over thickness beyond which no wrench presses a tool, and how well
 STIFFENING = 10.0  # growth of the force beyond, relative, a thickness of the way that it was drawn back
 FORCE_TOLERANCE = 0.015  # relative error of the force at which trials end; the rest of the way is reckoned
 LEAST_STEP = 2e-4  # step of the depth, over the thickness, that is likewise only reckoned
@@ -347,7 +347,7 @@ class Toucher:
             moved = gap + FIRST_DEPTH * self._thickest
         last: tuple[float, float] | None = None  # depth and force of the trial before
         strains: list[tuple[float, float]] = []  # way and strain of those that do not reach the core
-        pressed_at = np.inf
+        back, pressed_at = 0.1 * self._thickest, np.inf
         for _ in range(MAX_DEPTH_TRIALS):
             pose, clearance = shifted(start, moved * push), stated
             if moved:
@@ -377,32 +377,31 @@ class Toucher:
             normal = 0.0 if wrapped else float(force @ vector) / size
             if normal <= 0 and not through:
                 return None
-            if normal <= 0 or strain > MAX_PRESSED_STRAIN + 0.02:  # too deep, whatever it presses with
-                high, following = min(high, moved), _strained(strains, squeeze)
-                least = moved - 0.05 * self._thickest
-                moved = min(following, least) if low == -np.inf else following
-                moved = moved if low < moved < high else 0.5 * (low + high)
-                continue
-            status = MOVED if gap > MAX_TOUCHING_GAP * self.hole else TOUCHING
-            way = float((pose[:3, 3] - stated_at) @ push)
-            best, pressed_at = _Placed(contact, field, status, pose, depth, way, squeeze, normal, held=held), moved
-            deep = self._depth(squeeze)
-            power = held.power * STIFFER
+            deep, power = self._depth(squeeze), held.power * STIFFER
             if last is not None and abs(deep / last[0] - 1) > 1e-6:
                 power = float(np.log(size / last[1]) / np.log(deep / last[0]))
             power = min(max(power, POWERS[0]), POWERS[1])
             gain = max(normal / float(np.linalg.norm(force)), MIN_FACING_COSINE)
-            further = deep * ((normal / size) ** (1 / power) - 1) / gain
+            further = deep * ((max(normal, 0.0) / size) ** (1 / power) - 1) / gain
+            following = min(moved + further, _strained(strains, squeeze))
+            if normal <= 0 or strain > MAX_PRESSED_STRAIN + STRAINED:  # too deep, whatever it presses with
+                if not strain < 1:
+                    back, following = 2 * back, min(following, moved - back)
+                high = min(high, moved)
+                moved = following if low < following < high else 0.5 * (max(low, high - 2 * back) + high)
+                continue
+            status = MOVED if gap > MAX_TOUCHING_GAP * self.hole else TOUCHING
+            way = float((pose[:3, 3] - stated_at) @ push)
+            best, pressed_at = _Placed(contact, field, status, pose, depth, way, squeeze, normal, held=held), moved
             if abs(size / normal - 1) < FORCE_TOLERANCE or abs(further) < LEAST_STEP * self._thickest:
                 under = np.where(squeeze.depth > 0, squeeze.depth + further * (self._inward[v] @ push), 0.0)
                 return best._replace(pose=shifted(pose, further * push), moved=way + further,
                                      squeeze=squeeze._replace(depth=np.maximum(under, 0.0)))  # fmt: skip
-            if size < normal and strain > MAX_PRESSED_STRAIN - 0.005:
+            if size < normal and strain > MAX_PRESSED_STRAIN - STRAINED:
                 why = (f"{contact.name} carries {size:.2g} of {normal:.2g} N along the skin's normal, "
                        f"pressed to {strain:.0%} of the layer")  # fmt: skip
                 return best._replace(force=size, why=why)
             low, high, last = (moved, high, (deep, size)) if size < normal else (low, moved, (deep, size))
-            following = min(moved + further, _strained(strains, squeeze))
             if not low < following < high:  # halve the bracket, or go to where its open end must be
                 least = 0.05 * self._thickest
                 inside = np.isfinite(high - low)
