@@ -85,7 +85,7 @@ def test_the_cheapest_that_is_accurate_enough_answers_and_is_named_with_its_boun
 
 def test_a_deadline_takes_the_most_accurate_that_is_fast_enough_and_flags_what_misses_the_wish(layer):
     load = disc(layer)
-    method, _ = three(layer, 0.005 * unit(layer, load), deadline=5e-3)
+    method, _ = three(layer, 0.005 * unit(layer, load), deadline=5.0, seconds=(0.1, 1, 10))
     answer = method.solve(load)
     assert answer.method == "b" and not answer.trust.in_range
     assert "nothing meets the wish" in answer.trust.why
@@ -161,7 +161,7 @@ def test_outside_of_what_was_measured_the_most_accurate_answers_flagged_and_with
 
 def test_outside_of_what_was_measured_time_and_the_methods_own_ranges_decide(layer):
     load = disc(layer, 1.0)
-    assert outside(layer, deadline=5e-3)[0].solve(load).method == "b"
+    assert outside(layer, deadline=5.0, seconds=(0.1, 1, 10))[0].solve(load).method == "b"
     assert outside(layer, deadline=5e-5)[0].solve(load).method == "a"
     assert outside(layer, ok=(True, True, False))[0].solve(load).method == "b"
     assert outside(layer, ok=(False, False, False))[0].solve(load).method == "c"
