@@ -57,6 +57,22 @@ class Bone:
         share = np.clip((points - self.start) @ axis / (axis @ axis), 0, 1)
         return self.start + share[:, None] * axis
 
+    def outward(self, points: Points) -> VertexVectors:
+        """Unit vectors straight away from its axis to each of the points, (N, 3)."""
+        axis = (self.end - self.start) / np.linalg.norm(self.end - self.start)
+        away = across(points - self.middles(points), axis)
+        return away / np.maximum(np.linalg.norm(away, axis=1, keepdims=True), 1e-9)
+
+    def ends_from(self, other: Bone) -> tuple[np.ndarray, np.ndarray]:
+        """Its ends, (3,) each, first the one that is nearer to another bone [m]."""
+        gap = [float(np.linalg.norm(end - other.middles(end[None])[0])) for end in (self.start, self.end)]
+        return (self.start, self.end) if gap[0] < gap[1] else (self.end, self.start)
+
+
+def across(ways: np.ndarray, axis: np.ndarray) -> np.ndarray:
+    """The parts of vectors, (N, 3) or (3,), at right angles to an axis of length 1, (3,)."""
+    return ways - (ways @ axis)[..., None] * axis
+
 
 def bones_of(body: Body, part: str) -> list[Bone]:
     """The bones of an arm, a leg, a segment of one, of a shoulder, abdomen or neck. Raises InvalidInput for others.

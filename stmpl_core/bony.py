@@ -9,13 +9,12 @@ from __future__ import annotations
 from functools import cache
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from stmpl_core.arrays import Points
 from stmpl_core.body import Body
-from stmpl_core.bones import bones_of
+from stmpl_core.bones import SEGMENTS, across, bones_of
+from stmpl_core.fat import near_on
 
-NEAREST = 4  # vertices of the body by which a place of a part is known
 KNEECAP = (-45e-3, 25e-3)  # from so far above the knee to so far below [m]
 SHIN = (0.06, 0.92)  # from such a share of the way from knee to ankle to such a one [-]
 SHIN_ANGLES = np.deg2rad((-15.0, 75.0))  # from its ridge in front towards the inside, round the leg
@@ -32,12 +31,11 @@ def bony(body: Body, part: str, points: Points) -> np.ndarray | None:
         points: places on its skin, (N, 3) [m].
     """
     side, _, name = part.partition("_")
-    limb = {"leg": "leg", "thigh": "leg", "calf": "leg", "arm": "arm", "upper_arm": "arm", "forearm": "arm"}.get(name)
+    limb = next((limb for limb, segments in SEGMENTS.items() if name in (limb, *segments)), None)
     if limb is None or side not in ("left", "right") or body.name != "anny":
         return None
-    distance, nearest = cKDTree(body.vertices).query(points, NEAREST)
-    weight = 1 / (distance + 1e-4)
-    own = (weight * _bony(side, limb)[nearest]).sum(axis=1) > 0.5 * weight.sum(axis=1)
+    weight, nearest = near_on(body, points)
+    own = (weight * _bony(side, limb)[nearest]).sum(axis=1) > 0.5
     return own if own.any() else None
 
 
@@ -46,20 +44,16 @@ def _bony(side: str, limb: str) -> np.ndarray:
     """The mask of Anny's average body, (V,), which stands at rest, up along z, and looks along x."""
     body = Body.anny()
     upper, lower = bones_of(body, f"{side}_{limb}")
-    joint = min((lower.start, lower.end), key=lambda end: float(np.linalg.norm(end - upper.end)))
-    far = lower.end if joint is lower.start else lower.start
-    axis = far - joint
-    length = float(np.linalg.norm(axis))
-    axis = axis / length
-    along, away = (body.vertices - joint) @ axis, body.vertices - lower.middles(body.vertices)
-    away -= (away @ axis)[:, None] * axis
-    away /= np.maximum(np.linalg.norm(away, axis=1, keepdims=True), 1e-9)
+    joint, far = lower.ends_from(upper)
+    length = float(np.linalg.norm(far - joint))
+    axis, away = (far - joint) / length, lower.outward(body.vertices)
+    along = (body.vertices - joint) @ axis
     if limb == "arm":
         back = -(upper.start - joint) / np.linalg.norm(upper.start - joint) - axis
-        back -= back @ axis * axis
+        back = across(back, axis)
         found = (away @ back > FACING * np.linalg.norm(back)) & (np.abs(along) < ELBOW)
     else:
-        front = np.array([1.0, 0.0, 0.0]) - axis[0] * axis
+        front = across(np.array([1.0, 0.0, 0.0]), axis)
         front /= np.linalg.norm(front)
         inner = np.cross(axis, front) * (1 if side == "left" else -1)
         angle = np.arctan2(away @ inner, away @ front)

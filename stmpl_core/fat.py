@@ -8,7 +8,6 @@ squares: ln thickness = a + b (female - 1/2) + c (body mass index - 24 kg/m2).
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 from math import exp
@@ -18,7 +17,7 @@ from scipy.spatial import cKDTree
 
 from stmpl_core.arrays import PerVertex, Points
 from stmpl_core.body import Body, Physique
-from stmpl_core.bones import SEGMENTS, Bone, bones_of
+from stmpl_core.bones import SEGMENTS, across, bones_of
 from stmpl_core.regions import Quantity, Region, region
 
 MULTIS = "MULTIS, Neumann et al., Sci Data 5 (2018) 180193: 95 adults, ultrasound, geometric mean and deviation"
@@ -108,9 +107,7 @@ def fat_map(body: Body, part: str, points: Points) -> PerVertex | None:
     bones = bones_of(body, part)
     far = np.array([np.linalg.norm(points - bone.middles(points), axis=1) for bone in bones])
     near = 1 / far**2
-    distance, nearest = cKDTree(body.vertices).query(points, NEAREST)
-    weight = 1 / (distance + 1e-4)
-    weight /= weight.sum(axis=1, keepdims=True)
+    weight, nearest = near_on(body, points)
     thickness = np.zeros(len(points))
     for segment, share in zip(segments, near / near.sum(axis=0), strict=True):
         where, site = SITES[segment]
@@ -119,6 +116,13 @@ def fat_map(body: Body, part: str, points: Points) -> PerVertex | None:
         facing = (weight * _frontward(f"{side}_{segment}")[nearest]).sum(axis=1)
         thickness += share * front * (1 / site.ratio + (1 - 1 / site.ratio) * (1 + facing) / 2)
     return np.maximum(thickness, LEAST_FAT)
+
+
+def near_on(body: Body, points: Points) -> tuple[np.ndarray, np.ndarray]:
+    """Weights that sum to 1, and numbers, of the vertices of a body near places (N, 3) [m], (N, NEAREST) each."""
+    distance, nearest = cKDTree(body.vertices).query(points, NEAREST)
+    weight = 1 / (distance + 1e-4)
+    return weight / weight.sum(axis=1, keepdims=True), nearest
 
 
 @cache
@@ -130,32 +134,22 @@ def _frontward(part: str) -> np.ndarray:
     """
     body = Body.anny()
     (bone,) = bones_of(body, part)
-    away = body.vertices - bone.middles(body.vertices)
     axis = (bone.end - bone.start) / np.linalg.norm(bone.end - bone.start)
-    away -= (away @ axis)[:, None] * axis
-    away /= np.maximum(np.linalg.norm(away, axis=1, keepdims=True), 1e-9)
-    front = np.tile([1.0, 0.0, 0.0], (len(away), 1))
+    front = np.tile([1.0, 0.0, 0.0], (len(body.vertices), 1))
     if part.endswith("forearm"):
         (upper,) = bones_of(body, part.replace("forearm", "upper_arm"))
-        elbow, wrist = _sorted_ends(bone, upper)
+        elbow, wrist = bone.ends_from(upper)
         shoulder = max((upper.start, upper.end), key=lambda end: float(np.linalg.norm(end - elbow)))
         along = np.clip((body.vertices - elbow) @ (wrist - elbow) / ((wrist - elbow) @ (wrist - elbow)), 0, 1)[:, None]
-        crease, palm = (_across(way, axis) for way in (shoulder - elbow, _palm(body, part)))
+        crease, palm = (_unit(across(way, axis)) for way in (shoulder - elbow, _palm(body, part)))
         front = (1 - along) * crease + along * palm
-    front = front - (front @ axis)[:, None] * axis
+    front = across(front, axis)
     front /= np.maximum(np.linalg.norm(front, axis=1, keepdims=True), 1e-9)
-    return np.einsum("ij,ij->i", away, front)
+    return np.einsum("ij,ij->i", bone.outward(body.vertices), front)
 
 
-def _sorted_ends(bone: Bone, other: Bone) -> Sequence[np.ndarray]:
-    """The ends of a bone, first the one that is nearer to another bone."""
-    gap = [float(np.linalg.norm(end - other.middles(end[None])[0])) for end in (bone.start, bone.end)]
-    return (bone.start, bone.end) if gap[0] < gap[1] else (bone.end, bone.start)
-
-
-def _across(way: np.ndarray, axis: np.ndarray) -> np.ndarray:
-    across = way - way @ axis * axis
-    return across / np.linalg.norm(across)
+def _unit(way: np.ndarray) -> np.ndarray:
+    return way / np.linalg.norm(way)
 
 
 def _palm(body: Body, part: str) -> np.ndarray:

@@ -501,11 +501,11 @@ class Toucher:
                                f"times as stiff, tried is {SOFT_SHARE:.0%}", in_range=False)  # fmt: skip
         for why in self._unlearnt:
             trust = trust.also(why, in_range=False)
-        thickest = float(one.squeeze.nodes.thickness.max())
         if strange > MAX_UNSEEN_FORCE_SHARE:
             trust = trust.also(f"{strange:.0%} of the force of {name} is where no training contact was like it",
                                in_range=False)  # fmt: skip
-        if one.force is not None and abs(one.moved) > max(self.reach, MUCH_MOVED * thickest):
+        far = one.force is not None and abs(one.moved) > self.reach
+        if far and abs(one.moved) > MUCH_MOVED * float(one.squeeze.nodes.thickness.max()):
             trust = trust.also(f"{name} was moved {one.moved * 1e3:+.1f} mm along its force: check its calibration")
         if alone:
             trust = self.unmet(trust, touch, stated)

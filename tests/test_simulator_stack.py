@@ -237,8 +237,7 @@ def test_skin_with_next_to_no_tension_is_flagged(tension: float, sound: bool) ->
 
 
 @pytest.mark.parametrize("force", [0.3, 3.0, 10.0, 100.0])
-def test_few_trials_find_where_a_tool_that_is_stated_at_the_skin_presses(force, monkeypatch) -> None:
-    simulator = Simulator(LIMB, MomentNet())
+def test_few_trials_find_where_a_tool_that_is_stated_at_the_skin_presses(force, simulator, monkeypatch) -> None:
     toucher, tried = simulator.toucher, []
     hold = toucher.net.hold
     monkeypatch.setattr(toucher.net, "hold", lambda nodes: tried.append(nodes) or hold(nodes))
