@@ -38,7 +38,7 @@ LEARN = [*BODIES, *DRAWN, "zarr>=3.0"]
 STUDIES = LEARN
 SIM = ["gymnasium>=1.0", "manifold3d>=3.0", "mujoco==4.0.0"]
 FMI = ["pythonfmu3>=0.3.4"]
-GPU = ["warp-lang>=1.8"]
+GPU = ["warp-lang>=1.10"]
 VIEW = [*DRAWN, "viser>=1.1"]
 FOXGLOVE = ["foxglove-sdk>=0.30"]
 CLUSTER = ["distributed>=2024.8"]

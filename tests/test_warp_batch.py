@@ -173,6 +173,17 @@ def test_skin_beyond_a_gap_is_not_felt() -> None:
     same(made(skin, [tip], 3).touch(poses), Batch(skin, [tip], 3, threads=1).touch(poses))
 
 
+def test_fields_do_not_cross_a_gap() -> None:
+    skin, tools = Skin.of(FINGERS, MomentNet(sticks=False)), [ball(0.005).named("left"), ball(0.005).named("right")]
+    poses = np.stack([[at(-x, 0.02, 0.005 - 1e-3), at(x, y, 0.005 - 1.5e-3)] for x, y in
+                      ((0.006, 0.02), (0.004, 0.022), (0.004, 0.062))])  # fmt: skip  # the last is near the root
+    moved(made(skin, tools, 3), Batch(skin, tools, 3, threads=1), poses, 3)
+    count, off = len(FINGERS.vertices), np.concatenate([poses[:1, :1], at(0.0, 0.0, 0.05)[None, None]], axis=1)
+    alone = made(skin, tools, 1).touch(off, fields=[0]).fields.numpy()[0, :count]
+    beyond = (FINGERS.vertices[:, 0] > 0) & (FINGERS.vertices[:, 1] < 0.03)
+    assert np.linalg.norm(alone, axis=1).max() > 5e-4 and not alone[beyond].any()
+
+
 def test_tools_side_by_side_feel_each_other(cylinder: Skin) -> None:
     same(made(cylinder, [LEFT, RIGHT], 6).touch(pairs()), Batch(cylinder, [LEFT, RIGHT], 6).touch(pairs()))
 

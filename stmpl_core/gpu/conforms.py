@@ -8,7 +8,7 @@ import warp as wp
 
 from stmpl_core import conform, simulator, touch
 from stmpl_core.gpu.field_packs import FieldScratch, SkinFields
-from stmpl_core.gpu.motion import FAR, PER_LOG, STEPS, TOP, _at
+from stmpl_core.gpu.motion import FAR, PER_LOG, STEPS, TOP, _at, feels
 from stmpl_core.gpu.packs import Scratch, Skins
 from stmpl_core.gpu.places import BY_POSE, REFUSED
 from stmpl_core.gpu.rays import OPTIONS, Grid, along, cubic, depth_and_share, depth_in_column, real, vec3, wall_in
@@ -170,7 +170,10 @@ def begin(pick: wp.array(dtype=wp.int32), lanes: wp.int32, many: wp.int32, skins
     first, count = skins.one[id].first, field.many[f]
     for n in range(lane, count * count, lanes):
         i, j = n // count, n % count
-        field.sinking[f, i, j] = _sinks(more, id, field.under[f, i], field.under[f, j])
+        sinks = wp.float32(0.0)
+        if field.folds[f] <= 1 or field.fold[f, i] == field.fold[f, j]:
+            sinks = _sinks(more, id, field.under[f, i], field.under[f, j])
+        field.sinking[f, i, j] = sinks
     for n in range(lane, count, lanes):
         field.moved[f, n] = field.motion[f, field.under[f, n] - first]
         field.pulls[f, n] = vec3()
@@ -278,7 +281,7 @@ def spread(pick: wp.array(dtype=wp.int32), lanes: wp.int32, many: wp.int32, skin
         if field.ask[f, n] == 1:
             sum = vec3()
             for m in range(field.many[f]):
-                if wp.length_sq(field.pulls[f, m]) > real(0.0):
+                if wp.length_sq(field.pulls[f, m]) > real(0.0) and feels(field, f, n, m):
                     sum = sum + real(_sinks(more, id, one.first + n, field.under[f, m])) * field.pulls[f, m]
             field.spread[f, n] = sum
 

@@ -37,6 +37,7 @@ FIELD_SCRATCH: dict[str, tuple[Any, str]] = {
     "sinking": (wp.float32, "FWW"), "left": (real, "FWW"), "right": (vec3, "FW"), "wanted": (vec3, "FW"),
     "weight": (real, "FW"), "moved": (vec3, "FW"), "pulls": (vec3, "FW"), "act": (wp.int32, "FW"),
     "acts": (wp.int32, "F"), "own": (real, "F"), "spread": (vec3, "FV"), "most": (wp.int32, "1"),
+    "folds": (wp.int32, "F"), "fold": (wp.int32, "FW"), "queue": (wp.int32, "FW"), "feels": (wp.uint32, "FV"),
 }  # fmt: skip
 MOTION_NET: dict[str, tuple[Any, str]] = {
     name: (wp.float32, "io" if name[0] == "w" or name.startswith("mix") else "o")

@@ -35,9 +35,9 @@ class Fields:
     """
 
     def __init__(self, skins: Sequence[Skin], tools: int, lanes: int, memory: int, device: Any) -> None:
-        if any(skin.layer.stacked or skin.near.folded for skin in skins):
-            raise InvalidInput("fields of stacks (living limbs) and of skin with folds are not served by WarpBatch "
-                               "yet, only what tools do to them. Try Batch.")  # fmt: skip
+        if any(skin.layer.stacked for skin in skins):
+            raise InvalidInput("fields of stacks (living limbs) are not served by WarpBatch yet, only what tools do to "
+                               "them. Try Batch.")  # fmt: skip
         self._net, self._more = field_packs.motion_net(skins, device), field_packs.pack(skins, device)
         self.vertices = max(len(skin.layer.vertices) for skin in skins)
         self._room = FieldRoom(self.vertices, UNDER, tools, lanes)
@@ -100,6 +100,7 @@ class Fields:
 
         # What the method says.
         run(motion.forget, 1, skins, touched, field)
+        self._run(motion.fold, scenes, pick, tools, 0, skins, touched, field)
         run(motion.mark, 0, skins, more, touched, field)
         run(motion.ask, skins, more, touched, field)
         run(motion.move, skins, more, touched, field, self._net)
@@ -108,6 +109,7 @@ class Fields:
 
         # What is touched lies on its tool, and the rest comes along.
         run(conforms.lie, skins, touched, field, dim=(scenes * tools, lanes))
+        self._run(motion.fold, scenes, pick, tools, 1, skins, touched, field)
         run(conforms.begin, skins, more, touched, field)
         for _ in range(PASSES):
             run(conforms.want, skins, touched, field)

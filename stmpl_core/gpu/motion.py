@@ -18,6 +18,7 @@ from stmpl_core.methods import moment_net as law
 from stmpl_core.networks import DIRECTIONS, INPUTS, MOTION
 
 ZONES, FILLED_FROM = wp.constant(len(thinning.ZONES) + 1), wp.constant(thinning.CORNERS)
+MOST_FOLDS = wp.constant(31)  # the highest number of a group, whose bits are those of a word
 FAR, STEPS = wp.constant(wp.float32(response.REACH)), wp.constant(wp.float32(response.STEPS))
 NEAR_END, FINER = wp.constant(wp.float32(response.NEAR * response.STEPS)), wp.constant(wp.float32(response.FINER))
 PER_LOG = wp.constant(wp.float32(1 / math.log(response.SPREADS[1] / response.SPREADS[0])))
@@ -116,10 +117,48 @@ def forget(pick: wp.array(dtype=wp.int32), lanes: wp.int32, many: wp.int32, firs
     one = skins.one[scratch.skin[pick[f] * many]]
     for n in range(lane, one.end - one.first, lanes):
         field.mark[f, n] = 0
+        field.feels[f, n] = wp.uint32(0)
         field.ask[f, n] = 0
         field.here[f, n] = wp.vec2f()
         if first == 1:
             field.motion[f, n] = vec3()
+
+
+@wp.kernel
+def fold(pick: wp.array(dtype=wp.int32), many: wp.int32, all: wp.int32, skins: Skins, scratch: Scratch,
+         field: FieldScratch):  # fmt: skip
+    """Groups of sources of which none feels another, on skin with folds: thinning._together; all: see `mark`."""
+    f = wp.tid()
+    one, count, groups = skins.one[scratch.skin[pick[f] * many]], field.many[f], wp.int32(0)
+    field.folds[f] = 1
+    if one.folded == 0:
+        return
+    for n in range(count):
+        field.fold[f, n] = -1
+    for n in range(count):
+        if field.fold[f, n] < 0 and (all == 1 or field.source[f, n][0] != wp.float32(0.0)):
+            field.fold[f, n] = groups
+            field.queue[f, 0] = n
+            done, end = wp.int32(0), wp.int32(1)
+            while done < end:
+                v = field.under[f, field.queue[f, done]]
+                done += 1
+                for m in range(count):
+                    if field.fold[f, m] < 0 and (all == 1 or field.source[f, m][0] != wp.float32(0.0)):
+                        w = field.under[f, m] - one.first
+                        if ((skins.linked[v, w // 32] >> wp.uint32(w % 32)) & wp.uint32(1)) == wp.uint32(1):
+                            field.fold[f, m] = groups
+                            field.queue[f, end] = m
+                            end += 1
+            groups = wp.min(groups + 1, MOST_FOLDS)
+    field.folds[f] = groups
+
+
+@wp.func
+def feels(field: FieldScratch, f: wp.int32, n: wp.int32, m: wp.int32) -> bool:
+    """Whether a vertex feels a source: not what is near it through the air only."""
+    return field.folds[f] <= 1 or \
+        ((field.feels[f, n] >> wp.uint32(field.fold[f, m])) & wp.uint32(1)) == wp.uint32(1)  # fmt: skip
 
 
 @wp.kernel
@@ -135,6 +174,8 @@ def mark(pick: wp.array(dtype=wp.int32), lanes: wp.int32, many: wp.int32, all: w
             for z in range(ZONES):
                 for p in range(more.reach[ZONES * v + z], more.reach[ZONES * v + z + 1]):
                     wp.atomic_max(field.mark, f, more.index[p] - first, ZONES - z)
+                    if field.folds[f] > 1:
+                        wp.atomic_or(field.feels, f, more.index[p] - first, wp.uint32(1) << wp.uint32(field.fold[f, n]))
 
 
 @wp.kernel
@@ -226,7 +267,7 @@ def move(pick: wp.array(dtype=wp.int32), lanes: wp.int32, many: wp.int32, skins:
             even, cos_1, sin_1, cos_2, sin_2 = mat28(), mat28(), mat28(), mat28(), mat28()
             for n in range(field.many[f]):
                 source = field.source[f, n]
-                if source[0] != zero:
+                if source[0] != zero and feels(field, f, local, n):
                     q = field.under[f, n]
                     other, away = more.site[q], more.at[q] - at
                     inverse = site[0] * other[0]

@@ -145,8 +145,8 @@ class WarpBatch:
             fields_out: array that takes the fields, (F, V, 3), float32 or float64, likewise.
 
         Raises:
-            InvalidInput: shapes, precisions, devices or numbers of scenes that do not fit; fields of stacks, of skin
-                with folds, of skins that are not moved by one MomentNet, or one that there is no memory for.
+            InvalidInput: shapes, precisions, devices or numbers of scenes that do not fit; fields of stacks, of
+                skins that are not moved by one MomentNet, or one that there is no memory for.
         """
         n, many = len(self), len(self.tools)
         wanted = np.array(list(fields), dtype=np.int64)
