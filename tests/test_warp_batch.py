@@ -324,6 +324,16 @@ def test_a_tool_without_room_is_told(cylinder: Skin) -> None:
     assert not found.in_range.numpy().any()
 
 
+def test_room_grows_where_a_tool_needs_more_nodes(cylinder: Skin) -> None:
+    poses, batch = scattered(cylinder, 0.012, 9), made(cylinder, [LEFT], 9)
+    whole, memory = batch.touch(poses).wrenches.numpy(), batch.room.bytes_of(1)
+    assert batch._make_room(32) and batch.room.nodes == 32
+    assert np.array_equal(batch.touch(poses).wrenches.numpy(), whole, equal_nan=True) and batch.room.nodes > 64
+    tight = made(cylinder, [LEFT], 9, memory=memory)
+    assert tight._make_room(32) and tight._part > 1  # and in smaller parts, as soon as it grows
+    assert np.array_equal(tight.touch(poses).wrenches.numpy(), whole, equal_nan=True) and tight._part == 1
+
+
 def test_what_is_not_served_is_refused_when_it_is_made(cylinder: Skin, layered: Skin) -> None:
     with pytest.raises(InvalidInput, match="do not go into one"):
         made([cylinder, layered], [LEFT])

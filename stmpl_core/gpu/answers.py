@@ -8,8 +8,7 @@ import warp as wp
 
 from stmpl_core import pieces, soundness, toucher
 from stmpl_core import wrenches as wrenches_of_skin
-from stmpl_core.gpu.hold import _wanted
-from stmpl_core.gpu.packs import BONY_BIT, BORDER_BIT, LONG_BIT, STEEP_BIT, OneSkin, Scratch, Skins
+from stmpl_core.gpu.packs import BONY_BIT, BORDER_BIT, LONG_BIT, STEEP_BIT, Scratch, Skins
 from stmpl_core.gpu.places import APART, BY_POSE, DEEP, REFUSED, WRAPPED
 from stmpl_core.gpu.rays import FAR, OPTIONS, real, vec3
 from stmpl_core.obstacle import REACH
@@ -92,12 +91,12 @@ def group(many: wp.int32, skins: Skins, scratch: Scratch):
 
 
 @wp.func
-def _power(scratch: Scratch, one: OneSkin, s: wp.int32, many: wp.int32, k: wp.int32) -> real:
+def _power(scratch: Scratch, s: wp.int32, many: wp.int32, k: wp.int32) -> real:
     """Power of the depth with which the force of a tool's group grows."""
     deepest, found, force = real(0.0), real(0.0), real(0.0)
     for i in range(scratch.nodes[s]):
         if scratch.group[s * many + scratch.tool[s, i]] == scratch.group[s * many + k]:
-            deepest = wp.max(deepest, _wanted(scratch, one, s, i))
+            deepest = wp.max(deepest, scratch.wanted[s, i])
             found += scratch.found_power[s, i]
             force += scratch.force[s, i]
     return deepest * found / wp.max(force, NONE)
@@ -136,23 +135,63 @@ def _along(area_vector: vec3, way: vec3) -> real:
     return out
 
 
+@wp.kernel
+def find_beside(lanes: wp.int32, many: wp.int32, scratch: Scratch):
+    """Bits of the nodes of the same tool that are of one piece with each."""
+    s, lane = wp.tid()
+    count = scratch.nodes[s]
+    words = (count + 31) // 32
+    for n in range(lane, count * words, lanes):
+        i, w, bits = n // words, n % words, wp.uint32(0)
+        for j in range(32 * w, wp.min(32 * w + 32, count)):
+            if scratch.tool[s, i] == scratch.tool[s, j] and \
+                    wp.length_sq(scratch.point[s, i] - scratch.point[s, j]) < PIECE * scratch.area[s, i]:
+                bits = bits | (wp.uint32(1) << wp.uint32(j - 32 * w))
+        scratch.beside[s, i, w] = bits
+    for n in range(lane, many * words, lanes):
+        scratch.reached[s * many + n // words, n % words] = wp.uint32(0)
+
+
 @wp.func
-def _pins(scratch: Scratch, s: wp.int32, start: wp.int32, end: wp.int32) -> wp.vec2d:
-    """Force beside each piece over its own, and radius of a piece [m], of nodes from start to end: pieces.pins."""
-    found = wp.int32(0)
-    for n in range(start, end):
-        scratch.fold[s, n] = -1
-    for n in range(start, end):
-        if scratch.fold[s, n] < 0:
+def _reached(scratch: Scratch, c: wp.int32, n: wp.int32) -> bool:
+    return ((scratch.reached[c, n // 32] >> wp.uint32(n % 32)) & wp.uint32(1)) == wp.uint32(1)
+
+
+@wp.func
+def _lowest(bits: wp.uint32) -> wp.int32:
+    """Number of the lowest bit that is set."""
+    n, rest = wp.int32(0), wp.uint32(bits)
+    while (rest & wp.uint32(1)) == wp.uint32(0):
+        rest = rest >> wp.uint32(1)
+        n += 1
+    return n
+
+
+@wp.func
+def _pins(scratch: Scratch, c: wp.int32, s: wp.int32, k: wp.int32) -> wp.vec2d:
+    """Force beside each piece of a tool over its own, and radius of a piece [m]: pieces.pins."""
+    nodes, found, last, end = scratch.nodes[s], wp.int32(0), wp.int32(0), wp.int32(0)
+    for n in range(nodes):
+        if scratch.tool[s, n] < k:
+            last += 1  # the queues of tools lie one after the other
+        if scratch.tool[s, n] <= k:
+            end += 1
+    for n in range(nodes):
+        if scratch.tool[s, n] == k and not _reached(scratch, c, n):
+            first = wp.int32(last)
             scratch.fold[s, n] = found
-            scratch.queue[s, start] = n
-            first, last = wp.int32(start), wp.int32(start + 1)
-            while first < last:
+            scratch.queue[s, last] = n
+            scratch.reached[c, n // 32] = scratch.reached[c, n // 32] | (wp.uint32(1) << wp.uint32(n % 32))
+            last += 1
+            while first < last and last < end:
                 i = scratch.queue[s, first]
                 first += 1
-                for j in range(start, end):
-                    if scratch.fold[s, j] < 0 and \
-                            wp.length_sq(scratch.point[s, i] - scratch.point[s, j]) < PIECE * scratch.area[s, i]:
+                for w in range((nodes + 31) // 32):
+                    bits = scratch.beside[s, i, w] & ~scratch.reached[c, w]
+                    scratch.reached[c, w] = scratch.reached[c, w] | bits
+                    while bits != wp.uint32(0):
+                        j = 32 * w + _lowest(bits)
+                        bits = bits & (bits - wp.uint32(1))
                         scratch.fold[s, j] = found
                         scratch.queue[s, last] = j
                         last += 1
@@ -160,16 +199,20 @@ def _pins(scratch: Scratch, s: wp.int32, start: wp.int32, end: wp.int32) -> wp.v
     if found < 2:
         return wp.vec2d(real(0.0), real(0.0))
     beside, size, total = real(0.0), real(0.0), real(0.0)
-    for i in range(start, end):
+    for i in range(nodes):
         own, other, wide = real(0.0), real(0.0), real(0.0)
         near = NEAR_PIECE * scratch.thick[s, i]
-        for j in range(start, end):
+        for j in range(nodes):
             force = scratch.pressure[s, j] * scratch.area[s, j]
-            if scratch.fold[s, i] == scratch.fold[s, j]:
+            if scratch.tool[s, i] != k or scratch.tool[s, j] != k:
+                force = real(0.0)
+            elif scratch.fold[s, i] == scratch.fold[s, j]:
                 own += force
                 wide += scratch.area[s, j]
             elif wp.length_sq(scratch.point[s, i] - scratch.point[s, j]) < near * near:
                 other += force
+        if scratch.tool[s, i] != k:
+            continue
         force = scratch.pressure[s, i] * scratch.area[s, i]
         beside += force * other / wp.max(own, NONE)
         size += force * wp.sqrt(wide / PI)
@@ -214,10 +257,8 @@ def answer(first: wp.int32, many: wp.int32, known: Known, skins: Skins, scratch:
     total, below = real(0.0), real(0.0)
     steep, long, border, bony, highest = real(0.0), real(0.0), real(0.0), real(0.0), real(0.0)
     depth, thick, count, carried = real(scratch.deep[c]), real(0.0), real(0.0), real(0.0)
-    start = wp.int32(scratch.nodes[s])
     for i in range(scratch.nodes[s]):
         if scratch.tool[s, i] == k:
-            start = wp.min(start, i)
             here, corners = scratch.pressure[s, i] * scratch.area[s, i], skins.faces[scratch.face[s, i]]
             for x in range(3):
                 v, part = corners[x], here * scratch.shares[s, i][x]
@@ -247,15 +288,16 @@ def answer(first: wp.int32, many: wp.int32, known: Known, skins: Skins, scratch:
     if one.stacked == 1 and size > real(0.0):
         way = force / size
         share = wp.clamp((size / total - ONE_WAY) / (ALL_ONE_WAY - ONE_WAY), real(0.0), real(1.0))
-        for i in range(start, start + wp.int32(count)):
-            trio = skins.faces[scratch.face[s, i]]
-            for x in range(3):
-                pressed = scratch.pressure[s, i] * scratch.area[s, i] * scratch.shares[s, i][x] / skins.area[trio[x]]
-                more = share * pressed * _along(skins.area_vectors[trio[x]], way)
-                along += more
-                torque = torque + wp.cross(skins.points[trio[x]] - scratch.place[c], more * way)
+        for i in range(scratch.nodes[s]):
+            if scratch.tool[s, i] == k:
+                trio, pressure = skins.faces[scratch.face[s, i]], scratch.pressure[s, i] * scratch.area[s, i]
+                for x in range(3):
+                    pressed = pressure * scratch.shares[s, i][x] / skins.area[trio[x]]
+                    more = share * pressed * _along(skins.area_vectors[trio[x]], way)
+                    along += more
+                    torque = torque + wp.cross(skins.points[trio[x]] - scratch.place[c], more * way)
         force = force + along * way
-    power = _power(scratch, one, s, many, k)
+    power = _power(scratch, s, many, k)
     doubt = doubt / wp.max(size, NONE) + power * grid.surface_error / wp.max(depth, grid.surface_error)
     if one.stacked == 1 and forces > real(0.0):
         unlike = known.uneven * wp.log(carried / (forces * one.flat))
@@ -267,7 +309,7 @@ def answer(first: wp.int32, many: wp.int32, known: Known, skins: Skins, scratch:
     sound = sound and strange <= UNSEEN * forces and one.learnt == 1
     sound = sound and depth <= SOFT_SHARE * one.soft
     sound = sound and (size <= SIDES[0] * forces or size >= SIDES[1] * forces)
-    pins = _pins(scratch, s, start, start + wp.int32(count))
+    pins = _pins(scratch, c, s, k)
     group = pins[0] > GROUP and depth > PINS_DEEP * pins[1]
     sound = sound and not group
     sound = sound and skins.holes[k] == 0

@@ -86,7 +86,8 @@ def guess(many: wp.int32, skins: Skins, scratch: Scratch):
     s = wp.tid()
     one = skins.one[scratch.skin[s * many]]
     for i in range(scratch.nodes[s]):
-        scratch.force[s, i] = START * _wanted(scratch, one, s, i) / scratch.matrix[s, i, i]
+        scratch.wanted[s, i] = _wanted(scratch, one, s, i)
+        scratch.force[s, i] = START * scratch.wanted[s, i] / scratch.matrix[s, i, i]
         scratch.move[s, i] = real(0.0)
     scratch.before[s] = real(1.0)
     scratch.restart[s] = 1
@@ -109,14 +110,14 @@ def multiply(lanes: wp.int32, scratch: Scratch, vector: wp.array2d(dtype=real), 
 
 
 @wp.kernel
-def turn(many: wp.int32, skins: Skins, scratch: Scratch):
+def turn(scratch: Scratch):
     """Direction of a step of conjugate gradients."""
     s = wp.tid()
     if scratch.done[s] == 1:
         return
-    one, square = skins.one[scratch.skin[s * many]], real(0.0)
+    square = real(0.0)
     for i in range(scratch.nodes[s]):
-        gap = scratch.gap[s, i] - _wanted(scratch, one, s, i)
+        gap = scratch.gap[s, i] - scratch.wanted[s, i]
         scratch.gap[s, i] = gap
         if scratch.force[s, i] > real(0.0):
             square += gap * gap

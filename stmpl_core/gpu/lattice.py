@@ -180,21 +180,22 @@ def add_area(lanes: wp.int32, last: wp.int32, scratch: Scratch):
 def list_nodes(many: wp.int32, side: wp.int32, scratch: Scratch):
     """Numbers of the places whose columns are squeezed, one after the other for all tools of a scene."""
     s = wp.tid()
-    count = wp.int32(scratch.nodes[s])
+    count, room = wp.int32(scratch.nodes[s]), scratch.tool.shape[1]
     scratch.begin[s] = count
     for k in range(many):
         c = s * many + k
         for n in range(scratch.lattice[c].rows * scratch.lattice[c].wide):
             if scratch.value[c, n] > real(0.0):
-                if count < scratch.tool.shape[1]:
+                if count < room:
                     scratch.tool[s, count] = k
                     scratch.cell[s, count] = n
-                    count += 1
                 else:
                     scratch.status[c] = OVERFULL
+                count += 1
                 if scratch.value[c, n] >= FULL and scratch.status[c] == PENDING:
                     scratch.status[c] = DEEP
-    scratch.nodes[s] = count
+    scratch.nodes[s] = wp.min(count, room)
+    wp.atomic_max(scratch.wants, 0, count)
 
 
 @wp.kernel

@@ -129,18 +129,21 @@ def fold(pick: wp.array(dtype=wp.int32), many: wp.int32, all: wp.int32, skins: S
          field: FieldScratch):  # fmt: skip
     """Groups of sources of which none feels another, on skin with folds: thinning._together; all: see `mark`."""
     f = wp.tid()
-    one, count, groups = skins.one[scratch.skin[pick[f] * many]], field.many[f], wp.int32(0)
+    one, count, groups, left = skins.one[scratch.skin[pick[f] * many]], field.many[f], wp.int32(0), wp.int32(0)
     field.folds[f] = 1
     if one.folded == 0:
         return
     for n in range(count):
         field.fold[f, n] = -1
+        if all == 1 or field.source[f, n][0] != wp.float32(0.0):
+            left += 1
     for n in range(count):
         if field.fold[f, n] < 0 and (all == 1 or field.source[f, n][0] != wp.float32(0.0)):
             field.fold[f, n] = groups
             field.queue[f, 0] = n
             done, end = wp.int32(0), wp.int32(1)
-            while done < end:
+            left -= 1
+            while done < end and left > 0:
                 v = field.under[f, field.queue[f, done]]
                 done += 1
                 for m in range(count):
@@ -150,6 +153,7 @@ def fold(pick: wp.array(dtype=wp.int32), many: wp.int32, all: wp.int32, skins: S
                             field.fold[f, m] = groups
                             field.queue[f, end] = m
                             end += 1
+                            left -= 1
             groups = wp.min(groups + 1, MOST_FOLDS)
     field.folds[f] = groups
 

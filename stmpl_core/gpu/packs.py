@@ -30,7 +30,6 @@ MOST_PLACES = 8192  # places of a lattice: nodes.MOST_LOOKED_AT and a margin aro
 LEAST_PARTS = 800  # parts of few triangles: of 199 in 4
 MARGIN = 1.3  # room for columns over the most that were counted
 HIDDEN = 32  # units of a hidden layer; a smaller network's are filled up with units that say nothing
-FEWEST_NODES = 192  # room for nodes of a tool at the least: a small one has 80 to 130
 
 
 @wp.struct
@@ -104,7 +103,7 @@ SKINS: dict[str, tuple[Any, str]] = {
     "gathered": (real, "c"), "motion": (wp.float32, "m"), "hard_logs": (real, "St"), "hard": (real, "Sts"),
 }  # fmt: skip
 # C: scene and tool, S: scene, M: columns, B: blocks of columns, F: triangles, P: their parts, L: lattice, N: nodes,
-# Q, K: nodes and coarse vertices of stacks
+# W: words of a bit for each node, Q, K: nodes and coarse vertices of stacks
 SCRATCH: dict[str, tuple[Any, str]] = {
     "skin": (wp.int32, "C"), "grid": (wp.int32, "C"), "status": (wp.int32, "C"), "busy": (wp.int32, "1"),
     "pose": (mat33, "C"), "place": (vec3, "C"), "centre": (vec3, "C"), "wide": (wp.int32, "C"),
@@ -116,15 +115,16 @@ SCRATCH: dict[str, tuple[Any, str]] = {
     "chart": (wp.int32, "CF"), "sides": (wp.int32, "C"), "axes": (mat33, "C6"), "deepest": (real, "C"),
     "covers": (real, "C"), "sees": (real, "C"), "lattice": (Lattice, "C"),
     "owner": (wp.int32, "CL"), "value": (real, "CL"), "partial": (real, "CR"),
-    "nodes": (wp.int32, "S"), "begin": (wp.int32, "S"), "tool": (wp.int32, "SN"), "cell": (wp.int32, "SN"),
-    "face": (wp.int32, "SN"), "shares": (vec3, "SN"), "point": (vec3, "SN"), "inward": (vec3, "SN"),
-    "thick": (real, "SN"), "area": (real, "SN"), "strain": (real, "SN"),
+    "nodes": (wp.int32, "S"), "wants": (wp.int32, "1"), "begin": (wp.int32, "S"), "tool": (wp.int32, "SN"),
+    "cell": (wp.int32, "SN"), "face": (wp.int32, "SN"), "shares": (vec3, "SN"), "point": (vec3, "SN"),
+    "inward": (vec3, "SN"), "thick": (real, "SN"), "area": (real, "SN"), "strain": (real, "SN"),
     "fold": (wp.int32, "SN"), "queue": (wp.int32, "SN"), "mean": (vec3, "C"), "least_area": (real, "C"),
     "most_area": (real, "C"), "sinking": (real, "SQ"), "soft": (real, "SQ"), "slot": (wp.int32, "SK"),
     "met": (wp.int32, "SK"), "meets": (wp.int32, "S"), "slots": (wp.int32, "SQ9"), "weights": (real, "SQ9"),
     "parts": (real, "SQ9"), "around_node": (wp.int32, "SQ"), "rows": (real, "SQK"),
-    "wide_part": (real, "SQQ"), "kept": (real, "SQ"), "given_way": (real, "C"),
+    "wide_part": (real, "SQQ"), "kept": (real, "SQ"), "given_way": (real, "C"), "works": (wp.vec2d, "CR"),
     "matrix": (real, "SNN"), "force": (real, "SN"), "gap": (real, "SN"), "move": (real, "SN"), "along": (real, "SN"),
+    "wanted": (real, "SN"), "beside": (wp.uint32, "SNW"), "reached": (wp.uint32, "CW"),
     "found_power": (real, "SN"), "left": (real, "SN"), "before": (real, "S"), "restart": (wp.int32, "S"),
     "first_square": (real, "S"), "done": (wp.int32, "S"), "group": (wp.int32, "C"),
     "pressure": (real, "SN"), "fade": (real, "SN"), "strange": (wp.int32, "SN"), "error": (real, "SN"),
@@ -151,7 +151,7 @@ class Room(NamedTuple):
         """Length of each axis of SCRATCH."""
         faces = 2 * self.columns + 64
         return {"C": scenes * tools, "S": scenes, "M": self.columns, "B": self.blocks, "F": faces, "6": CHARTS,
-                "P": max(faces, LEAST_PARTS), "L": MOST_PLACES, "N": self.nodes, "R": self.lanes,
+                "P": max(faces, LEAST_PARTS), "L": MOST_PLACES, "N": self.nodes, "R": self.lanes, "W": self.nodes // 32,
                 "I": max(NODE.size, STACK_NODE.size), "H": HIDDEN, "1": 1, "K": max(1, self.coarse), "9": 9,
                 "Q": self.nodes if self.coarse else 1}  # fmt: skip
 
@@ -329,9 +329,14 @@ def _looked_at(tool: Tool) -> tuple[np.ndarray, tuple[int, int]]:
     return np.concatenate([few, many]), (len(few), len(many))
 
 
+def whole_words(nodes: int) -> int:
+    """A number of nodes, each of which has a bit, filled up."""
+    return 32 * -(-nodes // 32)
+
+
 def room_for(skins: Sequence[Skin], fields: Sequence[Sequence[SignedDistance]], lanes: int,
              nodes: int | None) -> Room:  # fmt: skip
-    """Capacities that the tools need on these skins, however they lie there."""
+    """Capacities for the tools on these skins: what they need however they lie there; of nodes, what most need."""
     columns = blocks = most = 0
     for skin, own in zip(skins, fields, strict=True):
         layer, tree, wanted = skin.layer, KDTree(skin.layer.vertices), 0.0
@@ -340,9 +345,9 @@ def room_for(skins: Sequence[Skin], fields: Sequence[Sequence[SignedDistance]], 
             extent = np.sort(np.subtract(*field.tool_bounds[::-1]))
             reach = 0.5 * float(np.linalg.norm(extent)) + 0.6 * layer.edge_length + 2 * float(layer.thickness.max())
             columns = max(columns, int(np.max(tree.query_ball_point(some, reach, return_length=True))))
-            cell = 0.5 * 3**0.5 * (WIDEST * float(layer.thickness.min())) ** 2
-            wanted += min(max(FEWEST_NODES, 2 * NODES + 1.3 * extent[1] * extent[2] / cell), 1.2 * MOST)
+            cell = 0.5 * 3**0.5 * (WIDEST * float(np.median(layer.thickness))) ** 2
+            wanted += min(1.5 * NODES + extent[1] * extent[2] / cell, 1.2 * MOST)
         most, blocks = max(most, int(wanted)), max(blocks, -(-len(layer.vertices) // BLOCK))
     return Room(min(int(MARGIN * columns) + BLOCK, max(len(s.layer.vertices) for s in skins)), blocks,
-                32 * -(-(most if nodes is None else nodes) // 32), lanes,
+                whole_words(most if nodes is None else nodes), lanes,
                 max(len(skin.green.coarse.gathered) if skin.green and skin.green.coarse else 0 for skin in skins))

@@ -84,13 +84,14 @@ def fold(many: wp.int32, skins: Skins, scratch: Scratch):
             scratch.fold[s, i] = -1
     if one.folded == 0:
         return
-    groups = wp.int32(0)
+    groups, left = wp.int32(0), wp.int32(scratch.nodes[s])
     for i in range(scratch.nodes[s]):
         if scratch.fold[s, i] < 0:
             scratch.fold[s, i] = groups
             scratch.queue[s, 0] = i
             done, end = wp.int32(0), wp.int32(1)
-            while done < end:
+            left -= 1
+            while done < end and left > 0:
                 n = scratch.queue[s, done]
                 done += 1
                 v, group = skins.faces[scratch.face[s, n]][0], scratch.group[s * many + scratch.tool[s, n]]
@@ -101,6 +102,7 @@ def fold(many: wp.int32, skins: Skins, scratch: Scratch):
                             scratch.fold[s, j] = groups
                             scratch.queue[s, end] = j
                             end += 1
+                            left -= 1
             groups += 1
 
 
@@ -246,18 +248,28 @@ def temper(lanes: wp.int32, scratch: Scratch):
 
 
 @wp.kernel
-def share_given_way(many: wp.int32, scratch: Scratch):
-    """Share of the work of the forces of each tool's group that goes into the limb as a whole."""
-    c = wp.tid()
+def work(lanes: wp.int32, many: wp.int32, scratch: Scratch):
+    """Work of the forces of each tool's group, lane by lane: on the limb as a whole, and all."""
+    c, lane = wp.tid()
     s, coarse, whole = c // many, real(0.0), real(0.0)
-    for i in range(scratch.nodes[s]):
+    for i in range(lane, scratch.nodes[s], lanes):
         force = scratch.force[s, i]
         if force > real(0.0) and scratch.group[s * many + scratch.tool[s, i]] == scratch.group[c]:
             for j in range(scratch.nodes[s]):
                 if scratch.group[s * many + scratch.tool[s, j]] == scratch.group[c]:
                     coarse += force * scratch.wide_part[s, i, j] * scratch.force[s, j]
                     whole += force * scratch.matrix[s, i, j] * scratch.force[s, j]
-    scratch.given_way[c] = coarse / wp.max(whole, real(1e-300))
+    scratch.works[c, lane] = wp.vec2d(coarse, whole)
+
+
+@wp.kernel
+def share_given_way(lanes: wp.int32, scratch: Scratch):
+    """Share of that work that goes into the limb as a whole."""
+    c = wp.tid()
+    works = wp.vec2d()
+    for lane in range(lanes):
+        works = works + scratch.works[c, lane]
+    scratch.given_way[c] = works[0] / wp.max(works[1], real(1e-300))
 
 
 @wp.func

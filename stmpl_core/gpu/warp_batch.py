@@ -75,7 +75,8 @@ class WarpBatch:
         tools: tools, each with a name of its own.
         n: number of scenes; None: that of the skins.
         device: device as Warp names it: "cuda", "cuda:1", "cpu".
-        nodes: room for contact nodes of all tools of a scene together; None: what these tools need.
+        nodes: room for contact nodes of all tools of a scene together; None: what these tools need, found out as they
+            press (the first touch that needs more is answered twice).
         memory: scratch space [bytes]; scenes that do not fit go one part after the other; None: 4 GiB on a GPU, 256 MiB
             on a CPU, or what one scene needs. Fields take as much again.
         lanes: threads that share the work of a scene; None: LANES on a GPU, 1 on a CPU.
@@ -88,6 +89,8 @@ class WarpBatch:
         InvalidInput: numbers that do not fit, no such device, skins of both kinds, or one that joints have moved.
         MeshError: a tool's surface that cannot be used.
     """
+
+    _scratch: Any
 
     def __init__(self, skins: Skin | Sequence[Skin], tools: Sequence[Tool], n: int | None = None, *,
                  device: str = "cuda", nodes: int | None = None, memory: int | None = None,
@@ -120,15 +123,26 @@ class WarpBatch:
         self._skin_of = np.array([number[id(skin)] for skin in each], np.int32)
         room = self.room.bytes_of(len(self.tools))
         self._memory = budget = max(MEMORY[self.device.is_cuda], room) if memory is None else memory
+        self._grows = nodes is None
         if room > budget:
             raise InvalidInput(f"one scene needs {room} bytes of scratch space; {budget} are allowed. Raise memory, or "
                                "leave it out.")  # fmt: skip
-        self._part = min(count, budget // room)
-        self._scratch = packs.scratch(self.room, self._part, len(self.tools), self.device)
-        self._numbers = [self._numbers_of(first) for first in range(0, count, self._part)]
+        self._make_room(self.room.nodes)
 
     def __len__(self) -> int:
         return len(self._skin_of)
+
+    def _make_room(self, nodes: int) -> bool:
+        """Makes scratch space with room for so many nodes of a scene; False: one scene does not fit."""
+        room = self.room._replace(nodes=nodes)
+        each = room.bytes_of(len(self.tools))
+        if each > self._memory:
+            return False
+        self._scratch = None  # given back before as much is taken again
+        self.room, self._part = room, min(len(self), self._memory // each)
+        self._scratch = packs.scratch(room, self._part, len(self.tools), self.device)
+        self._numbers = [self._numbers_of(first) for first in range(0, len(self), self._part)]
+        return True
 
     def touch(self, poses: Any, *, fields: Iterable[int] = (), out: Any = None,
               fields_out: Any = None) -> WarpTouches:  # fmt: skip
@@ -165,12 +179,16 @@ class WarpBatch:
         depths, bounds = (wp.empty((n, many), dtype=real, device=self.device) for _ in range(2))
         kinds: tuple[Any, Any] = wp.bool, wp.int32
         in_range, statuses = (wp.empty((n, many), dtype=kind, device=self.device) for kind in kinds)
+        first = 0
         with _stream_of(poses, self.device):
-            for part, first in enumerate(range(0, n, self._part)):
-                self._answer(part, first, given, (wrenches, depths, bounds, in_range, statuses))
+            while first < n:
+                if not self._answer(first, given, (wrenches, depths, bounds, in_range, statuses)):
+                    first = 0  # with more room, in parts of another size
+                    continue
                 rows = np.flatnonzero((wanted >= first) & (wanted < first + self._part))
                 if len(rows) and self._fields is not None:
                     self._fields.move(wanted[rows] - first, rows, self._skins, self._scratch, motion)
+                first += self._part
         return WarpTouches(wrenches, depths, bounds, in_range, statuses, motion)
 
     def _output(self, name: str, given: Any, shape: tuple[int, ...], reals: tuple[Any, ...]) -> Any:
@@ -197,8 +215,8 @@ class WarpBatch:
         else:
             plain = np.asarray(values)
             plain = plain if plain.dtype in (np.float32, np.float64) else plain.astype(float)
-            found = wp.from_numpy(np.ascontiguousarray(plain), device=self.device) if self.device.is_cuda else \
-                wp.array(np.ascontiguousarray(plain), copy=False, device="cpu")  # fmt: skip
+            found = wp.array(np.ascontiguousarray(plain), dtype=wp.dtype_from_numpy(plain.dtype), ndim=plain.ndim,
+                             copy=self.device.is_cuda, device=self.device)  # fmt: skip
         if found.device != self.device:
             raise InvalidInput(f"{name} is on {found.device}; this batch is on {self.device}.")
         if found.dtype not in (wp.float32, wp.float64):
@@ -214,10 +232,10 @@ class WarpBatch:
     def _run(self, kernel: Any, dim: int | tuple[int, int], *inputs: Any) -> None:
         wp.launch(kernel, dim=dim, inputs=[*inputs], device=self.device)
 
-    def _answer(self, part: int, first: int, poses: Any, out: tuple[Any, ...]) -> None:
-        """Answers the scenes of one part."""
+    def _answer(self, first: int, poses: Any, out: tuple[Any, ...]) -> bool:
+        """Answers the scenes of one part; False: there was no room for the nodes, and now there is."""
         scratch, skins, many = self._scratch, self._skins, len(self.tools)
-        scratch.skin, scratch.grid = self._numbers[part]
+        scratch.skin, scratch.grid = self._numbers[first // self._part]
         tools = len(scratch.skin)
         read = places.read_quaternions if poses.ndim == 3 else places.read_matrices
         self._run(read, tools, poses, first, many, skins, scratch)
@@ -228,10 +246,14 @@ class WarpBatch:
         self._run(columns.widen, tools, skins, scratch)
         self._meet(tools, 1)
         self._lay(tools)
+        wants = int(scratch.wants.numpy()[0])
+        if wants > self.room.nodes and self._grows and self._make_room(packs.whole_words(wants + wants // 8)):
+            return False
         self._run(columns.tell_inside, tools, many, skins, scratch)
         self._run(lattice.withdraw, tools // many, many, scratch)
         self._hold(tools)
         self._run(answers.answer, tools, first, many, self._known, skins, scratch, *out)
+        return True
 
     def _meet(self, tools: int, again: int) -> None:
         """Columns near the tools, and their distances."""
@@ -251,6 +273,7 @@ class WarpBatch:
         self._run(looks.gather_look, tools, scratch)
         sides = int(scratch.busy.numpy()[0])  # one, but for tools that close around a limb
         scratch.nodes.zero_()
+        scratch.wants.zero_()
         for only_look in (1, 0):
             for side in range(sides):
                 self._run(lattice.lay, tools, side, only_look, skins, scratch)
@@ -284,13 +307,14 @@ class WarpBatch:
 
         def turn() -> None:
             self._run(hold.multiply, shared, lanes, scratch, scratch.force, scratch.gap)
-            self._run(hold.turn, scenes, many, skins, scratch)
+            self._run(hold.turn, scenes, scratch)
 
         self._iterate(scenes, turn, hold.step)
         self._run(hold.begin_power, scenes, scratch)
         self._iterate(scenes, lambda: None, hold.step_power)
         if self._stacked:
-            self._run(stacks.share_given_way, tools, many, scratch)
+            self._run(stacks.work, (tools, lanes), lanes, many, scratch)
+            self._run(stacks.share_given_way, tools, lanes, scratch)
         self._run(stacks.see if self._stacked else hold.see, shared, lanes, many, skins, scratch)
         self._run(hold.judge, shared, lanes, scratch, net)
         self._run(hold.layer, shared, lanes, scratch, scratch.inputs, net.w1, net.b1, scratch.one)
@@ -298,6 +322,7 @@ class WarpBatch:
         self._run(hold.layer, shared, lanes, scratch, scratch.two, net.w3, net.b3, scratch.one)
         self._run(hold.correct, shared, lanes, scratch, net)
         self._run(answers.find_highest, shared, lanes, many, skins, scratch)
+        self._run(answers.find_beside, shared, lanes, many, scratch)
 
     def _iterate(self, scenes: int, turn: Callable[[], None], step: Any) -> None:
         """Conjugate gradients until every scene is done."""
