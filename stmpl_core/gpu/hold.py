@@ -1,9 +1,9 @@
 # type: ignore  # kernels are in Warp's language, which pyright does not know
 """Kernels of the pressure at contact nodes: stmpl_core.obstacle and stmpl_core.contact_net.
 
-Conjugate gradients run in lock-step: a kernel over all nodes of all scenes multiplies, one over the scenes steps. Both
-sums are taken by one thread each, in the order of the nodes, so an answer does not depend on who runs first; scenes
-that are done are skipped. A launch costs microseconds, which thousands of scenes share.
+Conjugate gradients run in lock-step, four kernels a step. Of what a scene sums up each lane leaves the part of its own
+nodes, and the next kernel's lanes add these in their order: an answer does not depend on who runs first. Scenes that
+are done are skipped. A launch costs microseconds, which thousands of scenes share.
 """
 
 import warp as wp
@@ -81,7 +81,7 @@ def _wanted(scratch: Scratch, one: OneSkin, s: wp.int32, i: wp.int32) -> real:
 
 
 @wp.kernel
-def guess(many: wp.int32, skins: Skins, scratch: Scratch):
+def guess(lanes: wp.int32, many: wp.int32, skins: Skins, scratch: Scratch):
     """First guess of the forces."""
     s = wp.tid()
     one = skins.one[scratch.skin[s * many]]
@@ -89,81 +89,116 @@ def guess(many: wp.int32, skins: Skins, scratch: Scratch):
         scratch.wanted[s, i] = _wanted(scratch, one, s, i)
         scratch.force[s, i] = START * scratch.wanted[s, i] / scratch.matrix[s, i, i]
         scratch.move[s, i] = real(0.0)
+    for lane in range(lanes):
+        scratch.changes[s, lane] = wp.vec2d(real(1.0), real(0.0))  # not settled yet
     scratch.before[s] = real(1.0)
-    scratch.restart[s] = 1
+    scratch.again[s] = 1
+    scratch.settled[s] = 0
     scratch.done[s] = 0
     if scratch.nodes[s] == 0:
         scratch.done[s] = 1
 
 
+@wp.func
+def _times(scratch: Scratch, s: wp.int32, i: wp.int32, vector: wp.array2d(dtype=real)) -> real:
+    """A row of a scene's matrix times a vector."""
+    sum = real(0.0)
+    for j in range(scratch.nodes[s]):
+        sum += scratch.matrix[s, j, i] * vector[s, j]
+    return sum
+
+
+@wp.func
+def _sum(scratch: Scratch, s: wp.int32, lanes: wp.int32) -> real:
+    """What the lanes of a scene have left, in their order."""
+    out = real(0.0)
+    for lane in range(lanes):
+        out = out + scratch.sums[s, lane]
+    return out
+
+
 @wp.kernel
-def multiply(lanes: wp.int32, scratch: Scratch, vector: wp.array2d(dtype=real), out: wp.array2d(dtype=real)):
-    """A scene's matrix times a vector."""
+def press(lanes: wp.int32, scratch: Scratch):
+    """Depths under the forces, beyond what the tool asks for. A scene whose forces have settled is done."""
     s, lane = wp.tid()
     if scratch.done[s] == 1:
         return
-    for i in range(lane, scratch.nodes[s], lanes):
-        sum = real(0.0)
-        for j in range(scratch.nodes[s]):
-            sum += scratch.matrix[s, j, i] * vector[s, j]
-        out[s, i] = sum
-
-
-@wp.kernel
-def turn(scratch: Scratch):
-    """Direction of a step of conjugate gradients."""
-    s = wp.tid()
-    if scratch.done[s] == 1:
+    change, largest = real(0.0), real(0.0)
+    for other in range(lanes):
+        change = wp.max(change, scratch.changes[s, other][0])
+        largest = wp.max(largest, scratch.changes[s, other][1])
+    if change <= TOLERANCE * largest:
+        scratch.settled[s] = 1
         return
+    wp.atomic_max(scratch.busy, 0, 1)
+    if lane == 0:
+        scratch.restart[s] = scratch.again[s]
+        scratch.again[s] = 0
     square = real(0.0)
-    for i in range(scratch.nodes[s]):
-        gap = scratch.gap[s, i] - scratch.wanted[s, i]
+    for i in range(lane, scratch.nodes[s], lanes):
+        gap = _times(scratch, s, i, scratch.force) - scratch.wanted[s, i]
         scratch.gap[s, i] = gap
         if scratch.force[s, i] > real(0.0):
             square += gap * gap
-    if square == real(0.0):
-        scratch.done[s] = 1
+    scratch.sums[s, lane] = square
+
+
+@wp.kernel
+def turn(lanes: wp.int32, scratch: Scratch):
+    """Direction of a step of conjugate gradients."""
+    s, lane = wp.tid()
+    if scratch.done[s] == 1 or scratch.settled[s] == 1:
         return
-    on = square / scratch.before[s]
-    if scratch.restart[s] == 1:
-        on = real(0.0)
-    for i in range(scratch.nodes[s]):
+    square, on = _sum(scratch, s, lanes), real(0.0)
+    if scratch.restart[s] == 0:
+        on = square / scratch.before[s]
+    for i in range(lane, scratch.nodes[s], lanes):
         move = real(0.0)
         if scratch.force[s, i] > real(0.0):
             move = scratch.gap[s, i] + on * scratch.move[s, i]
         scratch.move[s, i] = move
-    scratch.before[s] = square
 
 
 @wp.kernel
-def step(scratch: Scratch):
-    """A step of conjugate gradients, no node pulling; nodes that the skin would enter press after all."""
-    s = wp.tid()
+def follow(lanes: wp.int32, scratch: Scratch):
+    """Depths that come with the direction; how far to go is what the lanes leave."""
+    s, lane = wp.tid()
     if scratch.done[s] == 1:
         return
+    square = _sum(scratch, s, lanes)
     up, down = real(0.0), real(0.0)
-    for i in range(scratch.nodes[s]):
-        up += scratch.gap[s, i] * scratch.move[s, i]
-        down += scratch.along[s, i] * scratch.move[s, i]
-    if down <= real(0.0):
-        scratch.done[s] = 1
+    if scratch.settled[s] == 0 and square > real(0.0):
+        for i in range(lane, scratch.nodes[s], lanes):
+            along = _times(scratch, s, i, scratch.move)
+            up += scratch.gap[s, i] * scratch.move[s, i]
+            down += along * scratch.move[s, i]
+    scratch.ways_gone[s, lane] = wp.vec2d(up, down)
+    if lane == 0:
+        scratch.before[s] = square
+
+
+@wp.kernel
+def step(lanes: wp.int32, scratch: Scratch):
+    """A step of conjugate gradients, no node pulling; nodes that the skin would enter press after all."""
+    s, lane = wp.tid()
+    if scratch.done[s] == 1:
         return
-    restart, change, largest = wp.int32(0), real(0.0), real(0.0)
-    for i in range(scratch.nodes[s]):
-        now = real(scratch.force[s, i])
-        if now > real(0.0):
-            now = wp.max(now - up / down * scratch.move[s, i], real(0.0))
-        elif scratch.gap[s, i] < real(0.0):
-            now = -scratch.gap[s, i] / scratch.matrix[s, i, i]
-            restart = 1
-        change = wp.max(change, wp.abs(now - scratch.force[s, i]))
-        largest = wp.max(largest, now)
-        scratch.force[s, i] = now
-    scratch.restart[s] = restart
-    if change <= TOLERANCE * largest:
-        scratch.done[s] = 1
-    else:
-        wp.atomic_max(scratch.busy, 0, 1)
+    way = wp.vec2d()
+    for other in range(lanes):
+        way = way + scratch.ways_gone[s, other]
+    change, largest = real(0.0), real(0.0)
+    if way[1] > real(0.0):
+        for i in range(lane, scratch.nodes[s], lanes):
+            now = real(scratch.force[s, i])
+            if now > real(0.0):
+                now = wp.max(now - way[0] / way[1] * scratch.move[s, i], real(0.0))
+            elif scratch.gap[s, i] < real(0.0):
+                now = -scratch.gap[s, i] / scratch.matrix[s, i, i]
+                scratch.again[s] = 1
+            change = wp.max(change, wp.abs(now - scratch.force[s, i]))
+            largest = wp.max(largest, now)
+            scratch.force[s, i] = now
+    scratch.changes[s, lane] = wp.vec2d(change, largest)
 
 
 @wp.kernel
@@ -184,6 +219,15 @@ def begin_power(scratch: Scratch):
     scratch.done[s] = 0
     if sum == real(0.0):
         scratch.done[s] = 1
+
+
+@wp.kernel
+def multiply(lanes: wp.int32, scratch: Scratch):
+    """A scene's matrix times the direction of obstacle.power_of."""
+    s, lane = wp.tid()
+    if scratch.done[s] == 0:
+        for i in range(lane, scratch.nodes[s], lanes):
+            scratch.along[s, i] = _times(scratch, s, i, scratch.move)
 
 
 @wp.kernel

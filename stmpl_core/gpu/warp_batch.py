@@ -13,7 +13,7 @@ Geometry and the linear problem are float64, the network float32, as in the law 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass
 from numbers import Integral
@@ -32,7 +32,7 @@ from stmpl_core.tool import Tool
 
 STATUSES = ("pending", "apart", "pressed by pose", "wrapped around", "refused", "too deep", "no room")
 LANES = 128  # threads that share the work of a scene on a GPU
-MEMORY = {True: 4 << 30, False: 256 << 20}  # scratch space on a GPU and on a CPU [bytes]
+MEMORY = {True: 8 << 30, False: 256 << 20}  # scratch space on a GPU and on a CPU [bytes]
 ASKED_EVERY = 4  # iterations after which it is asked whether any scene goes on
 
 
@@ -77,8 +77,8 @@ class WarpBatch:
         device: device as Warp names it: "cuda", "cuda:1", "cpu".
         nodes: room for contact nodes of all tools of a scene together; None: what these tools need, found out as they
             press (the first touch that needs more is answered twice).
-        memory: scratch space [bytes]; scenes that do not fit go one part after the other; None: 4 GiB on a GPU, 256 MiB
-            on a CPU, or what one scene needs. Fields take as much again.
+        memory: scratch space [bytes]; scenes that do not fit go one part after the other; None: 8 GiB on a GPU, but no
+            more than a third of what is free, 256 MiB on a CPU, or what one scene needs. Fields take as much again.
         lanes: threads that share the work of a scene; None: LANES on a GPU, 1 on a CPU.
 
     Attributes:
@@ -122,7 +122,8 @@ class WarpBatch:
         number = {id(skin): k for k, skin in enumerate(unique)}
         self._skin_of = np.array([number[id(skin)] for skin in each], np.int32)
         room = self.room.bytes_of(len(self.tools))
-        self._memory = budget = max(MEMORY[self.device.is_cuda], room) if memory is None else memory
+        free = self.device.free_memory // 3 if self.device.is_cuda else MEMORY[False]
+        self._memory = budget = max(min(MEMORY[self.device.is_cuda], free), room) if memory is None else memory
         self._grows = nodes is None
         if room > budget:
             raise InvalidInput(f"one scene needs {room} bytes of scratch space; {budget} are allowed. Raise memory, or "
@@ -303,15 +304,10 @@ class WarpBatch:
         if self._stacked:
             self._run(stacks.find_kept, shared, lanes, scratch)
             self._run(stacks.temper, shared, lanes, scratch)
-        self._run(hold.guess, scenes, many, skins, scratch)
-
-        def turn() -> None:
-            self._run(hold.multiply, shared, lanes, scratch, scratch.force, scratch.gap)
-            self._run(hold.turn, scenes, scratch)
-
-        self._iterate(scenes, turn, hold.step)
+        self._run(hold.guess, scenes, lanes, many, skins, scratch)
+        self._iterate([(kernel, shared, lanes) for kernel in (hold.press, hold.turn, hold.follow, hold.step)])
         self._run(hold.begin_power, scenes, scratch)
-        self._iterate(scenes, lambda: None, hold.step_power)
+        self._iterate([(hold.multiply, shared, lanes), (hold.step_power, scenes)])
         if self._stacked:
             self._run(stacks.work, (tools, lanes), lanes, many, scratch)
             self._run(stacks.share_given_way, tools, lanes, scratch)
@@ -324,14 +320,13 @@ class WarpBatch:
         self._run(answers.find_highest, shared, lanes, many, skins, scratch)
         self._run(answers.find_beside, shared, lanes, many, scratch)
 
-    def _iterate(self, scenes: int, turn: Callable[[], None], step: Any) -> None:
-        """Conjugate gradients until every scene is done."""
-        scratch, lanes = self._scratch, self._lanes
+    def _iterate(self, kernels: Sequence[tuple[Any, ...]]) -> None:
+        """Conjugate gradients until every scene is done: kernels, over how many, what they are told."""
+        scratch = self._scratch
         for number in range(MAX_ITERATIONS):
-            turn()
-            self._run(hold.multiply, (scenes, lanes), lanes, scratch, scratch.move, scratch.along)
             scratch.busy.zero_()
-            self._run(step, scenes, scratch)
+            for kernel, dim, *told in kernels:
+                self._run(kernel, dim, *told, scratch)
             if number % ASKED_EVERY == ASKED_EVERY - 1 and not scratch.busy.numpy()[0]:
                 return
 
