@@ -28,9 +28,9 @@ from stmpl_core.tool import Tool
 AIM = 2500  # touches a second of one core
 DEPTH = 0.3  # of each tool, over the thickness
 ROUNDS, TURN_S = 12, 0.2
-N = {"touches": 256, "fields": 32}  # scenes
+N, ON_GPU = {"touches": 256, "fields": 32}, 4096  # scenes; of a GPU, which few do not fill
 NO_CUDA = "not measured: no CUDA device"
-Row = Callable[[], object] | str  # call that answers all scenes; or why there is none
+Row = tuple[Callable[[], object], int] | str  # call that answers all scenes, and how many; or why there is none
 Rates = dict[str, list[tuple[float, float]]]  # scenes a second of the clock and of the processor in each round, by name
 
 
@@ -69,15 +69,18 @@ def rows(skin: Skin, tool: Tool, what: str) -> dict[str, Row]:
             if fields:
                 simulator.answer(touches)
 
-    out: dict[str, Row] = {f"Simulator.{'step' if fields else 'touch'} in a loop": loop}
+    out: dict[str, Row] = {f"Simulator.{'step' if fields else 'touch'} in a loop": (loop, n)}
     for threads in dict.fromkeys((1, cores)):
         batch = Batch(skin, [tool], n, threads=threads)
         name = f"Batch, {threads} thread{'s' * (threads > 1)}"
-        out[name] = lambda batch=batch: batch.touch(poses, fields=wanted)
+        out[name] = (lambda batch=batch: batch.touch(poses, fields=wanted)), n
     if fields and not skin.layer.stacked:
         skin = Skin.of(skin.layer, MomentNet(sticks=False))
-    return out | {f"WarpBatch, {device}": _on_device(skin, tool, poses, wanted, device)
-                  for device in ("cpu", "cuda")}  # fmt: skip
+    many = np.resize(poses, (ON_GPU, *poses.shape[1:]))
+    return out | {
+        "WarpBatch, cpu": _on_device(skin, tool, poses, wanted, "cpu"),
+        f"WarpBatch, cuda, {ON_GPU:,} scenes": _on_device(skin, tool, many, range(ON_GPU) if fields else (), "cuda"),
+    }
 
 
 def _on_device(skin: Skin, tool: Tool, poses: np.ndarray, wanted: Iterable[int], device: str) -> Row:
@@ -100,20 +103,21 @@ def _on_device(skin: Skin, tool: Tool, poses: np.ndarray, wanted: Iterable[int],
         batch.touch(there, fields=wanted)
         wp.synchronize_device(batch.device)
 
-    return call
+    return call, len(poses)
 
 
-def rates(of: dict[str, Row], n: int, rounds: int = ROUNDS) -> Rates:
+def rates(of: dict[str, Row], rounds: int = ROUNDS) -> Rates:
     """What each gets done."""
     calls = {name: row for name, row in of.items() if not isinstance(row, str)}
     out: Rates = {name: [] for name in calls}
-    for call in calls.values():
+    for call, _ in calls.values():
         call()
     for turn in range(rounds):
         for name in calls if turn % 2 else reversed(calls):
+            call, n = calls[name]
             start, busy, done = time.perf_counter(), time.process_time(), 0
             while not done or time.perf_counter() - start < TURN_S:
-                calls[name]()
+                call()
                 done += n
             out[name].append((done / (time.perf_counter() - start), done / (time.process_time() - busy)))
     return out
@@ -165,7 +169,7 @@ def main() -> None:
     for name, skin in skins().items():
         for what, n in N.items():
             of = rows(skin, tool, what)
-            found = rates(of, n, given.rounds)
+            found = rates(of, given.rounds)
             aim = f"; the aim is {AIM:,} a core" if what == "touches" else ""
             print(f"\n{name}: {what}, {n} scenes, load {os.getloadavg()[0]:.1f}{aim}:\n\n" +
                   "\n".join(table(of, found, what)), flush=True)  # fmt: skip
