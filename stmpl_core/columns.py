@@ -14,6 +14,7 @@ from stmpl_core.layer import SoftLayer
 from stmpl_core.nodes import Nodes, nodes_under
 from stmpl_core.rays import (
     NOT_SUNK,
+    STEEPEST,
     UNSAID,
     WALL,
     depth_and_share,
@@ -24,11 +25,13 @@ from stmpl_core.rays import (
     to_tool,
     wall_in,
 )
-from stmpl_core.sdf import SignedDistance
+from stmpl_core.sdf import SignedDistance, distance_at
+from stmpl_core.soundness import too_long
 from stmpl_core.touch import MIN_ONE_WAY_SHARE
 
 LEAST_UNDER = 0.05  # how much further inside a tool a column gets below its skin than there, over the width of a wall
 BLOCK = 32  # columns that are looked at together
+FINEST = 0.02  # size of the parts of a long triangle at which the search for a tool in it ends, over the thickness
 HOLE_RADIUS = 0.6  # farthest point of a triangle from its corners, over the edge length (equilateral: 0.577)
 
 
@@ -72,10 +75,13 @@ class Columns:
 
     Args:
         layer: soft layer at rest.
+
+    Attributes:
+        long: numbers of triangles that are too long for a tool between their corners to be found; none of a good mesh.
     """
 
     def __init__(self, layer: SoftLayer) -> None:
-        self.layer = layer
+        self.layer, self.long = layer, too_long(layer)
         self.points, self.inward = layer.vertices, np.ascontiguousarray(-layer.normals)
         self.faces = np.ascontiguousarray(layer.faces, dtype=np.int64)
         corners = self.faces.ravel()
@@ -126,6 +132,18 @@ class Columns:
                 return np.empty(0, np.int64)
         skin = self.points, self.inward, self.layer.thickness
         return _through_box(*skin, self._order, self._blocks, pose, low, high, reach)
+
+    def between(self, field: SignedDistance, pose: Transform, reach: float) -> float:
+        """Length of a triangle that is too long, and that a tool meets or is within `reach` of [m]; 0 if there is none.
+
+        Args:
+            field, pose: distance field of the tool and pose_body_from_tool, (4, 4).
+            reach: see above [m].
+        """
+        if not len(self.long):
+            return 0.0
+        finest = FINEST * float(self.layer.thickness.min())
+        return _between(grid_of(field), pose, self.points, self.faces[self.long], reach, finest)
 
     def squeezed(self, field: SignedDistance, pose: Transform) -> Squeeze:
         """Squeeze of the columns by a tool at its pose."""
@@ -227,6 +245,39 @@ def _through_box(points, inward, thickness, order, blocks, pose, low, high, reac
                 found[n] = v
                 n += 1
     return np.sort(found[:n])
+
+
+@numba.njit(cache=True, nogil=True)
+def _between(grid, pose, points, faces, reach, finest):
+    """See Columns.between: triangles (F, 3) are halved, down to a size [m], where the distance says too little."""
+    parts = np.empty((64, 3, 3))
+    for f in range(len(faces)):
+        for c in range(3):
+            parts[0, c] = points[faces[f, c]]
+        whole, count = 0.0, 1
+        while count > 0:
+            count -= 1
+            part = parts[count].copy()
+            x, y, z = part[:, 0].mean(), part[:, 1].mean(), part[:, 2].mean()
+            u, v, w = to_tool(pose, x, y, z)
+            d, size, long, at = distance_at(grid[0], grid[1], grid[2], u, v, w), 0.0, 0.0, 0
+            for c in range(3):
+                size = max(size, (part[c, 0] - x) ** 2 + (part[c, 1] - y) ** 2 + (part[c, 2] - z) ** 2)
+                edge = ((part[(c + 1) % 3] - part[c]) ** 2).sum()
+                if edge > long:
+                    long, at = edge, c
+            size, whole = np.sqrt(size), max(whole, np.sqrt(long))
+            if d < reach:
+                return whole
+            if size < finest or d - STEEPEST * size > reach:
+                continue
+            middle = 0.5 * (part[at] + part[(at + 1) % 3])
+            parts[count] = part
+            parts[count, at] = middle
+            parts[count + 1] = part
+            parts[count + 1, (at + 1) % 3] = middle
+            count += 2
+    return 0.0
 
 
 @numba.njit(cache=True, nogil=True)

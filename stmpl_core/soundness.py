@@ -20,6 +20,7 @@ STEEP = 0.25  # slope of the thickness from triangle to triangle; trained is up 
 STEEP_SHARE = 0.02  # share of what moves or presses that may be so steep
 LONG = 2.2  # length of a triangle over its width; trained is up to about 2
 LONG_SHARE = 0.3  # share of what moves or presses that may be in such: to there 0.6 % of force, 3 % of the peak
+COARSE = 2.0, 2.5  # longest edge over thickness, and over the median edge, from which a tool may press between corners
 BORDER = 2.0  # distance of a load from the open border, over t; nearer the worst vertex is 6 to 21 % off
 STACK_BORDER = 1.2  # the same on stacks, whose coarse response knows the border: to there they are no worse than inside
 BORDER_SHARE = 0.05  # share of the load that may be nearer
@@ -161,13 +162,25 @@ def slope_of_thickness(layer: SoftLayer) -> np.ndarray:
 
 def longest_over_width(layer: SoftLayer) -> np.ndarray:
     """Longest of the triangles around each vertex: its longest edge over the width of an even one of its area, (V,)."""
-    corners = layer.vertices[layer.faces]
-    longest = ((corners - np.roll(corners, 1, axis=1)) ** 2).sum(axis=2).max(axis=1)
-    areas = np.linalg.norm(layer.face_area_vectors, axis=1)
+    _, length = _lengths(layer)
     out = np.zeros(len(layer.vertices))
     for corner in range(3):
-        np.maximum.at(out, layer.faces[:, corner], longest * (np.sqrt(3) / 4) / areas)
+        np.maximum.at(out, layer.faces[:, corner], length)
     return out
+
+
+def too_long(layer: SoftLayer) -> np.ndarray:
+    """Numbers of the triangles so long, for layer and mesh, that a tool may press unseen between their corners."""
+    longest, length = _lengths(layer)
+    uneven = (length > LONG) | (longest > COARSE[1] * layer.edge_length)
+    return np.flatnonzero(uneven & (longest > COARSE[0] * layer.thickness[layer.faces].max(axis=1)))
+
+
+def _lengths(layer: SoftLayer) -> tuple[np.ndarray, np.ndarray]:
+    """Longest edge of each triangle, (F,) [m], and that over the width of an even one of its area, (F,)."""
+    corners = layer.vertices[layer.faces]
+    square = ((corners - np.roll(corners, 1, axis=1)) ** 2).sum(axis=2).max(axis=1)
+    return np.sqrt(square), square * (np.sqrt(3) / 4) / np.linalg.norm(layer.face_area_vectors, axis=1)
 
 
 def below_curved(layer: SoftLayer) -> np.ndarray:

@@ -88,6 +88,7 @@ WHY = {
              "give each finger as a contact, or leave the wrench out",
     IN_CORE: "{name} reaches {depth:.1f} mm deep, into the rigid core: check its pose or the thickness",
 }  # fmt: skip
+LOST = "{name} is at triangles {long:.0f} mm long, between whose corners it may press unseen: remesh the skin"
 
 
 class _Placed(NamedTuple):
@@ -104,6 +105,7 @@ class _Placed(NamedTuple):
     why: str = ""
     held: Held | None = None  # pressures of the skin against this tool alone, where they are known
     factor: float = 1.0  # on the pressures: what a tool that was drawn back presses more
+    lost: bool = False  # truth of the claim that it may press between corners of long triangles, where it is not found
 
 
 class Toucher:
@@ -233,6 +235,9 @@ class Toucher:
         def nothing(status: str) -> _Placed:
             around, why = -float(clearance.skin.min(initial=np.inf)), ""
             off = float(np.abs(pose[:3, 3] - self.layer.vertices[0]).max())
+            if status != NO_FORCE and (long := self.columns.between(field, pose, reach)):
+                why = LOST.format(name=contact.name, long=1e3 * long)
+                return _Placed(contact, field, status, pose, math.nan, 0.0, NO_SQUEEZE, 0.0, why=why, lost=True)
             if status == APART and around > MAX_AROUND * self._thickest:
                 status, why = WRAPPED, f"{1e3 * around:.1f} mm of skin are inside {contact.name}, which no column " \
                     "meets from outside: check its pose, its scale and which side of its surface is out"  # fmt: skip
@@ -243,7 +248,8 @@ class Toucher:
         force, tool = contact.wrench[:3] if contact.wrench is not None else None, contact.tool.vertices
         light = force is not None and 0 < depth < 0.5 * float(self.layer.thickness[clearance.vertices].min())
         squeeze = NO_SQUEEZE if light else self.columns.squeeze(field, pose, clearance)
-        inside = not light and not len(squeeze.nodes.area) and self.deep.inside(field, pose, tool)
+        inside = not light and not len(squeeze.nodes.area) and not self.columns.between(field, pose, 0.0) \
+            and self.deep.inside(field, pose, tool)
         if force is not None and not force.any():
             return nothing(NO_FORCE if depth > 0 or inside else APART)
         if inside or self.deep.strain(squeeze) >= DEEPEST:
@@ -260,7 +266,9 @@ class Toucher:
         found = None if gap is None else self._pressed(contact, field, pose, clearance, depth, gap)
         if tried is None:
             if found is None and gap == 0.0:
-                return nothing(PULLING)._replace(why=self._disagrees(contact, field, pose, clearance, depth))
+                pulls = nothing(PULLING)
+                return pulls if pulls.lost \
+                    else pulls._replace(why=self._disagrees(contact, field, pose, clearance, depth))
             return found or nothing(NO_TOUCH if gap is None else PULLING)
         if found is None or found.status == WRAPPED:
             return self._place(contact, field, many, None)
@@ -442,7 +450,7 @@ class Toucher:
         touch = Touch(
             one.contact.name, one.status, one.pose, wrench,
             depth=depth if math.isfinite(depth) else float("nan"),
-            force_bound=size * bound * wider if size > 0 else 0.0,
+            force_bound=size * bound * wider if size > 0 else math.nan if one.lost else 0.0,
             moved=one.moved,
             missing=np.zeros(6) if stated is None else stated - wrench,
             pressure=values,

@@ -627,3 +627,20 @@ def test_no_force_presses_a_tool_through_the_limb(thick: float) -> None:
     assert not any("settle" in touch.trust.why for touch in touches)
     assert all(touch.force > 0.97 * force or "carries" in touch.trust.why
                for touch, force in zip(touches, (0.01, 0.1, 1, 10, 100, 1e4), strict=True))  # fmt: skip
+
+
+@pytest.mark.parametrize("rings", [2, 3, 7])
+def test_a_tool_between_the_corners_of_long_triangles_is_not_silently_apart(rings: int) -> None:
+    around, place = np.arange(48), np.eye(4)
+    other, angle = (around + 1) % 48, 2 * np.pi * around / 48
+    flat = np.stack([0.045 * np.cos(angle), 0.045 * np.sin(angle), 0 * angle], axis=1)
+    strip = np.concatenate([np.stack([around, other, other + 48], 1), np.stack([around, other + 48, around + 48], 1)])
+    vertices = np.concatenate([flat + [0, 0, 0.3 * k / (rings - 1)] for k in range(rings)])
+    toucher = Toucher(SoftLayer(vertices, np.concatenate([strip + 48 * k for k in range(rings - 1)]), 0.01))
+    place[:3, 3] = [0.053, 0, 0.15 / (rings - 1)]
+    for wrench in (None, [-1.0, 0, 0, 0, 0, 0]):
+        touch = toucher.touch(Contact(ball(0.01), place, wrench=wrench))
+        lost = "mm long" in touch.trust.why and np.isnan([touch.depth, touch.force_bound]).all()
+        assert (touch.force > 0 or lost) and not touch.trust.in_range
+    place[0, 3] += 0.005
+    assert toucher.touch(Contact(ball(0.01), place)).trust.in_range
