@@ -8,7 +8,8 @@
 
 benchmarks/limbs.md says what is in benchmarks/limbs_v3.npz. `answer(layer, tool, pose, way)` gets a SoftLayer, a Tool,
 its pose (4, 4) in the limb's frame and the unit vector (3,) along which it came there, and returns the force of the
-tool on the limb (3,) [N] and the motion of the skin (V, 3) [m], or None for the latter.
+tool on the limb (3,) [N] and the motion of the skin (V, 3) [m], or None for the latter. Forces are compared by size. No
+answer is where it fails, is not finite, or presses the other way: it counts as no force and no motion.
 """
 
 from __future__ import annotations
@@ -33,6 +34,7 @@ from fem_tools.dataset import Sample
 from fem_tools.plies import confined_modulus
 from fem_tools.released import Released
 from stmpl_core import Contact, SoftLayer, Tool
+from stmpl_core.arrays import finite
 from stmpl_core.console import steps_bar
 from stmpl_core.errors import InvalidInput
 from stmpl_core.methods import MomentNet
@@ -66,6 +68,7 @@ class Off(NamedTuple):
         moves, worst: mean error where it moves, and the largest at any vertex, over the true peak [-].
         flagged: truth of the claim that the answer says that it is not to be relied upon.
         bound: bound on the force's error that is stated, over the true force [-].
+        answered: truth of the claim that there was an answer; none counts as no force and no motion.
     """
 
     force: float
@@ -73,6 +76,7 @@ class Off(NamedTuple):
     worst: float = float("nan")
     flagged: bool = False
     bound: float = float("nan")
+    answered: bool = True
 
 
 def off(one: Pressed, force: np.ndarray, motion: np.ndarray | None, flagged: bool = False,
@@ -87,6 +91,23 @@ def off(one: Pressed, force: np.ndarray, motion: np.ndarray | None, flagged: boo
     return Off(error, float(wrong[size > MOVES * size.max()].mean()), float(wrong.max()), flagged, bound)
 
 
+def asked(law: Answer, one: Pressed) -> tuple[np.ndarray, np.ndarray | None]:
+    """What a law answers to a scene. Raises InvalidInput: it fails, or that is no answer."""
+    layer, info = one.sample.layer, one.sample.info
+    where = f"{info['body']}, contact {info['number']} at {info['ratio']:.2g} thicknesses"
+    try:
+        force, motion = law(layer, one.tool, one.pose, one.way)
+        force = finite("the force", force, (3,))
+        motion = None if motion is None else finite("the motion", motion, layer.vertices.shape)
+    except Exception as error:  # whatever a person's law does
+        raise InvalidInput(f"no answer to {where}: {type(error).__name__}: {str(error).rstrip('.')}. Needed is force "
+                           f"(3,) [N], motion {layer.vertices.shape} [m] or None.") from error  # fmt: skip
+    if force @ one.force < 0:
+        raise InvalidInput(f"no answer to {where}: the force points the other way. Needed is that of the tool on the "
+                           f"limb, about {np.round(one.force, 2).tolist()} N.")  # fmt: skip
+    return force, motion
+
+
 def met(simulator: Simulator, one: Pressed) -> Touch:
     """Our touch of a scene, which is told the way that the tool came, as a wrench would tell it."""
     (touch,) = simulator.touch([Contact(one.tool, one.pose)])
@@ -98,6 +119,7 @@ class Laws:
 
     def __init__(self, layer: SoftLayer, others: Mapping[str, Answer]) -> None:
         self.layer, self.others = layer, others
+        self.refused: dict[str, list[str]] = defaultdict(list)  # why there was no answer, by law
         self.simulator = Simulator(layer, MomentNet())
         self.net = self.simulator.toucher.net
         self.modulus = np.array([confined_modulus(layer.tissue, float(t)) for t in layer.thickness])
@@ -123,15 +145,19 @@ class Laws:
             out["without its network"] = off(one, force_of(layer, nodes, self.unlearnt(nodes)), None)
             out["elastic foundation"] = off(one, force_of(layer, nodes, self.columns(nodes)), None)
         for name, other in self.others.items():
-            force, motion = other(layer, one.tool, one.pose, one.way)
-            if np.isfinite(force).all():  # else it has no answer
-                out[name] = off(one, force, motion)
+            try:
+                out[name] = off(one, *asked(other, one))
+            except InvalidInput as error:
+                self.refused[name].append(str(error))
+                out[name] = off(one, np.zeros(3), np.zeros_like(layer.vertices))._replace(answered=False)
         return out
 
 
 def compare(released: Released, splits: Sequence[str], names: tuple[str, ...], others: Mapping[str, Answer],
-            balls: bool = False) -> dict[str, list[Off]]:  # fmt: skip
+            balls: bool = False) -> tuple[dict[str, list[Off]], dict[str, list[str]]]:  # fmt: skip
     """All laws on the scenes of some splits on limbs of such names, where finite elements know the pressure.
+
+    Also why some have no answer, by name.
 
     Args:
         released: contacts.
@@ -141,6 +167,7 @@ def compare(released: Released, splits: Sequence[str], names: tuple[str, ...], o
         balls: choice of balls alone, in the middle of their depths.
     """
     found: dict[str, list[Off]] = defaultdict(list)
+    refused: dict[str, list[str]] = defaultdict(list)
     samples = [one for split in splits for one in released.samples(split)
                if slant_of(one) <= STRAIGHT and one.info["body"].startswith(names)]  # fmt: skip
     if balls:
@@ -151,20 +178,29 @@ def compare(released: Released, splits: Sequence[str], names: tuple[str, ...], o
         for k, one in enumerate(pressed(samples)):
             if laws is None or last is not one.sample.layer:
                 laws, last = Laws(one.sample.layer, others), one.sample.layer
+                laws.refused = refused
             if seen(one, laws.net) is not None:
                 for name, result in laws.answers(one).items():
                     found[name].append(result)
             show(k + 1, len(samples), one.sample.info["body"])
-    return found
+    return found, refused
 
 
 def table(title: str, found: dict[str, list[Off]]) -> Table:
-    """The rows, in per cent."""
+    """The rows, in per cent; of a law that did not answer all scenes a second one, of those that it did."""
     out = Table(title=title)
     for heading in ("law", "scenes", "force: mean", "90 %", "worst", "where it moves", "worst vertex", "flagged",
                     "in its bound"):  # fmt: skip
         out.add_column(heading, justify="left" if heading == "law" else "right")
+    rows = []
     for name, every in found.items():
+        some = [one for one in every if one.answered]
+        if all(np.isnan(one.worst) for one in some):  # a law of forces alone
+            every = [one._replace(moves=float("nan"), worst=float("nan")) for one in every]
+        rows.append((name, every, f"{len(some)} of {len(every)}" if len(some) < len(every) else str(len(every))))
+        if 0 < len(some) < len(every):
+            rows.append((f"{name}, where it answers", some, str(len(some))))
+    for name, every, count in rows:
         by_name = zip(Off._fields, np.array(every, dtype=float).T, strict=True)
         columns = {key: np.asarray(values) for key, values in by_name}
         force = np.abs(columns["force"])
@@ -172,7 +208,7 @@ def table(title: str, found: dict[str, list[Off]]) -> Table:
         def shown(values: np.ndarray, how: Callable[[np.ndarray], float] = np.mean) -> str:
             return "" if np.isnan(values).all() else f"{100 * float(how(values)):.1f} %"
 
-        out.add_row(name, str(len(force)), shown(force), shown(force, lambda v: float(np.quantile(v, 0.9))),
+        out.add_row(name, count, shown(force), shown(force, lambda v: float(np.quantile(v, 0.9))),
                     shown(force, np.max), shown(columns["moves"]), shown(columns["worst"]), shown(columns["flagged"]),
                     shown(np.where(np.isnan(columns["bound"]), np.nan, force <= columns["bound"])))  # fmt: skip
     return out
@@ -242,7 +278,11 @@ def main() -> None:
         Console(width=130).print(kept(kind, samples))
     for kind in () if options.kept else options.limbs:
         splits, names = LIMBS[kind]
-        Console(width=130).print(table(kind, compare(released(kind), splits, names, others, balls=options.peer)))
+        found, refused = compare(released(kind), splits, names, others, balls=options.peer)
+        Console(width=130).print(table(kind, found))
+        for name, why in refused.items():
+            print(f"{name}, {len(why)} scenes without an answer, which count as no force and no motion; first: "
+                  f"{why[0]}")  # fmt: skip
 
 
 if __name__ == "__main__":

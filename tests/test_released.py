@@ -1,6 +1,7 @@
 """Laws of what is released of a data set, of presses into flat stacks, and of who is judged by them."""
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -193,6 +194,12 @@ def test_a_law_of_ones_own_is_judged_like_ours(monkeypatch: pytest.MonkeyPatch, 
     found = laws.answers(scene)
     assert found["yours"].force == pytest.approx(-0.1) and np.isnan(found["yours"].worst)
     assert abs(found["moment_net"].force) < abs(found["elastic foundation"].force)
+    given: list[Any] = [None, (3.0, None), (force, motion[:4]), (np.nan * force, None), (-force, None), 1 / 3]
+    for answer in given:
+        laws.others = {"yours": lambda *_, answer=answer: answer}
+        one = laws.answers(scene)["yours"]
+        assert (one.answered, one.force, one.worst) == (False, -1, 1) and "no answer to " in laws.refused["yours"][-1]
+    assert limbs.table("both", {"yours": [one, found["yours"]]}).columns[1]._cells == ["1 of 2", "1"]
     assert limbs.export([scene.sample], tmp_path) == 1
     assert len(list(tmp_path.glob("*.stl"))) == 2 and "force_on_limb_N" in (tmp_path / "scenes.json").read_text()
 
