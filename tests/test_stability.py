@@ -263,6 +263,19 @@ def test_an_answer_of_another_shape_and_an_error_that_is_none_of_ours_are_crashe
     assert all(re.search(said, row.broken[0].measured) for row in rows if row.outcome == "crashed")
 
 
+def test_a_method_that_writes_into_its_layer_crashes_and_the_next_gets_what_it_was(tmp_path):
+    class Writes(Zero):
+        def prepare(self, layer):
+            layer.vertices[:] = layer.thickness[:] = 0
+            return super().prepare(layer)
+
+    few = QUICK.only("pressures")
+    report, alone = stability({"writes": Writes, "zero": Zero}, few), stability({"zero": Zero}, few)
+    assert set(report.counts("writes")) >= {"crashed"} and not report.counts("writes")["held"]
+    assert "wrote into its layer's thickness and vertices" in str(report.rows[0])
+    assert report.counts("zero") == alone.counts("zero")
+
+
 def test_the_summary_names_the_range_held_and_the_first_failure(run):
     summary = run[0].summary("crashing", "pressure")
     assert summary == {"held": "0.1 E ... 0.5 E", "failed_at": "1 E", "law": "answers", "outcome": "crashed"}
@@ -345,6 +358,10 @@ def test_a_method_in_a_file_of_ones_own_is_the_class_in_it_or_the_one_that_is_na
     (tmp_path / "ending.py").write_text("raise SystemExit(5)")
     with pytest.raises(InvalidInput, match=r"it ends the process \(exit 5\)"):
         maker("ending:Careful")
+    file.write_text(YOURS)
+    file.write_text(YOURS.replace("def prepare", "def __init__(self, needed):\n        pass\n\n    def prepare"))
+    with pytest.raises(InvalidInput, match=r"called without arguments, and fails: TypeError: .*'needed'"):
+        maker(str(file))
     file.write_text(YOURS)
     for name, parts, said in ((f"{file}:Nothing", (), "has no Nothing"), (str(file), (), "Say which, as in")):
         with pytest.raises(InvalidInput, match=said):

@@ -50,7 +50,8 @@ def maker(name: str) -> Make:
     """What makes a method: one of METHODS, or a class, a function or a method object of one's own (see studies.own).
 
     Raises:
-        InvalidInput: no such method, module, file or attribute, or it lacks prepare and solve.
+        InvalidInput: no such method, module, file or attribute, it fails where it is called without arguments, or it
+            lacks prepare and solve.
     """
     if name in METHODS:
         return METHODS[name]
@@ -59,7 +60,11 @@ def maker(name: str) -> Make:
         raise InvalidInput(f"unknown method {name!r}. Available: {known}; or yours, as file.py or module:attribute.")
     found = own(name, *PARTS)
     if callable(found):
-        made = found()
+        try:
+            made = found()
+        except Exception as error:  # whatever a person's class does
+            raise InvalidInput(f"{name} is called without arguments, and fails: {type(error).__name__}: {error}. Name "
+                               "a function or an object of that file that needs none.") from error  # fmt: skip
         _check(name, made)
         return cast(Make, found)
     _check(name, found)

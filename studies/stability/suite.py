@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import logging
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -18,7 +18,7 @@ from stmpl_core.provenance import commit, machine, versions
 from stmpl_core.trust import Displacement, Trust
 from studies.stability import failures
 from studies.stability.laws import LAWS, VERDICTS, Answers, Broken
-from studies.stability.scene import Make, Pressures, Scene
+from studies.stability.scene import Make, Mesh, Pressures, Scene
 from studies.stability.sweeps import Preset, Stage, trials
 from studies.stability.trial import Trial
 
@@ -146,7 +146,30 @@ def again(path: str | Path, make: Callable[[str], Make], *, patience: float = PA
 
 
 def judge(name: str, make: Make, trial: Trial, *, patience: float = PATIENCE) -> Row:
-    """Asks fresh methods for a trial's answers, and judges them by its laws."""
+    """Asks fresh methods for a trial's answers, and judges them by its laws. One that writes into its layer crashed."""
+    meshes = [scene.mesh for scene in (trial.scene, trial.twin and trial.twin.scene) if scene is not None]
+    before = [{key: values.copy() for key, values in mesh.arrays().items()} for mesh in meshes]
+    row = _judge(name, make, trial, patience)
+    wrote = {key for mesh, kept in zip(meshes, before, strict=True) for key in _written(mesh, kept)}
+    if not wrote:
+        return row
+    for mesh, kept in zip(meshes, before, strict=True):  # the trials that follow get what it was
+        vars(mesh).pop("layer", None)
+        for key, values in mesh.arrays().items():
+            values[:] = kept[key]
+    broken = Broken("answers", f"crashed: it wrote into its layer's {' and '.join(sorted(wrote))}", False)
+    return Row(name, trial.axis, trial.level, "crashed", (broken,))
+
+
+def _written(mesh: Mesh, kept: dict[str, np.ndarray]) -> Iterator[str]:
+    """Names of the arrays of a mesh and its layer that are no longer what was kept."""
+    layer, now = vars(mesh).get("layer"), list(mesh.arrays().items())
+    if layer is not None and mesh.core is None:
+        now.append(("thickness", layer.thickness))  # a layer's own copy
+    yield from (key for key, values in now if not np.array_equal(values, kept[key], equal_nan=True))
+
+
+def _judge(name: str, make: Make, trial: Trial, patience: float) -> Row:
     try:
         if "refuses" in trial.laws:
             assert isinstance(trial.scene, Pressures)
