@@ -99,12 +99,14 @@ def build(
         gripper: choice to add a gripper of two fingers beside the site.
 
     Raises:
-        InvalidInput: a place that is not finite, a ball without a radius, a file that MuJoCo does not read, an end that
-            is not there, a site out of reach, or a limb that cannot be gripped.
+        InvalidInput: a place that is not finite, a ball without a radius, a timestep that is none, a file that MuJoCo
+            does not read, an end that is not there, a site out of reach, or a limb that cannot be gripped.
     """
     where, spec = finite("at", at, (3,)), robot_spec(ARM if robot is None else Path(robot))
     if not 0 < radius < np.inf:
         raise InvalidInput(f"the ball's radius is {radius:g} m; it must be finite and above 0.")
+    if not 0 < timestep < np.inf:
+        raise InvalidInput(f"the timestep is {timestep:g} s; it must be finite and above 0.")
     holder, side, tools = _end(spec, end), -1.0, (BALL,)
     chain = _chain(holder if hasattr(holder, "add_body") else holder.parent)
     try:

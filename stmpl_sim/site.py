@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import cached_property
+from numbers import Integral
 from typing import NamedTuple
 
 import numpy as np
@@ -27,20 +28,33 @@ class Site:
     Args:
         layer: skin.
         vertex: number of the vertex in its middle.
+
+    Raises:
+        InvalidInput: a vertex that the skin does not have.
     """
 
     layer: SoftLayer
     vertex: int
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.vertex, Integral) or not 0 <= self.vertex < len(self.layer.vertices):
+            raise InvalidInput(f"there is no vertex {self.vertex}: the skin has 0..{len(self.layer.vertices) - 1}.")
 
     @classmethod
     def thickest(cls, layer: SoftLayer) -> Site:
         """The vertex in the middle part of the limb whose tissue is thickest, averaged over its surroundings.
 
         The middle part is that along its length, and farther from an open border than half as far as any vertex there.
+
+        Raises:
+            InvalidInput: no vertex is there.
         """
         v, room = layer.vertices, border_distance(layer)
         along = (v - v.mean(axis=0)) @ _long_axis(layer)
         some = np.flatnonzero(np.abs(along) < MIDDLE * np.ptp(along))
+        if not len(some):
+            raise InvalidInput("no vertex is in the middle part of the limb. Mesh it more finely (stmpl_core.remesh), "
+                               "or name a vertex: Site(layer, 0).")  # fmt: skip
         some = some[room[some] >= 0.5 * room[some].max()]
         tree, thickness = KDTree(v[some]), layer.thickness[some]
         thick = np.array([thickness[tree.query_ball_point(one, 2 * SMOOTH_M)].mean() for one in v[some]])

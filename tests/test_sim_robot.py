@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import trimesh
 
 from stmpl_core import Prony, Simulator, SoftLayer, Tissue
 from stmpl_core.errors import InvalidInput
@@ -577,3 +578,18 @@ def test_an_arm_starts_where_its_joints_have_room(forearm: SoftLayer, tmp_path: 
     low, high = scene.model.jnt_range[list(scene.joints)].T
     room = np.minimum(scene.qpos[:4] - low, high - scene.qpos[:4]) / (high - low)
     assert room.min() >= ROOM and scene.qpos[1] > 0.05  # the key's place would leave 2 cm of 82
+
+
+def test_a_site_or_a_timestep_that_is_none_is_refused(forearm: SoftLayer) -> None:
+    from stmpl_sim.scene import build
+    from stmpl_sim.site import Site
+
+    for vertex in (-1, len(forearm.vertices), 0.5):
+        with pytest.raises(InvalidInput, match="there is no vertex"):
+            Site(forearm, vertex)  # type: ignore[arg-type]
+    coarse = trimesh.creation.box((0.2, 0.1, 0.1))
+    with pytest.raises(InvalidInput, match="no vertex is in the middle part"):
+        Site.thickest(SoftLayer(coarse.vertices, coarse.faces, 0.01))
+    for timestep in (0.0, -1e-3, np.nan):
+        with pytest.raises(InvalidInput, match="timestep is"):
+            build(forearm, Site(forearm, 0), timestep=timestep)
