@@ -44,6 +44,16 @@ def _all_finite(values):
     return total == 0.0
 
 
+def check_dt(dt: float) -> None:
+    """Raises InvalidInput: a time since the step before [s] that is no number, below 0, or not finite."""
+    try:
+        sound = bool(0 <= dt < np.inf)
+    except (TypeError, ValueError):
+        sound = False
+    if not sound:
+        raise InvalidInput(f"dt is {dt!r:.40} s; time goes forward, allowed is a number of 0 or more, and finite.")
+
+
 def finite(name: str, value: ArrayLike, shape: tuple[int | None, ...]) -> np.ndarray:
     """Returns `value` as a contiguous float64 array of `shape` (None: any length).
 

@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from stmpl_core.arrays import check_dt
 from stmpl_core.contact import Contact
 from stmpl_core.errors import InvalidInput, StmplError
 from stmpl_core.friction import Friction, check_tools
@@ -83,9 +84,10 @@ class Batch:
         self.tools = list(tools)
         if not all(isinstance(skin, Skin) for skin in self.skins):
             raise InvalidInput("a batch needs prepared skins. Try Skin.of(layer, MomentNet()).")
-        if not isinstance(count, Integral) or count < 1 or len(self.skins) != count:
-            raise InvalidInput(f"{len(self.skins)} skins do not fit {count} scenes: give one, or one for each of at "
-                               "least one scene.")  # fmt: skip
+        if not isinstance(count, Integral) or count < 1:
+            raise InvalidInput(f"a batch is asked for {count} scenes; at least one scene is needed.")
+        if len(self.skins) != count:
+            raise InvalidInput(f"{len(self.skins)} skins do not fit {count} scenes: give one, or one for each.")
         check_tools(friction, [tool.name for tool in self.tools])
         if not self.tools or len({tool.name for tool in self.tools}) < len(self.tools):
             raise InvalidInput("a batch needs tools, each with a name of its own. Try tool.named('left').")
@@ -130,8 +132,7 @@ class Batch:
             raise InvalidInput(f"{len(states)} states do not fit {n} scenes.")
         if not wanted <= set(range(n)):
             raise InvalidInput(f"fields are asked for scenes {sorted(wanted)}; there are {n}.")
-        if not 0 <= dt < np.inf:
-            raise InvalidInput(f"dt is {dt} s; time goes forward, allowed is 0 or more, and finite.")
+        check_dt(dt)
         wrenches = np.zeros((n, many, 6)) if out is None else np.asarray(out)
         if wrenches.shape != (n, many, 6) or (out is not None and not np.shares_memory(wrenches, np.asarray(out))):
             raise InvalidInput(f"out has shape {wrenches.shape}; ({n}, {many}, 6) is needed, on a CPU.")

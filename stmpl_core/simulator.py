@@ -9,7 +9,7 @@ from typing import overload
 import numba
 import numpy as np
 
-from stmpl_core.arrays import PerVertex
+from stmpl_core.arrays import PerVertex, check_dt
 from stmpl_core.bounds import motion_bound
 from stmpl_core.carrying import carried
 from stmpl_core.conform import Conformed, conform, kept_out, laid_on, no_further
@@ -157,8 +157,7 @@ class Simulator:
         names = [contact.name for contact in contacts]
         if len(set(names)) < len(names):
             raise InvalidInput(f"contacts must have names of their own; got {', '.join(names)}.")
-        if not 0 <= dt < np.inf:
-            raise InvalidInput(f"dt is {dt} s; time goes forward, allowed is 0 or more, and finite.")
+        check_dt(dt)
         if state is None:
             return self.toucher.touch_all(contacts)
         return self.history.step(contacts, carried(state, self.skin, self.skin), dt)

@@ -78,7 +78,7 @@ class SoftBody:
 
     Raises:
         InvalidInput: names that the model does not have, kinds of geoms that cannot be tools, a tool that is part of
-            the limb, or one that also collides with it rigidly.
+            the limb or of another tool, or one that also collides with the limb rigidly.
         MeshError: a surface that cannot be a tool.
     """
 
@@ -114,6 +114,11 @@ class SoftBody:
                     raise InvalidInput(f"'{name}' is part of '{whose}', or rigidly joined to it: it cannot touch its "
                                        "skin.")  # fmt: skip
                 _check_no_rigid_contact(model, limb, source)
+        for whole, source in self._sources.items():
+            for name, part in self._sources.items():
+                if source.geom is None and part.geom in _geoms_of(model, source):
+                    raise InvalidInput(f"tool '{name}' is a geom of tool '{whole}': it would press twice. Name one of "
+                                       "them.")  # fmt: skip
         self._posed: dict[str, float] = {}
         made = [_tool(model, name, self._sources[name]) for name in tools]
         self.contact = SoftContact(layer, made, method, pose_body_from_layer=pose_body_from_layer, damping=damping,

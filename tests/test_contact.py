@@ -11,7 +11,7 @@ from benchmarks.living_limbs import site
 from fem_tools.indenter import IndenterFem
 from fem_tools.patch import PatchFem
 from fem_tools.press import Press
-from stmpl_core import Contact, Load, SoftLayer, Tissue, Tool
+from stmpl_core import Contact, Load, SoftLayer, State, Tissue, Tool
 from stmpl_core.body import Body
 from stmpl_core.errors import InvalidInput, MeshError
 from stmpl_core.living import living
@@ -504,6 +504,9 @@ def test_bad_input_is_refused_with_a_reason(sim: Simulator) -> None:
     assert touch_of(sim.step([press(BALL, on_limb(), (-1e-300, 0, 0))])).status == NO_FORCE
     held = touch_of(sim.step([press(BALL, on_limb(), (-1e99, 0, 0))]))
     assert not held.trust.in_range and "carries" in held.trust.why
+    for odd in ("1", None, np.nan, np.ones(2)):
+        with pytest.raises(InvalidInput, match="dt is"):
+            sim.touch([], State(), odd)
     with pytest.raises(InvalidInput, match="names of their own"):
         sim.step([press(BALL, on_limb(), None), press(BALL, on_limb(), None)])
     with pytest.raises(MeshError, match="millimetres"):

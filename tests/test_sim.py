@@ -693,6 +693,16 @@ def test_what_does_not_fit_a_soft_contact_is_refused(simulator: Simulator) -> No
         SoftContact(simulator.skin, [tool], friction={"Ball": 0.3})
 
 
+def test_a_geom_of_a_body_that_is_a_tool_is_no_tool_of_its_own(simulator: Simulator) -> None:
+    model = mujoco.MjModel.from_xml_string("""<mujoco><worldbody><body name="limb"/><body name="hand" pos="0 0 .1">
+    <freejoint/><geom name="a" size=".01"/><geom name="b" size=".02" contype="0" conaffinity="0"/></body></worldbody>
+    </mujoco>""")
+    for tools in (["hand", "a"], ["a", "hand"]):
+        with pytest.raises(InvalidInput, match="'a' is a geom of tool 'hand': it would press twice"):
+            SoftBody(model, simulator, body="limb", tools=tools)
+    SoftBody(model, simulator, body="limb", tools=["hand", "b"])  # the body's tool has what collides of it
+
+
 def test_a_tool_that_hangs_on_the_limb_needs_no_exclude(simulator: Simulator) -> None:
     hung = """<mujoco><worldbody><body name="limb"><freejoint/><geom size=".01" mass="1"/>
     <body name="hand" pos="0 0 .05"><joint type="slide" axis="0 0 1"/><geom name="ball" size=".01" mass=".1"/></body>
