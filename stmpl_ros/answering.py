@@ -172,6 +172,7 @@ class Answering:
         if reaction is None:
             return False
         assert self._field is not None
+        reaction = reaction._replace(touches=[_flagged(touch, instant) for touch in reaction.touches])
         touches = {touch.name: touch for touch in reaction.touches}
         self.sending.reaction(instant, touches)
         self.remembering.keep(reaction, instant)
@@ -355,6 +356,12 @@ class Answering:
 
     def _now(self) -> int:
         return self._node.get_clock().now().nanoseconds
+
+
+def _flagged(touch: Touch, instant: Instant) -> Touch:
+    """The touch, flagged where a wrench was told that cannot be used; what is remembered of it is not."""
+    why = instant.refused.get(touch.name)
+    return touch.with_(trust=touch.trust.also(why, in_range=False)) if why else touch
 
 
 def _surfaces(instant: Instant) -> dict[str, str]:

@@ -40,6 +40,11 @@ class Gate:
                   "Are the clocks in step, or is this a replay? max_age:=0 accepts any age.")  # fmt: skip
         return False
 
+    @property
+    def dropped(self) -> str:
+        """Reason why the last message that came too late or out of order was dropped."""
+        return self._tally.last_drop
+
     def refuse(self, kind: str, why: str) -> None:
         """Counts and tells of what cannot be used."""
         self._tally.refused += 1

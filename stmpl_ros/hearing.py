@@ -157,20 +157,22 @@ class Hearing:
     def _listen(self, kind: Any, topic: str, callback: Callable, profile: Any, *, raw: bool = False) -> Any:
         return self.events.subscribe(self._node, kind, topic, callback, profile, raw=raw)
 
-    def _read(self, read: Read, data: bytes, what: str, take: Callable[[Any], None]) -> None:
+    def _read(self, read: Read, data: bytes, what: str, take: Callable[[Any], None],
+              refuse: Callable[[str, str], None]) -> None:  # fmt: skip
         """Hands on the message in these bytes."""
         try:
             message = read(data)
         except StmplError as error:
-            return self.gate.refuse(f"{what}, {type(error).__name__}", f"{what}: {error}")
+            return refuse(f"{what}, {type(error).__name__}", f"{what}: {error}")
         take(message)
 
     def _listen_to(self, name: str) -> None:
         def wrench(data: bytes) -> None:
-            self._read(read_wrench, data, f"wrench of {name}", partial(self._on_wrench, name))
+            self._read(read_wrench, data, f"wrench of {name}", partial(self._on_wrench, name),
+                       partial(self._refuse_wrench, name))  # fmt: skip
 
         def pose(data: bytes) -> None:
-            self._read(read_pose, data, f"pose of {name}", partial(self._on_pose, name))
+            self._read(read_pose, data, f"pose of {name}", partial(self._on_pose, name), self.gate.refuse)
 
         self._listened[name] = [self._listen(WrenchStamped, f"tools/{name}/wrench", wrench, NEWEST, raw=True)]
         if not self._followed.follow(name):
@@ -230,11 +232,18 @@ class Hearing:
         self._go_on("pose", name, self.inbox.put_pose(name, pose, stamp, self.now()))
 
     def _on_wrench(self, name: str, message: WrenchStamped) -> None:
-        if not self._hears(name) or not self.gate.fresh(wire.stamp_ns(message), self._config().max_age):
+        if not self._hears(name):
             return
+        if not self.gate.fresh(wire.stamp_ns(message), self._config().max_age):
+            return self.inbox.refuse_wrench(name, self.gate.dropped, self.now())
         if message.header.frame_id == name:  # a tool's own frame is where its pose says, whatever /tf knows
             return self._take_wrench(name, message)
-        self._patience.put(f"wrench of {name}", message, partial(self._take_wrench, name))
+        self._patience.put(f"wrench of {name}", message, partial(self._take_wrench, name),
+                           partial(self._refuse_wrench, name))  # fmt: skip
+
+    def _refuse_wrench(self, name: str, kind: str, why: str) -> None:
+        self.gate.refuse(kind, why)
+        self.inbox.refuse_wrench(name, why, self.now())
 
     def _take_wrench(self, name: str, message: WrenchStamped) -> None:
         stamp = wire.stamp_ns(message)
@@ -242,7 +251,7 @@ class Hearing:
             wire.wrench_from(message, body_frame=self._config().frame, tool=name, frames=self.frames.at(stamp),
                              pose_body_from_tool=np.eye(4))  # fmt: skip
         except StmplError as error:
-            return self.gate.refuse(f"wrench of {name}, {type(error).__name__}", str(error))
+            return self._refuse_wrench(name, f"wrench of {name}, {type(error).__name__}", str(error))
         self._go_on("wrench", name, self.inbox.put_wrench(name, message, stamp, self.now()))
 
     def _on_time_back(self) -> None:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from types import MappingProxyType
 from typing import Any
 
 from bags import wire
@@ -31,10 +32,11 @@ class Stream:
 
 @dataclass
 class Input:
-    """Streams of one tool: poses in the body's frame (4, 4), and WrenchStamped messages."""
+    """Streams of one tool: poses in the body's frame (4, 4), WrenchStamped messages, and why others are refused."""
 
     pose: Stream = field(default_factory=Stream)
     wrench: Stream = field(default_factory=Stream)
+    refused: Stream = field(default_factory=Stream)
 
 
 @dataclass(frozen=True)
@@ -47,6 +49,7 @@ class Instant:
         skew: time between their stamps [ns].
         inputs: stamps of each tool's pose and wrench [ns]; 0: no wrench.
         lost: streams that fell silent: a pose within the last second, a wrench while its tool still moves.
+        refused: why no wrench that comes for a tool can be used, by tool: it is answered by its pose alone.
     """
 
     contacts: list[Contact]
@@ -54,6 +57,7 @@ class Instant:
     skew: int
     inputs: Stamps
     lost: tuple[str, ...] = ()
+    refused: Mapping[str, str] = MappingProxyType({})
 
 
 class Inbox:
@@ -103,6 +107,10 @@ class Inbox:
         """Keeps a WrenchStamped; False if it was dropped as repeated or out of order."""
         return self._put(self.inputs.setdefault(name, Input()).wrench, wrench, stamp, now)
 
+    def refuse_wrench(self, name: str, why: str, now: int) -> None:
+        """Keeps why a wrench cannot be used, until one can, or none comes."""
+        self.inputs.setdefault(name, Input()).refused = Stream(why, came=now)
+
     def _put(self, stream: Stream, value: Any, stamp: int, now: int) -> bool:
         if stream.live(now, self.rest_after) and stamp <= stream.stamp:
             self.out_of_order += 1
@@ -122,8 +130,13 @@ class Inbox:
     def _lost(self, live: dict[str, Input], now: int) -> tuple[str, ...]:
         silent = {name: one for name, one in self.inputs.items() if one.pose.value is not None and name not in live}
         poses = [f"pose of {name}" for name, one in silent.items() if now - one.pose.came <= self.rest_after + RECENT]
-        dumb = {name: one.wrench for name, one in live.items() if one.wrench.value is not None}
+        dumb = {name: one.wrench for name, one in live.items()
+                if one.wrench.value is not None and not one.refused.live(now, self.rest_after)}  # fmt: skip
         return *poses, *(f"wrench of {name}" for name, s in dumb.items() if not s.live(now, self.rest_after))
+
+    def _refused(self, live: dict[str, Input], now: int) -> dict[str, str]:
+        return {name: f"the wrenches of {name} are refused: {one.refused.value}" for name, one in live.items()
+                if one.refused.live(now, self.rest_after) and not one.wrench.live(now, self.rest_after)}  # fmt: skip
 
     def take(self, now: int) -> Instant | None:
         """Instant to answer now, each once; None while there is nothing new or something is to come."""
@@ -142,7 +155,7 @@ class Inbox:
             for name, one in live.items()
         }
         contacts = [self._contact(name, one, now) for name, one in live.items()]
-        return Instant(contacts, max(poses), skew, inputs, self._lost(live, now))
+        return Instant(contacts, max(poses), skew, inputs, self._lost(live, now), self._refused(live, now))
 
     def _contact(self, name: str, one: Input, now: int) -> Contact:
         tool, pose, time = self.tools[name], one.pose.value, one.pose.stamp / wire.NANO

@@ -38,14 +38,16 @@ class Patience:
 
     def __init__(self, node: Node, frames: Frames, gate: Gate, wait: Callable[[], float]) -> None:
         self._frames, self._gate, self._wait = frames, gate, wait
-        self._streams: dict[str, tuple[deque[_Waits], Callable[[Any], None]]] = {}
+        self._streams: dict[str, tuple[deque[_Waits], Callable[[Any], None], Callable[[str, str], None]]] = {}
         self._timer = steady_timer(node, POLL_S, self._look) if frames.listens else None
 
-    def put(self, stream: str, message: Any, take: Callable[[Any], None]) -> None:
-        """Hands a stamped message of a stream on, now or once its frame is known."""
+    def put(self, stream: str, message: Any, take: Callable[[Any], None],
+            refuse: Callable[[str, str], None] | None = None) -> None:  # fmt: skip
+        """Hands a stamped message of a stream on, now or once its frame is known; refuse: in place of the gate's."""
         if not self._frames.moves(message.header.frame_id):
             return take(message)
-        waiting, _ = self._streams.setdefault(stream, (deque(maxlen=MOST), take))
+        first = deque[_Waits](maxlen=MOST), take, refuse or self._gate.refuse
+        waiting = self._streams.setdefault(stream, first)[0]
         waiting.append(_Waits(message, time.monotonic() + self._wait()))
         self._look_at(stream)
 
@@ -59,7 +61,7 @@ class Patience:
             self._look_at(stream)
 
     def _look_at(self, stream: str) -> None:
-        waiting, take = self._streams[stream]
+        waiting, take, refuse = self._streams[stream]
         for k in range(len(waiting) - 1, -1, -1):  # the newest first
             message = waiting[k].message
             if not self._missing(message):
@@ -68,9 +70,8 @@ class Patience:
                 return take(message)
         while waiting and waiting[0].until <= time.monotonic():
             message = waiting.popleft().message
-            self._gate.refuse(f"tf of {stream}", f"the {stream} is in frame '{message.header.frame_id}', and /tf did "
-                              f"not say within {self._wait():g} s where that was at its stamp: "
-                              f"{self._missing(message)}")  # fmt: skip
+            refuse(f"tf of {stream}", f"the {stream} is in frame '{message.header.frame_id}', and /tf did not say "
+                   f"within {self._wait():g} s where that was at its stamp: {self._missing(message)}")  # fmt: skip
 
     def _missing(self, message: Any) -> str:
         return self._frames.missing(message.header.frame_id, stamp_ns(message))

@@ -178,8 +178,8 @@ class Models:
         try:
             for name, model in zip((one.name for one in instant.contacts), future.result(), strict=True):
                 status = touches[name].status
-                if doubt:
-                    model = replace(model, trust=model.trust.also(doubt, in_range=False))
+                for why in filter(None, (doubt, instant.refused.get(name))):
+                    model = replace(model, trust=model.trust.also(why, in_range=False))
                 if status in MODELLED and self._heard(name):
                     self._publishers[name].publish(
                         wire.local_contact_message(name, model, status, self._frame, instant.stamp)

@@ -18,7 +18,7 @@ from stmpl_msgs.srv import SetBody
 
 from bags.reader import Bag
 from bags.replay import replay_run
-from bags.wire import header, layer_from, pose_message, pose_of_tool, stamp_ns, tool_message
+from bags.wire import header, layer_from, pose_message, pose_of_tool, stamp_ns, tool_message, wrench_message
 from stmpl_core import Tool
 from stmpl_core.errors import FrameError, InvalidInput
 from stmpl_core.methods import MomentNet
@@ -45,6 +45,26 @@ def test_poses_and_wrenches_in_a_listed_frame_count_as_in_the_bodys(bus, hand):
     answer = hand.ask(np.linalg.inv(TABLE) @ HERE, in_table, frame="table")
     assert answer.header.frame_id == "body" and statuses(answer) == {"probe": TOUCHING}
     np.testing.assert_allclose(rows(answer), rows(own), atol=1e-7)
+
+
+@pytest.mark.parametrize(("wrench", "frame", "says"), [
+    (PUSH, "sensor", "the wrench of probe is in frame 'sensor'"), (PUSH * np.nan, "body", "finite"),
+])  # fmt: skip
+def test_an_answer_by_the_pose_alone_is_flagged_while_wrenches_come_that_cannot_be_used(bus, hand, wrench, frame, says):
+    assert hand.ask(HERE, PUSH).touches[0].in_range
+
+    def answer(wrench, frame: str):
+        hand.wrench.publish(wrench_message(wrench, frame, bus.now()))
+        bus.spin(0.05)
+        return hand.ask(HERE)
+
+    said = "the wrenches of probe are refused: "
+    bus.wait(lambda: said in answer(wrench, frame).why, said)
+    flagged = answer(wrench, frame)
+    assert says in flagged.why and not flagged.in_range and not flagged.touches[0].in_range
+    assert statuses(flagged) == {"probe": BY_POSE}
+    sound = hand.ask(HERE, PUSH)
+    assert sound.in_range and said not in sound.why and statuses(sound) == {"probe": TOUCHING}
 
 
 def test_a_recording_of_another_frame_and_of_two_skins_is_replayed_bit_for_bit(bus, tmp_path):

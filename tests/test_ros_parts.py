@@ -266,6 +266,25 @@ def test_streams_that_fall_silent_are_named():
     assert later is not None and later.lost == ("wrench of probe",), "a tool put away is not spoken of for ever"
 
 
+def test_wrenches_that_are_refused_are_told_of_until_one_can_be_used_or_none_comes():
+    inbox = _inbox("probe")
+
+    def told(now: int):
+        inbox.put_pose("probe", np.eye(4), now * MS, now * MS)
+        instant = inbox.take(now * MS)
+        assert instant is not None
+        return instant.lost, dict(instant.refused)
+
+    inbox.refuse_wrench("probe", "not finite", 0)
+    refused = {"probe": "the wrenches of probe are refused: not finite"}
+    assert told(1) == ((), refused)
+    inbox.put_wrench("probe", _push(1, 2 * MS), 2 * MS, 2 * MS)
+    inbox.refuse_wrench("probe", "not finite", 200 * MS)
+    assert told(2) == ((), {}), "one among others is passed over"
+    assert told(300) == ((), refused), "that is why there is none"
+    assert told(900) == (("wrench of probe",), {})
+
+
 def test_one_line_of_a_kind_comes_through_and_tells_how_many_did_not(monkeypatch):
     said, now = [], [0.0]
     logger = SimpleNamespace(warning=said.append)
