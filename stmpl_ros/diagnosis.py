@@ -110,7 +110,8 @@ class Health(NamedTuple):
         live: truth of the claim that a tool is heard.
         doubt: why it is not known where the limb is.
         active: truth of the claim that the node answers.
-        rivals: sentence on who sends for one tool beside another; empty: nobody.
+        senders: sentence on who sends for one tool beside another, or for one that cannot be used; empty: nobody.
+        building: names of tools whose distance field is being built.
     """
 
     lately: Mapping[str, int] = MappingProxyType({})
@@ -120,7 +121,8 @@ class Health(NamedTuple):
     doubt: str = ""
     active: bool = True
     drop: str = ""
-    rivals: str = ""
+    senders: str = ""
+    building: tuple[str, ...] = ()
 
     @property
     def said(self) -> tuple[bytes, str]:
@@ -139,10 +141,12 @@ class Health(NamedTuple):
         if bad:
             told = ", ".join(f"{count} {name.replace('_', ' ')}" for name, count in bad.items())
             said = ": ".join([f"of the messages of the last second {told}", *why])
-            return DiagnosticStatus.WARN, f"{said.rstrip('.')}; {self.rivals}" if self.rivals else said
-        if self.rivals:
-            return DiagnosticStatus.WARN, self.rivals
-        return DiagnosticStatus.OK, "answering" if self.live else "at rest: no tool is heard"
+            return DiagnosticStatus.WARN, f"{said.rstrip('.')}; {self.senders}" if self.senders else said
+        if self.senders:
+            return DiagnosticStatus.WARN, self.senders
+        said = "answering" if self.live else "at rest: no tool is heard"
+        soon = f"; a distance field is being built for {', '.join(self.building)}" if self.building else ""
+        return DiagnosticStatus.OK, said + soon
 
 
 def skin_status(node: str, values: Mapping[str, str], health: Health) -> DiagnosticStatus:

@@ -73,7 +73,9 @@ class Hearing:
         self._topics: list[Any] = []
         self._listened: dict[str, list[Any]] = {}  # subscriptions of each tool
         self._unknown: dict[str, str] = {}  # topics of poses at the last look, by tool, whose surface is not known
-        self._strangers: set[str] = set()  # tools that were told of, or taken away
+        self._strangers: set[str] = set()  # tools that were told of
+        self._away: set[str] = set()  # tools that were taken away
+        self._refused: dict[str, str] = {}  # why the newest surface of a tool cannot be used, in brackets
 
     @property
     def tools(self) -> Tools:
@@ -96,6 +98,7 @@ class Hearing:
         for subscription in self._topics:
             self._node.destroy_subscription(subscription)
         self._topics.clear()
+        self._refused.clear()
         self._followed.close()
         self.forget()
 
@@ -112,6 +115,7 @@ class Hearing:
         if tool.name not in self._listened:
             self._listen_to(tool.name)
         self.tools.add(tool, field)
+        self._refused.pop(tool.name, None)
         for sentence in tool.mendings:
             self.gate.say(f"mended {tool.name} {sentence}", f"the mesh of '{tool.name}' was mended: {sentence}")
         if field.flipped:
@@ -124,21 +128,31 @@ class Hearing:
     def refuse(self, tool: Tool, error: BaseException) -> None:
         """Gives an announced tool up; the one of its name from before, if there is one, stays."""
         self.tools.withdraw(tool)
-        self.gate.refuse(f"mesh of {tool.name}", f"mesh of '{tool.name}' refused: {error}")
+        self._refuse_mesh(tool.name, error)
 
-    def look_for_strangers(self) -> None:
-        """Tells once of each tool whose poses are sent and whose surface is not known, at the second look."""
+    def _refuse_mesh(self, name: str, error: BaseException) -> None:
+        why = f"mesh of '{name:.60}' refused: {error}"
+        self._refused[name] = f" ({why})"
+        self.gate.refuse(f"mesh of {name}", why)
+
+    def look_for_strangers(self) -> str:
+        """Which tools' poses are sent in vain, since their surface is not known, from the second look on; empty: none.
+
+        Of each a line tells once.
+        """
         before, self._unknown = self._unknown, {}
         tools = self._node.get_namespace().rstrip("/") + "/tools/"
         for topic, _ in self._node.get_topic_names_and_types():
             name = topic.removeprefix(tools).removesuffix("/pose")
             if topic == f"{tools}{name}/pose" and not self._knows(name) and self._node.count_publishers(topic):
                 self._unknown[name] = topic
-        for name in self._unknown.keys() & before.keys() - self._strangers:
+        said = {name: f"{self._unknown[name]}: poses come, but no surface of '{name}' that can be used is on "
+                      f"contact_mesh; they are not heard{self._refused.get(name, '')}"
+                for name in sorted(self._unknown.keys() & before.keys() - self._away)}  # fmt: skip
+        for name in said.keys() - self._strangers:
             self._strangers.add(name)
-            topic = self._unknown[name]
-            self.gate.say(f"stranger {name}", f"{topic}: poses come, but no surface of '{name}' that can be used is on "
-                          "contact_mesh; they are not heard")  # fmt: skip
+            self.gate.say(f"stranger {name}", said[name])
+        return "; ".join(said.values())
 
     def rivals(self) -> str:
         """Who sends poses of one tool beside another; empty: no tool has two senders."""
@@ -194,12 +208,9 @@ class Hearing:
         self._announce(message.header.frame_id, len(message.triangles), lambda: wire.tool_from(message))
 
     def _announce(self, name: str, triangles: int, read: Callable[[], Tool]) -> None:
-        if not triangles and self._knows(name):
-            self._stop_listening(name)
-            self.tools.remove(name)
-            self._strangers.add(name)  # who takes a tool away may go on sending where it is
-            self._node.get_logger().info(f"tool '{name}' is taken away")
-            return self.on_removed(name)
+        if not triangles:
+            return self._take_away(name)
+        self._away.discard(name)
         try:
             if name == self._config().frame:
                 raise FrameError(f"'{name}' is the body's own frame, in whose axes its wrenches would be read; "
@@ -209,10 +220,19 @@ class Hearing:
                                    f"with a letter or _, at most {MAX_NAME} letters with the namespace.")  # fmt: skip
             tool = read()
         except StmplError as error:
-            return self.gate.refuse(f"mesh of {name}", f"mesh of '{name:.60}' refused: {error}")
+            return self._refuse_mesh(name, error)
         if not self.tools.known(tool):  # sent once more, for who came late: what it touched is not forgotten
             self.tools.announce(tool)
             self.on_tool(tool)
+
+    def _take_away(self, name: str) -> None:
+        self._away.add(name)  # who takes a tool away may go on sending where it is
+        self._refused.pop(name, None)
+        if self._knows(name):
+            self._stop_listening(name)
+            self.tools.remove(name)
+            self._node.get_logger().info(f"tool '{name}' is taken away")
+            self.on_removed(name)
 
     def _on_pose(self, name: str, message: PoseStamped) -> None:
         if self._hears(name) and self.gate.fresh(wire.stamp_ns(message), self._config().max_age):

@@ -401,7 +401,7 @@ class SkinNode(ServingNode):
         self.hearing.now.look()
         if not self.active:
             return self._tell_health([skin_status(name, {}, Health(active=False))])
-        self.hearing.look_for_strangers()
+        senders = "; ".join(filter(None, (self.hearing.rivals(), self.hearing.look_for_strangers())))
         self._look_for_twins()
         inbox, events = self.hearing.inbox, self.hearing.events
         values = self.tally.values() | {
@@ -418,7 +418,8 @@ class SkinNode(ServingNode):
         lately = self._counts.since(reactions=self.tally.reactions, refused=self.tally.refused, stale=self.tally.stale,
                                     out_of_order=inbox.out_of_order, missed=events.missed_deadlines)  # fmt: skip
         health = Health(lately, self.tally.last_refusal, self.answering.fading, bool(inbox.live(self.hearing.now())),
-                        self.bending.doubt, drop=self.tally.last_drop, rivals=self.hearing.rivals())  # fmt: skip
+                        self.bending.doubt, drop=self.tally.last_drop, senders=senders,
+                        building=tuple(tool.name for tool in self.hearing.tools.waiting()))  # fmt: skip
         statuses = [skin_status(name, values, health)]
         if self.answering.limits:
             statuses.append(limits_status(name, self.answering.limits))

@@ -192,6 +192,8 @@ def test_health_tells_what_is_so_now_and_not_what_was():
     assert Health(fading=True).said[0] == DiagnosticStatus.STALE == Health(active=False).said[0]
     assert Health(doubt="no joints").said == (DiagnosticStatus.STALE, "no joints")
     assert Health().said == (DiagnosticStatus.OK, "at rest: no tool is heard")
+    soon = "at rest: no tool is heard; a distance field is being built for big"
+    assert Health(building=("big",)).said == (DiagnosticStatus.OK, soon)
 
 
 def test_another_body_takes_over_while_the_node_goes_on_answering(bus, hand):

@@ -12,15 +12,16 @@ from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState, GetState
 from rclpy.context import Context
 from rclpy.parameter import Parameter
+from stmpl_msgs.msg import ContactMesh
 from stmpl_msgs.srv import SetBody
 
-from bags.wire import pose_message
+from bags.wire import header, pose_message
 from stmpl_ros.node import SkinNode
 from stmpl_ros.parameters import ANY_TIME, CONFIGURING, NodeConfig
 from stmpl_ros.topics import STREAM
 from tests.bus import ROOT, end, running, start
 from tests.conftest import BUSES
-from tests.node_bus import HERE, NODE, PUSH, Bus
+from tests.node_bus import HERE, NODE, PUSH, Bus, Hand
 
 
 def change(bus, number: int = 0, label: str = "") -> bool:
@@ -115,12 +116,13 @@ def test_who_asks_for_the_body_that_answers_is_told_so_at_once_and_nothing_is_ma
     assert hand.ask(HERE, PUSH).touches and len(bus.got["skin/topology"]) == layers
 
 
-def told(bus, do) -> DiagnosticStatus:
-    """What /diagnostics tells once it is not well, while `do` is done again and again."""
+def told(bus, do, says: str = "") -> DiagnosticStatus:
+    """What /diagnostics tells once it is not well, and says so, while `do` is done again and again."""
     heard: list[DiagnosticStatus] = []
     ear = bus.node.create_subscription(DiagnosticArray, "/diagnostics", lambda m: heard.append(m.status[0]), STREAM)
     level = {DiagnosticStatus.WARN, DiagnosticStatus.ERROR}
-    bus.wait(lambda: (do(), bus.spin(0.05), heard and heard[-1].level in level)[-1], "a level")
+    bus.wait(lambda: (do(), bus.spin(0.05), heard and heard[-1].level in level and says in heard[-1].message)[-1],
+             f"a level, and {says}")  # fmt: skip
     bus.node.destroy_subscription(ear)
     return heard[-1]
 
@@ -136,6 +138,22 @@ def test_stamps_that_are_too_old_or_to_come_are_told_in_the_diagnostics(bus, han
     assert ("s before now" if seconds < 0 else "s after now") in late.message
     assert "nowhere" not in late.message and "max_age:=0" in late.message
     assert "max_age:=0" in {one.key: one.value for one in late.values}["last dropped"]
+
+
+def test_poses_of_a_tool_whose_mesh_was_refused_are_told_in_the_diagnostics(bus, hand):
+    torn = ContactMesh(header=header("torn", bus.now()), vertices=[0.0] * 4, triangles=[0, 1, 2])
+    Hand(bus, "nobody", announce=False).take_away()
+    bus.mesh.publish(torn)
+    bus.wait(lambda: bus.said("mesh of 'torn' refused"), "the log line")
+    assert not bus.said("'nobody'"), "who is not known is taken away already"
+    bus.still()
+    bus.spin(1.5)
+    sender = Hand(bus, "torn", announce=False)
+    level = told(bus, lambda: sender.send(HERE), "no surface of 'torn' that can be used").level
+    assert level == DiagnosticStatus.WARN
+    assert "(mesh of 'torn' refused: " in told(bus, lambda: sender.send(HERE)).message
+    for one in (sender.pose, sender.wrench):
+        bus.node.destroy_publisher(one)
 
 
 def test_two_senders_of_one_tool_are_told_in_the_diagnostics_by_their_names(bus, hand):
