@@ -275,7 +275,7 @@ class Answering:
             self.last = answer, instant, before
             for sentence in asked.news:
                 self._news.pop(sentence, None)
-        self._tally.solved(seconds, (self._now() - instant.stamp) / NANO)
+        self._tally.solved(seconds, (self._now() - instant.stamp) / NANO, answer.trust)
 
     def _field_of(self, asked: Asked) -> Answer:
         """The answer to touches. Raises InvalidInput if it would not be finite."""

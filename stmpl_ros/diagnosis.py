@@ -12,6 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 
+from stmpl_core.trust import Trust
 from stmpl_ros.limits import ADVISORY, Limits
 
 RECENT = 1000  # number of answers whose times are kept
@@ -32,6 +33,7 @@ class Tally:
         latencies: times from the stamp of the pose to the publication of recent answers [s].
         touch_times: times spent on recent reactions [s].
         reaction_latencies: times from the stamp of the pose to the publication of recent reactions [s].
+        doubt: that all fields of the last report were out of range, and why the newest was; empty: they were not.
     """
 
     refused: int = 0
@@ -45,6 +47,8 @@ class Tally:
     latencies: deque[float] = field(default_factory=lambda: deque(maxlen=RECENT))
     touch_times: deque[float] = field(default_factory=lambda: deque(maxlen=RECENT))
     reaction_latencies: deque[float] = field(default_factory=lambda: deque(maxlen=RECENT))
+    doubt: str = ""
+    _trusts: list[Trust] = field(default_factory=list)  # of the fields since the last report
     _reported: tuple[int, int, float] = field(default_factory=lambda: (0, 0, time.monotonic()))
 
     def reacted(self, seconds: float, latency: float) -> None:
@@ -53,8 +57,9 @@ class Tally:
         self.touch_times.append(seconds)
         self.reaction_latencies.append(latency)
 
-    def solved(self, seconds: float, latency: float) -> None:
+    def solved(self, seconds: float, latency: float, trust: Trust) -> None:
         """Counts a field, on its own thread."""
+        self._trusts.append(trust)
         self.solve_times.append(seconds)
         self.latencies.append(latency)
 
@@ -64,6 +69,11 @@ class Tally:
         self._reported = self.answers, self.reactions, time.monotonic()
         passed, methods, self.methods = max(self._reported[2] - since, 1e-9), self.methods, Counter()
         shares = {method: count / methods.total() for method, count in list(methods.items())}
+        trusts, self._trusts = self._trusts, []
+        doubted = [trust for trust in trusts if not trust.in_range]
+        self.doubt = ""
+        if len(doubted) == len(trusts) > 1:
+            self.doubt = f"all {len(trusts)} answers of the last second are out of range: {doubted[-1].why}"
         return {
             "answers": str(self.answers),
             "rate [Hz]": f"{(self.answers - answers) / passed:.1f}",
@@ -72,6 +82,7 @@ class Tally:
             **_percentiles("reaction latency", self.reaction_latencies),
             **_percentiles("solve", self.solve_times),
             **_percentiles("latency", self.latencies),
+            "out of range": f"{len(doubted)} of {len(trusts)}",
             "methods": ", ".join(f"{method} {share:.0%}" for method, share in shares.items()),
             "dropped, stale": str(self.stale),
             "refused": str(self.refused),
@@ -111,6 +122,7 @@ class Health(NamedTuple):
         doubt: why it is not known where the limb is.
         active: truth of the claim that the node answers.
         senders: sentence on who sends for one tool beside another, or for one that cannot be used; empty: nobody.
+        out_of_range: sentence on answers that are all out of range; empty: they are not.
         building: names of tools whose distance field is being built.
     """
 
@@ -122,6 +134,7 @@ class Health(NamedTuple):
     active: bool = True
     drop: str = ""
     senders: str = ""
+    out_of_range: str = ""
     building: tuple[str, ...] = ()
 
     @property
@@ -131,6 +144,7 @@ class Health(NamedTuple):
         if not self.active:
             return DiagnosticStatus.STALE, "not active: nothing is answered"
         why = [self.refusal] if "refused" in bad else []
+        more = "; ".join(filter(None, (self.senders, self.out_of_range)))
         why += [self.drop] if bad.keys() & {"stale", "out_of_order"} else []
         if bad and not self.lately.get("reactions"):
             return DiagnosticStatus.ERROR, ": ".join(["nothing that came could be used", *why])
@@ -141,9 +155,9 @@ class Health(NamedTuple):
         if bad:
             told = ", ".join(f"{count} {name.replace('_', ' ')}" for name, count in bad.items())
             said = ": ".join([f"of the messages of the last second {told}", *why])
-            return DiagnosticStatus.WARN, f"{said.rstrip('.')}; {self.senders}" if self.senders else said
-        if self.senders:
-            return DiagnosticStatus.WARN, self.senders
+            return DiagnosticStatus.WARN, f"{said.rstrip('.')}; {more}" if more else said
+        if more:
+            return DiagnosticStatus.WARN, more
         said = "answering" if self.live else "at rest: no tool is heard"
         soon = f"; a distance field is being built for {', '.join(self.building)}" if self.building else ""
         return DiagnosticStatus.OK, said + soon

@@ -21,8 +21,9 @@ from stmpl_core.methods import Winkler
 from stmpl_core.skin import published
 from stmpl_core.touch import BY_POSE, MOVED, STALE, TOUCHING
 from stmpl_core.toucher import Toucher
+from stmpl_core.trust import Trust
 from stmpl_ros.calibration import EVERY
-from stmpl_ros.diagnosis import Counts, Health
+from stmpl_ros.diagnosis import Counts, Health, Tally
 from stmpl_ros.making import restiffened, skin_of
 from stmpl_ros.parameters import NodeConfig
 from stmpl_ros.settings import _told, checked
@@ -192,6 +193,14 @@ def test_health_tells_what_is_so_now_and_not_what_was():
     assert Health(fading=True).said[0] == DiagnosticStatus.STALE == Health(active=False).said[0]
     assert Health(doubt="no joints").said == (DiagnosticStatus.STALE, "no joints")
     assert Health().said == (DiagnosticStatus.OK, "at rest: no tool is heard")
+    doubted, sound = Trust(in_range=False, why="pulls"), Trust()
+    for trusts, told in (((doubted, sound), "1 of 2"), ((doubted,), "1 of 1"), ((doubted, doubted), "2 of 2")):
+        tally = Tally()
+        for trust in trusts:
+            tally.solved(0.1, 0.1, trust)
+        assert tally.values()["out of range"] == told and bool(tally.doubt) == (told == "2 of 2")
+    said = Health(live=True, out_of_range=tally.doubt).said
+    assert said == (DiagnosticStatus.WARN, "all 2 answers of the last second are out of range: pulls")
     soon = "at rest: no tool is heard; a distance field is being built for big"
     assert Health(building=("big",)).said == (DiagnosticStatus.OK, soon)
 
