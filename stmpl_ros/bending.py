@@ -52,6 +52,7 @@ class Bending:
         self._held = 0.0  # time in which the node could not listen [s]
         self._stands = 0.0  # when the angles came that the newest skin stands at [s]; 0: none yet
         self._others = ""  # joints that messages told of instead
+        self._refused = "", 0.0  # why the last message that could not be used could not, and when it came [s]
         self._lock = threading.Lock()  # held while the newest skin is changed
         self._subscription: Any = None
         self._thread: LatestWins[tuple[Skin, tuple[float, ...], float]] | None = None
@@ -83,7 +84,7 @@ class Bending:
         if self._thread is not None:
             self._thread.close()
         self._subscription = self._thread = self._rest = self.newest = None
-        self._heard, self._stands, self._others = {}, 0.0, ""
+        self._heard, self._stands, self._others, self._refused = {}, 0.0, "", ("", 0.0)
 
     def held_up(self, seconds: float) -> None:
         """Takes time in which the node could not listen [s] out of the silence of its sensors."""
@@ -104,17 +105,25 @@ class Bending:
         if unheard or not heard:
             others = f" (there: {self._others}; see the parameter joints)" if self._others else ""
             whose = ", ".join(unheard) if heard else "the limb"
-            return f"no joint states of {whose} on {self._config().joint_states} yet{others}: it is taken to be at rest"
+            topic = self._config().joint_states
+            return f"no joint states of {whose} on {topic} yet{self._useless}{others}: it is taken to be at rest"
         silent = {name: now - one.came for name, one in heard.items() if now - one.came > SILENT_S}
         if silent:
             whose = "" if len(silent) == len(heard) else f" of {', '.join(silent)}"
-            return f"no joint states{whose} for {max(silent.values()):.0f} s: the limb is taken to be where it was"
+            return (f"no joint states{whose}{self._useless} for {max(silent.values()):.0f} s: the limb is taken to be "
+                    "where it was")  # fmt: skip
         if not self._stands:
             return "the skin is not bent as the joint states say yet: it is taken to be at rest"
         behind = max(one.came for one in heard.values()) - self._stands
         if behind > SILENT_S:
             return f"the skin was not bent for {behind:.0f} s: the limb is taken to be where it was"
         return ""
+
+    @property
+    def _useless(self) -> str:
+        """What is said of messages that come and cannot be used; empty: none come."""
+        why, came = self._refused
+        return f" that could be used (refused: {why})" if why and self._now() - came < SILENT_S else ""
 
     def _on_joints(self, message: JointState) -> None:
         gate, stamp, now = self._hearing.gate, wire.stamp_ns(message), self._now()
@@ -132,8 +141,10 @@ class Bending:
             heard = self._heard | {name: _Heard(angle, stamp, now) for name, angle in told.items()}
             angles = rig.angles({name: one.angle for name, one in heard.items()})
         except StmplError as error:
+            self._refused = str(error), now
             return gate.refuse("joints", str(error))
         if not gate.fresh(stamp, self._config().max_age):
+            self._refused = gate.dropped, now
             return None
         last = [self._heard[name] for name in told if name in self._heard]
         if any(stamp <= one.stamp and now - one.came < SILENT_S for one in last):

@@ -144,11 +144,11 @@ class Health(NamedTuple):
         if not self.active:
             return DiagnosticStatus.STALE, "not active: nothing is answered"
         why = [self.refusal] if "refused" in bad else []
-        more = "; ".join(filter(None, (self.senders, self.out_of_range)))
+        more = "; ".join(filter(None, (self.doubt or self.out_of_range, self.senders)))
         why += [self.drop] if bad.keys() & {"stale", "out_of_order"} else []
         if bad and not self.lately.get("reactions"):
             return DiagnosticStatus.ERROR, ": ".join(["nothing that came could be used", *why])
-        if self.doubt:
+        if self.doubt and not bad:
             return DiagnosticStatus.STALE, self.doubt
         if self.fading:
             return DiagnosticStatus.STALE, "input has stopped: the last answer fades"

@@ -192,6 +192,8 @@ def test_health_tells_what_is_so_now_and_not_what_was():
     assert level == DiagnosticStatus.ERROR and said.endswith("no frame")
     assert Health(fading=True).said[0] == DiagnosticStatus.STALE == Health(active=False).said[0]
     assert Health(doubt="no joints").said == (DiagnosticStatus.STALE, "no joints")
+    level, said = Health({"reactions": 4, "refused": 3}, "nan", doubt="no joints").said
+    assert level == DiagnosticStatus.WARN and said.endswith("3 refused: nan; no joints")
     assert Health().said == (DiagnosticStatus.OK, "at rest: no tool is heard")
     doubted, sound = Trust(in_range=False, why="pulls"), Trust()
     for trusts, told in (((doubted, sound), "1 of 2"), ((doubted,), "1 of 1"), ((doubted, doubted), "2 of 2")):

@@ -114,6 +114,22 @@ def test_what_no_joint_can_be_is_refused_and_the_limb_stays(bus, person):
         assert list(hand.ask(HERE).joints) == [0.2]
 
 
+def test_joint_states_that_are_all_refused_are_no_silence(bus, person):
+    hand = bus.tool("probe").ready()
+    at_angle(bus, person, hand, 0.2)
+    said = "no joint states that could be used (refused: joint elbow_2 is nan rad; it must be finite"
+
+    def refused():
+        person.bend(float("nan"))
+        bus.spin(0.1)
+        answer = hand.ask(HERE)
+        return answer if said in answer.why else None
+
+    answer = bus.wait(refused, said)
+    assert not answer.in_range and list(answer.joints) == [0.2]
+    assert at_angle(bus, person, hand, 0.2).in_range
+
+
 def test_a_sensor_that_falls_silent_is_said_and_flagged_and_comes_back(bus, person):
     hand = bus.tool("probe").ready()
     models, heard = bus.got["tools/probe/local_contact"], bus.listen(LocalContact, "tools/probe/local_contact", STREAM)
