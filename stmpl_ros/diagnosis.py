@@ -123,6 +123,7 @@ class Health(NamedTuple):
         active: truth of the claim that the node answers.
         senders: sentence on who sends for one tool beside another, or for one that cannot be used; empty: nobody.
         out_of_range: sentence on answers that are all out of range; empty: they are not.
+        paused: truth of the claim that the simulated clock stands still.
         building: names of tools whose distance field is being built.
     """
 
@@ -135,6 +136,7 @@ class Health(NamedTuple):
     drop: str = ""
     senders: str = ""
     out_of_range: str = ""
+    paused: bool = False
     building: tuple[str, ...] = ()
 
     @property
@@ -160,7 +162,7 @@ class Health(NamedTuple):
             return DiagnosticStatus.WARN, more
         said = "answering" if self.live else "at rest: no tool is heard"
         soon = f"; a distance field is being built for {', '.join(self.building)}" if self.building else ""
-        return DiagnosticStatus.OK, said + soon
+        return DiagnosticStatus.OK, f"{said}{'; the simulated clock is paused' if self.paused else ''}{soon}"
 
 
 def skin_status(node: str, values: Mapping[str, str], health: Health) -> DiagnosticStatus:

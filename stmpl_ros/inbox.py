@@ -14,6 +14,7 @@ from stmpl_core.contact import Contact
 from stmpl_core.tools import Tools
 
 RECENT = 1_000_000_000  # time for which a tool that fell silent is told of [ns]
+JUST_NOW = 100_000_000  # time on a simulated clock since a message that is sent again while that stands still [ns]
 PATIENCE = 3  # number of poses of a tool that may pass a missing partner before the newest of each is taken as it is
 
 
@@ -94,6 +95,11 @@ class Inbox:
     def pose_of(self, name: str) -> Transform | None:
         """The newest pose of a tool, if there is one."""
         return self.inputs[name].pose.value if name in self.inputs else None
+
+    def repeats(self, kind: str, name: str, stamp: int, now: int) -> bool:
+        """Whether this is the stamp of the newest pose or wrench (`kind`) of a tool, which came just now."""
+        stream = getattr(self.inputs.get(name, Input()), kind)
+        return stream.stamp == stamp and stream.live(now, JUST_NOW)
 
     def put_pose(self, name: str, pose: Transform, stamp: int, now: int) -> bool:
         """Keeps a pose; False if it was dropped as repeated or out of order."""

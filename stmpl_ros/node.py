@@ -419,7 +419,7 @@ class SkinNode(ServingNode):
                                     out_of_order=inbox.out_of_order, missed=events.missed_deadlines)  # fmt: skip
         health = Health(lately, self.tally.last_refusal, self.answering.fading, bool(inbox.live(self.hearing.now())),
                         self.bending.doubt, drop=self.tally.last_drop, senders=senders,
-                        out_of_range=self.tally.doubt,
+                        out_of_range=self.tally.doubt, paused=self.hearing.now.paused,
                         building=tuple(tool.name for tool in self.hearing.tools.waiting()))  # fmt: skip
         statuses = [skin_status(name, values, health)]
         if self.answering.limits:

@@ -29,11 +29,14 @@ class Ticks:
         node: node whose clock it is.
 
     Attributes:
+        simulated: truth of the claim that the simulated clock counts, at the last look.
+        paused: truth of the claim that it stood still between the last two looks.
         on_back: callback for a simulated clock that was set back.
     """
 
     def __init__(self, node: Node) -> None:
-        self._node, self._simulated, self._ahead, self._last = node, False, 0, 0
+        self._node, self.simulated, self.paused, self._ahead, self._last = node, False, False, 0, 0
+        self._looked = 0  # simulated time at the last look [ns]
         self.on_back: Callable[[], None] = lambda: None
         threshold = JumpThreshold(min_forward=None, min_backward=Duration(nanoseconds=-1), on_clock_change=False)
         self._jumps = node.get_clock().create_jump_callback(threshold, post_callback=self._back)
@@ -44,18 +47,20 @@ class Ticks:
         return self._last
 
     def look(self) -> None:
-        """Looks whether a simulation is there."""
+        """Looks whether a simulation is there, and goes on."""
         asked = self._node.get_parameter_or(USE_SIM_TIME_NAME)
         simulated = bool(asked.value) and self._node.count_publishers(CLOCK) > 0
-        if simulated != self._simulated:
+        if simulated != self.simulated:
             now = self()
-            self._simulated = simulated
+            self.simulated = simulated
             self._ahead = now - self._source()
+        before, self._looked = self._looked, self._node.get_clock().now().nanoseconds
+        self.paused = simulated and self._looked == before
 
     def _source(self) -> int:
-        return self._node.get_clock().now().nanoseconds if self._simulated else time.monotonic_ns()
+        return self._node.get_clock().now().nanoseconds if self.simulated else time.monotonic_ns()
 
     def _back(self, _: object) -> None:
-        if self._simulated:
+        if self.simulated:
             self._ahead = self._last - self._source()
         self.on_back()

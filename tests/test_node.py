@@ -203,6 +203,7 @@ def test_health_tells_what_is_so_now_and_not_what_was():
         assert tally.values()["out of range"] == told and bool(tally.doubt) == (told == "2 of 2")
     said = Health(live=True, out_of_range=tally.doubt).said
     assert said == (DiagnosticStatus.WARN, "all 2 answers of the last second are out of range: pulls")
+    assert Health(live=True, paused=True).said == (DiagnosticStatus.OK, "answering; the simulated clock is paused")
     soon = "at rest: no tool is heard; a distance field is being built for big"
     assert Health(building=("big",)).said == (DiagnosticStatus.OK, soon)
 

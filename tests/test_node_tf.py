@@ -312,7 +312,11 @@ def test_a_simulation_slower_than_its_clock_is_not_silent_and_one_that_is_gone_i
         before = ticks()
         time.sleep(0.05)
         assert ticks() == before, "a paused simulation is not silent"
+        ticks.look()
+        assert ticks.simulated and ticks.paused
         say(10.5)
+        ticks.look()
+        assert not ticks.paused
         assert ticks() - before == NANO // 2
         say(3.0)
         assert backs and ticks() - before == NANO // 2, "the count never goes back"

@@ -241,6 +241,15 @@ def test_messages_out_of_order_or_repeated_are_dropped_and_counted():
     assert inbox.put_pose("probe", np.eye(4), 4 * MS, 300 * MS), "a device that was silent may start its clock again"
 
 
+def test_a_message_that_is_sent_again_while_the_clock_stands_still_is_known():
+    inbox = _inbox("probe")
+    assert not inbox.repeats("pose", "probe", 0, 0), "the first one is none"
+    inbox.put_pose("probe", np.eye(4), 5 * MS, 10 * MS)
+    assert inbox.repeats("pose", "probe", 5 * MS, 20 * MS) and not inbox.repeats("wrench", "probe", 5 * MS, 20 * MS)
+    assert not inbox.repeats("pose", "probe", 6 * MS, 20 * MS)
+    assert not inbox.repeats("pose", "probe", 5 * MS, 120 * MS), "the clock goes on, and a sender that does not is told"
+
+
 def test_a_silent_tool_is_no_longer_in_contact():
     inbox = _inbox("probe", "thumb")
     inbox.put_pose("probe", np.eye(4), 1 * MS, 0)
