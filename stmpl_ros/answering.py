@@ -182,7 +182,7 @@ class Answering:
         said = self._remarks(instant, touches, back)
         doubt, skin = self._bending.doubt, self.simulator.skin
         if doubt:
-            self._hearing.gate.say("joints", doubt)
+            self._hearing.gate.say("where the limb is", doubt)
         asked = Asked(instant, reaction, self._fields, self._epoch, seconds, tuple(self._news), said, skin, doubt)
         self._field.put(asked)
         self.sending.models.put(instant, touches, reaction.before, doubt)

@@ -64,4 +64,4 @@ class Gate:
             self._said[kind] = last, held + 1
             return
         self._said[kind] = now, 0
-        self._node.get_logger().warning(f"{text} ({held} more like it before)" if held else text)
+        self._node.get_logger().warning(f"{text} ({held} more of its kind before)" if held else text)

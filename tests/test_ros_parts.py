@@ -308,7 +308,7 @@ def test_one_line_of_a_kind_comes_through_and_tells_how_many_did_not(monkeypatch
     assert line("nan", "not finite", 0.0) == "not finite"
     assert line("frame", "wrong frame", 0.1) == "wrong frame", "another kind is not held back"
     assert [line("nan", "not finite", t) for t in (0.2, 0.9)] == [None, None]
-    assert line("nan", "not finite", 1.0) == "not finite (2 more like it before)"
+    assert line("nan", "infinite", 1.0) == "infinite (2 more of its kind before)", "of this or another text"
     assert line("nan", "not finite", 2.5) == "not finite"
 
 
