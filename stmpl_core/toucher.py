@@ -251,7 +251,12 @@ class Toucher:
         inside = not light and not len(squeeze.nodes.area) and not self.columns.between(field, pose, 0.0) \
             and self.deep.inside(field, pose, tool)
         if force is not None and not force.any():
-            return nothing(NO_FORCE if depth > 0 or inside else APART)
+            felt_from = max(self.reach, MUCH_MOVED * float(squeeze.nodes.thickness.max(initial=0.0)))
+            if inside or (depth > felt_from and not light):
+                deep = "inside the limb" if inside else f"{1e3 * depth:.2g} mm deep in the skin"
+                why = f"{contact.name} is {deep} by its pose, and its force is zero: they disagree. Check its sensor"
+                return nothing(NO_FORCE)._replace(why=why)
+            return nothing(NO_FORCE if depth > 0 else APART)
         if inside or self.deep.strain(squeeze) >= DEEPEST:
             back, drawn, way = self.deep.drawn_back(field, pose, tool, squeeze)
             core = inside or bool((squeeze.depth >= self.layer.thickness[squeeze.vertices]).any())

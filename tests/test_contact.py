@@ -34,6 +34,7 @@ from stmpl_core.toucher import Toucher, groups_of
 from tests.scenes import (
     LENGTH,
     RADIUS,
+    THICKNESS,
     at,
     ball,
     band,
@@ -99,6 +100,8 @@ def test_zero_wrench_moves_nothing_at_any_pose(sim: Simulator, depth: float) -> 
     answer = sim.step([press(BALL, on_limb(depth), (0, 0, 0))])
     assert not answer.displacement.any()
     assert touch_of(answer).status == (NO_FORCE if depth > 0 else APART)
+    numb = "mm deep in the skin by its pose, and its force is zero: they disagree"
+    assert (numb in answer.trust.why) == (not answer.trust.in_range) == (depth > 0.5 * THICKNESS)
 
 
 @pytest.mark.parametrize("force", [(-0.3, 0, 0), (-0.2, 0.1, 0.05), (-0.4, -0.08, 0.06)])
