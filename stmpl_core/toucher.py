@@ -464,8 +464,9 @@ class Toucher:
         )  # fmt: skip
         trust = self._trust(one, touch, v, pressure, strange, alone, covered)
         if beside_off > MAX_BESIDE:
-            trust = trust.also(f"{touch.name} was moved to where it presses so alone; beside the other tools that is "
-                               f"{beside_off:.0%} off", in_range=False)  # fmt: skip
+            where = (f"no place was found where {touch.name} presses so: the nearest" if held is one.held else
+                     f"{touch.name} was moved to where it presses so alone; beside the other tools that")  # fmt: skip
+            trust = trust.also(f"{where} is {beside_off:.0%} off", in_range=False)
         if wider > 1 and len(v):
             trust = trust.also(f"{touch.name} presses with pins of {1e3 * radius:.2g} mm radius, "
                                f"{1e3 * depth:.2g} mm deep, that feel each other; contacts were learnt of one area",

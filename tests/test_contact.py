@@ -104,6 +104,12 @@ def test_zero_wrench_moves_nothing_at_any_pose(sim: Simulator, depth: float) -> 
     assert (numb in answer.trust.why) == (not answer.trust.in_range) == (depth > 0.5 * THICKNESS)
 
 
+def test_a_force_that_is_too_small_to_be_placed_is_not_laid_to_other_tools_where_there_are_none(sim: Simulator) -> None:
+    answer = sim.step([press(BALL, on_limb(2e-3), (-1e-12, 0, 0))])
+    assert not answer.trust.in_range and "no place was found where probe presses so" in answer.trust.why
+    assert "other tools" not in answer.trust.why
+
+
 @pytest.mark.parametrize("force", [(-0.3, 0, 0), (-0.2, 0.1, 0.05), (-0.4, -0.08, 0.06)])
 @pytest.mark.parametrize("mesh, x", [(BALL, RADIUS + 0.010), (PUNCH, RADIUS + 0.008)])
 def test_load_sums_to_the_normal_component_of_the_wrench(
