@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -67,7 +69,7 @@ def recover(source: Path | str, target: Path | str | None = None) -> Recovery:
     schemas, channels = dict(index.schemas), dict(index.channels)
     damage, orphans, messages, finished, times = [], 0, 0, False, [0, 0]
     copied: dict[int, int] = {}
-    with BagWriter(target) as writer:
+    with _begun(target, source) as writer:
         for record in walk(source):
             match record:
                 case Schema():
@@ -97,6 +99,18 @@ def recover(source: Path | str, target: Path | str | None = None) -> Recovery:
         raise BagError(f"{source} holds no sound message: {damage[0]}.")
     seconds = (times[1] - times[0]) / 1e9
     return Recovery(source, writer.path, messages, seconds, orphans, index.messages, tuple(damage), finished)
+
+
+@contextmanager
+def _begun(target: Path, source: Path) -> Iterator[BagWriter]:
+    """The writer of a copy; where that fails, its file is removed."""
+    writer = BagWriter(target, source=source)
+    try:
+        with writer:
+            yield writer
+    except BagError:
+        writer.path.unlink(missing_ok=True)
+        raise
 
 
 def _copy_channel(writer: BagWriter, channel: Channel, schemas: dict[int, Schema], copied: dict[int, int]) -> bool:

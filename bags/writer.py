@@ -99,15 +99,16 @@ class BagWriter:
     Args:
         path: path of a folder, which gets FILE, or of the .mcap file; metadata.yaml goes beside it.
         chunk_seconds: wall-clock time after which a chunk is closed and handed to the operating system.
+        source: recording that this one is a copy of, to be copied again if the disk refuses; None: it is none.
 
     Raises:
         BagError: a file that exists, or cannot be written.
     """
 
-    def __init__(self, path: Path | str, *, chunk_seconds: float = 1.0) -> None:
+    def __init__(self, path: Path | str, *, chunk_seconds: float = 1.0, source: Path | None = None) -> None:
         path = Path(path)
         self.path = path if path.suffix == ".mcap" else path / FILE
-        self._chunk_seconds = chunk_seconds
+        self._chunk_seconds, self._source = chunk_seconds, source
         self._topics: dict[int, _Topic] = {}
         self._schemas: dict[tuple[str, str, bytes], int] = {}
         self._times: tuple[int, int] | None = None
@@ -238,13 +239,21 @@ class BagWriter:
         try:
             return act()
         except OSError as error:
-            self._error = BagError(
-                f"writing {self.path} failed: {error.strerror}. Safe on disk are the first {self.safe_messages} of "
-                f"{self._messages} messages ({self._safe_bytes / 1e6:.1f} MB, whole chunks). Make room, then bring "
-                f"them back with: stmpl recover {self.path}"
-            )
+            self._error = BagError(f"writing {self.path} failed: {error.strerror}. {self._left}")
             log.error("%s", self._error)
             raise self._error from error
+
+    @property
+    def _left(self) -> str:
+        """What a disk that refused has left, and what to do."""
+        if self._source:
+            return (f"{self._source} is as it was. Make room, then bring it back with: stmpl recover {self._source} "
+                    f"--target {self.path}")  # fmt: skip
+        if not self.safe_messages:
+            return f"None of {self._messages} messages is safe on disk. Make room, and record into another folder."
+        return (f"Safe on disk are the first {self.safe_messages} of {self._messages} messages "
+                f"({self._safe_bytes / 1e6:.1f} MB, whole chunks). Make room, then bring them back with: "
+                f"stmpl recover {self.path}")  # fmt: skip
 
     def _drop_file(self) -> None:
         """Closes the file; what a failed disk did not take is thrown away."""

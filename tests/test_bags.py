@@ -7,6 +7,7 @@ import resource
 import signal
 import subprocess
 import sys
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -226,17 +227,42 @@ def test_what_is_no_recording_is_refused(tmp_path):
         Bag(tmp_path / "nowhere")
 
 
-def test_a_full_disk_says_what_is_safe(tmp_path):
+@contextmanager
+def full_disk():
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (60_000, limits[1]))
     try:
-        with pytest.raises(BagError, match=r"Safe on disk are the first \d+ of \d+ messages") as caught:
-            with BagWriter(tmp_path / "run", chunk_seconds=0.0) as bag:
-                channel = bag.add_channel("/count", HEADER)
-                for k in range(10_000):
-                    bag.write(channel, cdr(header(f"{k}", START + k)), START + k, START + k)
+        yield
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+
+
+def test_a_recovery_on_a_full_disk_leaves_nothing_and_names_its_source(tmp_path):
+    random = np.random.default_rng(0)
+
+    def record(name: str) -> None:
+        with BagWriter(tmp_path / name, chunk_seconds=60.0) as bag:
+            channel = bag.add_channel("/count", HEADER)
+            for k in range(2000):
+                bag.write(channel, cdr(header(random.bytes(50).hex(), START + k)), START + k, START + k)
+
+    record("run")
+    source, target = tmp_path / "run" / "run_0.mcap", tmp_path / "back" / "run_0.mcap"
+    with full_disk():
+        with pytest.raises(BagError, match="None of 2000 messages is safe"):
+            record("none")
+        with pytest.raises(BagError, match=f"stmpl recover {source} --target {target}"):
+            recover(tmp_path / "run", tmp_path / "back")
+    assert not target.exists()
+    assert recover(tmp_path / "run", tmp_path / "back").messages == 2000
+
+
+def test_a_full_disk_says_what_is_safe(tmp_path):
+    with full_disk(), pytest.raises(BagError, match=r"Safe on disk are the first \d+ of \d+ messages") as caught:
+        with BagWriter(tmp_path / "run", chunk_seconds=0.0) as bag:
+            channel = bag.add_channel("/count", HEADER)
+            for k in range(10_000):
+                bag.write(channel, cdr(header(f"{k}", START + k)), START + k, START + k)
     safe = int(str(caught.value).split("the first ")[1].split()[0])
     recover(tmp_path / "run", tmp_path / "back")
     assert safe > 0 and numbers(tmp_path / "back")[:safe] == list(range(safe))
