@@ -119,7 +119,7 @@ class Health(NamedTuple):
         drop: why the last message was dropped.
         fading: truth of the claim that the last answer fades, as input has stopped.
         live: truth of the claim that a tool is heard.
-        doubt: why it is not known where the limb is.
+        doubt: why it is not known where the limb is; or what an inactive node is at.
         active: truth of the claim that the node answers.
         senders: sentence on who sends for one tool beside another, or for one that cannot be used; empty: nobody.
         out_of_range: sentence on answers that are all out of range; empty: they are not.
@@ -144,7 +144,7 @@ class Health(NamedTuple):
         """Level and sentence: ERROR: nothing that came could be used; STALE: what should come does not."""
         bad = {name: count for name, count in self.lately.items() if count and name != "reactions"}
         if not self.active:
-            return DiagnosticStatus.STALE, "not active: nothing is answered"
+            return DiagnosticStatus.STALE, "; ".join(filter(None, ("not active: nothing is answered", self.doubt)))
         why = [self.refusal] if "refused" in bad else []
         more = "; ".join(filter(None, (self.doubt or self.out_of_range, self.senders)))
         why += [self.drop] if bad.keys() & {"stale", "out_of_order"} else []

@@ -13,6 +13,7 @@ from typing import Any
 
 import numba
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from numba.core.event import install_listener
 from rclpy.experimental.events_executor import EventsExecutor
 from rclpy.lifecycle import LifecycleState, TransitionCallbackReturn
 from rclpy.logging import get_logger
@@ -38,7 +39,9 @@ from stmpl_ros.hearing import Hearing
 from stmpl_ros.lifecycle import ServingNode, told
 from stmpl_ros.limits import Limits
 from stmpl_ros.making import (
+    TOLD_EVERY_S,
     Build,
+    Compiling,
     at_once,
     check,
     check_part,
@@ -137,8 +140,9 @@ class SkinNode(ServingNode):
             check(self.config, self._build)
             self.answering.limits = Limits.read(self.config.limits, self.config.limb)
             builders = Builders()  # start while the skin is made
-            for simulator in self._answer_on(self._make_skin(), self.config, builders):
-                warm_up(simulator)
+            with install_listener("numba:compile", Compiling(self._tell_progress)):
+                for simulator in self._answer_on(self._make_skin(), self.config, builders):
+                    warm_up(simulator)
         except StmplError as error:
             self._end()
             self.get_logger().error(f"cannot be configured: {error}")
@@ -211,10 +215,14 @@ class SkinNode(ServingNode):
         """At once where that is quick, else in a process beside this one: Ctrl-C is heard meanwhile."""
         if at_once(self.config, self._build):
             return skin_of(self.config, self._build)
-        self.get_logger().info(f"making {self.config.limb}; this may take a minute")
-        making = Beside(skin_of, self.config, self._build)
+        self._tell_progress(f"making {self.config.limb}; this may take a minute, the first time some")
+        making, started, told = Beside(skin_of, self.config, self._build), time.monotonic(), 0
         try:
             while True:
+                passed = time.monotonic() - started
+                if passed >= (told + 1) * TOLD_EVERY_S:
+                    told = int(passed / TOLD_EVERY_S)
+                    self._tell_progress(f"making {self.config.limb} for {passed:.0f} s")
                 try:
                     return making.result.result(POLL_PERIOD_S)
                 except TimeoutError:
@@ -425,6 +433,11 @@ class SkinNode(ServingNode):
         if self.answering.limits:
             statuses.append(limits_status(name, self.answering.limits))
         self._tell_health(statuses)
+
+    def _tell_progress(self, said: str) -> None:
+        """Tells of what takes long, in the log and on /diagnostics: no timer runs while the node configures."""
+        self.get_logger().info(said)
+        self._tell_health([skin_status(self.get_fully_qualified_name(), {}, Health(active=False, doubt=said))])
 
     def _tell_health(self, statuses: list[DiagnosticStatus]) -> None:
         self.diagnostics.publish(diagnostics(statuses, self.get_clock().now().to_msg()))

@@ -9,6 +9,8 @@ import pytest
 from geometry_msgs.msg import PoseStamped
 from hypothesis import given
 from hypothesis import strategies as st
+from numba import njit
+from numba.core.event import install_listener
 from rclpy.serialization import deserialize_message, serialize_message
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
@@ -48,6 +50,7 @@ from stmpl_ros.calibration import strokes_of
 from stmpl_ros.diagnosis import Tally
 from stmpl_ros.gate import SAY_EVERY, Gate
 from stmpl_ros.inbox import PATIENCE, Inbox
+from stmpl_ros.making import Compiling
 from stmpl_ros.parameters import NodeConfig
 from stmpl_ros.scripts import DEEPEST, ON_LIMBS, ON_ONE_LAYER, PRESS, Device, Keyframe, Motion, scripts_for
 from stmpl_ros.show import SkinMarker
@@ -310,6 +313,14 @@ def test_one_line_of_a_kind_comes_through_and_tells_how_many_did_not(monkeypatch
     assert [line("nan", "not finite", t) for t in (0.2, 0.9)] == [None, None]
     assert line("nan", "infinite", 1.0) == "infinite (2 more of its kind before)", "of this or another text"
     assert line("nan", "not finite", 2.5) == "not finite"
+
+
+def test_kernels_are_told_of_as_they_are_compiled():
+    said: list[str] = []
+    with install_listener("numba:compile", Compiling(said.append)):
+        twice = njit(lambda x: 2 * x)
+        assert twice(2) == 4 == twice(2) and twice(1.5) == 3, "two kernels, and one of them again"
+    assert [one[:29] for one in said] == ["compiling kernels, number 1; "], "a line is enough for a while"
 
 
 def test_a_share_of_an_answer_is_smaller_stale_and_not_to_be_trusted():
