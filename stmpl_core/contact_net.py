@@ -33,6 +33,7 @@ ROUND_FROM = 0.05  # overlap over the thickness to which curvature is compared a
 SMALL_STEP = 5e-3  # of the largest force, in which the network's part of a slope is found: far above float32's noise
 APART = 1e-3  # depth, relative, that skin may miss beside other tools and still be off a tool that does not press
 FAR_OUTSIDE = 0.3  # standard deviations beyond the training contacts, from which a node is all outside
+LITTLE = 0.1  # share of its correction up to which a network says next to nothing, and need not know what it sees
 STACK_FADE = 0.1  # the same on a stack, whose linear response alone is good to some percent up to there
 
 
@@ -42,7 +43,7 @@ class Held(NamedTuple):
     Args:
         pressure: pressure over E at the nodes, (N,) [-].
         doubt: error to expect of it, over E, (N,) [-].
-        outside: degree to which the nodes see what no training contact had, from 0 to 1, (N,) [-].
+        outside: degree to which the nodes see what no training contact had, from 0 to 1, (N,) [-]; 0 in a first touch.
         power: power of the depth with which the force grows, about [-].
         shell: share of the linear work by which a limb is stiffer than its flat stack [-]; stiff skin around it stands
             up like a shell, until it is dented.
@@ -428,7 +429,8 @@ def _correct(pressure, inputs, fade, low, high, mean, scale, w1, b1, w2, b2, w3,
     for n in range(count):
         for m in range(len(low)):
             value = min(max(inputs[n, m], low[m]), high[m])
-            outside[n] = max(outside[n], min(abs(inputs[n, m] - value) * scale[m] / FAR_OUTSIDE, 1.0))
+            if fade[n] > LITTLE:
+                outside[n] = max(outside[n], min(abs(inputs[n, m] - value) * scale[m] / FAR_OUTSIDE, 1.0))
             kept[n, m] = (value - mean[m]) * scale[m]
     think_few(kept, w1, b1, w2, b2, w3, b3, w4, b4, outputs)
     for n in range(count):

@@ -500,6 +500,13 @@ def test_what_the_skin_cannot_carry_is_said_and_not_scaled(sim: Simulator, force
     assert answer.magnitude.max() < LIMB.thickness.max()
 
 
+def test_a_first_touch_that_carries_next_to_nothing_is_not_flagged() -> None:
+    toucher = Toucher(plate(0.08))
+    for depth in (20e-6, 25e-6, 30e-6, 50e-6):
+        touch = toucher.touch(Contact(ball(0.01), at(0, 0, 0.01 - depth)))
+        assert 0 < touch.force < 1e-3 and touch.trust.in_range
+
+
 def test_bad_input_is_refused_with_a_reason(sim: Simulator) -> None:
     with pytest.raises(InvalidInput, match="wrench of probe holds 1"):
         press(BALL, on_limb(), (np.nan, 0, 0))
