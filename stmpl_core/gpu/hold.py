@@ -22,6 +22,7 @@ POWER_TOLERANCE = wp.constant(wp.float64(obstacle.POWER_TOLERANCE))
 LINEAR_TO = wp.constant(wp.float64(contact_net.LINEAR_TO))
 STACK_LINEAR_TO = wp.constant(wp.float64(contact_net.STACK_LINEAR_TO))
 HARDENING = wp.constant(wp.float64(contact_net.HARDENING))
+LITTLE = wp.constant(wp.float64(contact_net.LITTLE))
 FADE, FADE_RING = wp.constant(wp.float64(contact_net.FADE)), wp.constant(contact_net.FADE_RING)
 LARGEST = wp.constant(wp.float64(contact_net.MAX_LOG_RATIO))
 START, SMALL, SMALLER = (wp.constant(wp.float64(x)) for x in (0.3, 1e-3, 1e-4))
@@ -362,7 +363,7 @@ def judge(lanes: wp.int32, scratch: Scratch, net: Net):
         for m in range(net.low.shape[0]):
             given = scratch.inputs[s, i, m]
             kept = wp.clamp(given, net.low[m], net.high[m])
-            if kept != given:
+            if kept != given and scratch.fade[s, i] > LITTLE:
                 scratch.strange[s, i] = 1
             scratch.inputs[s, i, m] = (kept - net.mean[m]) * net.scale[m]
 
