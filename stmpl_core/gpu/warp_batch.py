@@ -13,6 +13,7 @@ Geometry and the linear problem are float64, the network float32, as in the law 
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterable, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass
@@ -28,8 +29,10 @@ from stmpl_core.gpu.fields import Fields
 from stmpl_core.networks import shipped
 from stmpl_core.obstacle import MAX_ITERATIONS
 from stmpl_core.skin import Skin
+from stmpl_core.soundness import too_long
 from stmpl_core.tool import Tool
 
+log = logging.getLogger(__name__)
 STATUSES = ("pending", "apart", "pressed by pose", "wrapped around", "refused", "too deep", "no room")
 LANES = 128  # threads that share the work of a scene on a GPU
 MEMORY = {True: 8 << 30, False: 256 << 20}  # scratch space on a GPU and on a CPU [bytes]
@@ -345,6 +348,9 @@ def _check(skin: Any) -> None:
         raise InvalidInput("a batch needs prepared skins. Try Skin.of(layer, MomentNet()).")
     if skin.rest is not None:
         raise InvalidInput("a skin that joints have moved is not served by WarpBatch yet; skin at rest is. Try Batch.")
+    if many := len(too_long(skin.layer)):
+        log.warning("%d triangles of the skin are so long that a tool between their corners is told as apart: remesh "
+                    "the skin, or take Batch, which flags it", many)  # fmt: skip
 
 
 def _known(network: str) -> Any:
