@@ -281,7 +281,7 @@ def test_a_trained_network_comes_with_a_card_that_says_what_made_it(data: Path, 
 
 def test_what_training_saw_is_not_outside_however_it_mixed_its_inputs(data: Path, tmp_path: Path) -> None:
     """Mixing is learnt, so the inputs' ranges change: they are taken again, or all would be outside in the end."""
-    settings = SETTINGS.model_copy(update={"steps": 1200, "learning_rate": 2e-2, "checkpoint_minutes": 1e3})
+    settings = SETTINGS.model_copy(update={"steps": 600, "learning_rate": 2e-2, "checkpoint_minutes": 1e3})
     points = draw_points(Dataset.open(data), settings, lambda *_: None)
     rows = torch.from_numpy(points.rows)
     model = fit(points, settings, tmp_path, lambda *_: None)

@@ -134,7 +134,7 @@ def test_no_fuzzed_path_gains_energy_from_late_models(seed: int, friction: float
     assert book.gained < 0.01
 
 
-@pytest.mark.parametrize("kind", list(KINDS))
+@pytest.mark.parametrize("kind", ["mu 0.5", "both"])
 def test_a_device_that_strokes_skin_which_relaxes_and_rubs_is_passive(kind: str) -> None:
     hard = arm_spot().with_modulus(HARD / 10).with_memory(*KINDS[kind])
     hand, device = Hand(stroke=8e-3), Device()

@@ -242,10 +242,12 @@ def test_truth_is_of_the_scenes_that_are_pressed():
 
 def test_no_answer_to_a_rigid_tool_is_silent_or_flagged_in_vain(tmp_path):
     """The whole sweep of contacts, with the method that the node answers by; a minute."""
-    report = stability({"moment_net": MomentNet}, PRESETS["default"].only("contacts"), tmp_path)
+    preset = PRESETS["default"].only("contacts")
+    levels = {**preset.levels, "part as measured": preset.levels["part as measured"][::2]}  # each is a skin to prepare
+    report = stability({"moment_net": MomentNet}, replace(preset, levels=levels), tmp_path)
     counts = report.counts("moment_net")
     assert counts["silent"] == counts["needless"] == counts["crashed"] == 0, list(tmp_path.glob("failures/*"))
-    assert len(report.rows) > 140 and counts["flagged"] <= 20
+    assert len(report.rows) > 135 and counts["flagged"] <= 20
     of_layers = {row.level: row.outcome for row in report.rows if row.axis == "skin, fat, muscle"}
     assert {told: of_layers[told] for told in LAYERED} == {
         told: "flagged" if told == "1e+20 N" else "held" for told in LAYERED}  # fmt: skip

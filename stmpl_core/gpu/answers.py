@@ -276,7 +276,7 @@ def answer(first: wp.int32, many: wp.int32, known: Known, skins: Skins, scratch:
                 if (skins.doubts[v] & BONY) != 0:
                     bony += part
             forces += here
-            strange += here * real(scratch.strange[s, i])
+            strange += here * scratch.strange[s, i]
             doubt += scratch.error[s, i] * scratch.area[s, i]
             depth = wp.max(depth, scratch.strain[s, i] * scratch.thick[s, i])
             thick += scratch.thick[s, i]

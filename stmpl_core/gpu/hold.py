@@ -22,7 +22,7 @@ POWER_TOLERANCE = wp.constant(wp.float64(obstacle.POWER_TOLERANCE))
 LINEAR_TO = wp.constant(wp.float64(contact_net.LINEAR_TO))
 STACK_LINEAR_TO = wp.constant(wp.float64(contact_net.STACK_LINEAR_TO))
 HARDENING = wp.constant(wp.float64(contact_net.HARDENING))
-LITTLE = wp.constant(wp.float64(contact_net.LITTLE))
+LITTLE, FAR_OUTSIDE = (wp.constant(wp.float64(x)) for x in (contact_net.LITTLE, contact_net.FAR_OUTSIDE))
 FADE, FADE_RING = wp.constant(wp.float64(contact_net.FADE)), wp.constant(contact_net.FADE_RING)
 LARGEST = wp.constant(wp.float64(contact_net.MAX_LOG_RATIO))
 START, SMALL, SMALLER = (wp.constant(wp.float64(x)) for x in (0.3, 1e-3, 1e-4))
@@ -318,7 +318,7 @@ def _write_alike(scratch: Scratch, s: wp.int32, i: wp.int32, pressure: real, str
     _write(scratch, s, i, AT_PRESSURE, pressure)
     _write(scratch, s, i, AT_LOG_STRAIN, wp.log(strain + SMALL))
     _write(scratch, s, i, AT_STRAIN, strain)
-    scratch.strange[s, i] = 0
+    scratch.strange[s, i] = real(0.0)
     for m in range(RINGS):
         _write(scratch, s, i, AT_MOMENTS + m, wp.log(moments[m] + SMALLER))
         _write(scratch, s, i, AT_MOMENTS + RINGS + m, wp.log(strains[m] + SMALLER))
@@ -357,14 +357,15 @@ def _write_shape(scratch: Scratch, skins: Skins, s: wp.int32, i: wp.int32, v: ve
 
 @wp.kernel
 def judge(lanes: wp.int32, scratch: Scratch, net: Net):
-    """Keeps inputs within what training had, says where they were not, and scales them."""
+    """Keeps inputs within what training had, says how far they were not, and scales them."""
     s, lane = wp.tid()
     for i in range(lane, scratch.nodes[s], lanes):
         for m in range(net.low.shape[0]):
             given = scratch.inputs[s, i, m]
             kept = wp.clamp(given, net.low[m], net.high[m])
-            if kept != given and scratch.fade[s, i] > LITTLE:
-                scratch.strange[s, i] = 1
+            if scratch.fade[s, i] > LITTLE:
+                beyond = real(wp.abs(given - kept) * net.scale[m]) / FAR_OUTSIDE
+                scratch.strange[s, i] = wp.max(scratch.strange[s, i], wp.min(beyond, real(1.0)))
             scratch.inputs[s, i, m] = (kept - net.mean[m]) * net.scale[m]
 
 

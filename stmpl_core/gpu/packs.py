@@ -129,7 +129,7 @@ SCRATCH: dict[str, tuple[Any, str]] = {
     "again": (wp.int32, "S"), "settled": (wp.int32, "S"), "sums": (real, "SR"), "changes": (wp.vec2d, "SR"),
     "ways_gone": (wp.vec2d, "SR"),
     "first_square": (real, "S"), "done": (wp.int32, "S"), "group": (wp.int32, "C"),
-    "pressure": (real, "SN"), "fade": (real, "SN"), "strange": (wp.int32, "SN"), "error": (real, "SN"),
+    "pressure": (real, "SN"), "fade": (real, "SN"), "strange": (real, "SN"), "error": (real, "SN"),
     "inputs": (wp.float32, "SNI"), "one": (wp.float32, "SNH"), "two": (wp.float32, "SNH"), "highest": (real, "SN"),
 }  # fmt: skip
 NET: dict[str, tuple[Any, str]] = {
