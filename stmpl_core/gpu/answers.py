@@ -8,6 +8,7 @@ import warp as wp
 
 from stmpl_core import pieces, soundness, toucher
 from stmpl_core import wrenches as wrenches_of_skin
+from stmpl_core.gpu.columns import _mark, _marked
 from stmpl_core.gpu.packs import BONY_BIT, BORDER_BIT, LONG_BIT, STEEP_BIT, Scratch, Skins
 from stmpl_core.gpu.places import APART, BY_POSE, DEEP, REFUSED, WRAPPED
 from stmpl_core.gpu.rays import FAR, OPTIONS, real, vec3
@@ -153,11 +154,6 @@ def find_beside(lanes: wp.int32, many: wp.int32, scratch: Scratch):
 
 
 @wp.func
-def _reached(scratch: Scratch, c: wp.int32, n: wp.int32) -> bool:
-    return ((scratch.reached[c, n // 32] >> wp.uint32(n % 32)) & wp.uint32(1)) == wp.uint32(1)
-
-
-@wp.func
 def _lowest(bits: wp.uint32) -> wp.int32:
     """Number of the lowest bit that is set."""
     n, rest = wp.int32(0), wp.uint32(bits)
@@ -170,20 +166,18 @@ def _lowest(bits: wp.uint32) -> wp.int32:
 @wp.func
 def _pins(scratch: Scratch, c: wp.int32, s: wp.int32, k: wp.int32) -> wp.vec2d:
     """Force beside each piece of a tool over its own, and radius of a piece [m]: pieces.pins."""
-    nodes, found, last, end = scratch.nodes[s], wp.int32(0), wp.int32(0), wp.int32(0)
+    nodes, found, last = scratch.nodes[s], wp.int32(0), wp.int32(0)
     for n in range(nodes):
         if scratch.tool[s, n] < k:
             last += 1  # the queues of tools lie one after the other
-        if scratch.tool[s, n] <= k:
-            end += 1
     for n in range(nodes):
-        if scratch.tool[s, n] == k and not _reached(scratch, c, n):
+        if scratch.tool[s, n] == k and not _marked(scratch.reached, c, n):
             first = wp.int32(last)
             scratch.fold[s, n] = found
             scratch.queue[s, last] = n
-            scratch.reached[c, n // 32] = scratch.reached[c, n // 32] | (wp.uint32(1) << wp.uint32(n % 32))
+            _mark(scratch.reached, c, n)
             last += 1
-            while first < last and last < end:
+            while first < last:
                 i = scratch.queue[s, first]
                 first += 1
                 for w in range((nodes + 31) // 32):
@@ -200,19 +194,18 @@ def _pins(scratch: Scratch, c: wp.int32, s: wp.int32, k: wp.int32) -> wp.vec2d:
         return wp.vec2d(real(0.0), real(0.0))
     beside, size, total = real(0.0), real(0.0), real(0.0)
     for i in range(nodes):
+        if scratch.tool[s, i] != k:
+            continue
         own, other, wide = real(0.0), real(0.0), real(0.0)
         near = NEAR_PIECE * scratch.thick[s, i]
         for j in range(nodes):
-            force = scratch.pressure[s, j] * scratch.area[s, j]
-            if scratch.tool[s, i] != k or scratch.tool[s, j] != k:
-                force = real(0.0)
-            elif scratch.fold[s, i] == scratch.fold[s, j]:
-                own += force
-                wide += scratch.area[s, j]
-            elif wp.length_sq(scratch.point[s, i] - scratch.point[s, j]) < near * near:
-                other += force
-        if scratch.tool[s, i] != k:
-            continue
+            if scratch.tool[s, j] == k:
+                force = scratch.pressure[s, j] * scratch.area[s, j]
+                if scratch.fold[s, i] == scratch.fold[s, j]:
+                    own += force
+                    wide += scratch.area[s, j]
+                elif wp.length_sq(scratch.point[s, i] - scratch.point[s, j]) < near * near:
+                    other += force
         force = scratch.pressure[s, i] * scratch.area[s, i]
         beside += force * other / wp.max(own, NONE)
         size += force * wp.sqrt(wide / PI)

@@ -7,6 +7,7 @@ The linear systems, one a scene, are eliminated without pivots: their matrices a
 import warp as wp
 
 from stmpl_core import conform, simulator, touch
+from stmpl_core.gpu.columns import _marked
 from stmpl_core.gpu.field_packs import FieldScratch, SkinFields
 from stmpl_core.gpu.motion import FAR, PER_LOG, STEPS, TOP, _at, feels
 from stmpl_core.gpu.packs import Scratch, Skins
@@ -83,7 +84,7 @@ def _met(scratch: Scratch, c: wp.int32, n: wp.int32) -> bool:
     """Whether a vertex is one of the triangles that a pressing tool touches."""
     if scratch.status[c] != BY_POSE:
         return False
-    return ((scratch.seen[c, n // 32] >> wp.uint32(n % 32)) & wp.uint32(1)) == wp.uint32(1)
+    return _marked(scratch.seen, c, n)
 
 
 @wp.func

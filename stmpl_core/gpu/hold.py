@@ -94,7 +94,6 @@ def guess(lanes: wp.int32, many: wp.int32, skins: Skins, scratch: Scratch):
         scratch.changes[s, lane] = wp.vec2d(real(1.0), real(0.0))  # not settled yet
     scratch.before[s] = real(1.0)
     scratch.again[s] = 1
-    scratch.settled[s] = 0
     scratch.done[s] = 0
     if scratch.nodes[s] == 0:
         scratch.done[s] = 1
@@ -129,7 +128,7 @@ def press(lanes: wp.int32, scratch: Scratch):
         change = wp.max(change, scratch.changes[s, other][0])
         largest = wp.max(largest, scratch.changes[s, other][1])
     if change <= TOLERANCE * largest:
-        scratch.settled[s] = 1
+        scratch.done[s] = 1  # each lane says so, or sees that another has
         return
     wp.atomic_max(scratch.busy, 0, 1)
     if lane == 0:
@@ -148,7 +147,7 @@ def press(lanes: wp.int32, scratch: Scratch):
 def turn(lanes: wp.int32, scratch: Scratch):
     """Direction of a step of conjugate gradients."""
     s, lane = wp.tid()
-    if scratch.done[s] == 1 or scratch.settled[s] == 1:
+    if scratch.done[s] == 1:
         return
     square, on = _sum(scratch, s, lanes), real(0.0)
     if scratch.restart[s] == 0:
@@ -168,7 +167,7 @@ def follow(lanes: wp.int32, scratch: Scratch):
         return
     square = _sum(scratch, s, lanes)
     up, down = real(0.0), real(0.0)
-    if scratch.settled[s] == 0 and square > real(0.0):
+    if square > real(0.0):
         for i in range(lane, scratch.nodes[s], lanes):
             along = _times(scratch, s, i, scratch.move)
             up += scratch.gap[s, i] * scratch.move[s, i]

@@ -10,6 +10,7 @@ import math
 import warp as wp
 
 from stmpl_core import response, thinning
+from stmpl_core.gpu.columns import _marked
 from stmpl_core.gpu.field_packs import FieldScratch, MotionNet, SkinFields
 from stmpl_core.gpu.packs import Scratch, Skins
 from stmpl_core.gpu.places import BY_POSE
@@ -149,7 +150,7 @@ def fold(pick: wp.array(dtype=wp.int32), many: wp.int32, all: wp.int32, skins: S
                 for m in range(count):
                     if field.fold[f, m] < 0 and (all == 1 or field.source[f, m][0] != wp.float32(0.0)):
                         w = field.under[f, m] - one.first
-                        if ((skins.linked[v, w // 32] >> wp.uint32(w % 32)) & wp.uint32(1)) == wp.uint32(1):
+                        if _marked(skins.linked, v, w):
                             field.fold[f, m] = groups
                             field.queue[f, end] = m
                             end += 1

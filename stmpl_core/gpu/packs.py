@@ -126,7 +126,7 @@ SCRATCH: dict[str, tuple[Any, str]] = {
     "matrix": (real, "SNN"), "force": (real, "SN"), "gap": (real, "SN"), "move": (real, "SN"), "along": (real, "SN"),
     "wanted": (real, "SN"), "beside": (wp.uint32, "SNW"), "reached": (wp.uint32, "CW"),
     "found_power": (real, "SN"), "left": (real, "SN"), "before": (real, "S"), "restart": (wp.int32, "S"),
-    "again": (wp.int32, "S"), "settled": (wp.int32, "S"), "sums": (real, "SR"), "changes": (wp.vec2d, "SR"),
+    "again": (wp.int32, "S"), "sums": (real, "SR"), "changes": (wp.vec2d, "SR"),
     "ways_gone": (wp.vec2d, "SR"),
     "first_square": (real, "S"), "done": (wp.int32, "S"), "group": (wp.int32, "C"),
     "pressure": (real, "SN"), "fade": (real, "SN"), "strange": (real, "SN"), "error": (real, "SN"),

@@ -7,6 +7,7 @@ import warp as wp
 
 from stmpl_core import contact_net, green
 from stmpl_core.columns import MIN_ONE_WAY_SHARE
+from stmpl_core.gpu.columns import _marked
 from stmpl_core.gpu.hold import FADE_RING, HARDENING, NEAR, RINGS, STACK_LINEAR_TO, STEPS, _row, _write, _write_alike
 from stmpl_core.gpu.packs import Scratch, Skins
 from stmpl_core.gpu.rays import OPTIONS, depth_in_column, real, vec3
@@ -98,7 +99,7 @@ def fold(many: wp.int32, skins: Skins, scratch: Scratch):
                 for j in range(scratch.nodes[s]):
                     if scratch.fold[s, j] < 0 and scratch.group[s * many + scratch.tool[s, j]] == group:
                         w = skins.faces[scratch.face[s, j]][0] - one.first
-                        if ((skins.linked[v, w // 32] >> wp.uint32(w % 32)) & wp.uint32(1)) == wp.uint32(1):
+                        if _marked(skins.linked, v, w):
                             scratch.fold[s, j] = groups
                             scratch.queue[s, end] = j
                             end += 1
