@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Callable
 from dataclasses import dataclass, field
-from functools import cached_property, partial
+from functools import cached_property
 from typing import Any, Self
 
 import numba
@@ -17,10 +16,11 @@ from scipy.spatial import KDTree
 from stmpl_core.arrays import Points, finite
 from stmpl_core.decimation import BAND_CELLS, MARGIN, MAX_NODES, field_spacing
 from stmpl_core.errors import InvalidInput, MeshError
-from stmpl_core.mending import closed, openings
+from stmpl_core.mending import closed, openings, places
 from stmpl_core.spline import spline_sum
 from stmpl_core.tool import Tool
 from stmpl_core.walls import areas, outer_walls
+from stmpl_core.winding import winding_numbers
 
 log = logging.getLogger(__name__)
 
@@ -41,8 +41,8 @@ ROUNDING_WIDTH = 0.57  # width of the smoothing over the radius that it gives a 
 class SignedDistance:
     """Cubic B-spline on a regular grid in the tool's frame (Unser 1999, "Splines: a perfect fit").
 
-    Nodes within three cells of the surface hold exact distances, signed by the fast winding number (Barill et al.
-    2018), so that open or slightly broken meshes have an inside too; the others are interpolated from a grid three
+    Nodes within three cells of the surface hold exact distances, signed by the winding number (of a mesh with holes,
+    so that it has an inside too, the fast one of Barill et al. 2018); the others are interpolated from a grid three
     times coarser. Walls inside the tool, of bodies that overlap or abut, are no surface (see stmpl_core.walls).
     Smooth faces are met to about spacing^2 / radius / 100, edges and corners are rounded by about a sixth of the
     spacing; `surface_error` is what was measured on this mesh. Outside the grid the answer is sqrt(|x - c|^2 +
@@ -113,8 +113,10 @@ class SignedDistance:
         from scipy import ndimage  # who only reads a field need not wait for what builds it
 
         origin = low + extent / 2 - spacing * (shape - 1) / 2
-        exact = partial(_exact, vertices, faces, outer)
-        values = _node_distances(exact, origin - COLLAR * spacing, spacing, shape + 2 * COLLAR)
+        corner, many = origin - COLLAR * spacing, shape + 2 * COLLAR
+        shut = vertices[places(vertices)[mesh.faces]] if watertight else None  # with what has no area: it closes seams
+        inside = None if shut is None else winding_numbers(shut, corner, spacing, many)
+        values = _node_distances(vertices, faces, outer, inside, corner, spacing, many)
         if rounding > 0:
             values = ndimage.gaussian_filter(values, ROUNDING_WIDTH * rounding / spacing, mode="nearest")
         inner = (slice(COLLAR, -COLLAR),) * 3
@@ -236,26 +238,26 @@ def _outside(vertices: Points, faces: np.ndarray, spacing: float) -> tuple[tuple
             np.concatenate([whole.reshape(-1, 3), whole.mean(axis=1)]))  # fmt: skip
 
 
-def _exact(vertices: Points, faces: np.ndarray, outer: tuple[Points, np.ndarray], points: Points) -> np.ndarray:
-    """Signed distances of points (N, 3) [m] to what is outside of a surface, (N,) [m]."""
+def _node_distances(vertices: Points, faces: np.ndarray, outer: tuple[Points, np.ndarray], rounds: np.ndarray | None,
+                    origin: np.ndarray, h: float, shape: np.ndarray) -> np.ndarray:  # fmt: skip
+    """Signed distances at all nodes (I, J, K) to what is outside of a surface [m].
+
+    They are exact in the band around the surface, from the coarse grid elsewhere. Rounds are winding numbers at the
+    nodes; None: the surface has holes.
+    """
     import igl
 
-    kinds = igl.SignedDistanceType
-    if outer[1] is faces:
-        kind = kinds.SIGNED_DISTANCE_TYPE_FAST_WINDING_NUMBER
-        return np.asarray(igl.signed_distance(points, vertices, faces, kind)[0])
-    number = np.minimum(np.abs(igl.fast_winding_number(vertices, faces, points)), 1.0)  # 2 where two bodies are
-    return (1 - 2 * number) * np.asarray(igl.signed_distance(points, *outer, kinds.SIGNED_DISTANCE_TYPE_UNSIGNED)[0])
+    kind = igl.SignedDistanceType.SIGNED_DISTANCE_TYPE_UNSIGNED
 
+    def exact(nodes: np.ndarray) -> np.ndarray:
+        points = origin + h * nodes.astype(float)
+        within = igl.fast_winding_number(vertices, faces, points) if rounds is None else np.abs(rounds[tuple(nodes.T)])
+        return (1 - 2 * np.clip(within, 0, 1)) * np.asarray(igl.signed_distance(points, *outer, kind)[0])
 
-def _node_distances(exact: Callable[[Points], np.ndarray], origin: np.ndarray, h: float,
-                    shape: np.ndarray) -> np.ndarray:  # fmt: skip
-    """Distances at all nodes (I, J, K) [m]: exact in the band around the surface, from the coarse grid elsewhere."""
     index = np.stack(np.meshgrid(*(np.arange(0, n, COARSE) for n in shape), indexing="ij"), axis=-1)
-    coarse = exact(origin + h * index.reshape(-1, 3).astype(float)).reshape(index.shape[:3])
-    values = _finer(coarse)
+    values = _finer(exact(index.reshape(-1, 3)).reshape(index.shape[:3]))
     band = np.argwhere(np.abs(values) < BAND_CELLS * h)
-    values[tuple(band.T)] = exact(origin + h * band.astype(float))
+    values[tuple(band.T)] = exact(band)
     return values
 
 

@@ -1,5 +1,6 @@
 """The signed distance field against exact shapes, its derivatives, and what it refuses."""
 
+import igl
 import numpy as np
 import pytest
 import trimesh
@@ -7,6 +8,7 @@ import trimesh
 from stmpl_core import Tool
 from stmpl_core.errors import InvalidInput, MeshError
 from stmpl_core.sdf import SignedDistance
+from stmpl_core.winding import winding_numbers
 from tests.scenes import ball, box, capsule, scaled, tool
 
 POINTS = np.random.default_rng(1).uniform(-0.02, 0.02, (20_000, 3))
@@ -111,6 +113,26 @@ def test_a_mesh_inside_out_is_turned_and_says_so() -> None:
     field = SignedDistance.of(Tool("probe", mesh.vertices, mesh.faces[:, ::-1]))
     assert field.flipped and field.watertight
     assert field.distance([[0, 0, 0]])[0] < 0
+
+
+def test_how_often_a_surface_goes_round_a_node_is_a_whole_number() -> None:
+    """Nodes on faces, edges and corners too: of a box that is in line with the grid, and of two that overlap."""
+    nodes = np.stack(np.meshgrid(*(np.arange(12),) * 3, indexing="ij"), axis=-1)
+    bodies = [trimesh.creation.box(bounds=[[1, 1, 1], [7, 7, 7]]), trimesh.creation.box(bounds=[[4, 4, 4], [10, 9, 8]])]
+    numbers = winding_numbers(np.concatenate([body.triangles for body in bodies]), np.zeros(3), 1.0, np.full(3, 12))
+    inside = [(nodes > body.bounds[0]) & (nodes < body.bounds[1]) for body in bodies]
+    beyond = [(nodes < body.bounds[0]) | (nodes > body.bounds[1]) for body in bodies]
+    clear = np.logical_and(*(a.all(axis=-1) | b.any(axis=-1) for a, b in zip(inside, beyond, strict=True)))
+    assert (numbers == sum(a.all(axis=-1).astype(int) for a in inside))[clear].all() and numbers.max() == 2
+    assert (numbers[..., -1] == 0).all() and (numbers >= 0).all()
+
+    turned = trimesh.creation.torus(0.01, 0.004, major_sections=24, minor_sections=12)
+    turned.apply_transform(trimesh.transformations.euler_matrix(0.3, 0.4, 0.5))
+    numbers = winding_numbers(turned.vertices[turned.faces], np.full(3, -0.016), 0.0029, np.full(3, 12))
+    points = 0.0029 * nodes.reshape(-1, 3) - 0.016
+    exact = np.asarray(igl.winding_number(np.array(turned.vertices), np.array(turned.faces), points))
+    np.testing.assert_allclose(numbers.ravel(), exact, atol=1e-9)
+    assert (numbers == 1).sum() > 20
 
 
 def test_unmerged_vertices_are_no_holes() -> None:
