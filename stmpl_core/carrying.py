@@ -6,19 +6,23 @@ friction feels a tool's way along the skin, not through space, and a tool that r
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from stmpl_core.arrays import Transform
+from stmpl_core.arrays import Faces, Points, Transform
 from stmpl_core.errors import InvalidInput
 from stmpl_core.state import Memory, State
 from stmpl_core.wake import carried_trail
 
 if TYPE_CHECKING:
+    from stmpl_core.layer import SoftLayer
     from stmpl_core.skin import Skin
+
+WINDOW, LEAST_SHARE = 1.5, 6.0  # edges around a place whose skin tells how it turns, and exponent that is left out
 
 
 def carried(state: State, skin: Skin, after: Skin) -> State:
@@ -52,14 +56,48 @@ def carried(state: State, skin: Skin, after: Skin) -> State:
 
 
 def carry_at(before: Skin, after: Skin, place: np.ndarray) -> Transform:
-    """Rigid motion of the skin near a place (3,) [m] from one pose to another, (4, 4): that of the nearest vertex."""
-    start, end = before.layer.vertices, after.layer.vertices
-    away = start - place
-    nearest = int(np.argmin(np.einsum("vx,vx->v", away, away)))
-    out = np.eye(4)
-    out[:3, :3] = after.turn_at(nearest) @ before.turn_at(nearest).T
-    out[:3, 3] = end[nearest] - out[:3, :3] @ start[nearest]
+    """Rigid motion of the skin near a place (3,) [m] from one pose to another, (4, 4)."""
+    return motion_at(before.layer, lambda some: after.layer.vertices[some], place)
+
+
+def motion_at(layer: SoftLayer, moved: Callable[[np.ndarray], Points], place: np.ndarray) -> Transform:
+    """Rigid motion of a layer's skin near a place, (4, 4).
+
+    It goes as the nearest point of the skin, and turns as the vertices around do in the mean (Kabsch 1976), by a
+    Gaussian of WINDOW edges: it changes smoothly as the place moves.
+
+    Args:
+        layer: layer, of which skin that is flat or bent does not matter.
+        moved: function that gives where vertices have gone, (K, 3) [m], by their numbers (K,).
+        place: place near it, (3,) [m].
+    """
+    away = layer.vertices - place
+    square = np.einsum("vx,vx->v", away, away)
+    nearest = int(square.argmin())
+    exponent = (square - square[nearest]) / (2 * WINDOW**2 * layer.vertex_areas[nearest])
+    some = np.flatnonzero(exponent < LEAST_SHARE)
+    corners, at = _on_face(layer.vertices, layer.faces[(layer.faces == nearest).any(axis=1)], place)
+    end, shares, out = moved(np.concatenate([some, corners])), np.exp(-exponent[some]), np.eye(4)
+    start, shares = layer.vertices[some], shares / shares.sum()
+    first, second = shares @ start, shares @ end[:-3]
+    u, _, v = np.linalg.svd((shares[:, None] * (end[:-3] - second)).T @ (start - first))
+    u[:, 2] *= np.linalg.det(u) * np.linalg.det(v)  # no mirror: points on skin lie next to flat
+    out[:3, :3] = u @ v
+    out[:3, 3] = at @ end[-3:] - out[:3, :3] @ (at @ layer.vertices[corners])
     return out
+
+
+def _on_face(vertices: Points, faces: Faces, place: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices of the face nearest to a place, (3,), and where in it that is, in barycentric coordinates, (3,)."""
+    corner, first, second = np.moveaxis(vertices[faces], 1, 0)
+    first, second, away = first - corner, second - corner, place - corner
+    a, b, c, f, g = (np.einsum("fx,fx->f", p, q) for p, q in (
+        (first, first), (first, second), (second, second), (away, first), (away, second)))  # fmt: skip
+    v, w = np.stack([c * f - b * g, a * g - b * f]) / (a * c - b * b)
+    at = np.maximum(np.column_stack([1 - v - w, v, w]), 0.0)
+    at /= at.sum(axis=1)[:, None]
+    face = int(((np.einsum("fk,fkx->fx", at, vertices[faces]) - place) ** 2).sum(axis=1).argmin())
+    return faces[face], at[face]
 
 
 def _memory(memory: Memory, before: Skin, after: Skin) -> Memory:

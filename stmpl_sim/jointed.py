@@ -1,7 +1,7 @@
 """Jointed: a limb whose joints are hinges of a MuJoCo model: which body carries what, and where the skin is in between.
 
-To pose a skin takes milliseconds, a step of physics less. So the skin is posed again where a hinge has turned by
-POSE_STEP; in between it goes rigidly with the bone that a tool is nearest to, which is exact but around the joint.
+To pose a skin takes milliseconds, a step of physics less. So the skin is posed again where a hinge is POSE_STEP away;
+in between the skin around a tool goes rigidly, as the skin there goes in the mean.
 """
 
 from __future__ import annotations
@@ -12,15 +12,17 @@ from typing import Any
 
 import numpy as np
 
-from stmpl_core.arrays import Transform, inverted
+from stmpl_core.arrays import Points, Transform, inverted
+from stmpl_core.carrying import motion_at
 from stmpl_core.errors import InvalidInput
 from stmpl_core.rig import Rig
+from stmpl_core.skin import Skin
 from stmpl_core.touch import Touch
 from stmpl_sim.engine import mujoco
 
 log = logging.getLogger(__name__)
 
-POSE_STEP = 0.02  # turn of a hinge after which the skin is posed again [rad]
+POSE_STEP = 0.01  # angle between a hinge and what the skin is posed at, beyond which it is posed again [rad]
 MAX_TURNED, MAX_AWAY_M = 10.0, 0.01  # angle [degrees] and distance of a hinge's axis from the rig's, not worth a word
 BEYOND = 0.02  # angle beyond a joint's limits that is not worth a word: springs that stop a hinge give way [rad]
 
@@ -86,16 +88,16 @@ class Jointed:
                             "it turns. Has it the rig's axis, in the layer's axes, and sign?",
                             joint.name, turned, 1e3 * away)  # fmt: skip
 
-    def angles(self, data: Any) -> dict[str, float]:
+    def angles(self, data: Any) -> tuple[float, ...]:
         """Angle of each joint in `data` [rad], within the rig's limits. Raises InvalidInput: one is not finite."""
-        out = {}
+        out = []
         for joint in self.rig.joints:
             angle = float(data.qpos[self._places[joint.name]]) if joint.name in self._places else 0.0
             if not np.isfinite(angle):
                 raise InvalidInput(f"joint {joint.name} is {angle} rad. Has the simulation diverged? Try a shorter "
                                    "timestep.")  # fmt: skip
-            out[joint.name] = min(max(angle, joint.low), joint.high)
-        return out
+            out.append(min(max(angle, joint.low), joint.high))
+        return tuple(out)
 
     def beyond(self, data: Any) -> str:
         """What of the hinges' angles the skin does not follow; empty: nothing."""
@@ -113,17 +115,32 @@ class Jointed:
         shares = touch.pressure @ self.rig.weights
         return shares / shares.sum()
 
-    def back(self, place: np.ndarray, vertices: np.ndarray, posed: Mapping[str, float],
-             now: Mapping[str, float]) -> Transform:  # fmt: skip
-        """Rigid motion of the bone nearest to a place, from the angles now to those that the skin is posed at, (4, 4).
+    def following(self, posed: tuple[float, ...], now: tuple[float, ...]) -> tuple[float, ...] | None:
+        """Angles to pose the skin at next, where those that it is posed at (none: at rest) will not do for now [rad].
+
+        As far ahead as the skin lagged behind: so what it is off in between has no sign, and no work comes of it.
+        """
+        way = np.subtract(now, posed or 0.0)
+        most = np.abs(way).max()
+        if not most > POSE_STEP:
+            return None
+        low, high = zip(*((joint.low, joint.high) for joint in self.rig.joints), strict=True)
+        return tuple(np.clip(now + way, low, high).tolist()) if most < 2 * POSE_STEP else now
+
+    def back(self, skin: Skin, place: np.ndarray, now: tuple[float, ...]) -> Transform:
+        """Rigid motion of the skin around a place, from the angles now to those that it is posed at, (4, 4).
 
         Args:
-            place: place near the skin, (3,) [m], layer axes.
-            vertices: vertices of the posed skin, (V, 3) [m].
-            posed, now: angles by joint [rad].
+            skin: skin as it is posed.
+            place: place near it, (3,) [m], layer axes.
+            now: angles of the joints [rad].
         """
-        if posed == now:
+        if now == skin.angles:
             return np.eye(4)
-        bone = int(self.rig.weights[int(((vertices - place) ** 2).sum(axis=1).argmin())].argmax())
-        start, end = (self.rig.motions(self.rig.angles(one))[bone] for one in (now, posed))
-        return end @ inverted(start)
+        rest, motions = (skin.rest or skin).layer.vertices, self.rig.motions(now)[:, :3]
+
+        def moved(some: np.ndarray) -> Points:
+            points = np.column_stack([rest[some], np.ones(len(some))])
+            return np.einsum("kb,bxy,ky->kx", self.rig.weights[some], motions, points)
+
+        return inverted(motion_at(skin.layer, moved, place))

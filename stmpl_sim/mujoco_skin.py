@@ -24,7 +24,7 @@ from stmpl_core.skin import Skin
 from stmpl_core.tool import Tool
 from stmpl_core.touch import Answer, Touch
 from stmpl_sim.engine import mujoco
-from stmpl_sim.jointed import POSE_STEP, Jointed
+from stmpl_sim.jointed import Jointed
 from stmpl_sim.protocol import Exerted, Memory, Poses, Reaction, Row, SoftContact
 
 MOST_NAMES = 30  # names of a model that an error lists
@@ -119,7 +119,6 @@ class SoftBody:
                 if source.geom is None and part.geom in _geoms_of(model, source):
                     raise InvalidInput(f"tool '{name}' is a geom of tool '{whole}': it would press twice. Name one of "
                                        "them.")  # fmt: skip
-        self._posed: dict[str, float] = {}
         made = [_tool(model, name, self._sources[name]) for name in tools]
         self.contact = SoftContact(layer, made, method, pose_body_from_layer=pose_body_from_layer, damping=damping,
                                    implicit=implicit, friction=friction, every=every)  # fmt: skip
@@ -201,15 +200,15 @@ class SoftBody:
 
     def _step_bent(self, jointed: Jointed, data: Any, poses: Poses, dt: float, mobility: Any) -> Reaction:
         """A step of a limb whose joints move."""
-        now = jointed.angles(data)
-        if not self._posed or max(abs(now[name] - self._posed[name]) for name in now) > POSE_STEP:
-            self._memory, self._posed = self.contact.pose(now, self._memory), now
+        now, skin = jointed.angles(data), self._stood().skin
+        if (angles := jointed.following(skin.angles, now)) is not None:
+            self._memory = self.contact.pose(dict(zip(jointed.rig.names, angles, strict=True)), self._memory)
+            skin = self.simulator.skin
         world = poses.body @ self.contact.pose_body_from_layer
-        backs = {}
+        to_layer, backs = inverted(world), {}
         for name, pose in poses.tools.items():
-            place = world[:3, :3].T @ (pose[:3, 3] - world[:3, 3])
-            back = jointed.back(place, self.simulator.layer.vertices, self._posed, now)
-            backs[name] = world @ back @ inverted(world)
+            place = self.contact.place(name, to_layer @ pose, self._memory)
+            backs[name] = world @ jointed.back(skin, place, now) @ to_layer
         there = Poses(poses.body, {name: backs[name] @ pose for name, pose in poses.tools.items()})
         made = self.contact.step(there, self._memory, dt, mobility)
         tools, on_body = {}, np.zeros(6)
@@ -223,6 +222,13 @@ class SoftBody:
             touches = {name: touch.with_(trust=touch.trust.also(beyond, in_range=False))
                        for name, touch in touches.items()}  # fmt: skip
         return Reaction(tools, on_body, touches, made.memory)
+
+    def _stood(self) -> Simulator:
+        """The simulator, at the angles of this skin's memory: others may use it too."""
+        simulator, joints = self.contact.simulator, self._memory.tissue.joints
+        if self._jointed is not None and joints is not None and joints != simulator.skin.angles:
+            simulator.move_to(simulator.skin.at_angles(joints))
+        return simulator
 
     def poses(self, data: Any) -> Poses:
         """Places of body and tools in `data`."""
@@ -239,6 +245,7 @@ class SoftBody:
         """The displacement of the skin at the last `apply`, layer axes. Raises InvalidInput before the first one."""
         if self.reaction is None:
             raise InvalidInput("there is no answer before the first apply(data).")
+        self._stood()
         return self.contact.answer(self.reaction)
 
     def stiffness(self, data: Any, name: str) -> np.ndarray:
@@ -251,20 +258,20 @@ class SoftBody:
         touch, memory = self.reaction.touches[name], self.reaction.memory
         model = None if memory.asked is None else memory.asked.models.get(name)
         if model is None:
-            (model,) = local_contacts(self.simulator.history, [touch], memory.tissue)
+            (model,) = local_contacts(self._stood().history, [touch], memory.tissue)
         turn = (self.pose(data) @ self.contact.pose_body_from_layer)[:3, :3]
         return turn @ model.push_stiffness[:3, :3] @ turn.T
 
     def skin_points(self, data: Any, answer: Answer | None = None) -> np.ndarray:
         """Vertices of the skin in the world, (V, 3) [m], deformed by an answer if one is given."""
         pose = _pose(data.xpos[self.body], data.xmat[self.body]) @ self.contact.pose_body_from_layer
-        rest = self.simulator.layer.vertices
+        rest = self._stood().layer.vertices
         return (rest if answer is None else rest + answer.displacement) @ pose[:3, :3].T + pose[:3, 3]
 
     def reset(self, data: Any) -> None:
         """Takes the wrenches out of `data`, and forgets."""
         self._exert(data, {})
-        self.memory, self.reaction, self._posed = Memory(), None, {}
+        self.memory, self.reaction = Memory(), None
 
     def _push(self, data: Any, reaction: Reaction) -> None:
         rows: dict[int, Wrench] = {}

@@ -347,11 +347,23 @@ class SoftContact:
         Raises:
             InvalidInput: see Simulator.pose.
         """
-        before = self.simulator.skin
+        before, places = self.simulator.skin, {name: self.place(name, pose, memory) for name, pose in memory.at.items()}
         tissue = self.simulator.pose(joints, memory.tissue)
-        at = {name: carry_at(before, self.simulator.skin, pose[:3, 3]) @ pose for name, pose in memory.at.items()}
+        at = {name: carry_at(before, self.simulator.skin, places[name]) @ pose for name, pose in memory.at.items()}
         return Memory(tissue, at, memory.speed, waited=memory.waited, pushes=memory.pushes,
                       through=memory.through)  # fmt: skip
+
+    def place(self, name: str, pose: Transform, memory: Memory) -> np.ndarray:
+        """Middle of a tool's last contact, or else of the tool at this pose, (3,) [m], layer axes."""
+        kept = memory.tissue.tools.get(name)
+        if kept is not None and kept.scalars.radius > 0:
+            return kept.contact[0]
+        pressure = None if memory.asked is None else memory.asked.touches[name].pressure
+        if pressure is None or not pressure.any():
+            return pose[:3, :3] @ self._balls[name][0] + pose[:3, 3]
+        layer, pressed = self.simulator.layer, np.flatnonzero(pressure)
+        forces = pressure[pressed] * layer.vertex_areas[pressed]
+        return forces @ layer.vertices[pressed] / forces.sum()
 
     def answer(self, reaction: Reaction) -> Answer:
         """The displacement of the skin under a reaction of this contact, layer axes."""

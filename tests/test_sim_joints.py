@@ -76,18 +76,97 @@ def test_who_presses_beyond_the_hinge_turns_it_away_and_the_balance_of_angular_m
     np.testing.assert_allclose(moment, 0, atol=1e-9)
 
 
-def test_between_two_poses_of_the_skin_it_goes_rigidly_with_its_bone(skin: Skin) -> None:
+def beside_the_hinge(skin: Skin, angle: float, depth: float) -> np.ndarray:
+    """Place of the ball on the skin that goes half with the hinge, where a bend stretches it, (3,) [m]."""
+    bent = skin.posed({"elbow": angle}).layer
+    vertex = int(np.linalg.norm(skin.layer.vertices - [RADIUS, 0, MIDDLE[2] + 4e-3], axis=1).argmin())
+    return bent.vertices[vertex] + (BALL - depth) * bent.normals[vertex]
+
+
+@pytest.mark.parametrize("depth", [0.5e-3, 2e-3])
+def test_between_two_poses_a_touch_beside_the_hinge_is_that_of_the_posed_skin(skin: Skin, depth: float) -> None:
+    """The skin goes as it does there, not as the bone that it mostly goes with: no force jumps as it is posed again."""
+    _, data, soft = made(skin, on_the_lower_part(skin, 0.0))
+    tool, forces, off = soft.contact.tools["ball"], [], []
+    for k in range(41):
+        angle = -0.0025 * k
+        data.qpos[0], data.mocap_pos[0], data.time = angle, beside_the_hinge(skin, angle, depth), 1e-3 * k
+        touch = soft.apply(data)["ball"]
+        truth = Simulator(skin.posed({"elbow": angle})).touch([Contact(tool, at(*data.mocap_pos[0]))])[0]
+        forces.append(touch.force)
+        off.append(touch.force / truth.force - 1)
+        assert touch.trust.in_range
+    assert np.abs(off).max() < 0.02
+    assert np.abs(np.diff(forces)).max() < 0.02 * np.mean(forces)
+
+
+def test_a_hinge_that_turns_to_and_fro_over_a_tool_gets_nothing_out_of_the_skin(skin: Skin) -> None:
+    model, data, soft = made(skin, beside_the_hinge(skin, 0.0, 2e-3))
+    torque, angles, steps = [], 0.1 * np.sin(np.linspace(0, 2.5 * np.pi, 201)), np.zeros(1)
+    for k, angle in enumerate(angles):
+        data.qpos[0], data.time = angle, 1e-3 * k
+        soft.apply(data)
+        mujoco.mj_fwdPosition(model, data)
+        steps[:] = 0.0
+        for body in range(model.nbody):
+            force, turn = np.split(data.xfrc_applied[body], 2)
+            mujoco.mj_applyFT(model, data, force, turn, data.xipos[body], body, steps)
+        torque.append(float(steps[0]))
+    work = 0.5 * np.add(torque[1:], torque[:-1]) * np.diff(angles)
+    round_once = slice(40, 200)  # from one end of the way to the same end
+    assert np.abs(work[round_once]).sum() > 1e-4
+    assert abs(work[round_once].sum()) < 0.01 * np.abs(work[round_once]).sum() / 2
+
+
+def test_two_skins_of_one_simulator_stand_each_where_its_own_hinge_is(skin: Skin) -> None:
+    places = [on_the_lower_part(skin, angle) for angle in (0.3, 0.0)]
+    model, first, one = made(skin, places[0])
+    other, second = SoftBody(model, one.simulator, body="upper", tools=["ball"], joints={"elbow": "hinge"}), \
+        mujoco.MjData(model)  # fmt: skip
+    first.qpos[0], second.mocap_pos[0] = 0.3, places[1]
+    told = [one.apply(first)["ball"], other.apply(second)["ball"]]
+    for step in (1, 2):
+        first.time = second.time = 1e-3 * step
+        for soft, data, before in ((one, first, told[0]), (other, second, told[1])):
+            np.testing.assert_allclose(soft.apply(data)["ball"].wrench, before.wrench, rtol=1e-9)
+    vertices = [soft.skin_points(data) for soft, data in ((one, first), (other, second), (one, first))]
+    assert np.abs(vertices[0] - vertices[1]).max() > 0.01
+    np.testing.assert_array_equal(vertices[0], vertices[2])
+
+
+def test_a_bend_goes_on_from_its_memory_as_it_went_on_then(skin: Skin) -> None:
+    def run(soft: SoftBody, data: Any, steps: range) -> list[np.ndarray]:
+        out = []
+        for k in steps:
+            angle = 0.012 * k
+            data.qpos[0], data.mocap_pos[0], data.time = angle, beside_the_hinge(skin, angle, 2e-3), 1e-3 * k
+            soft.apply(data)
+            out.append(data.xfrc_applied.copy())
+        return out
+
+    model, data, soft = made(skin, on_the_lower_part(skin, 0.0))
+    run(soft, data, range(4))
+    size = mujoco.mj_stateSize(model, mujoco.mjtState.mjSTATE_INTEGRATION)
+    state, memory = np.empty(size), soft.memory
+    mujoco.mj_getState(model, data, state, mujoco.mjtState.mjSTATE_INTEGRATION)
+    went_on = run(soft, data, range(4, 10))
+    mujoco.mj_setState(model, data, state, mujoco.mjtState.mjSTATE_INTEGRATION)
+    soft.memory = memory
+    np.testing.assert_array_equal(run(soft, data, range(4, 10)), went_on)
+
+
+def test_between_two_poses_of_the_skin_it_goes_along_with_its_bone(skin: Skin) -> None:
     model, data, soft = made(skin, on_the_lower_part(skin, 0.3))
     data.qpos[0] = 0.3
     first = soft.apply(data)["ball"]
     posed = soft.simulator.skin
-    data.qpos[0], data.mocap_pos[0] = 0.31, on_the_lower_part(skin, 0.31)
+    data.qpos[0], data.mocap_pos[0] = 0.305, on_the_lower_part(skin, 0.305)
     data.time = 1e-3
     again = soft.apply(data)["ball"]
     assert soft.simulator.skin is posed
     assert again.force == pytest.approx(first.force, rel=1e-3)  # the ball did not turn along
     tool = soft.contact.tools["ball"]
-    truth = Simulator(skin.posed({"elbow": 0.31})).touch([Contact(tool, at(*data.mocap_pos[0]))])[0]
+    truth = Simulator(skin.posed({"elbow": 0.305})).touch([Contact(tool, at(*data.mocap_pos[0]))])[0]
     np.testing.assert_allclose(-data.xfrc_applied[model.body("bob").id][:3], truth.wrench[:3], atol=2e-3 * truth.force)
     data.qpos[0], data.mocap_pos[0] = 0.33, on_the_lower_part(skin, 0.33)
     data.time = 2e-3
