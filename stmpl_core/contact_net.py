@@ -34,6 +34,9 @@ SMALL_STEP = 5e-3  # of the largest force, in which the network's part of a slop
 APART = 1e-3  # depth, relative, that skin may miss beside other tools and still be off a tool that does not press
 FAR_OUTSIDE = 0.3  # standard deviations beyond the training contacts, from which a node is all outside
 LITTLE = 0.1  # share of its correction up to which a network says next to nothing, and need not know what it sees
+THIN_NEAR, THIN_FAR = (-1.4, -1.5), (-4.3, -4.0)  # log of the share of the nearest and third ring that is pressed
+THIN_FELT, THIN_DEEP = (0.02, 0.04), (0.12, 0.2)  # strains from which that widens the bound, and is flagged
+THIN_DOUBT = 17.0  # factor on the doubt that it adds, of which the bound grows with the square root
 STACK_FADE = 0.1  # the same on a stack, whose linear response alone is good to some percent up to there
 
 
@@ -185,6 +188,8 @@ class ContactNet:
             return NOTHING
         look = self.look(nodes)
         corrected = _correct(*look[:3], *self._network)
+        if self._green is None:
+            _thin(look.inputs, *corrected[1:])
         shell = 0.0 if self._green is None else -float(look.inputs[0, STACK_NODE.at.given_way])
         return Held(*corrected, look.power, shell)
 
@@ -438,6 +443,32 @@ def _correct(pressure, inputs, fade, low, high, mean, scale, w1, b1, w2, b2, w3,
         held[n] = pressure[n] * np.exp(fade[n] * log_ratio)
         doubt[n] = held[n] * np.exp(min(float(outputs[n, SAY.log_error]), 1.0))
     return held, doubt, outside
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _thin(inputs, doubt, outside):
+    """Widens doubt and outside (N,) of nodes under what is long and thin."""
+    for n in range(len(inputs)):
+        row, around = inputs[n], AT.log_moments + RINGS
+        thin = thinness(row[around] - row[AT.log_strain], row[around + 2] - row[AT.log_strain])
+        doubt[n] *= 1 + THIN_DOUBT * thin * ramp(row[AT.strain], THIN_FELT)
+        outside[n] = max(outside[n], thin * ramp(row[AT.strain], THIN_DEEP))
+
+
+@numba.njit(cache=True, inline="always")
+def thinness(near, far):
+    """Degree to which what presses is thin and goes on aside, by logarithms of how much of two rings it covers.
+
+    Wires, walls and blades: no training contact of one material had their like. Balls and pins are not there in the
+    far ring, and broad tools fill the near one.
+    """
+    return ramp(near, THIN_NEAR) * ramp(far, THIN_FAR)
+
+
+@numba.njit(cache=True, inline="always")
+def ramp(value, ends):
+    """0 at one of two values and before it, 1 at the other and beyond."""
+    return min(max((value - ends[0]) / (ends[1] - ends[0]), 0.0), 1.0)
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")

@@ -98,6 +98,11 @@ def capsule(height: float, radius: float, count: int = 32) -> Tool:
     return tool(trimesh.creation.capsule(1e3 * height, 1e3 * radius, count=[count, count]), 1e-3)
 
 
+def wire(radius: float, thickness: float) -> Tool:
+    """A ring about z, of round wire of a thickness [m], bent to a radius [m]."""
+    return tool(trimesh.creation.torus(1e3 * radius, 500 * thickness, major_sections=120, minor_sections=24), 1e-3)
+
+
 def brush(count: int = 7) -> Tool:
     """Pins of 2.2 mm radius along z, one in the middle and up to six 8 mm around it."""
     pin, angle = capsule(0.01, 2.2e-3, 16), np.arange(count - 1) * np.pi / 3

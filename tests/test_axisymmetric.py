@@ -10,10 +10,13 @@ from benchmarks.axisymmetric import PLATE, RADIUS, Plate, forces, ground_truth, 
 from benchmarks.tools import flat
 from fem_tools import IndenterFem, PatchFem, Press
 from fem_tools.axisymmetric import Flat, Profile, membrane
+from stmpl_core.contact import Contact
+from stmpl_core.methods import MomentNet
 from stmpl_core.sdf import SignedDistance
+from stmpl_core.simulator import Simulator
 from stmpl_core.stack import ball_force
 from stmpl_core.tissue import Membrane, Tissue
-from tests.scenes import at, plate
+from tests.scenes import at, plate, wire
 
 ROUGH = replace(PLATE, fine=0.5)
 T = PLATE.thickness
@@ -115,3 +118,16 @@ def test_indenter_fem_agrees_under_a_flat_punch_from_first_touch_on():
     ours = [answer.force for answer in fem.path([start], depths)]
     others = [one.force for one in Flat(layer.tissue, thick).press(Profile((0, 0), (7.5e-3, 0), 1.5e-3), depths)]
     np.testing.assert_allclose(ours, others, rtol=0.04)
+
+
+@pytest.mark.parametrize(("thickness", "flagged"), [(1e-3, [False, True]), (4e-3, [False, False])])
+def test_a_ring_of_wire_is_within_its_bound_or_flagged_and_one_that_is_not_thin_is_not(thickness, flagged):
+    """In one material; networks know no contact that is thin and goes on aside: deep, 1 mm is half too hard."""
+    thick, radius, shares = 10e-3, 10e-3, [0.1, 0.3]
+    layer = plate(0.1, 3e-3, thick, youngs_modulus=20e3)
+    profile, simulator = Profile((radius, 0), (radius, 0), thickness / 2), Simulator(layer, MomentNet())
+    truth = [one.force for one in Flat(layer.tissue, thick).press(profile, [share * thick for share in shares])]
+    touches = [simulator.touch([Contact(wire(radius, thickness), at(3e-4, 2e-4, thickness / 2 - share * thick))])[0]
+               for share in shares]  # fmt: skip
+    assert [not one.trust.in_range for one in touches] == flagged
+    assert all(abs(one.force - force) < one.force_bound for one, force in zip(touches, truth, strict=True))

@@ -15,7 +15,7 @@ from stmpl_core.errors import InvalidInput
 from stmpl_core.living import living
 from stmpl_core.methods import MomentNet, Winkler
 from stmpl_core.skin import Skin
-from tests.scenes import LENGTH, RADIUS, at, ball, band, box, brush, capsule, limb, punch, tool, v_block
+from tests.scenes import LENGTH, RADIUS, at, ball, band, box, brush, capsule, limb, punch, tool, v_block, wire
 from tests.test_folds import FINGERS
 
 wp = pytest.importorskip("warp")
@@ -99,8 +99,8 @@ def same(found: WarpTouches, expected: BatchTouches, least_served: float = 1.0) 
 @pytest.mark.parametrize(
     ("one", "reach"),
     [(ball(0.012), 0.012), (capsule(0.03, 0.008), 0.012), (punch(), 0.012), (box(0.03, 0.02, 1e-3), 0.01),
-     (tool(LUMP), 0.009), (brush(), 0.009)],
-    ids=["ball", "capsule", "punch", "thin plate", "lump", "brush"],
+     (tool(LUMP), 0.009), (brush(), 0.009), (wire(0.008, 1.5e-3), 0.009)],
+    ids=["ball", "capsule", "punch", "thin plate", "lump", "brush", "wire"],
 )  # fmt: skip
 def test_touches_are_those_of_numba(arm: Skin, one: Tool, reach: float) -> None:
     poses = scattered(arm, reach)

@@ -24,6 +24,10 @@ STACK_LINEAR_TO = wp.constant(wp.float64(contact_net.STACK_LINEAR_TO))
 HARDENING = wp.constant(wp.float64(contact_net.HARDENING))
 LITTLE, FAR_OUTSIDE = (wp.constant(wp.float64(x)) for x in (contact_net.LITTLE, contact_net.FAR_OUTSIDE))
 FADE, FADE_RING = wp.constant(wp.float64(contact_net.FADE)), wp.constant(contact_net.FADE_RING)
+NEAR_NONE, NEAR_WHOLE, FAR_NONE, FAR_WHOLE, FELT_NONE, FELT_WHOLE, DEEP_NONE, DEEP_WHOLE = (
+    wp.constant(wp.float64(x)) for x in (*contact_net.THIN_NEAR, *contact_net.THIN_FAR, *contact_net.THIN_FELT,
+                                         *contact_net.THIN_DEEP))  # fmt: skip
+THIN_DOUBT, ONE_SEES = wp.constant(wp.float64(contact_net.THIN_DOUBT)), wp.constant(NODE.size)
 LARGEST = wp.constant(wp.float64(contact_net.MAX_LOG_RATIO))
 START, SMALL, SMALLER = (wp.constant(wp.float64(x)) for x in (0.3, 1e-3, 1e-4))
 LEAST_SQUARE, ALMOST_TWO = wp.constant(wp.float64(1e-6)), wp.constant(wp.float64(1.02))
@@ -354,11 +358,23 @@ def _write_shape(scratch: Scratch, skins: Skins, s: wp.int32, i: wp.int32, v: ve
     _write(scratch, s, i, AT_SLOPES, slopes)
 
 
+@wp.func
+def _ramp(value: real, none: real, whole: real) -> real:
+    return wp.clamp((value - none) / (whole - none), real(0.0), real(1.0))
+
+
 @wp.kernel
 def judge(lanes: wp.int32, scratch: Scratch, net: Net):
     """Keeps inputs within what training had, says how far they were not, and scales them."""
     s, lane = wp.tid()
     for i in range(lane, scratch.nodes[s], lanes):
+        scratch.error[s, i] = real(1.0)
+        if net.low.shape[0] == ONE_SEES:
+            strain, log_strain = real(scratch.inputs[s, i, AT_STRAIN]), scratch.inputs[s, i, AT_LOG_STRAIN]
+            thin = _ramp(real(scratch.inputs[s, i, AT_MOMENTS + RINGS] - log_strain), NEAR_NONE, NEAR_WHOLE)
+            thin *= _ramp(real(scratch.inputs[s, i, AT_MOMENTS + RINGS + 2] - log_strain), FAR_NONE, FAR_WHOLE)
+            scratch.error[s, i] = real(1.0) + THIN_DOUBT * thin * _ramp(strain, FELT_NONE, FELT_WHOLE)
+            scratch.strange[s, i] = thin * _ramp(strain, DEEP_NONE, DEEP_WHOLE)
         for m in range(net.low.shape[0]):
             given = scratch.inputs[s, i, m]
             kept = wp.clamp(given, net.low[m], net.high[m])
@@ -393,4 +409,4 @@ def correct(lanes: wp.int32, scratch: Scratch, net: Net):
         log_ratio = wp.clamp(real(ratio), -LARGEST, LARGEST)
         held = scratch.pressure[s, i] * wp.exp(scratch.fade[s, i] * log_ratio)
         scratch.pressure[s, i] = held
-        scratch.error[s, i] = held * wp.exp(wp.min(real(doubt), real(1.0)))
+        scratch.error[s, i] = scratch.error[s, i] * held * wp.exp(wp.min(real(doubt), real(1.0)))
