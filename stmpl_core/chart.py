@@ -9,7 +9,6 @@ from typing import cast
 import numba
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.ndimage import distance_transform_edt
 
 from stmpl_core.arrays import PerVertex, finite
 from stmpl_core.errors import InvalidInput, MeshError
@@ -165,6 +164,8 @@ class UvChart:
     @cached_property
     def _raster(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """For each texel that carries a value: its number, the vertices of its face, and their weights."""
+        from scipy.ndimage import distance_transform_edt
+
         distance, nearest = cast(tuple, distance_transform_edt(self._cover < 0, return_indices=True))
         row, column = np.nonzero(distance <= PADDING)
         face = self._cover[tuple(nearest[:, row, column])]

@@ -7,7 +7,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.optimize import brentq, least_squares
 from scipy.special import j0, j1, jv
 
 from stmpl_core.errors import InvalidInput
@@ -308,6 +307,8 @@ def ball(
         pressures = np.array([*(() if taut else (0.0,)), *found]) / scale
         return Ball(radius, float(depth), float(np.pi * a * a * pressures @ [1, 2 / 3, 1 / 2]), a, pressures)
 
+    from scipy.optimize import brentq  # a fifth of a second, which every process of a node would wait
+
     def beyond(a: float) -> float:
         """How far depth [m] or force [N] is from what is asked."""
         return at(a).depth - depth if depth is not None else at(a).force - (force or 0.0)
@@ -352,6 +353,8 @@ def nearest(stack: list[tuple[float, float, float]], skin: Membrane | None, its_
 
     depth, motion = at_depth(response(stack, skin, k))
     whole = np.linalg.norm(motion[0], axis=1, keepdims=True)
+
+    from scipy.optimize import least_squares
 
     def off(logs: np.ndarray) -> np.ndarray:
         """First the logarithm of the force, then the motion, (radius, 1 + 2 * k)."""
