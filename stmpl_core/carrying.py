@@ -11,9 +11,10 @@ from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING
 
+import numba
 import numpy as np
 
-from stmpl_core.arrays import Faces, Points, Transform
+from stmpl_core.arrays import Points, Transform
 from stmpl_core.errors import InvalidInput
 from stmpl_core.state import Memory, State
 from stmpl_core.wake import carried_trail
@@ -22,7 +23,7 @@ if TYPE_CHECKING:
     from stmpl_core.layer import SoftLayer
     from stmpl_core.skin import Skin
 
-WINDOW, LEAST_SHARE = 1.5, 6.0  # edges around a place whose skin tells how it turns, and exponent that is left out
+WINDOW, MOST_EXPONENT = 1.5, 6.0  # edges around a place whose skin tells how it turns, and exponent that is left out
 
 
 def carried(state: State, skin: Skin, after: Skin) -> State:
@@ -71,14 +72,8 @@ def motion_at(layer: SoftLayer, moved: Callable[[np.ndarray], Points], place: np
         moved: function that gives where vertices have gone, (K, 3) [m], by their numbers (K,).
         place: place near it, (3,) [m].
     """
-    away = layer.vertices - place
-    square = np.einsum("vx,vx->v", away, away)
-    nearest = int(square.argmin())
-    exponent = (square - square[nearest]) / (2 * WINDOW**2 * layer.vertex_areas[nearest])
-    some = np.flatnonzero(exponent < LEAST_SHARE)
-    corners, at = _on_face(layer.vertices, layer.faces[(layer.faces == nearest).any(axis=1)], place)
-    end, shares, out = moved(np.concatenate([some, corners])), np.exp(-exponent[some]), np.eye(4)
-    start, shares = layer.vertices[some], shares / shares.sum()
+    some, shares, corners, at = _around(layer.vertices, layer.vertex_areas, layer.faces, np.ascontiguousarray(place))
+    start, end, out = layer.vertices[some], moved(np.concatenate([some, corners])), np.eye(4)
     first, second = shares @ start, shares @ end[:-3]
     u, _, v = np.linalg.svd((shares[:, None] * (end[:-3] - second)).T @ (start - first))
     u[:, 2] *= np.linalg.det(u) * np.linalg.det(v)  # no mirror: points on skin lie next to flat
@@ -87,17 +82,39 @@ def motion_at(layer: SoftLayer, moved: Callable[[np.ndarray], Points], place: np
     return out
 
 
-def _on_face(vertices: Points, faces: Faces, place: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices of the face nearest to a place, (3,), and where in it that is, in barycentric coordinates, (3,)."""
-    corner, first, second = np.moveaxis(vertices[faces], 1, 0)
-    first, second, away = first - corner, second - corner, place - corner
-    a, b, c, f, g = (np.einsum("fx,fx->f", p, q) for p, q in (
-        (first, first), (first, second), (second, second), (away, first), (away, second)))  # fmt: skip
-    v, w = np.stack([c * f - b * g, a * g - b * f]) / (a * c - b * b)
-    at = np.maximum(np.column_stack([1 - v - w, v, w]), 0.0)
-    at /= at.sum(axis=1)[:, None]
-    face = int(((np.einsum("fk,fkx->fx", at, vertices[faces]) - place) ** 2).sum(axis=1).argmin())
-    return faces[face], at[face]
+@numba.njit(cache=True, nogil=True)
+def _around(vertices, areas, faces, place):
+    """Vertices around the one nearest to a place, and their shares, (K,) each; those of its face there, (3,) each."""
+    square, nearest = np.empty(len(vertices)), 0
+    for v in range(len(vertices)):
+        square[v] = 0.0
+        for x in range(3):
+            square[v] += (vertices[v, x] - place[x]) ** 2
+        if square[v] < square[nearest]:
+            nearest = v
+    unit = 2 * WINDOW**2 * areas[nearest]
+    some = np.flatnonzero(square < square[nearest] + MOST_EXPONENT * unit)
+    shares = np.exp((square[nearest] - square[some]) / unit)
+    corners, at, least, share = np.empty(3, np.int64), np.empty(3), np.inf, np.empty(3)
+    for f in range(len(faces)):
+        i, j, k = faces[f, 0], faces[f, 1], faces[f, 2]
+        if i != nearest and j != nearest and k != nearest:
+            continue
+        a = b = c = d = e = away = 0.0
+        for x in range(3):
+            u, v, w = vertices[j, x] - vertices[i, x], vertices[k, x] - vertices[i, x], place[x] - vertices[i, x]
+            a, b, c, d, e = a + u * u, b + u * v, c + v * v, d + w * u, e + w * v
+        share[1] = max((c * d - b * e) / (a * c - b * b), 0.0)
+        share[2] = max((a * e - b * d) / (a * c - b * b), 0.0)
+        share[0] = max(1 - (c * d - b * e + a * e - b * d) / (a * c - b * b), 0.0)
+        share /= share.sum()
+        for x in range(3):
+            there = share[0] * vertices[i, x] + share[1] * vertices[j, x] + share[2] * vertices[k, x]
+            away += (there - place[x]) ** 2
+        if away < least:
+            least, at[:] = away, share
+            corners[0], corners[1], corners[2] = i, j, k
+    return some, shares / shares.sum(), corners, at
 
 
 def _memory(memory: Memory, before: Skin, after: Skin) -> Memory:

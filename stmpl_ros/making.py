@@ -174,17 +174,17 @@ def warm_up(simulator: Simulator) -> None:
     """
     corners = 0.01 * np.array([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1]])
     faces = np.array([[0, 2, 4], [2, 1, 4], [1, 3, 4], [3, 0, 4], [2, 0, 5], [1, 2, 5], [3, 1, 5], [0, 3, 5]])
-    tool, rig = Tool("warm up", corners, faces), simulator.layer.rig
+    tool, rig, state = Tool("warm up", corners, faces), simulator.layer.rig, State()
     for angles in ([WARM_BEND] * len(rig.joints), ()) if rig else ((),):
         if rig:
-            simulator.move_to(simulator.skin.at_angles(angles))
-        _press(simulator, tool)
+            state = simulator.move_to(simulator.skin.at_angles(angles), state)
+        state = _press(simulator, tool, state)
     simulator.tools.remove(tool.name)
 
 
-def _press(simulator: Simulator, tool: Tool) -> None:
+def _press(simulator: Simulator, tool: Tool, state: State) -> State:
     """Touches the skin where it stands, in each way."""
-    layer, pose, state = simulator.layer, np.eye(4), State()
+    layer, pose = simulator.layer, np.eye(4)
     vertex = int(np.linalg.norm(layer.vertices - layer.vertices.mean(axis=0), axis=1).argmin())
     push, deep = np.concatenate([-0.01 * layer.normals[vertex], np.zeros(3)]), -float(layer.thickness[vertex])
     for away, wrench in ((0.009, push), (0.012, push), (0.009, None), (deep, None), (0.05, push)):
@@ -197,3 +197,4 @@ def _press(simulator: Simulator, tool: Tool) -> None:
             touches, state = simulator.touch([Contact(tool, pose.copy(), wrench)], state, 0.01)
             simulator.answer(touches)
             local_contacts(simulator.history, touches, state)
+    return state
