@@ -300,7 +300,7 @@ class Answering:
             self._hurry.set()
             return  # the last field comes first, without a rest before it
         silent, limit = self._hearing.inbox.silence(now) / NANO, config.rest_after
-        left = 1 - (silent - limit) / config.fade if config.fade else 0.0
+        left = min(1.0, 1 - (silent - limit) / config.fade) if config.fade else 0.0
         why = f"no pose for {limit} s"
         if gate.refused_since:
             why = f"{why} that could be used (refused: {gate.refused_since})"
@@ -325,6 +325,11 @@ class Answering:
         ready = all(one.name in self.simulator.tools for one in instant.contacts)
         if not (ready and self._hearing.inbox.live(self._hearing.now()) and self.answer(instant)):
             self.rest("another skin")
+
+    def on_time_back(self) -> None:
+        """Rest, if anything was answered before a simulated clock was set back: that lies in its future."""
+        if self._instant is not None:
+            self.rest("the simulated clock went back: back at rest")
 
     def without(self, name: str) -> None:
         """Tells that a tool, which was taken away, exerts nothing; rest, if no tool of the last instant is left."""

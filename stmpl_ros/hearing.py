@@ -52,6 +52,7 @@ class Hearing:
         on_tool: callback with a tool whose field is to be built.
         on_removed: callback with the name of a tool that was taken away.
         on_instant: callback with every complete instant.
+        on_time_back: callback for a simulated clock that was set back, once all is forgotten.
     """
 
     def __init__(self, node: Node, config: Callable[[], NodeConfig], tools: Tools, tally: Tally) -> None:
@@ -70,6 +71,7 @@ class Hearing:
         self.on_tool: Callable[[Tool], None] = lambda tool: None
         self.on_removed: Callable[[str], None] = lambda name: None
         self.on_instant: Callable[[Instant], None] = lambda instant: None
+        self.on_time_back: Callable[[], None] = lambda: None
         self._topics: list[Any] = []
         self._listened: dict[str, list[Any]] = {}  # subscriptions of each tool
         self._unknown: dict[str, str] = {}  # topics of poses at the last look, by tool, whose surface is not known
@@ -286,6 +288,7 @@ class Hearing:
                                         "forgotten")  # fmt: skip
         self.frames.forget()
         self.forget()
+        self.on_time_back()
 
     def _on_gazebo(self, message: Any) -> None:
         assert self.gazebo and self.layer

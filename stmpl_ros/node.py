@@ -106,7 +106,7 @@ class SkinNode(ServingNode):
         self.bending = Bending(self, self.hearing, lambda: self.config)
         self.answering = Answering(self, self.settings, self.hearing, self.tally, self.calibration, self.bending)
         self.hearing.on_tool, self.hearing.on_instant = self._on_tool, self.answering.answer
-        self.hearing.on_removed = self._on_removed
+        self.hearing.on_removed, self.hearing.on_time_back = self._on_removed, self.answering.on_time_back
         self._offer("reset", self.reset)
         self.create_service(SetBody, "~/set_body", self._on_set_body)
         self.create_service(GetTopology, "~/get_topology", self._on_get_topology)

@@ -377,6 +377,21 @@ def test_a_rare_field_does_not_hold_up_what_fades(composed):
     composed.wait(lambda: answering._instant is None)
 
 
+def test_a_simulated_clock_that_is_set_back_brings_rest_and_no_answer_is_ever_amplified(composed, monkeypatch):
+    node, answering = composed.node, composed.node.answering
+    composed.wait(lambda: composed.press() and composed.heard)
+    composed.wait(lambda: answering.fading)
+    with monkeypatch.context() as patch:
+        patch.setattr(node.hearing.inbox, "silence", lambda now: 0)
+        count = len(composed.heard)
+        composed.wait(lambda: len(composed.heard) > count + 3)
+    assert all(0 < one.fade <= 1 for one in composed.heard)
+    node.hearing.now.on_back()
+    composed.wait(lambda: "went back" in composed.heard[-1].why or composed.heard[-1].fade > 1)
+    assert composed.heard[-1].why == "the simulated clock went back: back at rest"
+    assert not composed.heard[-1].touches and not rows(composed.heard[-1]).any() and answering._instant is None
+
+
 def test_a_rate_that_was_rare_is_another_one_at_once(composed):
     """At 1 mHz the thread of the fields rests, and the display waits, for a thousand seconds."""
     node, answering = composed.node, composed.node.answering
