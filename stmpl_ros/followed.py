@@ -68,7 +68,11 @@ class Followed:
                 stamp = self._node.get_clock().now().nanoseconds
             if stamp is None or stamp <= self._newest.get(tool, 0):
                 continue
-            message = PoseStamped(header=header(self._frames.body, stamp), pose=self._frames.place(frame, stamp))
+            try:
+                place = self._frames.place(frame, stamp)
+            except KeyError:  # a frame between was first told of after that, as where /tf has just begun
+                continue
+            message = PoseStamped(header=header(self._frames.body, stamp), pose=place)
             self._newest[tool] = stamp
             publisher.publish(message)
             self._on_pose(tool, message)

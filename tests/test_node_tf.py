@@ -33,6 +33,7 @@ from bags.wire import (
     wrench_message,
 )
 from stmpl_core.errors import FrameError, InvalidInput
+from stmpl_ros.followed import Followed
 from stmpl_ros.frames import Frames
 from stmpl_ros.node import SkinNode
 from stmpl_ros.parameters import NodeConfig
@@ -248,6 +249,23 @@ def test_a_tool_may_be_a_frame_of_tf_and_what_it_is_taken_for_is_sent_for_a_reco
     answer = next(one for one in reversed(scene.heard) if one.touches and one.touches[0].pose_stamp.sec)
     stamp = answer.touches[0].pose_stamp.sec * NANO + answer.touches[0].pose_stamp.nanosec
     scene.wait(lambda: any(stamp_ns(one) == stamp for one in scene.poses))  # the answer names a pose that was sent
+
+
+def test_where_tf_has_just_begun_a_tool_of_it_waits_until_its_whole_chain_was_told():
+    """The newest time of both frames lies before the arm's first."""
+    frames, heard = Frames("body", {}, SimpleNamespace()), list[PoseStamped]()
+    clock = SimpleNamespace(create_publisher=lambda *_: SimpleNamespace(publish=lambda message: None),
+                            create_timer=lambda *_, **__: None)  # fmt: skip
+    config = NodeConfig(tf_tools=("finger=tool0",))
+    followed = Followed(clock, frames, config, lambda tool, pose: heard.append(pose))  # type: ignore[arg-type]
+    followed.follow("finger")
+    frames._buffer.set_transform(told("body", "base", np.eye(4), NANO), "test")
+    frames._buffer.set_transform(told("base", "tool0", HERE, NANO + 30 * MS), "test")
+    followed._look()
+    assert not heard
+    frames._buffer.set_transform(told("body", "base", np.eye(4), NANO + 33 * MS), "test")
+    followed._look()
+    assert [stamp_ns(pose) for pose in heard] == [NANO + 30 * MS]
 
 
 @pytest.mark.parametrize("scene", [{"tf_tools": ("finger=tool0",), "tf_rate": 200.0, "max_age": 0.0}], indirect=True)
