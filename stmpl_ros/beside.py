@@ -7,8 +7,7 @@ import os
 import signal
 import threading
 from collections.abc import Callable
-from concurrent.futures import BrokenExecutor, Future, ProcessPoolExecutor
-from contextlib import suppress
+from concurrent.futures import Future, ProcessPoolExecutor
 from multiprocessing.context import SpawnContext, SpawnProcess
 from typing import Any
 
@@ -30,34 +29,34 @@ class Beside[T]:
     """
 
     def __init__(self, do: Callable[..., T], *arguments: Any) -> None:
-        self._pool = pool(1)
-        self._pid = self._pool.submit(os.getpid)
+        self._pool = Pool(1)
         self.result: Future[T] = self._pool.submit(do, *arguments)
 
     def close(self) -> None:
         """Ends the process, whether the job is done or not."""
-        started = self._pid.done()
-        if started and not (self.result.done() and isinstance(self.result.exception(), BrokenExecutor)):
-            with suppress(ProcessLookupError):  # closed before
-                os.kill(self._pid.result(), signal.SIGTERM)
         # waits for what ends at once: a pool's thread that still ends trips over an interpreter that ends too
-        self._pool.shutdown(wait=started, cancel_futures=True)
+        self._pool.end(wait=True)
 
 
 class Builders:
     """Processes that build distance fields side by side; the first starts at once."""
 
     def __init__(self) -> None:
-        self._pool = pool(BUILDERS, _ready_to_build)
+        self._pool = Pool(BUILDERS, _ready_to_build)
         self._pool.submit(os.getpid)
+
+    @property
+    def broken(self) -> bool:
+        """Whether a process died."""
+        return self._pool.broken
 
     def field(self, tool: Tool, margin: float) -> Future[SignedDistance]:
         """The distance field of a tool, `margin` [m] wide. May raise MeshError."""
         return self._pool.submit(_field, tool, margin)
 
     def close(self) -> None:
-        """Ends the processes; what was not begun is dropped."""
-        self._pool.shutdown(wait=False, cancel_futures=True)
+        """Ends the processes; what they build is dropped."""
+        self._pool.end()
 
 
 class _Deaf(SpawnProcess):
@@ -75,9 +74,29 @@ class _Spawning(SpawnContext):
     Process = _Deaf
 
 
-def pool(workers: int, start: Callable | None = None, *arguments: Any) -> ProcessPoolExecutor:
-    """Processes that call `start` with `arguments` first."""
-    return ProcessPoolExecutor(workers, _Spawning(), stand_beside, (start, *arguments))
+class Pool(ProcessPoolExecutor):
+    """Processes that call `start` with `arguments` first.
+
+    Args:
+        workers: largest number of processes.
+    """
+
+    def __init__(self, workers: int, start: Callable | None = None, *arguments: Any) -> None:
+        super().__init__(workers, _Spawning(), stand_beside, (start, *arguments))
+
+    @property
+    def broken(self) -> bool:
+        """Whether a process died."""
+        return bool(self._broken)
+
+    def end(self, *, wait: bool = False) -> None:
+        """Ends the processes, whatever they are at, also while they import; what is not done is dropped."""
+        if self._processes is not None:  # None: ended before
+            queue: Any = self._result_queue
+            queue._writer.close()  # else the pool's thread waits for ever for the rest of a result that was cut off
+            for process in list(self._processes.values()):
+                process.terminate()
+        self.shutdown(wait=wait, cancel_futures=True)
 
 
 def stand_beside(start: Callable | None = None, *arguments: Any) -> None:

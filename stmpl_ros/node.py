@@ -30,7 +30,7 @@ from stmpl_core.tools import Tools
 from stmpl_core.toucher import margin_on
 from stmpl_ros.answering import Answering
 from stmpl_ros.bending import Bending
-from stmpl_ros.beside import Beside, Builders
+from stmpl_ros.beside import Beside
 from stmpl_ros.body_action import BodyAction, Done, changes_of
 from stmpl_ros.bond import Bond
 from stmpl_ros.calibration import Calibration
@@ -139,15 +139,14 @@ class SkinNode(ServingNode):
         try:
             check(self.config, self._build)
             self.answering.limits = Limits.read(self.config.limits, self.config.limb)
-            builders = Builders()  # start while the skin is made
+            self.workshop = Workshop(self)  # its builders start while the skin is made
             with install_listener("numba:compile", Compiling(self._tell_progress)):
-                for simulator in self._answer_on(self._make_skin(), self.config, builders):
+                for simulator in self._answer_on(self._make_skin(), self.config):
                     warm_up(simulator)
         except StmplError as error:
             self._end()
             self.get_logger().error(f"cannot be configured: {error}")
             return TransitionCallbackReturn.FAILURE
-        assert self.workshop
         self.answering.sending = Sending(self, self.config, self.skin, self.workshop, self.hearing.gate)
         self._open.callback(self.sending.close)
         self.answering.open()
@@ -232,19 +231,18 @@ class SkinNode(ServingNode):
         finally:
             making.close()
 
-    def _answer_on(self, skin: Skin, config: NodeConfig, builders: Builders | None = None) -> tuple[Simulator, ...]:
+    def _answer_on(self, skin: Skin, config: NodeConfig) -> tuple[Simulator, ...]:
         """From here on the answers are of this skin, with the friction of these settings; its simulators."""
-        tools, before, friction = self.hearing.tools, self.workshop, friction_of(config)
+        assert self.workshop
+        tools, friction = self.hearing.tools, friction_of(config)
         if tools.margin != margin_on(skin.layer):  # fields of another width are built anew
             self.hearing.inbox.tools = again = Tools(margin_on(skin.layer))
         else:
             again = tools
         self.skin, self.hearing.layer = skin, skin.layer
         simulators = self.answering.move_to(skin, again, friction)
-        self.workshop = Workshop(self, skin.layer, friction, builders)
-        if before:
-            before.close()
-        for tool in [*tools, *tools.waiting()] if again is not tools else again.waiting():
+        self.workshop.move_to(skin.layer, friction)
+        for tool in [*tools, *tools.waiting()] if again is not tools else ():
             again.announce(tool)
             self._on_tool(tool)
         return simulators
@@ -363,10 +361,9 @@ class SkinNode(ServingNode):
     def _take_over(self, skin: Skin, config: NodeConfig) -> None:
         same = skin is self.skin
         self._answer_on(skin, config)
-        assert self.workshop
         self.settings.take(config)
         self.answering.limits = Limits.read(config.limits, config.limb)
-        self.sending.move_to(skin, self.workshop)
+        self.sending.move_to(skin)
         gc.collect()
         gc.freeze()  # without a thaw, which would take 0.1 s of the answers
         if same:

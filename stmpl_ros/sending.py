@@ -81,10 +81,10 @@ class Sending:
             self._wrenches[name].wait_for_all_acked(Duration(seconds=LAST_WORD_S))
             self._close_tool(name)
 
-    def move_to(self, skin: Skin, workshop: Workshop) -> None:
+    def move_to(self, skin: Skin) -> None:
         """Sends answers of another skin from here on."""
         self._skin = skin
-        self.models.move_to(workshop)
+        self.models.drop()
         self.show.move_to(skin.layer)
 
     def topology(self, stamp: int) -> None:
@@ -149,9 +149,9 @@ class Models:
         """Closes it."""
         self._node.destroy_publisher(self._publishers.pop(name))
 
-    def move_to(self, workshop: Workshop) -> None:
-        """Goes on with another skin's workshop; what the old one was asked is dropped."""
-        self._workshop, self._next, self._busy = workshop, None, False
+    def drop(self) -> None:
+        """Goes on with another skin: the workshop drops what it was asked."""
+        self._next, self._busy = None, False
 
     def put(self, instant: Instant, touches: Touches, before: Before, doubt: str = "") -> None:
         """Takes the newest instant, its touches, what they were made from, and why it may not be known where."""

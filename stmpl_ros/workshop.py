@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import os
-import signal
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import BrokenExecutor, Future, ProcessPoolExecutor
-from typing import Any, TypeVar
+from concurrent.futures import BrokenExecutor, Future
+from typing import TypeVar
 
 import numpy as np
 from rclpy.node import Node
@@ -23,7 +21,7 @@ from stmpl_core.stiffness import Stiffness, fit_stiffness
 from stmpl_core.strokes import Fading, Rubbing, fit_friction, fit_relaxation
 from stmpl_core.tool import Tool
 from stmpl_core.toucher import Toucher, margin_on
-from stmpl_ros.beside import Builders, pool
+from stmpl_ros.beside import Builders, Pool
 from stmpl_ros.remembering import Before
 
 MAX_FITTED_INSTANTS = 500  # instants of a stroke or a press that stays, evenly over it; each takes a touch
@@ -41,27 +39,35 @@ class Workshop:
 
     Args:
         node: node whose executor gets what was made.
-        layer: layer that contacts are on.
-        friction: friction of the tools, see Simulator.
-        builders: processes that build distance fields; None: started here.
     """
 
-    def __init__(self, node: Node, layer: SoftLayer, friction: Friction | Mapping[str, Friction] = None,
-                 builders: Builders | None = None) -> None:  # fmt: skip
-        self._node, self._layer, self._friction, self._closed = node, layer, friction, False
-        self._fit: Future[Any] | None = None
-        self._pid: Future[int] | None = None
-        self._models: ProcessPoolExecutor | None = None  # started when somebody asks
-        self._builders = builders or Builders()
+    _knows: tuple[SoftLayer, Friction | Mapping[str, Friction]]
+
+    def __init__(self, node: Node) -> None:
+        self._node, self._closed = node, False
+        self._models: Pool | None = None  # started when somebody asks
+        self._builders = Builders()
+
+    def move_to(self, layer: SoftLayer, friction: Friction | Mapping[str, Friction]) -> None:
+        """Goes on with a layer that contacts are on, and the friction of the tools (see Simulator).
+
+        The builders stay. Models and fits on the layer from before are dropped, and fields of another width.
+        """
+        self._knows = layer, friction
+        if self._models:
+            self._models.end()
+            self._models = None
 
     def field(self, tool: Tool, do: Then) -> None:
         """Has the distance field of a tool built, for `do`. The future may raise MeshError."""
-        self._then(self._builders.field(tool, margin_on(self._layer)), do)
+        margin = margin_on(self._knows[0])
+        self._then(self._builders.field(tool, margin), do, lambda: margin == margin_on(self._knows[0]))
 
     def models(self, contacts: Sequence[Contact], before: Before, do: Then) -> None:
         """Has the local model of each contact found, beside the others and as the tissue remembers, for `do`."""
-        self._then(self._modeller().submit(_local_contacts, list(contacts), before.state, before.dt,
-                                             before.joints), do)
+        found = self._modeller().submit(_local_contacts, list(contacts), before.state, before.dt, before.joints)
+        knows = self._knows
+        self._then(found, do, lambda: knows is self._knows)
 
     def stiffness(self, presses: Sequence[Contact]) -> Future[Stiffness]:
         """Fits the skin's stiffness to these presses: for a thread that waits."""
@@ -77,39 +83,35 @@ class Workshop:
 
     def _fitted(self, fit: Callable[[list[Contact]], Fit], contacts: Sequence[Contact]) -> Future[Fit]:
         found = self._modeller().submit(fit, list(contacts))
-        self._fit = found
-        self._then(found, lambda future: self.renew(future.exception()))
+        self._then(found, lambda future: self.renew(future.exception()), lambda: True)
         return found
 
     def renew(self, error: BaseException | None) -> None:
         """Replaces the processes, if `error` says that one died."""
-        if isinstance(error, BrokenExecutor) and not self._closed:
-            self._node.get_logger().error(f"a process that builds distance fields or local models died: {error}")
-            self._end()
-            self._models, self._builders = None, Builders()
+        if not isinstance(error, BrokenExecutor):
+            return
+        self._node.get_logger().error(f"a process that builds distance fields or local models died: {error}")
+        if self._builders.broken:
+            self._builders.close()
+            self._builders = Builders()
+        if self._models and self._models.broken:
+            self._models.end()
+            self._models = None
 
     def close(self) -> None:
-        """Ends the processes; nothing comes back any more."""
+        """Ends the processes, whatever they are at; nothing comes back any more."""
         self._closed = True
-        self._end()
-
-    def _modeller(self) -> ProcessPoolExecutor:
-        if self._models is None:
-            self._models = pool(1, _know, self._layer, self._friction)
-            self._pid = self._models.submit(os.getpid)
-        return self._models
-
-    def _end(self) -> None:
-        """What was not begun is dropped, and a fit, which takes seconds, is broken off."""
-        pid = self._pid
-        if self._fit and not self._fit.done() and pid and pid.done() and not pid.exception():
-            os.kill(pid.result(), signal.SIGTERM)
         self._builders.close()
         if self._models:
-            self._models.shutdown(wait=False, cancel_futures=True)
+            self._models.end()
 
-    def _then(self, future: Future, do: Then) -> None:
-        then(self._node, future, lambda done: None if self._closed else do(done))
+    def _modeller(self) -> Pool:
+        if self._models is None:
+            self._models = Pool(1, _know, *self._knows)
+        return self._models
+
+    def _then(self, future: Future, do: Then, wanted: Callable[[], bool]) -> None:
+        then(self._node, future, lambda done: do(done) if wanted() and not self._closed else None)
 
 
 def then(node: Node, future: Future, do: Then) -> None:

@@ -1,6 +1,7 @@
 """Laws of the node's life: lifecycle, another node beside it, what is asked of devices, launch files."""
 
 import ast
+import multiprocessing
 import os
 import runpy
 import signal
@@ -13,6 +14,7 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import Future
 from dataclasses import replace
 from importlib.util import find_spec
+from multiprocessing.connection import wait
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, NamedTuple
@@ -38,6 +40,7 @@ from bags.wire import pose_message, stamp_ns, tool_message
 from stmpl_core import Tool
 from stmpl_core.errors import InvalidInput
 from stmpl_core.friction import PAIRS
+from stmpl_ros.beside import Beside, Builders
 from stmpl_ros.hearing import Hearing
 from stmpl_ros.inbox import Instant
 from stmpl_ros.node import SkinNode
@@ -334,6 +337,19 @@ def test_another_tissue_keeps_the_part_that_answers_where_none_was_asked_for(com
     assert node.settings.with_(tissue="relaxed").limb == node.config.limb == "left_arm"
 
 
+def test_another_stiffness_keeps_the_processes_that_build_fields_and_what_they_are_at(composed):
+    node = composed.node
+    composed.wait(lambda: "finger" in node.hearing.tools)
+    before = set(multiprocessing.active_children())
+    composed.announce(ball(0.008).named("thumb"))
+    composed.wait(node.hearing.tools.waiting)
+    for stiffness in (1300.0, 1400.0, 1500.0, 1600.0):
+        assert node.set_body(youngs_modulus=stiffness) == "taken over"
+    composed.wait(lambda: "thumb" in node.hearing.tools)
+    assert before <= set(multiprocessing.active_children())
+    assert len(multiprocessing.active_children()) <= len(before) + 1, "one more for the field beside the first"
+
+
 def test_friction_that_an_elastic_node_takes_over_is_compiled_beside_it(composed):
     """Its first answer may take half a minute elsewhere, not here."""
     node, skin = composed.node, composed.node.skin
@@ -593,6 +609,23 @@ one.close()
 def test_ctrl_c_does_not_reach_a_process_beside_the_node_that_still_imports():
     ended = subprocess.run([sys.executable, "-c", CTRL_C], start_new_session=True, capture_output=True, text=True)
     assert (ended.returncode, ended.stderr) == (0, "")
+
+
+def test_a_process_beside_the_node_ends_also_while_it_imports_or_hands_its_result_over():
+    """A result cut off midway left the pool's thread, and with it the node, waiting for ever."""
+    before = set(multiprocessing.active_children())
+    builders = Builders()
+    (importing,) = set(multiprocessing.active_children()) - before
+    builders.close()
+    importing.join(PATIENCE)
+    assert importing.exitcode == -signal.SIGTERM
+    asleep = Beside(time.sleep, 3600)
+    asleep.close()
+    assert asleep.result.exception() or asleep.result.cancelled()
+    large = Beside(bytes, 2 * 10**8)
+    wait([large._pool._result_queue._reader], PATIENCE)
+    large.close()
+    assert set(multiprocessing.active_children()) <= before
 
 
 def test_a_verb_whose_output_nobody_wants_ends_well():
