@@ -26,6 +26,13 @@ from stmpl_core.tool import Tool
 log = logging.getLogger(__name__)
 
 DISPLACEMENT, TOPOLOGY, MESH = "skin/displacement", "skin/topology", "contact_mesh"
+TYPES = {
+    DISPLACEMENT: "stmpl_msgs/msg/SkinDisplacement",
+    TOPOLOGY: "stmpl_msgs/msg/SkinTopology",
+    MESH: "stmpl_msgs/msg/ContactMesh",
+    "pose": "geometry_msgs/msg/PoseStamped",
+    "wrench": "geometry_msgs/msg/WrenchStamped",
+}  # of the topics that are read, by their endings
 _OF_ROBOT = re.compile(r"(?:(.*)/)?(?:skin/\w+|contact_mesh)")  # topics of a robot's run
 _OF_TOOL = re.compile(r"(?:(.*)/)?tools/(.+)/(pose|wrench|mesh|contact_wrench|local_contact)")  # NAME may hold "/"
 
@@ -344,6 +351,13 @@ def tool_topic(topic: str) -> tuple[str, str] | None:
     """(tool, "pose" or "wrench") if the topic is of a tool: .../tools/NAME/pose."""
     found = _OF_TOOL.fullmatch(topic)
     return (found[2], found[3]) if found and found[3] in ("pose", "wrench") else None
+
+
+@cache
+def type_of(topic: str) -> str:
+    """Type that a topic of a run has to have to be read; empty: any."""
+    contact = tool_topic(topic)
+    return TYPES[contact[1]] if contact else next((TYPES[e] for e in TYPES if "/" in e and ends(topic, e)), "")
 
 
 @cache

@@ -20,6 +20,7 @@ from rclpy.utilities import ok
 
 from bags.moving import TF, TF_STATIC
 from bags.provenance import write_provenance
+from bags.reader import type_of
 from bags.schema import find_schema
 from bags.wire import message_class
 from bags.writer import BagWriter, qos_yaml
@@ -71,17 +72,18 @@ class RecorderNode(Node):
         self._queue: queue.SimpleQueue[Item | None] = queue.SimpleQueue()
         self._thread = threading.Thread(target=self._write, name="writer")
         self._thread.start()
-        self._subscribed: set[str] = set()
+        self._known: dict[str, Sequence[str]] = {}  # types of topics that were refused, none of those that are recorded
         self.create_timer(POLL_PERIOD_S, self._look)
         self._waiting = self.create_timer(SILENCE_S, self._tell_of_silence)
 
     def _look(self) -> None:
         for topic, types in self.get_topic_names_and_types():
-            if topic not in self._subscribed and self.count_publishers(topic) and self._is_wanted(topic):
-                self._subscribed.add(topic)
+            if self._known.get(topic) not in ((), types) and self.count_publishers(topic) and self._is_wanted(topic):
                 try:
-                    self._subscribe(topic, types[0])
+                    self._subscribe(topic, types)
+                    self._known[topic] = ()
                 except BagError as error:
+                    self._known[topic] = types
                     self.get_logger().error(f"{topic} is not recorded: {error}")
 
     def _tell_of_silence(self) -> None:
@@ -105,7 +107,11 @@ class RecorderNode(Node):
         run = WANTED.search(topic) or (IF_HEARD.search(topic) and self.count_subscribers(topic))
         return bool(run) and (topic.startswith(own) or topic in EVERYBODYS)
 
-    def _subscribe(self, topic: str, type_name: str) -> None:
+    def _subscribe(self, topic: str, types: Sequence[str]) -> None:
+        expected = type_of(topic)
+        type_name = expected if expected in types else types[0]
+        if type_name != expected and expected and not self._wanted:
+            raise BagError(f"it carries {type_name}, and a run's carries {expected}. --topics records any type.")
         find_schema(type_name)  # raises BagError here, not in the thread that writes
         profile = as_offered(self, topic, DEPTH)
         reliable = profile.reliability == ReliabilityPolicy.RELIABLE
@@ -115,7 +121,7 @@ class RecorderNode(Node):
         lease = max((one for one in leases if one < FOREVER), default=0.0)
         depth = max((o.depth for o in offered), default=10) or 10
         qos = qos_yaml(depth=depth, reliable=reliable, transient_local=kept, lease=lease)
-        placed = PLACED.fullmatch(topic) is not None
+        placed = PLACED.fullmatch(topic) is not None and type_name == expected
 
         def keep(data: Any) -> None:
             if self._queue.qsize() > MAX_QUEUED_MESSAGES:
@@ -145,7 +151,7 @@ class RecorderNode(Node):
             found = PLACED.fullmatch(topic)
             assert found
             body = topology.get(found[1])
-            if body is not None and frame not in (body, found[2], *frames):
+            if frame and body is not None and frame not in (body, found[2], *frames):
                 yield (f"{topic} came in frame '{frame}', which is neither '{body}' nor in --frames, and no /tf was "
                        "recorded: these contacts are not replayed offline, only to a node that hears /tf (stmpl replay "
                        "--publish)")  # fmt: skip
@@ -182,7 +188,9 @@ class RecorderNode(Node):
 
 
 def frame_of(data: bytes) -> str:
-    """frame_id of a serialised message that begins with its header."""
+    """frame_id of a serialised message that begins with its header; empty where the message is cut."""
+    if len(data) < 16:
+        return ""
     (length,) = struct.unpack_from("<I" if data[1] else ">I", data, 12)
     return data[16 : 15 + length].decode(errors="replace")
 

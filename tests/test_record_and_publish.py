@@ -10,7 +10,8 @@ import pytest
 import rclpy
 from geometry_msgs.msg import PoseStamped
 from rclpy.qos import QoSProfile
-from std_msgs.msg import Header, String
+from rclpy.serialization import serialize_message
+from std_msgs.msg import Bool, Header, String
 from stmpl_msgs.msg import SkinTopology
 
 from bags.reader import Bag
@@ -80,6 +81,32 @@ def test_a_recorder_tells_of_poses_that_only_a_node_that_hears_tf_can_place(talk
     assert "/tools/other/pose came in frame 'moving_base', which is neither 'body' nor in --frames" in said
     assert said.count(" came in frame ") == 1
     assert "no answers were heard in namespace /, so this cannot be replayed" in said
+
+
+@pytest.mark.parametrize("asked", [(), ("--topics", ".*")])
+def test_a_message_of_another_type_on_a_tools_topic_ends_no_recording(talker, tmp_path, asked):
+    odd, pose = (talker.node.create_publisher(*one, STREAM) for one in ((Bool, "tools/odd/pose"),
+                                                                        (PoseStamped, "tools/tip/pose")))  # fmt: skip
+    recorder = start(*STMPL, "record", "--path", str(tmp_path / "run"), *asked)
+    try:
+        talker.wait_for_recorder(pose, *[odd] * bool(asked))
+        odd.publish(Bool(data=True))
+        talker.spin(0.3)
+        pose.publish(PoseStamped(header=Header(frame_id="body")))
+        talker.spin(0.3)
+    finally:
+        code, said = end(recorder, signal.SIGINT)
+        for publisher in (odd, pose):
+            talker.node.destroy_publisher(publisher)
+    assert code == 0 and "Traceback" not in said, said
+    assert Bag(tmp_path / "run").topics["/tools/tip/pose"].messages == 1
+    assert asked or ("/tools/odd/pose is not recorded: it carries std_msgs/msg/Bool, and a run's carries "
+                     "geometry_msgs/msg/PoseStamped") in said  # fmt: skip
+
+
+def test_a_recorder_reads_no_frame_from_a_message_that_is_cut():
+    whole = serialize_message(PoseStamped(header=Header(frame_id="body")))
+    assert [recorder.frame_of(whole[:size]) for size in (0, 3, 15, len(whole))] == ["", "", "", "body"]
 
 
 @pytest.fixture(scope="module")
