@@ -14,6 +14,7 @@ from mcap.records import Attachment, Channel, Message, Metadata, Schema
 from rosbags.typesys.store import Typestore
 
 from bags.frame import Frame
+from bags.moving import TF, TF_STATIC
 from bags.provenance import LAYER, RECORD, Provenance, layer_from_bytes, provenance_from
 from bags.records import Damage, End, Place, Record, bag_file, read_places, summary, walk, walk_places
 from bags.schema import typestore_of
@@ -30,9 +31,10 @@ TYPES = {
     DISPLACEMENT: "stmpl_msgs/msg/SkinDisplacement",
     TOPOLOGY: "stmpl_msgs/msg/SkinTopology",
     MESH: "stmpl_msgs/msg/ContactMesh",
-    "pose": "geometry_msgs/msg/PoseStamped",
-    "wrench": "geometry_msgs/msg/WrenchStamped",
+    TF: "tf2_msgs/msg/TFMessage",
+    TF_STATIC: "tf2_msgs/msg/TFMessage",
 }  # of the topics that are read, by their endings
+TOOL_TYPES = {"pose": "geometry_msgs/msg/PoseStamped", "wrench": "geometry_msgs/msg/WrenchStamped"}  # a tool's
 _OF_ROBOT = re.compile(r"(?:(.*)/)?(?:skin/\w+|contact_mesh)")  # topics of a robot's run
 _OF_TOOL = re.compile(r"(?:(.*)/)?tools/(.+)/(pose|wrench|mesh|contact_wrench|local_contact)")  # NAME may hold "/"
 
@@ -98,7 +100,7 @@ class Bag:
     @property
     def namespaces(self) -> list[str]:
         """Namespaces of the robots in the file, whether asked for or not; "/" where a robot has none."""
-        found = (namespace_of(channel.topic) for channel in self._channels.values())
+        found = (namespace_of(one.topic) for one in self._channels.values() if not self._odd_type(one))
         return sorted({namespace for namespace in found if namespace is not None})
 
     def messages(self, wanted: Callable[[str], bool] | None = None) -> Iterator[Recorded]:
@@ -138,7 +140,7 @@ class Bag:
 
     def find_topic(self, ending: str) -> str:
         """The one topic whose name ends with `ending`, whatever its namespace. Raises BagError."""
-        names = {channel.topic for channel in self._channels.values() if self._is_meant(channel.topic)}
+        names = {one.topic for one in self._channels.values() if self._is_meant(one.topic) and not self._odd_type(one)}
         found = [name for name in names if ends(name, ending)]
         if len(found) > 1:
             raise BagError(f"{self.file} holds {len(found)} robots, of the namespaces {', '.join(self.namespaces)}. "
@@ -287,6 +289,11 @@ class Bag:
         around = [name for name in self.namespaces if name != "/" and topic.startswith(name + "/")]
         return (namespace_of(topic) or max(around, key=len, default=None)) in (None, self.namespace)
 
+    def _odd_type(self, channel: Channel) -> str:
+        """Type of a topic of a run that carries another one than it has to; empty: the right one, or it is lost."""
+        schema, expected = self._schemas.get(channel.schema_id), type_of(channel.topic)
+        return schema.name if schema and expected and schema.name != expected else ""
+
     def _walk(self, wanted: Callable[[str], bool]) -> Iterator[tuple[str, Message]]:
         topics = {number: channel.topic for number, channel in self._channels.items()
                   if channel.topic in self.topics and wanted(channel.topic)}  # fmt: skip
@@ -321,7 +328,7 @@ class Bag:
     def _show(self, record: Message, place: Place) -> bool:
         """Lets `see` have a message that is meant; False if its topic is not known (yet)."""
         channel = self._channels.get(record.channel_id)
-        if channel and self._is_meant(channel.topic):
+        if channel and self._is_meant(channel.topic) and not self._odd_type(channel):
             self.see(channel.topic, record, place)
         return channel is not None
 
@@ -343,6 +350,10 @@ class Bag:
     def _warn(self) -> None:
         for damage in self.damage:
             log.warning("%s: %s", self.file, damage)
+        for channel in self._channels.values():
+            if (kind := self._odd_type(channel)) and self._is_meant(channel.topic):
+                log.warning("%s: %s is left out: it carries %s, and a run's carries %s", self.file, channel.topic, kind,
+                            type_of(channel.topic))  # fmt: skip
         if not self.finished:
             log.warning("%s was not finished by its writer; at most its last chunk is missing", self.file)
 
@@ -357,7 +368,7 @@ def tool_topic(topic: str) -> tuple[str, str] | None:
 def type_of(topic: str) -> str:
     """Type that a topic of a run has to have to be read; empty: any."""
     contact = tool_topic(topic)
-    return TYPES[contact[1]] if contact else next((TYPES[e] for e in TYPES if "/" in e and ends(topic, e)), "")
+    return TOOL_TYPES[contact[1]] if contact else next((TYPES[e] for e in TYPES if ends(topic, e)), "")
 
 
 @cache

@@ -11,7 +11,7 @@ from mcap.records import Message
 
 from bags.frame import Frame
 from bags.moving import TF, TF_STATIC, FramesAt, MovingFrames
-from bags.reader import DISPLACEMENT, Bag, ends, tool_topic
+from bags.reader import DISPLACEMENT, TYPES, Bag, ends, tool_topic
 from bags.records import Place
 from bags.wire import contact_from, frame_from, stamp_ns
 from stmpl_core.contact import Contact
@@ -91,7 +91,8 @@ class Run(Bag):
     def moving(self) -> MovingFrames:
         """Frames of the recorded /tf, read when they are first asked for."""
         found = MovingFrames()
-        for topic, message, _ in self.messages(lambda name: name in (TF, TF_STATIC)):
+        told = {TF, TF_STATIC} & {topic.name for topic in self.topics.values() if topic.type_name == TYPES[TF]}
+        for topic, message, _ in self.messages(told.__contains__):
             found.hear(message, still=topic == TF_STATIC)
         return found
 

@@ -17,7 +17,7 @@ from bags.replay import Replayed, replay_run
 from bags.report import write_report
 from bags.run import Run
 from bags.survey import survey
-from bags.writer import BagWriter
+from bags.writer import BagWriter, qos_yaml
 from stmpl_core.errors import BagError, InvalidInput
 from stmpl_core.layer import layer_id
 from stmpl_core.methods import Winkler
@@ -26,7 +26,7 @@ from stmpl_core.touch import Answer
 from stmpl_core.trust import Displacement, Trust
 from stmpl_ros.view.recording import Recording
 from tests import bag_scene
-from tests.bag_scene import START, stmpl, tube, write_run
+from tests.bag_scene import START, cdr, header, stmpl, tube, write_run
 
 LOST, SKIPPED, DELAY = (5, 6, 20), (10, 11), 0.003
 
@@ -277,6 +277,19 @@ def test_a_file_in_any_order_gives_the_same(run, tmp_path):
         assert vars(moment) == vars(expected)
     assert replay_run(backwards, Winkler()).identical == len(ours.moments)
     assert compare_run(backwards, Winkler(), method=Winkler(), tolerance=0.0).passed
+
+
+def test_a_topic_of_another_type_is_left_out_of_a_replay_with_a_line(run, tmp_path, caplog):
+    odd = tmp_path / "odd"
+    with BagWriter(odd) as bag:
+        for topic in ("/stmpl/tools/gripper/pose", "/right/skin/displacement", "/tf"):
+            number = bag.add_channel(topic, "std_msgs/msg/Header", qos_yaml())
+            bag.write(number, cdr(header("body", START)), START, START)
+    mixed = joined([odd, run], tmp_path / "run", order=lambda told: told[3])
+    replayed = replay_run(mixed, Winkler())
+    assert replayed.frames == replayed.identical == Bag(run).answers and Bag(mixed).namespaces == ["/stmpl"]
+    assert ("/stmpl/tools/gripper/pose is left out: it carries std_msgs/msg/Header, and a run's carries "
+            "geometry_msgs/msg/PoseStamped") in caplog.text  # fmt: skip
 
 
 def test_an_exact_layer_that_comes_last_counts_for_every_answer(run, tmp_path):
