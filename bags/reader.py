@@ -36,6 +36,7 @@ TYPES = {
 }  # of the topics that are read, by their endings
 TOOL_TYPES = {"pose": "geometry_msgs/msg/PoseStamped", "wrench": "geometry_msgs/msg/WrenchStamped"}  # a tool's
 _OF_ROBOT = re.compile(r"(?:(.*)/)?(?:skin/\w+|contact_mesh)")  # topics of a robot's run
+_TOOLS = re.compile(r"(?:^|/)(?=tools/)")  # where a namespace may end
 _OF_TOOL = re.compile(r"(?:(.*)/)?tools/(.+)/(pose|wrench|mesh|contact_wrench|local_contact)")  # NAME may hold "/"
 
 
@@ -90,6 +91,7 @@ class Bag:
         index = summary(self.file)
         self.expected = index.messages  # that the writer counted, or None
         self._schemas, self._channels = dict(index.schemas), dict(index.channels)
+        self._spaces: dict[str, str | None] = {}  # namespaces of the topics that were asked for, by all channels so far
         self._stores: dict[int, Typestore] = {}
         self._places: dict[str, list[Place]] = {}  # of the large messages, by topic
         self._layers: dict[str, SoftLayer] = {}  # that were read so far
@@ -100,7 +102,7 @@ class Bag:
     @property
     def namespaces(self) -> list[str]:
         """Namespaces of the robots in the file, whether asked for or not; "/" where a robot has none."""
-        found = (namespace_of(one.topic) for one in self._channels.values() if not self._odd_type(one))
+        found = (self._namespace_of(one.topic) for one in self._channels.values() if not self._odd_type(one))
         return sorted({namespace for namespace in found if namespace is not None})
 
     def messages(self, wanted: Callable[[str], bool] | None = None) -> Iterator[Recorded]:
@@ -287,7 +289,27 @@ class Bag:
         if not self.namespace:
             return True
         around = [name for name in self.namespaces if name != "/" and topic.startswith(name + "/")]
-        return (namespace_of(topic) or max(around, key=len, default=None)) in (None, self.namespace)
+        return (self._namespace_of(topic) or max(around, key=len, default=None)) in (None, self.namespace)
+
+    def _namespace_of(self, topic: str) -> str | None:
+        """Namespace of the robot that a topic is of, "/" for none; None if the topic is of no robot's run.
+
+        A namespace may hold "tools", and so may a tool's name: a tool is of the robot of whose skin there is a topic.
+        """
+        if topic not in self._spaces:
+            found = _OF_TOOL.fullmatch(topic) or _OF_ROBOT.fullmatch(topic)
+            space = found and (found[1] or "/")
+            if found and found.re is _OF_TOOL:
+                ways = {topic[: at.start()] or "/" for at in _TOOLS.finditer(topic)}
+                space = max(ways & self._robots(), key=len, default=space)
+            self._spaces[topic] = space
+        return self._spaces[topic]
+
+    def _robots(self) -> set[str]:
+        """Namespaces of the robots of whose skin, or of whose tools' surfaces, there is a topic."""
+        others = [one.topic for one in self._channels.values() if not self._odd_type(one)]
+        found = [_OF_ROBOT.fullmatch(topic) for topic in others if not _OF_TOOL.fullmatch(topic)]
+        return {one[1] or "/" for one in found if one}
 
     def _odd_type(self, channel: Channel) -> str:
         """Type of a topic of a run that carries another one than it has to; empty: the right one, or it is lost."""
@@ -338,6 +360,7 @@ class Bag:
                 self._schemas[record.id] = record
             case Channel():
                 self._channels[record.id] = record
+                self._spaces.clear()
             case Attachment():
                 self.attachments[record.name] = record.data
             case Metadata():
@@ -358,24 +381,18 @@ class Bag:
             log.warning("%s was not finished by its writer; at most its last chunk is missing", self.file)
 
 
-def tool_topic(topic: str) -> tuple[str, str] | None:
-    """(tool, "pose" or "wrench") if the topic is of a tool: .../tools/NAME/pose."""
+@cache
+def tool_kind(topic: str) -> str:
+    """"pose" or "wrench" if the topic is a tool's: .../tools/NAME/pose; empty: it is not."""
     found = _OF_TOOL.fullmatch(topic)
-    return (found[2], found[3]) if found and found[3] in ("pose", "wrench") else None
+    return found[3] if found and found[3] in TOOL_TYPES else ""
 
 
 @cache
 def type_of(topic: str) -> str:
     """Type that a topic of a run has to have to be read; empty: any."""
-    contact = tool_topic(topic)
-    return TOOL_TYPES[contact[1]] if contact else next((TYPES[e] for e in TYPES if ends(topic, e)), "")
-
-
-@cache
-def namespace_of(topic: str) -> str | None:
-    """Namespace of the robot that a topic is of, "/" for none; None if the topic is of no robot's run."""
-    found = _OF_TOOL.fullmatch(topic) or _OF_ROBOT.fullmatch(topic)
-    return found and (found[1] or "/")
+    kind = tool_kind(topic)
+    return TOOL_TYPES[kind] if kind else next((TYPES[e] for e in TYPES if ends(topic, e)), "")
 
 
 def ends(topic: str, ending: str) -> bool:

@@ -11,7 +11,7 @@ from mcap.records import Message
 
 from bags.frame import Frame
 from bags.moving import TF, TF_STATIC, FramesAt, MovingFrames
-from bags.reader import DISPLACEMENT, TYPES, Bag, ends, tool_topic
+from bags.reader import DISPLACEMENT, TYPES, Bag, ends, tool_kind
 from bags.records import Place
 from bags.wire import contact_from, frame_from, stamp_ns
 from stmpl_core.contact import Contact
@@ -42,7 +42,7 @@ class Run(Bag):
     ) -> None:
         self.received: dict[int, int] = {}
         self.pose_stamps: set[int] = set()
-        self._sent: dict[tuple[str, str], dict[int, Message]] = {}  # by tool and kind, then stamp
+        self._sent: dict[str, dict[int, Message]] = {}  # by topic, then stamp
         self.placed_by_tf: set[str] = set()
         self._on_answer, self._answering = on_answer, ""
         super().__init__(path, namespace)
@@ -50,12 +50,12 @@ class Run(Bag):
     def see(self, topic: str, record: Message, place: Place) -> None:
         """Keeps poses and wrenches, and hands on the answers."""
         super().see(topic, record, place)
-        if contact := tool_topic(topic):
+        if kind := tool_kind(topic):
             message = self.decode(record)
             stamp = stamp_ns(message)
-            self._sent.setdefault(contact, {})[stamp] = record
+            self._sent.setdefault(topic, {})[stamp] = record
             self.received[stamp] = max(self.received.get(stamp, 0), record.log_time)
-            if contact[1] == "pose":
+            if kind == "pose":
                 self.pose_stamps.add(stamp)
         elif ends(topic, DISPLACEMENT):
             if topic != self._answering:
@@ -104,5 +104,6 @@ class Run(Bag):
         return self.moving.place(self.body_frame, frame, stamp)
 
     def _told_at(self, tool: str, kind: str, stamp: int) -> Any | None:
-        record = self._sent.get((tool, kind), {}).get(stamp)
+        topic = self._answering.removesuffix(DISPLACEMENT) + f"tools/{tool}/{kind}"
+        record = self._sent.get(topic, {}).get(stamp)
         return None if record is None else self.decode(record)

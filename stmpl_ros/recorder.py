@@ -38,7 +38,7 @@ WANTED = re.compile(
 )
 NEEDED = {"answers": re.compile(r"skin/displacement$"), "contacts": re.compile(r"tools/[\w/]+/pose$")}  # for a replay
 EVERYBODYS = ("/diagnostics", TF, TF_STATIC)  # topics of no namespace that belong to a run
-PLACED = re.compile(r"(.*/)(?:skin/topology|tools/(.+)/(?:pose|wrench))")  # their frame_id says where things are
+PLACED = re.compile(r".*/(?:skin/topology|tools/.+/(?:pose|wrench))")  # their frame_id says where things are
 IF_HEARD = re.compile(r"tools/[\w/]+/local_contact$")  # recorded only once a device listens: it costs the node work
 FOREVER = 1e9  # lease of a sender that never tells that it is there, at least [s]
 POLL_PERIOD_S = 0.1  # time between two looks for new topics
@@ -148,10 +148,9 @@ class RecorderNode(Node):
         topology = {topic.removesuffix("skin/topology"): frame for topic, frame in self._placed
                     if topic.endswith("skin/topology")}  # fmt: skip
         for topic, frame in sorted(self._placed):
-            found = PLACED.fullmatch(topic)
-            assert found
-            body = topology.get(found[1])
-            if frame and body is not None and frame not in (body, found[2], *frames):
+            space = max((one for one in topology if topic.startswith(f"{one}tools/")), key=len, default="/")
+            body, tool = topology.get(space), topic.removeprefix(f"{space}tools/").rpartition("/")[0]
+            if frame and body is not None and frame not in (body, tool, *frames):
                 yield (f"{topic} came in frame '{frame}', which is neither '{body}' nor in --frames, and no /tf was "
                        "recorded: these contacts are not replayed offline, only to a node that hears /tf (stmpl replay "
                        "--publish)")  # fmt: skip

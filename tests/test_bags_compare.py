@@ -337,9 +337,9 @@ def test_a_recording_of_two_robots_is_read_by_namespace(two_robots):
         assert Recording.of(ours, frames=4).layer.tissue == skins[name].tissue
 
 
-@pytest.mark.parametrize("namespace", ["", "/tools/left"])
+@pytest.mark.parametrize("namespace", ["", "/tools/left", "/lab_1/tools"])
 def test_tools_with_slashes_in_their_names_are_read_and_replayed(tmp_path, monkeypatch, namespace):
-    names, script = {"ball": "panda/tool0", "finger": "skin/_tip"}, bag_scene.script
+    names, script = {"ball": "arm/tools/tip", "finger": "skin/_tip"}, bag_scene.script
     monkeypatch.setattr(bag_scene, "ANGLES", {names[tool]: angle for tool, angle in bag_scene.ANGLES.items()})
     monkeypatch.setattr(bag_scene, "script", lambda share: {names[tool]: n for tool, n in script(share).items()})
     run = write_run(tmp_path / "run", Winkler(), layer=tube(edge=9e-3), frames=8, namespace=namespace)

@@ -62,7 +62,7 @@ def talker():
 def test_a_recorder_tells_of_poses_that_only_a_node_that_hears_tf_can_place(talker, tmp_path):
     skin = talker.node.create_publisher(SkinTopology, "skin/topology", NOW)
     poses = {name: talker.node.create_publisher(PoseStamped, f"tools/{name}/pose", STREAM)
-             for name in ("one/tip", "other")}  # fmt: skip
+             for name in ("one/tools/a", "other/tools/b")}  # fmt: skip
     skin.publish(SkinTopology(header=Header(frame_id="body")))
     (tmp_path / "frames.yaml").write_text("table: {position: [0, 0, 0.1]}\n")
     arguments = ("record", "--path", str(tmp_path / "run"), "--frames", str(tmp_path / "frames.yaml"))
@@ -70,7 +70,7 @@ def test_a_recorder_tells_of_poses_that_only_a_node_that_hears_tf_can_place(talk
     try:
         talker.wait_for_recorder(*poses.values())
         talker.wait(lambda: skin.get_subscription_count() == 2, "the recorder beside the talker's own ear")
-        for name, frame in (("one/tip", "table"), ("one/tip", "one/tip"), ("other", "moving_base")):
+        for name, frame in (("one/tools/a", "table"), ("one/tools/a", "one/tools/a"), ("other/tools/b", "moving_base")):
             poses[name].publish(PoseStamped(header=Header(frame_id=frame)))
         talker.spin(0.5)
     finally:
@@ -78,7 +78,7 @@ def test_a_recorder_tells_of_poses_that_only_a_node_that_hears_tf_can_place(talk
         for publisher in (skin, *poses.values()):
             talker.node.destroy_publisher(publisher)
     assert code == 0
-    assert "/tools/other/pose came in frame 'moving_base', which is neither 'body' nor in --frames" in said
+    assert "/tools/other/tools/b/pose came in frame 'moving_base', which is neither 'body' nor in --frames" in said
     assert said.count(" came in frame ") == 1
     assert "no answers were heard in namespace /, so this cannot be replayed" in said
 
