@@ -217,16 +217,18 @@ def compare_bags(
         BagError: different skins, or no stamp in common.
     """
     run, other = (one if isinstance(one, Survey) else survey(one) for one in (run, other))
-    theirs = {moment.stamp_ns: moment.number for moment in other.moments}
+    theirs = {(moment.clock, moment.stamp_ns): moment.number for moment in other.moments}
     late = _left_out(run)
-    common = [moment for moment in run.moments[late:] if moment.stamp_ns in theirs]
+    common = [moment for moment in run.moments[late:] if (moment.clock, moment.stamp_ns) in theirs]
     if not common:
         raise BagError(f"{run.bag.file} and {other.bag.file} answer no common stamp. Compare a run with its replay.")
     picks = sample(common, frames)
-    numbers = [theirs[moment.stamp_ns] for moment in picks]
-    answers = {frame.stamp_ns: frame for frame in other.bag.frames(sorted(numbers))}
-    for frame in run.bag.frames(moment.number for moment in picks):
-        moved = len(answers[frame.stamp_ns].displacement)
+    numbers = [theirs[moment.clock, moment.stamp_ns] for moment in picks]
+    ours = run.bag.frames(moment.number for moment in picks)
+    answers: dict[tuple[int, int], Frame] = {}  # by stamp and log time of ours
+    for frame, answer in zip(ours, other.bag.frames(numbers), strict=True):
+        answers[_key(frame)] = answer
+        moved = len(answer.displacement)
         if moved != len(frame.displacement):
             raise BagError(f"{run.bag.file} moves {len(frame.displacement)} vertices, {other.bag.file} {moved}; "
                            "answers can be compared on one skin only.")  # fmt: skip
@@ -234,9 +236,13 @@ def compare_bags(
     if tolerance is None and run.method == other.method:
         tolerance, reason = allowance(other.bag.provenance.processor, run.bag.provenance.processor)
     return _compare(
-        run, picks, names, lambda frame: frame, lambda frame: answers[frame.stamp_ns], tolerance, None, late, reason,
-        alike=lambda frame: bool(frame.state) == bool(answers[frame.stamp_ns].state),
+        run, picks, names, lambda frame: frame, lambda frame: answers[_key(frame)], tolerance, None, late, reason,
+        alike=lambda frame: bool(frame.state) == bool(answers[_key(frame)].state),
     )  # fmt: skip
+
+
+def _key(frame: Frame) -> tuple[int, int]:
+    return frame.stamp_ns, frame.log_time_ns
 
 
 def sample(moments: Sequence[Moment], frames: int) -> list[Moment]:

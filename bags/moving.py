@@ -18,6 +18,9 @@ TF, TF_STATIC = "/tf", "/tf_static"
 
 Quaternion = tuple[float, float, float, float]  # x y z w
 Vector = tuple[float, float, float]
+BACK = NANO // 2  # way back of a frame's stamps by which the clock was set back, not one of them late [ns]
+ALWAYS = 2**63 - 1  # when everything was received [ns]
+
 Placed = tuple[Quaternion, Vector]  # turn, and place of the origin [m]
 
 
@@ -46,27 +49,33 @@ class FramesAt(Mapping[str, Transform]):
 
 
 class MovingFrames:
-    """All that a recording holds of /tf and /tf_static."""
+    """All that a recording holds of /tf and /tf_static.
+
+    Where a frame's stamps go back by more than BACK the clock was set back, and a node forgets what moved before.
+    """
 
     def __init__(self) -> None:
         self._tracks: dict[str, list[_Track]] = {}  # of each frame, in the order in which it was still or moved
 
-    def hear(self, message: Any, *, still: bool) -> None:
-        """Takes a tf2_msgs/TFMessage; still: it came on /tf_static."""
+    def hear(self, message: Any, *, still: bool, received: int = 0) -> None:
+        """Takes a tf2_msgs/TFMessage; still: it came on /tf_static; received: when [ns]."""
         for told in message.transforms:
             child = told.child_frame_id.removeprefix("/")
             tracks = self._tracks.setdefault(child, [])
-            if not tracks or tracks[-1].still != still:  # in tf2, too, a frame goes over to how it was told last
-                tracks.append(_Track(child, still))
+            back = bool(tracks) and not still and stamp_ns(told) < tracks[-1].last - BACK
+            if not tracks or tracks[-1].still != still or back:  # in tf2, too, it goes over to how it was told last
+                tracks.append(_Track(child, still, received))
             tracks[-1].put(told)
 
-    def place(self, body: str, frame: str, stamp: int) -> Transform:
+    def place(self, body: str, frame: str, stamp: int, by: int = ALWAYS) -> Transform:
         """pose_body_from_frame (4, 4) at a stamp [ns], between the two that were told around it.
+
+        Where the clock was set back it is as a node knew it at the time `by` [ns], at which things were received.
 
         Raises:
             FrameError: /tf does not cover the stamp, or does not join the two frames.
         """
-        (inner, why), (outer, other) = self._up(frame, body, stamp), self._up(body, frame, stamp)
+        (inner, why), (outer, other) = self._up(frame, body, stamp, by), self._up(body, frame, stamp, by)
         if body in inner:
             turn, at = inner[body]
         elif frame in outer:
@@ -78,11 +87,11 @@ class MovingFrames:
             raise FrameError(f"/tf does not say where '{frame}' was at {stamp / NANO:.3f} s: {reason}")
         return rigid(at, turn)
 
-    def _up(self, frame: str, until: str, stamp: int) -> tuple[dict[str, Placed], str]:
+    def _up(self, frame: str, until: str, stamp: int, by: int) -> tuple[dict[str, Placed], str]:
         """Where a frame stands in itself and in those that it hangs on, up to the last that is known, and why not."""
         found: dict[str, Placed] = {frame: ((0.0, 0.0, 0.0, 1.0), (0.0, 0.0, 0.0))}
         while frame != until and (tracks := self._tracks.get(frame)) is not None:
-            track = _of(tracks, stamp)
+            track = _of(tracks, stamp, by)
             told = track.at(stamp)
             if told is None:
                 return found, track.span
@@ -93,10 +102,14 @@ class MovingFrames:
         return found, ""
 
 
-def _of(tracks: list[_Track], stamp: int) -> _Track:
-    """The one that holds at a stamp [ns]: a frame is still until its first stamp on /tf, or after its last."""
+def _of(tracks: list[_Track], stamp: int, by: int) -> _Track:
+    """The one that holds at a stamp [ns]: a frame is still until its first stamp on /tf, or after its last.
+
+    Of those that began until `by` [ns], and since the clock was set back, which is between two that move.
+    """
+    tracks = [track for track in tracks if track.began <= by] or tracks[:1]
     for before, track in zip(tracks[-2::-1], tracks[:0:-1], strict=True):
-        if stamp > before.last if track.still else stamp >= track.first:
+        if stamp > before.last if track.still else stamp >= track.first or not before.still:
             return track
     return tracks[0]
 
@@ -104,8 +117,8 @@ def _of(tracks: list[_Track], stamp: int) -> _Track:
 class _Track:
     """Where one frame was told to stand in its parent, by the stamp; one that is still, the last time."""
 
-    def __init__(self, child: str, still: bool) -> None:
-        self._child, self.still = child, still
+    def __init__(self, child: str, still: bool, began: int) -> None:
+        self._child, self.still, self.began = child, still, began
         self._stamps, self._numbers, self._parents = array("q"), array("d"), list[str]()
 
     def put(self, told: Any) -> None:

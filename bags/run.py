@@ -18,6 +18,7 @@ from stmpl_core.contact import Contact
 from stmpl_core.errors import BagError, FrameError
 
 NANO = 1e-9  # seconds in a nanosecond
+LATE = 500_000_000  # time after an answer until which a recorder may receive what it answers [ns]
 
 
 class Run(Bag):
@@ -29,8 +30,8 @@ class Run(Bag):
         on_answer: function that gets each answer while the file is looked over, in its order.
 
     Attributes:
-        received: time at which the last contact message of a stamp was received [ns], by the stamp.
-        pose_stamps: stamps of all poses.
+        received: times at which contact messages of a stamp were received [ns], by the stamp.
+        pose_stamps: stamps of all poses, and how often each came: more than once where the clock was set back.
         placed_by_tf: frames of poses and wrenches that /tf placed, as far as contacts were asked for.
 
     Raises:
@@ -40,9 +41,10 @@ class Run(Bag):
     def __init__(
         self, path: Path | str, namespace: str = "", *, on_answer: Callable[[Self, Frame], None] | None = None
     ) -> None:
-        self.received: dict[int, int] = {}
-        self.pose_stamps: set[int] = set()
-        self._sent: dict[str, dict[int, Message]] = {}  # by topic, then stamp
+        self.received: dict[int, list[int]] = {}
+        self.pose_stamps: dict[int, int] = {}
+        self._sent: dict[str, dict[int, list[Message]]] = {}  # by topic, then stamp, which comes again after a reset
+        self._stamps: dict[str, int] = {}  # last of each topic
         self.placed_by_tf: set[str] = set()
         self._on_answer, self._answering = on_answer, ""
         super().__init__(path, namespace)
@@ -53,10 +55,13 @@ class Run(Bag):
         if kind := tool_kind(topic):
             message = self.decode(record)
             stamp = stamp_ns(message)
-            self._sent.setdefault(topic, {})[stamp] = record
-            self.received[stamp] = max(self.received.get(stamp, 0), record.log_time)
-            if kind == "pose":
-                self.pose_stamps.add(stamp)
+            self.received.setdefault(stamp, []).append(record.log_time)
+            if self._stamps.get(topic) != stamp:  # a node, too, takes the first of those that follow under one stamp
+                self._stamps[topic] = stamp
+                told = self._sent.setdefault(topic, {}).setdefault(stamp, [])
+                told.append(record)
+                if kind == "pose":
+                    self.pose_stamps[stamp] = max(self.pose_stamps.get(stamp, 0), len(told))
         elif ends(topic, DISPLACEMENT):
             if topic != self._answering:
                 self._answering = self.find_topic(DISPLACEMENT)
@@ -66,22 +71,25 @@ class Run(Bag):
     def contacts(self, frame: Frame) -> list[Contact]:
         """The contacts that `frame` answers: of each of its tools the pose and the wrench that it names.
 
+        Where a stamp came again, since the clock was set back, it is the last one that was received before the answer.
+
         Raises:
             BagError: a pose, a wrench or a mesh that it answers is not in the bag, or its /tf does not cover it.
         """
-        return [self._contact(tool, frame.surfaces.get(tool, ""), *stamps) for tool, stamps in frame.inputs.items()]
+        return [self._contact(tool, frame.surfaces.get(tool, ""), *stamps, frame.log_time_ns)
+                for tool, stamps in frame.inputs.items()]  # fmt: skip
 
-    def _contact(self, tool: str, surface: str, posed: int, pushed: int) -> Contact:
-        known, pose, wrench = self.surface(tool, surface), self._told_at(tool, "pose", posed), None
+    def _contact(self, tool: str, surface: str, posed: int, pushed: int, by: int) -> Contact:
+        known, pose, wrench = self.surface(tool, surface), self._told_at(tool, "pose", posed, by), None
         lacks = ["mesh"] * (known is None) + ["pose"] * (pose is None)
-        if pushed and (wrench := self._told_at(tool, "wrench", pushed)) is None:
+        if pushed and (wrench := self._told_at(tool, "wrench", pushed, by)) is None:
             lacks.append("wrench")
         if known is None or lacks:
             raise BagError(f"an answer to tool {tool} at {posed * NANO:.3f} s cannot be repeated: "
                            f"the bag has no {' and no '.join(lacks)} for it.")
         try:
-            return contact_from(known, pose, wrench, body_frame=self.body_frame, frames=self._frames_at(posed),
-                                wrench_frames=self._frames_at(pushed))  # fmt: skip
+            return contact_from(known, pose, wrench, body_frame=self.body_frame, frames=self._frames_at(posed, by),
+                                wrench_frames=self._frames_at(pushed, by))  # fmt: skip
         except FrameError as error:
             raise BagError(f"an answer to tool {tool} at {posed * NANO:.3f} s cannot be repeated offline: {error}. A "
                            "recording carries what came on /tf while stmpl record ran, and the table of its --frames; "
@@ -92,18 +100,21 @@ class Run(Bag):
         """Frames of the recorded /tf, read when they are first asked for."""
         found = MovingFrames()
         told = {TF, TF_STATIC} & {topic.name for topic in self.topics.values() if topic.type_name == TYPES[TF]}
-        for topic, message, _ in self.messages(told.__contains__):
-            found.hear(message, still=topic == TF_STATIC)
+        for topic, message, received in self.messages(told.__contains__):
+            found.hear(message, still=topic == TF_STATIC, received=received)
         return found
 
-    def _frames_at(self, stamp: int) -> FramesAt:
-        return FramesAt(self.body_frame, self.provenance.frames, lambda frame: self._moved(frame, stamp))
+    def _frames_at(self, stamp: int, by: int) -> FramesAt:
+        return FramesAt(self.body_frame, self.provenance.frames, lambda frame: self._moved(frame, stamp, by))
 
-    def _moved(self, frame: str, stamp: int) -> Any:
+    def _moved(self, frame: str, stamp: int, by: int) -> Any:
         self.placed_by_tf.add(frame)
-        return self.moving.place(self.body_frame, frame, stamp)
+        return self.moving.place(self.body_frame, frame, stamp, by)
 
-    def _told_at(self, tool: str, kind: str, stamp: int) -> Any | None:
+    def _told_at(self, tool: str, kind: str, stamp: int, by: int) -> Any | None:
+        """What a tool's topic told under a stamp, the last time before it was answered (`by`, log time [ns])."""
         topic = self._answering.removesuffix(DISPLACEMENT) + f"tools/{tool}/{kind}"
-        record = self._sent.get(topic, {}).get(stamp)
-        return None if record is None else self.decode(record)
+        told = sorted(self._sent.get(topic, {}).get(stamp, ()), key=lambda record: record.log_time)
+        before = [record for record in told if record.log_time <= by]
+        found = before[-1:] or [record for record in told[:1] if record.log_time <= by + LATE]
+        return self.decode(found[0]) if found else None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -20,6 +21,7 @@ class Moment:
     Args:
         number: place of the answer in the run, from 0, by which Bag.frames reads it.
         sequence: number that the node gave the answer; it starts again where a node was started again.
+        clock: number of times that the stamps had gone back before it: the clock was set back.
         stamp_ns: stamp of the newest pose that it answers [ns].
         time: time since the first answer's stamp [s].
         load: force on the skin in all, sum of pressure times area [N]; NaN where the pressure is not known.
@@ -32,6 +34,7 @@ class Moment:
 
     number: int
     sequence: int
+    clock: int
     stamp_ns: int
     time: float
     load: float
@@ -50,7 +53,7 @@ class Timing:
 
     Args:
         answers: number of recorded answers.
-        instants: number of distinct stamps of contact messages, from the first answered one to the last.
+        instants: number of distinct stamps of poses under one clock, from the first answered one to the last.
         skipped: number of these that were never answered because a newer one came first (latest wins).
         lost: number of answers that were sent but are not in the bag: gaps in their sequence numbers.
         answer_rate, instant_rate: answers and instants a second [1/s].
@@ -111,8 +114,10 @@ def survey(path: Path | str, namespace: str = "") -> Survey:
 
     def note(run: Run, frame: Frame) -> None:
         first = notes[0].moment.stamp_ns if notes else frame.stamp_ns
+        last = notes[-1].moment if notes else None
+        clock = last.clock + (frame.stamp_ns < last.stamp_ns) if last else 0
         layer = run.known_layers().get(frame.layer_id)
-        moment = _moment(len(notes), frame, first, layer)
+        moment = _moment(len(notes), clock, frame, first, layer)
         notes.append(_Note(moment, frame.method, frame.log_time_ns, frame.layer_id, layer))
 
     run = Run(path, namespace, on_answer=note)
@@ -126,10 +131,11 @@ def survey(path: Path | str, namespace: str = "") -> Survey:
     return Survey(run, notes[0].method, tuple(moments), _timing(moments, run))
 
 
-def _moment(number: int, frame: Frame, first_ns: int, layer: SoftLayer | None) -> Moment:
+def _moment(number: int, clock: int, frame: Frame, first_ns: int, layer: SoftLayer | None) -> Moment:
     return Moment(
         number=number,
         sequence=frame.sequence,
+        clock=clock,
         stamp_ns=frame.stamp_ns,
         time=(frame.stamp_ns - first_ns) * NANO,
         load=float("nan") if layer is None else _load(frame, layer),
@@ -149,24 +155,28 @@ def _load(frame: Frame, layer: SoftLayer) -> float:
 
 
 def _latency(note: _Note, run: Run) -> float:
-    received = run.received.get(note.moment.stamp_ns)
-    return float("nan") if received is None else (note.log_time_ns - received) * NANO
+    received = run.received.get(note.moment.stamp_ns, ())
+    before = [one for one in received if one <= note.log_time_ns] or received
+    return (note.log_time_ns - max(before)) * NANO if before else float("nan")
 
 
 def _timing(moments: list[Moment], run: Run) -> Timing:
     stamps = [moment.stamp_ns for moment in moments]
     first, last = min(stamps), max(stamps)
-    instants = {stamp for stamp in run.pose_stamps if first <= stamp <= last}
+    came = {stamp: times for stamp, times in run.pose_stamps.items() if first <= stamp <= last}
+    answered = Counter(stamp for _, stamp in {(moment.clock, moment.stamp_ns) for moment in moments})
+    instants = sum(came.values())
     jumps = np.diff([moment.sequence for moment in moments])
     lost = int((jumps[jumps > 0] - 1).sum())  # a step back is a node that was started again
-    seconds = (last - first) * NANO
+    steps = np.diff(stamps)
+    seconds = float(steps[steps > 0].sum()) * NANO  # of all clocks
     rate = 1 / seconds if seconds > 0 else float("nan")
     return Timing(
         answers=len(moments),
-        instants=len(instants),
-        skipped=max(len(instants - set(stamps)) - lost, 0),  # a lost answer did answer its instant
+        instants=instants,
+        skipped=max((Counter(came) - answered).total() - lost, 0),  # a lost answer did answer its instant
         lost=lost,
         answer_rate=(len(moments) - 1) * rate,
-        instant_rate=(len(instants) - 1) * rate,
+        instant_rate=(instants - 1) * rate,
         latencies=np.array([moment.latency for moment in moments]),
     )

@@ -210,7 +210,7 @@ def massaged(folder: Path, comparison: Comparison, film: Film) -> Massaged:
         fingers = [frame.touches[name] for name in FINGERS if name in frame.touches and frame.touches[name].presses]
         if len(fingers) == len(FINGERS) and frame.fade == 1:
             squeezed.append((at, *map(_size, fingers)))
-    took = (run.received[last] - run.received[start]) * NANO
+    took = (max(run.received[last]) - max(run.received[start])) * NANO
     return Massaged(
         log=log,
         answered=_columns(answered),

@@ -221,8 +221,11 @@ def two_skins(tmp_path_factory):
     return joined(parts, folder / "run"), skins
 
 
-def joined(parts, folder, order=None, attached=None):
-    """Several runs as one, one after the other, or in another order of (part, topic, data, log time); a layer last."""
+def joined(parts, folder, order=None, attached=None, after=1):
+    """Several runs as one, one after the other, or in another order of (part, topic, data, log time); a layer last.
+
+    Each comes `after` the one before it [ns].
+    """
     with BagWriter(folder) as writer:
         write_provenance(writer, None, method="winkler")
         channels = {}
@@ -231,7 +234,7 @@ def joined(parts, folder, order=None, attached=None):
         for part, topic, data, log_time in sorted(told, key=order) if order else told:
             if topic not in channels:
                 channels[topic] = writer.add_channel(topic, bags[part].topics[topic].type_name)
-            writer.write(channels[topic], data, log_time + part, log_time)
+            writer.write(channels[topic], data, log_time + part * after, log_time)
         if attached:
             writer.attach(LAYER, "application/x-npz", layer_to_bytes(attached))
     return folder
@@ -290,6 +293,25 @@ def test_a_topic_of_another_type_is_left_out_of_a_replay_with_a_line(run, tmp_pa
     assert replayed.frames == replayed.identical == Bag(run).answers and Bag(mixed).namespaces == ["/stmpl"]
     assert ("/stmpl/tools/gripper/pose is left out: it carries std_msgs/msg/Header, and a run's carries "
             "geometry_msgs/msg/PoseStamped") in caplog.text  # fmt: skip
+
+
+def test_answers_before_and_after_a_reset_are_those_to_what_came_in_their_own_run(tmp_path, monkeypatch):
+    """The same stamps come again, of other poses in a frame that stands elsewhere."""
+    parts, second, layer, going = [], 10**9, tube(edge=9e-3), bag_scene.going
+    for k, frames in enumerate((8, 12)):
+        monkeypatch.setattr(bag_scene, "going", lambda stamp, k=k: going(stamp + k * second // 5))
+        parts.append(write_run(tmp_path / f"part{k}", Winkler(), layer=layer, frames=frames, frame="base", delay=DELAY,
+                               unheard=(2,) * (k == 0), tf=(START - second // 10, START + second)))  # fmt: skip
+    run = joined(parts, tmp_path / "run", after=2 * second)
+    replayed = replay_run(run, Winkler())
+    assert (replayed.frames, replayed.left_out) == (19, 1) and replayed.worst < 1e-7  # unheard in the first run only
+    surveyed = survey(run)
+    timing = surveyed.timing
+    assert (timing.instants, timing.skipped, timing.lost) == (19, 0, 0)
+    np.testing.assert_allclose(timing.latencies[[0, 1, *range(3, 20)]], DELAY)
+    assert timing.answer_rate == pytest.approx(19 / 0.18)
+    assert compare_bags(surveyed, survey(run), frames=20).worst_under_contact == 0
+    assert compare_run(surveyed, Winkler(), method=Winkler(), frames=20).failed.keys() == {2}
 
 
 def test_an_exact_layer_that_comes_last_counts_for_every_answer(run, tmp_path):
