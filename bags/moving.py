@@ -5,7 +5,7 @@ from __future__ import annotations
 from array import array
 from bisect import bisect_left
 from collections.abc import Callable, Iterator, Mapping
-from math import acos, sin, sqrt
+from math import acos, isnan, sin, sqrt
 from typing import Any
 
 import numpy as np
@@ -19,6 +19,7 @@ TF, TF_STATIC = "/tf", "/tf_static"
 Quaternion = tuple[float, float, float, float]  # x y z w
 Vector = tuple[float, float, float]
 BACK = NANO // 2  # way back of a frame's stamps by which the clock was set back, not one of them late [ns]
+UNIT = 10e-3  # error of a quaternion's squared length that tf2 takes
 ALWAYS = 2**63 - 1  # when everything was received [ns]
 
 Placed = tuple[Quaternion, Vector]  # turn, and place of the origin [m]
@@ -59,7 +60,7 @@ class MovingFrames:
 
     def hear(self, message: Any, *, still: bool, received: int = 0) -> None:
         """Takes a tf2_msgs/TFMessage; still: it came on /tf_static; received: when [ns]."""
-        for told in message.transforms:
+        for told in filter(_sound, message.transforms):
             child = told.child_frame_id.removeprefix("/")
             tracks = self._tracks.setdefault(child, [])
             back = bool(tracks) and not still and stamp_ns(told) < tracks[-1].last - BACK
@@ -100,6 +101,13 @@ class MovingFrames:
                 return found, f"'{parent}' hangs on itself"
             found[parent], frame = _joined(placed, found[frame]), parent
         return found, ""
+
+
+def _sound(told: Any) -> bool:
+    """Whether tf2 takes a TransformStamped: no number is NaN, and its quaternion has length 1."""
+    p, q = told.transform.translation, told.transform.rotation
+    length = q.x * q.x + q.y * q.y + q.z * q.z + q.w * q.w  # squared, as in tf2::BufferCore::setTransformImpl
+    return not any(map(isnan, (p.x, p.y, p.z))) and abs(length - 1) < UNIT
 
 
 def _of(tracks: list[_Track], stamp: int, by: int) -> _Track:

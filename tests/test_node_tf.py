@@ -188,6 +188,20 @@ def test_a_replay_places_a_frame_that_stood_still_then_moved_and_stood_still_aga
     assert [plays.place("body", "arm", int(t * NANO))[0, 3] for t in asked] == [7.0, 0.0, 1.5, 4.0, 9.0]
 
 
+@pytest.mark.parametrize("turn", [(np.nan, 0, 0, 1), (0, 0, 0, 0), (0, 0, 0, 1.5), (0, 0, 0, 1)])
+def test_a_replay_passes_over_transforms_that_tf2_does_not_take(turn):
+    plays = MovingFrames()
+    for x, stamp in ((0.0, NANO), (1.0, 2 * NANO), (np.nan if turn[3] == 1 else 9.0, 3 * NANO // 2)):
+        place = np.eye(4)
+        place[0, 3] = 0 if stamp == 3 * NANO // 2 else x
+        sent = told("body", "arm", place, stamp)
+        if stamp == 3 * NANO // 2:
+            sent.transform.translation.x, q = x, sent.transform.rotation
+            q.x, q.y, q.z, q.w = map(float, turn)
+        plays.hear(SimpleNamespace(transforms=[sent]), still=False)
+    assert plays.place("body", "arm", 3 * NANO // 2)[0, 3] == 0.5
+
+
 def test_a_dead_tf_is_told_within_a_fifth_of_a_second_and_its_poses_are_not_answered(scene):
     def going() -> None:
         scene.move(scene.now())
