@@ -121,7 +121,8 @@ class Health(NamedTuple):
         live: truth of the claim that a tool is heard.
         doubt: why it is not known where the limb is; or what an inactive node is at.
         active: truth of the claim that the node answers.
-        senders: sentence on who sends for one tool beside another, or for one that cannot be used; empty: nobody.
+        senders: sentences on who sends for one tool beside another, or for one that cannot be used, is not heard, or
+            has stopped to send wrenches; empty: nobody.
         out_of_range: sentence on answers that are all out of range; empty: they are not.
         paused: truth of the claim that the simulated clock stands still.
         building: names of tools whose distance field is being built.

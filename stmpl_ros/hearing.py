@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from geometry_msgs.msg import PoseStamped, WrenchStamped
 from rclpy.node import Node
+from rclpy.qos import QoSCompatibility, qos_check_compatible
 from shape_msgs.msg import Mesh
 from stmpl_msgs.msg import ContactMesh
 
@@ -165,6 +166,18 @@ class Hearing:
             if len(senders) > 1:
                 return f"{topic} has {len(senders)} senders, {', '.join(sorted(senders))}; only one can be the tool"
         return ""
+
+    def unheard(self) -> str:
+        """Who sends to this node and is not heard, for it does not offer what is asked for; empty: nobody."""
+        said = []
+        for one in self._node.subscriptions:
+            for sender in self._node.get_publishers_info_by_topic(one.topic_name):
+                fits, why = qos_check_compatible(sender.qos_profile, one.qos_profile)
+                if fits == QoSCompatibility.ERROR:
+                    name = f"{sender.node_namespace.rstrip('/')}/{sender.node_name}"
+                    why = "; ".join(part.removeprefix("ERROR: ") for part in why.strip(";").split(";"))
+                    said.append(f"{one.topic_name}: {name} is not heard: {why}")
+        return "; ".join(said)
 
     def _knows(self, name: str) -> bool:
         """Whether a tool is in use, or its field is being built."""

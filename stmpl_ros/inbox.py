@@ -133,12 +133,18 @@ class Inbox:
         """Time since the newest pose of any tool came [ns]."""
         return now - max((one.pose.came for one in self.inputs.values()), default=now)
 
+    def dumb(self, now: int) -> list[str]:
+        """The tools whose wrenches have stopped, while their poses go on."""
+        return self._dumb(self.live(now), now)
+
     def _lost(self, live: dict[str, Input], now: int) -> tuple[str, ...]:
         silent = {name: one for name, one in self.inputs.items() if one.pose.value is not None and name not in live}
         poses = [f"pose of {name}" for name, one in silent.items() if now - one.pose.came <= self.rest_after + RECENT]
-        dumb = {name: one.wrench for name, one in live.items()
-                if one.wrench.value is not None and not one.refused.live(now, self.rest_after)}  # fmt: skip
-        return *poses, *(f"wrench of {name}" for name, s in dumb.items() if not s.live(now, self.rest_after))
+        return *poses, *(f"wrench of {name}" for name in self._dumb(live, now))
+
+    def _dumb(self, live: dict[str, Input], now: int) -> list[str]:
+        return [name for name, one in live.items() if one.wrench.value is not None
+                and not (one.wrench.live(now, self.rest_after) or one.refused.live(now, self.rest_after))]  # fmt: skip
 
     def _refused(self, live: dict[str, Input], now: int) -> dict[str, str]:
         return {name: f"the wrenches of {name} are refused: {one.refused.value}" for name, one in live.items()

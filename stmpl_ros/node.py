@@ -406,9 +406,12 @@ class SkinNode(ServingNode):
         self.hearing.now.look()
         if not self.active:
             return self._tell_health([skin_status(name, {}, Health(active=False))])
-        senders = "; ".join(filter(None, (self.hearing.rivals(), self.hearing.look_for_strangers())))
-        self._look_for_twins()
         inbox, events = self.hearing.inbox, self.hearing.events
+        stopped = [f"no wrench of {name} for {self.config.rest_after} s: answered without it"
+                   for name in inbox.dumb(self.hearing.now())]  # fmt: skip
+        senders = "; ".join(filter(None, (*stopped, self.hearing.unheard(), self.hearing.look_for_strangers(),
+                                          self.hearing.rivals())))  # fmt: skip
+        self._look_for_twins()
         values = self.tally.values() | {
             "tools": " ".join(inbox.live(self.hearing.now())),
             "dropped, out of order": str(inbox.out_of_order),

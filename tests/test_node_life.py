@@ -22,6 +22,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import pytest
 import rclpy
+from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseStamped, WrenchStamped
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState
@@ -536,6 +537,9 @@ def test_a_device_that_offers_no_deadline_is_told_why_it_is_not_heard_and_one_th
             hand = strict.tool("probe")
             strict.wait(lambda: strict.said("tools/probe/pose: a sender is not heard"), "the log line")
             assert "DEADLINE" in strict.said("a sender is not heard")[-1]
+            strict.listen(DiagnosticArray, "/diagnostics", STREAM)
+            why = "/strict/tools/probe/pose: /strict/robot is not heard: Subscription deadline is less"
+            strict.wait(lambda: any(why in one.status[0].message for one in strict.got["/diagnostics"]), why)
             strict.node.destroy_publisher(hand.pose)
             hand.pose = strict.node.create_publisher(PoseStamped, "tools/probe/pose", offering)
             hand.ready()

@@ -161,9 +161,29 @@ def test_two_senders_of_one_tool_are_told_in_the_diagnostics_by_their_names(bus,
     other = rclpy.create_node("impostor", namespace="/robot")
     try:
         other.create_publisher(PoseStamped, "tools/probe/pose", STREAM)
-        both = told(bus, lambda: hand.send(HERE))
+        both = told(bus, lambda: hand.send(HERE), "2 senders")
         assert both.level == DiagnosticStatus.WARN
         senders = "/robot/tools/probe/pose has 2 senders, /robot/impostor, /robot/robot; only one can be the tool"
         assert both.message.endswith(senders)
     finally:
         other.destroy_node()
+
+
+def test_a_force_sensor_that_died_is_told_in_the_diagnostics_while_its_poses_are_answered(bus, hand):
+    assert hand.ask(HERE, PUSH).touches[0].in_range
+    dead = told(bus, lambda: hand.send(HERE), "no wrench of probe for 0.4 s: answered without it")
+    assert dead.level == DiagnosticStatus.WARN and hand.ask(HERE).touches[0].in_range
+
+
+def test_who_is_not_heard_for_what_it_offers_is_told_in_the_diagnostics_until_it_is_gone(bus, hand):
+    unheard = "/robot/contact_mesh: /robot/hasty is not heard: Volatile publisher and transient local subscription"
+    other = rclpy.create_node("hasty", namespace="/robot")
+    try:
+        other.create_publisher(ContactMesh, "contact_mesh", STREAM)
+        assert told(bus, lambda: hand.send(HERE), unheard).level == DiagnosticStatus.WARN
+    finally:
+        other.destroy_node()
+    heard: list[DiagnosticStatus] = []
+    ear = bus.node.create_subscription(DiagnosticArray, "/diagnostics", lambda m: heard.append(m.status[0]), STREAM)
+    bus.wait(lambda: heard and unheard not in heard[-1].message, "word that it is gone")
+    bus.node.destroy_subscription(ear)

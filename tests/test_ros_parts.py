@@ -272,6 +272,7 @@ def test_streams_that_fall_silent_are_named():
     inbox.put_pose("probe", np.eye(4), 400 * MS, 400 * MS)
     alone = inbox.take(400 * MS)
     assert alone is not None and alone.lost == ("pose of thumb", "wrench of probe")
+    assert inbox.dumb(400 * MS) == ["probe"] and not inbox.dumb(100 * MS)
     assert alone.contacts[0].wrench is None
     inbox.put_pose("probe", np.eye(4), 1600 * MS, 1600 * MS)
     later = inbox.take(1600 * MS)
