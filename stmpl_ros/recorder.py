@@ -10,6 +10,7 @@ import struct
 import threading
 import time
 from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 from rclpy.event_handler import SubscriptionEventCallbacks
@@ -25,6 +26,7 @@ from bags.schema import find_schema
 from bags.wire import message_class
 from bags.writer import BagWriter, qos_yaml
 from stmpl_core.errors import BagError, InvalidInput
+from stmpl_core.text_file import text_of
 from stmpl_ros.frames import read_frames
 from stmpl_ros.parameters import RecordConfig
 from stmpl_ros.spinning import ros, spin
@@ -202,6 +204,17 @@ def pattern(topics: Sequence[str]) -> re.Pattern[str]:
         raise InvalidInput(f"topics {' '.join(topics)} are no regular expressions: {error}.") from error
 
 
+def _made_by(path: Path) -> dict[str, Any]:
+    """What a run was configured with, of a JSON file. Raises InvalidInput."""
+    try:
+        read = json.loads(text_of(path))
+    except (OSError, ValueError, RecursionError) as error:
+        raise InvalidInput(f"run file {path}: {error}.") from error
+    if not (isinstance(read, dict) and isinstance(read.get("node", {}), dict)):
+        raise InvalidInput(f"run file {path} holds no table of settings. Needed is {{\"node\": {{...}}}}.")
+    return read
+
+
 def run(config: RecordConfig, arguments: list[str] | None = None, topics: Sequence[str] = ()) -> int:
     """Records until SIGINT or SIGTERM; the exit code says whether anything came, and everything is on disk.
 
@@ -215,7 +228,7 @@ def run(config: RecordConfig, arguments: list[str] | None = None, topics: Sequen
         InvalidInput: an expression or a file of frames that cannot be read.
     """
     wanted = pattern(topics) if topics else None
-    made_by = json.loads(config.run.read_text()) if config.run else {}
+    made_by = _made_by(config.run) if config.run else {}
     frames = read_frames(str(config.frames or made_by.get("node", {}).get("frames", "")))
     with ros(arguments) as stop, BagWriter(config.path) as writer:
         write_provenance(

@@ -17,6 +17,7 @@ from stmpl_msgs.msg import SkinTopology
 from bags.reader import Bag
 from bags.recover import recover
 from bags.writer import FILE
+from stmpl_core.errors import InvalidInput
 from stmpl_ros import recorder
 from stmpl_ros.parameters import RecordConfig
 from stmpl_ros.topics import NOW, STREAM
@@ -48,6 +49,13 @@ class Talker(Robot):
 def test_a_recorder_that_hears_nothing_says_so_and_ends_with_1(tmp_path, monkeypatch, caplog, topics, says):
     monkeypatch.setattr(recorder, "spin", lambda executor, stop: None)
     assert recorder.run(RecordConfig(path=tmp_path / "run"), topics=topics) == 1 and says in caplog.text
+
+
+@pytest.mark.parametrize("text", ["[1, 2]", '{"node": null}', "{bad", "\xff"])
+def test_a_run_file_that_holds_no_settings_is_refused_in_a_sentence(tmp_path, text):
+    (tmp_path / "run.json").write_text(text, encoding="latin-1")
+    with pytest.raises(InvalidInput, match=r"run file .*run\.json"):
+        recorder.run(RecordConfig(path=tmp_path / "run", run=tmp_path / "run.json"))
 
 
 @pytest.fixture(scope="module")
