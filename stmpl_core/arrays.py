@@ -54,6 +54,13 @@ def check_dt(dt: float) -> None:
         raise InvalidInput(f"dt is {dt!r:.40} s; time goes forward, allowed is a number of 0 or more, and finite.")
 
 
+def real(value: ArrayLike) -> ArrayLike:
+    """The same value. Raises ValueError: complex numbers, of which numpy would drop a part with a warning."""
+    if np.iscomplexobj(value):
+        raise ValueError("they are complex")
+    return value
+
+
 def finite(name: str, value: ArrayLike, shape: tuple[int | None, ...]) -> np.ndarray:
     """Returns `value` as a contiguous float64 array of `shape` (None: any length).
 
@@ -61,7 +68,7 @@ def finite(name: str, value: ArrayLike, shape: tuple[int | None, ...]) -> np.nda
         InvalidInput: wrong shape, not numeric, or any NaN or infinity.
     """
     try:
-        array = np.ascontiguousarray(value, dtype=np.float64)
+        array = np.ascontiguousarray(real(value), dtype=np.float64)
     except (TypeError, ValueError) as error:
         raise InvalidInput(f"{name} is not an array of numbers: {error}") from error
     if array.ndim != len(shape) or any(n is not None and n != m for n, m in zip(shape, array.shape, strict=True)):

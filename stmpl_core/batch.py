@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from stmpl_core.arrays import check_dt
+from stmpl_core.arrays import check_dt, real
 from stmpl_core.contact import Contact
 from stmpl_core.errors import InvalidInput, StmplError
 from stmpl_core.friction import Friction, check_tools
@@ -88,6 +88,8 @@ class Batch:
             raise InvalidInput(f"a batch is asked for {count} scenes; at least one scene is needed.")
         if len(self.skins) != count:
             raise InvalidInput(f"{len(self.skins)} skins do not fit {count} scenes: give one, or one for each.")
+        if not all(isinstance(tool, Tool) for tool in self.tools):
+            raise InvalidInput(f"tools are {tools!r:.40}; a list of Tool is needed.")
         check_tools(friction, [tool.name for tool in self.tools])
         if not self.tools or len({tool.name for tool in self.tools}) < len(self.tools):
             raise InvalidInput("a batch needs tools, each with a name of its own. Try tool.named('left').")
@@ -128,6 +130,8 @@ class Batch:
         """
         n, many, wanted = len(self.skins), len(self.tools), set(fields)
         matrices = _matrices(poses, n, many)
+        if states is not None and not hasattr(states, "__len__"):
+            raise InvalidInput(f"states are {states!r:.40}; a list of one State or None for each scene is needed.")
         if states is not None and len(states) != n:
             raise InvalidInput(f"{len(states)} states do not fit {n} scenes.")
         if not wanted <= set(range(n)):
@@ -188,7 +192,10 @@ class Batch:
 
 def _matrices(poses: Any, n: int, many: int) -> np.ndarray:
     """Poses as matrices, (n, K, 4, 4); those that are not finite stay so."""
-    given = np.asarray(poses, dtype=float)
+    try:
+        given = np.asarray(real(poses), dtype=float)
+    except (TypeError, ValueError) as error:
+        raise InvalidInput(f"poses are no array of numbers: {error}.") from error
     if given.shape == (n, many, 4, 4):
         return given
     if given.shape != (n, many, 7):

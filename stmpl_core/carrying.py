@@ -35,8 +35,11 @@ def carried(state: State, skin: Skin, after: Skin) -> State:
         after: same skin where it is now.
 
     Raises:
-        InvalidInput: a memory that does not say where its joints were, or of other joints, or beyond their limits.
+        InvalidInput: no memory, or one that does not say where its joints were, of other joints, or beyond their
+            limits.
     """
+    if not isinstance(state, State):
+        raise InvalidInput(f"the state is {state!r:.40}; a State is needed, State() at the beginning.")
     if state.joints == after.angles:
         return state
     if not state.tools:

@@ -326,7 +326,7 @@ def twisted(pose_body_from_tool: ArrayLike, twist: ArrayLike) -> Transform:
 
 def _asked(contacts: Sequence[Contact], by: Collection[str]) -> list[Contact]:
     """The contacts by their poses alone, once it is known what is asked for."""
-    if strange := set(by) - set(EVERY):
+    if strange := set([by] if isinstance(by, str) else by) - set(EVERY):
         raise InvalidInput(f"there is no gradient by {', '.join(sorted(strange))}. Available: {', '.join(EVERY)}.")
     return [replace(one, wrench=None) for one in contacts]
 

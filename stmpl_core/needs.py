@@ -198,7 +198,8 @@ def needs(
         raise InvalidInput("a tissue wants a thickness: give thickness=, in m.")
     speeds = _checked("speeds", speeds, "m/s", FASTEST)
     mu = coefficient(friction)
-    for name, one in (("friction", mu), ("edge", edge), *enough._asdict().items()):
+    accuracies = ((f"the accuracy in {name}", one) for name, one in enough._asdict().items())
+    for name, one in (("friction", mu), ("edge", edge), *accuracies):
         if one is not None and not (np.isfinite(one) and one > 0):
             raise InvalidInput(f"{name} is {one:g}; it must be finite and above 0.")
     if min(enough) < FINEST:

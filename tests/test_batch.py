@@ -122,6 +122,27 @@ def test_arrays_of_torch_are_shared_not_copied(skin: Skin) -> None:
     assert np.allclose(out.numpy(), alone(skin, poses()), rtol=1e-6)
 
 
+@pytest.mark.parametrize("tools", [["ball"], {"ball": TOOLS[0]}])
+def test_tools_that_are_none_are_said(skin: Skin, tools) -> None:
+    with pytest.raises(InvalidInput, match="a list of Tool is needed"):
+        Batch(skin, tools, 1)
+
+
+def test_poses_and_states_of_another_kind_are_said(skin: Skin) -> None:
+    batch, contact = Batch(skin, TOOLS, N), Contact(TOOLS[0], np.eye(4))
+    for wrong in ("x", poses().astype(complex)):
+        with pytest.raises(InvalidInput, match="poses are no array of numbers"):
+            batch.touch(wrong)
+    with pytest.raises(InvalidInput, match="a list of one State or None for each scene"):
+        batch.touch(poses(), State(), 0.01)  # type: ignore[arg-type]
+    assert "a State is needed" in batch.touch(poses(), [1] * N, 0.01).why[0, 0]  # type: ignore[list-item]
+    for state in (1, {}):
+        with pytest.raises(InvalidInput, match="a State is needed"):
+            Simulator(skin).touch([contact], state, 0.01)  # type: ignore[call-overload]
+    with pytest.raises(InvalidInput, match="complex"):
+        Contact(TOOLS[0], np.eye(4, dtype=complex))
+
+
 def test_what_does_not_fit_is_said(skin: Skin) -> None:
     batch = Batch(skin, TOOLS, N)
     with pytest.raises(InvalidInput, match=r"\(6, 2, 7\)"):

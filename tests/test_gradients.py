@@ -328,5 +328,8 @@ def test_what_cannot_be_is_refused_in_words(gradients: Gradients) -> None:
         thicker(gradients.simulator.layer, 0.0)
     with pytest.raises(InvalidInput, match="no gradient by colour"):
         gradients.wrench([contact], by=("colour",))  # type: ignore[arg-type]
+    assert gradients.wrench([contact], by="thickness")[0].thickness is not None  # type: ignore[arg-type]
+    with pytest.raises(InvalidInput, match=r"no gradient by colour\. "):
+        gradients.wrench([contact], by="colour")  # type: ignore[arg-type]
     with pytest.raises(InvalidInput, match="names of their own"):
         gradients.wrench([contact, contact])

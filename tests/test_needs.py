@@ -141,7 +141,7 @@ def test_less_accuracy_asks_for_less():
         ({"duration": -1.0}, "duration is -1 s"),
         ({"path": float("nan")}, "path is nan m"),
         ({"thickness": None}, "thickness"),
-        ({"enough": Misfit(0.0, 0.1)}, "force is 0"),
+        ({"enough": Misfit(0.0, 0.1)}, "the accuracy in force is 0"),
         ({"enough": Misfit(1e-7, 0.1)}, "accuracy of 1e-07"),
         ({"radii": 8e-3}, "radii are numbers in m"),
     ],
