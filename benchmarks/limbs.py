@@ -258,19 +258,27 @@ def main() -> None:
     given.add_argument("--file", type=Path, default=None, help="released contacts; those of this folder unless given")
     options = given.parse_args()
     logging.disable(logging.WARNING)
+    try:
+        _answer(options)
+    except (InvalidInput, OSError) as error:
+        given.error(str(error))
+
+
+def _answer(options: argparse.Namespace) -> None:
     read = cache(Released)
 
-    def released(kind: str = "") -> Released:
+    def released(kind: str) -> Released:
         return read(options.file or (STOUT if kind == "heavy people" else FILE))
 
     if options.export:
-        print(f"{export(released().samples(), options.export)} scenes in {options.export}")
+        samples = (one for kind in options.limbs for one in released(kind).samples()
+                   if one.info["body"].startswith(LIMBS[kind][1]))  # fmt: skip
+        print(f"{export(samples, options.export)} scenes in {options.export}")
         return
-    try:
-        laws = {PEER: str(FILE.parents[1] / FLEX)} if options.peer else {"yours": options.answers}
-        others = {name: own(law) for name, law in laws.items() if law}
-    except InvalidInput as error:
-        given.error(str(error))
+    laws = {PEER: str(FILE.parents[1] / FLEX)} if options.peer else {"yours": options.answers}
+    others = {name: own(law) for name, law in laws.items() if law}
+    if not all(map(callable, others.values())):
+        raise InvalidInput(f"{options.answers} is no function. Needed is answer(layer, tool, pose, way).")
     for kind in options.limbs if options.kept else ():
         splits, names = LIMBS[kind]
         samples = [one for one in released(kind).samples() if one.info["split"] in splits and slant_of(one) <= STRAIGHT

@@ -204,6 +204,26 @@ def test_a_law_of_ones_own_is_judged_like_ours(monkeypatch: pytest.MonkeyPatch, 
     assert len(list(tmp_path.glob("*.stl"))) == 2 and "force_on_limb_N" in (tmp_path / "scenes.json").read_text()
 
 
+@pytest.mark.parametrize(("arguments", "says"), [
+    (("--answers", f"{__file__}:COARSE"), "COARSE is no function"),
+    (("--file", "/nonexistent.npz"), "/nonexistent.npz holds no released contacts"),
+    (("--limbs", "backs", "--export", "/dev/null/x"), "Not a directory"),
+])  # fmt: skip
+def test_the_comparison_on_limbs_refuses_in_a_sentence(monkeypatch, capsys, arguments, says):
+    monkeypatch.setattr("sys.argv", ["limbs", *arguments])
+    with pytest.raises(SystemExit):
+        limbs.main()
+    assert says in capsys.readouterr().err
+
+
+def test_scenes_are_written_of_the_limbs_that_are_asked_for(monkeypatch, tmp_path, capsys):
+    bodies: set[str] = set()
+    monkeypatch.setattr(limbs, "export", lambda samples, _: len([bodies.add(one.info["body"]) for one in samples]))
+    monkeypatch.setattr("sys.argv", ["limbs", "--limbs", "a forearm left out", "--export", str(tmp_path)])
+    limbs.main()
+    assert bodies and all(body.startswith("forearm") for body in bodies)
+
+
 @pytest.mark.parametrize("bodies", [("back_18", "back_22"), ("living_upper_arm_3", "living_thigh")])
 def test_the_bound_on_force_covers_backs_and_people(bodies: tuple[str, ...]) -> None:
     """Of people an upper arm and a thigh, which were missed most before the bound knew how even a limb is."""
