@@ -113,7 +113,10 @@ class Run(Bag):
 
     def _told_at(self, tool: str, kind: str, stamp: int, by: int) -> Any | None:
         """What a tool's topic told under a stamp, the last time before it was answered (`by`, log time [ns])."""
-        topic = self._answering.removesuffix(DISPLACEMENT) + f"tools/{tool}/{kind}"
+        ending = f"tools/{tool}/{kind}"
+        topic = self._answering.removesuffix(DISPLACEMENT) + ending
+        if topic not in self._sent:  # answers were remapped
+            topic = next((name for name in self._sent if ends(name, ending)), topic)
         told = sorted(self._sent.get(topic, {}).get(stamp, ()), key=lambda record: record.log_time)
         before = [record for record in told if record.log_time <= by]
         found = before[-1:] or [record for record in told[:1] if record.log_time <= by + LATE]

@@ -423,3 +423,8 @@ def test_the_verb_sweeps_and_runs_a_failure_again(tmp_path, capsys):
     code, row = said("--again", failed["file"])
     assert code == 1
     assert row["broken"][0]["law"] == failed["broken"][0]["law"] == "monotone"
+
+
+def test_a_sweep_of_no_method_is_refused():
+    with pytest.raises(InvalidInput, match="no method is given"):
+        stability({}, PRESETS["quick"])

@@ -112,8 +112,10 @@ def stability(methods: Mapping[str, Make], preset: Preset, out: Path | None = No
         on_progress: function that is called before each trial of each method.
 
     Raises:
-        InvalidInput: a preset with an axis that does not exist, or whose skin cannot be made.
+        InvalidInput: no method, or a preset with an axis that does not exist, or whose skin cannot be made.
     """
+    if not methods:
+        raise InvalidInput("no method is given to try. Try moment_net, or yours as file.py or module:attribute.")
     stage, rows = Stage.of(preset), []
     total, done = len(methods) * sum(map(len, preset.levels.values())), 0
     for trial in trials(stage, preset):
