@@ -168,6 +168,7 @@ class SkinNode(ServingNode):
         result = super().on_activate(state)
         self.sending.topology(self._now())
         self.hearing.active = True
+        self._diagnosing.reset()  # overdue after configuring, it would look twice at once, before a mesh can be heard
         self.bond.form()
         self.get_logger().info(f"answering with {self.skin.method.name} on layer {self.skin.layer_id}")
         return result
