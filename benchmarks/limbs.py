@@ -262,6 +262,8 @@ def main() -> None:
         _answer(options)
     except (InvalidInput, OSError) as error:
         given.error(str(error))
+    finally:
+        logging.disable(logging.NOTSET)
 
 
 def _answer(options: argparse.Namespace) -> None:

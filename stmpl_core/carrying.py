@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from stmpl_core.layer import SoftLayer
     from stmpl_core.skin import Skin
 
-WINDOW, MOST_EXPONENT = 1.5, 6.0  # edges around a place whose skin tells how it turns, and exponent that is left out
+WINDOW, MOST_EXPONENT = 0.8, 4.5  # edges around a place whose skin tells how it turns, and exponent that is left out
 
 
 def carried(state: State, skin: Skin, after: Skin) -> State:

@@ -90,6 +90,10 @@ class Posing:
         stacks = green if rest.green is not None else None
         return rest.at(layer, anew(rest.method).prepare(layer), moved, stacks, tuple(angles))
 
+    def turn_at(self, vertex: int, angles: Sequence[float]) -> np.ndarray:
+        """Rotation of the skin at a vertex under angles of the joints [rad], (3, 3)."""
+        return _turns(self.rig.weights[vertex : vertex + 1], _quaternions(self.rig.motions(angles)))[0]
+
     def _curved(self, layer: SoftLayer, frames: np.ndarray, turns: np.ndarray) -> np.ndarray:
         """Curvature at the places of a skin, turned back to rest, (P, 6); turns: rotation of each from rest."""
         out = np.empty((len(self._places), 6))

@@ -66,6 +66,10 @@ class Skin:
             return rest
         return rest.posing.skin(angles)
 
+    def turn_at(self, vertex: int) -> np.ndarray:
+        """Rotation of the skin at a vertex from its rest, (3, 3)."""
+        return np.eye(3) if self.rest is None else self.rest.posing.turn_at(vertex, self.angles)
+
     @cached_property
     def posing(self) -> Posing:
         """What this skin at rest needs to be posed, found on the first call (a fifth of a second)."""
