@@ -190,8 +190,8 @@ class ContactNet:
         corrected = _correct(*look[:3], *self._network)
         if self._green is None:
             _thin(look.inputs, *corrected[1:])
-        shell = 0.0 if self._green is None else -float(look.inputs[0, STACK_NODE.at.given_way])
-        return Held(*corrected, look.power, shell)
+            return Held(*corrected, look.power)
+        return Held(*corrected, look.power, -float(look.inputs[0, STACK_NODE.at.given_way]))
 
     def apart(self, nodes: Nodes) -> np.ndarray:
         """Mask of contact nodes at which the skin lies further in than their tool's surface, (N,)."""

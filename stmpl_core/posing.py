@@ -14,6 +14,7 @@ import numba
 import numpy as np
 from scipy.spatial import KDTree
 
+from stmpl_core.arrays import Points
 from stmpl_core.bend import Bend, Zone
 from stmpl_core.green import Green
 from stmpl_core.layer import SoftLayer
@@ -117,12 +118,17 @@ def posed(layer: SoftLayer, angles: Sequence[float]) -> SoftLayer:
 
 def _moved(layer: SoftLayer, motions: np.ndarray) -> SoftLayer:
     assert layer.rig is not None
-    less, vertices, core = motions[:, :3, :] - np.eye(3, 4), np.empty_like(layer.vertices), None
-    _go(layer.vertices, layer.rig.weights, less, vertices)
-    if layer.core is not None:
-        core = np.empty_like(vertices)
-        _go(layer.core, layer.rig.weights, less, core)
+    weights = layer.rig.weights
+    vertices = blended(layer.vertices, weights, motions)
+    core = None if layer.core is None else blended(layer.core, weights, motions)
     return layer.moved(vertices, core, *_areas(vertices, layer.faces))
+
+
+def blended(points: Points, weights: np.ndarray, motions: np.ndarray) -> Points:
+    """Points (N, 3) after the mean of motions of bones (B, 4, 4) by weights (N, B): linear blend skinning, (N, 3)."""
+    out = np.empty_like(points)
+    _go(points, weights, motions[:, :3, :] - np.eye(3, 4), out)
+    return out
 
 
 def _quaternions(motions: np.ndarray) -> np.ndarray:

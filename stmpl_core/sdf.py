@@ -114,9 +114,10 @@ class SignedDistance:
 
         origin = low + extent / 2 - spacing * (shape - 1) / 2
         corner, many = origin - COLLAR * spacing, shape + 2 * COLLAR
-        shut = vertices[places(vertices)[mesh.faces]] if watertight else None  # with what has no area: it closes seams
-        inside = None if shut is None else winding_numbers(shut, corner, spacing, many)
-        values = _node_distances(vertices, faces, outer, inside, corner, spacing, many)
+        rounds = None
+        if watertight:  # by all faces, also those without area: they close seams
+            rounds = winding_numbers(vertices[places(vertices)[mesh.faces]], corner, spacing, many)
+        values = _node_distances(vertices, faces, outer, rounds, corner, spacing, many)
         if rounding > 0:
             values = ndimage.gaussian_filter(values, ROUNDING_WIDTH * rounding / spacing, mode="nearest")
         inner = (slice(COLLAR, -COLLAR),) * 3

@@ -50,9 +50,10 @@ def _passes(ax, ay, bx, by, i, j):
     """
     if (ay > j) == (by > j):
         return 0
-    if ay < by:
-        return 1 if (bx - ax) * (j - ay) - (by - ay) * (i - ax) > 0 else 0
-    return -1 if (ax - bx) * (j - by) - (ay - by) * (i - bx) > 0 else 0
+    way = 1 if ay < by else -1
+    if way < 0:
+        ax, ay, bx, by = bx, by, ax, ay
+    return way if (bx - ax) * (j - ay) - (by - ay) * (i - ax) > 0 else 0
 
 
 @numba.njit(cache=True, inline="always")

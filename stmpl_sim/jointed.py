@@ -1,7 +1,7 @@
 """Jointed: a limb whose joints are hinges of a MuJoCo model: which body carries what, and where the skin is in between.
 
 To pose a skin takes milliseconds, a step of physics less. So the skin is posed again where a hinge is POSE_STEP away;
-in between the skin around a tool goes rigidly, as the skin there goes in the mean.
+in between the skin around a tool goes rigidly, as its nearest point goes and as its neighbours turn.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ import numpy as np
 from stmpl_core.arrays import Points, Transform, inverted
 from stmpl_core.carrying import motion_at
 from stmpl_core.errors import InvalidInput
+from stmpl_core.posing import blended
 from stmpl_core.rig import Rig
 from stmpl_core.skin import Skin
 from stmpl_core.touch import Touch
@@ -137,10 +138,9 @@ class Jointed:
         """
         if now == skin.angles:
             return np.eye(4)
-        rest, motions = (skin.rest or skin).layer.vertices, self.rig.motions(now)[:, :3]
+        rest, motions = (skin.rest or skin).layer.vertices, self.rig.motions(now)
 
         def moved(some: np.ndarray) -> Points:
-            points = np.column_stack([rest[some], np.ones(len(some))])
-            return np.einsum("kb,bxy,ky->kx", self.rig.weights[some], motions, points)
+            return blended(rest[some], self.rig.weights[some], motions)
 
         return inverted(motion_at(skin.layer, moved, place))

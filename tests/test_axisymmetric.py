@@ -126,7 +126,8 @@ def test_a_ring_of_wire_is_within_its_bound_or_flagged_and_one_that_is_not_thin_
     thick, radius, shares = 10e-3, 10e-3, [0.1, 0.3]
     layer = plate(0.1, 3e-3, thick, youngs_modulus=20e3)
     profile, simulator = Profile((radius, 0), (radius, 0), thickness / 2), Simulator(layer, MomentNet())
-    truth = [one.force for one in Flat(layer.tissue, thick, fine=0.7).press(profile, [share * thick for share in shares])]
+    fem = Flat(layer.tissue, thick, fine=0.7)
+    truth = [one.force for one in fem.press(profile, [share * thick for share in shares])]
     touches = [simulator.touch([Contact(wire(radius, thickness), at(3e-4, 2e-4, thickness / 2 - share * thick))])[0]
                for share in shares]  # fmt: skip
     assert [not one.trust.in_range for one in touches] == flagged
