@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -17,6 +18,9 @@ from stmpl_core.coarse_response import CoarseDrag, CoarseResponse
 from stmpl_core.green import add_motion, bank
 from stmpl_core.layer import SoftLayer
 from stmpl_core.methods.coarse import nearest_corners
+from stmpl_core.moments import Surroundings
+from stmpl_core.neighbours import neighbours
+from stmpl_core.nodewise import REACH
 from stmpl_core.softness import Softness
 
 VERTICES = 900  # vertices of the coarse skin, about: its operator has 3 times their square numbers
@@ -72,11 +76,19 @@ def _less_flat(wide: np.ndarray, layer: SoftLayer, coarse: SoftLayer, ways: np.n
     softness, every = Softness.of(layer, thickness), np.arange(len(coarse.vertices))
     banked, soft = bank(layer.tissue, thickness, softness), softness.at(coarse, thickness)
     inward, area, unit = -coarse.normals, coarse.vertex_areas, np.full(len(every), thickness)
-    for v in every:
+    felt = _along_skin(coarse, thickness) if Surroundings.of(layer).folded else [every] * len(every)
+    for v, there in zip(every, felt, strict=True):
         flat, one = np.zeros_like(coarse.vertices), slice(v, v + 1)
-        add_motion(flat, every, coarse.vertices, inward, unit, coarse.vertices[one], inward[one], area[one], unit[one],
+        add_motion(flat, there, coarse.vertices, inward, unit, coarse.vertices[one], inward[one], area[one], unit[one],
                    soft[one], area[v] * ways[one], banked)  # fmt: skip
         wide[:, v] -= flat.ravel()
+
+
+def _along_skin(coarse: SoftLayer, thickness: float) -> list[np.ndarray]:
+    """Vertices that feel each one on skin with folds: those in reach of it along the skin, not through the air."""
+    every = np.full(len(coarse.vertices), thickness)
+    start, index = neighbours(coarse.vertices, coarse.normals, every, coarse.faces, np.array([REACH]))
+    return [index[a:b] for a, b in pairwise(start)]
 
 
 def _spread(layer: SoftLayer, coarse: SoftLayer) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from stmpl_core import Contact, Load, SoftLayer
-from stmpl_core.methods import Linear, MomentNet
+from stmpl_core import Contact, Load, Membrane, Ply, SoftLayer, Tissue
+from stmpl_core.methods import LimbLinear, Linear, MomentNet
 from stmpl_core.simulator import Simulator
 from stmpl_core.thinning import ZONES, Thinning
 from tests.scenes import at, ball, limb, plate
@@ -26,6 +26,7 @@ def fingers() -> SoftLayer:
 
 
 FINGERS = fingers()
+LAYERED = FINGERS.with_(tissue=Tissue(3e3, 0.45, skin=Membrane(1.3e5, 1.2e-3, 11.0), deeper=(Ply(2e-3, 15e3, 0.45),)))
 LEFT = FINGERS.vertices[:, 0] < 0
 SPOT = np.array([-0.004, 0.02, 0.0])  # on the left one, far from the root
 
@@ -60,6 +61,16 @@ def test_tools_on_two_fingers_press_as_each_alone() -> None:
     for name, one in zip("ab", alone, strict=True):
         np.testing.assert_allclose(together.touches[name].wrench, one.touches[name].wrench, rtol=1e-4, atol=1e-8)
     np.testing.assert_allclose(together.displacement, alone[0].displacement + alone[1].displacement, atol=2e-6)
+
+
+def test_a_finger_with_layers_does_not_move_the_other_either() -> None:
+    """The coarse part takes off what the flat stack says only where that is felt: not on the other finger."""
+    simulator, tip = Simulator(LAYERED, MomentNet()), ball(4e-3)
+    by_hand = LimbLinear().prepare(LAYERED).solve(Load.pressure(400 * around(SPOT, 6e-3) * LEFT))
+    pressed = simulator.step([Contact(tip, at(-0.003, 0.02, 3e-3))])
+    root = FINGERS.vertices[:, 1] > LONG - 8 * THICKNESS
+    for answer in (by_hand, pressed):
+        assert answer.magnitude[~LEFT & ~root].max() < 1e-3 * answer.magnitude[LEFT].max()
 
 
 def test_where_skin_is_near_itself_is_known_and_plain_limbs_are_not_held_up() -> None:
