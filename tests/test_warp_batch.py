@@ -7,16 +7,16 @@ import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from stmpl_core import Membrane, Ply, Tissue, Tool
+from stmpl_core import Membrane, Ply, SoftLayer, Tissue, Tool
 from stmpl_core.batch import Batch, BatchTouches
 from stmpl_core.body import Body
 from stmpl_core.bones import Bone, to_bone
 from stmpl_core.errors import InvalidInput
 from stmpl_core.living import living
-from stmpl_core.methods import MomentNet, Winkler
+from stmpl_core.methods import LimbLinear, MomentNet, Winkler
 from stmpl_core.skin import Skin
 from tests.scenes import LENGTH, RADIUS, at, ball, band, box, brush, capsule, limb, punch, tool, v_block, wire
-from tests.test_folds import FINGERS
+from tests.test_folds import FINGERS, LAYERED
 
 wp = pytest.importorskip("warp")
 wp.config.quiet = True
@@ -45,6 +45,15 @@ def layered() -> Skin:
     tissue = Tissue(3e3, 0.45, skin=Membrane(1.3e5, 1.2e-3, 11.0), deeper=(Ply(6e-3, 15e3, 0.45),))
     bone = Bone(np.array([0.003, 0, -1]), np.array([0.003, 0, 1]), 0.006)
     return Skin.of(to_bone(limb(8e-3, 8e-3, THICK, LONG), [bone]).with_(tissue=tissue), MomentNet())
+
+
+@pytest.fixture(scope="module")
+def oval(layered: Skin) -> Skin:
+    """The same, oval: no two normals of it are at right angles to the last bit, beyond which skin feels nothing."""
+    layer = layered.layer
+    oval = SoftLayer(layer.vertices * [1.07, 0.98, 1], layer.faces, 8e-3)
+    bone = Bone(np.array([0.003, 0, -1]), np.array([0.003, 0, 1]), 0.006)
+    return Skin.of(to_bone(oval, [bone]).with_(tissue=layer.tissue), MomentNet())
 
 
 def scattered(skin: Skin, reach: float, n: int = N, deepest: float = 0.8, seed: int = 0) -> np.ndarray:
@@ -215,7 +224,7 @@ def test_arrays_of_torch_are_shared_not_copied(cylinder: Skin) -> None:
     assert torch.equal(out, torch.from_numpy(batch.touch(poses.detach().numpy()).wrenches.numpy()))
 
 
-def moved(batch: WarpBatch, expected: Batch, poses: np.ndarray, least: int) -> np.ndarray:
+def moved(batch: WarpBatch, expected: Batch, poses: np.ndarray, least: int, off: float = 1e-4) -> np.ndarray:
     """Fields of all scenes, held to 1e-4 of each peak where there is one; NaN where there is none."""
     n = len(poses)
     found, other = batch.touch(poses, fields=range(n)), expected.touch(poses, fields=range(n))
@@ -225,7 +234,7 @@ def moved(batch: WarpBatch, expected: Batch, poses: np.ndarray, least: int) -> n
     for i in np.flatnonzero(served).tolist():
         there = other.fields[i]
         peak = np.linalg.norm(there, axis=1).max()
-        assert np.linalg.norm(motion[i, : len(there)] - there, axis=1).max() <= 1e-4 * peak
+        assert np.linalg.norm(motion[i, : len(there)] - there, axis=1).max() <= off * peak
         assert not motion[i, len(there) :].any()
         moving += peak > 1e-4
     assert moving >= least
@@ -251,6 +260,50 @@ def test_fields_of_skins_that_differ(arm: Skin, cylinder: Skin) -> None:
     poses = np.concatenate([scattered(arm, 0.012, 4), scattered(cylinder, 0.012, 4)])
     skins = [arm] * 4 + [cylinder] * 4
     moved(made(skins, [LEFT]), Batch(skins, [LEFT], threads=1), poses, 3)
+
+
+@pytest.mark.parametrize(
+    ("one", "reach", "deepest"), [(ball(0.012), 0.012, 0.6), (capsule(0.03, 0.008), 0.012, 0.5), (punch(), 0.012, 0.3)],
+    ids=["ball", "capsule", "punch"],
+)  # fmt: skip
+def test_fields_of_layers_are_those_of_numba(oval: Skin, one: Tool, reach: float, deepest: float) -> None:
+    poses = scattered(oval, reach, 10, deepest)
+    moved(made(oval, [one], 10), Batch(oval, [one], 10, threads=1), poses, 5, 1e-5)
+
+
+def test_fields_of_layers_under_several_tools(oval: Skin) -> None:
+    """Side by side, on other sides of the limb, and one on the other, where which of the two holds a place is open."""
+    one = scattered(oval, 0.012, 9, 0.4, seed=2)
+    other = scattered(oval, 0.012, 9, 0.4, seed=3)
+    other[:3], other[6:] = one[:3], one[6:]
+    other[:3, :, 2, 3] += 0.014
+    other[6:, :, 0, 3] += 2e-4
+    skins, tools, poses = oval, [LEFT, LEFT.named("again")], np.concatenate([one, other], axis=1)
+    batch, expected = made(skins, tools, 9), Batch(skins, tools, 9, threads=1)
+    motion = moved(batch, expected, poses, 6, 1e-3)
+    assert np.isfinite(motion).all()
+    moved(made(skins, tools, 6), Batch(skins, tools, 6, threads=1), poses[:6], 4, 1e-5)
+
+
+def test_fields_of_layers_do_not_cross_a_gap() -> None:
+    skin, tools = Skin.of(LAYERED, MomentNet()), [ball(4e-3).named("left"), ball(4e-3)]
+    poses = np.stack([[at(-x, 0.02, 3e-3), at(x, y, 0.03 if far else 3.2e-3)] for x, y, far in
+                      ((0.004, 0.02, False), (0.003, 0.03, True), (0.004, 0.062, False))])  # fmt: skip
+    motion = moved(made(skin, tools, 3), Batch(skin, tools, 3, threads=1), poses, 3, 1e-5)
+    beyond = (FINGERS.vertices[:, 0] > 0) & (FINGERS.vertices[:, 1] < 0.03)
+    assert np.abs(motion[1, ~beyond]).max() > 5e-4 > 1e3 * np.abs(motion[1, beyond]).max()
+
+
+def test_neither_part_nor_lane_nor_room_changes_fields_of_layers(oval: Skin) -> None:
+    poses = scattered(oval, 0.012, 6, 0.5, seed=4)
+    batch = made(oval, [LEFT], 6)
+    whole = batch.touch(poses, fields=range(6)).fields.numpy()
+    assert np.array_equal(batch.touch(poses, fields=[4, 1]).fields.numpy(), whole[[4, 1]])
+    assert batch._fields is not None
+    room = batch.room.bytes_of(1) + batch._fields._room.bytes_of()
+    assert np.array_equal(made(oval, [LEFT], 6, memory=room).touch(poses, fields=range(6)).fields.numpy(), whole)
+    many = made(oval, [LEFT], 6, lanes=5).touch(poses, fields=range(6)).fields.numpy()
+    assert np.abs(many - whole).max() < 1e-6 * np.abs(whole).max()
 
 
 def test_fields_come_for_the_scenes_that_are_asked(cylinder: Skin) -> None:
@@ -291,8 +344,8 @@ def test_fields_that_are_not_served_are_refused(cylinder: Skin, layered: Skin) -
     for method in (Winkler(), MomentNet()):
         with pytest.raises(InvalidInput, match=r"from one MomentNet\(sticks=False\)"):
             made(Skin.of(cylinder.layer, method), [LEFT, RIGHT], 2).touch(poses, fields=[0])
-    with pytest.raises(InvalidInput, match="fields of stacks"):
-        made(layered, [LEFT, RIGHT], 2).touch(poses, fields=[0])
+    with pytest.raises(InvalidInput, match=r"from one MomentNet\(\) without a fallback; the skins have limb_linear"):
+        made(Skin.of(layered.layer, LimbLinear()), [LEFT, RIGHT], 2).touch(poses, fields=[0])
 
 
 def test_a_scene_that_is_refused_spoils_no_other(cylinder: Skin) -> None:

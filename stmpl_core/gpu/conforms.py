@@ -19,6 +19,7 @@ FIRM, FACING = wp.constant(wp.float64(conform.FIRM_DEPTH)), wp.constant(wp.float
 LEAST, RIDGE = wp.constant(wp.float64(conform.LEAST_WEIGHT)), wp.constant(wp.float64(conform.SMOOTHING_SHARE))
 ONE_WAY = wp.constant(wp.float64(touch.MIN_ONE_WAY_SHARE))
 MOST_MOVED = wp.constant(wp.float64(simulator.MOST_MOVED))
+PUSHES, LEFT = wp.constant(conform.PUSHES), wp.constant(wp.float64(conform.LEFT_DEPTH))
 NAN = wp.constant(wp.float64(float("nan")))
 wp.set_module_options({**OPTIONS, "max_unroll": 4})
 
@@ -106,6 +107,7 @@ def find_way(pick: wp.array(dtype=wp.int32), many: wp.int32, skins: Skins, scrat
                 total += part
                 force = force - part / skins.area[corners[x]] * skins.area_vectors[corners[x]]
     field.one_way[t] = 0
+    field.push[t] = force
     if wp.length(force) > ONE_WAY * total:
         field.one_way[t] = 1
         field.way[t] = wp.normalize(force)
@@ -299,9 +301,12 @@ def push_out(pick: wp.array(dtype=wp.int32), lanes: wp.int32, many: wp.int32, sk
         for k in range(many):
             c = pick[f] * many + k
             if _met(scratch, c, v - first):
-                jet = _jet_of(skins, scratch, c, skins.points[v] + moved)
-                if jet[0] < real(0.0):
+                jet, least, pushed = _jet_of(skins, scratch, c, skins.points[v] + moved), real(0.0), wp.int32(0)
+                while pushed < PUSHES and jet[0] < least:
                     moved = moved - jet[0] * vec3(jet[1], jet[2], jet[3])
+                    jet = _jet_of(skins, scratch, c, skins.points[v] + moved)
+                    least = -LEFT * skins.thickness[v]
+                    pushed += 1
         field.motion[f, v - first] = moved
 
 

@@ -10,11 +10,11 @@ import warp as wp
 
 from stmpl_core.conform import PASSES
 from stmpl_core.errors import InvalidInput
-from stmpl_core.gpu import conforms, field_packs, motion
+from stmpl_core.gpu import conforms, field_packs, motion, sticks, twins
 from stmpl_core.gpu.field_packs import FieldRoom
 from stmpl_core.skin import Skin
 
-UNDER = 256  # room for vertices under the tools of a scene at first; it grows where more are met
+UNDER, HOLDING = 256, 64  # room for vertices under the tools of a scene, and nodes, at first; it grows with need
 
 
 class Fields:
@@ -35,13 +35,11 @@ class Fields:
     """
 
     def __init__(self, skins: Sequence[Skin], tools: int, lanes: int, memory: int, device: Any) -> None:
-        if any(skin.layer.stacked for skin in skins):
-            raise InvalidInput("fields of stacks (living limbs) are not served by WarpBatch yet, only what tools do to "
-                               "them. Try Batch.")  # fmt: skip
         self._net, self._more = field_packs.motion_net(skins, device), field_packs.pack(skins, device)
         self.vertices = max(len(skin.layer.vertices) for skin in skins)
-        self._room = FieldRoom(self.vertices, UNDER, tools, lanes)
-        self._memory, self._device = memory, device
+        coarse = max(len(green.coarse.gathered) if (green := skin.green) and green.coarse else 0 for skin in skins)
+        self._room = FieldRoom(self.vertices, UNDER, tools, lanes, HOLDING, coarse)
+        self._memory, self._device, self._stacked = memory, device, coarse > 0
         self._scratch: Any = None
 
     def move(self, scenes: np.ndarray, rows: np.ndarray, skins: Any, touched: Any, out: Any) -> None:
@@ -76,14 +74,27 @@ class Fields:
         return many
 
     def _list(self, pick: Any, skins: Any, touched: Any) -> bool:
-        """Lists the vertices under the tools; False: there was no room for them, and now there is."""
-        self._scratch.most.zero_()
-        self._run(motion.list_under, len(pick), pick, self._room.tools, skins, touched, self._scratch)
-        most = int(self._scratch.most.numpy()[0])
-        if most <= self._room.under:
-            return True
-        self._room, self._scratch = self._room._replace(under=32 * -(-(most + most // 4) // 32)), None
-        return False
+        """Lists the vertices under the tools, and nodes; False: there was no room for them, and now there is."""
+        field, tools, lanes, most = self._scratch, self._room.tools, self._room.lanes, {}
+        field.most.zero_()
+        self._run(motion.list_under, len(pick), pick, tools, skins, touched, field)
+        if self._stacked:
+            shared = len(pick), lanes
+            self._run(motion.forget, shared, pick, lanes, tools, 1, skins, touched, field)
+            self._run(sticks.find_reach, len(pick) * tools, pick, tools, touched, field)
+            self._run(sticks.mark_beside, shared, pick, lanes, tools, skins, self._more, touched, field)
+            self._run(sticks.list_beside, len(pick), pick, tools, skins, touched, field)
+            most["under"] = int(field.most.numpy()[0])
+            field.most.zero_()
+            self._run(sticks.list_holding, len(pick), pick, tools, touched, field)
+            most["nodes"] = int(field.most.numpy()[0])
+        else:
+            most["under"] = int(field.most.numpy()[0])
+        more = {name: 32 * -(-(one + one // 4) // 32) for name, one in most.items()
+                if one > getattr(self._room, name)}  # fmt: skip
+        if more:
+            self._room, self._scratch = self._room._replace(**more), None
+        return not more
 
     def _run(self, kernel: Any, dim: int | tuple[int, int], *inputs: Any) -> None:
         wp.launch(kernel, dim=dim, inputs=list(inputs), device=self._device)
@@ -96,18 +107,74 @@ class Fields:
             self._run(kernel, dim, pick, lanes, tools, *inputs)
 
         self._run(conforms.find_way, scenes * tools, pick, tools, skins, touched, field)
+        if tools > 1:
+            self._run(twins.cover, (scenes * tools, tools), pick, tools, touched, field)
+            self._run(twins.go_together, scenes * tools, tools, field)
         run(motion.press, skins, touched, field)
+        if self._stacked:
+            self._stick(pick, skins, touched)
 
         # What the method says.
-        run(motion.forget, 1, skins, touched, field)
+        run(motion.forget, int(not self._stacked), skins, touched, field)
         self._run(motion.fold, scenes, pick, tools, 0, skins, touched, field)
         run(motion.mark, 0, skins, more, touched, field)
         run(motion.ask, skins, more, touched, field)
+        if self._stacked:
+            run(sticks.find_peak, skins, touched, field)
+            self._run(sticks.gather_peak, scenes, lanes, field)
         run(motion.move, skins, more, touched, field, self._net)
         self._run(motion.gain, scenes, lanes, field)
-        run(motion.fill, 0, skins, more, touched, field)
+        run(motion.fill, 2 if self._stacked else 0, skins, more, touched, field)
 
-        # What is touched lies on its tool, and the rest comes along.
+        if self._stacked:
+            self._run(sticks.hold_back, scenes, pick, tools, skins, touched, field)
+            run(sticks.mix, skins, touched, field)
+        else:
+            self._lay(pick, skins, touched)
+        run(conforms.push_out, skins, touched, field)
+        other: Any = wp.float64 if out.dtype is wp.float32 else wp.float32
+        none = wp.empty((0, 0, 0), dtype=other, device=self._device)
+        both = (out, none) if out.dtype is wp.float32 else (none, out)
+        self._run(conforms.hand_out, shared, pick, to, lanes, tools, skins, more, touched, field, *both)
+
+    def _stick(self, pick: Any, skins: Any, touched: Any) -> None:
+        """The linear motion of skin that sticks, and the pressures that the method adds to it."""
+        field, lanes, tools, more = self._scratch, self._room.lanes, self._room.tools, self._more
+        scenes, shared = len(pick), (len(pick), lanes)
+
+        def run(kernel: Any, *inputs: Any, dim: Any = shared) -> None:
+            self._run(kernel, dim, pick, lanes, tools, *inputs)
+
+        run(sticks.go, skins, touched, field)
+        run(sticks.fill_blocks, skins, more, touched, field)
+        if tools > 1:
+            self._run(twins.trace, shared, lanes, field)
+            self._run(twins.give_way, shared, pick, lanes, touched, field)
+        self._run(sticks.find_most, shared, lanes, field)
+        self._run(sticks.add_ridge, scenes, lanes, field)
+        end = self._room.nodes
+        for pivot in [(0, end)] if lanes == 1 else [(k, k + 1) for k in range(end)]:
+            self._run(sticks.eliminate, shared, lanes, *pivot, field)
+        self._run(sticks.substitute, scenes, field)
+        run(motion.forget, 1, skins, touched, field)
+        run(sticks.mark, skins, more, touched, field)
+        run(motion.ask, skins, more, touched, field)
+        run(sticks.move, skins, more, touched, field)
+        run(motion.fill, 1, skins, more, touched, field)
+        self._run(sticks.hand, shared, pick, lanes, touched, field)
+        run(sticks.move_limb, skins, touched, field)
+        run(sticks.add_limb, skins, touched, field)
+        run(sticks.share_out, skins, touched, field, dim=(scenes * tools, lanes))
+        run(sticks.spread, skins, touched, field)
+
+    def _lay(self, pick: Any, skins: Any, touched: Any) -> None:
+        """What is touched lies on its tool, and the rest comes along."""
+        field, lanes, tools, more = self._scratch, self._room.lanes, self._room.tools, self._more
+        scenes, shared = len(pick), (len(pick), lanes)
+
+        def run(kernel: Any, *inputs: Any, dim: Any = shared) -> None:
+            self._run(kernel, dim, pick, lanes, tools, *inputs)
+
         run(conforms.lie, skins, touched, field, dim=(scenes * tools, lanes))
         self._run(motion.fold, scenes, pick, tools, 1, skins, touched, field)
         run(conforms.begin, skins, more, touched, field)
@@ -119,11 +186,6 @@ class Fields:
         run(motion.ask, skins, more, touched, field)
         run(conforms.spread, skins, more, touched, field)
         run(motion.fill, 1, skins, more, touched, field)
-        run(conforms.push_out, skins, touched, field)
-        other: Any = wp.float64 if out.dtype is wp.float32 else wp.float32
-        none = wp.empty((0, 0, 0), dtype=other, device=self._device)
-        both = (out, none) if out.dtype is wp.float32 else (none, out)
-        self._run(conforms.hand_out, shared, pick, to, lanes, tools, skins, more, touched, field, *both)
 
     def _correct(self, scenes: int) -> None:
         """Moves the vertices under tools as they should still move."""

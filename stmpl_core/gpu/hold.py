@@ -86,12 +86,14 @@ def _wanted(scratch: Scratch, one: OneSkin, s: wp.int32, i: wp.int32) -> real:
 
 
 @wp.kernel
-def guess(lanes: wp.int32, many: wp.int32, skins: Skins, scratch: Scratch):
-    """First guess of the forces."""
+def guess(lanes: wp.int32, many: wp.int32, linear: wp.int32, skins: Skins, scratch: Scratch):
+    """First guess of the forces; linear: 1, of a stack that would never harden."""
     s = wp.tid()
     one = skins.one[scratch.skin[s * many]]
     for i in range(scratch.nodes[s]):
         scratch.wanted[s, i] = _wanted(scratch, one, s, i)
+        if linear == 1:
+            scratch.wanted[s, i] = scratch.sinking[s, i]
         scratch.force[s, i] = START * scratch.wanted[s, i] / scratch.matrix[s, i, i]
         scratch.move[s, i] = real(0.0)
     for lane in range(lanes):

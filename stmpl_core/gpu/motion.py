@@ -11,14 +11,15 @@ import warp as wp
 
 from stmpl_core import response, thinning
 from stmpl_core.gpu.columns import _marked
+from stmpl_core.gpu.field_packs import HIDDEN as UNITS
 from stmpl_core.gpu.field_packs import FieldScratch, MotionNet, SkinFields
 from stmpl_core.gpu.packs import Scratch, Skins
 from stmpl_core.gpu.places import BY_POSE
 from stmpl_core.gpu.rays import OPTIONS, real, vec3
 from stmpl_core.methods import moment_net as law
-from stmpl_core.networks import DIRECTIONS, INPUTS, MOTION
+from stmpl_core.networks import DIRECTIONS, INPUTS, MOTION, STACK_INPUTS
 
-ZONES, FILLED_FROM = wp.constant(len(thinning.ZONES) + 1), wp.constant(thinning.CORNERS)
+FILLED_FROM = wp.constant(thinning.CORNERS)
 MOST_FOLDS = wp.constant(31)  # the highest number of a group, whose bits are those of a word
 FAR, STEPS = wp.constant(wp.float32(response.REACH)), wp.constant(wp.float32(response.STEPS))
 NEAR_END, FINER = wp.constant(wp.float32(response.NEAR * response.STEPS)), wp.constant(wp.float32(response.FINER))
@@ -29,7 +30,7 @@ WAYS, MIXED_VECTORS, MIXED_TENSORS = (wp.constant(n) for n in (DIRECTIONS, law.M
 AMPLITUDE, SURROUNDED = wp.constant(wp.float32(law.AMPLITUDE)), wp.constant(wp.float32(law.SURROUNDED))
 FADE, RING = wp.constant(wp.float32(law.FADE)), wp.constant(wp.float32(law.RING))
 LEAST_GAIN, MOST_GAIN = (wp.constant(wp.float64(gain)) for gain in law.GAINS)
-HIDDEN, READ, SAID = wp.constant(96), wp.constant(INPUTS.size), wp.constant(MOTION.size)
+HIDDEN, SAID, MORE = wp.constant(UNITS), wp.constant(MOTION.size), wp.constant(INPUTS.size)
 IN_SCALARS, IN_NORMAL, IN_HERE = (wp.constant(n) for n in (INPUTS.at.scalars, INPUTS.at.linear_normal, INPUTS.at.here))
 IN_LOG_HERE, IN_LOG_G = wp.constant(INPUTS.at.log_here), wp.constant(INPUTS.at.log_g)
 IN_G, IN_ROOT_G = wp.constant(INPUTS.at.g), wp.constant(INPUTS.at.root_g)
@@ -42,7 +43,8 @@ IN_VOLUMETRIC, IN_SLOPES = wp.constant(INPUTS.at.volumetric), wp.constant(INPUTS
 OUT_NORMAL, OUT_WAYS, OUT_TURNED = (wp.constant(n) for n in (MOTION.at.normal, MOTION.at.directions, MOTION.at.turned))
 OUT_CURVED, OUT_SLOPE = wp.constant(MOTION.at.curved), wp.constant(MOTION.at.slope)
 mat28, row, hidden, said = (wp.types.matrix(shape=(2, 8), dtype=wp.float32),
-                            *(wp.types.vector(length=n, dtype=wp.float32) for n in (INPUTS.size, 96, MOTION.size)))
+                            *(wp.types.vector(length=n, dtype=wp.float32)
+                              for n in (STACK_INPUTS.size, UNITS, MOTION.size)))
 mat14, mat82 = (wp.types.matrix(shape=(n, 2), dtype=wp.float32) for n in (14, 8))
 mat62, mat42 = (wp.types.matrix(shape=(n, 2), dtype=wp.float32) for n in (6, 4))
 assert (DIRECTIONS, 2 * response.TENSORS, law.MIXED_VECTORS, law.MIXED_TENSORS) == (14, 8, 6, 4)
@@ -171,14 +173,14 @@ def mark(pick: wp.array(dtype=wp.int32), lanes: wp.int32, many: wp.int32, all: w
          scratch: Scratch, field: FieldScratch):  # fmt: skip
     """How near a source each vertex is: thinning._zones; all: 1, those that carry nothing too."""
     f, lane = wp.tid()
-    first = skins.one[scratch.skin[pick[f] * many]].first
+    first, zones = skins.one[scratch.skin[pick[f] * many]].first, more.stands.shape[0]
     for n in range(lane, field.many[f], lanes):
         v = field.under[f, n]
         if all == 1 or field.source[f, n][0] != wp.float32(0.0):
             field.here[f, v - first] = field.source[f, n]
-            for z in range(ZONES):
-                for p in range(more.reach[ZONES * v + z], more.reach[ZONES * v + z + 1]):
-                    wp.atomic_max(field.mark, f, more.index[p] - first, ZONES - z)
+            for z in range(zones):
+                for p in range(more.reach[zones * v + z], more.reach[zones * v + z + 1]):
+                    wp.atomic_max(field.mark, f, more.index[p] - first, zones - z)
                     if field.folds[f] > 1:
                         wp.atomic_or(field.feels, f, more.index[p] - first, wp.uint32(1) << wp.uint32(field.fold[f, n]))
 
@@ -191,7 +193,7 @@ def ask(pick: wp.array(dtype=wp.int32), lanes: wp.int32, many: wp.int32, skins: 
     one = skins.one[scratch.skin[pick[f] * many]]
     for n in range(lane, one.end - one.first, lanes):
         if field.mark[f, n] > 0:
-            z, v = ZONES - field.mark[f, n], one.first + n
+            z, v = more.stands.shape[0] - field.mark[f, n], one.first + n
             if more.stands[z, v] != wp.uint8(0):
                 field.ask[f, n] = 1
             else:
@@ -232,7 +234,7 @@ def _layer(given: hidden, w: wp.array2d(dtype=wp.float32), b: wp.array(dtype=wp.
 def _think(inputs: row, net: MotionNet) -> said:
     """What the network says."""
     one = hidden()
-    for m in range(READ):
+    for m in range(net.w1.shape[0]):
         x = (wp.clamp(inputs[m], net.low[m], net.high[m]) - net.mean[m]) * net.scale[m]
         for unit in range(HIDDEN):
             one[unit] = one[unit] + x * net.w1[m, unit]
@@ -304,6 +306,12 @@ def move(pick: wp.array(dtype=wp.int32), lanes: wp.int32, many: wp.int32, skins:
                                     sin_1[p, m] = sin_1[p, m] + value * d * vectors[m]
                                     cos_2[p, m] = cos_2[p, m] + value * c_2 * tensors[m]
                                     sin_2[p, m] = sin_2[p, m] + value * d_2 * tensors[m]
+            thick = wp.float32(skins.thickness[v])
+            if one.stacked == 1:  # known better: see stmpl_core.gpu.sticks
+                thick = wp.float32(one.flat)
+                known = field.linear[f, local]
+                linear_0 = frame * wp.vec3f(wp.float32(known[0]), wp.float32(known[1]), wp.float32(known[2])) / thick
+                linear_1 = wp.vec3f(linear_0)
             g = wp.float32(0.0)
             for m in range(SCALARS):
                 g += wp.abs(even[1, m])
@@ -367,6 +375,13 @@ def move(pick: wp.array(dtype=wp.int32), lanes: wp.int32, many: wp.int32, skins:
                 inputs[IN_CONSTANTS] = nu
                 inputs[IN_VOLUMETRIC] = unit / (wp.float32(1.02) - wp.float32(2.0) * nu)
                 inputs[IN_SLOPES] = slope_x * slope_x + slope_y * slope_y
+                if one.stacked == 1:
+                    inputs[MORE] = wp.float32(wp.log(skins.thickness[v] / one.flat))
+                    inputs[MORE + 1] = wp.float32(wp.log(one.effective / one.flat))
+                    inputs[MORE + 2] = wp.float32(one.log_kappa)
+                    inputs[MORE + 3] = wp.float32(one.log_pull)
+                    inputs[MORE + 4] = wp.float32(wp.log(one.softness))
+                    inputs[MORE + 5] = wp.float32(wp.log(field.peak[f] / one.flat + real(1e-6)))
                 out = _think(inputs, net)
                 x, y = out[OUT_SLOPE] * slope_x, out[OUT_SLOPE] * slope_y
                 for m in range(WAYS):
@@ -388,7 +403,6 @@ def move(pick: wp.array(dtype=wp.int32), lanes: wp.int32, many: wp.int32, skins:
                     told = told + wp.vec2d(real(weight * wp.dot(linear_1, whole)), real(weight * square))
                 fixed = share * whole
                 scaled = (unit - share) * linear_1
-            thick = wp.float32(skins.thickness[v])
             field.fixed[f, local] = thick * (wp.transpose(frame) * fixed)
             field.scaled[f, local] = thick * (wp.transpose(frame) * scaled)
     field.told[f, lane] = told
@@ -415,18 +429,25 @@ def _moved(field: FieldScratch, f: wp.int32, n: wp.int32, spread: wp.int32) -> v
                 real(fixed[2]) + g * real(scaled[2]))  # fmt: skip
 
 
+@wp.func
+def _before(field: FieldScratch, f: wp.int32, n: wp.int32, spread: wp.int32) -> vec3:
+    if spread == 2:
+        return vec3()
+    return field.motion[f, n]
+
+
 @wp.kernel
 def fill(pick: wp.array(dtype=wp.int32), lanes: wp.int32, many: wp.int32, spread: wp.int32, skins: Skins,
          more: SkinFields, scratch: Scratch, field: FieldScratch):  # fmt: skip
-    """Adds the motion of all vertices, from those that were asked; spread: 1, what corrects it."""
+    """Adds the motion of all vertices, from those that were asked; spread: 1, what corrects it, 2: not added."""
     f, lane = wp.tid()
     one = skins.one[scratch.skin[pick[f] * many]]
     for n in range(lane, one.end - one.first, lanes):
         if field.ask[f, n] == 1:
-            field.motion[f, n] = field.motion[f, n] + _moved(field, f, n, spread)
+            field.motion[f, n] = _before(field, f, n, spread) + _moved(field, f, n, spread)
         elif field.mark[f, n] > 0:
-            z, v, sum = ZONES - field.mark[f, n], one.first + n, vec3()
+            z, v, sum = more.stands.shape[0] - field.mark[f, n], one.first + n, vec3()
             for k in range(FILLED_FROM):
                 weight = real(more.weights[z, v, k])
                 sum = sum + weight * _moved(field, f, more.corners[z, v, k] - one.first, spread)
-            field.motion[f, n] = field.motion[f, n] + sum
+            field.motion[f, n] = _before(field, f, n, spread) + sum

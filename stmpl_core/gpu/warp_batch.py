@@ -24,7 +24,7 @@ import numpy as np
 import warp as wp
 
 from stmpl_core.errors import InvalidInput
-from stmpl_core.gpu import answers, columns, hold, lattice, looks, packs, places, stacks
+from stmpl_core.gpu import answers, columns, hold, lattice, looks, packs, places, stacks, sticks
 from stmpl_core.gpu.fields import Fields
 from stmpl_core.networks import shipped
 from stmpl_core.obstacle import MAX_ITERATIONS
@@ -163,8 +163,8 @@ class WarpBatch:
             fields_out: array that takes the fields, (F, V, 3), float32 or float64, likewise.
 
         Raises:
-            InvalidInput: shapes, precisions, devices or numbers of scenes that do not fit; fields of stacks, of
-                skins that are not moved by one MomentNet, or one that there is no memory for.
+            InvalidInput: shapes, precisions, devices or numbers of scenes that do not fit; fields of skins that are
+                not moved by one MomentNet, or one that there is no memory for.
         """
         n, many = len(self), len(self.tools)
         wanted = np.array(list(fields), dtype=np.int64)
@@ -191,6 +191,8 @@ class WarpBatch:
                     continue
                 rows = np.flatnonzero((wanted >= first) & (wanted < first + self._part))
                 if len(rows) and self._fields is not None:
+                    if self._stacked:
+                        self._stick()
                     self._fields.move(wanted[rows] - first, rows, self._skins, self._scratch, motion)
                 first += self._part
         return WarpTouches(wrenches, depths, bounds, in_range, statuses, motion)
@@ -307,8 +309,8 @@ class WarpBatch:
         if self._stacked:
             self._run(stacks.find_kept, shared, lanes, scratch)
             self._run(stacks.temper, shared, lanes, scratch)
-        self._run(hold.guess, scenes, lanes, many, skins, scratch)
-        self._iterate([(kernel, shared, lanes) for kernel in (hold.press, hold.turn, hold.follow, hold.step)])
+        self._run(hold.guess, scenes, lanes, many, 0, skins, scratch)
+        self._relax(shared)
         self._run(hold.begin_power, scenes, scratch)
         self._iterate([(hold.multiply, shared, lanes), (hold.step_power, scenes)])
         if self._stacked:
@@ -322,6 +324,24 @@ class WarpBatch:
         self._run(hold.correct, shared, lanes, scratch, net)
         self._run(answers.find_highest, shared, lanes, many, skins, scratch)
         self._run(answers.find_beside, shared, lanes, many, scratch)
+
+    def _relax(self, shared: tuple[int, int]) -> None:
+        """Forces at the nodes of the linear problem."""
+        self._iterate([(kernel, shared, self._lanes) for kernel in (hold.press, hold.turn, hold.follow, hold.step)])
+
+    def _stick(self) -> None:
+        """The same for skin of stacks that sticks: of all tools of a scene together, and not as if it hardened."""
+        scratch, skins, lanes, many = self._scratch, self._skins, self._lanes, len(self.tools)
+        tools = len(scratch.skin)
+        scenes = tools // many
+        self._run(sticks.unite, tools, scratch)
+        self._run(stacks.fold, scenes, many, skins, scratch)
+        self._run(stacks.find_mean, tools, many, skins, scratch)
+        self._run(stacks.respond, (scenes, lanes), lanes, many, skins, scratch)
+        self._run(stacks.find_kept, (scenes, lanes), lanes, scratch)
+        self._run(stacks.temper, (scenes, lanes), lanes, scratch)
+        self._run(hold.guess, scenes, lanes, many, 1, skins, scratch)
+        self._relax((scenes, lanes))
 
     def _iterate(self, kernels: Sequence[tuple[Any, ...]]) -> None:
         """Conjugate gradients until every scene is done: kernels, over how many, what they are told."""

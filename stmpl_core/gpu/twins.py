@@ -1,0 +1,89 @@
+# type: ignore  # kernels are in Warp's language, which pyright does not know
+"""Kernels of tools that are in one place: stmpl_core.twins."""
+
+import warp as wp
+
+from stmpl_core import twins
+from stmpl_core.gpu.conforms import ONE_WAY
+from stmpl_core.gpu.field_packs import FieldScratch
+from stmpl_core.gpu.packs import Scratch
+from stmpl_core.gpu.rays import OPTIONS, real, vec3
+
+PLACE, SEEN = (wp.constant(wp.float64(most * most / 3**0.5)) for most in (twins.APART, twins.AROUND))
+COVERED, GIVES = wp.constant(wp.float64(twins.COVERED)), wp.constant(wp.float64(twins.GIVES))
+wp.set_module_options({**OPTIONS, "max_unroll": 4})
+
+
+@wp.func
+def _apart(scratch: Scratch, s: wp.int32, i: wp.int32, j: wp.int32, most: real) -> real:
+    """Squared distance of two nodes over one of their lattices, 1 where they face apart: twins._apart."""
+    over = wp.length_sq(scratch.point[s, i] - scratch.point[s, j]) / (most * (scratch.area[s, i] + scratch.area[s, j]))
+    if wp.dot(scratch.inward[s, i], scratch.inward[s, j]) <= real(0.0):
+        return real(1.0)
+    return wp.min(over, real(1.0))
+
+
+@wp.kernel
+def cover(pick: wp.array(dtype=wp.int32), many: wp.int32, scratch: Scratch, field: FieldScratch):
+    """How much of what each tool covers each other one covers too: twins.covered."""
+    t, other = wp.tid()
+    k, s, total, both = t % many, pick[t // many], real(0.0), real(0.0)
+    if other != k:
+        for i in range(scratch.nodes[s]):
+            if scratch.tool[s, i] == k:
+                own, its = real(0.0), real(0.0)
+                for j in range(scratch.nodes[s]):
+                    if scratch.tool[s, j] == k or scratch.tool[s, j] == other:
+                        seen = scratch.area[s, j] * (real(1.0) - _apart(scratch, s, i, j, SEEN))
+                        if scratch.tool[s, j] == k:
+                            own += seen
+                        else:
+                            its += seen
+                deep = scratch.area[s, i] * scratch.strain[s, i]
+                total += deep
+                both += deep * wp.min(its / own, real(1.0))
+    x = real(0.0)
+    if total > real(0.0):
+        x = wp.max(both / total - COVERED, real(0.0)) / (real(1.0) - COVERED)
+    field.covers[t, other] = x * x * (real(3.0) - real(2.0) * x)
+
+
+@wp.kernel
+def go_together(many: wp.int32, field: FieldScratch):
+    """Tools that cover the same skin go the way of the force that they share: twins.going_together."""
+    t = wp.tid()
+    first, push, shares = t - t % many, vec3(field.push[t]), real(0.0)
+    for k in range(many):
+        share = wp.min(field.covers[t, k], field.covers[first + k, t % many])
+        push = push + share * field.push[first + k]
+        shares += share
+    if shares > real(0.0) and field.one_way[t] == 1 and wp.length_sq(push) > real(0.0):
+        way = wp.normalize(push)
+        if wp.dot(way, field.way[t]) > ONE_WAY:
+            field.way[t] = way
+
+
+@wp.kernel
+def trace(lanes: wp.int32, field: FieldScratch):
+    """How much each node goes its own way under a force E, in three directions."""
+    f, lane = wp.tid()
+    for a in range(lane, field.holds[f], lanes):
+        field.own_way[f, a] = wp.trace(field.block[f, a, a])
+
+
+@wp.kernel
+def give_way(pick: wp.array(dtype=wp.int32), lanes: wp.int32, scratch: Scratch, field: FieldScratch):
+    """Nodes of two tools in one place give way to what their forces differ by: twins.give_way."""
+    f, lane = wp.tid()
+    s = pick[f]
+    for a in range(lane, field.holds[f], lanes):
+        i, sum = wp.int32(field.hold[f, a]), real(0.0)
+        for b in range(field.holds[f]):
+            j = wp.int32(field.hold[f, b])
+            if scratch.tool[s, i] != scratch.tool[s, j] and scratch.fold[s, i] == scratch.fold[s, j]:
+                left = real(1.0) - _apart(scratch, s, i, j, PLACE)
+                if left > real(0.0):
+                    gives = GIVES * left * left * (field.own_way[f, a] + field.own_way[f, b]) / real(6.0)
+                    field.block[f, a, b] = field.block[f, a, b] - gives * wp.identity(n=3, dtype=real)
+                    sum += gives
+        field.block[f, a, a] = field.block[f, a, a] + sum * wp.identity(n=3, dtype=real)
