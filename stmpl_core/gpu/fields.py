@@ -41,6 +41,7 @@ class Fields:
         self._room = FieldRoom(self.vertices, UNDER, tools, lanes, HOLDING, coarse)
         self._memory, self._device, self._stacked = memory, device, coarse > 0
         self._scratch: Any = None
+        self._holding = 0  # most nodes that press in a scene of those at hand
 
     def move(self, scenes: np.ndarray, rows: np.ndarray, skins: Any, touched: Any, out: Any) -> None:
         """Writes the motion of some scenes.
@@ -87,7 +88,7 @@ class Fields:
             most["under"] = int(field.most.numpy()[0])
             field.most.zero_()
             self._run(sticks.list_holding, len(pick), pick, tools, touched, field)
-            most["nodes"] = int(field.most.numpy()[0])
+            most["nodes"] = self._holding = int(field.most.numpy()[0])
         else:
             most["under"] = int(field.most.numpy()[0])
         more = {name: 32 * -(-(one + one // 4) // 32) for name, one in most.items()
@@ -152,7 +153,7 @@ class Fields:
             self._run(twins.give_way, shared, pick, lanes, touched, field)
         self._run(sticks.find_most, shared, lanes, field)
         self._run(sticks.add_ridge, scenes, lanes, field)
-        end = self._room.nodes
+        end = self._holding
         for pivot in [(0, end)] if lanes == 1 else [(k, k + 1) for k in range(end)]:
             self._run(sticks.eliminate, shared, lanes, *pivot, field)
         self._run(sticks.substitute, scenes, field)

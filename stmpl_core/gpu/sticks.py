@@ -58,7 +58,11 @@ def list_holding(pick: wp.array(dtype=wp.int32), many: wp.int32, scratch: Scratc
 @wp.kernel
 def go(pick: wp.array(dtype=wp.int32), lanes: wp.int32, many: wp.int32, skins: Skins, scratch: Scratch,
        field: FieldScratch):  # fmt: skip
-    """Where these go with their tools, stick._along; and how each goes with the limb under a pressure at its mesh."""
+    """Where these go with their tools, stick._along; and how each goes with the limb under a pressure at its mesh.
+
+    Of the tables of green.add_motion each reads a row between two spreads and a softness, in few steps of both; third
+    is the square of the distance at which what it does no longer rises, over the thickness.
+    """
     f, lane = wp.tid()
     s = pick[f]
     one, met = skins.one[scratch.skin[s * many]], scratch.meets[s]
@@ -76,6 +80,10 @@ def go(pick: wp.array(dtype=wp.int32), lanes: wp.int32, many: wp.int32, skins: S
         far = depth_in_column(skins.grids[scratch.grid[c]], skins.coefficients, start, pose * way,
                               real(4.0) * depth, depth)  # fmt: skip
         field.pull[f, a] = wp.min(far, FURTHEST * depth) * way
+        fine = wp.floor(FINE_SPREADS * _row_of(wp.log(SPREAD * wp.sqrt(scratch.area[s, i]) / one.flat)))
+        soft = wp.floor(FINE_SOFTS * scratch.soft[s, i] + real(0.5))
+        field.row[f, a] = vec3((fine + real(0.5)) / FINE_SPREADS, soft / FINE_SOFTS,
+                               scratch.area[s, i] * ROUND_SQUARE / (one.flat * one.flat))  # fmt: skip
     for n in range(lane, field.holds[f] * met, lanes):
         a, d = n // met, n % met
         i = field.hold[f, a]
@@ -275,15 +283,10 @@ def move(pick: wp.array(dtype=wp.int32), lanes: wp.int32, many: wp.int32, skins:
                 source = scratch.inward[s, i]
                 facing, r = wp.dot(inward, source), wp.length(away) / t
                 if felt and facing > real(0.0) and r < real(0.98) * REACH:
-                    spread = SPREAD * wp.sqrt(scratch.area[s, i]) / t
-                    row = wp.floor(FINE_SPREADS * _row_of(wp.log(spread)))
-                    g = wp.floor(row / FINE_SPREADS)
-                    h = (row - FINE_SPREADS * g + real(0.5)) / FINE_SPREADS
-                    soft = wp.floor(FINE_SOFTS * scratch.soft[s, i] + real(0.5)) / FINE_SOFTS
-                    x = wp.min(wp.sqrt(r) * ROWS, FARTHEST)
-                    k = wp.int32(x)
-                    per = _share(facing) / (wp.sqrt(r * r + scratch.area[s, i] * ROUND_SQUARE / (t * t)) * t)
-                    told = per * _softly(more, id, soft, k, x - real(k), wp.int32(g), h)
+                    row, x = field.row[f, a], wp.min(wp.sqrt(r) * ROWS, FARTHEST)
+                    k, g = wp.int32(x), wp.int32(row[0])
+                    per = _share(facing) / (wp.sqrt(r * r + row[2]) * t)
+                    told = per * _softly(more, id, row[1], k, x - real(k), g, row[0] - real(g))
                     sum = sum + _of_force(inward, source, away, t, told, field.pull[f, a])
             field.spread[f, n] = sum
 
