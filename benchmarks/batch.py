@@ -23,12 +23,14 @@ from stmpl_core.batch import Batch
 from stmpl_core.errors import StmplError
 from stmpl_core.methods import MomentNet
 from stmpl_core.skin import Skin
+from stmpl_core.state import State
 from stmpl_core.tool import Tool
 
 AIM = 2500  # touches a second of one core
 DEPTH = 0.3  # of each tool, over the thickness
 ROUNDS, TURN_S = 12, 0.2
-N, ON_GPU = {"touches": 256, "fields": 32}, 4096  # scenes; of a GPU, which few do not fill
+N, ON_GPU = {"touches": 256, "steps": 256, "fields": 32}, 4096  # scenes; of a GPU, which few do not fill
+STEP, FRICTION = 2e-3, "oiled"  # of a step: a touch with a memory [s], and what rubs
 NO_CUDA = "not measured: no CUDA device"
 Row = tuple[Callable[[], object], int] | str  # call that answers all scenes, and how many; or why there is none
 Rates = dict[str, list[tuple[float, float]]]  # scenes a second of the clock and of the processor in each round, by name
@@ -59,32 +61,41 @@ def scattered(skin: Skin, n: int) -> np.ndarray:
 
 def rows(skin: Skin, tool: Tool, what: str) -> dict[str, Row]:
     """Who answers a batch of scenes, by name."""
-    n, cores, fields = N[what], len(os.sched_getaffinity(0)), what == "fields"
-    poses, wanted = scattered(skin, n), range(n) if fields else ()
-    simulator = Simulator(skin)
+    n, cores, fields, steps = N[what], len(os.sched_getaffinity(0)), what == "fields", what == "steps"
+    poses, wanted, friction = scattered(skin, n), range(n) if fields else (), FRICTION if steps else None
+    simulator = Simulator(skin, friction=friction)
 
     def loop() -> None:
         for pose in poses[:, 0]:
+            if steps:
+                simulator.touch([Contact(tool, pose)], State(), STEP)
+                continue
             touches = simulator.touch([Contact(tool, pose)])
             if fields:
                 simulator.answer(touches)
 
     out: dict[str, Row] = {f"Simulator.{'step' if fields else 'touch'} in a loop": (loop, n)}
+    begins = [None] * n if steps else None
     for threads in dict.fromkeys((1, cores)):
-        batch = Batch(skin, [tool], n, threads=threads)
+        batch = Batch(skin, [tool], n, threads=threads, friction=friction)
         name = f"Batch, {threads} thread{'s' * (threads > 1)}"
-        out[name] = (lambda batch=batch: batch.touch(poses, fields=wanted)), n
+        out[name] = (lambda batch=batch: batch.touch(poses, begins, STEP, fields=wanted)), n
     if fields and not skin.layer.stacked:
         skin = Skin.of(skin.layer, MomentNet(sticks=False))
     many = np.resize(poses, (ON_GPU, *poses.shape[1:]))
     return out | {
-        "WarpBatch, cpu": _on_device(skin, tool, poses, wanted, "cpu"),
-        f"WarpBatch, cuda, {ON_GPU:,} scenes": _on_device(skin, tool, many, range(ON_GPU) if fields else (), "cuda"),
+        "WarpBatch, cpu": _on_device(skin, tool, poses, wanted, friction, "cpu"),
+        f"WarpBatch, cuda, {ON_GPU:,} scenes": _on_device(skin, tool, many, range(ON_GPU) if fields else (), friction,
+                                                         "cuda"),
     }
 
 
-def _on_device(skin: Skin, tool: Tool, poses: np.ndarray, wanted: Iterable[int], device: str) -> Row:
-    """WarpBatch on a device of Warp's; on a GPU the poses lie there already, and what it says stays there."""
+def _on_device(skin: Skin, tool: Tool, poses: np.ndarray, wanted: Iterable[int], friction: str | None,
+               device: str) -> Row:  # fmt: skip
+    """WarpBatch on a device of Warp's; on a GPU the poses lie there already, and what it says stays there.
+
+    With friction its scenes remember: on the CPU's cores.
+    """
     try:
         import warp as wp
 
@@ -93,14 +104,15 @@ def _on_device(skin: Skin, tool: Tool, poses: np.ndarray, wanted: Iterable[int],
         wp.config.quiet = True
         if device == "cuda" and not wp.is_cuda_available():
             return NO_CUDA
-        batch = WarpBatch(skin, [tool], len(poses), device=device)
+        batch = WarpBatch(skin, [tool], len(poses), friction=friction, device=device)
+        begins = batch.at_rest() if friction else None
         there = wp.array(np.ascontiguousarray(poses), dtype=wp.float64, device=device)
-        batch.touch(there, fields=wanted)
+        batch.touch(there, begins, STEP, fields=wanted)
     except (ImportError, StmplError) as error:
         return f"not measured: {error}"
 
     def call() -> None:
-        batch.touch(there, fields=wanted)
+        batch.touch(there, begins, STEP, fields=wanted)
         wp.synchronize_device(batch.device)
 
     return call, len(poses)

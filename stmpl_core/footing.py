@@ -104,10 +104,20 @@ def bearing(push, points, area, thickness, depth, forces, deepest, power, factor
         stored, whole: see Law (stmpl_core.balance) [J].
         doubt: error of the force that relaxing brings [N].
     """
+    normal = push / np.sqrt(_dot(push, push))
+    middle, radius, lever, mean, whole = patch_of(points, area, thickness, depth, forces, normal)
+    out = borne(push, middle, radius, mean, whole, forces.sum(), deepest, power, factor, before, held, fades, kept,
+                gain, owed, shares, stated, creeps, slid)  # fmt: skip
+    force, elastic, at_rest, net, long, contact, relaxed, stored, whole, doubt = out
+    return (force, elastic, at_rest, net, radius, long, lever, mean, contact, relaxed, stored, whole, doubt)
+
+
+@numba.njit(cache=True, error_model="numpy")
+def borne(push, middle, radius, mean, whole, elastic, deepest, power, factor, before, held, fades, kept, gain, owed,
+          shares, stated, creeps, slid):  # fmt: skip
+    """`bearing` of a contact whose patch is known; middle, radius, mean, whole: see `patch_of`."""
     size = np.sqrt(_dot(push, push))
     normal = push / size
-    middle, radius, lever, mean, whole = patch_of(points, area, thickness, depth, forces, normal)
-    elastic = forces.sum()
     net, long, more, now = min(size / elastic, 1.0), stretch(deepest, mean), faded(fades, radius), 1.0
     for i in range(len(shares)):
         now -= more * shares[i] * gain[i]
@@ -124,8 +134,7 @@ def bearing(push, points, area, thickness, depth, forces, deepest, power, factor
         gone += shares[i] * relaxed[i]
     whole *= 0.5 + 0.5 / factor  # what draws a tool back from the core is steep: it stores less
     stored = whole * left_over(gone / at_rest, power, 1 - long)
-    return (force, elastic, at_rest, net, radius, long, lever, mean, contact, relaxed, stored, whole,
-            ROUGH * long * gone)  # fmt: skip
+    return force, elastic, at_rest, net, long, contact, relaxed, stored, whole, ROUGH * long * gone
 
 
 @numba.njit(cache=True, error_model="numpy")
@@ -375,7 +384,8 @@ def way_along(twist, contact, pose):
     return _dot(go, contact[2]), _dot(go, _cross(contact[1], contact[2]))
 
 
-def part_of_way(way: np.ndarray, normal: np.ndarray, depth: float, radius: float, power: float) -> float:
+@numba.njit(cache=True, error_model="numpy")
+def part_of_way(way, normal, depth, radius, power):
     """Share of a step in which a tool is in the skin that it comes to, or leaves [-].
 
     Its force rises with a power of the depth, and is taken to rise straight: in a shorter time, at the end of which as
@@ -387,8 +397,9 @@ def part_of_way(way: np.ndarray, normal: np.ndarray, depth: float, radius: float
         depth, radius: depth and radius of the contact that it comes to, or leaves [m].
         power: that power [-].
     """
-    across, depth, radius = float(way @ normal), max(depth, LEAST), max(radius, LEAST)
-    aside = float(np.linalg.norm(way - across * normal))
+    across, depth, radius = _dot(way, normal), max(depth, LEAST), max(radius, LEAST)
+    along = way - across * normal
+    aside = np.sqrt(_dot(along, along))
     return min(1.0, depth / max(across, depth), radius / max(aside, radius)) * 2 / (max(power, 1.0) + 1)
 
 

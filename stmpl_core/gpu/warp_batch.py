@@ -14,7 +14,7 @@ Geometry and the linear problem are float64, the network float32, as in the law 
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass
 from numbers import Integral
@@ -23,13 +23,19 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from stmpl_core.arrays import check_dt
+from stmpl_core.columns import Columns
 from stmpl_core.errors import InvalidInput
-from stmpl_core.gpu import answers, columns, hold, lattice, looks, packs, places, stacks, sticks
+from stmpl_core.friction import Friction, check_tools
+from stmpl_core.gpu import answers, bears, columns, hold, lattice, looks, packs, places, stacks, sticks
 from stmpl_core.gpu.fields import Fields
+from stmpl_core.gpu.memory import PATCH, Steps, WarpStates
+from stmpl_core.gpu.rays import mat33
 from stmpl_core.networks import shipped
 from stmpl_core.obstacle import MAX_ITERATIONS
 from stmpl_core.skin import Skin
 from stmpl_core.soundness import too_long
+from stmpl_core.state import State
 from stmpl_core.tool import Tool
 
 log = logging.getLogger(__name__)
@@ -54,6 +60,7 @@ class WarpTouches:
             back and this does not; "no room": a tool of the scene meets more skin than there is room for (`nodes`).
         fields: motion of the vertices of each scene that was asked for it, in the order asked, (F, V, 3) [m]; NaN where
             the scene was refused or is not served, 0 beyond the vertices of a smaller skin. None: none was asked for.
+        states: memory of each scene after this step; None: none was given.
     """
 
     wrenches: Any
@@ -62,6 +69,7 @@ class WarpTouches:
     in_range: Any
     statuses: Any
     fields: Any = None
+    states: WarpStates | None = None
 
     @property
     def served(self) -> np.ndarray:
@@ -80,6 +88,7 @@ class WarpBatch:
         device: device as Warp names it: "cuda", "cuda:1", "cpu".
         nodes: room for contact nodes of all tools of a scene together; None: what these tools need, found out as they
             press (the first touch that needs more is answered twice).
+        friction: as of a Simulator; it is felt where touches have states.
         memory: scratch space [bytes]; scenes that do not fit go one part after the other; None: 8 GiB on a GPU, but no
             more than a third of what is free, 256 MiB on a CPU, or what one scene needs. Fields take as much again.
         lanes: threads that share the work of a scene; None: LANES on a GPU, 1 on a CPU.
@@ -94,10 +103,12 @@ class WarpBatch:
     """
 
     _scratch: Any
+    _steps: Steps | None  # made when the first state is asked for
+    _along: tuple[Any, ...]
 
     def __init__(self, skins: Skin | Sequence[Skin], tools: Sequence[Tool], n: int | None = None, *,
-                 device: str = "cuda", nodes: int | None = None, memory: int | None = None,
-                 lanes: int | None = None) -> None:  # fmt: skip
+                 friction: Friction | Mapping[str, Friction] = None, device: str = "cuda", nodes: int | None = None,
+                 memory: int | None = None, lanes: int | None = None) -> None:  # fmt: skip
         some = list(skins) if isinstance(skins, Sequence) else [skins]
         count = len(some) if n is None else n
         for name, one in (("n", count), ("lanes", 1 if lanes is None else lanes)):
@@ -109,6 +120,8 @@ class WarpBatch:
             raise InvalidInput(f"{len(each)} skins do not fit {count} scenes: give one, or one for each.")
         if not self.tools or len({tool.name for tool in self.tools}) < len(self.tools):
             raise InvalidInput("a batch needs tools, each with a name of its own. Try tool.named('left').")
+        check_tools(friction, [tool.name for tool in self.tools])
+        self._friction, self._steps, self._along = friction, None, ()
         self.device = _device(device)
         self._unique = unique = list({id(skin): skin for skin in each}.values())
         self._fields: Fields | None = None  # made when the first is asked for
@@ -148,28 +161,61 @@ class WarpBatch:
         self._numbers = [self._numbers_of(first) for first in range(0, len(self), self._part)]
         return True
 
-    def touch(self, poses: Any, *, fields: Iterable[int] = (), out: Any = None,
-              fields_out: Any = None) -> WarpTouches:  # fmt: skip
-        """What all tools do in all scenes, elastic skin without friction, as if nothing had been before.
+    def at_rest(self) -> WarpStates:
+        """Memory of scenes in which nothing was touched yet: what the first step with a memory takes."""
+        return self._remembers().states()
+
+    def states(self, states: Sequence[State | None]) -> WarpStates:
+        """Memory of each scene as Batch or Simulator tells it, but for grooves; None: that scene begins.
+
+        Raises:
+            InvalidInput: states of another number, or of skin that relaxes otherwise or that joints have moved.
+        """
+        return self._remembers().states(states)
+
+    def _remembers(self) -> Steps:
+        if self._steps is None:
+            self._steps = steps = Steps(self._unique, self._skin_of, self.tools, self._friction)
+            orders = [Columns(skin.layer)._order for skin in self._unique]
+            ends = np.cumsum([0, *map(len, orders)])
+            order = np.concatenate([first + one for first, one in zip(ends, orders, strict=False)])
+            self._along = tuple(wp.array(values[order] if len(values) else values, dtype=mat33, device=self.device)
+                                for values in (steps.gives, steps.bends))  # fmt: skip
+        return self._steps
+
+    def touch(self, poses: Any, states: WarpStates | None = None, dt: float = 0.0, *, fields: Iterable[int] = (),
+              out: Any = None, fields_out: Any = None) -> WarpTouches:  # fmt: skip
+        """What all tools do in all scenes.
 
         Args:
             poses: pose_body_from_tool of each tool in each scene: place [m] and unit quaternion x, y, z, w, (n, K, 7),
                 or matrices, (n, K, 4, 4), float32 or float64. Arrays of Warp (of wp.transform, (n, K), too) and torch
                 on this device are not copied; those of numpy are, to a GPU. A scene with a pose that is not finite or
                 not rigid is refused, and no other.
-            fields: numbers of the scenes whose skin's motion is wanted too.
+            states: memory of each scene from the step before, `at_rest` at the beginning; None: elastic skin without
+                friction, as if nothing had been before. Time and friction are answered on the CPU's cores, from some
+                numbers of each contact. A scene that is refused or not served stays as it was.
+            dt: time since those states [s].
+            fields: numbers of the scenes whose skin's motion is wanted too; not with states.
             out: array of Warp or torch on this device that takes the wrenches, (n, K, 6), of the poses' precision;
                 None: a new one.
             fields_out: array that takes the fields, (F, V, 3), float32 or float64, likewise.
 
         Raises:
-            InvalidInput: shapes, precisions, devices or numbers of scenes that do not fit; fields of skins that are
-                not moved by one MomentNet, or one that there is no memory for.
+            InvalidInput: shapes, precisions, devices or numbers of scenes that do not fit; states of another batch, or
+                a dt below 0 or not finite; fields with states, of skins that are not moved by one MomentNet, or one
+                that there is no memory for.
         """
         n, many = len(self), len(self.tools)
+        check_dt(dt)
+        if states is not None and not isinstance(states, WarpStates):
+            raise InvalidInput(f"states are {states!r:.40}; those of at_rest(), states(...) or a step before are "
+                               "needed.")  # fmt: skip
         wanted = np.array(list(fields), dtype=np.int64)
         if len(wanted) and not (0 <= wanted.min() and wanted.max() < n):
             raise InvalidInput(f"fields are asked for scenes {wanted.min()} to {wanted.max()}; there are {n}.")
+        if len(wanted) and states is not None:
+            raise InvalidInput("fields of skin with a memory are not served by WarpBatch. Try Batch.")
         given = self._array("poses", poses)
         if given.shape not in ((n, many, 7), (n, many, 4, 4)):
             raise InvalidInput(f"poses have shape {given.shape}; ({n}, {many}, 7) or ({n}, {many}, 4, 4) is needed.")
@@ -180,7 +226,13 @@ class WarpBatch:
             self._fields = self._fields or Fields(self._unique, many, self._lanes, self._memory, self.device)
             motion = self._output("fields_out", fields_out, (len(wanted), self._fields.vertices, 3),
                                   (real, wp.float32, wp.float64))  # fmt: skip
-        depths, bounds = (wp.empty((n, many), dtype=real, device=self.device) for _ in range(2))
+        exact: Any = real if states is None else wp.float64
+        told = wrenches
+        if states is not None:
+            steps = self._remembers()
+            wrenches = wp.empty((n, many, 6), dtype=exact, device=self.device)
+            patches = wp.zeros((n, many, PATCH), dtype=exact, device=self.device)
+        depths, bounds = (wp.empty((n, many), dtype=exact, device=self.device) for _ in range(2))
         kinds: tuple[Any, Any] = wp.bool, wp.int32
         in_range, statuses = (wp.empty((n, many), dtype=kind, device=self.device) for kind in kinds)
         first = 0
@@ -189,13 +241,25 @@ class WarpBatch:
                 if not self._answer(first, given, (wrenches, depths, bounds, in_range, statuses)):
                     first = 0  # with more room, in parts of another size
                     continue
+                if states is not None:
+                    self._run(bears.bear, len(self._scratch.skin), first, many, *self._along, self._skins,
+                              self._scratch, wrenches, depths, bounds, in_range, statuses, patches)  # fmt: skip
                 rows = np.flatnonzero((wanted >= first) & (wanted < first + self._part))
                 if len(rows) and self._fields is not None:
                     if self._stacked:
                         self._stick()
                     self._fields.move(wanted[rows] - first, rows, self._skins, self._scratch, motion)
                 first += self._part
-        return WarpTouches(wrenches, depths, bounds, in_range, statuses, motion)
+            if states is None:
+                return WarpTouches(wrenches, depths, bounds, in_range, statuses, motion)
+            known = STATUSES.index
+            rows, after = steps.step(patches.numpy(), states, dt, known("pressed by pose"), known("apart"),
+                                     known("refused"))  # fmt: skip
+            for to, part in ((told, rows[..., :6]), (in_range, rows[..., 7]), (statuses, rows[..., 8])):
+                to.assign(np.ascontiguousarray(part, wp.dtype_to_numpy(to.dtype)))
+            depths, bounds = (wp.array(np.ascontiguousarray(rows[..., at], wp.dtype_to_numpy(real)), dtype=real,
+                                       device=self.device) for at in (9, 6))  # fmt: skip
+        return WarpTouches(told, depths, bounds, in_range, statuses, states=after)
 
     def _output(self, name: str, given: Any, shape: tuple[int, ...], reals: tuple[Any, ...]) -> Any:
         """An array that takes an answer, of one of these precisions: the one given, or a new one of the first."""
