@@ -12,7 +12,7 @@ import warp as wp
 
 from stmpl_core.columns import Columns
 from stmpl_core.errors import InvalidInput
-from stmpl_core.gpu.packs import bytes_of, filled, struct_of
+from stmpl_core.gpu.packs import bytes_of, filled, struct_of, wider
 from stmpl_core.gpu.rays import mat33, real, vec3
 from stmpl_core.methods.moment_net import MomentNet
 from stmpl_core.networks import INPUTS, MOTION, STACK_INPUTS, Weights
@@ -20,7 +20,7 @@ from stmpl_core.response import _RINGS
 from stmpl_core.skin import Skin
 
 vec8 = wp.types.vector(length=8, dtype=wp.float32)
-MOST_HIDDEN = 96  # units of a hidden layer
+HIDDEN = 96  # units of a hidden layer; a smaller network's are filled up, for loops of a known length run twice as fast
 
 # V: vertices of all skins, Z: zones and vertices, N: neighbours, z: zones, R: rows of tables
 SKIN_FIELDS: dict[str, tuple[Any, str]] = {
@@ -104,9 +104,8 @@ def motion_net(skins: Sequence[Skin], device: Any) -> Any:
     """The network that says how tools move these skins."""
     arrays, out = weights_of(skins).arrays, MotionNet()
     assert len(arrays["w1"]) in (INPUTS.size, STACK_INPUTS.size) and arrays["w4"].shape[1] == MOTION.size
-    assert max(len(arrays[name]) for name in ("w2", "w3", "w4")) <= MOST_HIDDEN
     for name in MOTION_NET:
-        setattr(out, name, wp.array(arrays[name], dtype=wp.float32, device=device))
+        setattr(out, name, wp.array(wider(name, arrays[name], HIDDEN), dtype=wp.float32, device=device))
     return out
 
 

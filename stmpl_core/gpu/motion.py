@@ -11,7 +11,8 @@ import warp as wp
 
 from stmpl_core import response, thinning
 from stmpl_core.gpu.columns import _marked
-from stmpl_core.gpu.field_packs import MOST_HIDDEN, FieldScratch, MotionNet, SkinFields
+from stmpl_core.gpu.field_packs import HIDDEN as UNITS
+from stmpl_core.gpu.field_packs import FieldScratch, MotionNet, SkinFields
 from stmpl_core.gpu.packs import Scratch, Skins
 from stmpl_core.gpu.places import BY_POSE
 from stmpl_core.gpu.rays import OPTIONS, real, vec3
@@ -29,7 +30,7 @@ WAYS, MIXED_VECTORS, MIXED_TENSORS = (wp.constant(n) for n in (DIRECTIONS, law.M
 AMPLITUDE, SURROUNDED = wp.constant(wp.float32(law.AMPLITUDE)), wp.constant(wp.float32(law.SURROUNDED))
 FADE, RING = wp.constant(wp.float32(law.FADE)), wp.constant(wp.float32(law.RING))
 LEAST_GAIN, MOST_GAIN = (wp.constant(wp.float64(gain)) for gain in law.GAINS)
-SAID, MORE = wp.constant(MOTION.size), wp.constant(INPUTS.size)
+HIDDEN, SAID, MORE = wp.constant(UNITS), wp.constant(MOTION.size), wp.constant(INPUTS.size)
 IN_SCALARS, IN_NORMAL, IN_HERE = (wp.constant(n) for n in (INPUTS.at.scalars, INPUTS.at.linear_normal, INPUTS.at.here))
 IN_LOG_HERE, IN_LOG_G = wp.constant(INPUTS.at.log_here), wp.constant(INPUTS.at.log_g)
 IN_G, IN_ROOT_G = wp.constant(INPUTS.at.g), wp.constant(INPUTS.at.root_g)
@@ -43,7 +44,7 @@ OUT_NORMAL, OUT_WAYS, OUT_TURNED = (wp.constant(n) for n in (MOTION.at.normal, M
 OUT_CURVED, OUT_SLOPE = wp.constant(MOTION.at.curved), wp.constant(MOTION.at.slope)
 mat28, row, hidden, said = (wp.types.matrix(shape=(2, 8), dtype=wp.float32),
                             *(wp.types.vector(length=n, dtype=wp.float32)
-                              for n in (STACK_INPUTS.size, MOST_HIDDEN, MOTION.size)))
+                              for n in (STACK_INPUTS.size, UNITS, MOTION.size)))
 mat14, mat82 = (wp.types.matrix(shape=(n, 2), dtype=wp.float32) for n in (14, 8))
 mat62, mat42 = (wp.types.matrix(shape=(n, 2), dtype=wp.float32) for n in (6, 4))
 assert (DIRECTIONS, 2 * response.TENSORS, law.MIXED_VECTORS, law.MIXED_TENSORS) == (14, 8, 6, 4)
@@ -219,11 +220,11 @@ def _at(table: wp.array3d(dtype=wp.float32), id: wp.int32, g: wp.int32, k: wp.in
 def _layer(given: hidden, w: wp.array2d(dtype=wp.float32), b: wp.array(dtype=wp.float32)) -> hidden:
     """A hidden layer."""
     out = hidden()
-    for m in range(w.shape[0]):
+    for m in range(HIDDEN):
         x = given[m]
-        for unit in range(w.shape[1]):
+        for unit in range(HIDDEN):
             out[unit] = out[unit] + x * w[m, unit]
-    for unit in range(w.shape[1]):
+    for unit in range(HIDDEN):
         x = out[unit] + b[unit]
         out[unit] = x * (wp.float32(0.5) + wp.float32(0.5) * x / (wp.float32(1.0) + wp.abs(x)))
     return out
@@ -235,15 +236,15 @@ def _think(inputs: row, net: MotionNet) -> said:
     one = hidden()
     for m in range(net.w1.shape[0]):
         x = (wp.clamp(inputs[m], net.low[m], net.high[m]) - net.mean[m]) * net.scale[m]
-        for unit in range(net.w1.shape[1]):
+        for unit in range(HIDDEN):
             one[unit] = one[unit] + x * net.w1[m, unit]
-    for unit in range(net.w1.shape[1]):
+    for unit in range(HIDDEN):
         x = one[unit] + net.b1[unit]
         one[unit] = x * (wp.float32(0.5) + wp.float32(0.5) * x / (wp.float32(1.0) + wp.abs(x)))
     two = _layer(one, net.w2, net.b2)
     three = _layer(two, net.w3, net.b3)
     out = said()
-    for m in range(net.w4.shape[0]):
+    for m in range(HIDDEN):
         for k in range(SAID):
             out[k] = out[k] + three[m] * net.w4[m, k]
     for k in range(SAID):

@@ -189,13 +189,17 @@ def net(network: str, device: Any) -> Any:
     out, arrays = Net(), shipped(network).arrays
     assert arrays["w1"].shape[1] == arrays["w3"].shape[1] <= HIDDEN and arrays["w4"].shape[1] == PRESSURE.size
     for name in NET:
-        values = arrays[name]
-        if name[0] in "wb":
-            rows = (0, HIDDEN - len(values)) if name in ("w2", "w3", "w4") else (0, 0)
-            wide = (0, HIDDEN - values.shape[-1]) if name[1] != "4" else (0, 0)
-            values = np.pad(values, (rows, wide) if name[0] == "w" else wide)
-        setattr(out, name, wp.array(values, dtype=wp.float32, device=device))
+        setattr(out, name, wp.array(wider(name, arrays[name], HIDDEN), dtype=wp.float32, device=device))
     return out
+
+
+def wider(name: str, values: np.ndarray, hidden: int) -> np.ndarray:
+    """An array of a network by its name, as if hidden layers had so many units: those that are added say nothing."""
+    if name[0] not in "wb":
+        return values
+    rows = (0, hidden - len(values)) if name in ("w2", "w3", "w4") else (0, 0)
+    wide = (0, hidden - values.shape[-1]) if name[1] != "4" else (0, 0)
+    return np.pad(values, (rows, wide) if name[0] == "w" else wide)
 
 
 def pack(skins: Sequence[Skin], tools: Sequence[Tool], device: Any) -> tuple[Any, list[list[SignedDistance]]]:
