@@ -384,8 +384,7 @@ def way_along(twist, contact, pose):
     return _dot(go, contact[2]), _dot(go, _cross(contact[1], contact[2]))
 
 
-@numba.njit(cache=True, error_model="numpy")
-def part_of_way(way, normal, depth, radius, power):
+def part_of_way(way: np.ndarray, normal: np.ndarray, depth: float, radius: float, power: float) -> float:
     """Share of a step in which a tool is in the skin that it comes to, or leaves [-].
 
     Its force rises with a power of the depth, and is taken to rise straight: in a shorter time, at the end of which as
@@ -397,9 +396,8 @@ def part_of_way(way, normal, depth, radius, power):
         depth, radius: depth and radius of the contact that it comes to, or leaves [m].
         power: that power [-].
     """
-    across, depth, radius = _dot(way, normal), max(depth, LEAST), max(radius, LEAST)
-    along = way - across * normal
-    aside = np.sqrt(_dot(along, along))
+    across, depth, radius = float(way @ normal), max(depth, LEAST), max(radius, LEAST)
+    aside = float(np.linalg.norm(way - across * normal))
     return min(1.0, depth / max(across, depth), radius / max(aside, radius)) * 2 / (max(power, 1.0) + 1)
 
 

@@ -156,6 +156,8 @@ def read_model(path: str | Path) -> Model:
     """
     try:
         given = json.loads(text_of(path))
+        if not isinstance(given, dict) or not {"tissue", "thickness"} <= given.keys():
+            raise ValueError("an object with 'tissue' and 'thickness' is needed")
         friction = given.get("friction")
         return Model(stack_from_text(json.dumps(given["tissue"]))[0], float(given["thickness"]),
                      None if friction is None else str(friction), bool(given.get("relaxing", False)))  # fmt: skip

@@ -17,6 +17,7 @@ from stmpl_ros.waiting import Aside, by_executor
 
 FEEDBACK_S = 0.5  # time between two words of progress [s]
 CANCELLED = "cancelled: the skin from before goes on"
+NOT_YET = "counts when the node is configured"  # said of a change to a node that has no skin yet
 
 Done = Callable[[str], None]  # called once, with the reason why another skin does not answer; empty: it does
 
@@ -63,7 +64,8 @@ class BodyAction:
                 by_executor(self._node, self._abandon, CANCELLED)
         if not why[0]:
             goal.succeed()
-            return SetBody.Result(success=True, message="the node answers on it", layer_id=self._layer_id())
+            said = stage if stage == NOT_YET else "the node answers on it"
+            return SetBody.Result(success=True, message=said, layer_id=self._layer_id())
         if goal.is_cancel_requested:
             goal.canceled()
         else:

@@ -50,10 +50,13 @@ def main(arguments: list[str] | None = None) -> None:
             sys.stdout.flush()
     except KeyboardInterrupt as interrupt:
         code = 128 + next(iter(interrupt.args), signal.SIGINT)
-    except SystemError as error:  # how a compiled call tells of an interrupt that came in it
-        if not isinstance(error.__cause__ or error.__context__, KeyboardInterrupt):
+    except (SystemError, RuntimeError) as error:  # how a call or a compiler tells of an interrupt that came in it
+        cause: BaseException | None = error
+        while cause is not None and not isinstance(cause, KeyboardInterrupt):
+            cause = cause.__cause__ or cause.__context__
+        if cause is None:
             raise
-        code = 128 + signal.SIGINT
+        code = 128 + next(iter(cause.args), signal.SIGINT)
     except BrokenPipeError:  # `stmpl ... | head`
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         code = 0

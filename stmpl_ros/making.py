@@ -170,7 +170,7 @@ def warm_up(simulator: Simulator) -> None:
     """Solves one contact of each kind, so that nothing is left to compile when the first real one comes.
 
     Where time and friction count, they are one press that slides; where joints bend the skin, all is done bent and at
-    rest. The deepest reaches into the core. Of each comes a local model.
+    rest. The deepest reaches into the core. Of each comes a local model. Last two tools press at one place.
     """
     corners = 0.01 * np.array([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1]])
     faces = np.array([[0, 2, 4], [2, 1, 4], [1, 3, 4], [3, 0, 4], [2, 0, 5], [1, 2, 5], [3, 1, 5], [0, 3, 5]])
@@ -197,4 +197,13 @@ def _press(simulator: Simulator, tool: Tool, state: State) -> State:
             touches, state = simulator.touch([Contact(tool, pose.copy(), wrench)], state, 0.01)
             simulator.answer(touches)
             local_contacts(simulator.history, touches, state)
-    return state
+    pose[:3, 3] = layer.vertices[vertex] + 0.009 * layer.normals[vertex]
+    again = tool.named(f"{tool.name} again")
+    for wrench in (None, push):
+        both = [Contact(tool, pose, wrench), Contact(again, pose, wrench)]
+        simulator.answer(simulator.touch(both))
+        if simulator.remembers:
+            touches, state = simulator.touch(both, state, 0.01)
+            simulator.answer(touches)
+    simulator.tools.remove(again.name)
+    return state.without(again.name)

@@ -31,7 +31,7 @@ from stmpl_core.toucher import margin_on
 from stmpl_ros.answering import Answering
 from stmpl_ros.bending import Bending
 from stmpl_ros.beside import Beside
-from stmpl_ros.body_action import BodyAction, Done, changes_of
+from stmpl_ros.body_action import NOT_YET, BodyAction, Done, changes_of
 from stmpl_ros.bond import Bond
 from stmpl_ros.calibration import Calibration
 from stmpl_ros.diagnosis import Counts, Health, Tally, diagnostics, limits_status, skin_status
@@ -315,7 +315,7 @@ class SkinNode(ServingNode):
         if not self.settings.locked:
             self.settings.take(config)
             done("")
-            return "counts when the node is configured"
+            return NOT_YET
         if self._making:
             raise InvalidInput("another skin is being made; wait for skin/topology.")
         if config == self.config:

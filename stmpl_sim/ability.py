@@ -11,6 +11,8 @@ from stmpl_sim.engine import mujoco
 
 AXES = 5  # of a place and a direction to point in; to spin about it is of no use to a ball
 LEANS = 1.0  # angle off straight down from which it is said [degrees]
+AT_LIMIT = 0.01  # of a joint's range, within which it is at a limit
+MOST_AT_LIMIT = 0.5  # part of a run at one, from which it is said
 MOST_NAMED = 4  # pairs of links that are named
 log = logging.getLogger(__name__)
 
@@ -40,6 +42,28 @@ def start_notes(model: Any, joints: tuple[int, ...], qpos: np.ndarray, tool: str
                      "contype and conaffinity of these geoms to 0")  # fmt: skip
     for note in found:
         log.warning("%s.", note)
+    return tuple(found)
+
+
+def stuck_joints(model: Any, joints: tuple[int, ...], qpos: np.ndarray) -> tuple[str, ...]:
+    """Which joints of an arm stood at a limit for most of a run, one sentence each.
+
+    Args:
+        model: MuJoCo model.
+        joints: numbers of the arm's joints.
+        qpos: poses of all, (N, nq).
+    """
+    found = []
+    for joint in joints:
+        low, high = model.jnt_range[joint]
+        if model.jnt_limited[joint] and high > low:
+            at, near = qpos[:, model.jnt_qposadr[joint]], AT_LIMIT * (high - low)
+            for limit, share in ((low, np.mean(at < low + near)), (high, np.mean(at > high - near))):
+                if share > MOST_AT_LIMIT:
+                    by = f"{limit:.3g} m" if model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_SLIDE else \
+                        f"{np.rad2deg(limit):.3g} degrees"  # fmt: skip
+                    found.append(f"joint {model.joint(joint).name} stood at its limit of {by} for {share:.0%} of the "
+                                 "run (MJCF takes degrees unless its compiler says angle=\"radian\")")  # fmt: skip
     return tuple(found)
 
 

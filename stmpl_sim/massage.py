@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +14,7 @@ from stmpl_core.arrays import Wrench, cross
 from stmpl_core.errors import InvalidInput
 from stmpl_core.friction import Friction
 from stmpl_core.local_contact import local_contacts
-from stmpl_sim.ability import strength
+from stmpl_sim.ability import strength, stuck_joints
 from stmpl_sim.controller import ForceImpedance, Gains, Goal
 from stmpl_sim.energy import EnergyBook
 from stmpl_sim.engine import mujoco
@@ -383,8 +383,9 @@ class Massage:
                          took, spent, busy))  # fmt: skip
             for see in seen:
                 see(self, at)
-        return Log(*(np.array(column) for column in zip(*rows, strict=True)), phases=self.course.phases,
-                   notes=self.scene.notes)  # fmt: skip
+        log = Log(*(np.array(column) for column in zip(*rows, strict=True)), phases=self.course.phases)
+        stuck = stuck_joints(self.scene.model, self.scene.joints, log.qpos)
+        return replace(log, notes=(*self.scene.notes, *stuck))
 
 
 def _in_layer(wrench: np.ndarray, limb: np.ndarray) -> np.ndarray:

@@ -352,6 +352,20 @@ def test_what_takes_an_arm_off_its_course_is_said_before_and_after(forearm: Soft
     assert f"to note: {scene.notes[0]}" in console.export_text()
 
 
+def test_a_joint_that_stands_at_its_limit_is_named() -> None:
+    import mujoco
+
+    from stmpl_sim.ability import stuck_joints
+
+    model = mujoco.MjModel.from_xml_string("""<mujoco><worldbody><body><geom size=".1"/>
+      <joint name="turn" range="-2 2"/><joint name="slide" type="slide" range="-.1 .1"/></body></worldbody></mujoco>""")
+    limit, free = np.full(10, np.deg2rad(2.0)), np.linspace(-0.05, 0.1, 10)
+    (said,) = stuck_joints(model, (0, 1), np.column_stack([limit, free]))
+    assert said.startswith("joint turn stood at its limit of 2 degrees for 100% of the run")
+    assert not stuck_joints(model, (0, 1), np.column_stack([0.5 * limit, free]))
+    assert "slide" in stuck_joints(model, (1,), np.full((4, 2), -0.1))[0]
+
+
 def test_an_arm_presses_with_its_weight_and_what_its_weakest_motor_gives(forearm: SoftLayer, tmp_path: Path) -> None:
     from stmpl_sim.ability import strength
     from stmpl_sim.massage import Course, Massage

@@ -41,10 +41,14 @@ for angle in (0.0, 0.4):
             contacts = [Contact(ball(), at(0, RADIUS + 0.012 - depth, 0.05 + depth), wrench)]
             simulator.step(contacts)
             local_contacts(simulator.history, simulator.touch(contacts))
+            twice = [*contacts, Contact(ball().named("again"), contacts[0].pose_body_from_tool, wrench)]
+            simulator.step(twice)
             if simulator.remembers:
                 touches, state = simulator.touch(contacts, state, 0.01)
                 simulator.answer(touches)
                 local_contacts(simulator.history, touches, state)
+                touches, state = simulator.touch(twice, state, 0.01)
+                simulator.answer(touches)
 print(sorted(kernels() - before))
 """
 

@@ -37,6 +37,7 @@ from stmpl_core.wake import untouched
 PATCH = 51
 FEW = 64  # scenes that are not shared among threads
 NONE, NO_PLACE = np.zeros(6), np.zeros(3)
+_part_of_way = numba.njit(cache=True, error_model="numpy")(part_of_way)
 (PRESSING, ELASTIC, LARGEST, NET, RADIUS, DEPTH, IMPRINT_FORCE, POWER, SHARE, WORK, PASSIVE, LIMIT, STRETCH, SURFACE,
  SLID, STRAYS, HELD, ROLLED, _, _, PASSED, _, _, DOUBTED) = range(len(Scalars._fields))  # fmt: skip
 
@@ -377,7 +378,7 @@ def _one(patch, before, after, s, k, shares, times, fades, mu, number, has_skin,
     presses, depth, power = patch[8] == by_pose and patch[10] > 0 and size > 0, patch[9], patch[18]
     if presses and known and not held and p:
         way = -_gone(pose, was, patch[11:14])
-        part = part_of_way(way, push / size, depth, patch[20], power)
+        part = _part_of_way(way, push / size, depth, patch[20], power)
         _, gone, kept, gain, owed, _, passed = aged(
             was, pose, imprint, contact, known, held, old[SHARE], goes, radius, at, part, shares, times, fades, dt,
             old[ELASTIC], relaxed)  # fmt: skip
@@ -463,7 +464,7 @@ def _free(pose, was, before, after, s, k, old, shares, times, dt, gone, asked, t
     p, held, part, new = len(times), old[PRESSING] > 0, 1.0, after.scalars[s, k]
     contact, relaxed = before.contact[s, k], before.relaxed[s, k, :p]
     if asked == 0 and held and old[RADIUS] > 0:
-        part = part_of_way(_gone(was, pose, contact[0]), -contact[1], old[DEPTH], old[RADIUS], old[POWER])
+        part = _part_of_way(_gone(was, pose, contact[0]), -contact[1], old[DEPTH], old[RADIUS], old[POWER])
     left, least = let_go(shares, times, dt, gone, part, old[ELASTIC] if held else 0.0, asked, relaxed)
     if held and old[IMPRINT_FORCE] > 0:
         depth = old[DEPTH] * depth_left(min(least / old[IMPRINT_FORCE], 1.0), old[POWER], 1 - old[STRETCH])
