@@ -150,6 +150,9 @@ def test_outputs_and_precision_are_those_of_the_poses(plain: Skin) -> None:
     batch = WarpBatch(plain, [LEFT, RIGHT], N, friction=0.4, device="cpu")
     out = torch.empty((N, 2, 6), dtype=torch.float32)
     where = torch.from_numpy(poses(plain, 0.1).astype(np.float32))
+    begun = batch.touch(where, batch.at_rest(), 0.01).states
+    for done in (torch.tensor([False, True, False]), wp.array([False, True, False], dtype=wp.bool, device="cpu")):
+        assert begun.reset(done).to_states()[1].pack() == begun.reset([1]).to_states()[1].pack()
     found = batch.touch(where, batch.at_rest(), 0.01, out=out)
     exact = batch.touch(poses(plain, 0.1), batch.at_rest(), 0.01)
     assert found.wrenches.ptr == out.data_ptr() and found.depths.dtype is found.force_bounds.dtype is wp.float32

@@ -8,9 +8,9 @@ trail of grooves (stmpl_core.wake), which moves skin and changes no force.
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numba
 import numpy as np
@@ -84,16 +84,17 @@ class WarpStates:
     def __len__(self) -> int:
         return len(self.memories.told)
 
-    def reset(self, scenes: Iterable[int] | np.ndarray) -> WarpStates:
+    def reset(self, scenes: Any) -> WarpStates:
         """The same, of which some scenes begin anew.
 
         Args:
-            scenes: their numbers, or a mask (n,).
+            scenes: their numbers, or a mask (n,); arrays of numpy, torch and Warp on any device, too.
 
         Raises:
             InvalidInput: numbers that there are not.
         """
-        which, n = np.asarray(list(scenes)), len(self)
+        here = scenes.cpu() if type(scenes).__module__.startswith("torch") else scenes
+        which, n = np.asarray(here.numpy() if hasattr(here, "numpy") else list(here)), len(self)
         if which.dtype == np.bool_ and which.shape == (n,):
             which = np.flatnonzero(which)
         if len(which) and (which.dtype.kind not in "iu" or which.min() < 0 or which.max() >= n):
