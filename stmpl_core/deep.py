@@ -17,6 +17,8 @@ from stmpl_core.sdf import SignedDistance
 DEEPEST = 0.9  # depth over thickness beyond which a tool is answered for where it is drawn back to that
 LOOKED_AT, FIRST = 64, 8  # points of a tool that are looked at; so many first, to see whether any is inside
 FACING = 0.3  # cosine to the mean of the skin's normals from which a column says which way is out
+FAR = 2.0  # way that a tool is drawn back, over the thickness, from which it is looked for again
+EVEN, MOST_EVEN = 0.2, 41  # steps of that, over the thickness, and one more than there are
 ACCURACY = 1e-4  # of the way that a tool is drawn back, over the thickness
 
 
@@ -77,7 +79,8 @@ class Deep:
     ) -> tuple[Transform, Squeeze, float]:
         """Pose and squeeze where a tool with these points is drawn back to along the skin's normal, and the way [m].
 
-        A tool that closes around the limb cannot be drawn back: it stays.
+        A tool that closes around the limb cannot be drawn back: it stays. Ways are tried twice as far each; in a crease
+        the room between two folds may lie between two of these, so a way that is far is looked for again in even steps.
         """
         out = self._out(field, pose, squeeze)
         if out is None:
@@ -86,6 +89,11 @@ class Deep:
         low, high = 0.0, 0.1 * thickness
         while self.beyond(field, shifted(pose, high * out), points) and high < 1e3 * thickness:
             low, high = high, 2 * high
+        if high > FAR * thickness:
+            for way in EVEN * thickness * np.arange(1, MOST_EVEN):
+                if way < low and not self.beyond(field, shifted(pose, way * out), points):
+                    low, high = way - EVEN * thickness, way
+                    break
         some = self._which_may_be(field, shifted(pose, 0.5 * (low + high) * out), 0.5 * (high - low))
         while high - low > ACCURACY * thickness:
             way = 0.5 * (low + high)

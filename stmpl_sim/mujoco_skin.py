@@ -25,7 +25,7 @@ from stmpl_core.tool import Tool
 from stmpl_core.touch import Answer, Touch
 from stmpl_sim.engine import mujoco
 from stmpl_sim.jointed import Jointed
-from stmpl_sim.protocol import Exerted, Memory, Poses, Reaction, Row, SoftContact
+from stmpl_sim.protocol import Exerted, Memory, Poses, Reaction, Row, SoftContact, sound_pose
 
 MOST_NAMES = 30  # names of a model that an error lists
 KNOWN = 10_000  # rows of xfrc_applied that are known again
@@ -204,10 +204,10 @@ class SoftBody:
         if (angles := jointed.following(skin.angles, now)) is not None:
             self._memory = self.contact.pose(dict(zip(jointed.rig.names, angles, strict=True)), self._memory)
             skin = self.simulator.skin
-        world = poses.body @ self.contact.pose_body_from_layer
+        world = sound_pose("the body", poses.body) @ self.contact.pose_body_from_layer
         to_layer, backs = inverted(world), {}
         for name, pose in poses.tools.items():
-            place = self.contact.place(name, to_layer @ pose, self._memory)
+            place = self.contact.place(name, to_layer @ sound_pose(name, pose), self._memory)
             backs[name] = world @ jointed.back(skin, place, now) @ to_layer
         there = Poses(poses.body, {name: backs[name] @ pose for name, pose in poses.tools.items()})
         made = self.contact.step(there, self._memory, dt, mobility)

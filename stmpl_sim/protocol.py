@@ -26,6 +26,7 @@ from stmpl_core.skin import Skin
 from stmpl_core.state import State
 from stmpl_core.tool import Tool
 from stmpl_core.touch import APART, IN_CORE, Answer, Touch
+from stmpl_core.toucher import FAR
 
 WAY_THROUGH = 0.5  # way of a tool, over the thickness, from which it may have gone through the limb
 FAR_HOLES = 3.0  # distance of a tool from the skin, over a hole of the mesh, from which the contact law is not asked
@@ -245,13 +246,13 @@ class SoftContact:
         if self.implicit and mobility is None:
             raise InvalidInput("an implicit contact needs the mobility of its tools. Try implicit=False.")
         memory = memory or Memory()
-        body = _rigid("the body", poses.body)
+        body = sound_pose("the body", poses.body)
         world_from_layer = body @ self.pose_body_from_layer
         layer_from_world = inverted(world_from_layer)
         missing = [name for name in self.tools if name not in poses.tools]
         if missing:
             raise InvalidInput(f"there is no pose of {', '.join(missing)}; given: {', '.join(poses.tools) or 'none'}.")
-        at = {name: layer_from_world @ _rigid(name, poses.tools[name]) for name in self.tools}
+        at = {name: layer_from_world @ sound_pose(name, poses.tools[name]) for name in self.tools}
 
         # Touch: to first order from the last step that asked, or asked.
         touches, now = self._between(at, memory, dt) or self._ask(at, memory, dt)
@@ -283,7 +284,7 @@ class SoftContact:
         """
         free = {name: self._free(name, pose, memory) for name, pose in at.items()
                 if not _has_imprint(memory.tissue, name)}  # fmt: skip
-        near = [Contact(self.tools[name], pose) for name, pose in at.items() if not free.get(name, 0.0) > 0]
+        near = [Contact(self.tools[name], pose) for name, pose in at.items() if not 0 < free.get(name, 0.0) <= FAR]
         found, tissue = self.simulator.touch(near, memory.tissue, memory.waited + dt)
         through = frozenset(touch.name for touch in found if self._went_through(touch, at[touch.name], memory))
         found = [touch.with_(trust=touch.trust.also(WENT_THROUGH.format(name=touch.name), in_range=False))
@@ -460,8 +461,8 @@ def _way(before: Transform, now: Transform, point: np.ndarray) -> np.ndarray:
     return point - before[:3, :3] @ at - before[:3, 3]
 
 
-def _rigid(name: str, pose: ArrayLike) -> Transform:
-    """The pose, if it is one."""
+def sound_pose(name: str, pose: ArrayLike) -> Transform:
+    """The pose, if it is one. Raises InvalidInput: it is not finite or not rigid."""
     try:
         return rigid(f"the pose of {name}", pose)
     except InvalidInput as error:

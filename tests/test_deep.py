@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from stmpl_core import Membrane, Ply, Simulator, Tissue, Tool
+from stmpl_core import Membrane, Ply, Rig, Simulator, Skin, Tissue, Tool
+from stmpl_core.body import Body
 from stmpl_core.deep import DEEPEST
 from stmpl_core.methods import MomentNet, Winkler
 from stmpl_core.touch import APART, IN_CORE, NO_FORCE
@@ -146,3 +147,22 @@ def test_a_force_controller_settles_on_the_barrier(touched: dict[str, Simulator]
         way += dt * speed
     off = np.abs(np.array(found) / wanted - 1)
     assert off[-100:].max() < 0.01 and np.ptp(off[-50:]) < 1e-3
+
+
+def test_in_a_crease_a_tool_is_drawn_back_between_the_folds_not_through_the_limb() -> None:
+    """A hair's breadth aside it was drawn back 26 cm along the arm, and pressed with 300 N in place of 15."""
+    body = Body.anny()
+    arm = body.part("left_arm", edge_length=7e-3)
+    arm = arm.with_(rig=Rig.of(body, "left_arm", arm))
+    skin = Skin.of(arm, Winkler())
+    elbow, head = arm.rig.joints[0].name, arm.rig.heads[1]
+    half, near = skin.posed({elbow: 0.5}).layer, np.flatnonzero(np.linalg.norm(arm.vertices - head, axis=1) < 0.06)
+    inside = near[np.argmin(half.vertex_areas[near] / arm.vertex_areas[near])]
+    there = skin.posed({elbow: 0.6}).layer
+    place = there.vertices[inside] + 0.01275 * there.normals[inside]
+    bent, rng, forces = Simulator(skin.posed({elbow: 1.02})), np.random.default_rng(0), []
+    for _ in range(14):
+        touch = bent.touch([press(ball(0.015), at(*(place + rng.normal(0, 3e-4, 3))), None)])[0]
+        assert touch.status == IN_CORE and not touch.trust.in_range and touch.depth < 0.03
+        forces.append(touch.force)
+    assert max(forces) < 1.2 * min(forces)

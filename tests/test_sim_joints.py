@@ -228,3 +228,15 @@ def test_no_time_is_lost_where_joints_move_between_two_steps_that_ask(skin: Skin
     assert memory.asked is None and memory.waited == pytest.approx(3e-3)
     memory = contact.step(poses, memory, 1e-3).memory
     assert memory.asked is not None and memory.asked.steps == 0 and memory.waited == 0
+
+
+def test_a_tool_that_is_nowhere_is_said_and_one_that_is_far_is_flagged(skin: Skin) -> None:
+    _, data, soft = made(skin, on_the_lower_part(skin, 0.0))
+    for place, why in ((np.nan, "the pose of ball .* Has the simulation diverged"), (np.inf, "Has the simulation")):
+        data.mocap_pos[0] = place
+        with pytest.raises(InvalidInput, match=why):
+            soft.apply(data)
+    data.mocap_pos[0] = (1e3, 0, 0)
+    for _ in range(2):
+        touch = soft.apply(data)["ball"]
+        assert not touch.trust.in_range and "is its pose in millimetres" in touch.trust.why

@@ -371,6 +371,12 @@ def test_neither_run_nor_part_nor_lane_changes_a_bit(cylinder: Skin) -> None:
     assert np.abs(many.touch(poses).wrenches.numpy() - whole).max() < 1e-12 * np.abs(whole).max()
 
 
+def test_a_tool_that_is_far_is_flagged_here_too(cylinder: Skin) -> None:
+    poses = np.stack([at(x, 0.0, 0.0)[None] for x in (1.0, 50.0, 1e12)])
+    found, expected = made(cylinder, [LEFT], 3).touch(poses), Batch(cylinder, [LEFT], 3).touch(poses)
+    assert found.in_range.numpy()[:, 0].tolist() == expected.in_range[:, 0].tolist() == [True, False, False]
+
+
 def test_a_tool_without_room_is_told(cylinder: Skin) -> None:
     found = made(cylinder, [LEFT], 1, nodes=32).touch(at(RADIUS + 0.01, 0.0, LENGTH / 2)[None, None])
     assert STATUSES[found.statuses.numpy()[0, 0]] == "no room" and np.isnan(found.wrenches.numpy()).all()

@@ -24,6 +24,7 @@ SIDES = wp.constant(wp.vec2d(*toucher.SIDES))
 SOFT_SHARE = wp.constant(wp.float64(toucher.SOFT_SHARE))
 SHELL, SHELL_FROM = wp.constant(wp.float64(toucher.SHELL)), wp.constant(wp.float64(toucher.SHELL_FROM))
 SHALLOW, SHALLOW_TO = wp.constant(wp.float64(toucher.SHALLOW)), wp.constant(wp.float64(toucher.SHALLOW_TO))
+FAR_OFF = wp.constant(wp.float64(toucher.FAR))
 STUCK, WIDER = wp.constant(wp.float64(toucher.STUCK)), wp.constant(wp.float64(pieces.WIDER))
 GROUP, PINS_DEEP = wp.constant(wp.float64(pieces.GROUP)), wp.constant(wp.float64(pieces.DEEP))
 PIECE = wp.constant(wp.float64(2.0 / 3.0**0.5 * pieces.SPACINGS**2))
@@ -239,12 +240,14 @@ def answer(first: wp.int32, many: wp.int32, known: Known, skins: Skins, scratch:
         if depth < real(-0.5) * FAR:
             depth = NAN
         around = scratch.around[c] > AROUND * one.thickest
+        off = scratch.place[c] - skins.points[one.first]
+        far = wp.max(wp.max(wp.abs(off[0]), wp.abs(off[1])), wp.abs(off[2])) > FAR_OFF
         statuses[n, k] = APART
         if around:
             statuses[n, k] = WRAPPED
         depths[n, k] = depths.dtype(depth)
         bounds[n, k] = bounds.dtype(real(0.0))
-        in_range[n, k] = not around
+        in_range[n, k] = not around and not far
         return
     force, torque, forces, strange, doubt = vec3(), vec3(), real(0.0), real(0.0), real(0.0)
     total, below = real(0.0), real(0.0)
