@@ -31,10 +31,15 @@ class Gate:
 
     def fresh(self, stamp: int, max_age: float) -> bool:
         """Whether what is stamped [ns] is at most `max_age` [s] old; 0 takes any."""
-        age = (self._node.get_clock().now().nanoseconds - stamp) / NANO
+        now = self._node.get_clock().now().nanoseconds
+        age = (now - stamp) / NANO
         if not max_age or abs(age) <= max_age:
             return True
         self._tally.stale += 1
+        if not now:
+            self.drop("age", "a message was dropped, for there is no time yet: use_sim_time is set, and nothing was "
+                      "heard on /clock")  # fmt: skip
+            return False
         self.drop("age", f"a message stamped {abs(age):.2f} s {'before' if age > 0 else 'after'} now was dropped; "
                   f"allowed is {max_age} s. "
                   "Are the clocks in step, or is this a replay? max_age:=0 accepts any age.")  # fmt: skip

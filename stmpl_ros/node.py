@@ -346,7 +346,7 @@ class SkinNode(ServingNode):
         except Exception as error:  # whatever happened in the other process; the node goes on
             self._finish(str(error) or type(error).__name__)
             self.tally.last_refusal = f"set_body: {error}"
-            self.get_logger().error(f"no other skin: {error or type(error).__name__}. The one from before goes on.")
+            self.get_logger().error(f"no other skin, the one from before goes on: {error or type(error).__name__}")
 
     def _abandon(self, why: str) -> None:
         """Gives the skin up that is being made."""

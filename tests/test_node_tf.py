@@ -33,8 +33,10 @@ from bags.wire import (
     wrench_message,
 )
 from stmpl_core.errors import FrameError, InvalidInput
+from stmpl_ros.diagnosis import Tally
 from stmpl_ros.followed import Followed
 from stmpl_ros.frames import Frames
+from stmpl_ros.gate import Gate
 from stmpl_ros.node import SkinNode
 from stmpl_ros.parameters import NodeConfig
 from stmpl_ros.ticks import Ticks
@@ -339,7 +341,10 @@ def test_a_simulation_slower_than_its_clock_is_not_silent_and_one_that_is_gone_i
     try:
         executor.add_node(node)
         executor.add_node(other)
+        gate = Gate(node, Tally())
+        assert not gate.fresh(3 * 10**9, 1.0) and "nothing was heard on /clock" in gate.dropped
         say(10.0)
+        assert not gate.fresh(3 * 10**9, 1.0) and "7.00 s before now" in gate.dropped
         ticks.look()
         before = ticks()
         time.sleep(0.05)

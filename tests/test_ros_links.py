@@ -228,6 +228,9 @@ def test_what_cannot_be_is_one_sentence(tmp_path: Path) -> None:
     (tmp_path / "tip.md").write_text("# no mesh")
     with pytest.raises(InvalidInput, match=r"tip.md' is no mesh: .* Try STL, OBJ"):
         tools_of([f"tip={tmp_path / 'tip.md'}"])
+    (tmp_path / "none.stl").write_text("solid none\nendsolid none\n")
+    with pytest.raises(InvalidInput, match=r"none.stl' is no mesh: "):
+        tools_of([f"tip={tmp_path / 'none.stl'}"])
     with pytest.raises(InvalidInput, match=r"'tip=1,2' is no link=x,y,z"):
         points_of(["tip=1,2"], ["tip"])
     with pytest.raises(InvalidInput, match=r"no link 'toe'; known are arm, tip"):

@@ -56,6 +56,8 @@ def tool_from_bytes(name: str, content: bytes) -> Tool:
         vertices, faces = np.asarray(mesh.vertices), np.asarray(mesh.faces)
     except Exception as error:  # each format's reader raises what it likes
         raise InvalidInput(f"'{name}' is no mesh: {error}. Try STL, OBJ, PLY or GLB, in metres.") from error
+    if not len(faces):
+        raise InvalidInput(f"'{name}' is no mesh: there are no triangles in it. Try STL, OBJ, PLY or GLB, in metres.")
     return Tool(Path(name).stem, vertices, faces)
 
 
