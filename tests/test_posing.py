@@ -224,7 +224,8 @@ def test_skin_that_comes_near_through_the_air_feels_nothing():
     body = Body.anny()
     layer = body.part("left_arm", edge_length=6e-3)
     rig = Rig.of(body, "left_arm", layer)
-    moved = Simulator(Skin.of(layer.with_(rig=rig), MomentNet()).posed({"left_elbow": 1.6}))
+    skin = Skin.of(layer.with_(rig=rig), MomentNet())
+    moved = Simulator(skin.posed({"left_elbow": 1.3}))  # from 1.5 rad on the ball lies on both parts
     upper, lower = (np.flatnonzero(rig.weights[:, k] > 0.9) for k in (0, 1))
     gaps = np.linalg.norm(moved.layer.vertices[upper][:, None] - moved.layer.vertices[lower], axis=2)
     a, b = np.unravel_index(gaps.argmin(), gaps.shape)
