@@ -173,6 +173,19 @@ def _together(scratch: Scratch, s: wp.int32, many: wp.int32, i: wp.int32, j: wp.
 
 
 @wp.func
+def _share(facing: real) -> real:
+    """Share of the flat response that two places with this cosine between their normals feel: green._share."""
+    x = wp.clamp(facing / AROUND, real(0.0), real(1.0))
+    return x * x * (real(3.0) - real(2.0) * x)
+
+
+@wp.func
+def _row_of(log_spread: real) -> real:
+    """Place of a spread over the thickness in the tables, from its logarithm: green._row_of."""
+    return wp.clamp((log_spread - FIRST_LOG) / STEP_LOG, real(0.0), LAST_ROW)
+
+
+@wp.func
 def _log_spread(least: real, steps: real, n: real) -> real:
     return wp.log(SPREAD * wp.sqrt(least + n / steps))
 
@@ -208,16 +221,16 @@ def respond(lanes: wp.int32, many: wp.int32, skins: Skins, scratch: Scratch):
                 low, share = wp.floor(a), a - wp.floor(a)
                 log_spread = (real(1.0) - share) * _log_spread(least, steps, low)
                 log_spread += share * _log_spread(least, steps, low + real(1.0))
-                h = wp.clamp((log_spread - wp.log(one.flat) - FIRST_LOG) / STEP_LOG, real(0.0), LAST_ROW)
+                h = _row_of(log_spread - wp.log(one.flat))
                 k, g = wp.int32(f), wp.int32(h)
-                x, y, near = f - real(k), h - real(g), wp.clamp(facing / AROUND, real(0.0), real(1.0))
+                x, y = f - real(k), h - real(g)
                 soft = real(0.5) * (scratch.soft[s, i] + scratch.soft[s, j])
                 b = wp.int32(soft)
                 z = soft - real(b)
                 value = _at(skins, id, b, g, k, x, y)
                 if z > real(0.0):
                     value += z * (_at(skins, id, b + 1, g, k, x, y) - value)
-                value *= near * near * (real(3.0) - real(2.0) * near)
+                value *= _share(facing)
                 value = value / wp.sqrt(square + mean * ROUND_SQUARE)
         scratch.wide_part[s, i, j] = both
         scratch.matrix[s, i, j] = value + both

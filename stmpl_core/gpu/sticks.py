@@ -15,7 +15,7 @@ from stmpl_core.gpu.motion import MOST_FOLDS, _stretch
 from stmpl_core.gpu.packs import Scratch, Skins
 from stmpl_core.gpu.places import REFUSED
 from stmpl_core.gpu.rays import OPTIONS, depth_in_column, mat33, real, vec3
-from stmpl_core.gpu.stacks import AROUND, FARTHEST, FIRST_LOG, LAST_ROW, ROUND_SQUARE, ROWS, SPREAD, STEP_LOG
+from stmpl_core.gpu.stacks import FARTHEST, ROUND_SQUARE, ROWS, SPREAD, _row_of, _share
 
 LEAST_COSINE, FURTHEST = wp.constant(wp.float64(green.ONE_WAY)), wp.constant(wp.float64(stick.FURTHEST))
 RIDGE, REACH = wp.constant(wp.float64(green.RIDGE)), wp.constant(wp.float64(green.REACH))
@@ -93,17 +93,6 @@ def go(pick: wp.array(dtype=wp.int32), lanes: wp.int32, many: wp.int32, skins: S
             sum = sum + scratch.weights[s, i, k] * vec3(real(skins.motion[row]), real(skins.motion[row + one.coarse]),
                                                         real(skins.motion[row + 2 * one.coarse]))  # fmt: skip
         field.with_limb[f, a, d] = sum
-
-
-@wp.func
-def _share(facing: real) -> real:
-    x = wp.clamp(facing / AROUND, real(0.0), real(1.0))
-    return x * x * (real(3.0) - real(2.0) * x)
-
-
-@wp.func
-def _row_of(log_spread: real) -> real:
-    return wp.clamp((log_spread - FIRST_LOG) / STEP_LOG, real(0.0), LAST_ROW)
 
 
 @wp.func
@@ -201,13 +190,20 @@ def find_most(lanes: wp.int32, field: FieldScratch):
     field.told[f, lane] = wp.vec2d(most, real(0.0))
 
 
+@wp.func
+def _largest(field: FieldScratch, f: wp.int32, lanes: wp.int32) -> real:
+    """The largest number that the lanes of a scene have told."""
+    most = real(0.0)
+    for lane in range(lanes):
+        most = wp.max(most, field.told[f, lane][0])
+    return most
+
+
 @wp.kernel
 def add_ridge(lanes: wp.int32, field: FieldScratch):
     """Two nodes in one place are no error."""
     f = wp.tid()
-    most = real(0.0)
-    for lane in range(lanes):
-        most = wp.max(most, field.told[f, lane][0])
+    most = _largest(field, f, lanes)
     for a in range(field.holds[f]):
         field.block[f, a, a] = field.block[f, a, a] + RIDGE * most * wp.identity(n=3, dtype=real)
 
@@ -460,10 +456,7 @@ def find_peak(pick: wp.array(dtype=wp.int32), lanes: wp.int32, many: wp.int32, s
 def gather_peak(lanes: wp.int32, field: FieldScratch):
     """The same of all."""
     f = wp.tid()
-    most = real(0.0)
-    for lane in range(lanes):
-        most = wp.max(most, field.told[f, lane][0])
-    field.peak[f] = wp.sqrt(most)
+    field.peak[f] = wp.sqrt(_largest(field, f, lanes))
 
 
 @wp.kernel
