@@ -51,7 +51,7 @@ class Bending:
         self._heard: dict[str, _Heard] = {}  # by joint of the limb
         self._held = 0.0  # time in which the node could not listen [s]
         self._stands = 0.0  # when the angles came that the newest skin stands at [s]; 0: none yet
-        self._others = ""  # joints that messages told of instead
+        self._others = "", 0.0  # joints that a message told of instead, and when it came [s]
         self._refused = "", 0.0  # why the last message that could not be used could not, and when it came [s]
         self._lock = threading.Lock()  # held while the newest skin is changed
         self._subscription: Any = None
@@ -84,7 +84,7 @@ class Bending:
         if self._thread is not None:
             self._thread.close()
         self._subscription = self._thread = self._rest = self.newest = None
-        self._heard, self._stands, self._others, self._refused = {}, 0.0, "", ("", 0.0)
+        self._heard, self._stands, self._others, self._refused = {}, 0.0, ("", 0.0), ("", 0.0)
 
     def held_up(self, seconds: float) -> None:
         """Takes time in which the node could not listen [s] out of the silence of its sensors."""
@@ -103,15 +103,16 @@ class Bending:
         names, heard = () if rig is None else rig.names, dict(self._heard)
         unheard = [name for name in names if name not in heard]
         if unheard or not heard:
-            others = f" (there: {self._others}; see the parameter joints)" if self._others else ""
             whose = ", ".join(unheard) if heard else "the limb"
-            topic = self._config().joint_states
-            return f"no joint states of {whose} on {topic} yet{self._useless}{others}: it is taken to be at rest"
+            topic, there = self._config().joint_states, _there(self._others[0])
+            return f"no joint states of {whose} on {topic} yet{self._useless}{there}: it is taken to be at rest"
         silent = {name: now - one.came for name, one in heard.items() if now - one.came > SILENT_S}
         if silent:
             whose = "" if len(silent) == len(heard) else f" of {', '.join(silent)}"
-            return (f"no joint states{whose}{self._useless} for {max(silent.values()):.0f} s: the limb is taken to be "
-                    "where it was")  # fmt: skip
+            others, came = self._others
+            there = _there(others if now - came < SILENT_S else "")
+            return (f"no joint states{whose}{self._useless} for {max(silent.values()):.0f} s{there}: the limb is taken "
+                    "to be where it was")  # fmt: skip
         if not self._stands:
             return "the skin is not bent as the joint states say yet: it is taken to be at rest"
         behind = max(one.came for one in heard.values()) - self._stands
@@ -136,7 +137,7 @@ class Bending:
             names = {name: self._config().joint_names.get(name, name) for name in rig.names}
             told = wire.joints_from(message, names)
             if not told:  # of another limb, or of a robot
-                self._others = ", ".join(message.name) or "none"
+                self._others = ", ".join(message.name) or "none", now
                 return None
             heard = self._heard | {name: _Heard(angle, stamp, now) for name, angle in told.items()}
             angles = rig.angles({name: one.angle for name, one in heard.items()})
@@ -167,3 +168,8 @@ class Bending:
         with self._lock:  # else a skin that takes over just now would be overwritten
             if rest is self._rest:
                 self.newest, self._stands = skin, came
+
+
+def _there(others: str) -> str:
+    """What is said of joints that messages tell of instead."""
+    return f" (there: {others}; see the parameter joints)" if others else ""

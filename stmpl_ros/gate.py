@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import time
+from typing import NamedTuple
 
 from rclpy.node import Node
 
@@ -11,6 +12,18 @@ from bags.wire import NANO
 from stmpl_ros.diagnosis import Tally
 
 SAY_EVERY = 1.0  # time between two lines of the same kind [s]
+OFTEN, RARELY = 5, 30.0  # lines of a kind in a row, after which they come this much apart [s]
+QUIET = 5.0  # time without a reason for a line, after which its kind is new again [s]
+
+
+class _Said(NamedTuple):
+    """Lines of a kind: when the last one was and when there was reason for one [s], how many were held back since it,
+    and how many came in a row."""
+
+    last: float = -math.inf
+    asked: float = -math.inf
+    held: int = 0
+    row: int = 0
 
 
 class Gate:
@@ -26,7 +39,7 @@ class Gate:
 
     def __init__(self, node: Node, tally: Tally) -> None:
         self._node, self._tally = node, tally
-        self._said: dict[str, tuple[float, int]] = {}  # of each kind: when the last line was, how many were held back
+        self._said: dict[str, _Said] = {}  # by kind
         self.refused_since = ""
 
     def fresh(self, stamp: int, max_age: float) -> bool:
@@ -62,11 +75,11 @@ class Gate:
         self.say(kind, why)
 
     def say(self, kind: str, text: str) -> None:
-        """A warning, one of a kind in SAY_EVERY seconds; it tells how many of its kind were held back."""
-        now = time.monotonic()
-        last, held = self._said.get(kind, (-math.inf, 0))
-        if now - last < SAY_EVERY:
-            self._said[kind] = last, held + 1
+        """A warning, one of a kind in SAY_EVERY seconds, in RARELY once it goes on; it tells how many were held back."""
+        now, said = time.monotonic(), self._said.get(kind, _Said())
+        row = said.row if now - said.asked < QUIET else 0
+        if now - said.last < (SAY_EVERY if row < OFTEN else RARELY):
+            self._said[kind] = _Said(said.last, now, said.held + 1, row)
             return
-        self._said[kind] = now, 0
-        self._node.get_logger().warning(f"{text} ({held} more of its kind before)" if held else text)
+        self._said[kind] = _Said(now, now, 0, row + 1)
+        self._node.get_logger().warning(f"{text} ({said.held} more of its kind before)" if said.held else text)

@@ -48,7 +48,7 @@ from stmpl_core.touch import BY_POSE, STALE, TOUCHING, Slip
 from stmpl_core.trust import Trust
 from stmpl_ros.calibration import strokes_of
 from stmpl_ros.diagnosis import Tally
-from stmpl_ros.gate import SAY_EVERY, Gate
+from stmpl_ros.gate import OFTEN, QUIET, SAY_EVERY, Gate
 from stmpl_ros.inbox import PATIENCE, Inbox
 from stmpl_ros.making import Compiling
 from stmpl_ros.parameters import NodeConfig
@@ -314,6 +314,11 @@ def test_one_line_of_a_kind_comes_through_and_tells_how_many_did_not(monkeypatch
     assert [line("nan", "not finite", t) for t in (0.2, 0.9)] == [None, None]
     assert line("nan", "infinite", 1.0) == "infinite (2 more of its kind before)", "of this or another text"
     assert line("nan", "not finite", 2.5) == "not finite"
+
+    # what goes on and on is told rarely, until it was over
+    lines = [bool(line("lost", "no wrench", 10 + 0.5 * k)) for k in range(140)]
+    assert sum(lines[:10]) == OFTEN and sum(lines[10:]) == 2
+    assert line("lost", "no wrench", 80.0 + QUIET) and line("lost", "no wrench", 81.0 + QUIET)
 
 
 def test_kernels_are_told_of_as_they_are_compiled():
