@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike
 
 from bags.frame import Frame, Stamps
 from stmpl_core.arrays import Transform, Wrench, finite
-from stmpl_core.contact import Contact
+from stmpl_core.contact import MOST, Contact, counted
 from stmpl_core.errors import BagError, FrameError, InvalidInput, MeshError
 from stmpl_core.layer import MAX_EXTENT, SoftLayer, layer_id
 from stmpl_core.local_contact import Grip, LocalContact
@@ -37,6 +37,7 @@ NANO = 1_000_000_000  # nanoseconds in a second
 NO_FRAMES: FixedFrames = MappingProxyType({})
 NO_FRICTION: Mapping[str, float] = MappingProxyType({})
 NO_SURFACES: Mapping[str, str] = MappingProxyType({})
+MOST_TOLD = 1e-6 * MOST  # largest number of a wrench that is told: about another point it is one that is counted
 QUATERNION_TOLERANCE = 1e-2  # error of a unit quaternion's length; through float32 or text it is far less
 NOWHERE = np.full((4, 4), np.nan)  # pose that a recording does not tell
 NOT_TOLD = np.full(3, np.nan)  # likewise a place, or a way
@@ -125,7 +126,8 @@ def pose_of_tool(message: Any, tool: str, body_frame: str, frames: FixedFrames =
     finite(f"pose of {tool}", pose, (4, 4))
     far = float(np.abs(pose[:3, 3]).max())
     if far > MAX_EXTENT:
-        raise InvalidInput(f"{tool} is {far:.1f} m from the body's origin; at most {MAX_EXTENT} m is accepted. "
+        told = f"{far:.1f}" if far < 1e6 else f"{far:.3g}"
+        raise InvalidInput(f"{tool} is {told} m from the body's origin; at most {MAX_EXTENT} m is accepted. "
                            "Is its pose in millimetres? Scale it by 1e-3.")
     return pose
 
@@ -140,9 +142,10 @@ def wrench_from(
 
     Raises:
         FrameError: a frame that is neither the body's, nor the tool's own, nor in `frames`.
-        InvalidInput: numbers that are not finite.
+        InvalidInput: numbers that are not finite or beyond MOST_TOLD.
     """
-    frame, wrench = message.header.frame_id, finite(f"wrench of {tool}", _six(message.wrench), (6,))
+    frame = message.header.frame_id
+    wrench = counted(f"wrench of {tool}", _six(message.wrench), (6,), MOST_TOLD)
     if frame == body_frame:
         return wrench
     if frame != tool and frame not in frames:  # frames of /tf are found when asked for, and not listed

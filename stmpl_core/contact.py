@@ -40,7 +40,7 @@ class Contact:
         pose = rigid(f"pose of {self.name}", self.pose_body_from_tool).copy()  # a caller goes on with its own
         object.__setattr__(self, "pose_body_from_tool", pose)
         if self.wrench is not None:
-            wrench = _counted(f"wrench of {self.name}", self.wrench, (6,)).copy()
+            wrench = counted(f"wrench of {self.name}", self.wrench, (6,)).copy()
             wrench[np.abs(wrench) < 1 / MOST] = 0.0
             object.__setattr__(self, "wrench", wrench)
 
@@ -63,24 +63,25 @@ def rigid(what: str, pose: ArrayLike) -> Transform:
     Raises:
         InvalidInput: numbers that are not finite or beyond MOST, or a pose that is not rigid.
     """
-    array = _counted(what, pose, (4, 4))
+    array = counted(what, pose, (4, 4))
     if not _rigid(array):
         raise InvalidInput(f"{what} is not rigid: it is\n{array}.")
     return array
 
 
-def _counted(what: str, values: ArrayLike, shape: tuple[int, ...]) -> np.ndarray:
+def counted(what: str, values: ArrayLike, shape: tuple[int, ...], most: float = MOST) -> np.ndarray:
+    """Numbers as an array of a shape. Raises InvalidInput where one is not finite, or beyond the most."""
     array = finite(what, values, shape)
-    if _beyond(array.ravel()):
-        raise InvalidInput(f"{what} holds a number beyond {MOST:g}.")
+    if _beyond(array.ravel(), most):
+        raise InvalidInput(f"{what} holds a number beyond {most:g}.")
     return array
 
 
 @numba.njit(cache=True, nogil=True)
-def _beyond(values):
-    """Whether one of the numbers is beyond MOST; as `_rigid`, far sooner done than by numpy's own calls."""
+def _beyond(values, most):
+    """Whether one of the numbers is beyond the most; as `_rigid`, far sooner done than by numpy's own calls."""
     for value in values:
-        if abs(value) > MOST:
+        if abs(value) > most:
             return True
     return False
 

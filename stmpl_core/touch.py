@@ -166,9 +166,11 @@ class Touch:
 
     @property
     def drag(self) -> float:
-        """Size of the stated force along the skin, which is not carried [N]."""
-        missing = self.missing[:3]
-        return math.sqrt(missing @ missing)
+        """Size of the stated force across the push, which is not carried [N]."""
+        missing, push = self.missing[:3], self.push
+        size = push @ push
+        across = missing - (missing @ push) / size * push if size > 0 else missing
+        return math.sqrt(across @ across)
 
     @property
     def presses(self) -> bool:

@@ -75,7 +75,7 @@ class Gate:
         self.say(kind, why)
 
     def say(self, kind: str, text: str) -> None:
-        """A warning, one of a kind in SAY_EVERY seconds, in RARELY once it goes on; it tells how many were held back."""
+        """A warning, one of a kind in SAY_EVERY seconds, in RARELY once it goes on; it tells how many it held back."""
         now, said = time.monotonic(), self._said.get(kind, _Said())
         row = said.row if now - said.asked < QUIET else 0
         if now - said.last < (SAY_EVERY if row < OFTEN else RARELY):

@@ -89,9 +89,11 @@ def sim(
     from stmpl_core.friction import friction_from
     from stmpl_sim.grip import mount_of, usual_force
     from stmpl_sim.massage import Course, Massage
-    from stmpl_sim.scene import build
+    from stmpl_sim.scene import build, check_robot
     from stmpl_sim.site import Site
 
+    out.mkdir(parents=True, exist_ok=True)  # what cannot be is said before the skin is made
+    check_robot(robot, end)
     layer = limb(part, tissue, relaxing, phenotype)
     site = Site.thickest(layer)
     grip = usual_force(part) if grip is None else grip
@@ -100,7 +102,6 @@ def sim(
     course = Course(site.circle(1e-3 * circle), tuple(force), 1e-3 * speed, laps, grip)
     massage = Massage(scene, course, damping=damping, friction=friction_from(friction), every=every)
     massage.warm_up()
-    out.mkdir(parents=True, exist_ok=True)
     shots: list[Any] | None = None if film == "none" else []
     log = _run(massage, shots, quiet=as_json)
     log.save(out / "log.npz")

@@ -124,6 +124,13 @@ def test_load_sums_to_the_normal_component_of_the_wrench(
     assert np.hypot(found.force, found.drag) == pytest.approx(np.linalg.norm(force))
 
 
+def test_what_is_too_much_of_a_push_is_not_said_to_be_drag(sim: Simulator) -> None:
+    for along, drags in ((0.0, False), (20.0, True)):
+        found = touch_of(sim.step([press(BALL, at(RADIUS + 0.010, 0, MIDDLE), (-40.0, 0, along))]))
+        assert "carries" in found.trust.why and ("also drags" in found.trust.why) == drags
+        assert found.drag == pytest.approx(along, abs=0.02 * 40)
+
+
 def test_more_force_presses_deeper_and_on_more_skin(toucher: Toucher) -> None:
     touches = [felt(toucher, BALL, on_limb(), (-f, 0, 0)) for f in (0.02, 0.06, 0.2, 0.6)]
     for less, more in pairwise(touches):

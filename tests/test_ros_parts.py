@@ -19,6 +19,7 @@ from stmpl_msgs.msg import SkinDisplacement
 from visualization_msgs.msg import Marker
 
 from bags.wire import (
+    MOST_TOLD,
     displacement_message,
     floats,
     frame_from,
@@ -39,7 +40,7 @@ from stmpl_core import Answer, Contact, Membrane, Ply, Prony, State, Tissue, Too
 from stmpl_core.body import Body
 from stmpl_core.bones import Bone, to_bone
 from stmpl_core.errors import FrameError, InvalidInput, MeshError
-from stmpl_core.layer import layer_id
+from stmpl_core.layer import MAX_EXTENT, layer_id
 from stmpl_core.living import living
 from stmpl_core.local_contact import Grip, LocalContact
 from stmpl_core.skin import published
@@ -145,6 +146,7 @@ def _moved(x: float, **quaternion: float) -> PoseStamped:
         (_moved(float("nan")), InvalidInput, "not finite"),
         (_moved(float("inf")), InvalidInput, "not finite"),
         (_moved(120.0), InvalidInput, "120.0 m .* millimetres"),
+        (_moved(1e300), InvalidInput, r"1e\+300 m .* millimetres"),
         (_moved(0.1, w=0.0), InvalidInput, "length 0"),
         (_moved(0.1, w=float("nan")), InvalidInput, "nan"),
     ],
@@ -160,6 +162,11 @@ def test_a_wrench_that_cannot_be_meant_is_refused_and_told_why():
         wrench_from(wrench_message(np.zeros(6), "map", 0), **here)
     with pytest.raises(InvalidInput, match="not finite"):
         wrench_from(wrench_message(np.full(6, np.nan), "body", 0), **here)
+    with pytest.raises(InvalidInput, match=r"holds a number beyond 1e\+94"):
+        wrench_from(wrench_message(np.full(6, 1e95), "body", 0), **here)
+    here["pose_body_from_tool"] = at(MAX_EXTENT, 0, 0)
+    read = wrench_from(wrench_message(np.full(6, MOST_TOLD), "table", 0), frames={"table": np.eye(4)}, **here)
+    assert Contact(ball(), np.eye(4), read).wrench is not None, "what is let in can be answered"
 
 
 class Moving(Mapping):
