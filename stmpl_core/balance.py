@@ -73,15 +73,14 @@ def balanced(asked: Sequence[Asked], laws: Sequence[Law], shares: np.ndarray) ->
 
     Memories share no array with touches, which whoever is handed them may write to.
 
-    Where steps are long they leave open how much work was done; within that it is what the contact stores. Tools that
-    feel each other pass energy on, so one is weakened only where all together lack it.
+    Where steps are long they leave open how much work was done; within that it is what the contact stores.
 
     Args:
         asked, laws: what was asked, and what each tool does.
         shares: shares of the force that relax (see relaxation.Series), (P,) [-].
     """
-    works, parts = [], []
-    for one, law in zip(asked, laws, strict=True):
+    works, givens, spares, stored, whole = np.zeros((5, len(laws)))
+    for k, (one, law) in enumerate(zip(asked, laws, strict=True)):
         before, memory, new = one.before, law.memory, not one.known or one.stated.wrench is not None
         work, doubt, given = work_of(
             one.twist, before.wrench, memory.wrench, before.contact, memory.contact, memory.pose[:3, 3],
@@ -89,31 +88,65 @@ def balanced(asked: Sequence[Asked], laws: Sequence[Law], shares: np.ndarray) ->
             memory.relaxed, shares, before.scalars.depth, memory.scalars.depth, memory.scalars.power,
             memory.scalars.radius)  # fmt: skip
         work += before.scalars.work
-        work = max(work, law.stored if new else min(law.stored, work + doubt))
-        works.append(work)
-        parts.append((given, UNSURE * memory.scalars.largest * memory.scalars.depth))
-    all_stored, lent = sum(law.stored for law in laws), sum(spare for _, spare in parts)
-    together = (sum(works) + lent) / (GIVEN_BACK * all_stored) if all_stored > 0 else 1.0
+        works[k], givens[k] = max(work, law.stored if new else min(law.stored, work + doubt)), given
+        spares[k] = UNSURE * memory.scalars.largest * memory.scalars.depth
+        stored[k], whole[k] = law.stored, law.whole
+    factors = settled(works, givens, spares, stored, whole)
     touches, memories = [], {}
-    for law, work, (given, spare) in zip(laws, works, parts, strict=True):
-        touch, memory, passive, there = law.touch, law.memory, 1.0, work + spare
-        if law.stored > 0:
-            passive = min(1.0, max(there / (GIVEN_BACK * law.stored), together if len(laws) > 1 else 0.0, WEAKEST))
-            if passive < 1:
-                at_rest = there - given
-                if len(laws) == 1 and at_rest + passive * given < 0 and given < 0:
-                    passive = -at_rest / given
-                passive = max(passive, WEAKEST)
-                work -= (1 - passive) * given
-                touch = _weakened(touch, passive, MUCH * memory.scalars.largest)
-                memory = memory._replace(wrench=touch.wrench)
-        # A tool that left the skin sideways, in the air for a moment, has what it put in: it gave nothing back.
-        work = min(work, KEPT * law.whole) if law.stored > 0 else max(work, 0.0)
+    for law, work, passive in zip(laws, works.tolist(), factors.tolist(), strict=True):
+        touch, memory = law.touch, law.memory
+        if passive < 1:
+            touch = _weakened(touch, passive, MUCH * memory.scalars.largest)
+            memory = memory._replace(wrench=touch.wrench)
         memories[touch.name] = memory._replace(
             scalars=memory.scalars._replace(work=work, passive=passive), pose=memory.pose.copy(),
             wrench=memory.wrench.copy(), contact=memory.contact.copy(), imprint=memory.imprint.copy())  # fmt: skip
         touches.append(touch)
     return touches, memories
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def settled(works, givens, spares, stored, whole):
+    """Factors on the wrenches of tools (K,) [-], with which no more comes back than was put in; updates their works.
+
+    Tools that feel each other pass energy on: one is weakened only where all together lack it, what all have beyond
+    what all could hold is forgotten, and what one took from the others they no longer have. One that left the skin
+    sideways, in the air for a moment, has what it put in: it gave nothing back.
+
+    Args:
+        works: work that was put in and not given back, before; written: after, (K,) [J].
+        givens: what the last wrench has of it, (K,) [J].
+        spares: what a contact may lack, (K,) [J].
+        stored, whole: see Law, (K,) [J].
+    """
+    tools, out = len(works), np.ones(len(works))
+    all_stored, all_there = stored.sum(), works.sum() + spares.sum()
+    together = all_there / (GIVEN_BACK * all_stored) if all_stored > 0 else 1.0
+    excess = beyond = 0.0
+    for k in range(tools):
+        if stored[k] > 0:
+            there, given = works[k] + spares[k], givens[k]
+            passive = min(1.0, max(there / (GIVEN_BACK * stored[k]), together if tools > 1 else 0.0, WEAKEST))
+            if passive < 1:
+                at_rest = there - given
+                if tools == 1 and at_rest + passive * given < 0 and given < 0:
+                    passive = -at_rest / given
+                out[k] = max(passive, WEAKEST)
+                works[k] -= (1 - out[k]) * given
+            beyond += works[k] - KEPT * whole[k]
+            excess += max(works[k] - KEPT * whole[k], 0.0)
+    share, owed, left = max(beyond / excess, 0.0) if excess > 0 else 0.0, 0.0, 0.0
+    for k in range(tools):
+        if stored[k] > 0 and works[k] > KEPT * whole[k]:
+            works[k] = KEPT * whole[k] if share == 1 else works[k] - share * (works[k] - KEPT * whole[k])
+        owed, left = owed + max(-works[k], 0.0), left + max(works[k], 0.0)
+    paid = min(owed, left)
+    for k in range(tools):
+        if paid > 0:
+            works[k] *= 1 - paid / (left if works[k] > 0 else owed)
+        if stored[k] <= 0:
+            works[k] = max(works[k], 0.0)
+    return out
 
 
 def _factor(memory: Memory) -> float:

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import numba
 import numpy as np
 
-from stmpl_core.balance import GIVEN_BACK, KEPT, MUCH, UNSURE, WEAKEST, work_of
+from stmpl_core.balance import MUCH, UNSURE, settled, work_of
 from stmpl_core.errors import InvalidInput
 from stmpl_core.footing import aged, borne, part_of_way
 from stmpl_core.friction import Friction, coefficients
@@ -272,40 +272,27 @@ def _step(patch, before, after, s, shares, times, fades, mu, numbers, has_skin, 
             patch[k], before, after, s, k, shares, times, fades, mu[k], numbers[k], has_skin, table, log_thickness,
             logs, modulus, slack, dt, by_pose, apart, rubs[k], out[k])  # fmt: skip
     # balance.balanced
-    all_stored, all_there = 0.0, 0.0
+    spares = np.zeros(tools)
     for k in range(tools):
         new = not (before.told[s, k] and before.scalars[s, k, PRESSING] >= 0)
         work = works[k] + before.scalars[s, k, WORK]
         works[k] = max(work, stored[k] if new else min(stored[k], work + doubts[k]))
-        all_stored += stored[k]
-        all_there += works[k] + UNSURE * after.scalars[s, k, LARGEST] * after.scalars[s, k, DEPTH]
-    together = all_there / (GIVEN_BACK * all_stored) if all_stored > 0 else 1.0
+        spares[k] = UNSURE * after.scalars[s, k, LARGEST] * after.scalars[s, k, DEPTH]
+    factors = settled(works, givens, spares, stored, whole)
     for k in range(tools):
-        new, passive = after.scalars[s, k], 1.0
-        spare = UNSURE * new[LARGEST] * new[DEPTH]
-        there, given, work = works[k] + spare, givens[k], works[k]
-        if stored[k] > 0:
-            passive = min(1.0, max(there / (GIVEN_BACK * stored[k]), together if tools > 1 else 0.0, WEAKEST))
-            if passive < 1:
-                at_rest = there - given
-                if tools == 1 and at_rest + passive * given < 0 and given < 0:
-                    passive = -at_rest / given
-                passive = max(passive, WEAKEST)
-                work -= (1 - passive) * given
-                square = 0.0
-                for x in range(3):
-                    square += (out[k, x] - rubs[k, x]) ** 2
-                less = (1 - passive) * np.sqrt(square)
-                out[k, 6] = out[k, 6] * passive + less
-                for x in range(6):
-                    out[k, x] *= passive
-                    after.wrench[s, k, x] = out[k, x]
-                if less > MUCH * new[LARGEST]:
-                    out[k, 7] = 0.0
-            work = min(work, KEPT * whole[k])
-        else:
-            work = max(work, 0.0)
-        new[WORK], new[PASSIVE] = work, passive
+        new, passive = after.scalars[s, k], factors[k]
+        if passive < 1:
+            square = 0.0
+            for x in range(3):
+                square += (out[k, x] - rubs[k, x]) ** 2
+            less = (1 - passive) * np.sqrt(square)
+            out[k, 6] = out[k, 6] * passive + less
+            for x in range(6):
+                out[k, x] *= passive
+                after.wrench[s, k, x] = out[k, x]
+            if less > MUCH * new[LARGEST]:
+                out[k, 7] = 0.0
+        new[WORK], new[PASSIVE] = works[k], passive
     # history._doubted, then _after_others
     for k in range(tools):
         if p:
