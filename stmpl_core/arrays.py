@@ -46,11 +46,8 @@ def _all_finite(values):
 
 def check_dt(dt: float) -> None:
     """Raises InvalidInput: a time since the step before [s] that is no number, below 0, or not finite."""
-    try:
-        sound = bool(0 <= dt < np.inf)
-    except (TypeError, ValueError):
-        sound = False
-    if not sound:
+    number = isinstance(dt, (int, float, np.integer, np.floating)) and not isinstance(dt, bool)
+    if not (number and 0 <= dt < np.inf):
         raise InvalidInput(f"dt is {dt!r:.40} s; time goes forward, allowed is a number of 0 or more, and finite.")
 
 

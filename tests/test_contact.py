@@ -527,7 +527,7 @@ def test_bad_input_is_refused_with_a_reason(sim: Simulator) -> None:
     assert touch_of(sim.step([press(BALL, on_limb(), (-1e-300, 0, 0))])).status == NO_FORCE
     held = touch_of(sim.step([press(BALL, on_limb(), (-1e99, 0, 0))]))
     assert not held.trust.in_range and "carries" in held.trust.why
-    for odd in ("1", None, np.nan, np.ones(2)):
+    for odd in ("1", None, np.nan, np.ones(2), np.array([0.01]), True):
         with pytest.raises(InvalidInput, match="dt is"):
             sim.touch([], State(), odd)
     with pytest.raises(InvalidInput, match="names of their own"):

@@ -359,6 +359,10 @@ def test_a_scene_that_is_refused_spoils_no_other(cylinder: Skin) -> None:
     assert not found.served[2:5].any() and found.served[others].all()
     assert (found.statuses.numpy()[2:5] == STATUSES.index("refused")).all()
     assert not batch.touch(np.zeros((6, 2, 7))).served.any()  # quaternions of nothing
+    scenes = np.swapaxes(pairs(), -2, -1)  # told by columns
+    scenes[1], scenes[2] = pairs()[1], pairs()[2]
+    scenes[2, 0, 3, 3] = 2.0
+    assert batch.touch(scenes).served.all(axis=1).tolist() == [False, True] + 4 * [False]
 
 
 def test_neither_run_nor_part_nor_lane_changes_a_bit(cylinder: Skin) -> None:
@@ -414,6 +418,12 @@ def test_what_does_not_fit_is_said(cylinder: Skin) -> None:
         batch.touch(np.zeros((2, 7)))
     with pytest.raises(InvalidInput, match="float32 or float64"):
         batch.touch(torch.zeros((2, 1, 7), dtype=torch.int32))
+    with pytest.raises(InvalidInput, match="they are complex"):
+        batch.touch(np.zeros((2, 1, 7), complex))
+    with pytest.raises(InvalidInput, match="poses are no array of numbers"):
+        batch.touch("abc")
+    with pytest.raises(InvalidInput, match=r"scenes \[1.5\]; there are 2"):
+        batch.touch(np.zeros((2, 1, 7)), fields=[1.5])
     with pytest.raises(InvalidInput, match="out has shape"):
         batch.touch(np.zeros((2, 1, 7)), out=torch.zeros((2, 1, 6)))
     with pytest.raises(InvalidInput, match="out is numpy's"):

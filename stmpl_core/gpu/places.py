@@ -62,7 +62,8 @@ def read_matrices(poses: wp.array4d(dtype=Any), first: wp.int32, many: wp.int32,
         for j in range(3):
             turn[i, j] = real(poses[s, k, i, j])
             sound = sound and wp.isfinite(turn[i, j])
-        sound = sound and wp.isfinite(place[i])
+        sound = sound and wp.isfinite(place[i]) and wp.abs(real(poses[s, k, 3, i])) <= real(1e-4)
+    sound = sound and wp.abs(real(poses[s, k, 3, 3]) - real(1.0)) <= real(1e-4)
     if sound:
         product = turn * wp.transpose(turn)
         for i in range(3):

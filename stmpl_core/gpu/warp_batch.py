@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from stmpl_core.arrays import check_dt
+from stmpl_core.arrays import check_dt, real
 from stmpl_core.columns import Columns
 from stmpl_core.errors import InvalidInput
 from stmpl_core.friction import Friction, check_tools
@@ -211,9 +211,9 @@ class WarpBatch:
         if states is not None and not isinstance(states, WarpStates):
             raise InvalidInput(f"states are {states!r:.40}; those of at_rest(), states(...) or a step before are "
                                "needed.")  # fmt: skip
-        wanted = np.array(list(fields), dtype=np.int64)
-        if len(wanted) and not (0 <= wanted.min() and wanted.max() < n):
-            raise InvalidInput(f"fields are asked for scenes {wanted.min()} to {wanted.max()}; there are {n}.")
+        if not set(asked := list(fields)) <= set(range(n)):
+            raise InvalidInput(f"fields are asked for scenes {asked!r:.60}; there are {n}.")
+        wanted = np.array(asked, dtype=np.int64)
         if len(wanted) and states is not None:
             raise InvalidInput("fields of skin with a memory are not served by WarpBatch. Try Batch.")
         given = self._array("poses", poses)
@@ -277,14 +277,17 @@ class WarpBatch:
         if isinstance(values, wp.array):
             found = values
             if values.dtype in (wp.transformf, wp.transformd) and values.is_contiguous:
-                real = wp.float32 if values.dtype is wp.transformf else wp.float64
-                found = wp.array(ptr=values.ptr, dtype=real, shape=(*values.shape, 7), device=values.device)
+                exact = wp.float32 if values.dtype is wp.transformf else wp.float64
+                found = wp.array(ptr=values.ptr, dtype=exact, shape=(*values.shape, 7), device=values.device)
                 found._kept = values  # type: ignore[attr-defined]  # the memory is its
         elif type(values).__module__.startswith("torch"):
             found = wp.from_torch(values.detach())
         else:
-            plain = np.asarray(values)
-            plain = plain if plain.dtype in (np.float32, np.float64) else plain.astype(float)
+            try:
+                plain = np.asarray(real(values))
+                plain = plain if plain.dtype in (np.float32, np.float64) else plain.astype(float)
+            except (TypeError, ValueError) as error:
+                raise InvalidInput(f"{name} are no array of numbers: {error}.") from error
             found = wp.array(np.ascontiguousarray(plain), dtype=wp.dtype_from_numpy(plain.dtype), ndim=plain.ndim,
                              copy=self.device.is_cuda, device=self.device)  # fmt: skip
         if found.device != self.device:
