@@ -172,7 +172,7 @@ class Answering:
         if reaction is None:
             return False
         assert self._field is not None
-        reaction = reaction._replace(touches=[_flagged(touch, instant) for touch in reaction.touches])
+        reaction = reaction._replace(touches=[self._flagged(touch, instant) for touch in reaction.touches])
         touches = {touch.name: touch for touch in reaction.touches}
         self.sending.reaction(instant, touches)
         self.remembering.keep(reaction, instant)
@@ -193,10 +193,18 @@ class Answering:
         self._tally.reacted(seconds, (self._now() - instant.stamp) / NANO)
         if self.fading:
             self._node.get_logger().info("input is back")
-        self._instant, self.fading, self._hearing.gate.refused_since = instant, False, ""
+        self._instant, self.fading, self._hearing.useless = instant, False, ""
         self._hurry.clear()
         self._seen = set(touches)
         return True
+
+    def _flagged(self, touch: Touch, instant: Instant) -> Touch:
+        """The touch, flagged where a wrench or a surface was told that cannot be used; what is remembered is not."""
+        whys = instant.refused.get(touch.name, ""), self._hearing.outdated(touch.name)
+        trust = touch.trust
+        for why in filter(None, whys):
+            trust = trust.also(why, in_range=False)
+        return touch if trust is touch.trust else touch.with_(trust=trust)
 
     def _bend(self) -> bool:
         """Takes skin and memory to where the joints are now; whether they were elsewhere."""
@@ -302,8 +310,8 @@ class Answering:
         silent, limit = self._hearing.inbox.silence(now) / NANO, config.rest_after
         left = min(1.0, 1 - (silent - limit) / config.fade) if config.fade else 0.0
         why = f"no pose for {limit} s"
-        if gate.refused_since:
-            why = f"{why} that could be used (refused: {gate.refused_since})"
+        if self._hearing.useless:
+            why = f"{why} that could be used (refused: {self._hearing.useless})"
         self._seen = set()
         self.sending.models.forget()
         if left <= 0 or self.last is None or not self.last[0].displacement.any():
@@ -361,12 +369,6 @@ class Answering:
 
     def _now(self) -> int:
         return self._node.get_clock().now().nanoseconds
-
-
-def _flagged(touch: Touch, instant: Instant) -> Touch:
-    """The touch, flagged where a wrench was told that cannot be used; what is remembered of it is not."""
-    why = instant.refused.get(touch.name)
-    return touch.with_(trust=touch.trust.also(why, in_range=False)) if why else touch
 
 
 def _surfaces(instant: Instant) -> dict[str, str]:

@@ -32,15 +32,11 @@ class Gate:
     Args:
         node: node whose clock and logger are used.
         tally: counts of messages.
-
-    Attributes:
-        refused_since: reason why something was refused since it was last emptied.
     """
 
     def __init__(self, node: Node, tally: Tally) -> None:
         self._node, self._tally = node, tally
         self._said: dict[str, _Said] = {}  # by kind
-        self.refused_since = ""
 
     def fresh(self, stamp: int, max_age: float) -> bool:
         """Whether what is stamped [ns] is at most `max_age` [s] old; 0 takes any."""
@@ -66,7 +62,7 @@ class Gate:
     def refuse(self, kind: str, why: str) -> None:
         """Counts and tells of what cannot be used."""
         self._tally.refused += 1
-        self._tally.last_refusal = self.refused_since = why
+        self._tally.last_refusal = why
         self.say(kind, f"refused: {why}")
 
     def drop(self, kind: str, why: str) -> None:

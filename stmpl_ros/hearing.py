@@ -54,6 +54,7 @@ class Hearing:
         on_removed: callback with the name of a tool that was taken away.
         on_instant: callback with every complete instant.
         on_time_back: callback for a simulated clock that was set back, once all is forgotten.
+        useless: why the last pose that could not be used could not, since it was last emptied.
     """
 
     def __init__(self, node: Node, config: Callable[[], NodeConfig], tools: Tools, tally: Tally) -> None:
@@ -73,6 +74,7 @@ class Hearing:
         self.on_removed: Callable[[str], None] = lambda name: None
         self.on_instant: Callable[[Instant], None] = lambda instant: None
         self.on_time_back: Callable[[], None] = lambda: None
+        self.useless = ""
         self._topics: list[Any] = []
         self._listened: dict[str, list[Any]] = {}  # subscriptions of each tool
         self._unknown: dict[str, str] = {}  # topics of poses at the last look, by tool, whose surface is not known
@@ -138,6 +140,15 @@ class Hearing:
         self._refused[name] = f" ({why})"
         self.gate.refuse(f"mesh of {name}", why)
 
+    def outdated(self, name: str) -> str:
+        """Sentence on a tool in use whose newest surface cannot be used; empty: it is the newest."""
+        why = self._refused.get(name, "")
+        return f"{name} is answered with its surface from before{why}" if why and name in self.tools else ""
+
+    def look_for_outdated(self) -> str:
+        """The same of all tools."""
+        return "; ".join(filter(None, map(self.outdated, sorted(self._refused))))
+
     def look_for_strangers(self) -> str:
         """Which tools' poses are sent in vain, since their surface is not known, from the second look on; empty: none.
 
@@ -201,7 +212,7 @@ class Hearing:
                        partial(self._refuse_wrench, name))  # fmt: skip
 
         def pose(data: bytes) -> None:
-            self._read(read_pose, data, f"pose of {name}", partial(self._on_pose, name), self.gate.refuse)
+            self._read(read_pose, data, f"pose of {name}", partial(self._on_pose, name), self._refuse_pose)
 
         self._listened[name] = [self._listen(WrenchStamped, f"tools/{name}/wrench", wrench, NEWEST, raw=True)]
         if not self._followed.follow(name):
@@ -236,7 +247,9 @@ class Hearing:
             tool = read()
         except StmplError as error:
             return self._refuse_mesh(name, error)
-        if not self.tools.known(tool):  # sent once more, for who came late: what it touched is not forgotten
+        if self.tools.known(tool):  # sent once more, for who came late: what it touched is not forgotten
+            self._refused.pop(name, None)
+        else:
             self.tools.announce(tool)
             self.on_tool(tool)
 
@@ -250,20 +263,32 @@ class Hearing:
             self.on_removed(name)
 
     def _on_pose(self, name: str, message: PoseStamped) -> None:
-        if self._hears(name) and self.gate.fresh(wire.stamp_ns(message), self._config().max_age):
-            self._patience.put(f"pose of {name}", message, partial(self._take_pose, name))
+        if self._fresh_pose(name, message):
+            self._patience.put(f"pose of {name}", message, partial(self._take_pose, name), self._refuse_pose)
 
     def _on_followed(self, name: str, message: PoseStamped) -> None:
         """A pose that /tf told."""
-        if self._hears(name) and self.gate.fresh(wire.stamp_ns(message), self._config().max_age):
+        if self._fresh_pose(name, message):
             self._take_pose(name, message)
+
+    def _fresh_pose(self, name: str, message: PoseStamped) -> bool:
+        if not self._hears(name):
+            return False
+        if not self.gate.fresh(wire.stamp_ns(message), self._config().max_age):
+            self.useless = self.gate.dropped
+            return False
+        return True
+
+    def _refuse_pose(self, kind: str, why: str) -> None:
+        self.gate.refuse(kind, why)
+        self.useless = why
 
     def _take_pose(self, name: str, message: PoseStamped) -> None:
         stamp = wire.stamp_ns(message)
         try:
             pose = wire.pose_of_tool(message, name, self._config().frame, self.frames.at(stamp))
         except StmplError as error:
-            return self.gate.refuse(f"pose of {name}, {type(error).__name__}", str(error))
+            return self._refuse_pose(f"pose of {name}, {type(error).__name__}", str(error))
         if not self._stands("pose", name, stamp):
             self._go_on("pose", name, self.inbox.put_pose(name, pose, stamp, self.now()))
 

@@ -410,8 +410,8 @@ class SkinNode(ServingNode):
         inbox, events = self.hearing.inbox, self.hearing.events
         stopped = [f"no wrench of {name} for {self.config.rest_after} s: answered without it"
                    for name in inbox.dumb(self.hearing.now())]  # fmt: skip
-        senders = "; ".join(filter(None, (*stopped, self.hearing.unheard(), self.hearing.look_for_strangers(),
-                                          self.hearing.rivals())))  # fmt: skip
+        senders = "; ".join(filter(None, (*stopped, self.hearing.look_for_outdated(), self.hearing.unheard(),
+                                          self.hearing.look_for_strangers(), self.hearing.rivals())))  # fmt: skip
         self._look_for_twins()
         values = self.tally.values() | {
             "tools": " ".join(inbox.live(self.hearing.now())),

@@ -4,6 +4,7 @@ import os
 import re
 from collections import defaultdict
 
+import numpy as np
 import pytest
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
@@ -15,13 +16,14 @@ from rclpy.parameter import Parameter
 from stmpl_msgs.msg import ContactMesh
 from stmpl_msgs.srv import SetBody
 
-from bags.wire import header, pose_message
+from bags.wire import header, pose_message, tool_message
 from stmpl_ros.node import SkinNode
 from stmpl_ros.parameters import ANY_TIME, CONFIGURING, NodeConfig
 from stmpl_ros.topics import STREAM
 from tests.bus import ROOT, end, running, start
 from tests.conftest import BUSES
 from tests.node_bus import HERE, NODE, PUSH, Bus, Hand
+from tests.scenes import ball
 
 
 def change(bus, number: int = 0, label: str = "") -> bool:
@@ -155,6 +157,34 @@ def test_poses_of_a_tool_whose_mesh_was_refused_are_told_in_the_diagnostics(bus,
     assert "(mesh of 'torn' refused: " in told(bus, lambda: sender.send(HERE)).message
     for one in (sender.pose, sender.wrench):
         bus.node.destroy_publisher(one)
+
+
+def test_a_tool_whose_newest_surface_is_refused_is_answered_with_the_one_before_and_flagged(bus, hand):
+    assert hand.ask(HERE, PUSH).touches[0].in_range
+    bus.mesh.publish(ContactMesh(header=header("probe", bus.now()), vertices=[0.0] * 4, triangles=[0, 1, 2]))
+    bus.wait(lambda: bus.said("mesh of 'probe' refused"), "the log line")
+    answer, says = hand.ask(HERE, PUSH), "probe is answered with its surface from before (mesh of 'probe' refused: "
+    assert says in answer.why and not answer.in_range and not answer.touches[0].in_range
+    assert told(bus, lambda: hand.send(HERE, PUSH), says).level == DiagnosticStatus.WARN
+    bus.mesh.publish(tool_message(ball().named("probe"), bus.now()))
+    bus.wait(lambda: hand.ask(HERE, PUSH).in_range, "the good one to be trusted again")
+
+
+def test_a_fade_blames_the_poses_that_could_not_be_used_and_nothing_else(bus, hand):
+    def faded() -> str:
+        before = len(bus.got["skin/displacement"])
+        bus.wait(lambda: [one for one in bus.got["skin/displacement"][before:] if "no pose for" in one.why], "a fade")
+        return bus.got["skin/displacement"][-1].why
+
+    hand.ask(HERE, PUSH)
+    hand.send(HERE, np.full(6, np.nan))
+    assert "refused" not in faded(), "a wrench is no pose"
+    hand.ask(HERE, PUSH)
+    hand.pose.publish(pose_message(HERE, "body", bus.now() - 5 * 10**9))
+    assert "no pose for 0.4 s that could be used (refused: a message stamped" in faded()
+    hand.ask(HERE, PUSH)
+    hand.send(HERE, frame="nowhere")
+    assert "no pose for 0.4 s that could be used (refused: the pose of probe is in frame 'nowhere'" in faded()
 
 
 def test_two_senders_of_one_tool_are_told_in_the_diagnostics_by_their_names(bus, hand):
