@@ -11,6 +11,8 @@ import time
 from collections.abc import Callable
 from types import FrameType
 
+TOLD_AFTER_S = 3.0  # time that kernels are compiled, before a verb tells of it [s]
+SILENT = ("node", "demo", "record", "info", "recover", "foxglove", "fmu")  # verbs that compile nothing, or tell of it
 GRACE = 1.5  # time in which a verb must end after Ctrl-C or SIGTERM, whatever it is doing [s]
 PATIENT = {"record": 30.0}  # time for verbs that have something to save [s]
 VERBS = {  # module of each verb's function, and what it does
@@ -81,6 +83,12 @@ def _run(given: list[str]) -> int:
     logging.basicConfig(level=logging.INFO, format="%(levelname)s %(name)s: %(message)s")
     module = import_module(VERBS[verb][0])
     called = getattr(module, verb)
+    if verb not in SILENT and not {"-h", "--help"} & set(rest):
+        from numba.core.event import register
+
+        from stmpl_core.compiling import Compiling
+
+        register("numba:compile", Compiling(logging.getLogger("stmpl").info, TOLD_AFTER_S))
     if "--ros-args" in rest:
         at = rest.index("--ros-args")
         module.ros_arguments[:], rest = rest[at:], rest[:at]

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
 from typing import TYPE_CHECKING, cast, get_args
 
 import numpy as np
-from numba.core.event import Event, Listener
 
 from stmpl_core.contact import Contact
 from stmpl_core.errors import InvalidInput
@@ -33,7 +31,6 @@ ON_STACKS = ("moment_net", "limb_linear", "ladder")  # methods that know skin, f
 MOVED = ("moment_net", "linear", "limb_linear", "winkler", "naive", "zero")  # methods that go along with joints
 AT_ONCE = {"friction"}  # settings that the skin does not know of
 QUICK = {"moment_net", "winkler", "naive"}  # methods that such a change costs no preparation
-TOLD_EVERY_S = 10.0  # time between two words on how far what takes long has come [s]
 WARM_BEND = 0.1  # angle of each joint at which a bent skin is warmed up [rad]
 
 
@@ -143,27 +140,6 @@ def restiffened(skin: Skin, config: NodeConfig, changed: set[str]) -> Skin | Non
     if not changed or not changed <= STIFFNESS | AT_ONCE or config.method not in QUICK or skin.layer.stacked:
         return None
     return skin.stiffened(config.new_method(), youngs_modulus=config.youngs_modulus, density=config.density)
-
-
-class Compiling(Listener):
-    """Tells of kernels as they are compiled, the first one and then once in a while; those from disk are none.
-
-    Args:
-        tell: function that gets a sentence.
-    """
-
-    def __init__(self, tell: Callable[[str], None]) -> None:
-        self._tell, self._many, self._told = tell, 0, 0.0
-
-    def on_start(self, event: Event) -> None:
-        """Before one is compiled."""
-        now, self._many = time.monotonic(), self._many + 1
-        if now - self._told >= TOLD_EVERY_S:
-            self._told = now
-            self._tell(f"compiling kernels, number {self._many}; the first time takes minutes, then they are on disk")
-
-    def on_end(self, event: Event) -> None:
-        """After it."""
 
 
 def warm_up(simulator: Simulator) -> None:

@@ -21,6 +21,7 @@ from std_srvs.srv import Trigger
 from stmpl_msgs.srv import GetTopology, SetBody
 from threadpoolctl import threadpool_limits
 
+from stmpl_core.compiling import TOLD_EVERY_S, Compiling
 from stmpl_core.errors import InvalidInput, StmplError
 from stmpl_core.sdf import SignedDistance
 from stmpl_core.simulator import Simulator
@@ -39,9 +40,7 @@ from stmpl_ros.hearing import Hearing
 from stmpl_ros.lifecycle import ServingNode, told
 from stmpl_ros.limits import Limits
 from stmpl_ros.making import (
-    TOLD_EVERY_S,
     Build,
-    Compiling,
     at_once,
     check,
     check_part,

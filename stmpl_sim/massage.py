@@ -353,6 +353,7 @@ class Massage:
         self.reset()
         radius, dt = self.scene.radius, float(self.scene.model.opt.timestep)
         rows: list[tuple[Any, ...]] = []
+        left = ""  # why the first touch that was out of range was
         book, books = EnergyBook(), [EnergyBook() for _ in self.fingers]
         for k in range(round(self.course.duration / dt)):
             at, begun, busy = k * dt, time.perf_counter(), time.thread_time()
@@ -381,11 +382,13 @@ class Massage:
                          np.array([reaction.touches[name].force for name in self.fingers]),
                          np.array([held[name] for name in self.fingers]).reshape(-1, 4, 4), sum(worked),
                          took, spent, busy))  # fmt: skip
+            if not left and touch.trust.in_range is False:
+                left = f"{touch.name} was out of range from {at:.2f} s on, first as {touch.trust.why}"
             for see in seen:
                 see(self, at)
         log = Log(*(np.array(column) for column in zip(*rows, strict=True)), phases=self.course.phases)
         stuck = stuck_joints(self.scene.model, self.scene.joints, log.qpos)
-        return replace(log, notes=(*self.scene.notes, *stuck))
+        return replace(log, notes=(*self.scene.notes, *stuck, *([left] if left else [])))
 
 
 def _in_layer(wrench: np.ndarray, limb: np.ndarray) -> np.ndarray:

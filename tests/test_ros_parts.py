@@ -39,6 +39,7 @@ from bags.wire import (
 from stmpl_core import Answer, Contact, Membrane, Ply, Prony, State, Tissue, Tools, Touch
 from stmpl_core.body import Body
 from stmpl_core.bones import Bone, to_bone
+from stmpl_core.compiling import Compiling
 from stmpl_core.errors import FrameError, InvalidInput, MeshError
 from stmpl_core.layer import MAX_EXTENT, layer_id
 from stmpl_core.living import living
@@ -51,7 +52,6 @@ from stmpl_ros.calibration import strokes_of
 from stmpl_ros.diagnosis import Tally
 from stmpl_ros.gate import OFTEN, QUIET, SAY_EVERY, Gate
 from stmpl_ros.inbox import PATIENCE, Inbox
-from stmpl_ros.making import Compiling
 from stmpl_ros.parameters import NodeConfig
 from stmpl_ros.scripts import DEEPEST, ON_LIMBS, ON_ONE_LAYER, PRESS, Device, Keyframe, Motion, scripts_for
 from stmpl_ros.show import SkinMarker
@@ -334,6 +334,9 @@ def test_kernels_are_told_of_as_they_are_compiled():
         twice = njit(lambda x: 2 * x)
         assert twice(2) == 4 == twice(2) and twice(1.5) == 3, "two kernels, and one of them again"
     assert [one[:29] for one in said] == ["compiling kernels, number 1; "], "a line is enough for a while"
+    with install_listener("numba:compile", Compiling(said.append, after=60.0)):
+        assert njit(lambda x: 3 * x)(2) == 6
+    assert len(said) == 1, "a moment is not told of"
 
 
 def test_a_share_of_an_answer_is_smaller_stale_and_not_to_be_trusted():
