@@ -24,6 +24,8 @@ OFFSET_STEPS = 13  # offsets that are tried before the best is refined
 OFFSET_TOLERANCE_M = 5e-6  # error of the offset at which the search ends
 OFFSET_PENALTY = 2e-3  # relative error of the forces up to which the smaller of two offsets is taken
 MAX_RESIDUAL = 0.15  # relative error of the forces that may be left; with more it is no skin of one stiffness
+SET_ASIDE = 0.5  # weight below which a press that is off by more than MAX_RESIDUAL counts as set aside
+MAX_SET_ASIDE = 0.25  # share of the presses that may be
 DEVIATION = 1.25  # standard deviation of an error over the mean of its size, sqrt(pi / 2)
 MAX_RELATIVE_ERROR = 0.2  # standard error of the modulus over it
 HARDEST = 1e6  # Young's modulus above any soft layer's [Pa]: 8 times that of skin's sheet (stmpl_core.regions)
@@ -39,7 +41,8 @@ class Stiffness:
         relative_error: standard error of E over E, scatter and the contact law's own error together, if the thickness
             is right [-]: one that is 20 % too large makes E some 30 % too large, and the forces fit as well.
         offset: distance by which the poses stand too far back along their push [m]; negative: too far in.
-        residual: relative error of the forces that is left, root mean square [-].
+        residual: relative error of the forces that is left, root mean square by the presses' weights [-]: those that
+            were set aside hardly count, and `trust` says how many they are.
         presses: number of presses that were fitted.
         depths: smallest and largest depth among them, with the offset [m].
         trust: verdict on E: may it be used, and why not.
@@ -62,6 +65,7 @@ class Stiffness:
 
 class _Fit(NamedTuple):
     modulus: float  # Young's modulus [Pa]
+    errors: np.ndarray  # relative errors of the forces, (N,)
     weights: np.ndarray  # Huber's weights, (N,)
     cost: float  # mean weighted square of the relative errors
 
@@ -157,7 +161,7 @@ class _Presses:
             errors = f - modulus * g
             most = HUBER_DEVIATIONS * max(1.4826 * float(np.median(np.abs(errors))), 1e-6)
             weights = np.minimum(1.0, most / np.maximum(np.abs(errors), 1e-300))
-        return _Fit(modulus, weights, float((weights * errors**2).sum() / weights.sum()))
+        return _Fit(modulus, errors, weights, float((weights * errors**2).sum() / weights.sum()))
 
     def sound(self, press: Contact, touch: Touch) -> bool:
         """Whether a press may count: validated, or apart, and not dragging; what drags says little of the normal."""
@@ -186,6 +190,11 @@ class _Presses:
         if residual > MAX_RESIDUAL:
             trust = trust.also(f"one stiffness leaves the forces off by {residual:.0%}, at most {MAX_RESIDUAL:.0%} is "
                                "accepted: check frames, wrench and thickness", converged=False)  # fmt: skip
+        aside = int(((fit.weights < SET_ASIDE) & (np.abs(fit.errors) > MAX_RESIDUAL)).sum())
+        if aside:
+            trust = trust.also(f"{aside} of {len(law)} presses do not fit to the stiffness of the others by more than "
+                               f"{MAX_RESIDUAL:.0%}: is it another place, another tool, or a force that is not right?",
+                               converged=aside <= MAX_SET_ASIDE * len(law))  # fmt: skip
         if abs(offset) > reach - OFFSET_MARGIN_M:
             trust = trust.also(f"the poses are off by {reach * 1e3:g} mm along their push or more: calibrate them",
                                converged=False)  # fmt: skip

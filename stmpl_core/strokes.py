@@ -40,6 +40,8 @@ OWN_FORCE = 0.01  # error of the law of relaxation while a tool stays, over the 
 STAYS = 3e-4  # way along the skin within which a tool stays [m]
 MAX_RESIDUAL = 0.06  # relative error of the forces that may be left; with more it is not that series
 MAX_SHARE_ERROR = 0.1  # standard error of the share of the force that fades [-]
+WRONG_WAY = ("no force points into the skin where the poses touch it: is it what the tool exerts on the body, and are "
+             "the poses right, in metres?")  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -117,7 +119,8 @@ def fit_friction(toucher: Toucher, strokes: Sequence[Contact]) -> Rubbing:
     twice that after another way, with F the largest force along the skin and k the stiffness of the skin to what sticks
     (`stmpl_core.sideways`): one that sticks never does, since its force grows with the way. The normal is that of the
     contact law under the measured force; how far it is off changes sign with the way, so strokes there and back are
-    worth more than twice one of them.
+    worth more than twice one of them. So does a sensor's zero that is off along the way: by strokes one way it is
+    friction.
 
     Args:
         toucher: contact law on the skin, about as stiff as it is.
@@ -135,6 +138,8 @@ def fit_friction(toucher: Toucher, strokes: Sequence[Contact]) -> Rubbing:
         return _no_friction("the tool pressed nowhere, or stood still")
     sideways = Sideways(toucher.layer)
     found = [_rubbed(toucher, sideways, one) for one in pressing]
+    if sum(one is not None for one in found) < MIN_INSTANTS <= len(pressing):
+        return _no_friction(WRONG_WAY)
     ratios = [one.rubs / one.pressing for one in found if one is not None]
     most = max(FREE, float(np.quantile(ratios or [0.0], MOST_RUBBED)))
     slid, ways, mus, furthest, needed = [], [], [], 0.0, math.inf
@@ -155,8 +160,9 @@ def fit_friction(toucher: Toucher, strokes: Sequence[Contact]) -> Rubbing:
             mus.append(_friction_of(float(contact.wrench[:3] @ way) / went / one.pressing, one))
     if len(slid) < MIN_INSTANTS:
         went = f"; it went {1e3 * furthest:.1f} mm straight on, {1e3 * needed:.1f} mm are needed" if furthest else ""
+        more = "Tell more instants of the stroke" if furthest > 2 * needed else "Stroke further, there and back"
         return _no_friction(f"the tool slid at {len(slid)} of {len(pressing)} instants, {MIN_INSTANTS} are needed"
-                            f"{went}. Stroke further, there and back")  # fmt: skip
+                            f"{went}. {more}")  # fmt: skip
     mus, axis = np.array(mus), np.linalg.svd(np.array(ways), full_matrices=False)[2][0]
     forth = np.array(ways) @ axis > 0
     way = sum(float(np.linalg.norm(places[b] - places[a])) for a, b in pairwise(slid) if b == a + 1)
@@ -299,6 +305,8 @@ def fit_relaxation(toucher: Toucher, press: Sequence[Contact], relaxation: Prony
         rows.append((touch.force, -long * float(shares @ relaxed)))
         forces.append(float(one.wrench[:3] @ normal))
         when.append(one.time)
+    if not rows and press:
+        return _no_fading(WRONG_WAY)
     if len(rows) < MIN_INSTANTS:
         return _no_fading(f"the tool stayed where it pressed for {len(rows)} instants, {MIN_INSTANTS} are needed. "
                           "Press, and hold")  # fmt: skip
@@ -316,8 +324,7 @@ def _faded(rows: np.ndarray, forces: np.ndarray, when: np.ndarray, shares: np.nd
     (stiff, eased), *_ = np.linalg.lstsq(root * rows, root[:, 0] * forces, rcond=None)
     largest, whole = float(forces.max()), float(when[-1] - when[0])
     if not (stiff > 0 and largest > 0):
-        return _no_fading("no force points into the skin where the poses touch it: is it what the tool exerts on the "
-                          "body, and are the poses right?")  # fmt: skip
+        return _no_fading(WRONG_WAY)
     left = root[:, 0] * (forces - rows @ (stiff, eased))
     residual = float(np.sqrt(np.mean(left**2))) / largest
     normal = np.linalg.inv(rows.T @ (root**2 * rows) / len(rows) + 1e-12 * np.eye(2) * float((rows**2).mean()))

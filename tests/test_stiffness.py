@@ -76,6 +76,17 @@ def test_noise_and_a_few_wrong_forces_change_little(toucher, pressed):
         assert found.offset == pytest.approx(1e-3, abs=2e-4)
 
 
+@pytest.mark.parametrize("wrong, ok", [(0, True), (2, True), (5, False)])
+def test_presses_that_fit_to_no_stiffness_of_the_others_are_told_and_many_of_them_refused(toucher, pressed, wrong, ok):
+    """Five of twelve with ten times the force were a residual of 3 %, and nothing said."""
+    given = presses(pressed, times=2)
+    several = presses([(pose, 10 * wrench) for pose, wrench in pressed], times=2)
+    odd = np.random.default_rng(1).permutation(12)[:wrong]
+    found = fit_stiffness(toucher, [several[k] if k in odd else one for k, one in enumerate(given)])
+    assert found.trust.ok == ok and found.presses == 12
+    assert (f"{wrong} of 12 presses do not fit" in found.trust.why) == bool(wrong)
+
+
 def test_the_answer_does_not_depend_on_the_stiffness_that_was_taken_before(toucher, pressed):
     given = presses(pressed, back=1e-3)
     found, again = fit_stiffness(toucher, given), fit_stiffness(toucher_on(LAYER.with_(youngs_modulus=5e4)), given)

@@ -92,6 +92,19 @@ def test_a_force_the_wrong_way_round_is_no_friction(toucher: Toucher) -> None:
     assert not found.trust.ok and "against the tool's way" in found.trust.why
 
 
+def test_what_never_pressed_is_told_so_and_what_has_too_few_instants(toucher: Toucher) -> None:
+    """They were told to stroke further, and to hold."""
+    stroke, press = measured(*wiped(0.02, True), 0.4), measured(*held(5.0), None, SERIES)
+    for fit, contacts in ((fit_friction, stroke), (fit_relaxation, press)):
+        pulled = [replace(one, wrench=np.zeros(6) if one.wrench is None else -one.wrench) for one in contacts]
+        in_mm = [replace(one, pose_body_from_tool=at(*(1e3 * one.pose_body_from_tool[:3, 3]))) for one in contacts]
+        for given in (pulled, in_mm):
+            found = fit(toucher, given)
+            assert not found.trust.ok and "no force points into the skin where the poses touch" in found.trust.why
+    few = fit_friction(toucher, stroke[:110:12])
+    assert not few.trust.ok and few.trust.why.endswith("Tell more instants of the stroke")
+
+
 def test_a_tool_that_slides_freely_has_no_friction_to_be_found(toucher: Toucher) -> None:
     """It was told that its force points the wrong way."""
     for friction, noise in ((None, 0.0), (0.0, 0.02)):
