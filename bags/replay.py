@@ -64,6 +64,7 @@ class ReplaySummary:
         gap: truth of the claim that one of these came after an answer that was: the recording was not just begun late.
         why: sentence that tells why the first of these cannot; empty: all can.
         changed: packages with another version now than when the run was recorded, "numpy 2.4 -> 2.5".
+        held: truth of the claim that it is held to the tolerance; not where a method was named, to see how far off.
     """
 
     method: str
@@ -78,14 +79,16 @@ class ReplaySummary:
     gap: bool
     why: str
     changed: tuple[str, ...]
+    held: bool = True
 
     @property
     def passed(self) -> bool:
-        """Whether no frame is past the tolerance, and none was left out but at the start."""
-        return self.first_difference is None and not self.gap
+        """Whether no frame is past the tolerance, and none was left out but at the start, or it is held to nothing."""
+        return not self.held or (self.first_difference is None and not self.gap)
 
     def __str__(self) -> str:
         held = f"held to {f'{self.tolerance * 1e3:.3g} mm' if self.tolerance else 'every bit'}, since {self.reason}"
+        held = held if self.held else "held to nothing, since a method was named"
         each = f"{self.method}, {self.remembering} from a state" if self.remembering else self.method
         lost = f" {self.left_out} more were left out: {self.why}" * bool(self.left_out)
         if self.identical == self.frames:
@@ -93,7 +96,9 @@ class ReplaySummary:
         off = (f"{self.frames - self.identical} of {self.frames} frames replayed with {each} differ, "
                f"by up to {self.worst * 1e3:.3g} mm; {held}")  # fmt: skip
         note = f" Changed since: {', '.join(self.changed)}." if self.changed else ""
-        past = "." if self.first_difference is None else f"; number {self.first_difference} is the first past it.{note}"
+        past = f"; number {self.first_difference} is the first past it.{note}"
+        if self.first_difference is None or not self.held:
+            past = "."
         return off + past + lost
 
 

@@ -85,7 +85,8 @@ class Batch:
         if not all(isinstance(skin, Skin) for skin in self.skins):
             raise InvalidInput("a batch needs prepared skins. Try Skin.of(layer, MomentNet()).")
         if not isinstance(count, Integral) or count < 1:
-            raise InvalidInput(f"a batch is asked for {count} scenes; at least one scene is needed.")
+            raise InvalidInput(f"a batch is asked for {count} scenes; a whole number of at least one is "
+                               "needed.")  # fmt: skip
         if len(self.skins) != count:
             raise InvalidInput(f"{len(self.skins)} skins do not fit {count} scenes: give one, or one for each.")
         if not all(isinstance(tool, Tool) for tool in self.tools):

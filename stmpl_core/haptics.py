@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, fields
-from numbers import Integral
+from numbers import Integral, Real
 from typing import NamedTuple
 
 import numba
@@ -52,7 +52,7 @@ class LoopSettings:
     def __post_init__(self) -> None:
         for name in (f.name for f in fields(self) if f.name not in ("controller", "delay_steps")):
             value, least = getattr(self, name), name in ("coupling_damping", "most_damping", "velocity_noise", "blend")
-            if not (math.isfinite(value) and (value > 0 or (least and value == 0))):
+            if not (isinstance(value, Real) and math.isfinite(value) and (value > 0 or (least and value == 0))):
                 raise InvalidInput(f"{name} is {value}; it must be finite and {'at least' if least else 'above'} 0.")
         if not isinstance(self.delay_steps, Integral) or not 0 <= self.delay_steps < LONGEST_DELAY:
             raise InvalidInput(f"delay_steps is {self.delay_steps}; allowed are whole numbers, 0..{LONGEST_DELAY - 1}.")

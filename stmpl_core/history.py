@@ -37,6 +37,7 @@ PILED = 0.5  # of drag^2 / force: error of skin that piles up; 0.7 of it on a ba
 LOST = 0.5  # of what skin carries along itself: what is gone once all of it slides; 0.4 to 0.6 by slides on a forearm
 ROUND = 0.5  # of a drag and the thickness over the radius it goes around: its error on one material; 0.4 by one tube
 MOST_DRAGGED = 0.9  # way by which sticking skin is dragged along, over the thickness, up to which it was tried
+ELSEWHERE = 3.0  # thicknesses around a skin within which a contact on it lies, whatever presses
 STRAYED = 0.03  # of the elastic force: part of the memory from touches out of range, beyond which an answer is, too
 NONE, NO_ROOM = np.zeros(6), np.zeros(3)
 
@@ -71,7 +72,15 @@ class History:
         """The same history where joints take the skin."""
         out = copy(self)
         out.toucher = toucher
+        out.__dict__.pop("_box", None)
         return out
+
+    @cached_property
+    def _box(self) -> tuple[list[float], list[float]]:
+        """Corners of a box that holds every contact on this skin [m]."""
+        layer = self.toucher.layer
+        around = ELSEWHERE * float(layer.thickness.max())
+        return (layer.vertices.min(axis=0) - around).tolist(), (layer.vertices.max(axis=0) + around).tolist()
 
     def friction(self, name: str) -> float:
         """Coefficient of friction of a tool [-]."""
@@ -92,6 +101,12 @@ class History:
             if len(memory.relaxed) != len(self.series.times):
                 raise InvalidInput(f"the state of {name} is of skin with {len(memory.relaxed)} times of relaxation; "
                                    f"this layer has {len(self.series.times)}. Try an empty State().")  # fmt: skip
+            if memory.scalars.radius > 0:
+                low, high = self._box
+                if not all(a <= x <= b for a, x, b in zip(low, memory.contact[0].tolist(), high, strict=True)):
+                    where = memory.contact[0].round(3).tolist()
+                    raise InvalidInput(f"the state of {name} is of a contact at {where} m, where this skin is not. Is "
+                                       "it of another skin? Try an empty State().")  # fmt: skip
         asked = [self._asked(contact, state.tools.get(contact.name), dt) for contact in contacts]
         tried = {one.stated.name: one.moved for one in asked if one.moved is not None}
         touches = self.toucher.touch_all([one.contact for one in asked], alone=False, tried=tried)

@@ -203,7 +203,7 @@ class SoftLayer:
                 f"E {self.tissue.youngs_modulus:g} Pa, nu {self.tissue.poisson_ratio:g}{more})")
 
 
-def single(layer: SoftLayer, who: str, *, straight: bool = True) -> SoftLayer:
+def single(layer: SoftLayer, who: str, *, straight: bool = True, instead: str = " PatchFem knows these.") -> SoftLayer:
     """The layer, for those who know one material only, and columns straight below the skin unless `straight` is False.
 
     Raises:
@@ -218,7 +218,7 @@ def single(layer: SoftLayer, who: str, *, straight: bool = True) -> SoftLayer:
         more.append("columns that run to a core of their own")
     if more:
         raise InvalidInput(f"{who} knows one soft material{' straight below the skin' * straight}; this layer has "
-                           f"{', '.join(more)}. PatchFem knows these.")
+                           f"{', '.join(more)}.{instead}")
     return layer
 
 

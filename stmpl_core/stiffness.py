@@ -88,7 +88,7 @@ def fit_stiffness(toucher: Toucher, presses: Sequence[Contact]) -> Stiffness:
     Raises:
         InvalidInput: a press without a wrench, or a layer of several materials: one number does not scale them.
     """
-    single(toucher.layer, "the fit of a stiffness", straight=False)
+    single(toucher.layer, "the fit of a stiffness", straight=False, instead="")
     for press in presses:
         if press.wrench is None:
             raise InvalidInput(f"a press of {press.name} has no wrench; stiffness needs the force.")

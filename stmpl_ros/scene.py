@@ -16,7 +16,8 @@ if TYPE_CHECKING:
     from stmpl_core.living import Model
     from stmpl_core.needs import Needs
 
-OWN = ("modulus", "skin_modulus", "skin_thickness", "tension", "muscle_modulus", "muscle_depth")
+OWN = ("modulus", "nu", "skin_modulus", "skin_thickness", "tension", "muscle_modulus", "muscle_depth")
+NU = 0.45  # Poisson's ratio of soft tissue, of which nothing else was said
 LEAST_MM = 0.2  # least length of a scene [mm]: what is told in metres is smaller
 
 
@@ -43,7 +44,7 @@ class SceneConfig(BaseModel):
     thickness: float | None = Field(default=None, description="thickness from skin to bone [mm], of a tissue of your "
                                     "own instead of a region")  # fmt: skip
     modulus: float | None = Field(default=None, description="Young's modulus of its first material [kPa]")
-    nu: float = Field(default=0.45, description="Poisson's ratio of its materials")
+    nu: float | None = Field(default=None, description=f"Poisson's ratio of its materials; {NU} unless given")
     skin_modulus: float | None = Field(default=None, description="Young's modulus of its skin [kPa]; none: no skin")
     skin_thickness: float | None = Field(default=None, description="thickness of its skin [mm]")
     tension: float | None = Field(default=None, description="tension of its skin [N/m]")
@@ -111,7 +112,10 @@ class SceneConfig(BaseModel):
 
             part = region(self.part, self.tone)
             return part.tissue, part.thickness
-        modulus = self._with("modulus", "thickness")
+        if self.tone != "relaxed":
+            raise InvalidInput("--tone is that of a region's muscle; leave it out, or give --part instead of "
+                               "--thickness.")  # fmt: skip
+        modulus, nu = self._with("modulus", "thickness"), NU if self.nu is None else self.nu
         skin, deeper = None, ()
         if {"skin_modulus", "skin_thickness", "tension"} & set(given):
             skin = Membrane(self._with("skin_modulus", "a skin") * 1e3, self._with("skin_thickness", "a skin") * 1e-3,
@@ -122,8 +126,8 @@ class SceneConfig(BaseModel):
                 raise InvalidInput(f"--muscle-depth is {depth:g} mm; it must be less than --thickness, {thickness:g} "
                                    "mm, where the bone begins.")  # fmt: skip
             modulus_of_muscle = self._with("muscle_modulus", "a muscle")
-            deeper = (Ply(depth * 1e-3, modulus_of_muscle * 1e3, self.nu, "muscle"),)
-        return Tissue(modulus * 1e3, self.nu, skin=skin, deeper=deeper), (self.thickness or 0.0) * 1e-3
+            deeper = (Ply(depth * 1e-3, modulus_of_muscle * 1e3, nu, "muscle"),)
+        return Tissue(modulus * 1e3, nu, skin=skin, deeper=deeper), (self.thickness or 0.0) * 1e-3
 
     def _with(self, name: str, what: str) -> float:
         value = getattr(self, name)

@@ -100,6 +100,9 @@ class MassageEnv(gymnasium.Env[np.ndarray, np.ndarray]):
                 raise InvalidInput("a Simulator has its own friction and relaxation: give a layer, or neither.")
             ready, layer = layer, layer.layer
         else:
+            if layer is not None and not isinstance(layer, SoftLayer):
+                raise InvalidInput(f"layer is {layer!r:.40}; a SoftLayer or a Simulator is needed. Try "
+                                   "living(Body.anny(), 'left_forearm').")  # fmt: skip
             ready, layer = None, _skin(layer, relaxing)
         site = Site.thickest(layer)
         self._scene = build(layer, site, robot=robot, end=end, at=at, mount="animated", timestep=timestep)

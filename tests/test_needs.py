@@ -227,6 +227,8 @@ def test_the_verb_takes_a_tissue_of_ones_own(capsys):
         (("--part", "knee"), "no region 'knee'"),
         (("--part", "back", "--thickness", 20), "one of them"),
         (("--part", "back", "--tension", 20), "--tension"),
+        (("--part", "back", "--nu", 0.5), "leave --nu out"),
+        (("--thickness", 20, "--modulus", 10, "--tone", "tensed"), "--tone is that of a region's muscle"),
         (("--thickness", 20, "--modulus", 3, "--tension", 20), "--skin-modulus"),
         (("--part", "back", "--radius", 20, 40, 60), "--radius has 3 values; give one, or two for a range"),
         (("--thickness", 30, "--modulus", 3, "--muscle-modulus", 10, "--muscle-depth", 40), "--muscle-depth is 40 mm"),

@@ -364,6 +364,11 @@ def test_a_state_of_other_skin_is_refused(sim: Simulator, elastic: Simulator) ->
     _, state = elastic.touch([pressed(2e-3)], State(), 0.1)
     with pytest.raises(InvalidInput, match="times of relaxation"):
         sim.touch([pressed(2e-3)], state, 0.1)
+    _, state = sim.touch([pressed(2e-3)], State(), 0.1)
+    far = {name: one._replace(contact=one.contact + [[0.5, 0, 0], [0, 0, 0], [0, 0, 0]])
+           for name, one in state.tools.items()}  # fmt: skip
+    with pytest.raises(InvalidInput, match="where this skin is not. Is it of another skin"):
+        sim.touch([pressed(2e-3)], State(far), 0.1)
 
 
 def test_time_without_end_is_refused(sim: Simulator) -> None:

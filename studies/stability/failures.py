@@ -20,7 +20,9 @@ def save(folder: Path, trial: Trial, method: str, found: dict[str, Any]) -> Path
     arrays = folder / f"{stem}.npz"
     if not arrays.exists():
         np.savez_compressed(arrays, **trial.arrays())  # type: ignore[arg-type]
-    card = {"method": method, "arrays": arrays.name, "trial": trial.card(), "found": found}
+    place, of, name = method.partition(":")
+    from_anywhere = f"{Path(place).resolve()}{of}{name}" if place.endswith(".py") else method
+    card = {"method": from_anywhere, "arrays": arrays.name, "trial": trial.card(), "found": found}
     path = folder / f"{stem}.{_plain(method)}.json"
     path.write_text(json.dumps(card, indent=1) + "\n")
     return path

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import logging
 import time
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
@@ -89,6 +90,12 @@ class Report:
             row = cell[first]
             summary |= {"failed_at": row.level, "law": ", ".join(b.law for b in row.broken), "outcome": row.outcome}
         return summary
+
+    def crashes(self, method: str) -> list[str]:
+        """What a method's crashes said, each once, with how often."""
+        said = Counter(b.measured for row in self.rows if row.method == method and row.outcome == "crashed"
+                       for b in row.broken if b.measured.startswith("crashed"))  # fmt: skip
+        return [f"{why:.200} ({many} times)" for why, many in said.most_common()]
 
     def as_dict(self) -> dict[str, Any]:
         """For JSON: counts, summary of each method and axis, every trial."""
