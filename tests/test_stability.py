@@ -305,7 +305,8 @@ def test_report_table_and_picture_hold_every_method_and_axis(run):
     assert stability_table(report, out).row_count == len(report.axes) + 4
     page = stability_markdown(report)
     assert all(f"| {axis} |" in page for axis in report.axes) and "| crashed |" in page
-    assert "silent at 0.1 E: finite" in page and re.search(r"^- crashing: crashed: KeyError\(.*\) \(\d+ times\)", page, re.M)
+    assert "silent at 0.1 E: finite" in page
+    assert re.search(r"^- crashing: crashed: KeyError\(.*\) \(\d+ times\)", page, re.MULTILINE)
     assert draw(report, out / "stability.png").read_bytes().startswith(b"\x89PNG")
 
 
