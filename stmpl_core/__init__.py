@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 from importlib import import_module
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
+
+from stmpl_core.kernels import forget_old
 
 if TYPE_CHECKING:
     from stmpl_core.contact import Contact
@@ -27,6 +30,11 @@ _HOME = {"Answer": "touch", "Contact": "contact", "Displacement": "trust", "Join
          "Skin": "skin", "SoftLayer": "layer",
          "State": "state", "Tissue": "tissue", "Tool": "tool", "Tools": "tools",
          "Touch": "touch", "Trust": "trust"}  # fmt: skip
+_ON_CORE = ("fem_tools", "stmpl_sim")  # packages beside this one whose kernels are made from its
+
+
+forget_old([folder for folder in (Path(__file__).parent, *map(Path(__file__).parents[1].joinpath, _ON_CORE))
+            if folder.is_dir()])  # fmt: skip
 
 
 def __getattr__(name: str) -> Any:
