@@ -52,7 +52,8 @@ class LoopSettings:
     def __post_init__(self) -> None:
         for name in (f.name for f in fields(self) if f.name not in ("controller", "delay_steps")):
             value, least = getattr(self, name), name in ("coupling_damping", "most_damping", "velocity_noise", "blend")
-            if not (isinstance(value, Real) and math.isfinite(value) and (value > 0 or (least and value == 0))):
+            number = float(value) if isinstance(value, Real) else math.nan
+            if not (math.isfinite(number) and (number > 0 or (least and number == 0))):
                 raise InvalidInput(f"{name} is {value}; it must be finite and {'at least' if least else 'above'} 0.")
         if not isinstance(self.delay_steps, Integral) or not 0 <= self.delay_steps < LONGEST_DELAY:
             raise InvalidInput(f"delay_steps is {self.delay_steps}; allowed are whole numbers, 0..{LONGEST_DELAY - 1}.")

@@ -516,8 +516,8 @@ class Toucher:
         for why in self._unlearnt:
             trust = trust.also(why, in_range=False)
         if strange > MAX_UNSEEN_FORCE_SHARE:
-            trust = trust.also(f"{strange:.0%} of the force of {name} is where no training contact was like it",
-                               in_range=False)  # fmt: skip
+            trust = trust.also(f"{strange:.0%} of the force of {name} is where no training contact was like it"
+                               f"{self._too_thick(touch)}", in_range=False)  # fmt: skip
         far = one.force is not None and abs(one.moved) > self.reach
         if far and abs(one.moved) > MUCH_MOVED * float(one.squeeze.nodes.thickness.max()):
             trust = trust.also(f"{name} was moved {one.moved * 1e3:+.1f} mm along its force: check its calibration")
@@ -535,6 +535,18 @@ class Toucher:
         if one.field.flipped:
             trust = trust.also(f"the mesh of {name} was inside out and was turned")
         return trust
+
+    def _too_thick(self, touch: Touch) -> str:
+        """What is said of columns that run along the normals to beyond the middle of a limb; empty: they do not."""
+        pressed = touch.pressed
+        if self.layer.core is not None or pressed is None or pressed.forces is None or not pressed.forces.any():
+            return ""
+        nodes = pressed.squeeze.nodes
+        bent = float(np.linalg.eigvalsh(self.curvature(nodes, pressed.forces))[-1])
+        thick = float(nodes.thickness @ pressed.forces / pressed.forces.sum())
+        if bent * thick <= 1:
+            return ""
+        return f": the layer is {1e3 * thick:.0f} mm thick, and {1e3 / bent:.0f} mm below the skin is the limb's middle"
 
     def unmet(self, trust: Trust, touch: Touch, stated: np.ndarray | None) -> Trust:
         """The trust in a touch, lowered where much of the stated wrench (6,) is not carried."""

@@ -131,6 +131,13 @@ def test_what_is_too_much_of_a_push_is_not_said_to_be_drag(sim: Simulator) -> No
         assert found.drag == pytest.approx(along, abs=0.02 * 40)
 
 
+@pytest.mark.parametrize("thickness, said", [(0.035, False), (0.047, True)])
+def test_a_layer_thicker_than_the_limb_is_told_so(thickness: float, said: bool) -> None:
+    found = felt(Toucher(limb(4e-3, thickness)), BALL, on_limb(), None)
+    assert not found.trust.in_range
+    assert ("the layer is 47 mm thick, and 40 mm below the skin is the limb's middle" in found.trust.why) == said
+
+
 def test_more_force_presses_deeper_and_on_more_skin(toucher: Toucher) -> None:
     touches = [felt(toucher, BALL, on_limb(), (-f, 0, 0)) for f in (0.02, 0.06, 0.2, 0.6)]
     for less, more in pairwise(touches):
