@@ -541,12 +541,13 @@ class Toucher:
         pressed = touch.pressed
         if self.layer.core is not None or pressed is None or pressed.forces is None or not pressed.forces.any():
             return ""
-        nodes = pressed.squeeze.nodes
-        bent = float(np.linalg.eigvalsh(self.curvature(nodes, pressed.forces))[-1])
-        thick = float(nodes.thickness @ pressed.forces / pressed.forces.sum())
-        if bent * thick <= 1:
+        vertex = int(pressed.squeeze.nodes.corners[int(pressed.forces.argmax()), 0])
+        xx, xy, yy = self.near.curvature[vertex].tolist()
+        bent, thick = 0.5 * (xx + yy) + math.hypot(0.5 * (xx - yy), xy), float(self.near.thickness[vertex])
+        if bent <= 1:
             return ""
-        return f": the layer is {1e3 * thick:.0f} mm thick, and {1e3 / bent:.0f} mm below the skin is the limb's middle"
+        return (f": the layer is {1e3 * thick:.0f} mm thick, and {1e3 * thick / bent:.0f} mm below the skin is the "
+                "limb's middle")  # fmt: skip
 
     def unmet(self, trust: Trust, touch: Touch, stated: np.ndarray | None) -> Trust:
         """The trust in a touch, lowered where much of the stated wrench (6,) is not carried."""

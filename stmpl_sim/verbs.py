@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, cast, get_args
 
@@ -130,6 +131,7 @@ def fmu(out: Path = Path("runs")) -> int:
     return 0
 
 
+@lru_cache(maxsize=2)
 def limb(part: str, tissue: str, relaxing: bool = False, phenotype: str = "") -> SoftLayer:
     """A part of a body. Raises InvalidInput: no such part, tissue or phenotype."""
     from stmpl_core.body import Body, phenotype_from
