@@ -64,7 +64,8 @@ def made_from(source: bytes) -> str:
         tree = ast.parse(source)
     except SyntaxError:
         return ""
-    compiled = any(isinstance(node, ast.FunctionDef) and node.decorator_list for node in tree.body)
+    compiled = any("jit" in ast.unparse(one) for node in tree.body if isinstance(node, ast.FunctionDef)
+                   for one in node.decorator_list)  # fmt: skip
     kinds = (ast.Assign, ast.AnnAssign, *([ast.Import, ast.ImportFrom, ast.FunctionDef] if compiled else []))
     kept: list[ast.AST] = []
     for node in tree.body:

@@ -13,6 +13,7 @@ HELPER = "import numba\nBY = 2\n@numba.njit(cache=True)\ndef helped(x):\n    ret
 CALLER = (
     "import numba\nfrom core.helper import helped\n@numba.njit(cache=True)\ndef asked(x):\n    return helped(x) + 1\n"
 )
+KEPT = "from functools import cache\n@cache\ndef plain():\n    return 2\n"
 PLAIN = "def plain():\n    return 1\n"
 ASK = (
     "from pathlib import Path\nfrom stmpl_core.kernels import forget_old\nforget_old([Path('core'), Path('more')])\n"
@@ -43,7 +44,7 @@ def kept(packages: list[Path]) -> bool:
 @pytest.mark.parametrize("name, source, stays", [
     ("helper", HELPER.replace("BY = 2", "BY = 3"), False), ("helper", HELPER.replace("BY * x", "BY + x"), False),
     ("helper", HELPER.replace("return", '\"\"\"Told.\"\"\"\n    return'), True), ("helper", HELPER + "# said\n", True),
-    ("plain", PLAIN.replace("1", "2"), True), ("plain", PLAIN + "MOST = 3\n", False), ("plain", "def (", True),
+    ("plain", PLAIN.replace("1", "2"), True), ("plain", KEPT, True), ("plain", PLAIN + "MOST = 3\n", False), ("plain", "def (", True),
     ("other", HELPER, False),
 ])  # fmt: skip
 def test_kernels_go_where_what_they_are_made_from_changed_anywhere_and_stay_else(packages, name, source, stays):
