@@ -44,8 +44,8 @@ def kept(packages: list[Path]) -> bool:
 @pytest.mark.parametrize("name, source, stays", [
     ("helper", HELPER.replace("BY = 2", "BY = 3"), False), ("helper", HELPER.replace("BY * x", "BY + x"), False),
     ("helper", HELPER.replace("return", '\"\"\"Told.\"\"\"\n    return'), True), ("helper", HELPER + "# said\n", True),
-    ("plain", PLAIN.replace("1", "2"), True), ("plain", KEPT, True), ("plain", PLAIN + "MOST = 3\n", False), ("plain", "def (", True),
-    ("other", HELPER, False),
+    ("plain", PLAIN.replace("1", "2"), True), ("plain", KEPT, True), ("plain", PLAIN + "MOST = 3\n", False),
+    ("plain", "def (", True), ("other", HELPER, False),
 ])  # fmt: skip
 def test_kernels_go_where_what_they_are_made_from_changed_anywhere_and_stay_else(packages, name, source, stays):
     assert kept(packages) and kept(packages)
