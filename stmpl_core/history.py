@@ -76,11 +76,11 @@ class History:
         return out
 
     @cached_property
-    def _box(self) -> tuple[list[float], list[float]]:
-        """Corners of a box that holds every contact on this skin [m]."""
+    def _box(self) -> list[float]:
+        """The lowest and the highest corner of a box that holds every contact on this skin, (6,) [m]."""
         layer = self.toucher.layer
         around = ELSEWHERE * float(layer.thickness.max())
-        return (layer.vertices.min(axis=0) - around).tolist(), (layer.vertices.max(axis=0) + around).tolist()
+        return [*(layer.vertices.min(axis=0) - around).tolist(), *(layer.vertices.max(axis=0) + around).tolist()]
 
     def friction(self, name: str) -> float:
         """Coefficient of friction of a tool [-]."""
@@ -102,11 +102,10 @@ class History:
                 raise InvalidInput(f"the state of {name} is of skin with {len(memory.relaxed)} times of relaxation; "
                                    f"this layer has {len(self.series.times)}. Try an empty State().")  # fmt: skip
             if memory.scalars.radius > 0:
-                low, high = self._box
-                if not all(a <= x <= b for a, x, b in zip(low, memory.contact[0].tolist(), high, strict=True)):
-                    where = memory.contact[0].round(3).tolist()
-                    raise InvalidInput(f"the state of {name} is of a contact at {where} m, where this skin is not. Is "
-                                       "it of another skin? Try an empty State().")  # fmt: skip
+                (x, y, z), (a, b, c, d, e, f) = memory.contact[0].tolist(), self._box
+                if not (a <= x <= d and b <= y <= e and c <= z <= f):
+                    raise InvalidInput(f"the state of {name} is of a contact at {x:.3f}, {y:.3f}, {z:.3f} m, where this "
+                                       "skin is not. Is it of another skin? Try an empty State().")  # fmt: skip
         asked = [self._asked(contact, state.tools.get(contact.name), dt) for contact in contacts]
         tried = {one.stated.name: one.moved for one in asked if one.moved is not None}
         touches = self.toucher.touch_all([one.contact for one in asked], alone=False, tried=tried)
