@@ -104,8 +104,8 @@ class History:
             if memory.scalars.radius > 0:
                 (x, y, z), (a, b, c, d, e, f) = memory.contact[0].tolist(), self._box
                 if not (a <= x <= d and b <= y <= e and c <= z <= f):
-                    raise InvalidInput(f"the state of {name} is of a contact at {x:.3f}, {y:.3f}, {z:.3f} m, where this "
-                                       "skin is not. Is it of another skin? Try an empty State().")  # fmt: skip
+                    raise InvalidInput(f"the state of {name} is of a contact at {x:.3f}, {y:.3f}, {z:.3f} m, where "
+                                       "this skin is not. Is it of another skin? Try an empty State().")  # fmt: skip
         asked = [self._asked(contact, state.tools.get(contact.name), dt) for contact in contacts]
         tried = {one.stated.name: one.moved for one in asked if one.moved is not None}
         touches = self.toucher.touch_all([one.contact for one in asked], alone=False, tried=tried)
