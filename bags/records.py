@@ -164,7 +164,9 @@ def _mapped(path: Path | str) -> Iterator[mmap.mmap]:
     file = bag_file(path)
     try:
         with open(file, "rb") as stream:
-            if stream.read(len(MAGIC)) != MAGIC:
+            if not (first := stream.read(len(MAGIC))):
+                raise BagError(f"{file} is empty.")
+            if first != MAGIC:
                 raise BagError(f"{file} is no MCAP file: its first {len(MAGIC)} bytes are not MCAP's.")
             with mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ) as data:
                 yield data

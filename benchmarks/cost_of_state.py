@@ -10,6 +10,7 @@ caches what the other just did; medians. On the forearm also of whole steps, whi
 
 from __future__ import annotations
 
+import argparse
 import time
 from collections.abc import Sequence
 
@@ -85,6 +86,7 @@ def scenes(simulator: Simulator, tool: Tool, height: float, depth: float,
 
 def main() -> None:
     """Prints the table."""
+    argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter).parse_args()
     table = Table("tool", "depth in mm", "tissue", "by pose", "by wrench", "by wrench, pose off",
                   title="processor time with a state over an elastic touch (and that in us)")  # fmt: skip
     for kind in KINDS:

@@ -7,6 +7,7 @@ Everything runs in one process on one thread and side by side, so that ratios ho
 
 from __future__ import annotations
 
+import argparse
 import platform
 import time
 from collections.abc import Callable
@@ -112,6 +113,7 @@ def scaling_picture(body: Body, path: Path) -> None:
 
 def main() -> None:
     """Prints the tables and writes the picture."""
+    argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter).parse_args()
     threadpool_limits(1)
     plt.switch_backend("agg")
     console, body = Console(), Body.anny()

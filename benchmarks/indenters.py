@@ -7,6 +7,7 @@ Only the ratios of lengths and of p to E matter, so a thin layer stands for a la
 
 from __future__ import annotations
 
+import argparse
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -291,6 +292,7 @@ def picture(ways: list[Way], path: Path) -> None:
 
 def main() -> None:
     """Prints the tables and writes the picture."""
+    argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter).parse_args()
     threadpool_limits(1)
     plt.switch_backend("agg")
     console = Console()

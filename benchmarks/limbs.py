@@ -168,13 +168,14 @@ def compare(released: Released, splits: Sequence[str], names: tuple[str, ...], o
     """
     found: dict[str, list[Off]] = defaultdict(list)
     refused: dict[str, list[str]] = defaultdict(list)
-    samples = [one for split in splits for one in released.samples(split)
-               if slant_of(one) <= STRAIGHT and one.info["body"].startswith(names)]  # fmt: skip
-    if balls:
-        samples = [one for one in samples if one.info["drawn"].get("tool") == "sphere"
-                   and PEER_AT[0] < one.info["ratio"] < PEER_AT[1]]  # fmt: skip
     laws, last = None, None
     with steps_bar("scenes") as show:
+        show(0, 1, "reading")
+        samples = [one for split in splits for one in released.samples(split)
+                   if slant_of(one) <= STRAIGHT and one.info["body"].startswith(names)]  # fmt: skip
+        if balls:
+            samples = [one for one in samples if one.info["drawn"].get("tool") == "sphere"
+                       and PEER_AT[0] < one.info["ratio"] < PEER_AT[1]]  # fmt: skip
         for k, one in enumerate(pressed(samples)):
             if laws is None or last is not one.sample.layer:
                 laws, last = Laws(one.sample.layer, others), one.sample.layer
