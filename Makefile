@@ -21,7 +21,7 @@ demo: $(READY)  ## Run the main job: a robot massages a forearm over ROS 2, reco
 
 test: export NUMBA_NUM_THREADS = 1  # two processes have two cores; threads of their own would wait for each other
 test: $(READY_DEV)  ## Pass the tests, two at a time; print the slowest
-	$(BIN)/python -m tests.warm  # one process compiles: two at once round otherwise in the last bits
+	$(BIN)/python -m tests.warm  # kernels are there before two processes ask: what each compiles rounds otherwise in the last bits
 	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder $(TESTS)
 
 coverage: TESTS = --cov --cov-report=
