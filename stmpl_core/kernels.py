@@ -26,21 +26,16 @@ def forget_old(packages: Sequence[Path]) -> bool:
             elsewhere then.
     """
     stamp = packages[0] / "__pycache__" / STAMP
-    known: dict[str, list] = {}
-    try:
-        stamp.parent.mkdir(exist_ok=True)
-        known = json.loads(stamp.read_text())
-    except FileNotFoundError:
-        pass
-    except (OSError, ValueError):
-        known = {}
+    known = _read(stamp)
     found: dict[str, list] = {}
     for folder in packages:
         for file in _sources(folder):
             about, name = file.stat(), file.path.removeprefix(str(folder.parent))
             when, before = [about.st_mtime_ns, about.st_size], known.get(name, [])
             found[name] = before if before[:2] == when else [*when, made_from(Path(file.path).read_bytes())]
-    if found == known or not os.access(stamp.parent, os.W_OK):
+    with suppress(OSError):
+        stamp.parent.mkdir(exist_ok=True)
+    if found in (known, _read(stamp)) or not os.access(stamp.parent, os.W_OK):  # another process may have been quicker
         return False
     codes = [{name: one[2] for name, one in files.items() if one[2]} for files in (found, known)]
     changed = codes[0] != codes[1]
@@ -49,10 +44,18 @@ def forget_old(packages: Sequence[Path]) -> bool:
             for folder in packages:
                 for old in folder.rglob("*.nb[ic]"):
                     old.unlink(missing_ok=True)
-        new = stamp.with_suffix(f".{id(found)}")
+        new = stamp.with_suffix(f".{os.getpid()}")
         new.write_text(json.dumps(found))
         new.replace(stamp)
     return changed
+
+
+def _read(stamp: Path) -> dict[str, list]:
+    try:
+        read = json.loads(stamp.read_text())
+        return {name: [int(when), int(size), str(code)] for name, (when, size, code) in read.items()}
+    except (OSError, ValueError, TypeError, AttributeError):
+        return {}
 
 
 def made_from(source: bytes) -> str:

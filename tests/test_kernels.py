@@ -68,6 +68,7 @@ def test_a_caller_in_a_file_that_did_not_change_is_compiled_anew(packages):
 
 def test_a_broken_stamp_is_none_and_a_folder_that_cannot_be_written_is_left(packages):
     stamp = packages[0] / "__pycache__" / STAMP
-    stamp.write_text("{")
-    assert not kept(packages) and kept(packages)
+    for broken in ("{", "[1]", '{"a": 1}', '{"a": [1, 2]}', '{"a": [1, [], 3]}'):
+        stamp.write_text(broken)
+        assert not kept(packages) and kept(packages)
     assert made_from(b"def (") == ""
