@@ -87,8 +87,9 @@ class ReplaySummary:
         return not self.held or (self.first_difference is None and not self.gap)
 
     def __str__(self) -> str:
-        held = f"held to {f'{self.tolerance * 1e3:.3g} mm' if self.tolerance else 'every bit'}, since {self.reason}"
-        held = held if self.held else "held to nothing, since a method was named"
+        held = "held to nothing, since a method was named"
+        if self.held:
+            held = f"held to {f'{self.tolerance * 1e3:.3g} mm' if self.tolerance else 'every bit'}, since {self.reason}"
         each = f"{self.method}, {self.remembering} from a state" if self.remembering else self.method
         lost = f" {self.left_out} more were left out: {self.why}" * bool(self.left_out)
         if self.identical == self.frames:
@@ -96,9 +97,8 @@ class ReplaySummary:
         off = (f"{self.frames - self.identical} of {self.frames} frames replayed with {each} differ, "
                f"by up to {self.worst * 1e3:.3g} mm; {held}")  # fmt: skip
         note = f" Changed since: {', '.join(self.changed)}." if self.changed else ""
-        past = f"; number {self.first_difference} is the first past it.{note}"
-        if self.first_difference is None or not self.held:
-            past = "."
+        within = self.first_difference is None or not self.held
+        past = "." if within else f"; number {self.first_difference} is the first past it.{note}"
         return off + past + lost
 
 

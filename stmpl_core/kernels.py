@@ -33,9 +33,11 @@ def forget_old(packages: Sequence[Path]) -> bool:
             about, name = file.stat(), file.path.removeprefix(str(folder.parent))
             when, before = [about.st_mtime_ns, about.st_size], known.get(name, [])
             found[name] = before if before[:2] == when else [*when, made_from(Path(file.path).read_bytes())]
+    if found == known:
+        return False
     with suppress(OSError):
         stamp.parent.mkdir(exist_ok=True)
-    if found in (known, _read(stamp)) or not os.access(stamp.parent, os.W_OK):  # another process may have been quicker
+    if found == _read(stamp) or not os.access(stamp.parent, os.W_OK):  # another process may have been quicker
         return False
     codes = [{name: one[2] for name, one in files.items() if one[2]} for files in (found, known)]
     changed = codes[0] != codes[1]

@@ -26,6 +26,8 @@ OFFSET_PENALTY = 2e-3  # relative error of the forces up to which the smaller of
 MAX_RESIDUAL = 0.15  # relative error of the forces that may be left; with more it is no skin of one stiffness
 SET_ASIDE = 0.5  # weight below which a press that is off by more than MAX_RESIDUAL counts as set aside
 MAX_SET_ASIDE = 0.25  # share of the presses that may be
+WRONG_WAY = ("no force points into the skin where the poses touch it: is it what the tool exerts on the body, and are "
+             "the poses right, in metres?")  # fmt: skip
 DEVIATION = 1.25  # standard deviation of an error over the mean of its size, sqrt(pi / 2)
 MAX_RELATIVE_ERROR = 0.2  # standard error of the modulus over it
 HARDEST = 1e6  # Young's modulus above any soft layer's [Pa]: 8 times that of skin's sheet (stmpl_core.regions)
@@ -178,8 +180,7 @@ class _Presses:
         law, measured = self._law(offset)
         fit = self._fit(law, measured)
         if not fit.modulus > 0:
-            return _nothing("no force points into the skin where the poses touch it: is it what the tool exerts on "
-                            "the body, and are the poses right?")  # fmt: skip
+            return _nothing(WRONG_WAY)
         depths = [touch.depth for touch in touches if touch.force > 0]
         residual = float(np.sqrt(fit.cost))
         error = self._error(offset, fit, residual)

@@ -21,6 +21,7 @@ from stmpl_core.regions import HELD_SKIN
 from stmpl_core.relaxation import faded, fading, series_of, stretch, weights
 from stmpl_core.sideways import Sideways
 from stmpl_core.slip import MOST_LEAN, PLOUGHED, ploughing
+from stmpl_core.stiffness import WRONG_WAY
 from stmpl_core.tissue import Prony
 from stmpl_core.touch import Touch
 from stmpl_core.toucher import Toucher
@@ -40,8 +41,6 @@ OWN_FORCE = 0.01  # error of the law of relaxation while a tool stays, over the 
 STAYS = 3e-4  # way along the skin within which a tool stays [m]
 MAX_RESIDUAL = 0.06  # relative error of the forces that may be left; with more it is not that series
 MAX_SHARE_ERROR = 0.1  # standard error of the share of the force that fades [-]
-WRONG_WAY = ("no force points into the skin where the poses touch it: is it what the tool exerts on the body, and are "
-             "the poses right, in metres?")  # fmt: skip
 
 
 @dataclass(frozen=True)

@@ -537,7 +537,10 @@ class Toucher:
         return trust
 
     def _too_thick(self, touch: Touch) -> str:
-        """What is said of columns that run along the normals to beyond the middle of a limb; empty: they do not."""
+        """What is said of columns that run along the normals to beyond the middle of a limb; empty: they do not.
+
+        By the curvature at one vertex: `curvature` is compiled, and a flag must not wait for that.
+        """
         pressed = touch.pressed
         if self.layer.core is not None or pressed is None or pressed.forces is None or not pressed.forces.any():
             return ""

@@ -63,7 +63,7 @@ class Hearing:
         self.events = Events(self.gate.say)
         self.now = Ticks(node)
         self.frames = Frames(config().frame, read_frames(config().frames, config().frame), node)
-        self._patience = Patience(node, self.frames, self.gate, lambda: config().tf_wait)
+        self._patience = Patience(node, self.frames, lambda: config().tf_wait)
         self.gazebo = GazeboContacts(config(), self.frames) if config().gz_contacts else None
         self.inbox = Inbox(tools, config().frame, int(config().rest_after * wire.NANO), self.frames.at)
         self._followed = Followed(node, self.frames, config(), self._on_followed)

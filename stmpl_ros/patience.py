@@ -11,7 +11,6 @@ from rclpy.node import Node
 
 from bags.wire import stamp_ns
 from stmpl_ros.frames import Frames
-from stmpl_ros.gate import Gate
 from stmpl_ros.ticks import steady_timer
 
 POLL_S = 4e-3  # time between two looks whether /tf came [s]
@@ -32,21 +31,19 @@ class Patience:
     Args:
         node: node whose timer looks.
         frames: frames.
-        gate: what tells and counts.
         wait: longest wait [s].
     """
 
-    def __init__(self, node: Node, frames: Frames, gate: Gate, wait: Callable[[], float]) -> None:
-        self._frames, self._gate, self._wait = frames, gate, wait
+    def __init__(self, node: Node, frames: Frames, wait: Callable[[], float]) -> None:
+        self._frames, self._wait = frames, wait
         self._streams: dict[str, tuple[deque[_Waits], Callable[[Any], None], Callable[[str, str], None]]] = {}
         self._timer = steady_timer(node, POLL_S, self._look) if frames.listens else None
 
-    def put(self, stream: str, message: Any, take: Callable[[Any], None],
-            refuse: Callable[[str, str], None] | None = None) -> None:  # fmt: skip
-        """Hands a stamped message of a stream on, now or once its frame is known; refuse: in place of the gate's."""
+    def put(self, stream: str, message: Any, take: Callable[[Any], None], refuse: Callable[[str, str], None]) -> None:
+        """Hands a stamped message of a stream on, now or once its frame is known; or refuses it, by kind and reason."""
         if not self._frames.moves(message.header.frame_id):
             return take(message)
-        first = deque[_Waits](maxlen=MOST), take, refuse or self._gate.refuse
+        first = deque[_Waits](maxlen=MOST), take, refuse
         waiting = self._streams.setdefault(stream, first)[0]
         waiting.append(_Waits(message, time.monotonic() + self._wait()))
         self._look_at(stream)

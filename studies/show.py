@@ -51,8 +51,8 @@ def stability_table(report: Report, picture: Path) -> Table:
     counts = [report.counts(method) for method in report.methods]
     for outcome in ("flagged", "needless", "silent", "crashed"):
         table.add_row(f"all trials: {outcome}", *(str(count[outcome]) for count in counts))
-    said = [f"{method}: {why}" for method in report.methods for why in report.crashes(method)]
-    table.caption = "\n".join([f"drawn in {picture}; each failure runs again with stmpl stability --again FILE", *said])
+    again = f"drawn in {picture}; each failure runs again with stmpl stability --again FILE"
+    table.caption = "\n".join([again, *report.crashes()])
     return table
 
 
@@ -65,9 +65,9 @@ def stability_markdown(report: Report) -> str:
         first = report.cell(report.methods[0], axis)
         levels = first[0].level if len(first) == 1 else f"{first[0].level} to {first[-1].level}"
         cells.append([axis, levels, *(_ended(report, method, axis) for method in report.methods)])
-    said = [f"- {method}: {why}" for method in report.methods for why in report.crashes(method)]
     return "\n".join(["", *_rows(["", *report.methods], counts), "",
-                      *_rows(["axis", "levels", *report.methods], cells), "", *said])  # fmt: skip
+                      *_rows(["axis", "levels", *report.methods], cells), "",
+                      *(f"- {why}" for why in report.crashes())])  # fmt: skip
 
 
 def _ended(report: Report, method: str, axis: str) -> str:

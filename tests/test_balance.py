@@ -1,33 +1,18 @@
 """Laws of the balance of energy of several tools that share the skin."""
 
-from itertools import pairwise
-
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from scipy.spatial.transform import Rotation
 
 from stmpl_core import Contact, Simulator, State, Tissue, Tool, Touch
 from stmpl_core.balance import KEPT, settled
 from stmpl_core.methods import MomentNet
 from tests.scenes import LENGTH, RADIUS, at, ball, capsule, limb, plate, turn
+from tests.test_layered_strokes import works as works_of
 
 LYING = turn((0, 1, 0), np.pi / 2)  # a capsule's axis along x
 energies = st.lists(st.tuples(*[st.floats(-1, 1)] * 2, st.floats(0, 0.1), st.floats(0, 1)), min_size=1, max_size=4)
-
-
-def done(paths: list[list[Touch]]) -> np.ndarray:
-    """Work done on the skin by each tool in each step, (K, N) [J]."""
-    out = []
-    for touches in paths:
-        steps = []
-        for one, other in pairwise(touches):
-            start, end = one.pose_body_from_tool, other.pose_body_from_tool
-            spun = Rotation.from_matrix(end[:3, :3] @ start[:3, :3].T).as_rotvec()
-            steps.append(0.5 * (one.wrench + other.wrench) @ np.concatenate([end[:3, 3] - start[:3, 3], spun]))
-        out.append(steps)
-    return np.array(out)
 
 
 def led(
@@ -64,7 +49,8 @@ def test_what_one_tool_puts_in_another_may_take_out(first, second, height, depth
              [at(3e-4, 2e-4, z) @ turn((0, 0, 1), np.pi / 2) @ LYING for z in heights[1]]]  # fmt: skip
     simulator = Simulator(skin, MomentNet(), friction=friction)
     remembered = led(simulator, [first, second], poses, State())
-    works, once = done(remembered), done(led(simulator, [first, second], poses, None))
+    works, once = (np.array([works_of(path) for path in paths])
+                   for paths in (remembered, led(simulator, [first, second], poses, None)))  # fmt: skip
     put = works[works > 0].sum()
     assert min(touch.passive for path in remembered for touch in path) == 1
     assert -0.005 * put < works.sum() and abs(works.sum() - once.sum()) < 0.01 * put
@@ -80,8 +66,8 @@ def test_what_a_tool_took_from_another_the_other_does_not_have():
              @ turn((0.3, 0.5, 0.8), 1.5 * np.sin(2 * np.pi * p)) for s, p in zip(share, k, strict=True)]  # fmt: skip
     late = np.clip(2 * np.sin(np.pi * np.clip(2 * k - 0.8, 0, 1)) ** 2, 0, 1)
     other = [at(RADIUS + 0.008 + 1e-3 - 3.5e-3 * s, 0.0, LENGTH / 2 + 0.012) for s in late]
-    works = done(led(simulator, [ball(0.09, 4).named("large"), capsule(0.03, 0.008).named("other")], [large, other],
-                     State()))  # fmt: skip
+    tools = [ball(0.09, 4).named("large"), capsule(0.03, 0.008).named("other")]
+    works = np.array([works_of(path) for path in led(simulator, tools, [large, other], State())])
     assert works.sum() > -0.005 * works[works > 0].sum()
 
 

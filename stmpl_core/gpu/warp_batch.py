@@ -211,7 +211,7 @@ class WarpBatch:
         if states is not None and not isinstance(states, WarpStates):
             raise InvalidInput(f"states are {states!r:.40}; those of at_rest(), states(...) or a step before are "
                                "needed.")  # fmt: skip
-        if not set(asked := list(fields)) <= set(range(n)):
+        if (asked := list(fields)) and not set(asked) <= set(range(n)):
             raise InvalidInput(f"fields are asked for scenes {asked!r:.60}; there are {n}.")
         wanted = np.array(asked, dtype=np.int64)
         if len(wanted) and states is not None:

@@ -91,11 +91,11 @@ class Report:
             summary |= {"failed_at": row.level, "law": ", ".join(b.law for b in row.broken), "outcome": row.outcome}
         return summary
 
-    def crashes(self, method: str) -> list[str]:
-        """What a method's crashes said, each once, with how often."""
-        said = Counter(b.measured for row in self.rows if row.method == method and row.outcome == "crashed"
+    def crashes(self) -> list[str]:
+        """What the methods' crashes said, each once, with how often."""
+        said = Counter((row.method, b.measured) for row in self.rows if row.outcome == "crashed"
                        for b in row.broken if b.measured.startswith("crashed"))  # fmt: skip
-        return [f"{why:.200} ({many} times)" for why, many in said.most_common()]
+        return [f"{method}: {why:.200} ({many} times)" for (method, why), many in said.most_common()]
 
     def as_dict(self) -> dict[str, Any]:
         """For JSON: counts, summary of each method and axis, every trial."""
