@@ -2,15 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Any, NamedTuple
-
 import numba
 import numpy as np
-
-from stmpl_core.contact import Contact
-from stmpl_core.state import Memory
-from stmpl_core.touch import Pressed, Touch
 
 GIVEN_BACK = 0.7  # share of what an elastic contact gives back that must be covered by what was put in
 KEPT = 1.5  # work beyond what elastic skin could hold that is forgotten: what was lost before pays for nothing now
@@ -19,90 +12,6 @@ POWERS = (1.0, 12.0)  # range of the power of the depth with which a force grows
 MIN_SPREAD = 1e-3  # logarithm of two depths' ratio, from which their forces say that power
 MUCH = 0.1  # of the largest force so far: what is taken off a force, beyond which it is flagged
 WEAKEST = 1e-12  # factor on a wrench that has nothing left to give: by 0 nobody could divide to find how it is pressed
-
-
-class Asked(NamedTuple):
-    """What a step knows of a tool before the contact law is asked.
-
-    Args:
-        contact: what the law is asked.
-        stated: what was stated.
-        before: memory of the step before.
-        known: whether that memory is of this tool's way until now.
-        twist: its way, (6,) [m, rad].
-        gone: way of the contact over the skin, over its radius [-].
-        kept: what has relaxed, less what follows from this step's force (see relaxation.weights), (P,) [N].
-        gain: what follows, over that force, (P,) [-].
-        owed, now: numbers a [N] and b [-] such that after the step a force at rest of S_e is b S_e - a.
-        passed: where the contact is in the room that it has slid over (footing.beyond), (3,) [m].
-        moved: way along its force at which the tool pressed before, where the law is asked for creeping skin [m].
-    """
-
-    contact: Contact
-    stated: Contact
-    before: Memory
-    known: bool
-    twist: np.ndarray
-    gone: float
-    kept: np.ndarray
-    gain: np.ndarray
-    owed: float
-    now: float
-    passed: np.ndarray
-    moved: float | None
-
-
-class Law(NamedTuple):
-    """What a tool does before the balance of energy.
-
-    Args:
-        touch: touch with the forces of relaxed skin and friction.
-        memory: what is remembered, less work.
-        stored: energy that the contact could give back [J].
-        whole: energy that it could hold [J].
-    """
-
-    touch: Touch
-    memory: Memory
-    stored: float
-    whole: float
-
-
-def balanced(asked: Sequence[Asked], laws: Sequence[Law], shares: np.ndarray) -> tuple[list[Touch], dict[str, Memory]]:
-    """The touches, weakened where a contact would give more than was put in, and the memories with their balance.
-
-    Memories share no array with touches, which whoever is handed them may write to.
-
-    Where steps are long they leave open how much work was done; within that it is what the contact stores.
-
-    Args:
-        asked, laws: what was asked, and what each tool does.
-        shares: shares of the force that relax (see relaxation.Series), (P,) [-].
-    """
-    works, givens, spares, stored, whole = np.zeros((5, len(laws)))
-    for k, (one, law) in enumerate(zip(asked, laws, strict=True)):
-        before, memory, new = one.before, law.memory, not one.known or one.stated.wrench is not None
-        work, doubt, given = work_of(
-            one.twist, before.wrench, memory.wrench, before.contact, memory.contact, memory.pose[:3, 3],
-            before.scalars.pressing > 0, memory.scalars.pressing > 0, _factor(before), _factor(memory), before.relaxed,
-            memory.relaxed, shares, before.scalars.depth, memory.scalars.depth, memory.scalars.power,
-            memory.scalars.radius)  # fmt: skip
-        work += before.scalars.work
-        works[k], givens[k] = max(work, law.stored if new else min(law.stored, work + doubt)), given
-        spares[k] = UNSURE * memory.scalars.largest * memory.scalars.depth
-        stored[k], whole[k] = law.stored, law.whole
-    factors = settled(works, givens, spares, stored, whole)
-    touches, memories = [], {}
-    for law, work, passive in zip(laws, works.tolist(), factors.tolist(), strict=True):
-        touch, memory = law.touch, law.memory
-        if passive < 1:
-            touch = _weakened(touch, passive, MUCH * memory.scalars.largest)
-            memory = memory._replace(wrench=touch.wrench)
-        memories[touch.name] = memory._replace(
-            scalars=memory.scalars._replace(work=work, passive=passive), pose=memory.pose.copy(),
-            wrench=memory.wrench.copy(), contact=memory.contact.copy(), imprint=memory.imprint.copy())  # fmt: skip
-        touches.append(touch)
-    return touches, memories
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
@@ -117,7 +26,7 @@ def settled(works, givens, spares, stored, whole):
         works: work that was put in and not given back, before; written: after, (K,) [J].
         givens: what the last wrench has of it, (K,) [J].
         spares: what a contact may lack, (K,) [J].
-        stored, whole: see Law, (K,) [J].
+        stored, whole: energy that a contact could give back, and that it could hold, (K,) [J].
     """
     tools, out = len(works), np.ones(len(works))
     all_stored, all_there = stored.sum(), works.sum() + spares.sum()
@@ -149,12 +58,6 @@ def settled(works, givens, spares, stored, whole):
     return out
 
 
-def _factor(memory: Memory) -> float:
-    """Force along the normal over one that relaxed at rest, by what a tool presses with [-]."""
-    scalars = memory.scalars
-    return scalars.net * scalars.passive * scalars.stretch
-
-
 @numba.njit(cache=True, error_model="numpy")
 def work_of(twist, before, after, old, new, origin, presses_first, presses_last, factor_first, factor_last,
             relaxed_first, relaxed_last, shares, depth_first, depth_last, power, radius):  # fmt: skip
@@ -171,7 +74,8 @@ def work_of(twist, before, after, old, new, origin, presses_first, presses_last,
         old, new: contacts (see Memory), (3, 3).
         origin: origin of the tool, (3,) [m].
         presses_first, presses_last: whether the tool presses before and after.
-        factor_first, factor_last: see `_factor`.
+        factor_first, factor_last: force along the normal over one that relaxed at rest, by what a tool presses with:
+            net, passive and stretch of Scalars, one times the other [-].
         relaxed_first, relaxed_last: what has relaxed there, (P,) [N].
         shares: shares of the force that relax, (P,) [-].
         depth_first, depth_last: depths there [m].
@@ -222,32 +126,3 @@ def _less(first, last, power):
     if shallow > 1 - 1e-4:
         return 0.0
     return most * (0.5 * (1 + ratio) - (1 - ratio * shallow) / ((power + 1) * (1 - shallow)))
-
-
-def _weakened(touch: Touch, by: float, most: float) -> Touch:
-    """The touch with a factor on its forces; what is taken off is in the bound, and flagged beyond so many N."""
-    slip, less, trust = touch.slip, (1 - by) * touch.force, touch.trust
-    if slip is not None:
-        slip = slip._replace(wrench=slip.wrench * by, lean=slip.lean * by)
-    if less > most:
-        why = f"{touch.name} came to where it is with less work than it could give back: weakened to {by:.0%}"
-        trust = trust.also(why, in_range=False)
-    return touch.with_(**scaled(touch, by, less), slip=slip, passive=by, trust=trust)
-
-
-def scaled(touch: Touch, by: float, doubt: float) -> dict[str, Any]:
-    """What changes of a touch with other pressures on skin that is moved as before, by name.
-
-    Args:
-        touch: touch that presses.
-        by: factor on the pressures [-].
-        doubt: error of the force that comes in [N].
-    """
-    if by == 1.0 and not doubt:
-        return {}
-    assert touch.pressure is not None and touch.pressed is not None
-    forces = touch.pressed.forces
-    pressed: Pressed = touch.pressed._replace(factor=touch.pressed.factor * by,
-                                              forces=None if forces is None else forces * by)  # fmt: skip
-    return {"wrench": touch.wrench * by, "pressure": touch.pressure * by, "pressed": pressed,
-            "force_bound": touch.force_bound * by + doubt}  # fmt: skip

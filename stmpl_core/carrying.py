@@ -123,11 +123,11 @@ def _around(vertices, areas, faces, place):
 def _memory(memory: Memory, before: Skin, after: Skin) -> Memory:
     trail = carried_trail(memory.trail, partial(carry_at, before, after))
     if not memory.scalars.radius > 0:  # it never touched: where it is, it is in space
-        return memory._replace(trail=trail)
+        return memory.with_(trail=trail)
     motion = carry_at(before, after, memory.contact[0])
     turn = motion[:3, :3]
     middle, normal, tangent = memory.contact
     contact = np.stack([turn @ middle + motion[:3, 3], turn @ normal, turn @ tangent])
     wrench = np.concatenate([turn @ memory.wrench[:3], turn @ memory.wrench[3:]])
-    return memory._replace(pose=motion @ memory.pose, wrench=wrench, contact=contact, imprint=motion @ memory.imprint,
-                           trail=trail)  # fmt: skip
+    return memory.with_(pose=motion @ memory.pose, wrench=wrench, contact=contact, imprint=motion @ memory.imprint,
+                        trail=trail)  # fmt: skip

@@ -25,6 +25,12 @@ def _cross(a, b):
     return np.array([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]])
 
 
+@numba.njit(cache=True, error_model="numpy", inline="always")
+def _times(a, b):
+    """Matrix (3, 3) times vector (3,): BLAS, called once a step, is ten times as slow."""
+    return np.array([_dot(a[0], b), _dot(a[1], b), _dot(a[2], b)])
+
+
 @numba.njit(cache=True, error_model="numpy")
 def wrench_at(force, arm):
     """Wrench (6,) of a force (3,) that acts at the end of an arm (3,)."""
@@ -70,25 +76,26 @@ def needed(stated, push, size, whole, long, owed, now, slid):
         push, size: force of the touch, (3,) [N], and its size.
         whole: sum of the sizes of its parts [N].
         long: stretch of the column under the tool [-].
-        owed, now: see Asked (stmpl_core.balance).
+        owed, now: see `aged`.
         slid: see Scalars.
     """
     return (_dot(stated, push) / size * whole / size / slid + long * owed) / now
 
 
 @numba.njit(cache=True, error_model="numpy")
-def bearing(push, points, area, thickness, depth, forces, deepest, power, factor, before, held, fades, kept, gain, owed,
-            shares, stated, creeps, slid):  # fmt: skip
+def borne(push, middle, radius, mean, whole, elastic, deepest, power, factor, before, held, fades, kept, gain, owed,
+          shares, stated, creeps, slid):  # fmt: skip
     """What skin that relaxes bears of an elastic touch.
 
     Args:
         push: force of the touch, (3,) [N].
-        points, area, thickness, depth, forces: see `patch_of`.
+        middle, radius, mean, whole: see `patch_of`: its thickness is `mean`, its energy `whole`.
+        elastic: sum of the sizes of the forces [N].
         deepest: depth of the tool [m].
         power, factor: see Pressed.
         before, held: contact before the step (see Memory), and whether the tool pressed there.
         fades: see relaxation.faded.
-        kept, gain, owed: see Asked (stmpl_core.balance).
+        kept, gain, owed: see `aged`.
         shares: shares of the series, (P,).
         stated: wrench that the touch carries, (6,); read where skin creeps under one.
         creeps: whether the contact law was asked for another.
@@ -98,24 +105,11 @@ def bearing(push, points, area, thickness, depth, forces, deepest, power, factor
         force, elastic: sum of the sizes of the forces, relaxed and not [N]; the former is not above 0 where the skin
             came free.
         at_rest: the latter over the stretch [N].
-        net, radius, stretch: see Scalars.
-        lever, thickness: see `patch_of`.
+        net, stretch: see Scalars.
         contact, relaxed: see Memory, after the step.
-        stored, whole: see Law (stmpl_core.balance) [J].
+        stored, whole: energy that the contact could give back, and that it could hold [J].
         doubt: error of the force that relaxing brings [N].
     """
-    normal = push / np.sqrt(_dot(push, push))
-    middle, radius, lever, mean, whole = patch_of(points, area, thickness, depth, forces, normal)
-    out = borne(push, middle, radius, mean, whole, forces.sum(), deepest, power, factor, before, held, fades, kept,
-                gain, owed, shares, stated, creeps, slid)  # fmt: skip
-    force, elastic, at_rest, net, long, contact, relaxed, stored, whole, doubt = out
-    return (force, elastic, at_rest, net, radius, long, lever, mean, contact, relaxed, stored, whole, doubt)
-
-
-@numba.njit(cache=True, error_model="numpy")
-def borne(push, middle, radius, mean, whole, elastic, deepest, power, factor, before, held, fades, kept, gain, owed,
-          shares, stated, creeps, slid):  # fmt: skip
-    """`bearing` of a contact whose patch is known; middle, radius, mean, whole: see `patch_of`."""
     size = np.sqrt(_dot(push, push))
     normal = push / size
     net, long, more, now = min(size / elastic, 1.0), stretch(deepest, mean), faded(fades, radius), 1.0
@@ -245,9 +239,9 @@ def given_way(along, give, aim, contact):
     size = x * x + y * y
     if size > 0:
         way = x * first + y * second
-        more = _dot(way, give @ way) / size
+        more = _dot(way, _times(give, way)) / size
     else:
-        more = 0.5 * (_dot(first, give @ first) + _dot(second, give @ second))
+        more = 0.5 * (_dot(first, _times(give, first)) + _dot(second, _times(give, second)))
     return softened(along, more)
 
 
@@ -270,7 +264,8 @@ def along_give(contact, give, springs, relaxed, rolled, passed):
         contact, springs, relaxed, rolled, passed, turned, and the gives along both tangents, (2,) [m/N].
     """
     first, second = contact[2], _cross(contact[1], contact[2])
-    a, b, c = _dot(first, give @ first), 0.5 * _dot(first, (give + give.T) @ second), _dot(second, give @ second)
+    along, across = _times(give, first), _times(give, second)
+    a, b, c = _dot(first, along), 0.5 * (_dot(first, across) + _dot(second, along)), _dot(second, across)
     if not abs(b) > 1e-9 * max(abs(a), abs(c)):
         return contact, springs, relaxed, rolled, passed, np.array([a, c])
     angle = 0.5 * np.arctan(2 * b / (a - c)) if a != c else 0.25 * np.pi
@@ -312,7 +307,7 @@ def faced(springs, stiffness, contact, bend, most):
     """
     normal, first = contact[1], contact[2]
     way = springs[:, 0].sum() / stiffness[0] * first + springs[:, 1].sum() / stiffness[1] * _cross(normal, first)
-    turned = bend @ way
+    turned = _times(bend, way)
     turned -= _dot(turned, normal) * normal
     size = np.sqrt(_dot(turned, turned))
     if size > most:
@@ -384,7 +379,8 @@ def way_along(twist, contact, pose):
     return _dot(go, contact[2]), _dot(go, _cross(contact[1], contact[2]))
 
 
-def part_of_way(way: np.ndarray, normal: np.ndarray, depth: float, radius: float, power: float) -> float:
+@numba.njit(cache=True, error_model="numpy")
+def part_of_way(way, normal, depth, radius, power):
     """Share of a step in which a tool is in the skin that it comes to, or leaves [-].
 
     Its force rises with a power of the depth, and is taken to rise straight: in a shorter time, at the end of which as
@@ -396,15 +392,16 @@ def part_of_way(way: np.ndarray, normal: np.ndarray, depth: float, radius: float
         depth, radius: depth and radius of the contact that it comes to, or leaves [m].
         power: that power [-].
     """
-    across, depth, radius = float(way @ normal), max(depth, LEAST), max(radius, LEAST)
-    aside = float(np.linalg.norm(way - across * normal))
+    across, depth, radius = _dot(way, normal), max(depth, LEAST), max(radius, LEAST)
+    beside = way - across * normal
+    aside = np.sqrt(_dot(beside, beside))
     return min(1.0, depth / max(across, depth), radius / max(aside, radius)) * 2 / (max(power, 1.0) + 1)
 
 
 @numba.njit(cache=True, error_model="numpy")
 def aged(before, pose, imprint, contact, known, held, share, goes, radius, at, part, shares, times, fades, dt, elastic,
          relaxed):  # fmt: skip
-    """Twist, gone, kept, gain, owed, now and passed of an Asked (stmpl_core.balance).
+    """What a step knows of a tool before it is known what presses.
 
     Args:
         before, pose: poses of the tool before the step and after it, (4, 4).
@@ -418,6 +415,14 @@ def aged(before, pose, imprint, contact, known, held, share, goes, radius, at, p
         shares, times: series of the relaxation, (P,) each.
         fades: see relaxation.faded.
         dt: time of the step [s].
+
+    Returns:
+        twist: way of the tool, (6,) [m, rad].
+        gone: way of the contact over the skin, over its radius [-].
+        kept: what has relaxed, less what follows from this step's force (see relaxation.weights), (P,) [N].
+        gain: what follows, over that force, (P,) [-].
+        owed, now: numbers a [N] and b [-] such that after the step a force at rest of S_e is b S_e - a.
+        passed: where the contact is in the room that it has slid over, (3,) [m].
     """
     kept, gain, gone, owed, now = np.empty(len(times)), np.empty(len(times)), 0.0, 0.0, 1.0
     twist, passed = twist_between(before, pose) if known else np.zeros(6), np.zeros(3)

@@ -175,6 +175,11 @@ class Green:
         assert self.drag is not None
         return np.einsum("va,vaxy->vxy", self.drag.shares, self.drag.give[self.drag.corners])
 
+    @property
+    def gives(self) -> tuple[np.ndarray, np.ndarray]:
+        """`_give`, none where a contact gives as on a flat stack, and how the skin turned; see `give_at`."""
+        return (AS_AT_REST if self.drag is None else self._give), self._skin_turns
+
     def give(self, nodes: Nodes, forces: np.ndarray) -> np.ndarray:
         """How a contact as a whole gives where it is dragged along, beyond a flat stack, (3, 3) [1/m].
 
@@ -182,9 +187,7 @@ class Green:
             nodes: nodes that press.
             forces: forces that press them, (N,) [N].
         """
-        if self.drag is None:
-            return np.zeros((3, 3))
-        return _give_at(nodes.corners, nodes.shares, forces, self._give, self._skin_turns)
+        return give_at(nodes.corners, nodes.shares, forces, *self.gives)
 
     @property
     def _coarse(self) -> tuple[np.ndarray, ...]:
@@ -775,10 +778,10 @@ def add_motion(out, there, points, inward, unit, sources, source_inward, area, s
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _give_at(corners, shares, forces, give, turns):
+def give_at(corners, shares, forces, give, turns):
     """Mean of give (V, 3, 3) at nodes, weighed with forces (N,), turned with the skin by turns (V, 3, 3), (3, 3)."""
     out, total = np.zeros((3, 3)), 0.0
-    for n in range(len(corners)):
+    for n in range(len(corners) if len(give) else 0):
         total += forces[n]
         for a in range(3):
             v, weight = corners[n, a], shares[n, a] * forces[n]

@@ -32,6 +32,7 @@ LEAST_LEFT = 1e-6  # share of a modulus that is left at least
 LEAST_STRETCH = 0.15  # of a column, to which it counts as pressed together
 DEPTH_TRIALS = 12  # of Newton for the depth of skin that is free
 HALVINGS = 30  # of a step in which skin comes free
+SWEEPS = 30  # of rotations, at most; five or so are needed
 
 
 class Series(NamedTuple):
@@ -210,6 +211,33 @@ def depth_left(share, power, strain):
 
 
 @numba.njit(cache=True, error_model="numpy")
+def _diagonal(matrix):
+    """Eigenvectors of a small symmetric matrix, which is made diagonal, by Jacobi's rotations: LAPACK's code, which is
+    not in the processor's caches where it runs once a step, takes ten times as long to come there.
+    """
+    many = len(matrix)
+    vectors = np.eye(many)
+    for _ in range(SWEEPS):
+        aside = 0.0
+        for i in range(many):
+            for j in range(i):
+                if abs(matrix[i, j]) > 1e-16 * np.sqrt(abs(matrix[i, i] * matrix[j, j])):
+                    angle = 0.5 * np.arctan2(2 * matrix[i, j], matrix[i, i] - matrix[j, j])
+                    cosine, sine, aside = np.cos(angle), np.sin(angle), 1.0
+                    for k in range(many):
+                        one, other = matrix[k, i], matrix[k, j]
+                        matrix[k, i], matrix[k, j] = cosine * one + sine * other, cosine * other - sine * one
+                    for k in range(many):
+                        one, other = matrix[i, k], matrix[j, k]
+                        matrix[i, k], matrix[j, k] = cosine * one + sine * other, cosine * other - sine * one
+                        one, other = vectors[k, i], vectors[k, j]
+                        vectors[k, i], vectors[k, j] = cosine * one + sine * other, cosine * other - sine * one
+        if not aside:
+            break
+    return vectors
+
+
+@numba.njit(cache=True, error_model="numpy")
 def decay_of_free(shares, times, dt):
     """Matrix that takes what has relaxed to what is left of it after a time in which nothing holds the skin, (P, P).
 
@@ -228,7 +256,8 @@ def decay_of_free(shares, times, dt):
     for i in range(many):
         for j in range(many):
             out[i, j] = rate[i] * rate[j] - (1 / times[i] if i == j else 0.0)
-    values, vectors = np.linalg.eigh(out)
+    vectors = _diagonal(out)
+    values = np.diag(out).copy()
     for i in range(many):
         for j in range(many):
             out[i, j] = 0.0

@@ -118,15 +118,20 @@ class Sideways:
         self._table = np.log(np.array(rows)[..., :3] / units)
         self._modulus, self._slack = tissue.youngs_modulus, slack_at(tissue, 1.0)
 
+    @property
+    def numbers(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, float, float]:
+        """The table, (T, R, 3), of logarithms over T of thickness and R of radius; modulus and slack: see `at`."""
+        return self._table, self._log_thickness, self._logs, self._modulus, self._slack
+
     def at(self, radius: float, thickness: float) -> Patch:
         """Stiffness of a patch of a radius [m] where the layer is this thick [m]."""
-        along, turn, bare = _interpolated(self._table, self._log_thickness, self._logs, radius, thickness)
+        along, turn, bare = interpolated(self._table, self._log_thickness, self._logs, radius, thickness)
         size = self._modulus * radius
         return Patch(along * size, turn * size * radius**2, bare * size, self._slack * radius)
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _interpolated(table, log_thickness, log_radius, radius, thickness):
+def interpolated(table, log_thickness, log_radius, radius, thickness):
     """The three numbers of a table (thicknesses, radii, 3) at a radius and a thickness [m], between its logarithms."""
     log, j, g = np.log(radius / thickness), 0, 0.0
     f = min(max((log - log_radius[0]) / (log_radius[1] - log_radius[0]), 0.0), len(log_radius) - 1.001)

@@ -309,7 +309,7 @@ def rub(wrench, stated, by_force, contact, origin, bend, give, mu, along_itself,
         lever: mean distance of the forces from the middle [m].
         elastic, depth, radius, power: see Scalars.
         along, turn, bare, slack: see Patch.
-        twist, known: see Asked (stmpl_core.balance).
+        twist, known: see footing.aged.
         pressed: whether the tool pressed before the step.
         before_contact, before_elastic, before_slid, before_held: see Memory and Scalars, before the step.
         room, passed: Scalars.rolled_first, .rolled_second and .rolled before it, and those of `passed`, (3,) [m].
@@ -371,7 +371,9 @@ def rub(wrench, stated, by_force, contact, origin, bend, give, mu, along_itself,
     if by_force:
         grown = wants = carries / slid
     rubs, offset, turns = in_space(carried, new, after, leaned(contact, turned), contact, origin, arm_of_turn)
-    part = np.array([np.dot(SLID, np.ascontiguousarray(new[:, x])) for x in range(3)])
+    part = np.zeros(3)
+    for j in range(len(new)):
+        part += SLID[j] * new[j]
     slid_offset, slid_turn = way_of_skin(part, after, contact, arm_of_turn)
     stored += max(0.5 * (1 + grown * slid) * size * out, 0.0)
     lean = grown * slid * size * turned

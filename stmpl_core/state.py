@@ -7,21 +7,28 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
+import numba
 import numpy as np
+from numpy.typing import ArrayLike
 
 from stmpl_core.errors import InvalidInput
 from stmpl_core.slip import SPRINGS
-from stmpl_core.wake import untouched
+from stmpl_core.wake import FIXED, PLACES
 
 VERSION = 7  # of packed states; 6 knows no Scalars.held and what follows, 5 no strayed, 4 no slid, 3 no joints
 OLDEST, UNKNOWN = 3, {3: 10, 4: 10, 5: 9, 6: 8}  # version that is still read; how many of the last Scalars one lacks
+FIRST_OF_TERMS = 46  # number in a Memory behind its pose, wrench and scalars
+NEVER = -2.0  # Scalars.pressing of a tool that nobody told of yet
 FORGOTTEN = 1e-3  # elastic force of skin that comes back, over its largest, below which it is forgotten
 
 
-class Memory(NamedTuple):
+class Memory:
     """What skin and tool remember of each other after a step. P: number of times of relaxation.
 
     Args:
+        numbers: all that follows, in this order, (N,).
+
+    Attributes:
         pose: pose of the tool, (4, 4).
         wrench: wrench that it exerted, (6,) [N, N m].
         scalars: see Scalars, in that order.
@@ -32,31 +39,75 @@ class Memory(NamedTuple):
         stiffness: stiffness of the patch to the ways of `springs`, (3,) [N/m]; 0: no friction yet.
         springs: forces of the springs of friction without relaxation, (SPRINGS, 3) [N].
         springs_relaxed: what of them has relaxed, (P, SPRINGS, 3) [N].
-        trail: places along the tool's way where the skin is not back yet (stmpl_core.wake).
+        trail: places along the tool's way where the skin is not back yet (stmpl_core.wake), (PLACES, FIXED + P).
     """
 
-    pose: np.ndarray
-    wrench: np.ndarray
-    scalars: Scalars
-    relaxed: np.ndarray
-    contact: np.ndarray
-    imprint: np.ndarray
-    stiffness: np.ndarray
-    springs: np.ndarray
-    springs_relaxed: np.ndarray
-    trail: np.ndarray
+    __slots__ = ("numbers",)
+
+    def __init__(self, numbers: np.ndarray) -> None:
+        self.numbers = numbers
 
     @property
-    def slid(self) -> float:
-        """The factor on the push of skin that has slid and is held still [-]."""
-        return self.scalars.slid if self.scalars.pressing > 0 else 1.0
+    def terms(self) -> int:
+        """P."""
+        return max(len(self.numbers) - size_of(0) - PLACES * FIXED, 0) // (1 + 3 * SPRINGS + PLACES)
+
+    def _part(self, k: int) -> np.ndarray:
+        return parts_of.py_func(self.numbers, self.terms)[k]
+
+    @property
+    def surface(self) -> float:
+        """Scalars.surface."""
+        return float(self.numbers[22 + Scalars._fields.index("surface")])
+
+    pose = property(lambda self: self._part(0))
+    wrench = property(lambda self: self._part(1))
+    scalars = property(lambda self: Scalars(*self._part(2).tolist()))
+    relaxed = property(lambda self: self._part(3))
+    contact = property(lambda self: self._part(4))
+    imprint = property(lambda self: self._part(5))
+    stiffness = property(lambda self: self._part(6))
+    springs = property(lambda self: self._part(7))
+    springs_relaxed = property(lambda self: self._part(8))
+    trail = property(lambda self: trail_of.py_func(self.numbers, self.terms))
+
+    def with_(self, **parts: ArrayLike) -> Memory:
+        """The same with other values of some parts."""
+        out = Memory(self.numbers.copy())
+        for name, values in parts.items():
+            (out._part(2) if name == "scalars" else getattr(out, name))[...] = values
+        return out
+
+
+def size_of(terms: int, trail: bool = True) -> int:
+    """How many numbers a Memory has; trail: with it."""
+    places = PLACES if trail and terms else 0
+    return FIRST_OF_TERMS + 28 + 3 * SPRINGS + terms * (1 + 3 * SPRINGS) + places * (FIXED + terms)
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def parts_of(numbers, terms):
+    """Views of the numbers of a Memory, in its order up to `springs_relaxed`."""
+    at = FIRST_OF_TERMS + terms
+    springs, last = at + 28, at + 28 + 3 * SPRINGS
+    return (numbers[:16].reshape(4, 4), numbers[16:22], numbers[22:FIRST_OF_TERMS], numbers[FIRST_OF_TERMS:at],
+            numbers[at : at + 9].reshape(3, 3), numbers[at + 9 : at + 25].reshape(4, 4), numbers[at + 25 : springs],
+            numbers[springs:last].reshape(SPRINGS, 3),
+            numbers[last : last + terms * 3 * SPRINGS].reshape(terms, SPRINGS, 3))  # fmt: skip
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def trail_of(numbers, terms):
+    """View of the trail of a Memory that has one."""
+    first, places = FIRST_OF_TERMS + 28 + 3 * SPRINGS + terms * (1 + 3 * SPRINGS), PLACES if terms else 0
+    return numbers[first : first + places * (FIXED + terms)].reshape(places, FIXED + terms)
 
 
 class Scalars(NamedTuple):
     """The numbers of a Memory.
 
     Args:
-        pressing: 1 where the tool pressed, 0 where it did not, -1 where nobody told of it.
+        pressing: 1 where the tool pressed, 0 where it did not, -1 where nobody told of it, NEVER before anybody did.
         elastic: force at rest of elastic skin (stmpl_core.relaxation) [N]; of skin that is free, that of the depth to
             which it has come back.
         largest: largest of it so far [N].
@@ -70,7 +121,7 @@ class Scalars(NamedTuple):
         passive: factor on the wrench that kept it above 0 [-].
         limit: tangential force at which all of it slides [N]; 0 without friction.
         stretch: stretch of the column under the last contact [-].
-        surface: number of the tool's surface (Tool.number): what another surface of that name pressed is forgotten.
+        surface: number of the tool's surface (Tool.number): what another of its name pressed is as another tool's.
         slid: factor on the push of skin that has slid, by what it no longer carries along itself [-].
         strayed: part of what has relaxed that rests on touches out of range, at most [N].
         held: stiffness of the patch along the skin at which the springs' forces are held: the least that it had under
@@ -81,7 +132,7 @@ class Scalars(NamedTuple):
         doubted: 1 where the last touch was out of range.
     """
 
-    pressing: float = 0.0
+    pressing: float = NEVER
     elastic: float = 0.0
     largest: float = 0.0
     net: float = 1.0
@@ -114,8 +165,7 @@ class Scalars(NamedTuple):
 
 def fresh(pose: np.ndarray, terms: int) -> Memory:
     """Memory of a tool at a pose (4, 4) that has not touched, for skin with so many times of relaxation."""
-    return Memory(pose, np.zeros(6), Scalars(), np.zeros(terms), np.eye(3), pose, np.zeros(3), np.zeros((SPRINGS, 3)),
-                  np.zeros((terms, SPRINGS, 3)), untouched(terms))  # fmt: skip
+    return Memory(np.zeros(size_of(terms))).with_(pose=pose, scalars=Scalars(), contact=np.eye(3), imprint=pose)
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,7 +186,7 @@ class State:
     @property
     def finite(self) -> bool:
         """Whether every number of it is finite."""
-        return all(np.isfinite(part).all() for memory in self.tools.values() for part in memory)
+        return all(np.isfinite(memory.numbers).all() for memory in self.tools.values())
 
     def without(self, name: str) -> State:
         """The state without what it remembers of a tool: the skin that it pressed is at rest."""
@@ -145,9 +195,9 @@ class State:
     def pack(self) -> bytes:
         """The state as bytes, exact: a line of JSON, then float64 numbers, the least byte first."""
         names = sorted(self.tools)
-        terms = max((len(self.tools[name].relaxed) for name in names), default=0)
+        terms = max((self.tools[name].terms for name in names), default=0)
         head = json.dumps({"version": VERSION, "terms": terms, "tools": names, "joints": self.joints}) + "\n"
-        numbers = [np.ravel(one) for name in names for one in self.tools[name]]
+        numbers = [self.tools[name].numbers for name in names]
         return head.encode() + np.concatenate([*numbers, np.empty(0)]).astype("<f8").tobytes()
 
     @classmethod
@@ -173,19 +223,13 @@ class State:
                 raise ValueError(f"{terms} times of relaxation in {len(numbers)} numbers")
         except (ValueError, KeyError, TypeError, OverflowError) as error:
             raise InvalidInput(f"{len(packed)} bytes are no state: {error}.") from error
-        shapes = [one.shape for one in map(np.asarray, fresh(np.eye(4), terms))]
-        shapes[Memory._fields.index("scalars")] = (len(Scalars._fields) - UNKNOWN.get(version, 0),)
-        size = sum(int(np.prod(shape)) for shape in shapes)
+        lacks = UNKNOWN.get(version, 0)
+        size = size_of(terms) - lacks
         if version not in range(OLDEST, VERSION + 1) or len(numbers) != size * len(names):
             raise InvalidInput(f"a state of version {version} with {len(numbers)} numbers cannot be read; expected are "
                                f"versions {OLDEST} to {VERSION} and {size * len(names)} numbers of {len(names)} "
                                "tools. Older ones need the release that recorded them.")  # fmt: skip
-        return cls({name: _memory(part, shapes) for name, part in
-                    zip(names, numbers.reshape(len(names), size), strict=True)}, where)  # fmt: skip
-
-
-def _memory(numbers: np.ndarray, shapes: list[tuple[int, ...]]) -> Memory:
-    ends = np.cumsum([int(np.prod(shape)) for shape in shapes])[:-1]
-    parts = [part.reshape(shape) for part, shape in zip(np.split(numbers, ends), shapes, strict=True)]
-    pose, wrench, scalars, *rest = parts
-    return Memory._make([pose, wrench, Scalars(*map(float, scalars)), *rest])
+        rows = numbers.reshape(len(names), size)
+        if lacks:
+            rows = np.insert(rows, [FIRST_OF_TERMS - lacks] * lacks, Scalars()[-lacks:], axis=1)
+        return cls({name: Memory(row) for name, row in zip(names, rows, strict=True)}, where)

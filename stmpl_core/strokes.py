@@ -119,7 +119,7 @@ def fit_friction(toucher: Toucher, strokes: Sequence[Contact]) -> Rubbing:
     (`stmpl_core.sideways`): one that sticks never does, since its force grows with the way. The normal is that of the
     contact law under the measured force; how far it is off changes sign with the way, so strokes there and back are
     worth more than twice one of them. So does a sensor's zero that is off along the way: by strokes one way it is
-    friction.
+    friction. One that is off across the skin changes mu as it does the normal force, which no stroke tells.
 
     Args:
         toucher: contact law on the skin, about as stiff as it is.
@@ -159,7 +159,8 @@ def fit_friction(toucher: Toucher, strokes: Sequence[Contact]) -> Rubbing:
             mus.append(_friction_of(float(contact.wrench[:3] @ way) / went / one.pressing, one))
     if len(slid) < MIN_INSTANTS:
         went = f"; it went {1e3 * furthest:.1f} mm straight on, {1e3 * needed:.1f} mm are needed" if furthest else ""
-        more = "Tell more instants of the stroke" if furthest > 2 * needed else "Stroke further, there and back"
+        more = "Tell more instants of the stroke, or smooth poses that tremble by over 0.1 mm" \
+            if furthest > 2 * needed else "Stroke further, there and back"
         return _no_friction(f"the tool slid at {len(slid)} of {len(pressing)} instants, {MIN_INSTANTS} are needed"
                             f"{went}. {more}")  # fmt: skip
     mus, axis = np.array(mus), np.linalg.svd(np.array(ways), full_matrices=False)[2][0]
@@ -259,6 +260,9 @@ def fit_relaxation(toucher: Toucher, press: Sequence[Contact], relaxation: Prony
     the tool presses, the measured force is linear in two unknowns, the stiffness c and the share's factor x:
 
         F = c lambda S_e - (c x) lambda sum g_i D_i
+
+    A sensor that drifts while the tool is held, or a tool that creeps more than its poses say, is told as skin that
+    fades more or less: 10 % of the force in the press change the share by some 0.1.
 
     Args:
         toucher: contact law on the skin, of whatever stiffness.

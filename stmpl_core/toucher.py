@@ -509,6 +509,9 @@ class Toucher:
         if deepest > card["ranges"]["depth_over_thickness"][1] and one.status != IN_CORE:
             trust = trust.also(f"{name} presses to {deepest:.0%} of the thickness, learnt is "
                                f"{card['ranges']['depth_over_thickness'][1]:.0%}", in_range=False)  # fmt: skip
+        elif one.factor > 1 and one.status != IN_CORE:  # over thin tissue beside thick
+            trust = trust.also(f"{name} presses a part of the skin below it to over {DEEPEST:.0%} of the tissue there: "
+                               "all of it is answered for where it does not", in_range=False)  # fmt: skip
         softly = touch.depth / self._soft
         if softly > SOFT_SHARE and one.status != IN_CORE:
             trust = trust.also(f"{name} presses to {softly:.0%} of what lies over a material over {MUCH_STIFFER:g} "

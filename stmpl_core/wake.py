@@ -9,7 +9,7 @@ import numba
 import numpy as np
 
 from stmpl_core.arrays import Points, Transform, VertexVectors
-from stmpl_core.relaxation import Series, decay_of_free, depth_left, weights
+from stmpl_core.relaxation import decay_of_free, depth_left, weights
 
 if TYPE_CHECKING:
     from stmpl_core.layer import SoftLayer
@@ -20,34 +20,6 @@ SPACING = 0.4  # way between two of them, over the radius of the contact
 SAME = 0.1  # way over that radius within which a tool that presses harder deepens a place
 HARDER = 1e-6  # how much harder, relative, that is: far above rounding
 FORGOTTEN = 0.02  # depth of a place over that of the press, below which it is forgotten
-
-
-class Pass(NamedTuple):
-    """A tool as it presses on its way.
-
-    Args:
-        pose: its pose, (4, 4).
-        middle: middle of its contact on the skin at rest, (3,) [m].
-        normal: mean inward normal there, (3,).
-        relaxed: elastic force that has relaxed in each time, (P,) [N].
-        force: elastic force at rest (stmpl_core.relaxation) [N].
-        depth: depth of the contact [m].
-        power: power of the depth with which the elastic force grows [-].
-        strain: 1 less the stretch of the column under it [-].
-        radius: radius of the contact [m].
-        came: middle of its contact before the step, or where it is now, if it did not press, (3,) [m].
-    """
-
-    pose: Transform
-    middle: np.ndarray
-    normal: np.ndarray
-    relaxed: np.ndarray
-    force: float
-    depth: float
-    power: float
-    strain: float
-    radius: float
-    came: np.ndarray
 
 
 class Groove(NamedTuple):
@@ -68,11 +40,6 @@ _FROM = 16  # first column of the middle
 _POSE, _MIDDLE, _NORMAL = slice(0, _FROM), slice(_FROM, _FROM + 3), slice(_FROM + 3, 22)
 _NOW, _FORCE, _DEPTH, _POWER, _STRAIN = 22, 23, 24, 25, 26  # force at rest now and of the press; see Pass
 _LET_DEPTH, _LET_FORCE, FIXED = 27, 28, 29  # depth and force at rest where the tool went off, 0 under it; D_i follow
-
-
-def untouched(terms: int) -> np.ndarray:
-    """No places yet, of skin with so many times of relaxation: (PLACES, FIXED + P), none where nothing relaxes."""
-    return np.zeros((PLACES if terms else 0, FIXED + terms))
 
 
 @numba.njit(cache=True, error_model="numpy")
@@ -149,12 +116,35 @@ def _share_of_way(came, middle, place, far):
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _pressed(trail, shares, times, dt, pose, middle, normal, relaxed, force, depth, power, strain, radius, came):
-    """The places after a step in which the tool presses; see Pass.
+def let_age(trail, shares, times, dt):
+    """Lets the skin at the places come back by itself for a step; see `pressed_on`."""
+    _aged(trail, shares, times, dt, np.full(len(trail), np.inf), np.zeros(len(trail)), 0.0)
 
-    They lie SPACING apart on its way, wherever its steps end.
+
+@numba.njit(cache=True, error_model="numpy")
+def pressed_on(trail, shares, times, dt, pose, middle, normal, relaxed, force, depth, power, strain, radius, came):
+    """Writes the places as they are after a step in which the tool presses: those under it are held as deep as it is,
+    the others come back by themselves.
+
+    They lie SPACING apart on its way, wherever its steps end. A place is skin of its own, so it relaxes without the
+    fresh skin of `stmpl_core.relaxation`.
+
+    Args:
+        trail: places before, written.
+        shares, times: series of the relaxation, (P,) each.
+        dt: time of the step [s].
+        pose: pose of the tool, (4, 4).
+        middle: middle of its contact on the skin at rest, (3,) [m].
+        normal: mean inward normal there, (3,).
+        relaxed: elastic force that has relaxed in each time, (P,) [N].
+        force: elastic force at rest (stmpl_core.relaxation) [N].
+        depth: depth of the contact [m].
+        power: power of the depth with which the elastic force grows [-].
+        strain: 1 less the stretch of the column under it [-].
+        radius: radius of the contact [m].
+        came: middle of its contact before the step, or where it is now, if it did not press, (3,) [m].
     """
-    trail, away, stays = trail.copy(), np.full(len(trail), np.inf), np.ones(len(trail))
+    away, stays = np.full(len(trail), np.inf), np.ones(len(trail))
     for k in range(len(trail)):
         if trail[k, _FORCE] > 0:
             place = trail[k, _FROM : _FROM + 3]
@@ -166,12 +156,12 @@ def _pressed(trail, shares, times, dt, pose, middle, normal, relaxed, force, dep
     place = np.argmin(away)
     if not away[place] > SPACING * radius:
         if not (away[place] < SAME * radius and force > trail[place, _FORCE] * (1 + HARDER)):
-            return trail
+            return
         row = trail[place]  # one that is pressed deeper stays where it is, however slowly the tool goes on
         row[:_FROM] = pose.ravel()
         row[_NOW], row[_FORCE], row[_DEPTH], row[_POWER], row[_STRAIN] = force, force, depth, power, strain
         row[_LET_DEPTH] = row[_LET_FORCE] = 0.0
-        return trail
+        return
     for _ in range(PLACES):
         share = 1.0
         if away[place] < np.inf:
@@ -190,27 +180,6 @@ def _pressed(trail, shares, times, dt, pose, middle, normal, relaxed, force, dep
         away[place] = np.sqrt(np.sum(back**2))
         if not away[place] > SPACING * radius:
             break
-    return trail
-
-
-def after(trail: np.ndarray, series: Series, dt: float, now: Pass | None) -> np.ndarray:
-    """The places after a step: those under the tool are held as deep as it is, the others come back by themselves.
-
-    A place is skin of its own, so it relaxes without the fresh skin of `stmpl_core.relaxation`.
-
-    Args:
-        trail: places before.
-        series: relaxation of the layer's force.
-        dt: time of the step [s].
-        now: the tool, if it presses.
-    """
-    if not len(trail):
-        return trail
-    if now is not None:
-        return _pressed(trail, *series, dt, *now)
-    trail = trail.copy()
-    _aged(trail, *series, dt, np.full(len(trail), np.inf), np.zeros(len(trail)), 0.0)
-    return trail
 
 
 def carried_trail(trail: np.ndarray, motion_at: Callable[[np.ndarray], Transform]) -> np.ndarray:

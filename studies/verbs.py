@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 
 from stmpl_core.console import print_figures, steps_bar
+from stmpl_core.errors import InvalidInput
 from stmpl_core.extras import needed
 
 if TYPE_CHECKING:
@@ -227,6 +228,8 @@ def stability(
         told = f"{row.method} at {row.axis} {row.level}: {row.outcome}\n{said}".strip()
         print_figures(dataclasses.asdict(row) if as_json else told)
         return 1 if row.broken else 0
+    if fuzz < 0:
+        raise InvalidInput(f"--fuzz is {fuzz}; how many contacts is needed, or 0 for the sweep.")
     if fuzz > 0:
         return _fuzz(methods, fuzz, seed, out or Path("runs/fuzz"), as_json)
     folder = out or Path("runs/stability")
@@ -274,7 +277,7 @@ def _fuzz(methods: tuple[str, ...], count: int, seed: int, out: Path, as_json: b
     found = {}
     for name in methods:
         with steps_bar(f"contacts of {name}", quiet=as_json) as show:
-            found[name] = fuzz(name, maker(name), count, seed, out / name, on_progress=show)
+            found[name] = fuzz(name, maker(name), count, seed, out / Path(name).stem, on_progress=show)
     told = {name: dataclasses.asdict(one) for name, one in found.items()}
     print_figures(told if as_json else fuzz_table(found, out))
     return int(any(one.outcomes.get(bad, 0) for one in found.values() for bad in ("silent", "crashed")))

@@ -166,3 +166,14 @@ def test_in_a_crease_a_tool_is_drawn_back_between_the_folds_not_through_the_limb
         assert touch.status == IN_CORE and not touch.trust.in_range and touch.depth < 0.03
         forces.append(touch.force)
     assert max(forces) < 1.2 * min(forces)
+
+
+def test_a_rim_at_the_core_is_told_of_where_the_rest_is_not_deep() -> None:
+    """Tissue of 8 mm that thins to 4: the tool is drawn back for the one, and is not that deep in the mean."""
+    layer = plate(0.12, 3e-3)
+    thickness = 8e-3 - 4e-3 * np.clip((layer.vertices[:, 0] - 4e-3) / 6e-3, 0, 1)
+    uneven = Simulator(layer.with_(thickness=thickness, tissue=Tissue(2e4, 0.4)), Winkler())
+    for depth, told in ((3.4e-3, False), (3.7e-3, True)):
+        (touch,) = uneven.touch([press(box(0.03, 0.02, 0.02), at(0, 0, 0.01 - depth), None)])
+        assert touch.pressed is not None
+        assert (touch.pressed.factor > 1) == ("a part of the skin below it to over 90%" in touch.trust.why) == told

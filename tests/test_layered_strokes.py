@@ -205,7 +205,7 @@ def test_a_contact_that_was_given_nothing_gives_nothing(elastic: Simulator, fram
     depths = np.arange(9e-3, -1e-3, -2e-4)
     (first,), state = elastic.touch([Contact(BALL, frame @ shift(-depths[0]))], State(), 1e-3)
     memory = state.tools[BALL.name]
-    state, touches = State({BALL.name: memory._replace(scalars=memory.scalars._replace(work=0.0))}), [first]
+    state, touches = State({BALL.name: memory.with_(scalars=memory.scalars._replace(work=0.0))}), [first]
     for depth in depths[1:]:
         (touch,), state = elastic.touch([Contact(BALL, frame @ shift(-depth))], state, 1e-3)
         touches.append(touch)

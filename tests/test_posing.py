@@ -413,7 +413,7 @@ def test_a_state_comes_back_with_the_joints_that_it_was_told_at(skin):
     third = json.dumps({"version": 3, "terms": told["terms"], "tools": told["tools"]}).encode() + b"\n"
     third += fewer.tobytes()
     read, defaults = State.unpack(third, joints=(0.3,)), list(Scalars._field_defaults.items())[-UNKNOWN[3] :]
-    meant = {name: one._replace(scalars=one.scalars._replace(**dict(defaults))) for name, one in state.tools.items()}
+    meant = {name: one.with_(scalars=one.scalars._replace(**dict(defaults))) for name, one in state.tools.items()}
     assert read.pack() == replace(state, tools=meant).pack() != state.pack()
     with pytest.raises(InvalidInput, match="does not say where its joints were"):
         simulator.touch([Contact(ball(), pose)], State.unpack(third), 0.02)

@@ -63,7 +63,7 @@ def test_what_fails_or_is_not_finite_leaves_the_memory_as_it_was(sim: Simulator,
 
     def spoilt(contacts, state, dt):
         touches, after = step(contacts, state, dt)
-        return touches, State({name: one._replace(relaxed=one.relaxed * np.nan) for name, one in after.tools.items()})
+        return touches, State({name: one.with_(relaxed=one.relaxed * np.nan) for name, one in after.tools.items()})
 
     monkeypatch.setattr(sim.history, "step", spoilt)
     with pytest.raises(InvalidInput, match="would not be finite"):

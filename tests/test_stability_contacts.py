@@ -295,6 +295,13 @@ def test_random_skins_span_sizes_and_materials():
     assert len({len(mesh.vertices) for mesh in meshes}) > 20
 
 
+def test_tools_of_the_thinnest_skins_are_tools():
+    rng = np.random.default_rng([0, 0])
+    mesh = random_mesh(rng)
+    assert mesh.thickness.max() < 1e-5
+    assert all(np.ptp(random_tool(rng, mesh, "tool").vertices, axis=0).min() >= 2e-4 for _ in range(20))
+
+
 def test_the_verb_fuzzes(tmp_path, capsys):
     from stmpl_ros.cli import main
 
@@ -303,6 +310,20 @@ def test_the_verb_fuzzes(tmp_path, capsys):
     told = json.loads(capsys.readouterr().out)
     assert told["zero"]["contacts"] == 20
     assert bool(ended.value.code) == any(told["zero"]["outcomes"].get(bad, 0) for bad in ("silent", "crashed"))
+
+
+def test_the_verb_fuzzes_a_method_of_ones_own_wherever_its_file_is(tmp_path, capsys):
+    from stmpl_ros.cli import main
+
+    yours, out = tmp_path / "yours.py", tmp_path / "out"
+    yours.write_text("from stmpl_core.methods import Winkler\n\n\nclass Own(Winkler):\n    name = 'own'\n")
+    with pytest.raises(SystemExit):
+        main(["stability", "--fuzz", "3", "--seed", "3", "--methods", str(yours), "--out", str(out), "--json"])
+    assert json.loads((out / "yours" / "fuzz.json").read_text())["contacts"] == 3
+    capsys.readouterr()
+    with pytest.raises(SystemExit) as ended:
+        main(["stability", "--fuzz", "-3"])
+    assert ended.value.code == 1 and "--fuzz is -3" in capsys.readouterr().err
 
 
 def test_what_is_flagged_hides_nothing_that_is_not():

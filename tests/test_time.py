@@ -365,7 +365,7 @@ def test_a_state_of_other_skin_is_refused(sim: Simulator, elastic: Simulator) ->
     with pytest.raises(InvalidInput, match="times of relaxation"):
         sim.touch([pressed(2e-3)], state, 0.1)
     _, state = sim.touch([pressed(2e-3)], State(), 0.1)
-    far = {name: one._replace(contact=one.contact + [[0.5, 0, 0], [0, 0, 0], [0, 0, 0]])
+    far = {name: one.with_(contact=one.contact + [[0.5, 0, 0], [0, 0, 0], [0, 0, 0]])
            for name, one in state.tools.items()}  # fmt: skip
     with pytest.raises(InvalidInput, match="where this skin is not"):
         sim.touch([pressed(2e-3)], State(far), 0.1)
@@ -393,9 +393,26 @@ def test_another_surface_under_the_same_name_remembers_nothing(sim: Simulator) -
     simulator = Simulator(sim.layer, Winkler())
     (fresh,), clean = simulator.touch([here], State(), 0.1)
     (touch,), after = simulator.touch([here], state, 0.1)
-    assert touch.wrench.tobytes() == fresh.wrench.tobytes() and after.pack() == clean.pack()
+    assert touch.wrench.tobytes() == fresh.wrench.tobytes()
+    assert State({other.name: after.tools[other.name]}).pack() == clean.pack()
     (same,), _ = sim.touch([pressed(DEPTH)], State.unpack(state.pack()), 0.1)
     assert same.force < 0.8 * sim.touch([pressed(DEPTH)])[0].force
+
+
+def test_what_another_surface_of_a_name_made_relax_is_in_the_bound_until_it_is_back(sim: Simulator) -> None:
+    _, state = played(sim, np.array([0, 0.1, 5.0]), np.array([-1e-4, DEPTH, DEPTH]))
+    here = at(MIDDLE[0], MIDDLE[1], RADIUS - DEPTH)
+    (held,), _ = sim.touch([Contact(BALL, here)], state, 0.01)
+    swap = ball(RADIUS * 1.01)
+    swapped = [sim.touch([Contact(swap.named(name), here)], state, 0.01) for name in (BALL.name, "other")]
+    (same, other), (later, _) = ([touch for (touch,), _ in swapped], [state for _, state in swapped])
+    assert same.force == other.force and same.force_bound == other.force_bound
+    assert same.force - held.force < same.force_bound
+    for _ in range(3):
+        (touch,), later = sim.touch([Contact(swap.named(BALL.name), here)], later, 0.01)
+        assert touch.force_bound > held.force_bound + 0.5 * (same.force - held.force)
+    _, later = sim.touch([], later, 1e4)
+    assert not later.tools
 
 
 def test_an_imprint_whose_tool_was_taken_away_is_told_of(sim: Simulator) -> None:

@@ -23,6 +23,7 @@ from stmpl_core.gpu.warp_batch import STATUSES, WarpBatch, WarpTouches  # noqa: 
 LEFT, RIGHT = ball(0.012).named("left"), ball(0.009).named("right")
 SLOW, QUICK = Prony((0.3, 0.1), (0.05, 1.0)), Prony((0.2,), (0.3,))
 THICK, LONG, N = 0.02, 0.3, 3
+PARTS = ("pose", "wrench", "scalars", "relaxed", "contact", "imprint", "stiffness", "springs", "springs_relaxed")
 UNEVEN = (1e-4, 5e-2, 1e-3, 1e-2, 5e-3)  # s
 
 
@@ -66,13 +67,12 @@ def compared(found: WarpTouches, expected: BatchTouches, most: dict[str, float])
     for mine, theirs in zip(found.states.to_states(), expected.states or [], strict=True):
         assert mine.tools.keys() == theirs.tools.keys()
         for name, memory in mine.tools.items():
-            for part, there in memory._asdict().items():
-                if part != "trail":
-                    other = np.asarray(getattr(theirs.tools[name], part))
-                    least = 1e-3 if part == "scalars" else 1e-2
-                    apart = np.abs(np.asarray(there) - other)
-                    scale = np.maximum(np.abs(other) if part == "scalars" else np.abs(other).max(initial=0), least)
-                    off[part] = max(off.get(part, 0.0), float((apart / scale).max(initial=0)))
+            for part in PARTS:
+                there, other = (np.asarray(getattr(one, part)) for one in (memory, theirs.tools[name]))
+                least = 1e-3 if part == "scalars" else 1e-2
+                apart = np.abs(there - other)
+                scale = np.maximum(np.abs(other) if part == "scalars" else np.abs(other).max(initial=0), least)
+                off[part] = max(off.get(part, 0.0), float((apart / scale).max(initial=0)))
     for name, one in off.items():
         most[name] = max(most.get(name, 0.0), float(one))
 

@@ -29,13 +29,14 @@ from stmpl_core.errors import InvalidInput
 from stmpl_core.friction import Friction, check_tools
 from stmpl_core.gpu import answers, bears, columns, hold, lattice, looks, packs, places, stacks, sticks
 from stmpl_core.gpu.fields import Fields
-from stmpl_core.gpu.memory import PATCH, Steps, WarpStates
+from stmpl_core.gpu.memory import Steps, WarpStates
 from stmpl_core.gpu.rays import mat33
 from stmpl_core.networks import shipped
 from stmpl_core.obstacle import MAX_ITERATIONS
 from stmpl_core.skin import Skin
 from stmpl_core.soundness import too_long
 from stmpl_core.state import State
+from stmpl_core.stepped import PATCH
 from stmpl_core.tool import Tool
 
 log = logging.getLogger(__name__)
@@ -252,9 +253,7 @@ class WarpBatch:
                 first += self._part
             if states is None:
                 return WarpTouches(wrenches, depths, bounds, in_range, statuses, motion)
-            known = STATUSES.index
-            rows, after = steps.step(patches.numpy(), states, dt, known("pressed by pose"), known("apart"),
-                                     known("refused"))  # fmt: skip
+            rows, after = steps.step(patches.numpy(), states, dt)
             for to, part in ((told, rows[..., :6]), (in_range, rows[..., 7]), (statuses, rows[..., 8])):
                 to.assign(np.ascontiguousarray(part, wp.dtype_to_numpy(to.dtype)))
             depths, bounds = (wp.array(np.ascontiguousarray(rows[..., at], wp.dtype_to_numpy(real)), dtype=real,

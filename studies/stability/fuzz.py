@@ -33,6 +33,7 @@ log = logging.getLogger(__name__)
 ON_ONE_SKIN = 500  # contacts that a skin is pressed by, before the next one is made
 STACKED = 0.25  # share of the skins that are a stack
 TOOLS = 6  # tools that press it
+SMALLEST = 3e-3  # size of a tool [m]: a tenth of it, a sheet's, is still one
 DEEPER = 0.03  # of the thickness, by which a tool that presses by its pose alone goes on, where its force must not fall
 LONGEST_ERROR = 500  # letters of an error
 KEPT = 20  # failures of a kind that are saved
@@ -210,7 +211,7 @@ def random_stack(rng: np.random.Generator, tissue: Tissue, thickness: float) -> 
 
 def random_tool(rng: np.random.Generator, mesh: Mesh, name: str) -> Tool:
     """A ball, capsule, punch, box, plate or ring, from much smaller than the layer to larger than the limb."""
-    size = float(mesh.thickness.max()) * 10 ** rng.uniform(-0.7, 1.0)
+    size = max(float(mesh.thickness.max()) * 10 ** rng.uniform(-0.7, 1.0), SMALLEST)
     a, b, c = size * 10 ** rng.uniform(-0.5, 0.5, 3)
     kind = rng.choice(["ball", "capsule", "punch", "box", "sheet", "ring"])
     made = {"ball": lambda: shapes.ball(size, name), "capsule": lambda: shapes.capsule(a, b, name),
