@@ -71,6 +71,7 @@ PINS = 3  # tools side by side from which they may be pins of one brush
 SIDES = (0.2, 0.9)  # share of the force that points one way: below, a tool closes around; between, none was learnt
 MAX_UNSEEN_FORCE_SHARE = 0.1  # share of the force that vertices unlike all training contacts may carry
 MAX_PRESSED_STRAIN, STRAINED = 0.85, 0.003  # depth over thickness beyond which no wrench presses a tool, and how well
+RIM = 0.75, 0.89  # depth over the mean thickness from which a tool with a rim that is too deep is drawn back: wholly
 STIFFENING = 10.0  # growth of the force beyond, relative, a thickness of the way that it was drawn back
 FORCE_TOLERANCE = 0.015  # relative error of the force at which trials end; the rest of the way is reckoned
 LEAST_STEP = 2e-4  # step of the depth, over the thickness, that is likewise only reckoned
@@ -105,6 +106,7 @@ class _Placed(NamedTuple):
     why: str = ""
     held: Held | None = None  # pressures of the skin against this tool alone, where they are known
     factor: float = 1.0  # on the pressures: what a tool that was drawn back presses more
+    rim: bool = False  # truth of the claim that a part of the skin below is deeper than DEEPEST, and the most is not
     lost: bool = False  # truth of the claim that it may press between corners of long triangles, where it is not found
 
 
@@ -258,11 +260,19 @@ class Toucher:
                 return nothing(NO_FORCE)._replace(why=why)
             return nothing(NO_FORCE if depth > 0 else APART)
         if inside or self.deep.strain(squeeze) >= DEEPEST:
-            back, drawn, way = self.deep.drawn_back(field, pose, tool, squeeze)
             core = inside or bool((squeeze.depth >= self.layer.thickness[squeeze.vertices]).any())
+            share = 1.0 if inside else self._deep_share(squeeze)
+            if force is None and not share:
+                return _Placed(contact, field, IN_CORE if core else BY_POSE, pose, depth, 0.0, squeeze, None, rim=True)
+            back, drawn, way = self.deep.drawn_back(field, pose, tool, squeeze)
             if force is None:
-                return _Placed(contact, field, IN_CORE if core else BY_POSE, back, self._depth(drawn) + way, -way,
-                               drawn, None, factor=1 + STIFFENING * way / self._thickest)  # fmt: skip
+                deepest = self._depth(drawn) + way
+                if share < 1:
+                    way *= share
+                    back = shifted(pose, share * (back[:3, 3] - pose[:3, 3]))
+                    drawn = self.columns.squeezed(field, back)
+                return _Placed(contact, field, IN_CORE if core else BY_POSE, back, deepest, -way, drawn, None,
+                               factor=1 + STIFFENING * way / self._thickest, rim=share < 1)  # fmt: skip
             pose, clearance = back, self._clearance(field, back, reach)
         elif force is None:
             return _Placed(contact, field, BY_POSE, pose, depth, 0.0, squeeze, None) if len(squeeze.nodes.area) \
@@ -279,6 +289,20 @@ class Toucher:
             return self._place(contact, field, many, None)
         apart = found.moved - self._depth(found.squeeze) > MAX_TOUCHING_GAP * self.hole
         return found._replace(status=MOVED) if apart else found
+
+    def _deep_share(self, squeeze: Squeeze) -> float:
+        """Share of the way by which a tool is drawn back that is too deep: none where that is a rim over thin tissue,
+        and it is not deep by the thickness in the mean; all of it as on an even layer, where each column is as deep.
+
+        There the columns bear no more than at MAX_COLUMN_STRAIN: to draw all of the tool back for one took 20 % of its
+        force off as it slid on to it.
+        """
+        thickness = squeeze.nodes.thickness
+        if not len(thickness):
+            return 1.0
+        x = (self._depth(squeeze) / float(thickness.mean()) - RIM[0]) / (RIM[1] - RIM[0])
+        x = min(max(x, 0.0), 1.0)
+        return x * x * (3 - 2 * x)
 
     def _disagrees(self, contact: Contact, field: SignedDistance, pose: Transform, clearance: Clearance,
                    depth: float) -> str:  # fmt: skip
@@ -509,9 +533,9 @@ class Toucher:
         if deepest > card["ranges"]["depth_over_thickness"][1] and one.status != IN_CORE:
             trust = trust.also(f"{name} presses to {deepest:.0%} of the thickness, learnt is "
                                f"{card['ranges']['depth_over_thickness'][1]:.0%}", in_range=False)  # fmt: skip
-        elif one.factor > 1 and one.status != IN_CORE:  # over thin tissue beside thick
-            trust = trust.also(f"{name} presses a part of the skin below it to over {DEEPEST:.0%} of the tissue there: "
-                               "all of it is answered for where it does not", in_range=False)  # fmt: skip
+        elif one.rim and one.status != IN_CORE:
+            trust = trust.also(f"{name} presses a part of the skin below it to over {DEEPEST:.0%} of the tissue there",
+                               in_range=False)  # fmt: skip
         softly = touch.depth / self._soft
         if softly > SOFT_SHARE and one.status != IN_CORE:
             trust = trust.also(f"{name} presses to {softly:.0%} of what lies over a material over {MUCH_STIFFER:g} "
