@@ -145,9 +145,9 @@ class Hearing:
         why = self._refused.get(name, "")
         return f"{name} is answered with its surface from before{why}" if why and name in self.tools else ""
 
-    def look_for_outdated(self) -> str:
-        """The same of all tools."""
-        return "; ".join(filter(None, map(self.outdated, sorted(self._refused))))
+    def look_for_outdated(self) -> list[str]:
+        """The same of all tools that have one."""
+        return list(filter(None, map(self.outdated, sorted(self._refused))))
 
     def look_for_strangers(self) -> str:
         """Which tools' poses are sent in vain, since their surface is not known, from the second look on; empty: none.

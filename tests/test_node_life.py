@@ -503,7 +503,7 @@ def test_whatever_fails_beside_the_node_is_told_and_the_tool_from_before_goes_on
     before, again = node.hearing.tools["finger"], ball().named("finger")
     node.hearing.tools.announce(again)
     node._on_field(again, failed)
-    node.sending.models._on_models(Instant([contact_of(before, HERE)], 0, 0, {}), {}, "", failed)
+    node.sending.models._on_models(Instant([contact_of(before, HERE)], 0, 0, {}), {}, {}, failed)
     said = capfd.readouterr().err
     assert "refused: mesh of 'finger' refused: an accident\n" in said and "no local contact: an accident\n" in said
     assert node.hearing.tools["finger"] is before and not node.hearing.tools.waiting()

@@ -13,7 +13,7 @@ from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState, GetState
 from rclpy.context import Context
 from rclpy.parameter import Parameter
-from stmpl_msgs.msg import ContactMesh
+from stmpl_msgs.msg import ContactMesh, LocalContact
 from stmpl_msgs.srv import SetBody
 
 from bags.wire import header, pose_message, tool_message
@@ -160,12 +160,18 @@ def test_poses_of_a_tool_whose_mesh_was_refused_are_told_in_the_diagnostics(bus,
 
 
 def test_a_tool_whose_newest_surface_is_refused_is_answered_with_the_one_before_and_flagged(bus, hand):
-    assert hand.ask(HERE, PUSH).touches[0].in_range
+    models: list[LocalContact] = []
+    ear = bus.node.create_subscription(LocalContact, "tools/probe/local_contact", models.append, STREAM)
+    bus.wait(lambda: hand.ask(HERE, PUSH).touches[0].in_range and models and models[-1].in_range, "a model in range")
     bus.mesh.publish(ContactMesh(header=header("probe", bus.now()), vertices=[0.0] * 4, triangles=[0, 1, 2]))
     bus.wait(lambda: bus.said("mesh of 'probe' refused"), "the log line")
     answer, says = hand.ask(HERE, PUSH), "probe is answered with its surface from before (mesh of 'probe' refused: "
     assert says in answer.why and not answer.in_range and not answer.touches[0].in_range
     assert told(bus, lambda: hand.send(HERE, PUSH), says).level == DiagnosticStatus.WARN
+    all_of_them = told(bus, lambda: hand.send(HERE, PUSH), "answers of the last second are out of range")
+    assert all_of_them.message.count(says) == 1
+    bus.wait(lambda: not models[-1].in_range, "the model to be flagged as the answer is")
+    bus.node.destroy_subscription(ear)
     bus.mesh.publish(tool_message(ball().named("probe"), bus.now()))
     bus.wait(lambda: hand.ask(HERE, PUSH).in_range, "the good one to be trusted again")
 
