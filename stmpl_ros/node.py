@@ -480,11 +480,12 @@ def run(config: NodeConfig, arguments: list[str] | None = None, build: Build = l
         executor.add_node(node)
         try:
             with interruptible(stop):
-                if node.config.autostart and (
-                    node.trigger_configure() != TransitionCallbackReturn.SUCCESS
-                    or node.trigger_activate() != TransitionCallbackReturn.SUCCESS
-                ):
-                    return 1
+                if node.config.autostart:
+                    if node.trigger_configure() != TransitionCallbackReturn.SUCCESS:
+                        return 1
+                    # set: by an interrupt that came while something was deleted, where Python goes on
+                    if not stop.is_set() and node.trigger_activate() != TransitionCallbackReturn.SUCCESS:
+                        return 1
             numba.set_num_threads(1)  # a second one stalls answers for tens of milliseconds where its core is busy
             spin(executor, stop)
         finally:
