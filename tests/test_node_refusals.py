@@ -62,6 +62,7 @@ def test_a_node_whose_configuring_was_refused_may_be_asked_for_anything_and_is_c
 @pytest.mark.parametrize(("given", "says"), [
     (["--params-file", "/nope.yaml"], "ROS does not take its arguments: Couldn't parse params file"),
     (["-p", "part"], "ROS does not take its arguments: Couldn't parse parameter override rule: '-p part'"),
+    (["-p", "use_sim_time:=1"], "ROS does not take its arguments: Trying to set parameter 'use_sim_time' to '1'"),
     (["garbage", "--"], "ROS does not know what ['garbage'] means after --ros-args"),
 ])  # fmt: skip
 def test_arguments_that_ros_does_not_take_end_a_verb_with_one_sentence(given, says):
