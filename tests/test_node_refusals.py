@@ -17,6 +17,7 @@ from stmpl_msgs.msg import ContactMesh, LocalContact
 from stmpl_msgs.srv import SetBody
 
 from bags.wire import header, pose_message, tool_message
+from stmpl_core.errors import InvalidInput
 from stmpl_ros.node import SkinNode
 from stmpl_ros.parameters import ANY_TIME, CONFIGURING, NodeConfig
 from stmpl_ros.topics import STREAM
@@ -106,6 +107,19 @@ def test_a_part_that_no_body_has_is_refused_before_the_node_is_configured_too():
         assert taken.successful and node.config.part == "right_forearm"
     finally:
         node.destroy_node()
+        context.try_shutdown()
+        context.destroy()
+
+
+@pytest.mark.parametrize("name", ["1bad", "a//b", "x" * 200])
+def test_a_shape_tool_whose_name_no_topic_can_have_is_refused_at_the_start(name):
+    context = Context()
+    context.init(domain_id=int(os.environ["ROS_DOMAIN_ID"]) + BUSES)
+    says = f"shape_tools names '{name[:60]}': a tool's name must be a ROS name: letters, digits, _ and /, each part"
+    try:
+        with pytest.raises(InvalidInput, match=says):
+            SkinNode(NodeConfig(shape_tools=("ok", name)), context=context)
+    finally:
         context.try_shutdown()
         context.destroy()
 
