@@ -12,6 +12,7 @@ from geometry_msgs.msg import PoseStamped
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState, GetState
 from rclpy.context import Context
+from rclpy.lifecycle import LifecycleNode
 from rclpy.parameter import Parameter
 from stmpl_msgs.msg import ContactMesh, LocalContact
 from stmpl_msgs.srv import SetBody
@@ -20,6 +21,7 @@ from bags.wire import header, pose_message, tool_message
 from stmpl_core.errors import InvalidInput
 from stmpl_ros.node import SkinNode
 from stmpl_ros.parameters import ANY_TIME, CONFIGURING, NodeConfig
+from stmpl_ros.settings import Settings
 from stmpl_ros.topics import STREAM
 from tests.bus import ROOT, end, running, start
 from tests.conftest import BUSES
@@ -105,6 +107,25 @@ def test_a_part_that_no_body_has_is_refused_before_the_node_is_configured_too():
         refused, taken = (node.set_parameters([Parameter("part", value=part)])[0] for part in ("nose", "right_forearm"))
         assert not refused.successful and refused.reason.startswith("unknown part 'nose'. Available: left_arm")
         assert taken.successful and node.config.part == "right_forearm"
+    finally:
+        node.destroy_node()
+        context.try_shutdown()
+        context.destroy()
+
+
+def test_a_configured_node_takes_what_it_has_already_and_refuses_what_differs_by_name():
+    context = Context()
+    context.init(domain_id=int(os.environ["ROS_DOMAIN_ID"]) + BUSES)
+    node = LifecycleNode("configured", context=context)
+    try:
+        settings = Settings(node, NodeConfig(joints=("left_elbow=elbow_2",)), lambda config: None)
+        settings.locked = True
+        names = sorted(NodeConfig.names(CONFIGURING) | NodeConfig.names(ANY_TIME))
+        dumped = [node.get_parameter(name) for name in names]
+        assert all(result.successful for result in node.set_parameters(dumped)), "ros2 param dump and load"
+        given = [Parameter("edge_length", value=0.003), Parameter("method", value="unet")]
+        reason = node.set_parameters_atomically(given).reason
+        assert reason == "a configured node takes no other method as a parameter: clean up first."
     finally:
         node.destroy_node()
         context.try_shutdown()
