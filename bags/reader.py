@@ -66,6 +66,14 @@ class Topic(NamedTuple):
     last_ns: int
 
 
+def _together(one: Topic, other: Topic) -> Topic:
+    """Two channels of one topic, as a file that was merged of several has them."""
+    if not (one.messages and other.messages):
+        return one if one.messages else other
+    return one._replace(messages=one.messages + other.messages, first_ns=min(one.first_ns, other.first_ns),
+                        last_ns=max(one.last_ns, other.last_ns))  # fmt: skip
+
+
 class Bag:
     """A recording, given by its folder or its .mcap file, looked over once.
 
@@ -340,8 +348,9 @@ class Bag:
         for number, channel in self._channels.items():
             schema = self._schemas.get(channel.schema_id)
             if self._is_meant(channel.topic):
-                self.topics[channel.topic] = Topic(channel.topic, schema.name if schema else "?",
-                                                   *spans.get(number, (0, 0, 0)))  # fmt: skip
+                topic = Topic(channel.topic, schema.name if schema else "?", *spans.get(number, (0, 0, 0)))
+                before = self.topics.get(topic.name)
+                self.topics[topic.name] = topic if before is None else _together(before, topic)
         if self.namespace and self.namespace not in self.namespaces:
             raise BagError(f"{self.file} holds no robot of the namespace {self.namespace}; "
                            f"there: {', '.join(self.namespaces) or 'none'}.")  # fmt: skip

@@ -172,7 +172,8 @@ class Answering:
         if reaction is None:
             return False
         assert self._field is not None
-        reaction = reaction._replace(touches=[self._flagged(touch, instant) for touch in reaction.touches])
+        useless = {one.name: self._useless(instant, one.name) for one in instant.contacts}
+        reaction = reaction._replace(touches=[_flagged(touch, useless[touch.name]) for touch in reaction.touches])
         touches = {touch.name: touch for touch in reaction.touches}
         self.sending.reaction(instant, touches)
         self.remembering.keep(reaction, instant)
@@ -185,7 +186,8 @@ class Answering:
             self._hearing.gate.say("where the limb is", doubt)
         asked = Asked(instant, reaction, self._fields, self._epoch, seconds, tuple(self._news), said, skin, doubt)
         self._field.put(asked)
-        self.sending.models.put(instant, touches, reaction.before, doubt)
+        doubts = {name: "; ".join(filter(None, (doubt, why))) for name, why in useless.items()}
+        self.sending.models.put(instant, touches, reaction.before, doubts)
         if not any(skin.angles) and not doubt:  # a fit knows the skin at rest
             self._calibration.put(instant, touches)
         if self.limits:
@@ -198,13 +200,9 @@ class Answering:
         self._seen = set(touches)
         return True
 
-    def _flagged(self, touch: Touch, instant: Instant) -> Touch:
-        """The touch, flagged where a wrench or a surface was told that cannot be used; what is remembered is not."""
-        whys = instant.refused.get(touch.name, ""), self._hearing.outdated(touch.name)
-        trust = touch.trust
-        for why in filter(None, whys):
-            trust = trust.also(why, in_range=False)
-        return touch if trust is touch.trust else touch.with_(trust=trust)
+    def _useless(self, instant: Instant, name: str) -> str:
+        """What was told of a tool and cannot be used: a wrench, a surface; empty: neither."""
+        return "; ".join(filter(None, (instant.refused.get(name), self._hearing.outdated(name))))
 
     def _bend(self) -> bool:
         """Takes skin and memory to where the joints are now; whether they were elsewhere."""
@@ -373,6 +371,11 @@ class Answering:
 
 def _surfaces(instant: Instant) -> dict[str, str]:
     return {one.name: one.tool.digest for one in instant.contacts}
+
+
+def _flagged(touch: Touch, why: str) -> Touch:
+    """The touch, flagged if there is a reason."""
+    return touch.with_(trust=touch.trust.also(why, in_range=False)) if why else touch
 
 
 def _told(error: Exception) -> str:

@@ -147,11 +147,20 @@ class Bending:
         if not gate.fresh(stamp, self._config().max_age):
             self._refused = gate.dropped, now
             return None
-        last = [self._heard[name] for name in told if name in self._heard]
-        if any(stamp <= one.stamp and now - one.came < SILENT_S for one in last):
+        if any(self._is_over(self._heard[name], stamp, now) for name in told if name in self._heard):
             return gate.say("order of joints", "joint states were dropped: their stamp is not after the last one's")
         self._heard = heard
         return self._put(self._rest, angles)
+
+    def _is_over(self, last: _Heard, stamp: int, now: float) -> bool:
+        """Whether a stamp [ns] is not after the last one's: after a silence an older one is a clock that was set back.
+
+        The same one is no news, however late it comes, unless a simulation is there: while paused it sends no other,
+        and while it runs `max_age` tells what is old.
+        """
+        if stamp == last.stamp and not self._hearing.now.simulated:
+            return True
+        return stamp <= last.stamp and now - last.came < SILENT_S
 
     def _put(self, rest: Skin, angles: tuple[float, ...]) -> None:
         assert self._thread is not None

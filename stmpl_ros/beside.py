@@ -34,8 +34,7 @@ class Beside[T]:
 
     def close(self) -> None:
         """Ends the process, whether the job is done or not."""
-        # waits for what ends at once: a pool's thread that still ends trips over an interpreter that ends too
-        self._pool.end(wait=True)
+        self._pool.end()
 
 
 class Builders:
@@ -89,14 +88,15 @@ class Pool(ProcessPoolExecutor):
         """Whether a process died."""
         return bool(self._broken)
 
-    def end(self, *, wait: bool = False) -> None:
+    def end(self) -> None:
         """Ends the processes, whatever they are at, also while they import; what is not done is dropped."""
         if self._processes is not None:  # None: ended before
             queue: Any = self._result_queue
             queue._writer.close()  # else the pool's thread waits for ever for the rest of a result that was cut off
             for process in list(self._processes.values()):
                 process.terminate()
-        self.shutdown(wait=wait, cancel_futures=True)
+        # waits for what ends at once: a pool's thread that still ends trips over an interpreter that ends too
+        self.shutdown(wait=True, cancel_futures=True)
 
 
 def stand_beside(start: Callable | None = None, *arguments: Any) -> None:

@@ -99,7 +99,7 @@ def _read(data: bytes, kind: type, count: int, made: Callable[[Header, tuple[flo
     """What is made of the header and the numbers after it; the message by rclpy where the bytes are no plain CDR."""
     order = ORDERS.get(data[:2])
     if order is None:
-        return deserialize_message(data, kind)
+        return _read_by_rclpy(data, kind)
     try:
         sec, nanosec, length = struct.unpack_from(f"{order}iII", data, STAMP_AT)
         frame = str(data[FRAME_AT : FRAME_AT + max(length - 1, 0)], "utf-8")  # it ends with a zero
@@ -107,6 +107,15 @@ def _read(data: bytes, kind: type, count: int, made: Callable[[Header, tuple[flo
     except (struct.error, UnicodeDecodeError) as error:
         raise InvalidInput(f"its bytes are no message of this kind: {error}") from error
     return made(Header(Stamp(sec, nanosec), frame), numbers)
+
+
+def _read_by_rclpy(data: bytes, kind: type) -> Any:
+    """The message, for which rclpy takes its time. Raises InvalidInput if there is none."""
+    try:
+        return deserialize_message(data, kind)
+    except Exception as error:  # of the middleware, whichever it is
+        raise InvalidInput(f"its bytes are no message of this kind: they begin with '{data[:2].hex(' ')}', where plain "
+                           "CDR has '00 00' or '00 01'") from error  # fmt: skip
 
 
 def _aligned(length: int) -> int:

@@ -11,6 +11,8 @@ import time
 from collections.abc import Callable
 from types import FrameType
 
+from stmpl_ros.interrupts import interrupt_in
+
 TOLD_AFTER_S = 3.0  # time that kernels are compiled, before a verb tells of it [s]
 SILENT = ("node", "demo", "record", "info", "recover", "foxglove", "fmu")  # verbs that compile nothing, or tell of it
 GRACE = 1.5  # time in which a verb must end after Ctrl-C or SIGTERM, whatever it is doing [s]
@@ -53,12 +55,10 @@ def main(arguments: list[str] | None = None) -> None:
     except KeyboardInterrupt as interrupt:
         code = 128 + next(iter(interrupt.args), signal.SIGINT)
     except (SystemError, RuntimeError) as error:  # how a call or a compiler tells of an interrupt that came in it
-        cause: BaseException | None = error
-        while cause is not None and not isinstance(cause, KeyboardInterrupt):
-            cause = cause.__cause__ or cause.__context__
-        if cause is None:
+        interrupt = interrupt_in(error)
+        if interrupt is None:
             raise
-        code = 128 + next(iter(cause.args), signal.SIGINT)
+        code = 128 + next(iter(interrupt.args), signal.SIGINT)
     except BrokenPipeError:  # `stmpl ... | head`
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         code = 0

@@ -55,10 +55,14 @@ class Hearing:
         on_instant: callback with every complete instant.
         on_time_back: callback for a simulated clock that was set back, once all is forgotten.
         useless: why the last pose that could not be used could not, since it was last emptied.
+
+    Raises:
+        InvalidInput: a name in shape_tools that no tool can have.
     """
 
     def __init__(self, node: Node, config: Callable[[], NodeConfig], tools: Tools, tally: Tally) -> None:
         self._node, self._config = node, config
+        self._check_shape_tools()
         self.gate = Gate(node, tally)
         self.events = Events(self.gate.say)
         self.now = Ticks(node)
@@ -81,6 +85,13 @@ class Hearing:
         self._strangers: set[str] = set()  # tools that were told of
         self._away: set[str] = set()  # tools that were taken away
         self._refused: dict[str, str] = {}  # why the newest surface of a tool cannot be used, in brackets
+
+    def _check_shape_tools(self) -> None:
+        for name in self._config().shape_tools:
+            try:
+                self._check(name)
+            except InvalidInput as error:
+                raise InvalidInput(f"shape_tools names '{name:.60}': {error}") from error
 
     @property
     def tools(self) -> Tools:
@@ -145,9 +156,9 @@ class Hearing:
         why = self._refused.get(name, "")
         return f"{name} is answered with its surface from before{why}" if why and name in self.tools else ""
 
-    def look_for_outdated(self) -> str:
-        """The same of all tools."""
-        return "; ".join(filter(None, map(self.outdated, sorted(self._refused))))
+    def look_for_outdated(self) -> list[str]:
+        """The same of all tools that have one."""
+        return list(filter(None, map(self.outdated, sorted(self._refused))))
 
     def look_for_strangers(self) -> str:
         """Which tools' poses are sent in vain, since their surface is not known, from the second look on; empty: none.
@@ -241,9 +252,8 @@ class Hearing:
             if name == self._config().frame:
                 raise FrameError(f"'{name}' is the body's own frame, in whose axes its wrenches would be read; "
                                  "give the tool another name.")  # fmt: skip
-            if name and not (ROS_NAME.fullmatch(name) and len(self._node.get_namespace() + name) <= MAX_NAME):
-                raise InvalidInput("a tool's name must be a ROS name: letters, digits, _ and /, each part beginning "
-                                   f"with a letter or _, at most {MAX_NAME} letters with the namespace.")  # fmt: skip
+            if name:
+                self._check(name)
             tool = read()
         except StmplError as error:
             return self._refuse_mesh(name, error)
@@ -252,6 +262,12 @@ class Hearing:
         else:
             self.tools.announce(tool)
             self.on_tool(tool)
+
+    def _check(self, name: str) -> None:
+        """Raises InvalidInput for the name of a tool that no topics can have."""
+        if not (ROS_NAME.fullmatch(name) and len(self._node.get_namespace() + name) <= MAX_NAME):
+            raise InvalidInput("a tool's name must be a ROS name: letters, digits, _ and /, each part beginning "
+                               f"with a letter or _, at most {MAX_NAME} letters with the namespace.")  # fmt: skip
 
     def _take_away(self, name: str) -> None:
         self._away.add(name)  # who takes a tool away may go on sending where it is

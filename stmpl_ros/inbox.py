@@ -118,7 +118,9 @@ class Inbox:
         self.inputs.setdefault(name, Input()).refused = Stream(why, came=now)
 
     def _put(self, stream: Stream, value: Any, stamp: int, now: int) -> bool:
-        if stream.live(now, self.rest_after) and stamp <= stream.stamp:
+        # after a silence an older stamp is a clock that was set back; the same one is no news, however late it comes
+        repeated = stream.value is not None and stamp == stream.stamp
+        if repeated or (stamp < stream.stamp and stream.live(now, self.rest_after)):
             self.out_of_order += 1
             return False
         stream.value, stream.stamp, stream.came = value, stamp, now

@@ -9,17 +9,24 @@ from typing import Any
 from lifecycle_msgs.srv import ChangeState
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 
+from stmpl_ros.interrupts import interrupt_in
+
 
 def told[N: LifecycleNode](
     transit: Callable[[N, LifecycleState], TransitionCallbackReturn],
 ) -> Callable[[N, LifecycleState], TransitionCallbackReturn]:
-    """A callback of the lifecycle; what fails in it, which rclpy would swallow, is told, and on_error comes next."""
+    """A callback of the lifecycle; what fails in it, which rclpy would swallow, is told, and on_error comes next.
+
+    Ctrl-C is no failure, also where a compiled call that it came in tells of it by a SystemError.
+    """
 
     @wraps(transit)
     def wrapped(node: N, state: LifecycleState) -> TransitionCallbackReturn:
         try:
             return transit(node, state)
         except Exception as error:
+            if interrupt := interrupt_in(error):
+                raise interrupt from None
             node.get_logger().error(f"{transit.__name__} failed: {type(error).__name__}: {error}")
             return TransitionCallbackReturn.ERROR
 

@@ -409,8 +409,6 @@ class SkinNode(ServingNode):
         inbox, events = self.hearing.inbox, self.hearing.events
         stopped = [f"no wrench of {name} for {self.config.rest_after} s: answered without it"
                    for name in inbox.dumb(self.hearing.now())]  # fmt: skip
-        senders = "; ".join(filter(None, (*stopped, self.hearing.look_for_outdated(), self.hearing.unheard(),
-                                          self.hearing.look_for_strangers(), self.hearing.rivals())))  # fmt: skip
         self._look_for_twins()
         values = self.tally.values() | {
             "tools": " ".join(inbox.live(self.hearing.now())),
@@ -423,6 +421,10 @@ class SkinNode(ServingNode):
         }
         if self.config.joint_states:
             values["joints"] = self.bending.doubt or " ".join(f"{x:.4f}" for x in self.answering.simulator.skin.angles)
+        told = self.bending.doubt or self.tally.doubt  # where all answers are of a surface from before, it says so
+        outdated = [one for one in self.hearing.look_for_outdated() if one not in told]
+        senders = "; ".join(filter(None, (*stopped, *outdated, self.hearing.unheard(),
+                                          self.hearing.look_for_strangers(), self.hearing.rivals())))  # fmt: skip
         lately = self._counts.since(reactions=self.tally.reactions, refused=self.tally.refused, stale=self.tally.stale,
                                     out_of_order=inbox.out_of_order, missed=events.missed_deadlines)  # fmt: skip
         health = Health(lately, self.tally.last_refusal, self.answering.fading, bool(inbox.live(self.hearing.now())),
@@ -478,11 +480,12 @@ def run(config: NodeConfig, arguments: list[str] | None = None, build: Build = l
         executor.add_node(node)
         try:
             with interruptible(stop):
-                if node.config.autostart and (
-                    node.trigger_configure() != TransitionCallbackReturn.SUCCESS
-                    or node.trigger_activate() != TransitionCallbackReturn.SUCCESS
-                ):
-                    return 1
+                if node.config.autostart:
+                    if node.trigger_configure() != TransitionCallbackReturn.SUCCESS:
+                        return 1
+                    # set: by an interrupt that came while something was deleted, where Python goes on
+                    if not stop.is_set() and node.trigger_activate() != TransitionCallbackReturn.SUCCESS:
+                        return 1
             numba.set_num_threads(1)  # a second one stalls answers for tens of milliseconds where its core is busy
             spin(executor, stop)
         finally:

@@ -138,7 +138,7 @@ class Models:
     def __init__(self, node: LifecycleNode, frame: str, workshop: Workshop, gate: Gate) -> None:
         self._node, self._frame, self._workshop, self._gate = node, frame, workshop, gate
         self._publishers: dict[str, Publisher] = {}
-        self._next: tuple[Instant, Touches, Before, str] | None = None
+        self._next: tuple[Instant, Touches, Before, Mapping[str, str]] | None = None
         self._busy = False
 
     def open(self, name: str) -> None:
@@ -153,9 +153,9 @@ class Models:
         """Goes on with another skin: the workshop drops what it was asked."""
         self._next, self._busy = None, False
 
-    def put(self, instant: Instant, touches: Touches, before: Before, doubt: str = "") -> None:
-        """Takes the newest instant, its touches, what they were made from, and why it may not be known where."""
-        self._next = instant, touches, before, doubt
+    def put(self, instant: Instant, touches: Touches, before: Before, doubts: Mapping[str, str]) -> None:
+        """Takes the newest instant, its touches, what they were made from, and why each tool's is out of range."""
+        self._next = instant, touches, before, doubts
         self._tell()
 
     def forget(self) -> None:
@@ -165,21 +165,21 @@ class Models:
     def _tell(self) -> None:
         if self._busy or self._next is None:
             return
-        (instant, touches, before, doubt), self._next = self._next, None
+        (instant, touches, before, doubts), self._next = self._next, None
         if any(touches[one.name].status in MODELLED and self._heard(one.name) for one in instant.contacts):
             self._busy = True
-            self._workshop.models(instant.contacts, before, partial(self._on_models, instant, touches, doubt))
+            self._workshop.models(instant.contacts, before, partial(self._on_models, instant, touches, doubts))
 
     def _heard(self, tool: str) -> bool:
         return tool in self._publishers and self._publishers[tool].get_subscription_count() > 0
 
-    def _on_models(self, instant: Instant, touches: Touches, doubt: str, future: Future) -> None:
+    def _on_models(self, instant: Instant, touches: Touches, doubts: Mapping[str, str], future: Future) -> None:
         self._busy = False
         try:
             for name, model in zip((one.name for one in instant.contacts), future.result(), strict=True):
                 status = touches[name].status
-                for why in filter(None, (doubt, instant.refused.get(name))):
-                    model = replace(model, trust=model.trust.also(why, in_range=False))
+                if doubts[name]:
+                    model = replace(model, trust=model.trust.also(doubts[name], in_range=False))
                 if status in MODELLED and self._heard(name):
                     self._publishers[name].publish(
                         wire.local_contact_message(name, model, status, self._frame, instant.stamp)

@@ -87,7 +87,8 @@ class Settings:
                 self._check_part(config)
         except InvalidInput as error:
             return SetParametersResult(successful=False, reason=str(error))
-        late = sorted(changes.keys() & NodeConfig.names(CONFIGURING))
+        named = changes.keys() & NodeConfig.names(CONFIGURING)
+        late = sorted(name for name in named if getattr(config, name) != getattr(self.config, name))
         if late and self.locked:
             served = set(late) <= SetBody.Request.get_fields_and_field_types().keys()
             how = "call ~/set_body, or clean up first" if served else "clean up first"

@@ -12,6 +12,7 @@ from types import FrameType
 
 import rclpy
 from rclpy._rclpy_pybind11 import RCLError, UnknownROSArgsError
+from rclpy.exceptions import InvalidParameterTypeException, InvalidParameterValueException
 from rclpy.executors import Executor, ExternalShutdownException
 from rclpy.signals import SignalHandlerOptions
 from rclpy.task import Future
@@ -35,7 +36,8 @@ def ros(arguments: list[str] | None = None) -> Iterator[threading.Event]:
     or starved for a second, can leave its sender waiting for a lock of its own for ever (docs/laboratory/node.md).
 
     Raises:
-        InvalidInput: arguments that ROS does not take, or a file of parameters that it cannot read.
+        InvalidInput: arguments that ROS does not take, a file of parameters that it cannot read, or a parameter of
+            every node (use_sim_time) that is of another kind.
     """
     os.environ.setdefault(TRANSPORTS, UDP)
     stop = threading.Event()
@@ -50,6 +52,8 @@ def ros(arguments: list[str] | None = None) -> Iterator[threading.Event]:
     except KeyboardInterrupt:
         if not stop.is_set():
             raise
+    except (InvalidParameterTypeException, InvalidParameterValueException) as error:  # of rclpy's own: use_sim_time
+        raise InvalidInput(f"ROS does not take its arguments: {error}.") from error
     finally:
         try_shutdown()
         for number, handler in before.items():

@@ -61,11 +61,13 @@ class Workshop:
     def field(self, tool: Tool, do: Then) -> None:
         """Has the distance field of a tool built, for `do`. The future may raise MeshError."""
         margin = margin_on(self._knows[0])
-        self._then(self._builders.field(tool, margin), do, lambda: margin == margin_on(self._knows[0]))
+        built = self._begun(lambda: self._builders.field(tool, margin))
+        self._then(built, do, lambda: margin == margin_on(self._knows[0]))
 
     def models(self, contacts: Sequence[Contact], before: Before, do: Then) -> None:
         """Has the local model of each contact found, beside the others and as the tissue remembers, for `do`."""
-        found = self._modeller().submit(_local_contacts, list(contacts), before.state, before.dt, before.joints)
+        asked = list(contacts), before.state, before.dt, before.joints
+        found = self._begun(lambda: self._modeller().submit(_local_contacts, *asked))
         knows = self._knows
         self._then(found, do, lambda: knows is self._knows)
 
@@ -82,7 +84,7 @@ class Workshop:
         return self._fitted(_relaxation_of, press)
 
     def _fitted(self, fit: Callable[[list[Contact]], Fit], contacts: Sequence[Contact]) -> Future[Fit]:
-        found = self._modeller().submit(fit, list(contacts))
+        found = self._begun(lambda: self._modeller().submit(fit, list(contacts)))
         self._then(found, lambda future: self.renew(future.exception()), lambda: True)
         return found
 
@@ -104,6 +106,14 @@ class Workshop:
         self._builders.close()
         if self._models:
             self._models.end()
+
+    def _begun[T](self, submit: Callable[[], Future[T]]) -> Future[T]:
+        """What `submit` hands to a process; to another one, if that one died while it had nothing to do."""
+        try:
+            return submit()
+        except BrokenExecutor as error:
+            self.renew(error)
+            return submit()
 
     def _modeller(self) -> Pool:
         if self._models is None:

@@ -76,6 +76,15 @@ def test_what_was_written_comes_back(tmp_path):
     assert bag.topics["/count"].messages == 100 and bag.topics["/count"].type_name == HEADER
 
 
+def test_a_topic_of_several_channels_counts_the_messages_of_all(tmp_path):
+    with BagWriter(tmp_path / "run") as bag:
+        for k in range(4):  # the last one is never written to
+            channel = bag.add_channel("/count", HEADER, qos_yaml(depth=1 + k))
+            for stamp in [START + 10 * k + i for i in range(k + 1)] * (k < 3):
+                bag.write(channel, cdr(header("", stamp)), stamp, stamp)
+    assert Bag(tmp_path / "run").topics["/count"] == ("/count", HEADER, 6, START, START + 22)
+
+
 def test_rosbags_and_mcap_read_every_message_and_schema(tmp_path):
     path = write_headers(tmp_path / "run")
     with Reader(tmp_path / "run") as reader:

@@ -24,6 +24,7 @@ class Ear:
 
     def __init__(self) -> None:
         self.active, self.refused, self.said = True, [], []
+        self.now: Any = SimpleNamespace(simulated=False)
         self.events: Any = SimpleNamespace(subscribe=lambda *_: None)
         self.gate: Any = SimpleNamespace(refuse=lambda kind, why: self.refused.append(why), fresh=lambda *_: True,
                                          say=lambda kind, text: self.said.append(text))  # fmt: skip
@@ -96,6 +97,25 @@ def test_time_in_which_the_node_could_not_listen_is_no_silence(bent, monkeypatch
     assert hears.doubt == ""
     monkeypatch.setattr(module.time, "monotonic", lambda: now + 5e3)
     assert "no joint states for 2500 s" in hears.doubt
+
+
+def test_a_stamp_that_is_sent_for_ever_is_a_silence_and_of_a_paused_simulation_none(bent, monkeypatch):
+    hears, ear = bent
+    tell(hears, 5, first=0.1, second=0.2)
+    settle(hears)
+    now = time.monotonic()
+    monkeypatch.setattr(module.time, "monotonic", lambda: now + 3e3)
+    tell(hears, 5, first=0.1, second=0.2)
+    assert "no joint states for 3000 s" in hears.doubt and "not after the last one's" in ear.said[-1]
+    ear.now.simulated = True
+    tell(hears, 5, first=0.1, second=0.2)
+    settle(hears)
+    assert hears.doubt == ""
+    monkeypatch.setattr(module.time, "monotonic", lambda: now + 6e3)
+    ear.now.simulated = False
+    tell(hears, 4, first=0.1, second=0.2)
+    settle(hears)
+    assert hears.doubt == "", "a sensor that was silent may start its clock again"
 
 
 def test_until_the_skin_is_bent_as_was_told_answers_are_in_doubt(bent, layer):

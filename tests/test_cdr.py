@@ -52,3 +52,7 @@ def test_bytes_that_are_no_message_are_refused(read) -> None:
     for cut in (4, 12, 18, 30):
         with pytest.raises(InvalidInput, match="no message"):
             read(data[:cut])
+    assert read(b"\x00\x03" + data[2:]).header.frame_id == "body", "a list of parameters, which rclpy reads"
+    for odd in (b"\x07\x01" + data[2:], b"\x00\x03" + data[2:18], b""):
+        with pytest.raises(InvalidInput, match=r"no message of this kind: they begin with .*, where plain CDR"):
+            read(odd)

@@ -12,6 +12,7 @@ import time
 import weakref
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future
+from concurrent.futures.process import _threads_wakeups
 from dataclasses import replace
 from importlib.util import find_spec
 from multiprocessing.connection import wait
@@ -41,6 +42,7 @@ from bags.wire import pose_message, stamp_ns, tool_message
 from stmpl_core import Tool
 from stmpl_core.errors import InvalidInput
 from stmpl_core.friction import PAIRS
+from stmpl_ros import lifecycle
 from stmpl_ros.beside import Beside, Builders
 from stmpl_ros.hearing import Hearing
 from stmpl_ros.inbox import Instant
@@ -503,7 +505,7 @@ def test_whatever_fails_beside_the_node_is_told_and_the_tool_from_before_goes_on
     before, again = node.hearing.tools["finger"], ball().named("finger")
     node.hearing.tools.announce(again)
     node._on_field(again, failed)
-    node.sending.models._on_models(Instant([contact_of(before, HERE)], 0, 0, {}), {}, "", failed)
+    node.sending.models._on_models(Instant([contact_of(before, HERE)], 0, 0, {}), {}, {}, failed)
     said = capfd.readouterr().err
     assert "refused: mesh of 'finger' refused: an accident\n" in said and "no local contact: an accident\n" in said
     assert node.hearing.tools["finger"] is before and not node.hearing.tools.waiting()
@@ -597,6 +599,37 @@ def test_a_signal_ends_a_process_cleanly_just_where_it_stops_being_interruptible
     assert (code, said) == (0, "")
 
 
+DELETING = """
+import os, signal, sys
+from stmpl_ros.node import run
+from stmpl_ros.parameters import NodeConfig
+from tests.node_bus import skin
+
+class Left:
+    def __del__(self):
+        os.kill(os.getpid(), signal.SIGINT)
+
+def build(config):
+    Left()
+    return skin(config)
+
+sys.exit(run(NodeConfig(tissue="paper"), build=build))
+"""
+
+
+def test_ctrl_c_ends_a_node_that_configures_also_where_python_swallows_it():
+    code, said = end(start("-c", DELETING))
+    assert code == 0 and "Exception ignored in" in said and "answering with" not in said
+
+
+def test_ctrl_c_in_a_compiled_call_is_no_transition_that_failed():
+    def on_configure(node, state):
+        raise SystemError("a call returned a result with an exception set") from KeyboardInterrupt()
+
+    with pytest.raises(KeyboardInterrupt):
+        lifecycle.told(on_configure)(None, None)  # type: ignore[arg-type]
+
+
 CTRL_C = """
 import os, signal, time
 from stmpl_ros.beside import Beside
@@ -621,6 +654,7 @@ def test_a_process_beside_the_node_ends_also_while_it_imports_or_hands_its_resul
     builders = Builders()
     (importing,) = set(multiprocessing.active_children()) - before
     builders.close()
+    assert not any(thread.is_alive() for thread in _threads_wakeups), "a thread that ends beside Python trips over it"
     importing.join(PATIENCE)
     assert importing.exitcode == -signal.SIGTERM
     asleep = Beside(time.sleep, 3600)

@@ -12,13 +12,16 @@ from geometry_msgs.msg import PoseStamped
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState, GetState
 from rclpy.context import Context
+from rclpy.lifecycle import LifecycleNode
 from rclpy.parameter import Parameter
-from stmpl_msgs.msg import ContactMesh
+from stmpl_msgs.msg import ContactMesh, LocalContact
 from stmpl_msgs.srv import SetBody
 
 from bags.wire import header, pose_message, tool_message
+from stmpl_core.errors import InvalidInput
 from stmpl_ros.node import SkinNode
 from stmpl_ros.parameters import ANY_TIME, CONFIGURING, NodeConfig
+from stmpl_ros.settings import Settings
 from stmpl_ros.topics import STREAM
 from tests.bus import ROOT, end, running, start
 from tests.conftest import BUSES
@@ -62,6 +65,7 @@ def test_a_node_whose_configuring_was_refused_may_be_asked_for_anything_and_is_c
 @pytest.mark.parametrize(("given", "says"), [
     (["--params-file", "/nope.yaml"], "ROS does not take its arguments: Couldn't parse params file"),
     (["-p", "part"], "ROS does not take its arguments: Couldn't parse parameter override rule: '-p part'"),
+    (["-p", "use_sim_time:=1"], "ROS does not take its arguments: Trying to set parameter 'use_sim_time' to '1'"),
     (["garbage", "--"], "ROS does not know what ['garbage'] means after --ros-args"),
 ])  # fmt: skip
 def test_arguments_that_ros_does_not_take_end_a_verb_with_one_sentence(given, says):
@@ -105,6 +109,38 @@ def test_a_part_that_no_body_has_is_refused_before_the_node_is_configured_too():
         assert taken.successful and node.config.part == "right_forearm"
     finally:
         node.destroy_node()
+        context.try_shutdown()
+        context.destroy()
+
+
+def test_a_configured_node_takes_what_it_has_already_and_refuses_what_differs_by_name():
+    context = Context()
+    context.init(domain_id=int(os.environ["ROS_DOMAIN_ID"]) + BUSES)
+    node = LifecycleNode("configured", context=context)
+    try:
+        settings = Settings(node, NodeConfig(joints=("left_elbow=elbow_2",)), lambda config: None)
+        settings.locked = True
+        names = sorted(NodeConfig.names(CONFIGURING) | NodeConfig.names(ANY_TIME))
+        dumped = [node.get_parameter(name) for name in names]
+        assert all(result.successful for result in node.set_parameters(dumped)), "ros2 param dump and load"
+        given = [Parameter("edge_length", value=0.003), Parameter("method", value="unet")]
+        reason = node.set_parameters_atomically(given).reason
+        assert reason == "a configured node takes no other method as a parameter: clean up first."
+    finally:
+        node.destroy_node()
+        context.try_shutdown()
+        context.destroy()
+
+
+@pytest.mark.parametrize("name", ["1bad", "a//b", "x" * 200])
+def test_a_shape_tool_whose_name_no_topic_can_have_is_refused_at_the_start(name):
+    context = Context()
+    context.init(domain_id=int(os.environ["ROS_DOMAIN_ID"]) + BUSES)
+    says = f"shape_tools names '{name[:60]}': a tool's name must be a ROS name: letters, digits, _ and /, each part"
+    try:
+        with pytest.raises(InvalidInput, match=says):
+            SkinNode(NodeConfig(shape_tools=("ok", name)), context=context)
+    finally:
         context.try_shutdown()
         context.destroy()
 
@@ -160,12 +196,18 @@ def test_poses_of_a_tool_whose_mesh_was_refused_are_told_in_the_diagnostics(bus,
 
 
 def test_a_tool_whose_newest_surface_is_refused_is_answered_with_the_one_before_and_flagged(bus, hand):
-    assert hand.ask(HERE, PUSH).touches[0].in_range
+    models: list[LocalContact] = []
+    ear = bus.node.create_subscription(LocalContact, "tools/probe/local_contact", models.append, STREAM)
+    bus.wait(lambda: hand.ask(HERE, PUSH).touches[0].in_range and models and models[-1].in_range, "a model in range")
     bus.mesh.publish(ContactMesh(header=header("probe", bus.now()), vertices=[0.0] * 4, triangles=[0, 1, 2]))
     bus.wait(lambda: bus.said("mesh of 'probe' refused"), "the log line")
     answer, says = hand.ask(HERE, PUSH), "probe is answered with its surface from before (mesh of 'probe' refused: "
     assert says in answer.why and not answer.in_range and not answer.touches[0].in_range
     assert told(bus, lambda: hand.send(HERE, PUSH), says).level == DiagnosticStatus.WARN
+    all_of_them = told(bus, lambda: hand.send(HERE, PUSH), "answers of the last second are out of range")
+    assert all_of_them.message.count(says) == 1
+    bus.wait(lambda: not models[-1].in_range, "the model to be flagged as the answer is")
+    bus.node.destroy_subscription(ear)
     bus.mesh.publish(tool_message(ball().named("probe"), bus.now()))
     bus.wait(lambda: hand.ask(HERE, PUSH).in_range, "the good one to be trusted again")
 

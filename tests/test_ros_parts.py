@@ -251,6 +251,19 @@ def test_messages_out_of_order_or_repeated_are_dropped_and_counted():
     assert inbox.put_pose("probe", np.eye(4), 4 * MS, 300 * MS), "a device that was silent may start its clock again"
 
 
+@pytest.mark.parametrize("stamp", [0, 5 * MS])
+def test_a_stamp_that_is_sent_for_ever_is_no_news_after_any_silence_until_it_is_forgotten(stamp):
+    inbox = _inbox("probe")
+    inbox.put_wrench("probe", _push(1, stamp), stamp, 0)
+    assert inbox.put_pose("probe", np.eye(4), stamp, 0) and inbox.take(0) is not None
+    for now in range(10 * MS, 2000 * MS, 10 * MS):
+        assert not inbox.put_pose("probe", np.eye(4), stamp, now)
+        assert not inbox.put_wrench("probe", _push(1, stamp), stamp, now)
+        assert inbox.take(now) is None and bool(inbox.live(now)) == (now <= 250 * MS)
+    inbox.forget()
+    assert inbox.put_pose("probe", np.eye(4), stamp, 2000 * MS)
+
+
 def test_a_message_that_is_sent_again_while_the_clock_stands_still_is_known():
     inbox = _inbox("probe")
     assert not inbox.repeats("pose", "probe", 0, 0), "the first one is none"
