@@ -98,7 +98,7 @@ class Fields:
         return not more
 
     def _run(self, kernel: Any, dim: int | tuple[int, int], *inputs: Any) -> None:
-        wp.launch(kernel, dim=dim, inputs=list(inputs), device=self._device)
+        wp.launch(kernel, dim=dim, inputs=list(inputs), device=self._device, block_dim=self._room.lanes)
 
     def _answer(self, pick: Any, to: Any, skins: Any, touched: Any, out: Any) -> None:
         field, lanes, tools, more = self._scratch, self._room.lanes, self._room.tools, self._more
