@@ -6,6 +6,8 @@ before is there to be read after. A value does not depend on who came first. On 
 `wp.config.enable_cpu_blocks` allows more.
 """
 
+from typing import Any
+
 import warp as wp
 
 from stmpl_core.gpu.rays import OPTIONS, real
@@ -13,9 +15,15 @@ from stmpl_core.gpu.rays import OPTIONS, real
 wp.set_module_options(OPTIONS)
 
 
+def threads(lanes: int, device: Any) -> int:
+    """Threads of a block, of as many that are to share the work of a scene."""
+    return lanes if device.is_cuda or wp.config.enable_cpu_blocks else 1
+
+
 @wp.func
-def sum_of(value: real) -> real:
-    return wp.tile_sum(wp.tile(value))[0]
+def sum_of(value: Any):
+    """Sum of numbers, or of vectors: many at once cost little more than one."""
+    return wp.tile_sum(wp.tile(value, preserve_type=True))[0]
 
 
 @wp.func
