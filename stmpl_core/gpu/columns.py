@@ -92,23 +92,29 @@ def find_near(lanes: wp.int32, again: wp.int32, skins: Skins, scratch: Scratch):
 @wp.kernel
 def list_near(again: wp.int32, skins: Skins, scratch: Scratch):
     """Numbers of these columns, one after the other."""
-    c = wp.tid()
+    c, lane = wp.tid()
     if not _looks(scratch, c, again):
         return
     one, count = skins.one[scratch.skin[c]], wp.int32(0)
-    for local in range(one.end_ball - one.first_ball):
-        mask = scratch.near[c, local]
-        if mask != wp.uint32(0):
-            for bit in range(BLOCK):
-                if ((mask >> wp.uint32(bit)) & wp.uint32(1)) == wp.uint32(1):
-                    if count < scratch.columns.shape[1]:
-                        scratch.columns[c, count] = one.first + local * BLOCK + bit
-                    count += 1
-    if count > scratch.columns.shape[1]:
-        count = 0
-        if again == 0:
-            scratch.status[c] = OVERFULL
-    scratch.count[c] = count
+    blocks = one.end_ball - one.first_ball
+    each = (blocks + wp.block_dim() - 1) // wp.block_dim()  # of a thread, one after the other
+    for write in range(2):  # counts them, and then knows where to write
+        for local in range(lane * each, wp.min((lane + 1) * each, blocks)):
+            mask = scratch.near[c, local]
+            if mask != wp.uint32(0):
+                for bit in range(BLOCK):
+                    if ((mask >> wp.uint32(bit)) & wp.uint32(1)) == wp.uint32(1):
+                        if write == 1 and count < scratch.columns.shape[1]:
+                            scratch.columns[c, count] = one.first + local * BLOCK + bit
+                        count += 1
+        if write == 0:
+            count = sum_before(count)
+    if lane == wp.block_dim() - 1:
+        if count > scratch.columns.shape[1]:
+            count = 0
+            if again == 0:
+                scratch.status[c] = OVERFULL
+        scratch.count[c] = count
 
 
 @wp.kernel

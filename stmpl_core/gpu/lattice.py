@@ -11,7 +11,7 @@ import warp as wp
 
 from stmpl_core import nodes as law
 from stmpl_core.deep import DEEPEST
-from stmpl_core.gpu.blocks import least_of, most_of, sum_of
+from stmpl_core.gpu.blocks import least_of, most_of, sum_before, sum_of
 from stmpl_core.gpu.looks import CHARTS, FACING, inward_on, point_on, thickness_on
 from stmpl_core.gpu.packs import Lattice, Scratch, Skins
 from stmpl_core.gpu.places import APART, BY_POSE, DEEP, OVERFULL, PENDING
@@ -183,23 +183,32 @@ def sample(only_look: wp.int32, last: wp.int32, skins: Skins, scratch: Scratch):
 @wp.kernel
 def list_nodes(many: wp.int32, side: wp.int32, scratch: Scratch):
     """Numbers of the places whose columns are squeezed, one after the other for all tools of a scene."""
-    s = wp.tid()
-    count, room = wp.int32(scratch.nodes[s]), scratch.tool.shape[1]
-    scratch.begin[s] = count
+    s, lane = wp.tid()
+    begin, room, lanes = wp.int32(scratch.nodes[s]), scratch.tool.shape[1], wp.block_dim()
+    before = wp.int32(begin)
     for k in range(many):
-        c = s * many + k
-        for n in range(scratch.lattice[c].rows * scratch.lattice[c].wide):
+        c, count = s * many + k, wp.int32(0)
+        places = scratch.lattice[c].rows * scratch.lattice[c].wide
+        each = (places + lanes - 1) // lanes  # of a thread, one after the other
+        for n in range(lane * each, wp.min((lane + 1) * each, places)):
             if scratch.value[c, n] > real(0.0):
-                if count < room:
-                    scratch.tool[s, count] = k
-                    scratch.cell[s, count] = n
-                else:
-                    scratch.status[c] = OVERFULL
                 count += 1
-                if scratch.value[c, n] >= FULL and scratch.status[c] == PENDING:
-                    scratch.status[c] = DEEP
-    scratch.nodes[s] = wp.min(count, room)
-    wp.atomic_max(scratch.wants, 0, count)
+        place = before + sum_before(count)
+        before += wp.int32(sum_of(real(count)))
+        for n in range(lane * each, wp.min((lane + 1) * each, places)):
+            if scratch.value[c, n] > real(0.0):
+                if place < room:
+                    scratch.tool[s, place] = k
+                    scratch.cell[s, place] = n
+                else:
+                    wp.atomic_max(scratch.status, c, OVERFULL)
+                if scratch.value[c, n] >= FULL:
+                    wp.atomic_max(scratch.status, c, DEEP)
+                place += 1
+    if lane == 0:
+        scratch.begin[s] = begin
+        scratch.nodes[s] = wp.min(before, room)
+        wp.atomic_max(scratch.wants, 0, before)
 
 
 @wp.kernel

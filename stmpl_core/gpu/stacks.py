@@ -78,13 +78,12 @@ def sink(lanes: wp.int32, many: wp.int32, skins: Skins, scratch: Scratch):
 @wp.kernel
 def fold(many: wp.int32, skins: Skins, scratch: Scratch):
     """Numbers of groups of nodes of which none feels another, on skin with folds: thinning._together."""
-    s = wp.tid()
+    s, lane = wp.tid()
     one = skins.one[scratch.skin[s * many]]
-    for i in range(scratch.nodes[s]):
-        scratch.fold[s, i] = 0
-        if one.folded == 1:
-            scratch.fold[s, i] = -1
-    if one.folded == 0:
+    for i in range(lane, scratch.nodes[s], wp.block_dim()):
+        scratch.fold[s, i] = -one.folded
+    wait()
+    if one.folded == 0 or lane > 0:
         return
     groups, left = wp.int32(0), wp.int32(scratch.nodes[s])
     for i in range(scratch.nodes[s]):

@@ -13,7 +13,7 @@ Geometry and the linear problem are float64, the network float32, as in the law 
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass
 from numbers import Integral
@@ -27,6 +27,7 @@ from stmpl_core.columns import Columns
 from stmpl_core.errors import InvalidInput
 from stmpl_core.friction import Friction, check_tools
 from stmpl_core.gpu import answers, bears, columns, hold, lattice, looks, packs, places, stacks, sticks
+from stmpl_core.gpu.blocks import threads
 from stmpl_core.gpu.fields import Fields
 from stmpl_core.gpu.memory import PATCH, Steps, WarpStates
 from stmpl_core.gpu.rays import mat33
@@ -88,7 +89,7 @@ class WarpBatch:
         friction: as of a Simulator; it is felt where touches have states.
         memory: scratch space [bytes]; scenes that do not fit go one part after the other; None: 16 GiB on a GPU, but no
             more than a third of what is free, 256 MiB on a CPU, or what one scene needs. Fields take as much again.
-        lanes: threads that share the work of a scene; None: LANES on a GPU, 1 on a CPU.
+        lanes: threads that share the work of a scene, on a GPU whole warps; None: LANES on a GPU, 1 on a CPU.
 
     Attributes:
         device: Warp's device.
@@ -102,6 +103,7 @@ class WarpBatch:
     _scratch: Any
     _steps: Steps | None  # made when the first state is asked for
     _along: tuple[Any, ...]
+    _graphs: dict[tuple[Any, ...], Any]  # of what was done at least once
 
     def __init__(self, skins: Skin | Sequence[Skin], tools: Sequence[Tool], n: int | None = None, *,
                  friction: Friction | Mapping[str, Friction] = None, device: str = "cuda", nodes: int | None = None,
@@ -126,8 +128,8 @@ class WarpBatch:
             _check(skin)
         if len({skin.layer.stacked for skin in unique}) > 1:
             raise InvalidInput("stacks and skins of one material do not go into one WarpBatch. Try one for each kind.")
-        self._lanes = lanes or (LANES if self.device.is_cuda else 1)
-        self._block = self._lanes if self.device.is_cuda or wp.config.enable_cpu_blocks else 1
+        self._lanes = packs.whole_words(lanes or LANES) if self.device.is_cuda else lanes or 1
+        self._block = threads(self._lanes, self.device)
         self._skins, fields = packs.pack(unique, self.tools, self.device)
         self.room = packs.room_for(unique, fields, nodes)
         network = packs.network_of(unique[0].layer)
@@ -142,6 +144,7 @@ class WarpBatch:
         if room > budget:
             raise InvalidInput(f"one scene needs {room} bytes of scratch space; {budget} are allowed. Raise memory, or "
                                "leave it out.")  # fmt: skip
+        self._recorder = wp.Stream(self.device) if self.device.is_cuda else None
         self._make_room(self.room.nodes)
 
     def __len__(self) -> int:
@@ -153,7 +156,7 @@ class WarpBatch:
         each = room.bytes_of(len(self.tools))
         if each > self._memory:
             return False
-        self._scratch = None  # given back before as much is taken again
+        self._scratch, self._graphs = None, {}  # given back before as much is taken again
         self.room, self._part = room, min(len(self), self._memory // each)
         self._scratch = packs.scratch(room, self._part, len(self.tools), self.device)
         self._numbers = [self._numbers_of(first) for first in range(0, len(self), self._part)]
@@ -245,7 +248,7 @@ class WarpBatch:
                 rows = np.flatnonzero((wanted >= first) & (wanted < first + self._part))
                 if len(rows) and self._fields is not None:
                     if self._stacked:
-                        self._stick()
+                        self._play(("stick",), self._stick)
                     self._fields.move(wanted[rows] - first, rows, self._skins, self._scratch, motion)
                 first += self._part
             if states is None:
@@ -303,6 +306,21 @@ class WarpBatch:
     def _run(self, kernel: Any, dim: int | tuple[int, int], *inputs: Any) -> None:
         wp.launch(kernel, dim=dim, inputs=[*inputs], device=self.device, block_dim=self._block)
 
+    def _play(self, what: tuple[Any, ...], work: Callable[[], None]) -> None:
+        """Work that only scratch space takes part in: on a GPU, where a launch costs, from the second time on a graph.
+
+        Not the first time, which loads kernels; nor where scenes go in parts, which are too large to feel a launch.
+        """
+        if not self.device.is_cuda or what not in self._graphs or self._part < len(self):
+            self._graphs.setdefault(what)
+            work()
+            return
+        if self._graphs[what] is None:
+            with wp.ScopedStream(self._recorder, sync_enter=False), wp.ScopedCapture(stream=self._recorder) as capture:
+                work()
+            self._graphs[what] = capture.graph
+        wp.capture_launch(self._graphs[what])
+
     def _answer(self, first: int, poses: Any, out: tuple[Any, ...]) -> bool:
         """Answers the scenes of one part; False: there was no room for the nodes, and now there is."""
         scratch, skins, many = self._scratch, self._skins, len(self.tools)
@@ -310,39 +328,42 @@ class WarpBatch:
         tools = len(scratch.skin)
         read = places.read_quaternions if poses.ndim == 3 else places.read_matrices
         self._run(read, tools, poses, first, many, skins, scratch)
-        self._meet(tools, 0)
-        self._run(columns.list_faces, (tools, self._block), skins, scratch)
-        self._run(columns.sink, (tools, self._lanes), self._lanes, skins, scratch)
-        self._run(columns.gather_depth, tools, skins, scratch)
-        self._run(columns.widen, tools, skins, scratch)
-        self._meet(tools, 1)
-        self._lay(tools)
+        self._play(("look",), lambda: self._look(tools))
+        sides = int(scratch.busy.numpy()[0])  # one, but for tools that close around a limb
+        self._play(("lay", sides), lambda: self._lay(tools, sides))
         wants = int(scratch.wants.numpy()[0])
         if wants > self.room.nodes and self._grows and self._make_room(packs.whole_words(wants + wants // 8)):
             return False
-        self._run(columns.tell_inside, tools, many, skins, scratch)
-        self._run(lattice.withdraw, tools // many, many, scratch)
-        self._hold(tools)
-        self._run(answers.answer, tools, first, many, self._known, skins, scratch, *out)
+        self._play(("hold",), lambda: self._hold(tools))
+        self._run(answers.answer, (tools, self._block), first, many, self._known, skins, scratch, *out)
         return True
+
+    def _look(self, tools: int) -> None:
+        """Skin that the tools touch, and how much of it they cover."""
+        scratch, skins, shared, blocks = self._scratch, self._skins, (tools, self._lanes), (tools, self._block)
+        self._meet(tools, 0)
+        self._run(columns.list_faces, blocks, skins, scratch)
+        self._run(columns.sink, shared, self._lanes, skins, scratch)
+        self._run(columns.gather_depth, tools, skins, scratch)
+        self._run(columns.widen, tools, skins, scratch)
+        self._meet(tools, 1)
+        self._run(looks.begin, tools, scratch)
+        self._run(looks.look, shared, self._lanes, skins, scratch)
+        scratch.busy.zero_()
+        self._run(looks.gather_look, blocks, scratch)
 
     def _meet(self, tools: int, again: int) -> None:
         """Columns near the tools, and their distances."""
         scratch, skins, lanes = self._scratch, self._skins, self._lanes
         self._run(columns.find_near, (tools, lanes), lanes, again, skins, scratch)
-        self._run(columns.list_near, tools, again, skins, scratch)
+        self._run(columns.list_near, (tools, self._block), again, skins, scratch)
         self._run(columns.clear, (tools, lanes), lanes, again, skins, scratch)
         self._run(columns.gather_clearance, tools, again, skins, scratch)
 
-    def _lay(self, tools: int) -> None:
+    def _lay(self, tools: int, sides: int) -> None:
         """Contact nodes under the tools. The lattice is laid twice: first to see the covered area."""
         scratch, skins, lanes, many = self._scratch, self._skins, self._lanes, len(self.tools)
         shared, blocks, scenes = (tools, lanes), (tools, self._block), tools // many
-        self._run(looks.begin, tools, scratch)
-        self._run(looks.look, shared, lanes, skins, scratch)
-        scratch.busy.zero_()
-        self._run(looks.gather_look, tools, scratch)
-        sides = int(scratch.busy.numpy()[0])  # one, but for tools that close around a limb
         scratch.nodes.zero_()
         scratch.wants.zero_()
         for only_look in (1, 0):
@@ -352,7 +373,7 @@ class WarpBatch:
                 self._run(lattice.own, shared, lanes, side, skins, scratch)
                 self._run(lattice.sample, blocks, only_look, int(side == sides - 1), skins, scratch)
                 if not only_look:
-                    self._run(lattice.list_nodes, scenes, many, side, scratch)
+                    self._run(lattice.list_nodes, (scenes, self._block), many, side, scratch)
                     self._run(lattice.fill_nodes, (scenes, lanes), lanes, many, skins, scratch)
         self._run(lattice.tell, scenes, many, scratch)
 
@@ -361,8 +382,10 @@ class WarpBatch:
         scratch, skins, lanes, many, net = self._scratch, self._skins, self._lanes, len(self.tools), self._net
         scenes = tools // many
         shared, blocks = (scenes, lanes), (scenes, self._block)
+        self._run(columns.tell_inside, tools, many, skins, scratch)
+        self._run(lattice.withdraw, scenes, many, scratch)
         self._run(answers.group, scenes, many, skins, scratch)
-        self._run(stacks.fold, scenes, many, skins, scratch)
+        self._run(stacks.fold, (scenes, self._block), many, skins, scratch)
         if self._stacked:
             self._run(stacks.find_mean, tools, many, skins, scratch)
             self._run(stacks.sink, shared, lanes, many, skins, scratch)
@@ -391,7 +414,7 @@ class WarpBatch:
         tools = len(scratch.skin)
         scenes = tools // many
         self._run(sticks.unite, tools, scratch)
-        self._run(stacks.fold, scenes, many, skins, scratch)
+        self._run(stacks.fold, (scenes, self._block), many, skins, scratch)
         self._run(stacks.find_mean, tools, many, skins, scratch)
         self._run(stacks.respond, (scenes, lanes), lanes, many, skins, scratch)
         self._run(stacks.find_kept, (scenes, lanes), lanes, scratch)
