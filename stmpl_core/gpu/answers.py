@@ -8,6 +8,7 @@ import warp as wp
 
 from stmpl_core import pieces, soundness, toucher
 from stmpl_core import wrenches as wrenches_of_skin
+from stmpl_core.gpu.blocks import most_of, sum_of
 from stmpl_core.gpu.columns import _mark, _marked
 from stmpl_core.gpu.packs import BONY_BIT, BORDER_BIT, LONG_BIT, STEEP_BIT, Scratch, Skins
 from stmpl_core.gpu.places import APART, BY_POSE, DEEP, REFUSED, WRAPPED
@@ -35,6 +36,7 @@ ONE_WAY = wp.constant(wp.float64(wrenches_of_skin.ONE_WAY))
 ALL_ONE_WAY = wp.constant(wp.float64(wrenches_of_skin.ALL_ONE_WAY))
 NONE = wp.constant(wp.float64(1e-300))
 NAN, PI = wp.constant(wp.float64(float("nan"))), wp.constant(wp.float64(math.pi))
+vec15 = wp.types.vector(length=15, dtype=wp.float64)
 wp.set_module_options(OPTIONS)
 
 
@@ -165,8 +167,8 @@ def _lowest(bits: wp.uint32) -> wp.int32:
 
 
 @wp.func
-def _pins(scratch: Scratch, c: wp.int32, s: wp.int32, k: wp.int32) -> wp.vec2d:
-    """Force beside each piece of a tool over its own, and radius of a piece [m]: pieces.pins."""
+def _number_pieces(scratch: Scratch, c: wp.int32, s: wp.int32, k: wp.int32) -> wp.int32:
+    """Numbers the pieces that a tool's nodes lie in, and says how many there are."""
     nodes, found, last = scratch.nodes[s], wp.int32(0), wp.int32(0)
     for n in range(nodes):
         if scratch.tool[s, n] < k:
@@ -191,15 +193,24 @@ def _pins(scratch: Scratch, c: wp.int32, s: wp.int32, k: wp.int32) -> wp.vec2d:
                         scratch.queue[s, last] = j
                         last += 1
             found += 1
-    if found < 2:
+    return found
+
+
+@wp.func
+def _pins(scratch: Scratch, c: wp.int32, s: wp.int32, k: wp.int32, lane: wp.int32) -> wp.vec2d:
+    """Force beside each piece of a tool over its own, and radius of a piece [m]: pieces.pins."""
+    beside, size, total, found = real(0.0), real(0.0), real(0.0), real(0.0)
+    if lane == 0:
+        found = real(_number_pieces(scratch, c, s, k))
+    found = sum_of(found)
+    if found < real(2.0):
         return wp.vec2d(real(0.0), real(0.0))
-    beside, size, total = real(0.0), real(0.0), real(0.0)
-    for i in range(nodes):
+    for i in range(lane, scratch.nodes[s], wp.block_dim()):
         if scratch.tool[s, i] != k:
             continue
         own, other, wide = real(0.0), real(0.0), real(0.0)
         near = NEAR_PIECE * scratch.thick[s, i]
-        for j in range(nodes):
+        for j in range(scratch.nodes[s]):
             if scratch.tool[s, j] == k:
                 force = scratch.pressure[s, j] * scratch.area[s, j]
                 if scratch.fold[s, i] == scratch.fold[s, j]:
@@ -211,7 +222,8 @@ def _pins(scratch: Scratch, c: wp.int32, s: wp.int32, k: wp.int32) -> wp.vec2d:
         beside += force * other / wp.max(own, NONE)
         size += force * wp.sqrt(wide / PI)
         total += force
-    return wp.vec2d(beside / wp.max(total, NONE), size / wp.max(total, NONE))
+    sums = sum_of(vec3(beside, size, total))
+    return wp.vec2d(sums[0], sums[1]) / wp.max(sums[2], NONE)
 
 
 @wp.kernel
@@ -219,10 +231,13 @@ def answer(first: wp.int32, many: wp.int32, known: Known, skins: Skins, scratch:
            wrenches: wp.array3d(dtype=Any), depths: wp.array2d(dtype=Any), bounds: wp.array2d(dtype=Any),
            in_range: wp.array2d(dtype=wp.bool), statuses: wp.array2d(dtype=wp.int32)):  # fmt: skip
     """What each tool does, and whether it may be believed."""
-    c = wp.tid()
+    c, lane = wp.tid()
+    lanes = wp.block_dim()
     s, k = c // many, c % many
     n, one, grid = first + s, skins.one[scratch.skin[c]], skins.grids[scratch.grid[c]]
     whole = _scene_status(scratch, s, many)
+    if lane > 0 and (whole >= REFUSED or scratch.status[c] == APART):
+        return
     if whole >= REFUSED:
         for x in range(6):
             wrenches[n, k, x] = wrenches.dtype(real(0.0))
@@ -253,7 +268,7 @@ def answer(first: wp.int32, many: wp.int32, known: Known, skins: Skins, scratch:
     total, below = real(0.0), real(0.0)
     steep, long, border, bony, highest = real(0.0), real(0.0), real(0.0), real(0.0), real(0.0)
     depth, thick, count, carried = real(scratch.deep[c]), real(0.0), real(0.0), real(0.0)
-    for i in range(scratch.nodes[s]):
+    for i in range(lane, scratch.nodes[s], lanes):
         if scratch.tool[s, i] == k:
             here, corners = scratch.pressure[s, i] * scratch.area[s, i], skins.faces[scratch.face[s, i]]
             for x in range(3):
@@ -279,12 +294,19 @@ def answer(first: wp.int32, many: wp.int32, known: Known, skins: Skins, scratch:
             carried += here * scratch.thick[s, i]
             count += real(1.0)
             highest = wp.max(highest, scratch.highest[s, i])
+    sums = sum_of(vec15(force[0], force[1], force[2], forces, strange, doubt, total, below, steep, long, border, bony,
+                        thick, count, carried))  # fmt: skip
+    force, forces, strange, doubt = vec3(sums[0], sums[1], sums[2]), sums[3], sums[4], sums[5]
+    total, below, steep, long, border, bony = sums[6], sums[7], sums[8], sums[9], sums[10], sums[11]
+    thick, count, carried = sums[12], sums[13], sums[14]
+    depth = most_of(depth)
+    highest = most_of(highest)
     size = wp.length(force)
     along = real(0.0)
     if one.stacked == 1 and size > real(0.0):
         way = force / size
         share = wp.clamp((size / total - ONE_WAY) / (ALL_ONE_WAY - ONE_WAY), real(0.0), real(1.0))
-        for i in range(scratch.nodes[s]):
+        for i in range(lane, scratch.nodes[s], lanes):
             if scratch.tool[s, i] == k:
                 trio, pressure = skins.faces[scratch.face[s, i]], scratch.pressure[s, i] * scratch.area[s, i]
                 for x in range(3):
@@ -292,7 +314,13 @@ def answer(first: wp.int32, many: wp.int32, known: Known, skins: Skins, scratch:
                     more = share * pressed * _along(skins.area_vectors[trio[x]], way)
                     along += more
                     torque = torque + wp.cross(skins.points[trio[x]] - scratch.place[c], more * way)
-        force = force + along * way
+    more_sums = sum_of(wp.vec4d(torque[0], torque[1], torque[2], along))
+    pins = _pins(scratch, c, s, k, lane)
+    if lane > 0:
+        return
+    torque = vec3(more_sums[0], more_sums[1], more_sums[2])
+    along = more_sums[3]
+    force = force + along / wp.max(size, NONE) * force
     power = _power(scratch, s, many, k)
     doubt = doubt / wp.max(size, NONE) + power * grid.surface_error / wp.max(depth, grid.surface_error)
     if one.stacked == 1 and forces > real(0.0):
@@ -305,7 +333,6 @@ def answer(first: wp.int32, many: wp.int32, known: Known, skins: Skins, scratch:
     sound = sound and strange <= UNSEEN * forces and one.learnt == 1
     sound = sound and depth <= SOFT_SHARE * one.soft
     sound = sound and (size <= SIDES[0] * forces or size >= SIDES[1] * forces)
-    pins = _pins(scratch, c, s, k)
     group = pins[0] > GROUP and depth > PINS_DEEP * pins[1]
     sound = sound and not group
     sound = sound and skins.holes[k] == 0

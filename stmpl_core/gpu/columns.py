@@ -7,6 +7,7 @@ from stmpl_core import rays
 from stmpl_core.columns import BLOCK as IN_BLOCK
 from stmpl_core.columns import LEAST_UNDER, MIN_ONE_WAY_SHARE
 from stmpl_core.deep import DEEPEST
+from stmpl_core.gpu.blocks import sum_before
 from stmpl_core.gpu.packs import EDGE_BIT, OneSkin, Scratch, Skins
 from stmpl_core.gpu.places import APART, DEEP, OVERFULL, PENDING
 from stmpl_core.gpu.rays import FAR, OPTIONS, WALL_WIDTH, clearance_of, depth_and_share, real, vec3
@@ -91,23 +92,29 @@ def find_near(lanes: wp.int32, again: wp.int32, skins: Skins, scratch: Scratch):
 @wp.kernel
 def list_near(again: wp.int32, skins: Skins, scratch: Scratch):
     """Numbers of these columns, one after the other."""
-    c = wp.tid()
+    c, lane = wp.tid()
     if not _looks(scratch, c, again):
         return
     one, count = skins.one[scratch.skin[c]], wp.int32(0)
-    for local in range(one.end_ball - one.first_ball):
-        mask = scratch.near[c, local]
-        if mask != wp.uint32(0):
-            for bit in range(BLOCK):
-                if ((mask >> wp.uint32(bit)) & wp.uint32(1)) == wp.uint32(1):
-                    if count < scratch.columns.shape[1]:
-                        scratch.columns[c, count] = one.first + local * BLOCK + bit
-                    count += 1
-    if count > scratch.columns.shape[1]:
-        count = 0
-        if again == 0:
-            scratch.status[c] = OVERFULL
-    scratch.count[c] = count
+    blocks = one.end_ball - one.first_ball
+    each = (blocks + wp.block_dim() - 1) // wp.block_dim()  # of a thread, one after the other
+    for write in range(2):  # counts them, and then knows where to write
+        for local in range(lane * each, wp.min((lane + 1) * each, blocks)):
+            mask = scratch.near[c, local]
+            if mask != wp.uint32(0):
+                for bit in range(BLOCK):
+                    if ((mask >> wp.uint32(bit)) & wp.uint32(1)) == wp.uint32(1):
+                        if write == 1 and count < scratch.columns.shape[1]:
+                            scratch.columns[c, count] = one.first + local * BLOCK + bit
+                        count += 1
+        if write == 0:
+            count = sum_before(count)
+    if lane == wp.block_dim() - 1:
+        if count > scratch.columns.shape[1]:
+            count = 0
+            if again == 0:
+                scratch.status[c] = OVERFULL
+        scratch.count[c] = count
 
 
 @wp.kernel
@@ -159,32 +166,51 @@ def gather_clearance(again: wp.int32, skins: Skins, scratch: Scratch):
             scratch.top[c] = -(wp.transpose(scratch.pose[c]) * wp.normalize(met))
 
 
+@wp.func
+def _is_first(skins: Skins, scratch: Scratch, c: wp.int32, v: wp.int32, f: wp.int32) -> bool:
+    """Whether no corner of a triangle before v is covered."""
+    first, out = skins.one[scratch.skin[c]].first, wp.bool(True)
+    corners = skins.faces[f]
+    for x in range(3):
+        if corners[x] < v and _marked(scratch.covered, c, corners[x] - first):
+            out = False
+    return out
+
+
+@wp.func
+def _mark_corners(skins: Skins, scratch: Scratch, c: wp.int32, f: wp.int32):
+    corners = skins.faces[f]
+    for x in range(3):
+        n = corners[x] - skins.one[scratch.skin[c]].first
+        wp.atomic_or(scratch.seen, c, n // BLOCK, wp.uint32(1) << wp.uint32(n % BLOCK))
+
+
 @wp.kernel
 def list_faces(skins: Skins, scratch: Scratch):
     """Triangles around covered columns: each is listed by the first of its corners that is covered."""
-    c = wp.tid()
+    c, lane = wp.tid()
     if scratch.status[c] != PENDING:
         return
-    one, many = skins.one[scratch.skin[c]], wp.int32(0)
-    for n in range(scratch.count[c]):
-        v = scratch.columns[c, n]
-        if _marked(scratch.covered, c, v - one.first):
-            for p in range(skins.start[v], skins.start[v + 1]):
-                f, first = skins.around[p], wp.bool(True)
-                corners = skins.faces[f]
-                for x in range(3):
-                    if corners[x] < v and _marked(scratch.covered, c, corners[x] - one.first):
-                        first = False
-                if first:
-                    if many < scratch.found.shape[1]:
-                        scratch.found[c, many] = f
-                    many += 1
-                    for x in range(3):
-                        _mark(scratch.seen, c, corners[x] - one.first)
-    if many > scratch.found.shape[1]:
-        scratch.status[c] = OVERFULL
-        many = 0
-    scratch.many[c] = many
+    each = (scratch.count[c] + wp.block_dim() - 1) // wp.block_dim()  # columns of a thread, one after the other
+    first, place = skins.one[scratch.skin[c]].first, wp.int32(0)
+    for write in range(2):  # counts them, and then knows where to write
+        for n in range(lane * each, wp.min((lane + 1) * each, scratch.count[c])):
+            v = scratch.columns[c, n]
+            if _marked(scratch.covered, c, v - first):
+                for p in range(skins.start[v], skins.start[v + 1]):
+                    f = skins.around[p]
+                    if _is_first(skins, scratch, c, v, f):
+                        if write == 1 and place < scratch.found.shape[1]:
+                            scratch.found[c, place] = f
+                            _mark_corners(skins, scratch, c, f)
+                        place += 1
+        if write == 0:
+            place = sum_before(place)
+    if lane == wp.block_dim() - 1:
+        if place > scratch.found.shape[1]:
+            scratch.status[c] = OVERFULL
+            place = 0
+        scratch.many[c] = place
 
 
 @wp.kernel

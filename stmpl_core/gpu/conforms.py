@@ -7,6 +7,7 @@ The linear systems, one a scene, are eliminated without pivots: their matrices a
 import warp as wp
 
 from stmpl_core import conform, simulator, touch
+from stmpl_core.gpu.blocks import wait
 from stmpl_core.gpu.columns import _marked
 from stmpl_core.gpu.field_packs import FieldScratch, SkinFields
 from stmpl_core.gpu.motion import FAR, PER_LOG, STEPS, TOP, _at, feels
@@ -215,7 +216,6 @@ def list_wanted(field: FieldScratch):
             count += 1
     field.acts[f] = count
     field.own[f] = own
-    wp.atomic_max(field.most, 0, count)
 
 
 @wp.kernel
@@ -235,31 +235,30 @@ def set_up(lanes: wp.int32, field: FieldScratch):
 
 
 @wp.kernel
-def eliminate(lanes: wp.int32, start: wp.int32, end: wp.int32, field: FieldScratch):
-    """Gauss's elimination by some pivots; by more than one only where a scene has one lane."""
+def solve(field: FieldScratch):
+    """Sources that move the vertices as is wanted, by Gauss's elimination."""
     f, lane = wp.tid()
-    count = field.acts[f]
-    for k in range(start, wp.min(end, count)):
+    lanes, count = wp.block_dim(), field.acts[f]
+    for k in range(count):
+        rest = count - k - 1
         for i in range(k + 1 + lane, count, lanes):
             factor = field.left[f, i, k] / field.left[f, k, k]
-            for j in range(k + 1, count):
-                field.left[f, i, j] = field.left[f, i, j] - factor * field.left[f, k, j]
+            field.left[f, i, k] = factor
             field.right[f, i] = field.right[f, i] - factor * field.right[f, k]
-
-
-@wp.kernel
-def substitute(field: FieldScratch):
-    """Sources that move the vertices as is wanted."""
-    f = wp.tid()
-    count = field.acts[f]
+        wait()
+        for n in range(lane, rest * rest, lanes):
+            i, j = k + 1 + n // rest, k + 1 + n % rest
+            field.left[f, i, j] = field.left[f, i, j] - field.left[f, i, k] * field.left[f, k, j]
+        wait()
     for back in range(count):
-        a = count - 1 - back
-        sum = field.right[f, a]
-        for b in range(a + 1, count):
-            sum = sum - field.left[f, a, b] * field.right[f, b]
-        sum = sum / field.left[f, a, a]
-        field.right[f, a] = sum
-        field.pulls[f, field.act[f, a]] = field.pulls[f, field.act[f, a]] + sum
+        k = count - 1 - back
+        source = field.right[f, k] / field.left[f, k, k]
+        for i in range(lane, k, lanes):
+            field.right[f, i] = field.right[f, i] - field.left[f, i, k] * source
+        wait()
+        if lane == 0:
+            field.right[f, k] = source
+            field.pulls[f, field.act[f, k]] = field.pulls[f, field.act[f, k]] + source
 
 
 @wp.kernel

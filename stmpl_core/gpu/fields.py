@@ -11,6 +11,7 @@ import warp as wp
 from stmpl_core.conform import PASSES
 from stmpl_core.errors import InvalidInput
 from stmpl_core.gpu import conforms, field_packs, motion, sticks, twins
+from stmpl_core.gpu.blocks import threads
 from stmpl_core.gpu.field_packs import FieldRoom
 from stmpl_core.skin import Skin
 
@@ -40,8 +41,8 @@ class Fields:
         coarse = max(len(green.coarse.gathered) if (green := skin.green) and green.coarse else 0 for skin in skins)
         self._room = FieldRoom(self.vertices, UNDER, tools, lanes, HOLDING, coarse)
         self._memory, self._device, self._stacked = memory, device, coarse > 0
+        self._block = threads(lanes, device)
         self._scratch: Any = None
-        self._holding = 0  # most nodes that press in a scene of those at hand
 
     def move(self, scenes: np.ndarray, rows: np.ndarray, skins: Any, touched: Any, out: Any) -> None:
         """Writes the motion of some scenes.
@@ -84,11 +85,11 @@ class Fields:
             self._run(motion.forget, shared, pick, lanes, tools, 1, skins, touched, field)
             self._run(sticks.find_reach, len(pick) * tools, pick, tools, touched, field)
             self._run(sticks.mark_beside, shared, pick, lanes, tools, skins, self._more, touched, field)
-            self._run(sticks.list_beside, len(pick), pick, tools, skins, touched, field)
+            self._run(sticks.list_beside, (len(pick), self._block), pick, tools, skins, touched, field)
             most["under"] = int(field.most.numpy()[0])
             field.most.zero_()
             self._run(sticks.list_holding, len(pick), pick, tools, touched, field)
-            most["nodes"] = self._holding = int(field.most.numpy()[0])
+            most["nodes"] = int(field.most.numpy()[0])
         else:
             most["under"] = int(field.most.numpy()[0])
         more = {name: 32 * -(-(one + one // 4) // 32) for name, one in most.items()
@@ -98,7 +99,7 @@ class Fields:
         return not more
 
     def _run(self, kernel: Any, dim: int | tuple[int, int], *inputs: Any) -> None:
-        wp.launch(kernel, dim=dim, inputs=list(inputs), device=self._device)
+        wp.launch(kernel, dim=dim, inputs=list(inputs), device=self._device, block_dim=self._block)
 
     def _answer(self, pick: Any, to: Any, skins: Any, touched: Any, out: Any) -> None:
         field, lanes, tools, more = self._scratch, self._room.lanes, self._room.tools, self._more
@@ -121,8 +122,7 @@ class Fields:
         run(motion.mark, 0, skins, more, touched, field)
         run(motion.ask, skins, more, touched, field)
         if self._stacked:
-            run(sticks.find_peak, skins, touched, field)
-            self._run(sticks.gather_peak, scenes, lanes, field)
+            self._run(sticks.find_peak, (scenes, self._block), pick, tools, skins, touched, field)
         run(motion.move, skins, more, touched, field, self._net)
         self._run(motion.gain, scenes, lanes, field)
         run(motion.fill, 2 if self._stacked else 0, skins, more, touched, field)
@@ -151,12 +151,7 @@ class Fields:
         if tools > 1:
             self._run(twins.trace, shared, lanes, field)
             self._run(twins.give_way, shared, pick, lanes, touched, field)
-        self._run(sticks.find_most, shared, lanes, field)
-        self._run(sticks.add_ridge, scenes, lanes, field)
-        end = self._holding
-        for pivot in [(0, end)] if lanes == 1 else [(k, k + 1) for k in range(end)]:
-            self._run(sticks.eliminate, shared, lanes, *pivot, field)
-        self._run(sticks.substitute, scenes, field)
+        self._run(sticks.solve, (scenes, self._block), field)
         run(motion.forget, 1, skins, touched, field)
         run(sticks.mark, skins, more, touched, field)
         run(motion.ask, skins, more, touched, field)
@@ -190,12 +185,8 @@ class Fields:
 
     def _correct(self, scenes: int) -> None:
         """Moves the vertices under tools as they should still move."""
-        field, lanes, end = self._scratch, self._room.lanes, self._room.under
-        field.most.zero_()
+        field, lanes = self._scratch, self._room.lanes
         self._run(conforms.list_wanted, scenes, field)
         self._run(conforms.set_up, (scenes, lanes), lanes, field)
-        pivots = [(0, end)] if lanes == 1 else [(k, k + 1) for k in range(int(field.most.numpy()[0]))]
-        for pivot in pivots:
-            self._run(conforms.eliminate, (scenes, lanes), lanes, *pivot, field)
-        self._run(conforms.substitute, scenes, field)
+        self._run(conforms.solve, (scenes, self._block), field)
         self._run(conforms.follow, (scenes, lanes), lanes, field)

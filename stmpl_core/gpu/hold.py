@@ -1,14 +1,14 @@
 # type: ignore  # kernels are in Warp's language, which pyright does not know
 """Kernels of the pressure at contact nodes: stmpl_core.obstacle and stmpl_core.contact_net.
 
-Conjugate gradients run in lock-step, four kernels a step. Of what a scene sums up each lane leaves the part of its own
-nodes, and the next kernel's lanes add these in their order: an answer does not depend on who runs first. Scenes that
-are done are skipped. A launch costs microseconds, which thousands of scenes share.
+The conjugate gradients of a scene are one block's, which reads the scene's matrix from memory: its threads share out
+the nodes, and wait for each other where they add up. So no scene waits for another, nor for the CPU.
 """
 
 import warp as wp
 
 from stmpl_core import contact_net, obstacle
+from stmpl_core.gpu.blocks import most_of, sum_of, wait
 from stmpl_core.gpu.packs import HIDDEN as UNITS
 from stmpl_core.gpu.packs import Net, OneSkin, Scratch, Skins
 from stmpl_core.gpu.rays import OPTIONS, real, vec3
@@ -18,6 +18,7 @@ STEPS, RINGS = wp.constant(obstacle.STEPS), wp.constant(obstacle.RINGS)
 REACH, NEAR = wp.constant(wp.float64(obstacle.REACH)), wp.constant(wp.float64(obstacle.NEAR))
 OWN = wp.constant(wp.float64(obstacle.OWN))
 TOLERANCE = wp.constant(wp.float64(obstacle.TOLERANCE))
+ITERATIONS = wp.constant(obstacle.MAX_ITERATIONS)
 POWER_TOLERANCE = wp.constant(wp.float64(obstacle.POWER_TOLERANCE))
 LINEAR_TO = wp.constant(wp.float64(contact_net.LINEAR_TO))
 STACK_LINEAR_TO = wp.constant(wp.float64(contact_net.STACK_LINEAR_TO))
@@ -85,26 +86,6 @@ def _wanted(scratch: Scratch, one: OneSkin, s: wp.int32, i: wp.int32) -> real:
     return wp.min(scratch.strain[s, i], LINEAR_TO) * scratch.thick[s, i] / one.thickest
 
 
-@wp.kernel
-def guess(lanes: wp.int32, many: wp.int32, linear: wp.int32, skins: Skins, scratch: Scratch):
-    """First guess of the forces; linear: 1, of a stack that would never harden."""
-    s = wp.tid()
-    one = skins.one[scratch.skin[s * many]]
-    for i in range(scratch.nodes[s]):
-        scratch.wanted[s, i] = _wanted(scratch, one, s, i)
-        if linear == 1:
-            scratch.wanted[s, i] = scratch.sinking[s, i]
-        scratch.force[s, i] = START * scratch.wanted[s, i] / scratch.matrix[s, i, i]
-        scratch.move[s, i] = real(0.0)
-    for lane in range(lanes):
-        scratch.changes[s, lane] = wp.vec2d(real(1.0), real(0.0))  # not settled yet
-    scratch.before[s] = real(1.0)
-    scratch.again[s] = 1
-    scratch.done[s] = 0
-    if scratch.nodes[s] == 0:
-        scratch.done[s] = 1
-
-
 @wp.func
 def _times(scratch: Scratch, s: wp.int32, i: wp.int32, vector: wp.array2d(dtype=real)) -> real:
     """A row of a scene's matrix times a vector."""
@@ -114,152 +95,97 @@ def _times(scratch: Scratch, s: wp.int32, i: wp.int32, vector: wp.array2d(dtype=
     return sum
 
 
-@wp.func
-def _sum(scratch: Scratch, s: wp.int32, lanes: wp.int32) -> real:
-    """What the lanes of a scene have left, in their order."""
-    out = real(0.0)
-    for lane in range(lanes):
-        out = out + scratch.sums[s, lane]
-    return out
-
-
 @wp.kernel
-def press(lanes: wp.int32, scratch: Scratch):
-    """Depths under the forces, beyond what the tool asks for. A scene whose forces have settled is done."""
+def solve(many: wp.int32, linear: wp.int32, skins: Skins, scratch: Scratch):
+    """Forces at the nodes, none of which pulls: obstacle.solve; linear: 1, of a stack that would never harden."""
     s, lane = wp.tid()
-    if scratch.done[s] == 1:
-        return
-    change, largest = real(0.0), real(0.0)
-    for other in range(lanes):
-        change = wp.max(change, scratch.changes[s, other][0])
-        largest = wp.max(largest, scratch.changes[s, other][1])
-    if change <= TOLERANCE * largest:
-        scratch.done[s] = 1  # each lane says so, or sees that another has
-        return
-    wp.atomic_max(scratch.busy, 0, 1)
-    if lane == 0:
-        scratch.restart[s] = scratch.again[s]
-        scratch.again[s] = 0
-    square = real(0.0)
-    for i in range(lane, scratch.nodes[s], lanes):
-        gap = _times(scratch, s, i, scratch.force) - scratch.wanted[s, i]
-        scratch.gap[s, i] = gap
-        if scratch.force[s, i] > real(0.0):
-            square += gap * gap
-    scratch.sums[s, lane] = square
+    lanes, count = wp.block_dim(), scratch.nodes[s]
+    one = skins.one[scratch.skin[s * many]]
+    for i in range(lane, count, lanes):
+        scratch.wanted[s, i] = _wanted(scratch, one, s, i)
+        if linear == 1:
+            scratch.wanted[s, i] = scratch.sinking[s, i]
+        scratch.force[s, i] = START * scratch.wanted[s, i] / scratch.matrix[s, i, i]
+        scratch.move[s, i] = real(0.0)
+    wait()
+    change, largest, before, number = real(count), real(0.0), real(0.0), wp.int32(0)
+    while change > TOLERANCE * largest and number < ITERATIONS:
+        number += 1
+        square = real(0.0)
+        for i in range(lane, count, lanes):
+            gap = _times(scratch, s, i, scratch.force) - scratch.wanted[s, i]
+            scratch.gap[s, i] = gap
+            if scratch.force[s, i] > real(0.0):
+                square += gap * gap
+        square = sum_of(square)
+        on, up, down = real(0.0), real(0.0), real(0.0)
+        if before > real(0.0):
+            on = square / before
+        before = square
+        for i in range(lane, count, lanes):
+            move = real(0.0)
+            if scratch.force[s, i] > real(0.0):
+                move = scratch.gap[s, i] + on * scratch.move[s, i]
+            scratch.move[s, i] = move
+            up += scratch.gap[s, i] * move
+        up = sum_of(up)
+        for i in range(lane, count, lanes):
+            down += _times(scratch, s, i, scratch.move) * scratch.move[s, i]
+        down = sum_of(down)
+        change, largest, again = real(0.0), real(0.0), real(0.0)
+        if down > real(0.0):
+            for i in range(lane, count, lanes):
+                now = real(scratch.force[s, i])
+                if now > real(0.0):
+                    now = wp.max(now - up / down * scratch.move[s, i], real(0.0))
+                elif scratch.gap[s, i] < real(0.0):  # the skin would enter it: it presses after all
+                    now = -scratch.gap[s, i] / scratch.matrix[s, i, i]
+                    again = real(1.0)
+                change = wp.max(change, wp.abs(now - scratch.force[s, i]))
+                largest = wp.max(largest, now)
+                scratch.force[s, i] = now
+        change = most_of(change)
+        largest = most_of(largest)
+        if most_of(again) > real(0.0):
+            before = real(0.0)
 
 
 @wp.kernel
-def turn(lanes: wp.int32, scratch: Scratch):
-    """Direction of a step of conjugate gradients."""
+def find_power(scratch: Scratch):
+    """What each node does to the power with which forces grow: obstacle.power_of."""
     s, lane = wp.tid()
-    if scratch.done[s] == 1:
-        return
-    square, on = _sum(scratch, s, lanes), real(0.0)
-    if scratch.restart[s] == 0:
-        on = square / scratch.before[s]
-    for i in range(lane, scratch.nodes[s], lanes):
-        move = real(0.0)
-        if scratch.force[s, i] > real(0.0):
-            move = scratch.gap[s, i] + on * scratch.move[s, i]
-        scratch.move[s, i] = move
-
-
-@wp.kernel
-def follow(lanes: wp.int32, scratch: Scratch):
-    """Depths that come with the direction; how far to go is what the lanes leave."""
-    s, lane = wp.tid()
-    if scratch.done[s] == 1:
-        return
-    square = _sum(scratch, s, lanes)
-    up, down = real(0.0), real(0.0)
-    if square > real(0.0):
-        for i in range(lane, scratch.nodes[s], lanes):
-            along = _times(scratch, s, i, scratch.move)
-            up += scratch.gap[s, i] * scratch.move[s, i]
-            down += along * scratch.move[s, i]
-    scratch.ways_gone[s, lane] = wp.vec2d(up, down)
-    if lane == 0:
-        scratch.before[s] = square
-
-
-@wp.kernel
-def step(lanes: wp.int32, scratch: Scratch):
-    """A step of conjugate gradients, no node pulling; nodes that the skin would enter press after all."""
-    s, lane = wp.tid()
-    if scratch.done[s] == 1:
-        return
-    way = wp.vec2d()
-    for other in range(lanes):
-        way = way + scratch.ways_gone[s, other]
-    change, largest = real(0.0), real(0.0)
-    if way[1] > real(0.0):
-        for i in range(lane, scratch.nodes[s], lanes):
-            now = real(scratch.force[s, i])
-            if now > real(0.0):
-                now = wp.max(now - way[0] / way[1] * scratch.move[s, i], real(0.0))
-            elif scratch.gap[s, i] < real(0.0):
-                now = -scratch.gap[s, i] / scratch.matrix[s, i, i]
-                scratch.again[s] = 1
-            change = wp.max(change, wp.abs(now - scratch.force[s, i]))
-            largest = wp.max(largest, now)
-            scratch.force[s, i] = now
-    scratch.changes[s, lane] = wp.vec2d(change, largest)
-
-
-@wp.kernel
-def begin_power(scratch: Scratch):
-    """Start of the conjugate gradients of obstacle.power_of."""
-    s = wp.tid()
-    sum = real(0.0)
-    for i in range(scratch.nodes[s]):
+    lanes, count, square, on = wp.block_dim(), scratch.nodes[s], real(0.0), real(0.0)
+    for i in range(lane, count, lanes):
         here = real(0.0)
         if scratch.force[s, i] > real(0.0):
             here = real(1.0)
         scratch.found_power[s, i] = real(0.0)
         scratch.left[s, i] = here
-        scratch.move[s, i] = here
-        sum += here
-    scratch.before[s] = sum
-    scratch.first_square[s] = sum
-    scratch.done[s] = 0
-    if sum == real(0.0):
-        scratch.done[s] = 1
-
-
-@wp.kernel
-def multiply(lanes: wp.int32, scratch: Scratch):
-    """A scene's matrix times the direction of obstacle.power_of."""
-    s, lane = wp.tid()
-    if scratch.done[s] == 0:
-        for i in range(lane, scratch.nodes[s], lanes):
-            scratch.along[s, i] = _times(scratch, s, i, scratch.move)
-
-
-@wp.kernel
-def step_power(scratch: Scratch):
-    """A step of these."""
-    s = wp.tid()
-    if scratch.done[s] == 1:
-        return
-    down, square = real(0.0), real(0.0)
-    for i in range(scratch.nodes[s]):
-        if scratch.force[s, i] <= real(0.0):
-            scratch.along[s, i] = real(0.0)
-        down += scratch.along[s, i] * scratch.move[s, i]
-    size = scratch.before[s] / down
-    for i in range(scratch.nodes[s]):
-        left = scratch.left[s, i] - size * scratch.along[s, i]
-        scratch.found_power[s, i] = scratch.found_power[s, i] + size * scratch.move[s, i]
-        scratch.left[s, i] = left
-        square += left * left
-    for i in range(scratch.nodes[s]):
-        scratch.move[s, i] = scratch.left[s, i] + square / scratch.before[s] * scratch.move[s, i]
-    scratch.before[s] = square
-    if square <= POWER_TOLERANCE * scratch.first_square[s]:
-        scratch.done[s] = 1
-    else:
-        wp.atomic_max(scratch.busy, 0, 1)
+        scratch.move[s, i] = real(0.0)
+        square += here
+    square = sum_of(square)
+    first, number = real(square), wp.int32(0)
+    while square > POWER_TOLERANCE * first and number < ITERATIONS:
+        number += 1
+        for i in range(lane, count, lanes):
+            scratch.move[s, i] = scratch.left[s, i] + on * scratch.move[s, i]
+        wait()
+        down, before = real(0.0), real(square)
+        for i in range(lane, count, lanes):
+            along = real(0.0)
+            if scratch.force[s, i] > real(0.0):
+                along = _times(scratch, s, i, scratch.move)
+            scratch.along[s, i] = along
+            down += along * scratch.move[s, i]
+        size = before / sum_of(down)
+        square = real(0.0)
+        for i in range(lane, count, lanes):
+            left = scratch.left[s, i] - size * scratch.along[s, i]
+            scratch.found_power[s, i] = scratch.found_power[s, i] + size * scratch.move[s, i]
+            scratch.left[s, i] = left
+            square += left * left
+        square = sum_of(square)
+        on = square / before
 
 
 @wp.func

@@ -11,6 +11,7 @@ import warp as wp
 
 from stmpl_core import nodes as law
 from stmpl_core.deep import DEEPEST
+from stmpl_core.gpu.blocks import least_of, most_of, sum_before, sum_of
 from stmpl_core.gpu.looks import CHARTS, FACING, inward_on, point_on, thickness_on
 from stmpl_core.gpu.packs import Lattice, Scratch, Skins
 from stmpl_core.gpu.places import APART, BY_POSE, DEEP, OVERFULL, PENDING
@@ -30,21 +31,23 @@ wp.set_module_options(OPTIONS)
 @wp.kernel
 def lay(side: wp.int32, only_look: wp.int32, skins: Skins, scratch: Scratch):
     """The lattice on one side, and how far it must reach."""
-    c = wp.tid()
-    lattice = Lattice()
-    scratch.lattice[c] = lattice
+    c, lane = wp.tid()
+    lanes, lattice = wp.block_dim(), Lattice()
+    if lane == 0:
+        scratch.lattice[c] = lattice
     if side >= scratch.sides[c]:
         return
     many, parts, thick = scratch.many[c], scratch.split[c] * scratch.split[c], real(0.0)
-    for m in range(many):
+    for m in range(lane, many, lanes):
         thick += skins.thickness[skins.faces[scratch.found[c, m]][0]] / real(many)
+    thick = sum_of(thick)
     cell = scratch.covers[c] / NODES
     if only_look == 1:
         cell = real(0.5) * thick * thick * wp.pow(real(2.0), wp.floor(wp.log2(cell / (thick * thick))))
     least = wp.max(wp.min(cell, RISE * WIDEST * thick * WIDEST * thick), scratch.covers[c] / MOST)
     axes, centre = scratch.axes[c, side], scratch.centre[c]
     low_u, low_v, high_u, high_v = real(FAR), real(FAR), -FAR, -FAR
-    for m in range(many):
+    for m in range(lane, many, lanes):
         if scratch.chart[c, m] == side or scratch.chart[c, m] == side + CHARTS:
             corners, near = skins.faces[scratch.found[c, m]], wp.int32(0)
             edge = wp.length(skins.points[corners[0]] - skins.points[corners[1]]) / wp.sqrt(real(parts))
@@ -55,7 +58,11 @@ def lay(side: wp.int32, only_look: wp.int32, skins: Skins, scratch: Scratch):
                     low_u, high_u = wp.min(low_u, at[0] - edge), wp.max(high_u, at[0] + edge)
                     low_v, high_v = wp.min(low_v, at[1] - edge), wp.max(high_v, at[1] + edge)
             scratch.chart[c, m] = side + near
-    if high_u < low_u:
+    low_u = least_of(low_u)
+    low_v = least_of(low_v)
+    high_u = most_of(high_u)
+    high_v = most_of(high_v)
+    if high_u < low_u or lane > 0:
         return
     cell = wp.max(least, (high_u - low_u) * (high_v - low_v) / MOST_PLACES)
     lattice.cell = cell
@@ -143,9 +150,10 @@ def _shares_of_place(lattice: Lattice, skins: Skins, f: wp.int32, centre: vec3, 
 
 
 @wp.kernel
-def sample(lanes: wp.int32, only_look: wp.int32, skins: Skins, scratch: Scratch):
-    """Covered area [m2] of each place of the lattice; or the strain of its column."""
+def sample(only_look: wp.int32, last: wp.int32, skins: Skins, scratch: Scratch):
+    """Covered area [m2] of each place of the lattice, after the last side of all; or the strain of its column."""
     c, lane = wp.tid()
+    lanes = wp.block_dim()
     lattice, grid, pose = scratch.lattice[c], skins.grids[scratch.grid[c]], wp.transpose(scratch.pose[c])
     top, sum = scratch.top[c], real(0.0)
     for n in range(lane, lattice.rows * lattice.wide, lanes):
@@ -161,41 +169,46 @@ def sample(lanes: wp.int32, only_look: wp.int32, skins: Skins, scratch: Scratch)
             else:
                 value = strain_under(grid, skins.coefficients, start, way, t, top)
         scratch.value[c, n] = value
-    scratch.partial[c, lane] = sum
-
-
-@wp.kernel
-def add_area(lanes: wp.int32, last: wp.int32, scratch: Scratch):
-    """Adds what one side's lattice sees; after the last side this is the covered area."""
-    c = wp.tid()
-    for lane in range(lanes):
-        scratch.sees[c] = scratch.sees[c] + scratch.partial[c, lane]
-    if last == 1:
-        scratch.covers[c] = scratch.sees[c]
-        if scratch.sees[c] <= real(0.0):
-            scratch.sides[c] = 0
+    if only_look == 1:
+        sum = sum_of(sum)
+        if lane == 0:
+            sum += scratch.sees[c]
+            scratch.sees[c] = sum
+            if last == 1:
+                scratch.covers[c] = sum
+                if sum <= real(0.0):
+                    scratch.sides[c] = 0
 
 
 @wp.kernel
 def list_nodes(many: wp.int32, side: wp.int32, scratch: Scratch):
     """Numbers of the places whose columns are squeezed, one after the other for all tools of a scene."""
-    s = wp.tid()
-    count, room = wp.int32(scratch.nodes[s]), scratch.tool.shape[1]
-    scratch.begin[s] = count
+    s, lane = wp.tid()
+    begin, room, lanes = wp.int32(scratch.nodes[s]), scratch.tool.shape[1], wp.block_dim()
+    before = wp.int32(begin)
     for k in range(many):
-        c = s * many + k
-        for n in range(scratch.lattice[c].rows * scratch.lattice[c].wide):
+        c, count = s * many + k, wp.int32(0)
+        places = scratch.lattice[c].rows * scratch.lattice[c].wide
+        each = (places + lanes - 1) // lanes  # of a thread, one after the other
+        for n in range(lane * each, wp.min((lane + 1) * each, places)):
             if scratch.value[c, n] > real(0.0):
-                if count < room:
-                    scratch.tool[s, count] = k
-                    scratch.cell[s, count] = n
-                else:
-                    scratch.status[c] = OVERFULL
                 count += 1
-                if scratch.value[c, n] >= FULL and scratch.status[c] == PENDING:
-                    scratch.status[c] = DEEP
-    scratch.nodes[s] = wp.min(count, room)
-    wp.atomic_max(scratch.wants, 0, count)
+        place = before + sum_before(count)
+        before += wp.int32(sum_of(real(count)))
+        for n in range(lane * each, wp.min((lane + 1) * each, places)):
+            if scratch.value[c, n] > real(0.0):
+                if place < room:
+                    scratch.tool[s, place] = k
+                    scratch.cell[s, place] = n
+                else:
+                    wp.atomic_max(scratch.status, c, OVERFULL)
+                if scratch.value[c, n] >= FULL:
+                    wp.atomic_max(scratch.status, c, DEEP)
+                place += 1
+    if lane == 0:
+        scratch.begin[s] = begin
+        scratch.nodes[s] = wp.min(before, room)
+        wp.atomic_max(scratch.wants, 0, before)
 
 
 @wp.kernel

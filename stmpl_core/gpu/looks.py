@@ -6,6 +6,7 @@ import math
 import warp as wp
 
 from stmpl_core import nodes as law
+from stmpl_core.gpu.blocks import least_of, most_of, sum_of
 from stmpl_core.gpu.packs import Scratch, Skins
 from stmpl_core.gpu.places import PENDING
 from stmpl_core.gpu.rays import FAR, OPTIONS, depth_at, mat33, real, vec3
@@ -112,18 +113,25 @@ def _axes(pose: mat33, way: vec3) -> mat33:
 @wp.kernel
 def gather_look(scratch: Scratch):
     """Area that the tool covers, and the sides of the limb that its triangles are on."""
-    c = wp.tid()
-    many, parts = scratch.many[c], scratch.split[c] * scratch.split[c]
+    c, lane = wp.tid()
+    lanes, many, parts = wp.block_dim(), scratch.many[c], scratch.split[c] * scratch.split[c]
     if many == 0:
         return
-    best, deepest = wp.int32(0), -FAR
-    for m in range(many):
+    mine, deepest = wp.int32(0), -FAR
+    for m in range(lane, many, lanes):
         here = _deepest_of(scratch, c, m, parts)
-        if here > deepest or (here == deepest and scratch.found[c, m] < scratch.found[c, best]):
+        if here > deepest or (here == deepest and scratch.found[c, m] < scratch.found[c, mine]):
             deepest = here
-            best = m
+            mine = m
+    own, lowest, best = real(deepest), real(FAR), real(0.0)
+    deepest = most_of(deepest)
+    if own == deepest:
+        lowest = real(scratch.found[c, mine])
+    if lowest == least_of(lowest):
+        best = real(mine)
+    best = sum_of(best)  # of the one thread that has it
     area, total, mean = real(0.0), real(0.0), vec3()
-    for m in range(many):
+    for m in range(lane, many, lanes):
         size = scratch.sizes[c, m]
         blur = real(0.5) * wp.sqrt(size)
         if deepest > real(0.0):
@@ -136,19 +144,21 @@ def gather_look(scratch: Scratch):
         total += weight
         mean = mean + weight * scratch.ways[c, m]
         scratch.chart[c, m] = -1
+    area = sum_of(area)
+    total = sum_of(total)
+    mean = sum_of(mean)
     if deepest <= real(0.0):
         area = real(0.05) * area
-    scratch.covers[c] = area
-    scratch.deepest[c] = deepest
-    way = vec3(scratch.ways[c, best])
+    way = vec3(scratch.ways[c, wp.int32(best)])
     if wp.length(mean) > ONE_WAY * total:
         way = wp.normalize(mean)
     sides = wp.int32(0)
     if area > real(0.0):
         while sides < CHARTS:
-            rest, highest = wp.int32(-1), real(0.0)
-            scratch.axes[c, sides] = _axes(scratch.pose[c], way)
-            for m in range(many):
+            if lane == 0:
+                scratch.axes[c, sides] = _axes(scratch.pose[c], way)
+            rest, highest = wp.int32(many), real(0.0)
+            for m in range(lane, many, lanes):
                 if scratch.chart[c, m] < 0:
                     if wp.dot(scratch.ways[c, m], way) >= FACING:
                         scratch.chart[c, m] = sides
@@ -158,9 +168,15 @@ def gather_look(scratch: Scratch):
                             rest = m
                             highest = here
             sides += 1
-            if rest < 0:
+            if highest < most_of(highest):
+                rest = many
+            rest = wp.int32(least_of(real(rest)))
+            if rest == many:
                 break
             way = scratch.ways[c, rest]
-    scratch.sides[c] = sides
-    scratch.sees[c] = real(0.0)
-    wp.atomic_max(scratch.busy, 0, sides)
+    if lane == 0:
+        scratch.covers[c] = area
+        scratch.deepest[c] = deepest
+        scratch.sides[c] = sides
+        scratch.sees[c] = real(0.0)
+        wp.atomic_max(scratch.busy, 0, sides)

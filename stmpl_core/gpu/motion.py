@@ -174,12 +174,12 @@ def mark(pick: wp.array(dtype=wp.int32), lanes: wp.int32, many: wp.int32, all: w
     """How near a source each vertex is: thinning._zones; all: 1, those that carry nothing too."""
     f, lane = wp.tid()
     first, zones = skins.one[scratch.skin[pick[f] * many]].first, more.stands.shape[0]
-    for n in range(lane, field.many[f], lanes):
+    for n in range(field.many[f]):
         v = field.under[f, n]
         if all == 1 or field.source[f, n][0] != wp.float32(0.0):
-            field.here[f, v - first] = field.source[f, n]
+            field.here[f, v - first] = field.source[f, n]  # each lane says so; they share out the neighbours
             for z in range(zones):
-                for p in range(more.reach[zones * v + z], more.reach[zones * v + z + 1]):
+                for p in range(more.reach[zones * v + z] + lane, more.reach[zones * v + z + 1], lanes):
                     wp.atomic_max(field.mark, f, more.index[p] - first, zones - z)
                     if field.folds[f] > 1:
                         wp.atomic_or(field.feels, f, more.index[p] - first, wp.uint32(1) << wp.uint32(field.fold[f, n]))

@@ -114,7 +114,7 @@ SCRATCH: dict[str, tuple[Any, str]] = {
     "depths": (real, "CP"), "middles": (vec3, "CP"), "ways": (vec3, "CF"), "sizes": (real, "CF"),
     "chart": (wp.int32, "CF"), "sides": (wp.int32, "C"), "axes": (mat33, "C6"), "deepest": (real, "C"),
     "covers": (real, "C"), "sees": (real, "C"), "lattice": (Lattice, "C"),
-    "owner": (wp.int32, "CL"), "value": (real, "CL"), "partial": (real, "CR"),
+    "owner": (wp.int32, "CL"), "value": (real, "CL"),
     "nodes": (wp.int32, "S"), "wants": (wp.int32, "1"), "begin": (wp.int32, "S"), "tool": (wp.int32, "SN"),
     "cell": (wp.int32, "SN"), "face": (wp.int32, "SN"), "shares": (vec3, "SN"), "point": (vec3, "SN"),
     "inward": (vec3, "SN"), "thick": (real, "SN"), "area": (real, "SN"), "strain": (real, "SN"),
@@ -122,13 +122,10 @@ SCRATCH: dict[str, tuple[Any, str]] = {
     "most_area": (real, "C"), "sinking": (real, "SQ"), "soft": (real, "SQ"), "slot": (wp.int32, "SK"),
     "met": (wp.int32, "SK"), "meets": (wp.int32, "S"), "slots": (wp.int32, "SQ9"), "weights": (real, "SQ9"),
     "parts": (real, "SQ9"), "around_node": (wp.int32, "SQ"), "rows": (real, "SQK"),
-    "wide_part": (real, "SQQ"), "kept": (real, "SQ"), "given_way": (real, "C"), "works": (wp.vec2d, "CR"),
+    "wide_part": (real, "SQQ"), "kept": (real, "SQ"), "given_way": (real, "C"),
     "matrix": (real, "SNN"), "force": (real, "SN"), "gap": (real, "SN"), "move": (real, "SN"), "along": (real, "SN"),
     "wanted": (real, "SN"), "beside": (wp.uint32, "SNW"), "reached": (wp.uint32, "CW"),
-    "found_power": (real, "SN"), "left": (real, "SN"), "before": (real, "S"), "restart": (wp.int32, "S"),
-    "again": (wp.int32, "S"), "sums": (real, "SR"), "changes": (wp.vec2d, "SR"),
-    "ways_gone": (wp.vec2d, "SR"),
-    "first_square": (real, "S"), "done": (wp.int32, "S"), "group": (wp.int32, "C"),
+    "found_power": (real, "SN"), "left": (real, "SN"), "group": (wp.int32, "C"),
     "pressure": (real, "SN"), "fade": (real, "SN"), "strange": (real, "SN"), "error": (real, "SN"),
     "inputs": (wp.float32, "SNI"), "one": (wp.float32, "SNH"), "two": (wp.float32, "SNH"), "highest": (real, "SN"),
 }  # fmt: skip
@@ -146,14 +143,13 @@ class Room(NamedTuple):
     columns: int
     blocks: int
     nodes: int
-    lanes: int
     coarse: int  # coarse vertices of a stack; 0: one material
 
     def sizes(self, scenes: int, tools: int) -> dict[str, int]:
         """Length of each axis of SCRATCH."""
         faces = 2 * self.columns + 64
         return {"C": scenes * tools, "S": scenes, "M": self.columns, "B": self.blocks, "F": faces, "6": CHARTS,
-                "P": max(faces, LEAST_PARTS), "L": MOST_PLACES, "N": self.nodes, "R": self.lanes, "W": self.nodes // 32,
+                "P": max(faces, LEAST_PARTS), "L": MOST_PLACES, "N": self.nodes, "W": self.nodes // 32,
                 "I": max(NODE.size, STACK_NODE.size), "H": HIDDEN, "1": 1, "K": max(1, self.coarse), "9": 9,
                 "Q": self.nodes if self.coarse else 1}  # fmt: skip
 
@@ -340,8 +336,7 @@ def whole_words(nodes: int) -> int:
     return 32 * -(-nodes // 32)
 
 
-def room_for(skins: Sequence[Skin], fields: Sequence[Sequence[SignedDistance]], lanes: int,
-             nodes: int | None) -> Room:  # fmt: skip
+def room_for(skins: Sequence[Skin], fields: Sequence[Sequence[SignedDistance]], nodes: int | None) -> Room:
     """Capacities for the tools on these skins: what they need however they lie there; of nodes, what most need."""
     columns = blocks = most = 0
     for skin, own in zip(skins, fields, strict=True):
@@ -355,5 +350,5 @@ def room_for(skins: Sequence[Skin], fields: Sequence[Sequence[SignedDistance]], 
             wanted += min(1.5 * NODES + extent[1] * extent[2] / cell, 1.2 * MOST)
         most, blocks = max(most, int(wanted)), max(blocks, -(-len(layer.vertices) // BLOCK))
     return Room(min(int(MARGIN * columns) + BLOCK, max(len(s.layer.vertices) for s in skins)), blocks,
-                whole_words(most if nodes is None else nodes), lanes,
+                whole_words(most if nodes is None else nodes),
                 max(len(skin.green.coarse.gathered) if skin.green and skin.green.coarse else 0 for skin in skins))

@@ -7,6 +7,7 @@ import warp as wp
 
 from stmpl_core import contact_net, green
 from stmpl_core.columns import MIN_ONE_WAY_SHARE
+from stmpl_core.gpu.blocks import sum_of, wait
 from stmpl_core.gpu.columns import _marked
 from stmpl_core.gpu.hold import FADE_RING, HARDENING, NEAR, RINGS, STACK_LINEAR_TO, STEPS, _row, _write, _write_alike
 from stmpl_core.gpu.packs import Scratch, Skins
@@ -77,13 +78,12 @@ def sink(lanes: wp.int32, many: wp.int32, skins: Skins, scratch: Scratch):
 @wp.kernel
 def fold(many: wp.int32, skins: Skins, scratch: Scratch):
     """Numbers of groups of nodes of which none feels another, on skin with folds: thinning._together."""
-    s = wp.tid()
+    s, lane = wp.tid()
     one = skins.one[scratch.skin[s * many]]
-    for i in range(scratch.nodes[s]):
-        scratch.fold[s, i] = 0
-        if one.folded == 1:
-            scratch.fold[s, i] = -1
-    if one.folded == 0:
+    for i in range(lane, scratch.nodes[s], wp.block_dim()):
+        scratch.fold[s, i] = -one.folded
+    wait()
+    if one.folded == 0 or lane > 0:
         return
     groups, left = wp.int32(0), wp.int32(scratch.nodes[s])
     for i in range(scratch.nodes[s]):
@@ -110,34 +110,41 @@ def fold(many: wp.int32, skins: Skins, scratch: Scratch):
 @wp.kernel
 def meet(many: wp.int32, skins: Skins, scratch: Scratch):
     """Coarse vertices around the nodes of a scene, each once; and those around each node, with their weights."""
-    s = wp.tid()
-    one, count = skins.one[scratch.skin[s * many]], wp.int32(0)
-    for n in range(one.coarse):
+    s, lane = wp.tid()
+    lanes, one, count = wp.block_dim(), skins.one[scratch.skin[s * many]], wp.int32(0)
+    for n in range(lane, one.coarse, lanes):
         scratch.slot[s, n] = -1
-    for i in range(scratch.nodes[s]):
+    wait()
+    for i in range(lane, scratch.nodes[s], lanes):
         corners, shares, own = skins.faces[scratch.face[s, i]], scratch.shares[s, i], wp.int32(0)
         scratch.soft[s, i] = (shares[0] * skins.soft[corners[0]] + shares[1] * skins.soft[corners[1]]
                               + shares[2] * skins.soft[corners[2]])  # fmt: skip
         for q in range(9):
             v = corners[q // 3]
-            n, weight = skins.coarse_corner[v][q % 3], shares[q // 3] * skins.coarse_share[v][q % 3]
-            if scratch.slot[s, n] < 0:
-                scratch.slot[s, n] = count
-                scratch.met[s, count] = n
-                count += 1
-            slot, k = scratch.slot[s, n], wp.int32(0)
-            while k < own and scratch.slots[s, i, k] != slot:
+            n, weight, k = skins.coarse_corner[v][q % 3], shares[q // 3] * skins.coarse_share[v][q % 3], wp.int32(0)
+            while k < own and scratch.slots[s, i, k] != n:
                 k += 1
             if k == own:
-                scratch.slots[s, i, k] = slot
+                scratch.slot[s, n] = 0  # met by one node or by several, who all say so
+                scratch.slots[s, i, k] = n
                 scratch.weights[s, i, k] = real(0.0)
                 own += 1
             scratch.weights[s, i, k] = scratch.weights[s, i, k] + weight
-        for k in range(own):
-            area = skins.gathered[one.first_coarse + scratch.met[s, scratch.slots[s, i, k]]]
-            scratch.parts[s, i, k] = scratch.weights[s, i, k] / area
         scratch.around_node[s, i] = own
-    scratch.meets[s] = count
+    wait()
+    if lane == 0:
+        for n in range(one.coarse):
+            if scratch.slot[s, n] == 0:
+                scratch.slot[s, n] = count
+                scratch.met[s, count] = n
+                count += 1
+        scratch.meets[s] = count
+    wait()
+    for i in range(lane, scratch.nodes[s], lanes):
+        for k in range(scratch.around_node[s, i]):
+            n = scratch.slots[s, i, k]
+            scratch.slots[s, i, k] = scratch.slot[s, n]
+            scratch.parts[s, i, k] = scratch.weights[s, i, k] / skins.gathered[one.first_coarse + n]
 
 
 @wp.kernel
@@ -262,28 +269,21 @@ def temper(lanes: wp.int32, scratch: Scratch):
 
 
 @wp.kernel
-def work(lanes: wp.int32, many: wp.int32, scratch: Scratch):
-    """Work of the forces of each tool's group, lane by lane: on the limb as a whole, and all."""
+def share_given_way(many: wp.int32, scratch: Scratch):
+    """Share of the work of the forces of each tool's group that goes into the limb as a whole."""
     c, lane = wp.tid()
     s, coarse, whole = c // many, real(0.0), real(0.0)
-    for i in range(lane, scratch.nodes[s], lanes):
+    for i in range(lane, scratch.nodes[s], wp.block_dim()):
         force = scratch.force[s, i]
         if force > real(0.0) and scratch.group[s * many + scratch.tool[s, i]] == scratch.group[c]:
             for j in range(scratch.nodes[s]):
                 if scratch.group[s * many + scratch.tool[s, j]] == scratch.group[c]:
                     coarse += force * scratch.wide_part[s, i, j] * scratch.force[s, j]
                     whole += force * scratch.matrix[s, i, j] * scratch.force[s, j]
-    scratch.works[c, lane] = wp.vec2d(coarse, whole)
-
-
-@wp.kernel
-def share_given_way(lanes: wp.int32, scratch: Scratch):
-    """Share of that work that goes into the limb as a whole."""
-    c = wp.tid()
-    works = wp.vec2d()
-    for lane in range(lanes):
-        works = works + scratch.works[c, lane]
-    scratch.given_way[c] = works[0] / wp.max(works[1], real(1e-300))
+    coarse = sum_of(coarse)
+    whole = sum_of(whole)
+    if lane == 0:
+        scratch.given_way[c] = coarse / wp.max(whole, real(1e-300))
 
 
 @wp.func

@@ -9,6 +9,7 @@ the vertices that are asked, as on a flat stack, and all vertices with the limb'
 import warp as wp
 
 from stmpl_core import conform, green, moments, softness, stick, thinning
+from stmpl_core.gpu.blocks import most_of, sum_before, wait
 from stmpl_core.gpu.columns import _marked
 from stmpl_core.gpu.field_packs import FieldScratch, SkinFields
 from stmpl_core.gpu.motion import MOST_FOLDS, _stretch
@@ -178,61 +179,38 @@ def fill_blocks(pick: wp.array(dtype=wp.int32), lanes: wp.int32, many: wp.int32,
 
 
 @wp.kernel
-def find_most(lanes: wp.int32, field: FieldScratch):
-    """The largest number of these, lane by lane."""
+def solve(field: FieldScratch):
+    """Forces over E that take the nodes there, by Gauss's elimination; two nodes in one place are no error."""
     f, lane = wp.tid()
-    count, most = field.holds[f], real(0.0)
-    for p in range(lane, count * count, lanes):
-        block = field.block[f, p // count, p % count]
+    lanes, count, most = wp.block_dim(), field.holds[f], real(0.0)
+    for n in range(lane, count * count, lanes):
+        block = field.block[f, n // count, n % count]
         for y in range(3):
             for z in range(3):
                 most = wp.max(most, wp.abs(block[y, z]))
-    field.told[f, lane] = wp.vec2d(most, real(0.0))
-
-
-@wp.func
-def _largest(field: FieldScratch, f: wp.int32, lanes: wp.int32) -> real:
-    """The largest number that the lanes of a scene have told."""
-    most = real(0.0)
-    for lane in range(lanes):
-        most = wp.max(most, field.told[f, lane][0])
-    return most
-
-
-@wp.kernel
-def add_ridge(lanes: wp.int32, field: FieldScratch):
-    """Two nodes in one place are no error."""
-    f = wp.tid()
-    most = _largest(field, f, lanes)
-    for a in range(field.holds[f]):
+    most = most_of(most)
+    for a in range(lane, count, lanes):
         field.block[f, a, a] = field.block[f, a, a] + RIDGE * most * wp.identity(n=3, dtype=real)
-
-
-@wp.kernel
-def eliminate(lanes: wp.int32, start: wp.int32, end: wp.int32, field: FieldScratch):
-    """Gauss's elimination by some nodes; by more than one only where a scene has one lane."""
-    f, lane = wp.tid()
-    count = field.holds[f]
-    for k in range(start, wp.min(end, count)):
-        pivot = wp.inverse(field.block[f, k, k])
+    wait()
+    for k in range(count):
+        pivot, rest = wp.inverse(field.block[f, k, k]), count - k - 1
         for i in range(k + 1 + lane, count, lanes):
             factor = field.block[f, i, k] * pivot
-            for j in range(k + 1, count):
-                field.block[f, i, j] = field.block[f, i, j] - factor * field.block[f, k, j]
+            field.block[f, i, k] = factor
             field.pull[f, i] = field.pull[f, i] - factor * field.pull[f, k]
-
-
-@wp.kernel
-def substitute(field: FieldScratch):
-    """Forces over E that take the nodes there."""
-    f = wp.tid()
-    count = field.holds[f]
+        wait()
+        for n in range(lane, rest * rest, lanes):
+            i, j = k + 1 + n // rest, k + 1 + n % rest
+            field.block[f, i, j] = field.block[f, i, j] - field.block[f, i, k] * field.block[f, k, j]
+        wait()
     for back in range(count):
-        a = count - 1 - back
-        sum = field.pull[f, a]
-        for b in range(a + 1, count):
-            sum = sum - field.block[f, a, b] * field.pull[f, b]
-        field.pull[f, a] = wp.inverse(field.block[f, a, a]) * sum
+        k = count - 1 - back
+        force = wp.inverse(field.block[f, k, k]) * field.pull[f, k]
+        for i in range(lane, k, lanes):
+            field.pull[f, i] = field.pull[f, i] - field.block[f, i, k] * force
+        wait()
+        if lane == 0:
+            field.pull[f, k] = force
 
 
 @wp.kernel
@@ -242,12 +220,13 @@ def mark(pick: wp.array(dtype=wp.int32), lanes: wp.int32, many: wp.int32, skins:
     f, lane = wp.tid()
     s, zones = pick[f], more.stands.shape[0]
     one = skins.one[scratch.skin[s * many]]
-    for a in range(lane, field.holds[f], lanes):
+    for a in range(field.holds[f]):  # the lanes share out the neighbours
         i = field.hold[f, a]
         corners = skins.faces[scratch.face[s, i]]
         for x in range(3):
             for z in range(zones):
-                for p in range(more.reach[zones * corners[x] + z], more.reach[zones * corners[x] + z + 1]):
+                zone = zones * corners[x] + z
+                for p in range(more.reach[zone] + lane, more.reach[zone + 1], lanes):
                     v = more.index[p] - one.first
                     wp.atomic_max(field.mark, f, v, zones - z)
                     if field.parted[f] == 1:
@@ -375,17 +354,23 @@ def mark_beside(pick: wp.array(dtype=wp.int32), lanes: wp.int32, many: wp.int32,
 @wp.kernel
 def list_beside(pick: wp.array(dtype=wp.int32), many: wp.int32, skins: Skins, scratch: Scratch, field: FieldScratch):
     """Lists these with the vertices that the tools touch; counted where there is no room."""
-    f = wp.tid()
-    one, count = skins.one[scratch.skin[pick[f] * many]], wp.int32(0)
-    for n in range(field.many[f]):
+    f, lane = wp.tid()
+    lanes, one, count = wp.block_dim(), skins.one[scratch.skin[pick[f] * many]], wp.int32(0)
+    for n in range(lane, field.many[f], lanes):
         field.mark[f, field.under[f, n] - one.first] = 1
-    for n in range(one.end - one.first):
-        if field.mark[f, n] == 1:
-            if count < field.under.shape[1]:
-                field.under[f, count] = one.first + n
-            count += 1
-    field.many[f] = wp.min(count, field.under.shape[1])
-    wp.atomic_max(field.most, 0, count)
+    wait()
+    each = (one.end - one.first + lanes - 1) // lanes  # of a thread, one after the other
+    for write in range(2):  # counts them, and then knows where to write
+        for n in range(lane * each, wp.min((lane + 1) * each, one.end - one.first)):
+            if field.mark[f, n] == 1:
+                if write == 1 and count < field.under.shape[1]:
+                    field.under[f, count] = one.first + n
+                count += 1
+        if write == 0:
+            count = sum_before(count)
+    if lane == lanes - 1:
+        field.many[f] = wp.min(count, field.under.shape[1])
+        wp.atomic_max(field.most, 0, count)
 
 
 @wp.func
@@ -441,22 +426,16 @@ def spread(pick: wp.array(dtype=wp.int32), lanes: wp.int32, many: wp.int32, skin
 
 
 @wp.kernel
-def find_peak(pick: wp.array(dtype=wp.int32), lanes: wp.int32, many: wp.int32, skins: Skins, scratch: Scratch,
-              field: FieldScratch):  # fmt: skip
-    """Largest linear motion of the vertices that are asked, lane by lane."""
+def find_peak(pick: wp.array(dtype=wp.int32), many: wp.int32, skins: Skins, scratch: Scratch, field: FieldScratch):
+    """Largest linear motion of the vertices that are asked."""
     f, lane = wp.tid()
     one, most = skins.one[scratch.skin[pick[f] * many]], real(0.0)
-    for n in range(lane, one.end - one.first, lanes):
+    for n in range(lane, one.end - one.first, wp.block_dim()):
         if field.ask[f, n] == 1:
             most = wp.max(most, wp.length_sq(field.linear[f, n]))
-    field.told[f, lane] = wp.vec2d(most, real(0.0))
-
-
-@wp.kernel
-def gather_peak(lanes: wp.int32, field: FieldScratch):
-    """The same of all."""
-    f = wp.tid()
-    field.peak[f] = wp.sqrt(_largest(field, f, lanes))
+    most = most_of(most)
+    if lane == 0:
+        field.peak[f] = wp.sqrt(most)
 
 
 @wp.kernel

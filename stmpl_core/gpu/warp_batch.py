@@ -2,11 +2,10 @@
 
 The law is that of stmpl_core.toucher by pose, elastic and without memory: the same lattice of contact nodes, the same
 linear complementarity problem on a dense matrix for each scene, the same network. Each stage is one kernel over all
-scenes, with LANES threads a scene that share out its columns, triangles, places or nodes; what one scene sums up is
-summed by one of its threads. So nothing waits inside a kernel and nothing is added in an order that threads decide: an
-answer is the same to the bit from run to run, and the source has no line for one kind of device only. The alternative,
-a block a scene that keeps its matrix in shared memory, saves the few hundred launches of a batch (some milliseconds,
-whatever n) but holds 100 to 200 nodes only, in float32, and its barriers would never run in a test without a GPU.
+scenes, with LANES threads a scene, which are one block and share out its columns, triangles, places or nodes. What a
+scene sums up is summed by one of them or by all in a fixed order (blocks.py): an answer is the same to the bit from run
+to run, and the kernels have no line for one kind of device only. A scene's matrix stays in memory: a block's own has
+room for 100 to 200 nodes, in float32.
 
 Geometry and the linear problem are float64, the network float32, as in the law that runs on a CPU.
 """
@@ -14,7 +13,7 @@ Geometry and the linear problem are float64, the network float32, as in the law 
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass
 from numbers import Integral
@@ -28,11 +27,11 @@ from stmpl_core.columns import Columns
 from stmpl_core.errors import InvalidInput
 from stmpl_core.friction import Friction, check_tools
 from stmpl_core.gpu import answers, bears, columns, hold, lattice, looks, packs, places, stacks, sticks
+from stmpl_core.gpu.blocks import threads
 from stmpl_core.gpu.fields import Fields
 from stmpl_core.gpu.memory import Steps, WarpStates
 from stmpl_core.gpu.rays import mat33
 from stmpl_core.networks import shipped
-from stmpl_core.obstacle import MAX_ITERATIONS
 from stmpl_core.skin import Skin
 from stmpl_core.soundness import too_long
 from stmpl_core.state import State
@@ -42,8 +41,7 @@ from stmpl_core.tool import Tool
 log = logging.getLogger(__name__)
 STATUSES = ("pending", "apart", "pressed by pose", "wrapped around", "refused", "too deep", "no room")
 LANES = 128  # threads that share the work of a scene on a GPU
-MEMORY = {True: 8 << 30, False: 256 << 20}  # scratch space on a GPU and on a CPU [bytes]
-ASKED_EVERY = 4  # iterations after which it is asked whether any scene goes on
+MEMORY = {True: 16 << 30, False: 256 << 20}  # scratch space on a GPU and on a CPU [bytes]
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,9 +88,9 @@ class WarpBatch:
         nodes: room for contact nodes of all tools of a scene together; None: what these tools need, found out as they
             press (the first touch that needs more is answered twice).
         friction: as of a Simulator; it is felt where touches have states.
-        memory: scratch space [bytes]; scenes that do not fit go one part after the other; None: 8 GiB on a GPU, but no
+        memory: scratch space [bytes]; scenes that do not fit go one part after the other; None: 16 GiB on a GPU, but no
             more than a third of what is free, 256 MiB on a CPU, or what one scene needs. Fields take as much again.
-        lanes: threads that share the work of a scene; None: LANES on a GPU, 1 on a CPU.
+        lanes: threads that share the work of a scene, on a GPU whole warps; None: LANES on a GPU, 1 on a CPU.
 
     Attributes:
         device: Warp's device.
@@ -106,6 +104,7 @@ class WarpBatch:
     _scratch: Any
     _steps: Steps | None  # made when the first state is asked for
     _along: tuple[Any, ...]
+    _graphs: dict[tuple[Any, ...], Any]  # of what was done at least once
 
     def __init__(self, skins: Skin | Sequence[Skin], tools: Sequence[Tool], n: int | None = None, *,
                  friction: Friction | Mapping[str, Friction] = None, device: str = "cuda", nodes: int | None = None,
@@ -130,9 +129,10 @@ class WarpBatch:
             _check(skin)
         if len({skin.layer.stacked for skin in unique}) > 1:
             raise InvalidInput("stacks and skins of one material do not go into one WarpBatch. Try one for each kind.")
-        self._lanes = lanes or (LANES if self.device.is_cuda else 1)
+        self._lanes = packs.whole_words(lanes or LANES) if self.device.is_cuda else lanes or 1
+        self._block = threads(self._lanes, self.device)
         self._skins, fields = packs.pack(unique, self.tools, self.device)
-        self.room = packs.room_for(unique, fields, self._lanes, nodes)
+        self.room = packs.room_for(unique, fields, nodes)
         network = packs.network_of(unique[0].layer)
         self._stacked = unique[0].layer.stacked
         self._net, self._known = packs.net(network, self.device), _known(network)
@@ -145,6 +145,7 @@ class WarpBatch:
         if room > budget:
             raise InvalidInput(f"one scene needs {room} bytes of scratch space; {budget} are allowed. Raise memory, or "
                                "leave it out.")  # fmt: skip
+        self._recorder = wp.Stream(self.device) if self.device.is_cuda else None
         self._make_room(self.room.nodes)
 
     def __len__(self) -> int:
@@ -156,7 +157,7 @@ class WarpBatch:
         each = room.bytes_of(len(self.tools))
         if each > self._memory:
             return False
-        self._scratch = None  # given back before as much is taken again
+        self._scratch, self._graphs = None, {}  # given back before as much is taken again
         self.room, self._part = room, min(len(self), self._memory // each)
         self._scratch = packs.scratch(room, self._part, len(self.tools), self.device)
         self._numbers = [self._numbers_of(first) for first in range(0, len(self), self._part)]
@@ -248,7 +249,7 @@ class WarpBatch:
                 rows = np.flatnonzero((wanted >= first) & (wanted < first + self._part))
                 if len(rows) and self._fields is not None:
                     if self._stacked:
-                        self._stick()
+                        self._play(("stick",), self._stick)
                     self._fields.move(wanted[rows] - first, rows, self._skins, self._scratch, motion)
                 first += self._part
             if states is None:
@@ -302,7 +303,22 @@ class WarpBatch:
         return tuple(wp.array(values, dtype=wp.int32, device=self.device) for values in (skin, field))  # type: ignore
 
     def _run(self, kernel: Any, dim: int | tuple[int, int], *inputs: Any) -> None:
-        wp.launch(kernel, dim=dim, inputs=[*inputs], device=self.device)
+        wp.launch(kernel, dim=dim, inputs=[*inputs], device=self.device, block_dim=self._block)
+
+    def _play(self, what: tuple[Any, ...], work: Callable[[], None]) -> None:
+        """Work that only scratch space takes part in: on a GPU, where a launch costs, from the second time on a graph.
+
+        Not the first time, which loads kernels; nor where scenes go in parts, which are too large to feel a launch.
+        """
+        if not self.device.is_cuda or what not in self._graphs or self._part < len(self):
+            self._graphs.setdefault(what)
+            work()
+            return
+        if self._graphs[what] is None:
+            with wp.ScopedStream(self._recorder, sync_enter=False), wp.ScopedCapture(stream=self._recorder) as capture:
+                work()
+            self._graphs[what] = capture.graph
+        wp.capture_launch(self._graphs[what])
 
     def _answer(self, first: int, poses: Any, out: tuple[Any, ...]) -> bool:
         """Answers the scenes of one part; False: there was no room for the nodes, and now there is."""
@@ -311,51 +327,52 @@ class WarpBatch:
         tools = len(scratch.skin)
         read = places.read_quaternions if poses.ndim == 3 else places.read_matrices
         self._run(read, tools, poses, first, many, skins, scratch)
-        self._meet(tools, 0)
-        for kernel, dim in ((columns.list_faces, tools), (columns.sink, (tools, self._lanes)),
-                            (columns.gather_depth, tools)):  # fmt: skip
-            self._run(kernel, dim, *((self._lanes,) if dim != tools else ()), skins, scratch)
-        self._run(columns.widen, tools, skins, scratch)
-        self._meet(tools, 1)
-        self._lay(tools)
+        self._play(("look",), lambda: self._look(tools))
+        sides = int(scratch.busy.numpy()[0])  # one, but for tools that close around a limb
+        self._play(("lay", sides), lambda: self._lay(tools, sides))
         wants = int(scratch.wants.numpy()[0])
         if wants > self.room.nodes and self._grows and self._make_room(packs.whole_words(wants + wants // 8)):
             return False
-        self._run(columns.tell_inside, tools, many, skins, scratch)
-        self._run(lattice.withdraw, tools // many, many, scratch)
-        self._hold(tools)
-        self._run(answers.answer, tools, first, many, self._known, skins, scratch, *out)
+        self._play(("hold",), lambda: self._hold(tools))
+        self._run(answers.answer, (tools, self._block), first, many, self._known, skins, scratch, *out)
         return True
+
+    def _look(self, tools: int) -> None:
+        """Skin that the tools touch, and how much of it they cover."""
+        scratch, skins, shared, blocks = self._scratch, self._skins, (tools, self._lanes), (tools, self._block)
+        self._meet(tools, 0)
+        self._run(columns.list_faces, blocks, skins, scratch)
+        self._run(columns.sink, shared, self._lanes, skins, scratch)
+        self._run(columns.gather_depth, tools, skins, scratch)
+        self._run(columns.widen, tools, skins, scratch)
+        self._meet(tools, 1)
+        self._run(looks.begin, tools, scratch)
+        self._run(looks.look, shared, self._lanes, skins, scratch)
+        scratch.busy.zero_()
+        self._run(looks.gather_look, blocks, scratch)
 
     def _meet(self, tools: int, again: int) -> None:
         """Columns near the tools, and their distances."""
         scratch, skins, lanes = self._scratch, self._skins, self._lanes
         self._run(columns.find_near, (tools, lanes), lanes, again, skins, scratch)
-        self._run(columns.list_near, tools, again, skins, scratch)
+        self._run(columns.list_near, (tools, self._block), again, skins, scratch)
         self._run(columns.clear, (tools, lanes), lanes, again, skins, scratch)
         self._run(columns.gather_clearance, tools, again, skins, scratch)
 
-    def _lay(self, tools: int) -> None:
+    def _lay(self, tools: int, sides: int) -> None:
         """Contact nodes under the tools. The lattice is laid twice: first to see the covered area."""
         scratch, skins, lanes, many = self._scratch, self._skins, self._lanes, len(self.tools)
-        shared, scenes = (tools, lanes), tools // many
-        self._run(looks.begin, tools, scratch)
-        self._run(looks.look, shared, lanes, skins, scratch)
-        scratch.busy.zero_()
-        self._run(looks.gather_look, tools, scratch)
-        sides = int(scratch.busy.numpy()[0])  # one, but for tools that close around a limb
+        shared, blocks, scenes = (tools, lanes), (tools, self._block), tools // many
         scratch.nodes.zero_()
         scratch.wants.zero_()
         for only_look in (1, 0):
             for side in range(sides):
-                self._run(lattice.lay, tools, side, only_look, skins, scratch)
+                self._run(lattice.lay, blocks, side, only_look, skins, scratch)
                 self._run(lattice.disown, shared, lanes, scratch)
                 self._run(lattice.own, shared, lanes, side, skins, scratch)
-                self._run(lattice.sample, shared, lanes, only_look, skins, scratch)
-                if only_look:
-                    self._run(lattice.add_area, tools, lanes, int(side == sides - 1), scratch)
-                else:
-                    self._run(lattice.list_nodes, scenes, many, side, scratch)
+                self._run(lattice.sample, blocks, only_look, int(side == sides - 1), skins, scratch)
+                if not only_look:
+                    self._run(lattice.list_nodes, (scenes, self._block), many, side, scratch)
                     self._run(lattice.fill_nodes, (scenes, lanes), lanes, many, skins, scratch)
         self._run(lattice.tell, scenes, many, scratch)
 
@@ -363,25 +380,24 @@ class WarpBatch:
         """Pressures at the nodes: the linear problem, then the network."""
         scratch, skins, lanes, many, net = self._scratch, self._skins, self._lanes, len(self.tools), self._net
         scenes = tools // many
-        shared = scenes, lanes
+        shared, blocks = (scenes, lanes), (scenes, self._block)
+        self._run(columns.tell_inside, tools, many, skins, scratch)
+        self._run(lattice.withdraw, scenes, many, scratch)
         self._run(answers.group, scenes, many, skins, scratch)
-        self._run(stacks.fold, scenes, many, skins, scratch)
+        self._run(stacks.fold, (scenes, self._block), many, skins, scratch)
         if self._stacked:
             self._run(stacks.find_mean, tools, many, skins, scratch)
             self._run(stacks.sink, shared, lanes, many, skins, scratch)
-            self._run(stacks.meet, scenes, many, skins, scratch)
+            self._run(stacks.meet, blocks, many, skins, scratch)
             self._run(stacks.give_way, shared, lanes, many, skins, scratch)
         self._run(stacks.respond if self._stacked else hold.respond, shared, lanes, many, skins, scratch)
         if self._stacked:
             self._run(stacks.find_kept, shared, lanes, scratch)
             self._run(stacks.temper, shared, lanes, scratch)
-        self._run(hold.guess, scenes, lanes, many, 0, skins, scratch)
-        self._relax(shared)
-        self._run(hold.begin_power, scenes, scratch)
-        self._iterate([(hold.multiply, shared, lanes), (hold.step_power, scenes)])
+        self._run(hold.solve, blocks, many, 0, skins, scratch)
+        self._run(hold.find_power, blocks, scratch)
         if self._stacked:
-            self._run(stacks.work, (tools, lanes), lanes, many, scratch)
-            self._run(stacks.share_given_way, tools, lanes, scratch)
+            self._run(stacks.share_given_way, (tools, self._block), many, scratch)
         self._run(stacks.see if self._stacked else hold.see, shared, lanes, many, skins, scratch)
         self._run(hold.judge, shared, lanes, scratch, net)
         self._run(hold.layer, shared, lanes, scratch, scratch.inputs, net.w1, net.b1, scratch.one)
@@ -391,33 +407,18 @@ class WarpBatch:
         self._run(answers.find_highest, shared, lanes, many, skins, scratch)
         self._run(answers.find_beside, shared, lanes, many, scratch)
 
-    def _relax(self, shared: tuple[int, int]) -> None:
-        """Forces at the nodes of the linear problem."""
-        self._iterate([(kernel, shared, self._lanes) for kernel in (hold.press, hold.turn, hold.follow, hold.step)])
-
     def _stick(self) -> None:
         """The same for skin of stacks that sticks: of all tools of a scene together, and not as if it hardened."""
         scratch, skins, lanes, many = self._scratch, self._skins, self._lanes, len(self.tools)
         tools = len(scratch.skin)
         scenes = tools // many
         self._run(sticks.unite, tools, scratch)
-        self._run(stacks.fold, scenes, many, skins, scratch)
+        self._run(stacks.fold, (scenes, self._block), many, skins, scratch)
         self._run(stacks.find_mean, tools, many, skins, scratch)
         self._run(stacks.respond, (scenes, lanes), lanes, many, skins, scratch)
         self._run(stacks.find_kept, (scenes, lanes), lanes, scratch)
         self._run(stacks.temper, (scenes, lanes), lanes, scratch)
-        self._run(hold.guess, scenes, lanes, many, 1, skins, scratch)
-        self._relax((scenes, lanes))
-
-    def _iterate(self, kernels: Sequence[tuple[Any, ...]]) -> None:
-        """Conjugate gradients until every scene is done: kernels, over how many, what they are told."""
-        scratch = self._scratch
-        for number in range(MAX_ITERATIONS):
-            scratch.busy.zero_()
-            for kernel, dim, *told in kernels:
-                self._run(kernel, dim, *told, scratch)
-            if number % ASKED_EVERY == ASKED_EVERY - 1 and not scratch.busy.numpy()[0]:
-                return
+        self._run(hold.solve, (scenes, self._block), many, 1, skins, scratch)
 
 
 def _device(name: str) -> Any:
