@@ -79,6 +79,12 @@ class History:
         return [*(layer.vertices.min(axis=0) - around).tolist(), *(layer.vertices.max(axis=0) + around).tolist()]
 
     @cached_property
+    def _aside(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, float, float]:
+        """See Sideways.numbers; any numbers where nothing rubs."""
+        every, some = self._friction
+        return self.sideways.numbers if every or any(some.values()) else FLAT
+
+    @cached_property
     def _gives(self) -> tuple[np.ndarray, np.ndarray]:
         """See Green.gives."""
         return Green.of(self.toucher.layer).gives
@@ -109,14 +115,11 @@ class History:
         for patch, (stated, one, touch) in zip(patches, rows, strict=True):
             self._tell(patch, stated, one is not stated, touch)
         out, says = np.empty((many, OUT)), np.zeros((many, SAYS))
-        mu = np.array([self.friction(name) for name in names[:many]])
-        surfaces = np.array([float(contact.tool.number) for contact in contacts])
-        aside = self.sideways.numbers if mu.any() else FLAT
-        stepped.step(patches, before, after, True, *self.series, self._fades, mu, surfaces,
-                     self.toucher.layer.tissue.skin is not None, *aside, dt, out, says)  # fmt: skip
+        plain = stepped.step(patches, before, after, True, *self.series, self._fades,
+                             self.toucher.layer.tissue.skin is not None, *self._aside, dt, out, says)  # fmt: skip
         memories = {name: Memory(row) for name, row in zip(names, after, strict=True)}
         touches = [self._told(*one) for one in zip(contacts, touches, memories.values(), out, says, strict=False)]
-        if terms:
+        if terms and not (plain and all(touch.trust.in_range for touch in touches)):
             out[:, 7] = [touch.trust.in_range for touch in touches]
             bounds = out[:, 6].tolist()
             stepped.doubted(before, after, *self.series, dt, out, says)
@@ -179,12 +182,12 @@ class History:
 
     def _tell(self, out: np.ndarray, stated: Contact, creeps: bool, touch: Touch) -> None:
         """Writes what a touch is as a whole to a PATCH; creeps: whether another wrench than the stated was asked."""
-        pressed, wrench, toucher = touch.pressed, stated.wrench, self.toucher
+        pressed, wrench, toucher, mu = touch.pressed, stated.wrench, self.toucher, self.friction(touch.name)
         stepped.tell(touch.wrench, touch.force_bound, touch.trust.in_range, touch.depth, touch.pose_body_from_tool,
                      touch.wrench if wrench is None else wrench, stated.pose_body_from_tool, wrench is not None, creeps,
-                     out)  # fmt: skip
+                     mu, stated.tool.number, out)  # fmt: skip
         if touch.presses and pressed is not None:
-            nodes, near, rubs = pressed.squeeze.nodes, toucher.near, self.friction(touch.name) > 0
+            nodes, near, rubs = pressed.squeeze.nodes, toucher.near, mu > 0
             forces = stepped.NO_FORCE if pressed.forces is None else pressed.forces
             stepped.whole_of(
                 nodes.points, nodes.area, nodes.thickness, nodes.depths, forces, nodes.corners, nodes.shares,
@@ -205,7 +208,7 @@ class History:
         trust, pressed = touch.trust, touch.pressed
         changed: dict[str, Any] = {"wrench": out[:6].copy()}
         if self.series.times.size:
-            changed["wake"] = Wake(memory.trail.copy(), self.series.shares)
+            changed["wake"] = Wake(memory.trail, self.series.shares)
         if out[8] != stepped.HOLDS:
             if touch.presses and pressed is not None:
                 changed |= {"status": APART, "force_bound": 0.0, "pressure": None, "pressed": None, "trust": Trust()}

@@ -31,9 +31,9 @@ STRAYED = 0.03  # of the elastic force: part of the memory from touches out of r
 # that skin carries along itself, radius of all that presses [m]; how it gives, 21 to 29 [m/N], how skin bends there, 30
 # to 38 [1/m]; turn and place of the pose at which it presses, 39 to 50. All 0 by pose: factor on the pressures less 1,
 # whether it is told by a wrench, and whether the law was asked for another; that wrench, 54 to 59; turn and place of
-# the stated pose, 60 to 71.
-PATCH = 72
-FACTOR, BY_FORCE, CREEPS, STATED, STATED_POSE = 51, 52, 53, 54, 60
+# the stated pose, 60 to 71. Coefficient of friction and number of the tool's surface.
+PATCH = 74
+FACTOR, BY_FORCE, CREEPS, STATED, STATED_POSE, FRICTION, NUMBER = 51, 52, 53, 54, 60, 72, 73
 APART, HOLDS = 1.0, 2.0  # statuses: a tool is off, or holds the skin; another one's wrench stays as it is
 # What a step makes of it: wrench, bound, in range, status and depth, as in a PATCH; and more, see SAYS.
 OUT = 10
@@ -152,16 +152,16 @@ def asked_again(row, pose, wrench, asked, push, forces, area, thickness, depth, 
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def tell(wrench, bound, in_range, depth, pose, stated, stated_pose, by_force, creeps, out):
+def tell(wrench, bound, in_range, depth, pose, stated, stated_pose, by_force, creeps, friction, number, out):
     """Writes what an elastic touch is to a PATCH, but for what `whole_of` does.
 
     Args:
         wrench, bound, in_range, depth, pose: see Touch.
         stated, stated_pose: stated wrench, (6,), and pose, (4, 4); read where it is told `by_force`.
-        by_force, creeps: see PATCH.
+        by_force, creeps, friction, number: see PATCH.
         out: row of PATCH, all 0 before.
     """
-    out[6], out[9] = bound, depth
+    out[6], out[9], out[FRICTION], out[NUMBER] = bound, depth, friction, number
     out[7] = 1.0 if in_range else 0.0
     _put(wrench, out)
     for x in range(3):
@@ -212,8 +212,8 @@ def whole_of(points, area, thickness, depth, forces, corners, shares, power, alo
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def step(patches, before, after, grooves, shares, times, fades, mu, surfaces, has_skin, table, log_thickness, logs,
-         modulus, slack, dt, out, says):  # fmt: skip
+def step(patches, before, after, grooves, shares, times, fades, has_skin, table, log_thickness, logs, modulus, slack,
+         dt, out, says):  # fmt: skip
     """One step of K tools of a scene, tool by tool, then what all together have of energy; `doubted` ends it.
 
     Args:
@@ -222,12 +222,13 @@ def step(patches, before, after, grooves, shares, times, fades, mu, surfaces, ha
         after: the same, written: what is after the step.
         grooves: whether rows end in a trail.
         shares, times, fades: series of the relaxation, (P,) each, and see relaxation.faded.
-        mu: coefficient of friction of each tool, (K,).
-        surfaces: number of each tool's surface, (K,).
         has_skin: whether the layer has a skin of its own.
         table, log_thickness, logs, modulus, slack: see Sideways.
         dt: time of the step [s].
         out, says: rows of OUT and SAYS, (K, .), written.
+
+    Returns:
+        plain: whether `doubted` has nothing to say of answers that are in range: they are of one tool that was, too.
     """
     tools, terms = len(patches), len(times)
     stored, whole = np.zeros(tools), np.zeros(tools)
@@ -236,8 +237,8 @@ def step(patches, before, after, grooves, shares, times, fades, mu, surfaces, ha
         _put(patches[k, :OUT], out[k])
         _put(before[k], after[k])
         stored[k], whole[k], works[k], doubts[k], givens[k] = _one(
-            patches[k], before[k], after[k], grooves, shares, times, fades, mu[k], surfaces[k], has_skin, table,
-            log_thickness, logs, modulus, slack, dt, out[k], says[k])  # fmt: skip
+            patches[k], before[k], after[k], grooves, shares, times, fades, has_skin, table, log_thickness, logs,
+            modulus, slack, dt, out[k], says[k])  # fmt: skip
     for k in range(tools, len(before)):
         _put(before[k], after[k])
         _left(before[k], after[k], grooves, shares, times, dt)
@@ -266,6 +267,11 @@ def step(patches, before, after, grooves, shares, times, fades, mu, surfaces, ha
                 out[k, 7], says[k, 2] = 0.0, 1.0
         new[WORK], new[PASSIVE], says[k, 1] = works[k], passive, passive
         says[k, 0] *= passive
+    plain = len(before) == 1
+    for k in range(tools):
+        old = parts_of(before[k], terms)[2]
+        plain = plain and not (old[STRAYS] > 0 or old[DOUBTED] > 0)
+    return plain
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
@@ -329,15 +335,15 @@ def doubted(before, after, shares, times, dt, out, says):
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _one(patch, before, after, grooves, shares, times, fades, mu, surface, has_skin, table, log_thickness, logs,
-         modulus, slack, dt, out, says):  # fmt: skip
+def _one(patch, before, after, grooves, shares, times, fades, has_skin, table, log_thickness, logs, modulus, slack, dt,
+         out, says):  # fmt: skip
     """One tool. Writes its memory and its rows.
 
     Returns:
         stored, whole: energy that the contact could give back, and that it could hold [J].
         work, doubt, given: see balance.work_of [J].
     """
-    terms, by_force = len(times), patch[BY_FORCE] > 0
+    terms, by_force, mu = len(times), patch[BY_FORCE] > 0, patch[FRICTION]
     parts, news = parts_of(before, terms), parts_of(after, terms)
     was, wrench_before, old, relaxed, contact, _, stiffness, springs, springs_relaxed = parts
     pose, told, held = _pose_at(patch, 39), old[PRESSING] > NEVER, old[PRESSING] > 0
@@ -411,7 +417,7 @@ def _one(patch, before, after, grooves, shares, times, fades, mu, surface, has_s
             _put(wrench, out)
             work_before, largest = old[WORK], old[LARGEST]
             new[:] = 0.0
-            new[PRESSING], new[PASSIVE], new[WORK], new[SURFACE] = 1.0, 1.0, work_before, surface
+            new[PRESSING], new[PASSIVE], new[WORK], new[SURFACE] = 1.0, 1.0, work_before, patch[NUMBER]
             new[ELASTIC], new[IMPRINT_FORCE], new[LARGEST] = at_rest, at_rest, max(at_rest, largest)
             new[NET], new[RADIUS], new[DEPTH], new[POWER], new[STRETCH] = net, patch[14], depth, power, long
             new[SHARE], new[LIMIT], new[SLID], new[HELD] = share, limit, slid, held_at

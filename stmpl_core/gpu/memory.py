@@ -22,7 +22,7 @@ from stmpl_core.relaxation import fading, series_of
 from stmpl_core.sideways import Sideways
 from stmpl_core.skin import Skin
 from stmpl_core.state import NEVER, Memory, State, fresh, size_of
-from stmpl_core.stepped import OUT, SAYS, doubted, step
+from stmpl_core.stepped import FRICTION, NUMBER, OUT, SAYS, doubted, step
 from stmpl_core.tool import Tool
 
 FEW = 64  # scenes that are not shared among threads
@@ -154,7 +154,7 @@ class Steps:
         """Touches a step after some states: rows of PATCH up to the depth, (n, K, OUT), and the states then.
 
         Args:
-            patches: what contacts are, of elastic skin without friction, (n, K, PATCH).
+            patches: what contacts are, of elastic skin without friction, (n, K, PATCH); friction is written there.
             states: memory of the step before, which stays as it is.
             dt: time since then [s].
 
@@ -200,8 +200,10 @@ def _step_some(first, end, patches, before, after, of, terms, shares, times, fad
         if served:
             i, says[:] = of[s], 0.0
             p, wide, many = terms[i], tables.shape[1], int(sizes[i, 2])
-            step(patches[s], before[s], after[s], False, shares[i, :p], times[i, :p], fades[i], mu, numbers,
-                 skins[i] > 0, tables[i, :many], logs[i, :many], logs[i, wide:], sizes[i, 0], sizes[i, 1], dt, out[s],
+            for k in range(patches.shape[1]):
+                patches[s, k, FRICTION], patches[s, k, NUMBER] = mu[k], numbers[k]
+            step(patches[s], before[s], after[s], False, shares[i, :p], times[i, :p], fades[i], skins[i] > 0,
+                 tables[i, :many], logs[i, :many], logs[i, wide:], sizes[i, 0], sizes[i, 1], dt, out[s],
                  says)  # fmt: skip
             if p:
                 doubted(before[s], after[s], shares[i, :p], times[i, :p], dt, out[s], says)
