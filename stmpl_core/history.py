@@ -66,7 +66,7 @@ class History:
     def moved(self, toucher: Toucher) -> History:
         """The same history where joints take the skin."""
         out = copy(self)
-        out.toucher = toucher
+        out.toucher, out._last = toucher, None
         for name in ("_box", "_gives"):
             out.__dict__.pop(name, None)
         return out
