@@ -28,6 +28,7 @@ from stmpl_core.toucher import Toucher
 from stmpl_core.trust import Trust
 
 MIN_INSTANTS = 8  # instants of one kind that a fit needs
+TREMBLES = 0.2  # longest way straight on over how far the tool went, below which its poses tremble
 SLID = 1.8  # way over friction / stiffness from which a tool slides (Cattaneo, Mindlin: 1.5); twice after another way
 MOST_RUBBED = 0.95  # quantile of the force along the skin over that across it, from which follows where tools slide
 STRAIGHT = 1.05  # length of a way over the distance of its ends, up to which it counts as straight
@@ -159,8 +160,9 @@ def fit_friction(toucher: Toucher, strokes: Sequence[Contact]) -> Rubbing:
             mus.append(_friction_of(float(contact.wrench[:3] @ way) / went / one.pressing, one))
     if len(slid) < MIN_INSTANTS:
         went = f"; it went {1e3 * furthest:.1f} mm straight on, {1e3 * needed:.1f} mm are needed" if furthest else ""
-        more = "Tell more instants of the stroke, or smooth poses that tremble by over 0.1 mm" \
-            if furthest > 2 * needed else "Stroke further, there and back"
+        more = "Tell more instants of the stroke" if furthest > 2 * needed else "Stroke further, there and back"
+        if furthest < TREMBLES * float(np.ptp(places, axis=0).max()):
+            more = "Smooth its poses: they tremble"
         return _no_friction(f"the tool slid at {len(slid)} of {len(pressing)} instants, {MIN_INSTANTS} are needed"
                             f"{went}. {more}")  # fmt: skip
     mus, axis = np.array(mus), np.linalg.svd(np.array(ways), full_matrices=False)[2][0]

@@ -105,6 +105,14 @@ def test_what_never_pressed_is_told_so_and_what_has_too_few_instants(toucher: To
     assert not few.trust.ok and few.trust.why.endswith("Tell more instants of the stroke")
 
 
+def test_a_stroke_whose_poses_tremble_is_not_told_to_tell_more(toucher: Toucher) -> None:
+    rng, stroke = np.random.default_rng(0), measured(*wiped(0.02, True), 0.4)
+    trembling = [replace(one, pose_body_from_tool=at(*rng.normal(0, 3e-4, 3)) @ one.pose_body_from_tool)
+                 for one in stroke]  # fmt: skip
+    found = fit_friction(toucher, trembling)
+    assert not found.trust.ok and found.trust.why.endswith("Smooth its poses: they tremble"), found.trust.why
+
+
 def test_a_tool_that_slides_freely_has_no_friction_to_be_found(toucher: Toucher) -> None:
     """It was told that its force points the wrong way."""
     for friction, noise in ((None, 0.0), (0.0, 0.02)):
