@@ -408,6 +408,9 @@ class Toucher:
             vector = wrench_of(pressure, some, layer.vertices, layer.vertex_area_vectors, pose[:3, 3],
                                layer.stacked)[0][:3]  # fmt: skip
             size = float(np.linalg.norm(vector))
+            if through and not size > 0:
+                high, moved = moved, 0.5 * (low + moved)
+                continue
             wrapped = size <= MIN_NET_FORCE_SHARE * float(pressure @ layer.vertex_areas[some])
             if wrapped and not through:
                 return _Placed(contact, field, WRAPPED, contact.pose_body_from_tool, depth, 0.0, NO_SQUEEZE, 0.0)

@@ -644,6 +644,20 @@ def test_a_power_that_is_none_leaves_a_light_force_on_a_deep_tool_answered(power
     assert touch.status == TOUCHING and touch.force == pytest.approx(1e-9, rel=0.03)
 
 
+def test_a_trial_that_is_borne_by_nothing_is_too_deep(monkeypatch) -> None:
+    """Found by fuzz: deeper than where it pressed a tool had nodes and no pressure, and its force was divided by."""
+    toucher = Toucher(limb(4e-3, radius=0.04, length=0.12))
+    hold = toucher.net.hold
+
+    def borne(nodes):
+        held = hold(nodes)
+        return held if nodes.strain.max() < 0.4 else held._replace(pressure=np.zeros(len(nodes.area)))
+
+    monkeypatch.setattr(toucher.net, "hold", borne)
+    touch = toucher.touch(press(ball(0.015), at(0.055 - 1e-3, 0, 0.06), (-1e3, 0, 0)))
+    assert touch.status == TOUCHING and 0 < touch.force < 1e3 and not touch.trust.in_range
+
+
 @pytest.mark.parametrize("thick", [0.03, 0.04])
 def test_no_force_presses_a_tool_through_the_limb(thick: float) -> None:
     """Of a flat limb that is thinner where it is pressed: a trial that goes through to the far side is too deep."""
