@@ -20,7 +20,7 @@ from stmpl_core.contact import Contact
 from stmpl_core.dragged import MIN_OFFSET
 from stmpl_core.errors import InvalidInput
 from stmpl_core.friction import Friction, coefficients
-from stmpl_core.green import Green
+from stmpl_core.green import AS_AT_REST, Green
 from stmpl_core.relaxation import fading, series_of
 from stmpl_core.sideways import Sideways
 from stmpl_core.slip import MOST_GROWN
@@ -33,7 +33,7 @@ from stmpl_core.wake import Wake
 
 ELSEWHERE = 3.0  # thicknesses around a skin within which a contact on it lies, whatever presses
 FLAT = np.zeros((1, 1, 3)), np.zeros(1), np.zeros(1), 0.0, 0.0  # in place of a Sideways where nothing rubs
-NO_GIVES = np.empty((0, 3, 3)), np.empty((0, 3, 3))  # in place of Green.gives
+NO_GIVES = AS_AT_REST, AS_AT_REST  # in place of Green.gives
 
 
 class History:

@@ -33,7 +33,7 @@ STRAYED = 0.03  # of the elastic force: part of the memory from touches out of r
 # whether it is told by a wrench, and whether the law was asked for another; that wrench, 54 to 59; turn and place of
 # the stated pose, 60 to 71. Coefficient of friction and number of the tool's surface.
 PATCH = 74
-FACTOR, BY_FORCE, CREEPS, STATED, STATED_POSE, FRICTION, NUMBER = 51, 52, 53, 54, 60, 72, 73
+POSE, FACTOR, BY_FORCE, CREEPS, STATED, STATED_POSE, FRICTION, NUMBER = 39, 51, 52, 53, 54, 60, 72, 73
 APART, HOLDS = 1.0, 2.0  # statuses: a tool is off, or holds the skin; another one's wrench stays as it is
 # What a step makes of it: wrench, bound, in range, status and depth, as in a PATCH; and more, see SAYS.
 OUT = 10
@@ -55,6 +55,15 @@ def _put(values, out):
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
+def _put_pose(pose, row, first):
+    """Writes turn and place of a pose (4, 4) to a PATCH from there on."""
+    for x in range(3):
+        row[first + 9 + x] = pose[x, 3]
+        for y in range(3):
+            row[first + 3 * x + y] = pose[x, y]
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _pose_at(row, first):
     """Pose (4, 4) whose turn and place a PATCH has from there on."""
     out = np.eye(4)
@@ -63,6 +72,28 @@ def _pose_at(row, first):
         for y in range(3):
             out[x, y] = row[first + 3 * x + y]
     return out
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _slid(old):
+    """See Scalars.slid, of scalars before: 1 where the tool did not press."""
+    return old[SLID] if old[PRESSING] > 0 else 1.0
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _sunk(scalars):
+    """See Scalars.sunk."""
+    return scalars[ELASTIC] > FORGOTTEN * scalars[LARGEST]
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _pressing(forces, area):
+    """Sum of forces (N,) [N], and radius of a circle as large as the areas (N,) [m2] that press [m]."""
+    total, wide = 0.0, 0.0
+    for n in range(len(forces)):
+        total += forces[n]
+        wide += area[n] if forces[n] > 0 else 0.0
+    return total, np.sqrt(wide / np.pi)
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
@@ -103,7 +134,7 @@ def asked_for(row, pose, wrench, shares, times, fades, dt):
     """
     parts = parts_of(row, len(times))
     was, _, old, _, contact, imprint, _, _, _ = parts
-    slid, size, along, way = old[SLID] if old[PRESSING] > 0 else 1.0, 0.0, 0.0, 0.0
+    slid, size, along, way = _slid(old), 0.0, 0.0, 0.0
     if not (len(times) or slid < 1):
         return 0.0, np.nan
     _, _, _, _, owed, now, _ = _aged(parts, old[PRESSING] > NEVER, pose, 1.0, shares, times, fades, dt)
@@ -131,21 +162,20 @@ def asked_again(row, pose, wrench, asked, push, forces, area, thickness, depth, 
         depth: depth of the contact [m].
     """
     parts, terms = parts_of(row, len(times)), len(times)
-    old, has, size, wide, thick, carried = parts[2], 0.0, 0.0, 0.0, 0.0, 0.0
+    old, size, thick, carried = parts[2], 0.0, 0.0, 0.0
+    has, radius = _pressing(forces, area)
     for n in range(len(forces)):
-        has, thick = has + forces[n], thick + forces[n] * thickness[n]
-        wide += area[n] if forces[n] > 0 else 0.0
+        thick += forces[n] * thickness[n]
     for x in range(3):
         size, carried = size + push[x] ** 2, carried + asked[x] * push[x]
     size = np.sqrt(size)
     if not size > 0:
         return 0.0
     _, _, _, gain, owed, _, _ = _aged(parts, old[PRESSING] > NEVER, pose, 1.0, shares, times, fades, dt)
-    now, more = 1.0, faded(fades, np.sqrt(wide / np.pi))
+    now, more = 1.0, faded(fades, radius)
     for i in range(terms):
         now -= more * shares[i] * gain[i]
-    slid = old[SLID] if old[PRESSING] > 0 else 1.0
-    takes = needed(wrench, push, size, has, stretch(depth, thick / has), owed, now, slid)
+    takes = needed(wrench, push, size, has, stretch(depth, thick / has), owed, now, _slid(old))
     if size < (1 - 1e-6) * carried / size or not takes > 0 or abs(takes / has - 1) < HELD_OFF:
         return 0.0
     return takes / has
@@ -164,17 +194,11 @@ def tell(wrench, bound, in_range, depth, pose, stated, stated_pose, by_force, cr
     out[6], out[9], out[FRICTION], out[NUMBER] = bound, depth, friction, number
     out[7] = 1.0 if in_range else 0.0
     _put(wrench, out)
-    for x in range(3):
-        out[48 + x] = pose[x, 3]
-        for y in range(3):
-            out[39 + 3 * x + y] = pose[x, y]
+    _put_pose(pose, out, POSE)
     if by_force:
         out[BY_FORCE], out[CREEPS] = 1.0, 1.0 if creeps else 0.0
         _put(stated, out[STATED:])
-        for x in range(3):
-            out[STATED_POSE + 9 + x] = stated_pose[x, 3]
-            for y in range(3):
-                out[STATED_POSE + 3 * x + y] = stated_pose[x, y]
+        _put_pose(stated_pose, out, STATED_POSE)
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
@@ -198,12 +222,9 @@ def whole_of(points, area, thickness, depth, forces, corners, shares, power, alo
     normal = out[:3] / size
     middle, radius, lever, mean, energy = patch_of(points, area, thickness, depth, forces, normal)
     _put(middle, out[11:14])
-    total, wide = 0.0, 0.0
-    for n in range(len(forces)):
-        total += forces[n]
-        wide += area[n] if forces[n] > 0 else 0.0
-    out[10], out[14], out[15], out[16], out[17], out[18], out[19] = total, radius, lever, mean, energy, power, along
-    out[20], out[FACTOR] = np.sqrt(wide / np.pi), factor - 1
+    out[14], out[15], out[16], out[17], out[18], out[19] = radius, lever, mean, energy, power, along
+    out[10], out[20] = _pressing(forces, area)
+    out[FACTOR] = factor - 1
     if rubs:
         bend = curvature_at(corners, shares, forces, frames, curvature, vertex_thickness)
         _put(bend.ravel(), out[30:39])
@@ -315,16 +336,14 @@ def doubted(before, after, shares, times, dt, out, says):
         if doubts or old[DOUBTED] > 0:  # what this step may have added rests on one of its ends
             strayed = min(strayed + max(new[ELASTIC], old[ELASTIC]) * more, max(has, 0.0))
         new[STRAYS], new[DOUBTED] = strayed, 1.0 if doubts else 0.0
-        sunk = new[ELASTIC] > FORGOTTEN * new[LARGEST]
-        if (new[PRESSING] > 0 or sunk) and strayed > STRAYED * new[ELASTIC] > 0:
+        if (new[PRESSING] > 0 or _sunk(new)) and strayed > STRAYED * new[ELASTIC] > 0:
             out[k, 7] = 0.0
     for k in range(tools):
         (_, _, new, _, contact, _, _, _, _) = parts_of(after[k], terms)
         owed = 0.0
         for other in range(len(after)):
             (_, _, its, relaxed, there, _, _, _, _) = parts_of(after[other], terms)
-            if out[k, 8] == HOLDS and other != k and not its[PRESSING] > 0 and \
-                    its[ELASTIC] > FORGOTTEN * its[LARGEST]:  # fmt: skip
+            if out[k, 8] == HOLDS and other != k and not its[PRESSING] > 0 and _sunk(its):
                 far = 0.0
                 for x in range(3):
                     far += (there[0, x] - contact[0, x]) ** 2
@@ -346,7 +365,7 @@ def _one(patch, before, after, grooves, shares, times, fades, has_skin, table, l
     terms, by_force, mu = len(times), patch[BY_FORCE] > 0, patch[FRICTION]
     parts, news = parts_of(before, terms), parts_of(after, terms)
     was, wrench_before, old, relaxed, contact, _, stiffness, springs, springs_relaxed = parts
-    pose, told, held = _pose_at(patch, 39), old[PRESSING] > NEVER, old[PRESSING] > 0
+    pose, told, held = _pose_at(patch, POSE), old[PRESSING] > NEVER, old[PRESSING] > 0
     stated_pose = _pose_at(patch, STATED_POSE) if by_force else pose
     twist, gone, kept, gain, owed, _, passed = _aged(parts, told, stated_pose, 1.0, shares, times, fades, dt)
     push, size = patch[:3].copy(), np.sqrt(patch[0] ** 2 + patch[1] ** 2 + patch[2] ** 2)
@@ -357,7 +376,7 @@ def _one(patch, before, after, grooves, shares, times, fades, has_skin, table, l
         _, gone, kept, gain, owed, _, passed = _aged(parts, told, pose, part, shares, times, fades, dt)
     says[28], asked = gone, 0.0
     if presses:
-        slid_before = old[SLID] if held else 1.0
+        slid_before = _slid(old)
         force, elastic, at_rest, net, long, there, eased, stored, whole, doubt = borne(
             push, patch[11:14], patch[14], patch[16], patch[17], patch[10], depth, power, 1 + patch[FACTOR], contact,
             held, fades, kept, gain, owed, shares, patch[STATED : STATED + 6], patch[CREEPS] > 0,

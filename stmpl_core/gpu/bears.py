@@ -1,5 +1,5 @@
 # type: ignore  # kernels are in Warp's language, which pyright does not know
-"""Kernel of what the memory of skin takes of each contact as a whole: see stmpl_core.gpu.memory.PATCH."""
+"""Kernel of what the memory of skin takes of each contact as a whole: see stmpl_core.stepped.PATCH."""
 
 import warp as wp
 

@@ -131,7 +131,7 @@ class Steps:
                 raise InvalidInput(f"state {i} is of skin that joints have moved, which WarpBatch does not serve.")
             for k, tool in enumerate(self.tools):
                 memory = None if state is None else state.tools.get(tool.name)
-                if memory is None or memory.scalars.surface not in (0.0, self._numbers[k]):
+                if memory is None or memory.surface not in (0.0, self._numbers[k]):
                     continue
                 if memory.terms != self._terms[self._of[i]]:
                     raise InvalidInput(f"state {i} is of skin with {memory.terms} times of relaxation; its has "
