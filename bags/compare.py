@@ -10,6 +10,7 @@ from typing import Protocol, Self
 
 from bags.frame import Frame
 from bags.provenance import allowance
+from bags.run import BEGINNING
 from bags.survey import Moment, Survey, survey
 from stmpl_core.contact import Contact
 from stmpl_core.errors import BagError, InvalidInput, StmplError
@@ -326,12 +327,15 @@ def _compare(
 
 
 def _left_out(run: Survey) -> int:
-    """Number of answers before the first whose contacts were recorded; 0 where no answer's were."""
+    """Number of answers of the beginning before the first whose contacts were recorded; 0 where no answer's were."""
+    first: int | None = None
     for number, frame in enumerate(run.bag.frames()):
+        first = frame.log_time_ns if first is None else first
         try:
             run.bag.contacts(frame)
         except BagError:
-            continue
+            if frame.log_time_ns - first < BEGINNING:
+                continue
         return number
     return 0
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from bags.frame import Frame
 from bags.provenance import OTHER_PROCESSOR, allowance
-from bags.run import Run
+from bags.run import BEGINNING, Run
 from stmpl_core.errors import BagError
 from stmpl_core.layer import SoftLayer
 from stmpl_core.methods.base import Method
@@ -61,7 +61,8 @@ class ReplaySummary:
         reason: sentence that tells why this tolerance.
         first_difference: sequence number of the first frame past the tolerance, or None.
         left_out: number of answers that cannot be repeated, as what they answer was not recorded.
-        gap: truth of the claim that one of these came after an answer that was: the recording was not just begun late.
+        gap: truth of the claim that one of these came after the beginning: the recording was not just begun late.
+        untouched: truth of the claim that there are answers with tools, and none of these was replayed.
         why: sentence that tells why the first of these cannot; empty: all can.
         changed: packages with another version now than when the run was recorded, "numpy 2.4 -> 2.5".
         held: truth of the claim that it is held to the tolerance; not where a method was named, to see how far off.
@@ -77,21 +78,24 @@ class ReplaySummary:
     first_difference: int | None
     left_out: int
     gap: bool
+    untouched: bool
     why: str
     changed: tuple[str, ...]
     held: bool = True
 
     @property
     def passed(self) -> bool:
-        """Whether no frame is past the tolerance, and none was left out but at the start, or it is held to nothing."""
-        return not self.held or (self.first_difference is None and not self.gap)
+        """Whether contacts were replayed, none past the tolerance and none left out but at the start; or not held."""
+        return not self.held or (self.first_difference is None and not self.gap and not self.untouched)
 
     def __str__(self) -> str:
         held = "held to nothing, since a method was named"
         if self.held:
             held = f"held to {f'{self.tolerance * 1e3:.3g} mm' if self.tolerance else 'every bit'}, since {self.reason}"
         each = f"{self.method}, {self.remembering} from a state" if self.remembering else self.method
-        lost = f" {self.left_out} more were left out: {self.why}" * bool(self.left_out)
+        later = ", not only at its beginning" * self.gap
+        lost = f" {self.left_out} more were left out{later}: {self.why}" * bool(self.left_out)
+        lost += " No answer with a tool is among those replayed, and the recording has some." * self.untouched
         if self.identical == self.frames:
             return f"{self.frames} frames replayed with {each}, every one bit for bit as recorded; {held}.{lost}"
         off = (f"{self.frames - self.identical} of {self.frames} frames replayed with {each} differ, "
@@ -168,17 +172,20 @@ def replay_run(
     """
     run = run if isinstance(run, Run) else Run(run)
     then, now = run.provenance.versions, versions()
-    many = remembering = early = 0
+    many = remembering = touched = early = 0
     off: list[tuple[int, float]] = []  # number and difference of what is not as recorded
-    lost: list[BagError] = []
-    for replayed in replay(run, method, every=every, left_out=lambda _, error: lost.append(error)):
-        early = early if many else len(lost)
+    lost: list[tuple[int, BagError]] = []  # log time of what cannot be repeated, and why
+    for replayed in replay(run, method, every=every, left_out=lambda one, why: lost.append((one.log_time_ns, why))):
+        if replayed.frame.inputs:
+            early = early if touched else sum(at - lost[0][0] < BEGINNING for at, _ in lost)
+            touched += 1
         many += 1
         remembering += bool(replayed.frame.state)
         if not replayed.identical:
             off.append((replayed.frame.sequence, replayed.difference))
-    if lost and not many:
-        raise lost[0]
+    if not many:
+        raise lost[0][1] if lost else BagError(f"{run.file} holds no answers, so there is nothing to replay.")
+    untouched = not touched and any(frame.inputs for frame in run.frames())
     allowed, reason = allowance(run.provenance.processor, now["processor"])
     if not allowed and (frames := sorted(run.placed_by_tf)):
         allowed, reason = OTHER_PROCESSOR, f"/tf placed its poses ('{"', '".join(frames)}'), and tf2 rounds otherwise"
@@ -188,4 +195,4 @@ def replay_run(
     worst = max((much for _, much in off), default=0.0)
     changed = tuple(f"{k} {then[k]} -> {now.get(k, 'none')}" for k in then if now.get(k) != then[k])
     return ReplaySummary(method.name, many, remembering, many - len(off), worst, allowed, reason, first, len(lost),
-                         len(lost) > early, str(lost[0]) if lost else "", changed)  # fmt: skip
+                         len(lost) > early, untouched, str(lost[0][1]) if lost else "", changed)  # fmt: skip

@@ -19,6 +19,7 @@ from stmpl_core.errors import BagError, FrameError
 
 NANO = 1e-9  # seconds in a nanosecond
 LATE = 500_000_000  # time after an answer until which a recorder may receive what it answers [ns]
+BEGINNING = 2_000_000_000  # time in which a recorder comes to hear of everything that goes on as it begins [ns]
 
 
 class Run(Bag):

@@ -335,6 +335,54 @@ def test_a_comparison_walks_the_file_once(run, monkeypatch):
     assert len(walks) == 2
 
 
+def without(run, folder, wanted, resting=()):
+    """The run without the messages, by topic and time since its start [s], that are not `wanted`; answers to
+    nothing among `resting`."""
+    with BagWriter(folder) as writer:
+        write_provenance(writer, None, method="winkler")
+        channels = {}
+        for topic, message, log_time in Bag(run).messages():
+            if topic not in channels:
+                channels[topic] = writer.add_channel(topic, message.__msgtype__)
+            if topic.endswith("displacement") and message.sequence in resting:
+                message.touches, message.displacement = [], np.zeros_like(message.displacement)
+            if wanted(topic, (log_time - START) * 1e-9):
+                writer.write(channels[topic], cdr(message), log_time, log_time)
+    return folder
+
+
+@pytest.mark.parametrize("kind", ["pose", "wrench", "mesh"])
+def test_a_replay_of_answers_to_what_is_not_there_fails_also_where_a_rest_is_repeated(run, tmp_path, capsys, kind):
+    for name, resting in (("last", (21,)), ("first", (0,))):
+        part = without(run, tmp_path / name, lambda topic, _: not topic.endswith(kind), resting)
+        code, said = stmpl(capsys, "replay", part)
+        assert code == 1 and "1 frames replayed" in said and f"no {kind}" in said
+        assert "left out, not only at its beginning" in said and "No answer with a tool is among those replayed" in said
+    code, said = stmpl(capsys, "replay", part, "--method", "winkler")
+    assert code == 0 and "No answer with a tool" in said, "held to nothing, and told"
+
+
+def test_answers_are_excused_at_the_beginning_of_a_recording_only(tmp_path):
+    slow = write_run(tmp_path / "slow", Winkler(), layer=tube(edge=9e-3), frames=12, rate=2.0)
+    for until, passes in ((1.6, True), (2.9, False)):
+        part = without(slow, tmp_path / f"{until}", lambda one, time, until=until: "pose" not in one or time > until)
+        replayed = replay_run(part, Winkler())
+        assert replayed.frames == replayed.identical == 12 - replayed.left_out and replayed.passed == passes
+        compared = compare_run(part, Winkler(), method=Winkler(), frames=100)
+        assert compared.passed == passes, "a comparison excuses no more"
+
+
+def test_a_replay_that_takes_no_answer_with_a_tool_says_so_and_fails(run, tmp_path, capsys):
+    part = without(run, tmp_path / "part", lambda *_: True, resting=(0,))
+    code, said = stmpl(capsys, "replay", part, "--every", 1000)
+    assert code == 1 and said.endswith("No answer with a tool is among those replayed, and the recording has some.")
+    rest = without(run, tmp_path / "rest", lambda *_: True, resting=range(24))
+    assert stmpl(capsys, "replay", rest)[0] == 0, "nothing else was recorded"
+    nothing = without(run, tmp_path / "nothing", lambda topic, _: "displacement" not in topic)
+    code, said = stmpl(capsys, "replay", nothing)
+    assert code == 1 and "holds no answers" in said
+
+
 @pytest.fixture(scope="module")
 def two_robots(tmp_path_factory):
     """Two robots in one recording: skins, tools of the same names, answers; and a topic that is of neither."""
