@@ -237,7 +237,16 @@ def _walk(data: mmap.mmap, index: Summary) -> Iterator[tuple[int, list[Record]]]
             at = after
     if index.data_end or at < stop:
         broken = _wrong_crc(data, at) if sound else None
-        yield at, [broken, End()] if broken else [End()]
+        yield at, [*filter(None, (broken, _behind(data, at))), End()]
+
+
+def _behind(data: mmap.mmap, at: int) -> Damage | None:
+    """What stands behind the end of the recording whose data section ends at `at`; None: nothing."""
+    end = data.find(MAGIC, at) + len(MAGIC)
+    if not len(MAGIC) <= end < len(data):
+        return None
+    another = "another recording" if data[end : end + len(MAGIC)] == MAGIC else "what is of no recording"
+    return Damage(end, len(data) - end, f"{another} stands behind the end, and is not read,")
 
 
 def _opened(data: mmap.mmap, at: int) -> list[Record]:

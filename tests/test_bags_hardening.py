@@ -207,6 +207,24 @@ def test_the_command_says_what_is_missing_and_exits_with_1(bag, tmp_path, capsys
         assert stmpl(capsys, "info", refused)[0] == stmpl(capsys, "recover", refused)[0] == 1
 
 
+@pytest.mark.parametrize("junk", [b"x", b"\0" * 400, None], ids=["a byte", "noughts", "another"])
+def test_what_stands_behind_the_end_of_a_recording_is_told_and_nothing_is_lost(tmp_path, capsys, caplog, junk):
+    run = write_run(tmp_path / "run", Winkler(), layer=tube(edge=9e-3), frames=8)
+    file = Bag(run).file
+    whole, more = file.read_bytes(), write_run(tmp_path / "other", Winkler(), frames=4) if junk is None else None
+    behind = Bag(more).file.read_bytes() if more else junk
+    file.write_bytes(whole + behind)
+    told = ("another recording" if more else "what is of no recording") + " stands behind the end, and is not read,"
+    told += f" at byte {len(whole)} ({len(behind)} bytes)"
+    code, said = stmpl(capsys, "info", run)
+    assert code == 1 and "finished, 1 places damaged" in said and told in caplog.text
+    caplog.clear()
+    assert stmpl(capsys, "replay", run)[0] == 0 and told in caplog.text, "the recording itself is whole"
+    code, said = stmpl(capsys, "recover", run, "--target", tmp_path / "back")
+    assert code == 0 and told in said
+    assert Bag(tmp_path / "back").answers == 8 and not Bag(tmp_path / "back").damage
+
+
 def test_compare_exits_with_1_past_its_tolerance_only(tmp_path, capsys):
     layer = tube(edge=9e-3)
     ours, same, other = (write_run(tmp_path / name, method, layer=layer, frames=8) for name, method in
