@@ -59,10 +59,11 @@ class Builders:
 
 
 class _Deaf(SpawnProcess):
-    """A process that Ctrl-C does not reach: it starts with the signal blocked, as its imports take a second."""
+    """A process that Ctrl-C and a closed terminal do not reach: its imports take a second, so it starts with them
+    blocked, and ends with the node."""
 
     def start(self) -> None:
-        before = signal.pthread_sigmask(signal.SIG_BLOCK, (signal.SIGINT,))
+        before = signal.pthread_sigmask(signal.SIG_BLOCK, (signal.SIGINT, signal.SIGHUP))
         try:
             super().start()
         finally:

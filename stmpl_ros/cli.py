@@ -11,11 +11,11 @@ import time
 from collections.abc import Callable
 from types import FrameType
 
-from stmpl_ros.interrupts import interrupt_in
+from stmpl_ros.interrupts import endings, interrupt_in
 
 TOLD_AFTER_S = 3.0  # time that kernels are compiled, before a verb tells of it [s]
 SILENT = ("node", "demo", "record", "info", "recover", "foxglove", "fmu")  # verbs that compile nothing, or tell of it
-GRACE = 1.5  # time in which a verb must end after Ctrl-C or SIGTERM, whatever it is doing [s]
+GRACE = 1.5  # time in which a verb must end after Ctrl-C, SIGTERM or SIGHUP, whatever it is doing [s]
 PATIENT = {"record": 30.0}  # time for verbs that have something to save [s]
 VERBS = {  # module of each verb's function, and what it does
     "demo": ("stmpl_ros.verbs", "node, a robot that massages and recorder; then the run against FEM, with a report"),
@@ -113,17 +113,19 @@ def _said_of(called: Callable) -> str:
 
 
 def _end_soon_after_a_signal(grace: float) -> None:
-    """SIGTERM interrupts as Ctrl-C does; `grace` [s] after either the process ends, if it has not ended by itself.
+    """SIGTERM and SIGHUP interrupt as Ctrl-C does; `grace` [s] after any the process ends, if it has not by itself.
 
     Python's own handlers run between two steps of the main thread; a compiled call may keep it for longer.
     """
-    signal.signal(signal.SIGTERM, _interrupt)
+    ending = endings()
+    for number in ending[1:]:
+        signal.signal(number, _interrupt)
     told, tell = os.pipe()
     os.set_blocking(tell, False)
     signal.set_wakeup_fd(tell, warn_on_full_buffer=False)
 
     def watch() -> None:
-        while (number := os.read(told, 1)[0]) not in (signal.SIGINT, signal.SIGTERM):
+        while (number := os.read(told, 1)[0]) not in ending:
             continue
         time.sleep(grace)
         os._exit(128 + number)

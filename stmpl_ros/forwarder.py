@@ -100,7 +100,7 @@ class Forwarder(Node):
 
 
 def run(host: str, port: int, topics: Sequence[str] = (), arguments: list[str] | None = None) -> int:
-    """Serves until SIGINT or SIGTERM.
+    """Serves until SIGINT, SIGTERM or SIGHUP.
 
     Args:
         host: address to listen at.

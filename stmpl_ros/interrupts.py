@@ -1,6 +1,14 @@
-"""Interrupts: Ctrl-C and SIGTERM where they come in a call that tells of them by an error of its own."""
+"""Interrupts: the signals that end a process, and where one comes in a call that tells of it by an error of its own."""
 
 from __future__ import annotations
+
+import signal
+
+
+def endings() -> tuple[signal.Signals, ...]:
+    """SIGINT, SIGTERM, and the SIGHUP of a terminal that was closed; not that where it is ignored (nohup)."""
+    hangs_up = signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN
+    return signal.SIGINT, signal.SIGTERM, *([signal.SIGHUP] if hangs_up else ())
 
 
 def interrupt_in(error: BaseException) -> KeyboardInterrupt | None:

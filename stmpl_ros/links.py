@@ -294,7 +294,7 @@ def _tf_message() -> Any:
 
 def run(config: LinksConfig, arguments: Sequence[str] | None = None, build: Build = layer_of,
         tools: Sequence[Tool] | None = None) -> int:  # fmt: skip
-    """Answers a simulator until SIGINT or SIGTERM.
+    """Answers a simulator until SIGINT, SIGTERM or SIGHUP.
 
     Args:
         config: settings.

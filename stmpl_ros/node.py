@@ -468,7 +468,7 @@ def _served(response: Any, do: Callable[[], str]) -> Any:
 
 
 def run(config: NodeConfig, arguments: list[str] | None = None, build: Build = layer_of) -> int:
-    """Runs the node until SIGINT or SIGTERM; the exit code says whether it could be configured."""
+    """Runs the node until SIGINT, SIGTERM or SIGHUP; the exit code says whether it could be configured."""
     threadpool_limits(1, user_api="blas")  # where a core is busy, OpenBLAS' second thread stalls answers for 0.1 s
     with ros(arguments) as stop:
         try:

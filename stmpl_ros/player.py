@@ -96,7 +96,7 @@ def profile(offer: Offered) -> QoSProfile:
 def run(
     path: Path, speed: float, topics: tuple[str, ...], arguments: list[str] | None = None, *, namespace: str = ""
 ) -> int:
-    """Publishes a recording until its end, SIGINT or SIGTERM; 0 if all of it was sent.
+    """Publishes a recording until its end, SIGINT, SIGTERM or SIGHUP; 0 if all of it was sent.
 
     Args:
         path: folder or .mcap file of a run.

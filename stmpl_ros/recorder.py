@@ -216,7 +216,7 @@ def _made_by(path: Path) -> dict[str, Any]:
 
 
 def run(config: RecordConfig, arguments: list[str] | None = None, topics: Sequence[str] = ()) -> int:
-    """Records until SIGINT or SIGTERM; the exit code says whether anything came, and everything is on disk.
+    """Records until SIGINT, SIGTERM or SIGHUP; the exit code says whether anything came, and everything is on disk.
 
     Args:
         config: folder and files of the recording.

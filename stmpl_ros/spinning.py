@@ -1,4 +1,4 @@
-"""Starting and stopping a ROS process: SIGINT and SIGTERM end it cleanly, from any of its threads."""
+"""Starting and stopping a ROS process: SIGINT, SIGTERM and SIGHUP end it cleanly, from any of its threads."""
 
 from __future__ import annotations
 
@@ -19,6 +19,7 @@ from rclpy.task import Future
 from rclpy.utilities import ok, try_shutdown
 
 from stmpl_core.errors import InvalidInput
+from stmpl_ros.interrupts import endings
 
 POLL_PERIOD_S = 0.1  # time between two looks of a spinning process whether it is to stop
 TRANSPORTS = "FASTDDS_BUILTIN_TRANSPORTS"  # variable by which a person chooses another: DEFAULT
@@ -27,7 +28,7 @@ UDP = "UDPv4?sockets_size=4MB"  # an answer overflows the usual 212 kB of a sock
 
 @contextmanager
 def ros(arguments: list[str] | None = None) -> Iterator[threading.Event]:
-    """ROS while inside; yields an event that SIGINT and SIGTERM set. rclpy's own handlers stay out of the way.
+    """ROS while inside; yields an event that signals set which end a process. rclpy's own handlers stay out of the way.
 
     A KeyboardInterrupt that comes out of it once that is set ends it without a word: a signal can come just where
     `interruptible` is being left.
@@ -45,7 +46,7 @@ def ros(arguments: list[str] | None = None) -> Iterator[threading.Event]:
     def ask(_signal: int, _frame: FrameType | None) -> None:
         stop.set()
 
-    before = {number: signal.signal(number, ask) for number in (signal.SIGINT, signal.SIGTERM)}
+    before = {number: signal.signal(number, ask) for number in endings()}
     try:
         _init(arguments)
         yield stop
@@ -73,13 +74,13 @@ def _init(arguments: list[str] | None) -> None:
 
 @contextmanager
 def interruptible(stop: threading.Event) -> Iterator[None]:
-    """While inside, SIGINT and SIGTERM raise KeyboardInterrupt, so that what takes long ends."""
+    """While inside, signals that end a process raise KeyboardInterrupt, so that what takes long ends."""
 
     def interrupt(_signal: int, _frame: FrameType | None) -> None:
         stop.set()
         raise KeyboardInterrupt
 
-    before = {number: signal.signal(number, interrupt) for number in (signal.SIGINT, signal.SIGTERM)}
+    before = {number: signal.signal(number, interrupt) for number in endings()}
     try:
         yield
     except KeyboardInterrupt:

@@ -593,10 +593,26 @@ with ros() as stop:
 """
 
 
-@pytest.mark.parametrize("number", ["SIGINT", "SIGTERM"])
+@pytest.mark.parametrize("number", ["SIGINT", "SIGTERM", "SIGHUP"])
 def test_a_signal_ends_a_process_cleanly_just_where_it_stops_being_interruptible_too(number):
     code, said = end(start("-c", LEAVING, number))
     assert (code, said) == (0, "")
+
+
+HANGING_UP = """
+import os, signal
+from stmpl_ros import cli
+from stmpl_ros.spinning import interruptible, ros
+cli._end_soon_after_a_signal(0.0)
+with ros() as stop, interruptible(stop):
+    os.kill(os.getpid(), signal.SIGHUP)
+    print("goes on")
+"""
+
+
+def test_a_closed_terminal_ends_no_process_that_ignores_it():
+    ignores = start("-c", HANGING_UP, preexec_fn=lambda: signal.signal(signal.SIGHUP, signal.SIG_IGN))  # as nohup does
+    assert end(ignores) == (0, "goes on\n")
 
 
 DELETING = """

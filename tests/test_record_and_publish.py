@@ -132,6 +132,18 @@ def run(talker, tmp_path_factory):
     return folder
 
 
+def test_a_recording_whose_terminal_was_closed_is_finished(talker, tmp_path):
+    recorder = start(*STMPL, "record", "--path", str(tmp_path / "run"), "--topics", "/any/words")
+    try:
+        talker.wait_for_recorder(talker.words)
+        talker.say(1)
+        talker.spin(0.3)
+    finally:
+        code, said = end(recorder, signal.SIGHUP)
+    assert code == 0, said
+    assert Bag(tmp_path / "run").finished and Bag(tmp_path / "run").topics["/any/words"].messages == 1
+
+
 def test_any_topics_are_recorded_as_they_came(run):
     bag = Bag(run)
     assert bag.finished and set(bag.topics) == {"/any/words", "/other/heads"}

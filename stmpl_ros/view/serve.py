@@ -10,13 +10,14 @@ from rich.console import Console
 
 from fem_tools import RigidFem
 from stmpl_core.errors import InvalidInput
+from stmpl_ros.interrupts import endings
 from stmpl_ros.tables import compare_with_progress
 from stmpl_ros.view.config import ViewConfig
 from stmpl_ros.view.page import Page
 
 
 def run(config: ViewConfig, path: Path | None, live: bool, arguments: list[str] | None = None) -> int:
-    """Serves until SIGINT or SIGTERM.
+    """Serves until SIGINT, SIGTERM or SIGHUP.
 
     Raises:
         InvalidInput: a recording and the live node at once, or a tool that does not exist.
@@ -78,7 +79,7 @@ def _serve_live(config: ViewConfig, arguments: list[str] | None) -> int:
 
 def _until_stopped(page: Page, shown) -> int:
     stop = threading.Event()
-    for number in (signal.SIGINT, signal.SIGTERM):
+    for number in endings():
         signal.signal(number, lambda *_: stop.set())
     _say_where(page)
     stop.wait()
