@@ -106,7 +106,8 @@ def run(config: ProbeConfig, arguments: list[str] | None = None) -> int:
         try:
             layer = node.wait_for_skin(stop)
             if layer is None:
-                node.get_logger().error(f"no skin/topology within {config.patience:g} s. Is the node active?")
+                waited = f"no skin/topology within {config.patience:g} s. Is the node active?"
+                node.get_logger().error("interrupted as it waited for skin/topology" if stop.is_set() else waited)
                 return 1
             known = scripts_for(layer)
             scripts = [known[name] for name in config.scripts]

@@ -209,3 +209,23 @@ def test_a_recorder_on_a_full_disk_stops_and_says_what_is_safe(talker, tmp_path)
     assert code == 1 and "Safe on disk are the first" in said and "stmpl recover" in said and "Traceback" not in said
     safe = int(said.split("the first ")[1].split()[0])
     assert recover(tmp_path / "run", tmp_path / "back").messages >= safe
+
+
+WAITING = """
+import os, signal, sys
+from stmpl_ros import probe
+from stmpl_ros.parameters import ProbeConfig
+
+class Node(probe.ProbeNode):
+    def wait_for_skin(self, stop):
+        os.kill(os.getpid(), signal.SIGTERM)
+        return super().wait_for_skin(stop)
+
+probe.ProbeNode = Node
+sys.exit(probe.run(ProbeConfig()))
+"""
+
+
+def test_a_probe_that_is_interrupted_as_it_waits_says_so():
+    code, said = end(start("-c", WAITING))
+    assert code == 1 and "interrupted as it waited for skin/topology" in said and "within" not in said
