@@ -23,6 +23,7 @@ from stmpl_ros.interrupts import endings
 
 POLL_PERIOD_S = 0.1  # time between two looks of a spinning process whether it is to stop
 TRANSPORTS = "FASTDDS_BUILTIN_TRANSPORTS"  # variable by which a person chooses another: DEFAULT
+NO_LOG = "failed to initialize logging: "  # how RCLError begins where there is no place for its files
 UDP = "UDPv4?sockets_size=4MB"  # an answer overflows the usual 212 kB of a socket; what is lost is sent again, late
 
 
@@ -37,8 +38,8 @@ def ros(arguments: list[str] | None = None) -> Iterator[threading.Event]:
     or starved for a second, can leave its sender waiting for a lock of its own for ever (docs/laboratory/node.md).
 
     Raises:
-        InvalidInput: arguments that ROS does not take, a file of parameters that it cannot read, or a parameter of
-            every node (use_sim_time) that is of another kind.
+        InvalidInput: arguments that ROS does not take, a file of parameters that it cannot read, a parameter of every
+            node (use_sim_time) that is of another kind, or no folder for its log.
     """
     os.environ.setdefault(TRANSPORTS, UDP)
     stop = threading.Event()
@@ -69,6 +70,9 @@ def _init(arguments: list[str] | None) -> None:
                            "-r from:=to and --params-file FILE.") from error  # fmt: skip
     except RCLError as error:
         why = re.sub(r", at \S+:\d+|\s*\n\s*", "", str(error)).removeprefix("failed to initialize rcl: ")
+        if why.startswith(NO_LOG):
+            raise InvalidInput(f"ROS cannot write its log: {why.removeprefix(NO_LOG).rstrip('.')}. "
+                               "Set ROS_LOG_DIR, or HOME, to a folder that can be written.") from error  # fmt: skip
         raise InvalidInput(f"ROS does not take its arguments: {why.rstrip('.')}.") from error
 
 

@@ -74,6 +74,13 @@ def test_arguments_that_ros_does_not_take_end_a_verb_with_one_sentence(given, sa
     assert "/src/" not in said and "Traceback" not in said
 
 
+def test_a_place_for_ros_log_that_is_not_there_is_named_with_what_says_another():
+    here = {name: value for name, value in os.environ.items() if name not in ("HOME", "ROS_LOG_DIR", "ROS_HOME")}
+    code, said = end(start("-m", "stmpl_ros.cli", "node", env=here))
+    assert code == 1 and said.splitlines()[-1].startswith("stmpl: ROS cannot write its log: ")
+    assert said.rstrip().endswith("Set ROS_LOG_DIR, or HOME, to a folder that can be written.")
+
+
 def test_a_parameter_that_nobody_declared_is_told_once_and_with_it_the_one_that_may_be_meant(bus):
     space, given = Bus("/typos"), ("-p", "bogus:=1", "-p", "fede:=0.5", "-p", "use_sim_time:=false")
     try:
