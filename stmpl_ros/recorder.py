@@ -10,6 +10,7 @@ import struct
 import threading
 import time
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
@@ -58,25 +59,28 @@ class RecorderNode(Node):
     Nothing is decoded. A topic whose type is not installed is named in the log and left out.
 
     Args:
-        writer: writer that takes what comes.
         stop: event that is set when the disk refuses.
         wanted: topic names to record, whole; None: the run's own topics that lie in this node's namespace.
     """
 
-    def __init__(self, writer: BagWriter, stop: threading.Event, wanted: re.Pattern[str] | None = None) -> None:
+    def __init__(self, stop: threading.Event, wanted: re.Pattern[str] | None = None) -> None:
         super().__init__("recorder")
         self._space = self.get_namespace()
-        self.writer, self._stop, self._wanted = writer, stop, wanted
+        self._stop, self._wanted = stop, wanted
         self.received = self.lost = 0
         self.error: BagError | None = None
         self._channels: dict[str, int] = {}
         self._placed: set[tuple[str, str]] = set()  # topics and the frames that they came in
         self._queue: queue.SimpleQueue[Item | None] = queue.SimpleQueue()
-        self._thread = threading.Thread(target=self._write, name="writer")
-        self._thread.start()
         self._known: dict[str, Sequence[str]] = {}  # types of topics that were refused, none of those that are recorded
         self.create_timer(POLL_PERIOD_S, self._look)
         self._waiting = self.create_timer(SILENCE_S, self._tell_of_silence)
+
+    def write_to(self, writer: BagWriter) -> None:
+        """Begins to write what comes."""
+        self.writer = writer
+        self._thread = threading.Thread(target=self._write, name="writer")
+        self._thread.start()
 
     def _look(self) -> None:
         for topic, types in self.get_topic_names_and_types():
@@ -210,7 +214,8 @@ def _made_by(path: Path) -> dict[str, Any]:
         read = json.loads(text_of(path))
     except (OSError, ValueError, RecursionError) as error:
         raise InvalidInput(f"run file {path}: {error}.") from error
-    if not (isinstance(read, dict) and isinstance(read.get("node", {}), dict)):
+    node = read.get("node", {}) if isinstance(read, dict) else None
+    if not isinstance(node, dict) or not all(isinstance(node.get(key, ""), str) for key in ("method", "part")):
         raise InvalidInput(f"run file {path} holds no table of settings. Needed is {{\"node\": {{...}}}}.")
     return read
 
@@ -230,7 +235,10 @@ def run(config: RecordConfig, arguments: list[str] | None = None, topics: Sequen
     wanted = pattern(topics) if topics else None
     made_by = _made_by(config.run) if config.run else {}
     frames = read_frames(str(config.frames or made_by.get("node", {}).get("frames", "")))
-    with ros(arguments) as stop, BagWriter(config.path) as writer:
+    with ros(arguments) as stop, ExitStack() as opened:
+        node = RecorderNode(stop, wanted)  # before the file: what ROS refuses leaves none behind
+        opened.callback(node.destroy_node)
+        writer = opened.enter_context(BagWriter(config.path))
         write_provenance(
             writer,
             None,
@@ -239,7 +247,7 @@ def run(config: RecordConfig, arguments: list[str] | None = None, topics: Sequen
             config=made_by,
             frames=frames,
         )
-        node = RecorderNode(writer, stop, wanted)
+        node.write_to(writer)
         executor = EventsExecutor()
         executor.add_node(node)
         try:
@@ -250,7 +258,6 @@ def run(config: RecordConfig, arguments: list[str] | None = None, topics: Sequen
         finally:
             executor.shutdown()
             node.finish()
-            node.destroy_node()
         if node.error:
             raise node.error
         for sentence in node.foreign(frames):

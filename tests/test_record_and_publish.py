@@ -51,11 +51,18 @@ def test_a_recorder_that_hears_nothing_says_so_and_ends_with_1(tmp_path, monkeyp
     assert recorder.run(RecordConfig(path=tmp_path / "run"), topics=topics) == 1 and says in caplog.text
 
 
-@pytest.mark.parametrize("text", ["[1, 2]", '{"node": null}', "{bad", "\xff"])
+@pytest.mark.parametrize("text", ["[1, 2]", '{"node": null}', '{"node": {"method": 3}}', "{bad", "\xff"])
 def test_a_run_file_that_holds_no_settings_is_refused_in_a_sentence(tmp_path, text):
     (tmp_path / "run.json").write_text(text, encoding="latin-1")
     with pytest.raises(InvalidInput, match=r"run file .*run\.json"):
         recorder.run(RecordConfig(path=tmp_path / "run", run=tmp_path / "run.json"))
+    assert not (tmp_path / "run").exists()
+
+
+def test_what_ros_refuses_of_a_recorder_leaves_no_empty_recording(tmp_path):
+    with pytest.raises(InvalidInput, match="use_sim_time"):
+        recorder.run(RecordConfig(path=tmp_path / "run"), ["--ros-args", "-p", "use_sim_time:=1"])
+    assert not (tmp_path / "run").exists()
 
 
 @pytest.fixture(scope="module")
