@@ -172,6 +172,12 @@ def replay(
     from bags.replay import replay_run
     from bags.run import Run
 
+    unused = {"--every": every != 1, "--method": method, "--tolerance-mm": tolerance_mm is not None}
+    if not publish:
+        unused = {"--speed": speed != 1, "--topics": topics}
+    if given := [flag for flag, one in unused.items() if one]:
+        raise InvalidInput(f"{' and '.join(given)} {'has' if len(given) == 1 else 'have'} no meaning "
+                           f"{'with' if publish else 'without'} --publish: leave out one or the other.")  # fmt: skip
     if publish:
         from stmpl_ros.player import run as play
 

@@ -21,6 +21,7 @@ from stmpl_core.errors import InvalidInput
 from stmpl_ros import recorder
 from stmpl_ros.parameters import RecordConfig
 from stmpl_ros.topics import NOW, STREAM
+from tests.bag_scene import stmpl
 from tests.bus import PATIENCE, Robot, end, start
 
 STMPL = ("-m", "stmpl_ros.cli")
@@ -172,6 +173,16 @@ def test_a_recording_is_published_byte_for_byte_in_order(talker, run, speed):
     assert code == 0, said
     assert f"{SOME} messages published on 1 topics" in said
     assert [bytes(one) for one in got] == [raw.data for raw in Bag(run).raw(lambda topic: topic == "/any/words")]
+
+
+@pytest.mark.parametrize(("given", "says"), [
+    (("--publish", "--every", "3", "--method", "linear"), "--every and --method have no meaning with --publish"),
+    (("--publish", "--tolerance-mm", "0"), "--tolerance-mm has no meaning with --publish"),
+    (("--speed", "0", "--topics", "/any/words"), "--speed and --topics have no meaning without --publish"),
+])  # fmt: skip
+def test_a_replay_names_flags_that_count_for_nothing(run, capsys, given, says):
+    code, said = stmpl(capsys, "replay", run, *given)
+    assert code == 1 and says in said
 
 
 def test_what_cannot_be_published_is_refused(run):
