@@ -46,9 +46,9 @@ VERBS = {  # module of each verb's function, and what it does
 def main(arguments: list[str] | None = None) -> None:
     """Runs a verb; exits with its code, or with 1 and one sentence if it refuses."""
     given = list(sys.argv[1:] if arguments is None else arguments)
-    if arguments is None:
-        _end_soon_after_a_signal(PATIENT.get(given[0] if given else "", GRACE))
     try:
+        if arguments is None:
+            _end_soon_after_a_signal(PATIENT.get(given[0] if given else "", GRACE))
         code = _run(given)
         if sys.stdout:  # None: `stmpl ... >&-`
             sys.stdout.flush()

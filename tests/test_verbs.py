@@ -40,6 +40,16 @@ def test_what_made_a_recording_is_told_as_far_as_it_is_named() -> None:
         "method: fem; body: torso; made by stmpl 1")  # fmt: skip
 
 
+def test_ctrl_c_ends_a_verb_without_a_word_from_its_first_step_on(monkeypatch, capsys) -> None:
+    def interrupted(grace: float) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("stmpl_ros.cli._end_soon_after_a_signal", interrupted)
+    with pytest.raises(SystemExit) as ended:
+        main()
+    assert ended.value.code == 130 and capsys.readouterr() == ("", "")
+
+
 def test_data_by_no_worker_are_refused_before_anything_is_made(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     with pytest.raises(SystemExit) as ended:
         main(["generate", "--preset", "tiny", "--workers", "0", "--out", str(tmp_path / "data")])
