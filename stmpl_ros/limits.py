@@ -12,6 +12,7 @@ from stmpl_core.text_file import text_of
 from stmpl_core.touch import Touch
 
 ADVISORY = "advisory, not a safety function"
+SHAPE = "regions: {PART: {pressure_kpa: 1800, force_n: 160, source: where they are from}}, as config/limits.yaml"
 
 
 class Limit(BaseModel):
@@ -54,9 +55,14 @@ class Limits:
         from ruamel.yaml import YAML, YAMLError
 
         try:
-            file = LimitsFile.model_validate(YAML(typ="safe").load(text_of(path)))
+            read = YAML(typ="safe").load(text_of(path))
         except (OSError, UnicodeDecodeError, YAMLError, RecursionError) as error:
-            raise InvalidInput(f"limits file {path}: {error}") from error
+            why = getattr(error, "problem", None) or error  # YAML's own text has many lines
+            raise InvalidInput(f"limits file {path}: {why}. It holds {SHAPE}.") from error
+        if not isinstance(read, dict):
+            raise InvalidInput(f"limits file {path} holds no table of limits. It holds {SHAPE}.")
+        try:
+            file = LimitsFile.model_validate(read)
         except ValidationError as error:
             raise InvalidInput(f"limits file {path}: {sentence_of(error)}. See config/limits.yaml.") from error
         if region not in file.regions:

@@ -392,4 +392,9 @@ def test_limits_that_cannot_be_read_are_refused(tmp_path):
         Limits.read(str(path), "left_arm")
     with pytest.raises(InvalidInput, match="no region 'head'; it has"):
         Limits.read(str(ROOT / "config/limits.yaml"), "head")
+    for text, why in (("regions: [1", "expected ',' or ']'"), ("some words", "no table of limits"), ("", "no table")):
+        path.write_text(text)
+        with pytest.raises(InvalidInput, match=rf"^limits file .*{why}.* It holds regions: {{PART: ") as told:
+            Limits.read(str(path), "left_arm")
+        assert "\n" not in str(told.value)
     assert Limits.read("", "left_arm") is None
