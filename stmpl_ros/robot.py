@@ -20,6 +20,7 @@ from stmpl_msgs.msg import ContactMesh, SkinTopology
 from bags.wire import NANO, header, layer_from, pose_message, tool_message, wrench_message
 from stmpl_core.errors import StmplError
 from stmpl_core.layer import SoftLayer
+from stmpl_core.outputs import writable_folder
 from stmpl_ros.parameters import RobotConfig
 from stmpl_ros.spinning import interruptible, ros
 from stmpl_ros.tf import tf_type, transforms
@@ -204,6 +205,8 @@ def run(config: RobotConfig, arguments: Sequence[str] | None = None) -> int:
     from stmpl_sim.scene import check_robot
 
     check_robot(config.robot, config.end or None)  # before it waits for a node
+    if config.out:
+        writable_folder(config.out)
     with ros(list(arguments or ())) as stop:
         node = RobotNode(config)
         try:
@@ -267,5 +270,4 @@ def _massage(node: RobotNode, massage: Massage, stop: threading.Event) -> Log:
 
 def save(log: Log, folder: Path) -> Path:
     """Writes the log into a folder as LOG."""
-    folder.mkdir(parents=True, exist_ok=True)
     return log.save(folder / LOG)

@@ -13,6 +13,7 @@ from stmpl_core.errors import InvalidInput
 from stmpl_core.extras import needed
 from stmpl_core.methods import METHODS
 from stmpl_core.methods import method as method_named
+from stmpl_core.outputs import writable_file
 from stmpl_ros.parameters import DemoConfig, LinksConfig, NodeConfig, ProbeConfig, RecordConfig, RobotConfig
 from stmpl_ros.scene import SceneConfig
 from stmpl_ros.view.config import ViewConfig
@@ -300,6 +301,8 @@ def needs(config: Annotated[SceneConfig, Flat] = SCENE, out: Path | None = None,
     from stmpl_core.living import write_tissue
     from stmpl_ros.needs_table import needs_figures, needs_table
 
+    if out:
+        writable_file(out)
     found = config.needs()
     if out:
         write_tissue(out, *config.model(found))

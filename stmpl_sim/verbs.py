@@ -11,6 +11,7 @@ import tyro
 from stmpl_core.console import print_figures
 from stmpl_core.errors import InvalidInput, check_millimetres
 from stmpl_core.extras import needed
+from stmpl_core.outputs import writable_folder
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -93,7 +94,7 @@ def sim(
     from stmpl_sim.scene import build, check_robot
     from stmpl_sim.site import Site
 
-    out.mkdir(parents=True, exist_ok=True)  # what cannot be is said before the skin is made
+    writable_folder(out)  # what cannot be is said before the skin is made
     check_robot(robot, end)
     layer = limb(part, tissue, relaxing, phenotype)
     site = Site.thickest(layer)

@@ -13,6 +13,7 @@ import tyro
 from stmpl_core.console import print_figures, steps_bar
 from stmpl_core.errors import InvalidInput
 from stmpl_core.extras import needed
+from stmpl_core.outputs import writable_file, writable_folder
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -51,7 +52,7 @@ def train(
     needed("stmpl train", "learn", "torch", "zarr", "shapely")
     from studies.train import train as learn
 
-    folder = out or Path("runs/train") / preset
+    folder = writable_folder(out or Path("runs/train") / preset)
     with steps_bar(f"train {preset}", quiet=as_json) as show:
         card = learn(preset, data, folder, steps=steps, seed=seed, on_progress=show)
     print_figures(card if as_json else f"weights and their card are in {folder}")
@@ -81,6 +82,8 @@ def tables(
         as_json: figures on stdout, for machines.
     """
     needed("stmpl tables", "studies", "torch", "zarr", "shapely")
+    if out is not None:
+        writable_file(out)
     from stmpl_core.methods import Linear, MomentNet, UNet
     from studies.evaluate import THREE_BODY_ROW, evaluate
 
@@ -91,7 +94,6 @@ def tables(
     with steps_bar("tables", quiet=as_json) as show:
         made = evaluate(data, methods, limit=limit, on_progress=lambda done, total: show(done, total, "samples"))
     if out is not None:
-        out.parent.mkdir(parents=True, exist_ok=True)
         out.write_text(made.markdown() + "\n")
         out.with_suffix(".json").write_text(made.as_json() + "\n")
     sys.stdout.write((made.as_json() if as_json else made.text()) + "\n")
@@ -124,7 +126,7 @@ def chart(
     from studies.chart.picture import draw
     from studies.show import chart_table
 
-    out.mkdir(parents=True, exist_ok=True)
+    writable_folder(out)
     if redraw:
         measured = Chart.load(out / "chart.json")
     else:
@@ -164,6 +166,7 @@ def calibrate(
     from studies import calibrate as measuring
     from studies.show import coverage_table, times_table
 
+    file = writable_file(out or (trials / "ladder.json" if errors else times_file()))
     with steps_bar("calibrate", quiet=as_json) as show:
         if not errors:
             found = measuring.times(on_progress=show)
@@ -171,12 +174,12 @@ def calibrate(
             made = measuring.gather(trials, contacts=contacts, on_progress=show)
             found = measuring.fit(made)
     if errors:
-        found.save(out or trials / "ladder.json")
+        found.save(file)
         rows = measuring.coverage(made, found)
         print_figures({"rows": [vars(row) for row in rows]} if as_json else coverage_table(rows))
         return 0
-    found.save(out or times_file())
-    print_figures(dataclasses.asdict(found) if as_json else times_table(found, out or times_file()))
+    found.save(file)
+    print_figures(dataclasses.asdict(found) if as_json else times_table(found, file))
     return 0
 
 
@@ -232,7 +235,7 @@ def stability(
         raise InvalidInput(f"--fuzz is {fuzz}; how many contacts is needed, or 0 for the sweep.")
     if fuzz > 0:
         return _fuzz(methods, fuzz, seed, out or Path("runs/fuzz"), as_json)
-    folder = out or Path("runs/stability")
+    folder = writable_folder(out or Path("runs/stability"))
     with steps_bar("stability", quiet=as_json) as show:
         report = sweep({name: maker(name) for name in methods}, PRESETS[preset].only(only), folder, on_progress=show)
     picture = draw(report, folder / "stability.png")
@@ -261,6 +264,7 @@ def validate(
     from studies.validate import ROWS, as_dict, judge, save
     from studies.validate.multis import read, rows
 
+    writable_folder(out)
     asked = (*ROWS, *(rows(read(multis)) if multis else ()))
     with steps_bar("validate", quiet=as_json) as show:
         judged = judge(asked, quick=quick, on_progress=show)
@@ -275,6 +279,7 @@ def _fuzz(methods: tuple[str, ...], count: int, seed: int, out: Path, as_json: b
     from studies.stability.fuzz import fuzz
 
     found = {}
+    writable_folder(out)
     for name in methods:
         with steps_bar(f"contacts of {name}", quiet=as_json) as show:
             found[name] = fuzz(name, maker(name), count, seed, out / Path(name).stem, on_progress=show)
@@ -288,6 +293,7 @@ def _critical_load(out: Path, as_json: bool) -> int:
     from studies.show import critical_load_table
 
     rows, total = [], len(presses())
+    writable_file(out)
     with steps_bar("presses of a flat layer", quiet=as_json) as show:
         for row in critical_loads():
             rows.append(row)

@@ -50,6 +50,22 @@ def test_ctrl_c_ends_a_verb_without_a_word_from_its_first_step_on(monkeypatch, c
     assert ended.value.code == 130 and capsys.readouterr() == ("", "")
 
 
+@pytest.mark.parametrize(("verb", "work"), [
+    (["validate"], "studies.validate.judge"), (["tables"], "studies.evaluate.evaluate"),
+    (["train"], "studies.train.train"), (["calibrate"], "studies.calibrate.times"),
+    (["calibrate", "--errors"], "studies.calibrate.gather"),
+    (["stability"], "studies.stability.stability"), (["stability", "--fuzz", "9"], "studies.stability.fuzz.fuzz"),
+    (["stability", "--critical-load"], "studies.critical_load.critical_loads"), (["sim"], "stmpl_sim.verbs.limb"),
+    (["needs"], "stmpl_ros.scene.SceneConfig.needs"),
+])  # fmt: skip
+def test_a_place_that_cannot_be_written_to_is_refused_before_work(verb, work, tmp_path, monkeypatch, capsys) -> None:
+    (tmp_path / "file").write_text("")
+    monkeypatch.setattr(work, lambda *given, **named: pytest.fail("it worked first"))
+    with pytest.raises(SystemExit) as ended:
+        main([*verb, "--out", str(tmp_path / "file" / "x")])
+    assert ended.value.code == 1 and capsys.readouterr().err.startswith(f"stmpl: {tmp_path / 'file'}")
+
+
 def test_data_by_no_worker_are_refused_before_anything_is_made(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     with pytest.raises(SystemExit) as ended:
         main(["generate", "--preset", "tiny", "--workers", "0", "--out", str(tmp_path / "data")])
