@@ -117,7 +117,8 @@ class Workshop:
 
     def _modeller(self) -> Pool:
         if self._models is None:
-            self._models = Pool(1, _know, *self._knows)
+            self._models = Pool(1)
+            self._models.submit(_know, *self._knows)  # by its queue: who starts it would wait until it has imported
         return self._models
 
     def _then(self, future: Future, do: Then, wanted: Callable[[], bool]) -> None:
