@@ -37,6 +37,7 @@ CHARTS = 6  # charts of a tool that closes around a limb
 ASKEW = 0.3  # angle between lattice and tool [rad]: no row of a round or square tool's rim comes in all at once
 BESIDE = 0.6  # farthest that a part of a triangle reaches from its middle, over its side
 SAMPLES = 200  # points, about, from which the covered area is reckoned
+BLEND = 0.1  # part of the way from a spacing that sees the area to the next, over which one gives way to the other
 
 
 class Nodes(NamedTuple):
@@ -112,6 +113,9 @@ def gathered(corners, shares, forces, areas):
 def nodes_under(grid, pose, centre, points, inward, thickness, faces, found, top):
     """Nodes under a tool, all but their sinking. The lattice is laid twice: at first to see the area as it does.
 
+    That has a spacing of a few steps only, so that it stays as it is while the tool moves; from one step to the next
+    the area goes over from what one sees to what the other does.
+
     Args:
         grid: coefficients, origin and spacing of the tool's distance field.
         pose: pose_body_from_tool, (4, 4).
@@ -132,13 +136,21 @@ def nodes_under(grid, pose, centre, points, inward, thickness, faces, found, top
     rows = np.empty((0, 15))
     if area > 0:
         chart, frames = _charts(pose, found, depths, ways, sizes, best)
-        for only_look in (True, False):
-            seen, rows = _lay(grid, pose, centre, points, inward, thickness, faces, found, top, split, thick, depths,
-                              middles, edges, chart, frames, area, only_look)  # fmt: skip
-            if only_look:
-                area = seen
-                if area <= 0:
-                    break
+        scene = (grid, pose, centre, points, inward, thickness, faces, found, top, split, thick, depths, middles, edges,
+                 chart, frames)  # fmt: skip
+        unit = NODES * thick * thick
+        step = np.floor(np.log2(area / unit))
+        seen, _ = _lay(*scene, area, _cell(step, thick), True)
+        if seen > 0:
+            beyond = np.log2(seen / unit) - step
+            if not BLEND <= beyond <= 1 - BLEND:
+                other = step + 1 if beyond > 0.5 else step - 1
+                also, _ = _lay(*scene, area, _cell(other, thick), True)
+                fine, coarse = (seen, also) if other > step else (also, seen)
+                if fine > 0:
+                    share = (np.log2(fine / unit) - max(step, other)) / BLEND + 0.5
+                    seen = fine + min(max(share, 0.0), 1.0) * (coarse - fine)
+            _, rows = _lay(*scene, seen, seen / NODES, False)
     count = len(rows)
     corners = np.empty((count, 3), np.int64)
     for n in range(count):
@@ -146,6 +158,12 @@ def nodes_under(grid, pose, centre, points, inward, thickness, faces, found, top
             corners[n, c] = int(rows[n, 9 + c])
     return (rows[:, 0:3].copy(), rows[:, 3:6].copy(), rows[:, 6].copy(), rows[:, 7].copy(), rows[:, 8].copy(), corners,
             rows[:, 12:15].copy())  # fmt: skip
+
+
+@numba.njit(cache=True, inline="always")
+def _cell(step, thick):
+    """Area of a place of the lattice that sees the area, by its step [m2]."""
+    return 0.5 * thick * thick * 2.0**step
 
 
 @numba.njit(cache=True, inline="always")
@@ -171,8 +189,9 @@ def _strain_under(grid, ray, t, top):
     deep, share = depth_and_share(grid, ray, t, top)
     if deep <= 0:
         return 0.0
-    inside = -distance_in_column(grid, ray, deep - wall)
-    share *= min(max(2 * inside / wall, 0.0), 1.0) if deep > wall else 1.0
+    if deep > wall:
+        inside = min(max(-2 * distance_in_column(grid, ray, deep - wall) / wall, 0.0), 1.0)
+        share *= 1 - (1 - inside) * min(deep / wall - 1, 1.0)
     return share * min(deep / t, MAX_COLUMN_STRAIN)
 
 
@@ -299,17 +318,14 @@ def _charts(pose, found, depths, ways, sizes, best):
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _lay(grid, pose, centre, points, inward, thickness, faces, found, top, split, thick, depths, middles, edges,
-         chart, frames, area, only_look):  # fmt: skip
-    """Lays a lattice about the tool's middle on each side, for a covered area [m2].
+         chart, frames, area, cell, only_look):  # fmt: skip
+    """Lays a lattice about the tool's middle on each side, for a covered area and that of one of its places [m2].
 
     Returns:
         area: area that is covered, as the lattice sees it [m2]; it does not depend on the triangles.
         rows: rows of Nodes: point, inward, thickness, area, strain, corners, shares, (N, 15), unless only to look.
     """
     out, count, sum_area, deepest, sunk = np.empty((128, 15)), 0, 0.0, depths.max(), top.any()
-    cell = area / NODES
-    if only_look:  # a spacing of a few steps only, so that the lattice stays as it is while the tool moves
-        cell = 0.5 * thick * thick * 2.0 ** np.floor(np.log2(cell / (thick * thick)))
     least = max(min(cell, 0.5 * np.sqrt(3.0) * (WIDEST * thick) ** 2), area / MOST)
     for side in range(len(frames)):
         first, second, way = frames[side, 0], frames[side, 1], frames[side, 2]

@@ -274,16 +274,21 @@ def _deepened(points, inward, thickness, area, strain, columns, distance, gradie
         if deep <= 0 or abs(along) < LEAST_COSINE:
             continue
         share, rim, inside = strain[n] * t / deep, 1 - distance[1, n] / wall, -2 * distance[2, n] / wall
-        told = min(max(rim, 0.0), 1.0) * (min(max(inside, 0.0), 1.0) if deep > wall else 1.0)
+        felt = min(max(deep / wall - 1, 0.0), 1.0)
+        beside = 1 - (1 - min(max(inside, 0.0), 1.0)) * felt
+        told = min(max(rim, 0.0), 1.0) * beside
         known = abs(told - share) < 0.02 and told > 0.02  # else the tool has sunk under this skin: its share is held
         for k in range(6):
             rate = _entered(gradient[0, n], points[n], normal, deep, go[k, n], turned[k, n], k, origin) / along
             more = 0.0
             if known and rim < 1:
                 more += _entered(gradient[1, n], points[n], normal, 0.0, go[k, n], turned[k, n], k, origin) / wall / rim
-            if known and deep > wall and inside < 1:
+            if known and felt > 0 and inside < 1:
                 over = _entered(gradient[2, n], points[n], normal, columns[2, n], go[k, n], turned[k, n], k, origin)
-                more += 2 * (over - rate * _dot(gradient[2, n], normal)) / wall / inside
+                if inside > 0:
+                    more += 2 * felt * (over - rate * _dot(gradient[2, n], normal)) / wall / beside
+                if felt < 1:
+                    more -= (1 - max(inside, 0.0)) * rate / wall / beside
             if deep < MAX_COLUMN_STRAIN * t:
                 depths[k, n] = share * (rate + more * deep)
             strains[k, n] = (depths[k, n] - strain[n] * thicker[k, n]) / t

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import trimesh
 from scipy.spatial import Delaunay
+from scipy.spatial.transform import Rotation
 
 from benchmarks.living_limbs import site
 from fem_tools.indenter import IndenterFem
@@ -13,9 +14,11 @@ from fem_tools.patch import PatchFem
 from fem_tools.press import Press
 from stmpl_core import Contact, Load, SoftLayer, State, Tissue, Tool
 from stmpl_core.body import Body
+from stmpl_core.columns import shifted
 from stmpl_core.errors import InvalidInput, MeshError
 from stmpl_core.living import living
 from stmpl_core.methods import Linear, Naive, Winkler
+from stmpl_core.remesh import remesh
 from stmpl_core.sdf import SignedDistance
 from stmpl_core.simulator import Simulator
 from stmpl_core.touch import (
@@ -280,6 +283,39 @@ def test_load_changes_continuously_while_the_tool_comes_down(
     coarse, fine = (worst_change(flat_toucher, mesh, down(step), None) for step in (1e-4, 2.5e-5))
     assert fine < 0.4 * coarse
     assert worst_change(flat_toucher, mesh, down(2.5e-4), (0, 0, -0.1)) < 0.03
+
+
+def test_a_tilted_box_presses_as_it_did_a_nanometre_ago() -> None:
+    """Its rim crosses the width of a wall, and the area that it covers the steps of the lattice's spacing."""
+    rough = trimesh.creation.capsule(height=0.25, radius=0.045, count=[64, 64])
+    mesh = remesh(rough.vertices, rough.faces, edge_length=5e-3)
+    toucher = Toucher(SoftLayer(mesh.vertices, mesh.faces, 0.01, tissue=Tissue(youngs_modulus=20e3)))
+    layer, shape = toucher.layer, box(0.03, 0.02, 0.02)
+    tilt = Rotation.from_euler("xyz", [10, 6, 20], degrees=True).as_matrix()
+    lowest = (shape.vertices @ tilt.T)[:, 2].min()
+    middle = np.linalg.norm(layer.vertices - layer.vertices.mean(axis=0), axis=1).argsort()[:300]
+    rng = np.random.default_rng(1)
+    _, _, places = (rng.choice(middle, 8) for _ in range(3))
+    for v in places:
+        normal = layer.normals[v]
+        axis = np.array([1.0, 0, 0]) if abs(normal[0]) < 0.8 else np.array([0, 1.0, 0])
+        along = np.cross(axis, normal) / np.linalg.norm(np.cross(axis, normal))
+        pose = np.eye(4)
+        pose[:3, :3] = np.stack([along, np.cross(normal, along), normal], axis=1) @ tilt
+        pose[:3, 3] = layer.vertices[v] - (lowest + 1e-3) * normal
+        ways = np.arange(0, 4e-3, 1e-4)
+        forces = [felt(toucher, shape, shifted(pose, way * along), None).force for way in ways]
+        steps = np.diff(forces)
+        worst = int(np.abs(steps - np.median(steps)).argmax())
+        (low, high), (below, above) = ways[worst : worst + 2], forces[worst : worst + 2]
+        for _ in range(16):
+            half = 0.5 * (low + high)
+            between = felt(toucher, shape, shifted(pose, half * along), None).force
+            if abs(between - below) > abs(above - between):
+                high, above = half, between
+            else:
+                low, below = half, between
+        assert above == pytest.approx(below, rel=3e-3)
 
 
 @pytest.mark.parametrize("force", [True, False])

@@ -15,21 +15,81 @@ from stmpl_core.gpu.blocks import least_of, most_of, sum_before, sum_of
 from stmpl_core.gpu.looks import CHARTS, FACING, inward_on, point_on, thickness_on
 from stmpl_core.gpu.packs import Lattice, Scratch, Skins
 from stmpl_core.gpu.places import APART, BY_POSE, DEEP, OVERFULL, PENDING
-from stmpl_core.gpu.rays import FAR, OPTIONS, WALL_WIDTH, depth_at, real, strain_under, vec3
+from stmpl_core.gpu.rays import (
+    FAR,
+    MOST_STRAIN,
+    OPTIONS,
+    WALL_WIDTH,
+    Grid,
+    along,
+    depth_and_share,
+    depth_at,
+    real,
+    vec3,
+    wall_in,
+)
 
 NODES = wp.constant(wp.float64(law.NODES))
 MOST, MOST_PLACES = wp.constant(wp.float64(law.MOST)), wp.constant(wp.float64(law.MOST_LOOKED_AT))
-WIDEST = wp.constant(wp.float64(law.WIDEST))
+WIDEST, BLEND = wp.constant(wp.float64(law.WIDEST)), wp.constant(wp.float64(law.BLEND))
 RISE = wp.constant(wp.float64(0.5 * math.sqrt(3.0)))
 FIRST_OFF, SECOND_OFF = wp.constant(wp.float64(0.31)), wp.constant(wp.float64(0.17))
 ROUNDING = wp.constant(wp.float64(1e-9))
 FULL = wp.constant(wp.float64(DEEPEST))
 NO_ONE = wp.constant(2**31 - 1)
+LAID, LOOKS, LOOKS_AGAIN = wp.constant(0), wp.constant(1), wp.constant(2)  # what a lattice is for
 wp.set_module_options(OPTIONS)
 
 
+@wp.func
+def _steps(area: real, unit: real) -> real:
+    """Steps of the spacing up to that which sees an area."""
+    return wp.log2(area / unit)
+
+
+@wp.func
+def _other(step: real, seen: real, unit: real) -> real:
+    """The other step between which and its own the area that is seen goes over; its own where it does not."""
+    beyond, other = _steps(seen, unit) - step, real(step)
+    if beyond < BLEND or beyond > real(1.0) - BLEND:
+        other = step - real(1.0)
+        if beyond > real(0.5):
+            other = step + real(1.0)
+    return other
+
+
+@wp.func
+def _area_seen(scratch: Scratch, c: wp.int32, unit: real) -> real:
+    """Area that is covered, as the lattice sees it at one or two steps: nodes.nodes_under [m2]."""
+    step, seen, also = wp.floor(_steps(scratch.covers[c], unit)), real(scratch.sees[c]), real(scratch.also[c])
+    other = _other(step, seen, unit)
+    fine, coarse = seen, also
+    if other < step:
+        fine = also
+        coarse = seen
+    if other != step and fine > real(0.0):
+        share = (_steps(fine, unit) - wp.max(step, other)) / BLEND + real(0.5)
+        seen = fine + wp.clamp(share, real(0.0), real(1.0)) * (coarse - fine)
+    return seen
+
+
+@wp.func
+def strain_under(grid: Grid, coefficients: wp.array(dtype=real), start: vec3, way: vec3, t: real,
+                 top: vec3) -> real:  # fmt: skip
+    """How far the tool squeezes a column, over its thickness; rising from 0 beside the tool's walls."""
+    wall = wall_in(grid, t)
+    deep, share = depth_and_share(grid, coefficients, start, way, t, top)
+    if deep <= real(0.0):
+        return real(0.0)
+    if deep > wall:
+        inside = -along(grid, coefficients, start, way, deep - wall)
+        inside = wp.clamp(real(2.0) * inside / wall, real(0.0), real(1.0))
+        share = share * (real(1.0) - (real(1.0) - inside) * wp.min(deep / wall - real(1.0), real(1.0)))
+    return share * wp.min(deep / t, MOST_STRAIN)
+
+
 @wp.kernel
-def lay(side: wp.int32, only_look: wp.int32, skins: Skins, scratch: Scratch):
+def lay(side: wp.int32, what: wp.int32, skins: Skins, scratch: Scratch):
     """The lattice on one side, and how far it must reach."""
     c, lane = wp.tid()
     lanes, lattice = wp.block_dim(), Lattice()
@@ -41,10 +101,18 @@ def lay(side: wp.int32, only_look: wp.int32, skins: Skins, scratch: Scratch):
     for m in range(lane, many, lanes):
         thick += skins.thickness[skins.faces[scratch.found[c, m]][0]] / real(many)
     thick = sum_of(thick)
-    cell = scratch.covers[c] / NODES
-    if only_look == 1:
-        cell = real(0.5) * thick * thick * wp.pow(real(2.0), wp.floor(wp.log2(cell / (thick * thick))))
-    least = wp.max(wp.min(cell, RISE * WIDEST * thick * WIDEST * thick), scratch.covers[c] / MOST)
+    unit, area = NODES * thick * thick, real(scratch.covers[c])
+    step = wp.floor(_steps(area, unit))
+    if what == LOOKS_AGAIN:
+        other = _other(step, scratch.sees[c], unit)
+        if other == step:
+            return
+        step = other
+    cell = real(0.5) * thick * thick * wp.pow(real(2.0), step)
+    if what == LAID:
+        area = _area_seen(scratch, c, unit)
+        cell = area / NODES
+    least = wp.max(wp.min(cell, RISE * WIDEST * thick * WIDEST * thick), area / MOST)
     axes, centre = scratch.axes[c, side], scratch.centre[c]
     low_u, low_v, high_u, high_v = real(FAR), real(FAR), -FAR, -FAR
     for m in range(lane, many, lanes):
@@ -150,7 +218,7 @@ def _shares_of_place(lattice: Lattice, skins: Skins, f: wp.int32, centre: vec3, 
 
 
 @wp.kernel
-def sample(only_look: wp.int32, last: wp.int32, skins: Skins, scratch: Scratch):
+def sample(what: wp.int32, last: wp.int32, skins: Skins, scratch: Scratch):
     """Covered area [m2] of each place of the lattice, after the last side of all; or the strain of its column."""
     c, lane = wp.tid()
     lanes = wp.block_dim()
@@ -162,22 +230,22 @@ def sample(only_look: wp.int32, last: wp.int32, skins: Skins, scratch: Scratch):
             shares = _shares_of_place(lattice, skins, f, scratch.centre[c], n)
             inward, t = inward_on(skins, f, shares), thickness_on(skins, f, shares)
             start, way = pose * (point_on(skins, f, shares) - scratch.place[c]), pose * inward
-            if only_look == 1:
+            if what != LAID:
                 depth = depth_at(grid, skins.coefficients, start, way, t, top)
                 value = wp.clamp(real(0.5) + depth / lattice.blur, real(0.0), real(1.0)) * lattice.cell
                 sum += value / wp.max(wp.dot(inward, lattice.way), FACING)
             else:
                 value = strain_under(grid, skins.coefficients, start, way, t, top)
         scratch.value[c, n] = value
-    if only_look == 1:
+    if what != LAID:
         sum = sum_of(sum)
-        if lane == 0:
+        if lane == 0 and what == LOOKS:
             sum += scratch.sees[c]
             scratch.sees[c] = sum
-            if last == 1:
-                scratch.covers[c] = sum
-                if sum <= real(0.0):
-                    scratch.sides[c] = 0
+            if last == 1 and sum <= real(0.0):
+                scratch.sides[c] = 0
+        if lane == 0 and what == LOOKS_AGAIN:
+            scratch.also[c] = scratch.also[c] + sum
 
 
 @wp.kernel

@@ -179,4 +179,5 @@ def gather_look(scratch: Scratch):
         scratch.deepest[c] = deepest
         scratch.sides[c] = sides
         scratch.sees[c] = real(0.0)
+        scratch.also[c] = real(0.0)
         wp.atomic_max(scratch.busy, 0, sides)

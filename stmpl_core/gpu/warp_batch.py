@@ -360,18 +360,18 @@ class WarpBatch:
         self._run(columns.gather_clearance, tools, again, skins, scratch)
 
     def _lay(self, tools: int, sides: int) -> None:
-        """Contact nodes under the tools. The lattice is laid twice: first to see the covered area."""
+        """Contact nodes under the tools. The lattice is laid thrice: first to see the covered area, at two spacings."""
         scratch, skins, lanes, many = self._scratch, self._skins, self._lanes, len(self.tools)
         shared, blocks, scenes = (tools, lanes), (tools, self._block), tools // many
         scratch.nodes.zero_()
         scratch.wants.zero_()
-        for only_look in (1, 0):
+        for what in (lattice.LOOKS, lattice.LOOKS_AGAIN, lattice.LAID):
             for side in range(sides):
-                self._run(lattice.lay, blocks, side, only_look, skins, scratch)
+                self._run(lattice.lay, blocks, side, what, skins, scratch)
                 self._run(lattice.disown, shared, lanes, scratch)
                 self._run(lattice.own, shared, lanes, side, skins, scratch)
-                self._run(lattice.sample, blocks, only_look, int(side == sides - 1), skins, scratch)
-                if not only_look:
+                self._run(lattice.sample, blocks, what, int(side == sides - 1), skins, scratch)
+                if what == lattice.LAID:
                     self._run(lattice.list_nodes, (scenes, self._block), many, side, scratch)
                     self._run(lattice.fill_nodes, (scenes, lanes), lanes, many, skins, scratch)
         self._run(lattice.tell, scenes, many, scratch)
