@@ -43,12 +43,14 @@ class Squeeze(NamedTuple):
         depth: depth of the tool under the vertex itself, 0 where it is not covered, (N,) [m].
         rests: share from 0, not covered, to 1, WALL of the thickness inside the tool's walls and its skin, (N,) [-].
         nodes: contact nodes.
+        top: see nodes_under, (3,).
     """
 
     vertices: np.ndarray
     depth: np.ndarray
     rests: np.ndarray
     nodes: Nodes
+    top: np.ndarray = NOT_SUNK
 
 
 NO_SQUEEZE = Squeeze(np.empty(0, np.int64), np.empty(0), np.empty(0), Nodes.none())
@@ -160,10 +162,10 @@ class Columns:
         hole = HOLE_RADIUS * self.layer.edge_length
         if not clearance.nearest < hole:
             return NO_SQUEEZE
-        vertices, depth, rests, *nodes = _squeezed(
+        vertices, depth, rests, top, *nodes = _squeezed(
             grid_of(field), pose, middle_of(field, pose), self.points, self.inward, self.layer.thickness, self.faces,
             self._start, self._around, self._slot, *clearance[:3], hole, self.layer.stacked)  # fmt: skip
-        return Squeeze(vertices, depth, rests, Nodes(*nodes))
+        return Squeeze(vertices, depth, rests, Nodes(*nodes), top)
 
 
 def middle_of(field: SignedDistance, pose: Transform) -> np.ndarray:
@@ -312,7 +314,7 @@ def clearances(grid, pose, points, inward, thickness, near, far):
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _squeezed(grid, pose, centre, points, inward, thickness, faces, start, around, slot, near, least, above, hole,
               stacked):  # fmt: skip
-    """Parts of a Squeeze: vertices, depth, rests, and those of its nodes; their sinking only of a stack.
+    """Parts of a Squeeze: vertices, depth, rests, top, and those of its nodes; their sinking only of a stack.
 
     Args:
         centre: middle of the tool, in the body's frame, (3,) [m].
@@ -331,7 +333,7 @@ def _squeezed(grid, pose, centre, points, inward, thickness, faces, start, aroun
     nodes = nodes_under(grid, pose, centre, points, inward, thickness, faces, found, top)
     places, ways, heights, areas, strains = nodes[:5]
     sinking = _sinking(grid, pose, places, ways, heights, areas, strains) if stacked else np.empty(0)
-    return (vertices, depth, rests) + nodes + (sinking,)
+    return (vertices, depth, rests, top) + nodes + (sinking,)
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")

@@ -141,7 +141,7 @@ def _push_out(layer: SoftLayer, touches: Sequence[Touch], out: VertexVectors) ->
 
 def _tool(touch: Touch, pressed: Pressed, layer: SoftLayer) -> _Tool:
     assert touch.pressure is not None
-    grid, (v, depth, rests, _) = grid_of(pressed.field), pressed.squeeze
+    grid, (v, depth, rests, *_) = grid_of(pressed.field), pressed.squeeze
     pressure, inward = touch.pressure[v], -layer.normals[v]
     way = way_of(touch, pressed, inward, float(pressure @ layer.vertex_areas[v]))
     pose, gone, lies = touch.pose_body_from_tool, np.zeros((len(v), 3)), np.empty(len(v))

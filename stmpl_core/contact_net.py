@@ -18,6 +18,7 @@ from stmpl_core.networks import ARRAYS, NODE, PRESSURE, STACK_NODE, Weights, shi
 from stmpl_core.nodes import Nodes
 from stmpl_core.obstacle import RINGS, moments_of, pairs, power_of, rates_of, response, rings_of, solve
 from stmpl_core.rays import column_pressure
+from stmpl_core.twins import crowded
 
 MAX_LOG_RATIO = 2.5  # largest |log| of pressure over that of the linear layer [-]
 AT, SAY, NODES_SEE = NODE.at, PRESSURE.at, NODE.size  # first columns, constants to numba
@@ -84,12 +85,15 @@ class Solved(NamedTuple):
     Args:
         matrix, rings: those of stmpl_core.obstacle.pairs, or a stack's.
         force: forces over E that solve it, (N,).
+        times, over: see `crowded`, (N,).
         given_way: see `_given_way`; 0 of one material.
     """
 
     matrix: np.ndarray
     rings: np.ndarray
     force: np.ndarray
+    times: np.ndarray
+    over: np.ndarray
     given_way: float = 0.0
 
 
@@ -164,7 +168,7 @@ class ContactNet:
         group, bent = self.near.groups(nodes.corners[:, 0]), self.near.bent_at(nodes.corners)
         found: tuple[Any, ...]
         if self._green is None:
-            found = _look(*nodes[:7], group, bent, *self._table, self._moduli, self._nu)
+            found = _look(*nodes[:7], nodes.beside, group, bent, *self._table, self._moduli, self._nu)
         else:
             matrices = self._green.matrices(nodes, group)
             found = _look_on_stack(*nodes, group, bent, self._table.rows, self._nu, *matrices,
@@ -186,12 +190,12 @@ class ContactNet:
         """Pressure at contact nodes."""
         if not len(nodes.area):
             return NOTHING
-        look = self.look(nodes)
-        corrected = _correct(*look[:3], *self._network)
+        look, solved = self._looked(nodes)
+        pressure, doubt, outside = _correct(*look[:3], *self._network)
         if self._green is None:
-            _thin(look.inputs, *corrected[1:])
-            return Held(*corrected, look.power)
-        return Held(*corrected, look.power, -float(look.inputs[0, STACK_NODE.at.given_way]))
+            _thin(look.inputs, doubt, outside)
+        held = Held(pressure / solved.times, doubt / solved.times, outside, look.power)
+        return held if self._green is None else held._replace(shell=-float(look.inputs[0, STACK_NODE.at.given_way]))
 
     def apart(self, nodes: Nodes) -> np.ndarray:
         """Mask of contact nodes at which the skin lies further in than their tool's surface, (N,)."""
@@ -214,22 +218,23 @@ class ContactNet:
         """
         bent, solved, rates = self.near.bent_at(nodes.corners), self._solved(nodes), (strain_rates, sinking_rates)
         if self._green is None:
-            return _slopes(*nodes[:7], bent, *solved[:3], self._moduli, self._nu, *rates, *self._network)
-        return _slopes_on_stack(*nodes, bent, *solved, self._nu, self._green.effective.thickness,
+            return _slopes(*nodes[:7], bent, *solved[:5], self._moduli, self._nu, *rates, *self._network)
+        return _slopes_on_stack(*nodes[:8], bent, *solved, self._nu, self._green.effective.thickness,
                                 self._green.numbers, *self._green.hardening, *rates, *self._network)  # fmt: skip
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _look(points, inward, thickness, area, strain, corners, shares, group, bent, half_space, rows, moduli, nu):
+def _look(points, inward, thickness, area, strain, corners, shares, beside, group, bent, half_space, rows, moduli, nu):
     """See Look."""
     mean, here = thickness.mean(), _between(corners, shares, bent)
     matrix, rings = pairs(points, inward, thickness, area, group, mean, half_space, rows)
     depth = np.minimum(strain, LINEAR_TO) * thickness / mean
     force = solve(matrix, depth)
     pressure = force * mean**2 / area
-    moments, vectors = moments_of(rings, points, thickness, area, _one(pressure), _one(strain))
-    seen = _see(moments[0], vectors[0], inward, area, pressure, strain, here, moduli, nu)
-    return *seen, power_of(matrix, force, depth.max()), matrix, rings, force
+    times, over = crowded(points, inward, area, strain, beside, force)
+    moments, vectors = moments_of(rings, points, thickness, area, _one(pressure), _one(strain / over))
+    seen = _see(moments[0], vectors[0], inward, area, times * pressure, strain, here, moduli, nu)
+    return *seen, power_of(matrix, force, depth.max()), matrix, rings, force, times, over
 
 
 @numba.njit(cache=True, error_model="numpy")
@@ -248,18 +253,20 @@ def _see(moments, vectors, inward, area, pressure, strain, bent, moduli, nu):
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _look_on_stack(points, inward, thickness, area, strain, corners, shares, sinking, group, bent, rows, nu, matrix,
-                   wide, t, numbers, log_thickness, hardening, alike):  # fmt: skip
+def _look_on_stack(points, inward, thickness, area, strain, corners, shares, sinking, beside, group, bent, rows, nu,
+                   matrix, wide, t, numbers, log_thickness, hardening, alike):  # fmt: skip
     """See Look; t: thickness of the effective layer [m]; numbers and what follows: those of a Green."""
     rings, here = rings_of(points, inward, t, group, rows), _between(corners, shares, bent)
     depth = sinking * np.minimum(STACK_LINEAR_TO / strain, 1.0)
     force = solve(matrix, depth)
+    times, over = crowded(points, inward, area, strain, beside, force)
     moments, vectors = moments_of(rings, points, np.full(len(area), t), area,
-                                  _one(np.exp(numbers[3]) * (force / area)), _one(sinking / t))  # fmt: skip
+                                  _one(np.exp(numbers[3]) * (force / area)), _one(sinking / over / t))  # fmt: skip
     given_way = _given_way(matrix, wide, force)
-    seen = _see_on_stack(moments[0], vectors[0], inward, thickness, area, t, force, strain, sinking, here, nu, numbers,
-                         log_thickness, hardening, _between(corners, shares, alike)[:, 0], given_way)  # fmt: skip
-    return *seen, power_of(matrix, force, depth.max()), matrix, rings, force, given_way
+    seen = _see_on_stack(moments[0], vectors[0], inward, thickness, area, t, times * force, strain, sinking, here, nu,
+                         numbers, log_thickness, hardening, _between(corners, shares, alike)[:, 0],
+                         given_way)  # fmt: skip
+    return *seen, power_of(matrix, force, depth.max()), matrix, rings, force, times, over, given_way
 
 
 @numba.njit(cache=True, error_model="numpy")
@@ -312,25 +319,25 @@ def _reached(sinking, strain, sinking_rates, strain_rates, linear_to):
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _slopes(points, inward, thickness, area, strain, corners, shares, bent, matrix, rings, force, moduli, nu,
-            strain_rates, sinking_rates, low, high, mean, scale, w1, b1, w2, b2, w3, b3, w4, b4):  # fmt: skip
+def _slopes(points, inward, thickness, area, strain, corners, shares, bent, matrix, rings, force, times, over, moduli,
+            nu, strain_rates, sinking_rates, low, high, mean, scale, w1, b1, w2, b2, w3, b3, w4, b4):  # fmt: skip
     """See ContactNet.slopes."""
     unit, here = thickness.mean(), _between(corners, shares, bent)
     rates = rates_of(matrix, force, _reached(strain * thickness, strain, sinking_rates, strain_rates, LINEAR_TO) / unit)
     steps = _steps(force, rates, strain, strain_rates)
     pressures, strains = _stepped(force, rates, steps, 0.0) * unit**2 / area, _stepped(strain, strain_rates, steps, 0.0)
-    moments, vectors = moments_of(rings, points, thickness, area, pressures, strains)
+    moments, vectors = moments_of(rings, points, thickness, area, pressures, strains / over)
     held = np.empty_like(pressures)
     for k in range(len(held)):
-        seen = _see(moments[k], vectors[k], inward, area, pressures[k], strains[k], here, moduli, nu)
-        held[k] = _correct(*seen, low, high, mean, scale, w1, b1, w2, b2, w3, b3, w4, b4)[0]
+        seen = _see(moments[k], vectors[k], inward, area, times * pressures[k], strains[k], here, moduli, nu)
+        held[k] = _correct(*seen, low, high, mean, scale, w1, b1, w2, b2, w3, b3, w4, b4)[0] / times
     return _differences(held, steps)
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _slopes_on_stack(points, inward, thickness, area, strain, corners, shares, sinking, bent, matrix, rings, force,
-                     given_way, nu, t, numbers, log_thickness, hardening, alike, strain_rates, sinking_rates, low, high,
-                     mean, scale, w1, b1, w2, b2, w3, b3, w4, b4):  # fmt: skip
+                     times, over, given_way, nu, t, numbers, log_thickness, hardening, alike, strain_rates,
+                     sinking_rates, low, high, mean, scale, w1, b1, w2, b2, w3, b3, w4, b4):  # fmt: skip
     """See ContactNet.slopes."""
     here = _between(corners, shares, bent)
     rates = rates_of(matrix, force, _reached(sinking, strain, sinking_rates, strain_rates, STACK_LINEAR_TO))
@@ -339,12 +346,13 @@ def _slopes_on_stack(points, inward, thickness, area, strain, corners, shares, s
     forces, strains = _stepped(force, rates, steps, 0.0), _stepped(strain, strain_rates, steps, 1e-9)
     depths = _stepped(sinking, sinking_rates, steps, 0.0)
     moments, vectors = moments_of(rings, points, np.full(len(area), t), area, np.exp(numbers[3]) * (forces / area),
-                                  depths / t)  # fmt: skip
+                                  depths / over / t)  # fmt: skip
     held = np.empty_like(forces)
     for k in range(len(held)):
-        seen = _see_on_stack(moments[k], vectors[k], inward, thickness, area, t, forces[k], strains[k], depths[k], here,
-                             nu, numbers, log_thickness, hardening, alike_at, given_way)  # fmt: skip
-        held[k] = _correct(*seen, low, high, mean, scale, w1, b1, w2, b2, w3, b3, w4, b4)[0]
+        seen = _see_on_stack(moments[k], vectors[k], inward, thickness, area, t, times * forces[k], strains[k],
+                             depths[k], here, nu, numbers, log_thickness, hardening, alike_at,
+                             given_way)  # fmt: skip
+        held[k] = _correct(*seen, low, high, mean, scale, w1, b1, w2, b2, w3, b3, w4, b4)[0] / times
     return _differences(held, steps)
 
 

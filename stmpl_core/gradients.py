@@ -235,7 +235,8 @@ class Gradients:
         for group in groups_that_press(self.simulator.toucher, touches):
             parts = [one for k in group if (one := touches[k].pressed) is not None]
             every = [one.squeeze.nodes for one in parts]
-            joined = every[0] if len(every) == 1 else Nodes.joined(every)
+            joined = self.simulator.toucher.joined([(one.field, touches[k].pose_body_from_tool, one.squeeze)
+                                                    for k, one in zip(group, parts, strict=True)])  # fmt: skip
             thin, thick = (end.toucher.net.hold(_below(joined, by)).pressure
                            for end, by in zip(self._ends(), (1 - THICKNESS_STEP, 1 + THICKNESS_STEP), strict=True))
             rates = (thick - thin) * joined.area * self._modulus / (2 * THICKNESS_STEP)

@@ -53,6 +53,8 @@ class Nodes(NamedTuple):
         shares: barycentric coordinates among them, (N, 3) [-].
         sinking: depth by which the skin there sinks along its normal if it goes with the tool, all of it one way, (N,)
             [m]; empty where only depths in columns are known.
+        beside: strains of the columns by each of K tools that feel each other, below 0 by the node's own, (N, K) [-];
+            empty of one tool.
     """
 
     points: np.ndarray
@@ -63,6 +65,7 @@ class Nodes(NamedTuple):
     corners: np.ndarray
     shares: np.ndarray
     sinking: np.ndarray = np.empty(0)
+    beside: np.ndarray = np.empty((0, 0))
 
     @property
     def depths(self) -> np.ndarray:
@@ -82,7 +85,7 @@ class Nodes(NamedTuple):
 
     def some(self, which: np.ndarray) -> Nodes:
         """Those of these numbers, or where a mask (N,) says so."""
-        return Nodes(*(values[which] for values in self if len(values)))
+        return Nodes(*(values[which] if len(values) else values for values in self))
 
     def at_vertices(self, values: np.ndarray, areas: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Pressures at the nodes (N,) as pressures at the vertices around them: their numbers, (M,), and values, (M,).
@@ -193,6 +196,16 @@ def _strain_under(grid, ray, t, top):
         inside = min(max(-2 * distance_in_column(grid, ray, deep - wall) / wall, 0.0), 1.0)
         share *= 1 - (1 - inside) * min(deep / wall - 1, 1.0)
     return share * min(deep / t, MAX_COLUMN_STRAIN)
+
+
+@numba.njit(cache=True, nogil=True)
+def strains_under(grid, pose, points, inward, thickness, top):
+    """How far a tool squeezes the columns of nodes, whosever they are, over their thickness, (N,) [-]."""
+    out = np.empty(len(points))
+    for n in range(len(out)):
+        ray = ray_from(pose, points[n, 0], points[n, 1], points[n, 2], inward[n, 0], inward[n, 1], inward[n, 2])
+        out[n] = _strain_under(grid, ray, thickness[n], top)
+    return out
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")

@@ -19,7 +19,7 @@ import numba
 import numpy as np
 
 from stmpl_core.columns import grid_of
-from stmpl_core.nodes import FACING, Nodes
+from stmpl_core.nodes import FACING
 from stmpl_core.rays import MAX_COLUMN_STRAIN, depth_in_column, distance_in_column, ray_from, wall_in
 from stmpl_core.sdf import distances_and_gradients
 from stmpl_core.touch import MIN_ONE_WAY_SHARE, Pressed, Touch
@@ -84,9 +84,11 @@ def _of_group(toucher: Toucher, touches: Sequence[Touch]) -> list[Tangent]:
         low, high = one.field.tool_bounds
         rows = slice(6 * k, 6 * k + 6)
         strain[rows, slices[k]], sinking[rows, slices[k]], shares = _rates(
-            grid_of(one.field), 0.5 * (low + high), touch.pose_body_from_tool, *skin, *one.squeeze.nodes)  # fmt: skip
+            grid_of(one.field), 0.5 * (low + high), touch.pose_body_from_tool, *skin,
+            *one.squeeze.nodes[:8])  # fmt: skip
         moved.append(shares)
-    joined = every[0] if len(every) == 1 else Nodes.joined(every)
+    joined = toucher.joined([(one.field, touch.pose_body_from_tool, one.squeeze)
+                             for touch, one in zip(touches, parts, strict=True)])  # fmt: skip
     slopes = toucher.net.slopes(joined, strain, sinking)
     unit = layer.tissue.youngs_modulus
     out = []

@@ -12,7 +12,7 @@ import numba
 import numpy as np
 
 from stmpl_core.arrays import Transform
-from stmpl_core.columns import HOLE_RADIUS, NO_SQUEEZE, Clearance, Columns, Squeeze, shifted
+from stmpl_core.columns import HOLE_RADIUS, NO_SQUEEZE, Clearance, Columns, Squeeze, grid_of, shifted
 from stmpl_core.contact import Contact
 from stmpl_core.contact_net import NOTHING, ContactNet, Held
 from stmpl_core.deep import DEEPEST, Deep
@@ -20,7 +20,7 @@ from stmpl_core.footing import curvature_at
 from stmpl_core.green import Green
 from stmpl_core.layer import SoftLayer
 from stmpl_core.moments import Surroundings
-from stmpl_core.nodes import Nodes, gathered
+from stmpl_core.nodes import Nodes, gathered, strains_under
 from stmpl_core.obstacle import REACH
 from stmpl_core.pieces import DEEP, GROUP, WIDER, pins
 from stmpl_core.rays import WALL
@@ -194,7 +194,7 @@ class Toucher:
             if len(group) == 1:
                 held[group[0].contact.name] = group[0].held or self.net.hold(group[0].squeeze.nodes)
                 continue
-            nodes = Nodes.joined([one.squeeze.nodes for one in group])
+            nodes = self.joined([(one.field, one.pose, one.squeeze) for one in group])
             together = self.net.hold(nodes)
             if len(group) >= PINS:
                 forces = together.pressure * nodes.area
@@ -207,6 +207,18 @@ class Toucher:
             covered |= self._covered(group, nodes, held)
         return [self._answer(one, held.get(one.contact.name, NOTHING), beside.get(one.contact.name), alone,
                              one.contact.name in covered) for one in placed]  # fmt: skip
+
+    def joined(self, tools: Sequence[tuple[SignedDistance, Transform, Squeeze]]) -> Nodes:
+        """Nodes of tools that feel each other, one after the other: field, pose_body_from_tool and squeeze of each."""
+        if len(tools) == 1:
+            return tools[0][2].nodes
+        nodes, ends = Nodes.joined([squeeze.nodes for *_, squeeze in tools]), [0]
+        beside = np.empty((len(nodes.area), len(tools)))
+        for k, (field, pose, squeeze) in enumerate(tools):
+            beside[:, k] = strains_under(grid_of(field), pose, *nodes[:3], squeeze.top)
+            ends.append(ends[-1] + len(squeeze.nodes.area))
+            beside[ends[k] : ends[k + 1], k] = -1.0
+        return nodes._replace(beside=beside)
 
     def _covered(self, group: Sequence[_Placed], nodes: Nodes, held: Mapping[str, Held]) -> set[str]:
         """Names of the tools of a group that would press alone, had not the others pushed all skin off their way.

@@ -22,6 +22,7 @@ from stmpl_core.touch import Touch
 
 APART = 0.5  # distance over the lattice's spacing from which nodes of two tools are no twins
 GIVES = 1.0  # how much twins in one place give way, over what the skin gives to one of them
+HERE = 0.9  # likewise, within which nodes of one say what it presses with at a place of the other
 AROUND = 1.5  # distance over the lattice's spacing within which nodes say whether their tool covers a place
 COVERED = 0.5  # share of a tool that another one covers from which they begin to go one way
 
@@ -94,6 +95,40 @@ def covered(points, inward, area, strain, of, many):
             x = max(out[k, m] - COVERED, 0.0) / (1 - COVERED)
             out[k, m] = x * x * (3 - 2 * x)
     return out
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def crowded(points, inward, area, strain, beside, force):
+    """What tools that cover the same skin do at a node together, over what its own does there.
+
+    Args:
+        points, inward, area, strain, beside: those of Nodes, (N,) and (N, K).
+        force: forces at the nodes, none below 0, (N,).
+
+    Returns:
+        times: pressure of them all over the node's own, (N,) [-].
+        over: number of tools that cover the place, (N,) [-].
+    """
+    count, many = beside.shape
+    times, over, sums, areas = np.ones(len(area)), np.ones(len(area)), np.empty(many), np.empty(many)
+    for i in range(count):
+        for k in range(many):
+            over[i] += min(max(beside[i, k], 0.0) / strain[i], 1.0)
+        if over[i] == 1 or force[i] <= 0:
+            continue
+        sums[:] = 0.0
+        areas[:] = 1e-300
+        for j in range(count):
+            near = 1 - _apart(points, inward, area, i, j, HERE)
+            if near > 0:
+                for k in range(many):
+                    if beside[j, k] < 0:
+                        sums[k] += near * force[j]
+                        areas[k] += near * area[j]
+        for k in range(many):
+            share = min(max(beside[i, k], 0.0) / strain[i], 1.0)
+            times[i] += share * sums[k] / areas[k] * area[i] / force[i]
+    return times, over
 
 
 @numba.njit(cache=True, inline="always")

@@ -5,14 +5,14 @@ import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from stmpl_core import Contact, Membrane, Ply, Simulator, SoftLayer, Tissue
+from stmpl_core import Contact, Membrane, Ply, Simulator, SoftLayer, Tissue, Tool
 from stmpl_core.contact_net import Held
 from stmpl_core.green import Green
 from stmpl_core.methods import MomentNet
 from stmpl_core.nodes import Nodes
 from stmpl_core.toucher import Toucher
 from stmpl_core.twins import Twins, covered, twins
-from tests.scenes import RADIUS, at, ball, limb, tool
+from tests.scenes import RADIUS, at, ball, box, limb, tool
 
 THICK, LONG = 0.0125, 0.24
 ONE = Tissue(2e4, 0.4)
@@ -32,6 +32,28 @@ def on(depth: float, aside: float = 0.0, radius: float = 0.008) -> np.ndarray:
     turned = np.eye(4)
     turned[:3, :3] = Rotation.from_rotvec([0, 0, aside / RADIUS]).as_matrix()
     return turned @ out
+
+
+@pytest.mark.parametrize("shape", [ball(0.008), box(0.016, 0.02, 0.016)], ids=["ball", "box"])
+def test_tools_in_one_place_press_together_as_one_does(simulator: Simulator, shape: Tool) -> None:
+    (alone,) = simulator.touch([Contact(shape, on(6e-3))])
+    for many in (2, 3):
+        touches = simulator.touch([Contact(shape.named(f"{k}"), on(6e-3)) for k in range(many)])
+        forces = [touch.force for touch in touches]
+        assert sum(forces) == pytest.approx(alone.force, rel=1e-4)
+        assert forces == pytest.approx(many * [alone.force / many], rel=1e-4)
+    for gap in (1e-7, 1e-6, 1e-5, 1e-4):  # beside it
+        touches = simulator.touch([Contact(shape.named("one"), on(6e-3)), Contact(shape.named("two"), on(6e-3, gap))])
+        assert sum(touch.force for touch in touches) == pytest.approx(alone.force, rel=0.02)
+
+
+def test_tools_that_cover_no_place_together_are_seen_as_they_are(simulator: Simulator) -> None:
+    touches = simulator.touch([Contact(BALL, on(2e-3)), Contact(TWIN, on(2e-3, 0.016))])
+    nodes = simulator.toucher.joined([(touch.pressed.field, touch.pose_body_from_tool, touch.pressed.squeeze)
+                                      for touch in touches if touch.pressed])  # fmt: skip
+    assert len(nodes.beside) == len(nodes.area) and (nodes.beside <= 0).all()
+    held, plain = (simulator.toucher.net.hold(one) for one in (nodes, nodes._replace(beside=np.empty((0, 0)))))
+    np.testing.assert_array_equal(held.pressure, plain.pressure)
 
 
 @pytest.mark.parametrize("gap", [1e-6, 2.8e-6, 1e-5, 1e-4])

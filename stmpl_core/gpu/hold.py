@@ -211,7 +211,7 @@ def see(lanes: wp.int32, many: wp.int32, skins: Skins, scratch: Scratch):
             apart = _apart(scratch, s, i, j)
             if apart < NEAR:
                 f, per = apart * real(STEPS), scratch.area[s, j] / (t * scratch.thick[s, j])
-                p, e = per * _pressure(scratch, one, s, j), per * scratch.strain[s, j]
+                p, e = per * _pressure(scratch, one, s, j), per * scratch.strain[s, j] / scratch.over[s, j]
                 for m in range(RINGS):
                     weight = _row(skins, one, 1 + m, f)
                     moments[m] = moments[m] + weight * p
@@ -219,7 +219,7 @@ def see(lanes: wp.int32, many: wp.int32, skins: Skins, scratch: Scratch):
                 way = _row(skins, one, 1 + RINGS, f) / t * (scratch.point[s, j] - scratch.point[s, i])
                 pull = pull + p * way
                 sunk = sunk + e * way
-        pressure = _pressure(scratch, one, s, i)
+        pressure = scratch.times[s, i] * _pressure(scratch, one, s, i)
         pull = _write_alike(scratch, s, i, pressure, strain, moments, strains, pull, sunk)
         _write_shape(scratch, skins, s, i, pull)
         _write(scratch, s, i, AT_NU, one.nu)
@@ -335,6 +335,6 @@ def correct(lanes: wp.int32, scratch: Scratch, net: Net):
             ratio += scratch.one[s, i, m] * net.w4[m, 0]
             doubt += scratch.one[s, i, m] * net.w4[m, 1]
         log_ratio = wp.clamp(real(ratio), -LARGEST, LARGEST)
-        held = scratch.pressure[s, i] * wp.exp(scratch.fade[s, i] * log_ratio)
+        held = scratch.pressure[s, i] * wp.exp(scratch.fade[s, i] * log_ratio) / scratch.times[s, i]
         scratch.pressure[s, i] = held
         scratch.error[s, i] = scratch.error[s, i] * held * wp.exp(wp.min(real(doubt), real(1.0)))

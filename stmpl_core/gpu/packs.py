@@ -126,6 +126,7 @@ SCRATCH: dict[str, tuple[Any, str]] = {
     "matrix": (real, "SNN"), "force": (real, "SN"), "gap": (real, "SN"), "move": (real, "SN"), "along": (real, "SN"),
     "wanted": (real, "SN"), "beside": (wp.uint32, "SNW"), "reached": (wp.uint32, "CW"),
     "found_power": (real, "SN"), "left": (real, "SN"), "group": (wp.int32, "C"),
+    "times": (real, "SN"), "over": (real, "SN"),
     "pressure": (real, "SN"), "fade": (real, "SN"), "strange": (real, "SN"), "error": (real, "SN"),
     "inputs": (wp.float32, "SNI"), "one": (wp.float32, "SNH"), "two": (wp.float32, "SNH"), "highest": (real, "SN"),
 }  # fmt: skip

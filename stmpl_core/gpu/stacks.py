@@ -317,7 +317,7 @@ def see(lanes: wp.int32, many: wp.int32, skins: Skins, scratch: Scratch):
             if _together(scratch, s, many, i, j) and apart < NEAR and wp.dot(inward, scratch.inward[s, j]) > real(0.0):
                 f, per = apart * real(STEPS), scratch.area[s, j] / (t * t)
                 p = per * one.softness * scratch.force[s, j] / scratch.area[s, j]
-                e = per * scratch.sinking[s, j] / t
+                e = per * scratch.sinking[s, j] / scratch.over[s, j] / t
                 for m in range(RINGS):
                     weight = _row(skins, one, 1 + m, f)
                     moments[m] = moments[m] + weight * p
@@ -325,7 +325,7 @@ def see(lanes: wp.int32, many: wp.int32, skins: Skins, scratch: Scratch):
                 way = _row(skins, one, 1 + RINGS, f) / t * (scratch.point[s, j] - scratch.point[s, i])
                 pull = pull + p * way
                 sunk = sunk + e * way
-        linear = scratch.force[s, i] / scratch.area[s, i]
+        linear = scratch.times[s, i] * scratch.force[s, i] / scratch.area[s, i]
         pressure, overlap = one.softness * linear, scratch.sinking[s, i] / t
         _write_alike(scratch, s, i, pressure, overlap, moments, strains, pull, sunk)
         corners, shares, curvature = skins.faces[scratch.face[s, i]], scratch.shares[s, i], real(0.0)

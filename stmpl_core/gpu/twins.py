@@ -6,10 +6,12 @@ import warp as wp
 from stmpl_core import twins
 from stmpl_core.gpu.conforms import ONE_WAY
 from stmpl_core.gpu.field_packs import FieldScratch
-from stmpl_core.gpu.packs import Scratch
+from stmpl_core.gpu.lattice import strain_under
+from stmpl_core.gpu.packs import Scratch, Skins
+from stmpl_core.gpu.places import BY_POSE
 from stmpl_core.gpu.rays import OPTIONS, real, vec3
 
-PLACE, SEEN = (wp.constant(wp.float64(most * most / 3**0.5)) for most in (twins.APART, twins.AROUND))
+PLACE, HERE, SEEN = (wp.constant(wp.float64(most * most / 3**0.5)) for most in (twins.APART, twins.HERE, twins.AROUND))
 COVERED, GIVES = wp.constant(wp.float64(twins.COVERED)), wp.constant(wp.float64(twins.GIVES))
 wp.set_module_options({**OPTIONS, "max_unroll": 4})
 
@@ -21,6 +23,33 @@ def _apart(scratch: Scratch, s: wp.int32, i: wp.int32, j: wp.int32, most: real) 
     if wp.dot(scratch.inward[s, i], scratch.inward[s, j]) <= real(0.0):
         return real(1.0)
     return wp.min(over, real(1.0))
+
+
+@wp.kernel
+def crowd(lanes: wp.int32, many: wp.int32, skins: Skins, scratch: Scratch):
+    """What tools that cover the same skin do at a node together, over what its own does there: twins.crowded."""
+    s, lane = wp.tid()
+    for i in range(lane, scratch.nodes[s], lanes):
+        times, over = real(1.0), real(1.0)
+        for k in range(many):
+            c = s * many + k
+            if k != scratch.tool[s, i] and scratch.status[c] == BY_POSE:
+                pose = wp.transpose(scratch.pose[c])
+                start, way = pose * (scratch.point[s, i] - scratch.place[c]), pose * scratch.inward[s, i]
+                share = strain_under(skins.grids[scratch.grid[c]], skins.coefficients, start, way,
+                                     scratch.thick[s, i], scratch.top[c])  # fmt: skip
+                share = wp.min(share / scratch.strain[s, i], real(1.0))
+                over += share
+                if share > real(0.0) and scratch.force[s, i] > real(0.0):
+                    sum, area = real(0.0), real(1e-300)
+                    for j in range(scratch.nodes[s]):
+                        if scratch.tool[s, j] == k:
+                            near = real(1.0) - _apart(scratch, s, i, j, HERE)
+                            sum += near * scratch.force[s, j]
+                            area += near * scratch.area[s, j]
+                    times += share * sum / area * scratch.area[s, i] / scratch.force[s, i]
+        scratch.times[s, i] = times
+        scratch.over[s, i] = over
 
 
 @wp.kernel

@@ -26,7 +26,7 @@ from stmpl_core.arrays import check_dt, real
 from stmpl_core.columns import Columns
 from stmpl_core.errors import InvalidInput
 from stmpl_core.friction import Friction, check_tools
-from stmpl_core.gpu import answers, bears, columns, hold, lattice, looks, packs, places, stacks, sticks
+from stmpl_core.gpu import answers, bears, columns, hold, lattice, looks, packs, places, stacks, sticks, twins
 from stmpl_core.gpu.blocks import threads
 from stmpl_core.gpu.fields import Fields
 from stmpl_core.gpu.memory import Steps, WarpStates
@@ -398,6 +398,7 @@ class WarpBatch:
         self._run(hold.find_power, blocks, scratch)
         if self._stacked:
             self._run(stacks.share_given_way, (tools, self._block), many, scratch)
+        self._run(twins.crowd, shared, lanes, many, skins, scratch)
         self._run(stacks.see if self._stacked else hold.see, shared, lanes, many, skins, scratch)
         self._run(hold.judge, shared, lanes, scratch, net)
         self._run(hold.layer, shared, lanes, scratch, scratch.inputs, net.w1, net.b1, scratch.one)
