@@ -185,7 +185,9 @@ class SoftBody:
         if self._time is not None and data.time < self._time and not self._put:
             self._memory = Memory()
         dt = 0.0 if self._time is None else max(0.0, data.time - self._time)
-        mobility = None if self._jacobians is None else lambda name, at, along: self._mobility(data, name, at, along)
+        asked = self._memory.asked  # not kept where joints take the skin along
+        mobility = None if self._jacobians is None else lambda name, at, along: self._mobility(
+            data, name, at, along, None if asked is None else asked.touches.get(name))  # fmt: skip
         poses = self.poses(data)
         if self._jointed is None:
             reaction = self.contact.step(poses, self._memory, dt, mobility)
@@ -291,19 +293,22 @@ class SoftBody:
         every = {body: rows.get(body, np.zeros(6)) for body in self._felt}
         self._ledger.replace(data, self._key, every)
 
-    def _limb_under(self, name: str) -> int:
+    def _limb_under(self, touch: Touch | None) -> int:
         """Number of the body that carried most of a tool's last touch; without one or without joints, the skin's."""
-        touch = None if self.reaction is None else self.reaction.touches.get(name)
         if self._jointed is None or touch is None or touch.pressure is None or not touch.pressure.any():
             return self.body
         return self._jointed.bodies[int(self._jointed.on(touch).argmax())]
 
-    def _mobility(self, data: Any, name: str, at: np.ndarray, along: np.ndarray) -> float:
-        """Acceleration of the tool against the body along `along` for 1 N between them there [1/kg]."""
+    def _mobility(self, data: Any, name: str, at: np.ndarray, along: np.ndarray,
+                  last: Touch | None) -> float:  # fmt: skip
+        """Acceleration of the tool against the body along `along` for 1 N between them there [1/kg].
+
+        last: touch of the step before, if there is one.
+        """
         assert self._jacobians is not None
         tool, body = self._jacobians
         mujoco.mj_jac(self.model, data, tool, None, at, self._sources[name].body)
-        mujoco.mj_jac(self.model, data, body, None, at, self._limb_under(name))
+        mujoco.mj_jac(self.model, data, body, None, at, self._limb_under(last))
         row = (along @ (tool - body))[None]
         out = np.zeros_like(row)
         mujoco.mj_solveM(self.model, data, out, row)

@@ -155,6 +155,23 @@ def test_a_bend_goes_on_from_its_memory_as_it_went_on_then(skin: Skin) -> None:
     np.testing.assert_array_equal(run(soft, data, range(4, 10)), went_on)
 
 
+def test_another_skin_goes_on_from_the_memory_where_the_end_of_a_step_is_taken(skin: Skin) -> None:
+    """The body that gives way, the hinge's, is that under the last touch."""
+    model, first, soft = made(skin, on_the_lower_part(skin, 0.0))
+    pair = [(SoftBody(model, skin, body="upper", tools=["ball"], joints={"elbow": "hinge"}, implicit=True), data)
+            for data in (first, mujoco.MjData(model))]  # fmt: skip
+    soft.reset(first)
+    for k in range(4):
+        for n, (one, data) in enumerate(pair):
+            data.mocap_pos[0], data.time = on_the_lower_part(skin, 0.0, 2e-3 + 2e-4 * k), 1e-3 * k
+            if n == 0 or k == 3:
+                one.apply(data)
+        if k == 2:
+            pair[1][0].memory = pair[0][0].memory
+    assert first.xfrc_applied.any()
+    np.testing.assert_array_equal(pair[1][1].xfrc_applied, first.xfrc_applied)
+
+
 def test_between_two_poses_of_the_skin_it_goes_along_with_its_bone(skin: Skin) -> None:
     model, data, soft = made(skin, on_the_lower_part(skin, 0.3))
     data.qpos[0] = 0.3
