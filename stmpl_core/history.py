@@ -78,11 +78,16 @@ class History:
         around = ELSEWHERE * float(layer.thickness.max())
         return [*(layer.vertices.min(axis=0) - around).tolist(), *(layer.vertices.max(axis=0) + around).tolist()]
 
+    @property
+    def rubs(self) -> bool:
+        """Whether any tool rubs."""
+        every, some = self._friction
+        return bool(every) or any(some.values())
+
     @cached_property
     def _aside(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, float, float]:
         """See Sideways.numbers; any numbers where nothing rubs."""
-        every, some = self._friction
-        return self.sideways.numbers if every or any(some.values()) else FLAT
+        return self.sideways.numbers if self.rubs else FLAT
 
     @cached_property
     def _gives(self) -> tuple[np.ndarray, np.ndarray]:

@@ -204,7 +204,8 @@ class SoftContact:
         check_tools(friction, names)
         if isinstance(layer, Simulator):
             if friction is not None:
-                raise InvalidInput("this Simulator has its own friction. Give it there: Simulator(..., friction=0.3).")
+                has = "has its own friction" if layer.history.rubs else "is without friction"
+                raise InvalidInput(f"this Simulator {has}. Give it there: Simulator(..., friction=0.3).")
             self.simulator = layer
         else:
             ready = None if isinstance(layer, Skin) else method or MomentNet()

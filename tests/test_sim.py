@@ -615,8 +615,10 @@ def test_a_box_stays_on_a_slope_that_friction_can_hold_and_slides_off_one_that_i
 
 
 def test_friction_stands_in_one_place(simulator: Simulator, slab: SoftLayer) -> None:
-    with pytest.raises(InvalidInput, match="has its own friction"):
+    with pytest.raises(InvalidInput, match=r"this Simulator is without friction. Give it there"):
         SoftContact(simulator, [ball(RADIUS)], friction=0.3)
+    with pytest.raises(InvalidInput, match=r"this Simulator has its own friction. Give it there"):
+        SoftContact(Simulator(slab, Winkler(), friction=0.5), [ball(RADIUS)], friction=0.3)
     with pytest.raises(InvalidInput, match="there is no friction 'sticky'"):
         SoftContact(slab, [ball(RADIUS)], Winkler(), friction="sticky")
 
