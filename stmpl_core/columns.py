@@ -13,6 +13,7 @@ from stmpl_core.arrays import Points, Transform
 from stmpl_core.layer import SoftLayer
 from stmpl_core.nodes import Nodes, nodes_under
 from stmpl_core.rays import (
+    ANYHOW,
     NOT_SUNK,
     STEEPEST,
     UNSAID,
@@ -29,7 +30,8 @@ from stmpl_core.sdf import SignedDistance, distance_at
 from stmpl_core.soundness import too_long
 from stmpl_core.touch import MIN_ONE_WAY_SHARE
 
-LEAST_UNDER = 0.05  # how much further inside a tool a column gets below its skin than there, over the width of a wall
+LEAST_UNDER = 0.05  # how much further inside a tool a column gets below its skin than there, over the width of a wall;
+# at twice of it the tool has sunk under skin altogether
 BLOCK = 32  # columns that are looked at together
 FINEST = 0.02  # size of the parts of a long triangle at which the search for a tool in it ends, over the thickness
 HOLE_RADIUS = 0.6  # farthest point of a triangle from its corners, over the edge length (equilateral: 0.577)
@@ -328,6 +330,8 @@ def _squeezed(grid, pose, centre, points, inward, thickness, faces, start, aroun
     top = NOT_SUNK.copy()
     if under > LEAST_UNDER * wall:  # a layer that is thin beside the limb has no columns that lead so far aside
         top = _top(pose, inward, near, above) if stacked else UNSAID.copy()
+        share = min(under / (LEAST_UNDER * wall) - 1, 1.0)
+        top = top - (1 - share) if top[0] > ANYHOW else share * top
     found, vertices, depth, rests = _cover(grid, pose, points, inward, thickness, faces, start, around, slot, covered,
                                            top)  # fmt: skip
     nodes = nodes_under(grid, pose, centre, points, inward, thickness, faces, found, top)

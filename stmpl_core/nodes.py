@@ -185,7 +185,7 @@ def _column(inward, thickness, i, j, k, a, b, c):
     return x * length, y * length, z * length, a * thickness[i] + b * thickness[j] + c * thickness[k]
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@numba.njit(forceinline=True, cache=True, nogil=True, error_model="numpy")
 def _strain_under(grid, ray, t, top):
     """How far the tool squeezes a column, over its thickness; rising from 0 beside the tool's walls."""
     wall = wall_in(grid[3], t)
@@ -271,7 +271,7 @@ def _distance(grid, pose, x, y, z):
     return distance_at(grid[0], grid[1], grid[2], x, y, z)
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@numba.njit(forceinline=True, cache=True, nogil=True, error_model="numpy")
 def _inside(grid, ray, t, depth, least, top):
     """How far the column gets into a tool that has sunk under skin which it does not reach [m].
 

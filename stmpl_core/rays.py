@@ -10,7 +10,8 @@ from stmpl_core.sdf import distance_at
 WALL = 0.05  # width over which depth rises beside a tool's wall, over the thickness: nothing pops in while it slides
 PASSED, MOST_PASSED = 7, 64  # parts of a column's way between which it is looked how far it is inside a tool, or beside
 ENTERS, LOOKS_BACK = 12, 0.3  # steps to where a column enters a tool, cosine from which its surface looks back there
-NOT_SUNK, UNSAID = np.zeros(3), np.full(3, 9.0)  # what is said of a tool that has not sunk under skin, or anyhow
+NOT_SUNK, ANYHOW = np.zeros(3), 8.0  # what is said of a tool that has not sunk under skin; more than that: anyhow, by
+UNSAID = np.full(3, ANYHOW + 1)  # a share that rises by 1
 MAX_COLUMN_STRAIN = 0.9  # strain beyond which no column is squeezed
 STEEPEST = 1.5  # slope that a distance field does not exceed on its way to 0 [-]; its spline's is above 1 beside edges
 SECANT_START = 3e-3  # distance to the tool, over the thickness, at which the secant rule takes over from sphere tracing
@@ -42,7 +43,8 @@ def ray_of(pose, points, ways, n):
 @numba.njit(cache=True, inline="always")
 def distance_in_column(grid, ray, s):
     """Signed distance to the tool at depth s along a ray [m]."""
-    return distance_at(grid[0], grid[1], grid[2], ray[0] + s * ray[3], ray[1] + s * ray[4], ray[2] + s * ray[5])
+    x, y, z = ray[0] + s * ray[3], ray[1] + s * ray[4], ray[2] + s * ray[5]
+    return distance_at(grid[0], grid[1], grid[2], x, y, z)
 
 
 @numba.njit(cache=True, inline="always")
@@ -51,7 +53,7 @@ def wall_in(half, t):
     return min(WALL * t, half)
 
 
-@numba.njit(cache=True, error_model="numpy")
+@numba.njit(forceinline=True, cache=True, error_model="numpy")
 def depth_in_column(grid, ray, t, guess, least=0.0):
     """How deep along a ray, from the skin inwards, the tool ends [m]; 0 if it is not met.
 
@@ -96,7 +98,7 @@ def depth_in_column(grid, ray, t, guess, least=0.0):
     return min(s, t)
 
 
-@numba.njit(cache=True, error_model="numpy")
+@numba.njit(forceinline=True, cache=True, error_model="numpy")
 def inside_most(grid, ray, deep, most, least):
     """How far inside the tool a ray gets at most on its way to a depth [m]; below 0: how far it passes beside it.
 
@@ -116,7 +118,7 @@ def inside_most(grid, ray, deep, most, least):
     return most
 
 
-@numba.njit(cache=True, error_model="numpy")
+@numba.njit(forceinline=True, cache=True, error_model="numpy")
 def sunk_under(grid, ray, t, top):
     """Share to which a tool has sunk under a column's skin, from 0, it comes to the column from beside, to 1.
 
@@ -124,11 +126,12 @@ def sunk_under(grid, ray, t, top):
     above. On a thick, round limb columns around a deep tool lead into its lower half.
 
     Args:
-        top: against the way that a tool went, in its frame, (3,); UNSAID: any column that it is under; NOT_SUNK.
+        top: against the way that a tool went, in its frame, (3,), as long as the share to which it has sunk at all;
+            UNSAID: any column that it is under; NOT_SUNK.
     """
     size = top[0] * top[0] + top[1] * top[1] + top[2] * top[2]
     if size == 0 or size > 2:
-        return min(size, 1.0)
+        return min(max(top[0] - ANYHOW, 0.0), 1.0)
     s, d = 0.0, distance_in_column(grid, ray, 0.0)
     for _ in range(ENTERS):
         if d < SECANT_START * t:
@@ -137,13 +140,14 @@ def sunk_under(grid, ray, t, top):
         if s >= t:
             return 0.0
         d = distance_in_column(grid, ray, s)
-    step = WALL * t
+    whole = np.sqrt(size)
+    step = WALL * t / whole
     rise = distance_at(grid[0], grid[1], grid[2], ray[0] + s * ray[3] + step * top[0],
                        ray[1] + s * ray[4] + step * top[1], ray[2] + s * ray[5] + step * top[2]) - d  # fmt: skip
-    return min(max(rise / (LOOKS_BACK * step), 0.0), 1.0)
+    return whole * min(max(rise / (LOOKS_BACK * WALL * t), 0.0), 1.0)
 
 
-@numba.njit(cache=True, error_model="numpy")
+@numba.njit(forceinline=True, cache=True, error_model="numpy")
 def depth_and_share(grid, ray, t, top):
     """How deep the tool is in a column [m], and the share of that which counts: rising from 0 at its skin over a wall.
 
@@ -163,7 +167,7 @@ def depth_and_share(grid, ray, t, top):
     return deep, share
 
 
-@numba.njit(cache=True, error_model="numpy")
+@numba.njit(forceinline=True, cache=True, error_model="numpy")
 def column_pressure(moduli, strain):
     """Pressure of confined Neo-Hookean columns, over E [-]; moduli: mu and lambda over E."""
     stretch = 1 - strain

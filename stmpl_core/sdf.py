@@ -17,6 +17,7 @@ from stmpl_core.arrays import Points, finite
 from stmpl_core.decimation import BAND_CELLS, MARGIN, MAX_NODES, field_spacing
 from stmpl_core.errors import InvalidInput, MeshError
 from stmpl_core.mending import closed, openings, places
+from stmpl_core.solids import bend_of_solid, solid_jet, solid_of, to_solid
 from stmpl_core.spline import spline_sum
 from stmpl_core.tool import Tool
 from stmpl_core.walls import areas, outer_walls
@@ -27,12 +28,15 @@ log = logging.getLogger(__name__)
 MAX_EXTENT = 2.0  # largest extent of a tool [m]; that of a mesh in millimetres is larger
 MIN_EXTENT = 2e-4  # smallest extent of a tool [m]
 COARSE = 3  # factor by which the grid far from the surface is coarser
+COARSER = 1.02  # factor by which the cells of a grid grow until it fits
 COLLAR = 2 * COARSE  # nodes around the grid that splines end beyond: at their ends they are flat, and far off
 FAST = {"contract", "reassoc", "nsz"}  # sums of splines may be taken in any order
 ONE, TWO, THREE = np.uint64(1), np.uint64(2), np.uint64(3)
 SIXTH = 1 / 6  # dividing takes several times as long as multiplying
 MOST_KEPT, MOST_KEPT_BYTES = 16, 8e6  # fields that are kept for the next caller, and the largest of them
 MOST_OPENINGS, NO_POINTS = 1000, np.empty((0, 3))  # places at the rims of holes that are kept
+CHECKED = 100  # places at which a field is checked
+MOST_CHECKS = CHECKED + 27  # number of them with those farthest out
 PROBED, THICK = 600, 5e-3  # places of a tool from which its thickness is told, and the largest half of it [m]
 ROUNDING_WIDTH = 0.57  # width of the smoothing over the radius that it gives a right-angled edge, measured
 
@@ -49,8 +53,11 @@ class SignedDistance:
     d(c)^2), c the nearest point of the grid: continuous, and never more than the true distance, because the tool lies
     inside the (convex) grid.
 
+    A ball and a capsule need no grid: their distance is a formula, which holds everywhere (see stmpl_core.solids). So
+    do cylinders and boxes that are thin beside the grid's cells: sticks, boards, tables.
+
     Args:
-        coefficients: weights of the spline, (I, J, K) [m].
+        coefficients: weights of the spline, (I, J, K) [m]; of a solid see stmpl_core.solids.
         origin: position of node (0, 0, 0), (3,) [m].
         spacing: edge of the grid's cells [m].
         watertight: flag of a closed mesh; if it is not, the sign near its holes is a guess.
@@ -58,6 +65,7 @@ class SignedDistance:
         surface_error: largest |distance| at the vertices and face centres of the mesh, where it should be 0 [m].
         tool_bounds: lowest and highest corner of the mesh, (3,) [m] each.
         half_thickness: how far inside the tool one gets at most from most of its surface [m]; at most THICK.
+        checks: places spread over the surface, and those farthest out, with the distance there, (K, 4) [m].
         openings: places at the rims of its holes, (K, 3) [m].
     """
 
@@ -69,6 +77,7 @@ class SignedDistance:
     surface_error: float
     tool_bounds: tuple[np.ndarray, np.ndarray]
     half_thickness: float = math.inf
+    checks: np.ndarray = field(default_factory=lambda: np.empty((0, 4)))
     openings: Points = field(default_factory=lambda: NO_POINTS)
 
     @classmethod
@@ -82,7 +91,7 @@ class SignedDistance:
         Args:
             mesh: surface in the tool's frame.
             spacing: edge of the grid's cells [m]; None: as fine as half a second of work allows (0.4 mm for a 20 mm
-                ball).
+                cube), and no grid for a solid.
             margin: width of the grid around the tool [m].
             rounding: radius to which right-angled edges and corners are rounded [m], by smoothing the field; flat
                 faces stay, a ball of radius R shrinks by about rounding^2 / (3 R). No skin mesh can follow a sharp
@@ -97,41 +106,37 @@ class SignedDistance:
             return kept
         vertices, faces, watertight, flipped = _checked(mesh)
         used = vertices[np.unique(faces)]
-        low, extent = used.min(axis=0), np.ptp(used, axis=0)
-        area = float(areas(vertices[faces]).sum())
-        outer, seen = _outside(vertices, faces, field_spacing(area, extent, margin))
-        if spacing is None:
-            spacing = field_spacing(float(areas(outer[0][outer[1]]).sum()), extent, margin)
-        elif not (np.isfinite(spacing) and spacing > 0):
-            raise InvalidInput(f"spacing is {spacing} m; it must be finite and above 0.")
-        coarse = np.ceil((extent + 2 * margin) / (COARSE * spacing)).astype(int) + 2  # nodes each way
-        shape = COARSE * (coarse - 1) + 1
-        nodes = float(np.prod(shape.astype(float)))
-        if nodes > MAX_NODES:
-            raise InvalidInput(f"a grid of {spacing * 1e3:.3g} mm has {nodes:.3g} nodes; at most {MAX_NODES:.3g} fit. "
-                               "Try a larger spacing, or None.")
-        from scipy import ndimage  # who only reads a field need not wait for what builds it
-
-        origin = low + extent / 2 - spacing * (shape - 1) / 2
-        corner, many = origin - COLLAR * spacing, shape + 2 * COLLAR
-        rounds = None
-        if watertight:  # by all faces, also those without area: they close seams
-            rounds = winding_numbers(vertices[places(vertices)[mesh.faces]], corner, spacing, many)
-        values = _node_distances(vertices, faces, outer, rounds, corner, spacing, many)
-        if rounding > 0:
-            values = ndimage.gaussian_filter(values, ROUNDING_WIDTH * rounding / spacing, mode="nearest")
-        inner = (slice(COLLAR, -COLLAR),) * 3
-        coefficients = np.ascontiguousarray(ndimage.spline_filter(values, order=3, mode="mirror")[inner])
+        finest = field_spacing(float(areas(vertices[faces]).sum()), np.ptp(used, axis=0), margin)
+        solid = solid_of(vertices, faces, finest) if watertight and spacing is None and not rounding else None
+        if solid is None:
+            made = _on_grid(mesh, vertices, faces, watertight, spacing, margin, rounding)
+            coefficients, origin, spacing, outer, seen = made
+        else:
+            outer, seen = _whole(vertices, faces)
+            coefficients, origin, spacing = solid, used.min(axis=0), finest
         error = float(np.abs(_distances(coefficients, origin, spacing, seen)).max())
         half = _half_thickness(coefficients, origin, spacing, *outer)
+        places = _spread_over(*outer)
+        checks = np.column_stack([places, np.abs(_distances(coefficients, origin, spacing, places))])
         rims = NO_POINTS if watertight else openings(vertices, faces)
         rims = rims[:: 1 + len(rims) // MOST_OPENINGS]
-        built = cls(coefficients, origin, spacing, watertight, flipped, error, (low, low + extent), half, rims)
+        box = used.min(axis=0), used.max(axis=0)
+        built = cls(coefficients, origin, spacing, watertight, flipped, error, box, half, checks, rims)
         if coefficients.nbytes <= MOST_KEPT_BYTES:
             _KEPT[key] = built
             for old in list(_KEPT)[:-MOST_KEPT]:
                 _KEPT.pop(old, None)  # another thread may have
         return built
+
+    def off(self, pose: np.ndarray, points: Points, forces: np.ndarray) -> float:
+        """How far the surface is off where it presses [m]: the mean over points, at the place beside each.
+
+        Args:
+            pose: pose_body_from_tool, (4, 4).
+            points: points of the body's frame, (N, 3) [m].
+            forces: their weights, (N,), some above 0.
+        """
+        return _off(self.checks, pose, points, forces)
 
     def opening(self, points: ArrayLike) -> float:
         """Least distance of points (N, 3) [m] of the tool's frame from the rim of a hole [m]; infinite without one."""
@@ -141,9 +146,16 @@ class SignedDistance:
     def _rims(self) -> KDTree:
         return KDTree(self.openings)
 
+    @cached_property
+    def mostly_off(self) -> float:
+        """How far two thirds of the surface are off at most [m]."""
+        return float(np.quantile(self.checks[:, 3], 2 / 3)) if len(self.checks) else 0.0
+
     @property
     def bounds(self) -> tuple[np.ndarray, np.ndarray]:
-        """Lowest and highest corner of the box in which the spline holds, in the tool's frame, (3,) [m] each."""
+        """Lowest and highest corner of the box in which the field holds, in the tool's frame, (3,) [m] each."""
+        if self.coefficients.shape[0] == 1:
+            return np.full(3, -np.inf), np.full(3, np.inf)
         high = self.origin + self.spacing * (np.array(self.coefficients.shape) - 2)
         return self.origin + self.spacing, high
 
@@ -193,6 +205,45 @@ def _checked(mesh: Tool) -> tuple[Points, np.ndarray, bool, bool]:
     return np.ascontiguousarray(vertices), faces, watertight, flipped
 
 
+def _on_grid(mesh: Tool, vertices: Points, faces: np.ndarray, watertight: bool, spacing: float | None, margin: float,
+             rounding: float) -> tuple[np.ndarray, np.ndarray, float, tuple[Points, np.ndarray], Points]:  # fmt: skip
+    """Coefficients, origin and spacing of a spline for a surface; what is outside of it, and places on that."""
+    from scipy import ndimage  # who only reads a field need not wait for what builds it
+
+    used = vertices[np.unique(faces)]
+    low, extent = used.min(axis=0), np.ptp(used, axis=0)
+    area = float(areas(vertices[faces]).sum())
+    outer, seen = _outside(vertices, faces, field_spacing(area, extent, margin))
+    chosen = spacing is None
+    if spacing is None:
+        spacing = field_spacing(float(areas(outer[0][outer[1]]).sum()), extent, margin)
+    elif not (np.isfinite(spacing) and spacing > 0):
+        raise InvalidInput(f"spacing is {spacing} m; it must be finite and above 0.")
+    shape = _nodes_each_way(extent, margin, spacing)
+    while chosen and shape.prod() > MAX_NODES:  # whole cells are more than was reckoned
+        spacing *= COARSER
+        shape = _nodes_each_way(extent, margin, spacing)
+    nodes = float(np.prod(shape.astype(float)))
+    if nodes > MAX_NODES:
+        raise InvalidInput(f"a grid of {spacing * 1e3:.3g} mm has {nodes:.3g} nodes; at most {MAX_NODES:.3g} fit. "
+                           "Try a larger spacing, or None.")  # fmt: skip
+    origin = low + extent / 2 - spacing * (shape - 1) / 2
+    corner, many = origin - COLLAR * spacing, shape + 2 * COLLAR
+    rounds = None
+    if watertight:  # by all faces, also those without area: they close seams
+        rounds = winding_numbers(vertices[places(vertices)[mesh.faces]], corner, spacing, many)
+    values = _node_distances(vertices, faces, outer, rounds, corner, spacing, many)
+    if rounding > 0:
+        values = ndimage.gaussian_filter(values, ROUNDING_WIDTH * rounding / spacing, mode="nearest")
+    inner = (slice(COLLAR, -COLLAR),) * 3
+    coefficients = np.ascontiguousarray(ndimage.spline_filter(values, order=3, mode="mirror")[inner])
+    return coefficients, origin, spacing, outer, seen
+
+
+def _nodes_each_way(extent: np.ndarray, margin: float, spacing: float) -> np.ndarray:
+    return COARSE * (np.ceil((extent + 2 * margin) / (COARSE * spacing)).astype(int) + 1) + 1
+
+
 def _finer(coarse: np.ndarray) -> np.ndarray:
     """The cubic spline through the nodes of a grid (I, J, K) at those of one COARSE times as fine.
 
@@ -212,6 +263,16 @@ def _finer(coarse: np.ndarray) -> np.ndarray:
     return np.ascontiguousarray(out)
 
 
+def _spread_over(vertices: Points, faces: np.ndarray) -> Points:
+    """Places of a surface by its area, CHECKED of them, and middles of the triangles farthest out each way, (K, 3)."""
+    corners, rng, ways = vertices[faces], np.random.default_rng(1), np.array(list(np.ndindex(3, 3, 3))) - 1.0
+    area, middles = areas(corners), corners.mean(axis=1)
+    some = corners[rng.choice(len(faces), CHECKED, p=area / area.sum())]
+    shares = np.diff(np.sort(rng.uniform(size=(CHECKED, 2))), prepend=0.0, append=1.0)
+    farthest = np.unique((middles @ ways.T).argmax(axis=0))
+    return np.concatenate([np.einsum("pc,pcx->px", shares, some), middles[farthest]])
+
+
 def _half_thickness(coefficients: np.ndarray, origin: np.ndarray, spacing: float, vertices: Points,
                     faces: np.ndarray) -> float:  # fmt: skip
     """See SignedDistance; from PROBED places of the surface, a third of which may be less thick: edges are."""
@@ -228,11 +289,16 @@ def _half_thickness(coefficients: np.ndarray, origin: np.ndarray, spacing: float
     return max(float(np.quantile(inside.max(axis=1), 2 / 3)), 0.25 * spacing)
 
 
+def _whole(vertices: Points, faces: np.ndarray) -> tuple[tuple[Points, np.ndarray], Points]:
+    """Vertices and faces of a surface, and places on it [m]."""
+    return (vertices, faces), np.concatenate([vertices[np.unique(faces)], vertices[faces].mean(axis=1)])
+
+
 def _outside(vertices: Points, faces: np.ndarray, spacing: float) -> tuple[tuple[Points, np.ndarray], Points]:
     """Vertices and faces of what is outside of a surface, itself if it has no inner walls, and places on that [m]."""
     walls = outer_walls(vertices, faces, spacing)
     if walls is None:
-        return (vertices, faces), np.concatenate([vertices[np.unique(faces)], vertices[faces].mean(axis=1)])
+        return _whole(vertices, faces)
     log.info("the tool's mesh has walls inside it, of bodies that overlap; they are left out")
     pieces, whole = walls.pieces, walls.pieces[walls.whole]
     return ((np.ascontiguousarray(pieces.reshape(-1, 3)), np.arange(3 * len(pieces)).reshape(-1, 3)),
@@ -260,6 +326,26 @@ def _node_distances(vertices: Points, faces: np.ndarray, outer: tuple[Points, np
     band = np.argwhere(np.abs(values) < BAND_CELLS * h)
     values[tuple(band.T)] = exact(band)
     return values
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _off(checks, pose, points, forces):
+    """See SignedDistance.off."""
+    total = whole = 0.0
+    for n in range(len(points)):
+        if forces[n] > 0:
+            a, b, c = points[n, 0] - pose[0, 3], points[n, 1] - pose[1, 3], points[n, 2] - pose[2, 3]
+            x = pose[0, 0] * a + pose[1, 0] * b + pose[2, 0] * c
+            y = pose[0, 1] * a + pose[1, 1] * b + pose[2, 1] * c
+            z = pose[0, 2] * a + pose[1, 2] * b + pose[2, 2] * c
+            least, off = np.inf, 0.0
+            for k in range(len(checks)):
+                a, b, c = checks[k, 0] - x, checks[k, 1] - y, checks[k, 2] - z
+                square = a * a + b * b + c * c
+                if square < least:
+                    least, off = square, checks[k, 3]
+            total, whole = total + forces[n] * off, whole + forces[n]
+    return total / whole
 
 
 @numba.njit(cache=True, inline="always")
@@ -294,9 +380,11 @@ def _on_line(line, k, c0, c1, c2, c3):
     return c0 * line[k] + c1 * line[k + ONE] + (c2 * line[k + TWO] + c3 * line[k + THREE])
 
 
-@numba.njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
+@numba.njit(forceinline=True, cache=True, nogil=True, fastmath=FAST, error_model="numpy")
 def distance_at(coefficients, origin, spacing, x, y, z):
     """Signed distance at one point [m]; for use inside other kernels."""
+    if coefficients.shape[0] == 1:
+        return to_solid(coefficients, x, y, z)
     per = 1 / spacing
     i, u, f = _cell((x - origin[0]) * per, coefficients.shape[0])
     j, v, g = _cell((y - origin[1]) * per, coefficients.shape[1])
@@ -330,9 +418,11 @@ def _add_line(line, k, c, dc, b, db, value, across, along):
     return value + b * here, across + db * here, along + b * _on_line(line, k, dc[0], dc[1], dc[2], dc[3])
 
 
-@numba.njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
+@numba.njit(forceinline=True, cache=True, nogil=True, fastmath=FAST, error_model="numpy")
 def jet_at(coefficients, origin, spacing, x, y, z):
     """Signed distance at one point [m], and its gradient: four numbers; for use inside other kernels."""
+    if coefficients.shape[0] == 1:
+        return solid_jet(coefficients, x, y, z)
     i, u, f = _cell((x - origin[0]) / spacing, coefficients.shape[0])
     j, v, g = _cell((y - origin[1]) / spacing, coefficients.shape[1])
     k, w, e = _cell((z - origin[2]) / spacing, coefficients.shape[2])
@@ -380,6 +470,11 @@ def _jets(coefficients, origin, spacing, points):
     first, weights, away, free = np.empty(3, np.int64), np.empty((3, 3, 4)), np.empty(3), np.empty(3)
     for n in range(len(points)):
         g, h = gradient[n], hessian[n]
+        if coefficients.shape[0] == 1:
+            x, y, z = points[n]
+            value[n], g[0], g[1], g[2] = solid_jet(coefficients, x, y, z)
+            bend_of_solid(coefficients, x, y, z, h)
+            continue
         outside = 0.0
         for axis in range(3):
             u = (points[n, axis] - origin[axis]) / spacing

@@ -61,7 +61,9 @@ SHELL, SHELL_FROM = 2.5, 0.02  # bound on a force per share of work above this b
 SHALLOW, SHALLOW_TO = 0.1, 0.05  # bound on a first touch of one material, and depth over the thickness where it ends
 STUCK = 0.5  # error of what skin that sticks carries along itself, over that
 MAX_LEVER = 1.0  # torque that is not carried over the force, over the contact's radius, that is not yet worth a word
-MAX_FIELD_ERROR_M = 5e-4  # error of a distance field that is not yet worth a word
+SURE = 0.02  # largest error of a distance field over the depth, up to which it does not matter where the field is off
+MOST_OFF = 0.1  # error of a distance field where a tool presses, over the depth, beyond which the force is not known
+FIRST = 0.01  # depth over the thickness from which touches were tried
 MUCH_STIFFER = 50.0  # stiffness over that of the tissue above from which a material is nearly bone: people's are below
 SOFT_SHARE = 0.7  # depth over the soft tissue's there; at 0.62 force is 9 % off, at 0.87 by 18 to 33 %
 RATIOS_APART = 0.06  # difference of the materials' Poisson's ratios: 0.05 cost nothing, of 0.1 force is 15 % off
@@ -255,6 +257,9 @@ class Toucher:
             if status == APART and around > MAX_AROUND * self._thickest:
                 status, why = WRAPPED, f"{1e3 * around:.1f} mm of skin are inside {contact.name}, which no column " \
                     "meets from outside: check its pose, its scale and which side of its surface is out"  # fmt: skip
+            elif status == APART and -depth < field.mostly_off > 2 * FIRST * self._thickest:
+                why = f"{contact.name} may touch: it is {-1e3 * depth:.2g} mm away, and its distance field is " \
+                    f"{1e3 * field.mostly_off:.2g} mm off: leave out what of it is far away"  # fmt: skip
             elif status in (APART, NO_TOUCH) and off > FAR:
                 why = f"{contact.name} is {off:.3g} m from the limb: is its pose in millimetres? Scale it by 1e-3"
             return _Placed(contact, field, status, pose, depth, 0.0, NO_SQUEEZE, 0.0, why=why)
@@ -478,10 +483,15 @@ class Toucher:
         depth = self._depth(one.squeeze) if len(v) and not one.factor > 1 else one.depth
         way = stated[:3] / np.linalg.norm(stated[:3]) if stated is not None and stated[:3].any() else None
         known = self.net.weights.card["bound"]
-        doubt += held.power * one.field.surface_error / max(depth, one.field.surface_error)  # how well depth is known
+        wrong = one.field.surface_error
+        doubt += held.power * wrong / max(depth, wrong, 1e-300)  # how well depth is known
         if "uneven" in known and size > 0:
             doubt = math.hypot(doubt, known["uneven"] * self.net.unlike(thickness))
         bound = known["scale"] * doubt ** known["power"] if size > 0 else 0.0
+        off = 0.0  # of a board that is thin beside the field's cells, all of its face may lie elsewhere
+        if size > 0 and wrong > SURE * depth:
+            off = one.field.off(one.pose, nodes.points, forces)
+            bound += held.power * min(off / max(depth, 1e-300), 1.0)
         bound += SHELL * max(held.shell - SHELL_FROM, 0.0)
         if size > 0 and not layer.stacked:
             bound += SHALLOW * max(1 - depth / (SHALLOW_TO * thickness), 0.0)
@@ -502,6 +512,9 @@ class Toucher:
                             stuck, along) if len(v) else None,
         )  # fmt: skip
         trust = self._trust(one, touch, v, pressure, strange, alone, covered)
+        if off > MOST_OFF * max(depth, FIRST * thickness):
+            trust = trust.also(f"where {touch.name} presses, {1e3 * depth:.2g} mm deep, its distance field is "
+                               f"{1e3 * off:.2g} mm off: leave out what of it is far away", in_range=False)  # fmt: skip
         if beside_off > MAX_BESIDE:
             where = (f"no place was found where {touch.name} presses so: the nearest" if held is one.held else
                      f"{touch.name} was moved to where it presses so alone; beside the other tools that")  # fmt: skip
@@ -565,9 +578,6 @@ class Toucher:
             trust = trust.also(f"{name} was moved {one.moved * 1e3:+.1f} mm along its force: check its calibration")
         if alone:
             trust = self.unmet(trust, touch, stated)
-        if one.field.surface_error > MAX_FIELD_ERROR_M:
-            error_mm = one.field.surface_error * 1e3
-            trust = trust.also(f"the distance field of {name} is off by up to {error_mm:.1f} mm")
         if not one.field.watertight:
             nodes, pose = one.squeeze.nodes, one.pose
             away = one.field.opening((nodes.points - pose[:3, 3]) @ pose[:3, :3])

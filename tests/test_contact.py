@@ -52,6 +52,7 @@ from tests.scenes import (
     press,
     punch,
     scaled,
+    tool,
     touch_of,
     turn,
     v_block,
@@ -727,3 +728,43 @@ def test_a_tool_between_the_corners_of_long_triangles_is_not_silently_apart(ring
         assert (touch.force > 0 or lost) and not touch.trust.in_range
     place[0, 3] += 0.005
     assert toucher.touch(Contact(ball(0.01), place)).trust.in_range
+
+
+# Tools that are large beside what of them touches
+
+
+def on_top(mesh: Tool, depth: float) -> Touch:
+    """A tool's -z pressed into the top of a limb by so much [m]."""
+    down = turn((0, 1, 0), np.pi / 2)
+    down[:3, 3] = RADIUS - depth - mesh.vertices[:, 2].min(), 0.0, MIDDLE
+    return Toucher(LIMB).touch(Contact(mesh, down))
+
+
+def test_a_board_presses_alike_however_large_and_thin_it_is() -> None:
+    sizes = ((0.3, 0.02), (0.3, 0.004), (1.0, 0.02), (1.9, 0.005))
+    for depth in (5e-4, 2e-3):
+        first, *others = (on_top(box(wide, wide, thick), depth) for wide, thick in sizes)
+        assert all("distance field" not in touch.trust.why for touch in (first, *others))
+        for touch in others:
+            np.testing.assert_allclose(touch.wrench[:3], first.wrench[:3], rtol=0, atol=1e-3 * first.force)
+            assert touch.depth == pytest.approx(first.depth, abs=1e-6)
+        disc = on_top(tool(trimesh.creation.cylinder(0.4, 0.01, sections=96)), depth)
+        assert disc.force == pytest.approx(first.force, rel=1e-3)
+
+
+def test_a_bar_presses_with_its_end_as_its_end_does_alone() -> None:
+    end = on_top(box(0.02, 0.012, 0.02), 0.5 * THICKNESS).force
+    for length in (0.1, 0.6, 1.5):
+        assert on_top(box(0.02, 0.012, length), 0.5 * THICKNESS).force == pytest.approx(end, rel=0.04)
+
+
+def test_a_board_that_its_distance_field_does_not_know_is_flagged_from_before_it_touches() -> None:
+    board = tool(trimesh.creation.cylinder(0.5, 0.005, sections=6))
+    true = on_top(box(0.8, 0.8, 0.02), 1e-3).force
+    touch = on_top(board, 1e-3)
+    assert touch.trust.in_range is False and "its distance field is" in touch.trust.why
+    assert abs(touch.force - true) < touch.force_bound
+    flags = [on_top(board, depth).trust.in_range for depth in np.arange(-5e-3, 4e-3, 2.5e-4)]
+    first = flags.index(False)
+    assert on_top(board, -5e-3 + 2.5e-4 * first).status == APART
+    assert set(flags[first:]) == {False}

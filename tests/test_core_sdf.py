@@ -6,6 +6,7 @@ import pytest
 import trimesh
 
 from stmpl_core import Tool
+from stmpl_core.decimation import MAX_NODES
 from stmpl_core.errors import InvalidInput, MeshError
 from stmpl_core.sdf import SignedDistance
 from stmpl_core.winding import winding_numbers
@@ -16,7 +17,7 @@ POINTS = np.random.default_rng(1).uniform(-0.02, 0.02, (20_000, 3))
 
 @pytest.fixture(scope="module")
 def sphere() -> SignedDistance:
-    return SignedDistance.of(ball(0.01, 4))
+    return SignedDistance.of(ball(0.01, 4), spacing=4.3e-4)
 
 
 def test_distance_to_a_sphere_is_exact_but_for_its_facets(sphere: SignedDistance) -> None:
@@ -98,6 +99,14 @@ def test_distance_alone_is_that_which_comes_with_its_derivatives(sphere: SignedD
     alone = sphere.distance(points)
     np.testing.assert_allclose(alone, sphere.distance_gradient_hessian(points)[0], rtol=0, atol=1e-15)
     np.testing.assert_allclose(alone, sphere.distance_gradient(points)[0], rtol=0, atol=1e-15)
+
+
+def test_a_thin_stick_may_lie_askew_in_its_own_frame() -> None:
+    """Its box is large beside it: the grid that is chosen fits all the same."""
+    for angle in (0.6, 0.8, 1.0):
+        stick = trimesh.creation.cylinder(radius=2e-3, height=0.6, sections=16)  # too coarse to be round
+        stick.apply_transform(trimesh.transformations.rotation_matrix(angle, [0, 1, 0]))
+        assert SignedDistance.of(tool(stick)).coefficients.size <= MAX_NODES
 
 
 def test_an_open_shell_still_has_an_inside() -> None:

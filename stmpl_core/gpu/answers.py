@@ -36,7 +36,9 @@ ONE_WAY = wp.constant(wp.float64(wrenches_of_skin.ONE_WAY))
 ALL_ONE_WAY = wp.constant(wp.float64(wrenches_of_skin.ALL_ONE_WAY))
 NONE = wp.constant(wp.float64(1e-300))
 NAN, PI = wp.constant(wp.float64(float("nan"))), wp.constant(wp.float64(math.pi))
-vec15 = wp.types.vector(length=15, dtype=wp.float64)
+SURE, MOST_OFF = wp.constant(wp.float64(toucher.SURE)), wp.constant(wp.float64(toucher.MOST_OFF))
+FIRST, TWICE_FIRST = wp.constant(wp.float64(toucher.FIRST)), wp.constant(wp.float64(2 * toucher.FIRST))
+vec16 = wp.types.vector(length=16, dtype=wp.float64)
 wp.set_module_options(OPTIONS)
 
 
@@ -226,6 +228,19 @@ def _pins(scratch: Scratch, c: wp.int32, s: wp.int32, k: wp.int32, lane: wp.int3
     return wp.vec2d(sums[0], sums[1]) / wp.max(sums[2], NONE)
 
 
+@wp.func
+def _off(skins: Skins, grid: wp.int32, at: vec3) -> real:
+    """How far a distance field is off at the place beside a point of the tool's frame [m]: stmpl_core.sdf._off."""
+    least, off = real(1e30), real(0.0)
+    for j in range(skins.checks.shape[1]):
+        one = skins.checks[grid, j]
+        square = wp.length_sq(vec3(one[0], one[1], one[2]) - at)
+        if square < least:
+            least = square
+            off = one[3]
+    return off
+
+
 @wp.kernel
 def answer(first: wp.int32, many: wp.int32, known: Known, skins: Skins, scratch: Scratch,
            wrenches: wp.array3d(dtype=Any), depths: wp.array2d(dtype=Any), bounds: wp.array2d(dtype=Any),
@@ -262,10 +277,11 @@ def answer(first: wp.int32, many: wp.int32, known: Known, skins: Skins, scratch:
             statuses[n, k] = WRAPPED
         depths[n, k] = depths.dtype(depth)
         bounds[n, k] = bounds.dtype(real(0.0))
-        in_range[n, k] = not around and not far
+        may = -depth < grid.mostly_off and grid.mostly_off > TWICE_FIRST * one.thickest
+        in_range[n, k] = not around and not far and not may
         return
     force, torque, forces, strange, doubt = vec3(), vec3(), real(0.0), real(0.0), real(0.0)
-    total, below = real(0.0), real(0.0)
+    total, below, wrong = real(0.0), real(0.0), real(0.0)
     steep, long, border, bony, highest = real(0.0), real(0.0), real(0.0), real(0.0), real(0.0)
     depth, thick, count, carried = real(scratch.deep[c]), real(0.0), real(0.0), real(0.0)
     for i in range(lane, scratch.nodes[s], lanes):
@@ -287,6 +303,9 @@ def answer(first: wp.int32, many: wp.int32, known: Known, skins: Skins, scratch:
                 if (skins.doubts[v] & BONY) != 0:
                     bony += part
             forces += here
+            if grid.surface_error > SURE * real(scratch.deep[c]):
+                at = wp.transpose(scratch.pose[c]) * (scratch.point[s, i] - scratch.place[c])
+                wrong += here * _off(skins, scratch.grid[c], at)
             strange += here * scratch.strange[s, i]
             doubt += scratch.error[s, i] * scratch.area[s, i]
             depth = wp.max(depth, scratch.strain[s, i] * scratch.thick[s, i])
@@ -294,8 +313,8 @@ def answer(first: wp.int32, many: wp.int32, known: Known, skins: Skins, scratch:
             carried += here * scratch.thick[s, i]
             count += real(1.0)
             highest = wp.max(highest, scratch.highest[s, i])
-    sums = sum_of(vec15(force[0], force[1], force[2], forces, strange, doubt, total, below, steep, long, border, bony,
-                        thick, count, carried))  # fmt: skip
+    sums = sum_of(vec16(force[0], force[1], force[2], forces, strange, doubt, total, below, steep, long, border, bony,
+                        thick, count, carried, wrong))  # fmt: skip
     force, forces, strange, doubt = vec3(sums[0], sums[1], sums[2]), sums[3], sums[4], sums[5]
     total, below, steep, long, border, bony = sums[6], sums[7], sums[8], sums[9], sums[10], sums[11]
     thick, count, carried = sums[12], sums[13], sums[14]
@@ -322,7 +341,7 @@ def answer(first: wp.int32, many: wp.int32, known: Known, skins: Skins, scratch:
     along = more_sums[3]
     force = force + along / wp.max(size, NONE) * force
     power = _power(scratch, s, many, k)
-    doubt = doubt / wp.max(size, NONE) + power * grid.surface_error / wp.max(depth, grid.surface_error)
+    doubt = doubt / wp.max(size, NONE) + power * grid.surface_error / wp.max(wp.max(depth, grid.surface_error), NONE)
     if one.stacked == 1 and forces > real(0.0):
         unlike = known.uneven * wp.log(carried / (forces * one.flat))
         doubt = wp.sqrt(doubt * doubt + unlike * unlike)
@@ -336,13 +355,17 @@ def answer(first: wp.int32, many: wp.int32, known: Known, skins: Skins, scratch:
     group = pins[0] > GROUP and depth > PINS_DEEP * pins[1]
     sound = sound and not group
     sound = sound and skins.holes[k] == 0
+    wrong = real(0.0)
+    if size > real(0.0) and grid.surface_error > SURE * depth:
+        wrong = sums[15] / forces
+        sound = sound and wrong <= MOST_OFF * wp.max(depth, FIRST * carried / forces)
     for x in range(3):
         wrenches[n, k, x] = wrenches.dtype(one.modulus * force[x])
         wrenches[n, k, 3 + x] = wrenches.dtype(one.modulus * torque[x])
     depths[n, k] = depths.dtype(depth)
     bounds[n, k] = bounds.dtype(real(0.0))
     if size > real(0.0):
-        bound = known.scale * wp.pow(doubt, known.power)
+        bound = known.scale * wp.pow(doubt, known.power) + power * wp.min(wrong / wp.max(depth, NONE), real(1.0))
         below /= wp.max(forces, NONE)
         if one.stacked == 1:
             bound += SHELL * wp.max(-scratch.given_way[c] - SHELL_FROM, real(0.0))

@@ -14,7 +14,7 @@ from stmpl_core.gpu.rays import FAR, OPTIONS, WALL_WIDTH, clearance_of, depth_an
 
 BLOCK, EDGE = wp.constant(IN_BLOCK), wp.constant(EDGE_BIT)
 UNDER, TOO_DEEP = wp.constant(wp.float64(LEAST_UNDER)), wp.constant(wp.float64(DEEPEST))
-UNSAID, ONE_WAY = wp.constant(wp.float64(rays.UNSAID[0])), wp.constant(wp.float64(MIN_ONE_WAY_SHARE))
+ANYHOW, ONE_WAY = wp.constant(wp.float64(rays.ANYHOW)), wp.constant(wp.float64(MIN_ONE_WAY_SHARE))
 wp.set_module_options(OPTIONS)
 
 
@@ -161,9 +161,10 @@ def gather_clearance(again: wp.int32, skins: Skins, scratch: Scratch):
     if covers == 0:
         scratch.status[c] = APART
     elif under > UNDER * WALL_WIDTH * wall / real(covers):
-        scratch.top[c] = UNSAID * vec3(real(1.0), real(1.0), real(1.0))
+        share = wp.min(under / (UNDER * WALL_WIDTH * wall / real(covers)) - real(1.0), real(1.0))
+        scratch.top[c] = (ANYHOW + share) * vec3(real(1.0), real(1.0), real(1.0))
         if one.stacked == 1 and wp.length(met) > ONE_WAY * whole:
-            scratch.top[c] = -(wp.transpose(scratch.pose[c]) * wp.normalize(met))
+            scratch.top[c] = -share * (wp.transpose(scratch.pose[c]) * wp.normalize(met))
 
 
 @wp.func

@@ -13,7 +13,18 @@ from stmpl_core.gpu.field_packs import FieldScratch, SkinFields
 from stmpl_core.gpu.motion import FAR, PER_LOG, STEPS, TOP, _at, feels
 from stmpl_core.gpu.packs import Scratch, Skins
 from stmpl_core.gpu.places import BY_POSE, REFUSED
-from stmpl_core.gpu.rays import OPTIONS, Grid, along, cubic, depth_and_share, depth_in_column, real, vec3, wall_in
+from stmpl_core.gpu.rays import (
+    OPTIONS,
+    Grid,
+    along,
+    cubic,
+    depth_and_share,
+    depth_in_column,
+    real,
+    solid_jet,
+    vec3,
+    wall_in,
+)
 
 LYING = wp.constant(wp.float64(conform.MIN_LYING_PRESSURE))
 FIRM, FACING = wp.constant(wp.float64(conform.FIRM_DEPTH)), wp.constant(wp.float64(conform.MIN_FACING_COSINE))
@@ -36,6 +47,8 @@ def _slopes(f: real):
 @wp.func
 def _jet(grid: Grid, coefficients: wp.array(dtype=real), at: vec3):
     """Signed distance at a point of the tool's frame [m], and then its gradient: stmpl_core.sdf.jet_at."""
+    if grid.shape[0] == 1:
+        return solid_jet(grid, coefficients, at)
     u = (at - grid.origin) / grid.spacing
     first, inside = wp.vec3i(0, 0, 0), vec3()
     for x in range(3):

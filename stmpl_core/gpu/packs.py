@@ -19,7 +19,7 @@ from stmpl_core.layer import SoftLayer
 from stmpl_core.networks import ARRAYS, NODE, PRESSURE, STACK_NODE, shipped
 from stmpl_core.nodes import CHARTS, MOST, NODES, WIDEST
 from stmpl_core.obstacle import response
-from stmpl_core.sdf import SignedDistance
+from stmpl_core.sdf import MOST_CHECKS, SignedDistance
 from stmpl_core.skin import Skin
 from stmpl_core.tool import Tool
 from stmpl_core.tools import Tools
@@ -82,6 +82,8 @@ class Lattice:
     second: vec3
     way: vec3
 
+FAR_AWAY = np.full((MOST_CHECKS, 4), 1e9)  # places that fill up those at which a field was checked
+
 
 def struct_of(name: str, doc: str, fields: dict[str, tuple[Any, str]]) -> Any:
     """A struct of arrays, by their names: type of their elements, and a letter for each axis."""
@@ -96,7 +98,7 @@ SKINS: dict[str, tuple[Any, str]] = {
     "faces": (wp.vec3i, "F"),
     "start": (wp.int32, "V"), "around": (wp.int32, "F"), "balls": (wp.vec4d, "B"),
     "grids": (Grid, "G"), "coefficients": (real, "N"), "holes": (wp.int32, "K"),
-    "looked_at": (vec3, "Kx"), "look_many": (wp.int32, "Kx"),
+    "checks": (wp.vec4d, "Gx"), "looked_at": (vec3, "Kx"), "look_many": (wp.int32, "Kx"),
     "rows": (real, "Tx"), "linked": (wp.uint32, "Vb"),
     "green": (real, "SbgR"), "soft": (real, "V"), "alike": (real, "V"), "coarse_corner": (wp.vec3i, "V"),
     "coarse_share": (vec3, "V"),
@@ -220,6 +222,7 @@ def pack(skins: Sequence[Skin], tools: Sequence[Tool], device: Any) -> tuple[Any
                 parts["coefficients"].append(field.coefficients.ravel())
                 coefficients += field.coefficients.size
             grids.append(_grid(field, offsets[id(field)]))
+            parts["checks"].append(np.concatenate([field.checks, FAR_AWAY[len(field.checks) :]])[None])
         table = response(skin.layer.tissue.poisson_ratio)
         one.half_space = table.half_space
         parts["rows"].append(table.rows)
@@ -322,6 +325,7 @@ def _grid(field: SignedDistance, offset: int) -> Any:
     out = Grid()
     out.offset, out.shape, out.spacing = offset, wp.vec3i(*field.coefficients.shape), field.spacing
     out.origin, out.surface_error, out.half = vec3(*field.origin), field.surface_error, field.half_thickness
+    out.mostly_off = field.mostly_off
     out.low, out.high = (vec3(*corner) for corner in field.tool_bounds)
     return out
 

@@ -3,9 +3,10 @@
 
 import warp as wp
 
+from stmpl_core.rays import ANYHOW, MAX_COLUMN_STRAIN, MOST_PASSED, PASSED, SECANT_START, SECANT_TOLERANCE, WALL
 from stmpl_core.rays import ENTERS as MOST_ENTERS
 from stmpl_core.rays import LOOKS_BACK as LOOKED_BACK
-from stmpl_core.rays import MAX_COLUMN_STRAIN, MOST_PASSED, PASSED, SECANT_START, SECANT_TOLERANCE, WALL
+from stmpl_core.solids import BOX, CAPSULE, NEAREST
 
 real = wp.float64  # of all geometry: float32 keeps 1e-8 m on a limb, a touch of 0.1 mm wants less
 vec3, mat33 = wp.vec3d, wp.mat33d
@@ -14,7 +15,9 @@ FAR = wp.constant(wp.float64(1e30))  # stands for infinity
 WALL_WIDTH = wp.constant(wp.float64(WALL))
 MOST_STRAIN = wp.constant(wp.float64(MAX_COLUMN_STRAIN))
 PARTS, MOST_PARTS = wp.constant(wp.float64(PASSED)), wp.constant(wp.float64(MOST_PASSED))
+SAID_ANYHOW = wp.constant(wp.float64(ANYHOW))
 ENTERS, LOOKS_BACK = wp.constant(MOST_ENTERS), wp.constant(wp.float64(LOOKED_BACK))
+IS_BOX, IS_CAPSULE, ON_AXIS = wp.constant(BOX), wp.constant(CAPSULE), wp.constant(wp.float64(NEAREST))
 START, TOLERANCE = wp.constant(wp.float64(SECANT_START)), wp.constant(wp.float64(SECANT_TOLERANCE))
 wp.set_module_options(OPTIONS)
 
@@ -30,6 +33,7 @@ class Grid:
     low: vec3
     high: vec3
     surface_error: real
+    mostly_off: real
     half: real
 
 
@@ -37,6 +41,55 @@ class Grid:
 def wall_in(grid: Grid, t: real) -> real:
     """Width over which depth rises beside a wall of the tool, in a column t long [m]."""
     return wp.min(WALL_WIDTH * t, grid.half)
+
+
+@wp.func
+def _three(coefficients: wp.array(dtype=real), k: wp.int32) -> vec3:
+    return vec3(coefficients[k], coefficients[k + 1], coefficients[k + 2])
+
+
+@wp.func
+def _jet_of(d: real, way: vec3):
+    return wp.vec4d(d, way[0], way[1], way[2])
+
+
+@wp.func
+def solid_jet(grid: Grid, coefficients: wp.array(dtype=real), at: vec3):
+    """Signed distance to a solid at a point of the tool's frame [m], and its gradient: stmpl_core.solids.solid_jet."""
+    zero, start = real(0.0), _three(coefficients, grid.offset)
+    x = at - start
+    if grid.shape[1] == IS_BOX:
+        most, square, way, nearest = real(-1e30), real(0.0), vec3(), vec3()
+        for k in range(3):
+            axis = _three(coefficients, grid.offset + 3 + 3 * k)
+            half, far = wp.length(axis), wp.dot(x, axis)
+            over, axis = wp.abs(far) / half - half, axis / half * wp.where(far > zero, real(1.0), real(-1.0))
+            if over > most:
+                most, nearest = over, axis
+            if over > zero:
+                square += over * over
+                way = way + over * axis
+        if square == zero:
+            return _jet_of(most, nearest)
+        return _jet_of(wp.sqrt(square), way / wp.sqrt(square))
+    axis, radius = _three(coefficients, grid.offset + 3) - start, coefficients[grid.offset + 6]
+    long = wp.length(axis)
+    axis = axis / wp.max(long, ON_AXIS)
+    far = wp.dot(x, axis)
+    if grid.shape[1] == IS_CAPSULE:
+        x = x - wp.clamp(far, zero, long) * axis
+        away = wp.length(x)
+        return _jet_of(away - radius, x / wp.max(away, ON_AXIS))
+    x = x - far * axis
+    away = wp.length(x)
+    aside, beyond, out = away - radius, wp.max(-far, far - long), x / wp.max(away, ON_AXIS)
+    axis = axis * wp.where(far < real(0.5) * long, real(-1.0), real(1.0))
+    if wp.min(aside, beyond) > zero:
+        d = wp.sqrt(aside * aside + beyond * beyond)
+        return _jet_of(d, (aside * out + beyond * axis) / d)
+    if aside > beyond:
+        return _jet_of(aside, out)
+    return _jet_of(beyond, axis)
 
 
 @wp.func
@@ -54,6 +107,8 @@ def cubic(f: real):
 @wp.func
 def distance_at(grid: Grid, coefficients: wp.array(dtype=real), at: vec3) -> real:
     """Signed distance at one point of the tool's frame [m]."""
+    if grid.shape[0] == 1:
+        return solid_jet(grid, coefficients, at)[0]
     u = (at - grid.origin) / grid.spacing
     first, inside = wp.vec3i(0, 0, 0), vec3(real(0.0), real(0.0), real(0.0))
     for x in range(3):
@@ -182,7 +237,8 @@ def sunk_under(grid: Grid, coefficients: wp.array(dtype=real), start: vec3, way:
     """Share to which a tool has sunk under a column's skin, from 0, it comes from beside, to 1."""
     size = wp.length_sq(top)
     if size == real(0.0) or size > real(2.0):
-        return wp.min(size, real(1.0))
+        return wp.clamp(top[0] - SAID_ANYHOW, real(0.0), real(1.0))
+    whole = wp.sqrt(size)
     s, d, step = real(0.0), along(grid, coefficients, start, way, real(0.0)), wp.int32(0)
     while step < ENTERS:
         step += 1
@@ -195,9 +251,9 @@ def sunk_under(grid: Grid, coefficients: wp.array(dtype=real), start: vec3, way:
                 step = ENTERS
     if s >= t:
         return real(0.0)
-    by = WALL_WIDTH * t
+    by = WALL_WIDTH * t / whole
     rise = distance_at(grid, coefficients, start + s * way + by * top) - d
-    return wp.clamp(rise / (LOOKS_BACK * by), real(0.0), real(1.0))
+    return whole * wp.clamp(rise / (LOOKS_BACK * WALL_WIDTH * t), real(0.0), real(1.0))
 
 
 @wp.func
@@ -215,20 +271,6 @@ def depth_and_share(grid: Grid, coefficients: wp.array(dtype=real), start: vec3,
             if within > share:
                 share = share + (within - share) * sunk_under(grid, coefficients, start, way, t, top)
     return deep, share
-
-
-@wp.func
-def strain_under(grid: Grid, coefficients: wp.array(dtype=real), start: vec3, way: vec3, t: real,
-                 top: vec3) -> real:  # fmt: skip
-    """How far the tool squeezes a column, over its thickness; rising from 0 beside the tool's walls."""
-    wall = wall_in(grid, t)
-    deep, share = depth_and_share(grid, coefficients, start, way, t, top)
-    if deep <= real(0.0):
-        return real(0.0)
-    if deep > wall:
-        inside = -along(grid, coefficients, start, way, deep - wall)
-        share = share * wp.clamp(real(2.0) * inside / wall, real(0.0), real(1.0))
-    return share * wp.min(deep / t, MOST_STRAIN)
 
 
 @wp.func
