@@ -128,16 +128,6 @@ class SignedDistance:
                 _KEPT.pop(old, None)  # another thread may have
         return built
 
-    def off(self, pose: np.ndarray, points: Points, forces: np.ndarray) -> float:
-        """How far the surface is off where it presses [m]: the mean over points, at the place beside each.
-
-        Args:
-            pose: pose_body_from_tool, (4, 4).
-            points: points of the body's frame, (N, 3) [m].
-            forces: their weights, (N,), some above 0.
-        """
-        return _off(self.checks, pose, points, forces)
-
     def opening(self, points: ArrayLike) -> float:
         """Least distance of points (N, 3) [m] of the tool's frame from the rim of a hole [m]; infinite without one."""
         return float(self._rims.query(np.asarray(points))[0].min(initial=np.inf)) if len(self.openings) else np.inf
@@ -329,8 +319,15 @@ def _node_distances(vertices: Points, faces: np.ndarray, outer: tuple[Points, np
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _off(checks, pose, points, forces):
-    """See SignedDistance.off."""
+def mean_off(checks, pose, points, forces):
+    """How far a surface is off where it presses [m]: the mean over points, at the place beside each.
+
+    Args:
+        checks: see SignedDistance.
+        pose: pose_body_from_tool, (4, 4).
+        points: points of the body's frame, (N, 3) [m].
+        forces: their weights, (N,), some above 0.
+    """
     total = whole = 0.0
     for n in range(len(points)):
         if forces[n] > 0:

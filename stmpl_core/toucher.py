@@ -24,7 +24,7 @@ from stmpl_core.nodes import Nodes, gathered, strains_under
 from stmpl_core.obstacle import REACH
 from stmpl_core.pieces import DEEP, GROUP, WIDER, pins
 from stmpl_core.rays import WALL
-from stmpl_core.sdf import SignedDistance
+from stmpl_core.sdf import SignedDistance, mean_off
 from stmpl_core.tools import Tools
 from stmpl_core.touch import (
     APART,
@@ -144,6 +144,7 @@ class Toucher:
         self._thickest = float(layer.thickness.max())
         self._inward, self.deep = self.columns.inward, Deep(self.columns)
         self._soft = soft_depth(layer.tissue)
+        mean_off(np.zeros((1, 4)), np.eye(4), np.zeros((1, 3)), np.ones(1))  # compiled now
 
     @cached_property
     def _unlearnt(self) -> list[str]:
@@ -490,7 +491,7 @@ class Toucher:
         bound = known["scale"] * doubt ** known["power"] if size > 0 else 0.0
         off = 0.0  # of a board that is thin beside the field's cells, all of its face may lie elsewhere
         if size > 0 and wrong > SURE * depth:
-            off = one.field.off(one.pose, nodes.points, forces)
+            off = mean_off(one.field.checks, one.pose, nodes.points, forces)
             bound += held.power * min(off / max(depth, 1e-300), 1.0)
         bound += SHELL * max(held.shell - SHELL_FROM, 0.0)
         if size > 0 and not layer.stacked:

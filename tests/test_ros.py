@@ -276,7 +276,7 @@ def test_a_mesh_that_cannot_be_used_is_refused_and_the_node_stays_up(device, nam
 def test_while_the_mesh_of_a_tool_is_being_prepared_others_are_answered(device, another):
     import trimesh
 
-    sphere = trimesh.creation.icosphere(6, 0.03)  # 82,000 triangles
+    sphere = trimesh.creation.icosphere(6, 0.03).apply_scale([1, 1, 1.2])  # 82,000 triangles of what is no ball
     big, before = another("big", Tool("big", sphere.vertices, sphere.faces)), len(device.got["skin/displacement"])
 
     def ready():

@@ -21,7 +21,7 @@ LAYER = plate(0.06, 5e-3, 12e-3, crossed=True, poisson_ratio=0.45)
 
 @pytest.fixture(scope="module")
 def ball() -> SignedDistance:
-    return SignedDistance.of(scenes.ball(RADIUS, 4))
+    return SignedDistance.of(scenes.ball(RADIUS, 4), spacing=0.000347121012399023)
 
 
 def solver(mu, step: float = 0.1) -> IndenterFem:

@@ -230,7 +230,7 @@ def _pins(scratch: Scratch, c: wp.int32, s: wp.int32, k: wp.int32, lane: wp.int3
 
 @wp.func
 def _off(skins: Skins, grid: wp.int32, at: vec3) -> real:
-    """How far a distance field is off at the place beside a point of the tool's frame [m]: stmpl_core.sdf._off."""
+    """How far a distance field is off at the place beside a point of the tool's frame [m]: stmpl_core.sdf.mean_off."""
     least, off = real(1e30), real(0.0)
     for j in range(skins.checks.shape[1]):
         one = skins.checks[grid, j]
