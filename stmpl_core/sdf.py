@@ -35,7 +35,8 @@ ONE, TWO, THREE = np.uint64(1), np.uint64(2), np.uint64(3)
 SIXTH = 1 / 6  # dividing takes several times as long as multiplying
 MOST_KEPT, MOST_KEPT_BYTES = 16, 8e6  # fields that are kept for the next caller, and the largest of them
 MOST_OPENINGS, NO_POINTS = 1000, np.empty((0, 3))  # places at the rims of holes that are kept
-CHECKED = 100  # places at which a field is checked
+CHECKED, ALIKE = 100, 3  # places at which a field is checked, and how many of these say what it is off at one
+NO_CHECKS = np.empty((0, 4))
 MOST_CHECKS = CHECKED + 27  # number of them with those farthest out
 PROBED, THICK = 600, 5e-3  # places of a tool from which its thickness is told, and the largest half of it [m]
 ROUNDING_WIDTH = 0.57  # width of the smoothing over the radius that it gives a right-angled edge, measured
@@ -65,7 +66,8 @@ class SignedDistance:
         surface_error: largest |distance| at the vertices and face centres of the mesh, where it should be 0 [m].
         tool_bounds: lowest and highest corner of the mesh, (3,) [m] each.
         half_thickness: how far inside the tool one gets at most from most of its surface [m]; at most THICK.
-        checks: places spread over the surface, and those farthest out, with the distance there, (K, 4) [m].
+        checks: places spread over the surface, and those farthest out, with how far that is off around each: the least
+            of ALIKE places, as edges are off by more than faces, (K, 4) [m]; none where edges are rounded on purpose.
         openings: places at the rims of its holes, (K, 3) [m].
     """
 
@@ -77,7 +79,7 @@ class SignedDistance:
     surface_error: float
     tool_bounds: tuple[np.ndarray, np.ndarray]
     half_thickness: float = math.inf
-    checks: np.ndarray = field(default_factory=lambda: np.empty((0, 4)))
+    checks: np.ndarray = field(default_factory=lambda: NO_CHECKS)
     openings: Points = field(default_factory=lambda: NO_POINTS)
 
     @classmethod
@@ -116,8 +118,10 @@ class SignedDistance:
             coefficients, origin, spacing = solid, used.min(axis=0), finest
         error = float(np.abs(_distances(coefficients, origin, spacing, seen)).max())
         half = _half_thickness(coefficients, origin, spacing, *outer)
-        places = _spread_over(*outer)
-        checks = np.column_stack([places, np.abs(_distances(coefficients, origin, spacing, places))])
+        places = _spread_over(*outer) if not rounding else NO_POINTS
+        away = np.abs(_distances(coefficients, origin, spacing, places))
+        checks = np.column_stack([places, away[KDTree(places).query(places, ALIKE)[1]].min(axis=1)]) \
+            if len(places) else NO_CHECKS
         rims = NO_POINTS if watertight else openings(vertices, faces)
         rims = rims[:: 1 + len(rims) // MOST_OPENINGS]
         box = used.min(axis=0), used.max(axis=0)

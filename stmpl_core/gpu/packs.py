@@ -82,7 +82,7 @@ class Lattice:
     second: vec3
     way: vec3
 
-FAR_AWAY = np.full((MOST_CHECKS, 4), 1e9)  # places that fill up those at which a field was checked
+FAR_AWAY = np.tile([1e9, 1e9, 1e9, 0.0], (MOST_CHECKS, 1))  # places that fill up those at which a field was checked
 
 
 def struct_of(name: str, doc: str, fields: dict[str, tuple[Any, str]]) -> Any:
