@@ -185,7 +185,7 @@ def test_a_tool_is_taken_away_and_the_others_go_on(bus):
 
 
 def test_a_tool_that_is_taken_away_while_its_field_is_built_is_not_taken_into_use(bus):
-    sphere = trimesh.creation.icosphere(5, 0.03)
+    sphere = trimesh.creation.icosphere(5, 0.03).apply_scale([1, 1, 1.2])  # no ball: its field takes a while
     bus.mesh.publish(tool_message(Tool("early", sphere.vertices, sphere.faces), bus.now()))
     early = Hand(bus, "early", announce=False)
     early.take_away()
