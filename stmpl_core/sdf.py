@@ -111,7 +111,7 @@ class SignedDistance:
         finest = field_spacing(float(areas(vertices[faces]).sum()), np.ptp(used, axis=0), margin)
         solid = solid_of(vertices, faces, finest) if watertight and spacing is None and not rounding else None
         if solid is None:
-            made = _on_grid(mesh, vertices, faces, watertight, spacing, margin, rounding)
+            made = _on_grid(mesh, vertices, faces, watertight, spacing, finest, margin, rounding)
             coefficients, origin, spacing, outer, seen = made
         else:
             outer, seen = _whole(vertices, faces)
@@ -199,15 +199,18 @@ def _checked(mesh: Tool) -> tuple[Points, np.ndarray, bool, bool]:
     return np.ascontiguousarray(vertices), faces, watertight, flipped
 
 
-def _on_grid(mesh: Tool, vertices: Points, faces: np.ndarray, watertight: bool, spacing: float | None, margin: float,
-             rounding: float) -> tuple[np.ndarray, np.ndarray, float, tuple[Points, np.ndarray], Points]:  # fmt: skip
-    """Coefficients, origin and spacing of a spline for a surface; what is outside of it, and places on that."""
+def _on_grid(mesh: Tool, vertices: Points, faces: np.ndarray, watertight: bool, spacing: float | None, finest: float,
+             margin: float, rounding: float) -> tuple[np.ndarray, np.ndarray, float, tuple[Points, np.ndarray],
+                                                      Points]:  # fmt: skip
+    """Coefficients, origin and spacing of a spline for a surface; what is outside of it, and places on that.
+
+    finest: spacing that all of the surface would have, its inner walls too [m].
+    """
     from scipy import ndimage  # who only reads a field need not wait for what builds it
 
     used = vertices[np.unique(faces)]
     low, extent = used.min(axis=0), np.ptp(used, axis=0)
-    area = float(areas(vertices[faces]).sum())
-    outer, seen = _outside(vertices, faces, field_spacing(area, extent, margin))
+    outer, seen = _outside(vertices, faces, finest)
     chosen = spacing is None
     if spacing is None:
         spacing = field_spacing(float(areas(outer[0][outer[1]]).sum()), extent, margin)
@@ -259,25 +262,27 @@ def _finer(coarse: np.ndarray) -> np.ndarray:
 
 def _spread_over(vertices: Points, faces: np.ndarray) -> Points:
     """Places of a surface by its area, CHECKED of them, and middles of the triangles farthest out each way, (K, 3)."""
-    corners, rng, ways = vertices[faces], np.random.default_rng(1), np.array(list(np.ndindex(3, 3, 3))) - 1.0
-    area, middles = areas(corners), corners.mean(axis=1)
-    some = corners[rng.choice(len(faces), CHECKED, p=area / area.sum())]
-    shares = np.diff(np.sort(rng.uniform(size=(CHECKED, 2))), prepend=0.0, append=1.0)
+    middles, ways = vertices[faces].mean(axis=1), np.array(list(np.ndindex(3, 3, 3))) - 1.0
     farthest = np.unique((middles @ ways.T).argmax(axis=0))
-    return np.concatenate([np.einsum("pc,pcx->px", shares, some), middles[farthest]])
+    return np.concatenate([_anywhere(vertices[faces], CHECKED, 1)[0], middles[farthest]])
+
+
+def _anywhere(corners: np.ndarray, many: int, seed: int) -> tuple[Points, np.ndarray]:
+    """Places of triangles (F, 3, 3) by their areas, (K, 3), and the corners of the triangle of each, (K, 3, 3)."""
+    area, rng = areas(corners), np.random.default_rng(seed)
+    some = corners[rng.choice(len(corners), many, p=area / area.sum())]
+    shares = np.diff(np.sort(rng.uniform(size=(many, 2))), prepend=0.0, append=1.0)
+    return np.einsum("pc,pcx->px", shares, some), some
 
 
 def _half_thickness(coefficients: np.ndarray, origin: np.ndarray, spacing: float, vertices: Points,
                     faces: np.ndarray) -> float:  # fmt: skip
     """See SignedDistance; from PROBED places of the surface, a third of which may be less thick: edges are."""
-    corners, rng = vertices[faces], np.random.default_rng(0)
-    area = areas(corners)
-    some = rng.choice(len(faces), PROBED, p=area / area.sum())
-    shares = np.diff(np.sort(rng.uniform(size=(PROBED, 2))), prepend=0.0, append=1.0)
-    a, b, c = np.swapaxes(corners[some], 0, 1)
-    inwards = -np.cross(b - a, c - a) / (2 * area[some, None])
+    there, some = _anywhere(vertices[faces], PROBED, 0)
+    a, b, c = np.swapaxes(some, 0, 1)
+    inwards = -np.cross(b - a, c - a) / (2 * areas(some)[:, None])
     way = np.linspace(0.0, THICK, 1 + int(THICK / min(max(0.5 * spacing, 2e-4), 1e-3)))[1:]
-    places = np.einsum("pc,pcx->px", shares, corners[some])[:, None] + way[:, None] * inwards[:, None]
+    places = there[:, None] + way[:, None] * inwards[:, None]
     inside = -_distances(coefficients, origin, spacing, places.reshape(-1, 3)).reshape(PROBED, -1)
     inside[np.cumsum(inside <= 0, axis=1) > 0] = 0.0  # beyond the tool's other side
     return max(float(np.quantile(inside.max(axis=1), 2 / 3)), 0.25 * spacing)

@@ -15,19 +15,7 @@ from stmpl_core.gpu.blocks import least_of, most_of, sum_before, sum_of
 from stmpl_core.gpu.looks import CHARTS, FACING, inward_on, point_on, thickness_on
 from stmpl_core.gpu.packs import Lattice, Scratch, Skins
 from stmpl_core.gpu.places import APART, BY_POSE, DEEP, OVERFULL, PENDING
-from stmpl_core.gpu.rays import (
-    FAR,
-    MOST_STRAIN,
-    OPTIONS,
-    WALL_WIDTH,
-    Grid,
-    along,
-    depth_and_share,
-    depth_at,
-    real,
-    vec3,
-    wall_in,
-)
+from stmpl_core.gpu.rays import FAR, OPTIONS, WALL_WIDTH, depth_at, real, strain_under, vec3
 
 NODES = wp.constant(wp.float64(law.NODES))
 MOST, MOST_PLACES = wp.constant(wp.float64(law.MOST)), wp.constant(wp.float64(law.MOST_LOOKED_AT))
@@ -71,21 +59,6 @@ def _area_seen(scratch: Scratch, c: wp.int32, unit: real) -> real:
         share = (_steps(fine, unit) - wp.max(step, other)) / BLEND + real(0.5)
         seen = fine + wp.clamp(share, real(0.0), real(1.0)) * (coarse - fine)
     return seen
-
-
-@wp.func
-def strain_under(grid: Grid, coefficients: wp.array(dtype=real), start: vec3, way: vec3, t: real,
-                 top: vec3) -> real:  # fmt: skip
-    """How far the tool squeezes a column, over its thickness; rising from 0 beside the tool's walls."""
-    wall = wall_in(grid, t)
-    deep, share = depth_and_share(grid, coefficients, start, way, t, top)
-    if deep <= real(0.0):
-        return real(0.0)
-    if deep > wall:
-        inside = -along(grid, coefficients, start, way, deep - wall)
-        inside = wp.clamp(real(2.0) * inside / wall, real(0.0), real(1.0))
-        share = share * (real(1.0) - (real(1.0) - inside) * wp.min(deep / wall - real(1.0), real(1.0)))
-    return share * wp.min(deep / t, MOST_STRAIN)
 
 
 @wp.kernel

@@ -274,6 +274,21 @@ def depth_and_share(grid: Grid, coefficients: wp.array(dtype=real), start: vec3,
 
 
 @wp.func
+def strain_under(grid: Grid, coefficients: wp.array(dtype=real), start: vec3, way: vec3, t: real,
+                 top: vec3) -> real:  # fmt: skip
+    """How far the tool squeezes a column, over its thickness; rising from 0 beside the tool's walls."""
+    wall = wall_in(grid, t)
+    deep, share = depth_and_share(grid, coefficients, start, way, t, top)
+    if deep <= real(0.0):
+        return real(0.0)
+    if deep > wall:
+        inside = -along(grid, coefficients, start, way, deep - wall)
+        inside = wp.clamp(real(2.0) * inside / wall, real(0.0), real(1.0))
+        share = share * (real(1.0) - (real(1.0) - inside) * wp.min(deep / wall - real(1.0), real(1.0)))
+    return share * wp.min(deep / t, MOST_STRAIN)
+
+
+@wp.func
 def depth_at(grid: Grid, coefficients: wp.array(dtype=real), start: vec3, way: vec3, t: real, top: vec3) -> real:
     """Depth of the skin in the tool [m], or where the tool has sunk under it, of its column."""
     depth = -distance_at(grid, coefficients, start)

@@ -6,10 +6,9 @@ import warp as wp
 from stmpl_core import twins
 from stmpl_core.gpu.conforms import ONE_WAY
 from stmpl_core.gpu.field_packs import FieldScratch
-from stmpl_core.gpu.lattice import strain_under
 from stmpl_core.gpu.packs import Scratch, Skins
 from stmpl_core.gpu.places import BY_POSE
-from stmpl_core.gpu.rays import OPTIONS, real, vec3
+from stmpl_core.gpu.rays import OPTIONS, real, strain_under, vec3
 
 PLACE, HERE, SEEN = (wp.constant(wp.float64(most * most / 3**0.5)) for most in (twins.APART, twins.HERE, twins.AROUND))
 COVERED, GIVES = wp.constant(wp.float64(twins.COVERED)), wp.constant(wp.float64(twins.GIVES))
