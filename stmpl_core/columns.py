@@ -30,8 +30,8 @@ from stmpl_core.sdf import SignedDistance, distance_at
 from stmpl_core.soundness import too_long
 from stmpl_core.touch import MIN_ONE_WAY_SHARE
 
-LEAST_UNDER = 0.05  # how much further inside a tool a column gets below its skin than there, over the width of a wall;
-# at twice of it the tool has sunk under skin altogether
+LEAST_UNDER, ALL_UNDER = 0.05, 0.3  # how much further inside a tool a column gets below its skin than there, or nearer
+# to it than there and at its core, over the width of a wall, where the tool begins to sink under skin, and where it has
 BLOCK = 32  # columns that are looked at together
 FINEST = 0.02  # size of the parts of a long triangle at which the search for a tool in it ends, over the thickness
 HOLE_RADIUS = 0.6  # farthest point of a triangle from its corners, over the edge length (equilateral: 0.577)
@@ -325,12 +325,17 @@ def _squeezed(grid, pose, centre, points, inward, thickness, faces, start, aroun
     """
     covered, under, wall = near[least < hole], -np.inf, 0.0
     for n in range(len(near)):
-        under = max(under, -least[n] - max(-above[n], 0.0))
-        wall += WALL * thickness[near[n]] / len(covered) if least[n] < hole else 0.0
+        if least[n] < hole:  # of a thin tool between two vertices these know that it leans under skin
+            v = near[n]
+            wall += WALL * thickness[v] / len(covered)
+            under = max(under, -least[n] - max(-above[n], 0.0))
+            if above[n] - least[n] > under:
+                end = distance_in_column(grid, ray_of(pose, points, inward, v), thickness[v])
+                under = max(under, min(above[n], end) - least[n])
     top = NOT_SUNK.copy()
     if under > LEAST_UNDER * wall:  # a layer that is thin beside the limb has no columns that lead so far aside
-        top = _top(pose, inward, near, above) if stacked else UNSAID.copy()
-        share = min(under / (LEAST_UNDER * wall) - 1, 1.0)
+        top = _top(pose, inward, near, least, above, hole) if stacked else UNSAID.copy()
+        share = min((under / wall - LEAST_UNDER) / (ALL_UNDER - LEAST_UNDER), 1.0)
         top = top - (1 - share) if top[0] > ANYHOW else share * top
     found, vertices, depth, rests = _cover(grid, pose, points, inward, thickness, faces, start, around, slot, covered,
                                            top)  # fmt: skip
@@ -341,9 +346,16 @@ def _squeezed(grid, pose, centre, points, inward, thickness, faces, start, aroun
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _top(pose, inward, near, above):
-    """Against the mean inward normal of columns whose skin a tool has met, in its frame, (3,); UNSAID if none is."""
-    way, out = _one_way(inward[near], np.maximum(-above, 0.0)), np.zeros(3)
+def _top(pose, inward, near, least, above, hole):
+    """Against the mean inward normal of columns that a tool meets, in its frame, (3,); UNSAID if they have no one way.
+
+    They count by how deep it is in them, and the less the farther their skin is beside it: nothing jumps as it comes to
+    the skin of a vertex, of which a thin tool meets now one and now none.
+    """
+    weights, out = np.empty(len(near)), np.zeros(3)
+    for n in range(len(near)):
+        weights[n] = max(hole - least[n], 0.0) * np.exp(-max(above[n], 0.0) / hole)
+    way = _one_way(inward[near], weights)
     if not way.any():
         return UNSAID.copy()
     for x in range(3):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from benchmarks.living_limbs import site
-from stmpl_core import Tool
+from stmpl_core import Membrane, Ply, Tissue, Tool
 from stmpl_core.body import Body
 from stmpl_core.columns import Columns, Squeeze, grid_of
 from stmpl_core.living import living
@@ -17,6 +17,7 @@ from stmpl_core.sdf import SignedDistance
 from tests.scenes import LENGTH, RADIUS, at, ball, box, capsule, enlarged, limb, placed, plate, punch, scaled, turn
 
 LIMB, PLATE = limb(), plate()
+STACK = Tissue(3e3, 0.4, skin=Membrane(2e5, 1.5e-3, 15.0), deeper=(Ply(8e-3, 15e3, 0.4),))
 MARGIN = 5e-3  # m
 
 
@@ -263,6 +264,24 @@ def test_a_tool_has_sunk_under_columns_that_enter_it_from_above() -> None:
     assert 0 < under(0.03, 0.001, -1, 0) < 1 and under(0.03, 0.0, -1, 0) == pytest.approx(0.0, abs=0.5)
     assert under(0.03, 0.02, 0, -1) == 0  # past it
     assert under(0, 0.02, 0, -1, NOT_SUNK) == 0 and under(0.03, -0.012, -1, 0.1, UNSAID) == 1
+
+
+@pytest.mark.parametrize("stacked", [False, True])
+@pytest.mark.parametrize("lean", [0.32, 0.44])
+def test_a_leaning_stylus_sinks_under_skin_without_a_step_whatever_the_mesh(lean: float, stacked: bool) -> None:
+    """Its vertices are farther apart than the stylus is wide: none may be there where it comes under the skin."""
+    stylus, pose, depths = punch(0.003, 0.06), turn((1, 0, 0), lean), np.arange(4e-3, 10e-3, 2e-5)
+    tip, field, volumes = float((stylus.vertices @ pose[2, :3]).min()), SignedDistance.of(stylus, margin=0.02), []
+    for edge in (4e-3, 6e-3, 8e-3):
+        layer = plate(0.096, edge, 0.02)
+        columns = Columns(layer.with_(tissue=STACK) if stacked else layer)
+        for depth in depths:
+            pose[:3, 3] = 1e-3, 2e-3, -depth - tip
+            nodes = columns.squeezed(field, pose).nodes
+            volumes.append(float(nodes.area @ (nodes.strain * nodes.thickness)))
+    by_mesh = np.array(volumes).reshape(3, -1)
+    assert np.abs(np.diff(np.log(by_mesh))).max() < 0.02
+    assert np.abs(by_mesh / by_mesh[0] - 1).max() < 0.02
 
 
 @pytest.mark.parametrize("radius", [0.03, 0.04, 0.06, 0.08])

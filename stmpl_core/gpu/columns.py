@@ -4,16 +4,17 @@
 import warp as wp
 
 from stmpl_core import rays
+from stmpl_core.columns import ALL_UNDER, LEAST_UNDER, MIN_ONE_WAY_SHARE
 from stmpl_core.columns import BLOCK as IN_BLOCK
-from stmpl_core.columns import LEAST_UNDER, MIN_ONE_WAY_SHARE
 from stmpl_core.deep import DEEPEST
 from stmpl_core.gpu.blocks import sum_before
 from stmpl_core.gpu.packs import EDGE_BIT, OneSkin, Scratch, Skins
 from stmpl_core.gpu.places import APART, DEEP, OVERFULL, PENDING
-from stmpl_core.gpu.rays import FAR, OPTIONS, WALL_WIDTH, clearance_of, depth_and_share, real, vec3
+from stmpl_core.gpu.rays import FAR, OPTIONS, WALL_WIDTH, along, clearance_of, depth_and_share, real, vec3
 
 BLOCK, EDGE = wp.constant(IN_BLOCK), wp.constant(EDGE_BIT)
 UNDER, TOO_DEEP = wp.constant(wp.float64(LEAST_UNDER)), wp.constant(wp.float64(DEEPEST))
+SINKS = wp.constant(wp.float64(ALL_UNDER - LEAST_UNDER))
 ANYHOW, ONE_WAY = wp.constant(wp.float64(rays.ANYHOW)), wp.constant(wp.float64(MIN_ONE_WAY_SHARE))
 wp.set_module_options(OPTIONS)
 
@@ -138,18 +139,23 @@ def gather_clearance(again: wp.int32, skins: Skins, scratch: Scratch):
     c = wp.tid()
     if not _looks(scratch, c, again):
         return
-    one = skins.one[scratch.skin[c]]
+    one, grid, pose = skins.one[scratch.skin[c]], skins.grids[scratch.grid[c]], wp.transpose(scratch.pose[c])
     nearest, around, under, wall, covers = real(FAR), -FAR, -FAR, real(0.0), wp.int32(0)
     met, whole = vec3(), real(0.0)
     for n in range(scratch.count[c]):
         least, above = scratch.least[c, n], scratch.above[c, n]
         nearest = wp.min(nearest, least)
         around = wp.max(around, -above)
-        whole += wp.max(-above, real(0.0))
-        met = met + wp.max(-above, real(0.0)) * skins.inward[scratch.columns[c, n]]
-        under = wp.max(under, -least - wp.max(-above, real(0.0)))
+        weight = wp.max(one.hole - least, real(0.0)) * wp.exp(-wp.max(above, real(0.0)) / one.hole)
+        whole += weight
+        met = met + weight * skins.inward[scratch.columns[c, n]]
         if again == 0 and least < one.hole:
             v = scratch.columns[c, n]
+            under = wp.max(under, -least - wp.max(-above, real(0.0)))
+            if above - least > under:
+                start, way = pose * (skins.points[v] - scratch.place[c]), pose * skins.inward[v]
+                end = along(grid, skins.coefficients, start, way, skins.thickness[v])
+                under = wp.max(under, wp.min(above, end) - least)
             wall += skins.thickness[v]
             covers += 1
             _mark(scratch.covered, c, v - one.first)
@@ -161,10 +167,10 @@ def gather_clearance(again: wp.int32, skins: Skins, scratch: Scratch):
     if covers == 0:
         scratch.status[c] = APART
     elif under > UNDER * WALL_WIDTH * wall / real(covers):
-        share = wp.min(under / (UNDER * WALL_WIDTH * wall / real(covers)) - real(1.0), real(1.0))
+        share = wp.min((under / (WALL_WIDTH * wall / real(covers)) - UNDER) / SINKS, real(1.0))
         scratch.top[c] = (ANYHOW + share) * vec3(real(1.0), real(1.0), real(1.0))
         if one.stacked == 1 and wp.length(met) > ONE_WAY * whole:
-            scratch.top[c] = -share * (wp.transpose(scratch.pose[c]) * wp.normalize(met))
+            scratch.top[c] = -share * (pose * wp.normalize(met))
 
 
 @wp.func
