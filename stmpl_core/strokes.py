@@ -42,6 +42,7 @@ OWN_FORCE = 0.01  # error of the law of relaxation while a tool stays, over the 
 STAYS = 3e-4  # way along the skin within which a tool stays [m]
 MAX_RESIDUAL = 0.06  # relative error of the forces that may be left; with more it is not that series
 MAX_SHARE_ERROR = 0.1  # standard error of the share of the force that fades [-]
+MIN_SEEN = 0.2  # least part of the series' fading between half the largest force and the last instant [-]
 
 
 @dataclass(frozen=True)
@@ -327,7 +328,12 @@ def _faded(rows: np.ndarray, forces: np.ndarray, when: np.ndarray, shares: np.nd
     lasts = np.gradient(when)
     root = np.sqrt(lasts / lasts.mean())[:, None]
     (stiff, eased), *_ = np.linalg.lstsq(root * rows, root[:, 0] * forces, rcond=None)
-    largest, whole = float(forces.max()), float(when[-1] - when[0])
+    largest, whole, told = float(forces.max()), float(when[-1] - when[0]), _timing(when, taken)
+    fades, half = -rows[:, 1] / rows[:, 0] / float(shares.sum()), int(np.argmax(rows[:, 0] > 0.5 * rows[:, 0].max()))
+    seen = float(fades[-1] - fades[half])
+    if seen < MIN_SEEN:
+        return _no_fading(f"{told} hold {seen:.0%} of the fading, {MIN_SEEN:.0%} is needed: are the times in seconds? Press "
+                          "quickly, and hold longer")  # fmt: skip
     if not (stiff > 0 and largest > 0):
         return _no_fading(WRONG_WAY)
     left = root[:, 0] * (forces - rows @ (stiff, eased))
@@ -338,6 +344,9 @@ def _faded(rows: np.ndarray, forces: np.ndarray, when: np.ndarray, shares: np.nd
     spread = float(np.sqrt(slope @ normal @ slope)) * largest
     spread *= math.hypot(OWN_FORCE, residual / math.sqrt(len(rows)))
     share, error = factor * float(shares.sum()), spread * float(shares.sum())
+    if not -2 * error <= share < 1:
+        return _no_fading(f"{share:.0%} of the force would fade: it does not go as under a tool that stays. {told} "
+                          "tell it so: are the times in seconds?")  # fmt: skip
     trust = Trust()
     if residual > MAX_RESIDUAL:
         trust = trust.also(f"these times leave the forces off by {residual:.0%}, at most {MAX_RESIDUAL:.0%} is "
@@ -345,13 +354,16 @@ def _faded(rows: np.ndarray, forces: np.ndarray, when: np.ndarray, shares: np.nd
     if error > MAX_SHARE_ERROR:
         trust = trust.also(f"{whole:.1f} s of pressing tell the share that fades to {error:.0%} only, "
                            f"{MAX_SHARE_ERROR:.0%} is needed. Press quickly, and hold longer", converged=False)
-    if not -2 * error <= share < 1:
-        trust = trust.also(f"{share:.0%} of the force would fade: it does not go as under a tool that stays",
-                           converged=False)  # fmt: skip
     series = None
     if trust.ok and factor > 0:
         series = Prony(tuple(factor * g for g in taken.shares), taken.times, "measured by a press that stayed")
     return Fading(share, error, series, whole, residual, trust)
+
+
+def _timing(when: np.ndarray, taken: Prony) -> str:
+    """The times of a press (N,) [s] and those of its series, in words."""
+    every, times = float(np.median(np.diff(when))), " and ".join(f"{time:.3g}" for time in taken.times)
+    return f"{when[-1] - when[0]:.3g} s of pressing, told every {every:.3g} s, of skin that fades in {times} s"
 
 
 def _at(toucher: Toucher, one: Contact, shift: np.ndarray) -> Touch:

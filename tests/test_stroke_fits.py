@@ -154,6 +154,15 @@ def test_a_short_hold_or_a_slide_tells_no_relaxation(toucher: Toucher) -> None:
     assert not moving.trust.ok and "Press, and hold" in moving.trust.why
 
 
+@pytest.mark.parametrize("unit", [1e-3, 1e-2, 1e3])
+def test_a_press_whose_times_are_not_in_seconds_tells_no_relaxation(toucher: Toucher, unit: float) -> None:
+    """It was told that 1816 % of the force fade, or 93 %, where 35 % do."""
+    given = [replace(one, time=unit * one.time) for one in measured(*held(10.0), None, SERIES)]
+    found = fit_relaxation(toucher, given, SERIES)
+    assert not found.trust.ok and np.isnan(found.share) and found.relaxation is None
+    assert "are the times in seconds?" in found.trust.why and "0.5 and 5 s" in found.trust.why, found.trust.why
+
+
 def test_what_tells_nothing_by_its_kind_is_refused(toucher: Toucher) -> None:
     bare = [Contact(BALL, at(0, 0, RADIUS - DEPTH))]
     both = [Contact(one, at(0, 0, RADIUS - DEPTH), np.array([0, 0, -1.0, 0, 0, 0])) for one in (BALL, BALL.named("b"))]
