@@ -56,7 +56,8 @@ def carried(state: State, skin: Skin, after: Skin) -> State:
         raise InvalidInput(f"this state was told at {many} joint{'s' * (many > 1)}; this skin has "
                            f"{', '.join(names) or 'none'}. Try an empty State().")  # fmt: skip
     before = skin if skin.angles == state.joints else skin.posed(dict(zip(names, state.joints, strict=False)))
-    return State({name: _memory(memory, before, after) for name, memory in state.tools.items()}, after.angles)
+    memories = {name: _memory(memory, before, after) for name, memory in state.tools.items()}
+    return replace(state, tools=memories, joints=after.angles)
 
 
 def carry_at(before: Skin, after: Skin, place: np.ndarray) -> Transform:

@@ -11,6 +11,7 @@ from collections.abc import Mapping, Sequence
 from copy import copy
 from functools import cached_property
 from typing import Any
+from zlib import crc32
 
 import numpy as np
 
@@ -57,6 +58,7 @@ class History:
         self.series = series_of(layer.tissue, thickness)
         self._fades = fading(layer.tissue, thickness)
         self._last: State | None = None  # state of the last step, which is one of this skin
+        self._skin = crc32(layer.thickness.tobytes(), crc32(layer.faces.tobytes(), crc32(layer.vertices.tobytes())))
 
     @cached_property
     def sideways(self) -> Sideways:
@@ -103,7 +105,8 @@ class History:
         """Touches of contacts with names of their own, dt [s] after a state; and the state then.
 
         Raises:
-            InvalidInput: a state of skin that relaxes in another number of times, or whose joints were elsewhere.
+            InvalidInput: a state of another skin, one that relaxes in another number of times, or whose joints were
+                elsewhere.
         """
         if state is not self._last:
             self._check(state)
@@ -132,7 +135,7 @@ class History:
         for name in names[many:]:
             if not (memories[name].scalars.sunk or memories[name].trail.any()):
                 del memories[name]
-        self._last = State(memories, here)
+        self._last = State(memories, here, self._skin)
         return touches, self._last
 
     def _check(self, state: State) -> None:
@@ -141,6 +144,9 @@ class History:
         if state.tools and state.joints != here:
             raise InvalidInput(f"the skin's joints are at {here} rad, the state was told at {state.joints}. Try "
                                "Simulator.touch, which takes it along.")  # fmt: skip
+        if state.tools and state.skin not in (None, self._skin):
+            raise InvalidInput(f"the state of {', '.join(state.tools)} is of skin of another shape. Try an empty "
+                               "State().")  # fmt: skip
         for name, memory in state.tools.items():
             if memory.terms != len(self.series.times):
                 raise InvalidInput(f"the state of {name} is of skin with {memory.terms} times of relaxation; "

@@ -178,10 +178,12 @@ class State:
         tools: memory of each tool that touches or has touched, by name.
         joints: angle of each joint of the skin's rig at which it is told [rad], in whose axes it is; empty: at rest;
             None: nobody said, which only a skin without joints may read.
+        skin: number of the shape of the skin that it is of, which is not packed; None: not known.
     """
 
     tools: Mapping[str, Memory] = field(default_factory=dict)
     joints: tuple[float, ...] | None = ()
+    skin: int | None = None
 
     @property
     def finite(self) -> bool:
@@ -211,6 +213,8 @@ class State:
         Raises:
             InvalidInput: bytes of another kind.
         """
+        if not isinstance(packed, bytes | bytearray | memoryview | np.ndarray):
+            raise InvalidInput(f"a packed state is {packed!r:.40}; bytes are needed, as State.pack gives them.")
         head, _, rest = bytes(packed).partition(b"\n")
         try:
             told = json.loads(head)

@@ -347,6 +347,9 @@ def test_bytes_of_another_kind_are_no_state() -> None:
                   b'{"version": 2, "terms": -1, "tools": []}\n', b'{"version": 2, "terms": 1e400, "tools": []}\n'):
         with pytest.raises(InvalidInput):
             State.unpack(wrong)
+    for wrong in (None, "abc", 3):
+        with pytest.raises(InvalidInput, match="bytes are needed"):
+            State.unpack(wrong)  # type: ignore[arg-type]
 
 
 def test_a_state_is_a_value_whatever_becomes_of_pose_and_touch(sim: Simulator) -> None:
@@ -369,6 +372,17 @@ def test_a_state_of_other_skin_is_refused(sim: Simulator, elastic: Simulator) ->
            for name, one in state.tools.items()}  # fmt: skip
     with pytest.raises(InvalidInput, match="where this skin is not"):
         sim.touch([pressed(2e-3)], State(far), 0.1)
+
+
+def test_a_state_of_elastic_skin_of_another_shape_is_refused(elastic: Simulator) -> None:
+    """It answered 0 N, and said that the tool had come with too little work."""
+    _, state = elastic.touch([pressed(2e-3)], State(), 0.1)
+    layer = elastic.layer.with_(thickness=2 * elastic.layer.thickness)
+    with pytest.raises(InvalidInput, match=f"state of {BALL.name} is of skin of another shape"):
+        Simulator(layer, Winkler()).touch([pressed(2e-3)], state, 0.1)
+    for again in (state, pickle.loads(pickle.dumps(state)), State.unpack(state.pack())):
+        (same,), _ = Simulator(elastic.layer.with_(youngs_modulus=2e4), Winkler()).touch([pressed(2e-3)], again, 0.1)
+        assert same.trust.ok and same.force > 0
 
 
 def test_time_without_end_is_refused(sim: Simulator) -> None:
