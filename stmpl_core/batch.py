@@ -81,6 +81,8 @@ class Batch:
         some = list(skins) if isinstance(skins, Sequence) else [skins]
         count = len(some) if n is None else n
         self.skins = some if isinstance(skins, Sequence) or not isinstance(count, Integral) else some * count
+        if not isinstance(tools, Iterable):
+            raise InvalidInput(f"tools are {tools!r:.40}; a list of Tool is needed.")
         self.tools = list(tools)
         if not all(isinstance(skin, Skin) for skin in self.skins):
             raise InvalidInput("a batch needs prepared skins. Try Skin.of(layer, MomentNet()).")
@@ -95,8 +97,8 @@ class Batch:
         if not self.tools or len({tool.name for tool in self.tools}) < len(self.tools):
             raise InvalidInput("a batch needs tools, each with a name of its own. Try tool.named('left').")
         many = len(os.sched_getaffinity(0)) if threads is None else threads
-        if many < 1:
-            raise InvalidInput(f"threads is {many}; at least 1 is needed.")
+        if not isinstance(many, Integral) or many < 1:
+            raise InvalidInput(f"threads is {many!r:.40}; a whole number of at least 1 is needed.")
         self._friction, self._threads, self._own = friction, many, threading.local()
         self._stores: dict[int, Tools] = {}
         for skin in self.skins:  # what is slow to make is made here, once
@@ -129,16 +131,22 @@ class Batch:
         Raises:
             InvalidInput: shapes, states or numbers of scenes that do not fit, or a dt below 0 or not finite.
         """
-        n, many, wanted = len(self.skins), len(self.tools), set(fields)
+        n, many = len(self.skins), len(self.tools)
+        if not isinstance(fields, Iterable):
+            raise InvalidInput(f"fields is {fields!r:.40}; a list of numbers of scenes is needed.")
+        wanted = set(fields)
         matrices = _matrices(poses, n, many)
         if states is not None and not hasattr(states, "__len__"):
             raise InvalidInput(f"states are {states!r:.40}; a list of one State or None for each scene is needed.")
         if states is not None and len(states) != n:
             raise InvalidInput(f"{len(states)} states do not fit {n} scenes.")
         if not wanted <= set(range(n)):
-            raise InvalidInput(f"fields are asked for scenes {sorted(wanted)}; there are {n}.")
+            raise InvalidInput(f"fields are asked for scenes {sorted(wanted, key=str)}; there are {n}.")
         check_dt(dt)
-        wrenches = np.zeros((n, many, 6)) if out is None else np.asarray(out)
+        try:
+            wrenches = np.zeros((n, many, 6)) if out is None else np.asarray(out)
+        except (TypeError, ValueError, RuntimeError) as error:  # torch: on a GPU, or with a gradient
+            raise InvalidInput(f"out takes no numbers: {error}.") from error
         if wrenches.shape != (n, many, 6) or (out is not None and not np.shares_memory(wrenches, np.asarray(out))):
             raise InvalidInput(f"out has shape {wrenches.shape}; ({n}, {many}, 6) is needed, on a CPU.")
         if wrenches.dtype.kind != "f" or not wrenches.flags.writeable:
@@ -195,7 +203,7 @@ def _matrices(poses: Any, n: int, many: int) -> np.ndarray:
     """Poses as matrices, (n, K, 4, 4); those that are not finite stay so."""
     try:
         given = np.asarray(real(poses), dtype=float)
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, RuntimeError) as error:  # torch: on a GPU, or with a gradient
         raise InvalidInput(f"poses are no array of numbers: {error}.") from error
     if given.shape == (n, many, 4, 4):
         return given

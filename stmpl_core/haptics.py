@@ -130,6 +130,9 @@ class DeviceLoop:
             Force on the device, (3,) [N]; the same array at every call. Zero, and one more in `refused`, when the
             input is not finite, dt not above 0, or the position farther from the last than it can have come (2 m/s
             more than the velocity); where that stays so for 5 samples the loop begins anew there.
+
+        Raises:
+            InvalidInput: another shape, or what is no number.
         """
         state, newest = self._state, self._newest
         if newest is not None and newest is not self._taken:
@@ -137,7 +140,13 @@ class DeviceLoop:
             state.target[:] = newest
             _owe(state)
             state.scalars[LEFT], state.scalars[AGE] = self.settings.blend, 0.0
-        state.position[:], state.velocity[:] = position, velocity
+        if np.shape(position) != (3,) or np.shape(velocity) != (3,) or not isinstance(dt, Real):
+            raise InvalidInput(f"a step is of position {position!r:.60}, velocity {velocity!r:.60} and dt {dt!r:.20}; "
+                               "three numbers, three numbers and one are needed.")  # fmt: skip
+        try:
+            state.position[:], state.velocity[:] = position, velocity
+        except (TypeError, ValueError) as error:
+            raise InvalidInput(f"position and velocity are no numbers: {error}.") from error
         if not _step(state, self._constants, dt):
             self.refused += 1
         return state.force

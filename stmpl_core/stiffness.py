@@ -11,6 +11,7 @@ import numpy as np
 from stmpl_core.contact import Contact
 from stmpl_core.errors import InvalidInput
 from stmpl_core.layer import single
+from stmpl_core.simulator import Simulator
 from stmpl_core.tissue import SOFTEST
 from stmpl_core.touch import Touch
 from stmpl_core.toucher import MAX_DRAG_RATIO, Toucher
@@ -72,7 +73,17 @@ class _Fit(NamedTuple):
     cost: float  # mean weighted square of the relative errors
 
 
-def fit_stiffness(toucher: Toucher, presses: Sequence[Contact]) -> Stiffness:
+def asked(toucher: Toucher | Simulator, contacts: Sequence[Contact]) -> Toucher:
+    """The contact law that a fit is asked with. Raises InvalidInput: none, or no contacts."""
+    law = toucher.toucher if isinstance(toucher, Simulator) else toucher
+    if not isinstance(law, Toucher):
+        raise InvalidInput(f"the contact law is {law!r:.40}; a Toucher or a Simulator is needed.")
+    if not isinstance(contacts, Sequence) or not all(isinstance(one, Contact) for one in contacts):
+        raise InvalidInput(f"contacts are {contacts!r:.40}; a list of Contact, with wrenches, is needed.")
+    return law
+
+
+def fit_stiffness(toucher: Toucher | Simulator, presses: Sequence[Contact]) -> Stiffness:
     """Finds the modulus E with which the contact law explains the measured forces.
 
     By dimensional analysis the force at a pose is E g, where g does not depend on E. For a given offset s of the poses
@@ -84,12 +95,13 @@ def fit_stiffness(toucher: Toucher, presses: Sequence[Contact]) -> Stiffness:
     that is off by 3 % of the largest force makes E 12 % wrong, which looks like an offset and is not in that error.
 
     Args:
-        toucher: contact law on the skin, of whatever stiffness.
+        toucher: contact law on the skin, of whatever stiffness, or a simulator that has it.
         presses: contacts with their wrenches, of tools that pressed one at a time.
 
     Raises:
         InvalidInput: a press without a wrench, or a layer of several materials: one number does not scale them.
     """
+    toucher = asked(toucher, presses)
     single(toucher.layer, "the fit of a stiffness", straight=False, instead="")
     for press in presses:
         if press.wrench is None:

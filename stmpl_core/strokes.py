@@ -20,8 +20,9 @@ from stmpl_core.footing import patch_of
 from stmpl_core.regions import HELD_SKIN
 from stmpl_core.relaxation import faded, fading, series_of, stretch, weights
 from stmpl_core.sideways import Sideways
+from stmpl_core.simulator import Simulator
 from stmpl_core.slip import MOST_LEAN, PLOUGHED, ploughing
-from stmpl_core.stiffness import WRONG_WAY
+from stmpl_core.stiffness import WRONG_WAY, asked
 from stmpl_core.tissue import Prony
 from stmpl_core.touch import Touch
 from stmpl_core.toucher import Toucher
@@ -112,7 +113,7 @@ class _Rubbed(NamedTuple):
     once: float
 
 
-def fit_friction(toucher: Toucher, strokes: Sequence[Contact]) -> Rubbing:
+def fit_friction(toucher: Toucher | Simulator, strokes: Sequence[Contact]) -> Rubbing:
     """Finds the coefficient mu of a tool that slides.
 
     In steady slide the force along the way is R = mu (1 + (0.2 + 0.67 mu) r) of the normal one (`slip.ploughing`),
@@ -124,12 +125,13 @@ def fit_friction(toucher: Toucher, strokes: Sequence[Contact]) -> Rubbing:
     friction. One that is off across the skin changes mu as it does the normal force, which no stroke tells.
 
     Args:
-        toucher: contact law on the skin, about as stiff as it is.
+        toucher: contact law on the skin, about as stiff as it is, or a simulator that has it.
         strokes: contacts of one tool with their wrenches, in order of time.
 
     Raises:
         InvalidInput: a contact without a wrench, of more than one tool, or times that go back.
     """
+    toucher = asked(toucher, strokes)
     _of_one_tool(strokes)
     if not (np.diff([one.time for one in strokes]) >= 0).all():
         raise InvalidInput("the times of strokes go back; a tool's way is told in their order.")
@@ -255,7 +257,7 @@ def _straight(places: np.ndarray, lengths: np.ndarray, k: int, far: float) -> tu
     return best, start
 
 
-def fit_relaxation(toucher: Toucher, press: Sequence[Contact], relaxation: Prony | None = None,
+def fit_relaxation(toucher: Toucher | Simulator, press: Sequence[Contact], relaxation: Prony | None = None,
                    offset: float = 0.0) -> Fading:  # fmt: skip
     """Finds how much of a skin's force fades, from a press that stays in one place.
 
@@ -268,7 +270,7 @@ def fit_relaxation(toucher: Toucher, press: Sequence[Contact], relaxation: Prony
     fades more or less: 10 % of the force in the press change the share by some 0.1.
 
     Args:
-        toucher: contact law on the skin, of whatever stiffness.
+        toucher: contact law on the skin, of whatever stiffness, or a simulator that has it.
         press: contacts of one tool with their wrenches and times, from the first touch on.
         relaxation: series whose times and whose shares among each other are taken; None: the tissue's own, else
             stmpl_core.regions.HELD_SKIN.
@@ -277,6 +279,7 @@ def fit_relaxation(toucher: Toucher, press: Sequence[Contact], relaxation: Prony
     Raises:
         InvalidInput: a contact without a wrench, of more than one tool, or times that do not go forward.
     """
+    toucher = asked(toucher, press)
     _of_one_tool(press)
     taken = relaxation or toucher.layer.tissue.relaxation or HELD_SKIN
     layer, steps = toucher.layer, np.diff([one.time for one in press])
@@ -332,8 +335,8 @@ def _faded(rows: np.ndarray, forces: np.ndarray, when: np.ndarray, shares: np.nd
     fades, half = -rows[:, 1] / rows[:, 0] / float(shares.sum()), int(np.argmax(rows[:, 0] > 0.5 * rows[:, 0].max()))
     seen = float(fades[-1] - fades[half])
     if seen < MIN_SEEN:
-        return _no_fading(f"{told} hold {seen:.0%} of the fading, {MIN_SEEN:.0%} is needed: are the times in seconds? Press "
-                          "quickly, and hold longer")  # fmt: skip
+        return _no_fading(f"{told} hold {seen:.0%} of the fading, {MIN_SEEN:.0%} is needed: are the times in seconds? "
+                          "Press quickly, and hold longer")  # fmt: skip
     if not (stiff > 0 and largest > 0):
         return _no_fading(WRONG_WAY)
     left = root[:, 0] * (forces - rows @ (stiff, eased))

@@ -101,6 +101,8 @@ class SoftBody:
         self.body = _body(model, body)
         if isinstance(tools, str):
             raise InvalidInput(f"tools is the text '{tools}'; give a list of names: ['{tools}'].")
+        if not isinstance(tools, Iterable):
+            raise InvalidInput(f"tools is {tools!r:.40}; give a list of names of geoms or bodies.")
         if model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4:
             raise InvalidInput("the model's integrator is RK4, to which forces that are held over a step add energy. "
                                "Choose implicitfast, implicit or Euler.")  # fmt: skip

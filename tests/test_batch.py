@@ -122,10 +122,24 @@ def test_arrays_of_torch_are_shared_not_copied(skin: Skin) -> None:
     assert np.allclose(out.numpy(), alone(skin, poses()), rtol=1e-6)
 
 
-@pytest.mark.parametrize("tools", [["ball"], {"ball": TOOLS[0]}])
+@pytest.mark.parametrize("tools", [["ball"], {"ball": TOOLS[0]}, 5, None])
 def test_tools_that_are_none_are_said(skin: Skin, tools) -> None:
     with pytest.raises(InvalidInput, match="a list of Tool is needed"):
         Batch(skin, tools, 1)
+
+
+def test_threads_fields_and_tensors_of_another_kind_are_said(skin: Skin) -> None:
+    torch = pytest.importorskip("torch")
+    for threads in ("a", 2.5):
+        with pytest.raises(InvalidInput, match=r"threads is .*; a whole number"):
+            Batch(skin, TOOLS, N, threads=threads)  # type: ignore[arg-type]
+    batch, learnt = Batch(skin, TOOLS, N), torch.from_numpy(poses()).requires_grad_()
+    with pytest.raises(InvalidInput, match="a list of numbers of scenes"):
+        batch.touch(poses(), fields=3)  # type: ignore[arg-type]
+    with pytest.raises(InvalidInput, match=r"poses are no array of numbers.*detach"):
+        batch.touch(learnt)
+    with pytest.raises(InvalidInput, match=r"out takes no numbers.*detach"):
+        batch.touch(poses(), out=torch.zeros((N, 2, 6)).requires_grad_())
 
 
 def test_poses_and_states_of_another_kind_are_said(skin: Skin) -> None:

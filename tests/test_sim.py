@@ -558,6 +558,8 @@ def test_what_cannot_be_is_one_clear_sentence(simulator: Simulator) -> None:
         make(tools=["ball", "ball"])
     with pytest.raises(InvalidInput, match=r"tools is the text 'ball'"):
         make(tools="ball")
+    with pytest.raises(InvalidInput, match=r"tools is None; give a list of names"):
+        make(tools=None)
     with pytest.raises(InvalidInput, match=r"'core' is part of 'slab'"):
         make(tools=["core"])
     with pytest.raises(InvalidInput, match=r"is a plane; a tool can be a sphere"):

@@ -8,10 +8,12 @@ import pytest
 from fem_tools.indenter import IndenterFem
 from fem_tools.patch import PatchFem
 from fem_tools.press import Press
-from stmpl_core import Contact, SoftLayer
+from stmpl_core import Contact, Simulator, SoftLayer
 from stmpl_core.errors import InvalidInput
+from stmpl_core.methods import Winkler
 from stmpl_core.sdf import SignedDistance
 from stmpl_core.stiffness import fit_stiffness
+from stmpl_core.strokes import fit_friction, fit_relaxation
 from stmpl_core.toucher import Toucher
 from tests.scenes import LENGTH, RADIUS, at, ball, contact_of, limb, press
 
@@ -92,6 +94,16 @@ def test_the_answer_does_not_depend_on_the_stiffness_that_was_taken_before(touch
     found, again = fit_stiffness(toucher, given), fit_stiffness(toucher_on(LAYER.with_(youngs_modulus=5e4)), given)
     assert again.youngs_modulus == pytest.approx(found.youngs_modulus, rel=1e-3)
     assert again.relative_error == pytest.approx(found.relative_error, rel=0.01)
+
+
+def test_a_fit_takes_a_simulator_and_says_what_it_cannot_take(toucher, pressed):
+    some, simulator = presses(pressed), Simulator(toucher.layer, Winkler())
+    assert str(fit_stiffness(simulator, some)) == str(fit_stiffness(toucher, some))
+    for fit in (fit_stiffness, fit_friction, fit_relaxation):
+        with pytest.raises(InvalidInput, match="a Toucher or a Simulator is needed"):
+            fit(None, some)
+        with pytest.raises(InvalidInput, match="a list of Contact"):
+            fit(simulator, None)
 
 
 def test_too_few_presses_are_refused(toucher, pressed):
