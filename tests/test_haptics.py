@@ -332,7 +332,7 @@ def test_bad_input_is_refused_or_gives_no_force(spot: Spot, model: LocalContact)
     for wrong in ((deep[:2], STILL, 1e-3), (1e-3, STILL, 1e-3), (deep, None, 1e-3), (deep, STILL, "1"),
                   (["x", 0, 0], STILL, 1e-3)):  # fmt: skip
         with pytest.raises(InvalidInput, match=r"numbers"):
-            loop.step(*wrong)
+            loop.step(*wrong)  # type: ignore[arg-type]
     with pytest.raises(InvalidInput, match=r"delay_steps is 1\.5"):
         LoopSettings(delay_steps=1.5)  # type: ignore[arg-type]
 

@@ -101,9 +101,9 @@ def test_a_fit_takes_a_simulator_and_says_what_it_cannot_take(toucher, pressed):
     assert str(fit_stiffness(simulator, some)) == str(fit_stiffness(toucher, some))
     for fit in (fit_stiffness, fit_friction, fit_relaxation):
         with pytest.raises(InvalidInput, match="a Toucher or a Simulator is needed"):
-            fit(None, some)
+            fit(None, some)  # type: ignore[arg-type]
         with pytest.raises(InvalidInput, match="a list of Contact"):
-            fit(simulator, None)
+            fit(simulator, None)  # type: ignore[arg-type]
 
 
 def test_too_few_presses_are_refused(toucher, pressed):
