@@ -10,7 +10,7 @@ import numba
 import numpy as np
 
 from stmpl_core.arrays import PerVertex, check_dt
-from stmpl_core.bounds import motion_bound
+from stmpl_core.bounds import beside_walls, motion_bound
 from stmpl_core.carrying import carried
 from stmpl_core.conform import Conformed, conform, kept_out, laid_on, no_further
 from stmpl_core.contact import Contact
@@ -193,7 +193,10 @@ class Simulator:
             trust = trust.also(f"{cut} vertices would move further than there is skin: held back", in_range=False)
         if trust.in_range:
             known = getattr(self.method, "contact_bound" if by_vertices else "stick_bound", None)
-            trust = replace(trust, error_bound=motion_bound(known, touches, moves, peak, left))
+            bound = motion_bound(known, touches, moves, peak, left)
+            if bound is not None:
+                bound = max(bound, beside_walls(self.layer, moves, displacement))
+            trust = replace(trust, error_bound=bound)
         return Answer(displacement, trust, solved.method, pressure, {touch.name: touch for touch in touches})
 
     def _moved(self, touches: Sequence[Touch]) -> tuple[Displacement, Conformed, bool]:
