@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Protocol, Self
 
@@ -12,6 +12,7 @@ from bags.frame import Frame
 from bags.provenance import allowance
 from bags.run import BEGINNING
 from bags.survey import Moment, Survey, survey
+from bags.whole import Whole, in_common, whole
 from stmpl_core.contact import Contact
 from stmpl_core.errors import BagError, InvalidInput, StmplError
 from stmpl_core.layer import SoftLayer
@@ -90,6 +91,7 @@ class Comparison:
         tolerance: allowed mean error under the contact, in the worst frame [m]; None: no verdict is asked for.
         reason: sentence that tells why this tolerance, where nobody gave one.
         left_out: number of answers at the start that answer what was not recorded; none of them is sampled.
+        whole: all answers in common with the recording that judges; None: a method does.
     """
 
     run: Survey
@@ -100,6 +102,7 @@ class Comparison:
     tolerance: float | None
     reason: str = ""
     left_out: int = 0
+    whole: Whole | None = None
 
     @property
     def judged(self) -> tuple[FramePair, ...]:
@@ -135,11 +138,13 @@ class Comparison:
 
     @property
     def passed(self) -> bool:
-        """Whether every sampled frame was judged and none is over the tolerance (if one was given)."""
+        """Whether every sampled frame was judged and none, nor any of `whole`, is over the tolerance (if any)."""
         if self.failed or len(self.judged) < len(self.pairs) or not self.pairs:
             return False
         if self.tolerance is None:
             return True
+        if self.whole and self.whole.past(self.tolerance) is not None:
+            return False
         return self.unlike < len(self.judged) and self.worst_under_contact <= self.tolerance
 
     @property
@@ -157,7 +162,7 @@ class Comparison:
                          "is no error, and they are held to no tolerance")  # fmt: skip
         sentence += f"; {skipped} frames could not be judged." if skipped else "."
         late = f" The first {self.left_out} answers were left out: the bag has no contacts for them."
-        return sentence + late * bool(self.left_out)
+        return sentence + late * bool(self.left_out) + (self.whole.told(self.tolerance) if self.whole else "")
 
 
 def compare_run(
@@ -210,24 +215,22 @@ def compare_bags(
         run: recording that is judged.
         other: recording that judges.
         frames: number of frames to sample, >= 1.
-        tolerance: allowed mean error under the contact in the worst frame [m]. Unless given, two recordings of one
-            method are held to each other: exactly where one processor made both, else to OTHER_PROCESSOR; two methods
-            are not.
+        tolerance: allowed mean error under the contact in the worst frame [m]; of two recordings of one method the
+            allowed difference of all answers in common, in every part (whole.differences), too. Unless given, these
+            are held to each other exactly where one processor made both, else to OTHER_PROCESSOR; two methods are not.
 
     Raises:
         BagError: different skins, or no stamp in common.
     """
     run, other = (one if isinstance(one, Survey) else survey(one) for one in (run, other))
-    theirs = {(moment.clock, moment.stamp_ns): moment.number for moment in other.moments}
     late = _left_out(run)
-    common = [moment for moment in run.moments[late:] if (moment.clock, moment.stamp_ns) in theirs]
+    common = in_common(run, other, late)
     if not common:
         raise BagError(f"{run.bag.file} and {other.bag.file} answer no common stamp. Compare a run with its replay.")
-    picks = sample(common, frames)
-    numbers = [theirs[moment.clock, moment.stamp_ns] for moment in picks]
+    picks = sample(list(common), frames)
     ours = run.bag.frames(moment.number for moment in picks)
     answers: dict[tuple[int, int], Frame] = {}  # by stamp and log time of ours
-    for frame, answer in zip(ours, other.bag.frames(numbers), strict=True):
+    for frame, answer in zip(ours, other.bag.frames(common[moment] for moment in picks), strict=True):
         answers[_key(frame)] = answer
         moved = len(answer.displacement)
         if moved != len(frame.displacement):
@@ -236,10 +239,11 @@ def compare_bags(
     names, reason = (run.method, f"{other.method} of {other.bag.file.parent.name}"), ""
     if tolerance is None and run.method == other.method:
         tolerance, reason = allowance(other.bag.provenance.processor, run.bag.provenance.processor)
-    return _compare(
+    compared = _compare(
         run, picks, names, lambda frame: frame, lambda frame: answers[_key(frame)], tolerance, None, late, reason,
         alike=lambda frame: bool(frame.state) == bool(answers[_key(frame)].state),
     )  # fmt: skip
+    return replace(compared, whole=whole(run, other, common, late))
 
 
 def _key(frame: Frame) -> tuple[int, int]:

@@ -102,6 +102,7 @@ class Bag:
         self._spaces: dict[str, str | None] = {}  # namespaces of the topics that were asked for, by all channels so far
         self._stores: dict[int, Typestore] = {}
         self._places: dict[str, list[Place]] = {}  # of the large messages, by topic
+        self._received: dict[Place, int] = {}  # log times of the answers [ns]
         self._layers: dict[str, SoftLayer] = {}  # that were read so far
         self._posed: tuple[str, tuple[float, ...], SoftLayer] | None = None  # the last that was asked for, bent
         self._layers_read: dict[str, int] = {}  # number of messages, by topic
@@ -166,7 +167,7 @@ class Bag:
         return len(self._places.get(self.find_topic(DISPLACEMENT), ()))
 
     def frames(self, numbers: Iterable[int] | None = None) -> Iterator[Frame]:
-        """Yields recorded answers by their numbers in the file, from 0; all, in the order of the file, unless given.
+        """Yields recorded answers by their numbers, from 0, in the order in which they were received; all unless given.
 
         Raises:
             BagError: there is no topic of answers.
@@ -287,6 +288,8 @@ class Bag:
         """Called for each message while the file is looked over; keeps the places of the large ones."""
         if ends(topic, DISPLACEMENT) or ends(topic, TOPOLOGY) or ends(topic, MESH):
             self._places.setdefault(topic, []).append(place)
+        if ends(topic, DISPLACEMENT):
+            self._received[place] = record.log_time
 
     def _told(self, ending: str) -> list[str]:
         """Topics with messages whose names end with `ending`."""
@@ -345,6 +348,8 @@ class Bag:
                 self._take(record)
         for place, record in zip(early, read_places(self.file, early), strict=True):
             self._show(record, place)
+        for topic in self._told(DISPLACEMENT):  # a file may hold them in any order
+            self._places[topic].sort(key=self._received.__getitem__)
         for number, channel in self._channels.items():
             schema = self._schemas.get(channel.schema_id)
             if self._is_meant(channel.topic):

@@ -3,21 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
-
-import numpy as np
 
 from bags.frame import Frame
 from bags.provenance import OTHER_PROCESSOR, allowance
 from bags.run import BEGINNING, Run
+from bags.whole import Differences, differences, listed
 from stmpl_core.errors import BagError
 from stmpl_core.layer import SoftLayer
 from stmpl_core.methods.base import Method
 from stmpl_core.provenance import versions
 from stmpl_core.simulator import Simulator
 from stmpl_core.state import State
-from stmpl_core.touch import Answer
+from stmpl_core.touch import STALE, Answer
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,17 +34,20 @@ class Replayed:
     answer: Answer
     after: State | None = None
 
+    @cached_property
+    def off(self) -> Differences:
+        """Parts of the answer that are not as recorded, and how far off each is (whole.differences) [m]."""
+        return differences(self.answer, self.frame, replayed=True)
+
     @property
     def identical(self) -> bool:
-        """Whether the displacement is the recorded one bit for bit, as float32."""
-        return self.answer.displacement.astype(np.float32).tobytes() == self.frame.displacement.tobytes()
+        """Whether the whole answer is the recorded one bit for bit, as its message carries it."""
+        return not self.off
 
     @property
     def difference(self) -> float:
-        """Largest Euclidean difference at any vertex [m]; infinite where one of them is no number."""
-        off = self.answer.displacement.astype(np.float32) - self.frame.displacement
-        largest = float(np.linalg.norm(off, axis=1).max(initial=0.0))
-        return largest if np.isfinite(largest) else float("inf")
+        """Largest Euclidean difference of the displacement at any vertex [m]; infinite where one is no number."""
+        return self.off.get("displacement", 0.0)
 
 
 @dataclass(frozen=True)
@@ -57,9 +60,10 @@ class ReplaySummary:
         remembering: number of them that carry a state.
         identical: number of them that came out bit for bit as recorded.
         worst: largest difference at any vertex of any frame [m].
-        tolerance: largest difference that is allowed [m]; 0: bit for bit.
+        tolerance: largest difference that is allowed [m], as whole.differences tells it; 0: bit for bit.
         reason: sentence that tells why this tolerance.
-        first_difference: sequence number of the first frame past the tolerance, or None.
+        differ: parts in which a frame differs, as a sentence has them; empty: none does.
+        first_difference: sequence number of the first frame past the tolerance, in any of its parts, or None.
         left_out: number of answers that cannot be repeated, as what they answer was not recorded.
         gap: truth of the claim that one of these came after the beginning: the recording was not just begun late.
         untouched: truth of the claim that there are answers with tools, and none of these was replayed.
@@ -75,6 +79,7 @@ class ReplaySummary:
     worst: float
     tolerance: float
     reason: str
+    differ: str
     first_difference: int | None
     left_out: int
     gap: bool
@@ -98,8 +103,8 @@ class ReplaySummary:
         lost += " No answer with a tool is among those replayed, and the recording has some." * self.untouched
         if self.identical == self.frames:
             return f"{self.frames} frames replayed with {each}, every one bit for bit as recorded; {held}.{lost}"
-        off = (f"{self.frames - self.identical} of {self.frames} frames replayed with {each} differ, "
-               f"by up to {self.worst * 1e3:.3g} mm; {held}")  # fmt: skip
+        off = (f"{self.frames - self.identical} of {self.frames} frames replayed with {each} differ in "
+               f"{self.differ}; {held}")  # fmt: skip
         note = f" Changed since: {', '.join(self.changed)}." if self.changed else ""
         within = self.first_difference is None or not self.held
         past = "." if within else f"; number {self.first_difference} is the first past it.{note}"
@@ -140,8 +145,8 @@ def replay(run: Path | str | Run, method: Method, *, every: int = 1,
             answer = simulator.answer(touches)
         else:
             answer = simulator.step(contacts)
-        if frame.fade < 1:  # the input had stopped: a share of the last answer was sent
-            answer = replace(answer, displacement=frame.fade * answer.displacement)
+        if frame.fade < 1 or any(touch.status == STALE for touch in frame.touches.values()):  # the input had stopped
+            answer = answer.faded(frame.fade, "")
         yield Replayed(frame, answer, after)
 
 
@@ -173,7 +178,7 @@ def replay_run(
     run = run if isinstance(run, Run) else Run(run)
     then, now = run.provenance.versions, versions()
     many = remembering = touched = early = 0
-    off: list[tuple[int, float]] = []  # number and difference of what is not as recorded
+    off: list[tuple[int, Differences]] = []  # number and differences of what is not as recorded
     lost: list[tuple[int, BagError]] = []  # log time of what cannot be repeated, and why
     for replayed in replay(run, method, every=every, left_out=lambda one, why: lost.append((one.log_time_ns, why))):
         if replayed.frame.inputs:
@@ -182,7 +187,7 @@ def replay_run(
         many += 1
         remembering += bool(replayed.frame.state)
         if not replayed.identical:
-            off.append((replayed.frame.sequence, replayed.difference))
+            off.append((replayed.frame.sequence, replayed.off))
     if not many:
         raise lost[0][1] if lost else BagError(f"{run.file} holds no answers, so there is nothing to replay.")
     untouched = not touched and any(frame.inputs for frame in run.frames())
@@ -191,8 +196,9 @@ def replay_run(
         allowed, reason = OTHER_PROCESSOR, f"/tf placed its poses ('{"', '".join(frames)}'), and tf2 rounds otherwise"
     if tolerance is not None:
         allowed, reason = tolerance, "this tolerance was asked for"
-    first = next((number for number, much in off if not (allowed and much <= allowed)), None)
-    worst = max((much for _, much in off), default=0.0)
+    first = next((number for number, parts in off if max(parts.values()) > allowed), None)
+    worst = max((parts.get("displacement", 0.0) for _, parts in off), default=0.0)
+    differ = listed(parts for _, parts in off) if off else ""
     changed = tuple(f"{k} {then[k]} -> {now.get(k, 'none')}" for k in then if now.get(k) != then[k])
-    return ReplaySummary(method.name, many, remembering, many - len(off), worst, allowed, reason, first, len(lost),
-                         len(lost) > early, untouched, str(lost[0][1]) if lost else "", changed)  # fmt: skip
+    return ReplaySummary(method.name, many, remembering, many - len(off), worst, allowed, reason, differ, first,
+                         len(lost), len(lost) > early, untouched, str(lost[0][1]) if lost else "", changed)  # fmt: skip

@@ -19,7 +19,7 @@ class Moment:
     """One answer of a run, without its arrays.
 
     Args:
-        number: place of the answer in the run, from 0, by which Bag.frames reads it.
+        number: place of the answer in the run by its log time, from 0, by which Bag.frames reads it.
         sequence: number that the node gave the answer; it starts again where a node was started again.
         clock: number of times that the stamps had gone back before it: the clock was set back.
         stamp_ns: stamp of the newest pose that it answers [ns].
@@ -113,16 +113,14 @@ def survey(path: Path | str, namespace: str = "") -> Survey:
     notes: list[_Note] = []
 
     def note(run: Run, frame: Frame) -> None:
-        first = notes[0].moment.stamp_ns if notes else frame.stamp_ns
-        last = notes[-1].moment if notes else None
-        clock = last.clock + (frame.stamp_ns < last.stamp_ns) if last else 0
         layer = run.known_layers().get(frame.layer_id)
-        moment = _moment(len(notes), clock, frame, first, layer)
-        notes.append(_Note(moment, frame.method, frame.log_time_ns, frame.layer_id, layer))
+        notes.append(_Note(_moment(frame, layer), frame.method, frame.log_time_ns, frame.layer_id, layer))
 
     run = Run(path, namespace, on_answer=note)
     if not run.answers:
         raise BagError(f"{run.file} holds no answers. Did the node see the tool's mesh, pose and wrench?")
+    notes.sort(key=lambda one: one.log_time_ns)  # as Bag.frames has them, in whatever order the file does
+    _number(notes)
     late = [k for k, one in enumerate(notes) if one.layer is None or one.layer is not run.layers[one.layer_id]]
     for number, frame in zip(late, run.frames(late), strict=True):  # their layer, or the exact one, came after them
         moment = replace(notes[number].moment, load=_load(frame, run.layer_of(frame)))
@@ -131,13 +129,24 @@ def survey(path: Path | str, namespace: str = "") -> Survey:
     return Survey(run, notes[0].method, tuple(moments), _timing(moments, run))
 
 
-def _moment(number: int, clock: int, frame: Frame, first_ns: int, layer: SoftLayer | None) -> Moment:
+def _number(notes: list[_Note]) -> None:
+    """Tells each answer its place, clock and time, by those before it."""
+    clock, first, last = 0, notes[0].moment.stamp_ns, 0
+    for number, one in enumerate(notes):
+        stamp = one.moment.stamp_ns
+        clock, last = clock + (stamp < last), stamp
+        moment = replace(one.moment, number=number, clock=clock, time=(stamp - first) * NANO)
+        notes[number] = replace(one, moment=moment)
+
+
+def _moment(frame: Frame, layer: SoftLayer | None) -> Moment:
+    """What an answer tells of itself: not yet its place among the others."""
     return Moment(
-        number=number,
+        number=0,
         sequence=frame.sequence,
-        clock=clock,
+        clock=0,
         stamp_ns=frame.stamp_ns,
-        time=(frame.stamp_ns - first_ns) * NANO,
+        time=0.0,
         load=float("nan") if layer is None else _load(frame, layer),
         peak=frame.peak,
         tools=tuple(name for name, touch in frame.touches.items() if touch.presses),

@@ -68,6 +68,8 @@ def figures_of(comparison: Comparison) -> dict[str, Any]:
         "failed": comparison.failed,
         "left_out": comparison.left_out,
     }
+    if comparison.whole:
+        figures["whole"] = vars(comparison.whole)
     if comparison.judged:
         figures["score"] = vars(mean_and_deviation([pair.score for pair in comparison.judged])[0])
     return figures

@@ -162,8 +162,8 @@ def replay(
         path: folder or .mcap file of a run.
         method: method that answers; the one that was recorded unless given, and another one may differ.
         every: step from frame to frame; 1 takes each.
-        tolerance_mm: largest difference that is allowed at any vertex [mm]; unless given, 0 where this processor
-            recorded the run, and 1e-4 where another did.
+        tolerance_mm: largest difference that is allowed at any vertex [mm]; pressure and wrenches may be off by the
+            share that it is of 1 mm. Unless given, 0 where this processor recorded the run, and 1e-4 where another did.
         namespace: namespace of the robot that is meant, /left, where several were recorded.
         publish: publication of the recorded messages on their topics instead, with the timing of the recording.
         speed: speed of publishing; 1 as recorded, 0 as fast as possible.
@@ -215,8 +215,9 @@ def compare(
         reference: judge; rigid: of the recorded answers, by the same tools pressed in by finite elements; any
             other: of the run's method, under the recorded pressures.
         other: another bag that judges instead, at the stamps that both answer.
-        tolerance_mm: allowed mean error under the contact, in the worst frame [mm]. Unless given, nothing is held to
-            a tolerance but two recordings of one method: 0 where one processor made both, 1e-4 where two did.
+        tolerance_mm: allowed mean error under the contact, in the worst frame [mm]; two recordings of one method are
+            held to it in all answers, as by replay. Unless given, nothing is held to a tolerance but these: to 0 where
+            one processor made both, 1e-4 where two did.
         namespace: namespace of the robot that is meant, /left, where several were recorded; in both bags.
         frames: number of frames that the reference solves.
         as_json: figures as JSON, for machines.

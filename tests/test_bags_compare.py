@@ -17,6 +17,7 @@ from bags.replay import Replayed, replay_run
 from bags.report import write_report
 from bags.run import Run
 from bags.survey import survey
+from bags.whole import differences
 from bags.writer import BagWriter, qos_yaml
 from stmpl_core.errors import BagError, InvalidInput
 from stmpl_core.layer import layer_id
@@ -218,7 +219,7 @@ def two_skins(tmp_path_factory):
     folder = tmp_path_factory.mktemp("skins")
     skins = (tube(), tube().with_(youngs_modulus=2e4), tube(edge=9e-3))
     parts = [write_run(folder / f"part{k}", Winkler(), layer=skin, frames=8) for k, skin in enumerate(skins)]
-    return joined(parts, folder / "run"), skins
+    return joined(parts, folder / "run", after=10**9), skins
 
 
 def joined(parts, folder, order=None, attached=None, after=1):
@@ -335,6 +336,92 @@ def test_a_comparison_walks_the_file_once(run, monkeypatch):
     assert len(walks) == 2
 
 
+def changed(run, folder, change):
+    """The run with what `change` made of each of its messages; it gets their topics, too."""
+    with BagWriter(folder) as writer:
+        write_provenance(writer, None, method="winkler")
+        channels = {}
+        for topic, message, log_time in Bag(run).messages():
+            if topic not in channels:
+                channels[topic] = writer.add_channel(topic, message.__msgtype__)
+            change(topic, message)
+            writer.write(channels[topic], cdr(message), log_time, log_time)
+    return folder
+
+
+def far_off(answer):
+    """Moves the vertex that moved least by 5 mm."""
+    moved = answer.displacement = np.array(answer.displacement)
+    moved[3 * np.linalg.norm(moved.reshape(-1, 3), axis=1).argmin()] += 5e-3
+
+
+def pressed_twice(answer):
+    answer.pressure = 2 * np.array(answer.pressure)
+
+
+def pushed(answer):
+    for touch in answer.touches:
+        touch.wrench.force.z += 1.0
+
+
+def elsewhere(answer):
+    for touch in answer.touches:
+        touch.pose.position.x += 1e-6
+
+
+def flagged(answer):
+    answer.in_range = not answer.in_range
+
+
+@pytest.mark.parametrize(("change", "part"), [
+    (far_off, "displacement, by up to 5 mm at a vertex"), (pressed_twice, "pressure"), (pushed, "wrench"),
+    (elsewhere, "pose"), (flagged, "trust"),
+])  # fmt: skip
+def test_an_answer_that_differs_in_any_part_is_told_by_replay_and_compare(run, tmp_path, capsys, change, part):
+    theirs = changed(run, tmp_path / "theirs", lambda topic, answer: topic.endswith("displacement") and change(answer))
+    summary = replay_run(theirs, Winkler())
+    assert not summary.passed and f"differ in {part}; held to every bit" in str(summary)
+    for given in ((), ("--tolerance-mm", 0)):
+        code, said = stmpl(capsys, "compare", theirs, "--with", run, *given)
+        assert code == 1 and f"differ in {part}; number" in said.replace("│", "")
+
+
+def test_a_bound_that_was_told_is_held_and_a_node_may_doubt_more_than_a_replay_if_it_says_why(run, tmp_path):
+    frame = replace(list(Bag(run).frames())[5], trust=Trust())
+    now, other = (replace(frame, trust=Trust(error_bound=bound)) for bound in (1e-5, 2e-5))
+    assert differences(now, other) == {"bound": pytest.approx(1e-5)}
+    assert not differences(now, frame), "none was told"
+    doubted = replace(frame, trust=frame.trust.also("no joint states", in_range=False))
+    assert not differences(frame, doubted, replayed=True) and differences(doubted, frame, replayed=True)
+    assert differences(frame, replace(frame, trust=replace(frame.trust, in_range=False)), replayed=True)
+    assert differences(frame, doubted), "two recordings say the same"
+
+
+def test_answers_without_a_counterpart_are_counted(run, tmp_path, capsys):
+    half = without(run, tmp_path / "half", lambda topic, time: "displacement" not in topic or time < 0.1)
+    code, said = stmpl(capsys, "compare", half, "--with", run)
+    ours, theirs = Bag(half).answers, Bag(run).answers
+    assert code == 0 and f"{ours} answers are in both, 0 and {theirs - ours} have no counterpart" in said
+    _, said = stmpl(capsys, "compare", run, "--with", half)
+    assert f"{ours} answers are in both, {theirs - ours} and 0 have no counterpart" in said
+
+
+@pytest.mark.parametrize("first", [0, 6])
+def test_answers_are_paired_in_the_order_in_which_they_were_received(run, tmp_path, first):
+    """Two of them changed places in the file, and all after them are off."""
+    place = iter(range(1000))
+
+    def order(told):
+        number = next(place) if told[1].endswith("displacement") else -1
+        return told[3] + {first: 10**8, first + 1: -(10**8)}.get(number, 0) // 5
+
+    swapped = joined([run], tmp_path / "swapped", order=order)
+    assert [frame.sequence for frame in Bag(swapped).frames()] == [frame.sequence for frame in Bag(run).frames()]
+    same = compare_bags(swapped, run)
+    assert same.passed and same.whole.common == Bag(run).answers and same.whole.alone == (0, 0)
+    assert survey(swapped).timing.lost == len(LOST)
+
+
 def without(run, folder, wanted, resting=()):
     """The run without the messages, by topic and time since its start [s], that are not `wanted`; answers to
     nothing among `resting`."""
@@ -346,6 +433,7 @@ def without(run, folder, wanted, resting=()):
                 channels[topic] = writer.add_channel(topic, message.__msgtype__)
             if topic.endswith("displacement") and message.sequence in resting:
                 message.touches, message.displacement = [], np.zeros_like(message.displacement)
+                message.pressure = np.zeros_like(message.pressure)
             if wanted(topic, (log_time - START) * 1e-9):
                 writer.write(channels[topic], cdr(message), log_time, log_time)
     return folder
