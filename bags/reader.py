@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import re
 from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 from functools import cache, cached_property
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -144,6 +145,12 @@ class Bag:
         except Exception as error:
             raise BagError(f"a message on {channel.topic} is no {schema.name}: {error}.") from error
 
+    def read[T](self, record: Message, how: Callable[..., T], *more: Any) -> T:
+        """What `how` makes of the message that a record carries, and of `more`. Raises BagError as `decode`."""
+        message = self.decode(record)
+        with fields_of(self._channels[record.channel_id].topic):
+            return how(message, *more)
+
     def described(self, topic: str) -> tuple[str, str]:
         """Type hash and offered QoS profiles (YAML) of a topic; empty where the bag does not say. Raises KeyError."""
         told = {channel.topic: channel.metadata for channel in self._channels.values()}[topic]
@@ -154,7 +161,8 @@ class Bag:
         names = {one.topic for one in self._channels.values() if self._is_meant(one.topic) and not self._odd_type(one)}
         found = [name for name in names if ends(name, ending)]
         if len(found) > 1:
-            raise BagError(f"{self.file} holds {len(found)} robots, of the namespaces {', '.join(self.namespaces)}. "
+            spaces = sorted(name.removesuffix(ending).rstrip("/") or "/" for name in found)
+            raise BagError(f"{self.file} holds {len(found)} robots, of the namespaces {', '.join(spaces)}. "
                            "Name one of them with --namespace.")  # fmt: skip
         if not found:
             have = ", ".join(sorted(names)) or "none"
@@ -175,7 +183,7 @@ class Bag:
         places = self._places.get(self.find_topic(DISPLACEMENT), [])
         wanted = places if numbers is None else [places[number] for number in numbers]
         for record in read_places(self.file, wanted):
-            yield frame_from(self.decode(record), record.log_time)
+            yield self.read(record, frame_from, record.log_time)
 
     def layer_of(self, frame: Frame) -> SoftLayer:
         """The layer that `frame` answers for, where its joints took it. Raises BagError if the bag does not hold it."""
@@ -235,9 +243,9 @@ class Bag:
             places, read = self._places[topic], self._layers_read.get(topic, 0)
             self._layers_read[topic] = len(places)
             for record in read_places(self.file, places[read:]):
-                topology = self.decode(record)
-                if topology.layer_id not in self._layers:
-                    self._layers[topology.layer_id] = layer_from(topology)
+                name = self.read(record, lambda topology: topology.layer_id)
+                if name not in self._layers:
+                    self._layers[name] = self.read(record, layer_from)
         return self._layers
 
     @property
@@ -250,7 +258,7 @@ class Bag:
         """Frame id of the body, from SkinTopology. Raises BagError."""
         topic = self.find_topic(TOPOLOGY)
         for record in read_places(self.file, self._places.get(topic, [])[:1]):
-            return self.decode(record).header.frame_id
+            return self.read(record, lambda topology: topology.header.frame_id)
         raise BagError(f"{self.file} holds no message on {topic}, so the body's frame is not known.")
 
     @property
@@ -272,14 +280,14 @@ class Bag:
     def _surfaces(self) -> list[Tool]:
         """All surfaces that tools had, in the order in which they had them last."""
         places = sorted(place for topic in self._told(MESH) for place in self._places[topic])
-        found: dict[tuple[str, bytes, bytes], Tool] = {}
-        for message in map(self.decode, read_places(self.file, places)):
-            if not len(message.triangles):
+        found: dict[tuple[Any, ...], Tool] = {}
+        for record in read_places(self.file, places):
+            name, *arrays = self.read(record, lambda one: (one.header.frame_id, one.vertices, one.triangles))
+            if not len(arrays[1]):
                 continue
-            name = message.header.frame_id
-            same = name, np.asarray(message.vertices).tobytes(), np.asarray(message.triangles).tobytes()
+            same = name, *(np.asarray(one).tobytes() for one in arrays)
             try:
-                found[same] = found.pop(same, None) or tool_from(message)
+                found[same] = found.pop(same, None) or self.read(record, tool_from)
             except StmplError as error:
                 log.warning("%s: a surface of '%s' is left out: %s", self.file, name, error)
         return list(found.values())
@@ -407,6 +415,18 @@ def type_of(topic: str) -> str:
     """Type that a topic of a run has to have to be read; empty: any."""
     kind = tool_kind(topic)
     return TOOL_TYPES[kind] if kind else next((TYPES[e] for e in TYPES if ends(topic, e)), "")
+
+
+@contextmanager
+def fields_of(topic: str) -> Iterator[None]:
+    """While inside, a message without a field, which the file defines otherwise than it is read, is a BagError."""
+    try:
+        yield
+    except AttributeError as error:
+        if (kind := getattr(error.obj, "__msgtype__", None)) is None:
+            raise
+        raise BagError(f"a message on {topic} cannot be read: the file defines {kind} without a field "
+                       f"'{error.name}'.") from error  # fmt: skip
 
 
 def ends(topic: str, ending: str) -> bool:

@@ -11,7 +11,7 @@ from mcap.records import Message
 
 from bags.frame import Frame
 from bags.moving import TF, TF_STATIC, FramesAt, MovingFrames
-from bags.reader import DISPLACEMENT, TYPES, Bag, ends, tool_kind
+from bags.reader import DISPLACEMENT, TYPES, Bag, ends, fields_of, tool_kind
 from bags.records import Place
 from bags.wire import contact_from, frame_from, stamp_ns
 from stmpl_core.contact import Contact
@@ -54,8 +54,7 @@ class Run(Bag):
         """Keeps poses and wrenches, and hands on the answers."""
         super().see(topic, record, place)
         if kind := tool_kind(topic):
-            message = self.decode(record)
-            stamp = stamp_ns(message)
+            stamp = self.read(record, stamp_ns)
             self.received.setdefault(stamp, []).append(record.log_time)
             if self._stamps.get(topic) != stamp:  # a node, too, takes the first of those that follow under one stamp
                 self._stamps[topic] = stamp
@@ -67,7 +66,7 @@ class Run(Bag):
             if topic != self._answering:
                 self._answering = self.find_topic(DISPLACEMENT)
             if self._on_answer:
-                self._on_answer(self, frame_from(self.decode(record), record.log_time))
+                self._on_answer(self, self.read(record, frame_from, record.log_time))
 
     def contacts(self, frame: Frame) -> list[Contact]:
         """The contacts that `frame` answers: of each of its tools the pose and the wrench that it names.
@@ -89,8 +88,9 @@ class Run(Bag):
             raise BagError(f"an answer to tool {tool} at {posed * NANO:.3f} s cannot be repeated: "
                            f"the bag has no {' and no '.join(lacks)} for it.")
         try:
-            return contact_from(known, pose, wrench, body_frame=self.body_frame, frames=self._frames_at(posed, by),
-                                wrench_frames=self._frames_at(pushed, by))  # fmt: skip
+            with fields_of(f"tools/{tool}"):
+                return contact_from(known, pose, wrench, body_frame=self.body_frame, frames=self._frames_at(posed, by),
+                                    wrench_frames=self._frames_at(pushed, by))  # fmt: skip
         except FrameError as error:
             raise BagError(f"an answer to tool {tool} at {posed * NANO:.3f} s cannot be repeated offline: {error}. A "
                            "recording carries what came on /tf while stmpl record ran, and the table of its --frames; "

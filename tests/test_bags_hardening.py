@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from mcap.reader import make_reader
 from mcap.records import Attachment, Channel, Message, Metadata, Schema
 from mcap.writer import CompressionType, Writer
 from rosbags.rosbag2 import Reader
@@ -292,3 +293,21 @@ def test_angles_that_the_layers_joints_cannot_have_are_told(tmp_path, joints, hi
     for read in (run.rest_of, run.layer_of):
         with pytest.raises(BagError, match=told):
             read(replace(frame, joints=joints))
+
+
+@pytest.mark.parametrize("field", ["geometry_msgs/Pose pose", "string layer_id", "float32[] vertices", "Header header"])
+def test_a_recording_whose_messages_are_defined_otherwise_is_refused_in_a_sentence(tmp_path, capsys, field):
+    path = tmp_path / "other.mcap"
+    with SAMPLE.joinpath("run_0.mcap").open("rb") as stream, path.open("wb") as target:
+        writer, channels = Writer(target), {}
+        writer.start()
+        for schema, channel, message in make_reader(stream).iter_messages():
+            if channel.topic not in channels:
+                text = schema.data.replace(field.encode(), field.encode() + b"_2")
+                number = writer.register_schema(schema.name, schema.encoding, text)
+                channels[channel.topic] = writer.register_channel(channel.topic, channel.message_encoding, number)
+            if message.sequence < 5:
+                writer.add_message(channels[channel.topic], message.log_time, message.data, message.publish_time)
+        writer.finish()
+    code, said = stmpl(capsys, "replay", path)
+    assert code == 1 and "cannot be read: the file defines" in said and f"without a field '{field.split()[1]}'" in said
