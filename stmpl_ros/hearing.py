@@ -54,6 +54,7 @@ class Hearing:
         on_removed: callback with the name of a tool that was taken away.
         on_instant: callback with every complete instant.
         on_time_back: callback for a simulated clock that was set back, once all is forgotten.
+        backs: number of times that a simulated clock was set back since the last look at it.
         useless: why the last pose that could not be used could not, since it was last emptied.
 
     Raises:
@@ -72,7 +73,7 @@ class Hearing:
         self.inbox = Inbox(tools, config().frame, int(config().rest_after * wire.NANO), self.frames.at)
         self._followed = Followed(node, self.frames, config(), self._on_followed)
         self.now.on_back = self._on_time_back
-        self.active = False
+        self.active, self.backs = False, 0
         self.layer: SoftLayer | None = None
         self.on_tool: Callable[[Tool], None] = lambda tool: None
         self.on_removed: Callable[[str], None] = lambda name: None
@@ -338,11 +339,17 @@ class Hearing:
 
     def _on_time_back(self) -> None:
         """A simulation that begins anew: what it and its /tf said lies in its future."""
-        self._node.get_logger().warning("the simulated clock went back: poses, wrenches and /tf from before are "
-                                        "forgotten")  # fmt: skip
+        self.backs += 1
+        self.gate.say("clock", "the simulated clock went back: poses, wrenches and /tf from before are forgotten")
         self.frames.forget()
         self.forget()
         self.on_time_back()
+
+    def look_at_clock(self) -> str:
+        """Sentence on a simulated clock that was set back more than once since the last look; empty: it was not."""
+        backs, self.backs = self.backs, 0
+        return (f"the simulated clock went back {backs} times, and what was before is forgotten each time: do two "
+                "simulations send /clock?") * (backs > 1)  # fmt: skip
 
     def _on_gazebo(self, message: Any) -> None:
         assert self.gazebo and self.layer

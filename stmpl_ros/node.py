@@ -423,7 +423,7 @@ class SkinNode(ServingNode):
             values["joints"] = self.bending.doubt or " ".join(f"{x:.4f}" for x in self.answering.simulator.skin.angles)
         told = self.bending.doubt or self.tally.doubt  # where all answers are of a surface from before, it says so
         outdated = [one for one in self.hearing.look_for_outdated() if one not in told]
-        senders = "; ".join(filter(None, (*stopped, *outdated, self.hearing.unheard(),
+        senders = "; ".join(filter(None, (self.hearing.look_at_clock(), *stopped, *outdated, self.hearing.unheard(),
                                           self.hearing.look_for_strangers(), self.hearing.rivals())))  # fmt: skip
         lately = self._counts.since(reactions=self.tally.reactions, refused=self.tally.refused, stale=self.tally.stale,
                                     out_of_order=inbox.out_of_order, missed=events.missed_deadlines)  # fmt: skip

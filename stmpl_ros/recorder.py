@@ -154,6 +154,8 @@ class RecorderNode(Node):
         topology = {topic.removesuffix("skin/topology"): frame for topic, frame in self._placed
                     if topic.endswith("skin/topology")}  # fmt: skip
         for topic, frame in sorted(self._placed):
+            if topic.endswith("skin/topology"):
+                continue
             space = max((one for one in topology if topic.startswith(f"{one}tools/")), key=len, default="/")
             body, tool = topology.get(space), topic.removeprefix(f"{space}tools/").rpartition("/")[0]
             if frame and body is not None and frame not in (body, tool, *frames):

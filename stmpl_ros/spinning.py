@@ -9,6 +9,7 @@ import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from types import FrameType
+from typing import Any
 
 import rclpy
 from rclpy._rclpy_pybind11 import RCLError, UnknownROSArgsError
@@ -16,11 +17,13 @@ from rclpy.exceptions import InvalidParameterTypeException, InvalidParameterValu
 from rclpy.executors import Executor, ExternalShutdownException
 from rclpy.signals import SignalHandlerOptions
 from rclpy.task import Future
+from rclpy.time_source import TimeSource
 from rclpy.utilities import ok, try_shutdown
 
 from stmpl_core.errors import InvalidInput
 from stmpl_ros.interrupts import endings
 
+CLOCK_TOLD_S = 30.0  # time between two lines on a clock that cannot be [s]
 POLL_PERIOD_S = 0.1  # time between two looks of a spinning process whether it is to stop
 TRANSPORTS = "FASTDDS_BUILTIN_TRANSPORTS"  # variable by which a person chooses another: DEFAULT
 NO_LOG = "failed to initialize logging: "  # how RCLError begins where there is no place for its files
@@ -49,8 +52,9 @@ def ros(arguments: list[str] | None = None) -> Iterator[threading.Event]:
 
     before = {number: signal.signal(number, ask) for number in endings()}
     try:
-        _init(arguments)
-        yield stop
+        with _clock_above_zero():
+            _init(arguments)
+            yield stop
     except KeyboardInterrupt:
         if not stop.is_set():
             raise
@@ -60,6 +64,26 @@ def ros(arguments: list[str] | None = None) -> Iterator[threading.Event]:
         try_shutdown()
         for number, handler in before.items():
             signal.signal(number, handler)
+
+
+@contextmanager
+def _clock_above_zero() -> Iterator[None]:
+    """While inside, a time below 0 on /clock is passed over with a line; rclpy 7.1 raises ValueError as it spins."""
+    take = TimeSource.clock_callback
+
+    def taken(source: TimeSource, msg: Any) -> None:
+        node = source._get_node()
+        if msg.clock.sec >= 0:
+            take(source, msg)
+        elif node is not None:
+            node.get_logger().warning(f"a time of {msg.clock.sec} s on /clock is passed over; it must be 0 or more.",
+                                      throttle_duration_sec=CLOCK_TOLD_S)  # fmt: skip
+
+    TimeSource.clock_callback = taken
+    try:
+        yield
+    finally:
+        TimeSource.clock_callback = take
 
 
 def _init(arguments: list[str] | None) -> None:

@@ -25,7 +25,7 @@ class Aside:
     Args:
         node: node that serves.
         name: name of what is offered.
-        offer: function that creates it on the hidden node, under this full name.
+        offer: function that creates it on the hidden node, under this full name; a remap of `~/NAME` counts.
         threads: number of threads; an action needs a second one to hear of a cancel.
     """
 
@@ -34,7 +34,7 @@ class Aside:
             f"_{node.get_name()}_{name}", namespace=node.get_namespace(), context=node.context,
             use_global_arguments=False, enable_rosout=False, start_parameter_services=False,
         )  # fmt: skip
-        self._offered = offer(self._hidden, f"{node.get_fully_qualified_name()}/{name}")
+        self._offered = offer(self._hidden, node.resolve_service_name(f"~/{name}"))
         self._executor = (SingleThreadedExecutor(context=node.context) if threads == 1
                           else MultiThreadedExecutor(threads, context=node.context))  # fmt: skip
         self._executor.add_node(self._hidden)

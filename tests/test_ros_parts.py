@@ -2,16 +2,21 @@
 
 from collections.abc import Mapping
 from dataclasses import replace
+from time import monotonic
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import rclpy
+from builtin_interfaces.msg import Time
 from geometry_msgs.msg import PoseStamped
 from hypothesis import given
 from hypothesis import strategies as st
 from numba import njit
 from numba.core.event import install_listener
+from rclpy.experimental.events_executor import EventsExecutor
 from rclpy.serialization import deserialize_message, serialize_message
+from rosgraph_msgs.msg import Clock
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 from stmpl_msgs.msg import LocalContact as LocalContactMessage
@@ -51,10 +56,14 @@ from stmpl_core.trust import Trust
 from stmpl_ros.calibration import strokes_of
 from stmpl_ros.diagnosis import Tally
 from stmpl_ros.gate import OFTEN, QUIET, SAY_EVERY, Gate
+from stmpl_ros.hearing import Hearing
 from stmpl_ros.inbox import PATIENCE, Inbox
 from stmpl_ros.parameters import NodeConfig
+from stmpl_ros.recorder import RecorderNode
 from stmpl_ros.scripts import DEEPEST, ON_LIMBS, ON_ONE_LAYER, PRESS, Device, Keyframe, Motion, scripts_for
 from stmpl_ros.show import SkinMarker
+from stmpl_ros.spinning import ros
+from stmpl_ros.waiting import Aside
 from tests.scenes import at, ball, limb, scaled
 
 MS = 1_000_000
@@ -519,3 +528,54 @@ def test_strokes_of_no_tool_by_name_are_those_of_the_last_one_also_of_the_same_s
         assert [one.time for one in strokes_of(tool, kept)] == times
     kept.append(Contact(scaled(ball(), 2.0).named("a"), at(0, 0, 0), np.ones(6), time=6.0))
     assert [one.time for one in strokes_of("a", kept)] == [6]
+
+
+def test_a_time_below_0_on_the_clock_is_passed_over_and_told():
+    with ros(["--ros-args", "-p", "use_sim_time:=true"]):
+        node, executor, lines = rclpy.create_node("any"), EventsExecutor(), []
+        logger = SimpleNamespace(warning=lambda text, **_: lines.append(text))
+        node.get_logger = lambda: logger
+        executor.add_node(node)
+        clock = node.create_publisher(Clock, "/clock", 10)
+        for sec in (-1, 7):
+            until = monotonic() + 20
+            while monotonic() < until and not (lines if sec < 0 else node.get_clock().now().nanoseconds):
+                clock.publish(Clock(clock=Time(sec=sec)))
+                executor.spin_once(timeout_sec=0.05)
+        assert lines[0] == "a time of -1 s on /clock is passed over; it must be 0 or more."
+        assert node.get_clock().now().nanoseconds == 7 * 10**9, "and the next one counts"
+        executor.shutdown()
+        node.destroy_node()
+
+
+def test_a_remap_of_what_waits_aside_counts():
+    with ros(["--ros-args", "-r", "~/ask:=/arm/ask"]):
+        node, names = rclpy.create_node("any"), []
+        for name in ("ask", "tell"):
+            Aside(node, name, lambda hidden, full: names.append(full)).close()
+        assert names == ["/arm/ask", "/any/tell"]
+        node.destroy_node()
+
+
+def test_a_clock_that_goes_back_again_and_again_is_told_rarely_and_by_the_diagnostics():
+    lines = []
+    logger = SimpleNamespace(warning=lines.append)
+    node = SimpleNamespace(get_logger=lambda: logger)
+    hearing = SimpleNamespace(gate=Gate(node, Tally()), backs=0, frames=SimpleNamespace(forget=lambda: None),
+                              forget=lambda: None, on_time_back=lambda: None)  # fmt: skip
+    for _ in range(20):
+        Hearing._on_time_back(hearing)
+    assert len(lines) == 1 and "the simulated clock went back" in lines[0]
+    told = Hearing.look_at_clock(hearing)
+    assert "went back 20 times" in told and "two simulations" in told
+    Hearing._on_time_back(hearing)
+    assert not Hearing.look_at_clock(hearing), "a reset is no fault"
+
+
+def test_a_recorder_takes_no_topology_for_a_contact_in_a_foreign_frame():
+    placed = {("/skin/topology", "body"), ("/right/skin/topology", "arm"), ("/right/tools/ball/pose", "arm"),
+              ("/tools/ball/pose", "body")}  # fmt: skip
+    assert not list(RecorderNode.foreign(SimpleNamespace(_channels={}, _placed=placed), {}))
+    placed |= {("/tools/ball/wrench", "arm")}
+    (said,) = RecorderNode.foreign(SimpleNamespace(_channels={}, _placed=placed), {})
+    assert "/tools/ball/wrench came in frame 'arm', which is neither 'body'" in said
