@@ -46,6 +46,8 @@ SEXES = {"male": 0.0, "female": 1.0}  # share of a gender that is female [-]
 WATER = 1e3  # density of a body [kg/m3]
 PHENOTYPE = ("gender", "age", "muscle", "weight", "height", "proportions")
 AROUND = "around:"  # beginning of the name of a picked part
+LEAST_BORNE = 0.8  # share of the asked thickness, below which skin is said not to bear it
+MAX_THIN_SHARE = 0.5  # share of the skin that may not bear it
 NEAR_SKIN = 0.03  # distance from the skin up to which a picked place is taken to be on it [m]
 BIG = 1e3  # way to skin that is not reached [m]
 AVERAGE = 0.5  # value of every phenotype unless given
@@ -215,7 +217,8 @@ class Body:
             tissue: material; Tissue() unless given.
 
         Raises:
-            InvalidInput: unknown part; the error lists what exists.
+            InvalidInput: unknown part; the error lists what exists. Or a thickness that most of the skin is too tightly
+                curved for; the error says what would do.
             MeshError: a surface that `stmpl_core.remesh` refuses.
         """
         shipped = limbs.part(name, edge_length) if self is _average() else None
@@ -338,7 +341,8 @@ class Patch:
     def layer(self, body: Body, *, thickness: ArrayLike = 7.5e-3, tissue: Tissue | None = None) -> SoftLayer:
         """The part as a soft layer, on `body` in its pose: the mesh's connectivity and UVs stay what they are.
 
-        Where the skin curves more tightly than `thickness`, the layer is thinned, and a warning says where.
+        Where the skin curves more tightly than `thickness`, the layer is thinned, and a warning says where. Raises
+        InvalidInput where most of the skin does.
         """
         if self.source.max() >= len(body.vertices):
             raise InvalidInput(f"this patch was drawn from a body with at least {self.source.max() + 1} vertices; "
@@ -376,10 +380,20 @@ def _average() -> Body:
 def _layer(
     vertices: Points, faces: Faces, uv: np.ndarray | None, thickness: ArrayLike, tissue: Tissue | None
 ) -> SoftLayer:
-    """The layer under a mesh of the skin, thinned where the skin curves more tightly."""
+    """The layer under a mesh of the skin, thinned where the skin curves more tightly.
+
+    Raises:
+        InvalidInput: most of it does, by much.
+    """
     chart = None if uv is None else UvChart(vertices, faces, uv)
     layer = SoftLayer(vertices, faces, thickness, tissue=tissue, chart=chart)
-    return layer.with_(thickness=foldfree_thickness(layer))
+    borne, area = foldfree_thickness(layer), layer.vertex_areas
+    thin = borne < LEAST_BORNE * layer.thickness
+    share = area[thin].sum() / area.sum()
+    if share > MAX_THIN_SHARE:
+        raise InvalidInput(f"a layer {layer.thickness.max() * 1e3:.1f} mm thick would fold: {share:.0%} of this skin "
+                           f"curves so tightly that it bears less than {LEAST_BORNE:.0%} of that. Try {np.median(borne) * 1e3:.1f} mm.")  # fmt: skip
+    return layer.with_(thickness=borne)
 
 
 def _known(kind: str, given: Iterable[str], available: tuple[str, ...]) -> None:

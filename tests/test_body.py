@@ -76,6 +76,12 @@ def test_the_arm_has_two_ends_and_is_one_piece(arm: SoftLayer) -> None:
     assert np.einsum("ij,ij->i", arm.normals, arm.vertex_area_vectors).min() > 0
 
 
+def test_a_thickness_that_most_of_a_limb_does_not_bear_is_refused_with_one_that_it_does(body: Body) -> None:
+    with pytest.raises(InvalidInput, match=r"a layer 90.0 mm thick would fold: 100% of this skin .* Try 1\d\.\d mm"):
+        body.part("left_forearm", edge_length=7.5e-3, thickness=0.09)
+    assert body.part("left_forearm", edge_length=7.5e-3, thickness=0.018).thickness.max() == 0.018
+
+
 @pytest.mark.parametrize("thickness", [5e-3, 7.5e-3, 10e-3, 12.5e-3])
 def test_no_layer_folds(body: Body, patch: Patch, thickness: float) -> None:
     layer = patch.layer(body, thickness=thickness)
