@@ -392,7 +392,8 @@ def _layer(
     share = area[thin].sum() / area.sum()
     if share > MAX_THIN_SHARE:
         raise InvalidInput(f"a layer {layer.thickness.max() * 1e3:.1f} mm thick would fold: {share:.0%} of this skin "
-                           f"curves so tightly that it bears less than {LEAST_BORNE:.0%} of that. Try {np.median(borne) * 1e3:.1f} mm.")  # fmt: skip
+                           f"curves so tightly that it bears less than {LEAST_BORNE:.0%} of that. "
+                           f"Try {np.median(borne) * 1e3:.1f} mm.")  # fmt: skip
     return layer.with_(thickness=borne)
 
 

@@ -29,6 +29,7 @@ from stmpl_core.toucher import Toucher
 from stmpl_core.trust import Trust
 
 MIN_INSTANTS = 8  # instants of one kind that a fit needs
+MAX_FACTOR = 100.0  # measured force over the law's at a pose, beyond which it is no other stiffness [-]
 TREMBLES = 0.2  # longest way straight on over how far the tool went, below which its poses tremble
 SLID = 1.8  # way over friction / stiffness from which a tool slides (Cattaneo, Mindlin: 1.5); twice after another way
 MOST_RUBBED = 0.95  # quantile of the force along the skin over that across it, from which follows where tools slide
@@ -167,7 +168,7 @@ def fit_friction(toucher: Toucher | Simulator, strokes: Sequence[Contact]) -> Ru
         if furthest < TREMBLES * float(np.ptp(places, axis=0).max()):
             more = "Smooth its poses: they tremble"
         return _no_friction(f"the tool slid at {len(slid)} of {len(pressing)} instants, {MIN_INSTANTS} are needed"
-                            f"{went}. {more}")  # fmt: skip
+                            f"{went}. {_unlike(toucher, pressing) or more}")  # fmt: skip
     mus, axis = np.array(mus), np.linalg.svd(np.array(ways), full_matrices=False)[2][0]
     forth = np.array(ways) @ axis > 0
     way = sum(float(np.linalg.norm(places[b] - places[a])) for a, b in pairwise(slid) if b == a + 1)
@@ -186,6 +187,18 @@ def fit_friction(toucher: Toucher | Simulator, strokes: Sequence[Contact]) -> Ru
         trust = trust.also(f"friction is known to {error:.2f} of {friction:.2f} only, {MAX_FRICTION_ERROR:.0%} is "
                            "needed. Stroke there and back", converged=False)  # fmt: skip
     return Rubbing(friction, error, len(slid), way, bool(both), trust)
+
+
+def _unlike(toucher: Toucher, pressing: Sequence[Contact]) -> str:
+    """Question on forces that are far from what the skin presses with at their poses; empty: they are not."""
+    some = pressing[:: max(len(pressing) // MIN_INSTANTS, 1)]
+    told = np.array([np.linalg.norm(one.wrench[:3]) for one in some if one.wrench is not None])
+    borne = np.array([toucher.touch(Contact(one.tool, one.pose_body_from_tool)).force for one in some])
+    factor = float(np.median((told / borne)[borne > 0])) if borne.any() else 1.0
+    if 1 / MAX_FACTOR < factor < MAX_FACTOR:
+        return ""
+    return (f"Its forces are {factor:.3g} times those that this skin presses with at its poses: are wrenches in "
+            "newtons, and poses in metres?")  # fmt: skip
 
 
 def _rubbed(toucher: Toucher, sideways: Sideways, one: Contact) -> _Rubbed | None:

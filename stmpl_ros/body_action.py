@@ -30,11 +30,12 @@ class BodyAction:
         begin: function that begins to make another skin, by the node's executor; raises StmplError.
         abandon: function that gives that up, likewise.
         layer_id: function that says which layer answers.
+        active: function that says whether the node answers.
     """
 
     def __init__(self, node: Node, begin: Callable[[dict[str, Any], Done], str], abandon: Callable[[str], None],
-                 layer_id: Callable[[], str]) -> None:  # fmt: skip
-        self._node, self._begin, self._abandon, self._layer_id = node, begin, abandon, layer_id
+                 layer_id: Callable[[], str], active: Callable[[], bool]) -> None:  # fmt: skip
+        self._node, self._begin, self._abandon, self._layer_id, self._active = node, begin, abandon, layer_id, active
         self._aside = Aside(node, "set_body", self._offer, threads=2)
 
     def close(self) -> None:
@@ -64,7 +65,8 @@ class BodyAction:
                 by_executor(self._node, self._abandon, CANCELLED)
         if not why[0]:
             goal.succeed()
-            said = stage if stage == NOT_YET else "the node answers on it"
+            said = "the node answers on it" if self._active() else "the node answers on it once it is active"
+            said = stage if stage == NOT_YET else said
             return SetBody.Result(success=True, message=said, layer_id=self._layer_id())
         if goal.is_cancel_requested:
             goal.canceled()

@@ -15,9 +15,9 @@ from stmpl_msgs.srv import Calibrate
 
 from stmpl_core.contact import Contact
 from stmpl_core.errors import InvalidInput
-from stmpl_core.stiffness import Stiffness
+from stmpl_core.stiffness import WRONG_WAY, Stiffness
 from stmpl_core.strokes import Fading, Rubbing
-from stmpl_core.touch import MOVED, TOUCHING, Touch
+from stmpl_core.touch import MOVED, PULLING, TOUCHING, Touch
 from stmpl_ros.inbox import Instant
 from stmpl_ros.waiting import Aside, by_executor
 from stmpl_ros.workshop import Workshop
@@ -47,6 +47,7 @@ class Calibration:
         self._node, self._workshop, self._apply = node, workshop, apply
         self.presses: deque[Contact] = deque(maxlen=KEPT)
         self.strokes: deque[Contact] = deque(maxlen=KEPT_INSTANTS)  # with their times
+        self.pulled: set[str] = set()  # tools that a wrench drew off the skin
         self._service = Aside(node, "calibrate",
                               lambda hidden, name: hidden.create_service(Calibrate, name, self._serve))  # fmt: skip
 
@@ -58,9 +59,11 @@ class Calibration:
         """Starts anew."""
         self.presses.clear()
         self.strokes.clear()
+        self.pulled.clear()
 
     def put(self, instant: Instant, touches: Mapping[str, Touch]) -> None:
         """Keeps an instant if one tool alone pressed with a wrench, and has moved."""
+        self.pulled |= {name for name, touch in touches.items() if touch.status == PULLING}
         pressing = [contact for contact in instant.contacts if touches[contact.name].status in CARRYING]
         if len(pressing) != 1 or sum(touch.wrench.any() for touch in touches.values()) > 1:
             return
@@ -94,11 +97,14 @@ class Calibration:
     def _fit(self, what: str, tool: str) -> Future[Any]:
         if (workshop := self._workshop()) is None:
             raise InvalidInput("the node is not configured, so it has no skin to calibrate.")
+        if what not in ("", "stiffness", "friction", "relaxation"):
+            raise InvalidInput(f"there is no '{what}' to calibrate. Available: stiffness, friction, relaxation.")
+        pressed = {one.name for one in self.strokes}
+        if any(tool in ("", name) for name in self.pulled) and not any(tool in ("", name) for name in pressed):
+            raise InvalidInput(WRONG_WAY)
         if what in ("friction", "relaxation"):
             strokes = strokes_of(tool, self.strokes)
             return workshop.friction(strokes) if what == "friction" else workshop.relaxation(_longest(strokes))
-        if what not in ("", "stiffness"):
-            raise InvalidInput(f"there is no '{what}' to calibrate. Available: stiffness, friction, relaxation.")
         newest = {press.name: press.tool.digest for press in self.presses}  # a tool that changed is another one
         chosen = [press for press in self.presses if press.tool.digest == newest[press.name]]
         return workshop.stiffness([press for press in chosen if tool in ("", press.name)])

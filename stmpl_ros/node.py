@@ -110,7 +110,8 @@ class SkinNode(ServingNode):
         self.create_service(SetBody, "~/set_body", self._on_set_body)
         self.create_service(GetTopology, "~/get_topology", self._on_get_topology)
         self._action = BodyAction(self, lambda changes, done: self.set_body(done, **changes), self._abandon,
-                                  lambda: self.skin.layer_id if self.settings.locked else "")  # fmt: skip
+                                  lambda: self.skin.layer_id if self.settings.locked else "",
+                                  lambda: self.active)  # fmt: skip
         self.diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", STREAM)
         self._diagnosing = steady_timer(self, 1.0, self._diagnose)
 

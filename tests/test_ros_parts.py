@@ -1,5 +1,6 @@
 """Laws of what the ROS side is made of: conversions, instants, scripts, the marker's bytes. No process is started."""
 
+from collections import deque
 from collections.abc import Mapping
 from dataclasses import replace
 from time import monotonic
@@ -19,6 +20,7 @@ from rclpy.serialization import deserialize_message, serialize_message
 from rosgraph_msgs.msg import Clock
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
+from stmpl_msgs.action import SetBody
 from stmpl_msgs.msg import LocalContact as LocalContactMessage
 from stmpl_msgs.msg import SkinDisplacement
 from visualization_msgs.msg import Marker
@@ -51,9 +53,10 @@ from stmpl_core.living import living
 from stmpl_core.local_contact import Grip, LocalContact
 from stmpl_core.skin import published
 from stmpl_core.state import fresh
-from stmpl_core.touch import BY_POSE, STALE, TOUCHING, Slip
+from stmpl_core.touch import BY_POSE, PULLING, STALE, TOUCHING, Slip
 from stmpl_core.trust import Trust
-from stmpl_ros.calibration import strokes_of
+from stmpl_ros.body_action import BodyAction
+from stmpl_ros.calibration import Calibration, strokes_of
 from stmpl_ros.diagnosis import Tally
 from stmpl_ros.gate import OFTEN, QUIET, SAY_EVERY, Gate
 from stmpl_ros.hearing import Hearing
@@ -528,6 +531,27 @@ def test_strokes_of_no_tool_by_name_are_those_of_the_last_one_also_of_the_same_s
         assert [one.time for one in strokes_of(tool, kept)] == times
     kept.append(Contact(scaled(ball(), 2.0).named("a"), at(0, 0, 0), np.ones(6), time=6.0))
     assert [one.time for one in strokes_of("a", kept)] == [6]
+
+
+@pytest.mark.parametrize("what", ["", "friction", "relaxation"])
+def test_calibrate_says_of_a_tool_that_only_pulled_that_its_force_points_the_wrong_way(what):
+    """It said that nothing had pressed, and to press."""
+    kept = SimpleNamespace(pulled=set(), strokes=deque(), presses=deque(), _workshop=object)
+    contact = Contact(ball().named("probe"), np.eye(4), -np.ones(6))
+    pulling = Touch("probe", PULLING, np.eye(4), np.zeros(6))
+    Calibration.put(kept, SimpleNamespace(contacts=[contact], stamp=0), {"probe": pulling})
+    for tool in ("", "probe"):
+        with pytest.raises(InvalidInput, match="no force points into the skin where the poses touch it"):
+            Calibration._fit(kept, what, tool)
+
+
+@pytest.mark.parametrize(("active", "says"), [(True, "answers on it"), (False, "answers on it once it is active")])
+def test_the_action_says_whether_the_node_answers_on_the_new_skin(active, says):
+    node = SimpleNamespace(executor=SimpleNamespace(create_task=lambda do: do()))
+    action = SimpleNamespace(_node=node, _begin=lambda changes, done: done("") or "being made",
+                             _layer_id=lambda: "", _active=lambda: active)  # fmt: skip
+    goal = SimpleNamespace(request=SetBody.Goal(thickness=0.01), succeed=lambda: None)
+    assert BodyAction._execute(action, goal).message == f"the node {says}"
 
 
 def test_a_time_below_0_on_the_clock_is_passed_over_and_told():

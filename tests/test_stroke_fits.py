@@ -105,6 +105,13 @@ def test_what_never_pressed_is_told_so_and_what_has_too_few_instants(toucher: To
     assert not few.trust.ok and few.trust.why.endswith("Tell more instants of the stroke")
 
 
+def test_a_stroke_in_millinewtons_is_asked_for_its_unit(toucher: Toucher) -> None:
+    """It was told to stroke further."""
+    stroke = [replace(one, wrench=1e3 * np.asarray(one.wrench)) for one in measured(*wiped(1e-3, back=True), 0.4)]
+    found = fit_friction(toucher, stroke)
+    assert not found.trust.ok and found.trust.why.endswith("are wrenches in newtons, and poses in metres?")
+
+
 def test_a_stroke_whose_poses_tremble_is_not_told_to_tell_more(toucher: Toucher) -> None:
     rng, stroke = np.random.default_rng(0), measured(*wiped(0.02, True), 0.4)
     trembling = [replace(one, pose_body_from_tool=at(*rng.normal(0, 3e-4, 3)) @ one.pose_body_from_tool)
