@@ -71,10 +71,10 @@ def _clock_above_zero() -> Iterator[None]:
     """While inside, a time below 0 on /clock is passed over with a line; rclpy 7.1 raises ValueError as it spins."""
     take = TimeSource.clock_callback
 
-    def taken(source: TimeSource, msg: Any) -> None:
-        node = source._get_node()
+    def taken(self: TimeSource, msg: Any) -> None:
+        node = self._get_node()
         if msg.clock.sec >= 0:
-            take(source, msg)
+            take(self, msg)
         elif node is not None:
             node.get_logger().warning(f"a time of {msg.clock.sec} s on /clock is passed over; it must be 0 or more.",
                                       throttle_duration_sec=CLOCK_TOLD_S)  # fmt: skip
