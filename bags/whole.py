@@ -28,7 +28,7 @@ def differences(ours: Answer, theirs: Frame, *, replayed: bool = False) -> Diffe
     Displacement, depth, pose and the bound on displacement in metres; pressure and wrenches as the share of the largest
     times UNIT, so that one tolerance holds all; what is no number on one side, and status and flags, are off by
     infinity. Methods have flags and bounds of their own: these are held between answers of one method only.
-    The bound on force and the sentences are not held.
+    The sentences are not held.
 
     Args:
         ours: answer that is judged.
@@ -51,8 +51,11 @@ def differences(ours: Answer, theirs: Frame, *, replayed: bool = False) -> Diffe
         for part, much in _touches(touch, theirs.touches[name], told=bool(theirs.surfaces.get(name))).items():
             off[part] = max(off.get(part, 0.0), much)
         if ours.method == theirs.method:
-            flag = _flags((touch.trust.in_range,), (theirs.touches[name].trust.in_range,), doubted)
-            off["trust"] = max(off["trust"], flag)
+            known = theirs.touches[name]
+            off["trust"] = max(off["trust"], _flags((touch.trust.in_range,), (known.trust.in_range,), doubted))
+            if theirs.surfaces.get(name):
+                apart = UNIT * _apart(touch.force_bound, known.force_bound) / max(known.force, MIN_FORCE)
+                off["bound on force"] = max(off.get("bound on force", 0.0), apart)
     return {part: much for part, much in off.items() if much}
 
 

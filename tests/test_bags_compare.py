@@ -373,9 +373,14 @@ def flagged(answer):
     answer.in_range = not answer.in_range
 
 
+def bounded(answer):
+    for touch in answer.touches:
+        touch.force_bound *= 2
+
+
 @pytest.mark.parametrize(("change", "part"), [
     (far_off, "displacement, by up to 5 mm at a vertex"), (pressed_twice, "pressure"), (pushed, "wrench"),
-    (elsewhere, "pose"), (flagged, "trust"),
+    (elsewhere, "pose"), (flagged, "trust"), (bounded, "bound on force"),
 ])  # fmt: skip
 def test_an_answer_that_differs_in_any_part_is_told_by_replay_and_compare(run, tmp_path, capsys, change, part):
     theirs = changed(run, tmp_path / "theirs", lambda topic, answer: topic.endswith("displacement") and change(answer))
