@@ -380,7 +380,8 @@ def _one_way(inward, weights):
 def _sinking(grid, pose, points, inward, thickness, area, strain):
     """Depth by which skin sinks along its normal if it goes with the tool along the mean normal, (N,) [m].
 
-    On a limb that is no wider than its contact, columns along the normals meet the tool at a slant, and too deep.
+    On a limb that is no wider than its contact, columns along the normals meet the tool at a slant, and too deep. Those
+    that lead out of its wall leave it too early: skin that is inside it sinks to where it ends along that way.
     """
     depth = strain * thickness
     way = _one_way(inward, area * depth)
@@ -390,7 +391,9 @@ def _sinking(grid, pose, points, inward, thickness, area, strain):
         cosine = inward[n, 0] * way[0] + inward[n, 1] * way[1] + inward[n, 2] * way[2]
         guess = max(depth[n] * cosine, 1e-9)
         ray = ray_from(pose, points[n, 0], points[n, 1], points[n, 2], way[0], way[1], way[2])
-        depth[n] = min(depth_in_column(grid, ray, 4 * guess, guess) * cosine, depth[n])
+        inside = 1 - distance_in_column(grid, ray, 0.0) / wall_in(grid[3], thickness[n])
+        far = depth_in_column(grid, ray, max(4 * guess, thickness[n]), guess) * cosine
+        depth[n] += (far - depth[n]) * (min(max(inside, 0.0), 1.0) if far > depth[n] else 1.0)
     return depth
 
 

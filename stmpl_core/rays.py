@@ -9,7 +9,8 @@ from stmpl_core.sdf import distance_at
 
 WALL = 0.05  # width over which depth rises beside a tool's wall, over the thickness: nothing pops in while it slides
 PASSED, MOST_PASSED = 7, 64  # parts of a column's way between which it is looked how far it is inside a tool, or beside
-ENTERS, LOOKS_BACK = 12, 0.3  # steps to where a column enters a tool, cosine from which its surface looks back there
+ENTERS, LOOKS_BACK = 12, 0.15  # steps to where a column enters a tool, cosine from which its surface looks back there
+LOOKED_AT = 0.2 * WALL  # way over which it is asked whether it does, over the thickness
 NOT_SUNK, ANYHOW = np.zeros(3), 8.0  # what is said of a tool that has not sunk under skin; more than that: anyhow, by
 UNSAID = np.full(3, ANYHOW + 1)  # a share that rises by 1
 MAX_COLUMN_STRAIN = 0.9  # strain beyond which no column is squeezed
@@ -141,10 +142,10 @@ def sunk_under(grid, ray, t, top):
             return 0.0
         d = distance_in_column(grid, ray, s)
     whole = np.sqrt(size)
-    step = WALL * t / whole
+    step = LOOKED_AT * t / whole
     rise = distance_at(grid[0], grid[1], grid[2], ray[0] + s * ray[3] + step * top[0],
                        ray[1] + s * ray[4] + step * top[1], ray[2] + s * ray[5] + step * top[2]) - d  # fmt: skip
-    return whole * min(max(rise / (LOOKS_BACK * WALL * t), 0.0), 1.0)
+    return whole * min(max(rise / (LOOKS_BACK * LOOKED_AT * t), 0.0), 1.0)
 
 
 @numba.njit(forceinline=True, cache=True, error_model="numpy")

@@ -284,6 +284,22 @@ def test_a_leaning_stylus_sinks_under_skin_without_a_step_whatever_the_mesh(lean
     assert np.abs(by_mesh / by_mesh[0] - 1).max() < 0.02
 
 
+def test_skin_under_a_thin_pin_sinks_with_it_where_columns_lead_out_of_its_wall() -> None:
+    """On an uneven forearm, where they differ by 20 degrees under a pin of 4 mm."""
+    layer, pin = living(Body.anny(), "left_forearm", edge_length=6e-3), punch(0.002, 0.03)
+    vertex, columns, field = 1314, Columns(layer), SignedDistance.of(pin, margin=0.02)
+    t, z, azimuth = float(layer.thickness[vertex]), layer.normals[vertex], np.radians(335)
+    pose = turn((np.cos(azimuth), np.sin(azimuth), 0), 0.26)
+    x = np.cross(z, (0.3, 0.5, 0.8)) / np.linalg.norm(np.cross(z, (0.3, 0.5, 0.8)))
+    pose[:3, :3] = np.column_stack([x, np.cross(z, x), z]) @ pose[:3, :3]
+    heights = pin.vertices @ pose[:3, :3].T @ z
+    end = pose[:3, :3] @ pin.vertices[heights < heights.min() + 1e-3].mean(axis=0)
+    end += (heights.min() - end @ z) * z
+    for depth in np.linspace(0.6, 0.85, 10) * t:
+        pose[:3, 3] = layer.vertices[vertex] - depth * z - end
+        assert columns.squeezed(field, pose).nodes.depths.max() > 0.7 * depth
+
+
 @pytest.mark.parametrize("radius", [0.03, 0.04, 0.06, 0.08])
 def test_a_tool_as_wide_as_a_limb_presses_from_first_touch_on(round_limb: Columns, radius: float) -> None:
     """Its distance field ends above the core: no column may miss it for that."""

@@ -3,7 +3,16 @@
 
 import warp as wp
 
-from stmpl_core.rays import ANYHOW, MAX_COLUMN_STRAIN, MOST_PASSED, PASSED, SECANT_START, SECANT_TOLERANCE, WALL
+from stmpl_core.rays import (
+    ANYHOW,
+    LOOKED_AT,
+    MAX_COLUMN_STRAIN,
+    MOST_PASSED,
+    PASSED,
+    SECANT_START,
+    SECANT_TOLERANCE,
+    WALL,
+)
 from stmpl_core.rays import ENTERS as MOST_ENTERS
 from stmpl_core.rays import LOOKS_BACK as LOOKED_BACK
 from stmpl_core.solids import BOX, CAPSULE, NEAREST
@@ -17,6 +26,7 @@ MOST_STRAIN = wp.constant(wp.float64(MAX_COLUMN_STRAIN))
 PARTS, MOST_PARTS = wp.constant(wp.float64(PASSED)), wp.constant(wp.float64(MOST_PASSED))
 SAID_ANYHOW = wp.constant(wp.float64(ANYHOW))
 ENTERS, LOOKS_BACK = wp.constant(MOST_ENTERS), wp.constant(wp.float64(LOOKED_BACK))
+BEHIND = wp.constant(wp.float64(LOOKED_AT))
 IS_BOX, IS_CAPSULE, ON_AXIS = wp.constant(BOX), wp.constant(CAPSULE), wp.constant(wp.float64(NEAREST))
 START, TOLERANCE = wp.constant(wp.float64(SECANT_START)), wp.constant(wp.float64(SECANT_TOLERANCE))
 wp.set_module_options(OPTIONS)
@@ -251,9 +261,9 @@ def sunk_under(grid: Grid, coefficients: wp.array(dtype=real), start: vec3, way:
                 step = ENTERS
     if s >= t:
         return real(0.0)
-    by = WALL_WIDTH * t / whole
+    by = BEHIND * t / whole
     rise = distance_at(grid, coefficients, start + s * way + by * top) - d
-    return whole * wp.clamp(rise / (LOOKS_BACK * WALL_WIDTH * t), real(0.0), real(1.0))
+    return whole * wp.clamp(rise / (LOOKS_BACK * BEHIND * t), real(0.0), real(1.0))
 
 
 @wp.func

@@ -11,7 +11,7 @@ from stmpl_core.gpu.blocks import sum_of, wait
 from stmpl_core.gpu.columns import _marked
 from stmpl_core.gpu.hold import FADE_RING, HARDENING, NEAR, RINGS, STACK_LINEAR_TO, STEPS, _row, _write, _write_alike
 from stmpl_core.gpu.packs import Scratch, Skins
-from stmpl_core.gpu.rays import OPTIONS, depth_in_column, real, vec3
+from stmpl_core.gpu.rays import OPTIONS, along, depth_in_column, real, vec3, wall_in
 from stmpl_core.networks import STACK_NODE
 from stmpl_core.response import SPREAD as SPREAD_OF_AREA
 
@@ -69,9 +69,12 @@ def sink(lanes: wp.int32, many: wp.int32, skins: Skins, scratch: Scratch):
             pose, cosine = wp.transpose(scratch.pose[c]), wp.dot(scratch.inward[s, i], way)
             guess = wp.max(depth * cosine, real(1e-9))
             start = pose * (scratch.point[s, i] - scratch.place[c])
-            far = depth_in_column(skins.grids[scratch.grid[c]], skins.coefficients, start, pose * way,
-                                  real(4.0) * guess, guess)  # fmt: skip
-            sinking = wp.min(far * cosine, depth)
+            grid, thick = skins.grids[scratch.grid[c]], scratch.thick[s, i]
+            far = depth_in_column(grid, skins.coefficients, start, pose * way, wp.max(real(4.0) * guess, thick), guess)
+            inside = real(1.0)
+            if far * cosine > depth:
+                inside -= along(grid, skins.coefficients, start, pose * way, real(0.0)) / wall_in(grid, thick)
+            sinking += (far * cosine - depth) * wp.clamp(inside, real(0.0), real(1.0))
         scratch.sinking[s, i] = sinking
 
 
