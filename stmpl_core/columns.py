@@ -31,7 +31,7 @@ from stmpl_core.soundness import too_long
 from stmpl_core.touch import MIN_ONE_WAY_SHARE
 
 LEAST_UNDER, ALL_UNDER = 0.05, (0.1, 0.3)  # how much further inside a tool a column gets below its skin than there, or
-# of a stack nearer to it than there and at its core, over the width of a wall, where the tool begins to sink under skin,
+# of stacks nearer to it than there and at its core, over the width of a wall, where the tool begins to sink under skin,
 # and where it has: of one material, of a stack
 BLOCK = 32  # columns that are looked at together
 FINEST = 0.02  # size of the parts of a long triangle at which the search for a tool in it ends, over the thickness
