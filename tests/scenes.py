@@ -3,10 +3,11 @@
 import numpy as np
 import trimesh
 
-from stmpl_core import Answer, Contact, Load, SoftLayer, Tissue, Tool, Touch
+from stmpl_core import Answer, Contact, Load, Membrane, Ply, SoftLayer, Tissue, Tool, Touch
 
 RADIUS, LENGTH = 0.04, 0.16  # m, of the limb
 THICKNESS = 7.5e-3  # m
+STACK = Tissue(3e3, 0.4, skin=Membrane(2e5, 1.5e-3, 15.0), deeper=(Ply(8e-3, 15e3, 0.4),))
 
 
 # Skins

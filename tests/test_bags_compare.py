@@ -336,8 +336,9 @@ def test_a_comparison_walks_the_file_once(run, monkeypatch):
     assert len(walks) == 2
 
 
-def changed(run, folder, change):
-    """The run with what `change` made of each of its messages; it gets their topics, too."""
+def changed(run, folder, change, wanted=lambda topic, time: True):
+    """The run with what `change` made of each of its messages; it gets their topics, too. Without those, by topic and
+    time since its start [s], that are not `wanted`."""
     with BagWriter(folder) as writer:
         write_provenance(writer, None, method="winkler")
         channels = {}
@@ -345,7 +346,8 @@ def changed(run, folder, change):
             if topic not in channels:
                 channels[topic] = writer.add_channel(topic, message.__msgtype__)
             change(topic, message)
-            writer.write(channels[topic], cdr(message), log_time, log_time)
+            if wanted(topic, (log_time - START) * 1e-9):
+                writer.write(channels[topic], cdr(message), log_time, log_time)
     return folder
 
 
@@ -428,20 +430,14 @@ def test_answers_are_paired_in_the_order_in_which_they_were_received(run, tmp_pa
 
 
 def without(run, folder, wanted, resting=()):
-    """The run without the messages, by topic and time since its start [s], that are not `wanted`; answers to
-    nothing among `resting`."""
-    with BagWriter(folder) as writer:
-        write_provenance(writer, None, method="winkler")
-        channels = {}
-        for topic, message, log_time in Bag(run).messages():
-            if topic not in channels:
-                channels[topic] = writer.add_channel(topic, message.__msgtype__)
-            if topic.endswith("displacement") and message.sequence in resting:
-                message.touches, message.displacement = [], np.zeros_like(message.displacement)
-                message.pressure = np.zeros_like(message.pressure)
-            if wanted(topic, (log_time - START) * 1e-9):
-                writer.write(channels[topic], cdr(message), log_time, log_time)
-    return folder
+    """The run without the messages that are not `wanted` (see `changed`); answers to nothing among `resting`."""
+
+    def rest(topic, message):
+        if topic.endswith("displacement") and message.sequence in resting:
+            message.touches, message.displacement = [], np.zeros_like(message.displacement)
+            message.pressure = np.zeros_like(message.pressure)
+
+    return changed(run, folder, rest, wanted)
 
 
 @pytest.mark.parametrize("kind", ["pose", "wrench", "mesh"])

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from benchmarks.living_limbs import site
-from stmpl_core import Membrane, Ply, Tissue, Tool
+from stmpl_core import Tool
 from stmpl_core.body import Body
 from stmpl_core.columns import Columns, Squeeze, grid_of
 from stmpl_core.living import living
@@ -14,10 +14,24 @@ from stmpl_core.methods.winkler import column_pressure
 from stmpl_core.nodes import NODES
 from stmpl_core.rays import MAX_COLUMN_STRAIN, NOT_SUNK, PASSED, UNSAID, inside_most, sunk_under
 from stmpl_core.sdf import SignedDistance
-from tests.scenes import LENGTH, RADIUS, at, ball, box, capsule, enlarged, limb, placed, plate, punch, scaled, turn
+from tests.scenes import (
+    LENGTH,
+    RADIUS,
+    STACK,
+    at,
+    ball,
+    box,
+    capsule,
+    enlarged,
+    limb,
+    placed,
+    plate,
+    punch,
+    scaled,
+    turn,
+)  # fmt: skip
 
 LIMB, PLATE = limb(), plate()
-STACK = Tissue(3e3, 0.4, skin=Membrane(2e5, 1.5e-3, 15.0), deeper=(Ply(8e-3, 15e3, 0.4),))
 MARGIN = 5e-3  # m
 
 

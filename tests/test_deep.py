@@ -3,15 +3,14 @@
 import numpy as np
 import pytest
 
-from stmpl_core import Membrane, Ply, Rig, Simulator, Skin, Tissue, Tool
+from stmpl_core import Rig, Simulator, Skin, Tissue, Tool
 from stmpl_core.body import Body
 from stmpl_core.deep import DEEPEST
 from stmpl_core.methods import MomentNet, Winkler
 from stmpl_core.touch import APART, IN_CORE, NO_FORCE
-from tests.scenes import LENGTH, RADIUS, at, ball, box, capsule, limb, plate, press, punch, touch_of, turn
+from tests.scenes import LENGTH, RADIUS, STACK, at, ball, box, capsule, limb, plate, press, punch, touch_of, turn
 
 LIMB = limb(4e-3)
-STACK = Tissue(3e3, 0.4, skin=Membrane(2e5, 1.5e-3, 15.0), deeper=(Ply(8e-3, 15e3, 0.4),))
 LIMBS = {"paper": LIMB, "layered": limb(6e-3, 0.02, 0.05, LENGTH).with_(tissue=STACK)}
 BALLS = {"paper": (ball(), 0.012), "layered": (ball(0.02), 0.02)}
 LYING = turn((0, 1, 0), np.pi / 2)

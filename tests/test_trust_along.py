@@ -4,15 +4,14 @@ import numpy as np
 import pytest
 
 from benchmarks.tools import ball, block_letter, fingertip, flat
-from stmpl_core import Contact, Membrane, Ply, Simulator, Tissue, Tool
+from stmpl_core import Contact, Simulator, Tissue, Tool
 from stmpl_core.conform import kept_out
 from stmpl_core.methods import MomentNet, Winkler
 from studies.stability.meshes import inserted
 from studies.stability.meshes import limb as round_limb
-from tests.scenes import limb, plate, turn
+from tests.scenes import STACK, limb, plate, turn
 
 TOOLS = {"ball": ball(12), "fingertip": fingertip(8, 14), "punch": flat(9, 1.5), "letter": block_letter("H", 26)}
-STACK = Tissue(3e3, 0.4, skin=Membrane(2e5, 1.5e-3, 15.0), deeper=(Ply(8e-3, 15e3, 0.4),))
 SIDEWAYS = turn((0, 1, 0), np.pi / 2)  # z of a tool to x of the limb
 DEPTHS = np.concatenate([np.arange(0.005, 0.1, 0.01), np.arange(0.1, 0.905, 0.02)])  # over the thickness
 LAYERS = {"paper": limb(4e-3), "layered": limb(6e-3, 0.02, 0.05, 0.2).with_(tissue=STACK),
