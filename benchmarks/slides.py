@@ -40,6 +40,7 @@ log = logging.getLogger(__name__)
 RELAXATION = Prony((0.225, 0.225), (0.5, 5.0), "45 % in equal parts, for trials")
 SLAB = Tissue(5e3, 0.45)
 STACK = Tissue(3e3, 0.45, skin=Membrane(2e5, 1.5e-3, 15.0), deeper=(Ply(8e-3, 15e3, 0.45),))
+BACK = Tissue(2.5e3, 0.45, skin=Membrane(130e3, 2.5e-3, 11.4), deeper=(Ply(6e-3, 31e3, 0.45),))  # as measured there
 LEARNT_NU = 0.4  # Poisson's ratio that contacts were learnt with, as far as 0.42
 SPEEDS = 5e-4, 5e-3, 0.05, 0.3  # of presses [m/s]
 TUBE = 0.045  # radius of the tube [m]
@@ -64,6 +65,13 @@ def slab(thickness: float, stacked: bool, fading: bool, nu: float = SLAB.poisson
     layer = plate(0.168, 6e-3, thickness, crossed=True).with_(tissue=faded(tissue) if fading else tissue)
     fem = PatchFem(element="P1xP2", layers=1 if stacked else 2, refine=3, reach=5, check_stability=False)
     return Ground(layer, np.eye(4), fem)
+
+
+@cache
+def flat_stack(tissue: Tissue, thickness: float, size: float, refine: int) -> Ground:
+    """A flat square of skin, fat and muscle, for slides that take a minute."""
+    fem = PatchFem(element="P1xP2", layers=1, refine=refine, reach=4, check_stability=False)
+    return Ground(plate(size, 6e-3, thickness, crossed=True).with_(tissue=tissue), np.eye(4), fem)
 
 
 @cache
@@ -248,6 +256,12 @@ def _scenes() -> Iterator[tuple[str, Scene]]:
     yield "slab-ball8-spin-mu0.6", Scene(flat(), 8e-3, lambda g: spin(g, 8e-3, 4e-3, np.pi / 3), 0.6)
     yield "stack-ball20-mu0.6", Scene(flat(True, thickness=25e-3), 0.02, lambda g: slide(g, 0.02, 6e-3, 24e-3), 0.6)
     yield "slab-ball8-back-mu0.6", Scene(flat(), 8e-3, lambda g: slide(g, 8e-3, 4e-3, 10e-3, back=10e-3), 0.6)
+    yield "flat-back-ball20-mu0.8", Scene(lambda: flat_stack(BACK, 18e-3, 0.15, 2), 0.02,
+                                          lambda g: slide(g, 0.02, 7e-3, 24e-3, 1.5e-3), 0.8, 0.12)  # fmt: skip
+    yield "flat-back-ball8-mu0.5", Scene(lambda: flat_stack(BACK, 18e-3, 0.12, 3), 8e-3,
+                                         lambda g: slide(g, 8e-3, 7e-3, 12e-3), 0.5, 0.12)  # fmt: skip
+    yield "stack-ball20-deep-mu0.6", Scene(lambda: flat_stack(STACK, 25e-3, 0.15, 2), 0.02,
+                                           lambda g: slide(g, 0.02, 9e-3, 24e-3, 1.5e-3), 0.6, 0.12)  # fmt: skip
     for mu in (0.6, 0.3, 1.0):
         yield f"slab-ball20-mu{mu}", Scene(flat(), 0.02, lambda g: slide(g, 0.02, 5e-3, 24e-3), mu)
     yield "forearm-massage", Scene(lambda: forearm(True), 0.02, lambda g: massage(g, 0.02, 9e-3, 2), "stick", 0.15)
