@@ -501,10 +501,9 @@ def _softly(banked, soft, k, f, g, h):
 
 @numba.njit(cache=True, nogil=True)
 def _corners_of(corners, shares, skin_corners, skin_shares):
-    """The coarse vertices around nodes, their weights, (N, 9) each, how many there are, (N,), and all that are met."""
+    """The coarse vertices around nodes, their weights, (N, 9) each, and how many there are, (N,)."""
     count = len(corners) if len(skin_corners) else 0
     index, weight, many = np.zeros((count, 9), np.int64), np.zeros((count, 9)), np.zeros(count, np.int64)
-    met = np.empty(9 * count, np.int64)
     for n in range(count):
         for a in range(3):
             for b in range(3):
@@ -516,18 +515,23 @@ def _corners_of(corners, shares, skin_corners, skin_shares):
                     index[n, k] = c
                     many[n] += 1
                 weight[n, k] += shares[n, a] * skin_shares[corners[n, a], b]
-        met[9 * n : 9 * n + 9] = index[n, 0]
-        met[9 * n : 9 * n + many[n]] = index[n, : many[n]]
-    return index, weight, many, np.unique(met)
+    return index, weight, many
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _between_coarse(index, many, some, motion, turns):
+def _between_coarse(index, many, motion, turns):
     """Motion of coarse vertices under a pressure at others, (S, 3, S), and the place of each node's in it, (N, 9)."""
+    slot = np.full(len(motion), -1)
+    for n in range(len(index)):
+        for a in range(many[n]):
+            slot[index[n, a]] = 0
+    some = np.flatnonzero(slot == 0)
+    for c in range(len(some)):
+        slot[some[c]] = c
     place, felt = np.zeros(index.shape, np.int64), np.zeros((len(some), 3, len(some)))
     for n in range(len(index)):
         for a in range(many[n]):
-            place[n, a] = np.searchsorted(some, index[n, a])
+            place[n, a] = slot[index[n, a]]
     for c in range(len(some)):
         v = some[c]
         for x in range(3):
@@ -542,17 +546,17 @@ def _between_coarse(index, many, some, motion, turns):
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _wide(index, weight, many, some, gathered, motion, turns, out):
+def _wide(index, weight, many, gathered, motion, turns, out):
     """Adds the coarse motion of each node under a force E inwards at each, (N, 3, N) [1/m]."""
     if not len(gathered):
         return
-    felt, place = _between_coarse(index, many, some, motion, turns)
-    row = np.empty((3, len(some)))
+    felt, place = _between_coarse(index, many, motion, turns)
+    row = np.empty((3, len(felt)))
     for n in range(len(index)):
         row[:] = 0.0
         for a in range(many[n]):
             for x in range(3):
-                for d in range(len(some)):
+                for d in range(len(felt)):
                     row[x, d] += weight[n, a] * felt[place[n, a], x, d]
         for j in range(len(index)):
             for a in range(many[j]):
@@ -562,21 +566,42 @@ def _wide(index, weight, many, some, gathered, motion, turns, out):
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _inwards(index, weight, many, some, gathered, motion, turns, inward, out):
-    """Adds what `_wide` moves each node inwards, (N, N) [1/m]."""
-    if not len(gathered):
-        return
-    felt, place = _between_coarse(index, many, some, motion, turns)
-    rows, spread = np.zeros((len(index), len(some))), np.zeros((len(some), len(index)))
-    for n in range(len(index)):
-        row = rows[n]
-        for a in range(many[n]):
-            spread[place[n, a], n] = weight[n, a] / gathered[index[n, a]]
-            at = felt[place[n, a]]
-            s0, s1, s2 = (weight[n, a] * inward[n, 0], weight[n, a] * inward[n, 1], weight[n, a] * inward[n, 2])
-            for d in range(len(some)):  # one loop: the row stays in registers
-                row[d] = row[d] + s0 * at[0, d] + s1 * at[1, d] + s2 * at[2, d]
-    out += np.dot(rows, spread)
+def _inwards(index, weight, many, group, gathered, motion, turns, inward, out):
+    """Adds what `_wide` moves each node inwards under those of its group, (N, N) [1/m]."""
+    for one in np.unique(group) if len(gathered) else group[:0]:
+        of = np.flatnonzero(group == one)
+        at, share, last = index[of], weight[of], many[of]
+        felt, place = _between_coarse(at, last, motion, turns)
+        rows, spread = np.zeros((len(of), len(felt))), np.zeros((len(felt), len(of)))
+        for n in range(len(of)):
+            row, down = rows[n], inward[of[n]]
+            for a in range(last[n]):
+                spread[place[n, a], n] = share[n, a] / gathered[at[n, a]]
+                there = felt[place[n, a]]
+                s0, s1, s2 = share[n, a] * down[0], share[n, a] * down[1], share[n, a] * down[2]
+                for d in range(len(felt)):  # one loop: the row stays in registers
+                    row[d] = row[d] + s0 * there[0, d] + s1 * there[1, d] + s2 * there[2, d]
+        moved = _product(rows.T.copy(), spread)
+        for j in range(len(of)):
+            for n in range(len(of)):
+                out[of[n], of[j]] += moved[j, n]
+
+
+@numba.njit(cache=True, nogil=True, fastmath={"contract"}, error_model="numpy")
+def _product(columns, spread):
+    """Transposed product of rows, given as columns (S, N), and a matrix (S, N) most of which is 0, (N, N).
+
+    To the bit that of BLAS, which takes many times as long for the zeros.
+    """
+    out = np.zeros((spread.shape[1], columns.shape[1]))
+    for d in range(len(spread)):
+        column = columns[d]
+        for j in range(len(out)):
+            per, row = spread[d, j], out[j]
+            if per != 0:
+                for n in range(len(row)):
+                    row[n] += per * column[n]
+    return out
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
@@ -584,9 +609,9 @@ def _matrix(points, inward, area, corners, shares, group, unit, soft, banked, sk
             motion, turns):  # fmt: skip
     """See Green.matrix."""
     count = len(points)
-    index, weight, many, some = _corners_of(corners, shares, skin_corners, skin_shares)
+    index, weight, many = _corners_of(corners, shares, skin_corners, skin_shares)
     wide, out = np.zeros((count, count)), np.zeros((count, count))
-    _inwards(index, weight, many, some, gathered, motion, turns, inward, wide)
+    _inwards(index, weight, many, group, gathered, motion, turns, inward, wide)
     least, steps, logs = area.min(), (AREAS - 1) / max(np.ptp(area), 1e-9 * area.max()), np.empty(AREAS)
     for k in range(AREAS):  # of spreads in metres: one for each pair would take as long as all else
         logs[k] = np.log(SPREAD * np.sqrt(least + k / steps))
@@ -594,17 +619,18 @@ def _matrix(points, inward, area, corners, shares, group, unit, soft, banked, sk
     facing, place, spot, away = np.empty(count), np.empty(count), np.empty(count), np.empty(count)
     for i in range(count):
         p0, p1, p2, n0, n1, n2 = by[0, i], by[1, i], by[2, i], by[3, i], by[4, i], by[5, i]
-        its, root = area[i], roots[i]
-        for j in range(i + 1):  # what runs in vector registers
+        its, root, first, end = area[i], roots[i], np.uint64(0), np.uint64(i + 1)
+        while group[first] != group[i]:
+            first += NEXT
+        for j in range(first, end):  # what runs in vector registers
             facing[j] = n0 * by[3, j] + n1 * by[4, j] + n2 * by[5, j]
             x, y, z, mean = p0 - by[0, j], p1 - by[1, j], p2 - by[2, j], 0.5 * (its + area[j])
             square = x * x + y * y + z * z
             place[j] = np.sqrt(np.sqrt(square) / (root * roots[j])) * ROWS
             spot[j] = min((mean - least) * steps, AREAS - 1.001)
             away[j] = np.sqrt(square + mean * (ROUND * SPREAD) ** 2)
-        for j in range(i + 1):
+        for j in range(first, end):
             if group[i] != group[j]:
-                wide[i, j] = wide[j, i] = 0.0
                 continue
             both, f = 0.5 * (wide[i, j] + wide[j, i]), place[j]
             if facing[j] > 0 and f < FARTHEST:
@@ -668,9 +694,9 @@ def _blocks(points, inward, area, corners, shares, group, unit, soft, tables, sk
             motion, turns):  # fmt: skip
     """Motion of each node under a force E at each, (3 N, 3 N) [1/m]; the coarse part only under what goes inwards."""
     count = len(points)
-    index, weight, many, some = _corners_of(corners, shares, skin_corners, skin_shares)
+    index, weight, many = _corners_of(corners, shares, skin_corners, skin_shares)
     wide, out = np.zeros((count, 3, count)), np.zeros((count, 3, count, 3))
-    _wide(index, weight, many, some, gathered, motion, turns, wide)
+    _wide(index, weight, many, gathered, motion, turns, wide)
     force, moved = np.zeros(3), np.empty(3)
     for i in range(count):
         for j in range(count):
@@ -797,7 +823,7 @@ def give_at(corners, shares, forces, give, turns):
 @numba.njit(cache=True, nogil=True)
 def _handed(inward, corners, shares, forces, skin_corners, skin_shares, gathered):
     """Pressures over E at coarse vertices that forces over E at nodes amount to, inwards, (C,)."""
-    index, weight, many, _ = _corners_of(corners, shares, skin_corners, skin_shares)
+    index, weight, many = _corners_of(corners, shares, skin_corners, skin_shares)
     out = np.zeros(len(gathered))
     for n in range(len(index)):
         down = inward[n, 0] * forces[n, 0] + inward[n, 1] * forces[n, 1] + inward[n, 2] * forces[n, 2]
@@ -809,7 +835,7 @@ def _handed(inward, corners, shares, forces, skin_corners, skin_shares, gathered
 @numba.njit(cache=True, nogil=True)
 def _handed_along(ways, corners, shares, forces, skin_corners, skin_shares, gathered):
     """Tractions over E along ways (C, 3) at coarse vertices that forces over E at nodes amount to, (C,)."""
-    index, weight, many, _ = _corners_of(corners, shares, skin_corners, skin_shares)
+    index, weight, many = _corners_of(corners, shares, skin_corners, skin_shares)
     out = np.zeros(len(gathered))
     for n in range(len(index)):
         for a in range(many[n]):

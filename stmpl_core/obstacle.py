@@ -28,7 +28,7 @@ OWN = 3.921  # of an even pressure on a lattice of triangles: sum of 1 / r with 
 TOLERANCE = 3e-6  # largest change of the forces of one iteration, over the largest, at which it ends
 MAX_ITERATIONS = 1000  # most took 30; three tools that cross on one material took 250 to 600
 FARTHEST = 1e3  # force of a node over what it needs alone, beyond which there is no solution: no layer responds so
-NEXT = np.uint64(1)
+NONE, NEXT = np.uint64(0), np.uint64(1)
 ONE_THREAD = 2**18  # multiplications up to which OpenBLAS takes one thread, and so always sums in the same order
 POWER_TOLERANCE = 1e-4  # square of the residual over the first, at which the power is known
 
@@ -89,17 +89,17 @@ def pairs(points, inward, thickness, area, group, mean, half_space, rows):
     roots, own = 1 / np.sqrt(thickness), np.sqrt(area) / OWN
     away, place, per = np.empty(count), np.empty(count), np.empty(count)
     for i in range(count):
-        _apart(by, group, i, away)
+        _apart(by, group, NONE, i, away)
         for j in range(i + 1):
             per[j] = roots[i] * roots[j]
             place[j] = min(away[j] * per[j] * STEPS, REACH * STEPS)
             away[j] = half_space / max(away[j], 0.5 * (own[i] + own[j]))
-        _read(rows[:, 0], place, per, out[i], i)
+        _read(rows[:, 0], place, per, out[i], NONE, i)
         for j in range(i + 1):
             out[i, j] = mean * (away[j] + out[i, j]) if place[j] < REACH * STEPS else 0.0
             per[j] *= per[j]
         for m in range(width):
-            _read(rows[:, m + 1], place, per, rings[m, i], i)
+            _read(rows[:, m + 1], place, per, rings[m, i], NONE, i)
     _mirror(out)
     for m in range(width):
         _mirror(rings[m])
@@ -110,14 +110,17 @@ def pairs(points, inward, thickness, area, group, mean, half_space, rows):
 def rings_of(points, inward, thickness, group, rows):
     """The weights in rings that `pairs` gives for nodes on a layer of one thickness [m], (., N, N)."""
     count, scale, by = len(points), STEPS / thickness, columns_of(points, inward)
-    rings = np.empty((rows.shape[1] - 1, count, count), np.float32)
+    rings = np.zeros((rows.shape[1] - 1, count, count), np.float32)
     away, per = np.empty(count), np.full(count, 1 / (thickness * thickness))
     for i in range(count):
-        _apart(by, group, i, away)
-        for j in range(i + 1):
+        first = np.uint64(0)
+        while group[first] != group[i]:  # before it there are none that it feels
+            first += NEXT
+        _apart(by, group, first, i, away)
+        for j in range(first, np.uint64(i + 1)):
             away[j] = min(away[j] * scale, REACH * STEPS)
         for m in range(len(rings)):
-            _read(rows[:, m + 1], away, per, rings[m, i], i)
+            _read(rows[:, m + 1], away, per, rings[m, i], first, i)
     for m in range(len(rings)):
         _mirror(rings[m])
     return rings
@@ -134,19 +137,20 @@ def columns_of(points, inward):
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _apart(by, group, i, out):
-    """Writes how far node i is from those up to it [m]; inf from one that it does not face, or of another group."""
+def _apart(by, group, first, i, out):
+    """Writes how far node i is from those from a first one up to it [m]; inf from one that it does not face, or of
+    another group."""
     p0, p1, p2, n0, n1, n2, its = by[0, i], by[1, i], by[2, i], by[3, i], by[4, i], by[5, i], group[i]
-    for j in range(i + 1):
+    for j in range(first, np.uint64(i + 1)):
         facing = n0 * by[3, j] + n1 * by[4, j] + n2 * by[5, j]
         x, y, z = p0 - by[0, j], p1 - by[1, j], p2 - by[2, j]
         out[j] = np.sqrt(x * x + y * y + z * z) if (facing > 0) & (its == group[j]) else np.inf
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _read(table, place, per, out, i):
-    """Writes per times a table's value at places, for node i and those up to it."""
-    for j in range(i + 1):
+def _read(table, place, per, out, first, i):
+    """Writes per times a table's value at places, for the nodes from a first one up to i."""
+    for j in range(first, np.uint64(i + 1)):
         whole = np.int32(place[j])
         f, k = place[j] - whole, np.uint64(whole)  # no index that may count from the end
         out[j] = per[j] * ((1 - f) * table[k] + f * table[k + NEXT])

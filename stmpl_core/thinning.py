@@ -68,6 +68,7 @@ class Thinning:
         points, normals, thickness = np.ascontiguousarray(layer.vertices), layer.normals, layer.thickness
         self.start, self.index = neighbours(points, normals, thickness, layer.faces, np.array([*zones, reach]))
         self._first, self._beside = along_edges(layer.faces, len(points))
+        self._rows, self._reach = np.column_stack([points, normals, thickness]), reach
         count = len(points)
         self._last: tuple[Asked, ...] = ()
         self._grouped: tuple[np.ndarray, np.ndarray] | None = None
@@ -96,7 +97,7 @@ class Thinning:
             return np.zeros(len(vertices), np.int64)
         last = self._grouped
         if last is None or not np.array_equal(last[0], vertices):
-            last = self._grouped = vertices, _together(self.start, self.index, vertices, len(self._stands[0]))
+            last = self._grouped = vertices, _together(self.start, self.index, vertices, self._rows, self._reach)
         return last[1]
 
     def bent(self) -> Thinning:
@@ -165,8 +166,12 @@ def _folded(start, index, some, points, normals, thickness, reach):
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _together(start, index, vertices, count):
-    """Numbers of groups of `vertices`, within each of which each is a neighbour of another; one may come twice."""
+def _together(start, index, vertices, rows, reach):
+    """Numbers of groups of `vertices`, within each of which each is a neighbour of another; one may come twice.
+
+    rows, reach: point, normal and thickness of each vertex, and the reach of a neighbour, as `neighbours` has them.
+    """
+    count = len(rows)
     zones, some = (len(start) - 1) // count, np.unique(vertices)
     place, group, queue = np.full(count, -1), np.full(len(some), -1), np.empty(len(some), np.int64)
     for n in range(len(some)):
@@ -180,6 +185,8 @@ def _together(start, index, vertices, count):
         while many < ends and left:
             i = some[queue[many]]
             many += 1
+            if not _may_reach(rows, reach, i, some, group):
+                continue
             for p in range(start[zones * i], start[zones * (i + 1)]):
                 m = place[index[p]]
                 if m >= 0 and group[m] < 0:
@@ -192,6 +199,18 @@ def _together(start, index, vertices, count):
     for n in range(len(vertices)):
         out[n] = group[place[vertices[n]]]
     return out
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _may_reach(rows, reach, i, some, group):
+    """Whether a vertex that is of no group yet may be a neighbour of vertex i: their list is long to go through."""
+    for m in range(len(some)):
+        j = some[m]
+        if group[m] < 0 and rows[i, 3] * rows[j, 3] + rows[i, 4] * rows[j, 4] + rows[i, 5] * rows[j, 5] > 0:
+            x, y, z = rows[j, 0] - rows[i, 0], rows[j, 1] - rows[i, 1], rows[j, 2] - rows[i, 2]
+            if x * x + y * y + z * z < reach**2 * rows[i, 6] * rows[j, 6]:
+                return True
+    return False
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")

@@ -218,9 +218,12 @@ class Toucher:
         nodes, ends = Nodes.joined([squeeze.nodes for *_, squeeze in tools]), [0]
         beside = np.empty((len(nodes.area), len(tools)))
         for k, (field, pose, squeeze) in enumerate(tools):
-            beside[:, k] = strains_under(grid_of(field), pose, *nodes[:3], squeeze.top)
             ends.append(ends[-1] + len(squeeze.nodes.area))
             beside[ends[k] : ends[k + 1], k] = -1.0
+            for others in (slice(ends[k]), slice(ends[k + 1], None)):
+                if len(beside[others]):
+                    beside[others, k] = strains_under(grid_of(field), pose, *(each[others] for each in nodes[:3]),
+                                                      squeeze.top)  # fmt: skip
         return nodes._replace(beside=beside)
 
     def _covered(self, group: Sequence[_Placed], nodes: Nodes, held: Mapping[str, Held]) -> set[str]:
@@ -646,7 +649,7 @@ def groups_of(points: Sequence[np.ndarray], thickness: float) -> list[list[int]]
         middle, radius = _ball_around(some)
         ball = middle, radius + 0.5 * REACH * thickness
         near = [group for group in groups
-                if any(np.linalg.norm(middle - other) < ball[1] + size for other, size in group[1])]  # fmt: skip
+                if any(math.dist(middle, other) < ball[1] + size for other, size in group[1])]  # fmt: skip
         groups = [group for group in groups if group not in near]
         groups.append(([*(o for group in near for o in group[0]), n], [*(b for g in near for b in g[1]), ball]))
     return [sorted(group) for group, _ in groups]
