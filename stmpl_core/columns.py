@@ -138,6 +138,10 @@ class Columns:
         skin = self.points, self.inward, self.layer.thickness
         return _through_box(*skin, self._order, self._blocks, pose, low, high, reach)
 
+    def nearest(self, points: Points) -> np.ndarray:
+        """Numbers of the vertices nearest to points (N, 3) [m], (N,)."""
+        return _nearest(points, self.points, self._order, self._blocks)
+
     def between(self, field: SignedDistance, pose: Transform, reach: float) -> float:
         """Length of a triangle that is too long, and that a tool meets or is within `reach` of [m]; 0 if there is none.
 
@@ -250,6 +254,30 @@ def _through_box(points, inward, thickness, order, blocks, pose, low, high, reac
                 found[n] = v
                 n += 1
     return np.sort(found[:n])
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _nearest(points, skin, order, blocks):
+    """See Columns.nearest: block by block, but for those that lie farther off than a vertex that was met."""
+    out = np.zeros(len(points), np.int64)
+    for n in range(len(points)):
+        p0, p1, p2, least, first = points[n, 0], points[n, 1], points[n, 2], np.inf, 0
+        for b in range(len(blocks)):
+            x, y, z = blocks[b, 0] - p0, blocks[b, 1] - p1, blocks[b, 2] - p2
+            if x * x + y * y + z * z < least:
+                least, first = x * x + y * y + z * z, b
+        far = np.inf
+        for k in range(len(blocks) + 1):
+            b = k - 1 if k else first  # of all blocks the nearest one says most
+            x, y, z = blocks[b, 0] - p0, blocks[b, 1] - p1, blocks[b, 2] - p2
+            if x * x + y * y + z * z > (far + blocks[b, 3]) ** 2:
+                continue
+            for v in order[b * BLOCK : (b + 1) * BLOCK]:
+                x, y, z = skin[v, 0] - p0, skin[v, 1] - p1, skin[v, 2] - p2
+                away = np.sqrt(x * x + y * y + z * z)
+                if away < far:
+                    far, out[n] = away, v
+    return out
 
 
 @numba.njit(cache=True, nogil=True)

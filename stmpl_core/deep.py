@@ -6,7 +6,6 @@ from functools import cached_property
 
 import numba
 import numpy as np
-from scipy.spatial import KDTree
 
 from stmpl_core.arrays import Transform
 from stmpl_core.columns import Columns, Squeeze, grid_of, middle_of, shifted
@@ -40,7 +39,6 @@ class Deep:
 
     def __init__(self, columns: Columns) -> None:
         self.columns, self.layer = columns, columns.layer
-        self._tree: KDTree | None = None
 
     @cached_property
     def _looked(self) -> tuple[np.ndarray, np.ndarray]:
@@ -65,14 +63,13 @@ class Deep:
         centre, (low, high) = middle_of(field, pose), self._looked
         if (centre < low).any() or (centre > high).any():
             return False
-        return any(self._under(points[:: max(1, len(points) // FIRST)] @ pose[:3, :3].T + pose[:3, 3])) and \
-            bool(self._under(points[:: max(1, len(points) // LOOKED_AT)] @ pose[:3, :3].T + pose[:3, 3]).mean() > 0.5)
+        return all(self._under(points[:: max(1, len(points) // many)] @ pose[:3, :3].T + pose[:3, 3]) > share
+                   for many, share in ((FIRST, 0.0), (LOOKED_AT, 0.5)))  # fmt: skip
 
-    def _under(self, points: np.ndarray) -> np.ndarray:
-        """Mask of the points (N, 3) [m] of the body's frame that are under the skin, (N,)."""
-        nearest = self._nearest(points)
-        under = np.einsum("nx,nx->n", points - self.columns.points[nearest], self.columns.inward[nearest]) > 0
-        return under & ~self._edge[nearest]
+    def _under(self, points: np.ndarray) -> float:
+        """Share of points (N, 3) [m] of the body's frame that are under the skin [-]."""
+        columns = self.columns
+        return _under(points, columns.nearest(points), columns.points, columns.inward, self._edge)
 
     def drawn_back(
         self, field: SignedDistance, pose: Transform, points: np.ndarray, squeeze: Squeeze
@@ -128,20 +125,27 @@ class Deep:
         near = columns.near(field, pose, self.layer.edge_length + moved)
         return _reached(grid_of(field), pose, columns.points, columns.inward, self.layer.thickness, near, moved)
 
-    def _nearest(self, points: np.ndarray) -> np.ndarray:
-        if self._tree is None:
-            self._tree = KDTree(self.columns.points)
-        return np.asarray(self._tree.query(points)[1])
-
     def _out(self, field: SignedDistance, pose: Transform, squeeze: Squeeze) -> np.ndarray | None:
         """The mean normal of the skin over the tool, (3,); None where there is no such direction."""
         v = squeeze.vertices[squeeze.depth > 0]
         if not len(v):
-            return -self.columns.inward[int(self._nearest(middle_of(field, pose)[None])[0])]
+            return -self.columns.inward[int(self.columns.nearest(middle_of(field, pose)[None])[0])]
         vectors = self.layer.vertex_area_vectors[v]
         mean = vectors.sum(axis=0)
         size = float(np.linalg.norm(mean))
         return mean / size if size > FACING * float(self.layer.vertex_areas[v].sum()) else None
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _under(points, nearest, skin, inward, edge):
+    """Share of points (N, 3) that are further in than the vertices that are nearest to them, (N,), off the border."""
+    many = 0
+    for n in range(len(points)):
+        v, into = nearest[n], 0.0
+        for x in range(3):
+            into += (points[n, x] - skin[v, x]) * inward[v, x]
+        many += into > 0 and not edge[v]
+    return many / max(len(points), 1)
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
