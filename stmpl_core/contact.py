@@ -63,6 +63,9 @@ def rigid(what: str, pose: ArrayLike) -> Transform:
     Raises:
         InvalidInput: numbers that are not finite or beyond MOST, or a pose that is not rigid.
     """
+    if type(pose) is np.ndarray and pose.dtype == np.float64 and pose.shape == (4, 4) and pose.flags.c_contiguous \
+            and _rigid(pose):  # fmt: skip
+        return pose
     array = counted(what, pose, (4, 4))
     if not _rigid(array):
         raise InvalidInput(f"{what} is not rigid: it is\n{array}.")
@@ -90,7 +93,7 @@ def _beyond(values, most):
 def _rigid(pose):
     """Whether a matrix (4, 4) turns and moves, to 1e-4; numpy's own calls take ten times as long."""
     for x in range(4):
-        if abs(pose[3, x] - (1.0 if x == 3 else 0.0)) > 1e-4:
+        if not abs(pose[3, x] - (1.0 if x == 3 else 0.0)) <= 1e-4 or not abs(pose[x, 3]) <= MOST:
             return False
     for i in range(3):
         for j in range(3):

@@ -133,7 +133,7 @@ class History:
             stepped.doubted(before, after, *self.series, dt, out, says)
             touches = [self._doubted(touch, bound, row) for touch, bound, row in zip(touches, bounds, out, strict=True)]
         for name in names[many:]:
-            if not (memories[name].scalars.sunk or memories[name].trail.any()):
+            if not (memories[name].sunk or memories[name].trail.any()):
                 del memories[name]
         self._last = State(memories, here, self._skin)
         return touches, self._last
@@ -223,7 +223,7 @@ class History:
         if out[8] != stepped.HOLDS:
             if touch.presses and pressed is not None:
                 changed |= {"status": APART, "force_bound": 0.0, "pressure": None, "pressed": None, "trust": Trust()}
-            if memory.scalars.sunk:
+            if memory.sunk:
                 changed["imprint"] = Imprint(memory.imprint.copy(), depth_left)
         else:
             assert pressed is not None and pressed.forces is not None and touch.pressure is not None

@@ -60,6 +60,11 @@ class Memory:
         """Scalars.surface."""
         return float(self.numbers[22 + Scalars._fields.index("surface")])
 
+    @property
+    def sunk(self) -> bool:
+        """Scalars.sunk."""
+        return bool(self.numbers[23] > FORGOTTEN * self.numbers[24])
+
     pose = property(lambda self: self._part(0))
     wrench = property(lambda self: self._part(1))
     scalars = property(lambda self: Scalars(*self._part(2).tolist()))

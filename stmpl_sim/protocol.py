@@ -434,7 +434,7 @@ def exchange(contact: SoftContact, world: World, memory: Memory | None = None, d
 def _has_imprint(tissue: State, name: str) -> bool:
     """Whether the tissue has not yet come back from where this tool pressed."""
     known = tissue.tools.get(name)
-    return known is not None and known.scalars.sunk
+    return known is not None and known.sunk
 
 
 def _pushes(touches: Sequence[Touch], memory: Memory) -> dict[str, np.ndarray]:
