@@ -222,8 +222,8 @@ class Toucher:
             beside[ends[k] : ends[k + 1], k] = -1.0
             for others in (slice(ends[k]), slice(ends[k + 1], None)):
                 if len(beside[others]):
-                    beside[others, k] = strains_under(grid_of(field), pose, *(each[others] for each in nodes[:3]),
-                                                      squeeze.top)  # fmt: skip
+                    beside[others, k] = strains_under(grid_of(field), pose, nodes.points[others], nodes.inward[others],
+                                                      nodes.thickness[others], squeeze.top)  # fmt: skip
         return nodes._replace(beside=beside)
 
     def _covered(self, group: Sequence[_Placed], nodes: Nodes, held: Mapping[str, Held]) -> set[str]:
