@@ -55,15 +55,19 @@ class Memory:
     def _part(self, k: int) -> np.ndarray:
         return parts_of.py_func(self.numbers, self.terms)[k]
 
+    def _scalar(self, name: str) -> float:
+        """One of the scalars, without unpacking all."""
+        return float(self.numbers[22 + Scalars._fields.index(name)])
+
     @property
     def surface(self) -> float:
         """Scalars.surface."""
-        return float(self.numbers[22 + Scalars._fields.index("surface")])
+        return self._scalar("surface")
 
     @property
     def sunk(self) -> bool:
-        """Scalars.sunk."""
-        return bool(self.numbers[23] > FORGOTTEN * self.numbers[24])
+        """Whether the skin is not back yet."""
+        return self._scalar("elastic") > FORGOTTEN * self._scalar("largest")
 
     pose = property(lambda self: self._part(0))
     wrench = property(lambda self: self._part(1))
@@ -161,11 +165,6 @@ class Scalars(NamedTuple):
     passed_second: float = 0.0
     passed: float = 0.0
     doubted: float = 0.0
-
-    @property
-    def sunk(self) -> bool:
-        """Whether the skin is not back yet."""
-        return self.elastic > FORGOTTEN * self.largest
 
 
 def fresh(pose: np.ndarray, terms: int) -> Memory:

@@ -82,7 +82,7 @@ def _slid(old):
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _sunk(scalars):
-    """See Scalars.sunk."""
+    """See Memory.sunk."""
     return scalars[ELASTIC] > FORGOTTEN * scalars[LARGEST]
 
 
