@@ -30,9 +30,8 @@ from stmpl_core.sdf import SignedDistance, distance_at
 from stmpl_core.soundness import too_long
 from stmpl_core.touch import MIN_ONE_WAY_SHARE
 
-LEAST_UNDER, ALL_UNDER = 0.05, (0.1, 0.3)  # how much further inside a tool a column gets below its skin than there, or
-# of stacks nearer to it than there and at its core, over the width of a wall, where the tool begins to sink under skin,
-# and where it has: of one material, of a stack
+LEAST_UNDER, ALL_UNDER = 0.05, 0.3  # how much further inside a tool a column gets below its skin than there, or nearer
+# to it than there and at its core, over the width of a wall, where the tool begins to sink under skin, and where it has
 BLOCK = 32  # columns that are looked at together
 FINEST = 0.02  # size of the parts of a long triangle at which the search for a tool in it ends, over the thickness
 HOLE_RADIUS = 0.6  # farthest point of a triangle from its corners, over the edge length (equilateral: 0.577)
@@ -358,13 +357,13 @@ def _squeezed(grid, pose, centre, points, inward, thickness, faces, start, aroun
             v = near[n]
             wall += WALL * thickness[v] / len(covered)
             under = max(under, -least[n] - max(-above[n], 0.0))
-            if stacked and above[n] - least[n] > under:
+            if above[n] - least[n] > under:
                 end = distance_in_column(grid, ray_of(pose, points, inward, v), thickness[v])
                 under = max(under, min(above[n], end) - least[n])
     top = NOT_SUNK.copy()
     if under > LEAST_UNDER * wall:  # a layer that is thin beside the limb has no columns that lead so far aside
         top = _top(pose, inward, near, least, above, hole) if stacked else UNSAID.copy()
-        share = min((under / wall - LEAST_UNDER) / (ALL_UNDER[1 if stacked else 0] - LEAST_UNDER), 1.0)
+        share = min((under / wall - LEAST_UNDER) / (ALL_UNDER - LEAST_UNDER), 1.0)
         top = top - (1 - share) if top[0] > ANYHOW else share * top
     found, vertices, depth, rests = _cover(grid, pose, points, inward, thickness, faces, start, around, slot, covered,
                                            top)  # fmt: skip

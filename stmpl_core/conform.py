@@ -12,7 +12,7 @@ from stmpl_core.arrays import Points, VertexVectors
 from stmpl_core.columns import grid_of
 from stmpl_core.layer import SoftLayer
 from stmpl_core.moments import Surroundings
-from stmpl_core.rays import depth_in_column, ray_of, to_tool
+from stmpl_core.rays import depth_in_column, distance_in_column, ray_of, to_tool, wall_in
 from stmpl_core.sdf import FAST, jet_at
 from stmpl_core.touch import Pressed, Touch, way_of
 
@@ -145,21 +145,26 @@ def _tool(touch: Touch, pressed: Pressed, layer: SoftLayer) -> _Tool:
     pressure, inward = touch.pressure[v], -layer.normals[v]
     way = way_of(touch, pressed, inward, float(pressure @ layer.vertex_areas[v]))
     pose, gone, lies = touch.pose_body_from_tool, np.zeros((len(v), 3)), np.empty(len(v))
-    _lie(grid, pose, layer.vertices[v], inward, way, depth, rests, pressure, gone, lies)
+    _lie(grid, pose, layer.vertices[v], inward, way, layer.thickness[v], depth, rests, pressure, gone, lies)
     return _Tool(grid, pose, v, gone, lies)
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _lie(grid, pose, points, inward, way, depth, rests, pressure, gone, lies):
+def _lie(grid, pose, points, inward, way, thickness, depth, rests, pressure, gone, lies):
     """Writes how far vertices lie on a tool and where they have gone then; see _Tool."""
     light = MIN_LYING_PRESSURE * pressure.max()
     for n in range(len(points)):
         cosine = inward[n, 0] * way[n, 0] + inward[n, 1] * way[n, 1] + inward[n, 2] * way[n, 2]
-        lies[n] = rests[n] * _clipped(pressure[n] / light - 0.5) * _clipped((cosine - MIN_FACING_COSINE) / 0.1)
+        if rests[n] == 0 or not cosine > MIN_FACING_COSINE:
+            lies[n] = 0.0
+            continue
+        guess, ray, wall = depth[n] / cosine, ray_of(pose, points, way, n), wall_in(grid[3], thickness[n])
+        along = _clipped(-2 * distance_in_column(grid, ray, 0.5 * guess) / wall)  # a way may lead out of a wall at once
+        faces = _clipped((cosine - MIN_FACING_COSINE) / 0.1)
+        lies[n] = min(rests[n], along) * _clipped(pressure[n] / light - 0.5) * faces
         if lies[n] == 0:
             continue
-        guess = depth[n] / cosine
-        far = depth_in_column(grid, ray_of(pose, points, way, n), 4 * guess, guess)
+        far = depth_in_column(grid, ray, 4 * guess, guess)
         sure = _clipped(2 * lies[n] - 1)  # beside a wall it is not clear where the way ends
         for x in range(3):
             gone[n, x] = (sure * far + (1 - sure) * guess) * way[n, x]

@@ -50,6 +50,7 @@ GAUSS = np.polynomial.legendre.leggauss(4)  # points and weights on each panel o
 RIDGE = 1e-6  # of the matrix that sticks, over its largest number: two nodes in one place are no error
 LEAST_KAPPA, LEAST_PULL = 0.05, 0.02  # kappa and pull that are none, in logarithms
 NEXT = np.uint64(1)  # no index that may count from the end
+LEAST_FIRM = 1e-6  # at which a node that is hardly held counts
 ONE_WAY = 0.3  # least cosine between a tool's way and the skin's inward normal at a node
 ANY_MODULUS = 1e4  # of one material, whose response over E is found once for all stiffnesses, to the bit [Pa]
 FLAT = 0.05  # thickness over a radius of the skin up to which what is dragged gives as on a flat layer
@@ -260,7 +261,7 @@ class Green:
         return last[1]
 
     def stuck(self, nodes: Nodes, group: np.ndarray, gone: np.ndarray, guess: np.ndarray | None = None,
-              twins: Twins = NO_TWINS) -> np.ndarray:  # fmt: skip
+              twins: Twins = NO_TWINS, firm: np.ndarray | None = None) -> np.ndarray:  # fmt: skip
         """Forces over E with which nodes that stick are held where they have gone, (N, 3) [m2].
 
         Args:
@@ -269,15 +270,18 @@ class Green:
             gone: their motion, (N, 3) [m].
             guess: about these forces, (N, 3) [m2]: without a coarse part some steps lead from there.
             twins: nodes of two tools in one place, which need not go to two places at once.
+            firm: how firmly each is held, from 0, hardly, to 1, (N,); None: all are.
         """
+        firm = np.ones(len(gone)) if firm is None else firm
         if self.layer.stacked or guess is None:
             blocks = self._blocks(nodes, group)
             if len(twins.share):
                 give_way(blocks.reshape(len(gone), 3, len(gone), 3).transpose(0, 1, 3, 2), *twins)
-            return _held(blocks, gone)
+            return _held(blocks, gone, firm)
         blocks = nodewise.blocks(self._by_node(nodes), group, self._of_one.rows, self._of_one.scales)
         if len(twins.share):
             give_way(blocks.reshape(len(blocks), 3, 3, -1), *twins)
+        blocks[np.arange(len(firm)), :: 4, np.arange(len(firm))] /= _eased(firm)[:, None]
         return nodewise.approached(blocks, gone, guess)
 
     def _by_node(self, nodes: Nodes) -> np.ndarray:
@@ -306,7 +310,7 @@ class Green:
         blocks, rubs = self._blocks(nodes, group), pressing[:, None] * slides
         if self.drag is not None:
             blocks += np.tile(self.give(nodes, pressing), (len(slides), len(slides)))
-        out = np.zeros_like(slides) if sticks is None else _held(blocks, sticks)
+        out = np.zeros_like(slides) if sticks is None else _held(blocks, sticks, np.ones(len(sticks)))
         work = float(rubs.ravel() @ (blocks @ rubs.ravel()))
         if work > 0:  # else nothing presses, or nothing goes along the skin
             out += float(np.vdot(rubs, slides)) / work * rubs
@@ -735,11 +739,16 @@ def _blocks(points, inward, area, corners, shares, group, unit, soft, tables, sk
     return out.reshape(3 * count, 3 * count)
 
 
-def _held(blocks: np.ndarray, gone: np.ndarray) -> np.ndarray:
-    """Forces (N, 3) under which nodes go where they have gone, (N, 3), by `_blocks`."""
+def _held(blocks: np.ndarray, gone: np.ndarray, firm: np.ndarray) -> np.ndarray:
+    """Forces (N, 3) under which nodes go where they have gone, (N, 3), by `_blocks`; firm: see Green.stuck."""
     held = blocks.copy()
-    np.fill_diagonal(held, np.diag(held) + RIDGE * np.abs(held).max())
+    np.fill_diagonal(held, np.diag(blocks) / np.repeat(_eased(firm), 3) + RIDGE * np.abs(blocks).max())
     return np.linalg.solve(held, gone.ravel()).reshape(-1, 3)
+
+
+def _eased(firm: np.ndarray) -> np.ndarray:
+    """What nodes that are held so firmly, (N,), give to their own forces is what the skin gives over this, (N,)."""
+    return np.maximum(firm, LEAST_FIRM) ** 2
 
 
 @numba.njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")

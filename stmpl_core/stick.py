@@ -12,11 +12,13 @@ from stmpl_core.columns import grid_of
 from stmpl_core.green import ONE_WAY, Green
 from stmpl_core.nodes import Nodes
 from stmpl_core.obstacle import solve
-from stmpl_core.rays import depth_in_column, ray_of
+from stmpl_core.rays import depth_in_column, distance_in_column, inside_most, ray_of, wall_in
 from stmpl_core.touch import Pressed, Touch, way_of
 from stmpl_core.twins import NO_TWINS, Twins, twins
 
-FURTHEST = 1.5  # way of a node over its depth along the tool's way: beside a wall it is not clear where that ends
+FIRM = 0.1  # pressure over its mean, weighed with itself, from which a node is held where its tool is
+SURE = 0.25  # how far inside a tool, over the width of a wall, a node's way is clear; as far outside it does not go
+FURTHEST = 1.5  # way of a node over its depth along the tool's way
 
 
 def stuck_motion(green: Green, touches: Sequence[Touch], loaded: np.ndarray | None = None) -> VertexVectors:
@@ -49,7 +51,14 @@ def stuck_motion(green: Green, touches: Sequence[Touch], loaded: np.ndarray | No
     if len(pressed) > 1:
         of = np.repeat(np.arange(len(pressed)), [len(one.squeeze.nodes.area) for _, one in pressed])
         same = Twins(*twins(some.points, some.inward, some.area, group[holds], of[holds]))
-    return green.motion(some, green.stuck(some, group[holds], gone[holds], guess, same), loaded=loaded)
+    firm = _firm(forces[holds], some.area)
+    return green.motion(some, green.stuck(some, group[holds], gone[holds], guess, same, firm), loaded=loaded)
+
+
+def _firm(forces: np.ndarray, area: np.ndarray) -> np.ndarray:
+    """How firmly nodes that press with forces above 0, (N,), are held, from 0 to 1: none lets go with a jump."""
+    mean = float(forces @ (forces / area)) / float(forces.sum())
+    return np.minimum(forces / area / (FIRM * mean), 1.0)
 
 
 def _gone(touch: Touch, pressed: Pressed, areas: np.ndarray) -> np.ndarray:
@@ -68,7 +77,13 @@ def _along(grid, pose, points, inward, way, strain, thickness):
     for n in range(len(points)):
         cosine = inward[n, 0] * way[n, 0] + inward[n, 1] * way[n, 1] + inward[n, 2] * way[n, 2]
         depth = strain[n] * thickness[n] / max(cosine, ONE_WAY)
-        far = min(depth_in_column(grid, ray_of(pose, points, way, n), 4 * depth, depth), FURTHEST * depth)
+        ray = ray_of(pose, points, way, n)
+        far = min(depth_in_column(grid, ray, 4 * depth, depth), FURTHEST * depth)
+        wall, inside = wall_in(grid[3], thickness[n]), -distance_in_column(grid, ray, 0.0)
+        if inside < SURE * wall:
+            inside = inside_most(grid, ray, depth, inside, -SURE * wall)
+        sure = min(max(inside / (SURE * wall), -1.0), 1.0)
+        far = depth + sure * (far - depth if sure > 0 else depth)
         for x in range(3):
             out[n, x] = far * way[n, x]
     return out

@@ -280,13 +280,15 @@ def test_a_tool_has_sunk_under_columns_that_enter_it_from_above() -> None:
     assert under(0, 0.02, 0, -1, NOT_SUNK) == 0 and under(0.03, -0.012, -1, 0.1, UNSAID) == 1
 
 
+@pytest.mark.parametrize("stacked", [False, True])
 @pytest.mark.parametrize("lean", [0.32, 0.44])
-def test_a_leaning_stylus_sinks_under_skin_without_a_step_whatever_the_mesh(lean: float) -> None:
+def test_a_leaning_stylus_sinks_under_skin_without_a_step_whatever_the_mesh(lean: float, stacked: bool) -> None:
     """Its vertices are farther apart than the stylus is wide: none may be there where it comes under the skin."""
     stylus, pose, depths = punch(0.003, 0.06), turn((1, 0, 0), lean), np.arange(4e-3, 10e-3, 2e-5)
     tip, field, volumes = float((stylus.vertices @ pose[2, :3]).min()), SignedDistance.of(stylus, margin=0.02), []
     for edge in (4e-3, 6e-3, 8e-3):
-        columns = Columns(plate(0.096, edge, 0.02).with_(tissue=STACK))
+        layer = plate(0.096, edge, 0.02)
+        columns = Columns(layer.with_(tissue=STACK) if stacked else layer)
         for depth in depths:
             pose[:3, 3] = 1e-3, 2e-3, -depth - tip
             nodes = columns.squeezed(field, pose).nodes

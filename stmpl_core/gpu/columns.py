@@ -14,7 +14,7 @@ from stmpl_core.gpu.rays import FAR, OPTIONS, WALL_WIDTH, along, clearance_of, d
 
 BLOCK, EDGE = wp.constant(IN_BLOCK), wp.constant(EDGE_BIT)
 UNDER, TOO_DEEP = wp.constant(wp.float64(LEAST_UNDER)), wp.constant(wp.float64(DEEPEST))
-SINKS, SINKS_IN_STACKS = (wp.constant(wp.float64(most - LEAST_UNDER)) for most in ALL_UNDER)
+SINKS = wp.constant(wp.float64(ALL_UNDER - LEAST_UNDER))
 ANYHOW, ONE_WAY = wp.constant(wp.float64(rays.ANYHOW)), wp.constant(wp.float64(MIN_ONE_WAY_SHARE))
 wp.set_module_options(OPTIONS)
 
@@ -152,7 +152,7 @@ def gather_clearance(again: wp.int32, skins: Skins, scratch: Scratch):
         if again == 0 and least < one.hole:
             v = scratch.columns[c, n]
             under = wp.max(under, -least - wp.max(-above, real(0.0)))
-            if one.stacked == 1 and above - least > under:
+            if above - least > under:
                 start, way = pose * (skins.points[v] - scratch.place[c]), pose * skins.inward[v]
                 end = along(grid, skins.coefficients, start, way, skins.thickness[v])
                 under = wp.max(under, wp.min(above, end) - least)
@@ -167,10 +167,7 @@ def gather_clearance(again: wp.int32, skins: Skins, scratch: Scratch):
     if covers == 0:
         scratch.status[c] = APART
     elif under > UNDER * WALL_WIDTH * wall / real(covers):
-        over = SINKS
-        if one.stacked == 1:
-            over = SINKS_IN_STACKS
-        share = wp.min((under / (WALL_WIDTH * wall / real(covers)) - UNDER) / over, real(1.0))
+        share = wp.min((under / (WALL_WIDTH * wall / real(covers)) - UNDER) / SINKS, real(1.0))
         scratch.top[c] = (ANYHOW + share) * vec3(real(1.0), real(1.0), real(1.0))
         if one.stacked == 1 and wp.length(met) > ONE_WAY * whole:
             scratch.top[c] = -share * (pose * wp.normalize(met))
