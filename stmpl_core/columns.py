@@ -23,6 +23,7 @@ from stmpl_core.rays import (
     distance_in_column,
     ray_from,
     ray_of,
+    sure_of,
     to_tool,
     wall_in,
 )
@@ -419,9 +420,12 @@ def _sinking(grid, pose, points, inward, thickness, area, strain):
         cosine = inward[n, 0] * way[0] + inward[n, 1] * way[1] + inward[n, 2] * way[2]
         guess = max(depth[n] * cosine, 1e-9)
         ray = ray_from(pose, points[n, 0], points[n, 1], points[n, 2], way[0], way[1], way[2])
-        inside = 1 - distance_in_column(grid, ray, 0.0) / wall_in(grid[3], thickness[n])
-        far = depth_in_column(grid, ray, max(4 * guess, thickness[n]), guess) * cosine
-        depth[n] += (far - depth[n]) * (min(max(inside, 0.0), 1.0) if far > depth[n] else 1.0)
+        wall = wall_in(grid[3], thickness[n])
+        far, sure = depth_in_column(grid, ray, max(4 * guess, thickness[n]), guess), sure_of(grid, ray, guess, wall)
+        more = far * cosine - depth[n] if sure > 0 else depth[n]
+        if sure > 0 and more > 0:  # as far as its skin is inside the tool, and not at once
+            more *= min(max(1 - distance_in_column(grid, ray, 0.0) / wall, 0.0), depth[n] / wall, 1.0)
+        depth[n] += sure * more
     return depth
 
 

@@ -11,6 +11,7 @@ WALL = 0.05  # width over which depth rises beside a tool's wall, over the thick
 PASSED, MOST_PASSED = 7, 64  # parts of a column's way between which it is looked how far it is inside a tool, or beside
 ENTERS, LOOKS_BACK = 12, 0.15  # steps to where a column enters a tool, cosine from which its surface looks back there
 LOOKED_AT = 0.2 * WALL  # way over which it is asked whether it does, over the thickness
+SURE = 0.2  # how far inside a tool, over the width of a wall, it is clear where a way ends; so far outside: nowhere
 NOT_SUNK, ANYHOW = np.zeros(3), 8.0  # what is said of a tool that has not sunk under skin; more than that: anyhow, by
 UNSAID = np.full(3, ANYHOW + 1)  # a share that rises by 1
 MAX_COLUMN_STRAIN = 0.9  # strain beyond which no column is squeezed
@@ -120,11 +121,25 @@ def inside_most(grid, ray, deep, most, least):
 
 
 @numba.njit(forceinline=True, cache=True, error_model="numpy")
+def sure_of(grid, ray, deep, wall):
+    """How clear it is that a ray leads through the tool to a depth [m], from -1, it passes beside it, to 1.
+
+    Args:
+        wall: see `wall_in`.
+    """
+    inside = -distance_in_column(grid, ray, 0.0)
+    if inside < SURE * wall:
+        inside = inside_most(grid, ray, deep, inside, -SURE * wall)
+    return min(max(inside / (SURE * wall), -1.0), 1.0)
+
+
+@numba.njit(forceinline=True, cache=True, error_model="numpy")
 def sunk_under(grid, ray, t, top):
     """Share to which a tool has sunk under a column's skin, from 0, it comes to the column from beside, to 1.
 
-    Where the column enters the tool, its surface looks back along the way that the tool went: the column comes from
-    above. On a thick, round limb columns around a deep tool lead into its lower half.
+    Where the column enters the tool, or passes it within WALL of the thickness, its surface looks back along the way
+    that the tool went: the column comes from above. On a thick, round limb columns around a deep tool lead into its
+    lower half.
 
     Args:
         top: against the way that a tool went, in its frame, (3,), as long as the share to which it has sunk at all;
@@ -134,18 +149,24 @@ def sunk_under(grid, ray, t, top):
     if size == 0 or size > 2:
         return min(max(top[0] - ANYHOW, 0.0), 1.0)
     s, d = 0.0, distance_in_column(grid, ray, 0.0)
+    at, near = s, d
     for _ in range(ENTERS):
         if d < SECANT_START * t:
             break
         s += d
         if s >= t:
-            return 0.0
+            break
         d = distance_in_column(grid, ray, s)
+        if d < near:
+            at, near = s, d
+    enters = 1 - max(near - SECANT_START * t, 0.0) / (WALL * t)
+    if enters <= 0:
+        return 0.0
     whole = np.sqrt(size)
     step = LOOKED_AT * t / whole
-    rise = distance_at(grid[0], grid[1], grid[2], ray[0] + s * ray[3] + step * top[0],
-                       ray[1] + s * ray[4] + step * top[1], ray[2] + s * ray[5] + step * top[2]) - d  # fmt: skip
-    return whole * min(max(rise / (LOOKS_BACK * LOOKED_AT * t), 0.0), 1.0)
+    rise = distance_at(grid[0], grid[1], grid[2], ray[0] + at * ray[3] + step * top[0],
+                       ray[1] + at * ray[4] + step * top[1], ray[2] + at * ray[5] + step * top[2]) - near  # fmt: skip
+    return whole * enters * min(max(rise / (LOOKS_BACK * LOOKED_AT * t), 0.0), 1.0)
 
 
 @numba.njit(forceinline=True, cache=True, error_model="numpy")

@@ -12,12 +12,11 @@ from stmpl_core.columns import grid_of
 from stmpl_core.green import ONE_WAY, Green
 from stmpl_core.nodes import Nodes
 from stmpl_core.obstacle import solve
-from stmpl_core.rays import depth_in_column, distance_in_column, inside_most, ray_of, wall_in
+from stmpl_core.rays import depth_in_column, ray_of, sure_of, wall_in
 from stmpl_core.touch import Pressed, Touch, way_of
 from stmpl_core.twins import NO_TWINS, Twins, twins
 
 FIRM = 0.1  # pressure over its mean, weighed with itself, from which a node is held where its tool is
-SURE = 0.25  # how far inside a tool, over the width of a wall, a node's way is clear; as far outside it does not go
 FURTHEST = 1.5  # way of a node over its depth along the tool's way
 
 
@@ -79,10 +78,7 @@ def _along(grid, pose, points, inward, way, strain, thickness):
         depth = strain[n] * thickness[n] / max(cosine, ONE_WAY)
         ray = ray_of(pose, points, way, n)
         far = min(depth_in_column(grid, ray, 4 * depth, depth), FURTHEST * depth)
-        wall, inside = wall_in(grid[3], thickness[n]), -distance_in_column(grid, ray, 0.0)
-        if inside < SURE * wall:
-            inside = inside_most(grid, ray, depth, inside, -SURE * wall)
-        sure = min(max(inside / (SURE * wall), -1.0), 1.0)
+        sure = sure_of(grid, ray, depth, wall_in(grid[3], thickness[n]))
         far = depth + sure * (far - depth if sure > 0 else depth)
         for x in range(3):
             out[n, x] = far * way[n, x]

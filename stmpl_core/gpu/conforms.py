@@ -152,10 +152,12 @@ def lie(pick: wp.array(dtype=wp.int32), lanes: wp.int32, many: wp.int32, skins: 
             if field.one_way[t] == 1:
                 way = field.way[t]
             cosine = wp.dot(inward, way)
-            lies = rests * _clipped(field.press[t, n] / (LYING * highest) - real(0.5))
+            guess, along_it = depth / wp.max(cosine, FACING), real(0.0)
+            if rests > real(0.0) and cosine > FACING:
+                along_it = real(-2.0) * along(grid, skins.coefficients, start, pose * way, real(0.5) * guess) / wall
+            lies = wp.min(rests, _clipped(along_it)) * _clipped(field.press[t, n] / (LYING * highest) - real(0.5))
             lies = lies * _clipped((cosine - FACING) / real(0.1))
             if lies > real(0.0):
-                guess = depth / cosine
                 far = depth_in_column(grid, skins.coefficients, start, pose * way, real(4.0) * guess, guess)
                 sure = _clipped(real(2.0) * lies - real(1.0))
                 gone = (sure * far + (real(1.0) - sure) * guess) * way

@@ -41,7 +41,7 @@ FIELD_SCRATCH: dict[str, tuple[Any, str]] = {
     "acts": (wp.int32, "F"), "own": (real, "F"), "spread": (vec3, "FV"), "most": (wp.int32, "1"),
     "folds": (wp.int32, "F"), "fold": (wp.int32, "FW"), "queue": (wp.int32, "FW"), "feels": (wp.uint32, "FV"),
     "hold": (wp.int32, "FN"), "holds": (wp.int32, "F"), "parted": (wp.int32, "F"),
-    "pull": (vec3, "FN"), "with_limb": (vec3, "FNK"),
+    "firm": (real, "FN"), "light": (real, "F"), "pull": (vec3, "FN"), "with_limb": (vec3, "FNK"),
     "block": (mat33, "FNN"), "handed": (real, "FK"), "limb": (vec3, "FK"), "linear": (vec3, "FL"), "far": (real, "C"),
     "covers": (real, "CT"), "push": (vec3, "C"), "own_way": (real, "FN"), "row": (vec3, "FN"),
     "peak": (real, "F"),

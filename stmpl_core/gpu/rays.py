@@ -15,6 +15,7 @@ from stmpl_core.rays import (
 )
 from stmpl_core.rays import ENTERS as MOST_ENTERS
 from stmpl_core.rays import LOOKS_BACK as LOOKED_BACK
+from stmpl_core.rays import SURE as CLEAR_FROM
 from stmpl_core.solids import BOX, CAPSULE, NEAREST
 
 real = wp.float64  # of all geometry: float32 keeps 1e-8 m on a limb, a touch of 0.1 mm wants less
@@ -26,6 +27,7 @@ MOST_STRAIN = wp.constant(wp.float64(MAX_COLUMN_STRAIN))
 PARTS, MOST_PARTS = wp.constant(wp.float64(PASSED)), wp.constant(wp.float64(MOST_PASSED))
 SAID_ANYHOW = wp.constant(wp.float64(ANYHOW))
 ENTERS, LOOKS_BACK = wp.constant(MOST_ENTERS), wp.constant(wp.float64(LOOKED_BACK))
+CLEAR = wp.constant(wp.float64(CLEAR_FROM))
 BEHIND = wp.constant(wp.float64(LOOKED_AT))
 IS_BOX, IS_CAPSULE, ON_AXIS = wp.constant(BOX), wp.constant(CAPSULE), wp.constant(wp.float64(NEAREST))
 START, TOLERANCE = wp.constant(wp.float64(SECANT_START)), wp.constant(wp.float64(SECANT_TOLERANCE))
@@ -243,13 +245,19 @@ def inside_most(grid: Grid, coefficients: wp.array(dtype=real), start: vec3, way
 
 
 @wp.func
+def sure_of(grid: Grid, coefficients: wp.array(dtype=real), start: vec3, way: vec3, deep: real, wall: real) -> real:
+    """How clear it is that a ray leads through the tool to a depth [m], from -1, it passes beside it, to 1."""
+    return wp.clamp(inside_most(grid, coefficients, start, way, deep) / (CLEAR * wall), real(-1.0), real(1.0))
+
+
+@wp.func
 def sunk_under(grid: Grid, coefficients: wp.array(dtype=real), start: vec3, way: vec3, t: real, top: vec3) -> real:
     """Share to which a tool has sunk under a column's skin, from 0, it comes from beside, to 1."""
     size = wp.length_sq(top)
     if size == real(0.0) or size > real(2.0):
         return wp.clamp(top[0] - SAID_ANYHOW, real(0.0), real(1.0))
-    whole = wp.sqrt(size)
     s, d, step = real(0.0), along(grid, coefficients, start, way, real(0.0)), wp.int32(0)
+    at, near = real(0.0), real(d)
     while step < ENTERS:
         step += 1
         if d < START * t:
@@ -259,11 +267,15 @@ def sunk_under(grid: Grid, coefficients: wp.array(dtype=real), start: vec3, way:
             d = along(grid, coefficients, start, way, wp.min(s, t))
             if s >= t:
                 step = ENTERS
-    if s >= t:
+            elif d < near:
+                at, near = real(s), real(d)
+    enters = real(1.0) - wp.max(near - START * t, real(0.0)) / (WALL_WIDTH * t)
+    if enters <= real(0.0):
         return real(0.0)
+    whole = wp.sqrt(size)
     by = BEHIND * t / whole
-    rise = distance_at(grid, coefficients, start + s * way + by * top) - d
-    return whole * wp.clamp(rise / (LOOKS_BACK * BEHIND * t), real(0.0), real(1.0))
+    rise = distance_at(grid, coefficients, start + at * way + by * top) - near
+    return whole * enters * wp.clamp(rise / (LOOKS_BACK * BEHIND * t), real(0.0), real(1.0))
 
 
 @wp.func

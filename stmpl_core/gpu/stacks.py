@@ -11,7 +11,7 @@ from stmpl_core.gpu.blocks import sum_of, wait
 from stmpl_core.gpu.columns import _marked
 from stmpl_core.gpu.hold import FADE_RING, HARDENING, NEAR, RINGS, STACK_LINEAR_TO, STEPS, _row, _write, _write_alike
 from stmpl_core.gpu.packs import Scratch, Skins
-from stmpl_core.gpu.rays import OPTIONS, along, depth_in_column, real, vec3, wall_in
+from stmpl_core.gpu.rays import OPTIONS, along, depth_in_column, real, sure_of, vec3, wall_in
 from stmpl_core.networks import STACK_NODE
 from stmpl_core.response import SPREAD as SPREAD_OF_AREA
 
@@ -71,10 +71,14 @@ def sink(lanes: wp.int32, many: wp.int32, skins: Skins, scratch: Scratch):
             start = pose * (scratch.point[s, i] - scratch.place[c])
             grid, thick = skins.grids[scratch.grid[c]], scratch.thick[s, i]
             far = depth_in_column(grid, skins.coefficients, start, pose * way, wp.max(real(4.0) * guess, thick), guess)
-            inside = real(1.0)
-            if far * cosine > depth:
-                inside -= along(grid, skins.coefficients, start, pose * way, real(0.0)) / wall_in(grid, thick)
-            sinking += (far * cosine - depth) * wp.clamp(inside, real(0.0), real(1.0))
+            wall, more = wall_in(grid, thick), real(depth)
+            sure = sure_of(grid, skins.coefficients, start, pose * way, guess, wall)
+            if sure > real(0.0):
+                more = far * cosine - depth
+                if more > real(0.0):
+                    inside = real(1.0) - along(grid, skins.coefficients, start, pose * way, real(0.0)) / wall
+                    more = more * wp.min(wp.clamp(inside, real(0.0), real(1.0)), depth / wall)
+            sinking += sure * more
         scratch.sinking[s, i] = sinking
 
 

@@ -15,10 +15,12 @@ from stmpl_core.gpu.field_packs import FieldScratch, SkinFields
 from stmpl_core.gpu.motion import MOST_FOLDS, _stretch
 from stmpl_core.gpu.packs import Scratch, Skins
 from stmpl_core.gpu.places import REFUSED
-from stmpl_core.gpu.rays import OPTIONS, depth_in_column, mat33, real, vec3
+from stmpl_core.gpu.rays import OPTIONS, depth_in_column, mat33, real, sure_of, vec3, wall_in
 from stmpl_core.gpu.stacks import FARTHEST, ROUND_SQUARE, ROWS, SPREAD, _row_of, _share
 
 LEAST_COSINE, FURTHEST = wp.constant(wp.float64(green.ONE_WAY)), wp.constant(wp.float64(stick.FURTHEST))
+HELD_FROM, LEAST_FIRM = wp.constant(wp.float64(stick.FIRM)), wp.constant(wp.float64(green.LEAST_FIRM))
+TINY = wp.constant(wp.float64(1e-300))
 RIDGE, REACH = wp.constant(wp.float64(green.RIDGE)), wp.constant(wp.float64(green.REACH))
 LYING, BEYOND = wp.constant(wp.float64(conform.MIN_LYING_PRESSURE)), wp.constant(wp.float64(conform.BEYOND))
 WIDER = wp.constant(wp.float64(moments.SMOOTH / (0.5 * 3**0.5) ** 0.5))  # of the root of a node's area
@@ -39,7 +41,7 @@ def unite(scratch: Scratch):
 def list_holding(pick: wp.array(dtype=wp.int32), many: wp.int32, scratch: Scratch, field: FieldScratch):
     """Nodes that press without friction, of scenes that are served; counted where there is no room."""
     f = wp.tid()
-    s, count = pick[f], wp.int32(0)
+    s, count, total, square = pick[f], wp.int32(0), real(0.0), real(0.0)
     good = wp.bool(True)
     field.parted[f] = 0
     for k in range(many):
@@ -52,6 +54,9 @@ def list_holding(pick: wp.array(dtype=wp.int32), many: wp.int32, scratch: Scratc
                 if count < field.hold.shape[1]:
                     field.hold[f, count] = i
                 count += 1
+                total += scratch.force[s, i]
+                square += scratch.force[s, i] * scratch.force[s, i] / scratch.area[s, i]
+    field.light[f] = HELD_FROM * square / wp.max(total, TINY)
     field.holds[f] = wp.min(count, field.hold.shape[1])
     wp.atomic_max(field.most, 0, count)
 
@@ -78,9 +83,15 @@ def go(pick: wp.array(dtype=wp.int32), lanes: wp.int32, many: wp.int32, skins: S
         pose = wp.transpose(scratch.pose[c])
         depth = scratch.strain[s, i] * scratch.thick[s, i] / wp.max(wp.dot(inward, way), LEAST_COSINE)
         start = pose * (scratch.point[s, i] - scratch.place[c])
-        far = depth_in_column(skins.grids[scratch.grid[c]], skins.coefficients, start, pose * way,
-                              real(4.0) * depth, depth)  # fmt: skip
-        field.pull[f, a] = wp.min(far, FURTHEST * depth) * way
+        grid = skins.grids[scratch.grid[c]]
+        far = wp.min(depth_in_column(grid, skins.coefficients, start, pose * way, real(4.0) * depth, depth),
+                     FURTHEST * depth)  # fmt: skip
+        sure = sure_of(grid, skins.coefficients, start, pose * way, depth, wall_in(grid, scratch.thick[s, i]))
+        if sure > real(0.0):
+            field.pull[f, a] = (depth + sure * (far - depth)) * way
+        else:
+            field.pull[f, a] = (real(1.0) + sure) * depth * way
+        field.firm[f, a] = wp.min(scratch.force[s, i] / (scratch.area[s, i] * field.light[f]), real(1.0))
         fine = wp.floor(FINE_SPREADS * _row_of(wp.log(SPREAD * wp.sqrt(scratch.area[s, i]) / one.flat)))
         soft = wp.floor(FINE_SOFTS * scratch.soft[s, i] + real(0.5))
         field.row[f, a] = vec3((fine + real(0.5)) / FINE_SPREADS, soft / FINE_SOFTS,
@@ -190,7 +201,9 @@ def solve(field: FieldScratch):
                 most = wp.max(most, wp.abs(block[y, z]))
     most = most_of(most)
     for a in range(lane, count, lanes):
-        field.block[f, a, a] = field.block[f, a, a] + RIDGE * most * wp.identity(n=3, dtype=real)
+        own, firm = field.block[f, a, a], wp.max(field.firm[f, a], LEAST_FIRM)
+        more = (real(1.0) / (firm * firm) - real(1.0)) * wp.get_diag(own)
+        field.block[f, a, a] = own + wp.diag(more + RIDGE * most * vec3(real(1.0), real(1.0), real(1.0)))
     wait()
     for k in range(count):
         pivot, rest = wp.inverse(field.block[f, k, k]), count - k - 1
