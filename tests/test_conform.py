@@ -12,7 +12,7 @@ from stmpl_core.methods.base import Method
 from stmpl_core.moments import Surroundings
 from stmpl_core.simulator import MAX_ENTERED_SHARE, Simulator
 from stmpl_core.toucher import Toucher
-from tests.scenes import LENGTH, RADIUS, at, ball, capsule, limb, placed, press, punch, turn
+from tests.scenes import LENGTH, RADIUS, STACK, at, ball, box, capsule, limb, placed, press, punch, turn
 
 LIMB = limb(4e-3)
 THICKNESS = float(LIMB.thickness[0])
@@ -156,3 +156,32 @@ def test_a_correction_solves_its_equations_as_a_factor_does(near: Surroundings, 
     assert np.linalg.norm(sources - true) < 1e-3 * np.linalg.norm(true)
     assert np.linalg.norm(moved - sinking @ true) < 1e-3 * np.linalg.norm(sinking @ true)
     assert not _correct(sinking, wanted, np.zeros(many), moved, sources)
+
+
+@pytest.mark.parametrize("stacked", [False, True])
+def test_no_vertex_jumps_beside_a_rim_as_it_comes_on_to_a_tool_or_off_it(stacked: bool) -> None:
+    """Tilted tools go 0.6 mm any way; where skin moves most in a step, that is looked at down to 2 nm."""
+    rng, layer = np.random.default_rng(11), limb(4e-3, 0.0125, 0.045)
+    sim = Simulator(layer.with_(tissue=STACK) if stacked else layer, MomentNet())
+    tools, jumps = [box(0.02, 0.012, 0.02), punch(0.012, 0.006), punch(0.008)], []
+    for k in range(15):
+        mesh, pose = tools[k % 3], turn((0, 1, 0), np.pi / 2) @ turn(tuple(rng.normal(size=3)), rng.uniform(0, 0.35))
+        lowest = float((mesh.vertices @ pose[:3, :3].T)[:, 0].min())
+        pose[:3, 3] = 0.045 - rng.uniform(0.03, 0.5) * 0.0125 - lowest, *rng.uniform(-2e-3, 2e-3, 2) + [0, MIDDLE]
+        way = rng.normal(size=3)
+        way /= np.linalg.norm(way)
+
+        def moved(s: float, mesh=mesh, pose=pose, way=way) -> np.ndarray:
+            return sim.step([press(mesh, at(*(s * way)) @ pose, None)]).displacement
+
+        found = [(s, moved(s)) for s in np.linspace(0, 6e-4, 13)]
+        (low, a), (high, b) = max(pairwise(found), key=lambda two: np.abs(two[1][1] - two[0][1]).max())
+        while high - low > 2e-9:
+            middle = 0.5 * (low + high)
+            there = moved(middle)
+            if np.abs(there - a).max() > np.abs(b - there).max():
+                high, b = middle, there
+            else:
+                low, a = middle, there
+        jumps.append(np.linalg.norm(b - a, axis=1).max() / np.linalg.norm(a, axis=1).max())
+    assert max(jumps) < 0.2 and np.mean(jumps) < 0.02, np.round(jumps, 3)
