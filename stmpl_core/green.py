@@ -50,7 +50,7 @@ GAUSS = np.polynomial.legendre.leggauss(4)  # points and weights on each panel o
 RIDGE = 1e-6  # of the matrix that sticks, over its largest number: two nodes in one place are no error
 LEAST_KAPPA, LEAST_PULL = 0.05, 0.02  # kappa and pull that are none, in logarithms
 NEXT = np.uint64(1)  # no index that may count from the end
-LEAST_FIRM = 1e-6  # at which a node that is hardly held counts
+LEAST_FIRM = 1e-3  # at which a node that is hardly held counts
 ONE_WAY = 0.3  # least cosine between a tool's way and the skin's inward normal at a node
 ANY_MODULUS = 1e4  # of one material, whose response over E is found once for all stiffnesses, to the bit [Pa]
 FLAT = 0.05  # thickness over a radius of the skin up to which what is dragged gives as on a flat layer
@@ -281,8 +281,9 @@ class Green:
         blocks = nodewise.blocks(self._by_node(nodes), group, self._of_one.rows, self._of_one.scales)
         if len(twins.share):
             give_way(blocks.reshape(len(blocks), 3, 3, -1), *twins)
-        blocks[np.arange(len(firm)), :: 4, np.arange(len(firm))] /= _eased(firm)[:, None]
-        return nodewise.approached(blocks, gone, guess)
+        eased, own = _eased(firm)[:, None], np.arange(len(firm))
+        blocks[own, ::4, own] += (1 / eased - 1) * blocks[own, ::4, own].mean(axis=1, keepdims=True)
+        return nodewise.approached(blocks, gone, eased * guess)
 
     def _by_node(self, nodes: Nodes) -> np.ndarray:
         """Nodes as the kernels of stmpl_core.nodewise take them."""
@@ -741,13 +742,14 @@ def _blocks(points, inward, area, corners, shares, group, unit, soft, tables, sk
 
 def _held(blocks: np.ndarray, gone: np.ndarray, firm: np.ndarray) -> np.ndarray:
     """Forces (N, 3) under which nodes go where they have gone, (N, 3), by `_blocks`; firm: see Green.stuck."""
-    held = blocks.copy()
-    np.fill_diagonal(held, np.diag(blocks) / np.repeat(_eased(firm), 3) + RIDGE * np.abs(blocks).max())
+    held, own = blocks.copy(), np.diag(blocks)
+    more = (1 / _eased(firm) - 1) * own.reshape(-1, 3).mean(axis=1)
+    np.fill_diagonal(held, own + np.repeat(more, 3) + RIDGE * np.abs(blocks).max())
     return np.linalg.solve(held, gone.ravel()).reshape(-1, 3)
 
 
 def _eased(firm: np.ndarray) -> np.ndarray:
-    """What nodes that are held so firmly, (N,), give to their own forces is what the skin gives over this, (N,)."""
+    """What nodes that are held so firmly, (N,), give to their own forces is what skin gives in the mean over this."""
     return np.maximum(firm, LEAST_FIRM) ** 2
 
 

@@ -202,8 +202,8 @@ def solve(field: FieldScratch):
     most = most_of(most)
     for a in range(lane, count, lanes):
         own, firm = field.block[f, a, a], wp.max(field.firm[f, a], LEAST_FIRM)
-        more = (real(1.0) / (firm * firm) - real(1.0)) * wp.get_diag(own)
-        field.block[f, a, a] = own + wp.diag(more + RIDGE * most * vec3(real(1.0), real(1.0), real(1.0)))
+        more = (real(1.0) / (firm * firm) - real(1.0)) * wp.trace(own) / real(3.0) + RIDGE * most
+        field.block[f, a, a] = own + more * wp.identity(n=3, dtype=real)
     wait()
     for k in range(count):
         pivot, rest = wp.inverse(field.block[f, k, k]), count - k - 1
