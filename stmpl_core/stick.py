@@ -65,17 +65,17 @@ def _gone(touch: Touch, pressed: Pressed, areas: np.ndarray) -> np.ndarray:
     nodes = pressed.squeeze.nodes
     assert touch.pressure is not None
     way = way_of(touch, pressed, nodes.inward, float(touch.pressure @ areas))
-    return _along(grid_of(pressed.field), touch.pose_body_from_tool, nodes.points, nodes.inward, way, nodes.strain,
+    return _along(grid_of(pressed.field), touch.pose_body_from_tool, nodes.points, nodes.inward, way, nodes.depths,
                   nodes.thickness)  # fmt: skip
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _along(grid, pose, points, inward, way, strain, thickness):
-    """Way of nodes (N, 3) along unit vectors (N, 3) out of a tool, (N, 3) [m]."""
+def _along(grid, pose, points, inward, way, sinking, thickness):
+    """Way of nodes (N, 3) along unit vectors (N, 3) out of a tool, where their skin sinks by (N,), (N, 3) [m]."""
     out = np.empty((len(points), 3))
     for n in range(len(points)):
         cosine = inward[n, 0] * way[n, 0] + inward[n, 1] * way[n, 1] + inward[n, 2] * way[n, 2]
-        depth = strain[n] * thickness[n] / max(cosine, ONE_WAY)
+        depth = sinking[n] / max(cosine, ONE_WAY)
         ray = ray_of(pose, points, way, n)
         far = min(depth_in_column(grid, ray, 4 * depth, depth), FURTHEST * depth)
         sure = sure_of(grid, ray, depth, wall_in(grid[3], thickness[n]))
