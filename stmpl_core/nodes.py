@@ -242,10 +242,10 @@ def _look(grid, pose, points, inward, thickness, faces, found, top, split, thick
             a, b = shares[q, 0], shares[q, 1]
             x, y, z = _between_corners(points, i, j, k, a, b, 1 - a - b)
             depth = -_distance(grid, pose, x, y, z)
-            if sunk and depth < 0:
+            if sunk and depth < WALL * thick:
                 n0, n1, n2, t = _column(inward, thickness, i, j, k, a, b, 1 - a - b)
                 least = -BESIDE * edges[m] - WALL * thick
-                depth = _inside(grid, ray_from(pose, x, y, z, n0, n1, n2), t, depth, least, top)
+                depth = _inside(grid, ray_from(pose, x, y, z, n0, n1, n2), t, depth, least, WALL * thick, top)
             depths[m, q], middles[m, q, 0], middles[m, q, 1], middles[m, q, 2] = depth, x, y, z
             if depth > deepest:
                 deepest, best = depth, m
@@ -272,17 +272,19 @@ def _distance(grid, pose, x, y, z):
 
 
 @numba.njit(forceinline=True, cache=True, nogil=True, error_model="numpy")
-def _inside(grid, ray, t, depth, least, top):
+def _inside(grid, ray, t, depth, least, wall, top):
     """How far the column gets into a tool that has sunk under skin which it does not reach [m].
 
     Args:
         ray, t: column, and its thickness.
-        depth: depth of its skin in the tool [m], below 0.
+        depth: depth of its skin in the tool [m].
         least: depth up to which the answer does not matter.
+        wall: depth of the skin from which that is the answer, coming in from 0 on.
         top: see rays.sunk_under.
     """
     most = inside_most(grid, ray, max(depth_in_column(grid, ray, t, 0.0, 0.5 * t), 0.5 * t), depth, least)
-    return depth + (most - depth) * sunk_under(grid, ray, t, top) if most > depth else depth
+    beyond = 1 - max(depth, 0.0) / wall
+    return depth + beyond * (most - depth) * sunk_under(grid, ray, t, top) if most > depth else depth
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
@@ -351,7 +353,7 @@ def _lay(grid, pose, centre, points, inward, thickness, faces, found, top, split
             if chart[m] != side:
                 continue
             for q in range(depths.shape[1]):
-                if depths[m, q] > -BESIDE * edge - WALL * thick:
+                if sunk or depths[m, q] > -BESIDE * edge - WALL * thick:
                     near[m] = True
                     u = v = 0.0
                     for x in range(3):
@@ -419,9 +421,10 @@ def _lay(grid, pose, centre, points, inward, thickness, faces, found, top, split
                             share = 1.0
                     if only_look and share < 0:
                         depth = -_distance(grid, pose, x, y, z)
-                        if sunk and depth < 0:
+                        if sunk and depth < WALL * thick:
                             n0, n1, n2, t = _column(inward, thickness, f0, f1, f2, a, b, c)
-                            depth = _inside(grid, ray_from(pose, x, y, z, n0, n1, n2), t, depth, -border, top)
+                            depth = _inside(grid, ray_from(pose, x, y, z, n0, n1, n2), t, depth, -border, WALL * thick,
+                                            top)  # fmt: skip
                         share = min(max(0.5 + depth / blur, 0.0), 1.0)
                         if share <= 0:
                             continue

@@ -35,7 +35,7 @@ def stuck_motion(green: Green, touches: Sequence[Touch], loaded: np.ndarray | No
     pressed = [(touch, touch.pressed) for touch in touches if touch.pressed is not None]
     nodes = Nodes.joined([one.squeeze.nodes for _, one in pressed])
     group = green.near.groups(nodes.corners[:, 0])
-    gone = np.concatenate([_gone(touch, one, green.layer.vertex_areas) for touch, one in pressed])
+    gone, sure = map(np.concatenate, zip(*[_gone(touch, one, green.layer.vertex_areas) for touch, one in pressed], strict=True))
     if green.layer.stacked:
         forces = solve(green.matrix(nodes, group), nodes.sinking)
     else:
@@ -50,7 +50,7 @@ def stuck_motion(green: Green, touches: Sequence[Touch], loaded: np.ndarray | No
     if len(pressed) > 1:
         of = np.repeat(np.arange(len(pressed)), [len(one.squeeze.nodes.area) for _, one in pressed])
         same = Twins(*twins(some.points, some.inward, some.area, group[holds], of[holds]))
-    firm = _firm(forces[holds], some.area)
+    firm = _firm(forces[holds], some.area) * sure[holds]
     return green.motion(some, green.stuck(some, group[holds], gone[holds], guess, same, firm), loaded=loaded)
 
 
@@ -60,8 +60,8 @@ def _firm(forces: np.ndarray, area: np.ndarray) -> np.ndarray:
     return np.minimum(forces / area / (FIRM * mean), 1.0)
 
 
-def _gone(touch: Touch, pressed: Pressed, areas: np.ndarray) -> np.ndarray:
-    """Way of a tool's nodes with it, if they stick, (N, 3) [m]."""
+def _gone(touch: Touch, pressed: Pressed, areas: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Way of a tool's nodes with it, if they stick, (N, 3) [m]; and how sure it is, from 0 to 1, that they do, (N,)."""
     nodes = pressed.squeeze.nodes
     assert touch.pressure is not None
     way = way_of(touch, pressed, nodes.inward, float(touch.pressure @ areas))
@@ -72,14 +72,14 @@ def _gone(touch: Touch, pressed: Pressed, areas: np.ndarray) -> np.ndarray:
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _along(grid, pose, points, inward, way, sinking, thickness):
     """Way of nodes (N, 3) along unit vectors (N, 3) out of a tool, where their skin sinks by (N,), (N, 3) [m]."""
-    out = np.empty((len(points), 3))
+    out, held = np.empty((len(points), 3)), np.empty(len(points))
     for n in range(len(points)):
         cosine = inward[n, 0] * way[n, 0] + inward[n, 1] * way[n, 1] + inward[n, 2] * way[n, 2]
         depth = sinking[n] / max(cosine, ONE_WAY)
         ray = ray_of(pose, points, way, n)
         far = min(depth_in_column(grid, ray, 4 * depth, depth), FURTHEST * depth)
         sure = sure_of(grid, ray, depth, wall_in(grid[3], thickness[n]))
-        far = depth + sure * (far - depth if sure > 0 else depth)
+        far, held[n] = depth + max(sure, 0.0) * (far - depth), 1 + min(sure, 0.0)
         for x in range(3):
             out[n, x] = far * way[n, x]
-    return out
+    return out, held
