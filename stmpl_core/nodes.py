@@ -242,10 +242,10 @@ def _look(grid, pose, points, inward, thickness, faces, found, top, split, thick
             a, b = shares[q, 0], shares[q, 1]
             x, y, z = _between_corners(points, i, j, k, a, b, 1 - a - b)
             depth = -_distance(grid, pose, x, y, z)
-            if sunk and depth < WALL * thick:
+            if sunk:
                 n0, n1, n2, t = _column(inward, thickness, i, j, k, a, b, 1 - a - b)
                 least = -BESIDE * edges[m] - WALL * thick
-                depth = _inside(grid, ray_from(pose, x, y, z, n0, n1, n2), t, depth, least, WALL * thick, top)
+                depth = _inside(grid, ray_from(pose, x, y, z, n0, n1, n2), t, depth, least, top)
             depths[m, q], middles[m, q, 0], middles[m, q, 1], middles[m, q, 2] = depth, x, y, z
             if depth > deepest:
                 deepest, best = depth, m
@@ -272,18 +272,19 @@ def _distance(grid, pose, x, y, z):
 
 
 @numba.njit(forceinline=True, cache=True, nogil=True, error_model="numpy")
-def _inside(grid, ray, t, depth, least, wall, top):
-    """How far the column gets into a tool that has sunk under skin which it does not reach [m].
+def _inside(grid, ray, t, depth, least, top):
+    """How far the column gets into a tool that has sunk under skin which it does not reach, or just does [m].
 
     Args:
         ray, t: column, and its thickness.
         depth: depth of its skin in the tool [m].
         least: depth up to which the answer does not matter.
-        wall: depth of the skin from which that is the answer, coming in from 0 on.
         top: see rays.sunk_under.
     """
+    beyond = min(1 - depth / (WALL * t), 1.0)
+    if beyond <= 0:
+        return depth
     most = inside_most(grid, ray, max(depth_in_column(grid, ray, t, 0.0, 0.5 * t), 0.5 * t), depth, least)
-    beyond = 1 - max(depth, 0.0) / wall
     return depth + beyond * (most - depth) * sunk_under(grid, ray, t, top) if most > depth else depth
 
 
@@ -421,10 +422,9 @@ def _lay(grid, pose, centre, points, inward, thickness, faces, found, top, split
                             share = 1.0
                     if only_look and share < 0:
                         depth = -_distance(grid, pose, x, y, z)
-                        if sunk and depth < WALL * thick:
+                        if sunk:
                             n0, n1, n2, t = _column(inward, thickness, f0, f1, f2, a, b, c)
-                            depth = _inside(grid, ray_from(pose, x, y, z, n0, n1, n2), t, depth, -border, WALL * thick,
-                                            top)  # fmt: skip
+                            depth = _inside(grid, ray_from(pose, x, y, z, n0, n1, n2), t, depth, -border, top)
                         share = min(max(0.5 + depth / blur, 0.0), 1.0)
                         if share <= 0:
                             continue

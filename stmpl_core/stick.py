@@ -35,7 +35,8 @@ def stuck_motion(green: Green, touches: Sequence[Touch], loaded: np.ndarray | No
     pressed = [(touch, touch.pressed) for touch in touches if touch.pressed is not None]
     nodes = Nodes.joined([one.squeeze.nodes for _, one in pressed])
     group = green.near.groups(nodes.corners[:, 0])
-    gone, sure = map(np.concatenate, zip(*[_gone(touch, one, green.layer.vertex_areas) for touch, one in pressed], strict=True))
+    ways = [_gone(touch, one, green.layer.vertex_areas) for touch, one in pressed]
+    gone, sure = np.concatenate([way for way, _ in ways]), np.concatenate([held for _, held in ways])
     if green.layer.stacked:
         forces = solve(green.matrix(nodes, group), nodes.sinking)
     else:

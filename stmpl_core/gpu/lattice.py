@@ -86,14 +86,14 @@ def lay(side: wp.int32, what: wp.int32, skins: Skins, scratch: Scratch):
         area = _area_seen(scratch, c, unit)
         cell = area / NODES
     least = wp.max(wp.min(cell, RISE * WIDEST * thick * WIDEST * thick), area / MOST)
-    axes, centre = scratch.axes[c, side], scratch.centre[c]
+    axes, centre, sunk = scratch.axes[c, side], scratch.centre[c], wp.length_sq(scratch.top[c]) > real(0.0)
     low_u, low_v, high_u, high_v = real(FAR), real(FAR), -FAR, -FAR
     for m in range(lane, many, lanes):
         if scratch.chart[c, m] == side or scratch.chart[c, m] == side + CHARTS:
             corners, near = skins.faces[scratch.found[c, m]], wp.int32(0)
             edge = wp.length(skins.points[corners[0]] - skins.points[corners[1]]) / wp.sqrt(real(parts))
             for q in range(parts):
-                if scratch.depths[c, m * parts + q] > real(-0.6) * edge - WALL_WIDTH * thick:
+                if sunk or scratch.depths[c, m * parts + q] > real(-0.6) * edge - WALL_WIDTH * thick:
                     near = CHARTS
                     at = axes * (scratch.middles[c, m * parts + q] - centre)
                     low_u, high_u = wp.min(low_u, at[0] - edge), wp.max(high_u, at[0] + edge)

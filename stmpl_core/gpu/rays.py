@@ -312,11 +312,12 @@ def strain_under(grid: Grid, coefficients: wp.array(dtype=real), start: vec3, wa
 
 @wp.func
 def depth_at(grid: Grid, coefficients: wp.array(dtype=real), start: vec3, way: vec3, t: real, top: vec3) -> real:
-    """Depth of the skin in the tool [m], or where the tool has sunk under it, of its column."""
+    """Depth of the skin in the tool [m], or where the tool has sunk under it, of its column: nodes._inside."""
     depth = -distance_at(grid, coefficients, start)
-    if depth < real(0.0) and wp.length_sq(top) > real(0.0):
+    beyond = wp.min(real(1.0) - depth / (WALL_WIDTH * t), real(1.0))
+    if beyond > real(0.0) and wp.length_sq(top) > real(0.0):
         deep = wp.max(depth_in_column(grid, coefficients, start, way, t, real(0.0)), real(0.5) * t)
         most = inside_most(grid, coefficients, start, way, deep)
         if most > depth:
-            depth = depth + (most - depth) * sunk_under(grid, coefficients, start, way, t, top)
+            depth = depth + beyond * (most - depth) * sunk_under(grid, coefficients, start, way, t, top)
     return depth

@@ -81,17 +81,15 @@ def go(pick: wp.array(dtype=wp.int32), lanes: wp.int32, many: wp.int32, skins: S
         if field.one_way[f * many + k] == 1:
             way = field.way[f * many + k]
         pose = wp.transpose(scratch.pose[c])
-        depth = scratch.strain[s, i] * scratch.thick[s, i] / wp.max(wp.dot(inward, way), LEAST_COSINE)
+        depth = scratch.sinking[s, i] / wp.max(wp.dot(inward, way), LEAST_COSINE)
         start = pose * (scratch.point[s, i] - scratch.place[c])
         grid = skins.grids[scratch.grid[c]]
         far = wp.min(depth_in_column(grid, skins.coefficients, start, pose * way, real(4.0) * depth, depth),
                      FURTHEST * depth)  # fmt: skip
         sure = sure_of(grid, skins.coefficients, start, pose * way, depth, wall_in(grid, scratch.thick[s, i]))
-        if sure > real(0.0):
-            field.pull[f, a] = (depth + sure * (far - depth)) * way
-        else:
-            field.pull[f, a] = (real(1.0) + sure) * depth * way
-        field.firm[f, a] = wp.min(scratch.force[s, i] / (scratch.area[s, i] * field.light[f]), real(1.0))
+        field.pull[f, a] = (depth + wp.max(sure, real(0.0)) * (far - depth)) * way
+        field.firm[f, a] = wp.min(scratch.force[s, i] / (scratch.area[s, i] * field.light[f]), real(1.0)) * (
+            real(1.0) + wp.min(sure, real(0.0)))  # fmt: skip
         fine = wp.floor(FINE_SPREADS * _row_of(wp.log(SPREAD * wp.sqrt(scratch.area[s, i]) / one.flat)))
         soft = wp.floor(FINE_SOFTS * scratch.soft[s, i] + real(0.5))
         field.row[f, a] = vec3((fine + real(0.5)) / FINE_SPREADS, soft / FINE_SOFTS,
