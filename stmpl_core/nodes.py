@@ -130,11 +130,8 @@ def nodes_under(grid, pose, centre, points, inward, thickness, faces, found, top
     split = 1
     while split < 8 and len(found) * split**2 < SAMPLES:
         split += 1
-    thick = 0.0
-    for f in found:
-        thick += thickness[faces[f, 0]] / len(found)
-    depths, middles, ways, sizes, edges, best, area = _look(
-        grid, pose, points, inward, thickness, faces, found, top, split, thick
+    depths, middles, ways, sizes, edges, best, area, thick = _look(
+        grid, pose, points, inward, thickness, faces, found, top, split
     )
     rows = np.empty((0, 15))
     if area > 0:
@@ -209,7 +206,7 @@ def strains_under(grid, pose, points, inward, thickness, top):
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _look(grid, pose, points, inward, thickness, faces, found, top, split, thick):
+def _look(grid, pose, points, inward, thickness, faces, found, top, split):
     """How deep the tool is at parts of the triangles.
 
     Returns:
@@ -220,6 +217,7 @@ def _look(grid, pose, points, inward, thickness, faces, found, top, split, thick
         edges: their sides, (F,) [m].
         best: place in `found` of the deepest.
         area: area that is covered [m2]; a small share of what is near, where the tool touches between the middles.
+        thick: thickness there [m].
     """
     many, parts, sunk = len(found), split * split, top.any()
     depths, middles, ways = np.empty((many, parts)), np.empty((many, parts, 3)), np.empty((many, 3))
@@ -244,18 +242,20 @@ def _look(grid, pose, points, inward, thickness, faces, found, top, split, thick
             depth = -_distance(grid, pose, x, y, z)
             if sunk:
                 n0, n1, n2, t = _column(inward, thickness, i, j, k, a, b, 1 - a - b)
-                least = -BESIDE * edges[m] - WALL * thick
+                least = -BESIDE * edges[m] - WALL * t
                 depth = _inside(grid, ray_from(pose, x, y, z, n0, n1, n2), t, depth, least, top)
             depths[m, q], middles[m, q, 0], middles[m, q, 1], middles[m, q, 2] = depth, x, y, z
             if depth > deepest:
                 deepest, best = depth, m
-    area = 0.0
+    area = thick = 0.0
     for m in range(many):
         blur = 0.5 * np.sqrt(sizes[m])
         blur = min(blur, 0.5 * deepest) if deepest > 0 else blur
         for q in range(parts):
-            area += min(max(0.5 + depths[m, q] / blur, 0.0), 1.0) * sizes[m]
-    return depths, middles, ways, sizes, edges, best, area if deepest > 0 else 0.05 * area
+            part = min(max(0.5 + depths[m, q] / blur, 0.0), 1.0) * sizes[m]
+            area += part
+            thick += part * thickness[faces[found[m], 0]]
+    return depths, middles, ways, sizes, edges, best, area if deepest > 0 else 0.05 * area, thick / max(area, 1e-300)
 
 
 @numba.njit(cache=True, inline="always")
