@@ -17,6 +17,7 @@ UNSAID = np.full(3, ANYHOW + 1)  # a share that rises by 1
 MAX_COLUMN_STRAIN = 0.9  # strain beyond which no column is squeezed
 STEEPEST = 1.5  # slope that a distance field does not exceed on its way to 0 [-]; its spline's is above 1 beside edges
 SECANT_START = 3e-3  # distance to the tool, over the thickness, at which the secant rule takes over from sphere tracing
+GRAZES = 0.01  # least step along a wall of the tool, likewise
 SECANT_TOLERANCE = 4e-4  # largest last step of the secant rule, likewise; the depth is then known far better
 
 
@@ -89,7 +90,10 @@ def depth_in_column(grid, ray, t, guess, least=0.0):
                 return least
         else:
             slope = (d - last_d) / (s - last_s)
-            following = s - d / slope if slope > 0.2 else s - d
+            if slope > 0.2 or d * last_d < 0:
+                following = s - d / slope
+            else:  # along a wall
+                following = s - (max(d, GRAZES * t) if d > 0 else d)
             last_s, last_d = s, d
             s = following
         if s <= 0:
@@ -111,12 +115,14 @@ def inside_most(grid, ray, deep, most, least):
         least: value up to which the answer does not matter [m].
     """
     at, there = 0.0, most
-    parts = int(min(max(2 * deep / grid[3], PASSED), MOST_PASSED))
-    for k in range(1, parts):
-        s = deep * k / parts
+    step = max(min(0.5 * grid[3], deep / PASSED), deep / MOST_PASSED)
+    for k in range(1, MOST_PASSED + 1):
+        s = min(k * step, deep)
         if there + STEEPEST * (s - at) > max(most, least):
             at, there = s, -distance_in_column(grid, ray, s)
             most = max(most, there)
+        if s == deep:
+            break
     return most
 
 

@@ -12,11 +12,12 @@ from stmpl_core.columns import grid_of
 from stmpl_core.green import ONE_WAY, Green
 from stmpl_core.nodes import Nodes
 from stmpl_core.obstacle import solve
-from stmpl_core.rays import depth_in_column, ray_of, sure_of, wall_in
+from stmpl_core.rays import depth_in_column, distance_in_column, ray_of, sure_of, wall_in
 from stmpl_core.touch import Pressed, Touch, way_of
 from stmpl_core.twins import NO_TWINS, Twins, twins
 
 FIRM = 0.1  # pressure over its mean, weighed with itself, from which a node is held where its tool is
+LEAVES = 0.5  # slope of the distance where a way leaves a tool from which it is clear where: not along a wall
 FURTHEST = 1.5  # way of a node over its depth along the tool's way
 
 
@@ -79,8 +80,11 @@ def _along(grid, pose, points, inward, way, sinking, thickness):
         depth = sinking[n] / max(cosine, ONE_WAY)
         ray = ray_of(pose, points, way, n)
         far = min(depth_in_column(grid, ray, 4 * depth, depth), FURTHEST * depth)
-        sure = sure_of(grid, ray, depth, wall_in(grid[3], thickness[n]))
-        far, held[n] = depth + max(sure, 0.0) * (far - depth), 1 + min(sure, 0.0)
+        wall = wall_in(grid[3], thickness[n])
+        leaves = (distance_in_column(grid, ray, far) - distance_in_column(grid, ray, far - wall)) / wall
+        sure = sure_of(grid, ray, depth, wall)
+        far = depth + min(max(sure, 0.0), max(leaves / LEAVES, 0.0), 1.0) * (far - depth)
+        held[n] = 1 + min(sure, 0.0)
         for x in range(3):
             out[n, x] = far * way[n, x]
     return out, held
