@@ -121,7 +121,7 @@ def inside_most(grid, ray, deep, most, least):
         if there + STEEPEST * (s - at) > max(most, least):
             at, there = s, -distance_in_column(grid, ray, s)
             most = max(most, there)
-        if s == deep:
+        if not s < deep:
             break
     return most
 

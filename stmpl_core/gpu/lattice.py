@@ -70,10 +70,7 @@ def lay(side: wp.int32, what: wp.int32, skins: Skins, scratch: Scratch):
         scratch.lattice[c] = lattice
     if side >= scratch.sides[c]:
         return
-    many, parts, thick = scratch.many[c], scratch.split[c] * scratch.split[c], real(0.0)
-    for m in range(lane, many, lanes):
-        thick += skins.thickness[skins.faces[scratch.found[c, m]][0]] / real(many)
-    thick = sum_of(thick)
+    many, parts, thick = scratch.many[c], scratch.split[c] * scratch.split[c], real(scratch.height[c])
     unit, area = NODES * thick * thick, real(scratch.covers[c])
     step = wp.floor(_steps(area, unit))
     if what == LOOKS_AGAIN:

@@ -111,8 +111,8 @@ def _axes(pose: mat33, way: vec3) -> mat33:
 
 
 @wp.kernel
-def gather_look(scratch: Scratch):
-    """Area that the tool covers, and the sides of the limb that its triangles are on."""
+def gather_look(skins: Skins, scratch: Scratch):
+    """Area that the tool covers, the thickness there, and the sides of the limb that its triangles are on."""
     c, lane = wp.tid()
     lanes, many, parts = wp.block_dim(), scratch.many[c], scratch.split[c] * scratch.split[c]
     if many == 0:
@@ -130,7 +130,7 @@ def gather_look(scratch: Scratch):
     if lowest == least_of(lowest):
         best = real(mine)
     best = sum_of(best)  # of the one thread that has it
-    area, total, mean = real(0.0), real(0.0), vec3()
+    area, height, total, mean = real(0.0), real(0.0), real(0.0), vec3()
     for m in range(lane, many, lanes):
         size = scratch.sizes[c, m]
         blur = real(0.5) * wp.sqrt(size)
@@ -139,14 +139,18 @@ def gather_look(scratch: Scratch):
         weight = real(0.0)
         for q in range(parts):
             depth = scratch.depths[c, m * parts + q]
-            area += wp.clamp(real(0.5) + depth / blur, real(0.0), real(1.0)) * size
+            part = wp.clamp(real(0.5) + depth / blur, real(0.0), real(1.0)) * size
+            area += part
+            height += part * skins.thickness[skins.faces[scratch.found[c, m]][0]]
             weight += size * wp.max(depth + real(0.05) * wp.abs(deepest), real(0.0))
         total += weight
         mean = mean + weight * scratch.ways[c, m]
         scratch.chart[c, m] = -1
     area = sum_of(area)
+    height = sum_of(height)
     total = sum_of(total)
     mean = sum_of(mean)
+    height = height / wp.max(area, real(1e-300))
     if deepest <= real(0.0):
         area = real(0.05) * area
     way = vec3(scratch.ways[c, wp.int32(best)])
@@ -176,6 +180,7 @@ def gather_look(scratch: Scratch):
             way = scratch.ways[c, rest]
     if lane == 0:
         scratch.covers[c] = area
+        scratch.height[c] = height
         scratch.deepest[c] = deepest
         scratch.sides[c] = sides
         scratch.sees[c] = real(0.0)

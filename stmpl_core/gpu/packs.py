@@ -115,7 +115,7 @@ SCRATCH: dict[str, tuple[Any, str]] = {
     "found": (wp.int32, "CF"), "many": (wp.int32, "C"), "split": (wp.int32, "C"), "deep": (real, "C"),
     "depths": (real, "CP"), "middles": (vec3, "CP"), "ways": (vec3, "CF"), "sizes": (real, "CF"),
     "chart": (wp.int32, "CF"), "sides": (wp.int32, "C"), "axes": (mat33, "C6"), "deepest": (real, "C"),
-    "covers": (real, "C"), "sees": (real, "C"), "also": (real, "C"), "lattice": (Lattice, "C"),
+    "covers": (real, "C"), "height": (real, "C"), "sees": (real, "C"), "also": (real, "C"), "lattice": (Lattice, "C"),
     "owner": (wp.int32, "CL"), "value": (real, "CL"),
     "nodes": (wp.int32, "S"), "wants": (wp.int32, "1"), "begin": (wp.int32, "S"), "tool": (wp.int32, "SN"),
     "cell": (wp.int32, "SN"), "face": (wp.int32, "SN"), "shares": (vec3, "SN"), "point": (vec3, "SN"),

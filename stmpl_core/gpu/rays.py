@@ -5,6 +5,7 @@ import warp as wp
 
 from stmpl_core.rays import (
     ANYHOW,
+    GRAZES,
     LOOKED_AT,
     MAX_COLUMN_STRAIN,
     MOST_PASSED,
@@ -25,6 +26,7 @@ FAR = wp.constant(wp.float64(1e30))  # stands for infinity
 WALL_WIDTH = wp.constant(wp.float64(WALL))
 MOST_STRAIN = wp.constant(wp.float64(MAX_COLUMN_STRAIN))
 PARTS, MOST_PARTS = wp.constant(wp.float64(PASSED)), wp.constant(wp.float64(MOST_PASSED))
+GRAZE = wp.constant(wp.float64(GRAZES))
 SAID_ANYHOW = wp.constant(wp.float64(ANYHOW))
 ENTERS, LOOKS_BACK = wp.constant(MOST_ENTERS), wp.constant(wp.float64(LOOKED_BACK))
 CLEAR = wp.constant(wp.float64(CLEAR_FROM))
@@ -215,8 +217,10 @@ def depth_in_column(grid: Grid, coefficients: wp.array(dtype=real), start: vec3,
         else:
             slope = (d - last_d) / (s - last_s)
             following = s - d
-            if slope > real(0.2):
+            if slope > real(0.2) or d * last_d < real(0.0):
                 following = s - d / slope
+            elif d > real(0.0):
+                following = s - wp.max(d, GRAZE * t)
             last_s = s
             last_d = d
             s = following
@@ -238,9 +242,13 @@ def depth_in_column(grid: Grid, coefficients: wp.array(dtype=real), start: vec3,
 def inside_most(grid: Grid, coefficients: wp.array(dtype=real), start: vec3, way: vec3, deep: real) -> real:
     """How far inside the tool a ray gets at most on its way to a depth [m]; below 0: how far it passes beside it."""
     most = -along(grid, coefficients, start, way, real(0.0))
-    parts = wp.int32(wp.min(wp.max(real(2.0) * deep / grid.half, PARTS), MOST_PARTS))
-    for k in range(1, parts):
-        most = wp.max(most, -along(grid, coefficients, start, way, deep * real(k) / real(parts)))
+    step, k = wp.max(wp.min(real(0.5) * grid.half, deep / PARTS), deep / MOST_PARTS), wp.int32(1)
+    while k > 0:
+        s = wp.min(real(k) * step, deep)
+        most = wp.max(most, -along(grid, coefficients, start, way, s))
+        k += 1
+        if not s < deep:
+            k = wp.int32(0)
     return most
 
 

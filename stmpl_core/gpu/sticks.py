@@ -15,10 +15,11 @@ from stmpl_core.gpu.field_packs import FieldScratch, SkinFields
 from stmpl_core.gpu.motion import MOST_FOLDS, _stretch
 from stmpl_core.gpu.packs import Scratch, Skins
 from stmpl_core.gpu.places import REFUSED
-from stmpl_core.gpu.rays import OPTIONS, depth_in_column, mat33, real, sure_of, vec3, wall_in
+from stmpl_core.gpu.rays import OPTIONS, along, depth_in_column, mat33, real, sure_of, vec3, wall_in
 from stmpl_core.gpu.stacks import FARTHEST, ROUND_SQUARE, ROWS, SPREAD, _row_of, _share
 
 LEAST_COSINE, FURTHEST = wp.constant(wp.float64(green.ONE_WAY)), wp.constant(wp.float64(stick.FURTHEST))
+LEAVES = wp.constant(wp.float64(stick.LEAVES))
 HELD_FROM, LEAST_FIRM = wp.constant(wp.float64(stick.FIRM)), wp.constant(wp.float64(green.LEAST_FIRM))
 TINY = wp.constant(wp.float64(1e-300))
 RIDGE, REACH = wp.constant(wp.float64(green.RIDGE)), wp.constant(wp.float64(green.REACH))
@@ -86,8 +87,12 @@ def go(pick: wp.array(dtype=wp.int32), lanes: wp.int32, many: wp.int32, skins: S
         grid = skins.grids[scratch.grid[c]]
         far = wp.min(depth_in_column(grid, skins.coefficients, start, pose * way, real(4.0) * depth, depth),
                      FURTHEST * depth)  # fmt: skip
-        sure = sure_of(grid, skins.coefficients, start, pose * way, depth, wall_in(grid, scratch.thick[s, i]))
-        field.pull[f, a] = (depth + wp.max(sure, real(0.0)) * (far - depth)) * way
+        wall = wall_in(grid, scratch.thick[s, i])
+        leaves = (along(grid, skins.coefficients, start, pose * way, far)
+                  - along(grid, skins.coefficients, start, pose * way, far - wall)) / wall  # fmt: skip
+        sure = sure_of(grid, skins.coefficients, start, pose * way, depth, wall)
+        share = wp.min(wp.max(sure, real(0.0)), wp.clamp(leaves / LEAVES, real(0.0), real(1.0)))
+        field.pull[f, a] = (depth + share * (far - depth)) * way
         field.firm[f, a] = wp.min(scratch.force[s, i] / (scratch.area[s, i] * field.light[f]), real(1.0)) * (
             real(1.0) + wp.min(sure, real(0.0)))  # fmt: skip
         fine = wp.floor(FINE_SPREADS * _row_of(wp.log(SPREAD * wp.sqrt(scratch.area[s, i]) / one.flat)))

@@ -349,7 +349,7 @@ class WarpBatch:
         self._run(looks.begin, tools, scratch)
         self._run(looks.look, shared, self._lanes, skins, scratch)
         scratch.busy.zero_()
-        self._run(looks.gather_look, blocks, scratch)
+        self._run(looks.gather_look, blocks, skins, scratch)
 
     def _meet(self, tools: int, again: int) -> None:
         """Columns near the tools, and their distances."""
