@@ -12,7 +12,7 @@ from stmpl_core.columns import Columns, Squeeze, grid_of
 from stmpl_core.living import living
 from stmpl_core.methods.winkler import column_pressure
 from stmpl_core.nodes import NODES
-from stmpl_core.rays import MAX_COLUMN_STRAIN, NOT_SUNK, PASSED, UNSAID, inside_most, sunk_under
+from stmpl_core.rays import MAX_COLUMN_STRAIN, MOST_PASSED, NOT_SUNK, PASSED, UNSAID, inside_most, sunk_under
 from stmpl_core.sdf import SignedDistance
 from tests.scenes import (
     LENGTH,
@@ -246,7 +246,8 @@ def test_places_along_a_column_that_are_not_looked_at_are_not_the_deepest(least:
     rng, deep = np.random.default_rng(5), 4e-3
     starts, ways = rng.uniform(-0.02, 0.02, (2000, 3)) * (1, 1, 0.3), rng.normal(size=(2000, 3))
     ways /= np.linalg.norm(ways, axis=1, keepdims=True)
-    at = starts[:, None] + deep * np.arange(PASSED)[:, None] / PASSED * ways[:, None]
+    step = max(min(0.5 * grid_of(SLAB)[3], deep / PASSED), deep / MOST_PASSED)
+    at = starts[:, None] + np.minimum(step * np.arange(MOST_PASSED + 1), deep)[:, None] * ways[:, None]
     inside = -SLAB.distance(at.reshape(-1, 3)).reshape(2000, -1)
     found = [inside_most(grid_of(SLAB), (*start, *way), deep, first, least)
              for start, way, first in zip(starts, ways, inside[:, 0], strict=True)]  # fmt: skip
