@@ -194,7 +194,7 @@ def _unlike(toucher: Toucher, pressing: Sequence[Contact]) -> str:
     some = pressing[:: max(len(pressing) // MIN_INSTANTS, 1)]
     told = np.array([np.linalg.norm(one.wrench[:3]) for one in some if one.wrench is not None])
     borne = np.array([toucher.touch(Contact(one.tool, one.pose_body_from_tool)).force for one in some])
-    factor = float(np.median((told / borne)[borne > 0])) if borne.any() else 1.0
+    factor = float(np.median(told[borne > 0] / borne[borne > 0])) if borne.any() else 1.0
     if 1 / MAX_FACTOR < factor < MAX_FACTOR:
         return ""
     return (f"Its forces are {factor:.3g} times those that this skin presses with at its poses: are wrenches in "

@@ -9,7 +9,7 @@ from stmpl_core import Contact, Prony, Simulator, State, Tissue
 from stmpl_core.errors import InvalidInput
 from stmpl_core.history import History
 from stmpl_core.methods import Winkler
-from stmpl_core.strokes import fit_friction, fit_relaxation
+from stmpl_core.strokes import _unlike, fit_friction, fit_relaxation
 from stmpl_core.tissue import Membrane, Ply
 from stmpl_core.toucher import Toucher
 from tests.scenes import at, ball, plate
@@ -110,6 +110,13 @@ def test_a_stroke_in_millinewtons_is_asked_for_its_unit(toucher: Toucher) -> Non
     stroke = [replace(one, wrench=1e3 * np.asarray(one.wrench)) for one in measured(*wiped(1e-3, back=True), 0.4)]
     found = fit_friction(toucher, stroke)
     assert not found.trust.ok and found.trust.why.endswith("are wrenches in newtons, and poses in metres?")
+
+
+def test_instants_whose_poses_are_off_the_skin_divide_by_nothing(toucher: Toucher) -> None:
+    tool, wrench = ball(), np.array([0, 0, -1.0, 0, 0, 0])
+    both = [Contact(tool, at(0, 0, 0.012 - depth), wrench) for depth in (3e-3, -3e-3)]
+    with np.errstate(all="raise"):
+        _unlike(toucher, both)
 
 
 def test_a_stroke_whose_poses_tremble_is_not_told_to_tell_more(toucher: Toucher) -> None:
