@@ -43,7 +43,8 @@ class BatchTouches:
         statuses: see stmpl_core.touch, and REFUSED, (n, K).
         why: by scene and tool, what else is to be said of the touch.
         states: memory of each scene after this step; None: none was asked for.
-        fields: motion of all vertices (V, 3) [m], by the number of each scene that was asked for it.
+        fields: motion of all vertices (V, 3) [m], by the number of each scene that was asked for it; NaN of one that is
+            refused.
     """
 
     wrenches: np.ndarray
@@ -178,6 +179,8 @@ class Batch:
                 except (StmplError, np.linalg.LinAlgError) as error:
                     wrenches[i], in_range[i], statuses[i] = 0.0, False, REFUSED
                     why.update({(i, k): str(error) for k in range(many)})
+                    if i in wanted:
+                        moved[i] = np.full((len(self.skins[i].layer.vertices), 3), np.nan)
 
         if self._pool is None:
             work(range(n))
