@@ -45,7 +45,7 @@ class WarpStates:
         return len(self.rows)
 
     def reset(self, scenes: Any) -> WarpStates:
-        """The same, of which some scenes begin anew.
+        """A copy, of which some scenes begin anew; these states stay as they are.
 
         Args:
             scenes: their numbers, or a mask (n,); arrays of numpy, torch and Warp on any device, too.
