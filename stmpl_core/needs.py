@@ -26,7 +26,7 @@ from stmpl_core.relaxation import Series, faded, fading, series_of
 from stmpl_core.sideways import patch
 from stmpl_core.stack import Ball, Fit, Misfit, ball, nearest, plies, response
 from stmpl_core.stroke import Missed, Stroke, played, pulled, without_time
-from stmpl_core.tissue import FRICTION, Tissue
+from stmpl_core.tissue import FRICTION, HARDEST, SOFTEST, Tissue
 
 if TYPE_CHECKING:
     from stmpl_core.layer import SoftLayer
@@ -196,6 +196,11 @@ def needs(
     tissue = of if isinstance(of, Tissue) else of.tissue
     if thickness is None:
         raise InvalidInput("a tissue wants a thickness: give thickness=, in m.")
+    if not 0 < thickness <= MAX_THICKNESS:
+        raise InvalidInput(f"thickness is {thickness:g} m; above 0, and at most {MAX_THICKNESS:g} m is accepted.")
+    if not SOFTEST <= tissue.youngs_modulus <= HARDEST:
+        raise InvalidInput(f"no soft layer has {tissue.youngs_modulus:.4g} Pa, {SOFTEST:g} to {HARDEST:g} Pa are "
+                           "accepted.")  # fmt: skip
     speeds = _checked("speeds", speeds, "m/s", FASTEST)
     mu = coefficient(friction)
     accuracies = ((f"the accuracy in {name}", one) for name, one in enough._asdict().items())

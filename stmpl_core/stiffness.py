@@ -12,7 +12,7 @@ from stmpl_core.contact import Contact
 from stmpl_core.errors import InvalidInput
 from stmpl_core.layer import single
 from stmpl_core.simulator import Simulator
-from stmpl_core.tissue import SOFTEST
+from stmpl_core.tissue import HARDEST, SOFTEST
 from stmpl_core.touch import Touch
 from stmpl_core.toucher import MAX_DRAG_RATIO, Toucher
 from stmpl_core.trust import Trust
@@ -31,7 +31,6 @@ WRONG_WAY = ("no force points into the skin where the poses touch it: is it what
              "the poses right, in metres?")  # fmt: skip
 DEVIATION = 1.25  # standard deviation of an error over the mean of its size, sqrt(pi / 2)
 MAX_RELATIVE_ERROR = 0.2  # standard error of the modulus over it
-HARDEST = 1e6  # Young's modulus above any soft layer's [Pa]: 8 times that of skin's sheet (stmpl_core.regions)
 OFFSET_MARGIN_M = 1e-4  # distance from the ends of the search, within which the offset may as well lie outside
 
 

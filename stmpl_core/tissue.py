@@ -11,6 +11,7 @@ from stmpl_core.errors import InvalidInput
 
 THICKEST_SKIN = 5e-3  # largest thickness of a skin [m]; that of a skin in millimetres is larger
 SOFTEST = 100.0  # smallest Young's modulus of a tissue [Pa]; that of a modulus in kilopascals is smaller
+HARDEST = 1e6  # Young's modulus above any soft layer's [Pa]: 8 times that of skin's sheet (stmpl_core.regions)
 FRICTION = 0.52  # static, on skin: median of 450 measurements (Veijgen et al., 2013) [-]
 
 

@@ -141,6 +141,7 @@ def test_less_accuracy_asks_for_less():
         ({"duration": -1.0}, "duration is -1 s"),
         ({"path": float("nan")}, "path is nan m"),
         ({"thickness": None}, "thickness"),
+        ({"thickness": 30.0}, "thickness is 30 m"),
         ({"enough": Misfit(0.0, 0.1)}, "the accuracy in force is 0"),
         ({"enough": Misfit(1e-7, 0.1)}, "accuracy of 1e-07"),
         ({"radii": 8e-3}, "radii are numbers in m"),
@@ -149,6 +150,11 @@ def test_less_accuracy_asks_for_less():
 def test_what_cannot_be_is_refused_with_what_is_wrong(change, says):
     with pytest.raises(InvalidInput, match=says):
         asked(LIMB, **change)
+
+
+def test_a_modulus_that_no_soft_layer_has_is_refused():
+    with pytest.raises(InvalidInput, match="no soft layer has 3e\\+09 Pa"):
+        needs(Tissue(3e9), [20e-3], [1.0], thickness=0.03)
 
 
 def test_the_verb_says_the_smallest_model_with_units(capsys):
