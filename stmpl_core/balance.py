@@ -5,7 +5,7 @@ from __future__ import annotations
 import numba
 import numpy as np
 
-GIVEN_BACK = 0.7  # share of what an elastic contact gives back that must be covered by what was put in
+GIVEN_BACK = 0.7  # share of what a contact surely gives back that must be covered by what was put in
 KEPT = 1.5  # work beyond what elastic skin could hold that is forgotten: what was lost before pays for nothing now
 UNSURE = 1e-3  # of the largest force so far times the depth: energy that a contact may lack, as no sum is exact
 POWERS = (1.0, 12.0)  # range of the power of the depth with which a force grows between two depths
@@ -26,7 +26,7 @@ def settled(works, givens, spares, stored, whole):
         works: work that was put in and not given back, before; written: after, (K,) [J].
         givens: what the last wrench has of it, (K,) [J].
         spares: what a contact may lack, (K,) [J].
-        stored, whole: energy that a contact could give back, and that it could hold, (K,) [J].
+        stored, whole: energy that a contact surely gives back, and that it could hold, (K,) [J].
     """
     tools, out = len(works), np.ones(len(works))
     all_stored, all_there = stored.sum(), works.sum() + spares.sum()
@@ -60,7 +60,7 @@ def settled(works, givens, spares, stored, whole):
 
 @numba.njit(cache=True, error_model="numpy")
 def work_of(twist, before, after, old, new, origin, presses_first, presses_last, factor_first, factor_last,
-            relaxed_first, relaxed_last, shares, depth_first, depth_last, power, radius):  # fmt: skip
+            passive, relaxed_first, relaxed_last, shares, depth_first, depth_last, power, radius):  # fmt: skip
     """Work of a wrench over a tool's way in a step; how far it may be from that; and the last wrench's part of it [J].
 
     The wrench goes straight from one to the other, but for the force of elastic skin along the normal, which grows with
@@ -75,15 +75,16 @@ def work_of(twist, before, after, old, new, origin, presses_first, presses_last,
         origin: origin of the tool, (3,) [m].
         presses_first, presses_last: whether the tool presses before and after.
         factor_first, factor_last: force along the normal over one that relaxed at rest, by what a tool presses with:
-            net, passive and stretch of Scalars, one times the other [-].
+            net and stretch of Scalars, one times the other [-].
+        passive: factor by which the first wrench was weakened: forces grow as those that are not [-].
         relaxed_first, relaxed_last: what has relaxed there, (P,) [N].
         shares: shares of the force that relax, (P,) [-].
         depth_first, depth_last: depths there [m].
         power: power of the depth with which it grows, where the depths do not say it [-].
         radius: radius of the contact there [m].
     """
-    first = _elastic(before, old, factor_first, relaxed_first, shares) if presses_first else 0.0
-    last = _elastic(after, new, factor_last, relaxed_last, shares) if presses_last else 0.0
+    first = _elastic(before, old, 1 / passive, factor_first, relaxed_first, shares) if presses_first else 0.0
+    last = _elastic(after, new, 1.0, factor_last, relaxed_last, shares) if presses_last else 0.0
     contact, deep = (new, depth_last) if last > 0 else (old, depth_first)
     go, square, share, less = 0.0, 0.0, 1.0, 0.0
     for x in range(3):
@@ -99,6 +100,7 @@ def work_of(twist, before, after, old, new, origin, presses_first, presses_last,
     elif first > 0 or last > 0:
         share = min(1.0, deep / max(abs(go), 1e-12))
         less = _less(first, last, max(power, POWERS[0]))
+    less *= passive
     given = taken = 0.0
     for x in range(6):
         given += 0.5 * share * before[x] * twist[x]
@@ -108,11 +110,11 @@ def work_of(twist, before, after, old, new, origin, presses_first, presses_last,
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _elastic(wrench, contact, factor, relaxed, shares):
+def _elastic(wrench, contact, sized, factor, relaxed, shares):
     """What a tool that presses would press with along the normal, had nothing relaxed [N]."""
     force = 0.0
     for x in range(3):
-        force += wrench[x] * contact[1, x]
+        force += sized * wrench[x] * contact[1, x]
     for i in range(len(shares)):
         force += factor * shares[i] * relaxed[i]
     return max(force, 0.0)

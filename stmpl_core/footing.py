@@ -12,6 +12,7 @@ LEFT = 0.6  # of what is dragged: what a way of one radius leaves behind, far on
 ROLLED, PASSED = 0.5, 0.25  # radius of the room that a contact has rolled over, and of that it has slid over, over a
 EDGE_SHARE = 0.3  # pressure over its mean from which skin counts as touched in full
 ROUGH = 0.12  # error of the relaxed force, over what has relaxed: 5.4 of 45 % in trials where only the shear relaxes
+SURELY = 1.25  # what a contact gives back at least, over what it does if columns' forces go as strain over stretch
 HELD_OFF = 0.01  # relative error of the elastic force by wrench, from which it is asked for again
 
 
@@ -83,8 +84,8 @@ def needed(stated, push, size, whole, long, owed, now, slid):
 
 
 @numba.njit(cache=True, error_model="numpy")
-def borne(push, middle, radius, mean, whole, elastic, deepest, power, factor, before, held, fades, kept, gain, owed,
-          shares, stated, creeps, slid):  # fmt: skip
+def borne(push, middle, radius, mean, whole, elastic, deepest, power, factor, way, before, held, fades, kept, gain,
+          owed, shares, stated, creeps, slid):  # fmt: skip
     """What skin that relaxes bears of an elastic touch.
 
     Args:
@@ -93,6 +94,7 @@ def borne(push, middle, radius, mean, whole, elastic, deepest, power, factor, be
         elastic: sum of the sizes of the forces [N].
         deepest: depth of the tool [m].
         power, factor: see Pressed.
+        way: by which the tool is drawn back from the core [m].
         before, held: contact before the step (see Memory), and whether the tool pressed there.
         fades: see relaxation.faded.
         kept, gain, owed: see `aged`.
@@ -107,7 +109,7 @@ def borne(push, middle, radius, mean, whole, elastic, deepest, power, factor, be
         at_rest: the latter over the stretch [N].
         net, stretch: see Scalars.
         contact, relaxed: see Memory, after the step.
-        stored, whole: energy that the contact could give back, and that it could hold [J].
+        stored, sure, whole: energy that the contact could give back, that it surely does, and that it could hold [J].
         doubt: error of the force that relaxing brings [N].
     """
     size = np.sqrt(_dot(push, push))
@@ -126,9 +128,18 @@ def borne(push, middle, radius, mean, whole, elastic, deepest, power, factor, be
     for i in range(len(shares)):
         relaxed[i] = kept[i] + more * gain[i] * at_rest
         gone += shares[i] * relaxed[i]
-    whole *= 0.5 + 0.5 / factor  # what draws a tool back from the core is steep: it stores less
-    stored = whole * left_over(gone / at_rest, power, 1 - long)
-    return force, elastic, at_rest, net, long, contact, relaxed, stored, whole, ROUGH * long * gone
+    strain, left = 2 * whole / elastic / mean, left_over(gone / at_rest, power, 1 - long)
+    core = 0.5 * (1 + 1 / factor) * size * way  # a force that goes straight from 1 / factor of it to all of it
+    whole = whole / factor + core
+    sure = core + min(SURELY * steep(strain), 1.0) * (whole - core)
+    return force, elastic, at_rest, net, long, contact, relaxed, left * whole, left * sure, whole, ROUGH * long * gone
+
+
+@numba.njit(cache=True, error_model="numpy")
+def steep(strain):
+    """Energy of a column whose force goes as its strain over its stretch, over half of its force times its way [-]."""
+    x = min(strain, 0.99)
+    return 2 * (1 - x) * (-x - np.log1p(-x)) / (x * x) if x > 1e-2 else 1 - x / 3
 
 
 @numba.njit(cache=True, error_model="numpy")

@@ -28,7 +28,7 @@ from stmpl_core.slip import MOST_GROWN
 from stmpl_core.state import Memory, State, fresh
 from stmpl_core.stepped import MOST_DRAGGED, OUT, PATCH, SAYS
 from stmpl_core.touch import APART, Imprint, Slip, Touch
-from stmpl_core.toucher import Toucher
+from stmpl_core.toucher import STIFFENING, Toucher
 from stmpl_core.trust import Trust
 from stmpl_core.wake import Wake
 
@@ -198,11 +198,13 @@ class History:
                      touch.wrench if wrench is None else wrench, stated.pose_body_from_tool, wrench is not None, creeps,
                      mu, stated.tool.number, out)  # fmt: skip
         if touch.presses and pressed is not None:
-            nodes, near, rubs = pressed.squeeze.nodes, toucher.near, mu > 0
+            nodes, near, rubs, way = pressed.squeeze.nodes, toucher.near, mu > 0, 0.0
+            if pressed.factor > 1:
+                way = (pressed.factor - 1) / STIFFENING * float(toucher.layer.thickness.max())
             forces = stepped.NO_FORCE if pressed.forces is None else pressed.forces
             stepped.whole_of(
                 nodes.points, nodes.area, nodes.thickness, nodes.depths, forces, nodes.corners, nodes.shares,
-                pressed.power, pressed.along, pressed.factor, rubs, near.frames, near.curvature, near.thickness,
+                pressed.power, pressed.along, pressed.factor, way, rubs, near.frames, near.curvature, near.thickness,
                 *(self._gives if rubs else NO_GIVES), toucher.layer.tissue.youngs_modulus, out)  # fmt: skip
 
     def _told(self, contact: Contact, touch: Touch, memory: Memory, out: np.ndarray, says: np.ndarray) -> Touch:

@@ -29,11 +29,12 @@ STRAYED = 0.03  # of the elastic force: part of the memory from touches out of r
 # What a contact is as a whole: wrench without friction 0 to 5, bound, in range, status (of those below), depth; sum of
 # the forces [N], middle 11 to 13 [m], radius, lever, thickness, energy, see footing.patch_of; power of the depth, share
 # that skin carries along itself, radius of all that presses [m]; how it gives, 21 to 29 [m/N], how skin bends there, 30
-# to 38 [1/m]; turn and place of the pose at which it presses, 39 to 50. All 0 by pose: factor on the pressures less 1,
-# whether it is told by a wrench, and whether the law was asked for another; that wrench, 54 to 59; turn and place of
-# the stated pose, 60 to 71. Coefficient of friction and number of the tool's surface.
-PATCH = 74
-POSE, FACTOR, BY_FORCE, CREEPS, STATED, STATED_POSE, FRICTION, NUMBER = 39, 51, 52, 53, 54, 60, 72, 73
+# to 38 [1/m]; turn and place of the pose at which it presses, 39 to 50. Factor on the pressures less 1.
+# All 0 by pose: whether it is told by a wrench, and whether the law was asked for another; that wrench, 54 to 59. Turn
+# and place of the stated pose, 60 to 71, read where that is another. Coefficient of friction and number of the tool's
+# surface; way by which it is drawn back from the core [m].
+PATCH = 75
+POSE, FACTOR, BY_FORCE, CREEPS, STATED, STATED_POSE, FRICTION, NUMBER, BACK = 39, 51, 52, 53, 54, 60, 72, 73, 74
 APART, HOLDS = 1.0, 2.0  # statuses: a tool is off, or holds the skin; another one's wrench stays as it is
 # What a step makes of it: wrench, bound, in range, status and depth, as in a PATCH; and more, see SAYS.
 OUT = 10
@@ -187,7 +188,7 @@ def tell(wrench, bound, in_range, depth, pose, stated, stated_pose, by_force, cr
 
     Args:
         wrench, bound, in_range, depth, pose: see Touch.
-        stated, stated_pose: stated wrench, (6,), and pose, (4, 4); read where it is told `by_force`.
+        stated, stated_pose: stated wrench, (6,), read where it is told `by_force`; and pose, (4, 4).
         by_force, creeps, friction, number: see PATCH.
         out: row of PATCH, all 0 before.
     """
@@ -195,21 +196,22 @@ def tell(wrench, bound, in_range, depth, pose, stated, stated_pose, by_force, cr
     out[7] = 1.0 if in_range else 0.0
     _put(wrench, out)
     _put_pose(pose, out, POSE)
+    _put_pose(stated_pose, out, STATED_POSE)
     if by_force:
         out[BY_FORCE], out[CREEPS] = 1.0, 1.0 if creeps else 0.0
         _put(stated, out[STATED:])
-        _put_pose(stated_pose, out, STATED_POSE)
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def whole_of(points, area, thickness, depth, forces, corners, shares, power, along, factor, rubs, frames, curvature,
-             vertex_thickness, gives, turns, modulus, out):  # fmt: skip
+def whole_of(points, area, thickness, depth, forces, corners, shares, power, along, factor, way, rubs, frames,
+             curvature, vertex_thickness, gives, turns, modulus, out):  # fmt: skip
     """Writes what a contact is as a whole to a PATCH that has its wrench, if it presses.
 
     Args:
         points, area, thickness, depth, forces: see footing.patch_of.
         corners, shares: see Nodes.
         power, along, factor: see Pressed.
+        way: by which the tool is drawn back from the core [m].
         rubs: whether there is friction; how skin gives and bends is not told without.
         frames, curvature, vertex_thickness: see moments.Surroundings.
         gives, turns: see green.give_at; the former empty where a contact gives as on a flat layer.
@@ -224,7 +226,7 @@ def whole_of(points, area, thickness, depth, forces, corners, shares, power, alo
     _put(middle, out[11:14])
     out[14], out[15], out[16], out[17], out[18], out[19] = radius, lever, mean, energy, power, along
     out[10], out[20] = _pressing(forces, area)
-    out[FACTOR] = factor - 1
+    out[FACTOR], out[BACK] = factor - 1, way
     if rubs:
         bend = curvature_at(corners, shares, forces, frames, curvature, vertex_thickness)
         _put(bend.ravel(), out[30:39])
@@ -252,12 +254,12 @@ def step(patches, before, after, grooves, shares, times, fades, has_skin, table,
         plain: whether `doubted` has nothing to say of answers that are in range: they are of one tool that was, too.
     """
     tools, terms = len(patches), len(times)
-    stored, whole = np.zeros(tools), np.zeros(tools)
+    stored, sure, whole = np.zeros(tools), np.zeros(tools), np.zeros(tools)
     works, givens, doubts, spares = np.zeros(tools), np.zeros(tools), np.zeros(tools), np.zeros(tools)
     for k in range(tools):
         _put(patches[k, :OUT], out[k])
         _put(before[k], after[k])
-        stored[k], whole[k], works[k], doubts[k], givens[k] = _one(
+        stored[k], sure[k], whole[k], works[k], doubts[k], givens[k] = _one(
             patches[k], before[k], after[k], grooves, shares, times, fades, has_skin, table, log_thickness, logs,
             modulus, slack, dt, out[k], says[k])  # fmt: skip
     for k in range(tools, len(before)):
@@ -268,7 +270,7 @@ def step(patches, before, after, grooves, shares, times, fades, has_skin, table,
         first, work = not old[PRESSING] >= 0 or patches[k, BY_FORCE] > 0, works[k] + old[WORK]
         works[k] = max(work, stored[k] if first else min(stored[k], work + doubts[k]))
         spares[k] = UNSURE * new[LARGEST] * new[DEPTH]
-    factors = settled(works, givens, spares, stored, whole)
+    factors = settled(works, givens, spares, sure, whole)
     for k in range(tools):
         parts, passive = parts_of(after[k], terms), factors[k]
         new = parts[2]
@@ -359,27 +361,27 @@ def _one(patch, before, after, grooves, shares, times, fades, has_skin, table, l
     """One tool. Writes its memory and its rows.
 
     Returns:
-        stored, whole: energy that the contact could give back, and that it could hold [J].
+        stored, sure, whole: energy that the contact could give back, that it surely does, and that it could hold [J].
         work, doubt, given: see balance.work_of [J].
     """
     terms, by_force, mu = len(times), patch[BY_FORCE] > 0, patch[FRICTION]
     parts, news = parts_of(before, terms), parts_of(after, terms)
     was, wrench_before, old, relaxed, contact, _, stiffness, springs, springs_relaxed = parts
     pose, told, held = _pose_at(patch, POSE), old[PRESSING] > NEVER, old[PRESSING] > 0
-    stated_pose = _pose_at(patch, STATED_POSE) if by_force else pose
+    stated_pose = _pose_at(patch, STATED_POSE) if by_force or patch[BACK] > 0 else pose
     twist, gone, kept, gain, owed, _, passed = _aged(parts, told, stated_pose, 1.0, shares, times, fades, dt)
     push, size = patch[:3].copy(), np.sqrt(patch[0] ** 2 + patch[1] ** 2 + patch[2] ** 2)
     presses, depth, power = patch[8] == HOLDS and patch[10] > 0 and size > 0, patch[9], patch[18]
     if presses and old[PRESSING] == 0 and terms and not by_force:  # it came late in the step: from then on it relaxes
-        way = -_gone(pose, was, patch[11:14])
+        way = -_gone(stated_pose, was, patch[11:14])
         part = part_of_way(way, push / size, depth, patch[20], power)
-        _, gone, kept, gain, owed, _, passed = _aged(parts, told, pose, part, shares, times, fades, dt)
+        _, gone, kept, gain, owed, _, passed = _aged(parts, told, stated_pose, part, shares, times, fades, dt)
     says[28], asked = gone, 0.0
     if presses:
         slid_before = _slid(old)
-        force, elastic, at_rest, net, long, there, eased, stored, whole, doubt = borne(
-            push, patch[11:14], patch[14], patch[16], patch[17], patch[10], depth, power, 1 + patch[FACTOR], contact,
-            held, fades, kept, gain, owed, shares, patch[STATED : STATED + 6], patch[CREEPS] > 0,
+        force, elastic, at_rest, net, long, there, eased, stored, sure, whole, doubt = borne(
+            push, patch[11:14], patch[14], patch[16], patch[17], patch[10], depth, power, 1 + patch[FACTOR],
+            patch[BACK], contact, held, fades, kept, gain, owed, shares, patch[STATED : STATED + 6], patch[CREEPS] > 0,
             slid_before)  # fmt: skip
         asked = at_rest
         if force > 0:
@@ -422,7 +424,7 @@ def _one(patch, before, after, grooves, shares, times, fades, has_skin, table, l
                 for x in range(3):
                     says[11 + x], says[15 + x], says[19 + x] = offset[x], lean[x], slid_offset[x]
                 wrench = wrench + rubs
-                stored, whole = stored + bent, whole + 2 * bent
+                stored, sure, whole = stored + bent, sure + bent, whole + 2 * bent
                 _put(stiff, news[6])
                 for x in range(SPRINGS):
                     _put(drawn[x], news[7][x])
@@ -450,9 +452,9 @@ def _one(patch, before, after, grooves, shares, times, fades, has_skin, table, l
                 _put(pose[x], news[5][x])
             work, unsure, given = work_of(
                 twist, wrench_before, wrench, contact, there, stated_pose[:3, 3].copy(), held, True,
-                old[NET] * old[PASSIVE] * old[STRETCH], net * long, relaxed, eased, shares, old[DEPTH], depth, power,
+                old[NET] * old[STRETCH], net * long, old[PASSIVE], relaxed, eased, shares, old[DEPTH], depth, power,
                 patch[14])  # fmt: skip
-            return stored, whole, work, unsure, given
+            return stored, sure, whole, work, unsure, given
     if patch[8] == HOLDS:
         out[:7] = 0.0
         out[7], out[8] = 1.0, APART
@@ -472,9 +474,9 @@ def _one(patch, before, after, grooves, shares, times, fades, has_skin, table, l
     says[27] = new[DEPTH] * depth_left(share, new[POWER], 1 - new[STRETCH])
     work, unsure, given = work_of(
         twist, wrench_before, out[:6], contact, contact, stated_pose[:3, 3].copy(), held, False,
-        old[NET] * old[PASSIVE] * old[STRETCH], new[NET] * new[STRETCH], relaxed, eased, shares, old[DEPTH], new[DEPTH],
+        old[NET] * old[STRETCH], new[NET] * new[STRETCH], old[PASSIVE], relaxed, eased, shares, old[DEPTH], new[DEPTH],
         new[POWER], new[RADIUS])  # fmt: skip
-    return 0.0, 0.0, work, unsure, given
+    return 0.0, 0.0, 0.0, work, unsure, given
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")

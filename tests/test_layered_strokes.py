@@ -12,7 +12,7 @@ from stmpl_core.living import living
 from stmpl_core.methods import MomentNet
 from stmpl_core.regions import HELD_SKIN
 from stmpl_sim.site import Site
-from tests.scenes import at, ball, plate
+from tests.scenes import at, ball, plate, punch
 
 BALL, RADIUS, DEEPEST = ball(0.02), 0.02, 9e-3  # m
 KEPT = 0.005  # of what was put in, that a closed path may give back more
@@ -142,6 +142,38 @@ def test_no_closed_path_over_a_limb_gives_energy(arm: Simulator, frame: np.ndarr
     keys = keys * [0.01, 0.01, DEEPEST, 0.25, 0.25]
     keys[[0, -1], 2] = -2e-3
     assert gained(led(arm, poses_of(frame, between(keys, 4e-4)), 10 ** rng.uniform(-4, -1))) < KEPT
+
+
+@pytest.mark.parametrize("friction", [None, 0.4])
+def test_a_press_to_any_depth_is_as_without_a_state_and_gives_back_what_was_put_in(friction: float | None) -> None:
+    """Beyond the core's barrier, where the tool is drawn back, the books hold the way that it went."""
+    layer = plate(0.06).with_(tissue=Tissue(2e4, 0.4))
+    sim, state, pressed = Simulator(layer, MomentNet(), friction=friction), State(), np.linspace(-5e-4, 1.2, 50)
+    depths = float(layer.thickness.max()) * np.concatenate([pressed, pressed[-2::-1]])
+    forces, plain = [], []
+    for depth in depths:
+        contact = Contact(BALL, at(0, 0, RADIUS - depth))
+        (touch,), state = sim.touch([contact], state, 0.01)
+        forces.append(touch.force)
+        plain.append(sim.touch([contact])[0].force)
+        assert touch.passive == 1
+    assert forces == pytest.approx(plain, rel=1e-6, abs=1e-9)
+    assert abs(np.trapezoid(forces, depths)) < 1e-3 * np.trapezoid(forces[:50], depths[:50])
+
+
+@pytest.mark.parametrize("seed", [3, 6, 11])
+def test_a_disc_that_tilts_and_slides_deep_gives_no_energy(elastic: Simulator, frame: np.ndarray, seed: int) -> None:
+    rng, disc, layer, state = np.random.default_rng(seed), punch(0.012, 0.01), elastic.layer, State()
+    top, angle = 0.85 * layer.thickness[Site.thickest(layer).vertex], np.linspace(0, 2 * np.pi, 161)[:, None]
+    a, start, touches = rng.normal(size=(2, 5)), frame.copy(), []
+    start[:3, 3] -= (RADIUS - 0.005) * frame[:3, 2]
+    rows = (a[0] * np.sin(angle) + a[1] * (1 - np.cos(angle))) * [2e-3, 2e-3, 0, 0.07, 0.07]
+    rows[:, 2] = -5e-4 + (top + 5e-4) * np.sin(angle[:, 0] / 2) ** 2
+    sim = Simulator(layer, MomentNet())
+    for pose in poses_of(start, rows):
+        (touch,), state = sim.touch([Contact(disc, pose)], state, 1e-3)
+        touches.append(touch.with_(pose_body_from_tool=pose))
+    assert gained(touches) < KEPT
 
 
 def test_pressing_as_it_slides_and_lifting_as_it_sticks_gives_no_energy(elastic: Simulator, frame: np.ndarray) -> None:
