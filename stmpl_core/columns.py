@@ -320,7 +320,14 @@ def clearances(grid, pose, points, inward, thickness, near, far):
     A column whose core end lies inside the tool counts only if the tool comes from outside: where the distance still
     rises along the inward normal there.
     """
-    out, skin, nearest = np.empty(len(near)), np.empty(len(near)), np.inf
+    out, skin = np.empty(len(near)), np.empty(len(near))
+    return out, skin, _clear(grid, pose, points, inward, thickness, near, far, out, skin)
+
+
+@numba.njit(cache=True, nogil=True, _nrt=False)
+def _clear(grid, pose, points, inward, thickness, near, far, out, skin):
+    """Writes what `clearances` gives, and returns the least of it [m]."""
+    nearest = np.inf
     for n in range(len(near)):
         v = near[n]
         t, ray = thickness[v], ray_of(pose, points, inward, v)
@@ -339,7 +346,7 @@ def clearances(grid, pose, points, inward, thickness, near, far):
             least = np.inf
         out[n] = least
         nearest = min(nearest, least)
-    return out, skin, nearest
+    return nearest
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")

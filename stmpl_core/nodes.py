@@ -182,7 +182,7 @@ def _column(inward, thickness, i, j, k, a, b, c):
     return x * length, y * length, z * length, a * thickness[i] + b * thickness[j] + c * thickness[k]
 
 
-@numba.njit(forceinline=True, cache=True, nogil=True, error_model="numpy")
+@numba.njit(forceinline=True, cache=True, nogil=True, error_model="numpy", _nrt=False)
 def _strain_under(grid, ray, t, top):
     """How far the tool squeezes a column, over its thickness; rising from 0 beside the tool's walls."""
     wall = wall_in(grid[3], t)
@@ -219,14 +219,24 @@ def _look(grid, pose, points, inward, thickness, faces, found, top, split):
         area: area that is covered [m2]; a small share of what is near, where the tool touches between the middles.
         thick: thickness there [m].
     """
-    many, parts, sunk = len(found), split * split, top.any()
+    many, parts = len(found), split * split
     depths, middles, ways = np.empty((many, parts)), np.empty((many, parts, 3)), np.empty((many, 3))
-    sizes, edges, shares, deepest, best = np.empty(many), np.empty(many), np.empty((parts, 2)), -np.inf, 0
+    sizes, edges, shares = np.empty(many), np.empty(many), np.empty((parts, 2))
     for p in range(split):
         for r in range(split - p):
             for flip in range(2 if r < split - p - 1 else 1):
                 q = _part(p, r, flip, split)
                 shares[q, 0], shares[q, 1] = (p + (1 + flip) / 3) / split, (r + (1 + flip) / 3) / split
+    best, area, thick = _look_at(grid, pose, points, inward, thickness, faces, found, top, top.any(), shares, depths,
+                                 middles, ways, sizes, edges)  # fmt: skip
+    return depths, middles, ways, sizes, edges, best, area, thick
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy", _nrt=False)
+def _look_at(grid, pose, points, inward, thickness, faces, found, top, sunk, shares, depths, middles, ways,
+             sizes, edges):  # fmt: skip
+    """Writes what `_look` gives, and returns the last three; shares: barycentric coordinates of the parts, (P, 2)."""
+    many, parts, deepest, best = len(found), len(shares), -np.inf, 0
     for m in range(many):
         f = found[m]
         i, j, k = faces[f, 0], faces[f, 1], faces[f, 2]
@@ -255,7 +265,7 @@ def _look(grid, pose, points, inward, thickness, faces, found, top, split):
             part = min(max(0.5 + depths[m, q] / blur, 0.0), 1.0) * sizes[m]
             area += part
             thick += part * thickness[faces[found[m], 0]]
-    return depths, middles, ways, sizes, edges, best, area if deepest > 0 else 0.05 * area, thick / max(area, 1e-300)
+    return best, area if deepest > 0 else 0.05 * area, thick / max(area, 1e-300)
 
 
 @numba.njit(cache=True, inline="always")
@@ -271,7 +281,7 @@ def _distance(grid, pose, x, y, z):
     return distance_at(grid[0], grid[1], grid[2], x, y, z)
 
 
-@numba.njit(forceinline=True, cache=True, nogil=True, error_model="numpy")
+@numba.njit(forceinline=True, cache=True, nogil=True, error_model="numpy", _nrt=False)
 def _inside(grid, ray, t, depth, least, top):
     """How far the column gets into a tool that has sunk under skin which it does not reach, or just does [m].
 
@@ -346,22 +356,9 @@ def _lay(grid, pose, centre, points, inward, thickness, faces, found, top, split
     for side in range(len(frames)):
         first, second, way = frames[side, 0], frames[side, 1], frames[side, 2]
 
-        # How far the lattice must reach.
         near = np.zeros(len(found), np.bool_)
         reach = np.array([np.inf, np.inf, -np.inf, -np.inf])
-        for m in range(len(found)):
-            edge = edges[m]
-            if chart[m] != side:
-                continue
-            for q in range(depths.shape[1]):
-                if sunk or depths[m, q] > -BESIDE * edge - WALL * thick:
-                    near[m] = True
-                    u = v = 0.0
-                    for x in range(3):
-                        u += first[x] * (middles[m, q, x] - centre[x])
-                        v += second[x] * (middles[m, q, x] - centre[x])
-                    reach[0], reach[1] = min(reach[0], u - edge), min(reach[1], v - edge)
-                    reach[2], reach[3] = max(reach[2], u + edge), max(reach[3], v + edge)
+        _reach(first, second, centre, thick, depths, middles, edges, chart, side, sunk, near, reach)
         if reach[2] < reach[0]:
             continue
         cell = max(least, (reach[2] - reach[0]) * (reach[3] - reach[1]) / MOST_LOOKED_AT)
@@ -375,74 +372,111 @@ def _lay(grid, pose, centre, points, inward, thickness, faces, found, top, split
         left, right = int(np.floor(reach[0] / spacing)) - 1, int(np.ceil(reach[2] / spacing)) + 1
         taken = np.zeros((high - low + 1, right - left + 1), np.bool_)
 
-        # Which triangle each point of it lies on.
-        uv = np.empty((3, 2))
-        for m in range(len(found)):
-            if not near[m]:
-                continue
-            f0, f1, f2 = faces[found[m], 0], faces[found[m], 1], faces[found[m], 2]
-            border = 0.5 * blur if only_look else WALL * max(thickness[f0], thickness[f1], thickness[f2])
-            for c in range(3):
-                uv[c, 0], uv[c, 1] = -start[0], -start[1]
-                for x in range(3):
-                    uv[c, 0] += first[x] * (points[faces[found[m], c], x] - centre[x])
-                    uv[c, 1] += second[x] * (points[faces[found[m], c], x] - centre[x])
-            bx, by, cx, cy = uv[1, 0] - uv[0, 0], uv[1, 1] - uv[0, 1], uv[2, 0] - uv[0, 0], uv[2, 1] - uv[0, 1]
-            double = bx * cy - cx * by
-            from_row = max(low, int(np.ceil((uv[0, 1] + min(0.0, by, cy)) / rise - 1e-9)))
-            to_row = min(high, int(np.floor((uv[0, 1] + max(0.0, by, cy)) / rise + 1e-9)))
-            left_end, right_end = uv[0, 0] + min(0.0, bx, cx), uv[0, 0] + max(0.0, bx, cx)
-            for j in range(from_row, to_row + 1):
-                shift, v = 0.5 * (j & 1), j * rise
-                from_one = max(left, int(np.ceil(left_end / spacing - shift - 1e-9)))
-                to_one = min(right, int(np.floor(right_end / spacing - shift + 1e-9)))
-                for i in range(from_one, to_one + 1):
-                    if taken[j - low, i - left]:
-                        continue
-                    u = (i + shift) * spacing
-                    b = ((u - uv[0, 0]) * cy - cx * (v - uv[0, 1])) / double
-                    c = (bx * (v - uv[0, 1]) - (u - uv[0, 0]) * by) / double
-                    a = 1 - b - c
-                    if a < -1e-9 or b < -1e-9 or c < -1e-9:
-                        continue
-                    taken[j - low, i - left] = True
-                    x, y, z = _between_corners(points, f0, f1, f2, a, b, c)
-
-                    share = -1.0
-                    if not sunk:  # what is known of the middle of its part may say enough
-                        p = min(max(int(a * split), 0), split - 1)
-                        o = min(max(int(b * split), 0), split - 1 - p)
-                        flip = 1 if o < split - 1 - p and a * split - p + b * split - o > 1 else 0
-                        q = _part(p, o, flip, split)
-                        away = STEEPEST * np.sqrt((x - middles[m, q, 0]) ** 2 + (y - middles[m, q, 1]) ** 2
-                                                  + (z - middles[m, q, 2]) ** 2)  # fmt: skip
-                        if depths[m, q] + away < -border:
-                            continue
-                        if depths[m, q] - away > border:
-                            share = 1.0
-                    if only_look and share < 0:
-                        depth = -_distance(grid, pose, x, y, z)
-                        if sunk:
-                            n0, n1, n2, t = _column(inward, thickness, f0, f1, f2, a, b, c)
-                            depth = _inside(grid, ray_from(pose, x, y, z, n0, n1, n2), t, depth, -border, top)
-                        share = min(max(0.5 + depth / blur, 0.0), 1.0)
-                        if share <= 0:
-                            continue
-                    n0, n1, n2, t = _column(inward, thickness, f0, f1, f2, a, b, c)
-                    part = cell / max(n0 * way[0] + n1 * way[1] + n2 * way[2], FACING)
-                    if only_look:
-                        sum_area += share * part
-                        continue
-                    strain = _strain_under(grid, ray_from(pose, x, y, z, n0, n1, n2), t, top)
-                    if strain <= 0:
-                        continue
-                    if count == len(out):
-                        longer = np.empty((2 * count, 15))
-                        longer[:count] = out
-                        out = longer
-                    row = out[count]
-                    row[0], row[1], row[2], row[3], row[4], row[5], row[6] = x, y, z, n0, n1, n2, t
-                    row[7], row[8], row[9], row[10], row[11] = part, strain, f0, f1, f2
-                    row[12], row[13], row[14] = a, b, c
-                    count += 1
+        m, uv = 0, np.empty((3, 2))
+        while m < len(found):
+            m, count, sum_area = _on_triangles(
+                grid, pose, centre, points, inward, thickness, faces, found, top, sunk, split, depths, middles, first,
+                second, way, start, spacing, rise, blur, cell, near, low, high, left, right, only_look, uv, taken, m,
+                out, count, sum_area)  # fmt: skip
+            if count == len(out):
+                longer = np.empty((2 * count, 15))
+                longer[:count] = out
+                out = longer
     return sum_area, out[:count].copy()
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy", _nrt=False)
+def _reach(first, second, centre, thick, depths, middles, edges, chart, side, sunk, near, reach):
+    """Writes which triangles of a side the lattice must reach, and its rectangle: lowest u, v and highest, (4,) [m]."""
+    for m in range(len(near)):
+        edge = edges[m]
+        if chart[m] != side:
+            continue
+        for q in range(depths.shape[1]):
+            if sunk or depths[m, q] > -BESIDE * edge - WALL * thick:
+                near[m] = True
+                u = v = 0.0
+                for x in range(3):
+                    u += first[x] * (middles[m, q, x] - centre[x])
+                    v += second[x] * (middles[m, q, x] - centre[x])
+                reach[0], reach[1] = min(reach[0], u - edge), min(reach[1], v - edge)
+                reach[2], reach[3] = max(reach[2], u + edge), max(reach[3], v + edge)
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy", _nrt=False)
+def _on_triangles(grid, pose, centre, points, inward, thickness, faces, found, top, sunk, split, depths, middles, first,
+                  second, way, start, spacing, rise, blur, cell, near, low, high, left, right, only_look, uv, taken, m,
+                  out, count, sum_area):  # fmt: skip
+    """Which triangle each point of a lattice lies on, from triangle m on; see `_lay`.
+
+    Returns:
+        m: triangle from which it is to go on, once there is room in `out`.
+        count, sum_area: rows that are written, and area that is covered [m2].
+    """
+    for m in range(m, len(found)):
+        if not near[m]:
+            continue
+        f0, f1, f2 = faces[found[m], 0], faces[found[m], 1], faces[found[m], 2]
+        border = 0.5 * blur if only_look else WALL * max(thickness[f0], thickness[f1], thickness[f2])
+        for c in range(3):
+            uv[c, 0], uv[c, 1] = -start[0], -start[1]
+            for x in range(3):
+                uv[c, 0] += first[x] * (points[faces[found[m], c], x] - centre[x])
+                uv[c, 1] += second[x] * (points[faces[found[m], c], x] - centre[x])
+        bx, by, cx, cy = uv[1, 0] - uv[0, 0], uv[1, 1] - uv[0, 1], uv[2, 0] - uv[0, 0], uv[2, 1] - uv[0, 1]
+        double = bx * cy - cx * by
+        from_row = max(low, int(np.ceil((uv[0, 1] + min(0.0, by, cy)) / rise - 1e-9)))
+        to_row = min(high, int(np.floor((uv[0, 1] + max(0.0, by, cy)) / rise + 1e-9)))
+        left_end, right_end = uv[0, 0] + min(0.0, bx, cx), uv[0, 0] + max(0.0, bx, cx)
+        for j in range(from_row, to_row + 1):
+            shift, v = 0.5 * (j & 1), j * rise
+            from_one = max(left, int(np.ceil(left_end / spacing - shift - 1e-9)))
+            to_one = min(right, int(np.floor(right_end / spacing - shift + 1e-9)))
+            for i in range(from_one, to_one + 1):
+                if taken[j - low, i - left]:
+                    continue
+                u = (i + shift) * spacing
+                b = ((u - uv[0, 0]) * cy - cx * (v - uv[0, 1])) / double
+                c = (bx * (v - uv[0, 1]) - (u - uv[0, 0]) * by) / double
+                a = 1 - b - c
+                if a < -1e-9 or b < -1e-9 or c < -1e-9:
+                    continue
+                taken[j - low, i - left] = True
+                x, y, z = _between_corners(points, f0, f1, f2, a, b, c)
+
+                share = -1.0
+                if not sunk:  # what is known of the middle of its part may say enough
+                    p = min(max(int(a * split), 0), split - 1)
+                    o = min(max(int(b * split), 0), split - 1 - p)
+                    flip = 1 if o < split - 1 - p and a * split - p + b * split - o > 1 else 0
+                    q = _part(p, o, flip, split)
+                    away = STEEPEST * np.sqrt((x - middles[m, q, 0]) ** 2 + (y - middles[m, q, 1]) ** 2
+                                              + (z - middles[m, q, 2]) ** 2)  # fmt: skip
+                    if depths[m, q] + away < -border:
+                        continue
+                    if depths[m, q] - away > border:
+                        share = 1.0
+                if only_look and share < 0:
+                    depth = -_distance(grid, pose, x, y, z)
+                    if sunk:
+                        n0, n1, n2, t = _column(inward, thickness, f0, f1, f2, a, b, c)
+                        depth = _inside(grid, ray_from(pose, x, y, z, n0, n1, n2), t, depth, -border, top)
+                    share = min(max(0.5 + depth / blur, 0.0), 1.0)
+                    if share <= 0:
+                        continue
+                n0, n1, n2, t = _column(inward, thickness, f0, f1, f2, a, b, c)
+                part = cell / max(n0 * way[0] + n1 * way[1] + n2 * way[2], FACING)
+                if only_look:
+                    sum_area += share * part
+                    continue
+                strain = _strain_under(grid, ray_from(pose, x, y, z, n0, n1, n2), t, top)
+                if strain <= 0:
+                    continue
+                row = out[count]
+                row[0], row[1], row[2], row[3], row[4], row[5], row[6] = x, y, z, n0, n1, n2, t
+                row[7], row[8], row[9], row[10], row[11] = part, strain, f0, f1, f2
+                row[12], row[13], row[14] = a, b, c
+                count += 1
+                if count == len(out):
+                    return m, count, sum_area
+    return len(found), count, sum_area

@@ -56,7 +56,7 @@ def wall_in(half, t):
     return min(WALL * t, half)
 
 
-@numba.njit(forceinline=True, cache=True, error_model="numpy")
+@numba.njit(forceinline=True, cache=True, error_model="numpy", _nrt=False)
 def depth_in_column(grid, ray, t, guess, least=0.0):
     """How deep along a ray, from the skin inwards, the tool ends [m]; 0 if it is not met.
 
@@ -104,7 +104,7 @@ def depth_in_column(grid, ray, t, guess, least=0.0):
     return min(s, t)
 
 
-@numba.njit(forceinline=True, cache=True, error_model="numpy")
+@numba.njit(forceinline=True, cache=True, error_model="numpy", _nrt=False)
 def inside_most(grid, ray, deep, most, least):
     """How far inside the tool a ray gets at most on its way to a depth [m]; below 0: how far it passes beside it.
 
@@ -126,7 +126,7 @@ def inside_most(grid, ray, deep, most, least):
     return most
 
 
-@numba.njit(forceinline=True, cache=True, error_model="numpy")
+@numba.njit(forceinline=True, cache=True, error_model="numpy", _nrt=False)
 def sure_of(grid, ray, deep, wall):
     """How clear it is that a ray leads through the tool to a depth [m], from -1, it passes beside it, to 1.
 
@@ -139,7 +139,7 @@ def sure_of(grid, ray, deep, wall):
     return min(max(inside / (SURE * wall), -1.0), 1.0)
 
 
-@numba.njit(forceinline=True, cache=True, error_model="numpy")
+@numba.njit(forceinline=True, cache=True, error_model="numpy", _nrt=False)
 def sunk_under(grid, ray, t, top):
     """Share to which a tool has sunk under a column's skin, from 0, it comes to the column from beside, to 1.
 
@@ -175,7 +175,7 @@ def sunk_under(grid, ray, t, top):
     return whole * enters * min(max(rise / (LOOKS_BACK * LOOKED_AT * t), 0.0), 1.0)
 
 
-@numba.njit(forceinline=True, cache=True, error_model="numpy")
+@numba.njit(forceinline=True, cache=True, error_model="numpy", _nrt=False)
 def depth_and_share(grid, ray, t, top):
     """How deep the tool is in a column [m], and the share of that which counts: rising from 0 at its skin over a wall.
 

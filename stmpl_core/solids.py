@@ -175,7 +175,7 @@ def _from_axis(c, x, y, z):
     return x - share * a, y - share * b, z - share * d
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@numba.njit(cache=True, nogil=True, error_model="numpy", _nrt=False)
 def solid_jet(solid, x, y, z):
     """Signed distance of a point to a solid [m], and its gradient: four numbers."""
     c = solid[0, 0]
@@ -204,7 +204,7 @@ def solid_jet(solid, x, y, z):
     return d, a * x + b * u, a * y + b * v, a * z + b * w
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
+@numba.njit(cache=True, nogil=True, error_model="numpy", _nrt=False)
 def _box_jet(c, x, y, z):
     """See solid_jet, of a box, and a point beside its middle [m]."""
     most, square, g, nearest = -np.inf, 0.0, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)

@@ -478,12 +478,19 @@ class Toucher:
 
         among: what `pins` says of the tools that press beside it, if there are many; covered: see `_covered`.
         """
-        layer, nodes, unit = self.layer, one.squeeze.nodes, one.factor * self._modulus
+        layer, nodes, unit, stated = self.layer, one.squeeze.nodes, one.factor * self._modulus, one.contact.wrench
+        if not len(nodes.area):
+            nothing, none = np.zeros(6), np.empty(0)
+            touch = Touch(
+                one.contact.name, one.status, one.pose, nothing, one.depth if math.isfinite(one.depth) else math.nan,
+                math.nan if one.lost else 0.0, one.moved, nothing if stated is None else stated,
+                pressure=np.zeros(len(layer.vertices)))  # fmt: skip
+            object.__setattr__(touch, "trust", self._trust(one, touch, none, none, 0.0, alone, covered))
+            return touch
         v, pressure, values, wrench, forces, scale, size, doubt, strange, stuck, along, below, thickness = _carried(
             nodes.corners, nodes.shares, nodes.area, nodes.thickness, *held[:3], unit,
             math.nan if one.force is None else one.force, layer.vertex_areas, layer.vertices,
             layer.vertex_area_vectors, one.pose[:3, 3], layer.stacked, self.near.sound.facets)  # fmt: skip
-        stated = one.contact.wrench
         depth = self._depth(one.squeeze) if len(v) and not one.factor > 1 else one.depth
         way = stated[:3] / np.linalg.norm(stated[:3]) if stated is not None and stated[:3].any() else None
         known = self.net.weights.card["bound"]
