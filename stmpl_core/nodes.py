@@ -405,15 +405,15 @@ def _reach(first, second, centre, thick, depths, middles, edges, chart, side, su
 
 @numba.njit(cache=True, nogil=True, error_model="numpy", _nrt=False)
 def _on_triangles(grid, pose, centre, points, inward, thickness, faces, found, top, sunk, split, depths, middles, first,
-                  second, way, start, spacing, rise, blur, cell, near, low, high, left, right, only_look, uv, taken, m,
-                  out, count, sum_area):  # fmt: skip
-    """Which triangle each point of a lattice lies on, from triangle m on; see `_lay`.
+                  second, way, start, spacing, rise, blur, cell, near, low, high, left, right, only_look, uv, taken,
+                  begin, out, count, sum_area):  # fmt: skip
+    """Which triangle each point of a lattice lies on, from one on; see `_lay`.
 
     Returns:
         m: triangle from which it is to go on, once there is room in `out`.
         count, sum_area: rows that are written, and area that is covered [m2].
     """
-    for m in range(m, len(found)):
+    for m in range(begin, len(found)):
         if not near[m]:
             continue
         f0, f1, f2 = faces[found[m], 0], faces[found[m], 1], faces[found[m], 2]
