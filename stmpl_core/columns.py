@@ -10,6 +10,7 @@ import numba
 import numpy as np
 
 from stmpl_core.arrays import Points, Transform
+from stmpl_core.compiling import UNCOUNTED
 from stmpl_core.layer import SoftLayer
 from stmpl_core.nodes import Nodes, nodes_under
 from stmpl_core.rays import (
@@ -324,7 +325,7 @@ def clearances(grid, pose, points, inward, thickness, near, far):
     return out, skin, _clear(grid, pose, points, inward, thickness, near, far, out, skin)
 
 
-@numba.njit(cache=True, nogil=True, _nrt=False)
+@numba.njit(cache=True, nogil=True, **UNCOUNTED)
 def _clear(grid, pose, points, inward, thickness, near, far, out, skin):
     """Writes what `clearances` gives, and returns the least of it [m]."""
     nearest = np.inf

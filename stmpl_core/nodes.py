@@ -12,6 +12,7 @@ from typing import NamedTuple
 import numba
 import numpy as np
 
+from stmpl_core.compiling import UNCOUNTED
 from stmpl_core.rays import (
     MAX_COLUMN_STRAIN,
     STEEPEST,
@@ -182,7 +183,7 @@ def _column(inward, thickness, i, j, k, a, b, c):
     return x * length, y * length, z * length, a * thickness[i] + b * thickness[j] + c * thickness[k]
 
 
-@numba.njit(forceinline=True, cache=True, nogil=True, error_model="numpy", _nrt=False)
+@numba.njit(forceinline=True, cache=True, nogil=True, error_model="numpy", **UNCOUNTED)
 def _strain_under(grid, ray, t, top):
     """How far the tool squeezes a column, over its thickness; rising from 0 beside the tool's walls."""
     wall = wall_in(grid[3], t)
@@ -232,7 +233,7 @@ def _look(grid, pose, points, inward, thickness, faces, found, top, split):
     return depths, middles, ways, sizes, edges, best, area, thick
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy", _nrt=False)
+@numba.njit(cache=True, nogil=True, error_model="numpy", **UNCOUNTED)
 def _look_at(grid, pose, points, inward, thickness, faces, found, top, sunk, shares, depths, middles, ways,
              sizes, edges):  # fmt: skip
     """Writes what `_look` gives, and returns the last three; shares: barycentric coordinates of the parts, (P, 2)."""
@@ -281,7 +282,7 @@ def _distance(grid, pose, x, y, z):
     return distance_at(grid[0], grid[1], grid[2], x, y, z)
 
 
-@numba.njit(forceinline=True, cache=True, nogil=True, error_model="numpy", _nrt=False)
+@numba.njit(forceinline=True, cache=True, nogil=True, error_model="numpy", **UNCOUNTED)
 def _inside(grid, ray, t, depth, least, top):
     """How far the column gets into a tool that has sunk under skin which it does not reach, or just does [m].
 
@@ -385,7 +386,7 @@ def _lay(grid, pose, centre, points, inward, thickness, faces, found, top, split
     return sum_area, out[:count].copy()
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy", _nrt=False)
+@numba.njit(cache=True, nogil=True, error_model="numpy", **UNCOUNTED)
 def _reach(first, second, centre, thick, depths, middles, edges, chart, side, sunk, near, reach):
     """Writes which triangles of a side the lattice must reach, and its rectangle: lowest u, v and highest, (4,) [m]."""
     for m in range(len(near)):
@@ -403,7 +404,7 @@ def _reach(first, second, centre, thick, depths, middles, edges, chart, side, su
                 reach[2], reach[3] = max(reach[2], u + edge), max(reach[3], v + edge)
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy", _nrt=False)
+@numba.njit(cache=True, nogil=True, error_model="numpy", **UNCOUNTED)
 def _on_triangles(grid, pose, centre, points, inward, thickness, faces, found, top, sunk, split, depths, middles, first,
                   second, way, start, spacing, rise, blur, cell, near, low, high, left, right, only_look, uv, taken,
                   begin, out, count, sum_area):  # fmt: skip

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numba
 import numpy as np
 
+from stmpl_core.compiling import UNCOUNTED
 from stmpl_core.sdf import distance_at
 
 WALL = 0.05  # width over which depth rises beside a tool's wall, over the thickness: nothing pops in while it slides
@@ -56,7 +57,7 @@ def wall_in(half, t):
     return min(WALL * t, half)
 
 
-@numba.njit(forceinline=True, cache=True, error_model="numpy", _nrt=False)
+@numba.njit(forceinline=True, cache=True, error_model="numpy", **UNCOUNTED)
 def depth_in_column(grid, ray, t, guess, least=0.0):
     """How deep along a ray, from the skin inwards, the tool ends [m]; 0 if it is not met.
 
@@ -104,7 +105,7 @@ def depth_in_column(grid, ray, t, guess, least=0.0):
     return min(s, t)
 
 
-@numba.njit(forceinline=True, cache=True, error_model="numpy", _nrt=False)
+@numba.njit(forceinline=True, cache=True, error_model="numpy", **UNCOUNTED)
 def inside_most(grid, ray, deep, most, least):
     """How far inside the tool a ray gets at most on its way to a depth [m]; below 0: how far it passes beside it.
 
@@ -126,7 +127,7 @@ def inside_most(grid, ray, deep, most, least):
     return most
 
 
-@numba.njit(forceinline=True, cache=True, error_model="numpy", _nrt=False)
+@numba.njit(forceinline=True, cache=True, error_model="numpy", **UNCOUNTED)
 def sure_of(grid, ray, deep, wall):
     """How clear it is that a ray leads through the tool to a depth [m], from -1, it passes beside it, to 1.
 
@@ -139,7 +140,7 @@ def sure_of(grid, ray, deep, wall):
     return min(max(inside / (SURE * wall), -1.0), 1.0)
 
 
-@numba.njit(forceinline=True, cache=True, error_model="numpy", _nrt=False)
+@numba.njit(forceinline=True, cache=True, error_model="numpy", **UNCOUNTED)
 def sunk_under(grid, ray, t, top):
     """Share to which a tool has sunk under a column's skin, from 0, it comes to the column from beside, to 1.
 
@@ -175,7 +176,7 @@ def sunk_under(grid, ray, t, top):
     return whole * enters * min(max(rise / (LOOKS_BACK * LOOKED_AT * t), 0.0), 1.0)
 
 
-@numba.njit(forceinline=True, cache=True, error_model="numpy", _nrt=False)
+@numba.njit(forceinline=True, cache=True, error_model="numpy", **UNCOUNTED)
 def depth_and_share(grid, ray, t, top):
     """How deep the tool is in a column [m], and the share of that which counts: rising from 0 at its skin over a wall.
 

@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike
 from scipy.spatial import KDTree
 
 from stmpl_core.arrays import Points, finite
+from stmpl_core.compiling import UNCOUNTED
 from stmpl_core.decimation import BAND_CELLS, MARGIN, MAX_NODES, field_spacing
 from stmpl_core.errors import InvalidInput, MeshError
 from stmpl_core.mending import closed, openings, places
@@ -380,19 +381,15 @@ def _cell(u, n):
     return first - 1, inside, inside - first
 
 
-@numba.njit(cache=True, nogil=True, fastmath=FAST, _nrt=False)
+@numba.njit(cache=True, nogil=True, fastmath=FAST, **UNCOUNTED)
 def _on_line(line, k, c0, c1, c2, c3):
     """Spline along one line of nodes, from node k on."""
     return c0 * line[k] + c1 * line[k + ONE] + (c2 * line[k + TWO] + c3 * line[k + THREE])
 
 
-@numba.njit(forceinline=True, cache=True, nogil=True, fastmath=FAST, error_model="numpy", _nrt=False)
+@numba.njit(forceinline=True, cache=True, nogil=True, fastmath=FAST, error_model="numpy", **UNCOUNTED)
 def distance_at(coefficients, origin, spacing, x, y, z):
-    """Signed distance at one point [m]; for use inside other kernels.
-
-    Here, and in all that kernels do for each column, numba does not count references of arrays (`_nrt=False`): the
-    caller holds them, and the counts, which are atomic, took more than half of the time.
-    """
+    """Signed distance at one point [m]; for use inside other kernels."""
     if coefficients.shape[0] == 1:
         return to_solid(coefficients, x, y, z)
     per = 1 / spacing
@@ -412,7 +409,7 @@ def _slopes(f):
     return -g * g / 2, (3 * f * f - 4 * f) / 2, (4 * g - 3 * g * g) / 2, f * f / 2
 
 
-@numba.njit(cache=True, nogil=True, fastmath=FAST, _nrt=False)
+@numba.njit(cache=True, nogil=True, fastmath=FAST, **UNCOUNTED)
 def _jet_on_plane(plane, j, b, db, k, c, dc):
     """Spline on one plane of nodes, from node (j, k) on, and its derivatives along both axes of it."""
     value = across = along = 0.0
@@ -428,7 +425,7 @@ def _add_line(line, k, c, dc, b, db, value, across, along):
     return value + b * here, across + db * here, along + b * _on_line(line, k, dc[0], dc[1], dc[2], dc[3])
 
 
-@numba.njit(forceinline=True, cache=True, nogil=True, fastmath=FAST, error_model="numpy", _nrt=False)
+@numba.njit(forceinline=True, cache=True, nogil=True, fastmath=FAST, error_model="numpy", **UNCOUNTED)
 def jet_at(coefficients, origin, spacing, x, y, z):
     """Signed distance at one point [m], and its gradient: four numbers; for use inside other kernels."""
     if coefficients.shape[0] == 1:

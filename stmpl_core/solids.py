@@ -14,6 +14,7 @@ import numba
 import numpy as np
 
 from stmpl_core.arrays import Points
+from stmpl_core.compiling import UNCOUNTED
 
 CAPSULE, CYLINDER, BOX = 1, 2, 3
 ROUND_OFF = 2e-3  # largest distance of a mesh from the round solid that it is taken for, over the radius
@@ -175,7 +176,7 @@ def _from_axis(c, x, y, z):
     return x - share * a, y - share * b, z - share * d
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy", _nrt=False)
+@numba.njit(cache=True, nogil=True, error_model="numpy", **UNCOUNTED)
 def solid_jet(solid, x, y, z):
     """Signed distance of a point to a solid [m], and its gradient: four numbers."""
     c = solid[0, 0]
@@ -204,7 +205,7 @@ def solid_jet(solid, x, y, z):
     return d, a * x + b * u, a * y + b * v, a * z + b * w
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy", _nrt=False)
+@numba.njit(cache=True, nogil=True, error_model="numpy", **UNCOUNTED)
 def _box_jet(c, x, y, z):
     """See solid_jet, of a box, and a point beside its middle [m]."""
     most, square, g, nearest = -np.inf, 0.0, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)

@@ -203,9 +203,10 @@ class Toucher:
                 forces = together.pressure * nodes.area
                 among = pins(nodes.points, nodes.area, nodes.thickness, forces)
                 beside |= {one.contact.name: among for one in group}
-            ends = np.cumsum([len(one.squeeze.nodes.area) for one in group])[:-1]
-            parts = zip(*(np.split(values, ends) for values in together[:3]), strict=True)
-            for one, (pressure, doubt, outside) in zip(group, parts, strict=True):
+            end = 0
+            for one in group:
+                start, end = end, end + len(one.squeeze.nodes.area)
+                pressure, doubt, outside = (values[start:end] for values in together[:3])
                 held[one.contact.name] = together._replace(pressure=pressure, doubt=doubt, outside=outside)
             covered |= self._covered(group, nodes, held)
         return [self._answer(one, held.get(one.contact.name, NOTHING), beside.get(one.contact.name), alone,

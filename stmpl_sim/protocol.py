@@ -401,8 +401,7 @@ class SoftContact:
         mobility: Callable[[str, np.ndarray, np.ndarray], float] | None,
     ) -> tuple[float, tuple[float, float]]:
         """Factor on the wrench that presses; and for the memory, speed into the skin [m/s] and force [N]."""
-        force = touch.force
-        if force == 0 or not (self.damping or self.implicit):
+        if not (self.damping or self.implicit) or (force := touch.force) == 0:
             return 1.0, (0.0, 0.0)
         normal, centre = touch.push / force, _centre_of_pressure(touch)
         before = memory.at.get(touch.name)
@@ -439,7 +438,7 @@ def _has_imprint(tissue: State, name: str) -> bool:
 
 def _pushes(touches: Sequence[Touch], memory: Memory) -> dict[str, np.ndarray]:
     """The `pushes` of the next memory."""
-    now = {touch.name: touch.push / touch.force for touch in touches if touch.force > 0}
+    now = {touch.name: touch.push / force for touch in touches if (force := touch.force) > 0}
     kept = {touch.name for touch in touches if touch.status == IN_CORE} & set(memory.pushes)
     return now | {name: memory.pushes[name] for name in kept}
 
