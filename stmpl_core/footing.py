@@ -245,15 +245,19 @@ def given_way(along, give, aim, contact):
         aim: force as in `in_plane`, of which the way matters, (3,).
         contact: see Memory.
     """
+    return softened(along, along_aim(give, aim, contact))
+
+
+@numba.njit(cache=True, error_model="numpy")
+def along_aim(tensor, aim, contact):
+    """What of a tensor (3, 3) is along a force (3,), see `given_way`; its mean along the skin where there is none."""
     first, second = contact[2], _cross(contact[1], contact[2])
     x, y = aim[0], aim[1]
     size = x * x + y * y
     if size > 0:
         way = x * first + y * second
-        more = _dot(way, _times(give, way)) / size
-    else:
-        more = 0.5 * (_dot(first, _times(give, first)) + _dot(second, _times(give, second)))
-    return softened(along, more)
+        return _dot(way, _times(tensor, way)) / size
+    return 0.5 * (_dot(first, _times(tensor, first)) + _dot(second, _times(tensor, second)))
 
 
 @numba.njit(cache=True, inline="always", error_model="numpy")
@@ -324,6 +328,48 @@ def faced(springs, stiffness, contact, bend, most):
     if size > most:
         turned *= most / size
     return turned, 0.5 * _dot(turned, way)
+
+
+@numba.njit(cache=True, error_model="numpy")
+def wrapped_in(points, depth, forces, normal):
+    """Mean square of the sines by which a tool's surface turns from the push within a contact, (3, 3) [-].
+
+    Where skin has sunk by its depth along the push it is on the tool, of which a ball is fitted. That is a fifth of the
+    square of the contact's radius over the ball's, each way, and 0 for what is flat.
+
+    Args:
+        points, depth: see Nodes.
+        forces: forces of the nodes, (N,).
+        normal: unit vector of the push, (3,).
+    """
+    total, middle, away, out = 0.0, np.zeros(4), np.empty(3), np.zeros((3, 3))
+    for n in range(len(forces)):
+        total += forces[n]
+        middle[3] += forces[n] * depth[n]
+        for x in range(3):
+            middle[x] += forces[n] * points[n, x]
+    up_mean = square_mean = both = fourth = 0.0
+    for n in range(len(forces)):
+        share, up = forces[n] / total, 0.0
+        for x in range(3):
+            away[x] = points[n, x] - middle[x] / total
+            up += away[x] * normal[x]
+        square = 0.0
+        for x in range(3):
+            away[x] -= up * normal[x]
+            square += away[x] * away[x]
+        up += depth[n] - middle[3] / total
+        square += up * up
+        for x in range(3):
+            for y in range(3):
+                out[x, y] += share * away[x] * away[y]
+        up_mean += share * up
+        square_mean += share * square
+        both += share * up * square
+        fourth += share * square * square
+    spread = fourth - square_mean * square_mean
+    bend = 2 * (both - up_mean * square_mean) / spread if spread > 0 else 0.0  # |away|^2 = 2 h up + ..., on a ball
+    return bend * bend / (1 + bend * bend * square_mean) * out
 
 
 @numba.njit(cache=True, error_model="numpy")

@@ -26,6 +26,7 @@ import numba
 import numpy as np
 
 from stmpl_core.footing import (
+    along_aim,
     along_give,
     carried_more,
     faced,
@@ -56,8 +57,14 @@ MOST_CARRIED = 0.9999  # share of the cap that sticks: a force at the cap has no
 PART, PARTS = 0.25, 16  # way over cap / k from which a step is cut, for a slide that turns; most parts
 SPUN = 0.8  # of slide times spin over their limit: force aside that a turning tool takes; 0.64 by finite elements
 PLOUGHED = 0.33, 0.2, 0.67  # see ploughing: growth of stiffness, and of the cap without and over mu
+FOLDS = 2.0  # what skin ahead gives as it folds, over what its lost pressure does: its shear goes, too
+FURTHER = 1.05  # way of skin that slides over that of a patch that moves as one, see further
+SHEARED = 0.25  # of k u^2 of what is below skin, over its thickness: growth of the push; 1/2 between plates
+LOOSE = 0.4  # of W, see wrapped: what taut skin loses of the force once all of it slides, by flat stacks
+MOST_WRAPPED = 0.2  # lean of the push of a tool that is wrapped in taut skin; 0.17 by finite elements [rad]
 MOST_LEAN = 0.5  # turn of the normal under skin that is dragged along, of which a push takes note [rad]
 MOST_GROWN = 1.5  # factor on the push by which skin that is dragged around a limb grows; 1.38 by finite elements
+LEAST_LEFT = 0.25  # of its thickness: layer below a tool that is sheared
 LEAST_GROWN = 0.5  # depth over the tool's that counts at least, where skin came from a hollow
 MOST_PASSES, SETTLED = 4, 1e-3  # turn of the normal [rad] at which push and friction agree
 
@@ -99,6 +106,63 @@ def ploughing(depth, radius, force, along, bare, friction):
     rises = depth / radius * force / (along * radius)
     higher = 1 + (PLOUGHED[1] + PLOUGHED[2] * friction) * rises
     return 1 + PLOUGHED[0] * rises * bare / along, higher * friction * force
+
+
+@numba.njit(cache=True, error_model="numpy")
+def wrapped(mu, leans, across):
+    """Force along the skin over that into it at which a tool slides that is wrapped in taut skin [-].
+
+    Skin that is dragged by a way u pulls at the tool along its way, all over the contact. Where the tool's surface
+    turns from the push by a sine n, n^2 of that is pressure, so the push leans by l = W k_t u / N with W the mean of
+    n^2 along the way; friction is at right angles to it. Normals that turn aside from the way carry more pressure than
+    push: friction is mu (1 + W' / 2) of it, with W' the mean across the way. Neither changes the force into the skin.
+
+    Args:
+        mu: coefficient of friction [-].
+        leans: l over that ratio [-].
+        across: W' of taut skin [-].
+
+    Returns:
+        ratio, and by how much l is beyond MOST_WRAPPED [rad], where it is held.
+    """
+    rubs = mu * (1 + 0.5 * across)
+    root = np.sqrt(max((1 - leans) ** 2 - 4 * rubs * rubs * leans, 0.0))
+    lean = 2 * rubs * leans / max(1 - leans + root, 0.5)
+    held = min(lean, MOST_WRAPPED)
+    return (rubs + held) / max(1 - rubs * held, 0.5), lean - held
+
+
+@numba.njit(cache=True, error_model="numpy", inline="always")
+def further(along, alone, sticks, stiffer):
+    """Way of skin that slides, over that of a patch which sticks on a flat layer, without folds, under the same force.
+
+    In a slide the traction goes as the pressure, under which skin goes further than as one: 1.2 times on a half-space
+    (Johnson, "Contact Mechanics", 1985, chapters 3 and 7), 1.13 to 1.25 in the linear response of skin, fat and muscle,
+    of which finite elements have 0.93. Where it folds ahead it loses its shear there with its pressure, by symmetry as
+    much again.
+
+    Args:
+        along: k_t [N/m].
+        alone: the same where skin folds and is ploughed; sticks: and goes along with its limb [N/m].
+        stiffer: factor of ploughing on it [-].
+    """
+    return FURTHER * along / sticks + (FOLDS - 1) * (along / alone - 1 / stiffer)
+
+
+@numba.njit(cache=True, error_model="numpy", inline="always")
+def sheared(bare, thickness, depth, force):
+    """Growth of a push where what is below its skin is sheared by a way, over the square of that way [1/m^2].
+
+    A layer of a thickness t that is sheared between plates by a way u stores G A u^2 / (2 t), whose slope along the
+    depth is push: it grows by G A (u / t)^2 / 2, which is Poynting's effect (Proc. R. Soc. A 82, 546, 1909). A patch
+    feels its thickness less than a plate: by finite elements of flat stacks half of that, with k_t for G A / t.
+
+    Args:
+        bare: k_t of a patch without its skin [N/m].
+        thickness, depth: of the layer, and by which it is pressed in [m].
+        force: normal force [N].
+    """
+    return SHEARED * bare / (max(thickness - depth, LEAST_LEFT * thickness) * force)
 
 
 @numba.njit(cache=True, error_model="numpy")
@@ -287,9 +351,9 @@ def _find(wanted, stiffness, cap, start, left, over, springs, force, slides, go)
 
 
 @numba.njit(cache=True, error_model="numpy")
-def rub(wrench, stated, by_force, contact, origin, bend, give, mu, along_itself, force, lever, elastic, depth, radius,
-        power, along, turn, bare, slack, twist, known, pressed, before_contact, before_elastic, before_slid,
-        before_held, room, passed, springs, relaxed, stiffness, shares, times, dt):  # fmt: skip
+def rub(wrench, stated, by_force, contact, origin, bend, give, mu, along_itself, wrap, force, lever, elastic, depth,
+        radius, thickness, power, along, turn, bare, slack, twist, known, pressed, before_contact, before_elastic,
+        before_slid, before_held, room, passed, springs, relaxed, stiffness, shares, times, dt):  # fmt: skip
     """Friction of a contact that would press with a wrench (6,) without friction.
 
     Friction turns the way that the push faces, and the push bounds friction: both are asked until they agree.
@@ -305,9 +369,11 @@ def rub(wrench, stated, by_force, contact, origin, bend, give, mu, along_itself,
         give: how it gives along the skin beyond a flat layer, (3, 3) [m/N].
         mu: coefficient of friction [-].
         along_itself: what skin carries along itself once all of it slides, over its force [-].
+        wrap: see footing.wrapped_in, (3, 3) [-].
         force: normal force [N].
         lever: mean distance of the forces from the middle [m].
         elastic, depth, radius, power: see Scalars.
+        thickness: of the layer [m].
         along, turn, bare, slack: see Patch.
         twist, known: see footing.aged.
         pressed: whether the tool pressed before the step.
@@ -329,8 +395,10 @@ def rub(wrench, stated, by_force, contact, origin, bend, give, mu, along_itself,
     """
     wanted, turned, out, carries, slid = np.zeros(3), np.zeros(3), 0.0, 1.0, before_slid
     contact, springs, relaxed, room, passed, gives = along_give(contact, give, springs, relaxed, room, passed)
+    square = 0.0
     if stiffness[0] > 0:
         turned, out = faced(springs, stiffness, contact, bend, MOST_LEAN)
+        square = (springs[:, 0].sum() / stiffness[0]) ** 2 + (springs[:, 1].sum() / stiffness[1]) ** 2
     way, rolled, room = way_of_tool(twist, known, before_contact, pressed, contact, origin, depth, radius, lever, room)
     was = stiffness[0]
     last_held = before_held if before_held > 0 else was
@@ -338,6 +406,13 @@ def rub(wrench, stated, by_force, contact, origin, bend, give, mu, along_itself,
     size = np.sqrt(wrench[0] ** 2 + wrench[1] ** 2 + wrench[2] ** 2)
     lost = (1 - before_slid) * before_elastic / elastic
     before = np.array([springs[:, x].sum() for x in range(3)])
+    taut, past = 1 - bare / along, 0.0
+    loose = taut * LOOSE * 0.5 * (wrap[0, 0] + wrap[1, 1] + wrap[2, 2])
+    shears = taut * sheared(bare, thickness, depth, force)
+    along_itself += loose
+    aim = in_plane(stated, contact, origin, lever) if by_force else before + along * way
+    turns_along = along_aim(wrap, aim, contact)
+    turns_across = wrap[0, 0] + wrap[1, 1] + wrap[2, 2] - turns_along
     arm, wants, grown, cap, share, stored = contact[0] - origin, 1.0, 1.0, 0.0, 0.0, 0.0
     turned_by, arm_of_turn = way[2] / lever, lever
     carried, after, new, kept = np.zeros(3), stiffness.copy(), springs.copy(), relaxed.copy()
@@ -346,25 +421,31 @@ def rub(wrench, stated, by_force, contact, origin, bend, give, mu, along_itself,
             carries = carried_more(stated, contact[1], turned) * before_slid
             grown = carries / slid
         else:
-            wants = max(1 + out / depth, LEAST_GROWN) ** power
+            wants = max(1 + out / depth, LEAST_GROWN) ** power + shears * square
             grown = min(wants, MOST_GROWN)
         stiffer, cap = ploughing(depth, radius, grown * force, along, bare, mu)
-        plain = mu * grown * force / cap  # what turns in place has nothing before it that friction raises
+        most = mu * grown * force
+        plain = most / cap  # what turns in place has nothing before it that friction raises
         arm_of_turn = lever * (plain + (1 - plain) * PLOUGHED[1] / (PLOUGHED[1] + PLOUGHED[2] * mu))
         way[2] = turned_by * arm_of_turn
         if by_force:
             push = carries * (wrench + wrench_at(size * turned, arm))
             wanted = in_plane(stated - push, leaned(contact, turned), origin, arm_of_turn)
-        alone = stiffer * secant(along, bare, slack, mu * grown * force)
+        alone = stiffer * secant(along, bare, slack, most)
         sticks = given_way(alone, give, wanted if by_force else before + alone * way, contact)
         if out > 0:  # skin leans before the tool once: as it turns about the bone, or as it is ploughed
             by_turn = max(1 - sticks / alone, bare / along) * np.sqrt(np.sum(turned**2))
-            cap -= min(by_turn * grown * force, cap - mu * grown * force)
+            cap -= min(by_turn * grown * force, cap - most)
+        if taut > 0:
+            leans = taut * turns_along * further(along, alone, sticks, stiffer)
+            ratio, past = wrapped(mu, leans, taut * turns_across)
+            cap = (1 - loose) * (ratio * grown * force + (1 - taut) * (cap - most))
         after = np.array([softened(alone, gives[0]), softened(alone, gives[1]), stiffer * turn / arm_of_turn**2])
         new, kept, carried, share, stored = drag(
             springs, relaxed, shares, times, dt, rolled, after, held_at, cap, way, wanted, by_force)  # fmt: skip
         last, last_slid = turned, slid
         turned, out = faced(new, after, contact, bend, MOST_LEAN)
+        square = (new[:, 0].sum() / after[0]) ** 2 + (new[:, 1].sum() / after[1]) ** 2
         slid = 1 - max(along_itself * min(np.sqrt(np.sum(carried**2)) / cap, 1.0), min(lost, along_itself))
         if np.abs(turned - last).max() + abs(slid - last_slid) < SETTLED:
             break
@@ -387,7 +468,7 @@ def rub(wrench, stated, by_force, contact, origin, bend, give, mu, along_itself,
         held = after[0]
     push = grown * slid * wrench + wrench_at(lean, arm)
     drags = np.sqrt(carried[0] ** 2 + carried[1] ** 2)
-    off = (wants - grown) * size
+    off = (wants - grown + past) * size
     if cap > 0:
         off += SPUN * abs(carried[2]) * drags / cap
     return (push, rubs, share, offset, turns, lean, grown, slid_offset, slid_turn, cap, after, new, kept, stored, slid,

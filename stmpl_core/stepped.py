@@ -10,7 +10,7 @@ import numba
 import numpy as np
 
 from stmpl_core.balance import MUCH, UNSURE, settled, work_of
-from stmpl_core.footing import HELD_OFF, aged, borne, curvature_at, needed, part_of_way, patch_of
+from stmpl_core.footing import HELD_OFF, aged, borne, curvature_at, needed, part_of_way, patch_of, wrapped_in
 from stmpl_core.green import give_at
 from stmpl_core.relaxation import depth_left, faded, let_go, stretch
 from stmpl_core.sideways import interpolated
@@ -32,9 +32,10 @@ STRAYED = 0.03  # of the elastic force: part of the memory from touches out of r
 # to 38 [1/m]; turn and place of the pose at which it presses, 39 to 50. Factor on the pressures less 1.
 # All 0 by pose: whether it is told by a wrench, and whether the law was asked for another; that wrench, 54 to 59. Turn
 # and place of the stated pose, 60 to 71, read where that is another. Coefficient of friction and number of the tool's
-# surface; way by which it is drawn back from the core [m].
-PATCH = 75
+# surface; way by which it is drawn back from the core [m]; how it is wrapped in skin, 75 to 83, see footing.wrapped_in.
+PATCH = 84
 POSE, FACTOR, BY_FORCE, CREEPS, STATED, STATED_POSE, FRICTION, NUMBER, BACK = 39, 51, 52, 53, 54, 60, 72, 73, 74
+WRAPPED = 75
 APART, HOLDS = 1.0, 2.0  # statuses: a tool is off, or holds the skin; another one's wrench stays as it is
 # What a step makes of it: wrench, bound, in range, status and depth, as in a PATCH; and more, see SAYS.
 OUT = 10
@@ -230,6 +231,7 @@ def whole_of(points, area, thickness, depth, forces, corners, shares, power, alo
     if rubs:
         bend = curvature_at(corners, shares, forces, frames, curvature, vertex_thickness)
         _put(bend.ravel(), out[30:39])
+        _put(wrapped_in(points, depth, forces, normal).ravel(), out[WRAPPED : WRAPPED + 9])
         if len(gives):
             _put((give_at(corners, shares, forces, gives, turns) / modulus).ravel(), out[21:30])
 
@@ -400,10 +402,11 @@ def _one(patch, before, after, grooves, shares, times, fades, has_skin, table, l
                 (wrench, rubs, share, offset, turned, lean, grown, slid_offset, slid_turn, limit, stiff, drawn,
                  drawn_relaxed, bent, slid, held_at, room, passed, there, besides) = rub(
                     wrench, patch[STATED : STATED + 6], by_force, there, pose[:3, 3].copy(), bend, give, mu,
-                    LOST * patch[19], force, patch[15], at_rest, depth, patch[14], power, along * unit,
-                    turn * unit * patch[14] ** 2, bare * unit, slack * patch[14], twist, old[PRESSING] >= 0, held,
-                    contact, old[ELASTIC], slid_before, old[HELD], old[ROLLED : ROLLED + 3].copy(), passed, springs,
-                    springs_relaxed, stiffness, shares, times, dt)  # fmt: skip
+                    LOST * patch[19], patch[WRAPPED : WRAPPED + 9].copy().reshape(3, 3), force, patch[15], at_rest,
+                    depth, patch[14], patch[16], power, along * unit, turn * unit * patch[14] ** 2, bare * unit,
+                    slack * patch[14], twist, old[PRESSING] >= 0, held, contact, old[ELASTIC], slid_before, old[HELD],
+                    old[ROLLED : ROLLED + 3].copy(), passed, springs, springs_relaxed, stiffness, shares, times,
+                    dt)  # fmt: skip
                 changed, doubt = grown * changed, grown * doubt
                 drag = rubs[0] ** 2 + rubs[1] ** 2 + rubs[2] ** 2
                 pressing = np.sqrt(wrench[0] ** 2 + wrench[1] ** 2 + wrench[2] ** 2)

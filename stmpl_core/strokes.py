@@ -16,12 +16,12 @@ import numpy as np
 
 from stmpl_core.contact import Contact
 from stmpl_core.errors import InvalidInput
-from stmpl_core.footing import patch_of
+from stmpl_core.footing import patch_of, wrapped_in
 from stmpl_core.regions import HELD_SKIN
 from stmpl_core.relaxation import faded, fading, series_of, stretch, weights
-from stmpl_core.sideways import Sideways
+from stmpl_core.sideways import Patch, Sideways
 from stmpl_core.simulator import Simulator
-from stmpl_core.slip import MOST_LEAN, PLOUGHED, ploughing
+from stmpl_core.slip import MOST_LEAN, PLOUGHED, further, ploughing, wrapped
 from stmpl_core.stiffness import WRONG_WAY, asked
 from stmpl_core.tissue import Prony
 from stmpl_core.touch import Touch
@@ -37,6 +37,7 @@ STRAIGHT = 1.05  # length of a way over the distance of its ends, up to which it
 JITTER = 3e-4  # way by which a tool has moved, and not only what measures it trembled [m]
 BEGUN = 0.25  # force at the first instant over the largest, up to which a press counts as told from its beginning
 LEAN = 0.05  # tilt of the contact's normal that strokes one way do not tell from friction [-]
+HALVED = 40  # times that the range in which mu is sought is halved
 OWN_FRICTION = 0.08  # relative error of the law of friction: 3 to 9 % of the largest by finite elements
 FREE = 0.005  # coefficient that is none: a contact's normal that is 0.3 degrees off makes as much [-]
 MAX_FRICTION_ERROR = 0.3  # standard error of a coefficient over it
@@ -101,7 +102,9 @@ class _Rubbed(NamedTuple):
     """An instant at which a tool rubs: normal (3,), N and F_t [N], radius [m], k_t [N/m], r of ploughing [-].
 
     leans: turn of the push, as skin came from where the limb faces another way [rad]; once: share of it by which skin
-    is not ploughed, see slip.rub [-].
+    is not ploughed, see slip.rub [-]. patch: the patch that sticks, on a flat layer; stiffer, gives: by how
+    much it is stiffer there as it is ploughed [-], and gives more on a limb [m/N]. along, across: W and W' of
+    slip.wrapped [-].
     """
 
     normal: np.ndarray
@@ -112,18 +115,24 @@ class _Rubbed(NamedTuple):
     rises: float
     leans: float
     once: float
+    patch: Patch
+    stiffer: float
+    gives: float
+    along: float
+    across: float
 
 
 def fit_friction(toucher: Toucher | Simulator, strokes: Sequence[Contact]) -> Rubbing:
     """Finds the coefficient mu of a tool that slides.
 
-    In steady slide the force along the way is R = mu (1 + (0.2 + 0.67 mu) r) of the normal one (`slip.ploughing`),
-    which is solved for mu; around a limb the push leans besides. A tool slides once it went straight on by SLID F / k,
-    twice that after another way, with F the largest force along the skin and k the stiffness of the skin to what sticks
-    (`stmpl_core.sideways`): one that sticks never does, since its force grows with the way. The normal is that of the
-    contact law under the measured force; how far it is off changes sign with the way, so strokes there and back are
-    worth more than twice one of them. So does a sensor's zero that is off along the way: by strokes one way it is
-    friction. One that is off across the skin changes mu as it does the normal force, which no stroke tells.
+    In steady slide the force along the way is R = mu (1 + (0.2 + 0.67 mu) r) of the normal one (`slip.ploughing`), on
+    taut skin that of `slip.wrapped`, which is solved for mu; around a limb the push leans besides. A tool slides once
+    it went straight on by SLID F / k, twice that after another way, with F the largest force along the skin and k the
+    stiffness of the skin to what sticks (`stmpl_core.sideways`): one that sticks never does, since its force grows with
+    the way. The normal is that of the contact law under the measured force; how far it is off changes sign with the
+    way, so strokes there and back are worth more than twice one of them. So does a sensor's zero that is off along the
+    way: by strokes one way it is friction. One that is off across the skin changes mu as it does the normal force,
+    which no stroke tells.
 
     Args:
         toucher: contact law on the skin, about as stiff as it is, or a simulator that has it.
@@ -219,20 +228,29 @@ def _rubbed(toucher: Toucher, sideways: Sideways, one: Contact) -> _Rubbed | Non
     stiffer, _ = ploughing(touch.depth, radius, pressing, patch.along, patch.bare, 0.0)
     rises = touch.depth / radius * pressing / (patch.along * radius)
     alone = stiffness = stiffer * patch.secant(rubs)
-    leans = 0.0
+    leans, gives, wrap = 0.0, 0.0, wrapped_in(nodes.points, nodes.depths, pressed.forces, normal)
+    turns = float(along @ wrap @ along) / rubs**2 if rubs > 0 else 0.5 * float(np.trace(wrap))
     if rubs > 0:
-        stiffness = 1 / (1 / alone + max(float(along @ give @ along) / rubs**2, 0.0))
+        gives = max(float(along @ give @ along) / rubs**2, 0.0)
+        stiffness = 1 / (1 / alone + gives)
         leans = float(along @ toucher.curvature(nodes, pressed.forces) @ along) / rubs / stiffness
     once = max(1 - stiffness / alone, patch.bare / patch.along)
-    return _Rubbed(normal, pressing, rubs, radius, stiffness, rises, min(leans, MOST_LEAN), once)
+    return _Rubbed(normal, pressing, rubs, radius, stiffness, rises, min(leans, MOST_LEAN), once, patch,
+                   float(stiffer), gives, turns, float(np.trace(wrap)) - turns)  # fmt: skip
 
 
 def _friction_of(ratio: float, one: _Rubbed) -> float:
-    """mu from the force along the way over the normal one; see slip.ploughing and slip.rub."""
-    a, b = PLOUGHED[2] * one.rises, 1 + PLOUGHED[1] * one.rises
+    """mu from the force along the way over the normal one; see slip.ploughing, slip.wrapped and slip.rub."""
     plain = max(math.tan(math.atan(abs(ratio)) - one.leans), 0.0)
-    size = plain + one.once * max(one.leans, 0.0)
-    return math.copysign(min(2 * size / (b + math.sqrt(b * b + 4 * a * size)), plain), ratio)
+    taut, low, high = 1 - one.patch.bare / one.patch.along, 0.0, plain
+    for _ in range(HALVED):
+        mu = 0.5 * (low + high)
+        alone = one.stiffer * one.patch.secant(mu * one.pressing)
+        leans = taut * one.along * further(one.patch.along, alone, 1 / (1 / alone + one.gives), one.stiffer)
+        rises = mu * (PLOUGHED[1] + PLOUGHED[2] * mu) * one.rises - one.once * max(one.leans, 0.0)
+        more = wrapped(mu, leans, taut * one.across)[0] + (1 - taut) * max(rises, 0.0) > plain
+        low, high = (low, mu) if more else (mu, high)
+    return math.copysign(0.5 * (low + high), ratio)
 
 
 @numba.njit(cache=True)

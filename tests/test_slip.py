@@ -11,7 +11,7 @@ from stmpl_core.errors import InvalidInput
 from stmpl_core.friction import PAIRS, coefficient
 from stmpl_core.methods import MomentNet, Winkler
 from stmpl_core.sideways import Sideways, patch
-from stmpl_core.slip import LIMIT, SPRINGS, drag
+from stmpl_core.slip import LIMIT, MOST_WRAPPED, SPRINGS, drag, wrapped
 from stmpl_core.tissue import Membrane
 from tests.scenes import RADIUS as LIMB_RADIUS
 from tests.scenes import at, ball, limb, plate, punch, turn
@@ -329,6 +329,23 @@ def test_friction_is_by_tool_and_by_name(sim: Simulator) -> None:
     for wrong in ("wet", -0.1, 9.0, float("nan")):
         with pytest.raises(InvalidInput):
             coefficient(wrong)
+
+
+# Wrapped in taut skin
+
+
+@pytest.mark.parametrize("mu", [0.1, 0.5, 0.8])
+def test_friction_of_a_wrapped_tool_is_at_right_angles_to_its_push_that_leans_by_the_drag(mu: float) -> None:
+    ratio, past = wrapped(mu, 0.12, 0.1)
+    rubs, lean = 1.05 * mu, 0.12 * ratio
+    assert ratio == pytest.approx((rubs + lean) / (1 - rubs * lean)) and past == 0
+    assert wrapped(mu, 0.0, 0.0) == (mu, 0.0)
+
+
+@pytest.mark.parametrize("leans", [0.2, 0.6, 1.5])
+def test_a_tool_that_is_wrapped_leans_no_further_than_was_tried(leans: float) -> None:
+    ratio, past = wrapped(1.2, leans, 0.1)
+    assert past > 0 and np.arctan(ratio) == pytest.approx(np.arctan(1.26) + np.arctan(MOST_WRAPPED))
 
 
 # Around a limb

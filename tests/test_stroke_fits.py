@@ -5,10 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from stmpl_core import Contact, Prony, Simulator, State, Tissue
+from stmpl_core import Contact, Prony, Simulator, SoftLayer, State, Tissue
 from stmpl_core.errors import InvalidInput
 from stmpl_core.history import History
-from stmpl_core.methods import Winkler
+from stmpl_core.methods import MomentNet, Winkler
 from stmpl_core.strokes import _unlike, fit_friction, fit_relaxation
 from stmpl_core.tissue import Membrane, Ply
 from stmpl_core.toucher import Toucher
@@ -21,14 +21,16 @@ SERIES = Prony((0.2, 0.15), (0.5, 5.0))
 
 
 def measured(poses: np.ndarray, times: np.ndarray, friction: float | None, series: Prony | None = None, *,
-             noise: float = 0.02, lag: float = 0.0) -> list[Contact]:  # fmt: skip
+             noise: float = 0.02, lag: float = 0.0, layer: SoftLayer | None = None) -> list[Contact]:  # fmt: skip
     """What a robot reports of a ball at positions (N, 3) [m], as our own simulator feels it, with noise on the forces.
 
     Args:
         noise: standard deviation of the forces over the largest.
         lag: way by which the reported positions are too high [m].
+        layer: skin; None: a slab of one material, which relaxes as the series says.
     """
-    simulator = Simulator(plate(0.09).with_(tissue=Tissue(2e4, 0.4, relaxation=series)), Winkler(), friction=friction)
+    layer = layer or plate(0.09).with_(tissue=Tissue(2e4, 0.4, relaxation=series))
+    simulator = Simulator(layer, MomentNet() if layer.tissue.skin else Winkler(), friction=friction)
     state, out, random = State(), [], np.random.default_rng(0)
     for k, place in enumerate(poses):
         (touch,), state = simulator.touch([Contact(BALL, at(*place))], state, times[k] - times[k - 1] if k else 0.0)
@@ -64,6 +66,16 @@ def test_friction_of_a_stroke_comes_back(toucher: Toucher, mu: float) -> None:
     assert found.trust.ok, found.trust.why
     assert found.both_ways and found.friction == pytest.approx(mu, rel=0.08)
     assert abs(found.friction - mu) < 2 * found.error < 0.4 * mu
+
+
+@pytest.mark.parametrize("mu", [0.3, 0.8])
+def test_friction_on_taut_skin_comes_back(mu: float) -> None:
+    """Where a tool is wrapped in skin the force along it is up to half more than mu of that into it."""
+    tissue = Tissue(2.5e3, 0.45, skin=Membrane(1.3e5, 2.5e-3, 11.4), deeper=(Ply(6e-3, 3.1e4, 0.45),))
+    layer = plate(0.09, 3e-3, 18e-3).with_(tissue=tissue)
+    found = fit_friction(Toucher(layer), measured(*wiped(0.04, back=True, depth=5e-3), mu, layer=layer))
+    assert found.trust.ok, found.trust.why
+    assert found.friction == pytest.approx(mu, rel=0.06)
 
 
 @pytest.mark.parametrize("mu", [0.3, 0.6, 1.0])

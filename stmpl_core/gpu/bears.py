@@ -14,12 +14,51 @@ EDGE_SHARE, STIFFER = wp.constant(wp.float64(footing.EDGE_SHARE)), wp.constant(w
 wp.set_module_options(OPTIONS)
 
 
+@wp.func
+def _sunk(scratch: Scratch, s: wp.int32, i: wp.int32, stacked: wp.int32) -> real:
+    """How deep a node has sunk [m]."""
+    depth = scratch.strain[s, i] * scratch.thick[s, i]
+    if stacked == 1:
+        depth = scratch.sinking[s, i]
+    return depth
+
+
+@wp.func
+def _wrapped_in(scratch: Scratch, s: wp.int32, k: wp.int32, stacked: wp.int32, middle: vec3, normal: vec3,
+                total: real) -> mat33:  # fmt: skip
+    """footing.wrapped_in of a tool's nodes in a scene."""
+    deep, up_mean, square_mean, both, fourth = real(0.0), real(0.0), real(0.0), real(0.0), real(0.0)
+    out = mat33()
+    for i in range(scratch.nodes[s]):
+        if scratch.tool[s, i] == k:
+            share = scratch.pressure[s, i] * scratch.area[s, i] / total
+            deep += share * _sunk(scratch, s, i, stacked)
+    for i in range(scratch.nodes[s]):
+        if scratch.tool[s, i] == k:
+            share = scratch.pressure[s, i] * scratch.area[s, i] / total
+            away = scratch.point[s, i] - middle
+            up = wp.dot(away, normal)
+            away = away - up * normal
+            up += _sunk(scratch, s, i, stacked) - deep
+            square = wp.length_sq(away) + up * up
+            out = out + share * wp.outer(away, away)
+            up_mean += share * up
+            square_mean += share * square
+            both += share * up * square
+            fourth += share * square * square
+    spread = fourth - square_mean * square_mean
+    if spread <= real(0.0):
+        return mat33()
+    bend = real(2.0) * (both - up_mean * square_mean) / spread
+    return bend * bend / (real(1.0) + bend * bend * square_mean) * out
+
+
 @wp.kernel
 def bear(first: wp.int32, many: wp.int32, gives: wp.array(dtype=mat33), bends: wp.array(dtype=mat33), skins: Skins,
          scratch: Scratch, wrenches: wp.array3d(dtype=real), depths: wp.array2d(dtype=real),
          bounds: wp.array2d(dtype=real), in_range: wp.array2d(dtype=wp.bool), statuses: wp.array2d(dtype=wp.int32),
          out: wp.array3d(dtype=real)):  # fmt: skip
-    """What each contact is as a whole: footing.patch_of and curvature_at, green._give_at.
+    """What each contact is as a whole: footing.patch_of, curvature_at and wrapped_in, green._give_at.
 
     Args:
         first: number of the part's first scene.
@@ -51,10 +90,7 @@ def bear(first: wp.int32, many: wp.int32, gives: wp.array(dtype=mat33), bends: w
     for i in range(scratch.nodes[s]):
         if scratch.tool[s, i] == k:
             force, own = scratch.pressure[s, i] * scratch.area[s, i], scratch.area[s, i]
-            depth = scratch.strain[s, i] * scratch.thick[s, i]
-            if one.stacked == 1:
-                depth = scratch.sinking[s, i]
-            energy += real(0.5) * force * depth
+            energy += real(0.5) * force * _sunk(scratch, s, i, one.stacked)
             total += force
             squares += force * force / own
             thick += force * scratch.thick[s, i]
@@ -81,6 +117,11 @@ def bear(first: wp.int32, many: wp.int32, gives: wp.array(dtype=mat33), bends: w
                     share = force / wp.max(total, NONE) * scratch.shares[s, i][x]
                     give = give + share * gives[trio[x]]
                     bend = bend + share * bends[trio[x]]
+    if gives.shape[0] > 0:
+        wrap = _wrapped_in(scratch, s, k, one.stacked, middle, normal, wp.max(total, NONE))
+        for x in range(3):
+            for y in range(3):
+                out[n, k, 75 + 3 * x + y] = wrap[x, y]
     radius = wp.sqrt(size / PI)
     out[n, k, 10] = one.modulus * total
     for x in range(3):
