@@ -13,6 +13,7 @@ from stmpl_ros.diagnosis import Tally
 
 SAY_EVERY = 1.0  # time between two lines of the same kind [s]
 OFTEN, RARELY = 5, 30.0  # lines of a kind in a row, after which they come this much apart [s]
+ASKS = ". Are the clocks in step, or is this a replay?"
 QUIET = 5.0  # time without a reason for a line, after which its kind is new again [s]
 
 
@@ -32,15 +33,20 @@ class Gate:
     Args:
         node: node whose clock and logger are used.
         tally: counts of messages.
+
+    Attributes:
+        stamp: stamp of the last message that was looked at [ns].
+        clock: what is wrong with the clock that ages are told by; empty: nothing.
     """
 
     def __init__(self, node: Node, tally: Tally) -> None:
         self._node, self._tally = node, tally
+        self.stamp, self.clock = 0, ""
         self._said: dict[str, _Said] = {}  # by kind
 
     def fresh(self, stamp: int, max_age: float) -> bool:
         """Whether what is stamped [ns] is at most `max_age` [s] old; 0 takes any."""
-        now = self._node.get_clock().now().nanoseconds
+        self.stamp, now = stamp, self._node.get_clock().now().nanoseconds
         age = (now - stamp) / NANO
         if not max_age or abs(age) <= max_age:
             return True
@@ -50,8 +56,7 @@ class Gate:
                       "heard on /clock")  # fmt: skip
             return False
         self.drop("age", f"a message stamped {abs(age):.2f} s {'before' if age > 0 else 'after'} now was dropped; "
-                  f"allowed is {max_age} s. "
-                  "Are the clocks in step, or is this a replay? max_age:=0 accepts any age.")  # fmt: skip
+                  f"allowed is {max_age} s{f': {self.clock}.' if self.clock else ASKS} max_age:=0 accepts any age.")
         return False
 
     @property

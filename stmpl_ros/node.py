@@ -404,7 +404,7 @@ class SkinNode(ServingNode):
 
     def _diagnose(self) -> None:
         name = self.get_fully_qualified_name()
-        self.hearing.now.look()
+        clock = self.hearing.look()
         if not self.active:
             return self._tell_health([skin_status(name, {}, Health(active=False))])
         inbox, events = self.hearing.inbox, self.hearing.events
@@ -424,8 +424,9 @@ class SkinNode(ServingNode):
             values["joints"] = self.bending.doubt or " ".join(f"{x:.4f}" for x in self.answering.simulator.skin.angles)
         told = self.bending.doubt or self.tally.doubt  # where all answers are of a surface from before, it says so
         outdated = [one for one in self.hearing.look_for_outdated() if one not in told]
-        senders = "; ".join(filter(None, (self.hearing.look_at_clock(), *stopped, *outdated, self.hearing.unheard(),
-                                          self.hearing.look_for_strangers(), self.hearing.rivals())))  # fmt: skip
+        senders = "; ".join(filter(None, (clock, self.hearing.look_at_clock(), *stopped, *outdated,
+                                          self.hearing.unheard(), self.hearing.look_for_strangers(),
+                                          self.hearing.rivals())))  # fmt: skip
         lately = self._counts.since(reactions=self.tally.reactions, refused=self.tally.refused, stale=self.tally.stale,
                                     out_of_order=inbox.out_of_order, missed=events.missed_deadlines)  # fmt: skip
         health = Health(lately, self.tally.last_refusal, self.answering.fading, bool(inbox.live(self.hearing.now())),

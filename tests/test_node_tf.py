@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable, Iterator
 from importlib.util import find_spec
 from types import SimpleNamespace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
@@ -37,6 +37,7 @@ from stmpl_ros.diagnosis import Tally
 from stmpl_ros.followed import Followed
 from stmpl_ros.frames import Frames
 from stmpl_ros.gate import Gate
+from stmpl_ros.hearing import Hearing
 from stmpl_ros.node import SkinNode
 from stmpl_ros.parameters import NodeConfig
 from stmpl_ros.ticks import Ticks
@@ -321,57 +322,112 @@ def test_a_sensors_torque_is_moved_to_the_tools_origin():
     np.testing.assert_allclose(found, [2, 0, 0, 0, 0.5 + 0.07 * 2, 0], atol=1e-15)
 
 
-def test_a_simulation_slower_than_its_clock_is_not_silent_and_one_that_is_gone_is():
+class Simulation(NamedTuple):
+    """A node on a simulated clock, and who says that."""
+
+    node: Any
+    ticks: Ticks
+    say: Callable[[float], None]
+    leave: Callable[[], None]
+
+
+@pytest.fixture
+def simulation() -> Iterator[Simulation]:
     context = rclpy.Context()
     context.init(domain_id=int(os.environ["ROS_DOMAIN_ID"]) + BUSES)
     executor = SingleThreadedExecutor(context=context)
     node = rclpy.create_node("sim", context=context, parameter_overrides=[Parameter("use_sim_time", value=True)])
     other = rclpy.create_node("gz", context=context)
-    clock, backs = other.create_publisher(Clock, "/clock", 10), []
-    ticks = Ticks(node)
-    ticks.on_back = lambda: backs.append(1)
+    clock = other.create_publisher(Clock, "/clock", 10)
+
+    def until(done: Callable[[], bool], do: Callable[[], object] = lambda: None) -> None:
+        last = time.monotonic() + PATIENCE
+        while not done():
+            assert time.monotonic() < last
+            do()
+            executor.spin_once(timeout_sec=0.02)
 
     def say(seconds: float) -> None:
-        until = time.monotonic() + PATIENCE
-        while node.get_clock().now().nanoseconds != round(seconds * 1e9):
-            assert time.monotonic() < until
-            clock.publish(Clock(clock=TimeMessage(sec=int(seconds), nanosec=round(seconds % 1 * 1e9))))
-            executor.spin_once(timeout_sec=0.02)
+        told = Clock(clock=TimeMessage(sec=int(seconds), nanosec=round(seconds % 1 * 1e9)))
+        until(lambda: node.get_clock().now().nanoseconds == round(seconds * 1e9), lambda: clock.publish(told))
+
+    def leave() -> None:
+        other.destroy_publisher(clock)
+        until(lambda: not node.count_publishers("/clock"))
 
     try:
         executor.add_node(node)
         executor.add_node(other)
-        gate = Gate(node, Tally())
-        assert not gate.fresh(3 * 10**9, 1.0) and "nothing was heard on /clock" in gate.dropped
-        say(10.0)
-        assert not gate.fresh(3 * 10**9, 1.0) and "7.00 s before now" in gate.dropped
-        ticks.look()
-        before = ticks()
-        time.sleep(0.05)
-        assert ticks() == before, "a paused simulation is not silent"
-        ticks.look()
-        assert ticks.simulated and ticks.paused
-        say(10.5)
-        ticks.look()
-        assert not ticks.paused
-        assert ticks() - before == NANO // 2
-        say(3.0)
-        assert backs and ticks() - before == NANO // 2, "the count never goes back"
-        say(3.25)
-        assert ticks() - before == 3 * NANO // 4
-        other.destroy_publisher(clock)
-        until = time.monotonic() + PATIENCE
-        while node.count_publishers("/clock"):
-            assert time.monotonic() < until
-            executor.spin_once(timeout_sec=0.02)
-        ticks.look()
-        gone = ticks()
-        assert 0 <= gone - before - 3 * NANO // 4 < NANO, "it goes on from where it was"
-        time.sleep(0.02)
-        assert ticks() - gone >= 20 * MS, "by the wall's clock"
+        yield Simulation(node, Ticks(node), say, leave)
     finally:
         executor.shutdown()
         node.destroy_node()
         other.destroy_node()
         context.try_shutdown()
         context.destroy()
+
+
+def test_a_simulation_slower_than_its_clock_is_not_silent_and_one_that_is_gone_is(simulation):
+    node, ticks, say, leave = simulation
+    backs = []
+    ticks.on_back = lambda: backs.append(1)
+    gate = Gate(node, Tally())
+    assert not gate.fresh(3 * 10**9, 1.0) and "nothing was heard on /clock" in gate.dropped
+    say(10.0)
+    assert not gate.fresh(3 * 10**9, 1.0) and "7.00 s before now" in gate.dropped
+    ticks.look()
+    before = ticks()
+    time.sleep(0.05)
+    assert ticks() == before, "a paused simulation is not silent"
+    ticks.look()
+    assert ticks.simulated and ticks.paused
+    say(10.5)
+    ticks.look()
+    assert not ticks.paused
+    assert ticks() - before == NANO // 2
+    say(3.0)
+    assert backs and ticks() - before == NANO // 2, "the count never goes back"
+    say(3.25)
+    assert ticks() - before == 3 * NANO // 4
+    leave()
+    ticks.look()
+    gone = ticks()
+    assert 0 <= gone - before - 3 * NANO // 4 < NANO, "it goes on from where it was"
+    time.sleep(0.02)
+    assert ticks() - gone >= 20 * MS, "by the wall's clock"
+    assert ticks.doubt.startswith("use_sim_time is set and /clock stands still at 3.25 s, and nobody sends it")
+
+
+def test_a_clock_that_stands_still_while_stamps_go_on_is_gone_and_no_paused_simulation(simulation):
+    _, ticks, say, _ = simulation
+    say(10.0)
+    ticks.look(9 * NANO)
+    ticks.look(10 * NANO + 10 * MS)
+    assert ticks.paused and not ticks.doubt, "a message that came before its clock"
+    before = ticks()
+    ticks.look(11 * NANO)
+    assert not ticks.simulated and not ticks.paused
+    assert ticks.doubt.startswith("use_sim_time is set and /clock stands still at 10.00 s, while stamps go on")
+    assert 0 <= ticks() - before < NANO, "it goes on from where it was"
+    time.sleep(0.02)
+    assert ticks() - before >= 20 * MS, "what is sent no more is silent"
+    ticks.look(11 * NANO)
+    assert ticks.doubt, "also once the stamps stand still too"
+    say(11.0)
+    ticks.look(11 * NANO)
+    assert ticks.simulated and not ticks.doubt
+
+
+def test_a_node_says_that_its_clock_is_gone_where_it_refuses_what_comes(simulation):
+    node, ticks, say, _ = simulation
+    say(10.0)
+    hearing = SimpleNamespace(gate=Gate(node, Tally()), now=ticks)
+    Hearing.look(hearing)
+    assert not hearing.gate.fresh(12 * NANO, 1.0) and "Are the clocks in step" in hearing.gate.dropped
+    for _ in range(2):
+        assert Hearing.look(hearing) == ticks.doubt != ""
+    assert not hearing.gate.fresh(13 * NANO, 1.0)
+    assert hearing.gate.dropped == (f"a message stamped 3.00 s after now was dropped; allowed is 1.0 s: {ticks.doubt}. "
+                                    "max_age:=0 accepts any age.")  # fmt: skip
+    say(13.0)
+    assert Hearing.look(hearing) == "" and hearing.gate.fresh(13 * NANO, 1.0)
