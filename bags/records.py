@@ -108,7 +108,7 @@ def bag_file(path: Path | str) -> Path:
         return path
     if not path.exists():
         raise BagError(f"{path} does not exist. stmpl record or stmpl demo makes a recording.")
-    found = sorted(path.glob("*.mcap"))
+    found = sorted(file for file in path.iterdir() if file.suffix == ".mcap") if path.is_dir() else []
     if len(found) != 1:
         names = ", ".join(f.name for f in found) or "none"
         raise BagError(f"{path} is no recording: expected one .mcap file, found {names}.")

@@ -64,7 +64,7 @@ def recover(source: Path | str, target: Path | str | None = None) -> Recovery:
         BagError: the source is no MCAP file or holds nothing sound, or the target exists or cannot be written.
     """
     source = bag_file(source)
-    target = Path(target) if target else source.parent.with_name(f"{source.parent.resolve().name}-recovered")
+    target = Path(target) if target else _beside(source.parent.resolve())
     index = summary(source)
     schemas, channels = dict(index.schemas), dict(index.channels)
     damage, orphans, messages, finished, times = [], 0, 0, False, [0, 0]
@@ -93,24 +93,28 @@ def recover(source: Path | str, target: Path | str | None = None) -> Recovery:
                     damage.append(record)
                 case End():
                     finished = True
-    if not messages and damage:
-        for made in (writer.path, writer.path.with_name("metadata.yaml")):
-            made.unlink()
-        raise BagError(f"{source} holds no sound message: {damage[0]}.")
+        if not messages and not (finished and not damage):
+            why = damage[0] if damage else "its writer was stopped before it flushed one"
+            raise BagError(f"{source} holds no sound message: {why}.")
     seconds = (times[1] - times[0]) / 1e9
     return Recovery(source, writer.path, messages, seconds, orphans, index.messages, tuple(damage), finished)
 
 
 @contextmanager
 def _begun(target: Path, source: Path) -> Iterator[BagWriter]:
-    """The writer of a copy; where that fails, its file is removed."""
+    """The writer of a copy; where that fails, what it made is removed."""
     writer = BagWriter(target, source=source)
     try:
-        with writer:
-            yield writer
-    except BagError:
-        writer.path.unlink(missing_ok=True)
+        yield writer
+        writer.close()
+    except BaseException:
+        writer.discard()
         raise
+
+
+def _beside(folder: Path) -> Path:
+    """Where the sound part of a recording in a folder goes unless told."""
+    return folder.with_name(f"{folder.name}-recovered")
 
 
 def _copy_channel(writer: BagWriter, channel: Channel, schemas: dict[int, Schema], copied: dict[int, int]) -> bool:

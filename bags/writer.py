@@ -25,6 +25,7 @@ log = logging.getLogger(__name__)
 ROS_DISTRO = "jazzy"
 FILE = "run_0.mcap"  # file in a recording's folder; ros2 bag reindex takes only names that end in a number
 FOREVER = 2147483647.0  # duration that is written for infinity or more [s]
+INFORMATION = "rosbag2_bagfile_information"  # what metadata.yaml holds
 METADATA_VERSION = 9  # version of rosbag2's metadata.yaml in Jazzy
 CHUNK_BYTES = 8 << 20  # size at which a chunk is closed [bytes], if chunk_seconds have not passed before
 
@@ -116,6 +117,8 @@ class BagWriter:
         self._messages = self._safe_bytes = 0
         self._error: BagError | None = None
         self._closed = False
+        self._metadata, self._made = self.path.with_name("metadata.yaml"), list[Path]()
+        fresh = not self.path.parent.exists()
         try:
             self.path.parent.mkdir(parents=True, exist_ok=True)
             self._file = open(self.path, "xb", buffering=1 << 20)
@@ -125,6 +128,7 @@ class BagWriter:
             raise BagError(f"{self.path} exists already. Record into another folder, or remove it.") from error
         except OSError as error:
             raise BagError(f"{self.path} cannot be written: {error.strerror}.") from error
+        self._made += [self.path.parent, self.path] if fresh else [self.path]
         self._writer = Writer(self._file, chunk_size=CHUNK_BYTES, compression=CompressionType.ZSTD,
                               enable_data_crcs=True)  # fmt: skip
         self._guard(lambda: self._writer.start(profile="ros2"))
@@ -202,12 +206,24 @@ class BagWriter:
             self._closed = True
             self._drop_file()
 
+    def discard(self) -> None:
+        """Closes and removes what was made."""
+        self._closed = True
+        self._drop_file()
+        for made in reversed(self._made):
+            with suppress(OSError):  # a folder in which somebody has put something since stays
+                made.rmdir() if made.is_dir() else made.unlink()
+
     def _finish(self) -> None:
         information = self._information()
         self._writer.add_metadata("rosbag2", {"ROS_DISTRO": ROS_DISTRO, "serialized_metadata": _yaml(information)})
         self._writer.finish()
         self._file.flush()
-        (self.path.parent / "metadata.yaml").write_text(_yaml({"rosbag2_bagfile_information": information}))
+        if self._metadata.exists() and self.path.name not in _files_of(self._metadata):
+            log.warning("%s is another recording's and stays; %s is whole without one", self._metadata, self.path)
+            return
+        self._made.append(self._metadata)
+        self._metadata.write_text(_yaml({INFORMATION: information}))
 
     def _information(self) -> dict[str, Any]:
         first, last = self._times or (0, 0)
@@ -283,6 +299,14 @@ def _topic_metadata(topic: _Topic) -> dict[str, Any]:
         "offered_qos_profiles": qos,
         "type_description_hash": topic.type_hash,
     }
+
+
+def _files_of(metadata: Path) -> list[str]:
+    """The files of the recording that a metadata.yaml describes; none if it describes none."""
+    try:
+        return list(YAML(typ="safe").load(metadata.read_text())[INFORMATION]["relative_file_paths"])
+    except (YAMLError, OSError, UnicodeDecodeError, TypeError, KeyError):
+        return []
 
 
 def _yaml(value: Any) -> str:

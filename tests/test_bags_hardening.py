@@ -208,6 +208,53 @@ def test_the_command_says_what_is_missing_and_exits_with_1(bag, tmp_path, capsys
         assert stmpl(capsys, "info", refused)[0] == stmpl(capsys, "recover", refused)[0] == 1
 
 
+def test_a_recording_without_one_sound_message_is_refused_and_leaves_nothing(bag, tmp_path, capsys):
+    data = bag.read_bytes()
+    first = next(place for place, kind, _ in summary(bag).places if kind == CHUNK)
+    for length in (0, 1, 8, 20, first - 1, first, first + 50):
+        broken = tmp_path / "broken.mcap"
+        broken.write_bytes(data[:length])
+        code, said = stmpl(capsys, "recover", broken, "--target", tmp_path / "back")
+        assert code == 1 and said.startswith("stmpl: ") and "\n" not in said, (length, said)
+        assert not (tmp_path / "back").exists() and broken.read_bytes() == data[:length]
+    with BagWriter(tmp_path / "empty"):
+        pass
+    code, said = stmpl(capsys, "recover", tmp_path / "empty")
+    assert code == 0 and said.startswith("0 messages") and "nothing is missing" in said
+
+
+def test_another_recording_beside_a_recovered_one_keeps_its_metadata(bag, tmp_path, capsys):
+    beside = bag.with_name("metadata.yaml")
+    before = beside.read_text()
+    assert stmpl(capsys, "recover", bag, "--target", bag.with_name("sound.mcap"))[0] == 0
+    assert beside.read_text() == before and whole(list(walk(bag.with_name("sound.mcap"))))
+    (bag.parent / "broken.mcap").write_bytes(bag.read_bytes()[:60])
+    assert stmpl(capsys, "recover", bag.parent / "broken.mcap", "--target", bag.with_name("none.mcap"))[0] == 1
+    assert beside.read_text() == before and {file.name for file in bag.parent.iterdir()} == {
+        bag.name, "metadata.yaml", "sound.mcap", "broken.mcap"}  # fmt: skip
+    bag.unlink()
+    with BagWriter(bag):
+        pass
+    assert "message_count: 0" in beside.read_text(), "its own is written anew"
+
+
+def test_a_recording_is_recovered_from_within_its_folder(bag, tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(bag.parent)
+    code, said = stmpl(capsys, "recover", bag.name)
+    assert code == 0, said
+    assert whole(list(walk(bag.parent.with_name("run-recovered"))))
+
+
+def test_a_recovery_that_is_interrupted_leaves_nothing_that_looks_whole(bag, tmp_path, monkeypatch):
+    def interrupted(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(BagWriter, "attach", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        recover(bag, tmp_path / "back")
+    assert not (tmp_path / "back").exists()
+
+
 @pytest.mark.parametrize("junk", [b"x", b"\0" * 400, None], ids=["a byte", "noughts", "another"])
 def test_what_stands_behind_the_end_of_a_recording_is_told_and_nothing_is_lost(tmp_path, capsys, caplog, junk):
     run = write_run(tmp_path / "run", Winkler(), layer=tube(edge=9e-3), frames=8)
