@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import json
-import multiprocessing
 import os
 import shutil
 import time
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import FIRST_COMPLETED, Executor, ProcessPoolExecutor, wait
+from concurrent.futures import FIRST_COMPLETED, Executor, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -30,6 +29,7 @@ from stmpl_core.body import Body
 from stmpl_core.errors import InvalidInput, StmplError
 from stmpl_core.extras import needed
 from stmpl_core.layer import SoftLayer
+from stmpl_core.pool import Pool
 from stmpl_core.provenance import versions
 
 ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
@@ -202,7 +202,7 @@ def _executor(workers: int | None, scheduler: str | None) -> Iterator[tuple[Exec
     before = {name: os.environ.get(name) for name in ONE_THREAD}
     os.environ.update(dict.fromkeys(ONE_THREAD, "1"))
     try:
-        with ProcessPoolExecutor(many, mp_context=multiprocessing.get_context("spawn")) as executor:
+        with Pool(many) as executor:
             yield executor, many
     finally:
         for name, value in before.items():

@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import logging
-import multiprocessing
 import os
 from collections.abc import Iterable, Sequence
-from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from functools import partial
 from logging.handlers import BufferingHandler
 
 from stmpl_core.errors import InvalidInput, StmplError
+from stmpl_core.pool import Pool
 from stmpl_core.sdf import MARGIN, SignedDistance
 from stmpl_core.tool import Tool
 
@@ -50,7 +49,7 @@ def fields_of(
     fields: list[SignedDistance | StmplError] = []
     if many > 1:
         try:
-            with ProcessPoolExecutor(many, multiprocessing.get_context("spawn")) as pool:
+            with Pool(many) as pool:
                 fields = _heard(pool.map(partial(_recorded, build), distinct.values()))
         except BrokenProcessPool:
             log.warning("the processes that build distance fields died; the fields are built one by one instead")

@@ -11,7 +11,7 @@ import time
 from collections.abc import Callable
 from types import FrameType
 
-from stmpl_ros.interrupts import endings, interrupt_in
+from stmpl_ros.interrupts import endings, interrupt_in, raise_swallowed_again
 
 TOLD_AFTER_S = 3.0  # time that kernels are compiled, before a verb tells of it [s]
 SILENT = ("node", "demo", "record", "info", "recover", "foxglove", "fmu")  # verbs that compile nothing, or tell of it
@@ -118,8 +118,10 @@ def _end_soon_after_a_signal(grace: float) -> None:
     Python's own handlers run between two steps of the main thread; a compiled call may keep it for longer.
     """
     ending = endings()
-    for number in ending[1:]:
-        signal.signal(number, _interrupt)
+    for number in ending:
+        if number != signal.SIGINT or signal.getsignal(number) is not signal.SIG_IGN:  # as of `stmpl ... &` in a script
+            signal.signal(number, _interrupt)
+    raise_swallowed_again()
     told, tell = os.pipe()
     os.set_blocking(tell, False)
     signal.set_wakeup_fd(tell, warn_on_full_buffer=False)

@@ -10,10 +10,8 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
-from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
 from datetime import datetime
-from multiprocessing import get_context
 from pathlib import Path
 
 from pydantic import BaseModel
@@ -31,6 +29,7 @@ from stmpl_core.errors import StmplError
 from stmpl_core.extras import needed
 from stmpl_core.friction import friction_from
 from stmpl_core.methods import method as method_named
+from stmpl_core.pool import Pool
 from stmpl_ros.massage_report import filmed, front, massaged, rows
 from stmpl_ros.parameters import DemoConfig
 from stmpl_ros.robot import TOOL
@@ -67,7 +66,7 @@ def run(config: DemoConfig) -> int:
     play(config, folder, console)
     _point_latest_at(folder)
 
-    with ProcessPoolExecutor(1, get_context("spawn")) as beside:
+    with Pool(1) as beside:
         filming = beside.submit(filmed, folder, config.robot) if config.device == "robot" else None
         replay = _replay(folder, config.node.method, console)
         # The frames of the grip take finite elements a minute each, and friction, which they lack: not compared.

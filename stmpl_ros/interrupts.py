@@ -1,8 +1,15 @@
-"""Interrupts: the signals that end a process, and where one comes in a call that tells of it by an error of its own."""
+"""Interrupts: the signals that end a process, also where one comes in what swallows it, or tells of it otherwise."""
 
 from __future__ import annotations
 
 import signal
+import sys
+import threading
+from contextlib import suppress
+from typing import Any
+
+AGAIN_S = 0.02  # time after which an interrupt that was swallowed is raised once more [s]
+_swallowed: list[KeyboardInterrupt] = []
 
 
 def endings() -> tuple[signal.Signals, ...]:
@@ -12,8 +19,25 @@ def endings() -> tuple[signal.Signals, ...]:
 
 
 def interrupt_in(error: BaseException) -> KeyboardInterrupt | None:
-    """The KeyboardInterrupt that an error tells of, as a compiled call or a compiler does; None: of none."""
+    """The KeyboardInterrupt that an error tells of, as a compiled call or a compiler does, or that was swallowed before
+    it; None: of none."""
     cause: BaseException | None = error
     while cause is not None and not isinstance(cause, KeyboardInterrupt):
         cause = cause.__cause__ or cause.__context__
-    return cause
+    return cause or next(iter(_swallowed), None)
+
+
+def raise_swallowed_again() -> None:
+    """From here on an interrupt that Python cannot raise where it comes (as something is deleted, in a callback of a
+    compiled library) is not printed with a traceback, but raised a moment later, where the process is then."""
+    before, main = sys.unraisablehook, threading.main_thread().ident
+
+    def heed(said: Any) -> None:
+        if not issubclass(said.exc_type, KeyboardInterrupt):
+            return before(said)
+        number = next(iter(said.exc_value.args), signal.SIGINT) if said.exc_value else signal.SIGINT
+        _swallowed.append(KeyboardInterrupt(number))
+        with suppress(RuntimeError):  # Python ends already
+            threading.Timer(AGAIN_S, signal.pthread_kill, (main, number)).start()  # which wakes what sleeps, too
+
+    sys.unraisablehook = heed

@@ -270,3 +270,23 @@ def test_outlines_have_their_own_area() -> None:
     assert ellipse(0.01, 0.02).area == pytest.approx(np.pi * 2e-4, rel=1e-9)
     assert isinstance(letter("O", 0.03), shapely.Polygon) and len(letter("O", 0.03).interiors) == 1
     assert np.diff(np.reshape(letter("K", 0.03).bounds, (2, 2)), axis=0)[0, 1] == pytest.approx(0.03)
+
+
+ENDING = """
+import os, signal, sys, time
+from fem_tools.generate import _executor
+with _executor(1, None) as (pool, _):
+    pool.submit(os.getpid).result()
+    pool.submit(time.sleep, 3600)
+    os._exit(3) if sys.argv[1] == "exit" else os.killpg(0, signal.SIGINT)
+    time.sleep(3600)
+"""
+
+
+@pytest.mark.parametrize("how", ["exit", "ctrl-c"])
+def test_workers_end_with_the_process_that_makes_data_and_say_nothing_of_ctrl_c(how):
+    """A worker that stays would hold the output open, and `run` would wait for it."""
+    ended = subprocess.run([sys.executable, "-c", ENDING, how], start_new_session=True, capture_output=True, text=True,
+                           preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL), timeout=120)  # fmt: skip
+    assert (ended.returncode == 3) == (how == "exit")
+    assert ended.stderr.count("Traceback") == (how == "ctrl-c")

@@ -1,5 +1,9 @@
 """Laws of what verbs print: an example is a line, a rate is one, and nothing is said of what nobody named."""
 
+import os
+import signal
+import subprocess
+import sys
 from contextlib import redirect_stdout
 from io import StringIO
 from pathlib import Path
@@ -71,3 +75,44 @@ def test_data_by_no_worker_are_refused_before_anything_is_made(tmp_path: Path, c
         main(["generate", "--preset", "tiny", "--workers", "0", "--out", str(tmp_path / "data")])
     assert ended.value.code == 1 and not (tmp_path / "data").exists()
     assert capsys.readouterr().err.endswith("--workers 0 makes nothing; give 1 or more.\n")
+
+
+SWALLOWED = """
+import os, signal, time
+from stmpl_ros import cli, interrupts
+class Left:
+    def __del__(self):
+        os.kill(os.getpid(), signal.SIGTERM)
+cli._end_soon_after_a_signal(60.0)
+try:
+    Left()
+    time.sleep(60)
+except KeyboardInterrupt as interrupt:
+    print(interrupt, repr(interrupts.interrupt_in(RuntimeError("no compiled object yet"))))
+"""
+
+
+def test_an_interrupt_that_python_swallows_is_raised_a_moment_later_and_known_to_what_fails_by_it() -> None:
+    ended = subprocess.run([sys.executable, "-c", SWALLOWED], capture_output=True, text=True)
+    assert (ended.returncode, ended.stdout, ended.stderr) == (0, "15 KeyboardInterrupt(15)\n", "")
+
+
+@pytest.mark.parametrize(("name", "ignored", "said"), [("stmpl", False, 0), ("stmpl", True, 0), ("mine.py", False, 1)])
+def test_ctrl_c_while_the_command_is_imported_ends_it_without_a_word(name, ignored, said, tmp_path: Path) -> None:
+    """Who imports stmpl hears Ctrl-C as ever; where a shell has it ignored, it stays so."""
+    (tmp_path / name).write_text("import os, signal, stmpl_ros\nos.kill(os.getpid(), signal.SIGINT)\n")
+    ended = subprocess.run(
+        [sys.executable, tmp_path / name], capture_output=True, text=True,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_IGN if ignored else signal.SIG_DFL),
+        env=os.environ | {"PYTHONPATH": str(Path(__file__).parents[1])},
+    )  # fmt: skip
+    assert ended.returncode == (0 if ignored else -signal.SIGINT) and ended.stderr.count("Traceback") == said
+
+
+def test_the_command_hears_ctrl_c_by_itself_once_it_runs(tmp_path: Path) -> None:
+    (tmp_path / "stmpl").write_text("import os, signal, sys\nfrom stmpl_ros import cli\n"
+                                    "cli._run = lambda given: os.kill(os.getpid(), signal.SIGINT)\ncli.main()\n")
+    ended = subprocess.run([sys.executable, tmp_path / "stmpl", "info"], capture_output=True, text=True,
+                           preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
+                           env=os.environ | {"PYTHONPATH": str(Path(__file__).parents[1])})  # fmt: skip
+    assert (ended.returncode, ended.stdout + ended.stderr) == (130, "")
