@@ -56,7 +56,8 @@ class BodyAction:
 
         try:
             stage = by_executor(self._node, self._begin, changes_of(goal.request), done)
-        except StmplError as error:
+        except StmplError as error:  # not rejected: ROS says no reason then
+            self._node.get_logger().warning(f"set_body refused: {error}")
             goal.abort()
             return SetBody.Result(message=str(error), layer_id=self._layer_id())
         while not finished.wait(FEEDBACK_S):

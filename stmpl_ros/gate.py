@@ -55,6 +55,10 @@ class Gate:
             self.drop("age", "a message was dropped, for there is no time yet: use_sim_time is set, and nothing was "
                       "heard on /clock")  # fmt: skip
             return False
+        if not stamp:
+            self.drop("age", "a message without a stamp was dropped: its header says the time 0. Its sender must say "
+                      "when it holds; max_age:=0 accepts any age.")  # fmt: skip
+            return False
         self.drop("age", f"a message stamped {abs(age):.2f} s {'before' if age > 0 else 'after'} now was dropped; "
                   f"allowed is {max_age} s{f': {self.clock}.' if self.clock else ASKS} max_age:=0 accepts any age.")
         return False

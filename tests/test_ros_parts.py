@@ -554,6 +554,30 @@ def test_the_action_says_whether_the_node_answers_on_the_new_skin(active, says):
     assert BodyAction._execute(action, goal).message == f"the node {says}"
 
 
+def test_a_goal_of_the_action_that_cannot_be_is_aborted_with_its_reason_and_logged():
+    lines, done = [], []
+    logger = SimpleNamespace(warning=lines.append)
+    node = SimpleNamespace(executor=SimpleNamespace(create_task=lambda do: do()), get_logger=lambda: logger)
+
+    def begin(changes, _):
+        raise InvalidInput(f"thickness is {changes['thickness']}")
+
+    action = SimpleNamespace(_node=node, _begin=begin, _layer_id=lambda: "before")
+    goal = SimpleNamespace(request=SetBody.Goal(thickness=-1.0), abort=lambda: done.append("aborted"))
+    result = BodyAction._execute(action, goal)
+    assert (result.success, result.message, result.layer_id) == (False, "thickness is -1.0", "before")
+    assert done == ["aborted"] and lines == ["set_body refused: thickness is -1.0"]
+
+
+def test_a_message_without_a_stamp_is_told_as_such():
+    logger = SimpleNamespace(warning=lambda line: None)
+    clock = SimpleNamespace(now=lambda: SimpleNamespace(nanoseconds=10**18))
+    gate = Gate(SimpleNamespace(get_logger=lambda: logger, get_clock=lambda: clock), Tally())
+    assert not gate.fresh(0, 1.0) and "without a stamp" in gate.dropped and "clocks in step" not in gate.dropped
+    assert not gate.fresh(10**9, 1.0) and "clocks in step" in gate.dropped
+    assert gate.fresh(0, 0.0), "any age"
+
+
 def test_a_time_below_0_on_the_clock_is_passed_over_and_told():
     with ros(["--ros-args", "-p", "use_sim_time:=true"]):
         node, executor, lines = rclpy.create_node("any"), EventsExecutor(), []
