@@ -22,6 +22,7 @@ from stmpl_core.rays import (
     depth_and_share,
     depth_in_column,
     distance_in_column,
+    led_in,
     ray_from,
     ray_of,
     sure_of,
@@ -419,6 +420,7 @@ def _sinking(grid, pose, points, inward, thickness, area, strain):
 
     On a limb that is no wider than its contact, columns along the normals meet the tool at a slant, and too deep. Those
     that lead out of its wall leave it too early: skin that is inside it sinks to where it ends along that way.
+    Where that way just passes the tool, or grazes it, skin sinks as far as beside it, where one surely leads through.
     """
     depth = strain * thickness
     way = _one_way(inward, area * depth)
@@ -429,11 +431,16 @@ def _sinking(grid, pose, points, inward, thickness, area, strain):
         guess = max(depth[n] * cosine, 1e-9)
         ray = ray_from(pose, points[n, 0], points[n, 1], points[n, 2], way[0], way[1], way[2])
         wall = wall_in(grid[3], thickness[n])
-        far, sure = depth_in_column(grid, ray, max(4 * guess, thickness[n]), guess), sure_of(grid, ray, guess, wall)
-        more = far * cosine - depth[n] if sure > 0 else depth[n]
-        if sure > 0 and more > 0:  # as far as its skin is inside the tool, and not at once
-            more *= min(max(1 - distance_in_column(grid, ray, 0.0) / wall, 0.0), depth[n] / wall, 1.0)
-        depth[n] += sure * more
+        sure = sure_of(grid, ray, guess, wall)
+        if sure <= -1:
+            depth[n] = 0.0
+            continue
+        ends = ray if sure == 1 else led_in(grid, ray, guess, wall)
+        more = depth_in_column(grid, ends, max(4 * guess, thickness[n]), guess) * cosine - depth[n]
+        if more > 0:  # as far as its skin is inside the tool, and not at once
+            inside = 1 - distance_in_column(grid, ray, 0.0) / wall
+            more *= max(sure, 0.0) * min(max(inside, 0.0), depth[n] / wall, 1.0)
+        depth[n] = (1 + min(sure, 0.0)) * (depth[n] + more)
     return depth
 
 

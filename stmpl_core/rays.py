@@ -6,13 +6,14 @@ import numba
 import numpy as np
 
 from stmpl_core.compiling import UNCOUNTED
-from stmpl_core.sdf import distance_at
+from stmpl_core.sdf import distance_at, jet_at
 
 WALL = 0.05  # width over which depth rises beside a tool's wall, over the thickness: nothing pops in while it slides
 PASSED, MOST_PASSED = 7, 64  # parts of a column's way between which it is looked how far it is inside a tool, or beside
 ENTERS, LOOKS_BACK = 12, 0.15  # steps to where a column enters a tool, cosine from which its surface looks back there
 LOOKED_AT = 0.2 * WALL  # way over which it is asked whether it does, over the thickness
 SURE = 0.2  # how far inside a tool, over the width of a wall, it is clear where a way ends; so far outside: nowhere
+LEAST_ASIDE = 0.1  # square of the slope aside from which it is known on which side of a way a tool is
 NOT_SUNK, ANYHOW = np.zeros(3), 8.0  # what is said of a tool that has not sunk under skin; more than that: anyhow, by
 UNSAID = np.full(3, ANYHOW + 1)  # a share that rises by 1
 MAX_COLUMN_STRAIN = 0.9  # strain beyond which no column is squeezed
@@ -138,6 +139,30 @@ def sure_of(grid, ray, deep, wall):
     if inside < SURE * wall:
         inside = inside_most(grid, ray, deep, inside, -SURE * wall)
     return min(max(inside / (SURE * wall), -1.0), 1.0)
+
+
+@numba.njit(cache=True, error_model="numpy", **UNCOUNTED)
+def led_in(grid, ray, deep, wall):
+    """A ray that passes the tool, or leads through its edge, moved aside until it is clear that it leads through it.
+
+    Args:
+        deep, wall: see `sure_of`.
+    """
+    at, least = 0.0, distance_in_column(grid, ray, 0.0)
+    step = max(min(0.5 * grid[3], deep / PASSED), deep / MOST_PASSED)
+    for k in range(1, MOST_PASSED + 1):
+        s = min(k * step, deep)
+        d = distance_in_column(grid, ray, s)
+        if d < least:
+            at, least = s, d
+        if not s < deep:
+            break
+    x, y, z = ray[0] + at * ray[3], ray[1] + at * ray[4], ray[2] + at * ray[5]
+    _, a, b, c = jet_at(grid[0], grid[1], grid[2], x, y, z)
+    straight = a * ray[3] + b * ray[4] + c * ray[5]
+    a, b, c = a - straight * ray[3], b - straight * ray[4], c - straight * ray[5]
+    aside = max(SURE * wall + least, 0.0) / max(a * a + b * b + c * c, LEAST_ASIDE)
+    return ray[0] - aside * a, ray[1] - aside * b, ray[2] - aside * c, ray[3], ray[4], ray[5]
 
 
 @numba.njit(forceinline=True, cache=True, error_model="numpy", **UNCOUNTED)

@@ -234,3 +234,25 @@ def test_skin_whose_tissue_nobody_measured_is_not_made_up() -> None:
         with pytest.raises(InvalidInput, match="was not measured: at least 100 % of that skin is"):
             ask()
     check(NodeConfig(part=around_name(living(body, "back", edge_length=COARSE).vertices[0], 0.07)), layer_of)
+
+
+@pytest.mark.parametrize(("part", "edge", "strain", "truth"), [
+    ("left_upper_arm", 8e-3, 0.7, 18.05), ("left_thigh", 11e-3, 0.5, 16.68), ("left_thigh", 11e-3, 0.6, 22.65),
+])  # fmt: skip
+def test_a_ball_that_sinks_under_the_skin_beside_it_presses_as_finite_elements_say(
+    part: str, edge: float, strain: float, truth: float
+) -> None:
+    """`python -m benchmarks.living_limbs` solves them: skin that just passes the ball is not pressed by it."""
+    from benchmarks.living_limbs import RADIUS, ball, site
+    from fem_tools import Press
+    from stmpl_core.sdf import SignedDistance
+
+    layer = living(Body.anny(), part, edge_length=edge)
+    vertex, pose = site(layer, part), np.eye(4)
+    normal = layer.normals[vertex]
+    pose[:3, 3] = layer.vertices[vertex] + (RADIUS + 0.01) * normal
+    press = Press(SignedDistance.of(ball(RADIUS), margin=0.04), pose, -normal).touching(layer)
+    assert press is not None
+    deep = press.at(strain * float(layer.thickness[vertex])).pose_body_from_tool
+    (touch,) = Simulator(layer, MomentNet()).touch([Contact(ball(RADIUS), deep)])
+    assert touch.force == pytest.approx(truth, rel=0.04)

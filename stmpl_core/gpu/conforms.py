@@ -15,13 +15,11 @@ from stmpl_core.gpu.packs import Scratch, Skins
 from stmpl_core.gpu.places import BY_POSE, REFUSED
 from stmpl_core.gpu.rays import (
     OPTIONS,
-    Grid,
     along,
-    cubic,
     depth_and_share,
     depth_in_column,
+    jet_at,
     real,
-    solid_jet,
     vec3,
     wall_in,
 )
@@ -37,59 +35,10 @@ wp.set_module_options({**OPTIONS, "max_unroll": 4})
 
 
 @wp.func
-def _slopes(f: real):
-    """Slopes of the weights of rays.cubic."""
-    g = real(1.0) - f
-    return wp.vec4d(real(-0.5) * g * g, real(1.5) * f * f - real(2.0) * f, real(2.0) * g - real(1.5) * g * g,
-                    real(0.5) * f * f)  # fmt: skip
-
-
-@wp.func
-def _jet(grid: Grid, coefficients: wp.array(dtype=real), at: vec3):
-    """Signed distance at a point of the tool's frame [m], and then its gradient: stmpl_core.sdf.jet_at."""
-    if grid.shape[0] == 1:
-        return solid_jet(grid, coefficients, at)
-    u = (at - grid.origin) / grid.spacing
-    first, inside = wp.vec3i(0, 0, 0), vec3()
-    for x in range(3):
-        inside[x] = wp.min(wp.max(u[x], real(1.0)), real(grid.shape[x]) - real(2.0))
-        first[x] = wp.min(wp.int32(inside[x]), grid.shape[x] - 3)
-    f, g, e = inside[0] - real(first[0]), inside[1] - real(first[1]), inside[2] - real(first[2])
-    a, b, c, da, db, dc = cubic(f), cubic(g), cubic(e), _slopes(f), _slopes(g), _slopes(e)
-    total, gradient = real(0.0), vec3()
-    for i in range(4):
-        plane = grid.offset + (first[0] - 1 + i) * grid.shape[1] * grid.shape[2]
-        sum, across, up = real(0.0), real(0.0), real(0.0)
-        for j in range(4):
-            k = plane + (first[1] - 1 + j) * grid.shape[2] + first[2] - 1
-            line, slope = real(0.0), real(0.0)
-            for m in range(4):
-                line += c[m] * coefficients[k + m]
-                slope += dc[m] * coefficients[k + m]
-            sum += b[j] * line
-            across += db[j] * line
-            up += b[j] * slope
-        total += a[i] * sum
-        gradient = gradient + vec3(da[i] * sum, a[i] * across, a[i] * up)
-    gradient = gradient / grid.spacing
-    off = (u - inside) * grid.spacing
-    away = wp.length_sq(off)
-    if away < real(1e-24):
-        return wp.vec4d(total, gradient[0], gradient[1], gradient[2])
-    root = wp.sqrt(away + total * total)
-    for x in range(3):
-        if wp.abs(off[x]) > real(1e-12):
-            gradient[x] = off[x] / root
-        else:
-            gradient[x] = total * gradient[x] / root
-    return wp.vec4d(root, gradient[0], gradient[1], gradient[2])
-
-
-@wp.func
 def _jet_of(skins: Skins, scratch: Scratch, c: wp.int32, at: vec3):
-    """The same at a point of the body's frame."""
+    """Signed distance to a tool at a point of the body's frame [m], and then its gradient."""
     pose, grid = scratch.pose[c], skins.grids[scratch.grid[c]]
-    jet = _jet(grid, skins.coefficients, wp.transpose(pose) * (at - scratch.place[c]))
+    jet = jet_at(grid, skins.coefficients, wp.transpose(pose) * (at - scratch.place[c]))
     gradient = pose * vec3(jet[1], jet[2], jet[3])
     return wp.vec4d(jet[0], gradient[0], gradient[1], gradient[2])
 

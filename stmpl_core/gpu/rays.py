@@ -6,6 +6,7 @@ import warp as wp
 from stmpl_core.rays import (
     ANYHOW,
     GRAZES,
+    LEAST_ASIDE,
     LOOKED_AT,
     MAX_COLUMN_STRAIN,
     MOST_PASSED,
@@ -29,7 +30,7 @@ PARTS, MOST_PARTS = wp.constant(wp.float64(PASSED)), wp.constant(wp.float64(MOST
 GRAZE = wp.constant(wp.float64(GRAZES))
 SAID_ANYHOW = wp.constant(wp.float64(ANYHOW))
 ENTERS, LOOKS_BACK = wp.constant(MOST_ENTERS), wp.constant(wp.float64(LOOKED_BACK))
-CLEAR = wp.constant(wp.float64(CLEAR_FROM))
+CLEAR, ASIDE = wp.constant(wp.float64(CLEAR_FROM)), wp.constant(wp.float64(LEAST_ASIDE))
 BEHIND = wp.constant(wp.float64(LOOKED_AT))
 IS_BOX, IS_CAPSULE, ON_AXIS = wp.constant(BOX), wp.constant(CAPSULE), wp.constant(wp.float64(NEAREST))
 START, TOLERANCE = wp.constant(wp.float64(SECANT_START)), wp.constant(wp.float64(SECANT_TOLERANCE))
@@ -146,6 +147,55 @@ def distance_at(grid: Grid, coefficients: wp.array(dtype=real), at: vec3) -> rea
 
 
 @wp.func
+def _slopes(f: real):
+    """Slopes of the weights of `cubic`."""
+    g = real(1.0) - f
+    return wp.vec4d(real(-0.5) * g * g, real(1.5) * f * f - real(2.0) * f, real(2.0) * g - real(1.5) * g * g,
+                    real(0.5) * f * f)  # fmt: skip
+
+
+@wp.func
+def jet_at(grid: Grid, coefficients: wp.array(dtype=real), at: vec3):
+    """Signed distance at a point of the tool's frame [m], and then its gradient: stmpl_core.sdf.jet_at."""
+    if grid.shape[0] == 1:
+        return solid_jet(grid, coefficients, at)
+    u = (at - grid.origin) / grid.spacing
+    first, inside = wp.vec3i(0, 0, 0), vec3()
+    for x in range(3):
+        inside[x] = wp.min(wp.max(u[x], real(1.0)), real(grid.shape[x]) - real(2.0))
+        first[x] = wp.min(wp.int32(inside[x]), grid.shape[x] - 3)
+    f, g, e = inside[0] - real(first[0]), inside[1] - real(first[1]), inside[2] - real(first[2])
+    a, b, c, da, db, dc = cubic(f), cubic(g), cubic(e), _slopes(f), _slopes(g), _slopes(e)
+    total, gradient = real(0.0), vec3()
+    for i in range(4):
+        plane = grid.offset + (first[0] - 1 + i) * grid.shape[1] * grid.shape[2]
+        sum, across, up = real(0.0), real(0.0), real(0.0)
+        for j in range(4):
+            k = plane + (first[1] - 1 + j) * grid.shape[2] + first[2] - 1
+            line, slope = real(0.0), real(0.0)
+            for m in range(4):
+                line += c[m] * coefficients[k + m]
+                slope += dc[m] * coefficients[k + m]
+            sum += b[j] * line
+            across += db[j] * line
+            up += b[j] * slope
+        total += a[i] * sum
+        gradient = gradient + vec3(da[i] * sum, a[i] * across, a[i] * up)
+    gradient = gradient / grid.spacing
+    off = (u - inside) * grid.spacing
+    away = wp.length_sq(off)
+    if away < real(1e-24):
+        return wp.vec4d(total, gradient[0], gradient[1], gradient[2])
+    root = wp.sqrt(away + total * total)
+    for x in range(3):
+        if wp.abs(off[x]) > real(1e-12):
+            gradient[x] = off[x] / root
+        else:
+            gradient[x] = total * gradient[x] / root
+    return wp.vec4d(root, gradient[0], gradient[1], gradient[2])
+
+
+@wp.func
 def along(grid: Grid, coefficients: wp.array(dtype=real), start: vec3, way: vec3, s: real) -> real:
     """Signed distance to the tool at depth s along a ray [m]."""
     return distance_at(grid, coefficients, start + s * way)
@@ -256,6 +306,25 @@ def inside_most(grid: Grid, coefficients: wp.array(dtype=real), start: vec3, way
 def sure_of(grid: Grid, coefficients: wp.array(dtype=real), start: vec3, way: vec3, deep: real, wall: real) -> real:
     """How clear it is that a ray leads through the tool to a depth [m], from -1, it passes beside it, to 1."""
     return wp.clamp(inside_most(grid, coefficients, start, way, deep) / (CLEAR * wall), real(-1.0), real(1.0))
+
+
+@wp.func
+def led_in(grid: Grid, coefficients: wp.array(dtype=real), start: vec3, way: vec3, deep: real, wall: real) -> vec3:
+    """Start of a ray that passes the tool, moved aside until it is clear that it leads through it."""
+    at, least = real(0.0), along(grid, coefficients, start, way, real(0.0))
+    step, k = wp.max(wp.min(real(0.5) * grid.half, deep / PARTS), deep / MOST_PARTS), wp.int32(1)
+    while k > 0:
+        s = wp.min(real(k) * step, deep)
+        d = along(grid, coefficients, start, way, s)
+        if d < least:
+            at, least = real(s), real(d)
+        k += 1
+        if not s < deep:
+            k = wp.int32(0)
+    jet = jet_at(grid, coefficients, start + at * way)
+    aside = vec3(jet[1], jet[2], jet[3])
+    aside = aside - wp.dot(aside, way) * way
+    return start - wp.max(CLEAR * wall + least, real(0.0)) / wp.max(wp.length_sq(aside), ASIDE) * aside
 
 
 @wp.func

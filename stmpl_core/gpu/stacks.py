@@ -11,7 +11,7 @@ from stmpl_core.gpu.blocks import sum_of, wait
 from stmpl_core.gpu.columns import _marked
 from stmpl_core.gpu.hold import FADE_RING, HARDENING, NEAR, RINGS, STACK_LINEAR_TO, STEPS, _row, _write, _write_alike
 from stmpl_core.gpu.packs import Scratch, Skins
-from stmpl_core.gpu.rays import OPTIONS, along, depth_in_column, real, sure_of, vec3, wall_in
+from stmpl_core.gpu.rays import OPTIONS, along, depth_in_column, led_in, real, sure_of, vec3, wall_in
 from stmpl_core.networks import STACK_NODE
 from stmpl_core.response import SPREAD as SPREAD_OF_AREA
 
@@ -68,17 +68,18 @@ def sink(lanes: wp.int32, many: wp.int32, skins: Skins, scratch: Scratch):
         if wp.length_sq(way) > real(0.0):
             pose, cosine = wp.transpose(scratch.pose[c]), wp.dot(scratch.inward[s, i], way)
             guess = wp.max(depth * cosine, real(1e-9))
-            start = pose * (scratch.point[s, i] - scratch.place[c])
+            start, goes = pose * (scratch.point[s, i] - scratch.place[c]), pose * way
             grid, thick = skins.grids[scratch.grid[c]], scratch.thick[s, i]
-            far = depth_in_column(grid, skins.coefficients, start, pose * way, wp.max(real(4.0) * guess, thick), guess)
-            wall, more = wall_in(grid, thick), real(depth)
-            sure = sure_of(grid, skins.coefficients, start, pose * way, guess, wall)
-            if sure > real(0.0):
-                more = far * cosine - depth
-                if more > real(0.0):
-                    inside = real(1.0) - along(grid, skins.coefficients, start, pose * way, real(0.0)) / wall
-                    more = more * wp.min(wp.clamp(inside, real(0.0), real(1.0)), depth / wall)
-            sinking += sure * more
+            wall, ends = wall_in(grid, thick), start + vec3()
+            sure = sure_of(grid, skins.coefficients, start, goes, guess, wall)
+            if sure < real(1.0):
+                ends = led_in(grid, skins.coefficients, start, goes, guess, wall)
+            more = depth_in_column(grid, skins.coefficients, ends, goes, wp.max(real(4.0) * guess, thick), guess)
+            more = more * cosine - depth
+            if more > real(0.0):
+                inside = real(1.0) - along(grid, skins.coefficients, start, goes, real(0.0)) / wall
+                more = more * wp.max(sure, real(0.0)) * wp.min(wp.clamp(inside, real(0.0), real(1.0)), depth / wall)
+            sinking = (real(1.0) + wp.min(sure, real(0.0))) * (depth + more)
         scratch.sinking[s, i] = sinking
 
 
