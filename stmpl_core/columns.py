@@ -431,15 +431,15 @@ def _sinking(grid, pose, points, inward, thickness, area, strain):
         guess = max(depth[n] * cosine, 1e-9)
         ray = ray_from(pose, points[n, 0], points[n, 1], points[n, 2], way[0], way[1], way[2])
         wall = wall_in(grid[3], thickness[n])
-        sure = sure_of(grid, ray, guess, wall)
+        sure, inside, where = sure_of(grid, ray, guess, wall)
         if sure <= -1:
             depth[n] = 0.0
             continue
-        ends = ray if sure == 1 else led_in(grid, ray, guess, wall)
+        ends = ray if sure == 1 else led_in(grid, ray, where, inside, wall)
         more = depth_in_column(grid, ends, max(4 * guess, thickness[n]), guess) * cosine - depth[n]
         if more > 0:  # as far as its skin is inside the tool, and not at once
-            inside = 1 - distance_in_column(grid, ray, 0.0) / wall
-            more *= max(sure, 0.0) * min(max(inside, 0.0), depth[n] / wall, 1.0)
+            begins = 1 - distance_in_column(grid, ray, 0.0) / wall
+            more *= max(sure, 0.0) * min(max(begins, 0.0), depth[n] / wall, 1.0)
         depth[n] = (1 + min(sure, 0.0)) * (depth[n] + more)
     return depth
 

@@ -295,7 +295,7 @@ def _inside(grid, ray, t, depth, least, top):
     beyond = min(1 - depth / (WALL * t), 1.0)
     if beyond <= 0:
         return depth
-    most = inside_most(grid, ray, max(depth_in_column(grid, ray, t, 0.0, 0.5 * t), 0.5 * t), depth, least)
+    most, _ = inside_most(grid, ray, max(depth_in_column(grid, ray, t, 0.0, 0.5 * t), 0.5 * t), depth, least)
     return depth + beyond * (most - depth) * sunk_under(grid, ray, t, top) if most > depth else depth
 
 

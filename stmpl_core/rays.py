@@ -108,7 +108,7 @@ def depth_in_column(grid, ray, t, guess, least=0.0):
 
 @numba.njit(forceinline=True, cache=True, error_model="numpy", **UNCOUNTED)
 def inside_most(grid, ray, deep, most, least):
-    """How far inside the tool a ray gets at most on its way to a depth [m]; below 0: how far it passes beside it.
+    """How far inside the tool a ray gets at most on its way to a depth [m], below 0: passes beside it; and where [m].
 
     It is looked as often as a plate of the tool's half thickness wants.
 
@@ -116,16 +116,17 @@ def inside_most(grid, ray, deep, most, least):
         most: how far inside it begins [m].
         least: value up to which the answer does not matter [m].
     """
-    at, there = 0.0, most
+    at, there, where = 0.0, most, 0.0
     step = max(min(0.5 * grid[3], deep / PASSED), deep / MOST_PASSED)
     for k in range(1, MOST_PASSED + 1):
         s = min(k * step, deep)
         if there + STEEPEST * (s - at) > max(most, least):
             at, there = s, -distance_in_column(grid, ray, s)
-            most = max(most, there)
+            if there > most:
+                most, where = there, s
         if not s < deep:
             break
-    return most
+    return most, where
 
 
 @numba.njit(forceinline=True, cache=True, error_model="numpy", **UNCOUNTED)
@@ -134,34 +135,29 @@ def sure_of(grid, ray, deep, wall):
 
     Args:
         wall: see `wall_in`.
+
+    Returns:
+        how clear; and how far it is inside, and where, see `inside_most`.
     """
-    inside = -distance_in_column(grid, ray, 0.0)
+    where, inside = 0.0, -distance_in_column(grid, ray, 0.0)
     if inside < SURE * wall:
-        inside = inside_most(grid, ray, deep, inside, -SURE * wall)
-    return min(max(inside / (SURE * wall), -1.0), 1.0)
+        inside, where = inside_most(grid, ray, deep, inside, -SURE * wall)
+    return min(max(inside / (SURE * wall), -1.0), 1.0), inside, where
 
 
 @numba.njit(cache=True, error_model="numpy", **UNCOUNTED)
-def led_in(grid, ray, deep, wall):
+def led_in(grid, ray, at, inside, wall):
     """A ray that passes the tool, or leads through its edge, moved aside until it is clear that it leads through it.
 
     Args:
-        deep, wall: see `sure_of`.
+        at, inside: where it is most inside, and how far [m]: see `inside_most`.
+        wall: see `wall_in`.
     """
-    at, least = 0.0, distance_in_column(grid, ray, 0.0)
-    step = max(min(0.5 * grid[3], deep / PASSED), deep / MOST_PASSED)
-    for k in range(1, MOST_PASSED + 1):
-        s = min(k * step, deep)
-        d = distance_in_column(grid, ray, s)
-        if d < least:
-            at, least = s, d
-        if not s < deep:
-            break
     x, y, z = ray[0] + at * ray[3], ray[1] + at * ray[4], ray[2] + at * ray[5]
     _, a, b, c = jet_at(grid[0], grid[1], grid[2], x, y, z)
     straight = a * ray[3] + b * ray[4] + c * ray[5]
     a, b, c = a - straight * ray[3], b - straight * ray[4], c - straight * ray[5]
-    aside = max(SURE * wall + least, 0.0) / max(a * a + b * b + c * c, LEAST_ASIDE)
+    aside = max(SURE * wall - inside, 0.0) / max(a * a + b * b + c * c, LEAST_ASIDE)
     return ray[0] - aside * a, ray[1] - aside * b, ray[2] - aside * c, ray[3], ray[4], ray[5]
 
 
@@ -215,7 +211,7 @@ def depth_and_share(grid, ray, t, top):
     if deep == 0 and guess > 0:
         deep = guess  # the skin is no deeper in the tool than distances are off by
     if share < 1 and sunk and deep > 0:
-        within = min(2 * inside_most(grid, ray, deep, guess, 0.5 * share * wall) / wall, 1.0)
+        within = min(2 * inside_most(grid, ray, deep, guess, 0.5 * share * wall)[0] / wall, 1.0)
         if within > share:
             share += (within - share) * sunk_under(grid, ray, t, top)
     return deep, share

@@ -82,7 +82,7 @@ def _along(grid, pose, points, inward, way, sinking, thickness):
         far = min(depth_in_column(grid, ray, 4 * depth, depth), FURTHEST * depth)
         wall = wall_in(grid[3], thickness[n])
         leaves = (distance_in_column(grid, ray, far) - distance_in_column(grid, ray, far - wall)) / wall
-        sure = sure_of(grid, ray, depth, wall)
+        sure, _, _ = sure_of(grid, ray, depth, wall)
         far = depth + min(max(sure, 0.0), max(leaves / LEAVES, 0.0), 1.0) * (far - depth)
         held[n] = 1 + min(sure, 0.0)
         for x in range(3):

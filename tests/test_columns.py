@@ -249,7 +249,7 @@ def test_places_along_a_column_that_are_not_looked_at_are_not_the_deepest(least:
     step = max(min(0.5 * grid_of(SLAB)[3], deep / PASSED), deep / MOST_PASSED)
     at = starts[:, None] + np.minimum(step * np.arange(MOST_PASSED + 1), deep)[:, None] * ways[:, None]
     inside = -SLAB.distance(at.reshape(-1, 3)).reshape(2000, -1)
-    found = [inside_most(grid_of(SLAB), (*start, *way), deep, first, least)
+    found = [inside_most(grid_of(SLAB), (*start, *way), deep, first, least)[0]
              for start, way, first in zip(starts, ways, inside[:, 0], strict=True)]  # fmt: skip
     assert np.maximum(found, least) == pytest.approx(np.maximum(inside.max(axis=1), least), abs=1e-12)
 
