@@ -250,31 +250,46 @@ def test_a_manager_hears_the_beats(composed):
     composed.wait(lambda: not beats[-1].active)
 
 
+class Held(NamedTuple):
+    """Fields that wait: `begun` is set once the thread has taken one up, and none is found until `released` is."""
+
+    begun: threading.Event
+    released: threading.Event
+
+
 @pytest.fixture
-def held(composed, monkeypatch) -> Iterator[threading.Event]:
-    """An event until which no field is found, once the node has answered."""
+def held(composed, monkeypatch) -> Iterator[Held]:
+    """Fields wait, once the node has answered."""
     composed.wait(lambda: composed.press() and composed.heard)
     composed.wait(lambda: composed.node.answering._field.idle)
-    released, answer = threading.Event(), composed.node.answering._fields.answer
-    monkeypatch.setattr(composed.node.answering._fields, "answer", lambda touches: released.wait() and answer(touches))
-    yield released
-    released.set()
+    held, answer = Held(threading.Event(), threading.Event()), composed.node.answering._fields.answer
+
+    def answer_later(touches):
+        held.begun.set()
+        held.released.wait()
+        return answer(touches)
+
+    monkeypatch.setattr(composed.node.answering._fields, "answer", answer_later)
+    yield held
+    held.released.set()
 
 
 def test_reactions_do_not_wait_for_a_field_and_the_newest_instant_gets_the_next(composed, held):
-    wrenches, pressed, topic = [], [], "tools/finger/contact_wrench"
+    wrenches, topic = [], "tools/finger/contact_wrench"
     before = composed.node.answering._instant.stamp
 
     def fields() -> list[int]:
         return [stamp_ns(one) for one in composed.heard if one.fade == 1 and one.touches and stamp_ns(one) > before]
 
     composed.node.create_subscription(WrenchStamped, topic, wrenches.append, STREAM)
-    composed.wait(lambda: pressed.append(composed.press()) or len({stamp_ns(one) for one in wrenches}) > 5)
+    composed.wait(lambda: composed.press() and held.begun.is_set())
+    wrenches.clear()
+    composed.wait(lambda: composed.press() and len({stamp_ns(one) for one in wrenches}) > 5)
     assert not fields(), "none was found meanwhile"
     assert all(one.wrench.force.x < 0 for one in wrenches)
     composed.wait(lambda: composed.node.hearing.inbox.live(time.monotonic_ns()) == {})  # what was sent is heard
     newest = composed.node.answering._instant.stamp
-    held.set()
+    held.released.set()
     composed.wait(lambda: newest in fields())
     assert len(fields()) == 2 and fields()[-1] == newest, "the one that was begun, and the newest; none between"
     values = composed.node.tally.values()
@@ -282,12 +297,12 @@ def test_reactions_do_not_wait_for_a_field_and_the_newest_instant_gets_the_next(
 
 
 def test_what_is_solved_while_the_node_starts_anew_is_not_sent(composed, held):
-    composed.wait(lambda: composed.press() and not composed.node.answering._field.idle)
+    composed.wait(lambda: composed.press() and held.begun.is_set())
     begun = composed.node.answering._instant.stamp
     composed.node.reset()
     composed.wait(lambda: not composed.heard[-1].touches)
     heard = len(composed.heard)
-    held.set()
+    held.released.set()
     composed.wait(lambda: composed.node.answering._field.idle)
     composed.wait(lambda: composed.press() and len(composed.heard) > heard)
     assert composed.heard[heard].touches and composed.node.tally.refused == 0
@@ -434,24 +449,24 @@ def test_a_setting_too_small_to_mean_anything_is_refused(composed, name, least):
 
 def test_a_field_whose_time_is_over_before_it_is_begun_is_not_begun(composed, held, monkeypatch):
     answering, asked = composed.node.answering, []
-    composed.wait(lambda: composed.press() and not answering._field.idle)
+    composed.wait(lambda: composed.press() and held.begun.is_set())
     begun = answering._instant
     composed.wait(lambda: composed.press() and answering._instant is not begun)  # one more waits
     composed.wait(lambda: composed.node.hearing.inbox.live(time.monotonic_ns()) == {})  # what was sent is heard
     monkeypatch.setattr(answering._fields, "answer", asked.append)
     composed.node.reset()
-    held.set()
+    held.released.set()
     composed.wait(lambda: answering._field.idle)
     assert not asked and composed.node.tally.refused == 0
 
 
 def test_another_surface_of_a_tool_ends_the_field_on_the_one_from_before(composed, held):
-    composed.wait(lambda: composed.press() and not composed.node.answering._field.idle)
+    composed.wait(lambda: composed.press() and held.begun.is_set())
     begun = composed.node.answering._instant.stamp
     known = composed.node.hearing.tools["finger"]
     composed.announce(ball(0.008).named("finger"))
     composed.wait(lambda: composed.node.hearing.tools["finger"] is not known)
-    held.set()
+    held.released.set()
     composed.wait(lambda: composed.node.answering._field.idle)
     answered = composed.press()
     composed.wait(lambda: stamp_ns(composed.heard[-1]) >= answered or not composed.press())
