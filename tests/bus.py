@@ -35,15 +35,18 @@ def wait_for(done: Callable[[], Any], what: str, *nodes: rclpy.node.Node, second
 
 def start(*arguments: str, **options: Any) -> subprocess.Popen:
     """A Python process from the repository's root with these arguments."""
-    return subprocess.Popen([sys.executable, *arguments], stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
-                            text=True, cwd=ROOT, **options)  # fmt: skip
+    return subprocess.Popen([sys.executable, "-X", "faulthandler", *arguments], stdout=subprocess.PIPE,
+                            stderr=subprocess.STDOUT, text=True, cwd=ROOT, **options)  # fmt: skip
 
 
 def end(process: subprocess.Popen, number: int | None = None) -> tuple[int, str]:
-    """Exit code of a process and what it said, after a signal if one is given."""
+    """Exit code of a process and what it said, after a signal if one is given; of one that hangs, where it does."""
     if number is not None:
         process.send_signal(number)
     try:
+        said, _ = process.communicate(timeout=PATIENCE)
+    except subprocess.TimeoutExpired:
+        process.send_signal(signal.SIGABRT)  # faulthandler tells of each thread, whatever holds the interpreter
         said, _ = process.communicate(timeout=PATIENCE)
     finally:
         process.kill()
