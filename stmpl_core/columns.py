@@ -12,11 +12,10 @@ import numpy as np
 from stmpl_core.arrays import Points, Transform
 from stmpl_core.compiling import UNCOUNTED
 from stmpl_core.layer import SoftLayer
-from stmpl_core.nodes import Nodes, nodes_under
+from stmpl_core.nodes import Nodes, met_between, nodes_under
 from stmpl_core.rays import (
     ANYHOW,
     NOT_SUNK,
-    STEEPEST,
     UNSAID,
     WALL,
     depth_and_share,
@@ -29,7 +28,7 @@ from stmpl_core.rays import (
     to_tool,
     wall_in,
 )
-from stmpl_core.sdf import SignedDistance, distance_at
+from stmpl_core.sdf import SignedDistance
 from stmpl_core.soundness import too_long
 from stmpl_core.touch import MIN_ONE_WAY_SHARE
 
@@ -154,7 +153,7 @@ class Columns:
         if not len(self.long):
             return 0.0
         finest = FINEST * float(self.layer.thickness.min())
-        return _between(grid_of(field), pose, self.points, self.faces[self.long], reach, finest)
+        return met_between(grid_of(field), pose, self.points, self.faces[self.long], reach, finest)
 
     def squeezed(self, field: SignedDistance, pose: Transform) -> Squeeze:
         """Squeeze of the columns by a tool at its pose."""
@@ -280,39 +279,6 @@ def _nearest(points, skin, order, blocks):
                 if away < far:
                     far, out[n] = away, v
     return out
-
-
-@numba.njit(cache=True, nogil=True)
-def _between(grid, pose, points, faces, reach, finest):
-    """See Columns.between: triangles (F, 3) are halved, down to a size [m], where the distance says too little."""
-    parts = np.empty((64, 3, 3))
-    for f in range(len(faces)):
-        for c in range(3):
-            parts[0, c] = points[faces[f, c]]
-        whole, count = 0.0, 1
-        while count > 0:
-            count -= 1
-            part = parts[count].copy()
-            x, y, z = part[:, 0].mean(), part[:, 1].mean(), part[:, 2].mean()
-            u, v, w = to_tool(pose, x, y, z)
-            d, size, long, at = distance_at(grid[0], grid[1], grid[2], u, v, w), 0.0, 0.0, 0
-            for c in range(3):
-                size = max(size, (part[c, 0] - x) ** 2 + (part[c, 1] - y) ** 2 + (part[c, 2] - z) ** 2)
-                edge = ((part[(c + 1) % 3] - part[c]) ** 2).sum()
-                if edge > long:
-                    long, at = edge, c
-            size, whole = np.sqrt(size), max(whole, np.sqrt(long))
-            if d < reach:
-                return whole
-            if size < finest or d - STEEPEST * size > reach:
-                continue
-            middle = 0.5 * (part[at] + part[(at + 1) % 3])
-            parts[count] = part
-            parts[count, at] = middle
-            parts[count + 1] = part
-            parts[count + 1, (at + 1) % 3] = middle
-            count += 2
-    return 0.0
 
 
 @numba.njit(cache=True, nogil=True)

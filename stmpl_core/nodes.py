@@ -38,6 +38,7 @@ CHARTS = 6  # charts of a tool that closes around a limb
 ASKEW = 0.3  # angle between lattice and tool [rad]: no row of a round or square tool's rim comes in all at once
 BESIDE = 0.6  # farthest that a part of a triangle reaches from its middle, over its side
 SAMPLES = 200  # points, about, from which the covered area is reckoned
+LEAST_PART = 5e-3  # side of a part of a triangle down to which a tip is looked for, over the thickness
 BLEND = 0.1  # part of the way from a spacing that sees the area to the next, over which one gives way to the other
 
 
@@ -131,27 +132,22 @@ def nodes_under(grid, pose, centre, points, inward, thickness, faces, found, top
     split = 1
     while split < 8 and len(found) * split**2 < SAMPLES:
         split += 1
-    depths, middles, ways, sizes, edges, best, area, thick = _look(
-        grid, pose, points, inward, thickness, faces, found, top, split
-    )
-    rows = np.empty((0, 15))
-    if area > 0:
-        chart, frames = _charts(pose, found, depths, ways, sizes, best)
-        scene = (grid, pose, centre, points, inward, thickness, faces, found, top, split, thick, depths, middles, edges,
-                 chart, frames)  # fmt: skip
-        unit = NODES * thick * thick
-        step = np.floor(np.log2(area / unit))
-        seen, _ = _lay(*scene, area, _cell(step, thick), True)
-        if seen > 0:
-            beyond = np.log2(seen / unit) - step
-            if not BLEND <= beyond <= 1 - BLEND:
-                other = step + 1 if beyond > 0.5 else step - 1
-                also, _ = _lay(*scene, area, _cell(other, thick), True)
-                fine, coarse = (seen, also) if other > step else (also, seen)
-                if fine > 0:
-                    share = (np.log2(fine / unit) - max(step, other)) / BLEND + 0.5
-                    seen = fine + min(max(share, 0.0), 1.0) * (coarse - fine)
-            _, rows = _lay(*scene, seen, seen / NODES, False)
+    rows, least = np.empty((0, 15)), np.inf
+    for f in found:
+        least = min(least, LEAST_PART * thickness[faces[f, 0]])
+    while len(found):
+        depths, middles, ways, sizes, edges, best, area, thick = _look(
+            grid, pose, points, inward, thickness, faces, found, top, split
+        )
+        if area > 0:
+            rows = _laid(grid, pose, centre, points, inward, thickness, faces, found, top, split, thick, depths,
+                         middles, edges, *_charts(pose, found, depths, ways, sizes, best), area)  # fmt: skip
+        if len(rows) or edges.max() < least:
+            break
+        split, met = 2 * split, np.empty(len(found), np.bool_)
+        for m in range(len(found)):  # a tip may be between the places that were looked at
+            met[m] = met_between(grid, pose, points, faces[found[m : m + 1]], 0.0, least) > 0
+        found = found[met]
     count = len(rows)
     corners = np.empty((count, 3), np.int64)
     for n in range(count):
@@ -159,6 +155,76 @@ def nodes_under(grid, pose, centre, points, inward, thickness, faces, found, top
             corners[n, c] = int(rows[n, 9 + c])
     return (rows[:, 0:3].copy(), rows[:, 3:6].copy(), rows[:, 6].copy(), rows[:, 7].copy(), rows[:, 8].copy(), corners,
             rows[:, 12:15].copy())  # fmt: skip
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy", **UNCOUNTED)
+def _met(grid, pose, parts, reach, finest):
+    """See met_between: of the triangle in the first row; parts: room for 64 parts, their corners, (64, 9) [m]."""
+    whole, count = 0.0, 1
+    while count > 0:
+        part = parts[count - 1]
+        x, y, z = part[0] + part[3] + part[6], part[1] + part[4] + part[7], part[2] + part[5] + part[8]
+        x, y, z = x / 3, y / 3, z / 3
+        d, size, long, at = _distance(grid, pose, x, y, z), 0.0, 0.0, 0
+        for c in range(3):
+            a, b = 3 * c, 3 * ((c + 1) % 3)
+            size = max(size, (part[a] - x) ** 2 + (part[a + 1] - y) ** 2 + (part[a + 2] - z) ** 2)
+            edge = (part[b] - part[a]) ** 2 + (part[b + 1] - part[a + 1]) ** 2 + (part[b + 2] - part[a + 2]) ** 2
+            if edge > long:
+                long, at = edge, c
+        size, whole = np.sqrt(size), max(whole, np.sqrt(long))
+        if d < reach:
+            return whole
+        count -= 1
+        if size < finest or d - STEEPEST * size > reach:
+            continue
+        a, b, other = 3 * at, 3 * ((at + 1) % 3), parts[count + 1]
+        for x in range(9):
+            other[x] = part[x]
+        for x in range(3):
+            other[b + x] = 0.5 * (part[a + x] + part[b + x])
+            part[a + x] = other[b + x]
+        count += 2
+    return 0.0
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def met_between(grid, pose, points, faces, reach, finest):
+    """Length of one of triangles (F, 3) that a tool meets or is within `reach` of [m]; 0 if there is none.
+
+    They are halved, down to a size [m], where the distance says too little.
+    """
+    parts = np.empty((64, 9))
+    for f in range(len(faces)):
+        for c in range(3):
+            for x in range(3):
+                parts[0, 3 * c + x] = points[faces[f, c], x]
+        long = _met(grid, pose, parts, reach, finest)
+        if long > 0:
+            return long
+    return 0.0
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _laid(grid, pose, centre, points, inward, thickness, faces, found, top, split, thick, depths, middles, edges,
+          chart, frames, area):  # fmt: skip
+    """Rows of a lattice, see `_lay`, for an area that is covered by what was looked at [m2]."""
+    scene = (grid, pose, centre, points, inward, thickness, faces, found, top, split, thick, depths, middles, edges,
+             chart, frames)  # fmt: skip
+    unit = NODES * thick * thick
+    step = np.floor(np.log2(area / unit))
+    seen, _ = _lay(*scene, area, _cell(step, thick), True)
+    if not seen > 0:
+        return np.empty((0, 15))
+    beyond = np.log2(seen / unit) - step
+    if not BLEND <= beyond <= 1 - BLEND:
+        other = step + 1 if beyond > 0.5 else step - 1
+        also, _ = _lay(*scene, area, _cell(other, thick), True)
+        fine, coarse = (seen, also) if other > step else (also, seen)
+        if fine > 0:
+            share = (np.log2(fine / unit) - max(step, other)) / BLEND + 0.5
+            seen = fine + min(max(share, 0.0), 1.0) * (coarse - fine)
+    return _lay(*scene, seen, seen / NODES, False)[1]
 
 
 @numba.njit(cache=True, inline="always")

@@ -39,6 +39,7 @@ MOST_OPENINGS, NO_POINTS = 1000, np.empty((0, 3))  # places at the rims of holes
 CHECKED, ALIKE = 100, 3  # places at which a field is checked, and how many of these say what it is off at one
 NO_CHECKS = np.empty((0, 4))
 MOST_CHECKS = CHECKED + 27  # number of them with those farthest out
+TIPS, STANDS_OUT = 64, 0.05  # corners that are known, and how far they stand out at least, over the spacing
 PROBED, THICK = 600, 5e-3  # places of a tool from which its thickness is told, and the largest half of it [m]
 ROUNDING_WIDTH = 0.57  # width of the smoothing over the radius that it gives a right-angled edge, measured
 
@@ -70,6 +71,7 @@ class SignedDistance:
         checks: places spread over the surface, and those farthest out, with how far that is off around each: the least
             of ALIKE places, as edges are off by more than faces, (K, 4) [m]; none where edges are rounded on purpose.
         openings: places at the rims of its holes, (K, 3) [m].
+        tips: corners of the mesh that stand out of the rounded surface, farthest first, at most TIPS, (K, 3) [m].
     """
 
     coefficients: np.ndarray
@@ -82,6 +84,7 @@ class SignedDistance:
     half_thickness: float = math.inf
     checks: np.ndarray = field(default_factory=lambda: NO_CHECKS)
     openings: Points = field(default_factory=lambda: NO_POINTS)
+    tips: Points = field(default_factory=lambda: NO_POINTS)
 
     @classmethod
     def of(
@@ -125,8 +128,10 @@ class SignedDistance:
             if len(places) else NO_CHECKS
         rims = NO_POINTS if watertight else openings(vertices, faces)
         rims = rims[:: 1 + len(rims) // MOST_OPENINGS]
+        out = _distances(coefficients, origin, spacing, used)
+        tips = used[[n for n in np.argsort(-out)[:TIPS] if out[n] > STANDS_OUT * spacing]]
         box = used.min(axis=0), used.max(axis=0)
-        built = cls(coefficients, origin, spacing, watertight, flipped, error, box, half, checks, rims)
+        built = cls(coefficients, origin, spacing, watertight, flipped, error, box, half, checks, rims, tips)
         if coefficients.nbytes <= MOST_KEPT_BYTES:
             _KEPT[key] = built
             for old in list(_KEPT)[:-MOST_KEPT]:

@@ -507,7 +507,7 @@ class Toucher:
         bound += SHELL * max(held.shell - SHELL_FROM, 0.0)
         if size > 0 and not layer.stacked:
             bound += SHALLOW * max(1 - depth / (SHALLOW_TO * thickness), 0.0)
-        beside_off = abs(1 / scale - 1) if len(v) and one.force is not None else 0.0  # each was placed as if alone
+        beside_off = 0.0 if one.force is None else abs(1 / scale - 1) if len(v) else 1.0  # each was placed as if alone
         if beside_off > 2 * FORCE_TOLERANCE:
             bound += beside_off
         bound += STUCK * along + held.power * below / max(depth, below, 1e-300)  # the skin is no facets
@@ -516,7 +516,7 @@ class Toucher:
         touch = Touch(
             one.contact.name, one.status, one.pose, wrench,
             depth=depth if math.isfinite(depth) else float("nan"),
-            force_bound=size * bound * wider if size > 0 else math.nan if one.lost else 0.0,
+            force_bound=size * bound * wider if size > 0 else math.nan if one.lost else one.force or 0.0,
             moved=one.moved,
             missing=np.zeros(6) if stated is None else stated - wrench,
             pressure=values,
@@ -549,6 +549,12 @@ class Toucher:
             trust = trust.also(f"{name} asks for a torque without a force, which is not carried", in_range=False)
         if one.why:
             trust = trust.also(one.why, in_range=False)
+        if not touch.force and not covered and one.status in (APART, BY_POSE) and one.depth > -self.hole:
+            deep = self._tip(one)
+            if deep > 0:
+                trust = trust.also(f"a tip of {name} is {1e3 * deep:.2g} mm in the skin and presses nothing: it is "
+                                   f"narrower than its distance field, of {1e3 * one.field.spacing:.2g} mm, tells",
+                                   in_range=False)  # fmt: skip
         if not len(pressure):
             deep = not touch.depth <= MAX_AROUND * self._thickest
             if one.status == BY_POSE and deep and not covered:  # else others took its skin
@@ -599,6 +605,18 @@ class Toucher:
         if one.field.flipped:
             trust = trust.also(f"the mesh of {name} was inside out and was turned")
         return trust
+
+    def _tip(self, one: _Placed) -> float:
+        """How deep a tip of the tool is in the skin that its distance field may not tell [m]; 0: none is so deep."""
+        if not len(one.field.tips):
+            return 0.0
+        at = one.field.tips @ one.pose[:3, :3].T + one.pose[:3, 3]
+        v = self.columns.nearest(at)
+        away = at - self.columns.points[v]
+        deep = np.einsum("nx,nx->n", away, self._inward[v])
+        beside = np.linalg.norm(away - deep[:, None] * self._inward[v], axis=1)
+        known = (beside < self.layer.edge_length) & (deep > 2 * FIRST * self.layer.thickness[v])
+        return float(deep[known].max(initial=0.0))
 
     def _too_thick(self, touch: Touch) -> str:
         """What is said of columns that run along the normals to beyond the middle of a limb; empty: they do not.

@@ -278,7 +278,7 @@ def answer(first: wp.int32, many: wp.int32, known: Known, skins: Skins, scratch:
         depths[n, k] = depths.dtype(depth)
         bounds[n, k] = bounds.dtype(real(0.0))
         may = -depth < grid.mostly_off and grid.mostly_off > TWICE_FIRST * one.thickest
-        in_range[n, k] = not around and not far and not may
+        in_range[n, k] = not around and not far and not may and scratch.misses[c] == 0
         return
     force, torque, forces, strange, doubt = vec3(), vec3(), real(0.0), real(0.0), real(0.0)
     total, below, wrong = real(0.0), real(0.0), real(0.0)

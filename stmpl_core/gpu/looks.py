@@ -8,9 +8,11 @@ import warp as wp
 from stmpl_core import nodes as law
 from stmpl_core.gpu.blocks import least_of, most_of, sum_of
 from stmpl_core.gpu.packs import Scratch, Skins
-from stmpl_core.gpu.places import PENDING
-from stmpl_core.gpu.rays import FAR, OPTIONS, depth_at, mat33, real, vec3
+from stmpl_core.gpu.places import APART, PENDING
+from stmpl_core.gpu.rays import FAR, OPTIONS, depth_at, distance_at, mat33, real, vec3
 
+FINER = wp.constant(16)  # parts of the side of a part, between which no tip is looked for
+BESIDE, GRAZED = wp.constant(wp.float64(law.BESIDE)), wp.constant(wp.float64(1e-3))  # the latter over the thickness
 SAMPLES, CHARTS = wp.constant(law.SAMPLES), wp.constant(law.CHARTS)
 FACING, ONE_WAY = wp.constant(wp.float64(law.FACING)), wp.constant(wp.float64(law.ONE_WAY))
 COS_ASKEW, SIN_ASKEW = wp.constant(wp.float64(math.cos(law.ASKEW))), wp.constant(wp.float64(math.sin(law.ASKEW)))
@@ -59,6 +61,7 @@ def begin(scratch: Scratch):
     while split < 8 and scratch.many[c] * split * split < SAMPLES:
         split += 1
     scratch.split[c] = split
+    scratch.misses[c] = 0
     if scratch.status[c] != PENDING:
         scratch.many[c] = 0
 
@@ -83,6 +86,30 @@ def look(lanes: wp.int32, skins: Skins, scratch: Scratch):
         start, way = pose * (middle - scratch.place[c]), pose * inward_on(skins, f, shares)
         t = thickness_on(skins, f, shares)
         scratch.depths[c, n] = depth_at(grid, skins.coefficients, start, way, t, top)
+
+
+@wp.kernel
+def search(lanes: wp.int32, skins: Skins, scratch: Scratch):
+    """Which tools have no nodes and meet skin between the places that were looked at."""
+    c, lane = wp.tid()
+    if scratch.status[c] != APART or scratch.nearest[c] >= skins.one[scratch.skin[c]].hole:
+        return
+    split, pose, grid = scratch.split[c], wp.transpose(scratch.pose[c]), skins.grids[scratch.grid[c]]
+    parts = split * split
+    for n in range(lane, scratch.many[c] * parts, lanes):
+        f = scratch.found[c, n // parts]
+        corners, whole = skins.faces[f], _shares_of_part(split, n % parts)
+        edge = wp.length(skins.points[corners[0]] - skins.points[corners[1]]) / real(split)
+        row = whole[0] * real(split)
+        turn = real(1.0)
+        if row - wp.floor(row) > real(0.5):
+            turn = real(-1.0)
+        if scratch.depths[c, n] > -BESIDE * edge:
+            for q in range(FINER * FINER):
+                a = _shares_of_part(FINER, q) - vec3(real(1.0), real(1.0), real(1.0)) / real(3.0)
+                start = pose * (point_on(skins, f, whole + turn / real(split) * a) - scratch.place[c])
+                if distance_at(grid, skins.coefficients, start) < -GRAZED * skins.thickness[corners[0]]:
+                    scratch.misses[c] = 1
 
 
 @wp.func

@@ -111,7 +111,7 @@ SCRATCH: dict[str, tuple[Any, str]] = {
     "pose": (mat33, "C"), "place": (vec3, "C"), "centre": (vec3, "C"), "wide": (wp.int32, "C"),
     "near": (wp.uint32, "CB"), "covered": (wp.uint32, "CB"), "seen": (wp.uint32, "CB"),
     "columns": (wp.int32, "CM"), "count": (wp.int32, "C"), "least": (real, "CM"), "above": (real, "CM"),
-    "under": (real, "CM"), "nearest": (real, "C"), "around": (real, "C"), "top": (vec3, "C"),
+    "under": (real, "CM"), "nearest": (real, "C"), "misses": (wp.int32, "C"), "around": (real, "C"), "top": (vec3, "C"),
     "found": (wp.int32, "CF"), "many": (wp.int32, "C"), "split": (wp.int32, "C"), "deep": (real, "C"),
     "depths": (real, "CP"), "middles": (vec3, "CP"), "ways": (vec3, "CF"), "sizes": (real, "CF"),
     "chart": (wp.int32, "CF"), "sides": (wp.int32, "C"), "axes": (mat33, "C6"), "deepest": (real, "C"),

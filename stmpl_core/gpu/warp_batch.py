@@ -375,6 +375,7 @@ class WarpBatch:
                     self._run(lattice.list_nodes, (scenes, self._block), many, side, scratch)
                     self._run(lattice.fill_nodes, (scenes, lanes), lanes, many, skins, scratch)
         self._run(lattice.tell, scenes, many, scratch)
+        self._run(looks.search, shared, lanes, skins, scratch)
 
     def _hold(self, tools: int) -> None:
         """Pressures at the nodes: the linear problem, then the network."""

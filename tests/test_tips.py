@@ -1,0 +1,108 @@
+"""Laws of tips: needles and cones narrower than the places at which skin is looked at press, or it is told."""
+
+import numpy as np
+import pytest
+import trimesh
+
+from stmpl_core import Contact, Simulator, Tool
+from stmpl_core.arrays import Transform
+from stmpl_core.batch import Batch
+from stmpl_core.body import Body
+from stmpl_core.living import living
+from stmpl_core.methods import MomentNet
+from stmpl_core.skin import Skin
+from tests.scenes import ball, limb, press
+from tests.scenes import tool as named
+
+LAYERS = {"one material": limb(6e-3), "stack": living(Body.anny(), "left_forearm", edge_length=6e-3)}
+NEEDLE = trimesh.creation.cylinder(3e-4, 0.05, sections=16)
+NEEDLE.vertices[:, 2] += 0.025
+
+
+def cone(radius: float, height: float) -> trimesh.Trimesh:
+    """A cone whose tip is at the origin and points against z."""
+    mesh = trimesh.creation.cone(radius, height, sections=24)
+    mesh.vertices[:, 2] = height - mesh.vertices[:, 2]
+    mesh.invert()
+    return mesh
+
+
+TIPS = {"needle": named(NEEDLE), "pencil": named(cone(3.5e-3, 0.02))}
+
+
+@pytest.fixture(scope="module", params=LAYERS)
+def simulator(request: pytest.FixtureRequest) -> Simulator:
+    return Simulator(LAYERS[request.param], MomentNet())
+
+
+def places(simulator: Simulator, depth: float, count: int = 6) -> list[Transform]:
+    """Poses of a tool whose tip is at its origin, so deep in the skin [m]: over vertices, beside these, and between."""
+    layer, out = simulator.layer, []
+    middle = np.linalg.norm(layer.vertices - layer.vertices.mean(axis=0), axis=1).argsort()
+    for v in middle[: 7 * count : 7]:
+        n = layer.normals[v]
+        across = np.cross(n, [0.0, 1.0, 0.0] if abs(n[1]) < 0.9 else [1.0, 0.0, 0.0])
+        across /= np.linalg.norm(across)
+        for beside in (0.0, 2e-4, 5e-4, 2e-3):
+            pose = np.eye(4)
+            pose[:3, :3] = np.column_stack([across, np.cross(n, across), n])
+            pose[:3, 3] = layer.vertices[v] + beside * across - depth * n
+            out.append(pose)
+    return out
+
+
+def forces(simulator: Simulator, tip: Tool, depth: float) -> np.ndarray:
+    return np.array([simulator.touch([Contact(tip, pose)])[0].force for pose in places(simulator, depth)])
+
+
+@pytest.mark.parametrize("tip", TIPS)
+def test_a_tip_presses_wherever_it_comes_and_the_harder_the_deeper_it_is(simulator, tip):
+    """Where it came over a vertex, or missed all that was looked at, it was apart and trusted at any depth."""
+    by_depth = np.array([forces(simulator, TIPS[tip], depth) for depth in (1e-3, 2e-3, 4e-3)])
+    assert (by_depth > 0).all()
+    assert (np.diff(by_depth, axis=0) > 0).all()
+    assert by_depth[1].max() < 1.7 * by_depth[1].min()
+
+
+def test_a_tip_that_the_distance_field_does_not_tell_is_flagged(simulator):
+    thin = named(cone(1e-3, 0.03))
+    touches = [simulator.touch([Contact(thin, pose)])[0] for pose in places(simulator, 1e-3)]
+    unfelt = [touch for touch in touches if not touch.force]
+    assert unfelt and not any(touch.trust.ok for touch in unfelt)
+    assert all("a tip of probe is 1 mm in the skin" in touch.trust.why for touch in unfelt)
+    assert simulator.touch([Contact(thin, places(simulator, -1e-3)[0])])[0].trust.ok, "it is off"
+
+
+def test_a_batch_on_a_gpu_s_kernels_presses_likewise_or_flags():
+    pytest.importorskip("warp")
+    from stmpl_core.gpu.warp_batch import WarpBatch
+
+    skin = Skin.of(LAYERS["stack"], MomentNet())
+    poses = np.array(places(Simulator(skin), 2e-3))[:, None]
+    for tip in TIPS.values():
+        ours, there = (
+            Batch(skin, [tip], len(poses)).touch(poses),
+            WarpBatch(skin, [tip], len(poses), device="cpu").touch(poses),
+        )
+        wrenches, in_range = np.asarray(there.wrenches), np.asarray(there.in_range)
+        served = wrenches[:, 0, :3].any(axis=1)
+        assert not in_range[~served].any()
+        np.testing.assert_allclose(wrenches[served], ours.wrenches[served], atol=1e-6)
+
+
+def test_a_tool_whose_skin_others_pushed_away_says_that_it_does_not_press_as_asked():
+    simulator = Simulator(LAYERS["stack"], MomentNet())
+    layer = simulator.layer
+    v = int(np.linalg.norm(layer.vertices - layer.vertices.mean(axis=0), axis=1).argmin())
+    across = np.cross(layer.normals[v], [0.0, 1.0, 0.0])
+    beside = layer.vertices[v] + 0.018 * across / np.linalg.norm(across)
+    u = int(np.linalg.norm(layer.vertices - beside, axis=1).argmin())
+
+    def pressed(name: str, radius: float, vertex: int, force: float) -> Contact:
+        pose = np.eye(4)
+        pose[:3, 3] = layer.vertices[vertex] + radius * layer.normals[vertex]
+        return press(ball(radius), pose, tuple(-force * layer.normals[vertex]), name)
+
+    _, small = simulator.touch([pressed("big", 0.02, v, 3.0), pressed("small", 0.008, u, 0.04)])
+    assert small.force == 0 and small.force_bound == pytest.approx(0.04, rel=0.02)
+    assert not small.trust.ok and "100% off" in small.trust.why
