@@ -53,7 +53,7 @@ class History:
 
     def __init__(self, toucher: Toucher, friction: Friction | Mapping[str, Friction] = None) -> None:
         self.toucher, layer = toucher, toucher.layer
-        self._friction = coefficients(friction)
+        self.frictions = coefficients(friction)
         thickness = float(np.median(layer.thickness))
         self.series = series_of(layer.tissue, thickness)
         self._fades = fading(layer.tissue, thickness)
@@ -83,7 +83,7 @@ class History:
     @property
     def rubs(self) -> bool:
         """Whether any tool rubs."""
-        every, some = self._friction
+        every, some = self.frictions
         return bool(every) or any(some.values())
 
     @cached_property
@@ -98,7 +98,7 @@ class History:
 
     def friction(self, name: str) -> float:
         """Coefficient of friction of a tool [-]."""
-        every, some = self._friction
+        every, some = self.frictions
         return some.get(name, every)
 
     def step(self, contacts: Sequence[Contact], state: State, dt: float) -> tuple[list[Touch], State]:

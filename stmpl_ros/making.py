@@ -146,8 +146,11 @@ def warm_up(simulator: Simulator) -> None:
     """Solves one contact of each kind, so that nothing is left to compile when the first real one comes.
 
     Where time and friction count, they are one press that slides; where joints bend the skin, all is done bent and at
-    rest. The deepest reaches into the core. Of each comes a local model. Last two tools press at one place.
+    rest. The deepest reaches into the core. Of each comes a local model. Last two tools press at one place. All rub as
+    the roughest of those whose friction is told.
     """
+    frictions = every, some = simulator.history.frictions
+    simulator.history.frictions = max(every, *some.values(), 0.0), {}
     corners = 0.01 * np.array([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1]])
     faces = np.array([[0, 2, 4], [2, 1, 4], [1, 3, 4], [3, 0, 4], [2, 0, 5], [1, 2, 5], [3, 1, 5], [0, 3, 5]])
     tool, rig, state = Tool("warm up", corners, faces), simulator.layer.rig, State()
@@ -156,6 +159,7 @@ def warm_up(simulator: Simulator) -> None:
             state = simulator.move_to(simulator.skin.at_angles(angles), state)
         state = _press(simulator, tool, state)
     simulator.tools.remove(tool.name)
+    simulator.history.frictions = frictions
 
 
 def _press(simulator: Simulator, tool: Tool, state: State) -> State:

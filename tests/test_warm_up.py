@@ -31,7 +31,7 @@ from tests.test_posing import hinged
 layer = limb(8e-3)
 simulator = Simulator(layer.with_(rig=hinged(layer)), MomentNet(), friction=friction_from(sys.argv[1]))
 warm_up(simulator)
-assert simulator.skin.angles == () and not len(simulator.tools)
+assert simulator.skin.angles == () and not len(simulator.tools) and simulator.history.friction("else") in (0, 0.4)
 before, state, push = kernels(), State(), np.array([0, -0.3, 0, 0, 0, 0])
 for angle in (0.0, 0.4):
     simulator.move_to(simulator.skin.at_angles([angle]))
@@ -77,7 +77,7 @@ def test_nothing_is_left_to_compile_once_the_clock_of_a_robot_runs(friction):
     assert (code, said) == (0, "[]\n")
 
 
-@pytest.mark.parametrize("friction", ["none", "0.4"])
+@pytest.mark.parametrize("friction", ["none", "0.4", "other: 0.1, probe: 0.4"])
 def test_nothing_is_left_to_compile_when_a_tool_comes_to_a_limb_at_rest_or_bent(friction):
     """In a process that touched nothing before."""
     code, said = end(start("-c", FRESH, friction))
