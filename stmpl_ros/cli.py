@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import atexit
 import errno
 import os
 import signal
@@ -9,6 +10,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from types import FrameType
 
 from stmpl_ros.interrupts import endings, interrupt_in, raise_swallowed_again
@@ -45,7 +47,7 @@ VERBS = {  # module of each verb's function, and what it does
 
 def main(arguments: list[str] | None = None) -> None:
     """Runs a verb; exits with its code, or with 1 and one sentence if it refuses."""
-    given = list(sys.argv[1:] if arguments is None else arguments)
+    given, number = list(sys.argv[1:] if arguments is None else arguments), 0
     try:
         if arguments is None:
             _end_soon_after_a_signal(PATIENT.get(given[0] if given else "", GRACE))
@@ -53,16 +55,31 @@ def main(arguments: list[str] | None = None) -> None:
         if sys.stdout:  # None: `stmpl ... >&-`
             sys.stdout.flush()
     except KeyboardInterrupt as interrupt:
-        code = 128 + next(iter(interrupt.args), signal.SIGINT)
+        number = next(iter(interrupt.args), signal.SIGINT)
     except (SystemError, RuntimeError) as error:  # how a call or a compiler tells of an interrupt that came in it
         interrupt = interrupt_in(error)
         if interrupt is None:
             raise
-        code = 128 + next(iter(interrupt.args), signal.SIGINT)
+        number = next(iter(interrupt.args), signal.SIGINT)
     except BrokenPipeError:  # `stmpl ... | head`
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         code = 0
-    sys.exit(code)
+    if number and arguments is None:
+        _end(128 + number)
+    sys.exit(128 + number if number else code)
+
+
+def _end(code: int) -> None:
+    """Ends the process, once it has done what it is to do as it ends.
+
+    Python does not take itself apart: a thread that an interrupt ended may have left a lock that what is deleted then
+    would wait for, when the thread that ends what takes too long is gone.
+    """
+    atexit._run_exitfuncs()
+    for stream in filter(None, (sys.stdout, sys.stderr)):
+        with suppress(OSError, ValueError):
+            stream.flush()
+    os._exit(code)
 
 
 def _run(given: list[str]) -> int:

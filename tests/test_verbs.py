@@ -49,6 +49,7 @@ def test_ctrl_c_ends_a_verb_without_a_word_from_its_first_step_on(monkeypatch, c
         raise KeyboardInterrupt
 
     monkeypatch.setattr("stmpl_ros.cli._end_soon_after_a_signal", interrupted)
+    monkeypatch.setattr("stmpl_ros.cli._end", sys.exit)  # which ends this process, too
     with pytest.raises(SystemExit) as ended:
         main()
     assert ended.value.code == 130 and capsys.readouterr() == ("", "")
@@ -116,3 +117,30 @@ def test_the_command_hears_ctrl_c_by_itself_once_it_runs(tmp_path: Path) -> None
                            preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
                            env=os.environ | {"PYTHONPATH": str(Path(__file__).parents[1])})  # fmt: skip
     assert (ended.returncode, ended.stdout + ended.stderr) == (130, "")
+
+
+LOCKED = """
+import atexit, gc, os, signal, sys, threading, weakref
+from stmpl_ros import cli
+lock = threading.Lock()
+class Pool:
+    pass
+pool = Pool()
+pool.itself, last = pool, weakref.ref(pool, lambda _: lock.acquire())
+gc.disable()
+del pool
+atexit.register(print, "told")
+def run(given):
+    lock.acquire()  # as a pool's thread that an interrupt ended
+    os.kill(os.getpid(), signal.SIGTERM)
+cli._run = run
+cli.main()
+"""
+
+
+def test_what_an_interrupt_ends_waits_for_no_lock_that_nobody_gives_back(tmp_path: Path) -> None:
+    """Python's own end did, for ever: `stmpl generate`, two of 14 times."""
+    (tmp_path / "stmpl").write_text(LOCKED)
+    ended = subprocess.run([sys.executable, tmp_path / "stmpl", "info"], capture_output=True, text=True, timeout=60,
+                           env=os.environ | {"PYTHONPATH": str(Path(__file__).parents[1])})  # fmt: skip
+    assert (ended.returncode, ended.stdout, ended.stderr) == (143, "told\n", "")
