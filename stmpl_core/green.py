@@ -14,10 +14,11 @@ that is thin here and thick there.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from contextlib import suppress
 from copy import copy
 from functools import cache, cached_property, lru_cache
-from typing import NamedTuple
+from typing import Any, NamedTuple
 from weakref import WeakKeyDictionary
 
 import numba
@@ -60,7 +61,7 @@ TAKEN_BACK = 0.5  # most that the limb takes back of what a node does to itself 
 AS_AT_REST = np.empty((0, 3, 3))  # turns of vertices that did not turn
 NO_COARSE = (np.empty((0, 3), np.int64), np.empty((0, 3)), np.empty(0), np.empty((0, 3, 0), np.float32),
              AS_AT_REST)
-_KEPT: WeakKeyDictionary[SoftLayer, Green] = WeakKeyDictionary()  # entries die with their layers
+_KEPT: WeakKeyDictionary[SoftLayer, Green | Callable[[], Green]] = WeakKeyDictionary()  # entries die with their layers
 
 
 class _OfOne(NamedTuple):
@@ -80,6 +81,13 @@ class _OfOne(NamedTuple):
     roots: np.ndarray
     rows: np.ndarray
     scales: np.ndarray
+
+
+class _AtRest[T](cached_property[T]):
+    """What a skin has as it is at rest, wherever joints take it: made there, when somebody first wants it."""
+
+    def __get__(self, instance: Any, owner: type | None = None) -> T:
+        return super().__get__(instance and (instance._at_rest or instance), owner)
 
 
 class Green:
@@ -106,7 +114,7 @@ class Green:
             self.tables, self.soft = bank(layer.tissue, self.thickness, softness), softness.at(layer, self.thickness)
         else:
             self.tables, self.soft = _of_one(layer.tissue.poisson_ratio), np.zeros(len(layer.vertices))
-        self._turns = self._skin_turns = AS_AT_REST
+        self._skin_turns = AS_AT_REST
         self._at_rest: Green | None = None
         self._last: tuple[np.ndarray, tuple[np.ndarray, np.ndarray]] | None = None
 
@@ -117,14 +125,21 @@ class Green:
         Raises:
             InvalidInput, MeshError: the skin cannot be meshed coarsely.
         """
-        if layer not in _KEPT:
-            _KEPT[layer] = cls(layer, CoarseResponse.of(layer) if layer.stacked else None)
-        return _KEPT[layer]
+        kept = _KEPT.get(layer)
+        if not isinstance(kept, Green):
+            kept = _KEPT[layer] = kept() if kept else cls(layer, CoarseResponse.of(layer) if layer.stacked else None)
+        return kept
 
     @staticmethod
     def kept(layer: SoftLayer) -> Green | None:
         """The response of a layer, if it was made."""
-        return _KEPT.get(layer)
+        kept = _KEPT.get(layer)
+        return kept if isinstance(kept, Green) else None
+
+    @staticmethod
+    def keep_for(layer: SoftLayer, make: Callable[[], Green]) -> None:
+        """Lets `of` make the response of a layer so, when it is wanted; `make` must not hold the layer itself."""
+        _KEPT[layer] = make
 
     def keep(self, layer: SoftLayer) -> None:
         """Lets `of` give this one for another layer, of the same shape and the same ratios of moduli."""
@@ -145,34 +160,38 @@ class Green:
             turns: rotation of each vertex from rest, (V, 3, 3).
         """
         out = self.stiffened(layer, near)
-        vars(out).pop("_of_one", None)
+        for name in ("_of_one", "_turns"):
+            vars(out).pop(name, None)
         out._skin_turns, out._at_rest = turns, self._at_rest or self
-        mesh = self.coarse or vars(out._at_rest).get("drag")  # what was not needed so far is not made for a pose
-        if mesh is not None:
-            out._turns = _turns_of_coarse(mesh.corners, mesh.shares, turns, len(mesh.gathered))
+        if self.coarse is not None or "drag" in vars(out._at_rest):  # what nobody wanted so far is not made for a pose
+            _ = out._turns
         return out
 
     @cached_property
+    def _turns(self) -> np.ndarray:
+        """Rotation of each coarse vertex from rest, (C, 3, 3); none at rest, or where there is no coarse part."""
+        mesh = self.coarse or self.drag if len(self._skin_turns) else None
+        if mesh is None:
+            return AS_AT_REST
+        return _turns_of_coarse(mesh.corners, mesh.shares, self._skin_turns, len(mesh.gathered))
+
+    @_AtRest
     def drag(self) -> CoarseDrag | None:
         """The wide part where skin is dragged along, made or read on the first call; None: as flat skin.
 
         Raises:
             InvalidInput, MeshError: a stack's skin cannot be meshed coarsely.
         """
-        if self._at_rest is not None:
-            return self._at_rest.drag
         if self.coarse is not None:
             return CoarseDrag.of(self.layer)
-        if not self.near.posed and np.median(np.abs(self.near.curvature[:, ::2]).max(axis=1)) > FLAT:
+        if np.median(np.abs(self.near.curvature[:, ::2]).max(axis=1)) > FLAT:
             with suppress(StmplError):  # of one material flat skin is an answer, too
                 return CoarseDrag.of(self.layer.with_(tissue=Tissue(ANY_MODULUS, self.layer.tissue.poisson_ratio)))
         return None
 
-    @cached_property
+    @_AtRest
     def _give(self) -> np.ndarray:
         """CoarseDrag.give at each vertex of the skin, (V, 3, 3) [1/m]."""
-        if self._at_rest is not None:
-            return self._at_rest._give
         assert self.drag is not None
         return np.einsum("va,vaxy->vxy", self.drag.shares, self.drag.give[self.drag.corners])
 
@@ -195,7 +214,7 @@ class Green:
         """What kernels take of the coarse part; all empty if there is none."""
         return (*self.coarse[:4], self._turns) if self.coarse is not None else NO_COARSE
 
-    @cached_property
+    @_AtRest
     def _by_source(self) -> np.ndarray:
         """Motion of coarse vertices by where the pressure is, (C, 3 C) float32 [m]."""
         assert self.coarse is not None
@@ -210,12 +229,12 @@ class Green:
         """Softness at nodes, (N,)."""
         return (self.soft[nodes.corners] * nodes.shares).sum(axis=1)
 
-    @cached_property
+    @_AtRest
     def effective(self) -> Effective:
         """See the class."""
         return effective(self.layer.tissue, self.thickness)
 
-    @cached_property
+    @_AtRest
     def numbers(self) -> np.ndarray:
         """What networks read of the stack, (4,): logarithms of t over that of the flat stack, kappa, T / (E t), and E.
 
@@ -225,7 +244,7 @@ class Green:
         return np.log([one.thickness / self.thickness, one.kappa + LEAST_KAPPA, one.pull + LEAST_PULL,
                        self.layer.tissue.youngs_modulus / one.youngs_modulus])  # fmt: skip
 
-    @cached_property
+    @_AtRest
     def hardening(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """How columns harden, of tissue whose materials begin as deep as it says.
 

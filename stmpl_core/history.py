@@ -52,7 +52,8 @@ class History:
     """
 
     def __init__(self, toucher: Toucher, friction: Friction | Mapping[str, Friction] = None) -> None:
-        self.toucher, layer = toucher, toucher.layer
+        self.toucher = toucher
+        self._rest = layer = toucher.layer
         self.frictions = coefficients(friction)
         thickness = float(np.median(layer.thickness))
         self.series = series_of(layer.tissue, thickness)
@@ -62,8 +63,8 @@ class History:
 
     @cached_property
     def sideways(self) -> Sideways:
-        """Stiffness of the layer to what sticks to it."""
-        return Sideways(self.toucher.layer)
+        """Stiffness of the layer at rest to what sticks to it."""
+        return Sideways(self._rest)
 
     def moved(self, toucher: Toucher) -> History:
         """The same history where joints take the skin."""

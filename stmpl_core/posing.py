@@ -8,6 +8,7 @@ turns with the skin there. So a pose costs milliseconds where a new layer costs 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from copy import copy
 from typing import TYPE_CHECKING
 
 import numba
@@ -84,10 +85,8 @@ class Posing:
         _between(self._bending, self._corners, self._shares, change, near.frames, curvature)
         moved = near.moved(layer, frames, curvature, Bend(self._zone, layer, curvature))
         moved.keep(layer)
-        green = rest.green or Green.kept(rest.layer)  # of one material, if somebody asked for it
-        if green is not None:
-            green = green.moved(layer, moved, _turns(weights, quaternions))
-            green.keep(layer)
+        keep_green(rest, layer, moved, angles)
+        green = Green.of(layer) if rest.green or Green.kept(rest.layer) else None  # of one material, when it is wanted
         stacks = green if rest.green is not None else None
         return rest.at(layer, anew(rest.method).prepare(layer), moved, stacks, tuple(angles))
 
@@ -101,6 +100,24 @@ class Posing:
         _curved(layer.vertices, layer.normals, frames, self.rest.near.thickness, turns, self._places, self._start,
                 self._index, out)  # fmt: skip
         return out
+
+
+def keep_green(rest: Skin, layer: SoftLayer, near: Surroundings, angles: Sequence[float]) -> None:
+    """Lets Green.of give the rest skin's own response for a layer that is this skin posed, made when it is wanted.
+
+    Args:
+        rest: skin at rest.
+        layer, near: layer where its joints took it, and its neighbours.
+        angles: angle of each joint of the rig there [rad].
+    """
+    there, rig = copy(layer), rest.layer.rig
+    assert rig is not None
+
+    def make() -> Green:
+        turns = _turns(rig.weights, _quaternions(rig.motions(angles)))
+        return (rest.green or Green.of(rest.layer)).moved(there, near, turns)
+
+    Green.keep_for(layer, make)
 
 
 def posed(layer: SoftLayer, angles: Sequence[float]) -> SoftLayer:

@@ -66,8 +66,6 @@ class Simulator:
         else:
             skin = Skin.of(layer, method)
         self._stand_on(skin.rest or skin)
-        if self._green is not None:
-            self._green.keep(self.layer)  # a Skin from another process has a layer of its own
         self.toucher = Toucher(self.layer, self.skin.near, tools)
         self.history = History(self.toucher, friction)
         self.remembers = friction is not None or self.layer.tissue.relaxes

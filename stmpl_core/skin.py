@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -38,6 +38,17 @@ class Skin:
     green: Green | None = None
     angles: tuple[float, ...] = ()
     rest: Skin | None = None
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """What is kept by the layer is kept anew: one from another process has a layer of its own."""
+        from stmpl_core.posing import keep_green
+
+        vars(self).update(state)
+        self.near.keep(self.layer)
+        if self.green is not None:
+            self.green.keep(self.layer)
+        elif self.rest is not None:
+            keep_green(self.rest, self.layer, self.near, self.angles)
 
     @classmethod
     def of(cls, layer: SoftLayer, method: Method) -> Skin:

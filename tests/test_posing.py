@@ -1,6 +1,7 @@
 """Laws of a limb whose joints move: what a pose keeps, what turns with it, what it spoils and says so."""
 
 import json
+import pickle
 from dataclasses import replace
 from typing import Any
 
@@ -13,10 +14,12 @@ from benchmarks.posing import JOINT, sites
 from benchmarks.posing import arm as arm_of
 from fem_tools import IndenterFem, PatchFem, Press
 from stmpl_core import Answer, Contact, Membrane, Ply, Simulator, Skin, SoftLayer, State, Tissue
+from stmpl_core.batch import Batch
 from stmpl_core.body import Body
 from stmpl_core.bones import Bone, to_bone
 from stmpl_core.errors import InvalidInput
 from stmpl_core.green import Green
+from stmpl_core.history import History
 from stmpl_core.layer import layer_id
 from stmpl_core.load import Load
 from stmpl_core.methods import Coarse, Linear, MomentNet, Winkler
@@ -27,6 +30,7 @@ from stmpl_core.rig import Joint, Rig
 from stmpl_core.sdf import SignedDistance
 from stmpl_core.soundness import HOLLOW
 from stmpl_core.state import UNKNOWN, Scalars
+from stmpl_core.toucher import Toucher
 from stmpl_ros.making import MOVED
 from tests.scenes import LENGTH, RADIUS, at, ball, limb
 
@@ -446,3 +450,40 @@ def test_what_a_round_limb_of_one_material_gives_goes_along_and_is_not_found_aga
     turn = bent.turn_at(vertex)
     np.testing.assert_allclose(there, turn @ here @ turn.T, atol=1e-6 * np.abs(here).max())
     assert np.abs(here).max() > 0 and np.abs(there - here).max() > 0.05 * np.abs(here).max()
+
+
+def told(simulator: Simulator, vertex: int) -> tuple[np.ndarray, ...]:
+    """Wrench and motion under a ball that is drawn over a skin, with a state, and under one that is just there."""
+    layer, state, touches = simulator.layer, State(), []
+    for way in (0.0, 1e-3):
+        pose = pressed(layer, vertex)
+        pose[:3, 3] += way * np.cross(layer.normals[vertex], [0.6, 0, 0.8])
+        touches, state = simulator.touch([Contact(ball(), pose)], state, 0.02)
+    alone = simulator.touch([Contact(ball(), pressed(layer, vertex, 3e-3))])
+    return touches[0].wrench, simulator.answer(touches).displacement, alone[0].wrench
+
+
+@pytest.mark.parametrize("tissue", [Tissue(), STACK], ids=["one material", "stack to the bone"])
+def test_what_was_done_with_a_skin_before_does_not_tell_on_it_where_it_is_bent(tissue):
+    layer = limb(7e-3).with_(tissue=tissue)
+    if not tissue.single:
+        layer = to_bone(layer, [Bone(np.array([0.0, 0, -1]), np.array([0.0, 0, 1]), 0.012)])
+    skin = Skin.of(layer.with_(rig=hinged(layer)), MomentNet())
+    vertex, first = near(layer, (RADIUS, 0, MIDDLE[2])), skin.posed({"elbow": -0.4})
+    elsewhere = pickle.loads(pickle.dumps(first))
+    before = told(Simulator(first, friction=0.4), vertex)
+    told(Simulator(skin, friction=0.4), vertex)
+    stays = Simulator(skin, friction=0.4)
+    stays.pose({"elbow": 0.2})
+    stays.pose({"elbow": -0.4})
+    again = [Simulator(one, friction=0.4) for one in (first, skin.posed({"elbow": -0.4}), elsewhere)]
+    for other in (*again, stays):
+        for one, two in zip(before, told(other, vertex), strict=True):
+            np.testing.assert_array_equal(one, two)
+    contact = Contact(ball(), pressed(first.layer, vertex))
+    batch = Batch([skin.posed({"elbow": -0.4})], [contact.tool], friction=0.4)
+    scene = batch.touch(contact.pose_body_from_tool[None, None], [None], 0.02)
+    np.testing.assert_array_equal(scene.wrenches[0, 0], stays.touch([contact], State(), 0.02)[0][0].wrench)
+    history = History(Toucher(layer), 0.4)
+    bent = history.moved(history.toucher.moved(first)).sideways
+    assert bent.at(8e-3, 0.02) == Simulator(skin, friction=0.4).history.sideways.at(8e-3, 0.02)
