@@ -283,7 +283,8 @@ def headline(comparison: Comparison) -> list[tuple[str, str]]:
         ("reference", comparison.reference),
         ("contact instants", f"{timing.instants} at {timing.instant_rate:.1f} Hz"),
         ("answers", f"{timing.answers} at {timing.answer_rate:.1f} Hz"),
-        ("rate kept", f"{100 * timing.kept:.2f} % ({timing.skipped} instants overtaken by newer ones)"),
+        ("rate kept", f"{100 * timing.kept:.2f} % ({timing.skipped} instants without an answer: newer ones "
+         "came first, or the node was not active)"),
         ("answers lost", f"{timing.lost}"),
         ("latency, median", f"{1e3 * timing.latency(50):.2f} ms"),
         ("latency, 99 %", f"{1e3 * timing.latency(99):.2f} ms"),

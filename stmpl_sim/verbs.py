@@ -170,7 +170,9 @@ def _run(massage: Massage, shots: list[Any] | None, *, quiet: bool) -> Log:
                 shots.append(Shot(copy(run.data), run.skin.skin_points(run.data, answer), run.limb_pose(),
                                   answer.magnitude, answer.pressure, caption_of(at, answer.touches)))  # fmt: skip
 
-        return massage.run([see])
+        log = massage.run([see])
+        show(steps, steps, massage.course.phase(massage.course.duration).name)
+        return log
 
 
 def figures_of(log: Log) -> dict[str, Any]:
