@@ -12,6 +12,7 @@ import time
 from collections.abc import Callable
 from contextlib import suppress
 from types import FrameType
+from typing import Any
 
 from stmpl_ros.interrupts import endings, interrupt_in, raise_swallowed_again
 
@@ -75,6 +76,10 @@ def _end(code: int) -> None:
     Python does not take itself apart: a thread that an interrupt ended may have left a lock that what is deleted then
     would wait for, when the thread that ends what takes too long is gone.
     """
+    for number in endings():
+        signal.signal(number, signal.SIG_IGN)
+    threads: Any = threading
+    threads._shutdown()  # waits for them, as Python itself does first
     atexit._run_exitfuncs()
     for stream in filter(None, (sys.stdout, sys.stderr)):
         with suppress(OSError, ValueError):

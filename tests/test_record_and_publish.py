@@ -141,7 +141,8 @@ def run(talker, tmp_path_factory):
 
 
 def test_a_recording_whose_terminal_was_closed_is_finished(talker, tmp_path):
-    recorder = start(*STMPL, "record", "--path", str(tmp_path / "run"), "--topics", "/any/words")
+    heard = {"preexec_fn": lambda: signal.signal(signal.SIGHUP, signal.SIG_DFL)}  # as nohup of the tests would not
+    recorder = start(*STMPL, "record", "--path", str(tmp_path / "run"), "--topics", "/any/words", **heard)
     try:
         talker.wait_for_recorder(talker.words)
         talker.say(1)
