@@ -55,9 +55,7 @@ def main(arguments: list[str] | None = None) -> None:
         code = _run(given)
         if sys.stdout:  # None: `stmpl ... >&-`
             sys.stdout.flush()
-    except KeyboardInterrupt as interrupt:
-        number = next(iter(interrupt.args), signal.SIGINT)
-    except (SystemError, RuntimeError) as error:  # how a call or a compiler tells of an interrupt that came in it
+    except (KeyboardInterrupt, SystemError, RuntimeError) as error:  # a compiled call tells of one by these
         interrupt = interrupt_in(error)
         if interrupt is None:
             raise

@@ -1,5 +1,7 @@
 """Laws of tips: needles and cones narrower than the places at which skin is looked at press, or it is told."""
 
+from functools import cache
+
 import numpy as np
 import pytest
 import trimesh
@@ -14,7 +16,10 @@ from stmpl_core.skin import Skin
 from tests.scenes import ball, limb, press
 from tests.scenes import tool as named
 
-LAYERS = {"one material": limb(6e-3), "stack": living(Body.anny(), "left_forearm", edge_length=6e-3)}
+LAYERS = {
+    "one material": lambda: limb(6e-3),
+    "stack": cache(lambda: living(Body.anny(), "left_forearm", edge_length=6e-3)),
+}
 NEEDLE = trimesh.creation.cylinder(3e-4, 0.05, sections=16)
 NEEDLE.vertices[:, 2] += 0.025
 
@@ -32,7 +37,7 @@ TIPS = {"needle": named(NEEDLE), "pencil": named(cone(3.5e-3, 0.02))}
 
 @pytest.fixture(scope="module", params=LAYERS)
 def simulator(request: pytest.FixtureRequest) -> Simulator:
-    return Simulator(LAYERS[request.param], MomentNet())
+    return Simulator(LAYERS[request.param](), MomentNet())
 
 
 def places(simulator: Simulator, depth: float, count: int = 6) -> list[Transform]:
@@ -77,7 +82,7 @@ def test_a_batch_on_a_gpu_s_kernels_presses_likewise_or_flags():
     pytest.importorskip("warp")
     from stmpl_core.gpu.warp_batch import WarpBatch
 
-    skin = Skin.of(LAYERS["stack"], MomentNet())
+    skin = Skin.of(LAYERS["stack"](), MomentNet())
     poses = np.array(places(Simulator(skin), 2e-3))[:, None]
     for tip in TIPS.values():
         ours, there = (
@@ -91,7 +96,7 @@ def test_a_batch_on_a_gpu_s_kernels_presses_likewise_or_flags():
 
 
 def test_a_tool_whose_skin_others_pushed_away_says_that_it_does_not_press_as_asked():
-    simulator = Simulator(LAYERS["stack"], MomentNet())
+    simulator = Simulator(LAYERS["stack"](), MomentNet())
     layer = simulator.layer
     v = int(np.linalg.norm(layer.vertices - layer.vertices.mean(axis=0), axis=1).argmin())
     across = np.cross(layer.normals[v], [0.0, 1.0, 0.0])
