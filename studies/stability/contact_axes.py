@@ -273,6 +273,25 @@ def contact_cycles(stage: Stage, level: float) -> Trial:
     return Trial("", f"{int(level):,}", ("finite", "bounded", "returns"), scene, rounds=int(level))
 
 
+def tips(stage: Stage, level: float) -> Trial:
+    """Width of a needle and of a pencil's end over the mesh's edges: over a vertex, beside it, over an edge and a face.
+
+    They go in along the skin's normal, from 0.07 to 0.6 of the thickness.
+    """
+    layer = (mesh := skin(stage.tool_edge)).layer
+    v = int(np.linalg.norm(layer.vertices - (RADIUS, 0, LENGTH / 2), axis=1).argmin())
+    corners = layer.vertices[layer.faces[np.flatnonzero((layer.faces == v).any(axis=1))[0]]]
+    places = layer.vertices[v], 0.95 * layer.vertices[v] + 0.05 * corners.mean(axis=0), corners[:2].mean(axis=0), \
+        corners.mean(axis=0)  # fmt: skip
+    out = layer.normals[v]
+    turn = Rotation.align_vectors([out], [[0.0, 0.0, 1.0]])[0].as_matrix()
+    placed = [Placed(tool, posed(place - depth * THICKNESS * out, turn))
+              for tool in (shapes.needle(level * stage.tool_edge), shapes.pencil(level * stage.tool_edge))
+              for place in places for depth in np.linspace(0.07, 0.6, COUNT)]  # fmt: skip
+    series = tuple(np.repeat(range(2 * len(places)), COUNT).tolist())
+    return Trial("", f"{level:g}", (*SOUND, "rises"), Contacts(mesh, alone(placed), series))
+
+
 def _ordinary() -> tuple[tuple[Placed, ...], ...]:
     """A light and a deep touch by pose, one with a force, and two tools at once."""
     pin = on_limb("pin", 0.2 * THICKNESS, LENGTH / 2 + 0.02)
@@ -296,7 +315,7 @@ CONTACT_AXES: dict[str, Callable[[Stage, float], Trial]] = {
     "nu of contact": contact_nu, "through air": through_air, "long triangles": long_triangles, "coarse": coarse,
     "small tool": small_tool, "area jump of contact": area_jump, "massage": massage, "first touch": first_touch,
     "fit": fit, "slide": slide, "creep": creep, "pop": pop, "scale of contact": scale, "stiffness": stiffness,
-    "turn of contact": turn, "cycles of contact": contact_cycles,
+    "turn of contact": turn, "cycles of contact": contact_cycles, "tips": tips,
 }  # fmt: skip
 CONTACT_LEVELS: dict[str, Sequence[float]] = {
     "depth": DEEP_LEVELS,
@@ -321,11 +340,12 @@ CONTACT_LEVELS: dict[str, Sequence[float]] = {
     "stiffness": (1e2, 1e4, 1e6, 1e9, 1e12),
     "turn of contact": (30, 90, 180),
     "cycles of contact": (100, 1000),
+    "tips": (1, 0.3, 0.1, 0.03, 0.01),
 }
 QUICK_CONTACTS: dict[str, Sequence[float]] = {
     "depth": (0.3, 3), "overload": (0.1,), "torque": (0.1,), "border": (4,), "slant": (0,), "kind": (0,),
     "nu of contact": (0.4,), "through air": (1,), "long triangles": (2,), "coarse": (0.8,), "small tool": (0.67,),
     "area jump of contact": (1,), "massage": (20,), "first touch": (0.05,), "fit": (0.5,), "slide": (0,),
     "creep": (0,), "pop": (0.3,), "scale of contact": (0.5,), "stiffness": (1e6,), "turn of contact": (90,),
-    "cycles of contact": (100,),
+    "cycles of contact": (100,), "tips": (0.1,),
 }  # fmt: skip

@@ -50,6 +50,18 @@ def box(x: float, y: float, z: float, name: str = "box") -> Tool:
     return Tool(name, corners, np.array([t for a, b, c, d in quads for t in ((a, b, c), (a, c, d))]))
 
 
+@cache
+def needle(width: float, name: str = "needle") -> Tool:
+    """A flat-ended cylinder of this width and 40 mm along z, its end around the origin."""
+    return revolved(name, np.array([[0, 0], [width / 2, 0], [width / 2, 0.04], [0, 0.04]]))
+
+
+@cache
+def pencil(width: float, name: str = "pencil") -> Tool:
+    """A cone of 7 mm and 20 mm along z, cut off at this width, its end around the origin."""
+    return revolved(name, np.array([[0, 0], [width / 2, 0], [3.5e-3 + width / 2, 0.02], [0, 0.02]]))
+
+
 def revolved(name: str, profile: np.ndarray, closed: bool = False) -> Tool:
     """A tool of a profile, (N, 2) radius and height [m], turned about z; `closed`: the profile is a loop."""
     n = len(profile)
