@@ -78,15 +78,12 @@ def stiffest_contact(spot: Spot, node_delay: float, controller: bool, held_force
 
 
 def last_passive(levels: list, run: Callable[[float], Felt]) -> tuple[int, Felt] | None:
-    """The last level that is passive, by halving: from there on up none is taken to be."""
-    low, high, kept = -1, len(levels), None
-    while high - low > 1:
-        middle = (low + high) // 2
-        felt = run(levels[middle])
-        if felt.passive:
-            low, kept = middle, (middle, felt)
-        else:
-            high = middle
+    """The last level up to which all are passive: beyond the first that is not, some may be again."""
+    kept = None
+    for n, level in enumerate(levels):
+        if not (felt := run(level)).passive:
+            break
+        kept = n, felt
     return kept
 
 

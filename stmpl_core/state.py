@@ -237,6 +237,8 @@ class State:
             raise InvalidInput(f"a state of version {version} with {len(numbers)} numbers cannot be read; expected are "
                                f"versions {OLDEST} to {VERSION} and {size * len(names)} numbers of {len(names)} "
                                "tools. Older ones need the release that recorded them.")  # fmt: skip
+        if not np.isfinite(numbers).all():
+            raise InvalidInput("a packed state holds numbers that are not finite: begin anew, with State().")
         rows = numbers.reshape(len(names), size)
         if lacks:
             rows = np.insert(rows, [FIRST_OF_TERMS - lacks] * lacks, Scalars()[-lacks:], axis=1)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -89,11 +88,14 @@ class MassageEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         if render_mode not in (None, *self.metadata["render_modes"]):
             raise InvalidInput(f"render_mode is {render_mode}; allowed is rgb_array or none.")
         self.render_mode = render_mode
+        for name, value in {"timestep": timestep, "circle": circle, "laps": laps}.items():
+            if not isinstance(value, int | float | np.number) or not np.isfinite(value):
+                raise InvalidInput(f"{name} is {value!r:.40}; a finite number is needed.")
         steps = CONTROL_S / timestep if timestep > 0 else 0.0
         if not (steps >= 1 and abs(steps - round(steps)) < 1e-6):
             raise InvalidInput(f"timestep is {timestep:g} s; {CONTROL_S:g} s, for which an action is held, must be a "
                                "whole number of steps.")  # fmt: skip
-        if not (math.isfinite(circle) and circle > 0):
+        if not circle > 0:
             raise InvalidInput(f"circle is {circle:g} m; a radius above 0 is needed.")
         if isinstance(layer, Simulator):
             if friction is not None or relaxing:

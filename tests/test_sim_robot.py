@@ -489,6 +489,9 @@ def test_the_environment_passes_gymnasiums_own_check_and_its_script_solves_it(fo
             MassageEnv(forearm, timestep=odd)
     with pytest.raises(InvalidInput, match="circle is 0 m"):
         MassageEnv(forearm, circle=0.0)
+    for name in ("circle", "laps", "timestep"):
+        with pytest.raises(InvalidInput, match=f"{name} is 'a'; a finite number"):
+            MassageEnv(forearm, **{name: "a"})
 
 
 def test_the_script_holds_ten_newtons_on_the_back_of_a_person_who_breathes_sways_and_turns() -> None:

@@ -10,7 +10,7 @@ from stmpl_core.errors import InvalidInput
 from stmpl_core.methods import Winkler
 from stmpl_core.relaxation import depth_left, fades_under, series_of
 from stmpl_core.stack import ball as pressed_ball
-from stmpl_core.state import UNKNOWN, VERSION, Scalars
+from stmpl_core.state import UNKNOWN, VERSION, Scalars, fresh
 from stmpl_core.touch import APART, BY_POSE, MOVED, TOUCHING
 from tests.scenes import at, ball, plate
 
@@ -350,6 +350,10 @@ def test_bytes_of_another_kind_are_no_state() -> None:
     for wrong in (None, "abc", 3):
         with pytest.raises(InvalidInput, match="bytes are needed"):
             State.unpack(wrong)  # type: ignore[arg-type]
+    broken = fresh(np.eye(4), 0)
+    broken.numbers[-1] = np.nan
+    with pytest.raises(InvalidInput, match="not finite"):
+        State.unpack(State({"ball": broken}).pack())
 
 
 def test_a_state_is_a_value_whatever_becomes_of_pose_and_touch(sim: Simulator) -> None:
