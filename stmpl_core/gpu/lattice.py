@@ -12,7 +12,7 @@ import warp as wp
 from stmpl_core import nodes as law
 from stmpl_core.deep import DEEPEST
 from stmpl_core.gpu.blocks import least_of, most_of, sum_before, sum_of
-from stmpl_core.gpu.looks import CHARTS, FACING, inward_on, point_on, thickness_on
+from stmpl_core.gpu.looks import BESIDE, CHARTS, FACING, inward_on, point_on, thickness_on
 from stmpl_core.gpu.packs import Lattice, Scratch, Skins
 from stmpl_core.gpu.places import APART, BY_POSE, DEEP, OVERFULL, PENDING
 from stmpl_core.gpu.rays import FAR, OPTIONS, WALL_WIDTH, depth_at, real, strain_under, vec3
@@ -90,7 +90,7 @@ def lay(side: wp.int32, what: wp.int32, skins: Skins, scratch: Scratch):
             corners, near = skins.faces[scratch.found[c, m]], wp.int32(0)
             edge = wp.length(skins.points[corners[0]] - skins.points[corners[1]]) / wp.sqrt(real(parts))
             for q in range(parts):
-                if sunk or scratch.depths[c, m * parts + q] > real(-0.6) * edge - WALL_WIDTH * thick:
+                if sunk or scratch.depths[c, m * parts + q] > -BESIDE * edge - WALL_WIDTH * thick:
                     near = CHARTS
                     at = axes * (scratch.middles[c, m * parts + q] - centre)
                     low_u, high_u = wp.min(low_u, at[0] - edge), wp.max(high_u, at[0] + edge)

@@ -11,7 +11,7 @@ import numpy as np
 import warp as wp
 from scipy.spatial import KDTree
 
-from stmpl_core.columns import BLOCK, Columns
+from stmpl_core.columns import BLOCK, HOLE_RADIUS, Columns
 from stmpl_core.deep import FIRST, LOOKED_AT, where_inside
 from stmpl_core.gpu.rays import Grid, mat33, real, vec3
 from stmpl_core.green import COLUMNS, STRAINS
@@ -269,7 +269,7 @@ def _one_skin(skin: Skin, columns: Columns, at: tuple[int, int, int, int]) -> tu
     one, tissue = OneSkin(), layer.tissue
     one.first, one.end = at[0], at[0] + len(order)
     one.first_ball, one.end_ball, one.table = at[2], at[2] + len(columns._blocks), at[3]
-    one.hole, one.thickest, one.edge = 0.6 * layer.edge_length, float(layer.thickness.max()), layer.edge_length
+    one.hole, one.thickest, one.edge = HOLE_RADIUS * layer.edge_length, float(layer.thickness.max()), layer.edge_length
     one.modulus, one.nu = tissue.youngs_modulus, tissue.poisson_ratio
     one.mu, one.lam = tissue.shear_modulus / one.modulus, tissue.lame_lambda / one.modulus
     known = shipped(network_of(layer)).card["ranges"]["poisson_ratio"]
@@ -349,7 +349,8 @@ def room_for(skins: Sequence[Skin], fields: Sequence[Sequence[SignedDistance]], 
         some = layer.vertices[:: max(1, len(layer.vertices) // 200)]
         for field in own:
             extent = np.sort(np.subtract(*field.tool_bounds[::-1]))
-            reach = 0.5 * float(np.linalg.norm(extent)) + 0.6 * layer.edge_length + 2 * float(layer.thickness.max())
+            reach = 0.5 * float(np.linalg.norm(extent)) + HOLE_RADIUS * layer.edge_length
+            reach += 2 * float(layer.thickness.max())
             columns = max(columns, int(np.max(tree.query_ball_point(some, reach, return_length=True))))
             cell = 0.5 * 3**0.5 * (WIDEST * float(np.median(layer.thickness))) ** 2
             wanted += min(1.5 * NODES + extent[1] * extent[2] / cell, 1.2 * MOST)
