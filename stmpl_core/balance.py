@@ -7,7 +7,7 @@ import numpy as np
 
 GIVEN_BACK = 0.7  # share of what a contact surely gives back that must be covered by what was put in
 KEPT = 1.5  # work beyond what elastic skin could hold that is forgotten: what was lost before pays for nothing now
-UNSURE = 8e-4  # of the largest force so far times the depth: energy that a contact may lack, as no sum is exact
+UNSURE = 6e-4  # of the largest force so far times the depth: energy that a contact may lack, as no sum is exact
 POWERS = (1.0, 12.0)  # range of the power of the depth with which a force grows between two depths
 MIN_SPREAD = 1e-3  # logarithm of two depths' ratio, from which their forces say that power
 MUCH = 0.1  # of the largest force so far: what is taken off a force, beyond which it is flagged

@@ -51,6 +51,13 @@ def box(x: float, y: float, z: float, name: str = "box") -> Tool:
 
 
 @cache
+def cup(inner: float, outer: float, height: float, name: str = "cup") -> Tool:
+    """A cylinder with a hollow of 3/4 of its height, rim down, the rim's middle at the origin."""
+    profile = [[0, 0.75 * height], [inner, 0.75 * height], [inner, 0], [outer, 0], [outer, height], [0, height]]
+    return revolved(name, np.array(profile))
+
+
+@cache
 def needle(width: float, name: str = "needle") -> Tool:
     """A flat-ended cylinder of this width and 40 mm along z, its end around the origin."""
     return revolved(name, np.array([[0, 0], [width / 2, 0], [width / 2, 0.04], [0, 0.04]]))

@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 from stmpl_core.tissue import Membrane, Ply, Prony, Tissue
 from stmpl_core.tool import Tool
 from studies.stability import shapes
+from studies.stability.layered_axes import part
 from studies.stability.meshes import even_plate, limb
 from studies.stability.scene import Mesh
 from studies.stability.strokes import Spring, Strokes
@@ -29,6 +30,12 @@ STACK = Tissue(3e3, 0.45, skin=Membrane(1.3e5, 1.2e-3, 11.0, relaxation=SERIES),
                deeper=(Ply(2e-3, 12e3, 0.45, relaxation=SERIES),))  # fmt: skip
 BALL, FLAT = shapes.ball(RADIUS), shapes.punch(8e-3, 0.02, fillet=2e-3)
 HALF = {id(BALL): RADIUS, id(FLAT): 0.01}  # half of a tool's height [m]
+TILTED = {  # tools of the tilting paths, and how far their origins are above their lowest point [m]
+    "ball": (shapes.ball(0.01), 0.01), "box": (shapes.box(0.02, 0.012, 0.01), 0.005),
+    "disc": (shapes.punch(0.012, 0.01, "disc"), 0.005), "cup": (shapes.cup(9e-3, 12e-3, 0.02), 0.0),
+    "stylus": (shapes.capsule(3e-3, 0.054, "stylus"), 0.03),
+}  # fmt: skip
+LOOPS, RUBBED, OFF = (0.5, 0.85), (0.0, 0.3, 1e-3), 5e-4  # depths over the thickness, friction, way off the skin [m]
 MU = 0.5
 STEP = 0.01  # time between instants where nothing else is said [s]
 LAWS = ("finite", "gives", "caps")
@@ -238,6 +245,29 @@ def rocking(stage: Stage, level: float) -> Trial:
     return Trial("", f"{level:g} mm", (*LAWS, "lasts"), scene, _at_last(scene, rocked(1)))
 
 
+def tilting_path(stage: Stage, level: float) -> Trial:
+    """Number of a random smooth loop over a forearm as measured, elastic: it presses, slides and tilts, and lifts.
+
+    Five tools in turn, then to 0.5 and 0.85 of the thickness, then without friction, at mu 0.3 and at 0.001.
+    """
+    rng, number = np.random.default_rng([stage.seed, int(level)]), int(level)
+    mesh, (tool, half) = part("left_forearm"), list(TILTED.values())[number % 5]
+    layer = mesh.layer
+    near = np.linalg.norm(layer.vertices - layer.vertices.mean(axis=0), axis=1).argsort()
+    v = int(rng.choice(near[: len(near) // 4]))
+    out, phase = layer.normals[v], np.linspace(0, 2 * np.pi, 241)
+    upright = Rotation.align_vectors([out], [[0.0, 0.0, 1.0]])[0]
+    gone = rng.normal(size=(6, 2)) @ np.stack([np.sin(phase), 1 - np.cos(phase)])
+    turns = upright * Rotation.from_euler("xyz", 5 * gone[3:].T, degrees=True)
+    high = half + OFF - (LOOPS[number // 5 % 2] * layer.thickness[v] + OFF) * np.sin(phase / 2) ** 2
+    poses = np.tile(np.eye(4), (len(phase), 1, 1))
+    poses[:, :3, :3] = turns.as_matrix()
+    poses[:, :3, 3] = layer.vertices[v] + upright.apply(np.stack([*(2e-3 * gone[:2]), high], axis=1))
+    mu = RUBBED[number // 10 % 3]
+    scene = Strokes(mesh, tool, poses, STEP * np.arange(len(phase)), mu)
+    return Trial("", f"{number}: {tool.name}, {LOOPS[number // 5 % 2]:g} t, {mu:g}", ("finite", "gives"), scene)
+
+
 def _at_last(scene: Strokes, twin: Strokes) -> Twin:
     """A path that ends as another does."""
     return Twin(twin, np.array([[len(scene.times) - 1, len(twin.times) - 1]]), np.eye(3))
@@ -247,6 +277,7 @@ STROKE_AXES: dict[str, Callable[[Stage, float], Trial]] = {
     "time step": time_step, "lost steps": cut, "long gap": long_gap, "time of relaxation": fading, "friction": friction,
     "reversal": reversal, "spin": spin, "stick-slip": stick_slip, "lift-off": lift_off, "round a limb": on_a_limb,
     "friction round a limb": grip_on_a_limb, "noise of a pose": noise, "rocking": rocking, "closed path": closed_path,
+    "tilting path": tilting_path,
 }  # fmt: skip
 STROKE_LEVELS: dict[str, Sequence[float]] = {
     "time step": (0.1, 0.5, 2, 5, 10, 20, 50),
@@ -263,9 +294,11 @@ STROKE_LEVELS: dict[str, Sequence[float]] = {
     "noise of a pose": (1, 3, 10),
     "rocking": (0.1, 0.2, 0.4),
     "closed path": tuple(range(24)),
+    "tilting path": tuple(range(60)),
 }
 QUICK_STROKES: dict[str, Sequence[float]] = {
     "time step": (10,), "lost steps": (0.3,), "long gap": (10,), "time of relaxation": (0.1,), "friction": (0.5,),
     "reversal": (0.5,), "spin": (15,), "stick-slip": (100,), "lift-off": (100,), "round a limb": (10,),
     "friction round a limb": (0.8,), "noise of a pose": (3,), "rocking": (0.3,), "closed path": (7,),
+    "tilting path": (6,),
 }  # fmt: skip
