@@ -39,7 +39,10 @@ MOST_OPENINGS, NO_POINTS = 1000, np.empty((0, 3))  # places at the rims of holes
 CHECKED, ALIKE = 100, 3  # places at which a field is checked, and how many of these say what it is off at one
 NO_CHECKS = np.empty((0, 4))
 MOST_CHECKS = CHECKED + 27  # number of them with those farthest out
-TIPS, STANDS_OUT = 64, 0.05  # corners that are known, and how far they stand out at least, over the spacing
+TIPS, STANDS_OUT = 256, 0.05  # tips that are known, and how far they stand out at least, over the spacing
+MOST_EDGES, SHARP = 1000, np.cos(np.radians(30.0))  # places along edges that are looked at; cosine between their faces
+BLUNT = 0.95  # mean of the normals around a corner that is no tip
+LOST, LOOKS = 0.02, 80  # largest way inwards on which a tip's surface is looked for [m], and places on it
 PROBED, THICK = 600, 5e-3  # places of a tool from which its thickness is told, and the largest half of it [m]
 ROUNDING_WIDTH = 0.57  # width of the smoothing over the radius that it gives a right-angled edge, measured
 
@@ -71,7 +74,8 @@ class SignedDistance:
         checks: places spread over the surface, and those farthest out, with how far that is off around each: the least
             of ALIKE places, as edges are off by more than faces, (K, 4) [m]; none where edges are rounded on purpose.
         openings: places at the rims of its holes, (K, 3) [m].
-        tips: corners of the mesh that stand out of the rounded surface, farthest first, at most TIPS, (K, 3) [m].
+        tips: corners of the mesh, and places along its sharp edges, that stand out of the rounded surface, at most
+            TIPS of them, each with how far the surface lies inwards from there, the farthest first, (K, 4) [m].
     """
 
     coefficients: np.ndarray
@@ -84,7 +88,7 @@ class SignedDistance:
     half_thickness: float = math.inf
     checks: np.ndarray = field(default_factory=lambda: NO_CHECKS)
     openings: Points = field(default_factory=lambda: NO_POINTS)
-    tips: Points = field(default_factory=lambda: NO_POINTS)
+    tips: np.ndarray = field(default_factory=lambda: NO_CHECKS)
 
     @classmethod
     def of(
@@ -128,8 +132,7 @@ class SignedDistance:
             if len(places) else NO_CHECKS
         rims = NO_POINTS if watertight else openings(vertices, faces)
         rims = rims[:: 1 + len(rims) // MOST_OPENINGS]
-        out = _distances(coefficients, origin, spacing, used)
-        tips = used[[n for n in np.argsort(-out)[:TIPS] if out[n] > STANDS_OUT * spacing]]
+        tips = _tips(coefficients, origin, spacing, *outer)
         box = used.min(axis=0), used.max(axis=0)
         built = cls(coefficients, origin, spacing, watertight, flipped, error, box, half, checks, rims, tips)
         if coefficients.nbytes <= MOST_KEPT_BYTES:
@@ -271,6 +274,79 @@ def _spread_over(vertices: Points, faces: np.ndarray) -> Points:
     middles, ways = vertices[faces].mean(axis=1), np.array(list(np.ndindex(3, 3, 3))) - 1.0
     farthest = np.unique((middles @ ways.T).argmax(axis=0))
     return np.concatenate([_anywhere(vertices[faces], CHECKED, 1)[0], middles[farthest]])
+
+
+def _tips(coefficients: np.ndarray, origin: np.ndarray, spacing: float, vertices: Points,
+          faces: np.ndarray) -> np.ndarray:  # fmt: skip
+    """See SignedDistance: those farthest out, and of the others some anywhere."""
+    corners = vertices[faces]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normals /= np.maximum(np.linalg.norm(normals, axis=1), 1e-300)[:, None]
+    sides = np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
+    order = np.lexsort(sides.T)
+    same = (sides[order[1:]] == sides[order[:-1]]).all(axis=1)
+    one, two = order[:-1][same] // 3, order[1:][same] // 3
+    sharp = np.einsum("nx,nx->n", normals[one], normals[two]) < SHARP
+    ends, out = vertices[sides[order[:-1][same][sharp]]], normals[one[sharp]] + normals[two[sharp]]
+    length = np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1)
+    many = np.ceil(length / max(0.5 * spacing, length.sum() / MOST_EDGES, 1e-12)).astype(int)
+    number = np.repeat(np.arange(len(many)), many)
+    share = (np.arange(len(number)) - np.repeat(np.cumsum(many) - many, many) + 0.5) / many[number]
+    at_vertices, met = np.zeros_like(vertices), np.bincount(faces.ravel(), minlength=len(vertices))
+    np.add.at(at_vertices, faces.ravel(), np.repeat(normals, 3, axis=0))
+    used = np.flatnonzero(np.linalg.norm(at_vertices, axis=1) < BLUNT * met)
+    places = np.concatenate([vertices[used], ends[number, 0] + share[:, None] * (ends[number, 1] - ends[number, 0])])
+    inwards = -np.concatenate([at_vertices[used], out[number]])
+    away = _distances(coefficients, origin, spacing, places)
+    some = np.flatnonzero(away > STANDS_OUT * spacing)
+    some = some[np.argsort(-away[some], kind="stable")]
+    if len(some) > TIPS:
+        rest = np.random.default_rng(0).permutation(some[TIPS // 4 :])
+        some = np.concatenate([some[: TIPS // 4], rest[: TIPS - TIPS // 4]])
+    places, inwards = places[some], inwards[some]
+    inwards /= np.maximum(np.linalg.norm(inwards, axis=1), 1e-300)[:, None]
+    way = LOST * np.linspace(0.0, 1.0, LOOKS + 1)[1:] ** 2
+    looks = (places[:, None] + way[:, None] * inwards[:, None]).reshape(-1, 3)
+    inside = _distances(coefficients, origin, spacing, looks).reshape(-1, LOOKS) <= 0
+    lost = np.where(inside.any(axis=1), way[inside.argmax(axis=1)], LOST)
+    apart = np.linalg.norm(places[:, None] - places, axis=2)  # at a blade's corner normals may lead along its edge
+    lost = (apart + lost).min(axis=1, initial=LOST)
+    return np.column_stack([places, lost])[np.argsort(-lost, kind="stable")]
+
+
+@numba.njit(cache=True, nogil=True)
+def lacking(tips, pose, way, points, area, depth):
+    """How much deeper a tip is in the skin along a way than a tool is known to be, but for what its surface lacks [m].
+
+    Args:
+        tips: see SignedDistance.
+        pose: pose_body_from_tool, (4, 4).
+        way: unit vector into the skin, (3,).
+        points, area: places of nodes that are pressed, (N, 3) [m], and their areas, (N,) [m2].
+        depth: how deep the tool is known to be [m].
+    """
+    lowest, most, wide = np.inf, 0.0, 0.0
+    for n in range(len(points)):
+        lowest = min(lowest, way[0] * points[n, 0] + way[1] * points[n, 1] + way[2] * points[n, 2])
+        wide = max(wide, 2 * np.sqrt(area[n]))
+    for k in range(len(tips)):
+        at, high = np.empty(3), 0.0
+        for x in range(3):
+            at[x] = pose[x, 3]
+            for y in range(3):
+                at[x] += pose[x, y] * tips[k, y]
+            high += way[x] * at[x]
+        if min(tips[k, 3], high - lowest - depth) <= most:
+            continue
+        least, deep = (wide + tips[k, 3]) ** 2, 0.0
+        for n in range(len(points)):
+            a, b, c = at[0] - points[n, 0], at[1] - points[n, 1], at[2] - points[n, 2]
+            along = way[0] * a + way[1] * b + way[2] * c
+            square = a * a + b * b + c * c - along * along
+            if square < least:
+                least, deep = square, along
+        most = max(most, min(deep - depth, tips[k, 3]))
+    return most
 
 
 def _anywhere(corners: np.ndarray, many: int, seed: int) -> tuple[Points, np.ndarray]:

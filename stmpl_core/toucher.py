@@ -24,7 +24,7 @@ from stmpl_core.nodes import Nodes, gathered, strains_under
 from stmpl_core.obstacle import REACH
 from stmpl_core.pieces import DEEP, GROUP, WIDER, pins
 from stmpl_core.rays import WALL
-from stmpl_core.sdf import SignedDistance, mean_off
+from stmpl_core.sdf import SignedDistance, lacking, mean_off
 from stmpl_core.tools import Tools
 from stmpl_core.touch import (
     APART,
@@ -63,6 +63,8 @@ STUCK = 0.5  # error of what skin that sticks carries along itself, over that
 MAX_LEVER = 1.0  # torque that is not carried over the force, over the contact's radius, that is not yet worth a word
 SURE = 0.02  # largest error of a distance field over the depth, up to which it does not matter where the field is off
 MOST_OFF = 0.1  # error of a distance field where a tool presses, over the depth, beyond which the force is not known
+LOOKED_AT = 48  # tips of a tool that presses nothing that are looked at, the farthest; and as many of the others
+EDGE_OFF, MOST_LACKING = 0.2, 0.98  # depth of an edge that a distance field does not tell, from which it is flagged
 FIRST = 0.01  # depth over the thickness from which touches were tried
 MUCH_STIFFER = 50.0  # stiffness over that of the tissue above from which a material is nearly bone: people's are below
 SOFT_SHARE = 0.7  # depth over the soft tissue's there; at 0.62 force is 9 % off, at 0.87 by 18 to 33 %
@@ -144,7 +146,9 @@ class Toucher:
         self._thickest = float(layer.thickness.max())
         self._inward, self.deep = self.columns.inward, Deep(self.columns)
         self._soft = soft_depth(layer.tissue)
-        mean_off(np.zeros((1, 4)), np.eye(4), np.zeros((1, 3)), np.ones(1))  # compiled now
+        nothing, one = np.zeros((1, 4)), np.ones(1)  # compiled now
+        mean_off(nothing, np.eye(4), nothing[:, 1:].copy(), one)
+        lacking(nothing, np.eye(4), np.zeros(3), nothing[:, 1:].copy(), one, 0.0)
 
     @cached_property
     def _unlearnt(self) -> list[str]:
@@ -504,6 +508,11 @@ class Toucher:
         if size > 0 and wrong > SURE * depth:
             off = mean_off(one.field.checks, one.pose, nodes.points, forces)
             bound += held.power * min(off / max(depth, 1e-300), 1.0)
+        lack = lacks = 0.0  # how much deeper a sharp edge is than the distance field tells [m], and over that
+        if size > 0 and len(one.field.tips):
+            lack = lacking(one.field.tips, one.pose, wrench[:3] / size, nodes.points, nodes.area, depth)
+            lacks = min(lack / max(depth + lack, 1e-300), MOST_LACKING)
+            bound += (1 - lacks) ** -held.power - 1
         bound += SHELL * max(held.shell - SHELL_FROM, 0.0)
         if size > 0 and not layer.stacked:
             bound += SHALLOW * max(1 - depth / (SHALLOW_TO * thickness), 0.0)
@@ -527,6 +536,10 @@ class Toucher:
         if off > MOST_OFF * max(depth, FIRST * thickness):
             trust = trust.also(f"where {touch.name} presses, {1e3 * depth:.2g} mm deep, its distance field is "
                                f"{1e3 * off:.2g} mm off: leave out what of it is far away", in_range=False)  # fmt: skip
+        if lack > EDGE_OFF * max(depth + lack, FIRST * thickness):
+            trust = trust.also(f"{touch.name} is {1e3 * (depth + lack):.2g} mm deep in the skin, and its distance "
+                               f"field, of {1e3 * one.field.spacing:.2g} mm, tells {1e3 * depth:.2g} mm of its edge: "
+                               "leave out what of it is far away", in_range=False)  # fmt: skip
         if beside_off > MAX_BESIDE:
             where = (f"no place was found where {touch.name} presses so: the nearest" if held is one.held else
                      f"{touch.name} was moved to where it presses so alone; beside the other tools that")  # fmt: skip
@@ -608,9 +621,11 @@ class Toucher:
 
     def _tip(self, one: _Placed) -> float:
         """How deep a tip of the tool is in the skin that its distance field may not tell [m]; 0: none is so deep."""
-        if not len(one.field.tips):
+        tips = one.field.tips
+        if not len(tips):
             return 0.0
-        at = one.field.tips @ one.pose[:3, :3].T + one.pose[:3, 3]
+        tips = np.concatenate([tips[:LOOKED_AT], tips[LOOKED_AT :: len(tips) // LOOKED_AT + 1]])
+        at = tips[:, :3] @ one.pose[:3, :3].T + one.pose[:3, 3]
         v = self.columns.nearest(at)
         away = at - self.columns.points[v]
         deep = np.einsum("nx,nx->n", away, self._inward[v])

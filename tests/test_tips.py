@@ -5,6 +5,7 @@ from functools import cache
 import numpy as np
 import pytest
 import trimesh
+from scipy.spatial.transform import Rotation
 
 from stmpl_core import Contact, Simulator, Tool
 from stmpl_core.arrays import Transform
@@ -13,7 +14,7 @@ from stmpl_core.body import Body
 from stmpl_core.living import living
 from stmpl_core.methods import MomentNet
 from stmpl_core.skin import Skin
-from tests.scenes import ball, limb, press
+from tests.scenes import ball, limb, plate, press
 from tests.scenes import tool as named
 
 LAYERS = {
@@ -78,13 +79,65 @@ def test_a_tip_that_the_distance_field_does_not_tell_is_flagged(simulator):
     assert simulator.touch([Contact(thin, places(simulator, -1e-3)[0])])[0].trust.ok, "it is off"
 
 
+def chisel(length: float) -> Tool:
+    """A chisel of 20 mm, its edge of 20 degrees across y, at the origin; so long [m]."""
+    high = 5e-3 / np.tan(np.radians(20))
+    corners = [[x, y, z] for y in (-0.01, 0.01) for x, z in ((0, 0), (5e-3, high), (5e-3, length), (0, length))]
+    return named(trimesh.convex.convex_hull(np.array(corners)))
+
+
+def test_an_edge_that_a_long_tools_distance_field_loses_is_in_the_bound_or_flagged():
+    """Of the same edge a longer handle makes the field coarser: 0.38 N became 0.008 N, with a third of it stated."""
+    simulator = Simulator(plate(0.16, 4e-3, 20e-3, crossed=True, youngs_modulus=1e4), MomentNet())
+    flagged = []
+    for depth in (2e-3, 4e-3, 6e-3, 9e-3):
+        pose = np.eye(4)
+        pose[2, 3] = -depth
+        touches = [simulator.touch([Contact(chisel(length), pose)])[0] for length in (0.02, 0.045, 0.1, 0.15)]
+        most = max(touch.force for touch in touches)
+        for touch in touches:
+            assert touch.force + touch.force_bound > most or not touch.trust.ok
+            flagged.append(not touch.trust.ok)
+    assert any(flagged) and not all(flagged)
+
+
+def test_a_blunt_tool_lacks_no_edge():
+    """Neither a box that lies flat or on its edge, nor a ball of facets: nothing is flagged, and no bound is wider."""
+    simulator = Simulator(plate(0.16, 4e-3, 20e-3, crossed=True, youngs_modulus=1e4), MomentNet())
+    for mesh in (trimesh.creation.box([0.03, 0.02, 0.02]), trimesh.creation.icosphere(2, 0.015)):
+        tool, turn = named(mesh), np.eye(4)
+        for angle in (0.0, 10.0, 45.0):
+            turn[:3, :3] = Rotation.from_euler("y", angle, degrees=True).as_matrix()
+            low = (mesh.vertices @ turn[:3, :3].T)[:, 2].min()
+            for depth in (1e-3, 4e-3):
+                turn[2, 3] = -low - depth
+                assert simulator.touch([Contact(tool, turn.copy())])[0].trust.ok, (angle, depth)
+
+
+def test_a_blade_across_a_limb_is_told():
+    """Its corners are off the limb; the middle of its edge is 2 mm in the skin."""
+    simulator = Simulator(limb(4e-3), MomentNet())
+    layer = simulator.layer
+    v = int(np.linalg.norm(layer.vertices - layer.vertices.mean(axis=0), axis=1).argmin())
+    along = np.ptp(layer.vertices, axis=0).argmax()
+    axis = np.eye(3)[along]
+    across = np.cross(layer.normals[v], axis)
+    blade = trimesh.convex.convex_hull(np.array([[x, y, z] for y in (-0.02, 0.02) for x, z in
+                                                 ((0, 0), (1.75e-3, 0.02), (-1.75e-3, 0.02))]))  # fmt: skip
+    pose = np.eye(4)
+    pose[:3, :3] = np.column_stack([np.cross(across, layer.normals[v]), across, layer.normals[v]])
+    pose[:3, 3] = layer.vertices[v] - 2e-3 * layer.normals[v]
+    touch = simulator.touch([Contact(named(blade), pose)])[0]
+    assert touch.force > 0.0 or not touch.trust.ok
+
+
 def test_a_batch_on_a_gpu_s_kernels_presses_likewise_or_flags():
     pytest.importorskip("warp")
     from stmpl_core.gpu.warp_batch import WarpBatch
 
     skin = Skin.of(LAYERS["stack"](), MomentNet())
     poses = np.array(places(Simulator(skin), 2e-3))[:, None]
-    for tip in TIPS.values():
+    for tip in (*TIPS.values(), chisel(0.1)):
         ours, there = (
             Batch(skin, [tip], len(poses)).touch(poses),
             WarpBatch(skin, [tip], len(poses), device="cpu").touch(poses),
@@ -93,6 +146,8 @@ def test_a_batch_on_a_gpu_s_kernels_presses_likewise_or_flags():
         served = wrenches[:, 0, :3].any(axis=1)
         assert not in_range[~served].any()
         np.testing.assert_allclose(wrenches[served], ours.wrenches[served], atol=1e-6)
+        np.testing.assert_allclose(np.asarray(there.force_bounds)[served], ours.force_bounds[served], rtol=1e-3, atol=1e-6)
+        assert not (in_range[served] & ~ours.in_range[served]).any()
 
 
 def test_a_tool_whose_skin_others_pushed_away_says_that_it_does_not_press_as_asked():

@@ -8,7 +8,7 @@ import warp as wp
 
 from stmpl_core import pieces, soundness, toucher
 from stmpl_core import wrenches as wrenches_of_skin
-from stmpl_core.gpu.blocks import most_of, sum_of
+from stmpl_core.gpu.blocks import least_of, most_of, sum_of
 from stmpl_core.gpu.columns import _mark, _marked
 from stmpl_core.gpu.packs import BONY_BIT, BORDER_BIT, LONG_BIT, STEEP_BIT, Scratch, Skins
 from stmpl_core.gpu.places import APART, BY_POSE, DEEP, REFUSED, WRAPPED
@@ -36,6 +36,7 @@ ONE_WAY = wp.constant(wp.float64(wrenches_of_skin.ONE_WAY))
 ALL_ONE_WAY = wp.constant(wp.float64(wrenches_of_skin.ALL_ONE_WAY))
 NONE = wp.constant(wp.float64(1e-300))
 NAN, PI = wp.constant(wp.float64(float("nan"))), wp.constant(wp.float64(math.pi))
+EDGE_OFF, MOST_LACKING = wp.constant(wp.float64(toucher.EDGE_OFF)), wp.constant(wp.float64(toucher.MOST_LACKING))
 SURE, MOST_OFF = wp.constant(wp.float64(toucher.SURE)), wp.constant(wp.float64(toucher.MOST_OFF))
 FIRST, TWICE_FIRST = wp.constant(wp.float64(toucher.FIRST)), wp.constant(wp.float64(2 * toucher.FIRST))
 vec16 = wp.types.vector(length=16, dtype=wp.float64)
@@ -241,6 +242,37 @@ def _off(skins: Skins, grid: wp.int32, at: vec3) -> real:
     return off
 
 
+@wp.func
+def _lacking(skins: Skins, scratch: Scratch, c: wp.int32, s: wp.int32, k: wp.int32, way: vec3, depth: real,
+             lane: wp.int32) -> real:  # fmt: skip
+    """How much deeper a tip is than a tool is known to be [m]: stmpl_core.sdf.lacking."""
+    many = skins.tip_many[scratch.grid[c]]
+    if many == 0:
+        return real(0.0)
+    wide, lowest, most = real(0.0), real(1e30), real(0.0)
+    for i in range(lane, scratch.nodes[s], wp.block_dim()):
+        if scratch.tool[s, i] == k:
+            wide = wp.max(wide, real(2.0) * wp.sqrt(scratch.area[s, i]))
+            lowest = wp.min(lowest, wp.dot(way, scratch.point[s, i]))
+    wide = most_of(wide)
+    lowest = least_of(lowest)
+    for j in range(lane, many, wp.block_dim()):
+        tip = skins.tips[scratch.grid[c], j]
+        at = scratch.pose[c] * vec3(tip[0], tip[1], tip[2]) + scratch.place[c]
+        if wp.min(tip[3], wp.dot(way, at) - lowest - depth) > most:
+            least, deep = (wide + tip[3]) * (wide + tip[3]), real(0.0)
+            for i in range(scratch.nodes[s]):
+                if scratch.tool[s, i] == k:
+                    to = at - scratch.point[s, i]
+                    along = wp.dot(way, to)
+                    square = wp.length_sq(to) - along * along
+                    if square < least:
+                        least = square
+                        deep = along
+            most = wp.max(most, wp.min(deep - depth, tip[3]))
+    return most_of(most)
+
+
 @wp.kernel
 def answer(first: wp.int32, many: wp.int32, known: Known, skins: Skins, scratch: Scratch,
            wrenches: wp.array3d(dtype=Any), depths: wp.array2d(dtype=Any), bounds: wp.array2d(dtype=Any),
@@ -335,6 +367,7 @@ def answer(first: wp.int32, many: wp.int32, known: Known, skins: Skins, scratch:
                     torque = torque + wp.cross(skins.points[trio[x]] - scratch.place[c], more * way)
     more_sums = sum_of(wp.vec4d(torque[0], torque[1], torque[2], along))
     pins = _pins(scratch, c, s, k, lane)
+    lack = _lacking(skins, scratch, c, s, k, force / wp.max(size, NONE), depth, lane)
     if lane > 0:
         return
     torque = vec3(more_sums[0], more_sums[1], more_sums[2])
@@ -355,6 +388,8 @@ def answer(first: wp.int32, many: wp.int32, known: Known, skins: Skins, scratch:
     group = pins[0] > GROUP and depth > PINS_DEEP * pins[1]
     sound = sound and not group
     sound = sound and skins.holes[k] == 0
+    if size > real(0.0):
+        sound = sound and lack <= EDGE_OFF * wp.max(depth + lack, FIRST * carried / forces)
     wrong = real(0.0)
     if size > real(0.0) and grid.surface_error > SURE * depth:
         wrong = sums[15] / forces
@@ -371,6 +406,7 @@ def answer(first: wp.int32, many: wp.int32, known: Known, skins: Skins, scratch:
             bound += SHELL * wp.max(-scratch.given_way[c] - SHELL_FROM, real(0.0))
         else:
             bound += SHALLOW * wp.max(real(1.0) - depth * forces / (SHALLOW_TO * carried), real(0.0))
+        bound += wp.pow(real(1.0) - wp.min(lack / wp.max(depth + lack, NONE), MOST_LACKING), -power) - real(1.0)
         bound += STUCK * along / size + power * below / wp.max(depth, wp.max(below, NONE))
         if group:
             bound *= WIDER
