@@ -63,6 +63,7 @@ STUCK = 0.5  # error of what skin that sticks carries along itself, over that
 MAX_LEVER = 1.0  # torque that is not carried over the force, over the contact's radius, that is not yet worth a word
 SURE = 0.02  # largest error of a distance field over the depth, up to which it does not matter where the field is off
 MOST_OFF = 0.1  # error of a distance field where a tool presses, over the depth, beyond which the force is not known
+LED_OUT = 0.95  # how far nodes sink with their tool over how deep it is in their columns: below, these lead out of it
 LOOKED_AT = 48  # tips of a tool that presses nothing that are looked at, the farthest; and as many of the others
 EDGE_OFF, MOST_LACKING = 0.2, 0.98  # depth of an edge that a distance field does not tell, from which it is flagged
 FIRST = 0.01  # depth over the thickness from which touches were tried
@@ -513,6 +514,11 @@ class Toucher:
             lack = lacking(one.field.tips, one.pose, wrench[:3] / size, nodes.points, nodes.area, depth)
             lacks = min(lack / max(depth + lack, 1e-300), MOST_LACKING)
             bound += (1 - lacks) ** -held.power - 1
+        led = 1.0
+        if size > 0 and layer.stacked:
+            led = _led_in(nodes.sinking, nodes.strain, nodes.thickness, nodes.inward, wrench[:3] / size)
+            if led < LED_OUT:
+                bound += led**-held.power - 1
         bound += SHELL * max(held.shell - SHELL_FROM, 0.0)
         if size > 0 and not layer.stacked:
             bound += SHALLOW * max(1 - depth / (SHALLOW_TO * thickness), 0.0)
@@ -540,6 +546,9 @@ class Toucher:
             trust = trust.also(f"{touch.name} is {1e3 * (depth + lack):.2g} mm deep in the skin, and its distance "
                                f"field, of {1e3 * one.field.spacing:.2g} mm, tells {1e3 * depth:.2g} mm of its edge: "
                                "leave out what of it is far away", in_range=False)  # fmt: skip
+        if led < LED_OUT:
+            trust = trust.also(f"{touch.name} is {1e3 * depth:.2g} mm deep, and thin: the skin below it is led out of "
+                               f"its walls, and goes along by {led:.0%} of that", in_range=False)  # fmt: skip
         if beside_off > MAX_BESIDE:
             where = (f"no place was found where {touch.name} presses so: the nearest" if held is one.held else
                      f"{touch.name} was moved to where it presses so alone; beside the other tools that")  # fmt: skip
@@ -694,6 +703,20 @@ def groups_of(points: Sequence[np.ndarray], thickness: float) -> list[list[int]]
         groups = [group for group in groups if group not in near]
         groups.append(([*(o for group in near for o in group[0]), n], [*(b for g in near for b in g[1]), ball]))
     return [sorted(group) for group, _ in groups]
+
+
+@numba.njit(cache=True, nogil=True)
+def _led_in(sinking, strain, thickness, inward, way):
+    """Share of the depth in columns along a way (3,) by which the nodes of a thin tool sink with it, at most 1 [-].
+
+    Columns of a limb lead a little aside, so a thin wall that is deep is left by those that it began in.
+    """
+    sunk, deep = 0.0, 1e-300
+    for n in range(len(sinking)):
+        cosine = inward[n, 0] * way[0] + inward[n, 1] * way[1] + inward[n, 2] * way[2]
+        sunk = max(sunk, sinking[n])
+        deep = max(deep, strain[n] * thickness[n] * cosine * cosine)
+    return min(max(sunk / deep, 0.02), 1.0)
 
 
 @numba.njit(cache=True, nogil=True)

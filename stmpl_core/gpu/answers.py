@@ -36,6 +36,7 @@ ONE_WAY = wp.constant(wp.float64(wrenches_of_skin.ONE_WAY))
 ALL_ONE_WAY = wp.constant(wp.float64(wrenches_of_skin.ALL_ONE_WAY))
 NONE = wp.constant(wp.float64(1e-300))
 NAN, PI = wp.constant(wp.float64(float("nan"))), wp.constant(wp.float64(math.pi))
+LED_OUT = wp.constant(wp.float64(toucher.LED_OUT))
 EDGE_OFF, MOST_LACKING = wp.constant(wp.float64(toucher.EDGE_OFF)), wp.constant(wp.float64(toucher.MOST_LACKING))
 SURE, MOST_OFF = wp.constant(wp.float64(toucher.SURE)), wp.constant(wp.float64(toucher.MOST_OFF))
 FIRST, TWICE_FIRST = wp.constant(wp.float64(toucher.FIRST)), wp.constant(wp.float64(2 * toucher.FIRST))
@@ -273,6 +274,20 @@ def _lacking(skins: Skins, scratch: Scratch, c: wp.int32, s: wp.int32, k: wp.int
     return most_of(most)
 
 
+@wp.func
+def _led_in(scratch: Scratch, s: wp.int32, k: wp.int32, way: vec3, lane: wp.int32) -> real:
+    """Share of its depth in columns by which the nodes of a thin tool sink with it: stmpl_core.toucher._led_in."""
+    sunk, deep = real(0.0), real(1e-300)
+    for i in range(lane, scratch.nodes[s], wp.block_dim()):
+        if scratch.tool[s, i] == k:
+            cosine = wp.dot(scratch.inward[s, i], way)
+            sunk = wp.max(sunk, scratch.sinking[s, i])
+            deep = wp.max(deep, scratch.strain[s, i] * scratch.thick[s, i] * cosine * cosine)
+    sunk = most_of(sunk)
+    deep = most_of(deep)
+    return wp.clamp(sunk / deep, real(0.02), real(1.0))
+
+
 @wp.kernel
 def answer(first: wp.int32, many: wp.int32, known: Known, skins: Skins, scratch: Scratch,
            wrenches: wp.array3d(dtype=Any), depths: wp.array2d(dtype=Any), bounds: wp.array2d(dtype=Any),
@@ -367,6 +382,9 @@ def answer(first: wp.int32, many: wp.int32, known: Known, skins: Skins, scratch:
                     torque = torque + wp.cross(skins.points[trio[x]] - scratch.place[c], more * way)
     more_sums = sum_of(wp.vec4d(torque[0], torque[1], torque[2], along))
     pins = _pins(scratch, c, s, k, lane)
+    led = real(1.0)
+    if one.stacked == 1 and size > real(0.0):
+        led = _led_in(scratch, s, k, force / wp.max(size, NONE), lane)
     lack = _lacking(skins, scratch, c, s, k, force / wp.max(size, NONE), depth, lane)
     if lane > 0:
         return
@@ -389,7 +407,7 @@ def answer(first: wp.int32, many: wp.int32, known: Known, skins: Skins, scratch:
     sound = sound and not group
     sound = sound and skins.holes[k] == 0
     if size > real(0.0):
-        sound = sound and lack <= EDGE_OFF * wp.max(depth + lack, FIRST * carried / forces)
+        sound = sound and led >= LED_OUT and lack <= EDGE_OFF * wp.max(depth + lack, FIRST * carried / forces)
     wrong = real(0.0)
     if size > real(0.0) and grid.surface_error > SURE * depth:
         wrong = sums[15] / forces
@@ -403,6 +421,8 @@ def answer(first: wp.int32, many: wp.int32, known: Known, skins: Skins, scratch:
         bound = known.scale * wp.pow(doubt, known.power) + power * wp.min(wrong / wp.max(depth, NONE), real(1.0))
         below /= wp.max(forces, NONE)
         if one.stacked == 1:
+            if led < LED_OUT:
+                bound += wp.pow(led, -power) - real(1.0)
             bound += SHELL * wp.max(-scratch.given_way[c] - SHELL_FROM, real(0.0))
         else:
             bound += SHALLOW * wp.max(real(1.0) - depth * forces / (SHALLOW_TO * carried), real(0.0))
