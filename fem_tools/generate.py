@@ -192,7 +192,12 @@ def _executor(workers: int | None, scheduler: str | None) -> Iterator[tuple[Exec
         needed("a scheduler of Dask", "cluster", "distributed")
         from distributed import Client
 
-        with Client(scheduler, timeout="20s") as client, client.get_executor(pure=False) as executor:
+        try:
+            made = Client(scheduler, timeout="20s")
+        except (OSError, ValueError) as error:
+            raise InvalidInput(f"no scheduler of Dask answers at {scheduler!r}: {error}. Give its address, as "
+                               "tcp://127.0.0.1:8786.") from error  # fmt: skip
+        with made as client, client.get_executor(pure=False) as executor:
             nthreads: Any = client.nthreads()
             yield executor, max(1, len(nthreads))
         return

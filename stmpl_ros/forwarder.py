@@ -119,7 +119,8 @@ def run(host: str, port: int, topics: Sequence[str] = (), arguments: list[str] |
             raise InvalidInput(f"cannot listen at {host}:{port}: {error}. Take another --port.") from error
         node, executor = Forwarder(context, viewers, wanted), EventsExecutor()
         executor.add_node(node)
-        node.get_logger().info(f"open Foxglove, connect to ws://{host}:{server.port}, import foxglove/stmpl.json")
+        layout = "stmpl_ros/foxglove/stmpl.json"
+        node.get_logger().info(f"open Foxglove, connect to ws://{host}:{server.port}, import {layout}")
         try:
             spin(executor, stop)
         finally:

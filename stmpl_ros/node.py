@@ -369,6 +369,8 @@ class SkinNode(ServingNode):
         gc.freeze()  # without a thaw, which would take 0.1 s of the answers
         if same:
             self.get_logger().info(f"from here on friction is {config.friction or 'none'}")
+            if self.active:
+                self.sending.topology(self._now())  # the same once more: who asked waits for it
             return
         self.get_logger().info(f"from here on layer {skin.layer_id}: {skin.layer}")
         if self.active:

@@ -57,9 +57,10 @@ def train(
     changes |= {} if steps is None else {"steps": steps}
     if preset == "default":
         return train_moments(data, out, _settings(MomentTraining, changes), on_progress=on_progress)
+    from fem_tools.dataset import Dataset
     from stmpl_core.networks import Weights
     from studies.judge_contact import bound_motion
-    from studies.train_contact import ContactTraining, train_contact
+    from studies.train_contact import ContactTraining, tools_of, train_contact
 
     contacts, moments = _settings(ContactTraining, changes), _settings(MomentTraining, TOOLS | changes)
     if preset == "tissue":
@@ -67,6 +68,7 @@ def train(
         moments = _settings(MomentTraining, TOOLS | STACK_MOMENTS | changes)
     motion, pressure = ("stack_moment_net", "stack_contact_net") if preset == "tissue" else \
         ("moment_net_contact", "contact_net")  # fmt: skip
+    tools_of(Dataset.open(data))  # before the first network is trained
     train_moments(data, out, moments, name=motion, on_progress=on_progress)
     card = train_contact(data, out, contacts, name=pressure, on_progress=on_progress)
     if preset == "contacts":

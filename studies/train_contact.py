@@ -46,11 +46,18 @@ class ContactTraining(BaseModel):
 
     flat: float = Field(default=0.4, ge=0, lt=1)
     hidden: int = Field(default=32, ge=4)
-    steps: int = Field(default=6_000, ge=10)
+    steps: int = Field(default=6_000, ge=20)
     batch: int = Field(default=48, ge=4)
     learning_rate: float = Field(default=3e-3, gt=0)
     weight_decay: float = Field(default=1e-2, ge=0)
     seed: int = 0
+
+
+def tools_of(source: Dataset) -> Subset:
+    """The rigid tools of a data set that are learnt from. Raises InvalidInput where there is none."""
+    if not len(subset := source.split("train", kind="indenter", sets=("tool",))):
+        raise InvalidInput(f"{source.path} holds no rigid tools. Make them with stmpl generate --preset contacts.")
+    return subset
 
 
 class Drawn(NamedTuple):
@@ -183,9 +190,7 @@ def train_contact(
     """
     settings, said = settings or ContactTraining(), on_progress or (lambda *_: None)
     source, out, started = Dataset.open(data), Path(out), time.monotonic()
-    subset = source.split("train", kind="indenter", sets=("tool",))
-    if not len(subset):
-        raise InvalidInput(f"{data} holds no rigid tools. Make them with stmpl generate --preset contacts.")
+    subset = tools_of(source)
     drawn = draw_rows(subset, len(subset), said)
     flat = draw_flat(Plan.model_validate(source.manifest["plan"]), read_all(data), said)
     rows = drawn.rows

@@ -80,7 +80,7 @@ class MomentTraining(BaseModel):
     kinds: tuple[Kind, ...] = ("pressure", "nodal")
     stick: bool = False
     points: int = Field(default=128, ge=8)
-    steps: int = Field(default=40_000, ge=10)
+    steps: int = Field(default=40_000, ge=20)
     batch: int = Field(default=2048, ge=8)
     learning_rate: float = Field(default=4e-3, gt=0)
     weight_decay: float = Field(default=1e-5, ge=0)

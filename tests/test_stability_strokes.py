@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from stmpl_core import Simulator, SoftLayer, State, Touch
-from stmpl_core.methods import Winkler
+from stmpl_core.methods import MomentNet, Winkler
 from studies.stability import PRESETS, again, judge, stability
 from studies.stability.laws import MEANING
 from studies.stability.picture import LETTERS
@@ -39,7 +39,7 @@ class Brings:
     fault: Fault
 
     def simulator(self, layer: SoftLayer, friction: float | None = None) -> Faulty:
-        made = Faulty(layer, Winkler(), friction=friction)
+        made = Faulty(layer, MomentNet() if layer.stacked else Winkler(), friction=friction)
         made.fault = self.fault
         return made
 
