@@ -283,18 +283,23 @@ def _neighbourhood(touch: Touch, pressed: Pressed, power: float, middle: np.ndar
     """How far a model holds [m] and [rad].
 
     Along the normal F = c d^m leaves out m (m - 1) (x / d)^2 / 2 of F. Sideways the depth changes by x^2 d / a^2 at
-    most, a ball's on a plane being half of that, so m (x / a)^2 / 2 is left out. A turn moves the contact's rim so.
+    most, a ball's on a plane being half of that, so m (x / a)^2 / 2 is left out. A turn moves the contact's rim so, and
+    a tip far ahead of the origin: that of a tool as round as its contact, a^2 / d, only by what is beyond its centre.
     """
     deep = SAFETY * touch.depth * (2 * AGREEMENT / (power * (power - 1))) ** 0.5
     reach = min(deep, radius * (2 * AGREEMENT / power) ** 0.5, WIDEST)
     assert pressed.forces is not None
-    far = _arms(pressed.squeeze.nodes.points, pressed.forces, middle, touch.pose_body_from_tool[:3, 3], touch.push)
+    far = _arms(pressed.squeeze.nodes.points, pressed.forces, middle, touch.pose_body_from_tool[:3, 3], touch.push,
+                radius**2 / max(touch.depth, 1e-9))  # fmt: skip
     return reach, reach / far
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _arms(points, forces, middle, origin, push):
-    """How far the rim of a contact is from its middle, and that from the axis of the push through the origin [m]."""
+def _arms(points, forces, middle, origin, push, rounded):
+    """How far the rim of a contact is from its middle, and that from the axis of the push through the origin [m].
+
+    And by how much more than the radius to which its tool is rounded it is ahead of the origin along the push.
+    """
     rim = off = along = square = 0.0
     for n in range(len(points)):
         if forces[n] > 0:
@@ -303,7 +308,8 @@ def _arms(points, forces, middle, origin, push):
         off += (middle[x] - origin[x]) ** 2
         along += (middle[x] - origin[x]) * push[x]
         square += push[x] ** 2
-    return np.sqrt(rim) + np.sqrt(max(off - along * along / square, 0.0))
+    ahead = max(along / np.sqrt(square) - rounded, 0.0)
+    return np.sqrt(rim) + np.sqrt(max(off - along * along / square, 0.0)) + ahead
 
 
 def _grip(touch: Touch, memory: Memory, lever: float) -> Grip:

@@ -243,6 +243,24 @@ def test_the_model_is_the_reaction_at_its_own_pose(spot: Spot, model: LocalConta
     assert rendered.inside and model.normal @ spot.out < -0.9
 
 
+def test_a_stylus_turns_about_a_far_grip_only_as_far_as_its_tip_may_go_aside(spot: Spot) -> None:
+    """Told about a grip 0.1 m above its tip it claimed some 19 degrees, at which the tip had gone 33 mm aside."""
+    mesh = trimesh.creation.capsule(0.14, 0.005)
+    mesh.apply_translation([0, 0, -0.1 - mesh.bounds[0, 2]])
+    stylus, first = tool(mesh), np.cross(spot.out, np.eye(3)[np.abs(spot.out).argmin()])
+    first /= np.linalg.norm(first)
+    pose = np.eye(4)
+    pose[:3, :3] = np.column_stack([first, np.cross(spot.out, first), spot.out])
+    pose[:3, 3] = spot.place + (0.1 - DEEP) * spot.out
+    model = local_contact(spot.toucher, Contact(stylus, pose))
+    assert np.radians(0.05) < model.valid_rad < np.radians(1)
+    for axis in (first, pose[:3, 1]):
+        there = turned(pose, np.concatenate([np.zeros(3), 0.99 * model.valid_rad * axis]))
+        truth, rendered = spot.toucher.touch(Contact(stylus, there)), model.wrench_at(there)
+        assert rendered.inside
+        assert np.linalg.norm(rendered.wrench[:3] - truth.wrench[:3]) < 0.1 * truth.force
+
+
 @pytest.mark.parametrize("seed", range(3))
 def test_the_model_holds_where_it_says(
     block: tuple[Toucher, Contact], tilted: LocalContact, seed: int
