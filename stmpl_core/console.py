@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import json
+import math
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from typing import Any
 
 
 def print_figures(shown: object) -> None:
     """Prints a dict as JSON for machines, anything else as rich shows it to people."""
     if isinstance(shown, dict):
-        sys.stdout.write(json.dumps(shown, indent=2, default=str) + "\n")
+        sys.stdout.write(json.dumps(jsonable(shown), indent=2, default=str) + "\n")
         return
     from rich.console import Console
 
@@ -20,6 +22,15 @@ def print_figures(shown: object) -> None:
             raise BrokenPipeError
 
     Plain().print(shown)
+
+
+def jsonable(value: Any) -> Any:
+    """The same with null for what is not finite, which JSON does not know."""
+    if isinstance(value, dict):
+        return {key: jsonable(one) for key, one in value.items()}
+    if isinstance(value, list | tuple):
+        return [jsonable(one) for one in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 @contextmanager

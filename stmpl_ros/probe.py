@@ -21,6 +21,7 @@ from stmpl_ros.spinning import ros
 from stmpl_ros.topics import KEPT, STREAM
 
 POLL_PERIOD_S = 0.05  # time between two looks while waiting
+TOLD_AFTER_S = 5.0  # time that a node is waited for, before that is told
 
 
 class Played(NamedTuple):
@@ -46,8 +47,12 @@ class ProbeNode(Node):
 
     def wait_for_skin(self, stop: threading.Event) -> SoftLayer | None:
         """The layer that the node answers on; None if asked to stop or out of patience."""
-        deadline = time.monotonic() + self.config.patience
+        deadline, told = time.monotonic() + self.config.patience, time.monotonic() + TOLD_AFTER_S
         while not self.topology:
+            if time.monotonic() > told:
+                self.get_logger().info(f"waiting {self.config.patience:g} s at most for skin/topology: is a node "
+                                       "active?")  # fmt: skip
+                told = deadline + 1
             if stop.is_set() or time.monotonic() > deadline:
                 return None
             rclpy.spin_once(self, timeout_sec=POLL_PERIOD_S)

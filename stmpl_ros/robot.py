@@ -33,6 +33,7 @@ if TYPE_CHECKING:
 TOOL = "ball"  # name of the massage's tool on the bus; the fingers of a gripper have those of stmpl_sim.grip
 LOG = "robot.npz"  # file of what the robot did, in the folder that it is given
 POLL_PERIOD_S = 0.05  # time between two looks while waiting
+TOLD_AFTER_S = 5.0  # time that a node is waited for, before that is told
 CATCH_UP_S = 0.05  # simulated time that a robot behind real time makes up for
 
 
@@ -73,7 +74,7 @@ class RobotNode(Node):
 
     def wait_for_skin(self, stop: threading.Event) -> SoftLayer | None:
         """The layer that the node answers on; None if out of patience. Raises Stopped."""
-        self._wait(lambda: self.topology is not None, stop)
+        self._wait(lambda: self.topology is not None, stop, "skin/topology: is a node active?")
         return layer_from(self.topology) if self.topology else None
 
     def wait_for_listeners(self, stop: threading.Event) -> bool:
@@ -81,9 +82,12 @@ class RobotNode(Node):
         return self._wait(lambda: all(one.get_subscription_count() >= self.config.listeners
                                       for one in self._poses.values()), stop)  # fmt: skip
 
-    def _wait(self, done: Any, stop: threading.Event) -> bool:
-        deadline = time.monotonic() + self.config.patience
+    def _wait(self, done: Any, stop: threading.Event, what: str = "") -> bool:
+        deadline, told = time.monotonic() + self.config.patience, time.monotonic() + TOLD_AFTER_S
         while not done():
+            if what and time.monotonic() > told:
+                self.get_logger().info(f"waiting {self.config.patience:g} s at most for {what}")
+                told = deadline + 1
             _go_on(stop)
             if time.monotonic() > deadline:
                 return False

@@ -15,6 +15,7 @@ import numpy as np
 
 from fem_tools.dataset import Dataset, Sample, Subset, data_card
 from fem_tools.sampling import Kind, Split
+from stmpl_core.console import jsonable
 from stmpl_core.errors import InvalidInput, StmplError
 from stmpl_core.layer import SoftLayer
 from stmpl_core.methods import Method, Naive, Winkler
@@ -90,7 +91,7 @@ class Tables:
 
     def as_json(self) -> str:
         """For machines: metres and shares, null where there is no figure."""
-        return json.dumps(_plain(asdict(self)), indent=1)
+        return json.dumps(jsonable(asdict(self)), indent=1)
 
     def _notes(self) -> list[str]:
         data = self.about["data"]
@@ -324,12 +325,3 @@ def _cells(row: Row) -> list[str]:
 def _shown(value: float, form: str) -> str:
     """Empty for nan."""
     return "" if math.isnan(value) else format(value, form)
-
-
-def _plain(value: Any) -> Any:
-    """The same with null for nan, which JSON does not know."""
-    if isinstance(value, dict):
-        return {key: _plain(one) for key, one in value.items()}
-    if isinstance(value, list | tuple):
-        return [_plain(one) for one in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
