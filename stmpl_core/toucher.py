@@ -65,6 +65,7 @@ SURE = 0.02  # largest error of a distance field over the depth, up to which it 
 MOST_OFF = 0.1  # error of a distance field where a tool presses, over the depth, beyond which the force is not known
 LED_OUT = 0.95  # how far nodes sink with their tool over how deep it is in their columns: below, these lead out of it
 LOOKED_AT = 48  # tips of a tool that presses nothing that are looked at, the farthest; and as many of the others
+EDGE_SURE = 0.05  # share of its depth that an edge of a box lacks, with which contacts were learnt
 EDGE_OFF, MOST_LACKING = 0.2, 0.98  # depth of an edge that a distance field does not tell, from which it is flagged
 FIRST = 0.01  # depth over the thickness from which touches were tried
 MUCH_STIFFER = 50.0  # stiffness over that of the tissue above from which a material is nearly bone: people's are below
@@ -510,12 +511,13 @@ class Toucher:
             off = mean_off(one.field.checks, one.pose, nodes.points, forces)
             bound += held.power * min(off / max(depth, 1e-300), 1.0)
         lack = lacks = 0.0  # how much deeper a sharp edge is than the distance field tells [m], and over that
-        if size > 0 and len(one.field.tips):
+        one_way = size > SIDES[1] * scale * float(forces.sum())
+        if one_way and len(one.field.tips):
             lack = lacking(one.field.tips, one.pose, wrench[:3] / size, nodes.points, nodes.area, depth)
             lacks = min(lack / max(depth + lack, 1e-300), MOST_LACKING)
-            bound += (1 - lacks) ** -held.power - 1
+            bound += (1 - max(lacks - EDGE_SURE, 0.0)) ** -held.power - 1
         led = 1.0
-        if size > 0 and layer.stacked:
+        if one_way and layer.stacked:
             led = _led_in(nodes.sinking, nodes.strain, nodes.thickness, nodes.inward, wrench[:3] / size)
             if led < LED_OUT:
                 bound += led**-held.power - 1

@@ -247,7 +247,8 @@ def test_no_answer_to_a_rigid_tool_is_silent_or_flagged_in_vain(tmp_path):
     report = stability({"moment_net": MomentNet}, replace(preset, levels=levels), tmp_path)
     counts = report.counts("moment_net")
     assert counts["silent"] == counts["needless"] == counts["crashed"] == 0, list(tmp_path.glob("failures/*"))
-    assert len(report.rows) > 135 and counts["flagged"] <= 20
+    thin = [row for row in report.rows if row.axis == "tips" and row.outcome == "flagged"]  # meant to be, if too thin
+    assert len(report.rows) > 135 and counts["flagged"] - len(thin) <= 20 and len(thin) <= 3
     of_layers = {row.level: row.outcome for row in report.rows if row.axis == "skin, fat, muscle"}
     assert {told: of_layers[told] for told in LAYERED} == {
         told: "flagged" if told == "1e+20 N" else "held" for told in LAYERED}  # fmt: skip

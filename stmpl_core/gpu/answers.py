@@ -37,6 +37,7 @@ ALL_ONE_WAY = wp.constant(wp.float64(wrenches_of_skin.ALL_ONE_WAY))
 NONE = wp.constant(wp.float64(1e-300))
 NAN, PI = wp.constant(wp.float64(float("nan"))), wp.constant(wp.float64(math.pi))
 LED_OUT = wp.constant(wp.float64(toucher.LED_OUT))
+EDGE_SURE = wp.constant(wp.float64(toucher.EDGE_SURE))
 EDGE_OFF, MOST_LACKING = wp.constant(wp.float64(toucher.EDGE_OFF)), wp.constant(wp.float64(toucher.MOST_LACKING))
 SURE, MOST_OFF = wp.constant(wp.float64(toucher.SURE)), wp.constant(wp.float64(toucher.MOST_OFF))
 FIRST, TWICE_FIRST = wp.constant(wp.float64(toucher.FIRST)), wp.constant(wp.float64(2 * toucher.FIRST))
@@ -383,9 +384,11 @@ def answer(first: wp.int32, many: wp.int32, known: Known, skins: Skins, scratch:
     more_sums = sum_of(wp.vec4d(torque[0], torque[1], torque[2], along))
     pins = _pins(scratch, c, s, k, lane)
     led = real(1.0)
-    if one.stacked == 1 and size > real(0.0):
+    if one.stacked == 1 and size > SIDES[1] * forces:
         led = _led_in(scratch, s, k, force / wp.max(size, NONE), lane)
     lack = _lacking(skins, scratch, c, s, k, force / wp.max(size, NONE), depth, lane)
+    if size <= SIDES[1] * forces:
+        lack = real(0.0)
     if lane > 0:
         return
     torque = vec3(more_sums[0], more_sums[1], more_sums[2])
@@ -426,7 +429,8 @@ def answer(first: wp.int32, many: wp.int32, known: Known, skins: Skins, scratch:
             bound += SHELL * wp.max(-scratch.given_way[c] - SHELL_FROM, real(0.0))
         else:
             bound += SHALLOW * wp.max(real(1.0) - depth * forces / (SHALLOW_TO * carried), real(0.0))
-        bound += wp.pow(real(1.0) - wp.min(lack / wp.max(depth + lack, NONE), MOST_LACKING), -power) - real(1.0)
+        lacks = wp.max(wp.min(lack / wp.max(depth + lack, NONE), MOST_LACKING) - EDGE_SURE, real(0.0))
+        bound += wp.pow(real(1.0) - lacks, -power) - real(1.0)
         bound += STUCK * along / size + power * below / wp.max(depth, wp.max(below, NONE))
         if group:
             bound *= WIDER
