@@ -164,7 +164,7 @@ def test_a_recording_of_a_moving_limb_is_repeated_bit_for_bit(bus, person):
         for k, pose in enumerate(SLIDES):
             person.bend(0.03 * k)
             bus.spin(0.05)
-            hand.send(pose)
+            hand.ask(pose)  # waits for its answer, however busy the machine is
             bus.spin(0.1)
         bus.spin(0.5)
     finally:
