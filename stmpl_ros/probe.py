@@ -17,11 +17,10 @@ from bags.wire import layer_from, pose_message, tool_message, wrench_message
 from stmpl_core.layer import SoftLayer
 from stmpl_ros.parameters import ProbeConfig
 from stmpl_ros.scripts import Motion, Script, scripts_for
-from stmpl_ros.spinning import ros
+from stmpl_ros.spinning import TOLD_AFTER_S, ros
 from stmpl_ros.topics import KEPT, STREAM
 
 POLL_PERIOD_S = 0.05  # time between two looks while waiting
-TOLD_AFTER_S = 5.0  # time that a node is waited for, before that is told
 
 
 class Played(NamedTuple):

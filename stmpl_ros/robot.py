@@ -22,7 +22,7 @@ from stmpl_core.errors import StmplError
 from stmpl_core.layer import SoftLayer
 from stmpl_core.outputs import writable_folder
 from stmpl_ros.parameters import RobotConfig
-from stmpl_ros.spinning import interruptible, ros
+from stmpl_ros.spinning import TOLD_AFTER_S, interruptible, ros
 from stmpl_ros.tf import tf_type, transforms
 from stmpl_ros.topics import KEPT, STREAM
 
@@ -33,7 +33,6 @@ if TYPE_CHECKING:
 TOOL = "ball"  # name of the massage's tool on the bus; the fingers of a gripper have those of stmpl_sim.grip
 LOG = "robot.npz"  # file of what the robot did, in the folder that it is given
 POLL_PERIOD_S = 0.05  # time between two looks while waiting
-TOLD_AFTER_S = 5.0  # time that a node is waited for, before that is told
 CATCH_UP_S = 0.05  # simulated time that a robot behind real time makes up for
 
 

@@ -24,6 +24,7 @@ from stmpl_core.errors import InvalidInput
 from stmpl_ros.interrupts import endings
 
 CLOCK_TOLD_S = 30.0  # time between two lines on a clock that cannot be [s]
+TOLD_AFTER_S = 5.0  # time that a node is waited for, before that is told
 POLL_PERIOD_S = 0.1  # time between two looks of a spinning process whether it is to stop
 TRANSPORTS = "FASTDDS_BUILTIN_TRANSPORTS"  # variable by which a person chooses another: DEFAULT
 NO_LOG = "failed to initialize logging: "  # how RCLError begins where there is no place for its files

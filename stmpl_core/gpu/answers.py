@@ -383,12 +383,11 @@ def answer(first: wp.int32, many: wp.int32, known: Known, skins: Skins, scratch:
                     torque = torque + wp.cross(skins.points[trio[x]] - scratch.place[c], more * way)
     more_sums = sum_of(wp.vec4d(torque[0], torque[1], torque[2], along))
     pins = _pins(scratch, c, s, k, lane)
-    led = real(1.0)
-    if one.stacked == 1 and size > SIDES[1] * forces:
-        led = _led_in(scratch, s, k, force / wp.max(size, NONE), lane)
-    lack = _lacking(skins, scratch, c, s, k, force / wp.max(size, NONE), depth, lane)
-    if size <= SIDES[1] * forces:
-        lack = real(0.0)
+    led, lack = real(1.0), real(0.0)
+    if size > SIDES[1] * forces:
+        lack = _lacking(skins, scratch, c, s, k, force / size, depth, lane)
+        if one.stacked == 1:
+            led = _led_in(scratch, s, k, force / size, lane)
     if lane > 0:
         return
     torque = vec3(more_sums[0], more_sums[1], more_sums[2])

@@ -30,11 +30,10 @@ STACK = Tissue(3e3, 0.45, skin=Membrane(1.3e5, 1.2e-3, 11.0, relaxation=SERIES),
                deeper=(Ply(2e-3, 12e3, 0.45, relaxation=SERIES),))  # fmt: skip
 BALL, FLAT = shapes.ball(RADIUS), shapes.punch(8e-3, 0.02, fillet=2e-3)
 HALF = {id(BALL): RADIUS, id(FLAT): 0.01}  # half of a tool's height [m]
-TILTED = {  # tools of the tilting paths, and how far their origins are above their lowest point [m]
-    "ball": (shapes.ball(0.01), 0.01), "box": (shapes.box(0.02, 0.012, 0.01), 0.005),
-    "disc": (shapes.punch(0.012, 0.01, "disc"), 0.005), "cup": (shapes.cup(9e-3, 12e-3, 0.02), 0.0),
-    "stylus": (shapes.capsule(3e-3, 0.054, "stylus"), 0.03),
-}  # fmt: skip
+TILTED = (  # tools of the tilting paths, and how far their origins are above their lowest point [m]
+    (shapes.ball(0.01), 0.01), (shapes.box(0.02, 0.012, 0.01), 0.005), (shapes.punch(0.012, 0.01, "disc"), 0.005),
+    (shapes.cup(9e-3, 12e-3, 0.02), 0.0), (shapes.capsule(3e-3, 0.054, "stylus"), 0.03),
+)  # fmt: skip
 LOOPS, RUBBED, OFF = (0.5, 0.85), (0.0, 0.3, 1e-3), 5e-4  # depths over the thickness, friction, way off the skin [m]
 MU = 0.5
 STEP = 0.01  # time between instants where nothing else is said [s]
@@ -251,21 +250,20 @@ def tilting_path(stage: Stage, level: float) -> Trial:
     Five tools in turn, then to 0.5 and 0.85 of the thickness, then without friction, at mu 0.3 and at 0.001.
     """
     rng, number = np.random.default_rng([stage.seed, int(level)]), int(level)
-    mesh, (tool, half) = part("left_forearm"), list(TILTED.values())[number % 5]
-    layer = mesh.layer
+    mesh, (tool, half) = part("left_forearm"), TILTED[number % 5]
+    layer, top, mu = mesh.layer, LOOPS[number // 5 % 2], RUBBED[number // 10 % 3]
     near = np.linalg.norm(layer.vertices - layer.vertices.mean(axis=0), axis=1).argsort()
     v = int(rng.choice(near[: len(near) // 4]))
     out, phase = layer.normals[v], np.linspace(0, 2 * np.pi, 241)
     upright = Rotation.align_vectors([out], [[0.0, 0.0, 1.0]])[0]
     gone = rng.normal(size=(6, 2)) @ np.stack([np.sin(phase), 1 - np.cos(phase)])
     turns = upright * Rotation.from_euler("xyz", 5 * gone[3:].T, degrees=True)
-    high = half + OFF - (LOOPS[number // 5 % 2] * layer.thickness[v] + OFF) * np.sin(phase / 2) ** 2
+    high = half + OFF - (top * layer.thickness[v] + OFF) * np.sin(phase / 2) ** 2
     poses = np.tile(np.eye(4), (len(phase), 1, 1))
     poses[:, :3, :3] = turns.as_matrix()
     poses[:, :3, 3] = layer.vertices[v] + upright.apply(np.stack([*(2e-3 * gone[:2]), high], axis=1))
-    mu = RUBBED[number // 10 % 3]
     scene = Strokes(mesh, tool, poses, STEP * np.arange(len(phase)), mu)
-    return Trial("", f"{number}: {tool.name}, {LOOPS[number // 5 % 2]:g} t, {mu:g}", ("finite", "gives"), scene)
+    return Trial("", f"{number}: {tool.name}, {top:g} t, {mu:g}", ("finite", "gives"), scene)
 
 
 def _at_last(scene: Strokes, twin: Strokes) -> Twin:
