@@ -45,6 +45,7 @@ class Device(Robot):
         self.mesh = self.node.create_publisher(ContactMesh, "contact_mesh", KEPT)
         self.pose = self.node.create_publisher(PoseStamped, f"tools/{name}/pose", STREAM)
         self.wrench = self.node.create_publisher(WrenchStamped, f"tools/{name}/wrench", STREAM)
+        self.sent = 0
         self.mesh.publish(tool_message((tool or ball()).named(name), self.now()))
 
     def send(self, distance: float, force: float, *, pose_frame="body", wrench_frame="body") -> int:
@@ -53,6 +54,7 @@ class Device(Robot):
         push = np.array([-force, 0, 0, 0, 0, 0])
         self.wrench.publish(wrench_message(push, wrench_frame, stamp))
         self.pose.publish(pose_message(at(distance, 0, LENGTH / 2), pose_frame, stamp))
+        self.sent += 1
         return stamp
 
     def ask(self, distance: float, force: float, **frames) -> SkinDisplacement:
@@ -358,7 +360,9 @@ def test_every_message_of_a_run_is_recorded(device, tmp_path):
         device.wait(lambda: all(s.get_subscription_count() == 2 for s in streams), "the recorder")
         device.wait(lambda: device.node.count_subscribers("skin/displacement") == 2, "the recorder")
         device.spin(0.5)
+        before = device.sent
         stamps = [stamp_ns(device.ask(TOUCH, 0.001 * k)) for k in range(50)]
+        sent = device.sent - before  # more than 50 where the node, busy, took none of an instant
         device.wait(lambda: not device.got["skin/displacement"][-1].touches, "the answer at rest")
         device.spin(0.5)
     finally:
@@ -366,9 +370,9 @@ def test_every_message_of_a_run_is_recorded(device, tmp_path):
     assert code == 0, said
     bag = Bag(tmp_path / "run")
     assert bag.finished and not bag.damage
-    assert bag.topics["/tools/probe/pose"].messages == bag.topics["/tools/probe/wrench"].messages == 50
+    assert bag.topics["/tools/probe/pose"].messages == bag.topics["/tools/probe/wrench"].messages == sent >= 50
     fresh = [frame for frame in bag.frames() if frame.touches and not stale(frame)]
-    assert [frame.stamp_ns for frame in fresh] == stamps
+    assert [frame.stamp_ns for frame in fresh if frame.stamp_ns in stamps] == stamps
     replayed = replay_run(tmp_path / "run", MomentNet())
     assert replayed.frames > len(fresh) + 3, "while the last answer faded, answers went on"
     assert replayed.identical == replayed.frames, str(replayed)
