@@ -15,6 +15,7 @@ from stmpl_core.tissue import Membrane, Tissue
 
 RADII = (2e-3, 4e-3, 9e-3, 19e-3, 40e-3)  # radii of loads that one effective layer shall serve [m]
 THINNEST, THICKEST = 0.02, 4.0  # bounds of the effective layer's thickness, over that of the stack
+LEAST_GIVE = 0.95  # its least, over that of a first material which gives as much as the stack under an even stress
 WHERE = np.linspace(0, 1, 9)  # places in a contact that lie on the ball, over its radius
 FLIP = np.array([[1.0, -1.0], [-1.0, 1.0]])  # signs of a 2 x 2 stiffness in a mirror
 
@@ -262,7 +263,8 @@ def effective(tissue: Tissue, thickness: float, radii: Iterable[float] = RADII) 
         InvalidInput: a thickness or a radius that is not above 0.
     """
     stack = plies(tissue, thickness)
-    modulus, t, misfit = nearest(stack, tissue.skin, tissue.skin, radii)
+    gives = sum(h * min(1.0, stack[0][1] / modulus) for h, modulus, _ in stack)
+    modulus, t, misfit = nearest(stack, tissue.skin, tissue.skin, radii, thinnest=LEAST_GIVE * gives)
     bare = nearest(stack, tissue.skin, None, radii).misfit if tissue.skin else misfit
     stiffness, tension = (tissue.skin.stiffness, tissue.skin.tension) if tissue.skin else (0.0, 0.0)
     return Effective(modulus, t, stiffness / (modulus * t), tension / (modulus * t), misfit, bare)

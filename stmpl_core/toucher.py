@@ -72,7 +72,7 @@ MUCH_STIFFER = 50.0  # stiffness over that of the tissue above from which a mate
 SOFT_SHARE = 0.7  # depth over the soft tissue's there; at 0.62 force is 9 % off, at 0.87 by 18 to 33 %
 RATIOS_APART = 0.06  # difference of the materials' Poisson's ratios: 0.05 cost nothing, of 0.1 force is 15 % off
 MAX_PULL = 1.0  # T / (E t) of the effective layer: beyond, force on round limbs is up to 14 % off; people have 0.7
-SLACK = 0.04, 0.5  # T / (E t), and kappa, below and above which skin is slack and matters: force then falls with T
+SLACK = 0.012, 0.5  # T / (E_s h), and kappa, below and above which skin is slack and matters: force then falls with T
 PINS = 3  # tools side by side from which they may be pins of one brush
 SIDES = (0.2, 0.9)  # share of the force that points one way: below, a tool closes around; between, none was learnt
 MAX_UNSEEN_FORCE_SHARE = 0.1  # share of the force that vertices unlike all training contacts may carry
@@ -803,14 +803,16 @@ def unlearnt(layer: SoftLayer, low: float, high: float) -> list[str]:
     """What of a layer's tissue no contact was learnt with, as sentences; Poisson's ratios from low to high were."""
     tissue, out = layer.tissue, []
     ratios = {tissue.poisson_ratio, *(ply.poisson_ratio for ply in tissue.deeper)}
-    pull = Green.of(layer).effective.pull if tissue.skin is not None else 0.0
+    pull, kappa = 0.0, 0.0
+    if tissue.skin is not None:
+        pull, kappa = Green.of(layer).effective.pull, Green.of(layer).effective.kappa
     out += [f"contacts were learnt at Poisson's ratios from {low:g} to {high:g}, not {nu:g}"
             for nu in sorted(ratios) if not low - 1e-3 <= nu <= high + 1e-3]  # fmt: skip
     if (apart := max(ratios) - min(ratios)) > RATIOS_APART:
         out.append(f"Poisson's ratios of the materials differ by {apart:.2g}; tried is {RATIOS_APART:g}")
-    if tissue.skin is not None and pull < SLACK[0] and Green.of(layer).effective.kappa > SLACK[1]:
-        out.append(f"the skin has next to no tension, T / (E t) = {pull:.2g}: such skin is answered 10 to 22 % too "
-                   "stiff; people's is taut")  # fmt: skip
+    if kappa > SLACK[1] and pull < SLACK[0] * kappa:
+        out.append(f"the skin has next to no tension, T / (E_s h) = {pull / kappa:.2g}: such skin is answered 10 to "
+                   "22 % too stiff; people's is taut")  # fmt: skip
     if pull > MAX_PULL:
         out.append(f"the skin's tension is {pull:.2g} times E t of the tissue under it; tried is {MAX_PULL:g}")
     return out
