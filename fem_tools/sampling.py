@@ -194,6 +194,17 @@ STOUT: tuple[Person, ...] = (  # much fat under a skin that is stiff beside it, 
     ("thigh_2", 0.95, 0.9, 0.2, "left_thigh", "relaxed", 12e-3, 6.0, 0.3),
     ("calf", 0.95, 0.7, 0.2, "left_calf", "relaxed", 9e-3, 6.0, 0.3),
 )
+TRUNK: tuple[Person, ...] = (  # three materials on the abdomen, soft over stiff on neck and shoulder
+    ("abdomen_1", 0.5, 0.5, 0.5, "abdomen", "relaxed", 14e-3, 3.0, 0.45),
+    ("abdomen_2", 0.7, 0.9, 0.4, "abdomen", "tensed", 14e-3, 3.0, 0.35),
+    ("abdomen_3", 0.3, 0.2, 0.6, "abdomen", "relaxed", 14e-3, 3.0, 0.35),
+    ("neck_1", 0.5, 0.4, 0.5, "neck", "relaxed", 8e-3, 3.0, 0.35),
+    ("neck_2", 0.75, 0.8, 0.4, "neck", "tensed", 8e-3, 3.0, 0.25),
+    ("shoulder", 0.4, 0.6, 0.5, "left_shoulder", "relaxed", 8e-3, 3.0, 0.35),
+    ("forearm_1", 0.15, 0.3, 0.6, "left_forearm", "relaxed", 6e-3, 6.0, 0.35),
+    ("forearm_2", 0.5, 0.7, 0.5, "left_forearm", "relaxed", 6e-3, 6.0, 0.35),
+    ("forearm_3", 0.8, 0.1, 0.5, "left_forearm", "relaxed", 7e-3, 6.0, 0.35),
+)
 
 
 def _living(kind: str, people: tuple[Person, ...], **more: Any) -> tuple[BodyPlan, ...]:
@@ -210,6 +221,7 @@ LIVING_BODIES = _living("living", PEOPLE, sizes=(8e-3, 40e-3))
 DEEP_BODIES = _living("deep", DEEP, sizes=(12e-3, 30e-3), tools=("sphere", "ellipsoid", "capsule"),
                       shallowest=0.45, most_work=1e11)  # that go deep where tissue is thick: most others end before
 STOUT_BODIES = _living("stout", STOUT, sizes=(8e-3, 40e-3), most_work=8e10)
+TRUNK_BODIES = _living("trunk", TRUNK, sizes=(8e-3, 40e-3), most_work=8e10)
 
 
 def _drawn_bodies(count: int) -> tuple[BodyPlan, ...]:

@@ -113,6 +113,30 @@ def filled(body: Body, part: str, skin: SoftLayer, tone: Tone = "relaxed") -> So
     return to_bone(skin, bones_of(body, part), deepest)
 
 
+def laid(body: Body, part: str, tissue: Tissue, thickness: float, *, edge_length: float = EDGE_LENGTH) -> SoftLayer:
+    """A part of a body with one's own tissue: down to its bones, or to `thickness` [m] where they lie deeper.
+
+    Parts whose bones are not known (torso, back, hands) are as thick as that everywhere.
+
+    Args:
+        body: body.
+        part: its part, or `around:x,y,z,radius`.
+        tissue: tissue.
+        thickness: the most that it is thick [m].
+        edge_length: length of the skin mesh's edges [m].
+
+    Raises:
+        InvalidInput: no such part, or a thickness on which no layer can be laid.
+    """
+    try:
+        named = part_around(body, part) if part.startswith(AROUND) else part
+        bones = bones_of(body, named)
+    except InvalidInput:
+        return body.part(part, edge_length=edge_length, thickness=thickness, tissue=tissue)
+    skin = body.part(part, edge_length=edge_length, thickness=min(SHEET, thickness), tissue=tissue)
+    return to_bone(skin.with_(bony=bony(body, named, skin.vertices)), bones, min(thickness, DEEPEST))
+
+
 def held_skin(layer: SoftLayer) -> SoftLayer:
     """The layer with the stress of all its materials fading as in skin that was stretched and held (HELD_SKIN)."""
     return layer.with_(tissue=layer.tissue.relaxing(HELD_SKIN))

@@ -11,7 +11,7 @@ from stmpl_core.contact import Contact
 from stmpl_core.errors import InvalidInput
 from stmpl_core.friction import Friction, friction_from
 from stmpl_core.layer import SoftLayer
-from stmpl_core.living import held_skin, living, part_around, read_model, read_tissue, region_of
+from stmpl_core.living import held_skin, laid, living, part_around, read_model, read_tissue, region_of
 from stmpl_core.local_contact import local_contacts
 from stmpl_core.regions import Tone
 from stmpl_core.rig import Rig, joints_of
@@ -47,8 +47,7 @@ def _at_rest(config: NodeConfig, body: Body) -> SoftLayer:
     if config.tissue in get_args(Tone):
         return living(body, config.limb, cast(Tone, config.tissue), edge_length=config.edge_length)
     if config.tissue != PAPER:
-        tissue, thickness = read_tissue(config.tissue)
-        return body.part(config.limb, edge_length=config.edge_length, thickness=thickness, tissue=tissue)
+        return laid(body, config.limb, *read_tissue(config.tissue), edge_length=config.edge_length)
     tissue = Tissue(config.youngs_modulus, config.poisson_ratio, config.density)
     return body.part(config.limb, edge_length=config.edge_length, thickness=config.thickness, tissue=tissue)
 

@@ -13,7 +13,7 @@ from stmpl_core.body import Body, around_name
 from stmpl_core.bones import bones_of
 from stmpl_core.errors import InvalidInput
 from stmpl_core.extrusion import fold_ratios
-from stmpl_core.living import living, part_around, read_tissue, region_of, write_tissue
+from stmpl_core.living import laid, living, part_around, read_tissue, region_of, write_tissue
 from stmpl_core.methods import MomentNet
 from stmpl_core.methods.ladder import Measured
 from stmpl_core.regions import HELD_SKIN, region
@@ -60,6 +60,27 @@ def test_a_tissue_goes_through_a_file(tmp_path):
     tissue = region("back").tissue
     write_tissue(tmp_path / "back.json", tissue, 0.018)
     assert read_tissue(tmp_path / "back.json") == (tissue, 0.018)
+
+
+@pytest.mark.parametrize("part, thickness", [("left_calf", 0.0511), ("abdomen", 0.099)])
+def test_a_tissue_of_ones_own_ends_at_the_bones_where_an_even_layer_of_it_would_fold(part, thickness, tmp_path):
+    tissue = replace(region("calf").tissue, deeper=())
+    with pytest.raises(InvalidInput, match="would fold"):
+        Body.anny().part(part, edge_length=COARSE, thickness=thickness, tissue=tissue)
+    layer = laid(Body.anny(), part, tissue, thickness, edge_length=COARSE)
+    bones = living(Body.anny(), part, edge_length=COARSE)
+    assert (layer.thickness < thickness * (1 + 1e-9)).all() and layer.tissue == tissue
+    deep = bones.thickness < 0.9 * bones.thickness.max()
+    np.testing.assert_allclose(layer.thickness[deep], bones.thickness[deep], rtol=1e-6)
+    write_tissue(tmp_path / "own.json", tissue, thickness)
+    same = layer_of(NodeConfig(tissue=str(tmp_path / "own.json"), part=part, edge_length=COARSE))
+    np.testing.assert_array_equal(same.thickness, layer.thickness)
+
+
+@pytest.mark.parametrize("part", ["back", "around:0.1,0.1,0.4,0.05"])
+def test_a_tissue_of_ones_own_is_as_thick_as_asked_where_no_bones_are_known(part):
+    layer = laid(Body.anny(), part, Tissue(2e3, 0.4), 8e-3, edge_length=COARSE)
+    assert np.median(layer.thickness) == pytest.approx(8e-3)
 
 
 @pytest.mark.parametrize("content", ["", "{}", "[1]", '{"tissue": 3, "thickness": 1}', '{"tissue": {"skin": null}}',
