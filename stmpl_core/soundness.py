@@ -28,6 +28,8 @@ FOLD = 0.15  # fold ratio of prisms under bent skin, below which they are none t
 STRETCH = (0.8, 1.25)  # stretch of bent skin over rest, outside of which thickness and mesh are not what they were
 HOLLOW = -0.25  # curvature times thickness of bent skin, below which it is more hollow than the networks know
 FACING = 1.5  # distance to skin that faces it, over t, below which a tool touches both
+CROSSED = 0.9  # distance of a column's end from the nearest skin, over its length, below which it crosses others
+CROSSED_SHARE = 0.05  # share of the force that may be on such
 BONY_SHARE = 0.2  # share of the force that may be where bone is nearer than the layer knows
 BENT_SHARE = 0.05  # share of the load that may be on skin that a bend spoils
 
@@ -81,7 +83,7 @@ class Soundness:
         layer: soft layer at rest.
 
     Attributes:
-        steep, long, bony: masks of vertices, (V,).
+        steep, long, bony, crossed: masks of vertices, (V,).
         border: distance from the open border, over t, (V,).
         facets: how far the flat triangles around a vertex lie off the smooth skin that they stand for, (V,) [m].
         least_border: least such distance of a load that is sound [-].
@@ -97,6 +99,7 @@ class Soundness:
         self.facets = np.abs(below_curved(layer)) + roughness(layer)
         self.least_border = STACK_BORDER if layer.stacked else BORDER
         self._near = self.border < self.least_border
+        self.crossed = crossed_columns(layer)
         self.bony = np.zeros(len(self.steep), bool) if layer.bony is None else layer.bony
 
     def at(self, bend: Bend) -> Self:
@@ -126,11 +129,14 @@ class Soundness:
 
     def of_contact(self, loaded: np.ndarray, force: np.ndarray) -> list[str]:
         """What is wrong with the skin under a tool that presses with forces (L,) on vertices (L,), as sentences."""
-        steep, long, near, bony = _shares(loaded, force, self.steep, self.long, self._near, self.bony)
+        steep, long, near, bony, crossed = _shares(loaded, force, self.steep, self.long, self._near, self.bony,
+                                                   self.crossed)  # fmt: skip
         told = self.of_mesh(steep, long, "the force")
         if bony > BONY_SHARE:
             told.append(f"{bony:.0%} of the force is over a kneecap, a shin or the tip of an elbow, where people have "
                         "bone right under the skin: far too soft here")  # fmt: skip
+        if crossed > CROSSED_SHARE:
+            told.append(f"under {crossed:.0%} of the force the layer is thicker than half of the limb")
         return told if self.bend is None and near <= BORDER_SHARE else [*told, *self.of_load(loaded, force)]
 
 
@@ -158,6 +164,17 @@ def slope_of_thickness(layer: SoftLayer) -> np.ndarray:
         np.add.at(sums, layer.faces[:, corner], square)
         np.add.at(weights, layer.faces[:, corner], double)
     return np.sqrt(sums / np.maximum(weights, 1e-300))
+
+
+def crossed_columns(layer: SoftLayer) -> np.ndarray:
+    """Mask of the columns that end nearer to other skin than to their own: they are longer than the limb is deep, (V,).
+
+    Only of layers that end along their normals: where bones end them, many lie nearer to one side.
+    """
+    if layer.core is not None:
+        return np.zeros(len(layer.vertices), bool)
+    away = KDTree(layer.vertices).query(layer.inner_vertices)[0]
+    return np.asarray(away < CROSSED * layer.thickness)
 
 
 def longest_over_width(layer: SoftLayer) -> np.ndarray:

@@ -613,8 +613,8 @@ class Toucher:
         for why in self._unlearnt:
             trust = trust.also(why, in_range=False)
         if strange > MAX_UNSEEN_FORCE_SHARE:
-            trust = trust.also(f"{strange:.0%} of the force of {name} is where no training contact was like it"
-                               f"{self._too_thick(touch)}", in_range=False)  # fmt: skip
+            trust = trust.also(f"{strange:.0%} of the force of {name} is where no training contact was like it",
+                               in_range=False)  # fmt: skip
         far = one.force is not None and abs(one.moved) > self.reach
         if far and abs(one.moved) > MUCH_MOVED * float(one.squeeze.nodes.thickness.max()):
             trust = trust.also(f"{name} was moved {one.moved * 1e3:+.1f} mm along its force: check its calibration")
@@ -643,22 +643,6 @@ class Toucher:
         beside = np.linalg.norm(away - deep[:, None] * self._inward[v], axis=1)
         known = (beside < self.layer.edge_length) & (deep > 2 * FIRST * self.layer.thickness[v])
         return float(deep[known].max(initial=0.0))
-
-    def _too_thick(self, touch: Touch) -> str:
-        """What is said of columns that run along the normals to beyond the middle of a limb; empty: they do not.
-
-        By the curvature at one vertex: `curvature` is compiled, and a flag must not wait for that.
-        """
-        pressed = touch.pressed
-        if self.layer.core is not None or pressed is None or pressed.forces is None or not pressed.forces.any():
-            return ""
-        vertex = int(pressed.squeeze.nodes.corners[int(pressed.forces.argmax()), 0])
-        xx, xy, yy = self.near.curvature[vertex].tolist()
-        bent, thick = 0.5 * (xx + yy) + math.hypot(0.5 * (xx - yy), xy), float(self.near.thickness[vertex])
-        if bent <= 1:
-            return ""
-        return (f": the layer is {1e3 * thick:.0f} mm thick, and {1e3 * thick / bent:.0f} mm below the skin is the "
-                "limb's middle")  # fmt: skip
 
     def unmet(self, trust: Trust, touch: Touch, stated: np.ndarray | None) -> Trust:
         """The trust in a touch, lowered where much of the stated wrench (6,) is not carried."""

@@ -139,7 +139,16 @@ def test_what_is_too_much_of_a_push_is_not_said_to_be_drag(sim: Simulator) -> No
 def test_a_layer_thicker_than_the_limb_is_told_so(thickness: float, said: bool) -> None:
     found = felt(Toucher(limb(4e-3, thickness)), BALL, on_limb(), None)
     assert not found.trust.in_range
-    assert ("the layer is 47 mm thick, and 40 mm below the skin is the limb's middle" in found.trust.why) == said
+    assert ("under 100% of the force the layer is thicker than half of the limb" in found.trust.why) == said
+
+
+@pytest.mark.parametrize("thickness, sound", [(0.012, True), (0.02, False)])
+def test_a_layer_that_is_thicker_than_half_of_a_flat_limb_is_flagged(thickness: float, sound: bool) -> None:
+    """Skin on a broad side curves little: that its columns end beyond the limb's middle no curvature tells."""
+    wide = limb(4e-3, thickness, radius=0.06)
+    flat = wide.with_(vertices=wide.vertices * [0.25, 1.0, 1.0])
+    found = felt(Toucher(flat), BALL, at(0.015 + 0.010 - 0.1 * thickness, 0, MIDDLE), None)
+    assert found.trust.in_range == sound and ("half of the limb" in found.trust.why) != sound
 
 
 def test_more_force_presses_deeper_and_on_more_skin(toucher: Toucher) -> None:

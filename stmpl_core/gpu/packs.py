@@ -261,7 +261,7 @@ def _one_skin(skin: Skin, columns: Columns, at: tuple[int, int, int, int]) -> tu
     edge = np.zeros(len(order), bool)
     edge[layer.border] = True
     doubts = (STEEP_BIT * sound.steep + LONG_BIT * sound.long + EDGE_BIT * edge + BONY_BIT * sound.bony
-              + BORDER_BIT * (sound.border < sound.least_border))  # fmt: skip
+              + BORDER_BIT * ((sound.border < sound.least_border) | sound.crossed))  # fmt: skip
     arrays = {
         "points": layer.vertices[order], "inward": columns.inward[order], "thickness": layer.thickness[order],
         "area": layer.vertex_areas[order], "area_vectors": layer.vertex_area_vectors[order],
