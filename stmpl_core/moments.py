@@ -91,12 +91,13 @@ class Surroundings:
     """
 
     def __init__(self, layer: SoftLayer) -> None:
+        whole = layer
         if layer.stacked:  # to a stack, and to bone, belongs one flat response
             layer = SoftLayer(layer.vertices, layer.faces, float(np.median(layer.thickness)), tissue=layer.tissue)
         self.frames, self.thickness = _frames(layer.normals), layer.thickness
         points = np.ascontiguousarray(layer.vertices)
         self._thinning = Thinning(layer, self.frames, REACH)
-        self.sound = Soundness(layer)
+        self.sound = Soundness(layer, below=whole)
         self._frames = self.frames.astype(np.float32)
         self._sites = _sites(points, layer.normals, layer.thickness, layer.vertex_areas)
         shape = _shape(self._thinning.start, self._thinning.index, points, self.frames, layer.thickness)

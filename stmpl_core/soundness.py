@@ -80,7 +80,8 @@ class Soundness:
     """Where a layer is as the networks know skin: neither steep, nor badly meshed, nor at its border.
 
     Args:
-        layer: soft layer at rest.
+        layer: soft layer at rest, as methods count its thickness.
+        below: the same skin with what is below it as it is, if that is another.
 
     Attributes:
         steep, long, bony, crossed: masks of vertices, (V,).
@@ -92,15 +93,16 @@ class Soundness:
 
     bend: Bend | None = None
 
-    def __init__(self, layer: SoftLayer) -> None:
+    def __init__(self, layer: SoftLayer, below: SoftLayer | None = None) -> None:
+        below = below or layer
         self.steep = slope_of_thickness(layer) > STEEP
         self.long = longest_over_width(layer) > LONG
         self.border = border_distance(layer) / layer.thickness
         self.facets = np.abs(below_curved(layer)) + roughness(layer)
         self.least_border = STACK_BORDER if layer.stacked else BORDER
         self._near = self.border < self.least_border
-        self.crossed = crossed_columns(layer)
-        self.bony = np.zeros(len(self.steep), bool) if layer.bony is None else layer.bony
+        self.crossed = crossed_columns(below)
+        self.bony = np.zeros(len(self.steep), bool) if below.bony is None else below.bony
 
     def at(self, bend: Bend) -> Self:
         """The same of a skin that joints have bent."""

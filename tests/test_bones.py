@@ -13,10 +13,11 @@ from stmpl_core.errors import InvalidInput
 from stmpl_core.extrusion import fold_ratios
 from stmpl_core.layer import layer_id
 from stmpl_core.living import living
-from stmpl_core.methods import Winkler
+from stmpl_core.methods import MomentNet, Winkler
+from stmpl_core.moments import Surroundings
 from stmpl_core.packed import pack, unpack
-from stmpl_core.soundness import Soundness
-from tests.scenes import LENGTH, RADIUS, disc, limb
+from stmpl_core.simulator import Simulator
+from tests.scenes import LENGTH, RADIUS, ball, contact_of, disc, limb
 
 AXIS = Bone(np.array([0.0, 0, -1]), np.array([0.0, 0, 1]), 0.012)
 
@@ -80,7 +81,7 @@ def test_what_cannot_be_is_refused_with_what_is_wrong():
 def test_kneecap_shin_and_tip_of_the_elbow_are_told_of_and_flesh_is_not(part, bony, soft):
     """Forty millimetres of tissue over a kneecap, seventeen over the tip of an elbow, are not people's."""
     layer = living(Body.anny(), part, edge_length=8e-3)
-    sound = Soundness(layer)
+    sound = Surroundings.of(layer).sound
 
     def told(place) -> bool:
         distance = np.linalg.norm(layer.vertices - place, axis=1)
@@ -89,6 +90,17 @@ def test_kneecap_shin_and_tip_of_the_elbow_are_told_of_and_flesh_is_not(part, bo
 
     assert [told(place) for place in bony + soft] == [True] * len(bony) + [False] * len(soft)
     assert 0.01 < layer.bony.mean() < 0.12
+
+
+def test_a_press_on_a_shin_is_flagged_and_one_on_the_calf_is_not():
+    layer = living(Body.anny(), "left_calf", edge_length=8e-3)
+    simulator = Simulator(layer, MomentNet())
+    for place, sound in (((0.048, 0.121, -0.55), False), ((-0.06, 0.15, -0.52), True)):
+        v = int(np.linalg.norm(layer.vertices - place, axis=1).argmin())
+        pose = np.eye(4)
+        pose[:3, 3] = layer.vertices[v] + (0.012 - 0.1 * layer.thickness[v]) * layer.normals[v]
+        (touch,) = simulator.touch([contact_of(ball(0.012), pose)])
+        assert touch.trust.in_range == sound and ("right under the skin" in touch.trust.why) != sound
 
 
 def test_what_is_bony_travels_with_the_layer():
