@@ -51,8 +51,11 @@ LIMBS = {  # rows of scenes: what splits, and how the limbs are called; a networ
     "a forearm left out": (("held_out",), ("forearm",)),
     "people": (("test", "val"), ("living",)),
     "heavy people": (("test", "val"), ("stout",)),
+    "trunks, forearms": (("test", "val"), ("trunk",)),
 }
-STOUT = Path(__file__).with_name("stout_v1.npz")  # where the last are
+ELSEWHERE = {  # where the last are
+    "heavy people": FILE.with_name("stout_v1.npz"), "trunks, forearms": FILE.with_name("trunk_v1.npz"),
+}  # fmt: skip
 DEPTHS = (0.0, 0.1, 0.3, 0.6, 1.0)  # over the thickness, between which --kept takes means
 PEER_AT = (0.2, 0.4)  # depths at which a peer is asked [thicknesses]
 PEER, FLEX = "MuJoCo flex, the limb's mesh", "studies/peers/layered_flex.py:ball"
@@ -271,7 +274,7 @@ def _answer(options: argparse.Namespace) -> None:
     read = cache(Released)
 
     def released(kind: str) -> Released:
-        return read(options.file or (STOUT if kind == "heavy people" else FILE))
+        return read(options.file or ELSEWHERE.get(kind, FILE))
 
     if options.export:
         samples = (one for kind in options.limbs for one in released(kind).samples()

@@ -310,9 +310,9 @@ PRESETS = {
     "contacts": Plan(preset="contacts", bodies=CONTACT_BODIES, discs=0, ellipses=0, seams=0, hands=0, bands=0,
                      letters=0, tools=60, loads=8, deepest=0.9, indenter_step=0.08),
     "tissue": Plan(preset="tissue", bodies=TISSUE_BODIES + _drawn_bodies(DRAWN) + LIVING_BODIES + DEEP_BODIES +
-                   STOUT_BODIES + TRUNK_BODIES, discs=0, ellipses=0, seams=0, hands=0, bands=0, letters=0, tools=18, loads=8, deepest=0.85,
-                   indenter_step=0.12, clear=4.0, thinnest=1.4, sizes=(4e-3, 40e-3), linear=True, most_work=4e10,
-                   rounds=400),
+                   STOUT_BODIES + TRUNK_BODIES, discs=0, ellipses=0, seams=0, hands=0, bands=0, letters=0, tools=18,
+                   loads=8, deepest=0.85, indenter_step=0.12, clear=4.0, thinnest=1.4, sizes=(4e-3, 40e-3), linear=True,
+                   most_work=4e10, rounds=400),
 }  # fmt: skip
 
 
