@@ -68,8 +68,8 @@ LOOKED_AT = 48  # tips of a tool that presses nothing that are looked at, the fa
 EDGE_SURE = 0.05  # share of its depth that an edge of a box lacks, with which contacts were learnt
 EDGE_OFF, MOST_LACKING = 0.2, 0.98  # depth of an edge that a distance field does not tell, from which it is flagged
 FIRST = 0.01  # depth over the thickness from which touches were tried
-MUCH_STIFFER = 50.0  # stiffness over that of the tissue above from which a material is nearly bone: people's are below
-SOFT_SHARE = 0.7  # depth over the soft tissue's there; at 0.62 force is 9 % off, at 0.87 by 18 to 33 %
+MUCH_STIFFER = 25.0, 50.0  # stiffness over that of what lies above, bare and under a skin, from which it is nearly bone
+SOFT_SHARE = 0.25, 0.56  # depth over the soft tissue's there, likewise, to which force is within its bound
 RATIOS_APART = 0.06  # difference of the materials' Poisson's ratios: 0.05 cost nothing, of 0.1 force is 15 % off
 MAX_PULL = 1.0  # T / (E t) of the effective layer: beyond, force on round limbs is up to 14 % off; people have 0.7
 SLACK = 0.012, 0.5  # T / (E_s h), and kappa, below and above which skin is slack and matters: force then falls with T
@@ -606,10 +606,10 @@ class Toucher:
         elif one.rim and one.status != IN_CORE:
             trust = trust.also(f"{name} presses a part of the skin below it to over {DEEPEST:.0%} of the tissue there",
                                in_range=False)  # fmt: skip
-        softly = touch.depth / self._soft
-        if softly > SOFT_SHARE and one.status != IN_CORE:
-            trust = trust.also(f"{name} presses to {softly:.0%} of what lies over a material over {MUCH_STIFFER:g} "
-                               f"times as stiff, tried is {SOFT_SHARE:.0%}", in_range=False)  # fmt: skip
+        if touch.depth > self._soft and one.status != IN_CORE:
+            stiffer = MUCH_STIFFER[layer.tissue.skin is not None]
+            trust = trust.also(f"{name} presses {1e3 * touch.depth:.2g} mm into what lies over a material over "
+                               f"{stiffer:g} times as stiff, tried is {1e3 * self._soft:.2g} mm", in_range=False)
         for why in self._unlearnt:
             trust = trust.also(why, in_range=False)
         if strange > MAX_UNSEEN_FORCE_SHARE:
@@ -803,11 +803,11 @@ def unlearnt(layer: SoftLayer, low: float, high: float) -> list[str]:
 
 
 def soft_depth(tissue: Tissue) -> float:
-    """Depth of the first material that is MUCH_STIFFER than what lies over it [m]; infinite where none is."""
-    softest = tissue.youngs_modulus
+    """Depth to which a tool may press into what lies over a material that is MUCH_STIFFER [m]; infinite without one."""
+    softest, taut = tissue.youngs_modulus, tissue.skin is not None
     for ply in tissue.deeper:
-        if ply.youngs_modulus > MUCH_STIFFER * softest:
-            return ply.depth
+        if ply.youngs_modulus > MUCH_STIFFER[taut] * softest:
+            return SOFT_SHARE[taut] * ply.depth
         softest = min(softest, ply.youngs_modulus)
     return math.inf
 

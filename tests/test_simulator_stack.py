@@ -195,6 +195,22 @@ def test_soft_tissue_over_what_is_nearly_bone_is_flagged_where_it_is_nearly_pres
     assert touch.trust.in_range == sound, touch.trust.why
 
 
+@pytest.mark.parametrize("stiffer", [30.0, 1000.0])
+def test_bare_soft_tissue_over_what_is_nearly_bone_presses_as_on_bone_or_is_flagged(stiffer):
+    """It was up to 46 % too stiff at 0.6 of the soft tissue, where 13 were stated."""
+    soft, small = 10e-3, ball(6e-3)
+    even, stack = Tissue(3e3, 0.45), Tissue(3e3, 0.45, deeper=(Ply(soft, 3e3 * stiffer, 0.45),))
+    over, on = (Simulator(limb(4e-3, thickness, 0.045, 0.2).with_(tissue=tissue), MomentNet())
+                for thickness, tissue in ((soft, even), (0.03, stack)))  # fmt: skip
+    flagged = []
+    for depth in (0.1, 0.2, 0.3, 0.45, 0.6):
+        contact = contact_of(small, at(0.045 + 6e-3 - depth * soft, 0, 0.1))
+        (true,), (found,) = over.touch([contact]), on.touch([contact])
+        flagged.append(not found.trust.in_range)
+        assert flagged[-1] or abs(found.force - true.force) < found.force_bound
+    assert flagged == [False, False, True, True, True]
+
+
 def tube_of(first: float, deeper: float) -> SoftLayer:
     """A round limb of fat and muscle with these Poisson's ratios."""
     tissue = Tissue(3e3, first, skin=Membrane(1.3e5, 1.5e-3, 8.0), deeper=(Ply(8e-3, 12e3, deeper),))

@@ -22,7 +22,6 @@ STEEP_SHARE, LONG_SHARE = wp.constant(wp.float64(soundness.STEEP_SHARE)), wp.con
 BORDER_SHARE = wp.constant(wp.float64(soundness.BORDER_SHARE))
 AROUND, UNSEEN = wp.constant(wp.float64(toucher.MAX_AROUND)), wp.constant(wp.float64(toucher.MAX_UNSEEN_FORCE_SHARE))
 SIDES = wp.constant(wp.vec2d(*toucher.SIDES))
-SOFT_SHARE = wp.constant(wp.float64(toucher.SOFT_SHARE))
 SHELL, SHELL_FROM = wp.constant(wp.float64(toucher.SHELL)), wp.constant(wp.float64(toucher.SHELL_FROM))
 SHALLOW, SHALLOW_TO = wp.constant(wp.float64(toucher.SHALLOW)), wp.constant(wp.float64(toucher.SHALLOW_TO))
 FAR_OFF = wp.constant(wp.float64(toucher.FAR))
@@ -403,7 +402,7 @@ def answer(first: wp.int32, many: wp.int32, known: Known, skins: Skins, scratch:
     sound = sound and bony <= BONY_SHARE * forces
     sound = sound and one.softness * highest <= known.pressure and depth * count <= known.depth * thick
     sound = sound and strange <= UNSEEN * forces and one.learnt == 1
-    sound = sound and depth <= SOFT_SHARE * one.soft
+    sound = sound and depth <= one.soft
     sound = sound and (size <= SIDES[0] * forces or size >= SIDES[1] * forces)
     group = pins[0] > GROUP and depth > PINS_DEEP * pins[1]
     sound = sound and not group
