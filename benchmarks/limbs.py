@@ -71,6 +71,7 @@ class Off(NamedTuple):
         moves, worst: mean error where it moves, and the largest at any vertex, over the true peak [-].
         flagged: truth of the claim that the answer says that it is not to be relied upon.
         bound: bound on the force's error that is stated, over the true force [-].
+        motion_bound: bound on the motion's error at the worst vertex, over the true peak [-]; not a number: none.
         answered: truth of the claim that there was an answer; none counts as no force and no motion.
     """
 
@@ -79,6 +80,7 @@ class Off(NamedTuple):
     worst: float = float("nan")
     flagged: bool = False
     bound: float = float("nan")
+    motion_bound: float = float("nan")
     answered: bool = True
 
 
@@ -144,6 +146,9 @@ class Laws:
         true = float(np.linalg.norm(one.force))
         out["moment_net"] = off(one, touch.wrench[:3], answer.displacement, flagged=not answer.trust.in_range,
                                 bound=touch.force_bound / true)  # fmt: skip
+        if (most := answer.trust.error_bound) is not None:
+            peak = float(np.linalg.norm(one.sample.displacement, axis=1).max())
+            out["moment_net"] = out["moment_net"]._replace(motion_bound=most / peak)
         if len(nodes.area):
             out["without its network"] = off(one, force_of(layer, nodes, self.unlearnt(nodes)), None)
             out["elastic foundation"] = off(one, force_of(layer, nodes, self.columns(nodes)), None)
@@ -194,7 +199,7 @@ def table(title: str, found: dict[str, list[Off]]) -> Table:
     """The rows, in per cent; of a law that did not answer all scenes a second one, of those that it did."""
     out = Table(title=title)
     for heading in ("law", "scenes", "force: mean", "90 %", "worst", "where it moves", "worst vertex", "flagged",
-                    "in its bound"):  # fmt: skip
+                    "force in its bound", "motion"):  # fmt: skip
         out.add_column(heading, justify="left" if heading == "law" else "right")
     rows = []
     for name, every in found.items():
@@ -214,7 +219,8 @@ def table(title: str, found: dict[str, list[Off]]) -> Table:
 
         out.add_row(name, count, shown(force), shown(force, lambda v: float(np.quantile(v, 0.9))),
                     shown(force, np.max), shown(columns["moves"]), shown(columns["worst"]), shown(columns["flagged"]),
-                    shown(np.where(np.isnan(columns["bound"]), np.nan, force <= columns["bound"])))  # fmt: skip
+                    *(shown((wrong <= bound)[~np.isnan(bound)]) if not np.isnan(bound).all() else ""
+                      for wrong, bound in ((force, columns["bound"]), (columns["worst"], columns["motion_bound"]))))
     return out
 
 
@@ -293,7 +299,7 @@ def _answer(options: argparse.Namespace) -> None:
     for kind in () if options.kept else options.limbs:
         splits, names = LIMBS[kind]
         found, refused = compare(released(kind), splits, names, others, balls=options.peer)
-        Console(width=130).print(table(kind, found))
+        Console(width=140).print(table(kind, found))
         for name, why in refused.items():
             print(f"{name}, {len(why)} scenes without an answer, which count as no force and no motion; first: "
                   f"{why[0]}")  # fmt: skip
