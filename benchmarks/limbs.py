@@ -85,15 +85,16 @@ class Off(NamedTuple):
 
 
 def off(one: Pressed, force: np.ndarray, motion: np.ndarray | None, flagged: bool = False,
-        bound: float = float("nan")) -> Off:  # fmt: skip
-    """Compares an answer with a scene."""
+        bound: float = float("nan"), motion_bound: float | None = None) -> Off:  # fmt: skip
+    """Compares an answer with a scene; its bound on motion is in [m]."""
     true = float(np.linalg.norm(one.force))
     error = float(np.linalg.norm(force)) / true - 1
     if motion is None:
         return Off(error, flagged=flagged, bound=bound)
     size = np.linalg.norm(one.sample.displacement, axis=1)
     wrong = np.linalg.norm(motion - one.sample.displacement, axis=1) / size.max()
-    return Off(error, float(wrong[size > MOVES * size.max()].mean()), float(wrong.max()), flagged, bound)
+    return Off(error, float(wrong[size > MOVES * size.max()].mean()), float(wrong.max()), flagged, bound,
+               float("nan") if motion_bound is None else motion_bound / float(size.max()))
 
 
 def asked(law: Answer, one: Pressed) -> tuple[np.ndarray, np.ndarray | None]:
@@ -145,10 +146,7 @@ class Laws:
         answer = self.simulator.answer([touch])
         true = float(np.linalg.norm(one.force))
         out["moment_net"] = off(one, touch.wrench[:3], answer.displacement, flagged=not answer.trust.in_range,
-                                bound=touch.force_bound / true)  # fmt: skip
-        if (most := answer.trust.error_bound) is not None:
-            peak = float(np.linalg.norm(one.sample.displacement, axis=1).max())
-            out["moment_net"] = out["moment_net"]._replace(motion_bound=most / peak)
+                                bound=touch.force_bound / true, motion_bound=answer.trust.error_bound)  # fmt: skip
         if len(nodes.area):
             out["without its network"] = off(one, force_of(layer, nodes, self.unlearnt(nodes)), None)
             out["elastic foundation"] = off(one, force_of(layer, nodes, self.columns(nodes)), None)
