@@ -19,7 +19,7 @@ from stmpl_core.green import add_motion, bank
 from stmpl_core.layer import SoftLayer
 from stmpl_core.methods.coarse import nearest_corners
 from stmpl_core.moments import Surroundings
-from stmpl_core.neighbours import neighbours
+from stmpl_core.neighbours import Edges, neighbours
 from stmpl_core.nodewise import REACH
 from stmpl_core.softness import Softness
 
@@ -86,8 +86,9 @@ def _less_flat(wide: np.ndarray, layer: SoftLayer, coarse: SoftLayer, ways: np.n
 
 def _along_skin(coarse: SoftLayer, thickness: float) -> list[np.ndarray]:
     """Vertices that feel each one on skin with folds: those in reach of it along the skin, not through the air."""
-    every = np.full(len(coarse.vertices), thickness)
-    start, index = neighbours(coarse.vertices, coarse.normals, every, coarse.faces, np.array([REACH]))
+    count = len(coarse.vertices)
+    rows = np.column_stack([coarse.vertices, coarse.normals, np.full(count, thickness)])
+    start, index = neighbours(rows, REACH, Edges.of(coarse.faces, count))
     return [index[a:b] for a, b in pairwise(start)]
 
 

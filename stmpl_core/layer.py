@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike
 
 from stmpl_core.arrays import Faces, PerVertex, Points, VertexVectors, finite
 from stmpl_core.errors import InvalidInput, MeshError
+from stmpl_core.seams import border_edges, edge_table
 from stmpl_core.tissue import Tissue
 
 if TYPE_CHECKING:
@@ -181,8 +182,7 @@ class SoftLayer:
     @cached_property
     def edges(self) -> np.ndarray:
         """Undirected edges, each once with its lower vertex first, shape (E, 2)."""
-        directed = np.sort(self.faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
-        return np.unique(directed, axis=0)
+        return edge_table(self.faces)[0]
 
     @cached_property
     def edge_length(self) -> float:
@@ -192,9 +192,7 @@ class SoftLayer:
     @cached_property
     def border(self) -> np.ndarray:
         """Numbers of the vertices on an open edge of the surface, sorted."""
-        directed = np.sort(self.faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
-        pairs, count = np.unique(directed, axis=0, return_counts=True)
-        return np.unique(pairs[count == 1])
+        return np.unique(border_edges(self.faces))
 
     def __repr__(self) -> str:
         t, more = self.thickness * 1e3, ", relaxing" if self.tissue.relaxes else ""

@@ -12,6 +12,7 @@ import numba
 import numpy as np
 
 from stmpl_core.layer import SoftLayer
+from stmpl_core.neighbours import neighbours
 from stmpl_core.response import (
     REACH,
     SCALARS,
@@ -100,7 +101,9 @@ class Surroundings:
         self.sound = Soundness(layer, below=whole)
         self._frames = self.frames.astype(np.float32)
         self._sites = _sites(points, layer.normals, layer.thickness, layer.vertex_areas)
-        shape = _shape(self._thinning.start, self._thinning.index, points, self.frames, layer.thickness)
+        stand = self._thinning.levels[1 if layer.stacked else 0]
+        start, index = neighbours(stand.rows, 1.2 * WIDEST, stand.edges)
+        shape = _shape(stand.of, start, stand.stands[index], points, self.frames, layer.thickness)
         self.curvature, self.slope = shape[:, :3], shape[:, 3:]
         tangents, (xx, xy, yy) = self.frames[:, :2], self.curvature.T
         own = np.stack([xx, xy, xy, yy], axis=1).reshape(-1, 2, 2)
@@ -329,13 +332,16 @@ def along_tangents(frames, i, j, dx, dy, dz):
 
 
 @numba.njit(cache=True, nogil=True, parallel=True, error_model="numpy")
-def _shape(start, index, points, frames, thickness):
-    """Least-squares curvature (from the normals) and slope of the thickness, over a Gaussian of one thickness."""
-    out, zones = np.zeros((len(points), 5)), (len(start) - 1) // len(points)
+def _shape(of, start, index, points, frames, thickness):
+    """Least-squares curvature (from the normals) and slope of the thickness, over a Gaussian of one thickness.
+
+    of, start, index: neighbours of vertex i are index[start[of[i]] : start[of[i] + 1]].
+    """
+    out = np.zeros((len(points), 5))
     for i in numba.prange(len(points)):
         xx = xy = yy = 1e-12
         s0 = s1 = s2 = s3 = s4 = s5 = 0.0
-        for p in range(start[zones * i], start[zones * (i + 1)]):
+        for p in range(start[of[i]], start[of[i] + 1]):
             j = index[p]
             dx, dy, dz = ((points[j, 0] - points[i, 0]) / thickness[i], (points[j, 1] - points[i, 1]) / thickness[i],
                           (points[j, 2] - points[i, 2]) / thickness[i])  # fmt: skip

@@ -2,51 +2,67 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numba
 import numpy as np
 
 CHUNK = 64  # vertices that one thread takes at a time
 
 
-def neighbours(points: np.ndarray, normals: np.ndarray, thickness: np.ndarray, faces: np.ndarray,
-               reaches: np.ndarray) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
-    """Pairs within each of `reaches`, rising, thicknesses (their geometric mean), normals less than 90 degrees apart.
+class Edges(NamedTuple):
+    """Vertices at the other ends of the edges of vertex v: beside[first[v] : first[v + 1]]."""
+
+    first: np.ndarray
+    beside: np.ndarray
+
+    @classmethod
+    def of(cls, faces: np.ndarray, count: int) -> Edges:
+        """Those of faces (F, 3) of so many vertices."""
+        return cls.between(np.concatenate([faces[:, [k, (k + 1) % 3]] for k in range(3)]), count)
+
+    @classmethod
+    def between(cls, ends: np.ndarray, count: int) -> Edges:
+        """Those between pairs of so many vertices, (N, 2)."""
+        both = np.concatenate([ends, ends[:, ::-1]]).astype(np.int64)
+        key = np.unique(both[:, 0] * count + both[:, 1])
+        return cls(np.searchsorted(key, count * np.arange(count + 1)), (key % count).astype(np.int32))
+
+
+def neighbours(rows: np.ndarray, reach: float, edges: Edges,
+               some: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
+    """Vertices within `reach` thicknesses (their geometric mean) of each, normals less than 90 degrees apart.
 
     Only along the skin: a vertex is a neighbour if edges lead to it that never come back nearer, or if it is beside one
     that is. So what is near through the air, as another finger, is none.
 
+    Args:
+        rows: point, normal and thickness of each vertex, (V, 7).
+        reach: distance over the thickness.
+        edges: edges between them.
+        some: numbers of those whose neighbours are meant, (N,); all, if not said.
+
     Returns:
-        start (Z V + 1,), index: the neighbours of vertex v, itself among them, that lie between reach z - 1 and reach
-        z of Z are index[start[Z v + z] : start[Z v + z + 1]].
+        start (N + 1,), index: the neighbours of number n, itself among them, are index[start[n] : start[n + 1]].
     """
-    first, beside = along_edges(faces, len(points))
-    rows = np.column_stack([points, normals, thickness])
-    start = np.zeros(len(reaches) * len(points) + 1, dtype=np.int64)
-    _flood(rows, reaches, first, beside, start, np.empty(0, dtype=np.int32))
+    some = np.arange(len(rows)) if some is None else some
+    start = np.zeros(len(some) + 1, dtype=np.int64)
+    _flood(rows, reach, *edges, some, start, np.empty(0, dtype=np.int32))
     start = np.cumsum(start)
     index = np.empty(start[-1], dtype=np.int32)
-    _flood(rows, reaches, first, beside, start, index)
+    _flood(rows, reach, *edges, some, start, index)
     return start, index
 
 
-def along_edges(faces: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices at the other ends of the edges of vertex v: beside[first[v] : first[v + 1]]."""
-    ends = np.concatenate([faces[:, [k, (k + 1) % 3]] for k in range(3)])
-    ends = np.unique(np.concatenate([ends, ends[:, ::-1]]), axis=0)
-    return np.searchsorted(ends[:, 0], np.arange(count + 1)), np.ascontiguousarray(ends[:, 1], dtype=np.int32)
-
-
 @numba.njit(cache=True, nogil=True, parallel=True, error_model="numpy")
-def _flood(rows, reaches, first, beside, start, index):
-    """Counts the neighbours of vertex i in zone z into start[Z i + z + 1], or where `index` has room writes them."""
-    count, zones, writing = len(rows), len(reaches), len(index) > 0
-    squares = reaches**2
-    for chunk in numba.prange((count + CHUNK - 1) // CHUNK):
+def _flood(rows, reach, first, beside, some, start, index):
+    """Counts the neighbours of number n into start[n + 1], or where `index` has room writes them."""
+    count, writing, square = len(rows), len(index) > 0, reach**2
+    for chunk in numba.prange((len(some) + CHUNK - 1) // CHUNK):
         seen, away = np.full(count, -1, np.int32), np.empty(count)
-        queue, side, n = np.empty(count, np.int32), np.empty(count, np.int32), np.empty(zones, np.int64)
-        for i in range(CHUNK * chunk, min(CHUNK * (chunk + 1), count)):
-            n[:] = 0
-            many, ends, sides = 0, 1, 0
+        queue, side = np.empty(count, np.int32), np.empty(count, np.int32)
+        for n in range(CHUNK * chunk, min(CHUNK * (chunk + 1), len(some))):
+            i, many, ends, sides = some[n], 0, 1, 0
             queue[0], seen[i], away[i] = i, 2 * i + 1, 0.0
             while many < ends:
                 k = queue[many]
@@ -60,7 +76,7 @@ def _flood(rows, reaches, first, beside, start, index):
                         facing = rows[i, 3] * rows[j, 3] + rows[i, 4] * rows[j, 4] + rows[i, 5] * rows[j, 5]
                         away[j] = (x * x + y * y + z * z) if facing > 0 else np.inf
                         seen[j] = 2 * i
-                        if away[j] < squares[-1] * rows[i, 6] * rows[j, 6]:
+                        if away[j] < square * rows[i, 6] * rows[j, 6]:
                             side[sides] = j
                             sides += 1
                         else:
@@ -73,14 +89,7 @@ def _flood(rows, reaches, first, beside, start, index):
                 if seen[side[m]] == 2 * i:
                     queue[ends] = side[m]
                     ends += 1
-            for m in range(ends):
-                j = queue[m]
-                square, zone = away[j] / (rows[i, 6] * rows[j, 6]), 0
-                while square >= squares[zone]:
-                    zone += 1
-                if writing:
-                    index[start[zones * i + zone] + n[zone]] = j
-                n[zone] += 1
-            if not writing:
-                for zone in range(zones):
-                    start[zones * i + zone + 1] = n[zone]
+            if writing:
+                index[start[n] : start[n] + ends] = queue[:ends]
+            else:
+                start[n + 1] = ends

@@ -12,8 +12,9 @@ from stmpl_core.arrays import Faces
 def edge_table(faces: Faces) -> tuple[np.ndarray, np.ndarray]:
     """Undirected edges, (E, 2), and for each of the faces' three edges (ab, bc, ca) its number, (F, 3)."""
     directed = np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
-    edges, number = np.unique(directed, axis=0, return_inverse=True)
-    return edges, number.reshape(-1, 3)
+    width = int(faces.max(initial=0)) + 1
+    key, number = np.unique(directed.astype(np.int64) @ [width, 1], return_inverse=True)
+    return np.stack(np.divmod(key, width), axis=1).astype(faces.dtype), number.reshape(-1, 3)
 
 
 def seam_edges(faces: Faces, uv: np.ndarray) -> np.ndarray:

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from copy import copy
+from itertools import pairwise
 from typing import NamedTuple
 
 import numba
 import numpy as np
 
 from stmpl_core.layer import SoftLayer
-from stmpl_core.neighbours import along_edges, neighbours
+from stmpl_core.neighbours import Edges, neighbours
 
 ZONES, SPACINGS = (2.5,), (0.6,)  # distance from the load at which it begins; least between those asked there; over t
 FOLDS, STACK_FOLDS = 5.0, 2.5  # distances through the air from which folds of the skin do not matter, over t
@@ -49,8 +50,41 @@ class Asked(NamedTuple):
         return _stand_for(self.corners, self.weights, len(self.vertices))
 
 
+class Level(NamedTuple):
+    """Vertices that stand for those around them, and which of these are near each other along the skin.
+
+    Args:
+        stands: their numbers, (R,).
+        of: number among them of the one that stands for each vertex, (V,).
+        rows: point, normal and thickness of each, (R, 7).
+        edges: edges between them.
+        start, index: their neighbours, see `neighbours`.
+    """
+
+    stands: np.ndarray
+    of: np.ndarray
+    rows: np.ndarray
+    edges: Edges
+    start: np.ndarray
+    index: np.ndarray
+
+    @classmethod
+    def among(cls, rows: np.ndarray, edges: Edges, heads: np.ndarray, reach: float) -> Level:
+        """Of vertices with `rows` and `edges` the `heads` that stand for each, (V,), to `reach` thicknesses."""
+        stands, of = np.unique(heads, return_inverse=True)
+        of = of.astype(np.int32)
+        if len(stands) < len(of):
+            own = np.repeat(of, np.diff(edges.first))
+            edges = Edges.between(np.stack([own, of[edges.beside]], axis=1), len(stands))
+        rows = np.ascontiguousarray(rows[stands])
+        return cls(stands.astype(np.int32), of, rows, edges, *neighbours(rows, reach, edges))
+
+
 class Thinning:
     """Vertices in reach of each other by how far they are apart, and which of them stand for those around them.
+
+    What is further apart than the first zone is known of those alone that stand for others: on skin that is meshed
+    finely for its thickness, pairs of all vertices would be very many.
 
     Args:
         layer: soft layer at rest.
@@ -65,11 +99,10 @@ class Thinning:
         zones, spacings, folds = (
             (STACK_ZONES, STACK_SPACINGS, STACK_FOLDS) if layer.stacked else (ZONES, SPACINGS, FOLDS)
         )
-        points, normals, thickness = np.ascontiguousarray(layer.vertices), layer.normals, layer.thickness
-        self.start, self.index = neighbours(points, normals, thickness, layer.faces, np.array([*zones, reach]))
-        self._first, self._beside = along_edges(layer.faces, len(points))
-        self._rows, self._reach = np.column_stack([points, normals, thickness]), reach
-        count = len(points)
+        points, thickness, count = np.ascontiguousarray(layer.vertices), layer.thickness, len(layer.vertices)
+        rows, reaches = np.column_stack([points, layer.normals, thickness]), [*zones, reach]
+        near = level = Level.among(rows, Edges.of(layer.faces, count), np.arange(count), reaches[0])
+        self.levels, self._reach = [near], reach
         self._last: tuple[Asked, ...] = ()
         self._grouped: tuple[np.ndarray, np.ndarray] | None = None
         self._stands = np.zeros((len(zones) + 1, count), dtype=np.bool_)
@@ -77,10 +110,12 @@ class Thinning:
         self._weights = np.zeros((len(zones) + 1, count, CORNERS), dtype=np.float32)
         self._stands[0] = True
         for zone, spacing in enumerate(spacings, start=1):
-            within = 1 + int(np.searchsorted(zones[:-1], spacing))
-            stands = _thinned(self.start, self.index, self._stands[zone - 1], points, thickness, spacing, within)
-            corners = _nearest(self.start, self.index, stands, points)
-            some = np.flatnonzero(~stands & (corners[:, -1] >= 0))
+            stands = _thinned(near.start, near.index, self._stands[zone - 1], points, spacing * thickness)
+            heads = _heads(near.start, near.index, *near.edges, stands, points)
+            level = Level.among(rows, near.edges, heads, reaches[zone])
+            self.levels.append(level)
+            corners = _nearest(level.of, level.start, level.index, level.stands, points)
+            some = np.flatnonzero((heads != np.arange(count)) & (corners[:, -1] >= 0))
             weights = interpolation(points, frames, thickness, some, corners[some])
             good = np.abs(weights).sum(axis=1) < LARGEST
             some = some[good]
@@ -88,8 +123,7 @@ class Thinning:
             self._stands[zone, some] = False
             self._corners[zone, some], self._weights[zone, some] = corners[some], weights[good]
 
-        some = np.flatnonzero(self._stands[-1])
-        self.folded = _folded(self.start, self.index, some, points, normals, thickness, folds)
+        self.folded = _folded(level.start, level.index, level.rows, folds)
 
     def groups(self, vertices: np.ndarray) -> np.ndarray:
         """Numbers of groups of vertices (N,), none of which feels another, (N,): all 0 where the skin has no folds."""
@@ -97,7 +131,8 @@ class Thinning:
             return np.zeros(len(vertices), np.int64)
         last = self._grouped
         if last is None or not np.array_equal(last[0], vertices):
-            last = self._grouped = vertices, _together(self.start, self.index, vertices, self._rows, self._reach)
+            far = self.levels[-1]
+            last = self._grouped = vertices, _together(far.start, far.index, far.of[vertices], far.rows, self._reach)
         return last[1]
 
     def bent(self) -> Thinning:
@@ -108,19 +143,19 @@ class Thinning:
 
     def standing(self, points: np.ndarray, among: np.ndarray, spacing: float) -> np.ndarray:
         """Some of vertices `among`, no two of which are nearer along the skin than `spacing` [m], (N,)."""
-        mask = np.zeros(len(points), np.bool_)
-        mask[among] = True
-        apart, zones = np.full(len(points), spacing), len(self._stands)
-        return np.flatnonzero(_thinned(self.start, self.index, mask, points, apart, 1.0, zones))
+        rows, mask = self.levels[0].rows.copy(), np.zeros(len(points), np.bool_)
+        rows[:, 6], mask[among] = 1.0, True
+        start, index = neighbours(rows, spacing, self.levels[0].edges)
+        return np.flatnonzero(_thinned(start, index, mask, points, np.full(len(points), spacing)))
 
     def spread(self, points: np.ndarray, areas: np.ndarray, values: np.ndarray, reach: float) -> np.ndarray:
         """Values (V,) on areas (V,) [m2], each spread along the skin as far as `reach` [m]; their integral stays."""
-        return _spread(self._first, self._beside, points, areas, values, reach)
+        return _spread(*self.levels[0].edges, points, areas, values, reach)
 
     def around(self, vertices: np.ndarray) -> list[np.ndarray]:
         """Neighbours of some vertices."""
-        zones = (len(self.start) - 1) // len(self._stands[0])
-        return [self.index[self.start[zones * v] : self.start[zones * (v + 1)]] for v in vertices]
+        start, index = neighbours(self.levels[0].rows, self._reach, self.levels[0].edges, vertices)
+        return [index[a:b] for a, b in pairwise(start)]
 
     def reached(self, loaded: np.ndarray) -> np.ndarray:
         """All vertices with a loaded one in reach, in order."""
@@ -131,7 +166,12 @@ class Thinning:
         return Asked(loaded, *_asked(self._zones(loaded), self._stands, self._corners, self._weights))
 
     def _zones(self, loaded: np.ndarray) -> np.ndarray:
-        return _zones(self.start, self.index, self._first, self._beside, loaded, len(self._stands[0]))
+        """0 where no loaded vertex is in reach, else 1 for the outermost zone up to Z for the innermost, (V,)."""
+        mark, rim = np.zeros(len(self._stands[0]), np.uint8), _rim(*self.levels[0].edges, loaded)
+        for zone, level in enumerate(reversed(self.levels), start=1):
+            _mark(level.start, level.index, level.of, rim, zone, mark)
+        mark[loaded] = len(self.levels)
+        return mark
 
     def asked_again(self, loaded: np.ndarray) -> Asked:
         """Same as `asked`, but not done again if these were the last, or those before: an answer asks for two."""
@@ -143,24 +183,20 @@ class Thinning:
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _folded(start, index, some, points, normals, thickness, reach):
-    """Whether any two of `some` vertices are near each other through the air, but not along the skin."""
-    count = len(points)
-    zones = (len(start) - 1) // count
-    near = np.full(count, -1)
-    for a in range(len(some)):
-        i = some[a]
-        for p in range(start[zones * i], start[zones * (i + 1)]):
+def _folded(start, index, rows, reach):
+    """Whether any two are within `reach` thicknesses of each other through the air, but not along the skin."""
+    near = np.full(len(rows), -1)
+    for i in range(len(rows)):
+        for p in range(start[i], start[i + 1]):
             near[index[p]] = i
-        for b in range(len(some)):
-            j = some[b]
+        for j in range(len(rows)):
             if near[j] == i:
                 continue
             away = facing = 0.0
             for x in range(3):
-                away += (points[i, x] - points[j, x]) ** 2
-                facing += normals[i, x] * normals[j, x]
-            if facing > 0 and away < reach**2 * thickness[i] * thickness[j]:
+                away += (rows[i, x] - rows[j, x]) ** 2
+                facing += rows[i, 3 + x] * rows[j, 3 + x]
+            if facing > 0 and away < reach**2 * rows[i, 6] * rows[j, 6]:
                 return True
     return False
 
@@ -171,9 +207,8 @@ def _together(start, index, vertices, rows, reach):
 
     rows, reach: point, normal and thickness of each vertex, and the reach of a neighbour, as `neighbours` has them.
     """
-    count = len(rows)
-    zones, some = (len(start) - 1) // count, np.unique(vertices)
-    place, group, queue = np.full(count, -1), np.full(len(some), -1), np.empty(len(some), np.int64)
+    some = np.unique(vertices)
+    place, group, queue = np.full(len(rows), -1), np.full(len(some), -1), np.empty(len(some), np.int64)
     for n in range(len(some)):
         place[some[n]] = n
     groups, left = 0, len(some)
@@ -187,7 +222,7 @@ def _together(start, index, vertices, rows, reach):
             many += 1
             if not _may_reach(rows, reach, i, some, group):
                 continue
-            for p in range(start[zones * i], start[zones * (i + 1)]):
+            for p in range(start[i], start[i + 1]):
                 m = place[index[p]]
                 if m >= 0 and group[m] < 0:
                     group[m] = groups
@@ -214,40 +249,64 @@ def _may_reach(rows, reach, i, some, group):
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _thinned(start, index, among, points, thickness, spacing, within):
-    """Marks vertices of `among` no two of which are nearer than `spacing`, as many as come in order.
-
-    Such two are neighbours within so many zones.
-    """
-    count = len(points)
-    zones = (len(start) - 1) // count
-    kept, free = np.zeros(count, np.bool_), among.copy()
-    for v in range(count):
+def _thinned(start, index, among, points, apart):
+    """Marks vertices of `among` no two of which are nearer than `apart` (V,), as many as come in order."""
+    kept, free = np.zeros(len(points), np.bool_), among.copy()
+    for v in range(len(points)):
         if not free[v]:
             continue
         kept[v] = True
-        for p in range(start[zones * v], start[zones * v + within]):
+        for p in range(start[v], start[v + 1]):
             away = 0.0
             for x in range(3):
                 away += (points[v, x] - points[index[p], x]) ** 2
-            if away < (spacing * thickness[v]) ** 2:
+            if away < apart[v] ** 2:
                 free[index[p]] = False
     return kept
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _nearest(start, index, stands, points):
-    """The nearest CORNERS vertices in reach that stand for others, (V, CORNERS); -1 where there are fewer."""
+def _heads(start, index, first, beside, stands, points):
+    """Number of the nearest neighbour of each vertex that stands, (V,); where there is none, that of one beside it."""
     count = len(points)
-    zones = (len(start) - 1) // count
+    out, queue, ends = np.full(count, -1), np.empty(count, np.int64), 0
+    for v in range(count):
+        least = np.inf
+        for p in range(start[v], start[v + 1]):
+            j = index[p]
+            if stands[j]:
+                x, y, z = points[v, 0] - points[j, 0], points[v, 1] - points[j, 1], points[v, 2] - points[j, 2]
+                away = x * x + y * y + z * z
+                if away < least:
+                    least, out[v] = away, j
+        if out[v] >= 0:
+            queue[ends] = v
+            ends += 1
+    many = 0
+    while many < ends:
+        v = queue[many]
+        many += 1
+        for p in range(first[v], first[v + 1]):
+            j = beside[p]
+            if out[j] < 0:
+                out[j] = out[v]
+                queue[ends] = j
+                ends += 1
+    return out
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _nearest(of, start, index, stands, points):
+    """The nearest CORNERS that stand for others, neighbours of a vertex's own, (V, CORNERS); -1 where there are fewer.
+
+    of, start, index, stands: see Level.
+    """
+    count = len(points)
     out, far = np.full((count, CORNERS), -1, np.int32), np.empty(CORNERS)
     for v in range(count):
         n = 0
-        for p in range(start[zones * v], start[zones * (v + 1)]):
-            j = index[p]
-            if not stands[j]:
-                continue
-            away = 0.0
+        for p in range(start[of[v]], start[of[v] + 1]):
+            j, away = stands[index[p]], 0.0
             for x in range(3):
                 away += (points[v, x] - points[j, x]) ** 2
             if n == CORNERS and away >= far[-1]:
@@ -308,13 +367,9 @@ def _spread(first, beside, points, areas, values, reach):
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _zones(start, index, first, beside, loaded, count):
-    """0 where no loaded vertex is in reach, else 1 for the outermost zone up to Z for the innermost, (count,).
-
-    Only the rim of what is loaded is looked at: who is outside is nearest to that.
-    """
-    mark, inside = np.zeros(count, np.uint8), np.zeros(count, np.bool_)
-    zones, rim, many = (len(start) - 1) // count, np.empty(len(loaded), np.int64), 0
+def _rim(first, beside, loaded):
+    """Those loaded vertices that lie beside others: who is outside is nearest to these."""
+    inside, rim, many = np.zeros(len(first) - 1, np.bool_), np.empty(len(loaded), np.int64), 0
     for j in loaded:
         inside[j] = True
     for j in loaded:
@@ -323,13 +378,21 @@ def _zones(start, index, first, beside, loaded, count):
                 rim[many] = j
                 many += 1
                 break
-    for z in range(zones - 1, -1, -1):
-        for j in rim[:many]:
-            for p in range(start[zones * j + z], start[zones * j + z + 1]):
-                mark[np.uint32(index[p])] = zones - z  # unsigned: no index that may count from the end
-    for j in loaded:
-        mark[j] = zones
-    return mark
+    return rim[:many]
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _mark(start, index, of, rim, zone, mark):
+    """Writes `zone` where what stands for a vertex is a neighbour of what stands for one of the rim."""
+    near, done = np.zeros(len(start) - 1, np.bool_), np.zeros(len(start) - 1, np.bool_)
+    for j in rim:
+        if not done[of[j]]:
+            done[of[j]] = True
+            for p in range(start[of[j]], start[of[j] + 1]):
+                near[np.uint32(index[p])] = True  # unsigned: no index that may count from the end
+    for v in range(len(of)):
+        if near[of[v]]:
+            mark[v] = zone
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")

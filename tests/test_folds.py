@@ -83,12 +83,14 @@ def test_where_skin_is_near_itself_is_known_and_plain_limbs_are_not_held_up() ->
 def test_all_that_is_in_reach_along_the_skin_is_a_neighbour() -> None:
     layer = limb(4e-3)
     thinning = Thinning(layer, np.broadcast_to(np.eye(3), (len(layer.vertices), 3, 3)), 8.0)
-    zones = len(ZONES) + 1
-    for v in range(0, len(layer.vertices), 97):
-        away = np.linalg.norm(layer.vertices - layer.vertices[v], axis=1) / layer.thickness[0]
-        expected = np.flatnonzero((away < 8.0) & (layer.normals @ layer.normals[v] > 0))
-        found = thinning.index[thinning.start[zones * v] : thinning.start[zones * (v + 1)]]
-        np.testing.assert_array_equal(np.sort(found), expected)
+    assert len(thinning.levels[1].stands) < len(layer.vertices)
+    for level, reach in zip(thinning.levels, (ZONES[0], 8.0), strict=True):
+        at, normals = level.rows[:, :3], level.rows[:, 3:6]
+        for v in range(0, len(at), 97):
+            away = np.linalg.norm(at - at[v], axis=1) / layer.thickness[0]
+            expected = np.flatnonzero((away < reach) & (normals @ normals[v] > 0))
+            found = level.index[level.start[v] : level.start[v + 1]]
+            np.testing.assert_array_equal(np.sort(found), expected)
 
 
 def test_one_contact_is_one_group_however_many_nodes_share_a_vertex() -> None:

@@ -22,11 +22,13 @@ from stmpl_core.skin import Skin
 vec8 = wp.types.vector(length=8, dtype=wp.float32)
 HIDDEN = 96  # units of a hidden layer; a smaller network's are filled up, for loops of a known length run twice as fast
 
-# V: vertices of all skins, Z: zones and vertices, N: neighbours, z: zones, R: rows of tables
+# V: vertices of all skins, Z: zones and vertices, N: neighbours, z: zones, R: rows of tables; H: vertices that stand
+# for others, and M: those others, H after H
 SKIN_FIELDS: dict[str, tuple[Any, str]] = {
-    "reach": (wp.int32, "Z"), "index": (wp.int32, "N"), "stands": (wp.uint8, "zV"), "corners": (wp.int32, "zVc"),
-    "weights": (wp.float32, "zVc"), "at": (wp.vec3f, "V"), "site": (wp.vec4f, "V"), "normal": (wp.vec3f, "V"),
-    "frame": (wp.mat33f, "V"), "shape": (wp.float32, "Vs"), "original": (wp.int32, "V"),
+    "reach": (wp.vec2i, "Z"), "index": (wp.int32, "N"), "heads": (wp.int32, "H"), "member": (wp.int32, "M"),
+    "stands": (wp.uint8, "zV"), "corners": (wp.int32, "zVc"), "weights": (wp.float32, "zVc"), "at": (wp.vec3f, "V"),
+    "site": (wp.vec4f, "V"), "normal": (wp.vec3f, "V"), "frame": (wp.mat33f, "V"), "shape": (wp.float32, "Vs"),
+    "original": (wp.int32, "V"),
     "sink": (wp.float32, "SgR"), "away": (wp.float32, "SgR"), "rings": (vec8, "Rk"), "greens": (real, "b4gR"),
 }  # fmt: skip
 # F: scene whose field is asked, C: scene and tool, V: vertices of a skin, W: vertices under its tools, R: lanes;
@@ -112,13 +114,11 @@ def motion_net(skins: Sequence[Skin], device: Any) -> Any:
 def pack(skins: Sequence[Skin], device: Any) -> Any:
     """What fields take of skins, in the order and with the numbers of packs.pack."""
     parts: dict[str, list[np.ndarray]] = {name: [] for name in SKIN_FIELDS}
-    vertices = neighbours = 0
     for skin in skins:
-        arrays, near = _of_one(skin, vertices, neighbours)
-        for name, values in arrays.items():
+        before = {name: sum(map(len, parts[name])) for name in ("original", "index", "heads", "member")}
+        for name, values in _of_one(skin, before).items():
             parts[name].append(values)
-        vertices, neighbours = vertices + len(skin.layer.vertices), neighbours + near
-    parts["reach"].append(np.array([neighbours]))
+    parts["heads"].append(np.array([sum(map(len, parts["member"]))]))
     parts["rings"] = [_RINGS.reshape(-1, 3, 8)]
     out = SkinFields()
     for name, (dtype, axes) in SKIN_FIELDS.items():
@@ -127,23 +127,26 @@ def pack(skins: Sequence[Skin], device: Any) -> Any:
     return out
 
 
-def _of_one(skin: Skin, before: int, neighbours: int) -> tuple[dict[str, np.ndarray], int]:
-    """What fields take of one skin, after so many vertices and neighbours of others; the number of its neighbours."""
+def _of_one(skin: Skin, before: dict[str, int]) -> dict[str, np.ndarray]:
+    """What fields take of one skin, after so many vertices and the like of others."""
     near, order = skin.near, Columns(skin.layer)._order
-    thin, count, place = near._thinning, len(order), np.empty(len(order), np.int64)
-    place[order] = np.arange(count)
-    zones = (len(thin.start) - 1) // count
-    rows = (zones * order[:, None] + np.arange(zones)).ravel()
-    sizes = np.diff(thin.start)[rows]
-    ends = np.cumsum(sizes)
-    index = thin.index[np.arange(ends[-1]) - np.repeat(ends - sizes - thin.start[rows], sizes)]
+    thin, place, vertices = near._thinning, np.argsort(order), before["original"]
+    reach, index, heads, member = [], [], [], []
+    lists, stands, members = before["index"], before["heads"], before["member"]
+    for level in thin.levels:
+        own = level.of[order]
+        reach.append(lists + np.stack([level.start[own], level.start[own + 1]], axis=1))
+        index.append(stands + level.index)
+        heads.append(members + np.searchsorted(np.sort(level.of), np.arange(len(level.stands))))
+        member.append(vertices + place[np.argsort(level.of, kind="stable")])
+        lists, stands, members = lists + len(level.index), stands + len(level.stands), members + len(order)
     shape, sites = np.concatenate([near.curvature, near.slope], axis=1)[order], near._sites[:, order]
     return {
-        "reach": neighbours + ends - sizes, "index": before + place[index],
-        "stands": thin._stands[:, order].astype(np.uint8),
-        "corners": before + place[thin._corners[:, order]], "weights": thin._weights[:, order],
+        "reach": np.stack(reach, axis=1).reshape(-1, 2), "index": np.concatenate(index), "heads": np.concatenate(heads),
+        "member": np.concatenate(member), "stands": thin._stands[:, order].astype(np.uint8),
+        "corners": vertices + place[thin._corners[:, order]], "weights": thin._weights[:, order],
         "at": sites[:3].T, "site": sites[3:7].T, "normal": sites[7:].T, "frame": near.frames[order],
         "shape": shape, "original": order, "sink": near._response[None, 0], "away": near._response[None, 1],
         "greens": np.zeros((1, 1, 1, 1)) if skin.green is None else skin.green.tables,
-    }, int(ends[-1])  # fmt: skip
+    }  # fmt: skip
 

@@ -179,10 +179,12 @@ def mark(pick: wp.array(dtype=wp.int32), lanes: wp.int32, many: wp.int32, all: w
         if all == 1 or field.source[f, n][0] != wp.float32(0.0):
             field.here[f, v - first] = field.source[f, n]  # each lane says so; they share out the neighbours
             for z in range(zones):
-                for p in range(more.reach[zones * v + z] + lane, more.reach[zones * v + z + 1], lanes):
-                    wp.atomic_max(field.mark, f, more.index[p] - first, zones - z)
-                    if field.folds[f] > 1:
-                        wp.atomic_or(field.feels, f, more.index[p] - first, wp.uint32(1) << wp.uint32(field.fold[f, n]))
+                for p in range(more.reach[zones * v + z][0] + lane, more.reach[zones * v + z][1], lanes):
+                    for q in range(more.heads[more.index[p]], more.heads[more.index[p] + 1]):
+                        wp.atomic_max(field.mark, f, more.member[q] - first, zones - z)
+                        if field.folds[f] > 1:
+                            fold = wp.uint32(1) << wp.uint32(field.fold[f, n])
+                            wp.atomic_or(field.feels, f, more.member[q] - first, fold)
 
 
 @wp.kernel

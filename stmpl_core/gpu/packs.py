@@ -316,11 +316,11 @@ def _of_stack(one: Any, skin: Skin, order: np.ndarray, at: tuple[int, int]) -> d
 
 def _linked(skin: Skin, order: np.ndarray) -> np.ndarray:
     """Bits that say which vertices are neighbours along the skin, (V, V / 32)."""
-    thin, count, place = skin.near._thinning, len(order), np.empty(len(order), np.int64)
-    place[order] = np.arange(count)
-    zones = (len(thin.start) - 1) // count
-    bits = np.zeros((count, 32 * -(-count // 32)), bool)
-    bits[np.repeat(place, np.diff(thin.start[::zones])), place[thin.index]] = True
+    far = skin.near._thinning.levels[-1]
+    beside = np.zeros((len(far.stands),) * 2, bool)
+    beside[np.repeat(np.arange(len(far.stands)), np.diff(far.start)), far.index] = True
+    bits, own = np.zeros((len(order), 32 * -(-len(order) // 32)), bool), far.of[order]
+    bits[:, : len(order)] = beside[own][:, own]
     return np.packbits(bits, axis=1, bitorder="little").view(np.uint32)
 
 

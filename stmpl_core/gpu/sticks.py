@@ -242,12 +242,12 @@ def mark(pick: wp.array(dtype=wp.int32), lanes: wp.int32, many: wp.int32, skins:
         for x in range(3):
             for z in range(zones):
                 zone = zones * corners[x] + z
-                for p in range(more.reach[zone] + lane, more.reach[zone + 1], lanes):
-                    v = more.index[p] - one.first
-                    wp.atomic_max(field.mark, f, v, zones - z)
-                    if field.parted[f] == 1:
-                        fold = wp.uint32(wp.min(scratch.fold[s, i], MOST_FOLDS))
-                        wp.atomic_or(field.feels, f, v, wp.uint32(1) << fold)
+                for p in range(more.reach[zone][0] + lane, more.reach[zone][1], lanes):
+                    for q in range(more.heads[more.index[p]], more.heads[more.index[p] + 1]):
+                        wp.atomic_max(field.mark, f, more.member[q] - one.first, zones - z)
+                        if field.parted[f] == 1:
+                            fold = wp.uint32(1) << wp.uint32(wp.min(scratch.fold[s, i], MOST_FOLDS))
+                            wp.atomic_or(field.feels, f, more.member[q] - one.first, fold)
 
 
 @wp.kernel
@@ -359,9 +359,10 @@ def mark_beside(pick: wp.array(dtype=wp.int32), lanes: wp.int32, many: wp.int32,
                 z = wp.int32(0)
                 v = corners[x]
                 while z < zones:
-                    for p in range(more.reach[zones * v + z], more.reach[zones * v + z + 1]):
-                        if wp.length(skins.points[more.index[p]] - skins.points[v]) < far:
-                            field.mark[f, more.index[p] - one.first] = 1
+                    for p in range(more.reach[zones * v + z][0], more.reach[zones * v + z][1]):
+                        for q in range(more.heads[more.index[p]], more.heads[more.index[p] + 1]):
+                            if wp.length(skins.points[more.member[q]] - skins.points[v]) < far:
+                                field.mark[f, more.member[q] - one.first] = 1
                     if ENDS[z] * one.flat > far:
                         z = zones
                     z += 1
