@@ -201,6 +201,14 @@ class SoftLayer:
                 f"E {self.tissue.youngs_modulus:g} Pa, nu {self.tissue.poisson_ratio:g}{more})")
 
 
+def one_thickness(value: float) -> float:
+    """A thickness [m]. Raises InvalidInput: no number, or not above 0 and at most MAX_THICKNESS."""
+    thickness = float(finite("thickness", np.atleast_1d(value), (1,))[0])
+    if not 0 < thickness <= MAX_THICKNESS:
+        raise InvalidInput(f"thickness is {thickness:g} m; above 0, and at most {MAX_THICKNESS:g} m is accepted.")
+    return thickness
+
+
 def single(layer: SoftLayer, who: str, *, straight: bool = True, instead: str = " PatchFem knows these.") -> SoftLayer:
     """The layer, for those who know one material only, and columns straight below the skin unless `straight` is False.
 

@@ -15,7 +15,7 @@ from stmpl_core.bony import bony
 from stmpl_core.errors import InvalidInput
 from stmpl_core.fat import fat_map, for_person
 from stmpl_core.friction import Friction
-from stmpl_core.layer import MAX_THICKNESS, SoftLayer
+from stmpl_core.layer import MAX_THICKNESS, SoftLayer, one_thickness
 from stmpl_core.limbs import EDGE_LENGTH
 from stmpl_core.packed import stack_from_text, stack_to_text
 from stmpl_core.regions import HELD_SKIN, REGIONS, Region, Tone, region
@@ -122,12 +122,13 @@ def laid(body: Body, part: str, tissue: Tissue, thickness: float, *, edge_length
         body: body.
         part: its part, or `around:x,y,z,radius`.
         tissue: tissue.
-        thickness: the most that it is thick [m].
+        thickness: the most that it is thick, along the skin's normal [m]; columns that lean to a bone are longer.
         edge_length: length of the skin mesh's edges [m].
 
     Raises:
         InvalidInput: no such part, or a thickness on which no layer can be laid.
     """
+    thickness = one_thickness(thickness)
     try:
         named = part_around(body, part) if part.startswith(AROUND) else part
         bones = bones_of(body, named)

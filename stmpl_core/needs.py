@@ -20,7 +20,7 @@ from scipy.optimize import brentq
 
 from stmpl_core.errors import InvalidInput
 from stmpl_core.friction import Friction, coefficient
-from stmpl_core.layer import MAX_THICKNESS
+from stmpl_core.layer import MAX_THICKNESS, one_thickness
 from stmpl_core.regions import HELD_SKIN
 from stmpl_core.relaxation import Series, faded, fading, series_of
 from stmpl_core.sideways import patch
@@ -196,8 +196,7 @@ def needs(
     tissue = of if isinstance(of, Tissue) else of.tissue
     if thickness is None:
         raise InvalidInput("a tissue wants a thickness: give thickness=, in m.")
-    if not 0 < thickness <= MAX_THICKNESS:
-        raise InvalidInput(f"thickness is {thickness:g} m; above 0, and at most {MAX_THICKNESS:g} m is accepted.")
+    thickness = one_thickness(thickness)
     if not SOFTEST <= tissue.youngs_modulus <= HARDEST:
         raise InvalidInput(f"no soft layer has {tissue.youngs_modulus:.4g} Pa, {SOFTEST:g} to {HARDEST:g} Pa are "
                            "accepted.")  # fmt: skip

@@ -83,6 +83,12 @@ def test_a_tissue_of_ones_own_is_as_thick_as_asked_where_no_bones_are_known(part
     assert np.median(layer.thickness) == pytest.approx(8e-3)
 
 
+@pytest.mark.parametrize("thickness", [np.nan, np.inf, 0.0, -1e-3, 7.5, "thick", None])
+def test_a_thickness_that_is_none_is_told(thickness):
+    with pytest.raises(InvalidInput, match="thickness"):
+        laid(Body.anny(), "left_forearm", Tissue(2e3, 0.4), thickness, edge_length=COARSE)
+
+
 @pytest.mark.parametrize("part, place, way, edge, depth, truth", [
     ("neck", (-0.03, 0.01, 0.54), (-1, 0, 0), 8e-3, 8.4e-3, 4.98),
     ("abdomen", (0.12, 0.04, 0.17), (1, 0, 0), 14e-3, 21.5e-3, 5.04),
