@@ -204,6 +204,10 @@ TRUNK: tuple[Person, ...] = (  # three materials on the abdomen, soft over stiff
     ("forearm_1", 0.15, 0.3, 0.6, "left_forearm", "relaxed", 6e-3, 6.0, 0.35),
     ("forearm_2", 0.5, 0.7, 0.5, "left_forearm", "relaxed", 6e-3, 6.0, 0.35),
     ("forearm_3", 0.8, 0.1, 0.5, "left_forearm", "relaxed", 7e-3, 6.0, 0.35),
+    ("neck_3", 0.1, 0.0, 0.3, "neck", "tensed", 8e-3, 3.0, 0.35),  # the thinnest single layers that stand for people's
+    ("neck_4", 0.5, 0.5, 0.5, "neck", "tensed", 8e-3, 3.0, 0.35),
+    ("shoulder_2", 0.1, 0.0, 0.3, "left_shoulder", "tensed", 8e-3, 3.0, 0.35),
+    ("forearm_4", 0.9, 0.0, 0.7, "left_forearm", "tensed", 7e-3, 6.0, 0.35),
 )
 
 
