@@ -108,9 +108,7 @@ def filled(body: Body, part: str, skin: SoftLayer, tone: Tone = "relaxed") -> So
         middle = float(np.median(fat))
         tissue = replace(its, fat_thickness=replace(its.fat_thickness, value=middle)).tissue
         skin = skin.with_(tissue=tissue, ply_scale=fat / middle)
-    skin = skin.with_(bony=bony(body, part, skin.vertices))
-    deepest = min(its.thickness, DEEPEST) if part in TRUNK else DEEPEST
-    return to_bone(skin, bones_of(body, part), deepest)
+    return _to_bones(body, part, skin, its.thickness if part in TRUNK else DEEPEST)
 
 
 def laid(body: Body, part: str, tissue: Tissue, thickness: float, *, edge_length: float = EDGE_LENGTH) -> SoftLayer:
@@ -131,11 +129,17 @@ def laid(body: Body, part: str, tissue: Tissue, thickness: float, *, edge_length
     thickness = one_thickness(thickness)
     try:
         named = part_around(body, part) if part.startswith(AROUND) else part
-        bones = bones_of(body, named)
+        bones_of(body, named)
     except InvalidInput:
         return body.part(part, edge_length=edge_length, thickness=thickness, tissue=tissue)
     skin = body.part(part, edge_length=edge_length, thickness=min(SHEET, thickness), tissue=tissue)
-    return to_bone(skin.with_(bony=bony(body, named, skin.vertices)), bones, min(thickness, DEEPEST))
+    return _to_bones(body, named, skin, thickness)
+
+
+def _to_bones(body: Body, part: str, skin: SoftLayer, thickness: float) -> SoftLayer:
+    """A part's skin with columns to its bones, or to so deep below it [m]."""
+    skin = skin.with_(bony=bony(body, part, skin.vertices))
+    return to_bone(skin, bones_of(body, part), min(thickness, DEEPEST))
 
 
 def held_skin(layer: SoftLayer) -> SoftLayer:

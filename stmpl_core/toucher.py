@@ -789,7 +789,8 @@ def unlearnt(layer: SoftLayer, low: float, high: float) -> list[str]:
     ratios = {tissue.poisson_ratio, *(ply.poisson_ratio for ply in tissue.deeper)}
     pull, kappa = 0.0, 0.0
     if tissue.skin is not None:
-        pull, kappa = Green.of(layer).effective.pull, Green.of(layer).effective.kappa
+        effective = Green.of(layer).effective
+        pull, kappa = effective.pull, effective.kappa
     out += [f"contacts were learnt at Poisson's ratios from {low:g} to {high:g}, not {nu:g}"
             for nu in sorted(ratios) if not low - 1e-3 <= nu <= high + 1e-3]  # fmt: skip
     if (apart := max(ratios) - min(ratios)) > RATIOS_APART:

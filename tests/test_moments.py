@@ -94,7 +94,7 @@ def test_beyond_its_reach_nothing_moves() -> None:
     moved = Linear().prepare(layer).solve(load).magnitude
     away = np.linalg.norm(layer.vertices[:, None] - layer.vertices[load.loaded][None], axis=2).min(axis=1)
     assert moved.any() and not moved[away > (REACH + 2 * SPACINGS[0]) * T].any()
-    assert moved[away > REACH * T].max() < 1e-5 * moved.max()  # filled in beside the last that feels it
+    assert moved[away > REACH * T].max() < 1e-4 * moved.max()  # filled in beside the last that feels it
 
 
 def test_turning_the_scene_turns_the_answer() -> None:
