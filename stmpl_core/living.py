@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
@@ -10,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from stmpl_core.body import AROUND, Body
-from stmpl_core.bones import bones_of, to_bone
+from stmpl_core.bones import Bone, bones_of, to_bone
 from stmpl_core.bony import bony
 from stmpl_core.errors import InvalidInput
 from stmpl_core.fat import fat_map, for_person
@@ -108,7 +109,7 @@ def filled(body: Body, part: str, skin: SoftLayer, tone: Tone = "relaxed") -> So
         middle = float(np.median(fat))
         tissue = replace(its, fat_thickness=replace(its.fat_thickness, value=middle)).tissue
         skin = skin.with_(tissue=tissue, ply_scale=fat / middle)
-    return _to_bones(body, part, skin, its.thickness if part in TRUNK else DEEPEST)
+    return _to_bones(body, part, skin, bones_of(body, part), its.thickness if part in TRUNK else DEEPEST)
 
 
 def laid(body: Body, part: str, tissue: Tissue, thickness: float, *, edge_length: float = EDGE_LENGTH) -> SoftLayer:
@@ -129,17 +130,16 @@ def laid(body: Body, part: str, tissue: Tissue, thickness: float, *, edge_length
     thickness = one_thickness(thickness)
     try:
         named = part_around(body, part) if part.startswith(AROUND) else part
-        bones_of(body, named)
+        bones = bones_of(body, named)
     except InvalidInput:
         return body.part(part, edge_length=edge_length, thickness=thickness, tissue=tissue)
     skin = body.part(part, edge_length=edge_length, thickness=min(SHEET, thickness), tissue=tissue)
-    return _to_bones(body, named, skin, thickness)
+    return _to_bones(body, named, skin, bones, thickness)
 
 
-def _to_bones(body: Body, part: str, skin: SoftLayer, thickness: float) -> SoftLayer:
+def _to_bones(body: Body, part: str, skin: SoftLayer, bones: Sequence[Bone], thickness: float) -> SoftLayer:
     """A part's skin with columns to its bones, or to so deep below it [m]."""
-    skin = skin.with_(bony=bony(body, part, skin.vertices))
-    return to_bone(skin, bones_of(body, part), min(thickness, DEEPEST))
+    return to_bone(skin.with_(bony=bony(body, part, skin.vertices)), bones, min(thickness, DEEPEST))
 
 
 def held_skin(layer: SoftLayer) -> SoftLayer:
