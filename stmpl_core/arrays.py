@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import math
+from numbers import Real
+
 import numba
 import numpy as np
 from jaxtyping import Float, Int
@@ -44,10 +47,34 @@ def _all_finite(values):
     return total == 0.0
 
 
+def is_number(value: object) -> bool:
+    """Whether a value is a real number; truth is none."""
+    return isinstance(value, Real) and not isinstance(value, bool | np.bool_)
+
+
+def check_number(name: str, value: object) -> None:
+    """Raises InvalidInput: a value that is no number, or not finite."""
+    if not (is_number(value) and math.isfinite(value)):  # type: ignore[arg-type]
+        raise InvalidInput(f"{name} is {value!r:.40}; a finite number is needed.")
+
+
+def check_choice(name: str, value: object) -> None:
+    """Raises InvalidInput: a value that is neither True nor False."""
+    if not isinstance(value, bool | np.bool_):
+        raise InvalidInput(f"{name} is {value!r:.40}; True or False is needed.")
+
+
+def check_kind(name: str, value: object, kind: type | tuple[type, ...]) -> None:
+    """Raises InvalidInput: a value that is not of a kind."""
+    if not isinstance(value, kind):
+        kinds = " or ".join("None" if one is type(None) else one.__name__
+                            for one in (kind if isinstance(kind, tuple) else (kind,)))  # fmt: skip
+        raise InvalidInput(f"{name} is {value!r:.40}; {kinds} is needed.")
+
+
 def check_dt(dt: float) -> None:
     """Raises InvalidInput: a time since the step before [s] that is no number, below 0, or not finite."""
-    number = isinstance(dt, (int, float, np.integer, np.floating)) and not isinstance(dt, bool)
-    if not (number and 0 <= dt < np.inf):
+    if not (is_number(dt) and 0 <= dt < np.inf):
         raise InvalidInput(f"dt is {dt!r:.40} s; time goes forward, allowed is a number of 0 or more, and finite.")
 
 

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from stmpl_core import limbs
-from stmpl_core.arrays import Faces, Points, finite
+from stmpl_core.arrays import Faces, Points, check_kind, check_number, finite, is_number
 from stmpl_core.chart import UvChart
 from stmpl_core.errors import InvalidInput
 from stmpl_core.extras import needed
@@ -46,6 +46,7 @@ SEXES = {"male": 0.0, "female": 1.0}  # share of a gender that is female [-]
 WATER = 1e3  # density of a body [kg/m3]
 PHENOTYPE = ("gender", "age", "muscle", "weight", "height", "proportions")
 AROUND = "around:"  # beginning of the name of a picked part
+MOST_AROUND = 1.0  # largest radius of skin around a place [m]
 LEAST_BORNE = 0.8  # share of the asked thickness, below which skin is said not to bear it
 MAX_THIN_SHARE = 0.5  # share of the skin that may not bear it
 NEAR_SKIN = 0.03  # distance from the skin up to which a picked place is taken to be on it [m]
@@ -134,8 +135,8 @@ class Body:
         _known("bone", turns, _average().bones)
         _known("phenotype", phenotype, PHENOTYPE)
         for name, value in phenotype.items():
-            if not (np.isscalar(value) and 0 <= value <= 1):
-                raise InvalidInput(f"{name} is {value}; allowed is a number from 0 to 1 (0.5 is the average).")
+            if not (is_number(value) and 0 <= value <= 1):
+                raise InvalidInput(f"{name} is {value!r:.40}; allowed is a number from 0 to 1 (0.5 is the average).")
         if not turns and all(value == AVERAGE for value in phenotype.values()):
             return _average()
         from stmpl_core.anny_model import posed
@@ -221,6 +222,8 @@ class Body:
                 curved for; the error says what would do.
             MeshError: a surface that `stmpl_core.remesh` refuses.
         """
+        check_kind("the part's name", name, str)
+        check_number("edge_length", edge_length)
         shipped = limbs.part(name, edge_length) if self is _average() else None
         if shipped is not None:
             return _layer(*shipped, thickness, tissue)
@@ -239,11 +242,14 @@ class Body:
             edge_length, thickness, tissue: see `part`.
 
         Raises:
-            InvalidInput: a place that is not near the skin, or a radius of less than two edges.
+            InvalidInput: a place that is not near the skin, or a radius of less than two edges or of more than a metre.
             MeshError: a surface that `stmpl_core.remesh` refuses.
         """
-        if not radius >= 2 * edge_length:
-            raise InvalidInput(f"the radius is {radius:g} m; at least two edges, {2 * edge_length:g} m, are needed.")
+        check_number("radius", radius)
+        check_number("edge_length", edge_length)
+        if not 2 * edge_length <= radius <= MOST_AROUND:
+            raise InvalidInput(f"the radius is {radius:g} m; at least two edges, {2 * edge_length:g} m, and at most "
+                               f"{MOST_AROUND:g} m are accepted. Is it in millimetres? Scale it by 1e-3.")
         return self.part(around_name(finite("place", place, (3,)), radius), edge_length=edge_length,
                          thickness=thickness, tissue=tissue)  # fmt: skip
 
@@ -263,6 +269,7 @@ class Body:
 
         Of parts of the trunk (stmpl_core.trunk) it is a distance instead; only Anny's bodies have them.
         """
+        check_kind("part", part, str)
         if part in TRUNK and self._as_anny:
             return trunk_level(_average().vertices, _average().level("torso"), part)
         if part.startswith(AROUND):

@@ -9,7 +9,7 @@ import numba
 import numpy as np
 from numpy.typing import ArrayLike
 
-from stmpl_core.arrays import Transform, Wrench, finite
+from stmpl_core.arrays import Transform, Wrench, check_kind, finite
 from stmpl_core.errors import InvalidInput
 from stmpl_core.tool import Tool
 
@@ -37,6 +37,7 @@ class Contact:
     time: float = 0.0
 
     def __post_init__(self) -> None:
+        check_kind("the tool of a contact", self.tool, Tool)
         pose = rigid(f"pose of {self.name}", self.pose_body_from_tool).copy()  # a caller goes on with its own
         object.__setattr__(self, "pose_body_from_tool", pose)
         if self.wrench is not None:

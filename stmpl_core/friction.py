@@ -8,6 +8,7 @@ from typing import Literal
 
 import numpy as np
 
+from stmpl_core.arrays import is_number
 from stmpl_core.errors import InvalidInput
 from stmpl_core.tissue import FRICTION
 
@@ -60,7 +61,7 @@ def coefficient(friction: Friction) -> float:
         if friction not in PAIRS:
             raise InvalidInput(f"there is no friction '{friction}'. Available: {', '.join(PAIRS)}, or a number.")
         return PAIRS[friction].friction
-    if not isinstance(friction, int | float | np.number) or isinstance(friction, bool):
+    if not is_number(friction):
         raise InvalidInput(f"friction is {friction!r}; a number, the name of a pair, or these by tool are accepted.")
     if not (np.isfinite(friction) and 0 <= friction <= MOST):
         raise InvalidInput(f"friction is {friction:g}; a coefficient from 0 to {MOST:g} is accepted.")

@@ -17,7 +17,7 @@ from typing import Literal, Self, get_args
 import numpy as np
 from numpy.typing import ArrayLike
 
-from stmpl_core.arrays import Transform, VertexVectors, Wrench, finite
+from stmpl_core.arrays import Transform, VertexVectors, Wrench, check_kind, finite
 from stmpl_core.contact import Contact
 from stmpl_core.errors import InvalidInput
 from stmpl_core.layer import thicker
@@ -106,10 +106,11 @@ class Gradients:
             whose nodes come in one by one, half their spacing (0.5 mm) finds the trend; None: analytic.
 
     Raises:
-        InvalidInput: a step that is not above 0.
+        InvalidInput: no Simulator, or a step that is not above 0.
     """
 
     def __init__(self, simulator: Simulator, *, pose_step: float | None = None) -> None:
+        check_kind("simulator", simulator, Simulator)
         if pose_step is not None and not 0 < pose_step < np.inf:
             raise InvalidInput(f"pose_step is {pose_step} m; it must be finite and above 0. Try 5e-4.")
         self.simulator, self.pose_step = simulator, pose_step
@@ -327,8 +328,12 @@ def twisted(pose_body_from_tool: ArrayLike, twist: ArrayLike) -> Transform:
 
 def _asked(contacts: Sequence[Contact], by: Collection[str]) -> list[Contact]:
     """The contacts by their poses alone, once it is known what is asked for."""
-    if strange := set([by] if isinstance(by, str) else by) - set(EVERY):
+    check_kind("by", by, Collection)
+    if strange := {str(one) for one in ([by] if isinstance(by, str) else by)} - set(EVERY):
         raise InvalidInput(f"there is no gradient by {', '.join(sorted(strange))}. Available: {', '.join(EVERY)}.")
+    check_kind("contacts", contacts, Sequence)
+    for one in contacts:
+        check_kind("a contact", one, Contact)
     return [replace(one, wrench=None) for one in contacts]
 
 

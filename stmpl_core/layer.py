@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from stmpl_core.arrays import Faces, PerVertex, Points, VertexVectors, finite
+from stmpl_core.arrays import Faces, PerVertex, Points, VertexVectors, check_kind, finite
 from stmpl_core.errors import InvalidInput, MeshError
 from stmpl_core.seams import border_edges, edge_table
 from stmpl_core.tissue import Tissue
@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 
 MAX_EXTENT = 4.0  # largest extent of a skin [m]; that of a mesh in millimetres is larger
 STEEPEST = 0.35  # cosine between the normal and a column to the core, below which the column's length counts
+MOST_OUTSIDE = 0.01  # share of the skin whose core may lie on its other side, as where joints fold it
 MAX_THICKNESS = 0.1  # largest thickness of soft tissue [m]; that of a thickness in millimetres is larger
 
 
@@ -41,7 +42,8 @@ class SoftLayer:
 
     Raises:
         MeshError: empty, non-manifold, inside-out or degenerate surface, or one that looks like millimetres.
-        InvalidInput: numbers that are not finite, wrong shapes, or a thickness or factor not above 0.
+        InvalidInput: numbers that are not finite, wrong shapes, a thickness or factor not above 0, or a
+            core outside of the skin.
     """
 
     def __init__(
@@ -72,6 +74,7 @@ class SoftLayer:
         if (self.thickness <= 0).any():
             worst = int(self.thickness.argmin())
             raise InvalidInput(f"thickness is {self.thickness[worst]:g} m at vertex {worst}; it must be above 0.")
+        check_kind("tissue", tissue, (Tissue, type(None)))
         self.tissue = tissue or Tissue()
         self.ply_scale: PerVertex | None = None
         if ply_scale is not None:
@@ -82,10 +85,17 @@ class SoftLayer:
         if self.bony is not None and self.bony.shape != (len(self.vertices),):
             raise InvalidInput(f"bony has shape {self.bony.shape}, the skin has {len(self.vertices)} vertices.")
         self.chart, self.rig = chart, rig
+        if rig is not None and not hasattr(rig, "weights"):
+            raise InvalidInput(f"rig is {rig!r:.40}; Rig or None is needed.")
         if rig is not None and len(rig.weights) != len(self.vertices):
             raise InvalidInput(f"the rig has weights of {len(rig.weights)} vertices, the skin has "
                                f"{len(self.vertices)}.")  # fmt: skip
         _check_surface(self)
+        if self.core is not None:
+            out = np.einsum("vx,vx->v", self.core - self.vertices, self.normals) > 0
+            if (share := self.vertex_areas[out].sum() / self.vertex_areas.sum()) > MOST_OUTSIDE:
+                raise InvalidInput(f"the core lies outside of the skin under {100 * share:.2g} % of it, first at "
+                                   f"vertex {int(out.argmax())}. Inside out, or vertices and core exchanged?")
 
     def with_(self, **changes: Any) -> SoftLayer:
         """A copy with other vertices, thickness or core, tissue (or its fields), ply_scale, bony, chart or rig.
@@ -103,6 +113,7 @@ class SoftLayer:
         given = {"vertices": self.vertices, "faces": self.faces, "tissue": self.tissue, "chart": self.chart}
         given |= {"rig": self.rig, "bony": self.bony}
         given |= below | changes
+        check_kind("tissue", given["tissue"], Tissue)
         given["tissue"] = replace(given["tissue"], **material)
         return SoftLayer(**given)
 

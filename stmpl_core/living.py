@@ -10,6 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from stmpl_core.arrays import check_kind
 from stmpl_core.body import AROUND, Body
 from stmpl_core.bones import Bone, bones_of, to_bone
 from stmpl_core.bony import bony
@@ -63,11 +64,18 @@ def living(body: Body, part: str, tone: Tone = "relaxed", *, edge_length: float 
     Raises:
         InvalidInput: a part without a region.
     """
+    check_body(body, part)
     named = part_around(body, part) if part.startswith(AROUND) else part
     if named in STRAIGHT:
         its = for_person(region_of(named, tone), body.physique)
         return body.part(part, edge_length=edge_length, thickness=its.thickness, tissue=its.tissue)
     return filled(body, named, body.part(part, edge_length=edge_length, thickness=SHEET), tone)
+
+
+def check_body(body: object, part: object) -> None:
+    """Raises InvalidInput: no body, or a part that is no text."""
+    check_kind("body", body, Body)
+    check_kind("part", part, str)
 
 
 def part_around(body: Body, picked: str) -> str:
@@ -127,6 +135,7 @@ def laid(body: Body, part: str, tissue: Tissue, thickness: float, *, edge_length
     Raises:
         InvalidInput: no such part, or a thickness on which no layer can be laid.
     """
+    check_body(body, part)
     thickness = one_thickness(thickness)
     try:
         named = part_around(body, part) if part.startswith(AROUND) else part
@@ -143,7 +152,12 @@ def _to_bones(body: Body, part: str, skin: SoftLayer, bones: Sequence[Bone], thi
 
 
 def held_skin(layer: SoftLayer) -> SoftLayer:
-    """The layer with the stress of all its materials fading as in skin that was stretched and held (HELD_SKIN)."""
+    """The layer with the stress of all its materials fading as in skin that was stretched and held (HELD_SKIN).
+
+    Raises:
+        InvalidInput: no layer.
+    """
+    check_kind("layer", layer, SoftLayer)
     return layer.with_(tissue=layer.tissue.relaxing(HELD_SKIN))
 
 

@@ -123,7 +123,7 @@ def region(name: str, tone: Tone = "relaxed") -> Region:
     name = name.removeprefix("left_").removeprefix("right_")
     if name not in REGIONS:
         raise InvalidInput(f"there is no region '{name}'. Regions: {', '.join(REGIONS)}.")
-    if tone not in get_args(Tone):
+    if not isinstance(tone, str) or tone not in get_args(Tone):
         raise InvalidInput(f"there is no tone '{tone}'. Tones: {', '.join(get_args(Tone))}.")
     where, tensed, numbers = REGIONS[name]
     if tone == "tensed":

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial import KDTree
 
-from stmpl_core.arrays import Points, finite
+from stmpl_core.arrays import Points, check_kind, check_number, finite
 from stmpl_core.compiling import UNCOUNTED
 from stmpl_core.decimation import BAND_CELLS, MARGIN, MAX_NODES, field_spacing
 from stmpl_core.errors import InvalidInput, MeshError
@@ -111,6 +111,9 @@ class SignedDistance:
             MeshError: a surface without area, or an extent that no tool in metres has.
             InvalidInput: numbers that are not finite, or a spacing so fine that the grid would not fit in memory.
         """
+        check_kind("the tool", mesh, Tool)
+        if spacing is not None:
+            check_number("spacing", spacing)
         key = (cls, mesh.digest, spacing, margin, rounding)
         if kept := _KEPT.get(key):
             return kept

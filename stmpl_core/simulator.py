@@ -9,7 +9,7 @@ from typing import overload
 import numba
 import numpy as np
 
-from stmpl_core.arrays import PerVertex, check_dt
+from stmpl_core.arrays import PerVertex, check_dt, check_kind
 from stmpl_core.bounds import beside_walls, motion_bound
 from stmpl_core.carrying import carried
 from stmpl_core.conform import Conformed, conform, kept_out, laid_on, no_further
@@ -59,6 +59,7 @@ class Simulator:
 
     def __init__(self, layer: SoftLayer | Skin, method: Method | None = None, tools: Tools | None = None, *,
                  friction: Friction | Mapping[str, Friction] = None) -> None:  # fmt: skip
+        check_kind("tools", tools, (Tools, type(None)))
         if isinstance(layer, Skin):
             skin = layer
         elif method is None:
@@ -152,7 +153,10 @@ class Simulator:
             InvalidInput: two contacts of one name, a dt below 0 or not finite, or a state of other skin or joints.
             MeshError: a tool's surface that cannot be used.
         """
-        names = [contact.name for contact in contacts]
+        try:
+            names = [contact.name for contact in contacts]
+        except (AttributeError, TypeError):
+            raise InvalidInput(f"contacts are {contacts!r:.60}; a list of Contacts is needed.") from None
         if len(set(names)) < len(names):
             raise InvalidInput(f"contacts must have names of their own; got {', '.join(names)}.")
         check_dt(dt)
@@ -163,7 +167,10 @@ class Simulator:
     def answer(self, touches: Sequence[Touch]) -> Answer:
         """Finds the displacement of the skin under touches of this simulator, made where its joints are now."""
         # Sum: pressures of several tools add.
-        pressing = [touch.pressure for touch in touches if touch.pressure is not None]
+        try:
+            pressing = [touch.pressure for touch in touches if touch.pressure is not None]
+        except (AttributeError, TypeError):
+            raise InvalidInput(f"touches are {touches!r:.60}; a list of Touches is needed.") from None
         pressure = sum(pressing[1:], pressing[0]) if pressing else np.zeros(len(self.layer.vertices))
         moves = self.history.elastic(touches)
 

@@ -5,10 +5,12 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from numbers import Integral
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from stmpl_core.arrays import check_kind
 from stmpl_core.errors import InvalidInput
 from stmpl_core.green import Green
 from stmpl_core.layer import SoftLayer, layer_id
@@ -21,7 +23,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class Skin:
-    """A layer, ready to answer. It can be pickled, so that another process may make it.
+    """A layer, ready to answer. It can be pickled, so that another process of the same version of stmpl may make it.
 
     Args:
         layer: soft layer at rest.
@@ -53,6 +55,9 @@ class Skin:
     @classmethod
     def of(cls, layer: SoftLayer, method: Method) -> Skin:
         """Prepares a layer (seconds). Raises InvalidInput or MeshError."""
+        check_kind("layer", layer, SoftLayer)
+        if not hasattr(method, "prepare"):
+            raise InvalidInput(f"method is {method!r:.40}; one of stmpl_core.methods is needed, as MomentNet().")
         ready = method.prepare(layer)
         return cls(layer, ready, Surroundings.of(layer), Green.of(layer) if layer.stacked else None)
 
@@ -79,6 +84,9 @@ class Skin:
 
     def turn_at(self, vertex: int) -> np.ndarray:
         """Rotation of the skin at a vertex from its rest, (3, 3)."""
+        if not isinstance(vertex, Integral) or not 0 <= vertex < len(self.layer.vertices):
+            raise InvalidInput(f"the vertex is {vertex!r:.40}; whole numbers from 0 to {len(self.layer.vertices) - 1} "
+                               "are the skin's.")  # fmt: skip
         return np.eye(3) if self.rest is None else self.rest.posing.turn_at(vertex, self.angles)
 
     @cached_property

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
 
+from stmpl_core.arrays import check_kind, check_number, is_number
 from stmpl_core.errors import InvalidInput
 
 THICKEST_SKIN = 5e-3  # largest thickness of a skin [m]; that of a skin in millimetres is larger
@@ -32,8 +34,11 @@ class Prony:
     source: str = ""
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "shares", tuple(float(x) for x in self.shares))
-        object.__setattr__(self, "times", tuple(float(x) for x in self.times))
+        for name in ("shares", "times"):
+            values = getattr(self, name)
+            if not isinstance(values, Iterable) or not all(map(is_number, values := tuple(values))):
+                raise InvalidInput(f"the {name} of a Prony series are {values!r:.60}; numbers are needed.")
+            object.__setattr__(self, name, tuple(map(float, values)))
         if len(self.shares) != len(self.times) or not self.shares:
             raise InvalidInput(
                 f"a Prony series has {len(self.shares)} shares and {len(self.times)} times; it needs as "
@@ -78,6 +83,9 @@ class Membrane:
     relaxation: Prony | None = None
 
     def __post_init__(self) -> None:
+        for name in ("thickness", "tension", "poisson_ratio"):
+            check_number(f"the skin's {name}", getattr(self, name))
+        check_kind("the skin's relaxation", self.relaxation, (Prony, type(None)))
         _check_moduli(self.youngs_modulus, min(self.poisson_ratio, 0.499))
         if not (np.isfinite(self.thickness) and 0 < self.thickness <= THICKEST_SKIN):
             raise InvalidInput(
@@ -114,6 +122,8 @@ class Ply:
     relaxation: Prony | None = None
 
     def __post_init__(self) -> None:
+        check_number("the depth of a material", self.depth)
+        check_kind("the relaxation of a material", self.relaxation, (Prony, type(None)))
         _check_moduli(self.youngs_modulus, self.poisson_ratio)
         if not (np.isfinite(self.depth) and self.depth > 0):
             raise InvalidInput(f"a material begins {self.depth:g} m deep; it must be finite and above 0.")
@@ -146,6 +156,12 @@ class Tissue:
     relaxation: Prony | None = None
 
     def __post_init__(self) -> None:
+        check_number("density", self.density)
+        check_kind("skin", self.skin, (Membrane, type(None)))
+        check_kind("relaxation", self.relaxation, (Prony, type(None)))
+        check_kind("deeper", self.deeper, (tuple, list))
+        for ply in self.deeper:
+            check_kind("a deeper material", ply, Ply)
         _check_moduli(self.youngs_modulus, self.poisson_ratio)
         if not (np.isfinite(self.density) and self.density > 0):
             raise InvalidInput(f"density is {self.density} kg/m3; it must be finite and above 0.")
@@ -209,6 +225,9 @@ class Tissue:
 
 
 def _check_moduli(youngs_modulus: float, poisson_ratio: float) -> None:
+    check_number("poisson_ratio", poisson_ratio)
+    if not is_number(youngs_modulus):
+        raise InvalidInput(f"youngs_modulus is {youngs_modulus!r:.40}; a number is needed [Pa].")
     if not (np.isfinite(youngs_modulus) and youngs_modulus > 0):
         raise InvalidInput(f"youngs_modulus is {youngs_modulus} Pa; it must be finite and above 0.")
     if youngs_modulus < SOFTEST:

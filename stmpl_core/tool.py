@@ -10,6 +10,7 @@ from functools import cached_property
 import numpy as np
 
 from stmpl_core.arrays import Faces, Points
+from stmpl_core.errors import InvalidInput
 
 log = logging.getLogger(__name__)
 
@@ -27,7 +28,7 @@ class Tool:
         mendings: sentences that tell what of the surface was mended (see stmpl_core.mending); usually none.
 
     Raises:
-        MeshError, InvalidInput: a surface that is not finite, is empty, names vertices that do not exist, or
+        MeshError, InvalidInput: no name, a surface that is not finite, is empty, names vertices that do not exist, or
             cannot be mended.
     """
 
@@ -37,6 +38,8 @@ class Tool:
     mendings: tuple[str, ...] = field(default=(), init=False)
 
     def __post_init__(self) -> None:
+        if not isinstance(self.name, str) or not self.name:
+            raise InvalidInput(f"a tool's name is {self.name!r:.40}; a text of one letter or more is needed.")
         from stmpl_core.mending import mended  # brings numba, which a program without tools does not need
 
         surface = mended(self.vertices, self.faces)

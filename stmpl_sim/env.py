@@ -7,7 +7,7 @@ from typing import Any, NoReturn
 
 import numpy as np
 
-from stmpl_core.arrays import finite
+from stmpl_core.arrays import check_choice, check_number, finite
 from stmpl_core.errors import InvalidInput
 from stmpl_core.extras import needed
 from stmpl_core.friction import Friction
@@ -64,7 +64,7 @@ class MassageEnv(gymnasium.Env[np.ndarray, np.ndarray]):
 
     Raises:
         InvalidInput: another render_mode; friction or relaxing beside a Simulator, which has its own; a timestep of
-            which no whole number makes 20 ms; a circle that is none; an action that is not finite.
+            which no whole number makes 20 ms; a circle or laps that are none; an action that is not finite.
         gymnasium.error.ResetNeeded: a step before the first `reset`.
     """
 
@@ -89,14 +89,15 @@ class MassageEnv(gymnasium.Env[np.ndarray, np.ndarray]):
             raise InvalidInput(f"render_mode is {render_mode}; allowed is rgb_array or none.")
         self.render_mode = render_mode
         for name, value in {"timestep": timestep, "circle": circle, "laps": laps}.items():
-            if not isinstance(value, int | float | np.number) or not np.isfinite(value):
-                raise InvalidInput(f"{name} is {value!r:.40}; a finite number is needed.")
+            check_number(name, value)
+        for name, value in {"moving": moving, "relaxing": relaxing}.items():
+            check_choice(name, value)
         steps = CONTROL_S / timestep if timestep > 0 else 0.0
         if not (steps >= 1 and abs(steps - round(steps)) < 1e-6):
             raise InvalidInput(f"timestep is {timestep:g} s; {CONTROL_S:g} s, for which an action is held, must be a "
                                "whole number of steps.")  # fmt: skip
-        if not circle > 0:
-            raise InvalidInput(f"circle is {circle:g} m; a radius above 0 is needed.")
+        if not (circle > 0 and laps > 0):
+            raise InvalidInput(f"circle is {circle:g} m and laps {laps:g}; both must be above 0.")
         if isinstance(layer, Simulator):
             if friction is not None or relaxing:
                 raise InvalidInput("a Simulator has its own friction and relaxation: give a layer, or neither.")
@@ -256,9 +257,14 @@ class Scripted:
         proportional: gain on the force's error [-].
         integral: gain on its integral [1/s].
         along: gain on the integral of the place beside the course [1/s].
+
+    Raises:
+        InvalidInput: a gain that is not a finite number.
     """
 
     def __init__(self, proportional: float = 0.5, integral: float = 6.0, along: float = 4.0) -> None:
+        for name, value in {"proportional": proportional, "integral": integral, "along": along}.items():
+            check_number(name, value)
         self.proportional, self.integral, self.along = proportional, integral, along
         self.sum, self.beside = 0.0, np.zeros(2)
 

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from stmpl_core.arrays import Wrench, cross
+from stmpl_core.arrays import Wrench, check_kind, check_number, cross, is_number
 from stmpl_core.errors import InvalidInput
 from stmpl_core.friction import Friction
 from stmpl_core.local_contact import local_contacts
@@ -33,6 +33,7 @@ RAMP_S = 0.4  # time in which the speed along a circle is reached
 STIFFNESS_S = 0.01  # time between two looks at the contact's stiffness [s]
 FIRST = 0.3  # share of the force with which the tool comes to the skin
 LANDED = 0.6  # share of the approach after which it is taken to touch, and the force rises
+MOST_FORCE, MOST_SPEED = 200.0, 2.0  # of a course [N], [m/s]: far above what anybody is massaged with
 START_M, NEAR_M = 0.01, 0.003  # height over the skin at which the tool begins and ends; from which it approaches [m]
 
 
@@ -73,12 +74,17 @@ class Course:
     phases: tuple[Phase, ...] = field(init=False)
 
     def __post_init__(self) -> None:
-        if not self.forces or not all(0 < force < np.inf for force in self.forces):
-            raise InvalidInput(f"forces are {self.forces}; at least one is needed, each finite and above 0 N.")
-        if not 0 <= self.grip < np.inf:
-            raise InvalidInput(f"the grip is {self.grip} N; it must be finite and at least 0.")
-        if not (0 <= self.speed < np.inf and 0 <= self.laps < np.inf):
-            raise InvalidInput(f"speed is {self.speed} m/s and laps {self.laps}; both must be finite and at least 0.")
+        check_kind("forces", self.forces, (tuple, list))
+        for name in ("grip", "speed", "laps"):
+            check_number(name, getattr(self, name))
+        if not self.forces or not all(is_number(force) and 0 < force <= MOST_FORCE for force in self.forces):
+            raise InvalidInput(f"forces are {self.forces}; at least one is needed, each above 0 and at most "
+                               f"{MOST_FORCE:g} N.")  # fmt: skip
+        if not 0 <= self.grip <= MOST_FORCE:
+            raise InvalidInput(f"the grip is {self.grip} N; it must be from 0 to {MOST_FORCE:g}.")
+        if not (0 <= self.speed <= MOST_SPEED and self.laps >= 0):
+            raise InvalidInput(f"speed is {self.speed} m/s and laps {self.laps}; neither may be below 0, nor the speed "
+                               f"above {MOST_SPEED:g}. Is it in mm/s?")  # fmt: skip
         lap = 2 * np.pi * self.circle.radius * self.laps / self.speed + RAMP_S if self.speed and self.laps else 0.0
         found = [Phase("reach", 0.0, REACH_S, 0.0), Phase("approach", REACH_S, APPROACH_S, self.forces[0])]
         for force in self.forces:

@@ -12,7 +12,7 @@ from weakref import ReferenceType, WeakKeyDictionary, WeakValueDictionary, ref
 import numpy as np
 from numpy.typing import ArrayLike
 
-from stmpl_core.arrays import Transform, Wrench, cross, inverted
+from stmpl_core.arrays import Transform, Wrench, check_kind, cross, inverted
 from stmpl_core.errors import InvalidInput
 from stmpl_core.friction import Friction
 from stmpl_core.layer import SoftLayer
@@ -97,6 +97,7 @@ class SoftBody:
         joints: Mapping[str, str] | None = None,
         every: int = 1,
     ) -> None:
+        check_kind("model", model, mujoco.MjModel)
         self.model = model
         self.body = _body(model, body)
         if isinstance(tools, str):
@@ -143,6 +144,7 @@ class SoftBody:
 
     @memory.setter
     def memory(self, memory: Memory) -> None:
+        check_kind("memory", memory, Memory)
         self._memory, self._time, self._exerted_in, self._put = memory, None, None, True
         if memory.exerted is not None:
             self._time = memory.exerted.time
@@ -178,8 +180,9 @@ class SoftBody:
             Touch of each tool, by name, in layer axes.
 
         Raises:
-            InvalidInput: positions that are not finite.
+            InvalidInput: data of another model, or positions that are not finite.
         """
+        self._check(data)
         mujoco.mj_kinematics(self.model, data)
         if self._jacobians is not None:  # what mj_jac and mj_solveM read
             for update in (mujoco.mj_comPos, mujoco.mj_tendon, mujoco.mj_makeM, mujoco.mj_factorM):
@@ -201,6 +204,13 @@ class SoftBody:
         self._keep(data)
         self.reaction = replace(reaction, memory=self._memory)
         return reaction.touches
+
+    def _check(self, data: Any) -> None:
+        """Raises InvalidInput: no MjData, or that of another model, whose wrenches are not this skin's."""
+        check_kind("data", data, mujoco.MjData)
+        if data.model is not self.model:
+            raise InvalidInput("these are data of another model than the skin's. Make them of its model, "
+                               "mujoco.MjData(model), or a SoftBody of theirs.")  # fmt: skip
 
     def _step_bent(self, jointed: Jointed, data: Any, poses: Poses, dt: float, mobility: Any) -> Reaction:
         """A step of a limb whose joints move."""
@@ -235,14 +245,16 @@ class SoftBody:
         return simulator
 
     def poses(self, data: Any) -> Poses:
-        """Places of body and tools in `data`."""
+        """Places of body and tools in `data`. Raises InvalidInput: data of another model."""
+        self._check(data)
         tools = {name: _pose(data.xpos[s.body], data.xmat[s.body]) if s.geom is None
                  else _pose(data.geom_xpos[s.geom], data.geom_xmat[s.geom])
                  for name, s in self._sources.items()}  # fmt: skip
         return Poses(self.pose(data), tools)
 
     def pose(self, data: Any) -> Transform:
-        """pose_world_from_body in `data`, (4, 4)."""
+        """pose_world_from_body in `data`, (4, 4). Raises InvalidInput: data of another model."""
+        self._check(data)
         return _pose(data.xpos[self.body], data.xmat[self.body])
 
     def answer(self) -> Answer:
@@ -256,7 +268,12 @@ class SoftBody:
         """Stiffness of a tool's contact at the last `apply`, friction left out, world axes, (3, 3) [N/m].
 
         Found from the touch (stmpl_core.local_contact) in half a millisecond; zeros where nothing presses.
+        Raises InvalidInput: no such tool, or data of another model.
         """
+        self._check(data)
+        check_kind("name", name, str)
+        if name not in self.contact.tools:
+            raise InvalidInput(f"there is no tool {name!r:.40}. Available: {', '.join(self.contact.tools)}.")
         if self.reaction is None:
             return np.zeros((3, 3))
         touch, memory = self.reaction.touches[name], self.reaction.memory
@@ -268,12 +285,14 @@ class SoftBody:
 
     def skin_points(self, data: Any, answer: Answer | None = None) -> np.ndarray:
         """Vertices of the skin in the world, (V, 3) [m], deformed by an answer if one is given."""
-        pose = _pose(data.xpos[self.body], data.xmat[self.body]) @ self.contact.pose_body_from_layer
+        check_kind("answer", answer, (Answer, type(None)))
+        pose = self.pose(data) @ self.contact.pose_body_from_layer
         rest = self._stood().layer.vertices
         return (rest if answer is None else rest + answer.displacement) @ pose[:3, :3].T + pose[:3, 3]
 
     def reset(self, data: Any) -> None:
-        """Takes the wrenches out of `data`, and forgets."""
+        """Takes the wrenches out of `data`, and forgets. Raises InvalidInput: data of another model."""
+        self._check(data)
         self._exert(data, {})
         self.memory, self.reaction = Memory(), None
 

@@ -8,7 +8,7 @@ from typing import Any, Literal, NamedTuple, get_args
 
 import numpy as np
 
-from stmpl_core.arrays import Transform, finite
+from stmpl_core.arrays import Transform, check_choice, check_kind, check_number, finite
 from stmpl_core.errors import InvalidInput
 from stmpl_core.layer import SoftLayer
 from stmpl_sim.ability import AXES, start_notes
@@ -31,6 +31,7 @@ AIM = np.array([-0.03, 0.0, 0.045])  # point that it looks at, from the site [m]
 COLOURS = 256  # texels of the skin's colour scale
 ELBOW_DAMPING = 0.05  # of the hinge of a limb on a rest [N m s/rad]
 ROOM = 0.08  # distance of a start's joints from their limits, over their ranges, beyond which no other start is tried
+LONGEST_STEP = 0.02  # largest timestep [s]: ten times what the arm's control wants
 LONGEST = 10.0  # length of a robot's links beyond which its file is taken to be in millimetres [m]
 STARTS, STEPS = 40, 200  # starts that are tried at most, and steps from each
 POINTING = 150  # of these steps where the place goes before pointing: after them only the place is found
@@ -102,11 +103,18 @@ def build(
         InvalidInput: a place that is not finite, a ball without a radius, a timestep that is none, a file that MuJoCo
             does not read, an end that is not there, a site out of reach, or a limb that cannot be gripped.
     """
+    check_choice("gripper", gripper)
+    check_kind("robot", robot, (str, Path, type(None)))
+    check_kind("end", end, (str, type(None)))
     where, spec = finite("at", at, (3,)), robot_spec(ARM if robot is None else Path(robot))
-    if not 0 < radius < np.inf:
+    check_number("the ball's radius", radius)
+    if not radius > 0:
         raise InvalidInput(f"the ball's radius is {radius:g} m; it must be finite and above 0.")
-    if not 0 < timestep < np.inf:
-        raise InvalidInput(f"the timestep is {timestep:g} s; it must be finite and above 0.")
+    check_number("above", above)
+    check_number("the timestep", timestep)
+    if not 0 < timestep <= LONGEST_STEP:
+        raise InvalidInput(f"the timestep is {timestep:g} s; it must be above 0 and at most {LONGEST_STEP:g}. Is it in "
+                           "milliseconds?")  # fmt: skip
     holder, side, tools = _end(spec, end), -1.0, (BALL,)
     chain = _chain(holder if hasattr(holder, "add_body") else holder.parent)
     try:

@@ -298,6 +298,10 @@ def test_a_place_that_is_none_is_refused(body):
         body.part("around:1,2")
     with pytest.raises(InvalidInput, match="at least two edges"):
         body.around((0.13, 0.04, 0.17), 1e-3)
+    with pytest.raises(InvalidInput, match=r"radius is 80 m.*at most 1 m.*millimetres"):
+        body.around((0.13, 0.04, 0.17), 80)
+    with pytest.raises(InvalidInput, match="radius is 'wide'; a finite number"):
+        body.around((0.13, 0.04, 0.17), "wide")
     for ask in (body.part, lambda part: living(body, part)):  # between the vertices, which are further apart
         with pytest.raises(InvalidInput, match=r"no vertex of the body is within the radius of 'around:.*Try a larger"):
             ask("around:-0.09,0.06,0.33,0.005")

@@ -71,6 +71,9 @@ def test_what_cannot_be_is_refused_with_what_is_wrong():
         Winkler().prepare(layer)
     with pytest.raises(InvalidInput, match="one of them"):
         layer.with_(thickness=5e-3, core=layer.core)
+    out = layer.vertices + 5e-3 * layer.normals
+    with pytest.raises(InvalidInput, match=r"core lies outside of the skin under 1e\+02 % of it, first at vertex 0"):
+        layer.with_(core=out)
 
 
 @pytest.mark.parametrize(("part", "bony", "soft"), [

@@ -346,6 +346,11 @@ def test_what_cannot_be_is_refused_with_what_is_wrong(skin):
         skin.posed({"elbow": float("nan")})
     with pytest.raises(InvalidInput, match=r"elbow is 45 rad; it goes from -3.14 to 3.14 rad. Is it in degrees"):
         skin.posed({"elbow": 45.0})
+    for vertex in (10**9, -1, 0.5):
+        with pytest.raises(InvalidInput, match="the vertex is"):
+            skin.turn_at(vertex)
+    with pytest.raises(InvalidInput, match="rig is 'elbow'; Rig or None"):
+        layer.with_(rig="elbow")
     with pytest.raises(InvalidInput, match="this skin has no joints"):
         Simulator(layer.with_(rig=None), Winkler()).pose({"elbow": 0.1})
     with pytest.raises(InvalidInput, match="weights of 1 vertices, the skin has"):

@@ -10,7 +10,7 @@ import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from stmpl_core import Contact, Simulator, SoftLayer, State, Touch
+from stmpl_core import Contact, Simulator, SoftLayer, State, Tool, Touch
 from stmpl_core.errors import InvalidInput
 from stmpl_core.methods import MomentNet, Winkler
 from stmpl_core.regions import HELD_SKIN
@@ -570,6 +570,39 @@ def test_what_cannot_be_is_one_clear_sentence(simulator: Simulator) -> None:
         make(model=model(exclude=False))
     with pytest.raises(InvalidInput, match=r"before the first apply"):
         make().answer()
+    with pytest.raises(InvalidInput, match=r"model is '<mujoco/>'; MjModel is needed"):
+        make(model="<mujoco/>")
+    with pytest.raises(InvalidInput, match=r"implicit is 'yes'; True or False"):
+        make(implicit="yes")
+    with pytest.raises(InvalidInput, match=r"asked at every True steps"):
+        make(every=True)
+    with pytest.raises(InvalidInput, match=r"damping is None; a finite number"):
+        make(damping=None)
+    with pytest.raises(InvalidInput, match=r"this Simulator has its method; leave the other one out"):
+        make(method=Winkler())
+    with pytest.raises(InvalidInput, match=r"memory is 'x'; Memory is needed"):
+        make().memory = "x"  # type: ignore[assignment]
+    for some, says in (([RADIUS], "a tool is 0.012; Tool"), (None, "tools is None; a list of Tools")):
+        with pytest.raises(InvalidInput, match=says):
+            SoftContact(simulator, some)  # type: ignore[arg-type]
+    with pytest.raises(InvalidInput, match=r"layer is 'arm'; SoftLayer or Skin or Simulator"):
+        SoftContact("arm", [ball(RADIUS)])  # type: ignore[arg-type]
+    for name in ("", None):
+        with pytest.raises(InvalidInput, match="a tool's name is"):
+            Tool(name, ball().vertices, ball().faces)  # type: ignore[arg-type]
+
+
+def test_data_of_another_model_are_refused_and_left_as_they_are(simulator: Simulator) -> None:
+    m, more = model(), model(joint="<freejoint/>")
+    skin, other = SoftBody(m, simulator, body="slab", tools=["ball"]), mujoco.MjData(more)
+    other.xfrc_applied[:] = 0.5
+    for use in (skin.apply, skin.reset, skin.poses):
+        with pytest.raises(InvalidInput, match=r"data of another model.*mujoco.MjData\(model\)"):
+            use(other)
+    assert (other.xfrc_applied == 0.5).all() and skin.reaction is None
+    skin.apply(copy.copy(mujoco.MjData(m)))
+    with pytest.raises(InvalidInput, match="data is None; MjData is needed"):
+        skin.apply(None)
 
 
 def test_exclude_does_what_the_sentence_says(simulator: Simulator) -> None:

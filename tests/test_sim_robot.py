@@ -492,6 +492,13 @@ def test_the_environment_passes_gymnasiums_own_check_and_its_script_solves_it(fo
     for name in ("circle", "laps", "timestep"):
         with pytest.raises(InvalidInput, match=f"{name} is 'a'; a finite number"):
             MassageEnv(forearm, **{name: "a"})
+    with pytest.raises(InvalidInput, match="laps 0; both must be above 0"):
+        MassageEnv(forearm, laps=0)
+    for name in ("moving", "relaxing"):
+        with pytest.raises(InvalidInput, match=f"{name} is 'no'; True or False"):
+            MassageEnv(forearm, **{name: "no"})
+    with pytest.raises(InvalidInput, match="proportional is nan"):
+        Scripted(proportional=np.nan)
 
 
 def test_the_script_holds_ten_newtons_on_the_back_of_a_person_who_breathes_sways_and_turns() -> None:
@@ -598,6 +605,7 @@ def test_an_arm_starts_where_its_joints_have_room(forearm: SoftLayer, tmp_path: 
 
 
 def test_a_site_or_a_timestep_that_is_none_is_refused(forearm: SoftLayer) -> None:
+    from stmpl_sim.massage import Course
     from stmpl_sim.scene import build
     from stmpl_sim.site import Site
 
@@ -607,6 +615,13 @@ def test_a_site_or_a_timestep_that_is_none_is_refused(forearm: SoftLayer) -> Non
     coarse = trimesh.creation.box((0.2, 0.1, 0.1))
     with pytest.raises(InvalidInput, match="no vertex is in the middle part"):
         Site.thickest(SoftLayer(coarse.vertices, coarse.faces, 0.01))
-    for timestep in (0.0, -1e-3, np.nan):
+    for timestep in (0.0, -1e-3, np.nan, 10.0, "1 ms"):
         with pytest.raises(InvalidInput, match="timestep is"):
-            build(forearm, Site(forearm, 0), timestep=timestep)
+            build(forearm, Site(forearm, 0), timestep=timestep)  # type: ignore[arg-type]
+    circle = Site.thickest(forearm).circle(0.01)
+    for given, says in (({"forces": (5000,)}, "at most 200 N"), ({"speed": 1000.0}, "Is it in mm/s"),
+                        ({"forces": 5.0}, "forces is 5.0; tuple or list"), ({"grip": "firm"}, "grip is 'firm'"),
+                        ({"laps": None}, "laps is None"), ({"forces": ("5",)}, "forces are"),
+                        ({"grip": -1.0}, "the grip is -1")):  # fmt: skip
+        with pytest.raises(InvalidInput, match=says):
+            Course(circle, **given)  # type: ignore[arg-type]
