@@ -112,7 +112,8 @@ class Touch:
         status: one of the constants of this module.
         pose_body_from_tool: pose that is answered for, (4, 4): the stated one, moved along the force if there is one.
         wrench: force [N] and torque about the tool's origin [N m] that the tool exerts on the body, layer axes, (6,).
-        depth: depth of the deepest column under the tool [m]; negative when apart, NaN when far or not known.
+        depth: depth of the deepest column under the tool [m]; negative when apart, at least so far away; NaN when
+            farther than the limb is thick, or not known.
         force_bound: bound on the error of the force that the pose presses with [N]; NaN where it is not known.
         moved: way that the tool went from the stated pose, along its push [m].
         missing: part of the stated wrench that the skin does not carry, (6,) [N, N m].

@@ -64,6 +64,7 @@ MAX_LEVER = 1.0  # torque that is not carried over the force, over the contact's
 SURE = 0.02  # largest error of a distance field over the depth, up to which it does not matter where the field is off
 MOST_OFF = 0.1  # error of a distance field where a tool presses, over the depth, beyond which the force is not known
 LED_OUT = 0.95  # how far nodes sink with their tool over how deep it is in their columns: below, these lead out of it
+LED_DEEP, LED_LOST = 0.9, 0.35  # depth over the deepest of nodes that tell it first, and share that these may lack
 LOOKED_AT = 48  # tips of a tool that presses nothing that are looked at, the farthest; and as many of the others
 EDGE_SURE = 0.05  # share of its depth that an edge of a box lacks, with which contacts were learnt
 EDGE_OFF, MOST_LACKING = 0.2, 0.98  # depth of an edge that a distance field does not tell, from which it is flagged
@@ -273,7 +274,8 @@ class Toucher:
                     f"{1e3 * field.mostly_off:.2g} mm off: leave out what of it is far away"  # fmt: skip
             elif status in (APART, NO_TOUCH) and off > FAR:
                 why = f"{contact.name} is {off:.3g} m from the limb: is its pose in millimetres? Scale it by 1e-3"
-            return _Placed(contact, field, status, pose, depth, 0.0, NO_SQUEEZE, 0.0, why=why)
+            told = around if -depth >= self.hole else depth  # along columns that far away only a bound is known
+            return _Placed(contact, field, status, pose, told, 0.0, NO_SQUEEZE, 0.0, why=why)
 
         force, tool = contact.wrench[:3] if contact.wrench is not None else None, contact.tool.vertices
         light = force is not None and 0 < depth < 0.5 * float(self.layer.thickness[clearance.vertices].min())
@@ -695,14 +697,21 @@ def groups_of(points: Sequence[np.ndarray], thickness: float) -> list[list[int]]
 def _led_in(sinking, strain, thickness, inward, way):
     """Share of the depth in columns along a way (3,) by which the nodes of a thin tool sink with it, at most 1 [-].
 
-    Columns of a limb lead a little aside, so a thin wall that is deep is left by those that it began in.
+    Columns of a limb lead a little aside, so a thin wall that is deep is left by those that it began in: at first by
+    most of the deepest, and less of its edge presses, then by all.
     """
-    sunk, deep = 0.0, 1e-300
+    sunk, deep, depths = 0.0, 1e-300, np.empty(len(sinking))
     for n in range(len(sinking)):
         cosine = inward[n, 0] * way[0] + inward[n, 1] * way[1] + inward[n, 2] * way[2]
-        sunk = max(sunk, sinking[n])
-        deep = max(deep, strain[n] * thickness[n] * cosine * cosine)
-    return min(max(sunk / deep, 0.02), 1.0)
+        depths[n] = strain[n] * thickness[n] * cosine * cosine
+        sunk, deep = max(sunk, sinking[n]), max(deep, depths[n])
+    lost, whole = 0.0, 1e-300
+    for n in range(len(sinking)):
+        if depths[n] > LED_DEEP * deep:
+            lost += max(depths[n] - sinking[n], 0.0)
+            whole += depths[n]
+    most = 1 - lost / whole if lost > LED_LOST * whole else 1.0
+    return min(max(min(sunk / deep, most), 0.02), 1.0)
 
 
 @numba.njit(cache=True, nogil=True)

@@ -108,6 +108,17 @@ def test_zero_wrench_moves_nothing_at_any_pose(sim: Simulator, depth: float) -> 
     assert (numb in answer.trust.why) == (not answer.trust.in_range) == (depth > 0.5 * THICKNESS)
 
 
+@pytest.mark.parametrize("away", [1e-3, 3e-3, 8e-3, 20e-3, 0.5])
+def test_the_depth_of_a_tool_that_is_apart_says_how_far_it_is_away(sim: Simulator, away: float) -> None:
+    """Exactly where its distance field reaches, then a bound, not told at all far off; it was 3 mm everywhere there."""
+    touch = sim.touch([Contact(tool(BALL), on_limb(-away))])[0]
+    assert touch.status == APART and touch.trust.ok
+    if away < 2 * THICKNESS:
+        assert (1 if away < 5e-3 else 0.7) * away - 0.3e-3 < -touch.depth < away + 0.3e-3
+    else:
+        assert np.isnan(touch.depth)
+
+
 def test_a_force_that_is_too_small_to_be_placed_is_not_laid_to_other_tools_where_there_are_none(sim: Simulator) -> None:
     answer = sim.step([press(BALL, on_limb(2e-3), (-1e-12, 0, 0))])
     assert not answer.trust.in_range and "no place was found where probe presses so" in answer.trust.why

@@ -35,6 +35,7 @@ ONE_WAY = wp.constant(wp.float64(wrenches_of_skin.ONE_WAY))
 ALL_ONE_WAY = wp.constant(wp.float64(wrenches_of_skin.ALL_ONE_WAY))
 NONE = wp.constant(wp.float64(1e-300))
 NAN, PI = wp.constant(wp.float64(float("nan"))), wp.constant(wp.float64(math.pi))
+LED_DEEP, LED_LOST = (wp.constant(wp.float64(one)) for one in (toucher.LED_DEEP, toucher.LED_LOST))
 LED_OUT = wp.constant(wp.float64(toucher.LED_OUT))
 EDGE_SURE = wp.constant(wp.float64(toucher.EDGE_SURE))
 EDGE_OFF, MOST_LACKING = wp.constant(wp.float64(toucher.EDGE_OFF)), wp.constant(wp.float64(toucher.MOST_LACKING))
@@ -285,7 +286,19 @@ def _led_in(scratch: Scratch, s: wp.int32, k: wp.int32, way: vec3, lane: wp.int3
             deep = wp.max(deep, scratch.strain[s, i] * scratch.thick[s, i] * cosine * cosine)
     sunk = most_of(sunk)
     deep = most_of(deep)
-    return wp.clamp(sunk / deep, real(0.02), real(1.0))
+    lost, whole = real(0.0), real(0.0)
+    for i in range(lane, scratch.nodes[s], wp.block_dim()):
+        if scratch.tool[s, i] == k:
+            cosine = wp.dot(scratch.inward[s, i], way)
+            depth = scratch.strain[s, i] * scratch.thick[s, i] * cosine * cosine
+            if depth > LED_DEEP * deep:
+                lost += wp.max(depth - scratch.sinking[s, i], real(0.0))
+                whole += depth
+    sums = sum_of(wp.vec2d(lost, whole))
+    led = sunk / deep
+    if sums[0] > LED_LOST * sums[1]:
+        led = wp.min(led, real(1.0) - sums[0] / sums[1])
+    return wp.clamp(led, real(0.02), real(1.0))
 
 
 @wp.kernel
@@ -314,6 +327,8 @@ def answer(first: wp.int32, many: wp.int32, known: Known, skins: Skins, scratch:
         for x in range(6):
             wrenches[n, k, x] = wrenches.dtype(real(0.0))
         depth = -scratch.nearest[c]
+        if -depth >= one.hole:
+            depth = scratch.around[c]
         if depth < real(-0.5) * FAR:
             depth = NAN
         around = scratch.around[c] > AROUND * one.thickest
