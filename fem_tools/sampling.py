@@ -88,6 +88,7 @@ class BodyPlan(BaseModel):
     edge_length: float | None = None  # m, of the skin; None: the plan's
     reach: float = Field(default=6.0, gt=0)  # largest thicknesses under the load
     clear: float | None = None  # distance of tools from the open border, thicknesses; None: the plan's
+    thickest: float | None = None  # m, of the tissue under tools; None: any
     sizes: tuple[float, float] | None = None  # m, half the width of tools; None: the plan's
     tools: tuple[str, ...] | None = None  # kinds of tools; None: all
     shallowest: float = Field(default=0.0, ge=0, lt=1)  # thicknesses, from which tools are looked at
@@ -209,6 +210,16 @@ TRUNK: tuple[Person, ...] = (  # three materials on the abdomen, soft over stiff
     ("shoulder_2", 0.1, 0.0, 0.3, "left_shoulder", "tensed", 8e-3, 3.0, 0.35),
     ("forearm_4", 0.9, 0.0, 0.7, "left_forearm", "tensed", 7e-3, 6.0, 0.35),
 )
+THIN: tuple[Person, ...] = (  # where a limb's tissue is a third of its median and less, half of it skin and muscle
+    ("forearm_1", 0.5, 0.5, 0.5, "left_forearm", "relaxed", 4e-3, 6.7, 0.5),
+    ("forearm_2", 0.3, 0.8, 0.4, "left_forearm", "tensed", 4e-3, 6.7, 0.4),
+    ("forearm_3", 0.85, 0.6, 0.3, "left_forearm", "relaxed", 4e-3, 6.7, 0.4),
+    ("forearm_4", 0.15, 0.3, 0.7, "left_forearm", "relaxed", 4e-3, 6.7, 0.4),
+    ("calf_1", 0.5, 0.5, 0.5, "left_calf", "relaxed", 4.5e-3, 6.7, 0.5),
+    ("calf_2", 0.25, 0.2, 0.6, "left_calf", "tensed", 4.5e-3, 6.7, 0.4),
+    ("calf_3", 0.75, 0.9, 0.4, "left_calf", "relaxed", 4.5e-3, 6.7, 0.4),
+    ("calf_4", 0.6, 0.6, 0.7, "left_calf", "relaxed", 4.5e-3, 6.7, 0.4),
+)
 
 
 def _living(kind: str, people: tuple[Person, ...], **more: Any) -> tuple[BodyPlan, ...]:
@@ -226,6 +237,7 @@ DEEP_BODIES = _living("deep", DEEP, sizes=(12e-3, 30e-3), tools=("sphere", "elli
                       shallowest=0.45, most_work=1e11)  # that go deep where tissue is thick: most others end before
 STOUT_BODIES = _living("stout", STOUT, sizes=(8e-3, 40e-3), most_work=8e10)
 TRUNK_BODIES = _living("trunk", TRUNK, sizes=(8e-3, 40e-3), most_work=8e10)
+THIN_BODIES = _living("thin", THIN, sizes=(4e-3, 25e-3), thickest=9e-3)
 
 
 def _drawn_bodies(count: int) -> tuple[BodyPlan, ...]:
@@ -314,9 +326,9 @@ PRESETS = {
     "contacts": Plan(preset="contacts", bodies=CONTACT_BODIES, discs=0, ellipses=0, seams=0, hands=0, bands=0,
                      letters=0, tools=60, loads=8, deepest=0.9, indenter_step=0.08),
     "tissue": Plan(preset="tissue", bodies=TISSUE_BODIES + _drawn_bodies(DRAWN) + LIVING_BODIES + DEEP_BODIES +
-                   STOUT_BODIES + TRUNK_BODIES, discs=0, ellipses=0, seams=0, hands=0, bands=0, letters=0, tools=18,
-                   loads=8, deepest=0.85, indenter_step=0.12, clear=4.0, thinnest=1.4, sizes=(4e-3, 40e-3), linear=True,
-                   most_work=4e10, rounds=400),
+                   STOUT_BODIES + TRUNK_BODIES + THIN_BODIES, discs=0, ellipses=0, seams=0, hands=0, bands=0,
+                   letters=0, tools=18, loads=8, deepest=0.85, indenter_step=0.12, clear=4.0, thinnest=1.4,
+                   sizes=(4e-3, 40e-3), linear=True, most_work=4e10, rounds=400),
 }  # fmt: skip
 
 
@@ -495,6 +507,8 @@ def _draw_tool(
     clear = (plan.clear if own.clear is None else own.clear) * site.layer.thickness[vertex] + min(radius, 2 * SIZES[1])
     if site.layer.thickness[vertex] < plan.thinnest * site.layer.edge_length:
         raise UnusableContact("the tissue is thinner there than the mesh is fine")
+    if own.thickest is not None and site.layer.thickness[vertex] > own.thickest:
+        raise UnusableContact("the tissue is thicker there than asked")
     if (gap := float(site.border_distance[vertex])) < clear:
         raise UnusableContact(f"it stands {gap * 1e3:.0f} mm from the open border")
     return scene, drawn

@@ -12,8 +12,10 @@ from stmpl_core.stack import along, compliance
 from stmpl_core.tissue import Tissue
 
 BANK = 5  # softnesses whose responses are tabled
-SEEN = 150  # places of a limb that say in what its stacks differ
+SEEN = 150, 60  # places of a limb that say in what its stacks differ: of all its skin, and evenly from thin to thick
 LEAST, MOST = 0.3, 3.0  # thicknesses over the median that are told from each other
+ENDS = 0.01, 0.99  # quantiles of the places seen, between which softnesses are tabled
+SMOOTH = 0.3  # weight of second differences along the bank, beside that of a place
 ALIKE = 0.02  # logarithm of the compliance below which all places are alike
 FELT = (2.5, 15.0)  # wave numbers that decide [1/t]: longer waves are the coarse elements'
 WAVES = np.geomspace(1e-2, 60.0, 90)  # wave numbers at which stacks are compared [1/t]
@@ -21,22 +23,21 @@ GRID = 9, 7  # thicknesses, and depths of deeper materials, at which softness is
 
 
 class Softness(NamedTuple):
-    """How the response of the flat stack follows one number c: r(k; c) = r(k) (1 + c first(k) + c^2 second(k)).
+    """How the response of the flat stack follows one number c: r(k; c) = r(k) by a factor, linear between BANK of them.
 
     Tissue is thinner here and thicker there, and its fat ends less or more deep. Of what that does to a flat stack's
     responses 93 to 99 % of the variance goes with one number, on limbs as measured.
 
     Args:
         least, step: c of the first of BANK, and from one to the next; step 0: all places are alike.
-        first, second: of A, B, L and C (stmpl_core.stack), at WAVES, (4, K) each.
+        bank: factors on A, B, L and C (stmpl_core.stack), at WAVES, (BANK, 4, K).
         axes: logarithms of thickness over the median and of `ply_scale`, each even.
         table: c there.
     """
 
     least: float
     step: float
-    first: np.ndarray
-    second: np.ndarray
+    bank: np.ndarray
     axes: tuple[np.ndarray, np.ndarray]
     table: np.ndarray
 
@@ -46,7 +47,9 @@ class Softness(NamedTuple):
         tissue, (log_t, log_scale) = layer.tissue, _logs(layer, thickness)
         axes = _even(log_t, GRID[0]), _even(log_scale, GRID[1])
         median = _responses(tissue, thickness, 0.0, 0.0)
-        some = np.unique(np.linspace(0, len(log_t) - 1, SEEN).astype(int))
+        by_t, evenly = np.argsort(log_t, kind="stable"), np.linspace(log_t.min(), log_t.max(), SEEN[1])
+        some = np.union1d(np.linspace(0, len(log_t) - 1, SEEN[0]).astype(int),
+                          by_t[np.searchsorted(log_t, evenly, sorter=by_t)])  # fmt: skip
         there = np.array([_responses(tissue, thickness, float(log_t[v]), float(log_scale[v])) for v in some])
         felt = (WAVES > FELT[0]) & (WAVES < FELT[1])
         differs = np.log(there[:, 0, felt] / median[0, felt])
@@ -58,17 +61,18 @@ class Softness(NamedTuple):
             return np.log(responses[..., 0, felt] / median[0, felt]) @ way
 
         c = found(there)
-        least, most = (float(end) for end in np.quantile(c, (0.05, 0.95)))
+        least, most = (float(end) for end in np.quantile(c, ENDS))
         least, most = min(least, 0.0), max(most, 0.0)
         table = np.array([[found(_responses(tissue, thickness, a, b)) for b in axes[1]] for a in axes[0]])
         if most - least < ALIKE:
-            nothing = np.zeros((4, len(WAVES)))
-            return cls(0.0, 0.0, nothing, nothing, axes, 0.0 * table)
-        inside = (c >= least) & (c <= most)
-        terms = np.column_stack([c, c * c])[inside]
-        fits = np.linalg.lstsq(terms, (there[inside] / median - 1).reshape(len(terms), -1), rcond=None)[0]
-        first, second = fits.reshape(2, 4, -1)
-        return cls(least, (most - least) / (BANK - 1), first, second, axes, table)
+            return cls(0.0, 0.0, np.ones((BANK, *median.shape)), axes, 0.0 * table)
+        step = (most - least) / (BANK - 1)
+        at, ratios = np.clip((c - least) / step, 0, BANK - 1), (there / median).reshape(len(c), -1)
+        hats = np.maximum(1 - np.abs(at[:, None] - np.arange(BANK)), 0)
+        bends = SMOOTH * np.diff(np.eye(BANK), 2, axis=0)
+        wanted = np.vstack([ratios, np.zeros((len(bends), ratios.shape[1]))])
+        fitted = np.linalg.lstsq(np.vstack([hats, bends]), wanted, rcond=None)[0]
+        return cls(least, step, fitted.reshape(BANK, *median.shape), axes, table)
 
     def at(self, layer: SoftLayer, thickness: float) -> np.ndarray:
         """Place of each vertex among the BANK, (V,), from 0 to BANK - 1. The median's thickness is in m."""
@@ -79,10 +83,8 @@ class Softness(NamedTuple):
 
     def factors(self, waves: np.ndarray) -> np.ndarray:
         """What the responses of the median are to be multiplied by, (BANK, 4, K), at wave numbers (K,) [1/t]."""
-        first, second = (np.array([np.interp(np.log(waves), np.log(WAVES), one) for one in each])
-                         for each in (self.first, self.second))  # fmt: skip
-        c = (self.least + self.step * np.arange(BANK))[:, None, None]
-        return 1 + c * first + c * c * second
+        place, known = np.log(waves), np.log(WAVES)
+        return np.array([[np.interp(place, known, one) for one in each] for each in self.bank])
 
 
 def _logs(layer: SoftLayer, thickness: float) -> tuple[np.ndarray, np.ndarray]:

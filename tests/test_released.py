@@ -110,13 +110,13 @@ def test_a_data_set_goes_on_from_released_contacts_and_holds_its_flat_presses(tm
 
 def test_the_files_that_ship_hold_contacts_of_the_plan_that_networks_learn_from() -> None:
     found = {}
-    for name in ("limbs_v3.npz", "deep_v1.npz", "stout_v1.npz", "trunk_v1.npz"):
+    for name in ("limbs_v3.npz", "deep_v1.npz", "stout_v1.npz", "trunk_v1.npz", "thin_v1.npz"):
         some = Released(limbs.FILE.with_name(name))
         assert _fewer_bodies(some.plan, TISSUE)
         for contact, part in some.parts():
             assert part.about["split"] == split_of(TISSUE, contact)
             found[contact] = part
-    assert set(found) <= set(contacts(TISSUE)) and len(found) > 510
+    assert set(found) <= set(contacts(TISSUE)) and len(found) > 570
     deep = [dict(zip(FIGURES, one.figures, strict=True)) for contact, part in found.items()
             if contact.body.startswith("deep_") for one in part.records]  # fmt: skip
     assert len(deep) > 150 and min(one["ratio"] for one in deep) > 0.45

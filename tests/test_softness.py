@@ -6,6 +6,7 @@ import pytest
 from stmpl_core.green import Green, bank, tables
 from stmpl_core.layer import SoftLayer
 from stmpl_core.softness import BANK, Softness
+from stmpl_core.stack import compliance
 from stmpl_core.tissue import Membrane, Ply, Tissue
 from tests.test_remesh import tube
 
@@ -42,6 +43,23 @@ def test_where_fat_is_thin_or_thick_the_response_is_that_of_the_stack_there(shar
         true = there[kind, SPREAD, NEAR]
         assert np.abs(found[kind, SPREAD, NEAR] / true - 1).max() < 0.02
         assert np.abs(median[kind, SPREAD, NEAR] / true - 1).min() > 0.03
+
+
+@pytest.mark.parametrize("share", [0.02, 0.3, 0.98])
+def test_where_tissue_is_a_quarter_as_thick_as_in_the_middle_and_half_of_it_is_not_fat_it_answers_so_too(share):
+    """A shin's inner face, the thin side of a forearm: of two hundredths of the places one softness knew too little."""
+    vertices, _, _ = tube(30, 24)
+    round_it = np.cos(np.arctan2(vertices[:, 1], vertices[:, 0]))
+    thick, scale = THICK * np.exp(0.55 * round_it - 0.75 * (round_it < 0) * round_it**2), 1 + 0.25 * round_it
+    layer = limb(scale, thick)
+    vertex = int(np.abs(thick - np.quantile(thick, share)).argmin())
+    softness, by = Softness.of(layer, THICK), thick[vertex] / THICK
+    deeper = (Ply(6e-3 * scale[vertex], 15e3, 0.45),)
+    k = np.geomspace(2.5, 12.0, 20)
+    true = by * compliance(Tissue(3e3, 0.45, skin=STACK.skin, deeper=deeper), by * THICK, by * k).sinking
+    factors, soft = softness.factors(k)[:, 0], float(softness.at(layer, THICK)[vertex])
+    found = (1 - soft % 1) * factors[int(soft)] + soft % 1 * factors[int(soft) + 1]
+    assert np.abs(found * compliance(STACK, THICK, k).sinking / true - 1).max() < 0.05
 
 
 def test_tissue_as_thick_everywhere_is_the_median_everywhere():
