@@ -16,7 +16,7 @@ import numpy as np
 import scipy.sparse as sp
 from numpy.typing import ArrayLike
 
-from stmpl_core.arrays import Faces, PerVertex, Points, check_number, finite
+from stmpl_core.arrays import Faces, PerVertex, Points, finite, is_number
 from stmpl_core.chart import doubled_area
 from stmpl_core.errors import InvalidInput, MeshError
 from stmpl_core.layer import check_faces
@@ -116,7 +116,8 @@ def _check_edge_length(points: Points, faces: Faces, edge_length: float) -> None
     if (shared > 2).any():
         raise MeshError(f"{int((shared > 2).sum())} edges have more than two faces: the surface is not a manifold. "
                         "Repair it first, for instance with trimesh.")
-    check_number("edge_length", edge_length)
+    if not is_number(edge_length):
+        raise InvalidInput(f"edge_length is {edge_length!r:.40}; a number is needed.")
     extent = float(np.ptp(points, axis=0).max())
     if not (np.isfinite(edge_length) and 1e-3 * extent < edge_length < 0.5 * extent):
         raise InvalidInput(f"edge_length is {edge_length} m on a surface {extent:.3g} m wide; allowed is "

@@ -33,7 +33,7 @@ RAMP_S = 0.4  # time in which the speed along a circle is reached
 STIFFNESS_S = 0.01  # time between two looks at the contact's stiffness [s]
 FIRST = 0.3  # share of the force with which the tool comes to the skin
 LANDED = 0.6  # share of the approach after which it is taken to touch, and the force rises
-MOST_FORCE, MOST_SPEED = 200.0, 2.0  # of a course [N], [m/s]: far above what anybody is massaged with
+MOST_SPEED = 2.0  # of a course [m/s]: far above that of any massage
 START_M, NEAR_M = 0.01, 0.003  # height over the skin at which the tool begins and ends; from which it approaches [m]
 
 
@@ -77,11 +77,10 @@ class Course:
         check_kind("forces", self.forces, (tuple, list))
         for name in ("grip", "speed", "laps"):
             check_number(name, getattr(self, name))
-        if not self.forces or not all(is_number(force) and 0 < force <= MOST_FORCE for force in self.forces):
-            raise InvalidInput(f"forces are {self.forces}; at least one is needed, each above 0 and at most "
-                               f"{MOST_FORCE:g} N.")  # fmt: skip
-        if not 0 <= self.grip <= MOST_FORCE:
-            raise InvalidInput(f"the grip is {self.grip} N; it must be from 0 to {MOST_FORCE:g}.")
+        if not self.forces or not all(is_number(force) and 0 < force < np.inf for force in self.forces):
+            raise InvalidInput(f"forces are {self.forces}; at least one is needed, each finite and above 0 N.")
+        if self.grip < 0:
+            raise InvalidInput(f"the grip is {self.grip} N; it must be finite and at least 0.")
         if not (0 <= self.speed <= MOST_SPEED and self.laps >= 0):
             raise InvalidInput(f"speed is {self.speed} m/s and laps {self.laps}; neither may be below 0, nor the speed "
                                f"above {MOST_SPEED:g}. Is it in mm/s?")  # fmt: skip

@@ -34,7 +34,7 @@ def place(forearm: SoftLayer) -> Place:
 
 
 def test_models_of_one_press_lie_on_one_curve(place: Place) -> None:
-    """A straight line from 6 mm would be 12 % too low at 3 mm and 10 % at 9 mm."""
+    """A straight line from 6 mm would be 10 % too low at 4.5 and 9 mm; at 3, where the model holds no more, 76 %."""
     tool, toucher = ball(0.02), place.history.toucher
 
     def pose(depth: float) -> np.ndarray:
@@ -42,8 +42,8 @@ def test_models_of_one_press_lie_on_one_curve(place: Place) -> None:
 
     model = local_contact(toucher, Contact(tool, pose(6e-3)))
     for depth in (3e-3, 4.5e-3, 7.5e-3, 9e-3):
-        force = toucher.touch(Contact(tool, pose(depth))).force
-        assert np.linalg.norm(model.wrench_at(pose(depth)).wrench[:3]) == pytest.approx(force, rel=0.06)
+        force, told = toucher.touch(Contact(tool, pose(depth))).force, model.wrench_at(pose(depth))
+        assert np.linalg.norm(told.wrench[:3]) == pytest.approx(force, rel=0.06 if told.inside else 0.08)
 
 
 def test_what_a_model_says_is_stored_is_the_work_that_was_put_in(place: Place) -> None:

@@ -206,8 +206,10 @@ def test_a_mesh_that_cannot_be_meant_is_refused_and_told_why():
     good = ball()
     with pytest.raises(MeshError, match="millimetres"):
         tool_from(tool_message(scaled(good, 1e3), 0))
+    nameless = tool_message(good, 0)
+    nameless.header.frame_id = ""
     with pytest.raises(FrameError, match="frame_id"):
-        tool_from(tool_message(good.named(""), 0))
+        tool_from(nameless)
     empty = tool_message(good, 0)
     empty.triangles = []
     with pytest.raises(MeshError, match="F > 0"):
