@@ -64,7 +64,7 @@ def living(body: Body, part: str, tone: Tone = "relaxed", *, edge_length: float 
     Raises:
         InvalidInput: a part without a region.
     """
-    check_body(body, part)
+    _check_body(body, part)
     named = part_around(body, part) if part.startswith(AROUND) else part
     if named in STRAIGHT:
         its = for_person(region_of(named, tone), body.physique)
@@ -72,7 +72,7 @@ def living(body: Body, part: str, tone: Tone = "relaxed", *, edge_length: float 
     return filled(body, named, body.part(part, edge_length=edge_length, thickness=SHEET), tone)
 
 
-def check_body(body: object, part: object) -> None:
+def _check_body(body: object, part: object) -> None:
     """Raises InvalidInput: no body, or a part that is no text."""
     check_kind("body", body, Body)
     check_kind("part", part, str)
@@ -135,7 +135,7 @@ def laid(body: Body, part: str, tissue: Tissue, thickness: float, *, edge_length
     Raises:
         InvalidInput: no such part, or a thickness on which no layer can be laid.
     """
-    check_body(body, part)
+    _check_body(body, part)
     thickness = one_thickness(thickness)
     try:
         named = part_around(body, part) if part.startswith(AROUND) else part

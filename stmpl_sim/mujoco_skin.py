@@ -246,11 +246,11 @@ class SoftBody:
 
     def poses(self, data: Any) -> Poses:
         """Places of body and tools in `data`. Raises InvalidInput: data of another model."""
-        self._check(data)
+        body = self.pose(data)
         tools = {name: _pose(data.xpos[s.body], data.xmat[s.body]) if s.geom is None
                  else _pose(data.geom_xpos[s.geom], data.geom_xmat[s.geom])
                  for name, s in self._sources.items()}  # fmt: skip
-        return Poses(self.pose(data), tools)
+        return Poses(body, tools)
 
     def pose(self, data: Any) -> Transform:
         """pose_world_from_body in `data`, (4, 4). Raises InvalidInput: data of another model."""

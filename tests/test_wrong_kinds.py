@@ -12,10 +12,10 @@ from stmpl_core.methods import Winkler
 from stmpl_core.sdf import SignedDistance
 from stmpl_core.skin import Skin
 from stmpl_core.tissue import Tissue
-from tests.scenes import ball, plate, tool
+from tests.scenes import plate
 
 ODD = (None, "x", -1, float("nan"), [], object(), {"a": 1}, 3.7, True, (1, 2))
-LAYER, BALL = plate(0.09), tool(ball())
+LAYER = plate(0.09)
 SIMULATOR = Simulator(LAYER, Winkler())
 
 
