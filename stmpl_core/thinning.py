@@ -100,9 +100,12 @@ class Thinning:
             (STACK_ZONES, STACK_SPACINGS, STACK_FOLDS) if layer.stacked else (ZONES, SPACINGS, FOLDS)
         )
         points, thickness, count = np.ascontiguousarray(layer.vertices), layer.thickness, len(layer.vertices)
-        rows, reaches = np.column_stack([points, layer.normals, thickness]), [*zones, reach]
+        rows, farther = np.column_stack([points, layer.normals, thickness]), reach
+        if not layer.stacked:  # whose coarse response has no end; so that no pair in reach is left out
+            farther += 2 * sum(spacings)
+        reaches = [*zones, farther]
         near = level = Level.among(rows, Edges.of(layer.faces, count), np.arange(count), reaches[0])
-        self.levels, self._reach = [near], reach
+        self.levels, self._reach, self._farther = [near], reach, farther
         self._last: tuple[Asked, ...] = ()
         self._grouped: tuple[np.ndarray, np.ndarray] | None = None
         self._stands = np.zeros((len(zones) + 1, count), dtype=np.bool_)
@@ -123,6 +126,9 @@ class Thinning:
             self._stands[zone, some] = False
             self._corners[zone, some], self._weights[zone, some] = corners[some], weights[good]
 
+        self._members = None if layer.stacked else (
+            np.searchsorted(np.sort(level.of), np.arange(len(level.stands) + 1)), np.argsort(level.of)
+        )
         self.folded = _folded(level.start, level.index, level.rows, folds)
 
     def groups(self, vertices: np.ndarray) -> np.ndarray:
@@ -132,7 +138,8 @@ class Thinning:
         last = self._grouped
         if last is None or not np.array_equal(last[0], vertices):
             far = self.levels[-1]
-            last = self._grouped = vertices, _together(far.start, far.index, far.of[vertices], far.rows, self._reach)
+            found = _together(far.start, far.index, far.of[vertices], far.rows, self._farther)
+            last = self._grouped = vertices, found
         return last[1]
 
     def bent(self) -> Thinning:
@@ -167,9 +174,13 @@ class Thinning:
 
     def _zones(self, loaded: np.ndarray) -> np.ndarray:
         """0 where no loaded vertex is in reach, else 1 for the outermost zone up to Z for the innermost, (V,)."""
-        mark, rim = np.zeros(len(self._stands[0]), np.uint8), _rim(*self.levels[0].edges, loaded)
+        near = self.levels[0]
+        mark, rim = np.zeros(len(near.of), np.uint8), _rim(*near.edges, loaded)
         for zone, level in enumerate(reversed(self.levels), start=1):
-            _mark(level.start, level.index, level.of, rim, zone, mark)
+            if zone == 1 and self._members is not None:
+                _mark_in_reach(level.start, level.index, level.of, *self._members, near.rows, self._reach, rim, mark)
+            else:
+                _mark(level.start, level.index, level.of, rim, zone, mark)
         mark[loaded] = len(self.levels)
         return mark
 
@@ -393,6 +404,28 @@ def _mark(start, index, of, rim, zone, mark):
     for v in range(len(of)):
         if near[of[v]]:
             mark[v] = zone
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _mark_in_reach(start, index, of, first, member, rows, reach, rim, mark):
+    """Writes 1 at each vertex in reach of one of the rim, if what stands for one is a neighbour of the other's.
+
+    first, member: the vertices for which each stands; rows: point, normal and thickness of each vertex.
+    """
+    left, square = first[1:] - first[:-1], reach * reach
+    for j in rim:
+        for p in range(start[of[j]], start[of[j] + 1]):
+            n = np.uint32(index[p])
+            if left[n] == 0:
+                continue
+            for q in range(first[n], first[n + 1]):
+                v = member[q]
+                if mark[v] == 1 or rows[v, 3] * rows[j, 3] + rows[v, 4] * rows[j, 4] + rows[v, 5] * rows[j, 5] <= 0:
+                    continue
+                x, y, z = rows[v, 0] - rows[j, 0], rows[v, 1] - rows[j, 1], rows[v, 2] - rows[j, 2]
+                if x * x + y * y + z * z < square * rows[v, 6] * rows[j, 6]:
+                    mark[v] = 1
+                    left[n] -= 1
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")

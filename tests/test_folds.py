@@ -6,7 +6,7 @@ import pytest
 from stmpl_core import Contact, Load, Membrane, Ply, SoftLayer, Tissue
 from stmpl_core.methods import LimbLinear, Linear, MomentNet
 from stmpl_core.simulator import Simulator
-from stmpl_core.thinning import ZONES, Thinning
+from stmpl_core.thinning import SPACINGS, ZONES, Thinning
 from tests.scenes import at, ball, limb, plate
 
 GAP, LONG, THICKNESS = 1.5e-3, 0.06, 4e-3  # m
@@ -84,7 +84,8 @@ def test_all_that_is_in_reach_along_the_skin_is_a_neighbour() -> None:
     layer = limb(4e-3)
     thinning = Thinning(layer, np.broadcast_to(np.eye(3), (len(layer.vertices), 3, 3)), 8.0)
     assert len(thinning.levels[1].stands) < len(layer.vertices)
-    for level, reach in zip(thinning.levels, (ZONES[0], 8.0), strict=True):
+    farther = 8.0 + 2 * SPACINGS[0]  # what stands for others around may be so much farther
+    for level, reach in zip(thinning.levels, (ZONES[0], farther), strict=True):
         at, normals = level.rows[:, :3], level.rows[:, 3:6]
         for v in range(0, len(at), 97):
             away = np.linalg.norm(at - at[v], axis=1) / layer.thickness[0]

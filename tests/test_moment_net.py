@@ -25,7 +25,6 @@ from stmpl_core.metrics import score
 from stmpl_core.moments import Surroundings
 from stmpl_core.networks import INPUTS, POINT
 from stmpl_core.response import REACH
-from stmpl_core.thinning import SPACINGS
 from studies.train_moments import Model, MomentTraining, draw_points, fit, train_moments
 from tests import scenes
 from tests.scenes import turn
@@ -87,10 +86,9 @@ def test_a_scene_of_half_the_size_moves_half_as_far(net: MomentNet) -> None:
 
 def test_beyond_its_reach_nothing_moves(net: MomentNet) -> None:
     layer, load = limb(), pad(limb(), 0.8)
-    moved = net.solve(load).magnitude
+    moved = net.solve(load).magnitude > 0
     away = np.linalg.norm(layer.vertices[:, None] - layer.vertices[load.loaded][None], axis=2).min(axis=1)
-    assert moved.any() and not moved[away > (REACH + 2 * SPACINGS[0]) * T].any()
-    assert moved[away > REACH * T].max() < 1e-4 * moved.max()  # filled in beside the last that feels it
+    assert moved.any() and not moved[away > REACH * T].any()
 
 
 def test_more_pressure_is_more_depth(net: MomentNet) -> None:

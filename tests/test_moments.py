@@ -15,7 +15,6 @@ from stmpl_core.methods import Linear, MomentNet
 from stmpl_core.metrics import score
 from stmpl_core.moments import Surroundings
 from stmpl_core.response import FINER, NEAR, REACH, SPREADS, STEPS, response_table, ring_table
-from stmpl_core.thinning import SPACINGS
 from tests import scenes
 from tests.scenes import limb, plate, turn
 
@@ -91,10 +90,9 @@ def test_no_load_moves_nothing_and_two_loads_move_what_each_moves() -> None:
 def test_beyond_its_reach_nothing_moves() -> None:
     layer = arm()
     load = disc(layer, [0.04, 0, 0.08], 0.05)
-    moved = Linear().prepare(layer).solve(load).magnitude
+    moved = Linear().prepare(layer).solve(load).magnitude > 0
     away = np.linalg.norm(layer.vertices[:, None] - layer.vertices[load.loaded][None], axis=2).min(axis=1)
-    assert moved.any() and not moved[away > (REACH + 2 * SPACINGS[0]) * T].any()
-    assert moved[away > REACH * T].max() < 1e-4 * moved.max()  # filled in beside the last that feels it
+    assert moved.any() and not moved[away > REACH * T].any()
 
 
 def test_turning_the_scene_turns_the_answer() -> None:

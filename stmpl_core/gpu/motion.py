@@ -168,12 +168,21 @@ def feels(field: FieldScratch, f: wp.int32, n: wp.int32, m: wp.int32) -> bool:
         ((field.feels[f, n] >> wp.uint32(field.fold[f, m])) & wp.uint32(1)) == wp.uint32(1)  # fmt: skip
 
 
+@wp.func
+def in_reach(skins: Skins, more: SkinFields, v: wp.int32, w: wp.int32) -> bool:
+    """Whether two vertices feel each other, if what stands for them does: as stmpl_core.thinning."""
+    reach, away = real(FAR), skins.points[v] - skins.points[w]
+    return wp.dot(more.frame[v][2], more.frame[w][2]) > wp.float32(0.0) and \
+        wp.dot(away, away) < reach * reach * skins.thickness[v] * skins.thickness[w]  # fmt: skip
+
+
 @wp.kernel
 def mark(pick: wp.array(dtype=wp.int32), lanes: wp.int32, many: wp.int32, all: wp.int32, skins: Skins, more: SkinFields,
          scratch: Scratch, field: FieldScratch):  # fmt: skip
     """How near a source each vertex is: thinning._zones; all: 1, those that carry nothing too."""
     f, lane = wp.tid()
-    first, zones = skins.one[scratch.skin[pick[f] * many]].first, more.stands.shape[0]
+    one, zones = skins.one[scratch.skin[pick[f] * many]], more.stands.shape[0]
+    first = one.first
     for n in range(field.many[f]):
         v = field.under[f, n]
         if all == 1 or field.source[f, n][0] != wp.float32(0.0):
@@ -181,6 +190,8 @@ def mark(pick: wp.array(dtype=wp.int32), lanes: wp.int32, many: wp.int32, all: w
             for z in range(zones):
                 for p in range(more.reach[zones * v + z][0] + lane, more.reach[zones * v + z][1], lanes):
                     for q in range(more.heads[more.index[p]], more.heads[more.index[p] + 1]):
+                        if z == zones - 1 and one.stacked == 0 and not in_reach(skins, more, v, more.member[q]):
+                            continue
                         wp.atomic_max(field.mark, f, more.member[q] - first, zones - z)
                         if field.folds[f] > 1:
                             fold = wp.uint32(1) << wp.uint32(field.fold[f, n])
