@@ -16,7 +16,18 @@ from stmpl_core.methods.moment_net import think_few
 from stmpl_core.moments import Surroundings
 from stmpl_core.networks import ARRAYS, NODE, PRESSURE, STACK_NODE, Weights, shipped
 from stmpl_core.nodes import Nodes
-from stmpl_core.obstacle import RINGS, moments_of, pairs, power_of, rates_of, response, rings_of, solve
+from stmpl_core.obstacle import (
+    ONE_THREAD,
+    RINGS,
+    columns_of,
+    moments_of,
+    pairs,
+    power_of,
+    rates_of,
+    response,
+    rings_of,
+    solve,
+)
 from stmpl_core.rays import column_pressure
 from stmpl_core.twins import crowded
 
@@ -30,6 +41,8 @@ ROUND_GIVES = 1.5  # share that it loses per thickness over the limb's radius, o
 ROUNDEST = 0.45  # thickness over radius up to which it does
 HARDENING = 0.75  # power of the columns' pressure with which it does
 FADE, FADE_RING = 0.03, 2  # strain at and around a node at which half of the correction is left: a touch begins linear
+AMONG = 3.0  # distance over the thickness up to which a node knows how the limb is shaped under what presses
+TURNED_FROM = 3e-3  # turn of normals from which it counts
 ROUND_FROM = 0.05  # overlap over the thickness to which curvature is compared at the least
 SMALL_STEP = 5e-3  # of the largest force, in which the network's part of a slope is found: far above float32's noise
 APART = 1e-3  # depth, relative, that skin may miss beside other tools and still be off a tool that does not press
@@ -87,6 +100,7 @@ class Solved(NamedTuple):
         force: forces over E that solve it, (N,).
         times, over: see `crowded`, (N,).
         given_way: see `_given_way`; 0 of one material.
+        among: see `_among`, (N, 2); None of one material.
     """
 
     matrix: np.ndarray
@@ -95,6 +109,7 @@ class Solved(NamedTuple):
     times: np.ndarray
     over: np.ndarray
     given_way: float = 0.0
+    among: np.ndarray | None = None
 
 
 class ContactNet:
@@ -262,16 +277,16 @@ def _look_on_stack(points, inward, thickness, area, strain, corners, shares, sin
     times, over = crowded(points, inward, area, strain, beside, force)
     moments, vectors = moments_of(rings, points, np.full(len(area), t), area,
                                   _one(np.exp(numbers[3]) * (force / area)), _one(sinking / over / t))  # fmt: skip
-    given_way = _given_way(matrix, wide, force)
+    given_way, among = _given_way(matrix, wide, force), _among(points, inward, thickness, group, t, force)
     seen = _see_on_stack(moments[0], vectors[0], inward, thickness, area, t, times * force, strain, sinking, here, nu,
                          numbers, log_thickness, hardening, _between(corners, shares, alike)[:, 0],
-                         given_way)  # fmt: skip
-    return *seen, power_of(matrix, force, depth.max()), matrix, rings, force, times, over, given_way
+                         given_way, among)  # fmt: skip
+    return *seen, power_of(matrix, force, depth.max()), matrix, rings, force, times, over, given_way, among
 
 
 @numba.njit(cache=True, error_model="numpy")
 def _see_on_stack(moments, vectors, inward, thickness, area, t, force, strain, sinking, bent, nu, numbers,
-                  log_thickness, hardening, alike_at, given_way):  # fmt: skip
+                  log_thickness, hardening, alike_at, given_way, among):  # fmt: skip
     """Pressure, inputs and fade of a Look under forces (N,) over E [m2], and what nodes see around them."""
     softness, pressure, overlap = np.exp(numbers[3]), force / area, sinking / t
     alike, inputs = np.empty((len(area), NODES_SEE), np.float32), np.empty((len(area), STACKS_SEE), np.float32)
@@ -285,6 +300,7 @@ def _see_on_stack(moments, vectors, inward, thickness, area, t, force, strain, s
         row[ON_STACK.curvature] = alike[n, AT.mean_curvature]
         row[ON_STACK.curvature_over_strain] = alike[n, AT.mean_curvature] / (overlap[n] + ROUND_FROM)
         row[ON_STACK.given_way] = given_way
+        row[ON_STACK.turned], row[ON_STACK.uneven] = among[n]
         solved = min(strain[n], STACK_LINEAR_TO)
         top = _hardening(log_thickness, hardening, alike_at[n], solved)
         pressure[n] *= np.exp(_share(solved, row[ON_STACK.curvature]) * top)
@@ -292,6 +308,37 @@ def _see_on_stack(moments, vectors, inward, thickness, area, t, force, strain, s
             there = _hardening(log_thickness, hardening, alike_at[n], strain[n])
             pressure[n] *= (strain[n] / solved * np.exp(there - top)) ** HARDENING
     return pressure, inputs, _faded(overlap, moments, STACK_FADE)
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _among(points, inward, thickness, group, t, force):
+    """How the limb is shaped under what presses around each node, by forces (N,), (N, 2) [-].
+
+    log of how far normals turn from their mean there; and the standard deviation of the log of the thickness.
+    """
+    bears = np.flatnonzero(force > 0)
+    by, logs, reach = columns_of(points[bears], inward[bears]), np.log(thickness[bears] / t), 1 / (AMONG * t) ** 2
+    weights, sources, out = np.zeros((len(force), len(bears))), np.ones((len(bears), 6)), np.empty((len(force), 2))
+    sources[:, 4], sources[:, 5] = logs, logs * logs
+    for x in range(3):
+        sources[:, 1 + x] = by[3 + x]
+    for i in range(len(force)):
+        n, at, row = inward[i], points[i], weights[i]
+        for j in range(len(bears)):
+            away = (by[0, j] - at[0]) ** 2 + (by[1, j] - at[1]) ** 2 + (by[2, j] - at[2]) ** 2
+            facing, near = by[3, j] * n[0] + by[4, j] * n[1] + by[5, j] * n[2], max(1 - away * reach, 0.0)
+            row[j] = near * near * max(facing, 0.0) * force[bears[j]] if group[bears[j]] == group[i] else 0.0
+    block = max(1, ONE_THREAD // (6 * max(len(bears), 1)))
+    for start in range(0, len(force), block):
+        for i, sums in enumerate(np.dot(weights[start : start + block], sources), start):
+            total = sums[0]
+            if total > 0:
+                mean = sums[4] / total
+                turned = 1 - np.sqrt(sums[1] ** 2 + sums[2] ** 2 + sums[3] ** 2) / total
+                out[i] = np.log(max(turned, 0.0) + TURNED_FROM), np.sqrt(max(sums[5] / total - mean * mean, 0.0))
+            else:
+                out[i] = np.log(TURNED_FROM), 0.0
+    return out
 
 
 @numba.njit(cache=True, error_model="numpy")
@@ -336,7 +383,7 @@ def _slopes(points, inward, thickness, area, strain, corners, shares, bent, matr
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _slopes_on_stack(points, inward, thickness, area, strain, corners, shares, sinking, bent, matrix, rings, force,
-                     times, over, given_way, nu, t, numbers, log_thickness, hardening, alike, strain_rates,
+                     times, over, given_way, among, nu, t, numbers, log_thickness, hardening, alike, strain_rates,
                      sinking_rates, low, high, mean, scale, w1, b1, w2, b2, w3, b3, w4, b4):  # fmt: skip
     """See ContactNet.slopes."""
     here = _between(corners, shares, bent)
@@ -351,7 +398,7 @@ def _slopes_on_stack(points, inward, thickness, area, strain, corners, shares, s
     for k in range(len(held)):
         seen = _see_on_stack(moments[k], vectors[k], inward, thickness, area, t, times * forces[k], strains[k],
                              depths[k], here, nu, numbers, log_thickness, hardening, alike_at,
-                             given_way)  # fmt: skip
+                             given_way, among)  # fmt: skip
         held[k] = _correct(*seen, low, high, mean, scale, w1, b1, w2, b2, w3, b3, w4, b4)[0] / times
     return _differences(held, steps)
 

@@ -131,6 +131,8 @@ STACK_NODE = Layout(
     curvature=1,  # mean curvature of the skin, times the thickness: what is convex is pressed flat before it stretches
     curvature_over_strain=1,
     given_way=1,  # share of the linear work that goes into the limb as a whole, its coarse part
+    turned=1,  # log of how far normals turn from each other where it presses around the node
+    uneven=1,  # how uneven the tissue's thickness is there
 )
 
 ON_STACK = {

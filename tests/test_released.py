@@ -16,6 +16,7 @@ from fem_tools.rounds import THICKNESS, Pressed, drawn, learnt, read_all, releas
 from fem_tools.sampling import PRESETS, ContactId, contacts, layers, split_of
 from stmpl_core import Contact, Simulator
 from stmpl_core.body import Body
+from stmpl_core.contact_net import TURNED_FROM
 from stmpl_core.errors import InvalidInput
 from stmpl_core.living import living
 from stmpl_core.methods import MomentNet
@@ -181,6 +182,7 @@ def test_a_light_press_into_a_flat_stack_is_the_linear_layers(press: Pressed) ->
     parts = STACK_NODE.split(rows[0].rows)
     for name in ("curvature", "curvature_over_strain", "given_way"):
         assert not parts[name].any()  # flat, and nothing to give way as a whole
+    assert np.exp(parts["turned"]) == pytest.approx(TURNED_FROM, rel=1e-3) and parts["uneven"].max() < 1e-6
 
 
 def test_a_law_of_ones_own_is_judged_like_ours(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

@@ -33,6 +33,8 @@ AT_THICKNESS, AT_COLUMN = wp.constant(STACK_NODE.at.log_thickness), wp.constant(
 AT_HARDENING, AT_KAPPA = wp.constant(STACK_NODE.at.hardening), wp.constant(STACK_NODE.at.log_kappa)
 AT_PULL, AT_CURVATURE = wp.constant(STACK_NODE.at.log_pull), wp.constant(STACK_NODE.at.curvature)
 AT_OVER, AT_GIVEN = wp.constant(STACK_NODE.at.curvature_over_strain), wp.constant(STACK_NODE.at.given_way)
+AT_TURNED, AT_UNEVEN = wp.constant(STACK_NODE.at.turned), wp.constant(STACK_NODE.at.uneven)
+AMONG, TURNED_FROM = wp.constant(wp.float64(contact_net.AMONG)), wp.constant(wp.float64(contact_net.TURNED_FROM))
 assert math.isclose(green.SPREADS[0], math.exp(green.FIRST_LOG))
 wp.set_module_options({**OPTIONS, "max_unroll": 4})
 
@@ -320,9 +322,17 @@ def see(lanes: wp.int32, many: wp.int32, skins: Skins, scratch: Scratch):
     for i in range(lane, scratch.nodes[s], lanes):
         moments, strains, pull, sunk = wp.vec4d(), wp.vec4d(), vec3(), vec3()
         inward, strain, thick = scratch.inward[s, i], real(scratch.strain[s, i]), scratch.thick[s, i]
+        ways, logs, weights = vec3(), wp.vec2d(), real(0.0)
         for j in range(scratch.nodes[s]):
             apart = wp.length(scratch.point[s, i] - scratch.point[s, j]) / t
-            if _together(scratch, s, many, i, j) and apart < NEAR and wp.dot(inward, scratch.inward[s, j]) > real(0.0):
+            facing = wp.dot(inward, scratch.inward[s, j])
+            if _together(scratch, s, many, i, j) and apart < AMONG and facing > real(0.0):
+                near = real(1.0) - apart * apart / (AMONG * AMONG)
+                counts, log_j = near * near * scratch.force[s, j] * facing, wp.log(scratch.thick[s, j] / t)
+                weights += counts
+                ways = ways + counts * scratch.inward[s, j]
+                logs = logs + counts * wp.vec2d(log_j, log_j * log_j)
+            if _together(scratch, s, many, i, j) and apart < NEAR and facing > real(0.0):
                 f, per = apart * real(STEPS), scratch.area[s, j] / (t * t)
                 p = per * one.softness * scratch.force[s, j] / scratch.area[s, j]
                 e = per * scratch.sinking[s, j] / scratch.over[s, j] / t
@@ -350,6 +360,12 @@ def see(lanes: wp.int32, many: wp.int32, skins: Skins, scratch: Scratch):
         _write(scratch, s, i, AT_CURVATURE, curvature)
         _write(scratch, s, i, AT_OVER, curvature / (overlap + ROUND_FROM))
         _write(scratch, s, i, AT_GIVEN, scratch.given_way[s * many + scratch.tool[s, i]])
+        turned, uneven = real(0.0), real(0.0)
+        if weights > real(0.0):
+            turned, mean = wp.max(real(1.0) - wp.length(ways) / weights, real(0.0)), logs[0] / weights
+            uneven = wp.sqrt(wp.max(logs[1] / weights - mean * mean, real(0.0)))
+        _write(scratch, s, i, AT_TURNED, wp.log(turned + TURNED_FROM))
+        _write(scratch, s, i, AT_UNEVEN, uneven)
         solved = wp.min(strain, STACK_LINEAR_TO)
         top = _hardening(skins, id, alike, solved)
         share = (real(1.0) - DEEP_GIVES * solved) * (real(1.0) - ROUND_GIVES * wp.clamp(curvature, real(0.0), ROUNDEST))
