@@ -100,7 +100,7 @@ class Solved(NamedTuple):
         force: forces over E that solve it, (N,).
         times, over: see `crowded`, (N,).
         given_way: see `_given_way`; 0 of one material.
-        among: see `_among`, (N, 2); None of one material.
+        weights, what: see `_among`; None of one material.
     """
 
     matrix: np.ndarray
@@ -109,7 +109,8 @@ class Solved(NamedTuple):
     times: np.ndarray
     over: np.ndarray
     given_way: float = 0.0
-    among: np.ndarray | None = None
+    weights: np.ndarray | None = None
+    what: np.ndarray | None = None
 
 
 class ContactNet:
@@ -278,15 +279,16 @@ def _look_on_stack(points, inward, thickness, area, strain, corners, shares, sin
     moments, vectors = moments_of(rings, points, np.full(len(area), t), area,
                                   _one(np.exp(numbers[3]) * (force / area)), _one(sinking / over / t))  # fmt: skip
     given_way, among = _given_way(matrix, wide, force), _among(points, inward, thickness, group, t, force)
+    shape = _shape(*among, force)
     seen = _see_on_stack(moments[0], vectors[0], inward, thickness, area, t, times * force, strain, sinking, here, nu,
                          numbers, log_thickness, hardening, _between(corners, shares, alike)[:, 0],
-                         given_way, among)  # fmt: skip
-    return *seen, power_of(matrix, force, depth.max()), matrix, rings, force, times, over, given_way, among
+                         given_way, shape)  # fmt: skip
+    return *seen, power_of(matrix, force, depth.max()), matrix, rings, force, times, over, given_way, *among
 
 
 @numba.njit(cache=True, error_model="numpy")
 def _see_on_stack(moments, vectors, inward, thickness, area, t, force, strain, sinking, bent, nu, numbers,
-                  log_thickness, hardening, alike_at, given_way, among):  # fmt: skip
+                  log_thickness, hardening, alike_at, given_way, shape):  # fmt: skip
     """Pressure, inputs and fade of a Look under forces (N,) over E [m2], and what nodes see around them."""
     softness, pressure, overlap = np.exp(numbers[3]), force / area, sinking / t
     alike, inputs = np.empty((len(area), NODES_SEE), np.float32), np.empty((len(area), STACKS_SEE), np.float32)
@@ -300,7 +302,7 @@ def _see_on_stack(moments, vectors, inward, thickness, area, t, force, strain, s
         row[ON_STACK.curvature] = alike[n, AT.mean_curvature]
         row[ON_STACK.curvature_over_strain] = alike[n, AT.mean_curvature] / (overlap[n] + ROUND_FROM)
         row[ON_STACK.given_way] = given_way
-        row[ON_STACK.turned], row[ON_STACK.uneven] = among[n]
+        row[ON_STACK.turned], row[ON_STACK.uneven] = shape[n]
         solved = min(strain[n], STACK_LINEAR_TO)
         top = _hardening(log_thickness, hardening, alike_at[n], solved)
         pressure[n] *= np.exp(_share(solved, row[ON_STACK.curvature]) * top)
@@ -312,32 +314,45 @@ def _see_on_stack(moments, vectors, inward, thickness, area, t, force, strain, s
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _among(points, inward, thickness, group, t, force):
-    """How the limb is shaped under what presses around each node, by forces (N,), (N, 2) [-].
-
-    log of how far normals turn from their mean there; and the standard deviation of the log of the thickness.
-    """
+    """How each node counts what presses around it: weights (N, M) of the M nodes that press under forces (N,), and of
+    each its number, the log of its thickness over t, that squared, and its normal, (M, 6)."""
     bears = np.flatnonzero(force > 0)
     by, logs, reach = columns_of(points[bears], inward[bears]), np.log(thickness[bears] / t), 1 / (AMONG * t) ** 2
-    weights, sources, out = np.zeros((len(force), len(bears))), np.ones((len(bears), 6)), np.empty((len(force), 2))
-    sources[:, 4], sources[:, 5] = logs, logs * logs
+    weights, what = np.zeros((len(force), len(bears))), np.empty((len(bears), 6))
+    what[:, 0], what[:, 1], what[:, 2] = bears, logs, logs * logs
     for x in range(3):
-        sources[:, 1 + x] = by[3 + x]
+        what[:, 3 + x] = by[3 + x]
     for i in range(len(force)):
         n, at, row = inward[i], points[i], weights[i]
         for j in range(len(bears)):
-            away = (by[0, j] - at[0]) ** 2 + (by[1, j] - at[1]) ** 2 + (by[2, j] - at[2]) ** 2
-            facing, near = by[3, j] * n[0] + by[4, j] * n[1] + by[5, j] * n[2], max(1 - away * reach, 0.0)
-            row[j] = near * near * max(facing, 0.0) * force[bears[j]] if group[bears[j]] == group[i] else 0.0
-    block = max(1, ONE_THREAD // (6 * max(len(bears), 1)))
+            if group[bears[j]] == group[i]:
+                away = (by[0, j] - at[0]) ** 2 + (by[1, j] - at[1]) ** 2 + (by[2, j] - at[2]) ** 2
+                near = max(1 - away * reach, 0.0)
+                row[j] = near * near * max(by[3, j] * n[0] + by[4, j] * n[1] + by[5, j] * n[2], 0.0)
+    return weights, what
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _shape(weights, what, force):
+    """How the limb is shaped under forces (N,) around each node, (N, 2) [-]; the first two from `_among`.
+
+    log of how far normals turn from their mean there; and the standard deviation of the log of the thickness.
+    """
+    sources, out = np.empty_like(what), np.empty((len(force), 2))
+    for j in range(len(what)):
+        share = force[int(what[j, 0])]
+        sources[j] = share * what[j]
+        sources[j, 0] = share
+    block = max(1, ONE_THREAD // (6 * max(len(what), 1)))
     for start in range(0, len(force), block):
         for i, sums in enumerate(np.dot(weights[start : start + block], sources), start):
             total = sums[0]
             if total > 0:
-                mean = sums[4] / total
-                turned = 1 - np.sqrt(sums[1] ** 2 + sums[2] ** 2 + sums[3] ** 2) / total
-                out[i] = np.log(max(turned, 0.0) + TURNED_FROM), np.sqrt(max(sums[5] / total - mean * mean, 0.0))
+                mean, way = sums[1] / total, np.sqrt(sums[3] ** 2 + sums[4] ** 2 + sums[5] ** 2)
+                out[i, 0] = np.log(max(1 - way / total, 0.0) + TURNED_FROM)
+                out[i, 1] = np.sqrt(max(sums[2] / total - mean * mean, 0.0))
             else:
-                out[i] = np.log(TURNED_FROM), 0.0
+                out[i, 0], out[i, 1] = np.log(TURNED_FROM), 0.0
     return out
 
 
@@ -383,8 +398,8 @@ def _slopes(points, inward, thickness, area, strain, corners, shares, bent, matr
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _slopes_on_stack(points, inward, thickness, area, strain, corners, shares, sinking, bent, matrix, rings, force,
-                     times, over, given_way, among, nu, t, numbers, log_thickness, hardening, alike, strain_rates,
-                     sinking_rates, low, high, mean, scale, w1, b1, w2, b2, w3, b3, w4, b4):  # fmt: skip
+                     times, over, given_way, weights, what, nu, t, numbers, log_thickness, hardening, alike,
+                     strain_rates, sinking_rates, low, high, mean, scale, w1, b1, w2, b2, w3, b3, w4, b4):  # fmt: skip
     """See ContactNet.slopes."""
     here = _between(corners, shares, bent)
     rates = rates_of(matrix, force, _reached(sinking, strain, sinking_rates, strain_rates, STACK_LINEAR_TO))
@@ -398,7 +413,7 @@ def _slopes_on_stack(points, inward, thickness, area, strain, corners, shares, s
     for k in range(len(held)):
         seen = _see_on_stack(moments[k], vectors[k], inward, thickness, area, t, times * forces[k], strains[k],
                              depths[k], here, nu, numbers, log_thickness, hardening, alike_at,
-                             given_way, among)  # fmt: skip
+                             given_way, _shape(weights, what, forces[k]))  # fmt: skip
         held[k] = _correct(*seen, low, high, mean, scale, w1, b1, w2, b2, w3, b3, w4, b4)[0] / times
     return _differences(held, steps)
 

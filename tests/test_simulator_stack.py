@@ -11,7 +11,7 @@ from fem_tools import IndenterFem, PatchFem, Press
 from stmpl_core import Load, Membrane, Ply, Simulator, SoftLayer, Tissue
 from stmpl_core.body import Body
 from stmpl_core.bones import Bone, to_bone
-from stmpl_core.contact_net import TURNED_FROM, ContactNet, _among
+from stmpl_core.contact_net import TURNED_FROM, ContactNet, _among, _shape
 from stmpl_core.errors import InvalidInput
 from stmpl_core.living import living
 from stmpl_core.methods import LimbLinear, MomentNet
@@ -299,11 +299,12 @@ def test_a_node_knows_how_skin_turns_and_tissue_thins_where_its_own_side_is_pres
     inward = np.stack([-np.cos(turns), -np.sin(turns), np.zeros(5)], axis=1)
     points = np.array([[0, 0, 0], [0, y, 0], [0, -y, 0], [-2 * y, 0, 0], [0, 0, 3.1 * t]])
     thickness = t * np.exp([0.0, uneven, -uneven, 1.0, 1.0])
-    out = _among(points, inward, thickness, np.zeros(5, np.int64), t, np.array([0.0, 2.0, 2.0, 5.0, 5.0]))
+    forces = np.array([0.0, 2.0, 2.0, 5.0, 5.0])
+    out = _shape(*_among(points, inward, thickness, np.zeros(5, np.int64), t, forces), forces)
     assert np.exp(out[0, 0]) == pytest.approx(1 - np.cos(angle) + TURNED_FROM)
     assert out[0, 1] == pytest.approx(uneven)
     assert np.exp(out[3:, 0]) == pytest.approx(TURNED_FROM) and out[3:, 1] == pytest.approx(0)  # alone on its side
-    alone = _among(points[:1], inward[:1], thickness[:1], np.zeros(1, np.int64), t, np.zeros(1))
+    alone = _shape(*_among(points[:1], inward[:1], thickness[:1], np.zeros(1, np.int64), t, np.zeros(1)), np.zeros(1))
     assert np.exp(alone[0, 0]) == pytest.approx(TURNED_FROM) and alone[0, 1] == 0  # nothing presses
 
 
