@@ -15,16 +15,19 @@ from stmpl_core.layer import SoftLayer
 from stmpl_core.nodes import Nodes, met_between, nodes_under
 from stmpl_core.rays import (
     ANYHOW,
+    ASLANT,
     NOT_SUNK,
     UNSAID,
     WALL,
     depth_and_share,
     depth_in_column,
     distance_in_column,
+    inside_most,
     led_in,
     ray_from,
     ray_of,
     sure_of,
+    swept,
     to_tool,
     wall_in,
 )
@@ -172,7 +175,8 @@ class Columns:
             return NO_SQUEEZE
         vertices, depth, rests, top, *nodes = _squeezed(
             grid_of(field), pose, middle_of(field, pose), self.points, self.inward, self.layer.thickness, self.faces,
-            self._start, self._around, self._slot, *clearance[:3], hole, self.layer.stacked)  # fmt: skip
+            self._start, self._around, self._slot, *clearance[:3], hole, self.layer.stacked, self._order, self._blocks,
+            *field.tool_bounds)  # fmt: skip
         return Squeeze(vertices, depth, rests, Nodes(*nodes), top)
 
 
@@ -224,7 +228,10 @@ def _balls(points, thickness, order):
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _through_box(points, inward, thickness, order, blocks, pose, low, high, reach):
-    """Numbers of the columns, rising, that pass a box of the tool's frame that is made larger by a reach [m]."""
+    """Numbers of the columns, rising, that pass a box of the tool's frame that is made larger by a reach [m].
+
+    inward: unit vectors along the columns, (V, 3); or one for all, (1, 3).
+    """
     found, n, radius, centre = np.empty(len(points), np.int64), 0, 0.0, pose[:3, 3].copy()
     low, high = low - reach, high + reach
     for x in range(3):
@@ -243,7 +250,9 @@ def _through_box(points, inward, thickness, order, blocks, pose, low, high, reac
             x, y, z = to_tool(pose, points[v, 0], points[v, 1], points[v, 2])
             if max(low[0] - x, x - high[0], low[1] - y, y - high[1], low[2] - z, z - high[2]) > t:
                 continue
-            ray, begin, end = ray_of(pose, points, inward, v), 0.0, t
+            w = min(v, len(inward) - 1)
+            ray, begin, end = ray_from(pose, points[v, 0], points[v, 1], points[v, 2], inward[w, 0], inward[w, 1],
+                                       inward[w, 2]), 0.0, t  # fmt: skip
             for x in range(3):  # the part of the column between two sides of the box
                 start, way = (ray[0], ray[3]) if x == 0 else (ray[1], ray[4]) if x == 1 else (ray[2], ray[5])
                 if abs(way) < 1e-12:
@@ -319,13 +328,14 @@ def _clear(grid, pose, points, inward, thickness, near, far, out, skin):
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _squeezed(grid, pose, centre, points, inward, thickness, faces, start, around, slot, near, least, above, hole,
-              stacked):  # fmt: skip
+              stacked, order, blocks, low, high):  # fmt: skip
     """Parts of a Squeeze: vertices, depth, rests, top, and those of its nodes; their sinking only of a stack.
 
     Args:
         centre: middle of the tool, in the body's frame, (3,) [m].
         near, least, above: what a Clearance knows.
         hole: distance from which a tool is beside a column [m].
+        order, blocks, low, high: see _through_box.
     """
     covered, under, wall = near[least < hole], -np.inf, 0.0
     for n in range(len(near)):
@@ -340,12 +350,18 @@ def _squeezed(grid, pose, centre, points, inward, thickness, faces, start, aroun
     if under > LEAST_UNDER * wall:  # a layer that is thin beside the limb has no columns that lead so far aside
         top = _top(pose, inward, near, least, above, hole) if stacked else UNSAID.copy()
         share = min((under / wall - LEAST_UNDER) / (ALL_UNDER - LEAST_UNDER), 1.0)
-        top = top - (1 - share) if top[0] > ANYHOW else share * top
+        if top[0] > ANYHOW:
+            top = top - (1 - share)
+        else:
+            covered = _with_swept(grid, pose, points, inward, thickness, order, blocks, low, high, hole, top, covered)
+            top = share * top
     found, vertices, depth, rests = _cover(grid, pose, points, inward, thickness, faces, start, around, slot, covered,
                                            top)  # fmt: skip
     nodes = nodes_under(grid, pose, centre, points, inward, thickness, faces, found, top)
     places, ways, heights, areas, strains = nodes[:5]
-    sinking = _sinking(grid, pose, places, ways, heights, areas, strains) if stacked else np.empty(0)
+    sunk = np.sqrt((top * top).sum())
+    sunk = sunk if sunk < ANYHOW else 0.0
+    sinking = _sinking(grid, pose, places, ways, heights, areas, strains, sunk) if stacked else np.empty(0)
     return (vertices, depth, rests, top) + nodes + (sinking,)
 
 
@@ -369,6 +385,27 @@ def _top(pose, inward, near, least, above, hole):
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
+def _with_swept(grid, pose, points, inward, thickness, order, blocks, low, high, hole, top, covered):
+    """Numbers of covered columns, rising, and of those that a tool that has sunk meets along its way, against `top`."""
+    way = np.empty((1, 3))
+    for x in range(3):
+        way[0, x] = -(pose[x, 0] * top[0] + pose[x, 1] * top[1] + pose[x, 2] * top[2])
+    near = _through_box(points, way, thickness, order, blocks, pose, low, high, hole)
+    out, count = np.empty(len(near) + len(covered), np.int64), len(covered)
+    out[:count] = covered
+    for v in near:
+        cosine = inward[v, 0] * way[0, 0] + inward[v, 1] * way[0, 1] + inward[v, 2] * way[0, 2]
+        at = np.searchsorted(covered, v)
+        if cosine <= ASLANT or (at < len(covered) and covered[at] == v):
+            continue
+        ray = ray_from(pose, points[v, 0], points[v, 1], points[v, 2], way[0, 0], way[0, 1], way[0, 2])
+        if -inside_most(grid, ray, thickness[v], -distance_in_column(grid, ray, 0.0), -hole)[0] < hole:
+            out[count] = v
+            count += 1
+    return np.sort(out[:count])
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def _one_way(inward, weights):
     """Mean of unit vectors (N, 3) by weights (N,), 1 long, (3,); 0 where they have no one way."""
     way, whole = np.zeros(3), 0.0
@@ -381,7 +418,7 @@ def _one_way(inward, weights):
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _sinking(grid, pose, points, inward, thickness, area, strain):
+def _sinking(grid, pose, points, inward, thickness, area, strain, sunk):
     """Depth by which skin sinks along its normal if it goes with the tool along the mean normal, (N,) [m].
 
     On a limb that is no wider than its contact, columns along the normals meet the tool at a slant, and too deep. Those
@@ -398,13 +435,16 @@ def _sinking(grid, pose, points, inward, thickness, area, strain):
         ray = ray_from(pose, points[n, 0], points[n, 1], points[n, 2], way[0], way[1], way[2])
         wall = wall_in(grid[3], thickness[n])
         sure, inside, where = sure_of(grid, ray, guess, wall)
+        if sure < 1 and sunk > 0:  # a tool beside whose wall little counts is deeper than that
+            guess = max(guess, thickness[n])
+            sure, inside, where = sure_of(grid, ray, guess, wall)
         if sure <= -1:
             depth[n] = 0.0
             continue
         ends = ray if sure == 1 else led_in(grid, ray, where, inside, wall)
         more = depth_in_column(grid, ends, max(4 * guess, thickness[n]), guess) * cosine - depth[n]
         if more > 0:  # as far as its skin is inside the tool, and not at once
-            begins = 1 - distance_in_column(grid, ray, 0.0) / wall
+            begins = max(1 - distance_in_column(grid, ray, 0.0) / wall, sunk * (1 + inside / wall))
             more *= max(sure, 0.0) * min(max(begins, 0.0), depth[n] / wall, 1.0)
         depth[n] = (1 + min(sure, 0.0)) * (depth[n] + more)
     return depth
@@ -451,4 +491,8 @@ def _cover(grid, pose, points, inward, thickness, faces, start, around, slot, co
         if depth[n] > 0:
             inside = -distance_in_column(grid, ray, depth[n] - wall)
             rests[n] = min(max(2 * inside / wall, 0.0), 1.0) * min(depth[n] / wall, 1.0)
+        if share < 1 and top.any():
+            sunk, most, lies = swept(grid, ray, thickness[v], top)
+            depth[n] += max(most - share, 0.0) * sunk
+            rests[n] = max(rests[n], lies * min(depth[n] / wall, 1.0))
     return found, vertices, depth, rests

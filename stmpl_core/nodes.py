@@ -14,6 +14,7 @@ import numpy as np
 
 from stmpl_core.compiling import UNCOUNTED
 from stmpl_core.rays import (
+    ASLANT,
     MAX_COLUMN_STRAIN,
     STEEPEST,
     WALL,
@@ -23,6 +24,7 @@ from stmpl_core.rays import (
     inside_most,
     ray_from,
     sunk_under,
+    swept,
     to_tool,
     wall_in,
 )
@@ -254,12 +256,14 @@ def _strain_under(grid, ray, t, top):
     """How far the tool squeezes a column, over its thickness; rising from 0 beside the tool's walls."""
     wall = wall_in(grid[3], t)
     deep, share = depth_and_share(grid, ray, t, top)
-    if deep <= 0:
-        return 0.0
+    strain = share * min(deep / t, MAX_COLUMN_STRAIN)
     if deep > wall:
         inside = min(max(-2 * distance_in_column(grid, ray, deep - wall) / wall, 0.0), 1.0)
-        share *= 1 - (1 - inside) * min(deep / wall - 1, 1.0)
-    return share * min(deep / t, MAX_COLUMN_STRAIN)
+        strain *= 1 - (1 - inside) * min(deep / wall - 1, 1.0)
+    if share < 1 and top.any():
+        sunk, most, _ = swept(grid, ray, t, top)
+        strain += max(most - share, 0.0) * min(sunk / t, MAX_COLUMN_STRAIN)
+    return strain
 
 
 @numba.njit(cache=True, nogil=True)
@@ -362,7 +366,13 @@ def _inside(grid, ray, t, depth, least, top):
     if beyond <= 0:
         return depth
     most, _ = inside_most(grid, ray, max(depth_in_column(grid, ray, t, 0.0, 0.5 * t), 0.5 * t), depth, least)
-    return depth + beyond * (most - depth) * sunk_under(grid, ray, t, top) if most > depth else depth
+    sunk = (most - depth) * sunk_under(grid, ray, t, top) if most > depth else 0.0
+    size, misses = np.sqrt(top[0] * top[0] + top[1] * top[1] + top[2] * top[2]), min(1 - 2 * most / (WALL * t), 1.0)
+    if misses > 0 and 0 < size < 1.5 and -(top[0] * ray[3] + top[1] * ray[4] + top[2] * ray[5]) > ASLANT * size:
+        way = ray[0], ray[1], ray[2], -top[0] / size, -top[1] / size, -top[2] / size
+        along, _ = inside_most(grid, way, t, depth, max(least, depth + sunk))
+        sunk = max(sunk, misses * size * (along - depth))
+    return depth + beyond * sunk
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")

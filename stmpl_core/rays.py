@@ -14,6 +14,8 @@ ENTERS, LOOKS_BACK = 12, 0.15  # steps to where a column enters a tool, cosine f
 LOOKED_AT = 0.2 * WALL  # way over which it is asked whether it does, over the thickness
 SURE = 0.2  # how far inside a tool, over the width of a wall, it is clear where a way ends; so far outside: nowhere
 LEAST_ASIDE = 0.1  # square of the slope aside from which it is known on which side of a way a tool is
+ASLANT, UPRIGHT = 0.35, 0.15  # cosine to its tool's way from which skin goes with one that has sunk under it, and how
+# much more until it does so wholly
 NOT_SUNK, ANYHOW = np.zeros(3), 8.0  # what is said of a tool that has not sunk under skin; more than that: anyhow, by
 UNSAID = np.full(3, ANYHOW + 1)  # a share that rises by 1
 MAX_COLUMN_STRAIN = 0.9  # strain beyond which no column is squeezed
@@ -215,6 +217,38 @@ def depth_and_share(grid, ray, t, top):
         if within > share:
             share += (within - share) * sunk_under(grid, ray, t, top)
     return deep, share
+
+
+@numba.njit(cache=True, error_model="numpy", **UNCOUNTED)
+def swept(grid, ray, t, top):
+    """Where a tool that has sunk under skin has come through it, though the skin's column leads past the tool.
+
+    Skin goes with a tool along the tool's way. A limb's columns lead a little aside: past the back of a tool that is
+    less high than it is deep, where they would leave a taller one by its wall.
+
+    Args:
+        top: see `sunk_under`.
+
+    Returns:
+        depth by which the skin sinks along its normal [m]; the share of that which counts; and how much of it lies on
+        the tool: less beside a wall that the way just passes.
+    """
+    size = np.sqrt(top[0] * top[0] + top[1] * top[1] + top[2] * top[2])
+    if size == 0 or size > 1.5:
+        return 0.0, 0.0, 0.0
+    a, b, c = -top[0] / size, -top[1] / size, -top[2] / size
+    cosine = a * ray[3] + b * ray[4] + c * ray[5]
+    if cosine <= ASLANT:
+        return 0.0, 0.0, 0.0
+    way = ray[0], ray[1], ray[2], a, b, c
+    wall, d = wall_in(grid[3], t), distance_in_column(grid, ray, 0.0)
+    inside, _ = inside_most(grid, way, t, -d, 0.0)
+    if inside <= 0:
+        return 0.0, 0.0, 0.0
+    share = size * min(2 * inside / wall, 1.0) * min((cosine - ASLANT) / UPRIGHT, 1.0)
+    deep = depth_in_column(grid, way, t, 0.0)
+    lies = min(max(-2 * distance_in_column(grid, way, deep - wall) / wall, 0.0), 1.0) if deep > wall else 1.0
+    return deep * cosine, share, share * lies
 
 
 @numba.njit(forceinline=True, cache=True, error_model="numpy")

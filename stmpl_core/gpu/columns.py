@@ -10,7 +10,19 @@ from stmpl_core.deep import DEEPEST
 from stmpl_core.gpu.blocks import sum_before
 from stmpl_core.gpu.packs import EDGE_BIT, OneSkin, Scratch, Skins
 from stmpl_core.gpu.places import APART, DEEP, OVERFULL, PENDING
-from stmpl_core.gpu.rays import FAR, OPTIONS, WALL_WIDTH, along, clearance_of, depth_and_share, real, vec3
+from stmpl_core.gpu.rays import (
+    FAR,
+    OPTIONS,
+    SLANT,
+    WALL_WIDTH,
+    along,
+    clearance_of,
+    depth_and_share,
+    inside_most,
+    real,
+    swept,
+    vec3,
+)
 
 BLOCK, EDGE = wp.constant(IN_BLOCK), wp.constant(EDGE_BIT)
 UNDER, TOO_DEEP = wp.constant(wp.float64(LEAST_UNDER)), wp.constant(wp.float64(DEEPEST))
@@ -55,7 +67,8 @@ def widen(skins: Skins, scratch: Scratch):
 
 @wp.func
 def _looks(scratch: Scratch, c: wp.int32, again: wp.int32) -> bool:
-    return (again == 0 and scratch.status[c] == PENDING) or (again == 1 and scratch.wide[c] == 1)
+    pending = scratch.status[c] == PENDING
+    return (again == 0 and pending) or (again == 1 and scratch.wide[c] == 1) or (again == 2 and _swept(scratch, c))
 
 
 @wp.kernel
@@ -174,6 +187,39 @@ def gather_clearance(again: wp.int32, skins: Skins, scratch: Scratch):
 
 
 @wp.func
+def _swept(scratch: Scratch, c: wp.int32) -> bool:
+    """Whether a tool has sunk under skin along a way that is known."""
+    square = wp.length_sq(scratch.top[c])
+    return scratch.status[c] == PENDING and square > real(0.0) and square < real(2.0)
+
+
+@wp.kernel
+def find_swept(lanes: wp.int32, skins: Skins, scratch: Scratch):
+    """Marks columns besides that such a tool meets along its way: stmpl_core.columns._with_swept."""
+    c, lane = wp.tid()
+    if not _swept(scratch, c):
+        return
+    one, grid, pose = skins.one[scratch.skin[c]], skins.grids[scratch.grid[c]], scratch.pose[c]
+    wide = vec3(one.hole, one.hole, one.hole)
+    low, high, centre = grid.low - wide, grid.high + wide, scratch.centre[c]
+    radius, goes = real(0.5) * wp.length(high - low), -wp.normalize(scratch.top[c])
+    for b in range(one.first_ball + lane, one.end_ball, lanes):
+        local, ball = b - one.first_ball, skins.balls[b]
+        middle = vec3(ball[0], ball[1], ball[2])
+        if wp.length_sq(middle - centre) <= (radius + ball[3]) * (radius + ball[3]):
+            base = one.first + local * BLOCK
+            for v in range(base, wp.min(base + BLOCK, one.end)):
+                t, n = skins.thickness[v], v - one.first
+                if wp.length_sq(skins.points[v] - centre) <= (radius + t) * (radius + t):
+                    start, way = wp.transpose(pose) * (skins.points[v] - scratch.place[c]), skins.inward[v]
+                    if wp.dot(wp.transpose(pose) * way, goes) > SLANT and not _marked(scratch.covered, c, n):
+                        if _through(low, high, start, goes, t):
+                            if -inside_most(grid, skins.coefficients, start, goes, t) < one.hole:
+                                _mark(scratch.covered, c, n)
+                                _mark(scratch.near, c, n)
+
+
+@wp.func
 def _is_first(skins: Skins, scratch: Scratch, c: wp.int32, v: wp.int32, f: wp.int32) -> bool:
     """Whether no corner of a triangle before v is covered."""
     first, out = skins.one[scratch.skin[c]].first, wp.bool(True)
@@ -233,6 +279,9 @@ def sink(lanes: wp.int32, skins: Skins, scratch: Scratch):
             start, way = pose * (skins.points[v] - scratch.place[c]), pose * skins.inward[v]
             deep, share = depth_and_share(grid, skins.coefficients, start, way, skins.thickness[v], scratch.top[c])
             under = deep * share
+            if share < real(1.0) and wp.length_sq(scratch.top[c]) > real(0.0):
+                sunk = swept(grid, skins.coefficients, start, way, skins.thickness[v], scratch.top[c])
+                under = under + wp.max(sunk[1] - share, real(0.0)) * sunk[0]
         scratch.under[c, n] = under
 
 

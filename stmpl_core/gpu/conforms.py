@@ -20,6 +20,7 @@ from stmpl_core.gpu.rays import (
     depth_in_column,
     jet_at,
     real,
+    swept,
     vec3,
     wall_in,
 )
@@ -97,6 +98,10 @@ def lie(pick: wp.array(dtype=wp.int32), lanes: wp.int32, many: wp.int32, skins: 
             if depth > real(0.0):
                 inside = -along(grid, skins.coefficients, start, down, depth - wall)
                 rests = _clipped(real(2.0) * inside / wall) * wp.min(depth / wall, real(1.0))
+            if share < real(1.0) and wp.length_sq(scratch.top[c]) > real(0.0):
+                sunk = swept(grid, skins.coefficients, start, down, thick, scratch.top[c])
+                depth = depth + wp.max(sunk[1] - share, real(0.0)) * sunk[0]
+                rests = wp.max(rests, sunk[2] * wp.min(depth / wall, real(1.0)))
             way = vec3(inward)
             if field.one_way[t] == 1:
                 way = field.way[t]

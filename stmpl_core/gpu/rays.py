@@ -5,6 +5,7 @@ import warp as wp
 
 from stmpl_core.rays import (
     ANYHOW,
+    ASLANT,
     GRAZES,
     LEAST_ASIDE,
     LOOKED_AT,
@@ -13,6 +14,7 @@ from stmpl_core.rays import (
     PASSED,
     SECANT_START,
     SECANT_TOLERANCE,
+    UPRIGHT,
     WALL,
 )
 from stmpl_core.rays import ENTERS as MOST_ENTERS
@@ -30,6 +32,7 @@ PARTS, MOST_PARTS = wp.constant(wp.float64(PASSED)), wp.constant(wp.float64(MOST
 GRAZE = wp.constant(wp.float64(GRAZES))
 SAID_ANYHOW = wp.constant(wp.float64(ANYHOW))
 ENTERS, LOOKS_BACK = wp.constant(MOST_ENTERS), wp.constant(wp.float64(LOOKED_BACK))
+SLANT, MORE_UPRIGHT = wp.constant(wp.float64(ASLANT)), wp.constant(wp.float64(UPRIGHT))
 CLEAR, ASIDE = wp.constant(wp.float64(CLEAR_FROM)), wp.constant(wp.float64(LEAST_ASIDE))
 BEHIND = wp.constant(wp.float64(LOOKED_AT))
 IS_BOX, IS_CAPSULE, ON_AXIS = wp.constant(BOX), wp.constant(CAPSULE), wp.constant(wp.float64(NEAREST))
@@ -373,18 +376,40 @@ def depth_and_share(grid: Grid, coefficients: wp.array(dtype=real), start: vec3,
 
 
 @wp.func
+def swept(grid: Grid, coefficients: wp.array(dtype=real), start: vec3, way: vec3, t: real, top: vec3) -> vec3:
+    """Depth by which skin sinks with a tool along its way [m], share of that which counts, and how much lies on it."""
+    size, out = wp.length(top), vec3()
+    if size > real(0.0) and size < real(1.5):
+        goes = -top / size
+        cosine = wp.dot(goes, way)
+        if cosine > SLANT:
+            inside = inside_most(grid, coefficients, start, goes, t)
+            if inside > real(0.0):
+                wall, lies = wall_in(grid, t), real(1.0)
+                share = size * wp.min(real(2.0) * inside / wall, real(1.0))
+                share = share * wp.min((cosine - SLANT) / MORE_UPRIGHT, real(1.0))
+                deep = depth_in_column(grid, coefficients, start, goes, t, real(0.0))
+                if deep > wall:
+                    lies = real(-2.0) * along(grid, coefficients, start, goes, deep - wall) / wall
+                out = vec3(deep * cosine, share, share * wp.clamp(lies, real(0.0), real(1.0)))
+    return out
+
+
+@wp.func
 def strain_under(grid: Grid, coefficients: wp.array(dtype=real), start: vec3, way: vec3, t: real,
                  top: vec3) -> real:  # fmt: skip
     """How far the tool squeezes a column, over its thickness; rising from 0 beside the tool's walls."""
     wall = wall_in(grid, t)
     deep, share = depth_and_share(grid, coefficients, start, way, t, top)
-    if deep <= real(0.0):
-        return real(0.0)
+    strain = share * wp.min(deep / t, MOST_STRAIN)
     if deep > wall:
         inside = -along(grid, coefficients, start, way, deep - wall)
         inside = wp.clamp(real(2.0) * inside / wall, real(0.0), real(1.0))
-        share = share * (real(1.0) - (real(1.0) - inside) * wp.min(deep / wall - real(1.0), real(1.0)))
-    return share * wp.min(deep / t, MOST_STRAIN)
+        strain = strain * (real(1.0) - (real(1.0) - inside) * wp.min(deep / wall - real(1.0), real(1.0)))
+    if share < real(1.0) and wp.length_sq(top) > real(0.0):
+        sunk = swept(grid, coefficients, start, way, t, top)
+        strain = strain + wp.max(sunk[1] - share, real(0.0)) * wp.min(sunk[0] / t, MOST_STRAIN)
+    return strain
 
 
 @wp.func
@@ -394,7 +419,12 @@ def depth_at(grid: Grid, coefficients: wp.array(dtype=real), start: vec3, way: v
     beyond = wp.min(real(1.0) - depth / (WALL_WIDTH * t), real(1.0))
     if beyond > real(0.0) and wp.length_sq(top) > real(0.0):
         deep = wp.max(depth_in_column(grid, coefficients, start, way, t, real(0.0)), real(0.5) * t)
-        most = inside_most(grid, coefficients, start, way, deep)
+        most, more, size = inside_most(grid, coefficients, start, way, deep), real(0.0), wp.length(top)
         if most > depth:
-            depth = depth + beyond * (most - depth) * sunk_under(grid, coefficients, start, way, t, top)
+            more = (most - depth) * sunk_under(grid, coefficients, start, way, t, top)
+        misses = wp.min(real(1.0) - real(2.0) * most / (WALL_WIDTH * t), real(1.0))
+        if misses > real(0.0) and size < real(1.5) and -wp.dot(top, way) > SLANT * size:
+            through = inside_most(grid, coefficients, start, -top / size, t)
+            more = wp.max(more, misses * size * (through - depth))
+        depth = depth + beyond * more
     return depth

@@ -341,6 +341,9 @@ class WarpBatch:
         """Skin that the tools touch, and how much of it they cover."""
         scratch, skins, shared, blocks = self._scratch, self._skins, (tools, self._lanes), (tools, self._block)
         self._meet(tools, 0)
+        if self._stacked:
+            self._run(columns.find_swept, shared, self._lanes, skins, scratch)
+            self._run(columns.list_near, blocks, 2, skins, scratch)
         self._run(columns.list_faces, blocks, skins, scratch)
         self._run(columns.sink, shared, self._lanes, skins, scratch)
         self._run(columns.gather_depth, tools, skins, scratch)
