@@ -165,12 +165,16 @@ def _rates(grid, middle, pose, vertices, normals, thicknesses, points, inward, t
     size = np.sqrt(_dot(mean, mean))
     way = mean / max(size, 1e-300)
     slanted = len(sinking) > 0 and size > MIN_ONE_WAY_SHARE * total
-    places = np.empty(((4 if slanted else 3) * many, 3))
+    places, ends = np.empty(((4 if slanted else 3) * many, 3)), np.empty(many)
     for n in range(many):
         for m in range(3):
             places[m * many + n] = points[n] + columns[m, n] * inward[n]
         if slanted:
-            places[3 * many + n] = points[n] + sinking[n] / max(_dot(inward[n], way), 1e-3) * way
+            ends[n] = sinking[n] / max(_dot(inward[n], way), 1e-3)
+            if sinking[n] > depth[n] * (1 + 1e-9):  # the column leads out of the tool's wall, the way goes on
+                ray = ray_from(pose, points[n, 0], points[n, 1], points[n, 2], way[0], way[1], way[2])
+                ends[n] = depth_in_column(grid, ray, max(4 * ends[n], thickness[n]), ends[n])
+            places[3 * many + n] = points[n] + ends[n] * way
     found, out = distances_and_gradients(grid[0], grid[1], grid[2], (places - origin) @ turn)
     distance, gradient = found.reshape(-1, many), (out @ turn.T).reshape(-1, many, 3)
     moved, go, turned, thicker = _carried(vertices, normals, thicknesses, points, inward, thickness, corners, shares,
@@ -185,7 +189,8 @@ def _rates(grid, middle, pose, vertices, normals, thicknesses, points, inward, t
             for x in range(3):
                 swung[k, x] += area[n] * (deeper[k, n] * inward[n, x] + depth[n] * turned[k, n, x])
         swung[k] = (swung[k] - _dot(swung[k], way) * way) / size
-    sunk = _sunk(points, inward, depth, sinking, way, swung, gradient[3], go, turned, deeper, origin)
+    walls = np.array([wall_in(grid[3], t) for t in thickness])
+    sunk = _sunk(points, inward, depth, sinking, ends, walls, way, swung, gradient[3], go, turned, deeper, origin)
     return strains, sunk, moved
 
 
@@ -298,17 +303,25 @@ def _deepened(points, inward, thickness, area, strain, columns, distance, gradie
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _sunk(points, inward, depth, sinking, way, swung, gradient, go, turned, deeper, origin):
-    """Rates of `Nodes.sinking`, (6, N): of depths along one way (3,) for all, which swings, (6, 3)."""
+def _sunk(points, inward, depth, sinking, ends, walls, way, swung, gradient, go, turned, deeper, origin):
+    """Rates of `Nodes.sinking`, (6, N): of depths along one way (3,) for all, which swings, (6, 3).
+
+    Args:
+        ends: where the tool ends along that way, (N,) [m].
+        walls: see rays.wall_in, (N,) [m].
+    """
     out = deeper.copy()
     for n in range(len(depth)):
-        along, cosine = _dot(gradient[n], way), _dot(inward[n], way)
-        if sinking[n] >= depth[n] * (1 - 1e-9) or abs(along) < LEAST_COSINE or cosine <= 0:
+        along, cosine, s = _dot(gradient[n], way), _dot(inward[n], way), ends[n]
+        more = s * cosine - depth[n]
+        if abs(more) <= depth[n] * 1e-9 or abs(along) < LEAST_COSINE or cosine <= 0:
             continue
-        s = sinking[n] / cosine
+        share = min(max((sinking[n] - depth[n]) / more, 0.0), 1.0)  # of what it sinks more than its column says
+        rises = share < 1 and abs(share - depth[n] / walls[n]) < 0.02
         for k in range(6):
             rate = _entered(gradient[n], points[n], way, s, go[k, n], swung[k], k, origin) / along
-            out[k, n] = rate * cosine + s * (_dot(turned[k, n], way) + _dot(inward[n], swung[k]))
+            rate = rate * cosine + s * (_dot(turned[k, n], way) + _dot(inward[n], swung[k]))
+            out[k, n] += share * (rate - deeper[k, n]) + (more * deeper[k, n] / walls[n] if rises else 0.0)
     return out
 
 

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -9,6 +10,7 @@ import trimesh
 
 from stmpl_core import Contact, Membrane, Simulator, SoftLayer, Tissue, Tool
 from stmpl_core.body import Body
+from stmpl_core.columns import shifted
 from stmpl_core.errors import InvalidInput
 from stmpl_core.footing import twist_between
 from stmpl_core.gradients import Gradients, WrenchGradient, twisted
@@ -34,9 +36,14 @@ def made(layer: SoftLayer) -> Gradients:
     return Gradients(Simulator(layer, MomentNet()))
 
 
+@cache
+def forearm() -> Simulator:
+    return Simulator(living(Body.anny(), "left_forearm", edge_length=6e-3), MomentNet())
+
+
 @pytest.fixture(scope="module", params=SKINS)
 def gradients(request: pytest.FixtureRequest) -> Gradients:
-    return made(limb() if request.param == SKINS[0] else living(Body.anny(), "left_forearm", edge_length=6e-3))
+    return made(limb()) if request.param == SKINS[0] else Gradients(forearm())
 
 
 def standing(simulator: Simulator, one: Tool, share: float, aside: float = 0.0) -> Contact:
@@ -82,6 +89,23 @@ def test_a_balls_wrench_changes_with_its_pose_as_differences_say(gradients: Grad
                            contact.pose_body_from_tool, (1e-4,))  # fmt: skip
     np.testing.assert_array_equal(found.wrench, wrench_of(simulator, [contact], "ball"))
     assert off(found.pose, expected) < 0.05
+
+
+@pytest.mark.parametrize("radius", [0.01, 0.015])
+@pytest.mark.parametrize("share", [0.2, 0.4])
+def test_a_slender_cone_is_as_stiff_as_touches_a_little_deeper_and_less_deep_say(radius: float, share: float) -> None:
+    """A limb's columns lead out of its wall, and what goes on with it sinks as it does: a half was missing."""
+    simulator = forearm()
+    mesh = trimesh.creation.cone(radius, 0.03, sections=64).apply_transform(turn((1, 0, 0), np.pi))
+    contact = standing(simulator, on_its_face(mesh, "cone"), share)
+    pose, way = contact.pose_body_from_tool, contact.pose_body_from_tool[:3, 2]
+    found = way @ Gradients(simulator).wrench([contact])[0].pose[:3, :3] @ way
+    expected = []
+    for step in (2e-4, 8e-4):
+        more, less = (wrench_of(simulator, [replace(contact, pose_body_from_tool=shifted(pose, by * way))], "cone")
+                      for by in (step, -step))  # fmt: skip
+        expected.append(way @ (more - less)[:3] / (2 * step))
+    assert found == pytest.approx(np.mean(expected), rel=0.1)
 
 
 def test_a_punchs_wrench_changes_with_its_pose_as_differences_over_half_its_nodes_spacing_say(
