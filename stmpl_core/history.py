@@ -130,6 +130,9 @@ class History:
         touches = [self._told(*one) for one in zip(contacts, touches, memories.values(), out, says, strict=False)]
         if terms and not (plain and all(touch.trust.in_range for touch in touches)):
             out[:, 7] = [touch.trust.in_range for touch in touches]
+            for row, stated, touch in zip(out, contacts, touches, strict=True):
+                if stated.wrench is not None and not touch.presses and not touch.trust.in_range:  # it may press so
+                    row[6] = max(row[6], float(np.linalg.norm(stated.wrench[:3])))
             bounds = out[:, 6].tolist()
             stepped.doubted(before, after, *self.series, dt, out, says)
             touches = [self._doubted(touch, bound, row) for touch, bound, row in zip(touches, bounds, out, strict=True)]
@@ -246,6 +249,9 @@ class History:
                 if dragged > MOST_DRAGGED:
                     trust = trust.also(f"{touch.name} drags skin along by {dragged:.2g} of its thickness; tried is "
                                        f"{MOST_DRAGGED:g}", in_range=False)  # fmt: skip
+            if contact.name not in self.frictions[1] and self.frictions[1]:
+                trust = trust.also(f"{touch.name} slides freely: friction is told of "
+                                   f"{', '.join(sorted(self.frictions[1]))}")  # fmt: skip
             if much:
                 trust = trust.also(f"{touch.name} came to where it is with less work than it could give back: "
                                    f"weakened to {passive:.0%}", in_range=False)  # fmt: skip

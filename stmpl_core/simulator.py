@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import overload
@@ -34,6 +35,7 @@ from stmpl_core.wake import sunk
 
 LEAST_HELD = 0.02  # motion that is held back, over the peak, from which it is said
 MOST_MOVED = 0.95  # motion over the thickness from which it is held back
+ELSEWHERE = 1e-3  # distance of a touch's skin from where it is now, over the thickness, from which it is another's
 FEW_NODES, MANY_NODES = 160, 240  # nodes up to which skin goes with its tools node by node, and from which by vertices
 MAX_ENTERED_SHARE = 0.02  # depth of skin inside a tool over the thickness, which is not yet said
 
@@ -165,12 +167,18 @@ class Simulator:
         return self.history.step(contacts, carried(state, self.skin, self.skin), dt)
 
     def answer(self, touches: Sequence[Touch]) -> Answer:
-        """Finds the displacement of the skin under touches of this simulator, made where its joints are now."""
+        """Finds the displacement of the skin under touches of this simulator, made where its joints are now.
+
+        Raises:
+            InvalidInput: touches of another skin, or made where its joints were elsewhere.
+        """
         # Sum: pressures of several tools add.
         try:
             pressing = [touch.pressure for touch in touches if touch.pressure is not None]
         except (AttributeError, TypeError):
             raise InvalidInput(f"touches are {touches!r:.60}; a list of Touches is needed.") from None
+        for touch in touches:
+            self._check(touch)
         pressure = sum(pressing[1:], pressing[0]) if pressing else np.zeros(len(self.layer.vertices))
         moves = self.history.elastic(touches)
 
@@ -203,6 +211,19 @@ class Simulator:
                 bound = max(bound, beside_walls(self.layer, moves, displacement))
             trust = replace(trust, error_bound=bound)
         return Answer(displacement, trust, solved.method, pressure, {touch.name: touch for touch in touches})
+
+    def _check(self, touch: Touch) -> None:
+        """Refuses a touch of another skin; see `answer`."""
+        many = len(self.layer.vertices)
+        if touch.pressure is not None and len(touch.pressure) != many:
+            raise InvalidInput(f"the touch of {touch.name} is of skin with {len(touch.pressure)} vertices; this one "
+                               f"has {many}.")  # fmt: skip
+        if touch.pressed is None or not len((nodes := touch.pressed.squeeze.nodes).area):
+            return
+        here = nodes.shares[0] @ self.layer.vertices[nodes.corners[0]]
+        if math.dist(here.tolist(), nodes.points[0].tolist()) > ELSEWHERE * float(nodes.thickness[0]):
+            raise InvalidInput(f"the touch of {touch.name} is of skin that is elsewhere now: its joints have moved, or "
+                               "it is another skin. Try Simulator.touch there.")  # fmt: skip
 
     def _moved(self, touches: Sequence[Touch]) -> tuple[Displacement, Conformed, bool]:
         """What the method says of elastic touches, the same with what is touched on its tools, whether by vertices.

@@ -338,7 +338,10 @@ def doubted(before, after, shares, times, dt, out, says):
             more -= shares[i] * np.expm1(-dt / times[i])
         strayed = _strayed(old, dt, times, says[k, 28], has, had, new[PRESSING] > 0)
         if doubts or old[DOUBTED] > 0:  # what this step may have added rests on one of its ends
-            strayed = min(strayed + max(new[ELASTIC], old[ELASTIC]) * more, max(has, 0.0))
+            most = max(new[ELASTIC], old[ELASTIC])
+            if not (new[PRESSING] > 0 or old[PRESSING] > 0) and out[k, 6] < most:  # a wrench that found no skin
+                most = out[k, 6]
+            strayed = min(strayed + most * more, max(has, 0.0))
         new[STRAYS], new[DOUBTED] = strayed, 1.0 if doubts else 0.0
         if (new[PRESSING] > 0 or _sunk(new)) and strayed > STRAYED * new[ELASTIC] > 0:
             out[k, 7] = 0.0

@@ -10,7 +10,7 @@ from stmpl_core import Contact, Simulator, Skin
 from stmpl_core.errors import InvalidInput
 from stmpl_core.methods import Winkler
 from stmpl_sim import Memory, Poses, SoftBody, SoftContact
-from tests.scenes import RADIUS, at, ball, limb
+from tests.scenes import RADIUS, at, ball, limb, plate
 from tests.test_posing import MIDDLE, hinged
 
 mujoco = pytest.importorskip("mujoco", reason="pip install 'stmpl[sim]'")
@@ -45,6 +45,18 @@ def on_the_lower_part(skin: Skin, angle: float, depth: float = 2e-3) -> np.ndarr
     assert skin.layer.rig is not None
     motion = skin.layer.rig.motions((angle,))[1]
     return motion[:3, :3] @ [RADIUS + BALL - depth, 0, 0.13] + motion[:3, 3]
+
+
+def test_touches_of_skin_that_is_elsewhere_now_move_nothing_and_say_so(skin: Skin) -> None:
+    place = on_the_lower_part(skin, 0.3)
+    simulator = Simulator(skin.posed({"elbow": 0.3}))
+    touches = simulator.touch([Contact(ball(), at(*place))])
+    assert simulator.answer(touches).displacement.any()
+    simulator.pose({"elbow": 0.1})
+    with pytest.raises(InvalidInput, match="joints have moved"):
+        simulator.answer(touches)
+    with pytest.raises(InvalidInput, match="vertices"):
+        Simulator(plate(), Winkler()).answer(touches)
 
 
 def test_the_wrench_is_that_of_the_bent_skin_and_the_hinges_body_feels_it(skin: Skin) -> None:

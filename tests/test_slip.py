@@ -331,6 +331,12 @@ def test_friction_is_by_tool_and_by_name(sim: Simulator) -> None:
             coefficient(wrong)
 
 
+def test_a_tool_that_friction_by_tool_does_not_name_says_that_it_slides_freely(sim: Simulator) -> None:
+    some = Simulator(sim.layer, Winkler(), sim.tools, friction={"prob": "dry"})
+    (touch,), _ = some.touch([Contact(BALL, down()[-1])], State(), 0.0)
+    assert touch.trust.ok and "probe slides freely: friction is told of prob" in touch.trust.why
+
+
 # Wrapped in taut skin
 
 

@@ -318,6 +318,20 @@ def test_what_rests_on_a_touch_out_of_range_is_until_that_has_faded(sim: Simulat
     assert fresh.trust.in_range
 
 
+@pytest.mark.parametrize("share, doubted", [(0.02, False), (20.0, True)])
+def test_a_wrench_that_finds_no_skin_leaves_as_much_doubt_as_it_may_have_pressed(
+    sim: Simulator, share: float, doubted: bool,
+) -> None:  # fmt: skip
+    """Noise of a sensor in the air, told once, had all flagged for half a minute."""
+    touches, state = played(sim, 0.1 * np.arange(4), np.array([0.0, 2e-3, 2e-3, -0.03]))
+    away, newton = pressed(-0.03), share * touches[2].force
+    noise = Contact(away.tool, away.pose_body_from_tool, np.array([0, 0, -newton, 0, 0, 0]))
+    (lost,), state = sim.touch([noise], state, 0.1)
+    assert not lost.trust.in_range
+    (touch,), _ = sim.touch([away], state, 0.1)
+    assert touch.trust.in_range != doubted
+
+
 def test_a_replay_from_any_frame_is_bit_for_bit(sim: Simulator) -> None:
     times, depths = np.linspace(0, 2, 21), DEPTH * np.sin(np.linspace(-0.1, 6, 21))
     all_of, last = played(sim, times, depths)
