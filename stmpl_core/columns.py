@@ -30,6 +30,7 @@ from stmpl_core.rays import (
     swept,
     to_tool,
     wall_in,
+    way_of,
 )
 from stmpl_core.sdf import SignedDistance
 from stmpl_core.soundness import too_long
@@ -359,8 +360,7 @@ def _squeezed(grid, pose, centre, points, inward, thickness, faces, start, aroun
                                            top)  # fmt: skip
     nodes = nodes_under(grid, pose, centre, points, inward, thickness, faces, found, top)
     places, ways, heights, areas, strains = nodes[:5]
-    sunk = np.sqrt((top * top).sum())
-    sunk = sunk if sunk < ANYHOW else 0.0
+    sunk = way_of(top)[0]
     sinking = _sinking(grid, pose, places, ways, heights, areas, strains, sunk) if stacked else np.empty(0)
     return (vertices, depth, rests, top) + nodes + (sinking,)
 

@@ -130,11 +130,8 @@ class History:
         touches = [self._told(*one) for one in zip(contacts, touches, memories.values(), out, says, strict=False)]
         if terms and not (plain and all(touch.trust.in_range for touch in touches)):
             out[:, 7] = [touch.trust.in_range for touch in touches]
-            for row, stated, touch in zip(out, contacts, touches, strict=True):
-                if stated.wrench is not None and not touch.presses and not touch.trust.in_range:  # it may press so
-                    row[6] = max(row[6], float(np.linalg.norm(stated.wrench[:3])))
-            bounds = out[:, 6].tolist()
-            stepped.doubted(before, after, *self.series, dt, out, says)
+            bounds = out[:, 6].copy()
+            stepped.doubted(before, after, *self.series, dt, _possible(contacts, touches, bounds), out, says)
             touches = [self._doubted(touch, bound, row) for touch, bound, row in zip(touches, bounds, out, strict=True)]
         for name in names[many:]:
             if not (memories[name].sunk or memories[name].trail.any()):
@@ -295,6 +292,15 @@ class History:
         found = [(self.toucher.touch(Contact(self.toucher.tools[one.name], one.imprint.pose)), one.imprint.depth)
                  for one in some if one.imprint is not None]  # fmt: skip
         return [(touch, min(depth / touch.depth, 1.0)) for touch, depth in found if touch.presses]
+
+
+def _possible(contacts: Sequence[Contact], touches: Sequence[Touch], bounds: np.ndarray) -> np.ndarray:
+    """Force that each may press with though it is not known to [N], (K,): all of a wrench that found no place."""
+    out = bounds.copy()
+    for k, (contact, touch) in enumerate(zip(contacts, touches, strict=True)):
+        if contact.wrench is not None and not touch.presses and not touch.trust.in_range:
+            out[k] = max(out[k], float(np.linalg.norm(contact.wrench[:3])))
+    return out
 
 
 def _own(memories: dict[str, Memory], contact: Contact, terms: int) -> Memory:

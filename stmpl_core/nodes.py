@@ -27,6 +27,7 @@ from stmpl_core.rays import (
     swept,
     to_tool,
     wall_in,
+    way_of,
 )
 from stmpl_core.sdf import distance_at
 
@@ -367,10 +368,9 @@ def _inside(grid, ray, t, depth, least, top):
         return depth
     most, _ = inside_most(grid, ray, max(depth_in_column(grid, ray, t, 0.0, 0.5 * t), 0.5 * t), depth, least)
     sunk = (most - depth) * sunk_under(grid, ray, t, top) if most > depth else 0.0
-    size, misses = np.sqrt(top[0] * top[0] + top[1] * top[1] + top[2] * top[2]), min(1 - 2 * most / (WALL * t), 1.0)
-    if misses > 0 and 0 < size < 1.5 and -(top[0] * ray[3] + top[1] * ray[4] + top[2] * ray[5]) > ASLANT * size:
-        way = ray[0], ray[1], ray[2], -top[0] / size, -top[1] / size, -top[2] / size
-        along, _ = inside_most(grid, way, t, depth, max(least, depth + sunk))
+    misses, (size, a, b, c) = min(1 - 2 * most / (WALL * t), 1.0), way_of(top)
+    if misses > 0 and size > 0 and a * ray[3] + b * ray[4] + c * ray[5] > ASLANT:
+        along, _ = inside_most(grid, (ray[0], ray[1], ray[2], a, b, c), t, depth, max(least, depth + sunk))
         sunk = max(sunk, misses * size * (along - depth))
     return depth + beyond * sunk
 

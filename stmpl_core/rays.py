@@ -17,7 +17,8 @@ LEAST_ASIDE = 0.1  # square of the slope aside from which it is known on which s
 ASLANT, UPRIGHT = 0.35, 0.15  # cosine to its tool's way from which skin goes with one that has sunk under it, and how
 # much more until it does so wholly
 NOT_SUNK, ANYHOW = np.zeros(3), 8.0  # what is said of a tool that has not sunk under skin; more than that: anyhow, by
-UNSAID = np.full(3, ANYHOW + 1)  # a share that rises by 1
+UNSAID = np.full(3, ANYHOW + 1)  # a share that rises by 1. What is no longer than LONGEST says a way
+LONGEST = 2.0
 MAX_COLUMN_STRAIN = 0.9  # strain beyond which no column is squeezed
 STEEPEST = 1.5  # slope that a distance field does not exceed on its way to 0 [-]; its spline's is above 1 beside edges
 SECANT_START = 3e-3  # distance to the tool, over the thickness, at which the secant rule takes over from sphere tracing
@@ -163,6 +164,19 @@ def led_in(grid, ray, at, inside, wall):
     return ray[0] - aside * a, ray[1] - aside * b, ray[2] - aside * c, ray[3], ray[4], ray[5]
 
 
+@numba.njit(cache=True, inline="always")
+def way_of(top):
+    """Share to which a tool has sunk under skin along a way that is known, and that way, a unit vector in its frame.
+
+    Args:
+        top: see `sunk_under`; the share of NOT_SUNK and of UNSAID is 0.
+    """
+    size = np.sqrt(top[0] * top[0] + top[1] * top[1] + top[2] * top[2])
+    size = size if size < LONGEST else 0.0
+    over = 1 / size if size > 0 else 0.0
+    return size, -top[0] * over, -top[1] * over, -top[2] * over
+
+
 @numba.njit(forceinline=True, cache=True, error_model="numpy", **UNCOUNTED)
 def sunk_under(grid, ray, t, top):
     """Share to which a tool has sunk under a column's skin, from 0, it comes to the column from beside, to 1.
@@ -175,8 +189,8 @@ def sunk_under(grid, ray, t, top):
         top: against the way that a tool went, in its frame, (3,), as long as the share to which it has sunk at all;
             UNSAID: any column that it is under; NOT_SUNK.
     """
-    size = top[0] * top[0] + top[1] * top[1] + top[2] * top[2]
-    if size == 0 or size > 2:
+    whole, x, y, z = way_of(top)
+    if whole == 0:
         return min(max(top[0] - ANYHOW, 0.0), 1.0)
     s, d = 0.0, distance_in_column(grid, ray, 0.0)
     at, near = s, d
@@ -192,11 +206,10 @@ def sunk_under(grid, ray, t, top):
     enters = 1 - max(near - SECANT_START * t, 0.0) / (WALL * t)
     if enters <= 0:
         return 0.0
-    whole = np.sqrt(size)
-    step = LOOKED_AT * t / whole
-    rise = distance_at(grid[0], grid[1], grid[2], ray[0] + at * ray[3] + step * top[0],
-                       ray[1] + at * ray[4] + step * top[1], ray[2] + at * ray[5] + step * top[2]) - near  # fmt: skip
-    return whole * enters * min(max(rise / (LOOKS_BACK * LOOKED_AT * t), 0.0), 1.0)
+    back = LOOKED_AT * t
+    rise = distance_at(grid[0], grid[1], grid[2], ray[0] + at * ray[3] - back * x, ray[1] + at * ray[4] - back * y,
+                       ray[2] + at * ray[5] - back * z) - near  # fmt: skip
+    return whole * enters * min(max(rise / (LOOKS_BACK * back), 0.0), 1.0)
 
 
 @numba.njit(forceinline=True, cache=True, error_model="numpy", **UNCOUNTED)
@@ -233,12 +246,9 @@ def swept(grid, ray, t, top):
         depth by which the skin sinks along its normal [m]; the share of that which counts; and how much of it lies on
         the tool: less beside a wall that the way just passes.
     """
-    size = np.sqrt(top[0] * top[0] + top[1] * top[1] + top[2] * top[2])
-    if size == 0 or size > 1.5:
-        return 0.0, 0.0, 0.0
-    a, b, c = -top[0] / size, -top[1] / size, -top[2] / size
+    size, a, b, c = way_of(top)
     cosine = a * ray[3] + b * ray[4] + c * ray[5]
-    if cosine <= ASLANT:
+    if size == 0 or cosine <= ASLANT:
         return 0.0, 0.0, 0.0
     way = ray[0], ray[1], ray[2], a, b, c
     wall, d = wall_in(grid[3], t), distance_in_column(grid, ray, 0.0)

@@ -319,12 +319,13 @@ def _strayed(old, dt, times, gone, has, had, presses):
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def doubted(before, after, shares, times, dt, out, says):
+def doubted(before, after, shares, times, dt, possible, out, says):
     """What of the answers of a step rests on touches out of range, and what tools feel of what others let go.
 
     Writes out[:, 7] where an answer is out of range for that, and bounds.
 
     Args:
+        possible: force that each tool that presses nothing may press with [N], (K,).
         before, after, shares, times, dt, out, says: see `step`.
     """
     tools, terms = len(out), len(times)
@@ -339,8 +340,8 @@ def doubted(before, after, shares, times, dt, out, says):
         strayed = _strayed(old, dt, times, says[k, 28], has, had, new[PRESSING] > 0)
         if doubts or old[DOUBTED] > 0:  # what this step may have added rests on one of its ends
             most = max(new[ELASTIC], old[ELASTIC])
-            if not (new[PRESSING] > 0 or old[PRESSING] > 0) and out[k, 6] < most:  # a wrench that found no skin
-                most = out[k, 6]
+            if not (new[PRESSING] > 0 or old[PRESSING] > 0):  # a wrench that found no skin
+                most = min(most, possible[k])
             strayed = min(strayed + most * more, max(has, 0.0))
         new[STRAYS], new[DOUBTED] = strayed, 1.0 if doubts else 0.0
         if (new[PRESSING] > 0 or _sunk(new)) and strayed > STRAYED * new[ELASTIC] > 0:

@@ -206,4 +206,4 @@ def _step_some(first, end, patches, before, after, of, terms, shares, times, fad
                  tables[i, :many], logs[i, :many], logs[i, wide:], sizes[i, 0], sizes[i, 1], dt, out[s],
                  says)  # fmt: skip
             if p:
-                doubted(before[s], after[s], shares[i, :p], times[i, :p], dt, out[s], says)
+                doubted(before[s], after[s], shares[i, :p], times[i, :p], dt, out[s, :, 6].copy(), out[s], says)

@@ -8,6 +8,7 @@ from stmpl_core.rays import (
     ASLANT,
     GRAZES,
     LEAST_ASIDE,
+    LONGEST,
     LOOKED_AT,
     MAX_COLUMN_STRAIN,
     MOST_PASSED,
@@ -30,7 +31,7 @@ WALL_WIDTH = wp.constant(wp.float64(WALL))
 MOST_STRAIN = wp.constant(wp.float64(MAX_COLUMN_STRAIN))
 PARTS, MOST_PARTS = wp.constant(wp.float64(PASSED)), wp.constant(wp.float64(MOST_PASSED))
 GRAZE = wp.constant(wp.float64(GRAZES))
-SAID_ANYHOW = wp.constant(wp.float64(ANYHOW))
+SAID_ANYHOW, SAYS_NO_WAY = wp.constant(wp.float64(ANYHOW)), wp.constant(wp.float64(LONGEST))
 ENTERS, LOOKS_BACK = wp.constant(MOST_ENTERS), wp.constant(wp.float64(LOOKED_BACK))
 SLANT, MORE_UPRIGHT = wp.constant(wp.float64(ASLANT)), wp.constant(wp.float64(UPRIGHT))
 CLEAR, ASIDE = wp.constant(wp.float64(CLEAR_FROM)), wp.constant(wp.float64(LEAST_ASIDE))
@@ -331,10 +332,19 @@ def led_in(grid: Grid, coefficients: wp.array(dtype=real), start: vec3, way: vec
 
 
 @wp.func
+def way_of(top: vec3) -> wp.vec4d:
+    """Share to which a tool has sunk under skin along a way that is known, and that way: stmpl_core.rays.way_of."""
+    size = wp.length(top)
+    if size == real(0.0) or size >= SAYS_NO_WAY:
+        return wp.vec4d()
+    return wp.vec4d(size, -top[0] / size, -top[1] / size, -top[2] / size)
+
+
+@wp.func
 def sunk_under(grid: Grid, coefficients: wp.array(dtype=real), start: vec3, way: vec3, t: real, top: vec3) -> real:
     """Share to which a tool has sunk under a column's skin, from 0, it comes from beside, to 1."""
-    size = wp.length_sq(top)
-    if size == real(0.0) or size > real(2.0):
+    sunk = way_of(top)
+    if sunk[0] == real(0.0):
         return wp.clamp(top[0] - SAID_ANYHOW, real(0.0), real(1.0))
     s, d, step = real(0.0), along(grid, coefficients, start, way, real(0.0)), wp.int32(0)
     at, near = real(0.0), real(d)
@@ -352,10 +362,9 @@ def sunk_under(grid: Grid, coefficients: wp.array(dtype=real), start: vec3, way:
     enters = real(1.0) - wp.max(near - START * t, real(0.0)) / (WALL_WIDTH * t)
     if enters <= real(0.0):
         return real(0.0)
-    whole = wp.sqrt(size)
-    by = BEHIND * t / whole
-    rise = distance_at(grid, coefficients, start + at * way + by * top) - near
-    return whole * enters * wp.clamp(rise / (LOOKS_BACK * BEHIND * t), real(0.0), real(1.0))
+    back = BEHIND * t * vec3(sunk[1], sunk[2], sunk[3])
+    rise = distance_at(grid, coefficients, start + at * way - back) - near
+    return sunk[0] * enters * wp.clamp(rise / (LOOKS_BACK * BEHIND * t), real(0.0), real(1.0))
 
 
 @wp.func
@@ -378,20 +387,19 @@ def depth_and_share(grid: Grid, coefficients: wp.array(dtype=real), start: vec3,
 @wp.func
 def swept(grid: Grid, coefficients: wp.array(dtype=real), start: vec3, way: vec3, t: real, top: vec3) -> vec3:
     """Depth by which skin sinks with a tool along its way [m], share of that which counts, and how much lies on it."""
-    size, out = wp.length(top), vec3()
-    if size > real(0.0) and size < real(1.5):
-        goes = -top / size
-        cosine = wp.dot(goes, way)
-        if cosine > SLANT:
-            inside = inside_most(grid, coefficients, start, goes, t)
-            if inside > real(0.0):
-                wall, lies = wall_in(grid, t), real(1.0)
-                share = size * wp.min(real(2.0) * inside / wall, real(1.0))
-                share = share * wp.min((cosine - SLANT) / MORE_UPRIGHT, real(1.0))
-                deep = depth_in_column(grid, coefficients, start, goes, t, real(0.0))
-                if deep > wall:
-                    lies = real(-2.0) * along(grid, coefficients, start, goes, deep - wall) / wall
-                out = vec3(deep * cosine, share, share * wp.clamp(lies, real(0.0), real(1.0)))
+    sunk, out = way_of(top), vec3()
+    goes = vec3(sunk[1], sunk[2], sunk[3])
+    cosine = wp.dot(goes, way)
+    if cosine > SLANT:
+        inside = inside_most(grid, coefficients, start, goes, t)
+        if inside > real(0.0):
+            wall, lies = wall_in(grid, t), real(1.0)
+            share = sunk[0] * wp.min(real(2.0) * inside / wall, real(1.0))
+            share = share * wp.min((cosine - SLANT) / MORE_UPRIGHT, real(1.0))
+            deep = depth_in_column(grid, coefficients, start, goes, t, real(0.0))
+            if deep > wall:
+                lies = real(-2.0) * along(grid, coefficients, start, goes, deep - wall) / wall
+            out = vec3(deep * cosine, share, share * wp.clamp(lies, real(0.0), real(1.0)))
     return out
 
 
@@ -419,12 +427,13 @@ def depth_at(grid: Grid, coefficients: wp.array(dtype=real), start: vec3, way: v
     beyond = wp.min(real(1.0) - depth / (WALL_WIDTH * t), real(1.0))
     if beyond > real(0.0) and wp.length_sq(top) > real(0.0):
         deep = wp.max(depth_in_column(grid, coefficients, start, way, t, real(0.0)), real(0.5) * t)
-        most, more, size = inside_most(grid, coefficients, start, way, deep), real(0.0), wp.length(top)
+        most, more, sunk = inside_most(grid, coefficients, start, way, deep), real(0.0), way_of(top)
         if most > depth:
             more = (most - depth) * sunk_under(grid, coefficients, start, way, t, top)
         misses = wp.min(real(1.0) - real(2.0) * most / (WALL_WIDTH * t), real(1.0))
-        if misses > real(0.0) and size < real(1.5) and -wp.dot(top, way) > SLANT * size:
-            through = inside_most(grid, coefficients, start, -top / size, t)
-            more = wp.max(more, misses * size * (through - depth))
+        goes = vec3(sunk[1], sunk[2], sunk[3])
+        if misses > real(0.0) and wp.dot(goes, way) > SLANT:
+            through = inside_most(grid, coefficients, start, goes, t)
+            more = wp.max(more, misses * sunk[0] * (through - depth))
         depth = depth + beyond * more
     return depth

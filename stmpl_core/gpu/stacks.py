@@ -21,6 +21,7 @@ from stmpl_core.gpu.rays import (
     sure_of,
     vec3,
     wall_in,
+    way_of,
 )
 from stmpl_core.networks import STACK_NODE
 from stmpl_core.response import SPREAD as SPREAD_OF_AREA
@@ -83,9 +84,7 @@ def sink(lanes: wp.int32, many: wp.int32, skins: Skins, scratch: Scratch):
             start, goes = pose * (scratch.point[s, i] - scratch.place[c]), pose * way
             grid, thick = skins.grids[scratch.grid[c]], scratch.thick[s, i]
             wall, ends = wall_in(grid, thick), start + vec3()
-            sure, sunk = sure_of(grid, skins.coefficients, start, goes, guess, wall), wp.length(scratch.top[c])
-            if sunk > real(1.5):
-                sunk = real(0.0)
+            sure, sunk = sure_of(grid, skins.coefficients, start, goes, guess, wall), way_of(scratch.top[c])[0]
             if sure < real(1.0) and sunk > real(0.0):
                 guess = wp.max(guess, thick)
                 sure = sure_of(grid, skins.coefficients, start, goes, guess, wall)
