@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from numbers import Real
+from numbers import Integral, Real
 
 import numba
 import numpy as np
@@ -56,6 +56,13 @@ def check_number(name: str, value: object) -> None:
     """Raises InvalidInput: a value that is no number, or not finite."""
     if not (is_number(value) and math.isfinite(value)):  # type: ignore[arg-type]
         raise InvalidInput(f"{name} is {value!r:.40}; a finite number is needed.")
+
+
+def check_count(name: str, value: object, least: int = 1, most: float = math.inf) -> None:
+    """Raises InvalidInput: a value that is no whole number, or not from `least` to `most`; truth is none."""
+    if not (is_number(value) and isinstance(value, Integral) and least <= value <= most):
+        allowed = f"from {least} to {most}" if most < math.inf else f"of at least {least}"
+        raise InvalidInput(f"{name} is {value!r:.40}; a whole number {allowed} is needed.")
 
 
 def check_choice(name: str, value: object) -> None:

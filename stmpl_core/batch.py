@@ -11,13 +11,12 @@ import threading
 from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from numbers import Integral
 from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from stmpl_core.arrays import check_dt, real
+from stmpl_core.arrays import check_count, check_dt, real
 from stmpl_core.contact import Contact
 from stmpl_core.errors import InvalidInput, StmplError
 from stmpl_core.friction import Friction, check_tools
@@ -79,27 +78,10 @@ class Batch:
 
     def __init__(self, skins: Skin | Sequence[Skin], tools: Sequence[Tool], n: int | None = None, *,
                  friction: Friction | Mapping[str, Friction] = None, threads: int | None = None) -> None:  # fmt: skip
-        some = list(skins) if isinstance(skins, Sequence) else [skins]
-        count = len(some) if n is None else n
-        self.skins = some if isinstance(skins, Sequence) or not isinstance(count, Integral) else some * count
-        if not isinstance(tools, Iterable):
-            raise InvalidInput(f"tools are {tools!r:.40}; a list of Tool is needed.")
-        self.tools = list(tools)
-        if not all(isinstance(skin, Skin) for skin in self.skins):
-            raise InvalidInput("a batch needs prepared skins. Try Skin.of(layer, MomentNet()).")
-        if not isinstance(count, Integral) or count < 1:
-            raise InvalidInput(f"a batch is asked for {count} scenes; a whole number of at least one is "
-                               "needed.")  # fmt: skip
-        if len(self.skins) != count:
-            raise InvalidInput(f"{len(self.skins)} skins do not fit {count} scenes: give one, or one for each.")
-        if not all(isinstance(tool, Tool) for tool in self.tools):
-            raise InvalidInput(f"tools are {tools!r:.40}; a list of Tool is needed.")
+        self.skins, self.tools = scenes_of(skins, tools, n)
         check_tools(friction, [tool.name for tool in self.tools])
-        if not self.tools or len({tool.name for tool in self.tools}) < len(self.tools):
-            raise InvalidInput("a batch needs tools, each with a name of its own. Try tool.named('left').")
         many = len(os.sched_getaffinity(0)) if threads is None else threads
-        if not isinstance(many, Integral) or many < 1:
-            raise InvalidInput(f"threads is {many!r:.40}; a whole number of at least 1 is needed.")
+        check_count("threads", many)
         self._friction, self._threads, self._own = friction, many, threading.local()
         self._stores: dict[int, Tools] = {}
         for skin in self.skins:  # what is slow to make is made here, once
@@ -200,6 +182,23 @@ class Batch:
 
     def _make(self, skin: Skin) -> Simulator:
         return Simulator(skin, tools=self._stores.get(id(skin)), friction=self._friction)
+
+
+def scenes_of(skins: Skin | Sequence[Skin], tools: Sequence[Tool], n: int | None) -> tuple[list[Skin], list[Tool]]:
+    """The skin of each of n scenes, and the tools of all. Raises InvalidInput: see Batch."""
+    each = list(skins) if isinstance(skins, Sequence) else [skins]
+    check_count("n", len(each) if n is None else n)
+    if not all(isinstance(skin, Skin) for skin in each):
+        raise InvalidInput("a batch needs prepared skins. Try Skin.of(layer, MomentNet()).")
+    each = each if isinstance(skins, Sequence) else each * (n or 1)
+    if n is not None and len(each) != n:
+        raise InvalidInput(f"{len(each)} skins do not fit {n} scenes: give one, or one for each.")
+    every = list(tools) if isinstance(tools, Iterable) else [tools]
+    if not isinstance(tools, Iterable) or not all(isinstance(tool, Tool) for tool in every):
+        raise InvalidInput(f"tools are {tools!r:.40}; a list of Tool is needed.")
+    if not every or len({tool.name for tool in every}) < len(every):
+        raise InvalidInput("a batch needs tools, each with a name of its own. Try tool.named('left').")
+    return each, every
 
 
 def _matrices(poses: Any, n: int, many: int) -> np.ndarray:

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, fields
-from numbers import Integral, Real
+from numbers import Real
 from typing import NamedTuple
 
 import numba
 import numpy as np
 from numpy.typing import ArrayLike
 
+from stmpl_core.arrays import check_count
 from stmpl_core.errors import InvalidInput
 from stmpl_core.local_contact import FADE, LocalContact
 
@@ -55,8 +56,7 @@ class LoopSettings:
             number = float(value) if isinstance(value, Real) else math.nan
             if not (math.isfinite(number) and (number > 0 or (least and number == 0))):
                 raise InvalidInput(f"{name} is {value}; it must be finite and {'at least' if least else 'above'} 0.")
-        if not isinstance(self.delay_steps, Integral) or not 0 <= self.delay_steps < LONGEST_DELAY:
-            raise InvalidInput(f"delay_steps is {self.delay_steps}; allowed are whole numbers, 0..{LONGEST_DELAY - 1}.")
+        check_count("delay_steps", self.delay_steps, 0, LONGEST_DELAY - 1)
 
 
 class DeviceLoop:

@@ -5,12 +5,11 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from numbers import Integral
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from stmpl_core.arrays import check_kind
+from stmpl_core.arrays import check_count, check_kind
 from stmpl_core.errors import InvalidInput
 from stmpl_core.green import Green
 from stmpl_core.layer import SoftLayer, layer_id
@@ -84,9 +83,7 @@ class Skin:
 
     def turn_at(self, vertex: int) -> np.ndarray:
         """Rotation of the skin at a vertex from its rest, (3, 3)."""
-        if not isinstance(vertex, Integral) or not 0 <= vertex < len(self.layer.vertices):
-            raise InvalidInput(f"the vertex is {vertex!r:.40}; whole numbers from 0 to {len(self.layer.vertices) - 1} "
-                               "are the skin's.")  # fmt: skip
+        check_count("the vertex", vertex, 0, len(self.layer.vertices) - 1)
         return np.eye(3) if self.rest is None else self.rest.posing.turn_at(vertex, self.angles)
 
     @cached_property

@@ -230,7 +230,8 @@ class State:
             if not 0 <= terms <= len(numbers):
                 raise ValueError(f"{terms} times of relaxation in {len(numbers)} numbers")
         except (ValueError, KeyError, TypeError, OverflowError) as error:
-            raise InvalidInput(f"{len(packed)} bytes are no state: {error}.") from error
+            raise InvalidInput(f"{len(packed)} bytes are not what State.pack gives, or only a part of it "
+                               f"({type(error).__name__}: {error}). Try State() to begin anew.") from error  # fmt: skip
         lacks = UNKNOWN.get(version, 0)
         size = size_of(terms) - lacks
         if version not in range(OLDEST, VERSION + 1) or len(numbers) != size * len(names):

@@ -4,14 +4,23 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from numbers import Integral
 from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial import KDTree
 
-from stmpl_core.arrays import Transform, Wrench, check_choice, check_dt, check_kind, check_number, cross, inverted
+from stmpl_core.arrays import (
+    Transform,
+    Wrench,
+    check_choice,
+    check_count,
+    check_dt,
+    check_kind,
+    check_number,
+    cross,
+    inverted,
+)
 from stmpl_core.carrying import carry_at
 from stmpl_core.contact import Contact, rigid
 from stmpl_core.errors import InvalidInput
@@ -206,10 +215,10 @@ class SoftContact:
             raise InvalidInput(f"a skin wants tools with names of their own; got {', '.join(names) or 'none'}.")
         if damping < 0:
             raise InvalidInput(f"damping is {damping} s/m; it must be finite and at least 0.")
-        whole = isinstance(every, Integral) and not isinstance(every, bool)
-        if not whole or every < 1 or (every > 1 and (damping or implicit)):
-            raise InvalidInput(f"the contact law is asked at every {every} steps; that must be a whole number of at "
-                               "least 1, and 1 with damping or implicit=True.")  # fmt: skip
+        check_count("every", every)
+        if every > 1 and (damping or implicit):
+            raise InvalidInput(f"the contact law is asked at every {every} steps; with damping or implicit=True that "
+                               "must be 1.")  # fmt: skip
         check_tools(friction, names)
         if method is not None and not isinstance(layer, SoftLayer):
             raise InvalidInput(f"this {type(layer).__name__} has its method; leave the other one out.")

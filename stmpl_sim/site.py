@@ -5,13 +5,12 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import cached_property
-from numbers import Integral
 from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial import KDTree
 
-from stmpl_core.arrays import check_kind
+from stmpl_core.arrays import check_count, check_kind
 from stmpl_core.errors import InvalidInput
 from stmpl_core.layer import SoftLayer
 from stmpl_core.soundness import border_distance
@@ -39,8 +38,7 @@ class Site:
 
     def __post_init__(self) -> None:
         check_kind("layer", self.layer, SoftLayer)
-        if not isinstance(self.vertex, Integral) or not 0 <= self.vertex < len(self.layer.vertices):
-            raise InvalidInput(f"there is no vertex {self.vertex}: the skin has 0..{len(self.layer.vertices) - 1}.")
+        check_count("the vertex", self.vertex, 0, len(self.layer.vertices) - 1)
 
     @classmethod
     def thickest(cls, layer: SoftLayer) -> Site:

@@ -176,8 +176,10 @@ def test_what_does_not_fit_is_said(skin: Skin) -> None:
         batch.touch(poses(), [None] * N, -1.0)
     with pytest.raises(InvalidInput, match="do not fit 3"):
         Batch([skin, skin], TOOLS, 3)
-    with pytest.raises(InvalidInput, match="asked for 0 scenes"):
+    with pytest.raises(InvalidInput, match="n is 0; a whole number"):
         Batch(skin, TOOLS, 0)
+    with pytest.raises(InvalidInput, match="n is True"):
+        Batch(skin, TOOLS, True)
     with pytest.raises(InvalidInput, match="name of its own"):
         Batch(skin, (TOOLS[0], TOOLS[0]), 3)
     with pytest.raises(InvalidInput, match="threads"):

@@ -16,13 +16,13 @@ import logging
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass
-from numbers import Integral
 from typing import Any
 
 import numpy as np
 import warp as wp
 
-from stmpl_core.arrays import check_dt, real
+from stmpl_core.arrays import check_count, check_dt, real
+from stmpl_core.batch import scenes_of
 from stmpl_core.columns import Columns
 from stmpl_core.errors import InvalidInput
 from stmpl_core.friction import Friction, check_tools
@@ -109,17 +109,8 @@ class WarpBatch:
     def __init__(self, skins: Skin | Sequence[Skin], tools: Sequence[Tool], n: int | None = None, *,
                  friction: Friction | Mapping[str, Friction] = None, device: str = "cuda", nodes: int | None = None,
                  memory: int | None = None, lanes: int | None = None) -> None:  # fmt: skip
-        some = list(skins) if isinstance(skins, Sequence) else [skins]
-        count = len(some) if n is None else n
-        for name, one in (("n", count), ("lanes", 1 if lanes is None else lanes)):
-            if not isinstance(one, Integral) or one < 1:
-                raise InvalidInput(f"{name} is {one}; a whole number of at least 1 is needed.")
-        each = some if isinstance(skins, Sequence) else some * count
-        self.tools = list(tools)
-        if len(each) != count:
-            raise InvalidInput(f"{len(each)} skins do not fit {count} scenes: give one, or one for each.")
-        if not self.tools or len({tool.name for tool in self.tools}) < len(self.tools):
-            raise InvalidInput("a batch needs tools, each with a name of its own. Try tool.named('left').")
+        each, self.tools = scenes_of(skins, tools, n)
+        check_count("lanes", 1 if lanes is None else lanes)
         check_tools(friction, [tool.name for tool in self.tools])
         self._friction, self._steps, self._along = friction, None, ()
         self.device = _device(device)
