@@ -21,6 +21,7 @@ from stmpl_core.obstacle import (
     RINGS,
     columns_of,
     moments_of,
+    nearer,
     pairs,
     power_of,
     rates_of,
@@ -221,8 +222,9 @@ class ContactNet:
         sunk = solved.matrix @ solved.force * (1.0 if self._green is not None else nodes.thickness.mean())
         return (solved.force == 0) & (sunk > (1 - APART) * depth)
 
-    def slopes(self, nodes: Nodes, strain_rates: np.ndarray, sinking_rates: np.ndarray) -> np.ndarray:
-        """Rates of the pressures that `hold` gives, as depths change at nodes that stay where they are, (K, N).
+    def slopes(self, nodes: Nodes, strain_rates: np.ndarray, sinking_rates: np.ndarray, gone: np.ndarray,
+               ends: np.ndarray) -> np.ndarray:  # fmt: skip
+        """Rates of the pressures that `hold` gives, as depths change at nodes that go with their tools, (K, N).
 
         The linear problem's follow from its active set A: G_AA df_A = dd_A. The network's part is a difference over a
         small step along that.
@@ -231,8 +233,11 @@ class ContactNet:
             nodes: contact nodes, at least one.
             strain_rates: rates of their strains in each of K ways, (K, N).
             sinking_rates: rates of their depths [m], or on a stack of `sinking`, likewise.
+            gone: rates of their places, (K, N, 3) [m].
+            ends: where the nodes of each of M tools begin, and N, (M + 1,).
         """
-        bent, solved, rates = self.near.bent_at(nodes.corners), self._solved(nodes), (strain_rates, sinking_rates)
+        bent, solved = self.near.bent_at(nodes.corners), self._solved(nodes)
+        rates = strain_rates, sinking_rates, nearer(solved.matrix, solved.force, nodes.points, nodes.inward, gone, ends)
         if self._green is None:
             return _slopes(*nodes[:7], bent, *solved[:5], self._moduli, self._nu, *rates, *self._network)
         return _slopes_on_stack(*nodes[:8], bent, *solved, self._nu, self._green.effective.thickness,
@@ -382,10 +387,11 @@ def _reached(sinking, strain, sinking_rates, strain_rates, linear_to):
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _slopes(points, inward, thickness, area, strain, corners, shares, bent, matrix, rings, force, times, over, moduli,
-            nu, strain_rates, sinking_rates, low, high, mean, scale, w1, b1, w2, b2, w3, b3, w4, b4):  # fmt: skip
-    """See ContactNet.slopes."""
+            nu, strain_rates, sinking_rates, sunk, low, high, mean, scale, w1, b1, w2, b2, w3, b3, w4, b4):  # fmt: skip
+    """See ContactNet.slopes; sunk: what `nearer` gives."""
     unit, here = thickness.mean(), _between(corners, shares, bent)
-    rates = rates_of(matrix, force, _reached(strain * thickness, strain, sinking_rates, strain_rates, LINEAR_TO) / unit)
+    reached = _reached(strain * thickness, strain, sinking_rates, strain_rates, LINEAR_TO)
+    rates = rates_of(matrix, force, reached / unit - sunk)
     steps = _steps(force, rates, strain, strain_rates)
     pressures, strains = _stepped(force, rates, steps, 0.0) * unit**2 / area, _stepped(strain, strain_rates, steps, 0.0)
     moments, vectors = moments_of(rings, points, thickness, area, pressures, strains / over)
@@ -399,10 +405,11 @@ def _slopes(points, inward, thickness, area, strain, corners, shares, bent, matr
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _slopes_on_stack(points, inward, thickness, area, strain, corners, shares, sinking, bent, matrix, rings, force,
                      times, over, given_way, weights, what, nu, t, numbers, log_thickness, hardening, alike,
-                     strain_rates, sinking_rates, low, high, mean, scale, w1, b1, w2, b2, w3, b3, w4, b4):  # fmt: skip
-    """See ContactNet.slopes."""
+                     strain_rates, sinking_rates, sunk, low, high, mean, scale, w1, b1, w2, b2, w3, b3, w4,
+                     b4):  # fmt: skip
+    """See ContactNet.slopes; sunk: what `nearer` gives."""
     here = _between(corners, shares, bent)
-    rates = rates_of(matrix, force, _reached(sinking, strain, sinking_rates, strain_rates, STACK_LINEAR_TO))
+    rates = rates_of(matrix, force, _reached(sinking, strain, sinking_rates, strain_rates, STACK_LINEAR_TO) - sunk)
     alike_at = _between(corners, shares, alike)[:, 0]
     steps = _steps(force, rates, strain, strain_rates)
     forces, strains = _stepped(force, rates, steps, 0.0), _stepped(strain, strain_rates, steps, 1e-9)

@@ -29,6 +29,7 @@ TOLERANCE = 3e-6  # largest change of the forces of one iteration, over the larg
 MAX_ITERATIONS = 1000  # most took 30; three tools that cross on one material took 250 to 600
 FARTHEST = 1e3  # force of a node over what it needs alone, beyond which there is no solution: no layer responds so
 NONE, NEXT = np.uint64(0), np.uint64(1)
+LEAST_RISE, TINY = 1e-3, 1e-12  # stands against a rise across nodes in a row, over the square of their spread; and [m2]
 ONE_THREAD = 2**18  # multiplications up to which OpenBLAS takes one thread, and so always sums in the same order
 POWER_TOLERANCE = 1e-4  # square of the residual over the first, at which the power is known
 
@@ -270,6 +271,62 @@ def rates_of(matrix, force, depth_rates):
     for a in range(len(some)):
         for k in range(len(depth_rates)):
             out[k, some[a]] = found[a, k]
+    return out
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def nearer(matrix, force, points, inward, gone, ends):
+    """Rates (K, N) of how far nodes are sunk by the forces of other tools, as the tools go along the skin.
+
+    What one tool sinks beside itself is taken to rise evenly over where another presses; where that goes, the first
+    feels as much of it, over all its nodes alike (Betti).
+
+    Args:
+        matrix, force: see `solve`.
+        points, inward: places of the nodes and their inward normals, (N, 3).
+        gone: rates of the places, (K, N, 3).
+        ends: where the nodes of each of M tools begin, and N, (M + 1,).
+    """
+    out, many = np.zeros(gone.shape[:2]), len(ends) - 1
+    for m in range(many if many > 1 else 0):
+        here = np.arange(ends[m], ends[m + 1])
+        pressed, way, middle = force[here].sum(), np.zeros(3), np.zeros(3)
+        if not pressed > 0:
+            continue
+        for i in here:
+            for x in range(3):
+                way[x] += force[i] / pressed * inward[i, x]
+                middle[x] += force[i] / pressed * points[i, x]
+        for other in range(many):
+            there = np.arange(ends[other], ends[other + 1])
+            if other == m or not force[there].sum() > 0:
+                continue
+            square, slope = np.zeros((3, 3)), np.zeros(3)
+            for i in here:
+                sunk = 0.0
+                for j in there:
+                    sunk += matrix[i, j] * force[j]
+                for x in range(3):
+                    a = points[i, x] - middle[x]
+                    slope[x] += force[i] * sunk * a
+                    for y in range(3):
+                        square[x, y] += force[i] * a * (points[i, y] - middle[y])
+            wide = np.trace(square) + TINY
+            for x in range(3):
+                square[x, x] += LEAST_RISE * wide  # of nodes in a row, or of one, no rise across is known
+                for y in range(3):
+                    square[x, y] += wide * way[x] * way[y]
+            rise = np.linalg.solve(square, slope)
+            for k in range(len(gone)):
+                work = 0.0
+                for i in here:
+                    more = 0.0
+                    for x in range(3):
+                        more += gone[k, i, x] * rise[x]
+                    out[k, i] += more
+                    work += force[i] * more
+                for j in there:  # what moves one tool's forces in the other's field moves the other's in that one's
+                    out[k, j] += work / force[there].sum()
     return out
 
 

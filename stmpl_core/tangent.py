@@ -79,17 +79,18 @@ def _of_group(toucher: Toucher, touches: Sequence[Touch]) -> list[Tangent]:
     ends = np.concatenate([[0], np.cumsum([len(nodes.area) for nodes in every])])
     slices = [slice(a, b) for a, b in pairwise(ends)]
     strain, sinking = np.zeros((2, 6 * len(touches), ends[-1]))
+    gone = np.zeros((len(strain), ends[-1], 3))
     moved, skin = [], (layer.vertices, layer.normals, layer.thickness)
     for k, (touch, one) in enumerate(zip(touches, parts, strict=True)):
         low, high = one.field.tool_bounds
         rows = slice(6 * k, 6 * k + 6)
-        strain[rows, slices[k]], sinking[rows, slices[k]], shares = _rates(
+        strain[rows, slices[k]], sinking[rows, slices[k]], shares, gone[rows, slices[k]] = _rates(
             grid_of(one.field), 0.5 * (low + high), touch.pose_body_from_tool, *skin,
             *one.squeeze.nodes[:8])  # fmt: skip
         moved.append(shares)
     joined = toucher.joined([(one.field, touch.pose_body_from_tool, one.squeeze)
                              for touch, one in zip(touches, parts, strict=True)])  # fmt: skip
-    slopes = toucher.net.slopes(joined, strain, sinking)
+    slopes = toucher.net.slopes(joined, strain, sinking, gone, ends)
     unit = layer.tissue.youngs_modulus
     out = []
     for k, (touch, one, nodes) in enumerate(zip(touches, parts, every, strict=True)):
@@ -152,8 +153,8 @@ def _rates(grid, middle, pose, vertices, normals, thicknesses, points, inward, t
         points, inward, thickness, area, strain, corners, shares, sinking: see Nodes.
 
     Returns:
-        Rates of strain, (6, N) [1/m, 1/rad]; of the depth, or on a stack of `Nodes.sinking`, (6, N) [-, m/rad]; and of
-        barycentric coordinates, (6, N, 3).
+        Rates of strain, (6, N) [1/m, 1/rad]; of the depth, or on a stack of `Nodes.sinking`, (6, N) [-, m/rad]; of
+        barycentric coordinates, (6, N, 3); and of places, (6, N, 3) [-, m/rad].
     """
     many, origin, turn = len(area), pose[:3, 3].copy(), np.ascontiguousarray(pose[:3, :3])
     columns, depth = _columns(grid, pose, points, inward, thickness, area, strain), strain * thickness
@@ -182,7 +183,7 @@ def _rates(grid, middle, pose, vertices, normals, thicknesses, points, inward, t
     strains, deeper = _deepened(points, inward, thickness, area, strain, columns, distance, gradient, go, turned,
                                 thicker, origin, grid[3])  # fmt: skip
     if not slanted:
-        return strains, deeper, moved
+        return strains, deeper, moved, go
     swung = np.zeros((6, 3))
     for k in range(6):
         for n in range(many):
@@ -191,7 +192,7 @@ def _rates(grid, middle, pose, vertices, normals, thicknesses, points, inward, t
         swung[k] = (swung[k] - _dot(swung[k], way) * way) / size
     walls = np.array([wall_in(grid[3], t) for t in thickness])
     sunk = _sunk(points, inward, depth, sinking, ends, walls, way, swung, gradient[3], go, turned, deeper, origin)
-    return strains, sunk, moved
+    return strains, sunk, moved, go
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
