@@ -59,6 +59,7 @@ MAX_BESIDE = 0.3  # change of a force by the tools beside, beyond which the pose
 OPEN = 2.0  # distance of a hole in a tool's mesh over the depth, up to which what is inside the tool there is a guess
 SHELL, SHELL_FROM = 2.5, 0.02  # bound on a force per share of work above this by which a limb is stiff as a shell
 SHALLOW, SHALLOW_TO = 0.1, 0.05  # bound on a first touch of one material, and depth over the thickness where it ends
+FLATTEST = 1e3  # how far facets lie below smooth skin, over the depth of a touch, at most
 STUCK = 0.5  # error of what skin that sticks carries along itself, over that
 MAX_LEVER = 1.0  # torque that is not carried over the force, over the contact's radius, that is not yet worth a word
 SURE = 0.02  # largest error of a distance field over the depth, up to which it does not matter where the field is off
@@ -530,7 +531,8 @@ class Toucher:
         beside_off = 0.0 if one.force is None else abs(1 / scale - 1) if len(v) else 1.0  # each was placed as if alone
         if beside_off > 2 * FORCE_TOLERANCE:
             bound += beside_off
-        bound += STUCK * along + held.power * below / max(depth, below, 1e-300)  # the skin is no facets
+        flat = min(below / max(depth, 1e-300), FLATTEST)  # the skin is no facets, whose middle lies twice as low
+        bound += STUCK * along + (1 + flat + flat * min(flat, 1.0)) ** held.power - 1
         beside, radius = among or pins(nodes.points, nodes.area, nodes.thickness, forces)
         wider = WIDER if beside > GROUP and depth > DEEP * radius else 1.0
         touch = Touch(
@@ -600,7 +602,7 @@ class Toucher:
             most = min(most, float((touch.pressed.forces / one.squeeze.nodes.area).max()))
         ratio = most / self.net.unit
         if ratio > highest:
-            trust = trust.also(f"{name} presses with p/E = {ratio:.2g}; contacts were learnt up to {highest:.2g}",
+            trust = trust.also(f"{name} presses with p/E = {ratio:.3g}; contacts were learnt up to {highest:.3g}",
                                in_range=False)  # fmt: skip
         deepest = touch.depth / (float(one.squeeze.nodes.thickness.sum()) / len(one.squeeze.nodes.thickness))
         if deepest > card["ranges"]["depth_over_thickness"][1] and one.status != IN_CORE:

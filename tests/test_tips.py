@@ -211,6 +211,6 @@ def test_a_tool_whose_skin_others_pushed_away_says_that_it_does_not_press_as_ask
         pose[:3, 3] = layer.vertices[vertex] + radius * layer.normals[vertex]
         return press(ball(radius), pose, tuple(-force * layer.normals[vertex]), name)
 
-    _, small = simulator.touch([pressed("big", 0.02, v, 3.0), pressed("small", 0.008, u, 0.04)])
+    _, small = simulator.touch([pressed("big", 0.02, v, 3.5), pressed("small", 0.008, u, 0.04)])
     assert small.force == 0 and small.force_bound == pytest.approx(0.04, rel=0.02)
     assert not small.trust.ok and "100% off" in small.trust.why

@@ -25,6 +25,7 @@ SIDES = wp.constant(wp.vec2d(*toucher.SIDES))
 SHELL, SHELL_FROM = wp.constant(wp.float64(toucher.SHELL)), wp.constant(wp.float64(toucher.SHELL_FROM))
 SHALLOW, SHALLOW_TO = wp.constant(wp.float64(toucher.SHALLOW)), wp.constant(wp.float64(toucher.SHALLOW_TO))
 FAR_OFF = wp.constant(wp.float64(toucher.FAR))
+FLAT = wp.constant(wp.float64(toucher.FLATTEST))
 STUCK, WIDER = wp.constant(wp.float64(toucher.STUCK)), wp.constant(wp.float64(pieces.WIDER))
 GROUP, PINS_DEEP = wp.constant(wp.float64(pieces.GROUP)), wp.constant(wp.float64(pieces.DEEP))
 PIECE = wp.constant(wp.float64(2.0 / 3.0**0.5 * pieces.SPACINGS**2))
@@ -444,7 +445,9 @@ def answer(first: wp.int32, many: wp.int32, known: Known, skins: Skins, scratch:
             bound += SHALLOW * wp.max(real(1.0) - depth * forces / (SHALLOW_TO * carried), real(0.0))
         lacks = wp.max(wp.min(lack / wp.max(depth + lack, NONE), MOST_LACKING) - EDGE_SURE, real(0.0))
         bound += wp.pow(real(1.0) - lacks, -power) - real(1.0)
-        bound += STUCK * along / size + power * below / wp.max(depth, wp.max(below, NONE))
+        flat = wp.min(below / wp.max(depth, NONE), FLAT)
+        flat = flat + flat * wp.min(flat, real(1.0))
+        bound += STUCK * along / size + wp.pow(real(1.0) + flat, power) - real(1.0)
         if group:
             bound *= WIDER
         bounds[n, k] = bounds.dtype(one.modulus * size * bound)
