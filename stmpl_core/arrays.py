@@ -60,7 +60,7 @@ def check_number(name: str, value: object) -> None:
 
 def check_count(name: str, value: object, least: int = 1, most: float = math.inf) -> None:
     """Raises InvalidInput: a value that is no whole number, or not from `least` to `most`; truth is none."""
-    if not (is_number(value) and isinstance(value, Integral) and least <= value <= most):
+    if not (is_number(value) and isinstance(value, Integral) and least <= int(value) <= most):
         allowed = f"from {least} to {most}" if most < math.inf else f"of at least {least}"
         raise InvalidInput(f"{name} is {value!r:.40}; a whole number {allowed} is needed.")
 

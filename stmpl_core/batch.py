@@ -193,7 +193,7 @@ def scenes_of(skins: Skin | Sequence[Skin], tools: Sequence[Tool], n: int | None
     each = each if isinstance(skins, Sequence) else each * (n or 1)
     if n is not None and len(each) != n:
         raise InvalidInput(f"{len(each)} skins do not fit {n} scenes: give one, or one for each.")
-    every = list(tools) if isinstance(tools, Iterable) else [tools]
+    every = list(tools) if isinstance(tools, Iterable) else []
     if not isinstance(tools, Iterable) or not all(isinstance(tool, Tool) for tool in every):
         raise InvalidInput(f"tools are {tools!r:.40}; a list of Tool is needed.")
     if not every or len({tool.name for tool in every}) < len(every):
