@@ -220,7 +220,7 @@ def solve(matrix, depth):
             force[i] = 0.3 * depth[i] / matrix[i, i]
             most = max(most, FARTHEST * depth[i] / matrix[i, i])
     _add_times(matrix, force, gap)
-    before, restart, beside = 1.0, True, np.empty(count)
+    before, restart, beside, needs = 1.0, True, np.empty(count), np.empty(count)
     for _ in range(MAX_ITERATIONS):
         square = 0.0
         for i in range(count):
@@ -240,14 +240,19 @@ def solve(matrix, depth):
         if down <= 0:
             break
         step = up / down
+        for i in range(count):
+            needs[i] = -gap[i] if force[i] <= 0 and gap[i] < 0 else 0.0
         restart, change, largest = False, 0.0, 0.0
         for i in range(count):
             straight = now = force[i] - step * way[i]
             if force[i] > 0:
                 now = max(now, 0.0)
-            elif gap[i] < 0:
-                now = -gap[i] / matrix[i, i]  # the skin would be inside the tool: it presses after all
-                restart = True
+            elif needs[i] > 0:  # the skin would be inside the tool: it presses after all, and not alone
+                among = 0.0
+                for j in range(count):
+                    if needs[j] > 0:
+                        among += max(matrix[i, j], 0.0)
+                now, restart = needs[i] / among, True
             change, largest = max(change, abs(now - force[i])), max(largest, now)
             force[i], beside[i] = now, now - straight
             gap[i] -= step * along[i]

@@ -60,6 +60,7 @@ OPEN = 2.0  # distance of a hole in a tool's mesh over the depth, up to which wh
 SHELL, SHELL_FROM = 2.5, 0.02  # bound on a force per share of work above this by which a limb is stiff as a shell
 SHALLOW, SHALLOW_TO = 0.1, 0.05  # bound on a first touch of one material, and depth over the thickness where it ends
 FLATTEST = 1e3  # how far facets lie below smooth skin, over the depth of a touch, at most
+MOST_MORE = 100.0  # logarithm of how much harder that may press, at most
 STUCK = 0.5  # error of what skin that sticks carries along itself, over that
 MAX_LEVER = 1.0  # torque that is not carried over the force, over the contact's radius, that is not yet worth a word
 SURE = 0.02  # largest error of a distance field over the depth, up to which it does not matter where the field is off
@@ -532,7 +533,8 @@ class Toucher:
         if beside_off > 2 * FORCE_TOLERANCE:
             bound += beside_off
         flat = min(below / max(depth, 1e-300), FLATTEST)  # the skin is no facets, whose middle lies twice as low
-        bound += STUCK * along + (1 + flat + flat * min(flat, 1.0)) ** held.power - 1
+        more = held.power * math.log1p(flat + flat * min(flat, 1.0))
+        bound += STUCK * along + math.expm1(min(more, MOST_MORE))
         beside, radius = among or pins(nodes.points, nodes.area, nodes.thickness, forces)
         wider = WIDER if beside > GROUP and depth > DEEP * radius else 1.0
         touch = Touch(

@@ -95,6 +95,16 @@ def _times(scratch: Scratch, s: wp.int32, i: wp.int32, vector: wp.array2d(dtype=
     return sum
 
 
+@wp.func
+def _among(scratch: Scratch, s: wp.int32, i: wp.int32, count: wp.int32) -> real:
+    """Depth of node i under forces of 1 at all that come to press with it: those that do not move yet."""
+    among = real(0.0)
+    for j in range(count):
+        if scratch.gap[s, j] < real(0.0) and scratch.move[s, j] == real(0.0):
+            among += wp.max(scratch.matrix[s, i, j], real(0.0))
+    return among
+
+
 @wp.kernel
 def solve(many: wp.int32, linear: wp.int32, skins: Skins, scratch: Scratch):
     """Forces at the nodes, none of which pulls: obstacle.solve; linear: 1, of a stack that would never harden."""
@@ -131,15 +141,15 @@ def solve(many: wp.int32, linear: wp.int32, skins: Skins, scratch: Scratch):
         up = sum_of(up)
         for i in range(lane, count, lanes):
             down += _times(scratch, s, i, scratch.move) * scratch.move[s, i]
-        down = sum_of(down)
+        down = sum_of(down)  # no thread goes on before all have said how their nodes move
         change, largest, again = real(0.0), real(0.0), real(0.0)
         if down > real(0.0):
             for i in range(lane, count, lanes):
                 now = real(scratch.force[s, i])
                 if now > real(0.0):
                     now = wp.max(now - up / down * scratch.move[s, i], real(0.0))
-                elif scratch.gap[s, i] < real(0.0):  # the skin would enter it: it presses after all
-                    now = -scratch.gap[s, i] / scratch.matrix[s, i, i]
+                elif scratch.gap[s, i] < real(0.0):  # the skin would enter it: it presses after all, and not alone
+                    now = -scratch.gap[s, i] / _among(scratch, s, i, count)
                     again = real(1.0)
                 change = wp.max(change, wp.abs(now - scratch.force[s, i]))
                 largest = wp.max(largest, now)
