@@ -99,7 +99,7 @@ class Calibration:
             raise InvalidInput("the node is not configured, so it has no skin to calibrate.")
         if what not in ("", "stiffness", "friction", "relaxation"):
             raise InvalidInput(f"there is no '{what}' to calibrate. Available: stiffness, friction, relaxation.")
-        pressed = {one.name for one in self.strokes}
+        pressed = {one.name for one in (*self.strokes, *self.presses)}  # each forgets by its own measure
         if any(tool in ("", name) for name in self.pulled) and not any(tool in ("", name) for name in pressed):
             raise InvalidInput(WRONG_WAY)
         if tool and pressed and tool not in pressed:

@@ -547,6 +547,17 @@ def test_calibrate_says_of_a_tool_that_only_pulled_that_its_force_points_the_wro
             Calibration._fit(kept, what, tool)
 
 
+def test_calibrate_knows_the_presses_of_a_tool_whose_strokes_others_pushed_out():
+    """More instants of strokes come than of presses, which must be some way apart."""
+    press = Contact(ball().named("a"), np.eye(4), np.ones(6))
+    workshop = SimpleNamespace(stiffness=lambda presses: presses)
+    kept = SimpleNamespace(pulled=set(), strokes=deque([Contact(ball().named("b"), np.eye(4), np.ones(6))]),
+                           presses=deque([press]), _workshop=lambda: workshop)  # fmt: skip
+    assert Calibration._fit(kept, "stiffness", "a") == [press]
+    with pytest.raises(InvalidInput, match=r"'c' has not pressed .*; a, b has"):
+        Calibration._fit(kept, "stiffness", "c")
+
+
 @pytest.mark.parametrize(("active", "says"), [(True, "answers on it"), (False, "answers on it once it is active")])
 def test_the_action_says_whether_the_node_answers_on_the_new_skin(active, says):
     node = SimpleNamespace(executor=SimpleNamespace(create_task=lambda do: do()))

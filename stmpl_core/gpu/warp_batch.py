@@ -425,10 +425,8 @@ def _device(name: str) -> Any:
         raise InvalidInput(f"there is no device '{name}'. Available: {known}.") from error
 
 
-def _check(skin: Any) -> None:
+def _check(skin: Skin) -> None:
     """Refuses a skin that the kernels do not serve."""
-    if not isinstance(skin, Skin):
-        raise InvalidInput("a batch needs prepared skins. Try Skin.of(layer, MomentNet()).")
     if skin.rest is not None:
         raise InvalidInput("a skin that joints have moved is not served by WarpBatch yet; skin at rest is. Try Batch.")
     if many := len(too_long(skin.layer)):
