@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from copy import copy
 from functools import cached_property
 from typing import Any, NamedTuple
@@ -40,6 +41,8 @@ LEAST_UNDER, ALL_UNDER = 0.05, 0.3  # how much further inside a tool a column ge
 # to it than there and at its core, over the width of a wall, where the tool begins to sink under skin, and where it has
 BLOCK = 32  # columns that are looked at together
 FINEST = 0.02  # size of the parts of a long triangle at which the search for a tool in it ends, over the thickness
+AS_ONE = 1.8, 2.3  # distance of two tools' middles over the sum of their radii of gyration, up to which they press as
+# parts of one, and from which each its own way: quarters of a ball that share a side are up to 1.7 apart
 HOLE_RADIUS = 0.6  # farthest point of a triangle from its corners, over the edge length (equilateral: 0.577)
 
 
@@ -52,6 +55,8 @@ class Squeeze(NamedTuple):
         rests: share from 0, not covered, to 1, WALL of the thickness inside the tool's walls and its skin, (N,) [-].
         nodes: contact nodes.
         top: see nodes_under, (3,).
+        push: sum of its nodes' inward normals by area and depth, also of tools beside with which it presses as one: its
+            skin goes that way; 0 where they have no one way, and of one material, (3,) [m3].
     """
 
     vertices: np.ndarray
@@ -59,6 +64,7 @@ class Squeeze(NamedTuple):
     rests: np.ndarray
     nodes: Nodes
     top: np.ndarray = NOT_SUNK
+    push: np.ndarray = np.zeros(3)
 
 
 NO_SQUEEZE = Squeeze(np.empty(0, np.int64), np.empty(0), np.empty(0), Nodes.none())
@@ -174,11 +180,27 @@ class Columns:
         hole = HOLE_RADIUS * self.layer.edge_length
         if not clearance.nearest < hole:
             return NO_SQUEEZE
-        vertices, depth, rests, top, *nodes = _squeezed(
+        vertices, depth, rests, top, push, *nodes = _squeezed(
             grid_of(field), pose, middle_of(field, pose), self.points, self.inward, self.layer.thickness, self.faces,
             self._start, self._around, self._slot, *clearance[:3], hole, self.layer.stacked, self._order, self._blocks,
             *field.tool_bounds)  # fmt: skip
-        return Squeeze(vertices, depth, rests, Nodes(*nodes), top)
+        return Squeeze(vertices, depth, rests, Nodes(*nodes), top, push)
+
+    def as_one(self, tools: Sequence[tuple[SignedDistance, Transform, Squeeze]]) -> list[Squeeze]:
+        """Squeezes of tools on a stack that feel each other: of those side by side, as parts of one, skin goes one way.
+
+        Args:
+            tools: distance field, pose_body_from_tool and squeeze of each, all with nodes.
+        """
+        pushes = shared_pushes(np.array([pushed(*squeeze.nodes[:5]) for *_, squeeze in tools]))
+        out = []
+        for (field, pose, squeeze), push in zip(tools, pushes, strict=True):
+            nodes = squeeze.nodes
+            if not np.array_equal(push, squeeze.push):
+                sinking = _sinking(grid_of(field), pose, *nodes[:5], way_of(squeeze.top)[0], push)
+                squeeze = squeeze._replace(nodes=nodes._replace(sinking=sinking), push=push)
+            out.append(squeeze)
+        return out
 
 
 def middle_of(field: SignedDistance, pose: Transform) -> np.ndarray:
@@ -359,10 +381,12 @@ def _squeezed(grid, pose, centre, points, inward, thickness, faces, start, aroun
     found, vertices, depth, rests = _cover(grid, pose, points, inward, thickness, faces, start, around, slot, covered,
                                            top)  # fmt: skip
     nodes = nodes_under(grid, pose, centre, points, inward, thickness, faces, found, top)
-    places, ways, heights, areas, strains = nodes[:5]
-    sunk = way_of(top)[0]
-    sinking = _sinking(grid, pose, places, ways, heights, areas, strains, sunk) if stacked else np.empty(0)
-    return (vertices, depth, rests, top) + nodes + (sinking,)
+    sinking, push = np.empty(0), np.zeros(3)
+    if stacked:
+        places, ways, heights, areas, strains = nodes[:5]
+        push = _one_way(ways, areas * (strains * heights))
+        sinking = _sinking(grid, pose, places, ways, heights, areas, strains, way_of(top)[0], push)
+    return (vertices, depth, rests, top, push) + nodes + (sinking,)
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
@@ -378,9 +402,10 @@ def _top(pose, inward, near, least, above, hole):
     way = _one_way(inward[near], weights)
     if not way.any():
         return UNSAID.copy()
+    size = np.sqrt(way[0] * way[0] + way[1] * way[1] + way[2] * way[2])
     for x in range(3):
         for y in range(3):
-            out[x] -= pose[y, x] * way[y]
+            out[x] -= pose[y, x] * (way[y] / size)
     return out
 
 
@@ -407,28 +432,87 @@ def _with_swept(grid, pose, points, inward, thickness, order, blocks, low, high,
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _one_way(inward, weights):
-    """Mean of unit vectors (N, 3) by weights (N,), 1 long, (3,); 0 where they have no one way."""
+    """Sum of unit vectors (N, 3) by weights (N,), (3,); 0 where they have no one way."""
     way, whole = np.zeros(3), 0.0
     for n in range(len(weights)):
         whole += weights[n]
         for x in range(3):
             way[x] += weights[n] * inward[n, x]
     size = np.sqrt(way[0] * way[0] + way[1] * way[1] + way[2] * way[2])
-    return way / size if size > MIN_ONE_WAY_SHARE * whole else np.zeros(3)
+    return way if size > MIN_ONE_WAY_SHARE * whole else np.zeros(3)
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _sinking(grid, pose, points, inward, thickness, area, strain, sunk):
-    """Depth by which skin sinks along its normal if it goes with the tool along the mean normal, (N,) [m].
+def pushed(points, inward, thickness, area, strain):
+    """A row of `shared_pushes`, from what Nodes are told."""
+    out, square = np.zeros(8), 0.0
+    for n in range(len(area)):
+        weight = area[n] * (strain[n] * thickness[n])
+        out[0] += weight
+        for x in range(3):
+            out[1 + x] += weight * inward[n, x]
+            out[4 + x] += weight * points[n, x]
+    for x in range(3):
+        out[4 + x] /= max(out[0], 1e-300)
+    for n in range(len(area)):
+        for x in range(3):
+            square += area[n] * (strain[n] * thickness[n]) * (points[n, x] - out[4 + x]) ** 2
+    out[7] = np.sqrt(square / max(out[0], 1e-300))
+    return out
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def shared_pushes(rows):
+    """Sums of inward normals of K tools and of those beside with which they press as one, (K, 3) [m3]: Squeeze.push.
+
+    Each of the parts of a tool would press its own way: those of a ball, deep in a thigh, a little to its middle, and
+    with skin that lies beside it. What is part of one with a third tool is so with each other, unless they face apart.
+
+    Args:
+        rows: of each tool's nodes the sum of area times depth, of their inward normals likewise, and by that their
+            middle and the root of the mean square of the distance from it, (K, 8) [m3, m].
+    """
+    many, out = len(rows), np.zeros((len(rows), 3))
+    shares = np.zeros((many, many))
+    for k in range(many):
+        for m in range(many):
+            a, b, square = rows[k], rows[m], 0.0
+            for x in range(3):
+                square += (a[4 + x] - b[4 + x]) ** 2
+            share = (AS_ONE[1] - np.sqrt(square) / max(a[7] + b[7], 1e-12)) / (AS_ONE[1] - AS_ONE[0])
+            share = min(max(share, 0.0), 1.0)
+            shares[k, m] = share * share * (3 - 2 * share)
+    for third in range(many):
+        for k in range(many):
+            for m in range(many):
+                shares[k, m] = max(shares[k, m], min(shares[k, third], shares[third, m]))
+    for k in range(many):
+        way, whole = rows[k, 1:4].copy(), rows[k, 0]
+        for m in range(many):
+            facing = 0.0
+            for x in range(3):
+                facing += 2 * rows[k, 1 + x] * rows[m, 1 + x] / max(rows[k, 0] * rows[m, 0], 1e-300)
+            share = shares[k, m] * min(max(facing, 0.0), 1.0) if m != k else 0.0
+            whole += share * rows[m, 0]
+            for x in range(3):
+                way[x] += share * rows[m, 1 + x]
+        if np.sqrt(way[0] * way[0] + way[1] * way[1] + way[2] * way[2]) > MIN_ONE_WAY_SHARE * whole:
+            out[k] = way
+    return out
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _sinking(grid, pose, points, inward, thickness, area, strain, sunk, push):
+    """Depth by which skin sinks along its normal if it goes with the tool along a way, (N,) [m]: see Squeeze.push.
 
     On a limb that is no wider than its contact, columns along the normals meet the tool at a slant, and too deep. Those
     that lead out of its wall leave it too early: skin that is inside it sinks to where it ends along that way.
     Where that way just passes the tool, or grazes it, skin sinks as far as beside it, where one surely leads through.
     """
     depth = strain * thickness
-    way = _one_way(inward, area * depth)
-    if not way.any():
+    if not push.any():
         return depth
+    way = push / np.sqrt(push[0] * push[0] + push[1] * push[1] + push[2] * push[2])
     for n in range(len(depth)):
         cosine = inward[n, 0] * way[0] + inward[n, 1] * way[1] + inward[n, 2] * way[2]
         guess = max(depth[n] * cosine, 1e-9)

@@ -65,6 +65,7 @@ class Held(NamedTuple):
         power: power of the depth with which the force grows, about [-].
         shell: share of the linear work by which a limb is stiffer than its flat stack [-]; stiff skin around it stands
             up like a shell, until it is dented.
+        missed: how far the linear problem is from solved, over the depth [-]: see obstacle.solve.
     """
 
     pressure: np.ndarray
@@ -72,6 +73,7 @@ class Held(NamedTuple):
     outside: np.ndarray
     power: float
     shell: float = 0.0
+    missed: float = 0.0
 
 
 NOTHING = Held(np.empty(0), np.empty(0), np.empty(0), 1.0)
@@ -85,12 +87,14 @@ class Look(NamedTuple):
         inputs: what the network reads, (N, NODE.size) float32; or STACK_NODE.size, of which old networks read less.
         fade: share of the network's correction, (N,) [-].
         power: power of the depth with which the linear layer's force grows [-].
+        missed: see Held.
     """
 
     pressure: np.ndarray
     inputs: np.ndarray
     fade: np.ndarray
     power: float
+    missed: float
 
 
 class Solved(NamedTuple):
@@ -191,7 +195,7 @@ class ContactNet:
             found = _look_on_stack(*nodes, group, bent, self._table.rows, self._nu, *matrices,
                                    self._green.effective.thickness, self._green.numbers,
                                    *self._green.hardening)  # fmt: skip
-        seen, solved = Look(*found[:4]), Solved(*found[4:])
+        seen, solved = Look(*found[:5]), Solved(*found[5:])
         self._last = nodes, solved
         return seen, solved
 
@@ -211,7 +215,7 @@ class ContactNet:
         pressure, doubt, outside = _correct(*look[:3], *self._network)
         if self._green is None:
             _thin(look.inputs, doubt, outside)
-        held = Held(pressure / solved.times, doubt / solved.times, outside, look.power)
+        held = Held(pressure / solved.times, doubt / solved.times, outside, look.power, missed=look.missed)
         return held if self._green is None else held._replace(shell=-float(look.inputs[0, STACK_NODE.at.given_way]))
 
     def apart(self, nodes: Nodes) -> np.ndarray:
@@ -250,12 +254,12 @@ def _look(points, inward, thickness, area, strain, corners, shares, beside, grou
     mean, here = thickness.mean(), _between(corners, shares, bent)
     matrix, rings = pairs(points, inward, thickness, area, group, mean, half_space, rows)
     depth = np.minimum(strain, LINEAR_TO) * thickness / mean
-    force = solve(matrix, depth)
+    force, missed = solve(matrix, depth)
     pressure = force * mean**2 / area
     times, over = crowded(points, inward, area, strain, beside, force)
     moments, vectors = moments_of(rings, points, thickness, area, _one(pressure), _one(strain / over))
     seen = _see(moments[0], vectors[0], inward, area, times * pressure, strain, here, moduli, nu)
-    return *seen, power_of(matrix, force, depth.max()), matrix, rings, force, times, over
+    return *seen, power_of(matrix, force, depth.max()), missed, matrix, rings, force, times, over
 
 
 @numba.njit(cache=True, error_model="numpy")
@@ -279,7 +283,7 @@ def _look_on_stack(points, inward, thickness, area, strain, corners, shares, sin
     """See Look; t: thickness of the effective layer [m]; numbers and what follows: those of a Green."""
     rings, here = rings_of(points, inward, t, group, rows), _between(corners, shares, bent)
     depth = sinking * np.minimum(STACK_LINEAR_TO / strain, 1.0)
-    force = solve(matrix, depth)
+    force, missed = solve(matrix, depth)
     times, over = crowded(points, inward, area, strain, beside, force)
     moments, vectors = moments_of(rings, points, np.full(len(area), t), area,
                                   _one(np.exp(numbers[3]) * (force / area)), _one(sinking / over / t))  # fmt: skip
@@ -288,7 +292,7 @@ def _look_on_stack(points, inward, thickness, area, strain, corners, shares, sin
     seen = _see_on_stack(moments[0], vectors[0], inward, thickness, area, t, times * force, strain, sinking, here, nu,
                          numbers, log_thickness, hardening, _between(corners, shares, alike)[:, 0],
                          given_way, shape)  # fmt: skip
-    return *seen, power_of(matrix, force, depth.max()), matrix, rings, force, times, over, given_way, *among
+    return *seen, power_of(matrix, force, depth.max()), missed, matrix, rings, force, times, over, given_way, *among
 
 
 @numba.njit(cache=True, error_model="numpy")

@@ -208,10 +208,10 @@ def moments_of(rings, points, thickness, area, pressure, strain):
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def solve(matrix, depth):
-    """Forces (N,) >= 0 with matrix @ forces >= depth, and equal where they are above 0.
+    """Forces (N,) >= 0 with matrix @ forces >= depth, and equal where they are above 0; and what they lack of that.
 
     A matrix that is not positive, as that of a tool around half of a small limb, has none: what was found is large, and
-    not to be trusted.
+    not to be trusted. How far depths are missed at most, over the deepest, is told of what was found.
     """
     count, most = len(depth), 0.0
     force, gap, way, along = np.zeros(count), -depth, np.zeros(count), np.empty(count)
@@ -259,7 +259,11 @@ def solve(matrix, depth):
         if change <= TOLERANCE * largest or largest > most:
             break
         _add_times(matrix, beside, gap)  # few left the straight way: the gap follows without another whole product
-    return force
+    missed = deepest = 0.0
+    for i in range(count):
+        missed = max(missed, abs(gap[i]) if force[i] > 0 else -gap[i])
+        deepest = max(deepest, depth[i])
+    return force, missed / max(deepest, 1e-300)
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")

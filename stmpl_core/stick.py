@@ -39,7 +39,7 @@ def stuck_motion(green: Green, touches: Sequence[Touch], loaded: np.ndarray | No
     ways = [_gone(touch, one, green.layer.vertex_areas) for touch, one in pressed]
     gone, sure = np.concatenate([way for way, _ in ways]), np.concatenate([held for _, held in ways])
     if green.layer.stacked:
-        forces = solve(green.matrix(nodes, group), nodes.sinking)
+        forces, _ = solve(green.matrix(nodes, group), nodes.sinking)
     else:
         forces = np.concatenate([one.forces for _, one in pressed if one.forces is not None])
         forces /= green.layer.tissue.youngs_modulus

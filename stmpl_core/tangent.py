@@ -11,6 +11,7 @@ and with B (6, N) the wrench of a unit force at each node, dW = B df + dB f, plu
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from itertools import pairwise
 from typing import NamedTuple
@@ -18,15 +19,16 @@ from typing import NamedTuple
 import numba
 import numpy as np
 
-from stmpl_core.columns import grid_of
+from stmpl_core.columns import grid_of, pushed, shared_pushes
 from stmpl_core.nodes import FACING
 from stmpl_core.rays import MAX_COLUMN_STRAIN, depth_in_column, distance_in_column, ray_from, wall_in
 from stmpl_core.sdf import distances_and_gradients
-from stmpl_core.touch import MIN_ONE_WAY_SHARE, Pressed, Touch
+from stmpl_core.touch import Pressed, Touch
 from stmpl_core.toucher import Toucher, groups_of
 from stmpl_core.wrenches import unit_wrenches
 
 LEAST_COSINE = 0.05  # of a column's angle to the tool's normal, below which its depth is taken not to change
+SWING = 1e-3  # step of a tool's middle over its radius of gyration, in which it is found how ways swing
 
 
 class Tangent(NamedTuple):
@@ -80,14 +82,18 @@ def _of_group(toucher: Toucher, touches: Sequence[Touch]) -> list[Tangent]:
     slices = [slice(a, b) for a, b in pairwise(ends)]
     strain, sinking = np.zeros((2, 6 * len(touches), ends[-1]))
     gone = np.zeros((len(strain), ends[-1], 3))
-    moved, skin = [], (layer.vertices, layer.normals, layer.thickness)
+    moved, swings, rates, skin = [], [], [], (layer.vertices, layer.normals, layer.thickness)
     for k, (touch, one) in enumerate(zip(touches, parts, strict=True)):
         low, high = one.field.tool_bounds
         rows = slice(6 * k, 6 * k + 6)
-        strain[rows, slices[k]], sinking[rows, slices[k]], shares, gone[rows, slices[k]] = _rates(
+        strain[rows, slices[k]], sinking[rows, slices[k]], shares, gone[rows, slices[k]], swing, rate = _rates(
             grid_of(one.field), 0.5 * (low + high), touch.pose_body_from_tool, *skin,
-            *one.squeeze.nodes[:8])  # fmt: skip
+            *one.squeeze.nodes[:8], one.squeeze.push)  # fmt: skip
         moved.append(shares)
+        swings.append(swing)
+        rates.append(rate)
+    if layer.stacked:
+        _swing(parts, slices, swings, rates, sinking)
     joined = toucher.joined([(one.field, touch.pose_body_from_tool, one.squeeze)
                              for touch, one in zip(touches, parts, strict=True)])  # fmt: skip
     slopes = toucher.net.slopes(joined, strain, sinking, gone, ends)
@@ -143,7 +149,7 @@ def _turned(slopes, unit, area, corners, shares, forces, moved, k, vertices, are
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _rates(grid, middle, pose, vertices, normals, thicknesses, points, inward, thickness, area, strain, corners, shares,
-           sinking):  # fmt: skip
+           sinking, push):  # fmt: skip
     """What changes at nodes with each of six twists of their tool.
 
     Args:
@@ -151,21 +157,20 @@ def _rates(grid, middle, pose, vertices, normals, thicknesses, points, inward, t
         pose: pose of the tool, (4, 4).
         vertices, normals, thicknesses: of the skin.
         points, inward, thickness, area, strain, corners, shares, sinking: see Nodes.
+        push: see Squeeze.
 
     Returns:
-        Rates of strain, (6, N) [1/m, 1/rad]; of the depth, or on a stack of `Nodes.sinking`, (6, N) [-, m/rad]; of
-        barycentric coordinates, (6, N, 3); and of places, (6, N, 3) [-, m/rad].
+        Rates of strain, (6, N) [1/m, 1/rad]; of the depth, or on a stack of `Nodes.sinking` along a way that does not
+        swing, (6, N) [-, m/rad]; of barycentric coordinates, (6, N, 3); of places, (6, N, 3) [-, m/rad]; of the sinking
+        as that way turns, (N, 3) [m]; and of the row of columns.pushed, (6, 8).
     """
     many, origin, turn = len(area), pose[:3, 3].copy(), np.ascontiguousarray(pose[:3, :3])
     columns, depth = _columns(grid, pose, points, inward, thickness, area, strain), strain * thickness
-    mean, total = np.zeros(3), 0.0
+    mean, size = np.zeros(3), np.sqrt(_dot(push, push))
     for n in range(many):
-        total += area[n] * depth[n]
         for x in range(3):
             mean[x] += area[n] * depth[n] * inward[n, x]
-    size = np.sqrt(_dot(mean, mean))
-    way = mean / max(size, 1e-300)
-    slanted = len(sinking) > 0 and size > MIN_ONE_WAY_SHARE * total
+    way, slanted = push / max(size, 1e-300), size > 0
     places, ends = np.empty(((4 if slanted else 3) * many, 3)), np.empty(many)
     for n in range(many):
         for m in range(3):
@@ -179,20 +184,57 @@ def _rates(grid, middle, pose, vertices, normals, thicknesses, points, inward, t
     found, out = distances_and_gradients(grid[0], grid[1], grid[2], (places - origin) @ turn)
     distance, gradient = found.reshape(-1, many), (out @ turn.T).reshape(-1, many, 3)
     moved, go, turned, thicker = _carried(vertices, normals, thicknesses, points, inward, thickness, corners, shares,
-                                          way, origin, turn @ middle + origin)  # fmt: skip
+                                          mean / max(np.sqrt(_dot(mean, mean)), 1e-300), origin,
+                                          turn @ middle + origin)  # fmt: skip
     strains, deeper = _deepened(points, inward, thickness, area, strain, columns, distance, gradient, go, turned,
                                 thicker, origin, grid[3])  # fmt: skip
+    rates = _pushed_on(points, inward, thickness, area, strain, deeper, go, turned)
     if not slanted:
-        return strains, deeper, moved, go
-    swung = np.zeros((6, 3))
-    for k in range(6):
-        for n in range(many):
-            for x in range(3):
-                swung[k, x] += area[n] * (deeper[k, n] * inward[n, x] + depth[n] * turned[k, n, x])
-        swung[k] = (swung[k] - _dot(swung[k], way) * way) / size
+        return strains, deeper, moved, go, np.zeros((many, 3)), rates
     walls = np.array([wall_in(grid[3], t) for t in thickness])
-    sunk = _sunk(points, inward, depth, sinking, ends, walls, way, swung, gradient[3], go, turned, deeper, origin)
-    return strains, sunk, moved, go
+    sunk, swing = _sunk(points, inward, depth, sinking, ends, walls, way, gradient[3], go, turned, deeper, origin)
+    return strains, sunk, moved, go, swing, rates
+
+
+def _swing(parts: Sequence[Pressed], slices: Sequence[slice], swings: Sequence[np.ndarray], rates: Sequence[np.ndarray],
+           sinking: np.ndarray) -> None:  # fmt: skip
+    """Adds to rates of `Nodes.sinking` (6 K, N) what they change as the ways of K tools swing, by any tool's twists.
+
+    Args:
+        parts, slices: what they press, and which nodes are whose.
+        swings, rates: see `_rates`.
+    """
+    rows = np.array([pushed(*one.squeeze.nodes[:5]) for one in parts])
+    for m, rate in enumerate(rates):
+        for i in range(6):
+            turns = rate[None, i, 1:4]
+            if len(parts) > 1:
+                ends, step = np.stack([rows, rows]), SWING * rows[m, 7] / max(np.linalg.norm(rate[i, 4:7]), 1e-300)
+                ends[:, m] += step * np.multiply.outer([1.0, -1.0], rate[i])
+                turns = (shared_pushes(ends[0]) - shared_pushes(ends[1])) / (2 * step)
+            for k, one in enumerate(parts):
+                push, turn = one.squeeze.push, turns[k]
+                if square := float(push @ push):
+                    turn = (turn - turn @ push / square * push) / math.sqrt(square)
+                    sinking[6 * m + i, slices[k]] += swings[k] @ turn
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _pushed_on(points, inward, thickness, area, strain, deeper, go, turned):
+    """Rates of the row of columns.pushed, (6, 8), as nodes (N,) get deeper, go and turn, (6, N) and (6, N, 3)."""
+    row, out = pushed(points, inward, thickness, area, strain), np.zeros((6, 8))
+    for k in range(6):
+        spread = 0.0
+        for n in range(len(area)):
+            weight, more = area[n] * strain[n] * thickness[n], area[n] * deeper[k, n]
+            out[k, 0] += more
+            for x in range(3):
+                away = points[n, x] - row[4 + x]
+                out[k, 1 + x] += more * inward[n, x] + weight * turned[k, n, x]
+                out[k, 4 + x] += (more * away + weight * go[k, n, x]) / row[0]
+                spread += more * away * away + 2 * weight * away * go[k, n, x]
+        out[k, 7] = 0.5 * (spread / row[0] - out[k, 0] / row[0] * row[7] ** 2) / max(row[7], 1e-12)
+    return out
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
@@ -304,14 +346,14 @@ def _deepened(points, inward, thickness, area, strain, columns, distance, gradie
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _sunk(points, inward, depth, sinking, ends, walls, way, swung, gradient, go, turned, deeper, origin):
-    """Rates of `Nodes.sinking`, (6, N): of depths along one way (3,) for all, which swings, (6, 3).
+def _sunk(points, inward, depth, sinking, ends, walls, way, gradient, go, turned, deeper, origin):
+    """Rates of `Nodes.sinking`, (6, N), of depths along one way (3,) for all; and as that turns, (N, 3) [m].
 
     Args:
         ends: where the tool ends along that way, (N,) [m].
         walls: see rays.wall_in, (N,) [m].
     """
-    out = deeper.copy()
+    out, swing, still = deeper.copy(), np.zeros((len(depth), 3)), np.zeros(3)
     for n in range(len(depth)):
         along, cosine, s = _dot(gradient[n], way), _dot(inward[n], way), ends[n]
         more = s * cosine - depth[n]
@@ -320,10 +362,12 @@ def _sunk(points, inward, depth, sinking, ends, walls, way, swung, gradient, go,
         share = min(max((sinking[n] - depth[n]) / more, 0.0), 1.0)  # of what it sinks more than its column says
         rises = share < 1 and abs(share - depth[n] / walls[n]) < 0.02
         for k in range(6):
-            rate = _entered(gradient[n], points[n], way, s, go[k, n], swung[k], k, origin) / along
-            rate = rate * cosine + s * (_dot(turned[k, n], way) + _dot(inward[n], swung[k]))
+            rate = _entered(gradient[n], points[n], way, s, go[k, n], still, k, origin) / along
+            rate = rate * cosine + s * _dot(turned[k, n], way)
             out[k, n] += share * (rate - deeper[k, n]) + (more * deeper[k, n] / walls[n] if rises else 0.0)
-    return out
+        for x in range(3):
+            swing[n, x] = share * s * (inward[n, x] - cosine / along * gradient[n, x])
+    return out, swing
 
 
 @numba.njit(cache=True, error_model="numpy", inline="always")

@@ -59,8 +59,8 @@ MAX_BESIDE = 0.3  # change of a force by the tools beside, beyond which the pose
 OPEN = 2.0  # distance of a hole in a tool's mesh over the depth, up to which what is inside the tool there is a guess
 SHELL, SHELL_FROM = 2.5, 0.02  # bound on a force per share of work above this by which a limb is stiff as a shell
 SHALLOW, SHALLOW_TO = 0.1, 0.05  # bound on a first touch of one material, and depth over the thickness where it ends
-FLATTEST = 1e3  # how far facets lie below smooth skin, over the depth of a touch, at most
-MOST_MORE = 100.0  # logarithm of how much harder that may press, at most
+MOST_MORE = 100.0  # logarithm of how much harder a touch may press, as facets lie below smooth skin, at most
+UNSOLVED = 0.02  # how far depths may be missed, over the deepest, where contact is found
 STUCK = 0.5  # error of what skin that sticks carries along itself, over that
 MAX_LEVER = 1.0  # torque that is not carried over the force, over the contact's radius, that is not yet worth a word
 SURE = 0.02  # largest error of a distance field over the depth, up to which it does not matter where the field is off
@@ -202,11 +202,16 @@ class Toucher:
         held: dict[str, Held] = {}
         beside: dict[str, tuple[float, float]] = {}
         covered: set[str] = set()
+        told: dict[str, _Placed] = {}
         for some in groups_of([one.squeeze.nodes.points for one in pressing], self._thickest):
             group = [pressing[n] for n in some]
             if len(group) == 1:
                 held[group[0].contact.name] = group[0].held or self.net.hold(group[0].squeeze.nodes)
                 continue
+            if self.layer.stacked:
+                squeezes = self.columns.as_one([(one.field, one.pose, one.squeeze) for one in group])
+                group = [one._replace(squeeze=squeeze) for one, squeeze in zip(group, squeezes, strict=True)]
+                told |= {one.contact.name: one for one in group}
             nodes = self.joined([(one.field, one.pose, one.squeeze) for one in group])
             together = self.net.hold(nodes)
             if len(group) >= PINS:
@@ -219,8 +224,8 @@ class Toucher:
                 pressure, doubt, outside = (values[start:end] for values in together[:3])
                 held[one.contact.name] = together._replace(pressure=pressure, doubt=doubt, outside=outside)
             covered |= self._covered(group, nodes, held)
-        return [self._answer(one, held.get(one.contact.name, NOTHING), beside.get(one.contact.name), alone,
-                             one.contact.name in covered) for one in placed]  # fmt: skip
+        return [self._answer(told.get(name, one), held.get(name, NOTHING), beside.get(name), alone, name in covered)
+                for one in placed for name in (one.contact.name,)]  # fmt: skip
 
     def joined(self, tools: Sequence[tuple[SignedDistance, Transform, Squeeze]]) -> Nodes:
         """Nodes of tools that feel each other, one after the other: field, pose_body_from_tool and squeeze of each."""
@@ -527,12 +532,14 @@ class Toucher:
             if led < LED_OUT:
                 bound += led**-held.power - 1
         bound += SHELL * max(held.shell - SHELL_FROM, 0.0)
+        unsolved = held.missed > UNSOLVED
+        bound += 1 + held.power * held.missed if unsolved else 0.0
         if size > 0 and not layer.stacked:
             bound += SHALLOW * max(1 - depth / (SHALLOW_TO * thickness), 0.0)
         beside_off = 0.0 if one.force is None else abs(1 / scale - 1) if len(v) else 1.0  # each was placed as if alone
         if beside_off > 2 * FORCE_TOLERANCE:
             bound += beside_off
-        flat = min(below / max(depth, 1e-300), FLATTEST)  # the skin is no facets, whose middle lies twice as low
+        flat = below / max(depth, 1e-300)  # the skin is no facets, whose middle lies twice as low
         more = held.power * math.log1p(flat + flat * min(flat, 1.0))
         bound += STUCK * along + math.expm1(min(more, MOST_MORE))
         beside, radius = among or pins(nodes.points, nodes.area, nodes.thickness, forces)
@@ -558,6 +565,9 @@ class Toucher:
         if led < LED_OUT:
             trust = trust.also(f"{touch.name} is {1e3 * depth:.2g} mm deep, and thin: the skin below it is led out of "
                                f"its walls, and goes along by {led:.0%} of that", in_range=False)  # fmt: skip
+        if unsolved:
+            trust = trust.also(f"where {touch.name} presses was not found: skin misses it by {held.missed:.0%} of its "
+                               "depth", in_range=False, converged=False)  # fmt: skip
         if beside_off > MAX_BESIDE:
             where = (f"no place was found where {touch.name} presses so: the nearest" if held is one.held else
                      f"{touch.name} was moved to where it presses so alone; beside the other tools that")  # fmt: skip

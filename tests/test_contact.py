@@ -647,10 +647,51 @@ def test_a_plate_presses_thick_tissue_as_a_block_with_its_lower_face(place: str,
         assert forces[0] == pytest.approx(forces[1], rel=0.08)
 
 
+@pytest.mark.parametrize("place, off", [("right_thigh", 0.1), ("abdomen", 0.04)])
+def test_parts_of_a_ball_press_thick_tissue_as_the_ball(place: str, off: float) -> None:
+    """Halves and quarters: each on its own way pressed with up to half as much again."""
+    layer, radius = living(Body.anny(), place, edge_length=8e-3), 0.012
+    vertex, toucher, whole = site(layer, place), Toucher(layer), trimesh.creation.icosphere(3, radius)
+    pose, parts = trimesh.geometry.align_vectors([0, 0, 1], layer.normals[vertex]), [[whole]]
+    for axis in np.eye(3)[:2]:
+        parts.append([one.slice_plane((0, 0, 0), side * axis, cap=True) for one in parts[-1] for side in (1, -1)])
+    tools = [[Tool(f"part_{k}", one.vertices, one.faces) for k, one in enumerate(some)] for some in parts]
+    for strain in (0.5, 0.65):
+        depth = strain * float(layer.thickness[vertex])
+        pose[:3, 3] = layer.vertices[vertex] + (radius - depth) * layer.normals[vertex]
+        force, *of_parts = (float(np.linalg.norm(sum(touch.push for touch in toucher.touch_all(
+            [Contact(tool, pose) for tool in some])))) for some in tools)  # fmt: skip
+        assert of_parts == pytest.approx([force, force], rel=off)
+
+
+def test_fingers_on_either_side_of_a_limb_go_each_their_own_way() -> None:
+    """As parts of one tool they would go neither."""
+    layer = living(Body.anny(), "left_forearm", edge_length=8e-3)
+    vertex, toucher, finger = site(layer, "left_forearm"), Toucher(layer), ball(8e-3)
+    middle = layer.vertices[vertex] - 0.03 * layer.normals[vertex]
+    ways = layer.vertices - middle
+    far = int((ways @ layer.normals[vertex] / np.linalg.norm(ways, axis=1)).argmin())
+    contacts = [Contact(Tool(name, finger.vertices, finger.faces), at(*(
+        layer.vertices[v] + (8e-3 - 0.3 * layer.thickness[v]) * layer.normals[v])))
+        for name, v in (("thumb", vertex), ("finger", far))]  # fmt: skip
+    alone, together = [toucher.touch(one) for one in contacts], toucher.touch_all(contacts)
+    for one, other in zip(alone, together, strict=True):
+        np.testing.assert_array_equal(one.pressed.squeeze.push, other.pressed.squeeze.push)
+
+
 def test_a_sheet_under_the_skin_is_as_deep_as_it_lies() -> None:
     sheet, tilted = box(1.6e-4, 3e-3, 13e-3), turn((0, 1, 0), 0.95, (1e-3, 1e-3, -3.3e-3))
     touch = Toucher(plate(0.084, 7e-3, 4.2e-3)).touch(press(sheet, tilted, None))
     assert touch.force > 0 and touch.depth > 0.9 * 4.2e-3 and not touch.trust.in_range
+
+
+def test_what_is_not_solved_is_flagged(sim: Simulator, monkeypatch: pytest.MonkeyPatch) -> None:
+    contact, hold = press(BALL, on_limb(), None), sim.toucher.net.hold
+    solved = touch_of(sim.step([contact]))
+    monkeypatch.setattr(sim.toucher.net, "hold", lambda nodes: hold(nodes)._replace(missed=0.03))
+    touch = sim.toucher.touch(contact)
+    assert solved.trust.ok and not touch.trust.converged and not touch.trust.in_range and "misses" in touch.trust.why
+    assert touch.force == pytest.approx(solved.force) and touch.force_bound > solved.force_bound + touch.force
 
 
 def test_holes_are_flagged_where_they_are_near_what_presses(sim: Simulator) -> None:

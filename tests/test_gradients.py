@@ -171,7 +171,7 @@ def by_pose_of(simulator: Simulator, contacts: list[Contact], mover: int, feeler
         moved = [replace(one, pose_body_from_tool=pose) if k == mover else one for k, one in enumerate(contacts)]
         return wrench_of(simulator, moved, contacts[feeler].name)
 
-    return differences(ask, contacts[mover].pose_body_from_tool, (2e-4,))
+    return differences(ask, contacts[mover].pose_body_from_tool, (5e-4,))
 
 
 def test_tools_side_by_side_feel_each_others_poses(gradients: Gradients) -> None:
@@ -201,7 +201,7 @@ def test_tools_that_come_nearer_give_way_as_each_sinks_the_skin_beside_it() -> N
         for mover, name in enumerate(("ball", "punch")):
             for feeler, one in enumerate(found):
                 expected = by_pose_of(simulator, two, mover, feeler)[:, :3]
-                told, limit = (one.pose, 0.05) if mover == feeler else (one.across[name], 0.23)
+                told, limit = (one.pose, 0.05) if mover == feeler else (one.across[name], 0.25)
                 assert off(told[:, :3], expected) < limit
 
 

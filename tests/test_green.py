@@ -48,7 +48,7 @@ def under(green: Green, field: SignedDistance, pose: np.ndarray) -> tuple[Nodes,
     """Nodes under a tool, what they feel of each other, and the linear forces over E."""
     nodes = Columns(green.layer).squeezed(field, pose).nodes
     matrix = green.matrix(nodes, np.zeros(len(nodes.area), np.int64))
-    return nodes, matrix, solve(matrix, nodes.sinking)
+    return nodes, matrix, solve(matrix, nodes.sinking)[0]
 
 
 def test_a_wide_force_sinks_the_stack_as_its_table_says():

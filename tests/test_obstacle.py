@@ -35,7 +35,8 @@ def solved(points: np.ndarray, spacing: float, strain: np.ndarray, nu: float = N
     group = np.zeros(n, np.int64) if group is None else group
     inward, table, thick = np.tile([0.0, 0.0, -1.0], (n, 1)), response(nu), np.full(n, thickness)
     matrix, rings = pairs(points, inward, thick, area, group, thickness, *table)
-    force = solve(matrix, strain)
+    force, missed = solve(matrix, strain)
+    assert missed < 1e-4
     pressure = force * thickness**2 / area
     moments, vectors = (one[0] for one in moments_of(rings, points, thick, area, pressure[None], strain[None]))
     return Linear(pressure, moments, vectors, power_of(matrix, force, strain.max()))
@@ -50,6 +51,13 @@ def test_a_light_ball_presses_as_hertz_says(nu: float) -> None:
     strain = depth - (points**2).sum(axis=1) / (2 * radius)
     force = 0.5 * np.sqrt(3) * spacing**2 * solved(points, spacing, strain, nu).pressure.sum()
     assert force == pytest.approx(4 / 3 / (1 - nu**2) * np.sqrt(radius) * depth**1.5, rel=0.05)
+
+
+def test_it_says_how_far_what_has_no_solution_is_missed() -> None:
+    """Two nodes that sink each other more than themselves, and a third whose skin rises under force."""
+    matrix = np.array([[1.0, 2.0, 0.0], [2.0, 1.0, 0.0], [0.0, 0.0, -1.0]])
+    assert solve(matrix, np.array([1.0, 0.9, 0.5]))[1] > 0.02
+    assert solve(np.eye(3), np.array([1.0, 0.9, -0.5]))[1] < 1e-6
 
 
 def test_a_wide_flat_tool_presses_in_its_middle_as_a_confined_column() -> None:

@@ -25,7 +25,7 @@ SIDES = wp.constant(wp.vec2d(*toucher.SIDES))
 SHELL, SHELL_FROM = wp.constant(wp.float64(toucher.SHELL)), wp.constant(wp.float64(toucher.SHELL_FROM))
 SHALLOW, SHALLOW_TO = wp.constant(wp.float64(toucher.SHALLOW)), wp.constant(wp.float64(toucher.SHALLOW_TO))
 FAR_OFF = wp.constant(wp.float64(toucher.FAR))
-FLAT, MOST_MORE = wp.constant(wp.float64(toucher.FLATTEST)), wp.constant(wp.float64(toucher.MOST_MORE))
+UNSOLVED, MOST_MORE = wp.constant(wp.float64(toucher.UNSOLVED)), wp.constant(wp.float64(toucher.MOST_MORE))
 STUCK, WIDER = wp.constant(wp.float64(toucher.STUCK)), wp.constant(wp.float64(pieces.WIDER))
 GROUP, PINS_DEEP = wp.constant(wp.float64(pieces.GROUP)), wp.constant(wp.float64(pieces.DEEP))
 PIECE = wp.constant(wp.float64(2.0 / 3.0**0.5 * pieces.SPACINGS**2))
@@ -418,7 +418,7 @@ def answer(first: wp.int32, many: wp.int32, known: Known, skins: Skins, scratch:
     sound = sound and bony <= BONY_SHARE * forces
     sound = sound and one.softness * highest <= known.pressure and depth * count <= known.depth * thick
     sound = sound and strange <= UNSEEN * forces and one.learnt == 1
-    sound = sound and depth <= one.soft
+    sound = sound and depth <= one.soft and scratch.missed[s] <= UNSOLVED
     sound = sound and (size <= SIDES[0] * forces or size >= SIDES[1] * forces)
     group = pins[0] > GROUP and depth > PINS_DEEP * pins[1]
     sound = sound and not group
@@ -445,9 +445,11 @@ def answer(first: wp.int32, many: wp.int32, known: Known, skins: Skins, scratch:
             bound += SHALLOW * wp.max(real(1.0) - depth * forces / (SHALLOW_TO * carried), real(0.0))
         lacks = wp.max(wp.min(lack / wp.max(depth + lack, NONE), MOST_LACKING) - EDGE_SURE, real(0.0))
         bound += wp.pow(real(1.0) - lacks, -power) - real(1.0)
-        flat = wp.min(below / wp.max(depth, NONE), FLAT)
+        flat = below / wp.max(depth, NONE)
         flat = power * wp.log(real(1.0) + flat + flat * wp.min(flat, real(1.0)))
         bound += STUCK * along / size + wp.exp(wp.min(flat, MOST_MORE)) - real(1.0)
+        if scratch.missed[s] > UNSOLVED:
+            bound += real(1.0) + power * scratch.missed[s]
         if group:
             bound *= WIDER
         bounds[n, k] = bounds.dtype(one.modulus * size * bound)

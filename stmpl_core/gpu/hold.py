@@ -119,6 +119,7 @@ def solve(many: wp.int32, linear: wp.int32, skins: Skins, scratch: Scratch):
         scratch.move[s, i] = real(0.0)
     wait()
     change, largest, before, number = real(count), real(0.0), real(0.0), wp.int32(0)
+    down = real(1.0)
     while change > TOLERANCE * largest and number < ITERATIONS:
         number += 1
         square = real(0.0)
@@ -128,7 +129,8 @@ def solve(many: wp.int32, linear: wp.int32, skins: Skins, scratch: Scratch):
             if scratch.force[s, i] > real(0.0):
                 square += gap * gap
         square = sum_of(square)
-        on, up, down = real(0.0), real(0.0), real(0.0)
+        on, up = real(0.0), real(0.0)
+        down = real(0.0)
         if before > real(0.0):
             on = square / before
         before = square
@@ -158,6 +160,17 @@ def solve(many: wp.int32, linear: wp.int32, skins: Skins, scratch: Scratch):
         largest = most_of(largest)
         if most_of(again) > real(0.0):
             before = real(0.0)
+    missed, deepest = real(0.0), real(1e-300)
+    if number >= ITERATIONS or down <= real(0.0):
+        for i in range(lane, count, lanes):
+            gap = _times(scratch, s, i, scratch.force) - scratch.wanted[s, i]
+            deepest = wp.max(deepest, scratch.wanted[s, i])
+            missed = wp.max(missed, -gap)
+            if scratch.force[s, i] > real(0.0):
+                missed = wp.max(missed, gap)
+        missed = most_of(missed)
+        deepest = most_of(deepest)
+    scratch.missed[s] = missed / deepest
 
 
 @wp.kernel

@@ -118,10 +118,11 @@ SCRATCH: dict[str, tuple[Any, str]] = {
     "chart": (wp.int32, "CF"), "sides": (wp.int32, "C"), "axes": (mat33, "C6"), "deepest": (real, "C"),
     "covers": (real, "C"), "height": (real, "C"), "sees": (real, "C"), "also": (real, "C"), "lattice": (Lattice, "C"),
     "owner": (wp.int32, "CL"), "value": (real, "CL"),
-    "nodes": (wp.int32, "S"), "wants": (wp.int32, "1"), "begin": (wp.int32, "S"), "tool": (wp.int32, "SN"),
-    "cell": (wp.int32, "SN"), "face": (wp.int32, "SN"), "shares": (vec3, "SN"), "point": (vec3, "SN"),
-    "inward": (vec3, "SN"), "thick": (real, "SN"), "area": (real, "SN"), "strain": (real, "SN"),
-    "fold": (wp.int32, "SN"), "queue": (wp.int32, "SN"), "mean": (vec3, "C"), "least_area": (real, "C"),
+    "nodes": (wp.int32, "S"), "missed": (real, "S"), "wants": (wp.int32, "1"), "begin": (wp.int32, "S"),
+    "tool": (wp.int32, "SN"), "cell": (wp.int32, "SN"), "face": (wp.int32, "SN"), "shares": (vec3, "SN"),
+    "point": (vec3, "SN"), "inward": (vec3, "SN"), "thick": (real, "SN"), "area": (real, "SN"), "strain": (real, "SN"),
+    "fold": (wp.int32, "SN"), "queue": (wp.int32, "SN"), "mean": (vec3, "C"), "middle": (wp.vec4d, "C"),
+    "pushed": (real, "C"), "way": (vec3, "C"), "as_one": (real, "CT"), "least_area": (real, "C"),
     "most_area": (real, "C"), "sinking": (real, "SQ"), "soft": (real, "SQ"), "slot": (wp.int32, "SK"),
     "met": (wp.int32, "SK"), "meets": (wp.int32, "S"), "slots": (wp.int32, "SQ9"), "weights": (real, "SQ9"),
     "parts": (real, "SQ9"), "around_node": (wp.int32, "SQ"), "rows": (real, "SQK"),
@@ -152,8 +153,8 @@ class Room(NamedTuple):
     def sizes(self, scenes: int, tools: int) -> dict[str, int]:
         """Length of each axis of SCRATCH."""
         faces = 2 * self.columns + 64
-        return {"C": scenes * tools, "S": scenes, "M": self.columns, "B": self.blocks, "F": faces, "6": CHARTS,
-                "P": max(faces, LEAST_PARTS), "L": MOST_PLACES, "N": self.nodes, "W": self.nodes // 32,
+        return {"C": scenes * tools, "S": scenes, "T": tools, "M": self.columns, "B": self.blocks, "F": faces,
+                "6": CHARTS, "P": max(faces, LEAST_PARTS), "L": MOST_PLACES, "N": self.nodes, "W": self.nodes // 32,
                 "I": max(NODE.size, STACK_NODE.size), "H": HIDDEN, "1": 1, "K": max(1, self.coarse), "9": 9,
                 "Q": self.nodes if self.coarse else 1}  # fmt: skip
 

@@ -5,7 +5,7 @@ import math
 
 import warp as wp
 
-from stmpl_core import contact_net, green
+from stmpl_core import columns, contact_net, green
 from stmpl_core.columns import MIN_ONE_WAY_SHARE
 from stmpl_core.gpu.blocks import sum_of, wait
 from stmpl_core.gpu.columns import _marked
@@ -27,6 +27,7 @@ from stmpl_core.networks import STACK_NODE
 from stmpl_core.response import SPREAD as SPREAD_OF_AREA
 
 ONE_WAY = wp.constant(wp.float64(MIN_ONE_WAY_SHARE))
+AS_ONE, EACH_ITS_OWN = (wp.constant(wp.float64(x)) for x in columns.AS_ONE)
 ROWS, FARTHEST, AROUND = (wp.constant(wp.float64(x)) for x in (green.ROWS, green.FARTHEST, green.AROUND))
 FIRST_LOG, STEP_LOG = wp.constant(wp.float64(green.FIRST_LOG)), wp.constant(wp.float64(green.STEP_LOG))
 LAST_ROW = wp.constant(wp.float64(len(green.SPREADS) - 1.001))
@@ -52,23 +53,63 @@ wp.set_module_options({**OPTIONS, "max_unroll": 4})
 
 @wp.kernel
 def find_mean(many: wp.int32, skins: Skins, scratch: Scratch):
-    """Mean way of the skin under each tool, 0 where it has none: columns._sinking; and the extremes of its areas."""
+    """Where the skin under each tool is pushed: columns.pushed; and the extremes of the areas of its group."""
     c = wp.tid()
     s, k = c // many, c % many
-    mean, total, least, most = vec3(), real(0.0), real(1e30), real(0.0)
+    mean, middle, total, square = vec3(), vec3(), real(0.0), real(0.0)
+    least, most = real(1e30), real(0.0)
     for i in range(scratch.nodes[s]):
         if scratch.tool[s, i] == k:
             push = scratch.area[s, i] * scratch.strain[s, i] * scratch.thick[s, i]
             mean = mean + push * scratch.inward[s, i]
+            middle = middle + push * scratch.point[s, i]
             total += push
         if scratch.group[s * many + scratch.tool[s, i]] == scratch.group[c]:
             least = wp.min(least, scratch.area[s, i])
             most = wp.max(most, scratch.area[s, i])
-    if wp.length(mean) <= ONE_WAY * total:
-        mean = vec3()
-    scratch.mean[c] = wp.normalize(mean)
+    middle = middle / wp.max(total, real(1e-300))
+    for i in range(scratch.nodes[s]):
+        if scratch.tool[s, i] == k:
+            push = scratch.area[s, i] * scratch.strain[s, i] * scratch.thick[s, i]
+            square += push * wp.length_sq(scratch.point[s, i] - middle)
+    scratch.mean[c] = mean
+    scratch.middle[c] = wp.vec4d(middle[0], middle[1], middle[2], wp.sqrt(square / wp.max(total, real(1e-300))))
+    scratch.pushed[c] = total
     scratch.least_area[c] = least
     scratch.most_area[c] = most
+
+
+@wp.kernel
+def share_way(many: wp.int32, scratch: Scratch):
+    """The way of the skin under each tool of a scene, 0 where it has none: columns.shared_pushes."""
+    s = wp.tid()
+    first = s * many
+    for k in range(many):
+        for m in range(many):
+            own, other, share = scratch.middle[first + k], scratch.middle[first + m], real(0.0)
+            pressing = scratch.pushed[first + k] > real(0.0) and scratch.pushed[first + m] > real(0.0)
+            if pressing and scratch.group[first + k] == scratch.group[first + m]:
+                apart = wp.length(vec3(own[0] - other[0], own[1] - other[1], own[2] - other[2]))
+                share = (EACH_ITS_OWN - apart / wp.max(own[3] + other[3], real(1e-12))) / (EACH_ITS_OWN - AS_ONE)
+                share = wp.clamp(share, real(0.0), real(1.0))
+            scratch.as_one[first + k, m] = share * share * (real(3.0) - real(2.0) * share)
+    for third in range(many):
+        for k in range(many):
+            for m in range(many):
+                by = wp.min(scratch.as_one[first + k, third], scratch.as_one[first + third, m])
+                scratch.as_one[first + k, m] = wp.max(scratch.as_one[first + k, m], by)
+    for k in range(many):
+        way, whole = vec3(scratch.mean[first + k]), real(scratch.pushed[first + k])
+        for m in range(many):
+            if m != k and scratch.as_one[first + k, m] > real(0.0):
+                facing = real(2.0) * wp.dot(scratch.mean[first + k], scratch.mean[first + m])
+                facing = facing / (scratch.pushed[first + k] * scratch.pushed[first + m])
+                share = scratch.as_one[first + k, m] * wp.clamp(facing, real(0.0), real(1.0))
+                way = way + share * scratch.mean[first + m]
+                whole += share * scratch.pushed[first + m]
+        if wp.length(way) <= ONE_WAY * whole:
+            way = vec3()
+        scratch.way[first + k] = wp.normalize(way)
 
 
 @wp.kernel
@@ -77,7 +118,7 @@ def sink(lanes: wp.int32, many: wp.int32, skins: Skins, scratch: Scratch):
     s, lane = wp.tid()
     for i in range(lane, scratch.nodes[s], lanes):
         c, depth = s * many + scratch.tool[s, i], scratch.strain[s, i] * scratch.thick[s, i]
-        sinking, way = real(depth), scratch.mean[c]
+        sinking, way = real(depth), scratch.way[c]
         if wp.length_sq(way) > real(0.0):
             pose, cosine = wp.transpose(scratch.pose[c]), wp.dot(scratch.inward[s, i], way)
             guess = wp.max(depth * cosine, real(1e-9))

@@ -382,6 +382,7 @@ class WarpBatch:
         self._run(stacks.fold, (scenes, self._block), many, skins, scratch)
         if self._stacked:
             self._run(stacks.find_mean, tools, many, skins, scratch)
+            self._run(stacks.share_way, scenes, many, scratch)
             self._run(stacks.sink, shared, lanes, many, skins, scratch)
             self._run(stacks.meet, blocks, many, skins, scratch)
             self._run(stacks.give_way, shared, lanes, many, skins, scratch)
