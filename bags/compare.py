@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Protocol, Self
 
 from bags.frame import Frame
 from bags.provenance import allowance
-from bags.run import BEGINNING
+from bags.run import BEGINNING, Run
 from bags.survey import Moment, Survey, survey
 from bags.whole import Whole, in_common, whole
 from stmpl_core.contact import Contact
@@ -19,6 +20,7 @@ from stmpl_core.layer import SoftLayer
 from stmpl_core.load import Load
 from stmpl_core.methods.base import Method
 from stmpl_core.metrics import Score, mean_and_deviation, score
+from stmpl_core.pool import Pool
 from stmpl_core.touch import Answer
 from stmpl_core.trust import Displacement
 
@@ -174,6 +176,7 @@ def compare_run(
     tolerance: float | None = None,
     tool: str = "",
     on_frame: Callable[[int, int], None] | None = None,
+    workers: int = 1,
 ) -> Comparison:
     """Solves a sample of a run's frames by `reference`.
 
@@ -192,18 +195,22 @@ def compare_run(
         tolerance: allowed mean error under the contact in the worst frame [m].
         tool: name of the tool that alone is on the skin in a frame that is taken; empty: any tools.
         on_frame: callback with (done, total) before each frame, for a progress bar.
+        workers: number of processes that the reference solves frames in, each with memory of its own; from 2 on, a
+            script that asks for it must be one that can be imported (`if __name__ == "__main__"`).
 
     Raises:
         BagError: the run holds no answers, no loaded frame, or no pressures.
     """
     run = run if isinstance(run, Survey) else survey(run)
-    judge = _presser(reference, run) if hasattr(reference, "press") else _solver(reference, run)  # type: ignore[arg-type]
-    judged = (lambda frame: frame) if method is None else _solver(method, run)
+    judged = (lambda frame: frame) if method is None else _judge(method, run.bag)
     names = (run.method if method is None else method.name, reference.name)
     elastic = (lambda frame: _elastic(frame, run.bag.layer_of(frame))) if method is None else (lambda frame: True)
     late = _left_out(run)
-    taken = [moment for moment in run.moments[late:] if not tool or moment.tools == (tool,)]
-    return _compare(run, sample(taken, frames), names, judged, judge, tolerance, on_frame, late, alike=elastic)
+    picks = sample([moment for moment in run.moments[late:] if not tool or moment.tools == (tool,)], frames)
+    workers = min(workers, len(picks))
+    alone = nullcontext(_judge(reference, run.bag))
+    with _ahead(run.bag, reference, picks, workers) if workers > 1 else alone as judge:
+        return _compare(run, picks, names, judged, judge, tolerance, on_frame, late, alike=elastic)
 
 
 def compare_bags(
@@ -360,33 +367,44 @@ def _pair(run: Survey, moment: Moment, frame: Frame, ours: Displacement, referen
                      alike)  # fmt: skip
 
 
-def _solver(method: Method, run: Survey) -> Side:
-    ready = _prepared(method, run)
-    return lambda frame: ready(frame).solve(_load(frame))
-
-
-def _presser(reference: Presser, run: Survey) -> Side:
-    ready = _prepared(reference, run)
+def _judge(side: Method | Presser, bag: Run) -> Side:
+    """How a method answers a frame; it is prepared again only where the layer changes."""
+    layer: SoftLayer | None = None
 
     def answer(frame: Frame) -> Displacement:
-        _load(frame)
-        return ready(frame).press([c for c in run.bag.contacts(frame) if frame.touches[c.name].presses], frame)
+        nonlocal side, layer
+        load = _load(frame)
+        if layer is not bag.layer_of(frame):
+            layer = bag.layer_of(frame)
+            side = side.prepare(layer)
+        if press := getattr(side, "press", None):
+            return press([one for one in bag.contacts(frame) if frame.touches[one.name].presses], frame)
+        return side.solve(load)  # type: ignore[union-attr]
 
     return answer
 
 
-def _prepared[Judge: (Method, Presser)](side: Judge, run: Survey) -> Callable[[Frame], Judge]:
-    """`side`, prepared for the layer of a frame, and again only where the layer changes."""
-    layer: SoftLayer | None = None
+@contextmanager
+def _ahead(bag: Run, side: Method | Presser, picks: Sequence[Moment], workers: int) -> Iterator[Side]:
+    """The same, by processes that each take the next of some frames."""
+    numbers = [moment.number for moment in picks]
+    with Pool(workers, _take, bag.file, bag.namespace, side) as pool:
+        solved = [pool.submit(_solved, number) for number in numbers]
+        found = {_key(frame): one for frame, one in zip(bag.frames(numbers), solved, strict=True)}
+        yield lambda frame: found[_key(frame)].result()
 
-    def ready(frame: Frame) -> Judge:
-        nonlocal side, layer
-        if layer is not run.bag.layer_of(frame):
-            layer = run.bag.layer_of(frame)
-            side = side.prepare(layer)
-        return side
 
-    return ready
+_taken: list[tuple[Run, Side]] = []  # of a process of `_ahead`
+
+
+def _take(file: Path, namespace: str, side: Method | Presser) -> None:
+    bag = Run(file, namespace)
+    _taken.append((bag, _judge(side, bag)))
+
+
+def _solved(number: int) -> Displacement:
+    bag, judge = _taken[0]
+    return judge(next(iter(bag.frames([number]))))
 
 
 def _load(frame: Frame) -> Load:

@@ -51,6 +51,14 @@ class Stiffer:
         return Displacement(self.factor * answer.displacement, Trust(converged=self.converged), self.name)
 
 
+class Refusing(Stiffer):
+    """A method that solves nothing."""
+
+    def solve(self, load):
+        """Raises what a method may raise."""
+        raise InvalidInput(f"a load of {load.values.max():.3g} is refused")
+
+
 @pytest.fixture(scope="module")
 def run(tmp_path_factory):
     folder = tmp_path_factory.mktemp("run") / "bag"
@@ -169,6 +177,16 @@ def test_a_run_compared_with_itself_has_zero_error(run):
     assert all(pair.score.mee == 0 and pair.score.peak_error == 0 for pair in comparison.pairs)
     same = compare_run(run, Winkler(), method=Winkler(), tolerance=0.0)
     assert same.passed and same.worst_under_contact == 0
+
+
+def test_frames_are_judged_by_several_processes_as_by_one(run):
+    alone, together = (compare_run(run, Stiffer(1.25), frames=5, workers=workers) for workers in (1, 2))
+    assert len(alone.pairs) == len(together.pairs) == 5
+    for one, other in zip(alone.pairs, together.pairs, strict=True):
+        assert one.number == other.number
+        np.testing.assert_array_equal(one.reference.displacement, other.reference.displacement)
+    refused = [compare_run(run, Refusing(1.0), frames=2, workers=workers).failed for workers in (1, 2)]
+    assert refused[0] == refused[1] and len(refused[0]) == 2
 
 
 def test_the_comparison_measures_the_error_that_was_put_in(run):
