@@ -294,6 +294,18 @@ class History:
         return [(touch, min(depth / touch.depth, 1.0)) for touch, depth in found if touch.presses]
 
 
+def compile_steps() -> None:
+    """Compiles what steps with a memory take beyond touches: a quarter of what a first start does, and no more."""
+    pose, wrench, none, dt = np.eye(4), np.zeros(6), np.zeros(0), 0.01
+    series, fades = (none, none), np.zeros((2, 1))
+    before = np.array([fresh(pose, 0).numbers])
+    patches, after, out, says = np.zeros((1, PATCH)), np.empty_like(before), np.zeros((1, OUT)), np.zeros((1, SAYS))
+    stepped.asked_for(before[0], pose, wrench, *series, fades, dt)
+    stepped.tell(wrench, 0.0, True, 0.0, pose, wrench, pose, False, False, 0.0, 0.0, patches[0])
+    stepped.step(patches, before, after, True, *series, fades, True, *FLAT, dt, out, says)
+    stepped.doubted(before, after, *series, dt, np.zeros(1), out, says)
+
+
 def _possible(contacts: Sequence[Contact], touches: Sequence[Touch], bounds: np.ndarray) -> np.ndarray:
     """Force that each may press with though it is not known to [N], (K,): all of a wrench that found no place."""
     out = bounds.copy()

@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable
-from concurrent.futures import Future
+from concurrent.futures import Future, wait
 from typing import Any
 
+from numba.core.event import Event, Listener
+
+from stmpl_core.history import compile_steps
 from stmpl_core.pool import Pool
 from stmpl_core.sdf import SignedDistance
 from stmpl_core.tool import Tool
@@ -32,6 +35,35 @@ class Beside[T]:
     def close(self) -> None:
         """Ends the process, whether the job is done or not."""
         self._pool.end()
+
+
+class StepsAhead(Listener):
+    """Compiles what steps with a memory take in a process beside, once the first kernel is compiled here.
+
+    Args:
+        wanted: choice to do so at all.
+    """
+
+    def __init__(self, wanted: bool) -> None:
+        self._wanted, self._beside = wanted, None
+
+    def on_start(self, event: Event) -> None:
+        """Before a kernel is compiled."""
+        if self._wanted and self._beside is None:
+            self._beside = Beside(compile_steps)
+
+    def on_end(self, event: Event) -> None:
+        """After it."""
+
+    def wait(self) -> None:
+        """Until they are on disk: what two processes compile at once rounds otherwise in the last bits."""
+        if self._beside is not None:
+            wait([self._beside.result])
+
+    def close(self) -> None:
+        """Ends the process, whatever it is at."""
+        if self._beside is not None:
+            self._beside.close()
 
 
 class Builders:

@@ -141,12 +141,16 @@ def restiffened(skin: Skin, config: NodeConfig, changed: set[str]) -> Skin | Non
     return skin.stiffened(config.new_method(), youngs_modulus=config.youngs_modulus, density=config.density)
 
 
-def warm_up(simulator: Simulator) -> None:
+def warm_up(simulator: Simulator, until_compiled: Callable[[], None] = lambda: None) -> None:
     """Solves one contact of each kind, so that nothing is left to compile when the first real one comes.
 
     Where time and friction count, they are one press that slides; where joints bend the skin, all is done bent and at
     rest. The deepest reaches into the core. Of each comes a local model. Last two tools press at one place. All rub as
     the roughest of those whose friction is told.
+
+    Args:
+        simulator: simulator to warm up.
+        until_compiled: waits until somebody else has compiled what steps with a memory take.
     """
     frictions = every, some = simulator.history.frictions
     simulator.history.frictions = max(every, *some.values(), 0.0), {}
@@ -156,12 +160,12 @@ def warm_up(simulator: Simulator) -> None:
     for angles in ([WARM_BEND] * len(rig.joints), ()) if rig else ((),):
         if rig:
             state = simulator.move_to(simulator.skin.at_angles(angles), state)
-        state = _press(simulator, tool, state)
+        state = _press(simulator, tool, state, until_compiled)
     simulator.tools.remove(tool.name)
     simulator.history.frictions = frictions
 
 
-def _press(simulator: Simulator, tool: Tool, state: State) -> State:
+def _press(simulator: Simulator, tool: Tool, state: State, until_compiled: Callable[[], None]) -> State:
     """Touches the skin where it stands, in each way."""
     layer, pose = simulator.layer, np.eye(4)
     vertex = int(np.linalg.norm(layer.vertices - layer.vertices.mean(axis=0), axis=1).argmin())
@@ -171,6 +175,7 @@ def _press(simulator: Simulator, tool: Tool, state: State) -> State:
         touches = simulator.touch([Contact(tool, pose, wrench)])
         local_contacts(simulator.history, touches)
         simulator.answer(touches)
+        until_compiled()
         for way in (0.0, 1e-3) if simulator.remembers else ():
             pose[:3, 3] += way * np.roll(layer.normals[vertex], 1)
             touches, state = simulator.touch([Contact(tool, pose.copy(), wrench)], state, 0.01)

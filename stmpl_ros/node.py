@@ -7,7 +7,7 @@ import multiprocessing
 import time
 from collections.abc import Callable
 from concurrent.futures import BrokenExecutor, Future, TimeoutError
-from contextlib import ExitStack
+from contextlib import ExitStack, closing
 from functools import partial
 from typing import Any
 
@@ -31,7 +31,7 @@ from stmpl_core.tools import Tools
 from stmpl_core.toucher import margin_on
 from stmpl_ros.answering import Answering
 from stmpl_ros.bending import Bending
-from stmpl_ros.beside import Beside
+from stmpl_ros.beside import Beside, StepsAhead
 from stmpl_ros.body_action import NOT_YET, BodyAction, Done, changes_of
 from stmpl_ros.bond import Bond
 from stmpl_ros.calibration import Calibration
@@ -140,9 +140,11 @@ class SkinNode(ServingNode):
             check(self.config, self._build)
             self.answering.limits = Limits.read(self.config.limits, self.config.limb)
             self.workshop = Workshop(self)  # its builders start while the skin is made
-            with install_listener("numba:compile", Compiling(self._tell_progress)):
+            steps = StepsAhead(self.config.relaxing or friction_of(self.config) is not None)
+            with (closing(steps), install_listener("numba:compile", steps),
+                  install_listener("numba:compile", Compiling(self._tell_progress))):  # fmt: skip
                 for simulator in self._answer_on(self._make_skin(), self.config):
-                    warm_up(simulator)
+                    warm_up(simulator, steps.wait)
         except StmplError as error:
             self._end()
             self.get_logger().error(f"cannot be configured: {error}")

@@ -70,6 +70,26 @@ print(sorted(kernels() - before))
 """
 
 
+STEPS = KERNELS + """
+from stmpl_core import Simulator, stepped
+from stmpl_core.history import compile_steps
+from stmpl_core.methods import MomentNet
+from stmpl_core.regions import HELD_SKIN
+from stmpl_ros.making import warm_up
+from tests.scenes import limb
+
+compile_steps()
+layer = limb(8e-3)
+warm_up(Simulator(layer.with_(tissue=layer.tissue.relaxing(HELD_SKIN)), MomentNet(), friction=0.3))
+print(*(len(one.signatures) for one in (stepped.asked_for, stepped.tell, stepped.step, stepped.doubted)))
+"""
+
+
+def test_what_another_process_compiles_of_steps_is_what_they_take():
+    code, said = end(start("-c", STEPS))
+    assert (code, said) == (0, "1 1 1 1\n")
+
+
 @pytest.mark.parametrize("friction", ["none", "oiled"])
 def test_nothing_is_left_to_compile_once_the_clock_of_a_robot_runs(friction):
     """One that massages, then grips."""
