@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Protocol, Self
+from typing import Any, Protocol, Self
 
 from bags.frame import Frame
 from bags.provenance import allowance
@@ -20,7 +21,7 @@ from stmpl_core.layer import SoftLayer
 from stmpl_core.load import Load
 from stmpl_core.methods.base import Method
 from stmpl_core.metrics import Score, mean_and_deviation, score
-from stmpl_core.pool import Pool
+from stmpl_core.pool import Pool, one_thread_each
 from stmpl_core.touch import Answer
 from stmpl_core.trust import Displacement
 
@@ -195,21 +196,21 @@ def compare_run(
         tolerance: allowed mean error under the contact in the worst frame [m].
         tool: name of the tool that alone is on the skin in a frame that is taken; empty: any tools.
         on_frame: callback with (done, total) before each frame, for a progress bar.
-        workers: number of processes that the reference solves frames in, each with memory of its own; from 2 on, a
-            script that asks for it must be one that can be imported (`if __name__ == "__main__"`).
+        workers: number of processes that the reference solves frames in, each with memory of its own; from 2 on it
+            is pickled, and a script that asks for it must be one that can be imported (`if __name__ == "__main__"`).
 
     Raises:
         BagError: the run holds no answers, no loaded frame, or no pressures.
     """
     run = run if isinstance(run, Survey) else survey(run)
-    judged = (lambda frame: frame) if method is None else _judge(method, run.bag)
+    judged = (lambda frame: frame) if method is None else _judge(method, run.bag, presses=False)
     names = (run.method if method is None else method.name, reference.name)
     elastic = (lambda frame: _elastic(frame, run.bag.layer_of(frame))) if method is None else (lambda frame: True)
     late = _left_out(run)
     picks = sample([moment for moment in run.moments[late:] if not tool or moment.tools == (tool,)], frames)
     workers = min(workers, len(picks))
-    alone = nullcontext(_judge(reference, run.bag))
-    with _ahead(run.bag, reference, picks, workers) if workers > 1 else alone as judge:
+    judge = _judge(reference, run.bag, hasattr(reference, "press"))
+    with _ahead(run.bag, reference, picks, workers, judge) if workers > 1 else nullcontext(judge) as judge:
         return _compare(run, picks, names, judged, judge, tolerance, on_frame, late, alike=elastic)
 
 
@@ -367,8 +368,8 @@ def _pair(run: Survey, moment: Moment, frame: Frame, ours: Displacement, referen
                      alike)  # fmt: skip
 
 
-def _judge(side: Method | Presser, bag: Run) -> Side:
-    """How a method answers a frame; it is prepared again only where the layer changes."""
+def _judge(side: Any, bag: Run, presses: bool) -> Side:
+    """How a Method answers a frame, or a Presser; it is prepared again only where the layer changes."""
     layer: SoftLayer | None = None
 
     def answer(frame: Frame) -> Displacement:
@@ -377,29 +378,37 @@ def _judge(side: Method | Presser, bag: Run) -> Side:
         if layer is not bag.layer_of(frame):
             layer = bag.layer_of(frame)
             side = side.prepare(layer)
-        if press := getattr(side, "press", None):
-            return press([one for one in bag.contacts(frame) if frame.touches[one.name].presses], frame)
-        return side.solve(load)  # type: ignore[union-attr]
+        if not presses:
+            return side.solve(load)
+        return side.press([one for one in bag.contacts(frame) if frame.touches[one.name].presses], frame)
 
     return answer
 
 
 @contextmanager
-def _ahead(bag: Run, side: Method | Presser, picks: Sequence[Moment], workers: int) -> Iterator[Side]:
-    """The same, by processes that each take the next of some frames."""
+def _ahead(bag: Run, reference: Method | Presser, picks: Sequence[Moment], workers: int, alone: Side) -> Iterator[Side]:
+    """The same by processes that each take the next of some frames; if one dies, the rest is solved `alone`, here."""
     numbers = [moment.number for moment in picks]
-    with Pool(workers, _take, bag.file, bag.namespace, side) as pool:
+    with one_thread_each(), Pool(workers, _take, bag.file, bag.namespace, reference) as pool:
         solved = [pool.submit(_solved, number) for number in numbers]
         found = {_key(frame): one for frame, one in zip(bag.frames(numbers), solved, strict=True)}
-        yield lambda frame: found[_key(frame)].result()
+
+        def answer(frame: Frame) -> Displacement:
+            try:
+                return found[_key(frame)].result()
+            except BrokenProcessPool:
+                log.warning("a process died, perhaps for want of memory; this frame is solved without it")
+                return alone(frame)
+
+        yield answer
 
 
 _taken: list[tuple[Run, Side]] = []  # of a process of `_ahead`
 
 
-def _take(file: Path, namespace: str, side: Method | Presser) -> None:
+def _take(file: Path, namespace: str, reference: Method | Presser) -> None:
     bag = Run(file, namespace)
-    _taken.append((bag, _judge(side, bag)))
+    _taken.append((bag, _judge(reference, bag, hasattr(reference, "press"))))
 
 
 def _solved(number: int) -> Displacement:

@@ -29,10 +29,9 @@ from stmpl_core.body import Body
 from stmpl_core.errors import InvalidInput, StmplError
 from stmpl_core.extras import needed
 from stmpl_core.layer import SoftLayer
-from stmpl_core.pool import Pool
+from stmpl_core.pool import Pool, one_thread_each
 from stmpl_core.provenance import versions
 
-ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
 VERSIONS = ("stmpl", "numpy", "scipy", "numba", "anny", "libigl", "mmgpy", "trimesh", "shapely", "zarr")
 
 OnProgress = Callable[[int, int, int, int], None]  # contacts done, contacts in all, samples kept, samples dropped
@@ -204,14 +203,8 @@ def _executor(workers: int | None, scheduler: str | None) -> Iterator[tuple[Exec
     many = workers if workers is not None else len(os.sched_getaffinity(0))
     if many < 1:
         raise InvalidInput(f"workers is {many}; at least 1 is needed.")
-    before = {name: os.environ.get(name) for name in ONE_THREAD}
-    os.environ.update(dict.fromkeys(ONE_THREAD, "1"))
-    try:
-        with Pool(many) as executor:
-            yield executor, many
-    finally:
-        for name, value in before.items():
-            os.environ.pop(name) if value is None else os.environ.update({name: value})
+    with one_thread_each(), Pool(many) as executor:
+        yield executor, many
 
 
 def _part_path(out: Path, contact: ContactId | int) -> Path:

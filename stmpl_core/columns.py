@@ -444,7 +444,7 @@ def _one_way(inward, weights):
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def pushed(points, inward, thickness, area, strain):
-    """A row of `shared_pushes`, from what Nodes are told."""
+    """A row of `shared_pushes`, (8,) [m3, m], from what Nodes are told."""
     out, square = np.zeros(8), 0.0
     for n in range(len(area)):
         weight = area[n] * (strain[n] * thickness[n])
@@ -480,7 +480,7 @@ def shared_pushes(rows):
             for x in range(3):
                 square += (a[4 + x] - b[4 + x]) ** 2
             share = (AS_ONE[1] - np.sqrt(square) / max(a[7] + b[7], 1e-12)) / (AS_ONE[1] - AS_ONE[0])
-            share = min(max(share, 0.0), 1.0)
+            share = min(max(share, 0.0), 1.0) if min(a[0], b[0]) > 0 else 0.0
             shares[k, m] = share * share * (3 - 2 * share)
     for third in range(many):
         for k in range(many):

@@ -256,13 +256,15 @@ def solve(matrix, depth):
             change, largest = max(change, abs(now - force[i])), max(largest, now)
             force[i], beside[i] = now, now - straight
             gap[i] -= step * along[i]
+        _add_times(matrix, beside, gap)  # few left the straight way: the gap follows without another whole product
         if change <= TOLERANCE * largest or largest > most:
             break
-        _add_times(matrix, beside, gap)  # few left the straight way: the gap follows without another whole product
     missed = deepest = 0.0
     for i in range(count):
-        missed = max(missed, abs(gap[i]) if force[i] > 0 else -gap[i])
+        miss = abs(gap[i]) if force[i] > 0 else max(-gap[i], 0.0)
+        missed = max(missed, miss if miss < np.inf else np.inf)
         deepest = max(deepest, depth[i])
+        missed = np.inf if force[i] > most else missed
     return force, missed / max(deepest, 1e-300)
 
 

@@ -28,7 +28,8 @@ from stmpl_core.toucher import Toucher, groups_of
 from stmpl_core.wrenches import unit_wrenches
 
 LEAST_COSINE = 0.05  # of a column's angle to the tool's normal, below which its depth is taken not to change
-SWING = 1e-3  # step of a tool's middle over its radius of gyration, in which it is found how ways swing
+SWING = 1e-3  # step in which it is found how ways swing: of a tool's middle over its radius, and of its weight likewise
+TINY = 1e-6  # radius that a tool of one node is taken to have [m]
 
 
 class Tangent(NamedTuple):
@@ -188,9 +189,9 @@ def _rates(grid, middle, pose, vertices, normals, thicknesses, points, inward, t
                                           turn @ middle + origin)  # fmt: skip
     strains, deeper = _deepened(points, inward, thickness, area, strain, columns, distance, gradient, go, turned,
                                 thicker, origin, grid[3])  # fmt: skip
-    rates = _pushed_on(points, inward, thickness, area, strain, deeper, go, turned)
     if not slanted:
-        return strains, deeper, moved, go, np.zeros((many, 3)), rates
+        return strains, deeper, moved, go, np.zeros((many, 3)), np.zeros((6, 8))
+    rates = _pushed_on(points, inward, thickness, area, strain, deeper, go, turned)
     walls = np.array([wall_in(grid[3], t) for t in thickness])
     sunk, swing = _sunk(points, inward, depth, sinking, ends, walls, way, gradient[3], go, turned, deeper, origin)
     return strains, sunk, moved, go, swing, rates
@@ -209,7 +210,9 @@ def _swing(parts: Sequence[Pressed], slices: Sequence[slice], swings: Sequence[n
         for i in range(6):
             turns = rate[None, i, 1:4]
             if len(parts) > 1:
-                ends, step = np.stack([rows, rows]), SWING * rows[m, 7] / max(np.linalg.norm(rate[i, 4:7]), 1e-300)
+                size, fastest = max(rows[m, 7], TINY), max(float(np.linalg.norm(rate[i, 4:7])), abs(rate[i, 7]))
+                step = SWING / max(fastest / size, abs(rate[i, 0]) / rows[m, 0])
+                ends = np.stack([rows, rows])
                 ends[:, m] += step * np.multiply.outer([1.0, -1.0], rate[i])
                 turns = (shared_pushes(ends[0]) - shared_pushes(ends[1])) / (2 * step)
             for k, one in enumerate(parts):

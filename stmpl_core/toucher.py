@@ -532,8 +532,8 @@ class Toucher:
             if led < LED_OUT:
                 bound += led**-held.power - 1
         bound += SHELL * max(held.shell - SHELL_FROM, 0.0)
-        unsolved = held.missed > UNSOLVED
-        bound += 1 + held.power * held.missed if unsolved else 0.0
+        missed = min(held.missed, 1.0)
+        bound += 1 + held.power * missed if missed > UNSOLVED else 0.0
         if size > 0 and not layer.stacked:
             bound += SHALLOW * max(1 - depth / (SHALLOW_TO * thickness), 0.0)
         beside_off = 0.0 if one.force is None else abs(1 / scale - 1) if len(v) else 1.0  # each was placed as if alone
@@ -565,9 +565,9 @@ class Toucher:
         if led < LED_OUT:
             trust = trust.also(f"{touch.name} is {1e3 * depth:.2g} mm deep, and thin: the skin below it is led out of "
                                f"its walls, and goes along by {led:.0%} of that", in_range=False)  # fmt: skip
-        if unsolved:
-            trust = trust.also(f"where {touch.name} presses was not found: skin misses it by {held.missed:.0%} of its "
-                               "depth", in_range=False, converged=False)  # fmt: skip
+        if missed > UNSOLVED:
+            trust = trust.also(f"where {touch.name} presses was not found: skin misses it by {missed:.0%} of its depth",
+                               in_range=False, converged=False)  # fmt: skip
         if beside_off > MAX_BESIDE:
             where = (f"no place was found where {touch.name} presses so: the nearest" if held is one.held else
                      f"{touch.name} was moved to where it presses so alone; beside the other tools that")  # fmt: skip

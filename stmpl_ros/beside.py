@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable
 from concurrent.futures import Future, wait
+from contextlib import suppress
 from typing import Any
 
 from numba.core.event import Event, Listener
@@ -38,19 +39,22 @@ class Beside[T]:
 
 
 class StepsAhead(Listener):
-    """Compiles what steps with a memory take in a process beside, once the first kernel is compiled here.
+    """Compiles what steps with a memory take in a process beside, as soon as a kernel is to be compiled here.
 
     Args:
-        wanted: choice to do so at all.
+        wanted: choice to do so at all; nothing is done where there is no second core.
     """
 
     def __init__(self, wanted: bool) -> None:
-        self._wanted, self._beside = wanted, None
+        self._wanted = wanted and len(os.sched_getaffinity(0)) > 1
+        self._beside: Beside[None] | None = None
 
     def on_start(self, event: Event) -> None:
         """Before a kernel is compiled."""
-        if self._wanted and self._beside is None:
-            self._beside = Beside(compile_steps)
+        if self._wanted:
+            self._wanted = False
+            with suppress(OSError):  # then it is compiled here
+                self._beside = Beside(compile_steps)
 
     def on_end(self, event: Event) -> None:
         """After it."""

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 BALL_RADIUS, BALL_DEPTH = 0.010, 0.001  # ball and depth at which the stiffness of a part is told [m]
 NEEDS_RADII, NEEDS_FORCES = (5e-3, 40e-3), (1.0, 20.0)  # scene for which the smallest model of a part is told [m], [N]
-MOST_JUDGES = 4  # processes that press tools in once more
+MOST_JUDGES, JUDGE_BYTES = 4, 4 << 30  # processes that press tools in once more, and memory that one may take
 LOOKED_AT = 20  # number of answers of a recording that are looked at for their memory
 RATED, RATED_S = 5, 0.1  # messages, and time over which they came [s], from which on a topic has a rate
 SHOWN = {"Pa": (1e-3, "kPa"), "m": (1e3, "mm"), "N/m": (1.0, "N/m"), "-": (1.0, "")}  # factor and unit for people
@@ -36,7 +36,8 @@ def compare_with_progress(
 
     from bags.compare import compare_run
 
-    workers = min(MOST_JUDGES, len(os.sched_getaffinity(0))) if method is None else 1
+    memory = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    workers = max(1, min(MOST_JUDGES, len(os.sched_getaffinity(0)), memory // JUDGE_BYTES)) if method is None else 1
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     with Progress(*columns, console=Console(stderr=True), disable=quiet, transient=True) as progress:
         task = progress.add_task(f"frames solved by {reference.name}", total=frames)

@@ -201,7 +201,7 @@ def test_tools_that_come_nearer_give_way_as_each_sinks_the_skin_beside_it() -> N
         for mover, name in enumerate(("ball", "punch")):
             for feeler, one in enumerate(found):
                 expected = by_pose_of(simulator, two, mover, feeler)[:, :3]
-                told, limit = (one.pose, 0.05) if mover == feeler else (one.across[name], 0.25)
+                told, limit = (one.pose, 0.06) if mover == feeler else (one.across[name], 0.25)
                 assert off(told[:, :3], expected) < limit
 
 

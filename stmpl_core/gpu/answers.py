@@ -113,6 +113,17 @@ def _power(scratch: Scratch, s: wp.int32, many: wp.int32, k: wp.int32) -> real:
 
 
 @wp.func
+def _missed(scratch: Scratch, s: wp.int32, many: wp.int32, k: wp.int32) -> real:
+    """How far the linear problem of a tool's group is from solved, over the deepest, at most 1."""
+    deepest, missed = real(1e-300), real(0.0)
+    for i in range(scratch.nodes[s]):
+        if scratch.group[s * many + scratch.tool[s, i]] == scratch.group[s * many + k]:
+            deepest = wp.max(deepest, scratch.wanted[s, i])
+            missed = wp.max(missed, scratch.gap[s, i])
+    return wp.min(missed / deepest, real(1.0))
+
+
+@wp.func
 def _scene_status(scratch: Scratch, s: wp.int32, many: wp.int32) -> wp.int32:
     """REFUSED if a tool is, else what a tool is not served for, else below REFUSED."""
     out = wp.int32(-1)
@@ -408,7 +419,7 @@ def answer(first: wp.int32, many: wp.int32, known: Known, skins: Skins, scratch:
     torque = vec3(more_sums[0], more_sums[1], more_sums[2])
     along = more_sums[3]
     force = force + along / wp.max(size, NONE) * force
-    power = _power(scratch, s, many, k)
+    power, missed = _power(scratch, s, many, k), _missed(scratch, s, many, k)
     doubt = doubt / wp.max(size, NONE) + power * grid.surface_error / wp.max(wp.max(depth, grid.surface_error), NONE)
     if one.stacked == 1 and forces > real(0.0):
         unlike = known.uneven * wp.log(carried / (forces * one.flat))
@@ -418,7 +429,7 @@ def answer(first: wp.int32, many: wp.int32, known: Known, skins: Skins, scratch:
     sound = sound and bony <= BONY_SHARE * forces
     sound = sound and one.softness * highest <= known.pressure and depth * count <= known.depth * thick
     sound = sound and strange <= UNSEEN * forces and one.learnt == 1
-    sound = sound and depth <= one.soft and scratch.missed[s] <= UNSOLVED
+    sound = sound and depth <= one.soft and missed <= UNSOLVED
     sound = sound and (size <= SIDES[0] * forces or size >= SIDES[1] * forces)
     group = pins[0] > GROUP and depth > PINS_DEEP * pins[1]
     sound = sound and not group
@@ -448,8 +459,8 @@ def answer(first: wp.int32, many: wp.int32, known: Known, skins: Skins, scratch:
         flat = below / wp.max(depth, NONE)
         flat = power * wp.log(real(1.0) + flat + flat * wp.min(flat, real(1.0)))
         bound += STUCK * along / size + wp.exp(wp.min(flat, MOST_MORE)) - real(1.0)
-        if scratch.missed[s] > UNSOLVED:
-            bound += real(1.0) + power * scratch.missed[s]
+        if missed > UNSOLVED:
+            bound += real(1.0) + power * missed
         if group:
             bound *= WIDER
         bounds[n, k] = bounds.dtype(one.modulus * size * bound)

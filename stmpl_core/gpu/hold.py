@@ -11,7 +11,7 @@ from stmpl_core import contact_net, obstacle
 from stmpl_core.gpu.blocks import most_of, sum_of, wait
 from stmpl_core.gpu.packs import HIDDEN as UNITS
 from stmpl_core.gpu.packs import Net, OneSkin, Scratch, Skins
-from stmpl_core.gpu.rays import OPTIONS, real, vec3
+from stmpl_core.gpu.rays import FAR, OPTIONS, real, vec3
 from stmpl_core.networks import NODE
 
 STEPS, RINGS = wp.constant(obstacle.STEPS), wp.constant(obstacle.RINGS)
@@ -107,7 +107,10 @@ def _among(scratch: Scratch, s: wp.int32, i: wp.int32, count: wp.int32) -> real:
 
 @wp.kernel
 def solve(many: wp.int32, linear: wp.int32, skins: Skins, scratch: Scratch):
-    """Forces at the nodes, none of which pulls: obstacle.solve; linear: 1, of a stack that would never harden."""
+    """Forces at the nodes, none of which pulls: obstacle.solve; linear: 1, of a stack that would never harden.
+
+    The gap is then by how much each node misses its depth.
+    """
     s, lane = wp.tid()
     lanes, count = wp.block_dim(), scratch.nodes[s]
     one = skins.one[scratch.skin[s * many]]
@@ -119,7 +122,6 @@ def solve(many: wp.int32, linear: wp.int32, skins: Skins, scratch: Scratch):
         scratch.move[s, i] = real(0.0)
     wait()
     change, largest, before, number = real(count), real(0.0), real(0.0), wp.int32(0)
-    down = real(1.0)
     while change > TOLERANCE * largest and number < ITERATIONS:
         number += 1
         square = real(0.0)
@@ -129,8 +131,7 @@ def solve(many: wp.int32, linear: wp.int32, skins: Skins, scratch: Scratch):
             if scratch.force[s, i] > real(0.0):
                 square += gap * gap
         square = sum_of(square)
-        on, up = real(0.0), real(0.0)
-        down = real(0.0)
+        on, up, down = real(0.0), real(0.0), real(0.0)
         if before > real(0.0):
             on = square / before
         before = square
@@ -160,17 +161,15 @@ def solve(many: wp.int32, linear: wp.int32, skins: Skins, scratch: Scratch):
         largest = most_of(largest)
         if most_of(again) > real(0.0):
             before = real(0.0)
-    missed, deepest = real(0.0), real(1e-300)
-    if number >= ITERATIONS or down <= real(0.0):
-        for i in range(lane, count, lanes):
-            gap = _times(scratch, s, i, scratch.force) - scratch.wanted[s, i]
-            deepest = wp.max(deepest, scratch.wanted[s, i])
-            missed = wp.max(missed, -gap)
-            if scratch.force[s, i] > real(0.0):
-                missed = wp.max(missed, gap)
-        missed = most_of(missed)
-        deepest = most_of(deepest)
-    scratch.missed[s] = missed / deepest
+    for i in range(lane, count, lanes):
+        miss = _times(scratch, s, i, scratch.force) - scratch.wanted[s, i]
+        if scratch.force[s, i] > real(0.0):
+            miss = wp.abs(miss)
+        else:
+            miss = wp.max(-miss, real(0.0))
+        if not (miss < FAR):
+            miss = FAR
+        scratch.gap[s, i] = miss
 
 
 @wp.kernel

@@ -118,7 +118,7 @@ SCRATCH: dict[str, tuple[Any, str]] = {
     "chart": (wp.int32, "CF"), "sides": (wp.int32, "C"), "axes": (mat33, "C6"), "deepest": (real, "C"),
     "covers": (real, "C"), "height": (real, "C"), "sees": (real, "C"), "also": (real, "C"), "lattice": (Lattice, "C"),
     "owner": (wp.int32, "CL"), "value": (real, "CL"),
-    "nodes": (wp.int32, "S"), "missed": (real, "S"), "wants": (wp.int32, "1"), "begin": (wp.int32, "S"),
+    "nodes": (wp.int32, "S"), "wants": (wp.int32, "1"), "begin": (wp.int32, "S"),
     "tool": (wp.int32, "SN"), "cell": (wp.int32, "SN"), "face": (wp.int32, "SN"), "shares": (vec3, "SN"),
     "point": (vec3, "SN"), "inward": (vec3, "SN"), "thick": (real, "SN"), "area": (real, "SN"), "strain": (real, "SN"),
     "fold": (wp.int32, "SN"), "queue": (wp.int32, "SN"), "mean": (vec3, "C"), "middle": (wp.vec4d, "C"),
