@@ -23,7 +23,7 @@ from stmpl_core.moments import Surroundings
 from stmpl_core.nodes import Nodes, gathered, strains_under
 from stmpl_core.obstacle import REACH
 from stmpl_core.pieces import DEEP, GROUP, WIDER, pins
-from stmpl_core.rays import WALL
+from stmpl_core.rays import WALL, way_of
 from stmpl_core.sdf import SignedDistance, lacking, mean_off
 from stmpl_core.tools import Tools
 from stmpl_core.touch import (
@@ -66,6 +66,8 @@ MAX_LEVER = 1.0  # torque that is not carried over the force, over the contact's
 SURE = 0.02  # largest error of a distance field over the depth, up to which it does not matter where the field is off
 MOST_OFF = 0.1  # error of a distance field where a tool presses, over the depth, beyond which the force is not known
 LED_OUT = 0.95  # how far nodes sink with their tool over how deep it is in their columns: below, these lead out of it
+THIN_FROM, THIN_MORE, THIN_TO = 14.0, 0.03, 50.0  # bound on tools that have sunk, by depth over their half thickness
+LOW = 3.0  # share of that by the share of the depth that a tool's height lacks
 LED_DEEP, LED_LOST = 0.9, 0.35  # depth over the deepest of nodes that tell it first, and share that these may lack
 LOOKED_AT = 48  # tips of a tool that presses nothing that are looked at, the farthest; and as many of the others
 EDGE_SURE = 0.05  # share of its depth that an edge of a box lacks, with which contacts were learnt
@@ -532,6 +534,12 @@ class Toucher:
             if led < LED_OUT:
                 bound += led**-held.power - 1
         bound += SHELL * max(held.shell - SHELL_FROM, 0.0)
+        sunk, *way_in_tool = way_of(one.squeeze.top)
+        if sunk:
+            high = float(np.abs(way_in_tool) @ -np.subtract(*one.field.tool_bounds))
+            low = min(max(LOW * (1 - high / depth), 0.0), 1.0)
+            thin = depth / max(one.field.half_thickness, 1e-300) - THIN_FROM
+            bound += sunk * low * THIN_MORE * min(max(thin, 0.0), THIN_TO)
         missed = min(held.missed, 1.0)
         bound += 1 + held.power * missed if missed > UNSOLVED else 0.0
         if size > 0 and not layer.stacked:

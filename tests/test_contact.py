@@ -685,6 +685,19 @@ def test_a_sheet_under_the_skin_is_as_deep_as_it_lies() -> None:
     assert touch.force > 0 and touch.depth > 0.9 * 4.2e-3 and not touch.trust.in_range
 
 
+@pytest.mark.parametrize("place, high, strain", [("left_upper_arm", 0.012, 0.6), ("left_upper_arm", 0.012, 0.75)])
+def test_the_bound_of_a_blade_that_has_sunk_deep_covers_what_a_tall_one_presses_with(place, high, strain) -> None:
+    layer = living(Body.anny(), place, edge_length=8e-3)
+    vertex, toucher, found = site(layer, place), Toucher(layer), []
+    pose = np.array(trimesh.geometry.align_vectors([0, 0, 1], layer.normals[vertex]))
+    for height in (high, 0.12):
+        pose[:3, 3] = layer.vertices[vertex] + (height / 2 - strain * layer.thickness[vertex]) * layer.normals[vertex]
+        found.append(toucher.touch(press(box(0.03, 0.002, height), pose, None)))
+    low, tall = found
+    assert abs(low.force - tall.force) < low.force_bound
+    assert tall.force_bound < 0.3 * tall.force
+
+
 def test_what_is_not_solved_is_flagged(sim: Simulator, monkeypatch: pytest.MonkeyPatch) -> None:
     contact, hold = press(BALL, on_limb(), None), sim.toucher.net.hold
     solved = touch_of(sim.step([contact]))

@@ -12,7 +12,7 @@ from stmpl_core.gpu.blocks import least_of, most_of, sum_of
 from stmpl_core.gpu.columns import _mark, _marked
 from stmpl_core.gpu.packs import BONY_BIT, BORDER_BIT, LONG_BIT, STEEP_BIT, Scratch, Skins
 from stmpl_core.gpu.places import APART, BY_POSE, DEEP, REFUSED, WRAPPED
-from stmpl_core.gpu.rays import FAR, OPTIONS, real, vec3
+from stmpl_core.gpu.rays import FAR, OPTIONS, real, vec3, way_of
 from stmpl_core.obstacle import REACH
 
 HALF_REACH = wp.constant(wp.float64(0.5 * REACH))
@@ -38,6 +38,9 @@ NONE = wp.constant(wp.float64(1e-300))
 NAN, PI = wp.constant(wp.float64(float("nan"))), wp.constant(wp.float64(math.pi))
 LED_DEEP, LED_LOST = (wp.constant(wp.float64(one)) for one in (toucher.LED_DEEP, toucher.LED_LOST))
 LED_OUT = wp.constant(wp.float64(toucher.LED_OUT))
+THIN_FROM, THIN_MORE, THIN_TO, LOW = (
+    wp.constant(wp.float64(one)) for one in (toucher.THIN_FROM, toucher.THIN_MORE, toucher.THIN_TO, toucher.LOW)
+)
 EDGE_SURE = wp.constant(wp.float64(toucher.EDGE_SURE))
 EDGE_OFF, MOST_LACKING = wp.constant(wp.float64(toucher.EDGE_OFF)), wp.constant(wp.float64(toucher.MOST_LACKING))
 SURE, MOST_OFF = wp.constant(wp.float64(toucher.SURE)), wp.constant(wp.float64(toucher.MOST_OFF))
@@ -452,6 +455,11 @@ def answer(first: wp.int32, many: wp.int32, known: Known, skins: Skins, scratch:
             if led < LED_OUT:
                 bound += wp.pow(led, -power) - real(1.0)
             bound += SHELL * wp.max(-scratch.given_way[c] - SHELL_FROM, real(0.0))
+            thin = wp.clamp(depth / wp.max(grid.half, NONE) - THIN_FROM, real(0.0), THIN_TO)
+            sunk, box = way_of(scratch.top[c]), grid.high - grid.low
+            high = wp.abs(sunk[1]) * box[0] + wp.abs(sunk[2]) * box[1] + wp.abs(sunk[3]) * box[2]
+            low = wp.clamp(LOW * (real(1.0) - high / wp.max(depth, NONE)), real(0.0), real(1.0))
+            bound += sunk[0] * low * THIN_MORE * thin
         else:
             bound += SHALLOW * wp.max(real(1.0) - depth * forces / (SHALLOW_TO * carried), real(0.0))
         lacks = wp.max(wp.min(lack / wp.max(depth + lack, NONE), MOST_LACKING) - EDGE_SURE, real(0.0))
