@@ -47,9 +47,9 @@ class Pair(NamedTuple):
     in_range: bool
 
 
-def standing(mesh: trimesh.Trimesh, name: str) -> Tool:
-    """The tool, its lowest point at 0."""
-    return Tool(name, mesh.vertices - [0, 0, mesh.bounds[0, 2]], mesh.faces)
+def standing(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
+    """The mesh, its lowest point at 0."""
+    return mesh.apply_translation([0, 0, -mesh.bounds[0, 2]])
 
 
 def cut() -> dict[str, list[list[Tool]]]:
@@ -59,8 +59,7 @@ def cut() -> dict[str, list[list[Tool]]]:
               "box of 30 x 20 mm": trimesh.creation.box((0.03, 0.02, 0.1))}  # fmt: skip
     out = {}
     for name, whole in wholes.items():
-        whole.apply_translation([0, 0, -whole.bounds[0, 2]])
-        parts = [[whole]]
+        parts = [[standing(whole)]]
         for axis in np.eye(3)[:2]:
             parts.append([one.slice_plane((0, 0, 0), side * axis, cap=True) for one in parts[-1] for side in (1, -1)])
         out[name] = [[Tool(f"{name.split()[0]}_{len(some)}_{k}", one.vertices, one.faces) for k, one in enumerate(some)]
@@ -74,7 +73,8 @@ def faces(height: float) -> dict[str, Tool]:
     meshes = {"ring": made.annulus(0.008, 0.012, height), "tube": made.annulus(0.005, 0.0065, height),
               "blade": made.box((0.03, 0.002, height)), "bar": made.box((0.03, 0.006, height)),
               "pin": made.cylinder(0.002, height), "box": made.box((0.02, 0.015, height))}  # fmt: skip
-    return {name: standing(mesh, f"{name}_{1e3 * height:.0f}") for name, mesh in meshes.items()}
+    return {name: Tool(f"{name}_{1e3 * height:.0f}", standing(mesh).vertices, mesh.faces)
+            for name, mesh in meshes.items()}  # fmt: skip
 
 
 def pressed(toucher: Toucher, tools: list[Tool], pose: np.ndarray) -> tuple[float, float, bool]:
@@ -89,10 +89,10 @@ def pairs(part: str, strains: tuple[float, ...]) -> Iterator[Pair]:
     layer = living(Body.anny(), part, edge_length=EDGE)
     vertex, toucher = site(layer, part), Toucher(layer)
     pose = np.array(trimesh.geometry.align_vectors([0, 0, 1], layer.normals[vertex]))
-    tall = faces(TALL)
+    tall, low = faces(TALL), {height: faces(height) for height in HEIGHTS}
     scenes = [(whole, [(f"{name} in halves", halves), (f"{name} in quarters", quarters)])
               for name, (whole, halves, quarters) in cut().items()]  # fmt: skip
-    scenes += [([tall[name]], [(f"{name} of {1e3 * height:.0f} mm", [faces(height)[name]]) for height in HEIGHTS])
+    scenes += [([tall[name]], [(f"{name} of {1e3 * height:.0f} mm", [low[height][name]]) for height in HEIGHTS])
                for name in tall]  # fmt: skip
     for strain in strains:
         pose[:3, 3] = layer.vertices[vertex] - strain * layer.thickness[vertex] * layer.normals[vertex]

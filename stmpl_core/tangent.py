@@ -205,21 +205,26 @@ def _swing(parts: Sequence[Pressed], slices: Sequence[slice], swings: Sequence[n
         parts, slices: what they press, and which nodes are whose.
         swings, rates: see `_rates`.
     """
-    rows = np.array([pushed(*one.squeeze.nodes[:5]) for one in parts])
+    rows = np.array([pushed(*one.squeeze.nodes[:5]) for one in parts]) if len(parts) > 1 else None
     for m, rate in enumerate(rates):
-        for i in range(6):
-            turns = rate[None, i, 1:4]
-            if len(parts) > 1:
-                size, fastest = max(rows[m, 7], TINY), max(float(np.linalg.norm(rate[i, 4:7])), abs(rate[i, 7]))
-                step = SWING / max(fastest / size, abs(rate[i, 0]) / rows[m, 0])
-                ends = np.stack([rows, rows])
-                ends[:, m] += step * np.multiply.outer([1.0, -1.0], rate[i])
-                turns = (shared_pushes(ends[0]) - shared_pushes(ends[1])) / (2 * step)
-            for k, one in enumerate(parts):
-                push, turn = one.squeeze.push, turns[k]
-                if square := float(push @ push):
-                    turn = (turn - turn @ push / square * push) / math.sqrt(square)
-                    sinking[6 * m + i, slices[k]] += swings[k] @ turn
+        turns = rate[:, None, 1:4] if rows is None else _turns(rows, m, rate)
+        for k, one in enumerate(parts):
+            push, turn = one.squeeze.push, turns[:, k]
+            if square := float(push @ push):
+                turn = (turn - np.outer(turn @ push / square, push)) / math.sqrt(square)
+                sinking[6 * m : 6 * m + 6, slices[k]] += turn @ swings[k].T
+
+
+def _turns(rows: np.ndarray, m: int, rate: np.ndarray) -> np.ndarray:
+    """Rates of columns.shared_pushes of rows (K, 8) as that of tool m changes at six rates (6, 8), (6, K, 3)."""
+    out = np.empty((6, len(rows), 3))
+    for i in range(6):
+        size, fastest = max(rows[m, 7], TINY), max(float(np.linalg.norm(rate[i, 4:7])), abs(rate[i, 7]))
+        step = SWING / max(fastest / size, abs(rate[i, 0]) / rows[m, 0])
+        ends = np.stack([rows, rows])
+        ends[:, m] += step * np.multiply.outer([1.0, -1.0], rate[i])
+        out[i] = (shared_pushes(ends[0]) - shared_pushes(ends[1])) / (2 * step)
+    return out
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")

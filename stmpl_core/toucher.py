@@ -226,8 +226,9 @@ class Toucher:
                 pressure, doubt, outside = (values[start:end] for values in together[:3])
                 held[one.contact.name] = together._replace(pressure=pressure, doubt=doubt, outside=outside)
             covered |= self._covered(group, nodes, held)
-        return [self._answer(told.get(name, one), held.get(name, NOTHING), beside.get(name), alone, name in covered)
-                for one in placed for name in (one.contact.name,)]  # fmt: skip
+        placed = [told.get(one.contact.name, one) for one in placed]
+        return [self._answer(one, held.get(one.contact.name, NOTHING), beside.get(one.contact.name), alone,
+                             one.contact.name in covered) for one in placed]  # fmt: skip
 
     def joined(self, tools: Sequence[tuple[SignedDistance, Transform, Squeeze]]) -> Nodes:
         """Nodes of tools that feel each other, one after the other: field, pose_body_from_tool and squeeze of each."""
@@ -537,7 +538,7 @@ class Toucher:
         sunk, *way_in_tool = way_of(one.squeeze.top)
         if sunk:
             high = float(np.abs(way_in_tool) @ -np.subtract(*one.field.tool_bounds))
-            low = min(max(LOW * (1 - high / depth), 0.0), 1.0)
+            low = min(max(LOW * (1 - high / max(depth, 1e-300)), 0.0), 1.0)
             thin = depth / max(one.field.half_thickness, 1e-300) - THIN_FROM
             bound += sunk * low * THIN_MORE * min(max(thin, 0.0), THIN_TO)
         missed = min(held.missed, 1.0)

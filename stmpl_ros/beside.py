@@ -10,7 +10,6 @@ from typing import Any
 
 from numba.core.event import Event, Listener
 
-from stmpl_core.history import compile_steps
 from stmpl_core.pool import Pool
 from stmpl_core.sdf import SignedDistance
 from stmpl_core.tool import Tool
@@ -53,6 +52,8 @@ class StepsAhead(Listener):
         """Before a kernel is compiled."""
         if self._wanted:
             self._wanted = False
+            from stmpl_core.history import compile_steps  # not of those that build fields
+
             with suppress(OSError):  # then it is compiled here
                 self._beside = Beside(compile_steps)
 
