@@ -5,15 +5,16 @@ from __future__ import annotations
 from collections.abc import Sequence
 from copy import copy
 from functools import cached_property
+from itertools import permutations
 from typing import Any, NamedTuple
 
 import numba
 import numpy as np
 
-from stmpl_core.arrays import Points, Transform
+from stmpl_core.arrays import Points, Transform, inverted
 from stmpl_core.compiling import UNCOUNTED
 from stmpl_core.layer import SoftLayer
-from stmpl_core.nodes import Nodes, met_between, nodes_under
+from stmpl_core.nodes import Nodes, met_between, nodes_under, strains_beside
 from stmpl_core.rays import (
     ANYHOW,
     ASLANT,
@@ -187,19 +188,28 @@ class Columns:
         return Squeeze(vertices, depth, rests, Nodes(*nodes), top, push)
 
     def as_one(self, tools: Sequence[tuple[SignedDistance, Transform, Squeeze]]) -> list[Squeeze]:
-        """Squeezes of tools on a stack that feel each other: of those side by side, as parts of one, skin goes one way.
+        """Squeezes of tools that feel each other: those side by side press as parts of one.
+
+        No strain is rounded off where another goes on, and on a stack skin goes one way under them.
 
         Args:
             tools: distance field, pose_body_from_tool and squeeze of each, all with nodes.
         """
-        pushes = shared_pushes(np.array([pushed(*squeeze.nodes[:5]) for *_, squeeze in tools]))
-        out = []
-        for (field, pose, squeeze), push in zip(tools, pushes, strict=True):
-            nodes = squeeze.nodes
-            if not np.array_equal(push, squeeze.push):
-                sinking = _sinking(grid_of(field), pose, *nodes[:5], way_of(squeeze.top)[0], push)
-                squeeze = squeeze._replace(nodes=nodes._replace(sinking=sinking), push=push)
-            out.append(squeeze)
+        strains = [squeeze.nodes.strain for *_, squeeze in tools]
+        for k, m in permutations(range(len(tools)), 2):
+            (field, pose, squeeze), (other, other_pose, _) = tools[k], tools[m]
+            between = inverted(other_pose) @ pose
+            strains[k] = strains_beside(grid_of(field), pose, grid_of(other), between, *squeeze.nodes[:3], strains[k],
+                                        squeeze.top)  # fmt: skip
+        out = [squeeze._replace(nodes=squeeze.nodes._replace(strain=strain))
+               for (*_, squeeze), strain in zip(tools, strains, strict=True)]  # fmt: skip
+        if self.layer.stacked:
+            pushes = shared_pushes(np.array([pushed(*squeeze.nodes[:5]) for squeeze in out]))
+            for k, ((field, pose, before), push) in enumerate(zip(tools, pushes, strict=True)):
+                nodes = out[k].nodes
+                if not (np.array_equal(push, before.push) and np.array_equal(nodes.strain, before.nodes.strain)):
+                    sinking = _sinking(grid_of(field), pose, *nodes[:5], way_of(before.top)[0], push)
+                    out[k] = out[k]._replace(nodes=nodes._replace(sinking=sinking), push=push)
         return out
 
 

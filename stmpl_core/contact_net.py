@@ -53,6 +53,8 @@ THIN_NEAR, THIN_FAR = (-1.4, -1.5), (-4.3, -4.0)  # log of the share of the near
 THIN_FELT, THIN_DEEP = (0.02, 0.04), (0.12, 0.2)  # strains from which that widens the bound, and is flagged
 THIN_DOUBT = 17.0  # factor on the doubt that it adds, of which the bound grows with the square root
 STACK_FADE = 0.1  # the same on a stack, whose linear response alone is good to some percent up to there
+FAR_TOOLS = 1.0, 2.0  # distance of two tools' middles over their radii of gyration and the thickness under both, up to
+# which one's work counts in full with the other's, and from which not at all
 
 
 class Held(NamedTuple):
@@ -62,21 +64,21 @@ class Held(NamedTuple):
         pressure: pressure over E at the nodes, (N,) [-].
         doubt: error to expect of it, over E, (N,) [-].
         outside: degree to which the nodes see what no training contact had, from 0 to 1, (N,) [-]; 0 in a first touch.
+        shell: share of the linear work by which a limb is stiffer than its flat stack, (N,) [-]; stiff skin around it
+            stands up like a shell, until it is dented. Empty of one material.
         power: power of the depth with which the force grows, about [-].
-        shell: share of the linear work by which a limb is stiffer than its flat stack [-]; stiff skin around it stands
-            up like a shell, until it is dented.
         missed: how far the linear problem is from solved, over the depth [-]: see obstacle.solve.
     """
 
     pressure: np.ndarray
     doubt: np.ndarray
     outside: np.ndarray
+    shell: np.ndarray
     power: float
-    shell: float = 0.0
     missed: float = 0.0
 
 
-NOTHING = Held(np.empty(0), np.empty(0), np.empty(0), 1.0)
+NOTHING = Held(np.empty(0), np.empty(0), np.empty(0), np.empty(0), 1.0)
 
 
 class Look(NamedTuple):
@@ -104,7 +106,7 @@ class Solved(NamedTuple):
         matrix, rings: those of stmpl_core.obstacle.pairs, or a stack's.
         force: forces over E that solve it, (N,).
         times, over: see `crowded`, (N,).
-        given_way: see `_given_way`; 0 of one material.
+        given_way: see `_given_way`, (N,); none of one material.
         weights, what: see `_among`; None of one material.
     """
 
@@ -113,7 +115,7 @@ class Solved(NamedTuple):
     force: np.ndarray
     times: np.ndarray
     over: np.ndarray
-    given_way: float = 0.0
+    given_way: np.ndarray = np.empty(0)
     weights: np.ndarray | None = None
     what: np.ndarray | None = None
 
@@ -215,8 +217,7 @@ class ContactNet:
         pressure, doubt, outside = _correct(*look[:3], *self._network)
         if self._green is None:
             _thin(look.inputs, doubt, outside)
-        held = Held(pressure / solved.times, doubt / solved.times, outside, look.power, missed=look.missed)
-        return held if self._green is None else held._replace(shell=-float(look.inputs[0, STACK_NODE.at.given_way]))
+        return Held(pressure / solved.times, doubt / solved.times, outside, -solved.given_way, look.power, look.missed)
 
     def apart(self, nodes: Nodes) -> np.ndarray:
         """Mask of contact nodes at which the skin lies further in than their tool's surface, (N,)."""
@@ -287,7 +288,8 @@ def _look_on_stack(points, inward, thickness, area, strain, corners, shares, sin
     times, over = crowded(points, inward, area, strain, beside, force)
     moments, vectors = moments_of(rings, points, np.full(len(area), t), area,
                                   _one(np.exp(numbers[3]) * (force / area)), _one(sinking / over / t))  # fmt: skip
-    given_way, among = _given_way(matrix, wide, force), _among(points, inward, thickness, group, t, force)
+    near, of = _near_tools(points, thickness, area * (strain * thickness), beside)
+    given_way, among = _given_way(matrix, wide, force, near, of), _among(points, inward, thickness, group, t, force)
     shape = _shape(*among, force)
     seen = _see_on_stack(moments[0], vectors[0], inward, thickness, area, t, times * force, strain, sinking, here, nu,
                          numbers, log_thickness, hardening, _between(corners, shares, alike)[:, 0],
@@ -310,7 +312,7 @@ def _see_on_stack(moments, vectors, inward, thickness, area, t, force, strain, s
         row[ON_STACK.hardening] = _hardening(log_thickness, hardening, alike_at[n], sinking[n] / thickness[n])
         row[ON_STACK.curvature] = alike[n, AT.mean_curvature]
         row[ON_STACK.curvature_over_strain] = alike[n, AT.mean_curvature] / (overlap[n] + ROUND_FROM)
-        row[ON_STACK.given_way] = given_way
+        row[ON_STACK.given_way] = given_way[n]
         row[ON_STACK.turned], row[ON_STACK.uneven] = shape[n]
         solved = min(strain[n], STACK_LINEAR_TO)
         top = _hardening(log_thickness, hardening, alike_at[n], solved)
@@ -366,15 +368,67 @@ def _shape(weights, what, force):
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _given_way(matrix, wide, force):
-    """Share of the work of forces (N,) that the coarse part of their response does [-]."""
-    coarse = whole = 0.0
+def _near_tools(points, thickness, weight, beside):
+    """How near tools are to each other, from 0, far, to 1, (K, K), and which each node is of, (N,).
+
+    Args:
+        points, thickness, beside: see Nodes.
+        weight: weight of each node in its tool's middle, (N,).
+    """
+    many = max(beside.shape[1], 1)
+    of, out, told = np.zeros(len(points), np.int64), np.ones((many, many)), np.zeros((many, 6))
+    for n in range(len(points)):
+        for k in range(beside.shape[1]):
+            if beside[n, k] < 0:
+                of[n] = k
+        own = told[of[n]]
+        own[0] += weight[n]
+        own[4] += weight[n] * thickness[n]
+        for x in range(3):
+            own[1 + x] += weight[n] * points[n, x]
+    for k in range(many):
+        told[k, 1:5] /= max(told[k, 0], 1e-300)
+    for n in range(len(points)):
+        own = told[of[n]]
+        for x in range(3):
+            own[5] += weight[n] / max(own[0], 1e-300) * (points[n, x] - own[1 + x]) ** 2
+    for k in range(many):
+        for m in range(many):
+            a, b, square = told[k], told[m], 0.0
+            for x in range(3):
+                square += (a[1 + x] - b[1 + x]) ** 2
+            apart = np.sqrt(square) / max(np.sqrt(a[5]) + np.sqrt(b[5]) + a[4] + b[4], 1e-12)
+            share = min(max((FAR_TOOLS[1] - apart) / (FAR_TOOLS[1] - FAR_TOOLS[0]), 0.0), 1.0)
+            out[k, m] = share * share * (3 - 2 * share) if k != m else 1.0
+    return out, of
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _given_way(matrix, wide, force, near, of):
+    """Share of the work of the forces (N,) of each node's tool, and of tools near it, that the coarse part of their
+    response does, (N,) [-].
+
+    Args:
+        matrix, wide: response to the forces, and its coarse part, (N, N).
+        near, of: see `_near_tools`.
+    """
+    many, out = len(near), np.empty(len(force))
+    coarse, whole = np.zeros((many, many)), np.zeros((many, many))
     for i in range(len(force)):
         if force[i] > 0:
             for j in range(len(force)):
-                coarse += force[i] * wide[i, j] * force[j]
-                whole += force[i] * matrix[i, j] * force[j]
-    return coarse / max(whole, 1e-300)
+                coarse[of[i], of[j]] += force[i] * wide[i, j] * force[j]
+                whole[of[i], of[j]] += force[i] * matrix[i, j] * force[j]
+    for k in range(many):
+        some = every = 0.0
+        for a in range(many):
+            for b in range(many):
+                some += near[k, a] * near[k, b] * coarse[a, b]
+                every += near[k, a] * near[k, b] * whole[a, b]
+        for i in range(len(force)):
+            if of[i] == k:
+                out[i] = some / max(every, 1e-300)
+    return out
 
 
 @numba.njit(cache=True, error_model="numpy")

@@ -17,11 +17,14 @@ from stmpl_core.rays import (
     ASLANT,
     MAX_COLUMN_STRAIN,
     STEEPEST,
+    SURE,
+    UPRIGHT,
     WALL,
     depth_and_share,
     depth_in_column,
     distance_in_column,
     inside_most,
+    led_in,
     ray_from,
     sunk_under,
     swept,
@@ -29,7 +32,7 @@ from stmpl_core.rays import (
     wall_in,
     way_of,
 )
-from stmpl_core.sdf import distance_at
+from stmpl_core.sdf import distance_at, jet_at
 
 NODES = 80  # number of nodes under a tool, about
 WIDEST = 0.45  # largest spacing of nodes, over the thickness
@@ -274,6 +277,59 @@ def strains_under(grid, pose, points, inward, thickness, top):
     for n in range(len(out)):
         ray = ray_from(pose, points[n, 0], points[n, 1], points[n, 2], inward[n, 0], inward[n, 1], inward[n, 2])
         out[n] = _strain_under(grid, ray, thickness[n], top)
+    return out
+
+
+@numba.njit(cache=True, inline="always")
+def _there(between, x, y, z):
+    """A point of a tool's frame in that of another, by the pose of the former in the latter, (4, 4)."""
+    return (between[0, 0] * x + between[0, 1] * y + between[0, 2] * z + between[0, 3],
+            between[1, 0] * x + between[1, 1] * y + between[1, 2] * z + between[1, 3],
+            between[2, 0] * x + between[2, 1] * y + between[2, 2] * z + between[2, 3])  # fmt: skip
+
+
+@numba.njit(cache=True, inline="always")
+def _ended(grid, ray, other, between, s, wall):
+    """Share to which a tool has ended at s along a ray, from 0: it has not, or another is there beyond its wall, to 1."""
+    x, y, z = ray[0] + s * ray[3], ray[1] + s * ray[4], ray[2] + s * ray[5]
+    own, a, b, c = jet_at(grid[0], grid[1], grid[2], x, y, z)
+    if own <= -0.5 * wall:
+        return 0.0
+    far = 0.5 * wall - min(own, 0.0)
+    x, y, z = _there(between, x + far * a, y + far * b, z + far * c)
+    gap = max(own, 0.0) + max(distance_at(other[0], other[1], other[2], x, y, z) + 0.5 * wall, 0.0)
+    return min(2 * gap / wall, 1.0)
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def strains_beside(grid, pose, other, between, points, inward, thickness, strain, top):
+    """Strains of a tool's nodes, (N,) [-]: nothing is rounded off at a wall where another tool goes on.
+
+    Args:
+        grid, pose, top: the tool, see `nodes_under`.
+        other, between: distance field of the other one, and the tool's pose in its frame, (4, 4).
+        points, inward, thickness, strain: see Nodes.
+    """
+    out, (size, a, b, c) = strain.copy(), way_of(top)
+    for n in range(len(out)):
+        t, wall, now = thickness[n], wall_in(grid[3], thickness[n]), 0.0
+        ray = ray_from(pose, points[n, 0], points[n, 1], points[n, 2], inward[n, 0], inward[n, 1], inward[n, 2])
+        x, y, z = _there(between, ray[0], ray[1], ray[2])
+        if distance_at(other[0], other[1], other[2], x, y, z) > STEEPEST * t:
+            continue
+        deep, share = depth_and_share(grid, ray, t, top)
+        if deep > wall:
+            ended = _ended(grid, ray, other, between, deep - wall, wall)
+            now = share * min(deep / t, MAX_COLUMN_STRAIN) * (1 - ended * min(deep / wall - 1, 1.0))
+        cosine = a * ray[3] + b * ray[4] + c * ray[5]
+        if share < 1 and cosine > ASLANT:  # where a tool that has sunk has come through the skin: see rays.swept
+            way = ray[0], ray[1], ray[2], a, b, c
+            inside, where = inside_most(grid, way, t, -distance_in_column(grid, way, 0.0), -wall)
+            most = size * (1 - _ended(grid, way, other, between, where, wall)) * min((cosine - ASLANT) / UPRIGHT, 1.0)
+            if most > share:
+                ends = way if inside > SURE * wall else led_in(grid, way, where, inside, wall)
+                now += (most - share) * min(depth_in_column(grid, ends, t, 0.0) * cosine / t, MAX_COLUMN_STRAIN)
+        out[n] = max(out[n], now)
     return out
 
 

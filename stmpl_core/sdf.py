@@ -18,7 +18,7 @@ from stmpl_core.compiling import UNCOUNTED
 from stmpl_core.decimation import BAND_CELLS, MARGIN, MAX_NODES, field_spacing
 from stmpl_core.errors import InvalidInput, MeshError
 from stmpl_core.mending import closed, openings, places
-from stmpl_core.solids import bend_of_solid, solid_jet, solid_of, to_solid
+from stmpl_core.solids import bend_of_solid, half_of, solid_jet, solid_of, to_solid
 from stmpl_core.spline import spline_sum
 from stmpl_core.tool import Tool
 from stmpl_core.walls import areas, outer_walls
@@ -363,6 +363,8 @@ def _anywhere(corners: np.ndarray, many: int, seed: int) -> tuple[Points, np.nda
 def _half_thickness(coefficients: np.ndarray, origin: np.ndarray, spacing: float, vertices: Points,
                     faces: np.ndarray) -> float:  # fmt: skip
     """See SignedDistance; from PROBED places of the surface, a third of which may be less thick: edges are."""
+    if coefficients.shape[0] == 1:
+        return min(half_of(coefficients), THICK)
     there, some = _anywhere(vertices[faces], PROBED, 0)
     a, b, c = np.swapaxes(some, 0, 1)
     inwards = -np.cross(b - a, c - a) / (2 * areas(some)[:, None])

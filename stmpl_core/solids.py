@@ -63,6 +63,15 @@ def solid_of(vertices: Points, faces: np.ndarray, spacing: float) -> np.ndarray 
     return None
 
 
+def half_of(solid: np.ndarray) -> float:
+    """Largest distance inside a solid from its surface [m]: of a box and a cylinder half of what is least."""
+    numbers = solid[0, 0]
+    if solid.shape[1] == BOX:
+        return float(np.linalg.norm(numbers[3:].reshape(3, 3), axis=1).min())
+    radius = float(numbers[6])
+    return min(radius, 0.5 * float(np.linalg.norm(numbers[3:6] - numbers[:3]))) if solid.shape[1] == CYLINDER else radius
+
+
 def _packed(kind: int, numbers: np.ndarray) -> np.ndarray:
     out = np.zeros((1, kind, len(numbers)))
     out[0, 0] = numbers

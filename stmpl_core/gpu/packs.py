@@ -122,7 +122,7 @@ SCRATCH: dict[str, tuple[Any, str]] = {
     "tool": (wp.int32, "SN"), "cell": (wp.int32, "SN"), "face": (wp.int32, "SN"), "shares": (vec3, "SN"),
     "point": (vec3, "SN"), "inward": (vec3, "SN"), "thick": (real, "SN"), "area": (real, "SN"), "strain": (real, "SN"),
     "fold": (wp.int32, "SN"), "queue": (wp.int32, "SN"), "mean": (vec3, "C"), "middle": (wp.vec4d, "C"),
-    "pushed": (real, "C"), "way": (vec3, "C"), "as_one": (real, "CT"), "least_area": (real, "C"),
+    "pushed": (real, "C"), "way": (vec3, "C"), "as_one": (real, "CT"), "near_tools": (real, "CT"), "tissue": (real, "C"), "least_area": (real, "C"),
     "most_area": (real, "C"), "sinking": (real, "SQ"), "soft": (real, "SQ"), "slot": (wp.int32, "SK"),
     "met": (wp.int32, "SK"), "meets": (wp.int32, "S"), "slots": (wp.int32, "SQ9"), "weights": (real, "SQ9"),
     "parts": (real, "SQ9"), "around_node": (wp.int32, "SQ"), "rows": (real, "SQK"),

@@ -15,6 +15,7 @@ from stmpl_core.rays import (
     PASSED,
     SECANT_START,
     SECANT_TOLERANCE,
+    STEEPEST,
     UPRIGHT,
     WALL,
 )
@@ -30,7 +31,7 @@ FAR = wp.constant(wp.float64(1e30))  # stands for infinity
 WALL_WIDTH = wp.constant(wp.float64(WALL))
 MOST_STRAIN = wp.constant(wp.float64(MAX_COLUMN_STRAIN))
 PARTS, MOST_PARTS = wp.constant(wp.float64(PASSED)), wp.constant(wp.float64(MOST_PASSED))
-GRAZE = wp.constant(wp.float64(GRAZES))
+GRAZE, STEEP = wp.constant(wp.float64(GRAZES)), wp.constant(wp.float64(STEEPEST))
 SAID_ANYHOW, SAYS_NO_WAY = wp.constant(wp.float64(ANYHOW)), wp.constant(wp.float64(LONGEST))
 ENTERS, LOOKS_BACK = wp.constant(MOST_ENTERS), wp.constant(wp.float64(LOOKED_BACK))
 SLANT, MORE_UPRIGHT = wp.constant(wp.float64(ASLANT)), wp.constant(wp.float64(UPRIGHT))
@@ -293,17 +294,27 @@ def depth_in_column(grid: Grid, coefficients: wp.array(dtype=real), start: vec3,
 
 
 @wp.func
-def inside_most(grid: Grid, coefficients: wp.array(dtype=real), start: vec3, way: vec3, deep: real) -> real:
-    """How far inside the tool a ray gets at most on its way to a depth [m]; below 0: how far it passes beside it."""
-    most = -along(grid, coefficients, start, way, real(0.0))
-    step, k = wp.max(wp.min(real(0.5) * grid.half, deep / PARTS), deep / MOST_PARTS), wp.int32(1)
+def innermost(grid: Grid, coefficients: wp.array(dtype=real), start: vec3, way: vec3, deep: real) -> wp.vec2d:
+    """How far inside the tool a ray gets at most on its way to a depth, below 0: passes beside it; and where [m]."""
+    most, where, at = -along(grid, coefficients, start, way, real(0.0)), real(0.0), real(0.0)
+    there, step = real(most), wp.max(wp.min(real(0.5) * grid.half, deep / PARTS), deep / MOST_PARTS)
+    k = wp.int32(1)
     while k > 0:
         s = wp.min(real(k) * step, deep)
-        most = wp.max(most, -along(grid, coefficients, start, way, s))
+        if there + STEEP * (s - at) > most:
+            at, there = real(s), -along(grid, coefficients, start, way, s)
+            if there > most:
+                most, where = real(there), real(s)
         k += 1
         if not s < deep:
             k = wp.int32(0)
-    return most
+    return wp.vec2d(most, where)
+
+
+@wp.func
+def inside_most(grid: Grid, coefficients: wp.array(dtype=real), start: vec3, way: vec3, deep: real) -> real:
+    """How far inside the tool a ray gets at most on its way to a depth [m]; below 0: how far it passes beside it."""
+    return innermost(grid, coefficients, start, way, deep)[0]
 
 
 @wp.func
@@ -315,20 +326,11 @@ def sure_of(grid: Grid, coefficients: wp.array(dtype=real), start: vec3, way: ve
 @wp.func
 def led_in(grid: Grid, coefficients: wp.array(dtype=real), start: vec3, way: vec3, deep: real, wall: real) -> vec3:
     """Start of a ray that passes the tool, moved aside until it is clear that it leads through it."""
-    at, least = real(0.0), along(grid, coefficients, start, way, real(0.0))
-    step, k = wp.max(wp.min(real(0.5) * grid.half, deep / PARTS), deep / MOST_PARTS), wp.int32(1)
-    while k > 0:
-        s = wp.min(real(k) * step, deep)
-        d = along(grid, coefficients, start, way, s)
-        if d < least:
-            at, least = real(s), real(d)
-        k += 1
-        if not s < deep:
-            k = wp.int32(0)
-    jet = jet_at(grid, coefficients, start + at * way)
+    most = innermost(grid, coefficients, start, way, deep)
+    jet = jet_at(grid, coefficients, start + most[1] * way)
     aside = vec3(jet[1], jet[2], jet[3])
     aside = aside - wp.dot(aside, way) * way
-    return start - wp.max(CLEAR * wall + least, real(0.0)) / wp.max(wp.length_sq(aside), ASIDE) * aside
+    return start - wp.max(CLEAR * wall - most[0], real(0.0)) / wp.max(wp.length_sq(aside), ASIDE) * aside
 
 
 @wp.func

@@ -28,6 +28,7 @@ from stmpl_core.response import SPREAD as SPREAD_OF_AREA
 
 ONE_WAY = wp.constant(wp.float64(MIN_ONE_WAY_SHARE))
 AS_ONE, EACH_ITS_OWN = (wp.constant(wp.float64(x)) for x in columns.AS_ONE)
+NEAR_TOOLS, FAR_TOOLS = (wp.constant(wp.float64(x)) for x in contact_net.FAR_TOOLS)
 ROWS, FARTHEST, AROUND = (wp.constant(wp.float64(x)) for x in (green.ROWS, green.FARTHEST, green.AROUND))
 FIRST_LOG, STEP_LOG = wp.constant(wp.float64(green.FIRST_LOG)), wp.constant(wp.float64(green.STEP_LOG))
 LAST_ROW = wp.constant(wp.float64(len(green.SPREADS) - 1.001))
@@ -56,13 +57,14 @@ def find_mean(many: wp.int32, skins: Skins, scratch: Scratch):
     """Where the skin under each tool is pushed: columns.pushed; and the extremes of the areas of its group."""
     c = wp.tid()
     s, k = c // many, c % many
-    mean, middle, total, square = vec3(), vec3(), real(0.0), real(0.0)
+    mean, middle, total, square, thick = vec3(), vec3(), real(0.0), real(0.0), real(0.0)
     least, most = real(1e30), real(0.0)
     for i in range(scratch.nodes[s]):
         if scratch.tool[s, i] == k:
             push = scratch.area[s, i] * scratch.strain[s, i] * scratch.thick[s, i]
             mean = mean + push * scratch.inward[s, i]
             middle = middle + push * scratch.point[s, i]
+            thick += push * scratch.thick[s, i]
             total += push
         if scratch.group[s * many + scratch.tool[s, i]] == scratch.group[c]:
             least = wp.min(least, scratch.area[s, i])
@@ -75,23 +77,30 @@ def find_mean(many: wp.int32, skins: Skins, scratch: Scratch):
     scratch.mean[c] = mean
     scratch.middle[c] = wp.vec4d(middle[0], middle[1], middle[2], wp.sqrt(square / wp.max(total, real(1e-300))))
     scratch.pushed[c] = total
+    scratch.tissue[c] = thick / wp.max(total, real(1e-300))
     scratch.least_area[c] = least
     scratch.most_area[c] = most
 
 
 @wp.kernel
 def share_way(many: wp.int32, scratch: Scratch):
-    """The way of the skin under each tool of a scene, 0 where it has none: columns.shared_pushes."""
+    """The way of the skin under each tool of a scene, 0 where it has none: columns.shared_pushes; contact_net._near_tools."""
     s = wp.tid()
     first = s * many
     for k in range(many):
         for m in range(many):
             own, other, share = scratch.middle[first + k], scratch.middle[first + m], real(0.0)
+            near, around = real(0.0), scratch.tissue[first + k] + scratch.tissue[first + m]
             pressing = scratch.pushed[first + k] > real(0.0) and scratch.pushed[first + m] > real(0.0)
             if pressing and scratch.group[first + k] == scratch.group[first + m]:
                 apart = wp.length(vec3(own[0] - other[0], own[1] - other[1], own[2] - other[2]))
                 share = (EACH_ITS_OWN - apart / wp.max(own[3] + other[3], real(1e-12))) / (EACH_ITS_OWN - AS_ONE)
                 share = wp.clamp(share, real(0.0), real(1.0))
+                near = FAR_TOOLS - apart / wp.max(own[3] + other[3] + around, real(1e-12))
+                near = wp.clamp(near / (FAR_TOOLS - NEAR_TOOLS), real(0.0), real(1.0))
+            if k == m:
+                near = real(1.0)
+            scratch.near_tools[first + k, m] = near * near * (real(3.0) - real(2.0) * near)
             scratch.as_one[first + k, m] = share * share * (real(3.0) - real(2.0) * share)
     for third in range(many):
         for k in range(many):
@@ -338,16 +347,17 @@ def temper(lanes: wp.int32, scratch: Scratch):
 
 @wp.kernel
 def share_given_way(many: wp.int32, scratch: Scratch):
-    """Share of the work of the forces of each tool's group that goes into the limb as a whole."""
+    """Share of the work of the forces of each tool and those near it that goes into the limb as a whole."""
     c, lane = wp.tid()
     s, coarse, whole = c // many, real(0.0), real(0.0)
     for i in range(lane, scratch.nodes[s], wp.block_dim()):
-        force = scratch.force[s, i]
-        if force > real(0.0) and scratch.group[s * many + scratch.tool[s, i]] == scratch.group[c]:
+        force = scratch.near_tools[c, scratch.tool[s, i]] * scratch.force[s, i]
+        if force > real(0.0):
             for j in range(scratch.nodes[s]):
-                if scratch.group[s * many + scratch.tool[s, j]] == scratch.group[c]:
-                    coarse += force * scratch.wide_part[s, i, j] * scratch.force[s, j]
-                    whole += force * scratch.matrix[s, i, j] * scratch.force[s, j]
+                other = scratch.near_tools[c, scratch.tool[s, j]] * scratch.force[s, j]
+                if other > real(0.0):
+                    coarse += force * scratch.wide_part[s, i, j] * other
+                    whole += force * scratch.matrix[s, i, j] * other
     coarse = sum_of(coarse)
     whole = sum_of(whole)
     if lane == 0:

@@ -8,7 +8,25 @@ from stmpl_core.gpu.conforms import ONE_WAY
 from stmpl_core.gpu.field_packs import FieldScratch
 from stmpl_core.gpu.packs import Scratch, Skins
 from stmpl_core.gpu.places import BY_POSE
-from stmpl_core.gpu.rays import OPTIONS, real, strain_under, vec3
+from stmpl_core.gpu.rays import (
+    CLEAR,
+    MORE_UPRIGHT,
+    MOST_STRAIN,
+    OPTIONS,
+    SLANT,
+    STEEP,
+    depth_and_share,
+    depth_in_column,
+    distance_at,
+    innermost,
+    jet_at,
+    led_in,
+    real,
+    strain_under,
+    vec3,
+    wall_in,
+    way_of,
+)
 
 PLACE, HERE, SEEN = (wp.constant(wp.float64(most * most / 3**0.5)) for most in (twins.APART, twins.HERE, twins.AROUND))
 COVERED, GIVES = wp.constant(wp.float64(twins.COVERED)), wp.constant(wp.float64(twins.GIVES))
@@ -22,6 +40,56 @@ def _apart(scratch: Scratch, s: wp.int32, i: wp.int32, j: wp.int32, most: real) 
     if wp.dot(scratch.inward[s, i], scratch.inward[s, j]) <= real(0.0):
         return real(1.0)
     return wp.min(over, real(1.0))
+
+
+@wp.func
+def _ended(skins: Skins, scratch: Scratch, c: wp.int32, other: wp.int32, start: vec3, way: vec3, s: real, wall: real):
+    """Share to which tool c has ended at s along a ray, and another is not there beyond its wall: nodes._ended."""
+    grid, at = skins.grids[scratch.grid[c]], start + s * way
+    jet = jet_at(grid, skins.coefficients, at)
+    ended = real(0.0)
+    if jet[0] > real(-0.5) * wall:
+        at = at + (real(0.5) * wall - wp.min(jet[0], real(0.0))) * vec3(jet[1], jet[2], jet[3])
+        at = wp.transpose(scratch.pose[other]) * (scratch.pose[c] * at + scratch.place[c] - scratch.place[other])
+        beyond = distance_at(skins.grids[scratch.grid[other]], skins.coefficients, at)
+        gap = wp.max(jet[0], real(0.0)) + wp.max(beyond + real(0.5) * wall, real(0.0))
+        ended = wp.min(real(2.0) * gap / wall, real(1.0))
+    return ended
+
+
+@wp.kernel
+def go_on(lanes: wp.int32, many: wp.int32, skins: Skins, scratch: Scratch):
+    """Strains of nodes where another tool goes on at a wall of their own: nodes.strains_beside."""
+    s, lane = wp.tid()
+    for i in range(lane, scratch.nodes[s], lanes):
+        c, t = s * many + scratch.tool[s, i], scratch.thick[s, i]
+        for k in range(many):
+            other = s * many + k
+            if other != c and scratch.status[other] == BY_POSE and scratch.group[other] == scratch.group[c]:
+                grid, top, point = skins.grids[scratch.grid[c]], scratch.top[c], scratch.point[s, i]
+                there = wp.transpose(scratch.pose[other]) * (point - scratch.place[other])
+                if distance_at(skins.grids[scratch.grid[other]], skins.coefficients, there) <= STEEP * t:
+                    pose, wall, now = wp.transpose(scratch.pose[c]), wall_in(grid, t), real(0.0)
+                    start, way = pose * (point - scratch.place[c]), pose * scratch.inward[s, i]
+                    deep, share = depth_and_share(grid, skins.coefficients, start, way, t, top)
+                    if deep > wall:
+                        ended = _ended(skins, scratch, c, other, start, way, deep - wall, wall)
+                        now = real(1.0) - ended * wp.min(deep / wall - real(1.0), real(1.0))
+                        now = now * share * wp.min(deep / t, MOST_STRAIN)
+                    sunk = way_of(top)
+                    goes = vec3(sunk[1], sunk[2], sunk[3])
+                    cosine = wp.dot(goes, way)
+                    if share < real(1.0) and cosine > SLANT:
+                        inside = innermost(grid, skins.coefficients, start, goes, t)
+                        ended = _ended(skins, scratch, c, other, start, goes, inside[1], wall)
+                        most = sunk[0] * (real(1.0) - ended) * wp.min((cosine - SLANT) / MORE_UPRIGHT, real(1.0))
+                        if most > share:
+                            ends = start + vec3()
+                            if inside[0] <= CLEAR * wall:
+                                ends = led_in(grid, skins.coefficients, start, goes, t, wall)
+                            deep = depth_in_column(grid, skins.coefficients, ends, goes, t, real(0.0)) * cosine
+                            now += (most - share) * wp.min(deep / t, MOST_STRAIN)
+                    scratch.strain[s, i] = wp.max(scratch.strain[s, i], now)
 
 
 @wp.kernel

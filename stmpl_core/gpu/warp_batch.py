@@ -379,6 +379,8 @@ class WarpBatch:
         self._run(columns.tell_inside, tools, many, skins, scratch)
         self._run(lattice.withdraw, scenes, many, scratch)
         self._run(answers.group, scenes, many, skins, scratch)
+        if many > 1:
+            self._run(twins.go_on, shared, lanes, many, skins, scratch)
         self._run(stacks.fold, (scenes, self._block), many, skins, scratch)
         if self._stacked:
             self._run(stacks.find_mean, tools, many, skins, scratch)
