@@ -15,6 +15,7 @@ from fem_tools.slabs import Slabs, slabs_of
 from fem_tools.system import System
 from stmpl_core.bones import shortened, unfolded
 from stmpl_core.coarse_response import CoarseDrag, CoarseResponse
+from stmpl_core.errors import MeshError
 from stmpl_core.green import add_motion, bank
 from stmpl_core.layer import SoftLayer
 from stmpl_core.methods.coarse import nearest_corners
@@ -174,6 +175,9 @@ class _Elements(NamedTuple):
         blocks: Any = system.tangent(system.zeros(), 1.0)
         count, width = len(layer.vertices), blocks.shape[1]
         free, column = np.repeat(~system.fixed, width), np.flatnonzero(~system.fixed)
+        if not len(column):
+            raise MeshError("every vertex of the skin is on its open border, which is held. Refine it, for instance by "
+                            "stmpl_core.remesh.")  # fmt: skip
         whole = sp.bsr_matrix((blocks, mesh.indices, mesh.indptr), shape=(count * width,) * 2).tocsr()
         touch = sp.csr_matrix((np.ones(len(mesh.indices)), mesh.indices, mesh.indptr), shape=(count, count))
         slabs = [(width * one[:, None] + np.arange(width)).ravel() for one in slabs_of(touch[column][:, column])]

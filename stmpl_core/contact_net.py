@@ -23,7 +23,7 @@ from stmpl_core.obstacle import (
     moments_of,
     nearer,
     pairs,
-    power_of,
+    powers_of,
     rates_of,
     response,
     rings_of,
@@ -64,21 +64,37 @@ class Held(NamedTuple):
         pressure: pressure over E at the nodes, (N,) [-].
         doubt: error to expect of it, over E, (N,) [-].
         outside: degree to which the nodes see what no training contact had, from 0 to 1, (N,) [-]; 0 in a first touch.
-        shell: share of the linear work by which a limb is stiffer than its flat stack, (N,) [-]; stiff skin around it
+        shells: share of the linear work by which a limb is stiffer than its flat stack, (N,) [-]; stiff skin around it
             stands up like a shell, until it is dented. Empty of one material.
-        power: power of the depth with which the force grows, about [-].
+        powers: power of the depth with which the force of each node's tool grows, about, (N,) [-].
         missed: how far the linear problem is from solved, over the depth [-]: see obstacle.solve.
     """
 
     pressure: np.ndarray
     doubt: np.ndarray
     outside: np.ndarray
-    shell: np.ndarray
-    power: float
+    shells: np.ndarray
+    powers: np.ndarray
     missed: float = 0.0
 
+    def some(self, start: int, end: int) -> Held:
+        """Of the nodes from `start` on, up to `end`."""
+        return Held(self.pressure[start:end], self.doubt[start:end], self.outside[start:end], self.shells[start:end],
+                    self.powers[start:end], self.missed)  # fmt: skip
 
-NOTHING = Held(np.empty(0), np.empty(0), np.empty(0), np.empty(0), 1.0)
+    @property
+    def shell(self) -> float:
+        """Of one tool, see above."""
+        return float(self.shells[0]) if len(self.shells) else 0.0
+
+    @property
+    def power(self) -> float:
+        """Of one tool, see above."""
+        return float(self.powers[0]) if len(self.powers) else 1.0
+
+
+NO_NODES = np.empty(0)
+NOTHING = Held(NO_NODES, NO_NODES, NO_NODES, NO_NODES, NO_NODES)
 
 
 class Look(NamedTuple):
@@ -88,14 +104,14 @@ class Look(NamedTuple):
         pressure: pressure over E of the linear layer, with the barrier, (N,) [-].
         inputs: what the network reads, (N, NODE.size) float32; or STACK_NODE.size, of which old networks read less.
         fade: share of the network's correction, (N,) [-].
-        power: power of the depth with which the linear layer's force grows [-].
+        powers: power of the depth with which the force of each node's tool grows on the linear layer, (N,) [-].
         missed: see Held.
     """
 
     pressure: np.ndarray
     inputs: np.ndarray
     fade: np.ndarray
-    power: float
+    powers: np.ndarray
     missed: float
 
 
@@ -217,7 +233,7 @@ class ContactNet:
         pressure, doubt, outside = _correct(*look[:3], *self._network)
         if self._green is None:
             _thin(look.inputs, doubt, outside)
-        return Held(pressure / solved.times, doubt / solved.times, outside, -solved.given_way, look.power, look.missed)
+        return Held(pressure / solved.times, doubt / solved.times, outside, -solved.given_way, look.powers, look.missed)
 
     def apart(self, nodes: Nodes) -> np.ndarray:
         """Mask of contact nodes at which the skin lies further in than their tool's surface, (N,)."""
@@ -260,7 +276,8 @@ def _look(points, inward, thickness, area, strain, corners, shares, beside, grou
     times, over = crowded(points, inward, area, strain, beside, force)
     moments, vectors = moments_of(rings, points, thickness, area, _one(pressure), _one(strain / over))
     seen = _see(moments[0], vectors[0], inward, area, times * pressure, strain, here, moduli, nu)
-    return *seen, power_of(matrix, force, depth.max()), missed, matrix, rings, force, times, over
+    powers = powers_of(matrix, force, depth, _tool_of(beside, len(area)), max(beside.shape[1], 1))
+    return *seen, powers, missed, matrix, rings, force, times, over
 
 
 @numba.njit(cache=True, error_model="numpy")
@@ -288,13 +305,15 @@ def _look_on_stack(points, inward, thickness, area, strain, corners, shares, sin
     times, over = crowded(points, inward, area, strain, beside, force)
     moments, vectors = moments_of(rings, points, np.full(len(area), t), area,
                                   _one(np.exp(numbers[3]) * (force / area)), _one(sinking / over / t))  # fmt: skip
-    near, of = _near_tools(points, thickness, area * (strain * thickness), beside)
+    of = _tool_of(beside, len(area))
+    near = _near_tools(points, thickness, area * (strain * thickness), of, max(beside.shape[1], 1))
     given_way, among = _given_way(matrix, wide, force, near, of), _among(points, inward, thickness, group, t, force)
     shape = _shape(*among, force)
     seen = _see_on_stack(moments[0], vectors[0], inward, thickness, area, t, times * force, strain, sinking, here, nu,
                          numbers, log_thickness, hardening, _between(corners, shares, alike)[:, 0],
                          given_way, shape)  # fmt: skip
-    return *seen, power_of(matrix, force, depth.max()), missed, matrix, rings, force, times, over, given_way, *among
+    powers = powers_of(matrix, force, depth, of, len(near))
+    return *seen, powers, missed, matrix, rings, force, times, over, given_way, *among
 
 
 @numba.njit(cache=True, error_model="numpy")
@@ -368,19 +387,27 @@ def _shape(weights, what, force):
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _near_tools(points, thickness, weight, beside):
-    """How near tools are to each other, from 0, far, to 1, (K, K), and which each node is of, (N,).
-
-    Args:
-        points, thickness, beside: see Nodes.
-        weight: weight of each node in its tool's middle, (N,).
-    """
-    many = max(beside.shape[1], 1)
-    of, out, told = np.zeros(len(points), np.int64), np.ones((many, many)), np.zeros((many, 6))
-    for n in range(len(points)):
+def _tool_of(beside, count):
+    """Number of the tool of each of so many nodes, (N,); beside: see Nodes."""
+    of = np.zeros(count, np.int64)
+    for n in range(len(beside)):
         for k in range(beside.shape[1]):
             if beside[n, k] < 0:
                 of[n] = k
+    return of
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _near_tools(points, thickness, weight, of, many):
+    """How near tools are to each other, from 0, far, to 1, (K, K).
+
+    Args:
+        points, thickness: see Nodes.
+        weight: weight of each node in its tool's middle, (N,).
+        of, many: see `_tool_of`, and number of tools.
+    """
+    out, told = np.ones((many, many)), np.zeros((many, 6))
+    for n in range(len(points)):
         own = told[of[n]]
         own[0] += weight[n]
         own[4] += weight[n] * thickness[n]
@@ -400,7 +427,7 @@ def _near_tools(points, thickness, weight, beside):
             apart = np.sqrt(square) / max(np.sqrt(a[5]) + np.sqrt(b[5]) + a[4] + b[4], 1e-12)
             share = min(max((FAR_TOOLS[1] - apart) / (FAR_TOOLS[1] - FAR_TOOLS[0]), 0.0), 1.0)
             out[k, m] = share * share * (3 - 2 * share) if k != m else 1.0
-    return out, of
+    return out
 
 
 @numba.njit(cache=True, error_model="numpy")
@@ -410,7 +437,7 @@ def _given_way(matrix, wide, force, near, of):
 
     Args:
         matrix, wide: response to the forces, and its coarse part, (N, N).
-        near, of: see `_near_tools`.
+        near, of: see `_near_tools` and `_tool_of`.
     """
     many, out = len(near), np.empty(len(force))
     coarse, whole = np.zeros((many, many)), np.zeros((many, many))

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 from stmpl_core.arrays import Faces, PerVertex, Points, VertexVectors, check_kind, finite
 from stmpl_core.errors import InvalidInput, MeshError
 from stmpl_core.seams import border_edges, edge_table
-from stmpl_core.tissue import Tissue
+from stmpl_core.tissue import MAX_THICKNESS, Tissue
 
 if TYPE_CHECKING:
     from stmpl_core.rig import Rig
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 MAX_EXTENT = 4.0  # largest extent of a skin [m]; that of a mesh in millimetres is larger
 STEEPEST = 0.35  # cosine between the normal and a column to the core, below which the column's length counts
 MOST_OUTSIDE = 0.01  # share of the skin whose core may lie on its other side, as where joints fold it
-MAX_THICKNESS = 0.1  # largest thickness of soft tissue [m]; that of a thickness in millimetres is larger
+LOOSE = 2.0  # vertices over faces, from which triangles are not joined; a closed surface has half as many
 
 
 class SoftLayer:
@@ -323,6 +323,9 @@ def _check_surface(layer: SoftLayer) -> None:
     if (area <= 1e-9 * area.max()).any():
         raise MeshError(f"{int((area <= 1e-9 * area.max()).sum())} faces have no area, the first is face "
                         f"{int(area.argmin())}. Clean or remesh the skin (stmpl_core.remesh).")
+    if len(layer.vertices) >= LOOSE * len(layer.faces) > 3 * LOOSE:
+        raise MeshError(f"{len(layer.vertices)} vertices for {len(layer.faces)} faces: the triangles are not joined, "
+                        "as in an STL file. Merge their corners, for instance by trimesh.Trimesh.merge_vertices().")
     directed = layer.faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2).astype(np.int64)
     key = directed[:, 0] * len(layer.vertices) + directed[:, 1]
     if len(np.unique(key)) != len(key):

@@ -290,7 +290,7 @@ def _there(between, x, y, z):
 
 @numba.njit(cache=True, inline="always")
 def _ended(grid, ray, other, between, s, wall):
-    """Share to which a tool has ended at s along a ray, from 0: it has not, or another is there beyond its wall, to 1."""
+    """Share to which a tool has ended at s along a ray, from 0: it has not, or another is beyond its wall, to 1."""
     x, y, z = ray[0] + s * ray[3], ray[1] + s * ray[4], ray[2] + s * ray[5]
     own, a, b, c = jet_at(grid[0], grid[1], grid[2], x, y, z)
     if own <= -0.5 * wall:

@@ -351,8 +351,15 @@ def _add_times(matrix, vector, out):
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def power_of(matrix, force, depth):
-    """The slope of the whole force over the depth, times depth over force: conjugate gradients on what presses."""
+def powers_of(matrix, force, depth, of, many):
+    """The slope of the force of each node's tool over the depth, times depth over force, (N,): conjugate gradients on
+    what presses.
+
+    Args:
+        matrix, force: response, and forces that it needs, (N, N) and (N,).
+        depth: depths of the nodes, (N,).
+        of, many: number of the tool of each node, (N,), and of tools.
+    """
     count = len(force)
     found, left = np.zeros(count), (force > 0).astype(np.float64)
     way, along = left.copy(), np.empty(count)
@@ -373,4 +380,12 @@ def power_of(matrix, force, depth):
             square += left[i] * left[i]
         for i in range(count):
             way[i] = left[i] + square / before * way[i]
-    return depth * found.sum() / max(force.sum(), 1e-300)
+    told = np.zeros((many, 3))
+    for i in range(count):
+        told[of[i], 0] = max(told[of[i], 0], depth[i])
+        told[of[i], 1] += found[i]
+        told[of[i], 2] += force[i]
+    for i in range(count):
+        deepest, rises, whole = told[of[i]]
+        found[i] = deepest * rises / max(whole, 1e-300)
+    return found

@@ -9,7 +9,7 @@ from stmpl_core.compiling import UNCOUNTED
 from stmpl_core.sdf import distance_at, jet_at
 
 WALL = 0.05  # width over which depth rises beside a tool's wall, over the thickness: nothing pops in while it slides
-PASSED, MOST_PASSED = 7, 1024  # parts of a column's way between which it is looked how far it is inside a tool, or beside
+PASSED, MOST_PASSED = 7, 1024  # parts of a column's way between which it is looked how far it is in a tool, or beside
 ENTERS, LOOKS_BACK = 12, 0.15  # steps to where a column enters a tool, cosine from which its surface looks back there
 LOOKED_AT = 0.2 * WALL  # way over which it is asked whether it does, over the thickness
 SURE = 0.2  # how far inside a tool, over the width of a wall, it is clear where a way ends; so far outside: nowhere

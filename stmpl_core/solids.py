@@ -68,8 +68,8 @@ def half_of(solid: np.ndarray) -> float:
     numbers = solid[0, 0]
     if solid.shape[1] == BOX:
         return float(np.linalg.norm(numbers[3:].reshape(3, 3), axis=1).min())
-    radius = float(numbers[6])
-    return min(radius, 0.5 * float(np.linalg.norm(numbers[3:6] - numbers[:3]))) if solid.shape[1] == CYLINDER else radius
+    half = 0.5 * np.linalg.norm(numbers[3:6] - numbers[:3])
+    return float(min(numbers[6], half) if solid.shape[1] == CYLINDER else numbers[6])
 
 
 def _packed(kind: int, numbers: np.ndarray) -> np.ndarray:

@@ -222,7 +222,7 @@ class Toucher:
             end = 0
             for one in group:
                 start, end = end, end + len(one.squeeze.nodes.area)
-                held[one.contact.name] = Held(*(values[start:end] for values in together[:4]), *together[4:])
+                held[one.contact.name] = together.some(start, end)
             covered |= self._covered(group, nodes, held)
         placed = [told.get(one.contact.name, one) for one in placed]
         return [self._answer(one, held.get(one.contact.name, NOTHING), beside.get(one.contact.name), alone,
@@ -532,7 +532,7 @@ class Toucher:
             led = _led_in(nodes.sinking, nodes.strain, nodes.thickness, nodes.inward, wrench[:3] / size)
             if led < LED_OUT:
                 bound += led**-held.power - 1
-        bound += SHELL * max(float(held.shell.max(initial=0.0)) - SHELL_FROM, 0.0)
+        bound += SHELL * max(held.shell - SHELL_FROM, 0.0)
         sunk, *way_in_tool = way_of(one.squeeze.top)
         if sunk:
             high = float(np.abs(way_in_tool) @ -np.subtract(*one.field.tool_bounds))

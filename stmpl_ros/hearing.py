@@ -86,6 +86,7 @@ class Hearing:
         self._strangers: set[str] = set()  # tools that were told of
         self._away: set[str] = set()  # tools that were taken away
         self._refused: dict[str, str] = {}  # why the newest surface of a tool cannot be used, in brackets
+        self._standing: dict[str, str] = {}  # digest of the surface that such a tool is answered with
 
     def _check_shape_tools(self) -> None:
         for name in self._config().shape_tools:
@@ -132,7 +133,8 @@ class Hearing:
         if tool.name not in self._listened:
             self._listen_to(tool.name)
         self.tools.add(tool, field)
-        self._refused.pop(tool.name, None)
+        if self._standing.get(tool.name) != tool.digest:  # else its field was built anew for another skin
+            self._refused.pop(tool.name, None)
         for sentence in tool.mendings:
             self.gate.say(f"mended {tool.name} {sentence}", f"the mesh of '{tool.name}' was mended: {sentence}")
         if field.flipped:
@@ -149,7 +151,7 @@ class Hearing:
 
     def _refuse_mesh(self, name: str, error: BaseException) -> None:
         why = f"mesh of '{name:.60}' refused: {error}"
-        self._refused[name] = f" ({why})"
+        self._refused[name], self._standing[name] = f" ({why})", self.tools[name].digest if name in self.tools else ""
         self.gate.refuse(f"mesh of {name}", why)
 
     def outdated(self, name: str) -> str:

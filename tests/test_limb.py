@@ -6,9 +6,10 @@ import pytest
 from fem_tools import PatchFem
 from stmpl_core import Load, Membrane, Ply, SoftLayer, Tissue
 from stmpl_core.bones import Bone, to_bone
-from stmpl_core.errors import NotPrepared
-from stmpl_core.methods import LimbLinear
+from stmpl_core.errors import MeshError, NotPrepared
+from stmpl_core.methods import LimbLinear, MomentNet
 from stmpl_core.moments import Surroundings
+from stmpl_core.simulator import Simulator
 from tests.scenes import disc, limb
 
 RADIUS, LENGTH = 0.035, 0.26
@@ -61,3 +62,17 @@ def test_tissue_thinner_than_the_coarse_mesh_is_flagged():
 def test_it_wants_a_layer():
     with pytest.raises(NotPrepared):
         LimbLinear().solve(Load.pressure(np.zeros(3)))
+
+
+def test_skin_of_triangles_that_are_not_joined_is_refused() -> None:
+    loose = limb(8e-3)
+    corners = loose.vertices[loose.faces].reshape(-1, 3)
+    with pytest.raises(MeshError, match="not joined"):
+        SoftLayer(corners, np.arange(len(corners)).reshape(-1, 3), 8e-3)
+
+
+def test_layered_skin_that_is_all_border_is_refused() -> None:
+    rings = limb(0.02, thickness=16e-3, length=0.017).with_(tissue=STACK)
+    assert len(rings.border) == len(rings.vertices)
+    with pytest.raises(MeshError, match="every vertex of the skin is on its open border"):
+        Simulator(rings, MomentNet())

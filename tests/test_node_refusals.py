@@ -215,6 +215,10 @@ def test_a_tool_whose_newest_surface_is_refused_is_answered_with_the_one_before_
     assert all_of_them.message.count(says) == 1
     bus.wait(lambda: not models[-1].in_range, "the model to be flagged as the answer is")
     bus.node.destroy_subscription(ear)
+    skins = len(bus.got["skin/topology"])
+    assert bus.call(SetBody, "set_body", thickness=5e-3).success  # fields of another margin
+    bus.wait(lambda: hand.press() or bus.got["skin/topology"][skins:], "the other skin")
+    assert says in bus.wait(lambda: hand.ask(HERE, PUSH), "an answer").why
     bus.mesh.publish(tool_message(ball().named("probe"), bus.now()))
     bus.wait(lambda: hand.ask(HERE, PUSH).in_range, "the good one to be trusted again")
 

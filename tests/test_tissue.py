@@ -29,6 +29,7 @@ def test_kappa_and_pull_are_the_skin_s_numbers_over_those_of_the_material_under_
         (lambda: Membrane(2e5, 1e-3, -1.0), "tension is -1 N/m"),
         (lambda: Membrane(20.0, 1e-3), "kilopascals"),
         (lambda: Ply(0.0, 1e4), "begins 0 m deep"),
+        (lambda: Ply(6, 12e3), "Is it in millimetres"),
         (lambda: Tissue(deeper=(Ply(2e-2, 1e4), Ply(1e-2, 1e4))), "each must begin below"),
         (lambda: Tissue("soft"), "youngs_modulus is 'soft'; a number is needed"),
         (lambda: Tissue(poisson_ratio=None), "poisson_ratio is None; a finite number"),

@@ -32,7 +32,7 @@ from stmpl_ros.view.skin import glb
 from stmpl_ros.view.snapshot import Gauge, Snapshot
 from stmpl_ros.view.tools import TOOLS, place_on, tool_from_bytes, tool_named
 from tests.bag_scene import tube, write_run
-from tests.scenes import limb
+from tests.scenes import STACK, limb
 
 PATIENCE = 120.0  # s to wait for anything; only a failing test waits so long
 LAYOUT = Path(__file__).parents[1] / "stmpl_ros/foxglove/stmpl.json"
@@ -176,6 +176,14 @@ def test_a_tool_stands_off_the_skin_and_touches_when_it_is_pushed(layer, name):
     pose[:3, 3] -= 8e-3 * pose[:3, 2]
     reading = gauge.read([Contact(tool, pose)])[tool.name]
     assert reading.force > 0 and 1e-3 < reading.depth < 5e-3
+
+
+def test_the_gauge_reads_layered_limbs_too():
+    layers = limb(8e-3, thickness=16e-3).with_(tissue=STACK)
+    tool = tool_named("ball")
+    pose, gauge = place_on(layers, tool.vertices), Gauge(layers)
+    pose[:3, 3] -= 8e-3 * pose[:3, 2]
+    assert gauge.read([Contact(tool, pose)])[tool.name].force > 0
 
 
 def test_a_mesh_file_is_the_mesh_in_it(tmp_path):

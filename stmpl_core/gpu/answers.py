@@ -105,10 +105,10 @@ def group(many: wp.int32, skins: Skins, scratch: Scratch):
 
 @wp.func
 def _power(scratch: Scratch, s: wp.int32, many: wp.int32, k: wp.int32) -> real:
-    """Power of the depth with which the force of a tool's group grows."""
+    """Power of the depth with which the force of a tool grows."""
     deepest, found, force = real(0.0), real(0.0), real(0.0)
     for i in range(scratch.nodes[s]):
-        if scratch.group[s * many + scratch.tool[s, i]] == scratch.group[s * many + k]:
+        if scratch.tool[s, i] == k:
             deepest = wp.max(deepest, scratch.wanted[s, i])
             found += scratch.found_power[s, i]
             force += scratch.force[s, i]

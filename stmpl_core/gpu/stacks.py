@@ -84,7 +84,8 @@ def find_mean(many: wp.int32, skins: Skins, scratch: Scratch):
 
 @wp.kernel
 def share_way(many: wp.int32, scratch: Scratch):
-    """The way of the skin under each tool of a scene, 0 where it has none: columns.shared_pushes; contact_net._near_tools."""
+    """The way of the skin under each tool of a scene, 0 where it has none: columns.shared_pushes; and how near each
+    is to each other: contact_net._near_tools."""
     s = wp.tid()
     first = s * many
     for k in range(many):
