@@ -11,6 +11,7 @@ import threading
 from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -94,6 +95,10 @@ class Batch:
 
     def __len__(self) -> int:
         return len(self.skins)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Pickled it is what it was made of, and made anew where it is read, with threads of its own."""
+        return partial(type(self), friction=self._friction, threads=self._threads), (self.skins, self.tools)
 
     def touch(
         self, poses: Any, states: Sequence[State | None] | None = None, dt: float = 0.0, *, fields: Iterable[int] = (),

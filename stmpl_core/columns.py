@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from copy import copy
 from functools import cached_property
@@ -14,7 +15,7 @@ import numpy as np
 from stmpl_core.arrays import Points, Transform, inverted
 from stmpl_core.compiling import UNCOUNTED
 from stmpl_core.layer import SoftLayer
-from stmpl_core.nodes import Nodes, met_between, nodes_under, strains_beside
+from stmpl_core.nodes import Nodes, ball_around, met_between, nodes_under, strains_beside
 from stmpl_core.rays import (
     ANYHOW,
     ASLANT,
@@ -105,6 +106,7 @@ class Columns:
         self._around = np.argsort(corners, kind="stable") // 3  # faces around each vertex
         self._start = np.searchsorted(np.sort(corners), np.arange(len(self.points) + 1))
         self._slot = np.full(len(self.points), -1)
+        self._thickest = float(layer.thickness.max())
         self._tree = True  # a tree of boxes pays for itself only where the skin stays
         self._order = _along_a_curve(self.points)
         self._blocks = _balls(self.points, layer.thickness, self._order)
@@ -196,7 +198,10 @@ class Columns:
             tools: distance field, pose_body_from_tool and squeeze of each, all with nodes.
         """
         strains = [squeeze.nodes.strain for *_, squeeze in tools]
+        balls = [ball_around(squeeze.nodes.points) for *_, squeeze in tools]
         for k, m in permutations(range(len(tools)), 2):
+            if math.dist(balls[k][0], balls[m][0]) > balls[k][1] + balls[m][1] + self._thickest:
+                continue
             (field, pose, squeeze), (other, other_pose, _) = tools[k], tools[m]
             between = inverted(other_pose) @ pose
             strains[k] = strains_beside(grid_of(field), pose, grid_of(other), between, *squeeze.nodes[:3], strains[k],

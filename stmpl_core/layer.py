@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 from stmpl_core.arrays import Faces, PerVertex, Points, VertexVectors, check_kind, finite
 from stmpl_core.errors import InvalidInput, MeshError
 from stmpl_core.seams import border_edges, edge_table
-from stmpl_core.tissue import MAX_THICKNESS, Tissue
+from stmpl_core.tissue import Tissue
 
 if TYPE_CHECKING:
     from stmpl_core.rig import Rig
@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 MAX_EXTENT = 4.0  # largest extent of a skin [m]; that of a mesh in millimetres is larger
 STEEPEST = 0.35  # cosine between the normal and a column to the core, below which the column's length counts
 MOST_OUTSIDE = 0.01  # share of the skin whose core may lie on its other side, as where joints fold it
+MAX_THICKNESS = 0.1  # largest thickness of soft tissue [m]; that of a thickness in millimetres is larger
 LOOSE = 2.0  # vertices over faces, from which triangles are not joined; a closed surface has half as many
 
 

@@ -17,12 +17,12 @@ from stmpl_core.bony import bony
 from stmpl_core.errors import InvalidInput
 from stmpl_core.fat import fat_map, for_person
 from stmpl_core.friction import Friction
-from stmpl_core.layer import SoftLayer, one_thickness
+from stmpl_core.layer import MAX_THICKNESS, SoftLayer, one_thickness
 from stmpl_core.limbs import EDGE_LENGTH
 from stmpl_core.packed import stack_from_text, stack_to_text
 from stmpl_core.regions import HELD_SKIN, REGIONS, Region, Tone, region
 from stmpl_core.text_file import text_of
-from stmpl_core.tissue import MAX_THICKNESS, Tissue
+from stmpl_core.tissue import Tissue
 from stmpl_core.trunk import TRUNK
 
 WHOLE = {"arm": "forearm", "leg": "thigh", "torso": "back"}  # region whose numbers serve a part of several

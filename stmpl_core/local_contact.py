@@ -20,9 +20,9 @@ from stmpl_core.contact import MOST, Contact, rigid
 from stmpl_core.errors import InvalidInput
 from stmpl_core.footing import in_plane, leaned, patch_of, twist_between
 from stmpl_core.history import History
+from stmpl_core.layer import MAX_THICKNESS
 from stmpl_core.state import Memory, State
 from stmpl_core.tangent import Tangent, tangents
-from stmpl_core.tissue import MAX_THICKNESS
 from stmpl_core.touch import APART, Pressed, Touch
 from stmpl_core.toucher import STIFFENING, Toucher
 from stmpl_core.trust import Trust

@@ -20,13 +20,13 @@ from scipy.optimize import brentq
 
 from stmpl_core.errors import InvalidInput
 from stmpl_core.friction import Friction, coefficient
-from stmpl_core.layer import one_thickness
+from stmpl_core.layer import MAX_THICKNESS, one_thickness
 from stmpl_core.regions import HELD_SKIN
 from stmpl_core.relaxation import Series, faded, fading, series_of
 from stmpl_core.sideways import patch
 from stmpl_core.stack import Ball, Fit, Misfit, ball, nearest, plies, response
 from stmpl_core.stroke import Missed, Stroke, played, pulled, without_time
-from stmpl_core.tissue import FRICTION, HARDEST, MAX_THICKNESS, SOFTEST, Tissue
+from stmpl_core.tissue import FRICTION, HARDEST, SOFTEST, Tissue
 
 if TYPE_CHECKING:
     from stmpl_core.layer import SoftLayer

@@ -280,6 +280,19 @@ def strains_under(grid, pose, points, inward, thickness, top):
     return out
 
 
+@numba.njit(cache=True, nogil=True)
+def ball_around(points):
+    """Middle of points (N, 3), and the distance of the farthest from it [m]."""
+    middle, square = np.zeros(3), 0.0
+    for n in range(len(points)):
+        for x in range(3):
+            middle[x] += points[n, x] / len(points)
+    for n in range(len(points)):
+        a, b, c = points[n, 0] - middle[0], points[n, 1] - middle[1], points[n, 2] - middle[2]
+        square = max(square, a * a + b * b + c * c)
+    return middle, np.sqrt(square)
+
+
 @numba.njit(cache=True, inline="always")
 def _there(between, x, y, z):
     """A point of a tool's frame in that of another, by the pose of the former in the latter, (4, 4)."""

@@ -11,7 +11,7 @@ import numpy as np
 from stmpl_core.arrays import check_kind, check_number, is_number
 from stmpl_core.errors import InvalidInput
 
-MAX_THICKNESS = 0.1  # largest thickness of soft tissue [m]; that of a thickness in millimetres is larger
+DEEPEST = 1.0  # largest depth at which a material begins [m]; that of a depth in millimetres is larger
 THICKEST_SKIN = 5e-3  # largest thickness of a skin [m]; that of a skin in millimetres is larger
 SOFTEST = 100.0  # smallest Young's modulus of a tissue [Pa]; that of a modulus in kilopascals is smaller
 HARDEST = 1e6  # Young's modulus above any soft layer's [Pa]: 8 times that of skin's sheet (stmpl_core.regions)
@@ -128,8 +128,8 @@ class Ply:
         _check_moduli(self.youngs_modulus, self.poisson_ratio)
         if not (np.isfinite(self.depth) and self.depth > 0):
             raise InvalidInput(f"a material begins {self.depth:g} m deep; it must be finite and above 0.")
-        if self.depth > MAX_THICKNESS:
-            raise InvalidInput(f"a material begins {self.depth:g} m deep; at most {MAX_THICKNESS:g} m is accepted. "
+        if self.depth > DEEPEST:
+            raise InvalidInput(f"a material begins {self.depth:g} m deep; at most {DEEPEST:g} m is accepted. "
                                "Is it in millimetres? Scale it by 1e-3.")  # fmt: skip
 
 

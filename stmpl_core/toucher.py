@@ -20,7 +20,7 @@ from stmpl_core.footing import curvature_at
 from stmpl_core.green import Green
 from stmpl_core.layer import SoftLayer
 from stmpl_core.moments import Surroundings
-from stmpl_core.nodes import Nodes, gathered, strains_under
+from stmpl_core.nodes import Nodes, ball_around, gathered, strains_under
 from stmpl_core.obstacle import REACH
 from stmpl_core.pieces import DEEP, GROUP, WIDER, pins
 from stmpl_core.rays import WALL, way_of
@@ -706,7 +706,7 @@ def groups_of(points: Sequence[np.ndarray], thickness: float) -> list[list[int]]
         return [[0]] if len(points) else []
     groups: list[tuple[list[int], list[tuple[np.ndarray, float]]]] = []
     for n, some in enumerate(points):
-        middle, radius = _ball_around(some)
+        middle, radius = ball_around(some)
         ball = middle, radius + 0.5 * REACH * thickness
         near = [group for group in groups
                 if any(math.dist(middle, other) < ball[1] + size for other, size in group[1])]  # fmt: skip
@@ -734,19 +734,6 @@ def _led_in(sinking, strain, thickness, inward, way):
             whole += depths[n]
     most = 1 - lost / whole if lost > LED_LOST * whole else 1.0
     return min(max(min(sunk / deep, most), 0.02), 1.0)
-
-
-@numba.njit(cache=True, nogil=True)
-def _ball_around(points):
-    """Middle of points (N, 3), and the distance of the farthest from it [m]."""
-    middle, square = np.zeros(3), 0.0
-    for n in range(len(points)):
-        for x in range(3):
-            middle[x] += points[n, x] / len(points)
-    for n in range(len(points)):
-        a, b, c = points[n, 0] - middle[0], points[n, 1] - middle[1], points[n, 2] - middle[2]
-        square = max(square, a * a + b * b + c * c)
-    return middle, np.sqrt(square)
 
 
 @numba.njit(cache=True, nogil=True)

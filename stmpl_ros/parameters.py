@@ -12,8 +12,9 @@ from pydantic.config import JsonDict
 
 from stmpl_core.body import phenotype_from
 from stmpl_core.friction import friction_from
+from stmpl_core.layer import MAX_THICKNESS
 from stmpl_core.methods import Method, method
-from stmpl_core.tissue import MAX_THICKNESS, SOFTEST
+from stmpl_core.tissue import SOFTEST
 
 PAPER = "paper"  # tissue of one layer, by the settings beside it
 ONE_LAYER = ("thickness", "youngs_modulus", "poisson_ratio", "density")  # settings beside it

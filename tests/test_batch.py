@@ -1,5 +1,6 @@
 """Batch: many scenes give, each, what a simulator gives it alone."""
 
+import pickle
 from collections.abc import Sequence
 
 import numpy as np
@@ -47,7 +48,9 @@ def alone(skin: Skin, scenes: np.ndarray) -> np.ndarray:
 
 @pytest.mark.parametrize("threads", [1, 3])
 def test_each_scene_gets_what_it_would_alone(skin: Skin, threads: int) -> None:
-    found = Batch(skin, TOOLS, N, threads=threads).touch(poses())
+    batch = Batch(skin, TOOLS, N, threads=threads)
+    found, again = batch.touch(poses()), pickle.loads(pickle.dumps(batch)).touch(poses())
+    assert np.array_equal(again.wrenches, found.wrenches)
     assert np.array_equal(found.wrenches, alone(skin, poses()))
     assert (np.linalg.norm(found.wrenches[:, :, :3], axis=2) > 1e-3).all()
     assert found.in_range.all() and (found.statuses == "pressed by pose").all() and not found.fields

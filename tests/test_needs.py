@@ -8,12 +8,12 @@ import pytest
 
 from stmpl_core import Membrane, Ply, Prony, Tissue
 from stmpl_core.errors import InvalidInput
+from stmpl_core.layer import MAX_THICKNESS
 from stmpl_core.living import read_model, read_tissue
 from stmpl_core.needs import needs
 from stmpl_core.regions import HELD_SKIN, region
 from stmpl_core.relaxation import fades_under, series_of
 from stmpl_core.stack import Misfit
-from stmpl_core.tissue import MAX_THICKNESS
 from stmpl_ros.cli import main
 from tests.scenes import plate
 
