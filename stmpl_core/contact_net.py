@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 import numba
 import numpy as np
 
+from stmpl_core.columns import pushed
 from stmpl_core.green import Green
 from stmpl_core.layer import SoftLayer
 from stmpl_core.methods.moment_net import think_few
@@ -306,7 +307,7 @@ def _look_on_stack(points, inward, thickness, area, strain, corners, shares, sin
     moments, vectors = moments_of(rings, points, np.full(len(area), t), area,
                                   _one(np.exp(numbers[3]) * (force / area)), _one(sinking / over / t))  # fmt: skip
     of = _tool_of(beside, len(area))
-    near = _near_tools(points, thickness, area * (strain * thickness), of, max(beside.shape[1], 1))
+    near = _near_tools(points, inward, thickness, area, strain, of, max(beside.shape[1], 1))
     given_way, among = _given_way(matrix, wide, force, near, of), _among(points, inward, thickness, group, t, force)
     shape = _shape(*among, force)
     seen = _see_on_stack(moments[0], vectors[0], inward, thickness, area, t, times * force, strain, sinking, here, nu,
@@ -398,33 +399,27 @@ def _tool_of(beside, count):
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _near_tools(points, thickness, weight, of, many):
+def _near_tools(points, inward, thickness, area, strain, of, many):
     """How near tools are to each other, from 0, far, to 1, (K, K).
 
     Args:
-        points, thickness: see Nodes.
-        weight: weight of each node in its tool's middle, (N,).
+        points, inward, thickness, area, strain: see Nodes.
         of, many: see `_tool_of`, and number of tools.
     """
-    out, told = np.ones((many, many)), np.zeros((many, 6))
-    for n in range(len(points)):
-        own = told[of[n]]
-        own[0] += weight[n]
-        own[4] += weight[n] * thickness[n]
-        for x in range(3):
-            own[1 + x] += weight[n] * points[n, x]
+    out = np.ones((many, many))
+    if many == 1:
+        return out
+    told, reach = np.empty((many, 8)), np.empty(many)
     for k in range(many):
-        told[k, 1:5] /= max(told[k, 0], 1e-300)
-    for n in range(len(points)):
-        own = told[of[n]]
-        for x in range(3):
-            own[5] += weight[n] / max(own[0], 1e-300) * (points[n, x] - own[1 + x]) ** 2
+        some = np.flatnonzero(of == k)
+        told[k] = pushed(points[some], inward[some], thickness[some], area[some], strain[some])
+        reach[k] = told[k, 7] + np.sum(area[some] * strain[some] * thickness[some] ** 2) / max(told[k, 0], 1e-300)
     for k in range(many):
         for m in range(many):
-            a, b, square = told[k], told[m], 0.0
+            square = 0.0
             for x in range(3):
-                square += (a[1 + x] - b[1 + x]) ** 2
-            apart = np.sqrt(square) / max(np.sqrt(a[5]) + np.sqrt(b[5]) + a[4] + b[4], 1e-12)
+                square += (told[k, 4 + x] - told[m, 4 + x]) ** 2
+            apart = np.sqrt(square) / max(reach[k] + reach[m], 1e-12)
             share = min(max((FAR_TOOLS[1] - apart) / (FAR_TOOLS[1] - FAR_TOOLS[0]), 0.0), 1.0)
             out[k, m] = share * share * (3 - 2 * share) if k != m else 1.0
     return out

@@ -104,7 +104,7 @@ def group(many: wp.int32, skins: Skins, scratch: Scratch):
 
 
 @wp.func
-def _power(scratch: Scratch, s: wp.int32, many: wp.int32, k: wp.int32) -> real:
+def _power(scratch: Scratch, s: wp.int32, k: wp.int32) -> real:
     """Power of the depth with which the force of a tool grows."""
     deepest, found, force = real(0.0), real(0.0), real(0.0)
     for i in range(scratch.nodes[s]):
@@ -422,7 +422,7 @@ def answer(first: wp.int32, many: wp.int32, known: Known, skins: Skins, scratch:
     torque = vec3(more_sums[0], more_sums[1], more_sums[2])
     along = more_sums[3]
     force = force + along / wp.max(size, NONE) * force
-    power, missed = _power(scratch, s, many, k), _missed(scratch, s, many, k)
+    power, missed = _power(scratch, s, k), _missed(scratch, s, many, k)
     doubt = doubt / wp.max(size, NONE) + power * grid.surface_error / wp.max(wp.max(depth, grid.surface_error), NONE)
     if one.stacked == 1 and forces > real(0.0):
         unlike = known.uneven * wp.log(carried / (forces * one.flat))

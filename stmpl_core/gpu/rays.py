@@ -324,9 +324,8 @@ def sure_of(grid: Grid, coefficients: wp.array(dtype=real), start: vec3, way: ve
 
 
 @wp.func
-def led_in(grid: Grid, coefficients: wp.array(dtype=real), start: vec3, way: vec3, deep: real, wall: real) -> vec3:
-    """Start of a ray that passes the tool, moved aside until it is clear that it leads through it."""
-    most = innermost(grid, coefficients, start, way, deep)
+def led_in(grid: Grid, coefficients: wp.array(dtype=real), start: vec3, way: vec3, most: wp.vec2d, wall: real) -> vec3:
+    """Start of a ray that passes the tool, moved aside until it surely leads through it; most: see `innermost`."""
     jet = jet_at(grid, coefficients, start + most[1] * way)
     aside = vec3(jet[1], jet[2], jet[3])
     aside = aside - wp.dot(aside, way) * way

@@ -12,13 +12,13 @@ from stmpl_core.gpu.columns import _marked
 from stmpl_core.gpu.hold import FADE_RING, HARDENING, NEAR, RINGS, STACK_LINEAR_TO, STEPS, _row, _write, _write_alike
 from stmpl_core.gpu.packs import Scratch, Skins
 from stmpl_core.gpu.rays import (
+    CLEAR,
     OPTIONS,
     along,
     depth_in_column,
-    inside_most,
+    innermost,
     led_in,
     real,
-    sure_of,
     vec3,
     wall_in,
     way_of,
@@ -135,19 +135,18 @@ def sink(lanes: wp.int32, many: wp.int32, skins: Skins, scratch: Scratch):
             start, goes = pose * (scratch.point[s, i] - scratch.place[c]), pose * way
             grid, thick = skins.grids[scratch.grid[c]], scratch.thick[s, i]
             wall, ends = wall_in(grid, thick), start + vec3()
-            sure, sunk = sure_of(grid, skins.coefficients, start, goes, guess, wall), way_of(scratch.top[c])[0]
-            if sure < real(1.0) and sunk > real(0.0):
+            most, sunk = innermost(grid, skins.coefficients, start, goes, guess), way_of(scratch.top[c])[0]
+            if most[0] < CLEAR * wall and sunk > real(0.0):
                 guess = wp.max(guess, thick)
-                sure = sure_of(grid, skins.coefficients, start, goes, guess, wall)
+                most = innermost(grid, skins.coefficients, start, goes, guess)
+            sure = wp.clamp(most[0] / (CLEAR * wall), real(-1.0), real(1.0))
             if sure < real(1.0):
-                ends = led_in(grid, skins.coefficients, start, goes, guess, wall)
+                ends = led_in(grid, skins.coefficients, start, goes, most, wall)
             more = depth_in_column(grid, skins.coefficients, ends, goes, wp.max(real(4.0) * guess, thick), guess)
             more = more * cosine - depth
             if more > real(0.0):
                 inside = real(1.0) - along(grid, skins.coefficients, start, goes, real(0.0)) / wall
-                if sunk > real(0.0):
-                    through = inside_most(grid, skins.coefficients, start, goes, guess)
-                    inside = wp.max(inside, sunk * (real(1.0) + through / wall))
+                inside = wp.max(inside, sunk * (real(1.0) + most[0] / wall))
                 more = more * wp.max(sure, real(0.0)) * wp.min(wp.clamp(inside, real(0.0), real(1.0)), depth / wall)
             sinking = (real(1.0) + wp.min(sure, real(0.0))) * (depth + more)
         scratch.sinking[s, i] = sinking

@@ -86,7 +86,7 @@ def go_on(lanes: wp.int32, many: wp.int32, skins: Skins, scratch: Scratch):
                         if most > share:
                             ends = start + vec3()
                             if inside[0] <= CLEAR * wall:
-                                ends = led_in(grid, skins.coefficients, start, goes, t, wall)
+                                ends = led_in(grid, skins.coefficients, start, goes, inside, wall)
                             deep = depth_in_column(grid, skins.coefficients, ends, goes, t, real(0.0)) * cosine
                             now += (most - share) * wp.min(deep / t, MOST_STRAIN)
                     scratch.strain[s, i] = wp.max(scratch.strain[s, i], now)
