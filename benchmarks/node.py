@@ -277,7 +277,7 @@ def main() -> None:
     given.add_argument("--node", nargs="*", default=["tissue=paper"],
                        help="flags of stmpl node, as in tissue=paper edge-length=0.004")
     options = given.parse_args()
-    bus.take_own(options.shared)
+    _bus = bus.take_own(options.shared)  # until the end
     flags = [part for one in options.node for part in ("--" + one.split("=")[0], one.split("=")[1])]
     flags += ["--joint-states", "joint_states"] * options.joints
     print(f"{machine()}; load {os.getloadavg()[0]:.1f} before the run", flush=True)

@@ -175,7 +175,7 @@ def main() -> None:
     given.add_argument("--flags", nargs="*", default=[], help="further flags of the nodes, as in edge-length=0.004")
     given.add_argument("--out", type=Path, default=None, help="JSON file for the figures")
     options = given.parse_args()
-    bus.take_own(options.shared)
+    _bus = bus.take_own(options.shared)  # until the end
     trees = {"old": options.against.resolve()} if options.against else {}
     nodes = {name: (tree, []) for name, tree in trees.items()} | {"new": (HERE, [])}
     if options.field_rate:

@@ -32,6 +32,7 @@ from stmpl_msgs.msg import ContactMesh, SkinTopology
 from bags.wire import layer_from, pose_message, tool_message
 from benchmarks.crowd import EARLY, ENDINGS, Crowd, Listener
 from stmpl_core.provenance import machine
+from stmpl_ros.domain import claim
 from stmpl_ros.scripts import PRESS, Motion
 from stmpl_ros.spinning import TRANSPORTS, UDP, spin
 from stmpl_ros.topics import KEPT, NOW, STREAM
@@ -169,11 +170,13 @@ def main() -> None:
     given.add_argument("--settle", type=float, default=LEASE_S, help="time before the last reading [s]")
     given.add_argument("--shared-memory", action="store_true",
                        help="the node sends by shared memory too, as Fast DDS does unless told otherwise")
-    given.add_argument("--domain", type=int, default=1 + os.getpid() % 100, help="number of the bus")
+    given.add_argument("--domain", type=int, help="number of the bus (default: one of its own)")
     given.add_argument("--out", type=Path, default=None, help="JSON file for listeners, readings and verdict")
     given.add_argument("--node", nargs=argparse.REMAINDER, default=["-m", "stmpl_ros.cli", "node"],
                        help="arguments of Python that start the node; the last of all")  # fmt: skip
     options = given.parse_args()
+    if options.domain is None:
+        options.domain, _bus = claim()  # until the end
     os.environ.update(ROS_DOMAIN_ID=str(options.domain), ROS_AUTOMATIC_DISCOVERY_RANGE="SUBNET")
     print(f"{machine()}; load {os.getloadavg()[0]:.1f} before the run", flush=True)
     node = subprocess.Popen([sys.executable, *options.node], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,

@@ -30,6 +30,7 @@ from stmpl_core.extras import needed
 from stmpl_core.friction import friction_from
 from stmpl_core.methods import method as method_named
 from stmpl_core.pool import Pool
+from stmpl_ros.domain import claim
 from stmpl_ros.massage_report import filmed, front, massaged, rows
 from stmpl_ros.parameters import DemoConfig
 from stmpl_ros.robot import TOOL
@@ -106,9 +107,13 @@ def _replay(folder: Path, method: str, console: Console) -> ReplaySummary:
 
 
 def play(config: DemoConfig, folder: Path, console: Console) -> None:
-    """Starts the three processes, waits until the devices are done, and stops the others. Raises DemoError."""
+    """Starts the three processes, waits until the devices are done, and stops the others.
+
+    Raises: DemoError, DomainError.
+    """
+    domain, held = claim()
     environment = os.environ | {
-        "ROS_DOMAIN_ID": str(1 + os.getpid() % 100),  # a bus of its own, on this machine only
+        "ROS_DOMAIN_ID": str(domain),  # a bus of its own, on this machine only
         "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
         "PYTHONUNBUFFERED": "1",
     }
@@ -119,6 +124,7 @@ def play(config: DemoConfig, folder: Path, console: Console) -> None:
         flags = flags_of(config.robot.model_copy(update={"out": folder, "linger": settled}))
     node_arguments = config.node.ros_arguments() + (["-p", "use_sim_time:=true"] if config.device == "robot" else [])
     with (
+        held,
         _process("record", record, folder, environment) as recorder,
         _process("node", node_arguments, folder, environment) as node,
         _process(config.device, flags, folder, environment) as device,

@@ -8,8 +8,8 @@ from typing import Any
 
 import pytest
 
-BUSES = 50  # test_node_life.py uses the domain that lies so much higher as a second bus
-LOCKS = 27_400  # the first of the ports that stand for the buses; below those that systems hand out by themselves
+from stmpl_ros.domain import claim
+
 ROOMS = {  # every other file is of the room "unit"
     "ros": ["test_foxglove", "test_launch", "test_node", "test_node_life", "test_node_memory", "test_node_refusals",
             "test_node_tf", "test_node_topics", "test_record_and_publish", "test_ros", "test_ros_demo",
@@ -24,25 +24,12 @@ BUS = pytest.StashKey[socket.socket]()
 ROOM_OF = {file: room for room, files in ROOMS.items() for file in files}
 
 
-def own_bus() -> socket.socket:
-    """Claims a ROS domain, 1 to BUSES, by a port: the system gives it back when this process ends, however it ends."""
-    for k in range(BUSES):
-        domain, claim = 1 + (os.getpid() + k) % BUSES, socket.socket()
-        try:
-            claim.bind(("127.0.0.1", LOCKS + domain))
-        except OSError:
-            claim.close()
-            continue
-        os.environ.update(ROS_DOMAIN_ID=str(domain), ROS_AUTOMATIC_DISCOVERY_RANGE="LOCALHOST")  # children's too
-        return claim
-    raise RuntimeError(f"all {BUSES} ROS domains for tests are in use: end the test runs that hold them")
-
-
 def pytest_configure(config: pytest.Config) -> None:
     """Gives this process a bus; and one thread for linear algebra, where a worker has each core."""
     if "PYTEST_XDIST_WORKER" in os.environ:
         os.environ.update(OMP_NUM_THREADS="1", OPENBLAS_NUM_THREADS="1")
-    config.stash[BUS] = own_bus()
+    domain, config.stash[BUS] = claim()
+    os.environ.update(ROS_DOMAIN_ID=str(domain), ROS_AUTOMATIC_DISCOVERY_RANGE="LOCALHOST")  # children's too
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

@@ -44,6 +44,7 @@ from stmpl_core.errors import InvalidInput
 from stmpl_core.friction import PAIRS
 from stmpl_ros import lifecycle
 from stmpl_ros.beside import Beside, Builders
+from stmpl_ros.domain import DOMAINS
 from stmpl_ros.hearing import Hearing
 from stmpl_ros.inbox import Instant
 from stmpl_ros.node import SkinNode
@@ -51,7 +52,6 @@ from stmpl_ros.parameters import NodeConfig
 from stmpl_ros.sending import Sending
 from stmpl_ros.topics import KEPT, LEASE, STREAM
 from tests.bus import PATIENCE, ROOT, end, rows, running, start
-from tests.conftest import BUSES
 from tests.node_bus import HERE, NODE, PUSH, Bus, skin
 from tests.scenes import ball, contact_of
 
@@ -93,7 +93,7 @@ class Composed(NamedTuple):
 def composed():
     """SkinNode is an ordinary node to whoever composes."""
     context = rclpy.Context()
-    context.init(domain_id=int(os.environ["ROS_DOMAIN_ID"]) + BUSES)
+    context.init(domain_id=int(os.environ["ROS_DOMAIN_ID"]) + DOMAINS)
     executor = SingleThreadedExecutor(context=context)
     node = SkinNode(NodeConfig(), skin, context=context)
     other = rclpy.create_node("other", context=context)

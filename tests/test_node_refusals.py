@@ -19,12 +19,12 @@ from stmpl_msgs.srv import SetBody
 
 from bags.wire import header, pose_message, tool_message
 from stmpl_core.errors import InvalidInput
+from stmpl_ros.domain import DOMAINS
 from stmpl_ros.node import SkinNode
 from stmpl_ros.parameters import ANY_TIME, CONFIGURING, NodeConfig
 from stmpl_ros.settings import Settings
 from stmpl_ros.topics import STREAM
 from tests.bus import ROOT, end, running, start
-from tests.conftest import BUSES
 from tests.node_bus import HERE, NODE, PUSH, Bus, Hand
 from tests.scenes import ball
 
@@ -108,7 +108,7 @@ def test_the_page_names_every_parameter_where_it_counts():
 
 def test_a_part_that_no_body_has_is_refused_before_the_node_is_configured_too():
     context = Context()
-    context.init(domain_id=int(os.environ["ROS_DOMAIN_ID"]) + BUSES)
+    context.init(domain_id=int(os.environ["ROS_DOMAIN_ID"]) + DOMAINS)
     node = SkinNode(NodeConfig(), context=context)
     try:
         refused, taken = (node.set_parameters([Parameter("part", value=part)])[0] for part in ("nose", "right_forearm"))
@@ -122,7 +122,7 @@ def test_a_part_that_no_body_has_is_refused_before_the_node_is_configured_too():
 
 def test_a_configured_node_takes_what_it_has_already_and_refuses_what_differs_by_name():
     context = Context()
-    context.init(domain_id=int(os.environ["ROS_DOMAIN_ID"]) + BUSES)
+    context.init(domain_id=int(os.environ["ROS_DOMAIN_ID"]) + DOMAINS)
     node = LifecycleNode("configured", context=context)
     try:
         settings = Settings(node, NodeConfig(joints=("left_elbow=elbow_2",)), lambda config: None)
@@ -142,7 +142,7 @@ def test_a_configured_node_takes_what_it_has_already_and_refuses_what_differs_by
 @pytest.mark.parametrize("name", ["1bad", "a//b", "x" * 200])
 def test_a_shape_tool_whose_name_no_topic_can_have_is_refused_at_the_start(name):
     context = Context()
-    context.init(domain_id=int(os.environ["ROS_DOMAIN_ID"]) + BUSES)
+    context.init(domain_id=int(os.environ["ROS_DOMAIN_ID"]) + DOMAINS)
     says = f"shape_tools names '{name[:60]}': a tool's name must be a ROS name: letters, digits, _ and /, each part"
     try:
         with pytest.raises(InvalidInput, match=says):

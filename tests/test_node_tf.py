@@ -34,6 +34,7 @@ from bags.wire import (
 )
 from stmpl_core.errors import FrameError, InvalidInput
 from stmpl_ros.diagnosis import Tally
+from stmpl_ros.domain import DOMAINS
 from stmpl_ros.followed import Followed
 from stmpl_ros.frames import Frames
 from stmpl_ros.gate import Gate
@@ -44,7 +45,6 @@ from stmpl_ros.ticks import Ticks
 from stmpl_ros.topics import KEPT, STREAM
 from tests import tf2_stand_in
 from tests.bus import PATIENCE
-from tests.conftest import BUSES
 from tests.node_bus import HERE, skin
 from tests.scenes import ball
 
@@ -94,7 +94,7 @@ def told(parent: str, child: str, place: np.ndarray, stamp: int) -> TransformSta
 @pytest.fixture
 def scene(request) -> Iterator[Scene]:
     context = rclpy.Context()
-    context.init(domain_id=int(os.environ["ROS_DOMAIN_ID"]) + BUSES)
+    context.init(domain_id=int(os.environ["ROS_DOMAIN_ID"]) + DOMAINS)
     executor = SingleThreadedExecutor(context=context)
     node = SkinNode(NodeConfig(**getattr(request, "param", {})), skin, context=context)
     other = rclpy.create_node("other", context=context)
@@ -302,7 +302,7 @@ def test_a_simulation_that_begins_anew_is_not_placed_by_the_tf_of_its_last_run(s
 def test_tools_of_tf_are_refused_where_nobody_listens_to_it(monkeypatch):
     monkeypatch.setattr("stmpl_ros.frames.find_spec", lambda name: None)
     context = rclpy.Context()
-    context.init(domain_id=int(os.environ["ROS_DOMAIN_ID"]) + BUSES)
+    context.init(domain_id=int(os.environ["ROS_DOMAIN_ID"]) + DOMAINS)
     try:
         with pytest.raises(InvalidInput, match="tf_tools needs the package tf2_ros"):
             SkinNode(NodeConfig(tf_tools=("finger=tool0",)), skin, context=context)
@@ -334,7 +334,7 @@ class Simulation(NamedTuple):
 @pytest.fixture
 def simulation() -> Iterator[Simulation]:
     context = rclpy.Context()
-    context.init(domain_id=int(os.environ["ROS_DOMAIN_ID"]) + BUSES)
+    context.init(domain_id=int(os.environ["ROS_DOMAIN_ID"]) + DOMAINS)
     executor = SingleThreadedExecutor(context=context)
     node = rclpy.create_node("sim", context=context, parameter_overrides=[Parameter("use_sim_time", value=True)])
     other = rclpy.create_node("gz", context=context)
