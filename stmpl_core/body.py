@@ -348,7 +348,7 @@ class Patch:
     def layer(self, body: Body, *, thickness: ArrayLike = 7.5e-3, tissue: Tissue | None = None) -> SoftLayer:
         """The part as a soft layer, on `body` in its pose: the mesh's connectivity and UVs stay what they are.
 
-        Where the skin curves more tightly than `thickness`, the layer is thinned, and a warning says where. Raises
+        Where the skin curves more tightly than `thickness`, the layer is thinned, and the log says where. Raises
         InvalidInput where most of the skin does.
         """
         if self.source.max() >= len(body.vertices):

@@ -14,6 +14,7 @@ log = logging.getLogger(__name__)
 THINNING_FACTOR = 0.95  # factor on the thickness under a folding face, each pass
 MAX_THICKNESS_SLOPE = 0.3  # slope of the thickness along the skin [m/m]; a step would fold the layer by itself
 MIN_THICKNESS_SHARE = 0.1  # thinnest over asked thickness; what folds there is a fold of the skin itself
+FEW = 1e-3  # share of the skin up to which nobody is warned: a crease of ears, toes, or between the legs
 PASSES = 80  # passes of thinning at most
 
 
@@ -38,7 +39,8 @@ def foldfree_thickness(layer: SoftLayer, *, least: float = 0.15) -> PerVertex:
     """The layer's thickness, thinned where the skin curves more tightly than the layer is thick, (V,) [m].
 
     Thins the vertices under prisms whose fold ratio is below `least`, and lets the thickness grow back along the skin
-    with a slope of at most 0.3. Logs where it changed anything, and which folds of the skin itself are left.
+    with a slope of at most 0.3. Logs where it changed anything, and which folds of the skin itself are left: a warning
+    above a thousandth of the skin.
     """
     thickness = layer.thickness.copy()
     edges = layer.edges
@@ -73,13 +75,14 @@ def _report(layer: SoftLayer, thickness: PerVertex, least: float) -> None:
     thinned = np.flatnonzero(thickness < layer.thickness - 1e-6)
     left = _ratios(layer, thickness) < least
     if len(thinned):
-        thinnest = int(thickness.argmin())
-        log.warning(
+        thinnest, share = int(thickness.argmin()), layer.vertex_areas[thinned].sum() / layer.vertex_areas.sum()
+        log.log(
+            logging.WARNING if share > FEW else logging.INFO,
             "the skin curves more tightly than the layer is thick: thinned at %d of %d vertices (%.1f %% of the area), "
             "most at vertex %d, %.1f -> %.1f mm",
-            len(thinned), len(thickness), 100 * layer.vertex_areas[thinned].sum() / layer.vertex_areas.sum(),
-            thinnest, layer.thickness[thinnest] * 1e3, thickness[thinnest] * 1e3,
+            len(thinned), len(thickness), 100 * share, thinnest, layer.thickness[thinnest] * 1e3, thickness[thinnest] * 1e3,
         )
     if left.any():
-        log.warning("the skin itself is folded at %d faces, the first is face %d: no thickness suits them there",
-                    int(left.sum()), int(left.argmax()))
+        log.log(logging.WARNING if left.mean() > FEW else logging.INFO,
+                "the skin itself is folded at %d faces, the first is face %d: no thickness suits them there",
+                int(left.sum()), int(left.argmax()))
