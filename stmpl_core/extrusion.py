@@ -80,7 +80,8 @@ def _report(layer: SoftLayer, thickness: PerVertex, least: float) -> None:
             logging.WARNING if share > FEW else logging.INFO,
             "the skin curves more tightly than the layer is thick: thinned at %d of %d vertices (%.1f %% of the area), "
             "most at vertex %d, %.1f -> %.1f mm",
-            len(thinned), len(thickness), 100 * share, thinnest, layer.thickness[thinnest] * 1e3, thickness[thinnest] * 1e3,
+            len(thinned), len(thickness), 100 * share, thinnest, layer.thickness[thinnest] * 1e3,
+            thickness[thinnest] * 1e3,
         )
     if left.any():
         log.log(logging.WARNING if left.mean() > FEW else logging.INFO,

@@ -119,7 +119,7 @@ class Health(NamedTuple):
         drop: why the last message was dropped.
         fading: truth of the claim that the last answer fades, as input has stopped.
         live: truth of the claim that a tool is heard.
-        doubt: why it is not known where the limb is; or what an inactive node is at.
+        doubt: why it is not known where the limb is, or no tool at all; or what an inactive node is at.
         active: truth of the claim that the node answers.
         senders: sentences on who sends for one tool beside another, or for one that cannot be used, is not heard, or
             has stopped to send wrenches; empty: nobody.

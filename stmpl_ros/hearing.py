@@ -71,7 +71,7 @@ class Hearing:
         self._patience = Patience(node, self.frames, lambda: config().tf_wait)
         self.gazebo = GazeboContacts(config(), self.frames) if config().gz_contacts else None
         self.inbox = Inbox(tools, config().frame, int(config().rest_after * wire.NANO), self.frames.at)
-        self._followed = Followed(node, self.frames, config(), self._on_followed)
+        self._followed = Followed(node, self.frames, config, self.now, self._say_lost, self._on_followed)
         self.now.on_back = self._on_time_back
         self.active, self.backs = False, 0
         self.layer: SoftLayer | None = None
@@ -174,13 +174,21 @@ class Hearing:
             name = topic.removeprefix(tools).removesuffix("/pose")
             if topic == f"{tools}{name}/pose" and not self._knows(name) and self._node.count_publishers(topic):
                 self._unknown[name] = topic
-        said = {name: f"{self._unknown[name]}: poses come, but no surface of '{name}' that can be used is on "
-                      f"contact_mesh; they are not heard{self._refused.get(name, '')}"
+        said = {name: f"{self._unknown[name]} has a sender, but no surface of '{name}' that can be used is on "
+                      f"contact_mesh: its poses are not heard{self._refused.get(name, '')}"
                 for name in sorted(self._unknown.keys() & before.keys() - self._away)}  # fmt: skip
         for name in said.keys() - self._strangers:
             self._strangers.add(name)
             self.gate.say(f"stranger {name}", said[name])
         return "; ".join(said.values())
+
+    def lost_frames(self) -> str:
+        """Which tools that are frames of /tf it does not place any more, or never did; empty: none."""
+        return "; ".join(self._followed.lost().values())
+
+    def _say_lost(self, kind: str, why: str) -> None:
+        if self.active:
+            self.gate.say(kind, why)
 
     def rivals(self) -> str:
         """Who sends poses of one tool beside another; empty: no tool has two senders."""

@@ -415,8 +415,9 @@ class SkinNode(ServingNode):
         stopped = [f"no wrench of {name} for {self.config.rest_after} s: answered without it"
                    for name in inbox.dumb(self.hearing.now())]  # fmt: skip
         self._look_for_twins()
+        live, lost = inbox.live(self.hearing.now()), self.hearing.lost_frames()
         values = self.tally.values() | {
-            "tools": " ".join(inbox.live(self.hearing.now())),
+            "tools": " ".join(live),
             "dropped, out of order": str(inbox.out_of_order),
             "deadlines missed": str(events.missed_deadlines),
             "lost on the way": str(events.lost),
@@ -428,13 +429,13 @@ class SkinNode(ServingNode):
             values["joints"] = self.bending.doubt or " ".join(f"{x:.4f}" for x in self.answering.simulator.skin.angles)
         told = self.bending.doubt or self.tally.doubt  # where all answers are of a surface from before, it says so
         outdated = [one for one in self.hearing.look_for_outdated() if one not in told]
-        senders = "; ".join(filter(None, (clock, self.hearing.look_at_clock(), *stopped, *outdated,
-                                          self.hearing.unheard(), self.hearing.look_for_strangers(),
+        senders = "; ".join(filter(None, (clock, lost if live else "", self.hearing.look_at_clock(), *stopped,
+                                          *outdated, self.hearing.unheard(), self.hearing.look_for_strangers(),
                                           self.hearing.rivals())))  # fmt: skip
         lately = self._counts.since(reactions=self.tally.reactions, refused=self.tally.refused, stale=self.tally.stale,
                                     out_of_order=inbox.out_of_order, missed=events.missed_deadlines)  # fmt: skip
-        health = Health(lately, self.tally.last_refusal, self.answering.fading, bool(inbox.live(self.hearing.now())),
-                        self.bending.doubt, drop=self.tally.last_drop, senders=senders,
+        health = Health(lately, self.tally.last_refusal, self.answering.fading, bool(live),
+                        self.bending.doubt or ("" if live else lost), drop=self.tally.last_drop, senders=senders,
                         out_of_range=self.tally.doubt, paused=self.hearing.now.paused,
                         building=tuple(tool.name for tool in self.hearing.tools.waiting()))  # fmt: skip
         statuses = [skin_status(name, values, health)]

@@ -184,7 +184,7 @@ def calibrate(
 
 
 def stability(
-    methods: tuple[str, ...] = STABILITY_METHODS,
+    methods: Annotated[tuple[str, ...], tyro.conf.arg(aliases=["--method"])] = STABILITY_METHODS,
     preset: Literal["default", "quick"] = "default",
     only: Literal["all", "pressures", "contacts", "strokes"] = "all",
     out: Path | None = None,

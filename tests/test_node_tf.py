@@ -268,13 +268,43 @@ def test_a_tool_may_be_a_frame_of_tf_and_what_it_is_taken_for_is_sent_for_a_reco
     scene.wait(lambda: any(stamp_ns(one) == stamp for one in scene.poses))  # the answer names a pose that was sent
 
 
+@pytest.mark.parametrize("scene", [{"tf_tools": ("finger=tool0",)}], indirect=True)
+def test_a_tool_of_tf_is_told_of_when_tf_never_knew_it_and_when_it_dies(scene):
+    """A part of its chain dies while the rest goes on."""
+
+    def going(table: bool) -> None:
+        now, buffer = scene.now(), scene.node.hearing.frames._buffer
+        if table:
+            scene.move(now)
+        buffer.set_transform(told("base", "tool0", np.linalg.inv(base_at(now)) @ HERE, now), "test")
+
+    def lost() -> bool:
+        newest = scene.health[-1] if scene.health else DiagnosticStatus()
+        said = "/tf has not said for" in newest.message and "frame 'tool0' is, which is finger" in newest.message
+        return said and newest.level == DiagnosticStatus.STALE
+
+    def well() -> bool:
+        return scene.health[-1].level == DiagnosticStatus.WARN and "/tf" not in scene.health[-1].message  # two senders
+
+    scene.wait(lost)
+    scene.wait(lambda: going(True) or (scene.heard and well()))
+    lines, said = list[str](), scene.node.hearing.gate.say
+    scene.node.hearing._followed._say = lambda kind, text: (lines.append(text), said(kind, text))
+    died = time.monotonic()
+    scene.wait(lambda: going(False) or lines)
+    assert time.monotonic() - died < 1.0 and "'tool0'" in lines[0]  # 100 ms of patience, and what else is going on
+    scene.wait(lambda: going(False) or lost())
+    scene.wait(lambda: going(True) or well())
+
+
 def test_where_tf_has_just_begun_a_tool_of_it_waits_until_its_whole_chain_was_told():
     """The newest time of both frames lies before the arm's first."""
     frames, heard = Frames("body", {}, SimpleNamespace()), list[PoseStamped]()
     clock = SimpleNamespace(create_publisher=lambda *_: SimpleNamespace(publish=lambda message: None),
                             create_timer=lambda *_, **__: None)  # fmt: skip
     config = NodeConfig(tf_tools=("finger=tool0",))
-    followed = Followed(clock, frames, config, lambda tool, pose: heard.append(pose))  # type: ignore[arg-type]
+    followed = Followed(clock, frames, lambda: config, time.monotonic_ns, lambda kind, said: None,  # type: ignore[arg-type]
+                        lambda tool, pose: heard.append(pose))  # fmt: skip
     followed.follow("finger")
     frames._buffer.set_transform(told("body", "base", np.eye(4), NANO), "test")
     frames._buffer.set_transform(told("base", "tool0", HERE, NANO + 30 * MS), "test")

@@ -223,7 +223,7 @@ def test_poses_of_a_tool_that_nobody_announced_are_told_of_once(bus):
         ghost.press()
         bus.spin(0.05)
     (line,) = bus.said("no surface of 'ghost/tip'")
-    assert line.startswith("/robot/tools/ghost/tip/pose: poses come") and "they are not heard" in line
+    assert line.startswith("/robot/tools/ghost/tip/pose has a sender") and "its poses are not heard" in line
     assert not ghost.pose.get_subscription_count()
     assert not bus.said("no surface of 'probe'"), "a tool that was announced is none"
 

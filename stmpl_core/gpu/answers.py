@@ -449,7 +449,8 @@ def answer(first: wp.int32, many: wp.int32, known: Known, skins: Skins, scratch:
     depths[n, k] = depths.dtype(depth)
     bounds[n, k] = bounds.dtype(real(0.0))
     if size > real(0.0):
-        bound = known.scale * wp.pow(doubt, known.power) + power * wp.min(wrong / wp.max(depth, NONE), real(1.0))
+        bound = one.doubt * known.scale * wp.pow(doubt, known.power)
+        bound += power * wp.min(wrong / wp.max(depth, NONE), real(1.0))
         below /= wp.max(forces, NONE)
         if one.stacked == 1:
             if led < LED_OUT:

@@ -23,7 +23,7 @@ from stmpl_core.sdf import MOST_CHECKS, TIPS, SignedDistance
 from stmpl_core.skin import Skin
 from stmpl_core.tool import Tool
 from stmpl_core.tools import Tools
-from stmpl_core.toucher import margin_on, soft_depth, unlearnt
+from stmpl_core.toucher import margin_on, soft_depth, tissue_doubt, unlearnt
 
 STEEP_BIT, LONG_BIT, BORDER_BIT, EDGE_BIT, BONY_BIT = 1, 2, 4, 8, 16  # what is to be said of a vertex, see Soundness
 MOST_PLACES = 8192  # places of a lattice: nodes.MOST_LOOKED_AT and a margin around them
@@ -42,6 +42,7 @@ class OneSkin:
     end_ball: wp.int32
     table: wp.int32
     learnt: wp.int32
+    doubt: real
     hole: real
     thickest: real
     edge: real
@@ -278,7 +279,7 @@ def _one_skin(skin: Skin, columns: Columns, at: tuple[int, int, int, int]) -> tu
     one.modulus, one.nu = tissue.youngs_modulus, tissue.poisson_ratio
     one.mu, one.lam = tissue.shear_modulus / one.modulus, tissue.lame_lambda / one.modulus
     known = shipped(network_of(layer)).card["ranges"]["poisson_ratio"]
-    one.learnt, one.soft = int(not unlearnt(layer, *known)), soft_depth(tissue)
+    one.learnt, one.soft, one.doubt = int(not unlearnt(layer, *known)), soft_depth(tissue), tissue_doubt(layer)
     one.low, one.high = (vec3(*corner) for corner in where_inside(layer))
     return one, arrays
 
