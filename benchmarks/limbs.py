@@ -3,7 +3,7 @@
     .venv/bin/python -m benchmarks.limbs                            # our row and the simpler laws'; some minutes
     .venv/bin/python -m benchmarks.limbs --answers yours.py:answer  # and yours
     .venv/bin/python -m benchmarks.limbs --peer                     # MuJoCo's flex, and all others, under balls alone
-    .venv/bin/python -m benchmarks.limbs --export DIR               # the scenes as STL and JSON, for any program
+    .venv/bin/python -m benchmarks.limbs --export DIR               # the scenes, for any program
     .venv/bin/python -m benchmarks.limbs --kept                     # share of the tools' forces that the scenes keep
 
 benchmarks/limbs.md says what is in benchmarks/limbs_v3.npz. `answer(layer, tool, pose, way)` gets a SoftLayer, a Tool,
@@ -23,7 +23,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import trimesh
@@ -36,9 +36,11 @@ from fem_tools.released import Released
 from stmpl_core import Contact, SoftLayer, Tool
 from stmpl_core.arrays import finite
 from stmpl_core.console import steps_bar
+from stmpl_core.contact_net import ContactNet
 from stmpl_core.errors import InvalidInput
 from stmpl_core.methods import MomentNet
 from stmpl_core.nodes import Nodes
+from stmpl_core.packed import stack_to_text
 from stmpl_core.simulator import Simulator
 from stmpl_core.touch import Touch
 from studies.own import own
@@ -224,22 +226,41 @@ def table(title: str, found: dict[str, list[Off]]) -> Table:
     return out
 
 
-def export(samples: Iterable, folder: Path) -> int:
-    """Writes each limb and tool as STL [m] and a scenes.json beside them; the number of scenes."""
+def export(samples: Iterable[Sample], folder: Path, splits: Sequence[str]) -> int:
+    """Writes what a solver needs of each scene, and what finite elements found; the number of scenes.
+
+    Files: each limb's skin and the bone below it as PLY [m] with vertices in one order, each tool as STL [m], how each
+    vertex moves as .npy, (V, 3) [m], and scenes.json, which names them and has the tissues, poses and forces.
+
+    Args:
+        samples: contacts.
+        folder: folder for them.
+        splits: splits of which straight scenes are judged by the table, where finite elements know the pressure.
+    """
     folder.mkdir(parents=True, exist_ok=True)
-    scenes, limbs = [], set()
+    scenes: list[dict[str, Any]] = []
+    limbs: dict[str, dict[str, Any]] = {}
+    net = last = None
     for one in pressed(samples):
         info, layer = one.sample.info, one.sample.layer
-        limb, tool = f"{info['body']}.stl", f"{info['body']}-{info['number']:02d}-tool.stl"
+        limb, scene = info["body"], f"{info['body']}-{info['number']:02d}"
+        if net is None or last is not layer:
+            net, last = ContactNet(layer), layer
         if limb not in limbs:
-            trimesh.Trimesh(layer.vertices, layer.faces, process=False).export(folder / limb)
-            limbs.add(limb)
+            limbs[limb] = {"skin": f"{limb}-skin.ply", "bone": f"{limb}-bone.ply",
+                           "tissue": json.loads(stack_to_text(layer.tissue, layer.ply_scale))}  # fmt: skip
+            trimesh.Trimesh(layer.vertices, layer.faces, process=False).export(folder / limbs[limb]["skin"])
+            trimesh.Trimesh(layer.inner_vertices, layer.faces, process=False).export(folder / limbs[limb]["bone"])
+        tool, motion = f"{scene}-tool.stl", f"{scene}-{len(scenes):04d}-motion.npy"
         if not (folder / tool).exists():
             trimesh.Trimesh(one.tool.vertices, one.tool.faces, process=False).export(folder / tool)
-        scenes.append({"limb": limb, "tool": tool, "split": info["split"], "depth_over_thickness": info["ratio"],
-                       "pose_limb_from_tool": one.pose.tolist(), "way": one.way.tolist(),
-                       "force_on_limb_N": one.force.tolist(), "fem_error_m": info["discretisation_m"]})
-    (folder / "scenes.json").write_text(json.dumps(scenes, indent=1) + "\n")
+        np.save(folder / motion, one.sample.displacement.astype(np.float32))
+        judged = info["split"] in splits and slant_of(one.sample) <= STRAIGHT and seen(one, net) is not None
+        scenes.append({"limb": limb, "tool": tool, "split": info["split"], "judged": judged,
+                       "depth_over_thickness": info["ratio"], "pose_limb_from_tool": one.pose.tolist(),
+                       "way": one.way.tolist(), "force_on_limb_N": one.force.tolist(), "motion_of_skin_m": motion,
+                       "fem_error_m": info["discretisation_m"]})  # fmt: skip
+    (folder / "scenes.json").write_text(json.dumps({"limbs": limbs, "scenes": scenes}, indent=1) + "\n")
     return len(scenes)
 
 
@@ -283,9 +304,12 @@ def _answer(options: argparse.Namespace) -> None:
         return read(options.file or ELSEWHERE.get(kind, FILE))
 
     if options.export:
-        samples = (one for kind in options.limbs for one in released(kind).samples()
-                   if one.info["body"].startswith(LIMBS[kind][1]))  # fmt: skip
-        print(f"{export(samples, options.export)} scenes in {options.export}")
+        many = 0
+        for kind in options.limbs:
+            splits, names = LIMBS[kind]
+            some = (one for one in released(kind).samples() if one.info["body"].startswith(names))
+            many += export(some, options.export / kind.replace(",", "").replace(" ", "_"), splits)
+        print(f"{many} scenes in {options.export}")
         return
     laws = {PEER: str(FILE.parents[1] / FLEX)} if options.peer else {"yours": options.answers}
     others = {name: own(law) for name, law in laws.items() if law}

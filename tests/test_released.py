@@ -1,10 +1,13 @@
 """Laws of what is released of a data set, of presses into flat stacks, and of who is judged by them."""
 
+import json
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+import trimesh
 
 from benchmarks import limbs
 from fem_tools.axisymmetric import Flat, Profile
@@ -21,6 +24,7 @@ from stmpl_core.errors import InvalidInput
 from stmpl_core.living import living
 from stmpl_core.methods import MomentNet
 from stmpl_core.networks import STACK_NODE
+from stmpl_core.packed import stack_from_text
 from studies.flat import flat_rows, plate, pressure_on
 from tests.scenes import ball
 
@@ -202,8 +206,20 @@ def test_a_law_of_ones_own_is_judged_like_ours(monkeypatch: pytest.MonkeyPatch, 
         one = laws.answers(scene)["yours"]
         assert (one.answered, one.force, one.worst) == (False, -1, 1) and "no answer to " in laws.refused["yours"][-1]
     assert limbs.table("both", {"yours": [one, found["yours"]]}).columns[1]._cells == ["1 of 2", "1"]
-    assert limbs.export([scene.sample], tmp_path) == 1
-    assert len(list(tmp_path.glob("*.stl"))) == 2 and "force_on_limb_N" in (tmp_path / "scenes.json").read_text()
+    samples = list(islice(Released(limbs.FILE).samples("held_out"), 6))
+    assert limbs.export(samples, tmp_path, ("held_out",)) == sum(one.info["set"] == "tool" for one in samples)
+    told, layer = json.loads((tmp_path / "scenes.json").read_text()), scene.sample.layer
+    written, limb = told["scenes"][0], told["limbs"][scene.sample.info["body"]]
+    assert [one["judged"] for one in told["scenes"]].count(True) >= 2 and not written["judged"]  # it barely touches
+    read = {name: trimesh.load(tmp_path / file, process=False)
+            for name, file in (("skin", limb["skin"]), ("bone", limb["bone"]), ("tool", written["tool"]))}  # fmt: skip
+    np.testing.assert_allclose(read["skin"].vertices, layer.vertices, atol=1e-7)  # type: ignore[union-attr]
+    np.testing.assert_allclose(read["bone"].vertices, layer.inner_vertices, atol=1e-7)  # type: ignore[union-attr]
+    np.testing.assert_allclose(np.load(tmp_path / written["motion_of_skin_m"]), motion, atol=1e-7)
+    assert written["force_on_limb_N"] == pytest.approx(force.tolist())
+    assert stack_from_text(json.dumps(limb["tissue"]))[0] == layer.tissue and read["tool"].volume > 0  # type: ignore[union-attr]
+    limbs.export(samples, tmp_path, ("test",))
+    assert not any(one["judged"] for one in json.loads((tmp_path / "scenes.json").read_text())["scenes"])
 
 
 @pytest.mark.parametrize(("arguments", "says"), [
@@ -220,7 +236,7 @@ def test_the_comparison_on_limbs_refuses_in_a_sentence(monkeypatch, capsys, argu
 
 def test_scenes_are_written_of_the_limbs_that_are_asked_for(monkeypatch, tmp_path, capsys):
     bodies: set[str] = set()
-    monkeypatch.setattr(limbs, "export", lambda samples, _: len([bodies.add(one.info["body"]) for one in samples]))
+    monkeypatch.setattr(limbs, "export", lambda samples, *_: len([bodies.add(one.info["body"]) for one in samples]))
     monkeypatch.setattr("sys.argv", ["limbs", "--limbs", "a forearm left out", "--export", str(tmp_path)])
     limbs.main()
     assert bodies and all(body.startswith("forearm") for body in bodies)

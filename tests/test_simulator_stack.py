@@ -1,6 +1,7 @@
 """Laws of touches and answers on a limb of skin, fat and muscle, and what finite elements say of both."""
 
 import pickle
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -8,7 +9,7 @@ import trimesh
 from scipy.spatial import cKDTree
 
 from benchmarks.massage_force import CIRCLE, Place, laws
-from fem_tools import IndenterFem, PatchFem, Press
+from fem_tools import IndenterFem, PatchFem, Press, RigidFem
 from stmpl_core import Contact, Load, Membrane, Ply, Simulator, SoftLayer, Tissue
 from stmpl_core.body import Body
 from stmpl_core.bones import Bone, to_bone
@@ -19,9 +20,10 @@ from stmpl_core.methods import LimbLinear, MomentNet
 from stmpl_core.moments import Surroundings
 from stmpl_core.networks import STACK_NODE
 from stmpl_core.nodes import Nodes
+from stmpl_core.regions import region
 from stmpl_core.sdf import SignedDistance
 from stmpl_core.stiffness import fit_stiffness
-from stmpl_core.toucher import Toucher, unlearnt
+from stmpl_core.toucher import Toucher, tissue_doubt, unlearnt
 from stmpl_sim.site import Site
 from tests.scenes import at, ball, contact_of, limb, placed, punch, tool, turn
 
@@ -294,6 +296,50 @@ def test_skin_with_next_to_no_tension_is_flagged(tension: float, sound: bool) ->
     tissue = Tissue(3e3, 0.45, skin=skin, deeper=(Ply(10e-3, 15e3, 0.45),))
     layer = limb(6e-3, 25e-3, 45e-3, LENGTH).with_(tissue=tissue)
     assert any("next to no tension" in why for why in unlearnt(layer, 0.3, 0.49)) != sound
+
+
+def of_ratio(ratio: float) -> Tissue:
+    """A forearm's tissue with one Poisson's ratio of its materials."""
+    tissue = region("forearm").tissue
+    deeper = tuple(replace(one, poisson_ratio=ratio) for one in tissue.deeper)
+    return replace(tissue, poisson_ratio=ratio, deeper=deeper)
+
+
+def over(stiff: float, depth: float, soft: float) -> Tissue:
+    """A forearm's skin over so deep a material over a softer one [Pa, m]."""
+    return Tissue(stiff, 0.45, skin=region("forearm").tissue.skin, deeper=(Ply(depth, soft, 0.45),))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("tissue, sound", [(of_ratio(0.35), True), (over(12e3, 10e-3, 4e3), False),
+                                           (over(20e3, 8e-3, 2e3), False)])  # fmt: skip
+def test_the_bound_covers_tissue_that_few_contacts_were_learnt_with(tissue: Tissue, sound: bool) -> None:
+    """Finite elements press 10 % harder than the first, 12 and 29 % less than the others."""
+    layer = limb(5e-3, 25e-3, 45e-3, 0.16).with_(tissue=tissue)
+    contact = contact_of(ball(20e-3, 4), at(45e-3 + 20e-3 - 10e-3, 0, 0.08))
+    answer = Simulator(layer, MomentNet()).step([contact])
+    (touch,), truth = answer.touches.values(), RigidFem().prepare(layer).press([contact], answer)
+    assert touch.trust.in_range == sound and ("over a much softer one" in touch.trust.why) != sound
+    off = abs(touch.force - truth.trust.figures["probe.normal_n"])
+    assert 0.9 * touch.force_bound / tissue_doubt(layer) < off < touch.force_bound
+
+
+def test_how_far_tissue_is_from_what_was_learnt() -> None:
+    def doubt(tissue: Tissue, thickness: float = 25e-3) -> float:
+        return tissue_doubt(limb(12e-3, thickness, 45e-3).with_(tissue=tissue))
+
+    def told(tissue: Tissue, thickness: float) -> bool:
+        return any("over a much softer" in one for one in unlearnt(limb(12e-3, thickness, 0.13).with_(tissue=tissue),
+                                                                   0.35, 0.46))  # fmt: skip
+
+    assert doubt(of_ratio(0.45)) == doubt(of_ratio(0.46)) == doubt(Tissue(1e3, 0.3)) == 1
+    assert 1 < doubt(of_ratio(0.43)) < doubt(of_ratio(0.40)) < doubt(of_ratio(0.35)) < 2
+    assert doubt(over(4e3, 8e-3, 4e3)) == 1 < doubt(over(6e3, 8e-3, 4e3)) < doubt(over(12e3, 8e-3, 4e3))
+    assert doubt(over(12e3, 30e-3, 4e3)) == 1, "what lies below the bone is none"
+    for tone in ("relaxed", "tensed"):
+        belly = region("abdomen", tone)
+        assert 1.1 < doubt(belly.tissue, belly.thickness) < 1.4 and not told(belly.tissue, belly.thickness)
+    assert told(over(20e3, 8e-3, 2e3), 25e-3) and not told(over(6e3, 8e-3, 4e3), 25e-3)
 
 
 @pytest.mark.parametrize("force", [0.3, 3.0, 10.0, 100.0])
