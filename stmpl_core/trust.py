@@ -8,6 +8,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from stmpl_core.arrays import PerVertex, VertexVectors
+from stmpl_core.errors import InvalidInput
 
 
 @dataclass(frozen=True)
@@ -20,6 +21,9 @@ class Trust:
         error_bound: largest Euclidean error to expect at any vertex [m], or None where none is known.
         why: sentence for a person; empty when there is nothing to say.
         figures: figures that the method measured, by name with unit ("min_j", "truncation_m").
+
+    Raises:
+        InvalidInput: a flag that is neither True nor False.
     """
 
     converged: bool = True
@@ -27,6 +31,12 @@ class Trust:
     error_bound: float | None = None
     why: str = ""
     figures: Mapping[str, float] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        """Raises InvalidInput for a flag that is no truth."""
+        for name in ("converged", "in_range"):
+            if not isinstance(getattr(self, name), bool | np.bool_):
+                raise InvalidInput(f"{name} is {getattr(self, name)!r}; True or False is needed.")
 
     @property
     def ok(self) -> bool:

@@ -6,7 +6,9 @@ import pytest
 from benchmarks.tools import ball, block_letter, fingertip, flat
 from stmpl_core import Contact, Simulator, Tissue, Tool
 from stmpl_core.conform import kept_out
+from stmpl_core.errors import InvalidInput
 from stmpl_core.methods import MomentNet, Winkler
+from stmpl_core.trust import Trust
 from studies.stability.meshes import inserted
 from studies.stability.meshes import limb as round_limb
 from tests.scenes import STACK, limb, plate, turn
@@ -108,3 +110,10 @@ def test_bounds_know_the_noise_of_a_scan(depth: float) -> None:
         covered.append(abs(touch.force - smooth.force) < touch.force_bound)
         assert touch.force_bound / touch.force > smooth.force_bound / smooth.force + 0.05
     assert sum(covered) >= 7
+
+
+@pytest.mark.parametrize("flags", [{"in_range": ""}, {"converged": 1.0}, {"in_range": None}])
+def test_a_flag_that_is_no_truth_is_refused(flags: dict) -> None:
+    """A method of one's own that puts its reason where the flag belongs was counted as flagged."""
+    with pytest.raises(InvalidInput, match="True or False is needed"):
+        Trust(**flags)
