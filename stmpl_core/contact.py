@@ -69,7 +69,7 @@ def rigid(what: str, pose: ArrayLike) -> Transform:
         return pose
     array = counted(what, pose, (4, 4))
     if not _rigid(array):
-        raise InvalidInput(f"{what} is not rigid: it is\n{array}.")
+        raise InvalidInput(f"{what} is not rigid: it is {np.round(array, 6).tolist()}.")
     return array
 
 

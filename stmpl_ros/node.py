@@ -414,7 +414,6 @@ class SkinNode(ServingNode):
         inbox, events = self.hearing.inbox, self.hearing.events
         stopped = [f"no wrench of {name} for {self.config.rest_after} s: answered without it"
                    for name in inbox.dumb(self.hearing.now())]  # fmt: skip
-        self._look_for_twins()
         live, lost = inbox.live(self.hearing.now()), self.hearing.lost_frames()
         values = self.tally.values() | {
             "tools": " ".join(live),
@@ -429,9 +428,9 @@ class SkinNode(ServingNode):
             values["joints"] = self.bending.doubt or " ".join(f"{x:.4f}" for x in self.answering.simulator.skin.angles)
         told = self.bending.doubt or self.tally.doubt  # where all answers are of a surface from before, it says so
         outdated = [one for one in self.hearing.look_for_outdated() if one not in told]
-        senders = "; ".join(filter(None, (clock, lost if live else "", self.hearing.look_at_clock(), *stopped,
-                                          *outdated, self.hearing.unheard(), self.hearing.look_for_strangers(),
-                                          self.hearing.rivals())))  # fmt: skip
+        senders = "; ".join(filter(None, (clock, lost if live else "", self._look_for_twins(),
+                                          self.hearing.look_at_clock(), *stopped, *outdated, self.hearing.unheard(),
+                                          self.hearing.look_for_strangers(), self.hearing.rivals())))  # fmt: skip
         lately = self._counts.since(reactions=self.tally.reactions, refused=self.tally.refused, stale=self.tally.stale,
                                     out_of_order=inbox.out_of_order, missed=events.missed_deadlines)  # fmt: skip
         health = Health(lately, self.tally.last_refusal, self.answering.fading, bool(live),
@@ -451,16 +450,22 @@ class SkinNode(ServingNode):
     def _tell_health(self, statuses: list[DiagnosticStatus]) -> None:
         self.diagnostics.publish(diagnostics(statuses, self.get_clock().now().to_msg()))
 
-    def _look_for_twins(self) -> None:
-        """Tells, once as they come, of other nodes that answer on the same topic, or bear the same name."""
+    def _look_for_twins(self) -> str:
+        """Sentence on other nodes that answer on the same topic, or bear the same name; empty: there are none.
+
+        A line tells of them once as they come.
+        """
         topic, me = "skin/displacement", (self.get_name(), self.get_namespace())
         named = sum(one == me for one in self.get_node_names_and_namespaces()) - 1
         before, self._twin = self._twin, "that answers" if self.count_publishers(topic) > 1 else ""
         self._twin = "of the same name" if named > 0 else self._twin
-        if self._twin not in ("", before):
-            where = self.resolve_topic_name(topic)
-            said = f"there is another node {self._twin} on {where}: listeners get the answers of both. "
-            self.hearing.gate.say(f"twin {self._twin}", said + "Give each a namespace: --ros-args -r __ns:=/left")
+        if not self._twin:
+            return ""
+        said = (f"there is another node {self._twin} on {self.resolve_topic_name(topic)}: listeners get the answers of "
+                "both. Give each a namespace: --ros-args -r __ns:=/left")  # fmt: skip
+        if self._twin != before:
+            self.hearing.gate.say(f"twin {self._twin}", said)
+        return said
 
     def _now(self) -> int:
         return self.get_clock().now().nanoseconds

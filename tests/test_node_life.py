@@ -23,7 +23,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import pytest
 import rclpy
-from diagnostic_msgs.msg import DiagnosticArray
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import PoseStamped, WrenchStamped
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState
@@ -480,14 +480,20 @@ def test_two_nodes_on_one_topic_tell_of_each_other_and_of_one_of_their_name():
         where = f"there is another node {twin} on /twins/skin/displacement: listeners get the answers of both"
         return {line.name for line in twins.got["/rosout"] if line.msg.startswith(where) and "__ns:=" in line.msg}
 
+    def warned() -> bool:
+        return any(one.status[0].level == DiagnosticStatus.WARN and "there is another node" in one.status[0].message
+                   for one in twins.got["/diagnostics"])  # fmt: skip
+
     namesake = None
+    twins.listen(DiagnosticArray, "/diagnostics", STREAM)
     try:
         with running(*command):
             twins.wait(lambda: twins.got["skin/topology"], "skin/topology")
             twins.spin(2.5)
-            assert not told("that answers") | told("of the same name"), "one alone is no twin"
+            assert not told("that answers") | told("of the same name") and not warned(), "one alone is no twin"
             with running(*command, "-r", "__node:=other"):
                 twins.wait(lambda: told("that answers") == {"twins.stmpl", "twins.other"}, "both log lines")
+                twins.wait(warned, "a warning on /diagnostics")
             namesake = rclpy.create_node("stmpl", namespace="/twins")
             twins.wait(lambda: "twins.stmpl" in told("of the same name"), "word of the namesake")
     finally:
