@@ -548,12 +548,11 @@ class Toucher:
         if size > 0 and not layer.stacked:
             bound += SHALLOW * max(1 - depth / (SHALLOW_TO * thickness), 0.0)
         beside_off = 0.0 if one.force is None else abs(1 / scale - 1) if len(v) else 1.0  # each was placed as if alone
+        if beside_off > 2 * FORCE_TOLERANCE:
+            bound += beside_off
         flat = below / max(depth, 1e-300)  # the skin is no facets, whose middle lies twice as low
         more = held.power * math.log1p(flat + flat * min(flat, 1.0))
         bound += STUCK * along + math.expm1(min(more, MOST_MORE))
-        elsewhere = beside_off > MAX_BESIDE and not abs(1 - scale) < bound  # else it presses so for all that is known
-        if beside_off > 2 * FORCE_TOLERANCE:
-            bound += beside_off
         beside, radius = among or pins(nodes.points, nodes.area, nodes.thickness, forces)
         wider = WIDER if beside > GROUP and depth > DEEP * radius else 1.0
         touch = Touch(
@@ -580,7 +579,7 @@ class Toucher:
         if missed > UNSOLVED:
             trust = trust.also(f"where {touch.name} presses was not found: skin misses it by {missed:.0%} of its depth",
                                in_range=False, converged=False)  # fmt: skip
-        if elsewhere:
+        if beside_off > MAX_BESIDE:
             where = (f"no place was found where {touch.name} presses so: the nearest" if held is one.held else
                      f"{touch.name} was moved to where it presses so alone; beside the other tools that")  # fmt: skip
             trust = trust.also(f"{where} is {beside_off:.0%} off", in_range=False)

@@ -342,14 +342,6 @@ def test_how_far_tissue_is_from_what_was_learnt() -> None:
     assert told(over(20e3, 8e-3, 2e3), 25e-3) and not told(over(6e3, 8e-3, 4e3), 25e-3)
 
 
-@pytest.mark.parametrize("force", [1e-12, 1e-9, 1e-6, 1e-4])
-def test_a_force_below_what_the_first_touch_can_tell_is_within_its_bound(force: float, simulator: Simulator) -> None:
-    """The lightest touch that was found pressed several times as hard, and was told as 'no place was found'."""
-    (touch,) = simulator.touch([pressed(1e-3, push(force))])
-    assert touch.trust.in_range and touch.force == pytest.approx(force, rel=1e-4)
-    assert force < touch.force_bound < 0.05 and touch.depth < 5e-5
-
-
 @pytest.mark.parametrize("force", [0.3, 3.0, 10.0, 100.0])
 def test_few_trials_find_where_a_tool_that_is_stated_at_the_skin_presses(force, simulator, monkeypatch) -> None:
     toucher, tried = simulator.toucher, []
