@@ -242,12 +242,11 @@ class Answering:
         for stream in instant.lost:
             said.append(f"no {stream} for {rest_after} s: answered without it")
             say(f"lost {stream}", said[-1])
-        turned = {one.name for one in instant.contacts if one.wrench is not None and one.wrench[3:].any()}
         for name, touch in touches.items():
             if name not in self._seen and touch.depth > MAX_FIRST_DEPTH_M:
                 self._tell(f"start of {name}", f"{name} starts {1e3 * touch.depth:.1f} mm inside the skin")
             if touch.status in WORTH_A_LINE:
-                why = TURNED if name in turned and touch.status == NO_FORCE else WORTH_A_LINE[touch.status]
+                why = TURNED if touch.status == NO_FORCE and touch.missing[3:].any() else WORTH_A_LINE[touch.status]
                 say(f"{name} {touch.status}", f"{name}: {touch.status}; {why}")
         return tuple(said)
 

@@ -51,12 +51,10 @@ class Bus(Robot):
         """
         client = self.node.create_client(kind, f"stmpl/{name}")
         self.wait(client.service_is_ready, name)
-        futures, since = [client.call_async(kind.Request(**fields))], time.monotonic()
+        futures, begun = [client.call_async(kind.Request(**fields))], time.monotonic()
 
         def answered() -> list:
-            nonlocal since
-            if name.endswith("_parameters") and time.monotonic() - since > AGAIN / 1e9:
-                since = time.monotonic()
+            if name.endswith("_parameters") and time.monotonic() - begun > len(futures) * AGAIN / 1e9:
                 futures.append(client.call_async(kind.Request(**fields)))
             return [future for future in futures if future.done()]
 
