@@ -23,7 +23,7 @@ from stmpl_core.errors import InvalidInput
 from stmpl_core.friction import Friction, coefficients
 from stmpl_core.green import AS_AT_REST, Green
 from stmpl_core.relaxation import fading, series_of
-from stmpl_core.sideways import Sideways
+from stmpl_core.sideways import Sideways, fading_aside
 from stmpl_core.slip import MOST_GROWN
 from stmpl_core.state import Memory, State, fresh
 from stmpl_core.stepped import MOST_DRAGGED, OUT, PATCH, SAYS
@@ -57,9 +57,10 @@ class History:
         self.frictions = coefficients(friction)
         thickness = float(np.median(layer.thickness))
         self.series = series_of(layer.tissue, thickness)
-        self._fades = fading(layer.tissue, thickness)
+        self._fades = np.vstack([fading(layer.tissue, thickness), fading_aside(layer.tissue, thickness)])
         self._last: State | None = None  # state of the last step, which is one of this skin
         self._skin = crc32(layer.thickness.tobytes(), crc32(layer.faces.tobytes(), crc32(layer.vertices.tobytes())))
+        self._tissue = crc32(layer.tissue.numbers.tobytes())
 
     @cached_property
     def sideways(self) -> Sideways:
@@ -136,7 +137,7 @@ class History:
         for name in names[many:]:
             if not (memories[name].sunk or memories[name].trail.any()):
                 del memories[name]
-        self._last = State(memories, here, self._skin)
+        self._last = State(memories, here, self._skin, self._tissue)
         return touches, self._last
 
     def _check(self, state: State) -> None:
@@ -145,13 +146,18 @@ class History:
         if state.tools and state.joints != here:
             raise InvalidInput(f"the skin's joints are at {here} rad, the state was told at {state.joints}. Try "
                                "Simulator.touch, which takes it along.")  # fmt: skip
-        if state.tools and state.skin not in (None, self._skin):
-            raise InvalidInput(f"the state of {', '.join(state.tools)} is of skin of another shape. Try an empty "
-                               "State().")  # fmt: skip
         for name, memory in state.tools.items():
             if memory.terms != len(self.series.times):
                 raise InvalidInput(f"the state of {name} is of skin with {memory.terms} times of relaxation; "
                                    f"this layer has {len(self.series.times)}. Try an empty State().")  # fmt: skip
+        if state.tools and state.skin not in (None, self._skin):
+            raise InvalidInput(f"the state of {', '.join(state.tools)} is of skin of another shape. Try an empty "
+                               "State().")  # fmt: skip
+        remembers = any(one.terms or one.scalars.limit > 0 for one in state.tools.values())
+        if remembers and state.tissue not in (None, self._tissue):
+            raise InvalidInput(f"the state of {', '.join(state.tools)} is of other tissue, which relaxed or was "
+                               "dragged otherwise. Try an empty State().")  # fmt: skip
+        for name, memory in state.tools.items():
             if memory.scalars.radius > 0:
                 (x, y, z), (a, b, c, d, e, f) = memory.contact[0].tolist(), self._box
                 if not (a <= x <= d and b <= y <= e and c <= z <= f):

@@ -22,8 +22,8 @@ from stmpl_core.errors import InvalidInput
 from stmpl_core.friction import Friction, coefficient
 from stmpl_core.layer import MAX_THICKNESS, one_thickness
 from stmpl_core.regions import HELD_SKIN
-from stmpl_core.relaxation import Series, faded, fading, series_of
-from stmpl_core.sideways import patch
+from stmpl_core.relaxation import Series, faded, fading, series_of, shares_aside
+from stmpl_core.sideways import fading_aside, patch
 from stmpl_core.stack import Ball, Fit, Misfit, ball, nearest, plies, response
 from stmpl_core.stroke import Missed, Stroke, played, pulled, without_time
 from stmpl_core.tissue import FRICTION, HARDEST, SOFTEST, Tissue
@@ -224,9 +224,10 @@ def needs(
     rung = [_within(bare.misfit, enough), _within(taut.misfit, enough), True].index(True)
     pull = _tension(tissue, thickness, pressed, loose, rung, enough)
     eases = tissue if tissue.relaxes else tissue.relaxing(HELD_SKIN)
-    series, fades = series_of(eases, thickness), fading(eases, thickness)
+    series, fades = series_of(eases, thickness), np.vstack([fading(eases, thickness), fading_aside(eases, thickness)])
     strokes = [stroke_of(tissue, thickness, one.judged, speed, duration, path)._replace(
-                   fades=float(faded(fades, one.judged.contact_radius)))
+                   fades=float(faded(fades, one.judged.contact_radius)),
+                   aside=shares_aside(fades, one.judged.contact_radius, len(series.times)))
                for one in pressed for speed in speeds or (np.inf,)]  # fmt: skip
     time, moduli = _time(strokes, series, mu if path else 0.0, bool(speeds), enough)
     slip = _slip(strokes, series, mu, path, drag, enough)

@@ -16,6 +16,7 @@ steady slide.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numba
@@ -61,7 +62,7 @@ def series_of(tissue: Tissue, thickness: float) -> Series:
         tissue: materials, and the skin on them.
         thickness: thickness from the surface to the base [m], > 0.
     """
-    each = _relaxations(tissue, thickness)
+    each = relaxations(tissue, thickness)
     if not any(each):
         return Series(np.empty(0), np.empty(0))
     found: dict[float, float] = {}
@@ -91,20 +92,20 @@ def fading(tissue: Tissue, thickness: float) -> np.ndarray:
     return np.stack([np.log(radii), np.array(fades[:-1]) / max(fades[-1], 1e-300)])
 
 
-def _relaxations(tissue: Tissue, thickness: float) -> list[Prony | None]:
+def relaxations(tissue: Tissue, thickness: float) -> list[Prony | None]:
     """Series of each material of a stack, from the skin inwards, and last of the skin if there is one."""
     there = [ply for ply in tissue.deeper if ply.depth < thickness]
     skin = [tissue.skin.relaxation] if tissue.skin else []
     return [tissue.relaxation, *(ply.relaxation for ply in there), *skin]
 
 
-def _fading_moduli(tissue: Tissue, thickness: float) -> np.ndarray:
-    """Share of each material's modulus that fades in the end, in the order of `_relaxations`."""
-    return np.array([sum(one.shares) if one else 0.0 for one in _relaxations(tissue, thickness)])
+def fading_moduli(tissue: Tissue, thickness: float) -> np.ndarray:
+    """Share of each material's modulus that fades in the end, in the order of `relaxations`."""
+    return np.array([sum(one.shares) if one else 0.0 for one in relaxations(tissue, thickness)])
 
 
 def _log_force(tissue: Tissue, thickness: float, radius: float, factors: np.ndarray) -> float:
-    """Logarithm of the force under a Gaussian load of a radius [m], with factors on the moduli, as `_relaxations`."""
+    """Logarithm of the force under a Gaussian load of a radius [m], with factors on the moduli, as `relaxations`."""
     k, skin = np.geomspace(0.02, 8, 200) / radius, tissue.skin
     weight = np.exp(-0.25 * (k * radius) ** 2) * k * k
     changed = [(h, modulus * by, nu) for (h, modulus, nu), by in zip(plies(tissue, thickness), factors, strict=False)]
@@ -114,25 +115,37 @@ def _log_force(tissue: Tissue, thickness: float, radius: float, factors: np.ndar
 
 def _fades(tissue: Tissue, thickness: float, radius: float) -> float:
     """Share of the force under such a load that is gone once every material has relaxed [-]."""
-    left = np.maximum(1 - _fading_moduli(tissue, thickness), LEAST_LEFT)
+    left = np.maximum(1 - fading_moduli(tissue, thickness), LEAST_LEFT)
     whole = _log_force(tissue, thickness, radius, np.ones(len(left)))
     return 1 - float(np.exp(_log_force(tissue, thickness, radius, left) - whole))
 
 
 def _shares(tissue: Tissue, thickness: float) -> list[float]:
-    """Share of the force that each material bears, in the order of `_relaxations`.
+    """Share of the force that each material bears, in the order of `relaxations`."""
+    if tissue.single:
+        return [1.0]
+    return list(borne_by(fading_moduli(tissue, thickness),
+                         lambda factors: _log_force(tissue, thickness, MIX_RADIUS, factors)))  # fmt: skip
+
+
+def borne_by(fade: np.ndarray, log_force: Callable[[np.ndarray], float]) -> np.ndarray:
+    """Share of a force that each material bears, (M,) [-].
 
     That is d ln F / d ln E, times a factor by which all together fade as much as the force on relaxed moduli falls: a
     material that softens much bears less and less of it.
+
+    Args:
+        fade: share of each modulus that fades in the end, (M,).
+        log_force: function that tells the logarithm of the force, by factors on the moduli, (M,).
     """
-    if tissue.single:
-        return [1.0]
-    fade = _fading_moduli(tissue, thickness)
     steps = np.exp(LOG_STEP * np.eye(len(fade)))
-    up, down = ([_log_force(tissue, thickness, MIX_RADIUS, one) for one in some] for some in (steps, 1 / steps))
+    up, down = ([log_force(one) for one in some] for some in (steps, 1 / steps))
     shares = np.subtract(up, down) / (2 * LOG_STEP)
     first_order = float(shares @ fade)
-    return list(shares * (_fades(tissue, thickness, MIX_RADIUS) / first_order) if first_order > 0 else shares)
+    if not first_order > 0:
+        return shares
+    fades = 1 - np.exp(log_force(np.maximum(1 - fade, LEAST_LEFT)) - log_force(np.ones(len(fade))))
+    return shares * (fades / first_order)
 
 
 @numba.njit(cache=True, error_model="numpy")
@@ -140,15 +153,38 @@ def faded(fades, radius):
     """How much more of a force fades under a contact of a radius [m] than a Series says [-]; 1 where there is none.
 
     Args:
-        fades: rows of `fading`: logarithms of radii, evenly, and the factors there, (2, R).
+        fades: rows of `fading`: logarithms of radii, evenly, and the factors there, (2, R); more may follow.
         radius: radius of the contact [m]; 0: none.
     """
     if not radius > 0:
         return 1.0
-    logs, factors = fades
+    low, part = _place(fades[0], radius)
+    return fades[1, low] + part * (fades[1, low + 1] - fades[1, low])
+
+
+@numba.njit(cache=True, error_model="numpy", inline="always")
+def _place(logs, radius):
+    """Number of the row of a table by the logarithms of radii, evenly, and how far to the next one [-]."""
     at = min(max((np.log(radius) - logs[0]) / (logs[1] - logs[0]), 0.0), len(logs) - 1.0)
     low = min(int(at), len(logs) - 2)
-    return factors[low] + (at - low) * (factors[low + 1] - factors[low])
+    return low, at - low
+
+
+@numba.njit(cache=True, error_model="numpy")
+def shares_aside(fades, radius, terms):
+    """Share of a drag that relaxes in each time of a Series under a contact of a radius [m], (P,) [-].
+
+    Args:
+        fades: rows of `fading`, and below them those of `sideways.fading_aside`, (2 + P, R).
+        radius: radius of the contact [m], > 0.
+        terms: P.
+    """
+    out = np.empty(terms)
+    if terms:
+        low, part = _place(fades[0], radius)
+        for i in range(terms):
+            out[i] = fades[2 + i, low] + part * (fades[2 + i, low + 1] - fades[2 + i, low])
+    return out
 
 
 def fades_under(tissue: Tissue, thickness: float, radius: float) -> float:

@@ -11,6 +11,8 @@ import numpy as np
 from scipy.special import gamma, j0, j1, jv
 
 from stmpl_core.layer import SoftLayer
+from stmpl_core.relaxation import RADII as RELAXING_RADII
+from stmpl_core.relaxation import borne_by, fading_moduli, relaxations
 from stmpl_core.stack import along
 from stmpl_core.tissue import Tissue
 
@@ -20,6 +22,7 @@ WHERE = np.linspace(0.05, 0.95, 10)  # places in the patch that move with the to
 POWERS = (-0.5, 0.5, 1.5)  # powers of 1 - r^2 / a^2 in the traction: the first alone is exact on a half-space
 RADII = np.geomspace(0.02, 8.0, 18)  # radii of the patch that are tabled, over the thickness
 THICKNESSES = 5  # thicknesses of a stack that are tabled
+ASIDE_RADII = 7  # radii for which it is reckoned how much of a drag fades; others are between
 
 
 class Patch(NamedTuple):
@@ -87,6 +90,42 @@ def patch(tissue: Tissue, thickness: float, radius: float) -> Patch:
         return Patch(float(force), float(torque), float(force), 0.0)
     bare = patch(replace(tissue, skin=None), thickness, radius).along
     return Patch(float(force), float(torque), bare, slack_at(tissue, radius))
+
+
+def fading_aside(tissue: Tissue, thickness: float) -> np.ndarray:
+    """Share of a drag that relaxes in each time of the layer's Series (stmpl_core.relaxation), by the contact's radius.
+
+    As of a force into the skin there, with the stiffness of a patch along the skin (`patch`) in place of the force:
+    most of a drag is carried by skin and what is right below, whatever carries the push.
+
+    Returns:
+        Shares at the radii of relaxation.RADII, (P, R) [-].
+    """
+    each, (least, most, many) = relaxations(tissue, thickness), RELAXING_RADII
+    times = sorted({tau for one in each if one for tau in one.times})
+    if tissue.single:
+        shares = np.array(tissue.relaxation.shares if tissue.relaxation else ())
+        return np.repeat(shares[:, None], many, axis=1)
+    if not times:
+        return np.empty((0, many))
+    fade, logs = fading_moduli(tissue, thickness), np.log(np.geomspace(least, most, many))
+    coarse = np.linspace(logs[0], logs[-1], ASIDE_RADII)
+    found = np.zeros((len(times), ASIDE_RADII))
+    for k, radius in enumerate(np.exp(coarse)):
+        borne = borne_by(fade, lambda factors, radius=radius: math.log(
+            patch(_softened(tissue, factors), thickness, radius).along))  # fmt: skip
+        for one, share in zip(each, borne, strict=True):
+            for g, tau in zip(one.shares, one.times, strict=True) if one else ():
+                found[times.index(tau), k] += share * g
+    return np.array([np.interp(logs, coarse, row) for row in found])
+
+
+def _softened(tissue: Tissue, factors: np.ndarray) -> Tissue:
+    """The tissue with factors on its moduli, in the order of relaxation.relaxations; its skin keeps its tension."""
+    deeper = tuple(replace(ply, youngs_modulus=ply.youngs_modulus * by)
+                   for ply, by in zip(tissue.deeper, factors[1:], strict=False))  # fmt: skip
+    skin = tissue.skin and replace(tissue.skin, youngs_modulus=tissue.skin.youngs_modulus * float(factors[-1]))
+    return replace(tissue, youngs_modulus=tissue.youngs_modulus * float(factors[0]), deeper=deeper, skin=skin)
 
 
 def slack_at(tissue: Tissue, radius: float) -> float:

@@ -146,7 +146,8 @@ class Simulator:
         """Finds the reaction: touch of each contact, fast; `answer` finds the displacement.
 
         Args:
-            contacts: tools at one instant, each once.
+            contacts: tools at one instant, each once. A tool of the state that is not among them was taken away, in a
+                step with time; without time nothing happens to it.
             state: memory of the steps before, empty at the beginning, which goes along with the skin if its joints were
                 elsewhere; None: elastic skin without friction, as if nothing had been before, and no state is returned.
             dt: time since that state [s].
@@ -156,6 +157,7 @@ class Simulator:
             MeshError: a tool's surface that cannot be used.
         """
         try:
+            contacts = list(contacts)
             names = [contact.name for contact in contacts]
         except (AttributeError, TypeError):
             raise InvalidInput(f"contacts are {contacts!r:.60}; a list of Contacts is needed.") from None
@@ -174,6 +176,7 @@ class Simulator:
         """
         # Sum: pressures of several tools add.
         try:
+            touches = list(touches)
             pressing = [touch.pressure for touch in touches if touch.pressure is not None]
         except (AttributeError, TypeError):
             raise InvalidInput(f"touches are {touches!r:.60}; a list of Touches is needed.") from None

@@ -211,10 +211,11 @@ def _slipped(spring, left, stiffness, over, most):
 
 
 @numba.njit(cache=True, error_model="numpy")
-def drag(springs, relaxed, shares, times, dt, rolled, stiffness, before, cap, way, wanted, by_force):
-    """One step of the springs; see Drag, and for the arguments `_step`.
+def drag(springs, relaxed, shares, times, dt, rolled, stiffness, before, cap, way, wanted, by_force, first=-1.0):
+    """One step of the springs; see Drag, and for the arguments `_step`; first: cap before the step, below 0 as after.
 
-    A slider that turns follows the way within a length of cap / k, so a longer step by pose is cut into parts.
+    A slider that turns follows the way within a length of cap / k, so a longer step by pose is cut into parts, along
+    which cap and stiffness go from what they were to what they are.
     """
     far = 0.0
     for x in range(3):
@@ -222,11 +223,15 @@ def drag(springs, relaxed, shares, times, dt, rolled, stiffness, before, cap, wa
     parts = 1
     if not by_force and cap > 0:
         parts = int(min(max(np.ceil(np.sqrt(far) / (PART * cap)), 1.0), PARTS))
-    found, kept, force, share, stored = _step(springs, relaxed, shares, times, dt / parts, rolled, stiffness, before,
-                                              cap, way / parts, wanted, by_force)  # fmt: skip
-    for _ in range(parts - 1):
-        found, kept, force, share, stored = _step(found, kept, shares, times, dt / parts, 0.0, stiffness, stiffness,
-                                                  cap, way / parts, wanted, by_force)  # fmt: skip
+    found, kept, force, share, stored = springs, relaxed, np.zeros(3), 0.0, 0.0
+    last, begun = before, before if before[0] > 0 and first >= 0 else stiffness
+    for k in range(1, parts + 1):
+        to_go = (parts - k) / parts
+        limit = cap + to_go * (first - cap) if first >= 0 else cap
+        now = stiffness + to_go * (begun - stiffness)
+        found, kept, force, share, stored = _step(found, kept, shares, times, dt / parts, rolled, now, last, limit,
+                                                  way / parts, wanted, by_force)  # fmt: skip
+        last, rolled = now, 0.0
     return found, kept, force, share, stored
 
 
@@ -353,7 +358,7 @@ def _find(wanted, stiffness, cap, start, left, over, springs, force, slides, go)
 @numba.njit(cache=True, error_model="numpy")
 def rub(wrench, stated, by_force, contact, origin, bend, give, mu, along_itself, wrap, force, lever, elastic, depth,
         radius, thickness, power, along, turn, bare, slack, twist, known, pressed, before_contact, before_elastic,
-        before_slid, before_held, room, passed, springs, relaxed, stiffness, shares, times, dt):  # fmt: skip
+        before_slid, before_held, first, room, passed, springs, relaxed, stiffness, shares, times, dt):  # fmt: skip
     """Friction of a contact that would press with a wrench (6,) without friction.
 
     Friction turns the way that the push faces, and the push bounds friction: both are asked until they agree.
@@ -378,6 +383,7 @@ def rub(wrench, stated, by_force, contact, origin, bend, give, mu, along_itself,
         twist, known: see footing.aged.
         pressed: whether the tool pressed before the step.
         before_contact, before_elastic, before_slid, before_held: see Memory and Scalars, before the step.
+        first: Scalars.limit before the step [N]; below 0: none.
         room, passed: Scalars.rolled_first, .rolled_second and .rolled before it, and those of `passed`, (3,) [m].
         springs, relaxed, stiffness: see Memory, before it.
         shares, times: series of the relaxation, (P,) each.
@@ -442,7 +448,7 @@ def rub(wrench, stated, by_force, contact, origin, bend, give, mu, along_itself,
             cap = (1 - loose) * (ratio * grown * force + (1 - taut) * (cap - most))
         after = np.array([softened(alone, gives[0]), softened(alone, gives[1]), stiffer * turn / arm_of_turn**2])
         new, kept, carried, share, stored = drag(
-            springs, relaxed, shares, times, dt, rolled, after, held_at, cap, way, wanted, by_force)  # fmt: skip
+            springs, relaxed, shares, times, dt, rolled, after, held_at, cap, way, wanted, by_force, first)  # fmt: skip
         last, last_slid = turned, slid
         turned, out = faced(new, after, contact, bend, MOST_LEAN)
         square = (new[:, 0].sum() / after[0]) ** 2 + (new[:, 1].sum() / after[1]) ** 2

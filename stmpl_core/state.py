@@ -183,11 +183,13 @@ class State:
         joints: angle of each joint of the skin's rig at which it is told [rad], in whose axes it is; empty: at rest;
             None: nobody said, which only a skin without joints may read.
         skin: number of the shape of the skin that it is of, which is not packed; None: not known.
+        tissue: likewise of its tissue.
     """
 
     tools: Mapping[str, Memory] = field(default_factory=dict)
     joints: tuple[float, ...] | None = ()
     skin: int | None = None
+    tissue: int | None = None
 
     @property
     def finite(self) -> bool:

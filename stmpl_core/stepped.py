@@ -12,7 +12,7 @@ import numpy as np
 from stmpl_core.balance import MUCH, UNSURE, settled, work_of
 from stmpl_core.footing import HELD_OFF, aged, borne, curvature_at, needed, part_of_way, patch_of, wrapped_in
 from stmpl_core.green import give_at
-from stmpl_core.relaxation import depth_left, faded, let_go, stretch
+from stmpl_core.relaxation import depth_left, faded, let_go, shares_aside, stretch
 from stmpl_core.sideways import interpolated
 from stmpl_core.slip import MOST_GROWN, SPRINGS, rub
 from stmpl_core.state import FORGOTTEN, NEVER, Scalars, parts_of, trail_of
@@ -243,7 +243,8 @@ def step(patches, before, after, grooves, shares, times, fades, has_skin, table,
 
     Args:
         patches: rows of PATCH, (K, .).
-        before: what is remembered, (R, .); of tools that are not told of any more, too, from K on.
+        before: what is remembered, (R, .); of tools that are not told of any more, too, from K on: after a time they
+            are gone.
         after: the same, written: what is after the step.
         grooves: whether rows end in a trail.
         shares, times, fades: series of the relaxation, (P,) each, and see relaxation.faded.
@@ -266,7 +267,8 @@ def step(patches, before, after, grooves, shares, times, fades, has_skin, table,
             modulus, slack, dt, out[k], says[k])  # fmt: skip
     for k in range(tools, len(before)):
         _put(before[k], after[k])
-        _left(before[k], after[k], grooves, shares, times, dt)
+        if dt > 0:
+            _left(before[k], after[k], grooves, shares, times, dt)
     for k in range(tools):
         old, new = parts_of(before[k], terms)[2], parts_of(after[k], terms)[2]
         first, work = not old[PRESSING] >= 0 or patches[k, BY_FORCE] > 0, works[k] + old[WORK]
@@ -400,6 +402,7 @@ def _one(patch, before, after, grooves, shares, times, fades, has_skin, table, l
                 pressed_on(trail, shares, times, dt, pose, there[0], there[1], eased, at_rest, depth, power, 1 - long,
                            patch[14], came)  # fmt: skip
             if mu > 0 and net > MIN_ONE_WAY_SHARE:
+                limit_before = old[LIMIT] if held else -1.0
                 bend, give = patch[30:39].copy().reshape(3, 3), patch[21:30].copy().reshape(3, 3)
                 along, turn, bare = interpolated(table, log_thickness, logs, patch[14], patch[16])
                 unit = modulus * patch[14]
@@ -409,8 +412,8 @@ def _one(patch, before, after, grooves, shares, times, fades, has_skin, table, l
                     LOST * patch[19], patch[WRAPPED : WRAPPED + 9].copy().reshape(3, 3), force, patch[15], at_rest,
                     depth, patch[14], patch[16], power, along * unit, turn * unit * patch[14] ** 2, bare * unit,
                     slack * patch[14], twist, old[PRESSING] >= 0, held, contact, old[ELASTIC], slid_before, old[HELD],
-                    old[ROLLED : ROLLED + 3].copy(), passed, springs, springs_relaxed, stiffness, shares, times,
-                    dt)  # fmt: skip
+                    limit_before, old[ROLLED : ROLLED + 3].copy(), passed, springs, springs_relaxed,
+                    stiffness, shares_aside(fades, patch[14], terms), times, dt)  # fmt: skip
                 changed, doubt = grown * changed, grown * doubt
                 drag = rubs[0] ** 2 + rubs[1] ** 2 + rubs[2] ** 2
                 pressing = np.sqrt(wrench[0] ** 2 + wrench[1] ** 2 + wrench[2] ** 2)

@@ -35,6 +35,8 @@ class Stroke(NamedTuple):
         stays: time that the ball stays when it is pressed in [s].
         way: way along the skin after that [m].
         fades: how much more fades under a contact as wide than the series says (relaxation.faded) [-].
+        aside: share of a drag that relaxes in each time of the series (relaxation.shares_aside), (P,) [-]; None: as
+            much as of the force.
     """
 
     force: float
@@ -46,6 +48,7 @@ class Stroke(NamedTuple):
     stays: float = 0.0
     way: float = 0.0
     fades: float = 1.0
+    aside: np.ndarray | None = None
 
 
 class Course(NamedTuple):
@@ -121,7 +124,7 @@ def played(stroke: Stroke, series: Series, friction: float) -> Course:
 def pulled(stroke: Stroke, friction: float, share: float) -> tuple[float, float]:
     """Force of friction over the normal force [-] and way of the skin [m] where a share of that force pulls along."""
     wanted = np.array([share * stroke.force, 0.0, 0.0])
-    nothing = Series(np.empty(0), np.empty(0))
+    nothing, stroke = Series(np.empty(0), np.empty(0)), stroke._replace(aside=None)
     springs, _, carried, _, stiff = _dragged(stroke, nothing, friction, stroke.force, stroke.depth, 0.0, 0.0,
                                              np.zeros((SPRINGS, 3)), np.zeros((0, SPRINGS, 3)), np.zeros(3),
                                              wanted)  # fmt: skip
@@ -160,7 +163,8 @@ def _dragged(stroke: Stroke, series: Series, friction: float, force: float, dept
     stiffer, cap = ploughing(depth, radius, force, along, stroke.patch.bare * size, friction)
     pulled = stroke.patch.secant(friction * force / size) * size
     stiffness = stiffer * np.array([pulled, pulled, turn / (LEVER * radius) ** 2])
-    springs, faded, carried, share, _ = drag(springs, faded, *series, dt, 0.0, stiffness, before, cap,
+    shares = series.shares if stroke.aside is None else stroke.aside
+    springs, faded, carried, share, _ = drag(springs, faded, shares, series.times, dt, 0.0, stiffness, before, cap,
                                              np.array([way, 0.0, 0.0]), np.zeros(3) if wanted is None else wanted,
                                              wanted is not None)  # fmt: skip
     return springs, faded, carried, share, stiffness

@@ -19,7 +19,7 @@ from typing import NamedTuple
 import numba
 import numpy as np
 
-from stmpl_core.columns import grid_of, pushed, shared_pushes
+from stmpl_core.columns import LED_ON, grid_of, pushed, shared_pushes
 from stmpl_core.nodes import FACING
 from stmpl_core.rays import MAX_COLUMN_STRAIN, depth_in_column, distance_in_column, ray_from, wall_in
 from stmpl_core.sdf import distances_and_gradients
@@ -368,13 +368,18 @@ def _sunk(points, inward, depth, sinking, ends, walls, way, gradient, go, turned
         if abs(more) <= depth[n] * 1e-9 or abs(along) < LEAST_COSINE or cosine <= 0:
             continue
         share = min(max((sinking[n] - depth[n]) / more, 0.0), 1.0)  # of what it sinks more than its column says
-        rises = share < 1 and abs(share - depth[n] / walls[n]) < 0.02
+        led = LED_ON * s * cosine  # see columns.LED_ON
+        width = max(walls[n], led)
+        rises = share < 1 and abs(share - depth[n] / width) < 0.02
         for k in range(6):
             rate = _entered(gradient[n], points[n], way, s, go[k, n], still, k, origin) / along
             rate = rate * cosine + s * _dot(turned[k, n], way)
-            out[k, n] += share * (rate - deeper[k, n]) + (more * deeper[k, n] / walls[n] if rises else 0.0)
+            out[k, n] += share * (rate - deeper[k, n])
+            if rises:
+                out[k, n] += more / width * (deeper[k, n] - (share * LED_ON * rate if led > walls[n] else 0.0))
+        felt = share * (1 - (more * LED_ON / width if rises and led > walls[n] else 0.0))
         for x in range(3):
-            swing[n, x] = share * s * (inward[n, x] - cosine / along * gradient[n, x])
+            swing[n, x] = felt * s * (inward[n, x] - cosine / along * gradient[n, x])
     return out, swing
 
 

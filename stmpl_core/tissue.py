@@ -191,6 +191,16 @@ class Tissue:
         return self.lame_lambda + 2 * self.shear_modulus
 
     @property
+    def numbers(self) -> np.ndarray:
+        """All that an answer depends on, in a row; equal for tissues that differ in their sources alone."""
+        of = [*self.deeper, *([self.skin] if self.skin else [])]
+        names = "youngs_modulus", "poisson_ratio", "depth", "thickness", "tension"
+        rows = [[getattr(one, name, 0.0) for name in names] for one in (self, *of)]
+        fades = [number for one in (self, *of) if one.relaxation
+                 for number in (*one.relaxation.shares, *one.relaxation.times, -1.0)]  # fmt: skip
+        return np.array([*np.ravel(rows), *fades])
+
+    @property
     def single(self) -> bool:
         """Whether it is one material without a skin."""
         return self.skin is None and not self.deeper

@@ -97,6 +97,8 @@ class RosWorld:
         """What keeps an instant from being whole, for people."""
         if unheard := [name for name in (self.body, *self.tools) if name not in self.links]:
             return f"poses come, but none of {', '.join(unheard)}: no wrench is sent"
+        if not any(link.stamp for link in self.links.values()):
+            return "poses come, but without a stamp (time 0): no wrench is sent. Their sender must say when they hold"
         newest = ", ".join(f"{name} {link.stamp / NANO:.6f} s" for name, link in self.links.items())
         return f"poses come, but not with one stamp: no wrench is sent. The newest are of {newest}"
 
@@ -172,7 +174,11 @@ class LinkNode(Node):
                 if self._last is not None and stamp < self._last:  # the simulator was reset
                     self.memory, self._last = Memory(), None
                 dt = 0.0 if self._last is None else (stamp - self._last) / NANO
-                self.memory = exchange(self.contact, self.world, self.memory, dt).memory
+                reaction = exchange(self.contact, self.world, self.memory, dt)
+                self.memory = reaction.memory
+                for touch in reaction.touches.values():
+                    if touch.presses and touch.trust.in_range is False:
+                        self.gate.say(f"trust of {touch.name}", f"not to be relied upon: {touch.trust.why}")
                 self._last, self._heard, self._idle = stamp, now, False
         except StmplError as error:
             self.gate.refuse(f"pose of {name}", str(error))

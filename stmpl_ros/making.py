@@ -31,6 +31,7 @@ ON_STACKS = ("moment_net", "limb_linear", "ladder")  # methods that know skin, f
 MOVED = ("moment_net", "linear", "limb_linear", "winkler", "naive", "zero")  # methods that go along with joints
 AT_ONCE = {"friction"}  # settings that the skin does not know of
 QUICK = {"moment_net", "winkler", "naive"}  # methods that such a change costs no preparation
+TIP = 0.01  # size of the tool that warms up, from its middle to its corners [m]
 WARM_BEND = 0.1  # angle of each joint at which a bent skin is warmed up [rad]
 
 
@@ -154,15 +155,20 @@ def warm_up(simulator: Simulator, until_compiled: Callable[[], None] = lambda: N
     """
     frictions = every, some = simulator.history.frictions
     simulator.history.frictions = max(every, *some.values(), 0.0), {}
-    corners = 0.01 * np.array([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1]])
-    faces = np.array([[0, 2, 4], [2, 1, 4], [1, 3, 4], [3, 0, 4], [2, 0, 5], [1, 2, 5], [3, 1, 5], [0, 3, 5]])
-    tool, rig, state = Tool("warm up", corners, faces), simulator.layer.rig, State()
+    tool, rig, state = tip(), simulator.layer.rig, State()
     for angles in ([WARM_BEND] * len(rig.joints), ()) if rig else ((),):
         if rig:
             state = simulator.move_to(simulator.skin.at_angles(angles), state)
         state = _press(simulator, tool, state, until_compiled)
     simulator.tools.remove(tool.name)
     simulator.history.frictions = frictions
+
+
+def tip() -> Tool:
+    """A tool to warm up with: an octahedron whose corners are TIP from its middle."""
+    corners = TIP * np.array([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1]])
+    faces = np.array([[0, 2, 4], [2, 1, 4], [1, 3, 4], [3, 0, 4], [2, 0, 5], [1, 2, 5], [3, 1, 5], [0, 3, 5]])
+    return Tool("warm up", corners, faces)
 
 
 def _press(simulator: Simulator, tool: Tool, state: State, until_compiled: Callable[[], None]) -> State:

@@ -156,6 +156,8 @@ class Models:
     def put(self, instant: Instant, touches: Touches, before: Before, doubts: Mapping[str, str]) -> None:
         """Takes the newest instant, its touches, what they were made from, and why each tool's is out of range."""
         self._next = instant, touches, before, doubts
+        if any(self._heard(one.name) for one in instant.contacts):
+            self._workshop.expect_models()
         self._tell()
 
     def forget(self) -> None:

@@ -23,6 +23,7 @@ from stmpl_core.strokes import Fading, Rubbing, fit_friction, fit_relaxation
 from stmpl_core.tool import Tool
 from stmpl_core.toucher import Toucher, margin_on
 from stmpl_ros.beside import YIELDS, Builders
+from stmpl_ros.making import TIP, tip
 from stmpl_ros.remembering import Before
 
 MAX_FITTED_INSTANTS = 500  # instants of a stroke or a press that stays, evenly over it; each takes a touch
@@ -71,6 +72,10 @@ class Workshop:
         found = self._begun(lambda: self._modeller().submit(_local_contacts, *asked))
         knows = self._knows
         self._then(found, do, lambda: knows is self._knows)
+
+    def expect_models(self) -> None:
+        """Starts the process that finds them, unless it is there: it takes seconds, and somebody listens already."""
+        self._modeller()
 
     def stiffness(self, presses: Sequence[Contact]) -> Future[Stiffness]:
         """Fits the skin's stiffness to these presses: for a thread that waits."""
@@ -153,6 +158,11 @@ def _know(layer: SoftLayer, friction: Friction | Mapping[str, Friction]) -> None
     _history = History(Toucher(layer), friction)
     if layer.rig is not None:
         _skin = Skin.of(layer, Zero())
+    tool, pose = tip(), np.eye(4)
+    vertex = int(np.linalg.norm(layer.vertices - layer.vertices.mean(axis=0), axis=1).argmin())
+    pose[:3, 3] = layer.vertices[vertex] + 0.9 * TIP * layer.normals[vertex]
+    _local_contacts([Contact(tool, pose)], State(), 0.01)  # what is compiled is loaded before somebody waits
+    _history.toucher.tools.remove(tool.name)
 
 
 def _local_contacts(contacts: list[Contact], state: State | None, dt: float,

@@ -14,6 +14,7 @@ LEANS = 1.0  # angle off straight down from which it is said [degrees]
 AT_LIMIT = 0.01  # of a joint's range, within which it is at a limit
 MOST_AT_LIMIT = 0.5  # part of a run at one, from which it is said
 MOST_NAMED = 4  # pairs of links that are named
+PULLED = 1e-3  # violation of an equality constraint from which it is said [m, rad]
 log = logging.getLogger(__name__)
 
 
@@ -40,6 +41,12 @@ def start_notes(model: Any, joints: tuple[int, ...], qpos: np.ndarray, tool: str
         named = ", ".join([*pairs][:MOST_NAMED]) + (", ..." if len(pairs) > MOST_NAMED else "")
         found.append(f"links touch each other at the start ({named}), which pushes the tool off its course; set "
                      "contype and conaffinity of these geoms to 0")  # fmt: skip
+    pulled = dict.fromkeys(model.equality(int(data.efc_id[row])).name or f"number {data.efc_id[row]}"
+                           for row in range(data.nefc) if data.efc_type[row] == mujoco.mjtConstraint.mjCNSTR_EQUALITY
+                           and abs(data.efc_pos[row]) > PULLED)  # fmt: skip
+    if pulled:
+        found.append(f"equality constraints of the file do not hold at the start ({', '.join([*pulled][:MOST_NAMED])}) "
+                     "and pull on what they join; delete them, or let them hold there")  # fmt: skip
     for note in found:
         log.warning("%s.", note)
     return tuple(found)
@@ -83,10 +90,16 @@ def strength(model: Any, joints: tuple[int, ...], qpos: np.ndarray, tool: str) -
     most, weakest = np.inf, ""
     for joint in joints:
         dof = model.jnt_dofadr[joint]
-        if not model.jnt_actfrclimited[joint] or abs(arm := -jacobian[2, dof]) < 1e-6:
+        if not model.jnt_actfrclimited[joint]:
             continue
-        limit = model.jnt_actfrcrange[joint][int(arm > 0)]
-        force = max(0.0, float(limit - data.qfrc_bias[dof] + data.qfrc_passive[dof]) / arm)
+        (low, high), arm = model.jnt_actfrcrange[joint], -jacobian[2, dof]
+        holds = data.qfrc_bias[dof] - data.qfrc_passive[dof]
+        if not low <= holds <= high:  # not even itself
+            force = 0.0
+        elif abs(arm) < 1e-6:
+            continue
+        else:
+            force = float((high if arm > 0 else low) - holds) / arm
         if force < most:
             most, weakest = force, model.joint(joint).name
     return most, weakest

@@ -103,6 +103,7 @@ class ForceImpedance:
         self._body = int(model.geom_bodyid[self._tool])
         self._dofs = np.array([model.jnt_dofadr[j] for j in joints])
         self._places = np.array([model.jnt_qposadr[j] for j in joints])
+        self._carried = model.jnt_actgravcomp[list(joints)].astype(float)  # where MuJoCo adds to a motor's torque
         motors = {int(model.actuator_trnid[a, 0]): a for a in range(model.nu)
                   if model.actuator_trntype[a] == mujoco.mjtTrn.mjTRN_JOINT}  # fmt: skip
         self._motors = np.array([motors[j] for j in joints])
@@ -128,10 +129,11 @@ class ForceImpedance:
         mujoco.mj_jac(model, data, self._jacobian[:3], self._jacobian[3:], x, self._body)
         mujoco.mj_jacDot(model, data, self._rate[:3], self._rate[3:], x, self._body)
         mujoco.mj_fullM(model, data, self._mass)
+        known = data.qfrc_bias[dofs] - data.qfrc_passive[dofs] - self._carried * data.qfrc_gravcomp[dofs]
         return _torques(
             self._jacobian, self._rate, self._mass, dofs, data.qvel[dofs], self._rest - data.qpos[self._places],
-            data.qfrc_bias[dofs] - data.qfrc_passive[dofs], goal.point - x, data.geom_xmat[self._tool, 2::3].copy(),
-            goal.velocity, goal.acceleration, goal.normal, goal.spin, goal.swing,
+            known, goal.point - x, data.geom_xmat[self._tool, 2::3].copy(), goal.velocity, goal.acceleration,
+            goal.normal, goal.spin, goal.swing,
             np.nan if goal.force is None else float(goal.force), float(goal.growth), float(goal.height), goal.closed,
             wrench, stiffness, dt, (g.along, g.turn, g.ratio, g.into, g.force, g.integral, g.posture),
             self._felt)  # fmt: skip

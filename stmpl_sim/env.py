@@ -266,6 +266,10 @@ class Scripted:
         for name, value in {"proportional": proportional, "integral": integral, "along": along}.items():
             check_number(name, value)
         self.proportional, self.integral, self.along = proportional, integral, along
+        self.reset()
+
+    def reset(self) -> None:
+        """Forgets what was: an episode begins."""
         self.sum, self.beside = 0.0, np.zeros(2)
 
     def act(self, observation: np.ndarray) -> np.ndarray:

@@ -263,6 +263,9 @@ class Massage:
         friction: see SoftContact.
         every: see SoftContact.
 
+    Attributes:
+        log: what the last run did, also where it was stopped before its end; None before two steps.
+
     Raises:
         InvalidInput: a force that the arm's motors do not press with.
     """
@@ -284,6 +287,7 @@ class Massage:
         self.gripper = Gripper(scene.model, course.grip) if self.fingers else None
         self.data = mujoco.MjData(scene.model)
         self.controller = ForceImpedance(scene.model, scene.joints, BALL, scene.qpos, gains)
+        self.log: Log | None = None
         self.reset()
 
     def reset(self) -> None:
@@ -356,44 +360,50 @@ class Massage:
             InvalidInput: a simulation that diverged.
         """
         self.reset()
+        self.log = None
         radius, dt = self.scene.radius, float(self.scene.model.opt.timestep)
         rows: list[tuple[Any, ...]] = []
         left = ""  # why the first touch that was out of range was
         book, books = EnergyBook(), [EnergyBook() for _ in self.fingers]
-        for k in range(round(self.course.duration / dt)):
-            at, begun, busy = k * dt, time.perf_counter(), time.thread_time()
-            if self.gripper:
-                phase = self.course.phase(at)
-                self.gripper.command(self.data, phase.name, (at - phase.start) / phase.duration)
-            aim, took = self.step(lambda limb, at=at: self.course.goal(at, limb, radius))
-            if any(self.data.warning[kind].number for kind in DIVERGED):
-                raise InvalidInput(f"the simulation diverged at {at:.3f} s. Try a higher rate; if that does not help, "
-                                   "check the masses of the robot's links.")  # fmt: skip
-            spent, busy = time.perf_counter() - begun, time.thread_time() - busy
-            reaction = self.skin.reaction
-            assert reaction is not None
-            touch, wrench = reaction.touches[BALL], reaction.tools[BALL]
-            limb, held = self.limb_pose(), reaction.memory.at
-            energy = book.add(held[BALL], _in_layer(wrench, limb))
-            worked = [one.add(held[name], _in_layer(reaction.tools[name], limb))
-                      for name, one in zip(self.fingers, books, strict=True)]  # fmt: skip
-            off = self.data.geom(BALL).xpos - aim.point
-            along = off - (off @ aim.normal) * aim.normal
-            rows.append((at, wrench[:3] @ aim.normal, np.nan if aim.force is None else aim.force,
-                         touch.depth if touch.presses else np.nan, wrench, self.skin.poses(self.data).tools[BALL],
-                         limb, self.data.qpos.copy(), energy, np.linalg.norm(along),
-                         touch.trust.in_range is not False,
-                         np.array([reaction.tools[name] for name in self.fingers]).reshape(-1, 6),
-                         np.array([reaction.touches[name].force for name in self.fingers]),
-                         np.array([held[name] for name in self.fingers]).reshape(-1, 4, 4), sum(worked),
-                         took, spent, busy))  # fmt: skip
-            if not left and touch.trust.in_range is False:
-                left = f"{touch.name} was out of range from {at:.2f} s on, first as {touch.trust.why}"
-            for see in seen:
-                see(self, at)
-        log = Log(*(np.array(column) for column in zip(*rows, strict=True)), phases=self.course.phases)
-        stuck = stuck_joints(self.scene.model, self.scene.joints, log.qpos)
-        return replace(log, notes=(*self.scene.notes, *stuck, *([left] if left else [])))
+        try:
+            for k in range(round(self.course.duration / dt)):
+                at, begun, busy = k * dt, time.perf_counter(), time.thread_time()
+                if self.gripper:
+                    phase = self.course.phase(at)
+                    self.gripper.command(self.data, phase.name, (at - phase.start) / phase.duration)
+                aim, took = self.step(lambda limb, at=at: self.course.goal(at, limb, radius))
+                if any(self.data.warning[kind].number for kind in DIVERGED):
+                    raise InvalidInput(f"the simulation diverged at {at:.3f} s. Try a higher rate; if that does not "
+                                       "help, check the masses of the robot's links.")  # fmt: skip
+                spent, busy = time.perf_counter() - begun, time.thread_time() - busy
+                reaction = self.skin.reaction
+                assert reaction is not None
+                touch, wrench = reaction.touches[BALL], reaction.tools[BALL]
+                limb, held = self.limb_pose(), reaction.memory.at
+                energy = book.add(held[BALL], _in_layer(wrench, limb))
+                worked = [one.add(held[name], _in_layer(reaction.tools[name], limb))
+                          for name, one in zip(self.fingers, books, strict=True)]  # fmt: skip
+                off = self.data.geom(BALL).xpos - aim.point
+                along = off - (off @ aim.normal) * aim.normal
+                rows.append((at, wrench[:3] @ aim.normal, np.nan if aim.force is None else aim.force,
+                             touch.depth if touch.presses else np.nan, wrench, self.skin.poses(self.data).tools[BALL],
+                             limb, self.data.qpos.copy(), energy, np.linalg.norm(along),
+                             touch.trust.in_range is not False,
+                             np.array([reaction.tools[name] for name in self.fingers]).reshape(-1, 6),
+                             np.array([reaction.touches[name].force for name in self.fingers]),
+                             np.array([held[name] for name in self.fingers]).reshape(-1, 4, 4), sum(worked),
+                             took, spent, busy))  # fmt: skip
+                if not left and touch.trust.in_range is False:
+                    left = f"{touch.name} was out of range from {at:.2f} s on, first as {touch.trust.why}"
+                for see in seen:
+                    see(self, at)
+        finally:
+            if len(rows) > 1:
+                log = Log(*(np.array(column) for column in zip(*rows, strict=True)), phases=self.course.phases)
+                stuck = stuck_joints(self.scene.model, self.scene.joints, log.qpos)
+                self.log = replace(log, notes=(*self.scene.notes, *stuck, *([left] if left else [])))
+        assert self.log is not None
+        return self.log
 
 
 def _in_layer(wrench: np.ndarray, limb: np.ndarray) -> np.ndarray:

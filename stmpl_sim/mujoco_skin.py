@@ -29,6 +29,9 @@ from stmpl_sim.protocol import Exerted, Memory, Poses, Reaction, Row, SoftContac
 
 MOST_NAMES = 30  # names of a model that an error lists
 KNOWN = 10_000  # rows of xfrc_applied that are known again
+SAME = 1e-9  # difference of sums of wrenches, over the largest number, that is rounding
+NO_RK4 = ("the model's integrator is RK4, to which forces that are held over a step add energy. Choose implicitfast, "
+          "implicit or Euler.")  # fmt: skip
 
 
 class _Source(NamedTuple):
@@ -59,7 +62,8 @@ class SoftBody:
         layer: soft layer at rest, or a Skin, or a Simulator that is ready.
         body: name of the body that carries the skin.
         tools: names of geoms or bodies that may touch: sphere, capsule, ellipsoid, cylinder, box or mesh. A geom's tool
-            has the geom's frame; a body's has the body's, and the union of its colliding geoms (all, if none collides).
+            has the geom's frame; a body's has the body's, and the union of the colliding geoms (all, if none collides)
+            of it and of bodies that are welded to it from below.
         method: method that finds the displacement; MomentNet() unless given.
         pose_body_from_layer: pose of the layer's axes in the body's frame, (4, 4); the same frame unless given.
         damping: see SoftContact [s/m].
@@ -104,9 +108,9 @@ class SoftBody:
             raise InvalidInput(f"tools is the text '{tools}'; give a list of names: ['{tools}'].")
         if not isinstance(tools, Iterable):
             raise InvalidInput(f"tools is {tools!r:.40}; give a list of names of geoms or bodies.")
+        tools = list(tools)
         if model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4:
-            raise InvalidInput("the model's integrator is RK4, to which forces that are held over a step add energy. "
-                               "Choose implicitfast, implicit or Euler.")  # fmt: skip
+            raise InvalidInput(NO_RK4)
         self._sources = {name: _source(model, name) for name in tools}
         self._jointed = Jointed(model, _rig_of(layer), joints, self.body) if joints else None
         limbs = {self.body} if self._jointed is None else set(self._jointed.bodies)
@@ -180,9 +184,11 @@ class SoftBody:
             Touch of each tool, by name, in layer axes.
 
         Raises:
-            InvalidInput: data of another model, or positions that are not finite.
+            InvalidInput: data of another model, positions that are not finite, or RK4, chosen since.
         """
         self._check(data)
+        if self.model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4:
+            raise InvalidInput(NO_RK4)
         mujoco.mj_kinematics(self.model, data)
         if self._jacobians is not None:  # what mj_jac and mj_solveM read
             for update in (mujoco.mj_comPos, mujoco.mj_tendon, mujoco.mj_makeM, mujoco.mj_factorM):
@@ -365,8 +371,12 @@ class _Ledger:
     def know(self, owner: str, exerted: Exerted) -> None:
         """Knows the rows of a memory, in which what was its skin's is now this skin's."""
         for body, (numbers, others, ours) in exerted.rows.items():
-            known = self._known.get((body, numbers.tobytes()))
-            skins = {} if known is None else {key: each for key, each in known.skins.items() if key != exerted.owner}
+            known, left = self._known.get((body, numbers.tobytes())), numbers - others - ours
+            skins = {} if known is None else {key: each for key, each in known.skins.items()
+                                              if key not in (owner, exerted.owner)}  # fmt: skip
+            for key in [key for key, each in skins.items() if (each == ours).all()]:
+                if np.abs(sum(skins.values(), np.zeros(6)) - left).max() > SAME * np.abs(numbers).max():
+                    del skins[key]  # another that was given this memory
             self._put[body] = numbers, _Shares(others, skins | {owner: ours})
             self._remember(body, *self._put[body])
 
@@ -476,9 +486,16 @@ def _source(model: Any, name: str) -> _Source:
 def _geoms_of(model: Any, source: _Source) -> list[int]:
     if source.geom is not None:
         return [source.geom]
-    own = [geom for geom in range(model.ngeom) if model.geom_bodyid[geom] == source.body]
+    own = [geom for geom in range(model.ngeom) if _hangs_on(model, int(model.geom_bodyid[geom]), source.body)]
     hard = [geom for geom in own if model.geom_contype[geom] or model.geom_conaffinity[geom]]
     return hard or own
+
+
+def _hangs_on(model: Any, body: int, other: int) -> bool:
+    """Whether a body is another, or welded to it from below."""
+    while body != other and body != 0 and model.body_jntnum[body] == 0 and model.body_mocapid[body] < 0:
+        body = int(model.body_parentid[body])
+    return body == other
 
 
 def _tool(model: Any, name: str, source: _Source) -> Tool:
@@ -487,7 +504,8 @@ def _tool(model: Any, name: str, source: _Source) -> Tool:
     geoms = _geoms_of(model, source)
     if not geoms:
         raise InvalidInput(f"body '{name}' has no geom that could touch.")
-    return Tool(name, *(body_surface(model, geoms) if source.geom is None else geom_surface(model, source.geom)))
+    return Tool(name, *(geom_surface(model, source.geom) if source.geom is not None
+                        else body_surface(model, geoms, source.body)))  # fmt: skip
 
 
 def _is_welded(model: Any, body: int, limb: int) -> bool:
@@ -516,17 +534,17 @@ def _check_no_rigid_contact(model: Any, body: int, source: _Source) -> None:
     signatures = {int(s) for s in model.exclude_signature}
     for tool in _geoms_of(model, source):
         for limb in range(model.ngeom):
-            owner = int(model.geom_bodyid[limb])
+            owner, whose = int(model.geom_bodyid[limb]), int(model.geom_bodyid[tool])
             if not _is_welded(model, owner, body):
                 continue
-            first, second = sorted((source.body, owner))
-            meet = not _filtered(model, source.body, owner) and (
+            first, second = sorted((whose, owner))
+            meet = not _filtered(model, whose, owner) and (
                 model.geom_contype[tool] & model.geom_conaffinity[limb]
                 or model.geom_contype[limb] & model.geom_conaffinity[tool])  # fmt: skip
             paired = any({int(model.pair_geom1[p]), int(model.pair_geom2[p])} == {tool, limb}
                          for p in range(model.npair))  # fmt: skip
             if paired or (meet and (first << 16) + second not in signatures):
-                a, b = model.body(owner).name, model.body(source.body).name
+                a, b = model.body(owner).name, model.body(whose).name
                 raise InvalidInput(
                     f"geom '{model.geom(tool).name or tool}' of '{b}' also collides rigidly with geom "
                     f"'{model.geom(limb).name or limb}' of '{a}'. Let only the skin touch: add <exclude body1=\"{a}\" "

@@ -205,6 +205,7 @@ class SoftContact:
     ) -> None:
         if isinstance(tools, str) or not isinstance(tools, Iterable):
             raise InvalidInput(f"tools is {tools!r:.40}; a list of Tools is needed.")
+        tools = list(tools)
         for one in tools:
             check_kind("a tool", one, Tool)
         check_kind("layer", layer, (SoftLayer, Skin, Simulator))
@@ -277,7 +278,11 @@ class SoftContact:
         missing = [name for name in self.tools if name not in poses.tools]
         if missing:
             raise InvalidInput(f"there is no pose of {', '.join(missing)}; given: {', '.join(poses.tools) or 'none'}.")
-        at = {name: layer_from_world @ sound_pose(name, poses.tools[name]) for name in self.tools}
+        stand = {name: sound_pose(name, poses.tools[name]) for name in self.tools}
+        at = {name: layer_from_world @ pose for name, pose in stand.items()}
+        if memory.asked is not None and memory.asked.touches.keys() != self.tools.keys():
+            raise InvalidInput(f"the memory is of a contact with {', '.join(memory.asked.touches)}; this one has "
+                               f"{', '.join(self.tools)}. Start with an empty Memory().")  # fmt: skip
 
         # Touch: to first order from the last step that asked, or asked.
         touches, now = self._between(at, memory, dt) or self._ask(at, memory, dt)
@@ -298,7 +303,7 @@ class SoftContact:
             torque = torque + cross(touch.pose_body_from_tool[:3, 3] - at[name][:3, 3], force)
             force, torque = turn @ force, turn @ torque
             wrenches[name] = -np.concatenate([force, torque])
-            lever = poses.tools[name][:3, 3] - body[:3, 3]
+            lever = stand[name][:3, 3] - body[:3, 3]
             on_body += np.concatenate([force, torque + cross(lever, force)])
         return Reaction(wrenches, on_body, touches, replace(now, speed=speed))
 

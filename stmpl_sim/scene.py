@@ -31,6 +31,10 @@ AIM = np.array([-0.03, 0.0, 0.045])  # point that it looks at, from the site [m]
 COLOURS = 256  # texels of the skin's colour scale
 ELBOW_DAMPING = 0.05  # of the hinge of a limb on a rest [N m s/rad]
 ROOM = 0.08  # distance of a start's joints from their limits, over their ranges, beyond which no other start is tried
+NEEDED = "mjDSBL_ACTUATION", "mjDSBL_LIMIT", "mjDSBL_PASSIVE", "mjDSBL_SPRING", "mjDSBL_DAMPER"  # by motors and limb
+FINITE = ("qpos0", "body_pos", "body_quat", "body_mass", "body_inertia", "body_ipos", "jnt_pos", "jnt_axis",
+          "jnt_range", "jnt_stiffness", "dof_damping", "dof_armature", "dof_frictionloss", "geom_pos",
+          "geom_size")  # fmt: skip
 LONGEST_STEP = 0.02  # largest timestep [s]: ten times what the arm's control wants
 LONGEST = 10.0  # length of a robot's links beyond which its file is taken to be in millimetres [m]
 STARTS, STEPS = 40, 200  # starts that are tried at most, and steps from each
@@ -134,10 +138,20 @@ def build(
     exclude(spec, LIMB, tools)
     spec.option.timestep = timestep
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    spec.option.disableactuator = 0
+    for flag in NEEDED:
+        spec.option.disableflags &= ~int(getattr(mujoco.mjtDisableBit, flag, 0))
     model = _compiled(spec, "the scene")
+    for name in FINITE:
+        if not np.isfinite(getattr(model, name)).all():
+            raise InvalidInput(f"the robot's file has numbers that are not finite: MuJoCo's {name} of it.")
     joints = tuple(model.joint(joint.name).id for joint in chain)
     qpos = _reach(model, joints, where, radius + above)
-    return Scene(model, layer, site, joints, qpos, radius, tools, start_notes(model, joints, qpos, BALL))
+    _still(model, joints, qpos)
+    notes = start_notes(model, joints, qpos, BALL)
+    if (long := _length(model)) > LONGEST:
+        notes += (f"the robot's links are {long:.3g} m long in all; is its file in millimetres?",)
+    return Scene(model, layer, site, joints, qpos, radius, tools, notes)
 
 
 def check_robot(robot: Path | None, end: str | None) -> None:
@@ -211,6 +225,28 @@ def _drive(spec: Any, chain: list[Any]) -> None:
         motor.set_to_motor()  # the robot's defaults are its servos'
         motor.gear = [1, 0, 0, 0, 0, 0]
         motor.ctrllimited = motor.forcelimited = mujoco.mjtLimited.mjLIMITED_FALSE
+
+
+def _still(model: Any, joints: tuple[int, ...], qpos: np.ndarray) -> None:
+    """Switches off what else of the robot's file drives these joints: by a tendon, a site, a body."""
+    ours = {model.actuator(f"torque_{model.joint(joint).name}").id for joint in joints}
+    data, dofs = mujoco.MjData(model), model.jnt_dofadr[list(joints)]
+    data.qpos[:] = qpos
+    mujoco.mj_forward(model, data)
+    moment = np.zeros((model.nu, model.nv))
+    mujoco.mju_sparse2dense(moment, data.actuator_moment, data.moment_rownnz, data.moment_rowadr, data.moment_colind)
+    for k in range(model.nu):
+        if k not in ours and moment[k, dofs].any():
+            model.actuator_gaintype[k], model.actuator_gainprm[k] = mujoco.mjtGain.mjGAIN_FIXED, 0.0
+            model.actuator_biastype[k] = mujoco.mjtBias.mjBIAS_NONE
+
+
+def _length(model: Any) -> float:
+    """Length of the links from the base to the ball, in all [m]."""
+    body, long = model.geom_bodyid[model.geom(BALL).id], 0.0
+    while body:
+        long, body = long + float(np.linalg.norm(model.body_pos[body])), model.body_parentid[body]
+    return long
 
 
 def _compiled(spec: Any, what: str) -> Any:
@@ -356,9 +392,7 @@ def _reach(model: Any, joints: tuple[int, ...], at: np.ndarray, height: float) -
     least = min((one.lean for one in placed), default=np.inf)
     if least <= most:
         return max((one for one in placed if one.lean <= least + ALIKE), key=lambda one: one.room).qpos
-    body, long = model.geom_bodyid[model.geom(BALL).id], 0.0
-    while body:
-        long, body = long + float(np.linalg.norm(model.body_pos[body])), model.body_parentid[body]
+    long = _length(model)
     what = ("Is its file in millimetres? MuJoCo takes metres." if long > LONGEST else
             "Put the limb elsewhere (--at X Y Z), or name another end (--end).")  # fmt: skip
     best = f" (at best {np.rad2deg(least):.3g} degrees off)" if placed else ""

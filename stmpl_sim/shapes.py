@@ -64,20 +64,28 @@ def _mesh_surface(model: Any, mesh: int) -> Surface:
     return Surface(model.mesh_vert[first : first + count].astype(float), model.mesh_face[at : at + faces].copy())
 
 
-def body_surface(model: Any, geoms: list[int]) -> Surface:
-    """Surface of several geoms of one body together, in the body's frame: of their union, without inner walls."""
+def body_surface(model: Any, geoms: list[int], body: int) -> Surface:
+    """Surface of several geoms of one body together, and of bodies welded to it from below, in the body's frame: of
+    their union, without inner walls."""
     parts = []
     for geom in geoms:
-        surface, pose = geom_surface(model, geom), geom_in_body(model, geom)
+        surface, pose, on = geom_surface(model, geom), geom_in_body(model, geom), int(model.geom_bodyid[geom])
+        while on != body:
+            pose, on = _placed(model.body_pos[on], model.body_quat[on]) @ pose, int(model.body_parentid[on])
         parts.append(Surface(surface.vertices @ pose[:3, :3].T + pose[:3, 3], surface.faces))
     return parts[0] if len(parts) == 1 else _union(parts)
 
 
 def geom_in_body(model: Any, geom: int) -> Transform:
     """pose_body_from_geom, (4, 4)."""
+    return _placed(model.geom_pos[geom], model.geom_quat[geom])
+
+
+def _placed(position: np.ndarray, quaternion: np.ndarray) -> Transform:
+    """Pose of a position (3,) [m] and a quaternion (4,), scalar first, (4, 4)."""
     turn, pose = np.empty(9), np.eye(4)
-    mujoco.mju_quat2Mat(turn, model.geom_quat[geom])
-    pose[:3, :3], pose[:3, 3] = turn.reshape(3, 3), model.geom_pos[geom]
+    mujoco.mju_quat2Mat(turn, quaternion)
+    pose[:3, :3], pose[:3, 3] = turn.reshape(3, 3), position
     return pose
 
 

@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 FILM_RATE = 20.0  # frames a second
 LEAST_MM = 0.5  # least radius and speed of the verb [mm, mm/s]: what is told in metres is smaller
 LARGEST_OFF_N = 0.2  # difference of the mean force of a phase from what was asked for that is told
+MOST_GRIP_OFF = 0.1  # difference of the grip of the fingers from what was asked for, over it, that is told
 LARGEST_OFF_M = 1e-3  # distance off the course that is told
 SINGLE_MODULUS = 20e3  # Young's modulus of the limb of one material [Pa]
 ros_arguments: list[str] = []  # arguments of ROS, from --ros-args on; this verb has no use for them
@@ -105,7 +106,13 @@ def sim(
     massage = Massage(scene, course, damping=damping, friction=friction_from(friction), every=every)
     massage.warm_up()
     shots: list[Any] | None = None if film == "none" else []
-    log = _run(massage, shots, quiet=as_json)
+    try:
+        log = _run(massage, shots, quiet=as_json)
+    except KeyboardInterrupt:
+        if massage.log is not None:
+            print_figures(f"stopped at {massage.log.time[-1]:.1f} of {course.duration:.1f} s; the log so far: "
+                          f"{massage.log.save(out / 'log.npz')}")  # fmt: skip
+        raise
     log.save(out / "log.npz")
     figures = figures_of(log) | {"log": str(out / "log.npz"), "every": every}
     if shots is not None:
@@ -203,7 +210,7 @@ def figures_of(log: Log) -> dict[str, Any]:
         "real_time_factor_of_processor_time": log.own_core_factor,
         "touch_s": float(np.median(log.touch_s)),
         "step_s": float(np.median(log.step_s)),
-        "notes": [*force_missed(log), *course_left(log), *log.notes],
+        "notes": [*force_missed(log), *grip_missed(log), *course_left(log), *log.notes],
     }
 
 
@@ -220,6 +227,12 @@ def force_missed(log: Log) -> Iterator[str]:
         mean = float(log.force[rows].mean())
         if abs(mean - phase.force) > LARGEST_OFF_N:
             yield f"the robot kept {mean:.2f} N of {phase.force:g} N during '{phase.name}'"
+
+
+def grip_missed(log: Log) -> Iterator[str]:
+    """Whether the fingers did not grip as they were to, one sentence."""
+    if (grip := gripped(log)) and abs(grip["mean_N"] - grip["asked_N"]) > MOST_GRIP_OFF * grip["asked_N"]:
+        yield f"the fingers gripped with {grip['mean_N']:.2f} N of {grip['asked_N']:g} N each"
 
 
 def course_left(log: Log) -> Iterator[str]:

@@ -425,7 +425,7 @@ def test_a_mesh_and_a_body_of_several_geoms_are_tools(slab: SoftLayer) -> None:
         '<body name="hammer" pos="0 0 .05"><freejoint/><geom type="mesh" mesh="brick" pos="0 0 -.02" mass=".1"/>'
         '<geom type="sphere" size=".012" pos="0 0 -.02" mass=".1"/></body></worldbody>'
         '<contact><exclude body1="slab" body2="hammer"/></contact></mujoco>')  # fmt: skip
-    union = trimesh.Trimesh(*body_surface(m, [1, 2]))
+    union = trimesh.Trimesh(*body_surface(m, [1, 2], 2))
     sphere, brick = 4 / 3 * np.pi * 0.012**3, 0.02 * 0.03 * 0.04
     assert union.is_watertight
     assert union.volume == pytest.approx(brick + 7 / 8 * sphere, rel=2e-3)  # an eighth of the ball is in the brick
@@ -513,6 +513,49 @@ def test_a_state_that_is_put_back_late_or_elsewhere_with_its_memories_keeps_no_w
     d.qpos[2] += 1.0  # away from the skin
     walked(m, d, skins, 1)
     np.testing.assert_allclose(d.xfrc_applied[1:3], [[0] * 6, [3, 0.2, 0, 0, 0, 0]], atol=1e-12)
+
+
+def test_a_memory_that_others_were_given_too_leaves_no_wrench_of_theirs(simulator: Simulator) -> None:
+    """As a planner does, whose workers begin where another is, and which then goes on itself."""
+    m, whole = model(), mujoco.mjtState.mjSTATE_INTEGRATION
+    d, first = mujoco.MjData(m), SoftBody(m, simulator, body="slab", tools=["ball"])
+    d.qvel[:3] = 0.02, 0.0, -0.02
+    for _ in range(30):
+        step(m, d, first)
+    state, memory = np.empty(mujoco.mj_stateSize(m, whole)), first.memory
+    mujoco.mj_getState(m, d, state, whole)
+    assert first.reaction is not None and first.reaction.tools["ball"][2] > 0.01
+    others = [SoftBody(m, simulator, body="slab", tools=["ball"]) for _ in range(2)]
+    went = []
+    for skin, data in ((others[0], mujoco.MjData(m)), (others[1], mujoco.MjData(m)), (first, d)):
+        mujoco.mj_setState(m, data, state, whole)
+        skin.memory = memory
+        for _ in range(20):
+            step(m, data, skin)
+        assert skin.reaction is not None
+        np.testing.assert_allclose(data.xfrc_applied[2, :3], skin.reaction.tools["ball"][:3], rtol=1e-9, atol=1e-12)
+        went.append(data.qpos.copy())
+    np.testing.assert_array_equal(went, went[:1] * 3)
+
+
+def test_a_body_that_is_a_tool_has_what_is_welded_to_it(slab: SoftLayer) -> None:
+    m = mujoco.MjModel.from_xml_string(
+        f'<mujoco><worldbody><body name="slab">{CORE}</body><body name="hand" pos="0 0 .1"><freejoint/>'
+        '<geom size=".01" mass=".1" contype="0" conaffinity="0"/><body pos="0 0 -.05" euler="0 90 0"><body name="tip" '
+        'pos=".02 0 0"><geom size=".012" mass=".1" contype="0" conaffinity="0"/></body></body></body></worldbody>'
+        '</mujoco>')  # fmt: skip
+    skin, d = SoftBody(m, slab, body="slab", tools=["hand"], method=Winkler()), mujoco.MjData(m)
+    d.qpos[2] = 0.07 + 0.012 - 2e-3
+    assert skin.apply(d)["hand"].depth == pytest.approx(2e-3, abs=1e-4)
+
+
+def test_what_is_not_of_this_contact_is_refused(simulator: Simulator) -> None:
+    one = ball(RADIUS)
+    other = Tool("other", one.vertices, one.faces)
+    contact = SoftContact(simulator, (tool for tool in [one]))
+    memory = contact.step(Poses(np.eye(4), {one.name: pose(z=RADIUS - 2e-3).tolist()})).memory
+    with pytest.raises(InvalidInput, match=r"the memory is of a contact with .*; this one has other"):
+        SoftContact(simulator, [other]).step(Poses(np.eye(4), {"other": pose(z=RADIUS - 2e-3)}), memory)
 
 
 def test_a_memory_of_before_its_rows_is_still_taken(simulator: Simulator) -> None:

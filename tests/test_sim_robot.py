@@ -284,6 +284,53 @@ def test_an_arm_of_few_axes_keeps_its_place_before_it_points(forearm: SoftLayer,
         assert np.abs(log.force[rows] - 5.0).max() < 0.1 and log.off[rows].max() < 3e-4
 
 
+@pytest.mark.parametrize("what", ["gravity compensated by the motors", "a servo on a tendon", "actuation disabled"])
+def test_what_a_file_does_to_the_motors_beside_is_undone(forearm: SoftLayer, tmp_path: Path, what: str) -> None:
+    from stmpl_sim.massage import Course, Massage
+    from stmpl_sim.scene import build
+    from stmpl_sim.site import Site
+
+    path = arm_of(5, tmp_path / "arm.xml")
+    text, end = path.read_text(), "</mujoco>"
+    if what.startswith("gravity"):
+        text = text.replace("<joint ", '<joint actuatorgravcomp="true" ').replace("<body ", '<body gravcomp="1" ')
+    elif what.startswith("a servo"):
+        joints = '<joint joint="j2" coef="1"/><joint joint="j3" coef="-1"/>'
+        text = text.replace(end, f'<tendon><fixed name="t">{joints}</fixed></tendon><actuator><position tendon="t" '
+                            f'kp="500"/></actuator>{end}')  # fmt: skip
+    else:
+        text = text.replace(end, f'<option><flag actuation="disable"/></option>{end}')
+    path.write_text(text)
+    site = Site.thickest(forearm)
+    scene = build(forearm, site, robot=path, end="tcp", timestep=2e-3)
+    log = Massage(scene, Course(site.circle(0.012), (5.0,), laps=0.1), skin=Simulator(forearm, Winkler())).run()
+    for phase in log.phases[2:4]:
+        assert np.abs(log.force[log.during(phase)] - 5.0).max() < 0.1
+
+
+def test_a_file_in_millimetres_or_with_numbers_that_are_none_or_a_weld_that_pulls_is_told(
+    forearm: SoftLayer, tmp_path: Path
+) -> None:
+    from stmpl_sim.scene import build
+    from stmpl_sim.site import Site
+
+    path, site = arm_of(5, tmp_path / "arm.xml"), Site.thickest(forearm)
+    text = path.read_text()
+    path.write_text(text.replace("</mujoco>", '<equality><weld name="held" body1="hand"/></equality></mujoco>')
+                    .replace('<body pos="0 0 .1"><joint name="j5"', '<body name="hand" pos="0 0 .1"><joint name="j5"'))
+    (note,) = build(forearm, site, robot=path, end="tcp").notes
+    assert note.startswith("equality constraints of the file do not hold at the start (held)")
+    path.write_text(text.replace('pos="0 0 .35"', 'pos="0 0 nan"'))
+    with pytest.raises(InvalidInput, match=r"nan|finite"):
+        build(forearm, site, robot=path, end="tcp")
+    long = "".join(f'<body pos="0 0 {z}"><joint type="slide" axis="{axis}" range="-20 20"/><inertial pos="0 0 0" '
+                   'mass="1" diaginertia="1 1 1"/>' for z, axis in ((4, "1 0 0"), (4, "0 1 0"), (4, "0 0 1")))
+    path.write_text(f'<mujoco><worldbody>{long}<site name="tcp" quat="0 1 0 0"/></body></body></body></worldbody>'
+                    '</mujoco>')  # fmt: skip
+    *_, note = build(forearm, site, robot=path, end="tcp").notes
+    assert note == "the robot's links are 12 m long in all; is its file in millimetres?"
+
+
 @pytest.mark.parametrize(("roll", "lean"), [(3.14159, 0.0), (2.8, 19.57), (2.0, None)])
 def test_a_tool_of_few_axes_points_as_well_as_its_place_leaves_it(
     forearm: SoftLayer, tmp_path: Path, roll: float, lean: float | None
@@ -350,6 +397,24 @@ def test_what_takes_an_arm_off_its_course_is_said_before_and_after(forearm: Soft
     console = Console(record=True, width=300)
     console.print(table(figures_of(log) | {"log": "", "every": 1}))
     assert f"to note: {scene.notes[0]}" in console.export_text()
+
+
+def test_a_run_that_is_stopped_leaves_its_log(forearm: SoftLayer) -> None:
+    from stmpl_sim.massage import Course, Massage
+    from stmpl_sim.scene import build
+    from stmpl_sim.site import Site
+
+    site = Site.thickest(forearm)
+    scene = build(forearm, site, timestep=2e-3)
+    massage = Massage(scene, Course(site.circle(0.012)), skin=Simulator(forearm, Winkler()))
+
+    def stop(_: Massage, at: float) -> None:
+        if at > 0.099:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        massage.run([stop])
+    assert massage.log is not None and massage.log.time[-1] == pytest.approx(0.1) and len(massage.log.phases) == 7
 
 
 def test_a_joint_that_stands_at_its_limit_is_named() -> None:

@@ -18,8 +18,8 @@ import numpy as np
 from stmpl_core.errors import InvalidInput
 from stmpl_core.friction import Friction, coefficients
 from stmpl_core.green import Green
-from stmpl_core.relaxation import fading, series_of
-from stmpl_core.sideways import Sideways
+from stmpl_core.relaxation import RADII, fading, series_of
+from stmpl_core.sideways import Sideways, fading_aside
 from stmpl_core.skin import Skin
 from stmpl_core.state import NEVER, Memory, State, fresh, size_of
 from stmpl_core.stepped import FRICTION, NUMBER, OUT, SAYS, doubted, step
@@ -102,7 +102,9 @@ class Steps:
         shares, times = np.zeros((len(skins), most)), np.ones((len(skins), most))
         for k, one in enumerate(series):
             shares[k, : len(one.times)], times[k, : len(one.times)] = one
-        fades = np.array([fading(skin.layer.tissue, t) for skin, t in zip(skins, middle, strict=True)])
+        fades = np.zeros((len(skins), 2 + most, RADII[-1]))
+        for skin, t, rows, terms in zip(skins, middle, fades, self._terms, strict=True):
+            rows[:2], rows[2 : 2 + terms] = fading(skin.layer.tissue, t), fading_aside(skin.layer.tissue, t)
         self._series = shares, times, fades
         self._skins = np.array([float(skin.layer.tissue.skin is not None) for skin in skins])
         rubs = bool((self._mu > 0).any())
