@@ -27,6 +27,7 @@ from stmpl_core.rays import (
     distance_in_column,
     inside_most,
     led_in,
+    led_on,
     ray_from,
     ray_of,
     sure_of,
@@ -41,7 +42,6 @@ from stmpl_core.touch import MIN_ONE_WAY_SHARE
 
 LEAST_UNDER, ALL_UNDER = 0.05, 0.3  # how much further inside a tool a column gets below its skin than there, or nearer
 # to it than there and at its core, over the width of a wall, where the tool begins to sink under skin, and where it has
-LED_ON = 0.5  # depth of a column, over that along the way of its tool, from which its skin sinks by the latter in full
 BLOCK = 32  # columns that are looked at together
 FINEST = 0.02  # size of the parts of a long triangle at which the search for a tool in it ends, over the thickness
 AS_ONE = 1.8, 2.3  # distance of two tools' middles over the sum of their radii of gyration, up to which they press as
@@ -545,7 +545,7 @@ def _sinking(grid, pose, points, inward, thickness, area, strain, sunk, push):
         more = depth_in_column(grid, ends, max(4 * guess, thickness[n]), guess) * cosine - depth[n]
         if more > 0:  # as far as its skin is inside the tool, and not at once
             begins = max(1 - distance_in_column(grid, ray, 0.0) / wall, sunk * (1 + inside / wall))
-            rises = max(wall, LED_ON * (depth[n] + more))
+            rises = max(wall, led_on(grid[3], thickness[n]) * (depth[n] + more))
             more *= max(sure, 0.0) * min(max(begins, 0.0), depth[n] / rises, 1.0)
         depth[n] = (1 + min(sure, 0.0)) * (depth[n] + more)
     return depth

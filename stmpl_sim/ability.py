@@ -14,6 +14,7 @@ LEANS = 1.0  # angle off straight down from which it is said [degrees]
 AT_LIMIT = 0.01  # of a joint's range, within which it is at a limit
 MOST_AT_LIMIT = 0.5  # part of a run at one, from which it is said
 MOST_NAMED = 4  # pairs of links that are named
+LONGEST = 10.0  # length of a robot's links beyond which its file is taken to be in millimetres [m]
 PULLED = 1e-3  # violation of an equality constraint from which it is said [m, rad]
 log = logging.getLogger(__name__)
 
@@ -28,6 +29,8 @@ def start_notes(model: Any, joints: tuple[int, ...], qpos: np.ndarray, tool: str
         tool: name of the geom whose z axis is to point down.
     """
     data, found = mujoco.MjData(model), []
+    if (long := length_of(model, tool)) > LONGEST:
+        found.append(f"the robot's links are {long:.3g} m long in all; is its file in millimetres?")
     data.qpos[:] = qpos
     mujoco.mj_forward(model, data)
     if len(joints) < AXES:
@@ -50,6 +53,14 @@ def start_notes(model: Any, joints: tuple[int, ...], qpos: np.ndarray, tool: str
     for note in found:
         log.warning("%s.", note)
     return tuple(found)
+
+
+def length_of(model: Any, tool: str) -> float:
+    """Length of the links from the base to a geom's body, in all [m]."""
+    body, long = model.geom_bodyid[model.geom(tool).id], 0.0
+    while body:
+        long, body = long + float(np.linalg.norm(model.body_pos[body])), model.body_parentid[body]
+    return long
 
 
 def stuck_joints(model: Any, joints: tuple[int, ...], qpos: np.ndarray) -> tuple[str, ...]:

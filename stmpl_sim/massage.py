@@ -276,9 +276,9 @@ class Massage:
         self.scene, self.course = scene, course
         most, weakest = strength(scene.model, scene.joints, scene.qpos, BALL)
         if max(course.forces) > most:
+            limit = f"is at its limit from {most:.3g} N on" if most > 0 else "does not even hold the arm"
             raise InvalidInput(f"the arm cannot press with {max(course.forces):g} N: at the start the motor of "
-                               f"'{weakest}' is at its limit from {most:.3g} N on. Ask for less, or put the limb "
-                               "elsewhere (--at).")  # fmt: skip
+                               f"'{weakest}' {limit}. Ask for less, or put the limb elsewhere (--at).")  # fmt: skip
         self.fingers = tuple(name for name in scene.tools if name in FINGERS)
         if self.fingers and not hasattr(skin, "history"):  # a Simulator has its own
             friction = with_fingers(friction, BALL)
@@ -374,7 +374,8 @@ class Massage:
                 aim, took = self.step(lambda limb, at=at: self.course.goal(at, limb, radius))
                 if any(self.data.warning[kind].number for kind in DIVERGED):
                     raise InvalidInput(f"the simulation diverged at {at:.3f} s. Try a higher rate; if that does not "
-                                       "help, check the masses of the robot's links.")  # fmt: skip
+                                       "help, check the masses of the robot's links."
+                                       + "".join(f" To note: {note}." for note in self.scene.notes))  # fmt: skip
                 spent, busy = time.perf_counter() - begun, time.thread_time() - busy
                 reaction = self.skin.reaction
                 assert reaction is not None

@@ -11,7 +11,7 @@ import numpy as np
 from stmpl_core.arrays import Transform, check_choice, check_kind, check_number, finite
 from stmpl_core.errors import InvalidInput
 from stmpl_core.layer import SoftLayer
-from stmpl_sim.ability import AXES, start_notes
+from stmpl_sim.ability import AXES, LONGEST, length_of, start_notes
 from stmpl_sim.engine import mujoco
 from stmpl_sim.grip import END, FINGERS, add_gripper, place_of, thin_end
 from stmpl_sim.mujoco_skin import exclude
@@ -36,7 +36,6 @@ FINITE = ("qpos0", "body_pos", "body_quat", "body_mass", "body_inertia", "body_i
           "jnt_range", "jnt_stiffness", "dof_damping", "dof_armature", "dof_frictionloss", "geom_pos",
           "geom_size")  # fmt: skip
 LONGEST_STEP = 0.02  # largest timestep [s]: ten times what the arm's control wants
-LONGEST = 10.0  # length of a robot's links beyond which its file is taken to be in millimetres [m]
 STARTS, STEPS = 40, 200  # starts that are tried at most, and steps from each
 POINTING = 150  # of these steps where the place goes before pointing: after them only the place is found
 EXACT = 1e-6  # of the place [m] and the direction of a start
@@ -148,10 +147,7 @@ def build(
     joints = tuple(model.joint(joint.name).id for joint in chain)
     qpos = _reach(model, joints, where, radius + above)
     _still(model, joints, qpos)
-    notes = start_notes(model, joints, qpos, BALL)
-    if (long := _length(model)) > LONGEST:
-        notes += (f"the robot's links are {long:.3g} m long in all; is its file in millimetres?",)
-    return Scene(model, layer, site, joints, qpos, radius, tools, notes)
+    return Scene(model, layer, site, joints, qpos, radius, tools, start_notes(model, joints, qpos, BALL))
 
 
 def check_robot(robot: Path | None, end: str | None) -> None:
@@ -239,14 +235,6 @@ def _still(model: Any, joints: tuple[int, ...], qpos: np.ndarray) -> None:
         if k not in ours and moment[k, dofs].any():
             model.actuator_gaintype[k], model.actuator_gainprm[k] = mujoco.mjtGain.mjGAIN_FIXED, 0.0
             model.actuator_biastype[k] = mujoco.mjtBias.mjBIAS_NONE
-
-
-def _length(model: Any) -> float:
-    """Length of the links from the base to the ball, in all [m]."""
-    body, long = model.geom_bodyid[model.geom(BALL).id], 0.0
-    while body:
-        long, body = long + float(np.linalg.norm(model.body_pos[body])), model.body_parentid[body]
-    return long
 
 
 def _compiled(spec: Any, what: str) -> Any:
@@ -392,7 +380,7 @@ def _reach(model: Any, joints: tuple[int, ...], at: np.ndarray, height: float) -
     least = min((one.lean for one in placed), default=np.inf)
     if least <= most:
         return max((one for one in placed if one.lean <= least + ALIKE), key=lambda one: one.room).qpos
-    long = _length(model)
+    long = length_of(model, BALL)
     what = ("Is its file in millimetres? MuJoCo takes metres." if long > LONGEST else
             "Put the limb elsewhere (--at X Y Z), or name another end (--end).")  # fmt: skip
     best = f" (at best {np.rad2deg(least):.3g} degrees off)" if placed else ""

@@ -327,7 +327,7 @@ def test_a_file_in_millimetres_or_with_numbers_that_are_none_or_a_weld_that_pull
                    'mass="1" diaginertia="1 1 1"/>' for z, axis in ((4, "1 0 0"), (4, "0 1 0"), (4, "0 0 1")))
     path.write_text(f'<mujoco><worldbody>{long}<site name="tcp" quat="0 1 0 0"/></body></body></body></worldbody>'
                     '</mujoco>')  # fmt: skip
-    *_, note = build(forearm, site, robot=path, end="tcp").notes
+    note, *_ = build(forearm, site, robot=path, end="tcp").notes
     assert note == "the robot's links are 12 m long in all; is its file in millimetres?"
 
 
