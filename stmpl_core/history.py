@@ -27,6 +27,7 @@ from stmpl_core.sideways import Sideways, fading_aside
 from stmpl_core.slip import MOST_GROWN
 from stmpl_core.state import Memory, State, fresh
 from stmpl_core.stepped import MOST_DRAGGED, OUT, PATCH, SAYS
+from stmpl_core.tissue import Tissue
 from stmpl_core.touch import APART, Imprint, Slip, Touch
 from stmpl_core.toucher import STIFFENING, Toucher
 from stmpl_core.trust import Trust
@@ -57,15 +58,29 @@ class History:
         self.frictions = coefficients(friction)
         thickness = float(np.median(layer.thickness))
         self.series = series_of(layer.tissue, thickness)
-        self._fades = np.vstack([fading(layer.tissue, thickness), fading_aside(layer.tissue, thickness)])
         self._last: State | None = None  # state of the last step, which is one of this skin
         self._skin = crc32(layer.thickness.tobytes(), crc32(layer.faces.tobytes(), crc32(layer.vertices.tobytes())))
-        self._tissue = crc32(layer.tissue.numbers.tobytes())
+        self._tissue = number_of(layer.tissue)
 
     @cached_property
     def sideways(self) -> Sideways:
         """Stiffness of the layer at rest to what sticks to it."""
         return Sideways(self._rest)
+
+    @property
+    def _fades(self) -> np.ndarray:
+        """Rows of relaxation.fading, and below them, where anything rubs, of sideways.fading_aside, (2 + P, R)."""
+        return self._fades_aside if self.rubs else self._fades_alone
+
+    @cached_property
+    def _fades_alone(self) -> np.ndarray:
+        rows = fading(self._rest.tissue, float(np.median(self._rest.thickness)))
+        return np.vstack([rows, np.zeros((len(self.series.times), rows.shape[1]))])
+
+    @cached_property
+    def _fades_aside(self) -> np.ndarray:
+        tissue, thickness = self._rest.tissue, float(np.median(self._rest.thickness))
+        return np.vstack([fading(tissue, thickness), fading_aside(tissue, thickness)])
 
     def moved(self, toucher: Toucher) -> History:
         """The same history where joints take the skin."""
@@ -134,7 +149,7 @@ class History:
             bounds = out[:, 6].copy()
             stepped.doubted(before, after, *self.series, dt, _possible(contacts, touches, bounds), out, says)
             touches = [self._doubted(touch, bound, row) for touch, bound, row in zip(touches, bounds, out, strict=True)]
-        for name in names[many:]:
+        for name in names[many:] if dt > 0 else ():
             if not (memories[name].sunk or memories[name].trail.any()):
                 del memories[name]
         self._last = State(memories, here, self._skin, self._tissue)
@@ -153,8 +168,7 @@ class History:
         if state.tools and state.skin not in (None, self._skin):
             raise InvalidInput(f"the state of {', '.join(state.tools)} is of skin of another shape. Try an empty "
                                "State().")  # fmt: skip
-        remembers = any(one.terms or one.scalars.limit > 0 for one in state.tools.values())
-        if remembers and state.tissue not in (None, self._tissue):
+        if is_of_other(state, self._tissue):
             raise InvalidInput(f"the state of {', '.join(state.tools)} is of other tissue, which relaxed or was "
                                "dragged otherwise. Try an empty State().")  # fmt: skip
         for name, memory in state.tools.items():
@@ -298,6 +312,17 @@ class History:
         found = [(self.toucher.touch(Contact(self.toucher.tools[one.name], one.imprint.pose)), one.imprint.depth)
                  for one in some if one.imprint is not None]  # fmt: skip
         return [(touch, min(depth / touch.depth, 1.0)) for touch, depth in found if touch.presses]
+
+
+def number_of(tissue: Tissue) -> int:
+    """Number by which a tissue is known again; see State.tissue."""
+    return crc32(tissue.numbers.tobytes())
+
+
+def is_of_other(state: State, tissue: int) -> bool:
+    """Whether a state is of other tissue than this number's, where that counts: it relaxes, or was dragged."""
+    remembers = any(one.terms or one.scalars.limit > 0 for one in state.tools.values())
+    return remembers and state.tissue not in (None, tissue)
 
 
 def compile_steps() -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from functools import lru_cache
 from typing import NamedTuple
 
 import numba
@@ -12,7 +13,7 @@ from scipy.special import gamma, j0, j1, jv
 
 from stmpl_core.layer import SoftLayer
 from stmpl_core.relaxation import RADII as RELAXING_RADII
-from stmpl_core.relaxation import borne_by, fading_moduli, relaxations
+from stmpl_core.relaxation import borne_by, fading_moduli, relaxations, series_of
 from stmpl_core.stack import along
 from stmpl_core.tissue import Tissue
 
@@ -22,6 +23,7 @@ WHERE = np.linspace(0.05, 0.95, 10)  # places in the patch that move with the to
 POWERS = (-0.5, 0.5, 1.5)  # powers of 1 - r^2 / a^2 in the traction: the first alone is exact on a half-space
 RADII = np.geomspace(0.02, 8.0, 18)  # radii of the patch that are tabled, over the thickness
 THICKNESSES = 5  # thicknesses of a stack that are tabled
+HARDER = 1e6  # factor on all of a stack, by which what has softened is never softer than tissues may be
 ASIDE_RADII = 7  # radii for which it is reckoned how much of a drag fades; others are between
 
 
@@ -92,6 +94,7 @@ def patch(tissue: Tissue, thickness: float, radius: float) -> Patch:
     return Patch(float(force), float(torque), bare, slack_at(tissue, radius))
 
 
+@lru_cache(maxsize=64)
 def fading_aside(tissue: Tissue, thickness: float) -> np.ndarray:
     """Share of a drag that relaxes in each time of the layer's Series (stmpl_core.relaxation), by the contact's radius.
 
@@ -99,15 +102,13 @@ def fading_aside(tissue: Tissue, thickness: float) -> np.ndarray:
     most of a drag is carried by skin and what is right below, whatever carries the push.
 
     Returns:
-        Shares at the radii of relaxation.RADII, (P, R) [-].
+        Shares at the radii of relaxation.RADII, (P, R) [-]; not to be written to.
     """
     each, (least, most, many) = relaxations(tissue, thickness), RELAXING_RADII
-    times = sorted({tau for one in each if one for tau in one.times})
-    if tissue.single:
-        shares = np.array(tissue.relaxation.shares if tissue.relaxation else ())
-        return np.repeat(shares[:, None], many, axis=1)
-    if not times:
-        return np.empty((0, many))
+    series = series_of(tissue, thickness)
+    times = series.times.tolist()
+    if tissue.single or not times:
+        return np.repeat(series.shares[:, None], many, axis=1)
     fade, logs = fading_moduli(tissue, thickness), np.log(np.geomspace(least, most, many))
     coarse = np.linspace(logs[0], logs[-1], ASIDE_RADII)
     found = np.zeros((len(times), ASIDE_RADII))
@@ -121,11 +122,13 @@ def fading_aside(tissue: Tissue, thickness: float) -> np.ndarray:
 
 
 def _softened(tissue: Tissue, factors: np.ndarray) -> Tissue:
-    """The tissue with factors on its moduli, in the order of relaxation.relaxations; its skin keeps its tension."""
+    """HARDER times the tissue with factors on its moduli, in the order of relaxation.relaxations, but its tension."""
+    first, *others = (HARDER * factors).tolist()
     deeper = tuple(replace(ply, youngs_modulus=ply.youngs_modulus * by)
-                   for ply, by in zip(tissue.deeper, factors[1:], strict=False))  # fmt: skip
-    skin = tissue.skin and replace(tissue.skin, youngs_modulus=tissue.skin.youngs_modulus * float(factors[-1]))
-    return replace(tissue, youngs_modulus=tissue.youngs_modulus * float(factors[0]), deeper=deeper, skin=skin)
+                   for ply, by in zip(tissue.deeper, others[: len(others) - bool(tissue.skin)], strict=False))
+    skin = tissue.skin and replace(tissue.skin, youngs_modulus=tissue.skin.youngs_modulus * others[-1],
+                                   tension=tissue.skin.tension * HARDER)  # fmt: skip
+    return replace(tissue, youngs_modulus=tissue.youngs_modulus * first, deeper=deeper, skin=skin)
 
 
 def slack_at(tissue: Tissue, radius: float) -> float:

@@ -11,7 +11,7 @@ every reversal (Iwan, J. Appl. Mech. 33, 893, 1966). Whatever the path, they giv
 (F_x, F_y, M / rho) in the tangent plane, with M the torque about the contact's normal and rho its lever, the mean
 distance of the pressure from the middle; so translation and spin share one limit. What slides goes the way of its
 force (the flow rule of a limit surface: Goyal, Ruina & Papadopoulos, Wear 143, 307, 1991), however much stiffer skin is
-to the one than to the other. Springs relax as the force does.
+to the one than to the other. Springs relax as what carries a drag does (stmpl_core.sideways.fading_aside).
 
 Skin moves as one where it sticks, and the more the harder it is pressed where it slides. A spring stands for a ring of
 the contact, so the part of the way that is of skin that slides is a fixed sum of the springs' forces: nothing of it
@@ -211,11 +211,18 @@ def _slipped(spring, left, stiffness, over, most):
 
 
 @numba.njit(cache=True, error_model="numpy")
-def drag(springs, relaxed, shares, times, dt, rolled, stiffness, before, cap, way, wanted, by_force, first=-1.0):
-    """One step of the springs; see Drag, and for the arguments `_step`; first: cap before the step, below 0 as after.
+def drag(springs, relaxed, shares, times, dt, rolled, stiffness, before, cap, way, wanted, by_force):
+    """One step of the springs of a patch that stays as it is; see Drag, and for the arguments `_step`."""
+    return drag_on(springs, relaxed, shares, times, dt, rolled, stiffness, before, cap, way, wanted, by_force,
+                   stiffness, cap)  # fmt: skip
+
+
+@numba.njit(cache=True, error_model="numpy")
+def drag_on(springs, relaxed, shares, times, dt, rolled, stiffness, before, cap, way, wanted, by_force, was, first):
+    """One step of the springs; see Drag, and for the arguments `_step`.
 
     A slider that turns follows the way within a length of cap / k, so a longer step by pose is cut into parts, along
-    which cap and stiffness go from what they were to what they are.
+    which cap and stiffness go from what they were before the step, `first` and `was`, to what they are.
     """
     far = 0.0
     for x in range(3):
@@ -224,14 +231,15 @@ def drag(springs, relaxed, shares, times, dt, rolled, stiffness, before, cap, wa
     if not by_force and cap > 0:
         parts = int(min(max(np.ceil(np.sqrt(far) / (PART * cap)), 1.0), PARTS))
     found, kept, force, share, stored = springs, relaxed, np.zeros(3), 0.0, 0.0
-    last, begun = before, before if before[0] > 0 and first >= 0 else stiffness
+    least = before.copy()
     for k in range(1, parts + 1):
         to_go = (parts - k) / parts
-        limit = cap + to_go * (first - cap) if first >= 0 else cap
-        now = stiffness + to_go * (begun - stiffness)
-        found, kept, force, share, stored = _step(found, kept, shares, times, dt / parts, rolled, now, last, limit,
+        limit, now = cap + to_go * (first - cap), stiffness + to_go * (was - stiffness)
+        found, kept, force, share, stored = _step(found, kept, shares, times, dt / parts, rolled, now, least, limit,
                                                   way / parts, wanted, by_force)  # fmt: skip
-        last, rolled = now, 0.0
+        rolled = 0.0
+        for x in range(3):
+            least[x] = min(least[x], now[x]) if least[x] > 0 else now[x]
     return found, kept, force, share, stored
 
 
@@ -244,7 +252,7 @@ def _step(springs, relaxed, shares, times, dt, rolled, stiffness, before, cap, w
 
     Args:
         springs, relaxed: see Drag, before the step.
-        shares, times: series of the relaxation, (P,) each.
+        shares, times: series by which a drag relaxes, (P,) each.
         dt: time of the step [s].
         rolled: way that the contact rolled on, over its radius [-]: rolling leaves strained skin behind.
         stiffness: of the patch to (way, way, rho times turn), (3,) [N/m].
@@ -383,10 +391,10 @@ def rub(wrench, stated, by_force, contact, origin, bend, give, mu, along_itself,
         twist, known: see footing.aged.
         pressed: whether the tool pressed before the step.
         before_contact, before_elastic, before_slid, before_held: see Memory and Scalars, before the step.
-        first: Scalars.limit before the step [N]; below 0: none.
+        first: Scalars.limit before the step [N].
         room, passed: Scalars.rolled_first, .rolled_second and .rolled before it, and those of `passed`, (3,) [m].
         springs, relaxed, stiffness: see Memory, before it.
-        shares, times: series of the relaxation, (P,) each.
+        shares, times: series by which a drag relaxes, (P,) each.
         dt: time of the step [s].
 
     Returns:
@@ -447,8 +455,12 @@ def rub(wrench, stated, by_force, contact, origin, bend, give, mu, along_itself,
             ratio, past = wrapped(mu, leans, taut * turns_across)
             cap = (1 - loose) * (ratio * grown * force + (1 - taut) * (cap - most))
         after = np.array([softened(alone, gives[0]), softened(alone, gives[1]), stiffer * turn / arm_of_turn**2])
-        new, kept, carried, share, stored = drag(
-            springs, relaxed, shares, times, dt, rolled, after, held_at, cap, way, wanted, by_force, first)  # fmt: skip
+        from_cap, from_stiffness = cap, after.copy()
+        if pressed and was > 0:
+            from_cap, from_stiffness = first, stiffness.copy()
+        new, kept, carried, share, stored = drag_on(
+            springs, relaxed, shares, times, dt, rolled, after, held_at, cap, way, wanted, by_force, from_stiffness,
+            from_cap)  # fmt: skip
         last, last_slid = turned, slid
         turned, out = faced(new, after, contact, bend, MOST_LEAN)
         square = (new[:, 0].sum() / after[0]) ** 2 + (new[:, 1].sum() / after[1]) ** 2

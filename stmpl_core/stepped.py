@@ -402,7 +402,6 @@ def _one(patch, before, after, grooves, shares, times, fades, has_skin, table, l
                 pressed_on(trail, shares, times, dt, pose, there[0], there[1], eased, at_rest, depth, power, 1 - long,
                            patch[14], came)  # fmt: skip
             if mu > 0 and net > MIN_ONE_WAY_SHARE:
-                limit_before = old[LIMIT] if held else -1.0
                 bend, give = patch[30:39].copy().reshape(3, 3), patch[21:30].copy().reshape(3, 3)
                 along, turn, bare = interpolated(table, log_thickness, logs, patch[14], patch[16])
                 unit = modulus * patch[14]
@@ -412,7 +411,7 @@ def _one(patch, before, after, grooves, shares, times, fades, has_skin, table, l
                     LOST * patch[19], patch[WRAPPED : WRAPPED + 9].copy().reshape(3, 3), force, patch[15], at_rest,
                     depth, patch[14], patch[16], power, along * unit, turn * unit * patch[14] ** 2, bare * unit,
                     slack * patch[14], twist, old[PRESSING] >= 0, held, contact, old[ELASTIC], slid_before, old[HELD],
-                    limit_before, old[ROLLED : ROLLED + 3].copy(), passed, springs, springs_relaxed,
+                    old[LIMIT], old[ROLLED : ROLLED + 3].copy(), passed, springs, springs_relaxed,
                     stiffness, shares_aside(fades, patch[14], terms), times, dt)  # fmt: skip
                 changed, doubt = grown * changed, grown * doubt
                 drag = rubs[0] ** 2 + rubs[1] ** 2 + rubs[2] ** 2

@@ -196,9 +196,8 @@ class Tissue:
         of = [*self.deeper, *([self.skin] if self.skin else [])]
         names = "youngs_modulus", "poisson_ratio", "depth", "thickness", "tension"
         rows = [[getattr(one, name, 0.0) for name in names] for one in (self, *of)]
-        fades = [number for one in (self, *of) if one.relaxation
-                 for number in (*one.relaxation.shares, *one.relaxation.times, -1.0)]  # fmt: skip
-        return np.array([*np.ravel(rows), *fades])
+        fades = [(*one.relaxation.shares, *one.relaxation.times) if one.relaxation else () for one in (self, *of)]
+        return np.array([*np.ravel(rows), *(number for each in fades for number in (*each, -1.0))])
 
     @property
     def single(self) -> bool:

@@ -160,8 +160,9 @@ def _know(layer: SoftLayer, friction: Friction | Mapping[str, Friction]) -> None
         _skin = Skin.of(layer, Zero())
     tool, pose = tip(), np.eye(4)
     vertex = int(np.linalg.norm(layer.vertices - layer.vertices.mean(axis=0), axis=1).argmin())
-    pose[:3, 3] = layer.vertices[vertex] + 0.9 * TIP * layer.normals[vertex]
-    _local_contacts([Contact(tool, pose)], State(), 0.01)  # what is compiled is loaded before somebody waits
+    pose[:3, 3] = layer.vertices[vertex] + 0.5 * TIP * layer.normals[vertex]
+    remembers = _history.rubs or len(_history.series.times) > 0
+    _local_contacts([Contact(tool, pose)], State() if remembers else None, 0.01)  # loaded before somebody waits
     _history.toucher.tools.remove(tool.name)
 
 

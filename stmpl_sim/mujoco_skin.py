@@ -120,13 +120,14 @@ class SoftBody:
                     whose = model.body(limb).name
                     raise InvalidInput(f"'{name}' is part of '{whose}', or rigidly joined to it: it cannot touch its "
                                        "skin.")  # fmt: skip
-                _check_no_rigid_contact(model, limb, source)
+                _check_no_rigid_contact(model, limb, _geoms_of(model, source, self._sources.values()))
+        geoms = {name: _geoms_of(model, source, self._sources.values()) for name, source in self._sources.items()}
         for whole, source in self._sources.items():
             for name, part in self._sources.items():
-                if source.geom is None and part.geom in _geoms_of(model, source):
+                if source.geom is None and part.geom in geoms[whole]:
                     raise InvalidInput(f"tool '{name}' is a geom of tool '{whole}': it would press twice. Name one of "
                                        "them.")  # fmt: skip
-        made = [_tool(model, name, self._sources[name]) for name in tools]
+        made = [_tool(model, name, self._sources[name], geoms[name]) for name in tools]
         self.contact = SoftContact(layer, made, method, pose_body_from_layer=pose_body_from_layer, damping=damping,
                                    implicit=implicit, friction=friction, every=every)  # fmt: skip
         if self._jointed is not None:
@@ -366,7 +367,7 @@ class _Ledger:
     def __init__(self) -> None:
         self._known: OrderedDict[tuple[int, bytes], _Shares] = OrderedDict()
         self._left: WeakKeyDictionary[Any, dict[int, tuple[Wrench, _Shares]]] = WeakKeyDictionary()
-        self._put: dict[int, tuple[Wrench, _Shares]] = {}  # rows of the last memories that were put
+        self._put: dict[tuple[str, int], tuple[Wrench, _Shares]] = {}  # rows of each skin's last memory that was put
 
     def know(self, owner: str, exerted: Exerted) -> None:
         """Knows the rows of a memory, in which what was its skin's is now this skin's."""
@@ -377,8 +378,8 @@ class _Ledger:
             for key in [key for key, each in skins.items() if (each == ours).all()]:
                 if np.abs(sum(skins.values(), np.zeros(6)) - left).max() > SAME * np.abs(numbers).max():
                     del skins[key]  # another that was given this memory
-            self._put[body] = numbers, _Shares(others, skins | {owner: ours})
-            self._remember(body, *self._put[body])
+            self._put[owner, body] = numbers, _Shares(others, skins | {owner: ours})
+            self._remember(body, *self._put[owner, body])
 
     def rows(self, data: Any, owner: str, bodies: Iterable[int]) -> dict[int, Row]:
         """The rows in which a skin's wrench stands, as skins left them."""
@@ -396,7 +397,7 @@ class _Ledger:
         """Puts these wrenches, by body, in place of a skin's last ones."""
         left = self._left.setdefault(data, {})
         for body, wrench in rows.items():
-            others, skins = self._read(data.xfrc_applied[body], body, left)
+            others, skins = self._read(data.xfrc_applied[body], body, left, owner)
             skins = {key: each for key, each in skins.items() if key != owner and key in _LIVE}
             if wrench.any():
                 skins[owner] = wrench
@@ -406,14 +407,15 @@ class _Ledger:
             if skins:
                 self._remember(body, numbers, shares)
 
-    def _read(self, numbers: Wrench, body: int, left: Mapping[int, tuple[Wrench, _Shares]]) -> _Shares:
+    def _read(self, numbers: Wrench, body: int, left: Mapping[int, tuple[Wrench, _Shares]], owner: str) -> _Shares:
         if not numbers.any():
             return _Shares(np.zeros(6), {})
-        if body in left and (numbers == left[body][0]).all():
-            return left[body][1]
+        guesses = [guess for guess in (left.get(body), self._put.get((owner, body))) if guess is not None]
+        for last, shares in guesses:
+            if (numbers == last).all():
+                return shares
         if known := self._known.get((body, numbers.tobytes())):
             return known
-        guesses = [guess[body] for guess in (left, self._put) if body in guess]
         if not guesses:
             return _Shares(numbers.copy(), {})
         last, shares = max(guesses, key=lambda guess: (numbers == guess[0]).sum())
@@ -438,7 +440,13 @@ def exclude(spec: Any, body: str, tools: Sequence[str]) -> None:
         if owner not in known:
             raise InvalidInput(f"there is no geom or body '{name}'. Bodies: {_some(known)}.")
         if name != body:
-            spec.add_exclude(bodyname1=body, bodyname2=owner)
+            for each in (owner,) if geom is not None else _welded(spec.body(owner)):
+                spec.add_exclude(bodyname1=body, bodyname2=each)
+
+
+def _welded(body: Any) -> list[str]:
+    """Names of a body of a MjSpec and of those below it that no joint moves."""
+    return [body.name, *(name for one in body.bodies if one.name and not one.joints for name in _welded(one))]
 
 
 def _add(rows: dict[int, Wrench], body: int, wrench: Wrench, lever: np.ndarray) -> None:
@@ -483,25 +491,29 @@ def _source(model: Any, name: str) -> _Source:
                        f"Bodies: {_some(bodies)}.")  # fmt: skip
 
 
-def _geoms_of(model: Any, source: _Source) -> list[int]:
+def _geoms_of(model: Any, source: _Source, every: Iterable[_Source]) -> list[int]:
+    """Geoms of a tool: of a body those that collide, or all, and the same of each body that is welded to it from below
+    and is not named as a tool itself, nor any of whose geoms is."""
     if source.geom is not None:
         return [source.geom]
-    own = [geom for geom in range(model.ngeom) if _hangs_on(model, int(model.geom_bodyid[geom]), source.body)]
-    hard = [geom for geom in own if model.geom_contype[geom] or model.geom_conaffinity[geom]]
-    return hard or own
+    named, found = {one.body for one in every} - {source.body}, []
+    for body in range(source.body, model.nbody if source.body else 1):
+        if _hangs_on(model, body, source.body, named):
+            own = [geom for geom in range(model.ngeom) if model.geom_bodyid[geom] == body]
+            found += [geom for geom in own if model.geom_contype[geom] or model.geom_conaffinity[geom]] or own
+    return found
 
 
-def _hangs_on(model: Any, body: int, other: int) -> bool:
-    """Whether a body is another, or welded to it from below."""
-    while body != other and body != 0 and model.body_jntnum[body] == 0 and model.body_mocapid[body] < 0:
+def _hangs_on(model: Any, body: int, other: int, but: set[int]) -> bool:
+    """Whether a body is another, or welded to it from below by none of some."""
+    while body not in (other, 0) and body not in but and not (model.body_jntnum[body] or model.body_mocapid[body] >= 0):
         body = int(model.body_parentid[body])
     return body == other
 
 
-def _tool(model: Any, name: str, source: _Source) -> Tool:
+def _tool(model: Any, name: str, source: _Source, geoms: list[int]) -> Tool:
     from stmpl_sim.shapes import body_surface, geom_surface
 
-    geoms = _geoms_of(model, source)
     if not geoms:
         raise InvalidInput(f"body '{name}' has no geom that could touch.")
     return Tool(name, *(geom_surface(model, source.geom) if source.geom is not None
@@ -526,13 +538,13 @@ def _filtered(model: Any, one: int, other: int) -> bool:
     return bool(a and b and (a == above[1] or b == above[0]))
 
 
-def _check_no_rigid_contact(model: Any, body: int, source: _Source) -> None:
+def _check_no_rigid_contact(model: Any, body: int, geoms: Iterable[int]) -> None:
     """Raises InvalidInput where MuJoCo would make rigid contacts between the tool's geoms and the limb's.
 
     The limb has those of its body and of what is welded to it; where it is fixed to the world, of what hangs on it.
     """
     signatures = {int(s) for s in model.exclude_signature}
-    for tool in _geoms_of(model, source):
+    for tool in geoms:
         for limb in range(model.ngeom):
             owner, whose = int(model.geom_bodyid[limb]), int(model.geom_bodyid[tool])
             if not _is_welded(model, owner, body):

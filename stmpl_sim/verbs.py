@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, cast, get_args
@@ -110,8 +111,8 @@ def sim(
         log = _run(massage, shots, quiet=as_json)
     except KeyboardInterrupt:
         if massage.log is not None:
-            print_figures(f"stopped at {massage.log.time[-1]:.1f} of {course.duration:.1f} s; the log so far: "
-                          f"{massage.log.save(out / 'log.npz')}")  # fmt: skip
+            print(f"stopped at {massage.log.time[-1]:.1f} of {course.duration:.1f} s; the log so far: "
+                  f"{massage.log.save(out / 'log.npz')}", file=sys.stderr)  # fmt: skip
         raise
     log.save(out / "log.npz")
     figures = figures_of(log) | {"log": str(out / "log.npz"), "every": every}

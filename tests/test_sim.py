@@ -538,6 +538,24 @@ def test_a_memory_that_others_were_given_too_leaves_no_wrench_of_theirs(simulato
     np.testing.assert_array_equal(went, went[:1] * 3)
 
 
+def test_memories_that_are_put_before_any_skin_steps_leave_no_wrench(simulator: Simulator) -> None:
+    m, whole = model(), mujoco.mjtState.mjSTATE_INTEGRATION
+    d, first = mujoco.MjData(m), SoftBody(m, simulator, body="slab", tools=["ball"])
+    for _ in range(30):
+        step(m, d, first)
+    state, memory = np.empty(mujoco.mj_stateSize(m, whole)), first.memory
+    mujoco.mj_getState(m, d, state, whole)
+    others = [(SoftBody(m, simulator, body="slab", tools=["ball"]), mujoco.MjData(m)) for _ in range(3)]
+    for skin, data in others:
+        mujoco.mj_setState(m, data, state, whole)
+        skin.memory = memory
+    for skin, data in others:
+        for _ in range(5):
+            step(m, data, skin)
+        assert skin.reaction is not None
+        np.testing.assert_allclose(data.xfrc_applied[2, :3], skin.reaction.tools["ball"][:3], rtol=1e-9, atol=1e-12)
+
+
 def test_a_body_that_is_a_tool_has_what_is_welded_to_it(slab: SoftLayer) -> None:
     m = mujoco.MjModel.from_xml_string(
         f'<mujoco><worldbody><body name="slab">{CORE}</body><body name="hand" pos="0 0 .1"><freejoint/>'
@@ -547,6 +565,8 @@ def test_a_body_that_is_a_tool_has_what_is_welded_to_it(slab: SoftLayer) -> None
     skin, d = SoftBody(m, slab, body="slab", tools=["hand"], method=Winkler()), mujoco.MjData(m)
     d.qpos[2] = 0.07 + 0.012 - 2e-3
     assert skin.apply(d)["hand"].depth == pytest.approx(2e-3, abs=1e-4)
+    apart = SoftBody(m, slab, body="slab", tools=["hand", "tip"], method=Winkler()).apply(d)
+    assert apart["hand"].status == APART and apart["tip"].depth == pytest.approx(2e-3, abs=1e-4)
 
 
 def test_what_is_not_of_this_contact_is_refused(simulator: Simulator) -> None:

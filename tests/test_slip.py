@@ -464,6 +464,34 @@ def test_a_tool_that_has_nothing_left_to_give_still_has_an_answer() -> None:
     assert 0 < touches[0].force < 1e-9 and 2e-3 < found[1] < 4e-3, "the skin lies on the tool, which is not pushed"
 
 
+@pytest.mark.parametrize("rises", [0.4, -0.4, 0.0])
+def test_a_slide_that_turns_back_and_rises_may_be_told_in_long_steps(rises: float) -> None:
+    """15 mm back in three steps of 50 ms, or in sixty: 5 to 7 % of the force apart before, where it rises."""
+    layer, depth = plate(0.08, 5e-3, youngs_modulus=2e4), 3e-3
+    simulator = Simulator(layer, Winkler(), friction=0.8)
+    middle = layer.vertices.mean(axis=0)
+
+    def told(x: float, height: float) -> Contact:
+        return Contact(BALL, at(middle[0] + x, middle[1], RADIUS + height))
+
+    def play(each: int) -> np.ndarray:
+        state, forces = State(), []
+        for k in range(11):
+            (_,), state = simulator.touch([told(-5e-3, -0.1 * k * depth)], state, 0.01)
+        for x in np.linspace(-5e-3, 4e-3, 20):
+            (_,), state = simulator.touch([told(x, -depth)], state, 0.01)
+        for k in range(1, 3 * each + 1):
+            part, dt = k / (3 * each), 0.05 / each
+            (touch,), state = simulator.touch([told(4e-3 - 15e-3 * part, (rises * part - 1) * depth)], state, dt)
+            if k % each == 0:
+                forces.append(touch.wrench[:3])
+        return np.array(forces)
+
+    fine, coarse = play(20), play(1)
+    assert np.abs(fine[:, 0]).min() > 0.1 * np.abs(fine[:, 2]).min()
+    assert np.linalg.norm(fine - coarse, axis=1).max() < 0.01 * np.linalg.norm(fine, axis=1).max()
+
+
 def test_what_sticks_fades_with_the_materials_that_carry_it() -> None:
     """By finite elements (ball of 12 mm, 5 mm deep in a back, dragged 1 mm and held 40 s, 0.8 of one material's modulus
     fading) 0.36 of the drag is left if that is skin, 0.73 if fat, 0.86 if muscle, 0.21 of all; of the push 0.87 to
@@ -486,5 +514,10 @@ def test_what_sticks_fades_with_the_materials_that_carry_it() -> None:
     assert left(every) == pytest.approx(0.2, abs=1e-3)  # tension pulls at nothing that is moved along the skin
     assert one_by_one[0] < 0.6 < 0.7 < one_by_one[1] < one_by_one[2] < 1
     assert left(replace(stack, skin=skin), 1e-3) < left(replace(stack, skin=skin), 0.05)
+    soft = Tissue(1e3, 0.45, skin=Membrane(2e5, 2e-3, 10.0), relaxation=Prony((0.92,), (1.0,)))  # to 80 Pa
+    assert 0 < fading_aside(soft, 18e-3).sum(axis=0).max() < 0.92
+    for times, merged in (((5.0, 0.5), (0.1, 0.3)), ((1.0, 1.0), (0.4,))):
+        mixed = Tissue(2.4e3, 0.45, relaxation=Prony((0.3, 0.1), times))
+        np.testing.assert_allclose(fading_aside(mixed, 18e-3)[:, 0], merged)
     alone = Tissue(2.4e3, 0.45, relaxation=series)
     assert left(alone) == pytest.approx(0.2) and not len(fading_aside(stack, 18e-3))

@@ -410,6 +410,9 @@ def test_a_state_of_skin_that_relaxes_or_is_dragged_otherwise_is_refused(sim: Si
     for again in (state, pickle.loads(pickle.dumps(state))):
         with pytest.raises(InvalidInput, match=f"state of {BALL.name} is of other tissue"):
             stiff.touch([pressed(2e-3)], again, 0.1)
+    skins = [Tissue(2e4, 0.4, skin=Membrane(2e5, 1e-3, 5.0, relaxation=one), relaxation=other).numbers
+             for one, other in ((SERIES, None), (None, SERIES))]  # fmt: skip
+    assert not np.array_equal(*skins)
     assert stiff.touch([pressed(2e-3)], State.unpack(state.pack()), 0.1)[1].finite  # of which nobody knows
     (_,), state = Simulator(sim.layer, Winkler()).touch([pressed(2e-3)], State(), 0.1)
     assert Simulator(sim.layer, Winkler()).touch([pressed(2e-3)], state, 0.1)[0][0].trust.ok

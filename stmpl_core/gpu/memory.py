@@ -18,6 +18,7 @@ import numpy as np
 from stmpl_core.errors import InvalidInput
 from stmpl_core.friction import Friction, coefficients
 from stmpl_core.green import Green
+from stmpl_core.history import is_of_other, number_of
 from stmpl_core.relaxation import RADII, fading, series_of
 from stmpl_core.sideways import Sideways, fading_aside
 from stmpl_core.skin import Skin
@@ -103,11 +104,14 @@ class Steps:
         for k, one in enumerate(series):
             shares[k, : len(one.times)], times[k, : len(one.times)] = one
         fades = np.zeros((len(skins), 2 + most, RADII[-1]))
+        rubs = bool((self._mu > 0).any())
         for skin, t, rows, terms in zip(skins, middle, fades, self._terms, strict=True):
-            rows[:2], rows[2 : 2 + terms] = fading(skin.layer.tissue, t), fading_aside(skin.layer.tissue, t)
+            rows[:2] = fading(skin.layer.tissue, t)
+            if rubs:
+                rows[2 : 2 + terms] = fading_aside(skin.layer.tissue, t)
+        self._tissues = [number_of(skin.layer.tissue) for skin in skins]
         self._series = shares, times, fades
         self._skins = np.array([float(skin.layer.tissue.skin is not None) for skin in skins])
-        rubs = bool((self._mu > 0).any())
         self.gives, self.bends = _along_skin(skins) if rubs else (np.empty((0, 3, 3)), np.empty((0, 3, 3)))
         aside = [Sideways(skin.layer) for skin in skins] if rubs else []
         wide = max((len(one._table) for one in aside), default=1)
@@ -140,6 +144,8 @@ class Steps:
                                        f"{self._terms[self._of[i]]}. Try None.")  # fmt: skip
                 size = size_of(memory.terms, trail=False)
                 out[i, k, :size] = memory.numbers[:size]
+            if state is not None and is_of_other(state, self._tissues[self._of[i]]):
+                raise InvalidInput(f"state {i} is of other tissue than its skin. Try None.")
         return WarpStates(out, self)
 
     def state(self, rows: np.ndarray, i: int) -> State:
@@ -150,7 +156,7 @@ class Steps:
             numbers[:size] = row[:size]
             if (memory := Memory(numbers)).scalars.pressing > NEVER:
                 found[tool.name] = memory
-        return State(found)
+        return State(found, tissue=self._tissues[self._of[i]])
 
     def step(self, patches: np.ndarray, states: WarpStates, dt: float) -> tuple[np.ndarray, WarpStates]:
         """Touches a step after some states: rows of PATCH up to the depth, (n, K, OUT), and the states then.
