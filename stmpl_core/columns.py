@@ -27,7 +27,6 @@ from stmpl_core.rays import (
     distance_in_column,
     inside_most,
     led_in,
-    led_on,
     ray_from,
     ray_of,
     sure_of,
@@ -545,8 +544,7 @@ def _sinking(grid, pose, points, inward, thickness, area, strain, sunk, push):
         more = depth_in_column(grid, ends, max(4 * guess, thickness[n]), guess) * cosine - depth[n]
         if more > 0:  # as far as its skin is inside the tool, and not at once
             begins = max(1 - distance_in_column(grid, ray, 0.0) / wall, sunk * (1 + inside / wall))
-            rises = max(wall, led_on(grid[3], thickness[n]) * (depth[n] + more))
-            more *= max(sure, 0.0) * min(max(begins, 0.0), depth[n] / rises, 1.0)
+            more *= max(sure, 0.0) * min(max(begins, 0.0), depth[n] / wall, 1.0)
         depth[n] = (1 + min(sure, 0.0)) * (depth[n] + more)
     return depth
 

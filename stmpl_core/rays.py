@@ -13,8 +13,6 @@ PASSED, MOST_PASSED = 7, 1024  # parts of a column's way between which it is loo
 ENTERS, LOOKS_BACK = 12, 0.15  # steps to where a column enters a tool, cosine from which its surface looks back there
 LOOKED_AT = 0.2 * WALL  # way over which it is asked whether it does, over the thickness
 SURE = 0.2  # how far inside a tool, over the width of a wall, it is clear where a way ends; so far outside: nowhere
-LED_ON = 0.5  # see led_on
-NARROW, WIDE = 0.03, 0.08  # half thickness of a tool, over the layer's, to which that is 0, and from which it is whole
 LEAST_ASIDE = 0.1  # square of the slope aside from which it is known on which side of a way a tool is
 ASLANT, UPRIGHT = 0.35, 0.15  # cosine to its tool's way from which skin goes with one that has sunk under it, and how
 # much more until it does so wholly
@@ -148,16 +146,6 @@ def sure_of(grid, ray, deep, wall):
     if inside < SURE * wall:
         inside, where = inside_most(grid, ray, deep, inside, -SURE * wall)
     return min(max(inside / (SURE * wall), -1.0), 1.0), inside, where
-
-
-@numba.njit(cache=True, inline="always")
-def led_on(half, t):
-    """Depth of a column, over that along the way of its tool, from which its skin sinks by the latter in full [-].
-
-    As a wall of a wide tool comes to a node or leaves it, it sinks as slowly as its depth changes; columns leave a thin
-    tool soon wherever they are.
-    """
-    return LED_ON * min(max((half / t - NARROW) / (WIDE - NARROW), 0.0), 1.0)
 
 
 @numba.njit(cache=True, error_model="numpy", **UNCOUNTED)

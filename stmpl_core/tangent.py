@@ -21,7 +21,7 @@ import numpy as np
 
 from stmpl_core.columns import grid_of, pushed, shared_pushes
 from stmpl_core.nodes import FACING
-from stmpl_core.rays import MAX_COLUMN_STRAIN, depth_in_column, distance_in_column, led_on, ray_from, wall_in
+from stmpl_core.rays import MAX_COLUMN_STRAIN, depth_in_column, distance_in_column, ray_from, wall_in
 from stmpl_core.sdf import distances_and_gradients
 from stmpl_core.touch import Pressed, Touch
 from stmpl_core.toucher import Toucher, groups_of
@@ -192,10 +192,8 @@ def _rates(grid, middle, pose, vertices, normals, thicknesses, points, inward, t
     if not slanted:
         return strains, deeper, moved, go, np.zeros((many, 3)), np.zeros((6, 8))
     rates = _pushed_on(points, inward, thickness, area, strain, deeper, go, turned)
-    walls, led = np.empty(len(thickness)), np.empty(len(thickness))
-    for n in range(len(thickness)):
-        walls[n], led[n] = wall_in(grid[3], thickness[n]), led_on(grid[3], thickness[n])
-    sunk, swing = _sunk(points, inward, depth, sinking, ends, walls, led, way, gradient[3], go, turned, deeper, origin)
+    walls = np.array([wall_in(grid[3], t) for t in thickness])
+    sunk, swing = _sunk(points, inward, depth, sinking, ends, walls, way, gradient[3], go, turned, deeper, origin)
     return strains, sunk, moved, go, swing, rates
 
 
@@ -356,12 +354,12 @@ def _deepened(points, inward, thickness, area, strain, columns, distance, gradie
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _sunk(points, inward, depth, sinking, ends, walls, led, way, gradient, go, turned, deeper, origin):
+def _sunk(points, inward, depth, sinking, ends, walls, way, gradient, go, turned, deeper, origin):
     """Rates of `Nodes.sinking`, (6, N), of depths along one way (3,) for all; and as that turns, (N, 3) [m].
 
     Args:
         ends: where the tool ends along that way, (N,) [m].
-        walls, led: see rays.wall_in, (N,) [m], and rays.led_on, (N,) [-].
+        walls: see rays.wall_in, (N,) [m].
     """
     out, swing, still = deeper.copy(), np.zeros((len(depth), 3)), np.zeros(3)
     for n in range(len(depth)):
@@ -370,18 +368,13 @@ def _sunk(points, inward, depth, sinking, ends, walls, led, way, gradient, go, t
         if abs(more) <= depth[n] * 1e-9 or abs(along) < LEAST_COSINE or cosine <= 0:
             continue
         share = min(max((sinking[n] - depth[n]) / more, 0.0), 1.0)  # of what it sinks more than its column says
-        width = max(walls[n], led[n] * s * cosine)
-        widens = led[n] if width > walls[n] else 0.0
-        rises = share < 1 and abs(share - depth[n] / width) < 0.02
+        rises = share < 1 and abs(share - depth[n] / walls[n]) < 0.02
         for k in range(6):
             rate = _entered(gradient[n], points[n], way, s, go[k, n], still, k, origin) / along
             rate = rate * cosine + s * _dot(turned[k, n], way)
-            out[k, n] += share * (rate - deeper[k, n])
-            if rises:
-                out[k, n] += more / width * (deeper[k, n] - share * widens * rate)
-        felt = share * (1 - (more * widens / width if rises else 0.0))
+            out[k, n] += share * (rate - deeper[k, n]) + (more * deeper[k, n] / walls[n] if rises else 0.0)
         for x in range(3):
-            swing[n, x] = felt * s * (inward[n, x] - cosine / along * gradient[n, x])
+            swing[n, x] = share * s * (inward[n, x] - cosine / along * gradient[n, x])
     return out, swing
 
 

@@ -5,7 +5,7 @@ import math
 
 import warp as wp
 
-from stmpl_core import columns, contact_net, green, rays
+from stmpl_core import columns, contact_net, green
 from stmpl_core.columns import MIN_ONE_WAY_SHARE
 from stmpl_core.gpu.blocks import sum_of, wait
 from stmpl_core.gpu.columns import _marked
@@ -27,7 +27,6 @@ from stmpl_core.networks import STACK_NODE
 from stmpl_core.response import SPREAD as SPREAD_OF_AREA
 
 ONE_WAY = wp.constant(wp.float64(MIN_ONE_WAY_SHARE))
-LED_ON, NARROW, WIDE = (wp.constant(wp.float64(x)) for x in (rays.LED_ON, rays.NARROW, rays.WIDE))
 AS_ONE, EACH_ITS_OWN = (wp.constant(wp.float64(x)) for x in columns.AS_ONE)
 NEAR_TOOLS, FAR_TOOLS = (wp.constant(wp.float64(x)) for x in contact_net.FAR_TOOLS)
 ROWS, FARTHEST, AROUND = (wp.constant(wp.float64(x)) for x in (green.ROWS, green.FARTHEST, green.AROUND))
@@ -148,9 +147,7 @@ def sink(lanes: wp.int32, many: wp.int32, skins: Skins, scratch: Scratch):
             if more > real(0.0):
                 inside = real(1.0) - along(grid, skins.coefficients, start, goes, real(0.0)) / wall
                 inside = wp.max(inside, sunk * (real(1.0) + most[0] / wall))
-                wide = wp.clamp((real(grid.half) / thick - NARROW) / (WIDE - NARROW), real(0.0), real(1.0))
-                rises = depth / wp.max(wall, LED_ON * wide * (depth + more))
-                more = more * wp.max(sure, real(0.0)) * wp.min(wp.clamp(inside, real(0.0), real(1.0)), rises)
+                more = more * wp.max(sure, real(0.0)) * wp.min(wp.clamp(inside, real(0.0), real(1.0)), depth / wall)
             sinking = (real(1.0) + wp.min(sure, real(0.0))) * (depth + more)
         scratch.sinking[s, i] = sinking
 
