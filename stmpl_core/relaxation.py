@@ -115,9 +115,12 @@ def _log_force(tissue: Tissue, thickness: float, radius: float, factors: np.ndar
 
 def _fades(tissue: Tissue, thickness: float, radius: float) -> float:
     """Share of the force under such a load that is gone once every material has relaxed [-]."""
-    left = np.maximum(1 - fading_moduli(tissue, thickness), LEAST_LEFT)
-    whole = _log_force(tissue, thickness, radius, np.ones(len(left)))
-    return 1 - float(np.exp(_log_force(tissue, thickness, radius, left) - whole))
+    return _gone(fading_moduli(tissue, thickness), lambda factors: _log_force(tissue, thickness, radius, factors))
+
+
+def _gone(fade: np.ndarray, log_force: Callable[[np.ndarray], float]) -> float:
+    """Share of a force that is gone in the end [-]; for the arguments see `borne_by`."""
+    return 1 - float(np.exp(log_force(np.maximum(1 - fade, LEAST_LEFT)) - log_force(np.ones(len(fade)))))
 
 
 def _shares(tissue: Tissue, thickness: float) -> list[float]:
@@ -142,10 +145,7 @@ def borne_by(fade: np.ndarray, log_force: Callable[[np.ndarray], float]) -> np.n
     up, down = ([log_force(one) for one in some] for some in (steps, 1 / steps))
     shares = np.subtract(up, down) / (2 * LOG_STEP)
     first_order = float(shares @ fade)
-    if not first_order > 0:
-        return shares
-    fades = 1 - np.exp(log_force(np.maximum(1 - fade, LEAST_LEFT)) - log_force(np.ones(len(fade))))
-    return shares * (fades / first_order)
+    return shares * (_gone(fade, log_force) / first_order) if first_order > 0 else shares
 
 
 @numba.njit(cache=True, error_model="numpy")
