@@ -15,7 +15,15 @@ import numpy as np
 from stmpl_core.arrays import Points, Transform, inverted
 from stmpl_core.compiling import UNCOUNTED
 from stmpl_core.layer import SoftLayer
-from stmpl_core.nodes import Nodes, ball_around, met_between, nodes_under, strains_beside
+from stmpl_core.nodes import (
+    Nodes,
+    ball_around,
+    between_corners,
+    column_between,
+    met_between,
+    nodes_under,
+    strains_beside,
+)
 from stmpl_core.rays import (
     ANYHOW,
     ASLANT,
@@ -45,6 +53,9 @@ BLOCK = 32  # columns that are looked at together
 FINEST = 0.02  # size of the parts of a long triangle at which the search for a tool in it ends, over the thickness
 AS_ONE = 1.8, 2.3  # distance of two tools' middles over the sum of their radii of gyration, up to which they press as
 # parts of one, and from which each its own way: quarters of a ball that share a side are up to 1.7 apart
+SHEET, LEAST_MISSED = 0.5, 0.35  # thickness of a tool over its second longest side, and an edge over that, from which
+# vertices' columns may miss that it leans under skin
+BETWEEN, MOST_BETWEEN = 1.5, 12  # parts of half an edge of which one is as long as a third of that side; at most
 HOLE_RADIUS = 0.6  # farthest point of a triangle from its corners, over the edge length (equilateral: 0.577)
 
 
@@ -185,8 +196,8 @@ class Columns:
             return NO_SQUEEZE
         vertices, depth, rests, top, push, *nodes = _squeezed(
             grid_of(field), pose, middle_of(field, pose), self.points, self.inward, self.layer.thickness, self.faces,
-            self._start, self._around, self._slot, *clearance[:3], hole, self.layer.stacked, self._order, self._blocks,
-            *field.tool_bounds)  # fmt: skip
+            self._start, self._around, self._slot, *clearance[:3], hole, parts_between(field, self.layer.edge_length),
+            self.layer.stacked, self._order, self._blocks, *field.tool_bounds)  # fmt: skip
         return Squeeze(vertices, depth, rests, Nodes(*nodes), top, push)
 
     def as_one(self, tools: Sequence[tuple[SignedDistance, Transform, Squeeze]]) -> list[Squeeze]:
@@ -234,6 +245,22 @@ def shifted(pose: Transform, by: np.ndarray) -> Transform:
 def grid_of(field: SignedDistance) -> tuple[np.ndarray, np.ndarray, float, float]:
     """What kernels take of a distance field: coefficients, origin, spacing and half thickness."""
     return field.coefficients, field.origin, field.spacing, field.half_thickness
+
+
+def parts_between(field: SignedDistance, edge_length: float) -> int:
+    """Parts of half an edge between which a tool is looked for under skin: 0 of one that no vertices' columns miss.
+
+    A thin sheet that leans, and that is no wider than a few edges, sinks under skin between them.
+
+    Args:
+        field: distance field of the tool.
+        edge_length: mean edge length of the skin [m].
+    """
+    low, high = field.tool_bounds
+    wide = float(np.sort(high - low)[1])
+    if 2 * field.half_thickness > SHEET * wide or edge_length < LEAST_MISSED * wide:
+        return 0
+    return min(math.ceil(BETWEEN * edge_length / max(wide, 1e-12)), MOST_BETWEEN)
 
 
 def _along_a_curve(points: Points) -> np.ndarray:
@@ -345,45 +372,88 @@ def _clear(grid, pose, points, inward, thickness, near, far, out, skin):
     nearest = np.inf
     for n in range(len(near)):
         v = near[n]
-        t, ray = thickness[v], ray_of(pose, points, inward, v)
-        skin[n] = d = distance_in_column(grid, ray, 0.0)
-        if d > t + far:
-            out[n] = d - t  # the rest of the column cannot be nearer
-            nearest = min(nearest, out[n])
-            continue
-        least, s = d, 0.0
-        while s < t:
-            step = max(abs(d), d - least, min(t / 16, grid[3]))  # on the way out of the tool nothing nearer comes soon
-            s = min(s + step, t)
-            d = distance_in_column(grid, ray, s)
-            least = min(least, d)
-        if d <= 0 and distance_in_column(grid, ray, t + 1e-5) < d:
-            least = np.inf
-        out[n] = least
-        nearest = min(nearest, least)
+        out[n], skin[n] = _along_column(grid, ray_of(pose, points, inward, v), thickness[v], far)
+        nearest = min(nearest, out[n])
     return nearest
+
+
+@numba.njit(forceinline=True, cache=True, **UNCOUNTED)
+def _along_column(grid, ray, t, far):
+    """Least signed distance along a column, and that at its skin [m]: see `clearances`."""
+    above = d = distance_in_column(grid, ray, 0.0)
+    if d > t + far:
+        return d - t, above  # the rest of the column cannot be nearer
+    least, s = d, 0.0
+    while s < t:
+        step = max(abs(d), d - least, min(t / 16, grid[3]))  # on the way out of the tool nothing nearer comes soon
+        s = min(s + step, t)
+        d = distance_in_column(grid, ray, s)
+        least = min(least, d)
+    if d <= 0 and distance_in_column(grid, ray, t + 1e-5) < d:
+        least = np.inf
+    return least, above
+
+
+@numba.njit(forceinline=True, cache=True, **UNCOUNTED)
+def _further_in(grid, ray, t, least, above, under):
+    """How much further inside a tool a column gets below its skin, or nearer to it, than there; and `under` [m]."""
+    under = max(under, -least - max(-above, 0.0))
+    if above - least > under:  # of a thin tool between two vertices these know that it leans under skin
+        under = max(under, min(above, distance_in_column(grid, ray, t)) - least)
+    return under
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy", **UNCOUNTED)
+def _under_between(grid, pose, points, inward, thickness, faces, start, around, covered, parts, under, enough):
+    """See `_further_in`, of columns between covered vertices too, each in the triangles around the nearest of these.
+
+    Args:
+        parts: see `parts_between`.
+        under, enough: what is known, and what ends the search [m].
+    """
+    for v in covered:
+        for p in range(start[v], start[v + 1]):
+            f, at = around[p], 0
+            for k in range(3):
+                if faces[f, k] == v:
+                    at = k
+            j, k = faces[f, (at + 1) % 3], faces[f, (at + 2) % 3]
+            for q in range(parts * parts):
+                b, c = (q // parts + 0.5) / (2 * parts), (q % parts + 0.5) / (2 * parts)
+                if max(b, c) > 1 - b - c:
+                    continue
+                x, y, z = between_corners(points, v, j, k, 1 - b - c, b, c)
+                n0, n1, n2, t = column_between(inward, thickness, v, j, k, 1 - b - c, b, c)
+                ray = ray_from(pose, x, y, z, n0, n1, n2)
+                least, above = _along_column(grid, ray, t, 0.0)
+                if least < np.inf:
+                    under = _further_in(grid, ray, t, least, above, under)
+                if under >= enough:
+                    return under
+    return under
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _squeezed(grid, pose, centre, points, inward, thickness, faces, start, around, slot, near, least, above, hole,
-              stacked, order, blocks, low, high):  # fmt: skip
+              parts, stacked, order, blocks, low, high):  # fmt: skip
     """Parts of a Squeeze: vertices, depth, rests, top, and those of its nodes; their sinking only of a stack.
 
     Args:
         centre: middle of the tool, in the body's frame, (3,) [m].
         near, least, above: what a Clearance knows.
         hole: distance from which a tool is beside a column [m].
+        parts: see `parts_between`.
         order, blocks, low, high: see _through_box.
     """
     covered, under, wall = near[least < hole], -np.inf, 0.0
     for n in range(len(near)):
-        if least[n] < hole:  # of a thin tool between two vertices these know that it leans under skin
+        if least[n] < hole:
             v = near[n]
             wall += WALL * thickness[v] / len(covered)
-            under = max(under, -least[n] - max(-above[n], 0.0))
-            if above[n] - least[n] > under:
-                end = distance_in_column(grid, ray_of(pose, points, inward, v), thickness[v])
-                under = max(under, min(above[n], end) - least[n])
+            under = _further_in(grid, ray_of(pose, points, inward, v), thickness[v], least[n], above[n], under)
+    if parts > 0:
+        under = _under_between(grid, pose, points, inward, thickness, faces, start, around, covered, parts, under,
+                               ALL_UNDER * wall)  # fmt: skip
     top = NOT_SUNK.copy()
     if under > LEAST_UNDER * wall:  # a layer that is thin beside the limb has no columns that lead so far aside
         top = _top(pose, inward, near, least, above, hole) if stacked else UNSAID.copy()

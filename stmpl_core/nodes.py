@@ -240,7 +240,7 @@ def _cell(step, thick):
 
 
 @numba.njit(cache=True, inline="always")
-def _between_corners(values, i, j, k, a, b, c):
+def between_corners(values, i, j, k, a, b, c):
     """Vector at barycentric coordinates a, b, c of the triangle of vertices i, j, k, three numbers."""
     return (a * values[i, 0] + b * values[j, 0] + c * values[k, 0],
             a * values[i, 1] + b * values[j, 1] + c * values[k, 1],
@@ -248,9 +248,9 @@ def _between_corners(values, i, j, k, a, b, c):
 
 
 @numba.njit(cache=True, inline="always")
-def _column(inward, thickness, i, j, k, a, b, c):
+def column_between(inward, thickness, i, j, k, a, b, c):
     """Unit inward normal and thickness at barycentric coordinates of the triangle of these vertices, four numbers."""
-    x, y, z = _between_corners(inward, i, j, k, a, b, c)
+    x, y, z = between_corners(inward, i, j, k, a, b, c)
     length = 1 / np.sqrt(max(x * x + y * y + z * z, 1e-300))
     return x * length, y * length, z * length, a * thickness[i] + b * thickness[j] + c * thickness[k]
 
@@ -389,10 +389,10 @@ def _look_at(grid, pose, points, inward, thickness, faces, found, top, sunk, sha
         sizes[m], edges[m] = 0.5 * size / parts, np.sqrt((ax * ax + ay * ay + az * az) / parts)
         for q in range(parts):
             a, b = shares[q, 0], shares[q, 1]
-            x, y, z = _between_corners(points, i, j, k, a, b, 1 - a - b)
+            x, y, z = between_corners(points, i, j, k, a, b, 1 - a - b)
             depth = -_distance(grid, pose, x, y, z)
             if sunk:
-                n0, n1, n2, t = _column(inward, thickness, i, j, k, a, b, 1 - a - b)
+                n0, n1, n2, t = column_between(inward, thickness, i, j, k, a, b, 1 - a - b)
                 least = -BESIDE * edges[m] - WALL * t
                 depth = _inside(grid, ray_from(pose, x, y, z, n0, n1, n2), t, depth, least, top)
             depths[m, q], middles[m, q, 0], middles[m, q, 1], middles[m, q, 2] = depth, x, y, z
@@ -588,7 +588,7 @@ def _on_triangles(grid, pose, centre, points, inward, thickness, faces, found, t
                 if a < -1e-9 or b < -1e-9 or c < -1e-9:
                     continue
                 taken[j - low, i - left] = True
-                x, y, z = _between_corners(points, f0, f1, f2, a, b, c)
+                x, y, z = between_corners(points, f0, f1, f2, a, b, c)
 
                 share = -1.0
                 if not sunk:  # what is known of the middle of its part may say enough
@@ -605,12 +605,12 @@ def _on_triangles(grid, pose, centre, points, inward, thickness, faces, found, t
                 if only_look and share < 0:
                     depth = -_distance(grid, pose, x, y, z)
                     if sunk:
-                        n0, n1, n2, t = _column(inward, thickness, f0, f1, f2, a, b, c)
+                        n0, n1, n2, t = column_between(inward, thickness, f0, f1, f2, a, b, c)
                         depth = _inside(grid, ray_from(pose, x, y, z, n0, n1, n2), t, depth, -border, top)
                     share = min(max(0.5 + depth / blur, 0.0), 1.0)
                     if share <= 0:
                         continue
-                n0, n1, n2, t = _column(inward, thickness, f0, f1, f2, a, b, c)
+                n0, n1, n2, t = column_between(inward, thickness, f0, f1, f2, a, b, c)
                 part = cell / max(n0 * way[0] + n1 * way[1] + n2 * way[2], FACING)
                 if only_look:
                     sum_area += share * part

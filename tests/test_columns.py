@@ -299,6 +299,24 @@ def test_a_leaning_stylus_sinks_under_skin_without_a_step_whatever_the_mesh(lean
     assert np.abs(by_mesh / by_mesh[0] - 1).max() < 0.02
 
 
+@pytest.mark.parametrize("stacked", [False, True])
+@pytest.mark.parametrize("lean", [0.5, 0.9, 1.2])
+def test_a_thin_sheet_that_leans_between_two_vertices_has_sunk_under_skin(lean: float, stacked: bool) -> None:
+    """Its skin comes to 0.3 mm of it only, whatever lies below."""
+    sheet, pose, depths = box(0.01, 0.006, 3e-4), turn((0, 1, 0), lean), np.arange(1.5e-3, 6e-3, 2e-4)
+    tip, field, volumes = float((sheet.vertices @ pose[2, :3]).min()), SignedDistance.of(sheet, margin=0.02), []
+    for edge in (2e-3, 4e-3, 8e-3, 16e-3):
+        layer = plate(0.128, edge, 0.012)
+        columns = Columns(layer.with_(tissue=STACK) if stacked else layer)
+        for depth in depths:
+            pose[:3, 3] = 1e-3, 2e-3, -depth - tip
+            nodes = columns.squeezed(field, pose).nodes
+            volumes.append(float(nodes.area @ (nodes.strain * nodes.thickness)))
+    by_mesh = np.array(volumes).reshape(4, -1)
+    assert (np.diff(by_mesh) > 0).all()
+    assert np.abs(by_mesh / by_mesh[0] - 1).max() < 0.1
+
+
 def test_skin_under_a_thin_pin_sinks_with_it_where_columns_lead_out_of_its_wall() -> None:
     """On an uneven forearm, where they differ by 20 degrees under a pin of 4 mm."""
     layer, pin = living(Body.anny(), "left_forearm", edge_length=6e-3), punch(0.002, 0.03)

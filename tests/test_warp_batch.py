@@ -15,7 +15,7 @@ from stmpl_core.errors import InvalidInput
 from stmpl_core.living import living
 from stmpl_core.methods import LimbLinear, MomentNet, Winkler
 from stmpl_core.skin import Skin
-from tests.scenes import LENGTH, RADIUS, at, ball, band, box, brush, capsule, limb, punch, tool, v_block, wire
+from tests.scenes import LENGTH, RADIUS, at, ball, band, box, brush, capsule, limb, punch, tool, turn, v_block, wire
 from tests.test_folds import FINGERS, LAYERED
 
 wp = pytest.importorskip("warp")
@@ -118,6 +118,16 @@ def test_touches_are_those_of_numba(arm: Skin, one: Tool, reach: float) -> None:
     same(found, expected, 0.5)
     deep = ~found.served
     assert (np.array(STATUSES)[found.statuses.numpy()][deep] == "too deep").all() and not expected.in_range[deep].any()
+
+
+@pytest.mark.parametrize("on_layers", [False, True])
+def test_a_thin_sheet_that_leans_is_found_between_vertices_here_too(layered: Skin, on_layers: bool) -> None:
+    skin = layered if on_layers else Skin.of(limb(16e-3, 0.012, THICK, LONG), MomentNet(sticks=False))
+    sheet, poses = box(0.01, 0.006, 3e-4), np.tile(turn((0, 1, 0), np.pi / 2 - 0.8), (4, 1, 1, 1))
+    tip = float((sheet.vertices @ poses[0, 0, 0, :3]).min())
+    for pose, depth in zip(poses[:, 0], (1e-3, 2e-3, 3e-3, 4e-3), strict=True):
+        pose[:3, 3] = THICK - depth - tip, 0.0, LONG / 2
+    same(made(skin, [sheet], 4).touch(poses), Batch(skin, [sheet], 4, threads=1).touch(poses))
 
 
 def test_a_tool_around_the_limb_lies_on_several_charts(cylinder: Skin) -> None:

@@ -3,6 +3,7 @@
 
 import warp as wp
 
+from stmpl_core import columns as of_numba
 from stmpl_core import rays
 from stmpl_core.columns import ALL_UNDER, LEAST_UNDER, MIN_ONE_WAY_SHARE
 from stmpl_core.columns import BLOCK as IN_BLOCK
@@ -15,6 +16,7 @@ from stmpl_core.gpu.rays import (
     OPTIONS,
     SLANT,
     WALL_WIDTH,
+    Grid,
     along,
     clearance_of,
     depth_and_share,
@@ -28,6 +30,8 @@ BLOCK, EDGE = wp.constant(IN_BLOCK), wp.constant(EDGE_BIT)
 UNDER, TOO_DEEP = wp.constant(wp.float64(LEAST_UNDER)), wp.constant(wp.float64(DEEPEST))
 SINKS = wp.constant(wp.float64(ALL_UNDER - LEAST_UNDER))
 ANYHOW, ONE_WAY = wp.constant(wp.float64(rays.ANYHOW)), wp.constant(wp.float64(MIN_ONE_WAY_SHARE))
+SHEET, LEAST_MISSED = wp.constant(wp.float64(of_numba.SHEET)), wp.constant(wp.float64(of_numba.LEAST_MISSED))
+BETWEEN, MOST_BETWEEN = wp.constant(wp.float64(of_numba.BETWEEN)), wp.constant(of_numba.MOST_BETWEEN)
 wp.set_module_options(OPTIONS)
 
 
@@ -146,6 +150,52 @@ def clear(lanes: wp.int32, again: wp.int32, skins: Skins, scratch: Scratch):
         scratch.above[c, n] = above
 
 
+@wp.func
+def _parts_between(grid: Grid, edge: real) -> wp.int32:
+    """Parts of half an edge between which a tool is looked for under skin: stmpl_core.columns.parts_between."""
+    size, out = grid.high - grid.low, wp.int32(0)
+    wide = wp.max(wp.min(size[0], size[1]), wp.min(wp.max(size[0], size[1]), size[2]))
+    if real(2.0) * grid.half <= SHEET * wide and edge >= LEAST_MISSED * wide:
+        out = wp.min(wp.int32(wp.ceil(BETWEEN * edge / wp.max(wide, real(1e-12)))), MOST_BETWEEN)
+    return out
+
+
+@wp.func
+def _further_in(
+    skins: Skins, grid: Grid, start: vec3, way: vec3, t: real, least: real, above: real, under: real
+) -> real:
+    """How much further inside a tool a column gets below its skin, or nearer to it: stmpl_core.columns._further_in."""
+    out = wp.max(under, -least - wp.max(-above, real(0.0)))
+    if above - least > out:
+        out = wp.max(out, wp.min(above, along(grid, skins.coefficients, start, way, t)) - least)
+    return out
+
+
+@wp.func
+def _under_between(skins: Skins, scratch: Scratch, c: wp.int32, v: wp.int32, parts: wp.int32, least: real) -> real:
+    """The same of columns in the triangles around a vertex, the nearest: stmpl_core.columns._under_between."""
+    grid, pose, under = skins.grids[scratch.grid[c]], wp.transpose(scratch.pose[c]), real(least)
+    for p in range(skins.start[v], skins.start[v + 1]):
+        corners, at = skins.faces[skins.around[p]], wp.int32(0)
+        for x in range(3):
+            if corners[x] == v:
+                at = x
+        j, k = corners[(at + 1) % 3], corners[(at + 2) % 3]
+        for q in range(parts * parts):
+            half = real(1.0) / real(2 * parts)
+            b, d = (real(q // parts) + real(0.5)) * half, (real(q % parts) + real(0.5)) * half
+            a = real(1.0) - b - d
+            if wp.max(b, d) <= a:
+                place = a * skins.points[v] + b * skins.points[j] + d * skins.points[k]
+                way = pose * wp.normalize(a * skins.inward[v] + b * skins.inward[j] + d * skins.inward[k])
+                t = a * skins.thickness[v] + b * skins.thickness[j] + d * skins.thickness[k]
+                start = pose * (place - scratch.place[c])
+                near, above = clearance_of(grid, skins.coefficients, start, way, t, real(0.0))
+                if near < FAR:
+                    under = _further_in(skins, grid, start, way, t, near, above, under)
+    return under
+
+
 @wp.kernel
 def gather_clearance(again: wp.int32, skins: Skins, scratch: Scratch):
     """Least of these distances; masks of the columns that are covered; whether the tool has sunk under skin."""
@@ -154,7 +204,7 @@ def gather_clearance(again: wp.int32, skins: Skins, scratch: Scratch):
         return
     one, grid, pose = skins.one[scratch.skin[c]], skins.grids[scratch.grid[c]], wp.transpose(scratch.pose[c])
     nearest, around, under, wall, covers = real(FAR), -FAR, -FAR, real(0.0), wp.int32(0)
-    met, whole = vec3(), real(0.0)
+    met, whole, parts = vec3(), real(0.0), _parts_between(grid, one.edge)
     for n in range(scratch.count[c]):
         least, above = scratch.least[c, n], scratch.above[c, n]
         nearest = wp.min(nearest, least)
@@ -164,11 +214,10 @@ def gather_clearance(again: wp.int32, skins: Skins, scratch: Scratch):
         met = met + weight * skins.inward[scratch.columns[c, n]]
         if again == 0 and least < one.hole:
             v = scratch.columns[c, n]
-            under = wp.max(under, -least - wp.max(-above, real(0.0)))
-            if above - least > under:
-                start, way = pose * (skins.points[v] - scratch.place[c]), pose * skins.inward[v]
-                end = along(grid, skins.coefficients, start, way, skins.thickness[v])
-                under = wp.max(under, wp.min(above, end) - least)
+            start, way = pose * (skins.points[v] - scratch.place[c]), pose * skins.inward[v]
+            under = _further_in(skins, grid, start, way, skins.thickness[v], least, above, under)
+            if parts > 0:
+                under = _under_between(skins, scratch, c, v, parts, under)
             wall += skins.thickness[v]
             covers += 1
             _mark(scratch.covered, c, v - one.first)
