@@ -16,8 +16,10 @@ import skfem
 from scipy.sparse import coo_matrix
 from scipy.sparse.linalg import splu
 
+from stmpl_core.errors import InvalidInput
 from stmpl_core.tissue import Membrane, Tissue
 
+FARTHEST = 2.0  # angle from the contact to the rim of a stack around a ball, at most [rad]
 WIDE = 4.0  # distance from the contact to the plate's rim, which is held [thicknesses]
 PER_KAPPA = 0.2  # of that, more for each unit of E_s h / (E t): skin carries strain further
 PENALTY = 300.0  # stiffness with which skin is held where it stuck [E over the thickness of the contact's elements]
@@ -191,17 +193,28 @@ class Points:
 
 @dataclass(frozen=True)
 class Flat:
-    """A flat stack on a rigid base.
+    """A flat stack on a rigid base; or one around a rigid ball.
 
     Args:
         tissue: materials, and the skin on them.
         thickness: thickness [m].
         fine: factor on the number of elements each way.
+        radius: of the ball that its outer surface is a part of [m]; infinite: flat.
+
+    Raises:
+        InvalidInput: the radius is not above the thickness, or skin that is pulled would lift off a ball at rest.
     """
 
     tissue: Tissue
     thickness: float
     fine: float = 1.0
+    radius: float = np.inf
+
+    def __post_init__(self) -> None:
+        if not self.radius > self.thickness:
+            raise InvalidInput(f"radius is {self.radius:g} m; it must be above the thickness, {self.thickness:g} m.")
+        if self.radius < np.inf and self.tissue.skin and self.tissue.skin.tension:
+            raise InvalidInput("Skin that is pulled is known on a flat stack only, not around a ball.")
 
     def press(self, tool: Profile, depths: Sequence[float]) -> list[Round]:
         """Presses a tool in that sticks wherever it touches, to depths [m] that increase; ends where Newton does."""
@@ -227,11 +240,13 @@ class _Solver:
         tissue, t, self.tool = flat.tissue, flat.thickness, tool
         mesh, kinds, finest = _mesh(flat, tool, deepest)
         element = skfem.ElementVector(skfem.ElementQuad2())
-        self.basis = basis = skfem.Basis(mesh, element, intorder=4)
         top = mesh.facets_satisfying(lambda x: np.isclose(x[1], 0.0))
+        flat_basis, far = skfem.Basis(mesh, element, intorder=4), mesh.p[0].max()
+        held = flat_basis.get_dofs(lambda x: np.isclose(x[1], -t) | np.isclose(x[0], far)).all()
+        axis = flat_basis.get_dofs(lambda x: np.isclose(x[0], 0.0)).all("u^1")
+        mesh = _around(mesh, flat.radius)
+        self.basis = basis = skfem.Basis(mesh, element, intorder=4)
         self.inside, self.skin = Points(basis), Points(skfem.FacetBasis(mesh, element, facets=top, intorder=5))
-        held = basis.get_dofs(lambda x: np.isclose(x[1], -t) | np.isclose(x[0], mesh.p[0].max())).all()
-        axis = basis.get_dofs(lambda x: np.isclose(x[0], 0.0)).all("u^1")
         self.free = np.setdiff1d(np.arange(basis.N), np.union1d(held, axis))
         self.pull = membrane(tissue.skin) if tissue.skin else None
         laws = [neo_hookean(tissue.youngs_modulus, tissue.poisson_ratio)]
@@ -315,6 +330,15 @@ class _Solver:
                      moved.reshape(2, -1)[:, order])  # fmt: skip
 
 
+def _around(mesh: skfem.MeshQuad, radius: float) -> skfem.MeshQuad:
+    """A flat mesh bent around a ball of a radius [m]: heights stay, and lengths along the outer surface."""
+    if radius == np.inf:
+        return mesh
+    along, height = mesh.p
+    out, up = radius + height, along / radius
+    return skfem.MeshQuad(np.vstack([out * np.sin(up), out * np.cos(up) - radius]), mesh.t)
+
+
 def _mesh(flat: Flat, tool: Profile, deepest: float) -> tuple[skfem.MeshQuad, np.ndarray, float]:
     """Quadrilaterals, finest under the tool, the material of each, and the length of the finest [m]."""
     tissue, t = flat.tissue, flat.thickness
@@ -325,7 +349,7 @@ def _mesh(flat: Flat, tool: Profile, deepest: float) -> tuple[skfem.MeshQuad, np
     many = int(round(flat.fine * 20))
     size = near / many
     r = [near * k / many for k in range(many + 1)]
-    end, growing = near + (WIDE + PER_KAPPA * kappa) * t, size
+    end, growing = min(near + (WIDE + PER_KAPPA * kappa) * t, max(FARTHEST * flat.radius, near + t)), size
     while r[-1] < end:
         growing = min(1.3 * growing, 0.35 * t / flat.fine)
         r.append(r[-1] + growing)

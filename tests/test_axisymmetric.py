@@ -5,18 +5,21 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import trimesh
+from scipy.spatial.transform import Rotation
 
 from benchmarks.axisymmetric import PLATE, RADIUS, Plate, forces, ground_truth, neo_hookean
 from benchmarks.tools import flat
 from fem_tools import IndenterFem, PatchFem, Press
 from fem_tools.axisymmetric import Flat, Profile, membrane
 from stmpl_core.contact import Contact
+from stmpl_core.errors import InvalidInput
+from stmpl_core.layer import SoftLayer
 from stmpl_core.methods import MomentNet
 from stmpl_core.sdf import SignedDistance
 from stmpl_core.simulator import Simulator
 from stmpl_core.stack import ball_force
 from stmpl_core.tissue import Membrane, Tissue
-from tests.scenes import at, plate, wire
+from tests.scenes import at, ball, contact_of, plate, wire
 
 ROUGH = replace(PLATE, fine=0.5)
 T = PLATE.thickness
@@ -62,7 +65,7 @@ def test_a_single_layer_has_no_skin_to_be_solid():
     assert forces(bare, RADIUS, [0.1 * T]) == forces(replace(bare, solid_skin=True), RADIUS, [0.1 * T])
 
 
-BALL = Profile((0.0, 0.0), (0.0, 0.0), RADIUS)
+BALL, BALL_12 = (Profile((0.0, 0.0), (0.0, 0.0), radius) for radius in (RADIUS, 0.012))
 
 
 def test_skin_that_sticks_bears_more_than_skin_that_slides():
@@ -118,6 +121,38 @@ def test_indenter_fem_agrees_under_a_flat_punch_from_first_touch_on():
     ours = [answer.force for answer in fem.path([start], depths)]
     others = [one.force for one in Flat(layer.tissue, thick).press(Profile((0, 0), (7.5e-3, 0), 1.5e-3), depths)]
     np.testing.assert_allclose(ours, others, rtol=0.04)
+
+
+def test_a_stack_around_a_large_ball_is_a_flat_one_and_around_a_small_one_stiffer():
+    """It narrows towards the base. `RigidFem` on a ball of triangles, finest: 0.127 N at 0.45."""
+    tissue, thick = Tissue(1e3, 0.42), 0.012
+    flat_one, hardly, round_one = (
+        Flat(tissue, thick, fine=0.7, radius=radius).press(BALL_12, [0.2 * thick, 0.45 * thick])
+        for radius in (np.inf, 50.0, 0.05)
+    )
+    assert hardly[1].force == pytest.approx(flat_one[1].force, rel=3e-3)
+    assert round_one[1].force == pytest.approx(0.1273, rel=0.05)
+    for radius, skin in ((0.01, None), (0.1, Membrane(1e5, 1e-3, 10.0))):
+        with pytest.raises(InvalidInput, match=r"above the thickness|pulled"):
+            Flat(replace(tissue, skin=skin), thick, radius=radius)
+
+
+@pytest.mark.parametrize("thickness", [8e-3, 0.0115])
+def test_skin_that_is_round_like_a_ball_is_within_its_bound_or_flagged(thickness):
+    """No training contact was: the network takes off up to 29 % too much where tissue is thick beside the ball."""
+    mesh, flagged = trimesh.creation.icosphere(5, 0.05), thickness > 9e-3
+    layer = SoftLayer(mesh.vertices, mesh.faces, thickness, tissue=Tissue(1e3, 0.42))
+    depths, way = [0.25 * thickness, 0.45 * thickness, 0.65 * thickness], layer.normals[100]
+    fem = Flat(layer.tissue, thickness, fine=0.7, radius=0.05)
+    for tool, profile, reach in ((ball(0.012), BALL_12, 0.012), (flat(12, 2), Profile((0, 0), (0.01, 0), 2e-3), None)):
+        turned = np.eye(4)
+        turned[:3, :3] = Rotation.align_vectors(way, (0, 0, 1))[0].as_matrix()
+        low = reach if reach else -float(tool.vertices[:, 2].min())
+        for depth, true in zip(depths, fem.press(profile, depths), strict=True):
+            turned[:3, 3] = layer.vertices[100] + (low - depth) * way
+            (touch,) = Simulator(layer, MomentNet()).touch([contact_of(tool, turned)])
+            assert abs(touch.force - true.force) < touch.force_bound
+            assert touch.trust.in_range != flagged
 
 
 @pytest.mark.parametrize(("thickness", "flagged"), [(1e-3, [False, True]), (4e-3, [False, False])])

@@ -143,6 +143,16 @@ def test_a_tool_that_presses_from_several_sides_is_flagged_here_too(cylinder: Sk
     assert found.in_range.numpy().all() == sound
 
 
+@pytest.mark.parametrize(("thickness", "sound"), [(8e-3, True), (0.0115, False)])
+def test_skin_that_is_round_like_a_ball_is_doubted_here_too(thickness: float, sound: bool) -> None:
+    mesh = trimesh.creation.icosphere(4, 0.05)
+    skin = Skin.of(SoftLayer(mesh.vertices, mesh.faces, thickness), MomentNet(sticks=False))
+    poses = at(0.05 + 0.012 - 0.4 * thickness, 0, 0)[None, None]
+    found = made(skin, [LEFT], 1).touch(poses)
+    same(found, Batch(skin, [LEFT], 1).touch(poses))
+    assert found.in_range.numpy().all() == sound
+
+
 @pytest.mark.parametrize("tissue", [
     Tissue(1e3, 0.45, deeper=(Ply(0.012, 80e3, 0.45),)), Tissue(3e3, 0.45, deeper=(Ply(6e-3, 15e3, 0.36),)),
     Tissue(3e3, 0.45, skin=Membrane(1e5, 1.2e-3, 90.0), deeper=(Ply(6e-3, 15e3, 0.45),)),

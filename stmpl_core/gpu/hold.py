@@ -28,6 +28,8 @@ FADE, FADE_RING = wp.constant(wp.float64(contact_net.FADE)), wp.constant(contact
 NEAR_NONE, NEAR_WHOLE, FAR_NONE, FAR_WHOLE, FELT_NONE, FELT_WHOLE, DEEP_NONE, DEEP_WHOLE = (
     wp.constant(wp.float64(x)) for x in (*contact_net.THIN_NEAR, *contact_net.THIN_FAR, *contact_net.THIN_FELT,
                                          *contact_net.THIN_DEEP))  # fmt: skip
+DOMED_NONE, DOMED_WHOLE, TOO_NONE, TOO_WHOLE, DOMED_DOUBT = (
+    wp.constant(wp.float64(x)) for x in (*contact_net.DOMED, *contact_net.TOO_DOMED, contact_net.DOMED_DOUBT))
 THIN_DOUBT, ONE_SEES = wp.constant(wp.float64(contact_net.THIN_DOUBT)), wp.constant(NODE.size)
 LARGEST = wp.constant(wp.float64(contact_net.MAX_LOG_RATIO))
 START, SMALL, SMALLER = (wp.constant(wp.float64(x)) for x in (0.3, 1e-3, 1e-4))
@@ -323,8 +325,12 @@ def judge(lanes: wp.int32, scratch: Scratch, net: Net):
             strain, log_strain = real(scratch.inputs[s, i, AT_STRAIN]), scratch.inputs[s, i, AT_LOG_STRAIN]
             thin = _ramp(real(scratch.inputs[s, i, AT_MOMENTS + RINGS] - log_strain), NEAR_NONE, NEAR_WHOLE)
             thin *= _ramp(real(scratch.inputs[s, i, AT_MOMENTS + RINGS + 2] - log_strain), FAR_NONE, FAR_WHOLE)
-            scratch.error[s, i] = real(1.0) + THIN_DOUBT * thin * _ramp(strain, FELT_NONE, FELT_WHOLE)
-            scratch.strange[s, i] = thin * _ramp(strain, DEEP_NONE, DEEP_WHOLE)
+            both = real(scratch.inputs[s, i, AT_MEAN])
+            both -= wp.sqrt(wp.max(real(scratch.inputs[s, i, AT_SQUARED]), real(0.0)))
+            domed = real(1.0) + DOMED_DOUBT * _ramp(both, DOMED_NONE, DOMED_WHOLE)
+            scratch.error[s, i] = (real(1.0) + THIN_DOUBT * thin * _ramp(strain, FELT_NONE, FELT_WHOLE)) * domed
+            far = _ramp(both, TOO_NONE, TOO_WHOLE)
+            scratch.strange[s, i] = wp.max(thin * _ramp(strain, DEEP_NONE, DEEP_WHOLE), far)
         for m in range(net.low.shape[0]):
             given = scratch.inputs[s, i, m]
             kept = wp.clamp(given, net.low[m], net.high[m])
