@@ -380,7 +380,8 @@ def tool_message(tool: Tool, stamp_ns: int) -> Any:
 
 def topology_message(layer: SoftLayer, body_frame: str, stamp_ns: int) -> Any:
     """A layer as a SkinTopology."""
-    more = not layer.tissue.single or layer.tissue.relaxes or layer.ply_scale is not None or layer.bony is not None
+    tissue = layer.tissue
+    more = bool(tissue.skin or tissue.deeper) or tissue.relaxes or layer.ply_scale is not None or layer.bony is not None
     return message_class("stmpl_msgs/msg/SkinTopology")(
         header=header(body_frame, stamp_ns),
         layer_id=layer_id(layer),

@@ -25,7 +25,7 @@ def pack(layer: SoftLayer) -> dict[str, np.ndarray]:
     arrays["tissue"] = np.array([tissue.youngs_modulus, tissue.poisson_ratio, tissue.density])
     if isinstance(layer.chart, UvChart):
         arrays["uv"] = layer.chart.uv
-    if not tissue.single or tissue.source or tissue.relaxation:
+    if tissue.skin or tissue.deeper or tissue.source or tissue.relaxation:
         arrays["stack"] = np.frombuffer(stack_to_text(tissue).encode(), np.uint8)
     if layer.bony is not None:
         arrays["bony"] = layer.bony

@@ -201,8 +201,11 @@ class Tissue:
 
     @property
     def single(self) -> bool:
-        """Whether it is one material without a skin."""
-        return self.skin is None and not self.deeper
+        """Whether it is one material without a skin; several that are alike are one."""
+        first = self.youngs_modulus, self.poisson_ratio, self.relaxation
+        return self.skin is None and all(
+            (ply.youngs_modulus, ply.poisson_ratio, ply.relaxation) == first for ply in self.deeper
+        )
 
     def relaxing(self, series: Prony) -> Tissue:
         """The same tissue, the stress of all its materials fading by one series."""

@@ -149,6 +149,17 @@ def test_each_kind_of_layer_has_its_own_network():
     assert ContactNet(SoftLayer(LIMB.vertices, LIMB.faces, 5e-3)).network == "contact_net"
 
 
+def test_layers_that_are_alike_answer_as_one():
+    whole = limb(3e-3, 5e-3, RADIUS, 0.16)
+    cut = whole.with_(deeper=(Ply(2e-3, whole.tissue.youngs_modulus, whole.tissue.poisson_ratio),))
+    assert cut.tissue.single and not whole.with_(deeper=(Ply(2e-3, 2e3, 0.4),)).tissue.single
+    press = contact_of(ball(BALL), at(RADIUS + BALL - 1.5e-3, 0, 0.08))
+    one, other = (Simulator(layer, MomentNet()).step([press]) for layer in (whole, cut))
+    assert one.touches["probe"].force > 0
+    np.testing.assert_array_equal(one.displacement, other.displacement)
+    np.testing.assert_array_equal(one.touches["probe"].wrench, other.touches["probe"].wrench)
+
+
 def test_a_skin_from_another_process_is_ready_at_once(simulator):
     skin = pickle.loads(pickle.dumps(simulator.skin))
     with pytest.MonkeyPatch.context() as patch:

@@ -15,7 +15,23 @@ from stmpl_core.errors import InvalidInput
 from stmpl_core.living import living
 from stmpl_core.methods import LimbLinear, MomentNet, Winkler
 from stmpl_core.skin import Skin
-from tests.scenes import LENGTH, RADIUS, at, ball, band, box, brush, capsule, limb, punch, tool, turn, v_block, wire
+from tests.scenes import (
+    LENGTH,
+    RADIUS,
+    at,
+    ball,
+    band,
+    box,
+    brush,
+    capsule,
+    limb,
+    plate,
+    punch,
+    tool,
+    turn,
+    v_block,
+    wire,
+)
 from tests.test_folds import FINGERS, LAYERED
 
 wp = pytest.importorskip("warp")
@@ -151,6 +167,16 @@ def test_skin_that_is_round_like_a_ball_is_doubted_here_too(thickness: float, so
     found = made(skin, [LEFT], 1).touch(poses)
     same(found, Batch(skin, [LEFT], 1).touch(poses))
     assert found.in_range.numpy().all() == sound
+
+
+def test_a_stack_that_is_a_flat_plate_is_doubted_here_too() -> None:
+    stack = Tissue(2.5e3, 0.45, skin=Membrane(1.3e5, 1.2e-3, 11.0), deeper=(Ply(2e-3, 24e3, 0.45),))
+    skin = Skin.of(plate(0.16, 8e-3, 0.025).with_(tissue=stack), MomentNet(sticks=False))
+    poses = np.stack([at(0.0, 0.0, 0.012 - depth)[None] for depth in (5e-3, 0.01, 0.015)])
+    found, expected = made(skin, [LEFT], 3).touch(poses), Batch(skin, [LEFT], 3, threads=1).touch(poses)
+    same(found, expected)
+    bounds = expected.force_bounds[:, 0] / np.linalg.norm(expected.wrenches[:, 0, :3], axis=1)
+    assert bounds[2] > 1.5 * bounds[0]
 
 
 @pytest.mark.parametrize("tissue", [

@@ -12,7 +12,7 @@ from stmpl_core.gpu.blocks import most_of, sum_of, wait
 from stmpl_core.gpu.packs import HIDDEN as UNITS
 from stmpl_core.gpu.packs import Net, OneSkin, Scratch, Skins
 from stmpl_core.gpu.rays import FAR, OPTIONS, real, vec3
-from stmpl_core.networks import NODE
+from stmpl_core.networks import NODE, STACK_NODE
 
 STEPS, RINGS = wp.constant(obstacle.STEPS), wp.constant(obstacle.RINGS)
 REACH, NEAR = wp.constant(wp.float64(obstacle.REACH)), wp.constant(wp.float64(obstacle.NEAR))
@@ -30,6 +30,11 @@ NEAR_NONE, NEAR_WHOLE, FAR_NONE, FAR_WHOLE, FELT_NONE, FELT_WHOLE, DEEP_NONE, DE
                                          *contact_net.THIN_DEEP))  # fmt: skip
 DOMED_NONE, DOMED_WHOLE, TOO_NONE, TOO_WHOLE, DOMED_DOUBT = (
     wp.constant(wp.float64(x)) for x in (*contact_net.DOMED, *contact_net.TOO_DOMED, contact_net.DOMED_DOUBT))
+PLATE_NONE, PLATE_WHOLE, PLATE_FROM, PLATE_TO, KAPPA_NONE, KAPPA_WHOLE, PLATE_DOUBT, PLATE_ANYHOW = (
+    wp.constant(wp.float64(x)) for x in (*contact_net.PLATE, *contact_net.PLATE_DEEP, *contact_net.PLATE_KAPPA,
+                                         contact_net.PLATE_DOUBT, contact_net.PLATE_ANYHOW))  # fmt: skip
+AT_CURVATURE, AT_COLUMN = wp.constant(STACK_NODE.at.curvature), wp.constant(STACK_NODE.at.column_strain)
+AT_KAPPA = wp.constant(STACK_NODE.at.log_kappa)
 THIN_DOUBT, ONE_SEES = wp.constant(wp.float64(contact_net.THIN_DOUBT)), wp.constant(NODE.size)
 LARGEST = wp.constant(wp.float64(contact_net.MAX_LOG_RATIO))
 START, SMALL, SMALLER = (wp.constant(wp.float64(x)) for x in (0.3, 1e-3, 1e-4))
@@ -331,6 +336,12 @@ def judge(lanes: wp.int32, scratch: Scratch, net: Net):
             scratch.error[s, i] = (real(1.0) + THIN_DOUBT * thin * _ramp(strain, FELT_NONE, FELT_WHOLE)) * domed
             far = _ramp(both, TOO_NONE, TOO_WHOLE)
             scratch.strange[s, i] = wp.max(thin * _ramp(strain, DEEP_NONE, DEEP_WHOLE), far)
+        else:
+            plate = _ramp(wp.abs(real(scratch.inputs[s, i, AT_CURVATURE])), PLATE_NONE, PLATE_WHOLE)
+            plate *= _ramp(real(scratch.inputs[s, i, AT_COLUMN]), PLATE_FROM, PLATE_TO)
+            kappa = _ramp(real(scratch.inputs[s, i, AT_KAPPA]), KAPPA_NONE, KAPPA_WHOLE)
+            share = PLATE_ANYHOW + (real(1.0) - PLATE_ANYHOW) * kappa
+            scratch.error[s, i] = real(1.0) + PLATE_DOUBT * plate * share
         for m in range(net.low.shape[0]):
             given = scratch.inputs[s, i, m]
             kept = wp.clamp(given, net.low[m], net.high[m])
