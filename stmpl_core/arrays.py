@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from numbers import Integral, Real
+from typing import Any
 
 import numba
 import numpy as np
@@ -83,6 +84,16 @@ def check_dt(dt: float) -> None:
     """Raises InvalidInput: a time since the step before [s] that is no number, below 0, or not finite."""
     if not (is_number(dt) and 0 <= dt < np.inf):
         raise InvalidInput(f"dt is {dt!r:.40} s; time goes forward, allowed is a number of 0 or more, and finite.")
+
+
+def check_places(name: str, array: Any) -> None:
+    """Raises InvalidInput: an array to be written of which two elements may share a place; of numpy or Warp."""
+    reach = 1
+    for step, many in sorted((abs(step), many) for step, many in zip(array.strides, array.shape, strict=True)):
+        if many > 1 and step < reach:
+            raise InvalidInput(f"{name} has elements that share a place, as torch.expand makes them: what is written "
+                               "to one would be read in another. Try clone() or copy().")  # fmt: skip
+        reach += step * (many - 1)
 
 
 def real(value: ArrayLike) -> ArrayLike:

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from stmpl_core.arrays import check_count, check_dt, real
+from stmpl_core.arrays import check_count, check_dt, check_places, real
 from stmpl_core.contact import Contact
 from stmpl_core.errors import InvalidInput, StmplError
 from stmpl_core.friction import Friction, check_tools
@@ -101,7 +101,7 @@ class Batch:
         return partial(type(self), friction=self._friction, threads=self._threads), (self.skins, self.tools)
 
     def touch(
-        self, poses: Any, states: Sequence[State | None] | None = None, dt: float = 0.0, *, fields: Iterable[int] = (),
+        self, poses: Any, states: Sequence[State | None] | None = None, dt: float = 0.0, *, fields: Any = (),
         out: Any = None,
     ) -> BatchTouches:  # fmt: skip
         """What all tools do in all scenes.
@@ -113,23 +113,20 @@ class Batch:
             states: memory of each scene from the step before, None where a scene begins; None: elastic skin without
                 friction, as if nothing had been before.
             dt: time since those states [s].
-            fields: numbers of the scenes whose skin's motion is wanted too.
+            fields: numbers of the scenes whose skin's motion is wanted too, or a mask (n,); arrays, too.
             out: array that takes the wrenches, (n, K, 6), likewise; None: a new one.
 
         Raises:
             InvalidInput: shapes, states or numbers of scenes that do not fit, or a dt below 0 or not finite.
         """
         n, many = len(self.skins), len(self.tools)
-        if not isinstance(fields, Iterable):
-            raise InvalidInput(f"fields is {fields!r:.40}; a list of numbers of scenes is needed.")
-        wanted = set(fields)
+        wanted = set(numbers_of("fields are asked for scenes", fields, n).tolist())
         matrices = _matrices(poses, n, many)
-        if states is not None and not hasattr(states, "__len__"):
-            raise InvalidInput(f"states are {states!r:.40}; a list of one State or None for each scene is needed.")
+        if states is not None and not (isinstance(states, Iterable) and hasattr(states, "__len__")):
+            raise InvalidInput(f"states are {states!r:.40}; a list of one State or None for each scene is needed. Of a "
+                               "WarpBatch's take to_states().")  # fmt: skip
         if states is not None and len(states) != n:
             raise InvalidInput(f"{len(states)} states do not fit {n} scenes.")
-        if not wanted <= set(range(n)):
-            raise InvalidInput(f"fields are asked for scenes {sorted(wanted, key=str)}; there are {n}.")
         check_dt(dt)
         try:
             wrenches = np.zeros((n, many, 6)) if out is None else np.asarray(out)
@@ -140,6 +137,7 @@ class Batch:
         if wrenches.dtype.kind != "f" or not wrenches.flags.writeable:
             raise InvalidInput(f"out is an array of {wrenches.dtype}; floating-point numbers that may be written are "
                                "needed.")  # fmt: skip
+        check_places("out", wrenches)
         depths, bounds = np.full((n, many), np.nan), np.full((n, many), np.nan)
         in_range, statuses = np.zeros((n, many), bool), np.full((n, many), REFUSED, dtype=object)
         why: dict[tuple[int, int], str] = {}
@@ -204,6 +202,31 @@ def scenes_of(skins: Skin | Sequence[Skin], tools: Sequence[Tool], n: int | None
     if not every or len({tool.name for tool in every}) < len(every):
         raise InvalidInput("a batch needs tools, each with a name of its own. Try tool.named('left').")
     return each, every
+
+
+def numbers_of(what: str, scenes: Any, n: int) -> np.ndarray:
+    """Numbers of some of n scenes, as they come.
+
+    Args:
+        what: what is asked of them, for the message.
+        scenes: their numbers, or a mask (n,); arrays of numpy, torch and Warp on any device, too.
+
+    Raises:
+        InvalidInput: numbers that there are not, a mask of another length, or neither.
+    """
+    try:
+        here = scenes.cpu() if type(scenes).__module__.startswith("torch") else scenes
+        found = np.asarray(here.numpy() if hasattr(here, "numpy") else list(here))
+    except (TypeError, ValueError, RuntimeError):  # of no list, of lists of unequal length, of a torch without numbers
+        found = np.array("")
+    if found.dtype == np.bool_ and found.shape == (n,):
+        found = np.flatnonzero(found)
+    elif found.shape == (0,):
+        found = found.astype(np.int64)
+    if found.ndim != 1 or found.dtype.kind not in "iu" or ((found < 0) | (found >= n)).any():
+        raise InvalidInput(f"{what} {scenes!r:.60}; there are {n}: a list of numbers of scenes, or a mask of as many, "
+                           "is needed.")  # fmt: skip
+    return found.astype(np.int64)
 
 
 def _matrices(poses: Any, n: int, many: int) -> np.ndarray:

@@ -17,7 +17,7 @@ from typing import Literal, Self, get_args
 import numpy as np
 from numpy.typing import ArrayLike
 
-from stmpl_core.arrays import Transform, VertexVectors, Wrench, check_kind, finite
+from stmpl_core.arrays import Transform, VertexVectors, Wrench, check_kind, finite, is_number
 from stmpl_core.contact import Contact
 from stmpl_core.errors import InvalidInput
 from stmpl_core.layer import thicker
@@ -111,8 +111,8 @@ class Gradients:
 
     def __init__(self, simulator: Simulator, *, pose_step: float | None = None) -> None:
         check_kind("simulator", simulator, Simulator)
-        if pose_step is not None and not 0 < pose_step < np.inf:
-            raise InvalidInput(f"pose_step is {pose_step} m; it must be finite and above 0. Try 5e-4.")
+        if pose_step is not None and not (is_number(pose_step) and 0 < pose_step < np.inf):
+            raise InvalidInput(f"pose_step is {pose_step!r:.40} m; it must be finite and above 0. Try 5e-4.")
         self.simulator, self.pose_step = simulator, pose_step
         self._made: tuple[Simulator, Simulator] | None = None
 
@@ -198,6 +198,7 @@ class Gradients:
             MeshError: what `Simulator.touch` raises.
         """
         bare = _asked(contacts, ())
+        check_kind("twists", twists, Mapping)
         ways = {name: finite(f"twist of {name}", twist, (6,)) for name, twist in twists.items()}
         if strange := set(ways) - {one.name for one in bare}:
             raise InvalidInput(f"there is no contact of {', '.join(sorted(strange))}. Available: "

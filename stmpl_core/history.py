@@ -22,6 +22,7 @@ from stmpl_core.dragged import MIN_OFFSET
 from stmpl_core.errors import InvalidInput
 from stmpl_core.friction import Friction, coefficients
 from stmpl_core.green import AS_AT_REST, Green
+from stmpl_core.layer import SoftLayer
 from stmpl_core.relaxation import fading, series_of
 from stmpl_core.sideways import Sideways, fading_aside
 from stmpl_core.slip import MOST_GROWN
@@ -59,7 +60,7 @@ class History:
         thickness = float(np.median(layer.thickness))
         self.series = series_of(layer.tissue, thickness)
         self._last: State | None = None  # state of the last step, which is one of this skin
-        self._skin = crc32(layer.thickness.tobytes(), crc32(layer.faces.tobytes(), crc32(layer.vertices.tobytes())))
+        self._skin = shape_of(layer)
         self._tissue = number_of(layer.tissue)
 
     @cached_property
@@ -165,7 +166,7 @@ class History:
             if memory.terms != len(self.series.times):
                 raise InvalidInput(f"the state of {name} is of skin with {memory.terms} times of relaxation; "
                                    f"this layer has {len(self.series.times)}. Try an empty State().")  # fmt: skip
-        if state.tools and state.skin not in (None, self._skin):
+        if has_other_shape(state, self._skin):
             raise InvalidInput(f"the state of {', '.join(state.tools)} is of skin of another shape. Try an empty "
                                "State().")  # fmt: skip
         if is_of_other(state, self._tissue):
@@ -317,6 +318,16 @@ class History:
 def number_of(tissue: Tissue) -> int:
     """Number by which a tissue is known again; see State.tissue."""
     return crc32(tissue.numbers.tobytes())
+
+
+def shape_of(layer: SoftLayer) -> int:
+    """Number by which the shape of a skin is known again; see State.skin."""
+    return crc32(layer.thickness.tobytes(), crc32(layer.faces.tobytes(), crc32(layer.vertices.tobytes())))
+
+
+def has_other_shape(state: State, shape: int) -> bool:
+    """Whether a state that remembers anything is of skin of another shape than this number's."""
+    return bool(state.tools) and state.skin not in (None, shape)
 
 
 def is_of_other(state: State, tissue: int) -> bool:

@@ -76,6 +76,16 @@ def test_fields_come_for_the_scenes_that_are_asked(skin: Skin) -> None:
         assert np.array_equal(field, answer.displacement)
 
 
+def test_fields_come_for_a_mask_of_scenes(skin: Skin) -> None:
+    torch, batch, mask = pytest.importorskip("torch"), Batch(skin, TOOLS, N), np.arange(N) % 3 == 1
+    for asked in (mask, mask.tolist(), torch.from_numpy(mask), torch.tensor([1, 4]), np.array([4, 1], np.uint8)):
+        assert sorted(batch.touch(poses(), fields=asked).fields) == [1, 4]
+    assert not batch.touch(poses(), fields=np.zeros(N, bool)).fields
+    for wrong in (None, 2, [[0]], [[0], [1, 2]], mask[:3], [1.0], "0", torch.tensor(1), torch.empty(2, device="meta")):
+        with pytest.raises(InvalidInput, match=r"there are 6: a list of numbers of scenes, or a mask"):
+            batch.touch(poses(), fields=wrong)
+
+
 def test_memory_is_each_scenes_own(relaxing: Skin) -> None:
     """Scenes of unequal pasts: one begins anew each time, the others go on."""
     batch, scenes = Batch(relaxing, TOOLS, 3, friction="dry"), poses(3)
@@ -173,6 +183,8 @@ def test_what_does_not_fit_is_said(skin: Skin) -> None:
         batch.touch(poses(), out=np.zeros((N, 2, 3)))
     with pytest.raises(InvalidInput, match="out has shape"):
         batch.touch(poses(), out=np.zeros((N, 2, 6)).tolist())
+    with pytest.raises(InvalidInput, match="share a place"):
+        batch.touch(poses(), out=np.lib.stride_tricks.as_strided(np.zeros((1, 2, 6)), (N, 2, 6), (0, 48, 8)))
     with pytest.raises(InvalidInput, match="array of int64"):
         batch.touch(poses(), out=np.zeros((N, 2, 6), int))
     with pytest.raises(InvalidInput, match="dt is"):

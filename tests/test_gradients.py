@@ -368,6 +368,10 @@ def test_what_cannot_be_is_refused_in_words(gradients: Gradients) -> None:
     contact = standing(gradients.simulator, BALL, 0.3)
     with pytest.raises(InvalidInput, match="pose_step is 0 m"):
         Gradients(gradients.simulator, pose_step=0)
+    with pytest.raises(InvalidInput, match="pose_step is 'a' m"):
+        Gradients(gradients.simulator, pose_step="a")  # type: ignore[arg-type]
+    with pytest.raises(InvalidInput, match="twists is None; Mapping is needed"):
+        gradients.field_along([contact], None)  # type: ignore[arg-type]
     with pytest.raises(InvalidInput, match="no contact of thumb"):
         gradients.field_along([contact], {"thumb": np.zeros(6)})
     with pytest.raises(InvalidInput, match="factor on the thickness"):

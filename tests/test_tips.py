@@ -198,6 +198,30 @@ def test_a_batch_on_a_gpu_s_kernels_presses_likewise_or_flags():
         assert not (in_range[served] & ~ours.in_range[served]).any()
 
 
+def test_a_batch_on_a_gpu_s_kernels_flags_the_corners_of_plain_tools():
+    """Of a hexagonal cylinder and an L-bar that stand on a corner between vertices."""
+    pytest.importorskip("warp")
+    from stmpl_core.gpu.warp_batch import WarpBatch
+
+    skin, random, missed = Skin.of(LAYERS["stack"](), MomentNet()), np.random.default_rng(0), 0
+    bar = trimesh.util.concatenate([trimesh.creation.box(bounds=[[0, 0, 0], [x, y, 0.012]])
+                                    for x, y in ((0.03, 0.01), (0.01, 0.03))])  # fmt: skip
+    layer, inside = skin.layer, np.flatnonzero(skin.near.sound.border > 1.5)
+    for tool in (named(trimesh.creation.cylinder(0.011, 0.018, sections=6)), named(bar)):
+        poses = np.tile(np.eye(4), (200, 1, 1, 1))
+        for k, v in enumerate(random.choice(inside, 200)):
+            turn, n = Rotation.random(random_state=k).as_matrix(), layer.normals[v]
+            reach = float(-(tool.vertices @ turn.T @ n).min())
+            poses[k, 0, :3, :3], poses[k, 0, :3, 3] = turn, layer.vertices[v] + (reach - random.uniform(0, 3e-3)) * n
+        ours, there = Batch(skin, [tool], 200).touch(poses), WarpBatch(skin, [tool], 200, device="cpu").touch(poses)
+        unfelt = np.array(["presses nothing" in ours.why.get((k, 0), "") for k in range(200)])
+        missed += int(unfelt.sum())
+        assert not np.asarray(there.in_range)[unfelt].any()
+        off = ours.statuses[:, 0] == "apart"
+        assert np.array_equal(np.asarray(there.in_range)[off], ours.in_range[off])
+    assert missed
+
+
 def test_a_tool_whose_skin_others_pushed_away_says_that_it_does_not_press_as_asked():
     simulator = Simulator(LAYERS["stack"](), MomentNet())
     layer = simulator.layer

@@ -108,6 +108,12 @@ def test_half_precision_moves_the_skin_as_whole_precision_does(arm: SoftLayer, d
     assert 0 < np.abs(half - whole).max() < 0.02 * np.abs(whole).max()
 
 
+@pytest.mark.parametrize("device", ["nope", "meta", None])
+def test_a_device_that_there_is_not_is_said(drawn: Path, device: str) -> None:
+    with pytest.raises(InvalidInput, match="torch has no device"):
+        UNet(drawn, device=device)
+
+
 def test_what_needs_a_gpu_is_refused_without_one(drawn: Path) -> None:
     with pytest.raises(InvalidInput, match="graph of CUDA was asked for on cpu"):
         UNet(drawn, graph=True)

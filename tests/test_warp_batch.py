@@ -358,6 +358,8 @@ def test_fields_come_for_the_scenes_that_are_asked(cylinder: Skin, monkeypatch: 
     whole = batch.touch(poses, fields=range(6)).fields.numpy()
     assert batch.touch(poses).fields is None
     assert np.array_equal(batch.touch(poses, fields=[4, 1]).fields.numpy(), whole[[4, 1]])
+    mask = np.arange(6) == 3
+    assert np.array_equal(batch.touch(poses, fields=mask).fields.numpy(), whole[mask])
     batch.touch(poses, fields=[0])
     assert batch._fields is not None
     room = batch.room.bytes_of(2)
@@ -475,5 +477,15 @@ def test_what_does_not_fit_is_said(cylinder: Skin) -> None:
         batch.touch(np.zeros((2, 1, 7)), fields=[1.5])
     with pytest.raises(InvalidInput, match="out has shape"):
         batch.touch(np.zeros((2, 1, 7)), out=torch.zeros((2, 1, 6)))
+    with pytest.raises(InvalidInput, match="share a place"):
+        batch.touch(np.zeros((2, 1, 7)), out=torch.zeros((1, 1, 6), dtype=torch.float64).expand(2, 1, 6))
+    for wrong in (torch.empty((2, 1, 7), device="meta"), torch.zeros((2, 1, 7)).to_sparse()):
+        with pytest.raises(InvalidInput, match="poses is a tensor that Warp cannot take"):
+            batch.touch(wrong)
+    with pytest.raises(InvalidInput, match="there are 2: a list of numbers of scenes, or a mask"):
+        batch.touch(np.zeros((2, 1, 7)), fields=[True])
+    for nodes in (0, "a"):
+        with pytest.raises(InvalidInput, match=r"nodes is .*; a whole number"):
+            made(cylinder, [LEFT], 2, nodes=nodes)
     with pytest.raises(InvalidInput, match="out is numpy's"):
         batch.touch(np.zeros((2, 1, 7)), out=np.zeros((2, 1, 6)))

@@ -145,6 +145,45 @@ def test_scenes_begin_anew_and_one_that_is_refused_stays_as_it_was(plain: Skin) 
     assert again.wrenches.numpy().tobytes() == found.wrenches.numpy().tobytes()
 
 
+def two(left: float, right: float) -> np.ndarray:
+    """Both tools at depths [m], far from each other, in all scenes, (N, 2, 4, 4)."""
+    place = [at(RADIUS + 0.012 - left, 0.0, LENGTH / 2), at(RADIUS + 0.009 - right, 0.0, LENGTH / 2 - 0.04)]
+    return np.tile(np.array(place), (N, 1, 1, 1))
+
+
+def test_a_scene_that_missed_a_step_is_out_of_range_until_it_forgets(plain: Skin) -> None:
+    batch, off = WarpBatch(plain, [LEFT, RIGHT], N, device="cpu"), two(-2e-3, -2e-3)
+    begun = batch.touch(two(2e-3, 2e-3), batch.at_rest(), 0.1)
+    where = two(2e-3, 2e-3)
+    where[1, 1], where[2, 1, 0, 3] = two(2e-3, 8e-3)[0, 1], np.nan
+    missed = batch.touch(where, begun.states, 0.5)
+    assert [STATUSES[k] for k in missed.statuses.numpy()[:, 1]] == ["pressed by pose", "too deep", "refused"]
+    after = batch.touch(two(2e-3, 2e-3), missed.states, 0.1)
+    assert after.in_range.numpy().tolist() == [[True] * 2, [False] * 2, [True] * 2]
+    assert batch.touch(two(2e-3, 2e-3), missed.states.reset([1]), 0.1).in_range.numpy().all()
+    told = missed.states.to_states()  # a Batch knows, too
+    expected = Batch(plain, [LEFT, RIGHT], N, threads=1).touch(two(2e-3, 2e-3), told, 0.1)
+    assert expected.in_range.tolist() == after.in_range.numpy().tolist()
+    soon = batch.touch(off, after.states, 0.1)
+    assert not soon.in_range.numpy()[1].any()
+    late = batch.touch(off, soon.states, 100.0)
+    assert late.in_range.numpy().all() and not late.states.missed.any()
+    assert batch.touch(two(2e-3, 2e-3), late.states, 0.1).in_range.numpy().all()
+
+
+def test_what_drags_is_out_of_range_until_it_lets_go_and_elastic_skin_never(plain: Skin) -> None:
+    skin = Skin.of(limb(5e-3).with_(tissue=Tissue(5e3, 0.35)), MomentNet())
+    for friction, flagged in ((None, False), ({"left": 0.4}, True)):
+        batch = WarpBatch(skin, [LEFT, RIGHT], N, friction=friction, device="cpu")
+        states = batch.touch(two(2e-3, 2e-3), batch.at_rest(), 0.1).states
+        states = batch.touch(two(2e-3, 8e-3), states, 0.1).states
+        for _ in range(2):
+            found = batch.touch(two(2e-3, 2e-3), states, 10.0)
+            states = found.states
+            assert (found.in_range.numpy() != flagged).all()
+        assert batch.touch(two(-2e-3, 2e-3), states, 0.1).in_range.numpy().all()
+
+
 def test_outputs_and_precision_are_those_of_the_poses(plain: Skin) -> None:
     torch = pytest.importorskip("torch")
     batch = WarpBatch(plain, [LEFT, RIGHT], N, friction=0.4, device="cpu")
@@ -159,6 +198,25 @@ def test_outputs_and_precision_are_those_of_the_poses(plain: Skin) -> None:
     assert np.abs(out.numpy() - exact.wrenches.numpy()).max() < 1e-3 * np.abs(exact.wrenches.numpy()).max()
 
 
+def test_states_of_another_batch_are_refused(plain: Skin) -> None:
+    batch, where = WarpBatch(plain, [LEFT, RIGHT], N, device="cpu"), poses(plain, 0.1)
+    softer = Skin.of(limb(5e-3).with_(tissue=Tissue(4e3, 0.35, relaxation=SLOW)), MomentNet())
+    longer = Skin.of(limb(5e-3, length=0.2).with_(tissue=plain.layer.tissue), MomentNet())
+    others = {"skins": WarpBatch([plain, longer, plain], [LEFT, RIGHT], device="cpu"),
+              "tissue": WarpBatch([plain, softer, plain], [LEFT, RIGHT], device="cpu"),
+              "tools": WarpBatch(plain, [RIGHT, LEFT], N, device="cpu")}  # fmt: skip
+    for what, other in others.items():
+        with pytest.raises(InvalidInput, match=f"another batch do not fit: its {what} are other"):
+            batch.touch(where, other.at_rest(), 0.01)
+    told = others["skins"].touch(where, others["skins"].at_rest(), 0.1).states
+    with pytest.raises(InvalidInput, match="state 1 is of skin of another shape"):
+        batch.states(told.to_states())
+    with pytest.raises(InvalidInput, match="Of a WarpBatch"):
+        Batch(plain, [LEFT, RIGHT], N, threads=1).touch(where, batch.at_rest(), 0.01)  # type: ignore[arg-type]
+    alike = WarpBatch(plain, [LEFT, RIGHT], N, device="cpu")
+    assert batch.touch(where, alike.at_rest(), 0.01).in_range.numpy().all()
+
+
 def test_what_does_not_fit_is_said(plain: Skin) -> None:
     batch, where = WarpBatch(plain, [LEFT], N, device="cpu"), poses(plain, 0.1)[:, :1]
     rest = batch.at_rest()
@@ -170,6 +228,9 @@ def test_what_does_not_fit_is_said(plain: Skin) -> None:
         batch.touch(where, WarpBatch(plain, [LEFT, RIGHT], N, device="cpu").at_rest(), 0.01)
     with pytest.raises(InvalidInput, match="2 states do not fit 3 scenes"):
         batch.states([None, None])
+    for wrong in (0, None, "a", [[0]], [0.0], [True], -1):
+        with pytest.raises(InvalidInput, match="scenes to reset"):
+            rest.reset(wrong)
     with pytest.raises(InvalidInput, match="dt is"):
         batch.touch(where, rest, -1.0)
     with pytest.raises(InvalidInput, match="scenes to reset"):

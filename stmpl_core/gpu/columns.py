@@ -349,9 +349,9 @@ def gather_depth(skins: Skins, scratch: Scratch):
 
 
 @wp.func
-def _under_skin(skins: Skins, one: OneSkin, at: vec3) -> bool:
-    """Whether a point is under its nearest vertex, which is not on the open border."""
-    best, nearest = real(FAR), wp.int32(one.first)
+def nearest_to(skins: Skins, one: OneSkin, at: vec3, guess: wp.int32) -> wp.int32:
+    """Number of the vertex of a skin nearest to a point; guess: one that may be near, which saves looking."""
+    best, nearest = wp.length_sq(at - skins.points[guess]), wp.int32(guess)
     for b in range(one.first_ball, one.end_ball):
         ball = skins.balls[b]
         away = wp.length(at - vec3(ball[0], ball[1], ball[2])) - ball[3]
@@ -362,6 +362,13 @@ def _under_skin(skins: Skins, one: OneSkin, at: vec3) -> bool:
                 if square < best:
                     best = square
                     nearest = v
+    return nearest
+
+
+@wp.func
+def _under_skin(skins: Skins, one: OneSkin, at: vec3) -> bool:
+    """Whether a point is under its nearest vertex, which is not on the open border."""
+    nearest = nearest_to(skins, one, at, one.first)
     inward = wp.dot(at - skins.points[nearest], skins.inward[nearest])
     return inward > real(0.0) and (skins.doubts[nearest] & EDGE) == 0
 

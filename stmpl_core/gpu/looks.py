@@ -6,13 +6,16 @@ import math
 import warp as wp
 
 from stmpl_core import nodes as law
+from stmpl_core import toucher
 from stmpl_core.gpu.blocks import least_of, most_of, sum_of
+from stmpl_core.gpu.columns import nearest_to
 from stmpl_core.gpu.packs import Scratch, Skins
 from stmpl_core.gpu.places import APART, PENDING
 from stmpl_core.gpu.rays import FAR, OPTIONS, depth_at, distance_at, mat33, real, vec3
 
 FINER = wp.constant(16)  # parts of the side of a part, between which no tip is looked for
 BESIDE, GRAZED = wp.constant(wp.float64(law.BESIDE)), wp.constant(wp.float64(1e-3))  # the latter over the thickness
+LOOKED_AT, FIRST = wp.constant(toucher.LOOKED_AT), wp.constant(wp.float64(toucher.FIRST))
 SAMPLES, CHARTS = wp.constant(law.SAMPLES), wp.constant(law.CHARTS)
 FACING, ONE_WAY = wp.constant(wp.float64(law.FACING)), wp.constant(wp.float64(law.ONE_WAY))
 COS_ASKEW, SIN_ASKEW = wp.constant(wp.float64(math.cos(law.ASKEW))), wp.constant(wp.float64(math.sin(law.ASKEW)))
@@ -90,7 +93,7 @@ def look(lanes: wp.int32, skins: Skins, scratch: Scratch):
 
 @wp.kernel
 def search(lanes: wp.int32, skins: Skins, scratch: Scratch):
-    """Which tools have no nodes and meet skin between the places that were looked at."""
+    """Which tools have no nodes and meet skin between the places that were looked at, or with a tip: Toucher._tip."""
     c, lane = wp.tid()
     if scratch.status[c] != APART or scratch.nearest[c] >= skins.one[scratch.skin[c]].hole:
         return
@@ -110,6 +113,17 @@ def search(lanes: wp.int32, skins: Skins, scratch: Scratch):
                 start = pose * (point_on(skins, f, whole + turn / real(split) * a) - scratch.place[c])
                 if distance_at(grid, skins.coefficients, start) < -GRAZED * skins.thickness[corners[0]]:
                     scratch.misses[c] = 1
+    one, tips = skins.one[scratch.skin[c]], skins.tip_many[scratch.grid[c]]
+    v = wp.int32(one.first)
+    few, step = wp.min(tips, LOOKED_AT), tips // LOOKED_AT + 1
+    for n in range(lane, few + (tips - few + step - 1) // step, lanes):
+        tip = skins.tips[scratch.grid[c], n + wp.max(n - few, 0) * (step - 1)]
+        at = scratch.pose[c] * vec3(tip[0], tip[1], tip[2]) + scratch.place[c]
+        v = nearest_to(skins, one, at, v)
+        deep = wp.dot(at - skins.points[v], skins.inward[v])
+        beside = wp.length_sq(at - skins.points[v]) - deep * deep
+        if deep > real(2.0) * FIRST * skins.thickness[v] and beside < one.edge * one.edge:
+            scratch.misses[c] = 1
 
 
 @wp.func

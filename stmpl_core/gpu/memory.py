@@ -15,19 +15,20 @@ from typing import Any
 import numba
 import numpy as np
 
+from stmpl_core.batch import numbers_of
 from stmpl_core.errors import InvalidInput
 from stmpl_core.friction import Friction, coefficients
 from stmpl_core.green import Green
-from stmpl_core.history import is_of_other, number_of
+from stmpl_core.history import has_other_shape, is_of_other, number_of, shape_of
 from stmpl_core.relaxation import RADII, fading, series_of
 from stmpl_core.sideways import Sideways, fading_aside
 from stmpl_core.skin import Skin
-from stmpl_core.state import NEVER, Memory, State, fresh, size_of
-from stmpl_core.stepped import FRICTION, NUMBER, OUT, SAYS, doubted, step
+from stmpl_core.state import FORGOTTEN, NEVER, Memory, State, fresh, size_of
+from stmpl_core.stepped import FRICTION, HOLDS, NUMBER, OUT, SAYS, doubted, step
 from stmpl_core.tool import Tool
 
 FEW = 64  # scenes that are not shared among threads
-LOST = 4  # number of the first status (warp_batch.STATUSES) with which a scene is not served
+LOST = 4  # number of the first status (warp_batch.STATUSES) with which a scene is not served: refused; then time stands
 
 
 class WarpStates:
@@ -36,11 +37,13 @@ class WarpStates:
     Args:
         rows: what every tool of every scene remembers, but for its trail: rows of Memory, (n, K, .), as long as those
             of the skin with most times of relaxation.
+        missed: share of what a step that was not served may have left of each tool's touch that is still there, (n, K);
+            a scene that has any is out of range.
         steps: the batch's.
     """
 
-    def __init__(self, rows: np.ndarray, steps: Steps) -> None:
-        self.rows, self._steps = rows, steps
+    def __init__(self, rows: np.ndarray, missed: np.ndarray, steps: Steps) -> None:
+        self.rows, self.missed, self._steps = rows, missed, steps
 
     def __len__(self) -> int:
         return len(self.rows)
@@ -52,21 +55,20 @@ class WarpStates:
             scenes: their numbers, or a mask (n,); arrays of numpy, torch and Warp on any device, too.
 
         Raises:
-            InvalidInput: numbers that there are not.
+            InvalidInput: numbers that there are not, a mask of another length, or neither.
         """
-        here = scenes.cpu() if type(scenes).__module__.startswith("torch") else scenes
-        which, n = np.asarray(here.numpy() if hasattr(here, "numpy") else list(here)), len(self)
-        if which.dtype == np.bool_ and which.shape == (n,):
-            which = np.flatnonzero(which)
-        if len(which) and (which.dtype.kind not in "iu" or which.min() < 0 or which.max() >= n):
-            raise InvalidInput(f"scenes to reset are {which!r:.60}; numbers from 0 to {n - 1}, or a mask, are needed.")
-        out = self.rows.copy()
-        out[which.astype(int)] = self._steps.fresh[which.astype(int)]
-        return WarpStates(out, self._steps)
+        which = numbers_of("scenes to reset are", scenes, len(self))
+        out, missed = self.rows.copy(), self.missed.copy()
+        out[which], missed[which] = self._steps.fresh[which], 0.0
+        return WarpStates(out, missed, self._steps)
 
     def to_states(self) -> list[State]:
-        """The memory of each scene as Batch and Simulator take it, without grooves."""
-        return [self._steps.state(self.rows, i) for i in range(len(self))]
+        """The memory of each scene as Batch and Simulator take it, without grooves.
+
+        What skin remembers in a scene that missed a step is told as of a touch out of range; that tools which rub
+        missed it is not told.
+        """
+        return [self._steps.state(self, i) for i in range(len(self))]
 
 
 class Steps:
@@ -82,6 +84,7 @@ class Steps:
         gives, bends: by vertex of all skins, as they come, how a contact gives there [m/N] and skin bends [1/m],
             (., 3, 3); none where nothing rubs.
         fresh: rows of scenes in which nothing was touched yet, see WarpStates.
+        made_of: by name, what states of this batch are of.
     """
 
     def __init__(self, skins: Sequence[Skin], of: np.ndarray, tools: Sequence[Tool],
@@ -110,6 +113,10 @@ class Steps:
             if rubs:
                 rows[2 : 2 + terms] = fading_aside(skin.layer.tissue, t)
         self._tissues = [number_of(skin.layer.tissue) for skin in skins]
+        self._shapes = [shape_of(skin.layer) for skin in skins]
+        kinds, scenes = (np.array(one)[of].tolist() for one in (self._tissues, self._shapes))
+        self.made_of = {"scenes": len(of), "tools": [(tool.name, tool.number) for tool in tools], "skins": scenes,
+                        "tissue": kinds}  # fmt: skip
         self._series = shares, times, fades
         self._skins = np.array([float(skin.layer.tissue.skin is not None) for skin in skins])
         self.gives, self.bends = _along_skin(skins) if rubs else (np.empty((0, 3, 3)), np.empty((0, 3, 3)))
@@ -127,7 +134,7 @@ class Steps:
         """Memory of all scenes: of none of them, or as Batch tells it.
 
         Raises:
-            InvalidInput: states of another number, or of skin that relaxes otherwise or stood elsewhere.
+            InvalidInput: states of another number, or of skin that relaxes otherwise, is another or stood elsewhere.
         """
         n, out = len(self._of), self.fresh.copy()
         if given is not None and len(given) != n:
@@ -144,19 +151,24 @@ class Steps:
                                        f"{self._terms[self._of[i]]}. Try None.")  # fmt: skip
                 size = size_of(memory.terms, trail=False)
                 out[i, k, :size] = memory.numbers[:size]
+            if state is not None and has_other_shape(state, self._shapes[self._of[i]]):
+                raise InvalidInput(f"state {i} is of skin of another shape than its. Try None.")
             if state is not None and is_of_other(state, self._tissues[self._of[i]]):
                 raise InvalidInput(f"state {i} is of other tissue than its skin. Try None.")
-        return WarpStates(out, self)
+        return WarpStates(out, np.zeros(out.shape[:2]), self)
 
-    def state(self, rows: np.ndarray, i: int) -> State:
-        """The memory of one scene, by rows of all, see WarpStates."""
+    def state(self, states: WarpStates, i: int) -> State:
+        """The memory of one scene, of all."""
         terms, found = int(self._terms[self._of[i]]), {}
-        for tool, row in zip(self.tools, rows[i], strict=True):
+        for tool, row, missed in zip(self.tools, states.rows[i], states.missed[i], strict=True):
             numbers, size = np.zeros(size_of(terms)), size_of(terms, trail=False)
             numbers[:size] = row[:size]
             if (memory := Memory(numbers)).scalars.pressing > NEVER:
+                if missed > 0 and terms:
+                    relaxed = float(self._series[0][self._of[i], :terms] @ memory.relaxed)
+                    memory = memory.with_(scalars=memory.scalars._replace(strayed=max(relaxed, 0.0), doubted=1.0))
                 found[tool.name] = memory
-        return State(found, tissue=self._tissues[self._of[i]])
+        return State(found, skin=self._shapes[self._of[i]], tissue=self._tissues[self._of[i]])
 
     def step(self, patches: np.ndarray, states: WarpStates, dt: float) -> tuple[np.ndarray, WarpStates]:
         """Touches a step after some states: rows of PATCH up to the depth, (n, K, OUT), and the states then.
@@ -169,19 +181,19 @@ class Steps:
         Raises:
             InvalidInput: states of another batch.
         """
-        before = states.rows
-        if before.shape != self.fresh.shape:
-            raise InvalidInput(f"states of {len(states)} scenes and {before.shape[1]} tools do not fit; "
-                               "begin with those of this batch's at_rest().")  # fmt: skip
-        out, after = patches[:, :, :OUT].copy(), before.copy()
-        what = (patches, before, after, self._of, self._terms, *self._series, self._mu, self._numbers, self._skins,
-                self._tables, self._logs, self._sizes, dt, out)  # fmt: skip
+        before, of = states.rows, states._steps
+        if of is not self and (other := [name for name, one in self.made_of.items() if of.made_of[name] != one]):
+            raise InvalidInput(f"states of another batch do not fit: its {' and '.join(other)} are other. Begin with "
+                               "those of this batch's at_rest().")  # fmt: skip
+        out, after, missed = patches[:, :, :OUT].copy(), before.copy(), states.missed.copy()
+        what = (patches, before, after, missed, self._of, self._terms, *self._series, self._mu, self._numbers,
+                self._skins, self._tables, self._logs, self._sizes, dt, out)  # fmt: skip
         n, part = len(patches), max(FEW, -(-len(patches) // self._threads))
         if n > part:
             list(self._pool.map(lambda at: _step_some(at, min(at + part, n), *what), range(0, n, part)))
         else:
             _step_some(0, n, *what)
-        return out, WarpStates(after, self)
+        return out, WarpStates(after, missed, self)
 
 
 def _along_skin(skins: Sequence[Skin]) -> tuple[np.ndarray, np.ndarray]:
@@ -197,9 +209,9 @@ def _along_skin(skins: Sequence[Skin]) -> tuple[np.ndarray, np.ndarray]:
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _step_some(first, end, patches, before, after, of, terms, shares, times, fades, mu, numbers, skins, tables, logs,
-               sizes, dt, out):  # fmt: skip
-    """See Steps.step: some of the scenes."""
+def _step_some(first, end, patches, before, after, missed, of, terms, shares, times, fades, mu, numbers, skins, tables,
+               logs, sizes, dt, out):  # fmt: skip
+    """See Steps.step: some of the scenes. Writes what is `missed` after it, see WarpStates, over that before."""
     says = np.zeros((patches.shape[1], SAYS))
     for s in range(first, end):
         served = True
@@ -215,3 +227,29 @@ def _step_some(first, end, patches, before, after, of, terms, shares, times, fad
                  says)  # fmt: skip
             if p:
                 doubted(before[s], after[s], shares[i, :p], times[i, :p], dt, out[s, :, 6].copy(), out[s], says)
+            if _still_missed(missed[s], out[s], mu, shares[i, :p], times[i, :p], dt):
+                out[s, :, 7] = 0.0
+        else:
+            for k in range(patches.shape[1]):  # of a scene that is refused time stands
+                if patches[s, k, 8] > LOST and (terms[of[s]] or mu.max() > 0):
+                    missed[s, :] = 1.0
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _still_missed(missed, out, mu, shares, times, dt):
+    """Whether anything is left of a step that a scene missed, after one that is served; writes what of each tool's.
+
+    Args:
+        missed: see WarpStates, (K,).
+        out: rows of OUT, (K, .).
+        mu: coefficients of friction, (K,).
+        shares, times: series of the relaxation, (P,) each.
+        dt: time of the step [s].
+    """
+    fade = 0.0 if len(times) == 0 else np.exp(-dt * (1 - shares.sum()) / times[len(times) - 1])  # skin that is free
+    for k in range(len(missed)):
+        if not (mu[k] > 0 and out[k, 8] == HOLDS):  # what is dragged stays until the tool lets go
+            missed[k] *= fade
+        if missed[k] < FORGOTTEN:
+            missed[k] = 0.0
+    return missed.max() > 0

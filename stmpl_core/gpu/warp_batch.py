@@ -13,7 +13,7 @@ Geometry and the linear problem are float64, the network float32, as in the law 
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass
 from typing import Any
@@ -21,8 +21,8 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from stmpl_core.arrays import check_count, check_dt, real
-from stmpl_core.batch import scenes_of
+from stmpl_core.arrays import check_count, check_dt, check_places, real
+from stmpl_core.batch import numbers_of, scenes_of
 from stmpl_core.columns import Columns
 from stmpl_core.errors import InvalidInput
 from stmpl_core.friction import Friction, check_tools
@@ -110,7 +110,8 @@ class WarpBatch:
                  friction: Friction | Mapping[str, Friction] = None, device: str = "cuda", nodes: int | None = None,
                  memory: int | None = None, lanes: int | None = None) -> None:  # fmt: skip
         each, self.tools = scenes_of(skins, tools, n)
-        check_count("lanes", 1 if lanes is None else lanes)
+        for name, value, least in (("lanes", lanes, 1), ("nodes", nodes, 1), ("memory", memory, 0)):
+            check_count(name, least if value is None else value, least)
         check_tools(friction, [tool.name for tool in self.tools])
         self._friction, self._steps, self._along = friction, None, ()
         self.device = _device(device)
@@ -176,7 +177,7 @@ class WarpBatch:
                                 for values in (steps.gives, steps.bends))  # fmt: skip
         return self._steps
 
-    def touch(self, poses: Any, states: WarpStates | None = None, dt: float = 0.0, *, fields: Iterable[int] = (),
+    def touch(self, poses: Any, states: WarpStates | None = None, dt: float = 0.0, *, fields: Any = (),
               out: Any = None, fields_out: Any = None) -> WarpTouches:  # fmt: skip
         """What all tools do in all scenes.
 
@@ -187,9 +188,13 @@ class WarpBatch:
                 not rigid is refused, and no other.
             states: memory of each scene from the step before, `at_rest` at the beginning; None: elastic skin without
                 friction, as if nothing had been before. Time and friction are answered on the CPU's cores, from some
-                numbers of each contact. A scene that is refused or not served stays as it was.
+                numbers of each contact. A scene that is refused stays as it was. One that is not served does, too, but
+                has missed a step: where its skin relaxes or its tools rub, it is out of range from then on, until
+                that would be forgotten (skin that was pressed is back, tools that rub have let go), or until it is
+                reset.
             dt: time since those states [s].
-            fields: numbers of the scenes whose skin's motion is wanted too; not with states.
+            fields: numbers of the scenes whose skin's motion is wanted too, or a mask (n,); arrays on any device, too;
+                not with states.
             out: array of Warp or torch on this device that takes the wrenches, (n, K, 6), of the poses' precision;
                 None: a new one.
             fields_out: array that takes the fields, (F, V, 3), float32 or float64, likewise.
@@ -204,9 +209,7 @@ class WarpBatch:
         if states is not None and not isinstance(states, WarpStates):
             raise InvalidInput(f"states are {states!r:.40}; those of at_rest(), states(...) or a step before are "
                                "needed.")  # fmt: skip
-        if (asked := list(fields)) and not set(asked) <= set(range(n)):
-            raise InvalidInput(f"fields are asked for scenes {asked!r:.60}; there are {n}.")
-        wanted = np.array(asked, dtype=np.int64)
+        wanted = numbers_of("fields are asked for scenes", fields, n)
         if len(wanted) and states is not None:
             raise InvalidInput("fields of skin with a memory are not served by WarpBatch. Try Batch.")
         given = self._array("poses", poses)
@@ -261,6 +264,7 @@ class WarpBatch:
         if found.shape != shape or found.dtype not in reals:
             raise InvalidInput(f"{name} has shape {found.shape} of {found.dtype.__name__}; {shape} of "
                                f"{' or '.join(real.__name__ for real in reals[-2:])} is needed.")  # fmt: skip
+        check_places(name, found)
         return found
 
     def _array(self, name: str, values: Any) -> Any:
@@ -272,7 +276,10 @@ class WarpBatch:
                 found = wp.array(ptr=values.ptr, dtype=exact, shape=(*values.shape, 7), device=values.device)
                 found._kept = values  # type: ignore[attr-defined]  # the memory is its
         elif type(values).__module__.startswith("torch"):
-            found = wp.from_torch(values.detach())
+            try:
+                found = wp.from_torch(values.detach())
+            except (TypeError, RuntimeError) as error:  # of another kind of device, sparse, complex
+                raise InvalidInput(f"{name} is a tensor that Warp cannot take: {error}.") from error
         else:
             try:
                 plain = np.asarray(real(values))

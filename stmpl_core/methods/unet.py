@@ -94,7 +94,7 @@ class UNet:
         graph: choice to record the network as a CUDA graph on the first call, which is then launched as one piece.
 
     Raises:
-        InvalidInput: a path without weights, a card that does not fit them, or a graph or a GPU where torch has none.
+        InvalidInput: a path without weights, a card that does not fit them, or a device or graph that torch has not.
     """
 
     name = "unet"
@@ -104,9 +104,16 @@ class UNet:
         needed("the method unet", "learn", "torch")
         import torch
 
-        if graph and not device.startswith("cuda"):
+        device = str(device)
+        try:
+            cuda = torch.device(device).type == "cuda"
+            if not cuda:
+                torch.zeros(1, device=device).cpu()
+        except (RuntimeError, AssertionError) as error:  # NotImplementedError, too
+            raise InvalidInput(f"torch has no device {device!r:.40} here. Try device='cpu'.") from error
+        if graph and not cuda:
             raise InvalidInput(f"a graph of CUDA was asked for on {device}. Try device='cuda', or graph=False.")
-        if device.startswith("cuda") and not torch.cuda.is_available():
+        if cuda and not torch.cuda.is_available():
             raise InvalidInput(f"{device} was asked for, and torch sees no CUDA device here. Try device='cpu'.")
         self.card, self.network = load_unet(NETWORKS["unet"].path if path is None else Path(path), device)
         self.device, self.half, self.graph = device, half, graph
