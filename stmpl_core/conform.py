@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numba
 import numpy as np
 
-from stmpl_core.arrays import Points, VertexVectors
+from stmpl_core.arrays import Points, Transform, VertexVectors
 from stmpl_core.columns import grid_of
 from stmpl_core.layer import SoftLayer
 from stmpl_core.moments import Surroundings
@@ -23,6 +23,8 @@ MIN_FACING_COSINE = 0.3  # cosine between tool's way and inward normal, from whi
 LEAST_WEIGHT = 1e-3  # firmness from which a correction counts: one that falls to 0 lets go of its vertex continuously
 PUSHES = 5  # steps of a vertex out of a tool, at most
 LEFT_DEPTH = 1e-3  # depth over the thickness that a step may leave, or another one follows
+FURTHER = 4.0  # most that a step out of several tools is longer than the mean of what each of them asks for
+RIVAL = 0.8  # way of skin with a tool over its longest with any, from which that tool has a say where several cover it
 PASSES = 3  # corrections of one answer
 LEFT_SHARE = 1e-4  # share of what is wanted that one of these passes may leave: the next asks for it again
 ITERATIONS, BACK = 40, 2  # most steps of its linear solver, and how many steps before each is held against
@@ -73,10 +75,14 @@ def conform(layer: SoftLayer, near: Surroundings, displacement: VertexVectors, t
     places = [np.searchsorted(under, tool.vertices) for tool in tools]
     sinking, rest = near.sinking(under), layer.vertices[under]
     firm, moved, sources = FIRM_DEPTH * layer.thickness[under], displacement[under], np.zeros((len(under), 3))
+    lying = np.zeros(len(under))  # share to which each lies on any tool
+    for tool, at in zip(tools, places, strict=True):
+        lying[at] = np.maximum(lying[at], tool.lies)
+    says = [1 - (1 - first) * lying[at] for first, at in zip(_firsts(tools, places), places, strict=True)]
     for _ in range(PASSES):
-        wanted, weight = np.zeros((len(under), 3)), np.zeros(len(under))
-        for tool, at in zip(tools, places, strict=True):
-            _want(tool.grid, tool.pose, rest, moved, at, tool.gone, tool.lies, firm, wanted, weight)
+        wanted, weight, said = np.zeros((len(under), 3)), np.zeros(len(under)), np.zeros(len(under))
+        for tool, at, say in zip(tools, places, says, strict=True):
+            _want(tool.grid, tool.pose, rest, moved, at, tool.gone, tool.lies, say, firm, wanted, weight, said)
         if not _correct(sinking, wanted, weight, moved, sources):
             break
     out = displacement.copy()
@@ -87,11 +93,15 @@ def conform(layer: SoftLayer, near: Surroundings, displacement: VertexVectors, t
 
 def laid_on(layer: SoftLayer, displacement: VertexVectors, touches: Sequence[Touch]) -> Conformed:
     """The answer with the skin that is touched moved along its tool's way onto it; the skin around it stays."""
-    out = displacement.copy()
-    for touch in touches:
-        if touch.pressed is not None:
-            tool = _tool(touch, touch.pressed, layer)
-            _lay(tool.vertices, tool.gone, tool.lies, out)
+    out, tools = displacement.copy(), [_tool(touch, touch.pressed, layer) for touch in touches if touch.pressed]
+    shares = [first * tool.lies for first, tool in zip(_firsts(tools, [t.vertices for t in tools]), tools, strict=True)]
+    if len(tools) > 1:
+        total = np.zeros(len(out))
+        for tool, share in zip(tools, shares, strict=True):
+            total[tool.vertices] += share
+        shares = [share / np.maximum(total[tool.vertices], 1) for tool, share in zip(tools, shares, strict=True)]
+    for tool, share in zip(tools, shares, strict=True):
+        _lay(tool.vertices, tool.gone, share, displacement, out)
     return _pushed_out(layer, displacement, touches, out)
 
 
@@ -133,10 +143,58 @@ def no_further(layer: SoftLayer, motion: VertexVectors, displacement: VertexVect
 
 
 def _push_out(layer: SoftLayer, touches: Sequence[Touch], out: VertexVectors) -> float:
-    """Moves what is left inside tools straight out; the largest depth that is left [m]."""
-    return max((_pushed(grid_of(touch.pressed.field), touch.pose_body_from_tool, layer.vertices,
-                        layer.thickness, touch.pressed.squeeze.vertices, out)
-                for touch in touches if touch.pressed is not None), default=0.0)  # fmt: skip
+    """Moves what is left inside tools straight out; the largest depth that is left [m].
+
+    What several tools touch goes out of all at once, so that it does not matter which comes first.
+    """
+    tools = [(grid_of(touch.pressed.field), touch.pose_body_from_tool, touch.pressed.squeeze.vertices)
+             for touch in touches if touch.pressed is not None]  # fmt: skip
+    shared = np.empty(0, np.int64)
+    if len(tools) > 1:
+        vertices, many = np.unique(np.concatenate([v for *_, v in tools]), return_counts=True)
+        shared = vertices[many > 1]
+    alone = [np.setdiff1d(v, shared, assume_unique=True) if len(shared) else v for *_, v in tools]
+    entered = max((_pushed(grid, pose, layer.vertices, layer.thickness, some, out)
+                   for (grid, pose, _), some in zip(tools, alone, strict=True)), default=0.0)  # fmt: skip
+    return max(entered, _pushed_together(layer, tools, shared, out)) if len(shared) else entered
+
+
+def _pushed_together(layer: SoftLayer, tools: Sequence[tuple[Any, Transform, np.ndarray]], shared: np.ndarray,
+                     out: VertexVectors) -> float:  # fmt: skip
+    """Moves what several tools touch straight out of all of them; the largest depth that is left [m].
+
+    Args:
+        layer: soft layer at rest.
+        tools: grid, pose_body_from_tool and touched vertices of each, rising.
+        shared: vertices that more than one touches, rising.
+        out: displacement, (V, 3) [m].
+    """
+    places = [np.searchsorted(shared, np.intersect1d(v, shared, assume_unique=True)) for *_, v in tools]
+    rest, moved, thickness, left = layer.vertices[shared], out[shared], layer.thickness[shared], 0.0
+    for push in range(PUSHES + 1):
+        sums = np.zeros((len(shared), 6))
+        for (grid, pose, _), at in zip(tools, places, strict=True):
+            _ask_out(grid, pose, rest, moved, at, sums)
+        left = float(sums[:, 5].max())
+        if push == PUSHES or not _step_out(sums, LEFT_DEPTH * thickness if push else np.zeros(len(shared)), moved):
+            break
+    out[shared] = moved
+    return left
+
+
+def _firsts(tools: Sequence[_Tool], places: Sequence[np.ndarray]) -> list[np.ndarray]:
+    """How much of a say each tool has where skin that lies on it goes, from 0, another takes it further, to 1, (N,).
+
+    places: its vertices among those of all tools.
+    """
+    if len(tools) < 2:
+        return [np.ones(len(tool.lies)) for tool in tools]
+    ways = [tool.lies * np.linalg.norm(tool.gone, axis=1) for tool in tools]
+    most = np.zeros(1 + max(int(at.max(initial=0)) for at in places))
+    for way, at in zip(ways, places, strict=True):
+        most[at] = np.maximum(most[at], way)
+    return [np.clip((way / np.maximum(most[at], 1e-300) - RIVAL) / (1 - RIVAL), 0, 1)
+            for way, at in zip(ways, places, strict=True)]  # fmt: skip
 
 
 def _tool(touch: Touch, pressed: Pressed, layer: SoftLayer) -> _Tool:
@@ -171,13 +229,13 @@ def _lie(grid, pose, points, inward, way, thickness, depth, rests, pressure, gon
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _lay(vertices, gone, lies, out):
-    """Moves vertices along the way that they have gone with a tool by their share of what is missing."""
+def _lay(vertices, gone, lies, before, out):
+    """Moves vertices along the way that they have gone with a tool by their share of what was missing before."""
     for n in range(len(vertices)):
         v, size, missing = vertices[n], 0.0, 0.0
         for x in range(3):
             size += gone[n, x] ** 2
-            missing += gone[n, x] * (gone[n, x] - out[v, x])
+            missing += gone[n, x] * (gone[n, x] - before[v, x])
         for x in range(3 if size > 0 else 0):
             out[v, x] += lies[n] * missing / size * gone[n, x]
 
@@ -197,20 +255,22 @@ def _jet(grid, pose, rest, moved):
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def _want(grid, pose, rest, moved, places, gone, lies, firm, wanted, weight):
+def _want(grid, pose, rest, moved, places, gone, lies, say, firm, wanted, weight, said):
     """Writes how the vertices under a tool, at places, should still move [m], and how firmly: 0, need not, to 1.
 
-    Where another tool wants it more firmly that stays.
+    Where other tools want something too it is the mean, by how firmly each does and by its say there, which are summed.
     """
     for n in range(len(places)):
         k = places[n]
         phi, a, b, c = _jet(grid, pose, rest[k], moved[k])
         firmly = max(lies[n], _clipped(-phi / firm[k]))
-        if firmly > weight[k]:
-            weight[k], out = firmly, -(1 - lies[n]) * min(phi, 0.0)
-            wanted[k, 0] = lies[n] * (gone[n, 0] - moved[k, 0]) + out * a
-            wanted[k, 1] = lies[n] * (gone[n, 1] - moved[k, 1]) + out * b
-            wanted[k, 2] = lies[n] * (gone[n, 2] - moved[k, 2]) + out * c
+        weight[k] = max(weight[k], firmly)
+        if firmly * say[n] > 0:
+            said[k] += firmly * say[n]
+            share, out = firmly * say[n] / said[k], -(1 - lies[n]) * min(phi, 0.0)
+            wanted[k, 0] += share * (lies[n] * (gone[n, 0] - moved[k, 0]) + out * a - wanted[k, 0])
+            wanted[k, 1] += share * (lies[n] * (gone[n, 1] - moved[k, 1]) + out * b - wanted[k, 1])
+            wanted[k, 2] += share * (lies[n] * (gone[n, 2] - moved[k, 2]) + out * c - wanted[k, 2])
 
 
 @numba.njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")
@@ -306,6 +366,41 @@ def _pushed(grid, pose, points, thickness, vertices, out):
             phi, a, b, c = _jet(grid, pose, points[v], out[v])
         entered = max(entered, -phi)
     return entered
+
+
+@numba.njit(cache=True, nogil=True)
+def _ask_out(grid, pose, rest, moved, places, sums):
+    """Adds what a tool asks of the vertices at places that are inside it; see _step_out."""
+    for k in places:
+        phi, a, b, c = _jet(grid, pose, rest[k], moved[k])
+        if phi < 0:
+            sums[k, 0] -= phi
+            sums[k, 1] += phi * phi * a
+            sums[k, 2] += phi * phi * b
+            sums[k, 3] += phi * phi * c
+            sums[k, 4] -= phi**3 * (a * a + b * b + c * c)
+            sums[k, 5] = max(sums[k, 5], -phi)
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def _step_out(sums, leave, moved):
+    """Moves vertices (N, 3) out of several tools at once by parallel projections; False: none is deeper than leave.
+
+    The mean of their ways out, by depth, is made so long that it is right where each is a half space: Pierra (1984).
+
+    sums: of the tools that a vertex is inside, sum of depths [m], of ways out by depth (3) [m2], of these ways' squares
+    by depth [m3], and the largest depth [m], (N, 6).
+    """
+    many = 0
+    for n in range(len(sums)):
+        if sums[n, 5] <= leave[n]:
+            continue
+        many += 1
+        square = sums[n, 1] ** 2 + sums[n, 2] ** 2 + sums[n, 3] ** 2
+        longer = min(sums[n, 4] * sums[n, 0] / max(square, 1e-300), FURTHER)
+        for x in range(3):
+            moved[n, x] += longer * sums[n, 1 + x] / sums[n, 0]
+    return many > 0
 
 
 @numba.njit(cache=True, nogil=True)

@@ -234,7 +234,7 @@ class Simulator:
         Skin that sticks goes with its tools node by node where the method knows that (`sticks`), and on stacks. This
         costs the square of the nodes: under many, vertices are fine enough, and one way fades into the other.
         """
-        touches = going_together(touches)
+        touches = sorted(going_together(touches), key=lambda one: one.name)  # to the last bit in any order
         pressed = [(touch.pressure, touch.pressed) for touch in touches
                    if touch.pressure is not None and touch.pressed is not None]  # fmt: skip
         if not pressed:

@@ -1,18 +1,18 @@
 """Laws of conform: skin that is touched lies on its tool, none is inside, and the rest comes along as a layer would."""
 
-from itertools import pairwise
+from itertools import pairwise, permutations
 
 import numpy as np
 import pytest
 
 from stmpl_core import Contact, Tool
-from stmpl_core.conform import SMOOTHING_SHARE, _correct, conform
+from stmpl_core.conform import SMOOTHING_SHARE, _correct, conform, laid_on
 from stmpl_core.methods import Linear, MomentNet, Winkler
 from stmpl_core.methods.base import Method
 from stmpl_core.moments import Surroundings
 from stmpl_core.simulator import MAX_ENTERED_SHARE, Simulator
 from stmpl_core.toucher import Toucher
-from tests.scenes import LENGTH, RADIUS, STACK, at, ball, box, capsule, limb, placed, press, punch, turn
+from tests.scenes import LENGTH, RADIUS, STACK, at, ball, box, capsule, limb, placed, plate, press, punch, turn
 
 LIMB = limb(4e-3)
 THICKNESS = float(LIMB.thickness[0])
@@ -140,6 +140,42 @@ def test_the_same_step_gives_the_same_answer(sim: Simulator) -> None:
     first = sim.step(SCENES["two fingers"]).displacement
     sim.step(SCENES["punch"])
     assert sim.step(SCENES["two fingers"]).displacement.tobytes() == first.tobytes()
+
+
+STEPS = [(box(0.02, 0.02, 0.012), at(0.012 * k, 0.003 * k, 0.006 - depth))
+         for k, depth in enumerate((5e-3, 2e-3, 3e-3))]  # fmt: skip
+CROSS = [(box(0.04, 0.008, 0.012), at(0, 0, 0)), (box(0.008, 0.04, 0.012), at(0, 0, 2e-3))]
+BALLS = [(BALL, at(5e-4, 0, 0.006)), (ball(0.01), at(0.012, 0, 0.006))]
+
+
+@pytest.mark.parametrize("method", [Linear, MomentNet])
+@pytest.mark.parametrize("tools", [STEPS[:2], STEPS, CROSS, BALLS], ids=["two", "three", "cross", "balls"])
+def test_neither_order_nor_names_of_tools_that_overlap_matter(method: type, tools: list) -> None:
+    """Skin lies on the tool that takes it furthest, and is outside all of them."""
+    sim = Simulator(plate(0.1, 3e-3, 0.01), method())
+    contacts = [press(*one, None, name) for one, name in zip(tools, "abc", strict=False)]
+    first, *others = [sim.step(some) for some in permutations(contacts)]
+    assert first.trust.figures["entered_m"] <= MAX_ENTERED_SHARE * 0.01
+    assert first.magnitude.max() > 4e-3
+    for other in others:
+        np.testing.assert_allclose(other.displacement, first.displacement, atol=1e-9)
+    for names in permutations("abc"[: len(tools)]):  # of equal forces some are summed in another order
+        renamed = sim.step([press(*one, None, name) for one, name in zip(tools, names, strict=True)])
+        np.testing.assert_allclose(renamed.displacement, first.displacement, atol=1e-6)
+
+
+def test_skin_that_two_tools_touch_lies_on_them_continuously_while_one_passes_the_other() -> None:
+    toucher = Toucher(plate(0.1, 3e-3, 0.01))
+    still = np.zeros_like(toucher.layer.vertices)
+
+    def furthest(step: float) -> float:
+        moved, stays = [], press(*STEPS[0], None, "stays")
+        for depth in np.arange(3.5e-3, 6.5e-3, step):
+            other = press(box(0.02, 0.02, 0.012), at(0.012, 0.003, 0.006 - depth), None)
+            moved.append(laid_on(toucher.layer, still, toucher.touch_all([stays, other])).displacement)
+        return max(float(np.linalg.norm(b - a, axis=1).max()) for a, b in pairwise(moved))
+
+    assert furthest(2.5e-5) < 0.4 * furthest(1e-4)
 
 
 @pytest.mark.parametrize("many", [4, 40, 300])

@@ -302,6 +302,15 @@ def test_fields_of_several_tools_and_of_one_around_a_limb(cylinder: Skin) -> Non
     moved(made(cylinder, [band()], 1), Batch(cylinder, [band()], 1, threads=1), around, 1)
 
 
+def test_fields_under_tools_that_overlap_are_the_same_in_any_order(cylinder: Skin) -> None:
+    tools = [box(0.02, 0.02, 0.02), box(0.02, 0.02, 0.02).named("other")]
+    poses = np.stack([[at(0.05 - first, 0, 0.08), at(0.05 - second, 0.002, 0.092)]
+                      for first, second in ((3e-3, 1.5e-3), (1e-3, 3e-3), (2e-3, 2e-3))])  # fmt: skip
+    motion = moved(made(cylinder, tools, 3), Batch(cylinder, tools, 3, threads=1), poses, 3)
+    turned = made(cylinder, tools[::-1], 3).touch(poses[:, ::-1], fields=range(3)).fields.numpy()
+    np.testing.assert_allclose(turned, motion, atol=1e-9)
+
+
 def test_fields_of_skins_that_differ(arm: Skin, cylinder: Skin) -> None:
     poses = np.concatenate([scattered(arm, 0.012, 4), scattered(cylinder, 0.012, 4)])
     skins = [arm] * 4 + [cylinder] * 4

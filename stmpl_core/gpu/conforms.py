@@ -31,6 +31,7 @@ LEAST, RIDGE = wp.constant(wp.float64(conform.LEAST_WEIGHT)), wp.constant(wp.flo
 ONE_WAY = wp.constant(wp.float64(touch.MIN_ONE_WAY_SHARE))
 MOST_MOVED = wp.constant(wp.float64(simulator.MOST_MOVED))
 PUSHES, LEFT = wp.constant(conform.PUSHES), wp.constant(wp.float64(conform.LEFT_DEPTH))
+FURTHER, RIVAL = wp.constant(wp.float64(conform.FURTHER)), wp.constant(wp.float64(conform.RIVAL))
 NAN = wp.constant(wp.float64(float("nan")))
 wp.set_module_options({**OPTIONS, "max_unroll": 4})
 
@@ -160,15 +161,23 @@ def want(pick: wp.array(dtype=wp.int32), lanes: wp.int32, many: wp.int32, skins:
     first = skins.one[scratch.skin[pick[f] * many]].first
     for n in range(lane, field.many[f], lanes):
         v, moved, wanted, weight = field.under[f, n], field.moved[f, n], vec3(), real(0.0)
+        most, lying, said = real(0.0), real(0.0), real(0.0)
+        for k in range(many):
+            most = wp.max(most, field.lies[f * many + k, n] * wp.length(field.gone[f * many + k, n]))
+            lying = wp.max(lying, field.lies[f * many + k, n])
         for k in range(many):
             c, t = pick[f] * many + k, f * many + k
             if _met(scratch, c, v - first):
                 jet, lies = _jet_of(skins, scratch, c, skins.points[v] + moved), field.lies[t, n]
                 firmly = wp.max(lies, _clipped(-jet[0] / (FIRM * skins.thickness[v])))
-                if firmly > weight:
-                    weight = firmly
+                weight = wp.max(weight, firmly)
+                way = lies * wp.length(field.gone[t, n]) / wp.max(most, real(1e-300))
+                say = firmly * (real(1.0) - lying * (real(1.0) - _clipped((way - RIVAL) / (real(1.0) - RIVAL))))
+                if say > real(0.0):
+                    said += say
                     out = -(real(1.0) - lies) * wp.min(jet[0], real(0.0))
-                    wanted = lies * (field.gone[t, n] - moved) + out * vec3(jet[1], jet[2], jet[3])
+                    asked = lies * (field.gone[t, n] - moved) + out * vec3(jet[1], jet[2], jet[3])
+                    wanted = wanted + say / said * (asked - wanted)
         field.wanted[f, n] = wanted
         field.weight[f, n] = weight
 
@@ -260,21 +269,33 @@ def spread(pick: wp.array(dtype=wp.int32), lanes: wp.int32, many: wp.int32, skin
 @wp.kernel
 def push_out(pick: wp.array(dtype=wp.int32), lanes: wp.int32, many: wp.int32, skins: Skins, scratch: Scratch,
              field: FieldScratch):  # fmt: skip
-    """Moves vertices that are left inside tools straight out of them, one tool after the other."""
+    """Moves vertices that are left inside tools straight out of them, of several at once: conform._push_out."""
     f, lane = wp.tid()
     first = skins.one[scratch.skin[pick[f] * many]].first
     for n in range(lane, field.many[f], lanes):
-        v = field.under[f, n]
+        v, least, pushed, deep = field.under[f, n], real(0.0), wp.int32(0), real(1.0)
         moved = field.motion[f, v - first]
-        for k in range(many):
-            c = pick[f] * many + k
-            if _met(scratch, c, v - first):
-                jet, least, pushed = _jet_of(skins, scratch, c, skins.points[v] + moved), real(0.0), wp.int32(0)
-                while pushed < PUSHES and jet[0] < least:
-                    moved = moved - jet[0] * vec3(jet[1], jet[2], jet[3])
+        while pushed < PUSHES and deep > least:
+            deep = real(0.0)
+            total, squares, way, step, inside = real(0.0), real(0.0), vec3(), vec3(), wp.int32(0)
+            for k in range(many):
+                c = pick[f] * many + k
+                if _met(scratch, c, v - first):
                     jet = _jet_of(skins, scratch, c, skins.points[v] + moved)
-                    least = -LEFT * skins.thickness[v]
-                    pushed += 1
+                    if jet[0] < real(0.0):
+                        step = -jet[0] * vec3(jet[1], jet[2], jet[3])
+                        deep = wp.max(deep, -jet[0])
+                        total -= jet[0]
+                        squares -= jet[0] * wp.length_sq(step)
+                        way = way - jet[0] * step
+                        inside += 1
+            if deep > least:
+                if inside > 1:
+                    longer = squares * total / wp.max(wp.length_sq(way), real(1e-300))
+                    step = wp.min(longer, FURTHER) / total * way
+                moved = moved + step
+            least = LEFT * skins.thickness[v]
+            pushed += 1
         field.motion[f, v - first] = moved
 
 
