@@ -16,6 +16,7 @@ from stmpl_core.sdf import SignedDistance
 DEEPEST = 0.9  # depth over thickness beyond which a tool is answered for where it is drawn back to that
 LOOKED_AT, FIRST = 64, 8  # points of a tool that are looked at; so many first, to see whether any is inside
 FACING = 0.3  # cosine to the mean of the skin's normals from which a column says which way is out
+BELOW = 3.0  # way beyond the core of an open sheet to which a tool is looked for, over the thickness
 FAR = 2.0  # way that a tool is drawn back, over the thickness, from which it is looked for again
 EVEN, MOST_EVEN = 0.2, 41  # steps of that, over the thickness, and one more than there are
 ACCURACY = 1e-4  # of the way that a tool is drawn back, over the thickness
@@ -24,9 +25,9 @@ ACCURACY = 1e-4  # of the way that a tool is drawn back, over the thickness
 def where_inside(layer: SoftLayer) -> tuple[np.ndarray, np.ndarray]:
     """Lowest and highest corner of where a tool's middle may be inside a limb, (3,) each [m].
 
-    It goes on beyond the core of a flat layer by its thickness.
+    It goes on beyond the core of a flat layer by BELOW of its thickness: there a tool is under the skin, not apart.
     """
-    both, more = np.concatenate([layer.vertices, layer.inner_vertices]), float(layer.thickness.max())
+    both, more = np.concatenate([layer.vertices, layer.inner_vertices]), BELOW * float(layer.thickness.max())
     return both.min(axis=0) - more, both.max(axis=0) + more
 
 

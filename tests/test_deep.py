@@ -177,3 +177,14 @@ def test_a_rim_at_the_core_is_told_of_where_the_rest_is_not_deep() -> None:
         assert touch.pressed is not None
         assert touch.pressed.factor == 1
         assert ("a part of the skin below it to over 90%" in touch.trust.why) == told
+
+
+@pytest.mark.parametrize("tool", [ball(), box(0.02, 0.02, 0.01)], ids=["ball", "box"])
+def test_a_tool_below_an_open_sheet_is_not_apart(tool: Tool) -> None:
+    simulator, high = Simulator(plate(0.12, 3.5e-3, 0.01), MomentNet()), float(tool.vertices[:, 2].max())
+    for top in (2e-3, 8e-3, 0.012, 0.015, 0.02):
+        (touch,) = simulator.touch([press(tool, at(1e-3, 1.3e-3, -top - high), None)])
+        assert touch.status == IN_CORE and not touch.trust.in_range, top
+        assert touch.force > 0
+    for aside in ((0.08, -0.02), (0.0, high + 1e-3)):  # beside the sheet and over it
+        assert simulator.touch([press(tool, at(aside[0], 0, aside[1]), None)])[0].status == APART
