@@ -202,7 +202,8 @@ class Flat:
         radius: of the ball that its outer surface is a part of [m]; infinite: flat.
 
     Raises:
-        InvalidInput: the radius is not above the thickness, or skin that is pulled would lift off a ball at rest.
+        InvalidInput: the radius is not above the thickness, or the stack around a ball has a skin: a membrane is known
+            flat.
     """
 
     tissue: Tissue
@@ -213,8 +214,8 @@ class Flat:
     def __post_init__(self) -> None:
         if not self.radius > self.thickness:
             raise InvalidInput(f"radius is {self.radius:g} m; it must be above the thickness, {self.thickness:g} m.")
-        if self.radius < np.inf and self.tissue.skin and self.tissue.skin.tension:
-            raise InvalidInput("Skin that is pulled is known on a flat stack only, not around a ball.")
+        if self.radius < np.inf and self.tissue.skin:
+            raise InvalidInput("A skin is known on a flat stack only, not around a ball.")
 
     def press(self, tool: Profile, depths: Sequence[float]) -> list[Round]:
         """Presses a tool in that sticks wherever it touches, to depths [m] that increase; ends where Newton does."""
@@ -349,7 +350,9 @@ def _mesh(flat: Flat, tool: Profile, deepest: float) -> tuple[skfem.MeshQuad, np
     many = int(round(flat.fine * 20))
     size = near / many
     r = [near * k / many for k in range(many + 1)]
-    end, growing = min(near + (WIDE + PER_KAPPA * kappa) * t, max(FARTHEST * flat.radius, near + t)), size
+    if near + t > FARTHEST * flat.radius:
+        raise InvalidInput(f"the tool covers {near / flat.radius:.1f} rad of it; at most {FARTHEST:g} are meshed.")
+    end, growing = min(near + (WIDE + PER_KAPPA * kappa) * t, FARTHEST * flat.radius), size
     while r[-1] < end:
         growing = min(1.3 * growing, 0.35 * t / flat.fine)
         r.append(r[-1] + growing)

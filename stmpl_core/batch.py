@@ -216,7 +216,8 @@ def numbers_of(what: str, scenes: Any, n: int) -> np.ndarray:
     """
     try:
         here = scenes.cpu() if type(scenes).__module__.startswith("torch") else scenes
-        found = np.asarray(here.numpy() if hasattr(here, "numpy") else list(here))
+        here = here.numpy() if hasattr(here, "numpy") else here
+        found = np.asarray(here if isinstance(here, np.ndarray) else list(here))
     except (TypeError, ValueError, RuntimeError):  # of no list, of lists of unequal length, of a torch without numbers
         found = np.array("")
     if found.dtype == np.bool_ and found.shape == (n,):

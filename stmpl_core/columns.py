@@ -43,7 +43,7 @@ from stmpl_core.rays import (
     wall_in,
     way_of,
 )
-from stmpl_core.sdf import SignedDistance
+from stmpl_core.sdf import THICK, SignedDistance
 from stmpl_core.soundness import too_long
 from stmpl_core.touch import MIN_ONE_WAY_SHARE
 
@@ -55,7 +55,7 @@ AS_ONE = 1.8, 2.3  # distance of two tools' middles over the sum of their radii 
 # parts of one, and from which each its own way: quarters of a ball that share a side are up to 1.7 apart
 SHEET, LEAST_MISSED = 0.5, 0.35  # thickness of a tool over its second longest side, and an edge over that, from which
 # vertices' columns may miss that it leans under skin
-BETWEEN, MOST_BETWEEN = 1.5, 12  # parts of half an edge of which one is as long as a third of that side; at most
+BETWEEN, MOST_BETWEEN = 1.5, 5  # parts of half an edge of which one is as long as a third of that side; at most
 HOLE_RADIUS = 0.6  # farthest point of a triangle from its corners, over the edge length (equilateral: 0.577)
 
 
@@ -196,8 +196,8 @@ class Columns:
             return NO_SQUEEZE
         vertices, depth, rests, top, push, *nodes = _squeezed(
             grid_of(field), pose, middle_of(field, pose), self.points, self.inward, self.layer.thickness, self.faces,
-            self._start, self._around, self._slot, *clearance[:3], hole, parts_between(field, self.layer.edge_length),
-            self.layer.stacked, self._order, self._blocks, *field.tool_bounds)  # fmt: skip
+            self._start, self._around, self._slot, *clearance[:3], hole, self.layer.stacked, self._order, self._blocks,
+            *field.tool_bounds)  # fmt: skip
         return Squeeze(vertices, depth, rests, Nodes(*nodes), top, push)
 
     def as_one(self, tools: Sequence[tuple[SignedDistance, Transform, Squeeze]]) -> list[Squeeze]:
@@ -247,20 +247,22 @@ def grid_of(field: SignedDistance) -> tuple[np.ndarray, np.ndarray, float, float
     return field.coefficients, field.origin, field.spacing, field.half_thickness
 
 
-def parts_between(field: SignedDistance, edge_length: float) -> int:
+@numba.njit(cache=True, inline="always")
+def _parts_between(half, low, high, edge_length):
     """Parts of half an edge between which a tool is looked for under skin: 0 of one that no vertices' columns miss.
 
     A thin sheet that leans, and that is no wider than a few edges, sinks under skin between them.
 
     Args:
-        field: distance field of the tool.
+        half: half of its thickness [m]; no more than THICK is known.
+        low, high: corners of its box, (3,) [m].
         edge_length: mean edge length of the skin [m].
     """
-    low, high = field.tool_bounds
-    wide = float(np.sort(high - low)[1])
-    if 2 * field.half_thickness > SHEET * wide or edge_length < LEAST_MISSED * wide:
+    x, y, z = high[0] - low[0], high[1] - low[1], high[2] - low[2]
+    wide = max(min(x, y), min(max(x, y), z))
+    if half >= THICK or 2 * half > SHEET * wide or edge_length < LEAST_MISSED * wide:
         return 0
-    return min(math.ceil(BETWEEN * edge_length / max(wide, 1e-12)), MOST_BETWEEN)
+    return min(int(np.ceil(BETWEEN * edge_length / max(wide, 1e-12))), MOST_BETWEEN)
 
 
 def _along_a_curve(points: Points) -> np.ndarray:
@@ -408,7 +410,7 @@ def _under_between(grid, pose, points, inward, thickness, faces, start, around, 
     """See `_further_in`, of columns between covered vertices too, each in the triangles around the nearest of these.
 
     Args:
-        parts: see `parts_between`.
+        parts: see `_parts_between`.
         under, enough: what is known, and what ends the search [m].
     """
     for v in covered:
@@ -426,7 +428,7 @@ def _under_between(grid, pose, points, inward, thickness, faces, start, around, 
                 n0, n1, n2, t = column_between(inward, thickness, v, j, k, 1 - b - c, b, c)
                 ray = ray_from(pose, x, y, z, n0, n1, n2)
                 least, above = _along_column(grid, ray, t, 0.0)
-                if least < np.inf:
+                if above <= t and least < np.inf:  # of one that is farther, its distance at the core is not known
                     under = _further_in(grid, ray, t, least, above, under)
                 if under >= enough:
                     return under
@@ -435,14 +437,13 @@ def _under_between(grid, pose, points, inward, thickness, faces, start, around, 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _squeezed(grid, pose, centre, points, inward, thickness, faces, start, around, slot, near, least, above, hole,
-              parts, stacked, order, blocks, low, high):  # fmt: skip
+              stacked, order, blocks, low, high):  # fmt: skip
     """Parts of a Squeeze: vertices, depth, rests, top, and those of its nodes; their sinking only of a stack.
 
     Args:
         centre: middle of the tool, in the body's frame, (3,) [m].
         near, least, above: what a Clearance knows.
         hole: distance from which a tool is beside a column [m].
-        parts: see `parts_between`.
         order, blocks, low, high: see _through_box.
     """
     covered, under, wall = near[least < hole], -np.inf, 0.0
@@ -451,6 +452,7 @@ def _squeezed(grid, pose, centre, points, inward, thickness, faces, start, aroun
             v = near[n]
             wall += WALL * thickness[v] / len(covered)
             under = _further_in(grid, ray_of(pose, points, inward, v), thickness[v], least[n], above[n], under)
+    parts = _parts_between(grid[3], low, high, hole / HOLE_RADIUS)
     if parts > 0:
         under = _under_between(grid, pose, points, inward, thickness, faces, start, around, covered, parts, under,
                                ALL_UNDER * wall)  # fmt: skip

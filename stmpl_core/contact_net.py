@@ -55,7 +55,8 @@ THIN_FELT, THIN_DEEP = (0.02, 0.04), (0.12, 0.2)  # strains from which that wide
 THIN_DOUBT = 17.0  # factor on the doubt that it adds, of which the bound grows with the square root
 DOMED, TOO_DOMED = (0.1, 0.24), (0.17, 0.2)  # curvature over 1 / thickness both ways from which skin that is round like
 DOMED_DOUBT = 16.0  # a ball widens the bound, by this factor at the second; and from which it is flagged
-PLATE, PLATE_DEEP = (0.01, 0.003), (0.1, 0.65)  # curvature of a stack over 1 / thickness up to which it is a plate; and
+PLATE, PLATE_DEEP = (-5.2, -5.6), (0.1, 0.65)  # what the network reads of the turn of normals where they turn by 4 and
+# by 2 degrees, from which a stack is less and more a plate; and
 PLATE_DOUBT, PLATE_KAPPA, PLATE_ANYHOW = 24.0, (1.8, 0.0), 0.15  # strain of columns, and log of kappa, between which
 # its bound grows; and the share of that of any kappa
 STACK_FADE = 0.1  # the same on a stack, whose linear response alone is good to some percent up to there
@@ -636,7 +637,7 @@ def _on_plates(inputs, doubt):
     """
     for n in range(len(inputs)):
         row = inputs[n]
-        plate = ramp(abs(row[ON_STACK.curvature]), PLATE) * ramp(row[ON_STACK.column_strain], PLATE_DEEP)
+        plate = ramp(row[ON_STACK.turned], PLATE) * ramp(row[ON_STACK.column_strain], PLATE_DEEP)
         share = PLATE_ANYHOW + (1 - PLATE_ANYHOW) * ramp(row[ON_STACK.log_kappa], PLATE_KAPPA)
         doubt[n] *= 1 + PLATE_DOUBT * plate * share
 

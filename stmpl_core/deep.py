@@ -25,7 +25,7 @@ ACCURACY = 1e-4  # of the way that a tool is drawn back, over the thickness
 def where_inside(layer: SoftLayer) -> tuple[np.ndarray, np.ndarray]:
     """Lowest and highest corner of where a tool's middle may be inside a limb, (3,) each [m].
 
-    It goes on beyond the core of a flat layer by BELOW of its thickness: there a tool is under the skin, not apart.
+    It goes on all around by BELOW of the thickness, for the sake of an open sheet: below that a tool is not apart.
     """
     both, more = np.concatenate([layer.vertices, layer.inner_vertices]), BELOW * float(layer.thickness.max())
     return both.min(axis=0) - more, both.max(axis=0) + more

@@ -230,7 +230,7 @@ def single(layer: SoftLayer, who: str, *, straight: bool = True, instead: str = 
     tissue, more = layer.tissue, []
     if tissue.skin:
         more.append("a skin")
-    if tissue.deeper:
+    if not replace(tissue, skin=None).single:
         more.append(f"{len(tissue.deeper)} deeper material{'s' * (len(tissue.deeper) > 1)}")
     if straight and layer.core is not None:
         more.append("columns that run to a core of their own")
@@ -277,7 +277,7 @@ def layer_id(layer: SoftLayer) -> str:
     if tissue.relaxes:
         series = [one and one.relaxation for one in (tissue, tissue.skin, *tissue.deeper)]
         digest.update(repr([one and (one.shares, one.times) for one in series]).encode())
-    if not tissue.single:
+    if tissue.skin or tissue.deeper:
         digest.update(np.array(tissue.stacked, dtype="<f8").tobytes())
     if layer.ply_scale is not None:
         digest.update(np.ascontiguousarray(layer.ply_scale, dtype="<f4").tobytes())

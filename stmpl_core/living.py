@@ -20,30 +20,15 @@ from stmpl_core.friction import Friction
 from stmpl_core.layer import MAX_THICKNESS, SoftLayer, one_thickness
 from stmpl_core.limbs import EDGE_LENGTH
 from stmpl_core.packed import stack_from_text, stack_to_text
-from stmpl_core.regions import HELD_SKIN, REGIONS, Region, Tone, region
+from stmpl_core.regions import HELD_SKIN, Tone, region
 from stmpl_core.text_file import text_of
 from stmpl_core.tissue import Tissue
 from stmpl_core.trunk import TRUNK
 
-WHOLE = {"arm": "forearm", "leg": "thigh", "torso": "back"}  # region whose numbers serve a part of several
 STRAIGHT = ("torso", "back")  # parts whose bones are not known: their tissue lies straight below the skin
 SHEET = 2e-3  # thickness with which a part is meshed before its columns are known [m]
 NEARLY, LEAST_HELD = 0.9, 0.5  # shares of picked skin: of the most that any part holds of it, and least of that
 DEEPEST = 0.95 * MAX_THICKNESS  # depth at which tissue ends above the bone, as in a heavy person's groin [m]
-
-
-def region_of(part: str, tone: Tone = "relaxed") -> Region:
-    """The region whose numbers are those of a part of a body.
-
-    Args:
-        part: part, as stmpl_core.body knows it: left_forearm, right_thigh, torso.
-        tone: state of the muscle.
-
-    Raises:
-        InvalidInput: a part without a region.
-    """
-    name = part.removeprefix("left_").removeprefix("right_")
-    return region(name if name in REGIONS else WHOLE.get(name, name), tone)
 
 
 def living(body: Body, part: str, tone: Tone = "relaxed", *, edge_length: float = EDGE_LENGTH) -> SoftLayer:
@@ -67,7 +52,7 @@ def living(body: Body, part: str, tone: Tone = "relaxed", *, edge_length: float 
     _check_body(body, part)
     named = part_around(body, part) if part.startswith(AROUND) else part
     if named in STRAIGHT:
-        its = for_person(region_of(named, tone), body.physique)
+        its = for_person(region(named, tone), body.physique)
         return body.part(part, edge_length=edge_length, thickness=its.thickness, tissue=its.tissue)
     return filled(body, named, body.part(part, edge_length=edge_length, thickness=SHEET), tone)
 
@@ -87,7 +72,7 @@ def part_around(body: Body, picked: str) -> str:
     inside, held = body.level(picked) > 0, {}
     for part in body.parts:
         try:
-            region_of(part)
+            region(part)
         except InvalidInput:
             continue
         own = body.level(part) > 0
@@ -109,7 +94,7 @@ def filled(body: Body, part: str, skin: SoftLayer, tone: Tone = "relaxed") -> So
         skin: the part's skin as a thin layer.
         tone: state of the muscle.
     """
-    its = for_person(region_of(part, tone), body.physique)
+    its = for_person(region(part, tone), body.physique)
     fat = fat_map(body, part, skin.vertices)
     if fat is None:
         skin = skin.with_(tissue=its.tissue)

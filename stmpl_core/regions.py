@@ -113,14 +113,15 @@ def region(name: str, tone: Tone = "relaxed") -> Region:
     """A region of a typical adult's body.
 
     Args:
-        name: name of the region: forearm, upper_arm, shoulder, neck, back, abdomen, thigh or calf; or of a body's part
-            that is one, with its side: left_forearm.
+        name: name of the region: forearm, upper_arm, shoulder, neck, back, abdomen, thigh or calf; or of a part of a
+            body, as stmpl_core.body knows it: left_forearm, right_arm, torso.
         tone: state of the muscle: relaxed or tensed.
 
     Raises:
         InvalidInput: a region or a tone that is not listed.
     """
     name = name.removeprefix("left_").removeprefix("right_")
+    name = WHOLE.get(name, name)
     if name not in REGIONS:
         raise InvalidInput(f"there is no region '{name}'. Regions: {', '.join(REGIONS)}.")
     if not isinstance(tone, str) or tone not in get_args(Tone):
@@ -178,6 +179,7 @@ COMMON = {
     "fat_modulus": _FAT_E,
     "poisson_ratio": Quantity(0.45, 0.40, 0.49, "-", "assumed, as nearly incompressible"),
 }  # numbers of every region that has none of its own
+WHOLE = {"arm": "forearm", "leg": "thigh", "torso": "back"}  # region whose numbers serve a part of several
 REGIONS = {  # where, modulus of the tensed muscle, numbers
     "forearm": ("palm side, to the bones", _LIMB_E.times(*_TWICE), {
         "skin_modulus": _SKIN_E,

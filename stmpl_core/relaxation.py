@@ -94,6 +94,8 @@ def fading(tissue: Tissue, thickness: float) -> np.ndarray:
 
 def relaxations(tissue: Tissue, thickness: float) -> list[Prony | None]:
     """Series of each material of a stack, from the skin inwards, and last of the skin if there is one."""
+    if tissue.single:
+        return [tissue.relaxation]
     there = [ply for ply in tissue.deeper if ply.depth < thickness]
     skin = [tissue.skin.relaxation] if tissue.skin else []
     return [tissue.relaxation, *(ply.relaxation for ply in there), *skin]

@@ -105,7 +105,8 @@ class Skin:
             method: method, not yet prepared.
         """
         rest = self.rest or self
-        tissue = replace(rest.layer.tissue, youngs_modulus=youngs_modulus, density=density)
+        alike = tuple(replace(ply, youngs_modulus=youngs_modulus) for ply in rest.layer.tissue.deeper)
+        tissue = replace(rest.layer.tissue, youngs_modulus=youngs_modulus, density=density, deeper=alike)
         layer = rest.layer.with_(tissue=tissue)
         rest.near.keep(layer)
         if rest.green is None and (green := Green.kept(rest.layer)):

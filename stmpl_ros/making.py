@@ -11,9 +11,9 @@ from stmpl_core.contact import Contact
 from stmpl_core.errors import InvalidInput
 from stmpl_core.friction import Friction, friction_from
 from stmpl_core.layer import SoftLayer
-from stmpl_core.living import held_skin, laid, living, part_around, read_model, read_tissue, region_of
+from stmpl_core.living import held_skin, laid, living, part_around, read_model, read_tissue
 from stmpl_core.local_contact import local_contacts
-from stmpl_core.regions import Tone
+from stmpl_core.regions import Tone, region
 from stmpl_core.rig import Rig, joints_of
 from stmpl_core.simulator import Simulator
 from stmpl_core.skin import Skin, published
@@ -91,7 +91,7 @@ def check(config: NodeConfig, build: Build, changed: set[str] | None = None) -> 
         check_part(config, build)
         stacked = config.tissue != PAPER
         if config.tissue in get_args(Tone):
-            region_of(part_around(Body.anny(), config.limb) if config.limb.startswith(AROUND) else config.limb)
+            region(part_around(Body.anny(), config.limb) if config.limb.startswith(AROUND) else config.limb)
         elif stacked:
             stacked = not read_tissue(config.tissue)[0].single
         if stacked and config.method not in ON_STACKS:

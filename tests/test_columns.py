@@ -317,6 +317,18 @@ def test_a_thin_sheet_that_leans_between_two_vertices_has_sunk_under_skin(lean: 
     assert np.abs(by_mesh / by_mesh[0] - 1).max() < 0.1
 
 
+@pytest.mark.parametrize("stacked", [False, True])
+def test_what_only_stands_near_between_two_vertices_has_not_sunk(stacked: bool) -> None:
+    """A sheet that stands upright in thin skin or leans over it, and a ball, on edges as long as they are wide."""
+    layer = plate(0.16, 16e-3, 4e-3)
+    columns = Columns(layer.with_(tissue=STACK) if stacked else layer)
+    sheet, small = box(0.01, 0.006, 3e-4), ball(0.012)
+    for one, pose, depth in ((sheet, turn((0, 1, 0), np.pi / 2), 1e-3), (sheet, turn((0, 1, 0), 0.9), -2e-4),
+                             (small, np.eye(4), 1e-3)):  # fmt: skip
+        pose[:3, 3] = 1e-3, 2e-3, -depth - float((one.vertices @ pose[2, :3]).min())
+        assert not columns.squeezed(SignedDistance.of(one, margin=0.02), pose).top.any()
+
+
 def test_skin_under_a_thin_pin_sinks_with_it_where_columns_lead_out_of_its_wall() -> None:
     """On an uneven forearm, where they differ by 20 degrees under a pin of 4 mm."""
     layer, pin = living(Body.anny(), "left_forearm", edge_length=6e-3), punch(0.002, 0.03)

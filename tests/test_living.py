@@ -13,7 +13,7 @@ from stmpl_core.body import Body, around_name
 from stmpl_core.bones import bones_of
 from stmpl_core.errors import InvalidInput
 from stmpl_core.extrusion import fold_ratios
-from stmpl_core.living import laid, living, part_around, read_tissue, region_of, write_tissue
+from stmpl_core.living import laid, living, part_around, read_tissue, write_tissue
 from stmpl_core.methods import MomentNet
 from stmpl_core.methods.ladder import Measured
 from stmpl_core.regions import HELD_SKIN, region
@@ -51,9 +51,9 @@ def test_tensed_muscle_is_stiffer_and_nothing_else():
 
 
 def test_whole_limbs_and_the_torso_take_the_numbers_of_one_region():
-    assert region_of("left_arm").name == "forearm" and region_of("torso").name == "back"
+    assert region("left_arm").name == "forearm" and region("torso").name == "back"
     with pytest.raises(InvalidInput, match="there is no region"):
-        region_of("left_wing")
+        region("left_wing")
 
 
 def test_a_tissue_goes_through_a_file(tmp_path):
@@ -196,7 +196,7 @@ def test_the_default_node_starts_without_torch_or_anny():
     ("left_shoulder", 1e-2, (0.02, 0.24, 0.42)), ("right_shoulder", 1e-2, (0.02, -0.24, 0.42)),
 ])  # fmt: skip
 def test_a_part_of_the_trunk_has_the_tissue_of_its_region_and_its_border_far_from_where_it_is_pressed(part, edge, site):
-    layer, its = living(Body.anny(), part, edge_length=edge), region_of(part)
+    layer, its = living(Body.anny(), part, edge_length=edge), region(part)
     assert layer.tissue == its.tissue and part.endswith(its.name)
     place = int(np.linalg.norm(layer.vertices - np.array(site), axis=1).argmin())
     assert np.linalg.norm(layer.vertices[place] - site) < 0.03

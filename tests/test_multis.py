@@ -43,6 +43,16 @@ def test_numbers_come_in_si_and_lines_without_one_are_left_out(folder):
     assert one.stiffness == pytest.approx(5 / 6e-3)
 
 
+def test_what_spreadsheets_write_is_read_and_a_gender_that_is_neither_is_told(folder):
+    (path,) = folder.rglob("*.csv")
+    text = path.read_text()
+    path.write_text(text.replace("Female", "female"), encoding="utf-8-sig")
+    assert all(one.female for one in read(folder))
+    path.write_text(text.replace("Female", "F", 1))
+    with pytest.raises(InvalidInput, match="line 2: Gender is 'F'"):
+        read(folder)
+
+
 def test_every_site_becomes_a_row_with_the_peoples_own_thicknesses(folder):
     made = rows(read(folder))
     assert [row.region for row in made] == [region for region, _ in SITES.values()]

@@ -71,6 +71,12 @@ def test_info_without_a_word_more_is_of_the_default_limb(capsys):
     assert stmpl(capsys, "info") == stmpl(capsys, "info", "--part", "forearm")
 
 
+def test_info_knows_parts_that_hold_several_regions_by_the_one_that_serves_them(capsys):
+    for part, serves in (("torso", "back"), ("left_arm", "forearm")):
+        (code, said, _), (_, other, _) = (stmpl(capsys, "info", "--part", name) for name in (part, serves))
+        assert code == 0 and said.startswith(part) and said.splitlines()[1:] == other.splitlines()[1:]
+
+
 def test_info_gives_machines_the_same_in_si(capsys):
     code, said, _ = stmpl(capsys, "info", "--part", "thigh", "--json")
     figures, part = json.loads(said), region("thigh", "tensed")

@@ -20,8 +20,9 @@ from stmpl_core.methods import LimbLinear, MomentNet
 from stmpl_core.moments import Surroundings
 from stmpl_core.networks import STACK_NODE
 from stmpl_core.nodes import Nodes
-from stmpl_core.regions import region
+from stmpl_core.regions import HELD_SKIN, region
 from stmpl_core.sdf import SignedDistance
+from stmpl_core.state import State
 from stmpl_core.stiffness import fit_stiffness
 from stmpl_core.toucher import Toucher, tissue_doubt, unlearnt
 from stmpl_sim.site import Site
@@ -156,6 +157,10 @@ def test_layers_that_are_alike_answer_as_one():
     press = contact_of(ball(BALL), at(RADIUS + BALL - 1.5e-3, 0, 0.08))
     one, other = (Simulator(layer, MomentNet()).step([press]) for layer in (whole, cut))
     assert one.touches["probe"].force > 0
+    fades = [Simulator(layer.with_(tissue=layer.tissue.relaxing(HELD_SKIN)), MomentNet()) for layer in (whole, cut)]
+    (_, state), (_, other_state) = (simulator.touch([press], State(), 1.0) for simulator in fades)
+    (late,), (also_late,) = fades[0].touch([press], state, 30.0)[0], fades[1].touch([press], other_state, 30.0)[0]
+    assert 0 < late.force < one.touches["probe"].force and late.force == also_late.force
     np.testing.assert_array_equal(one.displacement, other.displacement)
     np.testing.assert_array_equal(one.touches["probe"].wrench, other.touches["probe"].wrench)
 

@@ -4,7 +4,7 @@
 import warp as wp
 
 from stmpl_core import columns as of_numba
-from stmpl_core import rays
+from stmpl_core import rays, sdf
 from stmpl_core.columns import ALL_UNDER, LEAST_UNDER, MIN_ONE_WAY_SHARE
 from stmpl_core.columns import BLOCK as IN_BLOCK
 from stmpl_core.deep import DEEPEST
@@ -28,6 +28,7 @@ from stmpl_core.gpu.rays import (
 
 BLOCK, EDGE = wp.constant(IN_BLOCK), wp.constant(EDGE_BIT)
 UNDER, TOO_DEEP = wp.constant(wp.float64(LEAST_UNDER)), wp.constant(wp.float64(DEEPEST))
+ENOUGH, THICK = wp.constant(wp.float64(ALL_UNDER)), wp.constant(wp.float64(sdf.THICK))
 SINKS = wp.constant(wp.float64(ALL_UNDER - LEAST_UNDER))
 ANYHOW, ONE_WAY = wp.constant(wp.float64(rays.ANYHOW)), wp.constant(wp.float64(MIN_ONE_WAY_SHARE))
 SHEET, LEAST_MISSED = wp.constant(wp.float64(of_numba.SHEET)), wp.constant(wp.float64(of_numba.LEAST_MISSED))
@@ -155,7 +156,7 @@ def _parts_between(grid: Grid, edge: real) -> wp.int32:
     """Parts of half an edge between which a tool is looked for under skin: stmpl_core.columns.parts_between."""
     size, out = grid.high - grid.low, wp.int32(0)
     wide = wp.max(wp.min(size[0], size[1]), wp.min(wp.max(size[0], size[1]), size[2]))
-    if real(2.0) * grid.half <= SHEET * wide and edge >= LEAST_MISSED * wide:
+    if grid.half < THICK and real(2.0) * grid.half <= SHEET * wide and edge >= LEAST_MISSED * wide:
         out = wp.min(wp.int32(wp.ceil(BETWEEN * edge / wp.max(wide, real(1e-12)))), MOST_BETWEEN)
     return out
 
@@ -191,7 +192,7 @@ def _under_between(skins: Skins, scratch: Scratch, c: wp.int32, v: wp.int32, par
                 t = a * skins.thickness[v] + b * skins.thickness[j] + d * skins.thickness[k]
                 start = pose * (place - scratch.place[c])
                 near, above = clearance_of(grid, skins.coefficients, start, way, t, real(0.0))
-                if near < FAR:
+                if above <= t and near < FAR:
                     under = _further_in(skins, grid, start, way, t, near, above, under)
     return under
 
@@ -216,8 +217,6 @@ def gather_clearance(again: wp.int32, skins: Skins, scratch: Scratch):
             v = scratch.columns[c, n]
             start, way = pose * (skins.points[v] - scratch.place[c]), pose * skins.inward[v]
             under = _further_in(skins, grid, start, way, skins.thickness[v], least, above, under)
-            if parts > 0:
-                under = _under_between(skins, scratch, c, v, parts, under)
             wall += skins.thickness[v]
             covers += 1
             _mark(scratch.covered, c, v - one.first)
@@ -225,6 +224,10 @@ def gather_clearance(again: wp.int32, skins: Skins, scratch: Scratch):
     scratch.around[c] = wp.max(scratch.around[c], around)
     if again == 1:
         return
+    if parts > 0:
+        for n in range(scratch.count[c]):
+            if scratch.least[c, n] < one.hole and under * real(covers) < ENOUGH * WALL_WIDTH * wall:
+                under = _under_between(skins, scratch, c, scratch.columns[c, n], parts, under)
     scratch.top[c] = vec3()
     if covers == 0:
         scratch.status[c] = APART

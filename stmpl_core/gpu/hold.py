@@ -33,7 +33,7 @@ DOMED_NONE, DOMED_WHOLE, TOO_NONE, TOO_WHOLE, DOMED_DOUBT = (
 PLATE_NONE, PLATE_WHOLE, PLATE_FROM, PLATE_TO, KAPPA_NONE, KAPPA_WHOLE, PLATE_DOUBT, PLATE_ANYHOW = (
     wp.constant(wp.float64(x)) for x in (*contact_net.PLATE, *contact_net.PLATE_DEEP, *contact_net.PLATE_KAPPA,
                                          contact_net.PLATE_DOUBT, contact_net.PLATE_ANYHOW))  # fmt: skip
-AT_CURVATURE, AT_COLUMN = wp.constant(STACK_NODE.at.curvature), wp.constant(STACK_NODE.at.column_strain)
+AT_TURNED, AT_COLUMN = wp.constant(STACK_NODE.at.turned), wp.constant(STACK_NODE.at.column_strain)
 AT_KAPPA = wp.constant(STACK_NODE.at.log_kappa)
 THIN_DOUBT, ONE_SEES = wp.constant(wp.float64(contact_net.THIN_DOUBT)), wp.constant(NODE.size)
 LARGEST = wp.constant(wp.float64(contact_net.MAX_LOG_RATIO))
@@ -337,7 +337,7 @@ def judge(lanes: wp.int32, scratch: Scratch, net: Net):
             far = _ramp(both, TOO_NONE, TOO_WHOLE)
             scratch.strange[s, i] = wp.max(thin * _ramp(strain, DEEP_NONE, DEEP_WHOLE), far)
         else:
-            plate = _ramp(wp.abs(real(scratch.inputs[s, i, AT_CURVATURE])), PLATE_NONE, PLATE_WHOLE)
+            plate = _ramp(real(scratch.inputs[s, i, AT_TURNED]), PLATE_NONE, PLATE_WHOLE)
             plate *= _ramp(real(scratch.inputs[s, i, AT_COLUMN]), PLATE_FROM, PLATE_TO)
             kappa = _ramp(real(scratch.inputs[s, i, AT_KAPPA]), KAPPA_NONE, KAPPA_WHOLE)
             share = PLATE_ANYHOW + (real(1.0) - PLATE_ANYHOW) * kappa

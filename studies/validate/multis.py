@@ -97,7 +97,7 @@ def read(path: Path) -> list[Indentation]:
                                "studies/LayerEffectonStiffness/dat.")  # fmt: skip
         file = found[0]
     try:
-        with file.open(newline="", encoding="utf-8") as lines:
+        with file.open(newline="", encoding="utf-8-sig") as lines:
             table = list(csv.DictReader(lines))
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise InvalidInput(f"{file} cannot be read: {error}.") from error
@@ -113,12 +113,14 @@ def _indentation(line: dict[str, str], where: str) -> Indentation:
         index, force, strain, skin, fat, muscle, pressure = (float(line[name]) for name in NUMBERS)
     except ValueError as error:
         raise InvalidInput(f"{where}: {error}.") from error
+    if (gender := line["Gender"].strip().lower()) not in ("female", "male"):
+        raise InvalidInput(f"{where}: Gender is {line['Gender']!r}; Female or Male is needed.")
     if line["Location"] not in SITES:
         raise InvalidInput(f"{where}: there is no site {line['Location']!r}. Sites: {', '.join(SITES)}.")
     sizes = (index, force, strain, skin, fat, muscle, pressure)
     if not (np.isfinite(sizes).all() and min(sizes) > 0 and strain < 1 and skin + fat + muscle < 300):
         raise InvalidInput(f"{where}: a force, strain or thickness [mm] that cannot be.")
-    return Indentation(line["SubID"], line["Location"], line["Gender"] == "Female", index, 1e-3 * skin, 1e-3 * fat,
+    return Indentation(line["SubID"], line["Location"], gender == "female", index, 1e-3 * skin, 1e-3 * fat,
                        1e-3 * muscle, force, strain, 1e-6 * force / pressure)  # fmt: skip
 
 
