@@ -632,7 +632,7 @@ def _on_plates(inputs, doubt):
     """Widens the doubt (N,) of nodes of a stack that is a flat plate.
 
     Limbs are round, and their networks give plates too much the deeper the tool is, the more so where the skin is weak
-    or what lies under it stiff: balls of 10 and 20 mm on 41 stacks 2 % in the median, but up to 43 % at 0.65 of the
+    or what lies under it stiff: balls of 10 and 20 mm on 41 stacks 4 % in the median, but up to 43 % at 0.65 of the
     thickness (axisymmetric finite elements).
     """
     for n in range(len(inputs)):
