@@ -399,4 +399,4 @@ def _sized_field(field: SignedDistance, by: float) -> SignedDistance:
     return replace(field, coefficients=by * field.coefficients, origin=by * field.origin, spacing=by * field.spacing,
                    surface_error=by * field.surface_error, tool_bounds=(by * low, by * high),
                    half_thickness=by * field.half_thickness, checks=by * field.checks,
-                   openings=by * field.openings, tips=by * field.tips)  # fmt: skip
+                   openings=by * field.openings, tips=by * field.tips, corners=by * field.corners)  # fmt: skip

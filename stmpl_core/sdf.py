@@ -42,6 +42,7 @@ MOST_CHECKS = CHECKED + 27  # number of them with those farthest out
 TIPS, STANDS_OUT = 256, 0.05  # tips that are known, and how far they stand out at least, over the spacing
 MOST_EDGES, SHARP = 1000, np.cos(np.radians(30.0))  # places along edges that are looked at; cosine between their faces
 BLUNT = 0.95  # mean of the normals around a corner that is no tip
+CORNERS, DEEP_CORNER = 64, 3.0  # sharpest corners that are known; depth over the thickness to which they are looked for
 LOST, LOOKS = 0.02, 80  # largest way inwards on which a tip's surface is looked for [m], and places on it
 PROBED, THICK = 600, 5e-3  # places of a tool from which its thickness is told, and the largest half of it [m]
 ROUNDING_WIDTH = 0.57  # width of the smoothing over the radius that it gives a right-angled edge, measured
@@ -76,6 +77,7 @@ class SignedDistance:
         openings: places at the rims of its holes, (K, 3) [m].
         tips: corners of the mesh, and places along its sharp edges, that stand out of the rounded surface, at most
             TIPS of them, each with how far the surface lies inwards from there, the farthest first, (K, 4) [m].
+        corners: its corners, the sharpest first, at most CORNERS, (K, 3) [m]; none where they are rounded on purpose.
     """
 
     coefficients: np.ndarray
@@ -89,6 +91,7 @@ class SignedDistance:
     checks: np.ndarray = field(default_factory=lambda: NO_CHECKS)
     openings: Points = field(default_factory=lambda: NO_POINTS)
     tips: np.ndarray = field(default_factory=lambda: NO_CHECKS)
+    corners: Points = field(default_factory=lambda: NO_POINTS)
 
     @classmethod
     def of(
@@ -137,7 +140,8 @@ class SignedDistance:
         rims = rims[:: 1 + len(rims) // MOST_OPENINGS]
         tips = _tips(coefficients, origin, spacing, *outer)
         box = used.min(axis=0), used.max(axis=0)
-        built = cls(coefficients, origin, spacing, watertight, flipped, error, box, half, checks, rims, tips)
+        corners = NO_POINTS if rounding else _corners(*outer)
+        built = cls(coefficients, origin, spacing, watertight, flipped, error, box, half, checks, rims, tips, corners)
         if coefficients.nbytes <= MOST_KEPT_BYTES:
             _KEPT[key] = built
             for old in list(_KEPT)[:-MOST_KEPT]:
@@ -315,6 +319,49 @@ def _tips(coefficients: np.ndarray, origin: np.ndarray, spacing: float, vertices
     apart = np.linalg.norm(places[:, None] - places, axis=2)  # at a blade's corner normals may lead along its edge
     lost = (apart + lost).min(axis=1, initial=LOST)
     return np.column_stack([places, lost])[np.argsort(-lost, kind="stable")]
+
+
+def _corners(vertices: Points, faces: np.ndarray) -> Points:
+    """See SignedDistance: vertices whose faces look many ways."""
+    used, where = np.unique(faces, return_inverse=True)
+    corners = vertices[faces]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normals /= np.maximum(np.linalg.norm(normals, axis=1), 1e-300)[:, None]
+    sums = np.zeros((len(used), 3))
+    np.add.at(sums, where.ravel(), np.repeat(normals, 3, axis=0))
+    mean = np.linalg.norm(sums, axis=1) / np.bincount(where.ravel())
+    sharp = np.argsort(mean, kind="stable")[:CORNERS]
+    return vertices[used[sharp[mean[sharp] < BLUNT]]]
+
+
+@numba.njit(cache=True, nogil=True)
+def deepest_corner(corners, pose, points, inward, thickness, area):
+    """Depth of the corner of a tool that is deepest for its column [m], and over the thickness there [-]; 0: of none.
+
+    Columns are asked how deep a tool is in them; a corner may be between two.
+
+    Args:
+        corners: see SignedDistance.
+        pose: pose_body_from_tool, (4, 4).
+        points, inward, thickness, area: of the nodes that are pressed: see Nodes.
+    """
+    wide, deep, most = 0.0, 0.0, 0.0
+    for n in range(len(points)):
+        wide = max(wide, 4 * area[n])
+    for k in range(len(corners)):
+        at = np.empty(3)
+        for x in range(3):
+            at[x] = pose[x, 3] + pose[x, 0] * corners[k, 0] + pose[x, 1] * corners[k, 1] + pose[x, 2] * corners[k, 2]
+        least, own, share = wide, 0.0, 0.0
+        for n in range(len(points)):
+            a, b, c = at[0] - points[n, 0], at[1] - points[n, 1], at[2] - points[n, 2]
+            into = a * inward[n, 0] + b * inward[n, 1] + c * inward[n, 2]
+            square = a * a + b * b + c * c - into * into
+            if square < least and 0 < into < DEEP_CORNER * thickness[n]:
+                least, own, share = square, into, into / thickness[n]
+        if share > most:
+            deep, most = own, share
+    return deep, most
 
 
 @numba.njit(cache=True, nogil=True)

@@ -24,7 +24,7 @@ from stmpl_core.nodes import Nodes, ball_around, gathered, strains_under
 from stmpl_core.obstacle import REACH
 from stmpl_core.pieces import DEEP, GROUP, WIDER, pins
 from stmpl_core.rays import WALL, way_of
-from stmpl_core.sdf import SignedDistance, lacking, mean_off
+from stmpl_core.sdf import SignedDistance, deepest_corner, lacking, mean_off
 from stmpl_core.tools import Tools
 from stmpl_core.touch import (
     APART,
@@ -72,6 +72,7 @@ LED_DEEP, LED_LOST = 0.9, 0.35  # depth over the deepest of nodes that tell it f
 LOOKED_AT = 48  # tips of a tool that presses nothing that are looked at, the farthest; and as many of the others
 EDGE_SURE = 0.05  # share of its depth that an edge of a box lacks, with which contacts were learnt
 EDGE_OFF, MOST_LACKING = 0.2, 0.98  # depth of an edge that a distance field does not tell, from which it is flagged
+TIP_FROM = 0.4  # depth over the thickness from which the corners of a tool are looked at
 FIRST = 0.01  # depth over the thickness from which touches were tried
 MUCH_STIFFER = 4.5, 22.0  # stiffness over that of what lies above, bare and under a skin, from which that may be felt
 SOFT_SHARE = 0.25, 0.56  # depth over the soft tissue's, likewise, to which force is within its bound over nearly bone
@@ -124,6 +125,11 @@ class _Placed(NamedTuple):
     factor: float = 1.0  # on the pressures: what a tool that was drawn back presses more
     rim: bool = False  # truth of the claim that a part of the skin below is deeper than DEEPEST, and the most is not
     lost: bool = False  # truth of the claim that it may press between corners of long triangles, where it is not found
+
+    @property
+    def unknown(self) -> bool:
+        """Whether it may press though nothing of that is found."""
+        return self.lost or self.status == IN_CORE
 
 
 class Toucher:
@@ -505,7 +511,7 @@ class Toucher:
             nothing, none = np.zeros(6), np.empty(0)
             touch = Touch(
                 one.contact.name, one.status, one.pose, nothing, one.depth if math.isfinite(one.depth) else math.nan,
-                math.nan if one.lost else 0.0, one.moved, nothing if stated is None else stated,
+                math.nan if one.unknown else 0.0, one.moved, nothing if stated is None else stated,
                 pressure=np.zeros(len(layer.vertices)))  # fmt: skip
             object.__setattr__(touch, "trust", self._trust(one, touch, none, none, 0.0, alone, covered))
             return touch
@@ -531,6 +537,11 @@ class Toucher:
             lack = lacking(one.field.tips, one.pose, wrench[:3] / size, nodes.points, nodes.area, depth)
             lacks = min(lack / max(depth + lack, 1e-300), MOST_LACKING)
             bound += (1 - max(lacks - EDGE_SURE, 0.0)) ** -held.power - 1
+        tip = tip_share = 0.0
+        if one.factor == 1 and size > 0 and depth > TIP_FROM * thickness:
+            tip, tip_share = deepest_corner(one.field.corners, one.pose, *nodes[:4])
+            if tip_share > DEEPEST and tip > depth:
+                bound += (tip / depth) ** held.power - 1
         led = 1.0
         if one_way and layer.stacked:
             led = _led_in(nodes.sinking, nodes.strain, nodes.thickness, nodes.inward, wrench[:3] / size)
@@ -558,7 +569,7 @@ class Toucher:
         touch = Touch(
             one.contact.name, one.status, one.pose, wrench,
             depth=depth if math.isfinite(depth) else float("nan"),
-            force_bound=size * bound * wider if size > 0 else math.nan if one.lost else one.force or 0.0,
+            force_bound=size * bound * wider if size > 0 else math.nan if one.unknown else one.force or 0.0,
             moved=one.moved,
             missing=np.zeros(6) if stated is None else stated - wrench,
             pressure=values,
@@ -573,6 +584,9 @@ class Toucher:
             trust = trust.also(f"{touch.name} is {1e3 * (depth + lack):.2g} mm deep in the skin, and its distance "
                                f"field, of {1e3 * one.field.spacing:.2g} mm, tells {1e3 * depth:.2g} mm of its edge: "
                                "leave out what of it is far away", in_range=False)  # fmt: skip
+        if tip_share > DEEPEST:
+            trust = trust.also(f"a corner of {touch.name} is {1e3 * tip:.2g} mm deep in the skin, {tip_share:.0%} "
+                               "of the tissue there", in_range=False)  # fmt: skip
         if led < LED_OUT:
             trust = trust.also(f"{touch.name} is {1e3 * depth:.2g} mm deep, and thin: the skin below it is led out of "
                                f"its walls, and goes along by {led:.0%} of that", in_range=False)  # fmt: skip

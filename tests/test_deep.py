@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+import trimesh
 
 from stmpl_core import Rig, Simulator, Skin, Tissue, Tool
 from stmpl_core.body import Body
@@ -188,3 +189,19 @@ def test_a_tool_below_an_open_sheet_is_not_apart(tool: Tool) -> None:
         assert touch.force > 0
     for aside in ((0.08, -0.02), (0.0, high + 1e-3)):  # beside the sheet and over it
         assert simulator.touch([press(tool, at(aside[0], 0, aside[1]), None)])[0].status == APART
+
+
+@pytest.mark.parametrize("half_angle", [15.0, 25.0])
+def test_a_tip_between_columns_that_reaches_the_core_is_told_of(half_angle: float) -> None:
+    """Columns around it are 76 to 84 % deep; a tip that ends in the tissue is none."""
+    layer, high = plate(0.12, 3e-3), 0.03
+    cone = trimesh.creation.cone(1e3 * high * np.tan(np.radians(half_angle)), 1e3 * high, sections=64)
+    tool = Tool("cone", 1e-3 * np.asarray(cone.vertices) * [1, 1, -1] + [0, 0, high], np.asarray(cone.faces)[:, ::-1])
+    sim = Simulator(layer, MomentNet())
+    bounds = []
+    for share, sound in ((0.8, True), (1.05, False)):
+        (touch,) = sim.touch([press(tool, at(1.1e-3, 0.7e-3, -share * float(layer.thickness[0])), None)])
+        assert touch.trust.in_range == sound
+        assert ("a corner of probe" in touch.trust.why) != sound
+        bounds.append(touch.force_bound / touch.force)
+    assert bounds[1] > 1.3 * bounds[0]

@@ -9,11 +9,12 @@ import warp as wp
 from stmpl_core import pieces, soundness, toucher
 from stmpl_core import wrenches as wrenches_of_skin
 from stmpl_core.gpu.blocks import least_of, most_of, sum_of
-from stmpl_core.gpu.columns import _mark, _marked
+from stmpl_core.gpu.columns import TOO_DEEP, _mark, _marked
 from stmpl_core.gpu.packs import BONY_BIT, BORDER_BIT, LONG_BIT, STEEP_BIT, Scratch, Skins
 from stmpl_core.gpu.places import APART, BY_POSE, DEEP, REFUSED, WRAPPED
 from stmpl_core.gpu.rays import FAR, OPTIONS, real, vec3, way_of
 from stmpl_core.obstacle import REACH
+from stmpl_core.sdf import DEEP_CORNER
 
 HALF_REACH = wp.constant(wp.float64(0.5 * REACH))
 STEEP, LONG, BORDER = wp.constant(STEEP_BIT), wp.constant(LONG_BIT), wp.constant(BORDER_BIT)
@@ -44,6 +45,7 @@ THIN_FROM, THIN_MORE, THIN_TO, LOW = (
 EDGE_SURE = wp.constant(wp.float64(toucher.EDGE_SURE))
 EDGE_OFF, MOST_LACKING = wp.constant(wp.float64(toucher.EDGE_OFF)), wp.constant(wp.float64(toucher.MOST_LACKING))
 SURE, MOST_OFF = wp.constant(wp.float64(toucher.SURE)), wp.constant(wp.float64(toucher.MOST_OFF))
+TIP_FROM, CORNER_TO = wp.constant(wp.float64(toucher.TIP_FROM)), wp.constant(wp.float64(DEEP_CORNER))
 FIRST, TWICE_FIRST = wp.constant(wp.float64(toucher.FIRST)), wp.constant(wp.float64(2 * toucher.FIRST))
 vec16 = wp.types.vector(length=16, dtype=wp.float64)
 wp.set_module_options(OPTIONS)
@@ -291,6 +293,33 @@ def _lacking(skins: Skins, scratch: Scratch, c: wp.int32, s: wp.int32, k: wp.int
 
 
 @wp.func
+def _deepest_corner(skins: Skins, scratch: Scratch, c: wp.int32, s: wp.int32, k: wp.int32, lane: wp.int32) -> wp.vec2d:
+    """Depth of the deepest corner [m], and over the thickness there: stmpl_core.sdf.deepest_corner."""
+    wide, deep, most = real(0.0), real(0.0), real(0.0)
+    for i in range(lane, scratch.nodes[s], wp.block_dim()):
+        if scratch.tool[s, i] == k:
+            wide = wp.max(wide, real(4.0) * scratch.area[s, i])
+    wide = most_of(wide)
+    for j in range(lane, skins.corner_many[scratch.grid[c]], wp.block_dim()):
+        at = scratch.pose[c] * vec3(skins.corners[scratch.grid[c], j]) + scratch.place[c]
+        least, own, share = real(wide), real(0.0), real(0.0)
+        for i in range(scratch.nodes[s]):
+            if scratch.tool[s, i] == k:
+                to = at - scratch.point[s, i]
+                into = wp.dot(to, scratch.inward[s, i])
+                square = wp.length_sq(to) - into * into
+                if square < least and into > real(0.0) and into < CORNER_TO * scratch.thick[s, i]:
+                    least = square
+                    own = into
+                    share = into / scratch.thick[s, i]
+        if share > most:
+            most = share
+            deep = own
+    highest = most_of(most)
+    return wp.vec2d(most_of(wp.where(most == highest, deep, real(0.0))), highest)
+
+
+@wp.func
 def _led_in(scratch: Scratch, s: wp.int32, k: wp.int32, way: vec3, lane: wp.int32) -> real:
     """Share of its depth in columns by which the nodes of a thin tool sink with it: stmpl_core.toucher._led_in."""
     sunk, deep = real(0.0), real(1e-300)
@@ -417,6 +446,9 @@ def answer(first: wp.int32, many: wp.int32, known: Known, skins: Skins, scratch:
         lack = _lacking(skins, scratch, c, s, k, force / size, depth, lane)
         if one.stacked == 1:
             led = _led_in(scratch, s, k, force / size, lane)
+    tip = wp.vec2d(real(0.0), real(0.0))
+    if size > real(0.0) and depth * forces > TIP_FROM * carried:
+        tip = _deepest_corner(skins, scratch, c, s, k, lane)
     if lane > 0:
         return
     torque = vec3(more_sums[0], more_sums[1], more_sums[2])
@@ -438,6 +470,7 @@ def answer(first: wp.int32, many: wp.int32, known: Known, skins: Skins, scratch:
     sound = sound and not group
     sound = sound and skins.holes[k] == 0
     if size > real(0.0):
+        sound = sound and tip[1] <= TOO_DEEP
         sound = sound and led >= LED_OUT and lack <= EDGE_OFF * wp.max(depth + lack, FIRST * carried / forces)
     wrong = real(0.0)
     if size > real(0.0) and grid.surface_error > SURE * depth:
@@ -465,6 +498,8 @@ def answer(first: wp.int32, many: wp.int32, known: Known, skins: Skins, scratch:
             bound += SHALLOW * wp.max(real(1.0) - depth * forces / (SHALLOW_TO * carried), real(0.0))
         lacks = wp.max(wp.min(lack / wp.max(depth + lack, NONE), MOST_LACKING) - EDGE_SURE, real(0.0))
         bound += wp.pow(real(1.0) - lacks, -power) - real(1.0)
+        if tip[1] > TOO_DEEP and tip[0] > depth:
+            bound += wp.pow(tip[0] / depth, power) - real(1.0)
         flat = below / wp.max(depth, NONE)
         flat = power * wp.log(real(1.0) + flat + flat * wp.min(flat, real(1.0)))
         bound += STUCK * along / size + wp.exp(wp.min(flat, MOST_MORE)) - real(1.0)

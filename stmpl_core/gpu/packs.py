@@ -19,7 +19,7 @@ from stmpl_core.layer import SoftLayer
 from stmpl_core.networks import ARRAYS, NODE, PRESSURE, STACK_NODE, shipped
 from stmpl_core.nodes import CHARTS, MOST, NODES, WIDEST
 from stmpl_core.obstacle import response
-from stmpl_core.sdf import MOST_CHECKS, TIPS, SignedDistance
+from stmpl_core.sdf import CORNERS, MOST_CHECKS, TIPS, SignedDistance
 from stmpl_core.skin import Skin
 from stmpl_core.tool import Tool
 from stmpl_core.tools import Tools
@@ -100,6 +100,7 @@ SKINS: dict[str, tuple[Any, str]] = {
     "start": (wp.int32, "V"), "around": (wp.int32, "F"), "balls": (wp.vec4d, "B"),
     "grids": (Grid, "G"), "coefficients": (real, "N"), "holes": (wp.int32, "K"),
     "checks": (wp.vec4d, "Gx"), "tips": (wp.vec4d, "Gx"), "tip_many": (wp.int32, "G"),
+    "corners": (wp.vec3d, "Gx"), "corner_many": (wp.int32, "G"),
     "looked_at": (vec3, "Kx"), "look_many": (wp.int32, "Kx"),
     "rows": (real, "Tx"), "linked": (wp.uint32, "Vb"),
     "green": (real, "SbgR"), "soft": (real, "V"), "alike": (real, "V"), "coarse_corner": (wp.vec3i, "V"),
@@ -229,6 +230,8 @@ def pack(skins: Sequence[Skin], tools: Sequence[Tool], device: Any) -> tuple[Any
             parts["checks"].append(np.concatenate([field.checks, FAR_AWAY[len(field.checks) :]])[None])
             parts["tips"].append(np.concatenate([field.tips, np.zeros((TIPS - len(field.tips), 4))])[None])
             parts["tip_many"].append(np.array([len(field.tips)]))
+            parts["corners"].append(np.concatenate([field.corners, np.zeros((CORNERS - len(field.corners), 3))])[None])
+            parts["corner_many"].append(np.array([len(field.corners)]))
         table = response(skin.layer.tissue.poisson_ratio)
         one.half_space = table.half_space
         parts["rows"].append(table.rows)
