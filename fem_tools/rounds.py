@@ -1,4 +1,4 @@
-"""Rounds: tools of revolution pressed into the flat stacks of a plan: seconds a press, so every stack is seen to depth.
+"""Rounds: tools of revolution pressed into flat stacks, a plan's bodies' and others: seconds a press, to any depth.
 
 Solid elements on a limb take minutes a press and see a stack a few times; these see it whole, but flat. All lengths are
 in thicknesses of the stack and all forces in E t^2 in the end, so one thickness serves.
@@ -7,22 +7,30 @@ in thicknesses of the stack and all forces in E t^2 in the end, so one thickness
 from __future__ import annotations
 
 import io
+import json
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
 from fem_tools.axisymmetric import Flat, Profile, Round
-from fem_tools.sampling import BodyPlan, Plan, ratios
+from fem_tools.sampling import SKIN, BodyPlan, Plan, ratios
 from stmpl_core.errors import InvalidInput
-from stmpl_core.tissue import Tissue
+from stmpl_core.packed import stack_from_text, stack_to_text
+from stmpl_core.tissue import Membrane, Ply, Tissue
 
 THICKNESS = 0.02  # of every flat stack [m]
 WIDTHS = (0.15, 2.0)  # radii of the tools, over it
 KINDS = ("ball", "flat", "cone", "ring")
 SHARES = (0.45, 0.25, 0.15, 0.15)  # of the kinds
+KAPPAS, PULLS = (0.1, 30.0), (0.01, 1.5)  # E_s h / (E t) and T / (E t) of skins on stacks of no body
+BARE, SLACK = 0.2, 0.15  # shares of these stacks without a skin, and of skins without tension
+PLIES, PLY_SHARES = (1, 2, 3, 4), (0.05, 0.6, 0.25, 0.1)  # their materials, and the shares of stacks with as many
+BEGINS = (0.05, 0.85)  # depths at which these begin, over the thickness
+STIFFER = (0.5, 50.0)  # their moduli over the first one's
+POISSON = (0.35, 0.47)  # their Poisson's ratios, one for all of a stack
 BEYOND = 1e-4  # share of the force that a release does not say where it is carried
 FULL = 20_000  # steps of what a release rounds
 
@@ -32,12 +40,12 @@ class Pressed:
     """One press.
 
     Args:
-        body: name of the body in the plan whose stack it is.
+        tissue: stack, THICKNESS thick.
         tool: tool.
         rounds: converged depths, increasing.
     """
 
-    body: str
+    tissue: Tissue
     tool: Profile
     rounds: list[Round]
 
@@ -47,7 +55,7 @@ class Pressed:
                   for name in ("radius", "carried", "moved")}  # fmt: skip
         buffer = io.BytesIO()
         tool = np.array([*self.tool.inner, *self.tool.outer, self.tool.rounding])
-        np.savez_compressed(buffer, body=np.array(self.body), tool=tool,
+        np.savez_compressed(buffer, tissue=np.array(stack_to_text(self.tissue)), tool=tool,
                             depths=np.array([one.depth for one in self.rounds]),
                             **{name: value.astype(np.float32) for name, value in arrays.items()})  # fmt: skip
         return buffer.getvalue()
@@ -60,7 +68,7 @@ class Pressed:
             rounds = [Round(float(depth), float(file[f"carried_{k}"][-1]),
                             *(file[f"{name}_{k}"].astype(float) for name in ("radius", "carried", "moved")))
                       for k, depth in enumerate(file["depths"])]  # fmt: skip
-            return cls(str(file["body"]), Profile((a, b), (c, d), e), rounds)
+            return cls(stack_from_text(str(file["tissue"]))[0], Profile((a, b), (c, d), e), rounds)
 
 
 def learnt(plan: Plan) -> list[BodyPlan]:
@@ -74,7 +82,23 @@ def tissue_of(body: BodyPlan) -> Tissue:
     return body.stack.tissue(body.poisson_ratio, THICKNESS)
 
 
-def drawn(plan: Plan, number: int) -> tuple[BodyPlan, Profile, list[float]]:
+def any_stack(plan: Plan, number: int) -> Tissue:
+    """A stack such as phantoms are, THICKNESS thick: of moduli, depths and skins that no body of the plan need have."""
+    rng = np.random.default_rng([plan.seed, 2, number])
+    fat = Tissue(poisson_ratio=float(rng.uniform(*POISSON)))
+    unit = fat.youngs_modulus * THICKNESS
+    begins = np.sort(np.exp(rng.uniform(*np.log(BEGINS), int(rng.choice(PLIES, p=PLY_SHARES)) - 1)))
+    stiffer = np.exp(rng.uniform(*np.log(STIFFER), len(begins)))
+    kappa, pull = (float(np.exp(rng.uniform(*np.log(ends)))) for ends in (KAPPAS, PULLS))
+    bare, slack = rng.uniform(size=2)
+    membrane = Membrane(kappa * unit / SKIN, SKIN, 0.0 if slack < SLACK else pull * unit)
+    skin = membrane if bare > BARE or not len(begins) else None  # one material alone is no stack
+    plies = tuple(Ply(float(begin) * THICKNESS, float(share) * fat.youngs_modulus, fat.poisson_ratio)
+                  for begin, share in zip(begins, stiffer, strict=True))  # fmt: skip
+    return replace(fat, skin=skin, deeper=plies)
+
+
+def drawn(plan: Plan, number: int) -> tuple[Tissue, Profile, list[float]]:
     """Stack, tool and depths [m] of a press, whoever draws it and when."""
     bodies = learnt(plan)
     rng = np.random.default_rng([plan.seed, 1 + number])
@@ -87,13 +111,15 @@ def drawn(plan: Plan, number: int) -> tuple[BodyPlan, Profile, list[float]]:
         "ring": Profile((width - edge, 0.0), (width - edge, 0.0), edge),
     }
     depths = THICKNESS * ratios(plan, "indenter", plan.loads, rng)
-    return bodies[number % len(bodies)], shapes[str(kind)], depths.tolist()
+    of_body = number < plan.rounds
+    tissue = tissue_of(bodies[number % len(bodies)]) if of_body else any_stack(plan, number)
+    return tissue, shapes[str(kind)], depths.tolist()
 
 
 def press(plan: Plan, number: int) -> bytes:
     """One press of a plan, as a file's bytes; to the depth to which Newton's method comes."""
-    body, tool, depths = drawn(plan, number)
-    return Pressed(body.name, tool, Flat(tissue_of(body), THICKNESS).press(tool, depths)).write()
+    tissue, tool, depths = drawn(plan, number)
+    return Pressed(tissue, tool, Flat(tissue, THICKNESS).press(tool, depths)).write()
 
 
 def release(presses: Sequence[Pressed], path: str | Path) -> None:
@@ -109,7 +135,7 @@ def release(presses: Sequence[Pressed], path: str | Path) -> None:
     shares = [np.append(one.carried[: end - 1] / one.force, 1.0) for one, end in zip(every, ends, strict=True)]
     np.savez_compressed(
         path,
-        bodies=np.array([press.body for press in presses]),
+        tissues=np.frombuffer(json.dumps([stack_to_text(press.tissue) for press in presses]).encode(), np.uint8),
         tools=np.array([(*press.tool.inner, *press.tool.outer, press.tool.rounding) for press in presses]),
         depths=np.array([len(press.rounds) for press in presses]),
         depth=np.array([one.depth for one in every]),
@@ -139,8 +165,9 @@ def released(path: str | Path) -> list[Pressed]:
             rounds.append(Round(float(file["depth"][k]), force, file["widest"][k] * radius, force * carried,
                                 np.full((2, len(radius)), np.nan)))  # fmt: skip
         tools = [Profile((a, b), (c, d), e) for a, b, c, d, e in file["tools"].tolist()]
-        return [Pressed(str(body), tool, rounds[end - many : end])
-                for body, tool, many, end in zip(file["bodies"], tools, file["depths"], first, strict=True)]
+        tissues = [stack_from_text(text)[0] for text in json.loads(file["tissues"].tobytes())]
+        return [Pressed(tissue, tool, rounds[end - many : end])
+                for tissue, tool, many, end in zip(tissues, tools, file["depths"], first, strict=True)]
     except (OSError, ValueError, KeyError) as error:
         raise InvalidInput(f"{path} holds no flat presses ({error}).") from error
 

@@ -284,6 +284,7 @@ class Plan(BaseModel):
     indenters: int = 0
     tools: int = 0  # rigid tools of all shapes, pressed in at a slant
     rounds: int = 0  # tools of revolution pressed into the bodies' stacks laid flat, see fem_tools.rounds
+    stacks: int = 0  # likewise, into stacks of no body
     hands: int = 395
     bands: int = 40
     letters: int = 273
@@ -328,7 +329,7 @@ PRESETS = {
     "tissue": Plan(preset="tissue", bodies=TISSUE_BODIES + _drawn_bodies(DRAWN) + LIVING_BODIES + DEEP_BODIES +
                    STOUT_BODIES + TRUNK_BODIES + THIN_BODIES, discs=0, ellipses=0, seams=0, hands=0, bands=0,
                    letters=0, tools=18, loads=8, deepest=0.85, indenter_step=0.12, clear=4.0, thinnest=1.4,
-                   sizes=(4e-3, 40e-3), linear=True, most_work=4e10, rounds=400),
+                   sizes=(4e-3, 40e-3), linear=True, most_work=4e10, rounds=400, stacks=300),
 }  # fmt: skip
 
 

@@ -350,7 +350,7 @@ def generate(
         scheduler: address of a Dask scheduler that does the work instead.
         start: files of released contacts to go on from; for tissue benchmarks/limbs_v3.npz and, all of them _v1.npz,
             benchmarks/{deep,stout,trunk,thin}.
-        flat: file of released presses of its flat stacks, benchmarks/rounds_v1.npz; without, twenty minutes more.
+        flat: file of released presses of its flat stacks, benchmarks/rounds_v2.npz; without, forty minutes more.
         as_json: manifest as JSON, for machines.
     """
     if workers is not None and workers < 1:

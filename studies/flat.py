@@ -9,8 +9,7 @@ import trimesh
 from scipy.spatial import Delaunay
 
 from fem_tools.axisymmetric import Profile, Round
-from fem_tools.rounds import THICKNESS, Pressed, tissue_of
-from fem_tools.sampling import Plan
+from fem_tools.rounds import THICKNESS, Pressed
 from stmpl_core.columns import Columns
 from stmpl_core.contact_net import ContactNet
 from stmpl_core.green import Green
@@ -63,14 +62,14 @@ def pressure_on(layer: SoftLayer, one: Round) -> np.ndarray:
     return at_vertices / layer.vertex_areas / layer.tissue.youngs_modulus
 
 
-def flat_rows(plan: Plan, press: Pressed) -> Iterator[Rows]:
+def flat_rows(press: Pressed) -> Iterator[Rows]:
     """What a ContactNet sees of each depth of a press, and what is true there."""
-    tissue, profile = tissue_of(plan.body(press.body)), press.tool
+    tissue, profile = press.tissue, press.tool
     if not press.rounds:
         return
     edge = min(EDGES[0] * THICKNESS, EDGES[1] * profile.width)
     layer = plate(tissue, max(profile.width, max(touched(one) for one in press.rounds)) + BEYOND * edge, edge)
-    Green(layer, None).keep(layer)  # what is flat and wide has no coarse part
+    Green(layer, None).keep(layer)  # the coarse part of what is flat is nothing
     net, columns = ContactNet(layer), Columns(layer)
     field = SignedDistance.of(tool_of(profile, 2 * max(profile.width, THICKNESS)), margin=0.7 * THICKNESS)
     for one in press.rounds:

@@ -14,7 +14,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from torch import Tensor
 
 from fem_tools.dataset import Dataset, Sample, Subset
-from fem_tools.rounds import Pressed, read_all
+from fem_tools.rounds import Pressed, learnt, read_all, tissue_of
 from fem_tools.sampling import Plan
 from stmpl_core.contact_net import MAX_LOG_RATIO, ContactNet
 from stmpl_core.errors import InvalidInput
@@ -61,7 +61,7 @@ def tools_of(source: Dataset) -> Subset:
 
 
 class Drawn(NamedTuple):
-    """What the network sees of contacts, and the body of each, (C,)."""
+    """What the network sees of contacts, and the body of each, "" of none, (C,)."""
 
     rows: Rows
     bodies: np.ndarray
@@ -91,9 +91,10 @@ def draw_flat(plan: Plan, presses: Sequence[Pressed], on_progress: OnProgress) -
     """What the network sees of presses into flat stacks; None of none."""
     parts: list[Rows] = []
     bodies: list[str] = []
-    for k, one in enumerate(sorted(presses, key=lambda each: each.body)):  # a stack's tables are made once
-        parts += flat_rows(plan, one)
-        bodies += [one.body] * (len(parts) - len(bodies))
+    names = {tissue_of(body): body.name for body in learnt(plan)}
+    for k, one in enumerate(sorted(presses, key=lambda each: repr(each.tissue))):  # a stack's tables are made once
+        parts += flat_rows(one)
+        bodies += [names.get(one.tissue, "")] * (len(parts) - len(bodies))
         on_progress(k + 1, len(presses), "looking at flat stacks")
     return Drawn(Rows.joined(parts), np.array(bodies)) if parts else None
 
@@ -214,7 +215,7 @@ def _left_out(source: Dataset, drawn: Drawn, flat: Drawn | None, settings: Conta
     for part in range(LEFT_OUT):
         out = [str(name) for name in bodies[part::LEFT_OUT]]
         known = [str(name) for name in bodies if name not in out]
-        model = fit(drawn.of(known), settings, on_progress, None if flat is None else flat.of(known))
+        model = fit(drawn.of(known), settings, on_progress, None if flat is None else flat.of([*known, ""]))
         yield source.split("train", kind="indenter", sets=("tool",), bodies=out), model.weights(card)
 
 

@@ -31,7 +31,7 @@ from tests.scenes import ball
 TISSUE = PRESETS["tissue"]
 BODY = next(b for b in TISSUE.bodies if b.name == "arm_20").model_copy(update={"edge_length": 9e-3, "reach": 3.0})
 PLAN = TISSUE.model_copy(
-    update={"preset": "few", "bodies": (BODY,), "tools": 1, "rounds": 1, "loads": 2, "deepest": 0.2,
+    update={"preset": "few", "bodies": (BODY,), "tools": 1, "rounds": 1, "stacks": 1, "loads": 2, "deepest": 0.2,
             "indenter_step": 0.2}
 )  # fmt: skip
 BALL = Profile((0.0, 0.0), (0.0, 0.0), 0.01)
@@ -42,7 +42,7 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 @pytest.fixture(scope="module")
 def press() -> Pressed:
     rounds = Flat(tissue_of(BODY), THICKNESS, fine=0.6).press(BALL, [2e-4, 1e-3])
-    return Pressed(BODY.name, BALL, rounds)
+    return Pressed(tissue_of(BODY), BALL, rounds)
 
 
 def made_up(plan_layers: dict) -> list[tuple[ContactId, Part]]:
@@ -103,10 +103,10 @@ def test_a_data_set_goes_on_from_released_contacts_and_holds_its_flat_presses(tm
     assert first[0][0] == contact  # so that nothing on the limb is left to solve
     write(file, PLAN, made, first)
     manifest = generate(PLAN, tmp_path / "out", workers=1, start=[file])
-    assert manifest["samples"] == 2 and manifest["rounds"] == 1
+    assert manifest["samples"] == 2 and manifest["rounds"] == 2
     assert len(Dataset.open(tmp_path / "out")) == 2
-    (press,) = read_all(tmp_path / "out")
-    assert press.body == BODY.name and press.tool == drawn(PLAN, 0)[1] and len(press.rounds) == 2
+    for k, press in enumerate(read_all(tmp_path / "out")):
+        assert (press.tissue, press.tool) == drawn(PLAN, k)[:2] and len(press.rounds) == 2
     with pytest.raises(InvalidInput, match="another plan"):
         generate(PLAN.model_copy(update={"seed": 1}), tmp_path / "other", workers=1, start=file)
     more = PLAN.model_copy(update={"bodies": (BODY, BODY.model_copy(update={"name": "another", "weight": 0.8}))})
@@ -137,21 +137,25 @@ def test_the_file_of_one_material_holds_the_whole_plan_of_contacts() -> None:
 def test_flat_presses_take_every_stack_that_is_learnt_from_and_no_other() -> None:
     bodies = learnt(TISSUE)
     assert {b.name for b in bodies} == {b.name for b in TISSUE.bodies if b.stack and not b.held_out}
-    names = {drawn(TISSUE, k)[0].name for k in range(len(bodies))}
-    assert len(names) == len(bodies)
+    assert {drawn(TISSUE, k)[0] for k in range(TISSUE.rounds)} == {tissue_of(body) for body in bodies}
     for k in range(40):
         _, tool, depths = drawn(TISSUE, k)
         assert 0 < tool.rounding <= tool.width + 1e-12 and np.all(np.diff(depths) > 0)
         assert drawn(TISSUE, k)[1:] == (tool, depths)
-    kept = Pressed.read(Pressed("x", BALL, []).write())
-    assert kept == Pressed("x", BALL, [])
+    of_none = [drawn(TISSUE, TISSUE.rounds + k)[0] for k in range(TISSUE.stacks)]
+    assert len(set(of_none)) == TISSUE.stacks and not {tissue_of(body) for body in bodies} & set(of_none)
+    assert {len(one.deeper) for one in of_none} == {0, 1, 2, 3}
+    assert any(one.skin is None for one in of_none) and any(one.skin and one.skin.tension == 0 for one in of_none)
+    for tissue in of_none[:4]:
+        assert Pressed.read(Pressed(tissue, BALL, []).write()) == Pressed(tissue, BALL, [])
 
 
 def test_flat_presses_are_kept_in_a_small_file_and_not_pressed_again(press: Pressed, tmp_path: Path) -> None:
     file = tmp_path / "flat.npz"
     release([press, press], file)
     one, other = released(file)
-    assert one.body == other.body == press.body and one.tool == press.tool and len(one.rounds) == len(press.rounds)
+    assert one.tissue == other.tissue == press.tissue and one.tool == press.tool
+    assert len(one.rounds) == len(press.rounds)
     for kept, true in zip(other.rounds, press.rounds, strict=True):
         many = len(kept.radius)
         assert kept.depth == true.depth and kept.force == true.force
@@ -162,10 +166,11 @@ def test_flat_presses_are_kept_in_a_small_file_and_not_pressed_again(press: Pres
         generate(PLAN, tmp_path / "out", workers=1, flat=file)
     with pytest.raises(InvalidInput, match="holds no flat presses"):
         released(tmp_path / "none.npz")
-    known = released(limbs.FILE.with_name("rounds_v1.npz"))
+    known = released(limbs.FILE.with_name("rounds_v2.npz"))
+    assert len(known) == TISSUE.rounds + TISSUE.stacks
     for k in (0, len(known) // 2, len(known) - 1):
-        body, tool, depths = drawn(TISSUE, k)
-        assert known[k].body == body.name and np.allclose(np.hstack(known[k].tool), np.hstack(tool))
+        tissue, tool, depths = drawn(TISSUE, k)
+        assert known[k].tissue == tissue and np.allclose(np.hstack(known[k].tool), np.hstack(tool))
         assert np.allclose([each.depth for each in known[k].rounds], depths[: len(known[k].rounds)])
 
 
@@ -178,7 +183,7 @@ def test_a_plate_carries_what_the_rings_carry(press: Pressed) -> None:
 
 
 def test_a_light_press_into_a_flat_stack_is_the_linear_layers(press: Pressed) -> None:
-    rows = list(flat_rows(PLAN, press))
+    rows = list(flat_rows(press))
     assert len(rows) == 2
     linear, true = ([float(getattr(r, v) @ getattr(r, a)) for r in rows] for v, a in
                     (("prior", "area"), ("true", "vertex_area")))  # fmt: skip
