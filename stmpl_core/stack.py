@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.special import j0, j1, jv
 
+from stmpl_core.arrays import check_number, finite
 from stmpl_core.errors import InvalidInput
 from stmpl_core.rays import column_pressure
 from stmpl_core.tissue import Membrane, Tissue
@@ -119,7 +120,8 @@ def plies(tissue: Tissue, thickness: float) -> list[tuple[float, float, float]]:
     Raises:
         InvalidInput: a thickness that is not above 0.
     """
-    if not (np.isfinite(thickness) and thickness > 0):
+    check_number("the thickness", thickness)
+    if not thickness > 0:
         raise InvalidInput(f"thickness is {thickness:g} m; it must be finite and above 0.")
     there = [ply for ply in tissue.deeper if ply.depth < thickness]
     depths = [0.0, *(ply.depth for ply in there), thickness]
@@ -291,6 +293,8 @@ def ball(
     """
     if (depth is None) == (force is None):
         raise InvalidInput("give the ball's depth or its force, one of them.")
+    check_number("the ball's radius", radius)
+    check_number("the ball's depth" if force is None else "the force on the ball", depth if force is None else force)
     if not (radius > 0 and (depth or force or 0) > 0):
         asked = f"depth {depth:g} m" if force is None else f"force {force:g} N"
         raise InvalidInput(f"the ball's radius is {radius:g} m, its {asked}; both must be above 0.")
@@ -342,7 +346,7 @@ def nearest(stack: list[tuple[float, float, float]], skin: Membrane | None, its_
 
     It is from `thinnest` to `thickest` [m]: what presses deep wants room, of which a linear response knows nothing.
     """
-    each = np.array(list(radii), dtype=float)
+    each = finite("radii", list(radii), (None,))
     if not (len(each) and (np.isfinite(each) & (each > 0)).all()):
         raise InvalidInput(f"the loads' radii are {each.tolist()} m; all must be finite and above 0.")
     k = np.geomspace(0.02 / each.max(), 8 / each.min(), 120)  # [1/m]

@@ -180,6 +180,9 @@ def test_skin_and_its_tension_each_make_a_ball_harder_to_press():
         (lambda: ball_force(LIMB, 0.04, 0.01, 0.0), "depth 0 m"),
         (lambda: ball(LIMB, 0.04, 0.01), "one of them"),
         (lambda: ball(LIMB, 0.04, 0.01, force=-1.0), "force -1 N"),
+        (lambda: ball(LIMB, 0.04, 0.01, depth="1"), "depth is '1'"),
+        (lambda: ball(LIMB, 0.04, None, depth=1e-3), "radius is None"),
+        (lambda: effective(LIMB, "0.04"), "thickness is '0.04'"),
     ],
 )
 def test_numbers_that_cannot_be_are_refused_with_what_is_wrong(make, says):
