@@ -148,7 +148,7 @@ def compare(edge: float, stack: bool, bends: tuple[int, ...], reach: float, plac
 def beyond(answer: Answer, force: float, off: float) -> str:
     """Which of an answer's bounds does not cover the true force [N], or by how far its motion is off [m]."""
     touch, bound = answer.touches["ball"], answer.trust.error_bound
-    outside = {"force": abs(touch.force - force) > touch.force_bound, "motion": bound is not None and off > bound}
+    outside = {"force": not abs(touch.force - force) <= touch.force_bound, "motion": bound is not None and off > bound}
     return "".join(f"{what} beyond its bound; " for what, is_off in outside.items() if is_off)
 
 

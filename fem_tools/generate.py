@@ -110,8 +110,8 @@ def _go_on_from(start: str | Path, plan: Plan, out: Path) -> None:
 def _press_on_from(flat: str | Path, plan: Plan, out: Path) -> None:
     """Puts released presses where those of a run are kept."""
     presses = released(flat)
-    if len(presses) > plan.rounds + plan.stacks or any(drawn(plan, k)[0] != one.tissue or not np.allclose(
-            np.hstack(drawn(plan, k)[1]), np.hstack(one.tool)) for k, one in enumerate(presses)):  # fmt: skip
+    if len(presses) > plan.rounds + plan.stacks or not all(
+            one.of(*drawn(plan, k)[:2]) for k, one in enumerate(presses)):  # fmt: skip
         raise InvalidInput(f"{flat} holds flat presses of another plan.")
     for k, one in enumerate(presses):
         if not _part_path(out, k).is_file():

@@ -29,10 +29,10 @@ FINEST = 1.1  # edges of the coarse mesh over the layer's own, below which the l
 ELEMENT: ElementName = "P1xP2"
 PASSES, SHORTER, TURNED = 40, 0.85, 0.25  # columns of the coarse mesh whose wedges fold: passes, and what each does
 RING = 0.5, 2.4  # distances of vertices whose motion is that of a whole contact, over the edges
-FLAT_AROUND = 2.5  # distance within which skin must be flat and its tissue even, and no border be [thicknesses]
+FLAT_AROUND = 2.5  # distance within which skin must be flat and its tissue even [thicknesses]
 TURNS, UNEVEN = (0.05, 0.12), (0.04, 0.12)  # root mean square turn of its normals [rad], and |log| of its thickness,
 # up to which it is flat, and from which not at all; and
-BORDERS = (0.4, 1.0)  # distances from the border up to which it is not, and from which it is [thicknesses]
+BORDERS = (0.4, 1.0)  # distances from the open border up to which it is not, and from which it is [thicknesses]
 HAT = np.array([[2.0, 1.0, 1.0], [1.0, 2.0, 1.0], [1.0, 1.0, 2.0]]) / 12  # forces of linear pressures on a triangle
 
 
@@ -94,7 +94,7 @@ def _less_flat(wide: np.ndarray, layer: SoftLayer, coarse: SoftLayer, ways: np.n
 def _forget_flat(wide: np.ndarray, layer: SoftLayer, coarse: SoftLayer) -> None:
     """Takes away what flat skin does to flat skin: the closed form knows it, and what is left are the elements' errors.
 
-    They made plates of little fat, or without a skin, up to 29 % too stiff.
+    They made plates of little fat, or without a skin, up to 29 % too stiff. `wide` (3 C, C) is changed in place.
     """
     flat = flatness(layer, coarse)
     for v in np.flatnonzero(flat):
@@ -102,7 +102,12 @@ def _forget_flat(wide: np.ndarray, layer: SoftLayer, coarse: SoftLayer) -> None:
 
 
 def flatness(layer: SoftLayer, coarse: SoftLayer) -> np.ndarray:
-    """How flat and even a layer is around the vertices of its coarse mesh, from 0, not, to 1, (C,)."""
+    """How flat and even a layer is around the vertices of a coarse mesh of it, from 0, not, to 1, (C,).
+
+    Args:
+        layer: layer whose median thickness is the unit.
+        coarse: the coarse mesh, or the layer itself.
+    """
     t = float(np.median(layer.thickness))
     scale = 1.0 if coarse.ply_scale is None else coarse.ply_scale
     uneven = np.abs(np.log(np.column_stack([coarse.thickness / t, np.broadcast_to(scale, coarse.thickness.shape)])))

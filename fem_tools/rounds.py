@@ -49,6 +49,11 @@ class Pressed:
     tool: Profile
     rounds: list[Round]
 
+    def of(self, tissue: Tissue, tool: Profile) -> bool:
+        """Whether it is a press of this tool into this stack, but for last bits, which processors draw otherwise."""
+        return len(self.tissue.numbers) == len(tissue.numbers) and np.allclose(self.tissue.numbers, tissue.numbers) \
+            and np.allclose(np.hstack(self.tool), np.hstack(tool))
+
     def write(self) -> bytes:
         """The press as a file's bytes."""
         arrays = {f"{name}_{k}": getattr(one, name) for k, one in enumerate(self.rounds)
@@ -83,7 +88,7 @@ def tissue_of(body: BodyPlan) -> Tissue:
 
 
 def any_stack(plan: Plan, number: int) -> Tissue:
-    """A stack such as phantoms are, THICKNESS thick: of moduli, depths and skins that no body of the plan need have."""
+    """The stack of a press by its number: such as phantoms are, of moduli, depths and skins that no body need have."""
     rng = np.random.default_rng([plan.seed, 2, number])
     fat = Tissue(poisson_ratio=float(rng.uniform(*POISSON)))
     unit = fat.youngs_modulus * THICKNESS
@@ -168,7 +173,7 @@ def released(path: str | Path) -> list[Pressed]:
         tissues = [stack_from_text(text)[0] for text in json.loads(file["tissues"].tobytes())]
         return [Pressed(tissue, tool, rounds[end - many : end])
                 for tissue, tool, many, end in zip(tissues, tools, file["depths"], first, strict=True)]
-    except (OSError, ValueError, KeyError) as error:
+    except (OSError, ValueError, KeyError, TypeError) as error:
         raise InvalidInput(f"{path} holds no flat presses ({error}).") from error
 
 
@@ -178,5 +183,12 @@ def _steps(shares: np.ndarray) -> np.ndarray:
 
 
 def read_all(folder: str | Path) -> list[Pressed]:
-    """All presses of a data set's folder, in their order; none where it has none."""
-    return [Pressed.read(file.read_bytes()) for file in sorted((Path(folder) / "rounds").glob("*.npz"))]
+    """All presses of a data set's folder, in their order; none where it has none.
+
+    Raises:
+        InvalidInput: a file that holds none, or one of before their stacks were kept.
+    """
+    try:
+        return [Pressed.read(file.read_bytes()) for file in sorted((Path(folder) / "rounds").glob("*.npz"))]
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise InvalidInput(f"{folder} holds flat presses that cannot be read ({error}). Make it again.") from error

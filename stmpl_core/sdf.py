@@ -42,7 +42,7 @@ MOST_CHECKS = CHECKED + 27  # number of them with those farthest out
 TIPS, STANDS_OUT = 256, 0.05  # tips that are known, and how far they stand out at least, over the spacing
 MOST_EDGES, SHARP = 1000, np.cos(np.radians(30.0))  # places along edges that are looked at; cosine between their faces
 BLUNT = 0.95  # mean of the normals around a corner that is no tip
-CORNERS, DEEP_CORNER = 64, 3.0  # sharpest corners that are known; depth over the thickness to which they are looked for
+CORNERS, DEEP_CORNER = 64, 1.5  # sharpest corners that are known; depth over the thickness to which they are looked for
 LOST, LOOKS = 0.02, 80  # largest way inwards on which a tip's surface is looked for [m], and places on it
 PROBED, THICK = 600, 5e-3  # places of a tool from which its thickness is told, and the largest half of it [m]
 ROUNDING_WIDTH = 0.57  # width of the smoothing over the radius that it gives a right-angled edge, measured
@@ -322,8 +322,8 @@ def _tips(coefficients: np.ndarray, origin: np.ndarray, spacing: float, vertices
 
 
 def _corners(vertices: Points, faces: np.ndarray) -> Points:
-    """See SignedDistance: vertices whose faces look many ways."""
-    used, where = np.unique(faces, return_inverse=True)
+    """See SignedDistance: vertices whose faces look many ways, however triangles share them."""
+    used, where = np.unique(places(vertices)[faces], return_inverse=True)
     corners = vertices[faces]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     normals /= np.maximum(np.linalg.norm(normals, axis=1), 1e-300)[:, None]
@@ -338,12 +338,13 @@ def _corners(vertices: Points, faces: np.ndarray) -> Points:
 def deepest_corner(corners, pose, points, inward, thickness, area):
     """Depth of the corner of a tool that is deepest for its column [m], and over the thickness there [-]; 0: of none.
 
-    Columns are asked how deep a tool is in them; a corner may be between two.
+    Columns are asked how deep a tool is in them; a corner may be between two. One deeper than DEEP_CORNER may be
+    outside the limb again, on its other side.
 
     Args:
-        corners: see SignedDistance.
+        corners: see SignedDistance, (K, 3) [m].
         pose: pose_body_from_tool, (4, 4).
-        points, inward, thickness, area: of the nodes that are pressed: see Nodes.
+        points, inward, thickness, area: of the nodes that are pressed, (N, 3) [m], (N, 3), (N,) [m], (N,) [m2].
     """
     wide, deep, most = 0.0, 0.0, 0.0
     for n in range(len(points)):

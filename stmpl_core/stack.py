@@ -151,9 +151,9 @@ def compliance(tissue: Tissue, thickness: float, k: ArrayLike) -> Compliance:
     Raises:
         InvalidInput: a thickness or a wave number that is not above 0.
     """
-    k = _wave_numbers(k)
+    k, stack = _wave_numbers(k), plies(tissue, thickness)
     unit = thickness / tissue.youngs_modulus
-    return Compliance(*(each / unit for each in response(plies(tissue, thickness), tissue.skin, k / thickness)))
+    return Compliance(*(each / unit for each in response(stack, tissue.skin, k / thickness)))
 
 
 def along(tissue: Tissue, thickness: float, k: ArrayLike) -> Along:
@@ -170,8 +170,8 @@ def along(tissue: Tissue, thickness: float, k: ArrayLike) -> Along:
     Raises:
         InvalidInput: a thickness or a wave number that is not above 0.
     """
-    k = _wave_numbers(k) / thickness
     stack, skin, unit = plies(tissue, thickness), tissue.skin, thickness / tissue.youngs_modulus
+    k = _wave_numbers(k) / thickness
     stiffness, across = _surface(stack, skin, k), np.full(len(k), np.inf)
     for h, modulus, nu in reversed(stack):
         shear, far = modulus / (2 * (1 + nu)) * k, np.exp(-k * h)
@@ -184,9 +184,9 @@ def along(tissue: Tissue, thickness: float, k: ArrayLike) -> Along:
 
 
 def _wave_numbers(k: ArrayLike) -> np.ndarray:
-    k = np.atleast_1d(np.asarray(k, dtype=float))
-    if not (np.isfinite(k) & (k > 0)).all():
-        raise InvalidInput(f"the smallest wave number is {k.min():g} / t; all must be finite and above 0.")
+    k = finite("wave numbers", np.atleast_1d(k), (None,))
+    if not (k > 0).all():
+        raise InvalidInput(f"the smallest wave number is {k.min():g} / t; all must be above 0.")
     return k
 
 
@@ -346,9 +346,9 @@ def nearest(stack: list[tuple[float, float, float]], skin: Membrane | None, its_
 
     It is from `thinnest` to `thickest` [m]: what presses deep wants room, of which a linear response knows nothing.
     """
-    each = finite("radii", list(radii), (None,))
-    if not (len(each) and (np.isfinite(each) & (each > 0)).all()):
-        raise InvalidInput(f"the loads' radii are {each.tolist()} m; all must be finite and above 0.")
+    each = finite("radii", [*radii] if isinstance(radii, Iterable) else [radii], (None,))
+    if not (len(each) and (each > 0).all()):
+        raise InvalidInput(f"the loads' radii are {each.tolist()} m; all must be above 0, and there must be one.")
     k = np.geomspace(0.02 / each.max(), 8 / each.min(), 120)  # [1/m]
     weight = np.exp(-0.25 * (k * each[:, None]) ** 2) * k * k  # g^2 k dk on a logarithmic grid, (radius, k)
 

@@ -72,7 +72,7 @@ LED_DEEP, LED_LOST = 0.9, 0.35  # depth over the deepest of nodes that tell it f
 LOOKED_AT = 48  # tips of a tool that presses nothing that are looked at, the farthest; and as many of the others
 EDGE_SURE = 0.05  # share of its depth that an edge of a box lacks, with which contacts were learnt
 EDGE_OFF, MOST_LACKING = 0.2, 0.98  # depth of an edge that a distance field does not tell, from which it is flagged
-TIP_FROM = 0.4  # depth over the thickness from which the corners of a tool are looked at
+TIP_FROM = 0.1  # depth over the thickness from which the corners of a tool are looked at
 FIRST = 0.01  # depth over the thickness from which touches were tried
 MUCH_STIFFER = 4.5, 22.0  # stiffness over that of what lies above, bare and under a skin, from which that may be felt
 SOFT_SHARE = 0.25, 0.56  # depth over the soft tissue's, likewise, to which force is within its bound over nearly bone
@@ -167,6 +167,7 @@ class Toucher:
         nothing, one = np.zeros((1, 4)), np.ones(1)  # compiled now
         mean_off(nothing, np.eye(4), nothing[:, 1:].copy(), one)
         lacking(nothing, np.eye(4), np.zeros(3), nothing[:, 1:].copy(), one, 0.0)
+        deepest_corner(*[nothing[:, 1:].copy(), np.eye(4)], *[nothing[:, 1:].copy()] * 2, one, one)
 
     @cached_property
     def _unlearnt(self) -> list[str]:
@@ -541,7 +542,7 @@ class Toucher:
         if one.factor == 1 and size > 0 and depth > TIP_FROM * thickness:
             tip, tip_share = deepest_corner(one.field.corners, one.pose, *nodes[:4])
             if tip_share > DEEPEST and tip > depth:
-                bound += (tip / depth) ** held.power - 1
+                bound += math.expm1(min(held.power * math.log(tip / depth), MOST_MORE))
         led = 1.0
         if one_way and layer.stacked:
             led = _led_in(nodes.sinking, nodes.strain, nodes.thickness, nodes.inward, wrench[:3] / size)

@@ -281,8 +281,9 @@ def rows(done: Massaged) -> list[tuple[str, str]]:
         ]  # fmt: skip
     if done.judged:
         told = ", ".join(f"{100 * one.off:+.1f}" for one in done.judged)
-        bound = 100 * max(one.bound / one.ours for one in done.judged)
-        figures.insert(1, ("force off finite elements", f"{told} % at the compared frames, ±{bound:.0f} % stated"))
+        bounds = [100 * one.bound / one.ours for one in done.judged if one.bound < np.inf and one.ours > 0]
+        stated = f"±{max(bounds):.0f} % stated" if len(bounds) == len(done.judged) else "not all with a bound"
+        figures.insert(1, ("force off finite elements", f"{told} % at the compared frames, {stated}"))
     return figures
 
 

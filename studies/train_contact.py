@@ -14,7 +14,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from torch import Tensor
 
 from fem_tools.dataset import Dataset, Sample, Subset
-from fem_tools.rounds import Pressed, learnt, read_all, tissue_of
+from fem_tools.rounds import Pressed, learnt, read_all
 from fem_tools.sampling import Plan
 from stmpl_core.contact_net import MAX_LOG_RATIO, ContactNet
 from stmpl_core.errors import InvalidInput
@@ -88,13 +88,15 @@ def draw_rows(samples: Iterable[Sample], count: int, on_progress: OnProgress) ->
 
 
 def draw_flat(plan: Plan, presses: Sequence[Pressed], on_progress: OnProgress) -> Drawn | None:
-    """What the network sees of presses into flat stacks; None of none."""
+    """What the network sees of all presses of a plan into flat stacks, by their numbers from 0 on; None of none."""
     parts: list[Rows] = []
     bodies: list[str] = []
-    names = {tissue_of(body): body.name for body in learnt(plan)}
-    for k, one in enumerate(sorted(presses, key=lambda each: repr(each.tissue))):  # a stack's tables are made once
-        parts += flat_rows(one)
-        bodies += [names.get(one.tissue, "")] * (len(parts) - len(bodies))
+    names = [body.name for body in learnt(plan)]
+    of = [names[k % len(names)] if k < plan.rounds else "" for k in range(len(presses))]
+    order = sorted(range(len(presses)), key=lambda k: repr(presses[k].tissue))  # a stack's tables are made once
+    for k, number in enumerate(order):
+        parts += flat_rows(presses[number])
+        bodies += [of[number]] * (len(parts) - len(bodies))
         on_progress(k + 1, len(presses), "looking at flat stacks")
     return Drawn(Rows.joined(parts), np.array(bodies)) if parts else None
 

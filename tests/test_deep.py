@@ -5,10 +5,14 @@ import pytest
 import trimesh
 
 from stmpl_core import Rig, Simulator, Skin, Tissue, Tool
+from stmpl_core.batch import Batch
 from stmpl_core.body import Body
+from stmpl_core.columns import NO_SQUEEZE
+from stmpl_core.contact_net import NOTHING
 from stmpl_core.deep import DEEPEST
 from stmpl_core.methods import MomentNet, Winkler
 from stmpl_core.touch import APART, IN_CORE, NO_FORCE
+from stmpl_core.toucher import _Placed
 from tests.scenes import LENGTH, RADIUS, STACK, at, ball, box, capsule, limb, plate, press, punch, touch_of, turn
 
 LIMB = limb(4e-3)
@@ -191,17 +195,66 @@ def test_a_tool_below_an_open_sheet_is_not_apart(tool: Tool) -> None:
         assert simulator.touch([press(tool, at(aside[0], 0, aside[1]), None)])[0].status == APART
 
 
-@pytest.mark.parametrize("half_angle", [15.0, 25.0])
-def test_a_tip_between_columns_that_reaches_the_core_is_told_of(half_angle: float) -> None:
-    """Columns around it are 76 to 84 % deep; a tip that ends in the tissue is none."""
-    layer, high = plate(0.12, 3e-3), 0.03
-    cone = trimesh.creation.cone(1e3 * high * np.tan(np.radians(half_angle)), 1e3 * high, sections=64)
-    tool = Tool("cone", 1e-3 * np.asarray(cone.vertices) * [1, 1, -1] + [0, 0, high], np.asarray(cone.faces)[:, ::-1])
+def cone(half_angle: float, high: float = 0.03) -> trimesh.Trimesh:
+    """A cone that stands on its tip at the origin [m]."""
+    mesh = trimesh.creation.cone(1e3 * high * np.tan(np.radians(half_angle)), 1e3 * high, sections=64)
+    return trimesh.Trimesh(1e-3 * mesh.vertices * [1, 1, -1] + [0, 0, high], mesh.faces[:, ::-1], process=False)
+
+
+def handled(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
+    """The same with a handle that overlaps it."""
+    handle = trimesh.creation.cylinder(0.01, 0.04, sections=32)
+    return trimesh.util.concatenate([mesh, handle.apply_translation([0, 0, 0.045])])
+
+
+def soup(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
+    """The same of triangles that share no vertex."""
+    return trimesh.Trimesh(mesh.triangles.reshape(-1, 3), np.arange(3 * len(mesh.faces)).reshape(-1, 3), process=False)
+
+
+@pytest.mark.parametrize("made", [cone(10), cone(15), cone(25), soup(cone(20)), handled(cone(20))],
+                         ids=["10", "15", "25", "soup", "handle"])  # fmt: skip
+def test_a_tip_between_columns_that_reaches_the_core_is_told_of(made: trimesh.Trimesh) -> None:
+    """Columns around it are 37 to 84 % deep; a tip that ends in the tissue is none. On the CPU and by Warp."""
+    layer, tool = plate(0.12, 3e-3), Tool("probe", np.asarray(made.vertices), np.asarray(made.faces))
     sim = Simulator(layer, MomentNet())
+    poses = [at(1.1e-3, 0.7e-3, -share * float(layer.thickness[0])) for share in (0.7, 1.05)]
     bounds = []
-    for share, sound in ((0.8, True), (1.05, False)):
-        (touch,) = sim.touch([press(tool, at(1.1e-3, 0.7e-3, -share * float(layer.thickness[0])), None)])
-        assert touch.trust.in_range == sound
+    for pose, sound in zip(poses, (True, False), strict=True):
+        (touch,) = sim.touch([press(tool, pose, None)])
         assert ("a corner of probe" in touch.trust.why) != sound
+        assert sound or not touch.trust.in_range
         bounds.append(touch.force_bound / touch.force)
     assert bounds[1] > 1.3 * bounds[0]
+    pytest.importorskip("warp")
+    from stmpl_core.gpu.warp_batch import WarpBatch
+
+    skin = Skin.of(layer, MomentNet())
+    ours, there = (batch.touch(np.array(poses)[:, None]) for batch in
+                   (Batch(skin, [tool], 2), WarpBatch(skin, [tool], 2, device="cpu")))  # fmt: skip
+    assert not np.asarray(there.in_range)[1].any() and np.asarray(there.in_range)[0] == ours.in_range[0]
+    served = np.asarray(there.wrenches)[:, 0, :3].any(axis=1)
+    np.testing.assert_allclose(np.asarray(there.force_bounds)[served], ours.force_bounds[served], rtol=1e-3)
+
+
+def test_a_corner_on_the_other_side_of_the_limb_is_not_in_its_core() -> None:
+    """Of a clamp whose other jaw is a millimetre off the skin there."""
+    layer = limb(5e-3, 0.03, RADIUS, LENGTH).with_(tissue=STACK)
+    sim, bounds = Simulator(layer, MomentNet()), []
+    jaw = trimesh.creation.box([4e-3, 0.02, 0.02]).apply_translation([-2 * RADIUS - 0.02 + 0.45 * 0.03 - 3e-3, 0, 0])
+    round_ = trimesh.creation.icosphere(4, 0.02)
+    for mesh in (round_, trimesh.util.concatenate([round_, jaw])):
+        tool = Tool("probe", np.asarray(mesh.vertices), np.asarray(mesh.faces))
+        (touch,) = sim.touch([press(tool, at(RADIUS + 0.02 - 0.45 * 0.03, 0, LENGTH / 2), None)])
+        assert touch.trust.in_range
+        bounds.append(touch.force_bound)
+    assert bounds[1] == pytest.approx(bounds[0], rel=0.1)
+
+
+def test_what_is_inside_the_core_and_presses_nothing_has_no_bound(sim: Simulator) -> None:
+    contact = press(ball(), at(0, 0, LENGTH / 2), None)
+    field = sim.tools.field(contact.tool)
+    for status, unknown in ((IN_CORE, True), (APART, False)):
+        placed = _Placed(contact, field, status, contact.pose_body_from_tool, 0.01, 0.0, NO_SQUEEZE, None)
+        touch = sim.toucher._answer(placed, NOTHING, None, True, False)
+        assert touch.force == 0 and np.isnan(touch.force_bound) == unknown

@@ -166,11 +166,15 @@ def test_flat_presses_are_kept_in_a_small_file_and_not_pressed_again(press: Pres
         generate(PLAN, tmp_path / "out", workers=1, flat=file)
     with pytest.raises(InvalidInput, match="holds no flat presses"):
         released(tmp_path / "none.npz")
+    (tmp_path / "rounds").mkdir()
+    np.savez(tmp_path / "rounds" / "00000.npz", body=np.array("arm"), tool=np.zeros(5), depths=np.zeros(0))
+    with pytest.raises(InvalidInput, match="flat presses that cannot be read"):
+        read_all(tmp_path)
     known = released(limbs.FILE.with_name("rounds_v2.npz"))
     assert len(known) == TISSUE.rounds + TISSUE.stacks
     for k in (0, len(known) // 2, len(known) - 1):
         tissue, tool, depths = drawn(TISSUE, k)
-        assert known[k].tissue == tissue and np.allclose(np.hstack(known[k].tool), np.hstack(tool))
+        assert known[k].of(tissue, tool)
         assert np.allclose([each.depth for each in known[k].rounds], depths[: len(known[k].rounds)])
 
 

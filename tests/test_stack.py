@@ -7,7 +7,7 @@ import pytest
 
 from stmpl_core import Membrane, Ply, Tissue
 from stmpl_core.errors import InvalidInput
-from stmpl_core.stack import ball, ball_force, compliance, effective
+from stmpl_core.stack import along, ball, ball_force, compliance, effective
 
 K = np.geomspace(0.02, 400, 300)
 SKIN = Membrane(2e5, 1.5e-3, 20.0)
@@ -183,6 +183,10 @@ def test_skin_and_its_tension_each_make_a_ball_harder_to_press():
         (lambda: ball(LIMB, 0.04, 0.01, depth="1"), "depth is '1'"),
         (lambda: ball(LIMB, 0.04, None, depth=1e-3), "radius is None"),
         (lambda: effective(LIMB, "0.04"), "thickness is '0.04'"),
+        (lambda: effective(LIMB, 0.04, "a"), "radii is not an array of numbers"),
+        (lambda: compliance(LIMB, "0.04", 1.0), "thickness is '0.04'"),
+        (lambda: along(LIMB, 0.0, 1.0), "thickness is 0 m"),
+        (lambda: along(LIMB, 0.04, ["a"]), "wave numbers is not an array of numbers"),
     ],
 )
 def test_numbers_that_cannot_be_are_refused_with_what_is_wrong(make, says):

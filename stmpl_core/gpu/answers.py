@@ -499,7 +499,7 @@ def answer(first: wp.int32, many: wp.int32, known: Known, skins: Skins, scratch:
         lacks = wp.max(wp.min(lack / wp.max(depth + lack, NONE), MOST_LACKING) - EDGE_SURE, real(0.0))
         bound += wp.pow(real(1.0) - lacks, -power) - real(1.0)
         if tip[1] > TOO_DEEP and tip[0] > depth:
-            bound += wp.pow(tip[0] / depth, power) - real(1.0)
+            bound += wp.exp(wp.min(power * wp.log(tip[0] / depth), MOST_MORE)) - real(1.0)
         flat = below / wp.max(depth, NONE)
         flat = power * wp.log(real(1.0) + flat + flat * wp.min(flat, real(1.0)))
         bound += STUCK * along / size + wp.exp(wp.min(flat, MOST_MORE)) - real(1.0)
