@@ -239,6 +239,6 @@ def test_the_steps_of_a_haptics_lab_run(tmp_path: Path, monkeypatch: pytest.Monk
     finally:
         if rclpy.ok():
             rclpy.shutdown()
-    assert names["held"] == pytest.approx(1.12, rel=0.05) and names["given_out"] > -1e-4
+    assert names["held"] == pytest.approx(1.18, rel=0.05) and names["given_out"] > -1e-4
     assert len(names["heard"]) > 1 and names["device"].force @ names["out"] > 0.5
     assert names["model"].grip.limit > 0.3 and np.linalg.norm(names["wrench"][:3]) > 0.5
