@@ -92,15 +92,21 @@ def any_stack(plan: Plan, number: int) -> Tissue:
     rng = np.random.default_rng([plan.seed, 2, number])
     fat = Tissue(poisson_ratio=float(rng.uniform(*POISSON)))
     unit = fat.youngs_modulus * THICKNESS
-    begins = np.sort(np.exp(rng.uniform(*np.log(BEGINS), int(rng.choice(PLIES, p=PLY_SHARES)) - 1)))
-    stiffer = np.exp(rng.uniform(*np.log(STIFFER), len(begins)))
-    kappa, pull = (float(np.exp(rng.uniform(*np.log(ends)))) for ends in (KAPPAS, PULLS))
+    begins = np.sort(_between(rng, BEGINS, int(rng.choice(PLIES, p=PLY_SHARES)) - 1))
+    stiffer = _between(rng, STIFFER, len(begins))
+    kappa, pull = (float(_between(rng, ends, 1)[0]) for ends in (KAPPAS, PULLS))
     bare, slack = rng.uniform(size=2)
     membrane = Membrane(kappa * unit / SKIN, SKIN, 0.0 if slack < SLACK else pull * unit)
     skin = membrane if bare > BARE or not len(begins) else None  # one material alone is no stack
     plies = tuple(Ply(float(begin) * THICKNESS, float(share) * fat.youngs_modulus, fat.poisson_ratio)
                   for begin, share in zip(begins, stiffer, strict=True))  # fmt: skip
     return replace(fat, skin=skin, deeper=plies)
+
+
+def _between(rng: np.random.Generator, ends: tuple[float, float], count: int) -> np.ndarray:
+    """Numbers between two, evenly in their logarithms."""
+    low, high = np.log(ends)
+    return np.exp(rng.uniform(float(low), float(high), count))
 
 
 def drawn(plan: Plan, number: int) -> tuple[Tissue, Profile, list[float]]:

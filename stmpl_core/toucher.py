@@ -165,9 +165,10 @@ class Toucher:
         self._inward, self.deep = self.columns.inward, Deep(self.columns)
         self._soft, self._doubt = soft_depth(layer.tissue), tissue_doubt(layer)
         nothing, one = np.zeros((1, 4)), np.ones(1)  # compiled now
-        mean_off(nothing, np.eye(4), nothing[:, 1:].copy(), one)
-        lacking(nothing, np.eye(4), np.zeros(3), nothing[:, 1:].copy(), one, 0.0)
-        deepest_corner(*[nothing[:, 1:].copy(), np.eye(4)], *[nothing[:, 1:].copy()] * 2, one, one)
+        three = nothing[:, 1:].copy()
+        mean_off(nothing, np.eye(4), three, one)
+        lacking(nothing, np.eye(4), np.zeros(3), three, one, 0.0)
+        deepest_corner(three, np.eye(4), three, three, one, one)
 
     @cached_property
     def _unlearnt(self) -> list[str]:
