@@ -9,7 +9,7 @@ interpolation from there and R the way there (forces keep their sum),
 
 the sharp part is the closed form's, the wide part the finite elements' (fem_tools.limb). G is of one thickness, but
 knows how soft the stack is at each place (stmpl_core.softness): under small tools the coarse part feels little of fat
-that is thin here and thick there.
+that is thin here and thick there. Between places of flat, even skin there is no coarse part (fem_tools.limb.flatness).
 """
 
 from __future__ import annotations
