@@ -69,7 +69,7 @@ def generate(
     if (kept := _manifest_of(plan, out)) and kept.get("complete"):
         return kept
     (out / "parts").mkdir(parents=True, exist_ok=True)
-    if plan.rounds + plan.stacks:
+    if plan.flat:
         (out / "rounds").mkdir(exist_ok=True)
     _write(out / "manifest.json", json.dumps({"format": FORMAT, "plan": plan.model_dump(mode="json"),
                                               "complete": False}, indent=1).encode())  # fmt: skip
@@ -110,7 +110,7 @@ def _go_on_from(start: str | Path, plan: Plan, out: Path) -> None:
 def _press_on_from(flat: str | Path, plan: Plan, out: Path) -> None:
     """Puts released presses where those of a run are kept."""
     presses = released(flat)
-    if len(presses) > plan.rounds + plan.stacks or not all(
+    if len(presses) > plan.flat or not all(
             one.of(*drawn(plan, k)[:2]) for k, one in enumerate(presses)):  # fmt: skip
         raise InvalidInput(f"{flat} holds flat presses of another plan.")
     for k, one in enumerate(presses):
@@ -145,7 +145,7 @@ class _Tally:
 def _solve_all(plan: Plan, out: Path, made: Mapping[str, SoftLayer], workers: int | None, scheduler: str | None,
                on_progress: OnProgress | None) -> _Tally:  # fmt: skip
     """Solves what has no file yet, in an order that mixes cheap and dear contacts, so that the rate holds."""
-    every: list[ContactId | int] = [*contacts(plan), *range(plan.rounds + plan.stacks)]
+    every: list[ContactId | int] = [*contacts(plan), *range(plan.flat)]
     every = [every[k] for k in np.random.default_rng(plan.seed).permutation(len(every))]
     left = [c for c in every if not _part_path(out, c).is_file()]
     tally, started, done = _Tally(), time.monotonic(), len(every) - len(left)
@@ -246,7 +246,7 @@ def _pack(plan: Plan, out: Path, made: Mapping[str, SoftLayer], tally: _Tally) -
         "plan": plan.model_dump(mode="json"),
         "versions": versions(VERSIONS),
         "samples": sum(counts.values()),
-        "rounds": plan.rounds + plan.stacks,
+        "rounds": plan.flat,
         "counts": dict(sorted(counts.items())),
         "wall_seconds_of_last_run": round(tally.seconds, 1),
         "workers": tally.workers,

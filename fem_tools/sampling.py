@@ -302,6 +302,11 @@ class Plan(BaseModel):
     linear: bool = False  # elements linear in plane whatever nu is; they are 1 to 3 % off in force up to 0.45
     seed: int = 0
 
+    @property
+    def flat(self) -> int:
+        """Number of all tools that are pressed into flat stacks."""
+        return self.rounds + self.stacks
+
     def body(self, name: str) -> BodyPlan:
         """The body of that name."""
         return next(body for body in self.bodies if body.name == name)

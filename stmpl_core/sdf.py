@@ -286,9 +286,7 @@ def _spread_over(vertices: Points, faces: np.ndarray) -> Points:
 def _tips(coefficients: np.ndarray, origin: np.ndarray, spacing: float, vertices: Points,
           faces: np.ndarray) -> np.ndarray:  # fmt: skip
     """See SignedDistance: those farthest out, and of the others some anywhere."""
-    corners = vertices[faces]
-    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    normals /= np.maximum(np.linalg.norm(normals, axis=1), 1e-300)[:, None]
+    normals, at_vertices, blunt = _faced(vertices, faces)
     sides = np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
     order = np.lexsort(sides.T)
     same = (sides[order[1:]] == sides[order[:-1]]).all(axis=1)
@@ -299,9 +297,7 @@ def _tips(coefficients: np.ndarray, origin: np.ndarray, spacing: float, vertices
     many = np.ceil(length / max(0.5 * spacing, length.sum() / MOST_EDGES, 1e-12)).astype(int)
     number = np.repeat(np.arange(len(many)), many)
     share = (np.arange(len(number)) - np.repeat(np.cumsum(many) - many, many) + 0.5) / many[number]
-    at_vertices, met = np.zeros_like(vertices), np.bincount(faces.ravel(), minlength=len(vertices))
-    np.add.at(at_vertices, faces.ravel(), np.repeat(normals, 3, axis=0))
-    used = np.flatnonzero(np.linalg.norm(at_vertices, axis=1) < BLUNT * met)
+    used = np.flatnonzero(blunt < BLUNT)
     places = np.concatenate([vertices[used], ends[number, 0] + share[:, None] * (ends[number, 1] - ends[number, 0])])
     inwards = -np.concatenate([at_vertices[used], out[number]])
     away = _distances(coefficients, origin, spacing, places)
@@ -323,15 +319,22 @@ def _tips(coefficients: np.ndarray, origin: np.ndarray, spacing: float, vertices
 
 def _corners(vertices: Points, faces: np.ndarray) -> Points:
     """See SignedDistance: vertices whose faces look many ways, however triangles share them."""
-    used, where = np.unique(places(vertices)[faces], return_inverse=True)
+    _, _, blunt = _faced(vertices, places(vertices)[faces])
+    sharp = np.argsort(blunt, kind="stable")[:CORNERS]
+    return vertices[sharp[blunt[sharp] < BLUNT]]
+
+
+def _faced(vertices: Points, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Unit normals of faces, (F, 3), their sums at vertices, (V, 3), and sizes of the means there, (V,); without: inf.
+
+    How blunt a corner is: on a face 1, at a tip little.
+    """
     corners = vertices[faces]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     normals /= np.maximum(np.linalg.norm(normals, axis=1), 1e-300)[:, None]
-    sums = np.zeros((len(used), 3))
-    np.add.at(sums, where.ravel(), np.repeat(normals, 3, axis=0))
-    mean = np.linalg.norm(sums, axis=1) / np.bincount(where.ravel())
-    sharp = np.argsort(mean, kind="stable")[:CORNERS]
-    return vertices[used[sharp[mean[sharp] < BLUNT]]]
+    sums, met = np.zeros_like(vertices), np.bincount(faces.ravel(), minlength=len(vertices))
+    np.add.at(sums, faces.ravel(), np.repeat(normals, 3, axis=0))
+    return normals, sums, np.where(met > 0, np.linalg.norm(sums, axis=1) / np.maximum(met, 1), np.inf)
 
 
 @numba.njit(cache=True, nogil=True)
