@@ -138,7 +138,7 @@ class SignedDistance:
             if len(places) else NO_CHECKS
         rims = NO_POINTS if watertight else openings(vertices, faces)
         rims = rims[:: 1 + len(rims) // MOST_OPENINGS]
-        tips = _tips(coefficients, origin, spacing, *outer)
+        tips = _tips(coefficients, origin, spacing, vertices, faces)  # what lies inside another body does not stand out
         box = used.min(axis=0), used.max(axis=0)
         corners = NO_POINTS if rounding else _corners(*outer)
         built = cls(coefficients, origin, spacing, watertight, flipped, error, box, half, checks, rims, tips, corners)
@@ -285,7 +285,8 @@ def _spread_over(vertices: Points, faces: np.ndarray) -> Points:
 
 def _tips(coefficients: np.ndarray, origin: np.ndarray, spacing: float, vertices: Points,
           faces: np.ndarray) -> np.ndarray:  # fmt: skip
-    """See SignedDistance: those farthest out, and of the others some anywhere."""
+    """See SignedDistance, however triangles share corners: those farthest out, and of the others some anywhere."""
+    faces = places(vertices)[faces]
     normals, at_vertices, blunt = _faced(vertices, faces)
     sides = np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
     order = np.lexsort(sides.T)
@@ -298,23 +299,23 @@ def _tips(coefficients: np.ndarray, origin: np.ndarray, spacing: float, vertices
     number = np.repeat(np.arange(len(many)), many)
     share = (np.arange(len(number)) - np.repeat(np.cumsum(many) - many, many) + 0.5) / many[number]
     used = np.flatnonzero(blunt < BLUNT)
-    places = np.concatenate([vertices[used], ends[number, 0] + share[:, None] * (ends[number, 1] - ends[number, 0])])
+    points = np.concatenate([vertices[used], ends[number, 0] + share[:, None] * (ends[number, 1] - ends[number, 0])])
     inwards = -np.concatenate([at_vertices[used], out[number]])
-    away = _distances(coefficients, origin, spacing, places)
+    away = _distances(coefficients, origin, spacing, points)
     some = np.flatnonzero(away > STANDS_OUT * spacing)
     some = some[np.argsort(-away[some], kind="stable")]
     if len(some) > TIPS:
         rest = np.random.default_rng(0).permutation(some[TIPS // 4 :])
         some = np.concatenate([some[: TIPS // 4], rest[: TIPS - TIPS // 4]])
-    places, inwards = places[some], inwards[some]
+    points, inwards = points[some], inwards[some]
     inwards /= np.maximum(np.linalg.norm(inwards, axis=1), 1e-300)[:, None]
     way = LOST * np.linspace(0.0, 1.0, LOOKS + 1)[1:] ** 2
-    looks = (places[:, None] + way[:, None] * inwards[:, None]).reshape(-1, 3)
+    looks = (points[:, None] + way[:, None] * inwards[:, None]).reshape(-1, 3)
     inside = _distances(coefficients, origin, spacing, looks).reshape(-1, LOOKS) <= 0
     lost = np.where(inside.any(axis=1), way[inside.argmax(axis=1)], LOST)
-    apart = np.linalg.norm(places[:, None] - places, axis=2)  # at a blade's corner normals may lead along its edge
+    apart = np.linalg.norm(points[:, None] - points, axis=2)  # at a blade's corner normals may lead along its edge
     lost = (apart + lost).min(axis=1, initial=LOST)
-    return np.column_stack([places, lost])[np.argsort(-lost, kind="stable")]
+    return np.column_stack([points, lost])[np.argsort(-lost, kind="stable")]
 
 
 def _corners(vertices: Points, faces: np.ndarray) -> Points:

@@ -14,6 +14,7 @@ from stmpl_core.batch import Batch
 from stmpl_core.body import Body
 from stmpl_core.living import living
 from stmpl_core.methods import MomentNet
+from stmpl_core.sdf import SignedDistance
 from stmpl_core.skin import Skin
 from tests.scenes import ball, limb, plate, press
 from tests.scenes import tool as named
@@ -100,6 +101,18 @@ def test_an_edge_that_a_long_tools_distance_field_loses_is_in_the_bound_or_flagg
             assert touch.force + touch.force_bound > most or not touch.trust.ok
             flagged.append(not touch.trust.ok)
     assert any(flagged) and not all(flagged)
+
+
+def test_edges_are_known_however_triangles_share_their_corners():
+    """As a file of triangles has them, each with corners of its own, and of bodies that overlap."""
+    whole = chisel(0.1)
+    loose = Tool("loose", whole.vertices[whole.faces].reshape(-1, 3), np.arange(whole.faces.size).reshape(-1, 3))
+    one, other = SignedDistance.of(whole).tips, SignedDistance.of(loose).tips
+    assert len(one) == len(other) > 0 and one[0, 3] == pytest.approx(other[0, 3])
+    handle = trimesh.creation.box([0.02, 0.03, 0.01], trimesh.transformations.translation_matrix([0.0, 0.0, 0.095]))
+    both = trimesh.util.concatenate([trimesh.Trimesh(whole.vertices, whole.faces), handle])
+    hammer = SignedDistance.of(named(both)).tips
+    assert hammer[hammer[:, 2] < 2e-3, 3].max() == pytest.approx(one[0, 3], rel=0.3)
 
 
 def test_a_blunt_tool_lacks_no_edge():
