@@ -66,6 +66,7 @@ MAX_LEVER = 1.0  # torque that is not carried over the force, over the contact's
 SURE = 0.02  # largest error of a distance field over the depth, up to which it does not matter where the field is off
 MOST_OFF = 0.1  # error of a distance field where a tool presses, over the depth, beyond which the force is not known
 LED_OUT = 0.95  # how far nodes sink with their tool over how deep it is in their columns: below, these lead out of it
+LED_FROM = 0.1  # depth over the thickness up to which as much may be lost as there: a first touch loses little
 THIN_FROM, THIN_MORE, THIN_TO = 14.0, 0.03, 50.0  # bound on tools that have sunk, by depth over their half thickness
 LOW = 3.0  # share of that by the share of the depth that a tool's height lacks
 LED_DEEP, LED_LOST = 0.9, 0.35  # depth over the deepest of nodes that tell it first, and share that these may lack
@@ -82,7 +83,9 @@ OVER_SOFT = 0.25, 0.04, 0.15  # bound by how much stiffer a material is than one
 # share of the thickness on: 10 times so over 8 mm force is 41 % off, a tensed belly over its organs 9 to 16
 MOST_OVER_SOFT = 0.35  # that share of the bound beyond which it is flagged: a tensed belly has 0.31
 RATIOS_APART = 0.06  # difference of the materials' Poisson's ratios: 0.05 cost nothing, of 0.1 force is 15 % off
-MAX_PULL = 1.0  # T / (E t) of the effective layer: beyond, force on round limbs is up to 14 % off; people have 0.7
+MAX_PULL = 1.0, 1.5  # T / (E t) of the effective layer that is tried: of any skin, and of skin no tauter than TAUT
+TAUT = 0.1, 0.6, 1.2  # T / (E_s h) up to which limbs were learnt, as people's are; bound beyond, at most, and its rise:
+# of a tube 0.55 of its radius thick force is 8 % off at 0.27, 11 at 1
 SLACK = 0.012, 0.5  # T / (E_s h), and kappa, below and above which skin is slack and matters: force then falls with T
 PINS = 3  # tools side by side from which they may be pins of one brush
 SIDES = (0.2, 0.9)  # share of the force that points one way: below, a tool closes around; between, none was learnt
@@ -589,7 +592,7 @@ class Toucher:
         if tip_share > DEEPEST:
             trust = trust.also(f"a corner of {touch.name} is {1e3 * tip:.2g} mm deep in the skin, {tip_share:.0%} "
                                "of the tissue there", in_range=False)  # fmt: skip
-        if led < LED_OUT:
+        if (1 - led) * depth > (1 - LED_OUT) * max(depth, LED_FROM * thickness):
             trust = trust.also(f"{touch.name} is {1e3 * depth:.2g} mm deep, and thin: the skin below it is led out of "
                                f"its walls, and goes along by {led:.0%} of that", in_range=False)  # fmt: skip
         if missed > UNSOLVED:
@@ -836,8 +839,9 @@ def unlearnt(layer: SoftLayer, low: float, high: float) -> list[str]:
     if kappa > SLACK[1] and pull < SLACK[0] * kappa:
         out.append(f"the skin has next to no tension, T / (E_s h) = {pull / kappa:.2g}: such skin is answered 10 to "
                    "22 % too stiff; people's is taut")  # fmt: skip
-    if pull > MAX_PULL:
-        out.append(f"the skin's tension is {pull:.2g} times E t of the tissue under it; tried is {MAX_PULL:g}")
+    tried = MAX_PULL[pull <= TAUT[0] * kappa]
+    if pull > tried:
+        out.append(f"the skin's tension is {pull:.2g} times E t of the tissue under it; tried is {tried:g}")
     if over_soft(layer) > MOST_OVER_SOFT:
         out.append("a material lies over a much softer one, and no contact was learnt with that")
     return out
@@ -848,7 +852,11 @@ def tissue_doubt(layer: SoftLayer) -> float:
     if not layer.stacked:
         return 1.0
     least = min(one.poisson_ratio for one in (layer.tissue, *layer.tissue.deeper))
-    return (1 + FEW * max(FEW_RATIO - least, 0.0)) * (1 + over_soft(layer))
+    doubt, (learnt, most, steep) = (1 + FEW * max(FEW_RATIO - least, 0.0)) * (1 + over_soft(layer)), TAUT
+    if layer.tissue.skin is not None:
+        one = Green.of(layer).effective
+        doubt *= 1 + min(steep * max(one.pull / one.kappa - learnt, 0.0), most)
+    return doubt
 
 
 def over_soft(layer: SoftLayer) -> float:

@@ -290,19 +290,28 @@ def test_a_deeper_material_of_another_poissons_ratio_presses_as_finite_elements_
     assert ("Poisson's ratio" in touch.trust.why) == (deeper != 0.40)
 
 
-@pytest.mark.parametrize("tension, sound", [(0.0, False), (50.0, True), (100.0, False)])
+@pytest.mark.parametrize("tension, sound", [(0.0, False), (20.0, True), (75.0, True), (100.0, False)])
 def test_force_under_slack_and_tight_skin_is_within_its_bound_or_flagged(tension: float, sound: bool) -> None:
-    """Beside finite elements: 6 % too small at 50 N/m round a limb of 45 mm, 14 at 100; people's is 6 to 22."""
+    """Beside finite elements round a limb of 45 mm, half of the thickness deep: 8 % too small at 20 N/m, 11 at 75.
+
+    So taut beside its own stiffness, T / (E_s h) = 0.27 and 1, is no skin of people (0.1).
+    """
     thickness, radius = 25e-3, 45e-3
     layer = limb(5e-3, thickness, radius, 0.18).with_(tissue=Tissue(3e3, 0.45, skin=Membrane(5e4, 1.5e-3, tension)))
-    depth, tool = 0.1 * thickness, ball(20e-3, 4)
+    depths, tool, simulator = [0.1 * thickness, 0.5 * thickness], ball(20e-3, 4), Simulator(layer, MomentNet())
     start = Press(SignedDistance.of(tool, margin=0.03), at(radius + 20e-3, 0, 0.09), np.array([-1.0, 0, 0]))
     fem = IndenterFem(PatchFem(element="P1xP2", reach=3, check_stability=False), step=0.1).prepare(layer)
-    truth = fem.press([start.touching(layer)], depth)
-    (touch,) = Simulator(layer, MomentNet()).touch([contact_of(tool, at(radius + 20e-3 - depth, 0, 0.09))])
-    assert touch.trust.in_range == sound and ("tension" in touch.trust.why) != sound
-    if tension < 100:  # linear elements press up to 4 % too hard
-        assert abs(touch.force - truth.force) < 1.4 * touch.force_bound
+    for depth, truth in zip(depths, fem.path([start.touching(layer)], depths), strict=True):
+        (touch,) = simulator.touch([contact_of(tool, at(radius + 20e-3 - depth, 0, 0.09))])
+        assert touch.trust.in_range == sound and ("tension" in touch.trust.why) != sound
+        assert abs(touch.force - truth.force) < touch.force_bound or not sound
+
+
+@pytest.mark.parametrize("kappa, sound", [(10.0, False), (15.0, True)])
+def test_tension_beyond_e_t_is_in_range_as_limbs_were_learnt_with_it(kappa: float, sound: bool) -> None:
+    tissue = Tissue(3e3, 0.45, skin=Membrane(kappa * 75 / 1.5e-3, 1.5e-3, 1.3 * 75))
+    layer = limb(12e-3, 25e-3, 45e-3, 0.18).with_(tissue=tissue)
+    assert any("tension" in why for why in unlearnt(layer, 0.3, 0.49)) != sound
 
 
 @pytest.mark.parametrize("tension, sound", [(0.6, False), (4.0, True)])

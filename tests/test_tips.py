@@ -16,9 +16,11 @@ from stmpl_core.living import living
 from stmpl_core.methods import MomentNet
 from stmpl_core.sdf import SignedDistance
 from stmpl_core.skin import Skin
-from tests.scenes import ball, limb, plate, press
+from stmpl_core.touch import Touch
+from tests.scenes import LENGTH, STACK, ball, limb, plate, press
 from tests.scenes import tool as named
 
+layered = cache(lambda: limb(6e-3, 0.02, 0.05, LENGTH).with_(tissue=STACK))
 LAYERS = {
     "one material": lambda: limb(6e-3),
     "stack": cache(lambda: living(Body.anny(), "left_forearm", edge_length=6e-3)),
@@ -170,6 +172,27 @@ def test_a_thin_wall_presses_the_harder_the_deeper_where_columns_leave_it(height
         forces = [calf().touch([Contact(named(card), pressed_to(layer, v, depth, height))])[0].force
                   for depth in (0.2, 0.3, 0.4, 0.5, 0.6, 0.7)]  # fmt: skip
         assert (np.diff(forces) > 0).all() and forces[-1] > 4 * forces[0], v
+
+
+@pytest.mark.parametrize("turned", [0.0, 1.0, 2.0])
+def test_a_board_that_leans_is_in_range_from_its_first_touch(turned: float) -> None:
+    """It was flagged up to a fiftieth of the thickness, as thin, and not from there on."""
+    simulator, board = Simulator(layered(), MomentNet()), trimesh.creation.box([0.03, 0.03, 0.004])
+    layer = simulator.layer
+    v = int(np.linalg.norm(layer.vertices - layer.vertices.mean(axis=0), axis=1).argmin())
+    pose = pressed_to(layer, v, 0.0, 0.0)
+    pose[:3, :3] @= Rotation.from_rotvec([0.3 * np.cos(turned), 0.3 * np.sin(turned), 0.0]).as_matrix()
+    normal, tool = layer.normals[v], named(board)
+
+    def at(depth: float) -> Touch:
+        there = pose.copy()
+        low = float((board.vertices @ pose[:3, :3].T @ normal).min())
+        there[:3, 3] = layer.vertices[v] - (low + depth * layer.thickness[v]) * normal
+        return simulator.touch([Contact(tool, there)])[0]
+
+    depths = np.linspace(-0.3, 0.5, 161)
+    touches = [touch for touch in map(at, depths) if touch.depth > 0.01 * layer.thickness[v]]
+    assert len(touches) > 80 and all(touch.trust.in_range for touch in touches)
 
 
 @pytest.mark.parametrize("cut", ["blade", "ring", "pin"])

@@ -38,7 +38,7 @@ ALL_ONE_WAY = wp.constant(wp.float64(wrenches_of_skin.ALL_ONE_WAY))
 NONE = wp.constant(wp.float64(1e-300))
 NAN, PI = wp.constant(wp.float64(float("nan"))), wp.constant(wp.float64(math.pi))
 LED_DEEP, LED_LOST = (wp.constant(wp.float64(one)) for one in (toucher.LED_DEEP, toucher.LED_LOST))
-LED_OUT = wp.constant(wp.float64(toucher.LED_OUT))
+LED_OUT, LED_FROM = (wp.constant(wp.float64(one)) for one in (toucher.LED_OUT, toucher.LED_FROM))
 THIN_FROM, THIN_MORE, THIN_TO, LOW = (
     wp.constant(wp.float64(one)) for one in (toucher.THIN_FROM, toucher.THIN_MORE, toucher.THIN_TO, toucher.LOW)
 )
@@ -471,7 +471,9 @@ def answer(first: wp.int32, many: wp.int32, known: Known, skins: Skins, scratch:
     sound = sound and skins.holes[k] == 0
     if size > real(0.0):
         sound = sound and tip[1] <= TOO_DEEP
-        sound = sound and led >= LED_OUT and lack <= EDGE_OFF * wp.max(depth + lack, FIRST * carried / forces)
+        least = LED_FROM * carried / forces
+        sound = sound and (real(1.0) - led) * depth <= (real(1.0) - LED_OUT) * wp.max(depth, least)
+        sound = sound and lack <= EDGE_OFF * wp.max(depth + lack, FIRST * carried / forces)
     wrong = real(0.0)
     if size > real(0.0) and grid.surface_error > SURE * depth:
         wrong = sums[15] / forces
