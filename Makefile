@@ -39,7 +39,7 @@ weights: $(READY_DEV)  ## Make the networks that ship, from nothing: data, train
 	$(BIN)/stmpl train --preset default --data data/default --out stmpl_core/weights
 	$(BIN)/stmpl generate --preset contacts --out data/contacts --start benchmarks/contacts_v1.npz
 	$(BIN)/stmpl train --preset contacts --data data/contacts --out stmpl_core/weights
-	$(BIN)/stmpl generate --preset tissue --out data/tissue --start benchmarks/limbs_v3.npz benchmarks/deep_v1.npz benchmarks/stout_v1.npz benchmarks/trunk_v1.npz benchmarks/thin_v1.npz --flat benchmarks/rounds_v2.npz
+	$(BIN)/stmpl generate --preset tissue --out data/tissue --start benchmarks/limbs_v3.npz benchmarks/deep_v2.npz benchmarks/stout_v1.npz benchmarks/trunk_v1.npz benchmarks/thin_v1.npz --flat benchmarks/rounds_v2.npz
 	$(BIN)/stmpl train --preset tissue --data data/tissue --out stmpl_core/weights
 	$(BIN)/stmpl train --preset paper-reduced --data data/default --out stmpl_core/weights
 

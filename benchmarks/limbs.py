@@ -55,10 +55,11 @@ LIMBS = {  # rows of scenes: what splits, and how the limbs are called; a networ
     "heavy people": (("test", "val"), ("stout",)),
     "trunks, forearms": (("test", "val"), ("trunk",)),
     "thin places": (("test", "val"), ("thin",)),
+    "deep": (("test", "val"), ("deep",)),
 }
 ELSEWHERE = {  # where the last are
     "heavy people": FILE.with_name("stout_v1.npz"), "trunks, forearms": FILE.with_name("trunk_v1.npz"),
-    "thin places": FILE.with_name("thin_v1.npz"),
+    "thin places": FILE.with_name("thin_v1.npz"), "deep": FILE.with_name("deep_v2.npz"),
 }  # fmt: skip
 DEPTHS = (0.0, 0.1, 0.3, 0.6, 1.0)  # over the thickness, between which --kept takes means
 PEER_AT = (0.2, 0.4)  # depths at which a peer is asked [thicknesses]

@@ -7,7 +7,7 @@ import math
 import string
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, partial
 from typing import Any, Literal
 
 import numpy as np
@@ -20,7 +20,7 @@ from fem_tools.scenes import EDGE, Scene, Site, UnusableContact, ellipse, letter
 from stmpl_core.body import Body
 from stmpl_core.bones import bones_of, to_bone
 from stmpl_core.layer import SoftLayer
-from stmpl_core.living import DEEPEST, SHEET, filled
+from stmpl_core.living import DEEPEST, filled
 from stmpl_core.regions import Tone
 from stmpl_core.tissue import Membrane, Ply, Tissue
 
@@ -184,6 +184,14 @@ DEEP: tuple[Person, ...] = (
     ("forearm_2", 0.4, 0.1, 0.5, "left_forearm", "tensed", 7e-3, 6.7, 0.21),
     ("calf", 0.4, 0.8, 0.5, "left_calf", "relaxed", 9e-3, 6.7, 0.16),
     ("thigh", 0.65, 0.3, 0.5, "left_thigh", "relaxed", 12e-3, 6.0, 0.1),
+    ("back_1", 0.35, 0.3, 0.5, "back", "relaxed", 9e-3, 6.0, 0.5),
+    ("back_2", 0.7, 0.8, 0.4, "back", "relaxed", 10e-3, 6.0, 0.5),
+    ("back_3", 0.2, 0.6, 0.6, "back", "relaxed", 8e-3, 6.0, 0.5),
+    ("back_4", 0.5, 0.9, 0.5, "back", "tensed", 9e-3, 6.0, 0.4),
+    ("back_5", 0.9, 0.4, 0.3, "back", "relaxed", 10e-3, 6.0, 0.4),
+    ("forearm_3", 0.55, 0.9, 0.6, "left_forearm", "relaxed", 7e-3, 6.7, 0.45),
+    ("forearm_4", 0.25, 0.2, 0.4, "left_forearm", "relaxed", 6e-3, 6.7, 0.45),
+    ("shoulder", 0.6, 0.7, 0.5, "left_shoulder", "relaxed", 8e-3, 3.0, 0.35),
 )
 STOUT: tuple[Person, ...] = (  # much fat under a skin that is stiff beside it, on limbs as round as they are thick
     ("upper_arm_1", 0.9, 0.9, 0.2, "left_upper_arm", "relaxed", 8e-3, 6.0, 0.5),
@@ -399,7 +407,7 @@ def layers(plan: Plan) -> dict[str, SoftLayer]:
     for body in plan.bodies:
         patch, skin = patches[kinds[body.name]], Body.anny(weight=body.weight, gender=body.gender, muscle=body.muscle)
         if body.tone:
-            out[body.name] = filled(skin, patch.part, patch.layer(skin, thickness=SHEET), body.tone)
+            out[body.name] = filled(skin, patch.part, partial(patch.layer, skin), body.tone)
             continue
         thickness = body.thickness
         if isinstance(thickness, tuple):

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -51,10 +52,7 @@ def living(body: Body, part: str, tone: Tone = "relaxed", *, edge_length: float 
     """
     _check_body(body, part)
     named = part_around(body, part) if part.startswith(AROUND) else part
-    if named in STRAIGHT:
-        its = for_person(region(named, tone), body.physique)
-        return body.part(part, edge_length=edge_length, thickness=its.thickness, tissue=its.tissue)
-    return filled(body, named, body.part(part, edge_length=edge_length, thickness=SHEET), tone)
+    return filled(body, named, partial(body.part, part, edge_length=edge_length), tone)
 
 
 def _check_body(body: object, part: object) -> None:
@@ -85,16 +83,19 @@ def part_around(body: Body, picked: str) -> str:
     return min((size, part) for part, (share, size) in held.items() if share > NEARLY * most)[1]
 
 
-def filled(body: Body, part: str, skin: SoftLayer, tone: Tone = "relaxed") -> SoftLayer:
-    """A part's skin with the tissue of its region below it, down to the bones: see `living`.
+def filled(body: Body, part: str, lay: Callable[..., SoftLayer], tone: Tone = "relaxed") -> SoftLayer:
+    """A part's skin with the tissue of its region below it, down to the bones where they are known: see `living`.
 
     Args:
         body: body.
-        part: its part, one with bones.
-        skin: the part's skin as a thin layer.
+        part: its part, one with a region.
+        lay: function that makes a layer on the part's skin, of a `thickness` [m] and, if told, a `tissue`.
         tone: state of the muscle.
     """
     its = for_person(region(part, tone), body.physique)
+    if part in STRAIGHT:
+        return lay(thickness=its.thickness, tissue=its.tissue)
+    skin = lay(thickness=SHEET)
     fat = fat_map(body, part, skin.vertices)
     if fat is None:
         skin = skin.with_(tissue=its.tissue)

@@ -25,6 +25,7 @@ from stmpl_core.obstacle import REACH
 from stmpl_core.pieces import DEEP, GROUP, WIDER, pins
 from stmpl_core.rays import WALL, way_of
 from stmpl_core.sdf import SignedDistance, deepest_corner, lacking, mean_off
+from stmpl_core.stack import effective
 from stmpl_core.tools import Tools
 from stmpl_core.touch import (
     APART,
@@ -854,7 +855,7 @@ def tissue_doubt(layer: SoftLayer) -> float:
     least = min(one.poisson_ratio for one in (layer.tissue, *layer.tissue.deeper))
     doubt, (learnt, most, steep) = (1 + FEW * max(FEW_RATIO - least, 0.0)) * (1 + over_soft(layer)), TAUT
     if layer.tissue.skin is not None:
-        one = Green.of(layer).effective
+        one = effective(layer.tissue, float(np.median(layer.thickness)))
         doubt *= 1 + min(steep * max(one.pull / one.kappa - learnt, 0.0), most)
     return doubt
 

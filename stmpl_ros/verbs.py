@@ -348,8 +348,8 @@ def generate(
         out: folder of the data; data/<preset> unless given.
         workers: local processes; one a core unless given.
         scheduler: address of a Dask scheduler that does the work instead.
-        start: files of released contacts to go on from; for tissue benchmarks/limbs_v3.npz and, all of them _v1.npz,
-            benchmarks/{deep,stout,trunk,thin}.
+        start: files of released contacts to go on from; for tissue benchmarks/limbs_v3.npz, deep_v2.npz, and, all of
+            them _v1.npz, {stout,trunk,thin}.
         flat: file of released presses of its flat stacks, benchmarks/rounds_v2.npz; without, forty minutes more.
         as_json: manifest as JSON, for machines.
     """

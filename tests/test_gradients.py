@@ -184,9 +184,9 @@ def test_tools_side_by_side_feel_each_others_poses(gradients: Gradients) -> None
         told = found[feeler].across[two[mover].name]
         expected = by_pose_of(simulator, two, mover, feeler)
         push = found[mover].wrench[:3] / np.linalg.norm(found[mover].wrench[:3])
-        assert np.linalg.norm(expected[:3, :3] @ push) > 2e-3 * np.linalg.norm(found[feeler].pose[:3, :3])  # it matters
+        assert np.linalg.norm(expected[:3, :3] @ push) > 5e-3 * np.linalg.norm(found[feeler].pose[:3, :3])  # it matters
         assert off(told[:, :3] @ push, expected[:, :3] @ push) < 0.35
-        known = 0.2 if simulator.layer.tissue.skin is None else 0.6  # along a forearm it is 1 % of what they feel alone
+        known = 0.2 if simulator.layer.tissue.skin is None else 0.5  # along a forearm it is 1 % of what they feel alone
         assert off(told[:, :3], expected[:, :3]) < known
     thin, thick = (wrench_of(Simulator(thicker(simulator.layer, by), MomentNet()), two, "ball") for by in (0.96, 1.04))
     assert off(found[0].thickness, (thick - thin) / 0.08) < 0.06

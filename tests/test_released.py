@@ -115,7 +115,7 @@ def test_a_data_set_goes_on_from_released_contacts_and_holds_its_flat_presses(tm
 
 def test_the_files_that_ship_hold_contacts_of_the_plan_that_networks_learn_from() -> None:
     found = {}
-    for name in ("limbs_v3.npz", "deep_v1.npz", "stout_v1.npz", "trunk_v1.npz", "thin_v1.npz"):
+    for name in ("limbs_v3.npz", "deep_v2.npz", "stout_v1.npz", "trunk_v1.npz", "thin_v1.npz"):
         some = Released(limbs.FILE.with_name(name))
         assert _fewer_bodies(some.plan, TISSUE)
         for contact, part in some.parts():
