@@ -92,10 +92,11 @@ def filled(body: Body, part: str, lay: Callable[..., SoftLayer], tone: Tone = "r
         lay: function that makes a layer on the part's skin, of a `thickness` [m] and, if told, a `tissue`.
         tone: state of the muscle.
     """
-    its = for_person(region(part, tone), body.physique)
     if part in STRAIGHT:
+        its = for_person(region(part, tone), body.physique)
         return lay(thickness=its.thickness, tissue=its.tissue)
-    skin = lay(thickness=SHEET)
+    skin = lay(thickness=SHEET)  # refuses a part that is none
+    its = for_person(region(part, tone), body.physique)
     fat = fat_map(body, part, skin.vertices)
     if fat is None:
         skin = skin.with_(tissue=its.tissue)

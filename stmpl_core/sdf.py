@@ -294,6 +294,9 @@ def _tips(coefficients: np.ndarray, origin: np.ndarray, spacing: float, vertices
     one, two = order[:-1][same] // 3, order[1:][same] // 3
     sharp = np.einsum("nx,nx->n", normals[one], normals[two]) < SHARP
     ends, out = vertices[sides[order[:-1][same][sharp]]], normals[one[sharp]] + normals[two[sharp]]
+    looked = np.concatenate([ends, ends.mean(axis=1, keepdims=True)], axis=1).reshape(-1, 3)
+    seen = (_distances(coefficients, origin, spacing, looked).reshape(-1, 3) > 0).any(axis=1)  # not inside another body
+    ends, out = ends[seen], out[seen]
     length = np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1)
     many = np.ceil(length / max(0.5 * spacing, length.sum() / MOST_EDGES, 1e-12)).astype(int)
     number = np.repeat(np.arange(len(many)), many)

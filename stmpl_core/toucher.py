@@ -25,7 +25,6 @@ from stmpl_core.obstacle import REACH
 from stmpl_core.pieces import DEEP, GROUP, WIDER, pins
 from stmpl_core.rays import WALL, way_of
 from stmpl_core.sdf import SignedDistance, deepest_corner, lacking, mean_off
-from stmpl_core.stack import effective
 from stmpl_core.tools import Tools
 from stmpl_core.touch import (
     APART,
@@ -85,8 +84,9 @@ OVER_SOFT = 0.25, 0.04, 0.15  # bound by how much stiffer a material is than one
 MOST_OVER_SOFT = 0.35  # that share of the bound beyond which it is flagged: a tensed belly has 0.31
 RATIOS_APART = 0.06  # difference of the materials' Poisson's ratios: 0.05 cost nothing, of 0.1 force is 15 % off
 MAX_PULL = 1.0, 1.5  # T / (E t) of the effective layer that is tried: of any skin, and of skin no tauter than TAUT
-TAUT = 0.1, 0.6, 1.2  # T / (E_s h) up to which limbs were learnt, as people's are; bound beyond, at most, and its rise:
-# of a tube 0.55 of its radius thick force is 8 % off at 0.27, 11 at 1
+TAUT = 0.12, 0.6, 1.2  # T / (E_s h) up to which limbs were learnt (0.1), as the regions' skins are, also relaxed; bound
+# beyond, at most, and its rise: of a tube 0.55 of its radius thick force is 8 % off at 0.27, 11 at 1
+PULLS_FROM = 0.2  # T / (E t) from which that is widened in full: what hardly pulls widens hardly
 SLACK = 0.012, 0.5  # T / (E_s h), and kappa, below and above which skin is slack and matters: force then falls with T
 PINS = 3  # tools side by side from which they may be pins of one brush
 SIDES = (0.2, 0.9)  # share of the force that points one way: below, a tool closes around; between, none was learnt
@@ -840,7 +840,7 @@ def unlearnt(layer: SoftLayer, low: float, high: float) -> list[str]:
     if kappa > SLACK[1] and pull < SLACK[0] * kappa:
         out.append(f"the skin has next to no tension, T / (E_s h) = {pull / kappa:.2g}: such skin is answered 10 to "
                    "22 % too stiff; people's is taut")  # fmt: skip
-    tried = MAX_PULL[pull <= TAUT[0] * kappa]
+    tried = MAX_PULL[tissue.skin is not None and tissue.skin.tension <= TAUT[0] * tissue.skin.stiffness]
     if pull > tried:
         out.append(f"the skin's tension is {pull:.2g} times E t of the tissue under it; tried is {tried:g}")
     if over_soft(layer) > MOST_OVER_SOFT:
@@ -854,9 +854,9 @@ def tissue_doubt(layer: SoftLayer) -> float:
         return 1.0
     least = min(one.poisson_ratio for one in (layer.tissue, *layer.tissue.deeper))
     doubt, (learnt, most, steep) = (1 + FEW * max(FEW_RATIO - least, 0.0)) * (1 + over_soft(layer)), TAUT
-    if layer.tissue.skin is not None:
-        one = effective(layer.tissue, float(np.median(layer.thickness)))
-        doubt *= 1 + min(steep * max(one.pull / one.kappa - learnt, 0.0), most)
+    if (skin := layer.tissue.skin) is not None and skin.tension > learnt * skin.stiffness:
+        pulls = min(layer.tissue.pull(float(np.median(layer.thickness))) / PULLS_FROM, 1.0)
+        doubt *= 1 + pulls * min(steep * (skin.tension / max(skin.stiffness, 1e-300) - learnt), most)
     return doubt
 
 

@@ -15,7 +15,7 @@ NUMBERS = {  # what main() returns; its docstring says what that is
     "06_judge_a_recording": 4.77e-5,  # m
     "07_how_stiff_is_it": 1400.0,  # Pa
     "08_a_haptic_loop": 0.0306,  # N
-    "09_press_evenly": 9.43e-3,  # m
+    "09_press_evenly": 9.63e-3,  # m
     "10_how_stiff_and_how_thick": 9.65e-3,  # m
     "11_many_at_once": 0.331,  # N
 }

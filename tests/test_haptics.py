@@ -106,7 +106,7 @@ def forearm() -> Toucher:
     return Toucher(living(Body.anny(), "left_forearm", edge_length=4e-3))
 
 
-@pytest.mark.parametrize("name, most", [("ball", 0.05), ("fingertip", 0.06), ("capsule", 0.06), ("disc", 0.08),
+@pytest.mark.parametrize("name, most", [("ball", 0.06), ("fingertip", 0.06), ("capsule", 0.06), ("disc", 0.08),
                                         ("two", 0.06)])  # fmt: skip
 @pytest.mark.parametrize("tissue", ["paper", "living"])
 def test_the_stiffness_is_that_of_differences(spot: Spot, forearm: Toucher, tissue: str, name: str,

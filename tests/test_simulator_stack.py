@@ -290,11 +290,11 @@ def test_a_deeper_material_of_another_poissons_ratio_presses_as_finite_elements_
     assert ("Poisson's ratio" in touch.trust.why) == (deeper != 0.40)
 
 
-@pytest.mark.parametrize("tension, sound", [(0.0, False), (20.0, True), (75.0, True), (100.0, False)])
+@pytest.mark.parametrize("tension, sound", [(0.0, False), (20.0, True), (70.0, True), (100.0, False)])
 def test_force_under_slack_and_tight_skin_is_within_its_bound_or_flagged(tension: float, sound: bool) -> None:
-    """Beside finite elements round a limb of 45 mm, half of the thickness deep: 8 % too small at 20 N/m, 11 at 75.
+    """Beside finite elements round a limb of 45 mm, half of the thickness deep: 8 % too small at 20 N/m, 11 at 70.
 
-    So taut beside its own stiffness, T / (E_s h) = 0.27 and 1, is no skin of people (0.1).
+    So taut beside its own stiffness, T / (E_s h) = 0.27 and 0.9, is no region's skin (0.07 at most, 0.12 relaxed).
     """
     thickness, radius = 25e-3, 45e-3
     layer = limb(5e-3, thickness, radius, 0.18).with_(tissue=Tissue(3e3, 0.45, skin=Membrane(5e4, 1.5e-3, tension)))
@@ -307,9 +307,9 @@ def test_force_under_slack_and_tight_skin_is_within_its_bound_or_flagged(tension
         assert abs(touch.force - truth.force) < touch.force_bound or not sound
 
 
-@pytest.mark.parametrize("kappa, sound", [(10.0, False), (15.0, True)])
-def test_tension_beyond_e_t_is_in_range_as_limbs_were_learnt_with_it(kappa: float, sound: bool) -> None:
-    tissue = Tissue(3e3, 0.45, skin=Membrane(kappa * 75 / 1.5e-3, 1.5e-3, 1.3 * 75))
+@pytest.mark.parametrize("kappa, pull, sound", [(8.0, 1.3, False), (15.0, 1.3, True), (20.0, 1.6, False)])
+def test_tension_beyond_e_t_is_in_range_as_limbs_were_learnt_with_it(kappa: float, pull: float, sound: bool) -> None:
+    tissue = Tissue(3e3, 0.45, skin=Membrane(kappa * 75 / 1.5e-3, 1.5e-3, pull * 75))
     layer = limb(12e-3, 25e-3, 45e-3, 0.18).with_(tissue=tissue)
     assert any("tension" in why for why in unlearnt(layer, 0.3, 0.49)) != sound
 
@@ -361,6 +361,7 @@ def test_how_far_tissue_is_from_what_was_learnt() -> None:
     assert 1 < doubt(of_ratio(0.43)) < doubt(of_ratio(0.40)) < doubt(of_ratio(0.35)) < 2
     assert doubt(over(4e3, 8e-3, 4e3)) == 1 < doubt(over(6e3, 8e-3, 4e3)) < doubt(over(12e3, 8e-3, 4e3))
     assert doubt(over(12e3, 30e-3, 4e3)) == 1, "what lies below the bone is none"
+    assert doubt(Tissue(3e3, 0.45, skin=Membrane(100.0, 1e-6, 1e-3))) < 1.001, "a skin that is hardly there"
     for tone in ("relaxed", "tensed"):
         belly = region("abdomen", tone)
         assert 1.1 < doubt(belly.tissue, belly.thickness) < 1.4 and not told(belly.tissue, belly.thickness)
