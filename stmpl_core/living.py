@@ -92,11 +92,10 @@ def filled(body: Body, part: str, lay: Callable[..., SoftLayer], tone: Tone = "r
         lay: function that makes a layer on the part's skin, of a `thickness` [m] and, if told, a `tissue`.
         tone: state of the muscle.
     """
-    if part in STRAIGHT:
-        its = for_person(region(part, tone), body.physique)
-        return lay(thickness=its.thickness, tissue=its.tissue)
-    skin = lay(thickness=SHEET)  # refuses a part that is none
+    skin = None if part in STRAIGHT else lay(thickness=SHEET)  # refuses a part that is none
     its = for_person(region(part, tone), body.physique)
+    if skin is None:
+        return lay(thickness=its.thickness, tissue=its.tissue)
     fat = fat_map(body, part, skin.vertices)
     if fat is None:
         skin = skin.with_(tissue=its.tissue)

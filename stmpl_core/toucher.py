@@ -840,7 +840,7 @@ def unlearnt(layer: SoftLayer, low: float, high: float) -> list[str]:
     if kappa > SLACK[1] and pull < SLACK[0] * kappa:
         out.append(f"the skin has next to no tension, T / (E_s h) = {pull / kappa:.2g}: such skin is answered 10 to "
                    "22 % too stiff; people's is taut")  # fmt: skip
-    tried = MAX_PULL[tissue.skin is not None and tissue.skin.tension <= TAUT[0] * tissue.skin.stiffness]
+    tried = MAX_PULL[_tautness(tissue) <= TAUT[0]]
     if pull > tried:
         out.append(f"the skin's tension is {pull:.2g} times E t of the tissue under it; tried is {tried:g}")
     if over_soft(layer) > MOST_OVER_SOFT:
@@ -853,11 +853,15 @@ def tissue_doubt(layer: SoftLayer) -> float:
     if not layer.stacked:
         return 1.0
     least = min(one.poisson_ratio for one in (layer.tissue, *layer.tissue.deeper))
-    doubt, (learnt, most, steep) = (1 + FEW * max(FEW_RATIO - least, 0.0)) * (1 + over_soft(layer)), TAUT
-    if (skin := layer.tissue.skin) is not None and skin.tension > learnt * skin.stiffness:
-        pulls = min(layer.tissue.pull(float(np.median(layer.thickness))) / PULLS_FROM, 1.0)
-        doubt *= 1 + pulls * min(steep * (skin.tension / max(skin.stiffness, 1e-300) - learnt), most)
-    return doubt
+    learnt, most, steep = TAUT
+    taut = min(steep * max(_tautness(layer.tissue) - learnt, 0.0), most)
+    pulls = min(layer.tissue.pull(float(np.median(layer.thickness))) / PULLS_FROM, 1.0)
+    return (1 + FEW * max(FEW_RATIO - least, 0.0)) * (1 + over_soft(layer)) * (1 + pulls * taut)
+
+
+def _tautness(tissue: Tissue) -> float:
+    """T / (E_s h) of a skin [-]; 0 without one."""
+    return tissue.skin.tension / max(tissue.skin.stiffness, 1e-300) if tissue.skin else 0.0
 
 
 def over_soft(layer: SoftLayer) -> float:
