@@ -18,3 +18,11 @@ function(drop_foreign_includes)
   endforeach()
 endfunction()
 cmake_language(DEFER CALL drop_foreign_includes)
+
+# What is generated in C++ is short, and includes much: all of a library at once takes a third of the time.
+function(compile_at_once)
+  foreach(kind IN ITEMS cpp fastrtps_c fastrtps_cpp introspection_cpp)
+    set_target_properties(${PROJECT_NAME}__rosidl_typesupport_${kind} PROPERTIES UNITY_BUILD ON UNITY_BUILD_BATCH_SIZE 0)
+  endforeach()
+endfunction()
+cmake_language(DEFER CALL compile_at_once)
