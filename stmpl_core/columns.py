@@ -613,7 +613,7 @@ def _sinking(grid, pose, points, inward, thickness, area, strain, sunk, push):
             depth[n] = 0.0
             continue
         ends = ray if sure == 1 else led_in(grid, ray, where, inside, wall)
-        more = depth_in_column(grid, ends, max(4 * guess, thickness[n]), guess) * cosine - depth[n]
+        more = depth_in_column(grid, ends, max(4 * guess, thickness[n]), guess, 0.0) * cosine - depth[n]
         if more > 0:  # as far as its skin is inside the tool, and not at once
             begins = max(1 - distance_in_column(grid, ray, 0.0) / wall, sunk * (1 + inside / wall))
             more *= max(sure, 0.0) * min(max(begins, 0.0), depth[n] / wall, 1.0)

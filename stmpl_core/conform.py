@@ -222,7 +222,7 @@ def _lie(grid, pose, points, inward, way, thickness, depth, rests, pressure, gon
         lies[n] = min(rests[n], along) * _clipped(pressure[n] / light - 0.5) * faces
         if lies[n] == 0:
             continue
-        far = depth_in_column(grid, ray, 4 * guess, guess)
+        far = depth_in_column(grid, ray, 4 * guess, guess, 0.0)
         sure = _clipped(2 * lies[n] - 1)  # beside a wall it is not clear where the way ends
         for x in range(3):
             gone[n, x] = (sure * far + (1 - sure) * guess) * way[n, x]

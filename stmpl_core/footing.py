@@ -393,7 +393,7 @@ def leaned(contact, turned):
     """The contact whose normal is turned, as `faced` says: friction is along the skin, at right angles to the push."""
     out, normal = contact.copy(), contact[1] + turned
     normal /= np.sqrt(_dot(normal, normal))
-    out[1], out[2] = normal, carried_tangent(contact, normal, True)
+    out[1], out[2] = normal, carried_tangent(contact, normal, np.bool_(True))
     return out
 
 

@@ -319,5 +319,5 @@ def _grip(touch: Touch, memory: Memory, lever: float) -> Grip:
     middle, normal, first = contact
     arm, second = middle - touch.pose_body_from_tool[:3, 3], np.cross(normal, first)
     axes = np.array([[*first, *np.cross(arm, first)], [*second, *np.cross(arm, second)], [0, 0, 0, *(lever * normal)]])
-    forces = in_plane(touch.slip.wrench, contact, touch.pose_body_from_tool[:3, 3], lever)
+    forces = in_plane(touch.slip.wrench, contact, touch.pose_body_from_tool[:3, 3].copy(), lever)
     return Grip(axes, forces, memory.stiffness, memory.scalars.limit / touch.force)

@@ -341,7 +341,7 @@ def strains_beside(grid, pose, other, between, points, inward, thickness, strain
             most = size * (1 - _ended(grid, way, other, between, where, wall)) * min((cosine - ASLANT) / UPRIGHT, 1.0)
             if most > share:
                 ends = way if inside > SURE * wall else led_in(grid, way, where, inside, wall)
-                now += (most - share) * min(depth_in_column(grid, ends, t, 0.0) * cosine / t, MAX_COLUMN_STRAIN)
+                now += (most - share) * min(depth_in_column(grid, ends, t, 0.0, 0.0) * cosine / t, MAX_COLUMN_STRAIN)
         out[n] = max(out[n], now)
     return out
 
@@ -497,7 +497,7 @@ def _lay(grid, pose, centre, points, inward, thickness, faces, found, top, split
         area: area that is covered, as the lattice sees it [m2]; it does not depend on the triangles.
         rows: rows of Nodes: point, inward, thickness, area, strain, corners, shares, (N, 15), unless only to look.
     """
-    out, count, sum_area, deepest, sunk = np.empty((128, 15)), 0, 0.0, depths.max(), top.any()
+    out, count, sum_area, deepest, sunk = np.empty((128, 15)), np.int64(0), 0.0, depths.max(), top.any()
     least = max(min(cell, 0.5 * np.sqrt(3.0) * (WIDEST * thick) ** 2), area / MOST)
     for side in range(len(frames)):
         first, second, way = frames[side, 0], frames[side, 1], frames[side, 2]
@@ -518,7 +518,7 @@ def _lay(grid, pose, centre, points, inward, thickness, faces, found, top, split
         left, right = int(np.floor(reach[0] / spacing)) - 1, int(np.ceil(reach[2] / spacing)) + 1
         taken = np.zeros((high - low + 1, right - left + 1), np.bool_)
 
-        m, uv = 0, np.empty((3, 2))
+        m, uv = np.int64(0), np.empty((3, 2))
         while m < len(found):
             m, count, sum_area = _on_triangles(
                 grid, pose, centre, points, inward, thickness, faces, found, top, sunk, split, depths, middles, first,

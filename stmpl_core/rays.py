@@ -62,7 +62,7 @@ def wall_in(half, t):
 
 
 @numba.njit(forceinline=True, cache=True, error_model="numpy", **UNCOUNTED)
-def depth_in_column(grid, ray, t, guess, least=0.0):
+def depth_in_column(grid, ray, t, guess, least):
     """How deep along a ray, from the skin inwards, the tool ends [m]; 0 if it is not met.
 
     From a guess above WALL of the thickness by the secant rule. Where that goes astray, as along a wall of the tool, or
@@ -222,7 +222,7 @@ def depth_and_share(grid, ray, t, top):
     share, sunk = min(max(1 + guess / wall, 0.0), 1.0), top.any()
     if share <= 0 and not sunk:
         return 0.0, 0.0
-    deep = depth_in_column(grid, ray, t, guess)
+    deep = depth_in_column(grid, ray, t, guess, 0.0)
     if deep == 0 and guess > 0:
         deep = guess  # the skin is no deeper in the tool than distances are off by
     if share < 1 and sunk and deep > 0:
@@ -256,7 +256,7 @@ def swept(grid, ray, t, top):
     if inside <= 0:
         return 0.0, 0.0, 0.0
     share = size * min(2 * inside / wall, 1.0) * min((cosine - ASLANT) / UPRIGHT, 1.0)
-    deep = depth_in_column(grid, way, t, 0.0)
+    deep = depth_in_column(grid, way, t, 0.0, 0.0)
     lies = min(max(-2 * distance_in_column(grid, way, deep - wall) / wall, 0.0), 1.0) if deep > wall else 1.0
     return deep * cosine, share, share * lies
 

@@ -460,7 +460,7 @@ def _one(patch, before, after, grooves, shares, times, fades, has_skin, table, l
                 _put(stated_pose[x], news[0][x])
                 _put(pose[x], news[5][x])
             work, unsure, given = work_of(
-                twist, wrench_before, wrench, contact, there, stated_pose[:3, 3].copy(), held, True,
+                twist, wrench_before, wrench, contact, there, stated_pose[:3, 3].copy(), held, np.bool_(True),
                 old[NET] * old[STRETCH], net * long, old[PASSIVE], relaxed, eased, shares, old[DEPTH], depth, power,
                 patch[14])  # fmt: skip
             return stored, sure, whole, work, unsure, given
@@ -482,7 +482,7 @@ def _one(patch, before, after, grooves, shares, times, fades, has_skin, table, l
     share = new[ELASTIC] / new[IMPRINT_FORCE] if new[ELASTIC] > 0 else 0.0
     says[27] = new[DEPTH] * depth_left(share, new[POWER], 1 - new[STRETCH])
     work, unsure, given = work_of(
-        twist, wrench_before, out[:6], contact, contact, stated_pose[:3, 3].copy(), held, False,
+        twist, wrench_before, out[:6], contact, contact, stated_pose[:3, 3].copy(), held, np.bool_(False),
         old[NET] * old[STRETCH], new[NET] * new[STRETCH], old[PASSIVE], relaxed, eased, shares, old[DEPTH], new[DEPTH],
         new[POWER], new[RADIUS])  # fmt: skip
     return 0.0, 0.0, 0.0, work, unsure, given
@@ -526,7 +526,7 @@ def _back(parts, news, grooves, after, shares, times, dt, gone, held, asked, par
 def _left(before, after, grooves, shares, times, dt):
     """The memory of a tool that is not told of any more: the skin comes back."""
     parts, news = parts_of(before, len(times)), parts_of(after, len(times))
-    _back(parts, news, grooves, after, shares, times, dt, 0.0, False, 0.0, 1.0)
+    _back(parts, news, grooves, after, shares, times, dt, 0.0, np.bool_(False), 0.0, 1.0)
     new, has, had = news[2], 0.0, 0.0
     new[PRESSING], new[WORK] = -1.0, 0.0
     for i in range(len(times)):

@@ -79,7 +79,7 @@ def _along(grid, pose, points, inward, way, sinking, thickness):
         cosine = inward[n, 0] * way[n, 0] + inward[n, 1] * way[n, 1] + inward[n, 2] * way[n, 2]
         depth = sinking[n] / max(cosine, ONE_WAY)
         ray = ray_of(pose, points, way, n)
-        far = min(depth_in_column(grid, ray, 4 * depth, depth), FURTHEST * depth)
+        far = min(depth_in_column(grid, ray, 4 * depth, depth, 0.0), FURTHEST * depth)
         wall = wall_in(grid[3], thickness[n])
         leaves = (distance_in_column(grid, ray, far) - distance_in_column(grid, ray, far - wall)) / wall
         sure, _, _ = sure_of(grid, ray, depth, wall)

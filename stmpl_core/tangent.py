@@ -180,7 +180,7 @@ def _rates(grid, middle, pose, vertices, normals, thicknesses, points, inward, t
             ends[n] = sinking[n] / max(_dot(inward[n], way), 1e-3)
             if sinking[n] > depth[n] * (1 + 1e-9):  # the column leads out of the tool's wall, the way goes on
                 ray = ray_from(pose, points[n, 0], points[n, 1], points[n, 2], way[0], way[1], way[2])
-                ends[n] = depth_in_column(grid, ray, max(4 * ends[n], thickness[n]), ends[n])
+                ends[n] = depth_in_column(grid, ray, max(4 * ends[n], thickness[n]), ends[n], 0.0)
             places[3 * many + n] = points[n] + ends[n] * way
     found, out = distances_and_gradients(grid[0], grid[1], grid[2], (places - origin) @ turn)
     distance, gradient = found.reshape(-1, many), (out @ turn.T).reshape(-1, many, 3)
@@ -252,7 +252,7 @@ def _columns(grid, pose, points, inward, thickness, area, strain):
     for n in range(len(area)):
         ray = ray_from(pose, points[n, 0], points[n, 1], points[n, 2], inward[n, 0], inward[n, 1], inward[n, 2])
         t = thickness[n]
-        out[0, n] = depth_in_column(grid, ray, t, max(-distance_in_column(grid, ray, 0.0), strain[n] * t))
+        out[0, n] = depth_in_column(grid, ray, t, max(-distance_in_column(grid, ray, 0.0), strain[n] * t), 0.0)
         out[2, n] = max(out[0, n] - wall_in(grid[3], t), 0.0)
     return out
 
