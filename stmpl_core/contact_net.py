@@ -9,9 +9,10 @@ from typing import Any, NamedTuple
 
 import numba
 import numpy as np
+from numba import float32, float64, int64
 
 from stmpl_core.columns import pushed
-from stmpl_core.green import Green
+from stmpl_core.green import Green, compile_matrix
 from stmpl_core.layer import SoftLayer
 from stmpl_core.methods.moment_net import think_few
 from stmpl_core.moments import Surroundings
@@ -272,6 +273,17 @@ class ContactNet:
             return _slopes(*nodes[:7], bent, *solved[:5], self._moduli, self._nu, *rates, *self._network)
         return _slopes_on_stack(*nodes[:8], bent, *solved, self._nu, self._green.effective.thickness,
                                 self._green.numbers, *self._green.hardening, *rates, *self._network)  # fmt: skip
+
+
+def compile_on_stacks() -> None:
+    """Compiles what says how a stack holds a tool whose nodes are known: an eighth of what a first start does."""
+    numbers, table, layer, rows = float64[::1], float64[:, ::1], float32[::1], float32[:, ::1]
+    nodes = table, table, numbers, numbers, numbers, int64[:, ::1], table, numbers, table
+    compile_matrix()
+    _look_on_stack.compile((*nodes, int64[::1], table, table, float64, table, table, float64, numbers, numbers, table,
+                            table))  # fmt: skip
+    _correct.compile((numbers, rows, numbers, *4 * [layer], *4 * [rows, layer]))
+    _on_plates.compile((rows, numbers))
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")

@@ -23,6 +23,7 @@ from weakref import WeakKeyDictionary
 
 import numba
 import numpy as np
+from numba import float32, float64, int64
 from scipy.special import j0, j1
 
 from stmpl_core import nodewise
@@ -626,6 +627,13 @@ def _product(columns, spread):
                 for n in range(len(row)):
                     row[n] += per * column[n]
     return out
+
+
+def compile_matrix() -> None:
+    """Compiles what finds Green.matrices."""
+    numbers, table = float64[::1], float64[:, ::1]
+    _matrix.compile((table, table, numbers, int64[:, ::1], table, int64[::1], numbers, numbers, float64[:, :, :],
+                     int64[:, ::1], table, numbers, float32[:, :, ::1], float64[:, :, ::1]))  # fmt: skip
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")

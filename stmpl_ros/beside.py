@@ -4,17 +4,13 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable
-from concurrent.futures import Future, wait
-from contextlib import suppress
+from concurrent.futures import Future
 from typing import Any
 
-from numba.core.event import Event, Listener
-
-from stmpl_core.pool import Pool
+from stmpl_core.pool import YIELDS, Pool
 from stmpl_core.sdf import SignedDistance
 from stmpl_core.tool import Tool
 
-YIELDS = 5  # nice value: what answers goes first
 BUILDERS = min(os.cpu_count() or 1, 4)  # processes that build distance fields, started as they are needed
 
 
@@ -35,40 +31,6 @@ class Beside[T]:
     def close(self) -> None:
         """Ends the process, whether the job is done or not."""
         self._pool.end()
-
-
-class StepsAhead(Listener):
-    """Compiles what steps with a memory take in a process beside, as soon as a kernel is to be compiled here.
-
-    Args:
-        wanted: choice to do so at all; nothing is done where there is no second core.
-    """
-
-    def __init__(self, wanted: bool) -> None:
-        self._wanted = wanted and len(os.sched_getaffinity(0)) > 1
-        self._beside: Beside[None] | None = None
-
-    def on_start(self, event: Event) -> None:
-        """Before a kernel is compiled."""
-        if self._wanted:
-            self._wanted = False
-            from stmpl_core.history import compile_steps  # not of those that build fields
-
-            with suppress(OSError):  # then it is compiled here
-                self._beside = Beside(compile_steps)
-
-    def on_end(self, event: Event) -> None:
-        """After it."""
-
-    def wait(self) -> None:
-        """Until they are on disk: what two processes compile at once rounds otherwise in the last bits."""
-        if self._beside is not None:
-            wait([self._beside.result])
-
-    def close(self) -> None:
-        """Ends the process, whatever it is at."""
-        if self._beside is not None:
-            self._beside.close()
 
 
 class Builders:

@@ -1,25 +1,20 @@
-"""Making: a skin from the settings, and what to do before its first answer."""
+"""Making: a skin from the settings."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from typing import TYPE_CHECKING, cast, get_args
 
-import numpy as np
-
-from stmpl_core.contact import Contact
 from stmpl_core.errors import InvalidInput
 from stmpl_core.friction import Friction, friction_from
 from stmpl_core.layer import SoftLayer
 from stmpl_core.living import held_skin, laid, living, part_around, read_model, read_tissue
-from stmpl_core.local_contact import local_contacts
 from stmpl_core.regions import Tone, region
 from stmpl_core.rig import Rig, joints_of
 from stmpl_core.simulator import Simulator
 from stmpl_core.skin import Skin, published
-from stmpl_core.state import State
 from stmpl_core.tissue import Tissue
-from stmpl_core.tool import Tool
+from stmpl_core.warming import warm_up
 from stmpl_ros.parameters import ONE_LAYER, PAPER, NodeConfig
 
 if TYPE_CHECKING:
@@ -31,8 +26,6 @@ ON_STACKS = ("moment_net", "limb_linear", "ladder")  # methods that know skin, f
 MOVED = ("moment_net", "linear", "limb_linear", "winkler", "naive", "zero")  # methods that go along with joints
 AT_ONCE = {"friction"}  # settings that the skin does not know of
 QUICK = {"moment_net", "winkler", "naive"}  # methods that such a change costs no preparation
-TIP = 0.01  # size of the tool that warms up, from its middle to its corners [m]
-WARM_BEND = 0.1  # angle of each joint at which a bent skin is warmed up [rad]
 
 
 def layer_of(config: NodeConfig) -> SoftLayer:
@@ -140,60 +133,3 @@ def restiffened(skin: Skin, config: NodeConfig, changed: set[str]) -> Skin | Non
     if not changed or not changed <= STIFFNESS | AT_ONCE or config.method not in QUICK or skin.layer.stacked:
         return None
     return skin.stiffened(config.new_method(), youngs_modulus=config.youngs_modulus, density=config.density)
-
-
-def warm_up(simulator: Simulator, until_compiled: Callable[[], None] = lambda: None) -> None:
-    """Solves one contact of each kind, so that nothing is left to compile when the first real one comes.
-
-    Where time and friction count, they are one press that slides; where joints bend the skin, all is done bent and at
-    rest. The deepest reaches into the core. Of each comes a local model. Last two tools press at one place. All rub as
-    the roughest of those whose friction is told.
-
-    Args:
-        simulator: simulator to warm up.
-        until_compiled: waits until somebody else has compiled what steps with a memory take.
-    """
-    frictions = every, some = simulator.history.frictions
-    simulator.history.frictions = max(every, *some.values(), 0.0), {}
-    tool, rig, state = tip(), simulator.layer.rig, State()
-    for angles in ([WARM_BEND] * len(rig.joints), ()) if rig else ((),):
-        if rig:
-            state = simulator.move_to(simulator.skin.at_angles(angles), state)
-        state = _press(simulator, tool, state, until_compiled)
-    simulator.tools.remove(tool.name)
-    simulator.history.frictions = frictions
-
-
-def tip() -> Tool:
-    """A tool to warm up with: an octahedron whose corners are TIP from its middle."""
-    corners = TIP * np.array([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1]])
-    faces = np.array([[0, 2, 4], [2, 1, 4], [1, 3, 4], [3, 0, 4], [2, 0, 5], [1, 2, 5], [3, 1, 5], [0, 3, 5]])
-    return Tool("warm up", corners, faces)
-
-
-def _press(simulator: Simulator, tool: Tool, state: State, until_compiled: Callable[[], None]) -> State:
-    """Touches the skin where it stands, in each way."""
-    layer, pose = simulator.layer, np.eye(4)
-    vertex = int(np.linalg.norm(layer.vertices - layer.vertices.mean(axis=0), axis=1).argmin())
-    push, deep = np.concatenate([-0.01 * layer.normals[vertex], np.zeros(3)]), -float(layer.thickness[vertex])
-    for away, wrench in ((0.009, push), (0.012, push), (0.009, None), (deep, None), (0.05, push)):
-        pose[:3, 3] = layer.vertices[vertex] + away * layer.normals[vertex]
-        touches = simulator.touch([Contact(tool, pose, wrench)])
-        local_contacts(simulator.history, touches)
-        simulator.answer(touches)
-        until_compiled()
-        for way in (0.0, 1e-3) if simulator.remembers else ():
-            pose[:3, 3] += way * np.roll(layer.normals[vertex], 1)
-            touches, state = simulator.touch([Contact(tool, pose.copy(), wrench)], state, 0.01)
-            simulator.answer(touches)
-            local_contacts(simulator.history, touches, state)
-    pose[:3, 3] = layer.vertices[vertex] + 0.009 * layer.normals[vertex]
-    again = tool.named(f"{tool.name} again")
-    for wrench in (None, push):
-        both = [Contact(tool, pose, wrench), Contact(again, pose, wrench)]
-        simulator.answer(simulator.touch(both))
-        if simulator.remembers:
-            touches, state = simulator.touch(both, state, 0.01)
-            simulator.answer(touches)
-    simulator.tools.remove(again.name)
-    return state.without(again.name)

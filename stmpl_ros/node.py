@@ -29,9 +29,10 @@ from stmpl_core.skin import Skin
 from stmpl_core.tool import Tool
 from stmpl_core.tools import Tools
 from stmpl_core.toucher import margin_on
+from stmpl_core.warming import CompiledAhead, warm_up
 from stmpl_ros.answering import Answering
 from stmpl_ros.bending import Bending
-from stmpl_ros.beside import Beside, StepsAhead
+from stmpl_ros.beside import Beside
 from stmpl_ros.body_action import NOT_YET, BodyAction, Done, changes_of
 from stmpl_ros.bond import Bond
 from stmpl_ros.calibration import Calibration
@@ -49,9 +50,8 @@ from stmpl_ros.making import (
     layer_of,
     restiffened,
     skin_of,
-    warm_up,
 )
-from stmpl_ros.parameters import NodeConfig
+from stmpl_ros.parameters import PAPER, NodeConfig
 from stmpl_ros.sending import Sending
 from stmpl_ros.settings import Settings
 from stmpl_ros.spinning import POLL_PERIOD_S, interruptible, ros, spin
@@ -140,11 +140,12 @@ class SkinNode(ServingNode):
             check(self.config, self._build)
             self.answering.limits = Limits.read(self.config.limits, self.config.limb)
             self.workshop = Workshop(self)  # its builders start while the skin is made
-            steps = StepsAhead(self.config.relaxing or friction_of(self.config) is not None)
-            with (closing(steps), install_listener("numba:compile", steps),
+            remembers = self.config.relaxing or friction_of(self.config) is not None
+            ahead = CompiledAhead(stacked=self.config.tissue != PAPER, steps=remembers)
+            with (closing(ahead), install_listener("numba:compile", ahead),
                   install_listener("numba:compile", Compiling(self._tell_progress))):  # fmt: skip
                 for simulator in self._answer_on(self._make_skin(), self.config):
-                    warm_up(simulator, steps.wait)
+                    warm_up(simulator, ahead)
         except StmplError as error:
             self._end()
             self.get_logger().error(f"cannot be configured: {error}")

@@ -15,15 +15,15 @@ from stmpl_core.history import History
 from stmpl_core.layer import SoftLayer
 from stmpl_core.local_contact import LocalContact, local_contacts
 from stmpl_core.methods.zero import Zero
-from stmpl_core.pool import Pool
+from stmpl_core.pool import YIELDS, Pool
 from stmpl_core.skin import Skin
 from stmpl_core.state import State
 from stmpl_core.stiffness import Stiffness, fit_stiffness
 from stmpl_core.strokes import Fading, Rubbing, fit_friction, fit_relaxation
 from stmpl_core.tool import Tool
 from stmpl_core.toucher import Toucher, margin_on
-from stmpl_ros.beside import YIELDS, Builders
-from stmpl_ros.making import TIP, tip
+from stmpl_core.warming import TIP, tip
+from stmpl_ros.beside import Builders
 from stmpl_ros.remembering import Before
 
 MAX_FITTED_INSTANTS = 500  # instants of a stroke or a press that stays, evenly over it; each takes a touch

@@ -14,6 +14,7 @@ from stmpl_core.arrays import Wrench, check_kind, check_number, cross, is_number
 from stmpl_core.errors import InvalidInput
 from stmpl_core.friction import Friction
 from stmpl_core.local_contact import local_contacts
+from stmpl_core.warming import CompiledAhead
 from stmpl_sim.ability import strength, stuck_joints
 from stmpl_sim.controller import ForceImpedance, Gains, Goal
 from stmpl_sim.energy import EnergyBook
@@ -299,8 +300,12 @@ class Massage:
         self.controller.reset()
         mujoco.mj_forward(self.scene.model, self.data)
 
-    def warm_up(self) -> None:
-        """Goes back to the start after steps with all tools in the skin: then nothing is left to compile."""
+    def warm_up(self, ahead: CompiledAhead | None = None) -> None:
+        """Goes back to the start after steps with all tools in the skin: then nothing is left to compile.
+
+        Args:
+            ahead: who compiles a part of it beside.
+        """
         skin, data = self.skin, self.data
         poses, normal = skin.poses(data), self.limb_pose()[:3, :3] @ self.scene.site.normal
         inwards = {BALL: -(START_M + 1e-3) * normal}
@@ -309,6 +314,9 @@ class Massage:
         for name, way in inwards.items():
             pressed[name][:3, 3] += way
         memory = Memory()
+        if ahead:
+            ahead.touch(skin.simulator)
+            ahead.wait()
         for _ in range(2):
             reaction = skin.contact.step(Poses(poses.body, pressed), memory, self.scene.model.opt.timestep)
             memory = reaction.memory

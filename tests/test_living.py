@@ -183,7 +183,8 @@ def test_only_a_skin_that_ships_is_made_while_a_node_waits():
 
 
 def test_the_default_node_starts_without_torch_or_anny():
-    code = ("import sys; from stmpl_ros.making import skin_of, warm_up; from stmpl_ros.parameters import NodeConfig\n"
+    code = ("import sys; from stmpl_ros.making import skin_of\n"
+            "from stmpl_core.warming import warm_up; from stmpl_ros.parameters import NodeConfig\n"
             "from stmpl_core import Simulator\n"
             "skin = skin_of(NodeConfig()); warm_up(Simulator(skin)); print(skin.layer)\n"
             "assert not {'anny', 'torch', 'roma', 'viser', 'zarr'} & set(sys.modules)")  # fmt: skip

@@ -10,8 +10,9 @@ from stmpl_core.errors import InvalidInput
 from stmpl_core.friction import PAIRS, friction_from
 from stmpl_core.living import write_tissue
 from stmpl_core.methods import Winkler
+from stmpl_core.warming import warm_up
 from stmpl_ros.inbox import Instant
-from stmpl_ros.making import friction_of, skin_of, warm_up
+from stmpl_ros.making import friction_of, skin_of
 from stmpl_ros.parameters import NodeConfig
 from stmpl_ros.remembering import ELASTIC, Remembering
 from stmpl_ros.settings import checked

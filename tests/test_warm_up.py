@@ -23,7 +23,7 @@ from stmpl_core.friction import friction_from
 from stmpl_core.local_contact import local_contacts
 from stmpl_core.methods import MomentNet
 from stmpl_core.state import State
-from stmpl_ros.making import warm_up
+from stmpl_core.warming import warm_up
 from tests.scenes import RADIUS, at, ball, limb
 from tests.test_posing import hinged
 
@@ -75,7 +75,7 @@ from stmpl_core import Simulator, stepped
 from stmpl_core.history import compile_steps
 from stmpl_core.methods import MomentNet
 from stmpl_core.regions import HELD_SKIN
-from stmpl_ros.making import warm_up
+from stmpl_core.warming import warm_up
 from tests.scenes import limb
 
 compile_steps()
@@ -85,9 +85,35 @@ print(*(len(one.signatures) for one in (stepped.asked_for, stepped.tell, stepped
 """
 
 
+LAW = KERNELS + """
+from stmpl_core import Simulator, contact_net, green
+from stmpl_core.body import Body
+from stmpl_core.contact_net import compile_on_stacks
+from stmpl_core.living import living
+from stmpl_core.methods import Zero
+from stmpl_core.warming import compile_touches, warm_up
+
+compile_on_stacks()
+layer = living(Body.anny(), "left_forearm", edge_length=8e-3)
+compile_touches(layer)
+told = (contact_net._look_on_stack, contact_net._correct, contact_net._on_plates, green._matrix)
+print(*(len(one.signatures) for one in told))
+before = kernels()
+warm_up(Simulator(layer, Zero()))
+print(sorted(kernels() - before))
+"""
+
+
 def test_what_another_process_compiles_of_steps_is_what_they_take():
     code, said = end(start("-c", STEPS))
     assert (code, said) == (0, "1 1 1 1\n")
+
+
+def test_what_another_process_compiles_of_touches_is_what_they_take():
+    """Of answers is left what lays the skin on its tools."""
+    code, said = end(start("-c", LAW))
+    assert (code, said.splitlines()[0]) == (0, "1 1 1 1")
+    assert "local" not in said and "contact_net" not in said and "nodes" not in said
 
 
 @pytest.mark.parametrize("friction", ["none", "oiled"])

@@ -1,0 +1,160 @@
+"""Warming up: all that answers take is compiled before the first is asked for, on two cores where there are."""
+
+from __future__ import annotations
+
+import os
+from concurrent.futures import BrokenExecutor, Future, wait
+from contextlib import suppress
+
+import numpy as np
+from numba.core.event import Event, Listener
+
+from stmpl_core.contact import Contact
+from stmpl_core.contact_net import compile_on_stacks
+from stmpl_core.history import compile_steps
+from stmpl_core.layer import SoftLayer
+from stmpl_core.local_contact import local_contacts
+from stmpl_core.methods.zero import Zero
+from stmpl_core.pool import YIELDS, Pool
+from stmpl_core.simulator import Simulator
+from stmpl_core.state import State
+from stmpl_core.tool import Tool
+
+TIP = 0.01  # size of the tool that warms up, from its middle to its corners [m]
+WARM_BEND = 0.1  # angle of each joint at which a bent skin is warmed up [rad]
+
+
+class CompiledAhead(Listener):
+    """Compiles in a process beside what is needed later, as soon as a kernel is to be compiled here.
+
+    First how a stack holds a tool, while the skin is made here; then what steps with a memory take; last, once a first
+    touch is compiled here, what else touches and local models take. Nothing is done where there is no second core.
+
+    Args:
+        stacked: whether there may be a stack.
+        steps: whether steps with a memory will be asked for.
+    """
+
+    def __init__(self, stacked: bool, steps: bool) -> None:
+        self._stacked, self._steps, self._wanted = stacked, steps, len(os.sched_getaffinity(0)) > 1
+        self._pool: Pool | None = None
+        self._jobs: list[Future[None]] = []
+
+    def on_start(self, event: Event) -> None:
+        """Before a kernel is compiled."""
+        if self._wanted:
+            self._wanted = False
+            with suppress(OSError):  # then it is compiled here
+                self._pool = Pool(1, yields=YIELDS)
+                jobs = compile_on_stacks if self._stacked else None, compile_steps if self._steps else None
+                self._jobs += [self._pool.submit(job) for job in jobs if job]
+
+    def on_end(self, event: Event) -> None:
+        """After it."""
+
+    def touch(self, simulator: Simulator) -> None:
+        """Touches for the first time; what else touches take is compiled beside from then on."""
+        if self._pool is None:
+            return
+        if self._stacked:
+            wait(self._jobs[:1])
+        tool = tip()
+        simulator.touch([_first(simulator.layer, tool)])
+        simulator.tools.remove(tool.name)
+        with suppress(OSError, BrokenExecutor):
+            self._jobs.append(self._pool.submit(compile_touches, simulator.layer))
+
+    def wait(self) -> None:
+        """Until all is on disk: what two processes compile at once rounds otherwise in the last bits."""
+        wait(self._jobs)
+
+    def close(self) -> None:
+        """Ends the process, whatever it is at."""
+        if self._pool is not None:
+            self._pool.end()
+
+
+def compile_touches(layer: SoftLayer) -> None:
+    """Compiles what local models, deep touches and those of two tools take beyond a first touch, which is compiled."""
+    simulator, tool, others = Simulator(layer, Zero()), tip(), tip().named("again")
+    first = _first(layer, tool)
+    local_contacts(simulator.history, simulator.touch([first]))
+    deep = first.pose_body_from_tool.copy()
+    deep[:3, 3] -= 2 * TIP * layer.normals[_middle(layer)]
+    for wrench in (None, first.wrench):
+        simulator.touch([Contact(tool, first.pose_body_from_tool, wrench),
+                         Contact(others, first.pose_body_from_tool, wrench)])  # fmt: skip
+    simulator.touch([Contact(tool, deep)])
+
+
+def warm_up(simulator: Simulator, ahead: CompiledAhead | None = None) -> None:
+    """Solves one contact of each kind, so that nothing is left to compile when the first real one comes.
+
+    Where time and friction count, they are one press that slides; where joints bend the skin, all is done bent and at
+    rest. The deepest reaches into the core. Of each comes a local model. Last two tools press at one place. All rub as
+    the roughest of those whose friction is told.
+
+    Args:
+        simulator: simulator to warm up.
+        ahead: who compiles a part of it beside.
+    """
+    frictions = every, some = simulator.history.frictions
+    simulator.history.frictions = max(every, *some.values(), 0.0), {}
+    tool, rig, state = tip(), simulator.layer.rig, State()
+    if ahead:
+        ahead.touch(simulator)
+    for angles in ([WARM_BEND] * len(rig.joints), ()) if rig else ((),):
+        if rig:
+            state = simulator.move_to(simulator.skin.at_angles(angles), state)
+        state = _press(simulator, tool, state, ahead)
+    simulator.tools.remove(tool.name)
+    simulator.history.frictions = frictions
+
+
+def tip() -> Tool:
+    """A tool to warm up with: an octahedron whose corners are TIP from its middle."""
+    corners = TIP * np.array([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1]])
+    faces = np.array([[0, 2, 4], [2, 1, 4], [1, 3, 4], [3, 0, 4], [2, 0, 5], [1, 2, 5], [3, 1, 5], [0, 3, 5]])
+    return Tool("warm up", corners, faces)
+
+
+def _middle(layer: SoftLayer) -> int:
+    """Vertex that is nearest to the middle of a limb."""
+    return int(np.linalg.norm(layer.vertices - layer.vertices.mean(axis=0), axis=1).argmin())
+
+
+def _first(layer: SoftLayer, tool: Tool) -> Contact:
+    """Pushes gently near the middle of the limb."""
+    vertex = _middle(layer)
+    pose, normal = np.eye(4), layer.normals[vertex]
+    pose[:3, 3] = layer.vertices[vertex] + 0.009 * normal
+    return Contact(tool, pose, np.concatenate([-0.01 * normal, np.zeros(3)]))
+
+
+def _press(simulator: Simulator, tool: Tool, state: State, ahead: CompiledAhead | None) -> State:
+    """Touches the skin where it stands, in each way."""
+    layer, pose = simulator.layer, np.eye(4)
+    vertex = _middle(layer)
+    push, deep = np.concatenate([-0.01 * layer.normals[vertex], np.zeros(3)]), -float(layer.thickness[vertex])
+    for away, wrench in ((0.009, push), (0.012, push), (0.009, None), (deep, None), (0.05, push)):
+        pose[:3, 3] = layer.vertices[vertex] + away * layer.normals[vertex]
+        touches = simulator.touch([Contact(tool, pose, wrench)])
+        simulator.answer(touches)
+        if ahead:
+            ahead.wait()
+        local_contacts(simulator.history, touches)
+        for way in (0.0, 1e-3) if simulator.remembers else ():
+            pose[:3, 3] += way * np.roll(layer.normals[vertex], 1)
+            touches, state = simulator.touch([Contact(tool, pose.copy(), wrench)], state, 0.01)
+            simulator.answer(touches)
+            local_contacts(simulator.history, touches, state)
+    pose[:3, 3] = layer.vertices[vertex] + 0.009 * layer.normals[vertex]
+    again = tool.named(f"{tool.name} again")
+    for wrench in (None, push):
+        both = [Contact(tool, pose, wrench), Contact(again, pose, wrench)]
+        simulator.answer(simulator.touch(both))
+        if simulator.remembers:
+            touches, state = simulator.touch(both, state, 0.01)
+            simulator.answer(touches)
+    simulator.tools.remove(again.name)
+    return state.without(again.name)
