@@ -17,7 +17,8 @@ PAGE = Path(__file__).parent / "api.md"
 PUBLIC = {  # heading: modules, and the names in them that are promised to stay
     "From contact to answer": ["stmpl_core: Tool Contact Simulator Tools State Touch Answer Trust",
                                "stmpl_core.batch: Batch BatchTouches", "stmpl_core.gpu.memory: WarpStates",
-                               "stmpl_core.touch: Slip", "stmpl_core.friction: Pair coefficient"],
+                               "stmpl_core.touch: Slip", "stmpl_core.friction: Pair coefficient",
+                               "stmpl_core.warming: warm_up CompiledAhead"],
     "Limb and load": ["stmpl_core.body: Body", "stmpl_core: SoftLayer Load Skin Rig Joint",
                       "stmpl_core.bones: Bone bones_of core_of to_bone"],
     "Tissue": ["stmpl_core: Tissue Membrane Ply Prony",

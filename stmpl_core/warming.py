@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+import logging
 import os
-from concurrent.futures import BrokenExecutor, Future, wait
-from contextlib import suppress
+from collections.abc import Callable
+from concurrent.futures import Future, wait
+from copy import copy
+from dataclasses import replace
+from typing import Any, Self
 
 import numpy as np
-from numba.core.event import Event, Listener
+from numba.core.event import Event, Listener, register, unregister
 
+from stmpl_core.compiling import TOLD_EVERY_S
 from stmpl_core.contact import Contact
 from stmpl_core.contact_net import compile_on_stacks
 from stmpl_core.history import compile_steps
@@ -20,6 +25,8 @@ from stmpl_core.simulator import Simulator
 from stmpl_core.state import State
 from stmpl_core.tool import Tool
 
+log = logging.getLogger(__name__)
+
 TIP = 0.01  # size of the tool that warms up, from its middle to its corners [m]
 WARM_BEND = 0.1  # angle of each joint at which a bent skin is warmed up [rad]
 
@@ -28,62 +35,87 @@ class CompiledAhead(Listener):
     """Compiles in a process beside what is needed later, as soon as a kernel is to be compiled here.
 
     First how a stack holds a tool, while the skin is made here; then what steps with a memory take; last, once a first
-    touch is compiled here, what else touches and local models take. Nothing is done where there is no second core.
+    touch is compiled here, what else touches and local models take. Nothing is done where there is no second core. It
+    listens as a context manager, and ends the process then.
 
     Args:
         stacked: whether there may be a stack.
         steps: whether steps with a memory will be asked for.
+        tell: function that gets a sentence once in a while as it is waited for.
     """
 
-    def __init__(self, stacked: bool, steps: bool) -> None:
-        self._stacked, self._steps, self._wanted = stacked, steps, len(os.sched_getaffinity(0)) > 1
+    def __init__(self, stacked: bool, steps: bool, tell: Callable[[str], None] = log.info) -> None:
+        self._stacked, self._steps, self._tell = stacked, steps, tell
+        self._wanted, self._touched = len(os.sched_getaffinity(0)) > 1, False
         self._pool: Pool | None = None
         self._jobs: list[Future[None]] = []
+
+    def __enter__(self) -> Self:
+        register("numba:compile", self)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        unregister("numba:compile", self)
+        if self._pool is not None:
+            self._pool.end()
 
     def on_start(self, event: Event) -> None:
         """Before a kernel is compiled."""
         if self._wanted:
             self._wanted = False
-            with suppress(OSError):  # then it is compiled here
-                self._pool = Pool(1, yields=YIELDS)
-                jobs = compile_on_stacks if self._stacked else None, compile_steps if self._steps else None
-                self._jobs += [self._pool.submit(job) for job in jobs if job]
+            self._pool = Pool(1, yields=YIELDS)
+            for job, wanted in ((compile_on_stacks, self._stacked), (compile_steps, self._steps)):
+                if wanted:
+                    self._submit(job)
 
     def on_end(self, event: Event) -> None:
         """After it."""
 
     def touch(self, simulator: Simulator) -> None:
         """Touches for the first time; what else touches take is compiled beside from then on."""
-        if self._pool is None:
+        self._wanted = False  # what is not on disk yet is compiled here: nobody is ahead any more
+        if self._pool is None or self._touched:
             return
+        self._touched = True
         if self._stacked:
-            wait(self._jobs[:1])
-        tool = tip()
+            self._wait(self._jobs[:1])
+        tool, skin = tip(), simulator.skin.rest or simulator.skin
         simulator.touch([_first(simulator.layer, tool)])
+        simulator.tools.field(tool).distance_gradient(np.zeros((1, 3)))  # answers and local models take it
         simulator.tools.remove(tool.name)
-        with suppress(OSError, BrokenExecutor):
-            self._jobs.append(self._pool.submit(compile_touches, simulator.layer))
+        self._submit(compile_touches, copy(skin.layer))  # which is pickled while the other may be added to
 
     def wait(self) -> None:
         """Until all is on disk: what two processes compile at once rounds otherwise in the last bits."""
-        wait(self._jobs)
+        self._wanted = False
+        self._wait(self._jobs)
+        for job in self._jobs:
+            if not job.cancelled() and (error := job.exception()):
+                log.debug("a process beside did not compile ahead: %r", error)
 
-    def close(self) -> None:
-        """Ends the process, whatever it is at."""
+    def _submit(self, job: Callable[..., None], *arguments: Any) -> None:
+        """Has a job done beside, unless that cannot be: then all of it is compiled here."""
         if self._pool is not None:
-            self._pool.end()
+            try:
+                self._jobs.append(self._pool.submit(job, *arguments))
+            except (OSError, RuntimeError):
+                self._pool.end()
+                self._pool = None
+
+    def _wait(self, jobs: list[Future[None]]) -> None:
+        while wait(jobs, TOLD_EVERY_S).not_done:
+            self._tell("compiling kernels in a process beside; the first time takes minutes, then they are on disk")
 
 
 def compile_touches(layer: SoftLayer) -> None:
     """Compiles what local models, deep touches and those of two tools take beyond a first touch, which is compiled."""
-    simulator, tool, others = Simulator(layer, Zero()), tip(), tip().named("again")
+    simulator, tool, again = Simulator(layer, Zero()), tip(), tip().named("again")
     first = _first(layer, tool)
     local_contacts(simulator.history, simulator.touch([first]))
+    for wrench in (None, first.wrench):
+        simulator.touch([replace(first, tool=one, wrench=wrench) for one in (tool, again)])
     deep = first.pose_body_from_tool.copy()
     deep[:3, 3] -= 2 * TIP * layer.normals[_middle(layer)]
-    for wrench in (None, first.wrench):
-        simulator.touch([Contact(tool, first.pose_body_from_tool, wrench),
-                         Contact(others, first.pose_body_from_tool, wrench)])  # fmt: skip
     simulator.touch([Contact(tool, deep)])
 
 

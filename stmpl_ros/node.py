@@ -7,7 +7,7 @@ import multiprocessing
 import time
 from collections.abc import Callable
 from concurrent.futures import BrokenExecutor, Future, TimeoutError
-from contextlib import ExitStack, closing
+from contextlib import ExitStack
 from functools import partial
 from typing import Any
 
@@ -141,8 +141,7 @@ class SkinNode(ServingNode):
             self.answering.limits = Limits.read(self.config.limits, self.config.limb)
             self.workshop = Workshop(self)  # its builders start while the skin is made
             remembers = self.config.relaxing or friction_of(self.config) is not None
-            ahead = CompiledAhead(stacked=self.config.tissue != PAPER, steps=remembers)
-            with (closing(ahead), install_listener("numba:compile", ahead),
+            with (CompiledAhead(self.config.tissue != PAPER, remembers, self._tell_progress) as ahead,
                   install_listener("numba:compile", Compiling(self._tell_progress))):  # fmt: skip
                 for simulator in self._answer_on(self._make_skin(), self.config):
                     warm_up(simulator, ahead)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import sys
-from contextlib import closing
 from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, cast, get_args
@@ -91,8 +90,6 @@ def sim(
         raise InvalidInput(f"--rate is {rate:g} Hz; allowed is 50 to 20000.")
     for flag, value in (("radius", radius), ("circle", circle), ("speed", speed)):
         check_millimetres(f"--{flag}", value, LEAST_MM)
-    from numba.core.event import install_listener
-
     from stmpl_core.friction import friction_from
     from stmpl_core.warming import CompiledAhead
     from stmpl_sim.grip import mount_of, usual_force
@@ -108,8 +105,7 @@ def sim(
     scene = build(layer, site, robot=robot, end=end, at=at, mount=mount_of(mount, grip), radius=1e-3 * radius,
                   timestep=1 / rate, gripper=grip > 0)  # fmt: skip
     course = Course(site.circle(1e-3 * circle), tuple(force), 1e-3 * speed, laps, grip)
-    ahead = CompiledAhead(stacked=layer.stacked, steps=True)
-    with closing(ahead), install_listener("numba:compile", ahead):
+    with CompiledAhead(layer.stacked, steps=True) as ahead:
         massage = Massage(scene, course, damping=damping, friction=friction_from(friction), every=every)
         massage.warm_up(ahead)
     shots: list[Any] | None = None if film == "none" else []

@@ -1,5 +1,7 @@
 """Laws of what a node does before its first answer: nothing is left to compile when a tool comes."""
 
+import os
+
 import pytest
 
 from tests.bus import end, start
@@ -86,21 +88,47 @@ print(*(len(one.signatures) for one in (stepped.asked_for, stepped.tell, stepped
 
 
 LAW = KERNELS + """
+import pickle
 from stmpl_core import Simulator, contact_net, green
 from stmpl_core.body import Body
 from stmpl_core.contact_net import compile_on_stacks
 from stmpl_core.living import living
-from stmpl_core.methods import Zero
-from stmpl_core.warming import compile_touches, warm_up
+from stmpl_core.methods import MomentNet
+from stmpl_core.warming import CompiledAhead, _first, compile_touches, tip
 
 compile_on_stacks()
 layer = living(Body.anny(), "left_forearm", edge_length=8e-3)
-compile_touches(layer)
+simulator, ahead, tool = Simulator(layer, MomentNet()), CompiledAhead(True, False), tip()
+ahead._pool, ahead._submit = True, lambda *job: None
+ahead.touch(simulator)
+touches, first = simulator.touch([_first(layer, tool)]), kernels()
 told = (contact_net._look_on_stack, contact_net._correct, contact_net._on_plates, green._matrix)
-print(*(len(one.signatures) for one in told))
-before = kernels()
-warm_up(Simulator(layer, Zero()))
-print(sorted(kernels() - before))
+assert [len(one.signatures) for one in told] == [1] * 4
+if sys.argv[1] == "answer":
+    simulator.answer(touches)
+else:
+    compile_touches(pickle.loads(pickle.dumps(layer)))
+print(*sorted(f"{module}.{name}" for module, name, _ in kernels() - first))
+"""
+
+
+AHEAD = """
+import time
+from numba import njit
+from stmpl_core.warming import CompiledAhead
+
+with CompiledAhead(stacked=False, steps=True) as ahead:
+    if sys.argv[1] == "late":
+        ahead.wait()
+    njit(lambda x: x + 1)(1)
+    jobs, pool = ahead._jobs, ahead._pool
+    if sys.argv[1] == "dies":
+        while not pool._processes:
+            time.sleep(0.01)
+        for process in list(pool._processes.values()):
+            process.kill()
+        ahead.wait()
+print(len(jobs), pool is not None, all(job.done() for job in jobs))
 """
 
 
@@ -109,11 +137,22 @@ def test_what_another_process_compiles_of_steps_is_what_they_take():
     assert (code, said) == (0, "1 1 1 1\n")
 
 
-def test_what_another_process_compiles_of_touches_is_what_they_take():
-    """Of answers is left what lays the skin on its tools."""
-    code, said = end(start("-c", LAW))
-    assert (code, said.splitlines()[0]) == (0, "1 1 1 1")
-    assert "local" not in said and "contact_net" not in said and "nodes" not in said
+def test_what_another_process_compiles_of_touches_is_not_what_answers_take():
+    """Both happen at once. The law's kernels, which it compiled before, are those that are asked for."""
+    left = {}
+    for what in ("answer", "touches"):
+        code, said = end(start("-c", LAW, what))
+        assert code == 0
+        left[what] = set(said.split())
+    assert "stmpl_core.tangent._rates" in left["touches"] and "stmpl_core.methods.moment_net._move" in left["answer"]
+    assert not left["answer"] & left["touches"]
+
+
+@pytest.mark.skipif(len(os.sched_getaffinity(0)) < 2, reason="one core")
+@pytest.mark.parametrize(("when", "there"), [("early", "1 True True"), ("late", "0 False True"),
+                                             ("dies", "1 True True")])  # fmt: skip
+def test_a_process_compiles_ahead_unless_this_one_has_begun_itself_and_ends_with_it(when, there):
+    assert end(start("-c", "import sys" + AHEAD, when)) == (0, there + "\n")
 
 
 @pytest.mark.parametrize("friction", ["none", "oiled"])
