@@ -41,11 +41,11 @@ class CompiledAhead(Listener):
     Args:
         stacked: whether there may be a stack.
         steps: whether steps with a memory will be asked for.
-        tell: function that gets a sentence once in a while as it is waited for.
+        tell: function that gets a sentence once in a while as it is waited for; None: the log does.
     """
 
-    def __init__(self, stacked: bool, steps: bool, tell: Callable[[str], None] = log.info) -> None:
-        self._stacked, self._steps, self._tell = stacked, steps, tell
+    def __init__(self, stacked: bool, steps: bool, tell: Callable[[str], None] | None = None) -> None:
+        self._stacked, self._steps, self._tell = stacked, steps, tell or log.info
         self._wanted, self._touched = len(os.sched_getaffinity(0)) > 1, False
         self._pool: Pool | None = None
         self._jobs: list[Future[None]] = []
