@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import logging
 from copy import copy
 from dataclasses import replace
 from functools import cached_property
@@ -19,6 +20,9 @@ from stmpl_core.tissue import Tissue
 if TYPE_CHECKING:
     from stmpl_core.rig import Rig
 
+log = logging.getLogger(__name__)
+
+HOLLOW = 0.02  # volume over area^1.5 from which an open skin encloses one: half of that of a limb that is long and thin
 MAX_EXTENT = 4.0  # largest extent of a skin [m]; that of a mesh in millimetres is larger
 STEEPEST = 0.35  # cosine between the normal and a column to the core, below which the column's length counts
 MOST_OUTSIDE = 0.01  # share of the skin whose core may lie on its other side, as where joints fold it
@@ -334,8 +338,11 @@ def _check_surface(layer: SoftLayer) -> None:
         a, b = divmod(int(values[count > 1][0]), len(layer.vertices))
         raise MeshError(f"edge {a}->{b} is used by several faces in the same direction: the surface is non-manifold "
                         "or its faces are not oriented alike. Repair it, for instance with trimesh.repair.fix_normals.")
-    if not len(layer.border):
-        volume = float(np.einsum("ij,ij->", layer.vertices[layer.faces[:, 0]], layer.face_area_vectors)) / 3
-        if volume < 0:
-            raise MeshError(f"the closed skin is inside out (volume {volume:.3g} m3). "
-                            "Reverse its faces: faces[:, ::-1].")
+    middle = np.average(layer.vertices[layer.faces].mean(axis=1), axis=0, weights=area)
+    volume = float(np.einsum("ij,ij->", layer.vertices[layer.faces[:, 0]] - middle, layer.face_area_vectors)) / 3
+    if not len(layer.border) and volume < 0:
+        raise MeshError(f"the closed skin is inside out (volume {volume:.3g} m3). "
+                        "Reverse its faces: faces[:, ::-1].")
+    if volume < -HOLLOW * area.sum() ** 1.5:
+        log.warning("the skin faces the hollow that it encloses, and its tissue lies outside; if that is wrong, "
+                    "reverse its faces: faces[:, ::-1]")  # fmt: skip

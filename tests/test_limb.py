@@ -10,7 +10,7 @@ from stmpl_core.errors import MeshError, NotPrepared
 from stmpl_core.methods import LimbLinear, MomentNet
 from stmpl_core.moments import Surroundings
 from stmpl_core.simulator import Simulator
-from tests.scenes import disc, limb
+from tests.scenes import disc, limb, plate, wavy_layer
 
 RADIUS, LENGTH = 0.035, 0.26
 STACK = Tissue(3e3, 0.45, skin=Membrane(1.3e5, 1.2e-3, 11.0), deeper=(Ply(6e-3, 15e3, 0.45),))
@@ -76,3 +76,11 @@ def test_layered_skin_that_is_all_border_is_refused() -> None:
     assert len(rings.border) == len(rings.vertices)
     with pytest.raises(MeshError, match="every vertex of the skin is on its open border"):
         Simulator(rings, MomentNet())
+
+
+@pytest.mark.parametrize(("skin", "hollow"), [(limb(8e-3), True), (plate(), False), (wavy_layer(), False)])
+def test_an_open_skin_that_faces_its_own_hollow_is_told_of(skin: SoftLayer, hollow: bool, caplog) -> None:
+    SoftLayer(skin.vertices, skin.faces, 5e-3)
+    assert not caplog.records
+    SoftLayer(skin.vertices, skin.faces[:, ::-1], 5e-3)
+    assert ["faces the hollow" in record.message for record in caplog.records] == [True] * hollow
