@@ -20,7 +20,7 @@ from stmpl_core.history import compile_steps
 from stmpl_core.layer import SoftLayer
 from stmpl_core.local_contact import local_contacts
 from stmpl_core.methods.zero import Zero
-from stmpl_core.pool import YIELDS, Pool
+from stmpl_core.pool import Pool
 from stmpl_core.simulator import Simulator
 from stmpl_core.state import State
 from stmpl_core.tool import Tool
@@ -63,7 +63,7 @@ class CompiledAhead(Listener):
         """Before a kernel is compiled."""
         if self._wanted:
             self._wanted = False
-            self._pool = Pool(1, yields=YIELDS)
+            self._pool = Pool(1)  # yields to nobody: it is waited for
             for job, wanted in ((compile_on_stacks, self._stacked), (compile_steps, self._steps)):
                 if wanted:
                     self._submit(job)
