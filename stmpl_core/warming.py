@@ -13,6 +13,7 @@ from typing import Any, Self
 import numpy as np
 from numba.core.event import Event, Listener, register, unregister
 
+from stmpl_core.arrays import Transform
 from stmpl_core.compiling import TOLD_EVERY_S
 from stmpl_core.contact import Contact
 from stmpl_core.contact_net import compile_on_stacks
@@ -28,6 +29,7 @@ from stmpl_core.tool import Tool
 log = logging.getLogger(__name__)
 
 TIP = 0.01  # size of the tool that warms up, from its middle to its corners [m]
+TOUCHING = 0.009  # height of its middle above the skin at which it touches [m]
 WARM_BEND = 0.1  # angle of each joint at which a bent skin is warmed up [rad]
 
 
@@ -114,9 +116,7 @@ def compile_touches(layer: SoftLayer) -> None:
     local_contacts(simulator.history, simulator.touch([first]))
     for wrench in (None, first.wrench):
         simulator.touch([replace(first, tool=one, wrench=wrench) for one in (tool, again)])
-    deep = first.pose_body_from_tool.copy()
-    deep[:3, 3] -= 2 * TIP * layer.normals[_middle(layer)]
-    simulator.touch([Contact(tool, deep)])
+    simulator.touch([Contact(tool, over(layer, middle(layer), TOUCHING - 2 * TIP))])
 
 
 def warm_up(simulator: Simulator, ahead: CompiledAhead | None = None) -> None:
@@ -150,26 +150,32 @@ def tip() -> Tool:
     return Tool("warm up", corners, faces)
 
 
-def _middle(layer: SoftLayer) -> int:
+def middle(layer: SoftLayer) -> int:
     """Vertex that is nearest to the middle of a limb."""
     return int(np.linalg.norm(layer.vertices - layer.vertices.mean(axis=0), axis=1).argmin())
 
 
+def over(layer: SoftLayer, vertex: int, away: float) -> Transform:
+    """Pose (4, 4), not turned, so far above a vertex along its normal [m]."""
+    pose = np.eye(4)
+    pose[:3, 3] = layer.vertices[vertex] + away * layer.normals[vertex]
+    return pose
+
+
 def _first(layer: SoftLayer, tool: Tool) -> Contact:
     """Pushes gently near the middle of the limb."""
-    vertex = _middle(layer)
-    pose, normal = np.eye(4), layer.normals[vertex]
-    pose[:3, 3] = layer.vertices[vertex] + 0.009 * normal
-    return Contact(tool, pose, np.concatenate([-0.01 * normal, np.zeros(3)]))
+    vertex = middle(layer)
+    push = np.concatenate([-0.01 * layer.normals[vertex], np.zeros(3)])
+    return Contact(tool, over(layer, vertex, TOUCHING), push)
 
 
 def _press(simulator: Simulator, tool: Tool, state: State, ahead: CompiledAhead | None) -> State:
     """Touches the skin where it stands, in each way."""
-    layer, pose = simulator.layer, np.eye(4)
-    vertex = _middle(layer)
-    push, deep = np.concatenate([-0.01 * layer.normals[vertex], np.zeros(3)]), -float(layer.thickness[vertex])
-    for away, wrench in ((0.009, push), (0.012, push), (0.009, None), (deep, None), (0.05, push)):
-        pose[:3, 3] = layer.vertices[vertex] + away * layer.normals[vertex]
+    layer = simulator.layer
+    vertex, push = middle(layer), _first(layer, tool).wrench
+    deep = -float(layer.thickness[vertex])
+    for away, wrench in ((TOUCHING, push), (0.012, push), (TOUCHING, None), (deep, None), (0.05, push)):
+        pose = over(layer, vertex, away)
         touches = simulator.touch([Contact(tool, pose, wrench)])
         simulator.answer(touches)
         if ahead:
@@ -180,7 +186,7 @@ def _press(simulator: Simulator, tool: Tool, state: State, ahead: CompiledAhead 
             touches, state = simulator.touch([Contact(tool, pose.copy(), wrench)], state, 0.01)
             simulator.answer(touches)
             local_contacts(simulator.history, touches, state)
-    pose[:3, 3] = layer.vertices[vertex] + 0.009 * layer.normals[vertex]
+    pose = over(layer, vertex, TOUCHING)
     again = tool.named(f"{tool.name} again")
     for wrench in (None, push):
         both = [Contact(tool, pose, wrench), Contact(again, pose, wrench)]

@@ -22,7 +22,7 @@ from stmpl_core.stiffness import Stiffness, fit_stiffness
 from stmpl_core.strokes import Fading, Rubbing, fit_friction, fit_relaxation
 from stmpl_core.tool import Tool
 from stmpl_core.toucher import Toucher, margin_on
-from stmpl_core.warming import TIP, tip
+from stmpl_core.warming import TIP, middle, over, tip
 from stmpl_ros.beside import Builders
 from stmpl_ros.remembering import Before
 
@@ -158,9 +158,7 @@ def _know(layer: SoftLayer, friction: Friction | Mapping[str, Friction]) -> None
     _history = History(Toucher(layer), friction)
     if layer.rig is not None:
         _skin = Skin.of(layer, Zero())
-    tool, pose = tip(), np.eye(4)
-    vertex = int(np.linalg.norm(layer.vertices - layer.vertices.mean(axis=0), axis=1).argmin())
-    pose[:3, 3] = layer.vertices[vertex] + 0.5 * TIP * layer.normals[vertex]
+    tool, pose = tip(), over(layer, middle(layer), 0.5 * TIP)
     remembers = _history.rubs or len(_history.series.times) > 0
     _local_contacts([Contact(tool, pose)], State() if remembers else None, 0.01)  # loaded before somebody waits
     _history.toucher.tools.remove(tool.name)
